@@ -108,7 +108,7 @@ def predict(
     settings: Settings = AS_USUAL,
     start: Mapping[str, Calibration] | None = None,
 ) -> tuple[Unknowns, FloatArray]:
-    """What would be found: the same equations without misclosures, for planning.
+    """Return what would be found: the same equations without misclosures, for planning.
 
     Returns:
         The unknowns that would be determined, with what is held, and their covariance (u, u).
@@ -125,7 +125,7 @@ def predict(
 
 
 def _stable(before: Solved, found: Solved) -> bool:
-    """Whether new correspondences moved no parameter by much of its sigma."""
+    """Return whether new correspondences moved no parameter by much of its sigma."""
     names, values = before.solution.rows.unknowns.names, before.solution.state.values
     old = dict(zip(names, values.tolist(), strict=True))
     sigmas = np.sqrt(np.diag(found.solution.parameters))

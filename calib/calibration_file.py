@@ -59,7 +59,7 @@ class Header:
 
 
 def calibration_text(calibration: Calibration, header: Header) -> str:
-    """The file: the same for the same calibration and header, byte for byte.
+    """Return the file: the same for the same calibration and header, byte for byte.
 
     Numbers stand in the file's units with as few digits as read back to the number they were; a few numbers (one in
     ten, of parameters in degrees and parts per million) are no product of a double and their unit: these read back as
@@ -116,7 +116,7 @@ def _parameters(calibration: Calibration) -> list[str]:
 
 
 def _estimated(calibration: Calibration) -> list[list[str]]:
-    """Tables [sigma], [held_sigma] and [correlation], the last of both together."""
+    """Return tables [sigma], [held_sigma] and [correlation], the last of both together."""
     blocks = []
     for title, sigmas in (("sigma", calibration.sigmas), ("held_sigma", calibration.held_sigmas)):
         rows = [
@@ -155,7 +155,7 @@ def _tables(calibration: Calibration) -> list[list[str]]:
 
 
 def in_unit(value: float, factor: float, back: Callable[[float], float] | None = None) -> float:
-    """A number in a file's unit: of those that read back as ``value``, the one with the fewest digits.
+    """Return a number in a file's unit: of those that read back as ``value``, the one with the fewest digits.
 
     Args:
         value: SI.
@@ -179,7 +179,7 @@ def in_unit(value: float, factor: float, back: Callable[[float], float] | None =
 
 
 def _number(value: float) -> str:
-    """A whole number without a point, as counts and rates are written."""
+    """Return a whole number without a point, as counts and rates are written."""
     if not math.isfinite(value):
         raise CalibrationFileError(f"a calibration holds {value!r}; want finite numbers")
     return str(int(value)) if float(value).is_integer() and abs(value) < 1e15 else repr(float(value))
@@ -194,7 +194,7 @@ def _said(value: str | None) -> str | None:
 
 
 def _text(value: str) -> str:
-    """A basic string of TOML: JSON's escapes are among its own, but it wants DEL escaped too."""
+    """Return a basic string of TOML: JSON's escapes are among its own, but it wants DEL escaped too."""
     try:
         value.encode()
     except UnicodeEncodeError as error:
@@ -221,5 +221,5 @@ def _matrix(rows: Sequence[Sequence[float]] | FloatArray) -> str:
 
 
 def _long_matrix(matrix: FloatArray) -> str:
-    """A row a line."""
+    """Return a row a line."""
     return "".join(["[\n", *(f"  {_list(row)},\n" for row in matrix.tolist()), "]"])

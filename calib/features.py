@@ -119,7 +119,7 @@ class Features:
 
     @classmethod
     def joined(cls, pieces: Sequence[Features]) -> Features:
-        """One after the other."""
+        """Return one after the other."""
         refused: Counter[str] = Counter()
         for piece in pieces:
             refused.update(piece.refused)

@@ -48,18 +48,18 @@ class Tangent:
 
     @classmethod
     def at(cls, position_e: FloatArray) -> Tangent:
-        """With its origin on the ellipsoid below or above a place (3,)."""
+        """Make it with its origin on the ellipsoid below or above a place (3,)."""
         lat, lon, _ = (float(value) for value in geodetic_from_e(position_e))
         rot_t_from_e = (rot_e_from_l(np.array(lat), np.array(lon)) @ _ROT_L_FROM_ENU).T
         return cls(np.asarray(e_from_geodetic(lat, lon, 0.0), dtype=np.float64), rot_t_from_e)
 
     def t_from_e(self, points_e: FloatArray) -> FloatArray:
-        """(…, 3) points."""
+        """Return (…, 3) points."""
         turned: FloatArray = (points_e - self.origin_e) @ self.rot_t_from_e.T
         return turned
 
     def e_from_t(self, points_t: FloatArray) -> FloatArray:
-        """(…, 3) points."""
+        """Return (…, 3) points."""
         turned: FloatArray = points_t @ self.rot_t_from_e + self.origin_e
         return turned
 
@@ -142,7 +142,7 @@ class Flight:
     swaths: tuple[Swath, ...]
 
     def rays(self, swath: Swath, calibration: Calibration, at: Rows = slice(None), *, with_axes: bool = True) -> Rays:
-        """Some of a swath's returns with a calibration: `swath.georef.scanner.sensor_model`, air applied."""
+        """Return some of a swath's returns with a calibration: `swath.georef.scanner.sensor_model`, air applied."""
         head, trajectory = self.heads[swath.head], self.trajectories[swath.flown]
         model = head.model(calibration)
         count = len(swath.time_ns[at])
@@ -161,14 +161,14 @@ class Flight:
         return rays
 
     def place(self, swath: Swath, calibration: Calibration, at: Rows = slice(None)) -> FloatArray:
-        """(n, 3) points in t; nan where there is none (gate, gap of the trajectory)."""
+        """Return (n, 3) points in t; nan where there is none (gate, gap of the trajectory)."""
         rays = self.rays(swath, calibration, at, with_axes=False)
         points = self.frame.t_from_e(rays.points_e)
         points[rays.fate != Fate.GEOREFERENCED] = np.nan
         return points
 
     def placed(self, calibrations: Mapping[str, Calibration]) -> Flight:
-        """The same with every swath's points by these calibrations, by scanner."""
+        """Return the same with every swath's points by these calibrations, by scanner."""
         swaths = tuple(
             replace(swath, points_t=self.place(swath, calibrations[self.heads[swath.head].name]))
             for swath in self.swaths
@@ -176,12 +176,12 @@ class Flight:
         return replace(self, swaths=swaths)
 
     def starts(self) -> dict[str, Calibration]:
-        """The calibrations to start from, by scanner."""
+        """Return the calibrations to start from, by scanner."""
         return {head.name: head.start for head in self.heads}
 
 
 def sensor_t(flight: Flight, swath: Swath, at: Int64Array) -> FloatArray:
-    """(n, 3) about where the scanner was when it sent returns: the body's origin at the epoch after."""
+    """Return (n, 3) about where the scanner was when it sent returns: the body's origin at the epoch after."""
     trajectory = flight.trajectories[swath.flown]
     epoch = np.minimum(np.searchsorted(trajectory.time_ns, swath.time_ns[at]), len(trajectory) - 1)
     return flight.frame.t_from_e(trajectory.position_e[epoch])

@@ -20,18 +20,18 @@ STEPS = 40
 
 
 def nodes_of(knots: FloatArray) -> FloatArray:
-    """(d,) intensities of the nodes, all knots (k,) among them as they are."""
+    """Return (d,) intensities of the nodes, all knots (k,) among them as they are."""
     nodes = [np.linspace(low, high, STEPS, endpoint=False) for low, high in pairwise(knots.tolist())]
     return np.concatenate([*nodes, knots[-1:]])
 
 
 def at_knots(correction_m: FloatArray) -> FloatArray:
-    """(k,) of a correction at nodes (d,)."""
+    """Return (k,) of a correction at nodes (d,)."""
     return correction_m[::STEPS]
 
 
 def curve(knots: FloatArray, correction_m: FloatArray) -> FloatArray:
-    """(d,) correction at the nodes.
+    """Return (d,) correction at the nodes.
 
     Args:
         knots: (k,) rising intensities, two or more.
@@ -44,7 +44,7 @@ def curve(knots: FloatArray, correction_m: FloatArray) -> FloatArray:
 
 
 def curve_by_knots(knots: FloatArray, correction_m: FloatArray) -> FloatArray:
-    """(k, d) derivatives of `curve` by the corrections at the knots.
+    """Return (k, d) derivatives of `curve` by the corrections at the knots.
 
     Where a slope has none (two secants change from one sign to the other, or both are zero) it is one of those beside.
     """
@@ -55,7 +55,7 @@ def curve_by_knots(knots: FloatArray, correction_m: FloatArray) -> FloatArray:
 
 
 def _cubics(knots: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """(d, k) weights of the knots' values, and of their slopes, at the nodes (Hermite's basis)."""
+    """Return (d, k) weights of the knots' values, and of their slopes, at the nodes (Hermite's basis)."""
     pieces = len(knots) - 1
     t = np.arange(STEPS) / STEPS
     by_value, by_slope = np.zeros((2, pieces * STEPS + 1, pieces + 1))
@@ -68,7 +68,7 @@ def _cubics(knots: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _slopes(knots: FloatArray, correction_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """(k,) slopes at the knots; (k, k − 1) their derivatives by the secants."""
+    """Return (k,) slopes at the knots; (k, k − 1) their derivatives by the secants."""
     count = len(knots)
     lengths = np.diff(knots)
     secants = np.diff(correction_m) / lengths
@@ -84,7 +84,7 @@ def _slopes(knots: FloatArray, correction_m: FloatArray) -> tuple[FloatArray, Fl
 
 
 def _inner(secants: FloatArray, lengths: FloatArray) -> tuple[float, FloatArray]:
-    """Harmonic mean of two secants, and its derivatives by them; each weighs more, the shorter it is."""
+    """Return harmonic mean of two secants, and its derivatives by them; each weighs more, the shorter it is."""
     weights = np.array([2.0 * lengths[1] + lengths[0], lengths[1] + 2.0 * lengths[0]])
     whole = weights.sum()
     if not secants.any():
@@ -97,7 +97,7 @@ def _inner(secants: FloatArray, lengths: FloatArray) -> tuple[float, FloatArray]
 
 
 def _end(secants: FloatArray, lengths: FloatArray) -> tuple[float, FloatArray]:
-    """Slope of a parabola through the last three knots, last first, kept from turning back; its derivatives."""
+    """Return slope of a parabola through the last three knots, last first, kept from turning back; its derivatives."""
     shares = np.array([2.0 * lengths[0] + lengths[1], -lengths[0]]) / lengths.sum()
     slope = float(shares @ secants)
     if np.sign(slope) != np.sign(secants[0]):

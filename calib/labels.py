@@ -74,13 +74,13 @@ def unknown(name: str) -> Unknown:
 
 
 def words_of(scanner: str, name: str, *, several: bool) -> str:
-    """A parameter's words, with its scanner where there are several."""
+    """Return a parameter's words, with its scanner where there are several."""
     words = unknown(f"{scanner}.{name}").words
     return f"{words} of {scanner}" if several else words
 
 
 def plain(text: str, *, several: bool) -> str:
-    """A sentence in which parameters go by their words, not by names as ``left.omega_rad``."""
+    """Return a sentence in which parameters go by their words, not by names as ``left.omega_rad``."""
     return _NAMED.sub(lambda found: words_of(found[1], found[2], several=several), text)
 
 
@@ -90,7 +90,7 @@ def is_undetermined(held: FixedParameter) -> bool:
 
 
 def decimals_of(sigma: float, most: int = 9) -> int:
-    """Digits after the point that show two digits of a sigma."""
+    """Return digits after the point that show two digits of a sigma."""
     if not math.isfinite(sigma) or sigma <= 0.0:
         return 4
     return min(max(1 - math.floor(math.log10(sigma)), 0), most)
@@ -105,7 +105,7 @@ def number(value: float | None, pattern: str = ".3g") -> str:
 
 
 def thousands(value: float, digits: int = 0) -> str:
-    """A number whose thousands stand apart."""
+    """Return a number whose thousands stand apart."""
     return f"{value:,.{digits}f}".replace(",", THIN).replace("-", MINUS)
 
 

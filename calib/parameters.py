@@ -148,7 +148,7 @@ class Unknowns:
         return len(self.items)
 
     def of_head(self, head: int) -> tuple[Int64Array, Int64Array, Int64Array]:
-        """A head's unknowns (m,): where they stand in the vector, kinds, arguments."""
+        """Return a head's unknowns (m,): where they stand in the vector, kinds, arguments."""
         at = [index for index, item in enumerate(self.items) if item.head == head]
         kinds = [self.items[index].kind for index in at]
         arguments = [self.items[index].argument for index in at]
@@ -209,7 +209,7 @@ class Unknowns:
         return done
 
     def pseudo(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Pseudo-observations 0 = A x + w of values (u,), divided by their sigmas: A (m, u), w (m,).
+        """Return pseudo-observations 0 = A x + w of values (u,), divided by their sigmas: A (m, u), w (m,).
 
         A parameter's prior; and that the correction by intensity bends little between its knots.
         """
@@ -306,7 +306,7 @@ def unknowns(
 
 
 def _asked(head: Head, name: str, wish: ParameterOptions) -> str:
-    """``fix``, ``free``, ``prior`` or nothing: what is said of it on this head, else on all."""
+    """Return ``fix``, ``free``, ``prior`` or nothing: what is said of it on this head, else on all."""
     for key in (f"{head.name}.{name}", name):
         for word, names in (("fix", wish.fix), ("prior", wish.priors), ("free", wish.free)):
             if key in names:
@@ -321,7 +321,7 @@ def _prior(head: Head, name: str, wish: ParameterOptions) -> float:
 
 
 def _word(head: Head, name: str, wish: ParameterOptions) -> str | None:
-    """Why a parameter is not estimated; None: it is."""
+    """Return why a parameter is not estimated; None: it is."""
     asked = _asked(head, name, wish)
     if name in head.geometry.without:
         if asked in ("free", "prior"):
@@ -398,7 +398,7 @@ def _put_offset(offsets: list[RangeOffset], item: Unknown, value: float) -> None
 
 
 def _reference(wish: ParameterOptions) -> int:
-    """Index of the knot whose correction is 0."""
+    """Return index of the knot whose correction is 0."""
     if wish.ibrc_reference is None:
         return len(wish.ibrc_knots) // 2
     return int(np.argmin(np.abs(np.array(wish.ibrc_knots) - wish.ibrc_reference)))

@@ -60,7 +60,9 @@ class Surface:
     control: tuple[ControlPoint, ...] = ()
 
     def taken_m2(self, cell_m: float) -> float:
-        """Area of which returns are taken: of a roof what whole cells of the search have room on, clear of its rims."""
+        """Return area of which returns are taken: of a roof what whole cells of the search have room on, clear of its
+        rims.
+        """
         inner_m = max(float(np.sqrt(self.area_m2)) - max(cell_m, 2.0 * RIM_M), 0.0)
         return inner_m**2 if self.kind == "roof" else self.area_m2
 
@@ -101,7 +103,7 @@ class Scan:
         return max(along_m, 1.0 / (per_m2 * along_m))
 
     def encoder_motion(self, angle_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(n,) rate and acceleration of the encoder at angles; one return goes out, the next comes back."""
+        """Return (n,) rate and acceleration of the encoder at angles; one return goes out, the next comes back."""
         back = np.where(np.arange(len(angle_rad)) % 2, -1.0, 1.0)
         turns = 2.0 * np.pi * self.scan_hz
         if self.motion == "sine":
@@ -141,7 +143,7 @@ def planned(
     surfaces: Sequence[Surface],
     most_returns: int,
 ) -> tuple[Flight, Features]:
-    """The flight as it would be read, and its planes.
+    """Return the flight as it would be read, and its planes.
 
     Args:
         frame: t.
@@ -203,7 +205,7 @@ def predict(
     prior: TrajectoryPrior | None,
     settings: Settings = AS_USUAL,
 ) -> Predicted:
-    """Sigmas and what is held, by the adjustment's own equations.
+    """Return sigmas and what is held, by the adjustment's own equations.
 
     Args:
         flight, features: planned or flown.
@@ -232,7 +234,7 @@ class _Shots:
     points_t: FloatArray
 
     def at(self, chosen: NDArray[np.bool_] | Int64Array) -> _Shots:
-        """Some of them."""
+        """Return some of them."""
         return _Shots(
             self.surface[chosen],
             self.time_ns[chosen],
@@ -299,13 +301,13 @@ def _crossings(
 def _plane_of_scan(
     trajectory: Trajectory, calibration: Calibration, time_ns: Int64Array
 ) -> tuple[FloatArray, FloatArray]:
-    """(n, 3) the scanner's place in e and the axis that its scan turns about, at times (n,)."""
+    """Return (n, 3) the scanner's place in e and the axis that its scan turns about, at times (n,)."""
     origin_e, rot_e_from_s = _scanner(trajectory, calibration, time_ns)
     return origin_e, rot_e_from_s[:, :, 0]
 
 
 def _scanner(trajectory: Trajectory, calibration: Calibration, time_ns: Int64Array) -> tuple[FloatArray, FloatArray]:
-    """(n, 3) place of the scanner, (n, 3, 3) of s to e, at times of its stamps."""
+    """Return (n, 3) place of the scanner, (n, 3, 3) of s to e, at times of its stamps."""
     value = calibration.value
     offset_ns = round(value("time_offset_s") * SECOND_NS)
     poses = trajectory.poses(np.clip(time_ns + offset_ns, *trajectory.span))
@@ -318,7 +320,7 @@ def _scanner(trajectory: Trajectory, calibration: Calibration, time_ns: Int64Arr
 def _beams(
     trajectory: Trajectory, calibration: Calibration, points_e: FloatArray, time_ns: Int64Array
 ) -> tuple[FloatArray, FloatArray]:
-    """(n, 3) from the scanner to points at times, in s and in e."""
+    """Return (n, 3) from the scanner to points at times, in s and in e."""
     origin_e, rot_e_from_s = _scanner(trajectory, calibration, time_ns)
     beam_e = points_e - origin_e
     return np.einsum("nij,ni->nj", rot_e_from_s, beam_e), beam_e
@@ -331,7 +333,7 @@ def _speed(trajectory: Trajectory, line: Line) -> float:
 
 
 def _density(scan: Scan, speed_mps: float, shots: _Shots) -> FloatArray:
-    """(n,) pulses a square metre of ground where shots are, evenly over the swath's width."""
+    """Return (n,) pulses a square metre of ground where shots are, evenly over the swath's width."""
     width_m = 2.0 * shots.range_m * np.cos(shots.angle_rad) * np.tan(scan.half_angle_rad)
     per_m2: FloatArray = scan.rate_hz / (speed_mps * width_m)
     return per_m2
@@ -340,7 +342,9 @@ def _density(scan: Scan, speed_mps: float, shots: _Shots) -> FloatArray:
 def _thinned(
     shots: _Shots, surface: Int64Array, surfaces: Sequence[Surface], per_m2: FloatArray, cell_m: float
 ) -> tuple[NDArray[np.bool_], FloatArray]:
-    """Which to keep, at most `MOST_MADE` a surface, none of what is hardly seen; by surface, how many would come."""
+    """Return which to keep, at most `MOST_MADE` a surface, none of what is hardly seen; by surface, how many would
+    come.
+    """
     keep = np.zeros(len(shots.surface), dtype=np.bool_)
     expected = np.zeros(len(surfaces))
     asked = np.bincount(surface, minlength=len(surfaces))
@@ -355,7 +359,7 @@ def _thinned(
 
 
 def _swath(name: str, head: int, line: Line, calibration: Calibration, scan: Scan, shots: _Shots) -> Swath:
-    """Readings that give these ranges and angles."""
+    """Return readings that give these ranges and angles."""
     value = calibration.value
     rows = np.zeros(len(shots.time_ns), RETURN_DTYPE)
     rows["range_m"] = (shots.range_m - value("range_offset_m")) / (1.0 + value("range_scale"))

@@ -93,7 +93,7 @@ def prealign(
     start: Mapping[str, Calibration] | None = None,
     control_t: FloatArray | None = None,
 ) -> dict[str, Calibration]:
-    """Calibrations by scanner, whose boresight angles are good to some hundredths of a degree.
+    """Return calibrations by scanner, whose boresight angles are good to some hundredths of a degree.
 
     Args:
         flight: at least two swaths that overlap.
@@ -186,7 +186,7 @@ class _Control:
 
 
 def _levels(scale: Scale, settings: PrealignSettings) -> tuple[float, ...]:
-    """Sigmas of the smoothing, coarse to fine: what the flight's sizes allow of those asked for."""
+    """Return sigmas of the smoothing, coarse to fine: what the flight's sizes allow of those asked for."""
     finest_m = _SMOOTH_POINTS * scale.spacing_m
     if settings.smooth_m is not None:
         return tuple(dict.fromkeys(max(one, finest_m) for one in settings.smooth_m))
@@ -237,7 +237,7 @@ def _shared(points: Sequence[FloatArray], cell_m: float) -> list[NDArray[np.bool
 
 
 def _last(swath: Swath, count: int) -> Int64Array:
-    """Rising indexes of last returns, evenly over a swath."""
+    """Return rising indexes of last returns, evenly over a swath."""
     at = np.arange(0, len(swath), max(1, len(swath) // count))
     rows = swath.rows[at]
     last: Int64Array = at[rows["return_number"] == rows["number_of_returns"]]
@@ -300,7 +300,9 @@ def _damping(last: FloatArray, step: FloatArray) -> float:
 
 
 def _motion(flight: Flight, swath: Swath, at: Int64Array, found: Mapping[str, Calibration]) -> FloatArray:
-    """(4, n, 3) how points of returns move with each of the parameters; it stays nearly the same all the while."""
+    """Return (4, n, 3) how points of returns move with each of the parameters; it stays nearly the same all the
+    while.
+    """
     calibration = found[flight.heads[swath.head].name]
     points = flight.place(swath, calibration, at)
     motion = np.empty((len(NAMES), *points.shape))
@@ -313,14 +315,16 @@ def _motion(flight: Flight, swath: Swath, at: Int64Array, found: Mapping[str, Ca
 def _placed(
     flight: Flight, swath: Swath, at: Int64Array, motion: FloatArray, found: Mapping[str, Calibration]
 ) -> tuple[FloatArray, FloatArray]:
-    """Points (m, 3) of those returns that have one, and their motion (4, m, 3)."""
+    """Return points (m, 3) of those returns that have one, and their motion (4, m, 3)."""
     points = flight.place(swath, found[flight.heads[swath.head].name], at)
     there = np.isfinite(points).all(axis=1) & np.isfinite(motion).all(axis=(0, 2))
     return points[there], motion[:, there]
 
 
 def _differences(surfaces: list[Surface], heads: list[int], count: int) -> tuple[FloatArray, FloatArray]:
-    """Heights of one swath above another (m,) in all cells that two have, and their change with all unknowns (m, u)."""
+    """Return heights of one swath above another (m,) in all cells that two have, and their change with all unknowns
+    (m, u).
+    """
     apart, design = [], []
     for one, other in combinations(range(len(surfaces)), 2):
         first, second = surfaces[one], surfaces[other]
@@ -334,8 +338,8 @@ def _differences(surfaces: list[Surface], heads: list[int], count: int) -> tuple
 
 
 def _robust(apart: FloatArray, design: FloatArray) -> tuple[float, FloatArray]:
-    """Sigma of a difference once the parameters are right, and weights (m,): what one strip sees and another does not,
-    as trees and what walls hide, counts little (Huber 1981)."""
+    """Return sigma of a difference once the parameters are right, and weights (m,): what one strip sees and another
+    does not, as trees and what walls hide, counts little (Huber 1981)."""
     weight = np.ones(len(apart))
     sigma_m = 1.0
     damping = 1e-9 * np.diag((design**2).sum(axis=0) + 1e-12)
@@ -351,7 +355,7 @@ def _robust(apart: FloatArray, design: FloatArray) -> tuple[float, FloatArray]:
 def _against_control(
     placed: list[tuple[FloatArray, FloatArray]], heads: list[int], count: int, control: _Control
 ) -> tuple[FloatArray, FloatArray]:
-    """Heights of swaths above control points (m,), and their change with all unknowns (m, u)."""
+    """Return heights of swaths above control points (m,), and their change with all unknowns (m, u)."""
     above, design = [np.zeros(0)], [np.zeros((0, count * len(NAMES)))]
     for (points, motion), head in zip(placed, heads, strict=True):
         near = cKDTree(points[:, :2]).query_ball_point(control.points_t[:, :2], control.reach_m)
@@ -376,7 +380,7 @@ class Lattice:
 
     @classmethod
     def over(cls, points: list[FloatArray], cell_m: float, most: int) -> Lattice:
-        """All points (n, 3); cells become larger where there were more than so many."""
+        """Return all points (n, 3); cells become larger where there were more than so many."""
         low = np.min([np.min(one[:, :2], axis=0) for one in points], axis=0)
         high = np.max([np.max(one[:, :2], axis=0) for one in points], axis=0)
         east, north = high - low
@@ -385,7 +389,7 @@ class Lattice:
         return cls(west, south, cell_m, int(north / cell_m) + 2, int(east / cell_m) + 2)
 
     def cells(self, points: FloatArray) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-        """(n,) cells of points, and whether they are on the lattice."""
+        """Return (n,) cells of points, and whether they are on the lattice."""
         column = np.floor((points[:, 0] - self.west) / self.cell_m).astype(np.int64)
         row = np.floor((points[:, 1] - self.south) / self.cell_m).astype(np.int64)
         inside = (column >= 0) & (row >= 0) & (column < self.columns) & (row < self.rows)

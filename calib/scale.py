@@ -68,7 +68,7 @@ def scale_of(flight: Flight, points_t: Sequence[tuple[Int64Array, FloatArray]] |
 
 
 def _width_m(flight: Flight, swath: Swath, away_t: FloatArray) -> float:
-    """Across the line between a swath's ends."""
+    """Return across the line between a swath's ends."""
     ends = sensor_t(flight, swath, np.array([0, len(swath) - 1]))
     east, north = (ends[1] - ends[0])[:2] / max(float(np.linalg.norm((ends[1] - ends[0])[:2])), 1e-9)
     low, high = np.percentile(away_t[:, 0] * north - away_t[:, 1] * east, _MIDDLE)

@@ -75,7 +75,7 @@ class Rule:
     shown: Callable[[float], str] = number
 
     def judged(self, report: ReportInput) -> Iterator[Reason]:
-        """Reasons that its measure gives, one for each thing measured; what is not a number is the worst."""
+        """Yield reasons that its measure gives, one for each thing measured; what is not a number is the worst."""
         for of, value in self.measure(report):
             for level, limit in ((Level.UNUSABLE, self.unusable), (Level.CARE, self.care)):
                 if limit is not None and not value <= limit:
@@ -85,7 +85,7 @@ class Rule:
 
 
 def overall_rms_m(pairs: Mapping[Pair, Difference]) -> float | None:
-    """Root mean square over all cells of all pairs; None: nothing was compared."""
+    """Return root mean square over all cells of all pairs; None: nothing was compared."""
     cells = sum(one.count for one in pairs.values())
     return math.sqrt(sum(one.count * one.rms_m**2 for one in pairs.values()) / cells) if cells else None
 
@@ -138,7 +138,7 @@ def _held(one: Considered, several: bool) -> str:
 
 
 def undetermined(report: ReportInput) -> list[str]:
-    """Parameters that this flight does not determine, in words."""
+    """Return parameters that this flight does not determine, in words."""
     several = len(report.adjusted.calibrations) > 1
     held = [one for one in report.adjusted.held if is_undetermined(one)]
     return [words_of(one.scanner, one.name, several=several) for one in held]
@@ -442,7 +442,7 @@ RULES: tuple[Rule, ...] = (
 
 
 def judge(report: ReportInput) -> Verdict:
-    """The verdict."""
+    """Return the verdict."""
     reasons = [reason for rule in RULES for reason in rule.judged(report)]
     reasons += [
         Reason(Level.UNUSABLE if one.unusable else Level.CARE, one.what, one.change, one.excess)
@@ -454,7 +454,7 @@ def judge(report: ReportInput) -> Verdict:
 
 
 def accuracy_words(report: ReportInput) -> str:
-    """Sigmas and agreement, as people say them."""
+    """Return sigmas and agreement, as people say them."""
     boresight, offset_m = sigma_of(report, BORESIGHT), sigma_of(report, ("range_offset_m",))
     words = [f"boresight to {degrees(boresight * DEG)}"] if boresight is not None else []
     words += [f"range offset to {length(offset_m)}"] if offset_m is not None else []

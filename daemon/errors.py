@@ -36,5 +36,7 @@ class ConfigError(UserError):
 
 
 def one_line(text: str) -> str:
-    """A text that may come from anywhere as one line without control characters, which any terminal and file takes."""
+    """Return a text that may come from anywhere as one line without control characters, which any terminal and file
+    takes.
+    """
     return _CONTROL.sub(" ", text).encode("utf-8", "backslashreplace").decode()  # half a surrogate pair has no bytes

@@ -31,7 +31,7 @@ CANFD_LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)  # ISO 1
 
 
 def frame_id(identifier: int, *, extended: bool) -> int:
-    """The ``can_id`` word of a data frame: identifier with its flag.
+    """Return the ``can_id`` word of a data frame: identifier with its flag.
 
     Raises:
         ValueError: the identifier has more bits than its format.
@@ -45,7 +45,7 @@ def frame_id(identifier: int, *, extended: bool) -> int:
 def encode_can_frame(
     identifier: int, data: bytes, *, extended: bool = False, fd: bool = False, remote: bool = False
 ) -> bytes:
-    """One unit of 16 bytes (classic) or 72 bytes (``fd``) as the log and SocketCAN hold it.
+    """Return one unit of 16 bytes (classic) or 72 bytes (``fd``) as the log and SocketCAN hold it.
 
     Raises:
         ValueError: the identifier or the data do not fit.
@@ -64,7 +64,7 @@ def encode_can_frame(
 
 
 def decode_can_frames(units: ByteRows) -> StructArray | None:
-    """View units of one length as frames; None where the length is neither 16 nor 72 bytes."""
+    """Return view units of one length as frames; None where the length is neither 16 nor 72 bytes."""
     dtype = {CAN_FRAME_BYTES: CAN_FRAME_DTYPE, CANFD_FRAME_BYTES: CANFD_FRAME_DTYPE}.get(units.shape[1])
     if dtype is None:
         return None

@@ -27,7 +27,9 @@ class UnknownProtocolError(LookupError):
 
 @cache
 def all_drivers(kind: DeviceKind) -> dict[str, Driver]:
-    """All drivers of a kind by protocol name, from the ``DRIVERS`` of each module, or of each package's ``parser``."""
+    """Return all drivers of a kind by protocol name, from the ``DRIVERS`` of each module, or of each package's
+    ``parser``.
+    """
     package = importlib.import_module(f"swath.drivers.{kind}")
     found: dict[str, Driver] = {}
     for info in sorted(pkgutil.iter_modules(package.__path__), key=lambda info: info.name):
@@ -43,7 +45,7 @@ def all_drivers(kind: DeviceKind) -> dict[str, Driver]:
 
 
 def find_driver(kind: DeviceKind, protocol: str) -> Driver:
-    """The driver of a protocol.
+    """Return the driver of a protocol.
 
     Raises:
         UnknownProtocolError: with the names that would be right.

@@ -4,5 +4,5 @@ from __future__ import annotations
 
 
 def how_to_install(extras: str) -> str:
-    """Swath is on no index: its extras are installed from its folder, into the environment it runs in."""
+    """Return Swath is on no index: its extras are installed from its folder, into the environment it runs in."""
     return f"pip install '.[{extras}]' in the folder of Swath's sources"

@@ -89,7 +89,7 @@ class Parser(ABC):
 
 
 def _joined(batches: list[ChunkBatch]) -> ChunkBatch:
-    """Batches of units of one length as one."""
+    """Return batches of units of one length as one."""
     if len(batches) == 1:
         return batches[0]
     times = np.concatenate([batch.host_time_ns for batch in batches])
@@ -117,7 +117,7 @@ class PacketParser(Parser):
     doubts: tuple[str, ...] = ()
 
     def feed(self, chunk: Chunk) -> list[Record]:
-        """One unit is a batch of one row."""
+        """Return one unit is a batch of one row."""
         units = np.frombuffer(chunk.data, dtype=np.uint8).reshape(1, -1)
         return self.parse_units(np.array([chunk.host_time_ns], dtype=np.int64), units)
 

@@ -83,7 +83,7 @@ class Session(Generic[UnitT]):
         self.openings = 0
 
     def receive(self, timeout_s: float) -> list[UnitT]:
-        """Units that came within ``timeout_s``; nothing while the device is away. Never raises `TransportError`.
+        """Return units that came within ``timeout_s``; nothing while the device is away. Never raises `TransportError`.
 
         A call that opens the device may last as long as opening does, and returns without having read.
         """
@@ -168,7 +168,7 @@ class Session(Generic[UnitT]):
         return True
 
     def poll_counters(self) -> TransportCounters:
-        """The kernel's counts over all openings; the buffer sizes are those of the present or last one."""
+        """Return the kernel's counts over all openings; the buffer sizes are those of the present or last one."""
         with self._lock:
             source = self._source
             if isinstance(source, Transport | PpsSource):
@@ -187,7 +187,7 @@ _LATEST = {"receive_buffer_bytes", "receive_buffer_asked_bytes"}
 
 
 def _sum(past: TransportCounters, present: TransportCounters) -> TransportCounters:
-    """Counts added up, sizes taken from ``present``."""
+    """Return counts added up, sizes taken from ``present``."""
     total = TransportCounters()
     for item in fields(TransportCounters):
         now: int = getattr(present, item.name)

@@ -107,6 +107,6 @@ class SetupKeys:
 
 
 def read_setup(settings: DeviceSettings) -> SetupKeys:
-    """The table, its defaults filled in."""
+    """Return the table, its defaults filled in."""
     table: Mapping[str, Any] = settings.config.get("setup") or {}
     return SetupKeys(table.get("port"), int(table.get("rate_hz", DEFAULT_RATE_HZ)), bool(table.get("raw", True)))

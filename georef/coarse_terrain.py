@@ -56,7 +56,7 @@ class CoarseTerrain:
             self._height_m = np.concatenate([self._height_m, self._height_m[:, :1]], axis=1)
 
     def height_at(self, lat_rad: ArrayLike, lon_rad: ArrayLike) -> FloatArray:
-        """(n,) ellipsoidal heights, nan outside the grid."""
+        """Return (n,) ellipsoidal heights, nan outside the grid."""
         lat, lon = np.asarray(lat_rad, dtype=np.float64), np.asarray(lon_rad, dtype=np.float64)
         x, y = (lon, lat) if self._to_grid is None else self._to_grid(lat, lon)
         column, row = (x - self._first[0]) / self._step[0], (y - self._first[1]) / self._step[1]
@@ -74,7 +74,8 @@ class CoarseTerrain:
         return height
 
     def predicted_m(self, origin_e: FloatArray, direction_e: FloatArray) -> FloatArray:
-        """(n,) ranges at which beams meet the terrain, to a metre or so; nan where they do not, or leave the grid.
+        """Return (n,) ranges at which beams meet the terrain, to a metre or so; nan where they do not, or leave the
+        grid.
 
         A step goes on to where the beam would be down if the ground ahead were level. Once that has led below the
         ground, as on slopes that face the beam, steps stay between the two, where a line through both heights is zero.

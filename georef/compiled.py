@@ -23,7 +23,8 @@ _HERE = Path(__file__).parent
 
 @cache
 def _digest(folder: Path) -> int:
-    """A number that changes with the text of any module whose functions or constants may be compiled into another's.
+    """Return a number that changes with the text of any module whose functions or constants may be compiled into
+    another's.
 
     Those here, and those of the folder of a package that builds on this one.
     """
@@ -62,5 +63,5 @@ def jit_cached(function: Compiled) -> Compiled:
 
 
 def whole(value: int) -> int:
-    """A constant for calls between compiled functions: numba compiles a function anew for every bare number."""
+    """Return a constant for calls between compiled functions: numba compiles a function anew for every bare number."""
     return cast(int, np.int64(value))

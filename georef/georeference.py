@@ -60,7 +60,7 @@ class Georeferencer:
         self.rates: PulseRates | None = None
 
     def georeference(self, rows: StructArray, time_ns: Int64Array, trajectory: Trajectory) -> tuple[Points, ByteArray]:
-        """Points of returns.
+        """Return points of returns.
 
         Args:
             rows: (n,) `RETURN_DTYPE`, best in the order of their times.
@@ -102,7 +102,7 @@ class Georeferencer:
         return points if filled == len(rows) else points.take(slice(filled)), fates
 
     def _blocks(self, rows: StructArray) -> Iterator[tuple[slice, float | None]]:
-        """Rows that are taken at once, of one pulse rate where that matters; and the rate."""
+        """Yield rows that are taken at once, of one pulse rate where that matters; and the rate."""
         runs = [(0, len(rows), self.prf_hz)]
         if self.rates is not None and any(row.prf_hz is not None for row in self.model.calibration.range_offsets):
             runs = [(start, stop, prf_hz) for start, stop, prf_hz, _ in self.rates.runs(rows["pulse_id"])]
@@ -111,7 +111,7 @@ class Georeferencer:
                 yield slice(start, min(start + BLOCK_ROWS, last)), prf_hz
 
     def _fill(self, points: Points, filled: int, rows: StructArray, rays: Rays) -> tuple[int, MappingError | None]:
-        """Through the air and onto the map: points of the rays that reached the ground, from row ``filled`` on.
+        """Return through the air and onto the map: points of the rays that reached the ground, from row ``filled`` on.
 
         Returns:
             how many; and, where there were rays that the map has no place for, what it said. Their fate is NOT_FINITE.
@@ -139,7 +139,9 @@ class Georeferencer:
         return len(points_map), failure
 
     def _mapped_points(self, rays: Rays) -> tuple[NDArray[np.float64], NDArray[np.float32] | None]:
-        """(n, 3) coordinates and sigmas along the same axes (ISO Eq. 8, 13, 14); MappingError: not all have a place."""
+        """Return (n, 3) coordinates and sigmas along the same axes (ISO Eq. 8, 13, 14); MappingError: not all have a
+        place.
+        """
         if self.mapping is not None:
             return self.mapping.map_with_sigmas(rays.points_e, rays.covariance_e)
         if rays.covariance_e is None:

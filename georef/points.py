@@ -15,7 +15,7 @@ from swath.georef.records import Int64Array
 
 
 def contiguous(array: NDArray[Any]) -> NDArray[Any]:
-    """The array, or a copy where it is strided or read-only: the kernels are compiled for one kind."""
+    """Return the array, or a copy where it is strided or read-only: the kernels are compiled for one kind."""
     flags = array.flags
     return array if flags.c_contiguous and flags.writeable else array.copy()
 
@@ -71,14 +71,14 @@ class Points:
         return len(self.time_ns)
 
     def take(self, which: Any) -> Points:
-        """Rows by index array, mask or slice."""
+        """Return rows by index array, mask or slice."""
         columns: list[Any] = [getattr(self, field.name) for field in fields(self)]
         taken: list[Any] = [None if column is None else column[which] for column in columns]
         return Points(*taken)
 
     @classmethod
     def empty(cls, count: int, *, with_sigmas: bool) -> Points:
-        """Room for n points."""
+        """Return room for n points."""
         return cls(
             time_ns=np.empty(count, np.int64),
             points_map=np.empty((count, 3)),
@@ -94,7 +94,7 @@ class Points:
 
     @classmethod
     def concatenate(cls, pieces: Sequence[Points]) -> Points:
-        """One after the other; sigmas only where all have them. At least one piece."""
+        """Return one after the other; sigmas only where all have them. At least one piece."""
         joined: list[Any] = []
         for field in fields(cls):
             columns = [getattr(piece, field.name) for piece in pieces]
@@ -149,7 +149,7 @@ class Rays:
     covariance_e: FloatArray | None = None
 
     def take(self, which: NDArray[np.bool_]) -> Rays:
-        """Some of the rays; vectors stay columns beside each other."""
+        """Return some of the rays; vectors stay columns beside each other."""
         columns: dict[str, Any] = {}
         for field in fields(self):
             column = getattr(self, field.name)

@@ -16,12 +16,12 @@ _OFFSETS = {name: int(place[1]) for name, place in (RETURN_DTYPE.fields or {}).i
 
 
 def words(rows: StructArray) -> NDArray[np.uint64]:
-    """Rows as numbers (n, `WORDS`): NumPy copies a structure with gaps field by field, ten times as slowly."""
+    """Return rows as numbers (n, `WORDS`): NumPy copies a structure with gaps field by field, ten times as slowly."""
     return np.ascontiguousarray(rows).view(np.uint64).reshape(-1, WORDS)
 
 
 def any_has(rows: StructArray, name: str, bits: int) -> bool:
-    """Whether any row has all these bits in a field of its last word."""
+    """Return whether any row has all these bits in a field of its last word."""
     offset = _OFFSETS[name]
     word = bits << 8 * (offset % 8)
     if not len(rows) or int(np.bitwise_or.reduce(words(rows)[:, -1])) & word != word:
@@ -30,12 +30,14 @@ def any_has(rows: StructArray, name: str, bits: int) -> bool:
 
 
 def take(rows: StructArray, mask: NDArray[np.bool_]) -> StructArray:
-    """The rows of a mask."""
+    """Return the rows of a mask."""
     return words(rows).take(np.flatnonzero(mask), axis=0).view(RETURN_DTYPE).reshape(-1)
 
 
 def concatenate(pieces: list[NDArray[Any]], like: NDArray[Any]) -> NDArray[Any]:
-    """One after the other; a single one as it is, for it holds many bytes; none as an empty array like another."""
+    """Return one after the other; a single one as it is, for it holds many bytes; none as an empty array like
+    another.
+    """
     pieces = [piece for piece in pieces if len(piece)]
     if not pieces:
         return like[:0]
@@ -47,7 +49,7 @@ def concatenate(pieces: list[NDArray[Any]], like: NDArray[Any]) -> NDArray[Any]:
 
 
 def compact(rows: StructArray) -> StructArray:
-    """Rows that may wait for long, without what lies beside them in memory: parsers make room for every slot."""
+    """Return rows that may wait for long, without what lies beside them in memory: parsers make room for every slot."""
     spare = isinstance(rows.base, np.ndarray) and rows.base.nbytes > rows.nbytes + rows.nbytes // 4
     return words(rows).copy().view(RETURN_DTYPE).reshape(-1) if spare else rows
 
@@ -62,7 +64,9 @@ class WaitingReturns:
 
 
 def split_at(held: WaitingReturns, mask: NDArray[np.bool_]) -> tuple[list[WaitingReturns], list[WaitingReturns]]:
-    """Those of the mask, and the others, each in order; nothing is copied where the others follow in one piece."""
+    """Return those of the mask, and the others, each in order; nothing is copied where the others follow in one
+    piece.
+    """
     count = int(np.count_nonzero(mask))
     if count == len(mask):
         return [held], []
@@ -77,7 +81,7 @@ def split_at(held: WaitingReturns, mask: NDArray[np.bool_]) -> tuple[list[Waitin
 
 
 def after(queue: deque[WaitingReturns], max_rows: int) -> list[WaitingReturns]:
-    """Taken from the queue: the oldest, until no more than so many rows are left."""
+    """Return taken from the queue: the oldest, until no more than so many rows are left."""
     rows, oldest = sum(len(held.rows) for held in queue), []
     while rows > max_rows:
         oldest.append(queue.popleft())

@@ -68,7 +68,7 @@ def straight_spans(
     rules: StripRules | None = None,
     unknown: Sequence[Span] = (),
 ) -> list[Span]:
-    """Where the aircraft does not turn: spans of the times (n,), with heading and roll (n,).
+    """Return where the aircraft does not turn: spans of the times (n,), with heading and roll (n,).
 
     Where nobody knows, it is taken not to: what is wanted there and cannot be had is then seen to be missing.
     """
@@ -86,7 +86,9 @@ def straight_spans(
 
 
 def _windowed(seconds: FloatArray, integral: FloatArray, window_s: float) -> FloatArray:
-    """Mean over a window about each time of what has this integral; at the ends over what there is of the window."""
+    """Return mean over a window about each time of what has this integral; at the ends over what there is of the
+    window.
+    """
     before = np.maximum(seconds - window_s / 2, seconds[0])
     after = np.minimum(seconds + window_s / 2, seconds[-1])
     mean: FloatArray = (np.interp(after, seconds, integral) - np.interp(before, seconds, integral)) / (after - before)
@@ -105,7 +107,7 @@ def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
 
 
 def _joined(spans: Sequence[Span], gap_ns: int) -> list[Span]:
-    """Spans in order, those that are less than a gap apart made one."""
+    """Return spans in order, those that are less than a gap apart made one."""
     joined: list[Span] = []
     for start, end in spans:
         if joined and start - joined[-1][1] < gap_ns:
@@ -116,26 +118,26 @@ def _joined(spans: Sequence[Span], gap_ns: int) -> list[Span]:
 
 
 def laser_spans(first_ns: Int64Array, last_ns: Int64Array, rules: StripRules | None = None) -> list[Span]:
-    """Where the laser was on, from the first and last times (n,) of pieces of its data, in any order."""
+    """Return where the laser was on, from the first and last times (n,) of pieces of its data, in any order."""
     order = np.argsort(first_ns, kind="stable")
     pieces = [(int(first_ns[i]), int(last_ns[i]) + 1) for i in order]
     return _joined(pieces, round((rules or StripRules()).laser_gap_s * SECOND_NS))
 
 
 def common(one: Sequence[Span], other: Sequence[Span]) -> list[Span]:
-    """What lies in both, each in order and without overlaps."""
+    """Return what lies in both, each in order and without overlaps."""
     both = [(max(a, c), min(b, d)) for a, b in one for c, d in other if a < d and c < b]
     return sorted(both)
 
 
 def cut(straight: Sequence[Span], laser: Sequence[Span], rules: StripRules | None = None) -> list[Span]:
-    """Strips: straight flight with the laser on, as long as a strip must be at least."""
+    """Return strips: straight flight with the laser on, as long as a strip must be at least."""
     shortest_ns = round((rules or StripRules()).min_strip_s * SECOND_NS)
     return [(start, end) for start, end in common(straight, laser) if end - start >= shortest_ns]
 
 
 def segments(strips: Sequence[Span], first_ns: int, end_ns: int, *, first_number: int = 1) -> list[Segment]:
-    """The span from first to end, tiled without gaps: strips as they are numbered, and what lies between.
+    """Return the span from first to end, tiled without gaps: strips as they are numbered, and what lies between.
 
     A strip keeps its number where only a part of it lies within; one that lies outside gives no segment.
 
@@ -160,7 +162,8 @@ def segments(strips: Sequence[Span], first_ns: int, end_ns: int, *, first_number
 
 
 def read_strips(text: str, name: str) -> list[Span]:
-    """Strips from a CSV file with the columns start_gps_ns and end_gps_ns (others are passed over), in order of time.
+    """Return strips from a CSV file with the columns start_gps_ns and end_gps_ns (others are passed over), in order of
+    time.
 
     Raises:
         StripError: a column is missing, a value is no integer, a strip has no length, or two overlap.

@@ -18,7 +18,7 @@ class TomlError(ValueError):
 
 
 def toml_tables(text: str) -> dict[str, Any]:
-    """The tables of a TOML text: numbers of 64 bits, at most `DEEPEST` deep.
+    """Return the tables of a TOML text: numbers of 64 bits, at most `DEEPEST` deep.
 
     Raises:
         TomlError: what is wrong, in one line.
@@ -48,7 +48,7 @@ def toml_tables(text: str) -> dict[str, Any]:
 
 
 def key_text(key: str) -> str:
-    """A key as TOML writes it: bare, or in quotes on one line."""
+    """Return a key as TOML writes it: bare, or in quotes on one line."""
     if _BARE.fullmatch(key):
         return key
     return _NOT_SHOWN.sub(lambda found: f"\\u{ord(found[0]):04x}", json.dumps(key, ensure_ascii=False))

@@ -44,7 +44,7 @@ def phase_refractivity_ppm(
     vapour: FloatArray,
     co2_ppm: float = CO2_PPM,
 ) -> FloatArray:
-    """1e6 (n − 1) of moist air (Ciddor 1996, Eq. 1 to 5).
+    """Return 1e6 (n − 1) of moist air (Ciddor 1996, Eq. 1 to 5).
 
     Args:
         wavelength_um: in vacuum.
@@ -68,7 +68,7 @@ def phase_refractivity_ppm(
 def group_refractivity_ppm(
     wavelength_um: float, temperature_k: FloatArray, pressure_pa: FloatArray, vapour: FloatArray
 ) -> FloatArray:
-    """1e6 (n_g − 1) with n_g = n − λ dn/dλ, the derivative a central difference; arguments as for the phase."""
+    """Return 1e6 (n_g − 1) with n_g = n − λ dn/dλ, the derivative a central difference; arguments as for the phase."""
     step = WAVELENGTH_STEP_UM
     above = phase_refractivity_ppm(wavelength_um + step, temperature_k, pressure_pa, vapour)
     below = phase_refractivity_ppm(wavelength_um - step, temperature_k, pressure_pa, vapour)
@@ -77,7 +77,7 @@ def group_refractivity_ppm(
 
 
 def vapour_fraction(temperature_k: FloatArray, pressure_pa: FloatArray, humidity: float) -> FloatArray:
-    """Molar fraction of water vapour at a relative humidity of 0 … 1 (Ciddor 1996, appendix A)."""
+    """Return molar fraction of water vapour at a relative humidity of 0 … 1 (Ciddor 1996, appendix A)."""
     t_c = temperature_k - ZERO_CELSIUS_K
     exponent = 1.2378847e-5 * temperature_k**2 - 1.9121316e-2 * temperature_k + 33.93711047
     saturated_pa = np.exp(exponent - 6.3431645e3 / temperature_k)
@@ -87,7 +87,7 @@ def vapour_fraction(temperature_k: FloatArray, pressure_pa: FloatArray, humidity
 
 
 def _density(temperature_k: FloatArray, pressure_pa: FloatArray, vapour: FloatArray, share: FloatArray) -> FloatArray:
-    """Moles of a component of this share in a volume of moist air (Ciddor 1996, Eq. 4 and 12).
+    """Return moles of a component of this share in a volume of moist air (Ciddor 1996, Eq. 4 and 12).
 
     Less 1/R: R and the molar masses of Eq. 4 cancel where densities are divided.
     """
@@ -105,7 +105,7 @@ def _density(temperature_k: FloatArray, pressure_pa: FloatArray, vapour: FloatAr
 
 @numba.njit(cache=True)
 def _refractivity_and_gradient(height_m: float, constant: float) -> tuple[float, float]:
-    """n − 1 and dn/dh of NGA Eq. 9 to 11; ``constant`` is C of Eq. 9, ppm K / hPa."""
+    """Return n − 1 and dn/dh of NGA Eq. 9 to 11; ``constant`` is C of Eq. 9, ppm K / hPa."""
     slope = -0.00356 * FT_PER_M
     fahrenheit = 59.0 + slope * height_m
     pressure_hpa = HPA_PER_PSF * 2116.0 * ((fahrenheit + 459.7) / 518.6) ** 5.256
@@ -115,7 +115,8 @@ def _refractivity_and_gradient(height_m: float, constant: float) -> tuple[float,
 
 @numba.njit(cache=True)
 def _rates(height_m: float, constant: float) -> tuple[float, float]:
-    """What tan ψ is multiplied by for the change, a metre of descent, of ψ and of the angle at the earth's centre.
+    """Return what tan ψ is multiplied by for the change, a metre of descent, of ψ and of the angle at the earth's
+    centre.
 
     ψ is the ray's angle from the local vertical. The ray equation d(n t)/ds = ∇n, where n changes with the radius
     only, is dψ/dr = −tan ψ (1/r + n'/n).
@@ -127,7 +128,9 @@ def _rates(height_m: float, constant: float) -> tuple[float, float]:
 
 @numba.njit(cache=True)
 def _trace(nadir_rad: float, sensor_m: float, ground_m: float, constant: float) -> float:
-    """Nadir angle of the beam as it leaves less that of the straight line to where it lands; Runge-Kutta steps."""
+    """Return nadir angle of the beam as it leaves less that of the straight line to where it lands; Runge-Kutta
+    steps.
+    """
     step_m = (sensor_m - ground_m) / RAY_STEPS
     angle, centre = nadir_rad, 0.0
     upper, upper_c = _rates(sensor_m, constant)
@@ -150,7 +153,7 @@ def _trace(nadir_rad: float, sensor_m: float, ground_m: float, constant: float) 
 
 @numba.njit(cache=True)
 def bending_by_layers(nadir_rad: FloatArray, sensor_m: FloatArray, ground_m: FloatArray, constant: float) -> FloatArray:
-    """(n,) Δd of rays through spherical layers, radians; arguments (n,) each, ``constant`` C of NGA Eq. 9."""
+    """Return (n,) Δd of rays through spherical layers, radians; arguments (n,) each, ``constant`` C of NGA Eq. 9."""
     bent = np.zeros(len(nadir_rad))
     for i in range(len(nadir_rad)):
         if ground_m[i] < sensor_m[i]:
@@ -159,7 +162,7 @@ def bending_by_layers(nadir_rad: FloatArray, sensor_m: FloatArray, ground_m: Flo
 
 
 def bending_ardc(nadir_rad: FloatArray, sensor_m: FloatArray, ground_m: FloatArray) -> FloatArray:
-    """(n,) Δd of the ARDC model, radians (NGA Eq. 4, 5)."""
+    """Return (n,) Δd of the ARDC model, radians (NGA Eq. 4, 5)."""
 
     def term(height_km: FloatArray) -> FloatArray:
         return 2410.0 * height_km / (height_km**2 - 6.0 * height_km + 250.0)
@@ -197,7 +200,7 @@ class Air:
         self._layers_constant = at_zero_ppm * ZERO_CELSIUS_K / (1e-2 * STANDARD_P_PA)
 
     def _refractivity_over(self, height_m: FloatArray) -> FloatArray:
-        """(k,) group refractivity in ppm over a grid of heights (k,)."""
+        """Return (k,) group refractivity in ppm over a grid of heights (k,)."""
         table = self._table
         if table.model == "standard":
             known_m, known_k, known_pa, humidity = 0.0, STANDARD_T_K, STANDARD_P_PA, 0.0
@@ -212,7 +215,9 @@ class Air:
         return group_refractivity_ppm(self._wavelength_um, temperature_k, pressure_pa, vapour)
 
     def group_refractivity_ppm(self, from_height_m: FloatArray, to_height_m: FloatArray) -> FloatArray:
-        """Mean of 1e6 (n_g − 1) along straight paths between heights; of the same shape, nan where one is nan."""
+        """Return mean of 1e6 (n_g − 1) along straight paths between heights; of the same shape, nan where one is
+        nan.
+        """
         low, high = np.broadcast_arrays(np.asarray(from_height_m, np.float64), np.asarray(to_height_m, np.float64))
         apart_m = high - low
         level = np.abs(apart_m) < 1.0
@@ -224,7 +229,8 @@ class Air:
         return through
 
     def device_range(self, range_m: FloatArray, from_height_m: FloatArray, to_height_m: FloatArray) -> FloatArray:
-        """What a device says of geometric ranges: itself corrected, or counted with the speed of light in vacuum.
+        """Return what a device says of geometric ranges: itself corrected, or counted with the speed of light in
+        vacuum.
 
         Args:
             range_m: (n, R) or (n,); 0 and nan stay as they are.
@@ -250,7 +256,7 @@ class Air:
     def bending(
         self, nadir_angle_rad: FloatArray, sensor_height_m: FloatArray, ground_height_m: FloatArray
     ) -> FloatArray:
-        """(n,) Δd: by how much nearer to nadir the ground point lies than the beam leaves; radians.
+        """Return (n,) Δd: by how much nearer to nadir the ground point lies than the beam leaves; radians.
 
         Args:
             nadir_angle_rad: (n,) of beams as they leave.
@@ -272,7 +278,7 @@ class Air:
     def bend(
         self, direction: FloatArray, down: FloatArray, sensor_height_m: FloatArray, ground_height_m: FloatArray
     ) -> FloatArray:
-        """(n, 3) unit vectors to where beams land, of unit vectors (n, 3) in which they leave.
+        """Return (n, 3) unit vectors to where beams land, of unit vectors (n, 3) in which they leave.
 
         Args:
             direction: (n, 3), any Cartesian frame.
@@ -293,7 +299,7 @@ class Air:
         return np.where(turns[:, np.newaxis], turned, direction)
 
     def transmission(self, range_m: FloatArray) -> FloatArray:
-        """Share of the light that is left after the way to a target and back; shape of ``range_m``, 0 … 1.
+        """Return share of the light that is left after the way to a target and back; shape of ``range_m``, 0 … 1.
 
         Koschmieder's extinction of the visibility, carried to the wavelength by Kruse's exponent.
         """

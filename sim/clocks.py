@@ -23,7 +23,7 @@ WANDER_PERIOD_S = 600.0
 
 
 def generator(seed: int, *names: str | int) -> np.random.Generator:
-    """Random numbers of one purpose: no other purpose's draws change them."""
+    """Return random numbers of one purpose: no other purpose's draws change them."""
     return np.random.default_rng([seed, zlib.crc32("/".join(map(str, names)).encode())])
 
 
@@ -35,7 +35,7 @@ class Oscillator:
         self._table = table
 
     def phase(self, time_s: FloatArray) -> FloatArray:
-        """(n,) the counter as a real number, at true times (n,)."""
+        """Return (n,) the counter as a real number, at true times (n,)."""
         table = self._table
         gained = table.offset_ppm * time_s + table.drift_ppm_per_h * time_s**2 / 7200.0
         turn = 2 * np.pi / WANDER_PERIOD_S
@@ -44,11 +44,11 @@ class Oscillator:
         return phase
 
     def ticks(self, time_s: FloatArray) -> IntArray:
-        """(n,) the counter's reading: whole ticks, `OscillatorTable.ticks_at_start` at the plan's start."""
+        """Return (n,) the counter's reading: whole ticks, `OscillatorTable.ticks_at_start` at the plan's start."""
         return np.floor(self.phase(time_s)).astype(np.int64) + self._table.ticks_at_start
 
     def time_of(self, ticks: FloatArray) -> FloatArray:
-        """(n,) true times at which the counter reaches ``ticks`` counted from the plan's start."""
+        """Return (n,) true times at which the counter reaches ``ticks`` counted from the plan's start."""
         time_s = np.asarray(ticks, np.float64) / self.tick_hz
         for _ in range(4):  # the map differs from the identity by parts per million: each step gains five digits
             time_s = time_s + (ticks - self.phase(time_s)) / self.tick_hz
@@ -70,7 +70,7 @@ class PulsePerSecond:
         self._jitter_s: FloatArray = np.zeros(0)
 
     def edges(self, seconds: IntArray) -> FloatArray:
-        """(n,) true times of the edges of these seconds, 0 being the plan's start."""
+        """Return (n,) true times of the edges of these seconds, 0 being the plan's start."""
         seconds = np.asarray(seconds, np.int64)
         if len(seconds) and seconds.max() >= len(self._jitter_s):
             draws = generator(self._seed, "pps", self._name).standard_normal(2 * int(seconds.max()) + 64)
@@ -78,7 +78,7 @@ class PulsePerSecond:
         return seconds + self._jitter_s[seconds]
 
     def latest(self, time_s: FloatArray) -> IntArray:
-        """(n,) the second of the newest edge at or before each time; −1 before the first."""
+        """Return (n,) the second of the newest edge at or before each time; −1 before the first."""
         nearest = np.maximum(np.rint(time_s).astype(np.int64), 0)
         return np.where(self.edges(nearest) <= time_s, nearest, nearest - 1)
 
@@ -98,15 +98,15 @@ class HostClock:
         self.wall_steps = sorted((fault.at_s, fault.step_s) for fault in faults)
 
     def host_ns(self, time_s: float) -> int:
-        """Host time (log_time) at a true time."""
+        """Return host time (log_time) at a true time."""
         return self.start_ns + round(time_s * self._rate * SECOND_NS)
 
     def monotonic_ns(self, time_s: float) -> int:
-        """CLOCK_MONOTONIC."""
+        """Return CLOCK_MONOTONIC."""
         return self.host_ns(time_s) - self.start_ns + UPTIME_AT_START_NS
 
     def realtime_ns(self, time_s: float) -> int:
-        """CLOCK_REALTIME, with the steps so far."""
+        """Return CLOCK_REALTIME, with the steps so far."""
         return self.host_ns(time_s) + sum(
             round(step_s * SECOND_NS) for at_s, step_s in self.wall_steps if at_s <= time_s
         )

@@ -52,7 +52,7 @@ Made by `swath sim fly` from the plan in `plan.toml`, seed {seed}. Starts {start
 
 
 def default_wires(plan: Plan) -> dict[str, str]:
-    """What each source is wired to on an aircraft's computer: transport URIs, and devices of PPS."""
+    """Return what each source is wired to on an aircraft's computer: transport URIs, and devices of PPS."""
     tables = plan.tables
     wires = {f"pps/{name}": f"/dev/pps{number}" for number, name in enumerate(tables.pps)}
     for number, (name, gnss) in enumerate(tables.gnss.items()):
@@ -67,7 +67,7 @@ def default_wires(plan: Plan) -> dict[str, str]:
 
 
 def config_text(plan: Plan, wires: dict[str, str], directory: str) -> str:
-    """The configuration that records a flight (CONFIG).
+    """Return the configuration that records a flight (CONFIG).
 
     Args:
         plan: of the flight.
@@ -89,7 +89,9 @@ def config_text(plan: Plan, wires: dict[str, str], directory: str) -> str:
 
 
 def companion_files(plan: Plan, site: Site, scene: Scene) -> dict[str, bytes]:
-    """The small files by name: DBC, calibrations, head tables, control, plan and explanation; not the configuration."""
+    """Return the small files by name: DBC, calibrations, head tables, control, plan and explanation; not the
+    configuration.
+    """
     tables = plan.tables
     files = {f"{name}.dbc": dbc_text(table) for name, table in tables.imu.items()}
     for name in tables.scanner:
@@ -105,12 +107,12 @@ def companion_files(plan: Plan, site: Site, scene: Scene) -> dict[str, bytes]:
 
 
 def control_points_e(plan: Plan, site: Site, scene: Scene) -> FloatArray:
-    """(k, 3) true ECEF of the control points."""
+    """Return (k, 3) true ECEF of the control points."""
     return site.e_from_site(control_points(plan, scene))
 
 
 def control_text(plan: Plan, points_e: FloatArray) -> str:
-    """The control points as their survey found them, as CONVENTIONS' CSV."""
+    """Return the control points as their survey found them, as CONVENTIONS' CSV."""
     sigma_m = plan.tables.control.sigma_m
     draws = generator(plan.tables.flight.seed, "control").standard_normal(points_e.shape)
     lat_rad, lon_rad, height_m = geodetic_from_e(points_e + sigma_m * draws)

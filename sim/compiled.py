@@ -45,12 +45,12 @@ def jit_cached(function: Compiled) -> Compiled:
 
 
 def digest(*modules: ModuleType) -> int:
-    """A number that changes with the text of modules, never 0."""
+    """Return a number that changes with the text of modules, never 0."""
     return zlib.crc32(b"".join(Path(str(module.__file__)).read_bytes() for module in modules)) or 1
 
 
 def whole(value: int) -> int:
-    """A constant for calls between compiled functions: numba compiles a function anew for every bare number."""
+    """Return a constant for calls between compiled functions: numba compiles a function anew for every bare number."""
     return cast(int, np.int64(value))
 
 

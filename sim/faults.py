@@ -42,7 +42,9 @@ def windows(tables: Tables, source: str, *kinds: str) -> list[Window]:
 
 
 def with_faults(plan: Plan, units: Iterable[WireUnit]) -> Iterator[WireUnit]:
-    """Units in order of time, with everything the plan does to those of each source, in the order of its faults."""
+    """Return units in order of time, with everything the plan does to those of each source, in the order of its
+    faults.
+    """
     stream = iter(units)
     for number, fault in enumerate(plan.tables.fault):
         of_device = fault.kind == "pps_lost" and not fault.source.startswith("pps/")  # it gets no edge, and sends
@@ -60,7 +62,7 @@ class _Hits:
         self._single = fault.for_s == 0.0
 
     def hit(self, unit: WireUnit) -> bool:
-        """Whether this unit is; to be asked once for each."""
+        """Return whether this unit is; to be asked once for each."""
         fault = self.fault
         if unit.source != fault.source or unit.time_s < fault.at_s:
             return False
@@ -77,7 +79,7 @@ def _dropped(units: Iterator[WireUnit], hits: _Hits) -> Iterator[WireUnit]:
 
 
 def _late(units: Iterator[WireUnit], hits: _Hits) -> Iterator[WireUnit]:
-    """Units that wait let others pass."""
+    """Yield units that wait let others pass."""
     waiting: list[tuple[float, int, WireUnit]] = []
     for number, unit in enumerate(units):
         while waiting and waiting[0][0] <= unit.time_s:
@@ -107,7 +109,7 @@ def _duplicated(units: Iterator[WireUnit], hits: _Hits) -> Iterator[WireUnit]:
 
 
 def _reordered(units: Iterator[WireUnit], hits: _Hits) -> Iterator[WireUnit]:
-    """A unit that is hit changes places with the next one, where both are of one source."""
+    """Yield a unit that is hit changes places with the next one, where both are of one source."""
     held: WireUnit | None = None
     for unit in units:
         if held is not None and held.source != unit.source:
@@ -126,7 +128,7 @@ def _reordered(units: Iterator[WireUnit], hits: _Hits) -> Iterator[WireUnit]:
 
 
 def _spurious(units: Iterator[WireUnit], hits: _Hits) -> Iterator[WireUnit]:
-    """Behind an edge that is hit another one, where no second begins."""
+    """Yield behind an edge that is hit another one, where no second begins."""
     extra: WireUnit | None = None
     for unit in units:
         if extra is not None:

@@ -35,7 +35,7 @@ BLOCK_S = 1.0
 
 
 def open_truth(plan: Plan, path: Path) -> TruthWriter:
-    """The truth file of a flight; raises OSError."""
+    """Return the truth file of a flight; raises OSError."""
     tables = {"trajectory": POSE_TRUTH_DTYPE} | dict.fromkeys(plan.tables.scanner, RETURN_TRUTH_DTYPE)
     return TruthWriter(path, tables)
 
@@ -93,7 +93,7 @@ class VirtualFlight:
         return self.host_clock.wall_steps
 
     def units(self) -> Iterator[WireUnit]:
-        """Every unit of every source, in order of time, with the plan's faults."""
+        """Return every unit of every source, in order of time, with the plan's faults."""
         streams: list[Iterator[WireUnit]] = [self._edges(name) for name in self.plan.tables.pps]
         streams += [self._blocks(wire) for wire in self._gnss.values()]
         streams += [self._blocks(wire) for wire in self._imu.values()]
@@ -151,7 +151,7 @@ class VirtualFlight:
     # ------------------------------------------------------------------ streams
 
     def _edges(self, name: str) -> Iterator[WireUnit]:
-        """Edges as the host stamps them."""
+        """Yield edges as the host stamps them."""
         host, flight = self.plan.tables.host, self.plan.tables.flight
         sigma_s = 1e-6 * host.pps_jitter_us if flight.noise else 0.0
         rng = generator(flight.seed, "host", "pps", name)

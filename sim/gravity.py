@@ -29,7 +29,7 @@ _HEIGHT_STEPS = 4
 
 
 def normal_gravity(sin_lat: FloatArray, height_m: FloatArray) -> FloatArray:
-    """(n,) magnitude of normal gravity, m/s², at sines of geodetic latitude and ellipsoidal heights (n,)."""
+    """Return (n,) magnitude of normal gravity, m/s², at sines of geodetic latitude and ellipsoidal heights (n,)."""
     square = sin_lat * sin_lat
     surface = EQUATOR_GRAVITY_MPS2 * (1 + SOMIGLIANA_K * square) / np.sqrt(1 - ECCENTRICITY_SQUARED * square)
     ratio = height_m / SEMI_MAJOR_AXIS_M
@@ -42,7 +42,7 @@ _normal_gravity = numba.njit(cache=True)(normal_gravity)
 
 
 def gravity_e(points_e: FloatArray) -> FloatArray:
-    """(n, 3) normal gravity in e, m/s², at ECEF points (n, 3); geodesy by PROJ."""
+    """Return (n, 3) normal gravity in e, m/s², at ECEF points (n, 3); geodesy by PROJ."""
     lat_rad, lon_rad, height_m = geodetic_from_e(points_e)
     up = np.stack([np.cos(lat_rad) * np.cos(lon_rad), np.cos(lat_rad) * np.sin(lon_rad), np.sin(lat_rad)], axis=-1)
     downward: FloatArray = -normal_gravity(np.sin(lat_rad), height_m)[..., None] * up
@@ -51,7 +51,7 @@ def gravity_e(points_e: FloatArray) -> FloatArray:
 
 @numba.njit(cache=True)
 def gravity_at(x: float, y: float, z: float) -> tuple[float, float, float]:
-    """The same for one point, compiled: the strapdown steps through a thousand of them a second.
+    """Return the same for one point, compiled: the strapdown steps through a thousand of them a second.
 
     The normal is found by the fixed point tan φ = (z + e² N sin φ) / p, which gains two digits a step.
     """

@@ -18,19 +18,19 @@ _GEODETIC_FROM_E = Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True
 
 
 def e_from_geodetic(lat_rad: FloatArray, lon_rad: FloatArray, height_m: FloatArray) -> FloatArray:
-    """(n, 3) ECEF of latitudes, longitudes and ellipsoidal heights (n,) each, WGS 84."""
+    """Return (n, 3) ECEF of latitudes, longitudes and ellipsoidal heights (n,) each, WGS 84."""
     xyz = _E_FROM_GEODETIC.transform(np.degrees(lon_rad), np.degrees(lat_rad), height_m)
     return np.stack(xyz, axis=-1)
 
 
 def geodetic_from_e(points_e: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Latitude, longitude (radians) and ellipsoidal height of (n, 3) ECEF."""
+    """Return latitude, longitude (radians) and ellipsoidal height of (n, 3) ECEF."""
     lon_deg, lat_deg, height_m = _GEODETIC_FROM_E.transform(points_e[..., 0], points_e[..., 1], points_e[..., 2])
     return np.radians(lat_deg), np.radians(lon_deg), np.asarray(height_m)
 
 
 def rot_e_from_ned(lat_rad: FloatArray, lon_rad: FloatArray) -> FloatArray:
-    """(n, 3, 3): columns are north, east and down (the ellipsoid's normal) in e."""
+    """Return (n, 3, 3): columns are north, east and down (the ellipsoid's normal) in e."""
     sin_lat, cos_lat, sin_lon, cos_lon = np.sin(lat_rad), np.cos(lat_rad), np.sin(lon_rad), np.cos(lon_rad)
     zero = np.zeros_like(sin_lat)
     north = np.stack([-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat], axis=-1)
@@ -56,7 +56,7 @@ class Site:
 
     @classmethod
     def at(cls, lat_deg: float, lon_deg: float) -> Site:
-        """The site frame there, by PROJ's topocentric conversion."""
+        """Return the site frame there, by PROJ's topocentric conversion."""
         lat_rad, lon_rad = np.radians(lat_deg), np.radians(lon_deg)
         zero = np.zeros(1)
         origin_e = e_from_geodetic(zero + lat_rad, zero + lon_rad, zero)[0]
@@ -69,17 +69,18 @@ class Site:
         return cls(float(lat_rad), float(lon_rad), origin_e, left @ right)
 
     def site_from_e(self, points_e: FloatArray) -> FloatArray:
-        """(n, 3) of (n, 3) ECEF."""
+        """Return (n, 3) of (n, 3) ECEF."""
         moved: FloatArray = (points_e - self.origin_e) @ self.rot_site_from_e.T
         return moved
 
     def e_from_site(self, points: FloatArray) -> FloatArray:
-        """(n, 3) ECEF of (n, 3) in the site frame."""
+        """Return (n, 3) ECEF of (n, 3) in the site frame."""
         moved: FloatArray = points @ self.rot_site_from_e + self.origin_e
         return moved
 
     def site_from_ground(self, east_m: FloatArray, north_m: FloatArray, height_m: FloatArray) -> FloatArray:
-        """(n, 3) site coordinates with these x and y whose ellipsoidal height is ``height_m``, to 0.1 mm or better.
+        """Return (n, 3) site coordinates with these x and y whose ellipsoidal height is ``height_m``, to 0.1 mm or
+        better.
 
         (n,) each. The height's error is one of height here (the normal is within a degree of z over 100 km), so a few
         steps of plain correction end at rounding.
@@ -91,5 +92,5 @@ class Site:
         return points
 
     def heights(self, points: FloatArray) -> FloatArray:
-        """(n,) ellipsoidal heights of (n, 3) site coordinates."""
+        """Return (n,) ellipsoidal heights of (n, 3) site coordinates."""
         return geodetic_from_e(self.e_from_site(points))[2]

@@ -102,5 +102,5 @@ class TruthWriter:
 
 
 def _member(name: str) -> zipfile.ZipInfo:
-    """A member of a fixed date, so that the same flight gives the same file."""
+    """Return a member of a fixed date, so that the same flight gives the same file."""
     return zipfile.ZipInfo(name, date_time=(1980, 1, 6, 0, 0, 0))

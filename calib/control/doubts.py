@@ -55,7 +55,9 @@ class Doubt:
 
 
 def geoid_undulation(position_e: FloatArray) -> tuple[float, str] | None:
-    """Height of the geoid above the ellipsoid at a position in e (3,), and which geoid; None: PROJ has no grid here."""
+    """Return height of the geoid above the ellipsoid at a position in e (3,), and which geoid; None: PROJ has no grid
+    here.
+    """
     lat, lon, height = (float(value) for value in geodetic_from_e(position_e))
     zone = int((math.degrees(lon) + 180.0) % 360.0 // 6.0) + 1
     for epsg, geoid in GEOIDS:
@@ -74,7 +76,7 @@ def doubts(
     rules: ControlRules | None = None,
     undulation: Undulation = geoid_undulation,
 ) -> tuple[Doubt, ...]:
-    """What speaks against points of control; best asked when the swaths are calibrated, or nearly.
+    """Return what speaks against points of control; best asked when the swaths are calibrated, or nearly.
 
     Args:
         flight: with its points placed.
@@ -133,7 +135,7 @@ def _length(metres: float) -> str:
 def _heights(
     flight: Flight, points: Sequence[ControlPoint], above_m: FloatArray, undulation: Undulation
 ) -> tuple[Doubt, ...]:
-    """A difference in height that all points share."""
+    """Return a difference in height that all points share."""
     middle_m, spread_m = _middle(above_m)
     if spread_m > max(1.0, 0.05 * abs(middle_m)) or abs(middle_m) < CONSTANT_M:
         return ()
@@ -159,13 +161,13 @@ def _heights(
 
 
 def _middle(values: FloatArray) -> tuple[float, float]:
-    """Median, and the sigma of a value by the median of the distances from it."""
+    """Return median, and the sigma of a value by the median of the distances from it."""
     middle = float(np.median(values))
     return middle, 1.4826 * float(np.median(np.abs(values - middle)))
 
 
 def _shift(points: Sequence[ControlPoint], grounds: Sequence[Ground]) -> tuple[Doubt, ...]:
-    """A horizontal shift: control too far along a slope's way up lies below the slope, Δz = c − g · shift."""
+    """Return a horizontal shift: control too far along a slope's way up lies below the slope, Δz = c − g · shift."""
     numbers = sorted({one.point for one in grounds})
     if len(numbers) < FEWEST_FOR_SHIFT:
         return ()
@@ -197,7 +199,9 @@ def _shift(points: Sequence[ControlPoint], grounds: Sequence[Ground]) -> tuple[D
 
 
 def _huber(design: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Least squares with Huber's weights: unknowns and covariance; what nothing determines has an infinite variance."""
+    """Return least squares with Huber's weights: unknowns and covariance; what nothing determines has an infinite
+    variance.
+    """
     weights = np.ones(len(values))
     unknowns: FloatArray = np.zeros(design.shape[1])
     for _ in range(10):
@@ -215,7 +219,7 @@ def _huber(design: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArr
 def _single(
     points: Sequence[ControlPoint], seen: Sequence[int], above_m: FloatArray, grounds: Sequence[Ground]
 ) -> tuple[Doubt, ...]:
-    """Points that disagree with the others."""
+    """Return points that disagree with the others."""
     middle_m, spread_m = _middle(above_m)
     limit_m = max(SURE_SIGMAS * spread_m, CONSTANT_M / 2.0)
     found = []

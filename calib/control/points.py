@@ -115,7 +115,7 @@ def read_control(text: str, name: str) -> tuple[Surveyed, ...]:
 
 
 def _other_header(header: str) -> str:
-    """What seems to be meant by another one."""
+    """Return what seems to be meant by another one."""
     if ";" in header or "\t" in header:
         return ", columns apart by commas"
     missing = [column for column in COLUMNS if column not in header]
@@ -154,7 +154,7 @@ def _number(field: str, column: str, line: int, mistakes: list[str]) -> float:
 
 
 def _twice(read: Sequence[tuple[int, Surveyed]]) -> list[str]:
-    """The same name, or the same place under two names: it would count twice."""
+    """Return the same name, or the same place under two names: it would count twice."""
     mistakes: list[str] = []
     names: dict[str, int] = {}
     for line, point in read:
@@ -177,7 +177,7 @@ def _twice(read: Sequence[tuple[int, Surveyed]]) -> list[str]:
 
 
 def in_t(surveyed: Sequence[Surveyed], frame: Tangent) -> tuple[ControlPoint, ...]:
-    """The same in a flight's frame."""
+    """Return the same in a flight's frame."""
     if not surveyed:
         return ()
     geodetic = np.array([[point.lat_rad, point.lon_rad, point.height_m] for point in surveyed])
@@ -186,7 +186,7 @@ def in_t(surveyed: Sequence[Surveyed], frame: Tangent) -> tuple[ControlPoint, ..
 
 
 def control_planes(flight: Flight, points: Sequence[ControlPoint], rules: ControlRules | None = None) -> Features:
-    """Planes that control lies on, one a point, with the returns of every swath that shows it.
+    """Return planes that control lies on, one a point, with the returns of every swath that shows it.
 
     Args:
         flight: with its points placed as well as is known.
@@ -214,7 +214,7 @@ def control_planes(flight: Flight, points: Sequence[ControlPoint], rules: Contro
 def grounds_at(
     flight: Flight, points: Sequence[ControlPoint], rules: ControlRules
 ) -> tuple[list[Ground], Counter[str]]:
-    """What every swath shows at every point, in the points' order; and why others show nothing."""
+    """Return what every swath shows at every point, in the points' order; and why others show nothing."""
     found: list[Ground] = []
     refused: Counter[str] = Counter()
     seen = np.zeros(len(points), dtype=bool)
@@ -244,7 +244,7 @@ class _Cells:
 
     @classmethod
     def around(cls, places: FloatArray, radius_m: float) -> _Cells:
-        """Of places (k, 2)."""
+        """Make that of places (k, 2)."""
         low, high = places.min(axis=0), places.max(axis=0)
         cell_m = max(radius_m, float((high - low).max()) / CELLS_A_SIDE)
         corner = low - cell_m
@@ -256,7 +256,7 @@ class _Cells:
         return cls(corner, cell_m, taken)
 
     def have(self, points: FloatArray) -> NDArray[np.int64]:
-        """Rising indexes of points (n, 2) in such cells; nan is in none."""
+        """Return rising indexes of points (n, 2) in such cells; nan is in none."""
         column, row = ((points[:, axis] - self.corner[axis]) / self.cell_m for axis in (0, 1))
         columns, rows = self.taken.shape
         inside = np.flatnonzero((column >= 0.0) & (row >= 0.0) & (column < columns) & (row < rows))
@@ -267,7 +267,7 @@ class _Cells:
 def _returns_around(
     swath: Swath, points: Sequence[ControlPoint], radius_m: float
 ) -> list[tuple[int, NDArray[np.int64]]]:
-    """Indexes of the points that have returns within a radius, and of those."""
+    """Return indexes of the points that have returns within a radius, and of those."""
     if not points:
         return []
     places = np.array([point.position_t[:2] for point in points])
@@ -306,7 +306,7 @@ def _ground(
 
 
 def _of_one_surface(grounds: list[Ground], rules: ControlRules) -> list[Ground]:
-    """Those that agree with the most of them."""
+    """Return those that agree with the most of them."""
     if len(grounds) < 2:
         return grounds
     above = np.array([one.above_m for one in grounds])

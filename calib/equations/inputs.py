@@ -26,7 +26,7 @@ TRACKED = ("time_ns", "position_e", "q_e_from_b", "position_sigma_l", "attitude_
 
 
 def new_looks(count: int, cofactor: FloatArray, design: FloatArray) -> RowDiagnostics:
-    """Room for what is seen of n rows."""
+    """Return room for what is seen of n rows."""
     return RowDiagnostics(np.zeros(count), np.zeros(count), np.zeros(count), np.zeros(count), cofactor, design)
 
 

@@ -11,14 +11,14 @@ from swath.georef.arrays import FloatArray
 
 
 def scales(matrix: FloatArray) -> FloatArray:
-    """(n,) by which rows and columns are multiplied for a unit diagonal."""
+    """Return (n,) by which rows and columns are multiplied for a unit diagonal."""
     diagonal = np.diag(matrix)
     found: FloatArray = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     return found
 
 
 def inverted(matrix: FloatArray) -> FloatArray:
-    """(n, n) by Cholesky of the matrix scaled to unit diagonal; LinAlgError: it is not positive definite."""
+    """Return (n, n) by Cholesky of the matrix scaled to unit diagonal; LinAlgError: it is not positive definite."""
     if not len(matrix):
         return matrix
     scale = scales(matrix)

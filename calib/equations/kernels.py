@@ -185,7 +185,7 @@ def flown_variance(
 
 @jit_inline
 def between(nodes: FloatArray, value: FloatArray, row: int, intensity: float) -> float:
-    """A row (d,) of a table at its nodes (d,), linear between them, level beyond the ends."""
+    """Return a row (d,) of a table at its nodes (d,), linear between them, level beyond the ends."""
     last = len(nodes) - 1
     if intensity >= nodes[last]:
         return float(value[row, last])
@@ -198,7 +198,7 @@ def between(nodes: FloatArray, value: FloatArray, row: int, intensity: float) ->
 
 @jit_inline
 def extra(cells: FloatArray, i: int, j: int, beam: Beam, head: Head, kind: int, argument: int) -> float:
-    """Column of what is no parameter of the model."""
+    """Return column of what is no parameter of the model."""
     row, along = beam.rows[j], cells[ALONG, i]
     if kind == SLOT:
         return float(along) if row.return_number == argument else 0.0
@@ -279,7 +279,7 @@ def column(cells: FloatArray, n: int, k: int, beam: Beam, head: Head, kind: int,
 
 @jit_inline
 def share_of(knots: Knots, before: int, after: int, t: int) -> float:
-    """Where between its knots; 0 where there is one."""
+    """Return where between its knots; 0 where there is one."""
     if after == before:
         return 0.0
     return float((t - knots.time_ns[before]) / (knots.time_ns[after] - knots.time_ns[before]))

@@ -95,7 +95,7 @@ class TrajectoryWeight:
             raise NormalError(text) from error
 
     def to_e(self, rows: FloatArray) -> FloatArray:
-        """States (6k, m) in north, east, down to e."""
+        """Return states (6k, m) in north, east, down to e."""
         split = rows.reshape(len(self.rot_e_from_l), 2, 3, -1)
         turned: FloatArray = (self.rot_e_from_l[:, np.newaxis] @ split).reshape(rows.shape)
         return turned
@@ -107,7 +107,7 @@ class TrajectoryWeight:
         return turned
 
     def variances_l(self, covariance_e: FloatArray) -> FloatArray:
-        """(6k,) of north, east, down; states' covariance (6k, 6k) in e."""
+        """Return (6k,) of north, east, down; states' covariance (6k, 6k) in e."""
         count = len(self.rot_e_from_l)
         knot = np.arange(count)
         blocks = covariance_e.reshape(count, 2, 3, count, 2, 3)
@@ -141,7 +141,7 @@ class Normals:
     parameters: int
 
     def step(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """δ of parameters and states (u,), planes (q, 3), tie points (m, 3).
+        """Return δ of parameters and states (u,), planes (q, 3), tie points (m, 3).
 
         Raises:
             NormalError: a parameter is not determined.
@@ -150,7 +150,7 @@ class Normals:
         return done, _back(self.planes, done), _back(self.ties, done)
 
     def covariance(self) -> FloatArray:
-        """(u, u) S⁻¹; NormalError as above."""
+        """Return (u, u) S⁻¹; NormalError as above."""
         try:
             return inverted(self.normal)
         except np.linalg.LinAlgError as error:
@@ -178,7 +178,7 @@ def normals(
     tie_weight: SingleArray,
     huber: float,
 ) -> Normals:
-    """Everything observed, at a state.
+    """Return everything observed, at a state.
 
     Args:
         rows, ties: observations.
@@ -219,7 +219,7 @@ def normals(
 
 
 def extras(rows: Rows, state: State) -> list[Extra]:
-    """Rows of control on planes and of surveyed planes, at a state."""
+    """Return rows of control on planes and of surveyed planes, at a state."""
     found = []
     rot = rows.flight.frame.rot_t_from_e
     firsts, seconds = tangents(state.normal_e)
@@ -244,7 +244,7 @@ def extras(rows: Rows, state: State) -> list[Extra]:
 
 
 def moved(state: State, step: tuple[FloatArray, FloatArray, FloatArray]) -> State:
-    """The state after a step; normals keep their length."""
+    """Return the state after a step; normals keep their length."""
     done, of_planes, of_ties = step
     p = len(state.values)
     first, second = tangents(state.normal_e)
@@ -260,7 +260,7 @@ def moved(state: State, step: tuple[FloatArray, FloatArray, FloatArray]) -> Stat
 
 
 def tie_share(seen: Seen, weight: float, huber: float) -> float:
-    """A sighting's weight: that given, times Huber's of its length in sigmas."""
+    """Return a sighting's weight: that given, times Huber's of its length in sigmas."""
     size = float(np.sqrt(seen.misclosure_e @ np.linalg.solve(seen.covariance_e, seen.misclosure_e) / 3.0))
     return weight * (huber / size if 0.0 < huber < size else 1.0)
 
@@ -302,7 +302,7 @@ def _add(normal: FloatArray, right: FloatArray, seen: Seen, inverse: FloatArray)
 
 
 def _back(features: Sequence[Feature], done: FloatArray) -> FloatArray:
-    """(q, 3) δ2."""
+    """Return (q, 3) δ2."""
     steps = [-one.inverse @ (one.right + one.mixed.T @ done[one.unknowns]) for one in features]
     return np.array(steps).reshape(-1, OF_PLANE)
 

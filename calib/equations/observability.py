@@ -155,7 +155,7 @@ class Rules:
         return self.table.get(kind_of(name), _OTHER)
 
     def rank(self, name: str) -> int:
-        """How soon it is given up: the largest first."""
+        """Return how soon it is given up: the largest first."""
         kinds = list(self.table)
         kind = kind_of(name)
         return kinds.index(kind) if kind in self.table else len(kinds)
@@ -165,7 +165,9 @@ RULES_OF_ALL = Rules()
 
 
 def kind_of(name: str) -> str:
-    """``left.omega_rad`` → ``omega_rad``; ``left.ibrc.3`` → ``ibrc``; ``left.beam.12.range_m`` → ``beam.range_m``."""
+    """Return ``left.omega_rad`` → ``omega_rad``; ``left.ibrc.3`` → ``ibrc``; ``left.beam.12.range_m`` →
+    ``beam.range_m``.
+    """
     _, *rest = name.split(".")
     if len(rest) == 3:
         return f"{rest[0]}.{rest[2]}"
@@ -273,7 +275,7 @@ class _Case:
         }
 
     def _figures(self, active: list[int], information: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
-        """Sigmas in plausible sizes, correlations with a zero diagonal."""
+        """Return sigmas in plausible sizes, correlations with a zero diagonal."""
         part = (self._information if information is None else information)[np.ix_(active, active)]
         root = np.sqrt(np.diag(part))
         covariance = np.linalg.inv(part / np.outer(root, root)) / np.outer(root, root) if active else part
@@ -287,7 +289,7 @@ class _Case:
         return found
 
     def _next(self, active: list[int], sigma: FloatArray, rho: FloatArray) -> tuple[int, int] | None:
-        """The unknown to hold, and for which; None: all are determined.
+        """Return the unknown to hold, and for which; None: all are determined.
 
         Of the worst and of those that look like it, the least wanted; of equals the worse one.
         """
@@ -325,7 +327,7 @@ class _Case:
 
 
 def _positive(normal: FloatArray, size: FloatArray) -> FloatArray:
-    """The normal matrix in plausible sizes, without what rounding made negative: it would pass for knowledge."""
+    """Return the normal matrix in plausible sizes, without what rounding made negative: it would pass for knowledge."""
     scaled = np.asarray(normal, dtype=np.float64) * np.outer(size, size)
     root = np.sqrt(np.maximum(np.diag(scaled), 0.0))
     divisor = np.outer(root, root) + (np.outer(root, root) == 0.0)
@@ -335,7 +337,9 @@ def _positive(normal: FloatArray, size: FloatArray) -> FloatArray:
 
 
 def spectrum(normal: FloatArray) -> FloatArray:
-    """(u,) eigenvalues of the normal matrix scaled to unit diagonal, rising; near 0: a combination nobody sees."""
+    """Return (u,) eigenvalues of the normal matrix scaled to unit diagonal, rising; near 0: a combination nobody
+    sees.
+    """
     root = np.sqrt(np.maximum(np.diag(normal), 0.0))
     divisor = np.where(root > 0.0, root, 1.0)
     values: FloatArray = np.linalg.eigvalsh(normal / np.outer(divisor, divisor))

@@ -70,7 +70,7 @@ class Solution:
 
 
 def examine(solution: Solution) -> Quality:
-    """All of it; one pass over the rows."""
+    """Return all of it; one pass over the rows."""
     on_planes, detectable = _on_planes(solution)
     on_ties, tie_square = _on_ties(solution)
     controls = _controls(solution)
@@ -88,7 +88,7 @@ def examine(solution: Solution) -> Quality:
 
 
 def trajectory_fit(solution: Solution) -> TrajectoryFit | None:
-    """Corrections of the trajectory, in north, east, down."""
+    """Return corrections of the trajectory, in north, east, down."""
     prior, p = solution.rows.prior, solution.normals.parameters
     if prior is None:
         return None
@@ -132,20 +132,20 @@ def _room(group: str, count: int) -> Residuals:
 
 
 def _typical(errors: FloatArray) -> float:
-    """Median of those that are found at all."""
+    """Return median of those that are found at all."""
     found = errors[np.isfinite(errors)]
     return float(np.median(found)) if len(found) else float("inf")
 
 
 def _of_feature(covariance: FloatArray, feature: Feature) -> tuple[FloatArray, FloatArray]:
-    """Cofactors of a feature's unknowns with its own (m, 3), of its own (3, 3)."""
+    """Return cofactors of a feature's unknowns with its own (m, 3), of its own (3, 3)."""
     half = feature.mixed @ feature.inverse
     mixed = -covariance[np.ix_(feature.unknowns, feature.unknowns)] @ half
     return mixed, feature.inverse - half.T @ mixed
 
 
 def _cofactors(solution: Solution, batch: Batch, known: Sequence[tuple[FloatArray, FloatArray]]) -> FloatArray:
-    """(g, c, c) of the runs' columns; known: of all planes `_of_feature`."""
+    """Return (g, c, c) of the runs' columns; known: of all planes `_of_feature`."""
     made = [_cofactor(solution, run, *known[run.plane]) for run in batch.runs]
     widest = max(len(one) for one in made)
     table = np.zeros((len(made), widest, widest))
@@ -193,7 +193,7 @@ def _on_ties(solution: Solution) -> tuple[Residuals, float]:
 
 
 def _tie_spread(solution: Solution, seen: Seen) -> FloatArray:
-    """(3, 3) A Q Aᵀ of a sighting."""
+    """Return (3, 3) A Q Aᵀ of a sighting."""
     feature = solution.normals.ties[seen.tie]
     mixed, own = _of_feature(solution.covariance, feature)
     inner = solution.covariance[np.ix_(seen.unknowns, seen.unknowns)]
@@ -210,7 +210,7 @@ class _Controls:
 
 
 def _controls(solution: Solution) -> _Controls:
-    """Rows of control on planes, of surveyed planes and of surveyed tie points."""
+    """Return rows of control on planes, of surveyed planes and of surveyed tie points."""
     columns, where, fits = [], [], []
     for extra in extras(solution.rows, solution.state):
         feature = solution.normals.planes[extra.plane]
@@ -241,7 +241,7 @@ def _controls(solution: Solution) -> _Controls:
 
 
 def _control_fit(solution: Solution, extra: Extra, mixed: FloatArray, free: float) -> ControlFit:
-    """A point on a plane, with what leaving it out would change: δ₋ᵢ − δ = Q Aᵢᵀ w / r, all in sigmas."""
+    """Return a point on a plane, with what leaving it out would change: δ₋ᵢ − δ = Q Aᵢᵀ w / r, all in sigmas."""
     plane = solution.rows.planes[extra.plane]
     change = np.zeros(solution.rows.size)
     change[solution.normals.planes[extra.plane].unknowns] = mixed * (extra.misclosure / max(free, 1e-9))
@@ -256,7 +256,7 @@ def _control_fit(solution: Solution, extra: Extra, mixed: FloatArray, free: floa
 
 
 def _pseudo(solution: Solution) -> list[GroupFit]:
-    """Priors of parameters and of the trajectory, as groups of observations."""
+    """Return priors of parameters and of the trajectory, as groups of observations."""
     p, values = solution.normals.parameters, solution.state.values
     design, misclosure = solution.rows.unknowns.pseudo(values)
     used = float(np.einsum("ij,jk,ik->", design, solution.parameters, design))
@@ -282,6 +282,6 @@ def _fit(residuals: Residuals, square: float | None) -> GroupFit:
 
 
 def _group(name: str, count: int, redundancy: float, square: float, rms: float, rejected: int = 0) -> GroupFit:
-    """Its variance component Σ p e² / Σ r (Förstner 1979)."""
+    """Return its variance component Σ p e² / Σ r (Förstner 1979)."""
     factor = square / redundancy if redundancy > 1e-9 else 1.0
     return GroupFit(name, count, redundancy, factor, rms, rejected)

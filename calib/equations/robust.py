@@ -19,7 +19,7 @@ POWER = 0.80  # with which a least detectable error is found
 
 
 def w_critical(count: int, family: float = 0.05, level: float = LEVEL) -> float:
-    """Greatest |w| of a good observation.
+    """Return greatest |w| of a good observation.
 
     Args:
         count: observations tested together.
@@ -31,17 +31,17 @@ def w_critical(count: int, family: float = 0.05, level: float = LEVEL) -> float:
 
 @cache
 def least_shift(level: float = LEVEL, power: float = POWER) -> float:
-    """δ0 of Baarda's internal reliability: an error of so many sigmas of w is found with this power."""
+    """Return δ0 of Baarda's internal reliability: an error of so many sigmas of w is found with this power."""
     return float(stats.norm.isf(level / 2.0) + stats.norm.isf(1.0 - power))
 
 
 def least_detectable(variance: FloatArray, redundancy: FloatArray) -> FloatArray:
-    """∇ = δ0 √(M / r) of misclosures, metres; inf where nothing controls one."""
+    """Return ∇ = δ0 √(M / r) of misclosures, metres; inf where nothing controls one."""
     with np.errstate(divide="ignore"):
         errors: FloatArray = least_shift() * np.sqrt(variance / np.maximum(redundancy, 0.0))
     return errors
 
 
 def global_test(square: float, redundancy: float) -> float:
-    """Probability of so large a Σ p e² by chance, χ²(r); 1 without redundancy."""
+    """Return probability of so large a Σ p e² by chance, χ²(r); 1 without redundancy."""
     return float(stats.chi2.sf(square, redundancy)) if redundancy > 0.0 else 1.0

@@ -120,7 +120,7 @@ class Rows:
         self._first = np.cumsum([0, *(len(at) for at in self.lists)])
 
     def thinned(self, step: int) -> Rows:
-        """The same with one return in so many of each run: enough to come near."""
+        """Return the same with one return in so many of each run: enough to come near."""
         less = copy(self)
         runs: list[list[Run]] = [[] for _ in self.flight.swaths]
         for batch in self.batches:
@@ -130,7 +130,7 @@ class Rows:
         return less
 
     def with_noise(self, shares: FloatArray) -> Rows:
-        """The same with shares (h,) of the noise that heads are said to have."""
+        """Return the same with shares (h,) of the noise that heads are said to have."""
         quieter = copy(self)
         heads = tuple(
             replace(head, noise=head.noise.times(share))
@@ -140,7 +140,7 @@ class Rows:
         return quieter
 
     def weights(self) -> SingleArray:
-        """(n,) how many returns each row stands for."""
+        """Return (n,) how many returns each row stands for."""
         runs = [run for batch in self.batches for run in batch.runs]
         lengths = [len(run.at) for run in runs]
         return np.repeat(np.array([run.each for run in runs], np.float32), np.array(lengths, np.int64))
@@ -172,7 +172,7 @@ class Rows:
         return State(self.unknowns.first, knots, normals, np.zeros(len(self.planes)), np.zeros((ties, 3)))
 
     def summed(self, state: State, weight: SingleArray, huber: float) -> Sums:
-        """Normal equations at a state.
+        """Return normal equations at a state.
 
         Args:
             state: where they are linearised.
@@ -188,7 +188,7 @@ class Rows:
     def looks(
         self, state: State, cofactors: Any = None, weight: SingleArray | None = None
     ) -> Iterator[tuple[Batch, RowDiagnostics]]:
-        """Batch by batch f and M of each row, and A Q Aᵀ (as `swath.calib.equations.sums.inspect` has them).
+        """Yield batch by batch f and M of each row, and A Q Aᵀ (as `swath.calib.equations.sums.inspect` has them).
 
         Args:
             state: at which.
@@ -210,12 +210,12 @@ class Rows:
             yield batch, looks
 
     def placed(self, state: State) -> Iterator[BeamTable]:
-        """Batch by batch the returns with their axes."""
+        """Yield batch by batch the returns with their axes."""
         for _, task in self._tasks(state):
             yield task.beam
 
     def expansion(self, run: Run, normal_e: FloatArray) -> tuple[Int64Array, FloatArray]:
-        """Unknowns (m,) behind a run's columns without the plane's own, and how they are in them: (m, c)."""
+        """Return unknowns (m,) behind a run's columns without the plane's own, and how they are in them: (m, c)."""
         at, kinds, arguments = self.unknowns.of_head(self.flight.swaths[run.swath].head)
         if run.channel >= 0:
             mine = ~np.isin(kinds, list(BEAM_PARTS.values())) | (arguments == run.channel)
@@ -233,7 +233,7 @@ class Rows:
         return np.concatenate([at, np.array(knots, dtype=np.int64)]), table
 
     def knots_at(self, swath: Swath, time_ns: Int64Array) -> tuple[Int64Array, Int64Array]:
-        """Knots before and after times (n,) of a swath: those of its strip; −1 without a prior."""
+        """Return knots before and after times (n,) of a swath: those of its strip; −1 without a prior."""
         if self.prior is None:
             none = np.full(len(time_ns), -1, dtype=np.int64)
             return none, none
@@ -248,7 +248,7 @@ class Rows:
         return knots[before], knots[after]
 
     def task(self, state: State, batch: Batch, planes: PlaneTable) -> Task:
-        """What the kernel is given of a batch of runs; the runs' planes may be other than the state's.
+        """Return what the kernel is given of a batch of runs; the runs' planes may be other than the state's.
 
         Raises:
             GeometryError: the calibration has what such a scanner has not.
@@ -340,7 +340,7 @@ class Rows:
 
 
 def tangents(normal_e: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Two unit vectors perpendicular to unit vectors (q, 3) and to each other."""
+    """Return two unit vectors perpendicular to unit vectors (q, 3) and to each other."""
     least = np.eye(3)[np.argmin(np.abs(normal_e), axis=1)]
     first = np.cross(normal_e, least)
     first /= np.linalg.norm(first, axis=1, keepdims=True)
@@ -348,7 +348,7 @@ def tangents(normal_e: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _pieces(before: Int64Array, after: Int64Array) -> Iterator[slice]:
-    """Runs of equal knots, none longer than a batch."""
+    """Yield runs of equal knots, none longer than a batch."""
     changes = np.flatnonzero((np.diff(before) != 0) | (np.diff(after) != 0)) + 1
     ends = [0, *changes.tolist(), len(before)]
     for begin, end in pairwise(ends):

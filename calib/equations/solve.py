@@ -72,12 +72,12 @@ class Block:
         prior: TrajectoryPrior | None,
         placed_with: Mapping[str, Calibration] | None,
     ) -> Block:
-        """Of what was observed; `NormalError` where the prior is none."""
+        """Make that of what was observed; `NormalError` where the prior is none."""
         rows = Rows(flight, features.planes, asked, prior)
         return cls(rows, Ties(rows, features.ties, placed_with), TrajectoryWeight(rows))
 
     def with_unknowns(self, asked: Unknowns) -> Block:
-        """The same observations."""
+        """Return the same observations."""
         rows = Rows(self.rows.flight, self.rows.planes, asked, self.rows.prior)
         return Block(rows, self.ties.of(rows), self.trajectory)
 
@@ -87,7 +87,7 @@ class Block:
         return self.rows.weights(), np.ones(sightings, np.float32)
 
     def part(self, most: int) -> tuple[Block, tuple[SingleArray, SingleArray]]:
-        """Every so many of the rows, each with the weight of those left out; itself where there are few."""
+        """Return every so many of the rows, each with the weight of those left out; itself where there are few."""
         rows, sightings = self.weights()
         if len(rows) <= most:
             return self, (rows, sightings)
@@ -96,7 +96,7 @@ class Block:
         return replace(self, rows=less), (step * less.weights(), sightings)
 
     def with_noise(self, shares: FloatArray) -> Block:
-        """The same observations with shares (h,) of the noise that the heads are said to have."""
+        """Return the same observations with shares (h,) of the noise that the heads are said to have."""
         rows = self.rows.with_noise(shares)
         return Block(rows, self.ties.of(rows), self.trajectory)
 
@@ -248,7 +248,7 @@ def _without(block: Block, equations: Normals, settings: Settings) -> Block | No
 
 
 def _carried(before: Solution, block: Block) -> State:
-    """Parameters and trajectory from another solution; planes and tie points as they are found now."""
+    """Return parameters and trajectory from another solution; planes and tie points as they are found now."""
     state, names = block.start(), before.rows.unknowns.names
     old = dict(zip(names, before.state.values.tolist(), strict=True))
     new = zip(block.rows.unknowns.names, state.values.tolist(), strict=True)
@@ -273,7 +273,7 @@ def _iterated(
 def _kept(
     residuals: Sequence[Residuals], before: tuple[SingleArray, SingleArray], settings: Settings
 ) -> tuple[SingleArray, SingleArray]:
-    """Weights of rows and sightings by the w-test; what was rejected comes back where it fits."""
+    """Return weights of rows and sightings by the w-test; what was rejected comes back where it fits."""
     count = sum(len(one.normalised) for one in residuals)
     critical = w_critical(count, settings.family) if settings.family > 0.0 else np.inf
     rows, sightings = before

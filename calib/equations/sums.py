@@ -21,8 +21,8 @@ MODE_SUM, MODE_LOOK, MODE_GIVE = whole(0), whole(1), whole(2)
 
 @jit_inline
 def weigh(cells: FloatArray, panel: FloatArray, weight: Any, huber: float, together: float) -> tuple[float, int]:
-    """Rows times √(weight / (M + n c)); Huber's weight by f / √(M + c) where asked for (> 0). Returns Σ p f², how many
-    count.
+    """Return rows times √(weight / (M + n c)); Huber's weight by f / √(M + c) where asked for (> 0). Returns Σ p f²,
+    how many count.
 
     An error c that n rows have in common counts to each as often: their mean then has the variance M / n + c.
     """
@@ -51,7 +51,9 @@ def add_up(total: FloatArray, more: FloatArray) -> None:
 
 @jit_inline
 def spread_out(head: Head, knots: Knots, active: Int64Array, normal: Three, groups: Groups, g: int, table: Any) -> int:
-    """Unknowns behind a group's columns: their number; in ``table`` where they stand, in the plane's list, whence."""
+    """Return unknowns behind a group's columns: their number; in ``table`` where they stand, in the plane's list,
+    whence.
+    """
     to, place, source, factor = table
     m = len(active)
     for c in range(m):
@@ -145,7 +147,7 @@ def inspect(
 
 @jit_inline
 def counted(weight: Any, fate: Any, begin: int, end: int) -> float:
-    """How many rows of a run there are: those kept, each with those that it stands for."""
+    """Return how many rows of a run there are: those kept, each with those that it stands for."""
     n = 0.0
     for k in range(begin, end):
         if fate[k] == 0:

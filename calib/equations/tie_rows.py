@@ -78,13 +78,13 @@ class Ties:
         return [(tie, self.ties[tie].sightings[place]) for tie, place, _ in self._runs]
 
     def of(self, rows: Rows) -> Ties:
-        """The same points with other unknowns."""
+        """Return the same points with other unknowns."""
         other = copy(self)
         other.rows = rows
         return other
 
     def seen(self, state: State) -> list[Seen | None]:
-        """All sightings at a state, in their order; None where a return is no point any more."""
+        """Return all sightings at a state, in their order; None where a return is no point any more."""
         found: list[Seen | None] = [None] * len(self._runs)
         for swath in sorted({run.swath for _, _, run in self._runs}):
             mine = [index for index, (_, _, run) in enumerate(self._runs) if run.swath == swath]
@@ -148,7 +148,7 @@ class Ties:
         return Seen(tie, place, expansions[0][0], np.array(design), misclosure_e, covariance)
 
     def _flown(self, run: Run, arm_b: FloatArray) -> FloatArray:
-        """(3, 3) of a trajectory whose errors are not estimated; alike in all directions."""
+        """Return (3, 3) of a trajectory whose errors are not estimated; alike in all directions."""
         swath = self.rows.flight.swaths[run.swath]
         trajectory = self.rows.flight.trajectories[swath.flown]
         epoch = min(int(np.searchsorted(trajectory.time_ns, swath.time_ns[run.at[0]])), len(trajectory) - 1)
@@ -158,5 +158,5 @@ class Ties:
 
 
 def covariance_t(point: ControlPoint) -> FloatArray:
-    """(3, 3) of a surveyed point."""
+    """Return (3, 3) of a surveyed point."""
     return np.diag(np.broadcast_to(np.square(point.sigma_m), 3).astype(np.float64))

@@ -55,7 +55,7 @@ class Taus:
     lasting_heading: float = 0.0
 
     def of_components(self) -> FloatArray:
-        """(6,) of north, east, down, roll, pitch, heading."""
+        """Return (6,) of north, east, down, roll, pitch, heading."""
         return np.array([self.position_s] * 3 + [self.roll_pitch_s] * 2 + [self.heading_s])
 
     def lasting(self) -> FloatArray:
@@ -82,7 +82,7 @@ class Knots:
     widened: bool
 
     def __len__(self) -> int:
-        """How many."""
+        """Return how many."""
         return len(self.time_ns)
 
 
@@ -129,13 +129,13 @@ class TrajectoryPrior:
         return mine[before], mine[after], np.clip((time_ns - knots[before]) / apart, 0.0, 1.0)
 
     def sigmas(self) -> FloatArray:
-        """(k, 6) of the errors."""
+        """Return (k, 6) of the errors."""
         sigmas: FloatArray = np.sqrt(np.diag(self.covariance)).reshape(-1, ERRORS)
         return sigmas
 
 
 def knots_of(flight: Flight, knot_s: float, most: int = MOST_KNOTS) -> Knots:
-    """Knots over the strips only, from a little before each to a little after.
+    """Return knots over the strips only, from a little before each to a little after.
 
     Args:
         flight: its swaths say when the strips were.
@@ -178,7 +178,7 @@ def _counts(lengths_s: FloatArray, apart_s: float) -> Int64Array:
 
 
 def _strips(flight: Flight) -> list[tuple[int, int, int, int]]:
-    """(trajectory, number, begin, end) of each, by time, of all its scanners together; margins stay apart."""
+    """Return (trajectory, number, begin, end) of each, by time, of all its scanners together; margins stay apart."""
     spans: dict[tuple[int, int], tuple[int, int]] = {}
     for swath in flight.swaths:
         if len(swath):
@@ -245,7 +245,9 @@ def gauss_markov_at(knots: Knots, trajectories: Sequence[Trajectory], taus: Taus
 
 
 def _told(trajectory: Trajectory, time_ns: Int64Array) -> tuple[FloatArray, FloatArray]:
-    """(k, 6) sigmas north, east, down, roll, pitch, heading; (k, 3, 3) turns about n, e, d a unit of the last three."""
+    """Return (k, 6) sigmas north, east, down, roll, pitch, heading; (k, 3, 3) turns about n, e, d a unit of the last
+    three.
+    """
     at = np.clip(np.searchsorted(trajectory.time_ns, time_ns), 0, len(trajectory) - 1)
     since, epochs = (times - trajectory.time_ns[0] for times in (time_ns, trajectory.time_ns))
     told = np.concatenate([trajectory.position_sigma_l, trajectory.attitude_sigma_rad], axis=1)
@@ -305,7 +307,7 @@ def from_smoother(flight: Flight, chains: Sequence[ErrorChain], knot_s: float = 
 
 
 def _walked(prior: TrajectoryPrior) -> FloatArray:
-    """(k,) as of `TrajectoryPrior.walk_rad2`, at the rate of a middling interval; of a strip's last knot 0.
+    """Return (k,) as of `TrajectoryPrior.walk_rad2`, at the rate of a middling interval; of a strip's last knot 0.
 
     In a turn errors of scale make turns differ by far more, and steadily: knots follow that, it is no walk.
     """
@@ -322,7 +324,7 @@ def _walked(prior: TrajectoryPrior) -> FloatArray:
 
 
 def _strip_at(time_ns: Int64Array, knots: Knots, at: Int64Array, name: str) -> Int64Array:
-    """(k,) strips of a chain's moments; FlightError where the asked knots have no moment near them."""
+    """Return (k,) strips of a chain's moments; FlightError where the asked knots have no moment near them."""
     wanted, strips = knots.time_ns[at], knots.strip[at]
     after = np.clip(np.searchsorted(time_ns, wanted), 1, max(len(time_ns) - 1, 1))
     near = np.minimum(
@@ -369,7 +371,7 @@ def positive(covariance: FloatArray) -> FloatArray:
 
 
 def draw(prior: TrajectoryPrior, rng: np.random.Generator) -> FloatArray:
-    """(k, 6) errors as large and as correlated as the prior says.
+    """Return (k, 6) errors as large and as correlated as the prior says.
 
     Directions in which the covariance is zero but for rounding (eigenvalues of the correlation, some of them below 0)
     get none.
@@ -383,7 +385,7 @@ def draw(prior: TrajectoryPrior, rng: np.random.Generator) -> FloatArray:
 
 
 def apply(trajectory: Trajectory, flown: int, prior: TrajectoryPrior, errors: FloatArray) -> Trajectory:
-    """A trajectory with errors added along.
+    """Return a trajectory with errors added along.
 
     Between knots, those of two strips too, they are linear; before the first knot and after the last they stay as
     there, so that the path has no steps. Velocity and sigmas stay.
@@ -411,6 +413,6 @@ def apply(trajectory: Trajectory, flown: int, prior: TrajectoryPrior, errors: Fl
 
 
 def _turn(rotvec: FloatArray) -> FloatArray:
-    """(n, 4) quaternions of rotation vectors (n, 3)."""
+    """Return (n, 4) quaternions of rotation vectors (n, 3)."""
     half = 0.5 * np.linalg.norm(rotvec, axis=1, keepdims=True)
     return np.concatenate([np.cos(half), 0.5 * rotvec * np.sinc(half / np.pi)], axis=1)

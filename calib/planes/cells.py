@@ -82,7 +82,7 @@ class Segments:
 
     @classmethod
     def joined(cls, pieces: list[Segments]) -> Segments:
-        """One after the other; at least one piece."""
+        """Return one after the other; at least one piece."""
         before = np.cumsum([0] + [len(piece) for piece in pieces])
         columns = [[getattr(piece, name) for piece in pieces] for name in cls.__dataclass_fields__]
         columns[6] = [piece.cell_of + shift for piece, shift in zip(pieces, before, strict=False)]
@@ -90,13 +90,13 @@ class Segments:
 
 
 def keys_of(columns: Int64Array, rows: Int64Array) -> Int64Array:
-    """Keys of cells of the lattice."""
+    """Return keys of cells of the lattice."""
     keys: Int64Array = (rows << 32) + columns
     return keys
 
 
 def cell_middles(keys: Int64Array, cell_m: float) -> FloatArray:
-    """(n, 2) east and north of cells' middles."""
+    """Return (n, 2) east and north of cells' middles."""
     rows = (keys + (1 << 31)) >> 32
     return (np.stack([keys - (rows << 32), rows], axis=1) + 0.5) * cell_m
 
@@ -104,7 +104,7 @@ def cell_middles(keys: Int64Array, cell_m: float) -> FloatArray:
 def blocks(
     swath: Swath, start: int = 0, stop: int | None = None
 ) -> Iterator[tuple[int, FloatArray, NDArray[np.uint8]]]:
-    """A swath's returns by and by: index of the first, points (n, 3), returns of their pulses (n,)."""
+    """Yield a swath's returns by and by: index of the first, points (n, 3), returns of their pulses (n,)."""
     stop = len(swath) if stop is None else stop
     for first in range(start, stop, BLOCK):
         part = slice(first, min(first + BLOCK, stop))
@@ -129,7 +129,9 @@ def cell_size(flight: Flight, settings: PlaneSettings) -> float:
 
 
 def _fill(flight: Flight, cell_m: float) -> float:
-    """Share of the cells with points enough for a plane that have them on more than one line, in a middling swath."""
+    """Return share of the cells with points enough for a plane that have them on more than one line, in a middling
+    swath.
+    """
     shares = []
     for swath in flight.swaths:
         middle, half = len(swath) // 2, _STRETCH // 2
@@ -169,7 +171,7 @@ class _Grid:
         return self.rows, self.columns
 
     def places(self, at: Int64Array) -> tuple[Int64Array, Int64Array]:
-        """Columns and rows of the lattice of cells."""
+        """Return columns and rows of the lattice of cells."""
         return at % self.columns + self.west, at // self.columns + self.south
 
 
@@ -194,7 +196,7 @@ def segments_of(
 
 
 def _grid(swath: Swath, part: range, cell_m: float) -> _Grid | None:
-    """Around a part's points; None where it has none."""
+    """Return around a part's points; None where it has none."""
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
     for first in range(part.start, part.stop, BLOCK):
         points = swath.points_t[first : min(first + BLOCK, part.stop), :2]
@@ -231,7 +233,7 @@ def _segments(
 
 
 def tile_cells(cell_m: float, settings: PlaneSettings) -> int:
-    """Cells a tile."""
+    """Return cells a tile."""
     return max(2, round(settings.tile_m / cell_m))
 
 
@@ -271,7 +273,7 @@ def _table(
     settings: PlaneSettings,
     refused: Counter[str],
 ) -> Segments:
-    """Those that are wide enough and have returns enough, as a table."""
+    """Return those that are wide enough and have returns enough, as a table."""
     at = np.flatnonzero(label >= 0)
     of = label[at].astype(np.int64)
     cells = np.bincount(of, minlength=len(regions))
@@ -291,7 +293,7 @@ def _table(
 
 
 def _axes(moments: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Variances (k, 3), rising, and normals (k, 3) pointing up, of moments."""
+    """Return variances (k, 3), rising, and normals (k, 3) pointing up, of moments."""
     xx, xy, xz, yy, yz, zz = (moments[:, 4:] / moments[:, :1]).T
     matrix = np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=1).reshape(-1, 3, 3)
     variances, vectors = np.linalg.eigh(matrix)

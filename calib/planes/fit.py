@@ -48,7 +48,7 @@ class Sight:
 
 
 def expected_sigma(noise: Noise, away_t: FloatArray, normal_t: FloatArray, settings: PlaneSettings) -> FloatArray:
-    """(n,) metres along normals (n, 3) of returns at (n, 3) from the scanner, trajectory and calibration apart.
+    """Return (n,) metres along normals (n, 3) of returns at (n, 3) from the scanner, trajectory and calibration apart.
 
     Range by the cosine of incidence, angle and footprint by its sine (FORMULAS 6.2), roughness whole.
     """
@@ -63,7 +63,7 @@ def expected_sigma(noise: Noise, away_t: FloatArray, normal_t: FloatArray, setti
 def fit_sight(
     flight: Flight, swath: Swath, at: Int64Array, settings: PlaneSettings, *, bent: bool = True
 ) -> Sight | None:
-    """The plane most of these returns lie on, and those of them that do; None: fewer than three are left.
+    """Return the plane most of these returns lie on, and those of them that do; None: fewer than three are left.
 
     What lies farther from it than `GATE` expected sigmas is left out, again and again from all, until nothing changes.
     ``bent``: how curved they are is asked too.
@@ -89,7 +89,9 @@ def fit_sight(
 
 
 def principal(points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Mean (3,), axes (3, 3) as rows, the normal first and pointing up, and variances along them (3,), rising."""
+    """Return mean (3,), axes (3, 3) as rows, the normal first and pointing up, and variances along them (3,),
+    rising.
+    """
     centre = points.mean(axis=0)
     off = points - centre
     variances, vectors = np.linalg.eigh(off.T @ off / len(points))
@@ -109,7 +111,9 @@ def _sight(at: Int64Array, points: FloatArray, sigma_m: float, gate_m: float, be
 
 
 def _sag(off: FloatArray, axes: FloatArray, rms_m: float) -> tuple[float, float]:
-    """Greatest arc height of a quadratic surface over the points' length, of both directions and between; its sigma."""
+    """Return greatest arc height of a quadratic surface over the points' length, of both directions and between; its
+    sigma.
+    """
     if len(off) < 7:
         return 0.0, np.inf
     across, u, v = (off @ axes.T).T
@@ -127,7 +131,7 @@ def _sag(off: FloatArray, axes: FloatArray, rms_m: float) -> tuple[float, float]
 
 
 def refusal(sight: Sight | None, settings: PlaneSettings, slack: float = 1.0) -> str:
-    """Why this is no plane; empty: it is one. Slack: of what was one before, so that it stays one."""
+    """Return why this is no plane; empty: it is one. Slack: of what was one before, so that it stays one."""
     if sight is None or len(sight.at) < settings.least_points:
         return "too few returns"
     if sight.rms_m > slack * settings.rough * sight.sigma_m:

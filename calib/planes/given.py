@@ -26,7 +26,7 @@ _SHARE_LEAST = 0.7  # of the returns in a polygon that lie on its plane
 
 
 def given_planes(flight: Flight, polygons: Rings, settings: PlaneSettings = _DEFAULT) -> Features:
-    """Planes inside polygons, each the one that most of the returns in it lie on (Fischler and Bolles 1981).
+    """Return planes inside polygons, each the one that most of the returns in it lie on (Fischler and Bolles 1981).
 
     They have to stand the same tests as planes that were found; what does not is counted.
 
@@ -76,7 +76,7 @@ def _checked(polygons: Rings) -> dict[str, FloatArray]:
 
 
 def _inside(swath: Swath, rings: Mapping[str, FloatArray], cell_m: float) -> dict[str, Int64Array]:
-    """A swath's single returns in polygons; those that share cells are looked for one after the other."""
+    """Return a swath's single returns in polygons; those that share cells are looked for one after the other."""
     left = {name: _cells(ring, cell_m) for name, ring in rings.items()}
     inside: dict[str, Int64Array] = {}
     while left:
@@ -99,7 +99,7 @@ def _inside(swath: Swath, rings: Mapping[str, FloatArray], cell_m: float) -> dic
 
 
 def _cells(ring: FloatArray, cell_m: float) -> Int64Array:
-    """Keys of all cells of a ring's box."""
+    """Return keys of all cells of a ring's box."""
     low, high = np.floor(ring.min(axis=0) / cell_m), np.floor(ring.max(axis=0) / cell_m)
     axes = [np.arange(int(first), int(last) + 1) for first, last in zip(low, high, strict=True)]
     columns, rows = np.meshgrid(*axes)
@@ -107,7 +107,7 @@ def _cells(ring: FloatArray, cell_m: float) -> Int64Array:
 
 
 def _in_ring(points: FloatArray, ring: FloatArray) -> NDArray[np.bool_]:
-    """(n,) whether points lie inside: a ray to the east meets an odd number of sides."""
+    """Return (n,) whether points lie inside: a ray to the east meets an odd number of sides."""
     x, y = points[:, 0], points[:, 1]
     odd = np.zeros(len(points), np.bool_)
     for (x0, y0), (x1, y1) in zip(ring, np.roll(ring, -1, axis=0), strict=True):
@@ -117,7 +117,7 @@ def _in_ring(points: FloatArray, ring: FloatArray) -> NDArray[np.bool_]:
 
 
 def _consensus(flight: Flight, swath: Swath, at: Int64Array, settings: PlaneSettings) -> Int64Array:
-    """Those of the returns that lie on the plane through three of them on which most do."""
+    """Return those of the returns that lie on the plane through three of them on which most do."""
     points = np.asarray(swath.points_t[at])
     if len(points) < settings.least_points:
         return at

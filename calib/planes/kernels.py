@@ -29,7 +29,7 @@ _REFIT_SHARE = 1.15  # a growing plane is fitted anew when it has so many times 
 
 @jit_inline
 def smallest(xx: float, xy: float, xz: float, yy: float, yz: float, zz: float) -> tuple[float, float, float, float]:
-    """Least eigenvalue of a symmetric matrix and its unit vector, z not negative (Smith, Comm. ACM 4, 1961)."""
+    """Return least eigenvalue of a symmetric matrix and its unit vector, z not negative (Smith, Comm. ACM 4, 1961)."""
     middle = (xx + yy + zz) / 3.0
     a, b, c = xx - middle, yy - middle, zz - middle
     size = math.sqrt((a * a + b * b + c * c + 2.0 * (xy * xy + xz * xz + yz * yz)) / 6.0)
@@ -59,7 +59,9 @@ def smallest(xx: float, xy: float, xz: float, yy: float, yz: float, zz: float) -
 
 @jit_inline
 def shorter_axis(sums: FloatArray, least: float) -> float:
-    """The middle eigenvalue of moments (10,), the least being known: of the product and the sum of the other two."""
+    """Return the middle eigenvalue of moments (10,), the least being known: of the product and the sum of the other
+    two.
+    """
     xx, xy, xz, yy, yz, zz = sums[4], sums[5], sums[6], sums[7], sums[8], sums[9]
     rest = xx + yy + zz - least
     product = xx * yy - xy * xy + xx * zz - xz * xz + yy * zz - yz * yz - least * rest
@@ -208,7 +210,7 @@ def _joined(one: FloatArray, more: FloatArray) -> None:
 def _fits(
     cell: FloatArray, region: FloatArray, plane: FloatArray, doubt: float, rough_m: float, sigma_m: float
 ) -> bool:
-    """Whether a cell's points lie on a region's plane (3,): all of them together, and in their mean.
+    """Return whether a cell's points lie on a region's plane (3,): all of them together, and in their mean.
 
     The plane's direction is not sure itself (``doubt``, rad), which counts the more the farther away the cell is.
     """
@@ -227,7 +229,7 @@ def _fits(
 
 @jit_inline
 def _refitted(region: FloatArray, plane: FloatArray, sigma_m: float) -> float:
-    """The region's plane anew; sigma of its direction, rad, by its spread along its shorter axis."""
+    """Return the region's plane anew; sigma of its direction, rad, by its spread along its shorter axis."""
     least, plane[0], plane[1], plane[2] = smallest(region[4], region[5], region[6], region[7], region[8], region[9])
     return sigma_m / math.sqrt(max(shorter_axis(region, least), 1e-6))
 
@@ -244,7 +246,7 @@ def grow(
     label: Int32Array,
     regions: FloatArray,
 ) -> int:
-    """Planes grown from good cells, best first, over their eight neighbours.
+    """Return planes grown from good cells, best first, over their eight neighbours.
 
     A plane that came to its end is fitted anew and begins again at all its cells, until none joins. Level planes end
     where tiles of the grid end, so that all swaths cut the ground alike; steep ones at their edges. A plane counts as
@@ -316,7 +318,7 @@ def grow(
 
 @jit_inline
 def _slot(key: int, mask: int) -> int:
-    """Where to look for a key first: Fibonacci hashing (Knuth, The Art of Computer Programming 3, 6.4)."""
+    """Return where to look for a key first: Fibonacci hashing (Knuth, The Art of Computer Programming 3, 6.4)."""
     slot: int = ((key * _GOLDEN) >> _HIGH) & mask
     return slot
 

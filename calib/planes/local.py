@@ -47,7 +47,7 @@ class LocalPlane:
         return float(self.normal_t @ (point_t - self.centre_t))
 
     def above_m(self, point_t: FloatArray) -> float:
-        """Along up: Δz = d / n_z."""
+        """Return along up: Δz = d / n_z."""
         return self.distance_m(point_t) / float(self.normal_t[2])
 
     @property
@@ -57,7 +57,9 @@ class LocalPlane:
 
 
 def plane_through(points_t: FloatArray) -> LocalPlane:
-    """The plane of least squares through points (n, 3): normal of the smallest eigenvalue λ0 of their covariance."""
+    """Return the plane of least squares through points (n, 3): normal of the smallest eigenvalue λ0 of their
+    covariance.
+    """
     centre = points_t.mean(axis=0)
     offsets = points_t - centre
     values, vectors = np.linalg.eigh(offsets.T @ offsets / len(points_t))
@@ -66,7 +68,7 @@ def plane_through(points_t: FloatArray) -> LocalPlane:
 
 
 def robust_plane(points_t: FloatArray, rules: PlaneRules) -> tuple[LocalPlane | None, NDArray[np.bool_], str]:
-    """The plane that most of points (n, 3) lie on, with which they are, or why there is none.
+    """Return the plane that most of points (n, 3) lie on, with which they are, or why there is none.
 
     The first plane is the one through three points that the points' median distance from is least (least median of
     squares, Rousseeuw 1984); then least squares of those within three sigmas, until they stay the same.
@@ -94,7 +96,7 @@ def robust_plane(points_t: FloatArray, rules: PlaneRules) -> tuple[LocalPlane | 
 
 
 def _first_distances(points_t: FloatArray) -> FloatArray:
-    """(n,) from the best plane through three of the points; the triples are the same for as many points."""
+    """Return (n,) from the best plane through three of the points; the triples are the same for as many points."""
     draws = np.random.default_rng(len(points_t))
     triples = points_t[np.argsort(draws.random((TRIPLES, len(points_t))), axis=1)[:, :3]]
     normals = np.cross(triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0])
@@ -110,7 +112,9 @@ def _first_distances(points_t: FloatArray) -> FloatArray:
 
 
 def is_inside(point: FloatArray, around: FloatArray) -> bool:
-    """Whether a place (2,) lies within the hull of places (n, 2): no half of the horizon around it is free of them."""
+    """Return whether a place (2,) lies within the hull of places (n, 2): no half of the horizon around it is free of
+    them.
+    """
     offsets = around - point
     if not (np.abs(offsets).sum(axis=1) > 0.0).all():
         return True

@@ -31,7 +31,7 @@ _SIGMAS = 4.0
 def rematch(
     flight: Flight, features: Features, settings: PlaneSettings = _DEFAULT, each: Callable[..., Any] = map
 ) -> Features:
-    """The planes of features with the returns that lie on them now; all else is handed on.
+    """Return the planes of features with the returns that lie on them now; all else is handed on.
 
     Sets are the same again where nothing has moved since the last time. A plane needs two swaths, or what it has from
     surveys; planes that are no longer seen so are dropped and counted. Swaths are looked through by `each`, as
@@ -59,7 +59,7 @@ def _surveyed(plane: Plane) -> bool:
 
 
 def _sights(flight: Flight, plane: Plane, settings: PlaneSettings) -> dict[int, Sight]:
-    """What swaths show of a plane with the returns it had."""
+    """Return what swaths show of a plane with the returns it had."""
     sights = {}
     for patch in plane.patches:
         at = patch.at[np.isfinite(flight.swaths[patch.swath].points_t[patch.at]).all(axis=1)]
@@ -70,7 +70,7 @@ def _sights(flight: Flight, plane: Plane, settings: PlaneSettings) -> dict[int, 
 
 
 def _agreeing(sights: Mapping[int, Sight], settings: PlaneSettings) -> dict[int, Sight]:
-    """Those that show the same plane as the one that most agree with; of several, the one of most returns."""
+    """Return those that show the same plane as the one that most agree with; of several, the one of most returns."""
     swaths = sorted(sights, key=lambda swath: -len(sights[swath].at))
     if len(swaths) < 2:
         return dict(sights)
@@ -88,7 +88,7 @@ def _agreeing(sights: Mapping[int, Sight], settings: PlaneSettings) -> dict[int,
 
 
 def _in_sorted(at: Int64Array, others: Int64Array) -> NDArray[np.bool_]:
-    """(n,) which of rising indexes are among others, rising too."""
+    """Return (n,) which of rising indexes are among others, rising too."""
     place = np.minimum(np.searchsorted(others, at), max(len(others) - 1, 0))
     among: NDArray[np.bool_] = others[place] == at if len(others) else np.zeros(len(at), np.bool_)
     return among
@@ -132,7 +132,7 @@ def _row(plane: Plane, sights: Mapping[int, Sight], settings: PlaneSettings) -> 
 def _footprints(
     flight: Flight, known: list[tuple[Plane, dict[int, Sight]]], cell_m: float
 ) -> tuple[Int64Array, Int64Array]:
-    """Cells that planes cover, each once: the plane's that has most returns in it."""
+    """Return cells that planes cover, each once: the plane's that has most returns in it."""
     keys, labels = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
     for label, (_, sights) in enumerate(known):
         for swath, sight in sights.items():

@@ -28,7 +28,7 @@ _SEED = 19159  # of which returns are kept where there are too many
 def returns_near(
     swath: Swath, keys: Int64Array, labels: Int64Array, planes: FloatArray, cell_m: float
 ) -> dict[int, Int64Array]:
-    """A swath's single returns in cells, near the plane of their cell: rising indexes by label.
+    """Return a swath's single returns in cells, near the plane of their cell: rising indexes by label.
 
     Args:
         swath: whose.
@@ -55,7 +55,7 @@ def returns_near(
 
 
 def cells_of(points_t: FloatArray, cell_m: float) -> Int64Array:
-    """(n,) numbers of the cells that points (n, 3) lie in, from 0 on."""
+    """Return (n,) numbers of the cells that points (n, 3) lie in, from 0 on."""
     columns, rows = np.floor(points_t[:, :2].T / cell_m).astype(np.int64)
     columns, rows = columns - columns.min(initial=0), rows - rows.min(initial=0)
     numbers: Int64Array = np.unique(keys_of(columns, rows), return_inverse=True)[1]
@@ -63,7 +63,8 @@ def cells_of(points_t: FloatArray, cell_m: float) -> Int64Array:
 
 
 def well_inside(points_t: FloatArray, keys: Int64Array, cell_m: float) -> NDArray[np.bool_]:
-    """Which of points (n, 3) are at least `RIM_M` inside the cells (c,) of a face, half a cell where cells are small.
+    """Return which of points (n, 3) are at least `RIM_M` inside the cells (c,) of a face, half a cell where cells are
+    small.
 
     Beyond a ridge the other face stays within the gate for some decimetres, always below: returns from there would make
     roofs lower, most of all in strips whose gate is wide, which looks like a range scale.
@@ -79,7 +80,8 @@ def well_inside(points_t: FloatArray, keys: Int64Array, cell_m: float) -> NDArra
 def pure(
     points_t: FloatArray, plane: FloatArray, gate_m: float, cell: Int64Array, had: NDArray[np.bool_] | None = None
 ) -> NDArray[np.bool_]:
-    """Which of points (n, 3) are within a gate of a plane (4,), in cells (n,) where nearly all points near it are.
+    """Return which of points (n, 3) are within a gate of a plane (4,), in cells (n,) where nearly all points near it
+    are.
 
     At a ridge both faces run through one cell: what lies within the gate there is not of one face alone. What was taken
     before (``had``) stays a little longer than others come in, so that sets become stable.
@@ -138,7 +140,7 @@ def sights_of(
 def _tested(
     flight: Flight, found: Mapping[int, Int64Array], settings: PlaneSettings
 ) -> tuple[dict[int, Sight], Counter[str], float]:
-    """Sights that are planes, why others are not, and how curved these are, metres."""
+    """Return sights that are planes, why others are not, and how curved these are, metres."""
     good: dict[int, Sight] = {}
     why: Counter[str] = Counter()
     bent_m = 0.0
@@ -156,7 +158,7 @@ def _tested(
 def _middle(
     flight: Flight, found: Mapping[int, Int64Array], share: float, settings: PlaneSettings
 ) -> dict[int, Int64Array]:
-    """Returns in the middle of all, a share of the whole length and width; none where that is too short."""
+    """Return returns in the middle of all, a share of the whole length and width; none where that is too short."""
     places = {swath: np.asarray(flight.swaths[swath].points_t[at, :2]) for swath, at in found.items()}
     every = np.concatenate(list(places.values()))
     low, high = every.min(axis=0), every.max(axis=0)
@@ -168,7 +170,7 @@ def _middle(
 
 
 def _together(flight: Flight, sights: dict[int, Sight], settings: PlaneSettings) -> dict[int, Sight]:
-    """Those that cover what the one of most returns covers, or a part of it."""
+    """Return those that cover what the one of most returns covers, or a part of it."""
     if len(sights) < 2:
         return sights
     boxes = {}
@@ -186,7 +188,9 @@ def _together(flight: Flight, sights: dict[int, Sight], settings: PlaneSettings)
 
 
 def plane_of(name: str, kind: str, sights: Mapping[int, Sight], like: Plane | None = None) -> Plane:
-    """A plane midway between its sights, those weighing more whose direction is surer; like another, if given."""
+    """Return a plane midway between its sights, those weighing more whose direction is surer; like another, if
+    given.
+    """
     weight = np.array([1.0 / max(sight.normal_sigma_rad, 1e-9) ** 2 for sight in sights.values()])
     normals = np.array([sight.normal_t for sight in sights.values()])
     normal = weight @ normals

@@ -38,7 +38,7 @@ _ROUNDS = 4
 
 
 def find_planes(flight: Flight, settings: PlaneSettings = _DEFAULT, each: Callable[..., Any] = map) -> Features:
-    """Planes seen by at least two swaths, roofs first; why other places bear none is counted by reason.
+    """Return planes seen by at least two swaths, roofs first; why other places bear none is counted by reason.
 
     Returns of pulses with a single return count. Candidates are counted as tiles of the ground where nothing grew, as
     planes afterwards. Swaths are searched by `each`, as `map` calls: a pool's does it for several at a time, and the
@@ -108,7 +108,7 @@ def _returns(
 
 
 def _coarse_sigma(flight: Flight, segments: Segments, settings: PlaneSettings) -> FloatArray:
-    """(k,) expected of a return of a segment along its normal, metres."""
+    """Return (k,) expected of a return of a segment along its normal, metres."""
     sigma = np.zeros(len(segments))
     for index in np.unique(segments.swath):
         swath, mine = flight.swaths[int(index)], np.flatnonzero(segments.swath == index)
@@ -139,7 +139,7 @@ class PlaneRow:
 
 
 def plane_rows(flight: Flight, features: Features) -> list[PlaneRow]:
-    """What was taken, plane by plane."""
+    """Return what was taken, plane by plane."""
     return [
         PlaneRow(
             plane.name,
@@ -155,7 +155,7 @@ def plane_rows(flight: Flight, features: Features) -> list[PlaneRow]:
 
 
 def same_faces(segments: Segments, settings: PlaneSettings, refused: Counter[str]) -> Int64Array:
-    """(k,) number of the face that each segment belongs to; −1: of none that several swaths see without doubt.
+    """Return (k,) number of the face that each segment belongs to; −1: of none that several swaths see without doubt.
 
     Two segments are linked where they overlap, face alike, and lie no farther apart than strips do. A face whose
     segments are not all alike, or of which one swath has two that are not coplanar, is ambiguous: it is refused.
@@ -180,7 +180,7 @@ def same_faces(segments: Segments, settings: PlaneSettings, refused: Counter[str
 
 
 def _overlapping(segments: Segments, settings: PlaneSettings) -> tuple[Int64Array, Int64Array]:
-    """Pairs of segments of different swaths with enough cells in common."""
+    """Return pairs of segments of different swaths with enough cells in common."""
     order = np.argsort(segments.cell_key, kind="stable")
     key, of = segments.cell_key[order], segments.cell_of[order]
     pairs = []
@@ -200,7 +200,7 @@ def _overlapping(segments: Segments, settings: PlaneSettings) -> tuple[Int64Arra
 
 
 def _differences(segments: Segments, one: Int64Array, other: Int64Array) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Angles between normals, their sigmas, distances of the planes from each other midway, of pairs (m,)."""
+    """Return angles between normals, their sigmas, distances of the planes from each other midway, of pairs (m,)."""
     cosine = np.minimum((segments.normal_t[one] * segments.normal_t[other]).sum(axis=1), 1.0)
     across, along, _ = segments.spread_m.T
     turn = across / (np.sqrt(segments.moments[:, 0]) * np.maximum(along, 1e-6))
@@ -211,7 +211,7 @@ def _differences(segments: Segments, one: Int64Array, other: Int64Array) -> tupl
 
 
 def _alike(segments: Segments, one: Int64Array, other: Int64Array, settings: PlaneSettings) -> BoolArray:
-    """Whether pairs may be the same face of two swaths that lie a little beside each other."""
+    """Return whether pairs may be the same face of two swaths that lie a little beside each other."""
     angle, sigma, apart = _differences(segments, one, other)
     level = segments.normal_t[one, 2]
     limit = settings.offset_m + settings.displacement_m * np.sqrt(np.maximum(0.0, 1.0 - level**2))
@@ -220,7 +220,7 @@ def _alike(segments: Segments, one: Int64Array, other: Int64Array, settings: Pla
 
 
 def _with_largest(segments: Segments, face: Int64Array, count: int, settings: PlaneSettings) -> BoolArray:
-    """Whether segments are like the largest of their face."""
+    """Return whether segments are like the largest of their face."""
     points = segments.moments[:, 0]
     order = np.lexsort((points, face))
     largest = np.zeros(count, np.int64)
@@ -229,7 +229,7 @@ def _with_largest(segments: Segments, face: Int64Array, count: int, settings: Pl
 
 
 def _of_same_swath(segments: Segments, face: Int64Array) -> tuple[Int64Array, Int64Array]:
-    """Segments of which another is the one before in the same face and swath, and those."""
+    """Return segments of which another is the one before in the same face and swath, and those."""
     order = np.lexsort((segments.swath, face))
     again = (np.diff(face[order]) == 0) & (np.diff(segments.swath[order]) == 0)
     return order[1:][again], order[:-1][again]
@@ -264,7 +264,9 @@ class Pieces:
 
 
 def cut(segments: Segments, face: Int64Array, cell_m: float, settings: PlaneSettings, refused: Counter[str]) -> Pieces:
-    """Faces (k,) of segments in pieces no longer than a tile; those that one swath alone shows well are left out."""
+    """Return faces (k,) of segments in pieces no longer than a tile; those that one swath alone shows well are left
+    out.
+    """
     at = np.flatnonzero(face[segments.cell_of] >= 0)
     of_face = face[segments.cell_of[at]]
     faces = int(face.max(initial=-1)) + 1
@@ -300,7 +302,9 @@ def cut(segments: Segments, face: Int64Array, cell_m: float, settings: PlaneSett
 def _parts(
     place: FloatArray, of_face: Int64Array, steep: BoolArray, cell_m: float, settings: PlaneSettings
 ) -> Int64Array:
-    """(c,) which part of its face a cell at (c, 2) is in: steep faces are cut along their longer side and across."""
+    """Return (c,) which part of its face a cell at (c, 2) is in: steep faces are cut along their longer side and
+    across.
+    """
     faces = len(steep)
     size = np.maximum(np.bincount(of_face, minlength=faces), 1)
     mean = np.stack([np.bincount(of_face, axis, minlength=faces) / size for axis in place.T], axis=1)
@@ -322,7 +326,9 @@ def _parts(
 def choose(
     flight: Flight, segments: Segments, pieces: Pieces, settings: PlaneSettings, without: Set[int]
 ) -> Int64Array:
-    """Pieces to be taken: roofs, those of every direction in turn; then ground, spread over every pair of swaths."""
+    """Return pieces to be taken: roofs, those of every direction in turn; then ground, spread over every pair of
+    swaths.
+    """
     usable = np.ones(len(pieces.steep), np.bool_)
     usable[list(without)] = False
     roofs = np.flatnonzero(pieces.steep & usable)
@@ -340,7 +346,9 @@ def choose(
 def _spread_ground(
     flight: Flight, segments: Segments, pieces: Pieces, usable: BoolArray, settings: PlaneSettings
 ) -> Int64Array:
-    """Level pieces, those that many swaths see first, as long as a pair of swaths lacks them at a place of theirs."""
+    """Return level pieces, those that many swaths see first, as long as a pair of swaths lacks them at a place of
+    theirs.
+    """
     place = _places(flight, segments)
     level = np.flatnonzero(~pieces.steep & usable)
     begin, end = np.searchsorted(pieces.piece, level), np.searchsorted(pieces.piece, level, side="right")
@@ -362,7 +370,7 @@ def _spread_ground(
 
 
 def _places(flight: Flight, segments: Segments) -> Int64Array:
-    """(k,) where in its swath a segment lies: fifths of the swath across times thirds along."""
+    """Return (k,) where in its swath a segment lies: fifths of the swath across times thirds along."""
     place = np.zeros(len(segments), np.int64)
     for index in np.unique(segments.swath):
         swath = flight.swaths[int(index)]

@@ -124,7 +124,7 @@ def compare(
     control: Sequence[ControlPoint] = (),
     settings: Settings = CHECK,
 ) -> tuple[Comparison, ...]:
-    """What profiles say together, beside the adjustment; arguments as of `check`."""
+    """Return what profiles say together, beside the adjustment; arguments as of `check`."""
     if not profiles:
         return ()
     together = _Together.of(flight, profiles, adjusted, prior, control)
@@ -148,7 +148,7 @@ def compare(
 
 
 def _most(name: str, settings: Settings) -> float:
-    """Greatest sigma that still says something; rad, or m."""
+    """Return greatest sigma that still says something; rad, or m."""
     return 0.5 if name.endswith(PARAMETER["range"]) else settings.greatest_sigma_rad
 
 

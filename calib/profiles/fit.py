@@ -50,7 +50,9 @@ class Fit:
 
 
 def trajectory_sigmas(flight: Flight, swath: int, unsaid: tuple[float, float]) -> FloatArray:
-    """(6,) north, east, down m, roll, pitch, heading rad: means over a swath; where nothing is said, what is given."""
+    """Return (6,) north, east, down m, roll, pitch, heading rad: means over a swath; where nothing is said, what is
+    given.
+    """
     one = flight.swaths[swath]
     trajectory = flight.trajectories[one.flown]
     part = trajectory.between(int(one.time_ns[0]), int(one.time_ns[-1]))
@@ -63,7 +65,7 @@ def trajectory_sigmas(flight: Flight, swath: int, unsaid: tuple[float, float]) -
 
 
 def levers(track: Track, places_t: FloatArray, height_m: FloatArray, slope_t: FloatArray) -> FloatArray:
-    """(k, 6) by how much the height above a place changes a unit of each of `STATES`.
+    """Return (k, 6) by how much the height above a place changes a unit of each of `STATES`.
 
     Args:
         track: of the swath.
@@ -86,7 +88,7 @@ def levers(track: Track, places_t: FloatArray, height_m: FloatArray, slope_t: Fl
 
 
 def comparable(first: Pieces, second: Pieces, rms_m: float, slope_apart: float) -> BoolArray:
-    """(k,) where both swaths show the same smooth plane."""
+    """Return (k,) where both swaths show the same smooth plane."""
     with np.errstate(invalid="ignore"):
         good: BoolArray = np.maximum(first.rms_m, second.rms_m) <= rms_m
         good &= np.hypot(first.slope - second.slope, first.side_slope - second.side_slope) <= slope_apart
@@ -100,7 +102,7 @@ def solve(
     states: Mapping[int, FloatArray],
     prior_sigma: Mapping[int, FloatArray],
 ) -> Fit:
-    """The error that explains differences of height (k,) best, robustly.
+    """Return the error that explains differences of height (k,) best, robustly.
 
     Args:
         difference_m: first − second.
@@ -133,7 +135,9 @@ def solve(
 
 
 def _gain(design: FloatArray, weight: FloatArray, prior: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """N⁻¹ Aᵀ P (u, k) and N⁻¹ (u, u); where nothing depends on the first unknown its variance is huge, not infinite."""
+    """Return N⁻¹ Aᵀ P (u, k) and N⁻¹ (u, u); where nothing depends on the first unknown its variance is huge, not
+    infinite.
+    """
     normal = design.T @ (design * weight[:, np.newaxis]) + prior
     normal[0, 0] += 1e-12
     inverse = np.asarray(np.linalg.inv(normal), np.float64)

@@ -109,7 +109,7 @@ def _pieces(
 
 
 def _returns(swath: Swath, cells: Sequence[Corridor]) -> tuple[Swath, Int64Array]:
-    """Returns of each cell, one after the other, and whose each is."""
+    """Return returns of each cell, one after the other, and whose each is."""
     ground = Ground.of(swath)
     parts = [ground.rows_near(cell) for cell in cells]
     piece = np.repeat(np.arange(len(cells)), [len(part) for part in parts])
@@ -117,7 +117,7 @@ def _returns(swath: Swath, cells: Sequence[Corridor]) -> tuple[Swath, Int64Array
 
 
 def _means(values: FloatArray, group: Int64Array, groups: int) -> FloatArray:
-    """(groups, c) means of columns (n, c); 0 where there is nothing."""
+    """Return (groups, c) means of columns (n, c); 0 where there is nothing."""
     count = np.maximum(np.bincount(group, minlength=groups), 1)
     return np.stack([np.bincount(group, column, groups) / count for column in values.T], axis=1)
 

@@ -104,7 +104,7 @@ class Part:
     calibration: Calibration
 
     def section(self, parameter: str, correction: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Distance, aside and height (n,) of those that lie in the corridor with a corrected parameter."""
+        """Return distance, aside and height (n,) of those that lie in the corridor with a corrected parameter."""
         value = self.calibration.value(parameter) + correction
         points_t = self.flight.place(self.swath, self.calibration.changed(**{parameter: value}))
         points_t = points_t[np.isfinite(points_t[:, 0])]
@@ -114,7 +114,7 @@ class Part:
 
 
 def shifts_m(flight: Flight, points_of: Mapping[str, Calibration], now: Mapping[str, Calibration]) -> float:
-    """How far points move at most, nearly, from one set of calibrations to another."""
+    """Return how far points move at most, nearly, from one set of calibrations to another."""
     moved = 0.0
     for swath in flight.swaths:
         name = flight.heads[swath.head].name
@@ -136,14 +136,14 @@ class Ground:
 
     @classmethod
     def of(cls, swath: Swath) -> Ground:
-        """With its boxes; points that are nan do not count."""
+        """Make it with its boxes; points that are nan do not count."""
         begins = range(0, len(swath), CHUNK)
         parts = [np.asarray(swath.points_t[begin : begin + CHUNK, :2]) for begin in begins]
         boxes = [np.concatenate([np.fmin.reduce(part), np.fmax.reduce(part)]) for part in parts]
         return cls(swath, np.array(boxes).reshape(-1, 4))
 
     def rows_near(self, corridor: Corridor, longer_m: float = 0.0) -> IndexArray:
-        """(k,) its returns in a corridor made longer by so much at either end."""
+        """Return (k,) its returns in a corridor made longer by so much at either end."""
         pieces = [np.zeros(0, np.int64)]
         for chunk in np.flatnonzero(corridor.meets(self.boxes_t, longer_m)).tolist():
             points_t = np.asarray(self.swath.points_t[chunk * CHUNK : (chunk + 1) * CHUNK, :2])
@@ -167,7 +167,7 @@ class Ground:
 def part_of(
     flight: Flight, ground: Ground, corridor: Corridor, wider_m: tuple[float, float], calibration: Calibration
 ) -> Part:
-    """Returns whose points lie in the corridor, made longer and wider by so much."""
+    """Return returns whose points lie in the corridor, made longer and wider by so much."""
     wide = replace(corridor, half_width_m=corridor.half_width_m + wider_m[1])
     return Part(flight, ground.taken(ground.rows_near(wide, wider_m[0])), corridor, calibration)
 
@@ -181,7 +181,7 @@ def measure_place(
     settings: Settings,
     margin_m: float,
 ) -> Measured | str:
-    """An angle from two swaths along a corridor; in words why not.
+    """Return an angle from two swaths along a corridor; in words why not.
 
     Args:
         flight: with points.
@@ -245,7 +245,7 @@ def _settle(
     prior: Mapping[int, FloatArray],
     found: float,
 ) -> tuple[float, Fit, _Compared, list[FloatTriple]] | str:
-    """The angle, its last fit, what was compared in it, and both sections as they end; in words why not."""
+    """Return the angle, its last fit, what was compared in it, and both sections as they end; in words why not."""
     settings = pair.settings
     for step in range(ITERATIONS):
         sections = [part.section(PARAMETER[pair.kind], found) for part in parts]
@@ -273,7 +273,7 @@ def _widened(corridor: Corridor, settings: Settings, density: float) -> tuple[Co
 
 
 def _forward_levers(kind: str, corridor: Corridor, track: Track) -> float:
-    """How far a unit of the angle's error moves a swath along the corridor."""
+    """Return how far a unit of the angle's error moves a swath along the corridor."""
     sense = float(track.forward @ corridor.along)
     if kind == "pitch":
         return track.above_m * sense
@@ -282,7 +282,7 @@ def _forward_levers(kind: str, corridor: Corridor, track: Track) -> float:
 
 
 def _coarse(pair: _Pair, sections: Sequence[FloatTriple]) -> float:
-    """The error that brings the sections onto each other within a bin; 0 where nothing stands out."""
+    """Return the error that brings the sections onto each other within a bin; 0 where nothing stands out."""
     if pair.kind == "roll":
         return 0.0
     corridor, (one, other) = pair.corridor, pair.tracks
@@ -345,7 +345,9 @@ def _compare_from(begin_m: float, pair: _Pair, sections: Sequence[FloatTriple], 
 
 
 def _slopes(corridor: Corridor, first: Pieces, second: Pieces) -> FloatArray:
-    """(k, 2) of the ground, east and north: a wrong roll tilts the swaths of an opposite pair against each other."""
+    """Return (k, 2) of the ground, east and north: a wrong roll tilts the swaths of an opposite pair against each
+    other.
+    """
     along, across = 0.5 * (first.slope + second.slope), 0.5 * (first.side_slope + second.side_slope)
     slopes: FloatArray = along[:, np.newaxis] * corridor.along + across[:, np.newaxis] * corridor.across
     return slopes

@@ -57,7 +57,7 @@ class Track:
         return np.array([self.forward[1], -self.forward[0]])
 
     def aside(self, places_t: FloatArray) -> FloatArray:
-        """(k,) Y: how far places (k, 2) are to the right of it."""
+        """Return (k,) Y: how far places (k, 2) are to the right of it."""
         aside: FloatArray = (places_t - self.origin_t) @ self.right
         return aside
 
@@ -114,7 +114,7 @@ class Place:
 def places(
     flight: Flight, tracks: Sequence[Track | None], kind: str, half_width_m: float, pitch_unknown: Collection[str] = ()
 ) -> Iterator[list[Place]]:
-    """The corridors of a kind, ``roll``, ``pitch`` or ``heading``, pair by pair of swaths of one scanner.
+    """Yield the corridors of a kind, ``roll``, ``pitch`` or ``heading``, pair by pair of swaths of one scanner.
 
     Opposite lines side by side are moved apart by a wrong pitch as by a wrong heading: they serve for the heading only
     of scanners whose pitch is known, not of those named.
@@ -143,7 +143,7 @@ def _stretch(one: Track, other: Track) -> tuple[float, float]:
 
 
 def _apart(one: Track, other: Track) -> float:
-    """How far the other track is to the right of the first, where they overlap."""
+    """Return how far the other track is to the right of the first, where they overlap."""
     middle = one.origin_t + 0.5 * sum(_stretch(one, other)) * one.forward
     onto = other.origin_t + ((middle - other.origin_t) @ other.forward) * other.forward
     return float((onto - one.origin_t) @ one.right)
@@ -155,7 +155,7 @@ def _is_twice_flown(one: Track, other: Track) -> bool:
 
 
 def _across(one: Track, other: Track, half_width_m: float) -> list[Corridor]:
-    """Across an opposite pair, over the full width both saw."""
+    """Return across an opposite pair, over the full width both saw."""
     low, high = _stretch(one, other)
     if not _is_twice_flown(one, other) or high - low < 4.0 * half_width_m:
         return []
@@ -170,7 +170,7 @@ def _across(one: Track, other: Track, half_width_m: float) -> list[Corridor]:
 
 
 def _along(one: Track, other: Track, half_width_m: float, middle_m: float) -> list[Corridor]:
-    """Corridors along the first track, about one that is so far to the right of it."""
+    """Return corridors along the first track, about one that is so far to the right of it."""
     low, high = _stretch(one, other)
     if high - low < 10.0 * half_width_m:
         return []
@@ -182,12 +182,12 @@ def _along(one: Track, other: Track, half_width_m: float, middle_m: float) -> li
 
 
 def _below(one: Track, other: Track, half_width_m: float) -> list[Corridor]:
-    """Along an opposite pair, at nadir of both."""
+    """Return along an opposite pair, at nadir of both."""
     return _along(one, other, half_width_m, 0.5 * _apart(one, other)) if _is_twice_flown(one, other) else []
 
 
 def _beside(one: Track, other: Track, half_width_m: float) -> list[Corridor]:
-    """Along two lines side by side, at nadir of each as far as the other sees it."""
+    """Return along two lines side by side, at nadir of each as far as the other sees it."""
     apart, sense = _apart(one, other), float(one.forward @ other.forward)
     if abs(sense) < PARALLEL or abs(apart) < SIDE_BY_SIDE * min(one.above_m, other.above_m):
         return []

@@ -39,7 +39,7 @@ class Corridor:
 
     @classmethod
     def between(cls, start_t: FloatArray, end_t: FloatArray, half_width_m: float) -> Corridor:
-        """From one point to another (2,) or (3,), of which only east and north count."""
+        """Make it from one point to another (2,) or (3,), of which only east and north count."""
         way = np.asarray(end_t, np.float64)[:2] - np.asarray(start_t, np.float64)[:2]
         length_m = float(np.hypot(*way))
         return cls(np.array(start_t[:2], np.float64), way / length_m, length_m, half_width_m)
@@ -50,24 +50,24 @@ class Corridor:
         return np.array([self.along[1], -self.along[0]])
 
     def coordinates(self, points_t: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Distance along (n,) and across (n,) of points (n, ≥ 2)."""
+        """Return distance along (n,) and across (n,) of points (n, ≥ 2)."""
         away = points_t[:, :2] - self.origin_t
         return away @ self.along, away @ self.across
 
     def holds(self, points_t: FloatArray, wider_m: float = 0.0) -> BoolArray:
-        """(n,) whether points lie in it, or in one that is longer by this at either end."""
+        """Return (n,) whether points lie in it, or in one that is longer by this at either end."""
         distance, aside = self.coordinates(points_t)
         inside: BoolArray = np.abs(aside) <= self.half_width_m
         inside &= (distance >= -wider_m) & (distance <= self.length_m + wider_m)
         return inside
 
     def part(self, middle_m: float, length_m: float) -> Corridor:
-        """A piece of it, so long, about a distance from its begin."""
+        """Return a piece of it, so long, about a distance from its begin."""
         begin_t = self.origin_t + (middle_m - 0.5 * length_m) * self.along
         return Corridor(begin_t, self.along, length_m, self.half_width_m)
 
     def meets(self, boxes_t: FloatArray, wider_m: float = 0.0) -> BoolArray:
-        """(k,) whether boxes (k, 4) of least and greatest east and north may hold any of what `holds`."""
+        """Return (k,) whether boxes (k, 4) of least and greatest east and north may hold any of what `holds`."""
         middle, half = 0.5 * (boxes_t[:, :2] + boxes_t[:, 2:]), 0.5 * (boxes_t[:, 2:] - boxes_t[:, :2])
         distance, aside = self.coordinates(middle)
         inside: BoolArray = np.abs(aside) <= self.half_width_m + half @ np.abs(self.across)
@@ -76,7 +76,7 @@ class Corridor:
         return inside
 
     def place(self, distance_m: FloatArray) -> FloatArray:
-        """(k, 2) east and north of distances (k,) on its middle line."""
+        """Return (k, 2) east and north of distances (k,) on its middle line."""
         places: FloatArray = self.origin_t + np.asarray(distance_m)[:, np.newaxis] * self.along
         return places
 
@@ -102,7 +102,7 @@ class Pieces:
 
 
 def grouped_median(values: FloatArray, group: IndexArray, groups: int) -> FloatArray:
-    """(groups,) median of the values (n,) of each group; nan where there are none."""
+    """Return (groups,) median of the values (n,) of each group; nan where there are none."""
     order = np.lexsort((values, group))
     count = np.bincount(group, minlength=groups)
     first = np.cumsum(count) - count
@@ -138,7 +138,9 @@ def fit_pieces(
 def _planes(
     group: IndexArray, columns: FloatArray, height: FloatArray, groups: int, least: int
 ) -> tuple[FloatArray, FloatArray]:
-    """(groups, 3) coefficients and (groups, 3, 3) inverse normal matrices by least squares; nan: too few or in line."""
+    """Return (groups, 3) coefficients and (groups, 3, 3) inverse normal matrices by least squares; nan: too few or in
+    line.
+    """
     normal, right = np.zeros((groups, 3, 3)), np.zeros((groups, 3))
     for i in range(3):
         right[:, i] = np.bincount(group, columns[:, i] * height, groups)
@@ -154,7 +156,7 @@ def _planes(
 
 
 def heights_by_bin(distance_m: FloatArray, height_m: FloatArray, bin_m: float, bins: int) -> FloatArray:
-    """(bins,) median height of the returns of each bin of a section; nan where there are none."""
+    """Return (bins,) median height of the returns of each bin of a section; nan where there are none."""
     group = np.floor(distance_m / bin_m).astype(np.int64)
     inside = (group >= 0) & (group < bins)
     return grouped_median(height_m[inside], group[inside], bins)

@@ -173,7 +173,7 @@ def measure(
     calibrations: Mapping[str, Calibration] | None = None,
     given: Sequence[Given] = (),
 ) -> tuple[Profile, ...]:
-    """All profiles the flight allows, each with the points as they lie: what is wrong with them, kind by kind.
+    """Return all profiles the flight allows, each with the points as they lie: what is wrong with them, kind by kind.
 
     Args:
         flight: with points.
@@ -197,7 +197,7 @@ def survey(
     with_points_of: Mapping[str, Calibration] | None = None,
     pitch_unknown: Collection[str] = (),
 ) -> Survey:
-    """Profiles of one kind: of each pair the best ones. Arguments as of `measure`.
+    """Return profiles of one kind: of each pair the best ones. Arguments as of `measure`.
 
     Args:
         with_points_of: by scanner, the calibrations of the flight's points, where they are not those to measure with.
@@ -293,7 +293,9 @@ def _profile(
 
 
 def formula(kind: str, separation_m: float, baseline_m: float, installation: FloatArray | None = None) -> str:
-    """The lecture's formula with numbers, the sense of the correction, and its value in our axes and the scanner's."""
+    """Return the lecture's formula with numbers, the sense of the correction, and its value in our axes and the
+    scanner's.
+    """
     size = abs(separation_m)
     if kind == "range":
         return f"range offset = mean(dh · cos θ) / mean(cos² θ) = {separation_m / baseline_m:+.4f} m"
@@ -327,7 +329,9 @@ def formula(kind: str, separation_m: float, baseline_m: float, installation: Flo
 
 
 def combined(profiles: Sequence[Profile]) -> tuple[float, float]:
-    """What several profiles of a kind say together, and its sigma: those of one swath share its trajectory's errors."""
+    """Return what several profiles of a kind say together, and its sigma: those of one swath share its trajectory's
+    errors.
+    """
     weight = np.array([profile.sigma**-2.0 for profile in profiles])
     weight /= weight.sum()
     variance = float(np.sum((weight * [profile.noise_sigma for profile in profiles]) ** 2))
@@ -346,7 +350,8 @@ def stepwise(
     calibrations: Mapping[str, Calibration] | None = None,
     given: Sequence[Given] = (),
 ) -> Stepwise:
-    """Roll, pitch, heading, range, each with those before applied; all of it twice, for they presume each other small.
+    """Return roll, pitch, heading, range, each with those before applied; all of it twice, for they presume each other
+    small.
 
     Where one of the angles has no profile, it stays as it was, and the others bear its part: the sigmas hold only with
     all of them found.

@@ -28,7 +28,7 @@ def measure_range(
     settings: Settings,
     margin_m: float,
 ) -> Measured | str:
-    """The range offset from flat targets that a swath shows."""
+    """Return the range offset from flat targets that a swath shows."""
     calibration = calibrations[flight.heads[ground.swath.head].name]
     seen = [(point, _target(flight, track, ground, point, calibration, settings, margin_m)) for point in control]
     shown = [(point, target) for point, target in seen if target is not None]

@@ -89,7 +89,7 @@ _OWNERS = {
 def content_of(
     flight: Flight, features: Features, adjusted: Adjusted, scanner: str, header: Header, settings: Mapping[str, str]
 ) -> Found:
-    """Values by ``CLASS.attribute``."""
+    """Return values by ``CLASS.attribute``."""
     calibration = adjusted.calibrations[scanner]
     return {
         "CA_CalibrationValidation.calibrationType": Value("inFlight", note="onboard, in flight: code 004"),
@@ -189,7 +189,7 @@ def _flown(flight: Flight) -> Found:
 
 
 def _heights(flight: Flight) -> tuple[float, float, float]:
-    """Ground, above ground, flying; metres."""
+    """Return ground, above ground, flying; metres."""
     ground, flying = [np.zeros(0)], [np.zeros(0)]
     share = max(1, sum(len(swath) for swath in flight.swaths) // MOST_POINTS)
     for swath in flight.swaths:
@@ -281,7 +281,7 @@ class Observed:
 
 
 def observed_of(flight: Flight, adjusted: Adjusted, scanner: str) -> Observed | None:
-    """Those that were kept; None: there is none on planes."""
+    """Return those that were kept; None: there is none on planes."""
     tables: list[Residuals] = [group for group in adjusted.residuals if group.group == "planes"]
     heads = [flight.heads[swath.head].name == scanner for swath in flight.swaths]
     if not tables:
@@ -361,6 +361,6 @@ def _block(
 
 
 def _there(column: FloatArray | None) -> FloatArray:
-    """What rays with axes have."""
+    """Return what rays with axes have."""
     assert column is not None
     return column

@@ -85,13 +85,13 @@ class Record:
     attachment: str = ""
 
     def arrays(self) -> dict[str, np.ndarray[Any, np.dtype[np.float64]]]:
-        """The matrices by attribute, for `numpy.savez_compressed`."""
+        """Return the matrices by attribute, for `numpy.savez_compressed`."""
         matrices = {key.partition(".")[2]: value.content for key, value in self.values.items()}
         return {name: content.array for name, content in matrices.items() if isinstance(content, Matrix)}
 
 
 def record_of(given: RecordInput) -> Record:
-    """What is known of a calibration.
+    """Return what is known of a calibration.
 
     Raises:
         RecordError: something told is no attribute, or not what the attribute takes.
@@ -105,7 +105,7 @@ def record_of(given: RecordInput) -> Record:
 
 
 def told_value(key: str, value: Plain, note: str = "as told") -> Value:
-    """Something told of an attribute, as the record holds it.
+    """Return something told of an attribute, as the record holds it.
 
     Raises:
         RecordError: there is no such attribute, or it takes something else.
@@ -139,12 +139,12 @@ def _summary(matrix: Matrix, name: str, attachment: str) -> dict[str, Any]:
 
 
 def record_json(record: Record) -> str:
-    """The record as JSON; the same text for the same record."""
+    """Return the record as JSON; the same text for the same record."""
     return document_json(_document(record))
 
 
 def document_json(document: Document) -> str:
-    """A record's JSON again, as `with_told` gives it."""
+    """Return a record's JSON again, as `with_told` gives it."""
     return json.dumps(document, ensure_ascii=False, indent=1, allow_nan=False) + "\n"
 
 
@@ -181,7 +181,7 @@ def _attribute(row: Row, value: Value, attachment: str) -> dict[str, Any]:
 
 
 def record_xml(record: Record) -> str:
-    """The same as XML: an element a class, an attribute, a value; numbers with all their digits."""
+    """Return the same as XML: an element a class, an attribute, a value; numbers with all their digits."""
     return document_xml(_document(record))
 
 
@@ -237,7 +237,7 @@ def _clean(text: str) -> str:
 
 
 def read_document(text: str, name: str) -> Document:
-    """A record as `record_json` wrote it.
+    """Return a record as `record_json` wrote it.
 
     Args:
         text: of the file.
@@ -266,7 +266,7 @@ def _refuse(constant: str) -> float:
 
 
 def with_told(document: Document, told: Mapping[str, tuple[Plain, str]]) -> Document:
-    """The same record with more told, as what came after the calibration.
+    """Return the same record with more told, as what came after the calibration.
 
     Args:
         document: of `read_document`.

@@ -31,7 +31,7 @@ class Matrix:
 
     @classmethod
     def of(cls, array: FloatArray) -> Matrix:
-        """All of it."""
+        """Return all of it."""
         table = np.atleast_2d(np.asarray(array, np.float64))
         return cls(table, len(table))
 
@@ -60,7 +60,7 @@ class Value:
 
 
 def utc_text(gps_ns: int) -> str:
-    """ISO 8601 of a GPS time, microseconds."""
+    """Return ISO 8601 of a GPS time, microseconds."""
     day = GPS_EPOCH + dt.timedelta(days=gps_ns // (86_400 * SECOND_NS))
     leap_seconds, _ = table_leap_seconds(day)
     start = dt.datetime(GPS_EPOCH.year, GPS_EPOCH.month, GPS_EPOCH.day, tzinfo=dt.UTC)
@@ -69,14 +69,14 @@ def utc_text(gps_ns: int) -> str:
 
 
 def is_plain(value: object) -> bool:
-    """Whether it is text, a finite number, or numbers: `Plain`."""
+    """Return whether it is text, a finite number, or numbers: `Plain`."""
     if isinstance(value, tuple):
         return all(_is_number(one) for one in value)
     return isinstance(value, str) or _is_number(value)
 
 
 def is_document(document: Any) -> bool:
-    """Whether what JSON gave is laid out as a record: heads, classes, attributes with a value or a matrix."""
+    """Return whether what JSON gave is laid out as a record: heads, classes, attributes with a value or a matrix."""
     heads = isinstance(document, dict) and all(isinstance(document.get(key), str) for key in ("id", "note"))
     if not heads or len(document["id"].splitlines()) != 1:
         return False
@@ -104,7 +104,9 @@ def _is_attribute(one: Any) -> bool:
 
 
 def _has_words(table: Any, texts: tuple[str, ...], others: tuple[str, ...]) -> bool:
-    """A table with these texts, and words, numbers or truths under names of letters for the rest but the others."""
+    """Return a table with these texts, and words, numbers or truths under names of letters for the rest but the
+    others.
+    """
     return (
         isinstance(table, dict)
         and all(isinstance(table.get(key), str) for key in texts)

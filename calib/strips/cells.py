@@ -62,7 +62,7 @@ class Strip(Protocol):
         """For people."""
 
     def blocks(self) -> Iterator[StripBlock]:
-        """All of it; the same points every time."""
+        """Return all of it; the same points every time."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class FlightStrip:
         return self.swath.name
 
     def blocks(self) -> Iterator[StripBlock]:
-        """All of it."""
+        """Yield all of it."""
         swath = self.swath
         for begin in range(0, len(swath), BLOCK):
             rows = slice(begin, begin + BLOCK)
@@ -98,13 +98,15 @@ class Cells:
 
 
 def numbers_of(points: FloatArray, cell_m: float, origin: tuple[float, float] = (0.0, 0.0)) -> Int64Array:
-    """The number (n,) of the cell of each place (n, ≥ 2): one for every two whole numbers of cells north and east."""
+    """Return the number (n,) of the cell of each place (n, ≥ 2): one for every two whole numbers of cells north and
+    east.
+    """
     east, north = (np.floor((points[:, axis] - origin[axis]) / cell_m).astype(np.int64) for axis in (0, 1))
     return np.asarray((north << 32) + east, np.int64)
 
 
 def overlap_cells(strips: Sequence[Strip], rules: StripRules) -> Cells:
-    """Cells in which two strips or more have returns, thinned evenly to as many as are wanted."""
+    """Return cells in which two strips or more have returns, thinned evenly to as many as are wanted."""
     fine = rules.cell_m or _cell_for(strips)
     found = [_occupied(strip, fine) for strip in strips]
     numbers, strips_there = np.unique(np.concatenate([*found, np.zeros(0, np.int64)]), return_counts=True)
@@ -125,7 +127,7 @@ def _occupied(strip: Strip, cell_m: float) -> Int64Array:
 
 
 def _cell_for(strips: Sequence[Strip]) -> float:
-    """A side that holds enough returns of the thinnest strip, by the area that each covers in coarse cells."""
+    """Return a side that holds enough returns of the thinnest strip, by the area that each covers in coarse cells."""
     densities = [_density(strip) for strip in strips]
     least = min((one for one in densities if one > 0.0), default=4.0)
     return float(np.clip(math.sqrt(RETURNS_A_CELL / least), FINEST_CELL_M, COARSEST_CELL_M))
@@ -159,12 +161,12 @@ class Gathered:
 
 
 def blocks_of(strips: Sequence[Strip]) -> Iterator[tuple[int, StripBlock]]:
-    """All blocks of strips, each with its strip's index."""
+    """Return all blocks of strips, each with its strip's index."""
     return ((number, block) for number, strip in enumerate(strips) for block in strip.blocks())
 
 
 def gather(blocks: Iterable[tuple[int, StripBlock]], cells: Cells) -> Gathered:
-    """What lies in the cells, of blocks with the index of their strip."""
+    """Return what lies in the cells, of blocks with the index of their strip."""
     none = np.zeros(0, np.int64)
     pieces = [(none, none, np.zeros((0, 3)), none, np.zeros(0, np.int8))]
     for number, raw in blocks:

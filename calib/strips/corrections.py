@@ -188,11 +188,11 @@ class _Quadratic:
     observations: int
 
     def square(self, x: FloatArray) -> float:
-        """χ²."""
+        """Return χ²."""
         return float(self.constant - 2.0 * self.right @ x + x @ self.normal @ x)
 
     def of(self, basis: FloatArray) -> _Quadratic:
-        """χ² of parameters (u,) with x = basis · parameters."""
+        """Return χ² of parameters (u,) with x = basis · parameters."""
         return _Quadratic(basis.T @ self.normal @ basis, basis.T @ self.right, self.constant, self.observations)
 
 
@@ -239,7 +239,7 @@ class _Equations:
 
 
 def _reduced_square(found: Normals) -> float:
-    """Σ p w² with planes and tie points where they are best."""
+    """Return Σ p w² with planes and tie points where they are best."""
     features = (*found.planes, *found.ties)
     return found.square - sum(float(one.right @ one.inverse @ one.right) for one in features)
 
@@ -265,7 +265,7 @@ class _Solved:
 
     @classmethod
     def of(cls, quadratic: _Quadratic, columns: Int64Array) -> _Solved:
-        """Of some parameters, the others held at zero."""
+        """Make that of some parameters, the others held at zero."""
         known, axes = np.linalg.eigh(quadratic.normal[np.ix_(columns, columns)])
         taken = known > LEAST_KNOWN
         right = axes[:, taken].T @ quadratic.right[columns]
@@ -274,7 +274,7 @@ class _Solved:
         return cls(axes[:, taken] @ best, float(np.sum(known[taken] / (1.0 + known[taken]))), square, known, axes)
 
     def covariance(self) -> FloatArray:
-        """(u, u); 1 along axes that keep their prior."""
+        """Return (u, u); 1 along axes that keep their prior."""
         spread = np.where(self.known > LEAST_KNOWN, 1.0 / (1.0 + np.maximum(self.known, 0.0)), 1.0)
         covariance: FloatArray = self.axes * spread @ self.axes.T
         return covariance
@@ -330,7 +330,7 @@ class _Choice:
         return sorted(range(len(size)), key=lambda number: size[number])
 
     def solved(self, quadratic: _Quadratic) -> tuple[FloatArray, FloatArray, float]:
-        """(k, 6) corrections, their sigmas, and the number of parameters determined."""
+        """Return (k, 6) corrections, their sigmas, and the number of parameters determined."""
         basis = self._basis[:, self._taken(self.models)]
         found = _Solved.of(quadratic.of(basis), np.arange(basis.shape[1]))
         spread = np.sqrt(np.maximum(np.einsum("ia,ia->i", basis @ found.covariance(), basis), 0.0))
@@ -339,12 +339,12 @@ class _Choice:
         return x.reshape(-1, ERRORS), sigmas.reshape(-1, ERRORS), found.parameters
 
     def prior_sigmas(self) -> FloatArray:
-        """(k, 6) of the models chosen."""
+        """Return (k, 6) of the models chosen."""
         sigmas: FloatArray = np.sqrt(np.sum(self._basis[:, self._taken(self.models)] ** 2, axis=1))
         return sigmas.reshape(-1, ERRORS)
 
     def told(self, quadratic: _Quadratic) -> tuple[StripChoice, ...]:
-        """A strip each."""
+        """Return a strip each."""
         of_all = quadratic.of(self._basis)
         singly = len(self._keys) <= MOST_CHOSEN_SINGLY
         told = []
@@ -366,7 +366,7 @@ class _Choice:
         return tuple(notes)
 
     def _tried(self, of_all: _Quadratic, number: int) -> dict[str, float]:
-        """Criterion by model of one strip, the others as they are."""
+        """Return criterion by model of one strip, the others as they are."""
         found = {}
         for model in self._settings.models:
             models = [*self.models[:number], model, *self.models[number + 1 :]]
@@ -381,12 +381,12 @@ class _Choice:
         return float(fit + 2.0 * k + 2.0 * k * (k + 1.0) / max(n - k - 1.0, 1.0))
 
     def _taken(self, models: Sequence[str]) -> Int64Array:
-        """(u,) columns of the basis that these models have."""
+        """Return (u,) columns of the basis that these models have."""
         return np.concatenate([own[model] for own, model in zip(self._columns, models, strict=True)])
 
 
 def _basis(model: str, knots: int, settings: Settings) -> FloatArray:
-    """(6 knots, u) of one strip, each parameter in prior sigmas."""
+    """Return (6 knots, u) of one strip, each parameter in prior sigmas."""
     constant = np.repeat([settings.position_m, settings.turn_rad], 3)
     tau = np.linspace(-1.0, 1.0, knots)[:, np.newaxis]
     along, sigmas = [np.ones((knots, 1)), tau], [constant, 0.5 * constant]

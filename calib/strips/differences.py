@@ -66,7 +66,7 @@ class Checks:
         return np.asarray(self.normal[:, 2] >= GENTLE)
 
     def take(self, which: Any) -> Checks:
-        """Some rows."""
+        """Return some rows."""
         return Checks(*(getattr(self, name)[which] for name in self.__dataclass_fields__))
 
 
@@ -84,7 +84,7 @@ class Numbers:
 
     @classmethod
     def of(cls, values: FloatArray) -> Numbers:
-        """Of values (n,); nan where there is none."""
+        """Make that of values (n,); nan where there is none."""
         if not len(values):
             return cls(0, *([math.nan] * 6))
         size = np.abs(values)
@@ -143,7 +143,7 @@ class StripReport:
 
 
 def differences(flight: Flight, rules: StripRules | None = None) -> StripReport:
-    """Strips of a flight as its points are placed."""
+    """Return strips of a flight as its points are placed."""
     rules = rules or StripRules()
     strips = [FlightStrip(swath) for swath in flight.swaths]
     cells = overlap_cells(strips, rules)
@@ -151,7 +151,7 @@ def differences(flight: Flight, rules: StripRules | None = None) -> StripReport:
 
 
 def report_of(names: Sequence[str], gathered: Gathered, rules: StripRules, cell_m: float) -> StripReport:
-    """What the returns in the cells say."""
+    """Return what the returns in the cells say."""
     planes = _planes(gathered, rules, cell_m)
     checks, refused = _checks(gathered, planes)
     pairs = []
@@ -210,7 +210,7 @@ NARROWEST = 0.125  # of a cell: the least spread (one sigma) of a plane's return
 
 
 def _planes(gathered: Gathered, rules: StripRules, cell_m: float) -> _Planes:
-    """Least squares planes: the normal is the eigenvector of the smallest eigenvalue λ0 of the covariance."""
+    """Return least squares planes: the normal is the eigenvector of the smallest eigenvalue λ0 of the covariance."""
     key = np.stack([gathered.cell, gathered.strip])
     begin = np.flatnonzero(np.append(True, (np.diff(key, axis=1) != 0).any(axis=0))[: key.shape[1]])
     count = np.diff(np.append(begin, key.shape[1]))
@@ -235,7 +235,7 @@ def _planes(gathered: Gathered, rules: StripRules, cell_m: float) -> _Planes:
 
 
 def _checks(gathered: Gathered, planes: _Planes) -> tuple[Checks, Counter[str]]:
-    """A check point for every two strips that are planar in a cell."""
+    """Return a check point for every two strips that are planar in a cell."""
     refused: Counter[str] = Counter()
     none = np.zeros(0, np.int64)
     pieces = [_checks_of(gathered, planes, none, none, refused)]
@@ -280,7 +280,7 @@ def _checks_of(
 
 
 def _members(planes: _Planes, which: Int64Array) -> tuple[Int64Array, Int64Array]:
-    """The returns of some planes, plane after plane, and where each plane's begin among them."""
+    """Return the returns of some planes, plane after plane, and where each plane's begin among them."""
     count = planes.count[which]
     begins = np.cumsum(count) - count
     within = np.arange(int(count.sum())) - np.repeat(begins, count)
@@ -299,7 +299,7 @@ def _nearest(gathered: Gathered, planes: _Planes, which: Int64Array, places: Flo
 
 
 def _inside(gathered: Gathered, planes: _Planes, which: Int64Array, places: FloatArray) -> NDArray[np.bool_]:
-    """Whether places lie within the hulls of planes' returns: nowhere is half of the horizon free of them."""
+    """Return whether places lie within the hulls of planes' returns: nowhere is half of the horizon free of them."""
     if not len(which):
         return np.zeros(0, bool)
     members, begins = _members(planes, which)
@@ -314,7 +314,7 @@ def _inside(gathered: Gathered, planes: _Planes, which: Int64Array, places: Floa
 
 
 def _of_members(gathered: Gathered, planes: _Planes, which: Int64Array, values: FloatArray) -> FloatArray:
-    """(n,) means over planes' returns."""
+    """Return (n,) means over planes' returns."""
     if not len(which):
         return np.zeros(0)
     members, begins = _members(planes, which)
@@ -322,7 +322,7 @@ def _of_members(gathered: Gathered, planes: _Planes, which: Int64Array, values: 
 
 
 def _mean_ns(gathered: Gathered, planes: _Planes, which: Int64Array) -> Int64Array:
-    """(n,) mean times; relative to each plane's first return, for their digits."""
+    """Return (n,) mean times; relative to each plane's first return, for their digits."""
     starts = gathered.time_ns[planes.begin]
     after = (gathered.time_ns - np.repeat(starts, planes.count)).astype(np.float64)
     return np.asarray(starts[which] + np.rint(_of_members(gathered, planes, which, after)).astype(np.int64))

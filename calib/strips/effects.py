@@ -97,7 +97,7 @@ class SeenFrom:
 
     @classmethod
     def of(cls, flight: Flight) -> SeenFrom:
-        """A flight's."""
+        """Return a flight's."""
         rates = [
             0.0 if swath.encoder_rate is None or not len(swath) else float(np.median(np.abs(swath.encoder_rate[::97])))
             for swath in flight.swaths
@@ -107,7 +107,7 @@ class SeenFrom:
 
 
 def _rot_b_from_s(head: Head, swath: Swath) -> FloatArray:
-    """(3, 3) in the middle of a swath, where the mount moves."""
+    """Return (3, 3) in the middle of a swath, where the mount moves."""
     if isinstance(head.geometry, SpinningGeometry) or not len(swath):
         return np.eye(3)  # a head that spins has its own axis, and no angle that such a column is of
     turned: FloatArray = head.mount.poses(swath.time_ns[len(swath) // 2 :][:1])[0][0]
@@ -159,7 +159,7 @@ def error_columns(points_t: FloatArray, strip: Int64Array, time_ns: Int64Array, 
 def effect_columns(
     points_t: FloatArray, strip: Int64Array, time_ns: Int64Array, direction: FloatArray, seen: SeenFrom
 ) -> tuple[FloatArray, FloatArray]:
-    """How points move with effects, and with errors of their strip.
+    """Return how points move with effects, and with errors of their strip.
 
     Args:
         points_t: (n, 3) metres.

@@ -132,7 +132,7 @@ def signatures(
 
 
 def _known(checks: Checks, seen: SeenFrom) -> NDArray[np.bool_]:
-    """Rows of which both strips' trajectory is known."""
+    """Return rows of which both strips' trajectory is known."""
     known = np.ones(len(checks), bool)
     for strip, time_ns in ((checks.first, checks.point_ns), (checks.second, checks.centre_ns)):
         for number in np.unique(strip):
@@ -159,7 +159,7 @@ def assumed_prior(checks: Checks, seen: SeenFrom) -> TrajectoryPrior:
 
 
 def _spans(checks: Checks, seen: SeenFrom) -> list[tuple[int, int, int, int]]:
-    """(trajectory, number, begin, end) of stretches with checks; of several scanners at one time it is one."""
+    """Return (trajectory, number, begin, end) of stretches with checks; of several scanners at one time it is one."""
     strip = np.concatenate([checks.first, checks.second])
     time_ns = np.concatenate([checks.point_ns, checks.centre_ns])
     own = sorted(
@@ -217,7 +217,7 @@ def _design(checks: Checks, seen: SeenFrom, prior: TrajectoryPrior) -> tuple[Flo
 def _shares(
     prior: TrajectoryPrior, flown: Int64Array, time_ns: Int64Array
 ) -> tuple[tuple[Int64Array, FloatArray], tuple[Int64Array, FloatArray]]:
-    """The knots (n,) before and after each moment, and how much of each knot's error is there."""
+    """Return the knots (n,) before and after each moment, and how much of each knot's error is there."""
     before, after = np.zeros(len(time_ns), np.int64), np.zeros(len(time_ns), np.int64)
     for number in np.unique(flown):
         own, knots = flown == number, np.flatnonzero(prior.flown == number)
@@ -245,13 +245,13 @@ class _Fit:
         self.left_rms_m, self.variance_factor = math.nan, math.nan
 
     def sigmas(self, taken: Sequence[int]) -> FloatArray:
-        """(effects taken,) by the noise and the trajectory's errors alone."""
+        """Return (effects taken,) by the noise and the trajectory's errors alone."""
         if self._plain is None:
             self._plain = self._reduced(np.ones(len(self._values)))[0]
         return _roots_of_inverse(self._plain[np.ix_(taken, taken)])
 
     def solve(self, taken: Sequence[int]) -> tuple[FloatArray, FloatArray]:
-        """Values and sigmas (effects taken,), with Huber's weights and a variance factor where it is above 1."""
+        """Return values and sigmas (effects taken,), with Huber's weights and a variance factor where it is above 1."""
         huber = np.ones(len(self._values))
         design = self._design[:, taken]
         for _ in range(5):
@@ -286,7 +286,7 @@ class _Fit:
 
 
 def _roots_of_inverse(normal: FloatArray) -> FloatArray:
-    """Sigmas; inf of what nothing determines."""
+    """Return sigmas; inf of what nothing determines."""
     scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
     scaled = normal / np.outer(scale, scale)
     values, vectors = np.linalg.eigh(scaled)
@@ -295,7 +295,9 @@ def _roots_of_inverse(normal: FloatArray) -> FloatArray:
 
 
 def _worst_m(prior: TrajectoryPrior, seen: SeenFrom, edges: FloatArray) -> float:
-    """The largest sigma at the edge of an effect that is told: the attitude leaves some to the best of flights."""
+    """Return the largest sigma at the edge of an effect that is told: the attitude leaves some to the best of
+    flights.
+    """
     row = np.zeros((len(prior), ERRORS))
     for number in np.unique(prior.flown):
         own = prior.flown == number
@@ -309,7 +311,7 @@ def _worst_m(prior: TrajectoryPrior, seen: SeenFrom, edges: FloatArray) -> float
 
 
 def _choose(fit: _Fit, edges: FloatArray, worst_m: float) -> tuple[list[int], dict[int, str]]:
-    """The effects that the differences tell apart, and why not of the others."""
+    """Return the effects that the differences tell apart, and why not of the others."""
     taken: list[int] = []
     refused: dict[int, str] = {}
     for number, effect in enumerate(EFFECTS):

@@ -75,7 +75,7 @@ def judge(
     pulses_m2: float | None = None,
     rmse_z_m: float | None = None,
 ) -> tuple[Judged, ...]:
-    """Numbers against every USGS quality level and the ASPRS 2014 class that fits; None: not measured.
+    """Return numbers against every USGS quality level and the ASPRS 2014 class that fits; None: not measured.
 
     Args:
         overlap_rms_m: RMSDz between strips on slopes below 10°.
@@ -107,7 +107,7 @@ def _kept(measured: dict[str, float | None], limits: dict[str, float]) -> dict[s
 
 
 def _asprs(measured: dict[str, float | None]) -> Judged:
-    """The smallest class that is kept, or the largest there is.
+    """Return the smallest class that is kept, or the largest there is.
 
     Its limit within strips is one of the largest difference, which a repeatability (RMS) says nothing of.
     """
@@ -126,5 +126,5 @@ def _asprs(measured: dict[str, float | None]) -> Judged:
 
 
 def best_of(judged: Sequence[Judged]) -> str | None:
-    """The strictest USGS level that is kept."""
+    """Return the strictest USGS level that is kept."""
     return next((one.level for one in judged if one.standard == USGS and one.all_kept), None)

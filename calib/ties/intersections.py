@@ -73,13 +73,13 @@ class PatchFit:
     spacing_m: float
 
     def variance_at(self, point_t: FloatArray) -> float:
-        """m² of the plane's place along its normal at a point (3,) on it."""
+        """Return m² of the plane's place along its normal at a point (3,) on it."""
         off = self.axes[1:] @ (point_t - self.centre_t)
         return float(self.variance @ [1.0, off[0] ** 2, off[1] ** 2])
 
 
 def fit_patch(points_t: FloatArray, at: Int64Array, towards: FloatArray) -> PatchFit:
-    """Orthogonal least squares of points (n, 3), n > 3; the normal on the side of ``towards`` (3,)."""
+    """Return orthogonal least squares of points (n, 3), n > 3; the normal on the side of ``towards`` (3,)."""
     centre = points_t.mean(axis=0)
     off = points_t - centre
     squares, axes = np.linalg.eigh(off.T @ off)
@@ -98,7 +98,7 @@ def fit_patch(points_t: FloatArray, at: Int64Array, towards: FloatArray) -> Patc
 def meet(
     fits: Sequence[PatchFit], line: tuple[FloatArray, float, float] | None = None
 ) -> tuple[FloatArray, FloatArray]:
-    """Where three planes meet (3,), and its covariance (3, 3) m².
+    """Return where three planes meet (3,), and its covariance (3, 3) m².
 
     Args:
         fits: three planes; or two, with
@@ -116,7 +116,7 @@ def meet(
 
 
 def find_ties(flight: Flight, planes: Features, settings: TieSettings = _DEFAULT) -> Features:
-    """Ridges and corners of planes that several swaths saw.
+    """Return ridges and corners of planes that several swaths saw.
 
     Args:
         flight: with points.
@@ -160,7 +160,7 @@ class _Search:
                 yield first, second
 
     def ridges(self) -> Iterator[TiePoint]:
-        """Points on the lines in which two planes meet."""
+        """Yield points on the lines in which two planes meet."""
         for first, second in self._pairs():
             if abs(self._planes[first].normal_t @ self._planes[second].normal_t) > np.cos(
                 self._settings.least_angle_rad
@@ -219,7 +219,7 @@ class _Search:
         return (float(low), float(high)) if high > low else None
 
     def corners(self) -> Iterator[TiePoint]:
-        """Points in which three planes meet, each two of which meet in a line too; after `ridges`."""
+        """Yield points in which three planes meet, each two of which meet in a line too; after `ridges`."""
         beside: dict[int, set[int]] = {}
         for first, second in self._meeting:
             if self._meeting[first, second]:

@@ -131,7 +131,7 @@ def _tie(
     settings: MarkingSettings,
     refused: Counter[str],
 ) -> TiePoint | None:
-    """The square's centre where the best swath has it, and where the others have what looks like it."""
+    """Return the square's centre where the best swath has it, and where the others have what looks like it."""
     centre = grid.centre(number)
     smooth_m = max(settings.smooth_m, *(0.8 / np.sqrt(square.density) for square in seen.values()))
     images = {i: _image(flight.swaths[i], returns[i], seen[i], centre, float(smooth_m), settings) for i in seen}
@@ -182,7 +182,7 @@ def _image(
     smooth_m: float,
     settings: MarkingSettings,
 ) -> Image:
-    """Mean intensities of cells, weighted by distance: of the square and what the search needs around it."""
+    """Return mean intensities of cells, weighted by distance: of the square and what the search needs around it."""
     points = np.asarray(swath.points_t[at])
     on_ground = np.abs(points[:, 2] - square.heights_at(points[:, :2])) <= 5.0 * settings.rms_m
     points, intensity = points[on_ground], swath.rows["intensity"][at][on_ground].astype(np.float64)
@@ -198,7 +198,7 @@ def _image(
 
 
 def _spread(place: FloatArray, values: FloatArray, side: int) -> tuple[FloatArray, FloatArray]:
-    """(side, side) sums of values (n,) and of ones, each shared among the four cells about its place (n, 2).
+    """Return (side, side) sums of values (n,) and of ones, each shared among the four cells about its place (n, 2).
 
     Shared linearly, so that where a pattern of scan lines falls in the cells does not move the image.
     """
@@ -255,7 +255,7 @@ def shifted(image: Image, other: Image, settings: MarkingSettings) -> Shift | st
 
 
 def there_and_back(image: Image, other: Image, settings: MarkingSettings) -> Shift | str:
-    """The shift, where that of the other image's middle is the same the other way."""
+    """Return the shift, where that of the other image's middle is the same the other way."""
     there, back = shifted(image, other, settings), shifted(other, image, settings)
     if isinstance(there, str) or isinstance(back, str):
         return there if isinstance(there, str) else str(back)
@@ -280,7 +280,9 @@ def _correlations(template: FloatArray, image: FloatArray) -> FloatArray:
 
 
 def _surface(values: FloatArray) -> FloatArray:
-    """(6,) of 1, x, y, x², xy, y² through (3, 3) values by least squares; x to the east, y to the north, in cells."""
+    """Return (6,) of 1, x, y, x², xy, y² through (3, 3) values by least squares; x to the east, y to the north, in
+    cells.
+    """
     y, x = (axis.ravel().astype(np.float64) for axis in np.mgrid[-1:2, -1:2])
     design = np.stack([np.ones(9), x, y, x * x, x * y, y * y], axis=1)
     solved: FloatArray = np.linalg.lstsq(design, values.ravel(), rcond=None)[0]
@@ -288,7 +290,7 @@ def _surface(values: FloatArray) -> FloatArray:
 
 
 def _away(correlation: FloatArray, row: int, column: int, settings: MarkingSettings) -> float:
-    """The greatest correlation beyond a metre from the peak."""
+    """Return the greatest correlation beyond a metre from the peak."""
     rows, columns = np.indices(correlation.shape)
     far = np.hypot(rows - row, columns - column) * settings.cell_m > max(1.0, 3.0 * settings.smooth_m)
     return float(np.max(correlation[far], initial=-1.0))
@@ -304,20 +306,20 @@ class Grid:
     rows: int
 
     def number(self, points_t: FloatArray) -> IndexArray:
-        """(n,) of the squares points (n, ≥ 2) lie in; −1: nan."""
+        """Return (n,) of the squares points (n, ≥ 2) lie in; −1: nan."""
         placed = np.isfinite(points_t[:, 0])
         away = np.where(placed[:, np.newaxis], points_t[:, :2], self.corner_t) - self.corner_t
         column, row = np.floor(away / self.side_m).astype(np.int64).T
         return np.where(placed, row * self.columns + column, -1)
 
     def centre(self, number: int) -> FloatArray:
-        """(2,) east and north."""
+        """Return (2,) east and north."""
         row, column = divmod(number, self.columns)
         centre: FloatArray = self.corner_t + self.side_m * (np.array([column, row]) + 0.5)
         return centre
 
     def around(self, number: int) -> list[int]:
-        """A square and its neighbours."""
+        """Return a square and its neighbours."""
         row, column = divmod(number, self.columns)
         return [
             r * self.columns + c
@@ -381,7 +383,7 @@ def grid_of(flight: Flight, side_m: float) -> Grid | None:
 
 
 def squares_of(swath: Swath, grid: Grid, least_density: float) -> Iterator[Square]:
-    """Those in which a swath has returns enough."""
+    """Yield those in which a swath has returns enough."""
     count = grid.columns * grid.rows
     sums = np.zeros((12, count))  # 1 x y z xx xy yy xz yz zz, intensity and its square
     for begin in range(0, len(swath), CHUNK):
@@ -407,7 +409,7 @@ def squares_of(swath: Swath, grid: Grid, least_density: float) -> Iterator[Squar
 
 
 def _square(number: int, grid: Grid, sums: FloatArray) -> Square | None:
-    """Plane and contrast of a square from its sums (12,)."""
+    """Return plane and contrast of a square from its sums (12,)."""
     n, x, y, z, xx, xy, yy, xz, yz, zz, i, ii = (float(value) for value in sums)
     normal = np.array([[n, x, y], [x, xx, xy], [y, xy, yy]])
     if np.linalg.cond(normal / n) > 1e4:

@@ -61,7 +61,7 @@ _DEFAULT = PickedSettings()
 
 
 def read_picked(text: str, name: str) -> tuple[Picked, ...]:
-    """A CSV with the columns name, strip, x, y, z, sigma_m; coordinates in the flight's CRS.
+    """Return a CSV with the columns name, strip, x, y, z, sigma_m; coordinates in the flight's CRS.
 
     Args:
         text: of the file.
@@ -168,7 +168,7 @@ def _swath(flight: Flight, one: Picked) -> int:
 
 
 def _nearest(swath: Swath, place_t: FloatArray, within_m: float) -> tuple[int, float]:
-    """The return nearest to a place, and how far it is; inf where none is about."""
+    """Return the return nearest to a place, and how far it is; inf where none is about."""
     best, least = -1, math.inf
     for begin in range(0, len(swath), CHUNK):
         off = np.asarray(swath.points_t[begin : begin + CHUNK]) - place_t

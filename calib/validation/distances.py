@@ -72,7 +72,7 @@ class Rows:
         return len(self.value_m)
 
     def take(self, which: Any) -> Rows:
-        """Some of them, evenly drawn where they are more than can be tested together."""
+        """Return some of them, evenly drawn where they are more than can be tested together."""
         at = np.flatnonzero(which)
         if len(at) > MOST_ROWS:
             at = np.sort(np.random.default_rng(6_8).choice(at, MOST_ROWS, replace=False))
@@ -93,7 +93,8 @@ class Rows:
         )
 
     def independent(self, which: Any) -> NDArray[np.bool_]:
-        """(n,) of the distances chosen those that tell something beyond the others: k sights of a plane have k − 1.
+        """Return (n,) of the distances chosen those that tell something beyond the others: k sights of a plane have k
+        − 1.
 
         Those whose sights are surest stay; any others are sums and differences of them.
         """
@@ -120,7 +121,7 @@ class Rows:
         return chosen
 
     def covariance(self) -> FloatArray:
-        """(n, n) that is expected, m²."""
+        """Return (n, n) that is expected, m²."""
         expected: FloatArray = np.diag(self.noise_m**2) + self.shared @ self.shared.T
         if self.local is not None:
             expected = expected + (self.local @ self.local.T).toarray()
@@ -129,7 +130,7 @@ class Rows:
         return expected + self.floor_m**2 * self.floor_pattern()
 
     def floor_pattern(self) -> FloatArray:
-        """(n, n) what the covariance gains by a square metre of the floor."""
+        """Return (n, n) what the covariance gains by a square metre of the floor."""
         if self.floor is None:
             return np.zeros((len(self), len(self)))
         pattern: FloatArray = (self.floor @ self.floor.T).toarray()
@@ -168,7 +169,7 @@ def estimated_floor_m(rows: Rows) -> float:
 
 
 def _scaled(effects: FloatArray) -> FloatArray:
-    """Columns (n, m) of length 1, without those that are zero."""
+    """Return columns (n, m) of length 1, without those that are zero."""
     length = np.linalg.norm(effects, axis=0)
     scaled: FloatArray = effects[:, length > 0.0] / length[length > 0.0]
     return scaled
@@ -189,7 +190,7 @@ class _Sight:
 def plane_rows(
     flight: Flight, features: Features, calibrations: Mapping[str, Calibration], prior: TrajectoryPrior
 ) -> Rows:
-    """Every two swaths on every plane: the mean of the one's returns from the other's plane.
+    """Return every two swaths on every plane: the mean of the one's returns from the other's plane.
 
     Args:
         flight: with points.
@@ -252,8 +253,10 @@ def _sight(flight: Flight, plane: Plane, number: int) -> _Sight | None:
 
 
 def _noise(firsts: Sequence[_Sight], seconds: Sequence[_Sight], sights: Int64Array, walked_m: FloatArray) -> Any:
-    """Sparse (n, sights · 4): of each sight its place along the normal, and the turn of its plane, by which the place
-    grows unsure where the other's returns lie off its middle; walked_m (n, 2) of what attitude does between knots."""
+    """Return sparse (n, sights · 4): of each sight its place along the normal, and the turn of its plane, by which the
+    place grows unsure where the other's returns lie off its middle; walked_m (n, 2) of what attitude does between
+    knots.
+    """
     moved = np.zeros((len(firsts), 2, 4))
     for row, (first, second) in enumerate(zip(firsts, seconds, strict=True)):
         away = first.plane.centre_t - second.plane.centre_t
@@ -268,7 +271,7 @@ def _noise(firsts: Sequence[_Sight], seconds: Sequence[_Sight], sights: Int64Arr
 
 
 def _floor(sights: Int64Array) -> Any:
-    """Sparse (n, sights) of `Rows.floor`: first less second, each with its share of a distance's."""
+    """Return sparse (n, sights) of `Rows.floor`: first less second, each with its share of a distance's."""
     row = np.repeat(np.arange(len(sights)), 2)
     shape = len(sights), int(sights.max(initial=-1)) + 1
     return sparse.csr_array((np.tile([HALF, -HALF], len(sights)), (row, sights.reshape(-1))), shape=shape)
@@ -281,7 +284,7 @@ def control_rows(
     rules: ControlRules,
     prior: TrajectoryPrior,
 ) -> Rows:
-    """Every swath at every control point: the swath above the point; arguments as of `plane_rows`."""
+    """Return every swath at every control point: the swath above the point; arguments as of `plane_rows`."""
     grounds, _ = grounds_at(flight, points, rules)
     grounds = [one for one in grounds if abs(one.above_m) < FAR_M]
     sights = [_sight_of_ground(flight, one) for one in grounds]
@@ -363,7 +366,7 @@ def _by_knots(
     times: Int64Array,
     prior: TrajectoryPrior,
 ) -> tuple[Any, FloatArray]:
-    """``knots`` and ``walk_m`` of `_Moved`: a body at x that sees p has n · (δx + δθ × (p − x)) along n."""
+    """Return ``knots`` and ``walk_m`` of `_Moved`: a body at x that sees p has n · (δx + δθ × (p − x)) along n."""
     flown = np.array([flight.swaths[one].flown for one in strip], np.int64)
     moved, walk = np.zeros((len(places), ERRORS)), np.zeros(len(places))
     row, column, value = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], [np.zeros(0)]
@@ -388,7 +391,7 @@ def _by_knots(
 
 
 def _root(calibration: Calibration) -> FloatArray:
-    """(effects, effects) whose square is the covariance of the effects' parameters; zero where held fixed."""
+    """Return (effects, effects) whose square is the covariance of the effects' parameters; zero where held fixed."""
     at = [INDEX[effect.parameter] for effect in EFFECTS]
     values, vectors = np.linalg.eigh(calibration.covariance()[np.ix_(at, at)])
     root: FloatArray = vectors * np.sqrt(np.maximum(values, 0.0))

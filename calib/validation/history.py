@@ -99,7 +99,7 @@ class Compared:
 
 
 def compare(earlier: Calibration, later: Calibration, names: Sequence[str] | None = None) -> Compared:
-    """Differences of two calibrations whose errors are independent.
+    """Return differences of two calibrations whose errors are independent.
 
     Args:
         earlier, later: of one scanner.
@@ -178,7 +178,7 @@ class History:
         return any(step.moved for step in self.steps) or any(trend.p < ALPHA for trend in self.trends)
 
     def table(self) -> list[dict[str, Any]]:
-        """A row a calibration: id, time, method, and the boresight with its sigmas, degrees."""
+        """Return a row a calibration: id, time, method, and the boresight with its sigmas, degrees."""
         rows = []
         for entry, time in zip(self.entries, self.times, strict=True):
             row: dict[str, Any] = {"id": entry.id, "created": _date(time), "method": entry.method}
@@ -213,7 +213,7 @@ class History:
 
 
 def history(calibrations: Sequence[Calibration]) -> tuple[History, ...]:
-    """One history a scanner and installation, of calibrations in any order.
+    """Return one history a scanner and installation, of calibrations in any order.
 
     What was never estimated (``method = "nominal"``) has no sigmas and is listed, but not tested.
 
@@ -299,7 +299,8 @@ def _date(time_s: float) -> str:
 
 
 def difference_between(one: Calibration, other: Calibration, sigma_rad: float) -> str:
-    """What differs by more than a part of the sigma of the angles that are compared, in words; empty: nothing does.
+    """Return what differs by more than a part of the sigma of the angles that are compared, in words; empty: nothing
+    does.
 
     What both estimated differs as its sigmas say, and the angles' sigmas have it. What a file leaves unsaid is none.
     """
@@ -331,7 +332,7 @@ def _differences(one: Calibration, other: Calibration, limit_rad: float) -> Iter
 
 
 def _ibrc_apart_m(one: Calibration, other: Calibration) -> float:
-    """The most that corrections by intensity differ by; no table corrects nothing."""
+    """Return the most that corrections by intensity differ by; no table corrects nothing."""
     tables = [table for table in (one.ibrc, other.ibrc) if table is not None]
     if not tables:
         return 0.0

@@ -204,7 +204,7 @@ class Validation:
         return f"the calibration holds{alone}: {could}{self._unseen()}"
 
     def _unseen(self) -> str:
-        """What errors would not have been seen, in words."""
+        """Return what errors would not have been seen, in words."""
         found = self.detectable
         several = len({one.scanner for one in found}) > 1
         below = [f"{one.scanner} {one.words}" if several else one.words for one in found if one.seen]
@@ -281,7 +281,7 @@ def with_sigmas(flight: Flight) -> Flight:
 
 
 def _undone(flight: Flight, validation: Validation, found: Mapping[str, Method], asked: Asked) -> tuple[str, ...]:
-    """What was asked for and could not be done, a line each."""
+    """Return what was asked for and could not be done, a line each."""
     lines = []
     if asked.control is not None and found["testfield"].passed is None:
         lines.append(f"control: {_why(found['testfield'])}")
@@ -303,7 +303,7 @@ def _why(method: Method) -> str:
 
 
 def same_logs(calibration: Calibration, logs: Sequence[tuple[str, str]]) -> tuple[str, ...]:
-    """Sentences where logs (name, SHA-256) are those that a calibration was made of."""
+    """Return sentences where logs (name, SHA-256) are those that a calibration was made of."""
     used = {entry.get("sha256", ""): entry.get("name", "") for entry in calibration.header.get("logs", [])}
     return tuple(
         f"{name}: calibration {calibration.id} was made of this log; this is no independent validation of it"
@@ -316,7 +316,7 @@ def same_logs(calibration: Calibration, logs: Sequence[tuple[str, str]]) -> tupl
 
 
 def _classes(flight: Flight, rows: Rows) -> dict[str, NDArray[np.bool_]]:
-    """Which rows belong to which method."""
+    """Return which rows belong to which method."""
     headings, heights = _flown_so(flight)
     first, second = rows.first, rows.second
     if not len(rows):
@@ -334,7 +334,7 @@ def _classes(flight: Flight, rows: Rows) -> dict[str, NDArray[np.bool_]]:
 
 
 def _flown_so(flight: Flight) -> tuple[FloatArray, FloatArray]:
-    """(swaths,) headings, degrees, and heights above their points, metres."""
+    """Return (swaths,) headings, degrees, and heights above their points, metres."""
     headings, heights = np.zeros(len(flight.swaths)), np.ones(len(flight.swaths))
     for number, swath in enumerate(flight.swaths):
         if not len(swath):
@@ -360,7 +360,8 @@ def _of_rows(name: str, every: Rows, which: NDArray[np.bool_]) -> Method:
 
 
 def distance_tests(rows: Rows) -> tuple[Test, ...]:
-    """χ² of values with their expected covariance, z of their mean (generalised least squares), tests of effects.
+    """Return χ² of values with their expected covariance, z of their mean (generalised least squares), tests of
+    effects.
 
     Of n values none of which follows from others χ² = dᵀ C⁻¹ d has n degrees of freedom;
     mean = (1ᵀ C⁻¹ d) / (1ᵀ C⁻¹ 1), z = mean · √(1ᵀ C⁻¹ 1).
@@ -381,7 +382,7 @@ def distance_tests(rows: Rows) -> tuple[Test, ...]:
 
 
 def _effects_tests(values: FloatArray, effects: FloatArray) -> tuple[Test, Test]:
-    """χ² of what whitened effects (n, m) explain of whitened values (n,), and z of the one that fits best."""
+    """Return χ² of what whitened effects (n, m) explain of whitened values (n,), and z of the one that fits best."""
     length = np.linalg.norm(effects, axis=0)
     seen = np.flatnonzero(length > 1e-9 * length.max())
     unit = effects[:, seen] / length[seen]

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 def describe_driver(driver: Driver) -> dict[str, Any]:
-    """A driver as plain values, the form of ``--json``."""
+    """Return a driver as plain values, the form of ``--json``."""
     return {
         "protocol": driver.protocol,
         "kind": driver.kind,

@@ -104,7 +104,7 @@ def command(
 
 
 def calibrations_given(given: list[str]) -> dict[str, tuple[str, str]]:
-    """Text and name of each file, by the scanner that is named, or else the one that the file names."""
+    """Return text and name of each file, by the scanner that is named, or else the one that the file names."""
     found: dict[str, tuple[str, str]] = {}
     for entry in given:
         named, equals, rest = entry.partition("=")

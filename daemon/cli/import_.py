@@ -96,7 +96,7 @@ def _import(config: Config, routes: Routes, captures: list[Capture], output: Pat
 
 
 def _by_source(texts: Sequence[str] | None, parse: Callable[[str], ValueT]) -> dict[str, ValueT]:
-    """``SOURCE=value`` or ``value`` for all."""
+    """Return ``SOURCE=value`` or ``value`` for all."""
     found: dict[str, ValueT] = {}
     for text in texts or ():
         source, _, value = text.rpartition("=")
@@ -108,7 +108,7 @@ def _by_source(texts: Sequence[str] | None, parse: Callable[[str], ValueT]) -> d
 
 
 def _time_ns(text: str) -> int:
-    """ISO 8601 with Z or an offset, or seconds since 1970 with up to nine decimals."""
+    """Return ISO 8601 with Z or an offset, or seconds since 1970 with up to nine decimals."""
     whole, _, fraction = text.partition(".")
     if whole.isdecimal() and len(whole) <= 10 and (not fraction or (fraction.isdecimal() and len(fraction) <= 9)):
         return int(whole) * 1_000_000_000 + int(fraction.ljust(9, "0"))

@@ -175,7 +175,7 @@ def _teller(console: Console, manager: Any, *, as_json: bool) -> Iterator[Callab
 
 
 def page(found: dict[str, Any]) -> Group:
-    """What stands on the terminal."""
+    """Return what stands on the terminal."""
     from rich.console import Group, RenderableType
     from rich.table import Table
     from rich.text import Text

@@ -102,7 +102,9 @@ def _callback(
 
 @functools.cache
 def make_app(name: str | None) -> typer.Typer:
-    """The application, its commands imported: the one of this name, or all; what is heavy they import as they run."""
+    """Return the application, its commands imported: the one of this name, or all; what is heavy they import as they
+    run.
+    """
     made = typer.Typer(name="swath", help=HELP, epilog=EPILOG, add_completion=False, rich_markup_mode="markdown")
     made.callback(help=HELP, epilog=EPILOG)(_callback)
     for listed in COMMANDS:
@@ -153,7 +155,7 @@ def _drop_output() -> None:
 
 
 def _end_unforeseen(error: Exception) -> int:
-    """A usage error of the argument parser, an abort, an I/O error, or a defect of ours."""
+    """Return a usage error of the argument parser, an abort, an I/O error, or a defect of ours."""
     format_message = getattr(error, "format_message", None)  # its class moved between versions of typer
     if callable(format_message):
         message = " ".join(str(format_message()).split())

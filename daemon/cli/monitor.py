@@ -78,7 +78,7 @@ def _once(monitor: Monitor, as_json: bool) -> str:
 
 
 def page(found: dict[str, Any]) -> Group:
-    """What stands on the terminal."""
+    """Return what stands on the terminal."""
     from rich.console import Group, RenderableType
     from rich.table import Table
     from rich.text import Text

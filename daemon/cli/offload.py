@@ -83,7 +83,7 @@ def _print(report: OffloadReport, verify: bool) -> None:
 
 
 def _sizes(paths: Sequence[Path]) -> dict[Path, int]:
-    """Bytes of the files that are still there."""
+    """Return bytes of the files that are still there."""
     sizes: dict[Path, int] = {}
     for path in paths:
         with contextlib.suppress(FileNotFoundError):

@@ -13,7 +13,7 @@ Tell = Callable[[str, int, int], None]  # what is done, how much, of how much
 
 
 def transfer_bar() -> Progress:
-    """What is done, how far, how fast, and the time remaining; gone when it is over."""
+    """Return what is done, how far, how fast, and the time remaining; gone when it is over."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
 

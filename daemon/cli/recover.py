@@ -58,7 +58,7 @@ def command(
 
 
 def _files(paths: list[Path], output: Path | None) -> list[Path]:
-    """The files named, and those of directories that may need it."""
+    """Return the files named, and those of directories that may need it."""
     from swath.daemon.log.claim import is_being_written
     from swath.daemon.log.reader import RECOVERED
 

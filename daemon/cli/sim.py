@@ -167,7 +167,7 @@ def _fly_into_log(console: Console, wish: FlightOptions, output: Path, *, with_t
 def _make_log(
     console: Console, wish: FlightOptions, folder: FlightFolder, *, with_truth: bool
 ) -> tuple[SimReport, list[str]]:
-    """Everything of a flight, in the folder's place out of sight."""
+    """Return everything of a flight, in the folder's place out of sight."""
     from swath.daemon.config import load_config
     from swath.daemon.simulate.into_log import fly_into_log, sim_session_info
     from swath.daemon.simulate.plans import configuration, make_flight
@@ -267,7 +267,7 @@ def _fly_on_wires(
 
 
 def _make_wires(console: Console, plan: Any, facts: FlightFacts, folder: Path | None) -> Path:
-    """A folder with ports, FIFOs and the configuration that records from them."""
+    """Return a folder with ports, FIFOs and the configuration that records from them."""
     from swath.daemon.simulate.on_wires import own_wires
     from swath.daemon.simulate.plans import configuration
 

@@ -95,7 +95,7 @@ def command(
 
 
 def _unusable(session: dict[str, Any]) -> list[str]:
-    """What is said of legs that are not to be used."""
+    """Return what is said of legs that are not to be used."""
     return [
         one_line(leg["verdict"]["sentence"]) for leg in session.get("legs", []) if leg["verdict"]["level"] == "unusable"
     ]

@@ -46,7 +46,7 @@ MIN_BASELINE_M = 0.1  # a shorter one tells no heading
 
 
 def check_devices(config: Config) -> list[str]:
-    """All findings of a configuration whose types are right."""
+    """Return all findings of a configuration whose types are right."""
     lines: list[str] = []
     lines += _check_directory(config)
     lines += _check_pps(config)
@@ -73,7 +73,7 @@ def _check_pps(config: Config) -> Iterator[str]:
 
 
 def _check_files(config: Config) -> Iterator[str]:
-    """Files named must be there; two DBC files of one name would be one attachment."""
+    """Yield files named must be there; two DBC files of one name would be one attachment."""
     dbc_of: dict[str, tuple[str, Path]] = {}
     for kind, name, table in config.device_tables():
         for file_key, path in config.files_of(table).items():
@@ -175,7 +175,7 @@ def _check_needs(section: str, table: DeviceTable, driver: Driver) -> Iterator[s
 
 
 def _described(model: type[BaseModel], key: str) -> str | None:
-    """What is said of a key, ``geometry.file`` of an inner table's."""
+    """Return what is said of a key, ``geometry.file`` of an inner table's."""
     first, _, rest = key.partition(".")
     field = model.model_fields[first]
     if not rest:
@@ -210,7 +210,7 @@ def _check_transport(config: Config, section: str, table: DeviceTable, driver: D
 
 
 def check_antennas(section: str, table: GnssConfig) -> Iterator[str]:
-    """What is wrong with the places of a receiver's two antennas."""
+    """Yield what is wrong with the places of a receiver's two antennas."""
     if table.secondary_lever_arm_m is None:
         return
     length_m = float(np.linalg.norm(np.subtract(table.secondary_lever_arm_m, table.lever_arm_m)))
@@ -232,7 +232,7 @@ def _check_rotations(section: str, table: DeviceTable) -> Iterator[str]:
 
 
 def rotation_problem(rows: list[list[float]]) -> str | None:
-    """Why three rows are not a proper rotation matrix; None when they are."""
+    """Return why three rows are not a proper rotation matrix; None when they are."""
     matrix = np.array(rows, dtype=np.float64)
     lengths = np.linalg.norm(matrix, axis=1)
     for row in range(3):
@@ -246,7 +246,7 @@ def rotation_problem(rows: list[list[float]]) -> str | None:
 
 
 def _check_gimbal(config: Config, name: str, table: ScannerConfig) -> Iterator[str]:
-    """Who tells a stage's angles must be there; whether it can, is seen when they are used."""
+    """Yield who tells a stage's angles must be there; whether it can, is seen when they are used."""
     sources = [f"gnss/{one}" for one in config.gnss] + [f"imu/{one}" for one in config.imu]
     for number, stage in enumerate(table.gimbal.stages if table.gimbal is not None else []):
         if stage.source is not None and stage.source not in sources:
@@ -264,7 +264,7 @@ def _check_calibration(config: Config, name: str, table: ScannerConfig) -> Itera
 
 
 def _check_wires(config: Config) -> Iterator[str]:
-    """Two sources on one port or device: one would take the other's bytes."""
+    """Yield two sources on one port or device: one would take the other's bytes."""
     wires: list[tuple[str, TransportSpec]] = list(_wires(config))
     for index, (key, spec) in enumerate(wires):
         for other_key, other in wires[:index]:
@@ -288,7 +288,7 @@ def _wires(config: Config) -> Iterator[tuple[str, TransportSpec]]:
 
 
 def same_wire(one: TransportSpec, other: TransportSpec) -> bool:
-    """Whether two transports would open the same port or device.
+    """Return whether two transports would open the same port or device.
 
     UDP ports are one where the addresses (or groups) are equal or either is the wildcard; devices where their real
     paths are, also a serial CAN adapter's; a CAN bus where interface and channel are.
@@ -308,7 +308,7 @@ def _udp_address(spec: TransportSpec) -> str:
 
 
 def _device_path(spec: TransportSpec) -> str | None:
-    """The real path of a device file, behind symbolic links; None where the transport is none."""
+    """Return the real path of a device file, behind symbolic links; None where the transport is none."""
     path = spec.channel if spec.kind == "can" else spec.address
     is_path = spec.kind == "serial" or (spec.kind == "can" and path.startswith("/"))
     return os.path.realpath(path) if is_path else None
@@ -324,7 +324,7 @@ def _wire_name(spec: TransportSpec) -> str:
 
 
 def check_calibration(path: Path, scanner: str, table: ScannerConfig) -> Iterator[str]:
-    """Findings of a calibration file for the scanner of that name: what is wrong, what would be right."""
+    """Yield findings of a calibration file for the scanner of that name: what is wrong, what would be right."""
     try:
         document = toml_tables(decoded(path.read_bytes()))
     except UnicodeDecodeError as error:

@@ -129,11 +129,11 @@ class Config:
         return self.tables.output
 
     def resolve(self, name: str) -> Path:
-        """A path of the file: relative ones are relative to the file."""
+        """Return a path of the file: relative ones are relative to the file."""
         return (self.path.parent / name).absolute()
 
     def device_tables(self) -> Iterator[tuple[DeviceKind, str, DeviceTable]]:
-        """(kind, name, table) of every device, in the order of the kinds and of the file."""
+        """Yield (kind, name, table) of every device, in the order of the kinds and of the file."""
         for name, gnss in self.gnss.items():
             yield "gnss", name, gnss
         for name, imu in self.imu.items():
@@ -144,11 +144,11 @@ class Config:
             yield "corrections", name, corrections
 
     def files_of(self, table: DeviceTable) -> dict[FileKey, Path]:
-        """The files a device's table names, by key."""
+        """Return the files a device's table names, by key."""
         return {key: self.resolve(name) for key, name in _names_of(table).items()}
 
     def settings_of(self, kind: DeviceKind, name: str, table: DeviceTable) -> DeviceSettings:
-        """What the parser of a device is made with; reads its files.
+        """Return what the parser of a device is made with; reads its files.
 
         Raises:
             OSError: a file cannot be read.
@@ -158,7 +158,7 @@ class Config:
         return DeviceSettings(f"{kind}/{name}", plain_table(table), contents)
 
     def devices(self) -> Iterator[DeviceEntry]:
-        """Every device: GNSS, IMU, scanners, corrections, in the order of the file."""
+        """Yield every device: GNSS, IMU, scanners, corrections, in the order of the file."""
         for kind, name, table in self.device_tables():
             auxiliary = table.auxiliary if isinstance(table, ScannerConfig) else None
             yield DeviceEntry(
@@ -173,7 +173,7 @@ class Config:
             )
 
     def attachments(self) -> list[tuple[str, str, bytes]]:
-        """What goes into every log: (name, media type, bytes); names as in the log format's page."""
+        """Return what goes into every log: (name, media type, bytes); names as in the log format's page."""
         found = [("config.toml", "application/toml", self.text.encode())]
         for _, name, table in self.device_tables():
             for key, path in self.files_of(table).items():
@@ -202,12 +202,12 @@ def _names_of(table: DeviceTable) -> dict[FileKey, str]:
 
 
 def plain_table(table: DeviceTable) -> dict[str, Any]:
-    """A device's table as plain values, defaults filled in."""
+    """Return a device's table as plain values, defaults filled in."""
     return table.model_dump()
 
 
 def attachment_name(key: FileKey, device: str, path: Path) -> str:
-    """What a device's file is called in a log."""
+    """Return what a device's file is called in a log."""
     if key == "dbc":
         return f"dbc/{path.name}"
     suffix = path.suffix if key == "geometry" else ".toml"

@@ -93,7 +93,7 @@ def validate(table: Mapping[str, Any], path: Path, text: str) -> Config:
 
 
 def describe(details: ErrorDetails, tables: type[BaseModel] = Tables) -> str:
-    """One line of one finding of the models: key path, what was got, what would be right.
+    """Return one line of one finding of the models: key path, what was got, what would be right.
 
     Args:
         details: the finding.
@@ -115,7 +115,7 @@ def describe(details: ErrorDetails, tables: type[BaseModel] = Tables) -> str:
 
 
 def shown(value: object) -> str:
-    """A value as it stands in the file, shortened."""
+    """Return a value as it stands in the file, shortened."""
     if isinstance(value, Mapping):
         return "a table"
     text = json.dumps(value, ensure_ascii=False, default=str)
@@ -174,7 +174,7 @@ def _wanted_of_field(field: FieldInfo | None) -> str:
 
 
 def _bounds(field: FieldInfo | None) -> str:
-    """``>= 1 and <= 60``, from the field's own metadata."""
+    """Return ``>= 1 and <= 60``, from the field's own metadata."""
     if field is None:
         return ""
     parts = []
@@ -187,7 +187,7 @@ def _bounds(field: FieldInfo | None) -> str:
 
 
 def _model_in(annotation: object) -> type[BaseModel] | None:
-    """The model in ``M``, ``M | None``, ``dict[str, M]``, ``list[M]``."""
+    """Return the model in ``M``, ``M | None``, ``dict[str, M]``, ``list[M]``."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
     if get_origin(annotation) in (dict, list, Union, UnionType, Annotated):
@@ -202,7 +202,7 @@ def _is_named(annotation: object) -> bool:
 
 
 def _walk(location: Sequence[int | str], tables: type[BaseModel]) -> tuple[type[BaseModel] | None, FieldInfo | None]:
-    """The innermost model on the way to a location, and the last field passed."""
+    """Return the innermost model on the way to a location, and the last field passed."""
     model: type[BaseModel] | None = tables
     field: FieldInfo | None = None
     skip = False

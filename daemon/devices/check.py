@@ -50,11 +50,11 @@ class Span:
     _ends_s: float = field(default=math.inf, init=False)
 
     def is_over(self) -> bool:
-        """Whether nobody listens any more."""
+        """Return whether nobody listens any more."""
         return self.stop.is_set() or time.monotonic() > self._ends_s
 
     def listen(self, session: Session[Any]) -> Iterable[list[Any]]:
-        """What a session hands over until the time is up."""
+        """Return what a session hands over until the time is up."""
         deadline_s = self._ends_s = time.monotonic() + self.seconds
         while not self.stop.is_set() and (left_s := deadline_s - time.monotonic()) > 0:
             if got := session.receive(min(SLICE_S, left_s)):
@@ -195,7 +195,7 @@ def check_everything(config: Config, seconds: float) -> list[Report]:
 
 
 def _wires(reading: Reading, readings: dict[str, Reading]) -> Iterable[Wire]:
-    """The wires of a device; devices inside its stream read along, and have none of their own."""
+    """Return the wires of a device; devices inside its stream read along, and have none of their own."""
     entry = reading.entry
     if entry.transport.kind == "gnss":
         return
@@ -219,7 +219,7 @@ def _run(jobs: list[Callable[[], None]], span: Span) -> None:
 
 
 def check_directory(directory: Path, reserve_mb: float) -> Report:
-    """Whether logs can be written there, and how much room is left."""
+    """Return whether logs can be written there, and how much room is left."""
     report = Report("log")
     existing, permitted = nearest_there(directory)
     if not permitted:
@@ -276,7 +276,7 @@ def _batch(source: str, block: UnitBlock) -> ChunkBatch:
 
 
 def _wire_problems(session: Session[Any], counters: TransportCounters, report: Report, seconds: float) -> Iterable[str]:
-    """What is wrong with the wire itself."""
+    """Return what is wrong with the wire itself."""
     if not report.opens:
         yield session.last_error or "not opened in the time; listen longer"
         return
@@ -297,7 +297,7 @@ def _wire_problems(session: Session[Any], counters: TransportCounters, report: R
 
 
 def bitrate_problems(spec: TransportSpec, actual: int | None) -> list[str]:
-    """Whether the interface runs at the configured bit rate; None: it has none (vcan) or cannot be asked."""
+    """Return whether the interface runs at the configured bit rate; None: it has none (vcan) or cannot be asked."""
     wanted = spec.options.get("bitrate")
     if wanted is None or actual is None or int(wanted) == actual:
         return []
@@ -306,7 +306,7 @@ def bitrate_problems(spec: TransportSpec, actual: int | None) -> list[str]:
 
 
 def _answer_problems(reading: Reading) -> list[str]:
-    """What is wrong with what came."""
+    """Return what is wrong with what came."""
     entry, heard, counters = reading.entry, reading.heard, reading.parser.counters
     good = counters.messages.total()
     other = not_understood(entry, heard, good, reading.kept, refused=counters.bad_messages)
@@ -354,7 +354,9 @@ def far_notes(heard: Heard, discipline: ClockDiscipline) -> list[str]:
 
 
 def _time_problems(entry: DeviceEntry, heard: Heard) -> list[str]:
-    """A GNSS must say a valid time, a counter must run like time, a device that says whether it sees its PPS see it."""
+    """Return a GNSS must say a valid time, a counter must run like time, a device that says whether it sees its PPS
+    see it.
+    """
     if entry.kind == "gnss":
         if heard.time_messages == 0:
             return ["no time message: the clock cannot be set by it; switch one on"]

@@ -82,7 +82,7 @@ class Heard:
 
 
 def describe_time(entry: DeviceEntry, heard: Heard) -> str:
-    """What the device says of its time, in a few words."""
+    """Return what the device says of its time, in a few words."""
     if heard.valid_time is not None:
         return f"{describe_tag(heard.valid_time.time)} ({heard.valid_time.message})"
     if heard.time_messages:
@@ -93,7 +93,7 @@ def describe_time(entry: DeviceEntry, heard: Heard) -> str:
 
 
 def describe_tag(tag: TimeTag) -> str:
-    """A device's time as far as it says it: ``2026-11-21 10:15:03 UTC``, ``GPS week 2443, 555303.0 s``."""
+    """Return a device's time as far as it says it: ``2026-11-21 10:15:03 UTC``, ``GPS week 2443, 555303.0 s``."""
     seconds = tag.time_ns * 1e-9
     if tag.scale == "gps":
         return f"GPS week {tag.week if tag.week is not None else '?'}, {seconds:.1f} s"
@@ -103,7 +103,7 @@ def describe_tag(tag: TimeTag) -> str:
 
 
 def identify(entry: DeviceEntry, kept: list[ChunkBatch], than: int) -> str | None:
-    """The protocol of the same kind that makes most of bytes of which the configured one makes no record.
+    """Return the protocol of the same kind that makes most of bytes of which the configured one makes no record.
 
     A parser that decodes records is before one that only finds messages (receivers mix protocols on a port, and
     their parsers frame each other's); the latter must find more than ``than``, what the configured one found. A
@@ -130,7 +130,8 @@ def identify(entry: DeviceEntry, kept: list[ChunkBatch], than: int) -> str | Non
 def not_understood(
     entry: DeviceEntry, heard: Heard, messages: int, kept: list[ChunkBatch], *, refused: int = 0
 ) -> str | None:
-    """What a device is instead of what it was configured as, or that nothing of it is known; None: it is understood.
+    """Return what a device is instead of what it was configured as, or that nothing of it is known; None: it is
+    understood.
 
     Args:
         entry: the device as configured.
@@ -152,7 +153,9 @@ def not_understood(
 
 
 def _default_settings(entry: DeviceEntry, protocol: str) -> DeviceSettings:
-    """Settings of a device of which only the protocol is known; what frames need no value of ours is stood in for."""
+    """Return settings of a device of which only the protocol is known; what frames need no value of ours is stood in
+    for.
+    """
     transport = entry.transport.text
     table: DeviceTable
     if entry.kind == "gnss":

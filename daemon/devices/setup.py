@@ -102,7 +102,7 @@ class WireSetup:
     present_baud: int | None = None
 
     def steps(self) -> list[Step]:
-        """All messages in the order they are sent."""
+        """Return all messages in the order they are sent."""
         steps = [step for device in self.devices for step in device.steps]
         return sorted(steps, key=lambda step: step.message.last)
 
@@ -158,7 +158,7 @@ class Line:
 def plan_setup(
     config: Config, only: Collection[str] = (), *, save: bool = False, present_baud: int | None = None
 ) -> list[WireSetup]:
-    """What would be sent, wire by wire.
+    """Return what would be sent, wire by wire.
 
     Args:
         config: the configuration.
@@ -216,7 +216,7 @@ def _add_device(wire: WireSetup, entry: DeviceEntry, carrier: DeviceEntry, wish:
 
 
 def _why_not_sent(spec: TransportSpec) -> str:
-    """A datagram goes to the group where there is one, and that is not the device."""
+    """Return a datagram goes to the group where there is one, and that is not the device."""
     if spec.kind == "serial" or (spec.kind == "udp" and "source" in spec.options and "group" not in spec.options):
         return ""
     hint = "; say ?source=<its address>, and no group" if spec.kind == "udp" else ""

@@ -59,7 +59,7 @@ def _asked_bytes(specs: list[TransportSpec]) -> int:
 
 
 def needed_modules(config: Config | None, specs: list[TransportSpec]) -> list[str]:
-    """Drivers that a configuration cannot do without, as modprobe names them."""
+    """Return drivers that a configuration cannot do without, as modprobe names them."""
     needed = ["can_raw"] if any(spec.kind == "can" and spec.interface == "socketcan" for spec in specs) else []
     paths = [spec.address for spec in specs if spec.kind == "serial"]
     if any(path.startswith("/dev/ttyUSB") for path in paths):

@@ -22,7 +22,7 @@ _COMMENT = ("!", ";", "#", "%")
 
 
 def keepers(tree: Tree, discipline: ClockDiscipline) -> Iterator[Finding]:
-    """Who keeps the wall clock, and whether he may step it while a flight is recorded."""
+    """Yield who keeps the wall clock, and whether he may step it while a flight is recorded."""
     check = "wall clock"
     found = sorted(KEEPERS[name] for name in tree.processes() & set(KEEPERS))
     if len(found) > 1:
@@ -44,7 +44,9 @@ def keepers(tree: Tree, discipline: ClockDiscipline) -> Iterator[Finding]:
 
 
 def chrony_steps(tree: Tree) -> Iterator[Finding]:
-    """Whether chrony's configuration lets it step the clock at any time (``makestep … -1``); the last line holds."""
+    """Yield whether chrony's configuration lets it step the clock at any time (``makestep … -1``); the last line
+    holds.
+    """
     said = [(file, words) for file, words in _chrony_lines(tree) if words[0].lower() == "makestep"]
     file, words = said[-1] if said else ("", [])
     if len(words) > 2 and words[2].startswith("-"):
@@ -54,7 +56,7 @@ def chrony_steps(tree: Tree) -> Iterator[Finding]:
 
 
 def _chrony_lines(tree: Tree) -> Iterator[tuple[str, list[str]]]:
-    """Lines of chrony's configuration in words, each with its file, in the order in which chrony reads them."""
+    """Yield lines of chrony's configuration in words, each with its file, in the order in which chrony reads them."""
     configuration = next((path for path in _CONFIGURATIONS if tree.at(path).exists()), None)
     if configuration is not None:
         yield from _lines_of(tree, configuration, _INCLUDE_LEVELS)
@@ -71,7 +73,8 @@ def _lines_of(tree: Tree, file: str, levels: int) -> Iterator[tuple[str, list[st
 
 
 def _included(tree: Tree, words: list[str]) -> list[str]:
-    """The files that a line has chrony read there: by ``include`` a pattern's, by ``confdir`` some folders' ``*.conf``.
+    """Return the files that a line has chrony read there: by ``include`` a pattern's, by ``confdir`` some folders'
+    ``*.conf``.
 
     Of folders the files come by name, of a name the first folder's only (chrony.conf(5)). ``sourcedir`` holds sources.
     """
@@ -94,7 +97,7 @@ def _files(tree: Tree, pattern: str) -> list[str]:
 
 
 def movement(step_ns: int, slew_ppm: float) -> Iterator[Finding]:
-    """What the clocks did while they were watched.
+    """Yield what the clocks did while they were watched.
 
     Args:
         step_ns: how far CLOCK_REALTIME moved against CLOCK_MONOTONIC.

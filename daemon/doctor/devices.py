@@ -30,7 +30,7 @@ class User:
     gids: frozenset[int]
 
     def may(self, status: os.stat_result, bits: int) -> bool:
-        """Whether the mode of a file lets him do what ``bits`` (of 7) say."""
+        """Return whether the mode of a file lets him do what ``bits`` (of 7) say."""
         if self.uid == 0:
             return True
         if status.st_uid == self.uid:
@@ -43,7 +43,7 @@ class User:
 
 
 def recording_user(tree: Tree) -> User:
-    """The service's user where there is one, else who runs this."""
+    """Return the service's user where there is one, else who runs this."""
     for line in (tree.read("/etc/passwd") or "").splitlines():
         fields = line.split(":")
         if fields[0] == SERVICE_USER and len(fields) > 3:
@@ -66,7 +66,7 @@ def group_name(tree: Tree, gid: int) -> str:
 
 
 def device_file(tree: Tree, path: str, user: User) -> Iterator[Finding]:
-    """Whether a device is there, and its user may read and write it."""
+    """Yield whether a device is there, and its user may read and write it."""
     check = "devices"
     try:
         status = tree.at(path).stat()
@@ -85,7 +85,7 @@ def device_file(tree: Tree, path: str, user: User) -> Iterator[Finding]:
 
 
 def device_policy(tree: Tree, path: str) -> Iterator[Finding]:
-    """Whether the unit lets its service open this class of devices (DeviceAllow)."""
+    """Yield whether the unit lets its service open this class of devices (DeviceAllow)."""
     files = [tree.at(_UNIT), *sorted(tree.at("/etc/systemd/system/swathd.service.d").glob("*.conf"))]
     said = [value for file in files for value in re.findall(r"^DeviceAllow=(\S+)", read_text(file) or "", re.MULTILINE)]
     if not said or path in said:
@@ -98,7 +98,7 @@ def device_policy(tree: Tree, path: str) -> Iterator[Finding]:
 
 
 def serial_port(tree: Tree, path: str) -> Iterator[Finding]:
-    """What else is on a serial port: the kernel's console, an adapter that holds bytes back."""
+    """Yield what else is on a serial port: the kernel's console, an adapter that holds bytes back."""
     name = tree.at(path).resolve().name
     if name in (tree.read("/sys/class/tty/console/active") or "").split():
         text = f"{path} is the kernel's console: its messages are mixed into the device's"
@@ -112,7 +112,7 @@ def serial_port(tree: Tree, path: str) -> Iterator[Finding]:
 
 
 def port_grabbers(tree: Tree) -> Iterator[Finding]:
-    """Programs that open any serial port they find."""
+    """Yield programs that open any serial port they find."""
     for name, unit in (("ModemManager", "ModemManager"), ("brltty", "brltty"), ("gpsd", "gpsd.socket gpsd")):
         if name in tree.processes():
             text = f"{name} runs: it opens serial ports and talks to receivers, in the middle of a flight too"
@@ -120,7 +120,7 @@ def port_grabbers(tree: Tree) -> Iterator[Finding]:
 
 
 def pps_device(tree: Tree, path: str, edge: str, now_s: float | None = None) -> Iterator[Finding]:
-    """Whether edges come at a PPS device.
+    """Yield whether edges come at a PPS device.
 
     Args:
         edge: assert or clear.
@@ -153,7 +153,7 @@ def pps_device(tree: Tree, path: str, edge: str, now_s: float | None = None) -> 
 def can_interface(
     tree: Tree, name: str, wanted_bitrate: int | None, bitrate_of: Callable[[str], int | None]
 ) -> Iterator[Finding]:
-    """Whether a CAN interface is there, up, at the right bit rate, and has lost nothing.
+    """Yield whether a CAN interface is there, up, at the right bit rate, and has lost nothing.
 
     Args:
         wanted_bitrate: of the configuration, if it says one.
@@ -188,7 +188,7 @@ def can_interface(
 
 
 def network_interface(tree: Tree, name: str) -> Iterator[Finding]:
-    """Whether the interface that a scanner is listened to on has a link."""
+    """Yield whether the interface that a scanner is listened to on has a link."""
     folder = tree.at(f"/sys/class/net/{name}")
     if not folder.exists():
         yield Finding("network", Verdict.WRONG, f"there is no interface {name}", "ip link")

@@ -39,7 +39,7 @@ class Mount:
 
 
 def mount_of(tree: Tree, directory: Path) -> Mount | None:
-    """The mounted file system that a directory is on."""
+    """Return the mounted file system that a directory is on."""
     best: Mount | None = None
     for line in (tree.read("/proc/mounts") or "").splitlines():
         device, point, kind, options, *_ = [*line.split(), "", "", "", ""]
@@ -50,7 +50,7 @@ def mount_of(tree: Tree, directory: Path) -> Mount | None:
 
 
 def file_system(mount: Mount | None, split_bytes: float) -> Iterator[Finding]:
-    """Whether a file system is one to trust a recording to.
+    """Yield whether a file system is one to trust a recording to.
 
     Args:
         split_bytes: the largest part.
@@ -79,7 +79,7 @@ def file_system(mount: Mount | None, split_bytes: float) -> Iterator[Finding]:
 
 
 def room(free_bytes: float, reserve_bytes: float, bytes_per_s: float) -> Iterator[Finding]:
-    """Whether there is room, down to the reserve, at the rate that the configured sensors may have."""
+    """Yield whether there is room, down to the reserve, at the rate that the configured sensors may have."""
     left_s = max(0.0, free_bytes - reserve_bytes) / bytes_per_s
     text = f"{free_bytes / 1e9:.1f} GB free, {duration_text(left_s)} at {bytes_per_s / 1e6:.1f} MB/s"
     few = left_s < LITTLE_ROOM_S
@@ -88,7 +88,7 @@ def room(free_bytes: float, reserve_bytes: float, bytes_per_s: float) -> Iterato
 
 
 def writable(tree: Tree, directory: Path, user: User) -> Iterator[Finding]:
-    """Whether logs can be made in a directory: whether its user may enter all it lies in, and write to it."""
+    """Yield whether logs can be made in a directory: whether its user may enter all it lies in, and write to it."""
     check = "log directory"
     there, permitted = nearest_there(tree.at(directory))
     existing = Path("/") / there.relative_to(tree.root)
@@ -108,7 +108,7 @@ def writable(tree: Tree, directory: Path, user: User) -> Iterator[Finding]:
 
 
 def measure(folder: Path, size: int = TEST_BYTES) -> tuple[float, float]:
-    """Bytes a second and the longest sync in seconds of writing as a recorder does; nothing is left behind.
+    """Return bytes a second and the longest sync in seconds of writing as a recorder does; nothing is left behind.
 
     Raises:
         OSError: it cannot be written there.
@@ -126,7 +126,7 @@ def measure(folder: Path, size: int = TEST_BYTES) -> tuple[float, float]:
 
 
 def speed(bytes_per_s: float, longest_sync_s: float, needed_bytes_per_s: float) -> Iterator[Finding]:
-    """Whether the disk keeps up."""
+    """Yield whether the disk keeps up."""
     check = "disk speed"
     told = f"writes {bytes_per_s / 1e6:.0f} MB/s, longest sync {longest_sync_s * 1e3:.0f} ms"
     text = f"{told}; the sensors may send {needed_bytes_per_s / 1e6:.1f} MB/s"

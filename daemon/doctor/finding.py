@@ -31,7 +31,7 @@ class Finding:
 
 
 def read_text(path: Path) -> str | None:
-    """A small file's text without blanks at its ends; None where it cannot be read."""
+    """Return a small file's text without blanks at its ends; None where it cannot be read."""
     try:
         return path.read_text(errors="replace").strip()
     except OSError:
@@ -45,21 +45,21 @@ class Tree:
     root: Path = Path("/")
 
     def at(self, path: str | Path) -> Path:
-        """An absolute path of the computer."""
+        """Return an absolute path of the computer."""
         return self.root / str(path).lstrip("/")
 
     def read(self, path: str | Path) -> str | None:
-        """A file's text as `read_text` gives it."""
+        """Return a file's text as `read_text` gives it."""
         return read_text(self.at(path))
 
     def number(self, path: str | Path) -> int | None:
-        """A file that holds a whole number; None where it does not."""
+        """Return a file that holds a whole number; None where it does not."""
         try:
             return int(self.read(path) or "")
         except ValueError:
             return None
 
     def processes(self) -> set[str]:
-        """Names of the programs that run, as far as this user may see them."""
+        """Return names of the programs that run, as far as this user may see them."""
         names = map(read_text, self.at("/proc").glob("[0-9]*/comm"))
         return {name for name in names if name}

@@ -17,7 +17,7 @@ CLOSED_LOOP_DRIVERS = ("intel_pstate", "amd-pstate", "amd-pstate-epp")  # their 
 
 
 def receive_buffers(tree: Tree, asked_bytes: int) -> Iterator[Finding]:
-    """Whether the kernel grants the receive buffers that the scanners' sockets ask for.
+    """Yield whether the kernel grants the receive buffers that the scanners' sockets ask for.
 
     Args:
         asked_bytes: the largest that is asked for.
@@ -40,7 +40,7 @@ def receive_buffers(tree: Tree, asked_bytes: int) -> Iterator[Finding]:
 
 
 def dropped_datagrams(tree: Tree) -> Iterator[Finding]:
-    """What the kernel has dropped since it started because a receive buffer was full (RcvbufErrors)."""
+    """Yield what the kernel has dropped since it started because a receive buffer was full (RcvbufErrors)."""
     lines = [line.split() for line in (tree.read("/proc/net/snmp") or "").splitlines() if line.startswith("Udp:")]
     if len(lines) < 2 or "RcvbufErrors" not in lines[0]:
         return
@@ -51,7 +51,7 @@ def dropped_datagrams(tree: Tree) -> Iterator[Finding]:
 
 
 def governor(tree: Tree) -> Iterator[Finding]:
-    """Whether the processor may run as fast as it can."""
+    """Yield whether the processor may run as fast as it can."""
     check = "CPU governor"
     folders = sorted(tree.at("/sys/devices/system/cpu").glob("cpu[0-9]*/cpufreq"))
     found = {(_word(folder / "scaling_governor"), _word(folder / "scaling_driver")) for folder in folders}
@@ -74,7 +74,7 @@ def _word(path: Path) -> str:
 
 
 def idle_states(tree: Tree) -> Iterator[Finding]:
-    """Whether the processor sleeps so deeply that a PPS interrupt comes late."""
+    """Yield whether the processor sleeps so deeply that a PPS interrupt comes late."""
     slow: dict[str, int] = {}
     for folder in sorted(tree.at("/sys/devices/system/cpu").glob("cpu[0-9]*/cpuidle/state*")):
         latency, disabled = _word(folder / "latency"), _word(folder / "disable")
@@ -89,7 +89,7 @@ def idle_states(tree: Tree) -> Iterator[Finding]:
 
 
 def memory(tree: Tree) -> Iterator[Finding]:
-    """Whether there is memory for the queue and the kernel's buffers."""
+    """Yield whether there is memory for the queue and the kernel's buffers."""
     for line in (tree.read("/proc/meminfo") or "").splitlines():
         key, _, value = line.partition(":")
         if key == "MemAvailable":
@@ -101,7 +101,7 @@ def memory(tree: Tree) -> Iterator[Finding]:
 
 
 def modules(tree: Tree, needed: Iterable[str]) -> Iterator[Finding]:
-    """Whether the drivers that the configuration needs are in the kernel, or can be.
+    """Yield whether the drivers that the configuration needs are in the kernel, or can be.
 
     Args:
         needed: names of modules, as modprobe knows them.

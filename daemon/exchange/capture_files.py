@@ -48,7 +48,7 @@ class Told:
 
 
 def find_captures(routes: Routes, files: Sequence[Path], told: Told) -> list[Capture]:
-    """Every file with its kind and device.
+    """Return every file with its kind and device.
 
     Raises:
         UserError: all that is wrong, a line each: no device, no times, or, where that is all, what cannot be read.
@@ -78,7 +78,7 @@ def find_captures(routes: Routes, files: Sequence[Path], told: Told) -> list[Cap
 
 
 def _named(routes: Routes, text: str) -> list[Capture]:
-    """``--source kind/name:selector=FILE``."""
+    """Return ``--source kind/name:selector=FILE``."""
     name, equals, file = text.partition("=")
     source, _, selector = name.partition(":")
     if not equals or not file or not source:
@@ -107,7 +107,7 @@ def _port(routes: Routes, source: str, where: str) -> Port:
 
 
 def _found(routes: Routes, path: Path) -> list[Capture]:
-    """A file whose units say themselves whose they are, or the folder of an export."""
+    """Return a file whose units say themselves whose they are, or the folder of an export."""
     if path.is_dir():
         return _of_export(routes, path)
     head, damage = read_beginning(path, _LOOKED_AT_BYTES)
@@ -161,7 +161,7 @@ def _settle(capture: Capture, told: Told) -> None:
 
 
 def _of_export(routes: Routes, folder: Path) -> list[Capture]:
-    """The files that its manifest names; of a folder of exports, those of all."""
+    """Return the files that its manifest names; of a folder of exports, those of all."""
     folders = [folder] if (folder / MANIFEST).exists() else sorted(path.parent for path in folder.glob(f"*/{MANIFEST}"))
     if not folders:
         raise UserError(f"{folder}: is a folder without {MANIFEST}; give captures, or the folder of an export")

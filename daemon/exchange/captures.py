@@ -64,7 +64,7 @@ class Capture:
     passed: Counter[str] = field(default_factory=Counter)
 
     def read(self, routes: Routes) -> Iterator[ImportUnit]:
-        """Units that belong to a device, in the file's order; what is wrong with the file stands in ``tally``."""
+        """Yield units that belong to a device, in the file's order; what is wrong with the file stands in ``tally``."""
         for unit in until_damage(self._captured(), self.tally):
             if not 0 <= unit.time_ns <= LATEST_NS:
                 self.tally.damaged(f"{self.path}: a unit of {len(unit.data)} bytes has no time between 1970 and 2262")
@@ -120,17 +120,17 @@ class Capture:
 
 
 def tag_of(path: Path) -> Path:
-    """Where RTKLIB put the time tags of a stream, which may have been gzipped since."""
+    """Return where RTKLIB put the time tags of a stream, which may have been gzipped since."""
     return path.with_name(path.name.removesuffix(".gz") + ".tag")
 
 
 def has_times(path: Path) -> bool:
-    """Whether something beside a serial file says when its bytes came."""
+    """Return whether something beside a serial file says when its bytes came."""
     return sidecar_of(path).exists() or chunk_table(path) is not None or tag_of(path).exists()
 
 
 def _edges(path: Path, edge: str, tally: CaptureTally) -> Iterator[CapturedUnit]:
-    """Lines ``realtime_ns sequence`` as messages of ``/pps``."""
+    """Yield lines ``realtime_ns sequence`` as messages of ``/pps``."""
     for number, line in read_lines(path, tally):
         fields = line.split()
         if len(fields) != 2 or not all(text.isdecimal() and int(text) <= LATEST_NS for text in fields):

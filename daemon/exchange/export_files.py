@@ -52,7 +52,7 @@ class NativeFile(ABC):
 
     @classmethod
     def suffix_for(cls, channel: ChannelSpec) -> str:
-        """How the name of the file ends."""
+        """Return how the name of the file ends."""
         return cls.suffix
 
     @abstractmethod
@@ -60,7 +60,7 @@ class NativeFile(ABC):
         """Units that follow."""
 
     def notes(self) -> list[str]:
-        """What a reader should know of the file."""
+        """Return what a reader should know of the file."""
         return []
 
     def close(self) -> None:
@@ -70,7 +70,7 @@ class NativeFile(ABC):
 
 
 def _spec(channel: ChannelSpec) -> TransportSpec | None:
-    """The transport of a channel; None where a stranger's log does not say it."""
+    """Return the transport of a channel; None where a stranger's log does not say it."""
     try:
         return parse_transport(channel.metadata.get("transport", ""))
     except ValueError:
@@ -204,7 +204,7 @@ class PcapFile(NativeFile):
         return [f"{self._unnamed} datagrams of senders that the log does not name"] if self._unnamed else []
 
     def _addresses(self, channel: ChannelSpec) -> tuple[Address, Address]:
-        """Sender and receiver; the receiver is what the recorder's port was bound to."""
+        """Return sender and receiver; the receiver is what the recorder's port was bound to."""
         metadata, spec = channel.metadata, _spec(channel)
         host, port = "0.0.0.0", _port(metadata.get("port", ""))
         if spec is not None and spec.kind == "udp":
@@ -234,7 +234,7 @@ class PpsFile(NativeFile):
 
 
 def _pps_line(message: bytes) -> bytes | None:
-    """The line of a message; None where a stranger's is no edge."""
+    """Return the line of a message; None where a stranger's is no edge."""
     try:
         value = json.loads(message)
         edge_time_ns, sequence = value["edge_time_ns"], value["sequence"]

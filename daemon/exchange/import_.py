@@ -22,7 +22,7 @@ from swath.daemon.log.session import read_boot_id, session_name
 
 
 def merge(captures: Iterable[Capture], routes: Routes) -> Iterator[ImportUnit]:
-    """Units of all files, the earliest of those that are next first; each file keeps its own order."""
+    """Yield units of all files, the earliest of those that are next first; each file keeps its own order."""
     streams = [capture.read(routes) for capture in captures]
     waiting = []
     for number, stream in enumerate(streams):
@@ -41,7 +41,7 @@ def merge(captures: Iterable[Capture], routes: Routes) -> Iterator[ImportUnit]:
 
 
 def import_session_info(name: str, first_ns: int) -> SessionInfo:
-    """Session of captures that begin at ``first_ns``: host time is their wall clock."""
+    """Return session of captures that begin at ``first_ns``: host time is their wall clock."""
     boot_id = read_boot_id()
     return SessionInfo(
         session_id=session_name(name, first_ns, boot_id),

@@ -111,19 +111,19 @@ class MadeLog:
     # ------------------------------------------------------------------ what a kind of log has of its own
 
     def count_of(self, source: Source, now_ns: int) -> SourceCount:
-        """The account as a recorder's receiver gives it."""
+        """Return the account as a recorder's receiver gives it."""
         silent = now_ns - source.last_ns > SILENT_AFTER_S * 1e9
         state = "silent" if silent else "receiving"
         return SourceCount(units=source.units, bytes=source.bytes, last_unit_ns=source.last_ns, state=state)
 
     def time_status(self, source: str) -> dict[str, object]:
-        """What a status says of the source's time; nothing where nobody judged it."""
+        """Return what a status says of the source's time; nothing where nobody judged it."""
         return {}
 
     # ------------------------------------------------------------------ what goes into it
 
     def add_source(self, port: Port) -> Source:
-        """A source that gets a status from now on."""
+        """Return a source that gets a status from now on."""
         source = self.sources[port.source] = Source(port)
         self._account.add_source(port.source)
         return source
@@ -152,11 +152,11 @@ class MadeLog:
                 self._parts.add(item.block)
 
     def units(self) -> dict[str, int]:
-        """Units by source."""
+        """Return units by source."""
         return {name: source.units for name, source in sorted(self.sources.items())}
 
     def bytes_written(self) -> int:
-        """Size of all parts so far."""
+        """Return size of all parts so far."""
         return self._parts.bytes_written()
 
     def finish(self) -> None:
@@ -197,7 +197,7 @@ class MadeLog:
     # ------------------------------------------------------------------ channels, chunks
 
     def _channel(self, source: Source, peer: Address | None) -> int:
-        """A channel a sender, and one for all beyond `MAX_SENDERS`, as a recorder has them."""
+        """Return a channel a sender, and one for all beyond `MAX_SENDERS`, as a recorder has them."""
         if len(source.channel_ids) >= MAX_SENDERS:
             peer = None
         if peer in source.channel_ids:

@@ -172,7 +172,7 @@ def _taken(directory: Path, destination: Path, same_disk: bool) -> Iterator[None
 
 
 def is_growing(path: Path) -> bool:
-    """Whether a log is being recorded."""
+    """Return whether a log is being recorded."""
     if is_being_written(path):
         return True
     sign = read_sign(path.parent)
@@ -258,7 +258,7 @@ def _no_room(report: OffloadReport, path: Path, needed: int, free: int) -> str:
 
 
 def _copy_and_read_back(path: Path, partial: Path, progress: Progress) -> tuple[str, int]:
-    """SHA-256 of the log and how much of the copy was there; what an interruption left wrong is copied anew."""
+    """Return SHA-256 of the log and how much of the copy was there; what an interruption left wrong is copied anew."""
     digest, resumed = _copy(path, partial, progress)
     size = path.stat().st_size
     for had in (resumed, 0):
@@ -310,7 +310,7 @@ def _let_go(fd: int) -> None:
 
 
 def _blocks(fd: int) -> Iterator[bytes]:
-    """A file from its beginning, its memory given back behind."""
+    """Yield a file from its beginning, its memory given back behind."""
     at = 0
     while block := os.pread(fd, BLOCK_BYTES, at):
         yield block
@@ -319,7 +319,7 @@ def _blocks(fd: int) -> Iterator[bytes]:
 
 
 def digest_of(path: Path, progress: Callable[[int], None]) -> str:
-    """SHA-256 of a file as it is on the disk: what of it was in memory is dropped first; raises OSError."""
+    """Return SHA-256 of a file as it is on the disk: what of it was in memory is dropped first; raises OSError."""
     digest, done = hashlib.sha256(), 0
     with path.open("rb", buffering=0) as file:
         os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
@@ -365,7 +365,7 @@ class ChecksumList:
 
 
 def _line(name: str, digest: str) -> str:
-    """coreutils: a name with a backslash or an end of line is escaped, and the line begins with a backslash."""
+    """Return coreutils: a name with a backslash or an end of line is escaped, and the line begins with a backslash."""
     escaped = name.replace("\\", "\\\\").replace("\n", "\\n").replace("\r", "\\r")
     return f"{'' if escaped == name else chr(92)}{digest}  {escaped}"
 

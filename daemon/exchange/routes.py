@@ -61,7 +61,7 @@ class Routes:
 
     @classmethod
     def of(cls, config: Config) -> Routes:
-        """Those of a configuration."""
+        """Return those of a configuration."""
         routes = cls({port.source: port for port in _ports(config)})
         for port in routes.ports.values():
             if port.spec is not None and port.kind == "udp":
@@ -90,7 +90,7 @@ class Routes:
         return self._can.get(unit.channel)
 
     def described(self, kind: str) -> str:
-        """The ports or buses there are, for people."""
+        """Return the ports or buses there are, for people."""
         if kind == "pcap":
             return ", ".join(f"{number} ({ports[0].source})" for number, ports in self._udp.items()) or "none"
         return ", ".join(f"{name} ({port.source if port else 'of two'})" for name, port in self._can.items()) or "none"

@@ -29,7 +29,7 @@ _MAX_LINE_BYTES = 2 * _MAX_UNIT_BYTES + 100
 
 
 def sidecar_of(path: Path) -> Path:
-    """Where the sidecar of a file lies, if it has one."""
+    """Return where the sidecar of a file lies, if it has one."""
     return path.with_name(path.name + SUFFIX)
 
 
@@ -74,7 +74,7 @@ class SidecarWriter:
 
 
 def read_sidecar(path: Path) -> Iterator[SidecarRow]:
-    """The rows of a file's sidecar; none where it has none.
+    """Yield the rows of a file's sidecar; none where it has none.
 
     Raises:
         CaptureDamageError: it is none, or ends early.
@@ -114,7 +114,7 @@ def _row(line: str) -> SidecarRow | None:
 
 
 def complete(units: Iterator[CapturedUnit], path: Path, within_ns: int | None = None) -> Iterator[CapturedUnit]:
-    """The units of a file that has an entry a unit, completed by its sidecar.
+    """Return the units of a file that has an entry a unit, completed by its sidecar.
 
     Args:
         units: as the file has them.
@@ -152,7 +152,7 @@ def _completed(units: Iterator[CapturedUnit], path: Path, within_ns: int | None)
 
 
 def cut_by_sidecar(path: Path) -> Iterator[CapturedUnit]:
-    """The units of a file of bytes without bounds, whose sidecar has a row for each.
+    """Yield the units of a file of bytes without bounds, whose sidecar has a row for each.
 
     Raises:
         CaptureDamageError: the sidecar is not of this file.

@@ -50,16 +50,16 @@ class Account:
         self._heard_ns[source] = self._clock.now_ns()
 
     def statuses(self, common: Mapping[str, object]) -> dict[str, dict[str, object]]:
-        """A status a source; ``common`` is what is the same for all: queue and disk."""
+        """Return a status a source; ``common`` is what is the same for all: queue and disk."""
         return {source: self._status(source, common) for source in self.counts}
 
     def encode(self, statuses: Mapping[str, dict[str, object]]) -> list[EncodedBlock]:
-        """The statuses as messages."""
+        """Return the statuses as messages."""
         now_ns = self._clock.now_ns()
         return [self._status_channels[source].encode(now_ns, status) for source, status in statuses.items()]
 
     def lost_write(self) -> int:
-        """Units of all sources that were not written."""
+        """Return units of all sources that were not written."""
         return sum(self._written_and_lost(source)[1] for source in self.counts)
 
     def _written_and_lost(self, source: str) -> tuple[int, int]:

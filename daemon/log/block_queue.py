@@ -56,7 +56,7 @@ class BlockQueue:
         return True
 
     def take_all(self) -> list[QueueItem]:
-        """Everything there is, in order."""
+        """Return everything there is, in order."""
         with self._lock:
             items = list(self._items)
             self._items.clear()
@@ -64,7 +64,7 @@ class BlockQueue:
         return items
 
     def pop_high_water(self) -> int:
-        """Most bytes held since the last call."""
+        """Return most bytes held since the last call."""
         with self._lock:
             high_water, self._high_water = self._high_water, self._bytes
         return high_water

@@ -18,7 +18,7 @@ class ChannelTable:
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def add(self, source: str, spec: ChannelSpec) -> int:
-        """A new channel of a source; returns its id. MCAP channel ids are 16 bit; 0 is left unused."""
+        """Return a new channel of a source; returns its id. MCAP channel ids are 16 bit; 0 is left unused."""
         with self._lock:
             channel_id = len(self.specs) + 1
             self.specs[channel_id] = spec
@@ -26,7 +26,7 @@ class ChannelTable:
         return channel_id
 
     def of_source(self, source: str) -> list[int]:
-        """Ids of a source's channels."""
+        """Return ids of a source's channels."""
         with self._lock:
             return list(self._of_source.get(source, ()))
 
@@ -40,7 +40,7 @@ class JsonChannel:
         self._lock = threading.Lock()
 
     def encode(self, log_time_ns: int, value: dict[str, object]) -> EncodedBlock:
-        """One message, ready for the writer."""
+        """Return one message, ready for the writer."""
         with self._lock:
             sequence = self._sequence
             self._sequence += 1

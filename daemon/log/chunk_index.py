@@ -91,21 +91,21 @@ class LogIndex:
     damage: list[PartDamage] = field(default_factory=list)
 
     def scanner_chunks(self) -> list[ChunkPlace]:
-        """Those with returns."""
+        """Return those with returns."""
         return [chunk for chunk in self.chunks if chunk.scanner]
 
     def between(self, start_ns: int, end_ns: int) -> list[ChunkPlace]:
-        """Scanner chunks with messages of a span of log time, [start, end)."""
+        """Return scanner chunks with messages of a span of log time, [start, end)."""
         return [chunk for chunk in self.scanner_chunks() if chunk.start_ns < end_ns and chunk.end_ns >= start_ns]
 
     def spans(self) -> tuple[Int64Array, Int64Array]:
-        """First and last log times (n,) of the chunks with returns."""
+        """Return first and last log times (n,) of the chunks with returns."""
         chunks = self.scanner_chunks()
         return np.array([chunk.start_ns for chunk in chunks]), np.array([chunk.end_ns for chunk in chunks])
 
 
 def index_log(session: Session) -> LogIndex:
-    """Where a session's chunks stand.
+    """Return where a session's chunks stand.
 
     Raises:
         LogError: a part is no log any more.
@@ -126,7 +126,7 @@ def index_log(session: Session) -> LogIndex:
 def read_chunks(
     index: LogIndex, places: Iterable[ChunkPlace], topics: TopicFilter | None, damage: list[PartDamage]
 ) -> Iterator[LogBatch]:
-    """Messages of chunks, in their order; what cannot be read is passed over and stands in ``damage``.
+    """Yield messages of chunks, in their order; what cannot be read is passed over and stands in ``damage``.
 
     Raises:
         OSError: a file cannot be read.
@@ -179,7 +179,7 @@ class Listening(Session):
         self.said: dict[str, dict[str, Any]] = {}
 
     def batches(self, topics: TopicFilter | None = None, *, skim: bool = False) -> Iterator[LogBatch]:
-        """All messages, as `Session.batches`."""
+        """Yield all messages, as `Session.batches`."""
         for batch in super().batches(topics, skim=skim):
             if batch.channel.topic.startswith(STATUS):
                 for _, value in json_objects(batch):
@@ -187,7 +187,7 @@ class Listening(Session):
             yield batch
 
     def lost(self) -> dict[str, int]:
-        """Units that the recorder lost, by source; none: it says it lost none."""
+        """Return units that the recorder lost, by source; none: it says it lost none."""
         counts = {
             source: sum(value for key in LOSSES if isinstance(value := said.get(key), int))
             for source, said in self.said.items()
@@ -199,7 +199,7 @@ class Listening(Session):
 
 
 def _from_summary(file: BinaryIO, size: int, part: int) -> tuple[PartChannels, list[ChunkPlace]] | None:
-    """Channels and chunks as the summary has them; None where there is no whole one."""
+    """Return channels and chunks as the summary has them; None where there is no whole one."""
     file.seek(max(0, size - _TAIL.size))
     tail = file.read(_TAIL.size)
     if len(tail) < _TAIL.size:
@@ -270,7 +270,7 @@ def _from_walk(
 
 
 def _place_of(record: Record, part: int, known: PartChannels) -> Iterator[ChunkPlace]:
-    """The place of an unpacked chunk; nothing where no message of it can be used."""
+    """Yield the place of an unpacked chunk; nothing where no message of it can be used."""
     place: ChunkPlace | None = None
     for batch in chunk_batches(record.body, known.channels, known.schemas, None, Counter()):
         start_ns, end_ns = int(batch.log_time_ns.min()), int(batch.log_time_ns.max())

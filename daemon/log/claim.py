@@ -29,7 +29,7 @@ def claim(fd: int) -> bool:
 
 
 def stands_at(fd: int, path: Path) -> bool:
-    """Whether a path names the very file that is open."""
+    """Return whether a path names the very file that is open."""
     try:
         there, mine = os.stat(path), os.fstat(fd)
     except OSError:
@@ -38,7 +38,7 @@ def stands_at(fd: int, path: Path) -> bool:
 
 
 def is_being_written(path: Path) -> bool:
-    """Whether some process holds the claim on a log."""
+    """Return whether some process holds the claim on a log."""
     try:
         fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     except OSError:

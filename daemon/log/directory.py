@@ -19,7 +19,7 @@ _WANTED = "give the log directory or a configuration file"
 
 
 def log_directory(where: Path) -> Path:
-    """The log directory that a command's CONFIG or DIR means.
+    """Return the log directory that a command's CONFIG or DIR means.
 
     Raises:
         ConfigError: the configuration is wrong.

@@ -58,7 +58,7 @@ class Events:
         return event
 
     def make(self, severity: Severity, source: str, code: str, text: str) -> EncodedBlock:
-        """The event's block, for the writer itself, which must place it in a certain part."""
+        """Return the event's block, for the writer itself, which must place it in a certain part."""
         return self._encode(self._note(severity, source, code, text))
 
     def _note(self, severity: Severity, source: str, code: str, text: str) -> Event:

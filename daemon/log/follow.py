@@ -99,7 +99,9 @@ class PartFollower:
         return os.fstat(self._file.fileno()).st_size
 
     def _whole_record(self) -> tuple[int, int] | None:
-        """Opcode and length of the record to come, once all of it is there; what cannot be one is passed over."""
+        """Return opcode and length of the record to come, once all of it is there; what cannot be one is passed
+        over.
+        """
         head = self._pread(self._at, _HEAD.size)
         if len(head) < _HEAD.size:
             return None
@@ -117,7 +119,7 @@ class PartFollower:
     # ------------------------------------------------------------------ messages
 
     def batches(self) -> Iterator[LogBatch]:
-        """The messages that have become readable since the last call, in the file's order."""
+        """Yield the messages that have become readable since the last call, in the file's order."""
         while not self.ended and (head := self._whole_record()) is not None:
             opcode, length = head
             at, self._at = self._at, self._at + _HEAD.size + length
@@ -165,7 +167,7 @@ class PartFollower:
         yield from self.batches()
 
     def _learn_events(self, at: int, length: int) -> int | None:
-        """Id of the channel of events, if this chunk has it: a part's first one has."""
+        """Return id of the channel of events, if this chunk has it: a part's first one has."""
         ids = [batch.channel_id for batch in self._chunk(at, length) if batch.channel.topic == _EVENTS]
         return ids[0] if ids else None
 
@@ -188,7 +190,7 @@ class LogFollower:
         self._waited = False
 
     def poll(self) -> Iterator[LogBatch]:
-        """All that has become readable since the last call."""
+        """Yield all that has become readable since the last call."""
         self.sign = read_sign(self._directory)
         if self.part is None:
             if self.sign is not None:
@@ -206,7 +208,7 @@ class LogFollower:
             self._waited = True
 
     def _go_on(self, part: PartFollower, sign: Sign) -> Iterator[LogBatch]:
-        """The session's next part, where it is wanted and there; else what is growing now."""
+        """Yield the session's next part, where it is wanted and there; else what is growing now."""
         following = self._directory / f"{part.info.session_id}_{part.number + 1}.mcap"
         if sign.path == following or (self._every_part and part.ended and os.path.exists(following)):
             yield from self._open(following, tail=False)

@@ -161,7 +161,7 @@ SCHEMA_IDS: dict[str, int] = {name: number for number, name in enumerate(SCHEMAS
 
 
 def safe_attachment_path(folder: Path, name: str) -> Path:
-    """Where an attachment may be written: below ``folder``.
+    """Return where an attachment may be written: below ``folder``.
 
     Raises:
         LogError: the name is a path out of the folder.
@@ -173,7 +173,7 @@ def safe_attachment_path(folder: Path, name: str) -> Path:
 
 
 def source_of_topic(topic: str) -> str | None:
-    """``/scanner/left/aux/raw`` → ``scanner/left/aux``; ``/pps/main`` → ``pps/main``; None for the rest."""
+    """Return ``/scanner/left/aux/raw`` → ``scanner/left/aux``; ``/pps/main`` → ``pps/main``; None for the rest."""
     if topic.startswith("/pps/"):
         return topic[1:]
     return topic[1 : -len("/raw")] if topic.endswith("/raw") else None

@@ -36,7 +36,8 @@ class ClockPair:
 
 
 def _bracketed(read: Callable[[], int]) -> tuple[int, int, int]:
-    """Another clock's time, MONOTONIC at that instant and how far apart the reads around it were, in nanoseconds.
+    """Return another clock's time, MONOTONIC at that instant and how far apart the reads around it were, in
+    nanoseconds.
 
     The tightest of a few readings, so that a preempted one does not look like a step.
     """
@@ -54,7 +55,7 @@ def _bracketed(read: Callable[[], int]) -> tuple[int, int, int]:
 
 
 def read_clock_pair() -> ClockPair:
-    """REALTIME beside MONOTONIC, by the tightest of a few readings."""
+    """Return REALTIME beside MONOTONIC, by the tightest of a few readings."""
     return ClockPair(*_bracketed(time.time_ns))
 
 
@@ -68,11 +69,11 @@ class HostClock:
         self.offset_ns = pair.offset_ns
 
     def now_ns(self) -> int:
-        """Host time now."""
+        """Return host time now."""
         return time.monotonic_ns() + self.offset_ns
 
     def step_ns(self, pair: ClockPair) -> int:
-        """How far the wall clock has been stepped since the session's start."""
+        """Return how far the wall clock has been stepped since the session's start."""
         return pair.offset_ns - self.offset_ns
 
 
@@ -90,7 +91,7 @@ class StampConverter:
         self.ambiguous = 0
 
     def convert_at(self, stamps_ns: Int64Array | None, count: int, pair: ClockPair) -> Int64Array:
-        """Host times of the units of a batch.
+        """Return host times of the units of a batch.
 
         Args:
             stamps_ns: (n,) CLOCK_REALTIME stamps, 0 where a unit came without; None where the transport has none.
@@ -178,7 +179,7 @@ class ClockDiscipline:
 
 
 def read_clock_discipline() -> ClockDiscipline:
-    """The kernel's own account of how its wall clock is kept."""
+    """Return the kernel's own account of how its wall clock is kept."""
     timex = _Timex()
     if _libc.adjtimex(ctypes.byref(timex)) < 0:
         return ClockDiscipline(0.0, STA_UNSYNC, float("inf"))
@@ -190,7 +191,7 @@ def _read_raw_ns() -> int:
 
 
 def read_clock_sample(discipline: ClockDiscipline) -> dict[str, int | float]:
-    """One message of ``/clock``: the three clocks side by side and adjtimex's frequency and status.
+    """Return one message of ``/clock``: the three clocks side by side and adjtimex's frequency and status.
 
     And, where the wall clock is kept, its greatest error: then it may name a second, here and when the log is read.
     """

@@ -13,7 +13,9 @@ MAX_NS = 1 << 62  # of a stranger's clocks, in either direction
 
 
 def readings_of(batch: LogBatch) -> Iterator[tuple[int, int, int, float]]:
-    """realtime_ns, monotonic_ns, monotonic_raw_ns and max_error_s (inf: unsaid) of ``/clock``; none is left out."""
+    """Yield realtime_ns, monotonic_ns, monotonic_raw_ns and max_error_s (inf: unsaid) of ``/clock``; none is left
+    out.
+    """
     for _, value in json_objects(batch):
         realtime_ns, monotonic_ns = _time_of(value.get("realtime_ns")), _time_of(value.get("monotonic_ns"))
         raw_ns = _time_of(value.get("monotonic_raw_ns"))
@@ -27,7 +29,7 @@ def _error_of(value: Any) -> float:
 
 
 def edges_of(batch: LogBatch, edge: str) -> Iterator[PpsEdge | None]:
-    """Edges of ``/pps/<name>`` of the polarity wanted; None for what is none."""
+    """Yield edges of ``/pps/<name>`` of the polarity wanted; None for what is none."""
     for _, value in json_objects(batch):
         time_ns, sequence = _time_of(value.get("edge_time_ns")), _time_of(value.get("sequence", 0))
         wanted = value.get("edge", edge) == edge
@@ -35,5 +37,5 @@ def edges_of(batch: LogBatch, edge: str) -> Iterator[PpsEdge | None]:
 
 
 def _time_of(value: Any) -> int | None:
-    """A whole number that can be a time; None for anything else that a stranger's log may say."""
+    """Return a whole number that can be a time; None for anything else that a stranger's log may say."""
     return value if isinstance(value, int) and not isinstance(value, bool) and abs(value) < MAX_NS else None

@@ -17,7 +17,7 @@ from swath.georef.toml_tables import TomlError, toml_tables
 
 
 def stored_config(attachments: Mapping[str, bytes]) -> Config | None:
-    """The configuration as it was used; None where the log has none.
+    """Return the configuration as it was used; None where the log has none.
 
     Raises:
         LogError: it is none of this version's.
@@ -33,7 +33,7 @@ def stored_config(attachments: Mapping[str, bytes]) -> Config | None:
 
 
 def stored_drivers(attachments: Mapping[str, bytes]) -> tuple[dict[str, Callable[[], Parser]], list[str]]:
-    """What makes a source's parser, by source (``kind/name``), and a line for what cannot be known.
+    """Return what makes a source's parser, by source (``kind/name``), and a line for what cannot be known.
 
     The callables raise DriverSettingsError where the settings are none that the driver can work with.
     """
@@ -57,7 +57,7 @@ def stored_drivers(attachments: Mapping[str, bytes]) -> tuple[dict[str, Callable
 
 
 def stored_parsers(attachments: Mapping[str, bytes]) -> tuple[dict[str, Parser], list[str]]:
-    """A parser a source (``kind/name``), and a line for every source that has none."""
+    """Return a parser a source (``kind/name``), and a line for every source that has none."""
     makers, troubles = stored_drivers(attachments)
     parsers: dict[str, Parser] = {}
     for source, make in makers.items():

@@ -45,7 +45,7 @@ class Sign:
 
 
 def read_sign(directory: Path) -> Sign | None:
-    """The sign of a directory; None where nothing is being recorded, or it is none of ours."""
+    """Return the sign of a directory; None where nothing is being recorded, or it is none of ours."""
     try:
         with (directory / RECORDING_SIGN).open("rb") as file:
             said = json.loads(file.read(_MOST_SIGN_BYTES))
@@ -119,7 +119,7 @@ class Parts:
         return number, path
 
     def has_gone(self) -> bool:
-        """Whether the current part is no longer where it was made: removed, moved, or its folder with it."""
+        """Return whether the current part is no longer where it was made: removed, moved, or its folder with it."""
         return self.current is not None and not self.current.stands_at(self.current.path)
 
     def add(self, block: EncodedBlock) -> None:
@@ -146,15 +146,15 @@ class Parts:
         return writer
 
     def bytes_written(self) -> int:
-        """Size of all parts together."""
+        """Return size of all parts together."""
         return self._released_bytes + (self.current.bytes_written if self.current is not None else 0)
 
     def total_written(self, channel_id: int) -> int:
-        """Messages of a channel in the log, over all parts."""
+        """Return messages of a channel in the log, over all parts."""
         return self.written[channel_id] + (self.current.written.get(channel_id, 0) if self.current else 0)
 
     def total_lost(self, channel_id: int) -> int:
-        """Messages of a channel that could not be written, over all parts."""
+        """Return messages of a channel that could not be written, over all parts."""
         return self.lost[channel_id] + (self.current.lost.get(channel_id, 0) if self.current else 0)
 
     def drop_page_cache(self) -> None:

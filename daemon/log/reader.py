@@ -89,7 +89,7 @@ class Session:
         return list(islice((number for number in range(max(there) + 1) if number not in there), MAX_MISSING))
 
     def batches(self, topics: TopicFilter | None = None, *, skim: bool = False) -> Iterator[LogBatch]:
-        """All messages in the order in which they stand in the files.
+        """Yield all messages in the order in which they stand in the files.
 
         ``skim``: a chunk that holds nothing wanted, by its index, is not read; damage in it is not found then.
         """
@@ -97,7 +97,7 @@ class Session:
             yield from chunk
 
     def batches_by_time(self, topics: TopicFilter | None = None) -> Iterator[LogBatch]:
-        """All messages merged by log time: batches are split where another's messages come between.
+        """Yield all messages merged by log time: batches are split where another's messages come between.
 
         A second of messages is held, longer than a chunk stays open; of a log whose times do not go on, 128 MiB.
         """
@@ -120,7 +120,7 @@ class Session:
         yield from _merge(held)
 
     def attachments(self) -> dict[str, bytes]:
-        """Attachments by name, of the first part that has each; what goes beyond 128 MiB in all is left out."""
+        """Return attachments by name, of the first part that has each; what goes beyond 128 MiB in all is left out."""
         found: dict[str, bytes] = {}
         size = 0
         for part in self.parts:
@@ -180,12 +180,12 @@ class Session:
 
 
 def _is_wanted(channels: dict[int, ChannelSpec], topics: TopicFilter, channel: int) -> bool:
-    """Whether a channel's messages are; those of one that is not known yet may be."""
+    """Return whether a channel's messages are; those of one that is not known yet may be."""
     return channel not in channels or topics(channels[channel].topic)
 
 
 def open_logs(paths: Sequence[Path | str], passed_over: list[str] | None = None) -> list[Session]:
-    """Sessions of logs and of directories of them, in order of time.
+    """Return sessions of logs and of directories of them, in order of time.
 
     Args:
         paths: files and directories.
@@ -223,7 +223,9 @@ def _session(parts: list[Part]) -> Session:
 
 
 def _files(paths: list[Path]) -> list[Path]:
-    """The files named, and those in the directories named; a recovered copy among them stands for its original."""
+    """Return the files named, and those in the directories named; a recovered copy among them stands for its
+    original.
+    """
     files: list[Path] = []
     for path in paths:
         if path.is_dir():
@@ -237,7 +239,7 @@ def _files(paths: list[Path]) -> list[Path]:
 
 
 def read_part_head(path: Path) -> Part:
-    """Session and number of a part, from its first records.
+    """Return session and number of a part, from its first records.
 
     Raises:
         LogError: it is no log of this program.
@@ -270,14 +272,14 @@ def read_part_head(path: Path) -> Part:
 
 
 def _in_order(batch: LogBatch) -> Iterator[LogBatch]:
-    """A batch split where its times step back: stamps of one socket come from several processors."""
+    """Yield a batch split where its times step back: stamps of one socket come from several processors."""
     steps_back = np.flatnonzero(np.diff(batch.log_time_ns) < 0) + 1
     for first, last in pairwise([0, *steps_back.tolist(), len(batch.log_time_ns)]):
         yield batch.between(first, last)
 
 
 def _older_than(held: list[LogBatch], limit_ns: int) -> tuple[list[LogBatch], list[LogBatch]]:
-    """Batches split at a time: those before it, those after."""
+    """Return batches split at a time: those before it, those after."""
     ready: list[LogBatch] = []
     rest: list[LogBatch] = []
     for batch in held:
@@ -290,13 +292,13 @@ def _older_than(held: list[LogBatch], limit_ns: int) -> tuple[list[LogBatch], li
 
 
 def _chunk_bytes(held: list[LogBatch]) -> int:
-    """Memory that batches keep: of each the whole chunk that it is a view into."""
+    """Return memory that batches keep: of each the whole chunk that it is a view into."""
     chunks = {id(batch.rows.base): batch.rows.base for batch in held}
     return sum(chunk.nbytes for chunk in chunks.values() if isinstance(chunk, np.ndarray))
 
 
 def _merge(batches: list[LogBatch]) -> Iterator[LogBatch]:
-    """Batches split at each other's times; equal times keep the order of the file."""
+    """Yield batches split at each other's times; equal times keep the order of the file."""
     heap = [(int(batch.log_time_ns[0]), number, 0) for number, batch in enumerate(batches)]
     heapq.heapify(heap)
     while heap:

@@ -233,7 +233,7 @@ def _pass(path: Path, writer: PartWriter | None) -> RecoveryReport:
 
 
 def _messages_said(file: BinaryIO, end: Record, size: int) -> int | None:
-    """How many messages the statistics of a file whose end is whole speak of; None where it has none."""
+    """Return how many messages the statistics of a file whose end is whole speak of; None where it has none."""
     for found in summary_records(file, end.offset + end.length, size):
         if found.opcode == OP_STATISTICS:
             try:

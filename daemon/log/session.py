@@ -34,7 +34,7 @@ def make_session_info(name: str, clock: HostClock) -> SessionInfo:
 
 
 def session_name(name: str, start_ns: int, boot_id: str) -> str:
-    """``session_id`` of a session that begins at this wall clock time."""
+    """Return ``session_id`` of a session that begins at this wall clock time."""
     try:
         start = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(start_ns // 1_000_000_000))
     except (ValueError, OverflowError, OSError):

@@ -47,7 +47,9 @@ class Intervals:
             self.longest_ns, self.longest_at_ns = int(steps[widest]), int(times_ns[widest])
 
     def gaps(self) -> int:
-        """Intervals in a higher bin than the usual ones, so up to twice as long or longer, and above `GAP_MIN_NS`."""
+        """Return intervals in a higher bin than the usual ones, so up to twice as long or longer, and above
+        `GAP_MIN_NS`.
+        """
         total = int(self.bins.sum())
         if total < 3:
             return 0
@@ -144,7 +146,7 @@ class EventNumbers:
 def session_statistics(
     session: Session, *, decode: bool = True, progress: Callable[[int], None] | None = None
 ) -> dict[str, Any]:
-    """All numbers of a session, in one pass over its parts.
+    """Return all numbers of a session, in one pass over its parts.
 
     Args:
         session: as `open_logs` gives it.

@@ -16,7 +16,7 @@ _ENCODINGS = {"serial": "x-swath-serial", "can": "x-swath-can", "udp": "x-swath-
 
 
 def make_wire(device: DeviceEntry, transport: TransportSpec, suffix: str) -> Wire:
-    """Where the units of a device's port go in a log; ``suffix`` is ``/aux`` for a second port."""
+    """Return where the units of a device's port go in a log; ``suffix`` is ``/aux`` for a second port."""
     metadata = {"protocol": device.protocol, "transport": transport.text}
     if transport.kind == "udp":
         metadata["port"] = str(transport.port)

@@ -125,7 +125,7 @@ class Monitor:
         return waiting and self._follower.sign is not None and not _is_of_this_boot(self._follower.sign.boot_id)
 
     def snapshot(self) -> dict[str, Any]:
-        """How things are now, as plain values: the form of ``--json``."""
+        """Return how things are now, as plain values: the form of ``--json``."""
         now_ns = None if self._part is None else self._now_ns(self._part.info)
         why_not = self._why_not_recording(now_ns)
         sources = {} if now_ns is None else self._plain_sources(now_ns)
@@ -153,7 +153,9 @@ class Monitor:
         return self._damaged + (0 if self._part is None else self._part.damaged)
 
     def _now_ns(self, session: SessionInfo) -> int:
-        """Host time of the session; of another computer's, whose clocks are not ours, that of what was read last."""
+        """Return host time of the session; of another computer's, whose clocks are not ours, that of what was read
+        last.
+        """
         own = _is_of_this_boot(session.boot_id)
         return time.monotonic_ns() + session.realtime_ns - session.monotonic_ns if own else self._newest_ns
 
@@ -227,7 +229,7 @@ def _modified(path: Path) -> float:
 
 
 def _sentence(found: dict[str, Any]) -> str:
-    """The line of ``--once``."""
+    """Return the line of ``--once``."""
     told = "; ".join(found["troubles"])
     if found["verdict"] == NOT_RECORDING:
         return f"NOT RECORDING: {told}"

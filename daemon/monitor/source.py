@@ -123,7 +123,7 @@ class Decoding:
 
 
 def usable_status(said: dict[str, Any]) -> dict[str, Any]:
-    """A status with what can be shown of it: a log that is no recorder's may say anything there."""
+    """Return a status with what can be shown of it: a log that is no recorder's may say anything there."""
     status: dict[str, Any] = {key: _number(said.get(key), int) or 0 for key in _COUNTS}
     status |= {key: _number(said[key], int, float) for key in _MEASURED if key in said}
     status |= {key: str(said[key])[:64] for key in _WORDS if key in said}
@@ -131,7 +131,7 @@ def usable_status(said: dict[str, Any]) -> dict[str, Any]:
 
 
 def _number(value: Any, *kinds: type) -> Any:
-    """The value, if it is a number that can be; else None."""
+    """Return the value, if it is a number that can be; else None."""
     return value if type(value) in kinds and -_MOST < value < _MOST else None
 
 
@@ -198,7 +198,7 @@ class SourceWatch:
 
 
 def decoded_trouble(decoded: dict[str, Any]) -> str:
-    """What is wrong with a source by its bytes, in a few words; nothing when all is well."""
+    """Return what is wrong with a source by its bytes, in a few words; nothing when all is well."""
     words = []
     if decoded["bad"] > DAMAGED_SHARE * decoded["messages"]:
         words.append(f"{decoded['bad']} of {decoded['bad'] + decoded['messages']} messages damaged")

@@ -85,7 +85,7 @@ def sha256_of(path: Path, given_up: Callable[[], bool] = lambda: False) -> str:
 
 
 def utc_text(time_ns: int) -> str:
-    """A host time for people."""
+    """Return a host time for people."""
     return datetime.fromtimestamp(time_ns / 1e9, tz=UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 

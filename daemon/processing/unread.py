@@ -41,7 +41,7 @@ class Unread:
 
 
 def refused_by(parser: Parser) -> Counter[str]:
-    """What a parser refused so far, by reason."""
+    """Return what a parser refused so far, by reason."""
     counters = parser.counters
     found = Counter(
         {code: count for code, count in counters.errors.items() if code.startswith("bad_") or code == SEQUENCE_GAP}

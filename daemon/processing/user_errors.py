@@ -34,7 +34,7 @@ def as_user_error(place: Path, *refused: type[Exception]) -> Iterator[None]:
 
 
 def finite(value: Any) -> Any:
-    """The value with null for every number that is none, in lists and tables too."""
+    """Return the value with null for every number that is none, in lists and tables too."""
     if isinstance(value, dict):
         return {key: finite(one) for key, one in value.items()}
     if isinstance(value, list):

@@ -138,7 +138,7 @@ class WarmUp:
     cache: Path | None
 
     def text(self) -> str:
-        """A line for people."""
+        """Return a line for people."""
         what = f"{self.compiled} loops compiled" if self.compiled else "all loops were compiled already"
         where = (
             f"kept in {self.cache}"
@@ -179,7 +179,7 @@ def before_compiling(call: Callable[[], None]) -> Iterator[None]:
 
 
 def cache_folder() -> Path | None:
-    """Where loops are kept; None: nowhere."""
+    """Return where loops are kept; None: nowhere."""
     loop: Any = count_points
     path: str | None = loop.stats.cache_path
     return None if path is None else Path(path)
@@ -258,7 +258,7 @@ def _warm_products(points: Points) -> None:
 
 
 def _placed(setup: Setup) -> tuple[list[tuple[str, Points]], Trajectory | None]:
-    """Points of a quarter of a minute of level flight, whose clocks have locked by then, and the flight."""
+    """Return points of a quarter of a minute of level flight, whose clocks have locked by then, and the flight."""
     unix_ns = unix_ns_from_gps(START_NS, LEAP_SECONDS)
     stream = setup.live_stream(SessionInfo("warm-up", "swath", "", "", unix_ns, 0))
     clocks = stream.clocks
@@ -291,7 +291,7 @@ def _device_clock(host_ns: int, passed_ns: int, second: int) -> StructArray:
 
 
 def _solutions(setup: Setup, gps_ns: int) -> StructArray:
-    """A second of level flight where the mapping frame is at home, as a device's INS would tell it."""
+    """Return a second of level flight where the mapping frame is at home, as a device's INS would tell it."""
     lat_deg, lon_deg = SOMEWHERE
     crs, area = setup.options.crs or setup.config.output.crs, None
     with contextlib.suppress(pyproj.exceptions.CRSError):
@@ -333,7 +333,7 @@ def _warm_parsers() -> None:
 
 
 def _decoded(parser: Parser, packets: list[bytes]) -> list[StructArray]:
-    """Returns of packets of one length, handed over as a log hands them over."""
+    """Return returns of packets of one length, handed over as a log hands them over."""
     units = np.zeros((len(packets), _HEAD_BYTES + len(packets[0])), dtype=np.uint8)
     units[:, _HEAD_BYTES:] = np.frombuffer(b"".join(packets), np.uint8).reshape(len(packets), -1)
     host_ns: Int64Array = np.arange(len(packets), dtype=np.int64) * 1_000_000
@@ -342,7 +342,9 @@ def _decoded(parser: Parser, packets: list[bytes]) -> list[StructArray]:
 
 
 def _packets_for(parser: Parser, protocol: str) -> list[list[bytes]]:
-    """Batches of two packets in each way a head may send them; none for a protocol whose packets nobody can make."""
+    """Return batches of two packets in each way a head may send them; none for a protocol whose packets nobody can
+    make.
+    """
     if isinstance(parser, OusterParser):
         return [_ouster(parser)]
     make = _PACKETS.get(protocol.partition("-")[0])
@@ -449,7 +451,7 @@ def _flight() -> Flight:
 
 
 def _trajectory(frame: Tangent) -> Trajectory:
-    """The same way twice, northwards."""
+    """Return the same way twice, northwards."""
     since_s = np.arange(0.0, LINE_S + 1.0, 0.02)
     north_m = LINE_MPS * (since_s - 0.5 * LINE_S)
     lat, lon, height = geodetic_from_e(
@@ -465,7 +467,7 @@ def _trajectory(frame: Tangent) -> Trajectory:
 
 
 def _swath(strip: int, begin_ns: int) -> Swath:
-    """Returns from level ground, not placed yet."""
+    """Return returns from level ground, not placed yet."""
     count = LINE_S * RETURNS_HZ
     since_s = np.arange(count) / RETURNS_HZ
     rows = np.zeros(count, RETURN_DTYPE)

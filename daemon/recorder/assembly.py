@@ -90,7 +90,7 @@ def assemble(config: Config, queue_bytes: int = QUEUE_BYTES) -> Assembly:
 
 
 def make_timekeeper(config: Config, events: Events, host_minus_monotonic_ns: int) -> TimeKeeper:
-    """A clock for each PPS of a configuration, and the receivers that name its seconds."""
+    """Return a clock for each PPS of a configuration, and the receivers that name its seconds."""
     keeper = TimeKeeper(events, host_minus_monotonic_ns)
     said = {gnss.pps: gnss.leap_seconds for gnss in config.gnss.values() if gnss.leap_seconds is not None}
     for name, pps in config.pps.items():
@@ -141,7 +141,7 @@ def _add_device(assembly: Assembly, device: DeviceEntry) -> None:
 
 
 def _watch_corrections(assembly: Assembly, device: DeviceEntry) -> CorrectionsWatch:
-    """Receivers come before corrections, so that the one to hand on to has its session already."""
+    """Return receivers come before corrections, so that the one to hand on to has its session already."""
     target = assembly.config.corrections[device.name].forward_to
     relay = None
     if target is not None:

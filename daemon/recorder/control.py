@@ -53,7 +53,7 @@ class BadRequestError(Exception):
 
 
 def control_place(directory: Path) -> Path:
-    """Where the socket is made: in the unit's runtime directory, by hand in the log directory."""
+    """Return where the socket is made: in the unit's runtime directory, by hand in the log directory."""
     runtime = os.environ.get("RUNTIME_DIRECTORY", "").split(":")[0]
     return Path(runtime) / "control" if runtime else directory / CONTROL_LINK
 
@@ -72,7 +72,7 @@ def socket_address(place: Path) -> Iterator[str]:
 
 
 def listen(place: Path) -> socket.socket:
-    """A socket at a place that its owner alone can connect to. One that nobody listens at any more is replaced.
+    """Return a socket at a place that its owner alone can connect to. One that nobody listens at any more is replaced.
 
     Raises:
         OSError: somebody listens there, something else stands there, or the file system has no sockets.
@@ -146,7 +146,7 @@ class _Allowance:
         self.left = self.most
 
     def take(self) -> bool:
-        """Whether one more is allowed now."""
+        """Return whether one more is allowed now."""
         now_s = time.monotonic()
         self.left = min(self.most, self.left + (now_s - self.at_s) * self.per_s)
         self.at_s = now_s

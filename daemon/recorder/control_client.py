@@ -26,7 +26,7 @@ _OF_COMMAND: dict[str, dict[str, type]] = {"mark": {"time_ns": int, "text": str}
 
 
 def ask(directory: Path, request: Mapping[str, str]) -> dict[str, Any]:
-    """A request and its answer, which has every key that the command's answer has, its texts in one line.
+    """Return a request and its answer, which has every key that the command's answer has, its texts in one line.
 
     Raises:
         UserError: no recorder runs there, it may not be asked, it does not answer or not as one, or it refuses.
@@ -53,7 +53,7 @@ def ask(directory: Path, request: Mapping[str, str]) -> dict[str, Any]:
 
 
 def _understood(said: bytes, wanted: Mapping[str, type]) -> dict[str, Any]:
-    """An answer or a refusal; raises ValueError, RecursionError where it is neither."""
+    """Return an answer or a refusal; raises ValueError, RecursionError where it is neither."""
     answer = json.loads(said)
     refused = isinstance(answer, dict) and answer.get("ok") is False
     wanted = {"ok": bool} | ({"error": str} if refused else dict(wanted))

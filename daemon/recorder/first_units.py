@@ -44,7 +44,7 @@ class FirstUnits:
             self._closed = self._bytes >= JUDGED_BYTES
 
     def take(self) -> list[ChunkBatch] | None:
-        """What there is to judge, once; None while too little has come, and ever after."""
+        """Return what there is to judge, once; None while too little has come, and ever after."""
         with self._lock:
             waited = self._first_s is not None and time.monotonic() - self._first_s >= JUDGED_AFTER_S
             if not self._kept or not waited:
@@ -55,7 +55,9 @@ class FirstUnits:
 
 
 def judge(entry: DeviceEntry, kept: list[ChunkBatch]) -> str | None:
-    """What a device is instead of what it was configured as, or that nothing of it is understood; None: all is well."""
+    """Return what a device is instead of what it was configured as, or that nothing of it is understood; None: all is
+    well.
+    """
     parser = find_driver(entry.kind, entry.protocol).make_parser(entry.settings)
     heard = Heard()
     for batch in kept:

@@ -21,7 +21,7 @@ class JournalFormatter(logging.Formatter):
     """Lines with the priority prefix that systemd-journald understands (sd-daemon(3))."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """The prefix and the message."""
+        """Return the prefix and the message."""
         return f"<{_PRIORITY[record.levelno]}>{super().format(record)}"
 
 
@@ -67,7 +67,7 @@ class JournalHandler(logging.Handler):
 
 
 def threads_text() -> str:
-    """Where every thread of this process stands; why it cannot be said, where it cannot."""
+    """Return where every thread of this process stands; why it cannot be said, where it cannot."""
     try:
         with os.fdopen(os.memfd_create("threads"), "w+b") as file:
             faulthandler.dump_traceback(file)

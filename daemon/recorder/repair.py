@@ -25,7 +25,7 @@ _HEAD_BYTES = 4096  # of a part at most: header and session
 
 
 def unfinished_logs(directory: Path) -> list[Path]:
-    """Logs of a directory without their end and without a repaired copy, oldest first.
+    """Return logs of a directory without their end and without a repaired copy, oldest first.
 
     What a crash leaves at a part's very beginning is none: nothing is in it that could be repaired.
     """

@@ -184,7 +184,7 @@ class RecorderProcess:
         self._stop.set()
 
     def _must_end(self) -> bool:
-        """Whether a thread has died that only a new process brings back.
+        """Return whether a thread has died that only a new process brings back.
 
         Without its writer the process is of no use. Without a receiver it goes on for the others, unless a service
         manager is there to start it anew at once.
@@ -222,7 +222,7 @@ class RecorderProcess:
 
 
 def stuck_threads(receivers: Iterable[Receiver], writer: WriterHealth, now_ns: int | None = None) -> list[str]:
-    """Names of the threads that have not made progress within `PROGRESS_S`; empty is healthy."""
+    """Return names of the threads that have not made progress within `PROGRESS_S`; empty is healthy."""
     now = time.monotonic_ns() if now_ns is None else now_ns
     limit = now - int(PROGRESS_S * 1e9)
     opening_limit = now - int(OPENING_S * 1e9)
@@ -238,12 +238,14 @@ def stuck_threads(receivers: Iterable[Receiver], writer: WriterHealth, now_ns: i
 
 
 def a_restart_helps_nobody(stuck: Collection[str], receivers: Iterable[Receiver]) -> bool:
-    """Whether all that is stuck is being opened: it has nothing to lose yet, and opens no sooner by a restart."""
+    """Return whether all that is stuck is being opened: it has nothing to lose yet, and opens no sooner by a
+    restart.
+    """
     return {receiver.source for receiver in receivers if receiver.opening}.issuperset(stuck)
 
 
 def sentence(session_id: str, part: int, writer: WriterHealth) -> str:
-    """What the operator reads in ``systemctl status``."""
+    """Return what the operator reads in ``systemctl status``."""
     if writer.state is not Writing.RECORDING:
         return f"NOT RECORDING: {writer.reason}"
     troubles = [text for source, status in writer.statuses.items() if (text := source_trouble(source, status))]

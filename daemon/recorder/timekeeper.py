@@ -37,14 +37,14 @@ class _TimeSource:
     remarks: list[str] = field(default_factory=list)  # told so far
 
     def note_message(self, host_ns: int) -> int | None:
-        """A time message came; how long there was none, where that had been told."""
+        """Return a time message came; how long there was none, where that had been told."""
         pause_ns = 0 if self.message_ns is None else max(0, host_ns - self.message_ns)
         self.message_ns, self.longest_ns = host_ns, max(self.longest_ns, pause_ns)
         told, self.told = self.told, False
         return pause_ns if told else None
 
     def note_stop(self) -> int | None:
-        """Data has come for so long without a time message; once, None before and after."""
+        """Return data has come for so long without a time message; once, None before and after."""
         if self.message_ns is None or self.told:
             return None
         pause_ns = self.units_ns - self.message_ns
@@ -85,7 +85,7 @@ class TimeKeeper:
         self._sources[source] = _TimeSource(source, self._clocks[source], parser, names_edge)
 
     def units_seen(self, source: str) -> Callable[[Int64Array, UnitBlock], None]:
-        """What a GNSS receiver thread calls with the bytes it has just handed over."""
+        """Return what a GNSS receiver thread calls with the bytes it has just handed over."""
 
         def feed(log_time_ns: Int64Array, block: UnitBlock) -> None:
             time_source = self._sources[source]
@@ -141,7 +141,7 @@ class TimeKeeper:
                 self._events.post(Severity.WARNING, time_source.source, "date_doubtful", remark)
 
     def edge_seen(self, source: str) -> Callable[[int, int], None]:
-        """What a PPS receiver thread calls with an edge's host time and sequence number."""
+        """Return what a PPS receiver thread calls with an edge's host time and sequence number."""
 
         def feed(host_ns: int, sequence: int) -> None:
             with self._defects_told(source), self._lock:
@@ -164,7 +164,7 @@ class TimeKeeper:
                 )
 
     def status(self, source: str, host_ns: int) -> dict[str, object]:
-        """``time_state`` and ``time_sigma_ns`` of a gnss or pps source; nothing for the others."""
+        """Return ``time_state`` and ``time_sigma_ns`` of a gnss or pps source; nothing for the others."""
         clock = self._clocks.get(source)
         if clock is None:
             return {}

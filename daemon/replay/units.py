@@ -14,7 +14,7 @@ from swath.daemon.replay.wire_player import Output, PpsOutput, TimedUnit, open_o
 
 
 def timed_units(session: Session, *, with_pps: bool) -> Iterator[TimedUnit]:
-    """Raw units and PPS edges of a session in the order of their host time.
+    """Yield raw units and PPS edges of a session in the order of their host time.
 
     A PPS edge's time is the edge's own, not that of its message; a message that says none is passed over.
     """
@@ -34,7 +34,7 @@ def timed_units(session: Session, *, with_pps: bool) -> Iterator[TimedUnit]:
 
 
 def output_makers(config: Config, *, with_pps: bool) -> dict[str, Callable[[], Output]]:
-    """What makes the sending end of every transport that a configuration names; each raises TransportError."""
+    """Return what makes the sending end of every transport that a configuration names; each raises TransportError."""
     makers: dict[str, Callable[[], Output]] = {}
     for device in config.devices():
         for spec, suffix in ((device.transport, ""), (device.auxiliary, "/aux")):
@@ -47,7 +47,7 @@ def output_makers(config: Config, *, with_pps: bool) -> dict[str, Callable[[], O
 
 
 def open_outputs(config: Config, *, with_pps: bool) -> dict[str, Output]:
-    """The sending ends of every transport that a configuration names.
+    """Return the sending ends of every transport that a configuration names.
 
     Raises:
         TransportError: one cannot be made; those already made are closed.

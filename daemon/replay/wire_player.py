@@ -48,7 +48,7 @@ class Output(ABC):
         """Send one unit; False when nobody took it."""
 
     def has_reader(self) -> bool:
-        """Whether somebody has opened the other end; True where nobody can know (UDP, CAN)."""
+        """Return whether somebody has opened the other end; True where nobody can know (UDP, CAN)."""
         return True
 
     @abstractmethod
@@ -75,7 +75,7 @@ class PtyOutput(Output):
         self._patience_s = _PATIENCE_S
 
     def has_reader(self) -> bool:
-        """Whether the port is open at the other end."""
+        """Return whether the port is open at the other end."""
         poll = select.poll()
         poll.register(self._master, 0)
         return not any(event & select.POLLHUP for _, event in poll.poll(0))
@@ -175,7 +175,7 @@ class PpsOutput(Output):
         self._sequence = 0
 
     def has_reader(self) -> bool:
-        """Whether somebody reads the FIFO; opens it then."""
+        """Return whether somebody reads the FIFO; opens it then."""
         if self._fd < 0:
             try:
                 self._fd = os.open(self._path, os.O_WRONLY | os.O_NONBLOCK)
@@ -206,7 +206,7 @@ class PpsOutput(Output):
 
 
 def open_output(spec: TransportSpec) -> Output:
-    """The sending end of a transport of the configuration.
+    """Return the sending end of a transport of the configuration.
 
     Raises:
         TransportError: it cannot be made.

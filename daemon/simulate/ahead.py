@@ -88,7 +88,7 @@ class Ahead:
         return self._facts
 
     def units(self) -> Iterator[TimedUnit]:
-        """All units, true time since the start as their time."""
+        """Yield all units, true time since the start as their time."""
         assert self.facts
         while (word := self._take()) is not None:
             assert isinstance(word, list)

@@ -29,13 +29,13 @@ class VirtualClock(Protocol):
     """The clocks of the virtual host at a true time; nanoseconds."""
 
     def host_ns(self, time_s: float) -> int:
-        """Host time, the log's."""
+        """Return host time, the log's."""
 
     def monotonic_ns(self, time_s: float) -> int:
-        """CLOCK_MONOTONIC."""
+        """Return CLOCK_MONOTONIC."""
 
     def realtime_ns(self, time_s: float) -> int:
-        """CLOCK_REALTIME, with the steps so far."""
+        """Return CLOCK_REALTIME, with the steps so far."""
 
 
 class Flight(Protocol):

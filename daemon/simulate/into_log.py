@@ -42,12 +42,12 @@ _Due = tuple[float, Callable[[float], None]]
 
 
 def virtual_boot_id(name: str, seed: int) -> str:
-    """The boot of a host that never was, by the plan's name and seed."""
+    """Return the boot of a host that never was, by the plan's name and seed."""
     return str(uuid.uuid5(uuid.NAMESPACE_URL, f"swath:sim:{name}:{seed}"))
 
 
 def sim_session_info(name: str, clock: VirtualClock, seed: int) -> SessionInfo:
-    """Session of a flight that begins at time 0."""
+    """Return session of a flight that begins at time 0."""
     boot_id, start_ns = virtual_boot_id(name, seed), clock.realtime_ns(0.0)
     return SessionInfo(
         session_id=session_name(name, start_ns, boot_id),
@@ -186,7 +186,7 @@ class SimLog(MadeLog):
     # ------------------------------------------------------------------ what is due
 
     def _schedule(self, flight: Flight) -> Iterator[_Due]:
-        """What is done when, without an end."""
+        """Return what is done when, without an end."""
         ticks: Iterator[_Due] = ((number * CLOCK_PERIOD_S, self._sample_clock) for number in itertools.count(1))
         once: list[_Due] = [(at_s, partial(self._wall_step, step_s)) for at_s, step_s in flight.wall_steps]
         for source, from_s, to_s in flight.unplugged:
@@ -234,7 +234,7 @@ class SimLog(MadeLog):
 
 
 def _in_order(routes: Routes, sources: tuple[str, ...]) -> Iterator[Port]:
-    """The ports of a flight in the order of the configuration: PPS, GNSS, IMU, scanners."""
+    """Return the ports of a flight in the order of the configuration: PPS, GNSS, IMU, scanners."""
     return (port for name, port in routes.ports.items() if name in sources)
 
 

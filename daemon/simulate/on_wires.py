@@ -27,7 +27,7 @@ _OUT, _IN = b"\0", b"\1"
 
 
 def free_ports(count: int) -> list[int]:
-    """UDP ports that nobody has at the moment."""
+    """Return UDP ports that nobody has at the moment."""
     sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(count)]
     for sock in sockets:
         sock.bind(("127.0.0.1", 0))
@@ -38,7 +38,7 @@ def free_ports(count: int) -> list[int]:
 
 
 def own_wires(folder: Path, sources: Iterable[str], baud: Mapping[str, int]) -> dict[str, str]:
-    """Transports, and sources of PPS, that nothing else uses: ports and FIFOs in a folder, free UDP ports.
+    """Return transports, and sources of PPS, that nothing else uses: ports and FIFOs in a folder, free UDP ports.
 
     Args:
         folder: of the ports and FIFOs.
@@ -160,7 +160,7 @@ def check_steps(facts: FlightFacts, *, set_clock: bool) -> None:
 
 
 def open_wires(config: Config, facts: FlightFacts) -> tuple[dict[str, Output], dict[str, Output]]:
-    """The outputs of a configuration for a flight, and what befalls them.
+    """Return the outputs of a configuration for a flight, and what befalls them.
 
     Returns:
         Outputs by source, and those of plugs and of the wall clock; all are closed with `close_outputs`.
@@ -212,7 +212,7 @@ def fly_on_wires(
 
 
 def _events(facts: FlightFacts) -> Iterator[TimedUnit]:
-    """What befalls the wires, in order of time."""
+    """Return what befalls the wires, in order of time."""
     events = [
         TimedUnit(round(at_s * 1e9), _CLOCK, str(round(step_s * 1e9)).encode()) for at_s, step_s in facts.wall_steps
     ]

@@ -35,7 +35,7 @@ class FlightOptions:
     seconds: float | None = None
 
     def load(self) -> Any:
-        """The plan.
+        """Return the plan.
 
         Raises:
             UserError: it is not there, or a key is wrong; or what `sim` needs is not installed.
@@ -71,7 +71,7 @@ def _check_installed() -> None:
 
 
 def make_flight(wish: FlightOptions, truth: Path | None = None) -> tuple[Flight, dict[str, bytes]]:
-    """A flight, and the files that stand beside it but for the configuration.
+    """Return a flight, and the files that stand beside it but for the configuration.
 
     Args:
         wish: what to fly.
@@ -97,7 +97,7 @@ def make_flight(wish: FlightOptions, truth: Path | None = None) -> tuple[Flight,
 
 
 def make_flight_in_time(wish: FlightOptions) -> tuple[Flight, dict[str, bytes]]:
-    """`make_flight` for real time: what is compiled when it is first used has been used before.
+    """Return `make_flight` for real time: what is compiled when it is first used has been used before.
 
     A moment of the same flight is flown with all scanners on.
     """
@@ -112,7 +112,7 @@ def make_flight_in_time(wish: FlightOptions) -> tuple[Flight, dict[str, bytes]]:
 
 
 def configuration(plan: Any, wires: dict[str, str] | None, directory: str) -> bytes:
-    """The configuration that records a flight.
+    """Return the configuration that records a flight.
 
     Args:
         plan: of `Wish.load`.

@@ -67,7 +67,7 @@ def report(tally: CaptureTally | None, text: str) -> None:
 
 
 def until_damage(units: Iterator[CapturedUnit], tally: CaptureTally | None) -> Iterator[CapturedUnit]:
-    """Units up to the place from which the file cannot be read on."""
+    """Yield units up to the place from which the file cannot be read on."""
     try:
         yield from units
     except CaptureDamageError as error:
@@ -106,7 +106,7 @@ def read_beginning(path: Path, count: int) -> tuple[bytes, str]:
 
 
 def read_bytes(stream: BufferedIOBase, count: int, path: Path) -> bytes:
-    """Up to ``count`` bytes, fewer at the end of the file only."""
+    """Return up to ``count`` bytes, fewer at the end of the file only."""
     try:
         return stream.read(count)
     except (EOFError, OSError, zlib.error) as error:
@@ -114,7 +114,7 @@ def read_bytes(stream: BufferedIOBase, count: int, path: Path) -> bytes:
 
 
 def read_lines(path: Path, tally: CaptureTally | None = None) -> Iterator[tuple[int, str]]:
-    """Lines that are not empty, with their number; what is too long for a line of any format here is damage."""
+    """Yield lines that are not empty, with their number; what is too long for a line of any format here is damage."""
     with open_capture(path) as stream:
         number = 0
         while line := _read_line(stream, path):

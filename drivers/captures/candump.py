@@ -38,7 +38,7 @@ _FD_FRAME = struct.Struct("<IBBxx64s")
 
 
 def is_candump(line: str) -> bool:
-    """Whether a line is one of ``candump -L``."""
+    """Return whether a line is one of ``candump -L``."""
     return _LINE.fullmatch(line) is not None or _DROPPED.fullmatch(line) is not None
 
 
@@ -50,7 +50,7 @@ def is_shown_candump(line: str) -> bool:
 def read_candump(
     path: Path | str, channel: str | None = None, tally: CaptureTally | None = None
 ) -> Iterator[CapturedUnit]:
-    """Frames of a log as ``candump -L`` of can-utils writes it, as SocketCAN units of 16 or 72 bytes.
+    """Return frames of a log as ``candump -L`` of can-utils writes it, as SocketCAN units of 16 or 72 bytes.
 
     Args:
         path: the file, possibly gzipped.
@@ -78,7 +78,7 @@ def _frames(path: Path, channel: str | None, tally: CaptureTally | None) -> Iter
 
 
 def _frame(identifier: str, content: str) -> bytes | None:
-    """One frame of its texts before and after ``#``; None where they make none."""
+    """Return one frame of its texts before and after ``#``; None where they make none."""
     can_id = int(identifier, 16)
     if len(identifier) == 8 and not can_id & CAN_ERR_FLAG:
         can_id |= CAN_EFF_FLAG
@@ -95,7 +95,7 @@ def _frame(identifier: str, content: str) -> bytes | None:
 
 
 def _fd_frame(can_id: int, content: str) -> bytes | None:
-    """``##<flags><data>``: one hexadecimal digit of flags, then the data."""
+    """Return ``##<flags><data>``: one hexadecimal digit of flags, then the data."""
     flags, data = _bytes("0" + content[:1]), _bytes(content[1:])
     if not flags or data is None or len(data) not in CANFD_LENGTHS:
         return None
@@ -110,7 +110,8 @@ def _bytes(text: str) -> bytes | None:
 
 
 def candump_line(time_ns: int, channel: str, frame: bytes) -> str | None:
-    """A frame as ``candump -L`` writes it, to the microsecond, with its line end; None where it has no such form.
+    """Return a frame as ``candump -L`` writes it, to the microsecond, with its line end; None where it has no such
+    form.
 
     Args:
         time_ns: since 1970, not negative.
@@ -151,7 +152,9 @@ def _fd_text(frame: bytes) -> str | None:
 
 
 def held_by_line(frame: bytes) -> bool:
-    """Whether the line of a frame reads back as the very same bytes; reserved ones and odd flags are not in it."""
+    """Return whether the line of a frame reads back as the very same bytes; reserved ones and odd flags are not in
+    it.
+    """
     line = candump_line(0, "can", frame)
     match = _LINE.fullmatch(line.strip()) if line else None
     return match is not None and _frame(match[4], match[5]) == frame

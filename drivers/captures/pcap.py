@@ -61,7 +61,7 @@ Packet = tuple[int, int, bytes]  # time in ns, link type, frame
 
 
 def is_pcap(head: bytes) -> bool:
-    """Whether a file that begins so is a pcap or pcapng file."""
+    """Return whether a file that begins so is a pcap or pcapng file."""
     magic = int.from_bytes(head[:4], "little") if len(head) >= 4 else 0
     return magic == _SECTION or magic in _PCAP_KINDS
 
@@ -69,7 +69,7 @@ def is_pcap(head: bytes) -> bool:
 def read_pcap(
     path: Path | str, port: int | None = None, tally: CaptureTally | None = None, *, drop_copies: bool = False
 ) -> Iterator[CapturedUnit]:
-    """UDP datagrams of a pcap or pcapng file, IP fragments put together; other packets are passed over.
+    """Return UDP datagrams of a pcap or pcapng file, IP fragments put together; other packets are passed over.
 
     A datagram in fragments has the time of the one that completes it.
 
@@ -132,7 +132,7 @@ def _unit(
 
 
 def _packets(stream: BufferedIOBase, path: Path, tally: CaptureTally | None) -> Iterator[Packet]:
-    """Time, link type and bytes of each packet."""
+    """Yield time, link type and bytes of each packet."""
     head = read_bytes(stream, 4, path)
     magic = struct.unpack("<I", head)[0] if len(head) == 4 else 0
     if magic == _SECTION:
@@ -182,7 +182,7 @@ class _PcapngReader:
         self._at = 0
 
     def packets(self) -> Iterator[Packet]:
-        """Time, link type and bytes of each packet."""
+        """Yield time, link type and bytes of each packet."""
         kind = _SECTION
         while True:
             body = self._block(kind)
@@ -209,7 +209,7 @@ class _PcapngReader:
         return data
 
     def _block(self, kind: int) -> bytes:
-        """A block's body; the byte order of a new section is learned before its length can be read."""
+        """Return a block's body; the byte order of a new section is learned before its length can be read."""
         head = self._read(4)
         start = b""
         if kind == _SECTION:
@@ -266,7 +266,7 @@ class UnknownLinkError(ValueError):
 
 
 def ip_packet(link: int, frame: bytes) -> bytes:
-    """The IP packet in a frame; nothing where it carries another protocol.
+    """Return the IP packet in a frame; nothing where it carries another protocol.
 
     Raises:
         UnknownLinkError: the link layer is not known.
@@ -304,7 +304,7 @@ class _Pending:
     total: int | None = None
 
     def whole(self) -> bytes | None:
-        """All of it, once nothing is missing."""
+        """Return all of it, once nothing is missing."""
         if self.total is None:
             return None
         data = b""
@@ -341,7 +341,7 @@ class IpPackets:
         return len(self._pending)
 
     def add(self, packet: bytes, time_ns: int = 0) -> Datagram | None:
-        """The datagram that a packet is or completes."""
+        """Return the datagram that a packet is or completes."""
         version = packet[0] >> 4 if packet else 0
         if version == 4 and len(packet) >= 20 and packet[9] == _UDP:
             return self._add_v4(packet, time_ns)

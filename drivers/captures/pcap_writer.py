@@ -24,12 +24,12 @@ _MAX_IDENTIFICATION = 65_535  # 0 says nothing and is left out
 
 
 def largest_payload(source: Address, destination: Address) -> int:
-    """Bytes that a datagram between two addresses can carry."""
+    """Return bytes that a datagram between two addresses can carry."""
     return 65_535 - _UDP_BYTES - (_IPV4_BYTES if _are_ipv4(source, destination) else 0)
 
 
 def is_address(text: str) -> bool:
-    """Whether a text is an IPv4 or IPv6 address."""
+    """Return whether a text is an IPv4 or IPv6 address."""
     try:
         ip_address(text)
     except ValueError:
@@ -40,7 +40,7 @@ def is_address(text: str) -> bool:
 def pcap_frames(
     times_ns: Int64Array, first_number: int, source: Address, destination: Address, payloads: ByteRows
 ) -> ByteRows:
-    """Packet records, as they stand in a file after `FILE_HEADER`.
+    """Return packet records, as they stand in a file after `FILE_HEADER`.
 
     Args:
         times_ns: (n,) since 1970, from 0 to `LATEST_PCAP_NS`.
@@ -76,7 +76,7 @@ def _are_ipv4(source: Address, destination: Address) -> bool:
 
 
 def _frame_head(source: Address, destination: Address, length: int) -> bytes:
-    """Ethernet, IP and UDP headers; identification and checksums are 0."""
+    """Return ethernet, IP and UDP headers; identification and checksums are 0."""
     udp = struct.pack(">HHHH", source[1], destination[1], _UDP_BYTES + length, 0)
     if _are_ipv4(source, destination):
         total = _IPV4_BYTES + _UDP_BYTES + length
@@ -88,7 +88,7 @@ def _frame_head(source: Address, destination: Address, length: int) -> bytes:
 
 
 def _as_ipv6(host: str) -> bytes:
-    """An address in 16 bytes; of IPv4, the one that stands for it (RFC 4291, 2.5.5.2)."""
+    """Return an address in 16 bytes; of IPv4, the one that stands for it (RFC 4291, 2.5.5.2)."""
     address = ip_address(host)
     return bytes(10) + b"\xff\xff" + address.packed if address.version == 4 else IPv6Address(address).packed
 
@@ -99,7 +99,7 @@ def _put_u16(rows: ByteRows, at: int, values: NDArray[np.int64]) -> None:
 
 
 def _sum16(rows: ByteRows) -> NDArray[np.int64]:
-    """One's complement sums of rows, 16 bits at a time, a last odd byte filled up with 0."""
+    """Return one's complement sums of rows, 16 bits at a time, a last odd byte filled up with 0."""
     high = rows[:, 0::2].sum(axis=1, dtype=np.int64)
     total: NDArray[np.int64] = (high << 8) + rows[:, 1::2].sum(axis=1, dtype=np.int64)
     for _ in range(3):

@@ -84,7 +84,7 @@ _LAYOUTS = (TagLayout("I", "I"), TagLayout("I", "Q"), TagLayout("q", "Q"), TagLa
 
 
 def read_tags(stream: BufferedIOBase) -> Iterator[tuple[int, int]]:
-    """Time and size of the stream after each write; an unfinished last entry is left out.
+    """Yield time and size of the stream after each write; an unfinished last entry is left out.
 
     Yields:
         nanoseconds since 1970 (UTC; leap seconds by the built-in table), bytes of the stream so far.
@@ -113,7 +113,7 @@ def read_tags(stream: BufferedIOBase) -> Iterator[tuple[int, int]]:
 
 
 def _layout_of(start: bytes) -> TagLayout:
-    """The first layout by which the numbers make sense; of a short file rather one that its length fits."""
+    """Return the first layout by which the numbers make sense; of a short file rather one that its length fits."""
     possible = [layout for layout in _LAYOUTS if _makes_sense(layout, start)]
     if not possible:
         raise ValueError("is of no known layout")
@@ -123,7 +123,7 @@ def _layout_of(start: bytes) -> TagLayout:
 
 
 def _makes_sense(layout: TagLayout, start: bytes) -> bool:
-    """Whether the time is of this age, and ticks and sizes never step back."""
+    """Return whether the time is of this age, and ticks and sizes never step back."""
     if len(start) < layout.time.size:
         return False
     seconds, fraction = layout.time.unpack_from(start)
@@ -139,7 +139,7 @@ def _makes_sense(layout: TagLayout, start: bytes) -> bool:
 
 
 def _unix_ns(gps_as_unix_ns: int) -> int:
-    """UTC of a GPS time that counts from 1970."""
+    """Return UTC of a GPS time that counts from 1970."""
     leap = 0
     for _ in range(2):  # the day a leap count begins is a day of UTC
         day = _UNIX_DAY + dt.timedelta(seconds=gps_as_unix_ns // SECOND_NS - leap)
@@ -186,7 +186,7 @@ _COLUMNS = ["arrival_unix_s", "offset", "length"]
 def read_serial(
     path: Path | str, chunks: Path | str | None = None, tally: CaptureTally | None = None
 ) -> Iterator[CapturedUnit]:
-    """Reads of a serial port or a TCP stream: the bytes, and a table of when which of them arrived.
+    """Return reads of a serial port or a TCP stream: the bytes, and a table of when which of them arrived.
 
     Args:
         path: the bytes, possibly gzipped.
@@ -202,7 +202,7 @@ def read_serial(
 
 
 def chunk_table(path: Path) -> Path | None:
-    """The table of arrivals beside a file of bytes; None where there is none."""
+    """Return the table of arrivals beside a file of bytes; None where there is none."""
     bare = path.with_suffix("") if path.suffix == ".gz" else path
     tables = (bare.with_suffix(suffix) for suffix in (".chunks.csv", ".chunks.csv.gz"))
     return next((table for table in tables if table.exists()), None)
@@ -236,7 +236,7 @@ def _seek(stream: BufferedIOBase, offset: int, position: int, path: Path) -> Non
 
 
 def _rows(table: Path) -> Iterator[tuple[int, int, int, int]]:
-    """Line number, arrival, offset and length of each row."""
+    """Yield line number, arrival, offset and length of each row."""
     lines = read_lines(table)
     header = next(lines, (1, ""))[1].split(",")
     for number, line in lines:
@@ -250,7 +250,7 @@ def _rows(table: Path) -> Iterator[tuple[int, int, int, int]]:
 
 
 def read_tagged(path: Path | str, tags: Path | str, tally: CaptureTally | None = None) -> Iterator[CapturedUnit]:
-    """A stream of str2str with its time tags: one unit a write, to the millisecond.
+    """Return a stream of str2str with its time tags: one unit a write, to the millisecond.
 
     Args:
         path: the bytes, possibly gzipped.
@@ -316,7 +316,7 @@ class BareTime:
 
 
 def read_bare(path: Path | str, time: BareTime, tally: CaptureTally | None = None) -> Iterator[CapturedUnit]:
-    """Bytes without times, in units of 512, each with the time of its last byte.
+    """Return bytes without times, in units of 512, each with the time of its last byte.
 
     Args:
         path: the bytes, possibly gzipped.

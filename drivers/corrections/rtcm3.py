@@ -28,11 +28,11 @@ class Rtcm3Parser(StreamParser):
         self._framer = Framer((RTCM3,), self.counters)
 
     def feed(self, chunk: Chunk) -> list[Record]:
-        """The station, where it is told."""
+        """Return the station, where it is told."""
         return self._records(self._framer.feed(chunk.data, chunk.host_time_ns))
 
     def close(self) -> list[Record]:
-        """What a false frame held back."""
+        """Return what a false frame held back."""
         return self._records(self._framer.close())
 
     def _records(self, frames: list[Frame]) -> list[Record]:
@@ -57,7 +57,7 @@ class Rtcm3Parser(StreamParser):
 
 
 def _unsigned(payload: bytes, first: int, bits: int) -> int:
-    """Bits from ``first`` on, the highest first."""
+    """Return bits from ``first`` on, the highest first."""
     whole = int.from_bytes(payload, "big")
     return whole >> (8 * len(payload) - first - bits) & ((1 << bits) - 1)
 

@@ -27,7 +27,7 @@ _FOLDS = [tuple(8 << power for power in reversed(range(places))) for places in r
 
 
 def nmea_xor(body: Bytes) -> int:
-    """Exclusive or of the bytes between ``$`` and ``*`` (NMEA 0183, 5.3).
+    """Return exclusive or of the bytes between ``$`` and ``*`` (NMEA 0183, 5.3).
 
     Folded in halves: shifting a number by half its length and adding it without carry leaves the halves' XOR below.
     """
@@ -39,7 +39,7 @@ def nmea_xor(body: Bytes) -> int:
 
 @cache
 def _fletcher_weights() -> NDArray[np.uint8]:
-    """How often the second sum counts each of the last n bytes: n … 2, 1, modulo 256."""
+    """Return how often the second sum counts each of the last n bytes: n … 2, 1, modulo 256."""
     return np.arange(FLETCHER_STEP_BYTES, 0, -1).astype(np.uint8)
 
 
@@ -49,7 +49,9 @@ def _fletcher_ones() -> NDArray[np.uint8]:
 
 
 def ubx_fletcher(body: Bytes) -> tuple[int, int]:
-    """CK_A and CK_B over class, id, length and payload (u-blox M8 protocol, 32.4): sums modulo 256, as uint8 wraps."""
+    """Return CK_A and CK_B over class, id, length and payload (u-blox M8 protocol, 32.4): sums modulo 256, as uint8
+    wraps.
+    """
     first = second = 0
     view = np.frombuffer(body, dtype=np.uint8)
     for start in range(0, len(view), FLETCHER_STEP_BYTES):
@@ -62,7 +64,9 @@ def ubx_fletcher(body: Bytes) -> tuple[int, int]:
 
 @cache
 def _crc24q_table() -> tuple[NDArray[np.uint32], NDArray[np.intp]]:
-    """CRC of each byte value followed by k zero bytes, flat over (k descending, value), and the rows' offsets."""
+    """Return CRC of each byte value followed by k zero bytes, flat over (k descending, value), and the rows'
+    offsets.
+    """
     row = np.arange(256, dtype=np.uint32) << np.uint32(16)
     for _ in range(8):
         row = (row << np.uint32(1)) ^ np.where(row & np.uint32(0x80_0000), np.uint32(CRC24Q_POLYNOMIAL), np.uint32(0))
@@ -76,7 +80,7 @@ def _crc24q_table() -> tuple[NDArray[np.uint32], NDArray[np.intp]]:
 
 
 def crc24q(data: Bytes) -> int:
-    """CRC-24Q, initial value 0 (RTCM 10403.3, 4.1.2)."""
+    """Return CRC-24Q, initial value 0 (RTCM 10403.3, 4.1.2)."""
     table, offsets = _crc24q_table()
     crc = 0
     for start in range(0, len(data), CRC24Q_STEP_BYTES):
@@ -91,7 +95,9 @@ def crc24q(data: Bytes) -> int:
 
 @cache
 def _crc24q_mark_table() -> tuple[NDArray[np.uint32], NDArray[np.intp]]:
-    """CRC of each byte value at place k, divided by x⁸ for each byte before it, flat over (k, value); rows' offsets."""
+    """Return CRC of each byte value at place k, divided by x⁸ for each byte before it, flat over (k, value); rows'
+    offsets.
+    """
     divided = np.arange(256, dtype=np.uint32)  # low byte of a register, by x⁸
     for _ in range(8):
         divided = (divided ^ (divided & np.uint32(1)) * np.uint32(CRC24Q_POLYNOMIAL)) >> np.uint32(1)
@@ -103,7 +109,7 @@ def _crc24q_mark_table() -> tuple[NDArray[np.uint32], NDArray[np.intp]]:
 
 
 def crc24q_marks(data: Bytes) -> NDArray[np.uint32]:
-    """One number a place between bytes; ``crc24q(data[a:b]) == 0`` just where those at a and b are equal.
+    """Return one number a place between bytes; ``crc24q(data[a:b]) == 0`` just where those at a and b are equal.
 
     The CRC up to a place, divided by x⁸ for every byte before it (the polynomial ends in 1, so that x has an inverse),
     is a sum to which each byte adds its own part, whatever comes behind. What lies between two places adds nothing to
@@ -120,7 +126,7 @@ def crc24q_marks(data: Bytes) -> NDArray[np.uint32]:
 
 
 def crc32_novatel(data: Bytes) -> int:
-    """NovAtel's CRC-32 (OEM7 manual, 32-bit CRC): the IEEE polynomial reflected, from 0, no final inversion.
+    """Return NovAtel's CRC-32 (OEM7 manual, 32-bit CRC): the IEEE polynomial reflected, from 0, no final inversion.
 
     zlib inverts the register before and after; inverting its seed and its result takes both away.
     """
@@ -128,5 +134,7 @@ def crc32_novatel(data: Bytes) -> int:
 
 
 def crc16_ccitt(data: Bytes) -> int:
-    """CRC-16 of SBF (PolaRx5TR reference guide, 4.1.1): x¹⁶ + x¹² + x⁵ + 1 from 0, high bit first, no inversion."""
+    """Return CRC-16 of SBF (PolaRx5TR reference guide, 4.1.1): x¹⁶ + x¹² + x⁵ + 1 from 0, high bit first, no
+    inversion.
+    """
     return binascii.crc_hqx(data, 0)

@@ -74,12 +74,12 @@ class FrameKind:
     marks: Callable[[bytes], NDArray[np.uint32]] | None = None
 
     def __deepcopy__(self, memo: dict[int, object]) -> FrameKind:
-        """A kind never changes: a parser's copy shares it."""
+        """Return a kind never changes: a parser's copy shares it."""
         return self
 
 
 def sync_expression(kinds: Sequence[FrameKind]) -> re.Pattern[bytes]:
-    """One group a kind; matches a whole sync, or the beginning of one at the end of the buffer."""
+    """Return one group a kind; matches a whole sync, or the beginning of one at the end of the buffer."""
     groups = []
     for kind in kinds:
         expression = b""
@@ -101,7 +101,7 @@ class _Overlaps:
         self._marked = 0  # the place of the first mark
 
     def intact(self, kind: FrameKind, start: int, data: bytes) -> bool:
-        """Whether the checksum of a complete frame is good."""
+        """Return whether the checksum of a complete frame is good."""
         assert kind.marks is not None
         end = start + len(data)
         if start >= self._bad_end:
@@ -143,7 +143,7 @@ class Framer:
         return self._scan(final=False) if self._held >= self._needed else []
 
     def close(self) -> list[Frame]:
-        """The stream has ended: frames still held back behind a false sync; the rest is skipped."""
+        """Return the stream has ended: frames still held back behind a false sync; the rest is skipped."""
         return self._scan(final=True)
 
     def _scan(self, *, final: bool) -> list[Frame]:
@@ -179,7 +179,7 @@ class Framer:
         return frames
 
     def _without_end(self, kind: FrameKind, length: int, there: int, final: bool) -> int:
-        """Bytes to wait for from the candidate's start on, of which some are there; 0 if it is no frame."""
+        """Return bytes to wait for from the candidate's start on, of which some are there; 0 if it is no frame."""
         if length == UNDECIDED:
             length = there + 1
         elif length == OVER_BOUND:
@@ -187,7 +187,7 @@ class Framer:
         return 0 if final or length < 0 else length
 
     def _arrival(self, end_offset: int) -> int:
-        """Host time of the read that brought the byte before ``end_offset``."""
+        """Return host time of the read that brought the byte before ``end_offset``."""
         while self._arrivals[0][0] < end_offset:
             self._arrivals.popleft()
         return self._arrivals[0][1]

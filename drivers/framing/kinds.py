@@ -23,7 +23,9 @@ NMEA_ADDRESS = re.compile(rb"[$!]([A-Z0-9]+)(?:,(\d\d)(?=[,*]))?")
 
 
 def measure_nmea(buffer: bytes, start: int, final: bool) -> int:
-    """Up to the line end, which belongs to the sentence; up to the checksum where there is none (6.1 of NMEA 0183)."""
+    """Return up to the line end, which belongs to the sentence; up to the checksum where there is none (6.1 of NMEA
+    0183).
+    """
     sentence = NMEA_SENTENCE.match(buffer, start)
     if sentence:
         return sentence.end() - start
@@ -43,13 +45,15 @@ def measure_nmea(buffer: bytes, start: int, final: bool) -> int:
 
 
 def intact_nmea(frame: bytes) -> bool:
-    """Whether the two hexadecimal digits are the XOR of the body."""
+    """Return whether the two hexadecimal digits are the XOR of the body."""
     star = frame.rindex(b"*")
     return nmea_xor(frame[1:star]) == int(frame[star + 1 : star + 3], 16)
 
 
 def nmea_name(frame: bytes) -> str:
-    """``GGA`` whoever talks; a maker's own sentence by its whole address, u-blox's with its number (``PUBX00``)."""
+    """Return ``GGA`` whoever talks; a maker's own sentence by its whole address, u-blox's with its number
+    (``PUBX00``).
+    """
     comma = frame.find(b",", 0, NMEA_LONGEST_ADDRESS)
     if comma < 0:
         return _nmea_name(frame)
@@ -98,7 +102,7 @@ UBX_NAME_TABLE = """
 
 
 def _read_ubx_names(table: str) -> dict[bytes, str]:
-    """Class and id as two bytes, to the message's name; a class alone as one byte, to its name."""
+    """Return class and id as two bytes, to the message's name; a class alone as one byte, to its name."""
     names: dict[bytes, str] = {}
     for line in table.strip().splitlines():
         family, title, *pairs = line.split()
@@ -112,7 +116,7 @@ UBX_NAMES = _read_ubx_names(UBX_NAME_TABLE)
 
 
 def measure_ubx(buffer: bytes, start: int, final: bool) -> int:
-    """Overhead and the length field."""
+    """Return overhead and the length field."""
     if len(buffer) - start < UBX_LENGTH.size:
         return UNDECIDED
     payload: int = UBX_LENGTH.unpack_from(buffer, start)[0]
@@ -120,12 +124,12 @@ def measure_ubx(buffer: bytes, start: int, final: bool) -> int:
 
 
 def intact_ubx(frame: bytes) -> bool:
-    """Fletcher over class to payload."""
+    """Return fletcher over class to payload."""
     return (frame[-2], frame[-1]) == ubx_fletcher(frame[2:-2])
 
 
 def ubx_name(frame: bytes) -> str:
-    """``NAV-PVT``; ``CFG-3E`` where the table has the class only."""
+    """Return ``NAV-PVT``; ``CFG-3E`` where the table has the class only."""
     return UBX_NAMES.get(frame[2:4]) or f"{UBX_NAMES.get(frame[2:3], f'UBX-{frame[2]:02X}')}-{frame[3]:02X}"
 
 
@@ -135,14 +139,14 @@ RTCM3_MAX_BYTES = 3 + 1023 + 3  # the length has 10 bits
 
 
 def measure_rtcm3(buffer: bytes, start: int, final: bool) -> int:
-    """Header, length, CRC."""
+    """Return header, length, CRC."""
     if len(buffer) - start < 3:
         return UNDECIDED
     return ((buffer[start + 1] & 3) << 8 | buffer[start + 2]) + 6
 
 
 def rtcm3_name(frame: bytes) -> str:
-    """``RTCM1077``: the message number is the payload's first 12 bits."""
+    """Return ``RTCM1077``: the message number is the payload's first 12 bits."""
     return f"RTCM{frame[3] << 4 | frame[4] >> 4}" if len(frame) >= 8 else "RTCM-empty"
 
 
@@ -158,7 +162,7 @@ NOVATEL_MESSAGE_ID = struct.Struct("<4xH")  # both headers
 
 
 def measure_novatel(buffer: bytes, start: int, final: bool) -> int:
-    """Header, message and CRC of the long form."""
+    """Return header, message and CRC of the long form."""
     if len(buffer) - start < NOVATEL_LENGTHS.size:
         return UNDECIDED
     header, message = NOVATEL_LENGTHS.unpack_from(buffer, start)
@@ -168,14 +172,14 @@ def measure_novatel(buffer: bytes, start: int, final: bool) -> int:
 
 
 def measure_novatel_short(buffer: bytes, start: int, final: bool) -> int:
-    """Header, message and CRC of the short form."""
+    """Return header, message and CRC of the short form."""
     if len(buffer) - start < 4:
         return UNDECIDED
     return NOVATEL_SHORT_HEADER_BYTES + buffer[start + 3] + 4
 
 
 def novatel_name(frame: bytes) -> str:
-    """``NOVATEL-42``: the message id; `swath.drivers.gnss.novatel.parser` knows the names."""
+    """Return ``NOVATEL-42``: the message id; `swath.drivers.gnss.novatel.parser` knows the names."""
     return f"NOVATEL-{NOVATEL_MESSAGE_ID.unpack_from(frame)[0]}"
 
 
@@ -189,7 +193,7 @@ XBUS_IDENTIFIERS = bytes(sorted({*XBUS_NAMES, *range(1, 256, 2)}))  # its answer
 
 
 def measure_xbus(buffer: bytes, start: int, final: bool) -> int:
-    """Preamble, bus and message identifier, length, data and checksum."""
+    """Return preamble, bus and message identifier, length, data and checksum."""
     if len(buffer) - start < 4:
         return UNDECIDED
     length = buffer[start + 3]
@@ -202,12 +206,12 @@ def measure_xbus(buffer: bytes, start: int, final: bool) -> int:
 
 
 def intact_xbus(frame: bytes) -> bool:
-    """All bytes but the preamble, checksum included, add up to 0 modulo 256."""
+    """Return all bytes but the preamble, checksum included, add up to 0 modulo 256."""
     return sum(frame[1:]) & 0xFF == 0
 
 
 def xbus_name(frame: bytes) -> str:
-    """``MTData2``; ``XBUS-31`` where the table has no name."""
+    """Return ``MTData2``; ``XBUS-31`` where the table has no name."""
     return XBUS_NAMES.get(frame[2]) or f"XBUS-{frame[2]:02X}"
 
 
@@ -222,7 +226,7 @@ SBF_NUMBER_BITS = 0x1FFF  # of the id; the three above are the revision
 
 
 def measure_sbf(buffer: bytes, start: int, final: bool) -> int:
-    """The length field, which counts the whole block; always a multiple of 4."""
+    """Return the length field, which counts the whole block; always a multiple of 4."""
     if len(buffer) - start < SBF_HEADER_BYTES:
         return UNDECIDED
     length: int = SBF_HEADER.unpack_from(buffer, start)[2]
@@ -232,12 +236,12 @@ def measure_sbf(buffer: bytes, start: int, final: bool) -> int:
 
 
 def intact_sbf(frame: bytes) -> bool:
-    """The CRC in the header against that of the rest."""
+    """Return the CRC in the header against that of the rest."""
     return bool(SBF_HEADER.unpack_from(frame)[0] == crc16_ccitt(memoryview(frame)[SBF_CRC_START:]))
 
 
 def sbf_name(frame: bytes) -> str:
-    """``SBF-4007``: the block's number; `swath.drivers.gnss.sbf.parser` knows the names."""
+    """Return ``SBF-4007``: the block's number; `swath.drivers.gnss.sbf.parser` knows the names."""
     return f"SBF-{SBF_HEADER.unpack_from(frame)[1] & SBF_NUMBER_BITS}"
 
 

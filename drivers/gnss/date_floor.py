@@ -42,7 +42,7 @@ def read_date_floor(settings: DeviceSettings) -> dt.date:
 
 
 def week_of(date: dt.date) -> int:
-    """Full GPS week a date lies in."""
+    """Return full GPS week a date lies in."""
     return (date - GPS_EPOCH).days // 7
 
 

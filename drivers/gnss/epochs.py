@@ -47,7 +47,7 @@ class EpochGatherer(Generic[PartT]):
         return complete
 
     def end(self) -> list[dict[str, PartT]]:
-        """The epoch is over: what was not yet handed over."""
+        """Return the epoch is over: what was not yet handed over."""
         complete = self._hand_over()
         if self.key is not None:
             aged = {name: age + 1 for name, age in self._expected.items() if age < FORGET_AFTER_EPOCHS}

@@ -18,7 +18,7 @@ class Row(NamedTuple):
 
 
 def join_rows(items: Iterable[Record | Row]) -> list[Record]:
-    """Records in order; neighbouring rows of one kind are one array."""
+    """Return records in order; neighbouring rows of one kind are one array."""
     records: list[Record] = []
     run: list[Row] = []
     for item in items:
@@ -33,7 +33,7 @@ def join_rows(items: Iterable[Record | Row]) -> list[Record]:
 
 
 def _array(run: list[Row]) -> Record:
-    """Rows of one kind as one record."""
+    """Return rows of one kind as one record."""
     values: list[Any] = [row.values for row in run]
     if run[0].record is ImuSamples:
         return ImuSamples(np.array(values, dtype=IMU_DTYPE))

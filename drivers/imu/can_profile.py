@@ -14,7 +14,7 @@ from swath.drivers.parser import DeviceSettings, DriverSettingsError
 def profile_map(
     settings: DeviceSettings, contents: bytes, name: str, signals: Mapping[str, Any], *, prefix: str = ""
 ) -> SignalMap:
-    """The signal map of a device whose messages are described by a DBC that comes with its driver.
+    """Return the signal map of a device whose messages are described by a DBC that comes with its driver.
 
     The message with the counter opens a sample unless the table's ``group`` says otherwise.
 
@@ -40,7 +40,7 @@ def profile_map(
 
 
 def _can_ids(config: Mapping[str, Any], defaults: Mapping[str, int]) -> dict[str, int]:
-    """The ``can_id`` word of each message."""
+    """Return the ``can_id`` word of each message."""
     extended = bool(config.get("extended_ids"))
     given = dict(config.get("ids") or {})
     unknown = sorted(set(given) - set(defaults))

@@ -131,7 +131,7 @@ class CanmodGpsParser(DbcParser):
         return [*super().parse_units(host_time_ns, units), *self._gnss_records(host_time_ns, table)]
 
     def _gnss_records(self, host_time_ns: Int64Array, table: StructArray) -> list[Record]:
-        """The GNSS messages of a batch in the order of their arrival; they come once a second."""
+        """Return the GNSS messages of a batch in the order of their arrival; they come once a second."""
         found: list[tuple[int, str, dict[str, float]]] = []
         for name, message in self._gnss.items():
             where = np.flatnonzero(table["can_id"] == np.uint32(message.can_id))
@@ -151,7 +151,7 @@ class CanmodGpsParser(DbcParser):
         return records
 
     def _gnss_record(self, host_time_ns: int, name: str, values: dict[str, float]) -> list[Record]:
-        """What one GNSS message says."""
+        """Return what one GNSS message says."""
         if name == "gnss_status":
             self._status = values
             return []
@@ -169,7 +169,7 @@ class CanmodGpsParser(DbcParser):
         return [DeviceStatus(host_time_ns, _status_values(name, values), message=name)]
 
     def _fix(self, host_time_ns: int, values: dict[str, float]) -> GnssFix:
-        """Position of the epoch of the last time message.
+        """Return position of the epoch of the last time message.
 
         The maker does not say what surface its altitude refers to, so the fix has no ellipsoidal height; the altitude
         is in the device's status.
@@ -193,7 +193,7 @@ class CanmodGpsParser(DbcParser):
 
 
 def _gnss_message(database: Any, name: str, file_name: str) -> GnssMessage:
-    """Layouts of one GNSS message."""
+    """Return layouts of one GNSS message."""
     found = {key: find_signal(database, f"{name}.{key}", file_name) for key in GNSS_SIGNALS[name]}
     layouts = {key: signal.layout for key, signal in found.items()}
     needs = max(layout.needs_bytes for layout in layouts.values())
@@ -201,7 +201,7 @@ def _gnss_message(database: Any, name: str, file_name: str) -> GnssMessage:
 
 
 def utc_tag(unix_s: float) -> TimeTag:
-    """UTC of a Unix time with the device's 1 ms resolution.
+    """Return UTC of a Unix time with the device's 1 ms resolution.
 
     The device cuts its epoch to milliseconds, so a whole second reads as .000 or .999: both are the whole second.
     """
@@ -213,13 +213,13 @@ def utc_tag(unix_s: float) -> TimeTag:
 
 
 def _status_values(name: str, values: dict[str, float]) -> dict[str, float | int | str | bool]:
-    """The message's values with their units in the keys; nothing where the device calls them invalid."""
+    """Return the message's values with their units in the keys; nothing where the device calls them invalid."""
     valid, signals = STATUS_SIGNALS[name]
     return {key: values[signal] * factor for signal, (key, factor) in signals.items()} if values[valid] else {}
 
 
 def make_time_parser(settings: DeviceSettings) -> CanmodGpsParser:
-    """The recorder's parser: time messages only."""
+    """Return the recorder's parser: time messages only."""
     return CanmodGpsParser(settings, time_only=True)
 
 

@@ -32,7 +32,9 @@ class CounterUnwrapper:
         self._last = 0
 
     def unwrap(self, raw: NDArray[np.uint64], host_time_ns: Int64Array) -> tuple[Int64Array, NDArray[np.bool_]]:
-        """Continuous counts (n,) of raw values (n,) with their host times, and (n,) where the device restarted."""
+        """Return continuous counts (n,) of raw values (n,) with their host times, and (n,) where the device
+        restarted.
+        """
         if not len(raw):
             return np.empty(0, np.int64), np.empty(0, np.bool_)
         first = self._last_raw is None
@@ -49,7 +51,7 @@ class CounterUnwrapper:
         return counts, restart
 
     def _steps(self, raw: NDArray[np.uint64], host_step_ns: Int64Array) -> tuple[Int64Array, NDArray[np.bool_]]:
-        """Steps between neighbours in ticks, whole wraps added by host time, and where the device restarted."""
+        """Return steps between neighbours in ticks, whole wraps added by host time, and where the device restarted."""
         span_s = host_step_ns / SECOND_NS
         expected = span_s * self._tick_hz
         steps: Int64Array = (raw[1:] - raw[:-1]).view(np.int64)
@@ -65,7 +67,7 @@ class CounterUnwrapper:
         return steps, unsure | (steps < 0) | (np.abs(expected - steps) > tolerance)
 
     def _accumulate(self, steps: Int64Array, restart: NDArray[np.bool_], raw: Int64Array) -> Int64Array:
-        """Running counts; each restart begins at its own raw value."""
+        """Return running counts; each restart begins at its own raw value."""
         sums = self._last + np.cumsum(np.where(restart, 0, steps))
         where = np.flatnonzero(restart)
         shift = np.concatenate([[0], raw[where] - sums[where]])
@@ -81,7 +83,7 @@ class GapCounter:
         self._last: np.uint64 | None = None
 
     def missing(self, raw: NDArray[np.uint64]) -> int:
-        """How many values lie between the raw ones (n,), the last of the call before included."""
+        """Return how many values lie between the raw ones (n,), the last of the call before included."""
         if not len(raw):
             return 0
         before = raw[:1] if self._last is None else np.array([self._last])
@@ -107,7 +109,7 @@ class LatchTracker:
     def track(
         self, raw: NDArray[np.uint64], known: NDArray[np.bool_], counts: Int64Array, restart: NDArray[np.bool_]
     ) -> Int64Array:
-        """Continuous latched counts (n,), −1 where unknown.
+        """Return continuous latched counts (n,), −1 where unknown.
 
         Args: latched bits and whether there are any, the running counts and restarts; (n,) each.
         """
@@ -124,7 +126,7 @@ class LatchTracker:
 
 
 def latched_before(raw: NDArray[np.uint64], bits: int, reference: Int64Array) -> Int64Array:
-    """Continuous counts of latched raw values: the nearest at or below the reference counts.
+    """Return continuous counts of latched raw values: the nearest at or below the reference counts.
 
     A latch may be reported a moment before the sample that follows it, so a value ahead of its reference by less than
     an eighth of the wrap is taken as ahead. Args: (n,) raw, the counter's bits, (n,) reference counts.
@@ -139,7 +141,7 @@ def latched_before(raw: NDArray[np.uint64], bits: int, reference: Int64Array) ->
 
 
 def nanoseconds(counts: Int64Array, tick_hz: Fraction) -> Int64Array:
-    """Counts in nanoseconds, exact below the nanosecond for whole and fractional rates."""
+    """Return counts in nanoseconds, exact below the nanosecond for whole and fractional rates."""
     scaled = counts * tick_hz.denominator
     whole, rest = np.divmod(scaled, tick_hz.numerator)
     result: Int64Array = whole * SECOND_NS + rest * SECOND_NS // tick_hz.numerator

@@ -165,7 +165,7 @@ class Nmea2000Parser(PacketParser):
     # -- frames
 
     def _addresses(self, can_id: NDArray[np.uint32]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """PGN (−1: no data frame with 29 bits) and source address of each frame."""
+        """Return PGN (−1: no data frame with 29 bits) and source address of each frame."""
         flagged = can_id & np.uint32(CAN_ERR_FLAG | CAN_RTR_FLAG)
         errors = int(np.count_nonzero(flagged & np.uint32(CAN_ERR_FLAG)))
         remote = int(np.count_nonzero(flagged)) - errors
@@ -180,7 +180,7 @@ class Nmea2000Parser(PacketParser):
         self.counters.errors[code] += messages
 
     def _source_of(self, pgn: int, first: int) -> int:
-        """The source used for a PGN; ``first``: of the first message there is."""
+        """Return the source used for a PGN; ``first``: of the first message there is."""
         return self._wanted if self._wanted is not None else self._used.setdefault(pgn, first)
 
     def _single_frames(
@@ -192,7 +192,7 @@ class Nmea2000Parser(PacketParser):
         table: StructArray,
         host_time_ns: Int64Array,
     ) -> list[tuple[int, list[Record]]]:
-        """Row and records of each frame of a single-frame PGN."""
+        """Return row and records of each frame of a single-frame PGN."""
         whole = where[table["length"][where] >= layout.needs_bytes]
         if len(whole) < len(where):
             self._count_bad(len(where) - len(whole))
@@ -213,7 +213,7 @@ class Nmea2000Parser(PacketParser):
     def _fast_frames(
         self, where: NDArray[np.intp], source: NDArray[np.int64], table: StructArray, host_time_ns: Int64Array
     ) -> list[tuple[int, list[Record]]]:
-        """Row and records of each 129029 that is completed; few of a bus's frames are."""
+        """Return row and records of each 129029 that is completed; few of a bus's frames are."""
         found: list[tuple[int, list[Record]]] = []
         lengths = np.minimum(table["length"][where], 8).tolist()
         data = np.ascontiguousarray(table["data"][where][:, :8])
@@ -244,7 +244,7 @@ class Nmea2000Parser(PacketParser):
     # -- records
 
     def _records_of(self, pgn: int, host_time_ns: int, values: Values) -> list[Record]:
-        """What one single-frame message says."""
+        """Return what one single-frame message says."""
         if pgn == SYSTEM_TIME:
             return self._time_records(host_time_ns, values)
         records: list[Record] = [DeviceStatus(host_time_ns, {**values}, message=str(pgn))]
@@ -254,14 +254,14 @@ class Nmea2000Parser(PacketParser):
         return records
 
     def _tag(self, days: int, time: int) -> TimeTag | None:
-        """UTC of a date and time of day; None, counted, where they are no time."""
+        """Return UTC of a date and time of day; None, counted, where they are no time."""
         if time > DAY_UNITS:
             self._count_bad(1, "bad_value")
             return None
         return TimeTag(TimeScale.UTC, time * TIME_UNIT_NS, date=UNIX_EPOCH + dt.timedelta(days=days))
 
     def _time_records(self, host_time_ns: int, values: Values) -> list[Record]:
-        """126992: valid where it comes from satellites."""
+        """Return 126992: valid where it comes from satellites."""
         if "date" not in values or "time" not in values:
             self.counters.errors["time_not_available"] += 1
             return []
@@ -272,7 +272,7 @@ class Nmea2000Parser(PacketParser):
         return [TimeMessage(host_time_ns, tag, NamesEdge.PREVIOUS, valid=valid, message=str(SYSTEM_TIME))]
 
     def _position_records(self, host_time_ns: int, message: bytes) -> list[Record]:
-        """129029: the fix, and what it says beside it."""
+        """Return 129029: the fix, and what it says beside it."""
         _, days, time, lat, lon, altitude, kinds, integrity, satellites, hdop, pdop, separation, _ = (
             GNSS_STRUCT.unpack_from(message)
         )
@@ -313,7 +313,7 @@ class Nmea2000Parser(PacketParser):
 
 
 def pgn_and_source(can_id: NDArray[np.uint32]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """PGN and source address of (n,) 29-bit identifiers (SAE J1939-21).
+    """Return PGN and source address of (n,) 29-bit identifiers (SAE J1939-21).
 
     PDU format below 240 means that the next byte is a destination and no part of the PGN.
     """
@@ -323,12 +323,12 @@ def pgn_and_source(can_id: NDArray[np.uint32]) -> tuple[NDArray[np.int64], NDArr
 
 
 def is_available(raw: int, bits: int) -> bool:
-    """Whether a field is a number: ``bits`` are those of its largest value (15 for a signed field of 16)."""
+    """Return whether a field is a number: ``bits`` are those of its largest value (15 for a signed field of 16)."""
     return raw <= (1 << bits) - 1 - SPECIAL_VALUES
 
 
 def decode_columns(layout: Layout, data: ByteRows) -> dict[str, list[float | None]]:
-    """Numbers and codes of (n, 8 or more) data bytes by name; None where not available."""
+    """Return numbers and codes of (n, 8 or more) data bytes by name; None where not available."""
     columns: dict[str, list[float | None]] = {}
     for field in layout.fields:
         dtype = np.dtype(field.dtype)
@@ -344,7 +344,7 @@ def decode_columns(layout: Layout, data: ByteRows) -> dict[str, list[float | Non
 
 
 def true_heading_rad(values: Values) -> float | None:
-    """Heading from true north, 0 … 2π; None where 127250 does not say enough.
+    """Return heading from true north, 0 … 2π; None where 127250 does not say enough.
 
     A magnetic heading needs the variation (east positive); the compass's deviation is added where it is said.
     """
@@ -359,7 +359,7 @@ def true_heading_rad(values: Values) -> float | None:
 
 
 def make_time_parser(settings: DeviceSettings) -> Nmea2000Parser:
-    """The recorder's parser: time messages only."""
+    """Return the recorder's parser: time messages only."""
     return Nmea2000Parser(settings, time_only=True)
 
 
@@ -432,7 +432,7 @@ class FastPackets:
         self._open.clear()
 
     def _begin(self, key: tuple[int, int], host_time_ns: int, data: bytes) -> bytes | None:
-        """Frame 0: a message of the same number that is still open is lost."""
+        """Return frame 0: a message of the same number that is still open is lost."""
         before = self._open.pop(key, None)
         if before is not None and before.data is not None:
             self.incomplete += 1
@@ -446,7 +446,7 @@ class FastPackets:
         return self._completed(key, message)
 
     def _completed(self, key: tuple[int, int], message: _Open) -> bytes | None:
-        """The message when all its bytes are there."""
+        """Return the message when all its bytes are there."""
         if message.data is None or len(message.data) < message.length:
             return None
         del self._open[key]

@@ -10,7 +10,7 @@ from swath.georef.records import ImuSamples, InsSolution
 
 
 def make_imu_parser(settings: DeviceSettings) -> NovatelParser:
-    """A parser of the receiver's stream that gives what is inertial."""
+    """Return a parser of the receiver's stream that gives what is inertial."""
     return NovatelParser(settings, wanted=(ImuSamples, InsSolution))
 
 

@@ -10,7 +10,7 @@ from swath.georef.records import ImuSamples, InsSolution
 
 
 def make_imu_parser(settings: DeviceSettings) -> SbfParser:
-    """A parser of the receiver's stream that gives what is inertial."""
+    """Return a parser of the receiver's stream that gives what is inertial."""
     return SbfParser(settings, wanted=(ImuSamples, InsSolution))
 
 

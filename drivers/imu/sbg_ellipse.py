@@ -29,7 +29,7 @@ SIGNALS = {  # canProtocol.md; TIME_STAMP is in µs, which is what tick_hz is wh
 
 
 def signal_map(settings: DeviceSettings) -> SignalMap:
-    """Where the signals lie; with ``pps_event``, the time of that Sync In's last event is the latched counter.
+    """Return where the signals lie; with ``pps_event``, the time of that Sync In's last event is the latched counter.
 
     Raises:
         DriverSettingsError: naming the key and what would be right.
@@ -40,12 +40,12 @@ def signal_map(settings: DeviceSettings) -> SignalMap:
 
 
 def make_parser(settings: DeviceSettings) -> DbcParser:
-    """The parser of everything."""
+    """Return the parser of everything."""
     return DbcParser(settings, signal_map=signal_map(settings))
 
 
 def make_clock_parser(settings: DeviceSettings) -> DbcParser:
-    """The recorder's parser: the device's clock only."""
+    """Return the recorder's parser: the device's clock only."""
     return DbcParser(settings, clock_only=True, signal_map=signal_map(settings))
 
 

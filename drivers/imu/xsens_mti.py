@@ -67,7 +67,7 @@ SIGNALS = {
 
 
 def dbc_text(byte_order: str) -> str:
-    """The messages as a DBC, with the default identifiers."""
+    """Return the messages as a DBC, with the default identifiers."""
     order = BYTE_ORDERS[byte_order]
     lines = ['VERSION ""', "NS_ :", "BS_:", "BU_: MTi", ""]
     for message in MESSAGES:
@@ -82,7 +82,7 @@ def dbc_text(byte_order: str) -> str:
 
 
 def signal_map(settings: DeviceSettings) -> SignalMap:
-    """Where the signals lie.
+    """Return where the signals lie.
 
     Raises:
         DriverSettingsError: naming the key and what would be right.
@@ -98,7 +98,7 @@ def signal_map(settings: DeviceSettings) -> SignalMap:
 
 
 def make_parser(settings: DeviceSettings) -> DbcParser:
-    """The parser of everything."""
+    """Return the parser of everything."""
     return DbcParser(settings, signal_map=signal_map(settings))
 
 

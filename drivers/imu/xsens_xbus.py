@@ -89,7 +89,7 @@ class Sample(NamedTuple):
 
 
 def decode_numbers(data: bytes, number_format: int) -> Values:
-    """Numbers of one format: float32, fixed point 12.20 and 16.32, float64, all high byte first.
+    """Return numbers of one format: float32, fixed point 12.20 and 16.32, float64, all high byte first.
 
     16.32 comes as its 32 fraction bits, then its 16 whole bits.
     """
@@ -104,7 +104,7 @@ def decode_numbers(data: bytes, number_format: int) -> Values:
 
 
 def encode_numbers(values: Sequence[float], number_format: int) -> bytes:
-    """The inverse of `decode_numbers`, rounded to the format's resolution.
+    """Return the inverse of `decode_numbers`, rounded to the format's resolution.
 
     Raises:
         struct.error: a value that does not fit.
@@ -123,7 +123,7 @@ def encode_numbers(values: Sequence[float], number_format: int) -> bytes:
 
 
 def encode_message(identifier: int, data: bytes) -> bytes:
-    """One Xbus message, with an extended length where it needs one.
+    """Return one Xbus message, with an extended length where it needs one.
 
     Raises:
         ValueError: more data than a message can hold.
@@ -136,7 +136,9 @@ def encode_message(identifier: int, data: bytes) -> bytes:
 
 
 def encode_item(kind: int, values: Sequence[float | int], number_format: int = FLOAT32) -> bytes:
-    """One item of MTData2: a counter or status by its one value, `UTC_TIME` by its eight fields, else numbers."""
+    """Return one item of MTData2: a counter or status by its one value, `UTC_TIME` by its eight fields, else
+    numbers.
+    """
     if kind in INTEGERS:
         data = INTEGERS[kind].pack(*values)
         number_format = 0
@@ -149,7 +151,7 @@ def encode_item(kind: int, values: Sequence[float | int], number_format: int = F
 
 
 def encode_mtdata2(*items: bytes) -> bytes:
-    """An MTData2 message of items."""
+    """Return an MTData2 message of items."""
     return encode_message(XBUS_MTDATA2, b"".join(items))
 
 
@@ -157,7 +159,7 @@ def encode_mtdata2(*items: bytes) -> bytes:
 
 
 def split_items(data: bytes) -> dict[int, tuple[int, bytes]] | None:
-    """Identifier without its format to format and contents; None where the items do not fill the message."""
+    """Return identifier without its format to format and contents; None where the items do not fill the message."""
     items: dict[int, tuple[int, bytes]] = {}
     position = 0
     while position + ITEM_HEADER.size <= len(data):
@@ -169,7 +171,7 @@ def split_items(data: bytes) -> dict[int, tuple[int, bytes]] | None:
 
 
 def rotation_vector(quaternion: Values) -> Values:
-    """The rotation of a quaternion (scalar first) of any length as a vector, radians; the shorter way round."""
+    """Return the rotation of a quaternion (scalar first) of any length as a vector, radians; the shorter way round."""
     scalar, *vector = quaternion if quaternion[0] >= 0.0 else tuple(-part for part in quaternion)
     length = hypot(*vector)
     factor = 2.0 * atan2(length, scalar) / length if length else 0.0
@@ -177,7 +179,7 @@ def rotation_vector(quaternion: Values) -> Values:
 
 
 def read_items(data: bytes) -> dict[int, tuple[Any, ...]] | None:
-    """Values of the items that are read here; None where a length is wrong."""
+    """Return values of the items that are read here; None where a length is wrong."""
     found = split_items(data)
     if found is None:
         return None
@@ -232,7 +234,7 @@ class XbusParser(StreamParser):
         return self._decode_all(self._framer.close())
 
     def _decode_all(self, frames: list[Frame]) -> list[Record]:
-        """Time messages in their order, then the samples of all frames."""
+        """Return time messages in their order, then the samples of all frames."""
         records: list[Record] = []
         samples: list[Sample] = []
         packets: list[int] = []
@@ -257,7 +259,7 @@ class XbusParser(StreamParser):
         self.counters.errors[code] += 1
 
     def _time_message(self, host_time_ns: int, items: Mapping[int, Any]) -> list[TimeMessage]:
-        """The UTC of the first sample of each second; its edge is the one before its arrival."""
+        """Return the UTC of the first sample of each second; its edge is the one before its arrival."""
         if UTC_TIME not in items:
             return []
         nanosecond, year, month, day, hour, minute, second, flags = items[UTC_TIME]
@@ -277,7 +279,7 @@ class XbusParser(StreamParser):
         return [TimeMessage(host_time_ns, tag, NamesEdge.PREVIOUS, valid=valid, message="UtcTime")]
 
     def _sample(self, host_time_ns: int, items: Mapping[int, Any]) -> list[Sample]:
-        """The sample of a message; nothing where it has none, counted where it has a part or the other kind."""
+        """Return the sample of a message; nothing where it has none, counted where it has a part or the other kind."""
         kinds = (DELTA_V, DELTA_Q) if self._increments else (ACCELERATION, RATE_OF_TURN)
         force, rate = (items.get(kind) for kind in kinds)
         if force is None or rate is None:
@@ -300,7 +302,7 @@ class XbusParser(StreamParser):
         return [Sample(host_time_ns, ticks, force, rate, celsius, status)]
 
     def _rows(self, samples: list[Sample]) -> ImuSamples:
-        """Samples as rows, their ticks unwrapped."""
+        """Return samples as rows, their ticks unwrapped."""
         rows = np.zeros(len(samples), IMU_DTYPE)
         host, ticks, force, rate, celsius, status = zip(*samples, strict=True)
         rows["host_time_ns"], rows["specific_force_b"], rows["angular_rate_b"] = host, force, rate
@@ -316,7 +318,7 @@ class XbusParser(StreamParser):
 
 
 def make_time_parser(settings: DeviceSettings) -> XbusParser:
-    """Time messages only."""
+    """Return time messages only."""
     return XbusParser(settings, time_only=True)
 
 

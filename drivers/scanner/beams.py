@@ -38,19 +38,19 @@ class BeamTable:
 
 
 def numbers(text: str) -> list[float]:
-    """A table written as words."""
+    """Return a table written as words."""
     return [float(word) for word in text.split()]
 
 
 def beam_table(elevation_deg: object, **others: object) -> BeamTable:
-    """A table of what is given; zeros for the rest."""
+    """Return a table of what is given; zeros for the rest."""
     elevation = np.array(elevation_deg, dtype=np.float64)
     given = {"elevation_deg": elevation, **{name: np.array(values, np.float64) for name, values in others.items()}}
     return BeamTable(**{field.name: given.get(field.name, np.zeros(len(elevation))) for field in fields(BeamTable)})
 
 
 def beam_points(rows: StructArray, beams: BeamTable) -> FloatArray:
-    """Where returns lie, in the maker's frame.
+    """Return where returns lie, in the maker's frame.
 
     The formula is FORMULAS 2.2's for a spinning beam with a full table, written with the beam's start as a vector.
 

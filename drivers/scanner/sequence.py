@@ -86,7 +86,7 @@ class SequenceTracker:
     def _regular(
         self, sequence: NDArray[np.integer], first_time_ns: Int64Array, pps_count: NDArray[np.integer]
     ) -> bool:
-        """Whether every datagram simply follows the one before."""
+        """Return whether every datagram simply follows the one before."""
         last = self._last
         if last is not None and (
             int(sequence[0]) != (last.sequence + 1) % self._modulus
@@ -101,7 +101,7 @@ class SequenceTracker:
         )
 
     def _step(self, sequence: int, first_time_ns: int, pps_count: int, host_time_ns: int) -> tuple[int, bool]:
-        """One datagram: its unwrapped number and whether it is a new one."""
+        """Return one datagram: its unwrapped number and whether it is a new one."""
         last = self._last
         if last is None:
             return self._remember(sequence, sequence, first_time_ns, pps_count, host_time_ns), True
@@ -132,7 +132,7 @@ class SequenceTracker:
         return self._remember(sequence, newest, first_time_ns, pps_count, host_time_ns), True
 
     def _late(self, at: int) -> tuple[int, bool]:
-        """A datagram behind the newest: late, or come before."""
+        """Return a datagram behind the newest: late, or come before."""
         if at not in self._missing:
             self._errors["duplicate"] += 1
             return at, False
@@ -157,7 +157,7 @@ class SampleThinner:
         self._last_bin: int | None = None
 
     def choose(self, host_time_ns: Int64Array) -> BoolArray:
-        """(n,) bool, True where a unit lies in another bin than the unit before it."""
+        """Return (n,) bool, True where a unit lies in another bin than the unit before it."""
         bins = host_time_ns // self._bin_ns
         chosen = np.ones(len(bins), dtype=np.bool_)
         chosen[1:] = bins[1:] != bins[:-1]

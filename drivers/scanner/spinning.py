@@ -64,7 +64,7 @@ class Firings:
     pair: tuple[bool, bool] | None
 
     def slots(self) -> ReturnSlots:
-        """Their places for returns."""
+        """Return their places for returns."""
         content = single_content(self.returns) if self.pair is None else pair_content(self.returns)
         packets, lasers = len(self.number), len(self.channel)
         rounds = len(content) // (packets * lasers)
@@ -87,7 +87,7 @@ class Firings:
 def returns_of_packets(
     mode: NDArray[np.uint8], most: int, firings_of: Callable[[slice], Firings], fill: Fill
 ) -> StructArray:
-    """Returns of all packets in order, worked on in blocks of one return mode.
+    """Return returns of all packets in order, worked on in blocks of one return mode.
 
     Args:
         mode: (n,) return mode of each packet.
@@ -111,7 +111,8 @@ def single_content(returns: StructArray) -> StructArray:
 
 
 def pair_content(returns: StructArray) -> StructArray:
-    """Dual returns (packets, blocks, lasers), a pair in neighbouring blocks, as slots (firings, 2) of rising range.
+    """Return dual returns (packets, blocks, lasers), a pair in neighbouring blocks, as slots (firings, 2) of rising
+    range.
 
     Equal ranges are one return, the first block's. The one of greater reflectivity is the stronger, the second block's
     where they are equal, since a head puts the second strongest beside a strongest that is also the other.
@@ -122,7 +123,9 @@ def pair_content(returns: StructArray) -> StructArray:
 
 
 def _as_numbers(returns: StructArray, second: int = 0) -> NDArray[np.uint32]:
-    """Returns as `_CONTENT` in one number each, flat; to put them together takes half as long as to write fields."""
+    """Return returns as `_CONTENT` in one number each, flat; to put them together takes half as long as to write
+    fields.
+    """
     number = returns["range"].astype(np.uint32).reshape(-1)
     strength = returns["reflectivity"].astype(np.uint16).reshape(-1)
     number <<= 16

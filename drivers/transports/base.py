@@ -22,7 +22,7 @@ class TransportError(OSError):
 
 
 def is_no_serial_port(error: BaseException) -> bool:
-    """Whether a port could not be set because it is none: ENOTTY in or below what pyserial raises."""
+    """Return whether a port could not be set because it is none: ENOTTY in or below what pyserial raises."""
     below: BaseException | None = error
     while below is not None:
         if isinstance(below, OSError | termios.error) and below.args[:1] == (errno.ENOTTY,):
@@ -107,7 +107,7 @@ class Transport(ABC):
         """Close; a second call does nothing."""
 
     def poll_counters(self) -> TransportCounters:
-        """Counters brought up to date with the kernel's."""
+        """Return counters brought up to date with the kernel's."""
         return self.counters
 
 
@@ -133,7 +133,7 @@ class PpsSource(ABC):
         """Wait at most ``timeout_s`` for edges not yet handed over; an empty list on silence."""
 
     def poll_counters(self) -> TransportCounters:
-        """What came and is no edge; nothing, of a source that gives edges only."""
+        """Return what came and is no edge; nothing, of a source that gives edges only."""
         return TransportCounters()
 
     @abstractmethod

@@ -123,12 +123,12 @@ class MessageReader:
         self._iovecs["len"][: self.offered] = self._expected, self._unit_bytes - self._expected
 
     def rows(self, count: int) -> ByteRows:
-        """(count, room + expected length) the first slots of the last read as they lie in memory."""
+        """Return (count, room + expected length) the first slots of the last read as they lie in memory."""
         stride = HEAD_ROOM_BYTES + self._expected
         return self._memory[self._taken : self._taken + count * stride].reshape(count, stride)
 
     def blocks(self, count: int) -> list[UnitBlock]:
-        """The first ``count`` slots as blocks: runs of equal length and sender, in order."""
+        """Return the first ``count`` slots as blocks: runs of equal length and sender, in order."""
         if count == 0:
             return []
         lengths = self._headers["len"][:count]
@@ -154,7 +154,9 @@ class MessageReader:
         return UnitBlock(np.concatenate([units, beyond], axis=1), stamps[first:last], peer)
 
     def _take_stamps(self, count: int) -> Int64Array:
-        """(count,) nanoseconds of CLOCK_REALTIME, 0 where the kernel gave none; readies the headers for the next."""
+        """Return (count,) nanoseconds of CLOCK_REALTIME, 0 where the kernel gave none; readies the headers for the
+        next.
+        """
         rows = self._stamps[:count]
         nanoseconds: Int64Array = rows["sec"].astype(np.int64) * 1_000_000_000 + rows["nsec"]
         given = (
@@ -187,7 +189,7 @@ class DropCounter:
         self.total = 0
 
     def update(self) -> int:
-        """The exact total since the socket was made."""
+        """Return the exact total since the socket was made."""
         count = self._kernel_count()
         self.total += (count - self._last) & 0xFFFFFFFF
         self._last = count
@@ -239,7 +241,7 @@ def stamping() -> Iterator[None]:
 
 
 def _stamps_on_arrival(probe: socket.socket) -> bool:
-    """Whether a datagram to itself has a stamp of before it was read."""
+    """Return whether a datagram to itself has a stamp of before it was read."""
     probe.sendto(b"", probe.getsockname())
     time.sleep(STAMPING_LOOK_S)
     before_reading_ns = time.time_ns()

@@ -31,7 +31,7 @@ class Gate:
         self._wake_poll.register(self._wake_fd, select.POLLIN)
 
     def wait(self, timeout_s: float) -> int:
-        """Poll events of the descriptor; 0 when the time is over or the gate was woken."""
+        """Return poll events of the descriptor; 0 when the time is over or the gate was woken."""
         ready = dict(self._poll.poll(max(0.0, timeout_s) * 1000.0))
         return 0 if self._wake_fd in ready else ready.get(self._fd, 0)
 
@@ -129,7 +129,7 @@ class DescriptorTransport(Transport):
             self._close_device()
 
     def poll_counters(self) -> TransportCounters:
-        """Counters brought up to date with the kernel's; the last values once closed."""
+        """Return counters brought up to date with the kernel's; the last values once closed."""
         with self._counting:
             if self._gate is not None:
                 self._refresh_counters()
@@ -142,7 +142,7 @@ class DescriptorTransport(Transport):
 
 
 def wait_writable(fd: int, deadline_s: float) -> bool:
-    """Whether ``fd`` takes data before ``deadline_s`` of `time.monotonic`."""
+    """Return whether ``fd`` takes data before ``deadline_s`` of `time.monotonic`."""
     poll = select.poll()
     poll.register(fd, select.POLLOUT)
     ready = poll.poll(max(0.0, deadline_s - time.monotonic()) * 1000.0)

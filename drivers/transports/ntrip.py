@@ -78,7 +78,7 @@ class NtripTransport(DescriptorTransport):
         return self._sock.fileno()
 
     def _connect(self) -> socket.socket:
-        """A connection on which data comes."""
+        """Return a connection on which data comes."""
         request = self._request()
         try:
             sock = socket.create_connection((self._spec.ntrip_host, self._spec.ntrip_port), CONNECT_S)
@@ -131,7 +131,7 @@ class NtripTransport(DescriptorTransport):
         return "\r\n".join([*lines, "", ""]).encode()
 
     def _head(self, sock: socket.socket, deadline_s: float) -> tuple[bytes, bytes]:
-        """The answer up to its empty line; of ICY 200 OK, which some casters send alone, its first line."""
+        """Return the answer up to its empty line; of ICY 200 OK, which some casters send alone, its first line."""
         data = b""
         while len(data) < MOST_HEADER_BYTES:
             line, found, rest = data.partition(b"\r\n")
@@ -150,7 +150,7 @@ class NtripTransport(DescriptorTransport):
         raise TransportError(f"{self.name}: answers without an end; is it an NTRIP caster?")
 
     def _not_in_table(self, sock: socket.socket) -> str:
-        """What a source table that came in place of data says."""
+        """Return what a source table that came in place of data says."""
         table, deadline_s = self._first, time.monotonic() + CONNECT_S
         try:
             while b"ENDSOURCETABLE" not in table and len(table) < MOST_TABLE_BYTES and time.monotonic() < deadline_s:
@@ -263,7 +263,7 @@ class _Attempt(threading.Thread):
                 self._sock = sock
 
     def wait(self, seconds: float) -> bool:
-        """Whether it has an end."""
+        """Return whether it has an end."""
         self.join(seconds)
         return not self.is_alive()
 
@@ -275,14 +275,14 @@ class _Attempt(threading.Thread):
                 self._sock.close()
 
     def result(self) -> socket.socket:
-        """The connection; raises TransportError."""
+        """Return the connection; raises TransportError."""
         if self._sock is None:
             raise self._error
         return self._sock
 
 
 def gga_sentence(lat_deg: float, lon_deg: float, height_m: float, now: datetime) -> bytes:
-    """A GGA of a position, as casters want it (NMEA 0183): fix 1, ten satellites, no geoid separation."""
+    """Return a GGA of a position, as casters want it (NMEA 0183): fix 1, ten satellites, no geoid separation."""
     parts = []
     for value, digits, letters in ((lat_deg, 2, "NS"), (lon_deg, 3, "EW")):
         minutes = round(abs(value) * 60.0, 4)
@@ -300,7 +300,7 @@ class _Chunks:
         self._left = 0  # bytes of the chunk still to come, its line end included
 
     def feed(self, data: bytes) -> bytes:
-        """The contents; ValueError where it is none."""
+        """Return the contents; ValueError where it is none."""
         held, out = self._held + data, []
         while held:
             if self._left > 2:
@@ -323,5 +323,5 @@ class _Chunks:
 
 
 def _printable(text: str) -> str:
-    """A foreign line, short and without control characters."""
+    """Return a foreign line, short and without control characters."""
     return "".join(letter if letter.isprintable() else "·" for letter in text[:60]) or "nothing"

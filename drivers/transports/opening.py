@@ -16,7 +16,8 @@ from swath.drivers.transports.udp_socket import UdpTransport
 
 
 def open_transport(spec: TransportSpec, stopped: Callable[[], bool] = lambda: False) -> Transport:
-    """The transport for ``spec``, not yet opened; ``stopped`` is asked while opening waits for a distant computer.
+    """Return the transport for ``spec``, not yet opened; ``stopped`` is asked while opening waits for a distant
+    computer.
 
     Raises:
         ValueError: the kind has no transport of its own (gnss).

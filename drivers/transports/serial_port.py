@@ -118,7 +118,7 @@ class SerialTransport(DescriptorTransport):
             self.counters.line_errors = errors - self._errors_at_open
 
     def _line_errors(self) -> int | None:
-        """Framing, parity and overrun errors since the driver was loaded; None where it does not count (pty)."""
+        """Return framing, parity and overrun errors since the driver was loaded; None where it does not count (pty)."""
         try:
             counts: tuple[int, ...] = _ICOUNTER.unpack(fcntl.ioctl(self._fd, _TIOCGICOUNT, bytes(_ICOUNTER.size)))
         except OSError:

@@ -84,7 +84,7 @@ class TransportSpec:
         return f"{self.kind}:{self.address}"
 
     def flag(self, key: str, default: bool = False) -> bool:
-        """An option that is yes or no."""
+        """Return an option that is yes or no."""
         return _boolean(self.options[key]) if key in self.options else default
 
 
@@ -170,7 +170,7 @@ def _baud(value: str) -> bool:
 
 
 def ntrip_position(value: str) -> tuple[float, float, float]:
-    """Latitude, longitude, degrees, height, m, of ``47.5,8.7,500``; ValueError where it is none."""
+    """Return latitude, longitude, degrees, height, m, of ``47.5,8.7,500``; ValueError where it is none."""
     lat, lon, height = (float(part) for part in value.split(","))
     if not (abs(lat) <= 90.0 and abs(lon) <= 180.0 and abs(height) <= 10_000.0):
         raise ValueError("not on earth")
@@ -275,7 +275,7 @@ def _check_gnss(spec: TransportSpec) -> None:
 
 
 def _can_be_asked_for(host: str) -> bool:
-    """Whether the resolver takes a name: it encodes it first, as Python does here."""
+    """Return whether the resolver takes a name: it encodes it first, as Python does here."""
     try:
         host.encode("idna")
     except UnicodeError:

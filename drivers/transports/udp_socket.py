@@ -193,7 +193,7 @@ class UdpTransport(DescriptorTransport):
 
 
 def _interface_address(sock: socket.socket, interface: str) -> str:
-    """IPv4 address of an interface; OSError ENODEV where there is no such interface or it has none."""
+    """Return IPv4 address of an interface; OSError ENODEV where there is no such interface or it has none."""
     request = _IFREQ.pack(interface.encode()[:15], bytes(24))
     try:
         answer = fcntl.ioctl(sock, _SIOCGIFADDR, request)

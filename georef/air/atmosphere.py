@@ -46,7 +46,7 @@ class AtmosphereError(ValueError):
 
 
 def saturated_hpa(temperature_c: ArrayLike) -> FloatArray:
-    """Pressure of saturated water vapour (FORMULAS 3.2, Magnus), (…,) °C."""
+    """Return pressure of saturated water vapour (FORMULAS 3.2, Magnus), (…,) °C."""
     temperature = np.asarray(temperature_c, dtype=np.float64)
     pressure: FloatArray = 6.112 * np.exp(17.62 * temperature / (243.12 + temperature))
     return pressure
@@ -55,7 +55,7 @@ def saturated_hpa(temperature_c: ArrayLike) -> FloatArray:
 def group_refractivity_ppm(
     wavelength_nm: float, temperature_k: ArrayLike, pressure_hpa: ArrayLike, vapour_hpa: ArrayLike
 ) -> FloatArray:
-    """1e6 (n_g − 1) of air (IAG 1999, closed form), (…,): within 0.1 ppm of Ciddor from 530 to 1550 nm.
+    """Return 1e6 (n_g − 1) of air (IAG 1999, closed form), (…,): within 0.1 ppm of Ciddor from 530 to 1550 nm.
 
     Args:
         wavelength_nm: in vacuum.
@@ -73,7 +73,7 @@ def group_refractivity_ppm(
 def standard_air(
     height_m: ArrayLike, known_height_m: float = 0.0, known_k: float = STANDARD_K, known_hpa: float = STANDARD_HPA
 ) -> tuple[FloatArray, FloatArray]:
-    """Temperature in K and pressure in hPa at heights (…,) of the standard atmosphere through a known point.
+    """Return temperature in K and pressure in hPa at heights (…,) of the standard atmosphere through a known point.
 
     The temperature falls by 6.5 K a km up to 11 km, the pressure is hydrostatic (ISO 2533).
     """
@@ -159,7 +159,9 @@ class Air:
         self._phase = _table(lambda heights_m: layer_refractivity(heights_m, self._constant_ppm))
 
     def mean_refractivity(self, from_height_m: ArrayLike, to_height_m: ArrayLike) -> FloatArray:
-        """(n,) mean n_g − 1 along straight paths between ellipsoidal heights; exact over height (FORMULAS 3.2)."""
+        """Return (n,) mean n_g − 1 along straight paths between ellipsoidal heights; exact over height (FORMULAS
+        3.2).
+        """
         start, end = np.broadcast_arrays(*(np.atleast_1d(np.asarray(h, float)) for h in (from_height_m, to_height_m)))
         out = np.empty(len(start))
         means(self._group, np.ascontiguousarray(start), np.ascontiguousarray(end), out)
@@ -183,7 +185,7 @@ class Air:
         apply_air(origin_e, points_e, travelled, *tables, self._index, self.corrects_range, bends)
 
     def at_edge(self, height_above_ground_m: float, half_angle_rad: float, ground_height_m: float = 0.0) -> EdgeEffect:
-        """What the models amount to for a beam this far from nadir over flat ground (ellipsoidal height).
+        """Return what the models amount to for a beam this far from nadir over flat ground (ellipsoidal height).
 
         Beams flatter than 80° are told as if they were at 80°.
         """
@@ -199,7 +201,7 @@ class Air:
         return EdgeEffect(length_m * (index / self._index - 1.0), length_m * bent)
 
     def warning(self, height_above_ground_m: float, half_angle_rad: float, ground_height_m: float = 0.0) -> str | None:
-        """A line where beams bend by more than 2 mm at the swath's edge and nothing is done about it."""
+        """Return a line where beams bend by more than 2 mm at the swath's edge and nothing is done about it."""
         bent_m = self.at_edge(height_above_ground_m, half_angle_rad, ground_height_m).bending_m
         if self.bends or bent_m <= WORTH_SAYING_M:
             return None
@@ -218,7 +220,7 @@ def _check(key: str, got: str, words: tuple[str, ...]) -> None:
 def _refractivity(
     height_m: FloatArray, wavelength_nm: float, measured: tuple[float, float, float, float] | None
 ) -> FloatArray:
-    """n_g − 1 over heights (…,); measured: °C, hPa, percent, at height."""
+    """Return n_g − 1 over heights (…,); measured: °C, hPa, percent, at height."""
     if measured is None:
         return 1e-6 * group_refractivity_ppm(wavelength_nm, *standard_air(height_m), 0.0)
     temperature_c, pressure_hpa, humidity_percent, known_m = measured
@@ -228,7 +230,8 @@ def _refractivity(
 
 
 def _table(refractivity: Callable[[FloatArray], FloatArray]) -> FloatArray:
-    """(CELLS, 5) of `swath.georef.air.kernels`: the cubic through four heights of each cell, and the integral below it.
+    """Return (CELLS, 5) of `swath.georef.air.kernels`: the cubic through four heights of each cell, and the integral
+    below it.
 
     Air is so smooth over a cell that this is exact to 1e-13.
     """
@@ -243,27 +246,31 @@ def _table(refractivity: Callable[[FloatArray], FloatArray]) -> FloatArray:
 
 
 def layer_constant_ppm(wavelength_nm: float) -> float:
-    """C of NGA Eq. 9 in ppm K/hPa, re-derived: 0.27315/1.01325 · N_p of the closed form of IAG 1999 (FORMULAS 4.3)."""
+    """Return C of NGA Eq. 9 in ppm K/hPa, re-derived: 0.27315/1.01325 · N_p of the closed form of IAG 1999 (FORMULAS
+    4.3).
+    """
     wave = (1e-3 * wavelength_nm) ** -2
     return 273.15 / 1013.25 * (287.6155 + 1.62887 * wave + 0.01360 * wave * wave)
 
 
 def layer_air(height_m: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Temperature in K and pressure in hPa at heights (…,) in metres (NGA Eq. 10, 11); the troposphere's."""
+    """Return temperature in K and pressure in hPa at heights (…,) in metres (NGA Eq. 10, 11); the troposphere's."""
     fahrenheit = 59.0 - 0.00356 * FT_PER_M * np.asarray(height_m, dtype=np.float64)
     pressure: FloatArray = HPA_PER_PSF * 2116.0 * ((fahrenheit + 459.7) / 518.6) ** 5.256
     return (fahrenheit + 459.67) * 5.0 / 9.0, pressure
 
 
 def layer_refractivity(height_m: ArrayLike, constant_ppm: float) -> FloatArray:
-    """n − 1 of dry air at heights (…,) in metres (NGA Eq. 9)."""
+    """Return n − 1 of dry air at heights (…,) in metres (NGA Eq. 9)."""
     temperature_k, pressure_hpa = layer_air(height_m)
     refractivity: FloatArray = 1e-6 * constant_ppm * pressure_hpa / temperature_k
     return refractivity
 
 
 def ardc_k(sensor_m: ArrayLike, ground_m: ArrayLike) -> FloatArray:
-    """K of the ARDC model in radians (NGA Eq. 5, restored), Δd = K tan α (Eq. 4); heights (…,) in metres, above 0."""
+    """Return K of the ARDC model in radians (NGA Eq. 5, restored), Δd = K tan α (Eq. 4); heights (…,) in metres, above
+    0.
+    """
     upper, lower = 1e-3 * np.asarray(sensor_m, dtype=np.float64), 1e-3 * np.asarray(ground_m, dtype=np.float64)
 
     def term(height_km: FloatArray) -> FloatArray:
@@ -274,7 +281,7 @@ def ardc_k(sensor_m: ArrayLike, ground_m: ArrayLike) -> FloatArray:
 
 
 def spherical_bending(nadir_rad: ArrayLike, sensor_m: ArrayLike, ground_m: ArrayLike, constant_ppm: float) -> Any:
-    """Δd in radians of rays through spherical layers (NGA Eq. 6 to 8, restored), for beams that go down.
+    """Return δd in radians of rays through spherical layers (NGA Eq. 6 to 8, restored), for beams that go down.
 
     Args:
         nadir_rad: (…,) of the beam as it leaves.

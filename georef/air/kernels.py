@@ -58,7 +58,8 @@ NODES, WEIGHTS = 0.5 * (1.0 + _roots), 0.25 * _weights
 
 @jit_inline
 def vertical_of(x: float, y: float, z: float) -> tuple[float, float, float, float, float]:
-    """The ellipsoid's normal (up, in e), the height above it and its mean radius of curvature at an ECEF position.
+    """Return the ellipsoid's normal (up, in e), the height above it and its mean radius of curvature at an ECEF
+    position.
 
     One step of Bowring (FORMULAS 1.2) without a trigonometric function: 1e-10 rad and 1e-9 m up to 20 km of height.
     """
@@ -77,7 +78,7 @@ def vertical_of(x: float, y: float, z: float) -> tuple[float, float, float, floa
 
 @jit_inline
 def cell_of(height_m: float) -> tuple[int, float]:
-    """Cell of a height and the share of it that lies below; not-a-number is taken as low."""
+    """Return cell of a height and the share of it that lies below; not-a-number is taken as low."""
     if not height_m > FLOOR_M:
         return 0, 0.0
     if height_m >= TOP_M:
@@ -89,7 +90,7 @@ def cell_of(height_m: float) -> tuple[int, float]:
 
 @jit_inline
 def value_of(table: FloatArray, height_m: float) -> float:
-    """Refractivity at a height; columns 0 to 3 of the table are its cubic's coefficients."""
+    """Return refractivity at a height; columns 0 to 3 of the table are its cubic's coefficients."""
     cell, x = cell_of(height_m)
     value: float = table[cell, 0] + x * (table[cell, 1] + x * (table[cell, 2] + x * table[cell, 3]))
     return value
@@ -97,7 +98,7 @@ def value_of(table: FloatArray, height_m: float) -> float:
 
 @jit_inline
 def slope_of(table: FloatArray, height_m: float) -> tuple[float, float]:
-    """Refractivity and its derivative by height, 1/m."""
+    """Return refractivity and its derivative by height, 1/m."""
     cell, x = cell_of(height_m)
     value = table[cell, 0] + x * (table[cell, 1] + x * (table[cell, 2] + x * table[cell, 3]))
     slope = table[cell, 1] + x * (2.0 * table[cell, 2] + x * 3.0 * table[cell, 3])
@@ -106,7 +107,7 @@ def slope_of(table: FloatArray, height_m: float) -> tuple[float, float]:
 
 @jit_inline
 def sum_of(table: FloatArray, height_m: float) -> tuple[float, float]:
-    """Refractivity and its integral from the table's floor; column 4 holds it at the floors of the cells."""
+    """Return refractivity and its integral from the table's floor; column 4 holds it at the floors of the cells."""
     cell, x = cell_of(height_m)
     first, second, third = table[cell, 1] * x, table[cell, 2] * x * x, table[cell, 3] * x * x * x
     value = table[cell, 0] + first + second + third
@@ -115,14 +116,16 @@ def sum_of(table: FloatArray, height_m: float) -> tuple[float, float]:
 
 @jit_inline
 def mean_of(from_m: float, from_sum: float, to_m: float, to_sum: float, value: float) -> float:
-    """Mean refractivity between heights: the difference of integrals over theirs; level: the value at the second."""
+    """Return mean refractivity between heights: the difference of integrals over theirs; level: the value at the
+    second.
+    """
     apart = from_m - to_m
     return (from_sum - to_sum) / apart if abs(apart) > LEVEL_M else value
 
 
 @jit_inline
 def height_along(sensor_m: float, radius_m: float, range_m: float, cos: float) -> float:
-    """Height reached along a straight line, on the sphere that touches the ellipsoid below the sensor.
+    """Return height reached along a straight line, on the sphere that touches the ellipsoid below the sensor.
 
     ``cos`` is of the nadir angle. The ellipsoid's other curvatures make 3 cm over 10 km, the series 5 µm.
     """
@@ -133,7 +136,7 @@ def height_along(sensor_m: float, radius_m: float, range_m: float, cos: float) -
 
 @jit_inline
 def bent_by_ardc(sensor_m: float, ground_m: float, cos: float) -> float:
-    """Δd / sin α of the ARDC model (NGA Eq. 4, 5): K over the cosine of the nadir angle.
+    """Return δd / sin α of the ARDC model (NGA Eq. 4, 5): K over the cosine of the nadir angle.
 
     The model knows no air below the sea; beams above the horizon are left as they are.
     """
@@ -146,7 +149,7 @@ def bent_by_ardc(sensor_m: float, ground_m: float, cos: float) -> float:
 
 @jit_inline
 def bent_by_layers(table: FloatArray, sensor_m: float, radius_m: float, range_m: float, cos: float) -> float:
-    """Δd / sin α in spherical layers: what NGA Eq. 6 to 8 amount to, as an integral along the path.
+    """Return δd / sin α in spherical layers: what NGA Eq. 6 to 8 amount to, as an integral along the path.
 
     A ray turns by −(n'/n) sin ψ a metre, ψ its angle from the vertical, for which Snell's law holds (Eq. 6); its chord
     leaves the first direction by the integral of that, each metre weighted with the share of the path still to go. That

@@ -15,7 +15,7 @@ from swath.georef.trajectory.trajectory import DEFAULT_MAX_GAP_NS, TrajectoryErr
 def read_antenna_positions(
     data: bytes, name: str, *, span_ns: Span | None = None, week: int | None = None, leap_seconds: int | None = None
 ) -> TrajectoryColumns:
-    """Rows of a file of positions, with sigmas, fix types and velocities as far as it says them.
+    """Return rows of a file of positions, with sigmas, fix types and velocities as far as it says them.
 
     Args:
         data: the file.

@@ -90,14 +90,14 @@ class CopcWriter:
         return self.header.encode(self._laszip.record_data(), encode_vlr("copc", 1, info, "COPC info"), 1)
 
     def _blocks(self) -> Iterator[tuple[int, NDArray[np.void]]]:
-        """Records in the order in which they came, with the first one's place."""
+        """Yield records in the order in which they came, with the first one's place."""
         self._spool.seek(0)
         dtype = self.header.dtype
         for first in range(0, self.header.count, READ_POINTS):
             yield first, np.frombuffer(self._spool.read(READ_POINTS * dtype.itemsize), dtype)
 
     def _count_nodes(self, cube: _Cube, tree: _Tree) -> tuple[Int64Array, Int64Array]:
-        """Nodes in the order of the file, and the points of each."""
+        """Return nodes in the order of the file, and the points of each."""
         found = [np.unique(tree.nodes(cube, first, records), return_counts=True) for first, records in self._blocks()]
         return _summed(found)
 
@@ -152,7 +152,7 @@ class _Cube:
         return cls(bounds[0] - header.scale, size, min(depth, MAX_DEPTH), header.scale, header.offset)
 
     def cells(self, records: NDArray[np.void]) -> Int64Array:
-        """(n,) the cell of the finest level that each record lies in."""
+        """Return (n,) the cell of the finest level that each record lies in."""
         cells = np.empty(len(records), np.int64)
         per_unit = (1 << self.depth) / self.size
         shift = (self.offset - self.low) * per_unit
@@ -190,7 +190,9 @@ class _Tree:
         return cls(cells, left)
 
     def nodes(self, cube: _Cube, first: int, records: NDArray[np.void]) -> Int64Array:
-        """(n,) node of each record: level, x, y, z in the bits of a number that rises in the order of the file."""
+        """Return (n,) node of each record: level, x, y, z in the bits of a number that rises in the order of the
+        file.
+        """
         nodes = np.empty(len(records), np.int64)
         _fill_nodes(cube.cells(records), first, self.cells, self.left, nodes)
         return nodes
@@ -218,7 +220,7 @@ def _fill_nodes(cells: Int64Array, first: int, known: Int64Array, left: FloatArr
 
 
 def _coarser(cells: Int64Array, levels: int) -> Int64Array:
-    """The cells in which cells lie, so many levels up."""
+    """Return the cells in which cells lie, so many levels up."""
     x, y, z = (cells >> shift & _AXIS_MASK for shift in (2 * _AXIS_BITS, _AXIS_BITS, 0))
     coarse: Int64Array
     coarse = (x >> levels) << 2 * _AXIS_BITS | (y >> levels) << _AXIS_BITS | z >> levels
@@ -226,12 +228,12 @@ def _coarser(cells: Int64Array, levels: int) -> Int64Array:
 
 
 def _unpacked(nodes: Int64Array) -> list[Int64Array]:
-    """Level, x, y, z of nodes."""
+    """Return level, x, y, z of nodes."""
     return [nodes >> shift * _AXIS_BITS & (_AXIS_MASK if shift < 3 else 15) for shift in (3, 2, 1, 0)]
 
 
 def _summed(found: list[tuple[Int64Array, Int64Array]]) -> tuple[Int64Array, Int64Array]:
-    """Numbers that were found, rising, and how often over all."""
+    """Return numbers that were found, rising, and how often over all."""
     if not found:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     numbers, which = np.unique(np.concatenate([one for one, _ in found]), return_inverse=True)

@@ -60,7 +60,7 @@ class LasSettings:
     provenance: str = ""
 
     def header(self, strip: int) -> LasHeader:
-        """The header of a strip's file."""
+        """Return the header of a strip's file."""
         return LasHeader(
             scale=np.array(self.scale),
             offset=np.array(self.offset),
@@ -112,7 +112,7 @@ class PointPacker:
     def pack(
         self, points: Points, first: int, *, scanner: int = 0, intensity_factor: float = 1.0, withheld: bool = False
     ) -> NDArray[np.void]:
-        """Records of at most `BLOCK` points from ``first`` on; the next call writes over them.
+        """Return records of at most `BLOCK` points from ``first`` on; the next call writes over them.
 
         Raises:
             LasError: coordinates beyond what the scale allows.

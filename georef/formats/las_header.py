@@ -88,7 +88,7 @@ class LasHeader:
         return bounds
 
     def encode(self, laszip: bytes, first_vlrs: bytes = b"", first_count: int = 0) -> bytes:
-        """Header and records before the points.
+        """Return header and records before the points.
 
         Args:
             laszip: the LASzip record's data.
@@ -135,14 +135,14 @@ class LasHeader:
 
 
 def encode_vlr(user_id: str, record_id: int, data: bytes, description: str) -> bytes:
-    """A variable length record; raises ValueError where the data is longer than one can be."""
+    """Return a variable length record; raises ValueError where the data is longer than one can be."""
     if len(data) > 0xFFFF:
         raise ValueError(f"record {user_id} {record_id} of {len(data)} bytes, more than 65535")
     return _VLR.pack(0, user_id.encode(), record_id, len(data), description.encode()) + data
 
 
 def encode_evlr(user_id: str, record_id: int, data: bytes, description: str) -> bytes:
-    """An extended record, which stands behind the points."""
+    """Return an extended record, which stands behind the points."""
     return _EVLR.pack(0, user_id.encode(), record_id, len(data), description.encode()) + data
 
 
@@ -153,7 +153,9 @@ def encode_copc_info(
     hierarchy: tuple[int, int],
     gps_time: tuple[float, float],
 ) -> bytes:
-    """COPC's first record: the root's cube, the spacing of its points, offset and size of the root page, time span."""
+    """Return COPC's first record: the root's cube, the spacing of its points, offset and size of the root page, time
+    span.
+    """
     return _COPC_INFO.pack(*centre, half_size, spacing, *hierarchy, *gps_time)
 
 

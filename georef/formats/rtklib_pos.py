@@ -36,12 +36,12 @@ FIX_TYPES = {
 
 
 def is_rtklib_pos(text: str) -> bool:
-    """Whether a comment line names a time system and columns."""
+    """Return whether a comment line names a time system and columns."""
     return text.lstrip("\ufeff \r\n").startswith("%") and HEADER.search(text) is not None
 
 
 def read_rtklib_pos(text: str, name: str, *, leap_seconds: int | None = None) -> TrajectoryColumns:
-    """Rows of a .pos file; attitude is nan. ``leap_seconds``, GPS − UTC, is for files in UTC."""
+    """Return rows of a .pos file; attitude is nan. ``leap_seconds``, GPS − UTC, is for files in UTC."""
     *_, found = HEADER.finditer(text)
     system, titles = found[1], found[2].split()
     if re.search(r"height=\S*/geodetic", text[: found.start()]):
@@ -72,7 +72,7 @@ def read_rtklib_pos(text: str, name: str, *, leap_seconds: int | None = None) ->
 
 
 def _columns(numbered: list[tuple[int, list[str]]], titles: list[str], name: str) -> dict[str, FloatArray]:
-    """Columns by name without unit; degrees, minutes and seconds come as degrees."""
+    """Return columns by name without unit; degrees, minutes and seconds come as degrees."""
     widths = [3 if title.endswith(DMS) else 1 for title in titles]
     needed = 2 + sum(widths)
     for number, row in numbered:
@@ -96,26 +96,28 @@ def _columns(numbered: list[tuple[int, list[str]]], titles: list[str], name: str
 
 
 def degrees_of(dms: FloatArray) -> FloatArray:
-    """(n,) degrees of degrees, minutes, seconds (n, 3); the sign is that of the degrees, be they −0."""
+    """Return (n,) degrees of degrees, minutes, seconds (n, 3); the sign is that of the degrees, be they −0."""
     size = np.abs(dms) @ np.array([1.0, 1.0 / 60.0, 1.0 / 3600.0])
     degrees: FloatArray = np.copysign(size, dms[:, 0])
     return degrees
 
 
 def fix_types(quality: FloatArray | None, known: dict[int, FixType]) -> NDArray[np.uint8] | None:
-    """(n,) `FixType` of a column of quality numbers; NONE of a number that is not known, None without a column."""
+    """Return (n,) `FixType` of a column of quality numbers; NONE of a number that is not known, None without a
+    column.
+    """
     if quality is None:
         return None
     return np.array([known.get(int(q) if np.isfinite(q) else 0, FixType.NONE) for q in quality], dtype=np.uint8)
 
 
 def byte_counts(said: FloatArray) -> NDArray[np.uint8]:
-    """(n,) whole numbers from 0 to 255; 0 where none is said."""
+    """Return (n,) whole numbers from 0 to 255; 0 where none is said."""
     return np.clip(np.nan_to_num(said, nan=0.0), 0, 255).astype(np.uint8)
 
 
 def _correlation_l(table: dict[str, FloatArray], sigma_l: FloatArray) -> FloatArray | None:
-    """(n, 3) of north–east, north–down, east–down, of sdne, sdeu, sdun: roots of covariances with their sign."""
+    """Return (n, 3) of north–east, north–down, east–down, of sdne, sdeu, sdun: roots of covariances with their sign."""
     if not all(column in table for column in ("sdne", "sdeu", "sdun")):
         return None
     mixed = _stacked(table, ("sdne", "sdun", "sdeu")) * np.array([1.0, -1.0, -1.0])
@@ -139,7 +141,7 @@ def _gps_ns(system: str, dates: list[str], clocks: list[str], name: str, leap_se
 def _solution(
     table: dict[str, FloatArray], name: str
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Latitude, longitude (rad), height (m), sigmas and velocity (n, 3) in l."""
+    """Return latitude, longitude (rad), height (m), sigmas and velocity (n, 3) in l."""
     if all(column in table for column in GEODETIC):
         lat, lon, height = (table[column] for column in GEODETIC)
         sigma = _stacked(table, ("sdn", "sde", "sdu"))

@@ -60,7 +60,7 @@ class Sigmas:
 def read_sbet(
     data: bytes, name: str, *, span_ns: Span | None = None, week: int | None = None, sigmas: Sigmas | None = None
 ) -> TrajectoryColumns:
-    """Rows of an SBET.
+    """Return rows of an SBET.
 
     Args:
         data: the file.
@@ -87,7 +87,7 @@ def read_sbet(
 
 
 def read_smrmsg(data: bytes, name: str) -> Sigmas:
-    """Sigmas of a trajectory; TrajectoryError where the file is none."""
+    """Return sigmas of a trajectory; TrajectoryError where the file is none."""
     table = _table(data, name, "smrmsg", SMRMSG_DOUBLES)
     bad = (table[:, 1:] < 0.0).any(axis=1)  # nan: unsaid
     if bad.any():
@@ -96,7 +96,7 @@ def read_smrmsg(data: bytes, name: str) -> Sigmas:
 
 
 def sbet_bytes(trajectory: Trajectory) -> bytes:
-    """The trajectory as an SBET: wander angle 0, velocities north, east, down, time running past the week's end.
+    """Return the trajectory as an SBET: wander angle 0, velocities north, east, down, time running past the week's end.
 
     Accelerations are those of the velocities relative to the earth, without gravity, and rates those relative to e.
     """
@@ -117,7 +117,7 @@ def sbet_bytes(trajectory: Trajectory) -> bytes:
 
 
 def smrmsg_bytes(trajectory: Trajectory, velocity_sigma_l: FloatArray | None = None) -> bytes:
-    """The trajectory's sigmas as an smrmsg, an epoch each; unsaid ones are nan.
+    """Return the trajectory's sigmas as an smrmsg, an epoch each; unsaid ones are nan.
 
     Args:
         trajectory: says those of position and attitude.
@@ -159,7 +159,7 @@ def _table(data: bytes, name: str, kind: str, doubles: int) -> FloatArray:
 
 
 def _velocity_l(columns: TrajectoryColumns, wander_rad: FloatArray, whole: NDArray[np.bool_]) -> FloatArray:
-    """North, east, down, by those axes of the platform with which velocities go the way the positions go.
+    """Return north, east, down, by those axes of the platform with which velocities go the way the positions go.
 
     That is judged by the records that say everything, ``whole`` (n,).
     """
@@ -178,7 +178,7 @@ def _velocity_l(columns: TrajectoryColumns, wander_rad: FloatArray, whole: NDArr
 
 
 def _sigmas_at(of_week_ns: Int64Array, sigmas: Sigmas | None, name: str) -> tuple[FloatArray, FloatArray]:
-    """Position and attitude sigmas at the SBET's epochs, linear between theirs; unsaid before and after them."""
+    """Return position and attitude sigmas at the SBET's epochs, linear between theirs; unsaid before and after them."""
     if sigmas is None:
         return unsaid(len(of_week_ns)), unsaid(len(of_week_ns))
     for shift_ns in (0, WEEK_NS, -WEEK_NS):  # one of the files may begin only after the week's end
@@ -198,7 +198,7 @@ def _sigmas_at(of_week_ns: Int64Array, sigmas: Sigmas | None, name: str) -> tupl
 
 
 def _once_round(angle_rad: FloatArray) -> FloatArray:
-    """0 … 2π, for angles within one turn of it: others stay as they are, to be refused."""
+    """Return 0 … 2π, for angles within one turn of it: others stay as they are, to be refused."""
     return np.where(np.abs(angle_rad) <= 4 * np.pi, angle_rad % (2 * np.pi), angle_rad)
 
 

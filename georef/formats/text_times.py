@@ -25,19 +25,21 @@ FIRST_YEAR, LAST_YEAR = 1980, 2125  # of GPS time in 64 bits of nanoseconds, wit
 
 
 def gps_days(texts: Sequence[str], order: str, name: str) -> Int64Array:
-    """(n,) days since the GPS epoch of dates like ``2026/11/22`` in an order like YMD; two-digit years are 20yy."""
+    """Return (n,) days since the GPS epoch of dates like ``2026/11/22`` in an order like YMD; two-digit years are
+    20yy.
+    """
     distinct, which = np.unique(np.asarray(texts), return_inverse=True)
     days = [_date(str(text), order, name).toordinal() - GPS_EPOCH.toordinal() for text in distinct]
     return np.asarray(days, dtype=np.int64)[which]
 
 
 def clock_ns(texts: Sequence[str], name: str) -> Int64Array:
-    """(n,) nanoseconds of the day of times like ``19:34:18.499``."""
+    """Return (n,) nanoseconds of the day of times like ``19:34:18.499``."""
     return np.array([_of_day_ns(text, name) for text in texts], dtype=np.int64)
 
 
 def weeks_ns(weeks: Sequence[str], seconds: Sequence[str], name: str) -> Int64Array:
-    """(n,) GPS time of weeks and seconds of the week."""
+    """Return (n,) GPS time of weeks and seconds of the week."""
     for week, second in zip(weeks, seconds, strict=True):
         if not (WEEK.fullmatch(week) and SECONDS.fullmatch(second)):
             raise TrajectoryError(
@@ -49,13 +51,13 @@ def weeks_ns(weeks: Sequence[str], seconds: Sequence[str], name: str) -> Int64Ar
 
 
 def gps_ns_of_day(days: Int64Array, of_day_ns: Int64Array) -> Int64Array:
-    """(n,) GPS time of days since the GPS epoch and nanoseconds of the day, both in GPS time."""
+    """Return (n,) GPS time of days since the GPS epoch and nanoseconds of the day, both in GPS time."""
     gps_ns: Int64Array = days * DAY_NS + of_day_ns
     return gps_ns
 
 
 def leap_seconds_on(day: int, said: int | None, name: str) -> int:
-    """GPS − UTC on a day since the GPS epoch: what was said, or the built-in table as far as it reaches."""
+    """Return GPS − UTC on a day since the GPS epoch: what was said, or the built-in table as far as it reaches."""
     if said is not None:
         return said
     date = GPS_EPOCH + dt.timedelta(days=int(day))

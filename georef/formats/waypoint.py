@@ -104,12 +104,12 @@ class Sheet:
     name: str
 
     def words(self, what: str) -> list[str]:
-        """(n,) one word a line."""
+        """Return (n,) one word a line."""
         at = self.columns[what].first
         return [line.split()[at] for line in self.lines]
 
     def numbers(self, what: str) -> FloatArray:
-        """(n, words) or, of one word, (n,); nan where there is no such column."""
+        """Return (n, words) or, of one word, (n,); nan where there is no such column."""
         column = self.columns.get(what)
         if column is None:
             return np.full(len(self.lines), np.nan)
@@ -121,7 +121,9 @@ class Sheet:
         return table[:, 0] if column.words == 1 else table
 
     def quantity(self, what: str, units: dict[str, float]) -> FloatArray:
-        """(n,) of a column in SI units, of those that are taken; one that stands below no unit is in the first."""
+        """Return (n,) of a column in SI units, of those that are taken; one that stands below no unit is in the
+        first.
+        """
         column = self.columns.get(what)
         unit = column.unit.lower() if column is not None and column.unit else next(iter(units))
         if unit not in units:
@@ -130,7 +132,7 @@ class Sheet:
         return self.numbers(what) * units[unit]
 
     def angle_rad(self, what: str) -> FloatArray:
-        """(n,) of a column in degrees, in degrees, minutes and seconds, or in radians."""
+        """Return (n,) of a column in degrees, in degrees, minutes and seconds, or in radians."""
         column = self.columns.get(what)
         if column is not None and column.words == 3:
             return np.radians(degrees_of(self.numbers(what)))
@@ -138,14 +140,14 @@ class Sheet:
 
 
 def is_waypoint(text: str) -> bool:
-    """Whether a line of known names is followed by one of units."""
+    """Return whether a line of known names is followed by one of units."""
     return _title_line(text.splitlines()) is not None
 
 
 def read_waypoint(
     text: str, name: str, *, span_ns: Span | None = None, week: int | None = None, leap_seconds: int | None = None
 ) -> TrajectoryColumns:
-    """Rows of an export; attitude is nan where it has none.
+    """Return rows of an export; attitude is nan where it has none.
 
     Args:
         text: of the file.
@@ -268,7 +270,7 @@ def _sheet(text: str, name: str) -> Sheet:
 
 
 def _layout(titles: str, units: str, separator: str | None) -> tuple[dict[str, Column], int]:
-    """Columns, and the number of words in a line. A unit belongs to the name above it, or in the same cell."""
+    """Return columns, and the number of words in a line. A unit belongs to the name above it, or in the same cell."""
     if separator is None:
         tokens, below = list(TOKEN.finditer(titles)), list(TOKEN.finditer(units))
         names, unit_of = [token[0] for token in tokens], _unit_of(tokens, below[: len(tokens)])
@@ -285,7 +287,7 @@ def _layout(titles: str, units: str, separator: str | None) -> tuple[dict[str, C
 
 
 def _unit_of(names: list[re.Match[str]], units: list[re.Match[str]]) -> dict[int, str]:
-    """The unit of names by their number: in their order, each below one name, all together as near as can be."""
+    """Return the unit of names by their number: in their order, each below one name, all together as near as can be."""
     cost = np.full((len(units) + 1, len(names) + 1), np.inf)  # of so many units below so many names
     cost[0] = 0.0
     for j, unit in enumerate(units):
@@ -332,7 +334,7 @@ def _gps_ns(sheet: Sheet, span_ns: Span | None, week: int | None, leap_seconds: 
 
 
 def _of_seconds(sheet: Sheet, time: str, days: Int64Array | None, span_ns: Span | None, week: int | None) -> Int64Array:
-    """Seconds of the week, or of the day where a date says that they are."""
+    """Return seconds of the week, or of the day where a date says that they are."""
     seconds = sheet.numbers(time)
     if not ((seconds >= 0.0) & (seconds < 10.0 * WEEK_S)).all():
         raise TrajectoryError(f"{sheet.name}: a time is no number of seconds of a week")

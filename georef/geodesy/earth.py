@@ -22,20 +22,20 @@ EP2 = E2 / (1.0 - E2)
 
 
 def prime_vertical_radius_m(lat_rad: ArrayLike) -> FloatArray:
-    """Radius of curvature N across the meridian (ISO/TS 19159-2 Eq. 7)."""
+    """Return radius of curvature N across the meridian (ISO/TS 19159-2 Eq. 7)."""
     radius: FloatArray = A_M / np.sqrt(1.0 - E2 * np.sin(np.asarray(lat_rad, dtype=np.float64)) ** 2)
     return radius
 
 
 def meridian_radius_m(lat_rad: ArrayLike) -> FloatArray:
-    """Radius of curvature M of the meridian."""
+    """Return radius of curvature M of the meridian."""
     sin = np.sin(np.asarray(lat_rad, dtype=np.float64))
     radius: FloatArray = A_M * (1.0 - E2) / (1.0 - E2 * sin**2) ** 1.5
     return radius
 
 
 def e_from_geodetic(lat_rad: ArrayLike, lon_rad: ArrayLike, height_m: ArrayLike) -> FloatArray:
-    """ECEF (…, 3) of geodetic coordinates (ISO/TS 19159-2 Eq. 7, completed)."""
+    """Return ECEF (…, 3) of geodetic coordinates (ISO/TS 19159-2 Eq. 7, completed)."""
     lat, lon, height = np.broadcast_arrays(*(np.asarray(a, dtype=np.float64) for a in (lat_rad, lon_rad, height_m)))
     radius = prime_vertical_radius_m(lat)
     flat = (radius + height) * np.cos(lat)
@@ -43,7 +43,9 @@ def e_from_geodetic(lat_rad: ArrayLike, lon_rad: ArrayLike, height_m: ArrayLike)
 
 
 def geodetic_from_e(position_e: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Latitude, longitude (−π … π) and height (…,) of ECEF (…, 3), to 1e-9 m and better up to 100 km of height."""
+    """Return latitude, longitude (−π … π) and height (…,) of ECEF (…, 3), to 1e-9 m and better up to 100 km of
+    height.
+    """
     position = np.asarray(position_e, dtype=np.float64)
     flat = np.ascontiguousarray(position.reshape(-1, 3))
     lat, lon, height = np.empty((3, len(flat)))
@@ -53,7 +55,7 @@ def geodetic_from_e(position_e: ArrayLike) -> tuple[FloatArray, FloatArray, Floa
 
 
 def rot_e_from_l(lat_rad: ArrayLike, lon_rad: ArrayLike) -> FloatArray:
-    """(…, 3, 3), columns north, east, down in e (ISO/TS 19159-2 Eq. 4, whose caption is reversed)."""
+    """Return (…, 3, 3), columns north, east, down in e (ISO/TS 19159-2 Eq. 4, whose caption is reversed)."""
     lat, lon = np.broadcast_arrays(np.asarray(lat_rad, dtype=np.float64), np.asarray(lon_rad, dtype=np.float64))
     sin_lat, cos_lat, sin_lon, cos_lon = np.sin(lat), np.cos(lat), np.sin(lon), np.cos(lon)
     zero = np.zeros_like(lat)
@@ -67,7 +69,7 @@ def rot_e_from_l(lat_rad: ArrayLike, lon_rad: ArrayLike) -> FloatArray:
 
 @jit_inline
 def geodetic_of(x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Latitude, longitude and height of one ECEF position: Bowring's step, twice (FORMULAS 1.2)."""
+    """Return latitude, longitude and height of one ECEF position: Bowring's step, twice (FORMULAS 1.2)."""
     flat = math.hypot(x, y)
     beta = math.atan2(A_M * z, B_M * flat)
     lat = 0.0
@@ -82,7 +84,7 @@ def geodetic_of(x: float, y: float, z: float) -> tuple[float, float, float]:
 
 @jit_inline
 def down_of(lat_rad: float, lon_rad: float) -> tuple[float, float, float]:
-    """The ellipsoid's nadir direction in e, of unit length."""
+    """Return the ellipsoid's nadir direction in e, of unit length."""
     cos = math.cos(lat_rad)
     return -cos * math.cos(lon_rad), -cos * math.sin(lon_rad), -math.sin(lat_rad)
 

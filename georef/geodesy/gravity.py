@@ -25,7 +25,8 @@ GRAVITY_RATIO = 0.00344978650684  # m = ω² a² b / GM
 
 @jit_inline
 def normal_of(x: float, y: float, z: float) -> tuple[Three, float]:
-    """Upward normal of the ellipsoid in e and the height of a point, without a trigonometric function (Bowring 1976).
+    """Return upward normal of the ellipsoid in e and the height of a point, without a trigonometric function (Bowring
+    1976).
 
     At the poles, where the longitude is none, the normal is ±z; the direction is good to 1e-11 rad below 20 km.
     """
@@ -42,7 +43,7 @@ def normal_of(x: float, y: float, z: float) -> tuple[Three, float]:
 
 @jit_inline
 def normal_gravity(sin: float, height_m: float) -> float:
-    """Magnitude, m/s², at the sine of a latitude and a height."""
+    """Return magnitude, m/s², at the sine of a latitude and a height."""
     square = sin * sin
     surface = EQUATOR_GRAVITY_MPS2 * (1.0 + SOMIGLIANA_K * square) / math.sqrt(1.0 - E2 * square)
     ratio = height_m / A_M
@@ -51,7 +52,7 @@ def normal_gravity(sin: float, height_m: float) -> float:
 
 @jit_inline
 def gravity_of(x: float, y: float, z: float) -> Three:
-    """Gravity in e at a point of e, m/s²."""
+    """Return gravity in e at a point of e, m/s²."""
     up, height_m = normal_of(x, y, z)
     magnitude = normal_gravity(up[2], height_m)
     return -magnitude * up[0], -magnitude * up[1], -magnitude * up[2]
@@ -59,7 +60,8 @@ def gravity_of(x: float, y: float, z: float) -> Three:
 
 @jit_inline
 def gradient_of(x: float, y: float, z: float) -> Matrix:
-    """∂ gravity / ∂ position in e, 1/s²: the normal turns by 1 / (M + h) and 1 / (N + h), the magnitude falls upward.
+    """Return ∂ gravity / ∂ position in e, 1/s²: the normal turns by 1 / (M + h) and 1 / (N + h), the magnitude falls
+    upward.
 
     The magnitude's change to the north, 8e-9 1/s² at most, is in it too.
     """
@@ -99,7 +101,7 @@ def _gradient_row(
     upward: float,
     north: float,
 ) -> Three:
-    """Row i of −(g_h u uᵀ + g_n u nᵀ) − g (n nᵀ / (M + h) + e eᵀ / (N + h))."""
+    """Return row i of −(g_h u uᵀ + g_n u nᵀ) − g (n nᵀ / (M + h) + e eᵀ / (N + h))."""
     a, b, c = -upward * u_i, -north * u_i - meridian * n_i, -east * e_i
     return (
         a * up[0] + b * n[0] + c * e[0],
@@ -109,7 +111,7 @@ def _gradient_row(
 
 
 def gravity_e(position_e: ArrayLike) -> FloatArray:
-    """(…, 3) normal gravity in e, m/s², at positions (…, 3)."""
+    """Return (…, 3) normal gravity in e, m/s², at positions (…, 3)."""
     position = np.asarray(position_e, dtype=np.float64)
     flat = np.ascontiguousarray(position.reshape(-1, 3))
     gravity = np.empty_like(flat)

@@ -9,7 +9,7 @@ from swath.georef.arrays import FloatArray
 
 
 def about(axis: int, angle_rad: ArrayLike) -> FloatArray:
-    """(…, 4) of the right-handed turns by angles (…,) about axis 0, 1 or 2."""
+    """Return (…, 4) of the right-handed turns by angles (…,) about axis 0, 1 or 2."""
     half = np.asarray(angle_rad, dtype=np.float64) / 2
     q = np.zeros((*half.shape, 4))
     q[..., 0], q[..., 1 + axis] = np.cos(half), np.sin(half)
@@ -17,13 +17,13 @@ def about(axis: int, angle_rad: ArrayLike) -> FloatArray:
 
 
 def conjugate(q: FloatArray) -> FloatArray:
-    """The turn back."""
+    """Return the turn back."""
     back: FloatArray = q * np.array([1.0, -1.0, -1.0, -1.0])
     return back
 
 
 def product(a: FloatArray, b: FloatArray) -> FloatArray:
-    """a ⊗ b: first the turn b, then a, as with matrices."""
+    """Return a ⊗ b: first the turn b, then a, as with matrices."""
     aw, ax, ay, az = a[..., 0], a[..., 1], a[..., 2], a[..., 3]
     bw, bx, by, bz = b[..., 0], b[..., 1], b[..., 2], b[..., 3]
     q = np.empty(np.broadcast_shapes(a.shape, b.shape))
@@ -35,14 +35,14 @@ def product(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def rotated(q: FloatArray, vector: FloatArray) -> FloatArray:
-    """Vectors (…, 3) turned by q: q ⊗ v ⊗ q*."""
+    """Return vectors (…, 3) turned by q: q ⊗ v ⊗ q*."""
     twice = 2.0 * np.cross(q[..., 1:], vector)
     turned: FloatArray = vector + q[..., :1] * twice + np.cross(q[..., 1:], twice)
     return turned
 
 
 def rotation_vector(q: FloatArray) -> FloatArray:
-    """(…, 3) axis times angle, rad, the shorter way round (angle ≤ π)."""
+    """Return (…, 3) axis times angle, rad, the shorter way round (angle ≤ π)."""
     sine = np.sqrt((q[..., 1:] ** 2).sum(axis=-1, keepdims=True))
     cosine = q[..., :1]
     half = np.arctan2(sine, np.abs(cosine))
@@ -53,5 +53,5 @@ def rotation_vector(q: FloatArray) -> FloatArray:
 
 
 def rotations_between(q: FloatArray) -> FloatArray:
-    """(n − 1, 3) from each of (n, 4) to the next, as `rotation_vector` in the axes of the first."""
+    """Return (n − 1, 3) from each of (n, 4) to the next, as `rotation_vector` in the axes of the first."""
     return rotation_vector(product(conjugate(q[:-1]), q[1:]))

@@ -14,22 +14,22 @@ from swath.georef.geodesy.earth import rot_e_from_l
 
 
 def rot_x(angle_rad: ArrayLike) -> FloatArray:
-    """About x: y turns towards z."""
+    """Return about x: y turns towards z."""
     return _about(angle_rad, 1, 2)
 
 
 def rot_y(angle_rad: ArrayLike) -> FloatArray:
-    """About y: z turns towards x."""
+    """Return about y: z turns towards x."""
     return _about(angle_rad, 2, 0)
 
 
 def rot_z(angle_rad: ArrayLike) -> FloatArray:
-    """About z: x turns towards y."""
+    """Return about z: x turns towards y."""
     return _about(angle_rad, 0, 1)
 
 
 def _about(angle_rad: ArrayLike, first: int, second: int) -> FloatArray:
-    """The turn that takes axis `first` towards axis `second`."""
+    """Return the turn that takes axis `first` towards axis `second`."""
     angle = np.asarray(angle_rad, dtype=np.float64)
     rotation = np.broadcast_to(np.eye(3), (*angle.shape, 3, 3)).copy()
     rotation[..., first, first] = rotation[..., second, second] = np.cos(angle)
@@ -39,12 +39,12 @@ def _about(angle_rad: ArrayLike, first: int, second: int) -> FloatArray:
 
 
 def rot_l_from_b(roll_rad: ArrayLike, pitch_rad: ArrayLike, heading_rad: ArrayLike) -> FloatArray:
-    """Attitude, Rz(heading) Ry(pitch) Rx(roll) (ISO/TS 19159-2 Eq. 3, whose label is reversed)."""
+    """Return attitude, Rz(heading) Ry(pitch) Rx(roll) (ISO/TS 19159-2 Eq. 3, whose label is reversed)."""
     return rot_z(heading_rad) @ rot_y(pitch_rad) @ rot_x(roll_rad)
 
 
 def attitude_of(rot_l_from_b: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Roll (−π … π), pitch (−π/2 … π/2) and heading (0 … 2π) of attitudes (…, 3, 3)."""
+    """Return roll (−π … π), pitch (−π/2 … π/2) and heading (0 … 2π) of attitudes (…, 3, 3)."""
     rotation = np.asarray(rot_l_from_b, dtype=np.float64)
     roll = np.arctan2(rotation[..., 2, 1], rotation[..., 2, 2])
     pitch = np.arctan2(-rotation[..., 2, 0], np.hypot(rotation[..., 0, 0], rotation[..., 1, 0]))
@@ -53,12 +53,12 @@ def attitude_of(rot_l_from_b: ArrayLike) -> tuple[FloatArray, FloatArray, FloatA
 
 
 def boresight(omega_rad: ArrayLike, phi_rad: ArrayLike, kappa_rad: ArrayLike) -> FloatArray:
-    """Rx(ω) Ry(φ) Rz(κ), from the installed scanner's axes to b (ISO/TS 19159-2 Eq. 2; FORMULAS 1.6)."""
+    """Return rx(ω) Ry(φ) Rz(κ), from the installed scanner's axes to b (ISO/TS 19159-2 Eq. 2; FORMULAS 1.6)."""
     return rot_x(omega_rad) @ rot_y(phi_rad) @ rot_z(kappa_rad)
 
 
 def skew(vector: ArrayLike) -> FloatArray:
-    """(…, 3, 3) of vectors (…, 3): skew(v) @ a = v × a."""
+    """Return (…, 3, 3) of vectors (…, 3): skew(v) @ a = v × a."""
     x, y, z = np.moveaxis(np.asarray(vector, dtype=np.float64), -1, 0)
     zero = np.zeros_like(x)
     rows = ((zero, -z, y), (z, zero, -x), (-y, x, zero))
@@ -78,7 +78,9 @@ def rot_l_from_plumb(lat_rad: ArrayLike, xi_rad: ArrayLike, eta_rad: ArrayLike) 
 
 
 def quaternion_from_rot(rotation: ArrayLike) -> FloatArray:
-    """(…, 4) of matrices (…, 3, 3), scalar first and ≥ 0, from the largest of the four components (Shepperd 1978)."""
+    """Return (…, 4) of matrices (…, 3, 3), scalar first and ≥ 0, from the largest of the four components (Shepperd
+    1978).
+    """
     r = np.asarray(rotation, dtype=np.float64)
     xx, yy, zz = r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]
     products = np.empty((*r.shape[:-2], 4, 4))  # 4 q qᵀ, whose row of the largest diagonal element is q but for length
@@ -97,7 +99,7 @@ def quaternion_from_rot(rotation: ArrayLike) -> FloatArray:
 
 
 def rot_from_quaternion(quaternion: ArrayLike) -> FloatArray:
-    """(…, 3, 3) of quaternions (…, 4) of unit length, scalar first."""
+    """Return (…, 3, 3) of quaternions (…, 4) of unit length, scalar first."""
     w, x, y, z = np.moveaxis(np.asarray(quaternion, dtype=np.float64), -1, 0)
     rows = (
         (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),

@@ -19,13 +19,13 @@ _QUARTER = (1.5707963267341256, 6.077100506506192e-11, 2.022266248795951e-21)  #
 
 @jit_inline
 def vector_at(array: FloatArray, k: int) -> Three:
-    """Row k of (n, 3)."""
+    """Return row k of (n, 3)."""
     return array[k, 0], array[k, 1], array[k, 2]
 
 
 @jit_inline
 def matrix_at(array: FloatArray, k: int) -> Matrix:
-    """Matrix k of (n, 3, 3)."""
+    """Return matrix k of (n, 3, 3)."""
     return (
         (array[k, 0, 0], array[k, 0, 1], array[k, 0, 2]),
         (array[k, 1, 0], array[k, 1, 1], array[k, 1, 2]),
@@ -35,13 +35,13 @@ def matrix_at(array: FloatArray, k: int) -> Matrix:
 
 @jit_inline
 def rot_at(q: FloatArray, k: int) -> Matrix:
-    """Matrix of unit quaternion k of (n, 4), scalar first."""
+    """Return matrix of unit quaternion k of (n, 4), scalar first."""
     return rot_of(q[k, 0], q[k, 1], q[k, 2], q[k, 3])
 
 
 @jit_inline
 def rot_of(w: float, x: float, y: float, z: float) -> Matrix:
-    """Matrix of a unit quaternion."""
+    """Return matrix of a unit quaternion."""
     return (
         (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
         (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
@@ -51,19 +51,19 @@ def rot_of(w: float, x: float, y: float, z: float) -> Matrix:
 
 @jit_inline
 def dot(a: Three, b: Three) -> float:
-    """Inner product."""
+    """Return inner product."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @jit_inline
 def times(m: Matrix, v: Three) -> Three:
-    """A matrix times a vector."""
+    """Return a matrix times a vector."""
     return dot(m[0], v), dot(m[1], v), dot(m[2], v)
 
 
 @jit_inline
 def small_sine_cosine(square: float, angle: float) -> tuple[float, float]:
-    """factor · sin(x)/x and cos(x) of small x, of their square and the factor: of x itself, the sine."""
+    """Return factor · sin(x)/x and cos(x) of small x, of their square and the factor: of x itself, the sine."""
     sin = 1.0 - square * (1.0 / 6.0 - square * (1.0 / 120.0 - square * (1.0 / 5040.0 - square / 362880.0)))
     cos = 1.0 - square * (0.5 - square * (1.0 / 24.0 - square * (1.0 / 720.0 - square / 40320.0)))
     return angle * sin, cos
@@ -71,7 +71,7 @@ def small_sine_cosine(square: float, angle: float) -> tuple[float, float]:
 
 @jit_inline
 def sine_cosine(square: float, angle: float) -> tuple[float, float]:
-    """sin(angle), cos(angle) of mostly small angles; ``square`` is that of the angle."""
+    """Return sin(angle), cos(angle) of mostly small angles; ``square`` is that of the angle."""
     if square >= SMALL_ANGLE_2:
         return math.sin(angle), math.cos(angle)
     return small_sine_cosine(square, angle)
@@ -79,7 +79,7 @@ def sine_cosine(square: float, angle: float) -> tuple[float, float]:
 
 @jit_inline
 def sine_cosine_of_large(angle: float, sin: float, cos: float) -> tuple[float, float]:
-    """What `sin_cos` gave, or where it does not reach the library's."""
+    """Return what `sin_cos` gave, or where it does not reach the library's."""
     if abs(angle) < LARGE_ANGLE:
         return sin, cos
     return math.sin(angle), math.cos(angle)
@@ -87,7 +87,7 @@ def sine_cosine_of_large(angle: float, sin: float, cos: float) -> tuple[float, f
 
 @jit_inline
 def sin_cos(angle: float) -> tuple[float, float]:
-    """Sine and cosine at once, to the last bit or so: Cody and Waite's reduction, the polynomials of fdlibm.
+    """Return sine and cosine at once, to the last bit or so: Cody and Waite's reduction, the polynomials of fdlibm.
 
     Without a branch; beyond LARGE_ANGLE it means nothing.
     """
@@ -119,7 +119,7 @@ def sin_cos(angle: float) -> tuple[float, float]:
 
 @jit_inline
 def angle_of(across: float, down: float) -> float:
-    """atan2 to 2e-8 rad, by steps that every processor rounds alike (Abramowitz and Stegun 4.4.49)."""
+    """Return atan2 to 2e-8 rad, by steps that every processor rounds alike (Abramowitz and Stegun 4.4.49)."""
     a, b = abs(across), abs(down)
     t = min(a, b) / max(a, b, 1e-300)
     s = t * t
@@ -133,26 +133,26 @@ def angle_of(across: float, down: float) -> float:
 
 @jit_inline
 def plus(a: Three, factor: float, b: Three) -> Three:
-    """a + factor · b."""
+    """Return a + factor · b."""
     return a[0] + factor * b[0], a[1] + factor * b[1], a[2] + factor * b[2]
 
 
 @jit_inline
 def unit(a: Three) -> Three:
-    """A vector's direction; of none, none."""
+    """Return a vector's direction; of none, none."""
     per_length = 1.0 / math.sqrt(max(dot(a, a), 1e-300))
     return per_length * a[0], per_length * a[1], per_length * a[2]
 
 
 @jit_inline
 def cross(a: Three, b: Three) -> Three:
-    """Vector product."""
+    """Return vector product."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 @jit_inline
 def transposed_times(m: Matrix, v: Three) -> Three:
-    """A matrix, transposed, times a vector."""
+    """Return a matrix, transposed, times a vector."""
     a, b, c = m
     return plus(plus((v[0] * a[0], v[0] * a[1], v[0] * a[2]), v[1], b), v[2], c)
 
@@ -165,13 +165,13 @@ def product(a: Matrix, b: Matrix) -> Matrix:
 
 @jit_inline
 def turned_by(sin: float, cos: float, v: Three) -> Three:
-    """Ry(angle) v, of the angle's sine and cosine."""
+    """Return ry(angle) v, of the angle's sine and cosine."""
     return cos * v[0] + sin * v[2], v[1], cos * v[2] - sin * v[0]
 
 
 @jit_inline
 def small_turn_factors(square: float, share: float) -> tuple[float, float]:
-    """`turn_factors` of turns that are small for sure."""
+    """Return `turn_factors` of turns that are small for sure."""
     first = 1.0 - square * (1.0 / 6.0 - square * (1.0 / 120.0 - square * (1.0 / 5040.0 - square / 362880.0)))
     second = 0.5 - square * (1.0 / 24.0 - square * (1.0 / 720.0 - square * (1.0 / 40320.0 - square / 3628800.0)))
     return share * first, share * share * second
@@ -179,7 +179,7 @@ def small_turn_factors(square: float, share: float) -> tuple[float, float]:
 
 @jit_inline
 def turn_factors(square: float, share: float) -> tuple[float, float]:
-    """a, b of exp(share [φ]×) v = v + a φ × v + b φ × (φ × v) (Rodrigues), of ``square`` = |share φ|²."""
+    """Return a, b of exp(share [φ]×) v = v + a φ × v + b φ × (φ × v) (Rodrigues), of ``square`` = |share φ|²."""
     if square >= SMALL_ANGLE_2:
         angle = math.sqrt(square)
         sin, cos = math.sin(0.5 * angle), math.cos(0.5 * angle)
@@ -189,6 +189,6 @@ def turn_factors(square: float, share: float) -> tuple[float, float]:
 
 @jit_inline
 def turned_on(phi: Three, a: float, b: float, v: Three) -> Three:
-    """v + a φ × v + b φ × (φ × v)."""
+    """Return v + a φ × v + b φ × (φ × v)."""
     once = cross(phi, v)
     return plus(plus(v, a, once), b, cross(phi, once))

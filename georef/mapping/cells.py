@@ -39,14 +39,16 @@ _ABSENT, _BEYOND = -1, -2
 
 
 def _stencil() -> FloatArray:
-    """Centre, six faces, twelve edges of a cube of half size 1: (19, 3)."""
+    """Return centre, six faces, twelve edges of a cube of half size 1: (19, 3)."""
     lattice = np.array(list(itertools.product((0.0, -1.0, 1.0), repeat=3)))
     stencil: FloatArray = lattice[np.count_nonzero(lattice, axis=1) <= 2]
     return stencil
 
 
 def _checks() -> FloatArray:
-    """Corners, where the neglected third order is largest and a crease cannot hide, and a lattice inside: (72, 3)."""
+    """Return corners, where the neglected third order is largest and a crease cannot hide, and a lattice inside: (72,
+    3).
+    """
     corners = itertools.product((-1.0, 1.0), repeat=3)
     inside = itertools.product((-0.75, -0.25, 0.25, 0.75), repeat=3)
     return np.array([*corners, *inside])
@@ -118,7 +120,7 @@ class MapCells:
         self._table_nodes = np.full(1024, _ABSENT, dtype=np.int32)
 
     def _locate(self, points: FloatArray) -> NDArray[np.int32]:
-        """The cube of each point, made where it is missing; negative for what is no place near the earth.
+        """Return the cube of each point, made where it is missing; negative for what is no place near the earth.
 
         Old cubes go all at once, before a block: to make again the few hundred of one block costs less than to keep
         account of their use.
@@ -190,7 +192,7 @@ class MapCells:
 def expand_cells(
     exact: Exact, centre: FloatArray, half_m: FloatArray, unit_m: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Expansions (n, 34) about centres (n, 3), and the largest error in metres (n,) that was found in each cube.
+    """Return expansions (n, 34) about centres (n, 3), and the largest error in metres (n,) that was found in each cube.
 
     Central differences over the whole cube; infinite where the map has no value.
     """
@@ -262,7 +264,7 @@ def _descend(
     kinds: NDArray[np.int8],
     rows: FloatArray,
 ) -> tuple[int, int]:
-    """The cube of a point and 0, or −1 and the key of the cube that is missing."""
+    """Return the cube of a point and 0, or −1 and the key of the cube that is missing."""
     key = _key_at(0, x, y, z)
     slot = _slot_of(key, len(table_keys))
     while table_nodes[slot] >= 0 and table_keys[slot] != key:
@@ -317,7 +319,7 @@ def _find(
 
 @jit_inline
 def _second_order(row: NDArray[np.float64], j: int, x: float, y: float, z: float, squares: tuple[float, ...]) -> float:
-    """Coordinate j of an expansion, x, y, z from its centre."""
+    """Return coordinate j of an expansion, x, y, z from its centre."""
     a, b = np.uint64(7 + 3 * j), np.uint64(16 + 6 * j)
     xx, xy, xz, yy, yz, zz = squares
     ones = (np.uint64(1), np.uint64(2), np.uint64(3), np.uint64(4), np.uint64(5))
@@ -350,7 +352,7 @@ def _expand(
 
 @jit_inline
 def _sigma(row: NDArray[np.float64], j: int, xx: float, xy: float, xz: float, yy: float, yz: float, zz: float) -> float:
-    """√(g Σ gᵀ) with g the first derivatives of coordinate j (law of propagation of variances)."""
+    """Return √(g Σ gᵀ) with g the first derivatives of coordinate j (law of propagation of variances)."""
     at = np.uint64(7 + 3 * j)
     a, b, c = row[at], row[at + np.uint64(1)], row[at + np.uint64(2)]
     variance = a * (a * xx + 2.0 * (b * xy + c * xz)) + b * (b * yy + 2.0 * c * yz) + c * c * zz

@@ -95,7 +95,7 @@ class _Judgement:
 
 
 def read_target(text: str) -> Target:
-    """A mapping frame as the user wrote it (anything PROJ reads).
+    """Return a mapping frame as the user wrote it (anything PROJ reads).
 
     Raises MappingError for what is not projected (geocentric is taken: ECEF), for axes other than east and north, and
     for depths.
@@ -119,7 +119,8 @@ def read_target(text: str) -> Target:
 
 
 def read_source(datum: str | None, target: Target) -> CRS:
-    """The geocentric CRS of positions in e: None is WGS 84 of unknown realisation, "same" is the target's own datum.
+    """Return the geocentric CRS of positions in e: None is WGS 84 of unknown realisation, "same" is the target's own
+    datum.
 
     Raises MappingError for what is no datum of positions, and for datums on another ellipsoid than WGS 84's: latitudes,
     longitudes and heights of receivers and files are taken to e on that one.
@@ -142,7 +143,7 @@ def read_source(datum: str | None, target: Target) -> CRS:
 def choose(
     source: CRS, target: Target, datum: str | None, area: Area | None, accuracy_m: float
 ) -> tuple[Operation, bool]:
-    """The best operation from positions to the mapping frame in an area (west, south, east, north in degrees).
+    """Return the best operation from positions to the mapping frame in an area (west, south, east, north in degrees).
 
     Without an area the frame's own is looked at: False says that another operation may be best in a part of it. Raises
     MappingError where the best is refused, or nothing in the frame's area could be taken.
@@ -190,7 +191,7 @@ class _Candidates:
 
 
 def _key(crs: CRS) -> str:
-    """A text of a CRS that PROJ reads back without loss."""
+    """Return a text of a CRS that PROJ reads back without loss."""
     authority = crs.to_authority(min_confidence=100)
     return ":".join(authority) if authority and CRS.from_user_input(":".join(authority)) == crs else crs.to_json()
 
@@ -241,7 +242,7 @@ def _judge(candidate: Transformer, target: Target, accuracy_m: float) -> _Judgem
 
 
 def _steps(candidate: Transformer) -> tuple[CoordinateOperation, ...]:
-    """The steps of an operation; one that has a single step is that step."""
+    """Return the steps of an operation; one that has a single step is that step."""
     return tuple(candidate.operations or ()) or (CoordinateOperation.from_string(candidate.to_wkt()),)
 
 
@@ -257,7 +258,7 @@ def _operation(candidate: Transformer, accuracy_m: float, realisation: str, grid
 
 
 def _member(step: CoordinateOperation, target: Target) -> str:
-    """The realisation's name, if a step does nothing but call it by the name of the output's ensemble."""
+    """Return the realisation's name, if a step does nothing but call it by the name of the output's ensemble."""
     text: dict[str, Any] = step.to_json_dict()
     source, ensemble = text.get("source_crs") or {}, (text.get("target_crs") or {}).get("datum_ensemble")
     geodetic = target.horizontal.geodetic_crs
@@ -268,7 +269,7 @@ def _member(step: CoordinateOperation, target: Target) -> str:
 
 
 def _refusal(flat: _Candidates, judged: list[_Judgement], target: Target, datum: str | None) -> str:
-    """Why the datum part is refused, and what would settle it."""
+    """Return why the datum part is refused, and what would settle it."""
     if flat.missing:
         return f'PROJ\'s best operation, "{_short(flat.best_name)}", lacks {_how_to_get(flat.missing)}'
     first = judged[0]
@@ -282,7 +283,7 @@ def _refusal(flat: _Candidates, judged: list[_Judgement], target: Target, datum:
 
 
 def _vertical_fault(whole: _Candidates) -> str:
-    """Why the heights are refused."""
+    """Return why the heights are refused."""
     if whole.missing:
         return f"its heights lack {_how_to_get(whole.missing)}"
     return "PROJ knows no geoid model for its heights: take a vertical CRS it has one for, or ellipsoidal heights"
@@ -293,7 +294,7 @@ def _guesses(candidate: Transformer) -> bool:
 
 
 def _with_heights(best: Transformer, flat: Operation, target: Target, area: Area, accuracy_m: float) -> Operation:
-    """The operation with heights, which has to agree with the judged one in the plane."""
+    """Return the operation with heights, which has to agree with the judged one in the plane."""
     grids = tuple(grid.short_name for step in _steps(best) for grid in step.grids)
     operation = _operation(best, flat.accuracy_m, flat.realisation, grids or _named_grids(str(best.definition)))
     if _apart_m(operation, flat, area) > max(accuracy_m, flat.stated_accuracy_m or 0.0):
@@ -309,7 +310,7 @@ def _named_grids(definition: str) -> tuple[str, ...]:
 
 
 def _apart_m(one: Operation, other: Operation, area: Area) -> float:
-    """Distance in the plane between two operations in the middle of an area (in units of the map)."""
+    """Return distance in the plane between two operations in the middle of an area (in units of the map)."""
     lon, lat = (area[0] + area[2] + (360.0 if area[2] < area[0] else 0.0)) / 2.0, (area[1] + area[3]) / 2.0
     xyz = Transformer.from_pipeline("+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart")
     at = (*xyz.transform(lon, lat, 0.0), 2020.0)
@@ -319,7 +320,9 @@ def _apart_m(one: Operation, other: Operation, area: Area) -> float:
 
 
 def transformer_of(operation: Operation) -> Transformer:
-    """PROJ's transformer of an operation, the same in every process. Raises MappingError where a grid has gone."""
+    """Return PROJ's transformer of an operation, the same in every process. Raises MappingError where a grid has
+    gone.
+    """
     set_network_enabled(False)
     try:
         return Transformer.from_pipeline(operation.definition)
@@ -407,7 +410,7 @@ def _how_to_get(grids: tuple[tuple[str, bool], ...]) -> str:
 
 
 def _short(name: str) -> str:
-    """An operation's name without its conversions."""
+    """Return an operation's name without its conversions."""
     parts = [part for part in name.split(" + ") if not part.startswith(("Conversion from", "axis order", "Null geo"))]
     return " + ".join(parts) or name
 
@@ -426,7 +429,9 @@ def _unbound(crs: CRS) -> CRS:
 
 
 def _has_our_ellipsoid(crs: CRS) -> bool:
-    """Whether geodetic coordinates on it mean what they mean on the ellipsoid of `swath.georef.geodesy.earth`."""
+    """Return whether geodetic coordinates on it mean what they mean on the ellipsoid of
+    `swath.georef.geodesy.earth`.
+    """
     ellipsoid = crs.ellipsoid
     if ellipsoid is None:
         return False
@@ -444,7 +449,7 @@ def _refuse_ellipsoid(datum: str, crs: CRS) -> None:
 
 
 def _geocentric(crs: CRS) -> CRS:
-    """The geocentric CRS on the datum of another."""
+    """Return the geocentric CRS on the datum of another."""
     if crs.is_geocentric:
         return crs
     geodetic = crs.geodetic_crs

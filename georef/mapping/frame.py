@@ -131,7 +131,7 @@ class Mapping:
             self._take(operation)
 
     def map_from_e(self, points_e: FloatArray) -> FloatArray:
-        """Easting, northing, height (n, 3) of positions in e (n, 3), within 0.1 mm of PROJ's own.
+        """Return easting, northing, height (n, 3) of positions in e (n, 3), within 0.1 mm of PROJ's own.
 
         A point's result depends on the point alone. Raises MappingError where PROJ has none, and naming where.
         """
@@ -155,7 +155,7 @@ class Mapping:
         return self._cells.map_with_sigmas(points, np.ascontiguousarray(covariance_e, dtype=np.float64))
 
     def reaches(self, points_e: FloatArray) -> NDArray[np.bool_]:
-        """Whether `map_from_e` has coordinates for each of positions in e (n, 3); never raises for one of them.
+        """Return whether `map_from_e` has coordinates for each of positions in e (n, 3); never raises for one of them.
 
         Raises MappingError where no operation can be chosen.
         """
@@ -176,13 +176,13 @@ class Mapping:
         return reached
 
     def exact(self, points_e: FloatArray) -> FloatArray:
-        """What `map_from_e` approximates: PROJ's own results (n, 3)."""
+        """Return what `map_from_e` approximates: PROJ's own results (n, 3)."""
         points = np.ascontiguousarray(points_e, dtype=np.float64)
         self._settle_by_first(points)
         return _finite(self._forward(points), points, self._target.text)
 
     def e_from_map(self, points_map: FloatArray) -> FloatArray:
-        """Positions in e (n, 3) of easting, northing, height (n, 3), by PROJ. The operation must be settled."""
+        """Return positions in e (n, 3) of easting, northing, height (n, 3), by PROJ. The operation must be settled."""
         if self._operation is None:
             raise MappingError(f'output.crs = "{self._target.text}": which operation leads there is still open')
         points = np.ascontiguousarray(points_map, dtype=np.float64)
@@ -193,7 +193,7 @@ class Mapping:
         return found
 
     def description(self) -> dict[str, Any]:
-        """What a sidecar states of the frame: plain numbers and texts."""
+        """Return what a sidecar states of the frame: plain numbers and texts."""
         target, (_, datum, epoch, accuracy_m) = self._target, self._said
         stated: dict[str, Any] = {
             "crs": target.text,
@@ -304,7 +304,7 @@ def _checked_epoch(epoch: float | None) -> float | None:
 
 
 def _area_of(points_e: FloatArray) -> Area:
-    """The box around positions, half a degree wider, across the antimeridian where that is shorter."""
+    """Return the box around positions, half a degree wider, across the antimeridian where that is shorter."""
     lat, lon, _ = (np.degrees(angle) for angle in geodetic_from_e(points_e))
     finite = np.isfinite(lat) & np.isfinite(lon)
     if not finite.any():
@@ -325,7 +325,7 @@ def _wrapped(lon_deg: float) -> float:
 
 
 def _finite(mapped: FloatArray, points_e: FloatArray, text: str) -> FloatArray:
-    """The same, or a refusal that names the first place without coordinates."""
+    """Return the same, or a refusal that names the first place without coordinates."""
     wrong = np.flatnonzero(~np.isfinite(mapped).all(axis=1))
     if len(wrong):
         raise MappingError(

@@ -91,7 +91,7 @@ def _leave_out(bridges: Bridges, newest: int, span_s: float) -> None:
 
 @jit_inline
 def _variance_of(bridges: Bridges, run: int, axis: int, long_s: float) -> float:
-    """Variance of the sum of a run of made-up samples."""
+    """Return variance of the sum of a run of made-up samples."""
     known = 0
     while known < LEVELS and bridges.seen[known] >= ENOUGH:
         known += 1

@@ -52,7 +52,7 @@ class ErrorChain:
         return len(self.time_ns)
 
     def covariance(self) -> FloatArray:
-        """(6k, 6k) of errors true − smoothed: position in l (m), small turns of the body about n, e, d (rad)."""
+        """Return (6k, 6k) of errors true − smoothed: position in l (m), small turns of the body about n, e, d (rad)."""
         count, size = len(self), self.left.shape[2]
         joint = np.zeros((count, ERRORS, count, ERRORS))
         behind = np.zeros((0, size))
@@ -77,7 +77,7 @@ class ErrorChain:
 
 
 def error_chain(run: FilterRun, time_ns: ArrayLike) -> ErrorChain:
-    """The chain at the smoother's nodes nearest to some times, each once.
+    """Return the chain at the smoother's nodes nearest to some times, each once.
 
     Args:
         run: of the filter, with its nodes; the last one that was smoothed.
@@ -115,7 +115,7 @@ def error_chain(run: FilterRun, time_ns: ArrayLike) -> ErrorChain:
 
 
 def _nearest(times: Int64Array, wanted: ArrayLike) -> Int64Array:
-    """Rising indexes, each once."""
+    """Return rising indexes, each once."""
     asked = np.asarray(wanted, dtype=np.int64)
     after = np.clip(np.searchsorted(times, asked), 1, max(len(times) - 1, 1))
     before_is_nearer = asked - times[after - 1] <= np.abs(times[np.minimum(after, len(times) - 1)] - asked)
@@ -148,7 +148,9 @@ def _unpacked(packed: FloatArray, n: int) -> FloatArray:
 
 
 def _rows_l(state: FloatArray, n: int, late: int) -> FloatArray:
-    """(6, n) what takes position and attitude out of the errors, turned to l; the position in GNSS's time, r + v τ."""
+    """Return (6, n) what takes position and attitude out of the errors, turned to l; the position in GNSS's time, r +
+    v τ.
+    """
     lat, lon, _ = geodetic_from_e(state[:3])
     rot_l_from_e = rot_e_from_l(lat, lon).T
     rows = np.zeros((ERRORS, n))

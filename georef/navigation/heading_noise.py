@@ -111,7 +111,7 @@ _OF_PRIOR = np.array([[-2.0, 2.0, 0.0], [0.0, 0.0, 1.0]])
 
 
 def _parameters(setup: Setup) -> FloatArray:
-    """(3,) ln of the white and of the lasting sigma, over the one told, and of the e-folding time in s."""
+    """Return (3,) ln of the white and of the lasting sigma, over the one told, and of the e-folding time in s."""
     scale, share = setup.gnss_heading_scale, max(setup.gnss_heading_share, LEAST_SHARE)
     white, lasting = scale * math.sqrt(1.0 - share), scale * math.sqrt(share)
     return np.log([white, lasting, setup.gnss_heading_correlation_s])

@@ -119,7 +119,7 @@ class Inertial:
         return len(self.time_ns)
 
     def between(self, first: int, last: int) -> Inertial:
-        """Samples first to last − 1, views."""
+        """Return samples first to last − 1, views."""
         part = slice(first, last)
         return Inertial(
             self.time_ns[part], self.interval_s[part], self.angle_b[part], self.velocity_b[part], self.bridged[part]
@@ -160,7 +160,7 @@ def imu_noise(
     accel_scale_ppm: float = 0.0,
     misalignment_mrad: float = 0.0,
 ) -> ImuNoise:
-    """`ImuNoise` in the units of data sheets and of the configuration."""
+    """Return `ImuNoise` in the units of data sheets and of the configuration."""
     return ImuNoise(
         angle_random_walk=float(np.radians(angle_random_walk_deg_per_sqrt_h)) / _SQRT_HOUR,
         velocity_random_walk=velocity_random_walk_m_per_s_per_sqrt_h / _SQRT_HOUR,

@@ -140,7 +140,7 @@ def not_blunders(run: StructArray) -> BoolArray:
 
 
 def second_moments(innovations: StructArray) -> tuple[dict[Source, float], dict[Source, int]]:
-    """Mean square of normalised innovations, outliers left out, and of how many components it is, by source."""
+    """Return mean square of normalised innovations, outliers left out, and of how many components it is, by source."""
     rows = innovations[_usable(innovations)]
     fix = np.where(rows["kind"] == Kind.HEADING, 0, rows["fix_type"])
     moments: dict[Source, float] = {}
@@ -178,7 +178,7 @@ def log_likelihood(innovations: StructArray) -> float:
 
 
 def log_likelihoods(innovations: StructArray) -> FloatArray:
-    """(n,) ln likelihood of each innovation, as `log_likelihood` adds them up."""
+    """Return (n,) ln likelihood of each innovation, as `log_likelihood` adds them up."""
     each: FloatArray = -0.5 * (innovations["log_det"] + np.minimum(innovations["chi2"], GREATEST))
     return each
 
@@ -284,7 +284,7 @@ def _of_velocities(judged: Judged, white: Hypothesis) -> Hypothesis:
     tried: dict[int, Hypothesis] = {}
 
     def worth(place: int) -> float:
-        """Ln likelihood with the likeliest share for a time."""
+        """Return ln likelihood with the likeliest share for a time."""
         if place not in tried:
             _, likeliest = _shares(judged, begun(place), VELOCITIES)
             tried[place] = judged.matched(likeliest.setup)
@@ -337,12 +337,14 @@ class Judged:
 
 
 def _shares(judged: Judged, middle: Hypothesis, part: Part) -> tuple[list[Hypothesis], Hypothesis]:
-    """Climb from an assumed share to the likeliest; all that were tried, and that one, on a parabola through three."""
+    """Return climb from an assumed share to the likeliest; all that were tried, and that one, on a parabola through
+    three.
+    """
     centre = math.log(part.of(middle.setup) / (1.0 - part.of(middle.setup)))
     known = {0: middle}
 
     def worth(place: int) -> float:
-        """Ln likelihood and prior of a share so many steps from the middle."""
+        """Return ln likelihood and prior of a share so many steps from the middle."""
         if place not in known:
             share = 1.0 / (1.0 + math.exp(-(centre + STEP * place)))
             near = known[place - 1 if place > 0 else place + 1]

@@ -91,7 +91,7 @@ class Sampler:
         self._held: tuple[int, FloatArray, bool] | None = None  # the sample after a jump, unconfirmed
 
     def feed(self, rows: StructArray, time_ns: Int64Array) -> Inertial:
-        """Samples made of the next rows (n,) `IMU_DTYPE` with the GPS times (n,) of their stamps.
+        """Return samples made of the next rows (n,) `IMU_DTYPE` with the GPS times (n,) of their stamps.
 
         Returns:
             In the body's axes; times rise over all that was ever given.
@@ -121,7 +121,7 @@ class Sampler:
         self.left_out.append((end_ns, end_ns if last_ns is None else last_ns, reason))
 
     def _in_order(self, ends_ns: Int64Array, values: FloatArray, saturated: BoolArray) -> NDArray[np.intp]:
-        """Which rows to take; counts the others, holds the one that only the next can judge."""
+        """Return which rows to take; counts the others, holds the one that only the next can judge."""
         if len(ends_ns) and self._last_ns is not None:
             steps = np.diff(ends_ns, prepend=self._last_ns)
             if ((steps > 0) & (steps <= self._max_gap_ns)).all():
@@ -150,7 +150,7 @@ class Sampler:
         return np.array(kept, dtype=np.intp)
 
     def _intervals(self, ends_ns: Int64Array, values: FloatArray, saturated: BoolArray) -> Inertial:
-        """Increments of rows in order, and of what is missing between them."""
+        """Return increments of rows in order, and of what is missing between them."""
         n = len(ends_ns)
         if not n:
             return Inertial(ends_ns, np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, dtype=np.bool_))
@@ -183,7 +183,7 @@ class Sampler:
         return Inertial(time_ns, interval_s, increments[:, 3:], increments[:, :3], made_up | saturated[row])
 
     def _missing(self, steps_ns: Int64Array, fresh: BoolArray) -> Int64Array:
-        """(n,) samples lost before each: whole intervals by which it is later than an even train of stamps says.
+        """Return (n,) samples lost before each: whole intervals by which it is later than an even train of stamps says.
 
         A stamp's jitter is told from a loss by that train, which follows the stamps slowly.
         """
@@ -205,7 +205,7 @@ class Sampler:
 
 
 def _rotation(rot_b_from_imu: ArrayLike | None) -> FloatArray | None:
-    """The matrix, checked."""
+    """Return the matrix, checked."""
     if rot_b_from_imu is None:
         return None
     rotation = np.asarray(rot_b_from_imu, dtype=np.float64)

@@ -73,7 +73,7 @@ class Solved:
     run: FilterRun
 
     def error_chain(self, time_ns: ArrayLike) -> ErrorChain:
-        """How the smoothed errors at the nodes nearest to some times (GNSS's) go together; see `error_chain`."""
+        """Return how the smoothed errors at the nodes nearest to some times (GNSS's) go together; see `error_chain`."""
         offset_ns = round(self.report.time_offset_s * SECOND_NS)
         chain = error_chain(self.run, np.asarray(time_ns, dtype=np.int64) + offset_ns)
         return replace(chain, time_ns=chain.time_ns - offset_ns)
@@ -142,7 +142,7 @@ def stretch_of(inertial: Inertial, observations: StructArray, start: Start) -> R
 
 
 def _attitude(nodes: SmoothedNodes) -> FloatArray:
-    """(3,) smoothed roll, pitch, heading of the first node."""
+    """Return (3,) smoothed roll, pitch, heading of the first node."""
     lat, lon, _ = geodetic_from_e(nodes.state[0, :3])
     rot = rot_e_from_l(lat, lon).T @ rot_from_quaternion(nodes.state[0, ATTITUDE : ATTITUDE + 4])
     return np.array(attitude_of(rot), dtype=np.float64)
@@ -158,12 +158,12 @@ def _mean(run: FilterRun, asked: Start, offset_s: float) -> FloatArray:
 
 
 def _change(nodes: SmoothedNodes) -> float:
-    """Angle between the smoothed attitude at the start and the assumed one."""
+    """Return angle between the smoothed attitude at the start and the assumed one."""
     return float(np.linalg.norm(nodes.leave[0, 6:]))
 
 
 def _bent(nodes: SmoothedNodes) -> bool:
-    """Whether the change at the start was too large for what is linear in it: its square against the sigma."""
+    """Return whether the change at the start was too large for what is linear in it: its square against the sigma."""
     return bool(_change(nodes) ** 2 > LINEAR_SHARE * nodes.sigma[0, 6:].min())
 
 
@@ -172,14 +172,14 @@ def _of_gnss(kinds: NDArray[np.uint8]) -> NDArray[np.bool_]:
 
 
 def _shifted(observations: StructArray, offset_s: float) -> StructArray:
-    """Observations with the offset added to the times of GNSS."""
+    """Return observations with the offset added to the times of GNSS."""
     rows = observations.copy()
     rows["time_ns"][_of_gnss(rows["kind"])] += round(offset_s * SECOND_NS)
     return rows
 
 
 def _in_gnss_time(solution: Solution, taken_s: float, whole_s: float) -> Solution:
-    """A solution in the inertial unit's time, put into GNSS's: its epochs less the whole offset.
+    """Return a solution in the inertial unit's time, put into GNSS's: its epochs less the whole offset.
 
     Args:
         solution: its innovations of GNSS are at the observations' times and what was taken.
@@ -201,7 +201,7 @@ def _in_gnss_time(solution: Solution, taken_s: float, whole_s: float) -> Solutio
 
 
 def _weak(solution: Solution, setup: Setup) -> tuple[str, ...]:
-    """Estimates of the installation that keep most of their prior sigma."""
+    """Return estimates of the installation that keep most of their prior sigma."""
     last: list[tuple[str, float, float]] = []
     if setup.estimate_lever_arm > 0.0:
         for name, sigma in zip("xyz", solution.lever_arm_sigma[-1].tolist(), strict=True):

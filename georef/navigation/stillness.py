@@ -25,7 +25,7 @@ BESIDE = 2  # seconds on either side that must be still too
 
 
 def still_seconds(inertial: Inertial, observations: StructArray) -> StructArray:
-    """Observations of no velocity, one in the middle of each whole second of GPS time that the vehicle stood.
+    """Return observations of no velocity, one in the middle of each whole second of GPS time that the vehicle stood.
 
     Args:
         inertial: of a piece without gaps.
@@ -51,12 +51,14 @@ def still_seconds(inertial: Inertial, observations: StructArray) -> StructArray:
 
 
 def with_still_seconds(inertial: Inertial, observations: StructArray) -> StructArray:
-    """The observations and those of standing still."""
+    """Return the observations and those of standing still."""
     return sort_observations(np.concatenate([observations, still_seconds(inertial, observations)]))
 
 
 def _feels_still(inertial: Inertial, first: int, count: int) -> BoolArray:
-    """(count,) of whole seconds from ``first`` on: no turn beside the earth's, and the same force as the neighbours."""
+    """Return (count,) of whole seconds from ``first`` on: no turn beside the earth's, and the same force as the
+    neighbours.
+    """
     number = (inertial.time_ns - 1) // SECOND_NS - first
     inside = (number >= 0) & (number < count)
     number = number[inside]
@@ -74,7 +76,7 @@ def _feels_still(inertial: Inertial, first: int, count: int) -> BoolArray:
 
 
 def _seen_still(observations: StructArray, first: int, count: int) -> BoolArray:
-    """(count,) a receiver's velocity says so, or its positions where it says none."""
+    """Return (count,) a receiver's velocity says so, or its positions where it says none."""
     seen, moves = np.zeros(count, np.bool_), np.zeros(count, np.bool_)
     for kind, moving in ((Kind.VELOCITY, _by_velocity), (Kind.POSITION, _by_position)):
         rows = observations[observations["kind"] == kind]
@@ -94,7 +96,7 @@ def _by_velocity(rows: StructArray) -> BoolArray:
 
 
 def _by_position(rows: StructArray) -> BoolArray:
-    """Against the position some time before: less than noise, and than what a slow roll makes."""
+    """Return against the position some time before: less than noise, and than what a slow roll makes."""
     back = np.maximum(np.searchsorted(rows["time_ns"], rows["time_ns"] - APART_NS, side="right") - 1, 0)
     away = np.linalg.norm(rows["value"] - rows["value"][back], axis=1)
     moves: BoolArray = away > np.clip(SIGMAS * np.linalg.norm(rows["sigma"], axis=1), *DRIFTS_M)

@@ -65,7 +65,7 @@ class Geometry(Protocol):
         """Parameters of the model, by their names in SI units, that such a scanner does not have."""
 
     def deflection(self, calibration: Calibration) -> Deflection:
-        """The table; GeometryError where the calibration has what such a scanner has not."""
+        """Return the table; GeometryError where the calibration has what such a scanner has not."""
 
 
 @dataclass(frozen=True)
@@ -262,7 +262,7 @@ def line_scanner(
     prism_ratio: float | None = None,
     fibres: FibreGeometry | None = None,
 ) -> Geometry:
-    """The geometry that ``[scanner.<name>.geometry]`` declares, by its keys; ``fibres`` is read from its file.
+    """Return the geometry that ``[scanner.<name>.geometry]`` declares, by its keys; ``fibres`` is read from its file.
 
     Raises:
         GeometryError: a key is missing, or the type is unknown.
@@ -291,7 +291,7 @@ def line_scanner(
 
 
 def read_fibres(text: str, name: str) -> FibreGeometry:
-    """A table of fibres: a line ``across_deg,along_deg``, then one a fibre, in the order the mirror lights them.
+    """Return a table of fibres: a line ``across_deg,along_deg``, then one a fibre, in the order the mirror lights them.
 
     Args:
         text: of the file.
@@ -330,7 +330,7 @@ def _line_table(plane_tilt_rad: FloatArray, mirror_tilt_rad: FloatArray) -> Floa
 
 
 def _beam_corrections(calibration: Calibration, count: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """(channels,) added to azimuths, elevations and ranges by [[beam]]."""
+    """Return (channels,) added to azimuths, elevations and ranges by [[beam]]."""
     corrections = np.zeros((3, count))
     for channel, beam in calibration.beams.items():
         corrections[:, channel] = beam.azimuth_rad, beam.elevation_rad, beam.range_m

@@ -147,7 +147,7 @@ class Calibration:
         return replace(self, held_sigmas=np.array([parameter.plausible for parameter in PARAMETERS]))
 
     def value(self, name: str) -> float:
-        """A parameter by its name in SI units, as ``omega_rad``."""
+        """Return a parameter by its name in SI units, as ``omega_rad``."""
         return float(self.parameters[INDEX[name]])
 
     @property
@@ -161,13 +161,13 @@ class Calibration:
         return self.sigmas + self.held_sigmas
 
     def covariance(self) -> FloatArray:
-        """(16, 16) of the parameters, estimated and held, SI units; zero where nothing is said of them."""
+        """Return (16, 16) of the parameters, estimated and held, SI units; zero where nothing is said of them."""
         sigmas = self.all_sigmas
         scaled: FloatArray = self.correlation * np.outer(sigmas, sigmas)
         return scaled
 
     def changed(self, **values: float) -> Calibration:
-        """The same with some parameters by their names in SI units."""
+        """Return the same with some parameters by their names in SI units."""
         parameters = self.parameters.copy()
         for name, value in values.items():
             parameters[INDEX[name]] = value
@@ -177,7 +177,9 @@ class Calibration:
 def nominal(
     scanner: str, lever_arm_b: Sequence[float] | FloatArray, installation: Sequence[Sequence[float]] | FloatArray
 ) -> Calibration:
-    """Where there is no file: every parameter zero but the lever arm (3,), and the installation matrix T (3, 3)."""
+    """Return where there is no file: every parameter zero but the lever arm (3,), and the installation matrix T (3,
+    3).
+    """
     parameters = np.zeros(len(PARAMETERS))
     first = INDEX["lever_arm_x_m"]
     parameters[first : first + 3] = lever_arm_b
@@ -186,7 +188,7 @@ def nominal(
 
 
 def read_calibration(text: str, name: str) -> Calibration:
-    """A calibration file.
+    """Return a calibration file.
 
     Args:
         text: of the file.
@@ -304,7 +306,7 @@ class _Reader:
         return value
 
     def _values(self, section: str) -> tuple[FloatArray, set[int]]:
-        """(16,) in SI units, and which of them were said."""
+        """Return (16,) in SI units, and which of them were said."""
         table = self._table(section, needed=section == "parameters")
         values, said = np.zeros(len(PARAMETERS)), set()
         for key in sorted(table.keys() - _INDEX_OF_KEY.keys()):
@@ -317,7 +319,7 @@ class _Reader:
         return values, said
 
     def _sigmas(self, section: str) -> tuple[FloatArray, set[int]]:
-        """(16,) sigmas in SI units, none negative or too small to be squared, and which of them were said."""
+        """Return (16,) sigmas in SI units, none negative or too small to be squared, and which of them were said."""
         sigmas, said = self._values(section)
         in_units = sigmas / [parameter.factor for parameter in PARAMETERS]
         for index in np.flatnonzero((sigmas != 0.0) & (in_units < LEAST_SIGMA)).tolist():
@@ -326,7 +328,7 @@ class _Reader:
         return sigmas, said
 
     def _correlation(self, known: set[int]) -> FloatArray:
-        """(16, 16) from the names and the matrix of those whose sigmas were said."""
+        """Return (16, 16) from the names and the matrix of those whose sigmas were said."""
         whole = np.eye(len(PARAMETERS))
         table = self._table("correlation")
         if not table:
@@ -373,7 +375,7 @@ class _Reader:
         return intensity, correction
 
     def _rows(self, key: str, columns: tuple[str, ...]) -> Iterator[tuple[str, Mapping[str, Any]]]:
-        """Rows of an array of tables, with where each stands."""
+        """Yield rows of an array of tables, with where each stands."""
         rows = self._document.get(key, [])
         if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
             self._wrong(key, f"want tables [[{key}]]")
@@ -416,7 +418,7 @@ class _Reader:
 
 
 def is_rotation(matrix: FloatArray) -> bool:
-    """Are the rows of (3, 3) perpendicular, of length 1 and right-handed?"""
+    """Return are the rows of (3, 3) perpendicular, of length 1 and right-handed?"""
     error = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
     return error < ROTATION_TOLERANCE and float(np.linalg.det(matrix)) > 0.0
 
@@ -427,7 +429,7 @@ def _is_correlation(matrix: FloatArray) -> bool:
 
 
 def _array(value: object, shape: tuple[int, ...] | None) -> FloatArray | None:
-    """Numbers of this shape (None: a list of any length), none beyond `LARGEST`, or None."""
+    """Return numbers of this shape (None: a list of any length), none beyond `LARGEST`, or None."""
     try:
         array = np.array(value)
     except ValueError:

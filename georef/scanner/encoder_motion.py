@@ -24,7 +24,7 @@ class TellsMotion(Protocol):
     """Tells how the encoder moved when it was read."""
 
     def motion(self, rows: StructArray, time_ns: Int64Array) -> tuple[FloatArray, FloatArray]:
-        """(n,) rate and acceleration of the readings, rad/s, rad/s²."""
+        """Return (n,) rate and acceleration of the readings, rad/s, rad/s²."""
 
 
 class EncoderMotion:
@@ -50,7 +50,7 @@ class EncoderMotion:
         self._given = 0  # of the rows held, those that only others need
 
     def feed(self, rows: StructArray, time_ns: Int64Array) -> Moving:
-        """Rows whose neighbourhood is known now.
+        """Return rows whose neighbourhood is known now.
 
         Args:
             rows: (n,) `RETURN_DTYPE`, in the order of emission.
@@ -64,7 +64,7 @@ class EncoderMotion:
         return self._give(everything=False)
 
     def flush(self) -> Moving:
-        """The rows held back, when no more will come."""
+        """Return the rows held back, when no more will come."""
         given = self._give(everything=True)
         self._rows, self._time_ns, self._given = self._rows[:0], self._time_ns[:0], 0
         return given
@@ -92,7 +92,7 @@ class EncoderMotion:
 
     @staticmethod
     def _complete(pieces: Int64Array) -> int:
-        """How many pieces have all the neighbours they can have: the train went on far enough, or ended."""
+        """Return how many pieces have all the neighbours they can have: the train went on far enough, or ended."""
         last = pieces[-1]
         open_pieces = (pieces[:, TRAIN] == last[TRAIN]) & (last[PLACE] - pieces[:, PLACE] <= REACH)
         return int(np.argmax(open_pieces))

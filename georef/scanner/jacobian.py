@@ -21,7 +21,7 @@ _SECOND_NS = 1e9
 
 
 def parameter_columns_e(rays: Rays, model: SensorModel, trajectory: Trajectory) -> FloatArray:
-    """∂point/∂parameter in e.
+    """Return ∂point/∂parameter in e.
 
     Args:
         rays: with axes, (n,).
@@ -61,7 +61,7 @@ def parameter_columns_e(rays: Rays, model: SensorModel, trajectory: Trajectory) 
 
 
 def observation_columns_e(rays: Rays, model: SensorModel, trajectory: Trajectory) -> FloatArray:
-    """∂point/∂observation in e, the eight of ISO/TS 19159-2 Eq. 13 completed.
+    """Return ∂point/∂observation in e, the eight of ISO/TS 19159-2 Eq. 13 completed.
 
     Args:
         rays, model, trajectory: as of `parameter_columns_e`.
@@ -89,7 +89,7 @@ def observation_columns_e(rays: Rays, model: SensorModel, trajectory: Trajectory
 
 
 def columns_l(columns_e: FloatArray, rays: Rays, trajectory: Trajectory) -> FloatArray:
-    """Columns (n, m, 3) in e as north, east, down at the body."""
+    """Return columns (n, m, 3) in e as north, east, down at the body."""
     turned: FloatArray = columns_e @ _rot_e_from_l(_body_e(rays, trajectory))
     return turned
 
@@ -102,20 +102,20 @@ def _axes(rays: Rays) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
 
 
 def _column(values: FloatArray | None) -> FloatArray:
-    """(n, 1); absent: zero."""
+    """Return (n, 1); absent: zero."""
     column: FloatArray = np.zeros((1, 1)) if values is None else values[:, np.newaxis]
     return column
 
 
 def _rot_b_from_e(rays: Rays) -> FloatArray:
-    """(n, 3, 3); rows of vectors in b times this are rows in e."""
+    """Return (n, 3, 3); rows of vectors in b times this are rows in e."""
     if rays.q_e_from_b is None:
         raise ValueError("rays without axes; want rays(…, with_axes=True)")
     return np.swapaxes(rot_from_quaternion(rays.q_e_from_b), 1, 2)
 
 
 def _body_e(rays: Rays, trajectory: Trajectory) -> FloatArray:
-    """(n, 3) where the body was."""
+    """Return (n, 3) where the body was."""
     if rays.epoch is None:
         raise ValueError("rays without axes; want rays(…, with_axes=True)")
     here, there = trajectory.position_e[rays.epoch], trajectory.position_e[rays.epoch + 1]

@@ -55,7 +55,7 @@ class AngleSeries:
 
     @classmethod
     def of_solutions(cls, rows: StructArray, max_gap_ns: int = DEFAULT_MAX_GAP_NS) -> AngleSeries:
-        """Roll, pitch and heading that a device told, as the angles of the stage it reads.
+        """Return roll, pitch and heading that a device told, as the angles of the stage it reads.
 
         Args:
             rows: `INS_DTYPE`, in the order in which they came; epochs that are told again or late, and those without
@@ -82,7 +82,7 @@ class AngleSeries:
         return np.unwrap(self.angles_rad, axis=0)
 
     def at(self, time_ns: Int64Array) -> tuple[FloatArray, NDArray[np.bool_]]:
-        """(n, 3) angles at GPS times (n,), and where they are known."""
+        """Return (n, 3) angles at GPS times (n,), and where they are known."""
         last = len(self.time_ns) - 2
         epoch = np.clip(np.searchsorted(self.time_ns, time_ns, side="right") - 1, 0, last)
         begin, end = self.time_ns[epoch], self.time_ns[epoch + 1]
@@ -107,7 +107,7 @@ class Stage:
     series: AngleSeries | None = None
 
     def joined(self, other: Stage) -> Stage:
-        """The same stage in two recordings."""
+        """Return the same stage in two recordings."""
         if self.series is None or other.series is None:
             return self
         return replace(self, series=self.series.joined(other.series))
@@ -125,7 +125,7 @@ class Mount:
         return any(stage.series is not None for stage in self.stages)
 
     def joined(self, other: Mount) -> Mount:
-        """The same mount in two recordings: its stages' angles over the time of both."""
+        """Return the same mount in two recordings: its stages' angles over the time of both."""
         return Mount(tuple(one.joined(again) for one, again in zip(self.stages, other.stages, strict=True)))
 
     def poses(self, time_ns: Int64Array) -> tuple[FloatArray, FloatArray, NDArray[np.uint8]]:

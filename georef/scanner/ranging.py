@@ -147,7 +147,7 @@ class ZoneResolver:
         return len(self._held)
 
     def feed(self, rows: StructArray, predicted_m: FloatArray | None = None) -> StructArray:
-        """Rows of which all is known now, in the order of emission.
+        """Return rows of which all is known now, in the order of emission.
 
         Args:
             rows: (n,) `RETURN_DTYPE`, in the order of their records.
@@ -171,7 +171,7 @@ class ZoneResolver:
         self._scale = (metres_per_tick, self._flight_ticks)
 
     def _fed(self, rows: StructArray, predicted_m: FloatArray | None) -> StructArray:
-        """Rows of one tick rate."""
+        """Return rows of one tick rate."""
         unknown = rows["mta_zone"] == ZONE_UNKNOWN
         if not unknown.any():
             return self._passed(rows)
@@ -186,7 +186,7 @@ class ZoneResolver:
         return np.concatenate(given)
 
     def flush(self) -> StructArray:
-        """The rows held back, when no more will come; what is fed after begins a new sequence."""
+        """Return the rows held back, when no more will come; what is fed after begins a new sequence."""
         held = self._released(np.ones(len(self._held), np.bool_))
         self._restart()
         return held
@@ -201,14 +201,14 @@ class ZoneResolver:
         self._held_key = np.zeros((0, 2), np.int64)  # ordinal, ticks of emission
 
     def _passed(self, rows: StructArray) -> StructArray:
-        """Rows whose ranges are whole."""
+        """Return rows whose ranges are whole."""
         if not len(rows) or not len(self._pulses):
             return rows
         held = self.flush()
         return np.concatenate([held, rows]) if len(held) else rows
 
     def _resolved(self, rows: StructArray, predicted_m: FloatArray) -> StructArray:
-        """Rows with apparent ranges: those that are complete now, with whole ones."""
+        """Return rows with apparent ranges: those that are complete now, with whole ones."""
         if self._tick_hz > MOST_TICK_HZ:
             self._count(np.where(rows["number_of_returns"] > 0, GAP, NO_RETURN), rows)
             return rows[:0]
@@ -229,7 +229,7 @@ class ZoneResolver:
         return self._released(old_train | (self._held_key[:, 1] < now - self._flight_ticks))
 
     def _oldest(self, pulses: Int64Array) -> int:
-        """Ordinal of the oldest emission an echo may still come from."""
+        """Return ordinal of the oldest emission an echo may still come from."""
         ordinal, ticks = pulses[:, ORDINAL], pulses[:, TICKS]
         recent = (ordinal > ordinal[-1] - SEGMENT // 2) & (ticks >= ticks[-1] - self._flight_ticks)
         return int(ordinal[int(np.argmax(recent))])
@@ -271,7 +271,7 @@ class ZoneResolver:
 
 
 def _times(ticks: Int64Array, tick_hz: int) -> Int64Array:
-    """Device times (n,) in nanoseconds of a counter."""
+    """Return device times (n,) in nanoseconds of a counter."""
     seconds = ticks // tick_hz
     time_ns: Int64Array = seconds * 1_000_000_000 + (ticks - seconds * tick_hz) * 1_000_000_000 // tick_hz
     return time_ns

@@ -84,7 +84,7 @@ class SensorModel:
         incidence_rad: FloatArray | None = None,
         prf_hz: float | None = None,
     ) -> Rays:
-        """Points of returns.
+        """Return points of returns.
 
         Args:
             rows: (n,) `RETURN_DTYPE`, best in the order of their times.
@@ -129,7 +129,7 @@ class SensorModel:
         )
 
     def offsets_by_rate_m(self, rows: StructArray, prf_hz: float | None) -> FloatArray:
-        """(n,) of returns (n,): those of the calibration's range offsets that hold at this pulse rate only."""
+        """Return (n,) of returns (n,): those of the calibration's range offsets that hold at this pulse rate only."""
         of_all, of_rate = (_range_offsets(self.calibration, rate) for rate in (None, prf_hz))
         added = of_rate - of_all
         if len(added) == 1:
@@ -191,7 +191,7 @@ class SensorModel:
         )
 
     def _mounted(self, time_ns: Int64Array) -> Mounted:
-        """s to b at the pulses' times (n,), as far as it does not depend on θ: κ, gimbal, installation, head."""
+        """Return s to b at the pulses' times (n,), as far as it does not depend on θ: κ, gimbal, installation, head."""
         gimbal, centre, known = self.mount.poses(time_ns)
         rot_mount_from_s = gimbal @ self.calibration.installation_matrix
         inner = self._kappa @ rot_mount_from_s @ self._deflection.rot_s_from_head
@@ -213,7 +213,7 @@ class SensorModel:
         )
 
     def _readings(self, rows: StructArray) -> FloatArray:
-        """(n,) what the scan angle's offset is subtracted from."""
+        """Return (n,) what the scan angle's offset is subtracted from."""
         deflection, readings = self._deflection, rows["encoder_rad"]
         if deflection.select < FIBRE_BY_CHANNEL:
             return readings.copy()
@@ -226,7 +226,7 @@ class SensorModel:
 
 
 def _out(count: int) -> Out:
-    """Room for what becomes of n returns."""
+    """Return room for what becomes of n returns."""
     return Out(
         fate=np.empty(count, np.uint8),
         time_ns=np.empty(count, np.int64),
@@ -239,7 +239,7 @@ def _out(count: int) -> Out:
 
 
 def _axes(count: int) -> Axes:
-    """Room for their axes."""
+    """Return room for their axes."""
     return Axes(
         q_e_from_b=np.empty((4, count)),
         epoch=np.zeros(count, np.int64),
@@ -252,7 +252,9 @@ def _axes(count: int) -> Axes:
 
 
 def _range_offsets(calibration: Calibration, prf_hz: float | None) -> FloatArray:
-    """(256, 256) metres by return number and MTA zone at this pulse rate; (1, 1) where the file has no such table."""
+    """Return (256, 256) metres by return number and MTA zone at this pulse rate; (1, 1) where the file has no such
+    table.
+    """
     matching = [
         row
         for row in calibration.range_offsets
@@ -269,7 +271,9 @@ def _range_offsets(calibration: Calibration, prf_hz: float | None) -> FloatArray
 
 
 def _ibrc_tables(calibration: Calibration) -> tuple[FloatArray, FloatArray, FloatArray, Int64Array, float]:
-    """Knots of the intensity-based range correction, and where to begin looking among them; as `Ranging` has them."""
+    """Return knots of the intensity-based range correction, and where to begin looking among them; as `Ranging` has
+    them.
+    """
     if calibration.ibrc is None:
         nothing = np.zeros(0)
         return nothing, nothing, nothing, np.zeros(1, np.int64), 0.0

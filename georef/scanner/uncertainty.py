@@ -115,7 +115,7 @@ class Uncertainty:
 
 
 def _effects(calibration: Calibration) -> FloatArray:
-    """(16, 18) what each parameter does (FORMULAS 5.2), columns as in `swath.georef.scanner.kernels.covariance`.
+    """Return (16, 18) what each parameter does (FORMULAS 5.2), columns as in `swath.georef.scanner.kernels.covariance`.
 
     ω, φ and κ turn the beam about their own axes in b; that the pitch slope moves κ's is left out (1e-4 of its part).
     """

@@ -172,7 +172,9 @@ class HostClocks:
             self.by_source[source].add_coarse(raw_ns, at_ns)
 
     def gps_from_host(self, source: str, host_ns: Int64Array) -> tuple[Int64Array, NDArray[np.float64]]:
-        """GPS ns (n,) and sigma ns (n,; inf without time) of host times (n,), by the clock that a source shows."""
+        """Return GPS ns (n,) and sigma ns (n,; inf without time) of host times (n,), by the clock that a source
+        shows.
+        """
         return self.by_source[source].gps_from_host(self.timeline.raw_from_host(host_ns))
 
     def settle(self) -> list[str]:
@@ -193,7 +195,7 @@ class HostClocks:
         return self.by_source[source].status(self.timeline.raw_at(host_ns))
 
     def drain_events(self) -> list[tuple[str, ClockEvent]]:
-        """What the clocks had to say since the last call, with the source that shows each."""
+        """Return what the clocks had to say since the last call, with the source that shows each."""
         return [(source, event) for source, clock in self.by_source.items() for event in clock.drain_events()]
 
 
@@ -221,7 +223,7 @@ class StreamClocks:
 
     @classmethod
     def growing(cls, plan: ClockPlan) -> StreamClocks:
-        """Clocks that know what has been fed so far, and of that the last quarter of an hour."""
+        """Return clocks that know what has been fed so far, and of that the last quarter of an hour."""
         return cls(HostClocks(plan))
 
     def add_reading(
@@ -256,7 +258,7 @@ class StreamClocks:
                 pieces.clear()
 
     def place(self, source: str, rows: StructArray, max_sigma_ns: float) -> tuple[NDArray[np.bool_], Int64Array]:
-        """Which rows (n,) have a time that is good enough, and GPS ns (n,), by device time and host time."""
+        """Return which rows (n,) have a time that is good enough, and GPS ns (n,), by device time and host time."""
         if source not in self._devices or not len(rows):
             return np.zeros(len(rows), np.bool_), np.zeros(len(rows), np.int64)
         quick = self._by_cells(source, rows, max_sigma_ns)
@@ -268,11 +270,11 @@ class StreamClocks:
     def gps_from_device(
         self, source: str, device_ns: Int64Array, host_ns: Int64Array
     ) -> tuple[Int64Array, NDArray[np.float64]]:
-        """GPS ns (n,) and sigma ns (n,; inf: not known) of device times (n,) that came at host times (n,)."""
+        """Return GPS ns (n,) and sigma ns (n,; inf: not known) of device times (n,) that came at host times (n,)."""
         return self._devices[source].gps_from_device(device_ns, self.host.timeline.raw_from_host(host_ns))
 
     def _by_cells(self, source: str, rows: StructArray, max_sigma_ns: float) -> Int64Array | None:
-        """GPS ns (n,) between the edges of cells of device time; None where rows must be asked one by one.
+        """Return GPS ns (n,) between the edges of cells of device time; None where rows must be asked one by one.
 
         The edges are asked as if they had come first, and as if last: where the answers differ, or are not all good,
         something happened between.
@@ -298,7 +300,7 @@ class StreamClocks:
         return self._devices[source].stamps
 
     def refused(self, source: str) -> dict[str, int]:
-        """What a device's clock refused, by reason."""
+        """Return what a device's clock refused, by reason."""
         return self._devices[source].status().refused
 
 
@@ -340,5 +342,5 @@ class FrozenClocks:
         return "" if head is None else head.trouble
 
     def for_stream(self) -> StreamClocks:
-        """Clocks for one stream over any piece of the log."""
+        """Return clocks for one stream over any piece of the log."""
         return StreamClocks(self.host, frozen=True, stamps=self.stamps)

@@ -70,7 +70,7 @@ class GrowingPath:
         self._new.append(rows)
 
     def update(self) -> Trajectory | None:
-        """All that came, at once."""
+        """Return all that came, at once."""
         if not self._new:
             return self._trajectory
         self._buffer.append(np.concatenate(self._new))

@@ -58,7 +58,7 @@ class Georeferences(Protocol):
     """What makes points of a scanner's returns: `swath.georef.georeference.Georeferencer`."""
 
     def georeference(self, rows: StructArray, time_ns: Int64Array, trajectory: Trajectory) -> tuple[Points, ByteArray]:
-        """Points, and the fate of every row."""
+        """Return points, and the fate of every row."""
 
 
 class Resolver(Protocol):
@@ -71,10 +71,10 @@ class Resolver(Protocol):
         """Returns held back."""
 
     def feed(self, rows: StructArray, predicted_m: NDArray[np.float64] | None = None) -> StructArray:
-        """Rows of which all is known now, in the order of emission."""
+        """Return rows of which all is known now, in the order of emission."""
 
     def flush(self) -> StructArray:
-        """The rest."""
+        """Return the rest."""
 
 
 Moving = tuple[StructArray, Int64Array, NDArray[np.float64], NDArray[np.float64]]
@@ -84,10 +84,10 @@ class Motion(Protocol):
     """Finds the encoder's rate and acceleration from readings around (`swath.georef.scanner.encoder_motion`)."""
 
     def feed(self, rows: StructArray, time_ns: Int64Array) -> Moving:
-        """Rows whose neighbourhood is known now, their GPS times, rad/s, rad/s²."""
+        """Return rows whose neighbourhood is known now, their GPS times, rad/s, rad/s²."""
 
     def flush(self) -> Moving:
-        """The rest."""
+        """Return the rest."""
 
 
 class GivenMotion:
@@ -97,7 +97,7 @@ class GivenMotion:
         self.rate = self.acceleration = np.empty(0)
 
     def motion(self, rows: StructArray, time_ns: Int64Array) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """(n,) rad/s, rad/s² of the rows that are georeferenced now."""
+        """Return (n,) rad/s, rad/s² of the rows that are georeferenced now."""
         del rows, time_ns
         return self.rate, self.acceleration
 
@@ -207,7 +207,9 @@ class _Lane:
         return (tick_ns - held.since_ns) / SECOND_NS > self._settings.settle_s
 
     def _is_worth_asking(self, waiting: deque[WaitingReturns], tick_ns: int, clocks: StreamClocks) -> bool:
-        """Whether the first or the last return that was asked in vain has a time by now, so that all are asked."""
+        """Return whether the first or the last return that was asked in vain has a time by now, so that all are
+        asked.
+        """
         asked = [held for held in waiting if self._was_asked(held, tick_ns)]
         if not asked:
             return False
@@ -224,7 +226,7 @@ class _Lane:
             self._give_up(held.rows, Fate.OUTSIDE_TRAJECTORY, held.time_ns)
 
     def _covered(self, tick_ns: int, covered_ns: int, *, last: bool) -> list[WaitingReturns]:
-        """Taken from the queue: what the trajectory covers, and what has waited for it for too long."""
+        """Return taken from the queue: what the trajectory covers, and what has waited for it for too long."""
         ready: list[WaitingReturns] = []
         waiting, self._timed = self._timed, deque()
         for held in waiting:
@@ -246,7 +248,7 @@ class _Lane:
         *,
         last: bool,
     ) -> tuple[StructArray, Int64Array]:
-        """Rows with the times of their emissions, of those that have become known."""
+        """Return rows with the times of their emissions, of those that have become known."""
         self._resolves = self._resolves or any_has(rows, "mta_zone", ZONE_UNKNOWN)
         if not self._resolves:
             return rows, time_ns
@@ -287,7 +289,7 @@ class _Lane:
         return points if len(points) else None
 
     def _moving(self, motion: Motion, rows: StructArray, time_ns: Int64Array, *, last: bool) -> Moving:
-        """Rows with the encoder's motion, of those where it is known."""
+        """Return rows with the encoder's motion, of those where it is known."""
         moving = motion.feed(rows, time_ns)
         if last:
             (one, at_ns, rate, acceleration), rest = moving, motion.flush()
@@ -331,7 +333,7 @@ class Stream:
         self._tick_ns = 0
 
     def chain(self, name: str) -> ScannerChain:
-        """What a scanner's returns go through."""
+        """Return what a scanner's returns go through."""
         return self._lanes[name].chain
 
     @property
@@ -349,7 +351,7 @@ class Stream:
         return self._advance(last=False)
 
     def close(self) -> list[tuple[str, Points]]:
-        """The log is over: what still waits is georeferenced or given up."""
+        """Return the log is over: what still waits is georeferenced or given up."""
         return self._advance(last=True)
 
     def _advance(self, *, last: bool) -> list[tuple[str, Points]]:
@@ -362,12 +364,12 @@ class Stream:
         return given
 
     def waiting(self, name: str) -> int:
-        """Returns of a scanner whose fate is not known yet."""
+        """Return returns of a scanner whose fate is not known yet."""
         lane = self._lanes[name]
         return lane.waiting + sum(len(rows) for rows in lane.new)
 
     def fates(self, name: str) -> dict[Fate, int]:
-        """What became of a scanner's returns so far; those without a fate yet are `waiting`."""
+        """Return what became of a scanner's returns so far; those without a fate yet are `waiting`."""
         lane = self._lanes[name]
         counts = {fate: int(lane.fates[fate]) for fate in Fate}
         if lane.chain.resolver is not None:

@@ -85,6 +85,6 @@ class EventLog:
             self.add(host_ns, Severity.WARNING, code, text)
 
     def drain(self) -> list[ClockEvent]:
-        """The events since the last call."""
+        """Return the events since the last call."""
         events, self._events = self._events, []
         return events

@@ -40,13 +40,15 @@ class CoarseClock:
         self._offsets = deque(((host, offset + seconds * SECOND_NS) for host, offset in self._offsets), maxlen=256)
 
     def settled(self) -> bool:
-        """Messages have come for long enough to be believed, and advance with the host's clock."""
+        """Return messages have come for long enough to be believed, and advance with the host's clock."""
         if not self._offsets or self._offsets[-1][0] - self._offsets[0][0] < SETTLED_SPAN_NS:
             return False
         return not self.runs_at_another_rate()
 
     def runs_at_another_rate(self) -> bool:
-        """The last 20 s' messages drift from the host by more than delays can, the outermost on either side aside."""
+        """Return the last 20 s' messages drift from the host by more than delays can, the outermost on either side
+        aside.
+        """
         if not self._offsets:
             return False
         newest_ns = self._offsets[-1][0]
@@ -54,7 +56,7 @@ class CoarseClock:
         return len(recent) >= RATE_MESSAGES and recent[-2] - recent[1] > RATE_SPREAD_NS
 
     def offset_ns(self) -> int | None:
-        """GPS − host: of those near the median the least delayed, less a typical delay."""
+        """Return GPS − host: of those near the median the least delayed, less a typical delay."""
         if not self._offsets or self.runs_at_another_rate():
             return None
         ordered = sorted(offset for _, offset in self._offsets)
@@ -89,7 +91,7 @@ class WallClock:
         return recent and self._sigma_s <= WALL_DECIDES_SIGMA_S and self.utc_offset_ns(host_ns) is None
 
     def utc_offset_ns(self, host_ns: int) -> int | None:
-        """Wall − host where it may decide between seconds: disciplined, steady, recent, sigma ≤ 0.1 s."""
+        """Return wall − host where it may decide between seconds: disciplined, steady, recent, sigma ≤ 0.1 s."""
         if self._offset_ns is None or not self._disciplined or self._sigma_s > WALL_DECIDES_SIGMA_S:
             return None
         if self._steady < STEADY_READINGS or self._host_ns - self._steady_since_ns < STEADY_SPAN_NS:

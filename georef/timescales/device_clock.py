@@ -86,13 +86,13 @@ class _Latch:
             del column[:-LIVE_KNOTS]
 
     def slope(self, at: int) -> float:
-        """GPS ns per device ns by the knots that end (or begin, at 0) at knot `at`."""
+        """Return GPS ns per device ns by the knots that end (or begin, at 0) at knot `at`."""
         low, high = (max(0, at - SLOPE_KNOTS), at) if at else (0, min(SLOPE_KNOTS, len(self.device) - 1))
         ticks = self.device[high] - self.device[low]
         return (self.seconds[high] - self.seconds[low]) * SECOND_NS / ticks if ticks else 1.0
 
     def noise_ns(self) -> float:
-        """Sigma of the latch by second differences of the last edges (1.48 MAD), beside the prior."""
+        """Return sigma of the latch by second differences of the last edges (1.48 MAD), beside the prior."""
         device = np.array(self.device[-256:], dtype=np.int64)
         seconds = np.array(self.seconds[-256:], dtype=np.int64)
         even = (np.diff(seconds)[:-1] == 1) & (np.diff(seconds)[1:] == 1)
@@ -124,7 +124,7 @@ class _Arrivals:
             del self.bins[key]
 
     def host_at(self, device_ns: Int64Array) -> tuple[Int64Array, float]:
-        """Host times (n,) of device times, and their sigma in ns."""
+        """Return host times (n,) of device times, and their sigma in ns."""
         rows = sorted(self.bins.values(), key=lambda row: row[1])
         late = np.array([row[0] for row in rows], dtype=np.int64)
         at = np.array([row[1] for row in rows], dtype=np.int64)
@@ -157,7 +157,8 @@ class _Segment:
 
 
 def _runs_free(rows: StructArray) -> NDArray[np.bool_]:
-    """(n,) where a head whose clock the PPS sets, and which counts no edges, has none: it drifts, and is set again.
+    """Return (n,) where a head whose clock the PPS sets, and which counts no edges, has none: it drifts, and is set
+    again.
 
     Its seconds before and after are no two points of one clock, as a counter's latches are.
     """
@@ -263,7 +264,9 @@ class DeviceClock:
             self._lock_state.append(int(locked[place]))
 
     def _segment_for(self, device_ns: int, count: int, host_ns: int, *, free: bool) -> _Segment:
-        """The segment that goes on; a new one where count or device time went back, that jumped, or lock changed."""
+        """Return the segment that goes on; a new one where count or device time went back, that jumped, or lock
+        changed.
+        """
         held = None
         if self._segments:
             last = self._segments[-1]
@@ -308,7 +311,7 @@ class DeviceClock:
         return broken
 
     def _follow_up(self, segment: _Segment, host_ns: int) -> _Segment:
-        """A new segment where the chain of latched edges broke."""
+        """Return a new segment where the chain of latched edges broke."""
         following = _Segment(host_ns, free=segment.free)
         following.last_pps_ns = segment.last_pps_ns
         self._segments.append(following)
@@ -327,7 +330,8 @@ class DeviceClock:
     def gps_from_device(
         self, device_time_ns: Int64Array, host_ns: Int64Array | None = None
     ) -> tuple[Int64Array, NDArray[np.float64]]:
-        """GPS ns (n,) and sigma ns (n,) of device times (n,). host_ns (n,), when they arrived, chooses among restarts.
+        """Return GPS ns (n,) and sigma ns (n,) of device times (n,). host_ns (n,), when they arrived, chooses among
+        restarts.
 
         Without host_ns the time since the last restart is meant. Where nothing is known the sigma is inf.
         """
@@ -370,7 +374,8 @@ class DeviceClock:
         return gps, np.hypot(sigma, scatter)
 
     def _by_latch(self, latch: _Latch, device: Int64Array) -> tuple[Int64Array, NDArray[np.float64]] | None:
-        """Piecewise linear between latched edges, by their last rate beyond; None where their second is not known.
+        """Return piecewise linear between latched edges, by their last rate beyond; None where their second is not
+        known.
 
         One edge alone is none: it may be a register that reads 0 before the first pulse, or a glitch at power-on.
         """
@@ -394,7 +399,7 @@ class DeviceClock:
         return gps[anchor] + np.rint(rate * since).astype(np.int64), np.sqrt(variance)
 
     def _label(self, latch: _Latch, around: int) -> int | None:
-        """GPS second of the first latched edge: what most of the host-labelled edges around a knot say."""
+        """Return GPS second of the first latched edge: what most of the host-labelled edges around a knot say."""
         low = max(0, min(around - LABEL_KNOTS // 2, len(latch.host) - LABEL_KNOTS))
         host = np.array(latch.host[low : low + LABEL_KNOTS], dtype=np.int64)
         gps, sigma = self._clock.gps_from_host(host)
@@ -449,7 +454,7 @@ class DeviceClock:
         gps[good], sigma[good] = placed[good], self.stamps.sigma_ns
 
     def status(self) -> DeviceClockStatus:
-        """Counts and drift."""
+        """Return counts and drift."""
         latch = self._segments[-1].latch if self._segments else _Latch()
         latched = len(latch.device) > 1
         drift = (1.0 / latch.slope(len(latch.device) - 1) - 1.0) * 1e6 if latched else None

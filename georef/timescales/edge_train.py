@@ -33,7 +33,8 @@ FIRST_NOISE_NS = 2_000.0  # prior of the stamps' noise, worth two edges beside t
 
 
 def find_chain(edges: Sequence[int], train: EdgeTrain | None = None, *, noisy: bool) -> list[tuple[int, int]] | None:
-    """Edges of one 1 Hz train that ends with the newest edge: (index from 0, host ns); None where there is none yet.
+    """Return edges of one 1 Hz train that ends with the newest edge: (index from 0, host ns); None where there is none
+    yet.
 
     Neighbours lie whole seconds (up to MAX_CHAIN_GAP_S) ± 200 ppm apart. noisy allows NOISY_TOLERANCE_NS more and asks
     for more edges. What a train there is has taken is not used: knots of two trains may not overlap.
@@ -55,7 +56,7 @@ def find_chain(edges: Sequence[int], train: EdgeTrain | None = None, *, noisy: b
 
 
 def _chain_noise_ns(chain: Sequence[tuple[int, int]], edges: Sequence[int]) -> float:
-    """First guess of the stamps' noise: residuals of a line through the chain, beside the prior.
+    """Return first guess of the stamps' noise: residuals of a line through the chain, beside the prior.
 
     The chain was chosen for being even; the other edges seen near the line (1.48 MAD) tell whether the stamps are.
     """
@@ -98,20 +99,20 @@ class EdgeTrain:
             self._take(index, host)
 
     def index_at(self, host_ns: int) -> float:
-        """Edge number (with fraction) at a host time."""
+        """Return edge number (with fraction) at a host time."""
         knot = self.bank.knot
         since = host_ns - self.anchor_ns - knot.index * SECOND_NS - knot.phase_ns
         return knot.index + since / (SECOND_NS + knot.drift_ns_s)
 
     def gps_ns_at(self, host_ns: int) -> int:
-        """GPS ns at a host time by the last knot's line; the train must have its label."""
+        """Return GPS ns at a host time by the last knot's line; the train must have its label."""
         knot = self.bank.knot
         since = host_ns - self.anchor_ns - knot.index * SECOND_NS - knot.phase_ns
         whole = ((self.labeller.label or 0) + knot.index) * SECOND_NS
         return whole + round(since * SECOND_NS / (SECOND_NS + knot.drift_ns_s))
 
     def sigma_at(self, host_ns: int) -> float:
-        """Sigma (ns) of the line at a host time."""
+        """Return sigma (ns) of the line at a host time."""
         return math.sqrt(self.bank.knot.variance_at(self.index_at(host_ns)))
 
     def offer(self, host_ns: int) -> str | None:
@@ -179,7 +180,7 @@ class EdgeTrain:
         return self._whole[-1]
 
     def knots_between(self, from_ns: int, to_ns: int) -> KnotTable:
-        """The knots that span host times from … to (one more on both sides)."""
+        """Return the knots that span host times from … to (one more on both sides)."""
         whole = np.array(self._whole, dtype=np.int64)
         low = max(0, int(np.searchsorted(whole, from_ns, side="right")) - 1)
         high = min(len(whole), int(np.searchsorted(whole, to_ns, side="right")) + 1)
@@ -197,7 +198,8 @@ KNOT_NUMBERS = 10  # fraction of a ns, drift, three (co)variances, wander, three
 
 
 def forget_later(edges: deque[int], train: EdgeTrain | None, host_ns: int) -> bool:
-    """Whether an edge before the latest of some goes on with a train all the same; then those after it are dropped.
+    """Return whether an edge before the latest of some goes on with a train all the same; then those after it are
+    dropped.
 
     They were none of the train's: an edge that is stamped in the future must stop no clock.
     """
@@ -220,13 +222,13 @@ class KnotTable:
         self.numbers = numbers
 
     def seconds_from(self, k: Int64Array, host_ns: Int64Array) -> NDArray[np.float64]:
-        """GPS seconds from knot k to the host times, by that knot's drift."""
+        """Return GPS seconds from knot k to the host times, by that knot's drift."""
         fraction, drift = self.numbers[k, 0], self.numbers[k, 1]
         since = (host_ns - self.host_ns[k]).astype(np.float64) - fraction
         return np.asarray(since / (SECOND_NS + drift), dtype=np.float64)
 
     def variance(self, k: Int64Array, seconds: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Variance (ns²) of the line of knot k, seconds away from it (sign as in `seconds_from`)."""
+        """Return variance (ns²) of the line of knot k, seconds away from it (sign as in `seconds_from`)."""
         xx, xy, yy, wander = self.numbers[k, 2], self.numbers[k, 3], self.numbers[k, 4], self.numbers[k, 5]
         away = np.abs(seconds)
         plain = xx + 2.0 * np.maximum(seconds * xy, 0.0) + away * away * (yy + wander * away / 3.0)

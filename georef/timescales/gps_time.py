@@ -55,59 +55,61 @@ MAX_AHEAD_NS = SECOND_NS // 2
 
 
 def table_leap_seconds(date: dt.date) -> tuple[int, bool]:
-    """GPS − UTC on a UTC day by the built-in table, and whether the table reaches that far (else: a guess)."""
+    """Return GPS − UTC on a UTC day by the built-in table, and whether the table reaches that far (else: a guess)."""
     row = max(0, bisect_right(_LEAP_DAYS, date) - 1)
     return LEAP_SECOND_TABLE[row][1], date <= LEAP_TABLE_VALID_UNTIL
 
 
 def gps_ns_from_utc(date: dt.date, time_of_day_ns: int, leap_seconds: int) -> int:
-    """GPS ns of a UTC day and time. In a leap second time_of_day_ns ≥ 86 400 s and leap_seconds is the old count."""
+    """Return GPS ns of a UTC day and time. In a leap second time_of_day_ns ≥ 86 400 s and leap_seconds is the old
+    count.
+    """
     return (date.toordinal() - GPS_EPOCH.toordinal()) * DAY_NS + time_of_day_ns + leap_seconds * SECOND_NS
 
 
 def gps_ns_from_unix(unix_ns: int, leap_seconds: int) -> int:
-    """GPS ns of a POSIX time stamp (CLOCK_REALTIME)."""
+    """Return GPS ns of a POSIX time stamp (CLOCK_REALTIME)."""
     return unix_ns - GPS_EPOCH_UNIX_S * SECOND_NS + leap_seconds * SECOND_NS
 
 
 def unix_ns_from_gps(gps_ns: int, leap_seconds: int) -> int:
-    """POSIX ns of a GPS time."""
+    """Return POSIX ns of a GPS time."""
     return gps_ns + GPS_EPOCH_UNIX_S * SECOND_NS - leap_seconds * SECOND_NS
 
 
 def utc_from_gps(gps_ns: int, leap_seconds: int) -> tuple[dt.date, int]:
-    """UTC date and nanoseconds of day of a GPS time; within a leap second it reads as the next day's first."""
+    """Return UTC date and nanoseconds of day of a GPS time; within a leap second it reads as the next day's first."""
     days, time_of_day_ns = divmod(gps_ns - leap_seconds * SECOND_NS, DAY_NS)
     return dt.date.fromordinal(GPS_EPOCH.toordinal() + days), time_of_day_ns
 
 
 def gps_ns_from_week(week: int, time_of_week_ns: int) -> int:
-    """GPS ns of a full week number and time of week."""
+    """Return GPS ns of a full week number and time of week."""
     return week * WEEK_NS + time_of_week_ns
 
 
 def week_from_gps(gps_ns: int) -> tuple[int, int]:
-    """Full week number and time of week in ns."""
+    """Return full week number and time of week in ns."""
     return divmod(gps_ns, WEEK_NS)
 
 
 def full_week(week: int, reference_week: int, modulus: int = 1024) -> int:
-    """The full week nearest to a reference for a week counted modulo 1024 (FORMULAS 12) or 4096."""
+    """Return the full week nearest to a reference for a week counted modulo 1024 (FORMULAS 12) or 4096."""
     return week + modulus * round((reference_week - week) / modulus)
 
 
 def week_difference_ns(difference_ns: int) -> int:
-    """A difference of times of week, folded to −302 400 … 302 400 s."""
+    """Return a difference of times of week, folded to −302 400 … 302 400 s."""
     return (difference_ns + WEEK_NS // 2) % WEEK_NS - WEEK_NS // 2
 
 
 def las_adjusted_s(gps_ns: int) -> float:
-    """LAS adjusted standard GPS time: GPS seconds − 1e9."""
+    """Return LAS adjusted standard GPS time: GPS seconds − 1e9."""
     return (gps_ns - LAS_ADJUSTED_ZERO_S * SECOND_NS) / SECOND_NS
 
 
 def whole_gps_ns(tag: TimeTag, leap_seconds: int | None) -> int | None:
-    """GPS ns of a tag that says all (week or date); None where it does not, or where UTC has no leap count.
+    """Return GPS ns of a tag that says all (week or date); None where it does not, or where UTC has no leap count.
 
     The tag's own leap count goes before the one given.
     """
@@ -120,7 +122,8 @@ def whole_gps_ns(tag: TimeTag, leap_seconds: int | None) -> int | None:
 
 
 def nearest_gps_ns(tag: TimeTag, near_gps_ns: int, leap_seconds: int | None) -> int | None:
-    """GPS ns nearest to a prediction that has the tag's time of week (or day); its week and date are not looked at.
+    """Return GPS ns nearest to a prediction that has the tag's time of week (or day); its week and date are not looked
+    at.
 
     That undoes 10-bit weeks and a week number that turned over before or after its time of week.
     """
@@ -137,7 +140,7 @@ def nearest_gps_ns(tag: TimeTag, near_gps_ns: int, leap_seconds: int | None) -> 
 def complete_time(
     tag: TimeTag, near_gps_ns: int | None, leap_seconds: int | None, *, max_age_ns: int = MAX_AGE_NS
 ) -> int | None:
-    """GPS ns of a device's time tag, or None where it cannot be placed.
+    """Return GPS ns of a device's time tag, or None where it cannot be placed.
 
     With a prediction (the GPS time of the message's arrival) the tag must lie between max_age_ns before it and 0.5 s
     after it: a week number that turned over at another moment than its time of week is repaired, anything else refused.

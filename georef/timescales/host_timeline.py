@@ -53,7 +53,7 @@ class HostTimeline:
         self._slope = (offset - recent[0][1]) / (host - recent[0][0]) if len(recent) > 1 else 0.0
 
     def _plausible(self, host: int, offset: int) -> bool:
-        """Whether a reading continues the last one; counted where it does not."""
+        """Return whether a reading continues the last one; counted where it does not."""
         elapsed = host - self._host[-1]
         if elapsed <= 0:
             self.refused += 1
@@ -68,7 +68,7 @@ class HostTimeline:
         return True
 
     def raw_at(self, host_ns: int) -> int:
-        """RAW of one host time; the live path (usually at or after the last reading)."""
+        """Return RAW of one host time; the live path (usually at or after the last reading)."""
         if not self._host:
             return host_ns - self.host_minus_monotonic_ns
         last = self._host[-1]
@@ -77,14 +77,14 @@ class HostTimeline:
         return int(self.raw_from_host(np.array([host_ns], dtype=np.int64))[0])
 
     def raw_from_host(self, host_ns: Int64Array) -> Int64Array:
-        """RAW (n,) of host times (n,)."""
+        """Return RAW (n,) of host times (n,)."""
         host = np.asarray(host_ns, dtype=np.int64)
         if not self._host:
             return host - self.host_minus_monotonic_ns
         return host + self._interpolate(host)
 
     def _interpolate(self, times: Int64Array) -> Int64Array:
-        """RAW − host at host times; last slope beyond the last reading."""
+        """Return RAW − host at host times; last slope beyond the last reading."""
         if self._arrays is None:
             first = self._offset[0]
             self._arrays = (

@@ -16,7 +16,7 @@ WALL_FRACTION_S = 0.3  # a wall clock this far off the edges' whole second decid
 
 
 def outranks(verdict: Verdict, basis: Verdict) -> bool:
-    """Whether a verdict may move a label that rests on another: only what is bound to its edge may."""
+    """Return whether a verdict may move a label that rests on another: only what is bound to its edge may."""
     return verdict.basis == "bound" and basis.basis != "bound"
 
 
@@ -29,7 +29,7 @@ class LabelKeeper:
         self._events = events
 
     def verdict(self, train: EdgeTrain, host_ns: int) -> Verdict:
-        """What is known of a train's seconds at a host time."""
+        """Return what is known of a train's seconds at a host time."""
         wall = self._wall.utc_offset_ns(host_ns)
         index = math.floor(train.index_at(host_ns))
         if wall is None:

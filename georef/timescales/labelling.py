@@ -92,7 +92,7 @@ class Verdict:
         return self.basis if self.key is None else f"{self.key.source} {self.key.message}".strip()
 
     def with_leap_said(self, seconds: int) -> Verdict:
-        """The same after the leap count turned out to be so many seconds more."""
+        """Return the same after the leap count turned out to be so many seconds more."""
         offset = None if self.offset is None else self.offset + seconds
         return replace(self, offset=offset, leap=LeapTrust.SAID)
 
@@ -146,7 +146,7 @@ class Voter:
 
 
 def _surely_aged(ages: list[float]) -> bool:
-    """Whether sorted ages leave no doubt which edge was before, with few votes."""
+    """Return whether sorted ages leave no doubt which edge was before, with few votes."""
     if ages[0] >= YOUNG_AGE_S:
         return ages[-1] <= SURE_AGE_S
     return ages[0] >= LEAST_AGE_S and ages[-1] - ages[0] <= YOUNG_SPREAD_S
@@ -205,7 +205,7 @@ class Labeller:
         )
 
     def decide(self, index: int, wall_offset: int | None, wall_leap: LeapTrust) -> Verdict:
-        """The verdict as of edge `index`; wall_offset: what a disciplined wall clock says."""
+        """Return the verdict as of edge `index`; wall_offset: what a disciplined wall clock says."""
         sure = [v for v in self.voters.values() if v.offset is not None and index - v.last_index <= VOTER_FORGOTTEN_S]
         bound = [v for v in sure if v.key.bound]
         if bound and all(v.offset == bound[0].offset for v in bound):
@@ -232,12 +232,14 @@ class Labeller:
         return Verdict(sure[0].offset if sure else None, doubt, late=late)
 
     def _wall_may_say(self) -> set[int]:
-        """Offsets a wall clock may decide for: what some message said, or what it meant if it came a second late."""
+        """Return offsets a wall clock may decide for: what some message said, or what it meant if it came a second
+        late.
+        """
         said = {vote.offset for voter in self.voters.values() for vote in voter.votes}
         return said | {offset + 1 for offset in said}
 
     def _somebody_else(self, sure: Voter, index: int) -> bool:
-        """Whether a voter not yet sure last said another second: a first label waits for it."""
+        """Return whether a voter not yet sure last said another second: a first label waits for it."""
         return any(
             v.offset is None and v.votes and index - v.last_index <= MIN_VOTES and v.votes[-1].offset != sure.offset
             for v in self.voters.values()
@@ -249,7 +251,7 @@ class Labeller:
         return Verdict(voter.offset, "", basis, voter.key, leap)
 
     def _doubt(self, sure: list[Voter], bound: list[Voter], index: int) -> str:
-        """Why the voters that are sure of their offset cannot be believed together; empty: they can."""
+        """Return why the voters that are sure of their offset cannot be believed together; empty: they can."""
         if not sure:
             lost = [v for v in self.voters.values() if v.undecided > VOTES and index - v.last_index <= VOTES]
             return f"{lost[0].key.source} {lost[0].key.message} keeps to no second" if lost else ""

@@ -75,7 +75,7 @@ class LeapBook:
         self._inserted: dict[str, tuple[dt.date, int]] = {}  # source: first day of the new count, the count
 
     def on(self, source: str, date: dt.date) -> LeapSeconds:
-        """The count for a UTC message of a source on a date; source "": as far as anybody knows."""
+        """Return the count for a UTC message of a source on a date; source "": as far as anybody knows."""
         inserted = self._inserted.get(source)
         if inserted is None and not source:
             inserted = next(iter(self._inserted.values()), None)

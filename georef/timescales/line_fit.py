@@ -63,29 +63,31 @@ class Knot:
     shrink: float = 1.0
 
     def phase_at(self, index: float) -> float:
-        """Phase (ns) extrapolated to an edge number."""
+        """Return phase (ns) extrapolated to an edge number."""
         return self.phase_ns + self.drift_ns_s * (index - self.index)
 
     def variance_at(self, index: float) -> float:
-        """Variance (ns²) of that phase: as the filters predict it, and what past predictions showed beyond."""
+        """Return variance (ns²) of that phase: as the filters predict it, and what past predictions showed beyond."""
         seconds = abs(index - self.index)
         plain = self.plain_variance(seconds) * shrink_factor(self.shrink, seconds)
         return plain + excess_variance(self.excess, seconds)
 
     def plain_variance(self, seconds: float) -> float:
-        """Variance (ns²) seconds after the knot, as the filters predict it."""
+        """Return variance (ns²) seconds after the knot, as the filters predict it."""
         return self.var_phase + seconds * (
             2.0 * self.var_cross + seconds * (self.var_drift + self.wander * seconds / 3.0)
         )
 
 
 def shrink_factor(shrink: float, seconds: float) -> float:
-    """Factor of the predicted variance after some seconds: 1 at the knot, `shrink` from SHRINK_HORIZON on."""
+    """Return factor of the predicted variance after some seconds: 1 at the knot, `shrink` from SHRINK_HORIZON on."""
     return 1.0 + (shrink - 1.0) * min(seconds / SHRINK_HORIZON, 1.0)
 
 
 def excess_variance(excess: tuple[float, ...], seconds: float) -> float:
-    """Excess variance after some seconds: linear in their cube between HORIZONS (and 0), growing with it beyond."""
+    """Return excess variance after some seconds: linear in their cube between HORIZONS (and 0), growing with it
+    beyond.
+    """
     near_s, near = 0.0, 0.0
     for far_s, far in zip(HORIZONS, excess, strict=True):
         if seconds <= far_s:
@@ -95,7 +97,7 @@ def excess_variance(excess: tuple[float, ...], seconds: float) -> float:
 
 
 def excess_variances(excess: NDArray[np.float64], seconds: NDArray[np.float64]) -> NDArray[np.float64]:
-    """`excess_variance` of rows (n, 3) at times (n,)."""
+    """Return `excess_variance` of rows (n, 3) at times (n,)."""
     cube = seconds**3
     near_s, near = 0.0, np.zeros_like(seconds)
     result = excess[:, -1] * cube / HORIZONS[-1] ** 3
@@ -134,7 +136,7 @@ class _Excess:
         self._ratio += ((squared - noise) * variance / (total * total) - self._ratio) * share
 
     def variance(self, noise: float) -> float:
-        """The excess variance, ns²."""
+        """Return the excess variance, ns²."""
         if not self._count:
             return 0.0
         chance = noise * math.sqrt(2.0 / self._count) + self._variance * math.sqrt(2.0 * self.horizon / self._count)
@@ -286,7 +288,7 @@ class LineBank:
         self._weight = [keep * weight + switch * prior for weight, prior in zip(raised, WANDER_PRIOR, strict=True)]
 
     def _moments(self, index: int) -> Knot:
-        """The bank as one line: weighted mean, and within- plus between-line covariance."""
+        """Return the bank as one line: weighted mean, and within- plus between-line covariance."""
         mean_x = mean_y = 0.0
         for weight, x, y in zip(self._weight, self._phase, self._drift, strict=True):
             mean_x += weight * x

@@ -122,7 +122,7 @@ class PpsClock:
         self.edges_refused[reason] = self.edges_refused.get(reason, 0) + 1
 
     def _without_quantisation(self, host_ns: int) -> int:
-        """The edge less the receiver's own error, where a message before it told that."""
+        """Return the edge less the receiver's own error, where a message before it told that."""
         told = self._quantisation
         if told is None or not 0 < host_ns - told[0] <= MAX_QUANTISATION_AGE_NS:
             return host_ns
@@ -246,7 +246,9 @@ class PpsClock:
         self.messages_refused[reason] = self.messages_refused.get(reason, 0) + 1
 
     def _place(self, source: str, tag: TimeTag, host_ns: int) -> tuple[int, LeapTrust] | None:
-        """GPS ns of a tag and the trust in its leap count; by what is known so far where it lacks week or date."""
+        """Return GPS ns of a tag and the trust in its leap count; by what is known so far where it lacks week or
+        date.
+        """
         if tag.scale is TimeScale.GPS and tag.week is not None:
             return whole_gps_ns(tag, None) or 0, LeapTrust.SAID
         near = self._best_guess(host_ns)
@@ -268,7 +270,7 @@ class PpsClock:
         return None if gps is None else (gps, leap.trust)
 
     def _best_guess(self, host_ns: int) -> int | None:
-        """GPS ns at a host time by the best there is, without regard to its quality."""
+        """Return GPS ns at a host time by the best there is, without regard to its quality."""
         train = self._train
         if train is not None and train.labeller.label is not None:
             return round(_gps_float(train, host_ns) * 1e6) * 1000
@@ -406,7 +408,8 @@ class PpsClock:
         return TimeState.LOST, offset, sigma + 1e-4 * (host_ns - last)
 
     def gps_from_host(self, host_ns: Int64Array) -> tuple[Int64Array, NDArray[np.float64]]:
-        """GPS ns (n,) and sigma ns (n,) of host times (n,): by the line forward, between knots where later ones exist.
+        """Return GPS ns (n,) and sigma ns (n,) of host times (n,): by the line forward, between knots where later ones
+        exist.
 
         Without time the sigma is inf and the GPS time 0.
         """
@@ -421,14 +424,14 @@ class PpsClock:
         return host + offset, np.full(host.shape, sigma)
 
     def leap_seconds_at(self, gps_ns: int) -> int:
-        """GPS − UTC as far as known, for labelling UTC stamps of devices that say no leap count themselves."""
+        """Return GPS − UTC as far as known, for labelling UTC stamps of devices that say no leap count themselves."""
         return self.leaps.on("", utc_from_gps(gps_ns, 18)[0]).seconds
 
     def _trains(self) -> list[EdgeTrain]:
         return [*self._former, self._train] if self._train is not None else []
 
     def _gps_at(self, train: EdgeTrain, host_ns: int) -> tuple[int, float]:
-        """GPS ns and sigma at one host time; quick from the last knot on, where live use asks."""
+        """Return GPS ns and sigma at one host time; quick from the last knot on, where live use asks."""
         if host_ns >= train.last_knot_ns and not train.doubtful:
             return train.gps_ns_at(host_ns), train.sigma_at(host_ns)
         gps, sigma = self._by_trains(np.array([host_ns], dtype=np.int64))
@@ -438,17 +441,17 @@ class PpsClock:
         return gps_of_trains([train for train in self._trains() if train.labeller.label is not None], host)
 
     def drain_events(self) -> list[ClockEvent]:
-        """What happened since the last call."""
+        """Return what happened since the last call."""
         return self._events.drain()
 
 
 def _gps_float(train: EdgeTrain, host_ns: int) -> float:
-    """GPS seconds of a labelled train at a host time, to 0.3 µs."""
+    """Return GPS seconds of a labelled train at a host time, to 0.3 µs."""
     return (train.labeller.label or 0) + train.index_at(host_ns)
 
 
 def gps_of_trains(trains: Sequence[EdgeTrain], host_ns: Int64Array) -> tuple[Int64Array, NDArray[np.float64]]:
-    """GPS ns (n,) and sigma ns (n,) at host times (n,) from labelled trains in order of time (at least one)."""
+    """Return GPS ns (n,) and sigma ns (n,) at host times (n,) from labelled trains in order of time (at least one)."""
     low, high = int(host_ns.min()), int(host_ns.max())
     chosen = _overlapping(trains, low, high)
     tables = [train.knots_between(low, high) for train in chosen]
@@ -468,7 +471,7 @@ def gps_of_trains(trains: Sequence[EdgeTrain], host_ns: Int64Array) -> tuple[Int
 
 
 def _overlapping(trains: Sequence[EdgeTrain], low: int, high: int) -> list[EdgeTrain]:
-    """The trains with knots in low … high, and the neighbours on both sides."""
+    """Return the trains with knots in low … high, and the neighbours on both sides."""
     after = [train for train in trains if train.first_knot_ns > high][:1]
     before = [train for train in trains if train.last_knot_ns < low][-1:]
     within = [train for train in trains if train.last_knot_ns >= low and train.first_knot_ns <= high]

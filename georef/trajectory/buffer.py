@@ -84,7 +84,7 @@ class TrajectoryBuffer:
             self._write(_trajectory_of(rows[new], *held))
 
     def snapshot(self) -> Trajectory:
-        """All epochs not forgotten. It shares memory with the buffer and does not change when that grows."""
+        """Return all epochs not forgotten. It shares memory with the buffer and does not change when that grows."""
         columns: dict[str, Any] = {name: values[self._begin : self._end] for name, values in self._columns.items()}
         whole = Trajectory(**columns, max_gap_ns=self._max_gap_ns, name=self._name)
         if len(whole):  # what the trajectory would compute of all its epochs at each tick anew
@@ -105,7 +105,7 @@ class TrajectoryBuffer:
         return usable
 
     def _taken(self, column: str, said: FloatArray, first: int, again: int) -> bool:
-        """Whether the row `again` gave its sigma to the epoch it repeats, which had none of its own."""
+        """Return whether the row `again` gave its sigma to the epoch it repeats, which had none of its own."""
         if not np.isfinite(said[again]).all():
             return False
         if first >= 0:
@@ -121,7 +121,7 @@ class TrajectoryBuffer:
         return wanted
 
     def _held(self, column: str, time_ns: Int64Array, said: FloatArray) -> FloatArray:
-        """(n, 3) sigmas, those of the last epoch that said some where an epoch says none."""
+        """Return (n, 3) sigmas, those of the last epoch that said some where an epoch says none."""
         held_ns, held = self._sigma[column]
         times, values = np.r_[held_ns, time_ns], np.vstack([held, said])
         speaks = np.isfinite(values).all(axis=1)

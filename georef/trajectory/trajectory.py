@@ -49,14 +49,16 @@ class TrajectoryGapError(TrajectoryError):
 
 
 def gps_text(gps_ns: int) -> str:
-    """GPS time for people: ``GPS week 2445, 561618.000 s``."""
+    """Return GPS time for people: ``GPS week 2445, 561618.000 s``."""
     week, of_week_ns = week_from_gps(int(gps_ns))
     return f"GPS week {week}, {of_week_ns / SECOND_NS:.3f} s"
 
 
 @jit_inline
 def locate_epoch(time_ns: Int64Array, t: int, guess: int) -> int:
-    """The epoch at or before t, 0 … n − 2; −1 where t lies outside. ``guess``, any number, only saves the search."""
+    """Return the epoch at or before t, 0 … n − 2; −1 where t lies outside. ``guess``, any number, only saves the
+    search.
+    """
     last = len(time_ns) - 1
     if last < 1 or t < time_ns[0] or t > time_ns[last]:
         return -1
@@ -79,7 +81,9 @@ def locate_epoch(time_ns: Int64Array, t: int, guess: int) -> int:
 def slerp(
     w: float, x: float, y: float, z: float, rx: float, ry: float, rz: float, share: float
 ) -> tuple[float, float, float, float]:
-    """(w, x, y, z) ⊗ exp(share · (rx, ry, rz) / 2): a quaternion turned on by a share of its interval's rotvec_b."""
+    """Return (w, x, y, z) ⊗ exp(share · (rx, ry, rz) / 2): a quaternion turned on by a share of its interval's
+    rotvec_b.
+    """
     half = 0.5 * share
     angle2 = half * half * (rx * rx + ry * ry + rz * rz)
     if angle2 < SMALL_HALF_ANGLE_2:
@@ -192,7 +196,7 @@ class Trajectory:
         max_gap_ns: int = DEFAULT_MAX_GAP_NS,
         name: str = "",
     ) -> Trajectory:
-        """From columns (n,), velocity and sigmas (n, 3) as files and receivers give them; no sigmas: nan."""
+        """Make it from columns (n,), velocity and sigmas (n, 3) as files and receivers give them; no sigmas: nan."""
         lat, lon = np.asarray(lat_rad, dtype=np.float64), np.asarray(lon_rad, dtype=np.float64)
         q_e_from_l = product(about(2, lon), about(1, -lat - np.pi / 2))
         q_l_from_b = product(product(about(2, heading_rad), about(1, pitch_rad)), about(0, roll_rad))
@@ -230,7 +234,7 @@ class Trajectory:
         return bool(np.isfinite(self.q_e_from_b).all())
 
     def poses(self, time_ns: ArrayLike) -> Poses:
-        """Poses at GPS times (n,), best in order; TrajectoryGapError where one is outside or in a gap."""
+        """Return poses at GPS times (n,), best in order; TrajectoryGapError where one is outside or in a gap."""
         times = np.ascontiguousarray(time_ns, dtype=np.int64)
         epoch, fate = self._located(times)
         if fate.any():
@@ -255,16 +259,17 @@ class Trajectory:
         )
 
     def fates(self, time_ns: ArrayLike) -> ByteArray:
-        """(n,) GEOREFERENCED, OUTSIDE_TRAJECTORY or TRAJECTORY_GAP of GPS times, as `Fate`."""
+        """Return (n,) GEOREFERENCED, OUTSIDE_TRAJECTORY or TRAJECTORY_GAP of GPS times, as `Fate`."""
         return self._located(np.ascontiguousarray(time_ns, dtype=np.int64))[1]
 
     def gaps(self) -> Int64Array:
-        """(k, 2) GPS times of the epochs before and after each gap."""
+        """Return (k, 2) GPS times of the epochs before and after each gap."""
         at = np.flatnonzero(np.diff(self.time_ns) > self.max_gap_ns)
         return np.stack([self.time_ns[at], self.time_ns[at + 1]], axis=1)
 
     def with_velocities(self) -> Trajectory:
-        """Velocities where they are unsaid: those of the way from the epoch before to the next, never over a gap.
+        """Return velocities where they are unsaid: those of the way from the epoch before to the next, never over a
+        gap.
 
         At an epoch beside a gap, or at the ends, that of the one interval there is; an epoch alone stays without.
         """
@@ -280,28 +285,30 @@ class Trajectory:
         return self._with(velocity_e=np.where(unsaid[:, np.newaxis], moved_e, self.velocity_e))
 
     def between(self, first_ns: int, last_ns: int) -> Trajectory:
-        """The epochs that poses from first_ns to last_ns need: views, one epoch beyond either end."""
+        """Return the epochs that poses from first_ns to last_ns need: views, one epoch beyond either end."""
         begin = max(0, int(np.searchsorted(self.time_ns, first_ns, side="right")) - 1)
         end = int(np.searchsorted(self.time_ns, last_ns, side="right")) + 1
         return self._with(**{column: getattr(self, column)[begin:end] for column in _COLUMNS})
 
     def geodetic(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """(n,) latitude, longitude, rad, ellipsoidal height, m, of the epochs."""
+        """Return (n,) latitude, longitude, rad, ellipsoidal height, m, of the epochs."""
         return geodetic_from_e(self.position_e)
 
     def attitude(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """(n,) roll, pitch and heading (0 … 2π) of the epochs, rad (FORMULAS 1.4)."""
+        """Return (n,) roll, pitch and heading (0 … 2π) of the epochs, rad (FORMULAS 1.4)."""
         w, x, y, z = self._q_l_from_b().T
         roll = np.arctan2(2 * (y * z + w * x), 1 - 2 * (x * x + y * y))
         nose_n, nose_e, nose_d = 1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)
         return roll, np.arctan2(-nose_d, np.hypot(nose_n, nose_e)), np.arctan2(nose_e, nose_n) % (2 * np.pi)
 
     def velocity_l(self) -> FloatArray:
-        """(n, 3) north, east, down of the epochs, m/s."""
+        """Return (n, 3) north, east, down of the epochs, m/s."""
         return rotated(conjugate(self._q_e_from_l()), self.velocity_e)
 
     def turn_rates_b(self, relative_to: Literal["e", "l", "i"] = "e") -> FloatArray:
-        """(n − 1, 3) mean turn rate of the body over each interval, in b, rad/s: relative to e, l or inertial space."""
+        """Return (n − 1, 3) mean turn rate of the body over each interval, in b, rad/s: relative to e, l or inertial
+        space.
+        """
         turned = self.rotvec_b
         if relative_to == "l":
             q_l_from_b = self._q_l_from_b()
@@ -313,7 +320,7 @@ class Trajectory:
         return rate
 
     def at_body(self, offset_b: ArrayLike) -> Trajectory:
-        """Brought to the body's origin from a point (antenna, scanner) at offset_b (3,) from it, m in b.
+        """Return brought to the body's origin from a point (antenna, scanner) at offset_b (3,) from it, m in b.
 
         The velocity loses what the turn gives that point, by the turn over the intervals beside an epoch, gaps aside;
         an epoch alone keeps its own. The sigmas stay.
@@ -382,7 +389,7 @@ _COLUMNS: dict[str, tuple[int, ...]] = {
 
 
 def _sign_continuous(q: FloatArray) -> FloatArray:
-    """q or −q, whichever is nearer to the one before: they mean the same attitude."""
+    """Return q or −q, whichever is nearer to the one before: they mean the same attitude."""
     turned = np.where((q[1:] * q[:-1]).sum(axis=1) < 0, -1.0, 1.0)
     q[1:] *= np.cumprod(turned)[:, np.newaxis]
     return q

@@ -93,7 +93,7 @@ class Turning:
 
 
 def correlate_turn_rates(trajectory: Trajectory, imu_time_ns: Int64Array, imu_rate_b: FloatArray) -> TimeShift:
-    """The shift at which a trajectory and an IMU turn alike.
+    """Return the shift at which a trajectory and an IMU turn alike.
 
     Args:
         trajectory: with attitude.
@@ -126,7 +126,7 @@ def correlate_turn_rates(trajectory: Trajectory, imu_time_ns: Int64Array, imu_ra
 
 
 def _told_near(trajectory: Trajectory, felt: Turning, coarse: int) -> Turning | None:
-    """What a trajectory tells, some steps away, of the time that was felt and what is looked at around it."""
+    """Return what a trajectory tells, some steps away, of the time that was felt and what is looked at around it."""
     first = felt.first - REACH_STEPS - coarse
     last = felt.first + len(felt.rate_b) + REACH_STEPS - coarse
     part = trajectory.between(first * STEP_NS, last * STEP_NS)
@@ -160,7 +160,7 @@ def turning(time_ns: Int64Array, rate_b: FloatArray, max_gap_ns: int, steps: tup
 
 
 def _best_shift(told: Turning, felt: Turning, coarse: int) -> tuple[float, float, float, float] | None:
-    """Seconds, correlation, sigma and the correlation at the coarse shift itself; None: too little in common."""
+    """Return seconds, correlation, sigma and the correlation at the coarse shift itself; None: too little in common."""
     begin = felt.first - REACH_STEPS - told.first - coarse  # of told's rows, which may lie outside
     wanted = np.arange(begin, begin + len(felt.rate_b) + 2 * REACH_STEPS)
     there = (wanted >= 0) & (wanted < len(told.rate_b))
@@ -188,7 +188,7 @@ def _best_shift(told: Turning, felt: Turning, coarse: int) -> tuple[float, float
 
 
 def _at_lags(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Σ a[k + j] b[j] for every k at which b lies within a."""
+    """Return Σ a[k + j] b[j] for every k at which b lies within a."""
     size = 1 << (len(a) - 1).bit_length()  # what wraps round does so beyond these k
     spectrum = np.fft.rfft(a, size) * np.conj(np.fft.rfft(b, size))
     sums: FloatArray = np.fft.irfft(spectrum, size)[: len(a) - len(b) + 1]
@@ -196,7 +196,7 @@ def _at_lags(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def _peak(values: FloatArray, at: int) -> float:
-    """Where between the neighbours of `at` the parabola through the three has its top, −0.5 … 0.5."""
+    """Return where between the neighbours of `at` the parabola through the three has its top, −0.5 … 0.5."""
     if not 0 < at < len(values) - 1:
         return 0.0
     before, top, after = values[at - 1 : at + 2]

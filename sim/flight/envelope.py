@@ -48,7 +48,7 @@ class Envelope:
 
     @classmethod
     def of(cls, tables: Tables) -> Envelope:
-        """For this flight.
+        """Make it for this flight.
 
         Raises:
             PlanError: leads are too short to roll into a turn, or the wind is too strong.
@@ -76,11 +76,11 @@ class Envelope:
         return self.climb_smoothing_s - self.smoothing_s
 
     def climb_mps(self, speed_mps: float) -> float:
-        """The fastest climb at this speed."""
+        """Return the fastest climb at this speed."""
         return min(self.flight.climb_max_mps, STEEPEST * speed_mps)
 
     def turning(self, speed_mps: float, climb_mps: float) -> Turning:
-        """How tightly it turns at this speed while it climbs so fast.
+        """Return how tightly it turns at this speed while it climbs so fast.
 
         The wings' lift across the path, g and what leads into the climb, bears the turn: v² / R = tan(bank) · lift.
 

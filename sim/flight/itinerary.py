@@ -24,7 +24,7 @@ RUNWAY_OFF_M = 10.0  # of the terrain
 
 
 def route_of(tables: Tables, envelope: Envelope, ground_m: Ground) -> Route:
-    """Where the aircraft is when, before smoothing.
+    """Return where the aircraft is when, before smoothing.
 
     Raises:
         PlanError: it cannot get from one line to the next, or from the runway to the first.
@@ -41,7 +41,7 @@ def route_of(tables: Tables, envelope: Envelope, ground_m: Ground) -> Route:
 
 
 def lines_legs(tables: Tables, index: int, envelope: Envelope, before_s: float) -> list[Leg]:
-    """Lead, line and lead."""
+    """Return lead, line and lead."""
     line = tables.line[index]
     speed, lead_s = speed_mps(tables.flight, line), tables.flight.lead_s
     start = _start_of(line)
@@ -105,7 +105,7 @@ def _refuse_climb(key: str, rise_m: float, climb_mps: float) -> None:
 
 
 def take_off(tables: Tables, start: GroundStart, envelope: Envelope, ground_m: Ground) -> list[Leg]:
-    """Standing, taxiing, the take-off run, the climb straight on and level flight at the first line's speed.
+    """Return standing, taxiing, the take-off run, the climb straight on and level flight at the first line's speed.
 
     Raises:
         PlanError: the runway is not on the site's ground.

@@ -49,7 +49,9 @@ class Arc:
     curvature_per_m: float
 
     def positions(self, along_m: FloatArray) -> FloatArray:
-        """(n, 2) east, north at distances (n,) from the start, beyond either end too: chord and half the turn."""
+        """Return (n, 2) east, north at distances (n,) from the start, beyond either end too: chord and half the
+        turn.
+        """
         half_turn = 0.5 * self.curvature_per_m * along_m
         chord_m = along_m * np.sinc(half_turn / math.pi)
         course = self.start.course_rad + half_turn
@@ -91,13 +93,13 @@ class Turning:
 
 
 def shortest_way(start: Pose, end: Pose, turning: Turning) -> Way:
-    """The shortest way from pose to pose; of no arc where both are the same."""
+    """Return the shortest way from pose to pose; of no arc where both are the same."""
     words = _words(start, end, turning)
     return _way(start, min(words, key=lambda word: word.radius_m * sum(word.parts)))
 
 
 def way_of_length(start: Pose, end: Pose, turning: Turning, least_m: float) -> Way:
-    """The shortest way, made at least ``least_m`` long: by whole circles first, the rest by turning later."""
+    """Return the shortest way, made at least ``least_m`` long: by whole circles first, the rest by turning later."""
     shortest = shortest_way(start, end, turning)
     missing_m = least_m - length_m(shortest)
     if missing_m <= 0.0:
@@ -115,7 +117,7 @@ def way_of_length(start: Pose, end: Pose, turning: Turning, least_m: float) -> W
 
 
 def _circles(start: Pose, way: Way, turning: Turning, count: int) -> Way:
-    """Whole circles, to the side to which the way turns next."""
+    """Return whole circles, to the side to which the way turns next."""
     if count == 0:
         return ()
     curvature = next((arc.curvature_per_m for arc in way if arc.curvature_per_m != 0.0), 1.0)
@@ -131,14 +133,14 @@ class _Word:
     radius_m: float
 
     def fits(self, turning: Turning) -> bool:
-        """Whether the radius is as wide as the word needs."""
+        """Return whether the radius is as wide as the word needs."""
         near = self.parts[1] * self.radius_m < turning.reversal_gap_m
         reverses = self.turns[1] != 0 or (self.turns[0] != self.turns[2] and near)
         return self.radius_m >= (turning.reversal_radius_m if reverses else turning.radius_m)
 
 
 def _words(start: Pose, end: Pose, turning: Turning) -> Iterator[_Word]:
-    """All there are, each with the radii it may be flown with."""
+    """Yield all there are, each with the radii it may be flown with."""
     east_m, north_m = end.east_m - start.east_m, end.north_m - start.north_m
     bearing, distance_m = math.atan2(east_m, north_m), math.hypot(east_m, north_m)
     for radius_m in (turning.radius_m, turning.reversal_radius_m):
@@ -153,7 +155,7 @@ def _words(start: Pose, end: Pose, turning: Turning) -> Iterator[_Word]:
 def _right_words(
     alpha: float, beta: float, distance: float
 ) -> Iterator[tuple[tuple[int, int, int], tuple[float, float, float]]]:
-    """LSL, LRL and LSR of Shkel and Lumelsky, their left being right; the mirror images are the other three."""
+    """Yield LSL, LRL and LSR of Shkel and Lumelsky, their left being right; the mirror images are the other three."""
     x, y = distance + math.sin(alpha) - math.sin(beta), math.cos(beta) - math.cos(alpha)
     between, heading = math.hypot(x, y), math.atan2(y, x)
     yield (1, 0, 1), (_positive(heading - alpha), between, _positive(beta - heading))
@@ -214,7 +216,7 @@ class Leg:
         return self.way[-1].end
 
     def sample(self, time_s: FloatArray) -> FloatArray:
-        """(n, 4) east, north, height, airborne (0 or 1) at times (n,) since its start."""
+        """Return (n, 4) east, north, height, airborne (0 or 1) at times (n,) since its start."""
         first, last = self.speeds_mps
         along_m = first * time_s + 0.5 * (last - first) / self.duration_s * time_s**2
         starts = np.cumsum([0.0, *(arc.length_m for arc in self.way[:-1])])
@@ -239,7 +241,7 @@ class Route:
         self.starts_s: FloatArray = np.cumsum([0.0, *(leg.duration_s for leg in legs)])
 
     def sample(self, time_s: FloatArray) -> FloatArray:
-        """(n, 4) east, north, height, airborne (0 or 1) at times (n,), which ascend."""
+        """Return (n, 4) east, north, height, airborne (0 or 1) at times (n,), which ascend."""
         cuts = np.searchsorted(time_s, self.starts_s[1:-1])
         parts = zip(self.legs, self.starts_s[:-1], np.split(time_s, cuts), strict=True)
         return np.concatenate([leg.sample(part - start_s) for leg, start_s, part in parts])

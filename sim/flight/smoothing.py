@@ -20,7 +20,7 @@ _DEGREE = 5
 
 
 def kernel(half: int) -> FloatArray:
-    """(2·half + 1,) weights; the highest is at most `PEAK` / half."""
+    """Return (2·half + 1,) weights; the highest is at most `PEAK` / half."""
     rounding = half // 16
     weights = np.ones(2 * (half - 4 * rounding) + 1)
     for _ in range(4):
@@ -30,13 +30,14 @@ def kernel(half: int) -> FloatArray:
 
 
 def smoothed(values: FloatArray, half: int, margin: int) -> FloatArray:
-    """(n − 2·margin,) of values (n,); ``half`` is at most ``margin``, the samples lost at either end."""
+    """Return (n − 2·margin,) of values (n,); ``half`` is at most ``margin``, the samples lost at either end."""
     kept = values[margin - half : len(values) - margin + half]
     return np.convolve(kept, kernel(half), mode="valid")
 
 
 def spline_through(first: int, values: FloatArray) -> BSpline:
-    """The quintic spline through values (n, k) at knots ``first``, ``first`` + 1, …, to the sixth order of `STEP_S`.
+    """Return the quintic spline through values (n, k) at knots ``first``, ``first`` + 1, …, to the sixth order of
+    `STEP_S`.
 
     Its coefficients are c = (1 − δ²/4 + 13 δ⁴/240) f, the first terms of what inverts a quintic B-spline at whole
     knots (1 + δ²/4 + δ⁴/120), so that what stands still does so exactly, whatever comes later. It is defined from

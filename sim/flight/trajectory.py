@@ -94,12 +94,12 @@ class Trajectory:
         self._bounds_s = np.array([[line.start_s, line.end_s] for line in lines]).ravel()
 
     def poses(self, time_s: FloatArray) -> Poses:
-        """Positions and attitudes at times (n,)."""
+        """Return positions and attitudes at times (n,)."""
         values = self._spline(time_s)
         return Poses(values[:, :3] + self._origin_e, _matrices(values[:, 3:]))
 
     def motion(self, time_s: FloatArray) -> Motion:
-        """Positions, attitudes and their derivatives at times (n,)."""
+        """Return positions, attitudes and their derivatives at times (n,)."""
         values, slopes = self._spline(time_s), self._first(time_s)
         quaternion, change = values[:, 3:], slopes[:, 3:]
         vector, scalar = quaternion[:, :3], quaternion[:, 3:]
@@ -108,17 +108,17 @@ class Trajectory:
         return Motion(values[:, :3] + self._origin_e, slopes[:, :3], self._second(time_s), _matrices(quaternion), rate)
 
     def line_at(self, time_s: FloatArray) -> NDArray[np.int16]:
-        """(n,) index of the line that is flown at each time, −1: none."""
+        """Return (n,) index of the line that is flown at each time, −1: none."""
         place = np.searchsorted(self._bounds_s, time_s, side="right")
         indices = np.array([line.index for line in self.lines], np.int16)
         return np.where(place % 2 == 1, indices[np.minimum(place // 2, len(indices) - 1)], np.int16(-1))
 
     def geodetic(self, time_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Latitude, longitude (radians) and ellipsoidal height, (n,) each."""
+        """Return latitude, longitude (radians) and ellipsoidal height, (n,) each."""
         return geodetic_from_e(self._spline(time_s)[:, :3] + self._origin_e)
 
     def attitude(self, time_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Roll, pitch and heading (0 … 2π) against north, east and down there, radians, (n,) each."""
+        """Return roll, pitch and heading (0 … 2π) against north, east and down there, radians, (n,) each."""
         poses = self.poses(time_s)
         lat_rad, lon_rad, _ = geodetic_from_e(poses.position_e)
         rot_l_from_b = np.swapaxes(rot_e_from_ned(lat_rad, lon_rad), 1, 2) @ poses.rot_e_from_b
@@ -127,7 +127,7 @@ class Trajectory:
         return roll, pitch, np.arctan2(rot_l_from_b[:, 1, 0], rot_l_from_b[:, 0, 0]) % (2.0 * np.pi)
 
     def velocity_l(self, time_s: FloatArray) -> FloatArray:
-        """(n, 3) north, east, down, m/s."""
+        """Return (n, 3) north, east, down, m/s."""
         lat_rad, lon_rad, _ = self.geodetic(time_s)
         velocity: FloatArray = np.einsum("nji,nj->ni", rot_e_from_ned(lat_rad, lon_rad), self._first(time_s)[:, :3])
         return velocity
@@ -164,7 +164,8 @@ def fly(plan: Plan, site: Site, ground_m: Ground) -> Trajectory:
 
 
 def _smooth_path(route: Route, envelope: Envelope, knots: NDArray[np.int64]) -> FloatArray:
-    """(n, 4) east, north, height, airborne at knots (n,), smooth; where the aircraft stands, the same to the last bit.
+    """Return (n, 4) east, north, height, airborne at knots (n,), smooth; where the aircraft stands, the same to the
+    last bit.
 
     Taken from the first place, so that sums of zeros are zero.
     """
@@ -180,7 +181,7 @@ def _smooth_path(route: Route, envelope: Envelope, knots: NDArray[np.int64]) -> 
 
 
 def _values(path: FloatArray, tables: Tables, site: Site, first: int) -> FloatArray:
-    """(n − 8, 7) positions less the site's origin and quaternions at all knots but four at either end.
+    """Return (n − 8, 7) positions less the site's origin and quaternions at all knots but four at either end.
 
     The attitude is that of the path in still air; then the air shakes both.
     """
@@ -199,13 +200,13 @@ def _values(path: FloatArray, tables: Tables, site: Site, first: int) -> FloatAr
 
 
 def _relative_e(points: FloatArray, site: Site) -> FloatArray:
-    """(n, 3) ECEF less the site's origin of east, north and ellipsoidal height (n, 3)."""
+    """Return (n, 3) ECEF less the site's origin of east, north and ellipsoidal height (n, 3)."""
     relative: FloatArray = site.site_from_ground(points[:, 0], points[:, 1], points[:, 2]) @ site.rot_site_from_e
     return relative
 
 
 def _matrices(quaternion: FloatArray) -> FloatArray:
-    """(n, 3, 3) rotations of quaternions (n, 4), x, y, z, w, of any length."""
+    """Return (n, 3, 3) rotations of quaternions (n, 4), x, y, z, w, of any length."""
     x, y, z, w = (quaternion * np.sqrt(2.0 / np.sum(quaternion**2, axis=1, keepdims=True))).T
     matrices = np.empty((len(quaternion), 3, 3))
     matrices[:, 0, 0], matrices[:, 0, 1], matrices[:, 0, 2] = 1.0 - y * y - z * z, x * y - z * w, x * z + y * w
@@ -217,7 +218,7 @@ def _matrices(quaternion: FloatArray) -> FloatArray:
 def coordinated(
     motion_e: tuple[FloatArray, FloatArray, FloatArray], runway_e: FloatArray, airborne: FloatArray, flight: FlightTable
 ) -> FloatArray:
-    """(n, 3) roll, pitch and heading, radians.
+    """Return (n, 3) roll, pitch and heading, radians.
 
     The nose points along the air's velocity in the level plane and ``pitch_deg`` above the path; the roll is that at
     which what the body feels (acceleration in inertial space less gravity) has nothing to the side. On the ground the
@@ -247,7 +248,7 @@ def coordinated(
 
 
 def quaternions_e_from_b(position_e: FloatArray, angles_rad: FloatArray) -> FloatArray:
-    """(n, 4) x, y, z, w of roll, pitch, heading (n, 3) at places (n, 3), without a change of sign on the way."""
+    """Return (n, 4) x, y, z, w of roll, pitch, heading (n, 3) at places (n, 3), without a change of sign on the way."""
     lat_rad, lon_rad, _ = geodetic_from_e(position_e)
     rot_e_from_l = Rotation.from_matrix(rot_e_from_ned(lat_rad, lon_rad))
     turned = rot_e_from_l * Rotation.from_euler("ZYX", angles_rad[:, ::-1])

@@ -28,14 +28,14 @@ _SETTLED_S = 120.0  # after which the filters have forgotten
 
 
 def displacement_m(intensity: str, seed: int, count: int) -> FloatArray:
-    """(count, 3) east, north, up off the path at knots `STEP_S` apart."""
+    """Return (count, 3) east, north, up off the path at knots `STEP_S` apart."""
     sections = _sections(PATH_FILTERS)
     per_step = float(np.linalg.norm(np.diff(_response(sections), prepend=0.0))) / STEP_S
     return INTENSITY[intensity] / per_step * _axes(VELOCITY_RMS_MPS, sections, seed, count)
 
 
 def angles_rad(intensity: str, seed: int, count: int) -> FloatArray:
-    """(count, 3) roll, pitch, heading off those of the path at knots `STEP_S` apart."""
+    """Return (count, 3) roll, pitch, heading off those of the path at knots `STEP_S` apart."""
     sections = _sections(ANGLE_FILTERS)
     scale = INTENSITY[intensity] / float(np.linalg.norm(_response(sections)))
     return scale * np.radians(_axes(ANGLE_RMS_DEG, sections, seed, count))
@@ -47,7 +47,7 @@ def _sections(filters: tuple[tuple[int, float, str], ...]) -> FloatArray:
 
 
 def _response(sections: FloatArray) -> FloatArray:
-    """To one impulse: its norm is the deviation of what white noise becomes."""
+    """Return to one impulse: its norm is the deviation of what white noise becomes."""
     impulse = np.zeros(round(_SETTLED_S / STEP_S))
     impulse[0] = 1.0
     response: FloatArray = sosfilt(sections, impulse)
@@ -55,7 +55,7 @@ def _response(sections: FloatArray) -> FloatArray:
 
 
 def _axes(rms: Mapping[str, float], sections: FloatArray, seed: int, count: int) -> FloatArray:
-    """(count, axes) filtered white noise of each axis, of this rms before the filters."""
+    """Return (count, axes) filtered white noise of each axis, of this rms before the filters."""
     settling = round(_SETTLED_S / STEP_S)
     axes = [generator(seed, "turbulence", name).standard_normal(settling + count) for name in rms]
     filtered: FloatArray = sosfilt(sections, np.stack(axes, axis=-1), axis=0)[settling:]

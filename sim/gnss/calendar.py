@@ -40,7 +40,7 @@ class Calendar:
     leap_seconds: int
 
     def at(self, time_s: float) -> Stamp:
-        """The nearest millisecond."""
+        """Return the nearest millisecond."""
         since_ms = round(time_s * 1000.0)
         gps_ns = self.start_gps_ns + since_ms * MILLISECOND_NS
         week, tow_ns = week_from_gps(gps_ns)

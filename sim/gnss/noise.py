@@ -48,7 +48,7 @@ class Noise:
         self._recent: dict[int, FloatArray] = {}
 
     def rows(self, first: int, count: int) -> FloatArray:
-        """(count, m) from row ``first`` on."""
+        """Return (count, m) from row ``first`` on."""
         blocks = range(first // BLOCK_ROWS, (first + max(count, 1) - 1) // BLOCK_ROWS + 1)
         rows = np.concatenate([self._block(block) for block in blocks])
         offset = first - blocks[0] * BLOCK_ROWS
@@ -65,7 +65,7 @@ class Noise:
         return np.stack([-self._poles[1] * newest - self._poles[2] * before, -self._poles[2] * newest])
 
     def _block(self, block: int) -> FloatArray:
-        """A block of rows; blocks ahead of it are made first where their end is not known yet."""
+        """Return a block of rows; blocks ahead of it are made first where their end is not known yet."""
         if block in self._recent:
             return self._recent[block]
         rows = np.empty(0)

@@ -44,7 +44,7 @@ class NovatelMessages:
         self._baseline_m = math.dist(second, table.lever_arm_m) if second is not None else None
 
     def epoch(self, epochs: Epochs, row: int) -> list[bytes]:
-        """TIME on whole seconds, BESTPOS, BESTVEL, HEADING2."""
+        """Return TIME on whole seconds, BESTPOS, BESTVEL, HEADING2."""
         stamp = self._calendar.at(float(epochs.time_s[row]))
         logs: list[tuple[str, nov.Body]] = []
         if stamp.second is not None:
@@ -55,7 +55,7 @@ class NovatelMessages:
         return [encode_log(name, body, stamp.week, stamp.tow_ms) for name, body in logs]
 
     def ins_epoch(self, ins: InsEpochs, row: int) -> list[bytes]:
-        """INSPVAS, and on whole seconds INSPVAX."""
+        """Return INSPVAS, and on whole seconds INSPVAX."""
         stamp = self._calendar.at(float(ins.time_s[row]))
         status = INS_SOLUTION_GOOD if ins.since_update_s[row] <= INS_GOOD_S else INS_HIGH_VARIANCE
         lat, lon = math.degrees(ins.lat_rad[row]), math.degrees(ins.lon_rad[row])
@@ -74,7 +74,7 @@ class NovatelMessages:
         return logs
 
     def _time(self, time_s: float, second: int) -> nov.Time:
-        """The edge just past; the pulse is early by what the receiver's clock is ahead."""
+        """Return the edge just past; the pulse is early by what the receiver's clock is ahead."""
         stamp = self._calendar.at(time_s)
         hour, minute, ms = stamp.clock
         return nov.Time(
@@ -139,7 +139,7 @@ def _velocity(epochs: Epochs, row: int) -> nov.BestVel:
 
 
 def _heading(epochs: Epochs, row: int, baseline_m: float) -> nov.Heading2:
-    """Master and rover are the primary and the secondary antenna."""
+    """Return master and rover are the primary and the secondary antenna."""
     fix, satellites = int(epochs.fix[row]), int(epochs.satellites[row])
     there = fix != NONE
     return nov.Heading2(

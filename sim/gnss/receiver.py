@@ -154,7 +154,7 @@ class Receiver:
         ]
 
     def epochs(self, first: int, count: int) -> Epochs:
-        """``count`` epochs from number ``first`` on; to rounding the same ones however they are asked for."""
+        """Return ``count`` epochs from number ``first`` on; to rounding the same ones however they are asked for."""
         index = np.arange(first, first + count)
         time_s = index / self.table.rate_hz
         fix = self._fix(time_s)
@@ -198,7 +198,7 @@ class Receiver:
         )
 
     def ins_epochs(self, first: int, count: int) -> InsEpochs:
-        """``count`` solutions of the INS at `INS_RATE_HZ`; without satellites it goes on, and drifts."""
+        """Return ``count`` solutions of the INS at `INS_RATE_HZ`; without satellites it goes on, and drifts."""
         index = np.arange(first, first + count)
         time_s = index / INS_RATE_HZ
         drift, since_update_s = self._coasting(time_s)
@@ -230,20 +230,20 @@ class Receiver:
     # --- geometry ---
 
     def _antenna(self, motion: BodyMotion) -> tuple[FloatArray, FloatArray]:
-        """Position (n, 3) of the primary antenna in e, axes of the local level there (n, 3, 3)."""
+        """Return position (n, 3) of the primary antenna in e, axes of the local level there (n, 3, 3)."""
         position_e = motion.position_e + motion.rot_e_from_b @ self._lever_arm_b
         lat_rad, lon_rad, _ = geodetic_from_e(position_e)
         return position_e, rot_e_from_ned(lat_rad, lon_rad)
 
     def _velocity_l(self, motion: BodyMotion) -> FloatArray:
-        """(n, 3) north east down, of the primary antenna."""
+        """Return (n, 3) north east down, of the primary antenna."""
         turning_b = np.cross(motion.rate_eb_b, self._lever_arm_b)
         velocity_e = motion.velocity_e + _turned(motion.rot_e_from_b, turning_b)
         _, rot_e_from_l = self._antenna(motion)
         return _turned(rot_e_from_l.swapaxes(-1, -2), velocity_e)
 
     def _baseline_direction(self, motion: BodyMotion, rot_e_from_l: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Heading and pitch of the baseline, the secondary antenna above the primary being positive pitch."""
+        """Return heading and pitch of the baseline, the secondary antenna above the primary being positive pitch."""
         baseline_e = motion.rot_e_from_b @ self._baseline_b
         north, east, down = _turned(rot_e_from_l.swapaxes(-1, -2), baseline_e).T
         return np.arctan2(east, north), np.arctan2(-down, np.hypot(north, east))
@@ -266,7 +266,9 @@ class Receiver:
         return offset_l
 
     def _coasting(self, time_s: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Factor on the errors of the INS (n, 1), growing with the square of the time without satellites (n,)."""
+        """Return factor on the errors of the INS (n, 1), growing with the square of the time without satellites
+        (n,).
+        """
         drift, since_s = np.ones(len(time_s)), np.zeros(len(time_s))
         for outage in self.table.outage:
             age_s = np.clip(time_s - outage.at_s, 0.0, outage.for_s)
@@ -284,7 +286,7 @@ class Receiver:
         return Noise(self._seed, ("gnss", self._name, *part), size, tau_s, step_s, smooth=smooth)
 
     def _direction_sigma_rad(self) -> FloatArray:
-        """(2,) of heading and pitch; nan without a second antenna."""
+        """Return (2,) of heading and pitch; nan without a second antenna."""
         sigma_rad: FloatArray = np.radians(grades.BASELINE_DEG_M) / np.linalg.norm(self._baseline_b)
         return sigma_rad
 
@@ -306,7 +308,7 @@ _INS_PARTS: tuple[tuple[ArrayLike, float], ...] = (
 
 
 def _baseline_b(table: GnssTable, name: str) -> FloatArray:
-    """(3,) from the primary to the secondary antenna; nan without one."""
+    """Return (3,) from the primary to the secondary antenna; nan without one."""
     if table.secondary_lever_arm_m is None:
         return np.full(3, np.nan)
     baseline_b: FloatArray = np.array(table.secondary_lever_arm_m) - np.array(table.lever_arm_m)
@@ -316,13 +318,13 @@ def _baseline_b(table: GnssTable, name: str) -> FloatArray:
 
 
 def _turned(rotations: FloatArray, vectors: FloatArray) -> FloatArray:
-    """(n, 3) of (n, 3, 3) times (n, 3)."""
+    """Return (n, 3) of (n, 3, 3) times (n, 3)."""
     turned: FloatArray = np.einsum("nij,nj->ni", rotations, vectors)
     return turned
 
 
 def _summed(parts: list[Noise], first: int, count: int, columns: int) -> FloatArray:
-    """(count, columns), zero without parts."""
+    """Return (count, columns), zero without parts."""
     rows = np.zeros((count, columns))
     for part in parts:
         rows += part.rows(first, count)

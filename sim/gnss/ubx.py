@@ -31,7 +31,9 @@ class UbxMessages:
         self._undulation_m = table.undulation_m
 
     def epoch(self, epochs: Epochs, row: int) -> list[bytes]:
-        """NAV messages of the epoch with NAV-EOE behind them; on whole seconds NAV-TIMELS and TIM-TP of the next."""
+        """Return NAV messages of the epoch with NAV-EOE behind them; on whole seconds NAV-TIMELS and TIM-TP of the
+        next.
+        """
         time_s = float(epochs.time_s[row])
         stamp = self._calendar.at(time_s)
         messages = [
@@ -48,7 +50,7 @@ class UbxMessages:
         return messages
 
     def ins_epoch(self, ins: InsEpochs, row: int) -> list[bytes]:
-        """UBX receivers have no INS here."""
+        """Return UBX receivers have no INS here."""
         return []
 
     def _timegps(self, stamp: Stamp) -> ubx.NavTimegps:
@@ -62,7 +64,7 @@ class UbxMessages:
         )
 
     def _tim_tp(self, second: int) -> ubx.TimTp:
-        """edge = true second − quantisation error."""
+        """Return edge = true second − quantisation error."""
         week, tow_ns = week_from_gps(self._calendar.start_gps_ns + second * SECOND_NS)
         quantisation_ps = round(-1e12 * self._pulse.late_s(second))
         return ubx.TimTp(tow_ns // MILLISECOND_NS, 0, quantisation_ps, week, ubx.TP_UTC_AVAILABLE, ubx.TP_REFERENCE_GPS)
@@ -101,7 +103,9 @@ class UbxMessages:
         return ubx.NavHpposllh(0, 0, stamp.tow_ms, *mains, *rests, *accuracies)
 
     def _whole(self, epochs: Epochs, row: int) -> tuple[int, int, int, int]:
-        """Latitude and longitude in 1e-9 degrees, heights above ellipsoid and geoid in tenths of a millimetre."""
+        """Return latitude and longitude in 1e-9 degrees, heights above ellipsoid and geoid in tenths of a
+        millimetre.
+        """
         height_m = float(epochs.height_m[row])
         return (
             round(1e9 * math.degrees(epochs.lat_rad[row])),
@@ -112,18 +116,18 @@ class UbxMessages:
 
 
 def _main(value: int, scale: int) -> int:
-    """The part in the coarser unit, so that the finer one's is at most half of it."""
+    """Return the part in the coarser unit, so that the finer one's is at most half of it."""
     return (value + scale // 2) // scale
 
 
 def _accuracies(epochs: Epochs, row: int) -> tuple[float, float]:
-    """Horizontal (of both axes together) and vertical, metres."""
+    """Return horizontal (of both axes together) and vertical, metres."""
     north, east, down = map(float, epochs.position_sigma_l[row])
     return math.hypot(north, east), down
 
 
 def _velocity(epochs: Epochs, row: int) -> dict[str, int]:
-    """NAV-PVT's fields of velocity."""
+    """Return NAV-PVT's fields of velocity."""
     north, east, down = map(float, epochs.velocity_l[row])
     speed_mps = math.hypot(north, east)
     accuracy_mps = math.hypot(*map(float, epochs.velocity_sigma_l[row][:2]))
@@ -140,7 +144,7 @@ def _velocity(epochs: Epochs, row: int) -> dict[str, int]:
 
 
 def _empty_pvt(stamp: Stamp) -> ubx.NavPvt:
-    """Time without a solution."""
+    """Return time without a solution."""
     hour, minute, ms = stamp.clock
     return ubx.NavPvt(
         itow_ms=stamp.tow_ms,

@@ -44,7 +44,7 @@ class NmeaMessages:
         self._two_antennas = table.secondary_lever_arm_m is not None
 
     def epoch(self, epochs: Epochs, row: int) -> list[bytes]:
-        """GGA, RMC, on whole seconds ZDA, VTG, GST, with a second antenna HDT: the direction of the baseline."""
+        """Return GGA, RMC, on whole seconds ZDA, VTG, GST, with a second antenna HDT: the direction of the baseline."""
         stamp = self._calendar.at(float(epochs.time_s[row]))
         there = epochs.fix[row] != FixType.NONE
         sentences = self._solution(epochs, row, stamp) if there else _no_solution(stamp)
@@ -55,7 +55,7 @@ class NmeaMessages:
         return sentences
 
     def ins_epoch(self, ins: InsEpochs, row: int) -> list[bytes]:
-        """NMEA receivers have no INS here."""
+        """Return NMEA receivers have no INS here."""
         return []
 
     def _solution(self, epochs: Epochs, row: int, stamp: Stamp) -> list[bytes]:
@@ -80,7 +80,7 @@ class NmeaMessages:
 
 
 def _no_solution(stamp: Stamp) -> list[bytes]:
-    """Time goes on; what there is no solution for stays empty."""
+    """Return time goes on; what there is no solution for stays empty."""
     hour, minute, ms = stamp.clock
     time = f"{hour:02d}{minute:02d}{ms / 1000.0:05.2f}"
     return [
@@ -104,10 +104,10 @@ class Messages(Protocol):
     """A protocol's encoder."""
 
     def epoch(self, epochs: Epochs, row: int) -> list[bytes]:
-        """All messages of a solution, in the order they are sent."""
+        """Return all messages of a solution, in the order they are sent."""
 
     def ins_epoch(self, ins: InsEpochs, row: int) -> list[bytes]:
-        """All messages of an inertial solution."""
+        """Return all messages of an inertial solution."""
 
 
 PROTOCOLS: dict[str, Callable[[GnssTable, Calendar, Pulse], Messages]] = {
@@ -150,7 +150,8 @@ class GnssWire:
         self._until_s = 0.0
 
     def units(self, start_s: float, stop_s: float) -> list[WireUnit]:
-        """The reads with ``start_s`` <= time < ``stop_s`` that have bytes; a call goes on where the last one ended.
+        """Return the reads with ``start_s`` <= time < ``stop_s`` that have bytes; a call goes on where the last one
+        ended.
 
         Raises:
             ValueError: it does not.
@@ -166,7 +167,7 @@ class GnssWire:
         return [WireUnit(time_s, self._source, data) for time_s, data in self._line.read_until(stop_s)]
 
     def _bursts(self, first_tick: int, stop_tick: int) -> Iterator[tuple[float, bytes]]:
-        """Bytes of the epochs in these ticks, in the order they are sent, and when at the earliest."""
+        """Yield bytes of the epochs in these ticks, in the order they are sent, and when at the earliest."""
         ticks = INS_RATE_HZ // self._table.rate_hz
         first, stop = -(-first_tick // ticks), -(-stop_tick // ticks)
         bursts: list[tuple[int, int, float, bytes]] = []  # tick, part, delay
@@ -190,7 +191,7 @@ class GnssWire:
         return delays_s
 
     def _typical_second(self) -> list[tuple[float, int]]:
-        """(time, bytes) of a second's epochs while there are satellites."""
+        """Return (time, bytes) of a second's epochs while there are satellites."""
         epochs = self._receiver.epochs(0, self._table.rate_hz)
         epochs = replace(epochs, fix=np.full_like(epochs.fix, FixType.SINGLE))
         sizes = [(float(t), _size(self._messages.epoch(epochs, row))) for row, t in enumerate(epochs.time_s)]
@@ -201,7 +202,7 @@ class GnssWire:
 
 
 def config_table(table: GnssTable, name: str, transport: str, leap_seconds: int | None = None) -> dict[str, Any]:
-    """``[gnss.<name>]`` of the configuration that records it (CONFIG).
+    """Return ``[gnss.<name>]`` of the configuration that records it (CONFIG).
 
     Args:
         table: of the plan.
@@ -293,7 +294,9 @@ class SerialLine:
         self._queue.append((start_s, data))
 
     def read_until(self, stop_s: float) -> list[tuple[float, bytes]]:
-        """The reads before ``stop_s`` that have bytes, each with its time; whatever arrives by then must be sent."""
+        """Return the reads before ``stop_s`` that have bytes, each with its time; whatever arrives by then must be
+        sent.
+        """
         reads = []
         while (time_s := self._first_read_s + self._reads * self._read_s) < stop_s:
             self._reads += 1
@@ -303,7 +306,7 @@ class SerialLine:
         return reads
 
     def _arrived(self, time_s: float) -> bytes:
-        """Bytes whose last bit is there and that no read has taken."""
+        """Return bytes whose last bit is there and that no read has taken."""
         parts = []
         while self._queue and self._queue[0][0] < time_s:
             start_s, data = self._queue[0]

@@ -94,7 +94,7 @@ GRADES = {
 
 
 def noise_of(table: ImuTable) -> dict[str, float]:
-    """Every key of `ImuNoiseTable` with its value: the plan's, else the grade's."""
+    """Return every key of `ImuNoiseTable` with its value: the plan's, else the grade's."""
     return GRADES[table.grade].model_dump() | table.noise.model_dump(exclude_none=True)
 
 
@@ -120,7 +120,7 @@ class SensorGrade:
 
 
 def sensor_grades(table: ImuTable) -> tuple[SensorGrade, SensorGrade]:
-    """Accelerometers and gyroscopes of a unit of the plan."""
+    """Return accelerometers and gyroscopes of a unit of the plan."""
     noise = noise_of(table)
     correlation_s, misalignment_rad = 3600.0 * noise["bias_correlation_h"], 1e-3 * noise["misalignment_mrad"]
     accelerometers = SensorGrade(

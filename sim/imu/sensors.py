@@ -50,7 +50,7 @@ class Increments:
 
 
 def true_increments(trajectory: Trajectory, edges_s: FloatArray, lever_arm_b: FloatArray | None = None) -> Increments:
-    """What perfect sensors integrate between neighbouring times, by Gauss and Legendre's rule of three points.
+    """Return what perfect sensors integrate between neighbouring times, by Gauss and Legendre's rule of three points.
 
     Args:
         trajectory: of the body's origin.
@@ -76,7 +76,7 @@ def true_increments(trajectory: Trajectory, edges_s: FloatArray, lever_arm_b: Fl
 
 
 def specific_force(motion: Motion, lever_arm_b: FloatArray | None = None) -> FloatArray:
-    """(n, 3) f^b, m/s², at the unit's point, but for the lever arm's ω̇ × l."""
+    """Return (n, 3) f^b, m/s², at the unit's point, but for the lever arm's ω̇ × l."""
     rot_e_from_b = motion.rot_e_from_b
     position_e, velocity_e = motion.position_e, motion.velocity_e
     extra_b: FloatArray | float = 0.0
@@ -127,7 +127,7 @@ class SensorErrors:
         self._starts = [start]  # of each second's drift, in units of its sigma
 
     def of_second(self, second: int) -> FloatArray:
-        """(rate, 6) bias, drift and white noise of the samples of a second."""
+        """Return (rate, 6) bias, drift and white noise of the samples of a second."""
         while len(self._starts) <= second:
             last = len(self._starts) - 1
             self._starts.append(self._drift_of(last, self._draws(last))[-1])
@@ -137,12 +137,12 @@ class SensorErrors:
         return errors
 
     def _draws(self, second: int) -> FloatArray:
-        """(rate, processes + 1, 6): what drives the drift, then the white noise."""
+        """Return (rate, processes + 1, 6): what drives the drift, then the white noise."""
         shape = (self._rate_hz, len(self.constants_s) + 1, 6)
         return generator(*self._names, "noise", second).standard_normal(shape)
 
     def _drift_of(self, second: int, draws: FloatArray) -> FloatArray:
-        """(rate, processes, 6) Gauss-Markov processes of sigma 1, sampled exactly."""
+        """Return (rate, processes, 6) Gauss-Markov processes of sigma 1, sampled exactly."""
         drift = np.empty((self._rate_hz, len(self.constants_s), 6))
         for number, kept in enumerate(np.exp(-1.0 / (self._rate_hz * self.constants_s))):
             drive = np.sqrt(1 - kept * kept) * draws[:, number]
@@ -152,21 +152,21 @@ class SensorErrors:
 
 
 def error_matrix(scale: FloatArray, lean_rad: FloatArray) -> FloatArray:
-    """(3, 3) I + E of scale factors (3,) and of the angles (3,) between y and z, z and x, x and y."""
+    """Return (3, 3) I + E of scale factors (3,) and of the angles (3,) between y and z, z and x, x and y."""
     x, y, z = lean_rad
     matrix: FloatArray = np.eye(3) + np.diag(scale) + np.array([[0.0, z, y], [z, 0.0, x], [y, x, 0.0]])
     return matrix
 
 
 def drift_constants(longest_s: float) -> FloatArray:
-    """(k,) time constants of the drift, seconds, from the longest down."""
+    """Return (k,) time constants of the drift, seconds, from the longest down."""
     count = 1 + max(int(np.log(longest_s / DRIFT_SHORTEST_S) / np.log(DRIFT_RATIO)), 0)
     constants_s: FloatArray = longest_s * DRIFT_RATIO ** -np.arange(count, dtype=np.float64)
     return constants_s
 
 
 def drift_level(constants_s: FloatArray) -> float:
-    """Greatest Allan deviation of a sum of Gauss-Markov processes of sigma 1 with these time constants.
+    """Return greatest Allan deviation of a sum of Gauss-Markov processes of sigma 1 with these time constants.
 
     The Allan variance of one: IEEE Std 952-1997, annex C, Eq. C.20, with q_c² T_c = 2 σ².
     """
@@ -219,17 +219,17 @@ class InertialUnit:
         self._kept: dict[int, FloatArray] = {}  # values of the last two seconds: who cuts time meets both
 
     def ends_s(self, number: FloatArray | IntArray) -> FloatArray:
-        """(n,) true times at which samples (n,) end."""
+        """Return (n,) true times at which samples (n,) end."""
         return self.oscillator.time_of(np.asarray(number, np.float64) * self.table.tick_hz / self.table.rate_hz)
 
     def count(self, stop_s: float) -> int:
-        """How many samples have ended at this time."""
+        """Return how many samples have ended at this time."""
         phase = self.oscillator.phase(np.array([stop_s]))
         number = np.floor(phase * self.table.rate_hz / self.table.tick_hz) + np.array([1.0, 0.0, -1.0])
         return max(int(number[np.argmax(self.ends_s(number) <= stop_s)]), 0)
 
     def samples(self, first: int, count: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Samples by number.
+        """Return samples by number.
 
         Returns:
             (n,) true times at which their intervals end, (n, 3) specific force m/s², (n, 3) angular rate rad/s, in
@@ -249,7 +249,7 @@ class InertialUnit:
         return self.ends_s(number), values[:, :3], values[:, 3:]
 
     def drawn(self) -> dict[str, FloatArray]:
-        """What the unit drew when it was switched on, in its own axes: biases (3,), error matrices (3, 3)."""
+        """Return what the unit drew when it was switched on, in its own axes: biases (3,), error matrices (3, 3)."""
         return {
             "accel_bias_mps2": self.errors.bias[:3],
             "gyro_bias_radps": self.errors.bias[3:],
@@ -258,7 +258,9 @@ class InertialUnit:
         }
 
     def _second(self, second: int) -> FloatArray:
-        """(n, 6) values of the samples second · rate_hz and on, as far as there are any; there is no sample 0."""
+        """Return (n, 6) values of the samples second · rate_hz and on, as far as there are any; there is no sample
+        0.
+        """
         if second not in self._kept:
             rate_hz = self.table.rate_hz
             begin, end = max(second * rate_hz, 1), min((second + 1) * rate_hz, self.last + 1)
@@ -268,7 +270,7 @@ class InertialUnit:
         return self._kept[second]
 
     def _means(self, begin: int, end: int) -> FloatArray:
-        """(n, 6) of the samples from ``begin`` to before ``end``, with scale factors and leaning axes."""
+        """Return (n, 6) of the samples from ``begin`` to before ``end``, with scale factors and leaning axes."""
         increments = true_increments(self._trajectory, self.ends_s(np.arange(begin - 1, end)), self._lever_arm_b)
         accelerometers, gyroscopes = self.errors.matrices @ self._rot_imu_from_b
         sensed = [increments.velocity_b @ accelerometers.T, increments.angle_b @ gyroscopes.T]

@@ -66,13 +66,13 @@ def _cross(a: Vector, b: Vector) -> Vector:
 
 @jit_inline
 def _plus(a: Vector, factor: float, b: Vector) -> Vector:
-    """a + factor · b."""
+    """Return a + factor · b."""
     return a[0] + factor * b[0], a[1] + factor * b[1], a[2] + factor * b[2]
 
 
 @jit_inline
 def _product(p: Quaternion, q: Quaternion) -> Quaternion:
-    """Hamilton's product, scalar first."""
+    """Return hamilton's product, scalar first."""
     return (
         p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3],
         p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2],
@@ -83,7 +83,7 @@ def _product(p: Quaternion, q: Quaternion) -> Quaternion:
 
 @jit_inline
 def _turned(q: Quaternion, vector: Vector) -> Vector:
-    """q v q*, for a unit quaternion."""
+    """Return q v q*, for a unit quaternion."""
     axis = (q[1], q[2], q[3])
     once = _cross(axis, vector)
     return _plus(_plus(vector, 2.0 * q[0], once), 2.0, _cross(axis, once))
@@ -100,7 +100,7 @@ def _quaternion(angle: Vector) -> Quaternion:
 
 @jit_inline
 def _force_increment(angle: Vector, force: Vector, angle_before: Vector, force_before: Vector) -> Vector:
-    """∫ f in the axes of the interval's start: exact for steady turning, and sculling."""
+    """Return ∫ f in the axes of the interval's start: exact for steady turning, and sculling."""
     square = angle[0] * angle[0] + angle[1] * angle[1] + angle[2] * angle[2]
     first, second = 0.5 - square / 24.0 * (1.0 - square / 30.0), 1.0 / 6.0 - square / 120.0 * (1.0 - square / 42.0)
     once = _cross(angle, force)

@@ -70,7 +70,7 @@ DBC_AXIS = """BO_ {identifier} {axis}: 8 IMU
 
 
 def dbc_text(table: ImuTable) -> str:
-    """The DBC of a unit of the plan."""
+    """Return the DBC of a unit of the plan."""
     axes = "\n".join(
         DBC_AXIS.format(identifier=257 + number, axis=axis, force_unit=FORCE_UNIT_MPS2, rate_unit=RATE_UNIT_RADPS)
         for number, axis in enumerate("XYZ")
@@ -80,7 +80,7 @@ def dbc_text(table: ImuTable) -> str:
 
 
 def config_table(table: ImuTable, name: str, transport: str) -> dict[str, Any]:
-    """``[imu.<name>]`` of the configuration that records the unit; its DBC is ``<name>.dbc``."""
+    """Return ``[imu.<name>]`` of the configuration that records the unit; its DBC is ``<name>.dbc``."""
     signals: dict[str, Any] = {
         "specific_force": [f"{axis}.force" for axis in "XYZ"],
         "angular_rate": [f"{axis}.rate" for axis in "XYZ"],
@@ -110,7 +110,7 @@ def config_table(table: ImuTable, name: str, transport: str) -> dict[str, Any]:
 
 
 def _configured_noise(table: ImuTable) -> dict[str, Any]:
-    """What a filter is told; a perfect unit is the best there is to it, for no filter runs on zeros."""
+    """Return what a filter is told; a perfect unit is the best there is to it, for no filter runs on zeros."""
     if table.grade == "perfect":
         return {"grade": "navigation"}
     noise = noise_of(table)
@@ -153,7 +153,7 @@ class ImuWire:
         self._latest_s = -np.inf
 
     def units(self, start_s: float, stop_s: float) -> list[WireUnit]:
-        """Frames that are through the bus from ``start_s`` to before ``stop_s``, in order.
+        """Return frames that are through the bus from ``start_s`` to before ``stop_s``, in order.
 
         Consecutive calls give the same frames and stamps however time is cut; a stamp may lie a little behind
         ``stop_s``, by the host's delay.
@@ -190,7 +190,7 @@ class ImuWire:
         return sent_s[sent], self._delays(number).ravel()[sent], [frame.tobytes() for frame in frames[sent]]
 
     def _latch_frames(self, start_s: float, stop_s: float) -> tuple[FloatArray, FloatArray, list[bytes]]:
-        """The same of edges' frames."""
+        """Return the same of edges' frames."""
         second = np.arange(max(int(start_s) - 1, 0), int(np.ceil(stop_s)) + 1)
         if self._pulse is None:
             second = second[:0]
@@ -207,12 +207,12 @@ class ImuWire:
         return sent_s[sent], delay_s[sent], frames
 
     def _ticks(self, time_s: FloatArray) -> IntArray:
-        """(n,) the counter's readings, not wrapped."""
+        """Return (n,) the counter's readings, not wrapped."""
         phase = self._unit.oscillator.phase(time_s)
         return np.floor(phase + TICK_ROUNDING).astype(np.int64) + self._start_ticks
 
     def _delays(self, number: IntArray) -> FloatArray:
-        """(n, frames of a sample) delays of the host's stamps, drawn for whole seconds of samples."""
+        """Return (n, frames of a sample) delays of the host's stamps, drawn for whole seconds of samples."""
         rate_hz = self._unit.table.rate_hz
         delays_s = np.zeros((len(number), SAMPLE_FRAMES))
         for second in np.unique(number // rate_hz).tolist() if self._jitter_s else []:

@@ -15,7 +15,7 @@ NotNegative = Annotated[float, Field(ge=0.0)]
 
 
 def none_of_empty(value: Any) -> Any:
-    """TOML has no null."""
+    """Return TOML has no null."""
     return None if value == "" else value
 
 

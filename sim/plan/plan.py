@@ -40,7 +40,7 @@ class Plan:
     start_gps_ns: int
 
     def with_seed(self, seed: int) -> Plan:
-        """The same flight on another day: other noise."""
+        """Return the same flight on another day: other noise."""
         return self.changed({"flight": {"seed": seed}})
 
     def changed(self, changes: dict[str, Any]) -> Plan:
@@ -50,7 +50,7 @@ class Plan:
 
 
 def load_plan(name: str | Path) -> Plan:
-    """A preset by its name, else a file.
+    """Return a preset by its name, else a file.
 
     Raises:
         PlanError: no such plan, not TOML, or a key is wrong; one line.
@@ -69,7 +69,7 @@ def load_plan(name: str | Path) -> Plan:
 
 
 def parse_plan(text: str, folder: Path) -> Plan:
-    """A plan from its text; raises `PlanError`."""
+    """Return a plan from its text; raises `PlanError`."""
     try:
         document = toml_tables(text)
     except TomlError as error:

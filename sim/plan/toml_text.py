@@ -9,7 +9,7 @@ from typing import Any
 
 
 def toml_text(document: Mapping[str, Any]) -> str:
-    """A document: nested mappings become tables, lists of mappings arrays of tables; None is left out."""
+    """Return a document: nested mappings become tables, lists of mappings arrays of tables; None is left out."""
     return "\n".join(_lines(document, "")).strip() + "\n"
 
 

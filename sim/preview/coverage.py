@@ -55,20 +55,20 @@ class Fan:
     sine: bool
 
     def limits(self, above_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(n,) smallest and largest angle from nadir that is measured at heights above ground (n,)."""
+        """Return (n,) smallest and largest angle from nadir that is measured at heights above ground (n,)."""
         reach = np.arccos(np.clip(above_m / self.range_max_m, 0.0, 1.0))
         first = np.maximum(self.centre_rad - self.half_angle_rad, -reach)
         return first, np.minimum(self.centre_rad + self.half_angle_rad, reach)
 
     def share(self, angle_rad: FloatArray) -> FloatArray:
-        """(n,) share of the pulses at angles below these, 0 … 1."""
+        """Return (n,) share of the pulses at angles below these, 0 … 1."""
         part = np.clip((angle_rad - self.centre_rad) / self.half_angle_rad, -1.0, 1.0)
         shares: FloatArray = 0.5 + (np.arcsin(part) / np.pi if self.sine else 0.5 * part)
         return shares
 
 
 def fan_of(table: ScannerTable) -> Fan:
-    """The fan of a scanner of the plan."""
+    """Return the fan of a scanner of the plan."""
     if table.kind in ("vlp16", "os1"):
         return Fan(0.0, math.pi, table.range_max_m, pulse_rate_hz(table), False)
     installation = np.array(table.installation)
@@ -78,7 +78,9 @@ def fan_of(table: ScannerTable) -> Fan:
 
 
 def pulse_rate_hz(table: ScannerTable) -> float:
-    """Pulses a second that leave while the laser is on: what a polygon or monogon fires beyond its scan is lost."""
+    """Return pulses a second that leave while the laser is on: what a polygon or monogon fires beyond its scan is
+    lost.
+    """
     if table.kind == "vlp16":
         return VLP16_PULSE_HZ
     if table.kind == "os1":
@@ -130,17 +132,17 @@ class Strip:
         return end
 
     def beside(self, east_m: FloatArray, north_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Distances along the line and to its right of points (n,)."""
+        """Return distances along the line and to its right of points (n,)."""
         east_m, north_m = east_m - self.from_m[0], north_m - self.from_m[1]
         return east_m * self.ahead[0] + north_m * self.ahead[1], east_m * self.ahead[1] - north_m * self.ahead[0]
 
     def point(self, along_m: FloatArray, right_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """East and north of what is so far along and to the right."""
+        """Return east and north of what is so far along and to the right."""
         east_m = self.from_m[0] + along_m * self.ahead[0] + right_m * self.ahead[1]
         return east_m, self.from_m[1] + along_m * self.ahead[1] - right_m * self.ahead[0]
 
     def covers(self, east_m: FloatArray, north_m: FloatArray, ground_m: FloatArray) -> NDArray[np.bool_]:
-        """(n,) whether ground at these heights is within the swath."""
+        """Return (n,) whether ground at these heights is within the swath."""
         along_m, right_m = self.beside(east_m, north_m)
         above_m = self.height_m - ground_m
         angle_rad = np.arctan2(right_m, above_m)
@@ -151,7 +153,7 @@ class Strip:
         return seen & (along_m >= 0.0) & (along_m <= self.length_m) & (above_m > 0.0)
 
     def density(self, east_m: FloatArray, north_m: FloatArray, ground_m: FloatArray, cell_m: float) -> FloatArray:
-        """(n,) pulses per square metre of ground, mean over a cell's width across the line."""
+        """Return (n,) pulses per square metre of ground, mean over a cell's width across the line."""
         _, right_m = self.beside(east_m, north_m)
         above_m = self.height_m - ground_m
         inner, outer = (np.arctan2(right_m + side * cell_m / 2, above_m) for side in (-1.0, 1.0))
@@ -163,14 +165,14 @@ class Strip:
         return np.where(self.covers(east_m, north_m, ground_m), per_m2, 0.0)
 
     def width_m(self, above_m: float) -> tuple[float, float]:
-        """The swath's edges at a height above flat ground, to the right of the line."""
+        """Return the swath's edges at a height above flat ground, to the right of the line."""
         limits = [fan.limits(np.array([above_m])) for fan in self.fans]
         first = min(float(low[0]) for low, _ in limits)
         return above_m * math.tan(first), above_m * math.tan(max(float(high[0]) for _, high in limits))
 
 
 def strip_of(plan: Plan, index: int, start_s: float, end_s: float) -> Strip:
-    """The swath of a line of the plan."""
+    """Return the swath of a line of the plan."""
     table = plan.tables.line[index]
     start_m, end_m = np.array(table.from_m), np.array(table.to_m)
     length_m = float(np.linalg.norm(end_m - start_m))
@@ -181,7 +183,7 @@ def strip_of(plan: Plan, index: int, start_s: float, end_s: float) -> Strip:
 
 
 def corners(plan: Plan) -> FloatArray:
-    """(k, 2) east and north of ground that must be there: around every line, as wide as it can be seen.
+    """Return (k, 2) east and north of ground that must be there: around every line, as wide as it can be seen.
 
     `swath.sim.scene.terrain.MARGIN_M` beyond is there anyway, which is enough for a wing that dips a little; corners
     lie outside the swath only where it is not.
@@ -204,7 +206,7 @@ def corners(plan: Plan) -> FloatArray:
 
 
 def _tilt_rad(plan: Plan) -> float:
-    """How far beams may be from where level wings and the installation point them."""
+    """Return how far beams may be from where level wings and the installation point them."""
     trues = [scanner.true for scanner in plan.tables.scanner.values()]
     mounted_deg = max((math.hypot(true.omega_deg, true.phi_deg, true.kappa_deg) for true in trues), default=0.0)
     flight = plan.tables.flight
@@ -213,7 +215,7 @@ def _tilt_rad(plan: Plan) -> float:
 
 
 def control_points(plan: Plan, scene: Scene) -> FloatArray:
-    """(k, 3) site frame: the plan's ground control points, where some line sees them.
+    """Return (k, 3) site frame: the plan's ground control points, where some line sees them.
 
     Raises:
         PlanError: ``control.points``: there is no room for so many.
@@ -266,12 +268,14 @@ class Survey:
         self.strips = tuple(strip_of(plan, line.index, line.start_s, line.end_s) for line in self.trajectory.lines)
 
     def stations(self, strip: Strip, count: int = 200) -> tuple[FloatArray, FloatArray]:
-        """Distances along a line, and heights above ground there."""
+        """Return distances along a line, and heights above ground there."""
         along_m = np.linspace(0.0, strip.length_m, count)
         return along_m, strip.height_m - self.scene.ground_m(*strip.point(along_m, np.zeros(count)))
 
     def edges(self, strip: Strip, count: int = 60) -> FloatArray:
-        """(2·count, 2) east and north around a swath on the ground as it is: each edge found by going there thrice."""
+        """Return (2·count, 2) east and north around a swath on the ground as it is: each edge found by going there
+        thrice.
+        """
         along_m = np.linspace(0.0, strip.length_m, count)
         sides = []
         for side in (0, 1):
@@ -304,7 +308,7 @@ class Grid:
 
 
 def grid_of(survey: Survey, cells: int = 90_000) -> Grid:
-    """Density and overlap over all swaths, on about so many square cells."""
+    """Return density and overlap over all swaths, on about so many square cells."""
     outline = np.concatenate([survey.edges(strip) for strip in survey.strips])
     low, high = outline.min(axis=0), outline.max(axis=0)
     cell_m = math.sqrt(float(np.prod(high - low)) / cells)
@@ -321,12 +325,12 @@ def grid_of(survey: Survey, cells: int = 90_000) -> Grid:
 
 
 def plan_summary(plan: Plan) -> list[dict[str, Any]]:
-    """One row a line, then one named ``total``; see `summary_of`. Raises PlanError."""
+    """Return one row a line, then one named ``total``; see `summary_of`. Raises PlanError."""
     return summary_of(Survey(plan))
 
 
 def summary_of(survey: Survey) -> list[dict[str, Any]]:
-    """What a plan covers.
+    """Return what a plan covers.
 
     Rows of lines: ``name``, ``length_m``, ``seconds``, ``height_min_m`` and ``height_mean_m`` above ground,
     ``swath_m`` (2 H tan of the half angle on flat ground, H the mean), ``density_per_m2`` (pulses a second within the

@@ -48,7 +48,7 @@ def colour_of(number: int) -> str:
 
 
 def shortened(name: str, most: int) -> str:
-    """A name of so many letters at most."""
+    """Return a name of so many letters at most."""
     return name if len(name) <= most else f"{name[: most - 1]}…"
 
 
@@ -60,7 +60,7 @@ def page_of(axes: Axes) -> Figure:
 
 
 def nice_step(size: float, *, up: bool = False) -> float:
-    """The largest of 1, 2, 5 × 10ⁿ not above a size; ``up``: the smallest not below it."""
+    """Return the largest of 1, 2, 5 × 10ⁿ not above a size; ``up``: the smallest not below it."""
     if size <= 0.0:
         return 1.0
     power = 10.0 ** math.floor(math.log10(size))

@@ -76,7 +76,7 @@ def draw_plan(plan: Plan, path: Path) -> list[dict[str, Any]]:
 
 
 def _tall_panels(rows: int, grid: Grid) -> dict[str, Box]:
-    """The map at the left; at the right the table takes what it needs, the small maps what suits their shape."""
+    """Return the map at the left; at the right the table takes what it needs, the small maps what suits their shape."""
     rows = min(rows, MOST_ROWS + 1)
     table = HEADER_IN + rows * float(np.clip(3.3 / rows, SMALLEST_PITCH_IN, LARGEST_PITCH_IN))
     bottom, left, width = 0.3 + table + 0.45, 10.35, 2.95
@@ -100,7 +100,7 @@ def _panel(figure: Figure, page: tuple[float, float], box: Box) -> Axes:
 
 
 def _track(survey: Survey) -> FloatArray:
-    """(n, 4) time, east, north and ellipsoidal height of the aircraft, every half second or so."""
+    """Return (n, 4) time, east, north and ellipsoidal height of the aircraft, every half second or so."""
     end_s = survey.trajectory.end_s
     time_s = np.linspace(0.0, end_s, int(np.clip(2 * end_s, 200, 8000)))
     points = survey.site.site_from_e(survey.trajectory.poses(time_s).position_e)
@@ -108,7 +108,7 @@ def _track(survey: Survey) -> FloatArray:
 
 
 def _extent(survey: Survey, track: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """South-western and north-eastern corner of what is shown."""
+    """Return south-western and north-eastern corner of what is shown."""
     points = np.concatenate([track[:, 1:3], *(survey.edges(strip) for strip in survey.strips)])
     low, high = points.min(axis=0), points.max(axis=0)
     border = 0.05 * (high - low)
@@ -116,7 +116,7 @@ def _extent(survey: Survey, track: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _framed(low: FloatArray, high: FloatArray, box: Box) -> tuple[FloatArray, FloatArray, float]:
-    """The corners, moved apart until they fill a panel; and by how much north is drawn larger than east."""
+    """Return the corners, moved apart until they fill a panel; and by how much north is drawn larger than east."""
     panel, middle = np.array(box[2:]), (low + high) / 2
     scale = (high - low) / panel
     if scale.max() < STRETCH * scale.min():
@@ -126,7 +126,7 @@ def _framed(low: FloatArray, high: FloatArray, box: Box) -> tuple[FloatArray, Fl
 
 
 def _wide_ground(survey: Survey, low: FloatArray, high: FloatArray) -> Ground:
-    """Heights all over the map; of a raster only where the flight asks for them, and beyond as at the edge."""
+    """Return heights all over the map; of a raster only where the flight asks for them, and beyond as at the edge."""
     if survey.plan.tables.terrain.raster:
         return survey.scene.ground_m
     cell_m = float(np.clip((high - low).max() / GROUND_CELLS, 0.25, 100.0))

@@ -21,24 +21,24 @@ class Head(Protocol):
     """Where pulses come from."""
 
     def pulses(self, start_s: float, stop_s: float) -> Pulses:
-        """Those that leave in this time."""
+        """Return those that leave in this time."""
 
 
 class Wire(Protocol):
     """What the scanner says of them."""
 
     def units(self, pulses: Pulses, measured: Measured, truth: StructArray) -> tuple[list[WireUnit], StructArray]:
-        """Datagrams that are complete, and the truth of their returns."""
+        """Return datagrams that are complete, and the truth of their returns."""
 
     def idle(self, start_s: float, stop_s: float) -> list[WireUnit]:
-        """What is said while the laser is off."""
+        """Return what is said while the laser is off."""
 
     def close(self) -> tuple[list[WireUnit], StructArray]:
-        """What is left."""
+        """Return what is left."""
 
 
 def head_and_wire(plan: Plan, name: str, pps: PulsePerSecond | None, trajectory: Trajectory) -> tuple[Head, Wire]:
-    """The parts of a scanner of the plan; raises `PlanError`."""
+    """Return the parts of a scanner of the plan; raises `PlanError`."""
     tables = plan.tables
     table = tables.scanner[name]
     lost_pps = windows(tables, f"scanner/{name}", "pps_lost")

@@ -14,7 +14,7 @@ SPINNING = ("vlp16", "os1")
 
 
 def mirror_factor(table: ScannerTable) -> float:
-    """Beam angle per encoder angle: 2 for a flat mirror that swings about an axis in its plane, else 1."""
+    """Return beam angle per encoder angle: 2 for a flat mirror that swings about an axis in its plane, else 1."""
     return 2.0 if table.kind == "oscillating" else 1.0
 
 
@@ -32,7 +32,7 @@ def _imu_latency_us(tables: Tables) -> float:
 
 
 def calibration_text(plan: Plan, scanner: str, *, true: bool) -> str:
-    """A calibration file: the true one with every error there is, or the nominal one."""
+    """Return a calibration file: the true one with every error there is, or the nominal one."""
     table = plan.tables.scanner[scanner]
     document: dict[str, Any] = {
         "calibration": _header(plan, scanner, table, "true" if true else "nominal"),

@@ -83,7 +83,7 @@ class LineHead:
         self._check_errors(f"scanner.{name}")
 
     def pulses(self, start_s: float, stop_s: float) -> Pulses:
-        """Every pulse with start_s <= time_s < stop_s."""
+        """Return every pulse with start_s <= time_s < stop_s."""
         number, time_s = self._fired(start_s, stop_s)
         swing = self._deflection.motion(time_s)
         lit = np.abs(swing.angle_rad) <= self._deflection.half_angle_rad
@@ -100,7 +100,7 @@ class LineHead:
         )
 
     def _fired(self, start_s: float, stop_s: float) -> tuple[IntArray, FloatArray]:
-        """Numbers and times of pulses in this time, also of those that leave no light."""
+        """Return numbers and times of pulses in this time, also of those that leave no light."""
         edges = self._oscillator.phase(np.array([start_s, stop_s]) - self._time_offset_s)
         first, last = np.floor(edges * (self._table.prf_hz / self._table.tick_hz)).astype(np.int64)
         number = np.arange(max(first - 1, 0), max(last + 3, 0))
@@ -109,11 +109,11 @@ class LineHead:
         return number[there], time_s[there]
 
     def _encoder(self, swing: Swing) -> IntArray:
-        """(n,) readings: whole counts, signed, 0 at the encoder's index."""
+        """Return (n,) readings: whole counts, signed, 0 at the encoder's index."""
         return np.rint(self._shaft_rad(swing) * (self._table.encoder_counts / (2 * np.pi))).astype(np.int64)
 
     def _shaft_rad(self, swing: Swing) -> FloatArray:
-        """(n,) the same before they are rounded: CONVENTIONS' equation solved for θ_encoder, on the shaft."""
+        """Return (n,) the same before they are rounded: CONVENTIONS' equation solved for θ_encoder, on the shaft."""
         beam = swing.angle_rad - self._latency_s * swing.rate_rps - self._torsion_s2 * swing.acceleration_rps2
         shaft: FloatArray = swing.centre_rad + (beam / self._scale + self._offset_rad) / self._deflection.shaft_factor
         return shaft
@@ -147,12 +147,12 @@ class LineHead:
 
 
 def emission_ticks(table: ScannerTable, number: IntArray) -> IntArray:
-    """(n,) ticks from the plan's start at which pulses of these numbers (n,) leave."""
+    """Return (n,) ticks from the plan's start at which pulses of these numbers (n,) leave."""
     return np.rint(number * table.tick_hz / table.prf_hz).astype(np.int64)
 
 
 def config_geometry(table: ScannerTable) -> dict[str, Any]:
-    """``[scanner.<name>.geometry]`` of the configuration for a line scanner."""
+    """Return ``[scanner.<name>.geometry]`` of the configuration for a line scanner."""
     geometry: dict[str, Any] = {"type": table.kind}
     if table.kind == "polygon":
         geometry["facets"] = table.facets
@@ -226,7 +226,9 @@ def _risley(table: ScannerTable, name: str) -> Deflection:
 
 
 def _turns_until_both_are_back(table: ScannerTable, name: str) -> int:
-    """Turns of the first prism, counted by its encoder, after which the second one stands as at the beginning."""
+    """Return turns of the first prism, counted by its encoder, after which the second one stands as at the
+    beginning.
+    """
     most = int(READING_COUNTS / table.encoder_counts)
     turns = Fraction(table.prism_ratio).limit_denominator(most)
     if abs(float(turns) - table.prism_ratio) > 1e-12:

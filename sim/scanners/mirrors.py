@@ -16,13 +16,14 @@ _DOWN = np.array([0.0, 0.0, 1.0])
 
 
 def reflected(ray: FloatArray, normal: FloatArray) -> FloatArray:
-    """(n, 3) rays (3,) or (n, 3) behind mirrors of these normals (n, 3): u = u0 − 2 (u0·n) n."""
+    """Return (n, 3) rays (3,) or (n, 3) behind mirrors of these normals (n, 3): u = u0 − 2 (u0·n) n."""
     away: FloatArray = ray - 2.0 * (normal * ray).sum(axis=1, keepdims=True) * normal
     return away
 
 
 def refracted(ray: FloatArray, normal: FloatArray, ratio: float) -> FloatArray:
-    """(n, 3) rays (n, 3) behind surfaces whose normals (n, 3) or (3,) point along with them; Snell's law as vectors.
+    """Return (n, 3) rays (n, 3) behind surfaces whose normals (n, 3) or (3,) point along with them; Snell's law as
+    vectors.
 
     Args:
         ray, normal: of n pulses.
@@ -37,7 +38,7 @@ def refracted(ray: FloatArray, normal: FloatArray, ratio: float) -> FloatArray:
 
 
 def swung_mirror(beam_rad: FloatArray, facet_tilt_rad: FloatArray | float, plane_tilt_rad: float) -> FloatArray:
-    """(n, 3) off a flat mirror whose axis is x, 45° to the laser at rest: oscillating mirror and polygon.
+    """Return (n, 3) off a flat mirror whose axis is x, 45° to the laser at rest: oscillating mirror and polygon.
 
     Args:
         beam_rad: (n,) θ, twice the turn of the mirror from rest.
@@ -55,7 +56,7 @@ def swung_mirror(beam_rad: FloatArray, facet_tilt_rad: FloatArray | float, plane
 
 
 def monogon(shaft_rad: FloatArray, plane_tilt_rad: float) -> FloatArray:
-    """(n, 3) off a single mirror turned by ``shaft_rad`` (n,) about the laser's beam; Δη/2 off its 45°."""
+    """Return (n, 3) off a single mirror turned by ``shaft_rad`` (n,) about the laser's beam; Δη/2 off its 45°."""
     slope = np.pi / 4 - 0.5 * plane_tilt_rad
     normal = np.empty((len(shaft_rad), 3))
     normal[:, 0] = -np.cos(slope)
@@ -65,7 +66,8 @@ def monogon(shaft_rad: FloatArray, plane_tilt_rad: float) -> FloatArray:
 
 
 def nutating(shaft_rad: FloatArray, nutation_rad: float) -> FloatArray:
-    """(n, 3) off a mirror whose normal leans by ψ from its shaft, which stands at 45° to the laser (Palmer scan).
+    """Return (n, 3) off a mirror whose normal leans by ψ from its shaft, which stands at 45° to the laser (Palmer
+    scan).
 
     At ``shaft_rad`` (n,) 0 the normal leans in the plane of incidence so that the beam goes forward by 2ψ; a quarter
     turn on it leans to the right.
@@ -82,7 +84,8 @@ def nutating(shaft_rad: FloatArray, nutation_rad: float) -> FloatArray:
 def risley(
     first_rad: FloatArray, second_rad: FloatArray, wedge_rad: tuple[float, float], refractive_index: float
 ) -> FloatArray:
-    """(n, 3) through two prisms, each with a flat entry and a wedged exit, at the four surfaces; towards the thick end.
+    """Return (n, 3) through two prisms, each with a flat entry and a wedged exit, at the four surfaces; towards the
+    thick end.
 
     Args:
         first_rad, second_rad: (n,) turns of the prisms; at 0 the thin end lies forward.

@@ -48,7 +48,7 @@ Motion = Callable[[FloatArray], Swing]
 
 
 def sine(half_angle_rad: float, scan_hz: float) -> Motion:
-    """θ = A sin 2πft."""
+    """Return θ = A sin 2πft."""
     turn = 2 * np.pi * scan_hz
 
     def swing(time_s: FloatArray) -> Swing:
@@ -60,7 +60,7 @@ def sine(half_angle_rad: float, scan_hz: float) -> Motion:
 
 
 def triangle(half_angle_rad: float, scan_hz: float) -> Motion:
-    """Even motion to and fro; while it turns round the rate goes from +v to −v as a cosine, so θ̈ is continuous.
+    """Return even motion to and fro; while it turns round the rate goes from +v to −v as a cosine, so θ̈ is continuous.
 
     Phases are in periods: from a zero crossing the even part goes to (1 − q)/4, the turning takes q/2.
     """
@@ -82,7 +82,7 @@ def triangle(half_angle_rad: float, scan_hz: float) -> Motion:
 
 
 def turning(scan_hz: float, turns: int = 1) -> Motion:
-    """A shaft that turns evenly; its angle counts on through so many turns, from minus to plus half of them."""
+    """Return a shaft that turns evenly; its angle counts on through so many turns, from minus to plus half of them."""
 
     def swing(time_s: FloatArray) -> Swing:
         angle = 2 * np.pi * turns * _within(scan_hz * time_s / turns)
@@ -92,7 +92,7 @@ def turning(scan_hz: float, turns: int = 1) -> Motion:
 
 
 def polygon(scan_hz: float, facets: int) -> Motion:
-    """A polygon that turns evenly: θ is twice the shaft's angle from the centre of the facet in the light."""
+    """Return a polygon that turns evenly: θ is twice the shaft's angle from the centre of the facet in the light."""
 
     def swing(time_s: FloatArray) -> Swing:
         turns = scan_hz * time_s
@@ -107,7 +107,7 @@ def polygon(scan_hz: float, facets: int) -> Motion:
 
 
 def _within(periods: FloatArray) -> FloatArray:
-    """(n,) without whole periods, −½ … ½."""
+    """Return (n,) without whole periods, −½ … ½."""
     rest: FloatArray = periods - np.floor(periods + 0.5)
     return rest
 

@@ -41,7 +41,7 @@ class Mounting:
         self._rot_omega = Rotation.from_euler("x", true.omega_deg, degrees=True).as_matrix()
 
     def beams(self, pulses: Pulses, poses: Poses, site: Site) -> Beams:
-        """Axes of pulses as they leave, at their poses of emission."""
+        """Return axes of pulses as they leave, at their poses of emission."""
         origin_e, origin, direction = np.empty((3, len(pulses), 3))
         _axes(
             (pulses.origin_s, pulses.direction_s, pulses.phi_extra_rad),
@@ -55,7 +55,7 @@ class Mounting:
 
 @jit_inline
 def _turned(rotation: FloatArray, vector: FloatArray | Three) -> Three:
-    """A vector (3,) by a matrix (3, 3), as three numbers."""
+    """Return a vector (3,) by a matrix (3, 3), as three numbers."""
     return (
         rotation[0, 0] * vector[0] + rotation[0, 1] * vector[1] + rotation[0, 2] * vector[2],
         rotation[1, 0] * vector[0] + rotation[1, 1] * vector[1] + rotation[1, 2] * vector[2],

@@ -49,7 +49,7 @@ INITIALIZATION_ID = 4_711
 
 
 def os1_metadata(table: ScannerTable) -> bytes:
-    """The metadata of the plan's head as its HTTP interface gives it: JSON, in sections, as of firmware 2.5.
+    """Return the metadata of the plan's head as its HTTP interface gives it: JSON, in sections, as of firmware 2.5.
 
     Args:
         table: of the plan.
@@ -113,7 +113,8 @@ class OusterWire:
         self._arrivals = Arrivals(plan, self._source)
 
     def units(self, pulses: Pulses, measured: Measured, truth: StructArray) -> tuple[list[WireUnit], StructArray]:
-        """Packets that are complete, and the truth of their returns in the order in which `OusterParser` gives them.
+        """Return packets that are complete, and the truth of their returns in the order in which `OusterParser` gives
+        them.
 
         Args:
             pulses: of `Os1Head`, consecutive.
@@ -133,15 +134,15 @@ class OusterWire:
         return self._packets(number, time_s, fields), _truth(raw, slots, truth)
 
     def idle(self, start_s: float, stop_s: float) -> list[WireUnit]:
-        """A head that does not fire says nothing."""
+        """Return a head that does not fire says nothing."""
         return []
 
     def close(self) -> tuple[list[WireUnit], StructArray]:
-        """A packet that is not full is not sent."""
+        """Return a packet that is not full is not sent."""
         return [], np.empty(0, RETURN_TRUTH_DTYPE)
 
     def _packets(self, number: IntArray, time_s: FloatArray, fields: dict[str, IntArray]) -> list[WireUnit]:
-        """Packets of pulses (n,) with these fields (n,)."""
+        """Return packets of pulses (n,) with these fields (n,)."""
         shape = (-1, COLUMNS_OF_PACKET, BEAMS)
         shaped = {name: values.reshape(shape) for name, values in fields.items()}
         fired_s = time_s.reshape(shape)[:, :, 0]
@@ -158,7 +159,7 @@ class OusterWire:
 
 
 def _strongest(raw: IntArray, light: IntArray, count: int) -> list[IntArray]:
-    """Slots (n,) of the strongest return, and of the second-strongest where two are wanted."""
+    """Return slots (n,) of the strongest return, and of the second-strongest where two are wanted."""
     rank = np.where(raw > 0, light, -1)
     slots = [best_slot(rank)]
     if count == 2:
@@ -168,7 +169,7 @@ def _strongest(raw: IntArray, light: IntArray, count: int) -> list[IntArray]:
 
 
 def _truth(raw: IntArray, slots: list[IntArray], truth: StructArray) -> StructArray:
-    """Truth of the returns in these slots, (n,) each, flattened: pulse by pulse, of two the nearer first."""
+    """Return truth of the returns in these slots, (n,) each, flattened: pulse by pulse, of two the nearer first."""
     pulse = np.arange(len(raw))
     rows = np.stack([truth[pulse, slot] for slot in slots], axis=1)
     there = np.stack([slot >= 0 for slot in slots], axis=1)
@@ -189,7 +190,8 @@ def _check_serial(serial: str, key: str) -> None:
 
 
 def config_table(table: ScannerTable, name: str, transport: str) -> dict[str, Any]:
-    """``[scanner.<name>]`` of the configuration that records this head; its metadata beside it is ``<name>.json``.
+    """Return ``[scanner.<name>]`` of the configuration that records this head; its metadata beside it is
+    ``<name>.json``.
 
     Args:
         table: of the plan.

@@ -72,7 +72,7 @@ class Ranging:
         _check(table, f"scanner.{name}")
 
     def measure(self, pulses: Pulses, echoes: Echoes, from_height_m: FloatArray, to_height_m: FloatArray) -> Measured:
-        """What the device says.
+        """Return what the device says.
 
         Args:
             pulses: n.
@@ -99,14 +99,14 @@ class Ranging:
         return Measured(range_m=placed[0], intensity=placed[1], pulse_width_ns=placed[2])
 
     def _intensity(self, range_m: FloatArray, reflectance: FloatArray) -> FloatArray:
-        """(k,) whole counts: reflectance by the square of the distance and what the air leaves of it."""
+        """Return (k,) whole counts: reflectance by the square of the distance and what the air leaves of it."""
         near = np.maximum(range_m, 1e-3)  # an echo at the scanner itself is bright, not infinite
         power = reflectance * (self._table.reference_range_m / near) ** 2 * self._air.transmission(range_m)
         counts: FloatArray = np.clip(np.rint(self._counts.full * power), 0.0, self._counts.most)
         return counts
 
     def _model_range(self, range_m: FloatArray, intensity: FloatArray, channel: NDArray[np.uint16]) -> FloatArray:
-        """(k,) ρ_measured of CONVENTIONS: ρ = (1 + range_scale) ρ_measured + range_offset − ibrc(intensity).
+        """Return (k,) ρ_measured of CONVENTIONS: ρ = (1 + range_scale) ρ_measured + range_offset − ibrc(intensity).
 
         A beam's own correction is added to the offset, as the calibration's other tables are.
         """
@@ -117,7 +117,7 @@ class Ranging:
         return measured_m
 
     def _sigma_m(self, intensity: FloatArray, depth_m: FloatArray) -> FloatArray:
-        """(k,) of the noise: less for bright echoes, more where the footprint lies on a slope."""
+        """Return (k,) of the noise: less for bright echoes, more where the footprint lies on a slope."""
         noise = self._table.range_noise
         weak = 0.1 * self._counts.full / np.maximum(intensity, 1.0)
         sigma: FloatArray = np.sqrt(noise.sigma_m**2 * weak + (noise.footprint * depth_m) ** 2)
@@ -125,7 +125,7 @@ class Ranging:
 
 
 def packed(measured: Measured, truth: StructArray) -> tuple[Measured, StructArray]:
-    """The same, nearest first, slots without a return at the end; ``truth`` (n, R) goes along, renumbered.
+    """Return the same, nearest first, slots without a return at the end; ``truth`` (n, R) goes along, renumbered.
 
     Args:
         measured: of n pulses.
@@ -167,7 +167,7 @@ def _check(table: ScannerTable, key: str) -> None:
 
 
 def _beam_corrections(table: ScannerTable) -> FloatArray:
-    """(channels + 1,) ``range_m`` of every beam; the last one, of all others, is 0."""
+    """Return (channels + 1,) ``range_m`` of every beam; the last one, of all others, is 0."""
     corrections = np.zeros(max((beam.channel for beam in table.beam), default=-1) + 2)
     for beam in table.beam:
         corrections[beam.channel] += beam.range_m
@@ -175,7 +175,7 @@ def _beam_corrections(table: ScannerTable) -> FloatArray:
 
 
 def _gauss(key: np.uint64, number: IntArray, slot: IntArray) -> FloatArray:
-    """(k,) standard normal numbers, each a function of pulse number and slot (k,) alone.
+    """Return (k,) standard normal numbers, each a function of pulse number and slot (k,) alone.
 
     Counters through SplitMix64's mixer (Steele, Lea, Flood 2014), pairs through Box and Muller.
     """

@@ -58,7 +58,7 @@ class Scanner:
         self._first_number = zlib.crc32(name.encode()) << 31  # the scene draws by it: two scanners see other leaves
 
     def work(self, stop_s: float) -> Iterator[tuple[list[WireUnit], StructArray]]:
-        """Everything until a time, block by block: units in order of time, truth of the returns in them."""
+        """Yield everything until a time, block by block: units in order of time, truth of the returns in them."""
         for start_s, end_s, laser_on in self._periods(stop_s):
             if laser_on:
                 for block_s in _cuts(start_s, end_s):
@@ -90,7 +90,7 @@ class Scanner:
         return self._wire.units(pulses, measured, self._truth(pulses, beams, echoes))
 
     def _cast(self, pulses: Pulses, beams: Beams) -> Echoes:
-        """Echoes along the beams; a bent beam is cast twice, since what it meets says how much it bends."""
+        """Return echoes along the beams; a bent beam is cast twice, since what it meets says how much it bends."""
         straight = self._cast_along(pulses, beams, beams.direction)
         if not self._air.bends:
             return straight
@@ -112,13 +112,15 @@ class Scanner:
         )
 
     def _down(self, origin: FloatArray) -> FloatArray:
-        """(n, 3) the plumb line, to the curvature of a sphere."""
+        """Return (n, 3) the plumb line, to the curvature of a sphere."""
         down = np.stack([-origin[:, 0], -origin[:, 1], np.full(len(origin), -EARTH_RADIUS_M)], axis=1)
         unit: FloatArray = down / np.linalg.norm(down, axis=1, keepdims=True)
         return unit
 
     def _heights(self, beams: Beams, echoes: Echoes) -> tuple[FloatArray, FloatArray]:
-        """Heights above the ellipsoid of the scanner (n,) and of echoes (n, R), for the air: good to a decimetre."""
+        """Return heights above the ellipsoid of the scanner (n,) and of echoes (n, R), for the air: good to a
+        decimetre.
+        """
         rho = echoes.range_m
         x = beams.origin[:, :1] + rho * beams.direction[:, :1]
         y = beams.origin[:, 1:2] + rho * beams.direction[:, 1:2]
@@ -127,7 +129,7 @@ class Scanner:
         return above, z + (x**2 + y**2) / (2 * EARTH_RADIUS_M)
 
     def _truth(self, pulses: Pulses, beams: Beams, echoes: Echoes) -> StructArray:
-        """(n, R) rows; those of empty slots mean nothing."""
+        """Return (n, R) rows; those of empty slots mean nothing."""
         rows = np.zeros(echoes.range_m.shape, RETURN_TRUTH_DTYPE)
         directions_e = beams.direction @ self._site.rot_site_from_e
         points_e = beams.origin_e[:, np.newaxis] + echoes.range_m[:, :, np.newaxis] * directions_e[:, np.newaxis]
@@ -144,7 +146,7 @@ class Scanner:
 
 
 def _cuts(start_s: float, stop_s: float) -> Iterator[tuple[float, float]]:
-    """The time between, cut at whole multiples of a block."""
+    """Yield the time between, cut at whole multiples of a block."""
     at_s = start_s
     while at_s < stop_s:
         next_s = min(stop_s, (np.floor(at_s / BLOCK_S + 1e-9) + 1) * BLOCK_S)

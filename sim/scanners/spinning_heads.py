@@ -63,7 +63,9 @@ class Vlp16Head:
         self._up_m = VLP16.beams.up_m
 
     def pulses(self, start_s: float, stop_s: float) -> Pulses:
-        """Every pulse with start_s <= time_s < stop_s, in order of firing, which is that of the packets' places."""
+        """Return every pulse with start_s <= time_s < stop_s, in order of firing, which is that of the packets'
+        places.
+        """
         number = _numbers(self._oscillator, SEQUENCE_NS, LASERS, start_s, stop_s)
         sequence, laser = np.divmod(number, LASERS)
         sequences = np.unique(sequence)
@@ -86,12 +88,12 @@ class Vlp16Head:
         )
 
     def _turn(self, head_ns: IntArray) -> FloatArray:
-        """Where the encoder stands, turns 0 … 1, at times of the head's oscillator."""
+        """Return where the encoder stands, turns 0 … 1, at times of the head's oscillator."""
         turned: FloatArray = np.mod(self._turns_per_ns * head_ns, 1.0)
         return turned
 
     def _directions(self, fired_ns: IntArray, laser: IntArray) -> FloatArray:
-        """(n, 3) x = cos ω sin α, y = cos ω cos α, z = sin ω (VLP-16 manual, 9.2)."""
+        """Return (n, 3) x = cos ω sin α, y = cos ω cos α, z = sin ω (VLP-16 manual, 9.2)."""
         azimuth = 2 * np.pi * self._turn(fired_ns) + self._ahead_rad + self._azimuth_rad[laser]
         flat = np.cos(self._elevation_rad)[laser]
         up = np.sin(self._elevation_rad)[laser]
@@ -123,7 +125,7 @@ class Os1Head:
         self._azimuth_rad = self._head.azimuth_rad + azimuth_rad
 
     def pulses(self, start_s: float, stop_s: float) -> Pulses:
-        """Every pulse with start_s <= time_s < stop_s, columns in order, beams from the top row down."""
+        """Return every pulse with start_s <= time_s < stop_s, columns in order, beams from the top row down."""
         beams = self._head.beams
         column = _numbers(self._oscillator, self._column_ns, 1, start_s, stop_s)
         time_s = self._oscillator.time_of(self._column_ns * column.astype(np.float64))
@@ -142,7 +144,7 @@ class Os1Head:
         )
 
     def _beams(self, encoder_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Origins and directions (columns · beams, 3) in the sensor frame ("Lidar Range to XYZ")."""
+        """Return origins and directions (columns · beams, 3) in the sensor frame ("Lidar Range to XYZ")."""
         heading = encoder_rad[:, np.newaxis] - self._azimuth_rad
         flat, up = np.cos(self._altitude_rad), np.sin(self._altitude_rad)
         direction = np.stack([flat * np.cos(heading), flat * np.sin(heading), np.broadcast_to(up, heading.shape)], 2)
@@ -156,7 +158,7 @@ class Os1Head:
 
 
 def _numbers(oscillator: Oscillator, spacing_ns: float, each: int, start_s: float, stop_s: float) -> IntArray:
-    """Numbers of all pulses that may leave in this time: ``each`` of them together, a spacing apart."""
+    """Return numbers of all pulses that may leave in this time: ``each`` of them together, a spacing apart."""
     first, last = np.floor(oscillator.phase(np.array([start_s, stop_s])) / spacing_ns).astype(np.int64)
     return np.arange(max(first - 1, 0) * each, max(last + 2, 0) * each)
 
@@ -168,7 +170,9 @@ def _ahead_rad(table: ScannerTable, turning: float = 1.0) -> float:
 
 
 def _checked(table: ScannerTable, name: str, beams: int) -> tuple[FloatArray, FloatArray]:
-    """What ``[[beam]]`` adds to azimuths and elevations, (beams,) each; refuses what a spinning head cannot have."""
+    """Return what ``[[beam]]`` adds to azimuths and elevations, (beams,) each; refuses what a spinning head cannot
+    have.
+    """
     for key in NOT_OF_HEADS:
         if getattr(table.true, key) != 0.0:
             text = f"got {getattr(table.true, key):g}, want 0: a head that turns full circles has no such error"

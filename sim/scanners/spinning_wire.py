@@ -54,7 +54,7 @@ class HeadClock:
         self._anchor = np.zeros(0, np.int64)  # latest second at which it was locked, −2: none
 
     def ticks(self, time_s: FloatArray) -> IntArray:
-        """(n,) its reading at true times (n,), whole ticks."""
+        """Return (n,) its reading at true times (n,), whole ticks."""
         time_s = np.asarray(time_s, np.float64)
         free = self._oscillator.ticks(time_s) + self._at_start
         if self._pps is None:
@@ -68,12 +68,12 @@ class HeadClock:
         return np.where(locked | (anchor > -2), whole, free)
 
     def status(self, time_s: FloatArray) -> IntArray:
-        """(n,) of the pulse at true times (n,): `PPS_ABSENT`, `PPS_SYNCHRONIZING` or `PPS_LOCKED`."""
+        """Return (n,) of the pulse at true times (n,): `PPS_ABSENT`, `PPS_SYNCHRONIZING` or `PPS_LOCKED`."""
         time_s = np.asarray(time_s, np.float64)
         return np.full(time_s.shape, PPS_ABSENT) if self._pps is None else self._of(self._pps, time_s)[0]
 
     def _of(self, pps: PulsePerSecond, time_s: FloatArray) -> tuple[IntArray, IntArray]:
-        """Status and anchor of the seconds that times (n,) lie in."""
+        """Return status and anchor of the seconds that times (n,) lie in."""
         second = pps.latest(time_s)
         if len(second) and int(second.max()) + 2 > len(self._status):
             self._follow(pps, 2 * int(second.max()) + 64)
@@ -103,7 +103,7 @@ class PacketCutter:
         self._waiting: list[NDArray[Any]] | None = None
 
     def take(self, columns: list[NDArray[Any]]) -> list[NDArray[Any]]:
-        """Whole packets of columns (n, …), whose first is the pulses' number; (k · pulses, …) each."""
+        """Return whole packets of columns (n, …), whose first is the pulses' number; (k · pulses, …) each."""
         number, waiting = columns[0], self._waiting
         if waiting is not None and len(number) and number[0] == waiting[0][0] + len(waiting[0]):
             columns = [np.concatenate(pair) for pair in zip(waiting, columns, strict=True)]
@@ -131,7 +131,7 @@ class Arrivals:
         self._latest_s = -np.inf
 
     def times(self, sent_s: FloatArray) -> list[float]:
-        """(n,) of datagrams in order, whose last firing was at ``sent_s`` (n,)."""
+        """Return (n,) of datagrams in order, whose last firing was at ``sent_s`` (n,)."""
         jitter_s = self._rng.exponential(size=len(sent_s)) * self._mean_s
         arrived = np.maximum.accumulate(np.concatenate([[self._latest_s], sent_s + PROCESSING_S + jitter_s]))
         self._latest_s = float(arrived[-1])
@@ -140,24 +140,24 @@ class Arrivals:
 
 
 def counts(measured: Measured, unit_m: float, most: int) -> tuple[IntArray, IntArray]:
-    """Ranges (n, R) in whole units, 0 where there is none or a packet cannot say it; light 0 … 255."""
+    """Return ranges (n, R) in whole units, 0 where there is none or a packet cannot say it; light 0 … 255."""
     raw = np.rint(measured.range_m / unit_m)
     raw = np.where((raw >= 1) & (raw <= most), raw, 0)
     return raw.astype(np.int64), np.clip(np.rint(measured.intensity), 0, 255).astype(np.int64)
 
 
 def best_slot(rank: IntArray) -> IntArray:
-    """(n,) slot of the greatest rank of each pulse, the first of equal ones; −1 where all of (n, R) are −1."""
+    """Return (n,) slot of the greatest rank of each pulse, the first of equal ones; −1 where all of (n, R) are −1."""
     return np.where(rank.max(axis=1) >= 0, rank.argmax(axis=1), -1)
 
 
 def in_slot(values: IntArray, slot: IntArray) -> IntArray:
-    """(n,) of values (n, R) in these slots (n,); 0 where it is −1."""
+    """Return (n,) of values (n, R) in these slots (n,); 0 where it is −1."""
     return np.where(slot >= 0, values[np.arange(len(values)), slot], 0)
 
 
 def head_config(table: ScannerTable, transport: str, protocol: str) -> dict[str, Any]:
-    """``[scanner.<name>]`` of the recording configuration, as far as all spinning heads have it."""
+    """Return ``[scanner.<name>]`` of the recording configuration, as far as all spinning heads have it."""
     nominal = table.nominal
     config = {
         "transport": transport,

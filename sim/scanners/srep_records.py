@@ -42,7 +42,7 @@ class Records:
         return len(self.ticks)
 
     def split(self, at: int) -> tuple[Records, Records]:
-        """The first so many, and the others."""
+        """Return the first so many, and the others."""
         returns = np.count_nonzero(self.body["slot"]["range"][:at])
         return (
             Records(self.ticks[:at], self.time_s[:at], self.zone[:at], self.body[:at], self.truth[:returns]),
@@ -50,7 +50,7 @@ class Records:
         )
 
     def followed_by(self, other: Records) -> Records:
-        """These and others."""
+        """Return these and others."""
         if not len(self):
             return other
         return Records(
@@ -63,7 +63,7 @@ class Records:
 
 
 def no_records(return_slots: int) -> Records:
-    """None."""
+    """Return none."""
     none = np.zeros(0, np.int64)
     return Records(none, np.zeros(0), none, np.zeros(0, pulse_dtype(return_slots)), np.zeros(0, RETURN_TRUTH_DTYPE))
 
@@ -74,10 +74,10 @@ class RecordMaker(Protocol):
     lost_echoes: int
 
     def take(self, pulses: Pulses, measured: Measured, truth: StructArray) -> Records:
-        """Records that are complete with these pulses."""
+        """Return records that are complete with these pulses."""
 
     def rest(self) -> Records:
-        """Records of pulses after which none follows for long."""
+        """Return records of pulses after which none follows for long."""
 
 
 class WholeRanges:
@@ -94,7 +94,7 @@ class WholeRanges:
         self._zone_m = LIGHT_MPS / (2.0 * table.prf_hz)
 
     def take(self, pulses: Pulses, measured: Measured, truth: StructArray) -> Records:
-        """A record for every pulse."""
+        """Return a record for every pulse."""
         measured, truth = packed(measured, truth)
         body = np.zeros(len(pulses), pulse_dtype(measured.range_m.shape[1]))
         body["encoder"] = pulses.encoder
@@ -104,7 +104,7 @@ class WholeRanges:
         return Records(ticks, pulses.time_s, zones, body, rows)
 
     def rest(self) -> Records:
-        """None wait."""
+        """Return none wait."""
         return no_records(self._table.return_slots)
 
     def _zones(self, first_m: FloatArray) -> IntArray:
@@ -132,7 +132,7 @@ class ApparentRanges:
         self._flying = _Flying(np.zeros(0, np.int64), np.zeros((3, 0)), np.zeros(0, RETURN_TRUTH_DTYPE))
 
     def take(self, pulses: Pulses, measured: Measured, truth: StructArray) -> Records:
-        """Records of all pulses but the last, into which echoes may still come."""
+        """Return records of all pulses but the last, into which echoes may still come."""
         ticks = emission_ticks(self._table, pulses.number)
         index = np.flatnonzero(measured.range_m > 0.0)
         columns = (measured.range_m, measured.intensity, measured.pulse_width_ns)
@@ -143,11 +143,11 @@ class ApparentRanges:
         return self._complete(len(self._emissions.ticks) - 1)
 
     def rest(self) -> Records:
-        """The last one."""
+        """Return the last one."""
         return self._complete(len(self._emissions.ticks))
 
     def _complete(self, n: int) -> Records:
-        """The first n records; what belongs to later ones waits."""
+        """Return the first n records; what belongs to later ones waits."""
         if n <= 0:
             return no_records(self._table.return_slots)
         emissions, flying = self._emissions, self._flying
@@ -165,7 +165,7 @@ class ApparentRanges:
         return Records(emissions.ticks[:n], emissions.time_s[:n], zones, body, flying.truth.take(echo))
 
     def _slots(self, record: IntArray, apparent_m: FloatArray, n: int) -> tuple[IntArray, IntArray]:
-        """Which echoes find a slot in the first n records, and which slot: in the order in which they come."""
+        """Return which echoes find a slot in the first n records, and which slot: in the order in which they come."""
         come = np.flatnonzero(record < n)
         seen = come[np.rint(apparent_m[come] / RANGE_UNIT_M) > 0.0]
         echo = seen[np.lexsort((apparent_m[seen], record[seen]))]

@@ -61,7 +61,9 @@ class PpsLatch:
         self._ticks: UInt64Array = np.zeros(0, np.uint64)
 
     def seen(self, time_s: FloatArray) -> tuple[IntArray, UInt64Array, BoolArray]:
-        """Edges latched so far, the counter at the latest one, and whether the device follows them; (n,) each."""
+        """Return edges latched so far, the counter at the latest one, and whether the device follows them; (n,)
+        each.
+        """
         self._reach(float(time_s.max(initial=0.0)))
         count = np.searchsorted(self._edge_s, time_s, side="right")
         latched = count > 0
@@ -136,7 +138,7 @@ class SrepWire:
         return self._records.lost_echoes
 
     def units(self, pulses: Pulses, measured: Measured, truth: StructArray) -> tuple[list[WireUnit], StructArray]:
-        """Datagrams that are complete, and the truth of their returns in the order in which they are parsed.
+        """Return datagrams that are complete, and the truth of their returns in the order in which they are parsed.
 
         Truth of datagrams that `idle` sent comes first. What does not fill a datagram waits.
         """
@@ -144,7 +146,7 @@ class SrepWire:
         return units, self._with_owed(rows)
 
     def idle(self, start_s: float, stop_s: float) -> list[WireUnit]:
-        """The laser is off: what waited, then heartbeats (N = 0) at whole tenths of a second."""
+        """Return the laser is off: what waited, then heartbeats (N = 0) at whole tenths of a second."""
         units, rows = self._send(self._records.rest(), ended=True)
         self._owed = self._with_owed(rows)
         time_s = np.arange(np.floor(HEARTBEATS_HZ * start_s), np.ceil(HEARTBEATS_HZ * stop_s) + 1) / HEARTBEATS_HZ
@@ -156,7 +158,7 @@ class SrepWire:
         return units + self._arriving(time_s + PROCESSING_S, encode_datagrams(header, body))
 
     def close(self) -> tuple[list[WireUnit], StructArray]:
-        """What still waits."""
+        """Return what still waits."""
         units, rows = self._send(self._records.rest(), ended=True)
         return units, self._with_owed(rows)
 
@@ -165,7 +167,7 @@ class SrepWire:
         return np.concatenate([owed, rows]) if len(owed) else rows
 
     def _send(self, records: Records, *, ended: bool) -> tuple[list[WireUnit], StructArray]:
-        """Datagrams of what waited and of further records; ``ended``: also one that is not full."""
+        """Return datagrams of what waited and of further records; ``ended``: also one that is not full."""
         waiting = self._waiting.followed_by(records)
         edges = _datagram_edges(waiting, self._table.pulses_per_datagram)
         if not ended and len(edges) > 1 and edges[-1] - edges[-2] < self._table.pulses_per_datagram:
@@ -181,7 +183,7 @@ class SrepWire:
         return self._arriving(time_s, _encoded(header, sent.body, edges)), sent.truth
 
     def _headers(self, first_ticks: IntArray, time_s: FloatArray, zone: IntArray, laser: int) -> StructArray:
-        """(m,) of datagrams sent at these times."""
+        """Return (m,) of datagrams sent at these times."""
         table = self._table
         count, latched_ticks, locked = self._latch.seen(time_s)
         header = np.zeros(len(first_ticks), HEADER_DTYPE)
@@ -197,7 +199,7 @@ class SrepWire:
         return header
 
     def _arriving(self, time_s: FloatArray, datagrams: list[bytes]) -> list[WireUnit]:
-        """Units of datagrams sent at these times (m,), none before the one ahead of it."""
+        """Return units of datagrams sent at these times (m,), none before the one ahead of it."""
         if self._jitter_s > 0.0:
             time_s = time_s + self._random.exponential(self._jitter_s, len(time_s))
         arrive_s = np.maximum.accumulate(np.concatenate([[self._arrived_s], time_s]))
@@ -206,7 +208,7 @@ class SrepWire:
 
 
 def config_table(table: ScannerTable, name: str, transport: str) -> dict[str, Any]:
-    """``[scanner.<name>]`` of the configuration that records it; raises `PlanError`."""
+    """Return ``[scanner.<name>]`` of the configuration that records it; raises `PlanError`."""
     matrix = np.array(table.installation)
     if not np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-6) or np.linalg.det(matrix) < 0.0:
         text = "is no rotation: want rows of length 1, perpendicular, determinant +1"
@@ -240,7 +242,7 @@ def _check(table: ScannerTable, key: str) -> None:
 
 
 def _datagram_edges(records: Records, pulses: int) -> IntArray:
-    """(m + 1,) where datagrams begin and the last one ends: full, or zone or epoch changes, or a long pause."""
+    """Return (m + 1,) where datagrams begin and the last one ends: full, or zone or epoch changes, or a long pause."""
     if not len(records):
         return np.zeros(1, np.int64)
     new = records.zone[1:] != records.zone[:-1]
@@ -251,7 +253,9 @@ def _datagram_edges(records: Records, pulses: int) -> IntArray:
 
 
 def _encoded(header: StructArray, body: StructArray, edges: IntArray) -> list[bytes]:
-    """Datagrams between edges (m + 1,), those of one length at once: where zones alternate they are many and short."""
+    """Return datagrams between edges (m + 1,), those of one length at once: where zones alternate they are many and
+    short.
+    """
     sizes = np.diff(edges)
     datagrams = [b""] * len(sizes)
     for size in np.unique(sizes).tolist():

@@ -44,10 +44,10 @@ class Track(Protocol):
     """Where the aircraft is, for the sentences its head is given; `swath.sim.flight.trajectory.Trajectory` is one."""
 
     def geodetic(self, time_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Latitude, longitude, height of (n,) times."""
+        """Return latitude, longitude, height of (n,) times."""
 
     def velocity_l(self, time_s: FloatArray) -> FloatArray:
-        """(n, 3) north, east, down."""
+        """Return (n, 3) north, east, down."""
 
 
 class _Sent(NamedTuple):
@@ -87,7 +87,8 @@ class VelodyneWire:
         self._positions = _Positions(plan, f"{self._source}/aux", self._clock, track if pps is not None else None)
 
     def units(self, pulses: Pulses, measured: Measured, truth: StructArray) -> tuple[list[WireUnit], StructArray]:
-        """Packets that are complete, in order of time, and the truth of their returns as `VelodyneParser` gives them.
+        """Return packets that are complete, in order of time, and the truth of their returns as `VelodyneParser` gives
+        them.
 
         Args:
             pulses: of `Vlp16Head`, consecutive.
@@ -104,21 +105,21 @@ class VelodyneWire:
         return self._arriving(positions + self._packets(time_s, encoder, content)), rows
 
     def idle(self, start_s: float, stop_s: float) -> list[WireUnit]:
-        """Position packets go on while the laser is off."""
+        """Return position packets go on while the laser is off."""
         return self._arriving(self._positions.until(stop_s))
 
     def close(self) -> tuple[list[WireUnit], StructArray]:
-        """A packet that is not full is not sent."""
+        """Return a packet that is not full is not sent."""
         return [], np.empty(0, RETURN_TRUTH_DTYPE)
 
     def _arriving(self, sent: list[_Sent]) -> list[WireUnit]:
-        """Packets of both ports as the host gets them: in the order of their sending."""
+        """Return packets of both ports as the host gets them: in the order of their sending."""
         sent = sorted(sent, key=lambda packet: packet.time_s)
         times_s = self._arrivals.times(np.array([packet.time_s for packet in sent]))
         return [WireUnit(at_s, packet.source, packet.data) for at_s, packet in zip(times_s, sent, strict=True)]
 
     def _packets(self, time_s: FloatArray, encoder: IntArray, content: IntArray) -> list[_Sent]:
-        """Data packets of pulses (n,), whose content is (returns, n, range and light)."""
+        """Return data packets of pulses (n,), whose content is (returns, n, range and light)."""
         mode, returns = (MODE_DUAL, 2) if self._dual else (MODE_STRONGEST, 1)
         packets = len(time_s) // (self._groups * PLACES)
         # a group's returns are in neighbouring blocks
@@ -143,7 +144,7 @@ class _Positions:
         self._second, self._sentence = -1, ""
 
     def until(self, time_s: float) -> list[_Sent]:
-        """Those assembled since the last call and not after this time."""
+        """Return those assembled since the last call and not after this time."""
         last = max(self._count, int(np.floor(time_s * POSITIONS_HZ + 0.5)))
         made_s = (np.arange(self._count, last) + 0.5) / POSITIONS_HZ
         self._count = last
@@ -155,7 +156,7 @@ class _Positions:
         ]
 
     def _rmc(self, time_s: float) -> str:
-        """The latest sentence the head was given; empty before the first."""
+        """Return the latest sentence the head was given; empty before the first."""
         second = int(np.floor(time_s - RMC_DELAY_S))
         if self._track is not None and second > self._second:
             self._second, self._sentence = second, self._rmc_of(self._track, second)
@@ -173,7 +174,7 @@ class _Positions:
 
 
 def _strongest(raw: IntArray, light: IntArray, truth: StructArray) -> tuple[IntArray, StructArray]:
-    """Content (1, n, 2) of single returns: range and reflectivity of the strongest; and their truth."""
+    """Return content (1, n, 2) of single returns: range and reflectivity of the strongest; and their truth."""
     slot = best_slot(np.where(raw > 0, light, -1))
     there = slot >= 0
     rows = truth[there, slot[there]]
@@ -182,7 +183,7 @@ def _strongest(raw: IntArray, light: IntArray, truth: StructArray) -> tuple[IntA
 
 
 def _pairs(raw: IntArray, light: IntArray, truth: StructArray) -> tuple[IntArray, StructArray]:
-    """Content (2, n, 2) of dual returns; and their truth, of two the nearer first.
+    """Return content (2, n, 2) of dual returns; and their truth, of two the nearer first.
 
     First the last return, then the strongest, or the second-strongest where the strongest is the last; an only one
     stands in both places. Echoes of equal range are one, as bright as the brightest (9.3.2).
@@ -199,12 +200,12 @@ def _pairs(raw: IntArray, light: IntArray, truth: StructArray) -> tuple[IntArray
 
 
 def _content(raw: IntArray, light: IntArray, slots: Sequence[IntArray]) -> IntArray:
-    """(returns, n, 2) range and reflectivity in these slots (n,)."""
+    """Return (returns, n, 2) range and reflectivity in these slots (n,)."""
     return np.stack([np.stack([in_slot(raw, slot), in_slot(light, slot)], axis=1) for slot in slots])
 
 
 def config_table(table: ScannerTable, name: str, transport: str, auxiliary: str) -> dict[str, Any]:
-    """``[scanner.<name>]`` of the configuration that records this head.
+    """Return ``[scanner.<name>]`` of the configuration that records this head.
 
     Args:
         table: of the plan.

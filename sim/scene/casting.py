@@ -95,7 +95,7 @@ class SceneArrays(NamedTuple):
 
 @jit_inline
 def clipped(at: float, step: float, low: float, high: float, start: float, stop: float) -> tuple[float, float]:
-    """Distances between which a coordinate of a ray lies between limits."""
+    """Return distances between which a coordinate of a ray lies between limits."""
     if step == 0.0:
         return (start, stop) if low <= at <= high else (start, -1.0)
     one, other = (low - at) / step, (high - at) / step
@@ -104,7 +104,7 @@ def clipped(at: float, step: float, low: float, high: float, start: float, stop:
 
 @jit_inline
 def texture(x: float, y: float) -> float:
-    """A factor about 1 that belongs to a place: patches of some 25 m, and grain of half a metre."""
+    """Return a factor about 1 that belongs to a place: patches of some 25 m, and grain of half a metre."""
     column, row = math.floor(x / 25.0), math.floor(y / 25.0)
     u, v = x / 25.0 - column, y / 25.0 - row
     u, v = u * u * (3.0 - 2.0 * u), v * v * (3.0 - 2.0 * v)
@@ -118,7 +118,7 @@ def texture(x: float, y: float) -> float:
 
 @jit_inline
 def on_road(rows: FloatArray, item: IntArray, first: int, last: int, x: float, y: float) -> int:
-    """What covers a place as far as roads go: `ROAD`, `MARKING` or `NO_SURFACE`; crossings bear no paint."""
+    """Return what covers a place as far as roads go: `ROAD`, `MARKING` or `NO_SURFACE`; crossings bear no paint."""
     found, nearest, crossing, surface = -1.0, NEVER, False, NO_SURFACE
     for k in range(first, last):
         if item[k] & 1 != ROADS:
@@ -143,7 +143,7 @@ def on_road(rows: FloatArray, item: IntArray, first: int, last: int, x: float, y
 
 @jit_inline
 def on_water(rows: FloatArray, item: IntArray, first: int, last: int, ray: Ray, at: float, pulse: Pulse) -> Hit:
-    """The lake above the ground that a ray meets at a distance; most pulses do not come back from it."""
+    """Return the lake above the ground that a ray meets at a distance; most pulses do not come back from it."""
     for k in range(first, last):
         if item[k] & 1 != LAKES:
             continue
@@ -175,7 +175,7 @@ def on_ground(
     at: float,
     pulse: Pulse,
 ) -> Hit:
-    """What a ray meets that goes below the ground at a distance: the ground itself or what covers it."""
+    """Return what a ray meets that goes below the ground at a distance: the ground itself or what covers it."""
     x, y = ray[0] + at * ray[3], ray[1] + at * ray[4]
     surface, reflectance = GROUND, frame.reflectance
     if last > first:
@@ -194,7 +194,9 @@ def on_ground(
 def into_crown(
     rows: FloatArray, tree: int, ray: Ray, start: float, stop: float, pulse: Pulse, soft: FloatArray, count: int
 ) -> int:
-    """Leaves a pulse meets in a crown entered between two distances: Beer's and Lambert's depths, shares at random."""
+    """Return leaves a pulse meets in a crown entered between two distances: Beer's and Lambert's depths, shares at
+    random.
+    """
     at, leave = crown_span(rows, tree, ray)
     if at < start or at >= stop:
         return count
@@ -212,7 +214,7 @@ def into_crown(
 def into_wire(
     rows: FloatArray, wire: int, ray: Ray, start: float, stop: float, spread: float, soft: FloatArray, count: int
 ) -> int:
-    """A wire in the footprint between two distances: its share of the footprint's area returns."""
+    """Return a wire in the footprint between two distances: its share of the footprint's area returns."""
     at, miss, cos = wire_passage(rows, wire, ray)
     foot, radius = spread * at, rows[wire + 6]
     if start <= at < stop and miss < foot + radius:
@@ -226,7 +228,7 @@ def into_wire(
 
 @jit_inline
 def beside_car(frame: Frame, z: FloatArray, rows: FloatArray, car: int, ray: Ray, time_s: float) -> Ray:
-    """A ray as it is seen from a car: its rows stand at the middle of its floor, which moves over the ground."""
+    """Return a ray as it is seen from a car: its rows stand at the middle of its floor, which moves over the ground."""
     length = rows[car + 10]
     driven = (rows[car + 11] * time_s) % (2.0 * length) if length > 0.0 else 0.0
     driven = min(driven, 2.0 * length - driven)
@@ -252,7 +254,7 @@ def meet(
     count: int,
     room: int,
 ) -> tuple[float, int, float, float, float, int]:
-    """What a cell lists, between two distances.
+    """Return what a cell lists, between two distances.
 
     Returns the four numbers of the nearest hard `Hit`, the distance of an edge within the beam's reach, and how many
     rows of ``soft`` are in use.

@@ -47,7 +47,7 @@ class Listed:
 
 
 def build_cells(ground: Ground, things: list[Listed], covers: list[Listed]) -> Cells:
-    """The lists of all cells over the ground."""
+    """Return the lists of all cells over the ground."""
     extent = (ground.east_m - ground.west_m, ground.north_m - ground.south_m)
     size_m = CELL_M * np.ceil(np.sqrt(extent[0] * extent[1] / (CELL_M**2 * MOST_CELLS)))
     columns, rows = (max(1, int(np.ceil(length / size_m))) for length in extent)
@@ -71,7 +71,7 @@ def _joined(listed: list[Listed]) -> Listed:
 
 
 def _ground_top(ground: Ground, size_m: float, rows: int, columns: int) -> FloatArray:
-    """(rows, columns) the highest node of each cell and of the patches that it cuts."""
+    """Return (rows, columns) the highest node of each cell and of the patches that it cuts."""
 
     def spans(count: int, nodes: int) -> tuple[IntArray, IntArray]:
         edge = np.arange(count + 1) * size_m / ground.cell_m
@@ -93,7 +93,7 @@ def _ground_top(ground: Ground, size_m: float, rows: int, columns: int) -> Float
 def _spread(
     ground: Ground, size_m: float, listed: Listed, rows: int, columns: int
 ) -> tuple[IntArray, IntArray, FloatArray]:
-    """(cell, item, top_z) of every cell that every box touches; what lies off the grid is left out."""
+    """Return (cell, item, top_z) of every cell that every box touches; what lies off the grid is left out."""
     origin = np.array([ground.west_m, ground.south_m])
     low = np.floor((listed.box[:, :2] - origin) / size_m).astype(np.int64)
     high = np.floor((listed.box[:, 2:] - origin) / size_m).astype(np.int64)
@@ -107,7 +107,7 @@ def _spread(
 
 
 def _lists(cell: IntArray, item: IntArray, cells: int) -> tuple[IntArray, IntArray]:
-    """First item of each cell (cells + 1,), and the items, each once a cell."""
+    """Return first item of each cell (cells + 1,), and the items, each once a cell."""
     width = int(np.max(item, initial=0)) + 1
     pairs = np.unique(cell * width + item)
     first = np.searchsorted(pairs, width * np.arange(cells + 1, dtype=np.int64))

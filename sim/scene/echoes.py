@@ -47,7 +47,7 @@ def in_order(rows: FloatArray, count: int) -> None:
 
 @jit_inline
 def energy_at(soft: FloatArray, count: int, at: float) -> float:
-    """What soft hits, in order, leave of a pulse's energy for a distance."""
+    """Return what soft hits, in order, leave of a pulse's energy for a distance."""
     energy = 1.0
     for k in range(count):
         if soft[k, 0] >= at:
@@ -58,7 +58,7 @@ def energy_at(soft: FloatArray, count: int, at: float) -> float:
 
 @jit_inline
 def add(echo: FloatArray, count: int, at: float, strength: float, cos: float, surface: float, on_axis: float) -> int:
-    """One more echo, if there is any of it."""
+    """Return one more echo, if there is any of it."""
     if at < NEVER and strength > 0.0 and count < len(echo):
         echo[count, 0], echo[count, 1], echo[count, 2], echo[count, 3], echo[count, 4] = (
             at,
@@ -73,7 +73,7 @@ def add(echo: FloatArray, count: int, at: float, strength: float, cos: float, su
 
 @jit_inline
 def rim(ray: Ray, spread: float, side: int) -> Ray:
-    """One of four rays that leave with a beam's axis, ``spread`` radians from it."""
+    """Return one of four rays that leave with a beam's axis, ``spread`` radians from it."""
     ox, oy, oz, dx, dy, dz, _, _ = ray
     if abs(dx) < 0.8:
         ax, ay, az = 0.0, dz, -dy  # d × x
@@ -98,7 +98,9 @@ def move(echo: FloatArray, source: int, target: int) -> None:
 
 @jit_inline
 def merged(echo: FloatArray, count: int, pulse_m: float) -> int:
-    """Echoes in order, those nearer to each other than a pulse made one: the axis' stands, else the stronger one."""
+    """Return echoes in order, those nearer to each other than a pulse made one: the axis' stands, else the stronger
+    one.
+    """
     kept = _NONE
     for k in range(1, count):
         if echo[k, 0] - echo[kept, 0] < pulse_m:
@@ -126,7 +128,7 @@ def echoes_of(
     soft: FloatArray,
     echo: FloatArray,
 ) -> int:
-    """All echoes of a pulse, in order of distance; returns how many."""
+    """Return all echoes of a pulse, in order of distance; returns how many."""
     count, softs, room, share, wide, beam = _NONE, _NONE, len(soft), 1.0, spread, ray
     for side in range(5):
         at, surface, reflectance, cos, edge, softs = march(
@@ -151,7 +153,7 @@ def echoes_of(
 
 
 def _cast_pulses(sources: int) -> Callable[..., None]:
-    """`cast_pulses` as compiled from ``sources``."""
+    """Return `cast_pulses` as compiled from ``sources``."""
 
     @jit_cached
     def cast_pulses(

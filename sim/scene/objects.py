@@ -45,7 +45,7 @@ class Things(NamedTuple):
 
 
 def flat(things: Things) -> tuple[FloatArray, dict[str, NDArray[np.int64]]]:
-    """All tables one behind the other, planes first, and where each row of each begins."""
+    """Return all tables one behind the other, planes first, and where each row of each begins."""
     starts, at = {}, 0
     for name, table in things._asdict().items():
         starts[name] = at + table.shape[1] * np.arange(len(table), dtype=np.int64)
@@ -72,7 +72,7 @@ class Solids:
 
 
 def build_solids(houses: Houses, ground: Ground, seed: int) -> Solids:
-    """Walls and roofs; the eaves stand above the highest ground under each building."""
+    """Return walls and roofs; the eaves stand above the highest ground under each building."""
     base, low_m = _bases(houses, ground)
     up = ups(ground.site, base)
     axes = _axes(houses.heading_rad, up)
@@ -97,7 +97,9 @@ def build_solids(houses: Houses, ground: Ground, seed: int) -> Solids:
 
 
 def _bases(houses: Houses, ground: Ground) -> tuple[FloatArray, FloatArray]:
-    """Centers (n, 3) as high as the highest ground beneath, and how far the lowest lies below (n,), not positive."""
+    """Return centers (n, 3) as high as the highest ground beneath, and how far the lowest lies below (n,), not
+    positive.
+    """
     longest = float(np.max(houses.size_m, initial=0.0))
     count = int(np.clip(np.ceil(2 * longest / ground.cell_m), 4, 40)) + 1
     steps = np.linspace(-0.5, 0.5, count)
@@ -112,7 +114,9 @@ def _bases(houses: Houses, ground: Ground) -> tuple[FloatArray, FloatArray]:
 
 
 def _axes(heading_rad: FloatArray, up: FloatArray) -> FloatArray:
-    """(n, 3, 3) rows: along the ridge, to its right, up; at right angles, the first two level where they stand."""
+    """Return (n, 3, 3) rows: along the ridge, to its right, up; at right angles, the first two level where they
+    stand.
+    """
     along = np.stack([np.sin(heading_rad), np.cos(heading_rad), np.zeros(len(heading_rad))], axis=1)
     right = np.cross(along, up)
     right /= np.linalg.norm(right, axis=1, keepdims=True)
@@ -120,7 +124,9 @@ def _axes(heading_rad: FloatArray, up: FloatArray) -> FloatArray:
 
 
 def _planes(houses: Houses, base: FloatArray, axes: FloatArray, seed: int) -> tuple[FloatArray, BoolArray]:
-    """(n, 9, 6) planes that a building may have, and which it has (n, 9): four walls, a flat roof, slopes, hips."""
+    """Return (n, 9, 6) planes that a building may have, and which it has (n, 9): four walls, a flat roof, slopes,
+    hips.
+    """
     count = len(houses)
     sin, cos = np.sin(houses.pitch_rad), np.cos(houses.pitch_rad)
     half, eaves = 0.5 * houses.size_m, houses.eaves_m
@@ -147,7 +153,7 @@ def _planes(houses: Houses, base: FloatArray, axes: FloatArray, seed: int) -> tu
 
 
 def build_trees(forests: list[ForestTable], ground: Ground, seed: int) -> FloatArray:
-    """`Things.tree`, also of trees that stand where something else does."""
+    """Return `Things.tree`, also of trees that stand where something else does."""
     rows = [np.zeros((0, 7))]
     for index, table in enumerate(forests):
         draws = generator(seed, "terrain", "forest", index)
@@ -167,7 +173,7 @@ def build_trees(forests: list[ForestTable], ground: Ground, seed: int) -> FloatA
 
 
 def build_wires(tables: list[WireTable], ground: Ground) -> FloatArray:
-    """`Things.wire`: parabolas between the tops of their masts, in straight pieces."""
+    """Return `Things.wire`: parabolas between the tops of their masts, in straight pieces."""
     rows = [np.zeros((0, 7))]
     for table in tables:
         ends = np.array([table.from_m, table.to_m])
@@ -182,7 +188,9 @@ def build_wires(tables: list[WireTable], ground: Ground) -> FloatArray:
 
 
 def build_cars(tables: list[CarTable], seed: int, planes_before: int) -> tuple[FloatArray, FloatArray]:
-    """Planes (5 n, 6) of boxes without a floor, which are to follow ``planes_before`` others, and `Things.car`."""
+    """Return planes (5 n, 6) of boxes without a floor, which are to follow ``planes_before`` others, and
+    `Things.car`.
+    """
     paint = generator(seed, "terrain", "cars").uniform(0.1, 0.7, len(tables))
     planes, cars = [np.zeros((0, PLANE))], [np.zeros((0, 12))]
     half_along, half_across, height = np.array(CAR_SIZE_M) * [0.5, 0.5, 1.0]
@@ -203,13 +211,13 @@ def build_cars(tables: list[CarTable], seed: int, planes_before: int) -> tuple[F
 
 
 def build_lakes(lakes: list[Lake]) -> FloatArray:
-    """`Things.lake`."""
+    """Return `Things.lake`."""
     rows = [[*lake.center, *lake.up, lake.radius_m, lake.returns] for lake in lakes]
     return np.array(rows, np.float64).reshape(-1, 8)
 
 
 def build_roads(tables: list[RoadTable]) -> FloatArray:
-    """`Things.road`: the pieces between the points of each road."""
+    """Return `Things.road`: the pieces between the points of each road."""
     rows = [np.zeros((0, 8))]
     for number, table in enumerate(tables):
         points = np.array(table.points_m)
@@ -224,7 +232,7 @@ def build_roads(tables: list[RoadTable]) -> FloatArray:
 
 
 def near_circles(points: FloatArray, radius_m: FloatArray, centers: FloatArray, within_m: FloatArray) -> BoolArray:
-    """(n,) whether circles about points (n, 2) touch circles about centers (k, 2)."""
+    """Return (n,) whether circles about points (n, 2) touch circles about centers (k, 2)."""
     near = np.zeros(len(points), np.bool_)
     if len(points) and len(centers):
         tree = cKDTree(points)
@@ -237,7 +245,7 @@ def near_circles(points: FloatArray, radius_m: FloatArray, centers: FloatArray, 
 
 
 def near_pieces(points: FloatArray, radius_m: FloatArray, pieces: FloatArray, within_m: FloatArray) -> BoolArray:
-    """(n,) whether circles about points (n, 2) come within (k,) of straight pieces (k, 4) from, to."""
+    """Return (n,) whether circles about points (n, 2) come within (k,) of straight pieces (k, 4) from, to."""
     near = np.zeros(len(points), np.bool_)
     if not len(points) or not len(pieces):
         return near

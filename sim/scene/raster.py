@@ -59,7 +59,7 @@ class RasterHeights:
         self._row = of_height(lambda x, y, height: pixels.at(*self._to_crs(x, y, height))[1])
 
     def __call__(self, east_m: FloatArray, north_m: FloatArray) -> FloatArray:
-        """(rows, columns) ellipsoidal heights at east (columns,) and north (rows,).
+        """Return (rows, columns) ellipsoidal heights at east (columns,) and north (rows,).
 
         Where a place is on the map depends a little on its height: 0.8 m of 500 m at 10 km. Three turns settle it.
         """
@@ -101,7 +101,7 @@ class _Edges:
         self._corner = np.array([transform.c, transform.f])
 
     def __call__(self, easting: FloatArray, northing: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(n,) each."""
+        """Return (n,) each."""
         x, y = easting - self._corner[0], northing - self._corner[1]
         (to_column_x, to_column_y), (to_row_x, to_row_y) = self._inverse
         return to_column_x * x + to_column_y * y, to_row_x * x + to_row_y * y
@@ -122,12 +122,12 @@ class _Pixels:
     edges: _Edges
 
     def at(self, easting: FloatArray, northing: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Column and row in the window, whole at the pixels' centres."""
+        """Return column and row in the window, whole at the pixels' centres."""
         column, row = self.edges(easting, northing)
         return column - self.first[0] - 0.5, row - self.first[1] - 0.5
 
     def sample(self, column: FloatArray, row: FloatArray) -> FloatArray:
-        """Bilinear; in the outer half of the outermost pixels as at their centres."""
+        """Return bilinear; in the outer half of the outermost pixels as at their centres."""
         rows, columns = self.values.shape
         column, row = np.clip(column, 0.0, columns - 1), np.clip(row, 0.0, rows - 1)
         left = np.minimum(column.astype(np.int64), max(columns - 2, 0))
@@ -153,7 +153,7 @@ def _horizontal(crs: CRS) -> CRS:
 
 
 def _read(plan: Plan, to_crs: _Projected, corners: FloatArray, height_m: float) -> _Pixels:
-    """The pixels under the corners (4, 2) of the grid."""
+    """Return the pixels under the corners (4, 2) of the grid."""
     try:
         import rasterio
     except ImportError:
@@ -185,7 +185,9 @@ def _read(plan: Plan, to_crs: _Projected, corners: FloatArray, height_m: float) 
 
 
 def _window(source: Any, first: NDArray[np.int64], size: NDArray[np.int64], path: Path) -> FloatArray:
-    """(rows, columns) of the first band, nan where it has none, or none of this Earth: a mark that it does not name."""
+    """Return (rows, columns) of the first band, nan where it has none, or none of this Earth: a mark that it does not
+    name.
+    """
     from rasterio.windows import Window
 
     columns, rows = map(int, size)

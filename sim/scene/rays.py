@@ -26,7 +26,9 @@ _S11, _S27, _S30, _S31 = np.uint64(11), np.uint64(27), np.uint64(30), np.uint64(
 
 @jit_inline
 def uniform(seed: int, number: int, purpose: int, draw: int) -> float:
-    """A number in [0, 1) that hangs on its four names alone (the finaliser of SplitMix64, Steele et al. 2014)."""
+    """Return a number in [0, 1) that hangs on its four names alone (the finaliser of SplitMix64, Steele et al.
+    2014).
+    """
     state = np.uint64(seed) * _ODD_1 + np.uint64(number) * _ODD_2 + np.uint64(purpose) * _ODD_3
     state += np.uint64(draw) * _ODD_4
     state = (state ^ (state >> _S30)) * _MIX_1
@@ -36,7 +38,9 @@ def uniform(seed: int, number: int, purpose: int, draw: int) -> float:
 
 @jit_inline
 def patch_root(height: float, slope: float, bend: float) -> float:
-    """Smallest s > 0 with height + slope · s + bend · s² = 0, height > 0 at s = 0: where a ray goes below a patch."""
+    """Return smallest s > 0 with height + slope · s + bend · s² = 0, height > 0 at s = 0: where a ray goes below a
+    patch.
+    """
     inside = slope * slope - 4.0 * bend * height
     if inside < 0.0:
         return NEVER
@@ -49,7 +53,7 @@ def patch_root(height: float, slope: float, bend: float) -> float:
 
 @jit_inline
 def boundary(at: float, step: float, per_step: float, low: float, size: float, index: int) -> float:
-    """Distance at which a ray leaves slice ``index`` of slices of this size, in one coordinate."""
+    """Return distance at which a ray leaves slice ``index`` of slices of this size, in one coordinate."""
     if step > 0.0:
         return (low + (index + 1) * size - at) * per_step
     return (low + index * size - at) * per_step if step < 0.0 else NEVER
@@ -57,7 +61,7 @@ def boundary(at: float, step: float, per_step: float, low: float, size: float, i
 
 @jit_inline
 def slice_at(value: float, low: float, size: float, count: int) -> int:
-    """Index of the slice that holds a value, the nearest one beyond the ends."""
+    """Return index of the slice that holds a value, the nearest one beyond the ends."""
     return min(max(math.floor((value - low) / size), 0), count - 1)
 
 
@@ -65,7 +69,7 @@ def slice_at(value: float, low: float, size: float, count: int) -> int:
 def ground_entry(
     z: FloatArray, west: float, south: float, cell: float, ray: Ray, start: float, stop: float, fresh: bool
 ) -> float:
-    """Where a ray goes below the bilinear ground between two distances.
+    """Return where a ray goes below the bilinear ground between two distances.
 
     Within a cell the height of the ray above the patch is a quadratic of the distance; it is set up at the ray's entry
     into the cell, so that nothing large cancels. `UNDERGROUND` where a ``fresh`` ray begins below.
@@ -103,7 +107,7 @@ def ground_entry(
 
 @jit_inline
 def ground_normal(z: FloatArray, west: float, south: float, cell: float, x: float, y: float) -> tuple[float, float]:
-    """Slope of the bilinear ground at a place: (dz/dx, dz/dy)."""
+    """Return slope of the bilinear ground at a place: (dz/dx, dz/dy)."""
     column = slice_at(x, west, cell, z.shape[1] - 1)
     row = slice_at(y, south, cell, z.shape[0] - 1)
     z00, z10, z01, z11 = z[row, column], z[row, column + 1], z[row + 1, column], z[row + 1, column + 1]
@@ -114,7 +118,7 @@ def ground_normal(z: FloatArray, west: float, south: float, cell: float, x: floa
 
 @jit_inline
 def ground_z(z: FloatArray, west: float, south: float, cell: float, x: float, y: float) -> float:
-    """Site z of the bilinear ground at a place."""
+    """Return site z of the bilinear ground at a place."""
     column = slice_at(x, west, cell, z.shape[1] - 1)
     row = slice_at(y, south, cell, z.shape[0] - 1)
     u, v = (x - west) / cell - column, (y - south) / cell - row
@@ -125,7 +129,7 @@ def ground_z(z: FloatArray, west: float, south: float, cell: float, x: float, y:
 
 @jit_inline
 def passes(ray: Ray, x: float, y: float, z: float, radius: float) -> float:
-    """Distance at which a ray is nearest to a point, if ahead and within a radius; else never."""
+    """Return distance at which a ray is nearest to a point, if ahead and within a radius; else never."""
     ox, oy, oz, dx, dy, dz, _, _ = ray
     wx, wy, wz = x - ox, y - oy, z - oz
     along = wx * dx + wy * dy + wz * dz
@@ -136,7 +140,7 @@ def passes(ray: Ray, x: float, y: float, z: float, radius: float) -> float:
 
 @jit_inline
 def solid_entry(rows: FloatArray, first: int, last: int, ray: Ray, grow: float) -> tuple[float, int, float, float]:
-    """Where a ray enters the body behind the planes in ``rows[first:last]`` (`Things.plane`).
+    """Return where a ray enters the body behind the planes in ``rows[first:last]`` (`Things.plane`).
 
     Returns distance, where the plane's row begins, cosine of incidence, and the distance of an edge in reach: finite
     where the beam's rim, ``grow`` from its axis, may meet something else than the axis does.
@@ -172,7 +176,7 @@ def solid_entry(rows: FloatArray, first: int, last: int, ray: Ray, grow: float) 
 
 @jit_inline
 def crown_span(rows: FloatArray, tree: int, ray: Ray) -> tuple[float, float]:
-    """Where a ray enters and leaves an upright ellipsoid (`Things.tree`, at ``rows[tree]``)."""
+    """Return where a ray enters and leaves an upright ellipsoid (`Things.tree`, at ``rows[tree]``)."""
     ox, oy, oz, dx, dy, dz, _, _ = ray
     across, upright = rows[tree + 3], rows[tree + 4]
     px, py, pz = (ox - rows[tree]) * across, (oy - rows[tree + 1]) * across, (oz - rows[tree + 2]) * upright
@@ -188,7 +192,9 @@ def crown_span(rows: FloatArray, tree: int, ray: Ray) -> tuple[float, float]:
 
 @jit_inline
 def wire_passage(rows: FloatArray, wire: int, ray: Ray) -> tuple[float, float, float]:
-    """Where a ray passes a piece of wire (`Things.wire`): distance, miss distance, cosine; never beside its ends."""
+    """Return where a ray passes a piece of wire (`Things.wire`): distance, miss distance, cosine; never beside its
+    ends.
+    """
     ox, oy, oz, dx, dy, dz, _, _ = ray
     ux, uy, uz = rows[wire + 3] - rows[wire], rows[wire + 4] - rows[wire + 1], rows[wire + 5] - rows[wire + 2]
     wx, wy, wz = ox - rows[wire], oy - rows[wire + 1], oz - rows[wire + 2]

@@ -73,11 +73,13 @@ class Scene:
     arrays: SceneArrays
 
     def ground_m(self, east_m: FloatArray, north_m: FloatArray) -> FloatArray:
-        """(n,) ellipsoidal heights of the ground at site x and y (n,); beyond the area those of its nearest place."""
+        """Return (n,) ellipsoidal heights of the ground at site x and y (n,); beyond the area those of its nearest
+        place.
+        """
         return self.ground.ground_m(east_m, north_m)
 
     def site_z(self, east_m: FloatArray, north_m: FloatArray) -> FloatArray:
-        """(n,) site z of the ground at site x and y (n,)."""
+        """Return (n,) site z of the ground at site x and y (n,)."""
         return self.ground.site_z(east_m, north_m)
 
     def cast(
@@ -90,7 +92,7 @@ class Scene:
         pulse_m: float,
         slots: int,
     ) -> Echoes:
-        """Echoes of pulses; those of a pulse do not depend on what else is in the batch.
+        """Return echoes of pulses; those of a pulse do not depend on what else is in the batch.
 
         Args:
             origin: (n, 3) site frame, metres.
@@ -121,7 +123,8 @@ class Scene:
         return Echoes(range_m, reflectance, incidence_rad, surface)
 
     def control_points(self, count: int, seed: int, seen: Seen | None = None) -> FloatArray:
-        """(count, 3) places on the ground, site frame: in the open, on the flatter half of it, far from each other.
+        """Return (count, 3) places on the ground, site frame: in the open, on the flatter half of it, far from each
+        other.
 
         Args:
             count: how many.
@@ -147,7 +150,7 @@ class Scene:
         return self.ground.points(chosen[:, 0], chosen[:, 1])
 
     def _occupied(self, places: FloatArray, clear_m: float) -> NDArray[np.bool_]:
-        """(n,) whether something is nearer to places (n, 2) than this; roads are not something."""
+        """Return (n,) whether something is nearer to places (n, 2) than this; roads are not something."""
         clear = np.full(len(places), clear_m)
         center = np.mean(self.buildings, axis=1)
         radius = np.max(np.linalg.norm(self.buildings - center[:, np.newaxis], axis=2), axis=1, initial=0.0)
@@ -160,7 +163,7 @@ class Scene:
 
 
 def _far_apart(places: FloatArray, count: int) -> FloatArray:
-    """Some of the places, each as far as can be from those before."""
+    """Return some of the places, each as far as can be from those before."""
     chosen = np.zeros((count, 2))
     distance = np.full(len(places), np.inf)
     at = 0
@@ -172,8 +175,8 @@ def _far_apart(places: FloatArray, count: int) -> FloatArray:
 
 
 def build_scene(plan: Plan, site: Site, corners: FloatArray) -> Scene:
-    """The scene over corners (k, 2) east, north, and `swath.sim.scene.terrain.MARGIN_M` around; what lies beyond is
-    left out.
+    """Return the scene over corners (k, 2) east, north, and `swath.sim.scene.terrain.MARGIN_M` around; what lies
+    beyond is left out.
 
     Raises:
         PlanError: ``terrain.cell_m``: too large an area for it; ``terrain.raster``: it cannot be used;
@@ -218,7 +221,7 @@ def build_scene(plan: Plan, site: Site, corners: FloatArray) -> Scene:
 
 
 def _ends(tables: list[WireTable] | list[CarTable]) -> FloatArray:
-    """(n, 4) from, to."""
+    """Return (n, 4) from, to."""
     return np.array([[*table.from_m, *table.to_m] for table in tables], np.float64).reshape(-1, 4)
 
 
@@ -228,7 +231,7 @@ def _covered(ground: Ground, places: list[list[float]]) -> bool:
 
 
 def _settle(table: TerrainTable, ground: Ground, water: FloatArray) -> tuple[Houses, list[RoadTable]]:
-    """Buildings and roads: the plan's own, then villages where there is room beside them."""
+    """Return buildings and roads: the plan's own, then villages where there is room beside them."""
     houses = Houses.of_tables(table.building)
     houses = houses.only(_on_grid(ground, houses))
     roads = list(table.road)
@@ -250,7 +253,7 @@ def _on_grid(ground: Ground, houses: Houses) -> NDArray[np.bool_]:
 
 
 def _standing(trees: FloatArray, ground: Ground, houses: Houses, road: FloatArray, water: FloatArray) -> FloatArray:
-    """Trees on the grid that touch no house, no water and no road."""
+    """Return trees on the grid that touch no house, no water and no road."""
     place, radius = trees[:, :2], 1 / trees[:, 3]
     taken = near_circles(place, radius, houses.center_m, houses.radius_m)
     taken |= near_circles(place, radius, water[:, :2], water[:, 6])
@@ -259,7 +262,7 @@ def _standing(trees: FloatArray, ground: Ground, houses: Houses, road: FloatArra
 
 
 def _arrays(plan: Plan, ground: Ground, things: Things, solids: Solids, ways: FloatArray) -> SceneArrays:
-    """Tables and lists for the compiled functions."""
+    """Return tables and lists for the compiled functions."""
     foot_m = _footprint_m(list(plan.tables.scanner.values()))
     rows, starts = flat(things)
     tree, wire, lake = things.tree, things.wire, things.lake
@@ -292,7 +295,7 @@ def _around(center: FloatArray, radius: FloatArray) -> FloatArray:
 
 
 def _footprint_m(scanners: list[ScannerTable]) -> float:
-    """Radius of the widest beam at the end of its range, as far as it counts."""
+    """Return radius of the widest beam at the end of its range, as far as it counts."""
     widest = max((0.5e-3 * one.divergence_mrad * one.range_max_m for one in scanners), default=0.0)
     return float(np.clip(widest, *FOOTPRINT_M))
 
@@ -300,13 +303,13 @@ def _footprint_m(scanners: list[ScannerTable]) -> float:
 def _listed(
     kinds: int, kind: int, start: IntArray, box: FloatArray, top_z: FloatArray, wider_m: FloatArray | float
 ) -> Listed:
-    """Objects of a kind, in boxes made wider on all sides."""
+    """Return objects of a kind, in boxes made wider on all sides."""
     wider = np.broadcast_to(wider_m, len(box))[:, np.newaxis]
     return Listed(kinds * start + kind, np.concatenate([box[:, :2] - wider, box[:, 2:] + wider], axis=1), top_z)
 
 
 def _pieces(lines: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Straight lines (n, 4) cut into pieces about as long as a cell: the line of each, and its box (m, 4)."""
+    """Return straight lines (n, 4) cut into pieces about as long as a cell: the line of each, and its box (m, 4)."""
     length = np.linalg.norm(lines[:, 2:] - lines[:, :2], axis=1)
     count = np.maximum(np.ceil(length / CELL_M), 1).astype(np.int64)
     row = np.repeat(np.arange(len(lines)), count)
@@ -319,7 +322,7 @@ def _pieces(lines: FloatArray) -> tuple[IntArray, FloatArray]:
 
 
 def _driven(ways: FloatArray, ground: Ground) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Pieces of the cars' ways: the car of each, its box (m, 4), and what the car does not exceed there (m,)."""
+    """Return pieces of the cars' ways: the car of each, its box (m, 4), and what the car does not exceed there (m,)."""
     row, box = _pieces(ways)
     across = np.linspace(0.0, 1.0, 2 + int(2 * CELL_M / ground.cell_m))
     x = box[:, np.newaxis, :1] + across[:, np.newaxis] * (box[:, 2:3] - box[:, :1])[:, np.newaxis]

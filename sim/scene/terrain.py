@@ -56,12 +56,12 @@ class Ground:
         return float(self.south_m + (self.z.shape[0] - 1) * self.cell_m)
 
     def covers(self, east_m: FloatArray, north_m: FloatArray) -> NDArray[np.bool_]:
-        """(n,) whether places lie on the grid."""
+        """Return (n,) whether places lie on the grid."""
         across = (east_m >= self.west_m) & (east_m <= self.east_m)
         return across & (north_m >= self.south_m) & (north_m <= self.north_m)
 
     def site_z(self, east_m: FloatArray, north_m: FloatArray) -> FloatArray:
-        """Site z of the ground at site x and y, metres; beyond the grid that of its nearest place."""
+        """Return site z of the ground at site x and y, metres; beyond the grid that of its nearest place."""
         rows, columns = self.z.shape
         across = np.clip((east_m - self.west_m) / self.cell_m, 0.0, columns - 1)
         along = np.clip((north_m - self.south_m) / self.cell_m, 0.0, rows - 1)
@@ -74,17 +74,17 @@ class Ground:
         return z
 
     def points(self, east_m: FloatArray, north_m: FloatArray) -> FloatArray:
-        """(…, 3) site coordinates on the ground."""
+        """Return (…, 3) site coordinates on the ground."""
         return np.stack([east_m, north_m, self.site_z(east_m, north_m)], axis=-1)
 
     def ground_m(self, east_m: FloatArray, north_m: FloatArray) -> FloatArray:
-        """Ellipsoidal heights of the ground at site x and y; beyond the grid that of its nearest place."""
+        """Return ellipsoidal heights of the ground at site x and y; beyond the grid that of its nearest place."""
         east = np.clip(np.asarray(east_m, np.float64), self.west_m, self.east_m)
         north = np.clip(np.asarray(north_m, np.float64), self.south_m, self.north_m)
         return self.site.heights(self.points(east, north))
 
     def slope(self, east_m: FloatArray, north_m: FloatArray) -> FloatArray:
-        """Tangent of the steepest slope of the grid around places (n,), over two cells."""
+        """Return tangent of the steepest slope of the grid around places (n,), over two cells."""
         step = self.cell_m
         across = self.site_z(east_m + step, north_m) - self.site_z(east_m - step, north_m)
         along = self.site_z(east_m, north_m + step) - self.site_z(east_m, north_m - step)
@@ -119,13 +119,13 @@ class OfHeight:
         self._height_m = height_m
 
     def __call__(self, east_m: FloatArray, north_m: FloatArray, height_m: FloatArray | float) -> FloatArray:
-        """(rows, columns) at east (columns,), north (rows,) and heights (rows, columns)."""
+        """Return (rows, columns) at east (columns,), north (rows,) and heights (rows, columns)."""
         value: FloatArray = self._middle(north_m, east_m) + self._gain(north_m, east_m) * (height_m - self._height_m)
         return value
 
 
 def build_ground(plan: Plan, site: Site, corners: FloatArray) -> Ground:
-    """The ground under corners (k, 2) east, north, and `MARGIN_M` around.
+    """Return the ground under corners (k, 2) east, north, and `MARGIN_M` around.
 
     Raises:
         PlanError: ``terrain.cell_m``: too many nodes; ``terrain.raster``: see `swath.sim.scene.raster`.
@@ -164,7 +164,9 @@ def _check_size(cells: NDArray[np.int64], cell_m: float) -> None:
 
 
 def analytic_heights(table: TerrainTable) -> HeightsOnGrid:
-    """Slope and hills of the plan: `TerrainTable.height_m` at the origin, hills of ``relief_m`` from foot to top."""
+    """Return slope and hills of the plan: `TerrainTable.height_m` at the origin, hills of ``relief_m`` from foot to
+    top.
+    """
     draws = generator(table.seed, "terrain", "hills")
     turned = draws.uniform(0.0, 360.0)
     waves = []
@@ -203,7 +205,7 @@ class Lake:
 
 
 def fill_lake(ground: Ground, center_m: list[float], radius_m: float, returns: float) -> Lake:
-    """A lake as high as the lowest place of its rim; the ground within is dug out below it.
+    """Return a lake as high as the lowest place of its rim; the ground within is dug out below it.
 
     Only cells that lie wholly within the circle change, so the shore is the ground as it was.
     """
@@ -227,7 +229,7 @@ def fill_lake(ground: Ground, center_m: list[float], radius_m: float, returns: f
 
 
 def ups(site: Site, points: FloatArray) -> FloatArray:
-    """(n, 3) the ellipsoid's outward normals at (n, 3) site coordinates, in the site frame."""
+    """Return (n, 3) the ellipsoid's outward normals at (n, 3) site coordinates, in the site frame."""
     step_m = 100.0
     beside = [site.heights(points + step_m * axis) - site.heights(points - step_m * axis) for axis in np.eye(3)]
     gradient = np.stack(beside, axis=-1)

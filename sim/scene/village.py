@@ -48,7 +48,7 @@ class Houses:
 
     @classmethod
     def of_tables(cls, tables: list[BuildingTable]) -> Houses:
-        """The plan's own buildings."""
+        """Return the plan's own buildings."""
         return cls(
             np.array([table.center_m for table in tables], np.float64).reshape(-1, 2),
             np.array([table.size_m for table in tables], np.float64).reshape(-1, 2),
@@ -68,11 +68,11 @@ class Houses:
         return 0.5 * np.hypot(self.size_m[:, 0], self.size_m[:, 1])
 
     def only(self, wanted: NDArray[np.bool_]) -> Houses:
-        """Some of them."""
+        """Return some of them."""
         return Houses(*(getattr(self, name)[wanted] for name in self.__dataclass_fields__))
 
     def and_also(self, others: Houses) -> Houses:
-        """These, then others."""
+        """Return these, then others."""
         names = self.__dataclass_fields__
         return Houses(*(np.concatenate([getattr(self, name), getattr(others, name)]) for name in names))
 
@@ -95,7 +95,7 @@ class _Lots:
 
 
 def build_village(table: VillageTable, seed: int, index: int) -> tuple[Houses, list[RoadTable]]:
-    """Houses and streets; ``index`` of the table names it in errors and makes its draws its own.
+    """Return houses and streets; ``index`` of the table names it in errors and makes its draws its own.
 
     Raises:
         PlanError: ``terrain.village[i]``: no room for so many houses.
@@ -115,7 +115,7 @@ def build_village(table: VillageTable, seed: int, index: int) -> tuple[Houses, l
 
 
 def _lots(extent: FloatArray, houses: int, key: str) -> _Lots:
-    """The largest lots on which the houses find room."""
+    """Return the largest lots on which the houses find room."""
     for scale in np.linspace(1.0, SMALLEST_LOT_M[0] / LARGEST_LOT_M[0], 25):
         lots = _lots_of_size(extent, scale * np.array(LARGEST_LOT_M))
         if len(lots.center) >= houses:
@@ -125,7 +125,7 @@ def _lots(extent: FloatArray, houses: int, key: str) -> _Lots:
 
 
 def _lots_of_size(extent: FloatArray, size: FloatArray) -> _Lots:
-    """Rows of lots on both sides of streets along, a crossing street every few lots."""
+    """Return rows of lots on both sides of streets along, a crossing street every few lots."""
     street = STREET_M + 2 * VERGE_M
     strip = street + 2 * size[1]
     rows = int(extent[1] // strip)
@@ -139,7 +139,7 @@ def _lots_of_size(extent: FloatArray, size: FloatArray) -> _Lots:
 
 
 def _houses(table: VillageTable, draws: np.random.Generator, lots: _Lots, placed: Placed, used: IntArray) -> Houses:
-    """One house on each lot used; turned a little, no corner leaves its lot."""
+    """Return one house on each lot used; turned a little, no corner leaves its lot."""
     count = len(used)
     turn = np.radians(np.clip(_TURN_DEG * draws.standard_normal(count), -10.0, 10.0))
     crosswise = draws.random(count) < 0.5

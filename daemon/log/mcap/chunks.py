@@ -49,7 +49,7 @@ class LogBatch:
         return self.rows[:, _MESSAGE_HEAD:]
 
     def between(self, first: int, last: int) -> LogBatch:
-        """The messages from one to before another."""
+        """Return the messages from one to before another."""
         return LogBatch(self.channel, self.channel_id, self.log_time_ns[first:last], self.rows[first:last])
 
 
@@ -60,7 +60,7 @@ def chunk_batches(
     topics: TopicFilter | None = None,
     lost: Counter[str] | None = None,
 ) -> Iterator[LogBatch]:
-    """Messages of an unpacked chunk as runs of equal channel and length; learns its channels on the way.
+    """Yield messages of an unpacked chunk as runs of equal channel and length; learns its channels on the way.
 
     Args:
         data: the chunk's records.
@@ -114,7 +114,7 @@ def json_objects(batch: LogBatch) -> Iterator[tuple[int, dict[str, Any]]]:
 
 
 def damage_within(chunk: Record, lost: Counter[str]) -> Damage:
-    """What is lost of a good chunk, with the reasons."""
+    """Return what is lost of a good chunk, with the reasons."""
     reasons = sorted(lost)
     more = f" and {len(reasons) - 3} reasons more" if len(reasons) > 3 else ""
     return Damage(chunk.offset, chunk.length, "; ".join(reasons[:3]) + more, lost.total())
@@ -127,7 +127,7 @@ def _lose(lost: Counter[str] | None, why: str, count: int) -> None:
 
 
 def _run_length(data: bytes, at: int, stride: int) -> int:
-    """Messages from here on with the same opcode, length and channel as the first: their eleven first bytes."""
+    """Return messages from here on with the same opcode, length and channel as the first: their eleven first bytes."""
     possible, head = (len(data) - at) // stride, data[at : at + 11]
     # most runs in a chunk of several channels or lengths are short: one by one before all at once
     for count in range(1, min(possible, ONE_BY_ONE)):

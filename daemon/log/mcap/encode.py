@@ -43,7 +43,7 @@ class EncodedBlock:
 
 @lru_cache(maxsize=1024)
 def _layout(length: int) -> np.dtype[np.void]:
-    """A message record with ``length`` bytes of data."""
+    """Return a message record with ``length`` bytes of data."""
     return np.dtype(
         [
             ("opcode", "u1"),
@@ -65,7 +65,7 @@ def encode_block(
     publish_time_ns: Int64Array | None = None,
     rows: ByteRows | None = None,
 ) -> EncodedBlock:
-    """Messages of equal length, one a unit.
+    """Return messages of equal length, one a unit.
 
     Args:
         channel_id: of all.
@@ -99,21 +99,21 @@ def encode_block(
 
 
 def encode_raw(channel_id: int, log_time_ns: Int64Array, rows: ByteRows) -> EncodedBlock:
-    """Whole message records of a log, (n, 31 + length) uint8, to be written again as they are."""
+    """Return whole message records of a log, (n, 31 + length) uint8, to be written again as they are."""
     count, stride = rows.shape
     offsets = np.arange(count, dtype=np.int64) * stride
     return EncodedBlock(channel_id, count, log_time_ns, offsets, np.ascontiguousarray(rows).reshape(-1).data)
 
 
 def encode_json(channel_id: int, sequence: int, log_time_ns: int, value: Mapping[str, Any]) -> EncodedBlock:
-    """One JSON message."""
+    """Return one JSON message."""
     text = json.dumps(value, separators=(",", ":"), allow_nan=False).encode()
     unit = np.frombuffer(text, np.uint8).reshape(1, -1)
     return encode_block(channel_id, sequence, np.array([log_time_ns], dtype=np.int64), unit)
 
 
 def message_index(channel_id: int, blocks: list[tuple[int, EncodedBlock]]) -> bytes:
-    """The message index record of one channel in a chunk: (log time, offset) pairs."""
+    """Return the message index record of one channel in a chunk: (log time, offset) pairs."""
     count = sum(block.count for _, block in blocks)
     pairs = np.empty(count, np.dtype([("time", "<u8"), ("offset", "<u8")]))
     at = 0

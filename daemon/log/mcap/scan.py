@@ -86,7 +86,7 @@ class Damage:
 def scan(
     file: BinaryIO, size: int, *, chunks: bool = True, wanted: ChannelFilter | None = None
 ) -> Iterator[Record | Damage]:
-    """All records of the data section, in order, and every damage; ends at the data's end or the cut.
+    """Yield all records of the data section, in order, and every damage; ends at the data's end or the cut.
 
     Args:
         file: seekable.
@@ -154,7 +154,9 @@ def _joined(one: Damage, other: Damage) -> Damage:
 
 
 def summary_records(file: BinaryIO, offset: int, size: int) -> Iterator[Record]:
-    """The records between the data's end, at ``offset``, and the footer, of a file whose end `scan` found whole."""
+    """Yield the records between the data's end, at ``offset``, and the footer, of a file whose end `scan` found
+    whole.
+    """
     while offset + _HEAD.size <= size:
         file.seek(offset)
         opcode, length = _HEAD.unpack(file.read(_HEAD.size))
@@ -165,7 +167,9 @@ def summary_records(file: BinaryIO, offset: int, size: int) -> Iterator[Record]:
 
 
 def end_is_whole(file: BinaryIO, offset: int, size: int) -> bool:
-    """Whether a summary that its CRC confirms, the footer and the magic stand from here to the end of the file."""
+    """Return whether a summary that its CRC confirms, the footer and the magic stand from here to the end of the
+    file.
+    """
     footer_at = size - len(MAGIC) - _FOOTER_BYTES - _HEAD.size
     if footer_at < offset:
         return False
@@ -184,7 +188,7 @@ def end_is_whole(file: BinaryIO, offset: int, size: int) -> bool:
 
 
 def _is_cut(file: BinaryIO, offset: int, size: int) -> bool:
-    """Whether a plausible record begins here and only its end is missing."""
+    """Return whether a plausible record begins here and only its end is missing."""
     file.seek(offset)
     head = file.read(_HEAD.size)
     if len(head) < _HEAD.size:
@@ -197,7 +201,7 @@ def _is_cut(file: BinaryIO, offset: int, size: int) -> bool:
 def _read_record(
     file: BinaryIO, offset: int, size: int, *, chunks: bool = True, wanted: ChannelFilter | None = None
 ) -> Record | Damage:
-    """The record at an offset; `Damage` of length 0 where none can begin there."""
+    """Return the record at an offset; `Damage` of length 0 where none can begin there."""
     file.seek(offset)
     head = file.read(_HEAD.size)
     nothing = Damage(offset, 0, "")
@@ -232,7 +236,7 @@ def _read_record(
 
 
 def _may_begin(file: BinaryIO, offset: int, size: int) -> bool:
-    """Whether the head of a record of the specification stands here, or the file ends."""
+    """Return whether the head of a record of the specification stands here, or the file ends."""
     file.seek(offset)
     head = file.read(_HEAD.size)
     if len(head) < _HEAD.size:
@@ -242,7 +246,7 @@ def _may_begin(file: BinaryIO, offset: int, size: int) -> bool:
 
 
 def _outside_chunks(file: BinaryIO, opcode: int, offset: int, total: int, size: int) -> Record | Damage:
-    """A record that has no CRC of its own (but an attachment's): its content must be what its opcode says."""
+    """Return a record that has no CRC of its own (but an attachment's): its content must be what its opcode says."""
     nothing = Damage(offset, 0, "")
     length = total - _HEAD.size
     if opcode not in _CONTENT:
@@ -271,7 +275,7 @@ def _outside_chunks(file: BinaryIO, opcode: int, offset: int, total: int, size: 
 
 
 def parse_record(kind: type[RecordT], body: bytes) -> RecordT:
-    """The content of a record.
+    """Return the content of a record.
 
     Raises:
         LogError: it is not what its opcode says.
@@ -288,7 +292,7 @@ def _parse(kind: type[RecordT], stream: ReadDataStream) -> RecordT:
 
 
 def _plausible_chunk(start: bytes, length: int) -> bool:
-    """Whether a chunk of a length, in full, begins so: its lengths agree with each other."""
+    """Return whether a chunk of a length, in full, begins so: its lengths agree with each other."""
     if len(start) < _CHUNK_HEAD.size + 8:
         return False
     size, name_length = _CHUNK_HEAD.unpack_from(start)[2], _CHUNK_HEAD.unpack_from(start)[4]
@@ -300,7 +304,7 @@ def _plausible_chunk(start: bytes, length: int) -> bool:
 
 
 def unpack_chunk(body: bytes) -> bytes:
-    """The records of a chunk.
+    """Return the records of a chunk.
 
     Raises:
         LogError: unknown compression, absurd size, undecodable, or a wrong CRC.
@@ -346,13 +350,13 @@ def _attachment_is_whole(body: bytes) -> bool:
 
 
 def _indexed_messages(file: BinaryIO, offset: int, size: int) -> int | None:
-    """Messages that the index records right behind a chunk speak of."""
+    """Return messages that the index records right behind a chunk speak of."""
     counts = [entries // 16 for _, entries in _indexed(file, offset, size)]
     return sum(counts) if counts else None
 
 
 def _indexed(file: BinaryIO, offset: int, size: int) -> Iterator[tuple[int, int]]:
-    """Channel, and bytes of entries, of the index records right behind a chunk."""
+    """Yield channel, and bytes of entries, of the index records right behind a chunk."""
     while offset + _HEAD.size <= size:
         file.seek(offset)
         opcode, length = _HEAD.unpack(file.read(_HEAD.size))
@@ -366,7 +370,7 @@ def _indexed(file: BinaryIO, offset: int, size: int) -> Iterator[tuple[int, int]
 
 
 def next_chunk(file: BinaryIO, offset: int, size: int) -> int | None:
-    """The next place where a chunk begins that can be unpacked."""
+    """Return the next place where a chunk begins that can be unpacked."""
     while offset < size:
         file.seek(offset)
         window = file.read(_RESYNC_STEP + _HEAD.size)

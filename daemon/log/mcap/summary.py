@@ -58,7 +58,7 @@ class Summary:
         self.chunks.append(index)
 
     def sections(self, specs: Mapping[int, ChannelSpec], schemas: SchemaTable) -> list[tuple[int, list[bytes]]]:
-        """The summary's groups: opcode and records, those of the channels that have messages."""
+        """Return the summary's groups: opcode and records, those of the channels that have messages."""
         used = {id_: specs[id_] for id_ in self.messages}
         names = sorted({spec.schema for spec in used.values() if spec.schema is not None})
         statistics = records.Statistics(
@@ -107,11 +107,11 @@ class SchemaTable:
             )
 
     def record(self, name: str) -> records.Schema:
-        """The record of a schema."""
+        """Return the record of a schema."""
         return self._records[name]
 
     def channel_record(self, channel_id: int, spec: ChannelSpec) -> records.Channel:
-        """The record of a channel, with its schema's id."""
+        """Return the record of a channel, with its schema's id."""
         return records.Channel(
             id=channel_id,
             topic=spec.topic,

@@ -64,12 +64,12 @@ class _OpenChunk:
         self.size += len(piece)
 
     def counts(self) -> Counter[int]:
-        """Messages by channel."""
+        """Return messages by channel."""
         return Counter({id_: sum(block.count for _, block in blocks) for id_, blocks in self.blocks.items()})
 
 
 def create_exclusively(path: Path) -> int:
-    """A file for a part, open for writing.
+    """Return a file for a part, open for writing.
 
     Raises:
         FileExistsError: something stands there.
@@ -122,11 +122,11 @@ class PartWriter:
             raise
 
     def stands_at(self, path: Path) -> bool:
-        """Whether a path names this very file."""
+        """Return whether a path names this very file."""
         return stands_at(self._fd, path)
 
     def is_unlinked(self) -> bool:
-        """Whether no directory names this file any more: what is written to it is gone with the process."""
+        """Return whether no directory names this file any more: what is written to it is gone with the process."""
         return self._fd < 0 or os.fstat(self._fd).st_nlink == 0
 
     # ------------------------------------------------------------------ what stands outside chunks
@@ -354,7 +354,7 @@ class PartWriter:
 
 
 def _after(views: list[memoryview], count: int) -> list[memoryview]:
-    """What is left of views after ``count`` bytes of them were written."""
+    """Return what is left of views after ``count`` bytes of them were written."""
     for number, view in enumerate(views):
         if count < view.nbytes:
             return [view[count:], *views[number + 1 :]]

@@ -70,7 +70,7 @@ def ties_of(path: Path, kept: KeptFlight) -> Features:
 
 
 def read_polygons(text: str, name: str) -> dict[str, FloatArray]:
-    """A CSV with the columns WKT and name, as GIS programs write layers of polygons.
+    """Return a CSV with the columns WKT and name, as GIS programs write layers of polygons.
 
     Args:
         text: of the file.

@@ -42,7 +42,7 @@ _ANY_STATE = f'want "free", "fixed" or {{ {PRIOR} = SIGMA }}, above 0 and in the
 
 
 def _state(value: object) -> str | float:
-    """``free``, ``fixed``, or the sigma of a prior in the key's unit."""
+    """Return ``free``, ``fixed``, or the sigma of a prior in the key's unit."""
     if value in ("free", "fixed"):
         return str(value)
     sigma = value.get(PRIOR) if isinstance(value, dict) and len(value) == 1 else None
@@ -143,7 +143,7 @@ class ModelTables(Section):
 
 
 def read_model(file: Path) -> ModelTables:
-    """What a file says.
+    """Return what a file says.
 
     Raises:
         UserError: it cannot be read; ConfigError: all that is wrong with it, one line each.
@@ -171,7 +171,7 @@ States = dict[tuple[str, str], str | float]  # by scanner (of all: empty) and na
 
 
 def model_of(model: str, fix: str = "", free: str = "", priors: Sequence[str] = ()) -> ParameterOptions:
-    """A model, and keys of a calibration file as ``phi_deg`` or ``left.phi_deg``, to what the adjustment takes.
+    """Return a model, and keys of a calibration file as ``phi_deg`` or ``left.phi_deg``, to what the adjustment takes.
 
     An option stands above what a file says of the same parameter; that of all scanners also above what it says of one.
 
@@ -203,7 +203,7 @@ def model_of(model: str, fix: str = "", free: str = "", priors: Sequence[str] = 
 
 
 def file_of(model: str) -> Path | None:
-    """The file that a model is given as; None: by its name."""
+    """Return the file that a model is given as; None: by its name."""
     return Path(model) if model.lower().endswith(SUFFIX) else None
 
 
@@ -215,7 +215,7 @@ def of_parameters(wish: ParameterOptions) -> ParameterOptions:
 
 
 def key_of(name: str, knots: Sequence[float] = ()) -> tuple[str, float]:
-    """How people are told of an unknown, as ``phi_deg`` or ``ibrc.2 at 1500``; SI units a unit of it.
+    """Return how people are told of an unknown, as ``phi_deg`` or ``ibrc.2 at 1500``; SI units a unit of it.
 
     Args:
         name: without its scanner, as ``phi_rad``, ``ibrc.2``, ``beam.3.azimuth_rad``.
@@ -250,7 +250,7 @@ def in_words(wish: ParameterOptions) -> str:
 
 
 def tables_in_words(wish: ParameterOptions) -> list[str]:
-    """What is asked for in tables."""
+    """Return what is asked for in tables."""
     words = []
     if wish.ibrc_knots:
         reference = "" if wish.ibrc_reference is None else f" (reference {wish.ibrc_reference:g})"
@@ -274,7 +274,7 @@ def _tables(model: str) -> ModelTables:
 
 
 def _of_tables(tables: ModelTables) -> ParameterOptions:
-    """All but the parameters."""
+    """Return all but the parameters."""
     wish, ibrc, offsets, beam = ParameterOptions(tables.model), tables.ibrc, tables.range_offset, tables.beam
     if ibrc is not None:
         wish = replace(
@@ -327,7 +327,7 @@ def _states(said: Iterable[tuple[str, str | float]], before: str, known: Known) 
 
 
 def _want(key: str, known: Known) -> str:
-    """What would be right, instead of a key of all scanners or of one."""
+    """Return what would be right, instead of a key of all scanners or of one."""
     scanner, _, own = key.partition(".")
     for before, text in (("", key), (f"{scanner}.", own)):
         close = difflib.get_close_matches(text, known, n=1, cutoff=0.6) if text else []

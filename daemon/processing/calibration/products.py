@@ -191,7 +191,7 @@ def _header(done: Calibrated, name: str, inputs: list[tuple[str, str]]) -> Heade
 
 
 def method_of(done: Calibrated) -> str:
-    """The word of a calibration file for what it was made of."""
+    """Return the word of a calibration file for what it was made of."""
     kinds = {"control" if plane.control else "planes" for plane in done.features.planes}
     kinds |= {"tie_points" for _ in done.features.ties[:1]}
     return kinds.pop() if len(kinds) == 1 else "combined"
@@ -260,7 +260,7 @@ def _need_entry(need: Need | None) -> dict[str, Any] | None:
 
 
 def strips_entry(strips: FlightStrips) -> dict[str, Any]:
-    """Height differences of all pairs together, and pair by pair, and the quality level by them."""
+    """Return height differences of all pairs together, and pair by pair, and the quality level by them."""
     told = strips.agreement.numbers or {}
     every = {"n": told.get("cells", 0)} | {key: told.get(key) for key in ("mean_m", "std_m", "rms_m")}
     pairs = [
@@ -271,7 +271,7 @@ def strips_entry(strips: FlightStrips) -> dict[str, Any]:
 
 
 def profiles_entry(check: Check) -> dict[str, Any]:
-    """What profiles say beside the adjustment, and each of them; SI."""
+    """Return what profiles say beside the adjustment, and each of them; SI."""
     profiles = [
         {
             "kind": one.kind,
@@ -322,13 +322,13 @@ def _report(
 
 
 def _middle_on_map(done: Calibrated) -> list[float]:
-    """East and north of the flight's middle, from which maps count."""
+    """Return east and north of the flight's middle, from which maps count."""
     mapping, frame = done.kept.logged[0].setup.mapping, done.flight.frame
     return [0.0, 0.0] if mapping is None else mapping.map_from_e(frame.origin_e[np.newaxis])[0, :2].tolist()
 
 
 def level_words(strips: FlightStrips) -> str:
-    """The quality level that strips keep, in words."""
+    """Return the quality level that strips keep, in words."""
     agreement = strips.agreement
     if not agreement.judged:
         return f"too few cells for a quality level ({agreement.cells:,} in {agreement.places} places)"
@@ -345,7 +345,7 @@ def _wanted(done: Calibrated) -> dict[str, float]:
 
 
 def _report_files(folder: Path, done: Calibrated, report: ReportInput, facts: Mapping[str, Plain]) -> dict[Path, bytes]:
-    """The page, the same on paper, and a record a scanner as XML and JSON with its matrices beside it."""
+    """Return the page, the same on paper, and a record a scanner as XML and JSON with its matrices beside it."""
     from swath.calib.record.record import RecordInput, record_json, record_of, record_xml
     from swath.daemon.processing.calibration.report.page import html, pdf
     from swath.daemon.processing.calibration.report.profiles import pictures

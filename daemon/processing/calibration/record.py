@@ -18,7 +18,8 @@ from swath.georef.toml_tables import TomlError, key_text, toml_tables
 
 
 def facts_of(file: Path) -> dict[str, Plain]:
-    """What people tell of a calibration, by ``CLASS.attribute``: a table a class, as ``[CA_GNSS] numberSatellites``.
+    """Return what people tell of a calibration, by ``CLASS.attribute``: a table a class, as ``[CA_GNSS]
+    numberSatellites``.
 
     Raises:
         UserError: it is no such file, or something in it is no attribute or not what the attribute takes.

@@ -190,7 +190,9 @@ def _heads(logged: Sequence[LoggedFlight]) -> tuple[Head, ...]:
 
 
 def _under(config: Config, table: ScannerConfig, calibration: Calibration) -> Calibration:
-    """A calibration with the settings it is used under, so that one estimated from it is refused under others."""
+    """Return a calibration with the settings it is used under, so that one estimated from it is refused under
+    others.
+    """
     factor = calibration.mirror_factor if table.mirror_factor is None else table.mirror_factor
     air = config.atmosphere
     return replace(calibration, ranges=air.ranges, refraction=air.refraction, mirror_factor=factor)

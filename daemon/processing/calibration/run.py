@@ -276,7 +276,7 @@ def _refuse_existing(wish: CalibrationOptions, files: Iterable[Path]) -> None:
 
 
 def paths_of(wish: CalibrationOptions, scanners: Iterable[str]) -> dict[str, Path]:
-    """Where each scanner's calibration goes."""
+    """Return where each scanner's calibration goes."""
     names = list(scanners)
     if len(names) == 1 and not wish.output.is_dir():
         return dict.fromkeys(names, wish.output)
@@ -326,7 +326,7 @@ def _control(wish: CalibrationOptions, flight: Flight) -> tuple[ControlPoint, ..
 
 
 def _doubts(flight: Flight, points: Sequence[ControlPoint]) -> tuple[str, ...]:
-    """What is doubtful of control; UserError where it cannot be used at all.
+    """Return what is doubtful of control; UserError where it cannot be used at all.
 
     That all its heights differ alike is only a doubt here: so does a range offset, which is to be found; what is more
     than that may be, is refused in the end (`_refuse_far`).
@@ -339,7 +339,9 @@ def _doubts(flight: Flight, points: Sequence[ControlPoint]) -> tuple[str, ...]:
 
 
 def _features(wish: CalibrationOptions, flight: Flight, planes: Features, points: Sequence[ControlPoint]) -> Features:
-    """What the adjustment takes: the planes or their intersections, never both, for they are of the same returns."""
+    """Return what the adjustment takes: the planes or their intersections, never both, for they are of the same
+    returns.
+    """
     found = [planes]
     if "ties" in wish.observe:
         from swath.calib.ties.intersections import find_ties
@@ -355,7 +357,7 @@ def _features(wish: CalibrationOptions, flight: Flight, planes: Features, points
 
 
 def prior_of(kept: KeptFlight) -> TrajectoryPrior:
-    """The trajectory's errors before: exactly, of those that were smoothed here, or by their sigmas."""
+    """Return the trajectory's errors before: exactly, of those that were smoothed here, or by their sigmas."""
     return smoothed_prior(kept) or gauss_markov(kept.flight)
 
 

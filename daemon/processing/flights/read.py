@@ -163,7 +163,7 @@ class Flight:
         return None if self.clock is None else self.clocks.clocks.host.status(self.clock, host_ns)
 
     def gps_from_host(self, host_ns: Any) -> Any:
-        """GPS ns (n,) of log times."""
+        """Return GPS ns (n,) of log times."""
         assert self.clock is not None
         gps_ns, _ = self.clocks.clocks.host.gps_from_host(self.clock, np.asarray(host_ns, np.int64))
         return gps_ns
@@ -181,7 +181,7 @@ class Flight:
 def read_flights(
     wish: GeorefOptions, tell: Tell, check: Callable[[list[str]], None] = lambda scanners: None
 ) -> list[Flight]:
-    """The flights of a wish, with trajectories and strips; what of a directory is no log is a hole of the first.
+    """Return the flights of a wish, with trajectories and strips; what of a directory is no log is a hole of the first.
 
     Args:
         wish: which logs, and how.
@@ -354,7 +354,7 @@ def _strips(wish: GeorefOptions, flight: Flight, given: Sequence[Span] | None) -
 
 
 def _straight(wish: GeorefOptions, flight: Flight) -> list[Span]:
-    """Straight flight in GPS time, and where the trajectory says nothing.
+    """Return straight flight in GPS time, and where the trajectory says nothing.
 
     Before a device's own INS is aligned there is nothing to be had: that is told, and no strip.
     """
@@ -429,7 +429,7 @@ def refuse_geocentric(crs: str) -> None:
 
 
 def of_log(log: Path, lines: Sequence[str], options: Options) -> list[str]:
-    """What is wrong with the configuration in a log names the log; what the command line said does not."""
+    """Return what is wrong with the configuration in a log names the log; what the command line said does not."""
     files = [file for _, file in options.calibrations.values()]
     own = ("output.", "datum", *files) if options.crs or options.datum or options.epoch else ("--", *files)
     return [line if line.startswith(own) else f"{log}: {line}" for line in lines]

@@ -154,7 +154,7 @@ def _from_file(wish: TrajectoryOptions, file: Path, span: tuple[int, int], leap_
 
 
 def _from_device(setup: Setup, clocks: LogClocks) -> tuple[Trajectory, dict[str, int]]:
-    """What the device's own INS said, and what became of its solutions."""
+    """Return what the device's own INS said, and what became of its solutions."""
     buffer = TrajectoryBuffer(setup.sources.protocol(setup.sources.ins_source), name=FROM_LOG)
     buffer.append(clocks.ins_rows)
     solutions = buffer.snapshot().with_velocities()
@@ -179,7 +179,8 @@ def _navigated(setup: Setup, session: Session, solutions: dict[str, int]) -> Nav
 
 
 def offset_of(at: str, setup: Setup) -> Vector | None:
-    """Where a trajectory's point is, from the body's origin in b; None: there. The scanner's is its calibration's.
+    """Return where a trajectory's point is, from the body's origin in b; None: there. The scanner's is its
+    calibration's.
 
     Raises:
         UserError: it is no such point.
@@ -225,7 +226,7 @@ def refuse_no_overlap(trajectory: Trajectory, file: str, span: Span, log: Path) 
 
 
 def refuse_other_motion(clocks: LogClocks, trajectory: Trajectory, file: str, log: Path) -> list[str]:
-    """The trajectory turns when the log's IMU does; one in UTC or of another week does not.
+    """Return the trajectory turns when the log's IMU does; one in UTC or of another week does not.
 
     Gives a line of doubt where it turns a little earlier or later.
 
@@ -245,7 +246,7 @@ def refuse_other_motion(clocks: LogClocks, trajectory: Trajectory, file: str, lo
 
 
 def attitude_doubts(trajectory: Trajectory, named: str) -> list[str]:
-    """A line where the body would fly on its back or not forward: the attitude is of other axes than b's."""
+    """Return a line where the body would fly on its back or not forward: the attitude is of other axes than b's."""
     step = max(1, len(trajectory) // LOOKED_AT)
     seen = replace(trajectory, **{column: getattr(trajectory, column)[::step] for column in COLUMNS})
     roll, pitch, heading = seen.attitude()

@@ -130,7 +130,7 @@ def _plan(
 
 
 def _origin(flights: Sequence[Flight]) -> tuple[float, float, float]:
-    """Offset of all files: the middle of the trajectory, rounded; heights have none."""
+    """Return offset of all files: the middle of the trajectory, rounded; heights have none."""
     flight = flights[0]
     assert flight.trajectory is not None
     assert flight.setup.mapping is not None
@@ -171,7 +171,7 @@ def _out_of_sight(wish: GeorefOptions, names: Sequence[str]) -> Iterator[tuple[P
 
 
 def _strips(folder: Path, name: str) -> list[Path]:
-    """Files of a session's strips that are there."""
+    """Return files of a session's strips that are there."""
     return [file for file in sorted(folder.glob(f"{glob.escape(name)}_strip*")) if file.name.endswith(ENDINGS)]
 
 
@@ -247,7 +247,7 @@ def _make(
 
 
 def _files(job: Job, result: JobResult) -> tuple[Path | None, Path | None]:
-    """What a job made: points, and the list of what has no place."""
+    """Return what a job made: points, and the list of what has no place."""
     if result.failed:
         return None, None
     return job.path if result.points or result.withheld else None, job.dropped if result.listed else None
@@ -276,7 +276,7 @@ def _write_trajectory(flight: Flight, folder: Path) -> list[Path]:
 
 
 def refuse_nothing(log: Path, troubles: Sequence[str], became: str) -> NoReturn:
-    """Where no return at all could be placed, there is no product.
+    """Return where no return at all could be placed, there is no product.
 
     Args:
         log: the first one.

@@ -31,14 +31,14 @@ UNCOVERED = {"outside_trajectory": "are outside the trajectory", "trajectory_gap
 
 
 def calibration_entry(calibration: Calibration) -> dict[str, Any]:
-    """A calibration with all its parameters, in the units of its file."""
+    """Return a calibration with all its parameters, in the units of its file."""
     parameters = {parameter.key: calibration.value(parameter.name) / parameter.factor for parameter in PARAMETERS}
     said = {key: calibration.header[key] for key in CARRIED if key in calibration.header}
     return {"id": calibration.id, "method": calibration.method, **said, "parameters": parameters}
 
 
 def settings_entry(setup: Setup) -> dict[str, Any]:
-    """What the configuration says that the points depend on."""
+    """Return what the configuration says that the points depend on."""
     config = setup.config
     return {
         "atmosphere": config.atmosphere.model_dump(mode="json"),
@@ -74,7 +74,7 @@ def count_unread(results: Sequence[JobResult]) -> dict[str, Counter[str]]:
 
 
 def reasons_text(fates: Iterable[Counter[str]]) -> str:
-    """What became of returns, for people."""
+    """Return what became of returns, for people."""
     total: Counter[str] = Counter()
     for counts in fates:
         total.update(counts)
@@ -89,7 +89,7 @@ def counts_entry(fates: Counter[str]) -> dict[str, Any]:
 
 
 def strip_entry(result: JobResult, file: Path | None, dropped: Path | None) -> dict[str, Any]:
-    """A strip: its files, its times, what is in it."""
+    """Return a strip: its files, its times, what is in it."""
     entry: dict[str, Any] = {
         "number": result.strip,
         "file": None if file is None else file.name,
@@ -114,7 +114,7 @@ def strip_entry(result: JobResult, file: Path | None, dropped: Path | None) -> d
 def run_record(
     flights: Sequence[Flight], results: Sequence[JobResult], files: Mapping[int, tuple[Path | None, Path | None]]
 ) -> dict[str, Any]:
-    """What the sidecar says of the run, but for the user's wishes.
+    """Return what the sidecar says of the run, but for the user's wishes.
 
     Args:
         flights: of the run.
@@ -220,7 +220,7 @@ def _warnings(flight: Flight, results: Sequence[JobResult]) -> list[str]:
 
 
 def unit_doubts(flight: Flight) -> list[str]:
-    """Where coordinates are feet and heights, of which the CRS says nothing, are metres."""
+    """Return where coordinates are feet and heights, of which the CRS says nothing, are metres."""
     assert flight.setup.mapping is not None
     frame = flight.setup.mapping.description()
     unit, _, unit_of_height = frame["units"]["names"]

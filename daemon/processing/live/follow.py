@@ -79,13 +79,15 @@ class LivePart(PartFollower):
             self._at += _HEAD.size + length
 
     def read(self, place: ChunkPlace, *, scanners: bool = True) -> Iterator[LogBatch]:
-        """The messages of a chunk, on wish without those of scanners."""
+        """Yield the messages of a chunk, on wish without those of scanners."""
         for batch in self._chunk(place.at, place.length):
             if scanners or batch.channel.chunk_class != "scanner":
                 yield batch
 
     def is_scanners(self, place: ChunkPlace) -> bool:
-        """Whether a chunk is known to hold scanners' messages, by the index behind it; what is unknown is not."""
+        """Return whether a chunk is known to hold scanners' messages, by the index behind it; what is unknown is
+        not.
+        """
         peek = self._pread(place.at + _HEAD.size + place.length, _HEAD.size + 2)
         if len(peek) < _HEAD.size + 2 or peek[0] != OP_MESSAGE_INDEX:
             return False
@@ -93,7 +95,7 @@ class LivePart(PartFollower):
         return channel is not None and channel.chunk_class == "scanner"
 
     def is_cached(self, place: ChunkPlace) -> bool:
-        """Whether a chunk can be read without the disk."""
+        """Return whether a chunk can be read without the disk."""
         return is_cached(self._file.fileno(), place.at, _HEAD.size + place.length)
 
     def go_to_cached(self) -> None:
@@ -136,7 +138,7 @@ class LiveFollower:
     # ------------------------------------------------------------------ from chunk to chunk
 
     def poll(self) -> Iterator[LogBatch | Skipped]:
-        """All that has become readable since the last call, in the file's order."""
+        """Yield all that has become readable since the last call, in the file's order."""
         sign = read_sign(self._directory)
         if self.part is None:
             if sign is None:
@@ -187,7 +189,7 @@ class LiveFollower:
     # ------------------------------------------------------------------ from part to part
 
     def _begin(self, sign: Sign) -> Iterator[LogBatch | Skipped]:
-        """The first part of all: with what lies before it, or with as much of that as clocks need."""
+        """Yield the first part of all: with what lies before it, or with as much of that as clocks need."""
         path = sign.path
         if self._from_start:
             path = next(iter(_parts_before(self._directory, sign)), path)
@@ -239,7 +241,7 @@ class LiveFollower:
         return False
 
     def _is_abandoned(self, part: LivePart) -> bool:
-        """Whether nobody writes a part any more that has no end; asked seldom, and only when nothing comes."""
+        """Return whether nobody writes a part any more that has no end; asked seldom, and only when nothing comes."""
         now_s = time.monotonic()
         if now_s - max(self._advanced_s, self._asked_s) < GONE_S:
             return False
@@ -258,7 +260,7 @@ def _opened(path: Path) -> LivePart | None:
 
 
 def _parts_before(directory: Path, sign: Sign) -> Iterator[Path]:
-    """Parts of the session that is recorded, the first one first."""
+    """Yield parts of the session that is recorded, the first one first."""
     names = (path.stem.rpartition("_")[2] for path in directory.glob(f"{sign.session_id}_*.mcap"))
     for number in sorted(int(name) for name in names if _NUMBER.fullmatch(name)):
         if number < sign.part:
@@ -276,7 +278,7 @@ _PROT_READ, _MAP_SHARED, _MAP_FAILED = 1, 1, ctypes.c_void_p(-1).value
 
 
 def is_cached(fd: int, at: int, length: int) -> bool:
-    """Whether all of a stretch of a file is in memory (mincore(2)); where that cannot be known, it is not.
+    """Return whether all of a stretch of a file is in memory (mincore(2)); where that cannot be known, it is not.
 
     The kernel tells it the file's owner and who may write it; for others everything looks cached.
     """

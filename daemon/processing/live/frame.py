@@ -35,7 +35,7 @@ class Maps(Protocol):
         """The CRS."""
 
     def map_from_e(self, points_e: FloatArray) -> FloatArray:
-        """(n, 3) east, north, height."""
+        """Return (n, 3) east, north, height."""
 
 
 class LocalFrame:
@@ -66,12 +66,12 @@ class LocalFrame:
         return points_e if self._mapping is None else self._mapping.map_from_e(points_e)
 
     def of_points(self, points: FloatArray) -> FloatArray:
-        """(n, 3) of points as the georeferencer gives them."""
+        """Return (n, 3) of points as the georeferencer gives them."""
         away: FloatArray = points - self.origin
         return away @ self._rot_points_from_enu if self.is_level else away * self.unit_m
 
     def cloud_of(self, points: Points, keep: NDArray[np.int64]) -> NDArray[Any]:
-        """Those of the points, by number, of `CLOUD_DTYPE`."""
+        """Return those of the points, by number, of `CLOUD_DTYPE`."""
         cloud = np.empty((len(keep), 4), np.float32)
         if self.is_level:
             cloud[:, :3] = self.of_points(points.points_map.take(keep, axis=0))
@@ -81,7 +81,7 @@ class LocalFrame:
         return cloud.view(CLOUD_DTYPE).reshape(-1)
 
     def pose_of(self, position_e: FloatArray, q_e_from_b: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Position (3,) and quaternion (4,), scalar first and ≥ 0, of the body.
+        """Return position (3,) and quaternion (4,), scalar first and ≥ 0, of the body.
 
         The axes are those of the frame where the body is: three steps along b, mapped, made perpendicular.
         """

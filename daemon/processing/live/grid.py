@@ -80,7 +80,9 @@ class CountGrid:
             self._counts[slot, top : top + half, left : left + half] += sums
 
     def extent(self) -> tuple[int, int, int, int] | None:
-        """West, south, east, north of what is held, in tiles (east and north beyond the last); None: nothing is."""
+        """Return west, south, east, north of what is held, in tiles (east and north beyond the last); None: nothing
+        is.
+        """
         held = int(self._state[0])
         if not held:
             return None
@@ -89,7 +91,7 @@ class CountGrid:
         return west, south, east, north
 
     def image(self, limit: int) -> tuple[NDArray[np.uint64], float, float, float]:
-        """Counts with north up, at most ``limit`` cells along a side.
+        """Return counts with north up, at most ``limit`` cells along a side.
 
         Returns:
             Counts (rows, columns); west and north edge, and width of the image's cells, in metres.
@@ -113,7 +115,9 @@ class CountGrid:
         return image, west * TILE * self.cell_m, north * TILE * self.cell_m, width_m
 
     def numbers(self) -> dict[str, Any]:
-        """Area that points fell into, their density there, and its quantiles over the cells, for people and scripts."""
+        """Return area that points fell into, their density there, and its quantiles over the cells, for people and
+        scripts.
+        """
         frequency = np.zeros(_FREQUENCIES, dtype=np.int64)
         _count_cells(self._counts, int(self._state[0]), frequency)
         cells, cell_m2 = int(frequency[1:].sum()), self.cell_m**2
@@ -135,7 +139,7 @@ class CountGrid:
 
 
 def _find_tile(column: int, row: int, keys: Any, slots: Any, places: Any, state: Any) -> int:
-    """The tile's number, a new one where it is not held; -1: there is no room."""
+    """Return the tile's number, a new one where it is not held; -1: there is no room."""
     key = column * (4 * _FAR) + row
     at = (column * 73_856_093 ^ row * 19_349_663) & (_SLOTS - 1)
     while keys[at] != _EMPTY and keys[at] != key:

@@ -88,7 +88,7 @@ class LiveMcap:
         return written + self._since_flush + END_BYTES + END_BYTES_PER_CHUNK * self._chunks
 
     def add_cloud(self, topic: str, points: NDArray[Any], time_ns: int, log_time_ns: int) -> bool:
-        """Points (n,) of `CLOUD_DTYPE` in the frame ``local``; whether they were written."""
+        """Return points (n,) of `CLOUD_DTYPE` in the frame ``local``; whether they were written."""
         cloud = fox.PointCloud(
             timestamp=_stamp(time_ns),
             frame_id=FRAME,
@@ -100,7 +100,7 @@ class LiveMcap:
         return self._add(topic, cloud, log_time_ns)
 
     def add_pose(self, pose: LivePose, log_time_ns: int) -> bool:
-        """Position, pose and the transform to the body; whether they were written."""
+        """Return position, pose and the transform to the body; whether they were written."""
         stamp = _stamp(pose.time_ns)
         w, *xyz = pose.q_local_from_b.tolist()
         turned = fox.Quaternion(x=xyz[0], y=xyz[1], z=xyz[2], w=w)
@@ -141,7 +141,7 @@ class LiveMcap:
         return True
 
     def _is_beyond(self, length: int) -> bool:
-        """Whether so much more is more than the quota; the run before gives way first."""
+        """Return whether so much more is more than the quota; the run before gives way first."""
         if self.is_full:
             return True
         size = self.size + length + 64

@@ -51,14 +51,14 @@ class Thinning:
         self._state = np.array([np.iinfo(np.int64).min, 0, 0, FIRST_STRIDE, 0], dtype=np.int64)
 
     def keep(self, time_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Which (k,) of points in the order in which they came."""
+        """Return which (k,) of points in the order in which they came."""
         kept_ones = np.empty(len(time_ns), dtype=np.int64)
         return kept_ones[: _thin(time_ns, self._limit, self._state, kept_ones)]
 
 
 @jit_cached
 def _thin(time_ns: Any, limit: int, state: Any, keep: Any) -> int:
-    """How many are kept.
+    """Return how many are kept.
 
     state: first nanosecond after the second, points in it, of them kept, stride, points until the next is kept.
     """
@@ -204,7 +204,7 @@ class LiveProducts:
         return written
 
     def origin(self) -> dict[str, Any]:
-        """What the coordinates of the products mean."""
+        """Return what the coordinates of the products mean."""
         said: dict[str, Any] = {"crs": self._about, "axes": "east, north, up, metres"}
         if self.frame is not None:
             said["origin"] = [round(value, 4) for value in self.frame.origin.tolist()]
@@ -243,7 +243,7 @@ class LiveProducts:
 
 
 def unix_from_gps(gps_ns: int) -> int:
-    """POSIX nanoseconds of a GPS time, for stamps that people see: leap seconds by the built-in table."""
+    """Return POSIX nanoseconds of a GPS time, for stamps that people see: leap seconds by the built-in table."""
     second, rest_ns = divmod(gps_ns, SECOND_NS)
     return _unix_of_second(second) + rest_ns
 
@@ -263,7 +263,9 @@ def replace_file(path: Path, data: bytes) -> None:
 
 
 def picture(counts: NDArray[Any], cell_m: float) -> bytes:
-    """A PNG (ISO/IEC 15948) of points in cells (rows, columns), a pixel each, coloured by density; none is clear."""
+    """Return a PNG (ISO/IEC 15948) of points in cells (rows, columns), a pixel each, coloured by density; none is
+    clear.
+    """
     index: NDArray[np.uint8] = np.zeros(counts.shape, dtype=np.uint8)
     for density, _ in _COLOURS:
         index += counts >= max(1, math.ceil(density * cell_m**2))

@@ -112,7 +112,9 @@ class LiveSession:
         self.products.take_pose(self._path.trajectory, self.now_ns)
 
     def host_now_ns(self, *, live: bool) -> int:
-        """Host time of the session; of another computer's, whose clocks are not ours, that of what was read last."""
+        """Return host time of the session; of another computer's, whose clocks are not ours, that of what was read
+        last.
+        """
         if live and self._is_own:
             return time.monotonic_ns() + self.info.realtime_ns - self.info.monotonic_ns
         return self.now_ns
@@ -257,7 +259,7 @@ def made_session(
     beside_recorder: bool = False,
     accept_verdict: bool = False,
 ) -> LiveSession:
-    """A session; UserError where its folder cannot be written to."""
+    """Return a session; UserError where its folder cannot be written to."""
     try:
         session = LiveSession(
             setup, info, folder, live, points, beside_recorder=beside_recorder, accept_verdict=accept_verdict
@@ -280,7 +282,7 @@ def replay(
     *,
     accept_verdict: bool = False,
 ) -> Told:
-    """The same over a finished session, as fast as it goes; the last status, which also stands in ``folder``.
+    """Return the same over a finished session, as fast as it goes; the last status, which also stands in ``folder``.
 
     Args:
         session: of `open_logs`.

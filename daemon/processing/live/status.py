@@ -43,7 +43,7 @@ class Latencies:
             self._blocks.popleft()
 
     def plain(self) -> dict[str, float] | None:
-        """p50, p95 and max; None: there are none."""
+        """Return p50, p95 and max; None: there are none."""
         now_s = time.monotonic()
         latest = [seconds for at_s, seconds in self._blocks if now_s - at_s <= WINDOW_S]
         if not latest:
@@ -108,7 +108,7 @@ class LiveStatus:
         return offset_ns
 
     def plain(self, follower: LiveFollower | None, now_ns: int) -> dict[str, Any]:
-        """How things are, at a host time; without a follower finished logs are read."""
+        """Return how things are, at a host time; without a follower finished logs are read."""
         stream, products = self._stream, self._products
         now_s = time.monotonic()
         passed_s = max(1e-3, now_s - self._told_s)
@@ -150,7 +150,7 @@ class LiveStatus:
         return {FATE_NAMES[fate]: count for fate, count in self._stream.fates(name).items()}
 
     def _without_time(self, name: str, now_ns: int) -> str:
-        """Why returns of a scanner that came since the last time have no time; empty: few or none."""
+        """Return why returns of a scanner that came since the last time have no time; empty: few or none."""
         source, clocks = f"scanner/{name}", self._stream.clocks
         fates, refused = Counter(self._fates(name)), Counter(clocks.refused(source))
         new_fates = fates - self._fates_before.get(name, Counter())
@@ -176,7 +176,7 @@ class LiveStatus:
 
 
 def sentence(found: dict[str, Any]) -> str:
-    """A line for people."""
+    """Return a line for people."""
     if "points" not in found:
         return str(found["state"])
     rate = sum(found["points_per_s"].values())
@@ -204,7 +204,9 @@ def sentence(found: dict[str, Any]) -> str:
 
 
 def is_well(found: dict[str, Any]) -> bool:
-    """Whether points come of every scanner, on time, and nothing is wrong: what an operator may take for good."""
+    """Return whether points come of every scanner, on time, and nothing is wrong: what an operator may take for
+    good.
+    """
     if "points" not in found:
         return False
     wrong = [found.get(key) for key in ("trouble", "points_file", "live_skipped_s", "damaged_chunks", "without_time")]
@@ -213,7 +215,7 @@ def is_well(found: dict[str, Any]) -> bool:
 
 
 def _behind_s(found: dict[str, Any]) -> float | None:
-    """How far points are behind their pulses, 95 % of the worst scanner's; None: there are none."""
+    """Return how far points are behind their pulses, 95 % of the worst scanner's; None: there are none."""
     return max((value["pulse"]["p95"] for value in found["latency_s"].values() if value["pulse"]), default=None)
 
 

@@ -41,7 +41,7 @@ def refuse_nothing(found: NavigationLog, sources: NavigationSources, log: Path, 
 
 
 def _heard(found: NavigationLog, source: str) -> str:
-    """What came of a source that gave nothing, and what that means."""
+    """Return what came of a source that gave nothing, and what that means."""
     size, skipped, messages = found.heard.get(source, (0, 0, Counter()))
     if not size:
         return "not a byte of it is in the log; is its wire recorded?"
@@ -179,7 +179,7 @@ def _silent_antenna(found: NavigationLog, sources: NavigationSources, log: Path)
 
 
 def _baseline_doubts(found: NavigationLog, sources: NavigationSources, log: Path) -> list[str]:
-    """The receiver measures the baseline too: another length is another lever arm."""
+    """Return the receiver measures the baseline too: another length is another lever arm."""
     told = [heading.baseline_m for heading in found.headings if heading.valid and heading.baseline_m]
     baseline = sources.setup().baseline_b
     if not told or baseline is None:

@@ -212,7 +212,7 @@ def _sources(session: Session, wish: InputOptions) -> NavigationSources:
 
 
 def _sampled(times: ImuTimes, sources: NavigationSources, storage: Storage) -> tuple[Inertial, Sampler]:
-    """Increments of all samples; what is missing between them shows in their times."""
+    """Return increments of all samples; what is missing between them shows in their times."""
     table = sources.imu
     try:
         sampler = Sampler(table.rate_hz, table.sample, table.stamp, sources.rot_b_from_imu)
@@ -335,7 +335,7 @@ class _Placed:
         return parts
 
     def leap_seconds(self) -> int | None:
-        """GPS − UTC as the receiver said it; None: it is a guess."""
+        """Return GPS − UTC as the receiver said it; None: it is a guess."""
         if self.sources.gnss_source is None:
             return None
         newest = max([int(self.found.imu["host_time_ns"][-1]), *(fix.host_time_ns for fix in self.found.fixes)])
@@ -360,7 +360,7 @@ class _Placed:
 def _arrived(
     records: Sequence[GnssFix] | Sequence[GnssHeading] | Sequence[EventMark],
 ) -> tuple[list[int], list[TimeTag | None]]:
-    """Host times and tags of records."""
+    """Return host times and tags of records."""
     return [record.host_time_ns for record in records], [record.time for record in records]
 
 

@@ -103,7 +103,7 @@ class Navigator:
             self._headings.append(record)
 
     def advance(self, tick_ns: int) -> StructArray:
-        """Poses that have become known at a tick of the log: `INS_DTYPE`, attitude of b."""
+        """Return poses that have become known at a tick of the log: `INS_DTYPE`, attitude of b."""
         self._clocks.update()
         observations, gaps = self._observations(tick_ns), len(self._sampler.gaps)
         inertial = self._inertial(tick_ns)
@@ -117,7 +117,7 @@ class Navigator:
         return np.empty(0, INS_DTYPE) if self._filter is None else poses(self._filter.new_path())
 
     def close(self) -> StructArray:
-        """The log is over: what still waits."""
+        """Return the log is over: what still waits."""
         rows = self.advance(NEVER_NS)
         if self._filter is None:
             return rows
@@ -149,7 +149,7 @@ class Navigator:
     # ------------------------------------------------------------------ times
 
     def _inertial(self, tick_ns: int) -> Inertial:
-        """Samples whose times are known by now."""
+        """Return samples whose times are known by now."""
         rows = np.concatenate([np.empty(0, IMU_DTYPE), *self._imu])
         time_ns, known = self._times(rows)
         if not known.all():  # those behind one that waits wait too, so that they stay in order
@@ -166,7 +166,7 @@ class Navigator:
         return self._sampler.feed(rows, time_ns)
 
     def _times(self, rows: StructArray) -> tuple[Int64Array, NDArray[np.bool_]]:
-        """GPS ns (n,) of samples, and whether they are known."""
+        """Return GPS ns (n,) of samples, and whether they are known."""
         source = self._sources.imu_source
         own = rows["gps_week"] >= 0
         if own.any():
@@ -239,7 +239,7 @@ class _Counter:
         self._host_ns: int | None = None
 
     def told(self, rows: StructArray, clocks: StreamClocks, source: str) -> StructArray:
-        """Rows with a device time; those that say GPS time themselves need no clock."""
+        """Return rows with a device time; those that say GPS time themselves need no clock."""
         if (rows["gps_week"] >= 0).any() or source not in clocks.host.plan.devices:
             return rows
         bare = np.flatnonzero(rows["device_time_ns"] < 0).tolist()
@@ -260,7 +260,7 @@ class _Counter:
 
 
 def poses(path: Path) -> StructArray:
-    """States of a filter (n, …) as `INS_DTYPE` rows."""
+    """Return states of a filter (n, …) as `INS_DTYPE` rows."""
     rows = np.zeros(len(path.time_ns), INS_DTYPE)
     lat, lon, height = geodetic_from_e(path.states[:, :3])
     rot_l_from_e = rot_e_from_l(lat, lon).swapaxes(-1, -2)

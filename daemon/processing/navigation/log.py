@@ -101,7 +101,7 @@ class _Reader:
                 self._take_records(name, self._parsers[name].feed_batch(units))
 
     def close(self) -> NavigationLog:
-        """Tails of the streams; all clocks at once."""
+        """Return tails of the streams; all clocks at once."""
         found = self.found
         for name, parser in self._parsers.items():
             self._take_records(name, parser.close())
@@ -162,7 +162,7 @@ def read_navigation_log(session: Session, sources: NavigationSources) -> Navigat
 
 
 def session_holes(session: Session) -> list[str]:
-    """What is missing of a session that has been read, a line each."""
+    """Return what is missing of a session that has been read, a line each."""
     folder = session.parts[0].path.parent
     lines = [f"{folder}: part {number} of {session.session_id} is missing" for number in session.missing_parts]
     if session.growing is not None:

@@ -85,7 +85,7 @@ class NavigatedLeg:
     findings: list[Finding]
 
     def solution(self, *, smooth: bool) -> Solution:
-        """The one asked for."""
+        """Return the one asked for."""
         return self.solved.smoothed if smooth else self.solved.forward
 
     def noise_found(self) -> dict[str, float]:
@@ -144,7 +144,7 @@ class Navigated:
         return joined_trajectory([solution.trajectory() for solution in self.solutions()], name)
 
     def velocity_sigma_l(self) -> FloatArray:
-        """(n, 3) m/s of the trajectory's epochs."""
+        """Return (n, 3) m/s of the trajectory's epochs."""
         return np.concatenate([solution.velocity_sigma_l for solution in self.solutions()])
 
 
@@ -226,7 +226,7 @@ def _navigated(inputs: NavigationInputs, leg: Leg, wish: NavigationOptions, stor
 
 
 def _why_not(inputs: NavigationInputs, leg: Leg) -> list[str]:
-    """What is wrong with a leg's data that gave no start."""
+    """Return what is wrong with a leg's data that gave no start."""
     from swath.georef.navigation.diagnosis.diagnose import diagnose
 
     found = diagnose(leg.inertial, leg.observations, inputs.setup, None)
@@ -234,7 +234,7 @@ def _why_not(inputs: NavigationInputs, leg: Leg) -> list[str]:
 
 
 def _with_attitude(leg: Leg, attitude_rad: tuple[float, float, float]) -> StructArray:
-    """The observations, and an attitude that is known at the leg's beginning."""
+    """Return the observations, and an attitude that is known at the leg's beginning."""
     row = np.zeros(1, OBSERVATION_DTYPE)
     row["time_ns"], row["kind"] = leg.inertial.time_ns[0], Kind.ATTITUDE
     row["value"], row["sigma"] = attitude_rad, GIVEN_SIGMA_RAD
@@ -268,7 +268,7 @@ def _ins_doubts(inputs: NavigationInputs, navigated: Trajectory) -> list[str]:
 
 
 def joined_trajectory(parts: Sequence[Trajectory], name: str, max_gap_ns: int = DEFAULT_MAX_GAP_NS) -> Trajectory:
-    """One trajectory of several that follow each other."""
+    """Return one trajectory of several that follow each other."""
     if len(parts) == 1:
         return replace(parts[0], name=name, max_gap_ns=max_gap_ns)
     columns = {column: np.concatenate([getattr(part, column) for part in parts]) for column in COLUMNS}
@@ -291,7 +291,7 @@ def arm_of_text(text: str) -> tuple[float, float, float]:
 
 
 def attitude_of_text(text: str) -> tuple[float, float, float]:
-    """``roll,pitch,heading`` in degrees; rad.
+    """Return ``roll,pitch,heading`` in degrees; rad.
 
     Raises:
         UserError: it is none.
@@ -320,7 +320,7 @@ class MappedStorage(Storage):
         self._mapped: weakref.WeakSet[mmap.mmap] = weakref.WeakSet()
 
     def empty(self, shape: tuple[int, ...], dtype: Any) -> NDArray[Any]:
-        """An array of zeros, mapped where it is large."""
+        """Return an array of zeros, mapped where it is large."""
         size = prod(shape) * np.dtype(dtype).itemsize
         if size < max(self._smallest_bytes, 1):
             return np.empty(shape, dtype)
@@ -340,7 +340,9 @@ class MappedStorage(Storage):
 
 
 def offset_in_b(ins: Trajectory, navigated: Trajectory) -> tuple[FloatArray, FloatArray] | None:
-    """Median and scatter (3,) of where an INS's point is, from the body's origin in b, m; None: too few to tell."""
+    """Return median and scatter (3,) of where an INS's point is, from the body's origin in b, m; None: too few to
+    tell.
+    """
     _, first = np.unique(ins.time_ns // STEP_NS, return_index=True)
     first = first[navigated.fates(ins.time_ns[first]) == Fate.GEOREFERENCED]
     if len(first) < FEWEST:
@@ -353,7 +355,7 @@ def offset_in_b(ins: Trajectory, navigated: Trajectory) -> tuple[FloatArray, Flo
 
 
 def point_doubts(ins: Trajectory, navigated: Trajectory, lever_arms_b: Sequence[FloatArray], source: str) -> list[str]:
-    """A line where the INS's point is not the body's origin, and which it seems to be."""
+    """Return a line where the INS's point is not the body's origin, and which it seems to be."""
     found = offset_in_b(ins, navigated)
     if found is None:
         return []

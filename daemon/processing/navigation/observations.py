@@ -62,7 +62,7 @@ class Observed:
 def gps_times(
     host: HostClocks, source: str | None, host_ns: Sequence[int], tags: Sequence[TimeTag | None]
 ) -> list[int | None]:
-    """GPS ns of a receiver's tags by what arrived when; None where one cannot be placed.
+    """Return GPS ns of a receiver's tags by what arrived when; None where one cannot be placed.
 
     Args:
         host: complete clocks.
@@ -91,7 +91,7 @@ def gps_times(
 def fix_observations(
     fixes: Sequence[GnssFix], time_ns: Sequence[int | None], antennas: int, said: Collection[str] = ()
 ) -> Observed:
-    """Positions and velocities of fixes at GPS times; ``antennas`` of the receiver have a known lever arm.
+    """Return positions and velocities of fixes at GPS times; ``antennas`` of the receiver have a known lever arm.
 
     ``said``: names of messages that came beside these, earlier.
     """
@@ -122,7 +122,7 @@ def fix_observations(
 
 
 def _why_not(fix: GnssFix, at_ns: int | None, antennas: int, said: set[str]) -> str | None:
-    """Why a fix is no observation; None: it is one."""
+    """Return why a fix is no observation; None: it is one."""
     if not fix.valid:
         return "not_valid"
     if fix.fix_type not in DEFAULT_SIGMAS:
@@ -179,7 +179,7 @@ def heading_times(
     fixes: Sequence[GnssFix],
     fix_time_ns: Sequence[int | None],
 ) -> list[int | None]:
-    """GPS ns of headings; of one that says no time (HDT) that of the fix that arrived nearest to it."""
+    """Return GPS ns of headings; of one that says no time (HDT) that of the fix that arrived nearest to it."""
     placed = [(fix.host_time_ns, at) for fix, at in zip(fixes, fix_time_ns, strict=True) if at is not None]
     placed.sort()
     arrived = np.array([host_ns for host_ns, _ in placed], np.int64)
@@ -196,7 +196,9 @@ def heading_times(
 def heading_observations(
     headings: Sequence[GnssHeading], time_ns: Sequence[int | None], baseline_m: float | None
 ) -> Observed:
-    """Directions of a baseline at GPS times; ``baseline_m`` by the configuration, None: it names no second antenna."""
+    """Return directions of a baseline at GPS times; ``baseline_m`` by the configuration, None: it names no second
+    antenna.
+    """
     refused: Counter[str] = Counter()
     assumed: Counter[str] = Counter()
     best: dict[int, GnssHeading] = {}
@@ -230,7 +232,9 @@ def _angle_sigma(said: float | None, usual: float) -> float:
 def ins_observations(
     rows: StructArray, is_solution: Callable[[NDArray[np.uint32]], NDArray[np.bool_]] | None
 ) -> Observed:
-    """Attitudes of a device's own INS, now and then: its positions rest on the fixes, which are taken already."""
+    """Return attitudes of a device's own INS, now and then: its positions rest on the fixes, which are taken
+    already.
+    """
     usable = np.isfinite(rows["roll_rad"]) & np.isfinite(rows["pitch_rad"]) & np.isfinite(rows["heading_rad"])
     if is_solution is not None:
         usable &= is_solution(rows["status"])
@@ -249,6 +253,6 @@ def ins_observations(
 
 
 def joined(parts: Sequence[Observed]) -> StructArray:
-    """All rows, sorted."""
+    """Return all rows, sorted."""
     rows = [part.rows for part in parts]
     return sort_observations(np.concatenate(rows) if rows else np.empty(0, OBSERVATION_DTYPE))

@@ -46,7 +46,7 @@ def refuse_unreadable(file: Path) -> None:
 def outside_observations(
     file: Path, span_ns: tuple[int, int], week: int | None, leap_seconds: int | None
 ) -> OutsidePositions:
-    """Positions and velocities of the file's antenna, the primary one.
+    """Return positions and velocities of the file's antenna, the primary one.
 
     Args:
         file: RTKLIB .pos or Waypoint text.
@@ -100,7 +100,9 @@ def refuse_shifted(outside: OutsidePositions, own: StructArray) -> None:
 
 
 def _apart_m(own: StructArray, rows: StructArray, shift_s: int) -> float:
-    """Median distance of the receiver's positions from the file's so many seconds later; inf: too few have both."""
+    """Return median distance of the receiver's positions from the file's so many seconds later; inf: too few have
+    both.
+    """
     epochs = rows["time_ns"]
     wanted = own["time_ns"] + shift_s * SECOND_NS
     after = np.clip(np.searchsorted(epochs, wanted), 1, len(epochs) - 1)
@@ -149,7 +151,7 @@ def _rows(
     value: NDArray[np.float64],
     sigma: NDArray[np.float64] | None,
 ) -> tuple[StructArray, NDArray[np.bool_]]:
-    """Rows of a kind, and where a default sigma stands in them."""
+    """Return rows of a kind, and where a default sigma stands in them."""
     n = len(columns.time_ns)
     default = np.ones((n, 3))
     for known, sigmas in DEFAULT_SIGMAS.items():

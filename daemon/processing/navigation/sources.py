@@ -129,7 +129,7 @@ class NavigationSources:
     # ------------------------------------------------------------------ reading
 
     def parsers(self) -> dict[str, Parser]:
-        """New parsers of the IMU and of all receivers, by source.
+        """Return new parsers of the IMU and of all receivers, by source.
 
         Raises:
             ConfigError: a driver cannot work with its settings.
@@ -157,15 +157,15 @@ class NavigationSources:
         return found
 
     def inside(self, source: str) -> list[str]:
-        """Sources whose messages stand in a wire's bytes."""
+        """Return sources whose messages stand in a wire's bytes."""
         return self._devices.inside(source)
 
     def edge_of(self, source: str) -> str | None:
-        """Polarity of the edges of ``pps/name``; None: no such source."""
+        """Return polarity of the edges of ``pps/name``; None: no such source."""
         return self._devices.edge_of(source)
 
     def clock_plan(self, info: SessionInfo) -> ClockPlan:
-        """The clocks of a session; the IMU's own is kept beside them."""
+        """Return the clocks of a session; the IMU's own is kept beside them."""
         plan = self._devices.clock_plan(info)
         devices = {} if self.clock is None else {self.imu_source: DevicePlan(self.clock)}
         return replace(plan, devices=devices)
@@ -178,11 +178,13 @@ class NavigationSources:
         return np.array(self.imu.rotation_b_imu, dtype=np.float64)
 
     def ins_rows_in_b(self, rows: NDArray[np.void]) -> NDArray[np.void]:
-        """Solutions of the device's INS with the attitude of b."""
+        """Return solutions of the device's INS with the attitude of b."""
         return self._devices.ins_rows(rows)
 
     def setup(self, *, time_sigma_s: float = 0.0) -> Setup:
-        """Lever arms, baseline and noise; ``time_sigma_s`` of the IMU's times, where an offset is to be found."""
+        """Return lever arms, baseline and noise; ``time_sigma_s`` of the IMU's times, where an offset is to be
+        found.
+        """
         table = self.gnss
         arms = [np.zeros(3) if table is None else np.array(table.lever_arm_m, dtype=np.float64)]
         if table is not None and table.secondary_lever_arm_m is not None:
@@ -197,7 +199,9 @@ class NavigationSources:
 
 
 def filter_setup(noise: ImuNoise, arms_b: Sequence[FloatArray], *, time_sigma_s: float = 0.0) -> Setup:
-    """The filter's setup of a unit, and of a receiver with antennas (3,), primary first; see `NavigationSources`."""
+    """Return the filter's setup of a unit, and of a receiver with antennas (3,), primary first; see
+    `NavigationSources`.
+    """
     return Setup(
         noise=noise,
         lever_arms_b=np.stack(arms_b),
@@ -211,7 +215,8 @@ def filter_setup(noise: ImuNoise, arms_b: Sequence[FloatArray], *, time_sigma_s:
 
 
 def files_of(session: Session, config: Config | None) -> dict[str, bytes]:
-    """What a configuration names, by the names in a log: of the log's own (or None) the log's, else those on the disk.
+    """Return what a configuration names, by the names in a log: of the log's own (or None) the log's, else those on
+    the disk.
 
     Raises:
         OSError: a file cannot be read.
@@ -223,7 +228,7 @@ def files_of(session: Session, config: Config | None) -> dict[str, bytes]:
 
 
 def config_of_log(attachments: Mapping[str, bytes]) -> Config:
-    """The configuration that is stored in a log.
+    """Return the configuration that is stored in a log.
 
     Raises:
         UserError: there is none, or one that cannot be used.
@@ -238,7 +243,7 @@ def config_of_log(attachments: Mapping[str, bytes]) -> Config:
 
 
 def without_scanners(config: Config, **tables: Any) -> Config:
-    """Scanners, their calibrations and the mapping frame do not matter to the way the aircraft went."""
+    """Return scanners, their calibrations and the mapping frame do not matter to the way the aircraft went."""
     update: dict[str, Any] = {
         "scanner": {},
         "output": OutputConfig.model_validate({}),
@@ -248,7 +253,7 @@ def without_scanners(config: Config, **tables: Any) -> Config:
 
 
 def _chosen(kind: str, wanted: str | None, known: list[str], usual: list[str]) -> str:
-    """A name of the configuration; the first of those usually meant where none is asked for."""
+    """Return a name of the configuration; the first of those usually meant where none is asked for."""
     if wanted is not None:
         if wanted in known:
             return wanted
@@ -279,7 +284,7 @@ _NOISE_FIELDS = {
 
 
 def noise_of(table: NoiseConfig) -> ImuNoise:
-    """What ``[imu.….noise]`` says; what it leaves out is its grade's."""
+    """Return what ``[imu.….noise]`` says; what it leaves out is its grade's."""
     said = {key: value for key, value in table.model_dump().items() if key != "grade" and value is not None}
     grade = GRADES[table.grade]
     in_si = imu_noise(**(dict.fromkeys(_NOISE_FIELDS, 0.0) | said))

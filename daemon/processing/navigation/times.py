@@ -133,7 +133,7 @@ def stretches(
 def _by_device(
     rows: StructArray, device_ns: Int64Array, host: HostClocks, clock: str
 ) -> tuple[Int64Array, NDArray[np.float64], bool]:
-    """GPS ns and sigma ns (n,) by a device's clock, and whether it latches the PPS."""
+    """Return GPS ns and sigma ns (n,) by a device's clock, and whether it latches the PPS."""
     said = np.zeros(len(rows), DEVICE_CLOCK_DTYPE)
     said["host_time_ns"], said["device_time_ns"], said["pps_time_ns"] = (
         rows["host_time_ns"],
@@ -149,7 +149,7 @@ def _by_device(
 
 
 def counted_arrivals(host_ns: Int64Array, rate_hz: float) -> Int64Array:
-    """A counter (n,), ns, for samples that have none: one interval each, and the host's time over pauses.
+    """Return a counter (n,), ns, for samples that have none: one interval each, and the host's time over pauses.
 
     Units arrive in bunches and late; the samples themselves are evenly spaced. The interval is the mean of those
     between the pauses, so that crystal and nominal rate may differ.

@@ -57,7 +57,7 @@ class Picture:
     draw: Callable[[Canvas], None]
 
     def svg(self, form: Format) -> bytes:
-        """Drawn alone; the same bytes each time."""
+        """Return drawn alone; the same bytes each time."""
         with rc_context(SETTINGS):
             height_in = self.height_in(form)
             figure = Figure(figsize=(form.width_in, height_in), facecolor="white")
@@ -83,19 +83,19 @@ class Canvas:
         self._page_in = float(figure.get_figwidth()), float(figure.get_figheight())
 
     def place(self, left: float, top: float) -> tuple[float, float]:
-        """A place in the figure's own measure, 0 … 1 from its left lower corner."""
+        """Return a place in the figure's own measure, 0 … 1 from its left lower corner."""
         (across, up), (x, y) = self._page_in, self._corner_in
         return (x + left) / across, 1.0 - (y + top) / up
 
     def panel(self, left: float, top: float, width: float, height: float, **more: Any) -> Axes:
-        """Axes of this size, dressed."""
+        """Return axes of this size, dressed."""
         x, y = self.place(left, top + height)
         axes: Axes = self.figure.add_axes((x, y, width / self._page_in[0], height / self._page_in[1]), **more)
         dress(axes)
         return axes
 
     def text(self, left: float, top: float, words: str, **style: Any) -> Any:
-        """Words whose upper left corner is there."""
+        """Return words whose upper left corner is there."""
         look: dict[str, Any] = {"fontsize": 8.5, "color": INK, "va": "top", "ha": "left"} | style
         return self.figure.text(*self.place(left, top), words, **look)
 
@@ -146,7 +146,7 @@ class Panels:
 
     @classmethod
     def height_in(cls, form: Format, count: int, panel_in: float, columns: int | None = None) -> float:
-        """Of all rows together, without what stands above."""
+        """Make that of all rows together, without what stands above."""
         rows = -(-count // min(columns or form.columns, count))
         return 0.25 + rows * (panel_in + cls.GAP_IN) - cls.GAP_IN + cls.BOTTOM_IN
 
@@ -161,17 +161,17 @@ def dress(axes: Axes) -> None:
 
 
 def colour_of(index: int) -> str:
-    """The same one for a swath in every picture."""
+    """Return the same one for a swath in every picture."""
     return SERIES[index % len(SERIES)]
 
 
 def class_of(value_cm: float) -> str:
-    """Colour of a residual's class."""
+    """Return colour of a residual's class."""
     return CLASSES[sum(value_cm > limit for limit in LIMITS_CM)]
 
 
 def class_words() -> list[tuple[str, str]]:
-    """Colour and words of each class."""
+    """Return colour and words of each class."""
     low, middle, high = (f"{limit:g}" for limit in LIMITS_CM)
     words = (f"≤ {low} cm", f"{low}–{middle} cm", f"{middle}–{high} cm", f"> {high} cm")
     return list(zip(CLASSES, words, strict=True))

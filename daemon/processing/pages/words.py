@@ -7,10 +7,10 @@ INK, MUTED, EMPTY = "#1d242b", "#5d6770", "#f3f4f2"
 
 
 def thousands(value: float, digits: int = 0) -> str:
-    """A number whose thousands stand apart, with a real minus."""
+    """Return a number whose thousands stand apart, with a real minus."""
     return f"{value:,.{digits}f}".replace(",", "\u202f").replace("-", "−")
 
 
 def shortened(name: str, most: int) -> str:
-    """A name of so many letters at most."""
+    """Return a name of so many letters at most."""
     return name if len(name) <= most else f"{name[: most - 1]}…"

@@ -104,7 +104,7 @@ class Dropped:
 
 
 def without_gate(gated: Georeferencer) -> Georeferencer:
-    """Makes points as another does, but of the ranges that this one's gate shuts out."""
+    """Return makes points as another does, but of the ranges that this one's gate shuts out."""
     made = copy(gated)
     made.model = copy(gated.model)
     made.model.range_gate = LIFTED_GATE_M

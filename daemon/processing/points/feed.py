@@ -76,7 +76,7 @@ class LogFeed:
         self._runs: dict[str, Run] = {}
 
     def take(self, batch: LogBatch, *, context: bool = False) -> Placed:
-        """The next messages; the points that have become final.
+        """Return the next messages; the points that have become final.
 
         Args:
             batch: in the order of the file.
@@ -108,7 +108,7 @@ class LogFeed:
             run.flush()
 
     def close(self) -> Placed:
-        """The log is over."""
+        """Return the log is over."""
         self.flush()
         for source, parser in self._parsers.items():
             self._take_records(source, parser.close())
@@ -116,11 +116,13 @@ class LogFeed:
         return self.stream.close()
 
     def parser(self, source: str) -> Parser:
-        """The parser of a source (``scanner/left``), for its counters."""
+        """Return the parser of a source (``scanner/left``), for its counters."""
         return self._parsers[source]
 
     def _pieces(self, batch: LogBatch) -> Iterator[Tick]:
-        """Runs of messages, and the tick that comes after each; the last run has none unless it fills the bytes."""
+        """Yield runs of messages, and the tick that comes after each; the last run has none unless it fills the
+        bytes.
+        """
         times, size = batch.log_time_ns, batch.rows.shape[1]
         if self._newest_ns is None:
             self._newest_ns = int(times[0])
@@ -156,7 +158,7 @@ class LogFeed:
             taker(batch)
 
     def _taker(self, topic: str) -> Callable[[LogBatch], None] | None:
-        """What takes the messages of a topic; None: nobody wants them."""
+        """Return what takes the messages of a topic; None: nobody wants them."""
         if topic == "/clock":
             return self._take_readings
         source = source_of_topic(topic)

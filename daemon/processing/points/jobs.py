@@ -319,7 +319,7 @@ def _count(plan: SessionPlan, job: Job, result: JobResult, tell: Tell) -> None:
 
 
 def _messages(plan: JobPlan, job: Job, result: JobResult, tell: Tell) -> Iterator[tuple[LogBatch, bool]]:
-    """Messages of the job's chunks, in the order of the file, and whether they are its own or of the margin."""
+    """Yield messages of the job's chunks, in the order of the file, and whether they are its own or of the margin."""
     start_ns, end_ns = job.segment.start_ns, job.segment.end_ns
     own_damage: list[PartDamage] = []
     for place in job.places:
@@ -332,7 +332,7 @@ def _messages(plan: JobPlan, job: Job, result: JobResult, tell: Tell) -> Iterato
 
 
 def _runs(batch: LogBatch, start_ns: int, end_ns: int) -> Iterator[tuple[LogBatch, bool]]:
-    """A batch split where messages of the span and others alternate."""
+    """Yield a batch split where messages of the span and others alternate."""
     own = (batch.log_time_ns >= start_ns) & (batch.log_time_ns < end_ns)
     changes = np.flatnonzero(np.diff(own)) + 1
     for first, last in pairwise([0, *changes.tolist(), len(own)]):

@@ -218,7 +218,7 @@ def _do_with(do: Do, plans: list[Any], job: Job) -> JobResult:
 
 
 def _result_of(future: Any, job: Job) -> JobResult:
-    """What a job on a cluster gave; a job whose worker was lost is one that failed."""
+    """Return what a job on a cluster gave; a job whose worker was lost is one that failed."""
     scheduler = importlib.import_module("distributed.scheduler")
     try:
         result: JobResult = future.result()

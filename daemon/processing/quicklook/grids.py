@@ -21,7 +21,7 @@ COUNT, FIRST, HEIGHT, INTENSITY, SIGMAS, SIGMA_HEIGHT = range(6)
 
 
 def round_up(size: float) -> float:
-    """The smallest round size not below one."""
+    """Return the smallest round size not below one."""
     power = 10.0 ** math.floor(math.log10(size))
     found = min(step * power for step in (*STEPS, 10.0) if step * power >= size * (1.0 - 1e-9))
     return float(f"{found:.6g}")
@@ -50,13 +50,15 @@ class Frame:
         return self.west_m, east_m, self.south_m, north_m
 
     def centres(self, row: NDArray[Any], column: NDArray[Any]) -> FloatArray:
-        """(n, 2) east and north of the middles of cells."""
+        """Return (n, 2) east and north of the middles of cells."""
         east_m = self.west_m + (column + 0.5) * self.cell_m
         return np.stack([east_m, self.south_m + (row + 0.5) * self.cell_m], axis=1)
 
 
 def frame_of(low_m: FloatArray, high_m: FloatArray, cell_m: float) -> Frame:
-    """Cells from a south-western (2,) to a north-eastern (2,) corner; larger ones where they would be too many."""
+    """Return cells from a south-western (2,) to a north-eastern (2,) corner; larger ones where they would be too
+    many.
+    """
     while True:
         first = np.floor(low_m[:2] / cell_m)
         columns, rows = (np.floor(high_m[:2] / cell_m) - first + 1.0).tolist()  # whole, and never beyond 64 bits
@@ -66,7 +68,7 @@ def frame_of(low_m: FloatArray, high_m: FloatArray, cell_m: float) -> Frame:
 
 
 def cell_for(density: float, points_a_cell: float) -> float:
-    """A round side of cells that hold so many points in the mean, of so many a square metre."""
+    """Return a round side of cells that hold so many points in the mean, of so many a square metre."""
     return round_up(max(math.sqrt(points_a_cell / density), SMALLEST_CELL_M))
 
 
@@ -144,13 +146,16 @@ class Surface:
         self.outside += _sum_up(*columns, frame.west_m, frame.south_m, frame.cell_m, self.sums)
 
     def mean(self, what: int) -> FloatArray:
-        """(rows, columns) means of heights, intensities (of first returns) or sigmas; nan where there is nothing."""
+        """Return (rows, columns) means of heights, intensities (of first returns) or sigmas; nan where there is
+        nothing.
+        """
         counts = self.sums[:, :, {INTENSITY: FIRST, SIGMA_HEIGHT: SIGMAS}.get(what, COUNT)]
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.asarray(np.where(counts > 0, self.sums[:, :, what] / counts, np.nan))
 
     def density(self) -> tuple[FloatArray, float]:
-        """Pulses a square metre (rows, columns) in cells large enough to say so, nan where there are none; their side.
+        """Return pulses a square metre (rows, columns) in cells large enough to say so, nan where there are none;
+        their side.
 
         A pulse counts where its first return lies.
         """
@@ -166,7 +171,7 @@ class Surface:
 
 
 def inner(there: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Cells all of whose eight neighbours are there too: the others may be covered in part only."""
+    """Return cells all of whose eight neighbours are there too: the others may be covered in part only."""
     found = np.zeros_like(there)
     if min(there.shape) > 2:
         found[1:-1, 1:-1] = there[1:-1, 1:-1]
@@ -178,7 +183,7 @@ def inner(there: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def filled(values: FloatArray, times: int = 2) -> FloatArray:
-    """Gaps of a few cells filled with the mean of their neighbours, for the eye."""
+    """Return gaps of a few cells filled with the mean of their neighbours, for the eye."""
     made = values.copy()
     for _ in range(times):
         known = np.isfinite(made)
@@ -191,7 +196,7 @@ def filled(values: FloatArray, times: int = 2) -> FloatArray:
 
 
 def _around(values: FloatArray) -> FloatArray:
-    """Sums over each cell and its neighbours."""
+    """Return sums over each cell and its neighbours."""
     padded = np.pad(values, 1)
     rows = padded[:-2] + padded[1:-1] + padded[2:]
     return np.asarray(rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:])

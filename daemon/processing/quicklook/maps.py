@@ -38,7 +38,7 @@ DZ_WORDS = ("≤ 3 cm", "3–5 cm", "5–10 cm", "> 10 cm")
 
 
 def strip_colour(number: int) -> str:
-    """The same one for a strip in every picture."""
+    """Return the same one for a strip in every picture."""
     return STRIP_COLOURS[number % len(STRIP_COLOURS)]
 
 
@@ -78,7 +78,7 @@ class MapPage:
         return axes
 
     def side(self, top: float, width: float, height: float) -> Axes:
-        """A panel in the right column, ``top`` inches below the map's upper edge."""
+        """Return a panel in the right column, ``top`` inches below the map's upper edge."""
         return self._panel(self.side_in, self.page_in[1] - TOP_IN - top - height, width, height)
 
     def say(self, top: float, text: str, **style: Any) -> None:
@@ -88,13 +88,13 @@ class MapPage:
         self.figure.text(x, y, text, **look)
 
     def box(self, frame: Frame) -> tuple[float, float, float, float]:
-        """A frame's west, east, south and north in the files' coordinates."""
+        """Return a frame's west, east, south and north in the files' coordinates."""
         west_m, east_m, south_m, north_m = frame.extent_m
         units = self.look.units
         return west_m / units.east_m, east_m / units.east_m, south_m / units.north_m, north_m / units.north_m
 
     def image(self, values: NDArray[Any], frame: Frame, **style: Any) -> Any:
-        """Cells (rows, columns[, colour]) on the map."""
+        """Return cells (rows, columns[, colour]) on the map."""
         return self.axes.imshow(
             values, origin="lower", extent=self.box(frame), aspect=self.axes.get_aspect(), **({"zorder": 1} | style)
         )
@@ -194,13 +194,13 @@ class MapPage:
 
 
 def round_down(size: float) -> float:
-    """The largest of 1, 2, 5 × 10ⁿ not above a size."""
+    """Return the largest of 1, 2, 5 × 10ⁿ not above a size."""
     power = 10.0 ** math.floor(math.log10(size))
     return max(step * power for step in (1.0, 2.0, 5.0) if step * power <= size * (1 + 1e-9))
 
 
 def _range_of(values: FloatArray, low: float = 2.0, high: float = 98.0) -> tuple[float, float]:
-    """Percentiles that a colour scale spans; never nothing."""
+    """Return percentiles that a colour scale spans; never nothing."""
     known = values[np.isfinite(values)]
     if not len(known):
         return 0.0, 1.0
@@ -210,7 +210,7 @@ def _range_of(values: FloatArray, low: float = 2.0, high: float = 98.0) -> tuple
 
 
 def shade_of(heights: FloatArray, cell_m: float) -> FloatArray:
-    """(rows, columns) 0 … 1 light on the ground from the north-west; gaps get the nearest height."""
+    """Return (rows, columns) 0 … 1 light on the ground from the north-west; gaps get the nearest height."""
     missing = ~np.isfinite(heights)
     if missing.any():
         nearest = ndimage.distance_transform_edt(missing, return_distances=False, return_indices=True)
@@ -339,7 +339,7 @@ def draw_differences(look: Look, path: Path) -> None:
 
 
 def _worst_pairs(look: Look) -> str:
-    """The pairs whose medians are farthest from zero."""
+    """Return the pairs whose medians are farthest from zero."""
     rows = sorted(look.overlap.rows, key=lambda row: -abs(row["median_m"]))[:4]
     names = [f"{shortened(look.names[row['first']], 10)} − {shortened(look.names[row['second']], 10)}" for row in rows]
     told = [f"{name}:  {thousands(100 * row['median_m'], 1)} cm" for name, row in zip(names, rows, strict=True)]

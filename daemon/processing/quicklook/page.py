@@ -56,7 +56,7 @@ def make_page(look: Look, folder: Path, title: str) -> Path:
 
 
 def page_of(look: Look, title: str, pictures: Sequence[tuple[str, Path]]) -> str:
-    """The page's text."""
+    """Return the page's text."""
     parts = [
         f"<!doctype html><html lang='en'><head><meta charset='utf-8'><title>{escape(title)}: quick look</title>",
         "<meta name='viewport' content='width=device-width, initial-scale=1'>",
@@ -125,7 +125,7 @@ def _notes(look: Look) -> str:
 
 
 def warnings_of(look: Look) -> list[str]:
-    """What the files' sidecars warn of, each once."""
+    """Return what the files' sidecars warn of, each once."""
     return list(dict.fromkeys(line for source in look.sources for line in warnings_in(source.sidecar)))
 
 
@@ -135,7 +135,7 @@ def _picture(words: str, path: Path) -> str:
 
 
 def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Cells are HTML; whoever gives them has escaped what is foreign."""
+    """Return cells are HTML; whoever gives them has escaped what is foreign."""
     head = "".join(f"<th>{word}</th>" for word in heads)
     body = "".join(f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>" for row in rows[:MOST_ROWS])
     more = f"<p class='muted'>and {len(rows) - MOST_ROWS} more</p>" if len(rows) > MOST_ROWS else ""
@@ -252,7 +252,7 @@ def _files(look: Look) -> str:
 
 
 def _sidecars(look: Look) -> str:
-    """What each sidecar says of how its files were made."""
+    """Return what each sidecar says of how its files were made."""
     said: list[tuple[list[str], list[tuple[str, str]]]] = []
     for source in look.sources:
         rows = rows_of(source.sidecar)

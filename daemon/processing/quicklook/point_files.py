@@ -33,7 +33,8 @@ _MOST_CHUNK_BYTES = 1 << 30  # of points as read; lazrs has room made for a whol
 
 
 def open_points(path: Path, selection: Selection | None = None) -> laspy.LasReader:
-    """A reader of a file whose header names no more records than the file has room for: laspy would read on for hours.
+    """Return a reader of a file whose header names no more records than the file has room for: laspy would read on for
+    hours.
 
     Raises one of UNREADABLE.
     """
@@ -86,7 +87,7 @@ def _refuse_chunks(file: BinaryIO, head: bytes, size: int) -> None:
 
 
 def _laszip_record(file: BinaryIO, head: bytes) -> bytes:
-    """The record that says how points were compressed; empty: there is none."""
+    """Return the record that says how points were compressed; empty: there is none."""
     at, _, count = _SIZES.unpack_from(head, _SIZES_AT)
     for _ in range(count):
         file.seek(at)
@@ -148,14 +149,15 @@ class PointReader:
 
 
 def has_varying_chunks(header: laspy.LasHeader) -> bool:
-    """Whether a LAZ file's chunks vary in size."""
+    """Return whether a LAZ file's chunks vary in size."""
     found = header.vlrs.get("LasZipVlr")
     with _panics_told():
         return bool(found) and bool(lazrs.LazVlr(found[0].record_data).uses_variable_size_chunks())
 
 
 def sample_of(path: Path, size: int) -> Points:
-    """Places of some points that follow each other: from the middle, or the first ones where that cannot be found.
+    """Return places of some points that follow each other: from the middle, or the first ones where that cannot be
+    found.
 
     Raises one of UNREADABLE.
     """

@@ -70,7 +70,7 @@ class Profile:
 
 
 def axis_of(points_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Centre and unit vector (2,) of the longest direction of points (n, 2)."""
+    """Return centre and unit vector (2,) of the longest direction of points (n, 2)."""
     centre = points_m.mean(axis=0)
     if len(points_m) < 2:
         return centre, np.array([1.0, 0.0])
@@ -86,7 +86,7 @@ def choose_line(
     sources: Sequence[Source],
     half_width_m: float,
 ) -> Line | None:
-    """Across the overlap of the two strips with most smooth cells in common; else along the longest strip.
+    """Return across the overlap of the two strips with most smooth cells in common; else along the longest strip.
 
     A long strip's middle is shown only, so that not all points need be read again.
     """
@@ -129,13 +129,15 @@ def _across(cells: StripCells, pair: Pair, names: Sequence[str], half_width_m: f
 
 
 def line_through(ends: Sequence[float], units: Units, half_width_m: float) -> Line:
-    """A line between two points in the files' coordinates: x1, y1, x2, y2."""
+    """Return a line between two points in the files' coordinates: x1, y1, x2, y2."""
     corners = np.array(ends).reshape(2, 2) * [units.east_m, units.north_m]
     return Line(corners[0], corners[1], half_width_m, "as asked for")
 
 
 def read_profile(sources: Sequence[Source], units: Units, book: StripBook, line: Line, *, trim: bool) -> Profile:
-    """The points of a corridor; only blocks that touch it are read. ``trim``: a line without points at its ends."""
+    """Return the points of a corridor; only blocks that touch it are read. ``trim``: a line without points at its
+    ends.
+    """
     none = (np.empty(0, np.float32), np.empty(0, np.float32), np.empty(0), np.empty(0, np.int32), np.empty(0, bool))
     parts: list[tuple[NDArray[Any], ...]] = [none]
     found = 0
@@ -161,7 +163,7 @@ def read_profile(sources: Sequence[Source], units: Units, book: StripBook, line:
 
 
 def _trimmed(profile: Profile) -> Profile:
-    """Its line from the first point to the last."""
+    """Return its line from the first point to the last."""
     if len(profile.along_m) < 2 or np.ptp(profile.along_m) <= 0.0:
         return profile
     line = profile.line
@@ -173,7 +175,7 @@ def _trimmed(profile: Profile) -> Profile:
 
 
 def _touches(box: FloatArray, line: Line) -> bool:
-    """Whether a box (west, south, east, north) may hold points of the corridor; never a false no."""
+    """Return whether a box (west, south, east, north) may hold points of the corridor; never a false no."""
     corners = np.array([[x, y] for x in (box[0], box[2]) for y in (box[1], box[3])])
     if not np.isfinite(corners).all():
         return False
@@ -198,7 +200,7 @@ class Steps:
 
 
 def steps_of(profile: Profile) -> Steps:
-    """Strips against their mean, bin by bin; a slope common to all strips of a bin is taken out first."""
+    """Return strips against their mean, bin by bin; a slope common to all strips of a bin is taken out first."""
     line, keep = profile.line, profile.single
     bins = int(np.clip(line.length_m / max(2 * line.half_width_m, 0.5), 1, BINS))
     size_m = line.length_m / bins
@@ -233,7 +235,7 @@ def steps_of(profile: Profile) -> Steps:
 def _slopes(
     xx: FloatArray, xy: FloatArray, yy: FloatArray, xz: FloatArray, yz: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Least squares slopes along and aside; zero where points do not spread."""
+    """Return least squares slopes along and aside; zero where points do not spread."""
     determinant = xx * yy - xy * xy
     spread = determinant > 1e-6 * (xx + yy) ** 2
     safe = np.where(spread, determinant, 1.0)

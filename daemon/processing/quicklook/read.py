@@ -154,7 +154,7 @@ class StripBook:
         self._tables: dict[Path, NDArray[np.int32]] = {}
 
     def numbers(self, source: Source, source_ids: NDArray[np.uint16]) -> NDArray[np.int32]:
-        """The strip (n,) of each point of a file."""
+        """Return the strip (n,) of each point of a file."""
         table = self._tables.setdefault(source.path, np.full(65536, -1, np.int32))
         found = table[source_ids]
         if len(found) and found.min() < 0:
@@ -184,7 +184,7 @@ class StripBook:
 
 
 def find_files(paths: Sequence[Path]) -> list[Path]:
-    """The files of points in folders and their folders, each once, by name.
+    """Return the files of points in folders and their folders, each once, by name.
 
     Raises:
         QuickLookError: a path is not there, or there is no such file in it.
@@ -204,7 +204,7 @@ def find_files(paths: Sequence[Path]) -> list[Path]:
 
 
 def open_source(path: Path) -> Source:
-    """A file's header and sidecar.
+    """Return a file's header and sidecar.
 
     Raises:
         QuickLookError: it is no LAS or LAZ file, or its coordinates are geocentric.
@@ -247,7 +247,7 @@ def _line(error: BaseException) -> str:
 
 
 def _crs_of(header: laspy.LasHeader) -> tuple[CRS | None, str]:
-    """The CRS in the header, or why there is none."""
+    """Return the CRS in the header, or why there is none."""
     try:
         crs = header.parse_crs()
     except BAD_CRS:
@@ -332,7 +332,7 @@ def check_one_crs(sources: Sequence[Source]) -> None:
 
 
 def read_blocks(source: Source, units: Units, book: StripBook, wanted: Sequence[int] | None = None) -> Iterator[Block]:
-    """A file's points block by block; what cannot be read is noted in the source's ``damage``.
+    """Yield a file's points block by block; what cannot be read is noted in the source's ``damage``.
 
     Args:
         source: the file; the boxes of its blocks are noted while it is read whole.
@@ -360,7 +360,7 @@ def read_blocks(source: Source, units: Units, book: StripBook, wanted: Sequence[
 
 
 def _salvaged(source: Source, units: Units, book: StripBook, begin: int, why: str) -> Iterator[Block]:
-    """Behind a block that cannot be read as a whole: as many points as can, in small pieces."""
+    """Yield behind a block that cannot be read as a whole: as many points as can, in small pieces."""
     try:
         with PointReader(source.path, WANTED) as reader:
             reader.go_to(begin)
@@ -377,7 +377,7 @@ def _salvaged(source: Source, units: Units, book: StripBook, begin: int, why: st
 
 
 def density_near(source: Source, units: Units) -> float:
-    """Returns a square metre, roughly, by some of a file's points: its header cannot tell, a strip lies askew.
+    """Return returns a square metre, roughly, by some of a file's points: its header cannot tell, a strip lies askew.
 
     Gives 0 where it cannot be read.
     """
@@ -410,7 +410,9 @@ def _box(block: Block) -> FloatArray:
 
 
 def _sigma(points: Points, name: str) -> NDArray[np.float32]:
-    """(n,) metres, as in files of ours; the largest integer says that a sigma is larger than it, or not known."""
+    """Return (n,) metres, as in files of ours; the largest integer says that a sigma is larger than it, or not
+    known.
+    """
     kind = points.array.dtype[name]
     values = np.array(points[name], np.float32)
     if kind.kind in "iu":

@@ -180,7 +180,7 @@ def look_at(
 
 
 def _corners(sources: Sequence[Source], units: Units) -> tuple[FloatArray, FloatArray]:
-    """South-western and north-eastern corner (3,) by the headers; those of files without points say nothing."""
+    """Return south-western and north-eastern corner (3,) by the headers; those of files without points say nothing."""
     metres = np.array([units.east_m, units.north_m, units.up_m])
     corners = np.array([[source.low * metres, source.high * metres] for source in sources if source.point_count])
     good = np.isfinite(corners).all(axis=(1, 2)) & (corners[:, 1] >= corners[:, 0]).all(axis=1)
@@ -236,7 +236,7 @@ class _Reading:
 
 
 def _read(sources: Sequence[Source], units: Units, given_m: tuple[float | None, float | None], told: Told) -> _Reading:
-    """All files; a second time where a header lies about its extent: the points themselves say it then.
+    """Return all files; a second time where a header lies about its extent: the points themselves say it then.
 
     ``given_m``: sides of the cells of the pictures and of the strips; None: to be found.
     """
@@ -297,7 +297,7 @@ def _profile(
 
 
 def _notes(reading: _Reading, overlap: Overlap, cell_m: float | None, strip_cell_m: float | None) -> list[str]:
-    """What was taken for granted, left out or changed."""
+    """Return what was taken for granted, left out or changed."""
     notes = [reading.units.note] if reading.units.note else []
     notes += reading.book.notes
     notes += time_notes([source.times for source in reading.sources])
@@ -324,7 +324,7 @@ def _notes(reading: _Reading, overlap: Overlap, cell_m: float | None, strip_cell
 
 
 def numbers_of(look: Look) -> dict[str, Any]:
-    """The page's numbers, for scripts."""
+    """Return the page's numbers, for scripts."""
     return {
         "files": [
             {

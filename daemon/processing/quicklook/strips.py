@@ -122,7 +122,7 @@ class Pair:
     scatter: tuple[tuple[FloatArray, FloatArray], ...] = ()
 
     def numbers(self) -> dict[str, Any]:
-        """Median, mean, root mean square, 95 % of the absolute and largest difference, metres."""
+        """Return median, mean, root mean square, 95 % of the absolute and largest difference, metres."""
         size = np.abs(self.dz_m)
         return {
             "cells": len(size),
@@ -148,7 +148,7 @@ class Coverage:
         return np.asarray(self.pulses > 0)
 
     def centres(self) -> FloatArray:
-        """(n, 2) east and north of the cells with a pulse."""
+        """Return (n, 2) east and north of the cells with a pulse."""
         return self.frame.centres(*np.nonzero(self.there))
 
 
@@ -268,7 +268,7 @@ class StripCells:
         return density, float(there.sum()) * cell_m**2
 
     def coverage(self, strip: int) -> Coverage:
-        """Where a strip is, in cells that hold enough of its pulses to tell a gap from chance."""
+        """Return where a strip is, in cells that hold enough of its pulses to tell a gap from chance."""
         ups, acrosses = np.nonzero(self.tiles[strip] >= 0) if strip < len(self.tiles) else (np.array([], int),) * 2
         if not len(ups):
             return Coverage(Frame(self.frame.west_m, self.frame.south_m, self.frame.cell_m, 1, 1), np.zeros((1, 1)))
@@ -288,7 +288,7 @@ class StripCells:
         return Coverage(Frame(west_m, south_m, cell_m, *pulses.shape), pulses)
 
     def pairs(self) -> Iterator[Pair]:
-        """Every two strips that share a smooth cell."""
+        """Yield every two strips that share a smooth cell."""
         there = (self.tiles >= 0).reshape(len(self.tiles), -1).astype(np.float32)
         for first, second in np.argwhere(np.triu(there @ there.T, 1) > 0):
             found = self._pair(int(first), int(second))
@@ -332,7 +332,7 @@ class _Planes:
 
 
 def _planes(moments: FloatArray, cell_m: float) -> _Planes:
-    """Least squares planes of cells (n, MOMENTS)."""
+    """Return least squares planes of cells (n, MOMENTS)."""
     n = moments[:, 1]
     x, y, z, xx, xy, yy, xz, yz, zz = (moments[:, 2:] / n[:, np.newaxis]).T
     xx, xy, yy, xz, yz, zz = xx - x * x, xy - x * y, yy - y * y, xz - x * z, yz - y * z, zz - z * z
@@ -387,7 +387,7 @@ def strip_frame(low_m: FloatArray, high_m: FloatArray, cell_m: float | None = No
 
 
 def _halved(moments: FloatArray, cell_m: float) -> FloatArray:
-    """A tile (256, MOMENTS) as a quarter (8, 8, MOMENTS) of one with twice the cell."""
+    """Return a tile (256, MOMENTS) as a quarter (8, 8, MOMENTS) of one with twice the cell."""
     cells = moments.reshape(TILE, TILE, MOMENTS)
     made = np.zeros((TILE // 2, TILE // 2, MOMENTS))
     for up in range(2):
@@ -494,7 +494,7 @@ class Overlap:
 
 
 def compare(cells: StripCells) -> Overlap:
-    """All strips against each other, in cells as large as `StripCells.settle` finds right."""
+    """Return all strips against each other, in cells as large as `StripCells.settle` finds right."""
     cells.settle()
     rows, columns = (size * TILE for size in cells.tiles.shape[1:])
     overlap = Overlap(np.full((rows, columns), np.nan, np.float32))

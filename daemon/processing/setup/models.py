@@ -50,7 +50,7 @@ def make_georeferencer(
     uncertainty: bool,
     angles: ByName[str, AngleSeries] | None = MappingProxyType({}),
 ) -> Georeferencer:
-    """What makes points of a scanner's returns.
+    """Return what makes points of a scanner's returns.
 
     Args:
         config: with [scanner.<name>] and [atmosphere].
@@ -86,7 +86,7 @@ def make_georeferencer(
 
 
 def geometry_of(table: ScannerConfig, parser: Parser, fibres: bytes | None = None) -> Geometry:
-    """How the beam goes: by the protocol's table of beams, or of a line scanner as the configuration declares.
+    """Return how the beam goes: by the protocol's table of beams, or of a line scanner as the configuration declares.
 
     Raises:
         ValueError: the protocol says neither, one line.
@@ -119,7 +119,7 @@ def geometry_of(table: ScannerConfig, parser: Parser, fibres: bytes | None = Non
 
 
 def mount_of(gimbal: GimbalConfig | None, angles: ByName[str, AngleSeries] | None = None) -> Mount:
-    """Stages of a gimbal: ``angles_deg`` and, where a source is named, the roll, pitch and heading it told.
+    """Return stages of a gimbal: ``angles_deg`` and, where a source is named, the roll, pitch and heading it told.
 
     Args:
         gimbal: of the scanner; None: a rigid mount.
@@ -141,7 +141,9 @@ def mount_of(gimbal: GimbalConfig | None, angles: ByName[str, AngleSeries] | Non
 
 
 def gimbal_sources(config: Config, name: str) -> Iterator[tuple[int, str]]:
-    """Stages of a scanner's gimbal whose angles are logged: number, and the source, ``imu/name`` or ``gnss/name``."""
+    """Yield stages of a scanner's gimbal whose angles are logged: number, and the source, ``imu/name`` or
+    ``gnss/name``.
+    """
     gimbal = config.scanner[name].gimbal
     for number, stage in enumerate(gimbal.stages if gimbal is not None else []):
         if stage.source is not None:
@@ -149,7 +151,7 @@ def gimbal_sources(config: Config, name: str) -> Iterator[tuple[int, str]]:
 
 
 def tells_attitude(config: Config, source: str) -> bool:
-    """Whether a source is one of the configuration's and gives an INS's solutions."""
+    """Return whether a source is one of the configuration's and gives an INS's solutions."""
     for kind, name, table in config.device_tables():
         if f"{kind}/{name}" == source:
             return InsSolution in find_driver(kind, table.protocol).yields
@@ -175,7 +177,9 @@ def air_of(config: Config, table: ScannerConfig) -> Air:
 
 
 def make_resolver(table: ScannerConfig, height_above_ground_m: float | None) -> ZoneResolver | None:
-    """What finds the emissions of a scanner that may have several pulses in air; None for heads that never do."""
+    """Return what finds the emissions of a scanner that may have several pulses in air; None for heads that never
+    do.
+    """
     if table.protocol != "srep":
         return None
     kind = table.geometry.type if table.geometry is not None else None
@@ -196,12 +200,12 @@ def connect(chain: ScannerChain, parser: Parser) -> None:
 
 
 def make_motion(table: ScannerConfig, model: SensorModel) -> EncoderMotion | None:
-    """What tells how the encoder moves; None where the calibration does not ask."""
+    """Return what tells how the encoder moves; None where the calibration does not ask."""
     return motion_of(table) if model.needs_encoder_motion else None
 
 
 def motion_of(table: ScannerConfig) -> EncoderMotion:
-    """What tells how a scanner's encoder moves."""
+    """Return what tells how a scanner's encoder moves."""
     kind = table.geometry.type if table.geometry is not None else None
     swings = table.protocol == "srep" and kind in (None, "oscillating")
     return EncoderMotion(steady=not swings, facets=kind == "polygon")
@@ -215,7 +219,9 @@ class TerrainRanges:
         self._model = SensorModel(model.calibration, model.geometry, mount=model.mount)
 
     def __call__(self, rows: StructArray, time_ns: Int64Array, trajectory: Trajectory) -> FloatArray:
-        """(n,) metres of rows at GPS times (n,); nan where nothing is known. The encoder's latency does not count."""
+        """Return (n,) metres of rows at GPS times (n,); nan where nothing is known. The encoder's latency does not
+        count.
+        """
         asked = np.flatnonzero(rows["number_of_returns"])  # the others are pulses without a return
         far, still = rows.take(asked), np.zeros(len(asked))
         far["range_m"] = FAR_M
@@ -231,7 +237,7 @@ class TerrainRanges:
 def calibration_mistakes(
     calibration: Calibration, name: str, table: ScannerConfig, air: AtmosphereConfig
 ) -> Iterator[str]:
-    """Why a calibration is not this scanner's, or was estimated under other settings than those in use."""
+    """Yield why a calibration is not this scanner's, or was estimated under other settings than those in use."""
     if calibration.scanner != name:
         yield f'calibration.scanner: is of scanner "{calibration.scanner}", want "{name}"'
     for key in ("model", "serial"):

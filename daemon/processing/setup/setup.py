@@ -98,7 +98,7 @@ class Setup:
 
     @classmethod
     def of_log(cls, attachments: Mapping[str, bytes], options: Options | None = None) -> Setup:
-        """By what is stored in a log.
+        """Make it by what is stored in a log.
 
         Raises:
             UserError: the log has no configuration, or one that cannot be used.
@@ -113,7 +113,7 @@ class Setup:
 
     @classmethod
     def of_config(cls, config: Config, options: Options | None = None) -> Setup:
-        """By a configuration and the files beside it."""
+        """Make it by a configuration and the files beside it."""
         return cls(config, {name: data for name, _, data in config.attachments()}, options)
 
     def _chosen(self) -> list[str]:
@@ -130,7 +130,7 @@ class Setup:
     # ------------------------------------------------------------------ streams
 
     def live_stream(self, info: SessionInfo, settings: StreamSettings | None = None) -> Stream:
-        """A stream whose clocks and trajectory grow with the log: the same live and in replay.
+        """Return a stream whose clocks and trajectory grow with the log: the same live and in replay.
 
         Raises:
             ConfigError: a gimbal's angles are logged.
@@ -153,7 +153,7 @@ class Setup:
         return Stream(self._chains(), StreamClocks.growing(plan), path, settings)
 
     def office_stream(self, clocks: FrozenClocks, trajectory: Trajectory, settings: StreamSettings = OFFICE) -> Stream:
-        """A stream with all of a log's clock and a complete trajectory, which is taken as it is."""
+        """Return a stream with all of a log's clock and a complete trajectory, which is taken as it is."""
         return Stream(self._chains(), clocks.for_stream(), CompletePath(trajectory), settings)
 
     @property
@@ -183,7 +183,7 @@ class Setup:
     # ------------------------------------------------------------------ models
 
     def georeferencer(self, name: str) -> Any:
-        """A scanner's `Georeferencer`."""
+        """Return a scanner's `Georeferencer`."""
         return self._georeferencers[name]
 
     def take_angles(self, angles: Mapping[str, AngleSeries]) -> None:

@@ -80,18 +80,20 @@ class Sources:
         return None if source is None else self._clock_of(self.config.imu[source.removeprefix("imu/")].pps)
 
     def edge_of(self, source: str) -> str | None:
-        """Polarity of the edges of ``pps/name``; None: no such source."""
+        """Return polarity of the edges of ``pps/name``; None: no such source."""
         pps = self.config.pps.get(source.removeprefix("pps/"))
         return None if pps is None else pps.edge
 
     def inside(self, source: str) -> list[str]:
-        """Sources whose messages stand in a wire's bytes: its own, and an IMU or INS inside a receiver's stream."""
+        """Return sources whose messages stand in a wire's bytes: its own, and an IMU or INS inside a receiver's
+        stream.
+        """
         kind, _, name = source.partition("/")
         within = [f"imu/{imu}" for imu, table in self.config.imu.items() if table.transport == f"gnss:{name}"]
         return [source, *(within if kind == "gnss" else [])]
 
     def parsers(self, kinds: tuple[DeviceKind, ...], *, whole: bool = False) -> dict[str, Parser]:
-        """New parsers of these kinds of sources, by source.
+        """Return new parsers of these kinds of sources, by source.
 
         A receiver's gives times only unless its INS is wanted, or all that it says (``whole``).
 
@@ -115,7 +117,7 @@ class Sources:
         return made
 
     def scanner_time_parsers(self) -> dict[str, Parser]:
-        """New parsers of what the scanners say of time, without returns, by source.
+        """Return new parsers of what the scanners say of time, without returns, by source.
 
         Raises:
             ConfigError: a driver cannot work with its settings.
@@ -152,7 +154,7 @@ class Sources:
             raise ConfigError(f"{kind}.{name}.protocol: {error}") from error
 
     def clock_plan(self, info: SessionInfo) -> ClockPlan:
-        """The clocks of a session."""
+        """Return the clocks of a session."""
         config = self.config
         said = {
             gnss.pps: gnss.leap_seconds for gnss in config.gnss.values() if gnss.pps and gnss.leap_seconds is not None
@@ -183,14 +185,16 @@ class Sources:
         )
 
     def _clock_of(self, pps: str | None) -> str | None:
-        """The clock of a device: its pulse's; of one that has none, the host's by the first that there is."""
+        """Return the clock of a device: its pulse's; of one that has none, the host's by the first that there is."""
         if pps is not None:
             return f"pps/{pps}"
         shown = [*(f"pps/{name}" for name in self.config.pps), *(f"gnss/{name}" for name in self.config.gnss)]
         return shown[0] if shown else None
 
     def ins_rows(self, rows: StructArray) -> StructArray:
-        """Solutions of the device's INS with the attitude of b instead of the IMU's own axes (``rotation_b_imu``)."""
+        """Return solutions of the device's INS with the attitude of b instead of the IMU's own axes
+        (``rotation_b_imu``).
+        """
         rot_b_from_imu = self._rotation_b_imu(self.ins_source)
         if np.array_equal(rot_b_from_imu, np.eye(3)):
             return rows
@@ -201,7 +205,7 @@ class Sources:
         return turned
 
     def in_b(self, measured: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(n, 3) turn rates or specific forces of the IMU along the axes of b."""
+        """Return (n, 3) turn rates or specific forces of the IMU along the axes of b."""
         turned: NDArray[np.float64] = measured @ self._rotation_b_imu(self.imu_source).T
         return turned
 

@@ -35,7 +35,7 @@ class ToGrid:
         self.turn = 2.0 * np.pi / crs.axis_info[0].unit_conversion_factor if crs.is_geographic else None
 
     def __call__(self, lat_rad: FloatArray, lon_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(n,) x and y in the raster's CRS."""
+        """Return (n,) x and y in the raster's CRS."""
         x, y = self._transformer.transform(np.degrees(lon_rad), np.degrees(lat_rad))
         return np.asarray(x), np.asarray(y)
 
@@ -55,7 +55,7 @@ def terrain_of(config: Config) -> CoarseTerrain | None:
 
 
 def read_terrain(path: Path) -> CoarseTerrain:
-    """A terrain model of a raster's first band, its nodes at the pixels' centres.
+    """Return a terrain model of a raster's first band, its nodes at the pixels' centres.
 
     Raises:
         ConfigError: ``mta.terrain``, one line: no rasterio, no heights, no CRS, no place, turned, or too large.
@@ -102,7 +102,9 @@ def _check(raster: Any, path: Path) -> None:
 
 
 def _heights(raster: Any) -> FloatArray:
-    """(rows, columns) of its first band, nan where it has none, or none of this Earth: a mark that it does not name."""
+    """Return (rows, columns) of its first band, nan where it has none, or none of this Earth: a mark that it does not
+    name.
+    """
     with np.errstate(invalid="ignore"):  # a NaN of any kind is none
         height_m: FloatArray = raster.read(1, out_dtype="float64")
     height_m[(raster.read_masks(1) == 0) | ~(np.abs(height_m) < FARTHEST_HEIGHT_M)] = np.nan

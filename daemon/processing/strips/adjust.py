@@ -125,7 +125,7 @@ def _refuse_output(wish: AdjustOptions) -> None:
 
 
 def files_of(wish: AdjustOptions, flight: LoggedFlight) -> TrajectoryFiles:
-    """Names of a session's files; UserError where they are there, or are what the trajectory was read from."""
+    """Return names of a session's files; UserError where they are there, or are what the trajectory was read from."""
     files = TrajectoryFiles.in_folder(wish.output, flight.session.session_id, csv=True)
     paths = [path for path in (files.sbet, files.smrmsg, files.csv) if path is not None]
     read = wish.logs.trajectory.file

@@ -147,7 +147,7 @@ def _record(wish: AdjustOptions, done: StripsCorrected, written: list[tuple[Path
 
 
 def _strip_entry(done: StripsCorrected, strip: _Strip) -> dict[str, Any]:
-    """A strip without corrections has none, and no sigmas of them."""
+    """Return a strip without corrections has none, and no sigmas of them."""
     corrected = strip.choice.model != UNCORRECTED
     knots = zip(strip.time_ns.tolist(), strip.corrections, strip.sigmas, strip.priors, strict=True)
     means = (strip.corrections.mean(axis=0), strip.sigmas.mean(axis=0), strip.priors.mean(axis=0))
@@ -163,7 +163,7 @@ def _strip_entry(done: StripsCorrected, strip: _Strip) -> dict[str, Any]:
 
 
 def _named(*sixes: FloatArray) -> dict[str, float]:
-    """A correction (6,), its sigmas and those before, by names with units."""
+    """Return a correction (6,), its sigmas and those before, by names with units."""
     entry: dict[str, float] = {}
     for prefix, six in zip(("", "sigma_", "prior_sigma_"), sixes, strict=True):
         entry |= {f"{prefix}{axis}_m": float(value) for axis, value in zip(AXES, six[:3], strict=True)}
@@ -196,7 +196,7 @@ def _lines(done: StripsCorrected) -> list[str]:
 
 
 def _row(strip: _Strip) -> str:
-    """Means along the strip; where nothing is corrected there is nothing to be unsure of."""
+    """Return means along the strip; where nothing is corrected there is nothing to be unsure of."""
     factors = np.array([100.0] * 3 + [1e3 * 180.0 / np.pi] * 3)
     means, sigmas = factors * strip.corrections.mean(axis=0), factors * strip.sigmas.mean(axis=0)
     columns = [

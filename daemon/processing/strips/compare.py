@@ -91,7 +91,7 @@ def rules_of(most_cells: int, cell_m: float | None) -> StripRules:
 
 
 def is_of_logs(paths: Sequence[Path]) -> bool:
-    """Whether paths are logs rather than points; UserError where they are neither, or both.
+    """Return whether paths are logs rather than points; UserError where they are neither, or both.
 
     A folder with points in it is one of points.
     """
@@ -153,7 +153,7 @@ class Judgement:
         return list(dict.fromkeys(one.words for one in found if one.level in ("significant", "rough")))
 
     def problem(self, level: str | None) -> str:
-        """What is wrong, a line; empty: nothing."""
+        """Return what is wrong, a line; empty: nothing."""
         wrong = self.wrong()
         if self.agreement.no_verdict:
             wrong.append(self.agreement.no_verdict)

@@ -155,7 +155,7 @@ def refuse_one(what: str, look: Look) -> None:
 
 
 def cells_of(look: Look, rules: StripRules) -> Cells:
-    """Cells of the quick look in which two strips have returns enough."""
+    """Return cells of the quick look in which two strips have returns enough."""
     cells = look.cells
     found = []
     for strip in range(len(cells.tiles)):
@@ -172,7 +172,7 @@ def cells_of(look: Look, rules: StripRules) -> Cells:
 
 
 def _file_blocks(look: Look, clock: PointClock) -> Iterator[tuple[int, StripBlock]]:
-    """Blocks by strip, numbered as the quick look numbered them: it read the same files in the same order."""
+    """Yield blocks by strip, numbered as the quick look numbered them: it read the same files in the same order."""
     book = StripBook()
     for source in look.sources:
         try:
@@ -236,7 +236,7 @@ def _times_apart(strips: Gathered, seen: SeenFrom) -> list[str]:
 
 
 def _seen_from(look: Look) -> tuple[SeenFrom | None, Callable[[FloatArray], FloatArray]]:
-    """The trajectories beside the points, and the way from the map's metres to t."""
+    """Return the trajectories beside the points, and the way from the map's metres to t."""
     sidecars = [source.sidecar for source in look.sources]
     trajectories, of_session = _trajectories(look)
     if not trajectories or not all(sidecars):
@@ -257,7 +257,7 @@ def _seen_from(look: Look) -> tuple[SeenFrom | None, Callable[[FloatArray], Floa
 
 
 def _mapping_of(crs: dict[str, Any]) -> Mapping:
-    """The frame of a sidecar's points, by what was said of it, on the command line or in the configuration."""
+    """Return the frame of a sidecar's points, by what was said of it, on the command line or in the configuration."""
     if "datum_said" not in crs or "accuracy_wanted_m" not in crs:
         raise MappingError(
             "the sidecar beside the points does not say of which datum they are; want swath georef again"
@@ -266,7 +266,7 @@ def _mapping_of(crs: dict[str, Any]) -> Mapping:
 
 
 def _trajectories(look: Look) -> tuple[list[Trajectory], list[str]]:
-    """Those beside the points, and of which session each is."""
+    """Return those beside the points, and of which session each is."""
     folders = {source.path.parent for source in look.sources}
     files = sorted(file for folder in folders for file in folder.glob(f"*{TRAJECTORY}"))
     return (
@@ -276,7 +276,7 @@ def _trajectories(look: Look) -> tuple[list[Trajectory], list[str]]:
 
 
 def _flown(look: Look, number: int, trajectories: Sequence[Trajectory], of_session: Sequence[str]) -> int:
-    """The trajectory of a strip: of its run's sessions the one of the times that the sidecar says of it."""
+    """Return the trajectory of a strip: of its run's sessions the one of the times that the sidecar says of it."""
     sessions, source_id = look.origins[number]
     own = [at for at, session in enumerate(of_session) if session in sessions] or list(range(len(trajectories)))
     for source in look.sources:
@@ -293,7 +293,7 @@ def _flown(look: Look, number: int, trajectories: Sequence[Trajectory], of_sessi
 
 
 def look_of_flight(flight: Flight, rules: StripRules, mapping: Mapping | None = None) -> Look:
-    """A quick look at a flight's points, on the map of its products, or in t."""
+    """Return a quick look at a flight's points, on the map of its products, or in t."""
     corners = low, high = corners_of(flight, mapping)
     area_m2 = max(float(np.prod((high - low)[:2])), 1.0)
     density = max((len(swath) for swath in flight.swaths), default=1) / area_m2

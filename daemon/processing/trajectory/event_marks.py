@@ -43,7 +43,7 @@ class EventTable:
 
 
 def event_table(marks: Sequence[Mark], trajectory: Trajectory) -> EventTable:
-    """Position (of the body's origin), attitude and sigmas of marks.
+    """Return position (of the body's origin), attitude and sigmas of marks.
 
     A mark's own sigma of time is in the sigmas of the position, by the velocity.
     """
@@ -91,7 +91,9 @@ def _line(mark: Mark, row: FloatArray | None, fate: str) -> str:
 
 
 def _poses(trajectory: Trajectory, time_ns: NDArray[np.int64]) -> FloatArray:
-    """(n, 15) latitude to the sigma of heading as they stand in the file, then the velocity north, east, down, m/s."""
+    """Return (n, 15) latitude to the sigma of heading as they stand in the file, then the velocity north, east, down,
+    m/s.
+    """
     if not len(time_ns):
         return np.empty((0, 15))
     poses = trajectory.poses(time_ns)

@@ -44,7 +44,7 @@ WINDOW_NS = 30 * SECOND_NS  # as long as the root mean square of a whole flight 
 
 
 def figures_of(flight: Flight, separation: Separation | None) -> Figures:
-    """All figures of a flight; sigmas are one standard deviation, of the smoother where it ran."""
+    """Return all figures of a flight; sigmas are one standard deviation, of the smoother where it ran."""
     best = flight.best
     intervals = np.diff(best.time_ns)
     return {
@@ -188,7 +188,7 @@ def _ratios(separation: Separation) -> dict[str, FloatArray]:
 
 
 def _separation(separation: Separation | None) -> Figures | None:
-    """Root mean square of filter − smoother over its predicted sigma: 1 where both tell the truth."""
+    """Return root mean square of filter − smoother over its predicted sigma: 1 where both tell the truth."""
     if separation is None:
         return None
     return {
@@ -198,7 +198,9 @@ def _separation(separation: Separation | None) -> Figures | None:
 
 
 def _worst_separation(separation: Separation | None, start_ns: int) -> dict[str, Figures] | None:
-    """The same of the window in which it is largest, and its middle: seconds of a wrong fix in hours of a flight."""
+    """Return the same of the window in which it is largest, and its middle: seconds of a wrong fix in hours of a
+    flight.
+    """
     if separation is None:
         return None
     found = {}
@@ -261,7 +263,7 @@ def _time_offset(flight: Flight) -> Figures | None:
 
 
 def accuracy_words(figures: Figures) -> str:
-    """Sigmas over the flight, as people say them."""
+    """Return sigmas over the flight, as people say them."""
     rms = figures["sigma_rms"]
     place = [rms["north_m"], rms["east_m"], rms["down_m"]]
     known = [value for value in place if value is not None]

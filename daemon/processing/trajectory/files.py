@@ -42,13 +42,13 @@ class TrajectoryFiles:
     page: Path
 
     def all(self) -> list[Path]:
-        """Those wanted."""
+        """Return those wanted."""
         named = (self.sbet, self.smrmsg, self.csv, self.page, self.summary)
         return [path for path in named if path is not None]
 
     @classmethod
     def of_output(cls, output: Path, session: str, *, csv: bool) -> TrajectoryFiles:
-        """By what ``-o`` says: a file .sbet, .out or .csv, or a folder for files with the session's name.
+        """Make it by what ``-o`` says: a file .sbet, .out or .csv, or a folder for files with the session's name.
 
         Raises:
             UserError: it is neither.
@@ -65,7 +65,7 @@ class TrajectoryFiles:
 
     @classmethod
     def in_folder(cls, folder: Path, session: str, *, csv: bool) -> TrajectoryFiles:
-        """Files with the session's name."""
+        """Return files with the session's name."""
 
         def ending(suffix: str) -> Path:
             return folder / f"{session}_trajectory{suffix}"
@@ -81,14 +81,14 @@ class TrajectoryFiles:
 
 
 def _smrmsg_of(sbet: Path) -> Path:
-    """The name under which the sigmas of an SBET are written."""
+    """Return the name under which the sigmas of an SBET are written."""
     if sbet.name.startswith("sbet") and sbet.suffix == ".out":
         return sbet.with_name("smrmsg" + sbet.name.removeprefix("sbet"))
     return sbet.with_suffix(".smrmsg")
 
 
 def smrmsg_beside(sbet: Path) -> Path | None:
-    """The sigmas that came with an SBET: as they are written here, or with the name's first word exchanged."""
+    """Return the sigmas that came with an SBET: as they are written here, or with the name's first word exchanged."""
     names = [_smrmsg_of(sbet)] if sbet.suffix.lower() in SBETS else []
     if sbet.name.startswith("sbet"):
         names.append(sbet.with_name("smrmsg" + sbet.name.removeprefix("sbet")))
@@ -98,7 +98,7 @@ def smrmsg_beside(sbet: Path) -> Path | None:
 def write_trajectory(
     files: TrajectoryFiles, trajectory: Trajectory, velocity_sigma_l: FloatArray | None
 ) -> list[tuple[Path, Path]]:
-    """SBET, smrmsg and CSV as far as they are wanted, under names that `put_in_place` takes away.
+    """Return SBET, smrmsg and CSV as far as they are wanted, under names that `put_in_place` takes away.
 
     Args:
         files: where to.
@@ -134,14 +134,16 @@ def _part(trajectory: Trajectory, first: int, last: int) -> Trajectory:
 
 
 def _of_week_s(trajectory: Trajectory, first: int, last: int) -> FloatArray:
-    """Seconds of the week of the trajectory's first epoch, running past its end."""
+    """Return seconds of the week of the trajectory's first epoch, running past its end."""
     week, _ = week_from_gps(trajectory.span[0])
     since: FloatArray = (trajectory.time_ns[first:last] - week * WEEK_NS) / SECOND_NS
     return since
 
 
 def _sbet_blocks(trajectory: Trajectory) -> Iterator[bytes]:
-    """An epoch beyond the block gives its last one's acceleration and rates; the very last has those before it."""
+    """Yield an epoch beyond the block gives its last one's acceleration and rates; the very last has those before
+    it.
+    """
     n = len(trajectory)
     for first in range(0, n, BLOCK):
         last = min(first + BLOCK, n)

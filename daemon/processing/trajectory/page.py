@@ -138,7 +138,7 @@ def write_page(path: Path, flight: Flight, findings: Iterable[Found] = ()) -> tu
 
 
 def summary_of(flight: Flight, findings: Iterable[Found] = ()) -> dict[str, object]:
-    """Verdict and figures without a page, for JSON."""
+    """Return verdict and figures without a page, for JSON."""
     figures = figures_of(flight, separation_of(flight))
     return {"verdict": judge(figures, findings).as_dict(), "figures": figures}
 
@@ -146,7 +146,7 @@ def summary_of(flight: Flight, findings: Iterable[Found] = ()) -> dict[str, obje
 def page_of(
     flight: Flight, figures: Figures, verdict: Verdict, pictures: Sequence[tuple[str, str, bytes, bytes]]
 ) -> str:
-    """The page's text; pictures are title, words, wide and narrow PNG."""
+    """Return the page's text; pictures are title, words, wide and narrow PNG."""
     parts = [
         f"<!doctype html><html lang='en'><head><meta charset='utf-8'><title>{escape(flight.title)}: trajectory</title>",
         "<meta name='viewport' content='width=device-width, initial-scale=1'>",

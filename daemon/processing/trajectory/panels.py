@@ -64,7 +64,7 @@ class Drawn:
         return {}
 
     def band(self, pixels: Pixels, solution: Solution, column: str) -> FloatArray:
-        """(2, m, …) of a solution's column; found once, drawn twice."""
+        """Return (2, m, …) of a solution's column; found once, drawn twice."""
         key = id(solution), column
         if key not in self._bands:
             self._bands[key] = pixels.band(getattr(solution, column))
@@ -81,7 +81,7 @@ class Drawn:
         return Pixels(self.flight.best.node_time_ns, self.flight.start_ns)
 
     def since_start_s(self, time_ns: Int64Array) -> FloatArray:
-        """(n,) of GPS times."""
+        """Return (n,) of GPS times."""
         seconds: FloatArray = (time_ns - self.flight.start_ns) / SECOND_NS
         return seconds
 
@@ -182,7 +182,7 @@ def dress(axes: Axes) -> None:
 
 
 def picture_of(figure: Figure, form: Format) -> bytes:
-    """PNG of few colours: a third of the bytes, and no difference to the eye."""
+    """Return PNG of few colours: a third of the bytes, and no difference to the eye."""
     figure.set_dpi(form.dpi)
     canvas: Any = FigureCanvasAgg(figure)
     canvas.draw()

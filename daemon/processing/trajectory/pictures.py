@@ -48,7 +48,7 @@ FATE_LOOK: dict[Fate, tuple[str, str, float, str]] = {  # marker, colour, size, 
 
 
 def draw_map(drawn: Drawn, form: Format) -> bytes:
-    """The flight from above, coloured by the fix type of its positions."""
+    """Return the flight from above, coloured by the fix type of its positions."""
     flight, course = drawn.flight, drawn.course
     lon, lat = course.place
     middle = math.radians(float(np.nanmean(lat)))
@@ -112,7 +112,7 @@ def _scale_bar(axes: Axes, lat_rad: float, width_deg: float, lon: FloatArray, la
 
 
 def draw_height(drawn: Drawn, form: Format) -> bytes:
-    """Height, ground speed, climb."""
+    """Return height, ground speed, climb."""
     course = drawn.course
     sheet = Sheet(drawn, form, ("Ellipsoidal height (m)", "Speed over ground (m/s)", "Climb (m/s)"))
     for axes, band in zip(sheet.panels, (course.height_m, course.speed_mps, course.climb_mps), strict=True):
@@ -121,7 +121,7 @@ def draw_height(drawn: Drawn, form: Format) -> bytes:
 
 
 def draw_attitude(drawn: Drawn, form: Format) -> bytes:
-    """Roll, pitch, heading."""
+    """Return roll, pitch, heading."""
     course = drawn.course
     sheet = Sheet(drawn, form, ("Roll (°)", "Pitch (°)", "Heading (°)"))
     for i, axes in enumerate(sheet.panels[:2]):
@@ -203,7 +203,7 @@ def draw_innovations(drawn: Drawn, form: Format) -> bytes:
 
 
 def _draw_sensors(names: Sequence[tuple[str, str, str, float]]) -> Callable[[Drawn, Format], bytes]:
-    """Estimates by axis, each with a band of one sigma."""
+    """Return estimates by axis, each with a band of one sigma."""
 
     def draw(drawn: Drawn, form: Format) -> bytes:
         best, pixels = drawn.flight.best, drawn.node_pixels
@@ -222,7 +222,7 @@ def _draw_sensors(names: Sequence[tuple[str, str, str, float]]) -> Callable[[Dra
 
 
 def draw_satellites(drawn: Drawn, form: Format) -> bytes:
-    """Satellites used, and what kind of positions these were."""
+    """Return satellites used, and what kind of positions these were."""
     flight = drawn.flight
     rows = flight.forward.innovations
     rows = rows[rows["kind"] == Kind.POSITION]

@@ -95,7 +95,7 @@ def _write(
 def _write_as_is(
     wish: TrajectoryRequest, files: TrajectoryFiles, sessions: Sequence[Session], holes: Sequence[str]
 ) -> TrajectoryReport:
-    """The devices' own INS, without a page."""
+    """Return the devices' own INS, without a page."""
     if wish.events is not None:
         raise UserError("--events: the marks are placed with a navigated trajectory; leave --ins as-is", ExitCode.USAGE)
     read = [(session, ins_as_is(session, wish.navigate.inputs.config)) for session in sessions]
@@ -120,7 +120,7 @@ def _write_as_is(
 
 
 def _joined(flights: Sequence[Navigated]) -> Trajectory:
-    """All sessions' trajectories as one; UserError where two are of one time."""
+    """Return all sessions' trajectories as one; UserError where two are of one time."""
     parts = [flight.trajectory(flight.session_id) for flight in flights]
     _refuse_overlap([(flight.inputs.log, part) for flight, part in zip(flights, parts, strict=True)])
     return joined_trajectory(parts, parts[0].name)
@@ -161,7 +161,7 @@ def _write_events(
 def _write_pages(
     wish: TrajectoryRequest, files: TrajectoryFiles, flights: Sequence[Navigated], written: Written
 ) -> tuple[list[Any], list[Any]]:
-    """A page a leg; verdicts and figures of all legs, in order."""
+    """Return a page a leg; verdicts and figures of all legs, in order."""
     verdicts: list[Any] = []
     figures: list[Any] = []
     for page in pages_of(flights):

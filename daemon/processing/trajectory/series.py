@@ -99,7 +99,7 @@ class Pixels:
         return len(self.starts)
 
     def blocks(self, most: int = BLOCK) -> Iterator[tuple[slice, slice]]:
-        """Columns, and the samples in them, some `most` at a time."""
+        """Yield columns, and the samples in them, some `most` at a time."""
         first = 0
         while first < len(self):
             last = max(int(np.searchsorted(self.starts, self.starts[first] + most, side="right")) - 1, first + 1)
@@ -108,11 +108,11 @@ class Pixels:
             first = last
 
     def band(self, values: FloatArray) -> FloatArray:
-        """(2, m, …) least and largest of values (n, …) in each column; nan only where all are."""
+        """Return (2, m, …) least and largest of values (n, …) in each column; nan only where all are."""
         return np.stack([np.fmin.reduceat(values, self.starts), np.fmax.reduceat(values, self.starts)])
 
     def line(self, band: FloatArray, broken: NDArray[np.bool_] | None = None) -> tuple[FloatArray, FloatArray]:
-        """(k,) times and values of a line that passes through both ends of each column, broken at gaps."""
+        """Return (k,) times and values of a line that passes through both ends of each column, broken at gaps."""
         where = np.flatnonzero(self.broken if broken is None else self.broken | broken) + 1
         at_s = np.insert(self.at_s, where, np.nan)
         return np.repeat(at_s, 2), np.insert(band, where, np.nan, axis=1).T.reshape(-1)
@@ -151,7 +151,7 @@ def _trajectory(solution: Solution, part: slice | Int64Array) -> Trajectory:
 
 
 def course_of(flight: Flight) -> Course:
-    """Where it flew, how fast, in what attitude: every epoch counts."""
+    """Return where it flew, how fast, in what attitude: every epoch counts."""
     solution = flight.best
     pixels = Pixels(solution.time_ns, flight.start_ns)
     bands = np.empty((2, len(pixels), 6))
@@ -168,7 +168,7 @@ def course_of(flight: Flight) -> Course:
 
 
 def _local_rows(solution: Solution, part: slice) -> FloatArray:
-    """(6, n) height, horizontal speed, climb, roll, pitch, heading (degrees, unwrapped) of consecutive epochs.
+    """Return (6, n) height, horizontal speed, climb, roll, pitch, heading (degrees, unwrapped) of consecutive epochs.
 
     Epochs close in time share the vertical of the first of them: that is wrong by metres over the earth's radius.
     """
@@ -223,7 +223,7 @@ class Separation:
 
 
 def separation_of(flight: Flight) -> Separation | None:
-    """None where the flight was not smoothed, or no epoch is in both solutions."""
+    """Return none where the flight was not smoothed, or no epoch is in both solutions."""
     forward, smoothed = flight.forward, flight.smoothed
     if smoothed is None:
         return None
@@ -260,7 +260,7 @@ def _of_difference(forward: FloatArray, smoothed: FloatArray) -> FloatArray:
 
 
 def used_positions(solution: Solution) -> StructArray:
-    """(k,) innovations of the positions that the filter used, one a time."""
+    """Return (k,) innovations of the positions that the filter used, one a time."""
     rows = solution.innovations
     rows = rows[(rows["kind"] == Kind.POSITION) & np.isin(rows["fate"], USED)]
     chosen: StructArray = rows[np.unique(rows["time_ns"], return_index=True)[1]]
@@ -268,7 +268,9 @@ def used_positions(solution: Solution) -> StructArray:
 
 
 def outages_of(flight: Flight) -> Int64Array:
-    """(k, 2) GPS times from which and until which no position was used, the flight's ends counting as positions."""
+    """Return (k, 2) GPS times from which and until which no position was used, the flight's ends counting as
+    positions.
+    """
     used_ns = used_positions(flight.forward)["time_ns"]
     usual_ns = float(np.median(np.diff(used_ns))) if len(used_ns) > 2 else 0.0
     ends_ns = flight.best.time_ns[[0, -1]]
@@ -278,7 +280,7 @@ def outages_of(flight: Flight) -> Int64Array:
 
 
 def fix_types_at(flight: Flight, time_ns: Int64Array) -> NDArray[np.int16]:
-    """(n,) fix type of the position before each time, of the first before that; −1 in outages."""
+    """Return (n,) fix type of the position before each time, of the first before that; −1 in outages."""
     used = used_positions(flight.forward)
     last = np.searchsorted(used["time_ns"], time_ns, side="right") - 1
     types = np.full(len(time_ns), -1, np.int16)
@@ -290,7 +292,7 @@ def fix_types_at(flight: Flight, time_ns: Int64Array) -> NDArray[np.int16]:
 
 
 def bridged_spans(solution: Solution) -> Int64Array:
-    """(k, 2) GPS times of runs of made-up inertial samples; from the epoch before a run to its last."""
+    """Return (k, 2) GPS times of runs of made-up inertial samples; from the epoch before a run to its last."""
     if not solution.bridged.any():
         return np.empty((0, 2), np.int64)
     change = np.diff(np.concatenate([[0], solution.bridged.astype(np.int8), [0]]))

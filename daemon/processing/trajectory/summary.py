@@ -49,13 +49,13 @@ class Page:
         return verdict, figures, aside
 
     def judge(self) -> tuple[Any, Any]:
-        """Verdict and figures alone."""
+        """Return verdict and figures alone."""
         figures = figures_of(self.flight, separation_of(self.flight))
         return judge(figures, self.findings), figures
 
 
 def pages_of(flights: Sequence[Navigated]) -> Iterator[Page]:
-    """A page a leg, in order."""
+    """Yield a page a leg, in order."""
     for flight in flights:
         noise = flight.inputs.sources.noise_words()
         notes = (*((noise,) if noise else ()), *flight.doubts, *flight.holes)
@@ -70,7 +70,7 @@ def pages_of(flights: Sequence[Navigated]) -> Iterator[Page]:
 
 
 def start_words(start: Start) -> str:
-    """How a leg's start was found, and its attitude."""
+    """Return how a leg's start was found, and its attitude."""
     how = getattr(start, "text", "")
     roll, pitch, heading = np.degrees(start.attitude_rad)
     sigma = np.degrees(start.attitude_sigma_rad)
@@ -81,7 +81,7 @@ def start_words(start: Start) -> str:
 def summary_head(
     wish: TrajectoryRequest, solution: str, sessions: Sequence[Session], holes: Sequence[str], warnings: Sequence[str]
 ) -> dict[str, Any]:
-    """What every summary says: the software, what it was made of, what is missing."""
+    """Return what every summary says: the software, what it was made of, what is missing."""
     wanted = wish.navigate.inputs
     outside = wanted.positions
     return {
@@ -116,7 +116,7 @@ def summary_of_run(
     figures: Sequence[Any],
     events: EventTable | None,
 ) -> dict[str, Any]:
-    """All but the names of the files."""
+    """Return all but the names of the files."""
     judged = iter(zip(verdicts, figures, strict=True))
     head = summary_head(
         wish,
@@ -176,7 +176,7 @@ def _session(flight: Navigated, judged: Iterator[tuple[Any, Any]]) -> dict[str, 
 
 
 def _setup(setup: Setup) -> dict[str, Any]:
-    """All its values, by name."""
+    """Return all its values, by name."""
     return {field.name: _plain(getattr(setup, field.name)) for field in dataclasses.fields(setup)}
 
 
@@ -194,7 +194,7 @@ def _leg(leg: NavigatedLeg, verdict: Any, figures: Any) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """What JSON can say: arrays as lists, dataclasses as objects, what is no number as null."""
+    """Return what JSON can say: arrays as lists, dataclasses as objects, what is no number as null."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {field.name: _plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
     if isinstance(value, np.ndarray | np.generic):

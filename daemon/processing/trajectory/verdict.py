@@ -66,7 +66,7 @@ class Rule:
     least: bool = False
 
     def judged(self, figures: Figures) -> Iterator[Reason]:
-        """Reasons that its measure gives, one for each thing measured."""
+        """Yield reasons that its measure gives, one for each thing measured."""
         for of, value in self.measure(figures):
             level, limit = self._level(value)
             if value is not None and level > Level.GOOD and limit is not None:
@@ -94,7 +94,7 @@ class Found(Protocol):
 
 
 def _one(*keys: str) -> Measure:
-    """The figure at a path of keys."""
+    """Return the figure at a path of keys."""
 
     def measure(figures: Figures) -> Iterator[tuple[str, float | None]]:
         value: Any = figures
@@ -106,7 +106,7 @@ def _one(*keys: str) -> Measure:
 
 
 def _largest(group: str, *keys: str) -> Measure:
-    """The largest of some figures of a group; not judged where none is known."""
+    """Return the largest of some figures of a group; not judged where none is known."""
 
     def measure(figures: Figures) -> Iterator[tuple[str, float | None]]:
         known = [(figures[group][key], key) for key in keys if figures[group][key] is not None]
@@ -128,7 +128,7 @@ def _share(*fates: str) -> Measure:
 
 
 def _of_kinds(key: str, *, inverse: bool = False) -> Measure:
-    """A figure of each kind of observation."""
+    """Return a figure of each kind of observation."""
 
     def measure(figures: Figures) -> Iterator[tuple[str, float | None]]:
         for kind, row in figures["observations"].items():
@@ -139,12 +139,12 @@ def _of_kinds(key: str, *, inverse: bool = False) -> Measure:
 
 
 def _noise_found(figures: Figures) -> Iterator[tuple[str, float | None]]:
-    """Factors on sigmas that the flight asked for."""
+    """Yield factors on sigmas that the flight asked for."""
     yield from figures["noise_found"].items()
 
 
 def _sensor(*names: str) -> Measure:
-    """Largest estimate of an axis, in sigmas that the configuration gives."""
+    """Return largest estimate of an axis, in sigmas that the configuration gives."""
 
     def measure(figures: Figures) -> Iterator[tuple[str, float | None]]:
         for name in names:
@@ -402,7 +402,7 @@ class Verdict:
 
 
 def judge(figures: Figures, findings: Iterable[Found] = ()) -> Verdict:
-    """The verdict on figures; what the diagnosis found are reasons too."""
+    """Return the verdict on figures; what the diagnosis found are reasons too."""
     reasons = [reason for rule in RULES for reason in rule.judged(figures)]
     reasons += [reason_of(finding) for finding in findings]
     reasons.sort(key=lambda reason: (-reason.level, -reason.excess))
@@ -411,7 +411,7 @@ def judge(figures: Figures, findings: Iterable[Found] = ()) -> Verdict:
 
 
 def reason_of(finding: Found) -> Reason:
-    """A finding's, which says in one sentence what is the matter and what to change."""
+    """Return a finding's, which says in one sentence what is the matter and what to change."""
     level = Level.UNUSABLE if finding.severity == "error" else Level.CARE
     return Reason(level, finding.code, finding.text.rstrip("."), "", float("inf"))
 

@@ -29,7 +29,7 @@ class Recorded:
 
 
 def records_of(files: Sequence[tuple[Path, Calibration]], where: Path | None) -> Recorded:
-    """The records of calibrations: beside their files, or where the user says.
+    """Return the records of calibrations: beside their files, or where the user says.
 
     Args:
         files: of the calibrations.
@@ -73,7 +73,7 @@ def _document(path: Path, file: Path, calibration: Calibration) -> Document:
 def record_files(
     folder: Path, documents: Mapping[str, Document], validation: Validation, logs: Sequence[tuple[str, str]]
 ) -> dict[Path, bytes]:
-    """Records with the validation in them, XML and JSON.
+    """Return records with the validation in them, XML and JSON.
 
     Args:
         folder: where they go.
@@ -91,7 +91,9 @@ def record_files(
 
 
 def told_of(validation: Validation, logs: Sequence[tuple[str, str]], now: dt.datetime) -> dict[str, tuple[Plain, str]]:
-    """Values and notes by ``CLASS.attribute``: methods with what each found, when, against what, check points."""
+    """Return values and notes by ``CLASS.attribute``: methods with what each found, when, against what, check
+    points.
+    """
     applied = [method for method in validation.methods if method.passed is not None]
     against = ", ".join(f"{name} (SHA-256 {sha256})" for name, sha256 in logs)
     told: dict[str, tuple[Plain, str]] = {

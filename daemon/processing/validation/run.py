@@ -127,7 +127,7 @@ def run_validation(wish: ValidationOptions, folder: Path, told: Told) -> Validat
 
 
 def read_file(path: Path) -> Calibration:
-    """A calibration file; UserError where it cannot be read."""
+    """Return a calibration file; UserError where it cannot be read."""
     try:
         return read_calibration(text_of(path, "a calibration file"), str(path))
     except CalibrationError as error:
@@ -145,7 +145,7 @@ def _histories(paths: Sequence[Path], validated: Sequence[Calibration]) -> tuple
 
 
 def _entry(path: Path, named: Sequence[Path]) -> Calibration | None:
-    """A calibration; of a folder's files those that are none are passed over, as configurations are TOML too."""
+    """Return a calibration; of a folder's files those that are none are passed over, as configurations are TOML too."""
     if path in named or "[calibration]" in decoded(path.read_bytes(), "replace"):
         return read_file(path)
     return None
@@ -331,7 +331,7 @@ def _write(output: Path, record: dict[str, Any], found: _Found) -> list[str]:
 
 
 def history_png(histories: Sequence[History]) -> bytes:
-    """Boresight angles with one sigma over time, a column a history."""
+    """Return boresight angles with one sigma over time, a column a history."""
     figure = Figure(figsize=(1.0 + 5.0 * max(len(histories), 1), 6.6), facecolor="white", layout="constrained")
     axes = figure.subplots(len(BORESIGHT), max(len(histories), 1), squeeze=False, sharex="col")
     for column, one in enumerate(histories):

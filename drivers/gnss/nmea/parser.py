@@ -209,7 +209,7 @@ class NmeaParser(StreamParser):
     def _time_message(
         self, host_time_ns: int, time_ns: int | None, date: dt.date | None, vouched: bool, name: str
     ) -> list[Record]:
-        """The previous edge's second; a date before the floor is a week rolled over, and counted."""
+        """Return the previous edge's second; a date before the floor is a week rolled over, and counted."""
         if time_ns is None:
             return []
         if date is not None and date < self._dates.floor:
@@ -234,7 +234,7 @@ class NmeaParser(StreamParser):
 
 
 def merge_epoch(parts: dict[str, Part]) -> GnssFix | None:
-    """One fix of an epoch's sentences; None where none that says a position is among them."""
+    """Return one fix of an epoch's sentences; None where none that says a position is among them."""
     message = next((name for name in POSITION_SENTENCES if name in parts), "")
     solution = parts.get(message)
     if solution is None or solution.fix_type is None or solution.time_ns is None:

@@ -43,13 +43,13 @@ class Sentence:
         self._message: Any = pynmea2.TalkerSentence.sentence_types[kind](fields[0][:-3], kind, fields[1:])
 
     def text(self, name: str) -> str:
-        """The field as it came; empty where the sentence is shorter."""
+        """Return the field as it came; empty where the sentence is shorter."""
         place: int = self._message.name_to_idx[name]
         data: list[str] = self._message.data
         return data[place] if place < len(data) else ""
 
     def number(self, name: str) -> float | None:
-        """A number; None where the field is empty."""
+        """Return a number; None where the field is empty."""
         text = self.text(name)
         if not text:
             return None
@@ -58,7 +58,9 @@ class Sentence:
         return float(text)
 
     def time_ns(self) -> int | None:
-        """Nanoseconds of the UTC day, 86 400 s and above in a leap second; None where the receiver has no time."""
+        """Return nanoseconds of the UTC day, 86 400 s and above in a leap second; None where the receiver has no
+        time.
+        """
         text = self.text("timestamp")
         if not text:
             return None
@@ -72,7 +74,7 @@ class Sentence:
         return (hours * 3600 + minutes * 60 + seconds) * SECOND_NS + int(fraction)
 
     def position_rad(self) -> tuple[float, float] | None:
-        """Latitude and longitude; None where empty."""
+        """Return latitude and longitude; None where empty."""
         if not (self.text("lat") and self.text("lon")):
             return None
         if self.text("lat_dir") not in ("N", "S") or self.text("lon_dir") not in ("E", "W"):
@@ -90,7 +92,7 @@ class Sentence:
         return degrees
 
     def date_ddmmyy(self) -> dt.date | None:
-        """RMC's date; two digits of the year are 1980 to 2079."""
+        """Return RMC's date; two digits of the year are 1980 to 2079."""
         text = self.text("datestamp")
         if not text:
             return None
@@ -100,7 +102,7 @@ class Sentence:
         return checked_date(year + (1900 if year >= 80 else 2000), int(text[2:4]), int(text[:2]))
 
     def date_ymd(self) -> dt.date | None:
-        """ZDA's date."""
+        """Return ZDA's date."""
         texts = [self.text(name) for name in ("year", "month", "day")]
         if not any(texts):
             return None
@@ -110,7 +112,7 @@ class Sentence:
 
 
 def checked_date(year: int, month: int, day: int) -> dt.date:
-    """A date of the calendar.
+    """Return a date of the calendar.
 
     Raises:
         FieldError: it is not on the calendar.
@@ -122,7 +124,7 @@ def checked_date(year: int, month: int, day: int) -> dt.date:
 
 
 def velocity_from_course(speed_mps: float | None, course_deg: float | None) -> tuple[float, float, float] | None:
-    """North, east and an unsaid down component; None where speed or course is empty."""
+    """Return north, east and an unsaid down component; None where speed or course is empty."""
     if speed_mps is None or course_deg is None:
         return None
     course = math.radians(course_deg)
@@ -133,13 +135,13 @@ def velocity_from_course(speed_mps: float | None, course_deg: float | None) -> t
 
 
 def encode_sentence(body: str) -> bytes:
-    """``$body*hh`` and the line end."""
+    """Return ``$body*hh`` and the line end."""
     raw = body.encode("ascii")
     return b"$%s*%02X\r\n" % (raw, nmea_xor(raw))
 
 
 def _time_text(time_ns: int) -> str:
-    """hhmmss.ss of nanoseconds of the UTC day, 235960 in a leap second."""
+    """Return hhmmss.ss of nanoseconds of the UTC day, 235960 in a leap second."""
     centiseconds = time_ns // 10_000_000
     seconds, hundredths = divmod(centiseconds, 100)
     leap = max(0, seconds - 86_399)
@@ -149,7 +151,7 @@ def _time_text(time_ns: int) -> str:
 
 
 def _angle_text(angle_rad: float, degree_digits: int, letters: str) -> str:
-    """ddmm.mmmmmmmm and the hemisphere's letter."""
+    """Return ddmm.mmmmmmmm and the hemisphere's letter."""
     scaled = round(abs(math.degrees(angle_rad)) * 60e8)
     degrees, minutes = divmod(scaled, 60 * 10**8)
     whole, fraction = divmod(minutes, 10**8)
@@ -171,7 +173,7 @@ def encode_gga(
     satellites: int = 12,
     talker: str = "GN",
 ) -> bytes:
-    """Altitude above the receiver's geoid and the geoid's height above the ellipsoid; time of the UTC day."""
+    """Return altitude above the receiver's geoid and the geoid's height above the ellipsoid; time of the UTC day."""
     return encode_sentence(
         f"{talker}GGA,{_time_text(time_ns)},{_position_text(lat_rad, lon_rad)},{quality},{satellites:02d},0.80,"
         f"{altitude_m:.4f},M,{separation_m:.4f},M,,"
@@ -189,7 +191,7 @@ def encode_rmc(
     valid: bool = True,
     talker: str = "GN",
 ) -> bytes:
-    """Position, speed over ground and course; ``valid=False`` is status V, mode N."""
+    """Return position, speed over ground and course; ``valid=False`` is status V, mode N."""
     return encode_sentence(
         f"{talker}RMC,{_time_text(time_ns)},{'A' if valid else 'V'},{_position_text(lat_rad, lon_rad)},"
         f"{speed_mps / MPS_PER_KNOT:.4f},{math.degrees(course_rad) % 360.0:.4f},{date:%d%m%y},,,{'A' if valid else 'N'}"
@@ -197,17 +199,17 @@ def encode_rmc(
 
 
 def encode_zda(time_ns: int, date: dt.date, *, talker: str = "GN") -> bytes:
-    """UTC time and date, local zone 0."""
+    """Return UTC time and date, local zone 0."""
     return encode_sentence(f"{talker}ZDA,{_time_text(time_ns)},{date:%d,%m,%Y},00,00")
 
 
 def encode_gst(time_ns: int, sigma_n_m: float, sigma_e_m: float, sigma_d_m: float, *, talker: str = "GN") -> bytes:
-    """Sigmas of latitude, longitude and height; the error ellipse is left empty."""
+    """Return sigmas of latitude, longitude and height; the error ellipse is left empty."""
     return encode_sentence(f"{talker}GST,{_time_text(time_ns)},,,,,{sigma_n_m:.4f},{sigma_e_m:.4f},{sigma_d_m:.4f}")
 
 
 def encode_vtg(speed_mps: float, course_rad: float, *, talker: str = "GN") -> bytes:
-    """Course over ground and speed."""
+    """Return course over ground and speed."""
     course = math.degrees(course_rad) % 360.0
     knots, kmph = speed_mps / MPS_PER_KNOT, speed_mps / MPS_PER_KMPH
     return encode_sentence(f"{talker}VTG,{course:.4f},T,,M,{knots:.4f},N,{kmph:.4f},K,A")

@@ -21,7 +21,7 @@ def encode_frame(
     message_type: int = 0,
     extra_header: bytes = b"",
 ) -> bytes:
-    """A log's frame: header, body, CRC.
+    """Return a log's frame: header, body, CRC.
 
     Args:
         message_id: the log's number.
@@ -48,7 +48,7 @@ def encode_frame(
 def encode_log(
     name: str, body: nov.Body, week: int, milliseconds: int, *, time_status: int = TIME_STATUS_FINESTEERING
 ) -> bytes:
-    """A log by name, with the header form that belongs to it.
+    """Return a log by name, with the header form that belongs to it.
 
     Raises:
         KeyError: no layout of that name.

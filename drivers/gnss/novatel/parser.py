@@ -65,7 +65,7 @@ GIVES: dict[type[nov.Body], tuple[type, ...]] = {  # what a body can become; the
 
 
 def message_name(frame: bytes) -> str:
-    """``BESTPOS``; ``NOVATEL-1234`` without a name here; answers to commands end in ``-response``."""
+    """Return ``BESTPOS``; ``NOVATEL-1234`` without a name here; answers to commands end in ``-response``."""
     number = int.from_bytes(frame[4:6], "little")
     layout = nov.LAYOUTS.get(number)
     name = layout.name if layout else nov.OTHER_NAMES.get(number, f"NOVATEL-{number}")
@@ -115,7 +115,7 @@ class NovatelParser(StreamParser):
         return join_rows(item for log in logs for item in self._decode(log))
 
     def _decode(self, frame: Frame) -> list[Record | Row]:
-        """One frame; a short body is counted."""
+        """Return one frame; a short body is counted."""
         number = int.from_bytes(frame.data[4:6], "little")
         if number in RAW_RANGES:
             return self._second_of_raw(frame, RAW_RANGES[number])
@@ -136,7 +136,7 @@ class NovatelParser(StreamParser):
         return [item for item in items if (item.record if isinstance(item, Row) else type(item)) in self._wanted]
 
     def _named_second(self, header: Header) -> list[TimeMessage]:
-        """The whole second a synchronous solution names, once for all logs of an epoch."""
+        """Return the whole second a synchronous solution names, once for all logs of an epoch."""
         epoch = (header.week, header.milliseconds)
         if header.name not in TIME_NAMING or header.milliseconds % 1000 or epoch == self._last_named:
             return []
@@ -161,7 +161,7 @@ class NovatelParser(StreamParser):
 
 
 def _split(frame: Frame, name: str, dates: ReceiverDates) -> tuple[Header | None, bytes]:
-    """Header and body of a frame; None for answers to commands and for other formats."""
+    """Return header and body of a frame; None for answers to commands and for other formats."""
     data = frame.data
     if data[:3] == nov.SYNC_SHORT:
         short = nov.ShortHeader._make(nov.SHORT_HEADER.unpack_from(data))
@@ -178,7 +178,7 @@ def _split(frame: Frame, name: str, dates: ReceiverDates) -> tuple[Header | None
 
 
 def imu_scale(settings: DeviceSettings) -> tables.ImuScale | None:
-    """The scale of the configured ``imu_type``, a name of INSCONFIG's table or its number; None without it.
+    """Return the scale of the configured ``imu_type``, a name of INSCONFIG's table or its number; None without it.
 
     Raises:
         DriverSettingsError: naming the types there are.
@@ -193,7 +193,7 @@ def imu_scale(settings: DeviceSettings) -> tables.ImuScale | None:
 
 
 def make_time_parser(settings: DeviceSettings) -> NovatelParser:
-    """The recorder's parser: time messages only."""
+    """Return the recorder's parser: time messages only."""
     return NovatelParser(settings, wanted=(TimeMessage,))
 
 

@@ -61,7 +61,7 @@ class Header(NamedTuple):
         return known and (self.time_status is None or self.time_status in tables.TIME_VALID)
 
     def tag(self, earlier_ns: int = 0) -> TimeTag:
-        """The header's GPS time less ``earlier_ns``."""
+        """Return the header's GPS time less ``earlier_ns``."""
         return gps_tag(self.week, self.milliseconds * MILLISECOND_NS - earlier_ns, self.floor_week)
 
 
@@ -87,21 +87,21 @@ class State:
         return self.dates.floor_week
 
     def has_week(self, week: int) -> bool:
-        """Whether a solution can be placed in time; counted where not."""
+        """Return whether a solution can be placed in time; counted where not."""
         known = is_week(week, self.floor_week)
         if not known:
             self.counters.errors["date_before_floor" if 0 < week < self.floor_week else "time_unknown"] += 1
         return known
 
     def time_counts(self, header: Header) -> bool:
-        """Whether what a header dates is valid in time; a week before the floor is counted."""
+        """Return whether what a header dates is valid in time; a week before the floor is counted."""
         if header.before_floor:
             self.counters.errors["date_before_floor"] += 1
         return header.time_valid
 
 
 def time_message(state: State, header: Header, time: nov.Time) -> list[Record | Row]:
-    """TIME names the edge its own header says; the PPS is early by what the receiver's clock is ahead."""
+    """Return TIME names the edge its own header says; the PPS is early by what the receiver's clock is ahead."""
     if not state.has_week(header.week):
         return []
     says_leap = time.utc_status == tables.UTC_VALID and abs(time.utc_offset_s) < GREATEST_LEAP_S
@@ -135,7 +135,7 @@ def _leap_of_fields(header: Header, time: nov.Time) -> int | None:
 
 
 def position_fix(state: State, header: Header, position: nov.BestPos) -> list[Record | Row]:
-    """Height above the geoid plus undulation is the ellipsoidal height."""
+    """Return height above the geoid plus undulation is the ellipsoidal height."""
     there = position.position_type != tables.POSITION_NONE
     sigmas = (position.lat_sigma_m, position.lon_sigma_m, position.height_sigma_m)
     return [
@@ -157,7 +157,7 @@ def position_fix(state: State, header: Header, position: nov.BestPos) -> list[Re
 
 
 def velocity_fix(state: State, header: Header, velocity: nov.BestVel) -> list[Record | Row]:
-    """The velocity holds `latency_s` before the header's time (BESTVEL, field 4)."""
+    """Return the velocity holds `latency_s` before the header's time (BESTVEL, field 4)."""
     track = radians(velocity.track_deg) if isfinite(velocity.track_deg) else nan
     north, east = velocity.horizontal_mps * cos(track), velocity.horizontal_mps * sin(track)
     there = velocity.velocity_type != tables.POSITION_NONE
@@ -178,7 +178,7 @@ def velocity_fix(state: State, header: Header, velocity: nov.BestVel) -> list[Re
 
 
 def ins_pva(state: State, header: Header, pva: nov.InsPva) -> list[Record | Row]:
-    """Its own time is finer than the header's."""
+    """Return its own time is finer than the header's."""
     if not state.has_week(pva.week):
         return []
     time_ns = pva.week * WEEK_NS + _nanoseconds(pva.seconds)
@@ -186,7 +186,7 @@ def ins_pva(state: State, header: Header, pva: nov.InsPva) -> list[Record | Row]
 
 
 def ins_pvax(state: State, header: Header, pva: nov.InsPvax) -> list[Record | Row]:
-    """Height and undulation make the ellipsoidal height."""
+    """Return height and undulation make the ellipsoidal height."""
     if not state.has_week(header.week):
         return []
     time_ns = header.week * WEEK_NS + header.milliseconds * MILLISECOND_NS
@@ -197,7 +197,7 @@ def ins_pvax(state: State, header: Header, pva: nov.InsPvax) -> list[Record | Ro
 def _ins_row(
     header: Header, time_ns: int, pva: nov.InsPva | nov.InsPvax, height_m: float, sigmas: tuple[float, ...]
 ) -> list[Record | Row]:
-    """A row of `INS_DTYPE`; sigmas of position, velocity (m, m/s) and attitude (rad)."""
+    """Return a row of `INS_DTYPE`; sigmas of position, velocity (m, m/s) and attitude (rad)."""
     values = (
         header.host_time_ns,
         time_ns,
@@ -215,7 +215,7 @@ def _ins_row(
 
 
 def ins_attitude(state: State, header: Header, attitude: nov.InsAtt | nov.InsAttx) -> list[Record | Row]:
-    """Position and velocity of such a row are nan."""
+    """Return position and velocity of such a row are nan."""
     week = attitude.week if isinstance(attitude, nov.InsAtt) else header.week
     if not state.has_week(week):
         return []
@@ -232,7 +232,7 @@ def ins_attitude(state: State, header: Header, attitude: nov.InsAtt | nov.InsAtt
 
 
 def raw_imu(state: State, header: Header, imu: nov.RawImu | nov.RawImux) -> list[Record | Row]:
-    """Counts to rates: increments of one sample, times the IMU's rate; axes of the wire are z, −y, x."""
+    """Return counts to rates: increments of one sample, times the IMU's rate; axes of the wire are z, −y, x."""
     scale = state.configured_scale or state.announced_scale
     if isinstance(imu, nov.RawImux):
         scale = state.configured_scale or tables.IMU_SCALES.get(imu.imu_type)
@@ -260,7 +260,7 @@ def raw_imu(state: State, header: Header, imu: nov.RawImu | nov.RawImux) -> list
 
 
 def corrected_imu(state: State, header: Header, imu: nov.CorrImu | nov.CorrImuData) -> list[Record | Row]:
-    """Increments since the last log, turned to forward, right, down; no specific force: gravity is taken out."""
+    """Return increments since the last log, turned to forward, right, down; no specific force: gravity is taken out."""
     values: dict[str, float | int | str | bool] = {
         "delta_angle_x_rad": imu.roll_rad,
         "delta_angle_y_rad": imu.pitch_rad,
@@ -279,7 +279,7 @@ def corrected_imu(state: State, header: Header, imu: nov.CorrImu | nov.CorrImuDa
 
 
 def event_mark(state: State, header: Header, mark: nov.MarkTime) -> list[Record | Row]:
-    """GPS time of the mark is the receiver's less its clock's offset (MARKxTIME, fields 3 and 4).
+    """Return GPS time of the mark is the receiver's less its clock's offset (MARKxTIME, fields 3 and 4).
 
     It is of the pulse's leading edge, which is the falling one unless MARKCONTROL was told otherwise; no log says it.
     """
@@ -316,29 +316,29 @@ def baseline_heading(state: State, header: Header, heading: nov.Heading2) -> lis
 
 
 def ins_config(state: State, header: Header, config: nov.InsConfig) -> list[Record | Row]:
-    """Says which IMU is connected, for the raw logs that do not."""
+    """Return says which IMU is connected, for the raw logs that do not."""
     state.announced_scale = tables.IMU_SCALES.get(config.imu_type)
     return []
 
 
 def is_week(week: int, floor_week: int) -> bool:
-    """Whether a message has a week, and one that is believed."""
+    """Return whether a message has a week, and one that is believed."""
     return max(1, floor_week) <= week <= GREATEST_WEEK
 
 
 def gps_tag(week: int, time_ns: int, floor_week: int) -> TimeTag:
-    """GPS time of week, carried over the week's end; no week where the receiver has none that is believed."""
+    """Return GPS time of week, carried over the week's end; no week where the receiver has none that is believed."""
     weeks, time_ns = divmod(time_ns, WEEK_NS)
     return TimeTag(TimeScale.GPS, time_ns, week=week + weeks if is_week(week, floor_week) else None)
 
 
 def _nanoseconds(seconds: float) -> int:
-    """Nearest nanosecond; 0 for what is no number."""
+    """Return nearest nanosecond; 0 for what is no number."""
     return round(seconds * SECOND_NS) if abs(seconds) < 1e9 else 0
 
 
 def _attitude(row: nov.InsPva | nov.InsPvax | nov.InsAtt | nov.InsAttx) -> tuple[float, float, float]:
-    """Roll, pitch, heading as CONVENTIONS has them.
+    """Return roll, pitch, heading as CONVENTIONS has them.
 
     SPAN's frame is x right, y forward, z up: its roll about y and its pitch about x are right-handed, its azimuth is
     clockwise from north; so right wing down, nose up and heading are positive, as here.

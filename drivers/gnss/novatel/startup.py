@@ -33,7 +33,7 @@ SAVE = "SAVECONFIG"
 
 
 def startup_messages(settings: DeviceSettings, wish: StartupOptions) -> tuple[StartupMessage, ...]:
-    """Baud rate where it changes, PPS, logs of time, position, events and raw measurements.
+    """Return baud rate where it changes, PPS, logs of time, position, events and raw measurements.
 
     Raises:
         DriverSettingsError: a port is named, which a NovAtel needs not.
@@ -55,7 +55,7 @@ def startup_messages(settings: DeviceSettings, wish: StartupOptions) -> tuple[St
 
 
 def imu_startup_messages(settings: DeviceSettings, wish: StartupOptions) -> tuple[StartupMessage, ...]:
-    """Logs of the IMU and INS in a receiver's stream."""
+    """Return logs of the IMU and INS in a receiver's stream."""
     return (*(_command(f"LOG {log}") for log in IMU_LOGS), *_saving(wish))
 
 

@@ -82,7 +82,7 @@ class ImuScale:
 
 
 def _rate_output(name: str, deg_per_s: float, milli_g: float, rate_hz: float) -> ImuScale:
-    """An IMU whose counts are rates in 1/65536 of a unit (Epson), as increments over one sample."""
+    """Return an IMU whose counts are rates in 1/65536 of a unit (Epson), as increments over one sample."""
     rad = radians(deg_per_s) / FULL_SCALE_16 / rate_hz
     return ImuScale(name, rad, milli_g / FULL_SCALE_16 * STANDARD_GRAVITY / 1000.0 / rate_hz, rate_hz)
 

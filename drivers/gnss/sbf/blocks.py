@@ -249,7 +249,7 @@ MEAS_EPOCH = 4027  # its header says its time; the measurements are for post-pro
 
 
 def ins_triples(frame: bytes, block: InsNavGeod) -> dict[int, Triple]:
-    """The sub-blocks of an INSNavGeod that are there, by INS_*.
+    """Return the sub-blocks of an INSNavGeod that are there, by INS_*.
 
     Raises:
         BlockError: shorter than the block says.
@@ -267,13 +267,13 @@ def ins_triples(frame: bytes, block: InsNavGeod) -> dict[int, Triple]:
 
 
 def encode_ins_nav_geod(block: InsNavGeod, triples: dict[int, Triple], tow_ms: int | None, week: int | None) -> bytes:
-    """The frame of an INSNavGeod; ``sub_blocks`` of the block is made from the triples."""
+    """Return the frame of an INSNavGeod; ``sub_blocks`` of the block is made from the triples."""
     behind = b"".join(INS_TRIPLE.pack(*triples[bit]) for bit in INS_SUB_BLOCKS if bit in triples)
     return INS_NAV_GEOD.encode(block._replace(sub_blocks=sum(triples)), tow_ms, week, behind=behind)
 
 
 def sensor_sets(frame: bytes) -> list[SensorSet]:
-    """The measurements of an ExtSensorMeas.
+    """Return the measurements of an ExtSensorMeas.
 
     Raises:
         BlockError: shorter than the block says.
@@ -286,6 +286,6 @@ def sensor_sets(frame: bytes) -> list[SensorSet]:
 
 
 def encode_ext_sensor_meas(sets: list[SensorSet], tow_ms: int | None, week: int | None) -> bytes:
-    """The frame of an ExtSensorMeas."""
+    """Return the frame of an ExtSensorMeas."""
     behind = b"".join(SENSOR_SET.pack(*one) for one in sets)
     return EXT_SENSOR_MEAS.encode(ExtSensorMeas(len(sets), SENSOR_SET.size), tow_ms, week, behind=behind)

@@ -61,12 +61,12 @@ class BlockHeader(NamedTuple):
 
 
 def number_of(frame: bytes) -> int:
-    """The block's number."""
+    """Return the block's number."""
     return int(SBF_HEADER.unpack_from(frame)[1] & SBF_NUMBER_BITS)
 
 
 def name_of(frame: bytes) -> str:
-    """``PVTGeodetic``; ``SBF-4999`` without a name here."""
+    """Return ``PVTGeodetic``; ``SBF-4999`` without a name here."""
     number = number_of(frame)
     return NAMES.get(number, f"SBF-{number}")
 
@@ -109,7 +109,7 @@ class Layout(Generic[BlockT]):
         return HEADER.size + self._wires[-1].size
 
     def decode(self, frame: bytes) -> BlockT:
-        """The block of a whole frame.
+        """Return the block of a whole frame.
 
         Raises:
             BlockError: shorter than its revision.
@@ -123,7 +123,7 @@ class Layout(Generic[BlockT]):
     def encode(
         self, block: BlockT, tow_ms: int | None, week: int | None, *, revision: int | None = None, behind: bytes = b""
     ) -> bytes:
-        """The whole frame, of the latest revision known unless said; ``behind`` are sub-blocks."""
+        """Return the whole frame, of the latest revision known unless said; ``behind`` are sub-blocks."""
         revision = len(self._wires) - 1 if revision is None else revision
         known = min(revision, len(self._wires) - 1)
         body = self._wires[known].pack(*block[: self._fields[known]])
@@ -131,7 +131,7 @@ class Layout(Generic[BlockT]):
 
 
 def encode_frame(number: int, body: bytes, tow_ms: int | None, week: int | None, *, revision: int = 0) -> bytes:
-    """A block's frame: header, time stamp, body, padding.
+    """Return a block's frame: header, time stamp, body, padding.
 
     Args:
         number, revision: of the block.

@@ -148,7 +148,7 @@ class SbfParser(StreamParser):
         return items
 
     def _stamp(self, host_time_ns: int, frame: bytes) -> Stamp:
-        """The block's time stamp; a week before the floor is none.
+        """Return the block's time stamp; a week before the floor is none.
 
         Raises:
             BlockError: too short, or a time that cannot be.
@@ -202,7 +202,7 @@ class SbfParser(StreamParser):
         ]
 
     def _named_second(self, stamp: Stamp, computed: bool) -> Items:
-        """The whole second a solution names, once for all blocks of an epoch."""
+        """Return the whole second a solution names, once for all blocks of an epoch."""
         tag = stamp.tag()
         if tag is None or tag.time_ns % SECOND_NS or stamp.epoch == self._last_named:
             return []
@@ -297,7 +297,7 @@ class SbfParser(StreamParser):
         return [*self._imu.add(stamp, self._clock.tag(stamp), sets)]
 
     def _is_timeless(self, stamp: Stamp) -> bool:
-        """Whether a block cannot be placed in time; counted where so."""
+        """Return whether a block cannot be placed in time; counted where so."""
         if stamp.tow_ms is None:
             self.counters.errors["time_unknown"] += 1
         return stamp.tow_ms is None
@@ -318,7 +318,7 @@ def _leap_of_fields(block: sbf.ReceiverTime, stamp: Stamp) -> int | None:
 
 
 def make_time_parser(settings: DeviceSettings) -> SbfParser:
-    """The recorder's parser: time messages only."""
+    """Return the recorder's parser: time messages only."""
     return SbfParser(settings, wanted=(TimeMessage,))
 
 

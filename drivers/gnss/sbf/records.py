@@ -69,7 +69,7 @@ class Stamp(NamedTuple):
         return (self.week or 0) * WEEK_MS + (self.tow_ms or 0)
 
     def tag(self, bias_ns: int = 0) -> TimeTag | None:
-        """GPS time, the clock's bias taken off; None while the receiver knows no time."""
+        """Return GPS time, the clock's bias taken off; None while the receiver knows no time."""
         if self.tow_ms is None:
             return None
         weeks, time_ns = divmod(self.tow_ms * MILLISECOND_NS - bias_ns, WEEK_NS)
@@ -101,7 +101,7 @@ class ReceiverClock:
             self._drift_ppm = drift_ppm if abs(drift_ppm) < GREATEST_DRIFT_PPM else 0.0
 
     def tag(self, stamp: Stamp) -> TimeTag | None:
-        """GPS time of a block that does not say the bias itself; counted where none is known."""
+        """Return GPS time of a block that does not say the bias itself; counted where none is known."""
         if stamp.tow_ms is None:
             return None
         since_ms = CLOCK_MODEL_MS + 1
@@ -114,12 +114,12 @@ class ReceiverClock:
 
 
 def usable(value: float) -> float:
-    """The value; nan where it is the do-not-use value or no number."""
+    """Return the value; nan where it is the do-not-use value or no number."""
     return value if value != sbf.FLOAT_UNSET and isfinite(value) else nan
 
 
 def usable_triple(values: sbf.Triple | None) -> sbf.Triple:
-    """The three values; nan where unset, or where there are none."""
+    """Return the three values; nan where unset, or where there are none."""
     return (usable(values[0]), usable(values[1]), usable(values[2])) if values is not None else (nan, nan, nan)
 
 
@@ -127,7 +127,7 @@ def usable_triple(values: sbf.Triple | None) -> sbf.Triple:
 
 
 def geodetic_fix(parts: dict[str, FixPart]) -> GnssFix | None:
-    """The fix of an epoch; None without a PVTGeodetic or without time."""
+    """Return the fix of an epoch; None without a PVTGeodetic or without time."""
     stamp, pvt = parts.get("PVTGeodetic", (None, None))
     if stamp is None or not isinstance(pvt, sbf.PvtGeodetic):
         return None
@@ -174,7 +174,7 @@ def _velocity_cov(parts: dict[str, FixPart]) -> NDArray[np.float64] | None:
 
 
 def _ned_cov(nn: float, ee: float, uu: float, ne: float, nu: float, eu: float) -> NDArray[np.float64] | None:
-    """North, east, up to north, east, down; None where any is unset."""
+    """Return north, east, up to north, east, down; None where any is unset."""
     values = [usable(value) for value in (nn, ee, uu, ne, nu, eu)]
     if not all(map(isfinite, values)):
         return None
@@ -185,7 +185,7 @@ def _ned_cov(nn: float, ee: float, uu: float, ne: float, nu: float, eu: float) -
 
 
 def event_mark(stamp: Stamp, event: sbf.ExtEvent) -> EventMark | None:
-    """GPS time of an event; not valid without the clock's bias. None without time."""
+    """Return GPS time of an event; not valid without the clock's bias. None without time."""
     bias_s, offset_s = usable(event.clock_bias_s), usable(event.offset_s)
     known = abs(bias_s) * 1000.0 < GREATEST_BIAS_MS and abs(offset_s) < GREATEST_EVENT_OFFSET_S
     tag = stamp.tag(round(bias_s * SECOND_NS) - round(offset_s * SECOND_NS) if known else 0)
@@ -202,7 +202,7 @@ def event_mark(stamp: Stamp, event: sbf.ExtEvent) -> EventMark | None:
 
 
 def antenna_heading(parts: dict[str, HeadingPart], clock: ReceiverClock) -> GnssHeading | None:
-    """Heading of an epoch; None where there is none. Sigmas are those of AttCovEuler."""
+    """Return heading of an epoch; None where there is none. Sigmas are those of AttCovEuler."""
     stamp, attitude = parts.get("AttEuler", (None, None))
     if stamp is None or not isinstance(attitude, sbf.AttEuler) or not isfinite(usable(attitude.heading_deg)):
         return None
@@ -229,7 +229,7 @@ def _sigma_rad(variance_deg2: float) -> float | None:
 
 
 def ins_row(stamp: Stamp, tag: TimeTag, block: sbf.InsNavGeod, triples: dict[int, sbf.Triple]) -> Row | None:
-    """A row of `INS_DTYPE`; None where the block has neither position nor attitude nor velocity."""
+    """Return a row of `INS_DTYPE`; None where the block has neither position nor attitude nor velocity."""
     position = usable_triple((block.lat_rad, block.lon_rad, block.height_m))
     heading, pitch, roll = usable_triple(triples.get(sbf.INS_ATTITUDE))
     east, north, up = usable_triple(triples.get(sbf.INS_VELOCITY))
@@ -288,7 +288,7 @@ class ImuPairs:
         return rows
 
     def _fill(self, stamp: Stamp, one: sbf.SensorSet) -> bool:
-        """Whether this measurement completed a sample."""
+        """Return whether this measurement completed a sample."""
         values = usable_triple(sbf.SENSOR_TRIPLE.unpack(one.data))
         if not all(map(isfinite, values)):
             self.counters.errors["imu_value_unset"] += 1
@@ -309,7 +309,7 @@ class ImuPairs:
         return halves.force is not None and halves.rate is not None
 
     def _row(self, stamp: Stamp, tag: TimeTag | None, source: int) -> Row:
-        """The sample, in the axes of the wire."""
+        """Return the sample, in the axes of the wire."""
         halves = self._halves.pop(source)
         rate = usable_triple(halves.rate)
         values = (

@@ -28,7 +28,7 @@ EVENT_STREAM, FIX_STREAM, SECOND_STREAM, HEADING_STREAM, INS_STREAM, IMU_STREAM 
 
 
 def startup_messages(settings: DeviceSettings, wish: StartupOptions) -> tuple[StartupMessage, ...]:
-    """Baud rate where it changes, PPS, streams of time, position, events and raw measurements.
+    """Return baud rate where it changes, PPS, streams of time, position, events and raw measurements.
 
     Raises:
         DriverSettingsError: a port that there is not.
@@ -51,7 +51,7 @@ def startup_messages(settings: DeviceSettings, wish: StartupOptions) -> tuple[St
 
 
 def imu_startup_messages(settings: DeviceSettings, wish: StartupOptions) -> tuple[StartupMessage, ...]:
-    """Streams of the INS and of its IMU, by the port of the receiver's own ``setup``."""
+    """Return streams of the INS and of its IMU, by the port of the receiver's own ``setup``."""
     port = _port(settings)
     commands = (
         _stream(INS_STREAM, port, "INSNavGeod", "msec20"),

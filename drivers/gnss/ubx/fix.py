@@ -25,7 +25,7 @@ CARRIER_TYPES = {1: FixType.RTK_FLOAT, 2: FixType.RTK_FIXED}
 
 
 def merge_epoch(parts: dict[str, tuple[int, NavMessage]], floor_week: int) -> GnssFix | None:
-    """The fix; None where the epoch has neither NAV-PVT nor NAV-HPPOSLLH."""
+    """Return the fix; None where the epoch has neither NAV-PVT nor NAV-HPPOSLLH."""
     _, pvt = parts.get("NAV-PVT", (0, None))
     _, high = parts.get("NAV-HPPOSLLH", (0, None))
     _, cov = parts.get("NAV-COV", (0, None))
@@ -57,7 +57,8 @@ def merge_epoch(parts: dict[str, tuple[int, NavMessage]], floor_week: int) -> Gn
 
 
 def _epoch_tag(itow_ms: int, pvt: ubx.NavPvt | None, time: ubx.NavTimegps | None, floor_week: int) -> TimeTag:
-    """GPS time of the epoch, sub-millisecond part included; the week only where NAV-TIMEGPS of this iTOW says it.
+    """Return GPS time of the epoch, sub-millisecond part included; the week only where NAV-TIMEGPS of this iTOW says
+    it.
 
     The receiver's clock may be up to half a millisecond off the millisecond that iTOW names.
     """
@@ -76,7 +77,7 @@ def _epoch_tag(itow_ms: int, pvt: ubx.NavPvt | None, time: ubx.NavTimegps | None
 
 
 def _position(pvt: ubx.NavPvt | None, high: ubx.NavHpposllh | None) -> Position | None:
-    """Latitude, longitude (rad), ellipsoidal height (m) and the covariance of the accuracies."""
+    """Return latitude, longitude (rad), ellipsoidal height (m) and the covariance of the accuracies."""
     if high is not None:
         return (
             math.radians((high.lat_1e7_deg * 100 + high.lat_hp_1e9_deg) / 1e9),
@@ -101,7 +102,7 @@ def _undulation_m(pvt: ubx.NavPvt | None, high: ubx.NavHpposllh | None) -> float
 
 
 def _accuracy_cov(horizontal: float, vertical: float) -> NDArray[np.float64]:
-    """The horizontal accuracy is that of both axes together, hAcc² = NN + EE; m or m/s."""
+    """Return the horizontal accuracy is that of both axes together, hAcc² = NN + EE; m or m/s."""
     return np.diag([horizontal**2 / 2.0, horizontal**2 / 2.0, vertical**2])
 
 
@@ -122,7 +123,7 @@ def _velocity(pvt: ubx.NavPvt | None) -> tuple[float, float, float] | None:
 
 
 def _velocity_cov(pvt: ubx.NavPvt | None, cov: ubx.NavCov | None) -> NDArray[np.float64] | None:
-    """NAV-COV, or the speed accuracy: with NAV-COV beside it, sAcc² is close to NN + EE and to DD."""
+    """Return NAV-COV, or the speed accuracy: with NAV-COV beside it, sAcc² is close to NN + EE and to DD."""
     if cov is not None and cov.velocity_valid:
         return _symmetric(cov.vel_nn, cov.vel_ne, cov.vel_nd, cov.vel_ee, cov.vel_ed, cov.vel_dd)
     if pvt is None or _velocity(pvt) is None:
@@ -132,7 +133,7 @@ def _velocity_cov(pvt: ubx.NavPvt | None, cov: ubx.NavCov | None) -> NDArray[np.
 
 
 def _fix_type(pvt: ubx.NavPvt | None) -> FixType:
-    """A NAV-HPPOSLLH alone says no more than that there is a position."""
+    """Return a NAV-HPPOSLLH alone says no more than that there is a position."""
     if pvt is None:
         return FixType.SINGLE
     if pvt.fix_type in SPECIAL_TYPES:

@@ -33,14 +33,14 @@ class Layout(Generic[MessageT]):
         self._min_length = min_length or length
 
     def decode(self, frame: bytes) -> MessageT | None:
-        """The message of a whole frame; None where its length is not the message's."""
+        """Return the message of a whole frame; None where its length is not the message's."""
         payload_bytes = len(frame) - 8
         if payload_bytes < self._min_length:
             return None
         return self._message(*self._struct.unpack_from(frame, 6))
 
     def encode(self, message: MessageT) -> bytes:
-        """The whole frame."""
+        """Return the whole frame."""
         return encode_frame(self.key, self._struct.pack(*message).ljust(self._length, b"\0"))
 
 
@@ -259,45 +259,45 @@ RXM_RAWX = Layout(b"\x02\x15", "dHbBB", RxmRawx, 16)
 
 
 def encode_nav_pvt(message: NavPvt) -> bytes:
-    """The frame of a NAV-PVT; the other ``encode_`` functions alike."""
+    """Return the frame of a NAV-PVT; the other ``encode_`` functions alike."""
     return NAV_PVT.encode(message)
 
 
 def encode_nav_hpposllh(message: NavHpposllh) -> bytes:
-    """The frame of a NAV-HPPOSLLH."""
+    """Return the frame of a NAV-HPPOSLLH."""
     return NAV_HPPOSLLH.encode(message)
 
 
 def encode_nav_timegps(message: NavTimegps) -> bytes:
-    """The frame of a NAV-TIMEGPS."""
+    """Return the frame of a NAV-TIMEGPS."""
     return NAV_TIMEGPS.encode(message)
 
 
 def encode_nav_timeutc(message: NavTimeutc) -> bytes:
-    """The frame of a NAV-TIMEUTC."""
+    """Return the frame of a NAV-TIMEUTC."""
     return NAV_TIMEUTC.encode(message)
 
 
 def encode_nav_timels(message: NavTimels) -> bytes:
-    """The frame of a NAV-TIMELS."""
+    """Return the frame of a NAV-TIMELS."""
     return NAV_TIMELS.encode(message)
 
 
 def encode_nav_cov(message: NavCov) -> bytes:
-    """The frame of a NAV-COV."""
+    """Return the frame of a NAV-COV."""
     return NAV_COV.encode(message)
 
 
 def encode_nav_eoe(message: NavEoe) -> bytes:
-    """The frame of a NAV-EOE."""
+    """Return the frame of a NAV-EOE."""
     return NAV_EOE.encode(message)
 
 
 def encode_tim_tp(message: TimTp) -> bytes:
-    """The frame of a TIM-TP."""
+    """Return the frame of a TIM-TP."""
     return TIM_TP.encode(message)
 
 
 def encode_tim_tm2(message: TimTm2) -> bytes:
-    """The frame of a TIM-TM2."""
+    """Return the frame of a TIM-TM2."""
     return TIM_TM2.encode(message)

@@ -146,7 +146,7 @@ class UbxParser(StreamParser):
     def _utc_message(
         self, host_time_ns: int, message: ubx.NavPvt | ubx.NavTimeutc, has_date: bool, vouched: bool, name: str
     ) -> list[Record]:
-        """The previous edge's second in UTC, if it agrees with the message's own iTOW."""
+        """Return the previous edge's second in UTC, if it agrees with the message's own iTOW."""
         tag = self._utc_tag(host_time_ns, message, has_date)
         agrees = tag.date is None or tag.leap_seconds is not None
         if not agrees:
@@ -210,7 +210,7 @@ class UbxParser(StreamParser):
         name: str,
         leap_seconds: int | None = None,
     ) -> list[Record]:
-        """The previous edge's second by week and time of week of one message."""
+        """Return the previous edge's second by week and time of week of one message."""
         self._vouched = vouched
         tag = TimeTag(TimeScale.GPS, itow_ms * MS_NS, week=week if has_week else None, leap_seconds=leap_seconds)
         valid = vouched and self._week_believed(week)
@@ -311,7 +311,7 @@ class UbxParser(StreamParser):
 
     @staticmethod
     def _week_tag(week: int, time_ns: int, utc: bool) -> TimeTag:
-        """Week and time of week in GPS time, or in UTC as a date and time of day."""
+        """Return week and time of week in GPS time, or in UTC as a date and time of day."""
         if not utc:
             return TimeTag(TimeScale.GPS, time_ns, week=week)
         days, time_of_day_ns = divmod(time_ns, DAY_NS)
@@ -340,14 +340,14 @@ class UbxParser(StreamParser):
 
 
 def _present(message: _AnyT | None) -> _AnyT:
-    """The message, unless its length is not that of its kind."""
+    """Return the message, unless its length is not that of its kind."""
     if message is None:
         raise MessageError("length")
     return message
 
 
 def _checked(message: _NavT | None) -> _NavT:
-    """The message, unless its length is not that of its kind or its iTOW is beyond the week."""
+    """Return the message, unless its length is not that of its kind or its iTOW is beyond the week."""
     if message is None or message.itow_ms >= WEEK_MS:
         raise MessageError("length or iTOW")
     return message

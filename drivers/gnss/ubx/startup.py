@@ -93,7 +93,7 @@ class AckListener(AnswerListener):
 
 
 def encode_valset(items: tuple[Item, ...], layers: int) -> bytes:
-    """UBX-CFG-VALSET, version 0: at most 64 keys and their values, into the layers."""
+    """Return UBX-CFG-VALSET, version 0: at most 64 keys and their values, into the layers."""
     payload = VALSET_HEADER.pack(0, layers)
     for item in items:
         size = item.key >> KEY_SIZE_SHIFT & KEY_SIZE_BITS
@@ -102,7 +102,7 @@ def encode_valset(items: tuple[Item, ...], layers: int) -> bytes:
 
 
 def startup_messages(settings: DeviceSettings, wish: StartupOptions) -> tuple[StartupMessage, ...]:
-    """Output of UBX on the port, rates, time pulse, messages; the baud rate first where it changes.
+    """Return output of UBX on the port, rates, time pulse, messages; the baud rate first where it changes.
 
     Raises:
         DriverSettingsError: a port that there is not.

@@ -29,7 +29,7 @@ def encode_samples(
     status: Int64Array | None = None,
     packet_counter: Int64Array | None = None,
 ) -> ByteRows:
-    """Frames of n samples, sample after sample, each with the message that opens it first, that closes it last.
+    """Return frames of n samples, sample after sample, each with the message that opens it first, that closes it last.
 
     Messages beside the samples are sent with every sample whose value for them is given.
 
@@ -66,7 +66,7 @@ def encode_samples(
 
 
 def encode_latch(signals: SignalMap, ticks: int) -> bytes:
-    """The frame of the message with the counter at a PPS edge.
+    """Return the frame of the message with the counter at a PPS edge.
 
     Raises:
         ValueError: no such message of its own, or one of more than 8 bytes.
@@ -80,21 +80,21 @@ def encode_latch(signals: SignalMap, ticks: int) -> bytes:
 
 
 def _order(signals: SignalMap, sent: set[int]) -> Iterator[int]:
-    """Parts of a sample as they go out; the key part first or last, by the rule."""
+    """Yield parts of a sample as they go out; the key part first or last, by the rule."""
     key = signals.key_part
     others = sorted(sent - {key})
     yield from [*others, key] if signals.rule == "last" else [key, *others]
 
 
 def _raw_of_scalar(signals: SignalMap, signal: MappedSignal, column: Int64Array | FloatArray) -> NDArray[np.uint64]:
-    """Counters and status words go out as they are, a temperature by its scale."""
+    """Return counters and status words go out as they are, a temperature by its scale."""
     if signal is signals.temperature:
         return _raw_of_values(signal.layout, np.asarray(column, np.float64))
     return np.asarray(column, np.int64).astype(np.uint64)
 
 
 def _raw_of_values(layout: SignalLayout, values: FloatArray) -> NDArray[np.uint64]:
-    """Bits of physical values, rounded to the signal's resolution."""
+    """Return bits of physical values, rounded to the signal's resolution."""
     scaled = (values - layout.offset) / layout.scale
     if layout.is_float:
         unsigned, floating = FLOAT_TYPES[layout.length]
@@ -107,7 +107,7 @@ def _raw_of_values(layout: SignalLayout, values: FloatArray) -> NDArray[np.uint6
 
 
 def _placed(layout: SignalLayout, raw: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """The signal's bits where they lie, in the word whose little-endian bytes are the frame's data."""
+    """Return the signal's bits where they lie, in the word whose little-endian bytes are the frame's data."""
     if layout.needs_bytes > CLASSIC_BYTES:
         raise ValueError(f"{layout.name} lies beyond the 8 bytes of a classic frame")
     word = (raw & np.uint64((1 << layout.length) - 1)) << np.uint64(layout.shift)
@@ -115,7 +115,7 @@ def _placed(layout: SignalLayout, raw: NDArray[np.uint64]) -> NDArray[np.uint64]
 
 
 def _frames(signals: SignalMap, part: int, words: NDArray[np.uint64]) -> ByteRows:
-    """(n, 16) frames of one message."""
+    """Return (n, 16) frames of one message."""
     frames = np.zeros(len(words), CAN_FRAME_DTYPE)
     frames["can_id"] = signals.parts[part].can_id
     frames["length"] = signals.parts[part].needs_bytes

@@ -43,11 +43,11 @@ class Frames:
     data: ByteRows
 
     def take(self, index: NDArray[np.intp] | slice) -> Frames:
-        """Some of the frames."""
+        """Return some of the frames."""
         return Frames(self.part[index], self.host_time_ns[index], self.data[index])
 
     def after(self, earlier: Frames) -> Frames:
-        """These frames, behind earlier ones."""
+        """Return these frames, behind earlier ones."""
         if not len(earlier.part):
             return self
         return Frames(
@@ -58,7 +58,7 @@ class Frames:
 
 
 def no_frames(width: int) -> Frames:
-    """An empty run of frames with ``width`` data bytes."""
+    """Return an empty run of frames with ``width`` data bytes."""
     return Frames(np.empty(0, np.int8), np.empty(0, np.int64), np.empty((0, width), np.uint8))
 
 
@@ -114,7 +114,7 @@ class SampleGrouper:
         return count, closed  # group 0: frames before the first opening, closed by it
 
     def _groups_by_repeat(self, part: NDArray[np.int8]) -> tuple[IndexArray, int]:
-        """Groups by the rule of the first repeat: starts are chained, regular runs in one step."""
+        """Return groups by the rule of the first repeat: starts are chained, regular runs in one step."""
         n, parts = len(part), self._parts
         if parts == 1 or n == 0:
             return np.arange(n), n

@@ -56,7 +56,7 @@ class SideSignal:
         self._bits = self._signal.layout.bits(frames.data[self._where])
 
     def before(self, position: NDArray[np.intp]) -> tuple[NDArray[np.uint64], NDArray[np.bool_]]:
-        """Its bits as of positions (m,) among this call's frames, and whether there were any yet."""
+        """Return its bits as of positions (m,) among this call's frames, and whether there were any yet."""
         place = np.searchsorted(self._where, position, side="left")
         bits = np.concatenate([[self._last], self._bits])[place]
         return bits, (place > 0) | self._known
@@ -108,7 +108,7 @@ class DbcParser(PacketParser):
         return self._samples_of(frames) if len(frames.part) else []
 
     def close(self) -> list[Record]:
-        """The last sample of rule "first", which only the end of the stream completes."""
+        """Return the last sample of rule "first", which only the end of the stream completes."""
         frames = self._unread
         if self._rule_is_open:
             self._settle_rule()
@@ -134,7 +134,7 @@ class DbcParser(PacketParser):
     # -- frames
 
     def _configured_frames(self, host_time_ns: Int64Array, units: ByteRows) -> Frames:
-        """The data frames of configured parts; other identifiers are other devices' traffic."""
+        """Return the data frames of configured parts; other identifiers are other devices' traffic."""
         table = decode_can_frames(units)
         if table is None:
             self._count_bad(len(units))
@@ -151,7 +151,7 @@ class DbcParser(PacketParser):
         return Frames(part[mine], np.asarray(host_time_ns, np.int64)[mine], data)
 
     def _frames_of(self, kind: Part, table: StructArray, can_id: NDArray[np.uint32]) -> NDArray[np.intp]:
-        """Indices of the frames of a kind that are whole; short ones are counted."""
+        """Return indices of the frames of a kind that are whole; short ones are counted."""
         where = np.flatnonzero(can_id == np.uint32(kind.can_id))
         if kind.selector is not None:
             data = _padded(table["data"][where], self._width)
@@ -203,7 +203,7 @@ class DbcParser(PacketParser):
         return self._records(samples, place[samples.closed_at])
 
     def _records(self, samples: Samples, position: NDArray[np.intp]) -> list[Record]:
-        """Rows of good samples; ``position``: where each was closed among this call's frames."""
+        """Return rows of good samples; ``position``: where each was closed among this call's frames."""
         rows = np.zeros(samples.index.shape[1], IMU_DTYPE)
         rows["host_time_ns"] = samples.frames.host_time_ns[samples.index.max(axis=0)]
         data = [samples.frames.data[index] for index in samples.index]
@@ -250,7 +250,7 @@ class DbcParser(PacketParser):
     def _bits_of(
         self, signal: MappedSignal, data: list[ByteRows], position: NDArray[np.intp]
     ) -> tuple[NDArray[np.uint64], NDArray[np.bool_]]:
-        """Bits of an optional signal for each sample, from its own frames or from the message beside them."""
+        """Return bits of an optional signal for each sample, from its own frames or from the message beside them."""
         if signal.part < self._map.grouped:
             bits = signal.layout.bits(data[signal.part])
             return bits, np.ones(len(bits), np.bool_)
@@ -258,14 +258,14 @@ class DbcParser(PacketParser):
 
 
 def _padded(data: ByteRows, width: int) -> ByteRows:
-    """Data bytes cut or filled up with zeros to the width signals are read from."""
+    """Return data bytes cut or filled up with zeros to the width signals are read from."""
     if data.shape[1] >= width:
         return data[:, :width]
     return np.pad(data, ((0, 0), (0, width - data.shape[1])))
 
 
 def _clock_rows(rows: StructArray) -> StructArray:
-    """What the samples say of the device's clock."""
+    """Return what the samples say of the device's clock."""
     clock = np.zeros(len(rows), DEVICE_CLOCK_DTYPE)
     for name in ("host_time_ns", "device_time_ns", "pps_time_ns"):
         clock[name] = rows[name]
@@ -275,7 +275,7 @@ def _clock_rows(rows: StructArray) -> StructArray:
 
 
 def make_clock_parser(settings: DeviceSettings) -> DbcParser:
-    """The recorder's parser: the device's clock only."""
+    """Return the recorder's parser: the device's clock only."""
     return DbcParser(settings, clock_only=True)
 
 

@@ -92,7 +92,7 @@ class _PartList:
     parts: list[Part] = field(default_factory=list)
 
     def number(self, found: FoundSignal) -> int:
-        """The part that carries a signal, made where there is none yet."""
+        """Return the part that carries a signal, made where there is none yet."""
         mine = [number for number, part in enumerate(self.parts) if part.can_id == found.can_id]
         for number in mine:
             part = self.parts[number]
@@ -113,7 +113,7 @@ class _PartList:
 
     @staticmethod
     def _widened(part: Part, found: FoundSignal, *, narrowed: bool = False) -> Part:
-        """The part with room for one more signal, and narrowed to its multiplexer values where it had none."""
+        """Return the part with room for one more signal, and narrowed to its multiplexer values where it had none."""
         chooser = found if narrowed else part
         needs = max(part.needs_bytes, found.layout.needs_bytes, found.selector.needs_bytes if found.selector else 0)
         return Part(part.can_id, part.message, chooser.selector, chooser.selector_values, needs)
@@ -167,7 +167,7 @@ def map_signals(settings: DeviceSettings) -> SignalMap:
 
 
 def _find_all(config: Mapping[str, Any], database: Any, file_name: str) -> dict[str, list[FoundSignal]]:
-    """The configured signals by key, vectors with their three components."""
+    """Return the configured signals by key, vectors with their three components."""
     names = {key: value for key, value in dict(config.get("signals") or {}).items() if value}
     unknown = sorted(set(names) - {*VECTORS, *SCALARS})
     if unknown:
@@ -197,7 +197,7 @@ def _refuse_axis_twice(names: Mapping[str, Any]) -> None:
 def _factors(
     config: Mapping[str, Any], found: Mapping[str, list[FoundSignal]], file_name: str
 ) -> dict[str, list[float]]:
-    """Factors to SI of the vectors' components; increments are divided by the nominal interval."""
+    """Return factors to SI of the vectors' components; increments are divided by the nominal interval."""
     increment = config.get("sample") == "increment"
     rate_hz = float(config.get("rate_hz") or 0.0)
     if increment and rate_hz <= 0.0:
@@ -218,14 +218,16 @@ def _factors(
 
 
 def _plain_unit(unit: str) -> str:
-    """One spelling for the many of a unit: lower case, no blanks or carets, deg for °."""
+    """Return one spelling for the many of a unit: lower case, no blanks or carets, deg for °."""
     plain = unit.strip().lower().replace(" ", "").replace("^", "").replace("²", "2").replace("·", ".")
     plain = plain.replace("°", "deg").replace("degrees", "deg").replace("degree", "deg").replace("sec", "s")
     return plain.replace("dps", "deg/s") if plain == "dps" else plain
 
 
 def _group_rule(config: Mapping[str, Any], ticks: MappedSignal | None, grouped: int) -> GroupRule:
-    """``group`` of the configuration; without ticks, or with one frame a sample, the first to repeat opens one."""
+    """Return ``group`` of the configuration; without ticks, or with one frame a sample, the first to repeat opens
+    one.
+    """
     group = config.get("group") or "last"
     if group not in ("last", "first"):
         raise DriverSettingsError(f'group: got "{group}", want "last" or "first"')
@@ -235,7 +237,7 @@ def _group_rule(config: Mapping[str, Any], ticks: MappedSignal | None, grouped: 
 
 
 def _tick_hz(config: Mapping[str, Any], ticks: MappedSignal | None) -> Fraction:
-    """Rate of the counters, exact."""
+    """Return rate of the counters, exact."""
     value = config.get("tick_hz")
     if ticks is None:
         return Fraction(1)

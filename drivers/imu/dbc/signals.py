@@ -57,7 +57,7 @@ class SignalLayout:
     needs_bytes: int
 
     def bits(self, data: ByteRows) -> UInt64Array:
-        """The signal's bits of each row of (n, 8 or 64) data, right-aligned and unsigned."""
+        """Return the signal's bits of each row of (n, 8 or 64) data, right-aligned and unsigned."""
         word = np.ascontiguousarray(data[:, self.first_byte : self.first_byte + 8]).view("<u8").reshape(-1)
         if self.big_endian:
             word = word.byteswap()
@@ -67,7 +67,7 @@ class SignalLayout:
         return self._with_ninth_byte(data, word) & mask
 
     def _with_ninth_byte(self, data: ByteRows, word: UInt64Array) -> UInt64Array:
-        """The same for a signal that begins inside one byte and ends in the ninth."""
+        """Return the same for a signal that begins inside one byte and ends in the ninth."""
         ninth = data[:, self.first_byte + 8].astype(np.uint64)
         over = -self.shift
         if self.big_endian:
@@ -77,7 +77,7 @@ class SignalLayout:
 
     @np.errstate(invalid="ignore", over="ignore")
     def values(self, bits: UInt64Array) -> FloatArray:
-        """Physical values of right-aligned bits, whatever float the wire holds: NaN and overflow included."""
+        """Return physical values of right-aligned bits, whatever float the wire holds: NaN and overflow included."""
         if self.is_float:
             unsigned, floating = FLOAT_TYPES[self.length]
             raw = bits.astype(unsigned).view(floating).astype(np.float64)
@@ -113,7 +113,7 @@ class FoundSignal:
 
 
 def signal_layout(message: Any, signal: Any) -> SignalLayout:
-    """Layout of a cantools signal.
+    """Return layout of a cantools signal.
 
     Raises:
         DriverSettingsError: no such float, or longer than 64 bits.
@@ -152,7 +152,8 @@ def signal_layout(message: Any, signal: Any) -> SignalLayout:
 
 
 def load_database(contents: bytes, key: str = "dbc") -> Any:
-    """The cantools database of a DBC file's bytes (UTF-8, UTF-16 by its mark, else Windows-1252, the format's own).
+    """Return the cantools database of a DBC file's bytes (UTF-8, UTF-16 by its mark, else Windows-1252, the format's
+    own).
 
     Raises:
         DriverSettingsError: it is no DBC file.
@@ -201,7 +202,7 @@ def find_signal(database: Any, path: str, file_name: str) -> FoundSignal:
 
 
 def _multiplexing(message: Any, signals: dict[str, Any], signal: Any) -> tuple[SignalLayout | None, frozenset[int]]:
-    """The multiplexer that decides on a signal; one level is read, deeper ones are refused."""
+    """Return the multiplexer that decides on a signal; one level is read, deeper ones are refused."""
     if not signal.multiplexer_ids:
         return None, frozenset()
     selector = signals[signal.multiplexer_signal]
@@ -211,7 +212,7 @@ def _multiplexing(message: Any, signals: dict[str, Any], signal: Any) -> tuple[S
 
 
 def _instead(wanted: str, names: dict[str, Any], owner: str) -> str:
-    """``; did you mean …?`` or what there is."""
+    """Return ``; did you mean …?`` or what there is."""
     close = difflib.get_close_matches(wanted, names, n=3, cutoff=0.5)
     listed = ", ".join(list(names)[:12]) + (", …" if len(names) > 12 else "")
     meant = f"; did you mean {' or '.join(close)}?" if close else ""

@@ -45,7 +45,7 @@ _STATUS_NAMES |= dict.fromkeys((b"1", b"2", b"3", b"4", b"5", b"9"), "valid") | 
 
 
 def encode_gps_packet(time: dt.datetime, sentence: str = "", status: bytes = b"A", *, locked: bool = True) -> bytes:
-    """One GPS data packet; ``time`` in UTC."""
+    """Return one GPS data packet; ``time`` in UTC."""
     packet = bytearray([_FILL] * GPS_BYTES)
     digits = f"{time:%y%m%d%S%M%H}"
     swapped = "".join(digits[at + 1] + digits[at] for at in range(0, len(digits), 2))
@@ -123,7 +123,7 @@ class GpsReader:
 
 
 def _time(digits: bytes) -> dt.datetime | None:
-    """Date and time of twelve digits, each pair's lower first; None if they are none. Years are 2000 to 2099."""
+    """Return date and time of twelve digits, each pair's lower first; None if they are none. Years are 2000 to 2099."""
     if not digits.isdigit():
         return None
     year, month, day, second, minute, hour = (int(digits[at + 1 :: -1][:2]) for at in range(0, 12, 2))

@@ -47,14 +47,16 @@ class HesaiHead:
     beams: BeamTable
 
     def packet_dtype(self, *, sequence: bool = True) -> np.dtype[np.void]:
-        """A point cloud packet: pre-header and header (12 bytes), body, tail (24 bytes), UDP sequence (4 bytes)."""
+        """Return a point cloud packet: pre-header and header (12 bytes), body, tail (24 bytes), UDP sequence (4
+        bytes).
+        """
         channel = np.dtype([("range", "<u2"), ("reflectivity", "u1"), ("reserved", "u1")])
         block = np.dtype([("azimuth", "<u2"), ("returns", channel, (self.channels,))])
         last = [("sequence", "<u4")] if sequence else []
         return np.dtype([*_HEADER, ("blocks", block, (self.blocks,)), *self.tail, *last])
 
     def round_start_ns(self, rounds: int) -> Int64Array:
-        """(rounds,) time of the azimuth's reading of each round of a packet after the packet's own time."""
+        """Return (rounds,) time of the azimuth's reading of each round of a packet after the packet's own time."""
         number = np.arange(rounds) - (rounds - 1 if self.stamped_round == LAST_ROUND else 0)
         start: Int64Array = np.rint(number * self.round_ns).astype(np.int64) + self.start_ns
         return start
@@ -145,7 +147,7 @@ QT64 = HesaiHead(
 
 
 def read_angle_file(data: bytes, head: HesaiHead) -> BeamTable:
-    """Beams of a head's own angle correction file: CSV of channel (from 1), elevation and azimuth in degrees.
+    """Return beams of a head's own angle correction file: CSV of channel (from 1), elevation and azimuth in degrees.
 
     Raises:
         DriverSettingsError: it is none, or not this model's.

@@ -68,7 +68,7 @@ def encode_point_packet(
     sequence: int | None = 1,
     motor_rpm: int = 600,
 ) -> bytes:
-    """One point cloud packet.
+    """Return one point cloud packet.
 
     Args:
         time: the packet's own, UTC.
@@ -153,7 +153,7 @@ class HesaiParser(PacketParser):
         return self._gps.dates.remarks()
 
     def _check(self, packets: StructArray) -> BoolArray:
-        """(n,) True for packets of this model that can be decoded; the others are counted by what is wrong."""
+        """Return (n,) True for packets of this model that can be decoded; the others are counted by what is wrong."""
         head, utc = self._head, packets["utc"].copy().view(_UTC)
         good = np.ones(len(packets), dtype=np.bool_)
         numbered = "sequence" in (packets.dtype.names or ())
@@ -189,7 +189,7 @@ class HesaiParser(PacketParser):
     def _follow(
         self, host_time_ns: Int64Array, packets: StructArray, second_ns: Int64Array
     ) -> tuple[Int64Array, BoolArray]:
-        """Running number of each packet, and False where it repeats the one before."""
+        """Return running number of each packet, and False where it repeats the one before."""
         if "sequence" in (packets.dtype.names or ()):
             stamp_ns = second_ns + packets["microsecond"].astype(np.int64) * 1000
             none = np.zeros(len(packets), dtype=np.uint32)
@@ -219,7 +219,9 @@ class HesaiParser(PacketParser):
     def _clock_samples(
         self, host_time_ns: Int64Array, stamp_ns: Int64Array, second_ns: Int64Array, mode: NDArray[np.uint8]
     ) -> StructArray:
-        """One `DEVICE_CLOCK_DTYPE` row a packet: device time of its last firing, and the edge its second began with."""
+        """Return one `DEVICE_CLOCK_DTYPE` row a packet: device time of its last firing, and the edge its second began
+        with.
+        """
         head = self._head
         last_ns = [
             int(head.round_start_ns(rounds)[-1] + head.offset_ns.max()) for rounds in (head.blocks, head.blocks // 2)
@@ -236,7 +238,7 @@ class HesaiParser(PacketParser):
     def _firings(
         self, host_time_ns: Int64Array, packets: StructArray, stamp_ns: Int64Array, number: Int64Array
     ) -> Firings:
-        """The firings of packets of one return mode."""
+        """Return the firings of packets of one return mode."""
         head, mode = self._head, int(packets["mode"][0])
         azimuth = packets["blocks"]["azimuth"][:, :: 2 if mode in DUAL_NAMES else 1]
         round_ns = (stamp_ns[:, np.newaxis] + head.round_start_ns(azimuth.shape[1])).reshape(-1, 1)
@@ -257,7 +259,9 @@ class HesaiParser(PacketParser):
 def _azimuths(
     azimuth: NDArray[np.uint16], motor_rpm: NDArray[np.uint16], head: HesaiHead
 ) -> Callable[[Chosen], FloatArray]:
-    """Azimuths at each firing, radians, 0 … 2π, made of those of the rounds (n, rounds) and of the channels' times."""
+    """Return azimuths at each firing, radians, 0 … 2π, made of those of the rounds (n, rounds) and of the channels'
+    times.
+    """
     start = (azimuth * (2 * np.pi / FULL_CIRCLE)).reshape(-1, 1)
     speed = np.repeat(motor_rpm * _RAD_PER_NS_AT_1_RPM, azimuth.shape[1])[:, np.newaxis]
     offset_ns = head.offset_ns.astype(np.float64)[np.newaxis]
@@ -277,7 +281,7 @@ def _within(value: NDArray[np.uint8], least: int, most: int) -> BoolArray:
 
 
 def _utc_seconds(packets: StructArray) -> Int64Array:
-    """Seconds since 1970 (n,) of the packets' date and time.
+    """Return seconds since 1970 (n,) of the packets' date and time.
 
     Year minus 1900 and five more bytes; or, as the maker's SDK reads a first byte of 0, seconds since 1970 in the
     last four, the highest first (udp_protocol_v6_1.h, GetMicroLidarTimeU64). Bytes that name no date give some time.

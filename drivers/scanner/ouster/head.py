@@ -81,12 +81,13 @@ class OusterHead:
     rot_sensor_from_imu: FloatArray
 
     def __deepcopy__(self, memo: dict[int, object]) -> OusterHead:
-        """A head never changes: a parser's copy shares it."""
+        """Return a head never changes: a parser's copy shares it."""
         return self
 
 
 def beam_points(rows: StructArray, head: OusterHead) -> FloatArray:
-    """Where returns lie in the maker's sensor frame (Sensor Data, "Lidar Range to XYZ" and "Sensor Coordinate Frame").
+    """Return where returns lie in the maker's sensor frame (Sensor Data, "Lidar Range to XYZ" and "Sensor Coordinate
+    Frame").
 
     The range counts from the encoder's axis along the way the light goes: over the beam's origin, n off the axis. So
     the beam is range − n long from there.
@@ -191,7 +192,7 @@ def _json_object(content: bytes) -> dict[str, Any]:
 
 
 def _merged(table: dict[str, Any]) -> _Keys:
-    """The sections of newer files laid flat, as older ones are."""
+    """Return the sections of newer files laid flat, as older ones are."""
     flat = dict(table)
     for name in _SECTIONS:
         section = table.get(name)
@@ -210,19 +211,19 @@ class _Keys:
     prefix: str
 
     def plain(self, key: str, kind: type, want: str) -> Any:
-        """A value of this type."""
+        """Return a value of this type."""
         value = self.table.get(key)
         if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
             raise _wrong(self.prefix + key, value, want)
         return value
 
     def optional(self, key: str, kind: type, default: Any) -> Any:
-        """The same, or the default where there is none."""
+        """Return the same, or the default where there is none."""
         wanted = {dict: "a table", str: "text", int: "a whole number"}[kind]
         return default if self.table.get(key) is None else self.plain(key, kind, wanted)
 
     def whole(self, key: str, low: int, high: int) -> int:
-        """A whole number within bounds."""
+        """Return a whole number within bounds."""
         want = f"a whole number {low} to {high}"
         value: int = self.plain(key, int, want)
         if not low <= value <= high:
@@ -230,7 +231,7 @@ class _Keys:
         return value
 
     def number(self, key: str, bound: float) -> float:
-        """A number, not beyond ±bound."""
+        """Return a number, not beyond ±bound."""
         value = self.table.get(key)
         if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= bound:
             raise _wrong(self.prefix + key, value, f"a number within ±{bound:g}")
@@ -253,7 +254,7 @@ def _serial(table: _Keys) -> int | None:
 
 
 def _header(layout: _Keys, profile: str) -> str:
-    """Which packet header comes; the FUSA profile brings its own without being asked."""
+    """Return which packet header comes; the FUSA profile brings its own without being asked."""
     if profile == "LEGACY":
         return "legacy"
     name = layout.optional("header_type", str, "FUSA" if profile == FUSA_PROFILE else "STANDARD")
@@ -291,7 +292,7 @@ def _altitudes(table: _Keys, beams: int) -> FloatArray:
 
 
 def _transform(table: _Keys, key: str) -> FloatArray:
-    """(4, 4) of sixteen numbers, row by row, translations in millimetres."""
+    """Return (4, 4) of sixteen numbers, row by row, translations in millimetres."""
     matrix = table.numbers(key, 16, 10_000.0).reshape(4, 4)
     rotation = matrix[:3, :3]
     proper = np.abs(rotation @ rotation.T - np.eye(3)).max() < ROTATION_TOLERANCE and np.linalg.det(rotation) > 0

@@ -42,7 +42,7 @@ SAMPLE_DTYPE = np.dtype(
 
 
 def imu_packet_bytes(head: OusterHead) -> int:
-    """Length of a head's IMU packets; 0 where it sends none that is known here."""
+    """Return length of a head's IMU packets; 0 where it sends none that is known here."""
     if head.imu_profile == "LEGACY":
         return LEGACY_DTYPE.itemsize
     if head.imu_profile != "ACCEL32_GYRO32_NMEA":
@@ -51,7 +51,7 @@ def imu_packet_bytes(head: OusterHead) -> int:
 
 
 def imu_samples(host_time_ns: Int64Array, units: ByteRows, head: OusterHead) -> tuple[StructArray, int]:
-    """Samples of IMU packets in the axes of the maker's sensor frame, in order.
+    """Return samples of IMU packets in the axes of the maker's sensor frame, in order.
 
     Args:
         host_time_ns: (n,).
@@ -92,7 +92,7 @@ def _doubles(values: NDArray[np.float32]) -> FloatArray:
 
 
 def encode_imu_packet(head: OusterHead, time_ns: ArrayLike, force: FloatArray, rate: FloatArray) -> bytes:
-    """One IMU packet of the head's profile.
+    """Return one IMU packet of the head's profile.
 
     Args:
         head: whose profile and axes are used.

@@ -141,7 +141,7 @@ class LidarLayout:
             raise DriverSettingsError(f"{FILE}: data_format: its packets are larger than a datagram")
 
     def __deepcopy__(self, memo: dict[int, object]) -> LidarLayout:
-        """A layout never changes: a parser's copy shares it."""
+        """Return a layout never changes: a parser's copy shares it."""
         return self
 
     @property
@@ -192,13 +192,13 @@ class LidarLayout:
     # -- reading
 
     def field(self, pixels: NDArray[np.uint32], name: str) -> NDArray[np.uint32]:
-        """A field of channel blocks (…, words), in the units the maker gives it; (…)."""
+        """Return a field of channel blocks (…, words), in the units the maker gives it; (…)."""
         bits = self.profile.fields[name]
         values = self.raw_field(pixels, name)
         return values << np.uint32(bits.dropped) if bits.dropped else values
 
     def raw_field(self, pixels: NDArray[np.uint32], name: str) -> NDArray[np.uint32]:
-        """The same without the low bits that are not sent."""
+        """Return the same without the low bits that are not sent."""
         bits = self.profile.fields[name]
         word = pixels[..., bits.first // 32]
         shift = bits.first % 32
@@ -207,24 +207,26 @@ class LidarLayout:
         return word & np.uint32((1 << bits.size) - 1) if shift + bits.size < 32 else word
 
     def headers(self, units: NDArray[np.uint8]) -> StructArray:
-        """(n,) headers of other packets than lidar's, (n, length); LEGACY heads send those with a STANDARD one."""
+        """Return (n,) headers of other packets than lidar's, (n, length); LEGACY heads send those with a STANDARD
+        one.
+        """
         kind = "standard" if self.legacy else self.head.header
         content = np.ascontiguousarray(units[:, :HEADER_BYTES])
         return content.view(_table(_HEADERS[kind], HEADER_BYTES)).reshape(-1)
 
     def valid(self, columns: StructArray) -> NDArray[np.bool_]:
-        """Which columns hold a measurement: bit 0 of the status."""
+        """Return which columns hold a measurement: bit 0 of the status."""
         found: NDArray[np.bool_] = (columns["status"] & 1).astype(np.bool_)
         return found
 
     def first_id(self, columns: StructArray) -> NDArray[np.int64]:
-        """(n,) measurement id of the first column of packets' columns (n, columns), by the first valid one."""
+        """Return (n,) measurement id of the first column of packets' columns (n, columns), by the first valid one."""
         place = self.valid(columns).argmax(axis=1)
         found: NDArray[np.int64] = columns["id"][np.arange(len(columns)), place].astype(np.int64) - place
         return found
 
     def frame_id(self, packets: StructArray) -> NDArray[np.int64]:
-        """(n,) of packets (n,)."""
+        """Return (n,) of packets (n,)."""
         found: NDArray[Any] = packets["columns"]["frame_id"][:, 0] if self.legacy else packets["frame_id"]
         return found.astype(np.int64)
 
@@ -234,7 +236,8 @@ class LidarLayout:
         return 1 << (32 if self.head.header == "fusa" else 16)
 
     def window_ranks(self) -> NDArray[np.int64]:
-        """(packets of a full frame,) which packet of a frame each place on the circle is, −1 where the window has none.
+        """Return (packets of a full frame,) which packet of a frame each place on the circle is, −1 where the window
+        has none.
 
         Packets are sent whole, in the order of their measurement ids, where the window reaches into them.
         """
@@ -246,13 +249,13 @@ class LidarLayout:
         return np.where(sent, np.cumsum(sent) - 1, -1).astype(np.int64)
 
     def init_id(self, packets: StructArray) -> NDArray[np.int64]:
-        """(n,) number of the head's start; 0 in LEGACY, which does not say it."""
+        """Return (n,) number of the head's start; 0 in LEGACY, which does not say it."""
         if self.legacy:
             return np.zeros(len(packets), dtype=np.int64)
         return ((packets["init_word"] >> _INIT_SHIFT[self.head.header]) & 0xFF_FFFF).astype(np.int64)
 
     def serial(self, packets: StructArray) -> NDArray[np.int64]:
-        """(n,) serial number of packets or headers; not in LEGACY's lidar packets."""
+        """Return (n,) serial number of packets or headers; not in LEGACY's lidar packets."""
         return (packets["serial_word"] & np.uint64((1 << 40) - 1)).astype(np.int64)
 
     # -- writing
@@ -267,7 +270,7 @@ class LidarLayout:
         init_id: int | None = None,
         serial: int | None = None,
     ) -> bytes:
-        """One packet, with its CRC where the header is STANDARD.
+        """Return one packet, with its CRC where the header is STANDARD.
 
         Args:
             frame_id: of the revolution.
@@ -298,12 +301,12 @@ class LidarLayout:
 
 
 def with_crc(packet: bytes) -> bytes:
-    """A packet whose last eight bytes are its CRC."""
+    """Return a packet whose last eight bytes are its CRC."""
     return packet[:-8] + crc64_xz(packet[:-8]).to_bytes(8, "little")
 
 
 def crc_holds(units: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """(n,) whether packets (n, length) have the CRC of their bytes, or were sent without one."""
+    """Return (n,) whether packets (n, length) have the CRC of their bytes, or were sent without one."""
     said = np.ascontiguousarray(units[:, -8:]).view("<u8")[:, 0]
     holds: NDArray[np.bool_] = np.isin(said, np.array(NO_CRC, dtype=np.uint64))
     for row in np.flatnonzero(~holds).tolist():

@@ -78,7 +78,7 @@ class OusterProbe(PacketParser):
 
 
 def looks_like_lidar(units: ByteRows) -> BoolArray:
-    """(n,) whether packets of one length are of sixteen columns, one behind the other.
+    """Return (n,) whether packets of one length are of sixteen columns, one behind the other.
 
     Args:
         units: (n, length).
@@ -94,7 +94,9 @@ def looks_like_lidar(units: ByteRows) -> BoolArray:
 
 
 def _counts_on(units: ByteRows, start: int, column_bytes: int) -> BoolArray:
-    """(n,) whether the measurement ids of columns that begin at ``start`` are consecutive, from a multiple of 16 on."""
+    """Return (n,) whether the measurement ids of columns that begin at ``start`` are consecutive, from a multiple of
+    16 on.
+    """
     at = start + _ID_AT + column_bytes * np.arange(COLUMNS_PER_PACKET)
     ids = units[:, at].astype(np.int64) + 256 * units[:, at + 1].astype(np.int64)
     steady: BoolArray = (np.diff(ids, axis=1) == 1).all(axis=1) & (ids[:, 0] % COLUMNS_PER_PACKET == 0)
@@ -171,7 +173,7 @@ class OusterParser(PacketParser):
             self.counters.bytes_skipped += count * length
 
     def _keep(self, units: ByteRows, packet_type: int, name: str) -> BoolArray:
-        """(n,) which packets with a header are of this kind and whole; all are counted."""
+        """Return (n,) which packets with a header are of this kind and whole; all are counted."""
         good = np.ones(len(units), dtype=np.bool_) if self.head.header == "fusa" else crc_holds(units)
         self._select(good, self._origin(self.layout.headers(units), packet_type), units.shape[1])
         self._count(name, int(good.sum()), units.shape[1])
@@ -185,7 +187,7 @@ class OusterParser(PacketParser):
             good &= passes
 
     def _origin(self, headers: StructArray, packet_type: int) -> list[tuple[str, BoolArray]]:
-        """What a packet's header must say."""
+        """Return what a packet's header must say."""
         criteria: list[tuple[str, BoolArray]] = [("bad_packet_type", headers["type"] == packet_type)]
         if self.head.serial is not None:
             criteria.append(("wrong_serial", self.layout.serial(headers) == self.head.serial))
@@ -240,7 +242,7 @@ class OusterParser(PacketParser):
         return records
 
     def _criteria(self, packets: StructArray) -> list[tuple[str, BoolArray]]:
-        """What a lidar packet must pass, in this order."""
+        """Return what a lidar packet must pass, in this order."""
         criteria = [] if self.layout.legacy else self._origin(packets, LIDAR_PACKET)
         columns, per_packet = packets["columns"], self.head.columns_per_packet
         valid, first_id = self.layout.valid(columns), self.layout.first_id(columns)
@@ -273,7 +275,7 @@ class OusterParser(PacketParser):
         return np.concatenate([at for at, _ in parts]), np.concatenate([new for _, new in parts])
 
     def _first_times(self, columns: StructArray) -> Int64Array:
-        """(n,) stamp of each packet's first valid column; the one before where a packet has none."""
+        """Return (n,) stamp of each packet's first valid column; the one before where a packet has none."""
         valid = self.layout.valid(columns)
         time_ns = columns["time_ns"][np.arange(len(columns)), valid.argmax(axis=1)].astype(np.int64)
         last = np.maximum.accumulate(np.where(valid.any(axis=1), np.arange(len(columns)), -1))
@@ -282,7 +284,7 @@ class OusterParser(PacketParser):
         return filled
 
     def _clock(self, host_time_ns: Int64Array, packets: StructArray) -> StructArray:
-        """One `DEVICE_CLOCK_DTYPE` row a packet that has a valid column: the stamp of the last one."""
+        """Return one `DEVICE_CLOCK_DTYPE` row a packet that has a valid column: the stamp of the last one."""
         valid = self.layout.valid(packets["columns"])
         some = np.flatnonzero(valid.any(axis=1))
         last = valid.shape[1] - 1 - valid[some, ::-1].argmax(axis=1)
@@ -298,7 +300,7 @@ class OusterParser(PacketParser):
     # -- returns
 
     def _returns(self, host_time_ns: Int64Array, packets: StructArray, unwrapped: Int64Array) -> StructArray:
-        """Returns of all packets in order."""
+        """Return returns of all packets in order."""
         pulses = self.head.columns_per_packet * self.head.beams
         slots = pulses * (2 if self.layout.dual else 1)
         table, filled = returns_table(len(packets) * slots), 0
@@ -315,7 +317,7 @@ class OusterParser(PacketParser):
         return table[:filled]
 
     def _block(self, columns: StructArray, number: Int64Array, host_time_ns: Int64Array) -> ReturnSlots:
-        """The slots of valid columns; ``number`` is each column's, counted from the first frame on."""
+        """Return the slots of valid columns; ``number`` is each column's, counted from the first frame on."""
         beam = np.arange(self.head.beams)
         dual = self.layout.dual
         flags = 0 if dual else _SINGLE_FLAGS.get(self.head.return_order, 0)
@@ -335,14 +337,16 @@ class OusterParser(PacketParser):
         )
 
     def _content(self, pixels: NDArray[np.uint32]) -> StructArray:
-        """(pulses, slots) returns of all beams of all columns: two of rising range, as sent where it is equal."""
+        """Return (pulses, slots) returns of all beams of all columns: two of rising range, as sent where it is
+        equal.
+        """
         first = self._as_numbers(pixels)
         if not self.layout.dual:
             return first.view(_CONTENT).reshape(-1, 1)
         return in_order(first, self._as_numbers(pixels, "2") | np.uint64(1 << 16)).view(_CONTENT)
 
     def _as_numbers(self, pixels: NDArray[np.uint32], which: str = "") -> NDArray[np.uint64]:
-        """(pulses,) one of the returns of a block as `_CONTENT` in one number."""
+        """Return (pulses,) one of the returns of a block as `_CONTENT` in one number."""
         number = self.layout.raw_field(pixels, f"RANGE{which}").astype(np.uint64).reshape(-1)
         number <<= np.uint64(32)
         number |= self.layout.raw_field(pixels, f"{self._light}{which}").reshape(-1)
@@ -350,13 +354,13 @@ class OusterParser(PacketParser):
 
 
 def _first_is_stronger(returns: StructArray) -> NDArray[np.uint16]:
-    """The first of the block is the stronger."""
+    """Return the first of the block is the stronger."""
     strength: NDArray[np.uint16] = ~returns["second"]
     return strength
 
 
 def _more_light_is_stronger(returns: StructArray) -> NDArray[np.uint32]:
-    """The one of more light, of equal ones the first of the block."""
+    """Return the one of more light, of equal ones the first of the block."""
     strength: NDArray[np.uint32] = (returns["intensity"].astype(np.uint32) << np.uint32(1)) + (1 - returns["second"])
     return strength
 
@@ -390,7 +394,7 @@ class HealthReader:
         self._last: tuple[int, ...] | None = None
 
     def read(self, host_time_ns: Int64Array, packets: StructArray) -> list[DeviceStatus]:
-        """One record a change in packets (n,), n at least 1, in order."""
+        """Return one record a change in packets (n,), n at least 1, in order."""
         said = np.zeros((len(packets), 1 + len(HEALTH)), dtype=np.int64)
         said[:, 0] = self._layout.init_id(packets)
         if not self._layout.legacy:

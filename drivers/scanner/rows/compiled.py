@@ -72,7 +72,7 @@ def _rows_written(
     encoder_rad: Any,
     channel: Any,
 ) -> int:
-    """Slots (m · n, s), what is the pulse's (m, n), ``pulse_id`` (m,); ``words`` are the table's."""
+    """Return slots (m · n, s), what is the pulse's (m, n), ``pulse_id`` (m,); ``words`` are the table's."""
     filled = np.uint64(0)  # unsigned, as the pulse: a signed index is looked at for counting from the end
     for i in range(host_time_ns.shape[0]):
         for j in range(host_time_ns.shape[1]):
@@ -118,7 +118,7 @@ _writers: dict[tuple[Any, ...], Callable[..., int]] = {}
 
 
 def _written(*arguments: Any) -> int:
-    """`_rows_written`, compiled once for each kind of slots, whatever the shapes and strides of its arrays."""
+    """Return `_rows_written`, compiled once for each kind of slots, whatever the shapes and strides of its arrays."""
     kind = tuple(getattr(argument, "dtype", type(argument)) for argument in arguments)
     writer = _writers.get(kind)
     if writer is None:

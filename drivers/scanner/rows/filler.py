@@ -8,7 +8,7 @@ from swath.drivers.scanner.rows.slots import Fill, ReturnSlots
 
 
 def filler(*, compiled: bool) -> Fill:
-    """`ReturnSlots.fill`, or the same compiled.
+    """Return `ReturnSlots.fill`, or the same compiled.
 
     Raises:
         DriverSettingsError: numba is not installed.

@@ -26,7 +26,7 @@ Fill: TypeAlias = "Callable[[ReturnSlots, StructArray], int]"
 
 @cache
 def _place(name: str) -> tuple[int, np.dtype[np.void]]:
-    """The word a field is in, and that word as a table of this field."""
+    """Return the word a field is in, and that word as a table of this field."""
     fields = RETURN_DTYPE.fields
     assert fields is not None
     kind, at = fields[name][:2]
@@ -34,7 +34,7 @@ def _place(name: str) -> tuple[int, np.dtype[np.void]]:
 
 
 def _column(words: NDArray[np.uint64], name: str) -> NDArray[Any]:
-    """A field of rows whose words are (words, rows)."""
+    """Return a field of rows whose words are (words, rows)."""
     word, kind = _place(name)
     column: NDArray[Any] = words[word].view(kind)[name]
     return column
@@ -56,7 +56,7 @@ class PairRule:
     names_last: bool
 
     def flags(self, returns: StructArray, number: NDArray[np.uint8], count: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """(n,) of consecutive returns with their numbers, of pulses that have so many."""
+        """Return (n,) of consecutive returns with their numbers, of pulses that have so many."""
         strength = np.ascontiguousarray(self.strength(returns))
         # choices are multiplications by 0 or 1: np.where takes ten times as long on conditions that keep changing
         second = (number[1:] == 2).view(np.uint8)
@@ -174,7 +174,7 @@ class ReturnSlots:
 
 
 def _numbers(pulse: NDArray[np.intp], slots: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """return_number and number_of_returns of returns of these pulses, in order, each with so many at most."""
+    """Return return_number and number_of_returns of returns of these pulses, in order, each with so many at most."""
     number, count = np.ones((2, len(pulse)), dtype=np.uint8)
     for lag in range(1, slots):
         same = (pulse[lag:] == pulse[:-lag]).view(np.uint8)
@@ -185,7 +185,7 @@ def _numbers(pulse: NDArray[np.intp], slots: int) -> tuple[NDArray[np.uint8], ND
 
 
 def in_order(one: NDArray[Any], other: NDArray[Any]) -> NDArray[Any]:
-    """Pairs (n, 2), the lesser number first."""
+    """Return pairs (n, 2), the lesser number first."""
     pairs = np.empty((len(one), 2), dtype=one.dtype)
     np.minimum(one, other, out=pairs[:, 0])
     np.maximum(one, other, out=pairs[:, 1])
@@ -195,7 +195,7 @@ def in_order(one: NDArray[Any], other: NDArray[Any]) -> NDArray[Any]:
 def common_words(
     shape: tuple[int, int], channel: ArrayLike = 0, mta_zone: ArrayLike = 0, flags: ArrayLike = 0
 ) -> NDArray[np.uint64]:
-    """Last words of the rows of pulses that have one return."""
+    """Return last words of the rows of pulses that have one return."""
     rows = np.zeros(shape, dtype=RETURN_DTYPE)
     rows["return_number"] = rows["number_of_returns"] = 1
     rows["channel"], rows["mta_zone"], rows["flags"] = channel, mta_zone, flags
@@ -203,5 +203,5 @@ def common_words(
 
 
 def returns_table(slots: int) -> StructArray:
-    """A `RETURN_DTYPE` table for at most so many returns; what is not written to takes no memory."""
+    """Return a `RETURN_DTYPE` table for at most so many returns; what is not written to takes no memory."""
     return np.empty(slots, dtype=RETURN_DTYPE)

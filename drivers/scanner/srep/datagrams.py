@@ -31,12 +31,12 @@ class Datagrams:
         return len(self.host_time_ns)
 
     def lengths(self) -> Int64Array:
-        """(n,) bytes of each."""
+        """Return (n,) bytes of each."""
         lengths = np.array([block.shape[1] for block in self.blocks], dtype=np.int64)
         return lengths.repeat([len(block) for block in self.blocks])
 
     def where(self, wanted: BoolArray) -> Datagrams:
-        """Those that are wanted, (n,); nothing is copied where all are."""
+        """Return those that are wanted, (n,); nothing is copied where all are."""
         if wanted.all():
             return self
         blocks, first = [], 0
@@ -48,13 +48,13 @@ class Datagrams:
         return Datagrams(self.host_time_ns[wanted], blocks)
 
     def headers(self) -> StructArray:
-        """(n,) `HEADER_DTYPE`, of datagrams that are long enough."""
+        """Return (n,) `HEADER_DTYPE`, of datagrams that are long enough."""
         if not self.blocks:
             return np.empty(0, dtype=HEADER_DTYPE)
         return np.concatenate([block[:, :HEADER_BYTES] for block in self.blocks]).view(HEADER_DTYPE)[:, 0]
 
     def agree_with_crc(self) -> BoolArray:
-        """(n,) True where the last four bytes are the CRC of all before."""
+        """Return (n,) True where the last four bytes are the CRC of all before."""
         if not self.blocks:
             return np.empty(0, dtype=np.bool_)
         said = np.concatenate([block[:, -CRC.size :] for block in self.blocks]).view("<u4")[:, 0]
@@ -63,7 +63,9 @@ class Datagrams:
         return agree
 
     def bodies(self) -> NDArray[np.uint64]:
-        """Pulse records of all datagrams, one behind the other, in words: as many of each as `body_words` tells."""
+        """Return pulse records of all datagrams, one behind the other, in words: as many of each as `body_words`
+        tells.
+        """
         bodies = [block[:, HEADER_BYTES : -CRC.size] for block in self.blocks]
         words = np.empty(sum(body.size for body in bodies) // 8, dtype="<u8")
         data, at = words.view(np.uint8), 0
@@ -75,7 +77,7 @@ class Datagrams:
 
 
 def clock_samples(host_time_ns: Int64Array, header: StructArray, words: NDArray[np.uint64]) -> StructArray:
-    """`DEVICE_CLOCK_DTYPE` rows (n,), one a datagram: the counter at its last pulse beside the latched one.
+    """Return `DEVICE_CLOCK_DTYPE` rows (n,), one a datagram: the counter at its last pulse beside the latched one.
 
     Args:
         host_time_ns, header: (n,) of the datagrams.

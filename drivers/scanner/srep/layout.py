@@ -56,17 +56,17 @@ _SECONDS = 1 << 32
 
 @cache
 def pulse_dtype(return_slots: int) -> np.dtype[np.void]:
-    """Layout of one pulse record with R return slots: 8 + 8·R bytes."""
+    """Return layout of one pulse record with R return slots: 8 + 8·R bytes."""
     return np.dtype([("ticks", "<u4"), ("encoder", "<i4"), ("slot", SLOT_DTYPE, (return_slots,))])
 
 
 def datagram_bytes(pulses: int, return_slots: int) -> int:
-    """The only right length of a datagram."""
+    """Return the only right length of a datagram."""
     return HEADER_BYTES + pulses * (PULSE_HEAD_BYTES + SLOT_BYTES * return_slots) + CRC.size
 
 
 def body_words(header: StructArray) -> Int64Array:
-    """Words of 64 bits that the pulses of datagrams take, (n,) of headers (n,)."""
+    """Return words of 64 bits that the pulses of datagrams take, (n,) of headers (n,)."""
     words: Int64Array = header["pulses"].astype(np.int64) * (1 + header["return_slots"].astype(np.int64))
     return words
 
@@ -95,7 +95,7 @@ def encode_datagram(
     intensity: ArrayLike = 0,
     pulse_width_10ps: ArrayLike = 0,
 ) -> bytes:
-    """One datagram.
+    """Return one datagram.
 
     Args:
         header: all fields of the header but N and R.
@@ -115,7 +115,7 @@ def encode_datagram(
 
 
 def encode_datagrams(header: StructArray, body: StructArray) -> list[bytes]:
-    """Datagrams of equal length.
+    """Return datagrams of equal length.
 
     Args:
         header: (m,) `HEADER_DTYPE`; magic, version, N and R are filled in here.
@@ -132,14 +132,14 @@ def encode_datagrams(header: StructArray, body: StructArray) -> list[bytes]:
 
 
 def nanoseconds(ticks: NDArray[np.uint64], tick_hz: NDArray[np.uint32]) -> Int64Array:
-    """Tick counter to device time, both (n,): floor(ticks · 10⁹ / tick_hz), seconds modulo 2³²."""
+    """Return tick counter to device time, both (n,): floor(ticks · 10⁹ / tick_hz), seconds modulo 2³²."""
     hz = tick_hz.astype(np.uint64)
     seconds, rest = np.divmod(ticks, hz)
     return ((seconds % np.uint64(_SECONDS)) * np.uint64(SECOND_NS) + rest * np.uint64(SECOND_NS) // hz).astype(np.int64)
 
 
 def header_checks(header: StructArray, length: Int64Array) -> list[tuple[str, BoolArray]]:
-    """What headers (n,) of datagrams of these lengths (n,) must say, by the code a failure is counted under.
+    """Return what headers (n,) of datagrams of these lengths (n,) must say, by the code a failure is counted under.
 
     Returns:
         (n,) True where it does, by code.
@@ -173,14 +173,14 @@ class PulseRows:
 
     @classmethod
     def of(cls, pulses: NDArray[np.uint16]) -> PulseRows:
-        """Of datagrams that have so many (n,)."""
+        """Make that of datagrams that have so many (n,)."""
         if (pulses == pulses[0]).all():
             return cls((len(pulses), int(pulses[0])))
         counts = pulses.astype(np.intp)
         return cls((int(counts.sum()), 1), counts)
 
     def spread(self, values: NDArray[Any]) -> NDArray[Any]:
-        """What is said of datagrams (n,), of each row."""
+        """Return what is said of datagrams (n,), of each row."""
         return values if self.counts is None else np.repeat(values, self.counts)
 
     def first_ids(self, ids: Int64Array) -> Int64Array:
@@ -194,7 +194,7 @@ class PulseRows:
 
 
 def pulse_times(header: StructArray, ticks: NDArray[np.uint32], rows: PulseRows) -> Int64Array:
-    """Device times of pulses ``ticks`` after each datagram's first, of datagrams (n,) with one tick_hz.
+    """Return device times of pulses ``ticks`` after each datagram's first, of datagrams (n,) with one tick_hz.
 
     The whole seconds are split off before: (rest + ticks) · 10⁹ < 2³³ · 10⁹ fits int64. Ticks and times are laid out
     as ``rows``.

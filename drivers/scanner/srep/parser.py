@@ -172,14 +172,16 @@ class SrepParser(PacketParser):
         return records
 
     def _forward(self, unwrapped: Int64Array) -> BoolArray:
-        """(n,) True for datagrams that came in their place: a late one would look like a clock that went back."""
+        """Return (n,) True for datagrams that came in their place: a late one would look like a clock that went
+        back.
+        """
         newest = np.maximum.accumulate(np.concatenate([[self._newest], unwrapped]))
         self._newest = int(newest[-1])
         forward: BoolArray = unwrapped > newest[:-1]
         return forward
 
     def _check(self, units: Datagrams) -> tuple[Datagrams, StructArray, BoolArray]:
-        """Whole datagrams, their headers, and which of them are decoded; the others are counted."""
+        """Return whole datagrams, their headers, and which of them are decoded; the others are counted."""
         chosen = np.ones(len(units), dtype=np.bool_)
         if self._thinner is not None:
             chosen = self._thinner.choose(units.host_time_ns)
@@ -206,7 +208,7 @@ class SrepParser(PacketParser):
         return units, header, chosen
 
     def _breaks(self, sequence: NDArray[np.uint32], good: BoolArray) -> BoolArray:
-        """Where a datagram does not follow the one before, beginning with the last of the batch before."""
+        """Return where a datagram does not follow the one before, beginning with the last of the batch before."""
         follows = np.zeros(len(sequence), dtype=np.bool_)
         if not len(sequence):
             return follows
@@ -222,7 +224,7 @@ class SrepParser(PacketParser):
             self.counters.bad_messages += count
 
     def _status(self, host_time_ns: Int64Array, header: StructArray) -> list[DeviceStatus]:
-        """A status for each datagram whose flags, id or pulse rate differ from the one before."""
+        """Return a status for each datagram whose flags, id or pulse rate differ from the one before."""
         keys = np.stack([header[name].astype(np.int64) for name in ("scanner_id", "flags", "prf_mhz")], axis=1)
         changed = np.ones(len(keys), dtype=np.bool_)
         changed[1:] = (keys[1:] != keys[:-1]).any(axis=1)
@@ -248,7 +250,9 @@ class SrepParser(PacketParser):
     def _returns(
         self, host_time_ns: Int64Array, header: StructArray, words: NDArray[np.uint64], unwrapped: Int64Array
     ) -> StructArray:
-        """Returns of all datagrams, whose `Datagrams.bodies` these are, in order, decoded in blocks of one layout."""
+        """Return returns of all datagrams, whose `Datagrams.bodies` these are, in order, decoded in blocks of one
+        layout.
+        """
         fired = header["pulses"] > 0
         if not fired.all():
             host_time_ns, header, unwrapped = host_time_ns[fired], header[fired], unwrapped[fired]
@@ -285,7 +289,7 @@ class SrepParser(PacketParser):
     def _block(
         self, host_time_ns: Int64Array, header: StructArray, words: NDArray[np.uint64], unwrapped: Int64Array
     ) -> ReturnSlots:
-        """The slots of datagrams of one layout, whose pulses these words are."""
+        """Return the slots of datagrams of one layout, whose pulses these words are."""
         slots = int(header["return_slots"][0])
         rows = PulseRows.of(header["pulses"])
         words = words.reshape(-1, 1 + slots)
@@ -318,7 +322,7 @@ class SrepParser(PacketParser):
 
 
 def _same_layout(header: StructArray, slots: Int64Array) -> list[tuple[int, int]]:
-    """Bounds of runs of datagrams of one layout: equal R, tick_hz and encoder_counts.
+    """Return bounds of runs of datagrams of one layout: equal R, tick_hz and encoder_counts.
 
     None is of more than `BLOCK_SLOTS` slots (or one datagram); ``slots`` are those of all to the end of each, (n,).
     """

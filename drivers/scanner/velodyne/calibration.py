@@ -32,7 +32,7 @@ _KEYS = (  # in the XML without its trailing underscore, in the YAML, the XML's 
 
 
 def read_calibration(data: bytes, head: SpinningHead) -> BeamTable:
-    """Beams of a head by its calibration file.
+    """Return beams of a head by its calibration file.
 
     Raises:
         DriverSettingsError: it is none, or not this model's; two-point corrections (of an HDL-64E) are not known here.
@@ -77,7 +77,7 @@ def _beams(lasers: list[dict[str, float]]) -> BeamTable:
 
 
 def _read_yaml(data: bytes) -> tuple[float | None, dict[int, dict[str, float]]]:
-    """Distance resolution in metres, and corrections by laser id."""
+    """Return distance resolution in metres, and corrections by laser id."""
     import yaml  # only where a head has such a file
 
     try:
@@ -103,7 +103,7 @@ def _read_yaml(data: bytes) -> tuple[float | None, dict[int, dict[str, float]]]:
 
 
 def _read_xml(data: bytes) -> tuple[float | None, dict[int, dict[str, float]]]:
-    """The same of the maker's file."""
+    """Return the same of the maker's file."""
     root = ElementTree.fromstring(data)
     lasers = {int(_text(px, "id_")): dict(_xml_values(px)) for px in root.iterfind("DB/points_/item/px")}
     if not lasers:

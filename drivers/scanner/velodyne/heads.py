@@ -43,11 +43,11 @@ class SpinningHead:
     block_flags: tuple[int, ...] = (0xEEFF,)  # FF EE on the wire
 
     def groups(self, *, dual: bool) -> int:
-        """How many groups a packet holds."""
+        """Return how many groups a packet holds."""
         return BLOCKS // (len(self.block_flags) * (2 if dual else 1))
 
     def used_block_flags(self, *, dual: bool) -> NDArray[np.uint16]:
-        """What the blocks of a packet begin with, as many as are used."""
+        """Return what the blocks of a packet begin with, as many as are used."""
         group = np.repeat(np.array(self.block_flags, dtype=np.uint16), 2 if dual else 1)
         return np.tile(group, self.groups(dual=dual))
 
@@ -73,7 +73,7 @@ VLP16 = SpinningHead(
 
 
 def _focal_beams(focal_m: float, elevation_deg: list[float], azimuth_deg: list[float]) -> BeamTable:
-    """Beams that cross in one point so far from the spin axis: they leave the axis at other heights.
+    """Return beams that cross in one point so far from the spin axis: they leave the axis at other heights.
 
     The focal distances are velodyne-decoder 3.1.0's (calib_db.cpp, which cites the maker's envelope drawings of other
     models); the VLP-16 manual's vertical corrections follow from its 41.91 mm.

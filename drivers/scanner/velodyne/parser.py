@@ -69,7 +69,7 @@ def encode_data_packet(
     mode: int = MODE_STRONGEST,
     head: SpinningHead = VLP16,
 ) -> bytes:
-    """One data packet (9.3.2).
+    """Return one data packet (9.3.2).
 
     Args:
         stamp_us: time of the first firing, microseconds past the hour.
@@ -164,7 +164,7 @@ class VelodyneParser(PacketParser):
         return records
 
     def _check(self, packets: StructArray) -> BoolArray:
-        """(n,) True for packets of this model that can be decoded; the others are counted by what is wrong."""
+        """Return (n,) True for packets of this model that can be decoded; the others are counted by what is wrong."""
         flag, azimuth = packets["blocks"]["flag"], packets["blocks"]["azimuth"]
         dual, mode = packets["mode"] == MODE_DUAL, packets["mode"]
         flags_right, azimuths_right = np.empty((2, len(packets)), dtype=np.bool_)
@@ -211,7 +211,9 @@ class VelodyneParser(PacketParser):
         return fresh, self._turn(packets["blocks"]["azimuth"][:, 0], steps * groups, step_us, known=not first)
 
     def _turn(self, azimuth: NDArray[np.uint16], groups: Int64Array, step_us: Int64Array, *, known: bool) -> FloatArray:
-        """Rotation a group (n,), from each packet's predecessor; the last one known where that does not tell it."""
+        """Return rotation a group (n,), from each packet's predecessor; the last one known where that does not tell
+        it.
+        """
         before = np.concatenate([[self._last_azimuth], azimuth[:-1]])
         gap = (azimuth - before) % FULL_CIRCLE / np.maximum(groups, 1)
         tells = (groups > 0) & (step_us < MAX_TURN_US) & (gap <= MAX_GAP)
@@ -222,7 +224,7 @@ class VelodyneParser(PacketParser):
         return turn
 
     def _firings(self, host_time_ns: Int64Array, packets: StructArray, turn: FloatArray, number: Int64Array) -> Firings:
-        """The firings of packets of one return mode."""
+        """Return the firings of packets of one return mode."""
         head, mode = self._head, int(packets["mode"][0])
         dual = mode == MODE_DUAL
         used, groups = len(self._flags[dual]), head.groups(dual=dual)
@@ -242,7 +244,9 @@ class VelodyneParser(PacketParser):
 
 
 def _firing_times(stamp_us: NDArray[np.uint32], head: SpinningHead, groups: int) -> Callable[[Chosen], Int64Array]:
-    """Device times of firings (9.4), made of those of the groups (n · groups, 1) and of the lasers' (1, places)."""
+    """Return device times of firings (9.4), made of those of the groups (n · groups, 1) and of the lasers' (1,
+    places).
+    """
     first = stamp_us.astype(np.int64)[:, np.newaxis] * 1000 + (np.arange(groups) * head.group_ns + head.stamp_ns)
     group_ns, offset_ns = first.reshape(-1, 1), head.offset_ns[np.newaxis]
     if first.max() + offset_ns.max() >= HOUR_NS or first.min() < 0:
@@ -253,7 +257,7 @@ def _firing_times(stamp_us: NDArray[np.uint32], head: SpinningHead, groups: int)
 def _firing_azimuths(
     azimuth: NDArray[np.uint16], turn: FloatArray, head: SpinningHead
 ) -> Callable[[Chosen], FloatArray]:
-    """Azimuths of firings in radians, 0 … 2π, turned on from the groups' own (n, groups) (9.5).
+    """Return azimuths of firings in radians, 0 … 2π, turned on from the groups' own (n, groups) (9.5).
 
     The rotation is that to the packet's next group, of the last group that to it; of a packet's only group it is
     ``turn`` (n,).
@@ -284,7 +288,7 @@ def _firing_azimuths(
 def _clock_samples(
     host_time_ns: Int64Array, stamp_us: NDArray[np.uint32], mode: NDArray[np.uint8], head: SpinningHead
 ) -> StructArray:
-    """One `DEVICE_CLOCK_DTYPE` row a packet: device time of its last firing; it has no latch to tell of."""
+    """Return one `DEVICE_CLOCK_DTYPE` row a packet: device time of its last firing; it has no latch to tell of."""
     groups = np.where(mode == MODE_DUAL, head.groups(dual=True), head.groups(dual=False))
     last_ns = (groups - 1) * head.group_ns + int(head.offset_ns.max()) + head.stamp_ns
     rows = np.empty(len(stamp_us), dtype=DEVICE_CLOCK_DTYPE)
@@ -358,7 +362,7 @@ class StampTracker:
         return np.ones(len(stamp_us), dtype=np.bool_)
 
     def _step(self, stamp_us: int, nominal_us: float) -> bool:
-        """One packet; whether it is a new one."""
+        """Return one packet; whether it is a new one."""
         if stamp_us in self._recent:
             self._errors["duplicate"] += 1
             return False

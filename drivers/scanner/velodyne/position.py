@@ -39,7 +39,7 @@ _SECOND_US = 1_000_000
 
 
 def encode_position_packet(stamp_us: int, pps_status: int, sentence: str) -> bytes:
-    """One position packet; ``sentence`` from ``$`` to its checksum, without CR LF; empty before any came."""
+    """Return one position packet; ``sentence`` from ``$`` to its checksum, without CR LF; empty before any came."""
     packet = bytearray(POSITION_BYTES)
     _STATUS.pack_into(packet, _STAMP_AT, stamp_us, pps_status)
     text = f"{sentence}\r\n".encode("ascii") if sentence else b""
@@ -99,7 +99,7 @@ class PositionReader:
             self._counters.bad_messages += bad
 
     def _events(self, host_ns: int, stamp_us: int, pps_status: int, sentence: bytes) -> list[Record]:
-        """The time message of a new sentence, and the status where it changed."""
+        """Return the time message of a new sentence, and the status where it changed."""
         events: list[Record] = []
         valid = self._status[1] if self._status else False
         if sentence != self._sentence:
@@ -131,7 +131,7 @@ class PositionReader:
         return TimeMessage(host_ns, said, NamesEdge.PREVIOUS, valid=valid, message="position RMC")
 
     def _is_of_this_second(self, time: TimeTag, stamp_us: int, pps_status: int) -> bool:
-        """Whether the sentence belongs to the edge just past: by the locked clock, else by being new."""
+        """Return whether the sentence belongs to the edge just past: by the locked clock, else by being new."""
         if pps_status != PPS_LOCKED:
             return self._sentence is not None
         if time.time_ns // SECOND_NS % 3600 == stamp_us // _SECOND_US:
@@ -141,7 +141,7 @@ class PositionReader:
 
 
 def rmc_time(sentence: bytes) -> tuple[TimeTag, bool] | None:
-    """UTC of an RMC sentence and whether the receiver vouches for it; None if it is none or is damaged.
+    """Return UTC of an RMC sentence and whether the receiver vouches for it; None if it is none or is damaged.
 
     NMEA 0183: ``$--RMC,hhmmss.sss,status,…,ddmmyy,…*hh``, checksum the XOR between ``$`` and ``*``. Years are 1980
     to 2079. Second 60 is a leap second: 86 400 s of the day and above.

@@ -62,7 +62,9 @@ _WORDS = {"true": True, "yes": True, "on": True, "false": False, "no": False, "o
 
 
 def keyword_value(text: str) -> int | float | bool | str:
-    """An option's text as python-can's interfaces expect it: whole number, number, yes or no, else as it stands."""
+    """Return an option's text as python-can's interfaces expect it: whole number, number, yes or no, else as it
+    stands.
+    """
     if text.lower() in _WORDS:
         return _WORDS[text.lower()]
     try:
@@ -166,7 +168,7 @@ class PythonCanTransport(DescriptorTransport):
         return _blocks(frames, stamps if self._kernel_stamped else None)
 
     def _messages(self, gate: Gate, timeout_s: float) -> list[can.Message]:
-        """What the bus has, after waiting for the first."""
+        """Return what the bus has, after waiting for the first."""
         messages: list[can.Message] = []
         if self._fd >= 0:
             deadline_s = time.monotonic() + timeout_s
@@ -218,7 +220,7 @@ class PythonCanTransport(DescriptorTransport):
             raise TransportError(f"{self.name}: the gateway closed the connection")
 
     def _read(self, timeout_s: float) -> can.Message | None:
-        """One message; None on silence or on input nobody can read, which is counted."""
+        """Return one message; None on silence or on input nobody can read, which is counted."""
         assert self._bus is not None
         try:
             return self._bus.recv(timeout_s)
@@ -272,7 +274,7 @@ def _connect_once(connection: socket.socket, host: str, port: int) -> None:
 
 
 def _connection(bus: can.BusABC) -> socket.socket | None:
-    """The connection of a socketcand bus, which has no other way to it, kept alive; None of any other."""
+    """Return the connection of a socketcand bus, which has no other way to it, kept alive; None of any other."""
     found = getattr(bus, "_SocketCanDaemonBus__socket", None)
     if not isinstance(found, socket.socket):
         return None
@@ -283,7 +285,7 @@ def _connection(bus: can.BusABC) -> socket.socket | None:
 
 
 def _one_line(error: BaseException) -> str:
-    """What happened in the end: the system's word where there is one below the interface's own."""
+    """Return what happened in the end: the system's word where there is one below the interface's own."""
     root = error
     while root.__cause__ is not None or root.__context__ is not None:
         root = root.__cause__ or root.__context__ or root
@@ -293,7 +295,7 @@ def _one_line(error: BaseException) -> str:
 
 
 def _blocks(frames: list[bytes], stamps: list[int] | None) -> list[UnitBlock]:
-    """Runs of equal length, in order."""
+    """Return runs of equal length, in order."""
     blocks: list[UnitBlock] = []
     first = 0
     for last in range(1, len(frames) + 1):
@@ -307,7 +309,7 @@ def _blocks(frames: list[bytes], stamps: list[int] | None) -> list[UnitBlock]:
 
 
 def pack_frame(message: can.Message) -> bytes:
-    """The frame of a python-can message: 16 bytes, or 72 for CAN FD.
+    """Return the frame of a python-can message: 16 bytes, or 72 for CAN FD.
 
     Raises:
         ValueError: the message does not fit a frame (its identifier or its length).
@@ -333,7 +335,7 @@ def pack_frame(message: can.Message) -> bytes:
 
 
 def unpack_frame(frame: bytes) -> can.Message:
-    """The python-can message of a frame; its time stamp is 0.
+    """Return the python-can message of a frame; its time stamp is 0.
 
     Raises:
         ValueError: not 16 or 72 bytes, or a length field beyond the data.

@@ -143,7 +143,7 @@ class FixedPps(PpsSource):
         return None
 
     def poll_counters(self) -> TransportCounters:
-        """Lines that are no edge, as ``refused``."""
+        """Return lines that are no edge, as ``refused``."""
         return TransportCounters(refused=self.garbage_lines)
 
     def close(self) -> None:

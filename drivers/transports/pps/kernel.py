@@ -96,7 +96,7 @@ class KernelPps(PpsSource):
             ) from error
 
     def _fetch(self, timeout_s: float) -> RawEdge:
-        """The latest edge, after waiting at most ``timeout_s`` for one that is newer than this call."""
+        """Return the latest edge, after waiting at most ``timeout_s`` for one that is newer than this call."""
         seconds, nanoseconds = divmod(round(timeout_s * 1e9), 1_000_000_000)
         request = FETCH_DATA.pack(*(0,) * 9, seconds, nanoseconds, 0)
         try:
@@ -142,7 +142,7 @@ class KernelPps(PpsSource):
 
 
 def edge_of(answer: bytes, edge: str) -> RawEdge:
-    """The edge of one polarity in a `struct pps_fdata`."""
+    """Return the edge of one polarity in a `struct pps_fdata`."""
     fields = FETCH_DATA.unpack(answer)
     sequence, at = (fields[0], 2) if edge == "assert" else (fields[1], 5)
     return RawEdge(fields[at] * 1_000_000_000 + fields[at + 1], sequence, edge)

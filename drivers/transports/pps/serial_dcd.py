@@ -124,7 +124,7 @@ class _Watch:
         self.edges: queue.SimpleQueue[RawEdge | OSError | None] = queue.SimpleQueue()
 
     def is_deaf(self) -> bool:
-        """Whether the line was set since it began to wait."""
+        """Return whether the line was set since it began to wait."""
         return not self._ended and _lines_set[self._device] != self._line
 
     def run(self) -> None:
@@ -147,7 +147,7 @@ class _Watch:
 
 
 def edge_at_wake_up(changes_before: int, changes: int, carrier: bool) -> tuple[str, int]:
-    """Which edge ended the wait, and its number.
+    """Return which edge ended the wait, and its number.
 
     The driver counts changes of the line. The first change after ``changes_before`` ended the wait; with an odd
     number of changes since, the line is now where that edge left it, with an even number where it was before. Two

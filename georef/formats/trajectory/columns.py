@@ -65,17 +65,17 @@ class TrajectoryColumns:
     position_correlation_l: FloatArray | None = None
 
     def at(self, where: NDArray[np.bool_]) -> str:
-        """The first row at which something is so, by name."""
+        """Return the first row at which something is so, by name."""
         return f"{self.row} {int(np.argmax(where)) + self.first_row}"
 
 
 def unsaid(n: int) -> FloatArray:
-    """(n, 3) of nan."""
+    """Return (n, 3) of nan."""
     return np.full((n, 3), np.nan)
 
 
 def trajectory_of(columns: TrajectoryColumns, name: str, max_gap_ns: int) -> Trajectory:
-    """The trajectory of a file's rows; TrajectoryError where they cannot be meant."""
+    """Return the trajectory of a file's rows; TrajectoryError where they cannot be meant."""
     if len(columns.time_ns) < 2:
         raise TrajectoryError(f"{name}: has {len(columns.time_ns)} epochs; a trajectory needs two")
     for check in CHECKS:
@@ -100,7 +100,7 @@ def trajectory_of(columns: TrajectoryColumns, name: str, max_gap_ns: int) -> Tra
 
 
 def continuous_of_week(time_s: FloatArray, name: str, row: str = "record", first_row: int = 1) -> Int64Array:
-    """Nanoseconds since the start of the first one's week, of seconds of week that may begin anew at its end."""
+    """Return nanoseconds since the start of the first one's week, of seconds of week that may begin anew at its end."""
     steps = np.diff(time_s)
     crossing = (steps + WEEK_S >= -1.0) & (steps + WEEK_S <= LONGEST_GAP_AT_WEEKS_END_S)
     back = (steps < 0) & ~crossing
@@ -113,7 +113,7 @@ def continuous_of_week(time_s: FloatArray, name: str, row: str = "record", first
 
 
 def placed_in_week(of_week_ns: Int64Array, name: str, span_ns: Span | None, week: int | None) -> Int64Array:
-    """GPS time of nanoseconds of a week: the week given, or the one in which they overlap a log's span most."""
+    """Return GPS time of nanoseconds of a week: the week given, or the one in which they overlap a log's span most."""
     if week is not None:
         if not 0 <= week <= LATEST_NS // WEEK_NS:  # as 24233, which is a week and a day of it
             raise TrajectoryError(f"{name}: --week {week} is no GPS week; want whole weeks since 1980, such as 2423")
@@ -278,7 +278,7 @@ CHECKS = (
 
 
 def course_pieces(time_ns: Int64Array) -> Int64Array:
-    """(k, 2) rows at the ends of pieces of some second, none over a gap."""
+    """Return (k, 2) rows at the ends of pieces of some second, none over a gap."""
     begun = np.unique((time_ns - time_ns[0]) // COURSE_PIECE_NS, return_index=True)[1]
     rows = np.unique(np.r_[begun, len(time_ns) - 1])
     pieces = np.stack([rows[:-1], rows[1:]], axis=1)
@@ -289,7 +289,7 @@ def course_pieces(time_ns: Int64Array) -> Int64Array:
 def moved_l(
     time_ns: Int64Array, lat_rad: FloatArray, lon_rad: FloatArray, height_m: FloatArray, pieces: Int64Array
 ) -> FloatArray:
-    """(k, 3) mean velocity of each piece by its positions, north, east, down in its middle, m/s."""
+    """Return (k, 3) mean velocity of each piece by its positions, north, east, down in its middle, m/s."""
     begin, end = pieces[:, 0], pieces[:, 1]
     places_e = [e_from_geodetic(lat_rad[rows], lon_rad[rows], height_m[rows]) for rows in (begin, end)]
     lat = (lat_rad[begin] + lat_rad[end]) / 2
@@ -301,7 +301,7 @@ def moved_l(
 
 
 def mean_over(time_ns: Int64Array, values: FloatArray, pieces: Int64Array) -> FloatArray:
-    """(k, 3) mean of values (n, 3), linear between rows, over each piece; nan where a row of it says none."""
+    """Return (k, 3) mean of values (n, 3), linear between rows, over each piece; nan where a row of it says none."""
     steps = np.diff(time_ns)[:, np.newaxis] / SECOND_NS * (values[1:] + values[:-1]) / 2
     unsaid = np.isnan(steps)
 

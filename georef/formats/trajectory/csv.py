@@ -25,12 +25,12 @@ SIGMAS = (*POSITION_SIGMAS, *ATTITUDE_SIGMAS)
 
 
 def is_csv(text: str) -> bool:
-    """Whether the first line is that of a trajectory CSV."""
+    """Return whether the first line is that of a trajectory CSV."""
     return text.lstrip("\ufeff \r\n").startswith("gps_ns")
 
 
 def read_csv(text: str, name: str) -> TrajectoryColumns:
-    """Rows of a trajectory CSV; TrajectoryError names the line which is wrong."""
+    """Return rows of a trajectory CSV; TrajectoryError names the line which is wrong."""
     lines = text.lstrip("\ufeff").splitlines()
     first = next(i for i, line in enumerate(lines) if line.strip())
     header = [column.strip() for column in lines[first].split(",")]
@@ -62,7 +62,7 @@ def read_csv(text: str, name: str) -> TrajectoryColumns:
 
 
 def csv_text(trajectory: Trajectory) -> str:
-    """The trajectory with its sigmas; latitude and longitude to 0.1 mm and better, angles to 1e-8°."""
+    """Return the trajectory with its sigmas; latitude and longitude to 0.1 mm and better, angles to 1e-8°."""
     trajectory.require_attitude()
     lat, lon, height = trajectory.geodetic()
     columns = (
@@ -96,7 +96,7 @@ def _numbers(lines: list[str], header: list[str], name: str, first_line: int) ->
 
 
 def _sigmas(table: NDArray[np.void], degrees: dict[str, FloatArray]) -> tuple[FloatArray, FloatArray]:
-    """(n, 3) of position in metres and of attitude in radians."""
+    """Return (n, 3) of position in metres and of attitude in radians."""
     position, attitude = unsaid(len(table)), unsaid(len(table))
     for column in table.dtype.names or ():
         metres = OTHER_NAMES.get(column, column)

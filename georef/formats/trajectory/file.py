@@ -27,7 +27,7 @@ def read_trajectory(
     max_gap_ns: int = DEFAULT_MAX_GAP_NS,
     needs_attitude: bool = True,
 ) -> Trajectory:
-    """The trajectory in a file: SBET, Waypoint text, RTKLIB .pos or trajectory CSV.
+    """Return the trajectory in a file: SBET, Waypoint text, RTKLIB .pos or trajectory CSV.
 
     Args:
         data: the file.
@@ -72,7 +72,7 @@ def _refuse_sparse(trajectory: Trajectory) -> None:
 
 
 def _text_of(data: bytes) -> str | None:
-    """The text; None: these are numbers."""
+    """Return the text; None: these are numbers."""
     if encoding_of(data[:4]) != "utf-8-sig":
         return decoded(data, "replace")
     head = data[:LOOKED_AT]
@@ -82,7 +82,7 @@ def _text_of(data: bytes) -> str | None:
 
 
 def _sbet(data: bytes, name: str, span_ns: Span | None, week: int | None, sigmas: Sigmas | None) -> TrajectoryColumns:
-    """An SBET; what is one of smrmsg instead is named."""
+    """Return an SBET; what is one of smrmsg instead is named."""
     if len(data) % SBET_BYTES and data and not len(data) % SMRMSG_BYTES:
         try:
             read_smrmsg(data, name)

@@ -154,7 +154,7 @@ class Aligner:
         self._judge(now_ns, fitted, method if _moved(rows) or method in GIVEN else TOLD_LITTLE[method], seconds)
 
     def _fit(self, problem: Problem, *, standing: bool) -> tuple[Fitted, str]:
-        """The best fit, and what its heading comes from."""
+        """Return the best fit, and what its heading comes from."""
         fitted = problem.fit(problem.first_guess())
         if problem.has_attitude:
             return fitted, "given"
@@ -235,7 +235,7 @@ AWAITED = {
 def align(
     inertial: Inertial, observations: StructArray, setup: Setup, crab_sigma_rad: float = CRAB_RAD
 ) -> AlignedStart:
-    """The earliest start that the data give.
+    """Return the earliest start that the data give.
 
     Args:
         inertial: samples.
@@ -260,7 +260,7 @@ def align(
 
 
 def _sound(rows: StructArray, antennas: int) -> NDArray[np.bool_]:
-    """(n,) whether a row can be used: finite, with a sigma, of an antenna that is known."""
+    """Return (n,) whether a row can be used: finite, with a sigma, of an antenna that is known."""
     needed = np.where(rows["kind"] == Kind.HEADING, 1, 3)
     component = np.arange(3) < needed[:, None]
     sound = np.isfinite(rows["value"]) & np.isfinite(rows["sigma"]) & (rows["sigma"] > 0.0)
@@ -270,7 +270,7 @@ def _sound(rows: StructArray, antennas: int) -> NDArray[np.bool_]:
 
 
 def _still(felt: Felt, rows: StructArray, noise: ImuNoise) -> Int64Array:
-    """GPS times of positions up to the last at which nothing moved: neither sensors nor GNSS say that it did."""
+    """Return GPS times of positions up to the last at which nothing moved: neither sensors nor GNSS say that it did."""
     block_s = np.sqrt(np.maximum(np.diff(felt.before_s[::-1])[::-1], 1e-3))[:, None]
     rate = np.abs(felt.rate_b) > STILL_RADPS + 3.0 * noise.gyro_bias + 5.0 * noise.angle_random_walk / block_s
     usual = np.median(felt.force_b[-20:], axis=0)
@@ -287,7 +287,7 @@ def _still(felt: Felt, rows: StructArray, noise: ImuNoise) -> Int64Array:
 
 
 def _moved(rows: StructArray) -> bool:
-    """Whether horizontal velocity changed by clearly more than GNSS's noise."""
+    """Return whether horizontal velocity changed by clearly more than GNSS's noise."""
     speed, place = (rows[rows["kind"] == kind] for kind in (Kind.VELOCITY, Kind.POSITION))
     if len(speed) >= FEWEST:
         velocity, sigma = speed["value"][:, :2], speed["sigma"][:, :2]
@@ -299,7 +299,7 @@ def _moved(rows: StructArray) -> bool:
 
 
 def _level_earth_rate(position_e: FloatArray) -> float:
-    """Horizontal component of the earth's rate, rad/s."""
+    """Return horizontal component of the earth's rate, rad/s."""
     return float(EARTH_RATE_RADPS * np.cos(geodetic_from_e(position_e)[0]))
 
 

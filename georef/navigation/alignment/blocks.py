@@ -149,7 +149,7 @@ class Blocks:
             setattr(self, name, getattr(self, name)[first:])
 
     def felt(self, begin_ns: int, end_ns: int) -> Felt | None:
-        """Integrals back from `end_ns` over unbroken blocks, from the first that begins at `begin_ns` or later.
+        """Return integrals back from `end_ns` over unbroken blocks, from the first that begins at `begin_ns` or later.
 
         Returns:
             None where no block holds `end_ns`.
@@ -195,7 +195,7 @@ class Blocks:
 
 
 def _integrals(edges_ns: Int64Array, angle_b: FloatArray, velocity_b: FloatArray) -> Felt:
-    """`Felt` of blocks between edges."""
+    """Return `Felt` of blocks between edges."""
     length_s = np.diff(edges_ns) / SECOND_NS
     step = length_s[:, None]
     rate, force = angle_b / step, velocity_b / step
@@ -234,14 +234,14 @@ def _integrals(edges_ns: Int64Array, angle_b: FloatArray, velocity_b: FloatArray
 
 
 def _back(parts: FloatArray) -> FloatArray:
-    """Sums from each edge (n + 1) to the last, of parts (n, …)."""
+    """Return sums from each edge (n + 1) to the last, of parts (n, …)."""
     sums = np.zeros((len(parts) + 1, *parts.shape[1:]))
     sums[:-1] = np.cumsum(parts[::-1], axis=0)[::-1]
     return sums
 
 
 def _prefix(q: FloatArray) -> FloatArray:
-    """(n, 4) products q_0 ⊗ … ⊗ q_k of (n, 4), by doubling."""
+    """Return (n, 4) products q_0 ⊗ … ⊗ q_k of (n, 4), by doubling."""
     product, reach = q.copy(), 1
     while reach < len(product):
         product[reach:] = quaternions.product(product[:-reach], product[reach:])
@@ -251,13 +251,13 @@ def _prefix(q: FloatArray) -> FloatArray:
 
 
 def _turned_by(vector: FloatArray) -> FloatArray:
-    """(n, 4) quaternions of rotation vectors (n, 3)."""
+    """Return (n, 4) quaternions of rotation vectors (n, 3)."""
     half = 0.5 * np.linalg.norm(vector, axis=-1, keepdims=True)
     return np.concatenate([np.cos(half), 0.5 * np.sinc(half / np.pi) * vector], axis=-1)
 
 
 def _joined(a: Inertial, b: Inertial) -> Inertial:
-    """One after the other."""
+    """Return one after the other."""
     return Inertial(
         np.concatenate([a.time_ns, b.time_ns]),
         np.concatenate([a.interval_s, b.interval_s]),

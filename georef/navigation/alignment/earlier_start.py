@@ -31,12 +31,13 @@ RATE_NS = SECOND_NS // 10  # over which the turn rate is taken, for the lever ar
 
 
 def drift_rad(noise: ImuNoise, seconds: float) -> float:
-    """Standard deviation of what the gyroscopes drift in a time, an axis."""
+    """Return standard deviation of what the gyroscopes drift in a time, an axis."""
     return float(np.hypot(noise.gyro_bias * seconds, noise.angle_random_walk * np.sqrt(seconds)))
 
 
 def earlier_start(inertial: Inertial, observations: StructArray, setup: Setup, start: StartT) -> StartT:
-    """The start at the earliest position that the gyroscopes reach back to; the start itself where there is none.
+    """Return the start at the earliest position that the gyroscopes reach back to; the start itself where there is
+    none.
 
     Args:
         inertial: samples without gaps.
@@ -66,7 +67,9 @@ def earlier_start(inertial: Inertial, observations: StructArray, setup: Setup, s
 
 
 def _velocity(places: StructArray, observations: StructArray, time_ns: int) -> tuple[FloatArray, FloatArray] | None:
-    """(3,) of the antenna, north, east, down, m/s, and sigmas: as said near a time, else by positions from then on."""
+    """Return (3,) of the antenna, north, east, down, m/s, and sigmas: as said near a time, else by positions from then
+    on.
+    """
     said = observations[(observations["kind"] == Kind.VELOCITY) & (observations["antenna"] == places[0]["antenna"])]
     away = np.abs(said["time_ns"] - time_ns)
     if len(said) and away.min() <= NEAR_NS and np.isfinite(said[int(np.argmin(away))]["value"]).all():
@@ -90,7 +93,7 @@ def _at(
     moving: tuple[FloatArray, FloatArray],
     drift: float,
 ) -> StartT:
-    """The start at a position: the antenna's place and speed, brought to the body's origin."""
+    """Return the start at a position: the antenna's place and speed, brought to the body's origin."""
     time_ns = int(place["time_ns"])
     rot_e_from_b = _rot_e_from_b(inertial, start, time_ns)
     arm = setup.lever_arms_b[place["antenna"]]
@@ -112,7 +115,7 @@ def _at(
 
 
 def _rot_e_from_b(inertial: Inertial, start: Start, time_ns: int) -> FloatArray:
-    """(3, 3) at an earlier time: back by the turns of the samples between, and by the earth's."""
+    """Return (3, 3) at an earlier time: back by the turns of the samples between, and by the earth's."""
     first, last = np.searchsorted(inertial.time_ns, [time_ns, start.time_ns], side="right").tolist()
     turned = rot_from_quaternion(_chained(inertial.angle_b[first:last]))
     at_start = _rot_e_from_l(start.position_e) @ rot_l_from_b(*start.attitude_rad)
@@ -122,7 +125,7 @@ def _rot_e_from_b(inertial: Inertial, start: Start, time_ns: int) -> FloatArray:
 
 
 def _chained(angle_b: FloatArray) -> FloatArray:
-    """(4,) of turns (n, 3) one after the other, by pairs."""
+    """Return (4,) of turns (n, 3) one after the other, by pairs."""
     size = np.linalg.norm(angle_b, axis=1, keepdims=True)
     q = np.concatenate([np.cos(size / 2), angle_b * (np.sinc(size / (2 * np.pi)) / 2)], axis=1)
     unit = np.array([[1.0, 0.0, 0.0, 0.0]])

@@ -76,7 +76,7 @@ class Fitted:
     gyro_scale: FloatArray
 
     def sigma(self, part: slice) -> FloatArray:
-        """(3,) of attitude, velocity or place; wider where the residuals are larger than their sigmas say."""
+        """Return (3,) of attitude, velocity or place; wider where the residuals are larger than their sigmas say."""
         variance: FloatArray = np.diag(self.covariance)[part] * max(self.misfit, 1.0)
         sigma: FloatArray = np.sqrt(variance)
         return sigma
@@ -134,7 +134,7 @@ class Problem:
         return len(self._attitude) > 0
 
     def first_guess(self) -> FloatArray:
-        """rot_l_from_b at T: from changes of velocity and what was felt between, and by given headings."""
+        """Return rot_l_from_b at T: from changes of velocity and what was felt between, and by given headings."""
         if self.has_attitude:
             last = self._attitude[-1]
             there = self._frame.rot_from_l(last["time_ns"][None])[0] @ rot_l_from_b(*last["value"])
@@ -148,7 +148,7 @@ class Problem:
         return rot
 
     def fit(self, rot: FloatArray, course: tuple[float, float] | None = None) -> Fitted:
-        """Least squares from a first guess of R.
+        """Return least squares from a first guess of R.
 
         Args:
             rot: (3, 3) first guess.
@@ -176,7 +176,7 @@ class Problem:
         return noise_covariances(self._speed, self._place, *self._observed)
 
     def _converged(self, rot: FloatArray, course: tuple[float, float] | None) -> Fitted:
-        """Gauss and Newton's steps to the end."""
+        """Return Gauss and Newton's steps to the end."""
         state = np.zeros(UNKNOWNS)
         state[VELOCITY] = self._speed_seen[-1] if len(self._speed_seen) else self._mean_speed()
         for _ in range(ITERATIONS):
@@ -212,18 +212,18 @@ class Problem:
         return Fitted(there @ rot, position_e, velocity_l, state[ARM], covariance, cost, misfit, left, scale)
 
     def _covariance(self, design: FloatArray) -> FloatArray:
-        """(24, 24) of the unknowns, inverted in units of what is known of them before."""
+        """Return (24, 24) of the unknowns, inverted in units of what is known of them before."""
         scaled = design * self._prior
         return np.asarray(np.linalg.inv(scaled.T @ scaled), dtype=np.float64) * np.outer(self._prior, self._prior)
 
     def _speeds_seen(self, speed: StructArray, still: Int64Array) -> FloatArray:
-        """(m, 3) velocities against inertial space; of one that stands still, by its place."""
+        """Return (m, 3) velocities against inertial space; of one that stands still, by its place."""
         rest = np.zeros(len(still), speed.dtype)
         rest["time_ns"] = still
         return self._frame.velocity(np.concatenate([speed, rest]))
 
     def _changes(self) -> tuple[FloatArray, FloatArray]:
-        """Changes of velocity less gravitation's, and what was felt for them in the axes of b at T."""
+        """Return changes of velocity less gravitation's, and what was felt for them in the axes of b at T."""
         if len(self._speed_seen) >= len(self._place_seen):
             order = np.argsort(-self._speed.before_s, kind="stable")
             return np.diff(self._speed_seen[order], axis=0), np.diff((self._swing - self._speed.alpha)[order], axis=0)
@@ -238,7 +238,7 @@ class Problem:
         return mean
 
     def _turned(self, rot: FloatArray, state: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(m, 3) what changed velocities and places since, by the sensors less their errors so far."""
+        """Return (m, 3) what changed velocities and places since, by the sensors less their errors so far."""
         speed, place = self._speed, self._place
         alpha = speed.alpha + speed.alpha_by_gyro @ state[GYRO] + speed.alpha_by_accel @ state[ACCEL] - self._swing
         alpha -= self._swing_by_arm @ state[ARM]
@@ -247,7 +247,7 @@ class Problem:
         return -alpha @ rot.T, total @ rot.T
 
     def _left(self, rot: FloatArray, state: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(m, 3) residuals of velocities and of places, observed − computed."""
+        """Return (m, 3) residuals of velocities and of places, observed − computed."""
         pushed, moved = self._turned(rot, state)
         flown = state[PLACE] - self._place.before_s[:, None] * state[VELOCITY]
         return self._speed_seen - state[VELOCITY] - pushed, self._place_seen - flown - moved
@@ -290,7 +290,7 @@ class Problem:
         return rows[:, 0], rows[:, 1:]
 
     def _heading_rows(self, rot: FloatArray, state: FloatArray) -> FloatArray:
-        """Directions of the baseline, and its slope where that is said."""
+        """Return directions of the baseline, and its slope where that is said."""
         rows = []
         if not len(self._heading):
             return NO_ROWS
@@ -316,7 +316,7 @@ class Problem:
         return np.array(rows).reshape(-1, 1 + UNKNOWNS)
 
     def _attitude_rows(self, rot: FloatArray, state: FloatArray) -> FloatArray:
-        """A device's own attitudes."""
+        """Return a device's own attitudes."""
         felt, seen = self._attitude_felt, self._attitude
         if not len(seen):
             return NO_ROWS
@@ -333,14 +333,16 @@ class Problem:
         return rows
 
     def _prior_rows(self, state: FloatArray) -> FloatArray:
-        """What is known of the unknowns before: of the sensors' errors their sigmas, of the others next to nothing."""
+        """Return what is known of the unknowns before: of the sensors' errors their sigmas, of the others next to
+        nothing.
+        """
         left = np.where(np.arange(UNKNOWNS) < 9, 0.0, -state)
         rows: FloatArray = np.column_stack([left, np.eye(UNKNOWNS)]) / self._prior[:, None]
         return rows
 
 
 def _course_row(rot: FloatArray, course_rad: float, sigma_rad: float) -> FloatArray:
-    """The heading is the course, but for crabbing."""
+    """Return the heading is the course, but for crabbing."""
     north, east, down = rot[:, 0]
     row = np.zeros((1, 1 + UNKNOWNS))
     row[0, 0] = (course_rad - np.arctan2(east, north) + np.pi) % (2.0 * np.pi) - np.pi
@@ -349,19 +351,21 @@ def _course_row(rot: FloatArray, course_rad: float, sigma_rad: float) -> FloatAr
 
 
 def _by_turn(north: float, east: float, down: float) -> FloatArray:
-    """(3,) by how much the heading of a vector grows when it is turned about north, east, down."""
+    """Return (3,) by how much the heading of a vector grows when it is turned about north, east, down."""
     square = max(north * north + east * east, 1e-12)
     return np.array([-down * north / square, -down * east / square, 1.0])
 
 
 def _turned_onto(seen: FloatArray, felt: FloatArray) -> FloatArray:
-    """(3, 3) rotation that takes vectors (n, 3) felt onto those seen, by least squares (Wahba 1965; Markley 1988)."""
+    """Return (3, 3) rotation that takes vectors (n, 3) felt onto those seen, by least squares (Wahba 1965; Markley
+    1988).
+    """
     u, _, vt = np.linalg.svd(seen.T @ felt)
     return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt, dtype=np.float64)
 
 
 def _turn(vector: FloatArray) -> FloatArray:
-    """(3, 3) of a rotation vector (3,) (Rodrigues)."""
+    """Return (3, 3) of a rotation vector (3,) (Rodrigues)."""
     angle = float(np.linalg.norm(vector))
     cross = skew(vector)
     turned: FloatArray = (

@@ -24,7 +24,9 @@ WANDER, WANDER_S = 0.25, 5.0  # share of its bias by which an accelerometer's er
 def covariances(
     speed: FeltAt, place: FeltAt, speed_rows: StructArray, place_rows: StructArray, setup: Setup
 ) -> list[tuple[FloatArray, FloatArray]]:
-    """(m, m) of the residuals to the north, east and down, velocities then places: in all, and the inertial unit's."""
+    """Return (m, m) of the residuals to the north, east and down, velocities then places: in all, and the inertial
+    unit's.
+    """
     still = len(speed.before_s) - len(speed_rows)
     floor = np.array([1.0, 1.0, 1.5])
     scale = np.array([setup.gnss_sigma_scale.get(int(fix), 1.0) for fix in place_rows["fix_type"]])
@@ -50,7 +52,8 @@ def covariances(
 
 
 def _walks(speed_s: FloatArray, place_s: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Covariances of velocities and places at times before T, of white rate noise under 1 m/s², of white force noise.
+    """Return covariances of velocities and places at times before T, of white rate noise under 1 m/s², of white force
+    noise.
 
     A disturbance at s before T has moved the velocity at t > s before T by (t − s) times the force if it was of the
     rate, by 1 if of the force; the place by one integral more, and to the other side.
@@ -72,7 +75,7 @@ def _walks(speed_s: FloatArray, place_s: FloatArray) -> tuple[FloatArray, FloatA
 
 
 def _powers(rest: FloatArray, degree: FloatArray) -> list[FloatArray]:
-    """Coefficients of x⁰, x¹, x² in (x + rest)^degree / degree!, degree 0, 1 or 2."""
+    """Return coefficients of x⁰, x¹, x² in (x + rest)^degree / degree!, degree 0, 1 or 2."""
     cases = [degree == 0.0, degree == 1.0, degree == 2.0]
     zero, one = np.zeros_like(rest), np.ones_like(rest)
     return [

@@ -70,7 +70,7 @@ def times(inertial: Inertial, place: StructArray) -> Iterator[Finding]:
 
 
 def gaps(inertial: Inertial) -> Iterator[Finding]:
-    """Samples that are missing."""
+    """Yield samples that are missing."""
     begins_ns = inertial.time_ns - np.rint(inertial.interval_s * SECOND_NS).astype(np.int64)
     missing_s = (begins_ns[1:] - inertial.time_ns[:-1]) / SECOND_NS
     found = np.flatnonzero(missing_s > 0.5 * inertial.interval_s[1:])
@@ -122,7 +122,7 @@ def receiver(observations: StructArray, place: StructArray) -> Iterator[Finding]
 
 
 def _speed_off(speed: StructArray, place: StructArray) -> float | None:
-    """Typical difference of velocities and positions' changes, m/s; None where it is small."""
+    """Return typical difference of velocities and positions' changes, m/s; None where it is small."""
     speed = speed[np.isfinite(speed["value"]).all(axis=1)]
     if len(place) < 10 or len(speed) < 10:
         return None

@@ -56,7 +56,7 @@ class HasSolution(Protocol):
 def diagnose(
     inertial: Inertial, observations: StructArray, setup: Setup, solved: HasSolution | None = None
 ) -> list[Finding]:
-    """Faults of the input that the data themselves show, the worst first; empty where nothing is wrong.
+    """Return faults of the input that the data themselves show, the worst first; empty where nothing is wrong.
 
     Args:
         inertial: samples.
@@ -176,7 +176,7 @@ def _offset_finding(offset: TimeOffset, gps_ns: int) -> Finding:
 
 
 def _sensor_finding(mounting: Mounting, body: FloatArray | None) -> Finding:
-    """What of the sensors is taken wrongly, with the remedy; by the way the vehicle goes where that is known."""
+    """Return what of the sensors is taken wrongly, with the remedy; by the way the vehicle goes where that is known."""
     turn = np.eye(3) if body is None else body
     gyro, accel = turn @ mounting.gyro, turn @ mounting.accel
     times = f"{np.sqrt(mounting.gain):.0f} times better"
@@ -264,7 +264,7 @@ def _axes_finding(matrix: FloatArray) -> Finding | None:
 
 
 def _gravity(inertial: Inertial) -> Finding | None:
-    """The mean specific force, for what never goes anywhere."""
+    """Return the mean specific force, for what never goes anywhere."""
     mean = inertial.velocity_b.sum(axis=0) / max(float(inertial.interval_s.sum()), 1e-9) / G_MPS2
     axis = int(np.argmax(np.abs(mean)))
     if (axis == 2 and mean[2] < 0.0) or abs(mean[axis]) < 0.8:
@@ -361,7 +361,7 @@ def _rejected(solved: HasSolution | None) -> Iterator[Finding]:
 
 
 def _axis(row: FloatArray) -> str:
-    """Which axis, with its sign, a row of a signed permutation takes."""
+    """Return which axis, with its sign, a row of a signed permutation takes."""
     axis = int(np.argmax(np.abs(row)))
     return f"{'-' if row[axis] < 0.0 else '+'}{AXES[axis]}"
 

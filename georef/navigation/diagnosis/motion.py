@@ -84,7 +84,7 @@ class Mounting:
 
 
 def windows(inertial: Inertial, observations: StructArray, setup: Setup) -> list[Window]:
-    """The stretches in which most happens, by time; fewer where data are few."""
+    """Return the stretches in which most happens, by time; fewer where data are few."""
     rows = _used(observations, len(setup.lever_arms_b))
     place = rows[rows["kind"] == Kind.POSITION]
     begins_ns = np.arange(max(_first(inertial.time_ns), _first(place["time_ns"])), _last(inertial.time_ns), WINDOW_NS)
@@ -183,7 +183,9 @@ def body_axes(chosen: list[Window], setup: Setup, mounting: Mounting | None = No
 
 
 def heading_offset(chosen: list[Window], setup: Setup) -> tuple[float, float] | None:
-    """Dual-antenna heading less the heading of the baseline by motion, and its sigma, rad; None where either lacks."""
+    """Return dual-antenna heading less the heading of the baseline by motion, and its sigma, rad; None where either
+    lacks.
+    """
     if setup.baseline_b is None:
         return None
     offsets, sigmas = [], []
@@ -204,7 +206,9 @@ def heading_offset(chosen: list[Window], setup: Setup) -> tuple[float, float] | 
 
 
 def other_signs(arm_b: FloatArray, fitted_b: FloatArray, sigma_m: FloatArray) -> FloatArray | None:
-    """Signs (3,) with which a lever arm fits clearly better than as it is; None where it does as it is, or none do."""
+    """Return signs (3,) with which a lever arm fits clearly better than as it is; None where it does as it is, or none
+    do.
+    """
     off = np.linalg.norm(fitted_b - arm_b)
     if off < max(0.3, 8.0 * float(sigma_m.max())):
         return None
@@ -216,7 +220,7 @@ def other_signs(arm_b: FloatArray, fitted_b: FloatArray, sigma_m: FloatArray) ->
 
 
 def lever_arm(chosen: list[Window], setup: Setup) -> tuple[FloatArray, FloatArray] | None:
-    """Lever arm (3,) of antenna 0 that positions and velocities fit best, m in b, and its sigma (3,)."""
+    """Return lever arm (3,) of antenna 0 that positions and velocities fit best, m in b, and its sigma (3,)."""
     information, weighted = np.zeros((3, 3)), np.zeros(3)
     for window in chosen:
         rows = window.rows[(window.rows["antenna"] == 0) & _is_motion(window.rows)]
@@ -295,7 +299,7 @@ def _window(inertial: Inertial, rows: StructArray, setup: Setup, begin_ns: int) 
 
 
 def _used(observations: StructArray, antennas: int) -> StructArray:
-    """Sound rows, thinned to about one a second of a kind."""
+    """Return sound rows, thinned to about one a second of a kind."""
     rows = observations[np.isin(observations["kind"], (Kind.POSITION, Kind.VELOCITY, Kind.HEADING))]
     needed = np.where(rows["kind"] == Kind.HEADING, 1, 3)
     sound = np.isfinite(rows["value"]) & np.isfinite(rows["sigma"]) & (rows["sigma"] > 0.0)
@@ -314,7 +318,7 @@ def _used(observations: StructArray, antennas: int) -> StructArray:
 
 
 def _eventfulness(inertial: Inertial, rows: StructArray, begin_ns: int) -> float:
-    """How much GNSS's velocity or the felt turning changes in a window; 0 where either has a gap."""
+    """Return how much GNSS's velocity or the felt turning changes in a window; 0 where either has a gap."""
     end_ns = begin_ns + WINDOW_NS
     first, last = np.searchsorted(inertial.time_ns, [begin_ns, end_ns])
     speed = rows[(rows["kind"] == Kind.VELOCITY) & (rows["time_ns"] >= begin_ns) & (rows["time_ns"] < end_ns)]
@@ -331,7 +335,7 @@ def _is_motion(rows: StructArray) -> NDArray[np.bool_]:
 
 
 def _signed_permutations(*, proper: bool = False) -> Iterator[FloatArray]:
-    """The 48 matrices that swap and mirror axes; of them the 24 rotations."""
+    """Yield the 48 matrices that swap and mirror axes; of them the 24 rotations."""
     for order in permutations(range(3)):
         for signs in product((1.0, -1.0), repeat=3):
             matrix = np.zeros((3, 3))

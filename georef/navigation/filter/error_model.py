@@ -106,7 +106,7 @@ class Drive(NamedTuple):
 
 
 def layout_of(setup: Setup, *, heights: bool = False) -> Layout:
-    """The errors that a setup asks for; of a barometer where there are heights."""
+    """Return the errors that a setup asks for; of a barometer where there are heights."""
     size, places = CORE, []
     for asked, count in (
         (setup.noise.misalignment > 0.0, LEANS),
@@ -123,7 +123,7 @@ def layout_of(setup: Setup, *, heights: bool = False) -> Layout:
 
 
 def prior_variance(setup: Setup, layout: Layout) -> FloatArray:
-    """(size,) variances at the start, of all but position, velocity and attitude."""
+    """Return (size,) variances at the start, of all but position, velocity and attitude."""
     noise = setup.noise
     variance = np.zeros(layout.size)
     for first, sigma in (
@@ -148,7 +148,7 @@ def prior_variance(setup: Setup, layout: Layout) -> FloatArray:
 
 
 def drive_of(setup: Setup, layout: Layout) -> Drive:
-    """Process noise of a setup."""
+    """Return process noise of a setup."""
     correlation_s = np.full(layout.size, np.inf)
     correlation_s[E_GYRO_BIAS : E_ACCEL_BIAS + 3] = setup.noise.bias_correlation_s
     if layout.slow >= 0:
@@ -194,7 +194,7 @@ def _put_sensor(top: FloatArray, row: int, at: int, sums: FloatArray, first: int
 
 @jit_inline
 def _force_of(sums: FloatArray) -> Three:
-    """∫ C f dt: row sums of the force's sums."""
+    """Return ∫ C f dt: row sums of the force's sums."""
     return (
         sums[SUM_FORCE] + sums[SUM_FORCE + 1] + sums[SUM_FORCE + 2],
         sums[SUM_FORCE + 3] + sums[SUM_FORCE + 4] + sums[SUM_FORCE + 5],

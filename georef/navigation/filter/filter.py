@@ -172,11 +172,11 @@ class NavigationFilter:
         write_node(run, self._nodes.room(1, 0), run.x, int(run.clock[SCALAR]))
 
     def new_path(self) -> Path:
-        """What was written since the last call; for live use, with `smoothed` False."""
+        """Return what was written since the last call; for live use, with `smoothed` False."""
         return self._path.taken()
 
     def finish(self) -> FilterRun:
-        """`flush`, and all that was written."""
+        """Return `flush`, and all that was written."""
         self.flush()
         return FilterRun(
             self.setup,
@@ -246,7 +246,7 @@ def _model_of(setup: Setup, layout: Layout) -> Model:
 
 
 def _begin(setup: Setup, start: Start, layout: Layout) -> Running:
-    """The state at the start."""
+    """Return the state at the start."""
     n = layout.size
     clock = np.zeros(CLOCK_SIZE, np.int64)
     clock[NOW] = start.time_ns
@@ -279,7 +279,7 @@ def _begin(setup: Setup, start: Start, layout: Layout) -> Running:
 
 
 def start_state(setup: Setup, start: Start) -> FloatArray:
-    """(STATE_SIZE,) at the start."""
+    """Return (STATE_SIZE,) at the start."""
     lat, lon, _ = geodetic_from_e(start.position_e)
     of_level = rot_e_from_l(lat, lon)
     roll, pitch, heading = np.asarray(start.attitude_rad, dtype=np.float64)
@@ -292,7 +292,7 @@ def start_state(setup: Setup, start: Start) -> FloatArray:
 
 
 def start_covariance(setup: Setup, start: Start, layout: Layout) -> FloatArray:
-    """(n, n) of the errors at the start."""
+    """Return (n, n) of the errors at the start."""
     lat, lon, _ = geodetic_from_e(start.position_e)
     of_level = rot_e_from_l(lat, lon)
     _, pitch, heading = np.asarray(start.attitude_rad, dtype=np.float64)

@@ -75,7 +75,9 @@ def widen(run: Running, kind: int, layout: Layout, nu: FloatArray, m: int) -> bo
 
 @jit_inline
 def drifted(kind: int, s: FloatArray, noise: FloatArray, m: int) -> bool:
-    """Whether the state has so large a share of an innovation's covariance that it is to blame for a large one."""
+    """Return whether the state has so large a share of an innovation's covariance that it is to blame for a large
+    one.
+    """
     if not (kind == _POSITION or kind == _VELOCITY or kind == _HEADING or kind == _ATTITUDE):
         return False
     whole, own = 0.0, 0.0
@@ -87,7 +89,7 @@ def drifted(kind: int, s: FloatArray, noise: FloatArray, m: int) -> bool:
 
 @jit_inline
 def noise_factor(run: Running, kind: int, white: FloatArray, chi2: float, m: int, limit: float) -> float:
-    """What the latest innovations of a kind say of this one's, which is then added to them.
+    """Return what the latest innovations of a kind say of this one's, which is then added to them.
 
     Of some `STEADY` observations the mean χ² a component and, of neighbours, the mean product. Innovations that are too
     large and fall here and there mean that observations are worse than they say; too large and alike, that the state
@@ -113,7 +115,7 @@ def noise_factor(run: Running, kind: int, white: FloatArray, chi2: float, m: int
 
 @jit_inline
 def settling(run: Running, model: Model, kind: int, lost: bool, chi2: float, m: int) -> bool:
-    """Whether the state has drifted more than predicted, or begun so, and is finding itself again.
+    """Return whether the state has drifted more than predicted, or begun so, and is finding itself again.
 
     That lasts `reacquire_ns`: velocity and attitude, corrected by a wrong covariance, take as long to settle.
     Observations are taken as they are then; smoothed, the drift spreads over the time without them.
@@ -137,7 +139,7 @@ def still_away(run: Running, model: Model, kind: int, chi2: float, m: int) -> bo
 
 @jit_inline
 def leapt(run: Running, model: Model, kind: int, settles: bool, chi2: float, m: int) -> bool:
-    """Whether positions lie far off since one leapt there: from within the gate, from one epoch to the next.
+    """Return whether positions lie far off since one leapt there: from within the gate, from one epoch to the next.
 
     So does a wrong fix. A state that is worse than its covariance leaves the gate slowly, and one that was not known
     much better than the positions is to blame itself. What lasts longer than a wrong fix may is judged like the rest.
@@ -158,7 +160,7 @@ def leapt(run: Running, model: Model, kind: int, settles: bool, chi2: float, m: 
 
 @jit_inline
 def judge(run: Running, model: Model, kind: int, settles: bool, chi2: float, m: int) -> int:
-    """Fate of an innovation by its χ² and by how many of its kind were refused before it."""
+    """Return fate of an innovation by its χ² and by how many of its kind were refused before it."""
     gate = model.rules.gate[m]
     refused = run.refused
     if chi2 <= gate * model.rules.reject * (SETTLING if settles else 1.0):

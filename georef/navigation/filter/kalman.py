@@ -73,7 +73,7 @@ def innovation_covariance(p: FloatArray, rows: FloatArray, noise: FloatArray, m:
 def take_component(
     p: FloatArray, h: FloatArray, innovation: float, error: FloatArray, gain: FloatArray
 ) -> tuple[float, float]:
-    """One observed component of variance 1: P and the error estimate so far are changed.
+    """Return one observed component of variance 1: P and the error estimate so far are changed.
 
     Args:
         p: (n, n); h: (n,); innovation: before this epoch's components.

@@ -75,7 +75,7 @@ GAP_FACTOR = 1.5  # an interval that begins so much later than the one before ha
 
 @jit_inline
 def quadratic(p: FloatArray, first: int, v: Three) -> float:
-    """vᵀ P v of the 3×3 block at first."""
+    """Return vᵀ P v of the 3×3 block at first."""
     value: float = (
         p[first, first] * v[0] * v[0]
         + p[first + 1, first + 1] * v[1] * v[1]
@@ -158,7 +158,7 @@ def tell(told: Told, r: int, nu: FloatArray, s: FloatArray, m: int, white: Float
 
 @jit_inline
 def chi2_of(nu: FloatArray, s: FloatArray, m: int, white: FloatArray) -> float:
-    """νᵀ S⁻¹ ν; ``white`` gets L⁻¹ ν, s its factor L. Infinite where S is not positive."""
+    """Return νᵀ S⁻¹ ν; ``white`` gets L⁻¹ ν, s its factor L. Infinite where S is not positive."""
     for i in range(m):
         white[i] = nu[i]
     if not factorise(s, m):
@@ -260,7 +260,7 @@ def bridge_over(run: Running, made_up: FloatArray, gap_s: float) -> None:
 
 @jit_inline
 def share_of(samples: Samples, i: int, now_ns: int, first: bool) -> float:
-    """Which share of a sample's increments belongs to the time from now to its end.
+    """Return which share of a sample's increments belongs to the time from now to its end.
 
     All of it, but for the sample in which the start lies (less), and where samples are missing that nobody bridged
     (more: the gap is given the present sample's rates).

@@ -134,7 +134,7 @@ def _scales_of(scale: Mapping[int, float], vertical: Mapping[int, float]) -> Flo
 
 @jit_inline
 def _acceleration(x: FloatArray, sums: FloatArray, rot: Matrix) -> tuple[Three, Three]:
-    """Specific force in e, of the latest sample, and the body's acceleration relative to e by it."""
+    """Return specific force in e, of the latest sample, and the body's acceleration relative to e by it."""
     f = times(rot, three(sums, LAST_FORCE))
     g = gravity_of(x[POSITION], x[POSITION + 1], x[POSITION + 2])
     twice = 2.0 * EARTH_RATE_RADPS
@@ -143,7 +143,7 @@ def _acceleration(x: FloatArray, sums: FloatArray, rot: Matrix) -> tuple[Three, 
 
 @jit_inline
 def _arm_of(x: FloatArray, rules: Rules, layout: Layout, antenna: int) -> Three:
-    """Lever arm of an antenna, as estimated where it is."""
+    """Return lever arm of an antenna, as estimated where it is."""
     if antenna == 0 and layout.lever_arm >= 0:
         return three(x, LEVER_ARM)
     return row(rules.arms_b, antenna)
@@ -151,7 +151,7 @@ def _arm_of(x: FloatArray, rules: Rules, layout: Layout, antenna: int) -> Three:
 
 @jit_inline
 def _swing_of(x: FloatArray, sums: FloatArray, rot: Matrix, arm: Three) -> tuple[Three, Three]:
-    """Rate of the body relative to e, in b, and the velocity it gives the arm's end, in b."""
+    """Return rate of the body relative to e, in b, and the velocity it gives the arm's end, in b."""
     earth = transposed_times(rot, (0.0, 0.0, EARTH_RATE_RADPS))
     rate = plus(three(sums, LAST_RATE), -1.0, earth)
     return rate, cross(rate, arm)
@@ -364,7 +364,7 @@ def predict(
     x: FloatArray, sums: FloatArray, rules: Rules, layout: Layout, what: NDArray[np.uint8], figures: FloatArray,
     nu: FloatArray, rows: FloatArray, noise: FloatArray,
 ) -> int:  # fmt: skip
-    """Innovation, its derivatives and the observation's covariance.
+    """Return innovation, its derivatives and the observation's covariance.
 
     Args:
         x: (STATE_SIZE,); sums: (SUMS_SIZE,), for the latest rate and force.

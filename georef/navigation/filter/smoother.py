@@ -95,7 +95,7 @@ def smooth(run: FilterRun) -> Solution:
 
 
 def forward(run: FilterRun) -> Solution:
-    """The filter's own solution, each epoch by what was known then."""
+    """Return the filter's own solution, each epoch by what was known then."""
     return solution_of(run, None)
 
 
@@ -396,7 +396,7 @@ def _write(
 
 
 def solution_of(run: FilterRun, smoothed: SmoothedNodes | None, first: int = 0, last: int | None = None) -> Solution:
-    """The solution at path rows first to last − 1: smoothed, or without that the filter's own."""
+    """Return the solution at path rows first to last − 1: smoothed, or without that the filter's own."""
     path = Path._make(column[first:last] for column in run.path)
     position_e, velocity_e, q, sigma = (run.storage.empty((len(path.time_ns), k), np.float64) for k in (3, 3, 4, 9))
     for begin in range(0, len(path.time_ns), PIECE):
@@ -450,7 +450,7 @@ def solution_of(run: FilterRun, smoothed: SmoothedNodes | None, first: int = 0, 
 
 
 def _sensor_sigmas(packed: FloatArray, size: int) -> FloatArray:
-    """(m, size − 9) of covariances packed by rows."""
+    """Return (m, size − 9) of covariances packed by rows."""
     diagonal = [i * (i + 1) // 2 + i for i in range(E_SENSORS, size)]
     sigmas: FloatArray = np.sqrt(np.maximum(packed[:, diagonal], 0.0))
     return sigmas

@@ -35,7 +35,7 @@ class Storage:
     """Where the arrays of a run are kept: in memory, unless the caller has another one (files, for a long flight)."""
 
     def empty(self, shape: tuple[int, ...], dtype: Any) -> NDArray[Any]:
-        """An array whose contents do not matter."""
+        """Return an array whose contents do not matter."""
         return np.empty(shape, dtype)
 
     def rest(self) -> None:
@@ -60,7 +60,7 @@ class PathStore:
         self._block = _path(0, IN_MEMORY)
 
     def room(self, rows: int) -> Path:
-        """A block that takes so many more."""
+        """Return a block that takes so many more."""
         if len(self._block.time_ns) - int(self._clock[OUT]) < rows:
             self._full.append(_cut(self._block, int(self._clock[OUT])))
             self._block = _path(max(rows, PATH_ROWS, self._expected), self._storage)
@@ -69,7 +69,7 @@ class PathStore:
         return self._block
 
     def whole(self) -> Path:
-        """All rows so far."""
+        """Return all rows so far."""
         parts = [part for part in [*self._full, _cut(self._block, int(self._clock[OUT]))] if len(part.time_ns)]
         if len(parts) == 1:
             return parts[0]
@@ -78,7 +78,7 @@ class PathStore:
         return Path._make(np.concatenate(columns) for columns in zip(*parts, strict=True))
 
     def taken(self) -> Path:
-        """All rows so far, which are forgotten."""
+        """Return all rows so far, which are forgotten."""
         whole = Path._make(column.copy() for column in self.whole())
         self._full.clear()
         self._clock[OUT] = 0
@@ -98,7 +98,7 @@ class NodeStore:
         self._block = _nodes(0, 0, layout, IN_MEMORY)
 
     def room(self, nodes: int, components: int) -> Nodes:
-        """A block that takes so many more."""
+        """Return a block that takes so many more."""
         if not self.kept:
             self._clock[NODE] = self._clock[SCALAR] = 0
         free = len(self._block.time_ns) - int(self._clock[NODE])
@@ -110,7 +110,7 @@ class NodeStore:
         return self._block
 
     def blocks(self) -> list[Nodes]:
-        """All so far, in order; `first` counts in each block anew."""
+        """Return all so far, in order; `first` counts in each block anew."""
         return [block for block in [*self._full, self._used()] if len(block.time_ns)]
 
     def _used(self) -> Nodes:
@@ -179,7 +179,7 @@ class RowQueue:
         self.refuse(waiting)
 
     def innovations(self) -> StructArray:
-        """What became of all rows so far (where they are kept), by time."""
+        """Return what became of all rows so far (where they are kept), by time."""
         if not self._told:
             return np.zeros(0, INNOVATION_DTYPE)
         whole = np.concatenate(self._told)
@@ -188,14 +188,14 @@ class RowQueue:
 
 
 def columns_of(rows: StructArray) -> Rows:
-    """Observations as compiled loops take them."""
+    """Return observations as compiled loops take them."""
     what = np.stack([rows[name] for name in ("kind", "fix_type", "satellites", "antenna")], axis=1)
     figures = np.concatenate([rows["value"], rows["sigma"], rows["correlation"]], axis=1)
     return Rows(np.ascontiguousarray(rows["time_ns"]), what, figures)
 
 
 def told_of(rows: int) -> Told:
-    """Room for what is told."""
+    """Return room for what is told."""
     return Told(np.empty(rows, np.uint8), np.empty(rows, np.uint8), np.empty((rows, TOLD_SIZE)))
 
 

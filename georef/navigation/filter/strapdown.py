@@ -55,7 +55,7 @@ class Samples(NamedTuple):
 
 
 def samples_of(inertial: Inertial) -> Samples:
-    """The columns, contiguous."""
+    """Return the columns, contiguous."""
     return Samples(
         np.ascontiguousarray(inertial.time_ns, dtype=np.int64),
         np.ascontiguousarray(inertial.interval_s, dtype=np.float64),
@@ -68,13 +68,13 @@ def samples_of(inertial: Inertial) -> Samples:
 
 @jit_inline
 def row(array: FloatArray, k: int) -> Three:
-    """Row k of (n, 3)."""
+    """Return row k of (n, 3)."""
     return array[k, 0], array[k, 1], array[k, 2]
 
 
 @jit_inline
 def three(array: FloatArray, k: int) -> Three:
-    """Elements k, k + 1, k + 2 of (n,)."""
+    """Return elements k, k + 1, k + 2 of (n,)."""
     return array[k], array[k + 1], array[k + 2]
 
 
@@ -106,7 +106,7 @@ def corrected(measured: Three, bias: Three, scale: Three, lean: Three, interval_
 
 @jit_inline
 def leaned(u: Three, lean: Three) -> Three:
-    """u − M(l) u."""
+    """Return u − M(l) u."""
     return (
         u[0] - (lean[2] * u[1] + lean[1] * u[2]),
         u[1] - (lean[2] * u[0] + lean[0] * u[2]),
@@ -116,7 +116,7 @@ def leaned(u: Three, lean: Three) -> Three:
 
 @jit_inline
 def rotated_velocity(angle: Three, velocity: Three) -> Three:
-    """∫ exp([φ(t)]×) f dt over an interval of constant rate and force, in the axes at its begin.
+    """Return ∫ exp([φ(t)]×) f dt over an interval of constant rate and force, in the axes at its begin.
 
     Savage 1998, part 2, Eq. 20:
     Velocity increment + (1 − cos φ) / φ² φ × Δv + (φ − sin φ) / φ³ φ × (φ × Δv).
@@ -135,7 +135,7 @@ def rotated_velocity(angle: Three, velocity: Three) -> Three:
 
 @jit_inline
 def half_turn(angle: Three) -> tuple[float, float]:
-    """cos(φ/2), sin(φ/2) / φ of a rotation vector."""
+    """Return cos(φ/2), sin(φ/2) / φ of a rotation vector."""
     square = 0.25 * (angle[0] * angle[0] + angle[1] * angle[1] + angle[2] * angle[2])
     if square < _SMALL_2:
         cos = 1.0 - square * (0.5 - square * (1.0 / 24.0 - square * (1.0 / 720.0 - square / 40320.0)))
@@ -211,7 +211,7 @@ def advance_part(x: FloatArray, sums: FloatArray, angle_b: Three, velocity_b: Th
 
 @jit_inline
 def coning_and_sculling(before: FloatArray, angle: Three, velocity: Three, span_s: float) -> tuple[Three, Three]:
-    """What a linear course of rate and force over two intervals adds to the increments of the second.
+    """Return what a linear course of rate and force over two intervals adds to the increments of the second.
 
     With h₁ and h₂ their lengths: h₂² / (6 h₁ (h₁ + h₂)) times the products of the increments, 1/12 of them where the
     lengths are equal (Savage 1998, Eq. 1-38 and 2-36).

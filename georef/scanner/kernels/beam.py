@@ -32,7 +32,8 @@ def mirror_angle(theta: float) -> float:
 
 @jit_inline
 def line_beam(row: Eight, sin: float, cos: float) -> Three:
-    """Off a mirror whose normal stands at 45° − θ/2 to a laser on the +y side: u = u0 − 2 (u0·n) n (FORMULAS 2.2).
+    """Return off a mirror whose normal stands at 45° − θ/2 to a laser on the +y side: u = u0 − 2 (u0·n) n (FORMULAS
+    2.2).
 
     With ε = 0 this is ISO/TS 19159-2 Eq. 14's (−sin Δη, sin θ cos Δη, cos θ cos Δη). Sine and cosine are of
     `mirror_angle`.
@@ -43,7 +44,7 @@ def line_beam(row: Eight, sin: float, cos: float) -> Three:
 
 @jit_inline
 def line_turn(row: Eight, sin: float, cos: float) -> tuple[Three, Three]:
-    """∂u/∂θ and ∂u/∂Δη of `line_beam`."""
+    """Return ∂u/∂θ and ∂u/∂Δη of `line_beam`."""
     twice = 2.0 * (row[0] * row[2] + row[1] * row[3] * sin)
     by_theta = row[1] * row[3] * cos
     by_eta = 2.0 * (row[1] * row[2] - row[0] * row[3] * sin)
@@ -57,7 +58,7 @@ def line_turn(row: Eight, sin: float, cos: float) -> tuple[Three, Three]:
 
 @jit_inline
 def nutating_beam(row: Eight, sin: float, cos: float) -> Three:
-    """Off a mirror whose normal leans by ψ from its shaft, the laser along +x (FORMULAS 2.2, Palmer)."""
+    """Return off a mirror whose normal leans by ψ from its shaft, the laser along +x (FORMULAS 2.2, Palmer)."""
     aside = row[0] * cos
     x, y, z = aside * row[2] - row[1] * row[3], row[0] * sin, aside * row[3] + row[1] * row[2]
     return 1.0 - 2.0 * x * x, -2.0 * x * y, -2.0 * x * z
@@ -65,7 +66,7 @@ def nutating_beam(row: Eight, sin: float, cos: float) -> Three:
 
 @jit_inline
 def nutating_turn(row: Eight, sin: float, cos: float) -> Three:
-    """∂u/∂γ of `nutating_beam`."""
+    """Return ∂u/∂γ of `nutating_beam`."""
     sin, cos = row[0] * sin, row[0] * cos
     x, y, z = cos * row[2] - row[1] * row[3], sin, cos * row[3] + row[1] * row[2]
     dx, dy, dz = -sin * row[2], cos, -sin * row[3]
@@ -74,7 +75,7 @@ def nutating_turn(row: Eight, sin: float, cos: float) -> Three:
 
 @jit_inline
 def risley_beam(row: Eight, first: Two, second: Two) -> Three:
-    """Through the last of a Risley pair's four surfaces by Snell's law as vectors (FORMULAS 2.2).
+    """Return through the last of a Risley pair's four surfaces by Snell's law as vectors (FORMULAS 2.2).
 
     Before it the ray is a cone about z that turns with the first prism: the three surfaces before are passed once for
     all, in `swath.georef.scanner.beams`. nan where the light is totally reflected. ``first``, ``second``: sine and
@@ -89,7 +90,7 @@ def risley_beam(row: Eight, first: Two, second: Two) -> Three:
 
 @jit_inline
 def risley_turn(row: Eight, first: Two, second: Two) -> Three:
-    """∂u/∂γ of `risley_beam`."""
+    """Return ∂u/∂γ of `risley_beam`."""
     x, y, z = row[0] * first[1], row[0] * first[0], row[1]
     nx, ny, nz = row[2] * second[1], row[2] * second[0], row[3]
     dnx, dny = -row[5] * ny, row[5] * nx
@@ -103,18 +104,18 @@ def risley_turn(row: Eight, first: Two, second: Two) -> Three:
 
 @jit_inline
 def spinning_angle(row: Eight, theta: float) -> float:
-    """Azimuth of a channel of a spinning head."""
+    """Return azimuth of a channel of a spinning head."""
     return row[6] * theta + row[2]
 
 
 @jit_inline
 def spinning_beam(row: Eight, sin: float, cos: float) -> tuple[Three, Three]:
-    """Where a spinning head's beam starts (m), and its direction; azimuth from y towards x (FORMULAS 2.2)."""
+    """Return where a spinning head's beam starts (m), and its direction; azimuth from y towards x (FORMULAS 2.2)."""
     start = row[4] * sin + row[3] * cos, row[4] * cos - row[3] * sin, row[5]
     return start, (row[1] * sin, row[1] * cos, row[0])
 
 
 @jit_inline
 def spinning_turn(row: Eight, start: Three, direction: Three, range_m: float) -> Three:
-    """∂point/∂θ, m/rad."""
+    """Return ∂point/∂θ, m/rad."""
     return row[6] * (start[1] + range_m * direction[1]), -row[6] * (start[0] + range_m * direction[0]), 0.0

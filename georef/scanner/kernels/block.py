@@ -63,7 +63,7 @@ ROWS = 68
 
 @jit_inline
 def three(block: FloatArray, at: int, i: int) -> Three:
-    """Three rows."""
+    """Return three rows."""
     return block[at, i], block[at + 1, i], block[at + 2, i]
 
 
@@ -82,7 +82,7 @@ def clear(block: FloatArray, at: int) -> None:
 
 @jit_inline
 def beam_at(block: FloatArray, i: int) -> Eight:
-    """The geometry's row."""
+    """Return the geometry's row."""
     return (
         block[BEAM, i],
         block[BEAM + 1, i],
@@ -231,5 +231,5 @@ def hand_over(block: FloatArray, n: int, at: int, out: FloatArray, k: int) -> No
 
 @jit_inline
 def new_block() -> FloatArray:
-    """Room; its size is a constant here, so that rows are known to be apart."""
+    """Return room; its size is a constant here, so that rows are known to be apart."""
     return np.zeros((ROWS, BLOCK))

@@ -112,14 +112,14 @@ class Doubt(NamedTuple):
 
 @jit_inline
 def with_outer(c: Six, factor: float, a: Three) -> Six:
-    """C + factor · a aᵀ; xx, xy, xz, yy, yz, zz."""
+    """Return C + factor · a aᵀ; xx, xy, xz, yy, yz, zz."""
     x, y, z = factor * a[0], factor * a[1], factor * a[2]
     return c[0] + x * a[0], c[1] + x * a[1], c[2] + x * a[2], c[3] + y * a[1], c[4] + y * a[2], c[5] + z * a[2]
 
 
 @jit_inline
 def sum_of(a: Six, factor: float, b: Six) -> Six:
-    """a + factor · b."""
+    """Return a + factor · b."""
     return (
         a[0] + factor * b[0],
         a[1] + factor * b[1],
@@ -132,14 +132,14 @@ def sum_of(a: Six, factor: float, b: Six) -> Six:
 
 @jit_inline
 def with_transpose(a: Three, b: Three) -> Six:
-    """a bᵀ + b aᵀ."""
+    """Return a bᵀ + b aᵀ."""
     mixed = a[0] * b[1] + a[1] * b[0], a[0] * b[2] + a[2] * b[0], a[1] * b[2] + a[2] * b[1]
     return 2.0 * a[0] * b[0], mixed[0], mixed[1], 2.0 * a[1] * b[1], mixed[2], 2.0 * a[2] * b[2]
 
 
 @jit_inline
 def applied(c: Six, a: Three) -> Three:
-    """C a."""
+    """Return C a."""
     return (
         c[0] * a[0] + c[1] * a[1] + c[2] * a[2],
         c[1] * a[0] + c[3] * a[1] + c[4] * a[2],
@@ -149,7 +149,7 @@ def applied(c: Six, a: Three) -> Three:
 
 @jit_inline
 def turned(c: Six, rows: Matrix) -> Six:
-    """R C Rᵀ."""
+    """Return R C Rᵀ."""
     x, y, z = rows
     cx, cy, cz = applied(c, x), applied(c, y), applied(c, z)
     return dot(x, cx), dot(x, cy), dot(x, cz), dot(y, cy), dot(y, cz), dot(z, cz)
@@ -172,7 +172,7 @@ def of_turn(c: Six, arm: Three) -> Six:
 
 @jit_inline
 def six(block: FloatArray, i: int) -> Six:
-    """The covariance so far."""
+    """Return the covariance so far."""
     at = COVARIANCE
     return block[at, i], block[at + 1, i], block[at + 2, i], block[at + 3, i], block[at + 4, i], block[at + 5, i]
 
@@ -186,7 +186,7 @@ def keep(block: FloatArray, i: int, c: Six) -> None:
 
 @jit_inline
 def axes_at(block: FloatArray, i: int) -> Matrix:
-    """Rows of rot_e_from_b."""
+    """Return rows of rot_e_from_b."""
     return three(block, ROT, i), three(block, ROT_2, i), three(block, ROT_3, i)
 
 
@@ -212,7 +212,7 @@ def take_axes(block: FloatArray, n: int, rot: Matrix, phi: Three) -> None:
 
 @jit_cached
 def at_epoch(flown: Flown, k: int) -> tuple[Six, Six]:
-    """Covariance of the position in e, m², and of the attitude as a rotation vector in b, rad², at an epoch.
+    """Return covariance of the position in e, m², and of the attitude as a rotation vector in b, rad², at an epoch.
 
     Roll turns the body about its x, pitch about the level y, heading about down.
     """

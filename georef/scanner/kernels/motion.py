@@ -42,7 +42,7 @@ def cut(
     angle: FloatArray,
     pieces: IntArray,
 ) -> tuple[int, int]:
-    """Rows to pulses, and pulses to pieces of time; a piece, and a window, never crosses a jump.
+    """Return rows to pulses, and pulses to pieces of time; a piece, and a window, never crosses a jump.
 
     Args:
         rows: (n,) `RETURN_DTYPE` in the order of emission; time_ns: (n,) their GPS times; n > 0.
@@ -79,7 +79,7 @@ def cut(
 
 @jit_inline
 def window_of(pieces: IntArray, m: int, n: int, piece: int, reach: int) -> tuple[int, int]:
-    """Pulses from, to of the pieces at most ``reach`` away in time, of the same train."""
+    """Return pulses from, to of the pieces at most ``reach`` away in time, of the same train."""
     first, last = piece, piece
     train, place = pieces[piece, TRAIN], pieces[piece, PLACE]
     while first > 0 and pieces[first - 1, TRAIN] == train and place - pieces[first - 1, PLACE] <= reach:
@@ -91,7 +91,7 @@ def window_of(pieces: IntArray, m: int, n: int, piece: int, reach: int) -> tuple
 
 @jit_inline
 def solve(normal: FloatArray, right: FloatArray, size: int) -> bool:
-    """Cholesky in place; the solution in ``right``. False: the points do not tell."""
+    """Return Cholesky in place; the solution in ``right``. False: the points do not tell."""
     for j in range(size):
         diagonal = normal[j, j]
         for k in range(j):
@@ -118,7 +118,8 @@ def solve(normal: FloatArray, right: FloatArray, size: int) -> bool:
 
 @jit_inline
 def take(pulse_ns: IntArray, angle: FloatArray, windows: IntArray, scale: FloatArray, begin: int, tile: Tile) -> int:
-    """Times and readings from pulse ``begin`` of each window on into the tile, a column each, zeros behind its end.
+    """Return times and readings from pulse ``begin`` of each window on into the tile, a column each, zeros behind its
+    end.
 
     Returns:
         How many rows of the tile are filled: an even number.
@@ -185,7 +186,9 @@ def sum_up(
 
 @jit_inline
 def fit(sums: FloatArray, lane: int, size: int, work: FloatArray) -> bool:
-    """Coefficients of the polynomial with these sums, in its window's unit, into row 0 of ``work``, zeros behind."""
+    """Return coefficients of the polynomial with these sums, in its window's unit, into row 0 of ``work``, zeros
+    behind.
+    """
     work[0] = 0.0
     for j in range(size):
         work[0, j] = sums[RIGHT + j, lane]
@@ -196,7 +199,9 @@ def fit(sums: FloatArray, lane: int, size: int, work: FloatArray) -> bool:
 
 @jit_inline
 def choose(pulse_ns: IntArray, pieces: IntArray, piece: int, steady: bool) -> tuple[int, int, int, int]:
-    """Window of a piece, as from pulse, to pulse, how many pieces to either side; number of coefficients, 0: none."""
+    """Return window of a piece, as from pulse, to pulse, how many pieces to either side; number of coefficients, 0:
+    none.
+    """
     first, last, reach, wide = 0, 0, 0, False
     for reach in TIERS:
         first, last = window_of(pieces, len(pieces), len(pulse_ns), piece, reach)
@@ -213,7 +218,7 @@ def choose(pulse_ns: IntArray, pieces: IntArray, piece: int, steady: bool) -> tu
 
 @jit_inline
 def pulses_of(pieces: IntArray, piece: int, n: int) -> tuple[int, int]:
-    """Pulses from, to of a piece."""
+    """Return pulses from, to of a piece."""
     return pieces[piece, FIRST], pieces[piece + 1, FIRST] if piece + 1 < len(pieces) else n
 
 
@@ -250,7 +255,7 @@ def rates(
     rate: FloatArray,
     acceleration: FloatArray,
 ) -> int:
-    """dθ/dt and d²θ/dt² of the rows of some pieces.
+    """Return dθ/dt and d²θ/dt² of the rows of some pieces.
 
     Args:
         pulses, pulse_ns, angle: (n,) of `cut`; pieces: (m, 3).

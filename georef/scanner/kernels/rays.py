@@ -76,7 +76,7 @@ FIRST = whole(0)
 
 @jit_inline
 def ibrc_of(ranging: Ranging, intensity: float) -> float:
-    """Linear between the knots, level beyond them."""
+    """Return linear between the knots, level beyond them."""
     knots, values = ranging.ibrc_intensity, ranging.ibrc_m
     last = len(knots) - 1
     if intensity >= knots[last]:
@@ -91,7 +91,9 @@ def ibrc_of(ranging: Ranging, intensity: float) -> float:
 
 @jit_inline
 def interval_of(track: Track, t: int, guess: int) -> tuple[int, int, float, int, int]:
-    """Interval of the trajectory with t: its times, 1 / ns between them, fate, epoch. Outside all one of no length."""
+    """Return interval of the trajectory with t: its times, 1 / ns between them, fate, epoch. Outside all one of no
+    length.
+    """
     at = locate_epoch(track.time_ns, t, guess)
     if at < 0:
         return t, t, 0.0, OUTSIDE, guess
@@ -101,7 +103,7 @@ def interval_of(track: Track, t: int, guess: int) -> tuple[int, int, float, int,
 
 @jit_inline
 def way_at(track: Track, t: int, guess: int) -> tuple[int, int, float, int, int, Three, Three]:
-    """The interval with t, the position at its epoch, and the way to the next."""
+    """Return the interval with t, the position at its epoch, and the way to the next."""
     begin, end, per_ns, fate, at = interval_of(track, t, guess)
     here = vector_at(track.position_e, at)
     return begin, end, per_ns, fate, at, here, plus(vector_at(track.position_e, at + 1), -1.0, here)
@@ -109,7 +111,7 @@ def way_at(track: Track, t: int, guess: int) -> tuple[int, int, float, int, int,
 
 @jit_inline
 def level_at(track: Track, at: int) -> tuple[Three, Three]:
-    """Down, and level to the right of the nose, in e at an epoch."""
+    """Return down, and level to the right of the nose, in e at an epoch."""
     x, y, z = vector_at(track.position_e, at)
     down = unit((-x, -y, -z / MINOR_2))  # along the ellipsoid's normal, to 2 µrad at 3 km
     rot_e_from_b = rot_at(track.q_e_from_b, at)
@@ -118,7 +120,7 @@ def level_at(track: Track, at: int) -> tuple[Three, Three]:
 
 @jit_inline
 def turn_at(model: Model, t: int, guess: int) -> tuple[int, int, float, int, int, Matrix, Three, float, Matrix]:
-    """The interval with t, and its turn as the boresight's ω and φ see it.
+    """Return the interval with t, and its turn as the boresight's ω and φ see it.
 
     Returns:
         the interval; rot_e_from_b · outer at its epoch; the rotation vector to the next, outerᵀ φ; φ²; and three
@@ -136,7 +138,7 @@ def turn_at(model: Model, t: int, guess: int) -> tuple[int, int, float, int, int
 
 @jit_inline
 def channel_of(select: int, channels: int, channel: int, encoder_rad: float) -> int:
-    """Row of the table; −1 where it has none."""
+    """Return row of the table; −1 where it has none."""
     if select == ONE:
         return 0
     if select == FIBRE_BY_ENCODER:

@@ -28,7 +28,7 @@ STATE_SIZE = 10
 
 @jit_inline
 def ticks_of(time_ns: int, tick_hz: int) -> int:
-    """Counter of a time that is floor(ticks · 10⁹ / tick_hz)."""
+    """Return counter of a time that is floor(ticks · 10⁹ / tick_hz)."""
     seconds = time_ns // 1_000_000_000
     return seconds * tick_hz + ((time_ns - seconds * 1_000_000_000) * tick_hz + 999_999_999) // 1_000_000_000
 
@@ -108,7 +108,7 @@ def push(sorted_m: FloatArray, ring_m: FloatArray, counts: IntArray, value: floa
 
 @jit_inline
 def even(state: IntArray) -> bool:
-    """Whether pulses come at even times: those between two of them are then known to the tick."""
+    """Return whether pulses come at even times: those between two of them are then known to the tick."""
     widest = max(state[MOST], state[OLD_MOST])
     return bool(widest > 0 and widest - min(state[LEAST], state[OLD_LEAST]) <= 1)
 
@@ -152,7 +152,7 @@ def nearest_emission(
     slanted: bool,
     scale: tuple[float, int],
 ) -> tuple[int, float]:
-    """The emission that gives a range nearest to the expected one, and by how much that is longer.
+    """Return the emission that gives a range nearest to the expected one, and by how much that is longer.
 
     Back from the record's own emission, whose range is the shortest, until the range is longer than expected.
 
@@ -177,7 +177,7 @@ def nearest_emission(
 
 @jit_inline
 def verdict(miss_m: float, period_m: float, margin: float, zone: int, apparent_m: float, blind_m: float) -> int:
-    """The zone, or why there is none."""
+    """Return the zone, or why there is none."""
     if abs(miss_m) > 0.5 * period_m:
         return GAP  # the emission expected is not known
     if abs(miss_m) > (0.5 - margin) * period_m or (zone > 0 and apparent_m < blind_m):

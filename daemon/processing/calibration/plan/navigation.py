@@ -61,7 +61,7 @@ class PlannedNavigation:
     sigmas: tuple[float, float, float]
 
     def prior(self, flight: Flight) -> TrajectoryPrior:
-        """The errors' joint covariance at knots of a flight on this trajectory alone."""
+        """Return the errors' joint covariance at knots of a flight on this trajectory alone."""
         knots = knots_of(flight, KNOT_S)
         return from_smoother(flight, [error_chain(self.run, knots.time_ns)], KNOT_S)
 

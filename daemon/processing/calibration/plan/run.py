@@ -195,7 +195,7 @@ def _gps(time_s: float) -> int:
 
 
 def _rows(predicted: Predicted) -> list[dict[str, Any]]:
-    """A parameter each, in files' units, in the order of the model."""
+    """Return a parameter each, in files' units, in the order of the model."""
     by_name = {parameter.name: (number, parameter) for number, parameter in enumerate(PARAMETERS)}
     found: list[tuple[str, float, FixedParameter | None]] = [
         (name, sigma, None) for name, sigma in zip(predicted.names, predicted.sigmas.tolist(), strict=True)
@@ -263,7 +263,7 @@ def _trajectory(survey: Survey, sigmas: tuple[float, float, float]) -> Trajector
 
 
 def _fallen(survey: Survey, places: FloatArray) -> tuple[FloatArray, NDArray[np.uint8]]:
-    """What rays that fall at places (…, 2) meet: site coordinates (…, 3) and the surface (…)."""
+    """Return what rays that fall at places (…, 2) meet: site coordinates (…, 3) and the surface (…)."""
     flat = places.reshape(-1, 2)
     top = survey.scene.site_z(flat[:, 0], flat[:, 1]) + ABOVE_M
     origin = np.column_stack([flat, top])
@@ -274,7 +274,7 @@ def _fallen(survey: Survey, places: FloatArray) -> tuple[FloatArray, NDArray[np.
 
 
 def _roofs(survey: Survey, frame: Tangent) -> Iterator[Surface]:
-    """The flat parts of every roof: where rays beside each other find one slope and one height."""
+    """Yield the flat parts of every roof: where rays beside each other find one slope and one height."""
     corners = survey.scene.buildings
     if not len(corners):
         return
@@ -312,7 +312,7 @@ def _unit(survey: Survey, frame: Tangent, normal: FloatArray) -> FloatArray:
 
 
 def _ground(survey: Survey, frame: Tangent) -> Iterator[Surface]:
-    """Squares of bare ground all over the swaths."""
+    """Yield squares of bare ground all over the swaths."""
     outline = np.concatenate([survey.edges(strip) for strip in survey.strips])
     low, high = outline.min(axis=0), outline.max(axis=0)
     east, north = (np.linspace(low[axis], high[axis], GROUND_PLACES) for axis in (0, 1))
@@ -323,7 +323,7 @@ def _ground(survey: Survey, frame: Tangent) -> Iterator[Surface]:
 
 
 def _control(survey: Survey, frame: Tangent, sigma_m: float) -> Iterator[Surface]:
-    """The ground around every control point, with it."""
+    """Yield the ground around every control point, with it."""
     for number, point in enumerate(control_points(survey.plan, survey.scene)):
         control = ControlPoint(f"{number + 1}", frame.t_from_e(survey.site.e_from_site(point[np.newaxis]))[0], sigma_m)
         surface = _square(survey, frame, point[:2], f"control {number + 1}", (control,))
@@ -334,7 +334,7 @@ def _control(survey: Survey, frame: Tangent, sigma_m: float) -> Iterator[Surface
 def _square(
     survey: Survey, frame: Tangent, centre: FloatArray, name: str, control: tuple[ControlPoint, ...] = ()
 ) -> Surface | None:
-    """None where it is no flat ground."""
+    """Return none where it is no flat ground."""
     side = np.linspace(-0.5, 0.5, 6) * GROUND_SIDE_M
     points, surface = _fallen(survey, centre + np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2))
     if not np.isin(surface, [GROUND, ROAD, MARKING]).all():

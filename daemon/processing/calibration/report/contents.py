@@ -55,7 +55,7 @@ MOST_REASONS = 40
 
 
 def blocks_of(report: ReportInput, verdict: Verdict) -> list[Block]:
-    """Everything below the verdict."""
+    """Return everything below the verdict."""
     several = len(report.adjusted.calibrations) > 1
     notes = [plain(line, several=several) for line in (*report.notes, *report.adjusted.notes)]
     found: list[Block | None] = [
@@ -92,7 +92,7 @@ def blocks_of(report: ReportInput, verdict: Verdict) -> list[Block]:
 
 
 def cards_of(report: ReportInput) -> list[tuple[str, str]]:
-    """The figures one looks for first, with their words."""
+    """Return the figures one looks for first, with their words."""
     adjusted, features = report.adjusted, report.features
     boresight, offset_m = sigma_of(report, BORESIGHT), sigma_of(report, ("range_offset_m",))
     before_m, after_m = overall_rms_m(dict(report.before)), overall_rms_m(dict(report.after))

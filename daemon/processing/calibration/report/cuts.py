@@ -40,7 +40,7 @@ class Cut:
 
 
 def cuts_of(report: ReportInput) -> list[Cut]:
-    """Cuts through a few roofs that most swaths saw, far from each other."""
+    """Return cuts through a few roofs that most swaths saw, far from each other."""
     chosen: list[Plane] = []
     slopes = [plane for plane in report.features.planes if _is_roof(plane)]
     for plane in sorted(slopes, key=lambda one: (-len(one.patches), -one.points, one.name)):
@@ -77,7 +77,7 @@ def _cut(flight: Flight, calibrations: Mapping[str, Calibration], plane: Plane) 
 
 
 def _near(points_t: FloatArray, centre_t: FloatArray, half_m: float) -> Int64Array:
-    """Indexes of points within a square, found on mapped arrays piece by piece."""
+    """Return indexes of points within a square, found on mapped arrays piece by piece."""
     found, step = [], 1 << 20
     for first in range(0, len(points_t), step):
         piece = np.asarray(points_t[first : first + step, :2])

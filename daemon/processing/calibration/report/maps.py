@@ -36,7 +36,7 @@ DIFFERENCE_COLOURS = ("#3b0f70", "#2166ac", "#67a9cf", "#c6dbef", "#dff0d8", "#f
 
 
 def map_picture(report: ReportInput) -> Picture:
-    """Strips and planes from above; planes coloured by the root mean square of their residuals."""
+    """Return strips and planes from above; planes coloured by the root mean square of their residuals."""
     shown = _Shown(report)
 
     def height_in(form: Format) -> float:
@@ -56,7 +56,7 @@ def map_picture(report: ReportInput) -> Picture:
 
 
 def difference_picture(report: ReportInput) -> Picture | None:
-    """Height differences of overlapping strips before and after."""
+    """Return height differences of overlapping strips before and after."""
     grid = report.differences
     if grid is None:
         return None
@@ -140,7 +140,7 @@ class _Shown:
         self.low_m, self.high_m = every.min(axis=0) - border, every.max(axis=0) + border
 
     def up_in(self, form: Format) -> float:
-        """Height of the map's panel."""
+        """Return height of the map's panel."""
         width = form.width_in - 0.8
         size = self.high_m - self.low_m
         most = 1.1 if form.narrow else 0.66
@@ -185,7 +185,7 @@ class _Shown:
                     axes.plot(mine[:, 0], mine[:, 1], MARKERS.get(kind, "o"), color=colour, **look)
 
     def legend(self) -> list[Line2D]:
-        """Colours of residuals, then shapes."""
+        """Return colours of residuals, then shapes."""
         handles = [Line2D([], [], marker="o", ls="", ms=6, color=colour, label=word) for colour, word in class_words()]
         look: dict[str, Any] = {"ls": "", "ms": 5.5, "color": MUTED}
         kinds = sorted({plane.kind for plane in self.features.planes})
@@ -222,7 +222,7 @@ def _words(axes: Axes) -> None:
 
 
 def track_of(flight: Flight, swath: Swath) -> FloatArray:
-    """(k, 2) east, north in t of the body while a swath was flown."""
+    """Return (k, 2) east, north in t of the body while a swath was flown."""
     trajectory = flight.trajectories[swath.flown]
     if not len(swath.time_ns):
         return np.zeros((0, 2))
@@ -233,7 +233,7 @@ def track_of(flight: Flight, swath: Swath) -> FloatArray:
 
 
 def outline_of(swath: Swath) -> FloatArray:
-    """(k, 2) convex outline in t of a swath's points."""
+    """Return (k, 2) convex outline in t of a swath's points."""
     points = np.asarray(swath.points_t[:: max(1, len(swath) // MOST_OUTLINE_POINTS), :2], np.float64)
     points = points[np.isfinite(points).all(axis=1)]
     try:
@@ -243,7 +243,7 @@ def outline_of(swath: Swath) -> FloatArray:
 
 
 def plane_rms_cm(report: ReportInput) -> FloatArray:
-    """(planes,) root mean square of residuals, centimetres; nan: none of its observations is left."""
+    """Return (planes,) root mean square of residuals, centimetres; nan: none of its observations is left."""
     count = len(report.features.planes)
     squares, counts = np.zeros(count), np.zeros(count)
     for group in report.adjusted.residuals:
@@ -257,7 +257,7 @@ def plane_rms_cm(report: ReportInput) -> FloatArray:
 
 
 def control_of(report: ReportInput) -> list[ControlPoint]:
-    """Every surveyed point once."""
+    """Return every surveyed point once."""
     points = [point for plane in report.features.planes for point in plane.control]
     points += [tie.control for tie in report.features.ties if tie.control is not None]
     return list({point.name: point for point in points}.values())

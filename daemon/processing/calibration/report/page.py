@@ -20,7 +20,7 @@ NARROW_PX = 640  # of the window, up to which the narrow pictures are shown
 
 
 def html(report: ReportInput) -> str:
-    """The page; the same text for the same input."""
+    """Return the page; the same text for the same input."""
     verdict = judge(report)
     parts = [
         f"<!doctype html><html lang='en'><head><meta charset='utf-8'><title>{escape(report.heading)}</title>",
@@ -37,7 +37,7 @@ def html(report: ReportInput) -> str:
 
 
 def pdf(report: ReportInput) -> bytes:
-    """The same on A4; the same bytes for the same input."""
+    """Return the same on A4; the same bytes for the same input."""
     verdict = judge(report)
     blocks = blocks_of(report, verdict)
     return pdf_of(report.heading, verdict, cards_of(report), identity_rows(report), blocks)

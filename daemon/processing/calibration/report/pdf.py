@@ -49,7 +49,7 @@ def pdf_of(
     identity: Sequence[tuple[str, str]],
     blocks: Sequence[Block],
 ) -> bytes:
-    """The file."""
+    """Return the file."""
     pieces = [_head(title), _judged(verdict), *_cards(cards), *_identity(identity)]
     for block in blocks:
         pieces += _pieces(block)
@@ -63,7 +63,7 @@ def pdf_of(
 
 
 def _paged(pieces: Sequence[Set]) -> list[list[Set]]:
-    """Pieces by page; one that must stand with its next goes over with it."""
+    """Return pieces by page; one that must stand with its next goes over with it."""
     room_in = PAGE_IN[1] - TOP_IN - FOOT_IN
     pages: list[list[Set]] = [[]]
     i = 0
@@ -105,7 +105,7 @@ def _advance(character: str, family: str) -> float:
 
 
 def wrapped(words: str, room_in: float, size: float = SIZE, family: str = "DejaVu Sans") -> list[str]:
-    """Lines that fit; words that are too long (hashes) are broken."""
+    """Return lines that fit; words that are too long (hashes) are broken."""
     lines: list[str] = []
     line = ""
     for word in words.split():
@@ -237,7 +237,7 @@ def _profile(profile: Profile) -> list[Set]:
 
 
 def _table(table: Table) -> list[Set]:
-    """A piece a row, so that a long table goes over pages; its heads stand with the first."""
+    """Return a piece a row, so that a long table goes over pages; its heads stand with the first."""
     size = SMALL
     columns = range(len(table.heads))
     wide = _widths(table, size)
@@ -279,7 +279,7 @@ def _table(table: Table) -> list[Set]:
 
 
 def _widths(table: Table, size: float) -> list[float]:
-    """Columns as wide as their words, those that may wrap sharing what is left."""
+    """Return columns as wide as their words, those that may wrap sharing what is left."""
     natural = []
     for j, head in enumerate(table.heads):
         family = MONO if j in table.hashes else "DejaVu Sans"

@@ -41,7 +41,7 @@ SWATH_LIMITS_CM = ((4.0, "QL0"), (8.0, "QL1, QL2"))  # RMSDz of swath overlap, U
 
 
 def correlation_picture(report: ReportInput) -> Picture | None:
-    """Correlation matrix of the unknowns, with its numbers."""
+    """Return correlation matrix of the unknowns, with its numbers."""
     adjusted = report.adjusted
     if len(adjusted.names) < 2:
         return None
@@ -96,7 +96,7 @@ def _cells(axes: Axes, matrix: FloatArray, cell_in: float) -> None:
 
 
 def strips_picture(report: ReportInput) -> Picture | None:
-    """Root mean square of height differences by pair of strips, before and after."""
+    """Return root mean square of height differences by pair of strips, before and after."""
     pairs: list[Pair] = sorted(report.after, key=lambda pair: -report.after[pair].rms_m)[:MOST_PAIRS]
     if not pairs:
         return None
@@ -138,7 +138,7 @@ def strips_picture(report: ReportInput) -> Picture | None:
 
 
 def control_picture(report: ReportInput) -> Picture | None:
-    """Misclosures of control."""
+    """Return misclosures of control."""
     points = report.adjusted.control[:MOST_CONTROL]
     if not points:
         return None
@@ -169,7 +169,7 @@ def control_picture(report: ReportInput) -> Picture | None:
 
 
 def trajectory_pictures(report: ReportInput) -> list[Picture]:
-    """Corrections of each session's trajectory."""
+    """Return corrections of each session's trajectory."""
     fit = report.adjusted.trajectory
     if fit is None:
         return []
@@ -223,7 +223,7 @@ def _trajectory_picture(fit: TrajectoryFit, flown: int, *, several: bool) -> Pic
 
 
 def _breaks(minutes: FloatArray) -> NDArray[np.int64]:
-    """Where a line would join what was flown long apart."""
+    """Return where a line would join what was flown long apart."""
     steps = np.diff(minutes)
     return np.flatnonzero(steps > 5.0 * np.median(steps)) + 1 if len(steps) else np.zeros(0, np.int64)
 
@@ -235,7 +235,7 @@ def _tables(fit: TrajectoryFit, kind: str) -> tuple[FloatArray, FloatArray, Floa
 
 
 def intensity_picture(report: ReportInput) -> Picture | None:
-    """Range corrections by intensity, where they were estimated or given."""
+    """Return range corrections by intensity, where they were estimated or given."""
     known = [(name, one.ibrc) for name, one in report.adjusted.calibrations.items() if one.ibrc is not None]
     if not known:
         return None

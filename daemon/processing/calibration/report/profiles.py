@@ -46,7 +46,7 @@ UNDER = (
 
 
 def comparison_table(checked: Check) -> Table | None:
-    """Profiles say, adjustment says, difference in sigmas; and what has no profile."""
+    """Return profiles say, adjustment says, difference in sigmas; and what has no profile."""
     if not checked.comparisons and not checked.missing:
         return None
     several = len({one.scanner for one in checked.comparisons} | {scanner for scanner, _ in checked.missing}) > 1
@@ -69,7 +69,7 @@ def _compared(one: Comparison, *, several: bool) -> list[str]:
 
 
 def profiles_table(checked: Check) -> Table | None:
-    """Every profile: separation, baseline, formula."""
+    """Return every profile: separation, baseline, formula."""
     rows = [
         [
             profile.kind,
@@ -107,7 +107,7 @@ def pictures(checked: Check, at_start: Flight, control: Sequence[ControlPoint] =
 
 
 def _surest(profiles: Sequence[Profile]) -> list[Profile]:
-    """One of every pair and kind, kinds in turn, no more than are worth looking at."""
+    """Return one of every pair and kind, kinds in turn, no more than are worth looking at."""
     pairs: dict[tuple[str, int, int], Profile] = {}
     for profile in sorted(profiles, key=lambda one: one.noise_sigma):
         pairs.setdefault((profile.kind, profile.first, profile.second), profile)
@@ -120,7 +120,7 @@ def _surest(profiles: Sequence[Profile]) -> list[Profile]:
 
 
 def _sections(profile: Profile, flight: Flight, control: Sequence[ControlPoint]) -> tuple[Section, Section]:
-    """Both strips' returns along it, as this flight places them."""
+    """Return both strips' returns along it, as this flight places them."""
     corridor = Corridor.between(profile.ends_t[0], profile.ends_t[1], profile.cells[0].half_width_m)
     first, second = (_section(corridor, Ground.of(flight.swaths[swath])) for swath in (profile.first, profile.second))
     return first, second
@@ -134,8 +134,8 @@ def _section(corridor: Corridor, ground: Ground) -> Section:
 
 
 def _targets(profile: Profile, flight: Flight, control: Sequence[ControlPoint]) -> tuple[Section, Section]:
-    """The ground that this flight shows at the profile's targets, less what was surveyed; those without any are left
-    out."""
+    """Return the ground that this flight shows at the profile's targets, less what was surveyed; those without any are
+    left out."""
     surveyed = {point.name: point.position_t for point in control}
     ground = Ground.of(flight.swaths[profile.first])
     right = profile.ends_t[1, :2] - profile.ends_t[0, :2]
@@ -155,7 +155,9 @@ def _targets(profile: Profile, flight: Flight, control: Sequence[ControlPoint]) 
 
 
 def draw(profile: Profile) -> Figure:
-    """Two panels, before and after, over the distance along the profile (of a range: to the right of the track)."""
+    """Return two panels, before and after, over the distance along the profile (of a range: to the right of the
+    track).
+    """
     figure = Figure(figsize=PAGE_IN, facecolor="white")
     panels: list[Axes] = list(figure.subplots(1, 2, sharex=True, sharey=True))
     low, high = _window(profile)
@@ -183,7 +185,7 @@ def draw(profile: Profile) -> Figure:
 
 
 def svg(profile: Profile) -> str:
-    """The picture as SVG, the same for the same profile."""
+    """Return the picture as SVG, the same for the same profile."""
     text = io.StringIO()
     with mpl.rc_context(_SVG):
         draw(profile).savefig(text, format="svg", metadata={"Date": None, "Creator": None})

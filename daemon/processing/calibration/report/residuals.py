@@ -38,7 +38,7 @@ class Seen:
 
 
 def seen_of(report: ReportInput) -> Seen:
-    """Those that were kept, of all groups."""
+    """Return those that were kept, of all groups."""
     pieces: list[tuple[FloatArray, ...]] = []
     for group in report.adjusted.residuals:
         kept = (group.weight > 0.0) & (group.swath >= 0) & (group.at >= 0)
@@ -54,7 +54,7 @@ def seen_of(report: ReportInput) -> Seen:
 
 
 def residual_picture(report: ReportInput) -> Picture | None:
-    """Their distribution by strip, scan angle, range and intensity."""
+    """Return their distribution by strip, scan angle, range and intensity."""
     seen = seen_of(report)
     if not len(seen.misclosure_m):
         return None

@@ -57,7 +57,7 @@ class Table:
 
 
 def parameter_tables(report: ReportInput) -> list[Table]:
-    """One a scanner: start, estimate, change, sigma, significance; what was held is set back."""
+    """Return one a scanner: start, estimate, change, sigma, significance; what was held is set back."""
     names = list(report.adjusted.calibrations)
     return [_parameters(report, scanner, several=len(names) > 1) for scanner in names]
 
@@ -117,7 +117,7 @@ def _estimated(one: Unknown, start: float, value: float, sigma: float, prior: fl
 
 
 def entries_table(report: ReportInput) -> Table | None:
-    """Unknowns that are entries of tables: IBRC, beams, range offsets."""
+    """Return unknowns that are entries of tables: IBRC, beams, range offsets."""
     adjusted = report.adjusted
     rows = []
     for i, name in enumerate(adjusted.names):
@@ -133,7 +133,7 @@ def entries_table(report: ReportInput) -> Table | None:
 
 
 def held_table(report: ReportInput) -> Table | None:
-    """What this flight does not determine, and what would."""
+    """Return what this flight does not determine, and what would."""
     several = len(report.adjusted.calibrations) > 1
     held = [one for one in report.adjusted.held if is_undetermined(one)]
     if not held:
@@ -166,7 +166,7 @@ def _alike(held: FixedParameter) -> str:
 
 
 def strips_table(report: ReportInput) -> Table | None:
-    """Height differences by pair of strips."""
+    """Return height differences by pair of strips."""
     if not report.after:
         return None
     rows = []
@@ -203,7 +203,7 @@ def groups_table(report: ReportInput) -> Table:
 
 
 def outlier_tables(report: ReportInput) -> list[Table]:
-    """Where rejected observations lie, and the largest that were kept."""
+    """Return where rejected observations lie, and the largest that were kept."""
     rejected, suspects = [], []
     for group in report.adjusted.residuals:
         out = group.weight <= 0.0
@@ -246,13 +246,13 @@ def _strips(report: ReportInput, group: Residuals, rows: NDArray[np.bool_]) -> s
 
 
 def refused_table(report: ReportInput) -> Table | None:
-    """Why candidates were not taken."""
+    """Return why candidates were not taken."""
     rows = [[reason, thousands(count)] for reason, count in report.features.refused.most_common()]
     return Table("", ("candidates not taken", "number"), rows) if rows else None
 
 
 def control_table(report: ReportInput) -> Table | None:
-    """Misclosures, and what leaving a point out would change."""
+    """Return misclosures, and what leaving a point out would change."""
     if not report.adjusted.control:
         return None
     several = len(report.adjusted.calibrations) > 1
@@ -278,7 +278,7 @@ def control_table(report: ReportInput) -> Table | None:
 
 
 def detectable_table(report: ReportInput) -> Table | None:
-    """Smallest errors that would be found."""
+    """Return smallest errors that would be found."""
     rows = [[OBSERVED.get(name, name), length(value)] for name, value in report.adjusted.least_detectable.items()]
     under = "An error of this size in one observation is found with probability 0.8 (significance 0.001)."
     return Table("Smallest errors that would be found", ("observation", "size"), rows, under) if rows else None
