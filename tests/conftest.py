@@ -49,11 +49,15 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         marker = item.get_closest_marker("xdist_group")
         if marker is None and _shares_a_fixture(item):
-            item.add_marker(pytest.mark.xdist_group(item.path.stem))
+            item.add_marker(pytest.mark.xdist_group(_name(item)))
         elif marker is not None and marker.args == ("kernels",):
-            folder = item.path.parent.name
-            group = item.path.stem if folder in ("daemon", "calib") else f"kernels of {folder}"
+            package = item.path.relative_to(TESTS).parts[0]
+            group = _name(item) if package in ("daemon", "calib") else f"kernels of {package}"
             item.add_marker(pytest.mark.xdist_group(group))
+
+
+def _name(item: pytest.Item) -> str:
+    return str(item.path.relative_to(TESTS))
 
 
 def _shares_a_fixture(item: pytest.Item) -> bool:

@@ -9,23 +9,24 @@ from __future__ import annotations
 TAKEN = (
     "tests/drivers",  # decoders; and transports, as far as qemu knows what they ask of the kernel
     "tests/georef",  # sensor model, trajectories, navigation, time scales, files
-    "tests/daemon/test_log.py",  # the log: written, read, damaged, repaired, of strangers
-    "tests/daemon/test_log_chunks.py",
-    "tests/daemon/test_log_damage.py",
-    "tests/daemon/test_log_stranger.py",
-    "tests/daemon/test_recover_cli.py",
-    "tests/daemon/test_sim_log.py",
-    "tests/daemon/test_import.py",  # captures to a log, and back
-    "tests/daemon/test_export.py",
-    "tests/daemon/test_processing_feed.py",  # a log to points
+    "tests/daemon/log/test_log.py",  # the log: written, read, damaged, repaired, of strangers
+    "tests/daemon/log/test_log_chunks.py",
+    "tests/daemon/log/test_log_damage.py",
+    "tests/daemon/log/test_log_stranger.py",
+    "tests/daemon/cli/test_recover_cli.py",
+    "tests/daemon/simulate/test_sim_log.py",
+    "tests/daemon/exchange/test_import.py",  # captures to a log, and back
+    "tests/daemon/exchange/test_export.py",
+    "tests/daemon/processing/points/test_processing_feed.py",  # a log to points
     "tests/daemon/test_priority.py",  # numbers of system calls
 )
 _UDP = "qemu's user mode does not know SO_MEMINFO, by which datagrams are counted that the kernel dropped"
 _PPS = "qemu's user mode answers an ioctl that it does not know by ENOSYS"
 _HOLDER = "under qemu a process has the emulator's name"
-_CAN = "tests/drivers/test_transport_can.py::test_"
+_EXPORT = "tests/daemon/exchange/test_export.py"
+_CAN = "tests/drivers/transports/can/test_transport_can.py::test_"
 LEFT_OUT = {  # by the beginning of the test's name
-    "tests/drivers/test_transport_udp.py": _UDP,
+    "tests/drivers/transports/test_transport_udp.py": _UDP,
     f"{_CAN}frames_come_in_order_with_the_kernels_stamps": _UDP,
     f"{_CAN}classic_and_fd_frames_mixed": _UDP,
     f"{_CAN}error_frames_and_bus_off_are_units_and_counted": _UDP,
@@ -33,7 +34,7 @@ LEFT_OUT = {  # by the beginning of the test's name
     f"{_CAN}received_and_lost_are_exactly_what_was_sent": _UDP,
     f"{_CAN}close_from_another_thread_ends_a_blocked_receive[can:udp_multicast": _UDP,
     f"{_CAN}the_readers_slots_for_frames_keep_classic_and_fd_apart": _UDP,
-    "tests/drivers/test_transport_pps.py::test_what_cannot_be_opened_says_why[source3": _PPS,
-    "tests/drivers/test_transport_serial.py::test_another_process_holds_the_port": _HOLDER,
-    "tests/daemon/test_export.py::test_what_was_on_the_wire_is_in_the_files_and_comes_back": f"records UDP: {_UDP}",
+    "tests/drivers/transports/pps/test_transport_pps.py::test_what_cannot_be_opened_says_why[source3": _PPS,
+    "tests/drivers/transports/test_transport_serial.py::test_another_process_holds_the_port": _HOLDER,
+    f"{_EXPORT}::test_what_was_on_the_wire_is_in_the_files_and_comes_back": f"records UDP: {_UDP}",
 }

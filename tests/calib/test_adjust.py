@@ -24,9 +24,9 @@ from swath.calib.parameters import MODELS, ParameterOptions, unknowns
 from swath.georef.arrays import FloatArray
 from swath.georef.scanner.calibration import INDEX, PARAMETERS, Calibration, nominal
 from swath.georef.trajectory.trajectory import Trajectory
+from tests.calib.equations.test_rows import design
 from tests.calib.printed import TRUTH, Printed, printed
 from tests.calib.roofs import LINES, NOISE, Line, Made, made, roofs
-from tests.calib.test_rows import design
 
 pytestmark = pytest.mark.xdist_group("kernels")
 PLAIN = Settings(huber=0.0, family=0.0, tolerance=1e-7)

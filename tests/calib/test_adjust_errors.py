@@ -12,8 +12,8 @@ from swath.calib.equations.rows import Rows
 from swath.calib.equations.solve import Settings
 from swath.calib.equations.trajectory_prior import Taus, gauss_markov
 from swath.calib.parameters import ParameterOptions, unknowns
+from tests.calib.equations.test_rows import shifted
 from tests.calib.roofs import LINES, made, trajectory
-from tests.calib.test_rows import shifted
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("kernels")]
 

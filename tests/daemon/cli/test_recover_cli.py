@@ -1,0 +1,217 @@
+"""``swath recover`` by hand: what it saves, what it says, what it leaves alone, and its exit codes."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from swath.daemon.log.claim import claim
+from swath.daemon.log.events import Event, Events, Severity
+from swath.daemon.log.format import LogError
+from swath.daemon.log.recover import recover
+from swath.daemon.recorder import repair
+from tests.daemon.commands import ROOT, swath
+from tests.daemon.log.test_log import INFO, write_part
+from tests.daemon.log_check import official_counts
+from tests.daemon.rig import HANGS_S, wait_until
+
+WHOLE, CUT = f"{INFO.session_id}_0.mcap", f"{INFO.session_id}_1.mcap"
+
+
+@pytest.fixture
+def logs(tmp_path: Path) -> Path:
+    folder = tmp_path / "logs"
+    folder.mkdir()
+    write_part(folder / WHOLE)
+    write_part(folder / CUT, part=1, finish=False)
+    return folder
+
+
+def digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def test_a_whole_log_needs_nothing(logs: Path) -> None:
+    result = swath("recover", str(logs / WHOLE))
+    assert (result.returncode, result.stderr) == (0, "")
+    assert "whole" in result.stdout
+    assert not list(logs.glob("*.recovered.mcap"))
+
+
+def test_a_directory_is_repaired_and_the_originals_stay(logs: Path) -> None:
+    before = {path.name: digest(path) for path in logs.iterdir()}
+    result = swath("recover", "--json", "--background", str(logs))
+    assert result.returncode == 4, result.stderr
+    whole, cut = json.loads(result.stdout)["logs"]
+    assert (whole["whole"], whole["recovered"]) == (True, None)
+    assert cut["whole"] is False
+    copy = Path(cut["recovered"])
+    assert copy == logs / CUT.replace(".mcap", ".recovered.mcap")
+    assert official_counts(copy) == cut["messages"]
+    assert cut["messages"]["/scanner/left/raw"] == 1200
+    assert {name: digest(logs / name) for name in before} == before
+
+
+def test_a_flipped_bit_costs_its_chunk_only(logs: Path) -> None:
+    data = bytearray((logs / WHOLE).read_bytes())
+    data[len(data) // 2] ^= 1
+    (logs / WHOLE).write_bytes(data)
+    result = swath("recover", str(logs / WHOLE))
+    assert result.returncode == 4
+    assert "at byte" in result.stdout
+    saved = official_counts(logs / WHOLE.replace(".mcap", ".recovered.mcap"))
+    assert 0 < saved["/scanner/left/raw"] < 1200
+    assert saved["/gnss/rover/raw"] == 60
+
+
+def test_output_folder(logs: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other"
+    other.mkdir()
+    assert swath("recover", "--output", str(other), str(logs / CUT)).returncode == 4
+    assert [path.name for path in other.iterdir()] == [CUT.replace(".mcap", ".recovered.mcap")]
+    assert sorted(path.name for path in logs.iterdir()) == [WHOLE, CUT]
+
+
+def test_what_cannot_be_done_is_one_line(logs: Path, tmp_path: Path) -> None:
+    (tmp_path / "text.mcap").write_text("no log")
+    (tmp_path / "empty").mkdir()
+    cases = [
+        ([str(tmp_path / "nothing.mcap")], "no such file"),
+        ([str(tmp_path / "empty")], "no logs"),
+        ([str(tmp_path / "text.mcap")], "text.mcap"),
+        (["--keep-free-mb", "1e9", str(logs / CUT)], "needed to recover"),
+        (["--output", str(tmp_path / "absent"), str(logs / CUT)], f"{tmp_path / 'absent'}: No such file"),
+    ]
+    for arguments, words in cases:
+        result = swath("recover", *arguments)
+        assert result.returncode == 3, (arguments, result)
+        assert words in result.stderr
+        assert result.stderr.count("\n") == 1
+    assert not list(logs.glob("*.recovered.mcap*"))
+
+
+def test_a_second_repair_does_not_overwrite_the_first(logs: Path) -> None:
+    assert swath("recover", str(logs / CUT)).returncode == 4
+    copy = logs / CUT.replace(".mcap", ".recovered.mcap")
+    before = digest(copy)
+    result = swath("recover", str(logs / CUT))
+    assert result.returncode == 3
+    assert "is there already" in result.stderr
+    assert digest(copy) == before
+
+
+LARGE = f"{INFO.session_id}_2.mcap"
+
+
+@pytest.fixture
+def recovering(logs: Path) -> Iterator[subprocess.Popen[str]]:
+    """A process that stands still in the middle of a recovery."""
+    write_part(logs / LARGE, part=2, blocks=1200, finish=False)
+    command = [sys.executable, "-m", "swath.daemon.cli.main", "recover", str(logs / LARGE)]
+    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    temporary = unfinished_copy(logs)
+    wait_until(lambda: temporary.exists() and temporary.stat().st_size > 1 << 20, "a part of the copy")
+    process.send_signal(signal.SIGSTOP)
+    assert temporary.exists(), "it was stopped too late to prove anything"
+    yield process
+    process.kill()
+    process.communicate()
+
+
+def unfinished_copy(logs: Path) -> Path:
+    return logs / LARGE.replace(".mcap", ".recovered.mcap.part")
+
+
+def test_a_log_that_another_process_recovers_is_left_to_it(logs: Path, recovering: subprocess.Popen[str]) -> None:
+    result = swath("recover", str(logs / LARGE))
+    assert (result.returncode, result.stdout) == (3, "")
+    assert result.stderr == f"swath: {logs / LARGE}: is being recovered by another process\n"
+    recovering.send_signal(signal.SIGCONT)
+    _, stderr = recovering.communicate(timeout=HANGS_S)
+    assert (recovering.returncode, stderr) == (4, "")
+    assert official_counts(logs / LARGE.replace(".mcap", ".recovered.mcap"))["/scanner/left/raw"] == 1200 * 20
+    assert not unfinished_copy(logs).exists()
+
+
+def test_what_a_killed_recovery_left_is_made_anew(logs: Path, recovering: subprocess.Popen[str]) -> None:
+    recovering.kill()
+    recovering.wait()
+    assert unfinished_copy(logs).exists()
+    assert swath("recover", str(logs / LARGE)).returncode == 4
+    assert official_counts(logs / LARGE.replace(".mcap", ".recovered.mcap"))["/scanner/left/raw"] == 1200 * 20
+    assert not unfinished_copy(logs).exists()
+
+
+def test_of_many_that_begin_at_once_one_recovers(logs: Path) -> None:
+    """A claim is of an open file, so threads stand for processes; a copy that was left behind is in everybody's way."""
+    copy = logs / CUT.replace(".mcap", ".recovered.mcap")
+    for _ in range(20):
+        copy.with_name(copy.name + ".part").write_bytes(b"left behind")
+        begin, became = threading.Barrier(4), Counter[str]()
+
+        def one(begin: threading.Barrier = begin, became: Counter[str] = became) -> None:
+            begin.wait()
+            try:
+                recover(logs / CUT)
+                became["recovered"] += 1
+            except LogError as error:
+                became["left" if "by another process" in str(error) or "there already" in str(error) else "?"] += 1
+
+        threads = [threading.Thread(target=one) for _ in range(4)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert became == {"recovered": 1, "left": 3}
+        assert official_counts(copy)["/scanner/left/raw"] == 1200
+        copy.unlink()
+        assert sorted(path.name for path in logs.iterdir()) == [WHOLE, CUT]
+
+
+@pytest.mark.parametrize("mode", [0o640, 0o600, 0o664])
+def test_who_may_read_the_log_may_read_the_copy(logs: Path, mode: int) -> None:
+    """As after `sudo swath recover`; only root can give files away, for others the owner is their own."""
+    owner = (4711, 4712) if os.geteuid() == 0 else (os.geteuid(), os.getegid())
+    os.chown(logs / CUT, *owner)
+    (logs / CUT).chmod(mode)
+    assert swath("recover", str(logs / CUT)).returncode == 4
+    copy = (logs / CUT.replace(".mcap", ".recovered.mcap")).stat()
+    assert (copy.st_uid, copy.st_gid, copy.st_mode & 0o777) == (*owner, mode)
+
+
+class Said(Events):
+    """What was reported."""
+
+    def __init__(self) -> None:
+        self.codes: list[str] = []
+
+    def post(self, severity: Severity, source: str, code: str, text: str) -> Event:
+        """Note it."""
+        self.codes.append(code)
+        return Event(0, severity, source, code, text)
+
+
+async def test_the_services_repair_waits_for_a_recovery_by_hand(logs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(repair, "_LOOK_AGAIN_S", 0.05)
+    temporary = logs / CUT.replace(".mcap", ".recovered.mcap.part")
+    events = Said()
+    with temporary.open("wb") as by_hand:
+        claim(by_hand.fileno())
+        task = asyncio.create_task(repair.repair_left_open(logs, 0, lambda path: False, events))
+        await asyncio.sleep(1.0)
+        assert events.codes == ["repair_waits"]
+        assert not task.done()
+    await asyncio.wait_for(task, HANGS_S)  # given up: it is repaired as if nobody had begun
+    assert events.codes == ["repair_waits", "log_repaired"]
+    assert official_counts(logs / CUT.replace(".mcap", ".recovered.mcap"))["/scanner/left/raw"] == 1200

@@ -1,0 +1,340 @@
+"""``swath strips`` on files as `swath georef` makes them, and on a flight: verdicts, exit codes, words."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import typer
+from pyproj import CRS
+
+from swath.calib.flight import Flight
+from swath.calib.strips.cells import StripRules
+from swath.calib.verdict import overall_rms_m
+from swath.daemon.cli import strips
+from swath.daemon.errors import ExitCode, UserError
+from swath.daemon.processing.calibration.products import level_words, strips_entry
+from swath.daemon.processing.calibration.returns import refuse_installations
+from swath.daemon.processing.quicklook.run import look_at, numbers_of
+from swath.daemon.processing.setup.setup import Options, Setup
+from swath.daemon.processing.strip_agreement import before_and_after, difference_map
+from swath.daemon.processing.strips.inputs import strips_of_files, strips_of_flight
+from swath.georef.formats.trajectory.csv import csv_text
+from swath.georef.mapping.frame import Mapping
+from swath.georef.timescales.gps_time import WEEK_NS
+from tests.calib.cast_flight import Cast, cast_flight
+from tests.daemon.processing.quicklook.test_quicklook import EAST_M, NORTH_M, lattice, plane, write
+from tests.daemon.standin import aircraft_config
+
+pytestmark = pytest.mark.xdist_group("kernels")
+
+LINES = ((-150, 0, 150, 0, 850), (150, 40, -150, 40, 850))
+FLAT = "height_m = 450.0\nrelief_m = 0.0"
+
+
+def run(*arguments: str) -> None:
+    """The command, in this process."""
+    app = typer.Typer()
+    app.command()(strips.command)
+    app(args=list(arguments), standalone_mode=False)
+
+
+def lifted(folder: Path, lift_m: float, south_m: float = 30.0) -> Path:
+    """Two strips over a slope, the second higher."""
+    folder.mkdir()
+    for number, (south, lift) in enumerate([(0.0, 0.0), (south_m, lift_m)], start=1):
+        x, y = lattice(EAST_M, NORTH_M + south, 120.0, 50.0, 0.5)
+        write(folder / f"s{number}.laz", x, y, plane(x, y) + lift, number, crs=CRS.from_epsg(25832))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def made() -> Cast:
+    """Two opposite lines over flat ground."""
+    return cast_flight(FLAT, LINES, prf_hz=40_000.0, true={})
+
+
+def products(
+    folder: Path,
+    flight: Flight,
+    mapping: Mapping | None = None,
+    *,
+    session: str = "a",
+    up_m: float = 0.0,
+    of_week: Sequence[int] = (),
+) -> Path:
+    """A flight's points as a folder of `swath georef`: LAZ a strip, trajectory, sidecar.
+
+    Strips ``of_week`` have the seconds of the GPS week, as other programs write them.
+    """
+    folder.mkdir()
+    mapping = mapping or Mapping("EPSG:25832", datum="same")
+    for number, swath in enumerate(flight.swaths, start=1):
+        points = mapping.map_from_e(flight.frame.e_from_t(np.asarray(swath.points_t)))
+        seconds = (swath.time_ns - 1_000_000_000_000_000_000) / 1e9
+        if number in of_week:
+            seconds = swath.time_ns % WEEK_NS / 1e9
+        number_of = np.asarray(swath.rows["number_of_returns"])
+        write(
+            folder / f"a_strip{number:02d}.laz",
+            points[:, 0],
+            points[:, 1],
+            points[:, 2] + up_m,
+            number,
+            crs=CRS.from_epsg(25832),
+            adjusted=number not in of_week,
+            gps_time=seconds,
+            return_number=np.asarray(swath.rows["return_number"]),
+            number_of_returns=number_of,
+        )
+    (folder / f"{session}_trajectory.csv").write_text(csv_text(flight.trajectories[0]))
+    sidecar = {
+        "flights": [{"session": session}],
+        "strips": [
+            {
+                "number": number,
+                "file": f"a_strip{number:02d}.laz",
+                "first_gps_ns": int(swath.time_ns.min()),
+            }
+            for number, swath in enumerate(flight.swaths, start=1)
+        ],
+        "crs": mapping.description(),
+    }
+    (folder / "a.json").write_text(json.dumps(sidecar))
+    return folder
+
+
+def test_numbers_of_a_lifted_strip_in_the_record_and_the_table(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = lifted(tmp_path / "now", 0.07)
+    run(str(folder), "-o", str(tmp_path / "out"), "--json")
+    record = json.loads(capsys.readouterr().out)
+    (pair,) = record["pairs"]
+    assert (pair["first"], pair["second"]) == ("1", "2")
+    for numbers in (pair["dz"], pair["gridded"], record["all"]["gridded"]):
+        assert numbers["mean_m"] == pytest.approx(-0.07, abs=2e-4)
+        assert numbers["rms_m"] == pytest.approx(0.07, abs=2e-4)
+        assert numbers["max_m"] == pytest.approx(0.07, abs=5e-4)
+        assert numbers["std_m"] == pytest.approx(0.0, abs=1e-3)
+    assert pair["point_to_plane"]["mean_m"] == pytest.approx(-0.07 / np.hypot(1.0, np.hypot(0.12, 0.07)), abs=2e-4)
+    assert record["quality"]["best"] == "QL2"  # 4 pulses a square metre are too few for QL1
+    assert record["signatures"] is None
+    assert any("no trajectory" in line or "no signatures" in line for line in record["notes"])
+    assert json.loads((tmp_path / "out" / "strips.json").read_text()) == record
+    assert (tmp_path / "out" / "differences.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_before_and_after_stand_beside_each_other(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    now, then = lifted(tmp_path / "now", 0.01), lifted(tmp_path / "then", 0.20)
+    run(str(now), "--before", str(then), "-o", str(tmp_path / "out"))
+    told = capsys.readouterr().out
+    assert "before: RMSDz 20.0 cm, largest 20.0 cm; now: RMSDz 1.0 cm, largest 1.0 cm" in told
+    assert "strips keep QL2; QL1 not for its limit of 8 pulses per m²" in told
+    assert "confirm them against the edition in the contract" in told
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
+        "differences.png",
+        "differences_before.png",
+        "strips.json",
+    ]
+
+
+def test_a_level_that_is_not_kept_is_a_problem(tmp_path: Path) -> None:
+    folder = lifted(tmp_path / "now", 0.12)
+    run(str(folder), "--level", "QL3")
+    with pytest.raises(UserError, match=r"QL2 is not kept, for its limit of 0\.08 m RMSDz") as caught:
+        run(str(folder), "--level", "QL2")
+    assert caught.value.exit_code == ExitCode.PROBLEM
+
+
+@pytest.mark.slow
+def test_a_wrong_roll_is_named_and_is_a_problem(made: Cast, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    good = products(tmp_path / "good", made.flight)
+    run(str(good), "--json")
+    record = json.loads(capsys.readouterr().out)
+    effects = {one["name"]: one for one in record["signatures"]["effects"]}
+    assert effects["roll"]["level"] == "none"
+    assert record["notes"] == []
+    bad = products(tmp_path / "bad", made.flight.placed({"left": made.truth.changed(omega_rad=4e-4)}))
+    with pytest.raises(UserError, match=r"roll: opposite strips tilt .* to omega_deg") as caught:
+        run(str(bad), "--json")
+    assert caught.value.exit_code == ExitCode.PROBLEM
+    roll = next(one for one in json.loads(capsys.readouterr().out)["signatures"]["effects"] if one["name"] == "roll")
+    assert roll["value"] == pytest.approx(np.degrees(-4e-4), abs=3.5 * roll["sigma"])
+    assert roll["sigma"] < 0.005
+
+
+@pytest.mark.slow
+def test_a_flight_gives_what_its_files_give(made: Cast, tmp_path: Path) -> None:
+    """Both ways to the same differences: arrays in t, and LAZ in a projection."""
+    of_flight = strips_of_flight("flight", made.flight, StripRules())
+    of_files = strips_of_files([products(tmp_path / "p", made.flight)], StripRules(), lambda what, done, of: None)
+    numbers = [one.look.overlap.numbers() for one in (of_flight, of_files)]
+    assert numbers[0] is not None
+    assert numbers[1] is not None
+    assert numbers[0]["rms_m"] == pytest.approx(numbers[1]["rms_m"], rel=0.1)
+    heights = of_files.gathered.points[:, 2], of_flight.gathered.points[:, 2]
+    assert float(np.median(heights[0])) == pytest.approx(float(np.median(heights[1])), abs=0.05)
+
+
+@pytest.mark.slow
+def test_one_cloud_has_one_figure_and_one_level_wherever_it_is_told(
+    made: Cast, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`calibrate`, the map of its report, `strips` and `view`; coordinates of files are rounded to 0.1 mm."""
+    mapping = Mapping("EPSG:25832", datum="same")
+    mapping.settle(made.flight.trajectories[0].position_e[:1])
+    folder = products(tmp_path / "p", made.flight, mapping)
+    run(str(folder), "--json")
+    told = json.loads(capsys.readouterr().out)["quality"]
+    seen = numbers_of(look_at([folder]))["quality"]
+    tilted = made.flight.placed({"left": made.truth.changed(omega_rad=1e-3)})
+    before, after = before_and_after(tilted, made.flight, mapping)
+    calibrated = strips_entry(after)
+    drawn = difference_map(before, after, (0.0, 0.0), 400)
+    assert drawn is not None
+    assert drawn.after_words == f"RMSDz {100.0 * told['rmsdz_m']:.1f} cm"
+    assert before.rms_m > 5.0 * after.rms_m
+    report = overall_rms_m(after.pairs())
+    for rms_m in (seen["rmsdz_m"], calibrated["all"]["rms_m"], calibrated["quality"]["rmsdz_m"], report):
+        assert rms_m == pytest.approx(told["rmsdz_m"], abs=5e-5)
+    assert told["best"] is not None
+    assert seen["best"] == calibrated["quality"]["best"] == told["best"]
+    assert seen["measure"] == calibrated["quality"]["measure"] == told["measure"]
+    assert level_words(after) == f"strips keep {told['best']}"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "said",
+    [
+        {},  # EPSG:7912, moved to ETRS89
+        {'datum = "EPSG:7912"': 'datum = "same"'},
+        {'datum = "EPSG:7912"\n': "", "datum_accuracy_m = 0.05": "datum_accuracy_m = 2.0"},
+    ],
+)
+def test_the_datum_is_that_of_the_configuration(made: Cast, tmp_path: Path, said: dict[str, str]) -> None:
+    """Points and trajectory are in one place whoever said the datum and how good the way there must be."""
+    setup = Setup.of_config(aircraft_config(tmp_path / "c", said), Options(crs="EPSG:25832", uncertainty=False))
+    assert setup.mapping is not None
+    setup.mapping.settle(made.flight.trajectories[0].position_e[:1])
+    folder = products(tmp_path / "p", made.flight, setup.mapping)
+    of_files = strips_of_files([folder], StripRules(), lambda what, done, of: None)
+    assert of_files.notes == []
+    assert of_files.seen is not None
+    swath, gathered = made.flight.swaths[0], of_files.gathered
+    own = np.flatnonzero((gathered.time_ns > swath.time_ns[0]) & (gathered.time_ns < swath.time_ns[-1]))
+    pulse = np.searchsorted(swath.time_ns, gathered.time_ns[own] - 1000)  # of the file, to 0.1 µs
+    assert len(own) > 1000
+    there = made.flight.frame.e_from_t(np.asarray(swath.points_t[pulse]))
+    assert np.abs(of_files.seen.frame.e_from_t(gathered.points[own]) - there).max() < 0.01
+
+
+@pytest.mark.slow
+def test_equal_numbers_of_two_runs_are_strips_of_their_own(made: Cast, tmp_path: Path) -> None:
+    """Also of two aircraft at one time: each strip has its run's trajectory."""
+    first = products(tmp_path / "p", made.flight)
+    second = products(tmp_path / "q", made.flight, session="b", up_m=0.07)
+    strips = strips_of_files([first, second], StripRules(), lambda what, done, of: None)
+    assert strips.look.names == ["1", "2", "1/2", "2/2"]
+    (row,) = (row for row in strips.look.overlap.rows if (row["first"], row["second"]) == (0, 2))
+    assert row["median_m"] == pytest.approx(-0.07, abs=2e-3)
+    assert strips.notes == [
+        f"strip {number}/2 is that of {second / f'a_strip0{number}.laz'}, of other sessions than {number}"
+        for number in (1, 2)
+    ]
+    assert strips.seen is not None
+    assert strips.seen.flown == [0, 0, 1, 1]
+
+
+@pytest.mark.slow
+def test_strips_of_two_scanners_processed_apart_are_the_same_strips(made: Cast, tmp_path: Path) -> None:
+    folders = [products(tmp_path / name, made.flight) for name in ("left", "right")]
+    strips = strips_of_files(folders, StripRules(), lambda what, done, of: None)
+    assert (strips.look.names, strips.notes) == (["1", "2"], [])
+
+
+@pytest.mark.parametrize("of_week", [(2,), (1, 2)])
+def test_seconds_of_the_week_are_of_the_trajectory_beside_them(
+    made: Cast, tmp_path: Path, of_week: tuple[int, ...]
+) -> None:
+    """By the header of each file; files that mix both kinds are named."""
+    folder = products(tmp_path / "p", made.flight, of_week=of_week)
+    strips = strips_of_files([folder], StripRules(), lambda what, done, of: None)
+    begin, end = made.flight.trajectories[0].span
+    assert ((strips.gathered.time_ns >= begin) & (strips.gathered.time_ns <= end)).all()
+    mixed = "files mix times: seconds of the GPS week in a_strip02.laz; adjusted standard GPS time in a_strip01.laz"
+    assert [note.startswith(mixed) for note in strips.notes] == [True] * (of_week == (2,))
+
+
+def test_points_of_another_time_than_their_trajectory_are_said_to_be(made: Cast, tmp_path: Path) -> None:
+    folder = products(tmp_path / "p", made.flight, of_week=(1, 2))
+    week = made.flight.trajectories[0].span[0] // WEEK_NS
+    strips = strips_of_files([folder], StripRules(), lambda what, done, of: None, week - 1)
+    assert len(strips.notes) == 1
+    assert strips.notes[0].startswith("100 % of the points are of other times")
+    with pytest.raises(UserError, match="--week 24233 is no GPS week; want whole weeks since 1980"):
+        strips_of_files([folder], StripRules(), lambda what, done, of: None, 24233)
+
+
+def test_a_sidecar_that_says_no_datum_is_noted(made: Cast, tmp_path: Path) -> None:
+    folder = products(tmp_path / "p", made.flight)
+    sidecar = json.loads((folder / "a.json").read_text())
+    del sidecar["crs"]["datum_said"]
+    (folder / "a.json").write_text(json.dumps(sidecar))
+    (note,) = strips_of_files([folder], StripRules(), lambda what, done, of: None).notes
+    assert "no signatures: the sidecar beside the points does not say of which datum they are" in note
+
+
+@pytest.mark.parametrize("what", ["one", "apart", "twice", "nothing", "absent", "level", "cell"])
+def test_what_cannot_be_compared_is_one_line(what: str, tmp_path: Path) -> None:
+    folder = lifted(tmp_path / "now", 0.0, 500.0 if what == "apart" else 30.0)
+    arguments, said = [str(folder)], ""
+    if what == "one":
+        (folder / "s2.laz").unlink()
+        said = "now: one strip only; differences want at least two strips that overlap"
+    elif what == "apart":
+        said = "now: no two of the 2 strips share smooth ground"
+    elif what == "twice":
+        x, y = lattice(EAST_M, NORTH_M, 120.0, 50.0, 0.5)
+        write(folder / "s2.laz", x, y, plane(x, y), 2, crs=CRS.from_epsg(25832))
+        said = "strips 1 and 2 are the same returns under two names"
+    elif what == "nothing":
+        (tmp_path / "empty").mkdir()
+        arguments, said = [str(tmp_path / "empty")], "holds neither LAS or LAZ files nor logs"
+    elif what == "absent":
+        arguments, said = [str(tmp_path / "no")], "no such file or folder"
+    elif what == "cell":
+        arguments, said = [str(folder), "--cell", "1e9"], r"--cell: got 1e\+09, want 0\.05 to 100 metres"
+    else:
+        arguments, said = [str(folder), "--level", "QL9"], 'got "QL9", want one of QL0, QL1, QL2, QL3'
+    with pytest.raises(UserError, match=said) as caught:
+        run(*arguments)
+    assert "\n" not in caught.value.message
+    codes = {"nothing": ExitCode.IO, "absent": ExitCode.IO, "level": ExitCode.USAGE, "cell": ExitCode.USAGE}
+    assert caught.value.exit_code == codes.get(what, ExitCode.PROBLEM)
+
+
+def logged(name: str, installation: str) -> Any:
+    """A flight as logged, as far as its installation goes."""
+    profile = SimpleNamespace(installation=installation)
+    return SimpleNamespace(log=Path(name), setup=SimpleNamespace(config=SimpleNamespace(profile=profile)))
+
+
+def test_logs_of_different_installations_are_refused() -> None:
+    refuse_installations([logged("a.mcap", "HB-ABC/1"), logged("b.mcap", "HB-ABC/1")])
+    with pytest.raises(
+        UserError, match=r'b\.mcap: is of installation "HB-ABC/2", a\.mcap of "HB-ABC/1"; want logs of one'
+    ):
+        refuse_installations([logged("a.mcap", "HB-ABC/1"), logged("b.mcap", "HB-ABC/2")])
+
+
+def test_a_flight_of_one_strip_is_refused(made: Cast) -> None:
+    with pytest.raises(UserError, match="one strip only"):
+        strips_of_flight("x.mcap", replace(made.flight, swaths=made.flight.swaths[:1]), StripRules())

@@ -1,0 +1,541 @@
+"""`swath check` on real ptys, UDP ports, CAN buses and FIFOs: what answers, what does not, what is something else."""
+
+from __future__ import annotations
+
+import datetime as dt
+import gzip
+import json
+import os
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import reduce
+from operator import xor
+from pathlib import Path
+from socket import AF_INET, SOCK_DGRAM, socket
+
+import can
+import numpy as np
+import pytest
+
+from swath.daemon.config import DeviceEntry, parse_config
+from swath.daemon.devices.check import Report, bitrate_problems, check_everything
+from swath.daemon.devices.identify import describe_tag, identify
+from swath.drivers.can_frames import encode_can_frame
+from swath.drivers.captures.opening import read_pcap
+from swath.drivers.parser import DeviceSettings
+from swath.drivers.scanner.srep.layout import SrepHeader, encode_datagram
+from swath.drivers.scanner.velodyne.position import PPS_ABSENT, PPS_LOCKED, encode_position_packet
+from swath.drivers.transports.spec import parse_transport
+from swath.georef.records import ChunkBatch, TimeScale, TimeTag
+from tests.daemon.rig import HANGS_S, free_udp_port
+from tests.daemon.wires import pty, repeating, udp_sender
+
+ROOT = Path(__file__).parents[3]
+CANMOD = ROOT / "fixtures/canmod-gps/3BA199E2_00000164_00000005_candump.log.gz"
+GROUP = "239.74.163.2"
+LISTEN_S = 1.2
+
+
+def nmea(body: str) -> bytes:
+    """A sentence with its checksum (NMEA 0183: exclusive or of what stands between $ and *)."""
+    return f"${body}*{reduce(xor, body.encode()):02X}\r\n".encode()
+
+
+def epoch(second: int, valid: bool = True) -> bytes:
+    """What a receiver says once a second."""
+    status = "A" if valid else "V"
+    clock = f"1015{second % 60:02}.00"
+    return nmea(f"GPRMC,{clock},{status},4730.0000,N,00900.0000,E,0.0,0.0,211126,,,A") + nmea(
+        f"GPGGA,{clock},4730.0000,N,00900.0000,E,{int(valid)},12,0.8,500.0,M,47.0,M,,"
+    )
+
+
+def srep_datagram(sequence: int, pps_count: int = 3) -> bytes:
+    header = SrepHeader(
+        sequence=sequence,
+        flags=int(pps_count > 0),
+        pps_count=pps_count,
+        pps_ticks=1_000_000,
+        first_ticks=1_500_000 + 1000 * sequence,
+    )
+    ticks = np.arange(10) * 50
+    return encode_datagram(header, ticks, np.arange(10) * 100, np.full((10, 1), 9_000_000))
+
+
+@contextmanager
+def pps_fifo(path: Path, spacing_ns: int = 1_000_000_000) -> Iterator[str]:
+    """A FIFO with edges, faster than real ones so that a test need not wait; their stamps say the spacing."""
+    os.mkfifo(path)
+    fd = os.open(path, os.O_RDWR | os.O_NONBLOCK)
+    start_ns = time.time_ns() // 1_000_000_000 * 1_000_000_000
+
+    def write(number: int) -> None:
+        os.write(fd, f"{start_ns + number * spacing_ns} {number}\n".encode())
+
+    try:
+        with repeating(write, 0.1):
+            yield f"fixed:{path}"
+    finally:
+        os.close(fd)
+
+
+def check(text: str, folder: Path, seconds: float = LISTEN_S) -> dict[str, Report]:
+    """Reports of a configuration, by source."""
+    config = parse_config(f'[session]\nname = "x"\ndirectory = "."\nreserve_mb = 1\n{text}', folder / "swath.toml")
+    return {report.source: report for report in check_everything(config, seconds)}
+
+
+def gnss(path: str, protocol: str = "nmea", more: str = "") -> str:
+    return f'[gnss.rover]\ntransport = "serial:{path}?baud=115200"\nprotocol = "{protocol}"\n{more}\n'
+
+
+def srep(port: int, more: str = "") -> str:
+    transport = f"udp:127.0.0.1:{port}?buffer_mb=1"
+    return f'[scanner.left]\ntransport = "{transport}"\nprotocol = "srep"\nmirror_factor = 2\n{more}\n'
+
+
+class TestAllWell:
+    def test_every_device_answers_and_says_its_time(self, tmp_path: Path) -> None:
+        port = free_udp_port()
+        with pty(epoch) as path, pps_fifo(tmp_path / "edges") as edges, udp_sender(port, srep_datagram):
+            pps = f'[pps.main]\nsource = "{edges}"\n'
+            reports = check(pps + gnss(path, more='pps = "main"') + srep(port, 'pps = "main"'), tmp_path)
+        assert list(reports) == ["pps/main", "gnss/rover", "scanner/left", "log"]
+        assert {source: report.problems for source, report in reports.items() if report.problems} == {}
+        assert all(report.opens for report in reports.values())
+        assert reports["pps/main"].time == "every 1.0000 s"
+        assert reports["gnss/rover"].records["GnssFix"] > 0
+        assert reports["gnss/rover"].time.startswith("2026-11-21 10:15:")
+        assert reports["scanner/left"].records["ScannerReturns"] == 10 * reports["scanner/left"].units
+        assert reports["scanner/left"].time == "PPS seen"
+
+    def test_both_ports_of_a_real_head_are_one_device(self, tmp_path: Path) -> None:
+        """A VLP-16 locked to its PPS, which only the position packets say, on a port of their own."""
+        data, position = free_udp_port(), free_udp_port()
+        recorded = list(read_pcap(ROOT / "fixtures/velodyne/mrpt_vlp16_gps.pcap.gz"))
+        streams = [[unit.data for unit in recorded if len(unit.data) == length] for length in (1206, 512)]
+        text = (
+            f'[scanner.roof]\ntransport = "udp:127.0.0.1:{data}?buffer_mb=1"\nprotocol = "velodyne-vlp16"\n'
+            f'auxiliary = "udp:127.0.0.1:{position}?buffer_mb=1"\npps = "main"\n'
+            'installation = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\n[pps.main]\nsource = "/dev/pps0"\n'
+        )
+        with (
+            udp_sender(data, lambda n: streams[0][n % len(streams[0])]),
+            udp_sender(position, lambda n: streams[1][n % len(streams[1])]),
+        ):
+            reports = check(text, tmp_path, 0.5)
+        assert reports["scanner/roof"].records["ScannerReturns"] > 0
+        assert reports["scanner/roof"].time in {"PPS seen", "2016-01-21 08:18:02 UTC (position RMC)"}
+        assert reports["scanner/roof"].problems == []
+        assert reports["scanner/roof/aux"].bytes == 512 * reports["scanner/roof/aux"].units > 0
+
+    @pytest.mark.parametrize(
+        ("pps", "status", "said"),
+        [
+            (PPS_LOCKED, "V", "the sentences at its input are void: want their receiver to have a fix"),
+            (PPS_ABSENT, "A", "it says that it is not locked to a pulse; want the receiver's PPS wired to it"),
+        ],
+    )
+    def test_a_head_without_fix_or_pulse_is_said(self, tmp_path: Path, pps: int, status: str, said: str) -> None:
+        data, position = free_udp_port(), free_udp_port()
+        recorded = list(read_pcap(ROOT / "fixtures/velodyne/mrpt_vlp16_gps.pcap.gz"))
+        packets = [unit.data for unit in recorded if len(unit.data) == 1206]
+        text = (
+            f'[scanner.roof]\ntransport = "udp:127.0.0.1:{data}?buffer_mb=1"\nprotocol = "velodyne-vlp16"\n'
+            f'auxiliary = "udp:127.0.0.1:{position}?buffer_mb=1"\ninstallation = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\n'
+        )
+
+        def told(second: int) -> bytes:
+            sentence = nmea(f"GPRMC,1015{second % 60:02}.00,{status},4730.0,N,00900.0,E,0.0,0.0,211126,,,A").decode()
+            return encode_position_packet((15 * 60 + second % 60) * 1_000_000, pps, sentence.strip())
+
+        with udp_sender(data, lambda n: packets[n % len(packets)]), udp_sender(position, told):
+            (note,) = check(text, tmp_path, 0.5)["scanner/roof"].notes
+        assert note == said
+
+    def test_it_is_said_where_nothing_tells_whether_a_head_is_locked(self, tmp_path: Path) -> None:
+        """The same head with its data port alone: auxiliary is named; a configured clock is named instead."""
+        data = free_udp_port()
+        recorded = list(read_pcap(ROOT / "fixtures/velodyne/mrpt_vlp16_gps.pcap.gz"))
+        packets = [unit.data for unit in recorded if len(unit.data) == 1206]
+        text = (
+            f'[scanner.roof]\ntransport = "udp:127.0.0.1:{data}?buffer_mb=1"\nprotocol = "velodyne-vlp16"\n'
+            "installation = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\n"
+        )
+        with udp_sender(data, lambda n: packets[n % len(packets)]):
+            (note,) = check(text, tmp_path, 0.5)["scanner/roof"].notes
+            (configured,) = check(text + 'clock = "utc-hour"\n', tmp_path, 0.5)["scanner/roof"].notes
+        assert "no position packet (Velodyne port 8308" in note
+        assert "want auxiliary" in note
+        assert 'clock = "utc-hour"' in configured
+
+    def test_a_head_is_read_by_the_metadata_beside_the_configuration(self, tmp_path: Path) -> None:
+        """An OS0 and its own IMU, on two ports."""
+        lidar, imu = free_udp_port(), free_udp_port()
+        capture = ROOT / "fixtures/ouster/crc_test.pcap.gz"
+        metadata = (ROOT / "fixtures/ouster/crc_test.json").read_text()
+        (tmp_path / "os0.json").write_text(metadata.replace("TIME_FROM_INTERNAL_OSC", "TIME_FROM_SYNC_PULSE_IN"))
+        streams = [[unit.data for unit in read_pcap(capture, port=port)] for port in (7502, 7503)]
+        text = (
+            f'[scanner.roof]\ntransport = "udp:127.0.0.1:{lidar}?buffer_mb=1"\nprotocol = "ouster"\n'
+            f'auxiliary = "udp:127.0.0.1:{imu}?buffer_mb=1"\ninstallation = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\n'
+            'pps = "main"\n[scanner.roof.geometry]\nfile = "os0.json"\n[pps.main]\nsource = "/dev/pps0"\n'
+        )
+        with (
+            udp_sender(lidar, lambda n: streams[0][n % len(streams[0])]),
+            udp_sender(imu, lambda n: streams[1][n % len(streams[1])]),
+        ):
+            reports = check(text, tmp_path, 0.5)
+        assert reports["scanner/roof"].problems == []
+        assert reports["scanner/roof"].records["ScannerReturns"] > 0
+        assert reports["scanner/roof"].time == ""  # its packets do not say whether pulses come
+        assert reports["scanner/roof"].records["ImuSamples"] == reports["scanner/roof/aux"].units > 0
+
+    def test_an_imu_inside_a_gnss_stream_reads_along(self, tmp_path: Path) -> None:
+        """A NovAtel SPAN recording: one wire, two devices."""
+        data = (ROOT / "fixtures/novatel/ins1.gps").read_bytes()
+        imu = '[imu.main]\ntransport = "gnss:rover"\nprotocol = "novatel"\n'
+        with pty(lambda number: data[number * 2000 % len(data) :][:2000]) as path:
+            reports = check(gnss(path, "novatel") + imu, tmp_path)
+        assert list(reports) == ["gnss/rover", "imu/main", "log"]
+        assert reports["imu/main"].records["InsSolution"] > 0
+        assert reports["imu/main"].bytes == reports["gnss/rover"].bytes > 0
+        assert reports["imu/main"].problems == []
+
+    def test_an_imu_on_a_serial_line(self, tmp_path: Path) -> None:
+        data = gzip.decompress((ROOT / "fixtures/xsens/1_output.bin.gz").read_bytes())
+        with pty(lambda number: data[number * 2000 % len(data) :][:2000]) as path:
+            report = check(f'[imu.main]\ntransport = "serial:{path}"\nprotocol = "xsens-xbus"\n', tmp_path)["imu/main"]
+        assert report.problems == []
+        assert report.records["ImuSamples"] > 10
+        assert report.time.startswith("2019-01-20 13:47:2")
+
+    def test_the_auxiliary_port_has_its_own_line(self, tmp_path: Path) -> None:
+        port, auxiliary = free_udp_port(), free_udp_port()
+        with udp_sender(port, srep_datagram), udp_sender(auxiliary, lambda _: bytes(512)):
+            more = f'auxiliary = "udp:127.0.0.1:{auxiliary}?buffer_mb=1"'
+            reports = check(srep(port, more), tmp_path, 0.5)
+        assert reports["scanner/left/aux"].bytes == 512 * reports["scanner/left/aux"].units > 0
+        assert reports["scanner/left/aux"].problems == []
+
+
+class TestAbsent:
+    def test_a_device_that_is_not_there(self, tmp_path: Path) -> None:
+        report = check(gnss(str(tmp_path / "ttyNone")), tmp_path, 0.3)["gnss/rover"]
+        assert not report.opens
+        [problem] = report.problems
+        assert "ttyNone" in problem
+
+    def test_a_pps_that_is_not_there(self, tmp_path: Path) -> None:
+        report = check(f'[pps.main]\nsource = "{tmp_path}/pps9"\n', tmp_path, 0.3)["pps/main"]
+        assert not report.opens
+        assert "pps9" in report.problems[0]
+
+    def test_a_silent_device(self, tmp_path: Path) -> None:
+        with pty() as path:
+            report = check(gnss(path), tmp_path, 0.3)["gnss/rover"]
+        assert report.opens
+        assert report.problems == ["silent: opened, but no byte in 0.3 s; is it powered, wired and sending here?"]
+
+    def test_a_pps_without_edges(self, tmp_path: Path) -> None:
+        os.mkfifo(tmp_path / "edges")
+        report = check(f'[pps.main]\nsource = "fixed:{tmp_path}/edges"\n', tmp_path, 0.3)["pps/main"]
+        assert report.problems[0].startswith("no assert edge in 0.3 s")
+
+    def test_a_port_that_another_program_has(self, tmp_path: Path) -> None:
+        with socket(AF_INET, SOCK_DGRAM) as holder:
+            holder.bind(("127.0.0.1", 0))
+            port = holder.getsockname()[1]
+            report = check(srep(port), tmp_path, 0.3)["scanner/left"]
+        assert not report.opens
+        assert f"port {port} is in use" in report.problems[0]
+
+
+class TestSomethingElse:
+    def test_a_receiver_of_another_protocol_is_named(self, tmp_path: Path) -> None:
+        with pty(epoch) as path:
+            report = check(gnss(path, "novatel"), tmp_path)["gnss/rover"]
+        assert report.problems == ["answers as nmea, configured as novatel"]
+
+    def test_a_scanner_of_another_protocol_is_named(self, tmp_path: Path) -> None:
+        port = free_udp_port()
+        text = srep(port).replace('"srep"', '"velodyne-vlp16"').replace("mirror_factor = 2", "")
+        with udp_sender(port, srep_datagram):
+            identity = "installation = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\n"
+            report = check(text + identity, tmp_path, 0.5)["scanner/left"]
+        assert report.problems == ["answers as srep, configured as velodyne-vlp16"]
+
+    @pytest.mark.parametrize(
+        ("configured", "recording", "answers_as"),
+        [
+            ("nmea", "novatel/propak6-basic-fix.gps.gz", "novatel"),
+            ("nmea", "ubx/ublox-zed-f9p-hp.log.gz", "ubx"),
+            ("novatel", "ubx/ublox-zed-f9p-hp.log.gz", "ubx"),
+            ("novatel", "nmea/nmea-rtk.log.gz", "nmea"),
+            ("ubx", "novatel/propak6-basic-fix.gps.gz", "novatel"),
+            ("novatel", "sbf/sbfdata.log.gz", "sbf"),
+            ("nmea", "sbf/sbfdata.log.gz", "sbf"),
+            ("ubx", "sbf/pygpsdata_x5status.log.gz", "sbf"),
+            ("sbf", "nmea/polarx2.log.gz", "nmea"),
+            ("sbf", "ubx/ublox-zed-f9p-hp.log.gz", "ubx"),
+        ],
+    )
+    def test_a_real_recording_of_another_receiver_is_named(
+        self, configured: str, recording: str, answers_as: str, tmp_path: Path
+    ) -> None:
+        data = gzip.decompress((ROOT / "fixtures" / recording).read_bytes())
+        with pty(lambda number: data[number * 2000 % len(data) :][:2000]) as path:
+            report = check(gnss(path, configured), tmp_path)["gnss/rover"]
+        assert report.problems == [f"answers as {answers_as}, configured as {configured}"]
+
+    def test_a_real_recording_of_another_scanner_is_named(self, tmp_path: Path) -> None:
+        """A VLP-16, where a line scanner is configured."""
+        port = free_udp_port()
+        recorded = [unit.data for unit in read_pcap(ROOT / "fixtures/velodyne/nebula_vlp16.pcap.gz")]
+        with udp_sender(port, lambda number: recorded[number % len(recorded)]):
+            report = check(srep(port), tmp_path, 0.5)["scanner/left"]
+        assert report.problems == ["answers as velodyne-vlp16, configured as srep"]
+
+    def test_a_head_that_needs_its_metadata_is_named_by_the_form_of_its_packets(self, tmp_path: Path) -> None:
+        port = free_udp_port()
+        recorded = [unit.data for unit in read_pcap(ROOT / "fixtures/ouster/crc_test.pcap.gz", port=7502)]
+        with udp_sender(port, lambda number: recorded[number % len(recorded)]):
+            report = check(srep(port), tmp_path, 0.5)["scanner/left"]
+        assert report.problems == ["answers as ouster, configured as srep"]
+
+    @pytest.mark.parametrize(
+        ("unit", "frames", "protocol"),
+        [
+            (2048, gzip.decompress((ROOT / "fixtures/xsens/2_output.bin.gz").read_bytes()), "xsens-xbus"),
+            (16, b"".join(encode_can_frame(number, bytes(8)) for number in (0x120, 0x121, 0x122)) * 20, "sbg-ellipse"),
+            (16, b"".join(encode_can_frame(number, bytes(8)) for number in (0x005, 0x032, 0x034)) * 20, "xsens-mti"),
+        ],
+        ids=["xsens-xbus", "sbg-ellipse", "xsens-mti"],
+    )
+    def test_an_imu_of_another_protocol_is_named(self, unit: int, frames: bytes, protocol: str) -> None:
+        whole = len(frames) // unit
+        rows = np.frombuffer(frames[: whole * unit], np.uint8).reshape(whole, unit)
+        kept = [ChunkBatch("imu/main", np.arange(whole, dtype=np.int64) * 1_000_000, rows)]
+        spec = parse_transport("serial:/dev/ttyUSB0")
+        entry = DeviceEntry("imu", "main", spec, None, "nmea2000", None, DeviceSettings("imu/main"), {})
+        assert identify(entry, kept, than=0) == protocol
+
+    @pytest.mark.parametrize(
+        ("recording", "answers_as"),
+        [
+            ("velodyne/nebula_vlp32.pcap.gz", "velodyne-vlp32c"),
+            ("hesai/nebula_xt32.pcap.gz", "hesai-xt32"),
+            ("hesai/nebula_qt64.pcap.gz", "hesai-qt64"),
+        ],
+    )
+    def test_a_head_of_another_model_is_named_though_its_second_port_is_alike(
+        self, recording: str, answers_as: str, tmp_path: Path
+    ) -> None:
+        """Velodyne's position packets are the same for all models: here they come while the data is another's."""
+        data, position = free_udp_port(), free_udp_port()
+        recorded = [unit.data for unit in read_pcap(ROOT / "fixtures" / recording)]
+        text = (
+            f'[scanner.roof]\ntransport = "udp:127.0.0.1:{data}?buffer_mb=1"\nprotocol = "velodyne-vlp16"\n'
+            f'auxiliary = "udp:127.0.0.1:{position}?buffer_mb=1"\n'
+            "installation = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\n"
+        )
+        packets = [unit.data for unit in read_pcap(ROOT / "fixtures/velodyne/mrpt_vlp16_gps.pcap.gz", port=8308)]
+        with (
+            udp_sender(data, lambda number: recorded[number % len(recorded)]),
+            udp_sender(position, lambda number: packets[number % len(packets)] if number % 9 == 0 else b""),
+        ):
+            report = check(text, tmp_path, 0.5)["scanner/roof"]
+        assert report.problems == [f"answers as {answers_as}, configured as velodyne-vlp16"]
+
+    def test_garbage_is_no_protocol_and_asks_for_the_baud_rate(self, tmp_path: Path) -> None:
+        noise = np.random.default_rng(7).integers(128, 255, 4000, dtype=np.uint8).tobytes()
+        with pty(lambda _: noise) as path:
+            report = check(gnss(path), tmp_path, 0.5)["gnss/rover"]
+        want = "nothing of it is nmea nor any other gnss protocol known; is the baud rate right?"
+        assert report.problems == [want]
+
+    def test_damaged_messages_are_counted(self, tmp_path: Path) -> None:
+        with pty(lambda number: epoch(number) + epoch(number).replace(b"4730", b"4731")) as path:
+            report = check(gnss(path), tmp_path)["gnss/rover"]
+        assert any("messages damaged" in problem for problem in report.problems)
+
+
+class TestCan:
+    """A real CANmod.gps recording on a bus of its own."""
+
+    @pytest.fixture
+    def port(self) -> Iterator[int]:
+        with gzip.open(CANMOD, "rt") as log:
+            frames = [line.split()[2].split("#") for line in log if " can2 " in line]
+        messages = [
+            can.Message(arbitration_id=int(name, 16), data=bytes.fromhex(data), is_extended_id=False)
+            for name, data in frames
+        ]
+        port = free_udp_port()
+        with can.Bus(interface="udp_multicast", channel=GROUP, port=port, ignore_config=True) as bus:
+
+            def send(number: int) -> None:
+                for message in messages[number * 100 % len(messages) :][:100]:
+                    bus.send(message)
+
+            with repeating(send):
+                yield port
+
+    def test_answers(self, port: int, tmp_path: Path) -> None:
+        text = f'[imu.main]\ntransport = "can:udp_multicast:{GROUP}?port={port}"\nprotocol = "canmod-gps"\n'
+        report = check(text, tmp_path)["imu/main"]
+        assert report.problems == []
+        assert report.records["ImuSamples"] > 100
+        assert report.bytes == 16 * report.units
+
+    @pytest.mark.parametrize(("tick_hz", "rate"), [(1_000_000, None), (10_000, 100.0), (100_000_000, 0.01)])
+    def test_a_counter_read_in_the_wrong_unit_is_said(self, tick_hz: int, rate: float | None, tmp_path: Path) -> None:
+        """An MTi whose SampleTime is in microseconds; the maker's documents say two units."""
+        port = free_udp_port()
+        with can.Bus(interface="udp_multicast", channel=GROUP, port=port, ignore_config=True) as bus:
+
+            def send(_: int) -> None:
+                ticks = (time.monotonic_ns() // 1000 % 2**32).to_bytes(4, "big")
+                for identifier, data in ((0x005, ticks), (0x032, bytes(6)), (0x034, bytes(6))):
+                    bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
+
+            with repeating(send, 0.02):
+                transport = f"can:udp_multicast:{GROUP}?port={port}"
+                table = f'transport = "{transport}"\nprotocol = "xsens-mti"\ntick_hz = {tick_hz}\n'
+                report = check(f"[imu.main]\n{table}", tmp_path)["imu/main"]
+        assert report.records["ImuSamples"] > 10
+        if rate is None:
+            assert report.problems == []
+        else:
+            [problem] = report.problems
+            said = re.fullmatch(r"its counter runs (\S+) times as fast as time: is tick_hz right\?", problem)
+            assert said
+            assert float(said[1]) == pytest.approx(rate, rel=0.1)
+
+    def test_answers_as_something_else(self, port: int, tmp_path: Path) -> None:
+        (tmp_path / "imu.dbc").write_bytes((ROOT / "fixtures/config/imu.dbc").read_bytes())
+        text = (
+            f'[imu.main]\ntransport = "can:udp_multicast:{GROUP}?port={port}"\nprotocol = "dbc"\ndbc = "imu.dbc"\n'
+            '[imu.main.signals]\nspecific_force = ["ACC.acc_x", "ACC.acc_y", "ACC.acc_z"]\n'
+            'angular_rate = ["GYR.gyr_x", "GYR.gyr_y", "GYR.gyr_z"]\n'
+        )
+        report = check(text, tmp_path)["imu/main"]
+        assert report.problems == ["answers as canmod-gps, configured as dbc"]
+
+
+class TestTime:
+    def test_a_receiver_without_valid_time(self, tmp_path: Path) -> None:
+        with pty(lambda number: epoch(number, valid=False)) as path:
+            report = check(gnss(path), tmp_path)["gnss/rover"]
+        assert report.problems == ["its time is not valid (yet)"]
+        assert report.time == "not valid"
+
+    def test_a_receiver_that_says_local_time_is_told_and_not_refused(self, tmp_path: Path) -> None:
+        """Two hours east of UTC, beside a clock that nobody keeps but that is set."""
+
+        def local(_: int) -> bytes:
+            now = dt.datetime.now(dt.UTC) + dt.timedelta(hours=2)
+            return nmea(f"GPRMC,{now:%H%M%S}.00,A,4730.0000,N,00900.0000,E,0.0,0.0,{now:%d%m%y},,,A")
+
+        with pty(local) as path:
+            report = check(gnss(path), tmp_path)["gnss/rover"]
+        assert report.problems == []
+        (note,) = report.notes
+        assert note.startswith("its time is 2 h ahead of this computer's clock")
+
+    def test_a_scanner_that_sees_no_pps(self, tmp_path: Path) -> None:
+        port = free_udp_port()
+        pps = '[pps.main]\nsource = "/dev/pps0"\n'
+        with udp_sender(port, lambda number: srep_datagram(number, pps_count=0)):
+            report = check(pps + srep(port, 'pps = "main"'), tmp_path, 0.5)["scanner/left"]
+        assert report.problems == ["does not see its PPS (main)"]
+
+    def test_edges_of_another_pulse(self, tmp_path: Path) -> None:
+        with pps_fifo(tmp_path / "edges", spacing_ns=200_000_000) as edges:
+            report = check(f'[pps.main]\nsource = "{edges}"\n', tmp_path)["pps/main"]
+        assert report.problems == ["edges are 0.2000 s apart, want 1 s: noise, or another pulse"]
+
+    @pytest.mark.parametrize(
+        ("tag", "text"),
+        [
+            (TimeTag(TimeScale.GPS, 555_303_000_000_000, week=2443), "GPS week 2443, 555303.0 s"),
+            (TimeTag(TimeScale.GPS, 555_303_000_000_000), "GPS week ?, 555303.0 s"),
+            (TimeTag(TimeScale.UTC, 86_400_000_000_000), "24:00:00 UTC"),
+        ],
+    )
+    def test_a_time_is_said_as_far_as_it_is_known(self, tag: TimeTag, text: str) -> None:
+        assert describe_tag(tag) == text
+
+
+class TestComputer:
+    def test_a_directory_that_is_full(self, tmp_path: Path) -> None:
+        config = parse_config('[session]\nname = "x"\ndirectory = "."\nreserve_mb = 10000000\n', tmp_path / "a.toml")
+        [report] = check_everything(config, 0.1)
+        assert "MB free, reserve_mb is 1e+07" in report.problems[0]
+
+    def test_a_can_interface_of_another_bitrate_is_named_with_the_command_that_mends_it(self) -> None:
+        spec = parse_transport("can:socketcan:can0?bitrate=1000000")
+        command = "ip link set can0 down && ip link set can0 up type can bitrate 1000000"
+        assert bitrate_problems(spec, 250_000) == [f"can0 runs at 250000 bit/s, configured is 1000000; `{command}`"]
+        assert bitrate_problems(spec, 1_000_000) == []
+        assert bitrate_problems(spec, None) == []
+
+    def test_a_receive_buffer_that_is_not_granted(self, tmp_path: Path) -> None:
+        """In a process without the right to force it, as the service is."""
+        config = tmp_path / "swath.toml"
+        port = free_udp_port()
+        text = srep(port).replace("buffer_mb=1", "buffer_mb=1023")
+        config.write_text(f'[session]\nname = "x"\ndirectory = "."\nreserve_mb = 1\n{text}')
+        with udp_sender(port, srep_datagram):
+            run = _unprivileged("check", str(config), "--seconds", "0.5", "--json")
+        assert run.returncode == 1, run.stderr
+        found = json.loads(run.stdout)
+        assert found["ok"] is False
+        [problem] = found["devices"][0]["problems"]
+        limit = int(Path("/proc/sys/net/core/rmem_max").read_text())
+        want = f"receive buffer: asked for {1023 << 20} bytes, got {limit}; `sysctl -w net.core.rmem_max={1023 << 20}`"
+        assert problem.startswith(want)
+
+    def test_the_table_has_a_line_a_device_and_a_line_a_problem(self, tmp_path: Path) -> None:
+        config = tmp_path / "swath.toml"
+        port = free_udp_port()
+        config.write_text(
+            f'[session]\nname = "x"\ndirectory = "."\nreserve_mb = 1\n{gnss(f"{tmp_path}/ttyNone")}{srep(port)}'
+        )
+        with udp_sender(port, srep_datagram):
+            run = subprocess.run(
+                [sys.executable, "-m", "swath.daemon.cli.main", "check", str(config), "--seconds", "0.5"],
+                cwd=ROOT,
+                env=os.environ | {"COLUMNS": "100"},
+                capture_output=True,
+                text=True,
+                timeout=HANGS_S,
+                check=False,
+            )
+        assert run.returncode == 1
+        lines = run.stdout.splitlines()
+        assert [
+            line.split()[-1] for line in lines if line.lstrip().startswith(("gnss/rover ", "scanner/left ", "log "))
+        ] == [
+            "wrong",
+            "ok",
+            "ok",
+        ]
+        assert sum(line.startswith("gnss/rover: ") for line in lines) == 1
+
+
+def _unprivileged(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run the command line without CAP_NET_ADMIN."""
+    drop = ["setpriv", "--bounding-set=-net_admin", "--inh-caps=-net_admin"] if os.getuid() == 0 else []
+    return subprocess.run(
+        [*drop, sys.executable, "-m", "swath.daemon.cli.main", *arguments],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=HANGS_S,
+        check=False,
+    )

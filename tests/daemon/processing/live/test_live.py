@@ -1,0 +1,436 @@
+"""``swath live``: live and replayed points are the same bytes; what it says of itself."""
+
+from __future__ import annotations
+
+import copy
+import json
+import random
+import re
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import replace as replaced
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+from unittest.mock import Mock
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from rich.text import Text
+
+from swath.daemon.cli.live import page
+from swath.daemon.cli.main import run_app
+from swath.daemon.config import Config, load_config
+from swath.daemon.config.tables import LiveConfig
+from swath.daemon.errors import UserError
+from swath.daemon.log.mcap.chunks import LogBatch
+from swath.daemon.log.parts import RECORDING_SIGN
+from swath.daemon.log.reader import Session, open_logs
+from swath.daemon.processing.live import follow as live_follow
+from swath.daemon.processing.live import session as live_module
+from swath.daemon.processing.live.points import POINT_DTYPE
+from swath.daemon.processing.live.session import Live, LiveSession, Told, replay
+from swath.daemon.processing.live.status import LiveStatus, sentence
+from swath.daemon.processing.points.feed import TICK_BYTES, TICK_NS
+from swath.daemon.processing.setup.setup import Options, Setup
+from swath.daemon.processing.warm_up import WarmUp
+from swath.daemon.simulate.into_log import fly_into_log
+from swath.georef.points import Fate
+from swath.georef.stream.clocks import DevicePlan
+from swath.georef.timescales import ClockStatus, TimeState
+from swath.sim.companions import companion_files, config_text, default_wires
+from swath.sim.fly import VirtualFlight
+from swath.sim.plan.plan import parse_plan
+from tests.daemon.cli.test_cli import swath
+from tests.daemon.commands import ROOT
+
+pytestmark = pytest.mark.xdist_group("kernels")
+
+# ---------------------------------------------------------------------------------------------- a flight
+
+PLAN = """
+[flight]
+name = "live"
+seed = 5
+speed_mps = 50.0
+[[line]]
+name = "1"
+from_m = [-150, 0]
+to_m = [150, 0]
+height_m = 520
+[[line]]
+name = "2"  # never reached: so that there is ground below the way to the first
+from_m = [-1000, 0]
+to_m = [-900, 0]
+height_m = 520
+[gnss.rover]
+ins = true
+rate_hz = 1
+[scanner.left]
+prf_hz = 5000
+on_lines_only = false
+[scanner.right]
+prf_hz = 3000
+on_lines_only = false
+"""
+SECONDS = 7.0
+
+
+class Flown:
+    """A finished log of several parts, which can be made to grow again."""
+
+    def __init__(self, folder: Path) -> None:
+        plan = parse_plan(PLAN, Path())
+        flight = VirtualFlight(plan, None, SECONDS)
+        for name, data in companion_files(plan, flight.site, flight.scene).items():
+            (folder / name).write_bytes(data)
+        text = config_text(plan, default_wires(plan), "logs").replace("[session]", "[session]\nsplit_minutes = 0.035")
+        text = text.replace('protocol = "novatel"', 'protocol = "novatel"\ndatum = "same"')
+        (folder / "swath.toml").write_text(text)
+        self.config: Config = load_config(folder / "swath.toml")
+        report = fly_into_log(self.config, folder / "logs", flight, plan.tables.flight.seed)
+        self.paths = report.paths
+        assert len(self.paths) >= 3
+
+    def session(self) -> Session:
+        (session,) = open_logs(self.paths)
+        return session
+
+    def setup(self) -> Setup:
+        return Setup.of_log(self.session().attachments(), Options(uncertainty=False))
+
+    def grow(self, folder: Path, seed: int) -> Iterator[None]:
+        """Write the same parts again, a piece at a time: the next part's head is there before this one's end."""
+        lengths = random.Random(seed)
+        session_id = self.session().session_id
+        for number, path in enumerate(self.paths):
+            data, at = path.read_bytes(), 0 if number == 0 else 2000
+            while at < len(data) - 500:
+                step = lengths.choice([7, 300, 20_000, 150_000])
+                _append(folder / path.name, data[at : min(at + step, len(data) - 500)])
+                if number == 0 and at == 0:
+                    _write_sign(folder, session_id, 0, path)
+                at += step
+                yield
+            if number + 1 < len(self.paths):
+                following = self.paths[number + 1]
+                _append(folder / following.name, following.read_bytes()[:2000])
+                _write_sign(folder, session_id, number + 1, following)
+                yield
+            _append(folder / path.name, data[-500:])
+            yield
+        (folder / RECORDING_SIGN).unlink()
+
+
+def _append(path: Path, data: bytes) -> None:
+    with path.open("ab") as file:
+        file.write(data)
+
+
+def _write_sign(folder: Path, session_id: str, part: int, path: Path) -> None:
+    sign = {"session_id": session_id, "part": part, "path": path.name, "boot_id": "virtual"}
+    (folder / RECORDING_SIGN).write_text(json.dumps(sign))
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
+    return Flown(tmp_path_factory.mktemp("flown"))
+
+
+@pytest.fixture(scope="module")
+def replayed(flown: Flown, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Told]:
+    """The folder of a replay, with all points in ``points.npy``, and what was told at its end."""
+    folder = tmp_path_factory.mktemp("replayed")
+    found = replay(flown.session(), flown.setup(), folder, LiveConfig(), folder / "points.npy")
+    return folder, found
+
+
+def follow_growing(flown: Flown, folder: Path, seed: int, monkeypatch: pytest.MonkeyPatch) -> list[Told]:
+    """Follow the flight while it is written anew; what was told."""
+    monkeypatch.setattr(live_module, "POLL_S", 0.0)
+    monkeypatch.setattr(live_module, "STATUS_S", 0.05)
+    monkeypatch.setattr(live_follow, "GONE_S", 1e9)
+    growth, told = flown.grow(folder, seed), list[Told]()
+    run = Live(folder, LiveConfig(), told.append, points=folder / "points.npy")
+    run.run(lambda: next(growth, None) is not None)
+    return told
+
+
+class TestPoints:
+    def test_all_returns_are_accounted_for(self, replayed: tuple[Path, Told]) -> None:
+        folder, found = replayed
+        points = np.load(folder / "points.npy")
+        assert points.dtype == POINT_DTYPE
+        for number, name in enumerate(("left", "right")):
+            assert found["fates"][name]["georeferenced"] == found["points"][name] > 10_000
+            assert np.count_nonzero(points["scanner"] == number) == found["points"][name]
+        assert found["waiting"] == {"left": 0, "right": 0}
+        assert (found["trouble"], found["damaged_chunks"]) == ("", 0)
+
+    @pytest.mark.parametrize("seed", [1, 2])
+    def test_followed_while_it_grows_over_parts_gives_the_bytes_of_its_replay(
+        self, flown: Flown, replayed: tuple[Path, Told], tmp_path: Path, seed: int, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        told = follow_growing(flown, tmp_path, seed, monkeypatch)
+        assert told[-1]["state"] == "ended (the recording has ended)"
+        assert told[-1]["live_skipped_s"] == 0.0
+        assert (tmp_path / "points.npy").read_bytes() == (replayed[0] / "points.npy").read_bytes()
+        assert json.loads((tmp_path / "live/live.json").read_text()) == told[-1]
+        assert sorted({int(one["part"]) for one in told if "part" in one}) == list(range(len(flown.paths)))
+
+    def test_cut_otherwise_the_same_bytes(self, flown: Flown, replayed: tuple[Path, Told], tmp_path: Path) -> None:
+        def cut() -> Iterator[LogBatch]:
+            lengths = random.Random(3)
+            for batch in flown.session().batches():
+                first = 0
+                while first < len(batch.log_time_ns):
+                    last = first + lengths.randint(1, 30)
+                    yield batch.between(first, last)
+                    first = last
+
+        replay(flown.session(), flown.setup(), tmp_path, LiveConfig(), tmp_path / "points.npy", batches=cut())
+        for name in ("points.npy", "coverage.png"):
+            assert (tmp_path / name).read_bytes() == (replayed[0] / name).read_bytes(), name
+
+    def test_after_what_was_skipped_points_lie_where_they_lay(
+        self, flown: Flown, replayed: tuple[Path, Told], tmp_path: Path
+    ) -> None:
+        """Chunks of scanners of 1.5 s are left out, as by somebody who is behind."""
+        begin_ns = flown.session().info.realtime_ns + 3_000_000_000
+
+        def with_a_hole() -> Iterator[LogBatch]:
+            for batch in flown.session().batches():
+                in_hole = begin_ns <= int(batch.log_time_ns[0]) < begin_ns + 1_500_000_000
+                if not (in_hole and batch.channel.chunk_class == "scanner"):
+                    yield batch
+
+        replay(flown.session(), flown.setup(), tmp_path, LiveConfig(), tmp_path / "points.npy", batches=with_a_hole())
+        some, everything = np.load(tmp_path / "points.npy"), np.load(replayed[0] / "points.npy")
+        some, everything = some[some["scanner"] == 0], everything[everything["scanner"] == 0]
+        late = some[some["time_ns"] > everything["time_ns"][0] + 5_000_000_000]
+        assert 0.5 * len(everything) < len(some) < 0.9 * len(everything)
+        assert len(late) > 5_000
+        theirs = everything[-len(late) :]
+        np.testing.assert_allclose(late["range_m"], theirs["range_m"])
+        np.testing.assert_allclose(late["time_ns"], theirs["time_ns"], rtol=0, atol=100)
+        np.testing.assert_allclose(late["points_map"], theirs["points_map"], rtol=0, atol=1e-4)
+
+    def test_without_a_solution_of_the_device_and_an_imu_nothing_can_be_made(
+        self, flown: Flown, tmp_path: Path
+    ) -> None:
+        attachments = flown.session().attachments()
+        text = attachments["config.toml"].replace(b'"novatel"', b'"nmea"')
+        attachments["config.toml"] = re.sub(rb"(?ms)^\[imu\..*?(?=^\[(?!imu))", b"", text)
+        setup = Setup.of_log(attachments, Options(datum="same", uncertainty=False))
+        with pytest.raises(UserError, match="no configured device tells its own INS solution"):
+            replay(flown.session(), setup, tmp_path, LiveConfig(), None)
+
+
+class TestStatus:
+    def test_says_rates_latencies_time_and_density(self, replayed: tuple[Path, Told]) -> None:
+        folder, found = replayed
+        assert json.loads((folder / "live.json").read_text()) == found
+        for name in ("left", "right"):
+            pulse = found["latency_s"][f"scanner/{name}"]["pulse"]
+            assert 0.0 < pulse["p50"] <= pulse["p95"] <= pulse["max"] < 5.0
+        assert found["time"]["pps/main"]["state"] == "LOCKED"
+        assert found["trajectory"]["source"] == "gnss/rover"
+        coverage = json.loads((folder / "coverage.json").read_text())
+        assert coverage["points"] == sum(found["points"].values())
+        # two scanners of 8000 pulses a second in all, at 50 m/s: pulses over the area that they fall into
+        assert 0.5 < coverage["density_per_m2"]["mean"] < 20.0
+
+    def test_a_sentence_names_what_is_wrong(self, replayed: tuple[Path, Told]) -> None:
+        found = dict(replayed[1])
+        assert "SKIPPED" not in sentence(found)
+        found["live_skipped_s"] = 7.25
+        found["trouble"] = "free space is down"
+        found["fates"] = {"left": {"georeferenced": 5, "no_time": 3}}
+        found["without_time"] = ["scanner/left: 3 of 8 returns have no time: its stamps run free"]
+        told = sentence(found)
+        assert "7.2 s SKIPPED, more than 5 s behind" in told
+        assert told.endswith("; free space is down")
+        assert "3 no time" in told
+        assert "its stamps run free" in told
+        assert sentence(found | {"points_file": "p.npy ends"}).endswith("; free space is down; p.npy ends")
+
+    def test_only_what_is_well_is_green(self, replayed: tuple[Path, Told]) -> None:
+        """At a glance: points of every scanner, on time, every clock locked, nothing damaged or passed over."""
+        found = copy.deepcopy(replayed[1])
+        found |= {"trouble": "", "live_skipped_s": 0.0, "damaged_chunks": 0, "state": "following", "without_time": []}
+        found["points_per_s"] = dict.fromkeys(found["points"], 8000)
+        for one in found["latency_s"].values():
+            if one["pulse"]:
+                one["pulse"]["p95"] = 0.4  # a flight of 7 s, of which most waited for the clock
+        late = copy.deepcopy(found)
+        late["latency_s"]["scanner/left"]["pulse"]["p95"] = 12.0
+        wrong: list[Told] = [
+            {},
+            {"trouble": "free space is down"},
+            {"points_file": "p.npy ends"},
+            {"live_skipped_s": 7.25},
+            {"damaged_chunks": 2},
+            {"without_time": ["scanner/left: 3 of 8 returns have no time"]},
+            {"points_per_s": found["points_per_s"] | {"right": 0}},
+            {"time": found["time"] | {"pps/main": {"state": "LOST", "sigma_ns": None}}},
+            {"latency_s": late["latency_s"]},
+        ]
+        styles = [str(cast(Text, page(found | one).renderables[0]).style) for one in wrong]
+        assert styles == ["bold green", *["bold yellow"] * (len(wrong) - 1)]
+        assert "2 chunks of the log DAMAGED" in sentence(found | {"damaged_chunks": 2})
+
+    def test_a_latency_is_by_the_scanners_clock_as_it_is_now(self) -> None:
+        """Which is asked once a second, and says something else each time here."""
+        asked: list[int] = []
+
+        def gps_from_host(clock: str, host_ns: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+            asked.append(int(host_ns[0]))
+            return host_ns + 100_000_000 * len(asked), np.array([np.inf if len(asked) == 1 else 1.0])
+
+        host = SimpleNamespace(
+            plan=SimpleNamespace(devices={"scanner/left": DevicePlan("pps/main")}), gps_from_host=gps_from_host
+        )
+        stream: Any = SimpleNamespace(clocks=SimpleNamespace(host=host))
+        status = LiveStatus(Mock(), stream, Mock())
+        found: list[float | None] = []
+        for tenths in (0, 1, 2, 10, 11, 12):  # no time yet, 0.2 s, and after a second 0.3 s
+            now_ns = 5_000_000_000 + tenths * 100_000_000
+            status._pulse.clear()
+            status.note_points("left", np.array([now_ns]), now_ns)
+            told = status._pulse["scanner/left"].plain() if status._pulse else None
+            found.append(told["max"] if told else None)
+        assert found == [None, 0.2, 0.2, 0.2, 0.3, 0.3]
+        assert len(asked) == 3
+
+    def test_returns_without_time_are_told_with_the_reason_while_they_come(self) -> None:
+        """Those since the last time: at its beginning nothing has time, which passes."""
+        counts: dict[Fate, int] = {}
+        refused: dict[str, int] = {}
+        locked = ClockStatus(TimeState.LOCKED, 100.0)
+        host = SimpleNamespace(
+            by_source={},
+            plan=SimpleNamespace(devices={"scanner/left": DevicePlan("pps/main")}),
+            status=lambda clock, host_ns: locked,
+        )
+        clocks = SimpleNamespace(host=host, refused=lambda source: refused, stamps=lambda source: None)
+        stream: Any = SimpleNamespace(
+            scanners=["left"],
+            clocks=clocks,
+            path=SimpleNamespace(covered_until_ns=7),
+            fates=lambda name: counts,
+            waiting=lambda name: 0,
+        )
+        products: Any = SimpleNamespace(
+            points=Counter(), shown=0, unwritten=0, trouble="", room=Mock(), origin=lambda: {}
+        )
+        status = LiveStatus(Mock(), stream, products)
+        said = []
+        for georeferenced, no_time, past_hour in ((0, 500, 0), (1000, 500, 0), (1900, 600, 0), (1900, 900, 300)):
+            counts.update({Fate.GEOREFERENCED: georeferenced, Fate.NO_TIME: no_time})
+            refused["past_hour"] = past_hour
+            said.append(status.plain(None, 0)["without_time"])
+        assert said[1] == []
+        assert said[0][0].startswith("scanner/left: 500 of 500 returns have no time: its stamps run free")
+        assert said[2][0].startswith("scanner/left: 100 of 1,000 returns have no time: its stamps run free")
+        assert said[3][0].startswith("scanner/left: 300 of 300 returns have no time: its stamps contradict the host's")
+
+    def test_what_was_navigated_is_not_called_the_devices_own(self) -> None:
+        """A receiver whose protocol could tell an INS solution, and that has none."""
+        host = SimpleNamespace(by_source={})
+        stream: Any = SimpleNamespace(
+            scanners=[], clocks=SimpleNamespace(host=host), path=SimpleNamespace(covered_until_ns=7)
+        )
+        products: Any = SimpleNamespace(
+            points=Counter(), shown=0, unwritten=0, trouble="", room=Mock(), origin=lambda: {}
+        )
+        setup: Any = SimpleNamespace(ins_source="gnss/rover")
+        status = LiveStatus(setup, stream, products)
+        assert status.plain(None, 0)["trajectory"] == {"source": "gnss/rover", "covered_until_gps_ns": 7}
+        status.navigation = "aligned with dual-antenna heading"
+        assert status.plain(None, 0)["trajectory"]["source"] == "navigated"
+
+    @pytest.mark.parametrize(("made_with", "other"), [("navigated", True), ("ins", False), ("file", False)])
+    def test_a_calibration_made_with_another_kind_of_trajectory_is_told(
+        self, flown: Flown, tmp_path: Path, made_with: str, other: bool
+    ) -> None:
+        """The receiver's own INS is what points come from here."""
+        setup = flown.setup()
+        assert setup.sources.ins_source is not None
+        for name, one in setup.calibrations.items():
+            setup.calibrations[name] = replaced(one, method="planes", header={"trajectory": made_with})
+        session = LiveSession(setup, flown.session().info, tmp_path, LiveConfig(), None)
+        told = [one["what"] for one in session.verdict["reasons"]]
+        assert len(told) == (len(setup.calibrations) if other else 0)
+        assert all("here is the device's own INS, whose alignment is another" in one for one in told)
+
+    def test_the_folder_cannot_be_written_to(self, flown: Flown, tmp_path: Path) -> None:
+        (tmp_path / "file").touch()
+        with pytest.raises(UserError, match=r"Not a directory|File exists"):
+            replay(flown.session(), flown.setup(), tmp_path / "file", LiveConfig(), None)
+
+
+class TestCommand:
+    @pytest.mark.slow
+    def test_replays_with_a_configuration_of_its_own(self, flown: Flown, tmp_path: Path) -> None:
+        config = flown.config.path.with_name("other.toml")
+        config.write_text(flown.config.text + "\n[live]\npoints_per_s = 100\ncell_m = 5.0\n")
+        logs = tmp_path / "logs"
+        logs.mkdir()
+        for path in flown.paths:
+            (logs / path.name).symlink_to(path.absolute())
+        (logs / "empty.mcap").touch()  # as a power cut leaves one
+        given = ("live", "--replay", str(logs), str(config), "-o", str(tmp_path), "--json")
+        refused = swath(*given)
+        assert refused.returncode == 1
+        assert "is nominal: points may lie" in refused.stderr
+        done = swath(*given, "--accept-verdict")
+        assert done.returncode == 0, done.stderr
+        assert f"passed over: {logs}/empty.mcap: " in done.stderr
+        found = json.loads(done.stdout)
+        assert found["state"] == "replayed"
+        seconds = int(SECONDS) + 1
+        assert 0 < found["live_mcap"]["points_written"] <= 100 * seconds
+        assert json.loads((tmp_path / "coverage.json").read_text())["cell_m"] == 5.0
+
+    @pytest.mark.parametrize(
+        ("arguments", "told"),
+        [
+            (["--replay", "some.mcap"], "say which logs, and where to: swath live --replay LOG… -o DIR [CONFIG]"),
+            (["-o", "x"], "-o belongs to --replay"),
+            (["a", "b"], "one recorder at a time"),
+        ],
+    )
+    def test_wrong_use_is_a_line(self, arguments: list[str], told: str) -> None:
+        done = swath("live", *arguments)
+        assert (done.returncode, done.stdout) == (2, "")
+        assert told in done.stderr
+        assert done.stderr.count("\n") == 1
+
+    def test_says_where_nothing_compiled_can_be_kept(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+    ) -> None:
+        """A service's journal has what stands on standard error."""
+
+        class Nothing:
+            def __init__(self, *_: object, **__: object) -> None:
+                pass
+
+            def run(self, stopped: object) -> Told:
+                return {"state": "ended (stopped)"}
+
+        monkeypatch.setattr("swath.daemon.processing.warm_up.warm_up", lambda setups: WarmUp(12, 3.25, None))
+        monkeypatch.setattr("swath.daemon.system.lower_priority", lambda: None)
+        monkeypatch.setattr("swath.daemon.processing.live.session.Live", Nothing)
+        assert run_app(["live", str(tmp_path)]) == 0
+        told = capfd.readouterr()
+        assert told.out == ""
+        assert told.err == WarmUp(12, 3.25, None).text() + "\n"
+
+
+def test_the_pages_say_how_often_is_decided() -> None:
+    tick = f"{TICK_NS // 1_000_000} ms"
+    assert f"decisions fall every {tick}" in (ROOT / "docs/live.md").read_text()
+    decision = (ROOT / "docs/decisions/0012-ticks-make-live-equal-replay.md").read_text()
+    assert f"a multiple of\n  {tick}, or where {TICK_BYTES >> 20} MiB" in decision
+    assert f"comes up to {tick} later" in decision

@@ -1,0 +1,95 @@
+"""``swath live`` beside a recorder, in real time: a virtual aircraft on wires, three processes, one log."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+import pytest
+
+from swath.daemon.config.tables import LiveConfig
+from swath.daemon.log.reader import open_logs
+from swath.daemon.processing.live.session import Told, replay
+from swath.daemon.processing.setup.setup import Options, Setup
+from swath.daemon.processing.warm_up import warm_up
+from tests.daemon.cli.test_cli import ROOT
+from tests.daemon.processing.live.test_live import PLAN
+from tests.daemon.rig import HANGS_S, Recorder, session_table, wait_until
+
+pytestmark = [pytest.mark.slow, pytest.mark.alone, pytest.mark.xdist_group("kernels")]
+
+SECONDS = 6.5
+PART_MINUTES = 0.035  # two seconds
+
+
+@contextmanager
+def running(*words: str | Path, output: IO[str] | int = subprocess.DEVNULL) -> Iterator[subprocess.Popen[str]]:
+    """A command of ours; gone at the end, whatever happens."""
+    command = [sys.executable, "-m", "swath.daemon.cli.main", *map(str, words)]
+    with subprocess.Popen(command, cwd=ROOT, stdout=output, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def config_of(wires: Path, folder: Path) -> str:
+    """The configuration that reads a flight's wires, and its files beside it."""
+    wait_until((wires / "pps-main").exists, "the last of the wires")
+    for path in [*wires.glob("*.true.toml"), wires / "main.dbc"]:
+        (folder / path.name).write_bytes(path.read_bytes())
+    text = (wires / "swath.toml").read_text().replace('"novatel"', '"novatel"\ndatum = "same"')
+    text = text.replace(".nominal.toml", ".true.toml")
+    head = session_table(folder / "logs", name='"growing"', split_minutes=PART_MINUTES)
+    return text.replace(text[: text.index("[pps.main]")], head)
+
+
+def test_points_made_while_it_is_recorded_are_those_of_the_replay(tmp_path: Path) -> None:
+    """Over part changes, to the last byte; nothing is skipped, and it says how far it is behind."""
+    warm_up([])  # else the command compiles before it follows anything, and says so
+    logs, points, said, plan = (tmp_path / name for name in ("logs", "points.npy", "said", "plan.toml"))
+    logs.mkdir()
+    plan.write_text(PLAN.replace("rate_hz = 1\n", "rate_hz = 20\n"))
+    wires = tmp_path / "wires"
+    fly = ("sim", "fly", plan, "--wire", "-o", wires, "--seconds", f"{SECONDS:g}", "--wait", f"{HANGS_S:g}")
+    with (
+        said.open("w") as output,
+        running(*fly) as flying,
+        running("live", logs, "--points", points, "--json", output=output) as live,
+    ):
+        config = config_of(wires, tmp_path)
+        wait_until(lambda: "waiting for a recording" in said.read_text(), "live waits")
+        with Recorder(tmp_path, config) as recorder:
+            flying.communicate(timeout=HANGS_S)
+            time.sleep(1.0)  # what is still on its way through the recorder
+            assert recorder.stop() == 0
+        _, trouble = live.communicate(timeout=HANGS_S)
+    told: list[Told] = [json.loads(line) for line in said.read_text().splitlines()]
+    assert (flying.returncode, live.returncode, trouble) == (0, 0, "")
+    assert told[-1]["state"] == "ended (the recording has ended)"
+    assert (told[-1]["live_skipped_s"], told[-1]["damaged_chunks"], told[-1]["trouble"]) == (0.0, 0, "")
+
+    (session,) = open_logs([logs])
+    assert len(session.parts) >= 3
+    assert {one["part"] for one in told if "part" in one} >= {0, 1, 2}
+    setup = Setup.of_log(session.attachments(), Options(uncertainty=False))
+    replayed = replay(session, setup, tmp_path / "replayed", LiveConfig(), tmp_path / "replayed.npy")
+    assert points.read_bytes() == (tmp_path / "replayed.npy").read_bytes()
+    assert len(np.load(points)) == sum(replayed["points"].values()) > 10_000
+    for key in ("points", "fates"):
+        assert told[-1][key] == replayed[key]
+
+    while_flying = [one for one in told if one.get("latency_s", {}).get("scanner/left", {}).get("pulse")]
+    assert len(while_flying) > 2
+    for one in while_flying:
+        pulse = one["latency_s"]["scanner/left"]["pulse"]
+        assert 0.1 < pulse["p50"] <= pulse["p95"] <= pulse["max"], "a chunk is open for a while"
+        assert one["behind_s"] >= 0.0
+        assert " s behind the pulse" in one["sentence"]

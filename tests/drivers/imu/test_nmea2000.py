@@ -1,0 +1,337 @@
+"""NMEA 2000: a busy bus against another decoder's values, in order; sources; fast packets; damage."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import re
+import struct
+from functools import cache
+from math import degrees, pi, radians
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from swath.drivers.can_frames import encode_can_frame
+from swath.drivers.driver import find_driver
+from swath.drivers.imu.nmea2000 import Nmea2000Parser, make_time_parser, pgn_and_source
+from swath.drivers.parser import DeviceSettings, DriverSettingsError
+from swath.georef.records import DeviceStatus, FixType, GnssFix, GnssHeading, NamesEdge, Record, TimeMessage
+from tests.drivers.harness import STREAM_HOST_NS, check_packet_damage, check_packets, packet_batches, run_packets
+
+FIXTURES = Path(__file__).parents[3] / "fixtures/nmea2000"
+SETTINGS = DeviceSettings("imu/main", {"protocol": "nmea2000"})
+COUNTS = {  # messages of all sources: nmea2000 2026.10.3 (PyPI)
+    "can0-2_candump.log.gz": {
+        "126992": 177,
+        "127250": 1786,
+        "127251": 2383,
+        "127252": 595,
+        "127257": 1906,
+        "129025": 1639,
+        "129026": 1390,
+        "129029": 356,
+    },
+    "candumpSample2.txt.gz": {
+        "129026": 46,
+        "129025": 46,
+        "127250": 46,
+        "127251": 46,
+        "129029": 5,
+        "126992": 5,
+        "127257": 5,
+    },
+    "candumpSample3.txt.gz": {"127250": 175, "127251": 175, "127257": 175, "129025": 165, "129026": 66},
+}
+NAMES = {  # the other decoder's field -> ours
+    "heading": "heading_rad",
+    "deviation": "deviation_rad",
+    "variation": "variation_rad",
+    "rate": "rate_of_turn_radps",
+    "heave": "heave_m",
+    "yaw": "yaw_rad",
+    "pitch": "pitch_rad",
+    "roll": "roll_rad",
+    "latitude": "lat_deg",
+    "longitude": "lon_deg",
+    "cog": "course_rad",
+    "sog": "speed_mps",
+}
+LINE = re.compile(r"([0-9A-F]{8})(?:#([0-9A-F]*)|\s+\[\d\]\s+([0-9A-F ]+))\s*$")
+
+
+@cache
+def bus(name: str) -> tuple[bytes, ...]:
+    """All frames with 29-bit identifiers of a recording, either format of candump."""
+    with gzip.open(FIXTURES / name, "rt") as file:
+        found = [match for line in file if (match := LINE.search(line))]
+    return tuple(
+        encode_can_frame(int(identifier, 16), bytes.fromhex(compact or spaced or ""), extended=True)
+        for identifier, compact, spaced in (match.groups() for match in found)
+    )
+
+
+def decoded(name: str) -> list[dict[str, Any]]:
+    """The other decoder's messages, in order."""
+    with gzip.open(FIXTURES / name, "rt") as file:
+        return [json.loads(line) for line in file]
+
+
+def parser_of(source_address: int | None = None) -> Nmea2000Parser:
+    """A parser that listens to one device, or to the first of each PGN."""
+    return Nmea2000Parser(DeviceSettings("imu/main", {"source_address": source_address}))
+
+
+def parse(units: list[bytes] | tuple[bytes, ...], parser: Nmea2000Parser) -> list[Record]:
+    """Everything as one batch, closed."""
+    records = [record for batch in packet_batches(units, lambda: len(units)) for record in parser.feed_batch(batch)]
+    return records + parser.close()
+
+
+def frame(pgn: int, data: bytes, source: int = 1, priority: int = 2) -> bytes:
+    """A frame of a broadcast PGN."""
+    return encode_can_frame(priority << 26 | pgn << 8 | source, data, extended=True)
+
+
+def fast_frames(message: bytes, sequence: int, source: int = 1) -> list[bytes]:
+    """A message of 129029 cut by hand."""
+    pieces = [bytes([len(message)]) + message[:6]]
+    pieces += [message[start : start + 7] for start in range(6, len(message), 7)]
+    return [
+        frame(129029, bytes([sequence << 5 | number]) + piece.ljust(7, b"\xff"), source)
+        for number, piece in enumerate(pieces)
+    ]
+
+
+def position(lat_deg: float, *, method: int = 1, days: int = 19326, time: int = 432_890_000) -> bytes:
+    """The 43 bytes of 129029 without stations."""
+    lat, lon, altitude = round(lat_deg * 1e16), round(8.5 * 1e16), 43_000_000
+    counts = struct.pack("<BHIqqq", 5, days, time, lat, lon, altitude)
+    return counts + struct.pack("<BBBhhiB", method << 4, 0xFC, 9, 90, 0x7FFF, 4690, 0)
+
+
+@pytest.mark.parametrize("name", COUNTS)
+def test_messages_are_counted_as_the_other_decoder_does(name: str) -> None:
+    parser = parser_of()
+    parse(bus(name), parser)
+    assert dict(parser.counters.messages) == COUNTS[name]
+    assert parser.counters.bad_messages == 0
+
+
+def test_the_whole_bus_is_read() -> None:
+    assert len(bus("can0-2_candump.log.gz")) == 47_166
+
+
+def test_values_of_every_source_in_order() -> None:
+    units = bus("can0-2_candump.log.gz")
+    theirs = decoded("can0-2.nmea2000_decoded.jsonl.gz")
+    compared = 0
+    for source in sorted({message["src"] for message in theirs}):
+        records = [r for r in parse(units, parser_of(source)) if isinstance(r, DeviceStatus | TimeMessage)]
+        mine = [r for r in records if r.message != "129029"]
+        expected = [message for message in theirs if message["src"] == source]
+        assert len(mine) == len(expected)
+        for record, message in zip(mine, expected, strict=True):
+            assert record.message == str(message["pgn"])
+            fields = message["fields"]
+            if isinstance(record, TimeMessage):
+                assert str(record.time.date) == fields["date"]
+                assert record.time.time_ns // 1_000_000_000 == seconds_of_day(fields["time"])
+                continue
+            said = {NAMES[key]: value for key, value in fields.items() if key in NAMES and value is not None}
+            got = {key: value for key, value in record.values.items() if key != "reference"}
+            assert got == pytest.approx(said, rel=1e-12, abs=1e-15)
+            compared += len(said)
+    assert compared > 15_000
+
+
+def seconds_of_day(text: str) -> int:
+    hours, minutes, seconds = (int(part) for part in text.split(":"))
+    return hours * 3600 + minutes * 60 + seconds
+
+
+def test_fast_packets_of_every_source_in_order() -> None:
+    units, theirs = bus("can0-2_candump.log.gz"), decoded("can0-2.129029_decoded.jsonl.gz")
+    types = {"GNSS fix": FixType.SINGLE, "DGNSS fix": FixType.DIFFERENTIAL}
+    for source in sorted({message["src"] for message in theirs}):
+        records = parse(units, parser_of(source))
+        fixes = [record for record in records if isinstance(record, GnssFix)]
+        status = [r.values for r in records if isinstance(r, DeviceStatus) and r.message == "129029"]
+        expected = [message["fields"] for message in theirs if message["src"] == source]
+        assert len(fixes) == len(status) == len(expected) >= 59
+        for fix, values, fields in zip(fixes, status, expected, strict=True):
+            assert fix.lat_rad is not None
+            assert fix.lon_rad is not None
+            assert degrees(fix.lat_rad) == pytest.approx(fields["latitude"], abs=1e-12)
+            assert degrees(fix.lon_rad) == pytest.approx(fields["longitude"], abs=1e-12)
+            assert (fix.satellites, fix.fix_type) == (fields["numberOfSvs"], types[fields["method"]])
+            assert fix.time.time_ns // 1_000_000_000 == seconds_of_day(fields["time"])
+            assert fix.height_m is None
+            assert values["altitude_m"] == pytest.approx(fields["altitude"], abs=1e-9)
+            assert values["geoidal_separation_m"] == pytest.approx(fields["geoidalSeparation"], abs=1e-9)
+            assert (values["hdop"], values["pdop"]) == pytest.approx((fields["hdop"], fields["pdop"]))
+
+
+def test_the_first_source_of_each_pgn_is_used_and_the_others_counted() -> None:
+    units, theirs = bus("can0-2_candump.log.gz"), decoded("can0-2.nmea2000_decoded.jsonl.gz")
+    first: dict[int, int] = {}
+    for message in theirs:
+        first.setdefault(message["pgn"], message["src"])
+    parser = parser_of()
+    records = parse(units, parser)
+    rates = [
+        r.values["rate_of_turn_radps"] for r in records if r_message(r) == "127251" and isinstance(r, DeviceStatus)
+    ]
+    expected = [m["fields"]["rate"] for m in theirs if m["pgn"] == 127251 and m["src"] == first[127251]]
+    assert rates == pytest.approx(expected, rel=1e-12)
+    used = sum(first[message["pgn"]] == message["src"] for message in theirs)
+    fixes = sum(isinstance(record, GnssFix) for record in records)
+    assert parser.counters.errors["other_source"] == len(theirs) - used + 356 - fixes
+    assert 59 <= fixes <= 60
+
+
+def r_message(record: Record) -> str:
+    """Name of the message, where the record has one."""
+    return getattr(record, "message", "")
+
+
+def test_batches_do_not_matter() -> None:
+    whole = check_packets(parser_of, bus("can0-2_candump.log.gz")[:3000])
+    assert whole.counters["errors"]["other_source"] > 100
+    assert whole.counters["messages"]["129029"] > 10
+
+
+def test_damaged_frames_never_raise() -> None:
+    check_packet_damage(parser_of, bus("can0-2_candump.log.gz")[100:])
+
+
+@settings(max_examples=150, deadline=None, derandomize=True)
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from([126992, 127250, 127251, 127252, 127257, 129025, 129026, 129029]),
+            st.integers(0, 3),
+            st.binary(max_size=8),
+        ),
+        min_size=1,
+        max_size=60,
+    ),
+    st.integers(1, 20),
+)
+def test_random_data_never_raises_whatever_the_batches(frames: list[tuple[int, int, bytes]], size: int) -> None:
+    units = [frame(pgn, data, source) for pgn, source, data in frames]
+    assert run_packets(parser_of, units, lambda: size) == run_packets(parser_of, units, lambda: len(units))
+
+
+def test_identifier_to_pgn_and_source() -> None:
+    broadcast, addressed = 0x09F11217, 0x18EA2314  # 127250 from 23; ISO request 59904 to 0x23 from 20
+    pgn, source = pgn_and_source(np.array([broadcast, addressed], np.uint32))
+    assert pgn.tolist() == [127250, 59904]
+    assert source.tolist() == [23, 20]
+
+
+def test_interleaved_sources_and_numbers_are_put_together() -> None:
+    packets = [fast_frames(position(47.0 + n), n % 8, source=3) for n in range(2)]
+    others = fast_frames(position(-30.0), 0, source=4)
+    units = [unit for trio in zip(*packets, others, strict=True) for unit in trio]
+    fixes = [record for record in parse(units, parser_of(3)) if isinstance(record, GnssFix)]
+    assert [degrees(fix.lat_rad or 0.0) for fix in fixes] == pytest.approx([47.0, 48.0])
+    assert [str(fix.time.date) for fix in fixes] == ["2022-11-30"] * 2
+    assert fixes[0].time.time_ns == 43_289_000_000_000
+
+
+@pytest.mark.parametrize("missing", range(7))
+def test_a_missing_frame_costs_its_message_and_is_counted_once(missing: int) -> None:
+    packets = [fast_frames(position(10.0 + n), n) for n in range(3)]
+    units = [packets[0], [u for n, u in enumerate(packets[1]) if n != missing], packets[2]]
+    parser = parser_of()
+    fixes = [r for r in parse([u for packet in units for u in packet], parser) if isinstance(r, GnssFix)]
+    assert [round(degrees(fix.lat_rad or 0.0)) for fix in fixes] == [10, 12]
+    assert parser.counters.errors == {"fast_packet_incomplete": 1}
+
+
+def test_a_late_frame_belongs_to_no_message() -> None:
+    units = fast_frames(position(1.0), 0)
+    parser = parser_of()
+    host = STREAM_HOST_NS + np.where(np.arange(len(units)) < 3, 0, 1_000_000_000)
+    records = parser.parse_units(host, np.frombuffer(b"".join(units), np.uint8).reshape(len(units), -1))
+    assert records + parser.close() == []
+    assert parser.counters.errors == {"fast_packet_incomplete": 1}
+
+
+def test_memory_is_bounded_by_sources_and_numbers() -> None:
+    parser = parser_of()
+    units = [frame(129029, bytes([n << 5, 223]) + bytes(6), source) for source in range(256) for n in range(8)]
+    parse(units * 3, parser)
+    assert parser.counters.errors["fast_packet_incomplete"] == 3 * 2048
+    assert parser.counters.messages.total() == 0
+
+
+def test_what_is_not_available_is_left_out() -> None:
+    units = [
+        frame(127257, bytes.fromhex("00FF7F1F02FE7FFF")),
+        frame(129025, bytes.fromhex("FFFFFF7FFFFFFF7F")),
+        frame(126992, bytes.fromhex("00F0FFFFFFFFFFFF")),
+    ]
+    parser = parser_of()
+    records = parse(units, parser)
+    assert [r.values for r in records if isinstance(r, DeviceStatus)] == [{"pitch_rad": pytest.approx(0.0543)}, {}]
+    assert len(records) == 2
+    assert parser.counters.errors == {"time_not_available": 1}
+
+
+def test_headings_are_true_or_none() -> None:
+    def heading(reference: int, deviation: int, variation: int) -> bytes:
+        return frame(127250, struct.pack("<BHhhB", 0, 60000, deviation, variation, 0xFC | reference))
+
+    units = [heading(0, 0x7FFF, 0x7FFF), heading(1, 0x7FFF, 0x7FFF), heading(1, 0x7FFF, 318), heading(1, -100, 4000)]
+    records = parse(units, parser_of())
+    headings = [record.heading_rad for record in records if isinstance(record, GnssHeading)]
+    assert headings == pytest.approx([6.0, 6.0318, 6.39 - 2 * pi])
+    assert len(records) == 7
+
+
+def test_times_of_local_clocks_are_not_valid() -> None:
+    units = [frame(126992, struct.pack("<BBHI", 0, 0xF0 | source, 19326, 432_890_000)) for source in (0, 1, 2, 5)]
+    units.append(frame(126992, struct.pack("<BBHI", 0, 0xF0, 19326, 900_000_000)))
+    parser = parser_of()
+    times = [record for record in parse(units, parser) if isinstance(record, TimeMessage)]
+    assert [time.valid for time in times] == [True, True, False, False]
+    assert {time.names_edge for time in times} == {NamesEdge.PREVIOUS}
+    assert parser.counters.errors == {"bad_value": 1}
+
+
+def test_impossible_positions_are_no_fixes() -> None:
+    parser = parser_of()
+    units = fast_frames(position(91.0), 0) + fast_frames(position(45.0, method=0), 1) + fast_frames(bytes(20), 2)
+    fixes = [record for record in parse(units, parser) if isinstance(record, GnssFix)]
+    assert [(fix.valid, fix.fix_type) for fix in fixes] == [(False, FixType.NONE)]
+    assert fixes[0].lat_rad == pytest.approx(radians(45.0))
+    assert parser.counters.errors == {"bad_value": 1, "bad_length": 1}
+
+
+def test_remote_error_and_short_frames_are_counted() -> None:
+    parser = parser_of()
+    short = frame(127251, b"\0\0")
+    remote = encode_can_frame(0x09F11217, b"", extended=True, remote=True)
+    base = struct.pack("<I", 0x2000_0004) + bytes([8, 0, 0, 0]) + bytes(8)
+    standard = encode_can_frame(0x123, bytes(8))
+    assert parse([short, remote, base, standard], parser) == []
+    assert parser.counters.errors == {"bad_length": 1, "rtr_frame": 1, "error_frame": 1}
+
+
+@pytest.mark.parametrize("wrong", [-1, 254, "23", True])
+def test_a_wrong_source_address_is_refused(wrong: Any) -> None:
+    with pytest.raises(DriverSettingsError, match=r"source_address: got .*, want 0 to 253"):
+        Nmea2000Parser(DeviceSettings("imu/main", {"source_address": wrong}))
+
+
+def test_the_recorder_gets_time_messages_only() -> None:
+    records = parse(bus("can0-2_candump.log.gz"), make_time_parser(SETTINGS))
+    assert {type(record) for record in records} == {TimeMessage}
+    assert len(records) == 60
+    assert find_driver("imu", "nmea2000").make_time_parser is make_time_parser
