@@ -1,1 +1,1 @@
-"""Calibration: observations, the adjustment, its proof. Nothing here may import drivers, daemon or sim."""
+"""Calibration: observations, adjustment and proof. This package must not import drivers, daemon or sim."""

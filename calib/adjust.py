@@ -1,18 +1,21 @@
-"""The adjustment: parameters of all scanners, the trajectory's errors, planes and tie points, all at once.
+"""Estimate the parameters of all scanners, trajectory errors, planes and tie points in one adjustment.
 
-Every return on a plane is one condition, n · x(parameters, trajectory, range, angle) + offset = 0, with the variance M
-of what was measured (Gauss–Helmert: ISO/TS 19159-2 Eq. 16 to 20; Skaloud and Lichti 2006); a tie point is three a
-sighting (NGA Eq. 55 to 60). Conditions are linearised at the estimated unknowns and at the observations as adjusted:
-with coefficients of the observations as measured the range scale would be off by its variance times the number of rows,
-which is nothing where a row knows little of it, and sigmas where the trajectory's errors leave it no better.
+Every return on a plane gives one condition, n · x(parameters, trajectory, range, angle) + offset = 0, with the variance
+M of the measurements (Gauss–Helmert: ISO/TS 19159-2 Eq. 16 to 20; Skaloud and Lichti 2006). Every sighting of a tie
+point gives three (NGA Eq. 55 to 60). Conditions are linearised at the estimated unknowns and at the adjusted
+observations. Coefficients at the observations as measured would bias the range scale by its variance times the number
+of rows. That bias is negligible where a single row knows little of the range scale; it is several sigmas where
+trajectory errors, which many rows share, keep that variance from falling with their number.
 
-The trajectory's errors are unknowns too, with what is known of them beforehand as their prior: correlated in time, they
-are the same for thousands of returns, and a calibration that takes them as noise of each return believes itself far
-too much. What this flight does not determine is held, and said (`swath.calib.equations.observability`).
+Trajectory errors are unknowns too, with the knowledge about them before the adjustment as their prior. They are
+correlated in time and therefore the same for thousands of returns; a calibration that treats them as noise of single
+returns reports sigmas that are far too small. Unknowns that the flight does not determine are held and reported
+(`swath.calib.equations.observability`).
 
-A held parameter is wrong by something, too. With N the reduced normal matrix of the estimated ones, B their part with
-the held ones and S what is plausible of these, the covariance is N⁻¹ + N⁻¹ B S Bᵀ N⁻¹, and −N⁻¹ B S between the two
-(S. F. Schmidt, "Application of state-space methods to navigation problems", Advances in Control Systems 3, 1966).
+A held parameter has an error, too. With N the reduced normal matrix of the estimated parameters, B their part with the
+held ones and S the plausible covariance of the held ones, the covariance is N⁻¹ + N⁻¹ B S Bᵀ N⁻¹, and −N⁻¹ B S between
+the two (S. F. Schmidt, "Application of state-space methods to navigation problems", Advances in Control Systems 3,
+1966).
 """
 
 from __future__ import annotations
@@ -38,8 +41,8 @@ from swath.georef.scanner.calibration import PARAMETERS, Calibration
 Rematch = Callable[[dict[str, Calibration]], Features | None]
 
 AS_USUAL = Settings()
-STABLE = 0.1  # sigmas by which new correspondences may still move a parameter
-CONTRADICTED = 4.0  # sigmas by which a flight may disagree with what is held
+STABLE = 0.1  # sigmas; a parameter that new correspondences move by less is stable
+CONTRADICTED = 4.0  # sigmas; a flight that disagrees by more with a held value contradicts it
 _NO_PRIOR = (
     "the trajectory's errors were taken as independent from return to return: sigmas are too small, perhaps by a "
     "factor of 5 to 10; want a trajectory with sigmas and its errors estimated along"
@@ -58,24 +61,25 @@ def adjust(
     doubted: Mapping[str, float] | None = None,
     entire: Rematch | None = None,
 ) -> Adjusted:
-    """Estimate.
+    """Estimate all unknowns, finding correspondences anew until they no longer change the result.
 
     Args:
         flight: returns and trajectories.
-        features: what was observed.
-        wish: what is to be estimated.
-        prior: of the trajectory's errors; None: its sigmas count as noise of single returns, and a note says so.
-        settings: how.
-        start: calibrations to start from, by scanner; None: the heads' own. What is held keeps their values.
-        rematch: finds the features anew with better calibrations; None, or if it gives None: they stay.
+        features: observed planes, tie points and control.
+        wish: which parameters to estimate.
+        prior: prior of trajectory errors; None: the trajectory's sigmas count as noise of single returns, and a note
+            reports that.
+        settings: settings of the solver.
+        start: calibrations to start from, by scanner; None: the heads' own. Held parameters keep their values.
+        rematch: finds the features anew with better calibrations; None, or if it returns None: the features stay.
         first: by scanner, boresight angles from which iterations begin; None: from the start.
         doubted: by name, as ``left.kappa_rad``, least sigma (SI) of its start where it is held.
-        entire: gives everything that was observed, once correspondences of a part of it stay; None, or if it gives
-            None: that part is all.
+        entire: returns all observations, once correspondences of a part of them are stable; None, or if it returns
+            None: that part is everything.
 
     Returns:
-        What was found. Sigmas are those that the observations' sigmas imply; where the global test rejects, times the
-        root of the variance factor if that is above 1; and with what is plausible of the parameters that are held.
+        The result. Sigmas are those that the observations' sigmas imply, multiplied by the root of the variance factor
+        where the global test rejects and that factor is above 1; they include the plausible errors of held parameters.
 
     Raises:
         ParameterError: the wish cannot be met; NormalError: nothing can be solved.
@@ -108,13 +112,13 @@ def predict(
     settings: Settings = AS_USUAL,
     start: Mapping[str, Calibration] | None = None,
 ) -> tuple[Unknowns, FloatArray]:
-    """Return what would be found: the same equations without misclosures, for planning.
+    """Predict the covariance of an adjustment for planning: the same equations without misclosures.
 
     Returns:
-        The unknowns that would be determined, with what is held, and their covariance (u, u).
+        The unknowns that would be determined, with the held parameters, and their covariance (u, u).
 
     Raises:
-        ParameterError, NormalError: as of `adjust`.
+        ParameterError, NormalError: see `adjust`.
     """
     block = determined(Block.of(flight, features, unknowns(flight, wish, start), prior, None), settings)
     state, weights, asked = block.start(), block.weights(), block.rows.unknowns
@@ -125,7 +129,7 @@ def predict(
 
 
 def _stable(before: Solved, found: Solved) -> bool:
-    """Return whether new correspondences moved no parameter by much of its sigma."""
+    """Return whether new correspondences moved every parameter by less than `STABLE` sigmas."""
     names, values = before.solution.rows.unknowns.names, before.solution.state.values
     old = dict(zip(names, values.tolist(), strict=True))
     sigmas = np.sqrt(np.diag(found.solution.parameters))
@@ -134,10 +138,10 @@ def _stable(before: Solved, found: Solved) -> bool:
 
 
 def _of_noise(told: Flight, found: Flight) -> tuple[str, ...]:
-    """Return by how much scanners' returns scatter less than was told, a line each."""
+    """Return one line for each scanner whose returns scatter less than its configured noise predicts."""
     lines = []
     for head, own in zip(told.heads, found.heads, strict=True):
-        share = sum(astuple(own.noise)) / sum(astuple(head.noise))  # all are scaled alike, and some may be 0
+        share = sum(astuple(own.noise)) / sum(astuple(head.noise))  # all noise terms share one scale, and some may be 0
         if share < 1.0:
             lines.append(
                 f"returns of {head.name} scatter {share:.2f} times what range_sigma_m, angle_sigma_deg and "
@@ -194,26 +198,27 @@ def _adjusted(flight: Flight, found: Solved, settings: Settings, matchings: int)
 
 
 def considered_of(asked: Unknowns, effects: HeldEffects, factor: float) -> tuple[Considered, ...]:
-    """Return the held parameters with their sigmas; where the flight contradicts one, with what the flight says.
+    """Return the held parameters with their sigmas, and the flight's estimate of those that it contradicts.
 
-    The score of the held ones has the covariance f I + I S I, with I their information and S what is plausible of them.
-    The one that is farthest beyond is taken to be wrong by what the flight says, until none is. Who holds one and gives
-    no sigma says that it is right, whatever is plausible: of that one its own part of S does not count.
+    The score of the held parameters has the covariance f I + I S I, where I is their information and S their plausible
+    covariance. The parameter that exceeds its sigmas most is assumed to be wrong by the flight's estimate; this repeats
+    until none exceeds them. A user who holds a parameter without a sigma states that it is right, however implausible:
+    for that parameter its own part of S does not count.
 
     Args:
-        asked: whose `considered` they are.
-        effects: at the solution.
-        factor: of the observations' variances.
+        asked: unknowns whose `considered` parameters are reported.
+        effects: effects of the held parameters at the solution.
+        factor: factor of the observations' variances.
     """
     sigmas = np.array([item.plausible for item in asked.considered], dtype=np.float64)
     likely = np.array([PARAMETERS[item.kind].plausible for item in asked.considered], dtype=np.float64)
     information, own = effects.information, np.diag(effects.information)
-    seen = own * likely**2 > 1e-2  # else the flight knows it to ten times what is plausible, and rounding as much
+    seen = own * likely**2 > 1e-2  # otherwise rounding dominates: sigma ≥ 10 × plausible
     told = np.where(seen, effects.score / np.where(seen, own, 1.0), np.nan)
     wrong = np.zeros(len(sigmas), np.bool_)
     words = {(one.scanner, one.name) for one in asked.held if not one.remedy}
     at_word = np.array([tuple(item.name.split(".", 1)) in words for item in asked.considered], np.bool_)
-    at_word &= sigmas == likely  # else the user, or an earlier calibration, gave a sigma
+    at_word &= sigmas == likely  # a different sigma comes from the user or an earlier calibration
     while True:
         spread = np.diag(factor * information + (information * sigmas**2) @ information)
         spread = spread / np.where(seen, own, 1.0) ** 2 - np.where(seen & at_word, sigmas, 0.0) ** 2

@@ -17,29 +17,29 @@ from swath.georef.arrays import FloatArray
 from swath.georef.scanner.calibration import CONVENTIONS, PARAMETERS, Calibration, CalibrationError, read_calibration
 
 _DEG = math.pi / 180.0
-ROUNDING = 1e-9  # of a correlation with itself
+ROUNDING = 1e-9  # tolerance for the correlation of a parameter with itself
 
 
 class CalibrationFileError(ValueError):
-    """A calibration that no file can hold; one line for the user."""
+    """A calibration that cannot be written to a file; the message is one line for the user."""
 
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """What a calibration file says besides the calibration itself.
+    """Holds the contents of a calibration file other than the calibration itself.
 
     Attributes:
-        id: unique; goes into every product made with it.
-        created: with its time zone.
-        method: of `swath.georef.scanner.calibration.METHODS`; empty: the calibration's own.
-        scanner_model, scanner_serial, imu_serial: whose calibration it is; empty: not compared.
+        id: unique; copied into every product made with the calibration.
+        created: time of creation, with its time zone.
+        method: one of `swath.georef.scanner.calibration.METHODS`; empty: the calibration's own.
+        scanner_model, scanner_serial, imu_serial: the devices it belongs to; empty: not compared.
         installation: id of the mounting.
-        logs: name and SHA-256 (hex) of each.
-        variance_factor, redundancy: of the adjustment; None: there was none.
-        verdict: one of `swath.georef.scanner.calibration.VERDICTS`; empty: nobody judged it.
-        verdict_reasons: why it is not simply good, one sentence each.
-        held: keys of parameters that were asked for and not estimated.
-        trajectory: ``navigated``, ``ins`` or ``file``, from which it was made; empty: not known.
+        logs: name and SHA-256 (hex) of each log.
+        variance_factor, redundancy: of the adjustment; None: there was no adjustment.
+        verdict: one of `swath.georef.scanner.calibration.VERDICTS`; empty: not judged.
+        verdict_reasons: why the verdict is not simply good, one sentence each.
+        held: keys of parameters that were requested but not estimated.
+        trajectory: ``navigated``, ``ins`` or ``file``, the source of the trajectory; empty: not known.
     """
 
     id: str
@@ -59,14 +59,15 @@ class Header:
 
 
 def calibration_text(calibration: Calibration, header: Header) -> str:
-    """Return the file: the same for the same calibration and header, byte for byte.
+    """Return the text of the file; the same calibration and header always give the same bytes.
 
-    Numbers stand in the file's units with as few digits as read back to the number they were; a few numbers (one in
-    ten, of parameters in degrees and parts per million) are no product of a double and their unit: these read back as
-    the nearest that is, one unit of the last of 53 binary digits away, and stay what they are from then on.
+    Numbers are in the file's units, with the fewest digits that read back to the same number. A few numbers (one in
+    ten, of parameters in degrees and parts per million) are not the product of a double and their unit: these read back
+    as the nearest such product, one unit of the last of 53 binary digits away, and keep that value from then on.
 
     Raises:
-        CalibrationFileError: what no reader would take: not finite, a negative sigma, no rotation, a time without zone.
+        CalibrationFileError: the calibration is one that readers refuse: not finite, a negative sigma, no rotation, a
+            time without zone.
     """
     blocks = [
         _header(calibration, header),
@@ -116,7 +117,7 @@ def _parameters(calibration: Calibration) -> list[str]:
 
 
 def _estimated(calibration: Calibration) -> list[list[str]]:
-    """Return tables [sigma], [held_sigma] and [correlation], the last of both together."""
+    """Return the tables [sigma], [held_sigma] and [correlation]; the correlation covers both kinds of parameters."""
     blocks = []
     for title, sigmas in (("sigma", calibration.sigmas), ("held_sigma", calibration.held_sigmas)):
         rows = [
@@ -155,12 +156,12 @@ def _tables(calibration: Calibration) -> list[list[str]]:
 
 
 def in_unit(value: float, factor: float, back: Callable[[float], float] | None = None) -> float:
-    """Return a number in a file's unit: of those that read back as ``value``, the one with the fewest digits.
+    """Return a number in a file's unit: of the numbers that read back as ``value``, the one with the fewest digits.
 
     Args:
         value: SI.
-        factor: SI units a unit of the file.
-        back: how a reader converts; None: times ``factor``.
+        factor: SI units per unit of the file.
+        back: conversion that a reader applies; None: times ``factor``.
 
     Raises:
         CalibrationFileError: the value is not finite.
@@ -179,7 +180,7 @@ def in_unit(value: float, factor: float, back: Callable[[float], float] | None =
 
 
 def _number(value: float) -> str:
-    """Return a whole number without a point, as counts and rates are written."""
+    """Format a number; whole numbers have no decimal point, as counts and rates are written."""
     if not math.isfinite(value):
         raise CalibrationFileError(f"a calibration holds {value!r}; want finite numbers")
     return str(int(value)) if float(value).is_integer() and abs(value) < 1e15 else repr(float(value))
@@ -194,7 +195,7 @@ def _said(value: str | None) -> str | None:
 
 
 def _text(value: str) -> str:
-    """Return a basic string of TOML: JSON's escapes are among its own, but it wants DEL escaped too."""
+    """Return a basic TOML string: JSON's escapes are valid in TOML, which also requires DEL to be escaped."""
     try:
         value.encode()
     except UnicodeEncodeError as error:
@@ -221,5 +222,5 @@ def _matrix(rows: Sequence[Sequence[float]] | FloatArray) -> str:
 
 
 def _long_matrix(matrix: FloatArray) -> str:
-    """Return a row a line."""
+    """Return a matrix with one row on each line."""
     return "".join(["[\n", *(f"  {_list(row)},\n" for row in matrix.tolist()), "]"])

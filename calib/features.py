@@ -1,6 +1,6 @@
-"""What several swaths saw of the same: planes, tie points and control; what the adjustment takes.
+"""Features that several swaths saw: planes, tie points and control, the input of the adjustment.
 
-All coordinates stand in t (`swath.calib.flight`). Indexes of returns are those of their swath's arrays.
+All coordinates are in t (`swath.calib.flight`). Indexes of returns are those of their swath's arrays.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from swath.georef.records import Int64Array
 
 @dataclass(frozen=True, eq=False)
 class ControlPoint:
-    """A surveyed point.
+    """A surveyed control point.
 
     Attributes:
-        name: of the survey.
+        name: name in the survey.
         position_t: (3,) metres.
-        sigma_m: of each coordinate, or (3,) east, north, up.
+        sigma_m: sigma of each coordinate, or (3,) east, north, up.
     """
 
     name: str
@@ -30,12 +30,12 @@ class ControlPoint:
 
 @dataclass(frozen=True, eq=False)
 class Patch:
-    """The returns by which one swath saw a plane.
+    """The returns of one swath on a plane.
 
     Attributes:
         swath: index in `Flight.swaths`.
         at: (n,) rising indexes of its returns.
-        each: returns that every one of them stands for, where a flight is planned.
+        each: number of real returns that each listed one represents, where a flight is planned.
     """
 
     swath: int
@@ -45,17 +45,17 @@ class Patch:
 
 @dataclass(frozen=True, eq=False)
 class Plane:
-    """A plane seen by several swaths, or by one that control lies on.
+    """A plane that several swaths saw, or one swath if control lies on the plane.
 
     Attributes:
         name: unique.
-        centre_t: (3,) near its middle; coordinates of the adjustment count from it.
+        centre_t: (3,) near its middle; origin of the plane's coordinates in the adjustment.
         normal_t: (3,) unit, pointing up or outwards; n · (x − centre) = 0 nearly.
-        patches: one a swath.
-        rms_m: of its points from it, swath by swath in its own plane.
+        patches: one per swath.
+        rms_m: distance of its points from it, each swath relative to its own fitted plane.
         control: surveyed points that lie on it.
-        given_sigma_m: of its place along the normal, where the plane itself is surveyed; None: it is free.
-        given_sigma_rad: of its direction, likewise.
+        given_sigma_m: sigma of its place along the normal, where the plane itself is surveyed; None: it is free.
+        given_sigma_rad: sigma of its direction, likewise.
         kind: roof, ground, wall, control, user; for reports.
     """
 
@@ -71,7 +71,7 @@ class Plane:
 
     @property
     def points(self) -> int:
-        """Returns on it, of all swaths."""
+        """Number of returns on the plane, of all swaths."""
         return sum(len(patch.at) for patch in self.patches)
 
 
@@ -81,8 +81,8 @@ class Sighting:
 
     Attributes:
         swath: index in `Flight.swaths`.
-        at: index of the return nearest to it: when and under which angle it was seen.
-        point_t: (3,) where it is, with the swath's points as they were placed.
+        at: index of the nearest return, which gives the time and angle of the sighting.
+        point_t: (3,) its position among the swath's points as they were placed.
         covariance_t: (3, 3) of the measurement in the points, m²; without trajectory and calibration.
     """
 
@@ -94,12 +94,12 @@ class Sighting:
 
 @dataclass(frozen=True, eq=False)
 class TiePoint:
-    """A point seen by several swaths (NGA Eq. 55), or by one and surveyed.
+    """A point that several swaths saw (NGA Eq. 55), or a surveyed one that at least one swath saw.
 
     Attributes:
         name: unique.
-        sightings: one a swath.
-        control: its surveyed place; None: unknown.
+        sightings: one per swath.
+        control: its surveyed position; None: unknown.
         kind: ridge, corner, marking, picked; for reports.
     """
 
@@ -111,7 +111,7 @@ class TiePoint:
 
 @dataclass(frozen=True, eq=False)
 class Features:
-    """Everything observed, from whatever method, for one adjustment; and why other candidates were not taken."""
+    """All observations for one adjustment, from any method, and counts of refused candidates by reason."""
 
     planes: tuple[Plane, ...] = ()
     ties: tuple[TiePoint, ...] = ()
@@ -119,7 +119,7 @@ class Features:
 
     @classmethod
     def joined(cls, pieces: Sequence[Features]) -> Features:
-        """Return one after the other."""
+        """Concatenate the features of several pieces, in order."""
         refused: Counter[str] = Counter()
         for piece in pieces:
             refused.update(piece.refused)

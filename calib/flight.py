@@ -1,7 +1,8 @@
-"""What a calibration works with: a flight's returns by strip and scanner, and how they are placed anew.
+"""The flight that a calibration works with: returns by strip and scanner, and functions that place them anew.
 
-Points stand in t: east, north, up along the axes of the ellipsoid's tangent plane at one point in the flight's middle,
-a Cartesian frame fixed to the earth, so that a plane of e is a plane of t and coordinates keep their digits.
+Points are in t: east, north, up along the axes of the ellipsoid's tangent plane at one point in the flight's middle.
+That is a Cartesian frame fixed to the earth, so a plane in e is a plane in t, and coordinates stay small enough to keep
+their digits.
 """
 
 from __future__ import annotations
@@ -31,12 +32,12 @@ _RIGID, _NOISE = Mount(), Noise()
 
 
 class FlightError(ValueError):
-    """A flight that cannot be calibrated with; one line for the user."""
+    """A flight that cannot be used for calibration; the message is one line for the user."""
 
 
 @dataclass(frozen=True, eq=False)
 class Tangent:
-    """The frame t: x_t = rot_t_from_e · (x_e − origin_e).
+    """The frame t, with x_t = rot_t_from_e · (x_e − origin_e).
 
     Attributes:
         origin_e: (3,) metres.
@@ -48,34 +49,34 @@ class Tangent:
 
     @classmethod
     def at(cls, position_e: FloatArray) -> Tangent:
-        """Make it with its origin on the ellipsoid below or above a place (3,)."""
+        """Create the frame with its origin on the ellipsoid below or above a position (3,)."""
         lat, lon, _ = (float(value) for value in geodetic_from_e(position_e))
         rot_t_from_e = (rot_e_from_l(np.array(lat), np.array(lon)) @ _ROT_L_FROM_ENU).T
         return cls(np.asarray(e_from_geodetic(lat, lon, 0.0), dtype=np.float64), rot_t_from_e)
 
     def t_from_e(self, points_e: FloatArray) -> FloatArray:
-        """Return (…, 3) points."""
+        """Transform points (…, 3) from e to t."""
         turned: FloatArray = (points_e - self.origin_e) @ self.rot_t_from_e.T
         return turned
 
     def e_from_t(self, points_t: FloatArray) -> FloatArray:
-        """Return (…, 3) points."""
+        """Transform points (…, 3) from t to e."""
         turned: FloatArray = points_t @ self.rot_t_from_e + self.origin_e
         return turned
 
 
 @dataclass(frozen=True, eq=False)
 class Head:
-    """A scanner as it is mounted, and what is known of it before the calibration.
+    """A scanner as mounted, with the knowledge of it before the calibration.
 
     Attributes:
-        name: of the configuration.
+        name: name in the configuration.
         start: calibration to start from.
-        geometry: of its beams.
+        geometry: geometry of its beams.
         noise: sigmas of a single return.
         range_gate: least and greatest ρ, metres.
         mount: stages of a gimbal.
-        air: of its surroundings; None: does nothing.
+        air: the air around it; None: the air has no effect.
     """
 
     name: str
@@ -87,10 +88,10 @@ class Head:
     air: Air | None = None
 
     def model(self, calibration: Calibration) -> SensorModel:
-        """With a calibration.
+        """Return the sensor model with a calibration.
 
         Raises:
-            GeometryError: it has what such a scanner has not.
+            GeometryError: the calibration has parameters that such a scanner does not have.
         """
         return SensorModel(calibration, self.geometry, self.range_gate, self.mount, self.air)
 
@@ -100,14 +101,14 @@ class Swath:
     """One scanner's returns of one strip; the arrays may be mapped from files.
 
     Attributes:
-        name: for people, as ``03`` or ``left 03``.
+        name: for display, as ``03`` or ``left 03``.
         head: index in `Flight.heads`.
         strip: its number.
         flown: index in `Flight.trajectories`.
         rows: (n,) `RETURN_DTYPE`, in the order of their times.
         time_ns: (n,) GPS time of emission by the scanner's stamps.
         points_t: (n, 3) as placed by `Flight.place` with the calibrations in use.
-        encoder_rate, encoder_acceleration: (n,) rad/s, rad/s²; None: the scanner's encoder does not tell.
+        encoder_rate, encoder_acceleration: (n,) rad/s, rad/s²; None: the scanner's encoder does not report them.
     """
 
     name: str
@@ -121,7 +122,7 @@ class Swath:
     encoder_acceleration: FloatArray | None = None
 
     def __len__(self) -> int:
-        """Number of returns."""
+        """Return the number of returns."""
         return len(self.rows)
 
 
@@ -130,9 +131,9 @@ class Flight:
     """All swaths of one or several logs of one installation.
 
     Attributes:
-        frame: t.
+        frame: the frame t.
         heads: scanners.
-        trajectories: of the body, one a session, with sigmas.
+        trajectories: of the body, one per session, with sigmas.
         swaths: in the order of time.
     """
 
@@ -142,7 +143,7 @@ class Flight:
     swaths: tuple[Swath, ...]
 
     def rays(self, swath: Swath, calibration: Calibration, at: Rows = slice(None), *, with_axes: bool = True) -> Rays:
-        """Return some of a swath's returns with a calibration: `swath.georef.scanner.sensor_model`, air applied."""
+        """Compute rays of a swath's returns with a calibration (`swath.georef.scanner.sensor_model`) and air."""
         head, trajectory = self.heads[swath.head], self.trajectories[swath.flown]
         model = head.model(calibration)
         count = len(swath.time_ns[at])
@@ -161,14 +162,14 @@ class Flight:
         return rays
 
     def place(self, swath: Swath, calibration: Calibration, at: Rows = slice(None)) -> FloatArray:
-        """Return (n, 3) points in t; nan where there is none (gate, gap of the trajectory)."""
+        """Return points (n, 3) in t; nan for returns that cannot be placed (gate, gap of the trajectory)."""
         rays = self.rays(swath, calibration, at, with_axes=False)
         points = self.frame.t_from_e(rays.points_e)
         points[rays.fate != Fate.GEOREFERENCED] = np.nan
         return points
 
     def placed(self, calibrations: Mapping[str, Calibration]) -> Flight:
-        """Return the same with every swath's points by these calibrations, by scanner."""
+        """Return a flight whose points of every swath are placed with these calibrations, given by scanner."""
         swaths = tuple(
             replace(swath, points_t=self.place(swath, calibrations[self.heads[swath.head].name]))
             for swath in self.swaths
@@ -181,7 +182,7 @@ class Flight:
 
 
 def sensor_t(flight: Flight, swath: Swath, at: Int64Array) -> FloatArray:
-    """Return (n, 3) about where the scanner was when it sent returns: the body's origin at the epoch after."""
+    """Return the scanner's approximate positions (n, 3) at returns: the body's origin at the next epoch."""
     trajectory = flight.trajectories[swath.flown]
     epoch = np.minimum(np.searchsorted(trajectory.time_ns, swath.time_ns[at]), len(trajectory) - 1)
     return flight.frame.t_from_e(trajectory.position_e[epoch])

@@ -1,9 +1,9 @@
-"""A range correction by intensity as a cubic through knots that rises and falls only where the knots do.
+"""A range correction by intensity: a cubic through knots that rises and falls only where the knots do.
 
-Between knots the curve is Hermite's cubic. Its slopes are Fritsch and Carlson's (1980, "Monotone piecewise cubic
+Between knots the curve is a cubic Hermite spline. Its slopes are Fritsch and Carlson's (1980, "Monotone piecewise cubic
 interpolation", SIAM J. Numer. Anal. 17, 238–246) in the form of Fritsch and Butland (1984, SIAM J. Sci. Stat. Comput.
-5, 300–304): harmonic means of the secants at either side, 0 where these differ in sign; at the ends by three points. A
-calibration's table is read linearly, so that the curve is handed on as nodes close enough for that.
+5, 300–304): harmonic means of the secants at either side, 0 where these differ in sign; at the ends by three points.
+Readers interpolate a calibration's table linearly, so the curve is passed on as nodes close enough for that.
 """
 
 from __future__ import annotations
@@ -14,28 +14,28 @@ import numpy as np
 
 from swath.georef.arrays import FloatArray
 
-# Nodes from a knot to the next. Read linearly they miss the cubic by 1.5 / STEPS² of what the knots differ, at most:
-# slopes are at most three secants, which bends it by 12 of these a knot's distance
+# Nodes from a knot to the next. Linear interpolation between them misses the cubic by at most 1.5 / STEPS² of the
+# knots' difference: slopes are at most three secants, so the second derivative is at most 12 of them per knot distance.
 STEPS = 40
 
 
 def nodes_of(knots: FloatArray) -> FloatArray:
-    """Return (d,) intensities of the nodes, all knots (k,) among them as they are."""
+    """Return the intensities (d,) of the nodes, which include all knots (k,) exactly."""
     nodes = [np.linspace(low, high, STEPS, endpoint=False) for low, high in pairwise(knots.tolist())]
     return np.concatenate([*nodes, knots[-1:]])
 
 
 def at_knots(correction_m: FloatArray) -> FloatArray:
-    """Return (k,) of a correction at nodes (d,)."""
+    """Return a correction's values (k,) at the knots from those at the nodes (d,)."""
     return correction_m[::STEPS]
 
 
 def curve(knots: FloatArray, correction_m: FloatArray) -> FloatArray:
-    """Return (d,) correction at the nodes.
+    """Return the correction (d,) at the nodes.
 
     Args:
         knots: (k,) rising intensities, two or more.
-        correction_m: (k,) at them.
+        correction_m: (k,) at the knots.
     """
     by_value, by_slope = _cubics(knots)
     whole: FloatArray = by_value @ correction_m + by_slope @ _slopes(knots, correction_m)[0]
@@ -44,9 +44,10 @@ def curve(knots: FloatArray, correction_m: FloatArray) -> FloatArray:
 
 
 def curve_by_knots(knots: FloatArray, correction_m: FloatArray) -> FloatArray:
-    """Return (k, d) derivatives of `curve` by the corrections at the knots.
+    """Return derivatives (k, d) of `curve` by the corrections at the knots.
 
-    Where a slope has none (two secants change from one sign to the other, or both are zero) it is one of those beside.
+    Where a slope has no derivative (two secants of different sign, or both zero), one of its one-sided derivatives is
+    used.
     """
     by_value, by_slope = _cubics(knots)
     secants = np.diff(np.eye(len(knots)), axis=0) / np.diff(knots)[:, np.newaxis]
@@ -55,7 +56,7 @@ def curve_by_knots(knots: FloatArray, correction_m: FloatArray) -> FloatArray:
 
 
 def _cubics(knots: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return (d, k) weights of the knots' values, and of their slopes, at the nodes (Hermite's basis)."""
+    """Return the weights (d, k) of the knots' values, and those of their slopes, at the nodes (Hermite basis)."""
     pieces = len(knots) - 1
     t = np.arange(STEPS) / STEPS
     by_value, by_slope = np.zeros((2, pieces * STEPS + 1, pieces + 1))
@@ -68,7 +69,7 @@ def _cubics(knots: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _slopes(knots: FloatArray, correction_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return (k,) slopes at the knots; (k, k − 1) their derivatives by the secants."""
+    """Return the slopes (k,) at the knots, and their derivatives (k, k − 1) by the secants."""
     count = len(knots)
     lengths = np.diff(knots)
     secants = np.diff(correction_m) / lengths
@@ -84,7 +85,7 @@ def _slopes(knots: FloatArray, correction_m: FloatArray) -> tuple[FloatArray, Fl
 
 
 def _inner(secants: FloatArray, lengths: FloatArray) -> tuple[float, FloatArray]:
-    """Return harmonic mean of two secants, and its derivatives by them; each weighs more, the shorter it is."""
+    """Return the harmonic mean of two secants and its derivatives by them; the shorter secant weighs more."""
     weights = np.array([2.0 * lengths[1] + lengths[0], lengths[1] + 2.0 * lengths[0]])
     whole = weights.sum()
     if not secants.any():
@@ -97,7 +98,10 @@ def _inner(secants: FloatArray, lengths: FloatArray) -> tuple[float, FloatArray]
 
 
 def _end(secants: FloatArray, lengths: FloatArray) -> tuple[float, FloatArray]:
-    """Return slope of a parabola through the last three knots, last first, kept from turning back; its derivatives."""
+    """Return the limited end slope of a parabola through the last three knots, and its derivatives.
+
+    Arguments begin at the end: the last secant comes first. The limit keeps the curve from turning back.
+    """
     shares = np.array([2.0 * lengths[0] + lengths[1], -lengths[0]]) / lengths.sum()
     slope = float(shares @ secants)
     if np.sign(slope) != np.sign(secants[0]):

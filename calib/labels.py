@@ -1,4 +1,4 @@
-"""Numbers and names as a report says them."""
+"""Format numbers and names for reports."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from swath.calib.outcome import FixedParameter
 from swath.georef.scanner.calibration import PARAMETERS
 
-MINUS, THIN, SPACE = "−", "\u202f", "\u00a0"  # spaces at which no line ends
+MINUS, THIN, SPACE = "−", "\u202f", "\u00a0"  # spaces at which no line breaks
 _LABELS: dict[str, tuple[str, str]] = {  # words, symbol
     "omega_rad": ("boresight ω (roll)", "ω"),
     "phi_rad": ("boresight φ (pitch)", "φ"),
@@ -36,13 +36,13 @@ _SUFFIXES = (("_rad", "°", 180.0 / math.pi), ("_m", "m", 1.0), ("_s", "µs", 1e
 
 @dataclass(frozen=True, slots=True)
 class Unknown:
-    """An unknown of the adjustment as people name it.
+    """An unknown of the adjustment with its name for display.
 
     Attributes:
-        scanner: whose.
-        name: of the parameter or of the table's entry.
-        words, symbol: long and short.
-        unit: in which reports give it; factor: units of reports a unit in SI.
+        scanner: the scanner it belongs to.
+        name: name of the parameter or of the table's entry.
+        words, symbol: long and short names.
+        unit: unit in reports; factor: units of reports per SI unit.
     """
 
     scanner: str
@@ -54,12 +54,12 @@ class Unknown:
 
     @property
     def is_parameter(self) -> bool:
-        """One of the model's sixteen, not an entry of a table."""
+        """True for one of the model's sixteen parameters, False for an entry of a table."""
         return self.name in _BY_NAME
 
 
 def unknown(name: str) -> Unknown:
-    """Of names as ``left.omega_rad``, ``left.ibrc.3``, ``left.beam.12.azimuth_rad``."""
+    """Return the unknown with a name as ``left.omega_rad``, ``left.ibrc.3``, ``left.beam.12.azimuth_rad``."""
     scanner, _, own = name.partition(".")
     if own in _BY_NAME:
         parameter = _BY_NAME[own]
@@ -74,30 +74,30 @@ def unknown(name: str) -> Unknown:
 
 
 def words_of(scanner: str, name: str, *, several: bool) -> str:
-    """Return a parameter's words, with its scanner where there are several."""
+    """Return a parameter's words, followed by its scanner if the flight has several."""
     words = unknown(f"{scanner}.{name}").words
     return f"{words} of {scanner}" if several else words
 
 
 def plain(text: str, *, several: bool) -> str:
-    """Return a sentence in which parameters go by their words, not by names as ``left.omega_rad``."""
+    """Replace parameter names such as ``left.omega_rad`` in a sentence by their words."""
     return _NAMED.sub(lambda found: words_of(found[1], found[2], several=several), text)
 
 
 def is_undetermined(held: FixedParameter) -> bool:
-    """Held because the flight does not tell it, not because the user said so."""
+    """Return True if a parameter is held because the flight does not determine it, not because the user fixed it."""
     return bool(held.remedy or held.with_others)
 
 
 def decimals_of(sigma: float, most: int = 9) -> int:
-    """Return digits after the point that show two digits of a sigma."""
+    """Return how many decimals show two digits of a sigma."""
     if not math.isfinite(sigma) or sigma <= 0.0:
         return 4
     return min(max(1 - math.floor(math.log10(sigma)), 0), most)
 
 
 def number(value: float | None, pattern: str = ".3g") -> str:
-    """With a real minus; a dash where there is none."""
+    """Format a number with a real minus sign; a dash stands for None or a number that is not finite."""
     if value is None or not math.isfinite(value):
         return "–"
     text = format(value, pattern)
@@ -105,12 +105,12 @@ def number(value: float | None, pattern: str = ".3g") -> str:
 
 
 def thousands(value: float, digits: int = 0) -> str:
-    """Return a number whose thousands stand apart."""
+    """Format a number with separated thousands."""
     return f"{value:,.{digits}f}".replace(",", THIN).replace("-", MINUS)
 
 
 def length(metres: float | None) -> str:
-    """Of a sigma or a difference: millimetres below a centimetre, centimetres below a metre."""
+    """Format a sigma or a difference: millimetres below a centimetre, centimetres below a metre."""
     if metres is None or not math.isfinite(metres):
         return "–"
     size = abs(metres)
@@ -122,14 +122,14 @@ def length(metres: float | None) -> str:
 
 
 def degrees(value_deg: float | None) -> str:
-    """Of a small angle's sigma."""
+    """Format the sigma of a small angle in degrees."""
     if value_deg is None or not math.isfinite(value_deg):
         return "–"
     return number(value_deg, f".{max(4, decimals_of(value_deg) - 1)}f" if value_deg < 0.1 else ".2f") + "°"
 
 
 def sized(name: str, value: float, *, sign: bool = False) -> str:
-    """Return a sigma or a difference (SI) of an unknown, as ``left.omega_rad``, in the unit of reports."""
+    """Format a sigma or a difference (SI) of an unknown, as ``left.omega_rad``, in the unit of reports."""
     one = unknown(name)
     if one.unit == "m":
         told = length(value)
@@ -140,11 +140,11 @@ def sized(name: str, value: float, *, sign: bool = False) -> str:
 
 
 def share(value: float) -> str:
-    """Per cent; what is not nothing is not 0 %."""
+    """Format a share as a percentage; a positive share never shows as 0 %."""
     return "0 %" if value <= 0.0 else "< 0.01 %" if value < 1e-4 else f"{100.0 * value:.2f} %"
 
 
 def listed(words: list[str], most: int = 6) -> str:
-    """Joined as a sentence lists things."""
+    """Join words as a sentence lists things."""
     shown = words if len(words) <= most else [*words[: most - 1], f"{len(words) - most + 1} more"]
     return shown[0] if len(shown) == 1 else f"{', '.join(shown[:-1])} and {shown[-1]}" if shown else ""

@@ -1,9 +1,10 @@
-"""How accurate a calibration has to be, and what it leaves in the points.
+"""Determine how accurate a calibration has to be, and which errors it leaves in the points.
 
-A point errs by its trajectory and its range whatever the calibration. By default a calibration is wanted that adds no
-more than half of that, which makes the whole larger by an eighth: an angle to that over the distance it acts at, the
-range offset to that itself. What the calibration leaves in points comes from its joint covariance, so that what cancels
-in a point (a range offset and the scan angle scale that was held beside it) cancels here.
+A point has errors of trajectory and range whatever the calibration. By default the calibration may add no more than
+half of these, which makes the total larger by an eighth: an angle may err by that amount divided by the distance at
+which it acts, the range offset by that amount itself. The errors that the calibration leaves in points follow from its
+joint covariance, so errors that cancel in a point (a range offset and the scan angle scale that was held beside it)
+cancel here too.
 """
 
 from __future__ import annotations
@@ -21,20 +22,20 @@ from swath.georef.arrays import FloatArray
 from swath.georef.records import Int64Array
 from swath.georef.scanner.calibration import PARAMETERS, Calibration
 
-POINT = "point"  # among what is wanted: of a point, metres
-SHARE = 0.5  # of a point's own sigma that a calibration may add
-SAMPLE = 60  # returns of a swath
-STEP = 0.1  # sigmas by which a parameter is changed to see what that does
+POINT = "point"  # key of the user's accuracies: of a point, metres
+SHARE = 0.5  # of a point's own sigma; a calibration may add this much
+SAMPLE = 60  # returns per swath
+STEP = 0.1  # sigmas by which a parameter is changed to see its effect
 
 
 @dataclass(frozen=True)
 class Need:
-    """Compare what is needed with what there is.
+    """The accuracy that points need and the accuracy that they have.
 
     Attributes:
         point_m: one sigma (root of the sum of three variances) that a calibration may leave in points.
         wanted: one sigma, SI, by parameter's name.
-        own_m: one sigma that points have without a calibration's errors; nan: the trajectory does not tell.
+        own_m: one sigma of points without errors of the calibration; nan: the trajectory has no sigmas.
         left_m: by scanner, one sigma that its calibration leaves in points.
     """
 
@@ -50,13 +51,13 @@ def need_of(
     trajectory: TrajectoryFit | None,
     wanted: Mapping[str, float] | None = None,
 ) -> Need:
-    """Return what a flight's points need of a calibration.
+    """Determine the accuracy that a flight's points need of a calibration.
 
     Args:
         flight: placed with the calibrations.
         calibrations: by scanner, with sigmas.
-        trajectory: errors known beforehand; None: nothing is known of them.
-        wanted: the user's, SI, by parameter's name or `POINT`; what it lacks is derived.
+        trajectory: trajectory errors known before the adjustment; None: unknown.
+        wanted: accuracies the user requires, SI, by parameter's name or `POINT`; missing ones are derived.
     """
     given = dict(wanted or {})
     samples = [_sample(len(swath)) for swath in flight.swaths]
@@ -75,7 +76,7 @@ def need_of(
 
 
 def _sample(count: int) -> Int64Array:
-    """Return indexes evenly over a swath, an odd step apart so that they do not keep to one scan angle."""
+    """Return indexes spread evenly over a swath; the step is odd so that they do not keep to one scan angle."""
     return np.arange(0, count, max(1, count // SAMPLE) | 1, dtype=np.int64)
 
 
@@ -86,7 +87,7 @@ def _root_mean(parts: list[FloatArray]) -> float:
 
 
 def _left_m2(flight: Flight, swath: Swath, at: Int64Array, calibration: Calibration) -> FloatArray:
-    """Return (n,) the sum of the variances of points along three axes, of the calibration's covariance alone."""
+    """Return the sums (n,) of the variances of points along three axes, due to the calibration's covariance alone."""
     covariance, sigmas = calibration.covariance(), calibration.all_sigmas
     known = np.flatnonzero(sigmas)
     points = flight.place(swath, calibration, at)
@@ -101,7 +102,10 @@ def _left_m2(flight: Flight, swath: Swath, at: Int64Array, calibration: Calibrat
 
 
 def _seen(flight: Flight, samples: list[Int64Array], trajectory: TrajectoryFit | None) -> tuple[FloatArray, float]:
-    """Return (n, 3) how far points are from the body, forward, right, down; one sigma of them without calibration."""
+    """Return distances (n, 3) of points from the body's axes, and one sigma of points without calibration errors.
+
+    The distances are forward, right, down.
+    """
     points = [swath.points_t[at] for swath, at in zip(flight.swaths, samples, strict=True)]
     strips = [np.full(len(at), number, dtype=np.int64) for number, at in enumerate(samples)]
     times = [swath.time_ns[at] for swath, at in zip(flight.swaths, samples, strict=True)]
@@ -111,7 +115,7 @@ def _seen(flight: Flight, samples: list[Int64Array], trajectory: TrajectoryFit |
     if not len(points_t):
         return np.zeros((0, 3)), float("nan")
     _, errors = effect_columns(points_t, strip, time_ns, np.zeros(len(points_t)), SeenFrom.of(flight))
-    turned = np.linalg.norm(errors[:, 3:], axis=2)  # metres a radian about the body's axes: distances from them
+    turned = np.linalg.norm(errors[:, 3:], axis=2)  # metres per radian about the body's axes: distances from them
     whole = 0.5 * (turned**2).sum(axis=1)
     arm = np.sqrt(np.maximum(whole[:, np.newaxis] - turned**2, 0.0))
     if trajectory is None or not len(trajectory.time_ns):

@@ -1,4 +1,4 @@
-"""What an adjustment found: parameters with honest sigmas, what could not be determined, and how good the fit is."""
+"""Results of an adjustment: parameters with realistic sigmas, undetermined parameters, and the quality of the fit."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ class FixedParameter:
 
     Attributes:
         scanner, name: as ``left``, ``lever_arm_z_m`` (names of `swath.georef.scanner.calibration.PARAMETERS`).
-        why: in plain words, for people.
-        remedy: the flight line or control that would determine it; empty where it was held at the user's word.
-        sigma: with which this flight would have determined it, SI; inf: not at all.
-        with_others: parameters it cannot be told apart from, with the correlation.
+        why: the reason in plain words, for display.
+        remedy: the flight line or control that would determine it; empty where the user asked to hold it.
+        sigma: sigma with which this flight would have determined it, SI; inf: not at all.
+        with_others: parameters from which it cannot be separated, with the correlation.
     """
 
     scanner: str
@@ -34,15 +34,16 @@ class FixedParameter:
 
 @dataclass(frozen=True, slots=True)
 class Considered:
-    """A parameter that kept its start, and what the flight says of that.
+    """A parameter that kept its start, and the flight's own estimate of it.
 
     Attributes:
         scanner, name: as ``left``, ``scan_angle_scale``.
-        value: at which it is held, SI.
-        sigma: one sigma of its error, SI: what is plausible, or what the flight says where that is more.
-        told: by how much the flight would change it if it were free, SI; nan: the flight says nothing.
-        told_sigma: of that, with what is plausible of all that is held; of what is held without a sigma: of all else.
-        contradicted: whether that is more than its sigmas allow.
+        value: value at which it is held, SI.
+        sigma: one sigma of its error, SI: the plausible one, or the flight's estimate where that is larger.
+        told: change that the flight would make if it were free, SI; nan: the flight cannot estimate it.
+        told_sigma: sigma of `told`, with the plausible errors of all held parameters; for a parameter held without a
+            sigma, with those of all others.
+        contradicted: whether `told` is larger than its sigmas allow.
     """
 
     scanner: str
@@ -56,7 +57,7 @@ class Considered:
 
 @dataclass(frozen=True, eq=False)
 class Residuals:
-    """Of one group of observations, one row an observation (n,).
+    """Residuals of one group of observations, one row per observation (n,).
 
     Attributes:
         group: ``planes``, ``ties``, ``control``.
@@ -64,10 +65,10 @@ class Residuals:
         swath: index in `Flight.swaths`; −1: of control.
         at: index of the return in its swath; −1: of control.
         misclosure_m: e = −(w + A δ), metres along the plane's normal (of ties: east, north, up, one row each).
-        sigma_m: √M, of the observation alone, with what returns of a moment have in common.
+        sigma_m: √M, of the observation alone, with the errors that returns of one moment share.
         redundancy: r_i; 0: uncontrolled, 1: fully.
         normalised: w_i = e / √(M r) of data snooping.
-        weight: of the robust estimation, 0 … 1; 0: taken out.
+        weight: of the robust estimation, 0 … 1; 0: excluded.
     """
 
     group: str
@@ -83,12 +84,12 @@ class Residuals:
 
 @dataclass(frozen=True, slots=True)
 class GroupFit:
-    """A group of observations as a whole: variance component and what it contributes.
+    """Fit of a whole group of observations: its variance component and contribution.
 
     Attributes:
-        observations: all of them, those that were rejected too.
-        rms_m: of those that were kept.
-        rejected: so many of all.
+        observations: number of all observations, including rejected ones.
+        rms_m: rms of the kept observations.
+        rejected: number of rejected observations.
     """
 
     group: str
@@ -101,7 +102,7 @@ class GroupFit:
 
 @dataclass(frozen=True, slots=True)
 class ControlFit:
-    """One control point: its misclosure (surveyed − laser, up positive), and what leaving it out would change.
+    """Fit of one control point: its misclosure (surveyed − laser, up positive) and the effect of leaving it out.
 
     Attributes:
         influence: change of each estimated parameter without this point, in its sigmas, by ``scanner.name``.
@@ -116,12 +117,12 @@ class ControlFit:
 
 @dataclass(frozen=True, eq=False)
 class TrajectoryFit:
-    """Corrections of the trajectory that were estimated along (k knots).
+    """Corrections of the trajectory, estimated along with the parameters (k knots).
 
     Attributes:
         flown: (k,) index of the trajectory.
         time_ns: (k,).
-        strip: (k,) number; 0: between.
+        strip: (k,) number; 0: between strips.
         position_l: (k, 3) north, east, down, metres; attitude_rad: (k, 3) small turns about n, e, d.
         position_sigma_l, attitude_sigma_rad: (k, 3) after the adjustment; prior_…: before.
     """
@@ -139,30 +140,30 @@ class TrajectoryFit:
 
 @dataclass(frozen=True, eq=False)
 class Adjusted:
-    """The result.
+    """The result of an adjustment.
 
     Attributes:
-        calibrations: by scanner, ready to be written but for what a file says besides (id, logs, …): parameters,
-            sigmas, correlations, tables.
+        calibrations: by scanner, with parameters, sigmas, correlations and tables; complete except for a file's header
+            (id, logs, …).
         names: (u,) of the unknowns as ``left.omega_rad``, ``left.ibrc.3``, ``left.beam.12.azimuth_rad``.
-        values, sigmas: (u,) SI; `start`: (u,) before; `prior_sigmas`: (u,) inf: none.
-        correlation: (u, u). Sigmas and correlations hold what those considered may have wrong.
-        held: what was not estimated, and why.
-        considered: (c,) what was held and may be wrong.
-        moved: (u, c) by how much one sigma of each of them moves the unknowns, SI.
-        trajectory: corrections of it; None: it was taken as free of errors.
+        values, sigmas: (u,) SI; `start`: (u,) before; `prior_sigmas`: (u,) inf: no prior.
+        correlation: (u, u). Sigmas and correlations include the possible errors of the considered parameters.
+        held: parameters that were not estimated, and why.
+        considered: (c,) held parameters that may be wrong.
+        moved: (u, c) change of the unknowns by one sigma of each considered parameter, SI.
+        trajectory: corrections of the trajectory; None: it was taken as free of errors.
         residuals: by group.
         groups: fits by group.
         control: fits by point.
-        variance_factor, redundancy: of all.
+        variance_factor, redundancy: of all observations.
         global_test: p-value of r σ̂0² as χ²(r).
-        iterations, matchings: how often it was linearised; how often correspondences were found anew.
+        iterations, matchings: number of linearisations; number of searches for correspondences.
         converged: False: the last step was too large.
         least_detectable: by name: range error (metres) of one return that is found with power 0.8, and the like.
         spectrum: eigenvalues of the reduced normal matrix scaled to unit diagonal, rising.
-        scaled: whether sigmas were multiplied by √variance_factor, because the global test rejected; else they are
-            what the sigmas of the observations say.
-        notes: for people: what was assumed, and what they should know.
+        scaled: whether sigmas were multiplied by √variance_factor, because the global test rejected; otherwise they
+            follow from the sigmas of the observations.
+        notes: assumptions and warnings for the user.
         planes_e: (q, 4) unit normals in e and s4 of the planes as adjusted: s · (x, 1) = 0.
     """
 
@@ -194,11 +195,11 @@ class Adjusted:
 
     @property
     def covariance(self) -> FloatArray:
-        """(u, u) SI, with what those considered may have wrong."""
+        """Covariance (u, u) in SI, including the possible errors of the considered parameters."""
         whole: FloatArray = self.correlation * np.outer(self.sigmas, self.sigmas)
         return whole
 
     @property
     def movements(self) -> FloatArray:
-        """(u, c) `moved`, also where nothing is considered."""
+        """The matrix `moved` (u, c), with its full shape even if no parameter is considered."""
         return self.moved if self.moved.size else np.zeros((len(self.names), len(self.considered)))

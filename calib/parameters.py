@@ -1,8 +1,9 @@
-"""Which parameters of the sensor model a calibration estimates, and how they stand in one vector over all scanners.
+"""Choose which parameters of the sensor model a calibration estimates, and arrange them in one vector for all scanners.
 
-Beyond the model's sixteen (CONVENTIONS, "The beam") a scanner may have: a range offset of its own for each return slot
-or zone of pulses in air; a range correction by intensity, linear between knots; corrections of the beams of a spinning
-head. Of what only differences can be seen, one is held: the reference intensity's correction and the first beam's.
+Beyond the model's sixteen (CONVENTIONS, "The beam") a scanner may have: a separate range offset for each return slot or
+zone of pulses in air; a range correction by intensity, linear between knots; corrections of the beams of a spinning
+head. Where only differences are observable, one member is held: the reference intensity's correction and the first
+beam's.
 """
 
 from __future__ import annotations
@@ -27,38 +28,39 @@ MODELS: Mapping[str, tuple[str, ...]] = {
     "scanner": _SCANNER,
     "full": tuple(parameter.name for parameter in PARAMETERS),
 }
-# What a column of the design is, besides the places of PARAMETERS
+# Kinds of design columns, besides the places of PARAMETERS
 SLOT, ZONE, KNOT, AZIMUTH, ELEVATION, RANGE = range(len(PARAMETERS), len(PARAMETERS) + 6)
-EXTRA = ("range_offset_slot.", "range_offset_zone.", "ibrc.", "beam.")  # of tables, by scanner or of all
+EXTRA = ("range_offset_slot.", "range_offset_zone.", "ibrc.", "beam.")  # prefixes of tables, of one scanner or of all
 BEAM_PARTS = {"azimuth_rad": AZIMUTH, "elevation_rad": ELEVATION, "range_m": RANGE}
 _BY_CONVENTION = "scan_angle_offset_rad"
 ANGLES = ("omega_rad", "phi_rad", "kappa_rad")
-# One sigma of what is installed and measured with the aircraft on the ground; every parameter that the model `scanner`
-# lacks and nobody asks for is known exactly otherwise.
+# One sigma of parameters that are measured on the ground with the scanner installed. All other parameters that the
+# model `scanner` lacks and that the user does not name are known exactly.
 INSTALLED: Mapping[str, float] = {f"lever_arm_{axis}_m": 0.002 for axis in "xyz"}
 
 
 class ParameterError(ValueError):
-    """A wish that cannot be met; one line for the user."""
+    """A wish that cannot be met; the message is one line for the user."""
 
 
 @dataclass(frozen=True)
 class ParameterOptions:
-    """What is to be estimated. Names are SI ones, of all scanners (``phi_rad``) or of one (``left.phi_rad``).
+    """Selects the parameters to estimate. Names are of all scanners (``phi_rad``) or of one (``left.phi_rad``).
 
-    What is said of one scanner's parameter stands above what is said of all; of the same name `fix` counts first.
+    A setting for one scanner's parameter overrides the setting for all scanners; for the same name `fix` takes
+    precedence.
 
     Attributes:
         model: key of `MODELS`.
         fix: parameters of the model that keep their value.
         free: parameters beyond the model.
-        priors: one sigma by which a parameter is held to its start, SI; it is estimated, in the model or not. Of one
-            in `fix`: how well its value is known.
-        ibrc_knots: rising intensities of a range correction by intensity; none: it is not estimated.
+        priors: one sigma by which a parameter is held to its start, SI; the parameter is estimated, whether it is in
+            the model or not. For a parameter in `fix`: the sigma of its value.
+        ibrc_knots: rising intensities of a range correction by intensity; empty: it is not estimated.
         ibrc_reference: the knot whose correction is 0; None: the middle one.
         ibrc_smoothness_m: one sigma of a knot's distance from the line through its neighbours.
         beams: parts of a spinning head's beams that are estimated, keys of `BEAM_PARTS`.
-        range_offset_slots: return numbers with a range offset of their own, beside that of all.
+        range_offset_slots: return numbers with their own range offset, in addition to the common one.
         range_offset_zones: numbers of pulses in air (from 0), likewise.
     """
 
@@ -84,10 +86,10 @@ class Unknown:
         argument: return slot, zone, knot or channel.
         name: as ``left.omega_rad``.
         start: its value before, SI.
-        prior_sigma: by which it is held to that; inf: free.
+        prior_sigma: sigma by which it is held to that value; inf: free.
         plausible: one sigma, SI, of the start's error where it is held; 0: the start is exact, or a reference.
         first: the value from which iterations begin; nan: the start.
-        assumed: whether the prior is what is plausible, not the user's.
+        assumed: whether the prior is the plausible sigma, not the user's.
     """
 
     head: int
@@ -106,13 +108,13 @@ class Unknowns:
     """The vector of the estimated parameters of all heads.
 
     Attributes:
-        base: calibration of each head, with what is not estimated.
+        base: calibration of each head, with the values of parameters that are not estimated.
         items: (u,).
-        held: parameters of the model that are not among them at the user's word or by convention.
-        knots: (k,) intensities of the range correction by intensity; none: it is not estimated. The base's tables
-            are at these.
-        smoothness_m: of it.
-        considered: (c,) parameters that keep their start, each wrong by what is plausible.
+        held: parameters of the model that are excluded at the user's request or by convention.
+        knots: (k,) intensities of the range correction by intensity; empty: it is not estimated. The base's tables use
+            these knots.
+        smoothness_m: of the range correction by intensity.
+        considered: (c,) parameters that keep their start, each with its plausible error.
     """
 
     base: tuple[Calibration, ...]
@@ -124,44 +126,44 @@ class Unknowns:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """(u,) as ``left.omega_rad``."""
+        """Names (u,) as ``left.omega_rad``."""
         return tuple(item.name for item in self.items)
 
     @property
     def start(self) -> FloatArray:
-        """(u,) values before."""
+        """Values (u,) before the adjustment."""
         return np.array([item.start for item in self.items], dtype=np.float64)
 
     @property
     def first(self) -> FloatArray:
-        """(u,) values from which iterations begin."""
+        """Values (u,) from which iterations begin."""
         first = np.array([item.first for item in self.items], dtype=np.float64)
         return np.where(np.isnan(first), self.start, first)
 
     @property
     def prior_sigmas(self) -> FloatArray:
-        """(u,) inf: none."""
+        """Prior sigmas (u,); inf where a parameter has no prior."""
         return np.array([item.prior_sigma for item in self.items], dtype=np.float64)
 
     def __len__(self) -> int:
-        """Number of unknowns."""
+        """Return the number of unknowns."""
         return len(self.items)
 
     def of_head(self, head: int) -> tuple[Int64Array, Int64Array, Int64Array]:
-        """Return a head's unknowns (m,): where they stand in the vector, kinds, arguments."""
+        """Return a head's unknowns (m,): their places in the vector, kinds and arguments."""
         at = [index for index, item in enumerate(self.items) if item.head == head]
         kinds = [self.items[index].kind for index in at]
         arguments = [self.items[index].argument for index in at]
         return np.array(at, dtype=np.int64), np.array(kinds, dtype=np.int64), np.array(arguments, dtype=np.int64)
 
     def without(self, names: frozenset[str], held: Sequence[FixedParameter] = ()) -> Unknowns:
-        """Return the same, some of them held at their start."""
+        """Return the same unknowns with some held at their start."""
         items = tuple(item for item in self.items if item.name not in names)
         gone = tuple(item for item in self.items if item.name in names and item.plausible > 0.0)
         return replace(self, items=items, held=(*self.held, *held), considered=(*self.considered, *gone))
 
     def assuming(self, sigmas: Mapping[str, float]) -> Unknowns:
-        """Return the same, the starts of some observed with one sigma (SI) by name."""
+        """Return the same unknowns; the starts of some count as observed with one sigma (SI) by name."""
         items = tuple(
             replace(item, prior_sigma=sigmas[item.name], assumed=True) if item.name in sigmas else item
             for item in self.items
@@ -170,16 +172,16 @@ class Unknowns:
 
     @property
     def given_sigmas(self) -> FloatArray:
-        """(u,) of the user's priors; inf: none."""
+        """Sigmas (u,) of the user's priors; inf where the user gave no prior."""
         return np.where([item.assumed for item in self.items], np.inf, self.prior_sigmas)
 
     def complete(self) -> Unknowns:
-        """Return the same with those that are considered among the unknowns, behind the others."""
+        """Return the same unknowns with the considered parameters appended to them."""
         free = tuple(replace(item, prior_sigma=np.inf) for item in self.considered)
         return replace(self, items=(*self.items, *free), considered=())
 
     def calibrations(self, values: FloatArray) -> dict[str, Calibration]:
-        """By scanner, with values (u,)."""
+        """Return calibrations by scanner with the values (u,)."""
         return {base.scanner: self._with(head, values) for head, base in enumerate(self.base)}
 
     def finished(
@@ -211,7 +213,8 @@ class Unknowns:
     def pseudo(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return pseudo-observations 0 = A x + w of values (u,), divided by their sigmas: A (m, u), w (m,).
 
-        A parameter's prior; and that the correction by intensity bends little between its knots.
+        There is one for each prior of a parameter, and one for each inner knot: the correction by intensity bends
+        little.
         """
         rows, misclosures = [], []
         for at, item in enumerate(self.items):
@@ -225,7 +228,7 @@ class Unknowns:
         return np.array(rows).reshape(len(rows), len(self.items)), np.array(misclosures, dtype=np.float64)
 
     def _bends(self, head: int, values: FloatArray) -> Iterator[tuple[FloatArray, float]]:
-        """Of the inner knots: their corrections from the line through their neighbours."""
+        """Yield coefficients and distance of each inner knot's correction from the line through its neighbours."""
         at, kinds, arguments = self.of_head(head)
         place = dict(zip(arguments[kinds == KNOT].tolist(), at[kinds == KNOT].tolist(), strict=True))
         table = self._with(head, values).ibrc
@@ -273,14 +276,14 @@ def unknowns(
     """Return the unknowns of a flight.
 
     Args:
-        flight: whose heads they are.
-        wish: what is to be estimated.
-        start: calibrations to start from, by scanner; None: the heads' own. What is held keeps their values.
+        flight: flight with the heads.
+        wish: which parameters to estimate.
+        start: calibrations to start from, by scanner; None: the heads' own. Held parameters keep their values.
         first: by scanner, boresight angles from which iterations begin; None: from the start.
         doubted: by name, as ``left.kappa_rad``, least sigma (SI) of its start where it is held.
 
     Raises:
-        ParameterError: the wish names what is not known, or what such a scanner does not have.
+        ParameterError: the wish names an unknown parameter, or one that such a scanner does not have.
     """
     check_wish(flight, wish)
     bases, items, held, considered = [], [], [], []
@@ -306,7 +309,7 @@ def unknowns(
 
 
 def _asked(head: Head, name: str, wish: ParameterOptions) -> str:
-    """Return ``fix``, ``free``, ``prior`` or nothing: what is said of it on this head, else on all."""
+    """Return ``fix``, ``free``, ``prior`` or an empty string, the user's setting for this head or else for all."""
     for key in (f"{head.name}.{name}", name):
         for word, names in (("fix", wish.fix), ("prior", wish.priors), ("free", wish.free)):
             if key in names:
@@ -321,7 +324,7 @@ def _prior(head: Head, name: str, wish: ParameterOptions) -> float:
 
 
 def _word(head: Head, name: str, wish: ParameterOptions) -> str | None:
-    """Return why a parameter is not estimated; None: it is."""
+    """Return why a parameter is not estimated; None: it is estimated."""
     asked = _asked(head, name, wish)
     if name in head.geometry.without:
         if asked in ("free", "prior"):
@@ -337,10 +340,11 @@ def _word(head: Head, name: str, wish: ParameterOptions) -> str | None:
 
 
 def _plausible(head: Head, base: Calibration, name: str, wish: ParameterOptions) -> float:
-    """Return one sigma, SI, by which a parameter may be wrong while it is held; 0: not at all.
+    """Return one sigma, SI, by which a parameter may be wrong while it is held; 0: the value is exact.
 
-    The user's word counts first, then what an earlier calibration found, then what is plausible. By convention the scan
-    angle's offset is part of roll, and what neither the model nor the user names is as it was installed.
+    The user's sigma counts first, then the one of an earlier calibration, then the plausible one. By convention the
+    scan angle's offset is part of roll; parameters that neither the model nor the user names have their installed
+    values.
     """
     if name in head.geometry.without:
         return 0.0
@@ -387,7 +391,7 @@ def _spins(head: Head) -> bool:
 
 
 def _is_own(row: RangeOffset, kind: int, number: int) -> bool:
-    """Is this the offset of a slot, or zone, and of nothing else?"""
+    """Return whether this row is the offset of just this slot or zone, whatever the pulse rate."""
     wanted = (number, None) if kind == SLOT else (None, number)
     return row.prf_hz is None and (row.return_slot, row.mta_zone) == wanted
 
@@ -398,14 +402,17 @@ def _put_offset(offsets: list[RangeOffset], item: Unknown, value: float) -> None
 
 
 def _reference(wish: ParameterOptions) -> int:
-    """Return index of the knot whose correction is 0."""
+    """Return the index of the knot whose correction is 0."""
     if wish.ibrc_reference is None:
         return len(wish.ibrc_knots) // 2
     return int(np.argmin(np.abs(np.array(wish.ibrc_knots) - wish.ibrc_reference)))
 
 
 def _with_knots(calibration: Calibration, wish: ParameterOptions) -> Calibration:
-    """With the correction by intensity at the wish's knots, 0 at the reference; what that takes goes to the offset."""
+    """Return a calibration whose correction by intensity is at the wish's knots and 0 at the reference.
+
+    The correction at the reference moves to the range offset.
+    """
     if not wish.ibrc_knots:
         return calibration
     knots = np.array(wish.ibrc_knots, dtype=np.float64)
@@ -418,7 +425,11 @@ def _with_knots(calibration: Calibration, wish: ParameterOptions) -> Calibration
 
 
 def check_scanners(scanners: Sequence[str], wish: ParameterOptions) -> None:
-    """Raise ParameterError where a wish names a scanner that is none of these, by name."""
+    """Refuse a wish that names a scanner that is not among these names.
+
+    Raises:
+        ParameterError: with the name and the scanners there are.
+    """
     for name in sorted({*wish.fix, *wish.free, *wish.priors}):
         scanner, dot, _ = name.partition(".")
         if dot and scanner not in scanners and not name.startswith(EXTRA):
@@ -426,7 +437,11 @@ def check_scanners(scanners: Sequence[str], wish: ParameterOptions) -> None:
 
 
 def check_wish(flight: Flight, wish: ParameterOptions) -> None:
-    """Raise ParameterError where a wish names what there is not, or says what cannot be; before anything lasts long."""
+    """Refuse a wish with unknown names or impossible values before any long computation starts.
+
+    Raises:
+        ParameterError: with the name and the values that are possible.
+    """
     if wish.model not in MODELS:
         raise ParameterError(f"model: got {wish.model!r}, want one of {', '.join(MODELS)}")
     heads = [head.name for head in flight.heads]

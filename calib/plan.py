@@ -1,8 +1,8 @@
-"""What a planned flight would determine, before take-off: predicted sigmas, and what would have to be held.
+"""Predict before take-off which parameters a planned flight would determine, their sigmas, and which it would hold.
 
-Returns are made where each line's scan would meet the flat pieces of the terrain, and go through the rows and normal
-equations of the adjustment as measured ones do, with the trajectory's errors as far as they are expected; only their
-misclosures are missing, which no sigma needs.
+Simulated returns lie where each line's scan would meet the flat pieces of the terrain. They pass through the rows and
+normal equations of the adjustment like measured ones, with the expected errors of the trajectory; only their
+misclosures are missing, which sigmas do not need.
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ from swath.georef.scanner.calibration import Calibration
 from swath.georef.timescales import SECOND_NS
 from swath.georef.trajectory.trajectory import Trajectory
 
-LEAST_POINTS = 10  # on a patch, for it to be found in a flight (FORMULAS 6.6)
-LEAST_MADE, MOST_MADE = 4, 24  # of a patch; each stands for as many as there would be
-STEEPEST_COS = 0.17  # of the incidence: flatter than 80° nothing comes back
+LEAST_POINTS = 10  # returns on a patch, for it to be found in a flight (FORMULAS 6.6)
+LEAST_MADE, MOST_MADE = 4, 24  # simulated returns of a patch; each stands for several real ones
+STEEPEST_COS = 0.17  # of the incidence: at more than 80° no echo returns
 _COARSE_NS = SECOND_NS // 2
 _STEPS = 20
 _PLANES = PlaneSettings()
-_LINES_A_CELL = 1.5  # distances between lines that a cell is wide, for most to have more than one of them
+_LINES_A_CELL = 1.5  # width of a cell in distances between scan lines; most cells then contain several lines
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """A flat piece of the terrain, as a roof's side.
+    """A flat piece of the terrain, such as a roof's side.
 
     Attributes:
         name, kind: as of `swath.calib.features.Plane`.
@@ -60,16 +60,14 @@ class Surface:
     control: tuple[ControlPoint, ...] = ()
 
     def taken_m2(self, cell_m: float) -> float:
-        """Return area of which returns are taken: of a roof what whole cells of the search have room on, clear of its
-        rims.
-        """
+        """Return the area whose returns are used: of a roof, whole search cells clear of its rims."""
         inner_m = max(float(np.sqrt(self.area_m2)) - max(cell_m, 2.0 * RIM_M), 0.0)
         return inner_m**2 if self.kind == "roof" else self.area_m2
 
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """A flight line: which trajectory, its number, from when to when (GPS time)."""
+    """A flight line: its trajectory, its number, and its begin and end (GPS time)."""
 
     name: str
     flown: int
@@ -80,14 +78,14 @@ class Line:
 
 @dataclass(frozen=True, slots=True)
 class Scan:
-    """How a line scanner scans.
+    """The scan pattern of a line scanner.
 
     Attributes:
         half_angle_rad: from the middle.
-        rate_hz: pulses a second within the scan.
-        scan_hz: oscillations, or turns, a second; 0: not known.
+        rate_hz: pulses per second within the scan.
+        scan_hz: oscillations, or turns, per second; 0: not known.
         motion: ``sine``, ``triangle`` or ``turning``.
-        facets: lines a turn.
+        facets: scan lines per turn.
     """
 
     half_angle_rad: float
@@ -97,13 +95,18 @@ class Scan:
     facets: int = 1
 
     def apart_m(self, per_m2: float, speed_mps: float) -> float:
-        """Metres between lines, or between pulses of one, whichever are farther apart; pulses lie so densely."""
+        """Return the distance between lines, or between pulses of a line, whichever is larger, in metres.
+
+        Args:
+            per_m2: density of pulses on the ground.
+            speed_mps: speed over ground.
+        """
         lines_hz = self.scan_hz * (self.facets if self.motion == "turning" else 2)
         along_m = speed_mps / lines_hz if lines_hz else per_m2**-0.5
         return max(along_m, 1.0 / (per_m2 * along_m))
 
     def encoder_motion(self, angle_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return (n,) rate and acceleration of the encoder at angles; one return goes out, the next comes back."""
+        """Return rate and acceleration (n,) of the encoder at angles; returns alternate in direction."""
         back = np.where(np.arange(len(angle_rad)) % 2, -1.0, 1.0)
         turns = 2.0 * np.pi * self.scan_hz
         if self.motion == "sine":
@@ -116,14 +119,14 @@ class Scan:
 
 @dataclass(frozen=True, eq=False)
 class Predicted:
-    """What a flight would determine.
+    """The prediction of what a flight would determine.
 
     Attributes:
-        names: (u,) of what it would estimate, as ``left.omega_rad``.
+        names: (u,) of the parameters that it would estimate, as ``left.omega_rad``.
         sigmas: (u,) SI.
         correlation: (u, u).
-        held: what it would not, and what to fly for it.
-        planes, returns: that it is predicted by.
+        held: parameters that it would not determine, and which lines would.
+        planes, returns: numbers on which the prediction is based.
     """
 
     names: tuple[str, ...]
@@ -146,13 +149,13 @@ def planned(
     """Return the flight as it would be read, and its planes.
 
     Args:
-        frame: t.
-        heads: line scanners; their starting calibration says where they look.
-        scans: of each head.
+        frame: the frame t.
+        heads: line scanners; their starting calibration gives the direction in which they look.
+        scans: scan pattern of each head.
         trajectories: planned, with the sigmas that are expected of them.
-        lines: to be flown.
+        lines: flight lines of the plan.
         surfaces: flat pieces of the terrain.
-        most_returns: of a strip on a surface that would be adjusted.
+        most_returns: greatest number of returns of a strip on a surface that the adjustment would use.
 
     Raises:
         FlightError: no surface is seen by two swaths.
@@ -189,7 +192,7 @@ def planned(
 
 
 def search_cell_m(scan: Scan, per_m2: FloatArray, speed_mps: float) -> float:
-    """Metres a cell of the plane search would have on such a line, as `swath.calib.planes.cells.cell_size` chooses."""
+    """Return the cell size, in metres, that `swath.calib.planes.cells.cell_size` would choose for such a line."""
     if not len(per_m2):
         return _PLANES.cell_m
     middling = float(np.median(per_m2))
@@ -205,16 +208,16 @@ def predict(
     prior: TrajectoryPrior | None,
     settings: Settings = AS_USUAL,
 ) -> Predicted:
-    """Return sigmas and what is held, by the adjustment's own equations.
+    """Predict sigmas and held parameters with the adjustment's own equations.
 
     Args:
         flight, features: planned or flown.
-        wish: what is to be estimated.
-        prior: of the trajectory's errors.
-        settings: of the adjustment, with the rules of what counts as determined.
+        wish: which parameters to estimate.
+        prior: prior of the trajectory's errors.
+        settings: settings of the adjustment, with its rules for which parameters count as determined.
 
     Raises:
-        ParameterError, NormalError: as of `swath.calib.adjust.predict`.
+        ParameterError, NormalError: see `swath.calib.adjust.predict`.
     """
     left, covariance = adjustment.predict(flight, features, wish, prior, settings)
     sigmas = np.sqrt(np.diag(covariance))
@@ -225,7 +228,7 @@ def predict(
 
 @dataclass(frozen=True, eq=False)
 class _Shots:
-    """Returns of one line: (n,) surface, GPS time, ρ, θ, and (n, 3) where they meet it; by time."""
+    """Returns of one line in order of time: (n,) surface, GPS time, ρ, θ, and points (n, 3) on the surface."""
 
     surface: Int64Array
     time_ns: Int64Array
@@ -234,7 +237,7 @@ class _Shots:
     points_t: FloatArray
 
     def at(self, chosen: NDArray[np.bool_] | Int64Array) -> _Shots:
-        """Return some of them."""
+        """Select some of the returns."""
         return _Shots(
             self.surface[chosen],
             self.time_ns[chosen],
@@ -247,7 +250,7 @@ class _Shots:
 def _shots(
     frame: Tangent, head: Head, scan: Scan, trajectory: Trajectory, line: Line, surfaces: Sequence[Surface]
 ) -> tuple[_Shots, FloatArray]:
-    """Return where and when a line's scan meets the surfaces' points, and by surface how many returns would be."""
+    """Return where and when a line's scan meets the surfaces' points, and the expected number of returns by surface."""
     surface = np.concatenate([np.full(len(one.points_t), index) for index, one in enumerate(surfaces)])
     points_t = np.concatenate([one.points_t for one in surfaces])
     points_e = frame.e_from_t(points_t)
@@ -270,14 +273,14 @@ def _shots(
 def _crossings(
     trajectory: Trajectory, calibration: Calibration, points_e: FloatArray, line: Line
 ) -> tuple[Int64Array, NDArray[np.bool_]]:
-    """When points (n, 3) pass through the plane of the scan; whether they do.
+    """Find the times at which points (n, 3) pass through the plane of the scan, and whether they do.
 
-    Looked for on a coarse grid, then by false position (the Illinois rule, Dowell and Jarratt 1971).
+    The search uses a coarse grid, then false position (the Illinois rule, Dowell and Jarratt 1971).
     """
     count = int((line.end_ns - line.begin_ns) // _COARSE_NS) + 2
     grid = line.begin_ns + np.rint(np.linspace(0, line.end_ns - line.begin_ns, count)).astype(np.int64)
     origin_e, ahead_e = _plane_of_scan(trajectory, calibration, grid)
-    # a scanner that looks back has its axis against the flight
+    # a scanner that looks back has its axis against the flight direction
     forward = -1.0 if ahead_e.mean(axis=0) @ (origin_e[-1] - origin_e[0]) < 0.0 else 1.0
     ahead_e *= forward
     ahead = points_e @ ahead_e.T - np.sum(origin_e * ahead_e, axis=1)
@@ -301,13 +304,13 @@ def _crossings(
 def _plane_of_scan(
     trajectory: Trajectory, calibration: Calibration, time_ns: Int64Array
 ) -> tuple[FloatArray, FloatArray]:
-    """Return (n, 3) the scanner's place in e and the axis that its scan turns about, at times (n,)."""
+    """Return the scanner's positions (n, 3) in e and the axes of its scan rotation, at times (n,)."""
     origin_e, rot_e_from_s = _scanner(trajectory, calibration, time_ns)
     return origin_e, rot_e_from_s[:, :, 0]
 
 
 def _scanner(trajectory: Trajectory, calibration: Calibration, time_ns: Int64Array) -> tuple[FloatArray, FloatArray]:
-    """Return (n, 3) place of the scanner, (n, 3, 3) of s to e, at times of its stamps."""
+    """Return positions (n, 3) of the scanner and rotations (n, 3, 3) from s to e, at times of its stamps."""
     value = calibration.value
     offset_ns = round(value("time_offset_s") * SECOND_NS)
     poses = trajectory.poses(np.clip(time_ns + offset_ns, *trajectory.span))
@@ -320,20 +323,20 @@ def _scanner(trajectory: Trajectory, calibration: Calibration, time_ns: Int64Arr
 def _beams(
     trajectory: Trajectory, calibration: Calibration, points_e: FloatArray, time_ns: Int64Array
 ) -> tuple[FloatArray, FloatArray]:
-    """Return (n, 3) from the scanner to points at times, in s and in e."""
+    """Return vectors (n, 3) from the scanner to points at given times, in s and in e."""
     origin_e, rot_e_from_s = _scanner(trajectory, calibration, time_ns)
     beam_e = points_e - origin_e
     return np.einsum("nij,ni->nj", rot_e_from_s, beam_e), beam_e
 
 
 def _speed(trajectory: Trajectory, line: Line) -> float:
-    """Metres a second along a line."""
+    """Return the speed along a line in metres per second."""
     ends = trajectory.poses(np.array([line.begin_ns, line.end_ns], dtype=np.int64)).position_e
     return float(np.linalg.norm(ends[1] - ends[0])) / ((line.end_ns - line.begin_ns) / SECOND_NS)
 
 
 def _density(scan: Scan, speed_mps: float, shots: _Shots) -> FloatArray:
-    """Return (n,) pulses a square metre of ground where shots are, evenly over the swath's width."""
+    """Return the density (n,) of pulses per square metre of ground at shots, taken as even over the swath's width."""
     width_m = 2.0 * shots.range_m * np.cos(shots.angle_rad) * np.tan(scan.half_angle_rad)
     per_m2: FloatArray = scan.rate_hz / (speed_mps * width_m)
     return per_m2
@@ -342,8 +345,9 @@ def _density(scan: Scan, speed_mps: float, shots: _Shots) -> FloatArray:
 def _thinned(
     shots: _Shots, surface: Int64Array, surfaces: Sequence[Surface], per_m2: FloatArray, cell_m: float
 ) -> tuple[NDArray[np.bool_], FloatArray]:
-    """Return which to keep, at most `MOST_MADE` a surface, none of what is hardly seen; by surface, how many would
-    come.
+    """Return a mask of the shots to keep, and the expected number of real returns by surface.
+
+    At most `MOST_MADE` shots of a surface are kept; surfaces that are hardly seen lose all their shots.
     """
     keep = np.zeros(len(shots.surface), dtype=np.bool_)
     expected = np.zeros(len(surfaces))
@@ -359,7 +363,7 @@ def _thinned(
 
 
 def _swath(name: str, head: int, line: Line, calibration: Calibration, scan: Scan, shots: _Shots) -> Swath:
-    """Return readings that give these ranges and angles."""
+    """Build a swath of raw readings that give these ranges and angles."""
     value = calibration.value
     rows = np.zeros(len(shots.time_ns), RETURN_DTYPE)
     rows["range_m"] = (shots.range_m - value("range_offset_m")) / (1.0 + value("range_scale"))

@@ -1,13 +1,13 @@
-"""Coarse alignment: gross errors of boresight and range made small, so that planes can be recognised.
+"""Align coarsely: reduce gross errors of boresight and range so that planes can be recognised.
 
-Heights of the swaths are laid on each other, first much smoothed, then less and less (Gauss–Newton on gridded heights,
-coarse to fine). How heights change with a parameter is had by placing a sample of the returns again with it changed, so
-any scanner and mount of the sensor model will do.
+Heights of the swaths are matched to each other, at first much smoothed, then less and less (Gauss–Newton on gridded
+heights, coarse to fine). The change of heights with a parameter comes from placing a sample of the returns again with
+that parameter changed, so the method works for any scanner and mount of the sensor model.
 
-Heights of swaths on one grid, smoothed, and how they change with a scanner's parameters.
+All swaths' smoothed heights, and their changes with a scanner's parameters, use one grid.
 
-A surface of points that move by (dx, dy, dz) changes at a fixed place by dz − ∂z/∂x · dx − ∂z/∂y · dy, which is all
-that is needed to lay surfaces of swaths on each other (least squares matching; FORMULAS 5.3 for what to expect).
+A surface of points that move by (dx, dy, dz) changes at a fixed place by dz − ∂z/∂x · dx − ∂z/∂y · dy; this is
+sufficient to match surfaces of swaths (least squares matching; FORMULAS 5.3 for the expected effects).
 """
 
 from __future__ import annotations
@@ -27,50 +27,52 @@ from swath.georef.arrays import FloatArray
 from swath.georef.records import Int64Array
 from swath.georef.scanner.calibration import INDEX, Calibration
 
-SUPPORT = 0.9  # of what is typical for a swath: a kernel's share that lies on cells with points
-_TYPICAL = 75.0  # percentile of a swath's cells, how much support they have: thin samples leave cells empty
-_REACH = 3.0  # of a kernel, in sigmas
+SUPPORT = 0.9  # least support (share of a kernel that lies on cells with points), of the swath's typical one
+_TYPICAL = 75.0  # percentile of the support of a swath's cells that is typical; thin samples leave cells empty
+_REACH = 3.0  # radius of a kernel, in sigmas
 
 NAMES = ("omega_rad", "phi_rad", "kappa_rad", "range_offset_m")
-_STEPS = (1e-4, 1e-4, 1e-4, 0.1)  # by which parameters are changed to see what that does
+_STEPS = (1e-4, 1e-4, 1e-4, 0.1)  # changes of the parameters for difference quotients
 _CELLS_MOST, _CELLS_LEAST = 400_000, 200
-_SMOOTH_CELLS = 3.0  # cells a sigma of the smoothing
+_SMOOTH_CELLS = 3.0  # cells per sigma of the smoothing
 _SMOOTH_POINTS = 2.0  # least sigma of the smoothing in units of the distance between points
-_SMOOTH_HEIGHTS = (0.06, 0.03, 0.015, 0.0075)  # sigmas in heights above ground: 3.4° of boresight and a half, …
-_SMOOTH_FINEST_M = (1.0, 6.0)  # of the finest: below, edges of roofs are all there is; above, roofs are gone
-_SMOOTH_WIDTHS = 0.125  # greatest sigma in widths of a swath: nothing wider fits into it
-_CONTROL_SPACINGS, _CONTROL_POINTS = 1.3, 3  # around a control point, returns whose median height counts
+_SMOOTH_HEIGHTS = (0.06, 0.03, 0.015, 0.0075)  # sigmas in heights above ground: 3.4° of boresight, then half of it, …
+_SMOOTH_FINEST_M = (1.0, 6.0)  # limits of the finest: below, only edges of roofs remain; above, roofs vanish
+_SMOOTH_WIDTHS = 0.125  # greatest sigma in widths of a swath; a wider kernel does not fit into it
+_CONTROL_SPACINGS, _CONTROL_POINTS = 1.3, 3  # radius around a control point; fewest returns there
 _RANGE_HEIGHTS, _RANGE_LEAST_M = 0.0075, 0.2
-_OVERSAMPLED = 4  # as many returns as are wanted are looked at for those where swaths overlap
-_OVERLAP_WIDTHS = 0.1  # side of the cells by which overlap is found, in widths of a swath
-_BACK = 0.5  # share of a step that the next one takes back where steps go to and fro
-_HELD = 1e-9  # rad, or m, by which what is held may move
+_OVERSAMPLED = 4  # factor of the returns that are examined to find those where swaths overlap
+_OVERLAP_WIDTHS = 0.1  # side of the cells that find overlap, in widths of a swath
+_BACK = 0.5  # share of a step that the next one reverses where steps oscillate
+_HELD = 1e-9  # rad, or m, by which a held parameter may move
 _STEP_MOST_RAD = np.radians(2.0)
 _NO_POINTS = "a swath has no points; want a trajectory and a calibration that place them"
-# By what share of the finest smoothing surfaces come to lie beside each other, one sigma: what one strip sees behind a
-# house and the other does not leans all one way. 0.01 to 0.25 on four flights 20 m, 60 m and 600 m above houses.
+# One sigma of the horizontal distance between matched surfaces, as a share of the finest smoothing: houses hide ground
+# from one strip that another strip sees, and that biases all matches the same way. 0.01 to 0.25 on four flights 20 m,
+# 60 m and 600 m above houses.
 _LEANS = 0.15
 _REWEIGHTINGS, _HUBER, _SIGMA_LEAST_M = 3, 2.0, 0.02
 
 
 class PrealignError(ValueError):
-    """Swaths that cannot be laid on each other; one line for the user."""
+    """Swaths that cannot be matched to each other; the message is one line for the user."""
 
 
 @dataclass(frozen=True, slots=True)
 class PrealignSettings:
-    """How it is done.
+    """Settings of the pre-alignment.
 
     Attributes:
         smooth_m: sigmas of the smoothing, coarse to fine; None: by the flight's height, width and density.
-        returns: of a swath that are placed.
-        rounds: most a level.
-        boresight_sigma_rad, range_sigma_m: what is known before; holds what this flight does not determine. The range
-            offset is known to `_RANGE_HEIGHTS` of the height above ground where that is less.
-        settled_rad: the finest level ends when no angle changes by more; a coarser one when by as much more.
-        greatest_rad: beyond this it is no coarse error of a mounting but a wrong installation matrix.
+        returns: number of returns of a swath that are placed.
+        rounds: greatest number of iterations at a level.
+        boresight_sigma_rad, range_sigma_m: prior sigmas; they hold the parameters that this flight does not determine.
+            The sigma of the range offset is `_RANGE_HEIGHTS` of the height above ground where that is less.
+        settled_rad: the finest level ends when no angle changes by more; a coarser level has a proportionally larger
+            limit.
+        greatest_rad: a larger correction is not an error of mounting but a wrong installation matrix.
         control_sigma_m: of control against heights of the surface.
-        held: of `NAMES`, by scanner as ``left.kappa_rad`` or of all: they keep their start.
+        held: of `NAMES`, by scanner as ``left.kappa_rad`` or for all: these keep their start.
     """
 
     smooth_m: tuple[float, ...] | None = None
@@ -93,28 +95,28 @@ def prealign(
     start: Mapping[str, Calibration] | None = None,
     control_t: FloatArray | None = None,
 ) -> dict[str, Calibration]:
-    """Return calibrations by scanner, whose boresight angles are good to some hundredths of a degree.
+    """Return calibrations by scanner, with boresight angles accurate to some hundredths of a degree.
 
     Args:
         flight: at least two swaths that overlap.
-        settings: of the way there.
+        settings: settings of the pre-alignment.
         start: calibrations to begin with; None: those of the flight's heads.
         control_t: (k, 3) surveyed points on open ground, which also fix the height.
 
     Raises:
-        PrealignError: there is one swath only, swaths do not overlap, or their heights do not come together.
+        PrealignError: there is one swath only, swaths do not overlap, or their heights do not converge.
     """
     return prealigned(flight, settings, start, control_t).calibrations
 
 
 @dataclass(frozen=True)
 class Prealigned:
-    """Hold the outcome of a pre-alignment.
+    """The outcome of a pre-alignment.
 
     Attributes:
         calibrations: by scanner.
-        sigmas: (4,) of `NAMES` by scanner, SI, as far as heights of the strips tell, with what houses that hide the
-            ground behind them do; of what heights do not tell, those of the settings.
+        sigmas: (4,) of `NAMES` by scanner, SI, from heights of the strips, including the effect of houses that hide the
+            ground behind them; parameters that heights do not determine have the sigmas of the settings.
     """
 
     calibrations: dict[str, Calibration]
@@ -127,7 +129,7 @@ def prealigned(
     start: Mapping[str, Calibration] | None = None,
     control_t: FloatArray | None = None,
 ) -> Prealigned:
-    """Return coarse calibrations with sigmas; arguments and errors as of `prealign`."""
+    """Return coarse calibrations with sigmas; see `prealign` for arguments and errors."""
     if len(flight.swaths) < 2:
         raise PrealignError(f"prealignment: got {len(flight.swaths)} swath, want at least two that overlap")
     found = dict(start or flight.starts())
@@ -146,7 +148,7 @@ def prealigned(
         for _ in range(settings.rounds):
             placed = [_placed(flight, *one, found) for one in zip(flight.swaths, fewer, motions, strict=True)]
             improved = _improved(flight, placed, found, began, smooth_m, settings, control, share)
-            if improved is None:  # a coarse level on a narrow overlap: a finer one may still do
+            if improved is None:  # the overlap may be too narrow for this level but not for a finer one
                 break
             found, step, sigma = improved
             share, last = share * _damping(last, step), step
@@ -179,14 +181,14 @@ def _refuse(
 
 @dataclass(frozen=True, eq=False)
 class _Control:
-    """Surveyed points (k, 3) and how far from them returns are taken."""
+    """Surveyed points (k, 3), and the radius around them in which returns are used."""
 
     points_t: FloatArray
     reach_m: float
 
 
 def _levels(scale: Scale, settings: PrealignSettings) -> tuple[float, ...]:
-    """Return sigmas of the smoothing, coarse to fine: what the flight's sizes allow of those asked for."""
+    """Return sigmas of the smoothing, coarse to fine, limited to those that the flight's sizes allow."""
     finest_m = _SMOOTH_POINTS * scale.spacing_m
     if settings.smooth_m is not None:
         return tuple(dict.fromkeys(max(one, finest_m) for one in settings.smooth_m))
@@ -199,11 +201,13 @@ def _levels(scale: Scale, settings: PrealignSettings) -> tuple[float, ...]:
 
 
 def _samples(flight: Flight, found: Mapping[str, Calibration], count: int) -> tuple[list[Int64Array], Scale]:
-    """By swath rising indexes of last returns where another swath is too, evenly; and the flight's sizes, whose
-    spacing is that of the thinnest of these samples.
+    """Sample last returns evenly where another swath is too, and measure the flight's sizes.
 
-    Of a long line of which a short one crosses a part, that part alone is of use. Where no two swaths meet, all of
-    them is taken: a coarse boresight may be what keeps them apart.
+    Of a long line that a short one crosses, only the crossed part is useful. Where no two swaths meet, the samples
+    cover whole swaths: a coarse boresight may keep them apart.
+
+    Returns:
+        Rising indexes of the returns by swath; and the sizes, whose spacing is that of the thinnest of these samples.
     """
     many = [_last(swath, _OVERSAMPLED * count) for swath in flight.swaths]
     points = [
@@ -225,7 +229,7 @@ def _samples(flight: Flight, found: Mapping[str, Calibration], count: int) -> tu
 
 
 def _shared(points: Sequence[FloatArray], cell_m: float) -> list[NDArray[np.bool_]]:
-    """By swath which of its points (n, 3) lie in a cell that another swath has points in or beside."""
+    """Return, by swath, a mask of its points (n, 3) with points of another swath in their or a neighbouring cell."""
     of_swath = []
     for place in points:
         columns, rows = np.floor(np.nan_to_num(place[:, :2]).T / cell_m).astype(np.int64)
@@ -254,9 +258,11 @@ def _improved(
     control: _Control | None,
     share: float,
 ) -> tuple[dict[str, Calibration], FloatArray, FloatArray] | None:
-    """Return better calibrations, and by how much each head's parameters changed, (h, 4), with their sigmas (h, 4).
+    """Improve the calibrations by one step, of which only the given share is applied.
 
-    None: too few cells are in two swaths. Of each change only the share is made.
+    Returns:
+        Calibrations, the changes of each head's parameters (h, 4), and their sigmas (h, 4). None: too few cells are in
+        two swaths.
     """
     if any(not len(points) for points, _ in placed):
         raise PrealignError(f"prealignment: {_NO_POINTS}")
@@ -268,7 +274,7 @@ def _improved(
     if len(apart) < _CELLS_LEAST:
         return None
     sigma_m, weight = _robust(apart, design)
-    alike = max(1.0, 4.0 * np.pi * (smooth_m / lattice.cell_m) ** 2)  # cells that the smoothing makes one
+    alike = max(1.0, 4.0 * np.pi * (smooth_m / lattice.cell_m) ** 2)  # cells that the smoothing merges into one
     normal = (design * weight[:, np.newaxis]).T @ design / (sigma_m**2 * alike)
     right = design.T @ (weight * apart) / (sigma_m**2 * alike)
     if control is not None and len(control.points_t):
@@ -291,18 +297,16 @@ def _improved(
 
 
 def _damping(last: FloatArray, step: FloatArray) -> float:
-    """Return by what the next step's share is to be smaller: half where this one went back most of the last one.
+    """Return the factor for the next step's share: a half if this step reversed most of the last one.
 
-    On a fine level few edges decide, other ones before a step than after it, and full steps go to and fro.
+    On a fine level a few edges decide, and they differ before and after a step, so full steps would oscillate.
     """
     back = -float(np.sum(last[:, :3] * step[:, :3]))
     return 0.5 if back > _BACK * float(np.sum(last[:, :3] ** 2)) > 0.0 else 1.0
 
 
 def _motion(flight: Flight, swath: Swath, at: Int64Array, found: Mapping[str, Calibration]) -> FloatArray:
-    """Return (4, n, 3) how points of returns move with each of the parameters; it stays nearly the same all the
-    while.
-    """
+    """Return the motion (4, n, 3) of returns' points with each parameter; it changes little over the iterations."""
     calibration = found[flight.heads[swath.head].name]
     points = flight.place(swath, calibration, at)
     motion = np.empty((len(NAMES), *points.shape))
@@ -315,16 +319,14 @@ def _motion(flight: Flight, swath: Swath, at: Int64Array, found: Mapping[str, Ca
 def _placed(
     flight: Flight, swath: Swath, at: Int64Array, motion: FloatArray, found: Mapping[str, Calibration]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return points (m, 3) of those returns that have one, and their motion (4, m, 3)."""
+    """Return points (m, 3) of the returns that can be placed, and their motion (4, m, 3)."""
     points = flight.place(swath, found[flight.heads[swath.head].name], at)
     there = np.isfinite(points).all(axis=1) & np.isfinite(motion).all(axis=(0, 2))
     return points[there], motion[:, there]
 
 
 def _differences(surfaces: list[Surface], heads: list[int], count: int) -> tuple[FloatArray, FloatArray]:
-    """Return heights of one swath above another (m,) in all cells that two have, and their change with all unknowns
-    (m, u).
-    """
+    """Return heights of one swath above another (m,) in all cells that two share, and their derivatives (m, u)."""
     apart, design = [], []
     for one, other in combinations(range(len(surfaces)), 2):
         first, second = surfaces[one], surfaces[other]
@@ -338,8 +340,10 @@ def _differences(surfaces: list[Surface], heads: list[int], count: int) -> tuple
 
 
 def _robust(apart: FloatArray, design: FloatArray) -> tuple[float, FloatArray]:
-    """Return sigma of a difference once the parameters are right, and weights (m,): what one strip sees and another
-    does not, as trees and what walls hide, counts little (Huber 1981)."""
+    """Return the sigma of a difference after the parameters are corrected, and robust weights (m,).
+
+    Objects that only one strip sees, such as trees and surfaces hidden by walls, get low weights (Huber 1981).
+    """
     weight = np.ones(len(apart))
     sigma_m = 1.0
     damping = 1e-9 * np.diag((design**2).sum(axis=0) + 1e-12)
@@ -355,7 +359,7 @@ def _robust(apart: FloatArray, design: FloatArray) -> tuple[float, FloatArray]:
 def _against_control(
     placed: list[tuple[FloatArray, FloatArray]], heads: list[int], count: int, control: _Control
 ) -> tuple[FloatArray, FloatArray]:
-    """Return heights of swaths above control points (m,), and their change with all unknowns (m, u)."""
+    """Return heights of swaths above control points (m,), and their derivatives by all unknowns (m, u)."""
     above, design = [np.zeros(0)], [np.zeros((0, count * len(NAMES)))]
     for (points, motion), head in zip(placed, heads, strict=True):
         near = cKDTree(points[:, :2]).query_ball_point(control.points_t[:, :2], control.reach_m)
@@ -370,7 +374,7 @@ def _against_control(
 
 @dataclass(frozen=True, slots=True)
 class Lattice:
-    """Cells of one size over all swaths: west, south, metres a cell, rows and columns."""
+    """A grid of square cells over all swaths: west, south, metres per cell, rows and columns."""
 
     west: float
     south: float
@@ -380,7 +384,7 @@ class Lattice:
 
     @classmethod
     def over(cls, points: list[FloatArray], cell_m: float, most: int) -> Lattice:
-        """Return all points (n, 3); cells become larger where there were more than so many."""
+        """Create a lattice that covers all points (n, 3); cells grow until there are at most ``most`` of them."""
         low = np.min([np.min(one[:, :2], axis=0) for one in points], axis=0)
         high = np.max([np.max(one[:, :2], axis=0) for one in points], axis=0)
         east, north = high - low
@@ -389,7 +393,7 @@ class Lattice:
         return cls(west, south, cell_m, int(north / cell_m) + 2, int(east / cell_m) + 2)
 
     def cells(self, points: FloatArray) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-        """Return (n,) cells of points, and whether they are on the lattice."""
+        """Return cells (n,) of points, and whether the points are on the lattice."""
         column = np.floor((points[:, 0] - self.west) / self.cell_m).astype(np.int64)
         row = np.floor((points[:, 1] - self.south) / self.cell_m).astype(np.int64)
         inside = (column >= 0) & (row >= 0) & (column < self.columns) & (row < self.rows)
@@ -398,7 +402,7 @@ class Lattice:
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """A swath's heights on a lattice, from `cells` on.
+    """A swath's heights on a lattice.
 
     Attributes:
         cells: (c,) cells that are well supported, rising.
@@ -412,7 +416,10 @@ class Surface:
 
 
 def surface(lattice: Lattice, points: FloatArray, motion: FloatArray, smooth_m: float) -> Surface:
-    """Of points (n, 3) and their motion with p parameters (p, n, 3); smoothed by a Gaussian of so many metres."""
+    """Build the surface of points (n, 3) and their motion with p parameters (p, n, 3).
+
+    A Gaussian with a sigma of ``smooth_m`` metres smooths the heights.
+    """
     cell, inside = lattice.cells(points)
     cell, points, motion = cell[inside], points[inside], motion[:, inside]
     rows, columns = np.divmod(cell, lattice.columns)

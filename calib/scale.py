@@ -1,8 +1,8 @@
-"""Sizes that a flight gives itself: how high it was, how wide its swaths are, how far apart its points lie.
+"""Measure the sizes of a flight: its height, the width of its swaths and the distance between its points.
 
-What a calibration looks at on the ground follows from these three, so that a drone 20 m above a yard and an aircraft
-3,000 m above a town are searched alike: an angle moves points by its product with the height, nothing wider than a
-swath can be compared, and nothing finer than its points can be seen.
+The sizes that a calibration searches on the ground follow from these three, so a drone 20 m above a yard and an
+aircraft 3,000 m above a town are treated alike: an angle moves points by its product with the height, features wider
+than a swath cannot be compared, and features finer than its points cannot be seen.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from swath.calib.flight import Flight, Swath, sensor_t
 from swath.georef.arrays import FloatArray
 from swath.georef.records import Int64Array
 
-REFERENCE_HEIGHT_M = 800.0  # at which what is given in metres for any flight was found to be right
-_SAMPLE = 20_000  # returns of a swath that are looked at
+REFERENCE_HEIGHT_M = 800.0  # height at which constants in metres were tuned
+_SAMPLE = 20_000  # returns of a swath that are examined
 _FEWEST = 100
 _POINTS_A_CELL, _ROUNDS = 16.0, 4
 _MIDDLE = (5.0, 95.0)  # percentiles across the track between which a swath's width is measured
@@ -44,12 +44,12 @@ class Scale:
 
 
 def scale_of(flight: Flight, points_t: Sequence[tuple[Int64Array, FloatArray]] | None = None) -> Scale | None:
-    """Return the sizes of a flight; None where no swath has points.
+    """Measure the sizes of a flight; None if no swath has points.
 
     Args:
         flight: whose swaths are measured.
-        points_t: by swath, rising indexes (n,) of returns and where they lie (n, 3) in t, if not where the flight has
-            them.
+        points_t: by swath, rising indexes (n,) of returns and their positions (n, 3) in t, if these differ from those
+            of the flight.
     """
     rows = []
     for index, swath in enumerate(flight.swaths):
@@ -68,7 +68,7 @@ def scale_of(flight: Flight, points_t: Sequence[tuple[Int64Array, FloatArray]] |
 
 
 def _width_m(flight: Flight, swath: Swath, away_t: FloatArray) -> float:
-    """Return across the line between a swath's ends."""
+    """Return a swath's width across the line between its ends."""
     ends = sensor_t(flight, swath, np.array([0, len(swath) - 1]))
     east, north = (ends[1] - ends[0])[:2] / max(float(np.linalg.norm((ends[1] - ends[0])[:2])), 1e-9)
     low, high = np.percentile(away_t[:, 0] * north - away_t[:, 1] * east, _MIDDLE)
@@ -76,9 +76,9 @@ def _width_m(flight: Flight, swath: Swath, away_t: FloatArray) -> float:
 
 
 def area_spacing_m(points: FloatArray) -> float:
-    """Return √(area a point) of points (n, ≥ 2), by cells that have some of them on average.
+    """Return √(area per point) of points (n, ≥ 2), measured with cells that contain some of them on average.
 
-    The area of few large cells is too large at the edges, that of many small ones too small between the points.
+    A few large cells overestimate the area at the edges; many small cells underestimate it between the points.
     """
     spacing_m = float(np.sqrt(max(np.prod(np.ptp(points[:, :2], axis=0)), 1e-6) / len(points)))
     for _ in range(_ROUNDS):
@@ -90,7 +90,7 @@ def area_spacing_m(points: FloatArray) -> float:
 
 
 def spacing_m(swath: Swath) -> float:
-    """Return √(area a return) of a swath, infinite where it has no points."""
+    """Return √(area per return) of a swath; infinite where it has no points."""
     step = max(1, len(swath) // 200_000)
     points = np.asarray(swath.points_t[::step])
     points = points[np.isfinite(points).all(axis=1)]

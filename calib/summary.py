@@ -1,4 +1,4 @@
-"""What a report is made of: the outcome of a calibration, and what was measured before and after it."""
+"""Data of a report: the outcome of a calibration, and the measurements before and after it."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class DifferenceMap:
         cell_m: its side.
         before_m, after_m: (rows, columns) from south and west; nan: not compared. Where several pairs of strips meet,
             it is the largest difference.
-        before_words, after_words: how far the strips differ, of all pairs, by the measure that the report tells.
+        before_words, after_words: overall difference of all pairs of strips, in the measure that the report states.
     """
 
     west_m: float
@@ -70,12 +70,12 @@ class DifferenceMap:
 
 @dataclass(frozen=True, eq=False)
 class Profile:
-    """A picture somebody else drew.
+    """A picture that another component drew for the report.
 
     Attributes:
-        title, caption: words above and below.
-        svg: it, for the page.
-        figure: makes it as a figure of Matplotlib, for the PDF; None: the page alone shows it.
+        title, caption: text above and below.
+        svg: the picture for the page.
+        figure: creates the picture as a figure of Matplotlib, for the PDF; None: only the page shows it.
     """
 
     title: str
@@ -86,12 +86,12 @@ class Profile:
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """Something that speaks against a calibration, found beside its figures.
+    """A finding against a calibration that does not come from the adjustment's own figures.
 
     Attributes:
-        what: is the matter, with the figure.
-        change: what to do about it.
-        excess: by how much it is beyond what is expected, to put the worst first.
+        what: the problem, with the figure.
+        change: the remedy.
+        excess: ratio to the expected value; the worst findings come first.
         unusable: whether the calibration must not be used with it.
     """
 
@@ -103,23 +103,23 @@ class Finding:
 
 @dataclass(frozen=True, eq=False)
 class ReportInput:
-    """All that a report shows.
+    """All data that a report shows.
 
     Attributes:
-        flight: its swaths' points as placed with whatever calibrations.
-        features, adjusted: as observed and as found.
+        flight: its swaths' points as placed, with any calibrations.
+        features, adjusted: observations and result.
         headers: of the calibration files, by scanner.
         before, after: height differences by pair of swath names, with the calibrations at the start and as found.
-        differences: them on a map; None: not made.
-        check: what profiles say beside the adjustment; None: not measured.
+        differences: the height differences on a map; None: not made.
+        check: independent check by profiles; None: not measured.
         profiles: more pictures.
-        inputs: name and SHA-256 of every file that went in.
+        inputs: name and SHA-256 of every input file.
         settings: of the run, in words, among them software and versions.
         notes: for the reader, one sentence each.
-        findings: reasons against it that its figures do not tell.
-        need: how accurate it has to be, and what it leaves in the points; None: not looked into.
+        findings: reasons against the calibration that its figures do not show.
+        need: required accuracy, and the errors that the calibration leaves in the points; None: not determined.
         title: of the whole; empty: made of installation and scanners.
-        measure: what the height differences are, for people; empty: unsaid.
+        measure: what the height differences are, for display; empty: not stated.
         level: the quality level that strips keep, or why there is none; empty: not judged.
     """
 

@@ -1,4 +1,4 @@
-"""Whether a calibration may be used: a table of limits on its figures, and a sentence."""
+"""Judge whether a calibration may be used: a table of limits on its figures, and a sentence."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from swath.calib.summary import Difference, Pair, ReportInput
 DEG = 180.0 / math.pi
 BORESIGHT = ("omega_rad", "phi_rad", "kappa_rad")
 MOST_CORRELATED = 0.95
-TOO_LARGE = 10.0  # times what is wanted
-# What is wanted where nobody says and the flight's points do not tell
+TOO_LARGE = 10.0  # ratio to the wanted sigma
+# Wanted sigmas if the user sets none and the flight's points do not imply them
 WANTED = {"omega_rad": 0.003 / DEG, "phi_rad": 0.003 / DEG, "kappa_rad": 0.006 / DEG, "range_offset_m": 0.02}
 
 
 class Level(IntEnum):
-    """Of a reason, and of the whole."""
+    """Level of a reason, and of the whole verdict."""
 
     GOOD = 0
     CARE = 1
@@ -30,19 +30,19 @@ class Level(IntEnum):
 
     @property
     def words(self) -> str:
-        """As a report says it."""
+        """Words for this level in a report."""
         return ("Good", "Usable with care", "Not to be used")[self]
 
 
 @dataclass(frozen=True, slots=True)
 class Reason:
-    """Why a calibration is not simply good.
+    """A reason why a calibration is not simply good.
 
     Attributes:
-        level: how bad it is.
-        what: what is the matter, with the figure.
-        change: what to do about it.
-        excess: value over its limit, to put the worst first.
+        level: severity.
+        what: the problem, with the figure.
+        change: the remedy.
+        excess: value over its limit; the worst reasons come first.
     """
 
     level: Level
@@ -53,14 +53,14 @@ class Reason:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """The judgement: the worst reason's level, the sentence, the reasons with the worst first."""
+    """The judgement: the worst reason's level, the sentence, and the reasons with the worst first."""
 
     level: Level
     sentence: str
     reasons: tuple[Reason, ...]
 
 
-Measure = Callable[[ReportInput], Iterator[tuple[str, float]]]  # of what, and how large
+Measure = Callable[[ReportInput], Iterator[tuple[str, float]]]  # yields the measured thing in words, and its size
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +75,7 @@ class Rule:
     shown: Callable[[float], str] = number
 
     def judged(self, report: ReportInput) -> Iterator[Reason]:
-        """Yield reasons that its measure gives, one for each thing measured; what is not a number is the worst."""
+        """Yield the reasons that its measure gives, one for each measured value; nan counts as the worst."""
         for of, value in self.measure(report):
             for level, limit in ((Level.UNUSABLE, self.unusable), (Level.CARE, self.care)):
                 if limit is not None and not value <= limit:
@@ -85,13 +85,13 @@ class Rule:
 
 
 def overall_rms_m(pairs: Mapping[Pair, Difference]) -> float | None:
-    """Return root mean square over all cells of all pairs; None: nothing was compared."""
+    """Return the root mean square over all cells of all pairs; None if nothing was compared."""
     cells = sum(one.count for one in pairs.values())
     return math.sqrt(sum(one.count * one.rms_m**2 for one in pairs.values()) / cells) if cells else None
 
 
 def sigma_of(report: ReportInput, names: tuple[str, ...]) -> float | None:
-    """Return the largest sigma (SI) of parameters of these names, estimated or held; None: nothing is said of them."""
+    """Return the largest sigma (SI) of parameters of these names, estimated or held; None if they have no sigma."""
     adjusted = report.adjusted
     known = [s for n, s in zip(adjusted.names, adjusted.sigmas.tolist(), strict=True) if unknown(n).name in names]
     known += [one.sigma for one in adjusted.considered if one.name in names]
@@ -99,15 +99,15 @@ def sigma_of(report: ReportInput, names: tuple[str, ...]) -> float | None:
 
 
 def wanted_of(report: ReportInput) -> dict[str, float]:
-    """Return one sigma (SI) that is wanted, by parameter's name."""
+    """Return the wanted sigmas (SI), by parameter's name."""
     told = {} if report.need is None else report.need.wanted
     return {**WANTED, **{name: sigma for name, sigma in told.items() if math.isfinite(sigma)}}
 
 
 def held_words(adjusted: Adjusted) -> list[str]:
-    """Return what held parameters would do, a sentence each: those that move an estimated one by more than its sigma.
+    """Return a sentence for each held parameter that would move an estimated one by more than its own sigma.
 
-    An estimated parameter's own sigma is the one it would have if nothing that is held were wrong.
+    An estimated parameter's own sigma is the one it would have if all held parameters were right.
     """
     several = len(adjusted.calibrations) > 1
     moved = adjusted.movements
@@ -126,19 +126,19 @@ def held_words(adjusted: Adjusted) -> list[str]:
 
 
 def unknown_words(name: str, several: bool) -> str:
-    """Return the words of an unknown, as ``left.omega_rad``."""
+    """Return the words for an unknown such as ``left.omega_rad``."""
     one = unknown(name)
     return words_of(one.scanner, one.name, several=several)
 
 
 def _held(one: Considered, several: bool) -> str:
-    """Return what is held, and how well it is known."""
+    """Describe a held parameter and its plausible error."""
     name = f"{one.scanner}.{one.name}"
     return f"{unknown_words(name, several)}, held, plausible to {sized(name, one.sigma)}"
 
 
 def undetermined(report: ReportInput) -> list[str]:
-    """Return parameters that this flight does not determine, in words."""
+    """Return the words for the parameters that this flight does not determine."""
     several = len(report.adjusted.calibrations) > 1
     held = [one for one in report.adjusted.held if is_undetermined(one)]
     return [words_of(one.scanner, one.name, several=several) for one in held]
@@ -153,7 +153,7 @@ def _no_redundancy(report: ReportInput) -> Iterator[tuple[str, float]]:
 
 
 def _held_angles(report: ReportInput) -> Iterator[tuple[str, float]]:
-    """Yield the boresight angles that are held, and how many times what is wanted they are uncertain by."""
+    """Yield the held boresight angles, and the ratio of their largest uncertainty to the wanted sigma."""
     yield from _held_of(report, BORESIGHT)
 
 
@@ -177,7 +177,7 @@ def _held_of(report: ReportInput, names: tuple[str, ...]) -> Iterator[tuple[str,
 
 
 def _beyond_wanted(report: ReportInput) -> Iterator[tuple[str, float]]:
-    """Yield estimated parameters with their sigmas and what is wanted, and the ratio."""
+    """Yield estimated parameters with their sigmas and the wanted ones, and the ratio."""
     several = len(report.adjusted.calibrations) > 1
     wanted = wanted_of(report)
     for name, sigma in zip(report.adjusted.names, report.adjusted.sigmas.tolist(), strict=True):
@@ -190,7 +190,7 @@ def _beyond_wanted(report: ReportInput) -> Iterator[tuple[str, float]]:
 
 
 def _points(report: ReportInput) -> Iterator[tuple[str, float]]:
-    """Yield what the calibration leaves in points, over what is wanted."""
+    """Yield the errors that the calibration leaves in points, and their ratio to the wanted sigma."""
     need = report.need
     if need is None or not need.point_m > 0.0:
         return
@@ -202,7 +202,7 @@ def _points(report: ReportInput) -> Iterator[tuple[str, float]]:
 
 
 def _contradicted(report: ReportInput) -> Iterator[tuple[str, float]]:
-    """Yield held parameters that the flight says are wrong."""
+    """Yield held parameters that the flight contradicts."""
     several = len(report.adjusted.calibrations) > 1
     for one in report.adjusted.considered:
         if one.contradicted:
@@ -212,7 +212,7 @@ def _contradicted(report: ReportInput) -> Iterator[tuple[str, float]]:
 
 
 def _profiles(report: ReportInput) -> Iterator[tuple[str, float]]:
-    """Yield what profiles say against the adjustment, in sigmas of the difference."""
+    """Yield the differences between profiles and the adjustment, in sigmas of the difference."""
     several = len(report.adjusted.calibrations) > 1
     for one in () if report.check is None else report.check.comparisons:
         name = f"{one.scanner}.{one.parameter}"
@@ -287,7 +287,10 @@ def _trajectory(report: ReportInput) -> Iterator[tuple[str, float]]:
 
 
 def _correlated(report: ReportInput) -> Iterator[tuple[str, float]]:
-    """Tell pairs whose sum alone is known, but where points are known as well as is wanted: there the sum suffices."""
+    """Yield pairs of parameters of which only the sum is known.
+
+    Scanners whose points are as accurate as wanted are left out: for them the sum suffices.
+    """
     adjusted, need = report.adjusted, report.need
     left_m = {} if need is None else need.left_m
     enough = {scanner for scanner, left in left_m.items() if need is not None and left <= need.point_m}
@@ -442,7 +445,7 @@ RULES: tuple[Rule, ...] = (
 
 
 def judge(report: ReportInput) -> Verdict:
-    """Return the verdict."""
+    """Judge the calibration of a report."""
     reasons = [reason for rule in RULES for reason in rule.judged(report)]
     reasons += [
         Reason(Level.UNUSABLE if one.unusable else Level.CARE, one.what, one.change, one.excess)
@@ -454,7 +457,7 @@ def judge(report: ReportInput) -> Verdict:
 
 
 def accuracy_words(report: ReportInput) -> str:
-    """Return sigmas and agreement, as people say them."""
+    """Return sigmas and agreement of strips in words."""
     boresight, offset_m = sigma_of(report, BORESIGHT), sigma_of(report, ("range_offset_m",))
     words = [f"boresight to {degrees(boresight * DEG)}"] if boresight is not None else []
     words += [f"range offset to {length(offset_m)}"] if offset_m is not None else []

@@ -1,1 +1,1 @@
-"""The process: configuration, acquisition, log, replay, health and the command line."""
+"""The swath process: configuration, acquisition, log, replay, health checks and the command line."""

@@ -1,4 +1,4 @@
-"""Errors a user can mend, each one line, and the exit codes of every command."""
+"""Defines the errors that a user can mend, one line each, and the exit codes of every command."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ _CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]+")
 
 
 class ExitCode(IntEnum):
-    """What a command's exit status says."""
+    """Exit status of a command."""
 
     OK = 0
     PROBLEM = 1  # the job ran and found a problem
@@ -19,7 +19,7 @@ class ExitCode(IntEnum):
 
 
 class UserError(Exception):
-    """Something the user can mend: printed as ``swath: <message>``, each line of the message by itself."""
+    """An error that the user can mend; it is printed as ``swath: <message>``, each line of the message separately."""
 
     def __init__(self, message: str, exit_code: ExitCode = ExitCode.PROBLEM) -> None:
         super().__init__(message)
@@ -28,7 +28,7 @@ class UserError(Exception):
 
 
 class ConfigError(UserError):
-    """The configuration is wrong; one line an error: file, key, what was got, what would be right."""
+    """An error in the configuration; each line names the file, the key, the value found and a correct value."""
 
     def __init__(self, lines: str | list[str]) -> None:
         self.lines = [one_line(line) for line in ([lines] if isinstance(lines, str) else lines)]
@@ -36,7 +36,7 @@ class ConfigError(UserError):
 
 
 def one_line(text: str) -> str:
-    """Return a text that may come from anywhere as one line without control characters, which any terminal and file
-    takes.
+    """Return a text of any origin as one line without control characters, so that every terminal and file
+    accepts it.
     """
     return _CONTROL.sub(" ", text).encode("utf-8", "backslashreplace").decode()  # half a surrogate pair has no bytes

@@ -1,4 +1,4 @@
-"""This process as the operating system sees it: its threads' names, its memory, its priority."""
+"""Adjusts how the operating system treats this process: thread names, memory and priority."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 NICE = 10
-KEPT_BYTES = 64 << 20  # freed memory that an arena keeps
-LARGEST_KEPT_BYTES = 32 << 20  # glibc's own largest
+KEPT_BYTES = 64 << 20  # freed memory that an arena keeps for reuse
+LARGEST_KEPT_BYTES = 32 << 20  # the largest threshold that glibc accepts
 
 
 def name_thread(name: str) -> None:
@@ -22,7 +22,9 @@ def name_thread(name: str) -> None:
 
 
 def lock_memory() -> None:
-    """Keep pages that are in use in memory, where the unit grants it without limit (mlockall(2), on fault)."""
+    """Lock pages into memory as they are first used, if the unit grants unlimited locked memory (mlockall(2), on
+    fault).
+    """
     if resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] != resource.RLIM_INFINITY:
         return
     current, future, on_fault = 1, 2, 4
@@ -30,9 +32,9 @@ def lock_memory() -> None:
 
 
 def keep_freed_memory() -> None:
-    """Have glibc use freed memory again instead of giving it back page by page, to be faulted in anew (mallopt(3)).
+    """Make glibc reuse freed memory instead of returning it to the kernel and faulting the pages in again (mallopt(3)).
 
-    Set before threads start. Another C library has no such call, and does without.
+    Call this before any thread starts. It does nothing with a C library that has no mallopt.
     """
     trim_threshold, mmap_threshold = -1, -3
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
@@ -42,9 +44,10 @@ def keep_freed_memory() -> None:
 
 
 def lower_priority() -> None:
-    """Run after the recorder: at `NICE` or lower, and on the disk when no other process wants it.
+    """Run at a lower priority than the recorder: nice value `NICE` or higher, and disk access only when the disk is
+    idle.
 
-    Where that is not permitted, the process goes on as it is.
+    If that is not permitted, the process continues at its present priority.
     """
     with contextlib.suppress(OSError):
         os.setpriority(os.PRIO_PROCESS, 0, max(NICE, os.getpriority(os.PRIO_PROCESS, 0)))
@@ -52,7 +55,7 @@ def lower_priority() -> None:
 
 
 def give_way() -> None:
-    """Run only when nothing else on the computer wants to: idle CPU and I/O priority, where that is permitted."""
+    """Run only when the computer is otherwise idle: idle CPU and I/O priority, where that is permitted."""
     with contextlib.suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
         os.nice(19)
@@ -67,7 +70,7 @@ def _leave_the_disk_to_others() -> None:
 
 
 def _psutil() -> Any:
-    """Import psutil here: the recorder, which asks for no lower priority, starts without it."""
+    """Import psutil on first use, so that the recorder, which never lowers its priority, starts without it."""
     import psutil
 
     return psutil

@@ -1,4 +1,4 @@
-"""Text files that users name: read alike everywhere, in UTF-8 or what their byte order mark says."""
+"""Reads text files that the user names, in UTF-8 or the encoding that their byte order mark declares."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from swath.georef.text_encoding import encoding_of
 
 
 def text_of(path: Path, want: str = "a CSV file") -> str:
-    """Return the text of a file that is to be such a one.
+    """Return the text of a file; ``want`` names the expected kind of file in the error message.
 
     Raises:
-        UserError: it cannot be read, or is no text.
+        UserError: the file cannot be read, or is not text.
     """
     try:
         with path.open("rb") as stream:

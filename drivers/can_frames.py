@@ -1,7 +1,7 @@
 """CAN frames as Linux lays them out in memory: ``struct can_frame`` and ``struct canfd_frame`` (linux/can.h).
 
-This is the layout of a CAN unit in the log (LOG_FORMAT, ``x-swath-can``) and on a SocketCAN socket. The bus knows no
-byte order of the identifier; in the log it is little-endian.
+This is the layout of a CAN unit in the log (LOG_FORMAT, ``x-swath-can``) and on a SocketCAN socket. The bus defines
+no byte order for the identifier; in the log it is little-endian.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from swath.georef.records import ByteRows, StructArray
 
 CAN_EFF_FLAG = 0x8000_0000  # 29-bit identifier
 CAN_RTR_FLAG = 0x4000_0000  # remote request: carries no data
-CAN_ERR_FLAG = 0x2000_0000  # error frame: the controller speaks, not a node
+CAN_ERR_FLAG = 0x2000_0000  # error frame: sent by the controller, not by a node
 CAN_SFF_MASK = 0x0000_07FF
 CAN_EFF_MASK = 0x1FFF_FFFF
 
@@ -31,7 +31,7 @@ CANFD_LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)  # ISO 1
 
 
 def frame_id(identifier: int, *, extended: bool) -> int:
-    """Return the ``can_id`` word of a data frame: identifier with its flag.
+    """Return the ``can_id`` word of a data frame: the identifier with its flag.
 
     Raises:
         ValueError: the identifier has more bits than its format.
@@ -45,7 +45,7 @@ def frame_id(identifier: int, *, extended: bool) -> int:
 def encode_can_frame(
     identifier: int, data: bytes, *, extended: bool = False, fd: bool = False, remote: bool = False
 ) -> bytes:
-    """Return one unit of 16 bytes (classic) or 72 bytes (``fd``) as the log and SocketCAN hold it.
+    """Encode one unit of 16 bytes (classic) or 72 bytes (``fd``) in the layout of the log and of SocketCAN.
 
     Raises:
         ValueError: the identifier or the data do not fit.
@@ -64,7 +64,7 @@ def encode_can_frame(
 
 
 def decode_can_frames(units: ByteRows) -> StructArray | None:
-    """Return view units of one length as frames; None where the length is neither 16 nor 72 bytes."""
+    """View units of one length as frames; return None where the length is neither 16 nor 72 bytes."""
     dtype = {CAN_FRAME_BYTES: CAN_FRAME_DTYPE, CANFD_FRAME_BYTES: CANFD_FRAME_DTYPE}.get(units.shape[1])
     if dtype is None:
         return None

@@ -1,4 +1,4 @@
-"""Finds protocol files by what they declare: no list to edit when a device is added."""
+"""Finds drivers by the ``DRIVERS`` tuples of the protocol files; a new device needs no entry in any list."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ KINDS: tuple[DeviceKind, ...] = ("gnss", "imu", "scanner", "corrections")
 
 
 class UnknownProtocolError(LookupError):
-    """No driver of that kind has that protocol; the text lists those there are."""
+    """No driver of that kind has that protocol; the text lists the protocols that exist."""
 
 
 @cache
 def all_drivers(kind: DeviceKind) -> dict[str, Driver]:
-    """Return all drivers of a kind by protocol name, from the ``DRIVERS`` of each module, or of each package's
-    ``parser``.
+    """Return all drivers of a kind by protocol name, from the ``DRIVERS`` of each module or of each package's
+    ``parser`` module.
     """
     package = importlib.import_module(f"swath.drivers.{kind}")
     found: dict[str, Driver] = {}
@@ -48,7 +48,7 @@ def find_driver(kind: DeviceKind, protocol: str) -> Driver:
     """Return the driver of a protocol.
 
     Raises:
-        UnknownProtocolError: with the names that would be right.
+        UnknownProtocolError: the protocol is unknown; the text lists the known ones.
     """
     drivers = all_drivers(kind)
     try:
@@ -60,29 +60,29 @@ def find_driver(kind: DeviceKind, protocol: str) -> Driver:
 
 @dataclass(frozen=True, slots=True)
 class Driver:
-    """What a protocol file declares in its ``DRIVERS`` tuple.
+    """Holds what a protocol file declares about one protocol in its ``DRIVERS`` tuple.
 
     Attributes:
-        protocol: the name in the configuration.
+        protocol: its name in the configuration.
         kind: gnss, imu, scanner or corrections.
-        transports: kinds of transport it can come by.
-        yields: record types it gives.
+        transports: kinds of transport that can carry it.
+        yields: record types that its parser returns.
         summary: one line for ``swath devices``.
-        make_parser: builds the parser of everything.
-        make_time_parser: builds the parser the recorder runs: time messages (and device clock samples) only; None
-            where the device says no time.
-        make_probe: builds the parser that only counts what looks like this protocol, where make_parser needs more than
-            defaults; it is asked when another protocol was configured.
-        names_edge: which edge its time messages name by default; None where mixed or none.
-        tells_pps: whether a latch in its clock samples is the device's own word, not only the configuration's.
-        needs: configuration keys without which it cannot work.
-        line_scanner: of a scanner: one beam, which goes as the configuration's ``geometry`` declares. The parser of any
-            other has ``beams``, a `swath.drivers.scanner.beams.BeamTable`, by which returns are georeferenced.
-        wavelength_nm: of a scanner's light, by its maker's data sheet; None: 1064, as of most airborne ones.
-        eight_bit_intensity: whether a scanner's intensities are 0 to 255.
-        past_hour: whether a scanner's device time is that past the full hour of UTC.
-        startup: builds the messages a device needs before a survey, in the order they are sent, and raises
-            `DriverSettingsError`; None where there are none.
+        make_parser: builds the parser of all record types.
+        make_time_parser: builds the parser that the recorder runs, which returns time messages (and device clock
+            samples) only; None where the device sends no time.
+        make_probe: builds a parser that only counts messages of this protocol, where make_parser needs more than
+            default settings; it is used to recognise this protocol when another one was configured.
+        names_edge: which PPS edge its time messages refer to by default; None where they are mixed or refer to no edge.
+        tells_pps: whether the device itself reports the PPS latch in its clock samples, rather than the configuration.
+        needs: configuration keys that it requires.
+        line_scanner: True for a scanner with one beam, whose path the configuration's ``geometry`` declares. The parser
+            of any other scanner has ``beams``, a `swath.drivers.scanner.beams.BeamTable` to georeference returns.
+        wavelength_nm: a scanner's wavelength by its maker's data sheet; None: 1064, as in most airborne scanners.
+        eight_bit_intensity: whether a scanner's intensities range from 0 to 255.
+        past_hour: whether a scanner's device time counts from the last full hour of UTC.
+        startup: builds the messages that a device needs before a survey, in sending order, and raises
+            `DriverSettingsError`; None where the device needs no such message.
     """
 
     protocol: str

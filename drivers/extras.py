@@ -1,8 +1,8 @@
-"""Words for what installs a package that is not there."""
+"""Gives the user instructions for installing optional packages."""
 
 from __future__ import annotations
 
 
 def how_to_install(extras: str) -> str:
-    """Return Swath is on no index: its extras are installed from its folder, into the environment it runs in."""
+    """Return the command that installs extras."""
     return f"pip install '.[{extras}]' in the folder of Swath's sources"

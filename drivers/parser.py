@@ -1,7 +1,7 @@
-"""The contract of every protocol file: bytes in, records out, no I/O, no clock, no logging.
+"""The contract of every protocol parser: bytes in, records out, no I/O, no clock, no logging.
 
-What the wire says never raises: it is counted in `ParserCounters` and skipped. A programming mistake of the caller
-(wrong settings) raises `DriverSettingsError` when the parser is made, never later.
+Bad input never raises: it is counted in `ParserCounters` and skipped. A mistake of the caller (wrong settings)
+raises `DriverSettingsError` when the parser is made, never later.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ DeviceKind = Literal["gnss", "imu", "scanner", "corrections"]
 
 
 class DriverSettingsError(ValueError):
-    """A setting the driver cannot work with; the text names the key and what would be right."""
+    """A setting that the driver cannot work with; the text names the key and a valid value."""
 
 
 @dataclass(slots=True)
 class ParserCounters:
-    """What a parser saw, so that nothing is dropped silently.
+    """Counts everything that a parser receives, so that no loss is silent.
 
     Attributes:
         bytes: all bytes fed.
@@ -52,10 +52,10 @@ class ParserCounters:
 
 
 class Parser(ABC):
-    """Feeds on units of one channel in the order of their arrival.
+    """Parses the units of one channel in the order of their arrival.
 
-    ``feed``, ``feed_batch`` and ``feed_batches`` give the same records for the same bytes however they are cut. `close`
-    gives what was still held back and counts an unfinished tail in ``counters.bytes_skipped``.
+    ``feed``, ``feed_batch`` and ``feed_batches`` return the same records for the same bytes, however cut. `close`
+    returns the records still held back and counts an unfinished tail in ``counters.bytes_skipped``.
     """
 
     def __init__(self) -> None:
@@ -63,16 +63,16 @@ class Parser(ABC):
 
     @abstractmethod
     def feed(self, chunk: Chunk) -> list[Record]:
-        """Take one unit; return the records it completed, in order."""
+        """Take one unit; return the records that it completed, in order."""
 
     @abstractmethod
     def feed_batch(self, batch: ChunkBatch) -> list[Record]:
-        """Take consecutive units of equal length; return the records they completed, in order."""
+        """Take consecutive units of equal length; return the records that they completed, in order."""
 
     def feed_batches(self, batches: Sequence[ChunkBatch]) -> list[Record]:
-        """Take consecutive batches of one channel, of any lengths; return the records they completed, in order.
+        """Take consecutive batches of one channel, of any lengths; return the records that they completed, in order.
 
-        Neighbours of equal length go to `feed_batch` as one: a call of it costs as much as many units.
+        Neighbours of equal length go to `feed_batch` as one batch, as each call costs as much as many units.
         """
         records: list[Record] = []
         for _, equal in groupby(batches, key=lambda batch: batch.units.shape[1]):
@@ -80,16 +80,16 @@ class Parser(ABC):
         return records
 
     def close(self) -> list[Record]:
-        """Release the tail at the end of a stream."""
+        """Return the records still held back at the end of a stream."""
         return []
 
     def remarks(self) -> list[str]:
-        """Return lines for the user, with the source: what was taken otherwise than said or refused, and the remedy."""
+        """Return lines for the user: which settings or data were reinterpreted or refused, and the remedy."""
         return []
 
 
 def _joined(batches: list[ChunkBatch]) -> ChunkBatch:
-    """Return batches of units of one length as one."""
+    """Join batches of units of one length into one batch."""
     if len(batches) == 1:
         return batches[0]
     times = np.concatenate([batch.host_time_ns for batch in batches])
@@ -97,10 +97,10 @@ def _joined(batches: list[ChunkBatch]) -> ChunkBatch:
 
 
 class StreamParser(Parser):
-    """For byte streams, whose units end anywhere: `feed` is written, `feed_batch` follows."""
+    """Base of parsers for byte streams, whose units end anywhere; a subclass implements `feed`."""
 
     def feed_batch(self, batch: ChunkBatch) -> list[Record]:
-        """Feed the rows one by one; stream units are few."""
+        """Feed the rows one by one, as stream units are few."""
         records: list[Record] = []
         for host_time_ns, unit in zip(batch.host_time_ns.tolist(), batch.units, strict=True):
             records += self.feed(Chunk(batch.source, host_time_ns, unit.tobytes()))
@@ -108,21 +108,21 @@ class StreamParser(Parser):
 
 
 class PacketParser(Parser):
-    """For datagrams and CAN frames, whose units are whole: `parse_units` is written, both feeds follow.
+    """Base of parsers for datagrams and CAN frames, whose units are whole; a subclass implements `parse_units`.
 
     Attributes:
-        doubts: what the units leave uncertain, a line for the user each.
+        doubts: facts that the units leave uncertain, one line for the user each.
     """
 
     doubts: tuple[str, ...] = ()
 
     def feed(self, chunk: Chunk) -> list[Record]:
-        """Return one unit is a batch of one row."""
+        """Parse one unit as a batch of one row."""
         units = np.frombuffer(chunk.data, dtype=np.uint8).reshape(1, -1)
         return self.parse_units(np.array([chunk.host_time_ns], dtype=np.int64), units)
 
     def feed_batch(self, batch: ChunkBatch) -> list[Record]:
-        """Hand the rows to `parse_units` whole."""
+        """Pass all rows to `parse_units` at once."""
         return self.parse_units(batch.host_time_ns, batch.units)
 
     @abstractmethod
@@ -137,14 +137,14 @@ class PacketParser(Parser):
 
 @dataclass(frozen=True, slots=True)
 class DeviceSettings:
-    """All a parser may know of its configuration.
+    """Holds everything that a parser may know of its configuration.
 
     Attributes:
         source: ``kind/name``.
-        config: the device's table of the configuration, defaults filled in.
-        files: contents of the files it names, by key (``dbc``, ``geometry``), from disk or from a log's attachments.
-        compiled: returns are decoded by compiled loops, which want numba (``swath[process]``): the same rows, faster
-            where there are millions.
+        config: the device's table in the configuration, defaults filled in.
+        files: contents of the files that the table names, by key (``dbc``, ``geometry``), from disk or from a log.
+        compiled: decode returns by compiled loops, which need numba (``swath[process]``); the rows are the same, and
+            decoding is faster where there are millions.
     """
 
     source: str

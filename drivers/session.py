@@ -1,9 +1,9 @@
-"""A transport kept open: the device may be absent at start, vanish and return, and the reader never sees an error.
+"""Keeps a transport open: the device may be absent at start, vanish and return, and the reader never sees an error.
 
     CLOSED --receive--> OPENING --opened--> OPEN --error--> WAITING --time over--> OPENING
                                  --refused--> WAITING
 
-The wait doubles from 0.25 s to 5 s with every failure, and begins anew once the device has delivered something or
+The wait doubles from 0.25 s to 5 s with every failure. It restarts at 0.25 s once the device has delivered data or
 has been open for longer than the longest wait.
 """
 
@@ -25,20 +25,20 @@ UnitT = TypeVar("UnitT")
 
 
 class Source(Protocol[UnitT]):
-    """What a session keeps open: a `Transport` or a `PpsSource`."""
+    """The interface that a session keeps open: a `Transport` or a `PpsSource`."""
 
     def open(self) -> None:
-        """Open; raises `TransportError`."""
+        """Open the source; raises `TransportError`."""
 
     def receive(self, timeout_s: float) -> list[UnitT]:
-        """Wait and hand over; raises `TransportError`."""
+        """Wait for units and return them; raises `TransportError`."""
 
     def close(self) -> None:
-        """Close; a second call does nothing."""
+        """Close the source; a second call does nothing."""
 
 
 class SessionState(StrEnum):
-    """Where a session stands."""
+    """States of a session."""
 
     CLOSED = "closed"
     OPENING = "opening"
@@ -47,13 +47,13 @@ class SessionState(StrEnum):
 
 
 class Session(Generic[UnitT]):
-    """One source of units, opened again whenever it went.
+    """Receives units from one source and reopens it after every failure.
 
     Args:
         make_source: makes a new, unopened transport or PPS source.
         on_change: called in the receiving thread with the new state and, for WAITING, the reason.
-        monotonic_s: the clock the waits are measured with.
-        pause: waits the given seconds or until the session is closed, whichever is first; a test's own may return
+        monotonic_s: the clock that measures the waits.
+        pause: waits the given seconds or until the session is closed, whichever is first; a test may return
             at once.
 
     `receive` belongs to one thread; `close` and `send` may come from another.
@@ -71,7 +71,7 @@ class Session(Generic[UnitT]):
         self._on_change = on_change
         self._monotonic_s = monotonic_s
         self._stopped = threading.Event()
-        self._lock = threading.Lock()  # of _source and _past together
+        self._lock = threading.Lock()  # keeps _source and _past consistent
         self._pause = pause or self._stopped.wait
         self._source: Source[UnitT] | None = None
         self._wait_s = FIRST_WAIT_S
@@ -83,9 +83,9 @@ class Session(Generic[UnitT]):
         self.openings = 0
 
     def receive(self, timeout_s: float) -> list[UnitT]:
-        """Return units that came within ``timeout_s``; nothing while the device is away. Never raises `TransportError`.
+        """Return the units of the next ``timeout_s``, empty while the device is away. Never raises `TransportError`.
 
-        A call that opens the device may last as long as opening does, and returns without having read.
+        A call that opens the device may last as long as the opening and returns without reading.
         """
         if self._stopped.is_set():
             return []
@@ -103,7 +103,7 @@ class Session(Generic[UnitT]):
         source = self._make_source()
         try:
             source.open()
-        except OSError as error:  # `TransportError`, and what a driver did not foresee: another try may succeed
+        except OSError as error:  # not `TransportError` only: another try may succeed after any of them
             self._fail(error)
             return
         with self._lock:
@@ -156,7 +156,7 @@ class Session(Generic[UnitT]):
             self._on_change(state, reason)
 
     def send(self, data: bytes) -> bool:
-        """Send one unit; False when the device is away."""
+        """Send one unit; return False when the device is away."""
         source = self._source
         if not isinstance(source, Transport):
             return False
@@ -168,7 +168,7 @@ class Session(Generic[UnitT]):
         return True
 
     def poll_counters(self) -> TransportCounters:
-        """Return the kernel's counts over all openings; the buffer sizes are those of the present or last one."""
+        """Return the kernel's counts over all openings; the buffer sizes are those of the present or last opening."""
         with self._lock:
             source = self._source
             if isinstance(source, Transport | PpsSource):
@@ -176,7 +176,7 @@ class Session(Generic[UnitT]):
             return self._past
 
     def close(self) -> None:
-        """End the session; a blocked `receive` returns, every later one gives nothing."""
+        """End the session; a blocked `receive` returns, and every later one returns an empty list."""
         self._stopped.set()
         self._release()
         if self.state is not SessionState.CLOSED:
@@ -187,7 +187,7 @@ _LATEST = {"receive_buffer_bytes", "receive_buffer_asked_bytes"}
 
 
 def _sum(past: TransportCounters, present: TransportCounters) -> TransportCounters:
-    """Return counts added up, sizes taken from ``present``."""
+    """Add up the counts; take the buffer sizes from ``present``."""
     total = TransportCounters()
     for item in fields(TransportCounters):
         now: int = getattr(present, item.name)

@@ -1,6 +1,6 @@
-"""Start-up messages: what a device is asked for before a survey, and how its answers are told from its data.
+"""Start-up messages: requests to a device before a survey, and how its answers are separated from its data.
 
-A protocol file builds the messages and knows the answers; whoever holds the wire sends them. No I/O here.
+A protocol file builds the messages and knows the answers; the owner of the transport sends them. No I/O here.
 """
 
 from __future__ import annotations
@@ -14,34 +14,34 @@ from typing import Any, NamedTuple
 from swath.drivers.parser import DeviceSettings
 
 DEFAULT_RATE_HZ = 5
-MAX_REPLY_BYTES = 4096  # of a command line's reply; Septentrio's longest command has 2000
+MAX_REPLY_BYTES = 4096  # longest reply of a command line; Septentrio's longest command has 2000
 
 
 class Answer(NamedTuple):
-    """What a device said to a message; ``text`` is its reason, where it gives one."""
+    """A device's answer to a message; ``text`` is its reason, where it gives one."""
 
     accepted: bool
     text: str = ""
 
 
 class AnswerListener(ABC):
-    """Finds the answer to one message among everything a device sends after it."""
+    """Finds the answer to one message in the data that a device sends after it."""
 
     @abstractmethod
     def hear(self, data: bytes) -> Answer | None:
-        """Take one read; the answer once it is complete."""
+        """Take one read; return the answer once it is complete."""
 
     def close(self) -> Answer | None:
-        """Nothing more will come: the answer in what was held back."""
+        """Return the answer in the data held back, at the end of the data."""
         return None
 
 
 class PhraseListener(AnswerListener):
-    """For command lines: the answer is a phrase that binary data does not hold.
+    """Finds the answer of a command line: a phrase that binary data does not contain.
 
     Args:
-        accepted: what the device says when it does as asked.
-        refused: what it says else; the first group is its reason.
+        accepted: the device's reply to a command that it executes.
+        refused: its reply to any other command; the first group is its reason.
     """
 
     def __init__(self, accepted: re.Pattern[bytes], refused: re.Pattern[bytes]) -> None:
@@ -50,7 +50,7 @@ class PhraseListener(AnswerListener):
         self._heard = b""
 
     def hear(self, data: bytes) -> Answer | None:
-        """Take one read; the first phrase that is complete."""
+        """Take one read; return the answer of the first complete phrase."""
         heard = self._heard + data
         self._heard = heard[-MAX_REPLY_BYTES:]
         accepted, refused = self._accepted.search(heard), self._refused.search(heard)
@@ -61,14 +61,14 @@ class PhraseListener(AnswerListener):
 
 @dataclass(frozen=True, slots=True)
 class StartupMessage:
-    """One message and how to know its answer.
+    """One message and the means to recognise its answer.
 
     Attributes:
-        lines: for the eye; the first says what it is, the others what is in it.
+        lines: description for the user; the first line names the message, the others list its content.
         data: the bytes on the wire.
         listen: makes a listener for the answer to this sending.
-        baud: the device speaks at this rate once it has accepted; None: as before.
-        last: keeps what the others set; sent behind them all, and only when each was accepted.
+        baud: line rate of the device once it has accepted; None: unchanged.
+        last: True for the message that saves the settings; it is sent after all others, only if each was accepted.
     """
 
     lines: tuple[str, ...]
@@ -80,11 +80,11 @@ class StartupMessage:
 
 @dataclass(frozen=True, slots=True)
 class StartupOptions:
-    """What of a set-up is said when it is asked for, not in the configuration.
+    """Options of a set-up that the caller gives, not the configuration.
 
     Attributes:
-        save: let the device keep its settings without power.
-        baud: change the line to this rate; None: it runs at the right one.
+        save: make the device keep its settings without power.
+        baud: change the line to this rate; None: keep the present rate.
     """
 
     save: bool = False
@@ -93,12 +93,12 @@ class StartupOptions:
 
 @dataclass(frozen=True, slots=True)
 class SetupKeys:
-    """The table ``setup`` of a receiver's configuration.
+    """Holds the table ``setup`` of a receiver's configuration.
 
     Attributes:
-        port: the receiver's own name of the port that is wired to this computer; None: the protocol's default.
-        rate_hz: of positions and velocities.
-        raw: raw measurements and ephemerides too.
+        port: the receiver's own name for the port wired to this computer; None: the protocol's default.
+        rate_hz: rate of positions and velocities.
+        raw: whether to send raw measurements and ephemerides too.
     """
 
     port: str | None
@@ -107,6 +107,6 @@ class SetupKeys:
 
 
 def read_setup(settings: DeviceSettings) -> SetupKeys:
-    """Return the table, its defaults filled in."""
+    """Read the table ``setup`` and fill in its defaults."""
     table: Mapping[str, Any] = settings.config.get("setup") or {}
     return SetupKeys(table.get("port"), int(table.get("rate_hz", DEFAULT_RATE_HZ)), bool(table.get("raw", True)))

@@ -1,11 +1,11 @@
-"""Does a trajectory belong to a log? Where it lies against the receiver's fixes, and how it turns against the IMU.
+"""Check whether a trajectory belongs to a log: its position against GNSS fixes, its rotation against the IMU.
 
-Positions are compared as medians over blocks of time, whose sigma holds what a kind of fix is wrong by for a whole
-flight: a receiver's own sigma is that of its noise from epoch to epoch. Turn rates are compared with what the attitude
-would give if its angles had other signs, so that a wrong convention is named and not only seen.
+Positions are compared as medians over blocks of time. The sigma of a median includes the error that a kind of fix keeps
+for a whole flight; a receiver's own sigma describes only its noise from epoch to epoch. Turn rates are also compared
+with those that the attitude would give if its angles had other signs, so that a message can name a wrong convention.
 
-Gusts are turn rates above 0.5 Hz, which no two flights over the same lines share. Slower ones are those of the lines
-flown and the turns between them: another flight of the same plan has them too.
+Gusts are turn rates above 0.5 Hz; they differ between two flights over the same lines. Slower rates come from the lines
+flown and the turns between them, and another flight of the same plan has them too.
 """
 
 from __future__ import annotations
@@ -26,24 +26,25 @@ from swath.georef.timescales.gps_time import SECOND_NS
 from swath.georef.trajectory.trajectory import EARTH_RATE_RADPS, Trajectory
 from swath.georef.trajectory.turn_rates import REACH_STEPS, STEP_NS, Turning, turning
 
-GUSTS_HZ = (0.5, 2.5)  # faster than what autopilots and pilots steer, slower than what engines shake
+GUSTS_HZ = (0.5, 2.5)  # above the frequencies that autopilots and pilots steer, below those of engine vibration
 
-ABOVE_HZ = (5.0, 9.5)  # noise and vibration alone
+ABOVE_HZ = (5.0, 9.5)  # the band of noise and vibration alone
 
-ABOVE_NOISE = 2.0  # rms of the former over that of the latter; noise alone has 0.7, so a ninth of the power is noise
+# minimum rms of the gust band over that of the noise band; noise alone has 0.7, so a ninth of the power is noise
+ABOVE_NOISE = 2.0
 
 
 def gusts(told: FloatArray, felt: FloatArray) -> tuple[FloatArray, FloatArray] | None:
-    """Return rates (k, 3) of a trajectory and an IMU in the band of gusts, at the lag that suits best.
+    """Return turn rates (k, 3) of a trajectory and an IMU in the band of gusts, at the lag with the best correlation.
 
-    A time that is off is judged elsewhere, and named.
+    Other functions judge and report time offsets.
 
     Args:
-        told, felt: (m, 3) rad/s over the same steps.
+        told, felt: (m, 3) rad/s over the same steps, of the trajectory and of the IMU.
 
     Returns:
-        None where one of them has little but noise there, or does not reach so far: a smoothed or coarse trajectory,
-        calm air, a rotor.
+        None where one of them holds little but noise in this band, or lacks these frequencies: a smoothed or coarse
+        trajectory, calm air, a rotor.
     """
     pair = []
     for rates in (told, felt):
@@ -56,7 +57,7 @@ def gusts(told: FloatArray, felt: FloatArray) -> tuple[FloatArray, FloatArray] |
 
 
 def _best_lag(one: FloatArray, other: FloatArray) -> int:
-    """Return by how many steps, at most `REACH_STEPS` and a half of all, the first is to be taken later."""
+    """Return the number of steps, at most `REACH_STEPS` and half the length, by which the first lags the second."""
     spectra = (np.fft.rfft(rates, 2 * len(one), axis=0) for rates in (one, other))
     sums = np.fft.irfft(next(spectra) * np.conj(next(spectra)), 2 * len(one), axis=0).sum(axis=1)
     reach = min(REACH_STEPS, len(one) // 2)
@@ -70,7 +71,7 @@ def _lagged(one: FloatArray, other: FloatArray, lag: int) -> tuple[FloatArray, F
 
 
 def _within(rates: FloatArray, band_hz: tuple[float, float]) -> FloatArray:
-    """Return rates (m, 3) with the frequencies of a band alone."""
+    """Return rates (m, 3) reduced to the frequencies of one band."""
     spectrum = np.fft.rfft(rates, axis=0)
     hz = np.fft.rfftfreq(len(rates), STEP_NS / SECOND_NS)
     spectrum[(hz < band_hz[0]) | (hz > band_hz[1])] = 0.0
@@ -78,8 +79,8 @@ def _within(rates: FloatArray, band_hz: tuple[float, float]) -> FloatArray:
     return kept
 
 
-# One sigma, horizontal and vertical, m, of what stays the same for a whole flight: the base's place and the troposphere
-# over a baseline; ionosphere, orbits and multipath where there is no base. Usual figures, for receivers in flight.
+# One sigma, horizontal and vertical, m, of errors that stay the same for a whole flight: the base's position and the
+# troposphere over a baseline; ionosphere, orbits and multipath without a base. Usual figures for receivers in flight.
 LASTING_M: dict[FixType, tuple[float, float]] = {
     FixType.RTK_FIXED: (0.02, 0.03),
     FixType.PPP: (0.1, 0.2),
@@ -87,22 +88,23 @@ LASTING_M: dict[FixType, tuple[float, float]] = {
     FixType.DIFFERENTIAL: (0.6, 1.2),
     FixType.SINGLE: (1.5, 3.0),
 }
-UNSAID_M = 0.05  # one sigma of a trajectory that says none
+UNSAID_M = 0.05  # one sigma assumed for a trajectory that gives none
 FEWEST_FIXES = 10
-BLOCK_NS = 10 * SECOND_NS  # errors of fixes that are farther apart are taken as independent
-FEWEST_BLOCKS = 5  # from which on their scatter is measured
-LONGEST_S, TRIED_S = 40.0, 0.25  # more than all leap seconds; steps that are straight
+BLOCK_NS = 10 * SECOND_NS  # errors of fixes farther apart than this are taken as independent
+FEWEST_BLOCKS = 5  # minimum number of blocks for measuring their scatter
+LONGEST_S, TRIED_S = 40.0, 0.25  # more than all leap seconds; a step over which the path is nearly straight
 MOST_FITTED = 1000
-NOISIEST = 3.0  # scatter of fixes over what lasts
+NOISIEST = 3.0  # limit of the scatter of fixes over their lasting error
 MAD = 1.4826  # sigma of a normal distribution over its median absolute deviation
 MEDIAN = 1.2533  # sigma of a median over that of a mean
 SHORTEST_STEPS = round(8 * SECOND_NS / STEP_NS)
 SECOND_STEPS = SECOND_NS // STEP_NS
-SLOW_STEPS = 20  # a second: attitude noise and vibration are averaged out
-MUCH_BETTER = 0.5  # what another convention, time or datum leaves of a difference, over that as it is
+SLOW_STEPS = 20  # one second, which averages out attitude noise and vibration
+# greatest ratio of the difference after a change of convention, time or datum to the difference before it
+MUCH_BETTER = 0.5
 SURE = 4.0  # sigmas
-LIKE = 0.7  # share of a motion below which it is surely another, SURE sigmas included
-FEWEST_TURNS = 10.0  # seconds with horizontal acceleration, for a heading
+LIKE = 0.7  # share of common motion below which, SURE sigmas included, two records are of different motions
+FEWEST_TURNS = 10.0  # minimum seconds with horizontal acceleration for a heading
 ACCELERATES = 0.5  # m/s²
 
 
@@ -111,14 +113,14 @@ class Compared:
     """Fixes of one kind beside the trajectory, epoch by epoch.
 
     Attributes:
-        fix_type: their kind.
+        fix_type: the kind of these fixes.
         time_ns: (n,) GPS time.
-        fix_e: (n, 3) the antenna by the receiver, m.
-        apart_e: (n, 3) the antenna by the trajectory less that, m.
+        fix_e: (n, 3) the antenna's position by the receiver, m.
+        apart_e: (n, 3) the antenna's position by the trajectory minus fix_e, m.
         q_e_from_b, velocity_e: (n, 4), (n, 3) of the trajectory.
         arm_b: (3,) the antenna's lever arm, m.
         sigma_l: (3,) median of the fixes' own sigmas, north, east, down, m.
-        own_sigma_l: (3,) median of the trajectory's, m.
+        own_sigma_l: (3,) median of the trajectory's sigmas, m.
     """
 
     fix_type: FixType
@@ -139,26 +141,27 @@ class Compared:
 
     @property
     def apart_b(self) -> FloatArray:
-        """Return (n, 3) the difference along the body's axes, m."""
+        """The difference (n, 3) along the body's axes, m."""
         return rotated(conjugate(self.q_e_from_b), self.apart_e)
 
     def blocks(self, values: FloatArray) -> FloatArray:
-        """Return the medians (k, 3) of values (n, 3) over the blocks of time that hold any."""
+        """Return the medians (k, 3) of values (n, 3) over each block of time that holds any."""
         number = (self.time_ns - self.time_ns[0]) // BLOCK_NS
         return np.array([np.median(values[number == one], axis=0) for one in np.unique(number)])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Apart:
-    """How far a trajectory lies from fixes.
+    """The distance between a trajectory and fixes.
 
     Attributes:
         median_l: (3,) north, east, up, m.
         scatter_l: (3,) robust sigma of single differences, m.
-        size_l: (3,) of the median, or the usual size in a block where that is larger: differences may change sign.
-        fix_sigma_l: (3,) one sigma of the median by the fixes alone, what lasts included, m.
-        sigma_l: (3,) with the trajectory's own, m.
-        of: what was compared.
+        size_l: (3,) absolute median, or the median of the absolute block medians where that is larger, as differences
+            may change sign.
+        fix_sigma_l: (3,) one sigma of the median due to the fixes alone, lasting errors included, m.
+        sigma_l: (3,) the same with the trajectory's own sigma, m.
+        of: the compared fixes.
     """
 
     median_l: FloatArray
@@ -170,22 +173,22 @@ class Apart:
 
     @property
     def sigmas(self) -> float:
-        """Return the size in its sigmas, along the worst axis."""
+        """The size in units of sigma_l, along the worst axis."""
         return float(np.max(self.size_l / self.sigma_l))
 
     @property
     def fix_sigmas(self) -> float:
-        """Return the size in the sigmas of the fixes alone, along the worst axis."""
+        """The size in units of fix_sigma_l, along the worst axis."""
         return float(np.max(self.size_l / self.fix_sigma_l))
 
     @property
     def metres(self) -> float:
-        """Return the size along the axis where it is largest."""
+        """The size along the axis where it is largest, m."""
         return float(np.max(self.size_l))
 
 
 def apart_from_fixes(trajectory: Trajectory, positions: StructArray, arms_b: FloatArray) -> Apart | None:
-    """Compare a trajectory plus lever arm with a receiver's fixes of the kind that tells most.
+    """Compare a trajectory plus lever arm with a receiver's fixes of the most informative kind.
 
     Args:
         trajectory: of the body's origin, with attitude.
@@ -233,17 +236,18 @@ def _apart(of: Compared) -> Apart:
     noise = usual if len(blocks) >= FEWEST_BLOCKS else scatter
     horizontal, vertical = LASTING_M[of.fix_type]
     lasting = np.maximum(of.sigma_l, (horizontal, horizontal, vertical))
-    noise = np.minimum(noise, NOISIEST * lasting)  # what scatters more is the trajectory's fault, and no excuse of it
+    # the trajectory causes a larger scatter, which must not excuse its error
+    noise = np.minimum(noise, NOISIEST * lasting)
     fix_sigma = np.hypot(lasting, MEDIAN * noise / np.sqrt(len(blocks)))
     size = np.maximum(np.abs(median), np.median(np.abs(blocks), axis=0))
     return Apart(median, scatter, size, fix_sigma, np.hypot(fix_sigma, of.own_sigma_l), of)
 
 
 def time_that_explains(apart: Apart) -> float | None:
-    """Return the seconds by which the trajectory would be late if time alone were wrong; None where it is not that.
+    """Return the seconds by which the trajectory is late if a time offset explains its distance; None if it does not.
 
-    The antenna's way by the trajectory is moved in time, by whole steps and then along its velocity, until it fits;
-    what no time makes much better, as a height, is nothing of time, however badly the fixes are known.
+    The antenna's path by the trajectory is moved in time, by whole steps and then along its velocity, until it fits. An
+    error that no time offset reduces much, such as a height, is not attributed to time, however poor the fixes are.
     """
     of = apart.of
     step = max(1, len(of.time_ns) // MOST_FITTED)
@@ -261,7 +265,7 @@ def time_that_explains(apart: Apart) -> float | None:
             moved = _way_at(way_l, time_s, time_s[there] + tried_s + TRIED_S) - fix_l[there] - rest
             share = float((rest * moved).sum() / max((moved**2).sum(), 1e-9))
             best, late_s = usual, float(tried_s) - share * TRIED_S
-            # farther than to the next step a straight way would be a guess: any place ahead could be so reached
+            # beyond the next step a straight extrapolation would be a guess: it could reach any place ahead
             within = abs(share) <= 1.0
             left = float(np.median(np.linalg.norm(rest - share * moved, axis=1))) if within else np.inf
     most = max(3.0 * float(apart.fix_sigma_l.max()), 0.05 * apart.metres)
@@ -278,21 +282,21 @@ def _q_e_from_l(position_e: FloatArray) -> FloatArray:
     return product(about(2, lon), about(1, -lat - np.pi / 2))
 
 
-# ---------------------------------------------------------------------- how it turns
+# ---------------------------------------------------------------------- turn rates
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Motion:
-    """How a trajectory turns against the turn rates that an IMU felt, at the same times.
+    """A trajectory's turn rates compared with those that an IMU measured at the same times.
 
     Attributes:
         correlation: over three axes, −1 … 1.
         by_axis: (3,) forward, right, down; nan where nothing turns.
-        convention: words for what the attitude would have to be for its turn rates to be those; empty: as it is.
-        converted: correlation then.
-        is_other: the two are surely no record of one motion.
-        gusts: correlation of what gusts do, above 0.5 Hz; nan where one of the two has little of it.
-        gusts_are_others: what they do in gusts is surely no record of one motion: of two flights over the same lines.
+        convention: words for the attitude convention whose turn rates fit; empty if the given one does.
+        converted: the correlation under that convention.
+        is_other: the two surely record different motions.
+        gusts: correlation above 0.5 Hz; nan where one of the two has little power there.
+        gusts_are_others: the gusts surely record different motions, such as two flights over the same lines.
     """
 
     correlation: float
@@ -313,7 +317,7 @@ def compare_motion(trajectory: Trajectory, imu_time_ns: Int64Array, imu_rate_b: 
         imu_rate_b: (m, 3) their angular rates in b, rad/s.
 
     Returns:
-        None where they have less than eight seconds in common.
+        None where the two have less than eight seconds in common.
     """
     pair = _turned(trajectory, imu_time_ns, imu_rate_b)
     if pair is None:
@@ -337,7 +341,7 @@ def compare_motion(trajectory: Trajectory, imu_time_ns: Int64Array, imu_rate_b: 
 def _turned(
     trajectory: Trajectory, imu_time_ns: Int64Array, imu_rate_b: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-    """Return rates told and felt (m, 3) over steps known to both, and the angles (m, 2, 3) at the steps' ends."""
+    """Return trajectory's and IMU's turn rates (m, 3) over steps that both know, and angles (m, 2, 3) at their ends."""
     if len(trajectory) < 2 or len(imu_time_ns) < 2:
         return None
     first = max(-(-int(imu_time_ns[0]) // STEP_NS), -(-trajectory.span[0] // STEP_NS))
@@ -367,7 +371,7 @@ def _centred(rates: FloatArray) -> FloatArray:
 
 
 def _conventions(told: FloatArray, ends: FloatArray) -> Iterator[tuple[str, FloatArray]]:
-    """Yield words for other readings of the attitude, and the rates (m, 3) that it would have turned with."""
+    """Yield a description of each other reading of the attitude, and the turn rates (m, 3) that it implies."""
     names = ("roll", "pitch", "heading")
     for swapped in (False, True):
         for signs in combinations((1.0, -1.0), repeat=3):
@@ -387,7 +391,7 @@ def _conventions(told: FloatArray, ends: FloatArray) -> Iterator[tuple[str, Floa
 
 
 def _rates_of(ends: FloatArray) -> FloatArray:
-    """Return turn rates in b (m, 3) of roll, pitch, heading (m, 2, 3) at the ends of steps (FORMULAS 1.4)."""
+    """Return turn rates in b (m, 3) from roll, pitch and heading (m, 2, 3) at the ends of steps (FORMULAS 1.4)."""
     middle = ends.mean(axis=1)
     roll_rate, pitch_rate, heading_rate = ((ends[:, 1] - ends[:, 0]) / (STEP_NS / SECOND_NS)).T
     sin_roll, cos_roll = np.sin(middle[:, 0]), np.cos(middle[:, 0])
@@ -404,7 +408,7 @@ def _rates_of(ends: FloatArray) -> FloatArray:
 
 
 def _power(residual: FloatArray) -> FloatArray:
-    """Return the sum of squares of (m, 3) in each second."""
+    """Return the sum of squares of (m, 3) values in each second."""
     squares = (residual**2).sum(axis=1)
     whole = len(squares) // SECOND_STEPS * SECOND_STEPS
     sums: FloatArray = squares[:whole].reshape(-1, SECOND_STEPS).sum(axis=1)
@@ -412,7 +416,7 @@ def _power(residual: FloatArray) -> FloatArray:
 
 
 def _is_better(before: FloatArray, after: FloatArray) -> bool:
-    """Return whether residuals by seconds (k,) fall much, and in so many of them that chance does not do it."""
+    """Return whether residual powers by second (k,) fall much, and in more seconds than chance explains."""
     gain = before - after
     sigma = np.std(gain, ddof=1) * np.sqrt(len(gain))
     return bool(after.sum() < MUCH_BETTER * before.sum() and gain.sum() > SURE * sigma)
@@ -430,9 +434,10 @@ def _coarser(rates: FloatArray, steps: int) -> FloatArray:
 
 
 def _is_other(told: FloatArray, felt: FloatArray) -> bool:
-    """Return whether neither is, in part, the other with noise: by the share of each that stands in the other.
+    """Return whether neither motion contains the other, judged by the share of each that the other holds.
 
-    Noise of one alone leaves the share of the other at 1. Sigmas are by leaving out tenths of the time (jackknife).
+    Noise in one of them alone leaves the share of the other at 1. Sigmas come from leaving out parts of the time
+    (jackknife).
     """
     for one, other in ((told, felt), (felt, told)):
         product_of, square = (one * other).sum(axis=1), (one**2).sum(axis=1)
@@ -450,21 +455,21 @@ def _is_other(told: FloatArray, felt: FloatArray) -> bool:
     return True
 
 
-# ---------------------------------------------------------------------- what its heading counts from
+# ---------------------------------------------------------------------- heading offset
 
 
 @dataclass(frozen=True, slots=True)
 class HeadingOffset:
-    """What a trajectory's heading is too large by, rad, and its sigma."""
+    """The excess of a trajectory's heading, rad, and its sigma."""
 
     offset_rad: float
     sigma_rad: float
 
 
 def heading_offset(trajectory: Trajectory, imu_time_ns: Int64Array, imu_force_b: FloatArray) -> HeadingOffset | None:
-    """Compare the accelerations of the way flown with those that the IMU felt: their directions tell a heading's error.
+    """Compare accelerations of the path flown with those that the IMU measured: their directions show a heading error.
 
-    Biases of the accelerometers are estimated beside. Only turns and changes of speed tell anything.
+    Accelerometer biases are estimated with it. Only turns and changes of speed carry information.
 
     Args:
         trajectory: of the body's origin, with attitude.
@@ -500,7 +505,7 @@ def heading_offset(trajectory: Trajectory, imu_time_ns: Int64Array, imu_force_b:
 
 
 def _whole_seconds(trajectory: Trajectory, imu_time_ns: Int64Array) -> Int64Array:
-    """Return the begins of seconds that both cover."""
+    """Return the start times of the seconds that both cover."""
     first = max(int(imu_time_ns[0]), trajectory.span[0]) + 1
     last = min(int(imu_time_ns[-1]), trajectory.span[1]) - 1
     begins = np.arange(first, last - SECOND_NS, SECOND_NS, dtype=np.int64)
@@ -515,7 +520,7 @@ def _whole_seconds(trajectory: Trajectory, imu_time_ns: Int64Array) -> Int64Arra
 def _force_flown(
     flown: Trajectory, seconds: Int64Array, q_l_from_e: FloatArray, position_e: FloatArray, velocity_e: FloatArray
 ) -> FloatArray:
-    """Return the specific force (k, 3) in l that the way flown needs: acceleration, Coriolis, less gravity."""
+    """Return the specific force (k, 3) in l that the path flown needs: acceleration and Coriolis less gravity."""
     change_e = flown.poses(seconds + SECOND_NS).velocity_e - flown.poses(seconds).velocity_e
     earth = np.array([0.0, 0.0, EARTH_RATE_RADPS])
     inertial_l = rotated(q_l_from_e, change_e + 2.0 * np.cross(earth, velocity_e))
@@ -524,7 +529,7 @@ def _force_flown(
 
 
 def _fitted(felt_l: FloatArray, flown_l: FloatArray, q_l_from_b: FloatArray) -> HeadingOffset:
-    """Fit a turn about the vertical and biases in b, with sigmas by leaving out tenths (jackknife)."""
+    """Fit a turn about the vertical and biases in b, with sigmas from leaving out tenths (jackknife)."""
     rest = felt_l - flown_l
     columns = np.zeros((len(rest), 3, 4))
     columns[:, 0, 0], columns[:, 1, 0] = -flown_l[:, 1], flown_l[:, 0]

@@ -1,4 +1,4 @@
-"""A coarse terrain model: what range a beam is about to have, so that pulses in air find their zone (FORMULAS 3.3)."""
+"""A coarse terrain model that predicts the range of a beam, so that pulses in air find their zone (FORMULAS 3.3)."""
 
 from __future__ import annotations
 
@@ -14,26 +14,27 @@ ToGrid = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
 
 STEPS = 30
 NEAR_M = 0.5  # a beam has arrived when it is this close to the terrain's height
-ROUND_COLUMNS = 0.5  # off a whole turn; a grid so near to it goes round the earth
-STEEPEST_COS = 0.05  # of beams that reach the ground within a swath
+ROUND_COLUMNS = 0.5  # tolerance from a whole turn within which a grid counts as going round the earth
+STEEPEST_COS = 0.05  # smallest cosine of the nadir angle of beams that reach the ground within a swath
 
 
 class TerrainError(ValueError):
-    """A grid that is none."""
+    """Raised for an invalid terrain grid."""
 
 
 class CoarseTerrain:
     """Ellipsoidal heights at the nodes of a regular grid, bilinear in between.
 
     Args:
-        height_m: (rows, columns) ellipsoidal; nan where nothing is known.
-        first: x and y of height_m[0, 0]: longitude and latitude in radians, or what ``to_grid`` gives.
+        height_m: (rows, columns) ellipsoidal; nan where unknown.
+        first: x and y of height_m[0, 0]: longitude and latitude in radians, or the units that ``to_grid`` returns.
         step: from column to column and from row to row; either may be negative.
-        to_grid: x and y of the grid of latitudes and longitudes (n,) in radians; None: the grid is in those.
-        turn: x once round the earth, where it is a longitude; None: it is none.
+        to_grid: converts latitudes and longitudes (n,) in radians to x and y of the grid; None: the grid is in
+            longitude and latitude.
+        turn: the change of x once round the earth, where x is a longitude; None: x is not a longitude.
 
     Raises:
-        TerrainError: no grid of two by two at least, or a step of 0.
+        TerrainError: the grid is smaller than two by two, or a step is 0.
     """
 
     def __init__(
@@ -60,7 +61,7 @@ class CoarseTerrain:
         lat, lon = np.asarray(lat_rad, dtype=np.float64), np.asarray(lon_rad, dtype=np.float64)
         x, y = (lon, lat) if self._to_grid is None else self._to_grid(lat, lon)
         column, row = (x - self._first[0]) / self._step[0], (y - self._first[1]) / self._step[1]
-        if self._turn is not None:  # longitudes may be said a turn higher or lower
+        if self._turn is not None:  # longitudes may be given a turn higher or lower
             column %= abs(self._turn / self._step[0])
         rows, columns = self._height_m.shape
         inside = (column >= 0) & (column <= columns - 1) & (row >= 0) & (row <= rows - 1)
@@ -74,14 +75,15 @@ class CoarseTerrain:
         return height
 
     def predicted_m(self, origin_e: FloatArray, direction_e: FloatArray) -> FloatArray:
-        """Return (n,) ranges at which beams meet the terrain, to a metre or so; nan where they do not, or leave the
-        grid.
+        """Return (n,) ranges at which beams meet the terrain, to about a metre; nan if they miss it or leave the grid.
 
-        A step goes on to where the beam would be down if the ground ahead were level. Once that has led below the
-        ground, as on slopes that face the beam, steps stay between the two, where a line through both heights is zero.
+        Each step goes to where the beam would reach the ground if the ground ahead were level. Once a step has led
+        below the ground, as on slopes that face the beam, later steps stay between the two, where a line through both
+        heights is zero.
 
         Args:
-            origin_e: (n, 3) metres; direction_e: (n, 3) unit vectors.
+            origin_e: (n, 3) metres.
+            direction_e: (n, 3) unit vectors.
         """
         lat, lon, height_m = geodetic_from_e(origin_e)
         fall = np.einsum("ni,ni->n", direction_e, rot_e_from_l(lat, lon)[..., 2])

@@ -1,4 +1,4 @@
-"""How loops over single returns are compiled by numba: quick to run, in tolerable time, and kept for later processes.
+"""Compile loops over single returns with numba, and cache them on disk for later processes.
 
 Nothing is compiled with fast-math or in parallel: a return's result depends on the return alone, bit for bit.
 """
@@ -23,10 +23,10 @@ _HERE = Path(__file__).parent
 
 @cache
 def _digest(folder: Path) -> int:
-    """Return a number that changes with the text of any module whose functions or constants may be compiled into
-    another's.
+    """Return a number that changes with the text of every module that may be compiled into another one's functions.
 
-    Those here, and those of the folder of a package that builds on this one.
+    The modules are those of this folder, and those of ``folder`` if it lies elsewhere: a package that builds on this
+    one.
     """
     digest = 0
     for one in (_HERE, *(() if folder.is_relative_to(_HERE) else (folder,))):
@@ -37,7 +37,7 @@ def _digest(folder: Path) -> int:
 
 
 def jit_inline(function: Compiled) -> Compiled:
-    """Compile a function into those that call it; x / 0 is infinite, which spares a branch."""
+    """Compile a function to be inlined into its callers; x / 0 is infinite, which spares a branch."""
     compiled: Compiled = _njit(forceinline=True, nogil=True, error_model="numpy")(function)
     return compiled
 
@@ -45,9 +45,9 @@ def jit_inline(function: Compiled) -> Compiled:
 def jit_cached(function: Compiled) -> Compiled:
     """Compile an outermost function, and keep it on disk.
 
-    Numba takes it for the same by the age of its own file, though kernels of others are compiled into it: the digest of
-    them all goes into the stamp, for else a new version would run the old one's loops. Where no folder can be written
-    to, or numba keeps its stamp elsewhere, it is compiled anew in every process.
+    Numba takes a cached function as current by the age of its own file, though kernels of other files are compiled into
+    it. The digest of all these files is therefore added to the stamp; otherwise a new version would run the old loops.
+    Where no folder is writable, or numba keeps its stamp elsewhere, every process compiles the function anew.
     """
     options = {"nogil": True, "error_model": "numpy"}
     compiled: Any

@@ -1,15 +1,20 @@
-"""From a scanner's returns to points on the map: the whole way, equation by equation.
+"""Compute points on the map from a scanner's returns: the whole chain, equation by equation.
 
-    sensor     x_s = ρ · (−sin Δη, sin θ cos Δη, cos θ cos Δη)                ISO/TS 19159-2 Eq. 14;
-    swath.georef.scanner.beams body       x_b = lever_arm_b + R(ω, φ, κ) · T · x_s                        Eq. 2, 15;
-    NGA Eq. 3 with a gimbal earth      x_e = x_b^e + rot_e_from_l · rot_l_from_b · x_b                 Eq. 10; Eq. 3,
-    4, 7 in the trajectory air        ρ by the group index, the beam bent towards the nadir           NGA Eq. 4 to 11;
-    swath.georef.air.atmosphere map        x_m = projection and heights of x_e, by PROJ                    Eq. 8;
-    swath.georef.mapping.frame sigmas     C_m = J C Jᵀ of trajectory, range, angle and calibration        Eq. 13, 14;
-    swath.georef.scanner.uncertainty
+    sensor     x_s = ρ · (−sin Δη, sin θ cos Δη, cos θ cos Δη)
+               ISO/TS 19159-2 Eq. 14; swath.georef.scanner.beams
+    body       x_b = lever_arm_b + R(ω, φ, κ) · T · x_s
+               Eq. 2, 15; NGA Eq. 3 with a gimbal
+    earth      x_e = x_b^e + rot_e_from_l · rot_l_from_b · x_b
+               Eq. 10; Eq. 3, 4, 7 in the trajectory
+    air        ρ by the group index, the beam bent towards the nadir
+               NGA Eq. 4 to 11; swath.georef.air.atmosphere
+    map        x_m = projection and heights of x_e, by PROJ
+               Eq. 8; swath.georef.mapping.frame
+    sigmas     C_m = J C Jᵀ of trajectory, range, angle and calibration
+               Eq. 13, 14; swath.georef.scanner.uncertainty
 
 The first three are one pass (`swath.georef.scanner.sensor_model`, `swath.georef.scanner.kernels.rays`). Returns are
-taken in blocks, so that what is between two steps stays in the processor's cache; a point depends on its return and
+processed in blocks, so that results between two steps stay in the processor's cache; a point depends on its return and
 the trajectory alone.
 """
 
@@ -36,14 +41,14 @@ BLOCK_ROWS = 8192
 
 
 class Georeferencer:
-    """Makes points of one scanner's returns.
+    """Computes points from one scanner's returns.
 
     Args:
         model: of the scanner, with its calibration and its air.
         mapping: frame of the points; None: e.
-        uncertainty: gives sigmas; None: none.
+        uncertainty: computes sigmas; None: no sigmas.
         encoder_motion: of the scanner's encoder, where its calibration has a latency or torsion.
-        prf_hz: pulse rate, where its calibration has range offsets by it; the attribute ``rates`` tells it by pulse.
+        prf_hz: pulse rate, where its calibration has range offsets by it; the attribute ``rates`` gives it by pulse.
     """
 
     def __init__(
@@ -56,28 +61,29 @@ class Georeferencer:
     ) -> None:
         self.model, self.mapping, self.uncertainty = model, mapping, uncertainty
         self.encoder_motion, self.prf_hz = encoder_motion, prf_hz
-        self._mapped = False  # any point so far
+        self._mapped = False  # whether any point was mapped so far
         self.rates: PulseRates | None = None
 
     def georeference(self, rows: StructArray, time_ns: Int64Array, trajectory: Trajectory) -> tuple[Points, ByteArray]:
-        """Return points of returns.
+        """Return the points of returns, and the fate of each return.
 
         Args:
-            rows: (n,) `RETURN_DTYPE`, best in the order of their times.
+            rows: (n,) `RETURN_DTYPE`, preferably in the order of their times.
             time_ns: (n,) GPS time of their emission by the scanner's stamps; negative: unknown.
             trajectory: of the body.
 
         Returns:
-            The points of those that could be georeferenced, in their order; and what became of each row, as `Fate`.
+            The points of those that could be georeferenced, in their order; and the `Fate` of each row.
 
         Raises:
             TrajectoryError: the trajectory has no attitude.
-            MappingError: the mapping frame has a place for no point of the first batches. Later, or where it has one
-                for some, those that it has none for are NOT_FINITE.
+            MappingError: the mapping frame has coordinates for no point of the first batches. In later batches, or
+                where some points have coordinates, those without are NOT_FINITE.
         """
         motion = None
         if self.encoder_motion is not None and self.model.needs_encoder_motion:
-            motion = self.encoder_motion.motion(rows, time_ns)  # of all at once: a reading's rate asks its neighbours
+            # for all rows at once: the rate at a reading depends on its neighbours
+            motion = self.encoder_motion.motion(rows, time_ns)
         points = Points.empty(len(rows), with_sigmas=self.uncertainty is not None)
         fates = np.empty(len(rows), np.uint8)
         filled = 0
@@ -102,7 +108,7 @@ class Georeferencer:
         return points if filled == len(rows) else points.take(slice(filled)), fates
 
     def _blocks(self, rows: StructArray) -> Iterator[tuple[slice, float | None]]:
-        """Yield rows that are taken at once, of one pulse rate where that matters; and the rate."""
+        """Yield slices of rows to process at once, of one pulse rate where that matters, with the rate."""
         runs = [(0, len(rows), self.prf_hz)]
         if self.rates is not None and any(row.prf_hz is not None for row in self.model.calibration.range_offsets):
             runs = [(start, stop, prf_hz) for start, stop, prf_hz, _ in self.rates.runs(rows["pulse_id"])]
@@ -111,10 +117,10 @@ class Georeferencer:
                 yield slice(start, min(start + BLOCK_ROWS, last)), prf_hz
 
     def _fill(self, points: Points, filled: int, rows: StructArray, rays: Rays) -> tuple[int, MappingError | None]:
-        """Return through the air and onto the map: points of the rays that reached the ground, from row ``filled`` on.
+        """Correct rays for the air, map those that reached the ground, and fill points from row ``filled`` on.
 
         Returns:
-            how many; and, where there were rays that the map has no place for, what it said. Their fate is NOT_FINITE.
+            The number of points; and the mapping's error if some rays have no coordinates. Their fate is NOT_FINITE.
         """
         if self.model.air is not None:
             self.model.air.apply(rays.origin_e, rays.points_e)  # in place; NGA Eq. 4 to 11
@@ -139,8 +145,10 @@ class Georeferencer:
         return len(points_map), failure
 
     def _mapped_points(self, rays: Rays) -> tuple[NDArray[np.float64], NDArray[np.float32] | None]:
-        """Return (n, 3) coordinates and sigmas along the same axes (ISO Eq. 8, 13, 14); MappingError: not all have a
-        place.
+        """Return coordinates (n, 3) and sigmas along the same axes (ISO Eq. 8, 13, 14).
+
+        Raises:
+            MappingError: some points have no coordinates.
         """
         if self.mapping is not None:
             return self.mapping.map_with_sigmas(rays.points_e, rays.covariance_e)
@@ -153,7 +161,7 @@ class Georeferencer:
 def fill_columns(
     rows: StructArray, time_ns: Int64Array, off_nadir_rad: FloatArray, range_m: FloatArray, to: PointColumns
 ) -> None:
-    """From rows (n,) `RETURN_DTYPE` and of rays (n,)."""
+    """Fill columns of points from rows (n,) `RETURN_DTYPE` and from columns (n,) of their rays."""
     times, angles, ranges, intensity, number, numbers, channel, zone = to
     for i in range(len(rows)):
         times[i] = time_ns[i]

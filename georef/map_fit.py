@@ -1,4 +1,4 @@
-"""Tell whether a projected CRS suits a place: its area of use, and how long a metre is on its map."""
+"""Check whether a projected CRS suits a place: its area of use, and the length of a metre on its map."""
 
 from __future__ import annotations
 
@@ -10,26 +10,26 @@ from pyproj.database import query_utm_crs_info
 
 from swath.georef.arrays import FloatArray
 
-OVERLAP_M = 40_000.0  # by which zones of UTM overlap
+OVERLAP_M = 40_000.0  # overlap of neighbouring UTM zones
 DEGREE_M = 111_200.0  # of a great circle
-GREATEST_SCALE = 0.005  # off 1
+GREATEST_SCALE = 0.005  # greatest deviation of the scale from 1
 
 
 def scales_at(crs: CRS, lat_deg: FloatArray, lon_deg: FloatArray) -> FloatArray:
-    """Return metres of the map for a metre on the ground along meridian and parallel (2, n), of a projected CRS."""
+    """Return the map metres per metre on the ground along meridian and parallel (2, n), of a projected CRS."""
     factors = pyproj.Proj(crs).get_factors(lon_deg, lat_deg)
     return np.stack([np.asarray(factors.meridional_scale), np.asarray(factors.parallel_scale)])
 
 
 def misfit_of(crs: CRS, said: str, lat_deg: FloatArray, lon_deg: FloatArray) -> str:
-    """Return why a projected CRS does not suit places (n,), with the zone that would; empty: it suits.
+    """Return why a projected CRS does not suit places (n,), with a zone that would; empty if it suits.
 
-    It does not where one lies farther outside the area of use than neighbouring zones overlap, or where the scale there
-    is 0.5 % off 1: a metre of the map is not one on the ground.
+    It does not suit if a place lies farther outside the area of use than neighbouring zones overlap, or if the scale
+    there deviates from 1 by 0.5 %, so that a metre of the map is not one on the ground.
 
     Args:
         crs: without heights.
-        said: what it is called, for the message.
+        said: its name for the message.
         lat_deg, lon_deg: the places.
     """
     away_m = DEGREE_M * outside_deg(crs, lat_deg, lon_deg)
@@ -54,7 +54,7 @@ def misfit_of(crs: CRS, said: str, lat_deg: FloatArray, lon_deg: FloatArray) -> 
 
 
 def outside_deg(crs: CRS, lat_deg: FloatArray, lon_deg: FloatArray) -> FloatArray:
-    """Return how far places (n,) lie outside a CRS's area of use, in degrees of a great circle."""
+    """Return the distances of places (n,) outside a CRS's area of use, in degrees of a great circle."""
     area = crs.area_of_use
     if area is None:
         return np.zeros(len(lat_deg))
@@ -67,18 +67,18 @@ def outside_deg(crs: CRS, lat_deg: FloatArray, lon_deg: FloatArray) -> FloatArra
 
 
 def _better(crs: CRS, lat: float, lon: float) -> str:
-    """Return the zone of UTM there, on the CRS's own datum where that has zones."""
+    """Return the UTM zone of a place, on the CRS's own datum where that has zones."""
     place = AreaOfInterest(lon, lat, lon, lat)
     geodetic = crs.geodetic_crs
     for datum in (geodetic.name if geodetic is not None else "", "WGS 84"):
         for info in query_utm_crs_info(datum_name=datum, area_of_interest=place):
             zone = info.name.removeprefix(f"{datum} / UTM zone ")
-            if len(zone) <= len("32N"):  # not one with axes in another order
+            if len(zone) <= len("32N"):  # excludes zones with axes in another order
                 return f'want "EPSG:{info.code}" ({info.name}), or another that is used there'
     return "want one that is used there"
 
 
 def degrees_text(lat_deg: float, lon_deg: float, digits: int) -> str:
-    """Return a place in words."""
+    """Return a place as text in degrees."""
     north, east = "NS"[lat_deg < 0.0], "EW"[lon_deg < 0.0]
     return f"{abs(lat_deg):.{digits}f}° {north}, {abs(lon_deg):.{digits}f}° {east}"

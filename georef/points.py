@@ -1,4 +1,4 @@
-"""Points: what georeferencing gives, and what became of the returns that gave none."""
+"""Points, the output of georeferencing, and the fates of returns that gave none."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from swath.georef.records import Int64Array
 
 
 def contiguous(array: NDArray[Any]) -> NDArray[Any]:
-    """Return the array, or a copy where it is strided or read-only: the kernels are compiled for one kind."""
+    """Return the array, or a copy if it is strided or read-only: the kernels are compiled for one kind."""
     flags = array.flags
     return array if flags.c_contiguous and flags.writeable else array.copy()
 
 
 class Fate(IntEnum):
-    """What became of a return; every one that was read has exactly one."""
+    """The fate of a return; every return that was read has exactly one."""
 
     GEOREFERENCED = 0
     NO_TIME = 1
@@ -44,12 +44,12 @@ class Points:
 
     Attributes:
         time_ns: (n,) GPS time of the pulse, time_offset applied.
-        points_map: (n, 3) easting, northing, height in metres; e where there is no mapping frame.
+        points_map: (n, 3) easting, northing, height in metres; e without a mapping frame.
         sigma_map: (n, 3) one sigma along the same axes, metres; None: not computed.
-        scan_angle_rad: (n,) of the beam about the level way the nose points, from the vertical, positive to the right,
-            −π … π: LAS 1.4's, with the aircraft's roll, whatever the scanner and its mounting.
+        scan_angle_rad: (n,) angle of the beam from the vertical, about the horizontal direction of the nose, positive
+            to the right, −π … π: LAS 1.4's, with the aircraft's roll, whatever the scanner and its mounting.
         range_m: (n,) as corrected.
-        intensity: (n,) as the device says it.
+        intensity: (n,) as the device gives it.
         return_number, number_of_returns: (n,).
         channel: (n,) beam or facet.
         mta_zone: (n,) pulses in air − 1; 255: unknown.
@@ -67,7 +67,7 @@ class Points:
     mta_zone: ByteArray
 
     def __len__(self) -> int:
-        """Number of points."""
+        """Return the number of points."""
         return len(self.time_ns)
 
     def take(self, which: Any) -> Points:
@@ -78,7 +78,7 @@ class Points:
 
     @classmethod
     def empty(cls, count: int, *, with_sigmas: bool) -> Points:
-        """Return room for n points."""
+        """Make room for n points with undefined contents."""
         return cls(
             time_ns=np.empty(count, np.int64),
             points_map=np.empty((count, 3)),
@@ -94,7 +94,7 @@ class Points:
 
     @classmethod
     def concatenate(cls, pieces: Sequence[Points]) -> Points:
-        """Return one after the other; sigmas only where all have them. At least one piece."""
+        """Join one or more pieces in order; sigmas are kept only if all pieces have them."""
         joined: list[Any] = []
         for field in fields(cls):
             columns = [getattr(piece, field.name) for piece in pieces]
@@ -104,28 +104,29 @@ class Points:
 
 @dataclass(slots=True)
 class Rays:
-    """What the sensor model made of returns on their way to the ground; (n,) or (n, …), one row a return.
+    """The sensor model's results for returns; (n,) or (n, …), one row per return.
 
-    The second half is there where axes were asked for: it is what the Jacobian and the covariance are made of.
+    The second half is present if axes were requested: the Jacobian and the covariance are made of it.
 
     Attributes:
-        fate: `Fate`; what lies in the rows of others than GEOREFERENCED is undefined.
+        fate: `Fate`; other columns are undefined in rows that are not GEOREFERENCED.
         time_ns: GPS time of the pulse, time_offset applied.
         points_e: (n, 3) metres.
         origin_e: (n, 3) of the scanner.
         angle_rad: θ as corrected.
         off_nadir_rad: see `Points.scan_angle_rad`.
         range_m: ρ as corrected.
-        q_e_from_b: (n, 4) attitude taken, scalar first.
-        epoch, share: of the trajectory: the epoch before the pulse, and where between it and the next, 0 … 1.
+        q_e_from_b: (n, 4) attitude used, scalar first.
+        epoch, share: of the trajectory: the epoch before the pulse, and the pulse's position between it and the next, 0
+            … 1.
         arm_b: (n, 3) from the body's origin to the point.
         range_axis_b: (n, 3) ∂point/∂ρ.
         angle_axis_b: (n, 3) ∂point/∂θ, m/rad.
         tilt_axis_b: (n, 3) ∂point/∂Δη, m/rad.
         measured_m: range as measured.
         encoder_rad: encoder reading.
-        encoder_rate, encoder_acceleration: rad/s, rad/s²; zero where nobody asked.
-        covariance_e: (n, 6) xx xy xz yy yz zz, m², where covariances were asked for.
+        encoder_rate, encoder_acceleration: rad/s, rad/s²; zero if not given.
+        covariance_e: (n, 6) xx xy xz yy yz zz, m², if covariances were requested.
     """
 
     fate: ByteArray
@@ -149,7 +150,7 @@ class Rays:
     covariance_e: FloatArray | None = None
 
     def take(self, which: NDArray[np.bool_]) -> Rays:
-        """Return some of the rays; vectors stay columns beside each other."""
+        """Return some of the rays; vectors stay stored as columns."""
         columns: dict[str, Any] = {}
         for field in fields(self):
             column = getattr(self, field.name)

@@ -1,7 +1,7 @@
-"""Records: what parsers give and everything else takes. ARCHITECTURE's table, as types.
+"""Records, the output of parsers and the input of everything else: ARCHITECTURE's table, as types.
 
-Single events (a fix, an edge, a time message) are frozen dataclasses; pulses and inertial samples are NumPy
-structured arrays in batches, wrapped so that their type names what they are.
+Single events (a fix, an edge, a time message) are frozen dataclasses; pulses and inertial samples are NumPy structured
+arrays in batches, wrapped so that their type names the content.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ StructArray: TypeAlias = NDArray[np.void]
 
 
 class TimeScale(StrEnum):
-    """The scale a device names its second in."""
+    """The time scale in which a device names its second."""
 
     GPS = "gps"
     UTC = "utc"
@@ -34,7 +34,7 @@ class NamesEdge(StrEnum):
 
 
 class FixType(IntEnum):
-    """Quality of a position solution, the coarse classes every receiver has."""
+    """Quality of a position solution, in the coarse classes that every receiver has."""
 
     NONE = 0
     SINGLE = 1
@@ -49,12 +49,12 @@ class FixType(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Chunk:
-    """Bytes of one unit (a serial read, a datagram, a CAN frame) as they came.
+    """Bytes of one unit (a serial read, a datagram, a CAN frame) as received.
 
     Attributes:
         source: ``kind/name`` of the configuration, for example ``gnss/rover``.
-        host_time_ns: host time; the kernel's receive stamp where there is one.
-        data: the bytes, nothing added, nothing removed.
+        host_time_ns: host time; the kernel's receive stamp if there is one.
+        data: the unchanged bytes.
     """
 
     source: str
@@ -69,7 +69,7 @@ class ChunkBatch:
     Attributes:
         source: ``kind/name``.
         host_time_ns: (n,) host time of each unit.
-        units: (n, length) uint8, possibly a strided view: one row a unit.
+        units: (n, length) uint8, possibly a strided view: one row per unit.
     """
 
     source: str
@@ -87,15 +87,15 @@ class PpsEdge:
 
 @dataclass(frozen=True, slots=True)
 class TimeTag:
-    """A device's own time as far as it says it.
+    """A device's own time, as completely as the device gives it.
 
     Attributes:
         scale: GPS or UTC.
-        time_ns: nanoseconds of the GPS week (scale gps) or of the UTC day (scale utc; 86 400 s and above in a
-            leap second).
-        week: full GPS week (roll-overs resolved), scale gps only; None where the message carries none.
-        date: UTC date, scale utc only; None where the message carries none.
-        leap_seconds: GPS − UTC, only when the receiver says that it knows it.
+        time_ns: nanoseconds of the GPS week (scale gps) or of the UTC day (scale utc; 86 400 s and above in a leap
+            second).
+        week: full GPS week (roll-overs resolved), scale gps only; None if the message carries none.
+        date: UTC date, scale utc only; None if the message carries none.
+        leap_seconds: GPS − UTC, only if the receiver states that it knows it.
     """
 
     scale: TimeScale
@@ -107,7 +107,7 @@ class TimeTag:
 
 @dataclass(frozen=True, slots=True)
 class TimeMessage:
-    """A message that says which second an edge was.
+    """A message that names the second of an edge.
 
     Attributes:
         host_time_ns: host time of its arrival.
@@ -116,8 +116,8 @@ class TimeMessage:
         bound: the device itself ties the message to its edge (UBX TIM-TP, NovAtel TIME header, SBF xPPSOffset, a
             latched device), so that no delay can make it mean another second.
         valid: the receiver vouches for the time.
-        quantisation_ns: the edge's own error if said (TIM-TP qErr), edge = true second + quantisation_ns.
-        message: name of the message, for the log and the eye.
+        quantisation_ns: the edge's own error if given (TIM-TP qErr), edge = true second + quantisation_ns.
+        message: name of the message, for the log.
     """
 
     host_time_ns: int
@@ -131,22 +131,22 @@ class TimeMessage:
 
 @dataclass(frozen=True, slots=True)
 class GnssFix:
-    """A position and, if said, velocity solution of an antenna.
+    """A position and, if given, velocity solution of an antenna.
 
     Attributes:
         host_time_ns: host time of arrival.
         time: epoch of the solution; `swath.georef.timescales` completes it to GPS nanoseconds.
-        lat_rad, lon_rad: geodetic, radians; None where the message has a velocity only.
+        lat_rad, lon_rad: geodetic, radians; None if the message has a velocity only.
         height_m: ellipsoidal height (geoid separation already added).
         velocity_l: north, east, down, m/s; None components absent from the protocol are nan.
-        position_cov_l: (3, 3) m², north east down; None where unsaid.
-        velocity_cov_l: (3, 3) m²/s²; None where unsaid.
+        position_cov_l: (3, 3) m², north east down; None if not given.
+        velocity_cov_l: (3, 3) m²/s²; None if not given.
         fix_type: coarse class.
-        satellites: satellites used, None where unsaid.
+        satellites: satellites used, None if not given.
         antenna: "primary", "secondary" or the receiver's name for it.
         valid: the receiver vouches for the solution.
         message: name of the message.
-        undulation_m: geoid above the ellipsoid by the receiver's own model; None where unsaid.
+        undulation_m: geoid above the ellipsoid by the receiver's own model; None if not given.
     """
 
     host_time_ns: int
@@ -182,7 +182,7 @@ class GnssHeading:
 
 @dataclass(frozen=True, slots=True)
 class EventMark:
-    """An external event the receiver stamped (camera trigger, photo pulse); `rising` None: it says no edge."""
+    """An external event that the receiver stamped (camera trigger, photo pulse); `rising` None: edge not given."""
 
     host_time_ns: int
     time: TimeTag
@@ -197,13 +197,13 @@ class EventMark:
 IMU_DTYPE = np.dtype(
     [
         ("host_time_ns", "i8"),  # of the unit that completed the sample
-        ("device_time_ns", "i8"),  # unwrapped device counter or GPS time of week; -1: the device says none
+        ("device_time_ns", "i8"),  # unwrapped device counter or GPS time of week; -1: the device gives none
         ("pps_time_ns", "i8"),  # device counter latched at the last PPS edge, same scale; -1: none
         ("specific_force_b", "f8", (3,)),  # m/s²
         ("angular_rate_b", "f8", (3,)),  # rad/s
-        ("temperature_c", "f4"),  # nan: unsaid
+        ("temperature_c", "f4"),  # nan: not given
         ("status", "u4"),
-        ("gps_week", "i4"),  # where device time is GPS time of week; -1: it is not
+        ("gps_week", "i4"),  # if device time is GPS time of week; -1: otherwise
     ],
     align=True,
 )
@@ -219,7 +219,7 @@ INS_DTYPE = np.dtype(
         ("roll_rad", "f8"),
         ("pitch_rad", "f8"),
         ("heading_rad", "f8"),
-        ("position_sigma_l", "f4", (3,)),  # nan: unsaid
+        ("position_sigma_l", "f4", (3,)),  # nan: not given
         ("velocity_sigma_l", "f4", (3,)),
         ("attitude_sigma_rad", "f4", (3,)),
         ("status", "u4"),  # the receiver's INS status word
@@ -250,11 +250,11 @@ RETURN_FLAG_PPS_LOCKED = 4
 
 DEVICE_CLOCK_DTYPE = np.dtype(
     [
-        ("host_time_ns", "i8"),  # host time of the unit that said it
+        ("host_time_ns", "i8"),  # host time of the unit that carried it
         ("device_time_ns", "i8"),  # device time nearest to the unit's sending (its last pulse or sample)
         ("pps_time_ns", "i8"),  # device time latched at the latest PPS edge; -1: no latch
-        ("pps_count", "i8"),  # edges since power-on; -1: unsaid
-        ("locked", "i1"),  # 1 locked, 0 not, -1 unsaid
+        ("pps_count", "i8"),  # edges since power-on; -1: not given
+        ("locked", "i1"),  # 1 locked, 0 not, -1 not given
     ],
     align=True,
 )
@@ -262,35 +262,35 @@ DEVICE_CLOCK_DTYPE = np.dtype(
 
 @dataclass(frozen=True, slots=True)
 class ImuSamples:
-    """Inertial samples, one row a sample (`IMU_DTYPE`)."""
+    """Inertial samples, one row per sample (`IMU_DTYPE`)."""
 
     rows: StructArray
 
 
 @dataclass(frozen=True, slots=True)
 class InsSolution:
-    """Solutions a device's own INS computed, one row an epoch (`INS_DTYPE`)."""
+    """Solutions that a device's own INS computed, one row per epoch (`INS_DTYPE`)."""
 
     rows: StructArray
 
 
 @dataclass(frozen=True, slots=True)
 class ScannerReturns:
-    """Laser returns, one row a return (`RETURN_DTYPE`)."""
+    """Laser returns, one row per return (`RETURN_DTYPE`)."""
 
     rows: StructArray
 
 
 @dataclass(frozen=True, slots=True)
 class DeviceClockSamples:
-    """What a device's clock said beside the host's, one row a unit (`DEVICE_CLOCK_DTYPE`)."""
+    """A device's clock readings beside the host's, one row per unit (`DEVICE_CLOCK_DTYPE`)."""
 
     rows: StructArray
 
 
 @dataclass(frozen=True, slots=True)
 class DeviceStatus:
-    """Health as the device tells it; keys carry their unit (``temperature_c``)."""
+    """Health as the device reports it; keys carry their unit (``temperature_c``)."""
 
     host_time_ns: int
     values: dict[str, float | int | str | bool] = field(default_factory=dict)

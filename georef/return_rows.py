@@ -1,4 +1,4 @@
-"""Returns that wait, copied and looked at as numbers of 64 bits: NumPy takes a structure with gaps field by field."""
+"""Copy and inspect waiting returns as 64-bit numbers, since NumPy copies a structure with gaps field by field."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ _OFFSETS = {name: int(place[1]) for name, place in (RETURN_DTYPE.fields or {}).i
 
 
 def words(rows: StructArray) -> NDArray[np.uint64]:
-    """Return rows as numbers (n, `WORDS`): NumPy copies a structure with gaps field by field, ten times as slowly."""
+    """Return rows as numbers (n, `WORDS`), whose copies are ten times as fast as those of a structure with gaps."""
     return np.ascontiguousarray(rows).view(np.uint64).reshape(-1, WORDS)
 
 
 def any_has(rows: StructArray, name: str, bits: int) -> bool:
-    """Return whether any row has all these bits in a field of its last word."""
+    """Return whether any row has all these bits set in a field of its last word."""
     offset = _OFFSETS[name]
     word = bits << 8 * (offset % 8)
     if not len(rows) or int(np.bitwise_or.reduce(words(rows)[:, -1])) & word != word:
@@ -35,9 +35,7 @@ def take(rows: StructArray, mask: NDArray[np.bool_]) -> StructArray:
 
 
 def concatenate(pieces: list[NDArray[Any]], like: NDArray[Any]) -> NDArray[Any]:
-    """Return one after the other; a single one as it is, for it holds many bytes; none as an empty array like
-    another.
-    """
+    """Join pieces in order; a single piece is returned without a copy, no pieces give an empty array like ``like``."""
     pieces = [piece for piece in pieces if len(piece)]
     if not pieces:
         return like[:0]
@@ -49,14 +47,17 @@ def concatenate(pieces: list[NDArray[Any]], like: NDArray[Any]) -> NDArray[Any]:
 
 
 def compact(rows: StructArray) -> StructArray:
-    """Return rows that may wait for long, without what lies beside them in memory: parsers make room for every slot."""
+    """Return rows that may wait long, copied if they are views of a larger array.
+
+    Parsers allocate room for every slot, which the copy releases.
+    """
     spare = isinstance(rows.base, np.ndarray) and rows.base.nbytes > rows.nbytes + rows.nbytes // 4
     return words(rows).copy().view(RETURN_DTYPE).reshape(-1) if spare else rows
 
 
 @dataclass(slots=True)
 class WaitingReturns:
-    """Returns that came to wait at one tick; their times where those are known."""
+    """Returns that began to wait at one tick; their times if known."""
 
     rows: StructArray
     since_ns: int
@@ -64,9 +65,7 @@ class WaitingReturns:
 
 
 def split_at(held: WaitingReturns, mask: NDArray[np.bool_]) -> tuple[list[WaitingReturns], list[WaitingReturns]]:
-    """Return those of the mask, and the others, each in order; nothing is copied where the others follow in one
-    piece.
-    """
+    """Split into the rows of the mask and the others, each in order; contiguous parts are not copied."""
     count = int(np.count_nonzero(mask))
     if count == len(mask):
         return [held], []
@@ -81,7 +80,7 @@ def split_at(held: WaitingReturns, mask: NDArray[np.bool_]) -> tuple[list[Waitin
 
 
 def after(queue: deque[WaitingReturns], max_rows: int) -> list[WaitingReturns]:
-    """Return taken from the queue: the oldest, until no more than so many rows are left."""
+    """Remove the oldest entries from the queue until at most this many rows are left, and return them."""
     rows, oldest = sum(len(held.rows) for held in queue), []
     while rows > max_rows:
         oldest.append(queue.popleft())

@@ -1,6 +1,6 @@
-"""Strips: the stretches of a flight that are delivered, cut where the aircraft turns and where the laser is silent.
+"""Strips: the stretches of a flight that are delivered, cut where the aircraft turns and where the laser is off.
 
-Times are int64 nanoseconds of one scale, the caller's; spans are half open, [start, end).
+Times are int64 nanoseconds on one scale of the caller's choice; spans are half open, [start, end).
 """
 
 from __future__ import annotations
@@ -25,19 +25,20 @@ Span = tuple[int, int]
 
 
 class StripError(ValueError):
-    """Strips that cannot be, or a file of them that cannot be read; one line."""
+    """Raised for impossible strips, or an unreadable file of strips; one line."""
 
 
 @dataclass(frozen=True, slots=True)
 class StripRules:
-    """When an aircraft turns, and what is long enough for a strip.
+    """Limits that decide when an aircraft turns, and what is long enough for a strip.
 
     Attributes:
-        turn_rate_radps, bank_rad: beyond either, as means over window_s, it turns. A standard turn is 3°/s.
-        window_s: over which gusts are averaged.
-        min_turn_s: less is no turn.
-        min_strip_s: less is no strip.
-        laser_gap_s: so long without data, and the laser was off.
+        turn_rate_radps, bank_rad: the aircraft turns if the mean over window_s of either is exceeded. A standard turn
+            is 3°/s.
+        window_s: time over which gusts are averaged.
+        min_turn_s: minimum turn duration; shorter turns are ignored.
+        min_strip_s: minimum strip duration; shorter stretches are ignored.
+        laser_gap_s: time without data after which the laser counts as off.
     """
 
     turn_rate_radps: float = np.radians(1.0)
@@ -50,10 +51,10 @@ class StripRules:
 
 @dataclass(frozen=True, slots=True)
 class Segment:
-    """A piece of the time; all of them together are the whole, and none overlaps another.
+    """A piece of the time span; all segments together cover it, without overlaps.
 
     Attributes:
-        strip: its number from 1 in the order of time; 0: what lies between strips.
+        strip: its number from 1 in the order of time; 0: between strips.
     """
 
     strip: int
@@ -68,9 +69,9 @@ def straight_spans(
     rules: StripRules | None = None,
     unknown: Sequence[Span] = (),
 ) -> list[Span]:
-    """Return where the aircraft does not turn: spans of the times (n,), with heading and roll (n,).
+    """Return spans of the times (n,) in which the aircraft does not turn, from heading and roll (n,).
 
-    Where nobody knows, it is taken not to: what is wanted there and cannot be had is then seen to be missing.
+    Spans without knowledge, ``unknown``, count as straight: missing data then become visible.
     """
     rules = rules or StripRules()
     if len(time_ns) < 2:
@@ -86,9 +87,7 @@ def straight_spans(
 
 
 def _windowed(seconds: FloatArray, integral: FloatArray, window_s: float) -> FloatArray:
-    """Return mean over a window about each time of what has this integral; at the ends over what there is of the
-    window.
-    """
+    """Return means over a window about each time, from the integral; at the ends over the existing part of it."""
     before = np.maximum(seconds - window_s / 2, seconds[0])
     after = np.minimum(seconds + window_s / 2, seconds[-1])
     mean: FloatArray = (np.interp(after, seconds, integral) - np.interp(before, seconds, integral)) / (after - before)
@@ -107,7 +106,7 @@ def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
 
 
 def _joined(spans: Sequence[Span], gap_ns: int) -> list[Span]:
-    """Return spans in order, those that are less than a gap apart made one."""
+    """Return spans in order, joined if less than a gap apart."""
     joined: list[Span] = []
     for start, end in spans:
         if joined and start - joined[-1][1] < gap_ns:
@@ -118,31 +117,31 @@ def _joined(spans: Sequence[Span], gap_ns: int) -> list[Span]:
 
 
 def laser_spans(first_ns: Int64Array, last_ns: Int64Array, rules: StripRules | None = None) -> list[Span]:
-    """Return where the laser was on, from the first and last times (n,) of pieces of its data, in any order."""
+    """Return spans in which the laser was on, from first and last times (n,) of pieces of its data, in any order."""
     order = np.argsort(first_ns, kind="stable")
     pieces = [(int(first_ns[i]), int(last_ns[i]) + 1) for i in order]
     return _joined(pieces, round((rules or StripRules()).laser_gap_s * SECOND_NS))
 
 
 def common(one: Sequence[Span], other: Sequence[Span]) -> list[Span]:
-    """Return what lies in both, each in order and without overlaps."""
+    """Return the spans common to both, each of which is in order and without overlaps."""
     both = [(max(a, c), min(b, d)) for a, b in one for c, d in other if a < d and c < b]
     return sorted(both)
 
 
 def cut(straight: Sequence[Span], laser: Sequence[Span], rules: StripRules | None = None) -> list[Span]:
-    """Return strips: straight flight with the laser on, as long as a strip must be at least."""
+    """Return strips: straight flight with the laser on, of at least the minimum duration."""
     shortest_ns = round((rules or StripRules()).min_strip_s * SECOND_NS)
     return [(start, end) for start, end in common(straight, laser) if end - start >= shortest_ns]
 
 
 def segments(strips: Sequence[Span], first_ns: int, end_ns: int, *, first_number: int = 1) -> list[Segment]:
-    """Return the span from first to end, tiled without gaps: strips as they are numbered, and what lies between.
+    """Return the span from first to end, tiled without gaps by numbered strips and the time between them.
 
-    A strip keeps its number where only a part of it lies within; one that lies outside gives no segment.
+    A strip keeps its number if only a part of it lies within; one that lies outside gives no segment.
 
     Raises:
-        StripError: more strips than a file's field can number.
+        StripError: there are more strips than a file's field can number.
     """
     tiles: list[Segment] = []
     at = first_ns
@@ -162,11 +161,12 @@ def segments(strips: Sequence[Span], first_ns: int, end_ns: int, *, first_number
 
 
 def read_strips(text: str, name: str) -> list[Span]:
-    """Return strips from a CSV file with the columns start_gps_ns and end_gps_ns (others are passed over), in order of
-    time.
+    """Return strips, in order of time, from a CSV file with the columns start_gps_ns and end_gps_ns.
+
+    Other columns are ignored.
 
     Raises:
-        StripError: a column is missing, a value is no integer, a strip has no length, or two overlap.
+        StripError: a column is missing, a value is not an integer, a strip has no length, or two overlap.
     """
     rows = csv.DictReader(io.StringIO(text), skipinitialspace=True)
     try:

@@ -1,4 +1,4 @@
-"""TOML as tables: what the standard library's reader leaves to its caller is refused here too, in one line."""
+"""Read TOML as tables, refusing in one line also the errors that the standard library's reader lets pass."""
 
 from __future__ import annotations
 
@@ -7,21 +7,22 @@ import re
 import tomllib
 from typing import Any
 
-DEEPEST = 32  # tables in tables; no file of ours has more than 5
-LEAST, MOST = -(1 << 63), (1 << 63) - 1  # TOML 1.0.0, Integer: 64 bits are expected, and what is lost is an error
+DEEPEST = 32  # tables within tables; the project's files have at most 5
+LEAST, MOST = -(1 << 63), (1 << 63) - 1  # TOML 1.0.0, Integer: 64 bits are expected, and a loss is an error
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
-_NOT_SHOWN = re.compile(r"[\x7f-\x9f\u2028\u2029]")  # JSON lets them stand; TOML not the first, a line not the others
+# JSON leaves these as they are, but TOML forbids the first ones, and the others break a line
+_NOT_SHOWN = re.compile(r"[\x7f-\x9f\u2028\u2029]")
 
 
 class TomlError(ValueError):
-    """Text that is no TOML, or that nobody could mean; one line without the file's name."""
+    """Raised for text that is not TOML, or is beyond the limits; one line without the file's name."""
 
 
 def toml_tables(text: str) -> dict[str, Any]:
     """Return the tables of a TOML text: numbers of 64 bits, at most `DEEPEST` deep.
 
     Raises:
-        TomlError: what is wrong, in one line.
+        TomlError: names the fault in one line.
     """
     try:
         document = tomllib.loads(text)
@@ -29,7 +30,7 @@ def toml_tables(text: str) -> dict[str, Any]:
         raise TomlError(f"not TOML: {' '.join(str(error).split())}") from error
     except RecursionError as error:
         raise TomlError(f"not readable: nested too deeply; want tables at most {DEEPEST} deep") from error
-    except ValueError as error:  # more digits than Python turns into a number
+    except ValueError as error:  # more digits than Python converts to a number
         raise TomlError("a whole number of thousands of digits; want numbers of 64 bits") from error
     waiting: list[tuple[Any, str, int]] = [(document, "", 0)]
     while waiting:

@@ -1,1 +1,1 @@
-"""The virtual aircraft. It shares no mathematics with georef or calib: an error must not agree with itself."""
+"""The virtual aircraft; it shares no mathematics with georef or calib, so that an error there cannot cancel here."""

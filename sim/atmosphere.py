@@ -1,9 +1,10 @@
-"""The air of the virtual aircraft: how slow light is in it, how it bends beams, how it dims them.
+"""The air of the virtual aircraft: the speed of light in it, how it bends beams and how it attenuates them.
 
-Group index: Ciddor, Applied Optics 35 (1996) 1566, appendices A and B, the phase index differentiated numerically, in
-the International Standard Atmosphere or one through a measured temperature, pressure and humidity. Bending: the ARDC
-model of NGA's lidar formulation paper (Eq. 4, 5), or a ray traced step by step through the atmosphere of its Eq. 9 to
-11. Heights are taken as they come: the plan's are ellipsoidal, and both models count them from the sea.
+The group index follows Ciddor, Applied Optics 35 (1996) 1566, appendices A and B, with the phase index differentiated
+numerically. The air is the International Standard Atmosphere, or one that passes through a measured temperature,
+pressure and humidity. Bending follows the ARDC model of NGA's lidar formulation paper (Eq. 4, 5), or a ray traced step
+by step through the atmosphere of its Eq. 9 to 11. Heights are used as given: the plan's heights are ellipsoidal, and
+both models count heights from the sea.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ LAYERS_RADIUS_M = 6_371_000.0
 FT_PER_M = 1.0 / 0.3048
 HPA_PER_PSF = 0.4788025898
 RAY_STEPS = 4
-FLATTEST_RAD = np.radians(80.0)  # from nadir: flatter beams are bent like this one, those above the horizon not at all
+FLATTEST_RAD = np.radians(80.0)  # from nadir: flatter beams bend by as much, those above the horizon do not bend
 
 KRUSE_NM = 550.0
 KOSCHMIEDER = 3.912  # −ln of a contrast of 2 %
@@ -44,11 +45,11 @@ def phase_refractivity_ppm(
     vapour: FloatArray,
     co2_ppm: float = CO2_PPM,
 ) -> FloatArray:
-    """Return 1e6 (n − 1) of moist air (Ciddor 1996, Eq. 1 to 5).
+    """Return the phase refractivity 1e6 (n − 1) of moist air (Ciddor 1996, Eq. 1 to 5).
 
     Args:
-        wavelength_um: in vacuum.
-        temperature_k, pressure_pa: (…) of the air.
+        wavelength_um: wavelength in vacuum.
+        temperature_k, pressure_pa: (…) temperature and pressure of the air.
         vapour: (…) molar fraction of water vapour.
         co2_ppm: molar fraction of carbon dioxide.
     """
@@ -68,7 +69,10 @@ def phase_refractivity_ppm(
 def group_refractivity_ppm(
     wavelength_um: float, temperature_k: FloatArray, pressure_pa: FloatArray, vapour: FloatArray
 ) -> FloatArray:
-    """Return 1e6 (n_g − 1) with n_g = n − λ dn/dλ, the derivative a central difference; arguments as for the phase."""
+    """Return the group refractivity 1e6 (n_g − 1), n_g = n − λ dn/dλ, with a central difference as derivative.
+
+    The arguments are those of `phase_refractivity_ppm`.
+    """
     step = WAVELENGTH_STEP_UM
     above = phase_refractivity_ppm(wavelength_um + step, temperature_k, pressure_pa, vapour)
     below = phase_refractivity_ppm(wavelength_um - step, temperature_k, pressure_pa, vapour)
@@ -77,7 +81,7 @@ def group_refractivity_ppm(
 
 
 def vapour_fraction(temperature_k: FloatArray, pressure_pa: FloatArray, humidity: float) -> FloatArray:
-    """Return molar fraction of water vapour at a relative humidity of 0 … 1 (Ciddor 1996, appendix A)."""
+    """Return the molar fraction of water vapour at a relative humidity of 0 … 1 (Ciddor 1996, appendix A)."""
     t_c = temperature_k - ZERO_CELSIUS_K
     exponent = 1.2378847e-5 * temperature_k**2 - 1.9121316e-2 * temperature_k + 33.93711047
     saturated_pa = np.exp(exponent - 6.3431645e3 / temperature_k)
@@ -87,9 +91,9 @@ def vapour_fraction(temperature_k: FloatArray, pressure_pa: FloatArray, humidity
 
 
 def _density(temperature_k: FloatArray, pressure_pa: FloatArray, vapour: FloatArray, share: FloatArray) -> FloatArray:
-    """Return moles of a component of this share in a volume of moist air (Ciddor 1996, Eq. 4 and 12).
+    """Return the moles in a volume of moist air of the component with this molar share (Ciddor 1996, Eq. 4 and 12).
 
-    Less 1/R: R and the molar masses of Eq. 4 cancel where densities are divided.
+    The factor 1/R is left out: R and the molar masses of Eq. 4 cancel where densities are divided.
     """
     t_c = temperature_k - ZERO_CELSIUS_K
     ratio = pressure_pa / temperature_k
@@ -115,11 +119,10 @@ def _refractivity_and_gradient(height_m: float, constant: float) -> tuple[float,
 
 @numba.njit(cache=True)
 def _rates(height_m: float, constant: float) -> tuple[float, float]:
-    """Return what tan ψ is multiplied by for the change, a metre of descent, of ψ and of the angle at the earth's
-    centre.
+    """Return the factors of tan ψ for the change per metre of descent of ψ and of the angle at the earth's centre.
 
-    ψ is the ray's angle from the local vertical. The ray equation d(n t)/ds = ∇n, where n changes with the radius
-    only, is dψ/dr = −tan ψ (1/r + n'/n).
+    ψ is the ray's angle from the local vertical. The ray equation d(n t)/ds = ∇n, where n changes with the radius only,
+    is dψ/dr = −tan ψ (1/r + n'/n).
     """
     refractivity, gradient = _refractivity_and_gradient(height_m, constant)
     curvature = 1.0 / (LAYERS_RADIUS_M + height_m)
@@ -128,8 +131,9 @@ def _rates(height_m: float, constant: float) -> tuple[float, float]:
 
 @numba.njit(cache=True)
 def _trace(nadir_rad: float, sensor_m: float, ground_m: float, constant: float) -> float:
-    """Return nadir angle of the beam as it leaves less that of the straight line to where it lands; Runge-Kutta
-    steps.
+    """Return the beam's nadir angle at the sensor minus that of the straight line to the point where the beam lands.
+
+    The ray is integrated by Runge-Kutta steps.
     """
     step_m = (sensor_m - ground_m) / RAY_STEPS
     angle, centre = nadir_rad, 0.0
@@ -153,7 +157,12 @@ def _trace(nadir_rad: float, sensor_m: float, ground_m: float, constant: float) 
 
 @numba.njit(cache=True)
 def bending_by_layers(nadir_rad: FloatArray, sensor_m: FloatArray, ground_m: FloatArray, constant: float) -> FloatArray:
-    """Return (n,) Δd of rays through spherical layers, radians; arguments (n,) each, ``constant`` C of NGA Eq. 9."""
+    """Return (n,) Δd of rays through spherical layers, radians.
+
+    Args:
+        nadir_rad, sensor_m, ground_m: (n,) nadir angles of the beams and heights of their two ends.
+        constant: C of NGA Eq. 9.
+    """
     bent = np.zeros(len(nadir_rad))
     for i in range(len(nadir_rad)):
         if ground_m[i] < sensor_m[i]:
@@ -167,7 +176,7 @@ def bending_ardc(nadir_rad: FloatArray, sensor_m: FloatArray, ground_m: FloatArr
     def term(height_km: FloatArray) -> FloatArray:
         return 2410.0 * height_km / (height_km**2 - 6.0 * height_km + 250.0)
 
-    upper_km = np.maximum(1e-3 * sensor_m, 1e-6)  # the model knows no sensor below the sea
+    upper_km = np.maximum(1e-3 * sensor_m, 1e-6)  # the model is undefined for a sensor below the sea
     lower_km = np.minimum(1e-3 * ground_m, upper_km)
     bent: FloatArray = 1e-6 * (term(upper_km) - term(lower_km) * lower_km / upper_km) * np.tan(nadir_rad)
     return bent
@@ -180,13 +189,14 @@ class Air:
     """The air of a flight for light of one wavelength.
 
     Args:
-        table: ``[atmosphere]`` of the plan. "standard": dry ISO 2533; "measured": its temperature, pressure and
-            relative humidity at its height, and from there the same lapse of temperature, hydrostatic pressure and the
-            same relative humidity. Bending follows the models' own atmosphere in both cases.
-        wavelength_nm: in vacuum.
+        table: ``[atmosphere]`` of the plan. "standard" is dry ISO 2533. "measured" takes the measured temperature,
+            pressure and relative humidity at the height of the measurement; from there temperature has the same lapse,
+            pressure is hydrostatic and relative humidity is constant. Bending follows the models' own atmosphere in
+            both cases.
+        wavelength_nm: wavelength in vacuum.
 
     Attributes:
-        bends: whether beams are refracted.
+        bends: True if beams are refracted.
     """
 
     def __init__(self, table: AtmosphereTable, wavelength_nm: float) -> None:
@@ -215,8 +225,9 @@ class Air:
         return group_refractivity_ppm(self._wavelength_um, temperature_k, pressure_pa, vapour)
 
     def group_refractivity_ppm(self, from_height_m: FloatArray, to_height_m: FloatArray) -> FloatArray:
-        """Return mean of 1e6 (n_g − 1) along straight paths between heights; of the same shape, nan where one is
-        nan.
+        """Return the mean of 1e6 (n_g − 1) along straight paths between heights.
+
+        The result has the shape of the heights and is nan where one of them is nan.
         """
         low, high = np.broadcast_arrays(np.asarray(from_height_m, np.float64), np.asarray(to_height_m, np.float64))
         apart_m = high - low
@@ -229,16 +240,17 @@ class Air:
         return through
 
     def device_range(self, range_m: FloatArray, from_height_m: FloatArray, to_height_m: FloatArray) -> FloatArray:
-        """Return what a device says of geometric ranges: itself corrected, or counted with the speed of light in
-        vacuum.
+        """Return the ranges that a device reports for geometric ranges.
+
+        The device either corrects its ranges itself or counts them with the speed of light in vacuum.
 
         Args:
             range_m: (n, R) or (n,); 0 and nan stay as they are.
-            from_height_m: (n,) of the scanner.
-            to_height_m: of the echoes, as ``range_m``; looked at only where there is one.
+            from_height_m: (n,) heights of the scanner.
+            to_height_m: heights of the echoes, of the shape of ``range_m``; used only where there is an echo.
 
         Returns:
-            as ``range_m``.
+            ranges of the shape of ``range_m``.
         """
         range_m = np.asarray(range_m, np.float64)
         if self._table.ranges == "corrected":
@@ -256,11 +268,11 @@ class Air:
     def bending(
         self, nadir_angle_rad: FloatArray, sensor_height_m: FloatArray, ground_height_m: FloatArray
     ) -> FloatArray:
-        """Return (n,) Δd: by how much nearer to nadir the ground point lies than the beam leaves; radians.
+        """Return (n,) Δd, radians: the nadir angle of the beam as it leaves minus that of the ground point.
 
         Args:
-            nadir_angle_rad: (n,) of beams as they leave.
-            sensor_height_m, ground_height_m: (n,) or one for all.
+            nadir_angle_rad: (n,) nadir angles of the beams as they leave.
+            sensor_height_m, ground_height_m: (n,) heights, or one for all.
         """
         nadir = np.asarray(nadir_angle_rad, np.float64)
         if not self.bends:
@@ -278,12 +290,12 @@ class Air:
     def bend(
         self, direction: FloatArray, down: FloatArray, sensor_height_m: FloatArray, ground_height_m: FloatArray
     ) -> FloatArray:
-        """Return (n, 3) unit vectors to where beams land, of unit vectors (n, 3) in which they leave.
+        """Return (n, 3) unit vectors towards the points where beams land, given the directions in which they leave.
 
         Args:
-            direction: (n, 3), any Cartesian frame.
+            direction: (n, 3) unit vectors of the beams as they leave, any Cartesian frame.
             down: (3,) or (n, 3) the vertical at the sensor, downward, the same frame.
-            sensor_height_m, ground_height_m: (n,) or one for all.
+            sensor_height_m, ground_height_m: (n,) heights, or one for all.
         """
         if not self.bends:
             return direction
@@ -292,16 +304,17 @@ class Air:
         sin = np.linalg.norm(direction - cos[:, np.newaxis] * down, axis=1)
         nadir = np.arctan2(sin, cos)
         bent = self.bending(nadir, sensor_height_m, ground_height_m)
-        turns = (sin > 1e-9) & (bent != 0.0)  # straight down nothing bends
+        turns = (sin > 1e-9) & (bent != 0.0)  # a vertical beam does not bend
         safe = np.where(turns, sin, 1.0)
         along, towards = np.sin(nadir - bent) / safe, np.sin(bent) / safe
         turned = along[:, np.newaxis] * direction + towards[:, np.newaxis] * down
         return np.where(turns[:, np.newaxis], turned, direction)
 
     def transmission(self, range_m: FloatArray) -> FloatArray:
-        """Return share of the light that is left after the way to a target and back; shape of ``range_m``, 0 … 1.
+        """Return the share of the light left after the path to a target and back, 0 … 1; shape of ``range_m``.
 
-        Koschmieder's extinction of the visibility, carried to the wavelength by Kruse's exponent.
+        The extinction follows from the visibility by Koschmieder's formula and is carried to the wavelength by Kruse's
+        exponent.
         """
         sight_km = self._table.visibility_km
         exponent = 1.6 if sight_km > 50.0 else 1.3 if sight_km > 6.0 else 0.585 * sight_km ** (1.0 / 3.0)

@@ -1,7 +1,7 @@
-"""Clocks of the virtual aircraft: devices' oscillators, the pulse per second, randomness that a name owns.
+"""Clocks of the virtual aircraft: device oscillators, the pulse per second, and named random generators.
 
-Time in `sim` is ``time_s``: seconds since the plan's start, true GPS time, float64 (1e-13 s at 1000 s). The plan
-starts on a whole second, so true edges stand at whole ``time_s``.
+Time in `sim` is ``time_s``: seconds since the plan's start, true GPS time, float64 (1e-13 s at 1000 s). The plan starts
+on a whole second, so true edges stand at whole ``time_s``.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ from swath.georef.timescales.gps_time import SECOND_NS
 from swath.sim.plan.plan import Plan
 from swath.sim.plan.tables import OscillatorTable, PpsTable
 
-UPTIME_AT_START_NS = 600 * 1_000_000_000  # what CLOCK_MONOTONIC says at the plan's start
+UPTIME_AT_START_NS = 600 * 1_000_000_000  # reading of CLOCK_MONOTONIC at the plan's start
 
 
 WANDER_PERIOD_S = 600.0
 
 
 def generator(seed: int, *names: str | int) -> np.random.Generator:
-    """Return random numbers of one purpose: no other purpose's draws change them."""
+    """Return the random generator of one purpose; draws for other purposes do not change it."""
     return np.random.default_rng([seed, zlib.crc32("/".join(map(str, names)).encode())])
 
 
 class Oscillator:
-    """A counter driven by an oscillator of its own, with offset, drift and a slow wave of frequency."""
+    """A counter driven by its own oscillator, which has an offset, a drift and a slow wave of frequency."""
 
     def __init__(self, tick_hz: int, table: OscillatorTable) -> None:
         self.tick_hz = tick_hz
@@ -44,7 +44,7 @@ class Oscillator:
         return phase
 
     def ticks(self, time_s: FloatArray) -> IntArray:
-        """Return (n,) the counter's reading: whole ticks, `OscillatorTable.ticks_at_start` at the plan's start."""
+        """Return (n,) the counter's reading in whole ticks, `OscillatorTable.ticks_at_start` at the plan's start."""
         return np.floor(self.phase(time_s)).astype(np.int64) + self._table.ticks_at_start
 
     def time_of(self, ticks: FloatArray) -> FloatArray:
@@ -56,12 +56,14 @@ class Oscillator:
 
 
 class PulsePerSecond:
-    """The pulse of a receiver: edges at whole seconds, each with its own jitter; everything wired to it sees the same.
+    """The pulse of a receiver: edges at whole seconds, each with its own jitter.
+
+    All devices wired to it see the same edges.
 
     Args:
         table: of the plan.
-        seed, name: of its jitter.
-        noise: False: no jitter.
+        seed, name: names that the jitter's random numbers depend on.
+        noise: False leaves the jitter out.
     """
 
     def __init__(self, table: PpsTable, seed: int, name: str, *, noise: bool) -> None:
@@ -70,7 +72,7 @@ class PulsePerSecond:
         self._jitter_s: FloatArray = np.zeros(0)
 
     def edges(self, seconds: IntArray) -> FloatArray:
-        """Return (n,) true times of the edges of these seconds, 0 being the plan's start."""
+        """Return (n,) true times of the edges of these seconds; second 0 is the plan's start."""
         seconds = np.asarray(seconds, np.int64)
         if len(seconds) and seconds.max() >= len(self._jitter_s):
             draws = generator(self._seed, "pps", self._name).standard_normal(2 * int(seconds.max()) + 64)
@@ -84,7 +86,7 @@ class PulsePerSecond:
 
 
 class HostClock:
-    """Host time as LOG_FORMAT defines it: it reads as UTC at the session's start and is never stepped after it.
+    """Host time as LOG_FORMAT defines it: it reads as UTC at the session's start and is never stepped afterwards.
 
     Attributes:
         wall_steps: (time_s, step_s) of the wall clock, in order of time.
@@ -98,15 +100,15 @@ class HostClock:
         self.wall_steps = sorted((fault.at_s, fault.step_s) for fault in faults)
 
     def host_ns(self, time_s: float) -> int:
-        """Return host time (log_time) at a true time."""
+        """Return the host time (log_time) at a true time."""
         return self.start_ns + round(time_s * self._rate * SECOND_NS)
 
     def monotonic_ns(self, time_s: float) -> int:
-        """Return CLOCK_MONOTONIC."""
+        """Return the reading of CLOCK_MONOTONIC at a true time."""
         return self.host_ns(time_s) - self.start_ns + UPTIME_AT_START_NS
 
     def realtime_ns(self, time_s: float) -> int:
-        """Return CLOCK_REALTIME, with the steps so far."""
+        """Return the reading of CLOCK_REALTIME at a true time, including the steps so far."""
         return self.host_ns(time_s) + sum(
             round(step_s * SECOND_NS) for at_s, step_s in self.wall_steps if at_s <= time_s
         )

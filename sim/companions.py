@@ -1,4 +1,4 @@
-"""What stands beside a flight's log: the configuration that records it, calibrations, control, a page about it all."""
+"""The files beside a flight's log: its recording configuration, calibrations, control points and a README."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ Made by `swath sim fly` from the plan in `plan.toml`, seed {seed}. Starts {start
 
 
 def default_wires(plan: Plan) -> dict[str, str]:
-    """Return what each source is wired to on an aircraft's computer: transport URIs, and devices of PPS."""
+    """Return the transport URI of each source and the device of each PPS, as wired on an aircraft's computer."""
     tables = plan.tables
     wires = {f"pps/{name}": f"/dev/pps{number}" for number, name in enumerate(tables.pps)}
     for number, (name, gnss) in enumerate(tables.gnss.items()):
@@ -72,7 +72,7 @@ def config_text(plan: Plan, wires: dict[str, str], directory: str) -> str:
     Args:
         plan: of the flight.
         wires: transport URI of each source, and the source of each PPS; see `default_wires`.
-        directory: for logs.
+        directory: directory for logs.
     """
     tables = plan.tables
     document: dict[str, Any] = {
@@ -89,8 +89,9 @@ def config_text(plan: Plan, wires: dict[str, str], directory: str) -> str:
 
 
 def companion_files(plan: Plan, site: Site, scene: Scene) -> dict[str, bytes]:
-    """Return the small files by name: DBC, calibrations, head tables, control, plan and explanation; not the
-    configuration.
+    """Return the small files beside the log by name, without the configuration.
+
+    They are DBC files, calibrations, head tables, control points, the plan and the README.
     """
     tables = plan.tables
     files = {f"{name}.dbc": dbc_text(table) for name, table in tables.imu.items()}
@@ -107,12 +108,12 @@ def companion_files(plan: Plan, site: Site, scene: Scene) -> dict[str, bytes]:
 
 
 def control_points_e(plan: Plan, site: Site, scene: Scene) -> FloatArray:
-    """Return (k, 3) true ECEF of the control points."""
+    """Return (k, 3) true ECEF coordinates of the control points."""
     return site.e_from_site(control_points(plan, scene))
 
 
 def control_text(plan: Plan, points_e: FloatArray) -> str:
-    """Return the control points as their survey found them, as CONVENTIONS' CSV."""
+    """Return the control points with their survey's errors, as the CSV that CONVENTIONS defines."""
     sigma_m = plan.tables.control.sigma_m
     draws = generator(plan.tables.flight.seed, "control").standard_normal(points_e.shape)
     lat_rad, lon_rad, height_m = geodetic_from_e(points_e + sigma_m * draws)

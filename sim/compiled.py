@@ -1,4 +1,4 @@
-"""How loops over single rays are compiled by numba: quick to run, in tolerable time, and kept for later processes."""
+"""Compiles loops over single rays with numba, so that they run quickly and are kept on disk for later processes."""
 
 from __future__ import annotations
 
@@ -23,17 +23,20 @@ _null: Any = cgutils.get_null_value
 
 
 def jit_inline(function: Compiled) -> Compiled:
-    """Compile a function into those that call it: no way in from Python; x / 0 is infinite, which spares a branch."""
+    """Compile a function into the functions that call it; Python cannot call it directly.
+
+    A division by zero gives infinity, which spares a branch.
+    """
     options = {"nogil": True, "error_model": "numpy", "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
     compiled: Compiled = _njit(forceinline=True, **options)(function)
     return compiled
 
 
 def jit_cached(function: Compiled) -> Compiled:
-    """Compile an outermost function, and keep it on disk.
+    """Compile an outermost function and keep the result on disk.
 
-    Numba knows it again by the age of its file and by what its closure holds: `digest` there stands for other files.
-    Where no folder can be written to, it is compiled anew in every process.
+    Numba identifies the cached result by the age of the function's file and by the values in its closure; `digest` in
+    the closure stands for the other files. If no folder is writable, every process compiles the function anew.
     """
     options = {"nogil": True, "error_model": "numpy"}
     compiled: Compiled
@@ -45,12 +48,12 @@ def jit_cached(function: Compiled) -> Compiled:
 
 
 def digest(*modules: ModuleType) -> int:
-    """Return a number that changes with the text of modules, never 0."""
+    """Return a number that changes with the text of modules and is never 0."""
     return zlib.crc32(b"".join(Path(str(module.__file__)).read_bytes() for module in modules)) or 1
 
 
 def whole(value: int) -> int:
-    """Return a constant for calls between compiled functions: numba compiles a function anew for every bare number."""
+    """Return a constant for calls between compiled functions; numba compiles a function anew for every bare number."""
     return cast(int, np.int64(value))
 
 

@@ -1,4 +1,4 @@
-"""Faults on demand: what a script in the plan does to the units of a source on their way to the recorder."""
+"""Faults on demand: what the plan's fault list does to the units of a source on their way to the recorder."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Window = tuple[float, float]
 
 
 def check_faults(tables: Tables) -> None:
-    """Refuse what makes no sense; raises `PlanError` with the fault's key."""
+    """Refuse faults that make no sense, with a `PlanError` that names the fault's key."""
     wired = {f"{kind}/{name}" for kind in ("gnss", "imu", "scanner", "pps") for name in getattr(tables, kind)}
     wired |= {f"scanner/{name}/aux" for name, table in tables.scanner.items() if table.kind == "vlp16"}
     for number, fault in enumerate(tables.fault):
@@ -37,17 +37,16 @@ def check_faults(tables: Tables) -> None:
 
 
 def windows(tables: Tables, source: str, *kinds: str) -> list[Window]:
-    """When a source suffers from faults of these kinds."""
+    """Return the times during which a source suffers from faults of these kinds, as (from, to)."""
     return [(f.at_s, f.at_s + f.for_s) for f in tables.fault if f.source == source and f.kind in kinds]
 
 
 def with_faults(plan: Plan, units: Iterable[WireUnit]) -> Iterator[WireUnit]:
-    """Return units in order of time, with everything the plan does to those of each source, in the order of its
-    faults.
-    """
+    """Return units in order of time after all faults of their sources, applied in the order of the plan."""
     stream = iter(units)
     for number, fault in enumerate(plan.tables.fault):
-        of_device = fault.kind == "pps_lost" and not fault.source.startswith("pps/")  # it gets no edge, and sends
+        # a device without edges still sends, so its units stay
+        of_device = fault.kind == "pps_lost" and not fault.source.startswith("pps/")
         if fault.kind in _ACTIONS and not of_device:
             rng = generator(plan.tables.flight.seed, "fault", number)
             stream = _ACTIONS[fault.kind](stream, _Hits(fault, rng))
@@ -55,14 +54,14 @@ def with_faults(plan: Plan, units: Iterable[WireUnit]) -> Iterator[WireUnit]:
 
 
 class _Hits:
-    """Which units a fault hits: those of its window, or, where that has no length, the first one after it."""
+    """Decides which units a fault hits: those in its window, or the first unit from its time on if it has no length."""
 
     def __init__(self, fault: FaultTable, rng: np.random.Generator) -> None:
         self.fault, self.rng = fault, rng
         self._single = fault.for_s == 0.0
 
     def hit(self, unit: WireUnit) -> bool:
-        """Return whether this unit is; to be asked once for each."""
+        """Return True if the fault hits this unit; call it once for each unit."""
         fault = self.fault
         if unit.source != fault.source or unit.time_s < fault.at_s:
             return False
@@ -79,7 +78,7 @@ def _dropped(units: Iterator[WireUnit], hits: _Hits) -> Iterator[WireUnit]:
 
 
 def _late(units: Iterator[WireUnit], hits: _Hits) -> Iterator[WireUnit]:
-    """Yield units that wait let others pass."""
+    """Yield the units; a delayed unit lets others pass."""
     waiting: list[tuple[float, int, WireUnit]] = []
     for number, unit in enumerate(units):
         while waiting and waiting[0][0] <= unit.time_s:
@@ -109,7 +108,7 @@ def _duplicated(units: Iterator[WireUnit], hits: _Hits) -> Iterator[WireUnit]:
 
 
 def _reordered(units: Iterator[WireUnit], hits: _Hits) -> Iterator[WireUnit]:
-    """Yield a unit that is hit changes places with the next one, where both are of one source."""
+    """Yield the units; a hit unit changes places with the next one if both are of one source."""
     held: WireUnit | None = None
     for unit in units:
         if held is not None and held.source != unit.source:
@@ -128,7 +127,7 @@ def _reordered(units: Iterator[WireUnit], hits: _Hits) -> Iterator[WireUnit]:
 
 
 def _spurious(units: Iterator[WireUnit], hits: _Hits) -> Iterator[WireUnit]:
-    """Yield behind an edge that is hit another one, where no second begins."""
+    """Yield the units; each edge that is hit is followed by another edge within the second."""
     extra: WireUnit | None = None
     for unit in units:
         if extra is not None:

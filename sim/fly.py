@@ -1,4 +1,4 @@
-"""A whole flight: the plan's parts put together, every source's units in order of time."""
+"""A whole flight: combines the plan's parts and yields every source's units in order of time."""
 
 from __future__ import annotations
 
@@ -35,28 +35,28 @@ BLOCK_S = 1.0
 
 
 def open_truth(plan: Plan, path: Path) -> TruthWriter:
-    """Return the truth file of a flight; raises OSError."""
+    """Open the truth file of a flight; raises OSError."""
     tables = {"trajectory": POSE_TRUTH_DTYPE} | dict.fromkeys(plan.tables.scanner, RETURN_TRUTH_DTYPE)
     return TruthWriter(path, tables)
 
 
 class VirtualFlight:
-    """A plan ready to be flown, once.
+    """A plan that is ready to be flown, once.
 
     Args:
         plan: of the flight.
-        truth: where the truth goes; None: nowhere.
-        stop_s: ends it early.
+        truth: writer of the truth; None discards it.
+        stop_s: time at which the flight ends early.
 
     Attributes:
-        site, scene, trajectory, host_clock: its parts.
+        site, scene, trajectory, host_clock: parts of the flight.
         duration_s: of the flight.
-        sources: ``kind/name`` of everything that sends, ``/aux`` for second ports.
+        sources: ``kind/name`` of everything that sends, with ``/aux`` for second ports.
         unplugged: (source, from, to) of ports that disappear.
-        returns: how many are in the packets so far.
+        returns: number of returns in the packets so far.
 
     Raises:
-        PlanError: it cannot be flown.
+        PlanError: the plan cannot be flown.
     """
 
     def __init__(self, plan: Plan, truth: TruthWriter | None = None, stop_s: float = math.inf) -> None:
@@ -89,7 +89,7 @@ class VirtualFlight:
 
     @property
     def wall_steps(self) -> list[tuple[float, float]]:
-        """(time_s, step_s) of the host's wall clock."""
+        """Steps of the host's wall clock, as (time_s, step_s)."""
         return self.host_clock.wall_steps
 
     def units(self) -> Iterator[WireUnit]:
@@ -102,7 +102,7 @@ class VirtualFlight:
         return heapq.merge(*faulty, key=lambda unit: unit.time_s)
 
     def finish_truth(self) -> None:
-        """Write what is left of the truth and pack it; raises OSError."""
+        """Write the rest of the truth and pack it; raises OSError."""
         if self._truth is None:
             return
         self._add_poses(self._truth)
@@ -151,7 +151,7 @@ class VirtualFlight:
     # ------------------------------------------------------------------ streams
 
     def _edges(self, name: str) -> Iterator[WireUnit]:
-        """Yield edges as the host stamps them."""
+        """Yield PPS edges at the times that the host stamps on them."""
         host, flight = self.plan.tables.host, self.plan.tables.flight
         sigma_s = 1e-6 * host.pps_jitter_us if flight.noise else 0.0
         rng = generator(flight.seed, "host", "pps", name)
@@ -171,7 +171,7 @@ class VirtualFlight:
             yield from units
 
     def _add_poses(self, truth: TruthWriter) -> None:
-        """The body's poses at the highest rate of the IMUs."""
+        """Write the body's poses at the highest rate of the IMUs."""
         rate_hz = max((table.rate_hz for table in self.plan.tables.imu.values()), default=100)
         count = math.floor(self.duration_s * rate_hz) + 1
         for first in range(0, count, 1 << 16):

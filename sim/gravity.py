@@ -1,9 +1,9 @@
 """Normal gravity of WGS 84 and the earth's rotation, for the inertial unit and for the strapdown that checks it.
 
-On the ellipsoid by Somigliana's formula, above it by the expansion to second order in height, along the ellipsoid's
-normal (NIMA TR8350.2, 3rd ed., Eq. 4-1 and 4-3; CONVENTIONS, time). Gravity here is what a plumb bob at rest on the
-turning earth feels: attraction and centrifugal acceleration together. The bend of the plumb line above the ellipsoid
-(8e-9 m/s² a metre of height at 45°) is not in it, by convention.
+Gravity on the ellipsoid follows Somigliana's formula, above it the expansion to second order in height, along the
+ellipsoid's normal (NIMA TR8350.2, 3rd ed., Eq. 4-1 and 4-3; CONVENTIONS, time). Gravity here is the acceleration of a
+plumb bob at rest on the rotating earth: attraction and centrifugal acceleration together. By convention it leaves out
+the bend of the plumb line above the ellipsoid (8e-9 m/s² per metre of height at 45°).
 """
 
 from __future__ import annotations
@@ -29,7 +29,12 @@ _HEIGHT_STEPS = 4
 
 
 def normal_gravity(sin_lat: FloatArray, height_m: FloatArray) -> FloatArray:
-    """Return (n,) magnitude of normal gravity, m/s², at sines of geodetic latitude and ellipsoidal heights (n,)."""
+    """Return (n,) the magnitude of normal gravity, m/s².
+
+    Args:
+        sin_lat: (n,) sines of geodetic latitudes.
+        height_m: (n,) ellipsoidal heights.
+    """
     square = sin_lat * sin_lat
     surface = EQUATOR_GRAVITY_MPS2 * (1 + SOMIGLIANA_K * square) / np.sqrt(1 - ECCENTRICITY_SQUARED * square)
     ratio = height_m / SEMI_MAJOR_AXIS_M
@@ -42,7 +47,7 @@ _normal_gravity = numba.njit(cache=True)(normal_gravity)
 
 
 def gravity_e(points_e: FloatArray) -> FloatArray:
-    """Return (n, 3) normal gravity in e, m/s², at ECEF points (n, 3); geodesy by PROJ."""
+    """Return (n, 3) normal gravity in e, m/s², at ECEF points (n, 3); PROJ supplies the geodetic coordinates."""
     lat_rad, lon_rad, height_m = geodetic_from_e(points_e)
     up = np.stack([np.cos(lat_rad) * np.cos(lon_rad), np.cos(lat_rad) * np.sin(lon_rad), np.sin(lat_rad)], axis=-1)
     downward: FloatArray = -normal_gravity(np.sin(lat_rad), height_m)[..., None] * up
@@ -51,9 +56,9 @@ def gravity_e(points_e: FloatArray) -> FloatArray:
 
 @numba.njit(cache=True)
 def gravity_at(x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Return the same for one point, compiled: the strapdown steps through a thousand of them a second.
+    """Return normal gravity in e at one ECEF point; compiled, for the strapdown's thousand calls per second.
 
-    The normal is found by the fixed point tan φ = (z + e² N sin φ) / p, which gains two digits a step.
+    The normal is found by the fixed point tan φ = (z + e² N sin φ) / p, which gains two digits per step.
     """
     distance = np.sqrt(x * x + y * y)
     top = z / (1 - ECCENTRICITY_SQUARED)

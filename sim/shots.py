@@ -1,4 +1,4 @@
-"""What the parts of a scanner hand to each other, in batches: pulses, their echoes, what is measured of them."""
+"""Batches that the parts of a scanner pass to each other: pulses, their echoes and the measurements of them."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ class Pulses:
     """Pulses as they leave, in order of emission.
 
     Attributes:
-        number: (n,) since power-on.
+        number: (n,) count since power-on.
         time_s: (n,) true time of emission, seconds since the plan's start.
-        encoder: (n,) what the encoder says: counts (SREP), or hundredths of a degree or ticks of a spinning head.
+        encoder: (n,) reading of the encoder: counts (SREP), or hundredths of a degree or ticks of a spinning head.
         channel: (n,) facet or beam.
-        origin_s: (n, 3) where the beam starts, metres, sensor frame; zeros for line scanners.
-        direction_s: (n, 3) unit vectors, sensor frame, as the light really leaves.
-        phi_extra_rad: (n,) what the pitch slope adds to φ.
+        origin_s: (n, 3) point at which the beam starts, metres, sensor frame; zeros for line scanners.
+        direction_s: (n, 3) unit vectors of the true direction of the light, sensor frame.
+        phi_extra_rad: (n,) amount that the pitch slope adds to φ.
     """
 
     number: IntArray
@@ -36,13 +36,13 @@ class Pulses:
     phi_extra_rad: FloatArray
 
     def __len__(self) -> int:
-        """Number of pulses."""
+        """Return the number of pulses."""
         return len(self.number)
 
 
 @dataclass(frozen=True, slots=True)
 class Echoes:
-    """What comes back of n pulses in R slots, nearest first; slots without an echo are at the end, range nan.
+    """Echoes of n pulses in R slots, nearest first; slots without an echo are at the end, range nan.
 
     Attributes:
         range_m: (n, R) true geometric distance along the beam's axis.
@@ -59,10 +59,10 @@ class Echoes:
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """What the scanner's receiver makes of echoes; (n, R), slots as in `Echoes`, range 0: no return.
+    """Measurements of echoes by the scanner's receiver; (n, R), slots as in `Echoes`, range 0: no return.
 
     Attributes:
-        range_m: as the device says it, before quantisation, whole (pulses in air resolved).
+        range_m: range that the device reports, before quantisation, whole (pulses in air resolved).
         intensity: 0 … 65535 (line scanners) or 0 … 255 (spinning heads), whole numbers.
         pulse_width_ns: length of the echo.
     """
@@ -77,9 +77,9 @@ class WireUnit:
     """One unit on its way to the recorder: a datagram, a CAN frame, the bytes of one read, or a PPS edge (no bytes).
 
     Attributes:
-        time_s: true time at which the host stamps it, seconds since the plan's start.
+        time_s: true time at which the host stamps the unit, seconds since the plan's start.
         source: ``kind/name``, with ``/aux`` for a head's second port.
-        data: its bytes.
+        data: bytes of the unit.
     """
 
     time_s: float

@@ -1,6 +1,6 @@
-"""The truth beside a flight: where every return came from, and where the aircraft was; NPZ files of any length.
+"""The truth beside a flight: the origin of every return and the aircraft's poses, in NPZ files of any length.
 
-Columns go to raw files while the flight is made and are packed at its end, so memory stays flat.
+Columns are written to raw files during the flight and packed at its end, so memory stays flat.
 """
 
 from __future__ import annotations
@@ -43,10 +43,12 @@ POSE_TRUTH_DTYPE = np.dtype(
 
 
 class TruthWriter:
-    """Rows of several tables, appended in pieces, packed into one uncompressed NPZ: one array ``table.field`` each.
+    """Collects rows of several tables in pieces and packs them into one uncompressed NPZ.
+
+    The NPZ has one array ``table.field`` for each field.
 
     Args:
-        path: of the NPZ; the pieces stand beside it until `finish`.
+        path: of the NPZ; the pieces are beside it until `finish`.
         tables: name → dtype.
     """
 
@@ -60,7 +62,7 @@ class TruthWriter:
                 self._parts[table, field] = self._part(table, field).open("wb")
 
     def add(self, table: str, rows: StructArray) -> None:
-        """Append rows; raises OSError."""
+        """Append rows to a table; raises OSError."""
         self.rows[table] += len(rows)
         for field in self._tables[table].names or ():
             np.ascontiguousarray(rows[field]).tofile(self._parts[table, field])
@@ -77,7 +79,7 @@ class TruthWriter:
         self._remove_parts()
 
     def abandon(self) -> None:
-        """Remove the pieces."""
+        """Remove the pieces without packing them."""
         self._remove_parts()
 
     def _pack(self, archive: zipfile.ZipFile, table: str, field: str) -> None:
@@ -102,5 +104,5 @@ class TruthWriter:
 
 
 def _member(name: str) -> zipfile.ZipInfo:
-    """Return a member of a fixed date, so that the same flight gives the same file."""
+    """Return an archive member of a fixed date, so that the same flight gives the same file."""
     return zipfile.ZipInfo(name, date_time=(1980, 1, 6, 0, 0, 0))

@@ -1,7 +1,7 @@
 """Airborne laser scanning, from the sensors' wires to the point cloud.
 
 ``swath.georef`` georeferences, ``swath.calib`` calibrates, ``swath.drivers`` reads devices, ``swath.daemon`` records
-and is the command line, ``swath.sim`` flies a virtual aircraft.
+and holds the command line, ``swath.sim`` flies a virtual aircraft.
 """
 
 __version__ = "0.1.0"

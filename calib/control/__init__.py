@@ -1,1 +1,1 @@
-"""Control points and their judgement."""
+"""Ground control points and checks of them."""

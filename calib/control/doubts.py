@@ -1,6 +1,6 @@
-"""What speaks against control as a whole: heights above the geoid, another datum, another place.
+"""Detect errors of control as a whole: heights above the geoid, another datum, another place.
 
-Such control would move a calibration without a word: all points agree with each other, and none with the flight.
+Such control would change a calibration unnoticed: all points agree with each other, but not with the flight.
 """
 
 from __future__ import annotations
@@ -19,29 +19,29 @@ from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.earth import geodetic_from_e
 from swath.georef.mapping.frame import Mapping, MappingError
 
-Undulation = Callable[[FloatArray], tuple[float, str] | None]  # of a position in e: metres, and by which geoid
+Undulation = Callable[[FloatArray], tuple[float, str] | None]  # from a position in e: metres, and the geoid's name
 
 FEWEST_POINTS = 3
 FEWEST_FOR_SHIFT = 6
-CONSTANT_M = 0.5  # a difference that no calibration explains
+CONSTANT_M = 0.5  # a difference that calibration errors cannot explain
 ORTHOMETRIC_M = (5.0, 110.0)  # undulations go from −107 to +86 m
 FEET = 1.0 / 0.3048
 OUTSIDE_M = 30.0
-THINNED_TO = 20_000  # returns of a swath that say where it is
+THINNED_TO = 20_000  # returns of a swath that represent its extent
 SURE_SIGMAS = 5.0
-SWATHS_APART = 0.5  # of what the slopes say: opposite swaths that are off by a quarter of the shift, to either side
+SWATHS_APART = 0.5  # of the heights' spread; swaths farther apart show a wrong boresight
 GEOIDS = ((3855, "EGM2008"), (5773, "EGM96"))
 COMPASS = ("north", "north-east", "east", "south-east", "south", "south-west", "west", "north-west")
 
 
 @dataclass(frozen=True, slots=True)
 class Doubt:
-    """Something that speaks against control.
+    """A doubt about control.
 
     Attributes:
-        kind: ``outside``, ``orthometric``, ``height``, ``shift`` of the whole; ``point`` of single ones.
+        kind: ``outside``, ``orthometric``, ``height``, ``shift`` of all control; ``point`` of single points.
         text: one line for the user.
-        points: names of those meant.
+        points: names of the points concerned.
     """
 
     kind: str
@@ -50,14 +50,12 @@ class Doubt:
 
     @property
     def refuses(self) -> bool:
-        """Whether nothing should be calibrated with such control."""
+        """True if control with this doubt must not be used for calibration."""
         return self.kind != "point"
 
 
 def geoid_undulation(position_e: FloatArray) -> tuple[float, str] | None:
-    """Return height of the geoid above the ellipsoid at a position in e (3,), and which geoid; None: PROJ has no grid
-    here.
-    """
+    """Return the geoid's name and height above the ellipsoid at a position in e (3,); None if PROJ has no grid."""
     lat, lon, height = (float(value) for value in geodetic_from_e(position_e))
     zone = int((math.degrees(lon) + 180.0) % 360.0 // 6.0) + 1
     for epsg, geoid in GEOIDS:
@@ -76,7 +74,7 @@ def doubts(
     rules: ControlRules | None = None,
     undulation: Undulation = geoid_undulation,
 ) -> tuple[Doubt, ...]:
-    """Return what speaks against points of control; best asked when the swaths are calibrated, or nearly.
+    """Return doubts about points of control; the swaths should be calibrated at least roughly.
 
     Args:
         flight: with its points placed.
@@ -135,7 +133,7 @@ def _length(metres: float) -> str:
 def _heights(
     flight: Flight, points: Sequence[ControlPoint], above_m: FloatArray, undulation: Undulation
 ) -> tuple[Doubt, ...]:
-    """Return a difference in height that all points share."""
+    """Detect a difference in height that all points share."""
     middle_m, spread_m = _middle(above_m)
     if spread_m > max(1.0, 0.05 * abs(middle_m)) or abs(middle_m) < CONSTANT_M:
         return ()
@@ -161,13 +159,16 @@ def _heights(
 
 
 def _middle(values: FloatArray) -> tuple[float, float]:
-    """Return median, and the sigma of a value by the median of the distances from it."""
+    """Return the median, and the sigma of a value from the median absolute deviation."""
     middle = float(np.median(values))
     return middle, 1.4826 * float(np.median(np.abs(values - middle)))
 
 
 def _shift(points: Sequence[ControlPoint], grounds: Sequence[Ground]) -> tuple[Doubt, ...]:
-    """Return a horizontal shift: control too far along a slope's way up lies below the slope, Δz = c − g · shift."""
+    """Detect a horizontal shift of control from slopes.
+
+    Control shifted uphill lies below the slope: Δz = c − g · shift.
+    """
     numbers = sorted({one.point for one in grounds})
     if len(numbers) < FEWEST_FOR_SHIFT:
         return ()
@@ -189,7 +190,7 @@ def _shift(points: Sequence[ControlPoint], grounds: Sequence[Ground]) -> tuple[D
     if not size > SURE_SIGMAS * sigma_m or left > 0.7 * before:
         return ()
     if apart and np.median(np.abs(apart)) > SWATHS_APART * np.median(np.abs(heights - np.median(heights))):
-        return ()  # a boresight that is wrong moves each swath its own way, another datum moves control alone
+        return ()  # a wrong boresight moves each swath differently; another datum moves control alone
     way = COMPASS[round(math.degrees(math.atan2(shift[0], shift[1])) / 45.0) % 8]
     text = (
         f"control lies {size:.2f} m (± {sigma_m:.2f} m) to the {way} of where the laser sees the same slopes, as "
@@ -199,8 +200,9 @@ def _shift(points: Sequence[ControlPoint], grounds: Sequence[Ground]) -> tuple[D
 
 
 def _huber(design: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return least squares with Huber's weights: unknowns and covariance; what nothing determines has an infinite
-    variance.
+    """Solve least squares with Huber's weights; return unknowns and covariance.
+
+    If the unknowns are not determined, all variances are infinite.
     """
     weights = np.ones(len(values))
     unknowns: FloatArray = np.zeros(design.shape[1])
@@ -219,7 +221,7 @@ def _huber(design: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArr
 def _single(
     points: Sequence[ControlPoint], seen: Sequence[int], above_m: FloatArray, grounds: Sequence[Ground]
 ) -> tuple[Doubt, ...]:
-    """Return points that disagree with the others."""
+    """Find single points that disagree with the others."""
     middle_m, spread_m = _middle(above_m)
     limit_m = max(SURE_SIGMAS * spread_m, CONSTANT_M / 2.0)
     found = []

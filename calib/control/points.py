@@ -1,8 +1,7 @@
-"""Ground control: surveyed points as text, the planes of the swaths' returns that they lie on, and what speaks against
-them.
+"""Read surveyed ground control points and find the planes of the swaths' returns on which they lie.
 
-A surveyed point is worth as much as the ground around it is plane: of each swath the returns around it are taken, a
-plane is drawn through them, and the point must lie within them. Nothing is interpolated beyond returns.
+A surveyed point is only useful if the ground around it is flat: a plane is fitted to each swath's returns around the
+point, and the point must lie within these returns. Heights are never extrapolated beyond returns.
 """
 
 from __future__ import annotations
@@ -28,17 +27,17 @@ SMALLEST_SIGMA_M = 1e-6
 LIMITS = {"lat_deg": 90.0, "lon_deg": 360.0, "h_ellipsoidal_m": 9000.0, "sigma_m": 10.0}
 MOST_MISTAKES = 10
 SAME_PLACE_M = 0.01
-BLOCK = 1_000_000  # returns that are looked through at a time
-CELLS_A_SIDE = 4096  # at most, of the grid by which returns far from all points are seen
+BLOCK = 1_000_000  # returns that are processed at a time
+CELLS_A_SIDE = 4096  # at most, of the grid that excludes returns far from all points
 
 
 class ControlError(ValueError):
-    """A file of control that cannot be used; its text has one line a mistake: file, line, what would be right."""
+    """A control file that cannot be used; its message has one line for each mistake: file, line, remedy."""
 
 
 @dataclass(frozen=True, slots=True)
 class Surveyed:
-    """A surveyed point as its file says it: radians, metres above the ellipsoid, one sigma of each coordinate."""
+    """A surveyed point as given in its file: radians, metres above the ellipsoid, one sigma of each coordinate."""
 
     name: str
     lat_rad: float
@@ -49,15 +48,16 @@ class Surveyed:
 
 @dataclass(frozen=True, slots=True)
 class ControlRules:
-    """What ground around a control point must be like.
+    """Requirements on the ground around a control point.
 
     Attributes:
-        radius_m: how far around the point returns are taken, horizontally.
-        widest_m: how far where a swath has fewer than twice those that a plane needs.
-        plane: of the plane through them.
-        farthest_m: distance of the point from it; what lies farther is no matter of calibration.
-        together_m: how far swaths' planes may be from their median at the point: beyond, they are of other surfaces.
-        together_deg: likewise their directions.
+        radius_m: horizontal radius around the point in which returns are used.
+        widest_m: greater radius, for swaths with fewer than twice the returns that a plane needs.
+        plane: rules of the plane through them.
+        farthest_m: greatest distance of the point from the plane; larger distances are not errors of calibration.
+        together_m: greatest distance of a swath's plane from the median at the point; farther planes are other
+            surfaces.
+        together_deg: likewise for their directions.
     """
 
     radius_m: float = 1.5
@@ -70,13 +70,13 @@ class ControlRules:
 
 @dataclass(frozen=True, eq=False)
 class Ground:
-    """What one swath shows at a control point.
+    """The ground that one swath shows at a control point.
 
     Attributes:
         point, swath: indexes in the points and in ``flight.swaths``.
         at: (n,) rising indexes of the returns of the plane.
-        plane: through them.
-        above_m: of the surveyed point above the plane, along up.
+        plane: plane through them.
+        above_m: height of the surveyed point above the plane, along up.
     """
 
     point: int
@@ -90,11 +90,11 @@ def read_control(text: str, name: str) -> tuple[Surveyed, ...]:
     """Read surveyed points (CONVENTIONS, "Trajectory and text files").
 
     Args:
-        text: of the file, with the header `HEADER`; lines that are empty or begin with # say nothing.
+        text: of the file, with the header `HEADER`; lines that are empty or begin with # are ignored.
         name: of the file, for messages.
 
     Raises:
-        ControlError: one line a mistake, the first `MOST_MISTAKES` of them.
+        ControlError: one line for each of the first `MOST_MISTAKES` mistakes.
     """
     lines = [(number, line.strip()) for number, line in enumerate(text.lstrip("\ufeff").splitlines(), start=1)]
     lines = [(number, line) for number, line in lines if line and not line.startswith("#")]
@@ -115,7 +115,7 @@ def read_control(text: str, name: str) -> tuple[Surveyed, ...]:
 
 
 def _other_header(header: str) -> str:
-    """Return what seems to be meant by another one."""
+    """Return a hint about the likely mistake in a wrong header."""
     if ";" in header or "\t" in header:
         return ", columns apart by commas"
     missing = [column for column in COLUMNS if column not in header]
@@ -154,7 +154,7 @@ def _number(field: str, column: str, line: int, mistakes: list[str]) -> float:
 
 
 def _twice(read: Sequence[tuple[int, Surveyed]]) -> list[str]:
-    """Return the same name, or the same place under two names: it would count twice."""
+    """Report points that occur twice: the same name, or the same place under two names, would count twice."""
     mistakes: list[str] = []
     names: dict[str, int] = {}
     for line, point in read:
@@ -177,7 +177,7 @@ def _twice(read: Sequence[tuple[int, Surveyed]]) -> list[str]:
 
 
 def in_t(surveyed: Sequence[Surveyed], frame: Tangent) -> tuple[ControlPoint, ...]:
-    """Return the same in a flight's frame."""
+    """Transform surveyed points to a flight's frame t."""
     if not surveyed:
         return ()
     geodetic = np.array([[point.lat_rad, point.lon_rad, point.height_m] for point in surveyed])
@@ -186,16 +186,16 @@ def in_t(surveyed: Sequence[Surveyed], frame: Tangent) -> tuple[ControlPoint, ..
 
 
 def control_planes(flight: Flight, points: Sequence[ControlPoint], rules: ControlRules | None = None) -> Features:
-    """Return planes that control lies on, one a point, with the returns of every swath that shows it.
+    """Find the planes that control lies on, one for each point, with the returns of every swath that shows it.
 
     Args:
-        flight: with its points placed as well as is known.
+        flight: with its points placed as accurately as possible.
         points: in the flight's frame.
         rules: None: `ControlRules()`.
 
     Returns:
-        planes of kind ``control``, named as their point; refused: swaths' patches by reason, and points that no swath
-        shows as ``control: no returns``.
+        planes of kind ``control``, named after their point; refused: counts of swaths' patches by reason, and points
+        that no swath shows as ``control: no returns``.
     """
     rules = rules or ControlRules()
     grounds, refused = grounds_at(flight, points, rules)
@@ -214,7 +214,7 @@ def control_planes(flight: Flight, points: Sequence[ControlPoint], rules: Contro
 def grounds_at(
     flight: Flight, points: Sequence[ControlPoint], rules: ControlRules
 ) -> tuple[list[Ground], Counter[str]]:
-    """Return what every swath shows at every point, in the points' order; and why others show nothing."""
+    """Return the ground that every swath shows at every point, in the points' order; count refusals by reason."""
     found: list[Ground] = []
     refused: Counter[str] = Counter()
     seen = np.zeros(len(points), dtype=bool)
@@ -233,9 +233,9 @@ def grounds_at(
 
 @dataclass(frozen=True, eq=False)
 class _Cells:
-    """Cells no smaller than a radius, and which of them or of their neighbours have one of some places.
+    """A grid of cells no smaller than a radius, with a mask of cells that contain or adjoin given places.
 
-    Most returns are far from all control: that is seen by their cell, without asking for the nearest point.
+    Most returns are far from all control: their cell shows that without a search for the nearest point.
     """
 
     corner: FloatArray
@@ -244,7 +244,7 @@ class _Cells:
 
     @classmethod
     def around(cls, places: FloatArray, radius_m: float) -> _Cells:
-        """Make that of places (k, 2)."""
+        """Create the grid for places (k, 2)."""
         low, high = places.min(axis=0), places.max(axis=0)
         cell_m = max(radius_m, float((high - low).max()) / CELLS_A_SIDE)
         corner = low - cell_m
@@ -256,7 +256,7 @@ class _Cells:
         return cls(corner, cell_m, taken)
 
     def have(self, points: FloatArray) -> NDArray[np.int64]:
-        """Return rising indexes of points (n, 2) in such cells; nan is in none."""
+        """Return rising indexes of points (n, 2) in such cells; points with nan are left out."""
         column, row = ((points[:, axis] - self.corner[axis]) / self.cell_m for axis in (0, 1))
         columns, rows = self.taken.shape
         inside = np.flatnonzero((column >= 0.0) & (row >= 0.0) & (column < columns) & (row < rows))
@@ -267,7 +267,7 @@ class _Cells:
 def _returns_around(
     swath: Swath, points: Sequence[ControlPoint], radius_m: float
 ) -> list[tuple[int, NDArray[np.int64]]]:
-    """Return indexes of the points that have returns within a radius, and of those."""
+    """Return the indexes of the points that have returns within a radius, each with the indexes of these returns."""
     if not points:
         return []
     places = np.array([point.position_t[:2] for point in points])
@@ -286,7 +286,7 @@ def _returns_around(
 
 
 def _near(swath: Swath, place_t: FloatArray, at: NDArray[np.int64], rules: ControlRules) -> NDArray[np.int64]:
-    """Of returns around a point those within the radius, or as many of the nearest as a plane needs twice over."""
+    """Return the returns within the radius around a point, or, if these are too few, twice as many as a plane needs."""
     away = np.hypot(*(swath.points_t[at, :2] - place_t[:2]).T)
     wanted = min(2 * rules.plane.fewest, len(at))
     farthest_m = max(rules.radius_m, float(np.partition(away, wanted - 1)[wanted - 1]))
@@ -306,7 +306,7 @@ def _ground(
 
 
 def _of_one_surface(grounds: list[Ground], rules: ControlRules) -> list[Ground]:
-    """Return those that agree with the most of them."""
+    """Return the grounds that lie on the same surface as the median one."""
     if len(grounds) < 2:
         return grounds
     above = np.array([one.above_m for one in grounds])

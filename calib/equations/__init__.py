@@ -1,1 +1,1 @@
-"""Rows, normal equations, their solution, and what these say of quality."""
+"""Rows, normal equations, their solution, and measures of its quality."""

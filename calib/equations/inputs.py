@@ -1,4 +1,4 @@
-"""What the loops over rows are given: returns, their scanner and their trajectory, as tables."""
+"""Prepare the inputs of the loops over rows as tables: returns, their scanner and their trajectory."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ TRACKED = ("time_ns", "position_e", "q_e_from_b", "position_sigma_l", "attitude_
 
 
 def new_looks(count: int, cofactor: FloatArray, design: FloatArray) -> RowDiagnostics:
-    """Return room for what is seen of n rows."""
+    """Allocate the diagnostics of n rows."""
     return RowDiagnostics(np.zeros(count), np.zeros(count), np.zeros(count), np.zeros(count), cofactor, design)
 
 
 def writeable(trajectory: Trajectory) -> Trajectory:
-    """With columns the kernels take as they are."""
+    """Return a trajectory whose columns the kernels accept without conversion."""
     columns: dict[str, Any] = {name: contiguous(getattr(trajectory, name)) for name in TRACKED}
     return replace(trajectory, **columns)
 
@@ -72,7 +72,7 @@ def track_of(trajectory: Trajectory, calibration: Calibration) -> Track:
 
 
 def sigmas_of(trajectory: Trajectory) -> Sigmas:
-    """Zero where it says none."""
+    """Return a trajectory's sigmas, 0 where it has none."""
     return Sigmas(np.nan_to_num(trajectory.position_sigma_l), np.nan_to_num(trajectory.attitude_sigma_rad))
 
 

@@ -1,4 +1,4 @@
-"""Inverses of symmetric positive matrices whose rows have units from metres to s²."""
+"""Invert symmetric positive matrices whose rows have units from metres to s²."""
 
 from __future__ import annotations
 
@@ -11,14 +11,18 @@ from swath.georef.arrays import FloatArray
 
 
 def scales(matrix: FloatArray) -> FloatArray:
-    """Return (n,) by which rows and columns are multiplied for a unit diagonal."""
+    """Return the factors (n,) of rows and columns that give a unit diagonal."""
     diagonal = np.diag(matrix)
     found: FloatArray = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     return found
 
 
 def inverted(matrix: FloatArray) -> FloatArray:
-    """Return (n, n) by Cholesky of the matrix scaled to unit diagonal; LinAlgError: it is not positive definite."""
+    """Return the inverse (n, n), by Cholesky decomposition of the matrix scaled to unit diagonal.
+
+    Raises:
+        LinAlgError: the matrix is not positive definite.
+    """
     if not len(matrix):
         return matrix
     scale = scales(matrix)

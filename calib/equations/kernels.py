@@ -1,8 +1,8 @@
-"""Columns of the returns on planes: their rows of the design matrix (FORMULAS 5.2, 6.1, 6.2).
+"""Compute the rows of the design matrix for returns on planes (FORMULAS 5.2, 6.1, 6.2).
 
 A row is f = n · (x − centre) + offset = 0 in e with unknowns in this order: the head's parameters; where trajectory
 states are estimated, eight columns that stand for the twelve of the knots before and after (both positions have the
-plane's normal as their coefficients); the plane's two turns and its offset. Behind these stands f itself.
+plane's normal as their coefficients); the plane's two turns and its offset. The last column is f itself.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from swath.georef.scanner.calibration import INDEX
 from swath.georef.scanner.kernels.types import Three, Track
 from swath.georef.trajectory.trajectory import locate_epoch
 
-_LEAST_COSINE_2 = 0.01  # of the incidence: no footprint grows without end
-_FARTHEST = 4.0  # sigmas of f that may be errors of measurement; more is a start that is far off
+_LEAST_COSINE_2 = 0.01  # of the incidence: limits the size of a footprint
+_FARTHEST = 4.0  # sigmas of f that may be errors of measurement; a larger f means a poor start
 _LATER = 1e9
 
 OMEGA, PHI, KAPPA, SLOPE = (INDEX[name] for name in ("omega_rad", "phi_rad", "kappa_rad", "pitch_slope"))
@@ -33,17 +33,17 @@ ARM, TIME, IMU = INDEX["lever_arm_x_m"], INDEX["time_offset_s"], INDEX["imu_late
 FIRST_EXTRA = len(INDEX)
 SLOT, ZONE, KNOT, AZIMUTH, ELEVATION, RANGE = range(FIRST_EXTRA, FIRST_EXTRA + 6)
 
-# Rows of the scratch table: normal in b; what turns of boresight and of the body do, in b; turns of the body in e;
-# along the beam, by scan angle, by tilt; the share of the later knot; f; M; θ; speed along the normal; place in the
-# plane; variance of the range; what of f is likely to be an error of the range, and of the encoder; variance of what
-# the attitude does between knots, which the rows of a run have in common
+# Rows of the scratch table: normal in b; effects of turns of the boresight and of the body, in b; turns of the body in
+# e; along the beam, by scan angle, by tilt; the share of the later knot; f; M; θ; speed along the normal; place in the
+# plane; variance of the range; the parts of f that are probably errors of the range and of the encoder; variance due to
+# the attitude's changes between knots, which the rows of a run share
 NORMAL, BORE, BODY, BODY_E, ALONG, BY_ANGLE, BY_TILT, SHARE, MISCLOSURE, VARIANCE = 0, 3, 6, 9, 12, 13, 14, 15, 16, 17
 SPEED, TURNED, PLACE, RANGING, LONGER, AHEAD, COMMON, ROWS = 18, 19, 20, 23, 24, 25, 26, 27
 
 
 @jit_inline
 def geometry(cells: FloatArray, n: int, k: int, beam: Beam, head: Head, planes: Planes, at: int, states: bool) -> None:
-    """What the columns are made of."""
+    """Compute the quantities from which the columns are built."""
     normal, centre = vector_at(planes.normal_e, at), vector_at(planes.centre_e, at)
     first, second = vector_at(planes.first_e, at), vector_at(planes.second_e, at)
     offset, lever = planes.offset[at], (head.value[ARM], head.value[ARM + 1], head.value[ARM + 2])
@@ -78,7 +78,7 @@ def geometry(cells: FloatArray, n: int, k: int, beam: Beam, head: Head, planes: 
 
 @jit_inline
 def speeds(cells: FloatArray, n: int, k: int, beam: Beam, track: Track, normal: Three) -> None:
-    """Speed of the body along the normal."""
+    """Compute the speed of the body along the normal."""
     epoch = -1
     speed = 0.0
     for i in range(n):
@@ -92,7 +92,7 @@ def speeds(cells: FloatArray, n: int, k: int, beam: Beam, track: Track, normal: 
 
 @jit_inline
 def turnings(cells: FloatArray, n: int, k: int, beam: Beam, track: Track) -> None:
-    """Speed along the normal of the point by the body's turning."""
+    """Compute the speed of the point along the normal due to the body's rotation."""
     for i in range(n):
         at = locate_epoch(track.time_ns, beam.time_ns[k + i] + round(track.latency_ns), beam.epoch[k + i])
         at = max(at, 0)
@@ -103,7 +103,7 @@ def turnings(cells: FloatArray, n: int, k: int, beam: Beam, track: Track) -> Non
 
 @jit_inline
 def own_variance(cells: FloatArray, n: int, k: int, beam: Beam, head: Head) -> None:
-    """M of range, footprint, scan angle and time (FORMULAS 6.2)."""
+    """Compute M due to range, footprint, scan angle and time (FORMULAS 6.2)."""
     longer, wider = 1.0 + head.value[SCALE], 1.0 + head.value[ENCODER_SCALE]
     for i in range(n):
         along = cells[ALONG, i]
@@ -118,15 +118,15 @@ def own_variance(cells: FloatArray, n: int, k: int, beam: Beam, head: Head) -> N
 
 @jit_inline
 def adjust_observations(cells: FloatArray, n: int, k: int, beam: Beam, head: Head, planes: Planes, at: int) -> None:
-    """Points as adjusted, l − Σ Bᵀ f / M in range and scan angle (FORMULAS 6.3), for all that columns are made of.
+    """Move the columns' quantities to the adjusted observations, l − Σ Bᵀ f / M in range and angle (FORMULAS 6.3).
 
-    What takes a point off its plane is an error of its range above all, and this stands in its coefficients, too: with
-    those as measured, Σ aᵀ p f has the expectation Σ (∂a/∂ρ) / (∂f/∂ρ), which for the range scale is the number of
-    rows, for the scan angle's scale Σ θ tan i. Where a million rows share a trajectory that is worth a few millimetres
-    that is several sigmas.
+    A point lies off its plane mainly because of an error of its range, and this error is in its coefficients, too: with
+    the coefficients as measured, Σ aᵀ p f has the expectation Σ (∂a/∂ρ) / (∂f/∂ρ), which for the range scale is the
+    number of rows, for the scan angle's scale Σ θ tan i. Where a million rows share a trajectory, this amounts to a few
+    millimetres, which are several sigmas.
 
-    The beam is taken to begin where its range does and to swing along a great circle. Where it does not, the small
-    part of the coefficients that errors of the angle leave is a little wrong.
+    The beam is assumed to begin where its range does and to swing along a great circle. Where it does not, the small
+    part of the coefficients that angle errors cause is slightly wrong.
     """
     first, second = vector_at(planes.first_e, at), vector_at(planes.second_e, at)
     longer, wider = 1.0 + head.value[SCALE], (1.0 + head.value[ENCODER_SCALE])
@@ -164,7 +164,7 @@ def adjust_observations(cells: FloatArray, n: int, k: int, beam: Beam, head: Hea
 def flown_variance(
     cells: FloatArray, n: int, k: int, beam: Beam, sigmas: Sigmas, normal: Three, rot_l_from_e: FloatArray
 ) -> None:
-    """M of a trajectory whose errors are taken as independent from return to return."""
+    """Add M due to a trajectory whose errors count as independent from return to return."""
     north, east, down = vector_at(rot_l_from_e, 0), vector_at(rot_l_from_e, 1), vector_at(rot_l_from_e, 2)
     by_n, by_e, by_d = dot(normal, north), dot(normal, east), dot(normal, down)
     q = beam.q_e_from_b
@@ -185,7 +185,7 @@ def flown_variance(
 
 @jit_inline
 def between(nodes: FloatArray, value: FloatArray, row: int, intensity: float) -> float:
-    """Return a row (d,) of a table at its nodes (d,), linear between them, level beyond the ends."""
+    """Interpolate a row (d,) of a table linearly between its nodes (d,), constant beyond the ends."""
     last = len(nodes) - 1
     if intensity >= nodes[last]:
         return float(value[row, last])
@@ -198,7 +198,7 @@ def between(nodes: FloatArray, value: FloatArray, row: int, intensity: float) ->
 
 @jit_inline
 def extra(cells: FloatArray, i: int, j: int, beam: Beam, head: Head, kind: int, argument: int) -> float:
-    """Return column of what is no parameter of the model."""
+    """Return an element of a column that is not a parameter of the model."""
     row, along = beam.rows[j], cells[ALONG, i]
     if kind == SLOT:
         return float(along) if row.return_number == argument else 0.0
@@ -224,7 +224,7 @@ def extra(cells: FloatArray, i: int, j: int, beam: Beam, head: Head, kind: int, 
 
 @jit_inline
 def column(cells: FloatArray, n: int, k: int, beam: Beam, head: Head, kind: int, argument: int, out: Any) -> None:
-    """One parameter's column (FORMULAS 5.2), as `swath.georef.scanner.jacobian.parameter_columns_e`."""
+    """Compute one parameter's column (FORMULAS 5.2), like `swath.georef.scanner.jacobian.parameter_columns_e`."""
     outer, value = matrix_at(head.outer, 0), head.value
     if kind == OMEGA:
         for i in range(n):
@@ -279,7 +279,7 @@ def column(cells: FloatArray, n: int, k: int, beam: Beam, head: Head, kind: int,
 
 @jit_inline
 def share_of(knots: Knots, before: int, after: int, t: int) -> float:
-    """Return where between its knots; 0 where there is one."""
+    """Return the position between two knots as a share; 0 if both are the same."""
     if after == before:
         return 0.0
     return float((t - knots.time_ns[before]) / (knots.time_ns[after] - knots.time_ns[before]))
@@ -289,7 +289,7 @@ def share_of(knots: Knots, before: int, after: int, t: int) -> float:
 def states_now(
     cells: FloatArray, n: int, k: int, beam: Beam, knots: Knots, before: int, after: int, normal: Three
 ) -> None:
-    """f gets what the states do now."""
+    """Add the effects of the current states to f."""
     state = knots.state
     shift = dot(normal, vector_at(state, before))
     shifted = dot(normal, vector_at(state, after))
@@ -304,7 +304,7 @@ def states_now(
 
 @jit_inline
 def walked(cells: FloatArray, n: int, walk: float) -> None:
-    """Variance of f by what the attitude does between knots: a bridge's, from one to the other."""
+    """Compute the variance of f due to the attitude's random walk between knots, as a bridge from one to the other."""
     for i in range(n):
         by, share = (cells[BODY_E, i], cells[BODY_E + 1, i], cells[BODY_E + 2, i]), cells[SHARE, i]
         cells[COMMON, i] = share * (1.0 - share) * walk * dot(by, by) if walk > 0.0 else 0.0
@@ -312,7 +312,7 @@ def walked(cells: FloatArray, n: int, walk: float) -> None:
 
 @jit_inline
 def of_states(cells: FloatArray, n: int, panel: FloatArray, c: int) -> None:
-    """The eight columns of the states, from column c on."""
+    """Fill the eight columns of the states, from column c on."""
     for i in range(n):
         share = cells[SHARE, i]
         rest = 1.0 - share
@@ -333,9 +333,9 @@ def fill(
     before: int,
     after: int,
 ) -> None:
-    """Columns (c + 1, n) of the rows from k on of one plane and pair of knots; f and M in ``cells``.
+    """Fill the columns (c + 1, n) of the rows from k on of one plane and pair of knots, and f and M in ``cells``.
 
-    ``active`` are the head's unknowns that these rows can have; rows that are no points are zero.
+    ``active`` are the head's unknowns that these rows can have; rows of returns without a point are zero.
     """
     beam, _, head, planes, knots, sigmas, track, rot_l_from_e = task
     n, states, normal = panel.shape[1], before >= 0, vector_at(planes.normal_e, at)

@@ -1,9 +1,9 @@
-"""The normal equations: planes and tie points are eliminated one by one, parameters and states remain (FORMULAS 6.4).
+"""Build and solve the normal equations of parameters and states; planes and tie points are eliminated (FORMULAS 6.4).
 
     S = N11 − Σ N12 N22⁻¹ N12ᵀ      b = b1 − Σ N12 N22⁻¹ b2      δ1 = −S⁻¹ b      δ2 = −N22⁻¹ (b2 + N12ᵀ δ1)
 
-A plane's three unknowns are two turns and an offset: its normal keeps its length exactly, as the hard constraint of
-ISO/TS 19159-2 Eq. 18 has it.
+A plane's three unknowns are two turns and an offset: its normal keeps its length exactly, in accordance with the hard
+constraint of ISO/TS 19159-2 Eq. 18.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from swath.georef.arrays import FloatArray, SingleArray
 from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
 from swath.georef.records import Int64Array
 
-FLOOR = 1e-12  # of a plane's or tie point's normal matrix: what lies below it is not determined and stays
+FLOOR = 1e-12  # of a plane's or tie point's normal matrix: smaller eigenvalues count as undetermined
 
 
 class NormalError(ValueError):
-    """Equations that cannot be solved; one line for the user."""
+    """Equations that cannot be solved; the message is one line for the user."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +36,7 @@ class Feature:
     """A plane or tie point in the normal equations.
 
     Attributes:
-        unknowns: (m,) it has to do with.
+        unknowns: (m,) that its observations contain.
         mixed: (m, 3) N12.
         inverse: (3, 3) N22⁻¹.
         right: (3,) b2.
@@ -50,7 +50,7 @@ class Feature:
 
 @dataclass(frozen=True, eq=False)
 class Extra:
-    """A row, divided by its sigma, on a plane's own unknowns: control on it, or that the plane itself is surveyed.
+    """A row, divided by its sigma, for a plane's own unknowns: from control on it or a survey of the plane.
 
     Attributes:
         plane: index.
@@ -71,12 +71,16 @@ class TrajectoryWeight:
     """The prior of the trajectory's states, in e.
 
     Attributes:
-        normal: (6k, 6k) its inverse.
-        rot_e_from_state: (6k, 6k) from north, east, down at each knot.
+        normal: (6k, 6k) inverse of its covariance.
+        rot_e_from_l: (k, 3, 3) from north, east, down at each knot.
     """
 
     def __init__(self, rows: Rows) -> None:
-        """NormalError where the prior's covariance is none."""
+        """Prepare the prior's normal matrix in e.
+
+        Raises:
+            NormalError: the prior's covariance is not positive definite.
+        """
         prior = rows.prior
         count = 0 if prior is None else len(prior.time_ns)
         self.rot_e_from_l = np.zeros((count, 3, 3))
@@ -95,19 +99,19 @@ class TrajectoryWeight:
             raise NormalError(text) from error
 
     def to_e(self, rows: FloatArray) -> FloatArray:
-        """Return states (6k, m) in north, east, down to e."""
+        """Rotate states (6k, m) from north, east, down to e."""
         split = rows.reshape(len(self.rot_e_from_l), 2, 3, -1)
         turned: FloatArray = (self.rot_e_from_l[:, np.newaxis] @ split).reshape(rows.shape)
         return turned
 
     def to_l(self, rows: FloatArray) -> FloatArray:
-        """And back."""
+        """Rotate states (6k, m) from e to north, east, down."""
         split = rows.reshape(len(self.rot_e_from_l), 2, 3, -1)
         turned: FloatArray = (self.rot_e_from_l.transpose(0, 2, 1)[:, np.newaxis] @ split).reshape(rows.shape)
         return turned
 
     def variances_l(self, covariance_e: FloatArray) -> FloatArray:
-        """Return (6k,) of north, east, down; states' covariance (6k, 6k) in e."""
+        """Return variances (6k,) in north, east, down, from the states' covariance (6k, 6k) in e."""
         count = len(self.rot_e_from_l)
         knot = np.arange(count)
         blocks = covariance_e.reshape(count, 2, 3, count, 2, 3)
@@ -120,14 +124,14 @@ class TrajectoryWeight:
 
 @dataclass(frozen=True, eq=False)
 class Normals:
-    """Normal equations at a state.
+    """The normal equations at a state.
 
     Attributes:
-        free: (u, u) S of what was observed: without parameters' priors, with the trajectory's.
+        free: (u, u) S of the observations: without parameters' priors, with the trajectory's.
         normal, right: S and b, complete.
         planes, ties: features, eliminated.
         square: Σ p w² of all observations at the state.
-        observations: number of rows, pseudo-observations too.
+        observations: number of rows, including pseudo-observations.
         parameters: p, the first of u.
     """
 
@@ -150,7 +154,11 @@ class Normals:
         return done, _back(self.planes, done), _back(self.ties, done)
 
     def covariance(self) -> FloatArray:
-        """Return (u, u) S⁻¹; NormalError as above."""
+        """Return the covariance S⁻¹ (u, u).
+
+        Raises:
+            NormalError: a parameter is not determined.
+        """
         try:
             return inverted(self.normal)
         except np.linalg.LinAlgError as error:
@@ -160,7 +168,7 @@ class Normals:
 
     @cached_property
     def of_parameters(self) -> FloatArray:
-        """(p, p) normal matrix of the parameters without their priors, trajectory states eliminated."""
+        """Normal matrix (p, p) of the parameters without their priors, trajectory states eliminated."""
         p = self.parameters
         inner = self.free[p:, p:]
         if not len(inner):
@@ -178,14 +186,14 @@ def normals(
     tie_weight: SingleArray,
     huber: float,
 ) -> Normals:
-    """Return everything observed, at a state.
+    """Build the normal equations of all observations at a state.
 
     Args:
         rows, ties: observations.
         weight: of the trajectory's prior.
-        state: where they are linearised.
-        row_weight: (n,) of the rows on planes; tie_weight: one a sighting, in their order.
-        huber: as of `Rows.summed`.
+        state: state at which they are linearised.
+        row_weight: (n,) of the rows on planes; tie_weight: one per sighting, in their order.
+        huber: see `Rows.summed`.
     """
     sums = rows.summed(state, row_weight, huber)
     p = len(rows.unknowns)
@@ -219,7 +227,7 @@ def normals(
 
 
 def extras(rows: Rows, state: State) -> list[Extra]:
-    """Return rows of control on planes and of surveyed planes, at a state."""
+    """Return the rows of control on planes and of surveyed planes, at a state."""
     found = []
     rot = rows.flight.frame.rot_t_from_e
     firsts, seconds = tangents(state.normal_e)
@@ -260,7 +268,7 @@ def moved(state: State, step: tuple[FloatArray, FloatArray, FloatArray]) -> Stat
 
 
 def tie_share(seen: Seen, weight: float, huber: float) -> float:
-    """Return a sighting's weight: that given, times Huber's of its length in sigmas."""
+    """Return a sighting's weight, multiplied by Huber's weight for its misclosure in sigmas."""
     size = float(np.sqrt(seen.misclosure_e @ np.linalg.solve(seen.covariance_e, seen.misclosure_e) / 3.0))
     return weight * (huber / size if 0.0 < huber < size else 1.0)
 
@@ -268,7 +276,7 @@ def tie_share(seen: Seen, weight: float, huber: float) -> float:
 def _tied(
     ties: Ties, state: State, weights: SingleArray, normal: FloatArray, right: FloatArray, huber: float
 ) -> tuple[tuple[Feature, ...], float, int]:
-    """Tie points: what they add to N11 and b1, and they themselves; Σ p w², rows."""
+    """Add the tie points' sightings to N11 and b1; return the tie points as features, Σ p w² and the number of rows."""
     square, count = 0.0, 0
     by_tie: list[list[tuple[Seen, float]]] = [[] for _ in ties.ties]
     for seen, weight in zip(ties.seen(state), weights.tolist(), strict=True):
@@ -295,20 +303,20 @@ def _tied(
 
 
 def _add(normal: FloatArray, right: FloatArray, seen: Seen, inverse: FloatArray) -> None:
-    """A knot may be there twice, where it is the only one."""
+    """Add a sighting to N11 and b1; a knot may occur twice if it is the only one, hence `np.add.at`."""
     product = seen.design.T @ inverse
     np.add.at(normal, np.ix_(seen.unknowns, seen.unknowns), product @ seen.design)
     np.add.at(right, seen.unknowns, product @ seen.misclosure_e)
 
 
 def _back(features: Sequence[Feature], done: FloatArray) -> FloatArray:
-    """Return (q, 3) δ2."""
+    """Return the steps δ2 (q, 3) of features."""
     steps = [-one.inverse @ (one.right + one.mixed.T @ done[one.unknowns]) for one in features]
     return np.array(steps).reshape(-1, OF_PLANE)
 
 
 def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
-    """By Cholesky of the matrix scaled to unit diagonal: unknowns have units from metres to s²."""
+    """Solve by Cholesky; the matrix is scaled to unit diagonal, as unknowns have units from metres to s²."""
     if not len(matrix):
         return right
     scale = scales(matrix)
@@ -322,7 +330,7 @@ def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
 
 
 def _inverted(matrices: FloatArray) -> FloatArray:
-    """Of symmetric (…, 3, 3); what is not determined counts as known."""
+    """Invert symmetric matrices (…, 3, 3); undetermined directions count as known."""
     if not len(matrices):
         return matrices
     inverse: Any = np.linalg.pinv(matrices, rcond=FLOOR, hermitian=True)

@@ -1,12 +1,12 @@
-"""What a flight determines, decided by the reduced normal matrix: what it does not is held, and said in plain words.
+"""Decide from the reduced normal matrix which parameters a flight determines; hold the others, and explain why.
 
-Each parameter is known beforehand to what is plausible of it. One of which the flight tells next to nothing beyond
-that is held. What the flight tells in part is estimated, with its start as an observation of that sigma: held, it
-would leave its error in all that looks like it, as a scan angle scale does in the range offset. Whether what comes out
-is good enough is for the verdict to say. Which of several that look alike is held is a matter of physics, not of
-numbers: the boresight stays as long as possible, then what the other errors of a scanner are usually made of (`RULES`,
-from its top). The known sets are those of FORMULAS 5.5, by their effects on the ground (Skaloud and Lichti 2006; Filin
-2003).
+Before the calibration each parameter is known to its plausible sigma. A parameter is held if the flight adds almost
+nothing to that. A parameter that the flight determines in part is estimated, with its start as an observation of that
+sigma: if it were held, its error would remain in all parameters with similar effects, as that of a scan angle scale
+would in the range offset. Whether the result is good enough is decided by the verdict. If several parameters have
+similar effects, physics decides which is held, not numbers: the boresight is kept as long as possible, then the usual
+errors of scanners (`RULES`, from its top). The known sets are those of FORMULAS 5.5, by their effects on the ground
+(Skaloud and Lichti 2006; Filin 2003).
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ from swath.calib.outcome import FixedParameter
 from swath.georef.arrays import FloatArray
 from swath.georef.scanner.calibration import INDEX, PARAMETERS
 
-ALIKE = 0.8  # from here on two parameters take each other's errors
-NOTHING = 300.0  # sigma in plausible sizes that is as good as none
-_WEAK = 1e-3  # 1 / plausible sizes: as little is known of each, so that nothing is singular, for what people are told
-NOTHING_TOLD = 0.95  # of what is plausible: a flight that leaves so much of it tells nothing
-WEAK = 0.3  # of what is plausible: what is known better needs no start beside it
+ALIKE = 0.8  # correlation above which two parameters absorb each other's errors
+NOTHING = 300.0  # sigma in plausible sizes; larger ones count as infinite
+_WEAK = 1e-3  # 1 / plausible sizes: a weak prior for all, so that the matrix for the explanations is not singular
+NOTHING_TOLD = 0.95  # of the plausible sigma; a flight that leaves more than this adds nothing
+WEAK = 0.3  # of the plausible sigma; below, the start is not needed as an observation
 
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """When a parameter counts as determined, and what to do where it is not.
+    """A parameter's plausible error, and what to do where the flight does not determine it.
 
     Attributes:
-        plausible: what it may be off by before the calibration, one sigma, SI.
+        plausible: its error before the calibration, one sigma, SI.
         looks: its effect on the ground, in words.
-        remedy: what would determine it.
+        remedy: flight lines or control that would determine it.
     """
 
     plausible: float
@@ -55,7 +55,7 @@ def _plausible(name: str) -> float:
     return PARAMETERS[INDEX[name]].plausible
 
 
-RULES: Mapping[str, Rule] = {  # by how long it is kept: the last is held first
+RULES: Mapping[str, Rule] = {  # in the order in which they are kept: the last is held first
     "omega_rad": Rule(
         _plausible("omega_rad"), "it tilts the swath", "fly a line and the same line in the opposite direction"
     ),
@@ -125,7 +125,7 @@ RULES: Mapping[str, Rule] = {  # by how long it is kept: the last is held first
 }
 _OTHER = Rule(1.0, "", "")
 
-PAIRS: Mapping[frozenset[str], str] = {  # what tells two apart, where it is more than what determines the one
+PAIRS: Mapping[frozenset[str], str] = {  # remedies that separate two parameters, where more is needed than for one
     frozenset(("omega_rad", "scan_angle_offset_rad")): "none is needed: they are one and the same turn",
     frozenset(("phi_rad", "scan_plane_tilt_rad")): "only a much wider swath: their difference grows as 1/cos θ",
     frozenset(("kappa_rad", "pitch_slope")): "nothing but a bench measurement of the mirror",
@@ -142,7 +142,7 @@ PAIRS: Mapping[frozenset[str], str] = {  # what tells two apart, where it is mor
 
 @dataclass(frozen=True)
 class Rules:
-    """By what is decided.
+    """The rules of a decision.
 
     Attributes:
         table: rules by parameter, most wanted first.
@@ -151,11 +151,11 @@ class Rules:
     table: Mapping[str, Rule] = field(default_factory=lambda: RULES)
 
     def of(self, name: str) -> Rule:
-        """Of an unknown by its name, as ``left.ibrc.3``."""
+        """Return the rule of an unknown by its name, as ``left.ibrc.3``."""
         return self.table.get(kind_of(name), _OTHER)
 
     def rank(self, name: str) -> int:
-        """Return how soon it is given up: the largest first."""
+        """Return the rank of an unknown; the one with the largest rank is given up first."""
         kinds = list(self.table)
         kind = kind_of(name)
         return kinds.index(kind) if kind in self.table else len(kinds)
@@ -165,8 +165,9 @@ RULES_OF_ALL = Rules()
 
 
 def kind_of(name: str) -> str:
-    """Return ``left.omega_rad`` → ``omega_rad``; ``left.ibrc.3`` → ``ibrc``; ``left.beam.12.range_m`` →
-    ``beam.range_m``.
+    """Return the kind of a name: ``left.omega_rad`` → ``omega_rad``; ``left.ibrc.3`` → ``ibrc``.
+
+    Likewise ``left.beam.12.range_m`` → ``beam.range_m``.
     """
     _, *rest = name.split(".")
     if len(rest) == 3:
@@ -180,20 +181,20 @@ def decide(
     prior_sigmas: FloatArray | None = None,
     rules: Rules = RULES_OF_ALL,
 ) -> tuple[tuple[FixedParameter, ...], dict[str, float]]:
-    """Return which unknowns are to be held, and which are to be estimated with their start as an observation.
+    """Return the unknowns to hold, and those to estimate with their start as an observation.
 
-    The worst is held and all is reckoned anew, until every other is determined; at last those that are determined
-    after all come back, unless they would take the place of one that is held.
+    The worst is held and everything is computed again, until all others are determined; finally those that are
+    determined after all are released, unless they would replace one that is held.
 
     Args:
-        normal: (u, u) reduced normal matrix of the parameters: trajectory, planes and ties eliminated, their own
-            priors left out.
+        normal: (u, u) reduced normal matrix of the parameters: trajectory, planes and ties eliminated, their own priors
+            left out.
         names: (u,) as ``left.omega_rad``.
-        prior_sigmas: (u,) of the user's priors, inf: none; what has one is never held.
+        prior_sigmas: (u,) of the user's priors, inf: no prior; a parameter with a prior is never held.
         rules: sizes and limits.
 
     Returns:
-        What is held, in the order of the names; of what is only weakly determined, one sigma of its start by name.
+        The held unknowns, in the order of the names; and by name, one sigma of the start of weakly determined ones.
     """
     case = _Case(normal, names, prior_sigmas, rules)
     case.hold_the_worst()
@@ -202,10 +203,10 @@ def decide(
 
 
 class _Case:
-    """A decision under way; sigmas are in plausible sizes.
+    """A decision in progress; sigmas are in plausible sizes.
 
     Attributes:
-        partner: of every unknown held so far: the one it was given up for; −1: none.
+        partner: for every unknown held so far: the one for which it was given up; −1: none.
     """
 
     def __init__(self, normal: FloatArray, names: Sequence[str], prior_sigmas: FloatArray | None, rules: Rules) -> None:
@@ -213,7 +214,7 @@ class _Case:
         size = np.array([rules.of(name).plausible for name in names])
         self._size = size
         self._rank = np.array([rules.rank(name) for name in names])
-        # two heads of one aircraft share its trajectory's errors: that makes them alike, and neither undetermined
+        # two heads of one aircraft share its trajectory's errors: that correlates them, but leaves both determined
         heads = np.array([name.partition(".")[0] for name in names])
         self._of_one_head = heads[:, np.newaxis] == heads
         sigmas = np.full(len(names), np.inf) if prior_sigmas is None else np.asarray(prior_sigmas, dtype=np.float64)
@@ -225,7 +226,7 @@ class _Case:
         self.partner: dict[int, int] = {}
 
     def hold_the_worst(self) -> None:
-        """Until what is left is determined."""
+        """Hold unknowns, the worst first, until all others are determined."""
         while True:
             active = self._active()
             sigma, rho = self._figures(active)
@@ -235,7 +236,7 @@ class _Case:
             self.partner[at[0]] = at[1]
 
     def take_back(self) -> None:
-        """What is determined beside all others after all, the most wanted first."""
+        """Release the held unknowns that are determined beside all others after all, the most wanted first."""
         for at in sorted(self.partner, key=lambda index: int(self._rank[index])):
             if self.partner[at] in self.partner:
                 continue
@@ -244,7 +245,10 @@ class _Case:
                 del self.partner[at]
 
     def told(self, at: int) -> FixedParameter:
-        """In words, beside what it was given up for: where that is held as well, it alone would look determined."""
+        """Describe a held unknown in words, with those for which it was given up counted as free.
+
+        If they were held as well, it would look determined.
+        """
         free, other = set(self._active()), at
         while other in self.partner and other not in free:
             free.add(other)
@@ -265,7 +269,7 @@ class _Case:
         return [at for at in range(len(self._names)) if at not in self.partner]
 
     def weak(self) -> dict[str, float]:
-        """Return, of what is estimated, what its start helps to determine: one sigma of it by name, SI."""
+        """Return by name, for estimated unknowns that need their start as an observation, its sigma, SI."""
         active = self._active()
         sigma, _ = self._figures(active)
         return {
@@ -275,7 +279,7 @@ class _Case:
         }
 
     def _figures(self, active: list[int], information: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
-        """Return sigmas in plausible sizes, correlations with a zero diagonal."""
+        """Return sigmas in plausible sizes, and correlations with a zero diagonal."""
         part = (self._information if information is None else information)[np.ix_(active, active)]
         root = np.sqrt(np.diag(part))
         covariance = np.linalg.inv(part / np.outer(root, root)) / np.outer(root, root) if active else part
@@ -289,9 +293,9 @@ class _Case:
         return found
 
     def _next(self, active: list[int], sigma: FloatArray, rho: FloatArray) -> tuple[int, int] | None:
-        """Return the unknown to hold, and for which; None: all are determined.
+        """Return the unknown to hold, and the one for which it is held; None: all are determined.
 
-        Of the worst and of those that look like it, the least wanted; of equals the worse one.
+        Among the worst and those with similar effects, the least wanted is held; of equal ranks the worse one.
         """
         open_ = ~self._determined(active, sigma)
         if not open_.any():
@@ -327,7 +331,10 @@ class _Case:
 
 
 def _positive(normal: FloatArray, size: FloatArray) -> FloatArray:
-    """Return the normal matrix in plausible sizes, without what rounding made negative: it would pass for knowledge."""
+    """Return the normal matrix in plausible sizes, without eigenvalues that rounding made negative.
+
+    Such eigenvalues would count as information.
+    """
     scaled = np.asarray(normal, dtype=np.float64) * np.outer(size, size)
     root = np.sqrt(np.maximum(np.diag(scaled), 0.0))
     divisor = np.outer(root, root) + (np.outer(root, root) == 0.0)
@@ -337,8 +344,9 @@ def _positive(normal: FloatArray, size: FloatArray) -> FloatArray:
 
 
 def spectrum(normal: FloatArray) -> FloatArray:
-    """Return (u,) eigenvalues of the normal matrix scaled to unit diagonal, rising; near 0: a combination nobody
-    sees.
+    """Return the eigenvalues (u,) of the normal matrix scaled to unit diagonal, rising.
+
+    An eigenvalue near 0 belongs to a combination that no observation shows.
     """
     root = np.sqrt(np.maximum(np.diag(normal), 0.0))
     divisor = np.where(root > 0.0, root, 1.0)

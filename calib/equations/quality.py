@@ -1,9 +1,9 @@
-"""How good an adjustment is: residuals and their redundancy, group by group, control point by point (FORMULAS 6.5).
+"""Assess an adjustment: residuals and their redundancy, by group and by control point (FORMULAS 6.5).
 
 Residuals are those of the misclosures, e = −(w + A δ) at the last linearisation; r = 1 − A Q Aᵀ / M with the cofactors
-of parameters, trajectory states and features together (Baarda 1968; Förstner 1979 for groups). M is all that a return
-errs by, also what it has in common with the others of its moment; what of A Q Aᵀ counts then is said in
-`swath.calib.equations.sums.inspect`.
+of parameters, trajectory states and features together (Baarda 1968; Förstner 1979 for groups). M covers all errors of a
+return, also those that it shares with the other returns of its moment; `swath.calib.equations.sums.inspect` explains
+which part of A Q Aᵀ then counts.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from swath.calib.equations.tie_rows import Seen, Ties
 from swath.calib.outcome import ControlFit, GroupFit, Residuals, TrajectoryFit
 from swath.georef.arrays import FloatArray, SingleArray
 
-BLOCK = 1 << 20  # residuals summed up at a time
+BLOCK = 1 << 20  # residuals that are summed at a time
 
 
 @dataclass(frozen=True, eq=False)
 class Quality:
-    """Of an adjustment.
+    """The quality of an adjustment.
 
     Attributes:
-        residuals, groups, control: as of `swath.calib.outcome.Adjusted`.
+        residuals, groups, control: see `swath.calib.outcome.Adjusted`.
         square, redundancy: Σ p e², and its expectation.
         least_detectable: by name.
     """
@@ -45,11 +45,11 @@ class Quality:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """A converged adjustment, for what is asked of it.
+    """A converged adjustment, with the matrices that its assessment needs.
 
     Attributes:
         rows, ties, trajectory: observations.
-        state: at which the equations stand.
+        state: state at which the equations are linearised.
         normals: equations; covariance: (u, u) of parameters and states.
         row_weight, tie_weight: of rows and sightings; 0: rejected.
     """
@@ -65,12 +65,12 @@ class Solution:
 
     @property
     def parameters(self) -> FloatArray:
-        """(p, p) covariance of the parameters."""
+        """Covariance (p, p) of the parameters."""
         return self.covariance[: self.normals.parameters, : self.normals.parameters]
 
 
 def examine(solution: Solution) -> Quality:
-    """Return all of it; one pass over the rows."""
+    """Compute the quality of a solution in one pass over the rows."""
     on_planes, detectable = _on_planes(solution)
     on_ties, tie_square = _on_ties(solution)
     controls = _controls(solution)
@@ -88,7 +88,7 @@ def examine(solution: Solution) -> Quality:
 
 
 def trajectory_fit(solution: Solution) -> TrajectoryFit | None:
-    """Return corrections of the trajectory, in north, east, down."""
+    """Return the estimated corrections of the trajectory in north, east, down; None without a prior."""
     prior, p = solution.rows.prior, solution.normals.parameters
     if prior is None:
         return None
@@ -124,7 +124,7 @@ def _on_planes(solution: Solution) -> tuple[Residuals, dict[str, float]]:
 
 
 def _room(group: str, count: int) -> Residuals:
-    """Single precision: ten million rows take a third of a gigabyte."""
+    """Allocate residuals in single precision: ten million rows take a third of a gigabyte."""
     single: list[Any] = [np.zeros(count, np.float32) for _ in range(5)]
     feature: Any = np.zeros(count, np.int32)
     swath: Any = np.zeros(count, np.int32)
@@ -132,20 +132,20 @@ def _room(group: str, count: int) -> Residuals:
 
 
 def _typical(errors: FloatArray) -> float:
-    """Return median of those that are found at all."""
+    """Return the median of the finite values; inf if there are none."""
     found = errors[np.isfinite(errors)]
     return float(np.median(found)) if len(found) else float("inf")
 
 
 def _of_feature(covariance: FloatArray, feature: Feature) -> tuple[FloatArray, FloatArray]:
-    """Return cofactors of a feature's unknowns with its own (m, 3), of its own (3, 3)."""
+    """Return the cofactors of a feature's unknowns with its own parameters (m, 3), and of the latter (3, 3)."""
     half = feature.mixed @ feature.inverse
     mixed = -covariance[np.ix_(feature.unknowns, feature.unknowns)] @ half
     return mixed, feature.inverse - half.T @ mixed
 
 
 def _cofactors(solution: Solution, batch: Batch, known: Sequence[tuple[FloatArray, FloatArray]]) -> FloatArray:
-    """Return (g, c, c) of the runs' columns; known: of all planes `_of_feature`."""
+    """Return the cofactors (g, c, c) of the runs' columns; ``known`` holds `_of_feature` of all planes."""
     made = [_cofactor(solution, run, *known[run.plane]) for run in batch.runs]
     widest = max(len(one) for one in made)
     table = np.zeros((len(made), widest, widest))
@@ -170,11 +170,11 @@ def _cofactor(solution: Solution, run: Run, mixed: FloatArray, own: FloatArray) 
 
 
 def _on_ties(solution: Solution) -> tuple[Residuals, float]:
-    """And Σ eᵀ W e, for a sighting's coordinates are correlated."""
+    """Return the residuals of sightings, and Σ eᵀ W e, because the coordinates of a sighting are correlated."""
     ties, square = solution.ties, 0.0
     rot = ties.rows.flight.frame.rot_t_from_e
     columns: list[tuple[FloatArray, ...]] = []
-    where, weights = [], solution.tie_weight.tolist()  # of single precision the sum would be, too, which no JSON takes
+    where, weights = [], solution.tie_weight.tolist()  # Python floats: a sum of float32 cannot be written as JSON
     for (tie, sighting), seen, weight in zip(ties.order, ties.seen(solution.state), weights, strict=True):
         where += [(tie, sighting.swath, sighting.at)] * 3
         if seen is None:
@@ -193,7 +193,7 @@ def _on_ties(solution: Solution) -> tuple[Residuals, float]:
 
 
 def _tie_spread(solution: Solution, seen: Seen) -> FloatArray:
-    """Return (3, 3) A Q Aᵀ of a sighting."""
+    """Return A Q Aᵀ (3, 3) of a sighting."""
     feature = solution.normals.ties[seen.tie]
     mixed, own = _of_feature(solution.covariance, feature)
     inner = solution.covariance[np.ix_(seen.unknowns, seen.unknowns)]
@@ -210,7 +210,7 @@ class _Controls:
 
 
 def _controls(solution: Solution) -> _Controls:
-    """Return rows of control on planes, of surveyed planes and of surveyed tie points."""
+    """Return the residuals and fits of control on planes, of surveyed planes and of surveyed tie points."""
     columns, where, fits = [], [], []
     for extra in extras(solution.rows, solution.state):
         feature = solution.normals.planes[extra.plane]
@@ -241,7 +241,10 @@ def _controls(solution: Solution) -> _Controls:
 
 
 def _control_fit(solution: Solution, extra: Extra, mixed: FloatArray, free: float) -> ControlFit:
-    """Return a point on a plane, with what leaving it out would change: δ₋ᵢ − δ = Q Aᵢᵀ w / r, all in sigmas."""
+    """Return the fit of a control point on a plane, with the change that leaving it out would cause.
+
+    That change is δ₋ᵢ − δ = Q Aᵢᵀ w / r, in sigmas.
+    """
     plane = solution.rows.planes[extra.plane]
     change = np.zeros(solution.rows.size)
     change[solution.normals.planes[extra.plane].unknowns] = mixed * (extra.misclosure / max(free, 1e-9))
@@ -256,7 +259,7 @@ def _control_fit(solution: Solution, extra: Extra, mixed: FloatArray, free: floa
 
 
 def _pseudo(solution: Solution) -> list[GroupFit]:
-    """Return priors of parameters and of the trajectory, as groups of observations."""
+    """Return the priors of parameters and of the trajectory as groups of observations."""
     p, values = solution.normals.parameters, solution.state.values
     design, misclosure = solution.rows.unknowns.pseudo(values)
     used = float(np.einsum("ij,jk,ik->", design, solution.parameters, design))
@@ -268,7 +271,7 @@ def _pseudo(solution: Solution) -> list[GroupFit]:
 
 
 def _fit(residuals: Residuals, square: float | None) -> GroupFit:
-    sums = np.zeros(5)  # observations that were kept, redundancy, Σ p (e / σ)², Σ e², rejected
+    sums = np.zeros(5)  # kept observations, redundancy, Σ p (e / σ)², Σ e², rejected
     for begin in range(0, len(residuals.weight), BLOCK):
         mine = slice(begin, begin + BLOCK)
         kept = residuals.weight[mine] > 0.0
@@ -282,6 +285,6 @@ def _fit(residuals: Residuals, square: float | None) -> GroupFit:
 
 
 def _group(name: str, count: int, redundancy: float, square: float, rms: float, rejected: int = 0) -> GroupFit:
-    """Return its variance component Σ p e² / Σ r (Förstner 1979)."""
+    """Return the fit of a group with its variance component Σ p e² / Σ r (Förstner 1979)."""
     factor = square / redundancy if redundancy > 1e-9 else 1.0
     return GroupFit(name, count, redundancy, factor, rms, rejected)

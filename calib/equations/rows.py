@@ -1,9 +1,9 @@
-"""The observations of an adjustment in the order in which they are gone through, and the passes over them.
+"""Order the observations of an adjustment on planes, and run the passes over them.
 
-Returns are taken swath by swath and plane by plane, in runs of one plane between two knots of the trajectory's states:
-all rows of a run have the same unknowns. A pass places the returns of some runs at once, with the calibrations of the
-moment, and sums them up or looks at them (`swath.calib.equations.kernels`); nothing of a row is kept but what a report
-needs.
+Returns are processed swath by swath and plane by plane, in runs of one plane between two knots of the trajectory's
+states: all rows of a run have the same unknowns. A pass places the returns of some runs at once, with the current
+calibrations, and sums them up or inspects them (`swath.calib.equations.kernels`); it keeps only those values of a row
+that a report needs.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from swath.georef.records import Int64Array
 from swath.georef.scanner.calibration import Calibration
 from swath.georef.scanner.sensor_model import SensorModel
 
-BATCH = 16_384  # returns placed at once: what is known of them stays in the second cache
+BATCH = 16_384  # returns placed at once; their data fit into the second-level cache
 SECOND_NS = 1e9
 _NO_SIGMAS = Sigmas(np.zeros((0, 3)), np.zeros((0, 3)))
 _NO_LOOKS = RowDiagnostics(np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0), np.zeros((0, 0, 0)), np.zeros((0, 0)))
@@ -42,13 +42,13 @@ _NO_LOOKS = RowDiagnostics(np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0), n
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Everything an adjustment estimates, as it stands.
+    """The current values of all unknowns of an adjustment.
 
     Attributes:
         values: (p,) of the parameters.
         knots: (k, 6) trajectory errors: shift (m) and small turn (rad), both along the axes of e.
         normal_e, offset: (q, 3), (q,) planes: n · (x − centre) + offset = 0.
-        ties_e: (m, 3) tie points from their first sighting.
+        ties_e: (m, 3) tie points relative to their first sighting.
     """
 
     values: FloatArray
@@ -63,11 +63,11 @@ class Run:
     """Returns of one swath on one plane between two knots.
 
     Attributes:
-        plane, swath: indexes; of what is no plane (a tie point's axis) −1.
+        plane, swath: indexes; plane is −1 for an axis of a tie point.
         at: (n,) returns.
         before, after: knots; −1: none.
         channel: of a spinning head whose beams are estimated; −1: any.
-        each: returns that every one of them stands for.
+        each: number of real returns that each listed one represents.
     """
 
     plane: int
@@ -81,7 +81,7 @@ class Run:
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """Runs of one swath that are gone through at once; ``begin`` is where their rows stand among all."""
+    """Runs of one swath that are processed at once; ``begin`` is the position of their rows among all rows."""
 
     swath: int
     runs: tuple[Run, ...]
@@ -94,16 +94,16 @@ class Batch:
 
 
 class Rows:
-    """The returns on planes.
+    """The returns on planes, as rows of the adjustment.
 
     Attributes:
-        flight: with trajectories the kernels can read.
+        flight: with trajectories that the kernels can read.
         unknowns: parameters.
         prior: of the trajectory; None: its sigmas count as independent from return to return.
         planes: of the features.
         batches: in order.
-        count: rows.
-        lists: by plane, where its unknowns stand: all parameters, then six a knot its returns lie at.
+        count: number of rows.
+        lists: by plane, positions of its unknowns: all parameters, then six for each knot next to its returns.
     """
 
     def __init__(
@@ -120,7 +120,7 @@ class Rows:
         self._first = np.cumsum([0, *(len(at) for at in self.lists)])
 
     def thinned(self, step: int) -> Rows:
-        """Return the same with one return in so many of each run: enough to come near."""
+        """Return the rows of every ``step``-th return of each run, enough for an approximate solution."""
         less = copy(self)
         runs: list[list[Run]] = [[] for _ in self.flight.swaths]
         for batch in self.batches:
@@ -130,7 +130,7 @@ class Rows:
         return less
 
     def with_noise(self, shares: FloatArray) -> Rows:
-        """Return the same with shares (h,) of the noise that heads are said to have."""
+        """Return the same rows with shares (h,) of the heads' configured noise."""
         quieter = copy(self)
         heads = tuple(
             replace(head, noise=head.noise.times(share))
@@ -140,14 +140,14 @@ class Rows:
         return quieter
 
     def weights(self) -> SingleArray:
-        """Return (n,) how many returns each row stands for."""
+        """Return the number (n,) of returns that each row represents."""
         runs = [run for batch in self.batches for run in batch.runs]
         lengths = [len(run.at) for run in runs]
         return np.repeat(np.array([run.each for run in runs], np.float32), np.array(lengths, np.int64))
 
     @property
     def no_sums(self) -> Sums:
-        """For passes that do not sum up."""
+        """Empty sums, for passes that do not sum up."""
         nothing = np.zeros(0)
         return Sums(
             np.zeros((0, 0)),
@@ -162,22 +162,22 @@ class Rows:
 
     @property
     def size(self) -> int:
-        """Unknowns that are not of one plane: parameters and trajectory states."""
+        """Number of unknowns that do not belong to a single plane: parameters and trajectory states."""
         return len(self.unknowns) + (0 if self.prior is None else 6 * len(self.prior.time_ns))
 
     def start(self, ties: int = 0) -> State:
-        """Before the first step; tie points where they were seen first."""
+        """Return the state before the first step; tie points are at their first sighting."""
         normals = np.array([plane.normal_t for plane in self.planes]).reshape(-1, 3) @ self.flight.frame.rot_t_from_e
         knots = np.zeros((0 if self.prior is None else len(self.prior.time_ns), 6))
         return State(self.unknowns.first, knots, normals, np.zeros(len(self.planes)), np.zeros((ties, 3)))
 
     def summed(self, state: State, weight: SingleArray, huber: float) -> Sums:
-        """Return normal equations at a state.
+        """Return the normal equations at a state.
 
         Args:
-            state: where they are linearised.
+            state: state at which they are linearised.
             weight: (n,) of the rows.
-            huber: rows whose |f| / √(M + c) is larger lose weight; 0: none does.
+            huber: rows whose |f| / √(M + c) is larger lose weight; 0: all keep theirs.
         """
         sums = self._new_sums()
         for batch, task in self._tasks(state):
@@ -188,11 +188,12 @@ class Rows:
     def looks(
         self, state: State, cofactors: Any = None, weight: SingleArray | None = None
     ) -> Iterator[tuple[Batch, RowDiagnostics]]:
-        """Yield batch by batch f and M of each row, and A Q Aᵀ (as `swath.calib.equations.sums.inspect` has them).
+        """Yield each batch with f and M of its rows, and A Q Aᵀ (see `swath.calib.equations.sums.inspect`).
 
         Args:
-            state: at which.
-            cofactors: of a batch's runs, Q (g, c, c) of their columns; None: instead rows of the design are given.
+            state: state at which the rows are evaluated.
+            cofactors: function that returns Q (g, c, c) of the columns of a batch's runs; None: rows of the design are
+                returned instead of A Q Aᵀ.
             weight: (n,) of the rows; None: 1.
         """
         sums = self.no_sums
@@ -210,12 +211,12 @@ class Rows:
             yield batch, looks
 
     def placed(self, state: State) -> Iterator[BeamTable]:
-        """Yield batch by batch the returns with their axes."""
+        """Yield the returns with their axes, batch by batch."""
         for _, task in self._tasks(state):
             yield task.beam
 
     def expansion(self, run: Run, normal_e: FloatArray) -> tuple[Int64Array, FloatArray]:
-        """Return unknowns (m,) behind a run's columns without the plane's own, and how they are in them: (m, c)."""
+        """Return the unknowns (m,) of a run's columns without the plane's own, and their share (m, c) in these."""
         at, kinds, arguments = self.unknowns.of_head(self.flight.swaths[run.swath].head)
         if run.channel >= 0:
             mine = ~np.isin(kinds, list(BEAM_PARTS.values())) | (arguments == run.channel)
@@ -233,7 +234,7 @@ class Rows:
         return np.concatenate([at, np.array(knots, dtype=np.int64)]), table
 
     def knots_at(self, swath: Swath, time_ns: Int64Array) -> tuple[Int64Array, Int64Array]:
-        """Return knots before and after times (n,) of a swath: those of its strip; −1 without a prior."""
+        """Return the knots before and after times (n,) of a swath, among those of its strip; −1 without a prior."""
         if self.prior is None:
             none = np.full(len(time_ns), -1, dtype=np.int64)
             return none, none
@@ -248,16 +249,16 @@ class Rows:
         return knots[before], knots[after]
 
     def task(self, state: State, batch: Batch, planes: PlaneTable) -> Task:
-        """Return what the kernel is given of a batch of runs; the runs' planes may be other than the state's.
+        """Return the kernel's input for a batch of runs; the runs' planes may differ from the state's.
 
         Raises:
-            GeometryError: the calibration has what such a scanner has not.
+            GeometryError: the calibration has parameters that such a scanner does not have.
         """
         calibrations = self.unknowns.calibrations(state.values)
         return self._task(state, batch, planes, self._model(self.flight.swaths[batch.swath].head, calibrations))
 
     def plane_table(self, state: State) -> PlaneTable:
-        """Of the state's planes."""
+        """Return the table of the state's planes."""
         first, second = tangents(state.normal_e)
         centres = np.array([plane.centre_t for plane in self.planes]).reshape(-1, 3)
         return PlaneTable(state.normal_e, self.flight.frame.e_from_t(centres), first, second, state.offset)
@@ -275,7 +276,7 @@ class Rows:
         swath = self.flight.swaths[batch.swath]
         trajectory = self.flight.trajectories[swath.flown]
         at = np.concatenate([run.at for run in batch.runs])
-        rows = swath.rows.take(at)  # many times quicker than by index
+        rows = swath.rows.take(at)  # many times faster than indexing
         beam = beam_table(rows, rays_of(self.flight, swath, model, rows, at))
         knots = KnotTable(np.zeros(0, np.int64), state.knots, len(self.unknowns), np.zeros(0))
         if self.prior is not None:
@@ -312,7 +313,10 @@ class Rows:
         )
 
     def _lists(self) -> tuple[list[Int64Array], dict[tuple[int, int], int]]:
-        """By plane its unknowns; where a knot's states stand in them, in knots after the parameters."""
+        """Return the unknowns of each plane, and the position of each knot's states in them.
+
+        The position counts knots after the parameters.
+        """
         knots: list[dict[int, int]] = [{} for _ in self.planes]
         for batch in self.batches:
             for run in batch.runs:
@@ -348,7 +352,7 @@ def tangents(normal_e: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _pieces(before: Int64Array, after: Int64Array) -> Iterator[slice]:
-    """Yield runs of equal knots, none longer than a batch."""
+    """Yield slices with equal knots, none longer than a batch."""
     changes = np.flatnonzero((np.diff(before) != 0) | (np.diff(after) != 0)) + 1
     ends = [0, *changes.tolist(), len(before)]
     for begin, end in pairwise(ends):

@@ -1,4 +1,4 @@
-"""From observations to a solution: linearise, solve, move; robust first, then without what does not belong."""
+"""Solve an adjustment by iteration: linearise, solve, update; robustly at first, then without outliers."""
 
 from __future__ import annotations
 
@@ -21,26 +21,26 @@ from swath.calib.parameters import Unknowns
 from swath.georef.arrays import FloatArray, SingleArray
 from swath.georef.scanner.calibration import Calibration
 
-NOISE_TELLS = 1000.0  # redundancy from which on residuals say how much a scanner's returns scatter
-FEW = 1e-5  # of the rows: whether so many are rejected or not moves nothing
+NOISE_TELLS = 1000.0  # redundancy above which residuals show how much a scanner's returns scatter
+FEW = 1e-5  # of the rows; a change of so few rejections does not affect the result
 
 
 @dataclass(frozen=True)
 class Settings:
-    """How an adjustment goes about it.
+    """Settings of an adjustment.
 
     Attributes:
-        huber: misclosures above so many sigmas lose weight while blunders are looked for; 0: none does.
-        family: probability that any good observation is rejected; 0: nothing is.
-        tolerance: step at which it has converged, in sigmas, root of the mean square of parameters and states; the next
-            would be a hundredth of it.
-        iterations: at most, of each stage.
-        rounds: of rejecting and solving anew.
-        matchings: how often correspondences are found anew, at most.
+        huber: misclosures above this many sigmas lose weight while blunders are searched; 0: all keep theirs.
+        family: probability that any good observation is rejected; 0: no rejection.
+        tolerance: step at which the adjustment has converged, in sigmas, root of the mean square of parameters and
+            states; the next step would be a hundredth of it.
+        iterations: greatest number in each stage.
+        rounds: greatest number of rejections with a new solution.
+        matchings: greatest number of searches for correspondences.
         test_level: of the global test.
-        thin_above: with more rows the first steps are made with a part of them.
-        rules: what is decided to be observable by.
-        own_noise: where returns on planes scatter less than their sigmas say, they are weighed by what they scatter.
+        thin_above: with more rows, a part of them is used for the first steps.
+        rules: rules that decide which unknowns are observable.
+        own_noise: where returns on planes scatter less than their sigmas predict, weight them by their actual scatter.
     """
 
     huber: float = HUBER
@@ -72,22 +72,26 @@ class Block:
         prior: TrajectoryPrior | None,
         placed_with: Mapping[str, Calibration] | None,
     ) -> Block:
-        """Make that of what was observed; `NormalError` where the prior is none."""
+        """Create the block from a flight's observed features.
+
+        Raises:
+            NormalError: the prior's covariance has no inverse.
+        """
         rows = Rows(flight, features.planes, asked, prior)
         return cls(rows, Ties(rows, features.ties, placed_with), TrajectoryWeight(rows))
 
     def with_unknowns(self, asked: Unknowns) -> Block:
-        """Return the same observations."""
+        """Return the same observations with other unknowns."""
         rows = Rows(self.rows.flight, self.rows.planes, asked, self.rows.prior)
         return Block(rows, self.ties.of(rows), self.trajectory)
 
     def weights(self) -> tuple[SingleArray, SingleArray]:
-        """Of rows and sightings, before anything is rejected."""
+        """Return the weights of rows and sightings before any rejection."""
         sightings = sum(len(tie.sightings) for tie in self.ties.ties)
         return self.rows.weights(), np.ones(sightings, np.float32)
 
     def part(self, most: int) -> tuple[Block, tuple[SingleArray, SingleArray]]:
-        """Return every so many of the rows, each with the weight of those left out; itself where there are few."""
+        """Return a block with a part of the rows, each weighted for the omitted ones; itself if there are few rows."""
         rows, sightings = self.weights()
         if len(rows) <= most:
             return self, (rows, sightings)
@@ -96,22 +100,22 @@ class Block:
         return replace(self, rows=less), (step * less.weights(), sightings)
 
     def with_noise(self, shares: FloatArray) -> Block:
-        """Return the same observations with shares (h,) of the noise that the heads are said to have."""
+        """Return the same observations with shares (h,) of the heads' configured noise."""
         rows = self.rows.with_noise(shares)
         return Block(rows, self.ties.of(rows), self.trajectory)
 
     def normals(self, state: State, weights: tuple[SingleArray, SingleArray], huber: float = 0.0) -> Normals:
-        """At a state."""
+        """Return the normal equations at a state."""
         return normals(self.rows, self.ties, self.trajectory, state, *weights, huber)
 
     def start(self) -> State:
-        """Before the first step."""
+        """Return the state before the first step."""
         return self.rows.start(len(self.ties.ties))
 
 
 @dataclass(frozen=True, eq=False)
 class HeldEffects:
-    """Hold what parameters that are held do to an adjustment (Schmidt 1966: "consider" parameters).
+    """Effects of held parameters on an adjustment (Schmidt 1966: "consider" parameters).
 
     Attributes:
         by_unit: (u, c) change of each unknown per unit of each held parameter's error.
@@ -127,7 +131,7 @@ class HeldEffects:
     def at(
         cls, block: Block, state: State, weights: tuple[SingleArray, SingleArray], covariance: FloatArray
     ) -> HeldEffects:
-        """Return them at a solution, whose parameters and states have this covariance (n, n)."""
+        """Compute the effects at a solution, whose parameters and states have this covariance (n, n)."""
         asked = block.rows.unknowns
         p, c = len(asked), len(asked.considered)
         if not c:
@@ -145,7 +149,7 @@ class HeldEffects:
 
 @dataclass(frozen=True, eq=False)
 class Solved:
-    """What came out of it, and how often it was linearised."""
+    """A solution with its quality and the number of linearisations."""
 
     solution: Solution
     quality: Quality
@@ -153,22 +157,22 @@ class Solved:
     converged: bool
 
     def calibrations(self) -> dict[str, Calibration]:
-        """By scanner."""
+        """Return the calibrations by scanner."""
         return self.solution.rows.unknowns.calibrations(self.solution.state.values)
 
 
 def determined(block: Block, settings: Settings) -> Block:
-    """Without the unknowns that these observations, as they are expected to be, do not determine."""
+    """Return the block without the unknowns that these observations, by their expected accuracy, do not determine."""
     part, weights = block.part(settings.thin_above)
     return _without(block, part.normals(part.start(), weights), settings) or block
 
 
 def settled(block: Block, settings: Settings, before: Solved | None = None) -> Solved:
-    """Solved for what is determined, at the start and at the solution.
+    """Solve for the unknowns that are determined, both at the start and at the solution.
 
     Args:
-        block: observations, and all unknowns that were asked for.
-        settings: how.
+        block: observations, and all unknowns that were requested.
+        settings: settings of the adjustment.
         before: a solution with other correspondences, to start from.
 
     Raises:
@@ -184,9 +188,9 @@ def settled(block: Block, settings: Settings, before: Solved | None = None) -> S
 
 
 def solved(block: Block, settings: Settings, state: State) -> Solved:
-    """Robust until it stands still, then plainly without what the w-test rejects, until that is always the same.
+    """Iterate robustly until convergence, then without observations that the w-test rejects, until these stay the same.
 
-    Where rows are many, the robust steps are made with a part of them.
+    If there are many rows, the robust steps use a part of them.
     """
     part, taken = block.part(settings.thin_above)
     state, huber = moved(state, part.normals(state, taken).step()), settings.huber
@@ -203,7 +207,7 @@ def solved(block: Block, settings: Settings, state: State) -> Solved:
         if changed <= FEW * block.rows.count and huber == 0.0 and part is block:
             break
         weights, huber, part = chosen, 0.0, block
-        del solution, quality  # a third of a gigabyte of ten million rows, of which those to come need another
+        del solution, quality  # frees memory before it is needed again: a third of a gigabyte for ten million rows
         state, equations, more, converged = _iterated(block, settings, state, weights, 0.0)
         solution, quality = _examined(block, state, equations, weights)
         count += more
@@ -211,9 +215,10 @@ def solved(block: Block, settings: Settings, state: State) -> Solved:
 
 
 def noise_shares(residuals: Sequence[Residuals], flight: Flight) -> FloatArray:
-    """Return by head what share (h,) of their sigmas its returns on planes scatter; 1: as much or more, or few tell.
+    """Return by head the share (h,) of their sigmas that its returns on planes scatter, at most 1.
 
-    The root of the variance component Σ p e² / Σ r (Förstner 1979), three of its own sigmas up.
+    The share is the root of the variance component Σ p e² / Σ r (Förstner 1979), increased by three of its own sigmas;
+    it is 1 where the redundancy is too small.
     """
     shares = np.ones(len(flight.heads))
     for one in (one for one in residuals if one.group == "planes"):
@@ -236,7 +241,7 @@ def _examined(
 
 
 def _without(block: Block, equations: Normals, settings: Settings) -> Block | None:
-    """Return the block with what equations do not determine held, or observed at its start; None: nothing changes."""
+    """Return the block with undetermined unknowns held, or observed at their start; None if all are determined."""
     asked = block.rows.unknowns
     held, weak = decide(equations.of_parameters, asked.names, asked.given_sigmas, settings.rules)
     assumed = {item.name for item in asked.items if item.assumed}
@@ -248,7 +253,7 @@ def _without(block: Block, equations: Normals, settings: Settings) -> Block | No
 
 
 def _carried(before: Solution, block: Block) -> State:
-    """Return parameters and trajectory from another solution; planes and tie points as they are found now."""
+    """Return the start state with parameters and trajectory of another solution; planes and tie points are new."""
     state, names = block.start(), before.rows.unknowns.names
     old = dict(zip(names, before.state.values.tolist(), strict=True))
     new = zip(block.rows.unknowns.names, state.values.tolist(), strict=True)
@@ -259,7 +264,7 @@ def _carried(before: Solution, block: Block) -> State:
 def _iterated(
     block: Block, settings: Settings, state: State, weights: tuple[SingleArray, SingleArray], huber: float
 ) -> tuple[State, Normals, int, bool]:
-    """Until a step is less than the tolerance."""
+    """Iterate until a step is less than the tolerance."""
     for count in range(1, settings.iterations + 1):
         equations = block.normals(state, weights, huber)
         step = equations.step()
@@ -273,7 +278,7 @@ def _iterated(
 def _kept(
     residuals: Sequence[Residuals], before: tuple[SingleArray, SingleArray], settings: Settings
 ) -> tuple[SingleArray, SingleArray]:
-    """Return weights of rows and sightings by the w-test; what was rejected comes back where it fits."""
+    """Return weights of rows and sightings by the w-test; rejected observations that fit now are accepted again."""
     count = sum(len(one.normalised) for one in residuals)
     critical = w_critical(count, settings.family) if settings.family > 0.0 else np.inf
     rows, sightings = before

@@ -1,4 +1,4 @@
-"""Rows summed up to normal equations, or looked at one by one (FORMULAS 6.3 to 6.5)."""
+"""Sum rows up to normal equations, or inspect them one by one (FORMULAS 6.3 to 6.5)."""
 
 from __future__ import annotations
 
@@ -15,16 +15,18 @@ from swath.georef.geodesy.vectors import vector_at
 from swath.georef.records import Int64Array
 from swath.georef.scanner.kernels.types import Three
 
-PIECE = 256  # returns at once
+PIECE = 256  # returns processed at once
 MODE_SUM, MODE_LOOK, MODE_GIVE = whole(0), whole(1), whole(2)
 
 
 @jit_inline
 def weigh(cells: FloatArray, panel: FloatArray, weight: Any, huber: float, together: float) -> tuple[float, int]:
-    """Return rows times √(weight / (M + n c)); Huber's weight by f / √(M + c) where asked for (> 0). Returns Σ p f²,
-    how many count.
+    """Multiply rows by √(weight / (M + n c)), and by Huber's weight of f / √(M + c) if ``huber`` > 0.
 
-    An error c that n rows have in common counts to each as often: their mean then has the variance M / n + c.
+    An error c that n rows share counts n times for each of them: their mean then has the variance M / n + c.
+
+    Returns:
+        Σ p f², and the number of rows with a positive weight.
     """
     n, last, total, count = panel.shape[1], len(panel) - 1, 0.0, 0
     for i in range(n):
@@ -43,7 +45,7 @@ def weigh(cells: FloatArray, panel: FloatArray, weight: Any, huber: float, toget
 
 @jit_inline
 def add_up(total: FloatArray, more: FloatArray) -> None:
-    """Elementwise."""
+    """Add a matrix to another one, element by element."""
     for i in range(len(total)):
         for j in range(len(total)):
             total[i, j] += more[i, j]
@@ -51,8 +53,10 @@ def add_up(total: FloatArray, more: FloatArray) -> None:
 
 @jit_inline
 def spread_out(head: Head, knots: Knots, active: Int64Array, normal: Three, groups: Groups, g: int, table: Any) -> int:
-    """Return unknowns behind a group's columns: their number; in ``table`` where they stand, in the plane's list,
-    whence.
+    """Fill ``table`` with the unknowns of a group's columns, and return their number.
+
+    For each unknown the table holds its position among all unknowns, its position in the plane's list, its column, and
+    its factor.
     """
     to, place, source, factor = table
     m = len(active)
@@ -76,7 +80,7 @@ def spread_out(head: Head, knots: Knots, active: Int64Array, normal: Three, grou
 
 @jit_inline
 def put(sums: Sums, total: FloatArray, table: Any, m: int, columns: int, plane: int) -> None:
-    """A group's sums of products (c + 1, c + 1) to the unknowns they belong to."""
+    """Add a group's sums of products (c + 1, c + 1) to the sums of their unknowns."""
     to, place, source, factor = table
     f = columns + OF_PLANE
     first = sums.first[plane]
@@ -95,7 +99,7 @@ def put(sums: Sums, total: FloatArray, table: Any, m: int, columns: int, plane: 
 
 @jit_inline
 def give(k: int, cells: FloatArray, panel: FloatArray, looks: RowDiagnostics) -> None:
-    """Rows as they are."""
+    """Copy rows unchanged to the diagnostics."""
     for i in range(panel.shape[1]):
         looks.misclosure[k + i], looks.variance[k + i] = cells[MISCLOSURE, i], cells[VARIANCE, i]
         looks.along[k + i] = cells[ALONG, i]
@@ -114,16 +118,19 @@ def inspect(
     weight: Any,
     n: float,
 ) -> None:
-    """f, its variance M + c, and how much of that the estimated unknowns take away; ``cofactor`` is room.
+    """Compute f, its variance M + c, and the part of the variance that the estimated unknowns absorb.
 
-    n returns with c in common have the covariance V = M I + c 1 1ᵀ and weights P = I / (M + n c); what is fitted to one
-    has (A Q Aᵀ P V)ᵢᵢ = (M aᵢ Q aᵢ + n c aᵢ Q ā) / (M + n c) in common with it, ā the mean of their rows a. M + c less
-    that is the residual's variance where these weights are the best: exactly where all rows of a run are the same. Of
-    others, as by the place in a plane, the sum over all rows is exact if M + n c is the same in all; a single
-    residual's variance is off by a seventh at most (99 %) while c is below M / 3. ā is that of up to PIECE rows.
+    ``cofactor`` is working space.
+
+    n returns that share an error c have the covariance V = M I + c 1 1ᵀ and weights P = I / (M + n c); the fit to a
+    return shares (A Q Aᵀ P V)ᵢᵢ = (M aᵢ Q aᵢ + n c aᵢ Q ā) / (M + n c) with it, where ā is the mean of their rows a.
+    The residual's variance is M + c minus that if these weights are optimal: exactly so where all rows of a run are
+    equal. If they differ, for example by the place in a plane, the sum over all rows is exact if M + n c is the same
+    for all; the variance of a single residual is wrong by a seventh at most (99 %) while c is below M / 3. ā is the
+    mean of at most PIECE rows.
     """
     width, count = panel.shape
-    for c in range(width - 1):  # f itself has none
+    for c in range(width - 1):  # f itself has no column
         for other in range(width - 1):
             cofactor[c, other] = looks.cofactor[g, c, other]
     turned = np.dot(cofactor, panel)
@@ -147,7 +154,7 @@ def inspect(
 
 @jit_inline
 def counted(weight: Any, fate: Any, begin: int, end: int) -> float:
-    """Return how many rows of a run there are: those kept, each with those that it stands for."""
+    """Return the number of valid returns in a run, each row counted with the returns that it represents."""
     n = 0.0
     for k in range(begin, end):
         if fate[k] == 0:
@@ -157,7 +164,7 @@ def counted(weight: Any, fate: Any, begin: int, end: int) -> float:
 
 @jit_cached
 def accumulate(mode: int, task: Task, weight: FloatArray, huber: float, sums: Sums, looks: RowDiagnostics) -> None:
-    """A batch: MODE_SUM adds to ``sums``, MODE_LOOK and MODE_GIVE fill ``looks``."""
+    """Process a batch: MODE_SUM adds to ``sums``, MODE_LOOK and MODE_GIVE fill ``looks``."""
     groups, head, planes, knots = task.groups, task.head, task.planes, task.knots
     widest = len(head.kind) + STATES + OF_PLANE + 1
     cells, room = np.zeros((ROWS, PIECE)), np.zeros(widest * PIECE)

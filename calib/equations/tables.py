@@ -1,4 +1,4 @@
-"""What the loops over rows are given and fill, as tuples that numba knows by their names."""
+"""Inputs and outputs of the loops over rows, as named tuples that numba understands."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ STATES, OF_PLANE = 8, 3  # columns of a row
 
 
 class Beam(NamedTuple):
-    """The second half of `swath.georef.points.Rays` of a batch of one swath, vectors as columns, and its rows."""
+    """A batch's part of `swath.georef.points.Rays` of one swath, with vectors as columns, and its rows."""
 
     rows: StructArray
     fate: ByteArray
@@ -39,7 +39,7 @@ class Head(NamedTuple):
         value: (16,) of its calibration.
         outer: (1, 3, 3) Rx(ω) Ry(φ).
         spin_b: (1, 3) a spinning head's axis.
-        before_m: of the range that lies before the beam's start; nan: the start turns with the beam.
+        before_m: part of the range before the beam's start; nan: the start turns with the beam.
         nodes: (d,) intensities of its range correction; by_knot: (k, d) derivatives of that by its knots.
         range_m, angle_rad, time_s, divergence_rad: sigmas of a return, and its beam.
     """
@@ -60,7 +60,7 @@ class Head(NamedTuple):
 
 
 class Planes(NamedTuple):
-    """(q, 3) normals, centres and two directions in each plane, in e; (q,) offsets."""
+    """Planes in e: (q, 3) normals, centres and two directions in each plane; (q,) offsets."""
 
     normal_e: FloatArray
     centre_e: FloatArray
@@ -70,8 +70,13 @@ class Planes(NamedTuple):
 
 
 class Knots(NamedTuple):
-    """Trajectory states: (k,) times; (k, 6) shift and turn in e; where the first stands among all unknowns; (k,) rad²
-    that the attitude walks to the next knot.
+    """Trajectory states at knots.
+
+    Attributes:
+        time_ns: (k,).
+        state: (k, 6) shift and turn in e.
+        first: position of the first state among all unknowns.
+        walk: (k,) variance of the attitude's random walk to the next knot, rad².
     """
 
     time_ns: Int64Array
@@ -81,7 +86,12 @@ class Knots(NamedTuple):
 
 
 class Sigmas(NamedTuple):
-    """Of a trajectory whose errors are not estimated: (n, 3) north, east, down; roll, pitch, heading; none: (0, 3)."""
+    """Sigmas of a trajectory whose errors are not estimated; otherwise empty, (0, 3).
+
+    Attributes:
+        position_l: (n, 3) north, east, down.
+        attitude: (n, 3) roll, pitch, heading.
+    """
 
     position_l: FloatArray
     attitude: FloatArray
@@ -93,7 +103,7 @@ class Groups(NamedTuple):
     Attributes:
         begin, end: (g,) in the batch.
         plane, before, after: (g,) indexes; knots −1: none.
-        place_before, place_after: (g,) of the knots' states in the plane's own list of unknowns.
+        place_before, place_after: (g,) places of the knots' states in the plane's own list of unknowns.
         channel: (g,) −1: any.
     """
 
@@ -112,10 +122,10 @@ class Sums(NamedTuple):
 
     Attributes:
         normal, right: (u, u), (u,) of parameters and states.
-        mixed: (entries, 3) plane by plane, a row an unknown in the plane's list; first: (q,) where each begins.
+        mixed: (entries, 3) plane by plane, one row for each unknown in the plane's list; first: (q,) where each begins.
         plane, plane_right: (q, 3, 3), (q, 3).
         square: (1,) Σ p f².
-        counts: (1,) rows.
+        counts: (1,) number of rows.
     """
 
     normal: FloatArray
@@ -129,8 +139,15 @@ class Sums(NamedTuple):
 
 
 class RowDiagnostics(NamedTuple):
-    """Of each row of a batch (n,): f, M (looked at: with c, that of what it has in common with its run), n · beam, q =
-    A Q Aᵀ; Q (g, c, c) of the groups; the design (n, c + 1).
+    """Diagnostics of the rows (n,) of a batch.
+
+    Attributes:
+        misclosure: (n,) f.
+        variance: (n,) M; with MODE_LOOK M + c, where c is the variance of the error that a row shares with its run.
+        along: (n,) n · beam.
+        spread: (n,) A Q Aᵀ.
+        cofactor: (g, c, c) Q of the groups.
+        design: (n, c + 1).
     """
 
     misclosure: FloatArray
@@ -142,10 +159,10 @@ class RowDiagnostics(NamedTuple):
 
 
 class Task(NamedTuple):
-    """A batch of one swath: its returns, their runs, and what they are placed with.
+    """A batch of one swath: its returns, their runs, and the data that place them.
 
     Attributes:
-        rot_l_from_e: (3, 3) somewhere on the way; counts where the trajectory's own sigmas do.
+        rot_l_from_e: (3, 3) at one position on the way; used only where the trajectory's own sigmas count.
     """
 
     beam: Beam

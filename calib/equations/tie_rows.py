@@ -1,8 +1,8 @@
-"""Tie points as observations: where swaths show the same point (NGA Eq. 55 to 60; FORMULAS 7.1).
+"""Tie points as observations: places where swaths show the same point (NGA Eq. 55 to 60; FORMULAS 7.1).
 
-A sighting is F = x + (moved − placed) − X = 0, three rows in e: x where it was measured, in points as they were placed;
-``moved`` and ``placed`` where the return nearest to it lies with the calibration of the moment and with that of the
-measurement; X the tie point. The columns are those of three planes through the point, across the axes of e.
+A sighting is F = x + (moved − placed) − X = 0, three rows in e: x is its measured position in the points as placed;
+``moved`` and ``placed`` are the positions of the nearest return with the current calibration and with that of the
+measurement; X is the tie point. The columns are those of three planes through the point, perpendicular to e's axes.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from swath.georef.arrays import FloatArray
 from swath.georef.records import Int64Array
 from swath.georef.scanner.calibration import Calibration
 
-AT_ONCE = 4096  # sightings
+AT_ONCE = 4096  # sightings per kernel call
 
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """A sighting at a state.
+    """A sighting evaluated at a state.
 
     Attributes:
         tie, sighting: indexes.
@@ -50,7 +50,7 @@ class Ties:
 
     Attributes:
         ties: of the features.
-        first_e: (m, 3) where each was seen first: what a state's tie points count from.
+        first_e: (m, 3) position of each point's first sighting, the origin of a state's tie points.
     """
 
     def __init__(self, rows: Rows, ties: Sequence[TiePoint], placed_with: Mapping[str, Calibration] | None) -> None:
@@ -59,8 +59,8 @@ class Ties:
         Args:
             rows: of the adjustment, for its flight and unknowns.
             ties: points.
-            placed_with: calibrations by which the points were placed when they were measured; None: as the flight's
-                points stand.
+            placed_with: calibrations that placed the points when they were measured; None: the flight's points are
+                still the same.
         """
         self.rows, self.ties = rows, tuple(ties)
         frame = rows.flight.frame
@@ -74,7 +74,7 @@ class Ties:
 
     @property
     def order(self) -> list[tuple[int, Sighting]]:
-        """Tie points' indexes and their sightings, as everything of them is ordered."""
+        """Tie points' indexes and their sightings, in the order that all results use."""
         return [(tie, self.ties[tie].sightings[place]) for tie, place, _ in self._runs]
 
     def of(self, rows: Rows) -> Ties:
@@ -84,7 +84,7 @@ class Ties:
         return other
 
     def seen(self, state: State) -> list[Seen | None]:
-        """Return all sightings at a state, in their order; None where a return is no point any more."""
+        """Return all sightings at a state, in their order; None where a return cannot be placed any more."""
         found: list[Seen | None] = [None] * len(self._runs)
         for swath in sorted({run.swath for _, _, run in self._runs}):
             mine = [index for index, (_, _, run) in enumerate(self._runs) if run.swath == swath]
@@ -93,7 +93,10 @@ class Ties:
         return found
 
     def control(self, tie: int) -> tuple[FloatArray, FloatArray] | None:
-        """Surveyed place of a tie point in e, from where it was seen first, and its covariance (3, 3)."""
+        """Return the surveyed position of a tie point in e, relative to its first sighting, and its covariance (3, 3).
+
+        None if the point is not surveyed.
+        """
         point = self.ties[tie].control
         if point is None:
             return None
@@ -107,7 +110,7 @@ class Ties:
         return Run(-1, swath, np.array([at], dtype=np.int64), int(before[0]), int(after[0]))
 
     def _offset_e(self, tie: int, place: int, placed_with: Mapping[str, Calibration] | None) -> FloatArray:
-        """From where the return lay to where the point was measured."""
+        """Return the vector from the placed return to the measured point, in e."""
         flight, sighting = self.rows.flight, self.ties[tie].sightings[place]
         swath = flight.swaths[sighting.swath]
         if placed_with is None:
@@ -119,7 +122,7 @@ class Ties:
         return offset
 
     def _look(self, state: State, which: list[int], found: list[Seen | None]) -> None:
-        """Sightings of one swath: each is three planes."""
+        """Evaluate sightings of one swath, each as three planes."""
         rows, axes = self.rows, np.eye(3)
         normals, centres, runs = np.tile(axes, (len(which), 1)), np.zeros((3 * len(which), 3)), []
         planes = PlaneTable(normals, centres, normals, normals, np.zeros(3 * len(which)))
@@ -148,7 +151,7 @@ class Ties:
         return Seen(tie, place, expansions[0][0], np.array(design), misclosure_e, covariance)
 
     def _flown(self, run: Run, arm_b: FloatArray) -> FloatArray:
-        """Return (3, 3) of a trajectory whose errors are not estimated; alike in all directions."""
+        """Return the covariance (3, 3) due to a trajectory whose errors are not estimated; equal in all directions."""
         swath = self.rows.flight.swaths[run.swath]
         trajectory = self.rows.flight.trajectories[swath.flown]
         epoch = min(int(np.searchsorted(trajectory.time_ns, swath.time_ns[run.at[0]])), len(trajectory) - 1)
@@ -158,5 +161,5 @@ class Ties:
 
 
 def covariance_t(point: ControlPoint) -> FloatArray:
-    """Return (3, 3) of a surveyed point."""
+    """Return the covariance (3, 3) of a surveyed point."""
     return np.diag(np.broadcast_to(np.square(point.sigma_m), 3).astype(np.float64))

@@ -1,10 +1,10 @@
-"""What is known beforehand of the trajectory's errors along the strips: correlated in time, as they are in truth.
+"""Prior of the trajectory's errors along the strips, with their actual correlation in time.
 
-Errors stand at knots, a few seconds apart, and are linear between them. They are what is ADDED to the trajectory to
-make it true: position north, east, down (m), then small turns of the body about north, east, down (rad).
+Errors are given at knots, a few seconds apart, and are linear between them. They are ADDED to the trajectory to make it
+true: position north, east, down (m), then small turns of the body about north, east, down (rad).
 
-Their covariance comes from navigation's own run, exactly (`from_smoother`), or where there is only a trajectory with
-sigmas, from these and e-folding times (`gauss_markov`). White errors, one a return, would average away over a strip
+Their covariance comes exactly from navigation's own run (`from_smoother`), or, if there is only a trajectory with
+sigmas, from these and e-folding times (`gauss_markov`). White errors, one per return, would average out over a strip
 and make the calibration's sigmas five to ten times too small.
 """
 
@@ -27,25 +27,25 @@ from swath.georef.records import Int64Array
 from swath.georef.timescales import SECOND_NS
 from swath.georef.trajectory.trajectory import Trajectory, gps_text
 
-ERRORS = 6  # a knot
-MOST_KNOTS = 400  # (2400, 2400) is factorised at every linearisation
-MARGIN_NS = SECOND_NS // 2  # before and after a strip, where offsets of time may lead
-ROUNDING = 1e-9  # of a variance: keeps the covariance positive where knots are as good as one
-NEAR_NS = SECOND_NS  # a knot may be so far from a moment of a chain
+ERRORS = 6  # per knot
+MOST_KNOTS = 400  # a matrix (2400, 2400) is factorised at every linearisation
+MARGIN_NS = SECOND_NS // 2  # before and after a strip: time offsets may move returns there
+ROUNDING = 1e-9  # of a variance: keeps the covariance positive where neighbouring knots are almost equal
+NEAR_NS = SECOND_NS  # greatest distance of a knot from a moment of a chain
 
 
 @dataclass(frozen=True)
 class Taus:
     """E-folding times of a trajectory's errors.
 
-    The defaults are those of a smoothed, tightly controlled INS with carrier-phase GNSS: what is left of its position
-    are residual troposphere, ionosphere and multipath, which last about a minute; its tilt drifts with the
-    accelerometers' biases between manoeuvres and its heading longer still, as nothing but turns tells it.
+    The defaults fit a smoothed, tightly controlled INS with carrier-phase GNSS. Its remaining position errors are
+    residual troposphere, ionosphere and multipath, which last about a minute. Its tilt drifts with the accelerometers'
+    biases between manoeuvres, and its heading lasts longer still, because only turns make it observable.
 
     Attributes:
         position_s, roll_pitch_s, heading_s: e-folding times.
-        lasting_tilt, lasting_heading: shares of the variances that do not fade but last for the whole flight, about
-            the body's axes.
+        lasting_tilt, lasting_heading: shares of the variances that do not fade but last for the whole flight, about the
+            body's axes.
     """
 
     position_s: float = 60.0
@@ -55,24 +55,24 @@ class Taus:
     lasting_heading: float = 0.0
 
     def of_components(self) -> FloatArray:
-        """Return (6,) of north, east, down, roll, pitch, heading."""
+        """Return the times (6,) of north, east, down, roll, pitch, heading."""
         return np.array([self.position_s] * 3 + [self.roll_pitch_s] * 2 + [self.heading_s])
 
     def lasting(self) -> FloatArray:
-        """Return the lasting shares (6,) likewise."""
+        """Return the lasting shares (6,) of the same components."""
         return np.array([0.0] * 3 + [self.lasting_tilt] * 2 + [self.lasting_heading])
 
 
 @dataclass(frozen=True, eq=False)
 class Knots:
-    """Where the trajectory's errors are estimated.
+    """The knots at which the trajectory's errors are estimated.
 
     Attributes:
         flown: (k,) index in `Flight.trajectories`.
         time_ns: (k,) GPS time, rising within a trajectory.
         strip: (k,) number of the strip.
         apart_s: greatest distance of neighbours in a strip.
-        widened: it had to be more than was asked for.
+        widened: whether that distance had to be larger than requested.
     """
 
     flown: Int64Array
@@ -82,22 +82,22 @@ class Knots:
     widened: bool
 
     def __len__(self) -> int:
-        """Return how many."""
+        """Return the number of knots."""
         return len(self.time_ns)
 
 
 @dataclass(frozen=True, eq=False)
 class TrajectoryPrior:
-    """The trajectory's errors before the adjustment: of zero mean, and jointly normal.
+    """The trajectory's errors before the adjustment: jointly normal, with zero mean.
 
     Attributes:
         flown: (k,) index in `Flight.trajectories`.
         time_ns: (k,) GPS time, rising within a trajectory.
         strip: (k,) number of the strip.
         covariance: (6k, 6k); a knot has north, east, down (m), then small turns of the body about n, e, d (rad).
-        notes: for people: where the covariance is from, and what was done to it.
-        walk_rad2: (k,) variance of what the attitude walks from a knot to the next, about each axis: all returns of a
-            moment share that. Empty: it is not known, and counts as nothing.
+        notes: for display: the source of the covariance and changes to it.
+        walk_rad2: (k,) variance of the attitude's random walk from a knot to the next, about each axis; all returns of
+            one moment share it. Empty: it is not known, and counts as zero.
     """
 
     flown: Int64Array
@@ -108,18 +108,18 @@ class TrajectoryPrior:
     walk_rad2: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     def __len__(self) -> int:
-        """Number of knots."""
+        """Return the number of knots."""
         return len(self.time_ns)
 
     @cached_property
     def information(self) -> FloatArray:
-        """(6k, 6k) inverse of the covariance; LinAlgError: it has none."""
+        """Inverse (6k, 6k) of the covariance; raises LinAlgError if it has none."""
         return inverted(self.covariance)
 
     def between(self, flown: int, time_ns: Int64Array) -> tuple[Int64Array, Int64Array, FloatArray]:
         """Return the knots (n,) before and after moments (n,) of a trajectory, and the share (n,) of the later one.
 
-        Outside of its knots the nearest counts alone.
+        Outside the range of its knots only the nearest knot counts.
         """
         mine = np.flatnonzero(self.flown == flown)
         knots = self.time_ns[mine]
@@ -129,21 +129,21 @@ class TrajectoryPrior:
         return mine[before], mine[after], np.clip((time_ns - knots[before]) / apart, 0.0, 1.0)
 
     def sigmas(self) -> FloatArray:
-        """Return (k, 6) of the errors."""
+        """Return the sigmas (k, 6) of the errors."""
         sigmas: FloatArray = np.sqrt(np.diag(self.covariance)).reshape(-1, ERRORS)
         return sigmas
 
 
 def knots_of(flight: Flight, knot_s: float, most: int = MOST_KNOTS) -> Knots:
-    """Return knots over the strips only, from a little before each to a little after.
+    """Return knots over the strips only, each strip with a small margin before and after it.
 
     Args:
-        flight: its swaths say when the strips were.
+        flight: its swaths give the times of the strips.
         knot_s: wanted distance.
-        most: knots in all; with more the distance is widened.
+        most: greatest number of knots; if it would be exceeded, the distance is widened.
 
     Raises:
-        FlightError: there are no strips, or the distance is no time.
+        FlightError: there are no strips, or the distance is not a positive time.
     """
     if not (np.isfinite(knot_s) and knot_s > 0.0):
         raise FlightError(f"trajectory errors: knots {knot_s:g} s apart; want more than 0 s")
@@ -159,7 +159,7 @@ def knots_within(strips: Sequence[tuple[int, int, int, int]], knot_s: float, mos
     Args:
         strips: trajectory, number, and GPS times of begin and end of each, by trajectory and time; they do not overlap.
         knot_s: wanted distance.
-        most: knots in all; with more the distance is widened.
+        most: greatest number of knots; if it would be exceeded, the distance is widened.
     """
     lengths = np.array([end - begin for _, _, begin, end in strips]) / SECOND_NS
     apart_s = knot_s
@@ -178,7 +178,7 @@ def _counts(lengths_s: FloatArray, apart_s: float) -> Int64Array:
 
 
 def _strips(flight: Flight) -> list[tuple[int, int, int, int]]:
-    """Return (trajectory, number, begin, end) of each, by time, of all its scanners together; margins stay apart."""
+    """Return (trajectory, number, begin, end) of each strip, by time, over all its scanners; margins do not overlap."""
     spans: dict[tuple[int, int], tuple[int, int]] = {}
     for swath in flight.swaths:
         if len(swath):
@@ -201,7 +201,7 @@ def _strips(flight: Flight) -> list[tuple[int, int, int, int]]:
 
 
 def gauss_markov(flight: Flight, taus: Taus = Taus(), knot_s: float = 5.0) -> TrajectoryPrior:
-    """From the sigmas that the trajectories carry, each component a Gauss–Markov process of its own.
+    """Return the prior from the trajectories' sigmas, with each component as a separate Gauss–Markov process.
 
     cov(a, b) = σ_a σ_b exp(−|t_a − t_b| / τ) for north, east, down and for roll, pitch, heading, these then turned to
     north, east, down; strips of one trajectory stay correlated, trajectories are independent (Gelb 1974, 2.2-12).
@@ -212,16 +212,16 @@ def gauss_markov(flight: Flight, taus: Taus = Taus(), knot_s: float = 5.0) -> Tr
         knot_s: distance of knots; widened where there would be more than `MOST_KNOTS`.
 
     Raises:
-        FlightError: a trajectory says no sigmas where they are needed.
+        FlightError: a trajectory has no sigmas where they are needed.
     """
     return gauss_markov_at(knots_of(flight, knot_s), flight.trajectories, taus)
 
 
 def gauss_markov_at(knots: Knots, trajectories: Sequence[Trajectory], taus: Taus) -> TrajectoryPrior:
-    """Return `gauss_markov` at knots that are given.
+    """Return the prior of `gauss_markov` at given knots.
 
     Raises:
-        FlightError: a trajectory says no sigmas where they are needed.
+        FlightError: a trajectory has no sigmas where they are needed.
     """
     covariance = np.zeros((len(knots), ERRORS, len(knots), ERRORS))
     for number, trajectory in enumerate(trajectories):
@@ -245,8 +245,9 @@ def gauss_markov_at(knots: Knots, trajectories: Sequence[Trajectory], taus: Taus
 
 
 def _told(trajectory: Trajectory, time_ns: Int64Array) -> tuple[FloatArray, FloatArray]:
-    """Return (k, 6) sigmas north, east, down, roll, pitch, heading; (k, 3, 3) turns about n, e, d a unit of the last
-    three.
+    """Return a trajectory's sigmas (k, 6) of north, east, down, roll, pitch, heading, and turns (k, 3, 3).
+
+    The turns are about n, e, d, per unit of roll, pitch and heading.
     """
     at = np.clip(np.searchsorted(trajectory.time_ns, time_ns), 0, len(trajectory) - 1)
     since, epochs = (times - trajectory.time_ns[0] for times in (time_ns, trajectory.time_ns))
@@ -269,18 +270,18 @@ def _told(trajectory: Trajectory, time_ns: Int64Array) -> tuple[FloatArray, Floa
 
 
 def from_smoother(flight: Flight, chains: Sequence[ErrorChain], knot_s: float = 1.0) -> TrajectoryPrior:
-    """From navigation's smoothed runs: the joint covariance of their errors, as the smoother has it.
+    """Return the prior from navigation's smoothed runs: the smoother's joint covariance of their errors.
 
     Args:
         flight: on the smoothed trajectories.
-        chains: of each trajectory, `swath.georef.navigation.cross_covariance.error_chain` of its run; the finer, the
-        nearer
-            the knots can be put.
-        knot_s: distance of knots; widened where there would be more than `MOST_KNOTS`. What gyroscopes walk between
-            two knots is nobody's, so that it should be small: with a tactical unit (0.1°/√h) half of 0.1° √(1 s / 1 h).
+        chains: `swath.georef.navigation.cross_covariance.error_chain` of each trajectory's run; the finer they are, the
+            nearer the knots are to the requested times.
+        knot_s: distance of knots; widened where there would be more than `MOST_KNOTS`. The gyroscopes' random walk
+            between two knots is not among the unknowns, so the distance should be small: with a tactical unit (0.1°/√h)
+            that error is half of 0.1° √(1 s / 1 h).
 
     Raises:
-        FlightError: not a chain a trajectory, or one that does not cover the strips.
+        FlightError: the number of chains differs from that of trajectories, or a chain does not cover the strips.
     """
     if len(chains) != len(flight.trajectories):
         raise FlightError(f"trajectory errors: {len(chains)} runs of {len(flight.trajectories)} trajectories; want all")
@@ -307,9 +308,10 @@ def from_smoother(flight: Flight, chains: Sequence[ErrorChain], knot_s: float = 
 
 
 def _walked(prior: TrajectoryPrior) -> FloatArray:
-    """Return (k,) as of `TrajectoryPrior.walk_rad2`, at the rate of a middling interval; of a strip's last knot 0.
+    """Return `TrajectoryPrior.walk_rad2` (k,), at the rate of the median interval; 0 for a strip's last knot.
 
-    In a turn errors of scale make turns differ by far more, and steadily: knots follow that, it is no walk.
+    In a turn, scale errors change the attitude error by far more, but steadily: knots follow that change, it is no
+    random walk.
     """
     count = len(prior)
     joint, at = prior.covariance.reshape(count, ERRORS, count, ERRORS), np.arange(count - 1)
@@ -324,7 +326,11 @@ def _walked(prior: TrajectoryPrior) -> FloatArray:
 
 
 def _strip_at(time_ns: Int64Array, knots: Knots, at: Int64Array, name: str) -> Int64Array:
-    """Return (k,) strips of a chain's moments; FlightError where the asked knots have no moment near them."""
+    """Return the strips (k,) of a chain's moments.
+
+    Raises:
+        FlightError: a requested knot has no moment near it.
+    """
     wanted, strips = knots.time_ns[at], knots.strip[at]
     after = np.clip(np.searchsorted(time_ns, wanted), 1, max(len(time_ns) - 1, 1))
     near = np.minimum(
@@ -349,9 +355,9 @@ def _prior(knots: Knots, covariance: FloatArray, source: str) -> TrajectoryPrior
 
 
 def positive(covariance: FloatArray) -> FloatArray:
-    """Return a covariance (n, n) that has an inverse: what rounding made negative of it is as good as zero.
+    """Return a covariance (n, n) that has an inverse; eigenvalues that rounding made negative count as zero.
 
-    Where a heading was known to degrees and is to thousandths once all is seen, its smoothed covariances are small
+    A heading that was known to degrees, and to thousandths after smoothing, has smoothed covariances that are small
     differences of large numbers. Directions in which the correlation is negative by that are raised to `ROUNDING`.
     """
     symmetric = 0.5 * (covariance + covariance.T)
@@ -371,10 +377,10 @@ def positive(covariance: FloatArray) -> FloatArray:
 
 
 def draw(prior: TrajectoryPrior, rng: np.random.Generator) -> FloatArray:
-    """Return (k, 6) errors as large and as correlated as the prior says.
+    """Draw random errors (k, 6) with the covariance of the prior.
 
-    Directions in which the covariance is zero but for rounding (eigenvalues of the correlation, some of them below 0)
-    get none.
+    Directions in which the covariance is zero apart from rounding (eigenvalues of the correlation, some of them below
+    0) get no error.
     """
     sigmas = np.sqrt(np.maximum(np.diag(prior.covariance), 0.0))
     divisor = np.where(sigmas > 0.0, sigmas, 1.0)
@@ -385,16 +391,17 @@ def draw(prior: TrajectoryPrior, rng: np.random.Generator) -> FloatArray:
 
 
 def apply(trajectory: Trajectory, flown: int, prior: TrajectoryPrior, errors: FloatArray) -> Trajectory:
-    """Return a trajectory with errors added along.
+    """Return a trajectory with errors added.
 
-    Between knots, those of two strips too, they are linear; before the first knot and after the last they stay as
-    there, so that the path has no steps. Velocity and sigmas stay.
+    Between knots, also between those of two strips, the errors are linear; before the first knot and after the last one
+    they are constant, so the path has no steps. Velocity and sigmas stay.
 
     Args:
         trajectory: index ``flown`` in the flight.
-        flown: which of the prior's knots are its own.
+        flown: selects the trajectory's own knots of the prior.
         prior: has the knots.
-        errors: (k, 6) of all knots, as `draw` gives them; with minus signs a true trajectory becomes an erroneous one.
+        errors: (k, 6) of all knots, as `draw` returns them; with reversed signs a true trajectory becomes an erroneous
+            one.
     """
     mine = prior.flown == flown
     if not mine.any():
@@ -413,6 +420,6 @@ def apply(trajectory: Trajectory, flown: int, prior: TrajectoryPrior, errors: Fl
 
 
 def _turn(rotvec: FloatArray) -> FloatArray:
-    """Return (n, 4) quaternions of rotation vectors (n, 3)."""
+    """Return quaternions (n, 4) of rotation vectors (n, 3)."""
     half = 0.5 * np.linalg.norm(rotvec, axis=1, keepdims=True)
     return np.concatenate([np.cos(half), 0.5 * rotvec * np.sinc(half / np.pi)], axis=1)

@@ -1,1 +1,1 @@
-"""Planes: their search, matching and fit."""
+"""Planes for the calibration: search, matching and fit."""

@@ -1,7 +1,7 @@
-"""Planes in one swath's returns: a grid of cells, planes grown over them (Vosselman and Maas 2010, 2.3.3).
+"""Find planes in one swath's returns: a grid of cells, and planes grown over them (Vosselman and Maas 2010, 2.3.3).
 
-Cells belong to one lattice for all swaths, whose corner is t's origin: cell (column, row) has the key
-row · 2³² + column. The grid of a swath is laid over so many returns at a time that its size stays bounded.
+Cells belong to one lattice for all swaths, whose corner is t's origin. The key of a cell is row · 2³² + column. The
+grid of a swath covers only part of its returns at a time, so its size stays bounded.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ from swath.georef.arrays import FloatArray
 from swath.georef.points import contiguous
 from swath.georef.records import Int64Array
 
-BLOCK = 1 << 18  # returns handed to a kernel at a time: mapped ones are copied so many at a time
-PIECE = 4 << 20  # returns a grid is laid over
-CELLS_MOST = 1 << 24  # of a grid; cells are made larger beyond
-CELL_POINTS = 5.0  # least of a cell, for a plane of its own that says something
+BLOCK = 1 << 18  # returns per kernel call; mapped ones are copied in blocks of this size
+PIECE = 4 << 20  # returns that one grid covers
+CELLS_MOST = 1 << 24  # of a grid; beyond that its returns are split
+CELL_POINTS = 5.0  # least number in a cell for a significant plane of its own
 CELL_SIZES_M = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
-CELL_SHORT_M = 0.2  # by which a cell may be smaller than wanted
+CELL_SHORT_M = 0.2  # a cell may be smaller than wanted by this much
 WIDTH_LEAST_M, CELLS_LEAST = 1.2, 3  # of a plane
 _FILL_LEAST = 0.5
-_STRETCH = 100_000  # consecutive returns of a swath that are looked at for its pattern
+_STRETCH = 100_000  # consecutive returns of a swath that represent its scan pattern
 _SLANT_RAD = np.radians(60.0)
-_ALIKE = float(np.cos(np.radians(15.0)))  # normals of a cell and of the plane it is to join
+_ALIKE = float(np.cos(np.radians(15.0)))  # cosine between normals of a cell and of the plane it joins
 _WHY = {
     FEW: "too few returns",
     THIN: "too few returns",
@@ -56,15 +56,15 @@ _WHY = {
 
 @dataclass(frozen=True, eq=False)
 class Segments:
-    """Planes grown in swaths, k of them, over c cells.
+    """Planes grown in swaths: k segments over c cells.
 
     Attributes:
-        swath: (k,) index of it.
+        swath: (k,) its index.
         first: (k,) index of one of its returns.
         moments: (k, 10) of its returns, as in `swath.calib.planes.kernels`.
         normal_t: (k, 3).
         spread_m: (k, 3) standard deviations along the normal, and along the two axes of the plane, rising.
-        cells: (c,) keys, (c,) of which segment, (c,) returns in them.
+        cell_key, cell_of, cell_points: (c,) keys of cells, their segments, and their numbers of returns.
     """
 
     swath: Int64Array
@@ -77,12 +77,12 @@ class Segments:
     cell_points: Int64Array
 
     def __len__(self) -> int:
-        """Number of segments."""
+        """Return the number of segments."""
         return len(self.swath)
 
     @classmethod
     def joined(cls, pieces: list[Segments]) -> Segments:
-        """Return one after the other; at least one piece."""
+        """Concatenate one or more pieces, in order."""
         before = np.cumsum([0] + [len(piece) for piece in pieces])
         columns = [[getattr(piece, name) for piece in pieces] for name in cls.__dataclass_fields__]
         columns[6] = [piece.cell_of + shift for piece, shift in zip(pieces, before, strict=False)]
@@ -90,13 +90,13 @@ class Segments:
 
 
 def keys_of(columns: Int64Array, rows: Int64Array) -> Int64Array:
-    """Return keys of cells of the lattice."""
+    """Return the keys of cells of the lattice."""
     keys: Int64Array = (rows << 32) + columns
     return keys
 
 
 def cell_middles(keys: Int64Array, cell_m: float) -> FloatArray:
-    """Return (n, 2) east and north of cells' middles."""
+    """Return east and north (n, 2) of the cells' middles."""
     rows = (keys + (1 << 31)) >> 32
     return (np.stack([keys - (rows << 32), rows], axis=1) + 0.5) * cell_m
 
@@ -104,7 +104,7 @@ def cell_middles(keys: Int64Array, cell_m: float) -> FloatArray:
 def blocks(
     swath: Swath, start: int = 0, stop: int | None = None
 ) -> Iterator[tuple[int, FloatArray, NDArray[np.uint8]]]:
-    """Yield a swath's returns by and by: index of the first, points (n, 3), returns of their pulses (n,)."""
+    """Yield a swath's returns in blocks: index of the first, points (n, 3), numbers of returns of their pulses (n,)."""
     stop = len(swath) if stop is None else stop
     for first in range(start, stop, BLOCK):
         part = slice(first, min(first + BLOCK, stop))
@@ -112,9 +112,9 @@ def blocks(
 
 
 def cell_size(flight: Flight, settings: PlaneSettings) -> float:
-    """Metres: so many that most cells of a middling swath have the points wanted, of more than one line of the scan.
+    """Choose the size of cells in metres: most cells of a median swath have enough points on several scan lines.
 
-    One size for all swaths of a flight.
+    All swaths of a flight have the same size.
 
     Raises:
         PlaneError: no swath has points.
@@ -129,8 +129,9 @@ def cell_size(flight: Flight, settings: PlaneSettings) -> float:
 
 
 def _fill(flight: Flight, cell_m: float) -> float:
-    """Return share of the cells with points enough for a plane that have them on more than one line, in a middling
-    swath.
+    """Return the share of cells whose points lie on more than one scan line, in a median swath.
+
+    Only cells with enough points for a plane count.
     """
     shares = []
     for swath in flight.swaths:
@@ -154,7 +155,7 @@ def _fill(flight: Flight, cell_m: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class _Grid:
-    """Cells of the lattice from a column and a row on."""
+    """A rectangular part of the lattice that begins at a column and a row."""
 
     west: int
     south: int
@@ -171,14 +172,14 @@ class _Grid:
         return self.rows, self.columns
 
     def places(self, at: Int64Array) -> tuple[Int64Array, Int64Array]:
-        """Return columns and rows of the lattice of cells."""
+        """Return columns and rows of cells in the lattice."""
         return at % self.columns + self.west, at // self.columns + self.south
 
 
 def segments_of(
     flight: Flight, index: int, cell_m: float, settings: PlaneSettings, refused: Counter[str]
 ) -> list[Segments]:
-    """Of one swath, by pieces of it; why other places bear no plane is counted, in tiles."""
+    """Grow the planes of one swath, in pieces of it; the reasons why other tiles have no plane are counted."""
     swath = flight.swaths[index]
     parts = [range(at, min(at + PIECE, len(swath))) for at in range(0, len(swath), PIECE)]
     found = []
@@ -196,7 +197,7 @@ def segments_of(
 
 
 def _grid(swath: Swath, part: range, cell_m: float) -> _Grid | None:
-    """Return around a part's points; None where it has none."""
+    """Return the grid around a part's points; None if it has no points."""
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
     for first in range(part.start, part.stop, BLOCK):
         points = swath.points_t[first : min(first + BLOCK, part.stop), :2]
@@ -233,12 +234,12 @@ def _segments(
 
 
 def tile_cells(cell_m: float, settings: PlaneSettings) -> int:
-    """Return cells a tile."""
+    """Return the number of cells along a tile."""
     return max(2, round(settings.tile_m / cell_m))
 
 
 def _coarse_sigma(flight: Flight, swath: Swath, part: range, settings: PlaneSettings) -> float:
-    """Metres, of a return on a surface seen at a slant, as far away as most are."""
+    """Return the sigma in metres of a return on an inclined surface at the median range."""
     at = np.arange(part.start, part.stop, max(1, len(part) // 1000))
     points = np.asarray(swath.points_t[at])
     range_m = float(np.nanmedian(np.linalg.norm(points - sensor_t(flight, swath, at), axis=1)))
@@ -250,7 +251,7 @@ def _coarse_sigma(flight: Flight, swath: Swath, part: range, settings: PlaneSett
 def _count_refused(
     what: NDArray[np.uint8], label: NDArray[np.int32], grid: _Grid, tile: int, refused: Counter[str]
 ) -> None:
-    """Tiles on which no plane grew, by what most of their cells are."""
+    """Count tiles in which no plane grew, by the kind of most of their cells."""
     at = np.flatnonzero(what != EMPTY)
     columns, rows = grid.places(at)
     _, of_tile = np.unique(keys_of(columns // tile, rows // tile), return_inverse=True)
@@ -273,7 +274,7 @@ def _table(
     settings: PlaneSettings,
     refused: Counter[str],
 ) -> Segments:
-    """Return those that are wide enough and have returns enough, as a table."""
+    """Return the table of the planes that are wide enough and have enough returns."""
     at = np.flatnonzero(label >= 0)
     of = label[at].astype(np.int64)
     cells = np.bincount(of, minlength=len(regions))

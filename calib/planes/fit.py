@@ -1,6 +1,6 @@
-"""A plane through points of one swath, how far they should lie from it, and whether it is one.
+"""Fit a plane to points of one swath, predict their scatter, and test whether the points form a plane.
 
-Curvature and roughness are told apart from noise by the sigmas of a single return (FORMULAS 6.2 and 6.6).
+The sigmas of a single return separate curvature and roughness from noise (FORMULAS 6.2 and 6.6).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from swath.georef.arrays import FloatArray
 from swath.georef.records import Int64Array
 from swath.georef.scanner.uncertainty import Noise
 
-_CELLS_ACROSS, _CELL_LEAST_M = 50.0, 0.5  # cells that a swath should have across, at least; the smallest there are
+_CELLS_ACROSS, _CELL_LEAST_M = 50.0, 0.5  # fewest cells across a swath; smallest cell
 _TILES_ACROSS, _TILE_LEAST_M = 4.0, 4.0
 
 GATE = 4.0  # sigmas within which a return belongs to a plane
@@ -29,10 +29,10 @@ class Sight:
     Attributes:
         at: (n,) rising indexes of its returns.
         centre_t, normal_t: (3,) of the points; the normal points up.
-        rms_m: of the points from it.
-        sigma_m: expected of a single return along the normal.
-        gate_m: within which returns were taken.
-        normal_sigma_rad: of the normal's less certain direction.
+        rms_m: distance of the points from the plane.
+        sigma_m: expected sigma of a single return along the normal.
+        gate_m: distance within which returns were used.
+        normal_sigma_rad: sigma of the normal's less certain direction.
         sag_m, sag_sigma_m: height of the arc of a curved surface through them over its length.
     """
 
@@ -48,9 +48,10 @@ class Sight:
 
 
 def expected_sigma(noise: Noise, away_t: FloatArray, normal_t: FloatArray, settings: PlaneSettings) -> FloatArray:
-    """Return (n,) metres along normals (n, 3) of returns at (n, 3) from the scanner, trajectory and calibration apart.
+    """Return the expected sigmas (n,) in metres along normals (n, 3) of returns at (n, 3) from the scanner.
 
-    Range by the cosine of incidence, angle and footprint by its sine (FORMULAS 6.2), roughness whole.
+    Range counts by the cosine of incidence, angle and footprint by its sine (FORMULAS 6.2), roughness fully. Errors of
+    trajectory and calibration are not included.
     """
     range_m = np.linalg.norm(away_t, axis=-1)
     cosine = np.minimum(np.abs((away_t * normal_t).sum(axis=-1)) / range_m, 1.0)
@@ -63,10 +64,10 @@ def expected_sigma(noise: Noise, away_t: FloatArray, normal_t: FloatArray, setti
 def fit_sight(
     flight: Flight, swath: Swath, at: Int64Array, settings: PlaneSettings, *, bent: bool = True
 ) -> Sight | None:
-    """Return the plane most of these returns lie on, and those of them that do; None: fewer than three are left.
+    """Fit the plane on which most of these returns lie, and keep those returns; None if fewer than four are left.
 
-    What lies farther from it than `GATE` expected sigmas is left out, again and again from all, until nothing changes.
-    ``bent``: how curved they are is asked too.
+    Returns farther from it than `GATE` expected sigmas are left out; this is repeated from all returns until the
+    selection stays the same. ``bent``: whether the curvature is estimated too.
     """
     if len(at) < 4:
         return None
@@ -89,8 +90,9 @@ def fit_sight(
 
 
 def principal(points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return mean (3,), axes (3, 3) as rows, the normal first and pointing up, and variances along them (3,),
-    rising.
+    """Return the mean (3,), the principal axes (3, 3) as rows, and the variances along them (3,), rising.
+
+    The normal is the first axis and points up.
     """
     centre = points.mean(axis=0)
     off = points - centre
@@ -111,8 +113,9 @@ def _sight(at: Int64Array, points: FloatArray, sigma_m: float, gate_m: float, be
 
 
 def _sag(off: FloatArray, axes: FloatArray, rms_m: float) -> tuple[float, float]:
-    """Return greatest arc height of a quadratic surface over the points' length, of both directions and between; its
-    sigma.
+    """Return the greatest arc height of a quadratic surface over the points' length, and its sigma.
+
+    The arcs in both directions and between them are compared.
     """
     if len(off) < 7:
         return 0.0, np.inf
@@ -131,7 +134,7 @@ def _sag(off: FloatArray, axes: FloatArray, rms_m: float) -> tuple[float, float]
 
 
 def refusal(sight: Sight | None, settings: PlaneSettings, slack: float = 1.0) -> str:
-    """Return why this is no plane; empty: it is one. Slack: of what was one before, so that it stays one."""
+    """Return why a sight is no plane; empty: it is one. A slack above 1 keeps former planes longer."""
     if sight is None or len(sight.at) < settings.least_points:
         return "too few returns"
     if sight.rms_m > slack * settings.rough * sight.sigma_m:
@@ -146,33 +149,35 @@ def refusal(sight: Sight | None, settings: PlaneSettings, slack: float = 1.0) ->
 
 
 class PlaneError(ValueError):
-    """Planes that cannot be searched for; one line for the user."""
+    """Planes cannot be searched in this flight; the message is one line for the user."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlaneSettings:
-    """Of the plane search and of finding the same planes again.
+    """Settings of the plane search, and of finding the same planes again.
 
     Attributes:
-        cell_m: least size of a cell; cells are larger where a swath has fewer than ``cell_points`` a cell.
-        cell_points: that a cell should have on average.
+        cell_m: least size of a cell; cells are larger where a swath has fewer than ``cell_points`` per cell.
+        cell_points: wanted average number of points in a cell.
         tile_m: greatest length of a piece of a plane; larger faces are cut, ground is cut along tiles of this size.
         least_points: returns a swath must have on a plane.
         most_points: returns of a swath on a plane that are kept: evenly drawn in the order of their times.
-        most_planes: roofs first, the larger the earlier, in turn by the direction they face; then ground.
-        ground_planes: pieces of level ground wanted of each third along and each fifth across a swath, for every
-            other swath that sees them.
-        roof_slope_rad: what is steeper is kept as a roof; the rest is ground, and thinned.
-        wall_slope_rad: what is steeper is left out.
+        most_planes: greatest number of planes: roofs first, larger ones earlier, in turn by the direction they face;
+            then ground.
+        ground_planes: pieces of level ground wanted of each third along and each fifth across a swath, for every other
+            swath that sees them.
+        roof_slope_rad: steeper planes are kept as roofs; the others are ground, and thinned.
+        wall_slope_rad: steeper planes are left out.
         surface_m: roughness of surfaces that count as plane, one sigma.
-        rough: greatest rms of a plane's points in units of that expected.
+        rough: greatest rms of a plane's points in units of the expected one.
         several: greatest share of points of pulses with several returns in a cell.
         sag_m: a plane's greatest curvature: height of the arc over its length.
-        displacement_m: by which strips may lie beside each other at first, horizontally.
-        offset_m: by which they may lie above each other, at first and once calibrated.
-        tight_m: by which planes of the same place may differ along their normal once the points were placed anew.
+        displacement_m: horizontal distance by which strips may differ at first.
+        offset_m: vertical distance by which they may differ, at first and once calibrated.
+        tight_m: distance along their normal by which planes of the same place may differ once the points were placed
+            anew.
         normal_sigma_rad: greatest sigma of a plane's direction in one swath.
-        angle_rad: between normals of the same plane in two swaths, besides what their noise explains.
+        angle_rad: angle between normals of the same plane in two swaths, beyond their noise.
         overlap: least share of the smaller one's cells that two sights of a plane have in common.
     """
 
@@ -199,8 +204,8 @@ class PlaneSettings:
     def scaled(self, scale: Scale) -> PlaneSettings:
         """Return the settings for a flight of these sizes; the fields are meant for 800 m above ground.
 
-        In narrow swaths cells and pieces are smaller, so that there are several side by side. From higher up the same
-        small angles lay strips farther apart.
+        In narrow swaths cells and pieces are smaller, so that several lie side by side. From greater heights the same
+        small angles move strips farther apart.
         """
         higher = max(scale.of_reference, 1.0)
         return replace(
@@ -214,6 +219,6 @@ class PlaneSettings:
 
 
 def scaled_to(flight: Flight, settings: PlaneSettings) -> PlaneSettings:
-    """Return the settings by the sizes of a flight, as they are where it has no points."""
+    """Return the settings for the sizes of a flight; unchanged if it has no points."""
     scale = scale_of(flight)
     return settings if scale is None else settings.scaled(scale)

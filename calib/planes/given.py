@@ -1,4 +1,4 @@
-"""Planes the user says where to look for."""
+"""Find planes at places that the user gives as polygons."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ Rings = Mapping[str, FloatArray] | Sequence[tuple[str, FloatArray]]
 _DEFAULT = PlaneSettings()
 _TRIALS = 200
 _SEED = 1981
-_LONGEST_M = 2_000.0  # east or north: no face is as large, and cells of its box would fill the memory
-_SHARE_LEAST = 0.7  # of the returns in a polygon that lie on its plane
+_LONGEST_M = 2_000.0  # east or north: no face is larger, and its box's cells would fill the memory
+_SHARE_LEAST = 0.7  # least share of a polygon's returns that lie on its plane
 
 
 def given_planes(flight: Flight, polygons: Rings, settings: PlaneSettings = _DEFAULT) -> Features:
-    """Return planes inside polygons, each the one that most of the returns in it lie on (Fischler and Bolles 1981).
+    """Find in each polygon the plane on which most of its returns lie (Fischler and Bolles 1981).
 
-    They have to stand the same tests as planes that were found; what does not is counted.
+    These planes must pass the same tests as planes that were found; failures are counted.
 
     Args:
         flight: with points.
@@ -36,7 +36,7 @@ def given_planes(flight: Flight, polygons: Rings, settings: PlaneSettings = _DEF
         settings: of the tests.
 
     Raises:
-        PlaneError: a polygon has fewer than three corners, or is no face for its size, or two have the same name.
+        PlaneError: a polygon has fewer than three corners, or is too large for a face, or two have the same name.
     """
     rings = _checked(polygons)
     settings = scaled_to(flight, settings)
@@ -76,7 +76,7 @@ def _checked(polygons: Rings) -> dict[str, FloatArray]:
 
 
 def _inside(swath: Swath, rings: Mapping[str, FloatArray], cell_m: float) -> dict[str, Int64Array]:
-    """Return a swath's single returns in polygons; those that share cells are looked for one after the other."""
+    """Return a swath's single returns in each polygon; polygons that share cells are processed one after the other."""
     left = {name: _cells(ring, cell_m) for name, ring in rings.items()}
     inside: dict[str, Int64Array] = {}
     while left:
@@ -99,7 +99,7 @@ def _inside(swath: Swath, rings: Mapping[str, FloatArray], cell_m: float) -> dic
 
 
 def _cells(ring: FloatArray, cell_m: float) -> Int64Array:
-    """Return keys of all cells of a ring's box."""
+    """Return the keys of all cells of a ring's bounding box."""
     low, high = np.floor(ring.min(axis=0) / cell_m), np.floor(ring.max(axis=0) / cell_m)
     axes = [np.arange(int(first), int(last) + 1) for first, last in zip(low, high, strict=True)]
     columns, rows = np.meshgrid(*axes)
@@ -107,7 +107,7 @@ def _cells(ring: FloatArray, cell_m: float) -> Int64Array:
 
 
 def _in_ring(points: FloatArray, ring: FloatArray) -> NDArray[np.bool_]:
-    """Return (n,) whether points lie inside: a ray to the east meets an odd number of sides."""
+    """Return whether points lie inside (n,): a ray to the east then meets an odd number of sides."""
     x, y = points[:, 0], points[:, 1]
     odd = np.zeros(len(points), np.bool_)
     for (x0, y0), (x1, y1) in zip(ring, np.roll(ring, -1, axis=0), strict=True):
@@ -117,7 +117,7 @@ def _in_ring(points: FloatArray, ring: FloatArray) -> NDArray[np.bool_]:
 
 
 def _consensus(flight: Flight, swath: Swath, at: Int64Array, settings: PlaneSettings) -> Int64Array:
-    """Return those of the returns that lie on the plane through three of them on which most do."""
+    """Return the largest set of these returns that lie on a plane through three of them."""
     points = np.asarray(swath.points_t[at])
     if len(points) < settings.least_points:
         return at

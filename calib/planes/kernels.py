@@ -1,7 +1,7 @@
-"""Loops of the plane search, compiled: moments of cells, growing of planes over cells, returns of known places.
+"""Compiled loops of the plane search: moments of cells, growing of planes over cells, returns at known places.
 
 A cell's place in the grid is ``row · columns + column``, rows to the north, columns to the east. Moments of n points
-are (10,): n, mean x y z, and the sums of products of what they differ from it, xx xy xz yy yz zz.
+are (10,): n, mean x y z, and the sums of products of the differences from the mean, xx xy xz yy yz zz.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from swath.georef.records import Int64Array
 Int32Array = NDArray[np.int32]
 
 MOMENTS = 10
-EMPTY, FEW, SEVERAL, ROUGH, WALL, THIN, GOOD = range(7)  # what a cell is; thin ones have no direction of their own
+EMPTY, FEW, SEVERAL, ROUGH, WALL, THIN, GOOD = range(7)  # kinds of cells; thin ones have no direction of their own
 THIN_POINTS = 2.0
-THIN_SPREAD = 0.15  # of a cell's size: standard deviation of points that lie on a line rather than on a plane
+THIN_SPREAD = 0.15  # of a cell's size: standard deviation of points on a line rather than on a plane
 _ONE_RETURN = 1
-_GOLDEN, _HIGH = whole(-7046029254386353131), whole(20)  # 2⁶⁴ over the golden ratio, and bits that are left out
+_GOLDEN, _HIGH = whole(-7046029254386353131), whole(20)  # 2⁶⁴ over the golden ratio, and the number of bits dropped
 _SURELY = 3.0  # sigmas of a plane's direction
-_REFIT_SHARE = 1.15  # a growing plane is fitted anew when it has so many times the points of its last fit
+_REFIT_SHARE = 1.15  # a growing plane is refitted when its points reach this multiple of the last fit's
 
 
 @jit_inline
 def smallest(xx: float, xy: float, xz: float, yy: float, yz: float, zz: float) -> tuple[float, float, float, float]:
-    """Return least eigenvalue of a symmetric matrix and its unit vector, z not negative (Smith, Comm. ACM 4, 1961)."""
+    """Return the least eigenvalue of a symmetric matrix and its unit vector, z ≥ 0 (Smith, Comm. ACM 4, 1961)."""
     middle = (xx + yy + zz) / 3.0
     a, b, c = xx - middle, yy - middle, zz - middle
     size = math.sqrt((a * a + b * b + c * c + 2.0 * (xy * xy + xz * xz + yz * yz)) / 6.0)
@@ -59,8 +59,9 @@ def smallest(xx: float, xy: float, xz: float, yy: float, yz: float, zz: float) -
 
 @jit_inline
 def shorter_axis(sums: FloatArray, least: float) -> float:
-    """Return the middle eigenvalue of moments (10,), the least being known: of the product and the sum of the other
-    two.
+    """Return the middle eigenvalue of moments (10,), given the least one.
+
+    It follows from the product and the sum of the two other eigenvalues.
     """
     xx, xy, xz, yy, yz, zz = sums[4], sums[5], sums[6], sums[7], sums[8], sums[9]
     rest = xx + yy + zz - least
@@ -81,13 +82,13 @@ def accumulate(
     several: Int32Array,
     seen: Int64Array,
 ) -> None:
-    """Add points (n, 3) to the cells' sums; those of pulses with several returns are counted only.
+    """Add points (n, 3) to the cells' sums; points of pulses with several returns are only counted.
 
     Args:
-        points_t: nan: none.
-        returns: (n,) of their pulses.
+        points_t: nan: no point.
+        returns: (n,) numbers of returns of their pulses.
         first: index of the first of them in its swath.
-        corner: west, south, metres a cell.
+        corner: west, south, metres per cell.
         shape: rows, columns.
         moments: (cells, 10) sums, x and y from the cell's middle, z from ``base``.
         base: (cells,) height of a cell's first point.
@@ -137,7 +138,7 @@ def fit_cells(
     rms_m: FloatArray,
     what: ByteArray,
 ) -> None:
-    """Planes of the cells; sums become moments, in the grid's coordinates.
+    """Fit planes to the cells; sums become moments, in the grid's coordinates.
 
     Args:
         moments, base, several: of `accumulate`.
@@ -189,7 +190,7 @@ def fit_cells(
 
 @jit_inline
 def _joined(one: FloatArray, more: FloatArray) -> None:
-    """Moments of both sets of points, in place of the first (Chan, Golub and LeVeque 1983)."""
+    """Merge the moments of two sets of points into the first (Chan, Golub and LeVeque 1983)."""
     n, m = one[0], more[0]
     x, y, z = more[1] - one[1], more[2] - one[2], more[3] - one[3]
     share = m / (n + m)
@@ -210,9 +211,9 @@ def _joined(one: FloatArray, more: FloatArray) -> None:
 def _fits(
     cell: FloatArray, region: FloatArray, plane: FloatArray, doubt: float, rough_m: float, sigma_m: float
 ) -> bool:
-    """Return whether a cell's points lie on a region's plane (3,): all of them together, and in their mean.
+    """Return whether a cell's points lie on a region's plane (3,), both all of them together and their mean.
 
-    The plane's direction is not sure itself (``doubt``, rad), which counts the more the farther away the cell is.
+    The plane's direction is itself uncertain (``doubt``, rad), which matters more for more distant cells.
     """
     u, v, w = cell[1] - region[1], cell[2] - region[2], cell[3] - region[3]
     x, y, z = plane[0], plane[1], plane[2]
@@ -229,7 +230,7 @@ def _fits(
 
 @jit_inline
 def _refitted(region: FloatArray, plane: FloatArray, sigma_m: float) -> float:
-    """Return the region's plane anew; sigma of its direction, rad, by its spread along its shorter axis."""
+    """Refit the region's plane, and return the sigma of its direction, rad, from its spread along its shorter axis."""
     least, plane[0], plane[1], plane[2] = smallest(region[4], region[5], region[6], region[7], region[8], region[9])
     return sigma_m / math.sqrt(max(shorter_axis(region, least), 1e-6))
 
@@ -246,24 +247,24 @@ def grow(
     label: Int32Array,
     regions: FloatArray,
 ) -> int:
-    """Return planes grown from good cells, best first, over their eight neighbours.
+    """Grow planes from good cells, best first, over their eight neighbours.
 
-    A plane that came to its end is fitted anew and begins again at all its cells, until none joins. Level planes end
-    where tiles of the grid end, so that all swaths cut the ground alike; steep ones at their edges. A plane counts as
-    level until, come to its end, it is steep beyond doubt, and again when it no longer is: one cell of a slope may look
-    steeper than it is, and a plane that began there would go on over all the ground of its swath.
+    A plane that cannot grow further is refitted and tried again at all its cells, until no cell joins. Level planes end
+    at the grid's tiles, so that all swaths cut the ground alike; steep ones end at their edges. A plane counts as level
+    until, at the end of its growth, it is significantly steep, and again when it no longer is. Otherwise a plane that
+    began in a cell that looks steeper than it is could spread over all the ground of its swath.
 
     Args:
-        order: good cells, those to begin with first.
+        order: good cells, in the order in which planes begin.
         what, moments, normal: of `fit_cells`.
         shape: rows, columns.
-        tiles: cells a tile, column and row in the tiles' grid of the corner.
-        limits: greatest rms and sigma of a return in metres, cosine between normals, least n_z of what is level.
+        tiles: cells per tile, column and row in the tiles' grid of the corner.
+        limits: greatest rms and sigma of a return in metres, cosine between normals, least n_z of level planes.
         label: (cells,) −1; becomes the plane's number.
         regions: (k, 10) room for moments of the planes.
 
     Returns:
-        How many planes there are.
+        The number of planes.
     """
     rows, columns = shape
     tile, east, north = tiles
@@ -318,14 +319,14 @@ def grow(
 
 @jit_inline
 def _slot(key: int, mask: int) -> int:
-    """Return where to look for a key first: Fibonacci hashing (Knuth, The Art of Computer Programming 3, 6.4)."""
+    """Return the first slot of a key: Fibonacci hashing (Knuth, The Art of Computer Programming 3, 6.4)."""
     slot: int = ((key * _GOLDEN) >> _HIGH) & mask
     return slot
 
 
 @jit_cached
 def fill_table(keys: Int64Array, labels: Int32Array, table_keys: Int64Array, table_labels: Int32Array) -> None:
-    """A table of labels by key with open addresses; its size is a power of two, empty slots have label −1."""
+    """Fill a hash table of labels by key (open addressing); its size is a power of two, empty slots have label −1."""
     mask = len(table_keys) - 1
     for i in range(len(keys)):
         at = _slot(keys[i], mask)
@@ -346,17 +347,17 @@ def gather(
     at: Int64Array,
     label: Int32Array,
 ) -> int:
-    """Single returns in cells of a table that lie near the plane of their cell.
+    """Collect single returns in cells of a table that lie near the plane of their cell.
 
     Args:
         points_t, returns, first: as in `accumulate`.
-        cell_m: metres a cell of the keys (`cell_key`).
+        cell_m: metres per cell of the keys (`cell_key`).
         table_keys, table_labels: of `fill_table`.
         planes: (k, 5) normal, its product with points on the plane, greatest distance.
-        at, label: (n,) room for what is found, indexes in the swath and labels.
+        at, label: (n,) room for the results, indexes in the swath and labels.
 
     Returns:
-        How many were found.
+        The number of collected returns.
     """
     found = 0
     mask = len(table_keys) - 1

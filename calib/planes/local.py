@@ -1,5 +1,4 @@
-"""A plane through the few returns around a place, as FORMULAS 8 asks of it: fit, roughness, slope, and whether a point
-lies within them."""
+"""Fit a plane to the few returns around a place (FORMULAS 8), and test roughness, slope, and whether it is inside."""
 
 from __future__ import annotations
 
@@ -11,15 +10,15 @@ from numpy.typing import NDArray
 
 from swath.georef.arrays import FloatArray
 
-TRIPLES = 60  # of returns that a first plane is drawn through
+TRIPLES = 60  # of returns, each defining a candidate for the first plane
 INLIER_SIGMAS = 3.0
-FEWEST_SHARE = 0.6  # of the returns, on the plane; where fewer are, it is not the ground that is seen
+FEWEST_SHARE = 0.6  # of the returns; if fewer lie on the plane, it is not the ground
 ROUNDS = 5
 
 
 @dataclass(frozen=True, slots=True)
 class PlaneRules:
-    """When returns are a plane: the least number, the greatest √λ0 (metres), the steepest slope (degrees)."""
+    """Rules for a plane: the least number of returns, the greatest √λ0 (metres), the steepest slope (degrees)."""
 
     fewest: int = 6
     roughest_m: float = 0.06
@@ -28,13 +27,13 @@ class PlaneRules:
 
 @dataclass(frozen=True, eq=False)
 class LocalPlane:
-    """A plane.
+    """A plane fitted to returns.
 
     Attributes:
         centre_t: (3,) mean of its returns.
         normal_t: (3,) unit, upwards.
         rms_m: √λ0, of its returns from it.
-        count: of them.
+        count: number of returns.
     """
 
     centre_t: FloatArray
@@ -43,22 +42,23 @@ class LocalPlane:
     count: int
 
     def distance_m(self, point_t: FloatArray) -> float:
-        """Signed, along the normal: d = n · (p − c)."""
+        """Return the signed distance of a point along the normal: d = n · (p − c)."""
         return float(self.normal_t @ (point_t - self.centre_t))
 
     def above_m(self, point_t: FloatArray) -> float:
-        """Return along up: Δz = d / n_z."""
+        """Return the height of a point above the plane, along up: Δz = d / n_z."""
         return self.distance_m(point_t) / float(self.normal_t[2])
 
     @property
     def slope_rad(self) -> float:
-        """Against the horizontal."""
+        """Slope against the horizontal."""
         return math.acos(min(1.0, abs(float(self.normal_t[2]))))
 
 
 def plane_through(points_t: FloatArray) -> LocalPlane:
-    """Return the plane of least squares through points (n, 3): normal of the smallest eigenvalue λ0 of their
-    covariance.
+    """Fit a plane by least squares to points (n, 3).
+
+    The normal belongs to the smallest eigenvalue λ0 of their covariance.
     """
     centre = points_t.mean(axis=0)
     offsets = points_t - centre
@@ -68,10 +68,10 @@ def plane_through(points_t: FloatArray) -> LocalPlane:
 
 
 def robust_plane(points_t: FloatArray, rules: PlaneRules) -> tuple[LocalPlane | None, NDArray[np.bool_], str]:
-    """Return the plane that most of points (n, 3) lie on, with which they are, or why there is none.
+    """Fit the plane on which most of points (n, 3) lie; return it, a mask of these points, and any reason of failure.
 
-    The first plane is the one through three points that the points' median distance from is least (least median of
-    squares, Rousseeuw 1984); then least squares of those within three sigmas, until they stay the same.
+    The first plane is the one through three points that has the least median distance from the points (least median of
+    squares, Rousseeuw 1984); then follows least squares of those within three sigmas, until they stay the same.
     """
     none = np.zeros(len(points_t), dtype=bool)
     if len(points_t) < rules.fewest:
@@ -96,7 +96,7 @@ def robust_plane(points_t: FloatArray, rules: PlaneRules) -> tuple[LocalPlane | 
 
 
 def _first_distances(points_t: FloatArray) -> FloatArray:
-    """Return (n,) from the best plane through three of the points; the triples are the same for as many points."""
+    """Return distances (n,) from the best plane through three of the points; the number of points seeds the draw."""
     draws = np.random.default_rng(len(points_t))
     triples = points_t[np.argsort(draws.random((TRIPLES, len(points_t))), axis=1)[:, :3]]
     normals = np.cross(triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0])
@@ -112,8 +112,9 @@ def _first_distances(points_t: FloatArray) -> FloatArray:
 
 
 def is_inside(point: FloatArray, around: FloatArray) -> bool:
-    """Return whether a place (2,) lies within the hull of places (n, 2): no half of the horizon around it is free of
-    them.
+    """Return whether a place (2,) lies within the convex hull of places (n, 2).
+
+    That is so if no half of the horizon around it is free of them.
     """
     offsets = around - point
     if not (np.abs(offsets).sum(axis=1) > 0.0).all():

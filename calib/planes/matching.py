@@ -1,7 +1,8 @@
-"""The same planes found again after the points have moved: correspondences of the next iteration.
+"""Find the same planes again after the points have moved: correspondences of the next iteration.
 
-A plane's footprint is what its returns cover now, in all swaths together. In it, the returns of every swath near the
-plane are its returns; a swath that no longer shows the same plane is left out, one that does now comes in.
+A plane's footprint is the area that its returns cover now, in all swaths together. Returns of every swath in the
+footprint and near the plane become its returns; a swath that no longer shows the same plane is left out, and others may
+be added.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from swath.georef.records import Int64Array
 
 LOST = "no longer fits"
 _DEFAULT = PlaneSettings()
-_SLACK = 1.5  # of the tests, for what was a plane before
+_SLACK = 1.5  # factor of the tests' limits for former planes
 _ROUNDS = 6
 _SIGMAS = 4.0
 
@@ -31,11 +32,11 @@ _SIGMAS = 4.0
 def rematch(
     flight: Flight, features: Features, settings: PlaneSettings = _DEFAULT, each: Callable[..., Any] = map
 ) -> Features:
-    """Return the planes of features with the returns that lie on them now; all else is handed on.
+    """Return the planes of features with the returns that lie on them now; other features are unchanged.
 
-    Sets are the same again where nothing has moved since the last time. A plane needs two swaths, or what it has from
-    surveys; planes that are no longer seen so are dropped and counted. Swaths are looked through by `each`, as
-    `map` calls: a pool's does it for several at a time, and the result is the same.
+    The sets of returns stay the same if the points have not moved since the last call. A plane needs two swaths, or one
+    and surveyed data; other planes are dropped and counted. Swaths are processed by `each`, which is called like `map`:
+    that of a pool processes several at a time, with the same result.
     """
     refused = Counter(features.refused)
     settings = scaled_to(flight, settings)
@@ -59,7 +60,7 @@ def _surveyed(plane: Plane) -> bool:
 
 
 def _sights(flight: Flight, plane: Plane, settings: PlaneSettings) -> dict[int, Sight]:
-    """Return what swaths show of a plane with the returns it had."""
+    """Fit a plane again with its former returns, and return its sights by swath."""
     sights = {}
     for patch in plane.patches:
         at = patch.at[np.isfinite(flight.swaths[patch.swath].points_t[patch.at]).all(axis=1)]
@@ -70,7 +71,7 @@ def _sights(flight: Flight, plane: Plane, settings: PlaneSettings) -> dict[int, 
 
 
 def _agreeing(sights: Mapping[int, Sight], settings: PlaneSettings) -> dict[int, Sight]:
-    """Return those that show the same plane as the one that most agree with; of several, the one of most returns."""
+    """Return the sights that agree with the most widely supported one; ties go to the one with most returns."""
     swaths = sorted(sights, key=lambda swath: -len(sights[swath].at))
     if len(swaths) < 2:
         return dict(sights)
@@ -88,7 +89,7 @@ def _agreeing(sights: Mapping[int, Sight], settings: PlaneSettings) -> dict[int,
 
 
 def _in_sorted(at: Int64Array, others: Int64Array) -> NDArray[np.bool_]:
-    """Return (n,) which of rising indexes are among others, rising too."""
+    """Return whether rising indexes (n,) are among other rising ones."""
     place = np.minimum(np.searchsorted(others, at), max(len(others) - 1, 0))
     among: NDArray[np.bool_] = others[place] == at if len(others) else np.zeros(len(at), np.bool_)
     return among
@@ -101,7 +102,7 @@ def _candidates(
     settings: PlaneSettings,
     each: Callable[..., Any],
 ) -> list[dict[int, Int64Array]]:
-    """By plane and swath, returns in the footprint and not far from the plane."""
+    """Return, by plane and swath, the returns in the footprint that are not far from the plane."""
     keys, labels = _footprints(flight, known, cell_m)
     near: list[dict[int, Int64Array]] = [{} for _ in known]
     joint = np.array([_row(plane_of("", "", sights), sights, settings) for _, sights in known]).reshape(-1, 5)
@@ -124,7 +125,7 @@ def _candidates(
 
 
 def _row(plane: Plane, sights: Mapping[int, Sight], settings: PlaneSettings) -> list[float]:
-    """For a swath that did not show the plane so far."""
+    """Return the plane and search distance for a swath that has not shown the plane so far."""
     reach_m = settings.tight_m + GATE * max(sight.sigma_m for sight in sights.values())
     return [*plane.normal_t.tolist(), float(plane.normal_t @ plane.centre_t), reach_m]
 
@@ -132,7 +133,7 @@ def _row(plane: Plane, sights: Mapping[int, Sight], settings: PlaneSettings) -> 
 def _footprints(
     flight: Flight, known: list[tuple[Plane, dict[int, Sight]]], cell_m: float
 ) -> tuple[Int64Array, Int64Array]:
-    """Return cells that planes cover, each once: the plane's that has most returns in it."""
+    """Return the cells that planes cover; a cell belongs to the plane with most returns in it."""
     keys, labels = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
     for label, (_, sights) in enumerate(known):
         for swath, sight in sights.items():
@@ -155,7 +156,7 @@ def _settled(
     cell_m: float,
     settings: PlaneSettings,
 ) -> dict[int, Sight]:
-    """By swath, the returns within the gate of the plane that is fitted to them."""
+    """Return, by swath, the returns within the gate of the plane that is fitted to them."""
     before = {patch.swath: patch.at for patch in plane.patches}
     found = {}
     for swath, at in near.items():

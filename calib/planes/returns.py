@@ -1,4 +1,4 @@
-"""Returns of known planes, and planes made of what swaths show of them."""
+"""Collect the returns of known planes, and build planes from the sights in several swaths."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from swath.calib.planes.kernels import fill_table, gather
 from swath.georef.arrays import FloatArray
 from swath.georef.records import Int64Array
 
-WIDE_M = 0.5  # within which of a plane returns are looked at
-RIM_M = 0.5  # of a face: so far beyond a fold of 17° the other face is 0.15 m off, and out of a gate of that
-PURE, PURE_BEFORE = 0.9, 0.75  # share of a cell's returns there that have to lie on the plane
-COMES = 0.9  # share of the gate for what was not of the plane before
-_SAG_SHARE, _SHORTEST = 0.7, 0.3  # of the sag allowed that the middle may have; of a tile that it must have
-_SEED = 19159  # of which returns are kept where there are too many
+WIDE_M = 0.5  # greatest distance of examined returns from a plane
+RIM_M = 0.5  # of a face: this far beyond a fold of 17° the other face is 0.15 m away, outside a gate of that size
+PURE, PURE_BEFORE = 0.9, 0.75  # least share of a cell's returns that lie on the plane; the second for former members
+COMES = 0.9  # share of the gate for returns that were not on the plane before
+_SAG_SHARE, _SHORTEST = 0.7, 0.3  # of the allowed sag, for the middle part; of a tile, its least length
+_SEED = 19159  # for the choice of returns where there are too many
 
 
 def returns_near(
@@ -31,7 +31,7 @@ def returns_near(
     """Return a swath's single returns in cells, near the plane of their cell: rising indexes by label.
 
     Args:
-        swath: whose.
+        swath: swath with the returns.
         keys, labels: (c,) cells of the lattice, and the plane of each.
         planes: (k, 5) by label: normal, its product with a point of the plane, greatest distance.
         cell_m: of the lattice.
@@ -55,7 +55,7 @@ def returns_near(
 
 
 def cells_of(points_t: FloatArray, cell_m: float) -> Int64Array:
-    """Return (n,) numbers of the cells that points (n, 3) lie in, from 0 on."""
+    """Return numbers (n,), from 0 on, of the cells in which points (n, 3) lie."""
     columns, rows = np.floor(points_t[:, :2].T / cell_m).astype(np.int64)
     columns, rows = columns - columns.min(initial=0), rows - rows.min(initial=0)
     numbers: Int64Array = np.unique(keys_of(columns, rows), return_inverse=True)[1]
@@ -63,8 +63,7 @@ def cells_of(points_t: FloatArray, cell_m: float) -> Int64Array:
 
 
 def well_inside(points_t: FloatArray, keys: Int64Array, cell_m: float) -> NDArray[np.bool_]:
-    """Return which of points (n, 3) are at least `RIM_M` inside the cells (c,) of a face, half a cell where cells are
-    small.
+    """Return which of points (n, 3) are at least `RIM_M`, or half of a small cell, inside the cells (c,) of a face.
 
     Beyond a ridge the other face stays within the gate for some decimetres, always below: returns from there would make
     roofs lower, most of all in strips whose gate is wide, which looks like a range scale.
@@ -80,11 +79,10 @@ def well_inside(points_t: FloatArray, keys: Int64Array, cell_m: float) -> NDArra
 def pure(
     points_t: FloatArray, plane: FloatArray, gate_m: float, cell: Int64Array, had: NDArray[np.bool_] | None = None
 ) -> NDArray[np.bool_]:
-    """Return which of points (n, 3) are within a gate of a plane (4,), in cells (n,) where nearly all points near it
-    are.
+    """Return which of points (n, 3) are within a gate of a plane (4,), in cells (n,) where nearly all points are.
 
-    At a ridge both faces run through one cell: what lies within the gate there is not of one face alone. What was taken
-    before (``had``) stays a little longer than others come in, so that sets become stable.
+    At a ridge both faces run through one cell: returns within the gate there belong to both. Former members (``had``)
+    stay within wider limits than new ones, so that sets become stable.
     """
     distance = np.abs(points_t @ plane[:3] - plane[3])
     share = np.bincount(cell, distance <= gate_m) / np.bincount(cell)
@@ -96,7 +94,7 @@ def pure(
 
 
 def thinned(at: Int64Array, most: int) -> Int64Array:
-    """At most so many: one drawn from each of as many equal stretches, always the same ones."""
+    """Thin indexes to at most ``most``: one drawn from each of as many equal stretches, always the same ones."""
     if len(at) <= most:
         return at
     edges = np.linspace(0.0, len(at), most + 1)
@@ -105,7 +103,7 @@ def thinned(at: Int64Array, most: int) -> Int64Array:
 
 
 def limited(features: Features, rows: int) -> Features:
-    """Return features with at most so many returns on planes in all: of large patches as many as of every other one."""
+    """Limit the total number of returns on planes; large patches are cut to a common size."""
     sizes = np.sort([len(patch.at) for plane in features.planes for patch in plane.patches])
     if sizes.sum() <= rows:
         return features
@@ -122,9 +120,9 @@ def limited(features: Features, rows: int) -> Features:
 def sights_of(
     flight: Flight, found: Mapping[int, Int64Array], settings: PlaneSettings, refused: Counter[str]
 ) -> dict[int, Sight]:
-    """By swath, what each shows of a plane that stands the tests; why it is none is counted.
+    """Return, by swath, the sights of a plane that pass the tests; reasons of failures are counted.
 
-    Of a place that is curved as a whole its middle is taken, as much of it as is plane.
+    If a place is curved as a whole, only its middle is used, as far as that is plane.
     """
     good, why, bent_m = _tested(flight, found, settings)
     if len(good) < 2 and bent_m > settings.sag_m:
@@ -140,7 +138,7 @@ def sights_of(
 def _tested(
     flight: Flight, found: Mapping[int, Int64Array], settings: PlaneSettings
 ) -> tuple[dict[int, Sight], Counter[str], float]:
-    """Return sights that are planes, why others are not, and how curved these are, metres."""
+    """Return the sights that are planes, the reasons why others are not, and the curvature of these, metres."""
     good: dict[int, Sight] = {}
     why: Counter[str] = Counter()
     bent_m = 0.0
@@ -158,7 +156,7 @@ def _tested(
 def _middle(
     flight: Flight, found: Mapping[int, Int64Array], share: float, settings: PlaneSettings
 ) -> dict[int, Int64Array]:
-    """Return returns in the middle of all, a share of the whole length and width; none where that is too short."""
+    """Return the returns in the middle of all, a share of the whole length and width; none if that is too short."""
     places = {swath: np.asarray(flight.swaths[swath].points_t[at, :2]) for swath, at in found.items()}
     every = np.concatenate(list(places.values()))
     low, high = every.min(axis=0), every.max(axis=0)
@@ -170,7 +168,7 @@ def _middle(
 
 
 def _together(flight: Flight, sights: dict[int, Sight], settings: PlaneSettings) -> dict[int, Sight]:
-    """Return those that cover what the one of most returns covers, or a part of it."""
+    """Return the sights that cover the same area as the one with most returns, or a part of it."""
     if len(sights) < 2:
         return sights
     boxes = {}
@@ -188,8 +186,9 @@ def _together(flight: Flight, sights: dict[int, Sight], settings: PlaneSettings)
 
 
 def plane_of(name: str, kind: str, sights: Mapping[int, Sight], like: Plane | None = None) -> Plane:
-    """Return a plane midway between its sights, those weighing more whose direction is surer; like another, if
-    given.
+    """Build a plane from its sights, weighted by the certainty of their directions.
+
+    Control and surveyed sigmas are copied from the plane ``like``, if given.
     """
     weight = np.array([1.0 / max(sight.normal_sigma_rad, 1e-9) ** 2 for sight in sights.values()])
     normals = np.array([sight.normal_t for sight in sights.values()])
@@ -206,7 +205,7 @@ def plane_of(name: str, kind: str, sights: Mapping[int, Sight], like: Plane | No
 
 
 def named(planes: Sequence[Plane]) -> tuple[Plane, ...]:
-    """With names that count the planes of each kind, as ``roof 017``."""
+    """Name the planes by kind and number, as ``roof 017``."""
     counts: Counter[str] = Counter()
     made = []
     for plane in planes:

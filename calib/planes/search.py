@@ -1,8 +1,9 @@
-"""Planes found in overlapping strips (ISO/TS 19159-2, 6.6), or given by the user.
+"""Find planes in overlapping strips (ISO/TS 19159-2, 6.6), or take those that the user gives.
 
-Grid first: planes are grown over the cells of each swath, the same face is recognised in other swaths by its place and
-direction, faces are cut into pieces, and only then are single returns looked at: are they a plane, as good as the
-range and the angle are? Roofs are all kept; of level ground there are enough pieces spread over every pair of swaths.
+The search uses grids first: planes grow over the cells of each swath, the same face is recognised in other swaths by
+its place and direction, and faces are cut into pieces. Only then are single returns tested: do they form a plane, as
+far as the accuracy of range and angle allows? All roofs are kept; of level ground enough pieces, spread over every pair
+of swaths.
 """
 
 from __future__ import annotations
@@ -26,9 +27,9 @@ from swath.georef.arrays import BoolArray, FloatArray
 from swath.georef.records import Int64Array
 
 FIFTHS, THIRDS, OCTANTS = 5, 3, 8
-_ROOF_SHARE = 0.8  # of all planes, where there are too many
+_ROOF_SHARE = 0.8  # of all planes, if there are too many
 
-_COPLANAR_M = 0.08  # by which parts of one face may lie apart in the same swath, besides their noise
+_COPLANAR_M = 0.08  # distance between parts of one face in the same swath, beyond their noise
 _SIGMAS = 4.0
 
 __all__ = ["PlaneError", "PlaneRow", "PlaneSettings", "find_planes", "given_planes", "plane_rows"]
@@ -38,11 +39,11 @@ _ROUNDS = 4
 
 
 def find_planes(flight: Flight, settings: PlaneSettings = _DEFAULT, each: Callable[..., Any] = map) -> Features:
-    """Return planes seen by at least two swaths, roofs first; why other places bear none is counted by reason.
+    """Find planes seen by at least two swaths, roofs first; the reasons why other places have none are counted.
 
-    Returns of pulses with a single return count. Candidates are counted as tiles of the ground where nothing grew, as
-    planes afterwards. Swaths are searched by `each`, as `map` calls: a pool's does it for several at a time, and the
-    result is the same.
+    Only returns of pulses with a single return are used. Failures are counted as tiles of the ground where no plane
+    grew, and as planes afterwards. Swaths are searched by `each`, which is called like `map`: that of a pool searches
+    several at a time, with the same result.
 
     Raises:
         PlaneError: no swath has points.
@@ -55,7 +56,7 @@ def find_planes(flight: Flight, settings: PlaneSettings = _DEFAULT, each: Callab
     pieces = cut(segments, face, cell_m, settings, refused)
     planes: dict[int, Plane] = {}
     tried: set[int] = set()
-    for _ in range(_ROUNDS):  # others stand in for what turns out to be no plane
+    for _ in range(_ROUNDS):  # other pieces replace those that turn out to be no planes
         chosen = choose(flight, segments, pieces, settings, tried - planes.keys())
         fresh = np.array([piece for piece in chosen.tolist() if piece not in tried], np.int64)
         tried.update(fresh.tolist())
@@ -73,7 +74,7 @@ def find_planes(flight: Flight, settings: PlaneSettings = _DEFAULT, each: Callab
 def _grown(
     flight: Flight, cell_m: float, settings: PlaneSettings, refused: Counter[str], each: Callable[..., Any]
 ) -> Segments:
-    """Of all swaths; each counts for itself why places bear no plane."""
+    """Grow planes in all swaths; each swath has its own counter of refusals."""
     why: list[Counter[str]] = [Counter() for _ in flight.swaths]
     found = list(each(lambda index: segments_of(flight, index, cell_m, settings, why[index]), range(len(why))))
     for counted in why:
@@ -84,7 +85,7 @@ def _grown(
 def _returns(
     flight: Flight, segments: Segments, pieces: Pieces, chosen: Int64Array, cell_m: float, settings: PlaneSettings
 ) -> dict[int, dict[int, Int64Array]]:
-    """By piece and swath, the returns in the cells of its segments, near the plane that the segment shows."""
+    """Return, by piece and swath, the returns in the cells of its segments, near the plane that the segment shows."""
     wanted = np.isin(pieces.piece, chosen)
     cell = np.flatnonzero(pieces.cell_sight >= 0)
     cell = cell[wanted[pieces.cell_sight[cell]]]
@@ -108,7 +109,7 @@ def _returns(
 
 
 def _coarse_sigma(flight: Flight, segments: Segments, settings: PlaneSettings) -> FloatArray:
-    """Return (k,) expected of a return of a segment along its normal, metres."""
+    """Return the expected sigma (k,) of a segment's returns along its normal, metres."""
     sigma = np.zeros(len(segments))
     for index in np.unique(segments.swath):
         swath, mine = flight.swaths[int(index)], np.flatnonzero(segments.swath == index)
@@ -119,14 +120,14 @@ def _coarse_sigma(flight: Flight, segments: Segments, settings: PlaneSettings) -
 
 @dataclass(frozen=True, slots=True)
 class PlaneRow:
-    """A plane for a report.
+    """A plane as a row of a report.
 
     Attributes:
         name, kind: of the plane.
-        slope_rad, aspect_rad: how steep it is, and the azimuth it faces.
-        swaths: names of those that saw it.
-        points: returns on it.
-        rms_m: of them from it, swath by swath.
+        slope_rad, aspect_rad: its slope, and the azimuth it faces.
+        swaths: names of the swaths that saw it.
+        points: number of returns on it.
+        rms_m: distance of these from it, each swath relative to its own fitted plane.
     """
 
     name: str
@@ -139,7 +140,7 @@ class PlaneRow:
 
 
 def plane_rows(flight: Flight, features: Features) -> list[PlaneRow]:
-    """Return what was taken, plane by plane."""
+    """Return the planes used, as rows of a report."""
     return [
         PlaneRow(
             plane.name,
@@ -155,7 +156,7 @@ def plane_rows(flight: Flight, features: Features) -> list[PlaneRow]:
 
 
 def same_faces(segments: Segments, settings: PlaneSettings, refused: Counter[str]) -> Int64Array:
-    """Return (k,) number of the face that each segment belongs to; −1: of none that several swaths see without doubt.
+    """Return the number (k,) of each segment's face; −1 if several swaths do not clearly see that face.
 
     Two segments are linked where they overlap, face alike, and lie no farther apart than strips do. A face whose
     segments are not all alike, or of which one swath has two that are not coplanar, is ambiguous: it is refused.
@@ -180,7 +181,7 @@ def same_faces(segments: Segments, settings: PlaneSettings, refused: Counter[str
 
 
 def _overlapping(segments: Segments, settings: PlaneSettings) -> tuple[Int64Array, Int64Array]:
-    """Return pairs of segments of different swaths with enough cells in common."""
+    """Return the pairs of segments of different swaths with enough cells in common."""
     order = np.argsort(segments.cell_key, kind="stable")
     key, of = segments.cell_key[order], segments.cell_of[order]
     pairs = []
@@ -200,7 +201,7 @@ def _overlapping(segments: Segments, settings: PlaneSettings) -> tuple[Int64Arra
 
 
 def _differences(segments: Segments, one: Int64Array, other: Int64Array) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return angles between normals, their sigmas, distances of the planes from each other midway, of pairs (m,)."""
+    """Return angles between normals, their sigmas, and distances between the planes midway, of pairs (m,)."""
     cosine = np.minimum((segments.normal_t[one] * segments.normal_t[other]).sum(axis=1), 1.0)
     across, along, _ = segments.spread_m.T
     turn = across / (np.sqrt(segments.moments[:, 0]) * np.maximum(along, 1e-6))
@@ -211,7 +212,7 @@ def _differences(segments: Segments, one: Int64Array, other: Int64Array) -> tupl
 
 
 def _alike(segments: Segments, one: Int64Array, other: Int64Array, settings: PlaneSettings) -> BoolArray:
-    """Return whether pairs may be the same face of two swaths that lie a little beside each other."""
+    """Return whether pairs may be the same face in two slightly displaced swaths."""
     angle, sigma, apart = _differences(segments, one, other)
     level = segments.normal_t[one, 2]
     limit = settings.offset_m + settings.displacement_m * np.sqrt(np.maximum(0.0, 1.0 - level**2))
@@ -229,7 +230,7 @@ def _with_largest(segments: Segments, face: Int64Array, count: int, settings: Pl
 
 
 def _of_same_swath(segments: Segments, face: Int64Array) -> tuple[Int64Array, Int64Array]:
-    """Return segments of which another is the one before in the same face and swath, and those."""
+    """Return the pairs of consecutive segments in the same face and swath."""
     order = np.lexsort((segments.swath, face))
     again = (np.diff(face[order]) == 0) & (np.diff(segments.swath[order]) == 0)
     return order[1:][again], order[:-1][again]
@@ -245,14 +246,14 @@ def _coplanar(segments: Segments, one: Int64Array, other: Int64Array) -> BoolArr
 
 @dataclass(frozen=True, eq=False)
 class Pieces:
-    """Pieces of faces and their sights: what one segment shows of a piece.
+    """Pieces of faces and their sights; a sight is a piece as one segment shows it.
 
     Attributes:
         steep: (p,) whether a piece is steeper than ground that is thinned.
         aspect: (p,) azimuth it faces, rad.
         points: (p,) returns of all swaths.
         piece, segment: (s,) of sights, by piece.
-        cell_sight: (c,) sight each of the segments' cells belongs to; −1: none.
+        cell_sight: (c,) sight to which each of the segments' cells belongs; −1: none.
     """
 
     steep: BoolArray
@@ -264,9 +265,7 @@ class Pieces:
 
 
 def cut(segments: Segments, face: Int64Array, cell_m: float, settings: PlaneSettings, refused: Counter[str]) -> Pieces:
-    """Return faces (k,) of segments in pieces no longer than a tile; those that one swath alone shows well are left
-    out.
-    """
+    """Cut faces (k,) of segments into pieces no longer than a tile; two swaths must show a piece well."""
     at = np.flatnonzero(face[segments.cell_of] >= 0)
     of_face = face[segments.cell_of[at]]
     faces = int(face.max(initial=-1)) + 1
@@ -302,9 +301,7 @@ def cut(segments: Segments, face: Int64Array, cell_m: float, settings: PlaneSett
 def _parts(
     place: FloatArray, of_face: Int64Array, steep: BoolArray, cell_m: float, settings: PlaneSettings
 ) -> Int64Array:
-    """Return (c,) which part of its face a cell at (c, 2) is in: steep faces are cut along their longer side and
-    across.
-    """
+    """Return which part of its face a cell at (c, 2) is in; steep faces are cut along their longer side and across."""
     faces = len(steep)
     size = np.maximum(np.bincount(of_face, minlength=faces), 1)
     mean = np.stack([np.bincount(of_face, axis, minlength=faces) / size for axis in place.T], axis=1)
@@ -326,9 +323,7 @@ def _parts(
 def choose(
     flight: Flight, segments: Segments, pieces: Pieces, settings: PlaneSettings, without: Set[int]
 ) -> Int64Array:
-    """Return pieces to be taken: roofs, those of every direction in turn; then ground, spread over every pair of
-    swaths.
-    """
+    """Choose the pieces to use: roofs, in turn by direction; then ground, spread over every pair of swaths."""
     usable = np.ones(len(pieces.steep), np.bool_)
     usable[list(without)] = False
     roofs = np.flatnonzero(pieces.steep & usable)
@@ -346,9 +341,7 @@ def choose(
 def _spread_ground(
     flight: Flight, segments: Segments, pieces: Pieces, usable: BoolArray, settings: PlaneSettings
 ) -> Int64Array:
-    """Return level pieces, those that many swaths see first, as long as a pair of swaths lacks them at a place of
-    theirs.
-    """
+    """Return level pieces, those seen by many swaths first, as long as a pair of swaths needs more at their place."""
     place = _places(flight, segments)
     level = np.flatnonzero(~pieces.steep & usable)
     begin, end = np.searchsorted(pieces.piece, level), np.searchsorted(pieces.piece, level, side="right")
@@ -370,7 +363,7 @@ def _spread_ground(
 
 
 def _places(flight: Flight, segments: Segments) -> Int64Array:
-    """Return (k,) where in its swath a segment lies: fifths of the swath across times thirds along."""
+    """Return where in its swath a segment lies (k,): fifths of the swath across times thirds along."""
     place = np.zeros(len(segments), np.int64)
     for index in np.unique(segments.swath):
         swath = flight.swaths[int(index)]

@@ -1,1 +1,1 @@
-"""Profiles across the swath: scan angle errors measured step by step."""
+"""Profiles across the swath: step-by-step measurement of angle errors."""

@@ -1,21 +1,20 @@
-"""Profiles as an independent check of an adjustment: what they say, what it says, and whether that is the same.
+"""Check an adjustment independently by profiles, and test whether both agree.
 
-Profiles are measured with the points where the adjustment put them. What each finds is, to first order,
+Profiles are measured with the points where the adjustment put them. The finding of each profile is, to first order,
 
     y = S x + L t + v
 
 with x the corrections that all parameters still need, t the errors of the trajectory at knots, v the noise of its
-pieces; S and L are taken from the pieces themselves: how far each moves with every parameter (by placing it anew) and
-with the trajectory at the moment it was seen. So profiles of one line share its errors, those of a long one average
-what changes along it, and an opposite pair side by side knows that pitch moves it as heading does.
+pieces. S and L come from the pieces themselves: how far each moves with every parameter (by placing it anew) and with
+the trajectory at the moment it was seen. So profiles of one line share its errors, those of a long one average errors
+that change along it, and for an opposite pair side by side S shows that pitch moves it as heading does.
 
 The angles and the range of all profiles together are x̂ = W y, by least squares with V = L C Lᵀ + D, C the prior
-covariance of the trajectory's errors. Their difference d from the adjustment is W S of what the adjustment has wrong,
-less what W makes of L t + v. An efficient estimate is uncorrelated with its difference from any other unbiased one
-(Hausman 1978, Econometrica 46, lemma 2.1), so cov d = W V Wᵀ − (W S) Σ (W S)ᵀ, Σ that of the adjustment's own errors;
-never less than the profiles' noise alone, which the adjustment does not share. What parameters that were held have
-wrong, and what it did to the estimated ones, is in d as it is in the profiles: it adds (W S) H (W S)ᵀ, H its
-covariance.
+covariance of the trajectory's errors. Their difference d from the adjustment is W S times the errors of the adjustment,
+less W (L t + v). An efficient estimate is uncorrelated with its difference from any other unbiased one (Hausman 1978,
+Econometrica 46, lemma 2.1), so cov d = W V Wᵀ − (W S) Σ (W S)ᵀ, with Σ that of the adjustment's own errors; it is never
+less than the profiles' noise alone, which the adjustment does not share. The errors of held parameters, and their
+effects on the estimated ones, are in d as they are in the profiles: they add (W S) H (W S)ᵀ, with H their covariance.
 """
 
 from __future__ import annotations
@@ -36,18 +35,18 @@ from swath.calib.profiles.stepwise import MISSING, Profile, survey
 from swath.georef.arrays import FloatArray
 from swath.georef.scanner.calibration import INDEX, PARAMETERS
 
-CHECK = Settings(search_rad=1e-4, most_a_pair=2)  # the strips lie on each other already
+CHECK = Settings(search_rad=1e-4, most_a_pair=2)  # the strips already coincide
 
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """One parameter of a scanner, SI.
+    """The comparison for one parameter of a scanner, SI.
 
     Attributes:
         scanner, parameter: as ``left``, ``omega_rad``.
-        profiles: how many of its kind.
-        told, told_sigma: what the profiles say; all other parameters as adjusted.
-        adjusted, adjusted_sigma: what the adjustment says.
+        profiles: number of profiles of its kind.
+        told, told_sigma: value from the profiles; all other parameters as adjusted.
+        adjusted, adjusted_sigma: value from the adjustment.
         difference_sigma: of told − adjusted.
     """
 
@@ -68,13 +67,13 @@ class Comparison:
 
 @dataclass(frozen=True, eq=False)
 class Check:
-    """What profiles say of an adjustment.
+    """The result of checking an adjustment by profiles.
 
     Attributes:
         profiles: as measured with the points as adjusted.
         comparisons: of the parameters they determine.
-        missing: by scanner and kind, why there is none, in words.
-        refused: profiles that were not taken, by reason.
+        missing: by scanner and kind, why there is no comparison, in words.
+        refused: counts of refused profiles, by reason.
     """
 
     profiles: tuple[Profile, ...]
@@ -90,14 +89,14 @@ def check(
     control: Sequence[ControlPoint] = (),
     settings: Settings = CHECK,
 ) -> Check:
-    """Measure profiles where the procedure prescribes them, and compare.
+    """Measure profiles where the procedure prescribes them, and compare them with the adjustment.
 
     Args:
         flight: with points as placed by ``adjusted.calibrations``, on the trajectories that were adjusted.
         adjusted: the outcome.
-        prior: of the trajectories' errors, that it was adjusted with.
+        prior: of the trajectories' errors, as used in the adjustment.
         control: for the range.
-        settings: what counts.
+        settings: limits of the profiles.
     """
     refused: Counter[str] = Counter()
     profiles: list[Profile] = []
@@ -124,7 +123,7 @@ def compare(
     control: Sequence[ControlPoint] = (),
     settings: Settings = CHECK,
 ) -> tuple[Comparison, ...]:
-    """Return what profiles say together, beside the adjustment; arguments as of `check`."""
+    """Compare the joint result of all profiles with the adjustment; see `check` for the arguments."""
     if not profiles:
         return ()
     together = _Together.of(flight, profiles, adjusted, prior, control)
@@ -148,13 +147,13 @@ def compare(
 
 
 def _most(name: str, settings: Settings) -> float:
-    """Return greatest sigma that still says something; rad, or m."""
+    """Return the greatest useful sigma of a parameter, rad or m."""
     return 0.5 if name.endswith(PARAMETER["range"]) else settings.greatest_sigma_rad
 
 
 @dataclass(frozen=True, eq=False)
 class _Solved:
-    """(k,) each, of k parameters."""
+    """Results (k,) for k parameters."""
 
     found: FloatArray
     told_sigma: FloatArray
@@ -163,14 +162,14 @@ class _Solved:
 
 @dataclass(frozen=True, eq=False)
 class _Together:
-    """Profiles (p,) as observations.
+    """Profiles (p,) as joint observations.
 
     Attributes:
         found: (p,) y.
         names: all parameters of all scanners; `by_parameter` (p, names) S.
-        variance: (p, p) V; noise: (p,) of it the pieces' own, sigmas.
-        adjusted: (names, names) Σ; zero where one was held.
-        held: (names, c) what one sigma of each held parameter moves, itself too.
+        variance: (p, p) V; noise: (p,) sigmas of the pieces' own part of it.
+        adjusted: (names, names) Σ; zero for held parameters.
+        held: (names, c) change by one sigma of each held parameter, itself included.
     """
 
     found: FloatArray
@@ -210,7 +209,7 @@ class _Together:
         return cls(found, names, by_parameter, variance, noise, *_covariances(adjusted, names))
 
     def solved(self, names: Sequence[str]) -> _Solved:
-        """Of these parameters; all others as adjusted."""
+        """Solve for these parameters, with all others as adjusted."""
         columns = [self.names.index(name) for name in names]
         mine = self.by_parameter[:, columns]
         weight = np.linalg.inv(self.variance)
@@ -238,7 +237,10 @@ def _by_parameter(part: Influence, profile: Profile, names: Sequence[str]) -> Fl
 
 
 def _covariances(adjusted: Adjusted, names: Sequence[str]) -> tuple[FloatArray, FloatArray]:
-    """Return (names, names) of the estimated parameters' own errors, (names, c) what one sigma of held ones moves."""
+    """Return the covariance (names, names) of estimated parameters' own errors, and effects (names, c) of held ones.
+
+    The effects are those of one sigma of each held parameter.
+    """
     covariance, held = np.zeros((len(names), len(names))), np.zeros((len(names), len(adjusted.considered)))
     at = [i for i, name in enumerate(adjusted.names) if name.partition(".")[2] in INDEX and name in names]
     to = [names.index(adjusted.names[i]) for i in at]

@@ -1,13 +1,14 @@
-"""What a profile pair says of an angle: heights of two swaths' pieces, compared where they lie.
+"""Estimate an angle from a profile pair: compare heights of two swaths' pieces at the same places.
 
-A wrong angle moves every piece of a swath forward, to the right and down by FORMULAS 5.3; where the ground slopes, what
-moves sideways changes the height above a place. So the difference of two swaths' heights over one place is linear in
+A wrong angle moves every piece of a swath forward, to the right and down by FORMULAS 5.3; where the ground slopes, a
+sideways movement changes the height above a place. So the difference of two swaths' heights over one place is linear in
 the angle, with a lever that each piece has from its place and its slope:
 
     roll     −Y + H (g · right)        pitch     −H (g · forward)        heading     Y (g · forward)
 
 with Y to the right of the track, H the height above ground, and g the slope of the ground. Errors of the trajectory,
-constant over a profile, act alike and are unknowns with their own sigmas as priors; so the sigma found is honest.
+constant over a profile, act alike and are unknowns with their own sigmas as priors; so the resulting sigma is
+realistic.
 """
 
 from __future__ import annotations
@@ -22,10 +23,10 @@ from swath.calib.profiles.places import Track
 from swath.calib.profiles.sections import Pieces
 from swath.georef.arrays import BoolArray, FloatArray
 
-STATES = 6  # a swath: north, east, down, roll, pitch, heading
-TURNS = {"roll": 3, "pitch": 4, "heading": 5}  # the trajectory's error that is the same as the angle's
+STATES = 6  # per swath: north, east, down, roll, pitch, heading
+TURNS = {"roll": 3, "pitch": 4, "heading": 5}  # index of the trajectory's error that acts like the angle's
 ROBUST_ROUNDS = 12
-HUBER, FAR = 1.5, 4.0  # sigmas: from which a piece counts less, from which not at all
+HUBER, FAR = 1.5, 4.0  # sigmas: above the first a piece counts less, above the second hardly at all
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,12 +34,12 @@ class Fit:
     """An angle or range from one profile.
 
     Attributes:
-        error: that the placed points show, rad or m; the correction is its negative.
-        sigma: of it, trajectory and all.
-        noise_sigma: of the points' part alone.
-        by_trajectory: per swath (6,): how far one sigma of each of its `STATES` moves it.
-        used: (k,) which pieces counted.
-        gain: (k,) by how much a unit of each piece's difference moves ``error``.
+        error: error that the placed points show, rad or m; the correction is its negative.
+        sigma: its sigma, including trajectory errors.
+        noise_sigma: its sigma from the points alone.
+        by_trajectory: per swath (6,): change of it by one sigma of each of its `STATES`.
+        used: (k,) mask of the pieces that counted.
+        gain: (k,) change of ``error`` per unit of each piece's difference.
     """
 
     error: float
@@ -50,8 +51,9 @@ class Fit:
 
 
 def trajectory_sigmas(flight: Flight, swath: int, unsaid: tuple[float, float]) -> FloatArray:
-    """Return (6,) north, east, down m, roll, pitch, heading rad: means over a swath; where nothing is said, what is
-    given.
+    """Return mean sigmas (6,) over a swath: north, east, down m, roll, pitch, heading rad.
+
+    Where the trajectory has no sigmas, those of ``unsaid`` count, with that of heading doubled.
     """
     one = flight.swaths[swath]
     trajectory = flight.trajectories[one.flown]
@@ -65,12 +67,12 @@ def trajectory_sigmas(flight: Flight, swath: int, unsaid: tuple[float, float]) -
 
 
 def levers(track: Track, places_t: FloatArray, height_m: FloatArray, slope_t: FloatArray) -> FloatArray:
-    """Return (k, 6) by how much the height above a place changes a unit of each of `STATES`.
+    """Return the change (k, 6) of the height above a place per unit of each of `STATES`.
 
     Args:
         track: of the swath.
         places_t: (k, 2) of the pieces.
-        height_m: (k,) theirs.
+        height_m: (k,) of the pieces.
         slope_t: (k, 2) of the ground, east and north, m/m.
     """
     aside = track.aside(places_t)
@@ -88,7 +90,7 @@ def levers(track: Track, places_t: FloatArray, height_m: FloatArray, slope_t: Fl
 
 
 def comparable(first: Pieces, second: Pieces, rms_m: float, slope_apart: float) -> BoolArray:
-    """Return (k,) where both swaths show the same smooth plane."""
+    """Return a mask (k,) of the pieces in which both swaths show the same smooth plane."""
     with np.errstate(invalid="ignore"):
         good: BoolArray = np.maximum(first.rms_m, second.rms_m) <= rms_m
         good &= np.hypot(first.slope - second.slope, first.side_slope - second.side_slope) <= slope_apart
@@ -102,19 +104,19 @@ def solve(
     states: Mapping[int, FloatArray],
     prior_sigma: Mapping[int, FloatArray],
 ) -> Fit:
-    """Return the error that explains differences of height (k,) best, robustly.
+    """Find robustly the error that best explains differences of height (k,).
 
     Args:
         difference_m: first − second.
         sigma_m: (k,) of the pieces' fits.
-        lever: (k,) of the angle or range sought.
+        lever: (k,) of the angle or range to find.
         states: by swath (k, 6) levers of its trajectory, with the sign of the swath in the difference.
         prior_sigma: by swath (6,).
     """
     swaths = sorted(states)
     design = np.concatenate([lever[:, np.newaxis], *(states[swath] for swath in swaths)], axis=1)
     scale = np.concatenate([[1.0], *(prior_sigma[swath] for swath in swaths)])
-    design = design * scale  # unknowns in their sigmas
+    design = design * scale  # scales the unknowns to their sigmas
     prior = np.eye(len(scale))
     prior[0, 0] = 0.0
     weight = 1.0 / sigma_m**2
@@ -135,8 +137,9 @@ def solve(
 
 
 def _gain(design: FloatArray, weight: FloatArray, prior: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return N⁻¹ Aᵀ P (u, k) and N⁻¹ (u, u); where nothing depends on the first unknown its variance is huge, not
-    infinite.
+    """Return N⁻¹ Aᵀ P (u, k) and N⁻¹ (u, u).
+
+    If no observation depends on the first unknown, its variance is huge but finite.
     """
     normal = design.T @ (design * weight[:, np.newaxis]) + prior
     normal[0, 0] += 1e-12

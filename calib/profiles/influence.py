@@ -1,4 +1,4 @@
-"""What moves the angle or range that a profile finds: every parameter, and the trajectory at every moment."""
+"""Compute how a profile's result depends on every parameter, and on the trajectory at every moment."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from swath.georef.arrays import FloatArray
 from swath.georef.records import Int64Array
 from swath.georef.scanner.calibration import PARAMETERS, Calibration
 
-STEP = {"rad": 1e-5, "m": 1e-3, "s": 1e-6}  # of a parameter, by its unit; else
+STEP = {"rad": 1e-5, "m": 1e-3, "s": 1e-6}  # steps of a parameter by its unit; otherwise the next one
 PURE_STEP = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
 class Influence:
-    """By how much what a profile finds changes.
+    """Derivatives of a profile's result.
 
     Attributes:
-        by_parameter: a unit of the correction a parameter of its scanner needs.
-        by_knot: (6 knots,) a unit of what the trajectory has to be corrected by, as in `TrajectoryPrior`.
-        by_target: a metre of a surveyed point's height, by name.
+        by_parameter: per unit of the correction that a parameter of its scanner needs.
+        by_knot: (6 knots,) per unit of the trajectory's correction, as in `TrajectoryPrior`.
+        by_target: per metre of a surveyed point's height, by name.
     """
 
     by_parameter: Mapping[str, float]
@@ -42,13 +42,13 @@ def influence(
     prior: TrajectoryPrior,
     estimated: Collection[str],
 ) -> Influence:
-    """Of a profile.
+    """Compute the derivatives of a profile's result.
 
     Args:
-        flight: with the points that it was measured with.
-        profile: it.
+        flight: with the points used for the measurement.
+        profile: the profile.
         calibrations: of the points, by scanner.
-        prior: whose knots are meant.
+        prior: prior with the knots.
         estimated: parameters that matter, as ``left.omega_rad``.
     """
     calibration = calibrations[profile.scanner]
@@ -59,7 +59,7 @@ def influence(
         if swath < 0:
             continue
         pieces = _pieces(flight, flight.swaths[swath], profile, calibration, parameters)
-        gain = -sign * profile.gain  # what has to be added is the error, negative
+        gain = -sign * profile.gain  # the correction is the negative error
         by_parameter += gain @ pieces.by_parameter
         _to_knots(by_knot, prior, flight.swaths[swath].flown, pieces.time_ns, gain[:, np.newaxis] * pieces.by_state)
     targets = dict(zip(profile.targets, profile.gain.tolist(), strict=False))
@@ -68,11 +68,11 @@ def influence(
 
 @dataclass(frozen=True, eq=False)
 class _Pieces:
-    """Of the pieces (k,) of one swath: when they were seen, and how their heights move.
+    """The pieces (k,) of one swath: the times at which they were seen, and the derivatives of their heights.
 
     Attributes:
         time_ns: (k,).
-        by_state: (k, 6) a metre of the body to north, east, down, a radian of its turns about them.
+        by_state: (k, 6) per metre of the body to north, east, down, per radian of its turns about them.
         by_parameter: (k, parameters).
     """
 
@@ -109,7 +109,7 @@ def _pieces(
 
 
 def _returns(swath: Swath, cells: Sequence[Corridor]) -> tuple[Swath, Int64Array]:
-    """Return returns of each cell, one after the other, and whose each is."""
+    """Return the returns of all cells, one cell after the other, and the cell of each return."""
     ground = Ground.of(swath)
     parts = [ground.rows_near(cell) for cell in cells]
     piece = np.repeat(np.arange(len(cells)), [len(part) for part in parts])
@@ -117,7 +117,7 @@ def _returns(swath: Swath, cells: Sequence[Corridor]) -> tuple[Swath, Int64Array
 
 
 def _means(values: FloatArray, group: Int64Array, groups: int) -> FloatArray:
-    """Return (groups, c) means of columns (n, c); 0 where there is nothing."""
+    """Return means (groups, c) of columns (n, c); 0 for empty groups."""
     count = np.maximum(np.bincount(group, minlength=groups), 1)
     return np.stack([np.bincount(group, column, groups) / count for column in values.T], axis=1)
 
@@ -125,7 +125,7 @@ def _means(values: FloatArray, group: Int64Array, groups: int) -> FloatArray:
 def _to_knots(
     by_knot: FloatArray, prior: TrajectoryPrior, flown: int, time_ns: Int64Array, effects: FloatArray
 ) -> None:
-    """Add effects (k, 6) at moments (k,) to those of the knots (knots, 6) between which they lie."""
+    """Distribute effects (k, 6) at moments (k,) to the knots (knots, 6) before and after them."""
     before, after, share = prior.between(flown, time_ns)
     np.add.at(by_knot, before, (1.0 - share[:, np.newaxis]) * effects)
     np.add.at(by_knot, after, share[:, np.newaxis] * effects)

@@ -1,4 +1,4 @@
-"""One profile: its returns, placed anew with the angle found so far until the two sections lie on each other."""
+"""Measure one profile: place its returns anew with the current angle until the two sections coincide."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ FloatTriple = tuple[FloatArray, FloatArray, FloatArray]
 
 KINDS = ("roll", "pitch", "heading", "range")
 PARAMETER = {"roll": "omega_rad", "pitch": "phi_rad", "heading": "kappa_rad", "range": "range_offset_m"}
-BIN_M = 1.0  # of the sections that are shifted against each other
-CAP_M = 1.0  # of a deviation of theirs
-UNIQUE = 1.1  # by how much worse the next shift has to fit
-RETURNS_A_PIECE = 16  # pieces are made so large that they have as many on the average
+BIN_M = 1.0  # bin size of the sections that are shifted against each other
+CAP_M = 1.0  # greatest deviation of heights that counts
+UNIQUE = 1.1  # factor by which the next best shift has to fit worse
+RETURNS_A_PIECE = 16  # average number of returns that sets the size of pieces
 ITERATIONS = 6
 DONE = 0.02  # sigmas
-LEAST_SLOPE = 0.06  # along the profile, of pieces for pitch and heading: flatter ones would only say how well all fits
-CHUNK = 8192  # neighbouring returns that are looked at or passed over together
+LEAST_SLOPE = 0.06  # along the profile, of pieces for pitch and heading: flatter ones do not show the angle
+CHUNK = 8192  # neighbouring returns that are examined or skipped together
 NO_TRACK = "a swath without a straight track"
 TOO_FEW_RETURNS = "too few returns"
 TOO_FEW_PIECES = "too few pieces of smooth ground in both swaths"
@@ -42,19 +42,20 @@ TOO_UNSURE = "too uncertain"
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """What counts.
+    """Limits and sizes of the profiles.
 
     Attributes:
-        half_width_m, piece_m: of the corridor and of its pieces where the returns are dense enough; else they grow.
-        least_returns, least_pieces: fewer say nothing.
+        half_width_m, piece_m: of the corridor and of its pieces where the returns are dense enough; otherwise they
+            grow.
+        least_returns, least_pieces: with fewer a piece or profile is refused.
         most_a_pair: profiles of a pair of swaths.
         flat_slope: greatest slope of ground for roll and of targets.
         rms_m: greatest scatter of a piece about its plane.
-        slope_apart: greatest difference of slopes of what is held for the same piece.
-        search_rad: greatest angle looked for.
+        slope_apart: greatest difference of slopes of two swaths' pieces that count as the same ground.
+        search_rad: greatest angle that is searched.
         target_radius_m: of a control target.
-        unsaid_sigma: position m, attitude rad, for trajectories that say none.
-        greatest_sigma_rad: what a profile is less sure of is refused.
+        unsaid_sigma: position m, attitude rad, for trajectories without sigmas.
+        greatest_sigma_rad: greatest sigma of an accepted profile.
         rounds: of the stepwise procedure.
         most_drawn: returns of a section that are kept for its picture.
     """
@@ -77,7 +78,7 @@ class Settings:
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """A profile's numbers; see `swath.calib.profiles.stepwise.Profile`."""
+    """The numbers of a measured profile; see `swath.calib.profiles.stepwise.Profile`."""
 
     kind: str
     first: int
@@ -96,7 +97,7 @@ class Measured:
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """A swath's returns about a corridor."""
+    """A swath's returns around a corridor."""
 
     flight: Flight
     swath: Swath
@@ -104,7 +105,7 @@ class Part:
     calibration: Calibration
 
     def section(self, parameter: str, correction: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return distance, aside and height (n,) of those that lie in the corridor with a corrected parameter."""
+        """Return distance, aside and height (n,) of the returns that lie in the corridor with a corrected parameter."""
         value = self.calibration.value(parameter) + correction
         points_t = self.flight.place(self.swath, self.calibration.changed(**{parameter: value}))
         points_t = points_t[np.isfinite(points_t[:, 0])]
@@ -114,7 +115,7 @@ class Part:
 
 
 def shifts_m(flight: Flight, points_of: Mapping[str, Calibration], now: Mapping[str, Calibration]) -> float:
-    """Return how far points move at most, nearly, from one set of calibrations to another."""
+    """Return approximately how far points move at most from one set of calibrations to another."""
     moved = 0.0
     for swath in flight.swaths:
         name = flight.heads[swath.head].name
@@ -129,21 +130,21 @@ def shifts_m(flight: Flight, points_of: Mapping[str, Calibration], now: Mapping[
 
 @dataclass(frozen=True, eq=False)
 class Ground:
-    """A swath, and boxes (k, 4) of least and greatest east and north about every `CHUNK` of its points."""
+    """A swath, and boxes (k, 4) of least and greatest east and north around every `CHUNK` of its points."""
 
     swath: Swath
     boxes_t: FloatArray
 
     @classmethod
     def of(cls, swath: Swath) -> Ground:
-        """Make it with its boxes; points that are nan do not count."""
+        """Create the boxes of a swath; points that are nan do not count."""
         begins = range(0, len(swath), CHUNK)
         parts = [np.asarray(swath.points_t[begin : begin + CHUNK, :2]) for begin in begins]
         boxes = [np.concatenate([np.fmin.reduce(part), np.fmax.reduce(part)]) for part in parts]
         return cls(swath, np.array(boxes).reshape(-1, 4))
 
     def rows_near(self, corridor: Corridor, longer_m: float = 0.0) -> IndexArray:
-        """Return (k,) its returns in a corridor made longer by so much at either end."""
+        """Return the indexes (k,) of its returns in a corridor that is extended by ``longer_m`` at either end."""
         pieces = [np.zeros(0, np.int64)]
         for chunk in np.flatnonzero(corridor.meets(self.boxes_t, longer_m)).tolist():
             points_t = np.asarray(self.swath.points_t[chunk * CHUNK : (chunk + 1) * CHUNK, :2])
@@ -151,7 +152,7 @@ class Ground:
         return np.concatenate(pieces)
 
     def taken(self, at: IndexArray) -> Swath:
-        """Only these (k,) of its returns."""
+        """Select these returns (k,) of the swath."""
         swath = self.swath
         rate, acceleration = swath.encoder_rate, swath.encoder_acceleration
         return replace(
@@ -167,7 +168,7 @@ class Ground:
 def part_of(
     flight: Flight, ground: Ground, corridor: Corridor, wider_m: tuple[float, float], calibration: Calibration
 ) -> Part:
-    """Return returns whose points lie in the corridor, made longer and wider by so much."""
+    """Select the returns whose points lie in the corridor after it is extended and widened."""
     wide = replace(corridor, half_width_m=corridor.half_width_m + wider_m[1])
     return Part(flight, ground.taken(ground.rows_near(wide, wider_m[0])), corridor, calibration)
 
@@ -181,16 +182,16 @@ def measure_place(
     settings: Settings,
     margin_m: float,
 ) -> Measured | str:
-    """Return an angle from two swaths along a corridor; in words why not.
+    """Measure an angle from two swaths along a corridor; a string is the reason of failure.
 
     Args:
         flight: with points.
         grounds: of both swaths.
         tracks: of all swaths.
-        place: where.
+        place: the corridor and its swaths.
         calibrations: to measure with, by scanner.
-        settings: what counts.
-        margin_m: how far those move the flight's points at most.
+        settings: limits of the profiles.
+        margin_m: how far those calibrations move the flight's points at most.
     """
     indexes, kind = (place.first, place.second), place.kind
     one, other = tracks[place.first], tracks[place.second]
@@ -229,7 +230,7 @@ def measure_place(
 
 @dataclass(frozen=True, eq=False)
 class _Pair:
-    """What is compared: two tracks along a corridor, in pieces."""
+    """The comparison of two tracks along a corridor, in pieces."""
 
     kind: str
     corridor: Corridor
@@ -245,7 +246,10 @@ def _settle(
     prior: Mapping[int, FloatArray],
     found: float,
 ) -> tuple[float, Fit, _Compared, list[FloatTriple]] | str:
-    """Return the angle, its last fit, what was compared in it, and both sections as they end; in words why not."""
+    """Iterate to the angle; return it, its last fit, the compared pieces, and both final sections.
+
+    A string is the reason of failure.
+    """
     settings = pair.settings
     for step in range(ITERATIONS):
         sections = [part.section(PARAMETER[pair.kind], found) for part in parts]
@@ -266,14 +270,14 @@ def _settle(
 
 
 def _widened(corridor: Corridor, settings: Settings, density: float) -> tuple[Corridor, float]:
-    """Made so wide, and with pieces so long, that thin clouds too have returns enough in them."""
+    """Widen the corridor and lengthen its pieces so that thin clouds too have enough returns in them."""
     wanted = RETURNS_A_PIECE / max(density, 1e-6)
     factor = max(1.0, math.sqrt(wanted / (2.0 * settings.half_width_m * settings.piece_m)))
     return replace(corridor, half_width_m=factor * settings.half_width_m), factor * settings.piece_m
 
 
 def _forward_levers(kind: str, corridor: Corridor, track: Track) -> float:
-    """Return how far a unit of the angle's error moves a swath along the corridor."""
+    """Return the distance by which a unit of the angle's error moves a swath along the corridor."""
     sense = float(track.forward @ corridor.along)
     if kind == "pitch":
         return track.above_m * sense
@@ -282,7 +286,7 @@ def _forward_levers(kind: str, corridor: Corridor, track: Track) -> float:
 
 
 def _coarse(pair: _Pair, sections: Sequence[FloatTriple]) -> float:
-    """Return the error that brings the sections onto each other within a bin; 0 where nothing stands out."""
+    """Return the error that aligns the sections within a bin; 0 if no shift stands out."""
     if pair.kind == "roll":
         return 0.0
     corridor, (one, other) = pair.corridor, pair.tracks
@@ -298,8 +302,14 @@ def _coarse(pair: _Pair, sections: Sequence[FloatTriple]) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Compared:
-    """The pieces both swaths show (k,): heights of the first less those of the second, sigmas, levers (k, 6) of both,
-    distances along the corridor, and slopes (k, 2) of the ground, east and north."""
+    """The pieces (k,) that both swaths show.
+
+    Attributes:
+        difference_m, sigma_m: heights of the first less those of the second, and their sigmas.
+        levers: (k, 6) of both swaths.
+        at_m: distances along the corridor.
+        slope_t: (k, 2) of the ground, east and north.
+    """
 
     difference_m: FloatArray
     sigma_m: FloatArray
@@ -309,7 +319,7 @@ class _Compared:
 
 
 def _compare(pair: _Pair, sections: Sequence[FloatTriple], *, wide: bool) -> _Compared:
-    """Of slopes, pieces that overlap by half: a roof is seldom longer than two."""
+    """Compare two sections; for slopes the pieces overlap by half, because a roof is seldom longer than two pieces."""
     if pair.kind == "roll":
         return _compare_from(0.0, pair, sections, wide=wide)
     one, other = (_compare_from(begin, pair, sections, wide=wide) for begin in (0.0, 0.5 * pair.piece_m))
@@ -345,8 +355,9 @@ def _compare_from(begin_m: float, pair: _Pair, sections: Sequence[FloatTriple], 
 
 
 def _slopes(corridor: Corridor, first: Pieces, second: Pieces) -> FloatArray:
-    """Return (k, 2) of the ground, east and north: a wrong roll tilts the swaths of an opposite pair against each
-    other.
+    """Return slopes (k, 2) of the ground, east and north, averaged over both swaths.
+
+    A wrong roll tilts the swaths of an opposite pair against each other, and the average removes that.
     """
     along, across = 0.5 * (first.slope + second.slope), 0.5 * (first.side_slope + second.side_slope)
     slopes: FloatArray = along[:, np.newaxis] * corridor.along + across[:, np.newaxis] * corridor.across

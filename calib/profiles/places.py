@@ -1,4 +1,4 @@
-"""Where profiles can be measured: the lines flown as straight tracks, and the corridors Leica's procedure prescribes.
+"""Find places for profiles: flight lines as straight tracks, and the corridors that Leica's procedure prescribes.
 
 Roll: across both tracks of an opposite pair over one another. Pitch: along such a pair, below the aircraft. Heading:
 along two overlapping lines side by side, below one of them (FORMULAS 5.4).
@@ -17,13 +17,13 @@ from swath.georef.arrays import FloatArray
 from swath.georef.points import Fate
 from swath.georef.scanner.calibration import Calibration
 
-SAMPLES = 2000  # returns of a swath from which its track is known
+SAMPLES = 2000  # returns of a swath from which its track is estimated
 PARALLEL = 0.985  # least cosine between tracks that count as parallel: 10°
-ONE_ABOVE_OTHER = 0.2  # tracks no farther apart, in heights above ground, are one track flown twice
+ONE_ABOVE_OTHER = 0.2  # greatest distance, in heights above ground, of tracks that count as one track flown twice
 SIDE_BY_SIDE = 0.2  # least distance of tracks for a heading, in heights above ground
 STRAIGHT = 0.1  # greatest rms of a track from a straight line, in heights above ground
-CROSS_PROFILES, ALONG_PROFILES = 9, 5  # tried a pair; those over the smoothest or the steepest ground are kept
-NADIR = 0.06  # half width of what counts as below the aircraft, in heights above ground
+CROSS_PROFILES, ALONG_PROFILES = 9, 5  # candidates for a pair; those over the smoothest or the steepest ground are kept
+NADIR = 0.06  # half width of the area that counts as below the aircraft, in heights above ground
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,11 +34,11 @@ class Track:
         origin_t: (2,) below its middle.
         forward: (2,) unit vector; `right` is 90° to the right of it.
         height_m: mean, in t, of the scanner.
-        half_length_m: to its ends, of the ground it saw.
+        half_length_m: to the ends of the ground it saw.
         above_m: mean height above the ground.
         left_m, right_m: how far the ground it saw reaches to the left (negative) and right of it.
-        density: returns a square metre.
-        straight: whether it is one.
+        density: returns per square metre.
+        straight: whether the line is straight enough.
     """
 
     origin_t: FloatArray
@@ -53,17 +53,17 @@ class Track:
 
     @property
     def right(self) -> FloatArray:
-        """(2,) unit vector."""
+        """Unit vector (2,) to the right."""
         return np.array([self.forward[1], -self.forward[0]])
 
     def aside(self, places_t: FloatArray) -> FloatArray:
-        """Return (k,) Y: how far places (k, 2) are to the right of it."""
+        """Return Y (k,): how far places (k, 2) are to the right of the track."""
         aside: FloatArray = (places_t - self.origin_t) @ self.right
         return aside
 
 
 def track_of(flight: Flight, swath: Swath, calibration: Calibration) -> Track | None:
-    """Of a swath; None where too few of its returns have a place."""
+    """Return the track of a swath; None if too few of its returns can be placed."""
     if len(swath) < 10:
         return None
     at = np.unique(np.linspace(0, len(swath) - 1, SAMPLES).astype(np.int64))
@@ -97,13 +97,13 @@ def track_of(flight: Flight, swath: Swath, calibration: Calibration) -> Track | 
 
 
 def tracks_of(flight: Flight, calibrations: Mapping[str, Calibration]) -> list[Track | None]:
-    """Of all swaths."""
+    """Return the tracks of all swaths."""
     return [track_of(flight, swath, calibrations[flight.heads[swath.head].name]) for swath in flight.swaths]
 
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """A corridor for a profile of two swaths, by their indexes in `Flight.swaths`."""
+    """A corridor for a profile of two swaths, given by their indexes in `Flight.swaths`."""
 
     kind: str
     first: int
@@ -114,10 +114,10 @@ class Place:
 def places(
     flight: Flight, tracks: Sequence[Track | None], kind: str, half_width_m: float, pitch_unknown: Collection[str] = ()
 ) -> Iterator[list[Place]]:
-    """Yield the corridors of a kind, ``roll``, ``pitch`` or ``heading``, pair by pair of swaths of one scanner.
+    """Yield the corridors of a kind, ``roll``, ``pitch`` or ``heading``, for each pair of swaths of one scanner.
 
-    Opposite lines side by side are moved apart by a wrong pitch as by a wrong heading: they serve for the heading only
-    of scanners whose pitch is known, not of those named.
+    A wrong pitch separates opposite lines side by side as a wrong heading does: such pairs are used for the heading
+    only of scanners whose pitch is known, not of those in ``pitch_unknown``.
     """
     for first in range(len(tracks)):
         for second in range(first + 1, len(tracks)):
@@ -135,7 +135,7 @@ def places(
 
 
 def _stretch(one: Track, other: Track) -> tuple[float, float]:
-    """From where to where, along the first track, both have ground."""
+    """Return the begin and end, along the first track, of the stretch in which both swaths have ground."""
     sense = float(one.forward @ other.forward)
     middle = float((other.origin_t - one.origin_t) @ one.forward)
     half = abs(sense) * other.half_length_m
@@ -155,7 +155,7 @@ def _is_twice_flown(one: Track, other: Track) -> bool:
 
 
 def _across(one: Track, other: Track, half_width_m: float) -> list[Corridor]:
-    """Return across an opposite pair, over the full width both saw."""
+    """Return corridors across an opposite pair, over the full width that both saw."""
     low, high = _stretch(one, other)
     if not _is_twice_flown(one, other) or high - low < 4.0 * half_width_m:
         return []
@@ -170,7 +170,7 @@ def _across(one: Track, other: Track, half_width_m: float) -> list[Corridor]:
 
 
 def _along(one: Track, other: Track, half_width_m: float, middle_m: float) -> list[Corridor]:
-    """Return corridors along the first track, about one that is so far to the right of it."""
+    """Return corridors along the first track, around a line at a given distance to the right of it."""
     low, high = _stretch(one, other)
     if high - low < 10.0 * half_width_m:
         return []
@@ -182,18 +182,18 @@ def _along(one: Track, other: Track, half_width_m: float, middle_m: float) -> li
 
 
 def _below(one: Track, other: Track, half_width_m: float) -> list[Corridor]:
-    """Return along an opposite pair, at nadir of both."""
+    """Return corridors along an opposite pair, at nadir of both."""
     return _along(one, other, half_width_m, 0.5 * _apart(one, other)) if _is_twice_flown(one, other) else []
 
 
 def _beside(one: Track, other: Track, half_width_m: float) -> list[Corridor]:
-    """Return along two lines side by side, at nadir of each as far as the other sees it."""
+    """Return corridors along two lines side by side, at nadir of each as far as the other sees it."""
     apart, sense = _apart(one, other), float(one.forward @ other.forward)
     if abs(sense) < PARALLEL or abs(apart) < SIDE_BY_SIDE * min(one.above_m, other.above_m):
         return []
     found: list[Corridor] = []
     turned = 1.0 if sense > 0.0 else -1.0
-    if other.left_m < -turned * apart < other.right_m:  # the first track's nadir, as the other sees it
+    if other.left_m < -turned * apart < other.right_m:  # the first track's nadir, if the other sees it
         found += _along(one, other, half_width_m, 0.0)
     if one.left_m < apart < one.right_m:
         found += _along(one, other, half_width_m, apart)

@@ -1,7 +1,7 @@
 """Sections of the ground along a line: returns in a narrow corridor, and the planes of its short pieces.
 
 A section is measured by planes fitted to a few metres of it, never by single points: heights, slopes and their sigmas
-come from all returns of a piece, and a piece over a ridge, a hedge or a car says so by its scatter.
+come from all returns of a piece, and the scatter of a piece reveals a ridge, a hedge or a car in it.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from swath.georef.arrays import BoolArray, FloatArray
 
 IndexArray = NDArray[np.int64]
 
-ROUNDS = 3  # of a piece's plane: once from all its returns, then without those far off
-FAR = 3.0  # beyond so many times the median deviation (as a sigma) a return is left out
-LEAST_RMS_M = 0.002  # no piece is taken for smoother than this
+ROUNDS = 3  # of a piece's plane: once from all its returns, then without distant ones
+FAR = 3.0  # a return is left out beyond this multiple of the median deviation (as a sigma)
+LEAST_RMS_M = 0.002  # lower limit of a piece's scatter
 _SIGMA_OF_MEDIAN = 1.4826
 
 
 @dataclass(frozen=True, eq=False)
 class Corridor:
-    """Where a profile lies, on the map of t.
+    """The corridor of a profile, on the map of t.
 
     Attributes:
         origin_t: (2,) east and north of its begin.
@@ -39,35 +39,35 @@ class Corridor:
 
     @classmethod
     def between(cls, start_t: FloatArray, end_t: FloatArray, half_width_m: float) -> Corridor:
-        """Make it from one point to another (2,) or (3,), of which only east and north count."""
+        """Create the corridor from one point to another, (2,) or (3,), of which only east and north count."""
         way = np.asarray(end_t, np.float64)[:2] - np.asarray(start_t, np.float64)[:2]
         length_m = float(np.hypot(*way))
         return cls(np.array(start_t[:2], np.float64), way / length_m, length_m, half_width_m)
 
     @property
     def across(self) -> FloatArray:
-        """(2,) unit vector to the right of `along`."""
+        """Unit vector (2,) to the right of `along`."""
         return np.array([self.along[1], -self.along[0]])
 
     def coordinates(self, points_t: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return distance along (n,) and across (n,) of points (n, ≥ 2)."""
+        """Return distances along (n,) and across (n,) of points (n, ≥ 2)."""
         away = points_t[:, :2] - self.origin_t
         return away @ self.along, away @ self.across
 
     def holds(self, points_t: FloatArray, wider_m: float = 0.0) -> BoolArray:
-        """Return (n,) whether points lie in it, or in one that is longer by this at either end."""
+        """Return whether points lie in the corridor (n,), or in one that is longer by ``wider_m`` at either end."""
         distance, aside = self.coordinates(points_t)
         inside: BoolArray = np.abs(aside) <= self.half_width_m
         inside &= (distance >= -wider_m) & (distance <= self.length_m + wider_m)
         return inside
 
     def part(self, middle_m: float, length_m: float) -> Corridor:
-        """Return a piece of it, so long, about a distance from its begin."""
+        """Return a part of the corridor with a given length, around a distance from its begin."""
         begin_t = self.origin_t + (middle_m - 0.5 * length_m) * self.along
         return Corridor(begin_t, self.along, length_m, self.half_width_m)
 
     def meets(self, boxes_t: FloatArray, wider_m: float = 0.0) -> BoolArray:
-        """Return (k,) whether boxes (k, 4) of least and greatest east and north may hold any of what `holds`."""
+        """Return whether boxes (k, 4) of least and greatest east and north may contain points that `holds` accepts."""
         middle, half = 0.5 * (boxes_t[:, :2] + boxes_t[:, 2:]), 0.5 * (boxes_t[:, 2:] - boxes_t[:, :2])
         distance, aside = self.coordinates(middle)
         inside: BoolArray = np.abs(aside) <= self.half_width_m + half @ np.abs(self.across)
@@ -76,14 +76,14 @@ class Corridor:
         return inside
 
     def place(self, distance_m: FloatArray) -> FloatArray:
-        """Return (k, 2) east and north of distances (k,) on its middle line."""
+        """Return east and north (k, 2) of distances (k,) on the middle line."""
         places: FloatArray = self.origin_t + np.asarray(distance_m)[:, np.newaxis] * self.along
         return places
 
 
 @dataclass(frozen=True, eq=False)
 class Pieces:
-    """Planes of a section's pieces, one row a piece (k,): h = height + slope · Δdistance + side_slope · Δacross.
+    """Planes of a section's pieces, one row per piece (k,): h = height + slope · Δdistance + side_slope · Δacross.
 
     Attributes:
         height_m: in the middle of the piece; nan: no plane.
@@ -102,7 +102,7 @@ class Pieces:
 
 
 def grouped_median(values: FloatArray, group: IndexArray, groups: int) -> FloatArray:
-    """Return (groups,) median of the values (n,) of each group; nan where there are none."""
+    """Return the median (groups,) of the values (n,) of each group; nan for empty groups."""
     order = np.lexsort((values, group))
     count = np.bincount(group, minlength=groups)
     first = np.cumsum(count) - count
@@ -116,7 +116,7 @@ def grouped_median(values: FloatArray, group: IndexArray, groups: int) -> FloatA
 def fit_pieces(
     distance_m: FloatArray, aside_m: FloatArray, height_m: FloatArray, piece_m: float, pieces: int, least: int
 ) -> Pieces:
-    """Robust planes of the pieces 0 … pieces − 1, each piece_m long, of returns (n,); at least so many a piece."""
+    """Fit robust planes to the pieces 0 … pieces − 1, each piece_m long, with ``least`` or more of the returns."""
     group = np.floor(distance_m / piece_m).astype(np.int64)
     inside = (group >= 0) & (group < pieces)
     group, height = group[inside], height_m[inside]
@@ -138,8 +138,9 @@ def fit_pieces(
 def _planes(
     group: IndexArray, columns: FloatArray, height: FloatArray, groups: int, least: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return (groups, 3) coefficients and (groups, 3, 3) inverse normal matrices by least squares; nan: too few or in
-    line.
+    """Return coefficients (groups, 3) and inverse normal matrices (groups, 3, 3) by least squares.
+
+    They are nan for groups with too few returns, or with returns on one line.
     """
     normal, right = np.zeros((groups, 3, 3)), np.zeros((groups, 3))
     for i in range(3):
@@ -156,24 +157,24 @@ def _planes(
 
 
 def heights_by_bin(distance_m: FloatArray, height_m: FloatArray, bin_m: float, bins: int) -> FloatArray:
-    """Return (bins,) median height of the returns of each bin of a section; nan where there are none."""
+    """Return the median height (bins,) of the returns in each bin of a section; nan for empty bins."""
     group = np.floor(distance_m / bin_m).astype(np.int64)
     inside = (group >= 0) & (group < bins)
     return grouped_median(height_m[inside], group[inside], bins)
 
 
 def best_shift(first_m: FloatArray, second_m: FloatArray, most: int, cap_m: float) -> tuple[int, float]:
-    """By how many bins the second section has to be read further on to look like the first.
+    """Find the shift, in bins, by which the second section has to be read further on to look like the first.
 
     Heights may differ by a constant. The cost of a shift is the mean of the deviations' sizes, each at most cap_m.
 
     Args:
-        first_m, second_m: (bins,) heights, nan where there are none.
+        first_m, second_m: (bins,) heights, nan for empty bins.
         most: bins to try, back and forth.
-        cap_m: of a deviation.
+        cap_m: greatest deviation that counts.
 
     Returns:
-        The shift with the least cost, and the least cost of any other that is no neighbour of it, as a multiple.
+        The shift with the least cost; and the least cost of any other shift not near it, as a multiple of that.
     """
     shifts: list[int] = list(range(-most, most + 1))
     cost = np.full(len(shifts), np.inf)

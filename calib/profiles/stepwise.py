@@ -1,12 +1,12 @@
-"""Profiles: roll, pitch, heading and range one after the other (Leica's stepwise procedure; FORMULAS 5.4).
+"""Measure roll, pitch, heading and range by profiles, one after the other (Leica's stepwise procedure; FORMULAS 5.4).
 
-Two swaths are cut along one line. Where an angle is wrong their sections stand apart, and how far over which baseline
-gives the angle: roll at the edges of an opposite pair over flat ground; pitch along an opposite pair at nadir over
+Two swaths are cut along one line. Where an angle is wrong their sections are separated; the separation and its baseline
+give the angle: roll at the edges of an opposite pair over flat ground; pitch along an opposite pair at nadir over
 slopes; heading along two lines side by side, at nadir of one of them, over slopes; the range by heights of flat
-targets. A first approximation for the adjustment, and a check of it that shares nothing with it but the points.
+targets. The result is a first approximation for the adjustment, and a check of it that shares only the points with it.
 
-The sections are compared by planes of their pieces (`swath.calib.profiles.fit`), and the points placed anew with the
-angle found until nothing is left, so that the lecture's formulas hold for large angles too.
+The sections are compared by planes of their pieces (`swath.calib.profiles.fit`), and the points are placed anew with
+the angle found until no separation is left, so that the lecture's formulas also hold for large angles.
 """
 
 from __future__ import annotations
@@ -40,32 +40,32 @@ class Section:
 
 @dataclass(frozen=True, eq=False)
 class Profile:
-    """One profile pair and what it says.
+    """One profile pair and its result.
 
     Attributes:
         kind: ``roll``, ``pitch``, ``heading`` or ``range``.
-        scanner: whose angle it is.
+        scanner: scanner with the angle.
         first, second: indexes in `Flight.swaths`; second −1: control.
         names: of the two.
         ends_t: (2, 3) begin and end.
-        before, after: the two sections, as the flight's points lie and with what was found; of a range: what the laser
-            says less what the survey says (first) and zero (second), over the distance to the right of the track.
-        separation_m: how far they stand apart before, with the sign of what was found; roll: at the swath's edge;
-            pitch, heading: along track; range: in height.
+        before, after: the two sections, with the flight's points as they are and with the correction; for a range:
+            laser less survey (first) and zero (second), over the distance to the right of the track.
+        separation_m: their separation before, with the sign of ``found``; roll: at the swath's edge; pitch, heading:
+            along track; range: in height.
         separation_sigma_m: one sigma.
         baseline_m: roll: the swath's width; pitch: the sum of both heights above ground; heading: the sum or difference
             of the distances from nadir; range: 1.
         found: to be added to the scanner's parameter, rad or m.
         sigma: one sigma of it, with the trajectory's errors as constants of each swath.
-        noise_sigma: without these.
-        by_trajectory: by swath (6,), how far one sigma of its position (north, east, down), roll, pitch and heading
-            moves ``found``.
-        pieces: pieces of ground, or targets, that counted.
+        noise_sigma: one sigma without these.
+        by_trajectory: by swath (6,), change of ``found`` by one sigma of its position (north, east, down), roll, pitch
+            and heading.
+        pieces: number of pieces of ground, or targets, that counted.
         formula: the lecture's, with the numbers.
         cells: (k) ground of every piece or target that was compared.
         slope_t: (k, 2) of it, east and north.
-        gain: (k,) by how much a unit of each piece's difference, first − second, moves ``found``.
-        targets: (k) their names, of a range.
+        gain: (k,) change of ``found`` per unit of each piece's difference, first − second.
+        targets: (k) their names, for a range.
     """
 
     kind: str
@@ -93,7 +93,7 @@ class Profile:
 
 @dataclass(frozen=True, slots=True)
 class Given:
-    """A profile where the user wants it: kind, two swaths by index, two ends (≥ 2,) in t."""
+    """A profile at a place that the user gives: kind, two swaths by index, two ends (≥ 2,) in t."""
 
     kind: str
     first: int
@@ -104,7 +104,7 @@ class Given:
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """Profiles of a flight, and why others were not taken."""
+    """Profiles of a flight, and counts of refused ones by reason."""
 
     profiles: tuple[Profile, ...]
     refused: Counter[str] = field(default_factory=Counter)
@@ -112,7 +112,7 @@ class Survey:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """One step of the procedure: a kind, its profiles, and by scanner what they say together, with sigma (rad or m)."""
+    """One step of the procedure: a kind, its profiles, and by scanner their joint result with its sigma (rad or m)."""
 
     kind: str
     profiles: tuple[Profile, ...]
@@ -121,14 +121,14 @@ class Step:
 
 @dataclass(frozen=True, eq=False)
 class Stepwise:
-    """What the procedure gave.
+    """The result of the procedure.
 
     Attributes:
         calibrations: by scanner.
         steps: roll, pitch, heading, range, and once more.
-        sigmas: by ``scanner.parameter`` as ``left.omega_rad``, of what could be found.
-        missing: by scanner and kind, what this flight has no profile for, in words.
-        refused: profiles that were not taken, by reason.
+        sigmas: by ``scanner.parameter`` as ``left.omega_rad``, of the determined parameters.
+        missing: by scanner and kind, the kinds for which this flight has no profile, in words.
+        refused: counts of refused profiles, by reason.
     """
 
     calibrations: Mapping[str, Calibration]
@@ -147,22 +147,28 @@ MISSING = {
 
 
 def roll_rad(separation_m: float, width_m: float) -> float:
-    """From the separation at the edges of an opposite pair and the full width of the swath."""
+    """Compute roll from the separation at the edges of an opposite pair and the full width of the swath."""
     return math.atan(separation_m / width_m)
 
 
 def pitch_rad(separation_m: float, height_m: float) -> float:
-    """From the separation along track of an opposite pair and the height above ground."""
+    """Compute pitch from the separation along track of an opposite pair and the height above ground."""
     return math.atan(separation_m / 2.0 / height_m)
 
 
 def heading_rad(separation_m: float, from_nadir_m: float) -> float:
-    """From the separation along track and the distance from nadir, or the sum or difference of two of them."""
+    """Compute heading from the separation along track and the distance from nadir.
+
+    For two lines that distance is the sum or difference of their distances.
+    """
     return separation_m / from_nadir_m
 
 
 def range_m(height_m: FloatArray, cosine: FloatArray) -> float:
-    """From heights above control (laser less survey) (k,) and cosines of the beams with the vertical (k,)."""
+    """Compute the range offset from heights above control (laser less survey) (k,) and cosines of the beams.
+
+    The cosines (k,) are those of the angles with the vertical.
+    """
     return float(np.mean(height_m * cosine) / np.mean(cosine**2))
 
 
@@ -173,14 +179,14 @@ def measure(
     calibrations: Mapping[str, Calibration] | None = None,
     given: Sequence[Given] = (),
 ) -> tuple[Profile, ...]:
-    """Return all profiles the flight allows, each with the points as they lie: what is wrong with them, kind by kind.
+    """Measure all profiles that the flight allows, kind by kind, each with the points as they are.
 
     Args:
         flight: with points.
         control: flat targets.
-        settings: what counts.
+        settings: limits of the profiles.
         calibrations: by scanner, those the points were placed with; None: those to start from.
-        given: profiles of the user's, instead of automatically placed ones of their kinds.
+        given: the user's profiles, instead of automatically placed ones of their kinds.
     """
     found = [survey(flight, kind, control, settings, calibrations, given) for kind in KINDS]
     return tuple(profile for one in found for profile in one.profiles)
@@ -197,7 +203,7 @@ def survey(
     with_points_of: Mapping[str, Calibration] | None = None,
     pitch_unknown: Collection[str] = (),
 ) -> Survey:
-    """Return profiles of one kind: of each pair the best ones. Arguments as of `measure`.
+    """Measure profiles of one kind, and keep the best ones of each pair; see `measure` for the other arguments.
 
     Args:
         with_points_of: by scanner, the calibrations of the flight's points, where they are not those to measure with.
@@ -250,7 +256,7 @@ def _sort(
     taken: list[Profile],
     refused: Counter[str],
 ) -> None:
-    """The surest go to the taken ones; the others are counted."""
+    """Append the most certain profiles to ``taken``, and count the others."""
     good = sorted((one for one in outcomes if isinstance(one, Measured)), key=lambda one: one.fit.noise_sigma)
     refused.update(one for one in outcomes if isinstance(one, str))
     refused["others of this pair are surer"] += max(0, len(good) - most)
@@ -293,8 +299,9 @@ def _profile(
 
 
 def formula(kind: str, separation_m: float, baseline_m: float, installation: FloatArray | None = None) -> str:
-    """Return the lecture's formula with numbers, the sense of the correction, and its value in our axes and the
-    scanner's.
+    """Return the lecture's formula with numbers, the sense of the correction, and its value.
+
+    The value is given about our axes, and about the scanner's where these differ in sign.
     """
     size = abs(separation_m)
     if kind == "range":
@@ -329,9 +336,7 @@ def formula(kind: str, separation_m: float, baseline_m: float, installation: Flo
 
 
 def combined(profiles: Sequence[Profile]) -> tuple[float, float]:
-    """Return what several profiles of a kind say together, and its sigma: those of one swath share its trajectory's
-    errors.
-    """
+    """Combine profiles of a kind to one value with its sigma; those of one swath share its trajectory's errors."""
     weight = np.array([profile.sigma**-2.0 for profile in profiles])
     weight /= weight.sum()
     variance = float(np.sum((weight * [profile.noise_sigma for profile in profiles]) ** 2))
@@ -350,13 +355,12 @@ def stepwise(
     calibrations: Mapping[str, Calibration] | None = None,
     given: Sequence[Given] = (),
 ) -> Stepwise:
-    """Return roll, pitch, heading, range, each with those before applied; all of it twice, for they presume each other
-    small.
+    """Run the procedure: roll, pitch, heading, range, each with the previous ones applied.
 
-    Where one of the angles has no profile, it stays as it was, and the others bear its part: the sigmas hold only with
-    all of them found.
+    It runs `Settings.rounds` times, because each step presumes that the other errors are small. An angle without
+    profiles keeps its value, and the others absorb its error: the sigmas hold only if all angles were found.
 
-    Arguments as of `measure`.
+    See `measure` for the arguments.
     """
     start = flight.starts() if calibrations is None else dict(calibrations)
     now = dict(start)

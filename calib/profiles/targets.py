@@ -1,4 +1,4 @@
-"""The range by heights of flat targets: what the laser says above surveyed points (FORMULAS 5.4)."""
+"""Measure the range offset by heights of flat targets: laser heights above surveyed points (FORMULAS 5.4)."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def measure_range(
     settings: Settings,
     margin_m: float,
 ) -> Measured | str:
-    """Return the range offset from flat targets that a swath shows."""
+    """Measure the range offset from flat targets that a swath shows; a string is the reason of failure."""
     calibration = calibrations[flight.heads[ground.swath.head].name]
     seen = [(point, _target(flight, track, ground, point, calibration, settings, margin_m)) for point in control]
     shown = [(point, target) for point, target in seen if target is not None]
@@ -64,7 +64,7 @@ class _Target:
     """A surveyed point as a swath shows it.
 
     Attributes:
-        figures: height above it, its sigma, lever of the range, distance from nadir to the right; metres.
+        figures: laser height above it, its sigma, lever of the range, distance from nadir to the right; metres.
         levers: (6,) of the trajectory's errors.
         cell: the ground that counts.
         slope_t: (2,) of it, east and north.

@@ -1,1 +1,1 @@
-"""The calibration record of ISO/TS 19159-2 and OGC terms: content, values, dictionary."""
+"""The calibration record in the terms of ISO/TS 19159-2 and OGC: content, values, dictionary."""

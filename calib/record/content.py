@@ -1,8 +1,8 @@
-"""What a calibration itself tells of the attributes of its record.
+"""Collect the attributes of a calibration record that follow from the calibration itself.
 
-The matrices of a calibration's computation (ISO/TS 19159-2, CA_LidarCalComputation), as at the solution.
+They include the matrices of a calibration's computation (ISO/TS 19159-2, CA_LidarCalComputation), as at the solution.
 
-Rows are the observations on planes in the order of the residuals; planes count in the order of the features.
+Rows are the observations on planes in the order of the residuals; planes are in the order of the features.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from swath.georef.records import Int64Array
 from swath.georef.scanner.calibration import INDEX, Calibration
 from swath.georef.scanner.jacobian import observation_columns_e, parameter_columns_e
 
-MOST_ROWS = 200_000  # observations whose rows are kept; of more, every k-th
+MOST_ROWS = 200_000  # observations whose rows are kept; with more, every k-th is kept
 BLOCK = 1 << 15
-COLUMNS = {  # of each return: name → columns
+COLUMNS = {  # of each return: name → number of columns
     "designMatrix1": 16,
     "designMatrix2": 4,
     "designMatrixObservations": 8,
@@ -48,7 +48,7 @@ Found = dict[str, Value]
 
 BORESIGHT = ("omega_rad", "phi_rad", "kappa_rad")
 LEVER_ARM = ("lever_arm_x_m", "lever_arm_y_m", "lever_arm_z_m")
-MOST_POINTS = 200_000  # of which heights of the ground are taken
+MOST_POINTS = 200_000  # greatest number of points that give heights of the ground
 _NOTES = {
     "designMatrix1": "nᵀ ∂x/∂parameter, the sixteen of the model in the order of the calibration file, SI units",
     "designMatrix2": "((x − c)ᵀ, 1) of the point's own plane, c its centre, axes of e; zero for all other planes",
@@ -89,7 +89,7 @@ _OWNERS = {
 def content_of(
     flight: Flight, features: Features, adjusted: Adjusted, scanner: str, header: Header, settings: Mapping[str, str]
 ) -> Found:
-    """Return values by ``CLASS.attribute``."""
+    """Collect a calibration's values by ``CLASS.attribute``."""
     calibration = adjusted.calibrations[scanner]
     return {
         "CA_CalibrationValidation.calibrationType": Value("inFlight", note="onboard, in flight: code 004"),
@@ -148,7 +148,7 @@ def _frames(flight: Flight, calibration: Calibration) -> Found:
 
 
 def _errors(calibration: Calibration, trajectory: TrajectoryFit | None) -> Found:
-    """Of 6.5: value and sigma of each; the trajectory's as root mean square over its knots."""
+    """Return the errors of clause 6.5: value and sigma of each; the trajectory's as root mean square over its knots."""
     found: Found = {}
     for key, names, unit in (
         ("boresight", BORESIGHT, "rad"),
@@ -189,7 +189,7 @@ def _flown(flight: Flight) -> Found:
 
 
 def _heights(flight: Flight) -> tuple[float, float, float]:
-    """Return ground, above ground, flying; metres."""
+    """Return the heights of the ground, above ground, and of flying; metres."""
     ground, flying = [np.zeros(0)], [np.zeros(0)]
     share = max(1, sum(len(swath) for swath in flight.swaths) // MOST_POINTS)
     for swath in flight.swaths:
@@ -281,7 +281,7 @@ class Observed:
 
 
 def observed_of(flight: Flight, adjusted: Adjusted, scanner: str) -> Observed | None:
-    """Return those that were kept; None: there is none on planes."""
+    """Return the accepted observations of a scanner on planes; None if there are none."""
     tables: list[Residuals] = [group for group in adjusted.residuals if group.group == "planes"]
     heads = [flight.heads[swath.head].name == scanner for swath in flight.swaths]
     if not tables:
@@ -297,14 +297,15 @@ def observed_of(flight: Flight, adjusted: Adjusted, scanner: str) -> Observed | 
 
 
 def matrices_of(flight: Flight, features: Features, adjusted: Adjusted, scanner: str) -> dict[str, Matrix]:
-    """By attribute; nothing where there are no observations on planes.
+    """Compute the matrices by attribute; those of observations are missing if there are none on planes.
 
-    designMatrix1 (n, 16): nᵀ ∂x/∂parameter in the order of `swath.georef.scanner.calibration.PARAMETERS`, SI.
-    designMatrix2 (n, 4): ((x − c)ᵀ, 1), c the plane's centre, in e. designMatrixObservations (n, 8): nᵀ ∂x/∂observable
-    in the order of `swath.georef.scanner.jacobian.OBSERVATIONS`. residuals (n, 8): v = Σ Bᵀ e / M (FORMULAS 6.3) of
-    range and scan angle; the trajectory's are zero here, for its errors are unknowns of their own.
-    designMatrixUnitLength (planes, 4): (2 s1, 2 s2, 2 s3, 0). lidarPlaneParameters (planes, 4): unit normal in e, s4 =
-    −n · c.
+    - designMatrix1 (n, 16): nᵀ ∂x/∂parameter in the order of `swath.georef.scanner.calibration.PARAMETERS`, SI.
+    - designMatrix2 (n, 4): ((x − c)ᵀ, 1), c the plane's centre, in e.
+    - designMatrixObservations (n, 8): nᵀ ∂x/∂observable in the order of `swath.georef.scanner.jacobian.OBSERVATIONS`.
+    - residuals (n, 8): v = Σ Bᵀ e / M (FORMULAS 6.3) of range and scan angle; those of the trajectory are zero here,
+      because its errors are unknowns of their own.
+    - designMatrixUnitLength (planes, 4): (2 s1, 2 s2, 2 s3, 0).
+    - lidarPlaneParameters (planes, 4): unit normal in e, s4 = −n · c.
     """
     found: dict[str, Matrix] = {}
     if features.planes:
@@ -361,6 +362,6 @@ def _block(
 
 
 def _there(column: FloatArray | None) -> FloatArray:
-    """Return what rays with axes have."""
+    """Return a column that rays with axes always have."""
     assert column is not None
     return column

@@ -1,8 +1,8 @@
 """The data dictionary of a calibration record: ISO/TS 19159-2 for lidar, ISO/TS 19159-1 where it applies.
 
-Names are the standards'. Rows 1 to 24 of the dictionary of ISO/TS 19159-2 (Annex B) were at hand; what stands after
-them, or in its clauses only, is marked as not confirmed: the class, the name, the obligation or the type is our
-reading.
+Names are the standards'. Rows 1 to 24 of the dictionary of ISO/TS 19159-2 (Annex B) were available. Rows after these,
+or found in its clauses only, are marked as not confirmed: the class, the name, the obligation or the type is our
+interpretation.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ class Row:
     """One attribute of the dictionary.
 
     Attributes:
-        standard, owner, name: whose, of which class, and what.
+        standard, owner, name: standard, class, and name of the attribute.
         obligation: M mandatory, O optional, "" not stated.
-        occurrence: how often at most; "" not stated.
+        occurrence: greatest number; "" not stated.
         type: of the standard.
         meaning: in a few words.
-        confirmed: name, obligation, occurrence and type stand so in the dictionary.
+        confirmed: name, obligation, occurrence and type are so in the dictionary.
     """
 
     standard: str
@@ -36,13 +36,13 @@ class Row:
 
     @property
     def key(self) -> str:
-        """``CLASS.attribute``."""
+        """Key of the attribute, ``CLASS.attribute``."""
         return f"{self.owner}.{self.name}"
 
 
 @dataclass(frozen=True, slots=True)
 class Class:
-    """A class of the dictionary: what it specialises, and whether its name is confirmed."""
+    """A class of the dictionary: the class it specialises, and whether its name is confirmed."""
 
     standard: str
     name: str

@@ -1,6 +1,6 @@
-"""The record of a calibration: its metadata by the data dictionary of ISO/TS 19159-2 and 19159-1, as XML and JSON.
+"""Build the record of a calibration: its metadata by the dictionary of ISO/TS 19159-2 and 19159-1, as XML and JSON.
 
-What was not told and cannot be found out is listed as missing, never made up.
+Mandatory values that are neither given nor derivable are listed as missing, never made up.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from swath.calib.record.dictionary import BY_KEY, CALIBRATION_TYPES, CLASSES, RO
 from swath.calib.record.values import Matrix, Plain, Value, is_document, is_plain
 from swath.georef.toml_tables import key_text
 
-Document = dict[str, Any]  # what a record's JSON holds
+Document = dict[str, Any]  # the content of a record's JSON
 
 VERSION = 1
 NAMESPACE = f"urn:swath:calibration-record:{VERSION}"
@@ -35,26 +35,27 @@ NOTE = (
 )
 
 
-_LONGEST_KEY = 80  # that names are compared with
+_LONGEST_KEY = 80  # greatest length of a name for the search of similar ones
 
 
 class RecordError(ValueError):
-    """Something told of a calibration that no record holds; one line for the user."""
+    """Information on a calibration that no record can hold; the message is one line for the user."""
 
 
 @dataclass(frozen=True, eq=False)
 class RecordInput:
-    """What a record is made of.
+    """The inputs of a record.
 
     Attributes:
         flight, features, adjusted: of the calibration.
-        scanner: whose record it is.
+        scanner: the scanner of the record.
         header: of its calibration file.
-        told: what only people know, by ``CLASS.attribute`` of `swath.calib.record.dictionary.ROWS`, as
+        told: values that only users know, by ``CLASS.attribute`` of `swath.calib.record.dictionary.ROWS`, as
             ``CA_GNSS.numberSatellites``; numbers in SI units.
         settings: of the run, in words.
-        attachment: name of the NPZ file that holds the matrices whole; empty: there is none.
-        known: what else is known, by ``CLASS.attribute``: of the instruments, whose configuration is not `calib`'s.
+        attachment: name of the NPZ file with the complete matrices; empty: there is none.
+        known: other known values, by ``CLASS.attribute``: of the instruments, whose configuration is not part of
+            `calib`.
     """
 
     flight: Flight
@@ -70,7 +71,7 @@ class RecordInput:
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """The record.
+    """The record of a calibration.
 
     Attributes:
         id: of the calibration.
@@ -91,10 +92,10 @@ class Record:
 
 
 def record_of(given: RecordInput) -> Record:
-    """Return what is known of a calibration.
+    """Build the record of a calibration.
 
     Raises:
-        RecordError: something told is no attribute, or not what the attribute takes.
+        RecordError: a given value belongs to no attribute, or has the wrong type for its attribute.
     """
     told = {key: told_value(key, value) for key, value in given.told.items()}
     found = content_of(given.flight, given.features, given.adjusted, given.scanner, given.header, given.settings)
@@ -105,10 +106,10 @@ def record_of(given: RecordInput) -> Record:
 
 
 def told_value(key: str, value: Plain, note: str = "as told") -> Value:
-    """Return something told of an attribute, as the record holds it.
+    """Check a value that a user gives for an attribute, and return it as the record holds it.
 
     Raises:
-        RecordError: there is no such attribute, or it takes something else.
+        RecordError: there is no such attribute, or the value has the wrong type for it.
     """
     row = BY_KEY.get(key)
     if row is None:
@@ -129,7 +130,7 @@ def told_value(key: str, value: Plain, note: str = "as told") -> Value:
 
 
 def _summary(matrix: Matrix, name: str, attachment: str) -> dict[str, Any]:
-    """Of a matrix: its size, how large its numbers are, and where they stand."""
+    """Summarise a matrix: its size, the magnitude of its numbers, and their place in the attachment."""
     known = matrix.array[np.isfinite(matrix.array)]
     told: dict[str, Any] = {"rows": matrix.rows, "columns": matrix.array.shape[1], "every": matrix.every}
     if len(known):
@@ -139,12 +140,12 @@ def _summary(matrix: Matrix, name: str, attachment: str) -> dict[str, Any]:
 
 
 def record_json(record: Record) -> str:
-    """Return the record as JSON; the same text for the same record."""
+    """Return the record as JSON; the text is the same for the same record."""
     return document_json(_document(record))
 
 
 def document_json(document: Document) -> str:
-    """Return a record's JSON again, as `with_told` gives it."""
+    """Return the JSON text of a document, for example one that `with_told` returns."""
     return json.dumps(document, ensure_ascii=False, indent=1, allow_nan=False) + "\n"
 
 
@@ -181,12 +182,12 @@ def _attribute(row: Row, value: Value, attachment: str) -> dict[str, Any]:
 
 
 def record_xml(record: Record) -> str:
-    """Return the same as XML: an element a class, an attribute, a value; numbers with all their digits."""
+    """Return the record as XML with an element per class, attribute and value; numbers have all their digits."""
     return document_xml(_document(record))
 
 
 def document_xml(document: Document) -> str:
-    """Likewise of a record's JSON."""
+    """Return the XML text of a document that holds a record's JSON."""
     ET.register_namespace("cr", NAMESPACE)
     head = {"version": str(document["version"]), "id": _clean(document["id"])}
     root = ET.Element(_tag("calibrationRecord"), head)
@@ -229,7 +230,7 @@ def _word(value: object) -> str:
 
 
 def _clean(text: str) -> str:
-    """Without the control characters that XML cannot hold."""
+    """Replace the control characters that XML cannot hold."""
     return "".join(one if (one >= " " or one in "\t\n") and one not in "\ufffe\uffff" else "\ufffd" for one in text)
 
 
@@ -237,18 +238,18 @@ def _clean(text: str) -> str:
 
 
 def read_document(text: str, name: str) -> Document:
-    """Return a record as `record_json` wrote it.
+    """Read a record as `record_json` wrote it.
 
     Args:
         text: of the file.
         name: of the file, for messages.
 
     Raises:
-        RecordError: it is no such record.
+        RecordError: it is not such a record.
     """
     try:
         document = json.loads(text, parse_constant=_refuse)
-        json.dumps(document, ensure_ascii=False).encode()  # half a pair of UTF-16 is no text
+        json.dumps(document, ensure_ascii=False).encode()  # raises an error for half a surrogate pair, which is no text
         known = document["version"] == VERSION and is_document(document)
         named = [(owner["name"], one["name"]) for owner in document["classes"] for one in owner["attributes"]]
         lost = [(one["class"], one["name"]) for one in document["missing"]]
@@ -261,19 +262,19 @@ def read_document(text: str, name: str) -> Document:
 
 
 def _refuse(constant: str) -> float:
-    """JSON has no NaN and no infinity; Python's reader takes them."""
+    """Refuse NaN and infinity: Python's reader accepts them, but JSON has neither."""
     raise ValueError(constant)
 
 
 def with_told(document: Document, told: Mapping[str, tuple[Plain, str]]) -> Document:
-    """Return the same record with more told, as what came after the calibration.
+    """Return the same record with more values, such as facts from after the calibration.
 
     Args:
         document: of `read_document`.
-        told: values and their notes by ``CLASS.attribute``, as `RecordInput.told`; what was told before is replaced.
+        told: values and their notes by ``CLASS.attribute``, as `RecordInput.told`; they replace earlier values.
 
     Raises:
-        RecordError: something told is no attribute, or not what the attribute takes.
+        RecordError: a given value belongs to no attribute, or has the wrong type for its attribute.
     """
     found = {f"{owner['name']}.{one['name']}": one for owner in document["classes"] for one in owner["attributes"]}
     for key, (value, note) in told.items():

@@ -1,4 +1,4 @@
-"""Values of a calibration record: what an attribute may hold, and how large matrices are told."""
+"""Values of a calibration record: the types that an attribute may hold, and the limits of matrices."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from swath.georef.arrays import FloatArray
 from swath.georef.timescales.gps_time import GPS_EPOCH, SECOND_NS, table_leap_seconds
 
-INLINE = 400  # numbers a matrix may have to stand in the record itself
+INLINE = 400  # greatest size of a matrix that is stored in the record itself
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,7 +21,7 @@ class Matrix:
 
     Attributes:
         array: (rows, columns) as kept.
-        rows: that there are; more than kept where only every k-th row is.
+        rows: their total number; more than kept if only every k-th row is kept.
         every: k.
     """
 
@@ -31,13 +31,13 @@ class Matrix:
 
     @classmethod
     def of(cls, array: FloatArray) -> Matrix:
-        """Return all of it."""
+        """Create a matrix that keeps all rows of an array."""
         table = np.atleast_2d(np.asarray(array, np.float64))
         return cls(table, len(table))
 
     @property
     def inline(self) -> bool:
-        """Small enough to stand in the record."""
+        """True if the matrix is small enough to be stored in the record, complete and finite."""
         return self.array.size <= INLINE and self.every == 1 and bool(np.isfinite(self.array).all())
 
 
@@ -46,12 +46,12 @@ Plain: TypeAlias = str | int | float | tuple[float, ...]
 
 @dataclass(frozen=True, eq=False)
 class Value:
-    """What an attribute holds.
+    """The value of an attribute.
 
     Attributes:
         content: text, a number, numbers, or a matrix.
         unit: of numbers; empty: none.
-        note: how it is to be read.
+        note: explains the value to readers.
     """
 
     content: Plain | Matrix
@@ -60,7 +60,7 @@ class Value:
 
 
 def utc_text(gps_ns: int) -> str:
-    """Return ISO 8601 of a GPS time, microseconds."""
+    """Format a GPS time as UTC in ISO 8601, with microseconds."""
     day = GPS_EPOCH + dt.timedelta(days=gps_ns // (86_400 * SECOND_NS))
     leap_seconds, _ = table_leap_seconds(day)
     start = dt.datetime(GPS_EPOCH.year, GPS_EPOCH.month, GPS_EPOCH.day, tzinfo=dt.UTC)
@@ -69,14 +69,14 @@ def utc_text(gps_ns: int) -> str:
 
 
 def is_plain(value: object) -> bool:
-    """Return whether it is text, a finite number, or numbers: `Plain`."""
+    """Return whether a value is `Plain`: text, a finite number, or several numbers."""
     if isinstance(value, tuple):
         return all(_is_number(one) for one in value)
     return isinstance(value, str) or _is_number(value)
 
 
 def is_document(document: Any) -> bool:
-    """Return whether what JSON gave is laid out as a record: heads, classes, attributes with a value or a matrix."""
+    """Return whether parsed JSON has the layout of a record: heads, classes, attributes with a value or a matrix."""
     heads = isinstance(document, dict) and all(isinstance(document.get(key), str) for key in ("id", "note"))
     if not heads or len(document["id"].splitlines()) != 1:
         return False
@@ -104,8 +104,9 @@ def _is_attribute(one: Any) -> bool:
 
 
 def _has_words(table: Any, texts: tuple[str, ...], others: tuple[str, ...]) -> bool:
-    """Return a table with these texts, and words, numbers or truths under names of letters for the rest but the
-    others.
+    """Return whether a table has these texts, and under names of letters only words, numbers or truth values.
+
+    The keys in ``others`` may hold other types.
     """
     return (
         isinstance(table, dict)
@@ -116,5 +117,5 @@ def _has_words(table: Any, texts: tuple[str, ...], others: tuple[str, ...]) -> b
 
 
 def _is_number(value: object) -> bool:
-    """Finite, no truth, and small enough for a number of 64 bits."""
+    """Return whether a value is a finite number and not a truth value."""
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < math.inf

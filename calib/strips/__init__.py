@@ -1,1 +1,1 @@
-"""Strips compared: differences, signatures of causes, corrections, accuracy standards."""
+"""Comparison of strips: differences, signatures of causes, corrections, accuracy standards."""

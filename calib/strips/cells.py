@@ -1,6 +1,6 @@
-"""Cells in which strips overlap, and the returns that strips have in them.
+"""Find cells in which strips overlap, and collect the returns that strips have in them.
 
-Strips are read block by block, from memory, mapped files or LAZ, so that only what lies in chosen cells is held.
+Strips are read block by block, from memory, mapped files or LAZ, so that only the returns in chosen cells are kept.
 """
 
 from __future__ import annotations
@@ -18,22 +18,22 @@ from swath.calib.flight import Swath
 from swath.georef.arrays import FloatArray
 from swath.georef.records import Int64Array
 
-BLOCK = 1_000_000  # returns that are looked through at a time
+BLOCK = 1_000_000  # returns that are processed at a time
 RETURNS_A_CELL = 16.0
 FINEST_CELL_M, COARSEST_CELL_M = 0.5, 20.0
-DENSITY_BLOCKS, DENSITY_CELL_M = 2, 5.0  # what a strip's density is taken from
+DENSITY_BLOCKS, DENSITY_CELL_M = 2, 5.0  # blocks and cells from which a strip's density is estimated
 
 
 @dataclass(frozen=True, slots=True)
 class StripRules:
-    """What is compared.
+    """Rules for the cells and planes of a comparison.
 
     Attributes:
-        cell_m: side of a cell; None: of a size that holds `RETURNS_A_CELL` of the thinnest strip.
-        most_cells: cells that are looked into, spread over the whole overlap.
-        fewest: returns of a plane.
-        roughest_m: √λ0 of a plane.
-        steepest_deg: slope of a plane.
+        cell_m: side of a cell; None: a size that contains `RETURNS_A_CELL` of the thinnest strip.
+        most_cells: greatest number of cells, spread over the whole overlap.
+        fewest: least number of returns of a plane.
+        roughest_m: greatest √λ0 of a plane.
+        steepest_deg: greatest slope of a plane.
     """
 
     cell_m: float | None = None
@@ -45,8 +45,14 @@ class StripRules:
 
 @dataclass(frozen=True, eq=False)
 class StripBlock:
-    """Some returns of a strip: places (n, 3) in metres, GPS times, whether each is its pulse's only one, and the scan's
-    direction there (+1 towards positive angles, −1, 0: not known)."""
+    """Some returns of a strip.
+
+    Attributes:
+        points: (n, 3) metres.
+        time_ns: (n,) GPS times.
+        single: (n,) whether each is its pulse's only return.
+        direction: (n,) the scan's direction there: +1 towards positive angles, −1, 0: not known.
+    """
 
     points: FloatArray
     time_ns: Int64Array
@@ -59,25 +65,25 @@ class Strip(Protocol):
 
     @property
     def name(self) -> str:
-        """For people."""
+        """Name for display."""
 
     def blocks(self) -> Iterator[StripBlock]:
-        """Return all of it; the same points every time."""
+        """Yield all returns in blocks; the points are the same every time."""
 
 
 @dataclass(frozen=True)
 class FlightStrip:
-    """A swath of a flight."""
+    """A swath of a flight as a strip."""
 
     swath: Swath
 
     @property
     def name(self) -> str:
-        """The swath's."""
+        """Name of the swath."""
         return self.swath.name
 
     def blocks(self) -> Iterator[StripBlock]:
-        """Yield all of it."""
+        """Yield all returns in blocks."""
         swath = self.swath
         for begin in range(0, len(swath), BLOCK):
             rows = slice(begin, begin + BLOCK)
@@ -90,7 +96,7 @@ class FlightStrip:
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """Cells of the overlap: side, numbers (n,), rising, as of `numbers_of`, and where they count from (east, north)."""
+    """Cells of the overlap: their side, their rising numbers (n,) (see `numbers_of`), and the origin (east, north)."""
 
     cell_m: float
     numbers: Int64Array
@@ -98,15 +104,13 @@ class Cells:
 
 
 def numbers_of(points: FloatArray, cell_m: float, origin: tuple[float, float] = (0.0, 0.0)) -> Int64Array:
-    """Return the number (n,) of the cell of each place (n, ≥ 2): one for every two whole numbers of cells north and
-    east.
-    """
+    """Return the number (n,) of the cell of each place (n, ≥ 2); it combines the cell's row and column."""
     east, north = (np.floor((points[:, axis] - origin[axis]) / cell_m).astype(np.int64) for axis in (0, 1))
     return np.asarray((north << 32) + east, np.int64)
 
 
 def overlap_cells(strips: Sequence[Strip], rules: StripRules) -> Cells:
-    """Return cells in which two strips or more have returns, thinned evenly to as many as are wanted."""
+    """Return the cells in which two strips or more have returns, thinned evenly to ``most_cells``."""
     fine = rules.cell_m or _cell_for(strips)
     found = [_occupied(strip, fine) for strip in strips]
     numbers, strips_there = np.unique(np.concatenate([*found, np.zeros(0, np.int64)]), return_counts=True)
@@ -114,7 +118,7 @@ def overlap_cells(strips: Sequence[Strip], rules: StripRules) -> Cells:
 
 
 def thinned(cells: Cells, rules: StripRules) -> Cells:
-    """As many as are wanted, drawn evenly; the same ones every time."""
+    """Draw at most ``most_cells`` cells evenly; the same ones every time."""
     if len(cells.numbers) <= rules.most_cells:
         return cells
     chosen = np.random.default_rng(19159).choice(len(cells.numbers), rules.most_cells, replace=False)
@@ -127,14 +131,17 @@ def _occupied(strip: Strip, cell_m: float) -> Int64Array:
 
 
 def _cell_for(strips: Sequence[Strip]) -> float:
-    """Return a side that holds enough returns of the thinnest strip, by the area that each covers in coarse cells."""
+    """Return a cell side that gives enough returns of the thinnest strip.
+
+    The density of a strip follows from the coarse cells that it covers.
+    """
     densities = [_density(strip) for strip in strips]
     least = min((one for one in densities if one > 0.0), default=4.0)
     return float(np.clip(math.sqrt(RETURNS_A_CELL / least), FINEST_CELL_M, COARSEST_CELL_M))
 
 
 def _density(strip: Strip) -> float:
-    """Single returns a square metre, by the median of covered cells at its beginning."""
+    """Return the density of single returns per square metre: the median of covered cells at the strip's beginning."""
     side_m = DENSITY_CELL_M
     numbers = [numbers_of(_singles(block).points, side_m) for block in islice(strip.blocks(), DENSITY_BLOCKS)]
     counts = np.unique(np.concatenate([*numbers, np.zeros(0, np.int64)]), return_counts=True)[1]
@@ -151,7 +158,7 @@ def _singles(block: StripBlock) -> StripBlock:
 
 @dataclass(frozen=True, eq=False)
 class Gathered:
-    """Single returns in the cells, ordered by cell, then by strip (n,) or (n, 3)."""
+    """Single returns in the cells, (n,) or (n, 3), ordered by cell, then by strip."""
 
     cell: Int64Array
     strip: Int64Array
@@ -166,7 +173,7 @@ def blocks_of(strips: Sequence[Strip]) -> Iterator[tuple[int, StripBlock]]:
 
 
 def gather(blocks: Iterable[tuple[int, StripBlock]], cells: Cells) -> Gathered:
-    """Return what lies in the cells, of blocks with the index of their strip."""
+    """Collect the returns that lie in the cells, from blocks with the index of their strip."""
     none = np.zeros(0, np.int64)
     pieces = [(none, none, np.zeros((0, 3)), none, np.zeros(0, np.int8))]
     for number, raw in blocks:

@@ -1,19 +1,19 @@
-"""Strip adjustment after the calibration: corrections of each strip's trajectory, and no parameter of the scanner.
+"""Adjust strips after the calibration: correct each strip's trajectory, but no parameter of the scanner.
 
-The calibration is held; each strip gets the simplest correction that its returns ask for (ISO/TS 19159-2, 6.3.3,
-Eq. 12, as corrections of the trajectory; FORMULAS 7.3):
+The calibration is held; each strip gets the simplest correction that its returns justify, as a correction of the
+trajectory (ISO/TS 19159-2, 6.3.3, Eq. 12; FORMULAS 7.3):
 
     none        0
     constant    a
     linear      a + b τ,  τ = −1 … 1 along the strip
-    spline      a + b τ + what bends between knots, its second differences held to 0
+    spline      a + b τ + bends between knots, with second differences held to 0
 
-of position (north, east, down) and of small turns about these axes. All have priors, as a common shift of all strips is
-seen by nobody without control. Which strip gets which is chosen by an information criterion (Schwarz 1978; AIC of
-Akaike 1974 as corrected by Hurvich and Tsai 1989), with the number of parameters that the returns determine, the trace
-of N (N + P)⁻¹ over those combinations of them that the returns know much better than the prior does; along all others
-nothing is corrected. The equations are those of the adjustment (`swath.calib.equations.normals`) with states of the
-trajectory alone.
+of position (north, east, down) and of small turns about these axes. All have priors, because no observation shows a
+common shift of all strips without control. An information criterion (Schwarz 1978; AIC of Akaike 1974 as corrected by
+Hurvich and Tsai 1989) chooses the model of each strip. Its number of parameters is the number that the returns
+determine: the trace of N (N + P)⁻¹ over those combinations of them that the returns know much better than the prior
+does; along all others there is no correction. The equations are those of the adjustment
+(`swath.calib.equations.normals`) with only the states of the trajectory as unknowns.
 """
 
 from __future__ import annotations
@@ -39,25 +39,25 @@ from swath.georef.trajectory.trajectory import Trajectory
 MODELS = ("none", "constant", "linear", "spline")
 MOST_CHOSEN_SINGLY = 30  # strips; with more, all get one model
 MOST_SWEEPS = 5
-LEAST_KNOWN = 15.0  # times what the prior knows: with less, a correction would be uncertain by a quarter of its prior
+LEAST_KNOWN = 15.0  # times the prior's information: below, a correction would keep a quarter of its prior's sigma
 
 
 class StripError(ValueError):
-    """Strips that cannot be adjusted; one line for the user."""
+    """Strips that cannot be adjusted; the message is one line for the user."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """Of the strip adjustment.
+    """Settings of the strip adjustment.
 
     Attributes:
         knot_s: distance of a spline's knots.
-        position_m, turn_rad: prior sigmas of a strip's constant correction; of its drift half as much.
+        position_m, turn_rad: prior sigmas of a strip's constant correction; its drift has half of them.
         bend_m, bend_rad: prior sigmas of a spline's second differences.
         criterion: ``bic`` or ``aicc``.
-        models: that may be chosen.
-        huber: returns farther off than so many sigmas lose weight.
-        linearisations: how often.
+        models: models that may be chosen.
+        huber: returns with misclosures above this many sigmas lose weight.
+        linearisations: number of linearisations.
     """
 
     knot_s: float = 10.0
@@ -76,7 +76,7 @@ DEFAULTS = Settings()
 
 @dataclass(frozen=True, slots=True)
 class StripChoice:
-    """What one strip got.
+    """The model that one strip got.
 
     Attributes:
         flown, strip: of the strip.
@@ -92,16 +92,16 @@ class StripChoice:
 
 @dataclass(frozen=True, eq=False)
 class StripAdjusted:
-    """The result; no calibration is in it.
+    """The result of a strip adjustment; it contains no calibration.
 
     Attributes:
-        choices: a strip each, by time.
-        fit: the corrections along, to be added to the trajectory, with their sigmas.
+        choices: one per strip, by time.
+        fit: the corrections along the strips, to be added to the trajectory, with their sigmas.
         trajectories: corrected.
-        parameters: number of parameters the returns determined.
+        parameters: number of parameters that the returns determined.
         variance_before, variance_after: mean square of misclosures in sigmas.
         observations: number of rows.
-        notes: for people.
+        notes: for display.
     """
 
     choices: tuple[StripChoice, ...]
@@ -121,15 +121,15 @@ def adjust_strips(
     settings: Settings = DEFAULTS,
     row_weight: SingleArray | None = None,
 ) -> StripAdjusted:
-    """Correct each strip's trajectory by what its features say.
+    """Correct each strip's trajectory according to its features.
 
     Args:
         flight: as measured.
         features: seen by several strips; control makes the corrections absolute.
         calibrations: by scanner; they are held.
-        settings: of it.
-        row_weight: (n,) of the rows on planes, in the order of `swath.calib.equations.rows`, as the calibration left
-        them; None: 1.
+        settings: of the strip adjustment.
+        row_weight: (n,) of the rows on planes, in the order of `swath.calib.equations.rows`, from the calibration;
+            None: 1.
 
     Raises:
         StripError: an unknown model or criterion, or no features; `FlightError`: there is no strip.
@@ -180,7 +180,7 @@ def _fit(free: TrajectoryPrior, along: FloatArray, sigma: FloatArray, prior: Flo
 
 @dataclass(frozen=True, eq=False)
 class _Quadratic:
-    """χ²(x) = constant − 2 right · x + x · normal x, of corrections x (6k,) in l, or of their parameters."""
+    """The function χ²(x) = constant − 2 right · x + x · normal x, of corrections x (6k,) in l or parameters."""
 
     normal: FloatArray
     right: FloatArray
@@ -188,16 +188,16 @@ class _Quadratic:
     observations: int
 
     def square(self, x: FloatArray) -> float:
-        """Return χ²."""
+        """Return χ² of corrections or parameters."""
         return float(self.constant - 2.0 * self.right @ x + x @ self.normal @ x)
 
     def of(self, basis: FloatArray) -> _Quadratic:
-        """Return χ² of parameters (u,) with x = basis · parameters."""
+        """Return χ² as a function of parameters (u,) with x = basis · parameters."""
         return _Quadratic(basis.T @ self.normal @ basis, basis.T @ self.right, self.constant, self.observations)
 
 
 class _Equations:
-    """The adjustment's own equations with nothing but states."""
+    """The equations of the adjustment with states of the trajectory as the only unknowns."""
 
     def __init__(
         self,
@@ -218,13 +218,13 @@ class _Equations:
         self._huber = settings.huber
 
     def start(self) -> State:
-        """No corrections."""
+        """Return the state without corrections."""
         return self._rows.start(len(self._ties.ties))
 
     def at(self, state: State) -> _Quadratic:
-        """Linearised there."""
+        """Return χ², linearised at a state."""
         found = normals(self._rows, self._ties, self._weight, state, self._row_weight, self._tie_weight, self._huber)
-        x, p = state.knots.reshape(-1, 1), found.parameters  # these are held: their rows and columns fall away
+        x, p = state.knots.reshape(-1, 1), found.parameters  # parameters are held: their rows and columns are dropped
         normal, right = found.normal[p:, p:], found.right[p:].reshape(-1, 1)
         constant = _reduced_square(found) - 2.0 * float((right * x).sum()) + float((x * (normal @ x)).sum())
         to_l = self._weight.to_l
@@ -234,27 +234,27 @@ class _Equations:
         )
 
     def moved(self, along: FloatArray) -> State:
-        """With corrections (k, 6) in l; planes as the first adjustment found them."""
+        """Return the state with corrections (k, 6) in l; planes are as at the start."""
         return replace(self.start(), knots=self._weight.to_e(along.reshape(-1, 1)).reshape(-1, ERRORS))
 
 
 def _reduced_square(found: Normals) -> float:
-    """Return Σ p w² with planes and tie points where they are best."""
+    """Return Σ p w² with planes and tie points at their optimum."""
     features = (*found.planes, *found.ties)
     return found.square - sum(float(one.right @ one.inverse @ one.right) for one in features)
 
 
 @dataclass(frozen=True, eq=False)
 class _Solved:
-    """Parameters with prior sigmas of 1, where χ² and their prior are least together.
+    """Parameters, scaled to prior sigmas of 1, that minimise the sum of χ² and the prior.
 
-    What the returns know little of keeps its prior, zero: the best estimate would be mostly their noise.
+    Combinations of which the returns know little keep their prior, zero: the best estimate would be mostly noise.
 
     Attributes:
         values: (u,).
-        parameters: how many of them the returns determine.
+        parameters: number of them that the returns determine.
         square: χ² with them.
-        known, axes: (u,) how much more than the prior the returns know along axes (u, u).
+        known, axes: (u,) ratio of the returns' information to the prior's along axes (u, u).
     """
 
     values: FloatArray
@@ -265,7 +265,7 @@ class _Solved:
 
     @classmethod
     def of(cls, quadratic: _Quadratic, columns: Int64Array) -> _Solved:
-        """Make that of some parameters, the others held at zero."""
+        """Solve for some parameters, with the others held at zero."""
         known, axes = np.linalg.eigh(quadratic.normal[np.ix_(columns, columns)])
         taken = known > LEAST_KNOWN
         right = axes[:, taken].T @ quadratic.right[columns]
@@ -274,16 +274,16 @@ class _Solved:
         return cls(axes[:, taken] @ best, float(np.sum(known[taken] / (1.0 + known[taken]))), square, known, axes)
 
     def covariance(self) -> FloatArray:
-        """Return (u, u); 1 along axes that keep their prior."""
+        """Return the covariance (u, u); it is 1 along axes that keep their prior."""
         spread = np.where(self.known > LEAST_KNOWN, 1.0 / (1.0 + np.maximum(self.known, 0.0)), 1.0)
         covariance: FloatArray = self.axes * spread @ self.axes.T
         return covariance
 
 
 class _Choice:
-    """Which strip gets which model.
+    """The choice of a model for each strip.
 
-    A model's parameters are the first ones of every richer model: those of the richest are worked out once.
+    A model's parameters are the first ones of every richer model, so those of the richest are computed once.
     """
 
     def __init__(self, flown: Int64Array, strip: Int64Array, settings: Settings) -> None:
@@ -304,10 +304,10 @@ class _Choice:
         self._basis = np.concatenate(bases, axis=1)
 
     def choose(self, quadratic: _Quadratic) -> None:
-        """By the criterion: all alike first, then strip by strip until no strip wants another.
+        """Choose models by the criterion: first one model for all strips, then strip by strip until no choice changes.
 
-        Without control one strip can be left as it is for nothing, and the others are moved to it: those that the
-        whole moves least come first.
+        Without control, one strip can remain uncorrected at no cost, and the others move to it: the strips that the
+        common solution moves least come first.
         """
         of_all = quadratic.of(self._basis)
         alike = [[model] * len(self._keys) for model in self._settings.models]
@@ -330,7 +330,7 @@ class _Choice:
         return sorted(range(len(size)), key=lambda number: size[number])
 
     def solved(self, quadratic: _Quadratic) -> tuple[FloatArray, FloatArray, float]:
-        """Return (k, 6) corrections, their sigmas, and the number of parameters determined."""
+        """Return corrections (k, 6), their sigmas, and the number of parameters determined."""
         basis = self._basis[:, self._taken(self.models)]
         found = _Solved.of(quadratic.of(basis), np.arange(basis.shape[1]))
         spread = np.sqrt(np.maximum(np.einsum("ia,ia->i", basis @ found.covariance(), basis), 0.0))
@@ -339,12 +339,12 @@ class _Choice:
         return x.reshape(-1, ERRORS), sigmas.reshape(-1, ERRORS), found.parameters
 
     def prior_sigmas(self) -> FloatArray:
-        """Return (k, 6) of the models chosen."""
+        """Return the prior sigmas (k, 6) of the chosen models."""
         sigmas: FloatArray = np.sqrt(np.sum(self._basis[:, self._taken(self.models)] ** 2, axis=1))
         return sigmas.reshape(-1, ERRORS)
 
     def told(self, quadratic: _Quadratic) -> tuple[StripChoice, ...]:
-        """Return a strip each."""
+        """Return the choice of each strip."""
         of_all = quadratic.of(self._basis)
         singly = len(self._keys) <= MOST_CHOSEN_SINGLY
         told = []
@@ -356,7 +356,7 @@ class _Choice:
         return tuple(told)
 
     def notes(self) -> tuple[str, ...]:
-        """For people."""
+        """Return notes on the choice for display."""
         name = "Schwarz's" if self._settings.criterion == "bic" else "Akaike's corrected"
         models = self._settings.models
         how = f"models chosen by {name} information criterion" if len(models) > 1 else f"all strips got {models[0]}"
@@ -366,7 +366,7 @@ class _Choice:
         return tuple(notes)
 
     def _tried(self, of_all: _Quadratic, number: int) -> dict[str, float]:
-        """Return criterion by model of one strip, the others as they are."""
+        """Return the criterion by model of one strip, with the other strips' models unchanged."""
         found = {}
         for model in self._settings.models:
             models = [*self.models[:number], model, *self.models[number + 1 :]]
@@ -381,12 +381,12 @@ class _Choice:
         return float(fit + 2.0 * k + 2.0 * k * (k + 1.0) / max(n - k - 1.0, 1.0))
 
     def _taken(self, models: Sequence[str]) -> Int64Array:
-        """Return (u,) columns of the basis that these models have."""
+        """Return the columns (u,) of the basis that belong to these models."""
         return np.concatenate([own[model] for own, model in zip(self._columns, models, strict=True)])
 
 
 def _basis(model: str, knots: int, settings: Settings) -> FloatArray:
-    """Return (6 knots, u) of one strip, each parameter in prior sigmas."""
+    """Return the basis (6 knots, u) of one strip, with each parameter in prior sigmas."""
     constant = np.repeat([settings.position_m, settings.turn_rad], 3)
     tau = np.linspace(-1.0, 1.0, knots)[:, np.newaxis]
     along, sigmas = [np.ones((knots, 1)), tau], [constant, 0.5 * constant]

@@ -1,8 +1,8 @@
-"""How far strips still are from each other: point to plane on planar overlap (ISO/TS 19159-2, 6.7; FORMULAS 8).
+"""Measure the remaining distances of strips: point to plane on planar overlap (ISO/TS 19159-2, 6.7; FORMULAS 8).
 
-The overlap is cut into cells. Where the returns of two strips in a cell are both a plane, one return of the first strip
-is a check point, and its distance from the second strip's plane is the difference: d along the normal, Δz along up,
-the first strip minus the second. Only single returns count: no vegetation.
+The overlap is cut into cells. Where the returns of both strips in a cell form planes, one return of the first strip is
+a check point, and its distance from the second strip's plane is the difference: d along the normal, Δz along up, the
+first strip minus the second. Only single returns count, which excludes vegetation.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from swath.georef.arrays import FloatArray
 from swath.georef.records import Int64Array
 
 OVERLAP_SLOPE_DEG = 10.0  # USGS: overlap is judged on gentler slopes only
-GENTLE = math.cos(math.radians(OVERLAP_SLOPE_DEG))  # least vertical part of their normals
-FLOOR_M = 0.003  # of the noise of a difference: no natural plane is better
+GENTLE = math.cos(math.radians(OVERLAP_SLOPE_DEG))  # least vertical component of their normals
+FLOOR_M = 0.003  # of the noise of a difference: no natural plane is smoother
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,22 +57,22 @@ class Checks:
     centre_direction: FloatArray
 
     def __len__(self) -> int:
-        """Number of check points."""
+        """Return the number of check points."""
         return len(self.distance_m)
 
     @property
     def gentle(self) -> NDArray[np.bool_]:
-        """(n,) slopes on which specifications judge heights."""
+        """Mask (n,) of the slopes on which specifications judge heights."""
         return np.asarray(self.normal[:, 2] >= GENTLE)
 
     def take(self, which: Any) -> Checks:
-        """Return some rows."""
+        """Select some rows."""
         return Checks(*(getattr(self, name)[which] for name in self.__dataclass_fields__))
 
 
 @dataclass(frozen=True, slots=True)
 class Numbers:
-    """Of differences, metres; RMS² = mean² + std² (divided by their number)."""
+    """Statistics of differences, metres; RMS² = mean² + std² (divided by their number)."""
 
     count: int
     mean_m: float
@@ -84,7 +84,7 @@ class Numbers:
 
     @classmethod
     def of(cls, values: FloatArray) -> Numbers:
-        """Make that of values (n,); nan where there is none."""
+        """Compute the statistics of values (n,); nan if there are none."""
         if not len(values):
             return cls(0, *([math.nan] * 6))
         size = np.abs(values)
@@ -101,14 +101,14 @@ class Numbers:
 
 @dataclass(frozen=True, slots=True)
 class PairReport:
-    """Two strips.
+    """The differences of two strips.
 
     Attributes:
         first, second: names.
         distance: d, all slopes.
         height: Δz where slopes are below 10°.
         noise_m: RMS that d would have from the returns' noise alone.
-        systematic_m: what its RMS has beyond that.
+        systematic_m: the part of its RMS beyond that.
     """
 
     first: str
@@ -121,16 +121,16 @@ class PairReport:
 
 @dataclass(frozen=True, eq=False)
 class StripReport:
-    """All strips against each other.
+    """The differences of all strips from each other.
 
     Attributes:
         names: of the strips.
-        pairs: that share planar cells.
+        pairs: pairs that share planar cells.
         all: all pairs together.
-        roughness_m: by strip, RMS of √λ0 of its planes: what it repeats within itself.
+        roughness_m: by strip, RMS of √λ0 of its planes: its repeatability within itself.
         refused: cells of pairs that were not compared, by reason.
         cell_m: side of the cells.
-        checks: behind it.
+        checks: the check points of all pairs.
     """
 
     names: tuple[str, ...]
@@ -143,7 +143,7 @@ class StripReport:
 
 
 def differences(flight: Flight, rules: StripRules | None = None) -> StripReport:
-    """Return strips of a flight as its points are placed."""
+    """Compare the strips of a flight with its points as placed."""
     rules = rules or StripRules()
     strips = [FlightStrip(swath) for swath in flight.swaths]
     cells = overlap_cells(strips, rules)
@@ -151,7 +151,7 @@ def differences(flight: Flight, rules: StripRules | None = None) -> StripReport:
 
 
 def report_of(names: Sequence[str], gathered: Gathered, rules: StripRules, cell_m: float) -> StripReport:
-    """Return what the returns in the cells say."""
+    """Compute the differences from the returns in the cells."""
     planes = _planes(gathered, rules, cell_m)
     checks, refused = _checks(gathered, planes)
     pairs = []
@@ -169,8 +169,8 @@ def report_of(names: Sequence[str], gathered: Gathered, rules: StripRules, cell_
 def single_return_sigma_m(variance_m2: FloatArray, count: FloatArray) -> float:
     """Return the sigma of single returns about a hard surface, metres.
 
-    By the lower quartile of the planes' variances, which what grows on the rest does not move. Quartile of χ²: Wilson
-    and Hilferty (1931).
+    It comes from the lower quartile of the planes' variances, which vegetation on the other planes does not affect.
+    Quartile of χ²: Wilson and Hilferty (1931).
 
     Args:
         variance_m2: (n,) of returns about their planes, by their number less 3.
@@ -193,7 +193,7 @@ def _pair(first: str, second: str, checks: Checks) -> PairReport:
 
 @dataclass(frozen=True, eq=False)
 class _Planes:
-    """A plane a strip and cell, (n,) or (n, 3): where its returns begin and end, and why it is none (0: it is)."""
+    """A plane for each strip and cell, (n,) or (n, 3): its returns, its fit, and why it is refused (0: accepted)."""
 
     cell: Int64Array
     strip: Int64Array
@@ -210,7 +210,7 @@ NARROWEST = 0.125  # of a cell: the least spread (one sigma) of a plane's return
 
 
 def _planes(gathered: Gathered, rules: StripRules, cell_m: float) -> _Planes:
-    """Return least squares planes: the normal is the eigenvector of the smallest eigenvalue λ0 of the covariance."""
+    """Fit least squares planes: the normal is the eigenvector of the smallest eigenvalue λ0 of the covariance."""
     key = np.stack([gathered.cell, gathered.strip])
     begin = np.flatnonzero(np.append(True, (np.diff(key, axis=1) != 0).any(axis=0))[: key.shape[1]])
     count = np.diff(np.append(begin, key.shape[1]))
@@ -250,7 +250,7 @@ def _checks(gathered: Gathered, planes: _Planes) -> tuple[Checks, Counter[str]]:
 def _checks_of(
     gathered: Gathered, planes: _Planes, first: Int64Array, second: Int64Array, refused: Counter[str]
 ) -> Checks:
-    """Of pairs of planes that share a cell each."""
+    """Return the check points of pairs of planes; the planes of a pair share a cell."""
     worst = np.maximum(planes.reason[first], planes.reason[second])
     refused.update({REASONS[number]: int((worst == number).sum()) for number in range(1, 5)})
     first, second = first[worst == 0], second[worst == 0]
@@ -280,7 +280,7 @@ def _checks_of(
 
 
 def _members(planes: _Planes, which: Int64Array) -> tuple[Int64Array, Int64Array]:
-    """Return the returns of some planes, plane after plane, and where each plane's begin among them."""
+    """Return the returns of some planes, plane after plane, and the begin of each plane among them."""
     count = planes.count[which]
     begins = np.cumsum(count) - count
     within = np.arange(int(count.sum())) - np.repeat(begins, count)
@@ -288,7 +288,7 @@ def _members(planes: _Planes, which: Int64Array) -> tuple[Int64Array, Int64Array
 
 
 def _nearest(gathered: Gathered, planes: _Planes, which: Int64Array, places: FloatArray) -> Int64Array:
-    """Of each of some planes the return nearest to a place (n, 3), horizontally."""
+    """Return, for each of some planes, the return that is horizontally nearest to its place (n, 3)."""
     if not len(which):
         return np.zeros(0, np.int64)
     members, begins = _members(planes, which)
@@ -299,7 +299,10 @@ def _nearest(gathered: Gathered, planes: _Planes, which: Int64Array, places: Flo
 
 
 def _inside(gathered: Gathered, planes: _Planes, which: Int64Array, places: FloatArray) -> NDArray[np.bool_]:
-    """Return whether places lie within the hulls of planes' returns: nowhere is half of the horizon free of them."""
+    """Return whether places lie within the convex hulls of planes' returns.
+
+    That is so if no half of the horizon around a place is free of returns.
+    """
     if not len(which):
         return np.zeros(0, bool)
     members, begins = _members(planes, which)
@@ -314,7 +317,7 @@ def _inside(gathered: Gathered, planes: _Planes, which: Int64Array, places: Floa
 
 
 def _of_members(gathered: Gathered, planes: _Planes, which: Int64Array, values: FloatArray) -> FloatArray:
-    """Return (n,) means over planes' returns."""
+    """Return means (n,) over planes' returns."""
     if not len(which):
         return np.zeros(0)
     members, begins = _members(planes, which)
@@ -322,7 +325,7 @@ def _of_members(gathered: Gathered, planes: _Planes, which: Int64Array, values: 
 
 
 def _mean_ns(gathered: Gathered, planes: _Planes, which: Int64Array) -> Int64Array:
-    """Return (n,) mean times; relative to each plane's first return, for their digits."""
+    """Return mean times (n,), computed relative to each plane's first return to keep their digits."""
     starts = gathered.time_ns[planes.begin]
     after = (gathered.time_ns - np.repeat(starts, planes.count)).astype(np.float64)
     return np.asarray(starts[which] + np.rint(_of_members(gathered, planes, which, after)).astype(np.int64))

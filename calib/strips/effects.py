@@ -1,4 +1,4 @@
-"""How points move with what a calibration may have wrong: the effects of FORMULAS 5.3, exact for any attitude."""
+"""Compute how points move with errors of a calibration: the effects of FORMULAS 5.3, exact for any attitude."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from swath.georef.trajectory.trajectory import Poses, Trajectory
 
 @dataclass(frozen=True, slots=True)
 class Effect:
-    """An effect on the ground.
+    """An effect of a calibration error on the ground.
 
     Attributes:
-        name: for people.
-        parameter: of the calibration that has it, SI (`swath.georef.scanner.calibration.PARAMETERS`).
+        name: for display.
+        parameter: parameter with the error, SI (`swath.georef.scanner.calibration.PARAMETERS`).
         factor, unit: of the report.
-        look: of it in the strips.
+        look: its appearance in the strips.
         remedy: the flight line that shows it.
     """
 
@@ -39,7 +39,7 @@ class Effect:
 
     @property
     def key(self) -> str:
-        """Of the parameter in calibration files, which has the report's unit: ``omega_deg``."""
+        """Key of the parameter in calibration files, which has the report's unit: ``omega_deg``."""
         return PARAMETERS[INDEX[self.parameter]].key
 
 
@@ -79,14 +79,14 @@ NAMES = tuple(effect.name for effect in EFFECTS)
 
 @dataclass(frozen=True, eq=False)
 class SeenFrom:
-    """Where strips were seen from: the frame of the checks' points, and by strip its trajectory, by session.
+    """The places from which strips were seen: the frame of the checks' points, and the trajectory of each strip.
 
     Attributes:
-        frame: t.
-        trajectories: of the body.
+        frame: the frame t.
+        trajectories: of the body, one per session.
         flown: of each strip, the index of its trajectory.
         scan_rate: of each strip, |θ̇| in rad/s, typical; 0: not known.
-        rot_b_from_s: of each strip, (3, 3), how its scanner is mounted; directions of the scan are about its x axis.
+        rot_b_from_s: of each strip, (3, 3), mounting of its scanner; directions of the scan are about its x axis.
     """
 
     frame: Tangent
@@ -97,7 +97,7 @@ class SeenFrom:
 
     @classmethod
     def of(cls, flight: Flight) -> SeenFrom:
-        """Return a flight's."""
+        """Create it for a flight."""
         rates = [
             0.0 if swath.encoder_rate is None or not len(swath) else float(np.median(np.abs(swath.encoder_rate[::97])))
             for swath in flight.swaths
@@ -107,16 +107,22 @@ class SeenFrom:
 
 
 def _rot_b_from_s(head: Head, swath: Swath) -> FloatArray:
-    """Return (3, 3) in the middle of a swath, where the mount moves."""
+    """Return the rotation (3, 3) of a swath's scanner, in the middle of the swath if the mount moves."""
     if isinstance(head.geometry, SpinningGeometry) or not len(swath):
-        return np.eye(3)  # a head that spins has its own axis, and no angle that such a column is of
+        return np.eye(3)  # a spinning head has its own axis, and no scan angle for such a column
     turned: FloatArray = head.mount.poses(swath.time_ns[len(swath) // 2 :][:1])[0][0]
     return turned @ head.start.installation_matrix
 
 
 @dataclass(frozen=True, eq=False)
 class _Arms:
-    """Hold the places that points were seen from: poses (n,), rot_t_from_b (n, 3, 3), body to point in t, b (n, 3)."""
+    """The places from which points were seen.
+
+    Attributes:
+        poses: (n,) of the body.
+        rot_t_from_b: (n, 3, 3).
+        arm_t, arm_b: (n, 3) from the body to the point, in t and in b.
+    """
 
     poses: Poses
     rot_t_from_b: FloatArray
@@ -125,7 +131,7 @@ class _Arms:
 
     @classmethod
     def of(cls, points_t: FloatArray, strip: int, time_ns: Int64Array, seen: SeenFrom) -> _Arms:
-        """Return those of points (n, 3) at GPS times (n,)."""
+        """Compute the places for points (n, 3) at GPS times (n,)."""
         poses = seen.trajectories[seen.flown[strip]].poses(time_ns)
         rot_t_from_b = seen.frame.rot_t_from_e @ rot_from_quaternion(poses.q_e_from_b)
         arm_t = points_t - seen.frame.t_from_e(poses.position_e)
@@ -133,24 +139,24 @@ class _Arms:
 
 
 def error_columns(points_t: FloatArray, strip: Int64Array, time_ns: Int64Array, seen: SeenFrom) -> FloatArray:
-    """Return how points move with errors of the trajectory at their moments.
+    """Return how points move with errors of the trajectory at their times.
 
     Args:
         points_t: (n, 3) metres.
         strip: (n,) index.
         time_ns: (n,) GPS time.
-        seen: where from.
+        seen: the places from which they were seen.
 
     Returns:
-        (n, 6, 3) in t, metres a unit of what is added to the trajectory: position north, east, down (m), then small
-        turns of the body about north, east, down (rad), as of `swath.calib.equations.trajectory_prior`.
+        (n, 6, 3) in t, metres per unit of the correction of the trajectory: position north, east, down (m), then small
+        turns of the body about north, east, down (rad), as in `swath.calib.equations.trajectory_prior`.
     """
     moved = np.zeros((len(points_t), 6, 3))
     for number in np.unique(strip).tolist():
         own = strip == number
         arms = _Arms.of(points_t[own], number, time_ns[own], seen)
         lat, lon, _ = geodetic_from_e(arms.poses.position_e)
-        axes_t = np.swapaxes(seen.frame.rot_t_from_e @ rot_e_from_l(lat, lon), 1, 2)  # a row each: north, east, down
+        axes_t = np.swapaxes(seen.frame.rot_t_from_e @ rot_e_from_l(lat, lon), 1, 2)  # one row each: north, east, down
         moved[own, :3] = axes_t
         moved[own, 3:] = np.cross(axes_t, arms.arm_t[:, np.newaxis])
     return moved
@@ -166,10 +172,10 @@ def effect_columns(
         strip: (n,) index.
         time_ns: (n,) GPS time.
         direction: (n,) of the scan, −1 … 1.
-        seen: where from.
+        seen: the places from which they were seen.
 
     Returns:
-        (n, effects, 3) and (n, 6, 3) in t, metres a unit in SI: FORMULAS 5.2 with the lever arm left out of the
+        (n, effects, 3) and (n, 6, 3) in t, metres per unit in SI: FORMULAS 5.2 with the lever arm left out of the
         boresight's columns (a part in a thousand); position east, north, up, then turns about the body's axes.
     """
     columns, errors = np.zeros((len(points_t), len(EFFECTS), 3)), np.zeros((len(points_t), 6, 3))

@@ -1,10 +1,10 @@
-"""What the differences between strips look like: the calibration's parameters that would remove them (FORMULAS 5.3).
+"""Explain the differences between strips by the calibration's parameters that would remove them (FORMULAS 5.3).
 
-A difference of two strips on a plane is what is wrong with each of them there, along the plane's normal. Each effect
-moves points in a way of its own with scan angle, flight direction, scan direction, range and speed; how much of each
-is in the differences is estimated together with the trajectory's errors at knots along the strips, of which the joint
-covariance is known beforehand: what is explained by them is not taken for a calibration. Errors that neighbouring
-strips share, or all of a flight, look like a boresight, and only the joint covariance keeps them apart from one.
+A difference of two strips on a plane is the sum of their errors there, along the plane's normal. Each effect moves
+points in its own way with scan angle, flight direction, scan direction, range and speed. The size of each effect in the
+differences is estimated together with the trajectory's errors at knots along the strips, whose joint covariance is
+known beforehand: differences that these errors explain are not attributed to the calibration. Errors that neighbouring
+strips share, or all of a flight, look like a boresight error, and only the joint covariance separates them from one.
 """
 
 from __future__ import annotations
@@ -30,27 +30,28 @@ from swath.georef.trajectory.trajectory import Trajectory
 
 SIGNIFICANT = 3.29  # sigmas; one in a thousand by chance
 MATTERS_M = 0.01  # on the ground, at the swath's edge
-TELLS_M = 0.02  # at the edge, one sigma: what is known worse is not told
-TELLS = 1.5  # or so many times what the trajectory's attitude leaves to the best of flights
-NOT_APART = 5.0  # times that another effect's sigma may grow
-ROUGH_M = 0.3  # RMS of the differences: planes of one cell are not the same surface any more, and effects not linear
+TELLS_M = 0.02  # at the edge, one sigma: effects that are less certain are not reported
+TELLS = 1.5  # or this multiple of the error that the trajectory's attitude leaves in the best of flights
+NOT_APART = 5.0  # factor by which another effect's sigma may grow
+ROUGH_M = 0.3  # RMS of the differences: above, planes of one cell may be different surfaces, and effects are not linear
 MOST_ROWS = 12_000
-MOST_KNOTS, KNOT_S = 300, 1.0  # of a trajectory of which no joint covariance is known
-POSITION_SIGMA_M, ATTITUDE_SIGMA_DEG = 0.05, (0.005, 0.005, 0.01)  # of trajectories that say none
-# Of a trajectory's told sigmas: half of the variance of roll and pitch lasts for the whole flight, as accelerometers'
-# biases tilt it, and a fifth of the heading's; the rest fades as fast as a tactical unit's gyroscopes walk. A smoothed
-# flight with such a unit has up to 0.46 of its pitch between any two strips, and up to 0.24 of its roll.
+MOST_KNOTS, KNOT_S = 300, 1.0  # of a trajectory without a joint covariance
+POSITION_SIGMA_M, ATTITUDE_SIGMA_DEG = 0.05, (0.005, 0.005, 0.01)  # of trajectories without sigmas
+# Shares of a trajectory's sigmas: half of the variance of roll and pitch lasts for the whole flight, because
+# accelerometers' biases tilt it, and a fifth of the heading's; the rest fades as fast as a tactical unit's gyroscopes
+# walk. A smoothed flight with such a unit has up to 0.46 of its pitch in common between any two strips, and up to 0.24
+# of its roll.
 ASSUMED = Taus(position_s=60.0, roll_pitch_s=10.0, heading_s=20.0, lasting_tilt=0.5, lasting_heading=0.2)
 
 
 @dataclass(frozen=True, slots=True)
 class Signature:
-    """One effect in the residuals.
+    """The estimate of one effect in the residuals.
 
     Attributes:
-        effect: which.
-        value, sigma: to be added to the parameter to remove it, SI; nan: not told.
-        edge_m: what the value moves at the swaths' edges.
+        effect: the effect.
+        value, sigma: to be added to the parameter to remove it, SI; nan: not determined.
+        edge_m: movement by the value at the swaths' edges.
         level: ``none``, ``small``, ``significant``, ``not told``, ``rough``.
         words: the verdict, one sentence.
     """
@@ -65,14 +66,14 @@ class Signature:
 
 @dataclass(frozen=True, eq=False)
 class Signatures:
-    """All effects; and how much of the differences they and the trajectory's errors explain.
+    """Estimates of all effects, and the part of the differences that they and the trajectory's errors explain.
 
     Attributes:
-        found: an effect each, in the order of `EFFECTS`.
-        rows: differences that were used.
+        found: one per effect, in the order of `EFFECTS`.
+        rows: number of differences used.
         rms_m, left_rms_m: of the differences, before and after.
-        variance_factor: of what is left, against its noise.
-        prior_notes: where the covariance of the trajectory's errors is from.
+        variance_factor: of the remaining differences, against their noise.
+        prior_notes: source of the covariance of the trajectory's errors.
     """
 
     found: tuple[Signature, ...]
@@ -84,26 +85,26 @@ class Signatures:
 
     @property
     def rough(self) -> bool:
-        """Tell whether the strips are too far apart for effects to be told."""
+        """True if the strips are too far apart for an estimate of effects."""
         return any(one.level == "rough" for one in self.found)
 
     @property
     def lines(self) -> list[str]:
-        """Return the verdicts for people: a line an effect, or one line where strips are too far apart."""
+        """The verdicts for display: one line per effect, or a single line if strips are too far apart."""
         return list(dict.fromkeys(one.words for one in self.found))
 
 
 def signatures(
     checks: Checks, seen: SeenFrom, prior: TrajectoryPrior | None = None, *, most_rows: int = MOST_ROWS
 ) -> Signatures:
-    """Estimate every effect that the differences can tell.
+    """Estimate every effect that the differences determine.
 
     Args:
         checks: of `swath.calib.strips.differences`, points in t.
-        seen: where from.
+        seen: the places from which they were seen.
         prior: joint covariance of the trajectory's errors, knots of the trajectories in the order of
             ``seen.trajectories`` (`swath.calib.equations.trajectory_prior.from_smoother`); None: `assumed_prior`.
-        most_rows: checks that are used, drawn evenly.
+        most_rows: greatest number of checks used, drawn evenly.
     """
     checks = checks.take(_known(checks, seen))
     if len(checks) > most_rows:
@@ -132,7 +133,7 @@ def signatures(
 
 
 def _known(checks: Checks, seen: SeenFrom) -> NDArray[np.bool_]:
-    """Return rows of which both strips' trajectory is known."""
+    """Return a mask of the rows for which both strips' trajectories are known."""
     known = np.ones(len(checks), bool)
     for strip, time_ns in ((checks.first, checks.point_ns), (checks.second, checks.centre_ns)):
         for number in np.unique(strip):
@@ -145,10 +146,10 @@ def _known(checks: Checks, seen: SeenFrom) -> NDArray[np.bool_]:
 
 
 def assumed_prior(checks: Checks, seen: SeenFrom) -> TrajectoryPrior:
-    """Return the covariance of trajectories' errors by the sigmas they tell, and by what is usual of the rest.
+    """Return the covariance of trajectories' errors from their sigmas and from usual correlation times.
 
-    Errors fade as of `ASSUMED`, whose lasting shares are on the safe side: a larger share makes larger sigmas of the
-    boresight. Trajectories that say no sigmas have `POSITION_SIGMA_M` and `ATTITUDE_SIGMA_DEG`.
+    Errors fade according to `ASSUMED`, whose lasting shares are on the safe side: a larger share makes larger sigmas of
+    the boresight. Trajectories without sigmas get `POSITION_SIGMA_M` and `ATTITUDE_SIGMA_DEG`.
     """
     spans = _spans(checks, seen)
     trajectories = [_with_sigmas(trajectory) for trajectory in seen.trajectories]
@@ -159,7 +160,7 @@ def assumed_prior(checks: Checks, seen: SeenFrom) -> TrajectoryPrior:
 
 
 def _spans(checks: Checks, seen: SeenFrom) -> list[tuple[int, int, int, int]]:
-    """Return (trajectory, number, begin, end) of stretches with checks; of several scanners at one time it is one."""
+    """Return (trajectory, number, begin, end) of stretches with checks; overlapping stretches are joined."""
     strip = np.concatenate([checks.first, checks.second])
     time_ns = np.concatenate([checks.point_ns, checks.centre_ns])
     own = sorted(
@@ -188,11 +189,11 @@ def _with_sigmas(trajectory: Trajectory) -> Trajectory:
 
 
 def _design(checks: Checks, seen: SeenFrom, prior: TrajectoryPrior) -> tuple[FloatArray, csr_array, FloatArray]:
-    """Return how differences go with what is to be added so that they vanish.
+    """Return the derivatives of the differences by the corrections that would remove them.
 
     Returns:
-        (n, effects); (n, 6 knots) for the trajectory's errors, linear between knots; and by effect (effects,) what one
-        unit moves at the swaths' edges.
+        (n, effects); (n, 6 knots) for the trajectory's errors, linear between knots; and by effect (effects,) the
+        movement per unit at the swaths' edges.
     """
     sides = (
         (checks.point, checks.first, checks.point_ns, checks.point_direction, 1.0),
@@ -217,7 +218,7 @@ def _design(checks: Checks, seen: SeenFrom, prior: TrajectoryPrior) -> tuple[Flo
 def _shares(
     prior: TrajectoryPrior, flown: Int64Array, time_ns: Int64Array
 ) -> tuple[tuple[Int64Array, FloatArray], tuple[Int64Array, FloatArray]]:
-    """Return the knots (n,) before and after each moment, and how much of each knot's error is there."""
+    """Return the knots (n,) before and after each moment, and each knot's share in the error at that moment."""
     before, after = np.zeros(len(time_ns), np.int64), np.zeros(len(time_ns), np.int64)
     for number in np.unique(flown):
         own, knots = flown == number, np.flatnonzero(prior.flown == number)
@@ -234,7 +235,7 @@ def _shares(
 
 
 class _Fit:
-    """Least squares of differences on chosen effects and the trajectory's errors, robust."""
+    """Robust least squares of differences on chosen effects and the trajectory's errors."""
 
     def __init__(
         self, design: FloatArray, errors: csr_array, information: FloatArray, values: FloatArray, noise: FloatArray
@@ -245,13 +246,13 @@ class _Fit:
         self.left_rms_m, self.variance_factor = math.nan, math.nan
 
     def sigmas(self, taken: Sequence[int]) -> FloatArray:
-        """Return (effects taken,) by the noise and the trajectory's errors alone."""
+        """Return the sigmas (effects taken,) due to the noise and the trajectory's errors alone."""
         if self._plain is None:
             self._plain = self._reduced(np.ones(len(self._values)))[0]
         return _roots_of_inverse(self._plain[np.ix_(taken, taken)])
 
     def solve(self, taken: Sequence[int]) -> tuple[FloatArray, FloatArray]:
-        """Return values and sigmas (effects taken,), with Huber's weights and a variance factor where it is above 1."""
+        """Return values and sigmas (effects taken,), with Huber's weights and the variance factor if it is above 1."""
         huber = np.ones(len(self._values))
         design = self._design[:, taken]
         for _ in range(5):
@@ -286,7 +287,7 @@ class _Fit:
 
 
 def _roots_of_inverse(normal: FloatArray) -> FloatArray:
-    """Return sigmas; inf of what nothing determines."""
+    """Return the sigmas of a normal matrix; those of undetermined unknowns are very large."""
     scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
     scaled = normal / np.outer(scale, scale)
     values, vectors = np.linalg.eigh(scaled)
@@ -295,8 +296,9 @@ def _roots_of_inverse(normal: FloatArray) -> FloatArray:
 
 
 def _worst_m(prior: TrajectoryPrior, seen: SeenFrom, edges: FloatArray) -> float:
-    """Return the largest sigma at the edge of an effect that is told: the attitude leaves some to the best of
-    flights.
+    """Return the largest sigma, at the swath's edge, of an effect that is still reported.
+
+    The limit accounts for the attitude error that remains even in the best of flights.
     """
     row = np.zeros((len(prior), ERRORS))
     for number in np.unique(prior.flown):
@@ -311,7 +313,7 @@ def _worst_m(prior: TrajectoryPrior, seen: SeenFrom, edges: FloatArray) -> float
 
 
 def _choose(fit: _Fit, edges: FloatArray, worst_m: float) -> tuple[list[int], dict[int, str]]:
-    """Return the effects that the differences tell apart, and why not of the others."""
+    """Return the effects that the differences separate, and the reasons against the others."""
     taken: list[int] = []
     refused: dict[int, str] = {}
     for number, effect in enumerate(EFFECTS):
@@ -351,7 +353,7 @@ def _told(effect: Effect, value: float, sigma: float, edge: float) -> Signature:
 
 
 def record_of(found: Signatures) -> Mapping[str, object]:
-    """For JSON: values in the unit of the report, which is that of the parameter's key in calibration files."""
+    """Return the estimates for JSON; values have the report's unit, that of the key in calibration files."""
     return {
         "rows": found.rows,
         "rms_m": found.rms_m,

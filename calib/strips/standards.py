@@ -1,6 +1,6 @@
-"""What lidar specifications ask of strips and of heights, as a table, and which of it numbers keep (FORMULAS 8).
+"""Limits of lidar specifications for strips and heights, as a table, and the judgement of numbers by them (FORMULAS 8).
 
-The limits are those of the editions named. A contract may name another edition: its own text decides.
+The limits are those of the editions named. If a contract names another edition, its text decides.
 """
 
 from __future__ import annotations
@@ -46,13 +46,13 @@ ASPRS_WITHIN, ASPRS_OVERLAP, ASPRS_OVERLAP_MAX = 0.6, 0.8, 1.6  # of a class: it
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """What numbers keep.
+    """The judgement of numbers by one level or class of a standard.
 
     Attributes:
-        standard: whose limit, with the edition.
+        standard: the standard, with its edition.
         level: quality level or class.
-        limits: what it asks, by word, metres (density: pulses a m²).
-        kept: likewise whether it is kept; None: there is nothing to judge by.
+        limits: by word, metres (density: pulses per m²).
+        kept: likewise whether the limit is kept; None: there is no number to judge.
     """
 
     standard: str
@@ -62,7 +62,7 @@ class Judged:
 
     @property
     def all_kept(self) -> bool:
-        """Whether everything that could be judged is kept, and something could."""
+        """True if all limits that could be judged are kept, and at least one could be judged."""
         known = [one for one in self.kept.values() if one is not None]
         return bool(known) and all(known)
 
@@ -75,7 +75,7 @@ def judge(
     pulses_m2: float | None = None,
     rmse_z_m: float | None = None,
 ) -> tuple[Judged, ...]:
-    """Return numbers against every USGS quality level and the ASPRS 2014 class that fits; None: not measured.
+    """Judge numbers by every USGS quality level and by the ASPRS 2014 class that fits; None: not measured.
 
     Args:
         overlap_rms_m: RMSDz between strips on slopes below 10°.
@@ -107,9 +107,9 @@ def _kept(measured: dict[str, float | None], limits: dict[str, float]) -> dict[s
 
 
 def _asprs(measured: dict[str, float | None]) -> Judged:
-    """Return the smallest class that is kept, or the largest there is.
+    """Return the smallest class that is kept, otherwise the largest class.
 
-    Its limit within strips is one of the largest difference, which a repeatability (RMS) says nothing of.
+    Its limit within strips applies to the largest difference, which a repeatability (RMS) does not show.
     """
     measured = measured | {"within_m": None}
     for size in ASPRS_CLASSES_M:
@@ -126,5 +126,5 @@ def _asprs(measured: dict[str, float | None]) -> Judged:
 
 
 def best_of(judged: Sequence[Judged]) -> str | None:
-    """Return the strictest USGS level that is kept."""
+    """Return the strictest USGS level that is kept; None if none is kept."""
     return next((one.level for one in judged if one.standard == USGS and one.all_kept), None)

@@ -1,1 +1,1 @@
-"""Tie points: intersections of planes, picked points, markings."""
+"""Tie points: intersections of planes, picked points, and markings."""

@@ -1,9 +1,9 @@
-"""Tie points: ridges and corners where planes meet, swath by swath, and points a user picked (NGA Eq. 55 to 60).
+"""Find tie points where planes meet, ridges and corners, swath by swath (NGA Eq. 55 to 60).
 
-Every swath's own planes, fitted to its own returns, are brought to intersection: three in a corner; two in a ridge, of
-which the point at a common place along it is taken and said to be unknown along it. The covariance comes from the
-fits. Such points are made of the returns of the planes: observations beside other features, or instead of these planes,
-but not together with them.
+Every swath's own planes, fitted to its own returns, are intersected: three in a corner; two in a ridge, of which the
+point at a common place is used and counts as unknown along the ridge. The covariance comes from the fits. Such points
+are made of the returns of the planes: they are observations beside other features, or instead of these planes, but not
+together with them.
 """
 
 from __future__ import annotations
@@ -21,23 +21,23 @@ from swath.calib.flight import Flight
 from swath.georef.arrays import FloatArray
 from swath.georef.records import Int64Array
 
-LEAST_RMS_M = 0.002  # no patch is taken for smoother than this
-SPACINGS = 2.5  # patches that end so many point spacings from a line may yet meet in it
+LEAST_RMS_M = 0.002  # lower limit of a patch's scatter
+SPACINGS = 2.5  # patches that end within this many point spacings of a line may still meet in it
 
 
 @dataclass(frozen=True, slots=True)
 class TieSettings:
-    """What counts as a ridge or a corner.
+    """Limits for ridges and corners.
 
     Attributes:
-        least_angle_rad: between two planes of a ridge.
+        least_angle_rad: least angle between two planes of a ridge.
         least_volume: of the three unit normals of a corner; 1: at right angles.
         least_returns: of a patch.
-        reach_m: from the intersection to the returns of each patch, at most; more where returns are sparse.
+        reach_m: greatest distance from the intersection to the returns of each patch; more where returns are sparse.
         least_length_m: of the stretch of a ridge that all its patches share.
-        along_sigma_m: of a ridge's point along it: nothing is known, but a covariance has to be finite.
+        along_sigma_m: of a ridge's point along it: its place is unknown, but a covariance has to be finite.
         greatest_sigma_m: of a corner, and across a ridge.
-        neighbours_m: between planes' centres, at most.
+        neighbours_m: greatest distance between planes' centres.
     """
 
     least_angle_rad: float = np.radians(20.0)
@@ -55,7 +55,7 @@ _DEFAULT = TieSettings()
 
 @dataclass(frozen=True, eq=False)
 class PatchFit:
-    """A plane through one swath's returns of a plane.
+    """A plane fitted to one swath's returns of a plane.
 
     Attributes:
         at: (n,) of the returns in the swath; `points_t`: (n, 3).
@@ -73,13 +73,13 @@ class PatchFit:
     spacing_m: float
 
     def variance_at(self, point_t: FloatArray) -> float:
-        """Return m² of the plane's place along its normal at a point (3,) on it."""
+        """Return the variance in m² of the plane's place along its normal, at a point (3,) on it."""
         off = self.axes[1:] @ (point_t - self.centre_t)
         return float(self.variance @ [1.0, off[0] ** 2, off[1] ** 2])
 
 
 def fit_patch(points_t: FloatArray, at: Int64Array, towards: FloatArray) -> PatchFit:
-    """Return orthogonal least squares of points (n, 3), n > 3; the normal on the side of ``towards`` (3,)."""
+    """Fit a plane by orthogonal least squares to points (n, 3), n > 3; the normal points towards ``towards``."""
     centre = points_t.mean(axis=0)
     off = points_t - centre
     squares, axes = np.linalg.eigh(off.T @ off)
@@ -98,11 +98,11 @@ def fit_patch(points_t: FloatArray, at: Int64Array, towards: FloatArray) -> Patc
 def meet(
     fits: Sequence[PatchFit], line: tuple[FloatArray, float, float] | None = None
 ) -> tuple[FloatArray, FloatArray]:
-    """Return where three planes meet (3,), and its covariance (3, 3) m².
+    """Return the point (3,) where three planes meet, and its covariance (3, 3) m².
 
     Args:
         fits: three planes; or two, with
-        line: direction (3,), place along it, and its variance, which make the third.
+        line: direction (3,), place along it, and its variance, which define the third plane.
     """
     normals = [fit.axes[0] for fit in fits]
     places = [float(fit.axes[0] @ fit.centre_t) for fit in fits]
@@ -116,15 +116,15 @@ def meet(
 
 
 def find_ties(flight: Flight, planes: Features, settings: TieSettings = _DEFAULT) -> Features:
-    """Return ridges and corners of planes that several swaths saw.
+    """Find ridges and corners of planes that several swaths saw.
 
     Args:
         flight: with points.
         planes: `Features` of `swath.calib.planes.search`, of this flight with these points.
-        settings: what counts.
+        settings: limits for ridges and corners.
 
     Returns:
-        Features with ties only, kind ``ridge`` or ``corner``; what did not become one counted by reason.
+        Features with ties only, kind ``ridge`` or ``corner``; refused candidates are counted by reason.
     """
     search = _Search(flight, planes.planes, settings)
     ties = [*search.ridges(), *search.corners()]
@@ -132,7 +132,7 @@ def find_ties(flight: Flight, planes: Features, settings: TieSettings = _DEFAULT
 
 
 class _Search:
-    """Goes over planes that lie beside each other."""
+    """Searches planes that lie beside each other for ridges and corners."""
 
     def __init__(self, flight: Flight, planes: Sequence[Plane], settings: TieSettings) -> None:
         self._flight, self._planes, self._settings = flight, planes, settings
@@ -204,7 +204,7 @@ class _Search:
         return max(self._settings.reach_m, SPACINGS * fit.spacing_m)
 
     def _stretch(self, fits: tuple[PatchFit, PatchFit], direction: FloatArray) -> tuple[float, float] | None:
-        """From where to where along the ridge both patches come near it."""
+        """Return begin and end of the stretch of the ridge to which both patches come near; None if it is empty."""
         middle = float(direction @ (0.5 * (fits[0].centre_t + fits[1].centre_t)))
         on_line, _ = meet(fits, (direction, middle, 1.0))
         ends = []
@@ -219,7 +219,7 @@ class _Search:
         return (float(low), float(high)) if high > low else None
 
     def corners(self) -> Iterator[TiePoint]:
-        """Yield points in which three planes meet, each two of which meet in a line too; after `ridges`."""
+        """Yield points in which three planes meet whose pairs meet in lines too; call `ridges` before."""
         beside: dict[int, set[int]] = {}
         for first, second in self._meeting:
             if self._meeting[first, second]:

@@ -1,9 +1,10 @@
-"""Tie points from intensity: road markings and other patterns on flat ground, found again in every swath.
+"""Find tie points from intensity: road markings and other patterns on flat ground, in every swath.
 
-Ground is cut into squares. Where one is flat, and its pattern strong, in two swaths or more, the intensities of each
-become a smooth image, and the image of the swath that sees it best is looked for in the others' by normalised
-cross-correlation (Lewis 1995). The peak, between cells, is the shift; its curvature, and how much of the images the
-correlation leaves unexplained, give the covariance. Heights come from the plane of each swath's own returns.
+Ground is cut into squares. Where a square is flat, and its pattern strong, in two swaths or more, the intensities of
+each swath become a smooth image, and the image of the swath with the densest returns is located in the others' by
+normalised cross-correlation (Lewis 1995). The peak, interpolated between cells, is the shift; its curvature, and the
+part of the images that the correlation leaves unexplained, give the covariance. Heights come from the plane of each
+swath's own returns.
 """
 
 from __future__ import annotations
@@ -26,26 +27,26 @@ IndexArray = NDArray[np.int64]
 CHUNK = 1_000_000
 LEAST_RMS_M = 0.002
 
-THIN = 0.05  # smoothed returns a cell below which an image has a hole, as a share of their mean
+THIN = 0.05  # smoothed returns per cell, as a share of their mean; an image with fewer has a hole
 
-BACK = 13.8  # χ²(2), 0.999: how far a shift and the one back may be apart
+BACK = 13.8  # χ²(2), 0.999: limit of the difference between a shift and its reverse
 
 
 @dataclass(frozen=True, slots=True)
 class MarkingSettings:
-    """What counts.
+    """Limits and sizes of the search for markings.
 
     Attributes:
         square_m: side of a square of ground.
         cell_m: of the images; `smooth_m`: their smoothing (one sigma); grows where returns are sparse.
         search_m: greatest shift between swaths.
-        least_density: returns a square metre.
+        least_density: returns per square metre.
         rms_m, flat_slope: greatest scatter about the square's plane, and its slope.
         least_contrast: standard deviation of intensities in a square, as a share of their mean.
         least_correlation: of the peak.
         unique: by how much the peak has to exceed the correlation of any place away from it.
-        greatest_sigma_m: of a shift in any direction: lines alone are not known along themselves.
-        most: squares, the strongest patterns first.
+        greatest_sigma_m: of a shift in any direction: lines alone do not fix the shift along themselves.
+        most: greatest number of squares, the strongest patterns first.
     """
 
     square_m: float = 12.0
@@ -67,10 +68,10 @@ _DEFAULT = MarkingSettings()
 
 @dataclass(frozen=True, eq=False)
 class Image:
-    """Intensities of one swath about a square.
+    """Intensities of one swath in and around a square.
 
     Attributes:
-        value: (rows, columns), rows to the north, columns to the east; `middle` is that of the square.
+        value: (rows, columns), rows to the north, columns to the east; the middle is that of the square.
         smooth_m: of their smoothing, one sigma.
         whole: whether there are no holes.
     """
@@ -82,7 +83,7 @@ class Image:
 
 @dataclass(frozen=True, eq=False)
 class Shift:
-    """Where an image lies in another: east and north (2,), covariance (2, 2) m², correlation."""
+    """The place of an image in another one: east and north (2,), covariance (2, 2) m², correlation."""
 
     shift_m: FloatArray
     covariance: FloatArray
@@ -90,11 +91,11 @@ class Shift:
 
 
 def find_markings(flight: Flight, settings: MarkingSettings = _DEFAULT) -> Features:
-    """Tie points of kind ``marking`` on flat ground; squares that gave none counted by reason.
+    """Find tie points of kind ``marking`` on flat ground; squares without one are counted by reason.
 
     Args:
-        flight: with points, whose swaths lie on each other within ``search_m``.
-        settings: what counts.
+        flight: with points, whose swaths coincide within ``search_m``.
+        settings: limits and sizes.
     """
     refused: Counter[str] = Counter()
     grid = grid_of(flight, settings.square_m)
@@ -131,7 +132,7 @@ def _tie(
     settings: MarkingSettings,
     refused: Counter[str],
 ) -> TiePoint | None:
-    """Return the square's centre where the best swath has it, and where the others have what looks like it."""
+    """Build the tie point of a square: its centre in the best swath, and the matching places in the others."""
     centre = grid.centre(number)
     smooth_m = max(settings.smooth_m, *(0.8 / np.sqrt(square.density) for square in seen.values()))
     images = {i: _image(flight.swaths[i], returns[i], seen[i], centre, float(smooth_m), settings) for i in seen}
@@ -148,7 +149,7 @@ def _tie(
     if not found:
         return None
     mean = np.mean([shift.covariance for shift in found.values()], axis=0)
-    placed = {best: (centre, 0.5 * mean)}  # either image has its half of the noise
+    placed = {best: (centre, 0.5 * mean)}  # each image contributes half of the noise
     placed |= {index: (centre + shift.shift_m, 0.5 * shift.covariance) for index, shift in found.items()}
     sightings = tuple(
         _sighting(flight.swaths[index], index, returns[index], seen[index], *placed[index]) for index in sorted(placed)
@@ -164,7 +165,7 @@ def _sighting(
     place: FloatArray,
     covariance: FloatArray,
 ) -> Sighting:
-    """On the square's plane; what is wrong of its place is wrong of its height by the slope."""
+    """Return the sighting on the square's plane; the slope carries errors of its place over to its height."""
     points = np.asarray(swath.points_t[at, :2])
     nearest = int(at[np.argmin(np.sum((points - place) ** 2, axis=1))])
     to_plane = np.concatenate([np.eye(2), square.slopes[np.newaxis]])
@@ -182,7 +183,7 @@ def _image(
     smooth_m: float,
     settings: MarkingSettings,
 ) -> Image:
-    """Return mean intensities of cells, weighted by distance: of the square and what the search needs around it."""
+    """Return the mean intensities of cells, weighted by distance, of the square and the search margin around it."""
     points = np.asarray(swath.points_t[at])
     on_ground = np.abs(points[:, 2] - square.heights_at(points[:, :2])) <= 5.0 * settings.rms_m
     points, intensity = points[on_ground], swath.rows["intensity"][at][on_ground].astype(np.float64)
@@ -198,9 +199,9 @@ def _image(
 
 
 def _spread(place: FloatArray, values: FloatArray, side: int) -> tuple[FloatArray, FloatArray]:
-    """Return (side, side) sums of values (n,) and of ones, each shared among the four cells about its place (n, 2).
+    """Return sums (side, side) of values (n,) and of ones, each shared among the four cells around its place (n, 2).
 
-    Shared linearly, so that where a pattern of scan lines falls in the cells does not move the image.
+    The sharing is linear, so that the positions of scan lines within the cells do not move the image.
     """
     whole = np.floor(place).astype(np.int64)
     share = place - whole
@@ -221,7 +222,7 @@ def _cells(metres: float, cell_m: float) -> int:
 
 
 def shifted(image: Image, other: Image, settings: MarkingSettings) -> Shift | str:
-    """By how much the other image shows the same farther to the east and north; in words why that cannot be said."""
+    """Return the shift of the same pattern in the other image; a string is the reason of failure."""
     if not (image.whole and other.whole):
         return "holes in the ground"
     search = _cells(settings.search_m, settings.cell_m)
@@ -255,7 +256,7 @@ def shifted(image: Image, other: Image, settings: MarkingSettings) -> Shift | st
 
 
 def there_and_back(image: Image, other: Image, settings: MarkingSettings) -> Shift | str:
-    """Return the shift, where that of the other image's middle is the same the other way."""
+    """Return the shift if the reverse search gives the same; a string is the reason of failure."""
     there, back = shifted(image, other, settings), shifted(other, image, settings)
     if isinstance(there, str) or isinstance(back, str):
         return there if isinstance(there, str) else str(back)
@@ -266,7 +267,7 @@ def there_and_back(image: Image, other: Image, settings: MarkingSettings) -> Shi
 
 
 def _correlations(template: FloatArray, image: FloatArray) -> FloatArray:
-    """Normalised cross-correlation at every place the template has in the image."""
+    """Return the normalised cross-correlation at every place of the template in the image."""
     zero_mean = template - template.mean()
     size = template.shape[0]
     image = image - image.mean()
@@ -280,8 +281,9 @@ def _correlations(template: FloatArray, image: FloatArray) -> FloatArray:
 
 
 def _surface(values: FloatArray) -> FloatArray:
-    """Return (6,) of 1, x, y, x², xy, y² through (3, 3) values by least squares; x to the east, y to the north, in
-    cells.
+    """Fit 1, x, y, x², xy, y² to (3, 3) values by least squares; return the coefficients (6,).
+
+    x is to the east, y to the north, in cells.
     """
     y, x = (axis.ravel().astype(np.float64) for axis in np.mgrid[-1:2, -1:2])
     design = np.stack([np.ones(9), x, y, x * x, x * y, y * y], axis=1)
@@ -290,7 +292,7 @@ def _surface(values: FloatArray) -> FloatArray:
 
 
 def _away(correlation: FloatArray, row: int, column: int, settings: MarkingSettings) -> float:
-    """Return the greatest correlation beyond a metre from the peak."""
+    """Return the greatest correlation beyond a metre, or three smoothing sigmas if larger, from the peak."""
     rows, columns = np.indices(correlation.shape)
     far = np.hypot(rows - row, columns - column) * settings.cell_m > max(1.0, 3.0 * settings.smooth_m)
     return float(np.max(correlation[far], initial=-1.0))
@@ -298,7 +300,7 @@ def _away(correlation: FloatArray, row: int, column: int, settings: MarkingSetti
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """Squares over a flight: the south-west corner (2,), their side, columns and rows of them."""
+    """Squares over a flight: the south-west corner (2,), their side, and their columns and rows."""
 
     corner_t: FloatArray
     side_m: float
@@ -306,20 +308,20 @@ class Grid:
     rows: int
 
     def number(self, points_t: FloatArray) -> IndexArray:
-        """Return (n,) of the squares points (n, ≥ 2) lie in; −1: nan."""
+        """Return the numbers (n,) of the squares in which points (n, ≥ 2) lie; −1 for nan."""
         placed = np.isfinite(points_t[:, 0])
         away = np.where(placed[:, np.newaxis], points_t[:, :2], self.corner_t) - self.corner_t
         column, row = np.floor(away / self.side_m).astype(np.int64).T
         return np.where(placed, row * self.columns + column, -1)
 
     def centre(self, number: int) -> FloatArray:
-        """Return (2,) east and north."""
+        """Return east and north (2,) of a square's centre."""
         row, column = divmod(number, self.columns)
         centre: FloatArray = self.corner_t + self.side_m * (np.array([column, row]) + 0.5)
         return centre
 
     def around(self, number: int) -> list[int]:
-        """Return a square and its neighbours."""
+        """Return the numbers of a square and its neighbours."""
         row, column = divmod(number, self.columns)
         return [
             r * self.columns + c
@@ -336,7 +338,7 @@ class Square:
         number: in the grid.
         centre_t: (2,); height_m: of its plane there; slopes: (2,) to the east and north.
         rms_m: of the returns about the plane; sigma_m: of its height, from their scatter.
-        density: returns a square metre.
+        density: returns per square metre.
         contrast: standard deviation of the intensities as a share of their mean.
     """
 
@@ -351,21 +353,21 @@ class Square:
 
     @property
     def slope(self) -> float:
-        """The steepest."""
+        """Steepest slope of the plane."""
         return float(np.hypot(*self.slopes))
 
     def height_at(self, place_t: FloatArray) -> float:
-        """Of the plane at a place (2,)."""
+        """Return the height of the plane at a place (2,)."""
         return self.height_m + float(self.slopes @ (place_t - self.centre_t))
 
     def heights_at(self, places_t: FloatArray) -> FloatArray:
-        """Of the plane at places (n, 2)."""
+        """Return the heights of the plane at places (n, 2)."""
         heights: FloatArray = self.height_m + (places_t - self.centre_t) @ self.slopes
         return heights
 
 
 def grid_of(flight: Flight, side_m: float) -> Grid | None:
-    """Over all points of a flight; None where it has none."""
+    """Create the grid over all points of a flight; None if it has no points."""
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
     for swath in flight.swaths:
         for begin in range(0, len(swath), CHUNK):
@@ -383,7 +385,7 @@ def grid_of(flight: Flight, side_m: float) -> Grid | None:
 
 
 def squares_of(swath: Swath, grid: Grid, least_density: float) -> Iterator[Square]:
-    """Yield those in which a swath has returns enough."""
+    """Yield the squares in which a swath has enough returns."""
     count = grid.columns * grid.rows
     sums = np.zeros((12, count))  # 1 x y z xx xy yy xz yz zz, intensity and its square
     for begin in range(0, len(swath), CHUNK):
@@ -409,7 +411,7 @@ def squares_of(swath: Swath, grid: Grid, least_density: float) -> Iterator[Squar
 
 
 def _square(number: int, grid: Grid, sums: FloatArray) -> Square | None:
-    """Return plane and contrast of a square from its sums (12,)."""
+    """Return the plane and contrast of a square from its sums (12,); None if its returns do not fix a plane."""
     n, x, y, z, xx, xy, yy, xz, yz, zz, i, ii = (float(value) for value in sums)
     normal = np.array([[n, x, y], [x, xx, xy], [y, xy, yy]])
     if np.linalg.cond(normal / n) > 1e4:
@@ -424,7 +426,7 @@ def _square(number: int, grid: Grid, sums: FloatArray) -> Square | None:
 
 
 def near(swath: Swath, grid: Grid, numbers: Sequence[int]) -> dict[int, IndexArray]:
-    """By square, the returns in it and in its neighbours, rising."""
+    """Return, by square, the rising indexes of the returns in it and in its neighbours."""
     wanted = np.zeros(grid.columns * grid.rows, np.bool_)
     for number in numbers:
         wanted[grid.around(number)] = True

@@ -1,4 +1,4 @@
-"""Tie points from a file: what a user picked in the points of several strips, by hand or with another program."""
+"""Read tie points that a user picked in the points of several strips, by hand or with another program."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ CHUNK = 1_000_000
 
 
 class PickedError(ValueError):
-    """A file of picked points that cannot be used; one line for the user."""
+    """A file of picked points that cannot be used; the message is one line for the user."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +32,7 @@ class Picked:
     Attributes:
         name: of the point, the same in every strip.
         strip: number of the strip, or the swath's name.
-        place: (3,) of the file's coordinates; of those of t for `picked_ties`.
+        place: (3,) in the file's coordinates; in those of t for `picked_ties`.
         sigma_m: of each coordinate.
         where: file and line, for messages.
     """
@@ -46,11 +46,11 @@ class Picked:
 
 @dataclass(frozen=True, slots=True)
 class PickedSettings:
-    """What counts.
+    """Limits for picked points.
 
     Attributes:
-        nearest_m: a return of the strip has to be within this.
-        apart_m: sightings of one point at most, before a calibration.
+        nearest_m: greatest distance to the nearest return of the strip.
+        apart_m: greatest distance of sightings of one point from their median, before a calibration.
     """
 
     nearest_m: float = 3.0
@@ -61,14 +61,14 @@ _DEFAULT = PickedSettings()
 
 
 def read_picked(text: str, name: str) -> tuple[Picked, ...]:
-    """Return a CSV with the columns name, strip, x, y, z, sigma_m; coordinates in the flight's CRS.
+    """Read a CSV with the columns name, strip, x, y, z, sigma_m; coordinates are in the flight's CRS.
 
     Args:
         text: of the file.
         name: of the file, for messages.
 
     Raises:
-        PickedError: not such a file; line and what would be right.
+        PickedError: it is not such a file; with the line and the remedy.
     """
     reader = csv.reader(io.StringIO(text))
     try:
@@ -111,10 +111,10 @@ def _row(cells: dict[str, str], where: str) -> Picked:
 
 
 def picked_ties(flight: Flight, picked: Sequence[Picked], settings: PickedSettings = _DEFAULT) -> Features:
-    """Tie points of picked points whose places stand in t; what cannot be one is counted by reason.
+    """Build tie points of picked points whose places are in t; refused points are counted by reason.
 
     Raises:
-        PickedError: a strip that the flight does not have, or that several scanners have.
+        PickedError: the flight does not have the strip, or several scanners have it.
     """
     refused: Counter[str] = Counter()
     named: dict[str, dict[int, Sighting]] = {}
@@ -142,9 +142,9 @@ def picked_ties(flight: Flight, picked: Sequence[Picked], settings: PickedSettin
 
 
 def carried(picked: Features, picked_in: Flight, flight: Flight) -> Features:
-    """Picked tie points where they would have been picked in the same returns as another calibration places them.
+    """Move picked tie points with their returns to where another calibration places them.
 
-    An adjustment takes points as measured where the flight's returns lie: picks are of the files that a user had.
+    An adjustment expects measured points among the flight's points, but a user picks in files of another calibration.
     """
 
     def seen(one: Sighting) -> Sighting:
@@ -168,7 +168,7 @@ def _swath(flight: Flight, one: Picked) -> int:
 
 
 def _nearest(swath: Swath, place_t: FloatArray, within_m: float) -> tuple[int, float]:
-    """Return the return nearest to a place, and how far it is; inf where none is about."""
+    """Return the nearest return to a place, and its distance; inf if there is none within reach."""
     best, least = -1, math.inf
     for begin in range(0, len(swath), CHUNK):
         off = np.asarray(swath.points_t[begin : begin + CHUNK]) - place_t

@@ -1,1 +1,1 @@
-"""Calibrations compared with one another and with later flights."""
+"""Validation: comparison of calibrations with one another and with later flights."""

@@ -1,5 +1,7 @@
-"""What a validation looks at: distances of swaths from each other and from control, with the errors that are expected
-of them: noise, the trajectory's errors along the strips, the calibration's own sigmas."""
+"""Measure distances of swaths from each other and from control for a validation, with their expected errors.
+
+These errors are noise, the trajectory's errors along the strips, and the calibration's own sigmas.
+"""
 
 from __future__ import annotations
 
@@ -24,12 +26,12 @@ from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
 from swath.georef.records import Int64Array
 from swath.georef.scanner.calibration import INDEX, Calibration
 
-FLOOR_M = 0.003  # of a distance, at most: what natural planes differ by from one sight to another
-HALF = math.sqrt(0.5)  # of the floor, each sight's
+FLOOR_M = 0.003  # of a distance, at most: variation of natural planes from one sight to another
+HALF = math.sqrt(0.5)  # share of each sight in the floor
 FAR_M = 10.0
 FEWEST = 6  # returns of a sight
 MOST_ROWS = 1500
-FLOOR_ROWS = 500  # that the floor is estimated from: twenty factorisations
+FLOOR_ROWS = 500  # rows used to estimate the floor: that takes twenty factorisations
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,15 +41,16 @@ class Rows:
     Attributes:
         value_m: first swath − second, or swath − control.
         first, second: indexes of swaths; second −1: control.
-        noise_m: sigma that each has for itself.
-        shared: (n, m) what one sigma of each shared error moves: the calibrations', the survey's.
+        noise_m: sigma of each distance's own error.
+        shared: (n, m) change by one sigma of each shared error: the calibrations', the survey's.
         name: of the planes or points.
-        effects: (n, heads · effects) what one unit (SI) of each effect of a calibration moves; (n, 0): none.
-        local: sparse (n, m) what one sigma of each error moves that only one plane's or point's share; None: none.
-        sights: (n, 2) which sight of a plane is the first, and the second; (0, 2): all are different.
-        by_knot: sparse (n, 6k) what a unit of the trajectory's errors at each knot moves; None: they count as none.
+        effects: (n, heads · effects) change by one unit (SI) of each effect of a calibration; (n, 0): no effects.
+        local: sparse (n, m) change by one sigma of each error that only the distances of one plane or point share;
+            None: there are no such errors.
+        sights: (n, 2) numbers of the first and the second sight of a plane; (0, 2): all are different.
+        by_knot: sparse (n, 6k) change by a unit of the trajectory's errors at each knot; None: these count as zero.
         knots: (6k, 6k) covariance of these, as of `swath.calib.equations.trajectory_prior.TrajectoryPrior`.
-        floor: sparse (n, sights) what a metre of each sight's own deviation from its plane moves; None: none.
+        floor: sparse (n, sights) change by a metre of each sight's own deviation from its plane; None: no deviations.
         floor_m: sigma of these deviations times √2, so that it is a distance's.
         heads: names of the scanners behind the effects.
     """
@@ -68,11 +71,11 @@ class Rows:
     heads: tuple[str, ...] = ()
 
     def __len__(self) -> int:
-        """Number of distances."""
+        """Return the number of distances."""
         return len(self.value_m)
 
     def take(self, which: Any) -> Rows:
-        """Return some of them, evenly drawn where they are more than can be tested together."""
+        """Select some of the rows, drawn evenly if they are more than can be tested together."""
         at = np.flatnonzero(which)
         if len(at) > MOST_ROWS:
             at = np.sort(np.random.default_rng(6_8).choice(at, MOST_ROWS, replace=False))
@@ -93,17 +96,16 @@ class Rows:
         )
 
     def independent(self, which: Any) -> NDArray[np.bool_]:
-        """Return (n,) of the distances chosen those that tell something beyond the others: k sights of a plane have k
-        − 1.
+        """Return a mask (n,) of the chosen distances that are independent: k sights of a plane have k − 1.
 
-        Those whose sights are surest stay; any others are sums and differences of them.
+        The distances with the most certain sights are kept; all others are sums and differences of them.
         """
         chosen = np.zeros(len(self), bool)
         if not len(self.sights):
             chosen[which] = True
             return chosen
         at = np.flatnonzero(which)
-        groups = np.arange(int(self.sights.max(initial=-1)) + 1).tolist()  # a sight leads to another that it hangs on
+        groups = np.arange(int(self.sights.max(initial=-1)) + 1).tolist()  # links to another sight of the same group
 
         def group(sight: int) -> int:
             while groups[sight] != sight:
@@ -121,7 +123,7 @@ class Rows:
         return chosen
 
     def covariance(self) -> FloatArray:
-        """Return (n, n) that is expected, m²."""
+        """Return the expected covariance (n, n), m²."""
         expected: FloatArray = np.diag(self.noise_m**2) + self.shared @ self.shared.T
         if self.local is not None:
             expected = expected + (self.local @ self.local.T).toarray()
@@ -130,7 +132,7 @@ class Rows:
         return expected + self.floor_m**2 * self.floor_pattern()
 
     def floor_pattern(self) -> FloatArray:
-        """Return (n, n) what the covariance gains by a square metre of the floor."""
+        """Return the change (n, n) of the covariance per square metre of the floor."""
         if self.floor is None:
             return np.zeros((len(self), len(self)))
         pattern: FloatArray = (self.floor @ self.floor.T).toarray()
@@ -138,13 +140,13 @@ class Rows:
 
 
 def estimated_floor_m(rows: Rows) -> float:
-    """Estimate how much planes differ from sight to sight for reasons of their own, at most `FLOOR_M`.
+    """Estimate how much planes themselves vary from sight to sight, at most `FLOOR_M`.
 
-    Restricted maximum likelihood (Patterson and Thompson 1971, Biometrika 58): everything that an error of a
-    calibration could explain is projected out first, so that no such error is taken for roughness.
+    Restricted maximum likelihood (Patterson and Thompson 1971, Biometrika 58): all parts that an error of a calibration
+    could explain are projected out first, so that such an error does not count as roughness.
 
     Args:
-        rows: that tell something beyond each other (`Rows.independent`).
+        rows: independent rows (`Rows.independent`).
     """
     if rows.floor is None or len(rows) < 2:
         return rows.floor_m
@@ -169,7 +171,7 @@ def estimated_floor_m(rows: Rows) -> float:
 
 
 def _scaled(effects: FloatArray) -> FloatArray:
-    """Return columns (n, m) of length 1, without those that are zero."""
+    """Scale columns (n, m) to length 1, and drop zero columns."""
     length = np.linalg.norm(effects, axis=0)
     scaled: FloatArray = effects[:, length > 0.0] / length[length > 0.0]
     return scaled
@@ -177,8 +179,15 @@ def _scaled(effects: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class _Sight:
-    """A plane as one swath shows it: its fit, mean time, the scan's direction, and the spread of its returns across
-    their longest direction."""
+    """A plane as one swath shows it.
+
+    Attributes:
+        swath: index.
+        plane: its fit.
+        time_ns: mean time.
+        direction: of the scan.
+        spread_m: spread of its returns across their longest direction.
+    """
 
     swath: int
     plane: LocalPlane
@@ -190,7 +199,7 @@ class _Sight:
 def plane_rows(
     flight: Flight, features: Features, calibrations: Mapping[str, Calibration], prior: TrajectoryPrior
 ) -> Rows:
-    """Return every two swaths on every plane: the mean of the one's returns from the other's plane.
+    """Compare every two swaths on every plane: the mean of the first one's returns from the second one's plane.
 
     Args:
         flight: with points.
@@ -235,7 +244,7 @@ def plane_rows(
 
 
 def _sight(flight: Flight, plane: Plane, number: int) -> _Sight | None:
-    """Return what a swath shows of a plane by those of its returns that have a place; None: too few have."""
+    """Fit a plane to a swath's placed returns on a plane; None if these are too few."""
     patch = plane.patches[number]
     swath = flight.swaths[patch.swath]
     points = np.asarray(swath.points_t[patch.at])
@@ -253,9 +262,15 @@ def _sight(flight: Flight, plane: Plane, number: int) -> _Sight | None:
 
 
 def _noise(firsts: Sequence[_Sight], seconds: Sequence[_Sight], sights: Int64Array, walked_m: FloatArray) -> Any:
-    """Return sparse (n, sights · 4): of each sight its place along the normal, and the turn of its plane, by which the
-    place grows unsure where the other's returns lie off its middle; walked_m (n, 2) of what attitude does between
-    knots.
+    """Return the effects of each sight's noise on distances, sparse (n, sights · 4).
+
+    The four columns of a sight are its place along the normal and the turn of its plane. Because of the turn, the place
+    is less certain where the other sight's returns lie away from its middle.
+
+    Args:
+        firsts, seconds: sights of each distance.
+        sights: (n, 2) their numbers.
+        walked_m: (n, 2) one sigma of the attitude's random walk between knots.
     """
     moved = np.zeros((len(firsts), 2, 4))
     for row, (first, second) in enumerate(zip(firsts, seconds, strict=True)):
@@ -271,7 +286,7 @@ def _noise(firsts: Sequence[_Sight], seconds: Sequence[_Sight], sights: Int64Arr
 
 
 def _floor(sights: Int64Array) -> Any:
-    """Return sparse (n, sights) of `Rows.floor`: first less second, each with its share of a distance's."""
+    """Return `Rows.floor`, sparse (n, sights): first less second, each with its share of a distance's floor."""
     row = np.repeat(np.arange(len(sights)), 2)
     shape = len(sights), int(sights.max(initial=-1)) + 1
     return sparse.csr_array((np.tile([HALF, -HALF], len(sights)), (row, sights.reshape(-1))), shape=shape)
@@ -284,7 +299,7 @@ def control_rows(
     rules: ControlRules,
     prior: TrajectoryPrior,
 ) -> Rows:
-    """Return every swath at every control point: the swath above the point; arguments as of `plane_rows`."""
+    """Compare every swath with every control point: the swath above the point; see `plane_rows` for the arguments."""
     grounds, _ = grounds_at(flight, points, rules)
     grounds = [one for one in grounds if abs(one.above_m) < FAR_M]
     sights = [_sight_of_ground(flight, one) for one in grounds]
@@ -318,13 +333,13 @@ def _sight_of_ground(flight: Flight, ground: Ground) -> _Sight:
 
 @dataclass(frozen=True, eq=False)
 class _Moved:
-    """How places (n,) move along normals.
+    """Movements of places (n,) along normals.
 
     Attributes:
-        heads: (n, heads · effects) one sigma of the calibrations.
-        effects: (n, heads · effects) a unit (SI) of each effect.
-        knots: sparse (n, 6k) a unit of the trajectory's errors at the knots.
-        walk_m: (n,) one sigma of what the attitude walks between knots.
+        heads: (n, heads · effects) by one sigma of the calibrations.
+        effects: (n, heads · effects) by a unit (SI) of each effect.
+        knots: sparse (n, 6k) by a unit of the trajectory's errors at the knots.
+        walk_m: (n,) one sigma of the attitude's random walk between knots.
     """
 
     heads: FloatArray
@@ -366,7 +381,10 @@ def _by_knots(
     times: Int64Array,
     prior: TrajectoryPrior,
 ) -> tuple[Any, FloatArray]:
-    """Return ``knots`` and ``walk_m`` of `_Moved`: a body at x that sees p has n · (δx + δθ × (p − x)) along n."""
+    """Return ``knots`` and ``walk_m`` of `_Moved`.
+
+    A place p seen from a body at x moves by n · (δx + δθ × (p − x)) along n.
+    """
     flown = np.array([flight.swaths[one].flown for one in strip], np.int64)
     moved, walk = np.zeros((len(places), ERRORS)), np.zeros(len(places))
     row, column, value = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], [np.zeros(0)]
@@ -391,7 +409,7 @@ def _by_knots(
 
 
 def _root(calibration: Calibration) -> FloatArray:
-    """Return (effects, effects) whose square is the covariance of the effects' parameters; zero where held fixed."""
+    """Return a matrix root (effects, effects) of the covariance of the effects' parameters; zero where held fixed."""
     at = [INDEX[effect.parameter] for effect in EFFECTS]
     values, vectors = np.linalg.eigh(calibration.covariance()[np.ix_(at, at)])
     root: FloatArray = vectors * np.sqrt(np.maximum(values, 0.0))

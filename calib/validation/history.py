@@ -1,10 +1,10 @@
-"""Calibrations of one mounting over time: has the boresight moved?
+"""Compare the calibrations of one mounting over time, and test whether the boresight has moved.
 
 Two calibrations are compared by their differences against the joint covariance of both; a trend is the weighted
 straight line through all of them.
 
-Whether two calibrations of a scanner were made with the same of all that is not compared: values that were held,
-tables, settings of the atmosphere. Where these differ, angles do, too, and nothing has moved.
+Two calibrations of a scanner are only comparable if they agree in everything that is not compared: held values, tables,
+settings of the atmosphere. Where these differ, angles differ too, although the boresight has not moved.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from scipy import stats
 
 from swath.georef.scanner.calibration import INDEX, PARAMETERS, BeamCorrection, Calibration
 
-LIKE = 1.0 / 3.0  # of a sigma: what differs by less adds a twentieth to the expected square
-DISTANCE_M = 500.0  # at which metres are told from angles
+LIKE = 1.0 / 3.0  # of a sigma: a difference of this size adds a twentieth to the expected square
+DISTANCE_M = 500.0  # distance at which metres are converted to angles
 METRE = 1.0 / DISTANCE_M
-TURNS = {  # radians at most, or about, that an angle found with a unit (SI) more of a parameter may differ by; else 1
+TURNS = {  # approximate greatest change (radians) of an angle per unit (SI) of a parameter; else 1
     "range_offset_m": METRE,
     "lever_arm_x_m": METRE,
     "lever_arm_y_m": METRE,
@@ -36,18 +36,18 @@ NO_BEAM = BeamCorrection()
 
 BORESIGHT = ("omega_rad", "phi_rad", "kappa_rad")
 ALPHA = 0.001
-EARLIEST, LATEST = 1980, 2500  # years in which calibrations are made
+EARLIEST, LATEST = 1980, 2500  # years in which calibrations can have been made
 FEWEST_FOR_TREND = 3
 YEAR_S = 365.25 * 86_400.0
 
 
 class HistoryError(ValueError):
-    """Calibrations that are no history; one line for the user."""
+    """Calibrations that form no history; the message is one line for the user."""
 
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """Of one parameter, later − earlier, SI."""
+    """The difference of one parameter, later − earlier, SI."""
 
     name: str
     difference: float
@@ -55,7 +55,7 @@ class Difference:
 
     @property
     def words(self) -> str:
-        """As ``phi_deg +0.0081 ± 0.0012 (6.8 σ)``."""
+        """Text such as ``phi_deg +0.0081 ± 0.0012 (6.8 σ)``."""
         parameter = PARAMETERS[INDEX[self.name]]
         value, sigma = self.difference / parameter.factor, self.sigma / parameter.factor
         digits = max(0, 1 - math.floor(math.log10(sigma))) if sigma > 0.0 else 6
@@ -63,7 +63,7 @@ class Difference:
         return f"{parameter.key} {value:+.{digits}f} ± {sigma:.{digits}f} ({times:.1f} σ)"
 
     def record(self) -> dict[str, Any]:
-        """For JSON, in the unit of the key."""
+        """Return the difference for JSON, in the unit of the key."""
         parameter = PARAMETERS[INDEX[self.name]]
         return {
             "parameter": parameter.key,
@@ -77,7 +77,7 @@ class Compared:
     """Two calibrations: differences of the parameters that both estimated, and χ² of all with their correlations.
 
     Attributes:
-        weights: of each difference, diagonal of their covariance's inverse, SI: what an error of it adds to χ².
+        weights: of each difference, diagonal of their covariance's inverse, SI: an error e adds weight · e² to χ².
     """
 
     earlier: str
@@ -89,21 +89,21 @@ class Compared:
 
     @property
     def p(self) -> float:
-        """Chance of so much where nothing has changed."""
+        """Probability of a χ² this large if no parameter has changed."""
         return float(stats.chi2.sf(self.chi2, self.freedom)) if self.freedom else math.nan
 
     @property
     def moved(self) -> bool:
-        """Whether the difference is more than chance."""
+        """True if the difference is larger than chance explains."""
         return bool(self.freedom and self.p < ALPHA)
 
 
 def compare(earlier: Calibration, later: Calibration, names: Sequence[str] | None = None) -> Compared:
-    """Return differences of two calibrations whose errors are independent.
+    """Compare two calibrations whose errors are independent.
 
     Args:
         earlier, later: of one scanner.
-        names: of parameters; None: all. Of them those count that both estimated.
+        names: of parameters; None: all. Only those that both calibrations estimated count.
 
     Raises:
         HistoryError: the installation matrices differ, so that angles mean different things.
@@ -134,7 +134,7 @@ def compare(earlier: Calibration, later: Calibration, names: Sequence[str] | Non
 
 @dataclass(frozen=True, slots=True)
 class Trend:
-    """A straight line through a parameter's values: change a year and its sigma, SI; p of the change."""
+    """A straight line through a parameter's values: change per year and its sigma, SI; p of the change."""
 
     name: str
     per_year: float
@@ -142,7 +142,7 @@ class Trend:
     p: float
 
     def record(self) -> dict[str, Any]:
-        """For JSON, in the unit of the key."""
+        """Return the trend for JSON, in the unit of the key."""
         parameter = PARAMETERS[INDEX[self.name]]
         return {
             "parameter": parameter.key,
@@ -157,7 +157,7 @@ class History:
     """Calibrations of a scanner in one mounting.
 
     Attributes:
-        scanner, installation: whose.
+        scanner, installation: of the calibrations.
         entries: in the order of time; times: (n,) seconds since 1970.
         steps: each against the one before, boresight only; without those that cannot be compared.
         trends: of the boresight; empty: too few calibrations, or some that cannot be compared.
@@ -174,11 +174,11 @@ class History:
 
     @property
     def moved(self) -> bool:
-        """Whether the boresight has moved, at once or by and by."""
+        """True if the boresight has moved, suddenly or gradually."""
         return any(step.moved for step in self.steps) or any(trend.p < ALPHA for trend in self.trends)
 
     def table(self) -> list[dict[str, Any]]:
-        """Return a row a calibration: id, time, method, and the boresight with its sigmas, degrees."""
+        """Return one row per calibration: id, time, method, and the boresight with its sigmas, degrees."""
         rows = []
         for entry, time in zip(self.entries, self.times, strict=True):
             row: dict[str, Any] = {"id": entry.id, "created": _date(time), "method": entry.method}
@@ -190,7 +190,7 @@ class History:
         return rows
 
     def record(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the history for JSON."""
         return {
             "scanner": self.scanner,
             "installation": self.installation,
@@ -213,12 +213,12 @@ class History:
 
 
 def history(calibrations: Sequence[Calibration]) -> tuple[History, ...]:
-    """Return one history a scanner and installation, of calibrations in any order.
+    """Return one history per scanner and installation, from calibrations in any order.
 
-    What was never estimated (``method = "nominal"``) has no sigmas and is listed, but not tested.
+    Calibrations without any estimate (``method = "nominal"``) have no sigmas and are listed, but not tested.
 
     Raises:
-        HistoryError: a calibration does not say when it was made, or of which installation it is; one stands twice.
+        HistoryError: a calibration has no creation time or no installation, or occurs twice.
     """
     groups: dict[tuple[str, str], list[tuple[float, Calibration]]] = {}
     seen: set[str] = set()
@@ -264,7 +264,7 @@ def _told(name: str, tested: Sequence[tuple[float, Calibration]]) -> int:
 
 
 def _trend(name: str, tested: Sequence[tuple[float, Calibration]]) -> Trend:
-    """Weighted straight line; its sigma is that of the calibrations' own."""
+    """Fit a weighted straight line; its sigma follows from the calibrations' own sigmas."""
     rows = [(t, e.value(name), float(e.sigmas[INDEX[name]])) for t, e in tested if e.sigmas[INDEX[name]] > 0.0]
     time, value, sigma = (np.array(column) for column in zip(*rows, strict=True))
     weight, years = 1.0 / sigma**2, time / YEAR_S
@@ -299,10 +299,11 @@ def _date(time_s: float) -> str:
 
 
 def difference_between(one: Calibration, other: Calibration, sigma_rad: float) -> str:
-    """Return what differs by more than a part of the sigma of the angles that are compared, in words; empty: nothing
-    does.
+    """Describe the first difference of two calibrations that matters, other than the angles; empty: nothing differs.
 
-    What both estimated differs as its sigmas say, and the angles' sigmas have it. What a file leaves unsaid is none.
+    A difference matters if it is more than a part of the sigma of the compared angles. Parameters that both estimated
+    do not count, because the angles' sigmas include their errors. A value that a file leaves out does not count as
+    different.
     """
     return next(_differences(one, other, LIKE * sigma_rad), "")
 
@@ -332,7 +333,7 @@ def _differences(one: Calibration, other: Calibration, limit_rad: float) -> Iter
 
 
 def _ibrc_apart_m(one: Calibration, other: Calibration) -> float:
-    """Return the most that corrections by intensity differ by; no table corrects nothing."""
+    """Return the greatest difference of corrections by intensity; without a table the correction is zero."""
     tables = [table for table in (one.ibrc, other.ibrc) if table is not None]
     if not tables:
         return 0.0

@@ -1,12 +1,12 @@
-"""Is a calibration right? The six methods of ISO/TS 19159-2, 6.8, each with numbers, a test and a sentence.
+"""Validate a calibration by the six methods of ISO/TS 19159-2, 6.8, each with numbers, a test and a sentence.
 
-Distances are tested against the covariance that is expected of them: noise of the planes, the trajectory's errors, as
-they go on along the strips and from one to the next, and the sigmas of the calibration itself. So a χ² that is too
-large says that something is wrong which none of these explains.
+Distances are tested against their expected covariance: noise of the planes, the trajectory's errors, with their
+correlation along the strips and from one to the next, and the sigmas of the calibration itself. So a χ² that is too
+large indicates an error that none of these explains.
 
-A test that finds nothing is worth what it could have found: of every parameter the smallest error is told that the
-tests would have seen with `POWER` (the minimal detectable bias of Baarda 1968, A testing procedure for use in geodetic
-networks).
+A test that passes is worth only as much as it could have detected: for every parameter the report gives the smallest
+error that the tests would have detected with `POWER` (the minimal detectable bias of Baarda 1968, A testing procedure
+for use in geodetic networks).
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ from swath.georef.geodesy.earth import geodetic_from_e
 from swath.georef.scanner.calibration import INDEX, PARAMETERS, Calibration
 
 ALPHA = 0.001  # of each test: one true calibration in a thousand fails it
-POWER = 0.8  # with which an error of the size told would have been found
-BLIND = 25.0  # plausible sizes: an error that must be as large to be seen is not seen at all
+POWER = 0.8  # probability of detecting an error of the reported size
+BLIND = 25.0  # plausible sizes: an error that is only detected above this counts as undetectable
 FEWEST = 5
 UNITS = {"rad": ("°", math.degrees(1.0)), "m": (" m", 1.0), "s": (" µs", 1e6), "s2": (" s²", 1.0)}
-SIGMAS_M, SIGMAS_DEG = 0.05, (0.005, 0.005, 0.01)  # of trajectories that say none
-KNOT_S = 1.0  # of trajectories that say sigmas only
-WANDER, WANDER_TAUS = 0.3, Taus(2.0, 2.0, 2.0)  # of these sigmas: as much as errors change from plane to plane
+SIGMAS_M, SIGMAS_DEG = 0.05, (0.005, 0.005, 0.01)  # of trajectories without sigmas
+KNOT_S = 1.0  # of trajectories that have only sigmas
+WANDER, WANDER_TAUS = 0.3, Taus(2.0, 2.0, 2.0)  # of these sigmas: the part of errors that changes from plane to plane
 CROSSING_DEG = 45.0
 HEIGHTS_RATIO = 1.2
 CODES = {  # CA_ValidationMethod
@@ -70,11 +70,12 @@ NOT_BOTH = "no parameter was estimated in both; want a calibration file with sig
 
 @dataclass(frozen=True, slots=True)
 class Test:
-    """A statistical test; p: chance of so much where nothing is wrong.
+    """A statistical test; p is the probability of a value this large if there is no error.
 
-    ``chi2`` of all values; ``z`` of their mean; ``effects``: χ² of what the calibration's effects (roll, pitch, …)
-    explain of them, which sees what all the rest hides; ``effect``: of the one effect that fits best, p of all of them
-    together (Bonferroni), which sees a single wrong parameter best.
+    The kinds are: ``chi2`` of all values; ``z`` of their mean; ``effects``: χ² of the part of them that the
+    calibration's effects (roll, pitch, …) explain, which shows errors that the noise of all values hides; ``effect``:
+    of the one effect that fits best, with the p of all of them together (Bonferroni), which shows a single wrong
+    parameter best.
     """
 
     kind: str
@@ -85,17 +86,17 @@ class Test:
 
     @property
     def passed(self) -> bool:
-        """Whether it is no surprise."""
+        """True if p is at least `ALPHA`."""
         return self.p >= ALPHA
 
 
 @dataclass(frozen=True, slots=True)
 class Detectable:
-    """The smallest error of a parameter that a test would have seen with `POWER`, were it the only one.
+    """The smallest error of a parameter that a test would have detected with `POWER`, if it were the only error.
 
     Attributes:
         scanner, parameter: as ``left``, ``omega_rad``.
-        size: SI; what the calibration's own sigmas allow is no error.
+        size: SI; deviations within the calibration's own sigmas are not errors.
     """
 
     scanner: str
@@ -104,23 +105,23 @@ class Detectable:
 
     @property
     def seen(self) -> bool:
-        """Tell whether the size is one that anybody would look for."""
+        """True if the size is below `BLIND` plausible errors of the parameter."""
         return self.size < BLIND * RULES_OF_ALL.of(f"{self.scanner}.{self.parameter}").plausible
 
     @property
     def words(self) -> str:
-        """Return the parameter and its size, as ``phi 0.0062°``."""
+        """Name of the parameter and the size, as ``phi 0.0062°``."""
         unit, factor = UNITS.get(self.parameter.rpartition("_")[2], (" ppm", 1e6))
         return f"{self.name} {float(f'{factor * self.size:.2g}'):g}{unit}"
 
     @property
     def name(self) -> str:
-        """Of the parameter, without its unit."""
+        """Name of the parameter without its unit."""
         name, _, unit = self.parameter.rpartition("_")
         return name if unit in UNITS else self.parameter
 
     def record(self) -> dict[str, Any]:
-        """For JSON, in the unit of the parameter's key; null: not at all."""
+        """Return the error for JSON, in the unit of the parameter's key; null if it is undetectable."""
         parameter = PARAMETERS[INDEX[self.parameter]]
         size = self.size / parameter.factor if self.seen else None
         return {"scanner": self.scanner, "parameter": parameter.key, "smallest_error": size}
@@ -128,15 +129,15 @@ class Detectable:
 
 @dataclass(frozen=True, eq=False)
 class Method:
-    """One method of validation.
+    """One method of validation with its result.
 
     Attributes:
         name: of `CODES`.
         numbers: of the values; None: not available.
-        tests: of them.
-        sentence: what came of it.
+        tests: of the values.
+        sentence: the result.
         more: further values for JSON.
-        detectable: the smallest errors that it would have seen.
+        detectable: the smallest errors that it would have detected.
     """
 
     name: str
@@ -148,18 +149,24 @@ class Method:
 
     @property
     def code(self) -> str:
-        """Of CA_ValidationMethod."""
+        """Code of CA_ValidationMethod."""
         return CODES[self.name]
 
     @property
     def passed(self) -> bool | None:
-        """None: it could not be applied."""
+        """True if all tests passed; None if the method could not be applied."""
         return None if not self.tests else all(test.passed for test in self.tests)
 
 
 @dataclass(frozen=True, eq=False)
 class Validation:
-    """All six; why they may not be independent of the calibration; and what was asked for and could not be done."""
+    """The results of all six methods.
+
+    Attributes:
+        methods: in the order of `CODES`.
+        dependent: why they may not be independent of the calibration.
+        undone: requests that could not be fulfilled.
+    """
 
     methods: tuple[Method, ...]
     dependent: tuple[str, ...] = ()
@@ -167,18 +174,18 @@ class Validation:
 
     @property
     def passed(self) -> bool | None:
-        """Whether all that could be applied passed; None: none could."""
+        """True if all methods that could be applied passed; None if none could be applied."""
         known = [method.passed for method in self.methods if method.passed is not None]
         return all(known) if known else None
 
     @property
     def holds(self) -> bool:
-        """Whether all passed that could be applied, and all that was asked for could be."""
+        """True if all methods that could be applied passed, and all requests could be fulfilled."""
         return bool(self.passed) and not self.undone
 
     @property
     def detectable(self) -> tuple[Detectable, ...]:
-        """The smallest errors that any of the methods would have seen."""
+        """The smallest errors that any of the methods would have detected."""
         best: dict[tuple[str, str], Detectable] = {}
         for one in (one for method in self.methods for one in method.detectable):
             there = best.setdefault((one.scanner, one.parameter), one)
@@ -188,7 +195,7 @@ class Validation:
 
     @property
     def sentence(self) -> str:
-        """The verdict, with what was asked for and not done, and what would not have been seen."""
+        """The verdict, with unfulfilled requests and undetectable errors."""
         applied = [method for method in self.methods if method.passed is not None]
         failed = [method.name for method in applied if not method.passed]
         undone = f"what was asked for could not be done: {'; '.join(self.undone)}" if self.undone else ""
@@ -204,7 +211,7 @@ class Validation:
         return f"the calibration holds{alone}: {could}{self._unseen()}"
 
     def _unseen(self) -> str:
-        """Return what errors would not have been seen, in words."""
+        """Describe in words the errors that would not have been detected."""
         found = self.detectable
         several = len({one.scanner for one in found}) > 1
         below = [f"{one.scanner} {one.words}" if several else one.words for one in found if one.seen]
@@ -215,12 +222,12 @@ class Validation:
 
 @dataclass(frozen=True, eq=False)
 class Asked:
-    """What a validation is asked for beyond the planes that two strips see.
+    """Requests to a validation beyond the planes that two strips see.
 
     Attributes:
-        control: points in the flight's frame; None: none were named.
-        anew: by scanner, parameters measured anew from this flight or otherwise; None: that was not asked for.
-        why_not_anew: why there are none, where it was.
+        control: points in the flight's frame; None: not requested.
+        anew: by scanner, parameters measured anew from this flight or otherwise; None: not requested.
+        why_not_anew: why there are none although they were requested.
         scanners: those whose calibrations were named; None: all.
     """
 
@@ -238,16 +245,16 @@ def validate(
     prior: TrajectoryPrior | None = None,
     rules: ControlRules | None = None,
 ) -> Validation:
-    """Validate.
+    """Validate calibrations by all methods that the flight allows.
 
     Args:
         flight: placed with the calibrations.
-        features: planes found in it, that no adjustment behind the calibrations has used.
-        calibrations: by scanner, what is to be validated.
-        asked: for more than that.
-        prior: errors of the flight's trajectories, as navigation knows them; None: by the trajectories' sigmas, of
-            which nobody says how errors of one strip go with those of the next: where strips are compared, not at all,
-            and where control is, as `Taus` says, for so either sees the larger errors.
+        features: planes found in it that no adjustment behind the calibrations has used.
+        calibrations: by scanner, the ones to validate.
+        asked: additional requests.
+        prior: errors of the flight's trajectories from navigation; None: from the trajectories' sigmas. These do not
+            tell how errors of one strip correlate with those of the next: comparisons of strips assume no correlation,
+            and comparisons with control the one of `Taus`, so that each expects the larger errors.
         rules: of control.
     """
     apart, along = _by_sigmas(with_sigmas(flight)) if prior is None else (prior, prior)
@@ -262,7 +269,7 @@ def validate(
 
 
 def _by_sigmas(flight: Flight) -> tuple[TrajectoryPrior, TrajectoryPrior]:
-    """Return the errors of the trajectories with strips apart, each with some wander, and along all of them."""
+    """Return two priors from trajectories' sigmas: with independent strips and some wander, and with joint strips."""
     along = gauss_markov(flight, knot_s=KNOT_S)
     strips = np.repeat(along.flown * (along.strip.max() + 1) + along.strip, ERRORS)
     wander = gauss_markov(flight, WANDER_TAUS, KNOT_S).covariance
@@ -271,7 +278,7 @@ def _by_sigmas(flight: Flight) -> tuple[TrajectoryPrior, TrajectoryPrior]:
 
 
 def with_sigmas(flight: Flight) -> Flight:
-    """Return the flight with the sigmas `SIGMAS_M` and `SIGMAS_DEG` where its trajectories say none."""
+    """Return the flight with the sigmas `SIGMAS_M` and `SIGMAS_DEG` where its trajectories have none."""
     trajectories = []
     for one in flight.trajectories:
         position = np.where(np.isfinite(one.position_sigma_l), one.position_sigma_l, SIGMAS_M)
@@ -281,7 +288,7 @@ def with_sigmas(flight: Flight) -> Flight:
 
 
 def _undone(flight: Flight, validation: Validation, found: Mapping[str, Method], asked: Asked) -> tuple[str, ...]:
-    """Return what was asked for and could not be done, a line each."""
+    """Return one line for each request that could not be fulfilled."""
     lines = []
     if asked.control is not None and found["testfield"].passed is None:
         lines.append(f"control: {_why(found['testfield'])}")
@@ -303,7 +310,7 @@ def _why(method: Method) -> str:
 
 
 def same_logs(calibration: Calibration, logs: Sequence[tuple[str, str]]) -> tuple[str, ...]:
-    """Return sentences where logs (name, SHA-256) are those that a calibration was made of."""
+    """Return a sentence for each log (name, SHA-256) from which the calibration was made."""
     used = {entry.get("sha256", ""): entry.get("name", "") for entry in calibration.header.get("logs", [])}
     return tuple(
         f"{name}: calibration {calibration.id} was made of this log; this is no independent validation of it"
@@ -316,7 +323,7 @@ def same_logs(calibration: Calibration, logs: Sequence[tuple[str, str]]) -> tupl
 
 
 def _classes(flight: Flight, rows: Rows) -> dict[str, NDArray[np.bool_]]:
-    """Return which rows belong to which method."""
+    """Return masks of the rows that belong to each method."""
     headings, heights = _flown_so(flight)
     first, second = rows.first, rows.second
     if not len(rows):
@@ -334,7 +341,7 @@ def _classes(flight: Flight, rows: Rows) -> dict[str, NDArray[np.bool_]]:
 
 
 def _flown_so(flight: Flight) -> tuple[FloatArray, FloatArray]:
-    """Return (swaths,) headings, degrees, and heights above their points, metres."""
+    """Return headings (swaths,), degrees, and heights above their points, metres."""
     headings, heights = np.zeros(len(flight.swaths)), np.ones(len(flight.swaths))
     for number, swath in enumerate(flight.swaths):
         if not len(swath):
@@ -360,11 +367,11 @@ def _of_rows(name: str, every: Rows, which: NDArray[np.bool_]) -> Method:
 
 
 def distance_tests(rows: Rows) -> tuple[Test, ...]:
-    """Return χ² of values with their expected covariance, z of their mean (generalised least squares), tests of
-    effects.
+    """Test values against their expected covariance: χ², z of their mean (generalised least squares), and effects.
 
-    Of n values none of which follows from others χ² = dᵀ C⁻¹ d has n degrees of freedom;
-    mean = (1ᵀ C⁻¹ d) / (1ᵀ C⁻¹ 1), z = mean · √(1ᵀ C⁻¹ 1).
+    For n independent values χ² = dᵀ C⁻¹ d has n degrees of freedom, and
+
+        mean = (1ᵀ C⁻¹ d) / (1ᵀ C⁻¹ 1)      z = mean · √(1ᵀ C⁻¹ 1)
     """
     factor = np.linalg.cholesky(rows.covariance())
     whitened = np.linalg.solve(factor, np.column_stack([rows.value_m, np.ones(len(rows))]))
@@ -382,7 +389,7 @@ def distance_tests(rows: Rows) -> tuple[Test, ...]:
 
 
 def _effects_tests(values: FloatArray, effects: FloatArray) -> tuple[Test, Test]:
-    """Return χ² of what whitened effects (n, m) explain of whitened values (n,), and z of the one that fits best."""
+    """Return χ² of the part of whitened values (n,) that effects (n, m) explain, and z of the best single effect."""
     length = np.linalg.norm(effects, axis=0)
     seen = np.flatnonzero(length > 1e-9 * length.max())
     unit = effects[:, seen] / length[seen]
@@ -398,7 +405,7 @@ def _effects_tests(values: FloatArray, effects: FloatArray) -> tuple[Test, Test]
 
 
 def smallest_errors(rows: Rows) -> tuple[Detectable, ...]:
-    """Return of every effect of every scanner the smallest error that the test ``effect`` finds with `POWER`.
+    """Return, for every effect of every scanner, the smallest error that the test ``effect`` detects with `POWER`.
 
     A unit of it moves the whitened values by g, so that δ = (z₁₋α′⁄₂ + z_power) / |g|, α′ = `ALPHA` over the number of
     effects that are seen (Baarda 1968, the power of the other side neglected).
@@ -489,6 +496,6 @@ def _anew(calibrations: Mapping[str, Calibration], anew: Mapping[str, Calibratio
 
 
 def _noncentrality(freedom: int) -> float:
-    """Return λ with which χ² of so many degrees of freedom fails at `ALPHA` with `POWER`."""
+    """Return λ with which χ² with ``freedom`` degrees of freedom fails at `ALPHA` with `POWER`."""
     limit = float(stats.chi2.isf(ALPHA, freedom))
     return float(optimize.brentq(lambda size: float(stats.ncx2.sf(limit, freedom, size)) - POWER, 1.0, 1e4))

@@ -1,4 +1,4 @@
-"""``swath calibrate``: from the logs of a calibration flight to the scanner's parameters."""
+"""The command ``swath calibrate``: estimates a scanner's parameters from the logs of a calibration flight."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`swath check`: is the configuration right, and does every device answer?"""
+"""The command `swath check`: validates a configuration and checks that every device answers."""
 
 from __future__ import annotations
 

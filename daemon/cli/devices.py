@@ -1,4 +1,4 @@
-"""`swath devices`: the protocols there are."""
+"""The command `swath devices`: lists the supported protocols."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def describe_driver(driver: Driver) -> dict[str, Any]:
         "kind": driver.kind,
         "transports": list(driver.transports),
         "yields": [record.__name__ for record in driver.yields],
-        "gives_time": driver.kind == "gnss",  # the clock takes its seconds from receivers only
+        "gives_time": driver.kind == "gnss",  # only receivers name the seconds of the clock
         "names_edge": str(driver.names_edge) if driver.names_edge is not None else None,
         "needs": list(driver.needs),
         "summary": driver.summary,

@@ -1,4 +1,4 @@
-"""``swath doctor``: is this computer fit to record?"""
+"""The command ``swath doctor``: checks whether this computer is fit to record."""
 
 from __future__ import annotations
 

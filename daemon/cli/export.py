@@ -1,4 +1,4 @@
-"""``swath export``: the devices' own files."""
+"""The command ``swath export``: writes logs as the files of the devices' own tools."""
 
 from __future__ import annotations
 

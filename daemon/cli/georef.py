@@ -1,4 +1,4 @@
-"""``swath georef``: from logs and a trajectory to points."""
+"""The command ``swath georef``: computes points from logs and a trajectory."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def command(
 
 
 def calibrations_given(given: list[str]) -> dict[str, tuple[str, str]]:
-    """Return text and name of each file, by the scanner that is named, or else the one that the file names."""
+    """Return text and name of each calibration file, by the scanner named in the option, or else in the file."""
     found: dict[str, tuple[str, str]] = {}
     for entry in given:
         named, equals, rest = entry.partition("=")

@@ -1,4 +1,4 @@
-"""``swath import``: a log of captures."""
+"""The command ``swath import``: makes a log from captures."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def command(
     from swath.daemon.exchange.capture_files import Told, find_captures
     from swath.daemon.exchange.routes import Routes
 
-    logging.getLogger("swath").addHandler(logging.NullHandler())  # what is told of captures stands below
+    logging.getLogger("swath").addHandler(logging.NullHandler())  # findings about captures are printed below
     told = Told(source or (), _by_source(start, _time_ns), _by_source(baud, _baud), keep_copies)
     loaded = load_config(config)
     routes = Routes.of(loaded)
@@ -80,7 +80,7 @@ def _import(config: Config, routes: Routes, captures: list[Capture], output: Pat
     from swath.drivers.transports.base import TransportError
 
     most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
-    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))  # captures are merged: all are open at once
+    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))  # merging keeps all captures open at once
     lock = take_directory(output, "--output")
     try:
         with Console(stderr=True).status("reading") as status:
@@ -96,7 +96,7 @@ def _import(config: Config, routes: Routes, captures: list[Capture], output: Pat
 
 
 def _by_source(texts: Sequence[str] | None, parse: Callable[[str], ValueT]) -> dict[str, ValueT]:
-    """Return ``SOURCE=value`` or ``value`` for all."""
+    """Parse options of the form ``SOURCE=value``, or ``value`` for all sources, into a dict by source."""
     found: dict[str, ValueT] = {}
     for text in texts or ():
         source, _, value = text.rpartition("=")
@@ -108,7 +108,9 @@ def _by_source(texts: Sequence[str] | None, parse: Callable[[str], ValueT]) -> d
 
 
 def _time_ns(text: str) -> int:
-    """Return ISO 8601 with Z or an offset, or seconds since 1970 with up to nine decimals."""
+    """Parse a time in ISO 8601 with Z or an offset, or in seconds since 1970 with up to nine decimals; return
+    nanoseconds.
+    """
     whole, _, fraction = text.partition(".")
     if whole.isdecimal() and len(whole) <= 10 and (not fraction or (fraction.isdecimal() and len(fraction) <= 9)):
         return int(whole) * 1_000_000_000 + int(fraction.ljust(9, "0"))

@@ -1,4 +1,4 @@
-"""``swath info``: what logs hold."""
+"""The command ``swath info``: reports the content of logs."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def command(
 
 
 def _plain(text: object) -> str:
-    """Whatever a log holds, in a line, and no markup to the console."""
+    """Return a text of a log as one line, without markup that the console would interpret."""
     from rich.markup import escape
 
     return escape(one_line(str(text)))
@@ -81,7 +81,7 @@ def _print_session(console: Console, numbers: dict[str, Any]) -> None:
         console.print(f"[red]part {number} is missing[/]")
     table = Table(box=None, pad_edge=False, header_style="bold")
     for column in ("source", "units", "MB", "per s", "gaps", "longest", "lost k/q/w", "time"):
-        if column in ("source", "time"):  # words may go on below; a number that lost its end would be another number
+        if column in ("source", "time"):  # words may wrap, but a truncated number would show another value
             table.add_column(column, overflow="fold", min_width=len("HOLDOVER"))
         else:
             table.add_column(column, justify="right", no_wrap=True)
@@ -117,7 +117,7 @@ def _print_session(console: Console, numbers: dict[str, Any]) -> None:
 
 
 def _print_trouble(console: Console, numbers: dict[str, Any]) -> None:
-    """What the wires and controllers say of themselves."""
+    """Print the error counts that wires and controllers report themselves."""
     for source, values in numbers["sources"].items():
         if values["trouble"]:
             told = ", ".join(f"{count:,} {key.replace('_', ' ')}" for key, count in values["trouble"].items())

@@ -1,4 +1,4 @@
-"""``swath live``: points while it is recorded."""
+"""The command ``swath live``: computes and shows points during a recording."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from swath.daemon.config import Config
     from swath.daemon.config.tables import LiveConfig
 
-JOURNAL_S = 60.0  # between two lines for the journal, which has the status beside
+JOURNAL_S = 60.0  # between two lines for the journal; systemd shows the status all the time
 
 
 def command(
@@ -68,7 +68,7 @@ def command(
 
 
 def _told(found: dict[str, Any]) -> None:
-    """UserError where the points were made with what is not to be used."""
+    """Refuse the result with `UserError` if its verdict is that the points are not to be used."""
     from swath.daemon.processing.carried_verdict import refusal
 
     unusable = refusal(found.get("verdict") or {})
@@ -87,7 +87,7 @@ def _check(where: list[Path] | None, output: Path | None, *, replay: bool) -> No
 
 @contextlib.contextmanager
 def _stop_signals() -> Iterator[list[int]]:
-    """Signals that came; the first one ends things in order."""
+    """Collect SIGINT and SIGTERM in a list during the block, so that the first one ends the work in order."""
     stop: list[int] = []
     before = {signum: signal.getsignal(signum) for signum in (signal.SIGINT, signal.SIGTERM)}
     for signum in before:
@@ -105,7 +105,10 @@ def _stop_signals() -> Iterator[list[int]]:
 def _follow(
     where: Path, points: Path | None, *, from_start: bool, accept_verdict: bool, as_json: bool
 ) -> dict[str, Any]:
-    """Until it ends or is stopped; while loops compile, which looks at no list of signals, a signal ends it at once."""
+    """Follow a recording until it ends or a signal stops it.
+
+    During compilation a signal ends the process at once, because compiling does not check for collected signals.
+    """
     from rich.console import Console
 
     from swath.daemon.config import load_config
@@ -147,7 +150,7 @@ def _tell_of_compiling() -> None:
 
 @contextlib.contextmanager
 def _teller(console: Console, manager: Any, *, as_json: bool) -> Iterator[Callable[[dict[str, Any]], None]]:
-    """What tells people a status: a page on a terminal, else a line a second, for a service now and then."""
+    """Give a function that shows a status: a page on a terminal, else a line each second, for a service less often."""
     from rich.live import Live as Screen
 
     said_s = -JOURNAL_S
@@ -175,7 +178,7 @@ def _teller(console: Console, manager: Any, *, as_json: bool) -> Iterator[Callab
 
 
 def page(found: dict[str, Any]) -> Group:
-    """Return what stands on the terminal."""
+    """Return the page for the terminal."""
     from rich.console import Group, RenderableType
     from rich.table import Table
     from rich.text import Text

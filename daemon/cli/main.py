@@ -1,7 +1,7 @@
-"""The command line: `swath COMMAND`, one file a command.
+"""The command line `swath COMMAND`; each command has its own file.
 
-Every error is one line on stderr. No traceback reaches a user: an internal error is written to a file that the
-line names.
+Every error is one line on stderr. Users never see a traceback: the details of an internal error are written to a file
+that the line names.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from swath import __version__
 from swath.daemon.errors import ExitCode, UserError, one_line
 from swath.daemon.system import keep_freed_memory
 
-INTERRUPTED = 130  # 128 + SIGINT, as shells say it
+INTERRUPTED = 130  # 128 + SIGINT, as in shells
 PIPE_CLOSED = 141  # 128 + SIGPIPE
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
 
@@ -42,7 +42,7 @@ EPILOG = (
 
 @dataclass(frozen=True, slots=True)
 class Listed:
-    """A command: its name, its line and its panel in the help."""
+    """A command with its name, its summary and its panel in the help."""
 
     name: str
     summary: str
@@ -50,7 +50,7 @@ class Listed:
 
     @property
     def module(self) -> str:
-        """The file it is in; one that Python has a word for has an underscore behind it."""
+        """Module of the command; a name that is a Python keyword gets an underscore at its end."""
         name = self.name.replace("-", "_")
         return f"swath.daemon.cli.{name}_" if keyword.iskeyword(name) else f"swath.daemon.cli.{name}"
 
@@ -97,20 +97,20 @@ def _callback(
         ),
     ] = False,
 ) -> None:
-    """Options of `swath` itself."""
+    """Take the options of `swath` itself."""
 
 
 @functools.cache
 def make_app(name: str | None) -> typer.Typer:
-    """Return the application, its commands imported: the one of this name, or all; what is heavy they import as they
-    run.
+    """Make the application with the command of this name, or all; each command imports its heavy modules
+    when it runs.
     """
     made = typer.Typer(name="swath", help=HELP, epilog=EPILOG, add_completion=False, rich_markup_mode="markdown")
     made.callback(help=HELP, epilog=EPILOG)(_callback)
     for listed in COMMANDS:
         if name in (None, listed.name) and importlib.util.find_spec(listed.module) is not None:
             module = importlib.import_module(listed.module)
-            if hasattr(module, "app"):  # commands of its own
+            if hasattr(module, "app"):  # it has subcommands
                 made.add_typer(module.app, name=listed.name, short_help=listed.summary, rich_help_panel=listed.panel)
             else:
                 made.command(listed.name, short_help=listed.summary, rich_help_panel=listed.panel)(module.command)
@@ -124,7 +124,7 @@ def main() -> None:
 
 
 def run_app(arguments: list[str]) -> int:
-    """Run a command; every way it can end becomes an exit code and at most a line an error."""
+    """Run a command; every outcome becomes an exit code and at most one line for each error."""
     if not arguments:
         make_app(None)(args=["--help"], prog_name="swath", standalone_mode=False)
         return int(ExitCode.USAGE)
@@ -140,22 +140,26 @@ def run_app(arguments: list[str]) -> int:
     except BrokenPipeError:
         _drop_output()
         return PIPE_CLOSED
-    except SystemExit as leaving:  # how Rich ends on a closed pipe
+    except SystemExit as leaving:  # Rich ends this way on a closed pipe
         if isinstance(leaving.__context__, BrokenPipeError):
             return PIPE_CLOSED
         raise
-    except Exception as error:  # the last resort: everything a command did not foresee
+    except Exception as error:  # the last resort, for errors that a command does not handle
         return _end_unforeseen(error)
     return int(result) if isinstance(result, int) else int(ExitCode.OK)
 
 
 def _drop_output() -> None:
-    """Have what is still buffered go nowhere: the interpreter would complain of it as it ends."""
+    """Redirect output that is still buffered to /dev/null; otherwise the interpreter would report an error
+    at its end.
+    """
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _end_unforeseen(error: Exception) -> int:
-    """Return a usage error of the argument parser, an abort, an I/O error, or a defect of ours."""
+    """Report a usage error of the argument parser, an abort, an I/O error or a defect of swath; return the
+    exit code.
+    """
     format_message = getattr(error, "format_message", None)  # its class moved between versions of typer
     if callable(format_message):
         message = " ".join(str(format_message()).split())
@@ -178,7 +182,7 @@ def _end_unforeseen(error: Exception) -> int:
 
 
 def _write_traceback(error: Exception) -> Path | None:
-    """Keep the details where a user may find them: the service's state directory, else the temporary one."""
+    """Write the details to the service's state directory, or else to the temporary one, and return the file's path."""
     directory = os.environ.get("STATE_DIRECTORY", "").split(":")[0] or tempfile.gettempdir()
     stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
     try:

@@ -1,4 +1,4 @@
-"""``swath mark``: a note into the log that is being recorded."""
+"""The command ``swath mark``: writes a note into the log that is being recorded."""
 
 from __future__ import annotations
 

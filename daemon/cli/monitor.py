@@ -1,4 +1,4 @@
-"""``swath monitor``: a running recorder on the terminal."""
+"""The command ``swath monitor``: shows a running recorder on the terminal."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from swath.daemon.monitor.display import Monitor
 
 EVENTS_SHOWN = 8
-FIRST_STATUS_S = 3.0  # a recorder that has just begun tells its first status after a second
+FIRST_STATUS_S = 3.0  # a recorder writes its first status one second after its start
 STATE_STYLE = {"receiving": "green", "silent": "red", "stuck": "red", "absent": "red", "opening": "yellow"}
 EXIT = {"recording": ExitCode.OK, "degraded": ExitCode.PROBLEM, "not recording": 2}
 
@@ -78,7 +78,7 @@ def _once(monitor: Monitor, as_json: bool) -> str:
 
 
 def page(found: dict[str, Any]) -> Group:
-    """Return what stands on the terminal."""
+    """Return the page for the terminal."""
     from rich.console import Group, RenderableType
     from rich.table import Table
     from rich.text import Text
@@ -118,7 +118,7 @@ def _row(source: str, values: dict[str, Any]) -> tuple[Any, ...]:
 
 
 def time_text(values: dict[str, Any]) -> str:
-    """``LOCKED ±0.3 µs``; nothing for a source without a clock."""
+    """Format the time status, as in ``LOCKED ±0.3 µs``; return an empty text for a source without a clock."""
     state, sigma_ns = values.get("time_state"), values.get("time_sigma_ns")
     if state is None:
         return ""

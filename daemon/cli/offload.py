@@ -1,4 +1,4 @@
-"""``swath offload``: logs off the aircraft."""
+"""The command ``swath offload``: copies logs off the aircraft."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def _print(report: OffloadReport, verify: bool) -> None:
 
 
 def _sizes(paths: Sequence[Path]) -> dict[Path, int]:
-    """Return bytes of the files that are still there."""
+    """Return the sizes in bytes of the files that still exist."""
     sizes: dict[Path, int] = {}
     for path in paths:
         with contextlib.suppress(FileNotFoundError):

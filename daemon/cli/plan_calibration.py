@@ -1,4 +1,4 @@
-"""``swath plan-calibration``: before take-off, what a planned flight would determine of the calibration."""
+"""The command ``swath plan-calibration``: predicts before take-off what a flight would determine of the calibration."""
 
 from __future__ import annotations
 

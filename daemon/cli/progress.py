@@ -1,4 +1,4 @@
-"""A bar on stderr for work that is counted in bytes, where that is a terminal."""
+"""Shows a progress bar on stderr, if that is a terminal, for work that is counted in bytes."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from rich.progress import Progress
 
-Tell = Callable[[str, int, int], None]  # what is done, how much, of how much
+Tell = Callable[[str, int, int], None]  # description, bytes done, bytes in total
 
 
 def transfer_bar() -> Progress:
-    """Return what is done, how far, how fast, and the time remaining; gone when it is over."""
+    """Return a bar with description, progress, speed and remaining time; it disappears when it ends."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
 
@@ -29,7 +29,7 @@ def transfer_bar() -> Progress:
 
 @contextmanager
 def progress_bar() -> Iterator[Tell]:
-    """A bar on stderr while the block runs, where that is a terminal; takes what it shall show."""
+    """Show a bar on stderr, if that is a terminal, during the block; give the function that updates it."""
     with transfer_bar() as bar:
         task = bar.add_task("reading", total=None)
 

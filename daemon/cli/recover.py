@@ -1,4 +1,4 @@
-"""``swath recover``: repair logs."""
+"""The command ``swath recover``: repairs logs."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def command(
 
 
 def _files(paths: list[Path], output: Path | None) -> list[Path]:
-    """Return the files named, and those of directories that may need it."""
+    """Return the named files, and those of the named directories that may need recovery."""
     from swath.daemon.log.claim import is_being_written
     from swath.daemon.log.reader import RECOVERED
 

@@ -1,4 +1,4 @@
-"""``swath replay``: put a log back on wires."""
+"""The command ``swath replay``: sends the bytes of a log over wires again."""
 
 from __future__ import annotations
 

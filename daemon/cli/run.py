@@ -1,4 +1,4 @@
-"""``swath run``: record."""
+"""The command ``swath run``: records."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`swath setup`: the messages the devices need before a survey, shown or sent."""
+"""The command `swath setup`: shows or sends the messages that the devices need before a survey."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from swath.daemon.devices.setup import DeviceSetup, Step, WireSetup
 
-MAX_BAUD = 20_000_000  # as in swath.drivers.transports.spec, which loads NumPy: too much for a help
+MAX_BAUD = 20_000_000  # as in swath.drivers.transports.spec, whose import of NumPy would slow the help
 
 
 def command(

@@ -1,4 +1,4 @@
-"""``swath sim``: the virtual aircraft."""
+"""The command ``swath sim``: flies the virtual aircraft."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ if TYPE_CHECKING:
     from swath.daemon.simulate.into_log import SimReport
     from swath.daemon.simulate.plans import FlightOptions
 
-PRESETS = "small, calibration, corridor, block, bench"  # swath.sim.plan.plan's
+PRESETS = "small, calibration, corridor, block, bench"  # as in swath.sim.plan.plan
 CONFIG_NAME, TRUTH_NAME, LOGS_NAME = "swath.toml", "truth.npz", "logs"
-SETTLE_S = 1.0  # from the last reader at a port to the first unit: nobody can see whether UDP and CAN are read
-LATE_S = 0.5  # a time message that comes later than this after its edge may be taken for the next one's
+SETTLE_S = 1.0  # from the last reader at a port to the first unit; readers of UDP and CAN cannot be detected
+LATE_S = 0.5  # a time message later than this after its edge may be taken as the next edge's
 INTERRUPTED = 130  # 128 + SIGINT
 
 PlanArgument = Annotated[str, typer.Argument(metavar="PLAN", help=f"A plan's file, or a preset: {PRESETS}.")]
@@ -77,7 +77,7 @@ def fly(
 
     from swath.daemon.simulate.plans import FlightOptions
 
-    logging.getLogger("swath").addHandler(logging.NullHandler())  # events of the log are in the log
+    logging.getLogger("swath").addHandler(logging.NullHandler())  # events are written to the log, not to stderr
     console = Console(stderr=True, markup=False, highlight=False, soft_wrap=True)
     wish = FlightOptions(plan, seed, seconds)
     if wire:
@@ -167,13 +167,13 @@ def _fly_into_log(console: Console, wish: FlightOptions, output: Path, *, with_t
 def _make_log(
     console: Console, wish: FlightOptions, folder: FlightFolder, *, with_truth: bool
 ) -> tuple[SimReport, list[str]]:
-    """Return everything of a flight, in the folder's place out of sight."""
+    """Make all files of a flight in the hidden folder; return the report and the names of the files beside the log."""
     from swath.daemon.config import load_config
     from swath.daemon.simulate.into_log import fly_into_log, sim_session_info
     from swath.daemon.simulate.plans import configuration, make_flight
 
     plan = wish.load()
-    folder.refuse_taken([CONFIG_NAME])  # before anything that takes its time
+    folder.refuse_taken([CONFIG_NAME])  # before anything that takes long
     with console.status("getting ready"):
         flight, files = make_flight(wish, folder.work / TRUTH_NAME if with_truth else None)
     files[CONFIG_NAME] = configuration(plan, None, ".")
@@ -267,7 +267,7 @@ def _fly_on_wires(
 
 
 def _make_wires(console: Console, plan: Any, facts: FlightFacts, folder: Path | None) -> Path:
-    """Return a folder with ports, FIFOs and the configuration that records from them."""
+    """Make a folder with ports, FIFOs and the configuration that records from them; return the configuration's path."""
     from swath.daemon.simulate.on_wires import own_wires
     from swath.daemon.simulate.plans import configuration
 
@@ -330,6 +330,6 @@ def _tell_report(
             continue
         refused = f", {report.refused[source]:,} refused by a reader" if report.refused[source] else ""
         console.print(f"{source}: {report.units[source]:,} units, {report.bytes[source]:,} bytes{refused}")
-    slow = report.latest_s > LATE_S and not report.refused  # else it may have waited for a reader
+    slow = report.latest_s > LATE_S and not report.refused  # otherwise it may have waited for a reader
     remark = "; this computer is too slow for this flight in real time" if slow else ""
     console.print(f"the latest unit left {report.latest_s:.3f} s after its time{remark}")

@@ -1,4 +1,4 @@
-"""``swath split``: a new part of the log that is being recorded."""
+"""The command ``swath split``: begins a new part of the log that is being recorded."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``swath strips``: how far strips are from each other; and their trajectory corrected, the calibration held."""
+"""The command ``swath strips``: compares strips, or corrects their trajectory with the calibration held."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``swath trajectory``: from a log's IMU and GNSS to where the aircraft was."""
+"""The command ``swath trajectory``: computes the path of the aircraft from a log's IMU and GNSS."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def command(
 
 
 def _unusable(session: dict[str, Any]) -> list[str]:
-    """Return what is said of legs that are not to be used."""
+    """Return the verdicts of the legs that are not to be used."""
     return [
         one_line(leg["verdict"]["sentence"]) for leg in session.get("legs", []) if leg["verdict"]["level"] == "unusable"
     ]
@@ -133,7 +133,7 @@ def _print(record: dict[str, Any], files: list[Path]) -> None:
 
 
 def _print_verdict(verdict: dict[str, Any]) -> None:
-    """Print a verdict's sentence, and each reason beyond the one that it names, with what to change."""
+    """Print a verdict's sentence, and each reason after the first, which the sentence names, with its remedy."""
     print(one_line(verdict["sentence"]))
     for reason in verdict["reasons"][1:]:
         print(one_line(f"also: {reason['what']}" + (f": {reason['change']}" if reason["change"] else "")))

@@ -1,4 +1,4 @@
-"""``swath validate``: is a calibration right, and does it still hold?"""
+"""The command ``swath validate``: checks whether a calibration is right and still holds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``swath view``: a quick look at products."""
+"""The command ``swath view``: gives a quick look at products."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def _ends(text: str | None) -> list[float] | None:
 def _make(
     paths: list[Path], output: Path | None, cell: float | None, ends: list[float] | None, *, as_json: bool
 ) -> bool:
-    """Read, draw, write, tell; gives whether a file could be read in part only."""
+    """Read, draw, write and report; return True if a file could be read only in part."""
     from rich.console import Console
 
     from swath.daemon.processing.quicklook.page import make_page

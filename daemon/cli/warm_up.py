@@ -1,4 +1,4 @@
-"""``swath warm-up``: compile before there is anything to compute."""
+"""The command ``swath warm-up``: compiles everything before there is anything to compute."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The configuration: one TOML file, validated whole before anything starts."""
+"""The configuration: one TOML file, validated completely before anything starts."""
 
 from swath.daemon.config.config import Config, DeviceEntry, DeviceTable
 from swath.daemon.config.load import load_config, parse_config

@@ -1,10 +1,9 @@
-"""What types cannot say: names that must exist, files, wires used twice, what the drivers need.
+"""Checks what types cannot express: references to names, files, wires used twice, the requirements of the drivers.
 
-Every check gives lines ``key: what is wrong; what would be right``; the file's name is put before by the caller.
+Every check yields lines ``key: the fault; a correct value``; the caller puts the file's name in front.
 
-Is a calibration file readable, and is it this scanner's? (CONVENTIONS, calibration file.)
-
-The full model is read by calib; the recorder only keeps a copy, and refuses to start with the wrong one.
+Calibration files are checked here for readability and for the right scanner (CONVENTIONS, calibration file); calib
+reads the full model. The recorder only keeps a copy, and refuses to start with the wrong file.
 """
 
 from __future__ import annotations
@@ -41,12 +40,12 @@ NEEDED_PARAMETERS = (
 )
 
 WILDCARD = "0.0.0.0"
-ROTATION_TOLERANCE = 1e-6  # of a matrix typed with 7 digits; 0.2 arc seconds
-MIN_BASELINE_M = 0.1  # a shorter one tells no heading
+ROTATION_TOLERANCE = 1e-6  # for a matrix typed with 7 digits; 0.2 arc seconds
+MIN_BASELINE_M = 0.1  # a shorter baseline gives no useful heading
 
 
 def check_devices(config: Config) -> list[str]:
-    """Return all findings of a configuration whose types are right."""
+    """Check a configuration whose types are right and return all findings."""
     lines: list[str] = []
     lines += _check_directory(config)
     lines += _check_pps(config)
@@ -73,7 +72,9 @@ def _check_pps(config: Config) -> Iterator[str]:
 
 
 def _check_files(config: Config) -> Iterator[str]:
-    """Yield files named must be there; two DBC files of one name would be one attachment."""
+    """Check that all named files exist, and that no two different DBC files have the same name: the log keeps them by
+    name.
+    """
     dbc_of: dict[str, tuple[str, Path]] = {}
     for kind, name, table in config.device_tables():
         for file_key, path in config.files_of(table).items():
@@ -143,11 +144,11 @@ def _check_device(config: Config, kind: DeviceKind, name: str, table: DeviceTabl
 
 
 def _check_clock(section: str, table: ScannerConfig, driver: Driver) -> Iterator[str]:
-    """Yield a line where a scanner's stamps are said to be what those of its protocol cannot be."""
+    """Check that a scanner's ``clock`` is one that the stamps of its protocol can have."""
     can = ["auto"]
     if driver.past_hour:
         can += ["utc-hour", "free"]
-    elif not driver.line_scanner:  # which latches its pulse: nothing is to be said
+    elif not driver.line_scanner:  # a line scanner latches the pulse, so ``clock`` has nothing to choose
         can += ["ptp-tai", "ptp-utc", "free"]
     if table.clock not in can:
         wanted = " or ".join(f'"{one}"' for one in can)
@@ -175,7 +176,7 @@ def _check_needs(section: str, table: DeviceTable, driver: Driver) -> Iterator[s
 
 
 def _described(model: type[BaseModel], key: str) -> str | None:
-    """Return what is said of a key, ``geometry.file`` of an inner table's."""
+    """Return the description of a key; ``geometry.file`` refers to a key of an inner table."""
     first, _, rest = key.partition(".")
     field = model.model_fields[first]
     if not rest:
@@ -210,7 +211,7 @@ def _check_transport(config: Config, section: str, table: DeviceTable, driver: D
 
 
 def check_antennas(section: str, table: GnssConfig) -> Iterator[str]:
-    """Yield what is wrong with the places of a receiver's two antennas."""
+    """Check the places of a receiver's two antennas and yield what is wrong."""
     if table.secondary_lever_arm_m is None:
         return
     length_m = float(np.linalg.norm(np.subtract(table.secondary_lever_arm_m, table.lever_arm_m)))
@@ -232,7 +233,7 @@ def _check_rotations(section: str, table: DeviceTable) -> Iterator[str]:
 
 
 def rotation_problem(rows: list[list[float]]) -> str | None:
-    """Return why three rows are not a proper rotation matrix; None when they are."""
+    """Return why three rows are not a proper rotation matrix; None if they are one."""
     matrix = np.array(rows, dtype=np.float64)
     lengths = np.linalg.norm(matrix, axis=1)
     for row in range(3):
@@ -246,7 +247,7 @@ def rotation_problem(rows: list[list[float]]) -> str | None:
 
 
 def _check_gimbal(config: Config, name: str, table: ScannerConfig) -> Iterator[str]:
-    """Yield who tells a stage's angles must be there; whether it can, is seen when they are used."""
+    """Check that the source of each stage's angles exists; whether it delivers angles is found when they are used."""
     sources = [f"gnss/{one}" for one in config.gnss] + [f"imu/{one}" for one in config.imu]
     for number, stage in enumerate(table.gimbal.stages if table.gimbal is not None else []):
         if stage.source is not None and stage.source not in sources:
@@ -264,7 +265,7 @@ def _check_calibration(config: Config, name: str, table: ScannerConfig) -> Itera
 
 
 def _check_wires(config: Config) -> Iterator[str]:
-    """Yield two sources on one port or device: one would take the other's bytes."""
+    """Check that no two sources use one port or device, where each would take bytes of the other."""
     wires: list[tuple[str, TransportSpec]] = list(_wires(config))
     for index, (key, spec) in enumerate(wires):
         for other_key, other in wires[:index]:
@@ -290,8 +291,9 @@ def _wires(config: Config) -> Iterator[tuple[str, TransportSpec]]:
 def same_wire(one: TransportSpec, other: TransportSpec) -> bool:
     """Return whether two transports would open the same port or device.
 
-    UDP ports are one where the addresses (or groups) are equal or either is the wildcard; devices where their real
-    paths are, also a serial CAN adapter's; a CAN bus where interface and channel are.
+    UDP ports are the same if the port numbers are equal and the addresses (or groups) are equal or either is the
+    wildcard; devices, including a serial CAN adapter's, if their real paths are equal; a CAN bus if interface and
+    channel are equal.
     """
     if one.kind == "udp" and other.kind == "udp":
         addresses = {_udp_address(one), _udp_address(other)}
@@ -299,7 +301,7 @@ def same_wire(one: TransportSpec, other: TransportSpec) -> bool:
     path, other_path = _device_path(one), _device_path(other)
     if path is not None or other_path is not None:
         return path == other_path
-    port, other_port = one.options.get("port"), other.options.get("port")  # of a bus over UDP
+    port, other_port = one.options.get("port"), other.options.get("port")  # set for a CAN bus over UDP
     return one.kind == other.kind and (one.address, port) == (other.address, other_port)
 
 
@@ -308,7 +310,9 @@ def _udp_address(spec: TransportSpec) -> str:
 
 
 def _device_path(spec: TransportSpec) -> str | None:
-    """Return the real path of a device file, behind symbolic links; None where the transport is none."""
+    """Return the real path of a device file, with symbolic links resolved; None if the transport is not a
+    device file.
+    """
     path = spec.channel if spec.kind == "can" else spec.address
     is_path = spec.kind == "serial" or (spec.kind == "can" and path.startswith("/"))
     return os.path.realpath(path) if is_path else None
@@ -324,7 +328,7 @@ def _wire_name(spec: TransportSpec) -> str:
 
 
 def check_calibration(path: Path, scanner: str, table: ScannerConfig) -> Iterator[str]:
-    """Yield findings of a calibration file for the scanner of that name: what is wrong, what would be right."""
+    """Check a calibration file for the scanner of this name; yield lines with the fault and a correct value."""
     try:
         document = toml_tables(decoded(path.read_bytes()))
     except UnicodeDecodeError as error:

@@ -1,4 +1,4 @@
-"""The loaded configuration: its tables, the file they came from, its devices and what of it goes into a log."""
+"""The loaded configuration: its tables, their file, its devices and the parts of it that go into a log."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from swath.drivers.transports.spec import TransportSpec, parse_transport
 
 DeviceTable = GnssConfig | ImuConfig | ScannerConfig | CorrectionsConfig
 FileKey = Literal["dbc", "calibration", "geometry"]
-PARSER_FILES: tuple[FileKey, ...] = ("dbc", "geometry")  # what a parser is given; a calibration is not its business
+PARSER_FILES: tuple[FileKey, ...] = ("dbc", "geometry")  # files that a parser needs; it does not use the calibration
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,11 +36,11 @@ class DeviceEntry:
 
     Attributes:
         kind, name: of its section; ``source`` is ``kind/name``.
-        transport: where its bytes come from; kind ``gnss`` where they lie inside another stream.
+        transport: source of its bytes; kind ``gnss`` if they are part of another stream.
         auxiliary: the same head's second port.
         protocol: the driver's name.
         pps: name of its PPS source.
-        settings: what its parser is made with.
+        settings: the settings for its parser.
         files: the files it names, by key.
     """
 
@@ -55,7 +55,7 @@ class DeviceEntry:
 
     @property
     def source(self) -> str:
-        """``kind/name``, the source's name everywhere."""
+        """``kind/name``, the name of the source in all parts of swath."""
         return f"{self.kind}/{self.name}"
 
 
@@ -69,67 +69,67 @@ class Config:
 
     @property
     def session(self) -> SessionConfig:
-        """``[session]``, its directory made absolute."""
+        """Table ``[session]``, with an absolute directory."""
         session = self.tables.session
         return session.model_copy(update={"directory": str(self.resolve(session.directory))})
 
     @property
     def pps(self) -> dict[str, PpsConfig]:
-        """``[pps.<name>]``."""
+        """Tables ``[pps.<name>]``, by name."""
         return self.tables.pps
 
     @property
     def gnss(self) -> dict[str, GnssConfig]:
-        """``[gnss.<name>]``."""
+        """Tables ``[gnss.<name>]``, by name."""
         return self.tables.gnss
 
     @property
     def imu(self) -> dict[str, ImuConfig]:
-        """``[imu.<name>]``."""
+        """Tables ``[imu.<name>]``, by name."""
         return self.tables.imu
 
     @property
     def scanner(self) -> dict[str, ScannerConfig]:
-        """``[scanner.<name>]``."""
+        """Tables ``[scanner.<name>]``, by name."""
         return self.tables.scanner
 
     @property
     def corrections(self) -> dict[str, CorrectionsConfig]:
-        """``[corrections.<name>]``."""
+        """Tables ``[corrections.<name>]``, by name."""
         return self.tables.corrections
 
     @property
     def attitude(self) -> AttitudeConfig:
-        """``[attitude]``."""
+        """Table ``[attitude]`` of the file."""
         return self.tables.attitude
 
     @property
     def atmosphere(self) -> AtmosphereConfig:
-        """``[atmosphere]``."""
+        """Table ``[atmosphere]`` of the file."""
         return self.tables.atmosphere
 
     @property
     def mta(self) -> MtaConfig:
-        """``[mta]``."""
+        """Table ``[mta]`` of the file."""
         return self.tables.mta
 
     @property
     def profile(self) -> ProfileConfig:
-        """``[profile]``."""
+        """Table ``[profile]`` of the file."""
         return self.tables.profile
 
     @property
     def calibration(self) -> CalibrationConfig:
-        """``[calibration]``."""
+        """Table ``[calibration]`` of the file."""
         return self.tables.calibration
 
     @property
     def output(self) -> OutputConfig:
-        """``[output]``."""
+        """Table ``[output]`` of the file."""
         return self.tables.output
 
     def resolve(self, name: str) -> Path:
-        """Return a path of the file: relative ones are relative to the file."""
+        """Return an absolute path for a name in the file; relative names are relative to the file's folder."""
         return (self.path.parent / name).absolute()
 
     def device_tables(self) -> Iterator[tuple[DeviceKind, str, DeviceTable]]:
@@ -144,11 +144,11 @@ class Config:
             yield "corrections", name, corrections
 
     def files_of(self, table: DeviceTable) -> dict[FileKey, Path]:
-        """Return the files a device's table names, by key."""
+        """Return the files that a device's table names, by key."""
         return {key: self.resolve(name) for key, name in _names_of(table).items()}
 
     def settings_of(self, kind: DeviceKind, name: str, table: DeviceTable) -> DeviceSettings:
-        """Return what the parser of a device is made with; reads its files.
+        """Return the settings for the parser of a device; this reads the device's files.
 
         Raises:
             OSError: a file cannot be read.
@@ -173,7 +173,7 @@ class Config:
             )
 
     def attachments(self) -> list[tuple[str, str, bytes]]:
-        """Return what goes into every log: (name, media type, bytes); names as in the log format's page."""
+        """Return the attachments of every log as (name, media type, bytes); docs/log-format.md lists the names."""
         found = [("config.toml", "application/toml", self.text.encode())]
         for _, name, table in self.device_tables():
             for key, path in self.files_of(table).items():
@@ -183,7 +183,7 @@ class Config:
         return found
 
     def attachment_names(self) -> list[tuple[str, str]]:
-        """Name in a log, and as it stands in the configuration, of every file that the devices' tables name."""
+        """Return, for every file that the devices' tables name, its name in a log and its name in the configuration."""
         return [
             (attachment_name(key, name, self.resolve(named)), named)
             for _, name, table in self.device_tables()
@@ -202,12 +202,12 @@ def _names_of(table: DeviceTable) -> dict[FileKey, str]:
 
 
 def plain_table(table: DeviceTable) -> dict[str, Any]:
-    """Return a device's table as plain values, defaults filled in."""
+    """Return a device's table as plain values, with defaults filled in."""
     return table.model_dump()
 
 
 def attachment_name(key: FileKey, device: str, path: Path) -> str:
-    """Return what a device's file is called in a log."""
+    """Return the name of a device's file in a log."""
     if key == "dbc":
         return f"dbc/{path.name}"
     suffix = path.suffix if key == "geometry" else ".toml"

@@ -1,4 +1,4 @@
-"""Reads the file and says in one line each what is wrong with it: file, key, what was got, what would be right."""
+"""Reads the configuration file and reports each fault in one line: file, key, the value found, a correct value."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from swath.daemon.errors import ConfigError, ExitCode, UserError
 from swath.georef.text_encoding import decoded
 from swath.georef.toml_tables import TomlError, toml_tables
 
-MAX_CONFIG_BYTES = 4 * 1024 * 1024  # no sane configuration is larger; a log given by mistake is not read whole
+MAX_CONFIG_BYTES = 4 * 1024 * 1024  # far above any real configuration; a log given by mistake is not read whole
 _SHOWN_CHARACTERS = 60
 
 _TYPE_WANTED = {
@@ -38,10 +38,10 @@ _BOUND_SIGNS = (("ge", ">="), ("gt", ">"), ("le", "<="), ("lt", "<"))
 
 
 def load_config(path: str | Path) -> Config:
-    """Read and validate a configuration file and all files it names.
+    """Read and validate a configuration file and all files that it names.
 
     Raises:
-        ConfigError: all that is wrong with it, one line each.
+        ConfigError: the configuration is wrong; it has one line for each fault.
         UserError: the file cannot be read.
     """
     file = Path(path)
@@ -65,7 +65,7 @@ def parse_config(text: str, path: Path) -> Config:
     """Validate the text of a configuration whose files lie beside ``path``.
 
     Raises:
-        ConfigError: all that is wrong with it, one line each.
+        ConfigError: the configuration is wrong; it has one line for each fault.
     """
     try:
         table = toml_tables(text)
@@ -75,10 +75,10 @@ def parse_config(text: str, path: Path) -> Config:
 
 
 def validate(table: Mapping[str, Any], path: Path, text: str) -> Config:
-    """Validate a parsed configuration; ``text`` is what it was parsed from.
+    """Validate a parsed configuration; ``text`` is the text that it was parsed from.
 
     Raises:
-        ConfigError: all that is wrong with it, one line each.
+        ConfigError: the configuration is wrong; it has one line for each fault.
     """
     try:
         tables = Tables.model_validate(table)
@@ -93,7 +93,7 @@ def validate(table: Mapping[str, Any], path: Path, text: str) -> Config:
 
 
 def describe(details: ErrorDetails, tables: type[BaseModel] = Tables) -> str:
-    """Return one line of one finding of the models: key path, what was got, what would be right.
+    """Describe one finding of the models in one line: key path, the value found, a correct value.
 
     Args:
         details: the finding.
@@ -115,7 +115,7 @@ def describe(details: ErrorDetails, tables: type[BaseModel] = Tables) -> str:
 
 
 def shown(value: object) -> str:
-    """Return a value as it stands in the file, shortened."""
+    """Format a value as it appears in the file, shortened."""
     if isinstance(value, Mapping):
         return "a table"
     text = json.dumps(value, ensure_ascii=False, default=str)
@@ -138,7 +138,7 @@ def _wanted(kind: str, context: Mapping[str, Any], field: FieldInfo | None) -> s
     if kind in ("too_short", "too_long") and kind == "too_short" and context.get("min_length") == 1:
         return "at least one"
     if kind in ("too_short", "too_long"):
-        # lists of numbers and of names have one length, those of tables a greatest
+        # lists of numbers and of names have a fixed length, lists of tables a maximum
         at_most = "at most " if kind == "too_long" and field is not None and _model_in(field.annotation) else ""
         return f"{at_most}{context.get('min_length', context.get('max_length'))} of them"
     if kind == "string_too_long":
@@ -174,7 +174,7 @@ def _wanted_of_field(field: FieldInfo | None) -> str:
 
 
 def _bounds(field: FieldInfo | None) -> str:
-    """Return ``>= 1 and <= 60``, from the field's own metadata."""
+    """Format the bounds of a field, from its own metadata, as ``>= 1 and <= 60``."""
     if field is None:
         return ""
     parts = []
@@ -187,7 +187,7 @@ def _bounds(field: FieldInfo | None) -> str:
 
 
 def _model_in(annotation: object) -> type[BaseModel] | None:
-    """Return the model in ``M``, ``M | None``, ``dict[str, M]``, ``list[M]``."""
+    """Return the model ``M`` in the annotations ``M``, ``M | None``, ``dict[str, M]`` or ``list[M]``."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
     if get_origin(annotation) in (dict, list, Union, UnionType, Annotated):

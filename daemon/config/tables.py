@@ -1,7 +1,7 @@
-"""Every key of the configuration: its type, unit (in the name), bounds and default.
+"""Defines every key of the configuration: its type, unit (in the name), bounds and default.
 
-Strict: a key not named here is an error, text is never taken for a number. The descriptions are what
-docs/configuration.md prints.
+The models are strict: an unknown key is an error, and text is never converted to a number. docs/configuration.md prints
+the descriptions.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ def _identity() -> list[list[float]]:
 
 
 class Section(BaseModel):
-    """A table of the file."""
+    """A table of the configuration file."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
 
 class SessionConfig(Section):
-    """``[session]``: what is recorded where."""
+    """``[session]``: name, directory and writing of the logs."""
 
     name: Name = Field(description="begins the name of every log")
     directory: Text = Field("/var/lib/swath", description="where logs go; relative to this file")
@@ -56,7 +56,7 @@ class SessionConfig(Section):
 
 
 class PpsConfig(Section):
-    """``[pps.<name>]``: a source of one edge a second."""
+    """``[pps.<name>]``: a source of one edge per second."""
 
     source: Text = Field(description="/dev/ppsN, serial-dcd:/dev/ttyS0 or fixed:<path>")
     edge: Literal["assert", "clear"] = Field("assert", description="which edge is the second")
@@ -66,7 +66,7 @@ class PpsConfig(Section):
 
 
 class GnssSetupConfig(Section):
-    """``[gnss.<name>.setup]``: what `swath setup` asks of a receiver."""
+    """``[gnss.<name>.setup]``: the settings that `swath setup` sends to a receiver."""
 
     port: Text | None = Field(
         None,
@@ -78,7 +78,7 @@ class GnssSetupConfig(Section):
 
 
 class GnssConfig(Section):
-    """``[gnss.<name>]``: a receiver."""
+    """``[gnss.<name>]``: a GNSS receiver."""
 
     transport: Text = Field(description="serial:… or udp:…")
     protocol: Text = Field(description="nmea, ubx, novatel, … (`swath devices` lists them)")
@@ -115,7 +115,7 @@ class GnssConfig(Section):
 
 
 class SignalsConfig(Section):
-    """``[imu.<name>.signals]``: which signal of the DBC is what, as ``MESSAGE.signal``."""
+    """``[imu.<name>.signals]``: the signals of the DBC for each quantity, as ``MESSAGE.signal``."""
 
     specific_force: SignalTriple | None = Field(None, description="three signals, axes of the IMU")
     angular_rate: SignalTriple | None = Field(None, description="three signals, axes of the IMU")
@@ -127,7 +127,7 @@ class SignalsConfig(Section):
 
 
 class NoiseConfig(Section):
-    """``[imu.<name>.noise]``: for the navigation filter; single keys override the grade."""
+    """``[imu.<name>.noise]``: noise model of the navigation filter; single keys override the grade."""
 
     grade: Literal["navigation", "tactical", "mems", "consumer"] = Field(
         "tactical", description="gives what is absent below"
@@ -296,7 +296,7 @@ class ScannerConfig(Section):
 
 
 class CorrectionsConfig(Section):
-    """``[corrections.<name>]``: corrections of a base station, logged, and handed on to a receiver."""
+    """``[corrections.<name>]``: corrections of a base station, which are logged and can be passed on to a receiver."""
 
     transport: Text = Field(description="serial:… or ntrip:<host>:<port>/<mountpoint>?…")
     protocol: Text = Field("rtcm3", description="rtcm3")
@@ -304,7 +304,7 @@ class CorrectionsConfig(Section):
 
 
 class AttitudeConfig(Section):
-    """``[attitude]``: what vertical the attitude refers to."""
+    """``[attitude]``: the vertical that the attitude refers to."""
 
     vertical: Literal["ellipsoid", "plumb"] = Field("ellipsoid", description="plumb needs the two keys below")
     xi_arcsec: float | None = Field(
@@ -339,7 +339,7 @@ class AtmosphereConfig(Section):
 
 
 class MtaConfig(Section):
-    """``[mta]``: pulses in air."""
+    """``[mta]``: several pulses in the air at the same time."""
 
     terrain: str = Field("", description="coarse DEM, GeoTIFF of ellipsoidal heights; empty: continuity")
     height_above_ground_m: float | None = Field(
@@ -351,7 +351,7 @@ class MtaConfig(Section):
 
 
 class ProfileConfig(Section):
-    """``[profile]``: names for the records."""
+    """``[profile]``: names of aircraft and installation for the records."""
 
     aircraft: str = Field("", description="the aircraft")
     installation: str = Field("", description="id of this mounting")
@@ -368,7 +368,7 @@ class OutputConfig(Section):
 
 
 class WantedConfig(Section):
-    """``[calibration.wanted]``: one sigma that a calibration has to reach."""
+    """``[calibration.wanted]``: the standard deviations that a calibration has to reach."""
 
     point_m: float | None = Field(None, gt=0.0, le=100.0, description="what it may leave in points, of three axes")
     omega_deg: float | None = Field(None, gt=0.0, le=10.0, description="boresight ω")
@@ -382,13 +382,13 @@ class WantedConfig(Section):
 
 
 class CalibrationConfig(Section):
-    """``[calibration]``: what `swath calibrate` judges by."""
+    """``[calibration]``: the criteria by which `swath calibrate` judges a calibration."""
 
     wanted: WantedConfig = Field(default_factory=WantedConfig, description="what it has to reach")
 
 
 class LiveConfig(Section):
-    """``[live]``: what `swath live` writes beside the log."""
+    """``[live]``: size and density of the files that `swath live` writes beside the log."""
 
     live_quota_mb: float = Field(
         4096.0, ge=1.0, le=10_000_000.0, description="of the disk for live.mcap, the one before it included"
@@ -398,7 +398,7 @@ class LiveConfig(Section):
 
 
 class Tables(Section):
-    """The whole file."""
+    """The whole configuration file."""
 
     session: SessionConfig
     pps: dict[Name, PpsConfig] = Field(default_factory=dict)

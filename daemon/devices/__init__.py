@@ -1,1 +1,1 @@
-"""Devices found, identified, checked and set up."""
+"""Identification, check and setup of the configured devices."""

@@ -1,6 +1,6 @@
-"""Opens everything a configuration names for some seconds and says of each what it answers and what is wrong.
+"""Opens everything that a configuration names for some seconds and reports the answer and the faults of each device.
 
-Nothing is written, nothing is sent. Every wire has its own thread, so all are heard at the same time.
+It writes and sends nothing. Every wire has its own thread, so all are heard at the same time.
 """
 
 from __future__ import annotations
@@ -35,26 +35,26 @@ from swath.georef.records import ChunkBatch, TimeMessage
 from swath.georef.timescales import ahead_s, distance_text
 
 SLICE_S = 0.1
-KEPT_BYTES = 1 << 20  # of each wire, to find out what it is if it is not what was configured
-DAMAGED_SHARE = 0.01  # of the messages: more is a wire or a setting, not chance
-CLOCK_RATE_FACTOR = 5.0  # a counter that runs faster or slower by this is read in the wrong unit
+KEPT_BYTES = 1 << 20  # of each wire, to identify a device that does not use the configured protocol
+DAMAGED_SHARE = 0.01  # of the messages; a larger share is a fault of wire or settings, not chance
+CLOCK_RATE_FACTOR = 5.0  # a counter faster or slower by this factor is read in the wrong unit
 EDGE_SPACING_TOLERANCE_S = 0.05  # of a user-space stamp on a busy computer
 
 
 @dataclass(slots=True)
 class Span:
-    """How long to listen: ``seconds``, or until ``stop`` is set."""
+    """The time to listen: ``seconds``, or until ``stop`` is set."""
 
     seconds: float
     stop: threading.Event = field(default_factory=threading.Event)
     _ends_s: float = field(default=math.inf, init=False)
 
     def is_over(self) -> bool:
-        """Return whether nobody listens any more."""
+        """Return True if listening has ended."""
         return self.stop.is_set() or time.monotonic() > self._ends_s
 
     def listen(self, session: Session[Any]) -> Iterable[list[Any]]:
-        """Return what a session hands over until the time is up."""
+        """Yield the blocks that a session receives until the time is up."""
         deadline_s = self._ends_s = time.monotonic() + self.seconds
         while not self.stop.is_set() and (left_s := deadline_s - time.monotonic()) > 0:
             if got := session.receive(min(SLICE_S, left_s)):
@@ -63,16 +63,16 @@ class Span:
 
 @dataclass(slots=True)
 class Report:
-    """What one source answered.
+    """The result of checking one source.
 
     Attributes:
         source: ``kind/name``; ``/aux`` behind it for a head's second port; ``log`` for the log directory.
         opens: the device could be opened.
-        bytes, units: what came in the time.
-        records: decoded records by type (rows, where they come in batches).
-        time: what it says of its time, for the eye.
-        problems: what is wrong, one line each.
-        notes: what is worth knowing and not wrong.
+        bytes, units: received in the time.
+        records: decoded records by type (rows, if they come in batches).
+        time: the device's own time, as text.
+        problems: faults, one line each.
+        notes: remarks that are not faults.
     """
 
     source: str
@@ -86,12 +86,12 @@ class Report:
     notes: list[str] = field(default_factory=list)
 
     def add(self, batch: ChunkBatch) -> None:
-        """Count units."""
+        """Count the units of a batch."""
         self.units += len(batch.units)
         self.bytes += int(batch.units.size)
 
     def plain(self) -> dict[str, Any]:
-        """As plain values, the form of ``--json``."""
+        """Return the report as plain values, the form of ``--json``."""
         return {
             "source": self.source,
             "protocol": self.protocol,
@@ -107,7 +107,7 @@ class Report:
 
 
 class Reading:
-    """One device's parser, what it made of the bytes, and what they were. Two ports of a head feed the same parser."""
+    """One device's parser, its results, and the first bytes. Two ports of a head feed the same parser."""
 
     def __init__(self, entry: DeviceEntry) -> None:
         self.entry = entry
@@ -129,7 +129,7 @@ class Reading:
                     self.kept.append(ChunkBatch(batch.source, batch.host_time_ns, batch.units.copy()))
 
     def finish(self) -> None:
-        """After the last byte: what it says, and what is wrong with it."""
+        """Complete the report after the last byte: the device's time, and its faults."""
         self.heard.add(self.parser.close())
         self.report.records = self.heard.counts
         if self.report.bytes:
@@ -139,7 +139,7 @@ class Reading:
 
 
 class Wire:
-    """One port, socket or bus, and who reads of it."""
+    """One port, socket or bus, and the readings that use its bytes."""
 
     def __init__(self, report: Report, spec: TransportSpec, readings: list[Reading], *, main: bool) -> None:
         self.report = report
@@ -148,7 +148,7 @@ class Wire:
         self._main = main
 
     def listen(self, span: Span) -> None:
-        """Feed the readings until the time is up; then say what is wrong with the wire."""
+        """Feed the readings until the time is up; then report the faults of the wire."""
         session = Session(lambda: open_transport(self._spec, span.is_over))
         for blocks in span.listen(session):
             for block in blocks:
@@ -175,7 +175,7 @@ class Wire:
 
 
 def check_everything(config: Config, seconds: float) -> list[Report]:
-    """Listen to all sources of a configuration at once for ``seconds``."""
+    """Listen to all sources of a configuration at once for ``seconds``, and return their reports."""
     span = Span(seconds)
     readings = {entry.source: Reading(entry) for entry in config.devices()}
     reports = [Report(f"pps/{name}", pps.source) for name, pps in config.pps.items()]
@@ -195,7 +195,7 @@ def check_everything(config: Config, seconds: float) -> list[Report]:
 
 
 def _wires(reading: Reading, readings: dict[str, Reading]) -> Iterable[Wire]:
-    """Return the wires of a device; devices inside its stream read along, and have none of their own."""
+    """Yield the wires of a device; devices inside its stream read along, and have no wires of their own."""
     entry = reading.entry
     if entry.transport.kind == "gnss":
         return
@@ -215,11 +215,11 @@ def _run(jobs: list[Callable[[], None]], span: Span) -> None:
             for future in [pool.submit(job) for job in jobs]:
                 future.result()
         finally:
-            span.stop.set()  # an interrupt does not wait for the rest of the time
+            span.stop.set()  # an interrupt ends listening at once
 
 
 def check_directory(directory: Path, reserve_mb: float) -> Report:
-    """Return whether logs can be written there, and how much room is left."""
+    """Check that logs can be written to a directory, and report the free space."""
     report = Report("log")
     existing, permitted = nearest_there(directory)
     if not permitted:
@@ -241,7 +241,7 @@ def check_directory(directory: Path, reserve_mb: float) -> Report:
 
 
 def check_pps(report: Report, edge: str, span: Span) -> None:
-    """Count the edges of the PPS source that the report's protocol names."""
+    """Count and check the edges of the PPS source that the report's protocol names."""
     session: Session[RawEdge] = Session(lambda: open_pps(parse_pps(report.protocol, edge=edge)))
     edges: list[RawEdge] = []
     for got in span.listen(session):
@@ -276,7 +276,7 @@ def _batch(source: str, block: UnitBlock) -> ChunkBatch:
 
 
 def _wire_problems(session: Session[Any], counters: TransportCounters, report: Report, seconds: float) -> Iterable[str]:
-    """Return what is wrong with the wire itself."""
+    """Yield the faults of the wire itself."""
     if not report.opens:
         yield session.last_error or "not opened in the time; listen longer"
         return
@@ -297,7 +297,11 @@ def _wire_problems(session: Session[Any], counters: TransportCounters, report: R
 
 
 def bitrate_problems(spec: TransportSpec, actual: int | None) -> list[str]:
-    """Return whether the interface runs at the configured bit rate; None: it has none (vcan) or cannot be asked."""
+    """Return a line if the interface runs at another bit rate than the configured one.
+
+    An ``actual`` rate of None means that the interface has none (vcan) or that the kernel did not answer; it is not a
+    fault.
+    """
     wanted = spec.options.get("bitrate")
     if wanted is None or actual is None or int(wanted) == actual:
         return []
@@ -306,14 +310,14 @@ def bitrate_problems(spec: TransportSpec, actual: int | None) -> list[str]:
 
 
 def _answer_problems(reading: Reading) -> list[str]:
-    """Return what is wrong with what came."""
+    """Return the faults of the received data."""
     entry, heard, counters = reading.entry, reading.heard, reading.parser.counters
     good = counters.messages.total()
     other = not_understood(entry, heard, good, reading.kept, refused=counters.bad_messages)
     if other is not None:
         return [other]
     found: list[str] = []
-    if not heard.counts and entry.kind != "corrections":  # those are not decoded, but for a station now and then
+    if not heard.counts and entry.kind != "corrections":  # of corrections only an occasional station message is decoded
         names = ", ".join(f"{name} {count}" for name, count in counters.messages.most_common(5))
         found.append(f"speaks {entry.protocol}, but sends nothing that is decoded ({names})")
     bad = counters.bad_checksums + counters.bad_messages
@@ -323,7 +327,7 @@ def _answer_problems(reading: Reading) -> list[str]:
 
 
 def lock_notes(entry: DeviceEntry, heard: Heard) -> list[str]:
-    """Say where a scanner is not locked to its PPS or nothing tells whether it is: whether its stamps can be used."""
+    """Report if a scanner is not locked to its PPS, or if its lock is unknown; its stamps may then be unusable."""
     if entry.kind != "scanner" or not heard.counts["DeviceClockSamples"]:
         return []
     if heard.sees_pps:
@@ -344,7 +348,7 @@ def lock_notes(entry: DeviceEntry, heard: Heard) -> list[str]:
 
 
 def far_notes(heard: Heard, discipline: ClockDiscipline) -> list[str]:
-    """Say that a device's time is hours or days from this computer's clock: either may be the wrong one."""
+    """Report if a device's time is hours or days from this computer's clock; either may be the wrong one."""
     message = heard.valid_time
     ahead = None if message is None else ahead_s(message.time, message.host_time_ns)
     if ahead is None:
@@ -354,8 +358,10 @@ def far_notes(heard: Heard, discipline: ClockDiscipline) -> list[str]:
 
 
 def _time_problems(entry: DeviceEntry, heard: Heard) -> list[str]:
-    """Return a GNSS must say a valid time, a counter must run like time, a device that says whether it sees its PPS
-    see it.
+    """Return the faults of a device's time.
+
+    A GNSS must give a valid time, a counter must run at the rate of time, and a device that reports its PPS must see
+    it.
     """
     if entry.kind == "gnss":
         if heard.time_messages == 0:

@@ -1,4 +1,4 @@
-"""What a device says of itself: counts of records, its time, and which protocol its bytes really are."""
+"""Identifies a device by its bytes: counts of records, its time, and the protocol that the bytes really follow."""
 
 from __future__ import annotations
 
@@ -12,20 +12,21 @@ from swath.drivers.driver import all_drivers, find_driver
 from swath.drivers.parser import DeviceSettings, DriverSettingsError
 from swath.georef.records import ChunkBatch, DeviceClockSamples, ImuSamples, Record, TimeMessage, TimeTag
 
-LEAST_MESSAGES = 2  # one frame may be chance
-LEAST_CLOCK_SPAN_NS = 500_000_000  # less says nothing of a counter's rate
+LEAST_MESSAGES = 2  # a single frame may be chance
+LEAST_CLOCK_SPAN_NS = 500_000_000  # too short a span gives no rate of a counter
 IDENTITY = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
 
 
 @dataclass(slots=True)
 class Heard:
-    """Records of a device, counted.
+    """Counts of a device's records, with the state of its time.
 
     Attributes:
-        counts: by type; rows, where they come in batches.
-        time_messages: how many said a time.
-        valid_time: the last one that the device vouches for.
-        sees_pps: whether the device says, last, that it has a PPS latched or is locked to it; None: it does not say.
+        counts: by type; rows, if they come in batches.
+        time_messages: number of messages with a time.
+        valid_time: the last one that the device marked as valid.
+        sees_pps: latest report of the device that it has latched a PPS or is locked to it; None if it does not report
+            this.
         imu_clock: host and device time of the first and of the last inertial sample since the counter last went back.
     """
 
@@ -36,7 +37,7 @@ class Heard:
     imu_clock: tuple[tuple[int, int], tuple[int, int]] | None = None
 
     def add(self, records: list[Record]) -> None:
-        """Count records."""
+        """Count records and keep the state of the device's time."""
         for record in records:
             rows = getattr(record, "rows", None)
             self.counts[type(record).__name__] += 1 if rows is None else len(rows)
@@ -50,7 +51,9 @@ class Heard:
 
     @property
     def imu_clock_rate(self) -> float | None:
-        """Seconds of the device's counter a second of the host's; None where it has none, or too little came."""
+        """Seconds of the device's counter for each second of the host; None without a counter, or with too
+        little data.
+        """
         if self.imu_clock is None:
             return None
         (first_host, first_device), (last_host, last_device) = self.imu_clock
@@ -82,7 +85,7 @@ class Heard:
 
 
 def describe_time(entry: DeviceEntry, heard: Heard) -> str:
-    """Return what the device says of its time, in a few words."""
+    """Describe the device's time in a few words."""
     if heard.valid_time is not None:
         return f"{describe_tag(heard.valid_time.time)} ({heard.valid_time.message})"
     if heard.time_messages:
@@ -93,7 +96,9 @@ def describe_time(entry: DeviceEntry, heard: Heard) -> str:
 
 
 def describe_tag(tag: TimeTag) -> str:
-    """Return a device's time as far as it says it: ``2026-11-21 10:15:03 UTC``, ``GPS week 2443, 555303.0 s``."""
+    """Format a device's time as completely as it is given: ``2026-11-21 10:15:03 UTC``, ``GPS week 2443,
+    555303.0 s``.
+    """
     seconds = tag.time_ns * 1e-9
     if tag.scale == "gps":
         return f"GPS week {tag.week if tag.week is not None else '?'}, {seconds:.1f} s"
@@ -103,11 +108,11 @@ def describe_tag(tag: TimeTag) -> str:
 
 
 def identify(entry: DeviceEntry, kept: list[ChunkBatch], than: int) -> str | None:
-    """Return the protocol of the same kind that makes most of bytes of which the configured one makes no record.
+    """Return the protocol of the same kind that decodes most of the bytes, if the configured one decodes no records.
 
-    A parser that decodes records is before one that only finds messages (receivers mix protocols on a port, and
-    their parsers frame each other's); the latter must find more than ``than``, what the configured one found. A
-    driver that cannot work without settings that only the right configuration has is asked by its probe, or left out.
+    A parser that decodes records is preferred to one that only finds messages (receivers mix protocols on a port, and
+    their parsers frame each other's messages); the latter must find more than ``than``, the count of the configured
+    protocol. A driver that needs settings which only the right configuration has is tried by its probe, or left out.
     """
     best, most = None, (0, max(than, LEAST_MESSAGES - 1))
     for protocol, driver in all_drivers(entry.kind).items():
@@ -130,16 +135,16 @@ def identify(entry: DeviceEntry, kept: list[ChunkBatch], than: int) -> str | Non
 def not_understood(
     entry: DeviceEntry, heard: Heard, messages: int, kept: list[ChunkBatch], *, refused: int = 0
 ) -> str | None:
-    """Return what a device is instead of what it was configured as, or that nothing of it is known; None: it is
+    """Return a line if a device uses another protocol than the configured one, or no known protocol; None if it is
     understood.
 
     Args:
         entry: the device as configured.
-        heard: what the configured parser made of its bytes.
-        messages: how many the configured parser found in them.
+        heard: records that the configured parser decoded from its bytes.
+        messages: number of messages that the configured parser found in them.
         kept: the bytes, or the first of them.
-        refused: messages it could make nothing of. More than good ones: a head's second port may say the same in
-            another model, while its own port is not understood.
+        refused: number of messages that it could not decode. If they outnumber the good ones, the device counts as not
+            understood: a head's second port may be readable although the head is another model, whose own port is not.
     """
     if messages and heard.counts and refused <= messages:
         return None
@@ -153,8 +158,8 @@ def not_understood(
 
 
 def _default_settings(entry: DeviceEntry, protocol: str) -> DeviceSettings:
-    """Return settings of a device of which only the protocol is known; what frames need no value of ours is stood in
-    for.
+    """Return settings of a device of which only the protocol is known; values that framing does not need are
+    placeholders.
     """
     transport = entry.transport.text
     table: DeviceTable

@@ -1,7 +1,7 @@
-"""Sends the devices the messages they need before a survey, and hears what they say to each.
+"""Sends the devices the messages they need before a survey, and reads their answer to each.
 
-One message at a time: the next is sent when the device has answered the one before. Without an answer nothing more is
-sent by that wire, since a late answer would be taken for that of another message.
+It sends one message at a time, the next only after the answer to the one before. After a missing answer nothing more is
+sent over that wire, since a late answer would be taken as that to another message.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from swath.drivers.transports.opening import open_transport
 from swath.drivers.transports.spec import TransportSpec
 
 SLICE_S = 0.1
-SETTLE_S = 0.3  # for a device to change the rate of its line
+SETTLE_S = 0.3  # time for a device to change its baud rate
 
 
 class Outcome(StrEnum):
-    """What became of a message."""
+    """The outcome of a message to a device."""
 
     PLANNED = "planned"
     ACCEPTED = "accepted"
@@ -38,14 +38,14 @@ class Outcome(StrEnum):
 
 @dataclass(slots=True)
 class Step:
-    """One message, what became of it, and what the device said."""
+    """One message, its outcome, and the device's answer."""
 
     message: StartupMessage
     outcome: Outcome = Outcome.PLANNED
     answer: str = ""
 
     def plain(self) -> dict[str, Any]:
-        """As plain values, the form of ``--json``."""
+        """Return the step as plain values, the form of ``--json``."""
         return {
             "lines": list(self.message.lines),
             "hex": self.message.data.hex(),
@@ -60,8 +60,8 @@ class DeviceSetup:
 
     Attributes:
         source: ``kind/name``.
-        transport: as configured; ``gnss:<name>`` where its bytes lie inside that receiver's stream.
-        steps: its messages; empty where it has none.
+        transport: as configured; ``gnss:<name>`` if its bytes are part of that receiver's stream.
+        steps: its messages; empty if it needs none.
         problem: why nothing can be sent to it, or what went wrong; one line.
     """
 
@@ -73,11 +73,11 @@ class DeviceSetup:
 
     @property
     def ok(self) -> bool:
-        """Whether nothing went wrong so far."""
+        """Whether nothing has gone wrong so far."""
         return not self.problem and all(step.outcome in (Outcome.PLANNED, Outcome.ACCEPTED) for step in self.steps)
 
     def plain(self) -> dict[str, Any]:
-        """As plain values, the form of ``--json``."""
+        """Return the device's setup as plain values, the form of ``--json``."""
         return {
             "source": self.source,
             "protocol": self.protocol,
@@ -90,11 +90,11 @@ class DeviceSetup:
 
 @dataclass(slots=True)
 class WireSetup:
-    """One wire and the devices that are asked by it: a receiver and the IMUs inside its stream.
+    """One wire and the devices that are set up over it: a receiver and the IMUs inside its stream.
 
     Attributes:
         spec: the transport.
-        present_baud: the rate the device speaks at before it is told the configured one; None: that one.
+        present_baud: the device's baud rate before it is set to the configured one; None if it is that one already.
     """
 
     spec: TransportSpec
@@ -102,17 +102,17 @@ class WireSetup:
     present_baud: int | None = None
 
     def steps(self) -> list[Step]:
-        """Return all messages in the order they are sent."""
+        """Return all messages in the order in which they are sent."""
         steps = [step for device in self.devices for step in device.steps]
         return sorted(steps, key=lambda step: step.message.last)
 
 
 class Line:
-    """An open wire: one message out, its answer in.
+    """An open wire, for one message at a time and its answer.
 
     Args:
         spec: the transport.
-        baud: its rate at first; None: as configured.
+        baud: its baud rate at first; None uses the configured one.
     """
 
     def __init__(self, spec: TransportSpec, baud: int | None) -> None:
@@ -121,10 +121,10 @@ class Line:
         self._transport.open()
 
     def ask(self, message: StartupMessage, timeout_s: float) -> Answer | None:
-        """Send a message and wait for its answer; None: there was none.
+        """Send a message and wait for its answer; return None if there was none.
 
-        Where it changes the rate, it is sent again at the new one, and that answer counts: what a device says while it
-        changes may be lost.
+        A message that changes the baud rate is sent again at the new rate, and the second answer counts, since an
+        answer during the change may be lost.
 
         Raises:
             TransportError: the device has gone.
@@ -140,7 +140,7 @@ class Line:
 
     def _ask(self, message: StartupMessage, timeout_s: float) -> Answer | None:
         listener = message.listen()
-        self._transport.receive(0.0)  # what was said before is no answer
+        self._transport.receive(0.0)  # discards earlier bytes, which are not an answer
         self._transport.send(message.data)
         deadline_s = time.monotonic() + timeout_s
         while (left_s := deadline_s - time.monotonic()) > 0:
@@ -158,16 +158,16 @@ class Line:
 def plan_setup(
     config: Config, only: Collection[str] = (), *, save: bool = False, present_baud: int | None = None
 ) -> list[WireSetup]:
-    """Return what would be sent, wire by wire.
+    """Plan the messages, wire by wire, without sending anything.
 
     Args:
         config: the configuration.
-        only: sources (``gnss/rover``); none: all.
-        save: let the devices keep it without power.
-        present_baud: the rate that the one device asked for speaks at now.
+        only: sources (``gnss/rover``); empty for all.
+        save: make the devices keep the settings without power.
+        present_baud: the present baud rate of the one device that is asked for.
 
     Raises:
-        UserError: a source that there is not, or a rate for more or less than one serial device.
+        UserError: a source does not exist, or a rate is given for more or less than one serial device.
     """
     entries = {entry.source: entry for entry in config.devices()}
     if unknown := [source for source in only if source not in entries]:
@@ -189,7 +189,7 @@ def _configured_baud(entry: DeviceEntry) -> int | None:
 
 
 def _change_rate(wires: dict[str, WireSetup], present_baud: int) -> None:
-    """Begin at another rate on the one wire whose device is told the configured one."""
+    """Set the present baud rate of the one wire whose device is set to another rate."""
     changing = [
         (source, wire) for source, wire in wires.items() if any(step.message.baud is not None for step in wire.steps())
     ]
@@ -207,7 +207,7 @@ def _add_device(wire: WireSetup, entry: DeviceEntry, carrier: DeviceEntry, wish:
     if startup is None:
         return
     settings = entry.settings
-    if entry is not carrier:  # the port is the receiver's
+    if entry is not carrier:  # the receiver owns the port
         setup = carrier.settings.config.get("setup")
         settings = DeviceSettings(settings.source, {**settings.config, "setup": setup}, settings.files)
     known = {step.message.data for step in wire.steps()}
@@ -216,7 +216,10 @@ def _add_device(wire: WireSetup, entry: DeviceEntry, carrier: DeviceEntry, wish:
 
 
 def _why_not_sent(spec: TransportSpec) -> str:
-    """Return a datagram goes to the group where there is one, and that is not the device."""
+    """Return why nothing can be sent over a transport; return "" if it can.
+
+    A UDP device needs a source address and no group: with a group, a datagram would go to the group, not to the device.
+    """
     if spec.kind == "serial" or (spec.kind == "udp" and "source" in spec.options and "group" not in spec.options):
         return ""
     hint = "; say ?source=<its address>, and no group" if spec.kind == "udp" else ""
@@ -228,7 +231,7 @@ def _at_baud(spec: TransportSpec, baud: int) -> TransportSpec:
 
 
 def apply_setup(wire: WireSetup, timeout_s: float) -> None:
-    """Send a wire's messages and keep what the devices say in its steps."""
+    """Send a wire's messages and keep the devices' answers in its steps."""
     steps = wire.steps()
     if steps and not any(device.problem for device in wire.devices):
         try:
@@ -247,7 +250,7 @@ def _send_all(line: Line, steps: list[Step], timeout_s: float) -> None:
         if step.message.last and not _all_accepted(steps):
             step.outcome, step.answer = Outcome.NOT_SENT, "not everything was accepted"
             continue
-        step.outcome = Outcome.NO_ANSWER  # until there is one
+        step.outcome = Outcome.NO_ANSWER  # kept if no answer arrives
         answer = line.ask(step.message, timeout_s)
         if answer is None:
             return

@@ -1,6 +1,6 @@
-"""What on this computer would cost data, and what mends it.
+"""Checks this computer for conditions that would cost data, and names a remedy for each.
 
-`examine` asks everything of this computer; each question is a small function over the files it is given.
+`examine` runs all checks on this computer; each check is a small function over the files that it is given.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ __all__ = ["Finding", "Tree", "Verdict", "examine"]
 
 
 def examine(config: Config | None, *, write: bool = True) -> Iterator[Finding]:
-    """Look at this computer.
+    """Run all checks on this computer.
 
     Args:
-        config: what is wired to it; None: what holds without knowing that.
+        config: the devices connected to it; None runs only the checks that need no configuration.
         write: measure the log directory's disk by writing to it.
     """
     tree = Tree()
@@ -59,7 +59,7 @@ def _asked_bytes(specs: list[TransportSpec]) -> int:
 
 
 def needed_modules(config: Config | None, specs: list[TransportSpec]) -> list[str]:
-    """Return drivers that a configuration cannot do without, as modprobe names them."""
+    """Return the kernel modules that a configuration needs, by the names that modprobe uses."""
     needed = ["can_raw"] if any(spec.kind == "can" and spec.interface == "socketcan" for spec in specs) else []
     paths = [spec.address for spec in specs if spec.kind == "serial"]
     if any(path.startswith("/dev/ttyUSB") for path in paths):

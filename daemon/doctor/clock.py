@@ -1,4 +1,4 @@
-"""The wall clock: who keeps it, whether he may step it in flight, and whether it is being pushed about now."""
+"""Checks the wall clock: which program disciplines it, whether that may step it in flight, and how it moves now."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from swath.daemon.doctor.finding import Finding, Tree, Verdict
 from swath.daemon.log.host_clock import STEP_NOTICED_NS, ClockDiscipline, read_clock_pair, read_clock_sample
 
 KEEPERS = {"chronyd": "chrony", "ntpd": "ntpd", "systemd-timesyn": "systemd-timesyncd", "openntpd": "openntpd"}
-STEPPERS = ("systemd-timesyncd", "openntpd", "ntpd")  # step whenever they find the clock far off
-SLEWED_PPM = 150.0  # beyond an oscillator's own error and chrony's drop-in of 100
+STEPPERS = ("systemd-timesyncd", "openntpd", "ntpd")  # these step the clock whenever it is far off
+SLEWED_PPM = 150.0  # above an oscillator's own error and the 100 that chrony's drop-in permits
 WATCH_S = 0.5
 _CHRONY = "sudo apt-get install chrony  # with /etc/chrony/conf.d/swath.conf it steps at its start only"
-_CONFIGURATIONS = ("/etc/chrony/chrony.conf", "/etc/chrony.conf")  # of Debian, of others
-_INCLUDE_LEVELS = 10  # chrony follows no more
+_CONFIGURATIONS = ("/etc/chrony/chrony.conf", "/etc/chrony.conf")  # on Debian, on other systems
+_INCLUDE_LEVELS = 10  # chrony follows no deeper nesting
 _COMMENT = ("!", ";", "#", "%")
 
 
 def keepers(tree: Tree, discipline: ClockDiscipline) -> Iterator[Finding]:
-    """Yield who keeps the wall clock, and whether he may step it while a flight is recorded."""
+    """Check which program disciplines the wall clock, and whether it may step the clock while a flight is recorded."""
     check = "wall clock"
     found = sorted(KEEPERS[name] for name in tree.processes() & set(KEEPERS))
     if len(found) > 1:
@@ -44,8 +44,9 @@ def keepers(tree: Tree, discipline: ClockDiscipline) -> Iterator[Finding]:
 
 
 def chrony_steps(tree: Tree) -> Iterator[Finding]:
-    """Yield whether chrony's configuration lets it step the clock at any time (``makestep … -1``); the last line
-    holds.
+    """Check whether chrony's configuration lets it step the clock at any time (``makestep … -1``).
+
+    The last ``makestep`` line is the one that chrony obeys.
     """
     said = [(file, words) for file, words in _chrony_lines(tree) if words[0].lower() == "makestep"]
     file, words = said[-1] if said else ("", [])
@@ -56,7 +57,9 @@ def chrony_steps(tree: Tree) -> Iterator[Finding]:
 
 
 def _chrony_lines(tree: Tree) -> Iterator[tuple[str, list[str]]]:
-    """Yield lines of chrony's configuration in words, each with its file, in the order in which chrony reads them."""
+    """Yield the lines of chrony's configuration as lists of words, each with its file, in the order in which chrony
+    reads them.
+    """
     configuration = next((path for path in _CONFIGURATIONS if tree.at(path).exists()), None)
     if configuration is not None:
         yield from _lines_of(tree, configuration, _INCLUDE_LEVELS)
@@ -73,10 +76,11 @@ def _lines_of(tree: Tree, file: str, levels: int) -> Iterator[tuple[str, list[st
 
 
 def _included(tree: Tree, words: list[str]) -> list[str]:
-    """Return the files that a line has chrony read there: by ``include`` a pattern's, by ``confdir`` some folders'
-    ``*.conf``.
+    """Return the files that a line makes chrony read at that point.
 
-    Of folders the files come by name, of a name the first folder's only (chrony.conf(5)). ``sourcedir`` holds sources.
+    ``include`` names a pattern, ``confdir`` folders whose ``*.conf`` are read in the order of their names; of several
+    files with one name, only the first folder's is read (chrony.conf(5)). ``sourcedir`` holds time sources and is not
+    followed.
     """
     directive, *places = words
     match directive.lower():
@@ -97,7 +101,7 @@ def _files(tree: Tree, pattern: str) -> list[str]:
 
 
 def movement(step_ns: int, slew_ppm: float) -> Iterator[Finding]:
-    """Yield what the clocks did while they were watched.
+    """Report how the clocks moved while they were watched.
 
     Args:
         step_ns: how far CLOCK_REALTIME moved against CLOCK_MONOTONIC.
@@ -117,7 +121,7 @@ def movement(step_ns: int, slew_ppm: float) -> Iterator[Finding]:
 
 
 def watch(seconds: float = WATCH_S) -> tuple[int, float]:
-    """Step in nanoseconds and slew in ppm over some time, of this computer."""
+    """Return the step in nanoseconds and the slew in ppm of this computer's clocks over some seconds."""
     quiet = ClockDiscipline(0.0, 0, 0.0)
     pair, sample = read_clock_pair(), read_clock_sample(quiet)
     time.sleep(seconds)
@@ -125,5 +129,5 @@ def watch(seconds: float = WATCH_S) -> tuple[int, float]:
     raw = int(later["monotonic_raw_ns"]) - int(sample["monotonic_raw_ns"])
     mono = int(later["monotonic_ns"]) - int(sample["monotonic_ns"])
     step_ns = later_pair.offset_ns - pair.offset_ns
-    seen = abs(step_ns) > pair.width_ns + later_pair.width_ns  # a reading that was interrupted is no step
+    seen = abs(step_ns) > pair.width_ns + later_pair.width_ns  # an interrupted reading looks like a step
     return step_ns if seen else 0, (mono - raw) / raw * 1e6

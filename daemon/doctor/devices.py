@@ -1,4 +1,4 @@
-"""The configured devices, as far as the system knows them without opening any: that is `swath check`'s business."""
+"""Checks the configured devices as far as the system knows them, without opening them; `swath check` opens them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pathlib import Path
 from swath.daemon.doctor.finding import Finding, Tree, Verdict, read_text
 
 SERVICE_USER = "swath"
-EDGE_S = 3.0  # without an edge for so long no pulse comes
+EDGE_S = 3.0  # an older edge means that no pulses arrive
 TEST_PPS = ("ktimer",)  # Documentation/driver-api/pps.rst: a kernel timer, for tests
 SERIAL_LATENCY_MS = 1
 CAN_QUEUE_FRAMES = 100
@@ -23,14 +23,14 @@ _UNIT = "/usr/lib/systemd/system/swathd.service"
 
 @dataclass(frozen=True, slots=True)
 class User:
-    """Somebody who opens devices."""
+    """A user who opens devices, with the ids that decide about permissions."""
 
     name: str
     uid: int
     gids: frozenset[int]
 
     def may(self, status: os.stat_result, bits: int) -> bool:
-        """Return whether the mode of a file lets him do what ``bits`` (of 7) say."""
+        """Return True if the mode of a file grants this user the access ``bits`` (of 7)."""
         if self.uid == 0:
             return True
         if status.st_uid == self.uid:
@@ -43,7 +43,7 @@ class User:
 
 
 def recording_user(tree: Tree) -> User:
-    """Return the service's user where there is one, else who runs this."""
+    """Return the service's user if it exists, else the user of this process."""
     for line in (tree.read("/etc/passwd") or "").splitlines():
         fields = line.split(":")
         if fields[0] == SERVICE_USER and len(fields) > 3:
@@ -57,7 +57,7 @@ def recording_user(tree: Tree) -> User:
 
 
 def group_name(tree: Tree, gid: int) -> str:
-    """Name of a group, or its number."""
+    """Return the name of a group, or its number as text if it has no name."""
     for line in (tree.read("/etc/group") or "").splitlines():
         fields = line.split(":")
         if len(fields) > 2 and fields[2] == str(gid):
@@ -66,7 +66,7 @@ def group_name(tree: Tree, gid: int) -> str:
 
 
 def device_file(tree: Tree, path: str, user: User) -> Iterator[Finding]:
-    """Yield whether a device is there, and its user may read and write it."""
+    """Check that a device exists, and that its user may read and write it."""
     check = "devices"
     try:
         status = tree.at(path).stat()
@@ -85,7 +85,7 @@ def device_file(tree: Tree, path: str, user: User) -> Iterator[Finding]:
 
 
 def device_policy(tree: Tree, path: str) -> Iterator[Finding]:
-    """Yield whether the unit lets its service open this class of devices (DeviceAllow)."""
+    """Check that the systemd unit lets the service open this class of devices (DeviceAllow)."""
     files = [tree.at(_UNIT), *sorted(tree.at("/etc/systemd/system/swathd.service.d").glob("*.conf"))]
     said = [value for file in files for value in re.findall(r"^DeviceAllow=(\S+)", read_text(file) or "", re.MULTILINE)]
     if not said or path in said:
@@ -98,7 +98,7 @@ def device_policy(tree: Tree, path: str) -> Iterator[Finding]:
 
 
 def serial_port(tree: Tree, path: str) -> Iterator[Finding]:
-    """Yield what else is on a serial port: the kernel's console, an adapter that holds bytes back."""
+    """Check a serial port for the kernel's console and for an adapter that holds bytes back."""
     name = tree.at(path).resolve().name
     if name in (tree.read("/sys/class/tty/console/active") or "").split():
         text = f"{path} is the kernel's console: its messages are mixed into the device's"
@@ -112,7 +112,7 @@ def serial_port(tree: Tree, path: str) -> Iterator[Finding]:
 
 
 def port_grabbers(tree: Tree) -> Iterator[Finding]:
-    """Yield programs that open any serial port they find."""
+    """Check for running programs that open any serial port they find."""
     for name, unit in (("ModemManager", "ModemManager"), ("brltty", "brltty"), ("gpsd", "gpsd.socket gpsd")):
         if name in tree.processes():
             text = f"{name} runs: it opens serial ports and talks to receivers, in the middle of a flight too"
@@ -120,11 +120,11 @@ def port_grabbers(tree: Tree) -> Iterator[Finding]:
 
 
 def pps_device(tree: Tree, path: str, edge: str, now_s: float | None = None) -> Iterator[Finding]:
-    """Yield whether edges come at a PPS device.
+    """Check that edges arrive at a PPS device.
 
     Args:
         edge: assert or clear.
-        now_s: CLOCK_REALTIME.
+        now_s: CLOCK_REALTIME; None reads it.
     """
     check = "PPS"
     folder = tree.at("/sys/class/pps") / tree.at(path).resolve().name
@@ -153,11 +153,11 @@ def pps_device(tree: Tree, path: str, edge: str, now_s: float | None = None) -> 
 def can_interface(
     tree: Tree, name: str, wanted_bitrate: int | None, bitrate_of: Callable[[str], int | None]
 ) -> Iterator[Finding]:
-    """Yield whether a CAN interface is there, up, at the right bit rate, and has lost nothing.
+    """Check that a CAN interface exists, is up, runs at the right bit rate and has lost no frames.
 
     Args:
-        wanted_bitrate: of the configuration, if it says one.
-        bitrate_of: asks the kernel (`interface_bitrate`).
+        wanted_bitrate: of the configuration; None if it gives no rate.
+        bitrate_of: reads the rate from the kernel (`interface_bitrate`).
     """
     check, folder = "CAN", tree.at(f"/sys/class/net/{name}")
     set_up = f"sudo ip link set {name} up type can bitrate {wanted_bitrate or 1_000_000} restart-ms 100"
@@ -188,7 +188,7 @@ def can_interface(
 
 
 def network_interface(tree: Tree, name: str) -> Iterator[Finding]:
-    """Yield whether the interface that a scanner is listened to on has a link."""
+    """Check that the network interface of a scanner has a link."""
     folder = tree.at(f"/sys/class/net/{name}")
     if not folder.exists():
         yield Finding("network", Verdict.WRONG, f"there is no interface {name}", "ip link")

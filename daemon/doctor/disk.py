@@ -1,4 +1,4 @@
-"""The disk that logs go to: its file system, its room, its speed."""
+"""Checks the disk that logs go to: its file system, its free space, its speed."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SCANNER_BYTES_PER_S = 25e6  # 20 000 datagrams of 1206 bytes
 OTHER_BYTES_PER_S = 0.2e6
 LITTLE_ROOM_S = 3600.0
 TEST_BYTES = 64 << 20
-SYNC_WRONG_S = 2.0  # the queue holds 2.6 s of such a scanner
+SYNC_WRONG_S = 2.0  # the queue holds 2.6 s of this scanner's data
 SYNC_NOTE_S = 0.5
 FAT_FILE_BYTES = 4 << 30
 _FAT = ("vfat", "msdos", "exfat")
@@ -39,7 +39,7 @@ class Mount:
 
 
 def mount_of(tree: Tree, directory: Path) -> Mount | None:
-    """Return the mounted file system that a directory is on."""
+    """Return the mounted file system that holds a directory."""
     best: Mount | None = None
     for line in (tree.read("/proc/mounts") or "").splitlines():
         device, point, kind, options, *_ = [*line.split(), "", "", "", ""]
@@ -50,10 +50,10 @@ def mount_of(tree: Tree, directory: Path) -> Mount | None:
 
 
 def file_system(mount: Mount | None, split_bytes: float) -> Iterator[Finding]:
-    """Yield whether a file system is one to trust a recording to.
+    """Check whether a file system is safe for a recording.
 
     Args:
-        split_bytes: the largest part.
+        split_bytes: the largest size of a part.
     """
     check = "file system"
     if mount is None:
@@ -79,7 +79,7 @@ def file_system(mount: Mount | None, split_bytes: float) -> Iterator[Finding]:
 
 
 def room(free_bytes: float, reserve_bytes: float, bytes_per_s: float) -> Iterator[Finding]:
-    """Yield whether there is room, down to the reserve, at the rate that the configured sensors may have."""
+    """Check the free space above the reserve against the highest data rate of the configured sensors."""
     left_s = max(0.0, free_bytes - reserve_bytes) / bytes_per_s
     text = f"{free_bytes / 1e9:.1f} GB free, {duration_text(left_s)} at {bytes_per_s / 1e6:.1f} MB/s"
     few = left_s < LITTLE_ROOM_S
@@ -88,7 +88,9 @@ def room(free_bytes: float, reserve_bytes: float, bytes_per_s: float) -> Iterato
 
 
 def writable(tree: Tree, directory: Path, user: User) -> Iterator[Finding]:
-    """Yield whether logs can be made in a directory: whether its user may enter all it lies in, and write to it."""
+    """Check that logs can be made in a directory: its user must be able to enter all parent folders and to
+    write to it.
+    """
     check = "log directory"
     there, permitted = nearest_there(tree.at(directory))
     existing = Path("/") / there.relative_to(tree.root)
@@ -108,10 +110,10 @@ def writable(tree: Tree, directory: Path, user: User) -> Iterator[Finding]:
 
 
 def measure(folder: Path, size: int = TEST_BYTES) -> tuple[float, float]:
-    """Return bytes a second and the longest sync in seconds of writing as a recorder does; nothing is left behind.
+    """Write as a recorder does, and return bytes per second and the longest sync in seconds; no file is left behind.
 
     Raises:
-        OSError: it cannot be written there.
+        OSError: the folder cannot be written to.
     """
     block, longest_s, written = os.urandom(1 << 20), 0.0, 0
     with tempfile.TemporaryFile(dir=folder) as file:
@@ -126,7 +128,7 @@ def measure(folder: Path, size: int = TEST_BYTES) -> tuple[float, float]:
 
 
 def speed(bytes_per_s: float, longest_sync_s: float, needed_bytes_per_s: float) -> Iterator[Finding]:
-    """Yield whether the disk keeps up."""
+    """Check that the disk is fast enough for the sensors."""
     check = "disk speed"
     told = f"writes {bytes_per_s / 1e6:.0f} MB/s, longest sync {longest_sync_s * 1e3:.0f} ms"
     text = f"{told}; the sensors may send {needed_bytes_per_s / 1e6:.1f} MB/s"

@@ -1,4 +1,4 @@
-"""What a check finds, and the files it looks at."""
+"""The result of a check, and the access to the files that checks read."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from pathlib import Path
 
 
 class Verdict(StrEnum):
-    """How much a finding matters."""
+    """The severity of a finding."""
 
     OK = "ok"
-    NOTE = "note"  # worth knowing; no data is lost by it
+    NOTE = "note"  # worth knowing, but costs no data
     WRONG = "wrong"  # would cost data
 
 
@@ -20,8 +20,8 @@ class Finding:
     """One line of the report.
 
     Attributes:
-        check: what was looked at.
-        mend: the command, or what else to do; "" where nothing is to be done.
+        check: name of the check.
+        mend: the command or other remedy; "" if there is nothing to do.
     """
 
     check: str
@@ -31,7 +31,7 @@ class Finding:
 
 
 def read_text(path: Path) -> str | None:
-    """Return a small file's text without blanks at its ends; None where it cannot be read."""
+    """Return the text of a small file without surrounding blanks; None if it cannot be read."""
     try:
         return path.read_text(errors="replace").strip()
     except OSError:
@@ -40,12 +40,12 @@ def read_text(path: Path) -> str | None:
 
 @dataclass(frozen=True, slots=True)
 class Tree:
-    """The files of a computer: its own, or a made one."""
+    """The file tree of a computer: the real one, or one made for tests."""
 
     root: Path = Path("/")
 
     def at(self, path: str | Path) -> Path:
-        """Return an absolute path of the computer."""
+        """Return the path in this tree of an absolute path of the computer."""
         return self.root / str(path).lstrip("/")
 
     def read(self, path: str | Path) -> str | None:
@@ -53,13 +53,13 @@ class Tree:
         return read_text(self.at(path))
 
     def number(self, path: str | Path) -> int | None:
-        """Return a file that holds a whole number; None where it does not."""
+        """Read a file that holds a whole number; return None if it does not."""
         try:
             return int(self.read(path) or "")
         except ValueError:
             return None
 
     def processes(self) -> set[str]:
-        """Return names of the programs that run, as far as this user may see them."""
+        """Return the names of the running programs, as far as this user may see them."""
         names = map(read_text, self.at("/proc").glob("[0-9]*/comm"))
         return {name for name in names if name}

@@ -1,4 +1,4 @@
-"""The computer itself: receive buffers, processor, memory, drivers."""
+"""Checks the computer itself: receive buffers, processor, memory, drivers."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from pathlib import Path
 
 from swath.daemon.doctor.finding import Finding, Tree, Verdict, read_text
 
-RMEM_MAX_BYTES = 64 << 20  # what systemd/sysctl/90-swath.conf sets
+RMEM_MAX_BYTES = 64 << 20  # the value in systemd/sysctl/90-swath.conf
 FRAGMENTS_BYTES = 32 << 20
-SLOW_IDLE_US = 50  # to wake up from a sleep: the PPS interrupt waits for it
+SLOW_IDLE_US = 50  # wake-up time from a sleep state, which delays the PPS interrupt
 MEMORY_BYTES = 256 << 20  # the recorder's 64 MiB, a full queue of 64 MiB, and room for the kernel's buffers
-DEBIAN_NAMES = {"x86_64": "amd64", "aarch64": "arm64", "armv7l": "armmp"}  # of processors, in packages of kernels
-CLOSED_LOOP_DRIVERS = ("intel_pstate", "amd-pstate", "amd-pstate-epp")  # their "powersave" goes as fast as is needed
+DEBIAN_NAMES = {"x86_64": "amd64", "aarch64": "arm64", "armv7l": "armmp"}  # as kernel packages name processors
+CLOSED_LOOP_DRIVERS = ("intel_pstate", "amd-pstate", "amd-pstate-epp")  # their "powersave" follows the load
 
 
 def receive_buffers(tree: Tree, asked_bytes: int) -> Iterator[Finding]:
-    """Yield whether the kernel grants the receive buffers that the scanners' sockets ask for.
+    """Check that the kernel grants the receive buffers that the scanners' sockets request.
 
     Args:
-        asked_bytes: the largest that is asked for.
+        asked_bytes: the largest buffer that is requested.
     """
     check = "receive buffers"
     limit = tree.number("/proc/sys/net/core/rmem_max")
@@ -40,7 +40,9 @@ def receive_buffers(tree: Tree, asked_bytes: int) -> Iterator[Finding]:
 
 
 def dropped_datagrams(tree: Tree) -> Iterator[Finding]:
-    """Yield what the kernel has dropped since it started because a receive buffer was full (RcvbufErrors)."""
+    """Report how many datagrams the kernel has dropped since its start because a receive buffer was full
+    (RcvbufErrors).
+    """
     lines = [line.split() for line in (tree.read("/proc/net/snmp") or "").splitlines() if line.startswith("Udp:")]
     if len(lines) < 2 or "RcvbufErrors" not in lines[0]:
         return
@@ -51,7 +53,7 @@ def dropped_datagrams(tree: Tree) -> Iterator[Finding]:
 
 
 def governor(tree: Tree) -> Iterator[Finding]:
-    """Yield whether the processor may run as fast as it can."""
+    """Check whether the processor may run at its highest frequency."""
     check = "CPU governor"
     folders = sorted(tree.at("/sys/devices/system/cpu").glob("cpu[0-9]*/cpufreq"))
     found = {(_word(folder / "scaling_governor"), _word(folder / "scaling_driver")) for folder in folders}
@@ -74,7 +76,7 @@ def _word(path: Path) -> str:
 
 
 def idle_states(tree: Tree) -> Iterator[Finding]:
-    """Yield whether the processor sleeps so deeply that a PPS interrupt comes late."""
+    """Check whether the processor enters sleep states so deep that a PPS interrupt is late."""
     slow: dict[str, int] = {}
     for folder in sorted(tree.at("/sys/devices/system/cpu").glob("cpu[0-9]*/cpuidle/state*")):
         latency, disabled = _word(folder / "latency"), _word(folder / "disable")
@@ -89,7 +91,7 @@ def idle_states(tree: Tree) -> Iterator[Finding]:
 
 
 def memory(tree: Tree) -> Iterator[Finding]:
-    """Yield whether there is memory for the queue and the kernel's buffers."""
+    """Check that there is memory for the queue and the kernel's buffers."""
     for line in (tree.read("/proc/meminfo") or "").splitlines():
         key, _, value = line.partition(":")
         if key == "MemAvailable":
@@ -101,7 +103,7 @@ def memory(tree: Tree) -> Iterator[Finding]:
 
 
 def modules(tree: Tree, needed: Iterable[str]) -> Iterator[Finding]:
-    """Yield whether the drivers that the configuration needs are in the kernel, or can be.
+    """Check that the drivers that the configuration needs are in the kernel, or can be loaded.
 
     Args:
         needed: names of modules, as modprobe knows them.

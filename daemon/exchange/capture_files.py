@@ -1,4 +1,4 @@
-"""What the files given to `swath import` are, and which device each belongs to."""
+"""Determines the kind of each file given to `swath import`, and the device that it belongs to."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _LOOKED_AT_BYTES = 65_536
 _LOOKED_AT_LINES = 10
 _MAX_MANIFEST_BYTES = 1 << 20
 _KIND_OF_PORT = {"udp": "pcap", "can": "candump", "serial": "serial", "pps": "pps"}
-_NO_CAPTURE = {  # what files begin with that hold devices' bytes in a way of their own
+_NO_CAPTURE = {  # first bytes of files that hold device bytes in a format that cannot be imported
     b"SQLite format 3\0": "a ROS 2 bag, or another SQLite file",
     b"#ROSBAG V": "a ROS 1 bag",
     b"\x89MCAP0\r\n": "a log, or a ROS 2 bag in MCAP",
@@ -33,12 +33,12 @@ _WANTED = "want kind/name=FILE, kind/name:<CAN interface>=FILE or kind/name:<UDP
 
 @dataclass(frozen=True, slots=True)
 class Told:
-    """What the command line says besides files.
+    """The options of the command line besides the files.
 
     Attributes:
         named: ``kind/name[/aux][:selector]=FILE``, as given.
-        start_ns, baud: by source, "" for all: when a serial file without times begins, and how fast it came.
-        keep_copies: packets that were captured twice stay.
+        start_ns, baud: start time and baud rate of serial files without times, by source, "" for all.
+        keep_copies: keep packets that were captured twice.
     """
 
     named: Sequence[str] = ()
@@ -51,7 +51,7 @@ def find_captures(routes: Routes, files: Sequence[Path], told: Told) -> list[Cap
     """Return every file with its kind and device.
 
     Raises:
-        UserError: all that is wrong, a line each: no device, no times, or, where that is all, what cannot be read.
+        UserError: one line for each fault: a file without device or times, or a file that cannot be read.
     """
     found: dict[tuple[Path, str, str | None], Capture] = {}
     wrong: list[str] = [
@@ -78,7 +78,7 @@ def find_captures(routes: Routes, files: Sequence[Path], told: Told) -> list[Cap
 
 
 def _named(routes: Routes, text: str) -> list[Capture]:
-    """Return ``--source kind/name:selector=FILE``."""
+    """Parse ``--source kind/name:selector=FILE``."""
     name, equals, file = text.partition("=")
     source, _, selector = name.partition(":")
     if not equals or not file or not source:
@@ -107,7 +107,7 @@ def _port(routes: Routes, source: str, where: str) -> Port:
 
 
 def _found(routes: Routes, path: Path) -> list[Capture]:
-    """Return a file whose units say themselves whose they are, or the folder of an export."""
+    """Return a file whose units identify their own device, or all files of an export's folder."""
     if path.is_dir():
         return _of_export(routes, path)
     head, damage = read_beginning(path, _LOOKED_AT_BYTES)
@@ -128,7 +128,7 @@ def _found(routes: Routes, path: Path) -> list[Capture]:
 
 
 def _kind(head: bytes) -> str:
-    """By the beginning: pcap, candump, else the bytes of a serial line."""
+    """Recognise a file by its beginning: pcap or candump, else the bytes of a serial line."""
     if is_pcap(head):
         return "pcap"
     return "candump" if any(map(is_candump, _first_lines(head))) else "serial"
@@ -139,7 +139,7 @@ def _first_lines(head: bytes) -> list[str]:
 
 
 def _settle(capture: Capture, told: Told) -> None:
-    """What the command line says of a file: its times, and whether copies stay."""
+    """Apply the command line's options to a file: its times, and whether copies stay."""
     capture.keep_copies = told.keep_copies
     if capture.kind != "serial" or has_times(capture.path):
         return
@@ -161,7 +161,7 @@ def _settle(capture: Capture, told: Told) -> None:
 
 
 def _of_export(routes: Routes, folder: Path) -> list[Capture]:
-    """Return the files that its manifest names; of a folder of exports, those of all."""
+    """Return the files that an export's manifest names; for a folder of exports, those of all exports."""
     folders = [folder] if (folder / MANIFEST).exists() else sorted(path.parent for path in folder.glob(f"*/{MANIFEST}"))
     if not folders:
         raise UserError(f"{folder}: is a folder without {MANIFEST}; give captures, or the folder of an export")

@@ -1,4 +1,4 @@
-"""A file that `swath import` reads: what it is, whose units it holds, and the units themselves."""
+"""Reads a file that `swath import` accepts: its kind, the devices in it and their units."""
 
 from __future__ import annotations
 
@@ -43,14 +43,14 @@ class ImportUnit:
 
 @dataclass(slots=True)
 class Capture:
-    """A file, what it is, and what was found in it.
+    """A file to import, its kind, and counts of the units found in it.
 
     Attributes:
         kind: "pcap", "candump", "serial" or "pps".
-        port: whose units it holds; None where the units say it themselves.
-        selector: the CAN interface, or the UDP port number, of which alone units are taken.
-        time: when the bytes of a serial file without times came.
-        units: taken, by source. passed: of no device, by what they were.
+        port: the port whose units it holds; None if the units identify their ports themselves.
+        selector: the only CAN interface, or UDP port number, whose units are used.
+        time: timing of the bytes of a serial file without times.
+        units: number used, by source. passed: number that belong to no device, by port or interface.
     """
 
     path: Path
@@ -64,7 +64,7 @@ class Capture:
     passed: Counter[str] = field(default_factory=Counter)
 
     def read(self, routes: Routes) -> Iterator[ImportUnit]:
-        """Yield units that belong to a device, in the file's order; what is wrong with the file stands in ``tally``."""
+        """Yield the units that belong to a device, in the file's order; damage of the file is noted in ``tally``."""
         for unit in until_damage(self._captured(), self.tally):
             if not 0 <= unit.time_ns <= LATEST_NS:
                 self.tally.damaged(f"{self.path}: a unit of {len(unit.data)} bytes has no time between 1970 and 2262")
@@ -107,7 +107,7 @@ class Capture:
         return found
 
     def plain(self) -> dict[str, Any]:
-        """For ``--json``."""
+        """Return the counts as plain values for ``--json``."""
         return {
             "file": str(self.path),
             "kind": self.kind,
@@ -120,12 +120,12 @@ class Capture:
 
 
 def tag_of(path: Path) -> Path:
-    """Return where RTKLIB put the time tags of a stream, which may have been gzipped since."""
+    """Return the path of RTKLIB's time tags of a stream; the stream may have been gzipped since."""
     return path.with_name(path.name.removesuffix(".gz") + ".tag")
 
 
 def has_times(path: Path) -> bool:
-    """Return whether something beside a serial file says when its bytes came."""
+    """Return whether a file beside a serial file gives the times of its bytes."""
     return sidecar_of(path).exists() or chunk_table(path) is not None or tag_of(path).exists()
 
 

@@ -1,7 +1,7 @@
-"""A log as the files that its devices' own tools read: serial streams, candump, pcap, PPS text.
+"""Exports a log as files that the tools of its devices read: serial streams, candump, pcap, PPS text.
 
-Every source is written in the log's own order. What a format cannot hold goes into a sidecar
-(`swath.daemon.exchange.sidecar`), so that `swath import` makes the same units of it again.
+Every source is written in the log's own order. Information that a format cannot hold goes into a sidecar
+(`swath.daemon.exchange.sidecar`), so that `swath import` restores the same units from it.
 """
 
 from __future__ import annotations
@@ -28,20 +28,20 @@ from swath.daemon.log.reader import Session
 MANIFEST = "swath-export.json"
 CONFIG_FOLDER = "config"
 _UNFINISHED = ".part"
-_MOST_NAME_BYTES = 200  # what is made of it is longer, and no file system takes more than 255
-_MOST_PLACE = 500  # characters of a name with its folders, which are made one in the other
-_NO_PLACE = (errno.ENAMETOOLONG, errno.ENOTDIR, errno.EEXIST, errno.EISDIR)  # a stranger's name, or two that collide
+_MOST_NAME_BYTES = 200  # names derived from it are longer, and file systems accept at most 255
+_MOST_PLACE = 500  # characters of a name with its folders, which are created one inside the other
+_NO_PLACE = (errno.ENAMETOOLONG, errno.ENOTDIR, errno.EEXIST, errno.EISDIR)  # a foreign log's name, or a collision
 
 
 @dataclass(slots=True)
 class ExportReport:
-    """What an export wrote.
+    """The files that an export wrote.
 
     Attributes:
-        folder: where it is.
-        files: by name, what the manifest says of each.
-        units: by source.
-        notes: what a reader should know, a line each.
+        folder: the export's folder.
+        files: the manifest's entry of each file, by name.
+        units: number by source.
+        notes: remarks for the reader, one line each.
     """
 
     folder: Path
@@ -55,12 +55,12 @@ def export_session(session: Session, directory: Path, progress: Callable[[int], 
 
     Args:
         session: as `open_logs` gives it; read once, a chunk at a time.
-        directory: made if need be.
-        progress: called with the bytes of every batch.
+        directory: created if necessary.
+        progress: called with the number of bytes of every batch.
 
     Raises:
-        LogError: the log's name is no name of a folder.
-        UserError: the folder is there.
+        LogError: the log's name cannot be the name of a folder.
+        UserError: the folder exists already.
         OSError: it cannot be written; nothing is left of it.
     """
     target = safe_attachment_path(directory, session.session_id)
@@ -85,7 +85,7 @@ def export_session(session: Session, directory: Path, progress: Callable[[int], 
 
 
 class _Export:
-    """One session on its way into a folder."""
+    """Exports one session into a folder."""
 
     def __init__(self, session: Session, folder: Path) -> None:
         self._session = session
@@ -95,7 +95,7 @@ class _Export:
         self._of_source: dict[tuple[str, str], NativeFile] = {}
 
     def run(self, progress: Callable[[int], None]) -> ExportReport:
-        """Write everything."""
+        """Write all files and return the report."""
         self._write_configuration()
         strange: Counter[str] = Counter()
         try:
@@ -128,7 +128,7 @@ class _Export:
             kind = PpsFile if source.startswith("pps/") else kinds.get(encoding)
             if kind is None:
                 return None
-            # a head's two ports were captured by one tcpdump, and its maker's viewer wants them in one file
+            # the viewer of a head's maker expects both ports in one file, as one tcpdump captures them
             of_head = source.removesuffix("/aux") if kind is PcapFile else source
             file = self._of_source.get((of_head, encoding)) or self._new_file(kind, of_head, batch)
             self._of_source[of_head, encoding] = self._of_source[source, encoding] = file
@@ -158,7 +158,9 @@ class _Export:
         (self._folder / MANIFEST).write_text(json.dumps(manifest, indent=2) + "\n")
 
     def _write_configuration(self) -> None:
-        """The configuration, and the files it names where it names them, if that is below its own folder."""
+        """Write the configuration, and each of its files also under the path that it uses, if that is below its own
+        folder.
+        """
         attachments = self._session.attachments()
         places = {name: [name] for name in attachments}
         try:
@@ -177,7 +179,7 @@ class _Export:
                 self._report.notes.append(f"attachment {name[:60]!r} is left out: no file can be called so here")
 
     def _write_attachment(self, place: str, data: bytes) -> bool:
-        """Below the folder only; whether it is there now."""
+        """Write an attachment, below the folder only, and return whether the file exists now."""
         try:
             path = safe_attachment_path(self._folder / CONFIG_FOLDER, place)
         except LogError:

@@ -1,4 +1,4 @@
-"""The files of an export, one class a form; each takes the batches of its source in the log's order."""
+"""Writes the files of an export, one class for each format; each class takes the batches of its source in log order."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ from swath.georef.records import Int64Array
 # .ubx, .gps, .sbf: the names by which RTKLIB's convbin knows a format (app/convbin/convbin.c)
 _SERIAL_SUFFIX = {"ubx": ".ubx", "novatel": ".gps", "sbf": ".sbf", "nmea": ".nmea"}
 
-_EVER_NS = (1 << 63) - 1  # no stamp is later
+_EVER_NS = (1 << 63) - 1  # later than any stamp
 
 
 class NativeFile(ABC):
     """A file that is being written, with its sidecar.
 
     Attributes:
-        units: entries so far, those that stand in the sidecar only among them.
+        units: number of units so far, including those that only the sidecar holds.
     """
 
     kind: ClassVar[str]
@@ -52,25 +52,25 @@ class NativeFile(ABC):
 
     @classmethod
     def suffix_for(cls, channel: ChannelSpec) -> str:
-        """Return how the name of the file ends."""
+        """Return the suffix of the file's name."""
         return cls.suffix
 
     @abstractmethod
     def add(self, source: str, batch: LogBatch) -> None:
-        """Units that follow."""
+        """Write the units of the next batch."""
 
     def notes(self) -> list[str]:
-        """Return what a reader should know of the file."""
+        """Return remarks for the reader of the file."""
         return []
 
     def close(self) -> None:
-        """Finish the file and what lies beside it."""
+        """Finish the file and its sidecar."""
         self._stream.close()
         self._sidecar.close()
 
 
 def _spec(channel: ChannelSpec) -> TransportSpec | None:
-    """Return the transport of a channel; None where a stranger's log does not say it."""
+    """Return the transport of a channel; None if a foreign log does not give it."""
     try:
         return parse_transport(channel.metadata.get("transport", ""))
     except ValueError:
@@ -78,7 +78,9 @@ def _spec(channel: ChannelSpec) -> TransportSpec | None:
 
 
 class SerialFile(NativeFile):
-    """The bytes, one after the other; beside them RTKLIB's time tags. Bounds and times of reads are in the sidecar."""
+    """Writes all bytes of a source in sequence, with RTKLIB's time tags beside; the sidecar has bounds and times of
+    reads.
+    """
 
     kind = "serial"
     suffix = ".raw"
@@ -91,11 +93,11 @@ class SerialFile(NativeFile):
 
     @classmethod
     def suffix_for(cls, channel: ChannelSpec) -> str:
-        """That of the protocol."""
+        """Return the suffix for the channel's protocol."""
         return _SERIAL_SUFFIX.get(channel.metadata.get("protocol", ""), cls.suffix)
 
     def add(self, source: str, batch: LogBatch) -> None:
-        """Units that follow."""
+        """Write the units of the next batch."""
         count, length = batch.units.shape
         self._stream.write(batch.units.tobytes())
         if self._tags is None:
@@ -107,19 +109,21 @@ class SerialFile(NativeFile):
         self.units += count
 
     def close(self) -> None:
-        """Finish the file and what lies beside it."""
+        """Finish the file, its sidecar and its time tags."""
         super().close()
         self._tag_stream.close()
 
 
 class CandumpFile(NativeFile):
-    """``candump -L``, to the microsecond. What is below it, and bytes that a line does not show, are in the sidecar."""
+    """Writes ``candump -L`` text, to the microsecond; the sidecar has nanoseconds, and bytes that a line
+    cannot show.
+    """
 
     kind = "candump"
     suffix = ".log"
 
     def add(self, source: str, batch: LogBatch) -> None:
-        """Units that follow."""
+        """Write the units of the next batch."""
         spec = _spec(batch.channel)
         interface = "".join(spec.channel.split()) if spec is not None and spec.kind == "can" else ""
         lines = []
@@ -137,10 +141,10 @@ class CandumpFile(NativeFile):
 
 
 class PcapFile(NativeFile):
-    """Datagrams with stamps in nanoseconds; Ethernet, IP and UDP headers are made anew.
+    """Writes datagrams with stamps in nanoseconds; Ethernet, IP and UDP headers are made anew.
 
-    A head's two ports are merged by their stamps; each keeps its own order, also where its stamps step back. A second
-    of them is held for that: a log has blocks of one port after blocks of the other.
+    The two ports of a head are merged by their stamps; each keeps its own order, even where its stamps step back. One
+    second of datagrams is held for the merge, because a log has blocks of one port after blocks of the other.
     """
 
     kind = "pcap"
@@ -154,7 +158,7 @@ class PcapFile(NativeFile):
         self._held_bytes = 0
 
     def add(self, source: str, batch: LogBatch) -> None:
-        """Units that follow."""
+        """Add the units of the next batch and write those that are due."""
         copy = LogBatch(batch.channel, batch.channel_id, batch.log_time_ns.copy(), batch.rows.copy())
         self._held.setdefault(source, deque()).append(copy)
         self._held_bytes += copy.rows.size
@@ -162,12 +166,12 @@ class PcapFile(NativeFile):
         self._write_held(until_ns if self._held_bytes <= LOOK_AHEAD_BYTES else _EVER_NS)
 
     def close(self) -> None:
-        """Finish the file and what lies beside it."""
+        """Write the units that are still held; finish the file and its sidecar."""
         self._write_held(_EVER_NS)
         super().close()
 
     def _write_held(self, until_ns: int) -> None:
-        """Write what is held up to a time, of the ports always the one whose next stamp is the earlier."""
+        """Write the held units up to a time, always from the port whose next stamp is earliest."""
         while waiting := [(int(batches[0].log_time_ns[0]), source) for source, batches in self._held.items()]:
             first_ns, source = min(waiting)
             if first_ns > until_ns:
@@ -200,11 +204,11 @@ class PcapFile(NativeFile):
         self.units += len(times)
 
     def notes(self) -> list[str]:
-        """That senders are missing, where they are."""
+        """Return a remark if senders of datagrams are unknown."""
         return [f"{self._unnamed} datagrams of senders that the log does not name"] if self._unnamed else []
 
     def _addresses(self, channel: ChannelSpec) -> tuple[Address, Address]:
-        """Return sender and receiver; the receiver is what the recorder's port was bound to."""
+        """Return sender and receiver; the receiver is the address that the recorder's port was bound to."""
         metadata, spec = channel.metadata, _spec(channel)
         host, port = "0.0.0.0", _port(metadata.get("port", ""))
         if spec is not None and spec.kind == "udp":
@@ -218,13 +222,15 @@ def _port(text: str) -> int:
 
 
 class PpsFile(NativeFile):
-    """A line an edge, ``edge_time_ns sequence``, as ``fixed:`` sources take them. The messages are in the sidecar."""
+    """Writes a line ``edge_time_ns sequence`` for each edge, as ``fixed:`` sources read; the sidecar has
+    the messages.
+    """
 
     kind = "pps"
     suffix = ".txt"
 
     def add(self, source: str, batch: LogBatch) -> None:
-        """Edges that follow."""
+        """Write the edges of the next batch."""
         for time_ns, row in zip(batch.log_time_ns.tolist(), batch.units, strict=True):
             line = _pps_line(row.tobytes())
             if line is not None:
@@ -234,7 +240,7 @@ class PpsFile(NativeFile):
 
 
 def _pps_line(message: bytes) -> bytes | None:
-    """Return the line of a message; None where a stranger's is no edge."""
+    """Return the line of a message; None if a foreign log's message is not an edge."""
     try:
         value = json.loads(message)
         edge_time_ns, sequence = value["edge_time_ns"], value["sequence"]

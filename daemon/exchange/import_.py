@@ -1,6 +1,6 @@
-"""Captures into an ordinary log: as a recorder would have written it, with the captures' stamps as log times.
+"""Imports captures into an ordinary log, as a recorder would have written it; the captures' stamps become log times.
 
-Files are merged by time, each read in its own order and never whole.
+Files are merged by time, each read in its own order and never held in memory as a whole.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from swath.daemon.log.session import read_boot_id, session_name
 
 
 def merge(captures: Iterable[Capture], routes: Routes) -> Iterator[ImportUnit]:
-    """Yield units of all files, the earliest of those that are next first; each file keeps its own order."""
+    """Yield the units of all files merged by time; each file keeps its own order."""
     streams = [capture.read(routes) for capture in captures]
     waiting = []
     for number, stream in enumerate(streams):
@@ -41,7 +41,7 @@ def merge(captures: Iterable[Capture], routes: Routes) -> Iterator[ImportUnit]:
 
 
 def import_session_info(name: str, first_ns: int) -> SessionInfo:
-    """Return session of captures that begin at ``first_ns``: host time is their wall clock."""
+    """Return the session of captures that begin at ``first_ns``; its host time is the wall clock of the captures."""
     boot_id = read_boot_id()
     return SessionInfo(
         session_id=session_name(name, first_ns, boot_id),
@@ -62,7 +62,7 @@ class ImportLog(MadeLog):
         self.event(Severity.INFO, "session_started", f"session {self.info.session_id}, imported from captures")
 
     def add(self, unit: ImportUnit) -> None:
-        """One unit; raises OSError when the disk refuses a chunk."""
+        """Add one unit; raises OSError if the disk refuses a chunk."""
         self.go_on(unit.time_ns)
         source = self.sources.get(unit.port.source) or self.add_source(unit.port)
         self.add_unit(source, unit.peer, unit.time_ns, unit.data)
@@ -70,7 +70,7 @@ class ImportLog(MadeLog):
 
 @dataclass(frozen=True, slots=True)
 class ImportReport:
-    """What came of an import; ``session_id`` and ``paths`` are empty where no capture held a unit."""
+    """The result of an import; ``session_id`` and ``paths`` are empty if no capture held a unit."""
 
     session_id: str
     paths: list[Path]
@@ -84,17 +84,17 @@ def import_captures(
     directory: Path,
     progress: Callable[[int], None] = lambda _: None,
 ) -> ImportReport:
-    """Make a log of captures.
+    """Make a log from captures.
 
     Args:
-        config: stored in the log, and what its devices are.
+        config: describes the devices; it is stored in the log.
         routes: of the same configuration.
-        captures: read here, once; what was found in them stands in each.
-        directory: of the log; made if need be.
-        progress: called with the number of units so far, now and then.
+        captures: read here, once; each holds the counts of its units afterwards.
+        directory: of the log; created if necessary.
+        progress: called occasionally with the number of units so far.
 
     Raises:
-        UserError: the log is there already.
+        UserError: the log exists already.
         OSError: it cannot be written; nothing is left of it.
     """
     log: ImportLog | None = None

@@ -1,5 +1,6 @@
-"""An ordinary log, made at the pace of its units' stamps: chunks, statuses and parts follow them as a recorder's
-follow its clock. Captures that are imported and flights of the virtual aircraft become logs so.
+"""Makes an ordinary log at the pace of its units' stamps, for imported captures and flights of the virtual aircraft.
+
+Chunks, statuses and parts follow the stamps as those of a recorder follow its clock.
 """
 
 from __future__ import annotations
@@ -26,19 +27,19 @@ from swath.daemon.log.wires import BLOCK_BYTES, MAX_SENDERS, SILENT_AFTER_S
 from swath.drivers.captures.base import Address
 
 STATUS_NS = 1_000_000_000
-_BEHIND = 1000  # units in a row so far behind the newest: its stamp was the wrong one
+_BEHIND = 1000  # so many units in a row behind the newest stamp prove that stamp wrong
 _NO_DISK_FIGURES = {"queue_high_water": 0, "write_ms_max": 0.0, "sync_ms_max": 0.0}
 
 
 class MadeClock(HostClock):
-    """The time of the unit at hand stands for the time of the recorder."""
+    """A clock that shows the time of the current unit as the recorder's time."""
 
     def __init__(self, realtime_ns: int, monotonic_ns: int) -> None:
         super().__init__(ClockPair(realtime_ns, monotonic_ns, 0))
         self.time_ns = realtime_ns
 
     def now_ns(self) -> int:
-        """Stamp of the latest unit."""
+        """Return the stamp of the latest unit."""
         return self.time_ns
 
 
@@ -54,7 +55,7 @@ class _Run:
 
 @dataclass(slots=True)
 class Source:
-    """A source's channels and account."""
+    """Channels and account of a source."""
 
     port: Port
     channel_ids: dict[Address | None, int] = field(default_factory=dict)
@@ -65,18 +66,18 @@ class Source:
     last_ns: int = 0
 
     def count(self, length: int, now_ns: int) -> None:
-        """One unit more."""
+        """Count one more unit."""
         self.units += 1
         self.bytes += length
         self.last_ns = now_ns
 
 
 class MadeLog:
-    """The log; used by one thread.
+    """A log made from stamped units; used by one thread.
 
     Args:
-        config: stored in the log, and what its devices are.
-        directory: of the log; made if need be.
+        config: describes the devices; it is stored in the log.
+        directory: of the log; created if necessary.
         info: of its session; the first units have its ``realtime_ns`` or later.
         author: the source of the log's own events.
 
@@ -84,7 +85,7 @@ class MadeLog:
         paths: of its parts.
 
     Raises:
-        UserError: a log of this name is there.
+        UserError: a log of this name exists already.
         OSError: the directory cannot be written.
     """
 
@@ -108,28 +109,28 @@ class MadeLog:
         self.paths: list[Path] = []
         self._open_part()
 
-    # ------------------------------------------------------------------ what a kind of log has of its own
+    # ------------------------------------------------------------------ overridden by each kind of log
 
     def count_of(self, source: Source, now_ns: int) -> SourceCount:
-        """Return the account as a recorder's receiver gives it."""
+        """Return the account of a source as a recorder's receiver gives it."""
         silent = now_ns - source.last_ns > SILENT_AFTER_S * 1e9
         state = "silent" if silent else "receiving"
         return SourceCount(units=source.units, bytes=source.bytes, last_unit_ns=source.last_ns, state=state)
 
     def time_status(self, source: str) -> dict[str, object]:
-        """Return what a status says of the source's time; nothing where nobody judged it."""
+        """Return the status entries for the source's time; empty if this kind of log does not judge time."""
         return {}
 
-    # ------------------------------------------------------------------ what goes into it
+    # ------------------------------------------------------------------ units and events
 
     def add_source(self, port: Port) -> Source:
-        """Return a source that gets a status from now on."""
+        """Add a source, which gets a status from now on."""
         source = self.sources[port.source] = Source(port)
         self._account.add_source(port.source)
         return source
 
     def add_unit(self, source: Source, peer: Address | None, now_ns: int, data: bytes) -> None:
-        """One unit, behind `go_on` to its time; ``peer`` is a datagram's sender. Raises OSError."""
+        """Add one unit after `go_on` to its time; ``peer`` is a datagram's sender. Raises OSError."""
         channel_id = source.channel_ids.get(peer) or self._channel(source, peer)
         run, length = source.run, len(data)
         if run is None or run.channel_id != channel_id or run.length != length:
@@ -142,25 +143,25 @@ class MadeLog:
             self._lay_run(source)
 
     def event(self, severity: Severity, code: str, text: str) -> None:
-        """Something to be known of the log as a whole, into it."""
+        """Write an event that concerns the log as a whole."""
         self._parts.add(self.events.make(severity, self._author, code, text))
 
     def lay_told(self) -> None:
-        """Events that were posted since, and messages, into the log."""
+        """Write the messages and events that were posted since the last call."""
         for item in self._told.take_all():
             if item.block is not None:
                 self._parts.add(item.block)
 
     def units(self) -> dict[str, int]:
-        """Return units by source."""
+        """Return the number of units by source."""
         return {name: source.units for name, source in sorted(self.sources.items())}
 
     def bytes_written(self) -> int:
-        """Return size of all parts so far."""
+        """Return the size of all parts so far, in bytes."""
         return self._parts.bytes_written()
 
     def finish(self) -> None:
-        """The last statuses and the index; raises OSError."""
+        """Write the last statuses and the index; raises OSError."""
         self._tell_status()
         self.event(Severity.INFO, "session_ended", f"session {self.info.session_id} ended")
         part = self._parts.release()
@@ -169,7 +170,7 @@ class MadeLog:
         self._parts.remove_sign()
 
     def give_up(self) -> None:
-        """Close and remove what has been written: half a log would look like a whole one."""
+        """Close and remove all written parts, because an incomplete log would look like a whole one."""
         part = self._parts.release()
         if part is not None:
             part.close()
@@ -178,7 +179,11 @@ class MadeLog:
         self._parts.remove_sign()
 
     def go_on(self, now_ns: int) -> None:
-        """What is due at a stamp. The newest counts: stamps of two clocks, years apart, must not be due each time."""
+        """Advance to a stamp, and flush, write statuses and split parts as they become due.
+
+        Only a stamp newer than all before makes anything due: alternating stamps of two clocks, years apart, must not
+        trigger all of it each time.
+        """
         self.clock.time_ns = now_ns
         if now_ns < self._newest_ns - STATUS_NS:
             self._behind += 1
@@ -197,7 +202,7 @@ class MadeLog:
     # ------------------------------------------------------------------ channels, chunks
 
     def _channel(self, source: Source, peer: Address | None) -> int:
-        """Return a channel a sender, and one for all beyond `MAX_SENDERS`, as a recorder has them."""
+        """Return the channel of a sender; all senders beyond `MAX_SENDERS` share one, as in a recorder."""
         if len(source.channel_ids) >= MAX_SENDERS:
             peer = None
         if peer in source.channel_ids:
@@ -229,7 +234,9 @@ class MadeLog:
     # ------------------------------------------------------------------ statuses, parts
 
     def _tell_status(self) -> None:
-        """As the recorder: counts of written chunks, then the statuses, both in the file before anything else."""
+        """Write the statuses as the recorder does: first all open chunks, so that the counts are of written ones, then
+        statuses.
+        """
         self._flush()
         now_ns = self.clock.time_ns
         for name, source in self.sources.items():
@@ -265,7 +272,7 @@ class MadeLog:
 
 
 def refuse_session(directory: Path, session_id: str) -> None:
-    """Refuse a directory that holds a log of this session; raises UserError."""
+    """Refuse a directory that already holds a log of this session; raises UserError."""
     if directory.is_dir():
         there = next(iter(sorted(directory.glob(f"{session_id}_*.mcap"))), None)
         if there is not None:

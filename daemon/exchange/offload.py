@@ -1,4 +1,4 @@
-"""Copies finished logs to another disk and proves each copy by reading it back. Nothing is deleted or overwritten."""
+"""Copies finished logs to another disk and proves each copy by reading it back; it deletes and overwrites nothing."""
 
 from __future__ import annotations
 
@@ -28,20 +28,20 @@ _ESCAPES = {"\\\\": "\\", "\\n": "\n", "\\r": "\r"}
 
 PARTIAL = ".partial"
 BLOCK_BYTES = 4 << 20
-SYNC_BYTES = 64 << 20  # so much is handed to the disk before it is waited for
-SAME_TIME_S = 2.0  # a copy has its log's time, as far as its file system keeps it: FAT does to two seconds
-SIGN_BELIEVED_S = 60.0  # of a file system without locks: a log named as growing is, while it does
+SYNC_BYTES = 64 << 20  # written between two syncs
+SAME_TIME_S = 2.0  # a copy keeps its log's time as exactly as its file system can: FAT to two seconds
+SIGN_BELIEVED_S = 60.0  # without file locks, a log named as growing counts as growing for so long after its last change
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
 
-Progress = Callable[[str, int, int], None]  # name, bytes done, bytes in all: the copy and reading it back
+Progress = Callable[[str, int, int], None]  # name, bytes done, bytes in all, copying and reading back
 
 
 class CopyDiffersError(Exception):
-    """What was read back, or stands there, is not what the log holds; one line."""
+    """A copy that was read back, or that existed already, differs from the log; the message is one line."""
 
 
 class NoRoomError(Exception):
-    """The destination is full; one line."""
+    """The destination is full; the message is one line."""
 
 
 @dataclass(slots=True)
@@ -49,7 +49,7 @@ class Copied:
     """A log whose copy has been read back.
 
     Attributes:
-        resumed_bytes: that an earlier, interrupted run had copied.
+        resumed_bytes: number that an earlier, interrupted run had copied.
     """
 
     name: str
@@ -60,15 +60,15 @@ class Copied:
 
 @dataclass(slots=True)
 class OffloadReport:
-    """What was done, and what was not.
+    """The results of an offload, log by log.
 
     Attributes:
-        there: names of logs whose checked copy was there already.
+        there: names of logs whose checked copy existed already.
         recording: names of logs that are being recorded.
-        left_open: names of copied logs that a crash left open and nobody has repaired.
+        left_open: names of copied logs that a crash left open and that have not been repaired.
         deletable: logs whose copies were read back and agreed.
-        differ, failed: lines, one a log.
-        stopped: why the logs after it were not looked at; "" when all were.
+        differ, failed: lines, one for each log.
+        stopped: the reason why the remaining logs were skipped; "" if none were.
     """
 
     directory: Path
@@ -83,7 +83,7 @@ class OffloadReport:
     stopped: str = ""
 
     def plain(self) -> dict[str, Any]:
-        """For ``--json``."""
+        """Return the report as plain values for ``--json``."""
         return {
             "directory": str(self.directory),
             "destination": str(self.destination),
@@ -109,14 +109,14 @@ def offload(
     same_disk: bool = False,
     progress: Progress | None = None,
 ) -> Generator[OffloadReport, None, None]:
-    """Copy log after log; gives the growing report after each.
+    """Copy log after log; yield the growing report after each.
 
     Args:
         directory: of the logs.
-        destination: a folder that is there, on another disk.
-        verify: read copies that are there already again.
-        same_disk: the destination may be on the logs' own disk.
-        progress: is told how far a log is.
+        destination: an existing folder, on another disk.
+        verify: read existing copies again.
+        same_disk: allow a destination on the logs' own disk.
+        progress: called with the progress of each log.
 
     Raises:
         UserError: the destination cannot be used, or another run is at work there.
@@ -143,25 +143,25 @@ def _sums_of(destination: Path) -> ChecksumList:
 
 
 def _nothing(name: str, done: int, total: int) -> None:
-    """Tells nobody."""
+    """Ignore the progress."""
 
 
 @contextlib.contextmanager
 def _taken(directory: Path, destination: Path, same_disk: bool) -> Iterator[None]:
-    """The destination, for one run at a time."""
+    """Check the destination and lock it against other runs for the duration of the block."""
     if not destination.is_dir():
         raise UserError(f"{destination}: no such directory; is the disk mounted?", ExitCode.IO)
     if destination.samefile(directory):
         raise UserError(f"{destination}: is where the logs are; give a folder on another disk", ExitCode.USAGE)
     if not same_disk and destination.stat().st_dev == directory.stat().st_dev:
-        # the empty folder that another disk is mounted at looks like that disk
+        # if the other disk is not mounted, its empty mount point looks like the disk
         text = f"{destination}: is on the same disk as {directory}; is the other disk mounted?"
         raise UserError(f"{text} --same-disk copies all the same", ExitCode.IO)
     if not os.access(destination, os.R_OK | os.W_OK | os.X_OK):
         raise UserError(f"{destination}: cannot be written: mounted read-only, or not permitted", ExitCode.IO)
     folder = os.open(destination, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
-        with contextlib.suppress(OSError):  # a file system without locks has none to ask for
+        with contextlib.suppress(OSError):  # some file systems have no locks
             try:
                 fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
@@ -210,9 +210,9 @@ def _is_left_open(path: Path) -> bool:
 
 
 def _check_there(path: Path, report: OffloadReport, sums: ChecksumList, verify: bool, progress: Progress) -> None:
-    """A copy is there: it was read back when it was made, or is compared now.
+    """Accept an existing copy: it was read back when it was made, or is compared now.
 
-    One of another time may be of another log with this name, of an import made anew for example.
+    A copy with another time may be a copy of an older log of this name, for example of a repeated import.
     """
     copy, size = report.destination / path.name, path.stat().st_size
     known = sums.sums.get(path.name)
@@ -258,7 +258,11 @@ def _no_room(report: OffloadReport, path: Path, needed: int, free: int) -> str:
 
 
 def _copy_and_read_back(path: Path, partial: Path, progress: Progress) -> tuple[str, int]:
-    """Return SHA-256 of the log and how much of the copy was there; what an interruption left wrong is copied anew."""
+    """Copy a log and read it back; wrong bytes left by an interruption are copied again.
+
+    Returns:
+        SHA-256 of the log, and the number of bytes that an earlier run had copied.
+    """
     digest, resumed = _copy(path, partial, progress)
     size = path.stat().st_size
     for had in (resumed, 0):
@@ -272,7 +276,7 @@ def _copy_and_read_back(path: Path, partial: Path, progress: Progress) -> tuple[
 
 
 def _copy(path: Path, partial: Path, progress: Progress) -> tuple[str, int]:
-    """Copy what the partial copy lacks; the sum is of all that was read of the log."""
+    """Copy the bytes that the partial copy lacks; the checksum covers the whole log."""
     target = os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o640)
     try:
         with path.open("rb", buffering=0) as source:
@@ -304,13 +308,15 @@ def _write(fd: int, data: bytes, at: int) -> None:
 
 
 def _let_go(fd: int) -> None:
-    """Bring to the disk what was written, and give its memory back: the recorder's cache is not to be pushed out."""
+    """Sync the written data and release its memory, so that it does not push the recorder's data out of the
+    page cache.
+    """
     os.fdatasync(fd)
     os.posix_fadvise(fd, 0, 0, os.POSIX_FADV_DONTNEED)
 
 
 def _blocks(fd: int) -> Iterator[bytes]:
-    """Yield a file from its beginning, its memory given back behind."""
+    """Yield a file in blocks and release the memory of each block after its use."""
     at = 0
     while block := os.pread(fd, BLOCK_BYTES, at):
         yield block
@@ -319,7 +325,7 @@ def _blocks(fd: int) -> Iterator[bytes]:
 
 
 def digest_of(path: Path, progress: Callable[[int], None]) -> str:
-    """Return SHA-256 of a file as it is on the disk: what of it was in memory is dropped first; raises OSError."""
+    """Return the SHA-256 of a file as stored on the disk; cached pages of it are dropped first. Raises OSError."""
     digest, done = hashlib.sha256(), 0
     with path.open("rb", buffering=0) as file:
         os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
@@ -331,14 +337,14 @@ def digest_of(path: Path, progress: Callable[[int], None]) -> str:
 
 
 class ChecksumList:
-    """The sums of a folder; lines of others that it holds are kept as they are.
+    """The checksum file of a folder; lines that belong to other files are kept unchanged.
 
     Attributes:
-        sums: hexadecimal SHA-256 by name of the file.
+        sums: hexadecimal SHA-256 by file name.
     """
 
     def __init__(self, folder: Path) -> None:
-        """Read it, if it is there; raises OSError."""
+        """Read the list if it exists; raises OSError."""
         self.path = folder / NAME
         self.sums: dict[str, str] = {}
         self._lines: list[str] = []
@@ -350,7 +356,7 @@ class ChecksumList:
                 self.sums[_plain(name) if escaped else name] = digest
 
     def add(self, name: str, digest: str) -> None:
-        """Add a file's sum and make the list durable; the list on disk is always whole. Raises OSError."""
+        """Add a file's sum and make the list durable; the list on disk is whole at every moment. Raises OSError."""
         line = _line(name, digest)
         self._lines = [old for old in self._lines if not _speaks_of(old, name)] + [line]
         self.sums[name] = digest
@@ -360,12 +366,14 @@ class ChecksumList:
             file.flush()
             os.fsync(file.fileno())
         new.replace(self.path)
-        with contextlib.suppress(OSError):  # not every file system syncs directories
+        with contextlib.suppress(OSError):  # some file systems do not sync directories
             sync_directory(self.path.parent)
 
 
 def _line(name: str, digest: str) -> str:
-    """Return coreutils: a name with a backslash or an end of line is escaped, and the line begins with a backslash."""
+    """Format a line as coreutils does: a name with a backslash or an end of line is escaped, and the line begins with a
+    backslash.
+    """
     escaped = name.replace("\\", "\\\\").replace("\n", "\\n").replace("\r", "\\r")
     return f"{'' if escaped == name else chr(92)}{digest}  {escaped}"
 

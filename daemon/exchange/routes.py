@@ -1,4 +1,4 @@
-"""Which device of a configuration the units of a capture belong to."""
+"""Finds the device of a configuration that the units of a capture belong to."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ class Port:
         source: ``kind/name``, with ``/aux`` for a second port.
         kind: "serial", "can", "udp" or "pps".
         spec: its transport; None for PPS.
-        channel: how its units are described in the log, without a sender.
-        edge: of a PPS source, which edge is the second.
+        channel: its channel in the log, without a sender.
+        edge: of a PPS source, the edge that marks the second.
     """
 
     source: str
@@ -32,7 +32,7 @@ class Port:
 
     @property
     def options(self) -> dict[str, str]:
-        """Of the transport."""
+        """Options of the transport."""
         return self.spec.options if self.spec is not None else {}
 
 
@@ -53,15 +53,15 @@ def _ports(config: Config) -> Iterator[Port]:
 
 @dataclass(slots=True)
 class Routes:
-    """The ports of a configuration, by what a capture says of a unit."""
+    """The ports of a configuration, found by the address or interface that a capture gives for a unit."""
 
     ports: dict[str, Port]
     _udp: dict[int, list[Port]] = field(default_factory=dict)
-    _can: dict[str, Port | None] = field(default_factory=dict)  # None: two buses are called so
+    _can: dict[str, Port | None] = field(default_factory=dict)  # None: two buses share the name
 
     @classmethod
     def of(cls, config: Config) -> Routes:
-        """Return those of a configuration."""
+        """Make the routes of a configuration."""
         routes = cls({port.source: port for port in _ports(config)})
         for port in routes.ports.values():
             if port.spec is not None and port.kind == "udp":
@@ -71,9 +71,11 @@ class Routes:
         return routes
 
     def of_datagram(self, unit: CapturedUnit) -> Port | None:
-        """By the port it was sent to, and by the sender where the configuration wants a certain one.
+        """Return the port that a datagram was sent to; its sender must be the configured one, if the configuration
+        names one.
 
-        Of several sources on one port number, each bound to its own address or group, the receiver's address decides.
+        If several sources on one port number are bound to different addresses or groups, the receiver's address
+        decides.
         """
         assert unit.source is not None
         assert unit.destination is not None
@@ -86,11 +88,11 @@ class Routes:
         return found[0] if found else None
 
     def of_frame(self, unit: CapturedUnit) -> Port | None:
-        """By the interface."""
+        """Return the port of a CAN frame by its interface."""
         return self._can.get(unit.channel)
 
     def described(self, kind: str) -> str:
-        """Return the ports or buses there are, for people."""
+        """List the configured ports or buses for a message."""
         if kind == "pcap":
             return ", ".join(f"{number} ({ports[0].source})" for number, ports in self._udp.items()) or "none"
         return ", ".join(f"{name} ({port.source if port else 'of two'})" for name, port in self._can.items()) or "none"

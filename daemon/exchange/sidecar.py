@@ -1,12 +1,12 @@
-"""What a device's own format cannot hold of a log, in a file beside an exported one: ``FILE.swath.csv.gz``.
+"""Stores what a device's own format cannot hold of a log, in a file beside an exported one: ``FILE.swath.csv.gz``.
 
-Gzipped CSV, a row for every unit of which the file does not say all:
+It is gzipped CSV with a row for every unit that the exported file does not describe completely:
 
     unit      its number in the file, from 0
     time_ns   its log time
-    length    its bytes
-    native    1 where the file has an entry for it (bytes, line, packet), 0 where it has none
-    data      the unit in hexadecimal where the entry gives other bytes; else empty
+    length    its number of bytes
+    native    1 if the file has an entry for it (bytes, line, packet), 0 if not
+    data      the unit in hexadecimal if the entry has other bytes; else empty
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ _MAX_LINE_BYTES = 2 * _MAX_UNIT_BYTES + 100
 
 
 def sidecar_of(path: Path) -> Path:
-    """Return where the sidecar of a file lies, if it has one."""
+    """Return the path of a file's sidecar, whether it exists or not."""
     return path.with_name(path.name + SUFFIX)
 
 
 @dataclass(frozen=True, slots=True)
 class SidecarRow:
-    """What the file cannot say of one unit; see the module's columns."""
+    """One row of a sidecar: the facts about one unit that the exported file lacks; see the module's columns."""
 
     unit: int
     time_ns: int
@@ -45,14 +45,14 @@ class SidecarRow:
 
 
 class SidecarWriter:
-    """Writes the sidecar of a file; one without rows leaves no file behind."""
+    """Writes the sidecar of a file; without rows it creates no file."""
 
     def __init__(self, path: Path) -> None:
         self._path = sidecar_of(path)
         self._stream: gzip.GzipFile | None = None
 
     def add(self, unit: int, time_ns: int, length: int, *, native: bool = True, data: bytes | None = None) -> None:
-        """One row, in the order of the units."""
+        """Write one row, in the order of the units."""
         if self._stream is None:
             self._stream = gzip.GzipFile(self._path, "xb", mtime=0)
             self._stream.write(_HEADER.encode() + b"\n")
@@ -74,10 +74,10 @@ class SidecarWriter:
 
 
 def read_sidecar(path: Path) -> Iterator[SidecarRow]:
-    """Yield the rows of a file's sidecar; none where it has none.
+    """Yield the rows of a file's sidecar; yield nothing if there is no sidecar.
 
     Raises:
-        CaptureDamageError: it is none, or ends early.
+        CaptureDamageError: it is not a sidecar, or ends early.
     """
     sidecar = sidecar_of(path)
     if not sidecar.exists():
@@ -114,15 +114,15 @@ def _row(line: str) -> SidecarRow | None:
 
 
 def complete(units: Iterator[CapturedUnit], path: Path, within_ns: int | None = None) -> Iterator[CapturedUnit]:
-    """Return the units of a file that has an entry a unit, completed by its sidecar.
+    """Return the units of a file that has one entry for each unit, completed by its sidecar.
 
     Args:
         units: as the file has them.
         path: the file.
-        within_ns: how near the file's own stamps are to the true ones; None where they may be any.
+        within_ns: maximum difference between the file's own stamps and the true ones; None allows any.
 
     Raises:
-        CaptureDamageError: the sidecar is not of this file.
+        CaptureDamageError: the sidecar does not belong to this file.
     """
     return _completed(units, path, within_ns) if sidecar_of(path).exists() else units
 
@@ -155,7 +155,7 @@ def cut_by_sidecar(path: Path) -> Iterator[CapturedUnit]:
     """Yield the units of a file of bytes without bounds, whose sidecar has a row for each.
 
     Raises:
-        CaptureDamageError: the sidecar is not of this file.
+        CaptureDamageError: the sidecar does not belong to this file.
     """
     with open_capture(path) as stream:
         for row in read_sidecar(path):

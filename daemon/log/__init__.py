@@ -1,1 +1,1 @@
-"""The log (MCAP): layout, writing, reading, recovery. docs/log-format.md is its public page."""
+"""The log (MCAP): layout, writing, reading and recovery. docs/log-format.md describes the format for users."""

@@ -1,4 +1,4 @@
-"""Where every unit went. For every source, always: units = written + lost_kernel + lost_queue + lost_write."""
+"""Accounts for every unit. For every source, at all times: units = written + lost_kernel + lost_queue + lost_write."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from swath.daemon.log.host_clock import HostClock
 from swath.daemon.log.mcap.encode import EncodedBlock
 from swath.daemon.log.parts import Parts
 
-STUCK_AFTER_S = 5.0  # without an account; a receiver that lives gives four a second while its device is open
+STUCK_AFTER_S = 5.0  # without an account; a working receiver sends four a second while its device is open
 
 TimeStatus = Callable[[str], "dict[str, object]"]
 
 
 class Account:
-    """Joins what the receivers say they took with what the parts say was written; used by the writer thread only.
+    """Compares the units that the receivers took with the units that the parts wrote; used by the writer thread only.
 
     Attributes:
-        counts: the latest account of each source, up to the last block of it that was taken from the queue.
-        unwritten: messages by channel that came while nothing could be written.
+        counts: the latest account of each source, up to its last block that was taken from the queue.
+        unwritten: number of messages by channel that arrived while nothing could be written.
     """
 
     def __init__(
@@ -40,26 +40,26 @@ class Account:
         self._mismatch_told: set[str] = set()
 
     def add_source(self, source: str) -> None:
-        """A source that gets a status."""
+        """Register a source and its status channel."""
         self.note(source, SourceCount())
         self._status_channels[source] = JsonChannel(self._channels, "status", f"/status/{source}", "swath.Status")
 
     def note(self, source: str, count: SourceCount) -> None:
-        """A receiver's account has come."""
+        """Store the latest account of a receiver and the time when it arrived."""
         self.counts[source] = count
         self._heard_ns[source] = self._clock.now_ns()
 
     def statuses(self, common: Mapping[str, object]) -> dict[str, dict[str, object]]:
-        """Return a status a source; ``common`` is what is the same for all: queue and disk."""
+        """Return one status for each source; ``common`` holds the values that all share: queue and disk."""
         return {source: self._status(source, common) for source in self.counts}
 
     def encode(self, statuses: Mapping[str, dict[str, object]]) -> list[EncodedBlock]:
-        """Return the statuses as messages."""
+        """Return the statuses as encoded messages."""
         now_ns = self._clock.now_ns()
         return [self._status_channels[source].encode(now_ns, status) for source, status in statuses.items()]
 
     def lost_write(self) -> int:
-        """Return units of all sources that were not written."""
+        """Return the number of units, over all sources, that were not written."""
         return sum(self._written_and_lost(source)[1] for source in self.counts)
 
     def _written_and_lost(self, source: str) -> tuple[int, int]:

@@ -1,4 +1,6 @@
-"""The one hand-over of the recorder: receive threads put, the writer thread takes. It never blocks a receiver."""
+"""The queue between receive threads, which put blocks in, and the writer thread, which takes them; it blocks no
+receiver.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,7 @@ from swath.daemon.log.mcap.encode import EncodedBlock
 
 @dataclass(frozen=True, slots=True)
 class SourceCount:
-    """A receiver's own account up to and including the block it travels with, cumulative."""
+    """A receiver's cumulative account up to and including the block that it travels with."""
 
     units: int = 0
     bytes: int = 0
@@ -22,12 +24,12 @@ class SourceCount:
     last_unit_ns: int | None = None
     receive_buffer_bytes: int = 0
     state: str = "opening"
-    trouble: Mapping[str, int] = field(default_factory=dict)  # what the wire says of itself, where it is not zero
+    trouble: Mapping[str, int] = field(default_factory=dict)  # error counts of the wire itself, where not zero
 
 
 @dataclass(frozen=True, slots=True)
 class QueueItem:
-    """A block of messages, the account of the receiver it comes from, or both."""
+    """A block of messages, the account of the receiver that sends it, or both."""
 
     source: str
     block: EncodedBlock | None = None
@@ -35,7 +37,9 @@ class QueueItem:
 
 
 class BlockQueue:
-    """First in, first out, bounded in bytes; a block that does not fit is refused and the caller counts it."""
+    """A first-in, first-out queue bounded in bytes; it refuses a block that does not fit, and the caller counts the
+    loss.
+    """
 
     def __init__(self, capacity_bytes: int) -> None:
         self._capacity = capacity_bytes
@@ -45,7 +49,10 @@ class BlockQueue:
         self._lock = threading.Lock()
 
     def put(self, item: QueueItem, *, always: bool = False) -> bool:
-        """Add an item; False when its block does not fit. Items without a block, and events, ``always`` fit."""
+        """Add an item; return False if its block does not fit.
+
+        Items without a block always fit; so do items that are put with ``always``, such as events.
+        """
         size = len(item.block.data) if item.block is not None else 0
         with self._lock:
             if not always and size and self._bytes + size > self._capacity:
@@ -56,7 +63,7 @@ class BlockQueue:
         return True
 
     def take_all(self) -> list[QueueItem]:
-        """Return everything there is, in order."""
+        """Remove and return all items, in order."""
         with self._lock:
             items = list(self._items)
             self._items.clear()
@@ -64,7 +71,7 @@ class BlockQueue:
         return items
 
     def pop_high_water(self) -> int:
-        """Return most bytes held since the last call."""
+        """Return the largest number of bytes held since the last call."""
         with self._lock:
             high_water, self._high_water = self._high_water, self._bytes
         return high_water

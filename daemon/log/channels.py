@@ -1,4 +1,4 @@
-"""Which MCAP channel a unit goes to: ids are the session's and stay the same through all its parts."""
+"""Assigns MCAP channels to sources; channel ids belong to the session and stay the same through all its parts."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from swath.daemon.log.mcap.encode import EncodedBlock, encode_json
 
 @dataclass(slots=True)
 class ChannelTable:
-    """All channels of a session, in the order in which they appeared."""
+    """All channels of a session, in the order in which they were added."""
 
     specs: dict[int, ChannelSpec] = field(default_factory=dict)
     _of_source: dict[str, list[int]] = field(default_factory=dict)
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def add(self, source: str, spec: ChannelSpec) -> int:
-        """Return a new channel of a source; returns its id. MCAP channel ids are 16 bit; 0 is left unused."""
+        """Add a channel to a source and return its id. MCAP channel ids have 16 bits; id 0 is never used."""
         with self._lock:
             channel_id = len(self.specs) + 1
             self.specs[channel_id] = spec
@@ -26,13 +26,13 @@ class ChannelTable:
         return channel_id
 
     def of_source(self, source: str) -> list[int]:
-        """Return ids of a source's channels."""
+        """Return the ids of a source's channels."""
         with self._lock:
             return list(self._of_source.get(source, ()))
 
 
 class JsonChannel:
-    """A JSON topic that several threads may write to; numbers its messages."""
+    """A JSON topic that several threads may write to; it numbers its messages."""
 
     def __init__(self, table: ChannelTable, source: str, topic: str, schema: str) -> None:
         self.channel_id = table.add(source, ChannelSpec(topic, "json", {}, schema, "other"))
@@ -40,7 +40,7 @@ class JsonChannel:
         self._lock = threading.Lock()
 
     def encode(self, log_time_ns: int, value: dict[str, object]) -> EncodedBlock:
-        """Return one message, ready for the writer."""
+        """Encode one message, ready for the writer."""
         with self._lock:
             sequence = self._sequence
             self._sequence += 1

@@ -1,7 +1,7 @@
-"""Where the chunks of a log stand, so that a job reads its own piece of it and nothing else.
+"""Locates the chunks of a log, so that a job reads only the piece of the log that it needs.
 
-A finished part says so in its summary, if its CRC confirms that; one that was cut off, or whose summary is damaged, is
-walked through. What is wrong with a chunk shows when it is read.
+The summary of a finished part gives the places, if its CRC is correct; a part that was cut off, or whose summary is
+damaged, is walked through. Damage inside a chunk is found only when the chunk is read.
 """
 
 from __future__ import annotations
@@ -51,11 +51,11 @@ LOSSES = ("lost_kernel", "lost_queue", "lost_write")
 
 @dataclass(frozen=True, slots=True)
 class ChunkPlace:
-    """A chunk of a session.
+    """The place of one chunk of a session.
 
     Attributes:
         part: index into the session's parts.
-        offset, length: the record in its file, with its head.
+        offset, length: the record in its file, including its head.
         start_ns, end_ns: log times of the first and the last of its messages.
         scanner, other: whether it holds messages of scanners, and of anything else.
     """
@@ -71,7 +71,7 @@ class ChunkPlace:
 
 @dataclass(frozen=True, slots=True)
 class PartChannels:
-    """What a part's messages belong to, by channel and by schema id."""
+    """The channels and schemas of a part, by their ids."""
 
     channels: dict[int, ChannelSpec]
     schemas: dict[int, records.Schema]
@@ -79,10 +79,10 @@ class PartChannels:
 
 @dataclass(slots=True)
 class LogIndex:
-    """A session's chunks in the order of the files; pickles.
+    """The chunks of a session in the order of the files; it can be pickled.
 
     Attributes:
-        damage: what could not be read while the index was made.
+        damage: parts of the files that could not be read while the index was made.
     """
 
     paths: list[Path]
@@ -91,25 +91,25 @@ class LogIndex:
     damage: list[PartDamage] = field(default_factory=list)
 
     def scanner_chunks(self) -> list[ChunkPlace]:
-        """Return those with returns."""
+        """Return the chunks that hold scanner messages."""
         return [chunk for chunk in self.chunks if chunk.scanner]
 
     def between(self, start_ns: int, end_ns: int) -> list[ChunkPlace]:
-        """Return scanner chunks with messages of a span of log time, [start, end)."""
+        """Return the scanner chunks with messages in a span of log time, [start, end)."""
         return [chunk for chunk in self.scanner_chunks() if chunk.start_ns < end_ns and chunk.end_ns >= start_ns]
 
     def spans(self) -> tuple[Int64Array, Int64Array]:
-        """Return first and last log times (n,) of the chunks with returns."""
+        """Return the first and last log times (n,) of the scanner chunks."""
         chunks = self.scanner_chunks()
         return np.array([chunk.start_ns for chunk in chunks]), np.array([chunk.end_ns for chunk in chunks])
 
 
 def index_log(session: Session) -> LogIndex:
-    """Return where a session's chunks stand.
+    """Locate the chunks of a session.
 
     Raises:
-        LogError: a part is no log any more.
-        OSError: it cannot be read.
+        LogError: a part is no longer a log.
+        OSError: a part cannot be read.
     """
     index = LogIndex([part.path for part in session.parts], [], [])
     for number, part in enumerate(session.parts):
@@ -126,7 +126,7 @@ def index_log(session: Session) -> LogIndex:
 def read_chunks(
     index: LogIndex, places: Iterable[ChunkPlace], topics: TopicFilter | None, damage: list[PartDamage]
 ) -> Iterator[LogBatch]:
-    """Yield messages of chunks, in their order; what cannot be read is passed over and stands in ``damage``.
+    """Yield the messages of chunks, in order; a chunk that cannot be read is skipped and listed in ``damage``.
 
     Raises:
         OSError: a file cannot be read.
@@ -166,10 +166,10 @@ def _read_chunk(
 
 
 class Listening(Session):
-    """A session that notes, while somebody else reads it, what the recorder last said of each source.
+    """A session that keeps the latest status of each source while another caller reads it.
 
     Attributes:
-        said: ``/status/…`` by source.
+        said: latest ``/status/…`` message by source.
     """
 
     __slots__ = ("said",)
@@ -179,7 +179,7 @@ class Listening(Session):
         self.said: dict[str, dict[str, Any]] = {}
 
     def batches(self, topics: TopicFilter | None = None, *, skim: bool = False) -> Iterator[LogBatch]:
-        """Yield all messages, as `Session.batches`."""
+        """Yield all messages, as `Session.batches` does, and keep the statuses among them."""
         for batch in super().batches(topics, skim=skim):
             if batch.channel.topic.startswith(STATUS):
                 for _, value in json_objects(batch):
@@ -187,7 +187,7 @@ class Listening(Session):
             yield batch
 
     def lost(self) -> dict[str, int]:
-        """Return units that the recorder lost, by source; none: it says it lost none."""
+        """Return the number of units that the recorder lost, by source; sources without losses are left out."""
         counts = {
             source: sum(value for key in LOSSES if isinstance(value := said.get(key), int))
             for source, said in self.said.items()
@@ -195,11 +195,11 @@ class Listening(Session):
         return {source: count for source, count in counts.items() if count}
 
 
-# ---------------------------------------------------------------------- a part that was finished
+# ---------------------------------------------------------------------- a finished part
 
 
 def _from_summary(file: BinaryIO, size: int, part: int) -> tuple[PartChannels, list[ChunkPlace]] | None:
-    """Return channels and chunks as the summary has them; None where there is no whole one."""
+    """Return the channels and chunks that the summary lists; None if there is no intact summary."""
     file.seek(max(0, size - _TAIL.size))
     tail = file.read(_TAIL.size)
     if len(tail) < _TAIL.size:
@@ -225,7 +225,7 @@ def _from_summary(file: BinaryIO, size: int, part: int) -> tuple[PartChannels, l
 
 
 def _follow_each_other(indexes: Sequence[records.ChunkIndex], size: int) -> bool:
-    """And lie in a file of so many bytes."""
+    """Return True if the chunks follow each other without overlap and lie within a file of ``size`` bytes."""
     at = 0
     for index in indexes:
         if index.chunk_start_offset < at or not index.message_index_offsets:
@@ -270,7 +270,7 @@ def _from_walk(
 
 
 def _place_of(record: Record, part: int, known: PartChannels) -> Iterator[ChunkPlace]:
-    """Yield the place of an unpacked chunk; nothing where no message of it can be used."""
+    """Yield the place of an unpacked chunk; yield nothing if none of its messages can be used."""
     place: ChunkPlace | None = None
     for batch in chunk_batches(record.body, known.channels, known.schemas, None, Counter()):
         start_ns, end_ns = int(batch.log_time_ns.min()), int(batch.log_time_ns.max())

@@ -1,4 +1,4 @@
-"""Which logs are being written right now: a writer holds a lock on its file until it closes it, or ends in any way."""
+"""Marks logs that are being written: a writer holds a lock on its file until it closes the file or its process ends."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ _TRIES, _PAUSE_S = 20, 0.001
 
 
 def claim(fd: int) -> bool:
-    """Lock a file for as long as it is open; False where somebody else holds it.
+    """Lock a file for as long as it stays open; return False if another process holds the lock.
 
-    Where a file system has no locks, nobody can ask either. Somebody who asks at this moment holds it for an instant
-    himself, so it is tried again, for 20 ms at most.
+    On a file system without locks this returns True, since no process can check there. A process that only checks holds
+    the lock for an instant, so the attempt is repeated for 20 ms at most.
     """
     for _ in range(_TRIES):
         try:
@@ -29,7 +29,7 @@ def claim(fd: int) -> bool:
 
 
 def stands_at(fd: int, path: Path) -> bool:
-    """Return whether a path names the very file that is open."""
+    """Return whether a path still names the file that is open as ``fd``."""
     try:
         there, mine = os.stat(path), os.fstat(fd)
     except OSError:
@@ -38,7 +38,7 @@ def stands_at(fd: int, path: Path) -> bool:
 
 
 def is_being_written(path: Path) -> bool:
-    """Return whether some process holds the claim on a log."""
+    """Return whether a process holds the lock on a log."""
     try:
         fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     except OSError:

@@ -1,4 +1,4 @@
-"""Where a recorder's things lie, for the commands that talk to one or look at what it writes."""
+"""Finds, locks and describes log directories, for commands that talk to a recorder or look at its files."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _WANTED = "give the log directory or a configuration file"
 
 
 def log_directory(where: Path) -> Path:
-    """Return the log directory that a command's CONFIG or DIR means.
+    """Return the log directory that a command's CONFIG or DIR argument means.
 
     Raises:
         ConfigError: the configuration is wrong.
@@ -35,7 +35,7 @@ def log_directory(where: Path) -> Path:
             raise UserError(f"{directory}: no such directory, so no recorder has written there", ExitCode.IO)
     except PermissionError as error:
         raise UserError(f"{error.filename}: not permitted; {_WHO_MAY}", ExitCode.IO) from error
-    except OSError as error:  # a note in the place of a path is longer than a name may be
+    except OSError as error:  # a sentence given instead of a path can be longer than a file name may be
         raise UserError(f"{where}: {error.strerror}; {_WANTED}", ExitCode.USAGE) from error
     except ConfigError as error:
         if where.suffix == ".toml":
@@ -47,7 +47,7 @@ def log_directory(where: Path) -> Path:
 
 
 def nearest_there(directory: Path) -> tuple[Path, bool]:
-    """Of a directory and its parents the nearest that is there, and whether this user may see what lies in it."""
+    """Return the nearest existing folder among a directory and its parents, and whether this user may look into it."""
     permitted = True
     for path in (directory, *directory.parents):
         try:
@@ -62,11 +62,11 @@ def nearest_there(directory: Path) -> tuple[Path, bool]:
 
 
 def take_directory(directory: Path, key: str = "session.directory") -> int:
-    """Create the log directory if need be and lock it; returns the lock's descriptor, which must stay open.
+    """Create the log directory if necessary and lock it; return the lock's descriptor, which must stay open.
 
     Args:
         directory: of logs.
-        key: what says so, for people.
+        key: the configuration key or option that names the directory, for messages.
 
     Raises:
         UserError: it cannot be written, or another recorder is at work in it.
@@ -86,10 +86,10 @@ def take_directory(directory: Path, key: str = "session.directory") -> int:
 
 
 def keep_directory(directory: Path, lock: int) -> None:
-    """Lock a directory anew that was removed and made anew since; the descriptor stays the same.
+    """Lock a directory again that was removed and recreated; the descriptor stays the same.
 
     Raises:
-        BlockingIOError: another recorder has come first.
+        BlockingIOError: another recorder has locked it first.
         OSError: it cannot be locked.
     """
     with contextlib.suppress(FileNotFoundError):
@@ -101,10 +101,10 @@ def keep_directory(directory: Path, lock: int) -> None:
 
 
 def _give_to_owner_of(directory: Path, fd: int) -> None:
-    """Root's lock would else keep the directory's owner, the service, from recording there for good."""
+    """Give root's lock file to the owner of the directory; the service could otherwise never record there again."""
     own, there = os.fstat(fd), directory.stat()
-    if os.geteuid() == 0 and stat.S_ISREG(own.st_mode) and own.st_nlink == 1:  # no other file under this name
-        with contextlib.suppress(PermissionError):  # a file system without owners
+    if os.geteuid() == 0 and stat.S_ISREG(own.st_mode) and own.st_nlink == 1:  # a hard link may name another file
+        with contextlib.suppress(PermissionError):  # some file systems have no owners
             os.fchown(fd, there.st_uid, there.st_gid)
 
 

@@ -1,4 +1,4 @@
-"""What survives a power cut only when it is asked for."""
+"""Makes files and directory entries survive a power cut."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ if _sync_file_range is not None:
 
 
 def begin_writing_out(fd: int, offset: int, length: int) -> None:
-    """Have the kernel begin to write bytes to the disk, so that a later fdatasync(2) has little left to wait for.
+    """Ask the kernel to start writing bytes to the disk, so that a later fdatasync(2) has little left to wait for.
 
-    A hint (sync_file_range(2)): nothing is durable by it, and where it is refused nothing is lost.
+    This is a hint (sync_file_range(2)): it makes nothing durable, and a refusal does no harm.
     """
     if _sync_file_range is not None:
         _sync_file_range(fd, offset, length, _SYNC_FILE_RANGE_WRITE)
 
 
 def sync_directory(directory: Path) -> None:
-    """Make a directory's entries durable: a new file is lost with its name, however well it was synced itself.
+    """Make a directory's entries durable: a new file is lost if its name is lost, even if its content was synced.
 
     Raises:
         OSError: the directory cannot be opened or synced.
@@ -32,13 +32,13 @@ def sync_directory(directory: Path) -> None:
 
 
 def try_sync_directory(directory: Path) -> None:
-    """As `sync_directory`, as far as the file system does it: not every one syncs directories."""
+    """Sync a directory like `sync_directory`, but ignore errors, because some file systems do not sync directories."""
     with contextlib.suppress(OSError):
         sync_directory(directory)
 
 
 def sync_file(path: Path) -> None:
-    """Make durable what somebody wrote to a file.
+    """Make durable what any process has written to a file.
 
     Raises:
         OSError: it cannot be opened or synced.
@@ -47,7 +47,7 @@ def sync_file(path: Path) -> None:
 
 
 def sync_tree(folder: Path) -> None:
-    """Make durable all files below a folder, and their names; raises OSError."""
+    """Make all files below a folder and their names durable; raises OSError."""
     for path in folder.rglob("*"):
         if path.is_dir():
             try_sync_directory(path)

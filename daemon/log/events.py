@@ -1,4 +1,4 @@
-"""Events: what happened, once, as it happened, into the log and to the service's journal."""
+"""Sends events, each once and at the time it happens, to the log and to the service's journal."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ log = logging.getLogger("swath")
 
 
 class Severity(StrEnum):
-    """How much an event matters to the flight."""
+    """The importance of an event for the flight."""
 
     INFO = "info"
     WARNING = "warning"
@@ -33,7 +33,7 @@ _LOG_LEVEL = {
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """One message of ``/events``."""
+    """One event, as a message of ``/events``."""
 
     time_ns: int
     severity: Severity
@@ -43,7 +43,7 @@ class Event:
 
 
 class Events:
-    """Takes events from every thread, logs them and hands them to the recorder."""
+    """Takes events from every thread, logs them and passes them to the recorder."""
 
     def __init__(self, clock: HostClock, queue: BlockQueue, channels: ChannelTable) -> None:
         self._clock = clock
@@ -52,7 +52,7 @@ class Events:
         self.channel_id = self._channel.channel_id
 
     def post(self, severity: Severity, source: str, code: str, text: str) -> Event:
-        """Report an event; ``source`` is kind/name, or what else it happened to (``recorder``, ``disk``)."""
+        """Report an event; ``source`` is kind/name, or another subject of the event (``recorder``, ``disk``)."""
         event = self._note(severity, source, code, text)
         self._queue.put(QueueItem("events", self._encode(event)), always=True)
         return event

@@ -1,6 +1,6 @@
-"""Follows a log that is being written: its chunks as they become whole, then the next part, then the next session.
+"""Follows a log that is being written: each chunk as it becomes complete, then the next part, then the next session.
 
-Only files are read, a chunk in memory at a time; the recorder does not notice.
+It only reads files and holds one chunk in memory at a time; the recorder is not affected.
 """
 
 from __future__ import annotations
@@ -29,28 +29,28 @@ from swath.daemon.log.mcap.scan import (
 )
 from swath.daemon.log.parts import Sign, read_sign
 
-EVENT_CHUNKS = 100  # of a part, the latest: what is shown of the time before the following began
+EVENT_CHUNKS = 100  # latest chunks of a part whose events are shown for the time before following began
 _HEAD = struct.Struct("<BQ")
-_PEEK_BYTES = _HEAD.size + 16  # of a chunk: first and last time; of an index: its channel
+_PEEK_BYTES = _HEAD.size + 16  # reaches a chunk's first and last time, and a message index's channel
 _EVENTS = "/events"
 
 
 class PartFollower:
-    """One file, growing or not: gives the messages of every chunk that has become whole, once.
+    """Follows one file, growing or not; it gives the messages of every chunk once, when the chunk has become complete.
 
     Attributes:
-        info, number: of its session.
-        attachments: those that stand before its first chunk: the recorder writes them all there.
-        ended: its data has come to its end, nothing more will be written.
-        damaged: chunks that could not be read.
+        info, number: session and part number.
+        attachments: those before its first chunk; the recorder writes them all there.
+        ended: the data section is complete; nothing more will be written.
+        damaged: number of chunks that could not be read.
         newest_ns: log time of the newest message so far.
     """
 
     def __init__(self, path: Path) -> None:
-        """Open it and read what stands before the first chunk.
+        """Open the file and read the records before the first chunk.
 
         Raises:
-            LogError: it does not begin as a log of ours, or not yet.
+            LogError: the file does not begin as a swath log, or its beginning is not yet complete.
             OSError: it cannot be read.
         """
         self.path = path
@@ -99,8 +99,8 @@ class PartFollower:
         return os.fstat(self._file.fileno()).st_size
 
     def _whole_record(self) -> tuple[int, int] | None:
-        """Return opcode and length of the record to come, once all of it is there; what cannot be one is passed
-        over.
+        """Return opcode and length of the next record once it is complete, else None; bytes that cannot be a record are
+        skipped.
         """
         head = self._pread(self._at, _HEAD.size)
         if len(head) < _HEAD.size:
@@ -138,11 +138,11 @@ class PartFollower:
             self.damaged += 1
 
     def tail(self, seconds: float) -> Iterator[LogBatch]:
-        """Go to the end: the latest events of what is passed over, then all messages of the last ``seconds``.
+        """Go to the end: yield the latest events of the skipped part, then all messages of the last ``seconds``.
 
-        Heads of chunks and of their indexes are looked at, nothing else is read of what lies before.
+        Of the skipped part, only the heads of chunks and of message indexes and the chunks with those events are read.
         """
-        chunks: deque[tuple[int, int]] = deque()  # place and last time of those within the last seconds
+        chunks: deque[tuple[int, int]] = deque()  # place and last time of the chunks within the last seconds
         with_events: deque[int] = deque(maxlen=EVENT_CHUNKS)
         chunk_at, events_id = self._at, None
         while (head := self._whole_record()) is not None and head[0] != OP_DATA_END:
@@ -167,21 +167,27 @@ class PartFollower:
         yield from self.batches()
 
     def _learn_events(self, at: int, length: int) -> int | None:
-        """Return id of the channel of events, if this chunk has it: a part's first one has."""
+        """Return the id of the events channel if this chunk has it; the first chunk of a part does."""
         ids = [batch.channel_id for batch in self._chunk(at, length) if batch.channel.topic == _EVENTS]
         return ids[0] if ids else None
 
 
 class LogFollower:
-    """Follows what is recorded in a directory, from part to part and from session to session.
+    """Follows a recording in a directory, from part to part and from session to session.
 
     Attributes:
-        part: the file that is read; None: nothing was recorded since the following began.
-        sign: what the directory says is growing; None: nothing.
+        part: the file being read; None if nothing has been recorded since following began.
+        sign: content of the directory's ``recording.json``, which names the growing file; None if there is none.
     """
 
     def __init__(self, directory: Path, tail_s: float, *, every_part: bool = True) -> None:
-        """``tail_s``: how much of a log that is there already is read; ``every_part``: even of those long finished."""
+        """Prepare to follow a directory.
+
+        Args:
+            directory: of logs.
+            tail_s: how much of an already existing log is read.
+            every_part: also read parts that were finished before the follower reached them.
+        """
         self.part: PartFollower | None = None
         self.sign: Sign | None = None
         self._directory = directory
@@ -190,7 +196,7 @@ class LogFollower:
         self._waited = False
 
     def poll(self) -> Iterator[LogBatch]:
-        """Yield all that has become readable since the last call."""
+        """Yield all messages that have become readable since the last call."""
         self.sign = read_sign(self._directory)
         if self.part is None:
             if self.sign is not None:
@@ -204,11 +210,11 @@ class LogFollower:
             self._waited = False
         elif self.part.ended or (self._waited and not got):
             yield from self._go_on(self.part, self.sign)
-        else:  # a part that was left open by a crash: what it still holds comes first
+        else:  # a crash may have left the part open: first give the messages that it still holds
             self._waited = True
 
     def _go_on(self, part: PartFollower, sign: Sign) -> Iterator[LogBatch]:
-        """Yield the session's next part, where it is wanted and there; else what is growing now."""
+        """Yield from the session's next part if it is wanted and exists, else from the file that is growing now."""
         following = self._directory / f"{part.info.session_id}_{part.number + 1}.mcap"
         if sign.path == following or (self._every_part and part.ended and os.path.exists(following)):
             yield from self._open(following, tail=False)
@@ -219,13 +225,13 @@ class LogFollower:
         try:
             part = PartFollower(path)
         except (LogError, OSError):
-            return  # not yet begun, or gone again: the next look tells
+            return  # not yet begun, or already removed: the next poll decides
         if self.part is not None:
             self.part.close()
         self.part, self._waited = part, False
         yield from part.tail(self._tail_s) if tail else part.batches()
 
     def close(self) -> None:
-        """Close the file."""
+        """Close the file that is being read."""
         if self.part is not None:
             self.part.close()

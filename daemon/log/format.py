@@ -1,4 +1,4 @@
-"""Names and layouts of the log: topics, schemas, session metadata, attachment names. docs/log-format.md in code."""
+"""Defines names and layouts of the log as in docs/log-format.md: topics, schemas, session metadata, attachments."""
 
 from __future__ import annotations
 
@@ -22,12 +22,14 @@ CHUNK_CLASSES: tuple[ChunkClass, ...] = ("scanner", "other")
 
 
 class LogError(Exception):
-    """Something is not a log of ours, or cannot be read as one; one line: what, where."""
+    """A file is not a swath log, or cannot be read as one; the message is one line that names the problem and the
+    place.
+    """
 
 
 @dataclass(frozen=True, slots=True)
 class ChannelSpec:
-    """A channel as the log describes it.
+    """A channel as described in the log.
 
     Attributes:
         topic: ``/gnss/rover/raw`` …
@@ -46,7 +48,7 @@ class ChannelSpec:
 
 @dataclass(frozen=True, slots=True)
 class SessionInfo:
-    """``swath.session``: what ties the parts together, and host time to the clocks of the computer.
+    """Content of ``swath.session``: it ties the parts together, and host time to the clocks of the computer.
 
     Attributes:
         realtime_ns, monotonic_ns: one reading of both clocks; log_time = monotonic + (realtime_ns − monotonic_ns).
@@ -63,7 +65,7 @@ class SessionInfo:
     origin: str | None = None
 
     def to_metadata(self, part: int) -> dict[str, str]:
-        """As the metadata record of a part."""
+        """Return the metadata record of a part."""
         values = {
             "session_id": self.session_id,
             "part": str(part),
@@ -80,7 +82,7 @@ class SessionInfo:
         """Read a metadata record: the session and the number of the part.
 
         Raises:
-            LogError: a key is missing or no number.
+            LogError: a key is missing or is not a number.
         """
         try:
             info = cls(
@@ -161,10 +163,10 @@ SCHEMA_IDS: dict[str, int] = {name: number for number, name in enumerate(SCHEMAS
 
 
 def safe_attachment_path(folder: Path, name: str) -> Path:
-    """Return where an attachment may be written: below ``folder``.
+    """Return the path below ``folder`` where an attachment may be written.
 
     Raises:
-        LogError: the name is a path out of the folder.
+        LogError: the name would lead out of the folder.
     """
     parts = PurePosixPath(name).parts
     if not parts or name.startswith("/") or ".." in parts or "\\" in name or "\0" in name:
@@ -173,7 +175,9 @@ def safe_attachment_path(folder: Path, name: str) -> Path:
 
 
 def source_of_topic(topic: str) -> str | None:
-    """Return ``/scanner/left/aux/raw`` → ``scanner/left/aux``; ``/pps/main`` → ``pps/main``; None for the rest."""
+    """Return the source of a topic: ``/scanner/left/aux/raw`` → ``scanner/left/aux``; ``/pps/main`` → ``pps/main``;
+    else None.
+    """
     if topic.startswith("/pps/"):
         return topic[1:]
     return topic[1 : -len("/raw")] if topic.endswith("/raw") else None

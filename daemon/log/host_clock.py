@@ -1,4 +1,4 @@
-"""Host time of a session: CLOCK_MONOTONIC plus a constant, and kernel stamps brought onto it.
+"""Computes the host time of a session, CLOCK_MONOTONIC plus a constant, and converts kernel stamps to it.
 
 The rules are those of docs/log-format.md, "Time stamps": a step of the wall clock never moves a log_time.
 """
@@ -15,15 +15,15 @@ import numpy as np
 from swath.georef.records import Int64Array
 
 STEP_NOTICED_NS = 50_000  # a change of REALTIME − MONOTONIC beyond this is a step of the wall clock
-LATER_NS = 1_000_000_000  # a stamp so much later than its reading is of a clock that was stepped on, and back meanwhile
-NEARER = 10  # a step that misses by a tenth of what the other does is the right one
-_BRACKET_NS = 20_000  # two MONOTONIC reads around one of REALTIME, no further apart, bound its error to half of this
+LATER_NS = 1_000_000_000  # a stamp later by more comes from a clock that was stepped forward and back meanwhile
+NEARER = 10  # a step whose misfit is below a tenth of the other's is the right one
+_BRACKET_NS = 20_000  # two MONOTONIC reads this close around one of REALTIME bound its error to half of this
 _BRACKET_TRIES = 8
 
 
 @dataclass(frozen=True, slots=True)
 class ClockPair:
-    """REALTIME and MONOTONIC at one instant, good to half of ``width_ns``."""
+    """REALTIME and MONOTONIC at one instant, accurate to half of ``width_ns``."""
 
     realtime_ns: int
     monotonic_ns: int
@@ -31,15 +31,15 @@ class ClockPair:
 
     @property
     def offset_ns(self) -> int:
-        """REALTIME − MONOTONIC."""
+        """Difference REALTIME − MONOTONIC in nanoseconds."""
         return self.realtime_ns - self.monotonic_ns
 
 
 def _bracketed(read: Callable[[], int]) -> tuple[int, int, int]:
-    """Return another clock's time, MONOTONIC at that instant and how far apart the reads around it were, in
+    """Return another clock's time, MONOTONIC at that instant, and the distance of the MONOTONIC reads around it, in
     nanoseconds.
 
-    The tightest of a few readings, so that a preempted one does not look like a step.
+    The closest of a few readings is used, so that a preempted reading does not look like a clock step.
     """
     best: tuple[int, int, int] | None = None
     for _ in range(_BRACKET_TRIES):
@@ -55,12 +55,12 @@ def _bracketed(read: Callable[[], int]) -> tuple[int, int, int]:
 
 
 def read_clock_pair() -> ClockPair:
-    """Return REALTIME beside MONOTONIC, by the tightest of a few readings."""
+    """Return REALTIME beside MONOTONIC, from the closest of a few readings."""
     return ClockPair(*_bracketed(time.time_ns))
 
 
 class HostClock:
-    """Host time of one session, fixed when it is made."""
+    """Host time of one session, fixed when the object is made."""
 
     def __init__(self, start: ClockPair | None = None) -> None:
         pair = start if start is not None else read_clock_pair()
@@ -69,19 +69,19 @@ class HostClock:
         self.offset_ns = pair.offset_ns
 
     def now_ns(self) -> int:
-        """Return host time now."""
+        """Return the host time now."""
         return time.monotonic_ns() + self.offset_ns
 
     def step_ns(self, pair: ClockPair) -> int:
-        """Return how far the wall clock has been stepped since the session's start."""
+        """Return by how much the wall clock has been stepped since the session's start."""
         return pair.offset_ns - self.offset_ns
 
 
 class StampConverter:
-    """Brings one channel's kernel stamps (CLOCK_REALTIME) to host time, across steps of the wall clock.
+    """Converts one channel's kernel stamps (CLOCK_REALTIME) to host time, across steps of the wall clock.
 
     Attributes:
-        ambiguous: stamps that neither the old nor the new step could place; their read time was taken.
+        ambiguous: number of stamps that neither the old nor the new step could place; their read time was used.
     """
 
     def __init__(self, clock: HostClock) -> None:
@@ -91,10 +91,10 @@ class StampConverter:
         self.ambiguous = 0
 
     def convert_at(self, stamps_ns: Int64Array | None, count: int, pair: ClockPair) -> Int64Array:
-        """Return host times of the units of a batch.
+        """Return the host times of the units of a batch.
 
         Args:
-            stamps_ns: (n,) CLOCK_REALTIME stamps, 0 where a unit came without; None where the transport has none.
+            stamps_ns: (n,) CLOCK_REALTIME stamps, 0 for a unit without a stamp; None if the transport has no stamps.
             count: n.
             pair: the clocks as they were read after the batch.
         """
@@ -117,12 +117,12 @@ class StampConverter:
         self, stamps_ns: Int64Array, old_step: int, new_step: int, previous_read_ns: int, read_ns: int
     ) -> Int64Array:
         by_old, by_new = stamps_ns - old_step, stamps_ns - new_step
-        # The reading after the batch and the stamps are of different clocks' reads: half a noticed step of slack.
+        # The clock reading after the batch and the stamps come from different reads: allow half a noticed step.
         earliest, latest = previous_read_ns - STEP_NOTICED_NS // 2, read_ns + STEP_NOTICED_NS // 2
         old_misses = np.maximum(0, np.maximum(earliest - by_old, by_old - latest))
         new_misses = np.maximum(0, np.maximum(earliest - by_new, by_new - latest))
-        # A unit that came between the previous batch and the reading after it lies before that reading: on a busy
-        # machine by milliseconds, where the other step misses by nearly the whole step.
+        # A unit that arrived between the previous batch and the clock reading after it lies before that reading, on a
+        # busy machine by milliseconds; the wrong step misses by nearly the whole step.
         decided = (old_misses == 0) != (new_misses == 0)
         decided |= np.minimum(old_misses, new_misses) * NEARER < np.maximum(old_misses, new_misses)
         undecided = ~decided & (stamps_ns != 0)
@@ -166,7 +166,7 @@ _libc = ctypes.CDLL(None, use_errno=True)
 
 @dataclass(frozen=True, slots=True)
 class ClockDiscipline:
-    """What adjtimex(2) says of the wall clock."""
+    """The state of the wall clock according to adjtimex(2)."""
 
     frequency_ppm: float
     status: int
@@ -174,7 +174,7 @@ class ClockDiscipline:
 
     @property
     def disciplined(self) -> bool:
-        """The kernel believes that somebody keeps this clock right to within half a second."""
+        """True if the kernel reports that a service keeps this clock right to within half a second."""
         return not self.status & STA_UNSYNC and self.max_error_s < 0.5
 
 
@@ -193,11 +193,12 @@ def _read_raw_ns() -> int:
 def read_clock_sample(discipline: ClockDiscipline) -> dict[str, int | float]:
     """Return one message of ``/clock``: the three clocks side by side and adjtimex's frequency and status.
 
-    And, where the wall clock is kept, its greatest error: then it may name a second, here and when the log is read.
+    If the wall clock is disciplined, the message also has its maximum error; the clock may then determine which second
+    it is, both now and when the log is read.
     """
     pair = read_clock_pair()
     raw, at_ns, _ = _bracketed(_read_raw_ns)
-    shift = at_ns - pair.monotonic_ns  # raw was read a little later: bring it to the pair's instant
+    shift = at_ns - pair.monotonic_ns  # raw was read a little later: move it to the instant of the pair
     sample: dict[str, int | float] = {
         "realtime_ns": pair.realtime_ns,
         "monotonic_ns": pair.monotonic_ns,

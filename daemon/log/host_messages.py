@@ -1,4 +1,4 @@
-"""Reads the messages that the recorder itself writes: clock readings and PPS edges."""
+"""Decodes the messages that the recorder itself writes: clock readings and PPS edges."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ from typing import Any
 from swath.daemon.log.mcap.chunks import LogBatch, json_objects
 from swath.georef.records import PpsEdge
 
-MAX_NS = 1 << 62  # of a stranger's clocks, in either direction
+MAX_NS = 1 << 62  # limit for the clock values of a foreign log, in either direction
 
 
 def readings_of(batch: LogBatch) -> Iterator[tuple[int, int, int, float]]:
-    """Yield realtime_ns, monotonic_ns, monotonic_raw_ns and max_error_s (inf: unsaid) of ``/clock``; none is left
-    out.
+    """Yield realtime_ns, monotonic_ns, monotonic_raw_ns and max_error_s (inf if absent) of ``/clock`` messages.
+
+    Messages without three valid times are skipped.
     """
     for _, value in json_objects(batch):
         realtime_ns, monotonic_ns = _time_of(value.get("realtime_ns")), _time_of(value.get("monotonic_ns"))
@@ -29,7 +30,7 @@ def _error_of(value: Any) -> float:
 
 
 def edges_of(batch: LogBatch, edge: str) -> Iterator[PpsEdge | None]:
-    """Yield edges of ``/pps/<name>`` of the polarity wanted; None for what is none."""
+    """Yield the edges of ``/pps/<name>`` that have the wanted polarity, and None for every other message."""
     for _, value in json_objects(batch):
         time_ns, sequence = _time_of(value.get("edge_time_ns")), _time_of(value.get("sequence", 0))
         wanted = value.get("edge", edge) == edge
@@ -37,5 +38,5 @@ def edges_of(batch: LogBatch, edge: str) -> Iterator[PpsEdge | None]:
 
 
 def _time_of(value: Any) -> int | None:
-    """Return a whole number that can be a time; None for anything else that a stranger's log may say."""
+    """Return a whole number that can be a time; None for any other value that a foreign log may hold."""
     return value if isinstance(value, int) and not isinstance(value, bool) and abs(value) < MAX_NS else None

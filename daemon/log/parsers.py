@@ -1,4 +1,4 @@
-"""The parsers of a log's sources, made from the configuration and files that are stored in the log itself."""
+"""Makes the parsers of a log's sources from the configuration and files that the log itself stores."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from swath.georef.toml_tables import TomlError, toml_tables
 
 
 def stored_config(attachments: Mapping[str, bytes]) -> Config | None:
-    """Return the configuration as it was used; None where the log has none.
+    """Return the configuration that was used for the recording; None if the log has none.
 
     Raises:
-        LogError: it is none of this version's.
+        LogError: it is not a configuration of this version.
     """
     stored = attachments.get("config.toml")
     if stored is None:
@@ -33,13 +33,13 @@ def stored_config(attachments: Mapping[str, bytes]) -> Config | None:
 
 
 def stored_drivers(attachments: Mapping[str, bytes]) -> tuple[dict[str, Callable[[], Parser]], list[str]]:
-    """Return what makes a source's parser, by source (``kind/name``), and a line for what cannot be known.
+    """Return callables that make each source's parser, by source (``kind/name``), and a line for each obstacle.
 
-    The callables raise DriverSettingsError where the settings are none that the driver can work with.
+    The callables raise DriverSettingsError if the driver cannot work with the settings.
     """
     try:
         config = stored_config(attachments)
-    except LogError as error:  # another version's: what is in the log still counts
+    except LogError as error:  # of another version: the units in the log can still be counted
         return {}, [f"{error}; units are counted, not decoded"]
     if config is None:
         return {}, ["the log holds no configuration: units are counted, not decoded"]
@@ -57,7 +57,7 @@ def stored_drivers(attachments: Mapping[str, bytes]) -> tuple[dict[str, Callable
 
 
 def stored_parsers(attachments: Mapping[str, bytes]) -> tuple[dict[str, Parser], list[str]]:
-    """Return a parser a source (``kind/name``), and a line for every source that has none."""
+    """Return a parser for each source (``kind/name``), and a line for every source that has none."""
     makers, troubles = stored_drivers(attachments)
     parsers: dict[str, Parser] = {}
     for source, make in makers.items():

@@ -1,4 +1,6 @@
-"""The files of a session: one part after the other, each complete in itself, and the sign of which one is growing."""
+"""Manages the files of a session, one part after the other, each complete in itself, and the sign of the
+growing one.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,7 @@ from swath.daemon.log.mcap.writer import PartWriter
 
 RECORDING_SIGN = "recording.json"
 _MOST_SIGN_BYTES = 4096
-_NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,200}")  # of a session or a part, as the recorder makes them
+_NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,200}")  # names of sessions and parts as the recorder makes them
 _DROP_CACHE_AFTER_S = 60.0
 
 
@@ -36,7 +38,7 @@ class Attachment:
 
 @dataclass(frozen=True, slots=True)
 class Sign:
-    """What ``recording.json`` says: which file of a directory is growing."""
+    """Content of ``recording.json``, which names the growing file of a directory."""
 
     session_id: str
     part: int
@@ -45,7 +47,7 @@ class Sign:
 
 
 def read_sign(directory: Path) -> Sign | None:
-    """Return the sign of a directory; None where nothing is being recorded, or it is none of ours."""
+    """Return the sign of a directory; None if nothing is being recorded, or the file is not a sign of swath."""
     try:
         with (directory / RECORDING_SIGN).open("rb") as file:
             said = json.loads(file.read(_MOST_SIGN_BYTES))
@@ -59,10 +61,10 @@ def read_sign(directory: Path) -> Sign | None:
 
 @dataclass(slots=True)
 class Parts:
-    """Opens parts, lays blocks into the current one and counts what was written and lost over all of them.
+    """Opens parts, adds blocks to the current one and counts written and lost messages over all of them.
 
     Attributes:
-        lock: descriptor of the directory's lock; None: it is not locked.
+        lock: descriptor of the directory's lock; None if it is not locked.
         written, lost: messages by channel in all parts closed so far; `total_written` adds the current one's.
     """
 
@@ -82,10 +84,10 @@ class Parts:
     _finished: deque[tuple[float, Path]] = field(default_factory=deque)
 
     def open_next(self, log_time_ns: int) -> PartWriter | None:
-        """Open the next part, with session and attachments, and say in ``recording.json`` that it is growing.
+        """Open the next part, with session and attachments, and record in ``recording.json`` that it is growing.
 
         Returns:
-            The part that was current, its counts kept; the caller finishes it.
+            The previously current part, whose counts are kept; the caller finishes it.
 
         Raises:
             OSError: it cannot be created; the current part stays, and nothing is left of the attempt.
@@ -107,23 +109,25 @@ class Parts:
         return before
 
     def keep_directory(self) -> None:
-        """Lock the directory anew where it was made anew; raises OSError, BlockingIOError for another recorder."""
+        """Lock the directory again if it was recreated; raises OSError, or BlockingIOError if another recorder holds
+        it.
+        """
         if self.lock is not None:
             keep_directory(self.directory, self.lock)
 
     def _next(self) -> tuple[int, Path]:
-        """Number and path of the next part; a name that is taken is passed over, never written to."""
+        """Return number and path of the next part; a name that exists already is skipped, never written to."""
         number = self.part + 1
         while os.path.lexists(path := self.directory / f"{self.info.session_id}_{number}.mcap"):
             number += 1
         return number, path
 
     def has_gone(self) -> bool:
-        """Return whether the current part is no longer where it was made: removed, moved, or its folder with it."""
+        """Return whether the current part is no longer at its path: removed, moved, or its folder with it."""
         return self.current is not None and not self.current.stands_at(self.current.path)
 
     def add(self, block: EncodedBlock) -> None:
-        """Lay a block into the current part; raises OSError when a chunk that it closed could not be written."""
+        """Add a block to the current part; raises OSError if a chunk that it completed could not be written."""
         assert self.current is not None
         if block.channel_id not in self._known:
             self.current.add_channel(block.channel_id, self.channels.specs[block.channel_id])
@@ -131,12 +135,12 @@ class Parts:
         self.current.add(block)
 
     def add_last(self, writer: PartWriter, block: EncodedBlock) -> None:
-        """Lay a block into a part that has been taken out; raises OSError."""
+        """Add a block to a part that has been released; raises OSError."""
         writer.add_channel(block.channel_id, self.channels.specs[block.channel_id])
         writer.add(block)
 
     def release(self) -> PartWriter | None:
-        """Take the current part out, its counts kept; the caller finishes it."""
+        """Release the current part and keep its counts; the caller finishes it."""
         writer, self.current = self.current, None
         if writer is not None:
             self.written.update(writer.written)
@@ -146,25 +150,25 @@ class Parts:
         return writer
 
     def bytes_written(self) -> int:
-        """Return size of all parts together."""
+        """Return the size of all parts together, in bytes."""
         return self._released_bytes + (self.current.bytes_written if self.current is not None else 0)
 
     def total_written(self, channel_id: int) -> int:
-        """Return messages of a channel in the log, over all parts."""
+        """Return the number of messages of a channel in the log, over all parts."""
         return self.written[channel_id] + (self.current.written.get(channel_id, 0) if self.current else 0)
 
     def total_lost(self, channel_id: int) -> int:
-        """Return messages of a channel that could not be written, over all parts."""
+        """Return the number of messages of a channel that could not be written, over all parts."""
         return self.lost[channel_id] + (self.current.lost.get(channel_id, 0) if self.current else 0)
 
     def drop_page_cache(self) -> None:
-        """Give the memory of parts finished a while ago back to the system."""
+        """Drop parts that were finished a while ago from the page cache."""
         while self._finished and time.monotonic() - self._finished[0][0] > _DROP_CACHE_AFTER_S:
             _, path = self._finished.popleft()
             try:
                 fd = os.open(path, os.O_RDONLY)
             except OSError:
-                continue  # moved away meanwhile: nothing of it to drop
+                continue  # moved away meanwhile: its pages cannot be dropped
             try:
                 os.posix_fadvise(fd, 0, 0, os.POSIX_FADV_DONTNEED)
             finally:
@@ -187,6 +191,8 @@ class Parts:
         sync_directory(self.directory)
 
     def remove_sign(self) -> None:
-        """Nothing is growing any more; where even that cannot be said, nobody reads it either."""
+        """Remove the sign, since no file is growing any more; errors are ignored, as an unreachable sign misleads no
+        reader.
+        """
         with contextlib.suppress(OSError):
             (self.directory / RECORDING_SIGN).unlink(missing_ok=True)

@@ -1,7 +1,7 @@
 """Reads logs: finished, cut off by a crash, or recovered; one file, several, or a directory of them.
 
 `open_logs` gives sessions in the order of time, their parts in the order of their number. A chunk is used only after
-its CRC has been checked; what cannot be read is skipped and stands in `Session.damage`.
+its CRC has been checked; whatever cannot be read is skipped and listed in `Session.damage`.
 """
 
 from __future__ import annotations
@@ -36,18 +36,18 @@ from swath.daemon.log.mcap.scan import (
 )
 
 RECOVERED = ".recovered.mcap"
-LOOK_AHEAD_NS = 1_000_000_000  # a chunk is open for 250 ms and waits for the writer a little longer
+LOOK_AHEAD_NS = 1_000_000_000  # a chunk stays open for 250 ms and then waits a little for the writer
 
-# What a stranger's log may take of the memory; ours stay far below.
+# Limits on the memory that a foreign log may take; logs of swath stay far below.
 LOOK_AHEAD_BYTES = 128 << 20
 MAX_ATTACHMENTS_BYTES = 128 << 20
-MAX_DAMAGE = 1000  # places that are listed
+MAX_DAMAGE = 1000  # number of places that are listed
 MAX_MISSING = 1000
 
 
 @dataclass(frozen=True, slots=True)
 class PartDamage:
-    """What could not be read of a part."""
+    """A stretch of a part that could not be read."""
 
     path: Path
     damage: Damage
@@ -55,7 +55,7 @@ class PartDamage:
 
 @dataclass(slots=True)
 class Part:
-    """One file of a session."""
+    """One file of a session: path, session and number."""
 
     path: Path
     info: SessionInfo
@@ -64,11 +64,11 @@ class Part:
 
 @dataclass(slots=True)
 class Session:
-    """One recording: its parts, and what was found while reading them.
+    """One recording: its parts, and the damage found while reading them.
 
     Attributes:
-        damage: what could not be read.
-        growing: the part that was being written meanwhile; that it has no end yet is no damage.
+        damage: the stretches that could not be read.
+        growing: the part that was being written during reading; its missing end is not damage.
     """
 
     info: SessionInfo
@@ -84,22 +84,23 @@ class Session:
 
     @property
     def missing_parts(self) -> list[int]:
-        """Numbers below the highest that are not there, the first thousand."""
+        """Numbers below the highest whose parts are missing, at most the first thousand."""
         there = {part.number for part in self.parts}
         return list(islice((number for number in range(max(there) + 1) if number not in there), MAX_MISSING))
 
     def batches(self, topics: TopicFilter | None = None, *, skim: bool = False) -> Iterator[LogBatch]:
-        """Yield all messages in the order in which they stand in the files.
+        """Yield all messages in their order in the files.
 
-        ``skim``: a chunk that holds nothing wanted, by its index, is not read; damage in it is not found then.
+        With ``skim``, a chunk whose index lists no wanted channel is not read, so damage inside it is not found.
         """
         for chunk in self._chunks(topics, skim=skim):
             yield from chunk
 
     def batches_by_time(self, topics: TopicFilter | None = None) -> Iterator[LogBatch]:
-        """Yield all messages merged by log time: batches are split where another's messages come between.
+        """Yield all messages merged by log time; a batch is split where messages of another one come between.
 
-        A second of messages is held, longer than a chunk stays open; of a log whose times do not go on, 128 MiB.
+        One second of messages is held in memory, more than a chunk stays open; at most 128 MiB, in case the log's times
+        do not advance.
         """
         held: list[LogBatch] = []
         limit_ns, size = 0, 0
@@ -113,14 +114,16 @@ class Session:
                 yield from _merge(ready)
             size += _chunk_bytes(chunk)
             if size > LOOK_AHEAD_BYTES:
-                size = _chunk_bytes(held)  # what was given out meanwhile counts no more
+                size = _chunk_bytes(held)  # batches already given out no longer count
                 if size > LOOK_AHEAD_BYTES // 2:
                     yield from _merge(held)
                     held, size = [], 0
         yield from _merge(held)
 
     def attachments(self) -> dict[str, bytes]:
-        """Return attachments by name, of the first part that has each; what goes beyond 128 MiB in all is left out."""
+        """Return attachments by name, each from the first part that has it; those beyond 128 MiB in total
+        are left out.
+        """
         found: dict[str, bytes] = {}
         size = 0
         for part in self.parts:
@@ -180,20 +183,20 @@ class Session:
 
 
 def _is_wanted(channels: dict[int, ChannelSpec], topics: TopicFilter, channel: int) -> bool:
-    """Return whether a channel's messages are; those of one that is not known yet may be."""
+    """Return whether a channel's messages are wanted; a channel that is not known yet counts as wanted."""
     return channel not in channels or topics(channels[channel].topic)
 
 
 def open_logs(paths: Sequence[Path | str], passed_over: list[str] | None = None) -> list[Session]:
-    """Return sessions of logs and of directories of them, in order of time.
+    """Open logs and directories of logs, and return their sessions in order of time.
 
     Args:
         paths: files and directories.
-        passed_over: takes a line for each file of a directory that is no log, as a crash at a part's very beginning
-            leaves one; where None, such a file is an error like one that was named.
+        passed_over: receives a line for each file of a directory that is not a log, such as a crash at the very
+            beginning of a part leaves; if None, such a file is an error, as if the user had named it.
 
     Raises:
-        LogError: a file is no log, or there is none.
+        LogError: a file is not a log, or there are no logs.
     """
     by_session: dict[str, list[Part]] = {}
     named = {Path(path) for path in paths}
@@ -223,9 +226,7 @@ def _session(parts: list[Part]) -> Session:
 
 
 def _files(paths: list[Path]) -> list[Path]:
-    """Return the files named, and those in the directories named; a recovered copy among them stands for its
-    original.
-    """
+    """Return the named files and those in the named directories; a recovered copy replaces its original."""
     files: list[Path] = []
     for path in paths:
         if path.is_dir():
@@ -239,10 +240,10 @@ def _files(paths: list[Path]) -> list[Path]:
 
 
 def read_part_head(path: Path) -> Part:
-    """Return session and number of a part, from its first records.
+    """Read session and number of a part from its first records.
 
     Raises:
-        LogError: it is no log of this program.
+        LogError: it is not a log of this program.
     """
     try:
         with path.open("rb") as file:
@@ -272,14 +273,14 @@ def read_part_head(path: Path) -> Part:
 
 
 def _in_order(batch: LogBatch) -> Iterator[LogBatch]:
-    """Yield a batch split where its times step back: stamps of one socket come from several processors."""
+    """Yield a batch in pieces, split where its times step back: stamps of one socket come from several processors."""
     steps_back = np.flatnonzero(np.diff(batch.log_time_ns) < 0) + 1
     for first, last in pairwise([0, *steps_back.tolist(), len(batch.log_time_ns)]):
         yield batch.between(first, last)
 
 
 def _older_than(held: list[LogBatch], limit_ns: int) -> tuple[list[LogBatch], list[LogBatch]]:
-    """Return batches split at a time: those before it, those after."""
+    """Split batches at a time; return those before it and those after."""
     ready: list[LogBatch] = []
     rest: list[LogBatch] = []
     for batch in held:
@@ -292,7 +293,7 @@ def _older_than(held: list[LogBatch], limit_ns: int) -> tuple[list[LogBatch], li
 
 
 def _chunk_bytes(held: list[LogBatch]) -> int:
-    """Return memory that batches keep: of each the whole chunk that it is a view into."""
+    """Return the memory that batches keep alive: for each one, the whole chunk that it is a view into."""
     chunks = {id(batch.rows.base): batch.rows.base for batch in held}
     return sum(chunk.nbytes for chunk in chunks.values() if isinstance(chunk, np.ndarray))
 
@@ -307,7 +308,7 @@ def _merge(batches: list[LogBatch]) -> Iterator[LogBatch]:
         times = batch.log_time_ns
         last = len(times)
         if heap:
-            next_ns = heap[0][0] + (number < heap[0][1])  # of equal times the one first in the file goes first
+            next_ns = heap[0][0] + (number < heap[0][1])  # among equal times, the first in the file comes first
             last = max(first + 1, first + int(np.searchsorted(times[first:], next_ns)))
         yield batch.between(first, last)
         if last < len(times):

@@ -1,7 +1,7 @@
-"""Makes a damaged or unfinished log whole: what can be read is copied beside it, the original is never touched.
+"""Repairs a damaged or unfinished log: all readable data is copied to a file beside it; the original is never touched.
 
-Whole chunks are written again with their messages in the same order and with the same stamps; bad ones are dropped
-and told. The copy has index and footer, so that every MCAP reader opens it.
+Whole chunks are written again with their messages in the same order and with the same stamps; damaged ones are dropped
+and reported. The copy has index and footer, so that every MCAP reader opens it.
 """
 
 from __future__ import annotations
@@ -39,19 +39,19 @@ from swath.daemon.log.mcap.scan import (
 from swath.daemon.log.mcap.writer import PartWriter, create_exclusively
 from swath.daemon.log.reader import MAX_DAMAGE, RECOVERED, read_part_head
 
-UNFINISHED = ".part"  # behind the name of a copy that is not whole yet
+UNFINISHED = ".part"  # suffix of a copy that is not complete yet
 
 
 @dataclass(slots=True)
 class RecoveryReport:
-    """What was found in a log and what was done about it.
+    """The findings about a log and the result of its recovery.
 
     Attributes:
         path: the original.
-        recovered: the copy; None where the log was whole and nothing was written.
-        chunks: good ones. messages: in them, by topic.
+        recovered: the copy; None if the log was whole and nothing was written.
+        chunks: number of good ones. messages: in them, by topic.
         damage: every stretch that could not be read.
-        messages_lost: in all, where the statistics at the end of the original are whole; None: unknown.
+        messages_lost: number over the whole log; None (unknown) if the original's statistics are missing or damaged.
     """
 
     path: Path
@@ -62,7 +62,9 @@ class RecoveryReport:
     messages_lost: int | None = None
 
     def add_damage(self, damage: Damage) -> None:
-        """Note a stretch that could not be read; beyond a thousand they are one, with the bytes of all."""
+        """Note a stretch that could not be read; stretches beyond a thousand are merged into one, with the bytes of
+        all.
+        """
         if len(self.damage) < MAX_DAMAGE:
             self.damage.append(damage)
             return
@@ -71,16 +73,16 @@ class RecoveryReport:
 
     @property
     def whole(self) -> bool:
-        """Nothing is wrong with the original."""
+        """True if the original has no damage."""
         return not self.damage
 
     @property
     def lost_bytes(self) -> int:
-        """Bytes of the original that could not be read."""
+        """Number of bytes of the original that could not be read."""
         return sum(damage.length for damage in self.damage)
 
     def plain(self) -> dict[str, object]:
-        """For ``--json``."""
+        """Return the report as plain values for ``--json``."""
         return {
             "path": str(self.path),
             "whole": self.whole,
@@ -97,10 +99,10 @@ class RecoveryReport:
 
 
 def examine(path: Path) -> RecoveryReport:
-    """Read a log through and check every CRC; writes nothing.
+    """Read a log through and check every CRC; write nothing.
 
     Raises:
-        LogError: it is no log.
+        LogError: it is not a log.
     """
     read_part_head(path)
     return _pass(path, None)
@@ -112,11 +114,11 @@ def recover(path: Path, destination: Path | None = None, *, keep_free_bytes: int
     Args:
         path: the log; it is only read.
         destination: folder of the copy.
-        keep_free_bytes: the copy is given up when less would stay free.
+        keep_free_bytes: the recovery is refused if less space would stay free.
 
     Raises:
-        LogError: it is no log, it is being recorded or recovered by another process, the copy is there already, or
-            there is no room for it.
+        LogError: it is not a log, another process is recording or recovering it, the copy exists already, or there is
+            no room for it.
         OSError: the copy cannot be written.
     """
     folder = path.parent if destination is None else destination
@@ -133,7 +135,7 @@ def recover(path: Path, destination: Path | None = None, *, keep_free_bytes: int
         raise LogError(f"{folder}: {free / 1e6:.0f} MB free, {needed / 1e6:.0f} MB needed to recover {path.name}")
     temporary = target.with_name(target.name + UNFINISHED)
     with _taken(temporary, path) as fd:
-        _refuse_existing(target, path)  # another process may have put it there meanwhile
+        _refuse_existing(target, path)  # another process may have made it meanwhile
         _give_to_owner_of(path, fd)
         head = read_part_head(path)
         report = _pass(path, PartWriter(temporary, head.info, head.number, fd=os.dup(fd)))
@@ -150,9 +152,10 @@ def _refuse_existing(target: Path, path: Path) -> None:
 
 @contextlib.contextmanager
 def _taken(temporary: Path, path: Path) -> Iterator[int]:
-    """The file of a copy, empty and claimed for as long as this lasts; gone afterwards where it was not renamed.
+    """Hold the file of a copy, empty and claimed, for the duration of the block; remove it unless it was renamed.
 
-    Who removes or renames a file of that name holds the claim on it and has seen that the name is still this file's.
+    A process that removes or renames a file of this name must hold the claim on it and have checked that the name still
+    refers to this file.
     """
     with contextlib.suppress(FileNotFoundError):
         _remove_left_behind(temporary, path)
@@ -173,7 +176,12 @@ def _taken(temporary: Path, path: Path) -> Iterator[int]:
 
 
 def _remove_left_behind(temporary: Path, path: Path) -> None:
-    """Remove what an interrupted recovery left; LogError where the recovery goes on, FileNotFoundError for nothing."""
+    """Remove the rest of an interrupted recovery.
+
+    Raises:
+        LogError: the other recovery is still running.
+        FileNotFoundError: there is nothing to remove.
+    """
     fd = os.open(temporary, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
         if not claim(fd):
@@ -189,19 +197,19 @@ def _taken_by_another(path: Path) -> LogError:
 
 
 def _give_to_owner_of(path: Path, fd: int) -> None:
-    """Let the same users read the copy who may read the log: readers take it instead.
+    """Give the copy the owner and permissions of the log, because readers use the copy instead of the log.
 
-    Root's copy would else be root's alone, and the recorder's user would have lost the log to it.
+    A copy made by root would otherwise be readable by root only, and the recorder's user would lose access to the data.
     """
     original = path.stat()
-    with contextlib.suppress(PermissionError):  # a file system without owners
+    with contextlib.suppress(PermissionError):  # some file systems have no owners
         if os.geteuid() == 0:
             os.fchown(fd, original.st_uid, original.st_gid)
         os.fchmod(fd, original.st_mode & 0o777)
 
 
 def _pass(path: Path, writer: PartWriter | None) -> RecoveryReport:
-    """Read all; write what is good to the copy if there is one, which is closed then."""
+    """Read the whole log; if a writer is given, write all good data to the copy and close it."""
     report = RecoveryReport(path)
     channels: dict[int, ChannelSpec] = {}
     schemas: dict[int, records.Schema] = {}
@@ -233,7 +241,7 @@ def _pass(path: Path, writer: PartWriter | None) -> RecoveryReport:
 
 
 def _messages_said(file: BinaryIO, end: Record, size: int) -> int | None:
-    """Return how many messages the statistics of a file whose end is whole speak of; None where it has none."""
+    """Return the message count from the statistics of a file whose end is whole; None if it has no statistics."""
     for found in summary_records(file, end.offset + end.length, size):
         if found.opcode == OP_STATISTICS:
             try:
@@ -279,7 +287,7 @@ def _copy_chunk(
 
 
 def _copy_schema(channel: ChannelSpec, schemas: dict[int, records.Schema], writer: PartWriter) -> None:
-    """The schema of a channel where it is a stranger's."""
+    """Copy the schema of a channel if it is not one of swath's own."""
     if channel.schema is not None and channel.schema not in SCHEMAS:
         writer.add_schema(next(one for one in schemas.values() if one.name == channel.schema))
 

@@ -1,4 +1,4 @@
-"""Names a session of recording and describes the computer that it runs on."""
+"""Names a recording session and describes the computer that it runs on."""
 
 from __future__ import annotations
 
@@ -14,13 +14,15 @@ from swath.daemon.log.host_clock import HostClock
 
 
 def read_boot_id() -> str:
-    """This boot of the computer; the unit says it in ``SWATH_BOOT_ID``, because its /proc holds processes only."""
+    """Return the id of this boot; the service's unit passes it in ``SWATH_BOOT_ID``, because its /proc shows processes
+    only.
+    """
     said = os.environ.get("SWATH_BOOT_ID", "")
     return str(uuid.UUID(said)) if said else Path("/proc/sys/kernel/random/boot_id").read_text().strip()
 
 
 def make_session_info(name: str, clock: HostClock) -> SessionInfo:
-    """Name a session by its start and this boot of the computer."""
+    """Make the description of a session, named by its start and this boot of the computer."""
     boot_id = read_boot_id()
     start = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(clock.realtime_ns // 1_000_000_000))
     return SessionInfo(
@@ -34,7 +36,7 @@ def make_session_info(name: str, clock: HostClock) -> SessionInfo:
 
 
 def session_name(name: str, start_ns: int, boot_id: str) -> str:
-    """Return ``session_id`` of a session that begins at this wall clock time."""
+    """Return the ``session_id`` of a session that begins at this wall clock time."""
     try:
         start = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(start_ns // 1_000_000_000))
     except (ValueError, OverflowError, OSError):

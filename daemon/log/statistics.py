@@ -1,4 +1,4 @@
-"""What logs hold, in numbers: counts, rates, gaps, losses, time status, damage. `swath info` shows it."""
+"""Counts the content of logs for `swath info`: units, rates, gaps, losses, time status, damage."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from swath.daemon.log.reader import Session
 from swath.drivers.parser import Parser
 from swath.georef.records import ChunkBatch, Int64Array
 
-USUAL_SHARE = 0.95  # intervals up to this quantile are usual, bursts and pauses between them alike
-GAP_MIN_NS = 1 << 27  # 0.134 s: a scanner whose laser is off still speaks ten times a second
-MAX_MARKS = 10_000  # nobody marks more in a flight; a stranger's log may say anything
+USUAL_SHARE = 0.95  # intervals up to this quantile count as usual: those within bursts and the pauses between them
+GAP_MIN_NS = 1 << 27  # 0.134 s: a scanner whose laser is off still sends ten times a second
+MAX_MARKS = 10_000  # more than an operator sets in a flight; a foreign log may hold any number
 MAX_WORDS = 32
 _ACCOUNT = ("units", "written", "lost_kernel", "lost_queue", "lost_write")
 _TROUBLE = ("bus_off", "error_frames", "line_errors", "refused")
@@ -26,7 +26,7 @@ _TROUBLE = ("bus_off", "error_frames", "line_errors", "refused")
 
 @dataclass(slots=True)
 class Intervals:
-    """Time between units, in bins of powers of two of a nanosecond: bounded memory for any length of log."""
+    """A histogram of the time between units in powers of two of a nanosecond; its memory does not grow with the log."""
 
     bins: Int64Array = field(default_factory=lambda: np.zeros(64, np.int64))
     longest_ns: int = 0
@@ -34,7 +34,7 @@ class Intervals:
     _last_ns: int | None = None
 
     def add(self, times_ns: Int64Array) -> None:
-        """Times of the next units."""
+        """Add the times of the next units."""
         if self._last_ns is not None:
             times_ns = np.concatenate([[self._last_ns], times_ns])
         self._last_ns = int(times_ns[-1])
@@ -47,8 +47,9 @@ class Intervals:
             self.longest_ns, self.longest_at_ns = int(steps[widest]), int(times_ns[widest])
 
     def gaps(self) -> int:
-        """Return intervals in a higher bin than the usual ones, so up to twice as long or longer, and above
-        `GAP_MIN_NS`.
+        """Return the number of gaps: intervals above `GAP_MIN_NS` in a higher bin than the usual ones.
+
+        Bins are powers of two, so a gap may be less than twice as long as a usual interval.
         """
         total = int(self.bins.sum())
         if total < 3:
@@ -60,7 +61,7 @@ class Intervals:
 
 @dataclass(slots=True)
 class SourceNumbers:
-    """One source of a session."""
+    """The counts of one source of a session."""
 
     units: int = 0
     bytes: int = 0
@@ -75,7 +76,7 @@ class SourceNumbers:
     records: Counter[str] = field(default_factory=Counter)
 
     def add(self, times_ns: Int64Array, units: Any) -> None:
-        """Units that were read."""
+        """Count units that were read."""
         self.units += len(times_ns)
         self.bytes += int(units.size)
         self.first_ns = int(times_ns[0]) if self.first_ns is None else self.first_ns
@@ -83,7 +84,9 @@ class SourceNumbers:
         self.intervals.add(times_ns)
 
     def add_status(self, status: dict[str, Any]) -> None:
-        """A status: its equation must hold, and ``written`` be what has been read before it, unless some is missing."""
+        """Check a status: the account's equation must hold, and ``written`` must equal the units read so far in a
+        complete log.
+        """
         self.status = status
         units, written, *lost = (_count(status, key) for key in _ACCOUNT)
         self.account_errors += units != written + sum(lost)
@@ -92,7 +95,9 @@ class SourceNumbers:
             _count_word(self.time_states, status["time_state"])
 
     def plain(self, *, complete: bool) -> dict[str, Any]:
-        """For ``--json``; of a complete log every status must agree with the units read before it."""
+        """Return plain values for ``--json``; in a complete log every status must agree with the units read
+        before it.
+        """
         first, last = self.first_ns, self.last_ns
         duration_s = (last - first) * 1e-9 if first is not None and last is not None else 0.0
         status = self.status or {}
@@ -128,14 +133,14 @@ class SourceNumbers:
 
 @dataclass(slots=True)
 class EventNumbers:
-    """Events of a session: how many of each severity, the operator's marks, the last that are no mere information."""
+    """Event counts of a session by severity, the operator's marks, and the latest events above severity "info"."""
 
     severities: Counter[str] = field(default_factory=Counter)
     marks: list[dict[str, Any]] = field(default_factory=list)
     last: deque[dict[str, Any]] = field(default_factory=lambda: deque(maxlen=10))
 
     def add(self, event: dict[str, Any]) -> None:
-        """The next event."""
+        """Count the next event."""
         _count_word(self.severities, event.get("severity"))
         if event.get("code") == "mark" and len(self.marks) < MAX_MARKS:
             self.marks.append(event)
@@ -146,12 +151,12 @@ class EventNumbers:
 def session_statistics(
     session: Session, *, decode: bool = True, progress: Callable[[int], None] | None = None
 ) -> dict[str, Any]:
-    """Return all numbers of a session, in one pass over its parts.
+    """Compute all numbers of a session, in one pass over its parts.
 
     Args:
         session: as `open_logs` gives it.
         decode: run the sources' parsers, for their messages, checksum errors and the devices' own sequence gaps.
-        progress: called with the bytes of every batch.
+        progress: called with the number of bytes of every batch.
     """
     attachments = session.attachments()
     parsers, troubles = stored_parsers(attachments) if decode else ({}, [])
@@ -222,7 +227,7 @@ def _take(batch: LogBatch, sources: dict[str, SourceNumbers], events: EventNumbe
 
 
 def _count_word(counts: Counter[str], word: object) -> None:
-    """One of a few words; a stranger's many are one."""
+    """Count a word; once there are `MAX_WORDS` different words, as in a foreign log, new ones count as "other"."""
     key = str(word)[:64]
     counts[key if key in counts or len(counts) < MAX_WORDS else "other"] += 1
 

@@ -1,4 +1,4 @@
-"""Says where the units of each port, socket and bus go in a log."""
+"""Describes where the log stores the units of each port, socket and bus."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from swath.daemon.log.format import ChunkClass
 from swath.drivers.transports.spec import TransportSpec
 
 SILENT_AFTER_S = 3.0
-MAX_SENDERS = 256  # of one UDP port with a channel each; a port scanner must not fill the log with channels
-BLOCK_BYTES = 512 * 1024  # a larger one is handed over in pieces, so that chunks stay near their 1 MiB
+MAX_SENDERS = 256  # that get a channel on one UDP port; a port scanner must not fill the log with channels
+BLOCK_BYTES = 512 * 1024  # a larger block is split, so that chunks stay near their 1 MiB
 
 _ENCODINGS = {"serial": "x-swath-serial", "can": "x-swath-can", "udp": "x-swath-udp", "ntrip": "x-swath-serial"}
 
 
 def make_wire(device: DeviceEntry, transport: TransportSpec, suffix: str) -> Wire:
-    """Return where the units of a device's port go in a log; ``suffix`` is ``/aux`` for a second port."""
+    """Describe where the log stores the units of a device's port; ``suffix`` is ``/aux`` for a second port."""
     metadata = {"protocol": device.protocol, "transport": transport.text}
     if transport.kind == "udp":
         metadata["port"] = str(transport.port)
@@ -33,14 +33,14 @@ def make_wire(device: DeviceEntry, transport: TransportSpec, suffix: str) -> Wir
 
 @dataclass(frozen=True, slots=True)
 class Wire:
-    """One port, socket or bus of a device, and where its units go in the log.
+    """One port, socket or bus of a device, and the place of its units in the log.
 
     Attributes:
         source: name of its account: ``kind/name``, with ``/aux`` for a scanner's second port.
         topic: of the raw channel.
         encoding: MCAP message encoding, ``x-swath-serial``, ``x-swath-can`` or ``x-swath-udp``.
         chunk_class: "scanner" or "other".
-        metadata: of the channel, without a sender's.
+        metadata: of the channel, without the sender's address.
     """
 
     source: str

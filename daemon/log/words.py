@@ -1,4 +1,4 @@
-"""Puts durations, clock states and troubles of sources into words, for every page and display alike."""
+"""Formats durations, clock states and faults of sources as text, the same on every page and display."""
 
 from __future__ import annotations
 
@@ -7,21 +7,21 @@ from collections.abc import Mapping
 
 
 def duration_text(seconds: float) -> str:
-    """Return ``3 h 05 min``, ``12 min``, ``40 s``."""
+    """Format a duration as ``3 h 05 min``, ``12 min`` or ``40 s``."""
     if seconds >= 3600:
         return f"{int(seconds // 3600)} h {int(seconds % 3600 // 60):02d} min"
     return f"{int(seconds // 60)} min" if seconds >= 60 else f"{int(seconds)} s"
 
 
 def clock_text(time_ns: object) -> str:
-    """Return UTC of a host time as ``10:15:03``; whatever else a log holds there is a question mark."""
+    """Format a host time as UTC, ``10:15:03``; return "?" for any other value that a log may hold."""
     if isinstance(time_ns, int) and 0 <= time_ns < 1 << 63:
         return time.strftime("%H:%M:%S", time.gmtime(time_ns // 1_000_000_000))
     return "?"
 
 
 def source_trouble(source: str, status: Mapping[str, object]) -> str:
-    """Return what is wrong with a source by its status, in a few words; nothing when all is well."""
+    """Describe the fault of a source by its status, in a few words; return an empty text when all is well."""
     lost = sum(int(str(status[key])) for key in ("lost_kernel", "lost_queue", "lost_write"))
     words = []
     if status["state"] == "silent":

@@ -1,1 +1,1 @@
-"""What a recorder says of itself, shown."""
+"""Displays the state of a recorder."""

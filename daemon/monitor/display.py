@@ -1,4 +1,4 @@
-"""Looks at a recorder by the log that grows and by nothing else: how every source does, the disk, the last events."""
+"""Shows a recorder's state from its growing log alone: every source, the disk, the last events."""
 
 from __future__ import annotations
 
@@ -19,29 +19,31 @@ from swath.daemon.monitor.source import Decoding, SourceWatch, decoded_trouble
 
 TAIL_S = 5.0
 EVENTS_KEPT = 50
-STALE_S = 5.0  # a status comes each second; a disk may take its time
+STALE_S = 5.0  # a status is written each second; a disk may delay it
 LITTLE_LEFT_S = 900.0
 RECORDING, DEGRADED, NOT_RECORDING = "recording", "degraded", "not recording"
 
 
 class Monitor:
-    """Follows what is recorded in a directory; `poll` reads on, `snapshot` says how things are."""
+    """Follows the recording in a directory; `poll` reads new data, `snapshot` gives the state."""
 
     def __init__(self, directory: Path, *, decode: bool = True) -> None:
-        """``decode``: run the sources' parsers, for rates of records, damaged messages and gaps."""
+        """Prepare to follow; with ``decode``, run the sources' parsers, for rates of records, damaged messages and
+        gaps.
+        """
         self._directory = directory
         self._decode = decode
         self._follower = LogFollower(directory, TAIL_S, every_part=False)
         self._part: PartFollower | None = None
         self._sources: dict[str, SourceWatch] = {}
-        self._inside: dict[str, list[str]] = {}  # devices by the stream that they lie in
+        self._inside: dict[str, list[str]] = {}  # devices by the stream that contains their data
         self._events: deque[dict[str, Any]] = deque(maxlen=EVENTS_KEPT)
         self._notes: list[str] = []
         self._reserve_bytes = 0
         self._damaged = 0
         self._newest_ns = 0
         self._began_s = time.monotonic()
-        self._grown_s: float | None = None  # when a newer message was seen than was there at the beginning
+        self._grown_s: float | None = None  # when a message newer than those at the beginning was read
 
     def close(self) -> None:
         """Close the log."""
@@ -50,7 +52,9 @@ class Monitor:
     # ------------------------------------------------------------------ reading
 
     def poll(self) -> None:
-        """Take what has been recorded since the last call; where nothing ever was since, the end of what was."""
+        """Read the data recorded since the last call; if nothing has been recorded yet, read the end of the
+        newest log.
+        """
         begun, newest_ns = self._part is not None, self._newest_ns
         for batch in self._follower.poll():
             if self._follower.part is not self._part:
@@ -76,7 +80,7 @@ class Monitor:
         try:
             config = stored_config(part.attachments)
         except LogError:
-            config = None  # another version's: the notes say so
+            config = None  # another version's, as the notes report
         if config is not None:
             self._reserve_bytes = int(config.session.reserve_mb * 1e6)
             for kind, name, table in config.device_tables():
@@ -103,7 +107,7 @@ class Monitor:
         return self._sources.setdefault(source, SourceWatch(source, None))
 
     def _read_latest(self) -> None:
-        """Events of the newest log of the directory, which say why nothing is recorded now."""
+        """Read the events of the directory's newest log, which tell why nothing is being recorded now."""
         paths = sorted(self._directory.glob("*.mcap"), key=_modified, reverse=True)
         for path in paths[:1]:
             try:
@@ -116,16 +120,16 @@ class Monitor:
                     self._events.extend(value for _, value in json_objects(batch))
             part.close()
 
-    # ------------------------------------------------------------------ saying
+    # ------------------------------------------------------------------ report
 
     @property
     def is_undecided(self) -> bool:
-        """Whether growth would still show that a log is recorded whose recorder cannot be asked."""
+        """Whether growth of the log could still prove a recording whose recorder cannot be asked."""
         waiting = self._grown_s is None and time.monotonic() - self._began_s < STALE_S
         return waiting and self._follower.sign is not None and not _is_of_this_boot(self._follower.sign.boot_id)
 
     def snapshot(self) -> dict[str, Any]:
-        """Return how things are now, as plain values: the form of ``--json``."""
+        """Return the present state as plain values, the form of ``--json``."""
         now_ns = None if self._part is None else self._now_ns(self._part.info)
         why_not = self._why_not_recording(now_ns)
         sources = {} if now_ns is None else self._plain_sources(now_ns)
@@ -153,9 +157,7 @@ class Monitor:
         return self._damaged + (0 if self._part is None else self._part.damaged)
 
     def _now_ns(self, session: SessionInfo) -> int:
-        """Return host time of the session; of another computer's, whose clocks are not ours, that of what was read
-        last.
-        """
+        """Return the session's host time now; for a log of another computer or boot, the time of the newest message."""
         own = _is_of_this_boot(session.boot_id)
         return time.monotonic_ns() + session.realtime_ns - session.monotonic_ns if own else self._newest_ns
 
@@ -173,7 +175,7 @@ class Monitor:
         try:
             disk = os.statvfs(self._directory)
             free = disk.f_bavail * disk.f_frsize
-        except OSError:  # gone, as a disk that was pulled
+        except OSError:  # gone, for example an unplugged disk
             free = 0
         left_s = max(0, free - self._reserve_bytes) / bytes_per_s if bytes_per_s > 0 else None
         hours = None if left_s is None else round(left_s / 3600, 2)
@@ -187,7 +189,7 @@ class Monitor:
             return f"nothing is being recorded in {self._directory}{told}"
         if self._part is None or now_ns is None:
             return f"{sign.path.name} should grow and cannot be read (yet)"
-        own = _is_of_this_boot(sign.boot_id)  # locks of another computer need not be seen here
+        own = _is_of_this_boot(sign.boot_id)  # locks of another computer may be invisible here
         if own and sign.path == self._part.path and not is_being_written(sign.path):
             return f"the recorder of {sign.path.name} is gone, and its log has no end"
         if own:
@@ -224,7 +226,7 @@ def _is_of_this_boot(boot_id: str) -> bool:
 def _modified(path: Path) -> float:
     try:
         return path.stat().st_mtime
-    except OSError:  # gone meanwhile
+    except OSError:  # removed meanwhile
         return 0.0
 
 

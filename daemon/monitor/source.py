@@ -1,4 +1,4 @@
-"""One source of a log that is followed: how it does by its statuses, and by what its bytes say."""
+"""Watches one source of a log that is followed: its condition by its statuses, and by the content of its bytes."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from swath.daemon.log.mcap.chunks import LogBatch
 from swath.drivers.parser import DriverSettingsError, Parser
 from swath.georef.records import ChunkBatch
 
-RATE_STATUSES = 6  # rates are of the last five seconds
-DECODED_SECONDS = 10  # kept of what the parser said
-DECODE_SHARE = 0.05  # of a processor for each source's parser
-DECODE_AT_ONCE_S = 0.5  # and so much beyond, for the beginning and for bursts
-DAMAGED_SHARE = 0.01  # of the messages: more is a wire or a setting, not chance
+RATE_STATUSES = 6  # for rates over the last five seconds
+DECODED_SECONDS = 10  # of parser results that are kept
+DECODE_SHARE = 0.05  # of one processor, for each source's parser
+DECODE_AT_ONCE_S = 0.5  # allowed on top of the share, for the beginning and for bursts
+DAMAGED_SHARE = 0.01  # of the messages; a larger share is a fault of wire or settings, not chance
 _LOST = ("lost_kernel", "lost_queue", "lost_write")
 _COUNTS = ("units", "bytes", *_LOST)
 _WORDS = ("state", "time_state")
 _MEASURED = ("last_unit_age_s", "time_sigma_ns")
-_MOST = 1 << 63  # of a count, and of what is measured
+_MOST = 1 << 63  # limit of counts and measured values
 
 
 @dataclass(slots=True)
 class DecodedSecond:
-    """What a parser made of a second of the log."""
+    """A parser's results for one second of the log."""
 
     records: Counter[str] = field(default_factory=Counter)
     messages: int = 0
@@ -35,13 +35,13 @@ class DecodedSecond:
 
 
 class Decoding:
-    """Runs a source's parser on whole seconds of the log, on fewer of them where all would cost too much.
+    """Runs a source's parser on whole seconds of the log, and on only some of them if all would take too long.
 
-    After a second that was left out a new parser begins, so that what was not read counts as no gap.
+    After a skipped second a new parser starts, so that skipped data does not count as a gap.
 
     Attributes:
         seconds: the latest that were decoded.
-        share: of all seconds, how many were decoded.
+        share: part of all seconds that were decoded.
     """
 
     def __init__(self, make_parser: Callable[[], Parser]) -> None:
@@ -61,7 +61,7 @@ class Decoding:
         return self._decoded / self._seen if self._seen else 0.0
 
     def feed(self, source: str, batch: LogBatch) -> None:
-        """Take units of the source, or of its second port."""
+        """Decode units of the source, or of its second port."""
         second = int(batch.log_time_ns[0]) // 1_000_000_000
         if self._second is None or second > self._second:
             self._begin_second(second)
@@ -89,7 +89,7 @@ class Decoding:
             try:
                 self._parser = self._make_parser()
             except DriverSettingsError:
-                self._parser = None  # `swath info` names what is wrong with it
+                self._parser = None  # `swath info` reports the fault
             self._before = (0, 0, Counter())
 
     def _note_counters(self, now: DecodedSecond) -> None:
@@ -103,7 +103,7 @@ class Decoding:
         self._before = (messages, bad, Counter(counters.errors))
 
     def plain(self) -> dict[str, Any]:
-        """For ``--json``: rates and counts of the latest seconds; the one under way counts when it is over."""
+        """Return rates and counts of the latest seconds for ``--json``; the current second counts when it is over."""
         whole = list(self.seconds)[:-1] or list(self.seconds)
         total = DecodedSecond()
         for second in whole:
@@ -123,7 +123,7 @@ class Decoding:
 
 
 def usable_status(said: dict[str, Any]) -> dict[str, Any]:
-    """Return a status with what can be shown of it: a log that is no recorder's may say anything there."""
+    """Return a status with only displayable values, because a log of another program may hold any value there."""
     status: dict[str, Any] = {key: _number(said.get(key), int) or 0 for key in _COUNTS}
     status |= {key: _number(said[key], int, float) for key in _MEASURED if key in said}
     status |= {key: str(said[key])[:64] for key in _WORDS if key in said}
@@ -131,12 +131,12 @@ def usable_status(said: dict[str, Any]) -> dict[str, Any]:
 
 
 def _number(value: Any, *kinds: type) -> Any:
-    """Return the value, if it is a number that can be; else None."""
+    """Return the value if it is a plausible number; else None."""
     return value if type(value) in kinds and -_MOST < value < _MOST else None
 
 
 class SourceWatch:
-    """Takes a source's statuses and units as the log gives them."""
+    """Collects a source's statuses and units in log order."""
 
     def __init__(self, source: str, decoding: Decoding | None) -> None:
         self.source = source
@@ -145,22 +145,22 @@ class SourceWatch:
         self._last_ns: int | None = None
 
     def add_units(self, batch: LogBatch, *, decode: bool = True) -> None:
-        """Units of its own port."""
+        """Take units of the source's own port."""
         self._last_ns = max(self._last_ns or 0, int(batch.log_time_ns[-1]))
         if decode:
             self.decode(batch)
 
     def decode(self, batch: LogBatch) -> None:
-        """Units for its parser only: those of a second port."""
+        """Take units for the parser only, as from a second port."""
         if self._decoding is not None:
             self._decoding.feed(self.source, batch)
 
     def add_status(self, time_ns: int, status: dict[str, Any]) -> None:
-        """A status of it."""
+        """Take a status of the source."""
         self._statuses.append((time_ns, usable_status(status)))
 
     def plain(self, now_ns: int) -> dict[str, Any]:
-        """For ``--json``; ``now_ns`` is host time."""
+        """Return the source's values for ``--json``; ``now_ns`` is host time."""
         status = self._statuses[-1][1] if self._statuses else {}
         found: dict[str, Any] = {
             "state": status.get("state", "opening"),
@@ -178,7 +178,7 @@ class SourceWatch:
 
     @property
     def status(self) -> dict[str, Any]:
-        """The latest; empty before the first."""
+        """Latest status; empty before the first."""
         return self._statuses[-1][1] if self._statuses else {}
 
     def _age_s(self, now_ns: int, status: dict[str, Any]) -> float | None:
@@ -198,7 +198,7 @@ class SourceWatch:
 
 
 def decoded_trouble(decoded: dict[str, Any]) -> str:
-    """Return what is wrong with a source by its bytes, in a few words; nothing when all is well."""
+    """Describe the faults in a source's bytes, in a few words; return an empty text when all is well."""
     words = []
     if decoded["bad"] > DAMAGED_SHARE * decoded["messages"]:
         words.append(f"{decoded['bad']} of {decoded['bad'] + decoded['messages']} messages damaged")

@@ -1,1 +1,1 @@
-"""Logs to products, after the flight and beside the recorder; imported by commands that run, never by a recorder."""
+"""Turns logs into products, after the flight and beside the recorder; recorders never import this package."""

@@ -1,4 +1,4 @@
-"""The verdict that travels: what was judged of a trajectory or a calibration is told of everything made with it."""
+"""Carries verdicts on trajectories and calibrations along to everything that is made with them."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ if TYPE_CHECKING:
 
 LEVELS = {level.words: level for level in Level}
 OF_TRAJECTORY, OF_POINTS = "swath.trajectory", "swath.georef"  # formats of summaries and sidecars
-OF_ADJUSTMENT, ADJUSTMENT = "swath.strip-adjustment", "strip-adjustment.json"  # its format and its file
+OF_ADJUSTMENT, ADJUSTMENT = "swath.strip-adjustment", "strip-adjustment.json"  # format and file name of its record
 SOURCES = {"smoothed": "navigated", "realtime": "navigated", "as-is": "ins"}  # by a trajectory's summary
 MADE_WITH = {"navigated": "a trajectory navigated from IMU and GNSS", "ins": "the device's own INS", "file": "a file"}
 TRAJECTORY_ENDS = ("_trajectory.csv", "_trajectory.sbet")
-RANGE_M = 100.0  # for which the error of a nominal calibration is told
+RANGE_M = 100.0  # range at which the error of a nominal calibration is given
 
 
 @dataclass(frozen=True, slots=True)
 class Carried:
-    """A verdict on something that products are made with.
+    """A verdict on a trajectory or a calibration that products are made with.
 
     Attributes:
-        level: not good.
-        sentence: of what it is, and why; without the level's words.
+        level: care or unusable; never good.
+        sentence: which input it is about, and why; without the level's words.
     """
 
     level: Level
@@ -45,33 +45,35 @@ class Carried:
 
     @property
     def line(self) -> str:
-        """Return it with its level, as a first line says it."""
+        """The sentence after its level, as the first line of an output."""
         return f"{self.level.words}: {self.sentence}"
 
 
 def verdict_entry(carried: Sequence[Carried], *, accepted: bool) -> dict[str, Any]:
-    """Return what a sidecar or a record says."""
+    """Return the verdict entry of a sidecar or a record."""
     level = max((one.level for one in carried), default=Level.GOOD)
     reasons = [{"level": one.level.words, "what": one.sentence} for one in carried]
     return {"level": level.words, "reasons": reasons, "accepted": accepted and level is Level.UNUSABLE}
 
 
 def first_lines(entry: Mapping[str, Any]) -> list[str]:
-    """Return a line for each reason of an entry, the worst first."""
+    """Return one line for each reason of an entry, the worst first."""
     reasons = sorted(entry.get("reasons", []), key=lambda one: -LEVELS.get(one["level"], Level.GOOD))
     return [f"{one['level']}: {one['what']}" for one in reasons]
 
 
 @contextmanager
 def told_before(carried: Sequence[Carried], *refused: type[Exception]) -> Iterator[None]:
-    """Have a problem within say first what is not to be used: most likely that is why. Wrong use stays what it is.
+    """Put an unusable input's verdict before any error raised in the block: it is the likely cause.
+
+    Errors of wrong use stay as they are.
 
     Args:
-        carried: verdicts on what is worked with.
-        refused: errors whose text is for the user as it stands, UserError aside.
+        carried: verdicts on the inputs.
+        refused: errors besides `UserError` whose text can be shown to the user unchanged.
 
     Raises:
-        UserError: of an error within, where something is not to be used; else the error itself.
+        UserError: an error was raised in the block and an input is unusable; otherwise the error itself is raised.
     """
     told: tuple[type[Exception], ...] = (UserError, *refused)
     try:
@@ -85,7 +87,9 @@ def told_before(carried: Sequence[Carried], *refused: type[Exception]) -> Iterat
 
 
 def refusal(entry: Mapping[str, Any]) -> str:
-    """Return the line that makes a command's exit code 1; empty: it is good enough, or accepted."""
+    """Return the line with which a command exits with code 1; empty if the products are usable or
+    the verdict accepted.
+    """
     if entry.get("level") != Level.UNUSABLE.words or entry.get("accepted"):
         return ""
     return f"{first_lines(entry)[0]}; --accept-verdict takes it all the same"
@@ -95,11 +99,11 @@ def refusal(entry: Mapping[str, Any]) -> str:
 
 
 def calibration_verdicts(setup: Setup, source: str = "") -> Iterator[Carried]:
-    """Yield what is to be said of a setup's calibrations.
+    """Yield the verdicts on a setup's calibrations.
 
     Args:
-        setup: of a log.
-        source: of its trajectory, ``navigated``, ``ins`` or ``file``; empty: not known.
+        setup: the setup of a log.
+        source: source of its trajectory, ``navigated``, ``ins`` or ``file``; empty if it is not known.
     """
     flown = setup.config.profile.installation
     for name, calibration in setup.calibrations.items():
@@ -127,7 +131,7 @@ def calibration_verdicts(setup: Setup, source: str = "") -> Iterator[Carried]:
 
 
 def nominal_words(name: str, calibration: Calibration) -> str:
-    """Return what a calibration that nobody estimated is good for."""
+    """Return a sentence on how far points may be off with a nominal (not estimated) calibration."""
     sigmas = calibration.with_plausible_sigmas().all_sigmas
     off_m = RANGE_M * math.hypot(sigmas[INDEX["omega_rad"]], sigmas[INDEX["phi_rad"]])
     return (
@@ -140,7 +144,7 @@ def nominal_words(name: str, calibration: Calibration) -> str:
 
 
 def trajectory_entry(trajectory: Trajectory, source: str, carried: Sequence[Carried]) -> dict[str, Any]:
-    """Return what a record says of a trajectory, by which `file_verdicts` tells it of files beside the record."""
+    """Return a record's entry on a trajectory; `file_verdicts` reads it for files beside the record."""
     first_ns, last_ns = trajectory.span
     return {
         "name": trajectory.name,
@@ -152,7 +156,7 @@ def trajectory_entry(trajectory: Trajectory, source: str, carried: Sequence[Carr
 
 
 def navigated_verdicts(flight: Navigated) -> Iterator[Carried]:
-    """Yield the verdict on each leg of what was navigated here."""
+    """Yield the verdict on each leg that was navigated from this log."""
     for number, leg in enumerate(flight.legs, start=1):
         title = flight.session_id if len(flight.legs) == 1 else f"{flight.session_id}, leg {number}"
         smoothed = leg.solved.smoothed if flight.smooth else None
@@ -163,9 +167,9 @@ def navigated_verdicts(flight: Navigated) -> Iterator[Carried]:
 
 
 def file_verdicts(file: Path, span_ns: tuple[int, int]) -> tuple[list[Carried], str]:
-    """Return what the summary or the sidecar beside a trajectory's file says of it for a span of GPS time.
+    """Return the verdicts on a trajectory's file for a span of GPS time, from the summary or sidecar beside it.
 
-    Also where the trajectory came from: ``navigated``, ``ins``, or ``file`` where nothing beside it says.
+    Also return where the trajectory came from: ``navigated``, ``ins``, or ``file`` if no file beside it tells.
     """
     for beside in _beside(file):
         record = _read(beside)
@@ -203,7 +207,9 @@ def _of_legs(file: Path, legs: Sequence[Mapping[str, Any]], span_ns: tuple[int, 
 
 
 def _of_sidecar(file: Path, record: Mapping[str, Any], span_ns: tuple[int, int]) -> tuple[list[Carried], str]:
-    """Return the trajectory's verdict by the sidecar of points, or the record of an adjustment, made with it."""
+    """Return the verdicts on a trajectory, and its source, from the sidecar of points or the record
+    of an adjustment.
+    """
     carried: list[Carried] = []
     source = "file"
     for flight in record.get("flights", []):
@@ -219,14 +225,14 @@ def _of_sidecar(file: Path, record: Mapping[str, Any], span_ns: tuple[int, int])
 
 
 def _reason(verdict: Mapping[str, Any]) -> str:
-    """Return the worst reason and what to do about it."""
+    """Return the worst reason of a verdict and its remedy."""
     reasons = verdict.get("reasons") or [{"what": verdict.get("sentence", "")}]
     change = reasons[0].get("change")
     return f"{reasons[0]['what']}" + (f"; {change}" if change else "")
 
 
 def points_verdicts(sidecars: Sequence[Mapping[str, Any]]) -> list[Carried]:
-    """Return what the sidecars beside points say of them, each reason once; files of others say nothing."""
+    """Return the verdicts in the sidecars beside points, each reason once; sidecars of other software are ignored."""
     told = [sidecar.get("verdict") for sidecar in sidecars if sidecar.get("format") == OF_POINTS]
     reasons = [one for verdict in told if isinstance(verdict, dict) for one in verdict.get("reasons", [])]
     found = [Carried(LEVELS[one["level"]], str(one["what"])) for one in reasons if one.get("level") in LEVELS]

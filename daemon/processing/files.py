@@ -1,4 +1,4 @@
-"""Writes result files whole or not at all, and describes them."""
+"""Writes result files completely or not at all, and describes them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import IO
 from swath.daemon.errors import UserError, one_line
 from swath.daemon.log.durable import try_sync_directory
 
-LONGEST_NAME = 200  # bytes of a session's name, whose products' names are longer
+LONGEST_NAME = 200  # bytes of a session's name at most; its products' names are longer
 
 _HASH_BLOCK = 1 << 20
 
@@ -22,7 +22,11 @@ PARTIAL = ".partial"
 
 
 def write_aside(path: Path, write: Callable[[IO[bytes]], None]) -> Path:
-    """Write a file beside its place; gives where it stands. OSError: it cannot be written, and is not there."""
+    """Write a file beside its final place and return the path of this temporary file.
+
+    Raises:
+        OSError: the file cannot be written; no temporary file is left.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     aside = path.with_name(path.name + PARTIAL)
     try:
@@ -37,7 +41,11 @@ def write_aside(path: Path, write: Callable[[IO[bytes]], None]) -> Path:
 
 
 def put_in_place(written: list[tuple[Path, Path]]) -> None:
-    """Files to their names, in the order given, and the names to the disk; OSError: it cannot be, nothing is aside."""
+    """Rename temporary files to their final names, in the order given, and sync the folders to disk.
+
+    Raises:
+        OSError: a file cannot be renamed; no temporary file is left.
+    """
     with gone_on_failure(written):
         for aside, path in written:
             aside.replace(path)
@@ -46,7 +54,11 @@ def put_in_place(written: list[tuple[Path, Path]]) -> None:
 
 
 def write_whole(files: Mapping[Path, bytes]) -> None:
-    """Write files, all of them aside before the first is put in its place; OSError: it cannot be, nothing is aside."""
+    """Write files, each to a temporary file first; rename them only when all are written.
+
+    Raises:
+        OSError: a file cannot be written or renamed; no temporary file is left.
+    """
     written: list[tuple[Path, Path]] = []
     with gone_on_failure(written):
         for path, data in files.items():
@@ -60,7 +72,7 @@ def _put(data: bytes, stream: IO[bytes]) -> None:
 
 @contextmanager
 def gone_on_failure(written: list[tuple[Path, Path]]) -> Iterator[None]:
-    """What was written aside goes where it comes to nothing, by an interrupt too."""
+    """Remove the temporary files if the block fails or is interrupted."""
     try:
         yield
     except BaseException:
@@ -69,14 +81,18 @@ def gone_on_failure(written: list[tuple[Path, Path]]) -> Iterator[None]:
 
 
 def remove(written: list[tuple[Path, Path]]) -> None:
-    """What was written aside, where it came to nothing."""
+    """Remove temporary files whose job failed."""
     for aside, _ in written:
         with suppress(OSError):
             aside.unlink(missing_ok=True)
 
 
 def sha256_of(path: Path, given_up: Callable[[], bool] = lambda: False) -> str:
-    """Of a file, or of some of it where that is given up meanwhile; raises OSError."""
+    """Return the SHA-256 of a file; if ``given_up`` returns True meanwhile, of the part read so far.
+
+    Raises:
+        OSError: the file cannot be read.
+    """
     with path.open("rb") as file:
         digest = hashlib.sha256()
         while (block := file.read(_HASH_BLOCK)) and not given_up():
@@ -85,15 +101,17 @@ def sha256_of(path: Path, given_up: Callable[[], bool] = lambda: False) -> str:
 
 
 def utc_text(time_ns: int) -> str:
-    """Return a host time for people."""
+    """Return a host time as text in UTC."""
     return datetime.fromtimestamp(time_ns / 1e9, tz=UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
 def refuse_no_name(session_id: str, log: Path) -> None:
-    """A session's name becomes that of its products: a log from elsewhere must not lead out of their folder.
+    """Refuse a session name that is not a plain file name.
+
+    Products are named after the session; a log from elsewhere must not lead out of their folder.
 
     Raises:
-        UserError: it is no name of a file.
+        UserError: the name is not a file name.
     """
     leads = session_id != Path(session_id).name or session_id in ("", ".", "..")
     if leads or not session_id.isprintable() or len(session_id.encode()) > LONGEST_NAME:

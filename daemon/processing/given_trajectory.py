@@ -1,4 +1,4 @@
-"""Does a trajectory that was given as a file belong to the log? Judged in words that name the likely mistake."""
+"""Checks whether a trajectory given as a file belongs to the log, and names the likely mistake if not."""
 
 from __future__ import annotations
 
@@ -34,21 +34,21 @@ if TYPE_CHECKING:
 
 
 REFUSED_M, REFUSED_SIGMAS, WARNED_SIGMAS = 3.0, 20.0, 5.0
-UNLIKE = 0.3  # correlation of turn rates below which two motions are hardly one
+UNLIKE = 0.3  # correlation of turn rates below which two motions are doubtful to be one
 FOOT_M = 0.3048
 GREATEST_UNDULATION_M = 110.0  # anywhere on earth
 LEAP_NEAR_S = 0.3
 WARNED_HEADING_DEG, REFUSED_HEADING_DEG = 0.2, 1.0
-DATUMS_APART_M = 3000.0  # more lies between no two datums
+DATUMS_APART_M = 3000.0  # no two datums are farther apart
 
 
 @dataclass
 class Belonging:
-    """What was found.
+    """Findings about a given trajectory.
 
     Attributes:
-        refused: why the trajectory is not this flight's, or not as it is said to be, a line each.
-        warnings: what is doubtful, a line each.
+        refused: why the trajectory is not of this flight, or not as declared; one line each.
+        warnings: doubts, one line each.
     """
 
     refused: list[str] = field(default_factory=list)
@@ -57,14 +57,14 @@ class Belonging:
 
 @dataclass(frozen=True, slots=True)
 class Given:
-    """A trajectory from a file.
+    """A trajectory that was read from a file.
 
     Attributes:
         file: its name, for messages.
-        trajectory: of the body's origin; its attitude refers to the ellipsoid.
-        offset_b: (3,) the point that the file is of by ``--trajectory-at``, from the body's origin, m.
-        points_b: points that it may be of instead, by what ``--trajectory-at`` would say.
-        datum_is_said: the command line names its datum.
+        trajectory: the trajectory of the body's origin; its attitude refers to the ellipsoid.
+        offset_b: (3,) the point that the file describes, by ``--trajectory-at``, from the body's origin, m.
+        points_b: other points that the file may describe, by the value of ``--trajectory-at`` for each.
+        datum_is_said: True if the command line names its datum.
     """
 
     file: str
@@ -75,7 +75,9 @@ class Given:
 
 
 def points_of(setup: Setup) -> dict[str, tuple[float, float, float]]:
-    """Return the points that a trajectory may be of, from the body's origin in b, m, by the words for them."""
+    """Return the points that a trajectory may describe, from the body's origin in b, m, by their ``--trajectory-at``
+    words.
+    """
     points = {"body": (0.0, 0.0, 0.0)}
     arms = [gnss.lever_arm_m for gnss in setup.config.gnss.values()]
     if arms:
@@ -96,11 +98,11 @@ def judge_given(given: Given, setup: Setup, clocks: LogClocks, log: Path) -> Bel
     return found
 
 
-# ---------------------------------------------------------------------- where it lies
+# ---------------------------------------------------------------------- place
 
 
 def _nearest(given: Given, setup: Setup, clocks: LogClocks) -> tuple[Apart | None, str, float | None]:
-    """Return the comparison with the receiver whose fixes tell most, its source, and the geoid by its word."""
+    """Return the comparison with the most precise receiver, its source, and the geoid undulation that it reports."""
     best: tuple[Apart | None, str, float | None] = (None, "", None)
     for name, table in setup.config.gnss.items():
         source = f"gnss/{name}"
@@ -121,7 +123,7 @@ def _nearest(given: Given, setup: Setup, clocks: LogClocks) -> tuple[Apart | Non
 
 
 def _in_datum(rows: StructArray, datum: str | None, given: Given, setup: Setup) -> StructArray:
-    """Return fixes in the datum of the trajectory, where both are named."""
+    """Return the fixes transformed to the datum of the trajectory; unchanged unless both datums are named."""
     wanted = _datum_of(given, setup)
     if datum is None or wanted is None or not len(rows) or setup.mapping is None:
         return rows
@@ -138,7 +140,9 @@ def _in_datum(rows: StructArray, datum: str | None, given: Given, setup: Setup) 
 
 
 def _datum_of(given: Given, setup: Setup) -> CRS | None:
-    """Return the datum of the trajectory by the command line; None: it says none, and the receivers' is taken."""
+    """Return the datum of the trajectory from the command line; None if it names none: then it is
+    the receivers' own.
+    """
     return setup.mapping.datum_crs if setup.mapping is not None and given.datum_is_said else None
 
 
@@ -171,7 +175,7 @@ def _judge_place(
 
 
 def _arm_is_unsaid(setup: Setup, source: str) -> bool:
-    """Return True if nobody said where a receiver's antenna is: a trajectory cannot be refused for its lever arm."""
+    """Return True if a receiver's lever arm is not configured: then it cannot be a reason to refuse a trajectory."""
     table = setup.config.gnss[source.removeprefix("gnss/")]
     return "lever_arm_m" not in table.model_fields_set
 
@@ -192,7 +196,7 @@ def _length(metres: float) -> str:
 
 
 def _reasons(given: Given, apart: Apart, undulation_m: float | None, setup: Setup) -> Iterator[str]:
-    """Yield what would explain where it lies, the most certain first."""
+    """Yield possible reasons for the offset between trajectory and fixes, the most certain first."""
     yield from _other_point(given, apart)
     yield from _other_height(apart, undulation_m)
     yield from _other_time(apart)
@@ -211,7 +215,7 @@ def _reasons(given: Given, apart: Apart, undulation_m: float | None, setup: Setu
 
 
 def _other_point(given: Given, apart: Apart) -> Iterator[str]:
-    """Yield the point it would be of: the difference is then the same in the body's axes all through."""
+    """Yield another point that the file may describe: the offset is then constant in the body's axes."""
     apart_b = apart.of.apart_b
     median_b = np.median(apart_b, axis=0)
     tolerance = np.maximum(3.0 * apart.fix_sigma_l.max(), 0.05)
@@ -227,7 +231,7 @@ def _other_point(given: Given, apart: Apart) -> Iterator[str]:
 
 
 def _other_height(apart: Apart, undulation_m: float | None) -> Iterator[str]:
-    """Yield what its heights would be: above the geoid, or in feet."""
+    """Yield other meanings of its heights: above the geoid, or in feet."""
     north, east, up = apart.median_l
     if max(abs(north), abs(east)) > max(REFUSED_M, WARNED_SIGMAS * float(apart.fix_sigma_l[:2].max())):
         return
@@ -262,7 +266,7 @@ def _other_time(apart: Apart) -> Iterator[str]:
 
 
 def _other_angles(apart: Apart) -> Iterator[str]:
-    """Yield a sign or an order of latitude and longitude that would bring it there."""
+    """Yield a change of sign or order of latitude and longitude that would explain the offset."""
     if apart.metres < 1000.0:
         return
     fix_e = np.median(apart.of.fix_e, axis=0)
@@ -286,7 +290,7 @@ def _unknown(apart: Apart, setup: Setup) -> str:
     )
 
 
-# ---------------------------------------------------------------------- how it turns
+# ---------------------------------------------------------------------- motion
 
 
 def _judge_motion(given: Given, setup: Setup, clocks: LogClocks, log: Path, found: Belonging) -> None:

@@ -1,8 +1,8 @@
-"""What scanners' own stamps count from, found before any return is placed: from pieces of the log all over it.
+"""Finds what scanners' own time stamps count from, before any return is placed, from samples all over the log.
 
-A job reads its own piece of a log only; so the question is settled once, by all of the log, and the answer goes to
-every job. Heads that say the time themselves (Velodyne's position packets, Hesai's GPS packets) are the host's clock
-where no receiver is in the log.
+A job reads its own piece of a log only; so this is settled once, for the whole log, and every job gets the answer.
+Scanner heads that report the time themselves (Velodyne's position packets, Hesai's GPS packets) serve as the host's
+clock where the log has no receiver.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from swath.georef.timescales.stamp_scale import AHEAD_NS, LEAST_SPAN_S
 if TYPE_CHECKING:
     from swath.daemon.processing.setup.setup import Setup
 
-LOOKED_AT_BYTES = 96 << 20  # of a log's scanner chunks, in pieces
+LOOKED_AT_BYTES = 96 << 20  # how much of a log's scanner chunks is read, in pieces
 PIECES = 12
 FOLLOWING_NS = 2 * SECOND_NS
 LEAST_SENTENCES_NS = SETTLED_SPAN_NS
@@ -51,10 +51,10 @@ HOUR_NS = 3600 * SECOND_NS
 
 
 def find_stamps(index: LogIndex, setup: Setup, host: HostClocks) -> FrozenClocks:
-    """Return the host's clocks with what each scanner's stamps count from.
+    """Return the host's clocks together with what each scanner's stamps count from.
 
-    The clock of a head that is its own is fed here, with what the head says of the time; where it says nothing, and its
-    stamps are configured to be UTC or TAI, with these.
+    If a head is its own clock, its time messages are fed to that clock here; if it sends none and its stamps are
+    configured as UTC or TAI, its stamps are.
     """
     plans = {source: plan for source, plan in host.plan.devices.items() if plan.stamps is not None}
     own = {source for source, plan in plans.items() if plan.clock == source}
@@ -66,7 +66,7 @@ def find_stamps(index: LogIndex, setup: Setup, host: HostClocks) -> FrozenClocks
         for message in read.messages[source]:
             host.add_message(source, message)
     host.update()
-    remarks = read.remarks(own) + (host.settle() if own else [])  # a head is the clock where no receiver was settled
+    remarks = read.remarks(own) + (host.settle() if own else [])  # a head is the clock if no receiver is
     stamps: dict[str, Stamps] = {}
     heads: dict[str, HeadTime] = {}
     for source, plan in plans.items():
@@ -82,7 +82,7 @@ def find_stamps(index: LogIndex, setup: Setup, host: HostClocks) -> FrozenClocks
 
 
 def _pieces(chunks: Sequence[ChunkPlace]) -> list[ChunkPlace]:
-    """Return all chunks of a short log, else neighbours in places all over it, the first and the last included."""
+    """Return all chunks of a short log; otherwise runs of chunks spread over it, the first and the last included."""
     if sum(chunk.length for chunk in chunks) <= LOOKED_AT_BYTES:
         return list(chunks)
     mean = sum(chunk.length for chunk in chunks) / len(chunks)
@@ -92,7 +92,7 @@ def _pieces(chunks: Sequence[ChunkPlace]) -> list[ChunkPlace]:
 
 
 class _Reader:
-    """Collects what scanners say of time."""
+    """Collects the time messages, status and clock samples of scanners."""
 
     def __init__(self, setup: Setup, plans: dict[str, DevicePlan]) -> None:
         self.messages: dict[str, list[TimeMessage]] = {source: [] for source in plans}
@@ -103,7 +103,7 @@ class _Reader:
         }
 
     def take(self, index: LogIndex, places: Sequence[ChunkPlace]) -> None:
-        """Read chunks; what is damaged is told when the returns are read."""
+        """Read chunks; damage is not reported here, but when the returns are read."""
         damage: list[PartDamage] = []
         for batch in read_chunks(index, places, lambda topic: topic.startswith(SCANNER), damage):
             source = (source_of_topic(batch.channel.topic) or "").removesuffix("/aux")
@@ -123,7 +123,7 @@ class _Reader:
                 self._rows[source].append(record.rows)
 
     def remarks(self, sources: Iterable[str]) -> list[str]:
-        """Return what is to be said of the dates that heads were given."""
+        """Return remarks about the dates that heads were given."""
         return [line for source in sorted(sources) for line in self._parsers[source].remarks()]
 
     def rows(self, source: str) -> StructArray:
@@ -132,12 +132,12 @@ class _Reader:
 
 
 def _trouble(read: _Reader, source: str, *, own: bool) -> str:
-    """Return why what a head says of time cannot be used, and the remedy; empty: it can, or it says nothing.
+    """Return why a head's time messages cannot be used, and the remedy; empty if they can or it sends none.
 
     Args:
-        read: what it says.
+        read: the messages read.
         source: the head.
-        own: no receiver is in the log: the head's sentences would be its clock.
+        own: True if the log has no receiver, so that the head's sentences would be its clock.
     """
     locked = read.rows(source)["locked"]
     if not (locked >= 0).any():
@@ -166,12 +166,12 @@ def _trouble(read: _Reader, source: str, *, own: bool) -> str:
 
 
 def is_void(status: DeviceStatus) -> bool:
-    """Tell whether a head says that the sentences of its receiver have no fix."""
+    """Return True if a head reports that its receiver's sentences have no fix."""
     return status.values.get("nmea_valid") is False or status.values.get("gps_status") in ("invalid", "none")
 
 
 def _judged(plan: DevicePlan, rows: StructArray, host: HostClocks) -> Stamps | None:
-    """Return what stamps count from; None where the head itself says whether it is locked, or nobody knows the time."""
+    """Return what stamps count from; None if the head itself reports whether it is locked, or the time is not known."""
     assert plan.stamps is not None
     says = (rows["locked"] >= 0) | (rows["pps_time_ns"] >= 0)
     brief = False
@@ -188,10 +188,10 @@ def _judged(plan: DevicePlan, rows: StructArray, host: HostClocks) -> Stamps | N
 
 
 def _before_it_says(rows: StructArray, says: NDArray[np.bool_]) -> tuple[StructArray, bool]:
-    """Return the rows from before a head says whether it is locked, and whether they are few.
+    """Return the rows before a head reports whether it is locked, and whether these rows are few.
 
-    Few of them show nothing by themselves. Where the head is locked as soon as it says something, and its stamps go on,
-    the rows that follow are judged along: a clock that the pulse set in between would have jumped.
+    Few rows prove nothing by themselves. If the head is locked as soon as it reports and its stamps go on without a
+    jump, the rows that follow are used too: a clock that the pulse set in between would have jumped.
     """
     host_ns, before = rows["host_time_ns"], ~says
     if not before.any() or np.ptp(host_ns[before]) >= LEAST_SPAN_S * SECOND_NS:
@@ -207,9 +207,9 @@ def _before_it_says(rows: StructArray, says: NDArray[np.bool_]) -> tuple[StructA
 
 
 def _tell_by_stamps(source: str, plan: DevicePlan, rows: StructArray, host: HostClocks) -> None:
-    """Set a head's own clock by its stamps, where they are configured to be TAI or UTC and nothing else sets it.
+    """Set a head's own clock by its stamps if they are configured as TAI or UTC and nothing else sets it.
 
-    Of stamps past the hour the wall clock of the log says which hour; so it must be good to half of one.
+    For stamps that count from the full hour, the log's wall clock gives the hour; it must be right to half an hour.
     """
     host_ns = rows["host_time_ns"]
     _, sigma_ns = host.gps_from_host(source, host_ns[-1:])
@@ -235,9 +235,9 @@ def _leap_at(unix_ns: int) -> int:
 
 
 def stamp_lines(clocks: FrozenClocks) -> list[str]:
-    """Return a line of each scanner whose stamps or sentences are the time, for the user: which, and why.
+    """Return one line for the user per scanner whose stamps or sentences give the time: which, and why.
 
-    None of stamps that only came less than a second before the head said itself that it is locked.
+    Stamps that span less than a second before the head reports its lock get no line.
     """
     host = clocks.host
     own = [source for source, plan in host.plan.devices.items() if plan.clock == source]
@@ -255,7 +255,7 @@ def stamp_lines(clocks: FrozenClocks) -> list[str]:
 
 
 def _own_words(clocks: FrozenClocks, source: str) -> str:
-    """Say what of a head is its clock."""
+    """Return words for which data of a head is its clock."""
     head, found = clocks.heads.get(source), clocks.stamps.get(source)
     if head is not None and head.messages:
         return "the head's own sentences and stamps"

@@ -1,8 +1,8 @@
-"""GPS times of points in LAS files: seconds of the week or adjusted standard time, as each file's header says.
+"""Reads GPS times of points in LAS files: seconds of the week or adjusted standard time, by each file's header.
 
 LAS 1.4 R15, 2.4: bit 0 of the global encoding is 0 for seconds of the GPS week, 1 for adjusted standard GPS time, GPS
-seconds less 1e9. LAS 1.5 adds bit 6: less another multiple of 1e6, which stands in the header (Offset GPS Time). Files
-of all kinds are merged and delivered side by side, and some headers say one and mean the other.
+seconds less 1e9. LAS 1.5 adds bit 6: GPS seconds less another multiple of 1e6, given in the header (Offset GPS Time).
+Files of all kinds are merged and delivered side by side, and some headers contradict their times.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ from swath.georef.timescales.gps_time import (
 )
 
 SAMPLED_POINTS = 1000
-OF_WEEK_BELOW_S = 2 * WEEK_S  # a flight that goes on beyond the week's end may be counted on
+OF_WEEK_BELOW_S = 2 * WEEK_S  # a flight that crosses the week's end may go on counting
 NAMED_FILES = 3
 DAY_S = 86_400
 GPS_EPOCH_UTC = dt.datetime(1980, 1, 6, tzinfo=dt.UTC)
-LARGEST_S = 4e9  # GPS seconds of 2106; beyond, numbers mean something else
-OFFSET_FLAG = 1 << 6  # LAS 1.5, 2.4: of the global encoding
+LARGEST_S = 4e9  # GPS seconds of 2106; larger numbers are something else
+OFFSET_FLAG = 1 << 6  # LAS 1.5, 2.4: bit 6 of the global encoding
 _OFFSET, _OFFSET_AT = struct.Struct("<H"), 391  # in millions of seconds
 
 
 class TimeKind(Enum):
-    """Say what the times of a file's points are."""
+    """The kinds of times that a file's points may have."""
 
     NONE = "no GPS times"
     OF_WEEK = "seconds of the GPS week"
@@ -49,13 +49,13 @@ class TimeKind(Enum):
 
 @dataclass(frozen=True, eq=False)
 class PointTimes:
-    """Hold what the times of a file's points are.
+    """The kind of times in a file, with samples.
 
     Attributes:
         path: the file.
-        kind: what its times are; decided by the header unless the times contradict it.
+        kind: kind of its times; by the header unless the times contradict it.
         sample_s: (k,) times of the first points, seconds as in the file.
-        doubt: why the header is not believed, or not likely to be right, one line; empty: nothing speaks against it.
+        doubt: why the header is not followed or is doubtful, one line; empty if there is no doubt.
         zero_s: GPS seconds from which adjusted times count.
     """
 
@@ -67,9 +67,9 @@ class PointTimes:
 
 
 def point_times_of(path: Path) -> PointTimes:
-    """Return what the times of a file's points are, by its header and its first points.
+    """Return the kind of times of a file's points, from its header and its first points.
 
-    A file that cannot be read has none, and nothing is raised: whoever reads its points says why.
+    A file that cannot be read has kind NONE and raises nothing here: the code that reads its points reports the error.
     """
     try:
         with open_points(path) as reader:
@@ -90,7 +90,7 @@ def point_times_of(path: Path) -> PointTimes:
 
 
 def _offset(path: Path, seconds: FloatArray) -> PointTimes:
-    """Return times that count from where the header of a LAS 1.5 file says; laspy opens none without the place."""
+    """Return times that count from the zero in the header of a LAS 1.5 file; laspy does not read that field."""
     with path.open("rb") as file:
         file.seek(_OFFSET_AT)
         (millions,) = _OFFSET.unpack(file.read(_OFFSET.size))
@@ -98,7 +98,7 @@ def _offset(path: Path, seconds: FloatArray) -> PointTimes:
 
 
 def _weighed(path: Path, said: TimeKind, seconds: FloatArray) -> PointTimes:
-    """Return the times with what the numbers themselves say against the header."""
+    """Return the times with a doubt wherever the numbers contradict the header."""
     low, high = float(seconds.min()), float(seconds.max())
     future = _of_the_future(low)
     remedy = future or "set bit 0 of the header's global encoding"
@@ -121,7 +121,7 @@ def _weighed(path: Path, said: TimeKind, seconds: FloatArray) -> PointTimes:
 
 
 def _of_the_future(adjusted_s: float) -> str:
-    """Return what is wrong with adjusted times that are later than now, and the remedy; empty: they are not.
+    """Return why adjusted times later than now are wrong, and the remedy; empty if they are not later.
 
     Some software writes GPS seconds with nothing taken off them, or seconds since 1970, under the same bit.
     """
@@ -138,7 +138,7 @@ def _of_the_future(adjusted_s: float) -> str:
 
 
 def time_notes(times: Sequence[PointTimes]) -> list[str]:
-    """Return lines on files whose header is doubtful, and on files that mix kinds of times."""
+    """Return lines on files whose header is doubtful, and a line on files that mix kinds of times."""
     notes = [one.doubt for one in times if one.doubt]
     of_week = [one.path.name for one in times if one.kind is TimeKind.OF_WEEK]
     adjusted = [one.path.name for one in times if one.kind is TimeKind.ADJUSTED]
@@ -156,15 +156,15 @@ def _named(names: Sequence[str]) -> str:
 
 
 class PointClock:
-    """Give GPS times of points of several files, of which some say seconds of a week only."""
+    """Gives GPS times of points of several files, some of which only have seconds of the week."""
 
     def __init__(self, times: Sequence[PointTimes], week: int | None = None, near_ns: int | None = None) -> None:
-        """Take what is known of the files.
+        """Take the times of all files and settle the week.
 
         Args:
-            times: of all files.
-            week: GPS week of the first of the times that say none; None: it was not given.
-            near_ns: a GPS time of the flight, by a trajectory beside the points; None: there is none.
+            times: times of all files.
+            week: GPS week of the first time of files that have seconds of the week; None: not given.
+            near_ns: a GPS time of the flight, from a trajectory beside the points; None: there is none.
         """
         self._kinds = {one.path: one.kind for one in times}
         self._zeros_s = {one.path: one.zero_s for one in times}
@@ -185,7 +185,7 @@ class PointClock:
                 self.notes.append(_untold([one.path.name for one in times if one.kind is TimeKind.OF_WEEK]))
 
     def time_ns(self, path: Path, seconds: FloatArray) -> Int64Array:
-        """Return GPS times (n,) of seconds (n,) as a file has them; 0 where it has no time that can be."""
+        """Return GPS times (n,) for seconds (n,) as in a file; 0 for values that are no valid time."""
         known = np.isfinite(seconds) & (np.abs(seconds) < LARGEST_S)
         seconds = np.where(known, seconds, 0.0)
         kind = self._kinds.get(path, TimeKind.NONE)
@@ -199,13 +199,15 @@ class PointClock:
 
 
 def _since(seconds: FloatArray, zero_s: int) -> Int64Array:
-    """Return GPS times (n,) of seconds (n,) that count from GPS seconds."""
+    """Return GPS times (n,) for seconds (n,) that count from ``zero_s`` in GPS seconds."""
     whole = np.rint(seconds * SECOND_NS).astype(np.int64)
     return np.asarray(whole + zero_s * SECOND_NS)
 
 
 def _span_of_week(seconds: FloatArray) -> tuple[int, int]:
-    """Return first and length, ns, of the shortest span that has all of some times of a week, over its end or not."""
+    """Return first time and length, ns, of the shortest span that holds all times of a week; it may cross the week's
+    end.
+    """
     times = np.unique(np.rint((seconds % WEEK_S) * SECOND_NS).astype(np.int64))
     gaps = np.diff(times, append=times[0] + WEEK_NS)
     last = int(np.argmax(gaps))

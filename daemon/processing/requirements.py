@@ -1,4 +1,4 @@
-"""What processing needs beside the recorder's own packages; looked at before anything of it is imported."""
+"""Checks for packages that processing needs beside the recorder's, before any processing module is imported."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from swath.daemon.errors import ExitCode, UserError
 from swath.drivers.extras import how_to_install
 
 PROCESS = ("numba", "scipy", "pyproj", "laspy", "lazrs")
-EXTRA_OF = {"foxglove": "live", "matplotlib": "process"}  # package: what brings it
+EXTRA_OF = {"foxglove": "live", "matplotlib": "process"}  # package: the extra that installs it
 
 
 def require_installed(command: str, *others: str) -> None:
-    """UserError where a package that a command wants is missing, with what installs it."""
+    """Refuse to run a command with `UserError` if a package is missing; the message tells how to install it."""
     missing = [name for name in (*PROCESS, *others) if importlib.util.find_spec(name) is None]
     if missing:
         extras = ",".join(dict.fromkeys(["process", *(EXTRA_OF[name] for name in others)]))

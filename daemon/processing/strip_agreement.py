@@ -1,8 +1,8 @@
-"""How well overlapping strips agree: one measure and one rule for the quality level, wherever either is told.
+"""Measures how well overlapping strips agree: one measure and one rule for the quality level, used by all reports.
 
 RMSDz is of heights: in each cell a plane goes through each strip's single returns, and the planes' heights at one place
-are compared where the ground is smooth and slopes are below 10° (`quicklook_strips`). Whatever else is told of strips
-is another measure, is named as such, and gives no level.
+are compared where the ground is smooth and slopes are below 10° (`quicklook_strips`). Any other number about strips is
+another measure, is named so, and gives no level.
 """
 
 from __future__ import annotations
@@ -44,15 +44,15 @@ LIMITS = {
 
 @dataclass(frozen=True, eq=False)
 class Agreement:
-    """The measure, and what it keeps.
+    """The agreement of strips, and the limits that it keeps.
 
     Attributes:
         cell_m: side of the cells.
-        cells, places: how many cells were compared, in how many places apart from each other.
-        numbers: of all pairs, as of `Overlap.numbers`; None: nothing was compared.
+        cells, places: number of cells that were compared, and of separate places that they lie in.
+        numbers: numbers of all pairs from `Overlap.numbers`; None: nothing was compared.
         repeatability_m: by number of the strip, sigma of its single returns on the smoothest quarter of gentle ground.
         pulses_m2, area_m2: mean density of pulses, all strips together, and the area that they cover.
-        judged: against every limit; empty: there are too few cells for a verdict.
+        judged: results against every limit; empty if there are too few cells for a verdict.
     """
 
     cell_m: float
@@ -66,7 +66,7 @@ class Agreement:
 
     @classmethod
     def of(cls, cells: StripCells, overlap: Overlap) -> Agreement:
-        """Return it for strips that were compared."""
+        """Return the agreement of strips that were compared."""
         numbers, within = overlap.numbers(), overlap.repeatability_m()
         density, area_m2 = cells.pulse_density()
         compared, places = overlap.compared_cells, overlap.places
@@ -83,7 +83,7 @@ class Agreement:
 
     @property
     def measure(self) -> str:
-        """Name the measure for people."""
+        """The measure in words, for people."""
         return (
             f"RMSDz: heights of planes of single returns in cells of {self.cell_m:g} m, smooth ground below "
             f"{STEEPEST_DEG:g}° of slope"
@@ -91,12 +91,12 @@ class Agreement:
 
     @property
     def best(self) -> str | None:
-        """Return the strictest USGS level that is kept; None: none is, or there is no verdict."""
+        """The strictest USGS level that is kept; None: no level is kept, or there is no verdict."""
         return best_of(self.judged)
 
     @property
     def no_verdict(self) -> str:
-        """Say why there is no verdict, and what to do; empty: there is one."""
+        """Why there is no verdict, and the remedy; empty if there is one."""
         if self.judged:
             return ""
         there = f"{self.cells:,} {'cell' if self.cells == 1 else 'cells'} of {self.cell_m:g} m in "
@@ -107,12 +107,12 @@ class Agreement:
         )
 
     def broken(self, level: str) -> list[str]:
-        """Return the limits of a USGS level that are not kept, in words."""
+        """Return in words the limits of a USGS level that are not kept."""
         named = next((one for one in self.judged if one.standard == USGS and one.level == level), None)
         return [] if named is None else _broken(named)
 
     def verdicts(self) -> list[str]:
-        """Return what specifications say, a line each; or why there is no verdict."""
+        """Return the result by each specification, one line each; or why there is no verdict."""
         if not self.judged:
             return [self.no_verdict]
         best = self.best
@@ -126,7 +126,7 @@ class Agreement:
         return [f"{USGS}: {usgs}", f"{ASPRS_2014}: {fits}", TO_CONFIRM]
 
     def record(self) -> dict[str, Any]:
-        """Return it for scripts; SI."""
+        """Return the agreement as values for scripts, in SI units."""
         asprs = next((one for one in self.judged if one.standard == ASPRS_2014), None)
         kept = asprs is not None and asprs.all_kept
         within = list(self.repeatability_m.values())
@@ -158,11 +158,11 @@ def _broken(one: Judged) -> list[str]:
 
 @dataclass(frozen=True, eq=False)
 class FlightStrips:
-    """A flight's strips, compared as `swath georef` would place them on the map.
+    """A flight's strips, compared where `swath georef` would place them on the map.
 
     Attributes:
-        names: of the strips.
-        cells, overlap, agreement: of them.
+        names: names of the strips.
+        cells, overlap, agreement: cells of these strips, their differences, and their agreement.
     """
 
     names: tuple[str, ...]
@@ -172,22 +172,22 @@ class FlightStrips:
 
     @property
     def rms_m(self) -> float:
-        """Return RMSDz of all pairs; nan: nothing was compared."""
+        """RMSDz of all pairs; nan: nothing was compared."""
         return math.nan if self.agreement.numbers is None else float(self.agreement.numbers["rms_m"])
 
     def pairs(self) -> dict[tuple[str, str], PairDifference]:
-        """Return the differences by names of strips, the first minus the second."""
+        """Return the differences by pair of strip names, the first strip minus the second."""
         return {(self.names[row["first"]], self.names[row["second"]]): difference_of(row) for row in self.overlap.rows}
 
     def rms_of(self, names: set[str]) -> float:
-        """Return RMSDz of all pairs that some strips are in; nan: there are none."""
+        """Return RMSDz of all pairs that include one of some strips; nan: there are none."""
         own = [one for pair, one in self.pairs().items() if set(pair) & names]
         count = sum(one.count for one in own)
         return math.sqrt(sum(one.count * one.rms_m**2 for one in own) / count) if count else math.nan
 
 
 def difference_of(row: dict[str, Any]) -> PairDifference:
-    """Return the numbers of a pair in `Overlap.rows`."""
+    """Return the differences of a pair from its row in `Overlap.rows`."""
     std_m = math.sqrt(max(row["rms_m"] ** 2 - row["mean_m"] ** 2, 0.0))
     return PairDifference(row["mean_m"], std_m, row["rms_m"], row["max_m"], row["cells"])
 
@@ -204,12 +204,12 @@ def compare_flight(
     """Compare a flight's strips where its points are placed.
 
     Args:
-        flight: its points stand in t.
-        mapping: the map of the products, settled; None: cells lie in t.
+        flight: a flight whose points are in t.
+        mapping: the settled mapping of the products; None: cells lie in t.
         cell_m: side of the cells; None: by the strips' density.
         corners: south-western and north-eastern corner (3,) of the cells; None: `corners_of`.
-        like: cells that are to be taken, whatever else is said; None: none are.
-        also: is given every block of points.
+        like: cells to use again, whatever the other arguments are; None: new cells.
+        also: called with every block of points.
     """
     if like is None:
         low_m, high_m = corners_of(flight, mapping) if corners is None else corners
@@ -265,7 +265,7 @@ def _blocks(flight: Flight, mapping: Mapping | None) -> Iterator[Block]:
 def before_and_after(
     before: Flight, after: Flight, mapping: Mapping | None = None
 ) -> tuple[FlightStrips, FlightStrips]:
-    """Compare a flight's strips as placed before and after, in the same cells: those that the latter wants."""
+    """Compare a flight's strips before and after a change, in the same cells: those chosen for the latter."""
     corners = [corners_of(flight, mapping) for flight in (before, after)]
     both = np.min([low for low, _ in corners], axis=0), np.max([high for _, high in corners], axis=0)
     now = compare_flight(after, mapping, corners=both)
@@ -275,12 +275,13 @@ def before_and_after(
 def difference_map(
     before: FlightStrips, after: FlightStrips, origin: Sequence[float], most: int
 ) -> DifferenceMap | None:
-    """Return the differences of all pairs on one grid, of each cell the largest; None: there are none.
+    """Return the differences of all pairs on two grids of the same cells, the largest of each cell; None: there are
+    none.
 
     Args:
-        before, after: in the same cells, as of `before_and_after`.
-        origin: east and north that the grid counts from.
-        most: cells along a side; more are put together.
+        before, after: strips in the same cells, from `before_and_after`.
+        origin: east and north of the grid's origin.
+        most: maximum number of cells along a side; more cells are merged.
     """
     if before.cells.frame != after.cells.frame:
         return None
@@ -308,7 +309,7 @@ def _words(strips: FlightStrips) -> str:
 
 
 def _largest(grid: NDArray[np.float32], times: int) -> FloatArray:
-    """Return for blocks of so many cells a side the value of largest size; nan: there is none."""
+    """Return the value of largest size in each block of ``times`` by ``times`` cells; nan: the block has none."""
     rows, columns = (-(-size // times) * times for size in grid.shape)
     padded = np.full((rows, columns), np.nan)
     padded[: grid.shape[0], : grid.shape[1]] = grid

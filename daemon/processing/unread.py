@@ -1,4 +1,4 @@
-"""Messages of scanners that gave nothing: damaged, not understood, or missing from the scanner's own sequence."""
+"""Counts scanner messages that gave no returns: damaged, not understood, or missing from the scanner's own sequence."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from swath.drivers.parser import Parser
 
 BAD_CHECKSUM = "bad_checksum"
 SEQUENCE_GAP = "sequence_gap"
-FOREIGN = ("bad_length", "bad_magic")  # of something else that speaks on this port
+FOREIGN = ("bad_length", "bad_magic")  # from another sender on this port
 WITHOUT_RETURNS = ("bad_gps", "bad_nmea", "bad_position", "bad_sample")
 WHY = {
     BAD_CHECKSUM: "a wrong checksum",
@@ -20,10 +20,10 @@ WHY = {
 
 
 class Unread:
-    """Follows the counters of parsers; what the margin around a piece of a log does to them is left out.
+    """Counts the messages that parsers refused, but for those in the margin around a piece of a log.
 
     Attributes:
-        counts: by scanner, messages by reason.
+        counts: by scanner, number of refused messages by reason.
     """
 
     def __init__(self, parsers: Mapping[str, Parser]) -> None:
@@ -32,7 +32,7 @@ class Unread:
         self._before = {name: refused_by(parser) for name, parser in parsers.items()}
 
     def note(self, *, own: bool) -> None:
-        """After messages of the piece itself (own), or of the margin."""
+        """Take up the parsers' counters after messages of the piece itself (``own``) or of its margin."""
         for name, parser in self._parsers.items():
             now = refused_by(parser)
             if own:
@@ -41,7 +41,7 @@ class Unread:
 
 
 def refused_by(parser: Parser) -> Counter[str]:
-    """Return what a parser refused so far, by reason."""
+    """Return how many messages a parser has refused so far, by reason."""
     counters = parser.counters
     found = Counter(
         {code: count for code, count in counters.errors.items() if code.startswith("bad_") or code == SEQUENCE_GAP}
@@ -51,7 +51,12 @@ def refused_by(parser: Parser) -> Counter[str]:
 
 
 def unread_lines(log: str, unread: Mapping[str, Mapping[str, int]]) -> tuple[list[str], list[str]]:
-    """Of counts by scanner and reason: lines of what is missing from the products, and lines that only warn."""
+    """Return two lists of lines: what is missing from the products, and what is only a warning.
+
+    Args:
+        log: its name, for the lines.
+        unread: by scanner, counts of messages by reason.
+    """
     holes: list[str] = []
     warnings: list[str] = []
     for scanner, counts in sorted(unread.items()):

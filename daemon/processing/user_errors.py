@@ -1,4 +1,4 @@
-"""What a job of the office could not do, as one line for its user: the same way for every command."""
+"""Turns errors of an office job into one line for its user, in the same way for every command."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from swath.daemon.log.format import LogError
 
 @contextmanager
 def as_user_error(place: Path, *refused: type[Exception]) -> Iterator[None]:
-    """Whatever is raised within becomes a UserError.
+    """Turn every expected error raised in the block into a `UserError`.
 
     Args:
-        place: what an error of the system is about, where it names no file.
-        refused: errors whose text is for the user as it stands.
+        place: named in a system error that names no file.
+        refused: errors whose text can be shown to the user unchanged.
 
     Raises:
-        UserError: the job cannot be done; a log or a file that cannot be read or written has an exit code of its own.
+        UserError: the job cannot be done; if a log or a file cannot be read or written, with its own exit code.
     """
     try:
         yield
@@ -34,7 +34,7 @@ def as_user_error(place: Path, *refused: type[Exception]) -> Iterator[None]:
 
 
 def finite(value: Any) -> Any:
-    """Return the value with null for every number that is none, in lists and tables too."""
+    """Return the value with None in place of every float that is not finite, in lists and tables too."""
     if isinstance(value, dict):
         return {key: finite(one) for key, one in value.items()}
     if isinstance(value, list):

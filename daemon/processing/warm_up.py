@@ -1,7 +1,7 @@
-"""Compiles what `swath live`, `georef` and `calibrate` run, before there is anything to run it on, and keeps it.
+"""Compiles the numba loops of `swath live`, `georef` and `calibrate` before the first data, and keeps them on disk.
 
-A moment of made-up returns goes the whole way: parser, model, air, mapping frame, products. What has been kept from
-before is only read. Nothing here knows which loops there are; a loop is warm because it has run.
+A moment of made-up returns goes the whole way: parser, model, air, mapping frame, products. Loops kept from an earlier
+run are only read. This module holds no list of loops; a loop is compiled because it has run.
 """
 
 from __future__ import annotations
@@ -88,13 +88,13 @@ PLACE = (np.radians(47.0), np.radians(9.0), 500.0)
 COMPILE_EVENT = "numba:compile"
 ROWS = 500
 LEAP_SECONDS = 18
-START_NS = (405_555 * 3600 + LEAP_SECONDS) * SECOND_NS  # GPS: a UTC hour of 2026, where stamps past the hour begin
-FLOWN_S = 15  # until clocks have locked, and some
+START_NS = (405_555 * 3600 + LEAP_SECONDS) * SECOND_NS  # GPS: a full UTC hour of 2026, where some stamps begin
+FLOWN_S = 15  # long enough for clocks to lock
 INS_GOOD = 3  # NovAtel's INS_SOLUTION_GOOD
 EPOCH_NS = 20_000_000
 HEIGHT_M = 800.0
-SOMEWHERE = (47.0, 9.0)  # degrees, for a frame that says no area
-_HEAD_BYTES = 31  # of a message in a log before its data: units of a log are strided so
+SOMEWHERE = (47.0, 9.0)  # degrees, for a mapping frame without an area of use
+_HEAD_BYTES = 31  # bytes of a message in a log before its data; units of a log have this stride
 
 _PLAN = """
 [session]
@@ -125,12 +125,12 @@ PLANS = (_PLAN, _PLAN + _AIR.format(refraction="ardc"), _PLAN + _AIR.format(refr
 
 @dataclass(frozen=True, slots=True)
 class WarmUp:
-    """What a warm-up did.
+    """The outcome of a warm-up.
 
     Attributes:
-        compiled: loops that were not in the cache.
-        seconds: that it took.
-        cache: where loops are kept; None: nowhere, they are compiled in memory by every process.
+        compiled: number of loops that were not in the cache.
+        seconds: duration of the warm-up.
+        cache: folder that loops are kept in; None: none, so every process compiles them in memory.
     """
 
     compiled: int
@@ -138,7 +138,7 @@ class WarmUp:
     cache: Path | None
 
     def text(self) -> str:
-        """Return a line for people."""
+        """Return the outcome as one line for people."""
         what = f"{self.compiled} loops compiled" if self.compiled else "all loops were compiled already"
         where = (
             f"kept in {self.cache}"
@@ -150,7 +150,7 @@ class WarmUp:
 
 @contextlib.contextmanager
 def compilations() -> Iterator[list[str]]:
-    """Names of the loops that are compiled meanwhile; those read from the cache are none."""
+    """Record the names of loops compiled within the block; those read from the cache are not listed."""
     with numba.core.event.install_recorder(COMPILE_EVENT) as recorder:
         names: list[str] = []
         yield names
@@ -158,7 +158,7 @@ def compilations() -> Iterator[list[str]]:
 
 
 class _FirstCompilation(numba.core.event.Listener):
-    """Calls once, when the first loop is about to be compiled."""
+    """Calls a function once, when the first loop is about to be compiled."""
 
     def __init__(self, call: Callable[[], None]) -> None:
         self._calls = [call]
@@ -168,25 +168,25 @@ class _FirstCompilation(numba.core.event.Listener):
             self._calls.pop()()
 
     def on_end(self, event: numba.core.event.Event) -> None:
-        """Nobody asks."""
+        """Ignore the end of a compilation."""
 
 
 @contextlib.contextmanager
 def before_compiling(call: Callable[[], None]) -> Iterator[None]:
-    """Have something called before the first loop that is compiled meanwhile; never where all come from the cache."""
+    """Call a function before the first loop is compiled within the block; never if all come from the cache."""
     with numba.core.event.install_listener(COMPILE_EVENT, _FirstCompilation(call)):
         yield
 
 
 def cache_folder() -> Path | None:
-    """Return where loops are kept; None: nowhere."""
+    """Return the folder that loops are kept in; None if there is none."""
     loop: Any = count_points
     path: str | None = loop.stats.cache_path
     return None if path is None else Path(path)
 
 
 def warm_up(setups: Iterable[Setup] = (), *, calibration: bool = False) -> WarmUp:
-    """Run everything once: for what any configuration is made of, and for those that are given; calibration on wish."""
+    """Run every loop once: for all kinds of configurations and for those given; for calibration if asked."""
     began_s = time.monotonic()
     with compilations() as names:
         _warm_parsers()
@@ -206,10 +206,10 @@ def _setup(plan: str, uncertainty: bool) -> Setup:
 
 
 def get_ready(setup: Setup) -> None:
-    """Before the first message of a recording: compile what its configuration needs, and clean up.
+    """Compile what a configuration needs and collect garbage, before the first message of a recording.
 
-    What has been loaded by now stays. The garbage collector would go through all of it in the midst of the flight, for
-    a tenth of a second.
+    Objects loaded by now stay. Without the freeze the garbage collector would go through all of them in the midst of
+    the flight, for a tenth of a second.
     """
     warm_setup(setup)
     gc.collect()
@@ -217,16 +217,16 @@ def get_ready(setup: Setup) -> None:
 
 
 def warm_setup(setup: Setup) -> None:
-    """Run once what one configuration needs; the setup itself is left as it is."""
+    """Run once what one configuration needs; the setup itself is not changed."""
     if setup.sources.imu_source is not None and setup.config.gnss:
         warm_navigation()
-    copy: Setup = pickle.loads(pickle.dumps(setup))  # a frame settles what it does by its first points
+    copy: Setup = pickle.loads(pickle.dumps(setup))  # a mapping frame settles by its first points
     parsers = copy.sources.parsers(("scanner",))
     for name in copy.scanners:
         parser = parsers[f"scanner/{name}"]
         for packets in _packets_for(parser, copy.config.scanner[name].protocol):
             _decoded(parser, packets)
-    with contextlib.suppress(ValueError):  # what such a place or such returns are refused for is no matter here
+    with contextlib.suppress(ValueError):  # errors that such a place or such returns raise do not matter here
         placed, trajectory = _placed(copy)
         for _, points in placed:
             _warm_products(points)
@@ -258,7 +258,7 @@ def _warm_products(points: Points) -> None:
 
 
 def _placed(setup: Setup) -> tuple[list[tuple[str, Points]], Trajectory | None]:
-    """Return points of a quarter of a minute of level flight, whose clocks have locked by then, and the flight."""
+    """Return points of a quarter of a minute of level flight, long enough for clocks to lock, and its trajectory."""
     unix_ns = unix_ns_from_gps(START_NS, LEAP_SECONDS)
     stream = setup.live_stream(SessionInfo("warm-up", "swath", "", "", unix_ns, 0))
     clocks = stream.clocks
@@ -291,7 +291,7 @@ def _device_clock(host_ns: int, passed_ns: int, second: int) -> StructArray:
 
 
 def _solutions(setup: Setup, gps_ns: int) -> StructArray:
-    """Return a second of level flight where the mapping frame is at home, as a device's INS would tell it."""
+    """Return a second of level flight in the mapping frame's area of use, as a device's INS would report it."""
     lat_deg, lon_deg = SOMEWHERE
     crs, area = setup.options.crs or setup.config.output.crs, None
     with contextlib.suppress(pyproj.exceptions.CRSError):
@@ -322,7 +322,7 @@ def _returns(host_ns: int, passed_ns: int) -> StructArray:
 
 
 def _warm_parsers() -> None:
-    """The decoding of protocols that no plan above names; an Ouster's wants its metadata and waits for it."""
+    """Warm up the decoding of protocols that no plan above names; an Ouster's needs its metadata and is left out."""
     for protocol, config in (
         ("srep", {"mirror_factor": 2.0, "geometry": {"type": "polygon", "facets": 4}}),
         ("hesai-xt32", {}),
@@ -333,7 +333,7 @@ def _warm_parsers() -> None:
 
 
 def _decoded(parser: Parser, packets: list[bytes]) -> list[StructArray]:
-    """Return returns of packets of one length, handed over as a log hands them over."""
+    """Return the returns decoded from packets of one length, passed to the parser as a log passes them."""
     units = np.zeros((len(packets), _HEAD_BYTES + len(packets[0])), dtype=np.uint8)
     units[:, _HEAD_BYTES:] = np.frombuffer(b"".join(packets), np.uint8).reshape(len(packets), -1)
     host_ns: Int64Array = np.arange(len(packets), dtype=np.int64) * 1_000_000
@@ -342,9 +342,7 @@ def _decoded(parser: Parser, packets: list[bytes]) -> list[StructArray]:
 
 
 def _packets_for(parser: Parser, protocol: str) -> list[list[bytes]]:
-    """Return batches of two packets in each way a head may send them; none for a protocol whose packets nobody can
-    make.
-    """
+    """Return batches of two packets in each mode of a head; empty for a protocol without an encoder."""
     if isinstance(parser, OusterParser):
         return [_ouster(parser)]
     make = _PACKETS.get(protocol.partition("-")[0])
@@ -393,7 +391,7 @@ _PACKETS: dict[str, Callable[[], list[list[bytes]]]] = {"srep": _srep, "velodyne
 
 
 def warm_navigation() -> None:
-    """Run everything once."""
+    """Run alignment, filter and smoother once."""
     position_e = e_from_geodetic(*PLACE)
     inertial, observations = _standing(float(np.linalg.norm(gravity_e(position_e)))), _seen(position_e)
     setup = NavigationSetup(GRADES["tactical"], np.array([[0.1, 0.0, -1.0]]))
@@ -429,11 +427,11 @@ def _seen(position_e: NDArray[np.float64]) -> StructArray:
 
 
 def warm_calibration() -> None:
-    """Run everything once."""
+    """Run the search for planes and the adjustment once."""
     flight = _flight()
     planes = find_planes(flight)
     planes = rematch(flight, planes)
-    with contextlib.suppress(ValueError):  # what such a flight does not determine is no matter here
+    with contextlib.suppress(ValueError):  # that such a flight does not determine the parameters does not matter here
         adjust(flight, planes, ParameterOptions("basic"), gauss_markov(flight))
 
 
@@ -451,7 +449,7 @@ def _flight() -> Flight:
 
 
 def _trajectory(frame: Tangent) -> Trajectory:
-    """Return the same way twice, northwards."""
+    """Return a trajectory that flies the same line northwards twice."""
     since_s = np.arange(0.0, LINE_S + 1.0, 0.02)
     north_m = LINE_MPS * (since_s - 0.5 * LINE_S)
     lat, lon, height = geodetic_from_e(

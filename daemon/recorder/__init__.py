@@ -1,1 +1,1 @@
-"""The recorder: from wires to the log."""
+"""The recorder: takes data from the wires and writes it to the log."""

@@ -1,4 +1,4 @@
-"""Assembles a recorder from a configuration: one thread a wire, one writer, the clocks. Opens nothing."""
+"""Assembles a recorder from a configuration: one thread for each wire, one writer, the clocks. It opens nothing."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from swath.drivers.transports.opening import open_pps, open_transport
 from swath.drivers.transports.spec import parse_pps
 from swath.georef.records import NamesEdge
 
-QUEUE_BYTES = 64 * 1024 * 1024  # 2.6 s of 20 000 datagrams of 1206 bytes: longer than a consumer SSD stalls
+QUEUE_BYTES = 64 * 1024 * 1024  # 2.6 s at 20 000 datagrams of 1206 bytes per second: longer than a consumer SSD stalls
 
 
 @dataclass(slots=True)
@@ -48,7 +48,7 @@ class Assembly:
 
 
 def assemble(config: Config, queue_bytes: int = QUEUE_BYTES) -> Assembly:
-    """Make everything, open nothing."""
+    """Make all parts of a recorder without opening any device or file."""
     clock = HostClock()
     channels = ChannelTable()
     queue = BlockQueue(queue_bytes)
@@ -90,7 +90,7 @@ def assemble(config: Config, queue_bytes: int = QUEUE_BYTES) -> Assembly:
 
 
 def make_timekeeper(config: Config, events: Events, host_minus_monotonic_ns: int) -> TimeKeeper:
-    """Return a clock for each PPS of a configuration, and the receivers that name its seconds."""
+    """Make a clock for each PPS of a configuration, and connect the receivers that name its seconds."""
     keeper = TimeKeeper(events, host_minus_monotonic_ns)
     said = {gnss.pps: gnss.leap_seconds for gnss in config.gnss.values() if gnss.leap_seconds is not None}
     for name, pps in config.pps.items():
@@ -121,7 +121,7 @@ def _add_pps(assembly: Assembly) -> None:
 
 def _add_device(assembly: Assembly, device: DeviceEntry) -> None:
     if device.transport is None or device.transport.kind == "gnss":
-        return  # inside another stream: logged there
+        return  # part of another stream, which is logged
     first_units = FirstUnits(device)
     assembly.first_units.append(first_units)
     units_seen: list[UnitsSeen] = [first_units.add]
@@ -141,7 +141,9 @@ def _add_device(assembly: Assembly, device: DeviceEntry) -> None:
 
 
 def _watch_corrections(assembly: Assembly, device: DeviceEntry) -> CorrectionsWatch:
-    """Return receivers come before corrections, so that the one to hand on to has its session already."""
+    """Watch a source of corrections and prepare forwarding; receivers come first, so the target's session exists
+    already.
+    """
     target = assembly.config.corrections[device.name].forward_to
     relay = None
     if target is not None:

@@ -1,9 +1,9 @@
-"""The control socket: what an operator says to a running recorder, one line of JSON a connection.
+"""The control socket: takes an operator's requests to a running recorder, one line of JSON for each connection.
 
     {"command": "mark", "text": "line 4 start"}      {"command": "split"}
 
-The thread does a bounded amount of work in each turn and rests between two, so that neither a flood of connections nor
-peers that say nothing cost the recording anything. Only the recorder's own user and root can connect.
+The thread does a bounded amount of work in each turn and rests between turns, so that neither a flood of connections
+nor silent peers slow the recording. Only the recorder's own user and root can connect.
 """
 
 from __future__ import annotations
@@ -34,33 +34,33 @@ from swath.daemon.system import name_thread
 
 log = logging.getLogger("swath")
 
-LINE_BYTES = 4096  # of a request, its end included
+LINE_BYTES = 4096  # of a request, including its end
 NOTE_CHARACTERS = 500
-PEERS = 8  # at a time, and as many more wait in the kernel
-PEER_S = 2.0  # to say a line
+PEERS = 8  # at a time; as many more can wait in the kernel
+PEER_S = 2.0  # allowed for sending a line
 TURN_S = 0.05  # rest after each turn
 NOTES_AT_ONCE = 20
 NOTES_PER_S = 5.0
 SPLITS_AT_ONCE = 3  # a new part costs a few syncs
 SPLITS_PER_S = 1.0
 IGNORED_TOLD_S = 60.0
-LOOK_S = 1.0  # between two looks whether the socket is still where people look for it
-_SUN_PATH_BYTES = 107  # unix(7), without the end
+LOOK_S = 1.0  # between two checks that the socket is still at its path
+_SUN_PATH_BYTES = 107  # unix(7), without the terminating zero
 
 
 class BadRequestError(Exception):
-    """A line that is no request; one line: why."""
+    """A line is not a valid request; the message is one line that gives the reason."""
 
 
 def control_place(directory: Path) -> Path:
-    """Return where the socket is made: in the unit's runtime directory, by hand in the log directory."""
+    """Return the path of the socket: in the unit's runtime directory, or in the log directory if there is no unit."""
     runtime = os.environ.get("RUNTIME_DIRECTORY", "").split(":")[0]
     return Path(runtime) / "control" if runtime else directory / CONTROL_LINK
 
 
 @contextlib.contextmanager
 def socket_address(place: Path) -> Iterator[str]:
-    """A path as an address, through a descriptor of its folder where it is longer than addresses may be."""
+    """Give a path as a socket address; a path longer than addresses may be goes through a descriptor of its folder."""
     if len(os.fsencode(place)) <= _SUN_PATH_BYTES:
         yield str(place)
         return
@@ -72,17 +72,17 @@ def socket_address(place: Path) -> Iterator[str]:
 
 
 def listen(place: Path) -> socket.socket:
-    """Return a socket at a place that its owner alone can connect to. One that nobody listens at any more is replaced.
+    """Return a listening socket that only its owner can connect to; a dead socket at this path is replaced.
 
     Raises:
-        OSError: somebody listens there, something else stands there, or the file system has no sockets.
+        OSError: another process listens there, another kind of file exists there, or the file system has no sockets.
     """
     folder = os.open(place.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC)
     try:
-        fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)  # two that start at once do not remove each other's
+        fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)  # two that start at once must not remove each other's
         _make_way(place)
-        os.fchmod(sock.fileno(), 0o600)  # before bind, which makes the file with it: it never stands open
+        os.fchmod(sock.fileno(), 0o600)  # before bind, which creates the file with this mode
         with socket_address(place) as address:
             sock.bind(address)
         sock.listen(PEERS)
@@ -95,7 +95,7 @@ def listen(place: Path) -> socket.socket:
 
 
 def _make_way(place: Path) -> None:
-    """Remove what a recorder that is gone has left."""
+    """Remove a socket that a dead recorder left."""
     try:
         mode = os.lstat(place).st_mode
     except FileNotFoundError:
@@ -111,7 +111,7 @@ def _make_way(place: Path) -> None:
 
 
 def place_link(link: Path, target: Path) -> None:
-    """Let a name in the log directory lead to the socket; raises OSError."""
+    """Link a name in the log directory to the socket; raises OSError."""
     if link == target:
         return
     with contextlib.suppress(FileNotFoundError):
@@ -126,7 +126,7 @@ def place_link(link: Path, target: Path) -> None:
 
 @dataclass(slots=True)
 class _Peer:
-    """A connection that has not said its line yet."""
+    """A connection whose line has not arrived yet."""
 
     sock: socket.socket
     until_s: float
@@ -135,7 +135,7 @@ class _Peer:
 
 @dataclass(slots=True)
 class _Allowance:
-    """So many at once, and so many a second for long."""
+    """Limits requests: ``most`` at once, and ``per_s`` per second over a longer time."""
 
     most: float
     per_s: float
@@ -146,7 +146,7 @@ class _Allowance:
         self.left = self.most
 
     def take(self) -> bool:
-        """Return whether one more is allowed now."""
+        """Return True and count one request if another is allowed now."""
         now_s = time.monotonic()
         self.left = min(self.most, self.left + (now_s - self.at_s) * self.per_s)
         self.at_s = now_s
@@ -170,10 +170,10 @@ class Recording(Protocol):
 
 
 class Control(threading.Thread):
-    """Listens to an operator of a recorder; a defect here ends this thread and nothing else.
+    """Takes requests from an operator; a defect here ends only this thread.
 
     Attributes:
-        ignored: connections that did not bring a request: too long, too late, not understood.
+        ignored: number of connections without a valid request: too long, too late, not understood.
     """
 
     def __init__(self, recording: Recording, events: Events) -> None:
@@ -190,13 +190,13 @@ class Control(threading.Thread):
         self._peers: list[_Peer] = []
         self._notes = _Allowance(NOTES_AT_ONCE, NOTES_PER_S)
         self._splits = _Allowance(SPLITS_AT_ONCE, SPLITS_PER_S)
-        self._told_ignored = (0, 0.0)  # how many, CLOCK_MONOTONIC
-        self._look_s = 0.0  # CLOCK_MONOTONIC of the next look
+        self._told_ignored = (0, 0.0)  # count, CLOCK_MONOTONIC
+        self._look_s = 0.0  # CLOCK_MONOTONIC of the next check
 
-    # ------------------------------------------------------------------ its life
+    # ------------------------------------------------------------------ start and end
 
     def open(self) -> None:
-        """Begin to listen; where that cannot be, an event says so and the recording goes on without."""
+        """Begin to listen; if that fails, post an event, and the recording continues without a control socket."""
         try:
             self._listen()
         except OSError as error:
@@ -212,7 +212,7 @@ class Control(threading.Thread):
         place_link(self._link, self.place)
 
     def _come_back(self, now_s: float) -> None:
-        """Listen anew where the socket was removed, and lead to it anew: with the log directory, when it is back."""
+        """Listen again if the socket was removed, and restore its link, for example when the log directory is back."""
         if now_s < self._look_s:
             return
         self._look_s = now_s + LOOK_S
@@ -226,7 +226,7 @@ class Control(threading.Thread):
                 place_link(self._link, self.place)
 
     def close(self) -> None:
-        """Stop listening and leave nothing behind that others could take for a recorder."""
+        """Stop listening and remove everything that others could take for a running recorder."""
         self._end.set()
         if self._sock is not None:
             self.join(1.0)
@@ -240,7 +240,7 @@ class Control(threading.Thread):
                 self._link.unlink()
 
     def run(self) -> None:
-        """Turn by turn until the end."""
+        """Handle connections, turn by turn, until the end."""
         name_thread("control")
         try:
             while not self._end.is_set():
@@ -252,13 +252,13 @@ class Control(threading.Thread):
         finally:
             for peer in self._peers:
                 peer.sock.close()
-            if self._sock is not None:  # who connects is refused at once, and does not wait for an answer
+            if self._sock is not None:  # later connections are refused at once instead of waiting for an answer
                 self._sock.close()
 
     # ------------------------------------------------------------------ one turn
 
     def _turn(self) -> None:
-        """Wait, then at most `PEERS` accepted and one read of each."""
+        """Wait, then accept at most `PEERS` connections and read once from each."""
         assert self._sock is not None
         listening = [self._sock] if len(self._peers) < PEERS else []
         ready, _, _ = select.select([*listening, *(peer.sock for peer in self._peers)], [], [], 0.5)
@@ -274,13 +274,13 @@ class Control(threading.Thread):
         while len(self._peers) < PEERS:
             try:
                 sock, _ = self._sock.accept()
-            except OSError:  # nobody more, gone again, or no descriptor left
+            except OSError:  # no more connections, already closed, or no descriptor left
                 return
             sock.setblocking(False)
             self._peers.append(_Peer(sock, time.monotonic() + PEER_S))
 
     def _is_done(self, peer: _Peer, ready: bool, now_s: float) -> bool:
-        """Read what a peer says; whether it is through with, answered or not."""
+        """Read from a peer and return whether the connection is finished, answered or not."""
         try:
             if ready:
                 got = peer.sock.recv(LINE_BYTES - len(peer.said))
@@ -315,7 +315,7 @@ class Control(threading.Thread):
             text = f"{self.ignored - told} connections to the control socket brought no request that can be followed"
             self._events.post(Severity.WARNING, "recorder", "control_ignored", text)
 
-    # ------------------------------------------------------------------ what can be asked
+    # ------------------------------------------------------------------ requests
 
     def _do(self, request: dict[str, object]) -> dict[str, object]:
         health = self._recording.recorder.health

@@ -1,4 +1,4 @@
-"""Asks a running recorder for something, over the control socket of its log directory."""
+"""Sends a request to a running recorder, over the control socket of its log directory."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from swath.daemon.recorder.control import socket_address
 
 ANSWER_S = 5.0
 ANSWER_BYTES = 1 << 16
-SHOWN_CHARACTERS = 1000  # of a text in it
+SHOWN_CHARACTERS = 1000  # of a text in the answer
 LATEST_NS = 1 << 63
-NEW_PART_S = 15.0  # the next one is tried again after 10 s
+NEW_PART_S = 15.0  # the recorder retries a failed new part after 10 s
 
 
 _OF_ALL: dict[str, type] = {"session_id": str, "part": int, "recording": bool, "reason": str}
@@ -26,10 +26,10 @@ _OF_COMMAND: dict[str, dict[str, type]] = {"mark": {"time_ns": int, "text": str}
 
 
 def ask(directory: Path, request: Mapping[str, str]) -> dict[str, Any]:
-    """Return a request and its answer, which has every key that the command's answer has, its texts in one line.
+    """Send a request and return its answer, which has all keys of the command's answer, with each text in one line.
 
     Raises:
-        UserError: no recorder runs there, it may not be asked, it does not answer or not as one, or it refuses.
+        UserError: no recorder runs there, this user may not ask it, it gives no valid answer, or it refuses.
     """
     try:
         said = _exchange(directory / CONTROL_LINK, json.dumps(request).encode() + b"\n")
@@ -38,7 +38,7 @@ def ask(directory: Path, request: Mapping[str, str]) -> dict[str, Any]:
     except PermissionError as error:
         text = f"{directory}: not permitted; only the recorder's own user and root may, such as with sudo"
         raise UserError(text, ExitCode.IO) from error
-    except OSError as error:  # a time-out is one
+    except OSError as error:  # includes a time-out
         raise UserError(f"{directory}: the recorder there does not answer", ExitCode.IO) from error
     if not said:
         raise UserError(f"{directory}: the recorder there does not answer", ExitCode.IO)
@@ -53,7 +53,7 @@ def ask(directory: Path, request: Mapping[str, str]) -> dict[str, Any]:
 
 
 def _understood(said: bytes, wanted: Mapping[str, type]) -> dict[str, Any]:
-    """Return an answer or a refusal; raises ValueError, RecursionError where it is neither."""
+    """Parse an answer or a refusal; raises ValueError or RecursionError if it is neither."""
     answer = json.loads(said)
     refused = isinstance(answer, dict) and answer.get("ok") is False
     wanted = {"ok": bool} | ({"error": str} if refused else dict(wanted))
@@ -78,7 +78,7 @@ def _exchange(place: Path, line: bytes) -> bytes:
 
 
 def _connect(sock: socket.socket, address: str) -> None:
-    """Connect, in turn where others wait too."""
+    """Connect, and retry while the queue of waiting connections is full."""
     deadline_s = time.monotonic() + ANSWER_S
     while True:
         try:
@@ -92,7 +92,7 @@ def _connect(sock: socket.socket, address: str) -> None:
 
 
 def wait_for_part(directory: Path, session_id: str, after: int, timeout_s: float = NEW_PART_S) -> str | None:
-    """Name of the part that grows once it is a later one than ``after``; None: there was none in the time."""
+    """Wait for a part later than ``after`` and return its file name; return None if none begins in time."""
     deadline_s = time.monotonic() + timeout_s
     while time.monotonic() < deadline_s:
         sign = read_sign(directory)

@@ -1,7 +1,7 @@
-"""Corrections of base stations beside their recording: counted by message, and handed on to a receiver's port.
+"""Handles corrections of base stations besides their recording: counts messages and forwards them to a receiver's port.
 
-What is recorded does not depend on it: the bytes are the writer's before they come here, and a port that takes nothing
-holds up only its own thread.
+The recording does not depend on it: the writer has the bytes before they arrive here, and a blocked port delays only
+its own thread.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from swath.drivers.parser import Parser
 from swath.drivers.transports.base import UnitBlock
 from swath.georef.records import Chunk, Int64Array
 
-MOST_WAITING = 64  # reads that a receiver's port has not taken yet; corrections older than that help nobody
+MOST_WAITING = 64  # reads that a receiver's port has not taken yet; older corrections are useless
 WAIT_S = 0.2
 
 
 class Relay(threading.Thread):
-    """Sends what is put into it, in order, to one port; drops and counts what the port does not take in time.
+    """Sends data to one port in order; drops and counts the data that the port does not take in time.
 
     Attributes:
         forwarded_bytes: taken by the port.
-        dropped_bytes: not taken: the port is away, or too slow.
+        dropped_bytes: not taken, because the port is missing or too slow.
     """
 
     def __init__(
@@ -41,10 +41,10 @@ class Relay(threading.Thread):
         self._waiting: queue.Queue[bytes] = queue.Queue(MOST_WAITING)
         self._ending = stop
         self._refused = False
-        self._telling = threading.Lock()  # who puts counts too
+        self._telling = threading.Lock()  # callers of `put` count too
 
     def put(self, data: bytes) -> None:
-        """Never waits; the first begins the thread."""
+        """Queue data without waiting; the first call starts the thread."""
         if self.ident is None:
             self.start()
         try:
@@ -53,7 +53,7 @@ class Relay(threading.Thread):
             self._tell(taken=False, count=len(data))
 
     def run(self) -> None:
-        """Until told to stop; what still waits then is let go."""
+        """Forward data until the stop event; data that still waits then is dropped."""
         name_thread(self.name)
         while not self._ending.is_set():
             try:
@@ -82,9 +82,9 @@ class Relay(threading.Thread):
 
 
 class CorrectionsWatch:
-    """What one source of corrections sends.
+    """Watches one source of corrections.
 
-    `units_seen` belongs to its receive thread, `status` may come from another.
+    `units_seen` is called by its receive thread, `status` may be called by another.
     """
 
     def __init__(self, source: str, parser: Parser, relay: Relay | None) -> None:
@@ -94,7 +94,7 @@ class CorrectionsWatch:
         self._lock = threading.Lock()
 
     def units_seen(self, log_time_ns: Int64Array, block: UnitBlock) -> None:
-        """Hand on, then count."""
+        """Forward the units, then count them."""
         for time_ns, unit in zip(log_time_ns.tolist(), block.units, strict=True):
             data = unit.tobytes()
             if self.relay is not None:
@@ -103,7 +103,7 @@ class CorrectionsWatch:
                 self._parser.feed(Chunk(self._source, time_ns, data))
 
     def status(self) -> dict[str, Any]:
-        """For the source's status: messages by number, what was damaged, what was handed on."""
+        """Return status entries: messages by number, damaged data, and forwarded and dropped bytes."""
         with self._lock:
             counters = self._parser.counters
             found: dict[str, Any] = {

@@ -1,6 +1,6 @@
-"""Whether the devices speak the protocols they are configured with, judged once from the first bytes of each.
+"""Checks once, from the first bytes of each device, whether the device uses the configured protocol.
 
-The recorder writes whatever comes; that it is not what the configuration says must not be found out after the flight.
+The recorder writes any bytes that arrive; a wrong protocol must be noticed before the end of the flight.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ JUDGED_AFTER_S = 10.0  # a slow device has sent several messages by then, and th
 class FirstUnits:
     """The first units of one device, kept until they are judged.
 
-    A receive thread adds, another thread judges; what has been taken away is no longer kept.
+    A receive thread adds units and another thread takes them; after that no more are kept.
     """
 
     def __init__(self, entry: DeviceEntry) -> None:
@@ -33,7 +33,7 @@ class FirstUnits:
         self._lock = threading.Lock()
 
     def add(self, log_time_ns: Int64Array, block: UnitBlock) -> None:
-        """Keep units while there is need of them."""
+        """Keep units as long as they are needed."""
         if self._closed:
             return
         room = max(1, (JUDGED_BYTES - self._bytes) // max(1, block.units.shape[1]))
@@ -44,7 +44,7 @@ class FirstUnits:
             self._closed = self._bytes >= JUDGED_BYTES
 
     def take(self) -> list[ChunkBatch] | None:
-        """Return what there is to judge, once; None while too little has come, and ever after."""
+        """Return the units to judge, once; return None before enough have arrived, and ever after."""
         with self._lock:
             waited = self._first_s is not None and time.monotonic() - self._first_s >= JUDGED_AFTER_S
             if not self._kept or not waited:
@@ -55,9 +55,7 @@ class FirstUnits:
 
 
 def judge(entry: DeviceEntry, kept: list[ChunkBatch]) -> str | None:
-    """Return what a device is instead of what it was configured as, or that nothing of it is understood; None: all is
-    well.
-    """
+    """Return a description of the mismatch if a device does not use the configured protocol; None if it does."""
     parser = find_driver(entry.kind, entry.protocol).make_parser(entry.settings)
     heard = Heard()
     for batch in kept:

@@ -1,4 +1,6 @@
-"""What the recorder says on stderr: written by a thread of its own, so that nobody who records waits for a reader."""
+"""Writes the recorder's messages to stderr in a separate thread, so that no recording thread waits for a
+slow reader.
+"""
 
 from __future__ import annotations
 
@@ -11,14 +13,14 @@ import threading
 
 from swath.daemon.system import name_thread
 
-MAX_LINES = 10_000  # that wait; further ones are counted: what they tell is in the log too
-END_S = 1.0  # that the last lines may take
+MAX_LINES = 10_000  # in the queue; further lines are only counted, since the log has their events too
+END_S = 1.0  # time limit for the last lines
 
 _PRIORITY = {logging.CRITICAL: 2, logging.ERROR: 3, logging.WARNING: 4, logging.INFO: 6, logging.DEBUG: 7}
 
 
 class JournalFormatter(logging.Formatter):
-    """Lines with the priority prefix that systemd-journald understands (sd-daemon(3))."""
+    """Formats lines with the priority prefix that systemd-journald understands (sd-daemon(3))."""
 
     def format(self, record: logging.LogRecord) -> str:
         """Return the prefix and the message."""
@@ -26,10 +28,10 @@ class JournalFormatter(logging.Formatter):
 
 
 class JournalHandler(logging.Handler):
-    """Never blocks: a full pipe, a journal that stands still or a busy disk behind stderr hold up its thread alone.
+    """Never blocks the caller: a full pipe, a stopped journal or a busy disk behind stderr delays only its own thread.
 
     Args:
-        fd: where the lines go; no stream of Python's, since the interpreter's end would wait for one that is stuck.
+        fd: descriptor for the lines, not a Python stream: at exit the interpreter would wait for a stuck stream.
     """
 
     def __init__(self, fd: int) -> None:
@@ -41,7 +43,7 @@ class JournalHandler(logging.Handler):
         self._thread.start()
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Line up a message; handlers are called one at a time (`logging.Handler.acquire`)."""
+        """Queue a message; handlers are called one at a time (`logging.Handler.acquire`)."""
         try:
             if self._left_out:
                 self._lines.put_nowait(f"{self._left_out} lines left out: nobody read them")
@@ -54,12 +56,12 @@ class JournalHandler(logging.Handler):
         name_thread("journal")
         while (line := self._lines.get()) is not None:
             rest = f"{line}\n".encode(errors="replace")
-            with contextlib.suppress(OSError):  # nobody is there any more; the recording goes on
+            with contextlib.suppress(OSError):  # the reader is gone; the recording continues
                 while rest:
                     rest = rest[os.write(self._fd, rest) :]
 
     def close(self) -> None:
-        """Write what waits, for no longer than `END_S`."""
+        """Write the queued lines, but take no longer than `END_S`."""
         with contextlib.suppress(queue.Full):
             self._lines.put_nowait(None)
             self._thread.join(END_S)
@@ -67,7 +69,7 @@ class JournalHandler(logging.Handler):
 
 
 def threads_text() -> str:
-    """Return where every thread of this process stands; why it cannot be said, where it cannot."""
+    """Return the stack of every thread of this process, or the reason why it cannot be read."""
     try:
         with os.fdopen(os.memfd_create("threads"), "w+b") as file:
             faulthandler.dump_traceback(file)

@@ -1,10 +1,10 @@
-"""One thread a wire: wait, take what the kernel has, stamp it, hand it to the recorder. Nothing here knows a protocol.
+"""Receives from the wires, one thread for each: wait, take the kernel's data, stamp it, pass it to the recorder.
 
-Only GNSS bytes are looked at besides, for the time messages in them, after they have been handed over.
+The receivers know no protocols. Only GNSS bytes are parsed as well, for their time messages, after they have been
+passed on.
 
-What a wire or controller says of its own trouble: told when it begins, counted all the time.
-
-None of it is a loss of units: error frames are units themselves, and what a line garbled is recorded as it came.
+Faults that a wire or controller reports are posted when they begin and counted all the time. They are not lost units:
+error frames are units themselves, and bytes garbled on the line are recorded as they arrive.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from swath.drivers.session import Session, SessionState
 from swath.drivers.transports.base import RawEdge, TransportCounters, UnitBlock
 from swath.georef.records import Int64Array
 
-TOLD_AGAIN_S = 30.0  # trouble that goes on is told so often, with what came meanwhile
+TOLD_AGAIN_S = 30.0  # a continuing fault is reported at this interval, with the new counts
 
 
 @dataclass(frozen=True, slots=True)
 class _Kind:
-    """One of the counters of a transport, and how its growth is told."""
+    """One of the counters of a transport, and the event that reports its growth."""
 
     counter: str
     severity: Severity
@@ -63,12 +63,12 @@ _KINDS = (
 
 
 class WireTrouble:
-    """Follows the counters of one wire.
+    """Follows the error counters of one wire.
 
     Args:
-        source: whose events these are.
-        events: where they go.
-        monotonic_s: the clock that says when going trouble is told again.
+        source: source of the events.
+        events: receives the events.
+        monotonic_s: the clock that decides when a continuing fault is reported again.
     """
 
     def __init__(self, source: str, events: Events, monotonic_s: Callable[[], float] = time.monotonic) -> None:
@@ -79,7 +79,7 @@ class WireTrouble:
         self._told_s: dict[str, float] = {}
 
     def look(self, counters: TransportCounters) -> dict[str, int]:
-        """Tell what has grown; the counters that are not zero."""
+        """Report counters that have grown, and return all that are not zero."""
         counts: dict[str, int] = {}
         for kind in _KINDS:
             count: int = getattr(counters, kind.counter)
@@ -96,10 +96,10 @@ class WireTrouble:
             self._events.post(kind.severity, self._source, kind.code, f"{grown} {kind.text}")
 
 
-WAIT_S = 0.2  # a receive thread comes back from its wait at least this often
-ACCOUNT_S = 0.25  # and says how much it has lost at least this often
-DRAIN_S = 1.0  # at the end, what the kernel already holds is still taken, for no longer than this
-QUEUE_TOLD_S = 1.0  # the queue counts as having room again when it refused nothing for so long
+WAIT_S = 0.2  # a receive thread returns from its wait at least this often
+ACCOUNT_S = 0.25  # and reports its losses at least this often
+DRAIN_S = 1.0  # at the end, data that the kernel already holds is taken for no longer than this
+QUEUE_TOLD_S = 1.0  # the queue counts as having room again after so long without a refusal
 
 UnitsSeen = Callable[[Int64Array, UnitBlock], None]
 
@@ -134,7 +134,7 @@ class _Account:
 
 @dataclass(slots=True)
 class Shared:
-    """What all receivers of a session work with."""
+    """The objects that all receivers of a session share."""
 
     clock: HostClock
     queue: BlockQueue
@@ -144,7 +144,7 @@ class Shared:
 
 
 class Receiver(threading.Thread, ABC):
-    """The life of a receive thread; subclasses take units and edges.
+    """Runs a receive thread; subclasses take units and edges.
 
     Attributes:
         came_back_ns: CLOCK_MONOTONIC of the last return from a wait, for the watchdog.
@@ -165,10 +165,10 @@ class Receiver(threading.Thread, ABC):
         self._told_silent = False
         self._opened_ns = self._silent_since_ns = shared.clock.now_ns()
         self._refused_ns: int | None = None  # CLOCK_MONOTONIC when the queue last had no room
-        self._lost_before = 0  # lost_queue when it began to have none
+        self._lost_before = 0  # lost_queue before the queue refused blocks
 
     def run(self) -> None:
-        """Receive until told to stop; an error here is a defect, which the watchdog turns into a restart."""
+        """Receive until the stop event; an error here is a defect, which the watchdog turns into a restart."""
         name_thread(self.source)
         try:
             while not self.shared.stop.is_set():
@@ -188,18 +188,18 @@ class Receiver(threading.Thread, ABC):
 
     @abstractmethod
     def take(self, timeout_s: float) -> int | None:
-        """Wait, hand over what came; the host time of the newest unit, None when there was none."""
+        """Wait for data and pass it on; return the host time of the newest unit, or None if there was none."""
 
     @abstractmethod
     def receive_once(self) -> None:
-        """One wait and what came of it."""
+        """Wait once, handle the data, and report states and counts."""
 
     @abstractmethod
     def finish(self) -> None:
         """Close the device and give the last account."""
 
     def drain(self) -> None:
-        """Take what the kernel held when the end was asked for."""
+        """Take the data that the kernel held when the stop was requested."""
         ended_ns, limit_ns = self.shared.clock.now_ns(), time.monotonic_ns() + int(DRAIN_S * 1e9)
         while time.monotonic_ns() < limit_ns:
             newest_ns = self.take(0.0)
@@ -207,7 +207,9 @@ class Receiver(threading.Thread, ABC):
                 return
 
     def hand_over(self, block: EncodedBlock) -> None:
-        """Put a block and the account so far into the queue; what it refuses is counted, and told once an episode."""
+        """Put a block and the account so far into the queue; blocks it refuses are counted, with one event for each
+        episode.
+        """
         now_ns = time.monotonic_ns()
         if not self.shared.queue.put(QueueItem(self.source, block, self.account.snapshot())):
             if self._refused_ns is None:
@@ -222,14 +224,14 @@ class Receiver(threading.Thread, ABC):
             self.shared.events.post(Severity.WARNING, self.source, "queue_drained", text)
 
     def tell_account(self, *, now: bool = False) -> None:
-        """Let the recorder know the totals even when no unit came."""
+        """Send the totals to the recorder, even if no unit arrived."""
         monotonic = time.monotonic_ns()
         if now or monotonic - self._accounted_ns >= ACCOUNT_S * 1e9:
             self._accounted_ns = monotonic
             self.shared.queue.put(QueueItem(self.source, count=self.account.snapshot()))
 
     def tell_state(self, state: SessionState, last_error: str) -> None:
-        """Report opening, loss, its reason when that changes, silence and return as events, each once."""
+        """Post opening, loss, a changed reason for absence, silence and return as events, each once."""
         if state is not self._told_state:
             self._tell_change(state, last_error)
             self._told_state = state
@@ -264,7 +266,7 @@ class Receiver(threading.Thread, ABC):
         return "silent"
 
     def note_units(self, count: int, length: int, last_ns: int) -> None:
-        """Count units; tell when silence ended."""
+        """Count units; post an event if they end a silence."""
         if self._told_silent:
             self._told_silent = False
             gap_s = (last_ns - self._silent_since_ns) * 1e-9
@@ -295,7 +297,7 @@ class UnitReceiver(Receiver):
         return self._session.state is SessionState.OPENING
 
     def take(self, timeout_s: float) -> int | None:
-        """Wait for units, stamp them, hand them over, then look for time in them."""
+        """Wait for units, stamp them, pass them on, then give them to the callbacks in ``units_seen``."""
         blocks = self._session.receive(timeout_s)
         if not blocks:
             return None
@@ -309,14 +311,14 @@ class UnitReceiver(Receiver):
         return int(times[-1][-1])
 
     def receive_once(self) -> None:
-        """One wait; then what there is to tell of the device and of losses."""
+        """Wait once; then report the state of the device, and losses."""
         took = self.take(WAIT_S) is not None
         self.tell_state(self._session.state, self._session.last_error)
         self._update_kernel_losses(force=not took)
         self.tell_account()
 
     def finish(self) -> None:
-        """Take the rest and close; the kernel's last word on losses is that of the closed socket."""
+        """Take the rest and close; the closed socket gives the kernel's final count of losses."""
         if self._session.state is SessionState.OPEN:
             self.drain()
         self._session.close()
@@ -325,7 +327,7 @@ class UnitReceiver(Receiver):
 
     def _stamp(self, blocks: list[UnitBlock]) -> list[Int64Array]:
         counts = [len(block.units) for block in blocks]
-        if all(block.kernel_realtime_ns is None for block in blocks):  # of a serial port: the time they were read
+        if all(block.kernel_realtime_ns is None for block in blocks):  # serial ports have no kernel stamps
             read_ns = self.shared.clock.now_ns()
             return [np.array([read_ns] * count, dtype=np.int64) for count in counts]
         pair = read_clock_pair()
@@ -399,11 +401,11 @@ class UnitReceiver(Receiver):
 
 
 class PpsReceiver(Receiver):
-    """Takes the edges of one PPS source; every edge goes to ``/pps/<name>``, accepted by the clock or not.
+    """Takes the edges of one PPS source; every edge goes to ``/pps/<name>``, whether the clock accepts it or not.
 
     Args:
-        overwrites: the kernel keeps the newest edge only, so that those it overwrote before they were fetched show
-            as a jump of its sequence. (A FIFO holds every edge: what is missing there was never in it.)
+        overwrites: the kernel keeps only the newest edge, so edges that it overwrote before they were fetched appear as
+            a jump of the sequence. (A FIFO holds every edge: one that is missing there was never written.)
     """
 
     def __init__(
@@ -430,7 +432,7 @@ class PpsReceiver(Receiver):
         return self._session.state is SessionState.OPENING
 
     def take(self, timeout_s: float) -> int | None:
-        """Wait for edges and hand them over."""
+        """Wait for edges and pass them on."""
         edges = self._session.receive(timeout_s)
         if not edges:
             return None
@@ -442,7 +444,7 @@ class PpsReceiver(Receiver):
         return int(times[-1])
 
     def receive_once(self) -> None:
-        """One wait, and what there is to tell of the device."""
+        """Wait once; then report the state of the device."""
         self.take(WAIT_S)
         self.account.trouble = self._trouble.look(self._session.poll_counters())
         self.tell_state(self._session.state, self._session.last_error)
@@ -470,7 +472,9 @@ class PpsReceiver(Receiver):
         self._edge_seen(host_ns, edge.sequence)
 
     def _count_missed(self, sequence: int) -> None:
-        """Edges since the last one, while the device was open, that were overwritten before they were fetched."""
+        """Count edges since the previous one that were overwritten before they were fetched, while the
+        device was open.
+        """
         if self._openings != self._session.openings:
             self._openings, self._sequence = self._session.openings, None
         previous, self._sequence = self._sequence, sequence

@@ -1,4 +1,4 @@
-"""After recording has begun: logs that a crash left open are completed, by another process, one at a time.
+"""Repairs logs that a crash left open: after recording has begun, in another process, one log at a time.
 
 The repair never competes with the recording: it runs at idle CPU and I/O priority and starts on a log only while the
 disk keeps the reserve and room for the whole copy. The original is not touched.
@@ -25,23 +25,23 @@ _HEAD_BYTES = 4096  # of a part at most: header and session
 
 
 def unfinished_logs(directory: Path) -> list[Path]:
-    """Return logs of a directory without their end and without a repaired copy, oldest first.
+    """Return the logs of a directory that have neither an end nor a repaired copy, oldest first.
 
-    What a crash leaves at a part's very beginning is none: nothing is in it that could be repaired.
+    A file that a crash left at the very beginning of a part is not among them: it holds nothing to repair.
     """
     found: list[tuple[float, Path]] = []
-    with contextlib.suppress(FileNotFoundError):  # the directory itself
+    with contextlib.suppress(FileNotFoundError):  # the directory may be missing
         for path in directory.glob("*.mcap"):
             if path.name.endswith(".recovered.mcap") or path.with_suffix(".recovered.mcap").exists():
                 continue
-            with contextlib.suppress(OSError):  # moved away meanwhile, or not ours to read
+            with contextlib.suppress(OSError):  # moved away meanwhile, or not readable
                 if (changed_s := _left_open_since(path)) is not None:
                     found.append((changed_s, path))
     return [path for _, path in sorted(found)]
 
 
 def _left_open_since(path: Path) -> float | None:
-    """When a log without its end was last written to; None where it has its end."""
+    """Return the time of the last write to a log without an end; None if the log has an end."""
     with path.open("rb") as file:
         stat = os.fstat(file.fileno())
         file.seek(max(0, stat.st_size - len(MCAP_MAGIC)))
@@ -61,9 +61,10 @@ def _has_head(path: Path) -> bool:
 async def repair_left_open(
     directory: Path, reserve_bytes: int, is_current: Callable[[Path], bool], events: Events
 ) -> None:
-    """Repair what a crash left open; waits while there is no room, ends when nothing is left to do.
+    """Repair logs that a crash left open; wait while there is no room, and end when nothing is left to do.
 
-    What somebody recovers by hand meanwhile is looked at again later: it is done then, or was given up.
+    A log that another process is recovering is checked again later; by then that recovery has succeeded or was given
+    up.
     """
     tried: set[Path] = set()
     told: set[str] = set()
@@ -93,7 +94,7 @@ def _is_being_recovered(path: Path) -> bool:
 
 
 async def _wait(text: str, told: set[str], events: Events) -> None:
-    """Say once why, and let some time pass."""
+    """Post the reason once, then wait before the next check."""
     if text not in told:
         told.add(text)
         events.post(Severity.WARNING, "recorder", "repair_waits", text)
@@ -101,8 +102,10 @@ async def _wait(text: str, told: set[str], events: Events) -> None:
 
 
 async def _repair(path: Path, reserve_bytes: int, events: Events) -> None:
-    """One log in its own process; 0 and 4 (damage found, what is whole was saved) both leave a repaired copy."""
-    # a child inherits the recorder's real-time priority: it must be idle before its interpreter even starts
+    """Repair one log in its own process; exit codes 0 and 4 (damage found, all whole data saved) both leave a repaired
+    copy.
+    """
+    # a child inherits the recorder's real-time priority: it must be idle before its interpreter starts
     command = ["chrt", "--idle", "0"] if shutil.which("chrt") else []
     command += [sys.executable, "-m", "swath.daemon.cli.main", "recover", "--background"]
     command += ["--keep-free-mb", str(reserve_bytes // 1_000_000), str(path)]

@@ -1,9 +1,7 @@
-"""The recorder's process while it records: signals, clocks, watchdog, repair, and an end that loses nothing.
+"""Runs the recorder's process: signals, clocks, watchdog, repair, and an end that loses no data.
 
-Is the recorder alive, and what would one tell a person about it in a sentence?
-
-The watchdog is fed while the recorder progresses. A silent or absent sensor is an event and a word in the sentence,
-never a reason to restart: a restart would only cost the data of the others.
+The watchdog is fed while the recorder progresses, and a sentence for people summarises the state. A silent or absent
+sensor is an event and part of that sentence, never a reason to restart: a restart would only lose data of the others.
 """
 
 from __future__ import annotations
@@ -36,14 +34,14 @@ from swath.daemon.recorder.writer import WriterHealth, Writing
 from swath.daemon.system import lock_memory
 
 PROGRESS_S = 2.0
-OPENING_S = 20.0  # a driver may take its time to open: python-can sleeps 2 s for a serial CAN adapter
+OPENING_S = 20.0  # a driver may be slow to open: python-can sleeps 2 s for a serial CAN adapter
 
 log = logging.getLogger("swath")
 
 CLOCK_PERIOD_S = 0.1
 JUDGE_PERIOD_S = 1.0
 STEP_TOLD_NS = 1_000_000
-COLLECT_ALL_S = 60.0  # between two full garbage collections; the young are collected each second
+COLLECT_ALL_S = 60.0  # between two full garbage collections; young objects are collected each second
 RECEIVERS_END_S = 3.0
 WRITER_ENDS_S = 50.0  # the unit allows 70 s for both
 
@@ -60,10 +58,10 @@ class RecorderProcess:
         self._failed = False
 
     async def run(self, seconds: float | None) -> bool:
-        """Start recording, say READY, keep watch, end cleanly.
+        """Start recording, report READY, keep watch, end cleanly.
 
         Returns:
-            Whether all was well at the end: every thread ended as asked, and data was being written.
+            Whether all was well at the end: every thread ended as requested, and data was being written.
 
         Raises:
             UserError: no log can be made in the directory.
@@ -88,7 +86,7 @@ class RecorderProcess:
         return not self._failed and self._assembly.recorder.health.state is Writing.RECORDING
 
     async def _job(self, name: str, job: Coroutine[object, object, None]) -> None:
-        """One job beside the recording: a defect in it is told, and does not end the others."""
+        """Run one job beside the recording; a defect in it is posted as an event and does not end the others."""
         try:
             await job
         except Exception as error:
@@ -112,17 +110,17 @@ class RecorderProcess:
         self._control.open()
         gc.collect()
         gc.freeze()
-        gc.disable()  # a collection stops every thread: `_watch` has them, each second
+        gc.disable()  # a collection stops every thread, so `_watch` runs it each second
 
     def _end(self) -> None:
-        """Receivers first, then the writer with all they gave; a thread that does not end is left behind."""
+        """Stop the receivers first, then the writer with all their data; a thread that does not end is abandoned."""
         assembly = self._assembly
         self._control.close()
         assembly.shared.stop.set()
         deadline_s = time.monotonic() + RECEIVERS_END_S
         for receiver in assembly.receivers:
             receiver.join(max(0.0, deadline_s - time.monotonic()))
-        # one whose device is being opened still has taken nothing that could be missing
+        # a receiver whose device is still opening has no data that could be lost
         left = [receiver.source for receiver in assembly.receivers if receiver.is_alive() and not receiver.opening]
         if left:
             text = f"no end of {', '.join(left)}: its last units may be missing"
@@ -137,7 +135,7 @@ class RecorderProcess:
         self._failed |= bool(left) or failed or assembly.recorder.is_alive()
 
     def _sample_clock(self) -> float:
-        """Log the clocks side by side; returns the wall clock's offset from host time in nanoseconds."""
+        """Log the clocks side by side; return the wall clock's offset from host time in nanoseconds."""
         assembly = self._assembly
         discipline = read_clock_discipline()
         sample = read_clock_sample(discipline)
@@ -159,7 +157,7 @@ class RecorderProcess:
             offset_ns = now_ns
 
     async def _watch(self) -> None:
-        """Feed the watchdog while there is progress; say in a sentence what is going on."""
+        """Feed the watchdog while there is progress, and report the state in a sentence."""
         period_s = min(1.0, (self._service.watchdog_s or 4.0) / 4)
         collected_s = time.monotonic()
         while not self._must_end():
@@ -173,7 +171,7 @@ class RecorderProcess:
             if stuck and stuck != self._stuck:
                 text = f"no progress in {', '.join(stuck)}"
                 self._assembly.shared.events.post(Severity.CRITICAL, "recorder", "stuck", text)
-                log.critical("%s", threads_text())  # before a restart wipes it out
+                log.critical("%s", threads_text())  # a restart would destroy this information
             self._stuck = stuck
             if time.monotonic() - collected_s > COLLECT_ALL_S:
                 collected_s = time.monotonic()
@@ -184,10 +182,10 @@ class RecorderProcess:
         self._stop.set()
 
     def _must_end(self) -> bool:
-        """Return whether a thread has died that only a new process brings back.
+        """Return whether a thread has died that only a new process can replace.
 
-        Without its writer the process is of no use. Without a receiver it goes on for the others, unless a service
-        manager is there to start it anew at once.
+        Without its writer the process is useless. Without a receiver it continues for the other sources, unless a
+        service manager will restart it at once.
         """
         assembly = self._assembly
         dead = any(receiver.failed for receiver in assembly.receivers)
@@ -204,7 +202,7 @@ class RecorderProcess:
         await repair_left_open(parts.directory, reserve_bytes, is_current, assembly.shared.events)
 
     async def _judge(self) -> None:
-        """Tell of devices that speak another protocol than the one configured, once each."""
+        """Post an event, once for each device, if the device uses another protocol than the configured one."""
         waiting = self._assembly.first_units
         while waiting:
             await asyncio.sleep(JUDGE_PERIOD_S)
@@ -222,7 +220,7 @@ class RecorderProcess:
 
 
 def stuck_threads(receivers: Iterable[Receiver], writer: WriterHealth, now_ns: int | None = None) -> list[str]:
-    """Return names of the threads that have not made progress within `PROGRESS_S`; empty is healthy."""
+    """Return the names of the threads that have not made progress within `PROGRESS_S`; an empty list means healthy."""
     now = time.monotonic_ns() if now_ns is None else now_ns
     limit = now - int(PROGRESS_S * 1e9)
     opening_limit = now - int(OPENING_S * 1e9)
@@ -231,21 +229,21 @@ def stuck_threads(receivers: Iterable[Receiver], writer: WriterHealth, now_ns: i
         for receiver in receivers
         if receiver.came_back_ns < (opening_limit if receiver.opening else limit)
     ]
-    # A status a second: the last one may be a second old and its successor have two seconds to reach the disk.
+    # Statuses are a second apart: the last one may be a second old, and the next one has two more to reach the disk.
     if writer.status_ns < limit - int(1e9):
         stuck.append("writer")
     return stuck
 
 
 def a_restart_helps_nobody(stuck: Collection[str], receivers: Iterable[Receiver]) -> bool:
-    """Return whether all that is stuck is being opened: it has nothing to lose yet, and opens no sooner by a
-    restart.
+    """Return True if every stuck source is still opening: it has no data to lose, and a restart would not open it
+    sooner.
     """
     return {receiver.source for receiver in receivers if receiver.opening}.issuperset(stuck)
 
 
 def sentence(session_id: str, part: int, writer: WriterHealth) -> str:
-    """Return what the operator reads in ``systemctl status``."""
+    """Return the sentence that the operator reads in ``systemctl status``."""
     if writer.state is not Writing.RECORDING:
         return f"NOT RECORDING: {writer.reason}"
     troubles = [text for source, status in writer.statuses.items() if (text := source_trouble(source, status))]

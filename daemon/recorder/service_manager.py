@@ -1,15 +1,15 @@
-"""Tells systemd what the service is doing (sd_notify(3)), or nobody when there is no systemd."""
+"""Reports the state of the service to systemd (sd_notify(3)), if it runs under systemd."""
 
 from __future__ import annotations
 
 import os
 import socket
 
-SEND_S = 0.5  # a manager that does not read must not stop the loop that watches
+SEND_S = 0.5  # a manager that does not read must not block the watch loop
 
 
 class ServiceManager:
-    """The notify socket of the environment at start; every call is a no-op without one."""
+    """The notify socket from the environment at start; every call is a no-op without one."""
 
     def __init__(self, environment: dict[str, str] | None = None) -> None:
         env = dict(os.environ) if environment is None else environment
@@ -29,4 +29,4 @@ class ServiceManager:
             try:
                 sock.sendto(message.encode(), self._address)
             except OSError:
-                return  # nobody to tell is no reason to stop recording
+                return  # a missing manager must not stop the recording

@@ -1,6 +1,6 @@
-"""What time it is while recording: edges and time messages of the running session, and the state of each clock.
+"""Keeps time while recording, from edges and time messages of the running session, with the state of each clock.
 
-Nothing here changes what is logged: a later reading of the log does all of it again, from the same edges and bytes.
+It does not change the logged data: a later reading of the log repeats the computation from the same edges and bytes.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from swath.drivers.transports.base import UnitBlock
 from swath.georef.records import ChunkBatch, Int64Array, NamesEdge, Record, TimeMessage
 from swath.georef.timescales import HostTimeline, PpsClock, WallComparison
 
-STOPPED_NS = 5_000_000_000  # data, but no time message for so long, and for thrice as long as ever before …
-STOPPED_LONGEST_NS = 60_000_000_000  # … or for so long
+STOPPED_NS = 5_000_000_000  # data, but no time message for so long, and for three times the longest pause before …
+STOPPED_LONGEST_NS = 60_000_000_000  # … or for this long in any case
 
 
 @dataclass(slots=True)
 class _TimeSource:
-    """A GNSS stream whose time messages are read; what it says of time may stop while its bytes go on."""
+    """A GNSS stream whose time messages are read; time messages may stop while other bytes continue."""
 
     source: str
     clock: PpsClock
@@ -34,17 +34,19 @@ class _TimeSource:
     message_ns: int | None = None
     longest_ns: int = 0  # between two messages
     told: bool = False
-    remarks: list[str] = field(default_factory=list)  # told so far
+    remarks: list[str] = field(default_factory=list)  # posted so far
 
     def note_message(self, host_ns: int) -> int | None:
-        """Return a time message came; how long there was none, where that had been told."""
+        """Note a time message; return the length of the pause before it, if that pause had been reported."""
         pause_ns = 0 if self.message_ns is None else max(0, host_ns - self.message_ns)
         self.message_ns, self.longest_ns = host_ns, max(self.longest_ns, pause_ns)
         told, self.told = self.told, False
         return pause_ns if told else None
 
     def note_stop(self) -> int | None:
-        """Return data has come for so long without a time message; once, None before and after."""
+        """Return the time without a time message while data arrived, once it is too long; None before and
+        after that.
+        """
         if self.message_ns is None or self.told:
             return None
         pause_ns = self.units_ns - self.message_ns
@@ -53,20 +55,20 @@ class _TimeSource:
 
 
 class TimeKeeper:
-    """Feeds one `PpsClock` a PPS source (and one a GNSS without PPS); all calls are safe from any thread."""
+    """Feeds one `PpsClock` for each PPS source (and for each GNSS without PPS); all calls are safe from any thread."""
 
     def __init__(self, events: Events, host_minus_monotonic_ns: int) -> None:
         self._events = events
         self._lock = threading.Lock()
         self._timeline = HostTimeline(host_minus_monotonic_ns)
         self._beside_wall = WallComparison("this computer's clock")
-        self._far: set[str] = set()  # receivers of which it has been told that their time is far from that clock
-        self._clocks: dict[str, PpsClock] = {}  # by the source that shows it: pps/main, gnss/rover
+        self._far: set[str] = set()  # receivers whose time was reported as far from that clock
+        self._clocks: dict[str, PpsClock] = {}  # by the source whose status shows it: pps/main, gnss/rover
         self._sources: dict[str, _TimeSource] = {}
         self._failed: set[str] = set()
 
     def add_pps(self, source: str, assumed_leap_seconds: int | None, delay_ns: int) -> None:
-        """A PPS source, ``pps/name``."""
+        """Add a PPS source, ``pps/name``."""
         self._clocks[source] = PpsClock(assumed_leap_seconds=assumed_leap_seconds, delay_ns=delay_ns)
 
     def add_gnss(
@@ -77,7 +79,7 @@ class TimeKeeper:
         names_edge: NamesEdge | None,
         assumed_leap_seconds: int | None,
     ) -> None:
-        """A GNSS stream; its clock is its PPS's, or one of messages alone."""
+        """Add a GNSS stream; its clock is that of its PPS, or one of time messages alone."""
         if pps_source is not None:
             self._clocks[source] = self._clocks[pps_source]
         else:
@@ -85,7 +87,7 @@ class TimeKeeper:
         self._sources[source] = _TimeSource(source, self._clocks[source], parser, names_edge)
 
     def units_seen(self, source: str) -> Callable[[Int64Array, UnitBlock], None]:
-        """Return what a GNSS receiver thread calls with the bytes it has just handed over."""
+        """Return the function that a GNSS receiver thread calls with the bytes it has just passed on."""
 
         def feed(log_time_ns: Int64Array, block: UnitBlock) -> None:
             time_source = self._sources[source]
@@ -98,7 +100,9 @@ class TimeKeeper:
 
     @contextlib.contextmanager
     def _defects_told(self, source: str) -> Iterator[None]:
-        """A defect in parser or clock is told once a source; it costs a time state, never the recording."""
+        """Report a defect in parser or clock once for each source; it may cost a time state, but never the
+        recording.
+        """
         try:
             yield
         except Exception as error:
@@ -127,21 +131,21 @@ class TimeKeeper:
             self._drain(time_source.source, time_source.clock)
 
     def _tell_far(self, source: str) -> None:
-        """Tell once of a receiver whose time is hours or days from this computer's clock."""
+        """Post an event, once for each receiver, if its time is hours or days from this computer's clock."""
         text = "" if source in self._far else self._beside_wall.verdict(source)
         if text:
             self._far.add(source)
             self._events.post(Severity.WARNING, source, "time_far_from_host", text)
 
     def _tell_remarks(self, time_source: _TimeSource) -> None:
-        """Tell once what the parser takes otherwise than the receiver says it, or refuses."""
+        """Post each remark of the parser once: receiver data that it corrects, or refuses."""
         for remark in time_source.parser.remarks():
             if remark not in time_source.remarks:
                 time_source.remarks.append(remark)
                 self._events.post(Severity.WARNING, time_source.source, "date_doubtful", remark)
 
     def edge_seen(self, source: str) -> Callable[[int, int], None]:
-        """Return what a PPS receiver thread calls with an edge's host time and sequence number."""
+        """Return the function that a PPS receiver thread calls with an edge's host time and sequence number."""
 
         def feed(host_ns: int, sequence: int) -> None:
             with self._defects_told(source), self._lock:
@@ -151,7 +155,9 @@ class TimeKeeper:
         return feed
 
     def clock_sample(self, sample: Mapping[str, int | float], discipline: ClockDiscipline) -> None:
-        """The host's clocks side by side, ten times a second; the wall clock may name a second where it is kept."""
+        """Take a reading of the host's clocks, ten times a second; a disciplined wall clock may determine which second
+        it is.
+        """
         realtime_ns, monotonic_ns = int(sample["realtime_ns"]), int(sample["monotonic_ns"])
         raw_ns = int(sample["monotonic_raw_ns"])
         with self._defects_told("clock"), self._lock:
@@ -164,7 +170,7 @@ class TimeKeeper:
                 )
 
     def status(self, source: str, host_ns: int) -> dict[str, object]:
-        """Return ``time_state`` and ``time_sigma_ns`` of a gnss or pps source; nothing for the others."""
+        """Return ``time_state`` and ``time_sigma_ns`` of a gnss or pps source; an empty dict for the others."""
         clock = self._clocks.get(source)
         if clock is None:
             return {}
@@ -178,7 +184,9 @@ class TimeKeeper:
         return {"time_state": "NO_TIME", "time_sigma_ns": None}
 
     def _tell_stop(self, time_source: _TimeSource) -> None:
-        """Edges carry a known second on, so that no state would say that nothing confirms it any more."""
+        """Post an event if time messages stop: edges alone continue the known second, so the state would not show the
+        stop.
+        """
         pause_ns = time_source.note_stop()
         if pause_ns is not None:
             text = f"data, but no time message for {pause_ns * 1e-9:.0f} s: has its message set or baud rate changed?"

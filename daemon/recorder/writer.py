@@ -1,7 +1,6 @@
-"""The writer thread: takes blocks from the queue, lays them into the current part and accounts for every unit.
+"""The writer thread: takes blocks from the queue, adds them to the current part and accounts for every unit.
 
-A status message is written after all chunks that its counts speak of, so it is true of the file that it stands in, up
-to the place where it stands.
+A status message is written after all chunks that its counts cover, so it is true for the file up to its own position.
 """
 
 from __future__ import annotations
@@ -28,34 +27,34 @@ from swath.daemon.system import name_thread
 
 log = logging.getLogger("swath")
 
-TAKE_S = 0.02  # pause between two looks at the queue
+TAKE_S = 0.02  # pause between two reads of the queue
 STATUS_S = 1.0
-SPLIT_AGAIN_S = 10.0  # after a next part could not be opened
-RESUME_LONGEST_S = 30.0  # between two tries to write again; begins with a status period, doubles
+SPLIT_AGAIN_S = 10.0  # after a failure to open the next part
+RESUME_LONGEST_S = 30.0  # between two attempts to write again; begins with a status period, doubles
 EVENTS_KEPT = 10_000  # while nothing can be written
 _ROOM_AGAIN = 1.05  # recording resumes with this much more than the reserve
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
 
 
 class Writing(StrEnum):
-    """Whether data reaches the disk."""
+    """The state of writing to the disk."""
 
     RECORDING = "recording"
-    RESERVE = "reserve"  # stopped on purpose, or by the disk itself: it is full up to the reserve
+    RESERVE = "reserve"  # free space is down to the reserve, or the disk is full
     FAILED = "failed"  # stopped by another error of the disk or directory
 
 
 @dataclass(slots=True)
 class WriterHealth:
-    """What the watchdog and people want to know, updated each second.
+    """The writer's state for the watchdog and for people, updated each second.
 
     Attributes:
-        status_ns: CLOCK_MONOTONIC when the latest status was written and synced, or the stop for want of room was
-            looked at. An error of the disk leaves it standing.
+        status_ns: CLOCK_MONOTONIC when the latest status was written and synced, or when free space was last checked
+            while writing is stopped for lack of it. An error of the disk does not advance it.
         free_bytes: on the log's file system.
-        reserve_bytes: of them nothing is written into.
+        reserve_bytes: part of the free bytes that is kept free.
         bytes_per_s: written over the last second.
-        reason: why nothing is written, in words.
+        reason: why writing is stopped, in words.
     """
 
     state: Writing = Writing.RECORDING
@@ -69,7 +68,7 @@ class WriterHealth:
 
 @dataclass(frozen=True, slots=True)
 class RecorderSettings:
-    """From [session]: when to split, sync and stop."""
+    """Settings from [session]: when to split, sync and stop."""
 
     split_bytes: int
     split_s: float
@@ -78,7 +77,7 @@ class RecorderSettings:
 
 
 class Recorder(threading.Thread):
-    """Owns the log's files; nobody else writes to them."""
+    """Owns the log's files; no other thread writes to them."""
 
     def __init__(
         self,
@@ -100,8 +99,8 @@ class Recorder(threading.Thread):
         self._events = events
         self._clock = clock
         self._account = Account(parts, channels, events, clock, time_status)
-        self._events_laid: deque[EncodedBlock] = deque(maxlen=EVENTS_KEPT)  # of the current part, newest last
-        self._events_waiting: deque[EncodedBlock] = deque(maxlen=EVENTS_KEPT)  # for a part to come
+        self._events_laid: deque[EncodedBlock] = deque(maxlen=EVENTS_KEPT)  # events of the current part, newest last
+        self._events_waiting: deque[EncodedBlock] = deque(maxlen=EVENTS_KEPT)  # events for the next part
         self._synced_s = self._bytes_at_s = time.monotonic()
         self._status_due_s = time.monotonic() + STATUS_S
         self._split_after_s = self._resume_after_s = 0.0
@@ -112,11 +111,13 @@ class Recorder(threading.Thread):
     # ------------------------------------------------------------------ sources and opening
 
     def add_source(self, source: str) -> None:
-        """A source that gets a status; before the thread starts."""
+        """Add a source that gets a status; call this before the thread starts."""
         self._account.add_source(source)
 
     def open_first(self) -> None:
-        """Open part 0, or stop at the reserve at once; raises OSError when the directory cannot be written."""
+        """Open part 0, or stop at once if free space is below the reserve; raises OSError if the directory cannot be
+        written.
+        """
         self.health.free_bytes = self._free_bytes() or 0
         if self.health.free_bytes < self._settings.reserve_bytes:
             text = self._reserve_text()
@@ -128,7 +129,7 @@ class Recorder(threading.Thread):
     # ------------------------------------------------------------------ the thread
 
     def run(self) -> None:
-        """Write until told to stop, then everything that is still queued, the last status and the index."""
+        """Write until the stop event, then write all that is still queued, the last status and the index."""
         name_thread("writer")
         try:
             while not self.stop.is_set():
@@ -145,7 +146,7 @@ class Recorder(threading.Thread):
             raise
 
     def turn(self) -> None:
-        """Take what is queued, and do what is due."""
+        """Take the queued blocks, and do what is due."""
         self._take()
         self._guard(lambda part: part.close_due(time.monotonic_ns()))
         now_s = time.monotonic()
@@ -182,7 +183,7 @@ class Recorder(threading.Thread):
             self._account.note(item.source, item.count)
 
     def _lay(self, block: EncodedBlock) -> None:
-        """Into the current part; where there is none, events wait for the next one and units are counted as lost."""
+        """Add a block to the current part; without one, events wait for the next part and units are counted as lost."""
         is_event = block.channel_id == self._events.channel_id
         if self._parts.current is not None:
             if is_event:
@@ -194,7 +195,7 @@ class Recorder(threading.Thread):
             self._account.unwritten[block.channel_id] += block.count
 
     def _guard(self, action: Callable[[PartWriter], None]) -> None:
-        """Do something to the current part; an error of the disk stops the writing, never the recorder."""
+        """Run an action on the current part; an error of the disk stops the writing, but not the recorder."""
         part = self._parts.current
         if part is None:
             return
@@ -219,7 +220,7 @@ class Recorder(threading.Thread):
         self._sync_ms_max = max(self._sync_ms_max, (self._synced_s - started) * 1e3)
 
     def _tell_status(self) -> None:
-        """Flush, so that the counts are of written chunks, then write one status a source."""
+        """Flush, so that the counts are of written chunks, then write one status for each source."""
         self._guard(lambda part: part.flush())
         common = {
             "queue_high_water": self._queue.pop_high_water(),
@@ -243,7 +244,7 @@ class Recorder(threading.Thread):
     # ------------------------------------------------------------------ disk
 
     def _free_bytes(self) -> int | None:
-        """Free for us on the log's file system; None where the directory cannot be asked."""
+        """Return the free bytes on the log's file system for this user; None if the directory cannot be accessed."""
         try:
             stat = os.statvfs(self._parts.directory)
         except OSError:
@@ -258,7 +259,7 @@ class Recorder(threading.Thread):
         )
 
     def _look_after_part(self) -> None:
-        """Is there room, and is the file still where people will look for it?"""
+        """Check that there is free space, and that the file is still at its path."""
         if self._parts.has_gone() and time.monotonic() >= self._split_after_s:
             self._go_on_elsewhere()
         free_bytes = self._free_bytes()
@@ -333,7 +334,9 @@ class Recorder(threading.Thread):
         )
 
     def _open_next(self) -> PartWriter | None:
-        """Open the next part; where its directory was made anew, its lock with it, or it is said why not."""
+        """Open the next part; if its directory was recreated, lock it again, or post an event with the
+        reason why not.
+        """
         old = self._parts.open_next(self._clock.now_ns())
         try:
             self._parts.keep_directory()

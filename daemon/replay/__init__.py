@@ -1,1 +1,1 @@
-"""A log's units, and their way back onto wires."""
+"""Replay of a log: its units, and the wires that they are sent over."""

@@ -1,4 +1,4 @@
-"""A finished log as a sequence of timed units, and the outputs that a configuration names for them."""
+"""Reads a finished log as a sequence of timed units, and opens the outputs that a configuration names for them."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ from swath.daemon.replay.wire_player import Output, PpsOutput, TimedUnit, open_o
 
 
 def timed_units(session: Session, *, with_pps: bool) -> Iterator[TimedUnit]:
-    """Yield raw units and PPS edges of a session in the order of their host time.
+    """Yield the raw units and PPS edges of a session in the order of their host time.
 
-    A PPS edge's time is the edge's own, not that of its message; a message that says none is passed over.
+    The time of a PPS edge is that of the edge itself, not that of its message; a message without an edge time is
+    skipped.
     """
     for batch in session.batches_by_time():
         source = source_of_topic(batch.channel.topic)
@@ -34,11 +35,13 @@ def timed_units(session: Session, *, with_pps: bool) -> Iterator[TimedUnit]:
 
 
 def output_makers(config: Config, *, with_pps: bool) -> dict[str, Callable[[], Output]]:
-    """Return what makes the sending end of every transport that a configuration names; each raises TransportError."""
+    """Return functions that make the sending end of every transport that a configuration names; each raises
+    TransportError.
+    """
     makers: dict[str, Callable[[], Output]] = {}
     for device in config.devices():
         for spec, suffix in ((device.transport, ""), (device.auxiliary, "/aux")):
-            if spec is not None and spec.kind not in ("gnss", "ntrip"):  # a caster is nobody to play to
+            if spec is not None and spec.kind not in ("gnss", "ntrip"):  # a caster only sends
                 makers[device.source + suffix] = partial(open_output, spec)
     for name, pps in config.pps.items():
         if with_pps and pps.source.startswith(FIXED_SCHEME):
@@ -47,7 +50,7 @@ def output_makers(config: Config, *, with_pps: bool) -> dict[str, Callable[[], O
 
 
 def open_outputs(config: Config, *, with_pps: bool) -> dict[str, Output]:
-    """Return the sending ends of every transport that a configuration names.
+    """Open the sending ends of every transport that a configuration names.
 
     Raises:
         TransportError: one cannot be made; those already made are closed.
@@ -63,6 +66,6 @@ def open_outputs(config: Config, *, with_pps: bool) -> dict[str, Output]:
 
 
 def close_outputs(outputs: Mapping[str, Output]) -> None:
-    """Close them all."""
+    """Close all the outputs."""
     for output in outputs.values():
         output.close()

@@ -1,4 +1,4 @@
-"""Puts recorded units back on wires at their recorded pace: ptys, UDP, CAN, and PPS edges into a ``fixed:`` FIFO.
+"""Sends recorded units over wires again at their recorded pace: ptys, UDP, CAN, and PPS edges into a ``fixed:`` FIFO.
 
 `swath replay` plays logs with it, the demonstration plays captures; a recorder, gpsd or a maker's viewer listens.
 """
@@ -24,16 +24,16 @@ from swath.drivers.transports.base import TransportError
 from swath.drivers.transports.opening import open_transport
 from swath.drivers.transports.spec import TransportSpec
 
-EMPTY_LOOKS = 15  # of 10 ms, until a port counts as read to its end
-_PATIENCE_S = 1.0  # a reader that does not take its bytes for so long loses them, counted
+EMPTY_LOOKS = 15  # of 10 ms each, after which a port counts as read to its end
+_PATIENCE_S = 1.0  # a reader that takes no bytes for so long loses them; the loss is counted
 _LATE_S = 0.002  # units due within this are sent without another sleep
 _PTYS = "/dev/pts"
-LONGEST_PAUSE_NS = 3600 * 1_000_000_000  # between units; a log that says more means another time, nobody waits for it
+LONGEST_PAUSE_NS = 3600 * 1_000_000_000  # between units; a longer one in a log is a step of its time
 
 
 @dataclass(frozen=True, slots=True)
 class TimedUnit:
-    """One unit and when it came; ``source`` picks the output."""
+    """One unit and its time; ``source`` selects the output."""
 
     time_ns: int
     source: str
@@ -41,33 +41,34 @@ class TimedUnit:
 
 
 class Output(ABC):
-    """Where a source's units go."""
+    """The sending end of a source's transport."""
 
     @abstractmethod
     def send(self, data: bytes, due_realtime_ns: int) -> bool:
-        """Send one unit; False when nobody took it."""
+        """Send one unit; return False if no reader took it."""
 
     def has_reader(self) -> bool:
-        """Return whether somebody has opened the other end; True where nobody can know (UDP, CAN)."""
+        """Return whether the other end is open; True if that cannot be known (UDP, CAN)."""
         return True
 
     @abstractmethod
     def close(self) -> None:
-        """Close and remove what was created."""
+        """Close the output and remove everything that it created."""
 
 
 class PtyOutput(Output):
-    """A pseudo-terminal that stands at the path where a recorder expects its serial port."""
+    """A pseudo-terminal, linked from the path where a recorder expects its serial port."""
 
     def __init__(self, path: Path) -> None:
         if path.exists() and not (path.is_symlink() and path.resolve().is_relative_to(_PTYS)):
-            # a link may be udev's, to a receiver: replaced and removed it would be gone until that is plugged in anew
+            # a link may be udev's, to a receiver: once replaced, it would be missing until the receiver is plugged in
+            # again
             text = "is there already and is no link to a pseudo-terminal; give a path that may be made"
             raise TransportError(f"{path}: {text}")
         self._master, slave = os.openpty()
         tty.setraw(slave)
         self._port = os.ttyname(slave)
-        os.close(slave)  # so that the master tells whether a reader is there
+        os.close(slave)  # so that the master shows whether a reader is present
         os.set_blocking(self._master, False)
         path.unlink(missing_ok=True)
         path.symlink_to(self._port)
@@ -81,9 +82,10 @@ class PtyOutput(Output):
         return not any(event & select.POLLHUP for _, event in poll.poll(0))
 
     def send(self, data: bytes, due_realtime_ns: int) -> bool:
-        """Write all bytes, waiting for a slow reader for a while; one that let us wait in vain is not waited for again.
+        """Write all bytes and wait up to one second for a slow reader; once that time has run out, do not wait for it
+        again.
 
-        (Else a port that nobody reads would delay every other source by its patience at each unit.)
+        Otherwise a port without an active reader would delay all other sources at each of its units.
         """
         view = memoryview(data)
         deadline = time.monotonic() + self._patience_s
@@ -98,7 +100,7 @@ class PtyOutput(Output):
         return True
 
     def close(self) -> None:
-        """Let a reader take the last bytes, which hanging up would throw away; remove the link, hang up."""
+        """Let a reader take the last bytes, which hanging up would discard; then remove the link and hang up."""
         if self.has_reader():
             self._drain()
         self._path.unlink(missing_ok=True)
@@ -109,7 +111,7 @@ class PtyOutput(Output):
         deadline = time.monotonic() + self._patience_s
         waiting, empty = array.array("i", [1]), 0
         try:
-            # what was written last may be on its way from end to end still, and be counted at neither
+            # the last bytes may still be in transit between the two ends, where neither end counts them
             while empty < EMPTY_LOOKS and time.monotonic() < deadline:
                 fcntl.ioctl(port, termios.FIONREAD, waiting)
                 empty = 0 if waiting[0] else empty + 1
@@ -119,7 +121,7 @@ class PtyOutput(Output):
 
 
 class UdpOutput(Output):
-    """Datagrams to the port that a recorder listens on."""
+    """Sends datagrams to the port that a recorder listens on."""
 
     def __init__(self, spec: TransportSpec) -> None:
         group = spec.options.get("group")
@@ -143,7 +145,7 @@ class UdpOutput(Output):
 
 
 class CanOutput(Output):
-    """Frames to the bus that a recorder listens on."""
+    """Sends frames to the bus that a recorder listens on."""
 
     def __init__(self, spec: TransportSpec) -> None:
         self._transport = open_transport(spec)
@@ -163,7 +165,7 @@ class CanOutput(Output):
 
 
 class PpsOutput(Output):
-    """Edges as lines ``realtime_ns sequence`` into the FIFO of a ``fixed:`` source."""
+    """Writes edges as lines ``realtime_ns sequence`` into the FIFO of a ``fixed:`` source."""
 
     def __init__(self, path: Path) -> None:
         if not path.exists():
@@ -175,7 +177,7 @@ class PpsOutput(Output):
         self._sequence = 0
 
     def has_reader(self) -> bool:
-        """Return whether somebody reads the FIFO; opens it then."""
+        """Return whether the FIFO has a reader; if so, the FIFO is open afterwards."""
         if self._fd < 0:
             try:
                 self._fd = os.open(self._path, os.O_WRONLY | os.O_NONBLOCK)
@@ -184,7 +186,7 @@ class PpsOutput(Output):
         return True
 
     def send(self, data: bytes, due_realtime_ns: int) -> bool:
-        """Write the edge that is due now; its data are not used."""
+        """Write the edge that is due now; ``data`` is not used."""
         self._sequence += 1
         if not self.has_reader():
             return False
@@ -206,7 +208,7 @@ class PpsOutput(Output):
 
 
 def open_output(spec: TransportSpec) -> Output:
-    """Return the sending end of a transport of the configuration.
+    """Open the sending end of a transport of the configuration.
 
     Raises:
         TransportError: it cannot be made.
@@ -217,7 +219,7 @@ def open_output(spec: TransportSpec) -> Output:
 
 
 def wait_for_readers(outputs: Mapping[str, Output], seconds: float, stopped: Callable[[], bool]) -> list[str]:
-    """Wait until every port and FIFO has a reader; the sources of those that have none after ``seconds``."""
+    """Wait until every port and FIFO has a reader; return the sources that still have none after ``seconds``."""
     deadline = time.monotonic() + seconds
     while missing := [source for source, output in outputs.items() if not output.has_reader()]:
         if time.monotonic() >= deadline or stopped():
@@ -228,14 +230,14 @@ def wait_for_readers(outputs: Mapping[str, Output], seconds: float, stopped: Cal
 
 @dataclass(slots=True)
 class PlayReport:
-    """What was sent, by source.
+    """The counts of sent units, by source.
 
     Attributes:
         units, bytes: sent.
-        refused: units that nobody took in time.
+        refused: units that no reader took in time.
         passed_over: units of sources without an output.
-        latest_s: how late the latest unit was.
-        jumps: steps of time of more than an hour, forwards or back, that were not waited for.
+        latest_s: the largest delay of a unit.
+        jumps: number of time steps of more than an hour, forwards or back, for which the player did not wait.
     """
 
     units: Counter[str] = field(default_factory=Counter)
@@ -256,18 +258,18 @@ def play(
 ) -> PlayReport:
     """Send units when they are due: the first now, the others after it as recorded, ``pace`` times as fast.
 
-    A step of more than an hour between two units is no pause: the later one is sent at once, and the pace goes on
+    A step of more than an hour between two units is not a pause: the later unit is sent at once, and the pace continues
     from there.
 
     Args:
-        units: in time order; those of sources without an output are passed over.
+        units: in time order; those of sources without an output are skipped.
         outputs: by source.
         pace: 1 is as recorded.
         progress: called about ten times a second with the played seconds.
-        stopped: ends the play early when true.
+        stopped: ends the play early when it returns True.
     """
     report = PlayReport()
-    # loopback keeps the order of datagrams only while they are sent from one processor
+    # loopback keeps the order of datagrams only if they are sent from one processor
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     start_ns = realtime_ns = 0
     first_ns: int | None = None
@@ -279,7 +281,7 @@ def play(
             continue
         if first_ns is None:
             first_ns = unit.time_ns
-            start_ns, realtime_ns = time.monotonic_ns(), time.time_ns()  # reading up to it has taken its time
+            start_ns, realtime_ns = time.monotonic_ns(), time.time_ns()  # reading up to the first unit took time
         elif abs(unit.time_ns - last_ns) > LONGEST_PAUSE_NS:
             first_ns += unit.time_ns - last_ns
             report.jumps += 1

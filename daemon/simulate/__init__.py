@@ -1,1 +1,1 @@
-"""The virtual aircraft into a log, files or onto wires."""
+"""Flights of the virtual aircraft, sent into a log, into files or onto wires."""

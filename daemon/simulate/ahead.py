@@ -1,6 +1,6 @@
-"""A flight that is made in a process of its own, some seconds ahead of the one who takes its units.
+"""Computes a flight in a separate process, some seconds ahead of the process that uses its units.
 
-Compiled kernels hold the interpreter for long; beside them in one process units would leave late.
+Compiled kernels hold the interpreter for long; in the same process, units would be sent late.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.replay.wire_player import TimedUnit
 from swath.daemon.simulate.flight import Flight
 
-AHEAD_S = 5.0  # of flight that wait, at most
+AHEAD_S = 5.0  # of flight in the queue, at most
 BATCH_S = 0.1
 END_S = 5.0
 
@@ -28,10 +28,11 @@ MakeFlight = Callable[[], "tuple[Flight, dict[str, bytes]]"]
 
 @dataclass(frozen=True, slots=True)
 class FlightFacts:
-    """What is known of a flight before it begins; the first four as of `swath.daemon.simulate.flight.Flight`.
+    """The facts of a flight that are known before it begins.
 
     Attributes:
-        files: what stands beside it, by name.
+        duration_s, sources, wall_steps, unplugged: as of `swath.daemon.simulate.flight.Flight`.
+        files: content of the files beside the flight, by name.
     """
 
     duration_s: float
@@ -43,7 +44,7 @@ class FlightFacts:
 
 @dataclass(frozen=True, slots=True)
 class _Failed:
-    """Why the flight cannot be made; without an exit code it is a defect."""
+    """The reason why the flight cannot be made; without an exit code it is a defect of the program."""
 
     text: str
     exit_code: ExitCode | None = None
@@ -53,17 +54,18 @@ _Word = FlightFacts | _Failed | _Batch | None
 
 
 class Ahead:
-    """Starts at once; `facts` waits until the flight is ready.
+    """Makes a flight in another process, which starts at once; `facts` waits until the flight is ready.
 
     Args:
-        make: gives the flight and its files, in the other process: a function of a module, or a `partial` of one.
+        make: called in the other process, gives the flight and its files: a function of a module, or a `partial` of
+            one.
     """
 
     def __init__(self, make: MakeFlight) -> None:
         context = multiprocessing.get_context("spawn")
         receiving, sending = context.Pipe(duplex=False)
         self._process = context.Process(target=_make_ahead, args=(make, sending), daemon=True)
-        handler = signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches both processes; this one ends the other
+        handler = signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches both; this process ends the other
         try:
             self._process.start()
         finally:
@@ -76,7 +78,7 @@ class Ahead:
 
     @property
     def facts(self) -> FlightFacts:
-        """What is known before it begins.
+        """The facts that are known before the flight begins.
 
         Raises:
             UserError: the plan cannot be flown.
@@ -88,7 +90,7 @@ class Ahead:
         return self._facts
 
     def units(self) -> Iterator[TimedUnit]:
-        """Yield all units, true time since the start as their time."""
+        """Yield all units; their time is the true time since the start."""
         assert self.facts
         while (word := self._take()) is not None:
             assert isinstance(word, list)
@@ -96,7 +98,7 @@ class Ahead:
                 yield TimedUnit(*unit)
 
     def close(self) -> None:
-        """End the other process, wherever it is."""
+        """Terminate the other process, whatever it is doing."""
         self._stop.set()
         self._process.terminate()
         self._process.join(END_S)
@@ -126,7 +128,7 @@ class Ahead:
 
 
 def _make_ahead(make: MakeFlight, sending: Connection) -> None:
-    """The other process: the facts, then batch after batch, then None."""
+    """Run the other process: send the facts, then batch after batch, then None."""
     try:
         flight, files = make()
         plugs, steps = tuple(flight.unplugged), tuple(flight.wall_steps)
@@ -135,10 +137,10 @@ def _make_ahead(make: MakeFlight, sending: Connection) -> None:
             sending.send(batch)
         sending.send(None)
     except BrokenPipeError:
-        return  # nobody takes them any more
+        return  # the receiving process has closed the pipe
     except UserError as error:
         sending.send(_Failed(error.message, error.exit_code))
-    except Exception:  # the end of a process: what nobody foresaw is told where somebody can say it
+    except Exception:  # top level of a process: the receiving process reports the defect
         sending.send(_Failed(traceback.format_exc()))
 
 

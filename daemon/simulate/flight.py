@@ -1,6 +1,8 @@
-"""What `daemon` knows of a flight of the virtual aircraft: its units, its host's clock, and what befalls its wires.
+"""Defines what `daemon` needs of a flight of the virtual aircraft: its units, its host's clock, the faults of its
+wires.
 
-`swath.sim.fly.VirtualFlight` is one; only the command imports it, so that no recorder loads what flying takes.
+`swath.sim.fly.VirtualFlight` implements it; only the command imports that class, so that no recorder loads the modules
+for flying.
 """
 
 from __future__ import annotations
@@ -10,7 +12,7 @@ from typing import Protocol
 
 
 class VirtualUnit(Protocol):
-    """A unit on its way to the recorder; of a PPS edge, without bytes."""
+    """A unit on its way to the recorder; a PPS edge has no bytes."""
 
     @property
     def time_s(self) -> float:
@@ -22,51 +24,51 @@ class VirtualUnit(Protocol):
 
     @property
     def data(self) -> bytes:
-        """Its bytes."""
+        """Bytes of the unit."""
 
 
 class VirtualClock(Protocol):
     """The clocks of the virtual host at a true time; nanoseconds."""
 
     def host_ns(self, time_s: float) -> int:
-        """Return host time, the log's."""
+        """Return the host time, which is the log's."""
 
     def monotonic_ns(self, time_s: float) -> int:
-        """Return CLOCK_MONOTONIC."""
+        """Return the time of CLOCK_MONOTONIC."""
 
     def realtime_ns(self, time_s: float) -> int:
-        """Return CLOCK_REALTIME, with the steps so far."""
+        """Return the time of CLOCK_REALTIME, including the steps so far."""
 
 
 class Flight(Protocol):
-    """A flight, to be flown once."""
+    """A flight of the virtual aircraft, which can be flown once."""
 
     @property
     def duration_s(self) -> float:
-        """How long it lasts."""
+        """Duration of the flight in seconds."""
 
     @property
     def sources(self) -> tuple[str, ...]:
-        """Every source there is, also those that stay silent."""
+        """All sources, including those that stay silent."""
 
     @property
     def host_clock(self) -> VirtualClock:
-        """Of the virtual host."""
+        """Clock of the virtual host."""
 
     @property
     def wall_steps(self) -> Sequence[tuple[float, float]]:
-        """(time_s, step_s) of the wall clock."""
+        """Steps of the wall clock as (time_s, step_s)."""
 
     @property
     def unplugged(self) -> Sequence[tuple[str, float, float]]:
-        """(source, from_s, to_s): the wire is out."""
+        """Intervals in which a wire is unplugged, as (source, from_s, to_s)."""
 
     @property
     def returns(self) -> int:
-        """Laser returns in the units given so far."""
+        """Number of laser returns in the units given so far."""
 
     def units(self) -> Iterator[VirtualUnit]:
-        """Of all sources, in order of time."""
+        """Yield the units of all sources, in order of time."""
 
     def finish_truth(self) -> None:
-        """Write the truth, where there is one, behind the last unit; raises OSError."""
+        """Write the end of the truth file, if there is one, after the last unit; raises OSError."""

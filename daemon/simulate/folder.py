@@ -1,4 +1,4 @@
-"""Where a flight into a log is written: out of sight while it is made, whole in its place when it is done."""
+"""Provides the folder of a flight's log: hidden while the flight is made, in its final place when complete."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ _AGAIN = "is there already; remove it or give another place"
 
 
 class FlightFolder:
-    """A folder of its own inside the one that is asked for; what is not kept at the end is removed.
+    """A temporary folder inside the requested one; files that are not kept at the end are removed.
 
     Args:
         output: a folder, or the name of the log, which ends in ``.mcap``.
 
     Attributes:
-        work: where everything is written.
-        place: where it goes.
+        work: folder where all files are written.
+        place: folder where they are moved at the end.
 
     Raises:
         UserError: it cannot be made, or another flight is at work there.
@@ -50,33 +50,37 @@ class FlightFolder:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        """Remove what has not been kept, and the folder where it was made for it."""
+        """Remove all files that were not kept, and the requested folder if this object created it."""
         shutil.rmtree(self.work, ignore_errors=True)
         if self._made:
-            with contextlib.suppress(OSError):  # there is something in it
+            with contextlib.suppress(OSError):  # fails if there are files in it
                 self.place.rmdir()
 
     def refuse_taken(self, names: Iterable[str]) -> None:
-        """Refuse to put a file where another stands; raises UserError."""
+        """Refuse to overwrite existing files; raises UserError."""
         for name in (self.log_name, *sorted(names)):
             if name and os.path.lexists(self.place / name):
                 raise UserError(f"{self.place / name}: {_AGAIN}", ExitCode.IO)
 
     def refuse_session(self, session_id: str) -> None:
-        """Refuse a folder that holds a log of this session; raises UserError."""
+        """Refuse a folder that already holds a log of this session; raises UserError."""
         if not self.log_name:
             refuse_session(self.place, session_id)
 
     def write(self, files: Mapping[str, bytes]) -> None:
-        """Small files; raises OSError."""
+        """Write small files; raises OSError."""
         for name, data in files.items():
             (self.work / name).write_bytes(data)
 
     def keep(self, logs: list[Path]) -> list[Path]:
-        """Put everything in its place; where the parts of the log are now. Raises UserError, OSError.
+        """Move all files to their place and return the new paths of the log's parts.
 
         Args:
-            logs: the parts, within ``work``; one where the log has a name.
+            logs: the parts, within ``work``; exactly one if the log has a name.
+
+        Raises:
+            UserError: a file of the same name exists already.
+            OSError: the files cannot be moved.
         """
         goes = {path: path.name for path in sorted(self.work.iterdir())}
         if self.log_name:

@@ -1,7 +1,7 @@
-"""A flight of the virtual aircraft into an ordinary log: as a recorder on board would have written it.
+"""Writes a flight of the virtual aircraft into an ordinary log, as a recorder on board would have written it.
 
-Everything in it follows from the flight: no clock, name or number of this computer is used, so that the same plan
-gives the same bytes.
+All content follows from the flight: no clock, name or number of this computer is used, so that the same plan gives the
+same bytes.
 """
 
 from __future__ import annotations
@@ -34,20 +34,20 @@ from swath.drivers.captures.base import Address
 from swath.drivers.transports.base import UnitBlock
 
 HOST = "virtual"
-FIRST_HEAD = 201  # 192.168.1.201, where heads are as they come from the factory
+FIRST_HEAD = 201  # 192.168.1.201, the factory setting of the heads
 _NOBODY_KEEPS_IT = ClockDiscipline(0.0, STA_UNSYNC, float("inf"))
-_TOLD_EVERY = 2000  # units between two words on the progress
+_TOLD_EVERY = 2000  # units between two calls of the progress function
 
 _Due = tuple[float, Callable[[float], None]]
 
 
 def virtual_boot_id(name: str, seed: int) -> str:
-    """Return the boot of a host that never was, by the plan's name and seed."""
+    """Return the boot id of the virtual host, derived from the plan's name and seed."""
     return str(uuid.uuid5(uuid.NAMESPACE_URL, f"swath:sim:{name}:{seed}"))
 
 
 def sim_session_info(name: str, clock: VirtualClock, seed: int) -> SessionInfo:
-    """Return session of a flight that begins at time 0."""
+    """Return the session of a flight that begins at time 0."""
     boot_id, start_ns = virtual_boot_id(name, seed), clock.realtime_ns(0.0)
     return SessionInfo(
         session_id=session_name(name, start_ns, boot_id),
@@ -65,9 +65,9 @@ class _Line:
     """A source as the recorder sees it.
 
     Attributes:
-        peer: of datagrams: who sends them.
-        opened_ns: when its wire was opened last; nothing came before.
-        edges: the channel of a PPS source, and the number of the latest edge.
+        peer: sender of its datagrams.
+        opened_ns: time when its wire was last opened; no units came before.
+        edges: the channel of a PPS source; sequence: the number of its latest edge.
     """
 
     source: Source
@@ -81,7 +81,7 @@ class _Line:
 
     @property
     def since_ns(self) -> int:
-        """Since when nothing has come."""
+        """Time since when no units have come."""
         return self.source.last_ns if self.heard else self.opened_ns
 
 
@@ -89,7 +89,7 @@ class SimLog(MadeLog):
     """The log of a flight.
 
     Args:
-        config: that records it; every source of the flight is in it.
+        config: of the virtual recorder; it contains every source of the flight.
         directory: of the log.
         flight: not flown yet.
         seed: of its plan.
@@ -117,10 +117,10 @@ class SimLog(MadeLog):
         self._due = self._schedule(flight)
         self._next = next(self._due)
 
-    # ------------------------------------------------------------------ what a recorder would say
+    # ------------------------------------------------------------------ statuses of a recorder
 
     def count_of(self, source: Source, now_ns: int) -> SourceCount:
-        """As a receiver gives it."""
+        """Return the account of a source as a receiver gives it."""
         line = self._lines[source.port.source]
         silent = now_ns - line.since_ns > SILENT_AFTER_S * 1e9
         state = "absent" if not line.plugged else "silent" if silent else "receiving"
@@ -132,13 +132,13 @@ class SimLog(MadeLog):
         return SourceCount(units=source.units, bytes=source.bytes, last_unit_ns=last_ns, state=state)
 
     def time_status(self, source: str) -> dict[str, object]:
-        """By the same clock models that a recorder has."""
+        """Return the time status from the clock models that a recorder uses."""
         return self._keeper.status(source, self.clock.time_ns)
 
-    # ------------------------------------------------------------------ what comes
+    # ------------------------------------------------------------------ units
 
     def add(self, unit: VirtualUnit) -> None:
-        """One unit; raises OSError when the disk refuses a chunk."""
+        """Add one unit; raises OSError if the disk refuses a chunk."""
         self.go_on_to(unit.time_s)
         now_ns = self._host.host_ns(unit.time_s)
         self.go_on(now_ns)
@@ -156,7 +156,7 @@ class SimLog(MadeLog):
             self.lay_told()
 
     def go_on_to(self, time_s: float) -> None:
-        """What is due until a time of the flight: readings of the clock, wires that go and come."""
+        """Do everything that is due until a time of the flight: clock readings, unplugged and replugged wires."""
         while self._next[0] <= time_s:
             due_s, action = self._next
             action(due_s)
@@ -183,10 +183,10 @@ class SimLog(MadeLog):
         self._edge_seen[name](now_ns, line.sequence)
         self.lay_told()
 
-    # ------------------------------------------------------------------ what is due
+    # ------------------------------------------------------------------ scheduled actions
 
     def _schedule(self, flight: Flight) -> Iterator[_Due]:
-        """Return what is done when, without an end."""
+        """Return the endless sequence of actions with their times."""
         ticks: Iterator[_Due] = ((number * CLOCK_PERIOD_S, self._sample_clock) for number in itertools.count(1))
         once: list[_Due] = [(at_s, partial(self._wall_step, step_s)) for at_s, step_s in flight.wall_steps]
         for source, from_s, to_s in flight.unplugged:
@@ -244,7 +244,7 @@ def _when(due: _Due) -> float:
 
 @dataclass(frozen=True, slots=True)
 class SimReport:
-    """What came of a flight."""
+    """The result of a flight."""
 
     session_id: str
     paths: list[Path]
@@ -264,14 +264,14 @@ def fly_into_log(
     seed: int,
     progress: Progress = lambda seconds, units, returns, size: None,
 ) -> SimReport:
-    """Fly as fast as it goes.
+    """Fly a flight into a log, as fast as the computer can.
 
     Args:
         config, directory, flight, seed: as of `SimLog`.
-        progress: called now and then with the seconds flown, units, returns and bytes so far.
+        progress: called occasionally with the seconds flown, units, returns and bytes so far.
 
     Raises:
-        UserError: a log of this session is there.
+        UserError: a log of this session exists already.
         OSError: it cannot be written; nothing is left of it.
     """
     log = SimLog(config, directory, flight, seed)

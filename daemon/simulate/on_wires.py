@@ -1,7 +1,6 @@
-"""A flight of the virtual aircraft on wires, in real time: ptys, python-can, UDP and the PPS FIFO.
+"""Sends a flight of the virtual aircraft over wires in real time: ptys, python-can, UDP and the PPS FIFO.
 
-What befalls the wires is a unit among the others, with an output of its own: a plug that is pulled, a wall clock
-that is stepped.
+Faults of the wires are units among the others, with outputs of their own: an unplugged wire, a stepped wall clock.
 """
 
 from __future__ import annotations
@@ -23,11 +22,11 @@ _CLOCK, _PLUG = "wall clock", "plug of "
 _OUT, _IN = b"\0", b"\1"
 
 
-# ---------------------------------------------------------------------------------------------- wires of their own
+# ---------------------------------------------------------------------------------------------- separate wires
 
 
 def free_ports(count: int) -> list[int]:
-    """Return UDP ports that nobody has at the moment."""
+    """Return UDP ports that are free at the moment."""
     sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(count)]
     for sock in sockets:
         sock.bind(("127.0.0.1", 0))
@@ -38,12 +37,12 @@ def free_ports(count: int) -> list[int]:
 
 
 def own_wires(folder: Path, sources: Iterable[str], baud: Mapping[str, int]) -> dict[str, str]:
-    """Return transports, and sources of PPS, that nothing else uses: ports and FIFOs in a folder, free UDP ports.
+    """Return transports and PPS sources that no other program uses: ptys and FIFOs in a folder, free UDP ports.
 
     Args:
-        folder: of the ports and FIFOs.
+        folder: of the ptys and FIFOs.
         sources: of the flight.
-        baud: of serial sources; it sets no pace.
+        baud: of serial sources; it does not limit the data rate.
     """
     names = list(sources)
     wires = {}
@@ -62,13 +61,13 @@ def own_wires(folder: Path, sources: Iterable[str], baud: Mapping[str, int]) -> 
 
 
 class WallClock(Output):
-    """This computer's wall clock: what is sent to it are steps, in nanoseconds; closing it takes them back.
+    """Steps this computer's wall clock: it takes steps in nanoseconds as data; closing it takes all steps back.
 
     Attributes:
         stepped_ns: all steps so far.
 
     Raises:
-        UserError: it may not be set.
+        UserError: this user may not set the clock.
     """
 
     def __init__(self) -> None:
@@ -80,7 +79,7 @@ class WallClock(Output):
             raise UserError(text, ExitCode.USAGE) from error
 
     def send(self, data: bytes, due_realtime_ns: int) -> bool:
-        """Step it now."""
+        """Step the clock now."""
         self._step(int(data))
         return True
 
@@ -95,7 +94,7 @@ class WallClock(Output):
 
 
 class _SteppedEdges(Output):
-    """PPS edges by a wall clock that has been stepped since they were planned."""
+    """PPS edges stamped by a wall clock that has been stepped since they were planned."""
 
     def __init__(self, output: Output, clock: WallClock) -> None:
         self._output, self._clock = output, clock
@@ -118,7 +117,7 @@ class _Pulled(Output):
         self._output: Output | None = make()
 
     def set(self, plugged: bool) -> None:
-        """Put the plug in, or pull it; raises TransportError."""
+        """Put the plug in if ``plugged``, else pull it; raises TransportError."""
         if plugged and self._output is None:
             self._output = self._make()
         elif not plugged and self._output is not None:
@@ -136,7 +135,7 @@ class _Pulled(Output):
 
 
 class _Plug(Output):
-    """The plug of an output: what is sent to it says whether it is in."""
+    """The plug of an output; the data sent to it put the plug in or pull it."""
 
     def __init__(self, output: _Pulled) -> None:
         self._output = output
@@ -150,7 +149,7 @@ class _Plug(Output):
 
 
 def check_steps(facts: FlightFacts, *, set_clock: bool) -> None:
-    """Refuse to step this computer's wall clock unasked; raises UserError."""
+    """Refuse to step this computer's wall clock without permission; raises UserError."""
     if facts.wall_steps and not set_clock:
         steps = ", ".join(f"{step_s:+g} s at {at_s:g} s" for at_s, step_s in facts.wall_steps)
         text = (
@@ -160,10 +159,10 @@ def check_steps(facts: FlightFacts, *, set_clock: bool) -> None:
 
 
 def open_wires(config: Config, facts: FlightFacts) -> tuple[dict[str, Output], dict[str, Output]]:
-    """Return the outputs of a configuration for a flight, and what befalls them.
+    """Open the outputs of a configuration for a flight, and the outputs that apply its faults.
 
     Returns:
-        Outputs by source, and those of plugs and of the wall clock; all are closed with `close_outputs`.
+        Outputs by source, and those of plugs and of the wall clock; close all of them with `close_outputs`.
 
     Raises:
         UserError: the flight steps the wall clock, and this user may not.
@@ -199,7 +198,7 @@ def fly_on_wires(
     progress: Callable[[float, PlayReport], None] | None = None,
     stopped: Callable[[], bool] = lambda: False,
 ) -> PlayReport:
-    """Send every unit when it is due, and do to the wires what the plan says.
+    """Send every unit when it is due, and apply the plan's faults to the wires.
 
     Args:
         units: of the flight, in order of time.
@@ -212,7 +211,7 @@ def fly_on_wires(
 
 
 def _events(facts: FlightFacts) -> Iterator[TimedUnit]:
-    """Return what befalls the wires, in order of time."""
+    """Return the faults of the wires as units, in order of time."""
     events = [
         TimedUnit(round(at_s * 1e9), _CLOCK, str(round(step_s * 1e9)).encode()) for at_s, step_s in facts.wall_steps
     ]

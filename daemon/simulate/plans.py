@@ -1,4 +1,4 @@
-"""The one place where `daemon` takes the virtual aircraft from `sim`, when a command is run that needs it."""
+"""Loads the virtual aircraft from `sim` for the commands that need it; no other module of `daemon` imports `sim`."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ if TYPE_CHECKING:
     from swath.daemon.simulate.flight import Flight
 
 NEEDS = ("scipy", "pyproj", "numba", "matplotlib")
-WARM_UP_S = 0.3  # a block of every source
+WARM_UP_S = 0.3  # long enough for a block of every source
 
 
 @dataclass(frozen=True, slots=True)
 class FlightOptions:
-    """A plan as it is asked for on the command line.
+    """The options of the command line that choose a plan.
 
     Attributes:
         plan: a file, or a preset's name.
-        seed: instead of the plan's own.
-        seconds: the first ones only.
+        seed: replaces the plan's own.
+        seconds: fly only the first seconds.
     """
 
     plan: str
@@ -35,10 +35,10 @@ class FlightOptions:
     seconds: float | None = None
 
     def load(self) -> Any:
-        """Return the plan.
+        """Load the plan.
 
         Raises:
-            UserError: it is not there, or a key is wrong; or what `sim` needs is not installed.
+            UserError: it does not exist, a key is wrong, or a package that `sim` needs is not installed.
         """
         _check_installed()
         from swath.sim.plan.plan import load_plan
@@ -49,10 +49,10 @@ class FlightOptions:
 
     @contextlib.contextmanager
     def told(self, *names: str) -> Iterator[None]:
-        """What is wrong with the plan as an error of the user's.
+        """Turn an error of the plan within the block into a `UserError`.
 
         Args:
-            names: of files beside the plan's that may be what is wrong.
+            names: of other files that the error may concern.
         """
         from swath.sim.plan.errors import PlanError
 
@@ -71,11 +71,11 @@ def _check_installed() -> None:
 
 
 def make_flight(wish: FlightOptions, truth: Path | None = None) -> tuple[Flight, dict[str, bytes]]:
-    """Return a flight, and the files that stand beside it but for the configuration.
+    """Make a flight, and the files that accompany it except the configuration.
 
     Args:
-        wish: what to fly.
-        truth: where the truth goes; None: nowhere.
+        wish: the plan to fly.
+        truth: file for the truth; None writes no truth.
 
     Raises:
         UserError: it cannot be flown.
@@ -97,9 +97,10 @@ def make_flight(wish: FlightOptions, truth: Path | None = None) -> tuple[Flight,
 
 
 def make_flight_in_time(wish: FlightOptions) -> tuple[Flight, dict[str, bytes]]:
-    """Return `make_flight` for real time: what is compiled when it is first used has been used before.
+    """Make a flight as `make_flight` does, but for real time: all functions that are compiled on first use are compiled
+    before.
 
-    A moment of the same flight is flown with all scanners on.
+    For this, a moment of the same flight is flown with all scanners on.
     """
     plan = wish.load()
     from swath.sim.fly import VirtualFlight
@@ -115,8 +116,8 @@ def configuration(plan: Any, wires: dict[str, str] | None, directory: str) -> by
     """Return the configuration that records a flight.
 
     Args:
-        plan: of `Wish.load`.
-        wires: transports and PPS sources by source; None: those of an aircraft's computer.
+        plan: of `FlightOptions.load`.
+        wires: transports and PPS sources by source; None uses those of an aircraft's computer.
         directory: for logs.
     """
     from swath.sim.companions import config_text, default_wires
@@ -126,7 +127,7 @@ def configuration(plan: Any, wires: dict[str, str] | None, directory: str) -> by
 
 
 def draw(wish: FlightOptions, picture: Path) -> list[dict[str, Any]]:
-    """Draw a plan; what it covers, a row a line and one for all. Raises UserError, OSError."""
+    """Draw a plan and return its coverage: one row for each line and one for all. Raises UserError, OSError."""
     plan = wish.load()
     from swath.sim.preview.picture import draw_plan
 

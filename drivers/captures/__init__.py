@@ -1,1 +1,1 @@
-"""Recordings that others made (pcap, candump, serial bytes): where their units come from."""
+"""Readers of recordings that other programs made: pcap, candump and serial bytes."""

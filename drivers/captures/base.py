@@ -1,4 +1,4 @@
-"""What the readers of recordings share: the unit they give, how a file is opened, what is told of damage."""
+"""Common parts of the readers of recordings: the unit they yield, opening a file, and reporting damage."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from swath.drivers.transports.base import TransportError
 
 Address = tuple[str, int]
 LATEST_NS = 2**63 - 1
-MAX_LINE_BYTES = 4096  # the longest line of a text format here has some 300
+MAX_LINE_BYTES = 4096  # the longest valid line of a text format here has some 300
 
 
 @dataclass(frozen=True, slots=True)
 class CapturedUnit:
-    """One unit as it was recorded.
+    """One unit as recorded, with its time and origin.
 
     Attributes:
         time_ns: the recorder's wall clock, nanoseconds since 1970.
@@ -36,16 +36,16 @@ class CapturedUnit:
 
 
 class CaptureDamageError(TransportError):
-    """A file is not what it should be from some place on."""
+    """A file is damaged from some place on."""
 
 
 @dataclass(slots=True)
 class CaptureTally:
-    """What a reader found beside units. A reader that is given one counts and goes on; without it, it raises.
+    """Counts what a reader found beside units; a reader with a tally counts damage and goes on, without one it raises.
 
     Attributes:
-        damage: places that could not be read. first_damage: the first of them, one line.
-        passed: what was passed over on purpose, by what it is.
+        damage: number of places that could not be read. first_damage: the first of them, one line.
+        passed: number of items left out on purpose, by kind.
     """
 
     damage: int = 0
@@ -53,21 +53,21 @@ class CaptureTally:
     passed: Counter[str] = field(default_factory=Counter)
 
     def damaged(self, text: str) -> None:
-        """Count a bad place; the first is remembered."""
+        """Count a bad place and remember the first one."""
         if not self.damage:
             self.first_damage = text
         self.damage += 1
 
 
 def report(tally: CaptureTally | None, text: str) -> None:
-    """Count a bad place, or raise where nobody counts."""
+    """Count a bad place in the tally, or raise `CaptureDamageError` without one."""
     if tally is None:
         raise CaptureDamageError(text)
     tally.damaged(text)
 
 
 def until_damage(units: Iterator[CapturedUnit], tally: CaptureTally | None) -> Iterator[CapturedUnit]:
-    """Yield units up to the place from which the file cannot be read on."""
+    """Yield units up to the place after which the file cannot be read."""
     try:
         yield from units
     except CaptureDamageError as error:
@@ -75,7 +75,7 @@ def until_damage(units: Iterator[CapturedUnit], tally: CaptureTally | None) -> I
 
 
 def open_capture(path: Path) -> BufferedIOBase:
-    """Open the file's content as a stream, decompressed where it begins as gzip does."""
+    """Open the file's content as a stream and decompress it if it begins with the gzip magic."""
     try:
         plain = path.open("rb")
         packed = plain.peek(2)[:2] == b"\x1f\x8b"
@@ -88,7 +88,7 @@ def open_capture(path: Path) -> BufferedIOBase:
 
 
 def read_beginning(path: Path, count: int) -> tuple[bytes, str]:
-    """Return up to ``count`` bytes of a file's content, and what kept more of them from being read ("" if nothing).
+    """Return up to ``count`` bytes of a file's content, and the error that ended the reading early ("" if none did).
 
     Raises:
         TransportError: nothing can be read.
@@ -114,7 +114,7 @@ def read_bytes(stream: BufferedIOBase, count: int, path: Path) -> bytes:
 
 
 def read_lines(path: Path, tally: CaptureTally | None = None) -> Iterator[tuple[int, str]]:
-    """Yield lines that are not empty, with their number; what is too long for a line of any format here is damage."""
+    """Yield the lines that are not empty, with their numbers; a line longer than any format here allows is damage."""
     with open_capture(path) as stream:
         number = 0
         while line := _read_line(stream, path):

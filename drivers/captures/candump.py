@@ -1,6 +1,6 @@
-"""Logs as ``candump -L`` of can-utils writes them, one frame a line: read and written.
+"""Reads and writes logs in the form of ``candump -L`` of can-utils, one frame a line.
 
-The form is that of can-utils' lib.c (`parse_canframe`) and candump.c.
+The form follows can-utils' lib.c (`parse_canframe`) and candump.c.
 """
 
 from __future__ import annotations
@@ -38,27 +38,27 @@ _FD_FRAME = struct.Struct("<IBBxx64s")
 
 
 def is_candump(line: str) -> bool:
-    """Return whether a line is one of ``candump -L``."""
+    """Return whether a line has the form of ``candump -L``."""
     return _LINE.fullmatch(line) is not None or _DROPPED.fullmatch(line) is not None
 
 
 def is_shown_candump(line: str) -> bool:
-    """Return whether a line is one that candump shows without ``-L``, for people to read."""
+    """Return whether a line has the form that candump prints without ``-L``, for people to read."""
     return _SHOWN.fullmatch(line) is not None
 
 
 def read_candump(
     path: Path | str, channel: str | None = None, tally: CaptureTally | None = None
 ) -> Iterator[CapturedUnit]:
-    """Return frames of a log as ``candump -L`` of can-utils writes it, as SocketCAN units of 16 or 72 bytes.
+    """Read the frames of a ``candump -L`` log as SocketCAN units of 16 or 72 bytes.
 
     Args:
         path: the file, possibly gzipped.
         channel: only frames of this interface.
-        tally: counts lines that are no frame, and frames that candump says it missed; where None, they are raised.
+        tally: counts lines that are no frame, and frames that candump reports as missed; where None, the former raise.
 
     Raises:
-        TransportError: the file cannot be read; without tally also: a line is no frame, and the text names it.
+        TransportError: the file cannot be read; without tally also: a line is not a frame, and the text names it.
     """
     return until_damage(_frames(Path(path), channel, tally), tally)
 
@@ -78,7 +78,7 @@ def _frames(path: Path, channel: str | None, tally: CaptureTally | None) -> Iter
 
 
 def _frame(identifier: str, content: str) -> bytes | None:
-    """Return one frame of its texts before and after ``#``; None where they make none."""
+    """Build one frame from its texts before and after ``#``; return None where they are not a frame."""
     can_id = int(identifier, 16)
     if len(identifier) == 8 and not can_id & CAN_ERR_FLAG:
         can_id |= CAN_EFF_FLAG
@@ -95,7 +95,7 @@ def _frame(identifier: str, content: str) -> bytes | None:
 
 
 def _fd_frame(can_id: int, content: str) -> bytes | None:
-    """Return ``##<flags><data>``: one hexadecimal digit of flags, then the data."""
+    """Build a frame from ``##<flags><data>``: one hexadecimal digit of flags, then the data."""
     flags, data = _bytes("0" + content[:1]), _bytes(content[1:])
     if not flags or data is None or len(data) not in CANFD_LENGTHS:
         return None
@@ -110,8 +110,8 @@ def _bytes(text: str) -> bytes | None:
 
 
 def candump_line(time_ns: int, channel: str, frame: bytes) -> str | None:
-    """Return a frame as ``candump -L`` writes it, to the microsecond, with its line end; None where it has no such
-    form.
+    """Format a frame as ``candump -L`` does, to the microsecond, with its line end; return None where no such form
+    exists.
 
     Args:
         time_ns: since 1970, not negative.
@@ -152,8 +152,8 @@ def _fd_text(frame: bytes) -> str | None:
 
 
 def held_by_line(frame: bytes) -> bool:
-    """Return whether the line of a frame reads back as the very same bytes; reserved ones and odd flags are not in
-    it.
+    """Return whether the line of a frame reads back as the same bytes; a line does not hold reserved bytes and odd
+    flags.
     """
     line = candump_line(0, "can", frame)
     match = _LINE.fullmatch(line.strip()) if line else None

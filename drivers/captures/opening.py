@@ -1,8 +1,9 @@
-"""Readers of recordings others made: pcap and pcapng, ``candump -L`` text, serial bytes with arrival times.
+"""Readers of recordings that other programs made: pcap and pcapng, ``candump -L`` text, serial bytes with arrival
+times.
 
-Each gives the units that went over the wire, with the recorder's time, in the file's order; gzip is seen by its
-magic. For import, replaying, demonstrations and tests. A file that is not what it should be raises `TransportError`
-with one line, after the units before the bad place were given; a reader that is given a `CaptureTally` counts instead.
+Each yields the units that were on the wire, with the recorder's time, in the file's order; gzip is recognised by its
+magic. They serve import, replay, demonstrations and tests. A damaged file raises `TransportError` with one line, after
+the units before the bad place; a reader with a `CaptureTally` counts the damage instead.
 """
 
 from swath.drivers.captures.base import Address, CapturedUnit, CaptureTally, open_capture, read_beginning

@@ -1,4 +1,4 @@
-"""Reader of pcap and pcapng: the UDP datagrams of a capture, with its stamps to the nanosecond. Nothing is read whole.
+"""Reads pcap and pcapng: the UDP datagrams of a capture, with its stamps to the nanosecond, as a stream.
 
 Layouts: https://datatracker.ietf.org/doc/draft-ietf-opsawg-pcap/ (4, 5) and …/draft-ietf-opsawg-pcapng/ (3, 4).
 """
@@ -28,7 +28,7 @@ from swath.drivers.transports.base import TransportError
 
 # https://www.tcpdump.org/linktypes.html
 _NULL, _ETHERNET, _RAW_IP, _LOOP, _LINUX_SLL, _IPV4_ONLY, _IPV6_ONLY, _LINUX_SLL2 = 0, 1, 101, 108, 113, 228, 229, 276
-_RAW_IP_BSD, _RAW_IP_OPENBSD = 12, 14  # DLT_RAW of the systems themselves, which some software writes as it is
+_RAW_IP_BSD, _RAW_IP_OPENBSD = 12, 14  # the systems' own DLT_RAW, which some software writes unchanged
 _RAW = (_RAW_IP, _RAW_IP_BSD, _RAW_IP_OPENBSD, _IPV4_ONLY, _IPV6_ONLY)
 _BARE = {**dict.fromkeys(_RAW, 0), _NULL: 4, _LOOP: 4}  # bytes before the IP packet
 _IPV4, _IPV6 = 0x0800, 0x86DD
@@ -36,13 +36,13 @@ _VLAN_TAGS = (0x8100, 0x88A8, 0x9100)
 _UDP, _IPV6_FRAGMENT = 17, 44
 # hop by hop, routing, destination: headers of 8 (length + 1) bytes (RFC 8200, 4.3, 4.4, 4.6)
 _IPV6_OPTIONS = (0, 43, 60)
-_MAX_PENDING = 64  # datagrams whose fragments are waited for; the oldest goes first
+_MAX_PENDING = 64  # incomplete datagrams kept; the oldest is discarded first
 _MAX_DATAGRAM_BYTES = 65_535
-_RECENT = 128  # packets among which a second copy is looked for: two times the fragments of the largest datagram
+_RECENT = 128  # packets searched for a second copy: twice the fragments of the largest datagram
 _COPY_WITHIN_NS = 100_000_000
 Datagram = tuple[str, str, bytes]  # source, destination, UDP header and payload
 
-# pcap file header, magic as read little-endian: byte order of what follows, nanoseconds of one fraction
+# pcap file header, magic as read little-endian: byte order of the fields, nanoseconds of one fraction
 _PCAP_KINDS = {
     0xA1B2C3D4: ("<", 1000),
     0xA1B23C4D: ("<", 1),
@@ -61,7 +61,7 @@ Packet = tuple[int, int, bytes]  # time in ns, link type, frame
 
 
 def is_pcap(head: bytes) -> bool:
-    """Return whether a file that begins so is a pcap or pcapng file."""
+    """Return whether a file with these first bytes is a pcap or pcapng file."""
     magic = int.from_bytes(head[:4], "little") if len(head) >= 4 else 0
     return magic == _SECTION or magic in _PCAP_KINDS
 
@@ -69,19 +69,19 @@ def is_pcap(head: bytes) -> bool:
 def read_pcap(
     path: Path | str, port: int | None = None, tally: CaptureTally | None = None, *, drop_copies: bool = False
 ) -> Iterator[CapturedUnit]:
-    """Return UDP datagrams of a pcap or pcapng file, IP fragments put together; other packets are passed over.
+    """Read the UDP datagrams of a pcap or pcapng file and join IP fragments; other packets are left out.
 
-    A datagram in fragments has the time of the one that completes it.
+    A datagram in fragments has the time of the fragment that completes it.
 
     Args:
         path: the file, possibly gzipped.
         port: only datagrams to this port.
-        tally: counts what is damaged or passed over; where None, damage is raised.
+        tally: counts damaged and left-out packets; where None, damage is raised.
         drop_copies: see `IpPackets`.
 
     Raises:
-        TransportError: no capture; without tally also: of an unknown link layer, cut short, or recorded with payloads
-            cut off.
+        TransportError: the file is not a capture; without tally also: its link layer is unknown, it is cut short, or
+            its payloads were cut off.
     """
     return until_damage(_datagrams(Path(path), port, tally, drop_copies), tally)
 
@@ -144,7 +144,7 @@ def _packets(stream: BufferedIOBase, path: Path, tally: CaptureTally | None) -> 
     rest = read_bytes(stream, _FILE_HEADER_BYTES - 4, path)
     if len(rest) < _FILE_HEADER_BYTES - 4:
         raise CaptureDamageError(f"{path}: ends in its header")
-    link = struct.unpack(f"{order}I", rest[-4:])[0] & 0xFFFF  # above: of the frame check sequence, and reserved
+    link = struct.unpack(f"{order}I", rest[-4:])[0] & 0xFFFF  # upper bits: frame check sequence, reserved
     record = struct.Struct(f"{order}IIII")
     at = _FILE_HEADER_BYTES
     while head := read_bytes(stream, record.size, path):
@@ -160,7 +160,7 @@ def _packets(stream: BufferedIOBase, path: Path, tally: CaptureTally | None) -> 
 
 @dataclass(frozen=True, slots=True)
 class _Interface:
-    """What an interface description block says of stamps: ``per_s`` counts a second, from ``offset_s`` on."""
+    """The time stamps of an interface description block: ``per_s`` counts a second, starting at ``offset_s``."""
 
     link: int
     per_s: int = 1_000_000
@@ -171,7 +171,7 @@ class _Interface:
 
 
 class _PcapngReader:
-    """The packets of a pcapng file of which the first block's type has been read."""
+    """Reads the packets of a pcapng file whose first block type has been read already."""
 
     def __init__(self, stream: BufferedIOBase, path: Path, tally: CaptureTally | None) -> None:
         self._stream = stream
@@ -209,7 +209,7 @@ class _PcapngReader:
         return data
 
     def _block(self, kind: int) -> bytes:
-        """Return a block's body; the byte order of a new section is learned before its length can be read."""
+        """Return a block's body; a new section's byte order is read before its length, which depends on it."""
         head = self._read(4)
         start = b""
         if kind == _SECTION:
@@ -262,14 +262,14 @@ class _PcapngReader:
 
 
 class UnknownLinkError(ValueError):
-    """A link layer that is not known here."""
+    """The link layer of a capture is unknown."""
 
 
 def ip_packet(link: int, frame: bytes) -> bytes:
-    """Return the IP packet in a frame; nothing where it carries another protocol.
+    """Return the IP packet in a frame, or empty bytes where the frame carries another protocol.
 
     Raises:
-        UnknownLinkError: the link layer is not known.
+        UnknownLinkError: the link layer is unknown.
     """
     if link in _BARE:
         return frame[_BARE[link] :]
@@ -281,13 +281,13 @@ def ip_packet(link: int, frame: bytes) -> bytes:
         kind, at = frame[0:2], 20
     else:
         raise UnknownLinkError(f"link type {link} is not known; want Ethernet, Linux cooked or raw IP")
-    while int.from_bytes(kind, "big") in _VLAN_TAGS and at + 4 <= len(frame):  # IEEE 802.1Q: tag, then what follows
+    while int.from_bytes(kind, "big") in _VLAN_TAGS and at + 4 <= len(frame):  # IEEE 802.1Q: tag, then the next type
         kind, at = frame[at + 2 : at + 4], at + 4
     return frame[at:] if int.from_bytes(kind, "big") in (_IPV4, _IPV6) else b""
 
 
 def _past_options(packet: bytes, following: int, at: int) -> tuple[int, int]:
-    """Return what follows an IPv6 packet's options, and where; no more than the packet was captured to."""
+    """Return the protocol after an IPv6 packet's options and its position, reading only captured bytes."""
     while following in _IPV6_OPTIONS and at + 2 <= len(packet):
         following, at = packet[at], at + 8 * (packet[at + 1] + 1)
     return following, at
@@ -304,7 +304,7 @@ class _Pending:
     total: int | None = None
 
     def whole(self) -> bytes | None:
-        """Return all of it, once nothing is missing."""
+        """Return the whole datagram, or None while a fragment is missing."""
         if self.total is None:
             return None
         data = b""
@@ -316,15 +316,15 @@ class _Pending:
 
 
 class IpPackets:
-    """Puts IP packets together to UDP datagrams, whatever the order of their fragments (RFC 791, 3.2; RFC 8200, 4.5).
+    """Joins IP packets to UDP datagrams, in any order of their fragments (RFC 791, 3.2; RFC 8200, 4.5).
 
     Args:
-        drop_copies: leave out IPv4 packets that are the same as one shortly before, with the same identification: a
-            frame that was captured on two interfaces. An identification of 0 tells nothing, such packets stay.
+        drop_copies: leave out IPv4 packets that equal a recent one, with the same identification: a frame captured on
+            two interfaces. An identification of 0 does not distinguish packets, so such packets stay.
 
     Attributes:
         copies: packets left out.
-        incomplete: datagrams of which a fragment is missing; those still waited for are not among them.
+        incomplete: datagrams given up because a fragment is missing; those still waited for are not included.
         cut: packets that were not captured to their end.
         others: packets that carry no UDP.
     """
@@ -337,11 +337,11 @@ class IpPackets:
 
     @property
     def waiting(self) -> int:
-        """Datagrams of which a fragment has not come yet."""
+        """Number of datagrams with a fragment still to come."""
         return len(self._pending)
 
     def add(self, packet: bytes, time_ns: int = 0) -> Datagram | None:
-        """Return the datagram that a packet is or completes."""
+        """Take one packet; return the datagram that it is or completes."""
         version = packet[0] >> 4 if packet else 0
         if version == 4 and len(packet) >= 20 and packet[9] == _UDP:
             return self._add_v4(packet, time_ns)

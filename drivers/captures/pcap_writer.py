@@ -1,4 +1,4 @@
-"""Datagrams as Ethernet frames of a pcap file, headers made anew, a batch at a time.
+"""Builds Ethernet frames of a pcap file from datagrams, with new headers, a batch at a time.
 
 Layouts: draft-ietf-opsawg-pcap (4, 5), RFC 791 (3.1), RFC 8200 (3), RFC 768, RFC 1071.
 """
@@ -14,17 +14,17 @@ from numpy.typing import NDArray
 from swath.drivers.captures.base import Address
 from swath.georef.records import ByteRows, Int64Array
 
-NOBODY: Address = ("0.0.0.0", 0)  # a sender that the log does not name
+NOBODY: Address = ("0.0.0.0", 0)  # stands for a sender that the log does not name
 FILE_HEADER = struct.pack("<IHHiIII", 0xA1B23C4D, 2, 4, 0, 0, 262_144, 1)  # stamps in nanoseconds, Ethernet
 LATEST_PCAP_NS = 2**32 * 1_000_000_000 - 1
 _RECORD = np.dtype([("seconds", "<u4"), ("nanoseconds", "<u4"), ("captured", "<u4"), ("length", "<u4")])
 _ETHERNET_BYTES, _IPV4_BYTES, _IPV6_BYTES, _UDP_BYTES = 14, 20, 40, 8
 _TTL, _UDP = 64, 17
-_MAX_IDENTIFICATION = 65_535  # 0 says nothing and is left out
+_MAX_IDENTIFICATION = 65_535  # 0 distinguishes no packets and is left out
 
 
 def largest_payload(source: Address, destination: Address) -> int:
-    """Return bytes that a datagram between two addresses can carry."""
+    """Return the most bytes that a datagram between two addresses can carry."""
     return 65_535 - _UDP_BYTES - (_IPV4_BYTES if _are_ipv4(source, destination) else 0)
 
 
@@ -40,11 +40,11 @@ def is_address(text: str) -> bool:
 def pcap_frames(
     times_ns: Int64Array, first_number: int, source: Address, destination: Address, payloads: ByteRows
 ) -> ByteRows:
-    """Return packet records, as they stand in a file after `FILE_HEADER`.
+    """Return packet records in the form that follows `FILE_HEADER` in a file.
 
     Args:
         times_ns: (n,) since 1970, from 0 to `LATEST_PCAP_NS`.
-        first_number: of the first packet in the file; IP identifications follow from it.
+        first_number: number of the first packet in the file; IP identifications are derived from it.
         source, destination: addresses and ports.
         payloads: (n, length) uint8; no longer than `largest_payload`.
 
@@ -76,7 +76,7 @@ def _are_ipv4(source: Address, destination: Address) -> bool:
 
 
 def _frame_head(source: Address, destination: Address, length: int) -> bytes:
-    """Return ethernet, IP and UDP headers; identification and checksums are 0."""
+    """Return Ethernet, IP and UDP headers; identification and checksums are 0."""
     udp = struct.pack(">HHHH", source[1], destination[1], _UDP_BYTES + length, 0)
     if _are_ipv4(source, destination):
         total = _IPV4_BYTES + _UDP_BYTES + length
@@ -88,7 +88,7 @@ def _frame_head(source: Address, destination: Address, length: int) -> bytes:
 
 
 def _as_ipv6(host: str) -> bytes:
-    """Return an address in 16 bytes; of IPv4, the one that stands for it (RFC 4291, 2.5.5.2)."""
+    """Return an address in 16 bytes; an IPv4 address becomes the mapped IPv6 address (RFC 4291, 2.5.5.2)."""
     address = ip_address(host)
     return bytes(10) + b"\xff\xff" + address.packed if address.version == 4 else IPv6Address(address).packed
 
@@ -99,7 +99,7 @@ def _put_u16(rows: ByteRows, at: int, values: NDArray[np.int64]) -> None:
 
 
 def _sum16(rows: ByteRows) -> NDArray[np.int64]:
-    """Return one's complement sums of rows, 16 bits at a time, a last odd byte filled up with 0."""
+    """Return the one's complement sums of rows, 16 bits at a time; an odd last byte is padded with 0."""
     high = rows[:, 0::2].sum(axis=1, dtype=np.int64)
     total: NDArray[np.int64] = (high << 8) + rows[:, 1::2].sum(axis=1, dtype=np.int64)
     for _ in range(3):
@@ -112,7 +112,7 @@ def _checksum(rows: ByteRows) -> NDArray[np.int64]:
 
 
 def _udp6_checksum(packets: ByteRows) -> NDArray[np.int64]:
-    """Over addresses, length, protocol and datagram (RFC 8200, 8.1); 0 is sent as FFFF."""
+    """Compute the checksum over addresses, length, protocol and datagram (RFC 8200, 8.1); 0 is sent as FFFF."""
     length = packets.shape[1] - _IPV6_BYTES
     total = _sum16(packets[:, 8:]) + length + _UDP
     for _ in range(2):

@@ -1,6 +1,6 @@
-"""Bytes of a serial line as others kept them: with a table of arrivals, with RTKLIB's time tags, or bare.
+"""Reads recorded bytes of a serial line: with a table of arrivals, with RTKLIB's time tags, or without times.
 
-Time tags as RTKLIB's str2str writes them beside a stream (``FILE.tag``): read and written.
+Time tags have the form that RTKLIB's str2str writes beside a stream (``FILE.tag``). They are read and written here.
 
 Source: src/stream.c, `openfile_`, `readfile` and `writefile`, of github.com/rtklibexplorer/RTKLIB @ 01225392d7ce. All
 little-endian:
@@ -11,8 +11,8 @@ little-endian:
      8 bytes   a write: milliseconds since the opening (u32), size of the stream after it (u32); repeated
 
 Older versions (github.com/tomojitakasu/RTKLIB @ 02a5688c2bf5) write time and sizes as the computer lays them out in
-memory: seconds and sizes have 8 bytes on one of 64 bits. With the option ``::P=8`` sizes have 8 bytes anywhere. Which
-layout a file has shows in whether its numbers make sense.
+memory: seconds and sizes have 8 bytes on a 64-bit computer. With the option ``::P=8`` sizes have 8 bytes on any
+computer. The reader recognises a file's layout by whether its numbers are plausible.
 """
 
 from __future__ import annotations
@@ -49,34 +49,34 @@ _MS_NS = 1_000_000
 
 _UNIX_DAY = dt.date(1970, 1, 1)
 
-_LEAST_FRACTION = 1e-7  # RTKLIB's clock has microseconds; parts of other numbers are far smaller as a fraction
+_LEAST_FRACTION = 1e-7  # RTKLIB's clock has microseconds; misread bytes give far smaller fractions
 
-_LATEST_FIRST_MS = 2**28  # three days; the parts of a fraction are larger as a count
+_LATEST_FIRST_MS = 2**28  # three days; misread bytes of a fraction give larger counts
 
 _UNIX_1990_S, _UNIX_2106_S = 631_152_000, 2**32
 
 _ENTRY = np.dtype([("tick_ms", "<u4"), ("size", "<u4")])
 
-_LOOKED_AT_BYTES = 16 + 48 * 16  # by which the layout is told; from 16 bytes on whole entries of 8 and of 12
+_LOOKED_AT_BYTES = 16 + 48 * 16  # bytes that determine the layout; after 16, whole entries of both 8 and 12
 
 _ENTRIES_A_READ = 4096
 
 
 @dataclass(frozen=True, slots=True)
 class TagLayout:
-    """Sizes that differ between versions of RTKLIB."""
+    """Field sizes of a tag file, which differ between versions of RTKLIB."""
 
     seconds: str  # struct code
     size: str
 
     @property
     def entry(self) -> struct.Struct:
-        """One write."""
+        """Layout of one write."""
         return struct.Struct(f"<I{self.size}")
 
     @property
     def time(self) -> struct.Struct:
-        """When the file was opened."""
+        """Layout of the opening time."""
         return struct.Struct(f"<{self.seconds}d")
 
 
@@ -84,13 +84,13 @@ _LAYOUTS = (TagLayout("I", "I"), TagLayout("I", "Q"), TagLayout("q", "Q"), TagLa
 
 
 def read_tags(stream: BufferedIOBase) -> Iterator[tuple[int, int]]:
-    """Yield time and size of the stream after each write; an unfinished last entry is left out.
+    """Yield the time and the stream's size after each write; an unfinished last entry is left out.
 
     Yields:
         nanoseconds since 1970 (UTC; leap seconds by the built-in table), bytes of the stream so far.
 
     Raises:
-        ValueError: it is no tag file, or of no known layout.
+        ValueError: the stream is not a tag file, or its layout is unknown.
     """
     head = stream.read(_TEXT_BYTES + 4)
     if len(head) < _TEXT_BYTES + 4 or not head.startswith(MARK):
@@ -113,7 +113,7 @@ def read_tags(stream: BufferedIOBase) -> Iterator[tuple[int, int]]:
 
 
 def _layout_of(start: bytes) -> TagLayout:
-    """Return the first layout by which the numbers make sense; of a short file rather one that its length fits."""
+    """Return the first layout that makes the numbers plausible; for a short file, prefer one that its length fits."""
     possible = [layout for layout in _LAYOUTS if _makes_sense(layout, start)]
     if not possible:
         raise ValueError("is of no known layout")
@@ -123,7 +123,7 @@ def _layout_of(start: bytes) -> TagLayout:
 
 
 def _makes_sense(layout: TagLayout, start: bytes) -> bool:
-    """Return whether the time is of this age, and ticks and sizes never step back."""
+    """Return whether the time is plausible, and ticks and sizes never decrease."""
     if len(start) < layout.time.size:
         return False
     seconds, fraction = layout.time.unpack_from(start)
@@ -139,9 +139,9 @@ def _makes_sense(layout: TagLayout, start: bytes) -> bool:
 
 
 def _unix_ns(gps_as_unix_ns: int) -> int:
-    """Return UTC of a GPS time that counts from 1970."""
+    """Return the UTC of a GPS time that counts from 1970."""
     leap = 0
-    for _ in range(2):  # the day a leap count begins is a day of UTC
+    for _ in range(2):  # leap counts begin on days of UTC, which the first pass finds
         day = _UNIX_DAY + dt.timedelta(seconds=gps_as_unix_ns // SECOND_NS - leap)
         leap, _ = table_leap_seconds(day)
     return gps_as_unix_ns - leap * SECOND_NS
@@ -153,7 +153,7 @@ def _gps_as_unix_ns(unix_ns: int) -> int:
 
 
 class TagWriter:
-    """The tag file of a stream whose first bytes came at ``first_ns`` (nanoseconds since 1970, UTC)."""
+    """Writes the tag file of a stream whose first bytes came at ``first_ns`` (nanoseconds since 1970, UTC)."""
 
     def __init__(self, stream: BufferedIOBase, first_ns: int) -> None:
         self._stream = stream
@@ -164,10 +164,11 @@ class TagWriter:
         stream.write(struct.pack("<Id", seconds % 2**32, rest_ms / 1000))
 
     def add(self, times_ns: Int64Array, sizes: Int64Array) -> None:
-        """Writes that followed.
+        """Append entries for the writes that followed.
 
         Args:
-            times_ns: (n,) when. RTKLIB knows no time that steps back: such a write gets the latest time before it.
+            times_ns: (n,) time of each write. RTKLIB allows no decreasing time: such a write gets the latest time
+                before it.
             sizes: (n,) bytes of the stream after each; beyond 4 GiB they wrap.
         """
         ticks = np.maximum.accumulate(np.maximum(times_ns // _MS_NS - self._open_ms, self._tick_ms))
@@ -178,7 +179,7 @@ class TagWriter:
 
 
 _LARGEST_FILE_BYTES = 2**62
-MAX_READ_BYTES = 16 << 20  # of one arrival; the recorder's own reads are far below
+MAX_READ_BYTES = 16 << 20  # largest arrival; the recorder's own reads are far smaller
 _BARE_READ_BYTES = 512
 _COLUMNS = ["arrival_unix_s", "offset", "length"]
 
@@ -186,11 +187,11 @@ _COLUMNS = ["arrival_unix_s", "offset", "length"]
 def read_serial(
     path: Path | str, chunks: Path | str | None = None, tally: CaptureTally | None = None
 ) -> Iterator[CapturedUnit]:
-    """Return reads of a serial port or a TCP stream: the bytes, and a table of when which of them arrived.
+    """Read the units of a serial port or TCP stream from a file of bytes and a table of their arrivals.
 
     Args:
         path: the bytes, possibly gzipped.
-        chunks: CSV with the columns ``arrival_unix_s,offset,length``; by default the file beside it that is named
+        chunks: CSV with the columns ``arrival_unix_s,offset,length``; by default the file beside ``path`` named
             ``<stem>.chunks.csv`` or ``<stem>.chunks.csv.gz``.
         tally: counts damage; where None, it is raised.
 
@@ -202,7 +203,7 @@ def read_serial(
 
 
 def chunk_table(path: Path) -> Path | None:
-    """Return the table of arrivals beside a file of bytes; None where there is none."""
+    """Return the table of arrivals beside a file of bytes; None where no table exists."""
     bare = path.with_suffix("") if path.suffix == ".gz" else path
     tables = (bare.with_suffix(suffix) for suffix in (".chunks.csv", ".chunks.csv.gz"))
     return next((table for table in tables if table.exists()), None)
@@ -250,7 +251,7 @@ def _rows(table: Path) -> Iterator[tuple[int, int, int, int]]:
 
 
 def read_tagged(path: Path | str, tags: Path | str, tally: CaptureTally | None = None) -> Iterator[CapturedUnit]:
-    """Return a stream of str2str with its time tags: one unit a write, to the millisecond.
+    """Read a stream of str2str with its time tags: one unit a write, to the millisecond.
 
     Args:
         path: the bytes, possibly gzipped.
@@ -258,7 +259,7 @@ def read_tagged(path: Path | str, tags: Path | str, tally: CaptureTally | None =
         tally: counts damage; where None, it is raised.
 
     Raises:
-        TransportError: a file is absent; without tally also: the tags are none, or do not fit the bytes.
+        TransportError: a file is absent; without tally also: the tag file is invalid, or does not fit the bytes.
     """
     return until_damage(_tagged(Path(path), Path(tags)), tally)
 
@@ -298,12 +299,12 @@ def _take(stream: BufferedIOBase, count: int, path: Path, tags: Path) -> Iterato
 
 @dataclass(frozen=True, slots=True)
 class BareTime:
-    """When the bytes of a file without times came.
+    """Arrival times of the bytes of a file without times.
 
     Attributes:
-        start_ns: when the first bit came, nanoseconds since 1970.
+        start_ns: arrival of the first bit, nanoseconds since 1970.
         baud: bits a second; 0: all bytes at once.
-        bits: of one character on the line, with start, parity and stop bits.
+        bits: bits of one character on the line, with start, parity and stop bits.
     """
 
     start_ns: int
@@ -311,16 +312,16 @@ class BareTime:
     bits: float = 10.0
 
     def after(self, count: int) -> int:
-        """When ``count`` bytes had come, if the line never paused."""
+        """Return the arrival time of byte number ``count``, on a line that never pauses."""
         return self.start_ns + (round(count * self.bits / self.baud * 1e9) if self.baud else 0)
 
 
 def read_bare(path: Path | str, time: BareTime, tally: CaptureTally | None = None) -> Iterator[CapturedUnit]:
-    """Return bytes without times, in units of 512, each with the time of its last byte.
+    """Read bytes without times, in units of 512, each with the time of its last byte.
 
     Args:
         path: the bytes, possibly gzipped.
-        time: how they came.
+        time: start and rate of the bytes' arrival.
         tally: counts damage; where None, it is raised.
 
     Raises:

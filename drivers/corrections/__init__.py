@@ -1,1 +1,1 @@
-"""Corrections of base stations: one file a protocol."""
+"""Parsers for corrections of base stations, one file for each protocol."""

@@ -1,7 +1,7 @@
 """RTCM 3 of a base station (RTCM 10403.3): every message is framed, checked and counted by its number.
 
-Of 1005 and 1006 the station's coordinates are told, so that a base that was moved is noticed. Observations stay as
-they came: the log holds the bytes.
+Messages 1005 and 1006 give the station's coordinates, so that a moved base is noticed. Observations are not decoded:
+the log holds their bytes.
 """
 
 from __future__ import annotations
@@ -16,23 +16,23 @@ HEADER_BYTES, CRC_BYTES = 3, 3
 STATION = {1005: 152, 1006: 168}  # bits of the stationary reference point's messages (3.5.2)
 COORDINATE_BITS = 38
 COORDINATE_M = 1e-4
-# from the message's beginning: DF002 12 bits, DF003 12, DF021 6, four indicators, then DF025, 2 bits, DF026, 2, DF027
+# bit positions in the message: DF002 12 bits, DF003 12, DF021 6, four indicators, then DF025, 2 bits, DF026, 2, DF027
 ID_AT, X_AT, Y_AT, Z_AT, HEIGHT_AT = 12, 34, 74, 114, 152
 
 
 class Rtcm3Parser(StreamParser):
-    """One stream of corrections; what lies between its frames is skipped and counted."""
+    """Parses one stream of corrections; bytes between its frames are skipped and counted."""
 
     def __init__(self, settings: DeviceSettings) -> None:
         super().__init__()
         self._framer = Framer((RTCM3,), self.counters)
 
     def feed(self, chunk: Chunk) -> list[Record]:
-        """Return the station, where it is told."""
+        """Return a record for each message with the station's coordinates."""
         return self._records(self._framer.feed(chunk.data, chunk.host_time_ns))
 
     def close(self) -> list[Record]:
-        """Return what a false frame held back."""
+        """Return the records that a false frame held back."""
         return self._records(self._framer.close())
 
     def _records(self, frames: list[Frame]) -> list[Record]:
@@ -57,7 +57,7 @@ class Rtcm3Parser(StreamParser):
 
 
 def _unsigned(payload: bytes, first: int, bits: int) -> int:
-    """Return bits from ``first`` on, the highest first."""
+    """Read an unsigned number of ``bits`` bits from bit ``first`` on, the highest bit first."""
     whole = int.from_bytes(payload, "big")
     return whole >> (8 * len(payload) - first - bits) & ((1 << bits) - 1)
 

@@ -1,1 +1,1 @@
-"""From a stream of bytes to frames: kinds of frames, their checksums, and the framer that finds them."""
+"""Extracts frames from a stream of bytes: kinds of frames, their checksums, and the framer that finds them."""

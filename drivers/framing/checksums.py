@@ -1,7 +1,7 @@
-"""Checksums of the serial protocols, each fast enough to run on everything that arrives.
+"""Checksums of the serial protocols, each fast enough to run on every byte that arrives.
 
-The cyclic ones are linear, so a message with its own checksum behind it leaves 0: `crc24q` and `crc32_novatel` of a
-whole frame are 0 when it is intact. SBF has its checksum in front and lowest byte first, so it is compared.
+Cyclic checksums are linear, so a message followed by its own checksum gives 0: `crc24q` and `crc32_novatel` of a
+whole frame are 0 when it is intact. SBF has its checksum in front, lowest byte first, so it must be compared.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ Bytes: TypeAlias = bytes | bytearray | memoryview
 CRC24Q_POLYNOMIAL = 0x1864CFB  # RTCM 10403.3, 4.1.2 (Qualcomm's)
 CRC24Q_STEP_BYTES = 1029  # the longest RTCM3 frame goes through the table at once
 CRC24Q_MARKED_BYTES = 2 * CRC24Q_STEP_BYTES
-FLETCHER_STEP_BYTES = 8192 + 8  # so does the longest UBX frame
+FLETCHER_STEP_BYTES = 8192 + 8  # the longest UBX frame is summed at once
 
 
-# By the bit length of a body's last place: shifts of the halves of the power of two not below its length, in bits.
+# Shifts in bits, by the bit length of a body's last index: halves of the smallest power of two not below its length.
 _FOLDS = [tuple(8 << power for power in reversed(range(places))) for places in range(32)]
 
 
 def nmea_xor(body: Bytes) -> int:
-    """Return exclusive or of the bytes between ``$`` and ``*`` (NMEA 0183, 5.3).
+    """Return the exclusive or of the bytes between ``$`` and ``*`` (NMEA 0183, 5.3).
 
-    Folded in halves: shifting a number by half its length and adding it without carry leaves the halves' XOR below.
+    The number is folded in halves: after a shift by half its length and an XOR, its low half is the XOR of both halves.
     """
     folded = int.from_bytes(body, "little")
     for shift in _FOLDS[(len(body) - 1).bit_length()] if body else ():
@@ -39,7 +39,7 @@ def nmea_xor(body: Bytes) -> int:
 
 @cache
 def _fletcher_weights() -> NDArray[np.uint8]:
-    """Return how often the second sum counts each of the last n bytes: n … 2, 1, modulo 256."""
+    """Return the weights of the last n bytes in the second sum: n … 2, 1, modulo 256."""
     return np.arange(FLETCHER_STEP_BYTES, 0, -1).astype(np.uint8)
 
 
@@ -64,7 +64,7 @@ def ubx_fletcher(body: Bytes) -> tuple[int, int]:
 
 @cache
 def _crc24q_table() -> tuple[NDArray[np.uint32], NDArray[np.intp]]:
-    """Return CRC of each byte value followed by k zero bytes, flat over (k descending, value), and the rows'
+    """Return the CRC of each byte value followed by k zero bytes, flat over (k descending, value), and the rows'
     offsets.
     """
     row = np.arange(256, dtype=np.uint32) << np.uint32(16)
@@ -74,19 +74,19 @@ def _crc24q_table() -> tuple[NDArray[np.uint32], NDArray[np.intp]]:
     table = np.empty((CRC24Q_STEP_BYTES, 256), dtype=np.uint32)
     table[-1] = step
     for k in range(CRC24Q_STEP_BYTES - 2, -1, -1):
-        after = table[k + 1]  # one zero byte more: the top byte goes through the table
+        after = table[k + 1]  # one more zero byte: the top byte goes through the table
         table[k] = ((after << np.uint32(8)) & np.uint32(0xFF_FFFF)) ^ step[after >> np.uint32(16)]
     return table.reshape(-1), np.arange(CRC24Q_STEP_BYTES, dtype=np.intp) * 256
 
 
 def crc24q(data: Bytes) -> int:
-    """Return CRC-24Q, initial value 0 (RTCM 10403.3, 4.1.2)."""
+    """Return the CRC-24Q with initial value 0 (RTCM 10403.3, 4.1.2)."""
     table, offsets = _crc24q_table()
     crc = 0
     for start in range(0, len(data), CRC24Q_STEP_BYTES):
         part = np.frombuffer(data[start : start + CRC24Q_STEP_BYTES], dtype=np.uint8)
         places = offsets[-len(part) :] + part
-        for index in range(min(3, len(part)) if crc else 0):  # the register so far lies over the next three bytes
+        for index in range(min(3, len(part)) if crc else 0):  # the register so far overlaps the next three bytes
             places[index] ^= (crc >> (16 - 8 * index)) & 0xFF
         rest = (crc << (8 * len(part))) & 0xFF_FFFF if len(part) < 3 else 0
         crc = int(np.bitwise_xor.reduce(table[places])) ^ rest
@@ -95,8 +95,8 @@ def crc24q(data: Bytes) -> int:
 
 @cache
 def _crc24q_mark_table() -> tuple[NDArray[np.uint32], NDArray[np.intp]]:
-    """Return CRC of each byte value at place k, divided by x⁸ for each byte before it, flat over (k, value); rows'
-    offsets.
+    """Return the CRC of each byte value at place k, divided by x⁸ for each byte before it, flat over (k, value), and
+    the rows' offsets.
     """
     divided = np.arange(256, dtype=np.uint32)  # low byte of a register, by x⁸
     for _ in range(8):
@@ -109,11 +109,12 @@ def _crc24q_mark_table() -> tuple[NDArray[np.uint32], NDArray[np.intp]]:
 
 
 def crc24q_marks(data: Bytes) -> NDArray[np.uint32]:
-    """Return one number a place between bytes; ``crc24q(data[a:b]) == 0`` just where those at a and b are equal.
+    """Return one number for each place between bytes; ``crc24q(data[a:b]) == 0`` exactly where those at a and b are
+    equal.
 
     The CRC up to a place, divided by x⁸ for every byte before it (the polynomial ends in 1, so that x has an inverse),
-    is a sum to which each byte adds its own part, whatever comes behind. What lies between two places adds nothing to
-    it when and only when its own CRC is 0.
+    is a sum to which each byte adds its own part, independent of later bytes. The bytes between two places add 0 to
+    the sum if and only if their own CRC is 0.
 
     Args:
         data: at most CRC24Q_MARKED_BYTES bytes.
@@ -134,7 +135,7 @@ def crc32_novatel(data: Bytes) -> int:
 
 
 def crc16_ccitt(data: Bytes) -> int:
-    """Return CRC-16 of SBF (PolaRx5TR reference guide, 4.1.1): x¹⁶ + x¹² + x⁵ + 1 from 0, high bit first, no
+    """Return the CRC-16 of SBF (PolaRx5TR reference guide, 4.1.1): x¹⁶ + x¹² + x⁵ + 1 from 0, high bit first, no
     inversion.
     """
     return binascii.crc_hqx(data, 0)

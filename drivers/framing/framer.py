@@ -1,17 +1,17 @@
-"""Finds frames of several protocols in one stream of bytes, whatever lies between them.
+"""Finds frames of several protocols in one stream of bytes, with any other bytes between them.
 
 One port often carries UBX, NMEA and RTCM3 together, or NovAtel logs with prompts between. The framer knows a table of
 frame kinds (`swath.drivers.framing.kinds`); a new kind is an entry there.
 
 Rules, the same however the stream is cut:
 
-- A candidate is decided once, from the bytes behind it alone. Until then everything from it on is held back, which is
-  at most ``FrameKind.max_bytes``: a false sync costs no more delay than that.
-- A frame whose checksum is good is handed out and the scan goes on behind it.
-- Otherwise one byte is skipped and the scan goes on with the next: a good frame inside a false one is found.
-- `close` decides as if nothing more ever came.
+- A candidate is decided once, from the bytes after its start alone. Until then all bytes from it on are held back,
+  at most ``FrameKind.max_bytes``, which bounds the delay that a false sync can cause.
+- A frame with a good checksum is returned, and the scan continues after it.
+- Otherwise one byte is skipped and the scan continues with the next, so that a good frame inside a false one is found.
+- `close` decides on the bytes present.
 
-Searching is one compiled expression over the buffer; Python code runs once a candidate, not once a byte.
+One compiled expression searches the buffer; Python code runs once for each candidate, not for each byte.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from numpy.typing import NDArray
 
 from swath.drivers.parser import ParserCounters
 
-UNDECIDED = 0  # what a measure says while the bytes there are do not tell the length
-FALSE_SYNC = -1  # … when this is no frame after all
-MAX_NAMES = 1024  # of messages that are counted each by itself; a receiver sends a few dozen
+UNDECIDED = 0  # result of a measure: the bytes so far do not determine the length
+FALSE_SYNC = -1  # … this is not a frame
+MAX_NAMES = 1024  # names of messages that are counted separately; a receiver sends a few dozen
 OTHER_NAMES = "other"
-OVER_BOUND = -2  # … when the length it claims is beyond what the protocol knows; counted
+OVER_BOUND = -2  # … the stated length exceeds the protocol's longest frame; counted
 
 
 class Frame(NamedTuple):
@@ -50,19 +50,19 @@ class Frame(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class FrameKind:
-    """A protocol's way to lay frames into a stream.
+    """Describes how a protocol lays frames into a stream.
 
     Attributes:
         name: ``nmea``, ``ubx``, …
-        sync: the bytes allowed at each of the first places of a frame.
-        max_bytes: the longest frame; what a false sync can hold back.
-        measure: ``(buffer, start, final)`` -> length of the frame at ``start`` in bytes, which may reach beyond the
-            buffer; or `UNDECIDED`, `FALSE_SYNC`, `OVER_BOUND`. With ``final`` nothing more will come.
+        sync: the bytes allowed at each of a frame's first positions.
+        max_bytes: length of the longest frame, the most that a false sync can hold back.
+        measure: ``(buffer, start, final)`` -> length of the frame at ``start`` in bytes, which may end beyond the
+            buffer; or `UNDECIDED`, `FALSE_SYNC`, `OVER_BOUND`. ``final`` means that the stream has ended.
         intact: whether the checksum of a complete frame is good.
-        message_name: what a good frame is counted as.
-        marks: of up to twice ``max_bytes``, a number a place between them; those at two places are equal just where an
-            intact frame may lie between. For a checksum that is dear to make anew for each of many false frames that
-            overlap; None: it is not.
+        message_name: the name under which a good frame is counted.
+        marks: returns, for up to twice ``max_bytes``, one number for each place between bytes; the numbers at two
+            places are equal exactly where an intact frame may lie between. For a checksum that is too expensive to
+            compute for each of many overlapping false frames; None for any other.
     """
 
     name: str
@@ -74,12 +74,14 @@ class FrameKind:
     marks: Callable[[bytes], NDArray[np.uint32]] | None = None
 
     def __deepcopy__(self, memo: dict[int, object]) -> FrameKind:
-        """Return a kind never changes: a parser's copy shares it."""
+        """Return the same object: a kind never changes, so a parser's copy shares it."""
         return self
 
 
 def sync_expression(kinds: Sequence[FrameKind]) -> re.Pattern[bytes]:
-    """Return one group a kind; matches a whole sync, or the beginning of one at the end of the buffer."""
+    """Return an expression with one group for each kind; it matches a whole sync, or the start of one at the buffer's
+    end.
+    """
     groups = []
     for kind in kinds:
         expression = b""
@@ -91,12 +93,12 @@ def sync_expression(kinds: Sequence[FrameKind]) -> re.Pattern[bytes]:
 
 
 class _Overlaps:
-    """The frames of one buffer whose kind has marks; those that overlap a bad one share the work of their checksums."""
+    """Checks the frames of one buffer whose kind has marks; frames that overlap a bad one share one table of marks."""
 
     def __init__(self, buffer: bytes) -> None:
         self._buffer = buffer
-        self._bad_end = 0  # of the bad frames so far
-        self._kind: FrameKind | None = None  # whose marks these are
+        self._bad_end = 0  # furthest end of the bad frames so far
+        self._kind: FrameKind | None = None  # the kind that computed the marks
         self._marks = memoryview(b"")
         self._marked = 0  # the place of the first mark
 
@@ -117,11 +119,11 @@ class _Overlaps:
 
 
 class Framer:
-    """A bounded buffer and the scan over it; counts into the parser's counters.
+    """Scans a bounded buffer for frames and updates the parser's counters.
 
     Args:
-        kinds: what may come, `swath.drivers.framing.kinds`.
-        counters: bytes, bytes_framed, bytes_skipped, messages, bad_checksums and errors are kept here.
+        kinds: the kinds to look for, from `swath.drivers.framing.kinds`.
+        counters: the framer updates bytes, bytes_framed, bytes_skipped, messages, bad_checksums and errors.
     """
 
     def __init__(self, kinds: Sequence[FrameKind], counters: ParserCounters) -> None:
@@ -130,12 +132,12 @@ class Framer:
         self._search = sync_expression(kinds).search
         self._pieces: list[bytes] = []
         self._held = 0  # bytes in the pieces
-        self._needed = 0  # fewer held bytes decide nothing
+        self._needed = 0  # held bytes below which a scan cannot decide
         self._offset = 0  # stream offset of the first held byte
-        self._arrivals: deque[tuple[int, int]] = deque()  # (stream offset behind a read, its host time)
+        self._arrivals: deque[tuple[int, int]] = deque()  # (stream offset after a read, its host time)
 
     def feed(self, data: bytes, host_time_ns: int) -> list[Frame]:
-        """Take one read; return the frames it completed, in order."""
+        """Take one read; return the frames that it completed, in order."""
         self.counters.bytes += len(data)
         self._pieces.append(data)
         self._held += len(data)
@@ -143,7 +145,9 @@ class Framer:
         return self._scan(final=False) if self._held >= self._needed else []
 
     def close(self) -> list[Frame]:
-        """Return the stream has ended: frames still held back behind a false sync; the rest is skipped."""
+        """Return the frames still held back behind a false sync at the end of the stream; the other bytes count as
+        skipped.
+        """
         return self._scan(final=True)
 
     def _scan(self, *, final: bool) -> list[Frame]:
@@ -166,7 +170,7 @@ class Framer:
             data = buffer[start:end]
             if kind.intact(data) if kind.marks is None else overlaps.intact(kind, start, data):
                 frames.append(Frame(kind.name, self._arrival(self._offset + end), data))
-                name = kind.message_name(data)  # noise makes any: those beyond what devices have are one
+                name = kind.message_name(data)  # noise can make any name: the surplus shares one
                 messages[name if name in messages or len(messages) < MAX_NAMES else OTHER_NAMES] += 1
                 framed += end - start
                 position = end
@@ -179,7 +183,9 @@ class Framer:
         return frames
 
     def _without_end(self, kind: FrameKind, length: int, there: int, final: bool) -> int:
-        """Return bytes to wait for from the candidate's start on, of which some are there; 0 if it is no frame."""
+        """Return how many bytes to wait for from the candidate's start; 0 if it is not a frame. ``there`` bytes are
+        present.
+        """
         if length == UNDECIDED:
             length = there + 1
         elif length == OVER_BOUND:
@@ -187,13 +193,13 @@ class Framer:
         return 0 if final or length < 0 else length
 
     def _arrival(self, end_offset: int) -> int:
-        """Return host time of the read that brought the byte before ``end_offset``."""
+        """Return the host time of the read that brought the byte before ``end_offset``."""
         while self._arrivals[0][0] < end_offset:
             self._arrivals.popleft()
         return self._arrivals[0][1]
 
     def _release(self, buffer: bytes, position: int, framed: int) -> None:
-        """Forget the first ``position`` bytes; what of them was in no frame is skipped."""
+        """Forget the first ``position`` bytes; those in no frame count as skipped."""
         self.counters.bytes_framed += framed
         self.counters.bytes_skipped += position - framed
         self._offset += position

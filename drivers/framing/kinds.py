@@ -1,4 +1,4 @@
-"""The frames that receivers and inertial units lay into a stream: sync, length and its bound, checksum, name."""
+"""The frames of receivers and inertial units in a stream: sync, length and its bound, checksum, name."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from swath.drivers.framing.framer import FALSE_SYNC, OVER_BOUND, UNDECIDED, Fram
 
 # The standard allows 82 characters; proprietary sentences (PUBX,03 with 32 satellites, PQTM…) reach several hundred.
 NMEA_MAX_BYTES = 1024
-NMEA_LONGEST_ADDRESS = 16  # that is looked for by its comma
-NMEA_NUMBER_END = 9  # of $PUBX,00,
-# A whole sentence with its line end, which nearly all are: body and checksum as below, the body as long as may be.
+NMEA_LONGEST_ADDRESS = 16  # longest address that the search for its comma covers
+NMEA_NUMBER_END = 9  # end of the number in $PUBX,00,
+# A whole sentence with its line end, the usual case: body and checksum as below, the body of any permitted length.
 NMEA_SENTENCE = re.compile(rb"[$!][A-Z][ -#%%-)+-~]{0,%d}\*[0-9A-Fa-f]{2}\r?\n" % (NMEA_MAX_BYTES - 7))
 NMEA_BODY = re.compile(rb"[$!][A-Z][ -#%-)+-~]*")  # printable, neither $ (a new sentence) nor * (the checksum)
 NMEA_CHECKSUM = re.compile(rb"\*[0-9A-Fa-f]{2}")
@@ -23,9 +23,7 @@ NMEA_ADDRESS = re.compile(rb"[$!]([A-Z0-9]+)(?:,(\d\d)(?=[,*]))?")
 
 
 def measure_nmea(buffer: bytes, start: int, final: bool) -> int:
-    """Return up to the line end, which belongs to the sentence; up to the checksum where there is none (6.1 of NMEA
-    0183).
-    """
+    """Measure a sentence with its line end, or up to its checksum where the line end is missing (6.1 of NMEA 0183)."""
     sentence = NMEA_SENTENCE.match(buffer, start)
     if sentence:
         return sentence.end() - start
@@ -51,7 +49,7 @@ def intact_nmea(frame: bytes) -> bool:
 
 
 def nmea_name(frame: bytes) -> str:
-    """Return ``GGA`` whoever talks; a maker's own sentence by its whole address, u-blox's with its number
+    """Return ``GGA`` for any talker, a maker's own sentence by its whole address, and u-blox's with its number
     (``PUBX00``).
     """
     comma = frame.find(b",", 0, NMEA_LONGEST_ADDRESS)
@@ -102,7 +100,7 @@ UBX_NAME_TABLE = """
 
 
 def _read_ubx_names(table: str) -> dict[bytes, str]:
-    """Return class and id as two bytes, to the message's name; a class alone as one byte, to its name."""
+    """Return message names by class and id (two bytes), and class names by class (one byte)."""
     names: dict[bytes, str] = {}
     for line in table.strip().splitlines():
         family, title, *pairs = line.split()
@@ -116,7 +114,7 @@ UBX_NAMES = _read_ubx_names(UBX_NAME_TABLE)
 
 
 def measure_ubx(buffer: bytes, start: int, final: bool) -> int:
-    """Return overhead and the length field."""
+    """Measure a frame by its length field."""
     if len(buffer) - start < UBX_LENGTH.size:
         return UNDECIDED
     payload: int = UBX_LENGTH.unpack_from(buffer, start)[0]
@@ -124,12 +122,12 @@ def measure_ubx(buffer: bytes, start: int, final: bool) -> int:
 
 
 def intact_ubx(frame: bytes) -> bool:
-    """Return fletcher over class to payload."""
+    """Return whether the Fletcher checksum over class to payload is good."""
     return (frame[-2], frame[-1]) == ubx_fletcher(frame[2:-2])
 
 
 def ubx_name(frame: bytes) -> str:
-    """Return ``NAV-PVT``; ``CFG-3E`` where the table has the class only."""
+    """Return a name such as ``NAV-PVT``, or ``CFG-3E`` where the table has the class only."""
     return UBX_NAMES.get(frame[2:4]) or f"{UBX_NAMES.get(frame[2:3], f'UBX-{frame[2]:02X}')}-{frame[3]:02X}"
 
 
@@ -139,14 +137,14 @@ RTCM3_MAX_BYTES = 3 + 1023 + 3  # the length has 10 bits
 
 
 def measure_rtcm3(buffer: bytes, start: int, final: bool) -> int:
-    """Return header, length, CRC."""
+    """Measure header, payload by the length field, and CRC."""
     if len(buffer) - start < 3:
         return UNDECIDED
     return ((buffer[start + 1] & 3) << 8 | buffer[start + 2]) + 6
 
 
 def rtcm3_name(frame: bytes) -> str:
-    """Return ``RTCM1077``: the message number is the payload's first 12 bits."""
+    """Return a name such as ``RTCM1077``; the message number is the payload's first 12 bits."""
     return f"RTCM{frame[3] << 4 | frame[4] >> 4}" if len(frame) >= 8 else "RTCM-empty"
 
 
@@ -154,7 +152,7 @@ def rtcm3_name(frame: bytes) -> str:
 
 # Long: the longest log is RANGE of all 555 channels of an OEM7, 4 + 44 · 555 = 24 424 bytes.
 NOVATEL_MAX_MESSAGE_BYTES = 24 * 1024
-NOVATEL_HEADER_BYTES = 28  # "the header length is variable": what it may grow by is bounded too
+NOVATEL_HEADER_BYTES = 28  # "the header length is variable": its growth is bounded too
 NOVATEL_MAX_HEADER_BYTES = 64
 NOVATEL_LENGTHS = struct.Struct("<3xB4xH")  # header length, message length
 NOVATEL_SHORT_HEADER_BYTES = 12  # message length is the byte after the sync
@@ -162,7 +160,7 @@ NOVATEL_MESSAGE_ID = struct.Struct("<4xH")  # both headers
 
 
 def measure_novatel(buffer: bytes, start: int, final: bool) -> int:
-    """Return header, message and CRC of the long form."""
+    """Measure header, message and CRC of the long form."""
     if len(buffer) - start < NOVATEL_LENGTHS.size:
         return UNDECIDED
     header, message = NOVATEL_LENGTHS.unpack_from(buffer, start)
@@ -172,28 +170,30 @@ def measure_novatel(buffer: bytes, start: int, final: bool) -> int:
 
 
 def measure_novatel_short(buffer: bytes, start: int, final: bool) -> int:
-    """Return header, message and CRC of the short form."""
+    """Measure header, message and CRC of the short form."""
     if len(buffer) - start < 4:
         return UNDECIDED
     return NOVATEL_SHORT_HEADER_BYTES + buffer[start + 3] + 4
 
 
 def novatel_name(frame: bytes) -> str:
-    """Return ``NOVATEL-42``: the message id; `swath.drivers.gnss.novatel.parser` knows the names."""
+    """Return a name such as ``NOVATEL-42`` by the message id; `swath.drivers.gnss.novatel.parser` has the real
+    names.
+    """
     return f"NOVATEL-{NOVATEL_MESSAGE_ID.unpack_from(frame)[0]}"
 
 
 # --- Xbus: FA FF, message identifier, length, data, checksum (Xsens MT Low-Level Communication Protocol) --------------
 
-XBUS_MAX_DATA_BYTES = 2048  # of a message with an extended length
+XBUS_MAX_DATA_BYTES = 2048  # data of a message with an extended length
 XBUS_EXTENDED = 0xFF  # length byte: the length follows in two bytes, high one first
 XBUS_MTDATA2 = 0x36
-XBUS_NAMES = {0x32: "MTData", XBUS_MTDATA2: "MTData2", 0x3E: "WakeUp", 0x42: "Error"}  # what a device says by itself
-XBUS_IDENTIFIERS = bytes(sorted({*XBUS_NAMES, *range(1, 256, 2)}))  # its answers are the odd ones
+XBUS_NAMES = {0x32: "MTData", XBUS_MTDATA2: "MTData2", 0x3E: "WakeUp", 0x42: "Error"}  # a device sends these unasked
+XBUS_IDENTIFIERS = bytes(sorted({*XBUS_NAMES, *range(1, 256, 2)}))  # its answers have odd identifiers
 
 
 def measure_xbus(buffer: bytes, start: int, final: bool) -> int:
-    """Return preamble, bus and message identifier, length, data and checksum."""
+    """Measure preamble, bus and message identifier, length, data and checksum."""
     if len(buffer) - start < 4:
         return UNDECIDED
     length = buffer[start + 3]
@@ -206,12 +206,12 @@ def measure_xbus(buffer: bytes, start: int, final: bool) -> int:
 
 
 def intact_xbus(frame: bytes) -> bool:
-    """Return all bytes but the preamble, checksum included, add up to 0 modulo 256."""
+    """Return whether all bytes but the preamble, checksum included, add up to 0 modulo 256."""
     return sum(frame[1:]) & 0xFF == 0
 
 
 def xbus_name(frame: bytes) -> str:
-    """Return ``MTData2``; ``XBUS-31`` where the table has no name."""
+    """Return a name such as ``MTData2``, or ``XBUS-31`` where the table has no name."""
     return XBUS_NAMES.get(frame[2]) or f"XBUS-{frame[2]:02X}"
 
 
@@ -222,11 +222,11 @@ SBF_MAX_BYTES = 16 * 1024
 SBF_HEADER_BYTES = 8
 SBF_HEADER = struct.Struct("<2xHHH")  # CRC, id and revision, length
 SBF_CRC_START = 4  # the CRC covers everything from the id on
-SBF_NUMBER_BITS = 0x1FFF  # of the id; the three above are the revision
+SBF_NUMBER_BITS = 0x1FFF  # block number within the id; the three bits above are the revision
 
 
 def measure_sbf(buffer: bytes, start: int, final: bool) -> int:
-    """Return the length field, which counts the whole block; always a multiple of 4."""
+    """Measure a block by its length field, which counts the whole block and is always a multiple of 4."""
     if len(buffer) - start < SBF_HEADER_BYTES:
         return UNDECIDED
     length: int = SBF_HEADER.unpack_from(buffer, start)[2]
@@ -236,12 +236,12 @@ def measure_sbf(buffer: bytes, start: int, final: bool) -> int:
 
 
 def intact_sbf(frame: bytes) -> bool:
-    """Return the CRC in the header against that of the rest."""
+    """Return whether the CRC in the header matches that of the following bytes."""
     return bool(SBF_HEADER.unpack_from(frame)[0] == crc16_ccitt(memoryview(frame)[SBF_CRC_START:]))
 
 
 def sbf_name(frame: bytes) -> str:
-    """Return ``SBF-4007``: the block's number; `swath.drivers.gnss.sbf.parser` knows the names."""
+    """Return a name such as ``SBF-4007`` by the block's number; `swath.drivers.gnss.sbf.parser` has the real names."""
     return f"SBF-{SBF_HEADER.unpack_from(frame)[1] & SBF_NUMBER_BITS}"
 
 
@@ -292,4 +292,4 @@ XBUS = FrameKind(
 
 SBF = FrameKind("sbf", (b"$", b"@"), SBF_MAX_BYTES, measure_sbf, intact_sbf, sbf_name)
 
-GNSS_KINDS = (NMEA, UBX, RTCM3)  # on one port of a u-blox or of most others
+GNSS_KINDS = (NMEA, UBX, RTCM3)  # may share one port of a u-blox receiver, and of most others

@@ -1,1 +1,1 @@
-"""GNSS receivers: one file a protocol."""
+"""Drivers of GNSS receivers, one file or package for each protocol."""

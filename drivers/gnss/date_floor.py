@@ -1,10 +1,10 @@
-"""What a receiver's dates may mean: roll-overs of the 10-bit week, the oldest date believed, leap counts they imply.
+"""Interprets a receiver's dates: roll-overs of the 10-bit week, the oldest accepted date, and implied leap counts.
 
-A receiver whose firmware is one roll-over behind says 1024 weeks less. Such a date is taken 1024 weeks later where the
-setting ``add_weeks`` says so, or where the host's clock, which stamped the bytes, shows that day to within one: no
-other mistake of either is exactly so large. Any other date before the floor is refused. The default floor catches it
-for all days until 2028-08-16 (2009-01-01 plus 1024 weeks); later the setting ``date_floor`` moves it. It is not the
-build date, so that older recordings can be read.
+A receiver whose firmware is one roll-over behind reports a week that is 1024 too small. Such a date is moved 1024 weeks
+later where the setting ``add_weeks`` asks for it, or where the host's clock, which stamped the bytes, shows the moved
+day to within one day: no other error of either is exactly that large. Any other date before the floor is refused. The
+default floor catches a roll-over on all days until 2028-08-16 (2009-01-01 plus 1024 weeks); later the setting
+``date_floor`` moves it. The floor is not the build date, so that older recordings can be read.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ ROLLOVER_DAYS = 7 * ROLLOVER_WEEKS
 HOST_DAY_TOLERANCE = 1  # a host's clock may keep local time
 DAY_NS = 86_400_000_000_000
 WEEK_MS = 604_800_000
-GREATEST_LEAP_S = 60  # GPS − UTC that a message's own two times may imply; more is another mistake
+GREATEST_LEAP_S = 60  # largest GPS − UTC that a message's own two times may imply; more is another error
 
 
 def read_date_floor(settings: DeviceSettings) -> dt.date:
-    """Return the setting ``date_floor``, a date or its text.
+    """Read the setting ``date_floor``, a date or its text.
 
     Raises:
-        DriverSettingsError: it is no date.
+        DriverSettingsError: the setting is not a date.
     """
     value = settings.config.get("date_floor")
     if value is None:
@@ -42,15 +42,15 @@ def read_date_floor(settings: DeviceSettings) -> dt.date:
 
 
 def week_of(date: dt.date) -> int:
-    """Return full GPS week a date lies in."""
+    """Return the full GPS week that contains a date."""
     return (date - GPS_EPOCH).days // 7
 
 
 class ReceiverDates:
-    """Moves a receiver's dates and weeks by the roll-overs it is behind, and remembers what it refused.
+    """Moves a receiver's dates and weeks by the roll-overs that it is behind, and remembers refused dates.
 
     Attributes:
-        floor: the oldest date believed, after the move.
+        floor: the oldest accepted date, after the move.
         floor_week: its GPS week.
     """
 
@@ -58,23 +58,23 @@ class ReceiverDates:
         """Read ``date_floor`` and ``add_weeks``.
 
         Raises:
-            DriverSettingsError: one is none.
+            DriverSettingsError: ``date_floor`` is not a date, or ``add_weeks`` is not a multiple of 1024.
         """
         self.floor = read_date_floor(settings)
         self.floor_week = week_of(self.floor)
         self._name = settings.source.partition("/")[2] or "NAME"
         self._source = settings.source
-        self._is_head = settings.source.startswith("scanner/")  # it hands on a receiver's date, and has no such keys
+        self._is_head = settings.source.startswith("scanner/")  # a head passes on a receiver's date, without such keys
         weeks = settings.config.get("add_weeks") or 0
         if not isinstance(weeks, int) or weeks % ROLLOVER_WEEKS or weeks < 0:
             raise DriverSettingsError(f"add_weeks: got {weeks!r}, want a multiple of {ROLLOVER_WEEKS}, as 1024")
         self._add_weeks = weeks
-        self._moved: tuple[dt.date, dt.date] | None = None  # the first, as said and as taken
-        self._refused: tuple[dt.date, dt.date] | None = None  # the first, as said, and the host's date
-        self._latest: tuple[dt.date | int, int, dt.date | int] | None = None  # as said, host's day, as taken
+        self._moved: tuple[dt.date, dt.date] | None = None  # the first moved date, as reported and as moved
+        self._refused: tuple[dt.date, dt.date] | None = None  # the first refused date, as reported, and the host's date
+        self._latest: tuple[dt.date | int, int, dt.date | int] | None = None  # as reported, host's day, as accepted
 
     def date(self, said: dt.date, host_time_ns: int) -> dt.date:
-        """Return the date that a receiver means; compare it with `floor`."""
+        """Return a receiver's date after the move by roll-overs; compare it with `floor`."""
         latest = self._latest
         if latest is None or latest[0] != said or latest[1] != host_time_ns // DAY_NS:
             latest = self._latest = said, host_time_ns // DAY_NS, self._date(said, host_time_ns)
@@ -82,7 +82,7 @@ class ReceiverDates:
         return latest[2]
 
     def week(self, said: int, host_time_ns: int) -> int:
-        """Return the GPS week that a receiver means; compare it with `floor_week`."""
+        """Return a receiver's GPS week after the move by roll-overs; compare it with `floor_week`."""
         latest = self._latest
         if latest is None or latest[0] != said or latest[1] != host_time_ns // DAY_NS:
             latest = self._latest = said, host_time_ns // DAY_NS, self._week(said, host_time_ns)
@@ -107,7 +107,7 @@ class ReceiverDates:
     def _week(self, said: int, host_time_ns: int) -> int:
         if said <= 0 or said > week_of(dt.date.max) - 1:
             return said
-        middle = GPS_EPOCH + dt.timedelta(days=7 * said + 3)  # the host's day may be any of the week
+        middle = GPS_EPOCH + dt.timedelta(days=7 * said + 3)  # the host's day may be any day of the week
         host = UNIX_EPOCH + dt.timedelta(days=min(max(host_time_ns // DAY_NS, 0), 100_000))
         weeks = self._add_weeks
         if not weeks:
@@ -124,7 +124,7 @@ class ReceiverDates:
         return said
 
     def remarks(self) -> list[str]:
-        """Return what the user should know of the dates: that they were moved, and why, or refused, and the remedy."""
+        """Return lines for the user about moved dates, with the reason, and about refused dates, with the remedy."""
         lines = []
         if self._moved is not None:
             said, taken = self._moved
@@ -149,9 +149,9 @@ class ReceiverDates:
 
 
 def leap_seconds_of(date: dt.date, of_day_ms: int, itow_ms: int) -> int | None:
-    """Return GPS − UTC in s as the UTC and the GPS time of week of one message imply it.
+    """Return GPS − UTC in s, as implied by the UTC and the GPS time of week in one message.
 
-    None where they are not whole seconds apart to 1 ms, or by more than `GREATEST_LEAP_S`.
+    None where they are not whole seconds apart to 1 ms, or differ by more than `GREATEST_LEAP_S`.
     """
     week_ms = ((date - GPS_EPOCH).days % 7) * 86_400_000 + of_day_ms
     ahead_ms = (itow_ms - week_ms + WEEK_MS // 2) % WEEK_MS - WEEK_MS // 2

@@ -1,8 +1,8 @@
-"""Gathers the messages that a receiver sends about one epoch, so that one fix comes of them.
+"""Gathers the messages that a receiver sends about one epoch, so that they make one fix.
 
-The rule knows the order of messages only, neither times of arrival nor reads, so that it gives the same however a
-stream is cut, live as in replay: an epoch is complete when every kind of message seen in the last epochs is there,
-or when a message of another epoch begins. So a fix waits for the next epoch only where a message of its own is absent.
+The rule uses the order of messages only, not times of arrival or reads, so that the result is the same however a stream
+is cut, live or in replay: an epoch is complete when every kind of message seen in the last epochs is present, or when a
+message of another epoch begins. A fix therefore waits for the next epoch only if a message of its own is missing.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ from swath.drivers.parser import ParserCounters
 
 PartT = TypeVar("PartT")
 
-FORGET_AFTER_EPOCHS = 16  # a kind of message not seen for so long is expected no more
+FORGET_AFTER_EPOCHS = 16  # a kind of message absent for so long is no longer expected
 
 
 class EpochGatherer(Generic[PartT]):
-    """Collects named parts under a key (time of day, iTOW) and hands complete epochs over as ``{name: part}``.
+    """Collects named parts under a key (time of day, iTOW) and returns complete epochs as ``{name: part}``.
 
-    The first part of a name counts; a later one in the same epoch is counted as ``repeated_in_epoch``, one that
-    comes when the epoch has been handed over as ``late_in_epoch``.
+    The first part of a name is kept; a later one in the same epoch is counted as ``repeated_in_epoch``, one that
+    comes after the epoch was returned as ``late_in_epoch``.
     """
 
     def __init__(self, counters: ParserCounters) -> None:
@@ -32,7 +32,7 @@ class EpochGatherer(Generic[PartT]):
         self._expected: dict[str, int] = {}  # kind: epochs since it was seen
 
     def add(self, key: int, name: str, part: PartT) -> list[dict[str, PartT]]:
-        """Take a part; return the epochs this completed."""
+        """Take a part; return the epochs that it completed."""
         complete = [] if key == self.key else self.end()
         self.key = key
         self._seen.add(name)
@@ -47,7 +47,7 @@ class EpochGatherer(Generic[PartT]):
         return complete
 
     def end(self) -> list[dict[str, PartT]]:
-        """Return the epoch is over: what was not yet handed over."""
+        """End the epoch and return it, unless it was returned before."""
         complete = self._hand_over()
         if self.key is not None:
             aged = {name: age + 1 for name, age in self._expected.items() if age < FORGET_AFTER_EPOCHS}

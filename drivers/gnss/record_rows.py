@@ -1,4 +1,4 @@
-"""Rows of array records, collected one message at a time and joined with their neighbours."""
+"""Rows of array records: collected one message at a time and joined with their neighbours."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Row(NamedTuple):
 
 
 def join_rows(items: Iterable[Record | Row]) -> list[Record]:
-    """Return records in order; neighbouring rows of one kind are one array."""
+    """Return records in order; neighbouring rows of one kind become one array."""
     records: list[Record] = []
     run: list[Row] = []
     for item in items:
@@ -33,7 +33,7 @@ def join_rows(items: Iterable[Record | Row]) -> list[Record]:
 
 
 def _array(run: list[Row]) -> Record:
-    """Return rows of one kind as one record."""
+    """Convert rows of one kind to one record."""
     values: list[Any] = [row.values for row in run]
     if run[0].record is ImuSamples:
         return ImuSamples(np.array(values, dtype=IMU_DTYPE))

@@ -1,1 +1,1 @@
-"""Inertial units: one file a protocol."""
+"""Drivers of inertial units, one file or package for each protocol."""

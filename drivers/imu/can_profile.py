@@ -1,4 +1,4 @@
-"""Named devices over `swath.drivers.imu.dbc`: messages are known, CAN identifiers are what the user set."""
+"""Signal maps of known CAN devices for `swath.drivers.imu.dbc`: messages are fixed, CAN identifiers set by the user."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from swath.drivers.parser import DeviceSettings, DriverSettingsError
 def profile_map(
     settings: DeviceSettings, contents: bytes, name: str, signals: Mapping[str, Any], *, prefix: str = ""
 ) -> SignalMap:
-    """Return the signal map of a device whose messages are described by a DBC that comes with its driver.
+    """Return the signal map of a device whose driver includes a DBC of its messages.
 
     The message with the counter opens a sample unless the table's ``group`` says otherwise.
 
     Args:
-        settings: the device's table; ``ids`` and ``extended_ids`` say what differs from the DBC's identifiers.
-        contents: the DBC.
-        name: of the DBC, for what is said of it.
-        signals: which of its signals is what, as in ``[imu.NAME.signals]``.
-        prefix: what all its message names begin with; the keys of ``ids`` leave it out.
+        settings: the device's table; ``ids`` and ``extended_ids`` replace identifiers of the DBC.
+        contents: the DBC's bytes.
+        name: the DBC's name for error messages.
+        signals: the role of each signal, as in ``[imu.NAME.signals]``.
+        prefix: common beginning of its message names, which the keys of ``ids`` leave out.
 
     Raises:
-        DriverSettingsError: naming the key and what would be right.
+        DriverSettingsError: a setting is invalid; the text names the key and a valid value.
     """
     if settings.config.get("sample") == "increment":
         raise DriverSettingsError(

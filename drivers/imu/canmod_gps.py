@@ -1,9 +1,8 @@
 """CSS Electronics CANmod.gps: an automotive IMU (100 Hz) and a GNSS receiver (1 Hz) on one CAN bus.
 
-A preset over `swath.drivers.imu.dbc.parser` with the maker's own DBC (canmod-gps.dbc beside this file, MIT licence
-inside). The
-device has no counter and no PPS output: its samples are timed by their arrival, and its time message, a second old
-and some 0.5 s late, names the edge before it for a host that has PPS from elsewhere.
+A preset of `swath.drivers.imu.dbc.parser` with the maker's own DBC (canmod-gps.dbc beside this file, which contains its
+MIT licence). The device has no counter and no PPS output: its samples are timed by their arrival, and its time message,
+a second old and some 0.5 s late, refers to the edge before it for a host that receives PPS from another source.
 """
 
 from __future__ import annotations
@@ -42,7 +41,7 @@ IMU_SIGNALS = {
     "angular_rate": [f"gnss_imu.AngularRate{axis}" for axis in "XYZ"],
 }
 IMU_VALID = "gnss_imu.ImuValid"
-# message -> the signal that vouches for it, and the key and factor of each signal in the device's status
+# message -> its validity signal, and the key and factor of each signal in the device's status
 STATUS_SIGNALS: dict[str, tuple[str, dict[str, tuple[str, float]]]] = {
     "gnss_altitude": ("AltitudeValid", {"Altitude": ("altitude_m", 1), "AltitudeAccuracy": ("altitude_accuracy_m", 1)}),
     "gnss_attitude": (
@@ -70,7 +69,7 @@ STATUS_SIGNALS: dict[str, tuple[str, dict[str, tuple[str, float]]]] = {
         {"FenceCombined": ("fence_combined", 1), **{f"Fence{n}": (f"fence_{n}", 1) for n in range(1, 5)}},
     ),
 }
-GNSS_SIGNALS = {  # message -> its signals that are read
+GNSS_SIGNALS = {  # message -> the signals read from it
     "gnss_status": ("FixType", "Satellites"),
     "gnss_time": ("TimeValid", "TimeConfirmed", "Epoch"),
     "gnss_pos": ("PositionValid", "Latitude", "Longitude", "PositionAccuracy"),
@@ -90,7 +89,7 @@ MS_PER_DAY = 86_400_000
 
 
 class GnssMessage(NamedTuple):
-    """One kind of GNSS frame: identifier, least length, signals by name."""
+    """One kind of GNSS frame: identifier, minimum length, signals by name."""
 
     can_id: int
     needs_bytes: int
@@ -98,10 +97,15 @@ class GnssMessage(NamedTuple):
 
 
 class CanmodGpsParser(DbcParser):
-    """`ImuSamples` by the DBC machinery, and the 1 Hz GNSS messages."""
+    """Decodes `ImuSamples` by the DBC parser, and the 1 Hz GNSS messages."""
 
     def __init__(self, settings: DeviceSettings, *, time_only: bool = False) -> None:
-        """Args: the device's table; ``time_only``: give time messages only, for the recorder."""
+        """Prepare a parser for one device.
+
+        Args:
+            settings: the device's table.
+            time_only: return time messages only, for the recorder.
+        """
         contents = settings.files.get("dbc") or DBC_PATH.read_bytes()
         file_name = str(settings.config.get("dbc") or DBC_PATH.name)
         config: dict[str, Any] = {**settings.config, "signals": IMU_SIGNALS, "dbc": file_name}
@@ -131,7 +135,7 @@ class CanmodGpsParser(DbcParser):
         return [*super().parse_units(host_time_ns, units), *self._gnss_records(host_time_ns, table)]
 
     def _gnss_records(self, host_time_ns: Int64Array, table: StructArray) -> list[Record]:
-        """Return the GNSS messages of a batch in the order of their arrival; they come once a second."""
+        """Return the records of a batch's GNSS messages, which come once a second, in the order of arrival."""
         found: list[tuple[int, str, dict[str, float]]] = []
         for name, message in self._gnss.items():
             where = np.flatnonzero(table["can_id"] == np.uint32(message.can_id))
@@ -151,7 +155,7 @@ class CanmodGpsParser(DbcParser):
         return records
 
     def _gnss_record(self, host_time_ns: int, name: str, values: dict[str, float]) -> list[Record]:
-        """Return what one GNSS message says."""
+        """Return the records of one GNSS message."""
         if name == "gnss_status":
             self._status = values
             return []
@@ -169,10 +173,10 @@ class CanmodGpsParser(DbcParser):
         return [DeviceStatus(host_time_ns, _status_values(name, values), message=name)]
 
     def _fix(self, host_time_ns: int, values: dict[str, float]) -> GnssFix:
-        """Return position of the epoch of the last time message.
+        """Return the position at the epoch of the last time message.
 
-        The maker does not say what surface its altitude refers to, so the fix has no ellipsoidal height; the altitude
-        is in the device's status.
+        The maker does not define the reference surface of its altitude, so the fix has no ellipsoidal height; the
+        altitude is in the device's status.
         """
         assert self._time is not None
         accuracy = values["PositionAccuracy"]
@@ -193,7 +197,7 @@ class CanmodGpsParser(DbcParser):
 
 
 def _gnss_message(database: Any, name: str, file_name: str) -> GnssMessage:
-    """Return layouts of one GNSS message."""
+    """Find the layouts of one GNSS message."""
     found = {key: find_signal(database, f"{name}.{key}", file_name) for key in GNSS_SIGNALS[name]}
     layouts = {key: signal.layout for key, signal in found.items()}
     needs = max(layout.needs_bytes for layout in layouts.values())
@@ -203,7 +207,8 @@ def _gnss_message(database: Any, name: str, file_name: str) -> GnssMessage:
 def utc_tag(unix_s: float) -> TimeTag:
     """Return UTC of a Unix time with the device's 1 ms resolution.
 
-    The device cuts its epoch to milliseconds, so a whole second reads as .000 or .999: both are the whole second.
+    The device truncates its epoch to milliseconds, so a whole second reads as .000 or .999; both become the whole
+    second.
     """
     unix_ms = round(unix_s * MS_PER_S)
     if unix_ms % MS_PER_S == MS_PER_S - 1:
@@ -213,13 +218,13 @@ def utc_tag(unix_s: float) -> TimeTag:
 
 
 def _status_values(name: str, values: dict[str, float]) -> dict[str, float | int | str | bool]:
-    """Return the message's values with their units in the keys; nothing where the device calls them invalid."""
+    """Return the message's values with their units in the keys; empty where the device marks them invalid."""
     valid, signals = STATUS_SIGNALS[name]
     return {key: values[signal] * factor for signal, (key, factor) in signals.items()} if values[valid] else {}
 
 
 def make_time_parser(settings: DeviceSettings) -> CanmodGpsParser:
-    """Return the recorder's parser: time messages only."""
+    """Make the recorder's parser, which returns time messages only."""
     return CanmodGpsParser(settings, time_only=True)
 
 

@@ -1,4 +1,4 @@
-"""Device counters that wrap, made continuous."""
+"""Makes wrapping device counters continuous."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from swath.georef.records import Int64Array
 from swath.georef.timescales.gps_time import SECOND_NS
 
-RESTART_TOLERANCE_S = 2.0  # host stamps may be late by stalls of this size
-RESTART_TOLERANCE_RATE = 0.01  # and both clocks together off by this
+RESTART_TOLERANCE_S = 2.0  # stalls may delay host stamps by this much
+RESTART_TOLERANCE_RATE = 0.01  # rate error of both clocks together
 LATE_LATCH_PART = 8  # a latched value may be ahead of its reference by this part of the wrap
 
 
@@ -19,8 +19,8 @@ class CounterUnwrapper:
     """Unwraps a counter of ``bits`` bits at ``tick_hz`` by its differences, and by host time across long gaps.
 
     A step that disagrees with host time by more than 2 s + 1 % (or goes back) is a restart of the device: the count
-    begins anew from the value read, which later stages see as a new segment of its clock. So it does where a counter
-    that wraps within 4 s seems to have wrapped unseen: host stamps that were late by a stall look the same.
+    restarts from the value read, which later stages treat as a new segment of its clock. The same happens where a
+    counter that wraps within 4 s appears to have wrapped unseen, because host stamps delayed by a stall look the same.
     """
 
     def __init__(self, bits: int, tick_hz: float) -> None:
@@ -32,7 +32,7 @@ class CounterUnwrapper:
         self._last = 0
 
     def unwrap(self, raw: NDArray[np.uint64], host_time_ns: Int64Array) -> tuple[Int64Array, NDArray[np.bool_]]:
-        """Return continuous counts (n,) of raw values (n,) with their host times, and (n,) where the device
+        """Return continuous counts (n,) of raw values (n,) with their host times, and (n,) True where the device
         restarted.
         """
         if not len(raw):
@@ -61,7 +61,7 @@ class CounterUnwrapper:
             steps = steps & (wrap - 1)
             wraps = np.maximum(np.rint((expected - steps) / wrap), 0).astype(np.int64)
             steps = steps + wraps * wrap
-            if wrap < 2 * RESTART_TOLERANCE_S * self._tick_hz:  # a stall may be half a wrap, which is rounded to one
+            if wrap < 2 * RESTART_TOLERANCE_S * self._tick_hz:  # a stall may last half a wrap, which rounds up to one
                 unsure = wraps > 0
         tolerance = (RESTART_TOLERANCE_S + RESTART_TOLERANCE_RATE * np.abs(span_s)) * self._tick_hz
         return steps, unsure | (steps < 0) | (np.abs(expected - steps) > tolerance)
@@ -76,14 +76,18 @@ class CounterUnwrapper:
 
 
 class GapCounter:
-    """Counts what a counter of samples sent skips; a step of half its range or more is a restart and no gap."""
+    """Counts the values that a counter of sent samples skips; a step of half its range or more is a restart, not a
+    gap.
+    """
 
     def __init__(self, bits: int) -> None:
         self._bits = bits
         self._last: np.uint64 | None = None
 
     def missing(self, raw: NDArray[np.uint64]) -> int:
-        """Return how many values lie between the raw ones (n,), the last of the call before included."""
+        """Return how many values are missing between the raw ones (n,), starting after the last one of the previous
+        call.
+        """
         if not len(raw):
             return 0
         before = raw[:1] if self._last is None else np.array([self._last])
@@ -94,10 +98,10 @@ class GapCounter:
 
 
 class LatchTracker:
-    """Makes the counter latched at a PPS edge continuous on the scale of its running counter.
+    """Makes the counter latched at a PPS edge continuous, on the scale of its running counter.
 
-    A new value is placed once, when it appears, at or below the running count of that moment, and then held: a latch
-    that no edge renews does not creep forward with the wraps. After a restart it is unknown until it changes.
+    A new value is placed once, when it appears, at or below the running count of that moment, and then kept, so that a
+    latch without new edges does not move forward with the wraps. After a restart it is unknown until it changes.
     """
 
     def __init__(self, bits: int) -> None:
@@ -111,7 +115,11 @@ class LatchTracker:
     ) -> Int64Array:
         """Return continuous latched counts (n,), −1 where unknown.
 
-        Args: latched bits and whether there are any, the running counts and restarts; (n,) each.
+        Args:
+            raw: (n,) latched bits.
+            known: (n,) whether a latched value exists.
+            counts: (n,) the running counts.
+            restart: (n,) where the device restarted.
         """
         if not len(raw):
             return np.empty(0, np.int64)
@@ -129,7 +137,12 @@ def latched_before(raw: NDArray[np.uint64], bits: int, reference: Int64Array) ->
     """Return continuous counts of latched raw values: the nearest at or below the reference counts.
 
     A latch may be reported a moment before the sample that follows it, so a value ahead of its reference by less than
-    an eighth of the wrap is taken as ahead. Args: (n,) raw, the counter's bits, (n,) reference counts.
+    an eighth of the wrap counts as ahead.
+
+    Args:
+        raw: (n,) latched values.
+        bits: the counter's bits.
+        reference: (n,) reference counts.
     """
     if bits >= 63:
         return raw.view(np.int64).copy()
@@ -141,7 +154,7 @@ def latched_before(raw: NDArray[np.uint64], bits: int, reference: Int64Array) ->
 
 
 def nanoseconds(counts: Int64Array, tick_hz: Fraction) -> Int64Array:
-    """Return counts in nanoseconds, exact below the nanosecond for whole and fractional rates."""
+    """Convert counts to nanoseconds, exactly for whole and fractional rates."""
     scaled = counts * tick_hz.denominator
     whole, rest = np.divmod(scaled, tick_hz.numerator)
     result: Int64Array = whole * SECOND_NS + rest * SECOND_NS // tick_hz.numerator

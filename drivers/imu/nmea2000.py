@@ -1,16 +1,16 @@
 """NMEA 2000: attitude, rate of turn, heading, heave, position and time of the devices on a vessel's bus.
 
-The 29-bit identifier holds priority, PGN and source address (SAE J1939-21); data are little-endian, and the largest
+The 29-bit identifier contains priority, PGN and source address (SAE J1939-21); data are little-endian, and the largest
 values of a field mean that it is not available. Layouts: canboat, docs/canboat.json (Apache-2.0), facts only. Several
 devices send the same PGN: one source is used for each, `source_address` or else the first that sends it.
 
-Rates and angles come at 10 to 20 Hz and without a device time: they are status, no inertial samples. Positions of
-129025 and 129026 name no time and are status too; a `GnssFix` is made of 129029, which names its own.
+Rates and angles come at 10 to 20 Hz and without a device time: they become status records, not inertial samples.
+Positions of 129025 and 129026 have no time and become status too; 129029, which has a time, becomes a `GnssFix`.
 
 Fast packets: messages of up to 223 bytes in up to 32 frames of one identifier. The first data byte of each frame is
-``sequence << 5 | frame``: the sequence number (0 … 7) is that of the message, by source and PGN, so that messages of
-many sources may be interleaved. Frame 0 goes on with the length in bytes and six bytes of the message, each other
-frame with seven; the last is filled up (canboat, docs: "fast packet").
+``sequence << 5 | frame``: the sequence number (0 … 7) identifies the message by source and PGN, so that messages of
+many sources may be interleaved. Frame 0 continues with the length in bytes and six bytes of the message, each other
+frame with seven; the last one is padded (canboat, docs: "fast packet").
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from swath.georef.records import (
 )
 
 LARGEST_MESSAGE_BYTES = 223
-FIRST_BYTES = 6  # of the message in frame 0
+FIRST_BYTES = 6  # bytes of the message in frame 0
 TIMEOUT_NS = 750_000_000  # the longest pause between frames of one message
 
 LARGEST_SOURCE = 253  # 254 is "no address", 255 the broadcast address
@@ -52,7 +52,7 @@ SYSTEM_TIME, HEADING, GNSS_POSITION = 126992, 127250, 129029
 TIME_UNIT_NS = 100_000  # 1e-4 s
 DAY_UNITS = 864_010_000  # a day with a leap second, in 1e-4 s
 UNIX_EPOCH = dt.date(1970, 1, 1)
-SATELLITE_TIME_SOURCES = (0, 1)  # of 126992: GPS, GLONASS; the others are radio and local clocks
+SATELLITE_TIME_SOURCES = (0, 1)  # in 126992: GPS, GLONASS; the others are radio and local clocks
 TRUE_NORTH, MAGNETIC_NORTH = 0, 1
 
 
@@ -74,7 +74,7 @@ class Bits(NamedTuple):
 
 
 class Layout(NamedTuple):
-    """A single-frame message: least bytes, numbers, codes."""
+    """A single-frame message: minimum number of bytes, numbers, codes."""
 
     needs_bytes: int
     fields: tuple[Field, ...]
@@ -121,13 +121,17 @@ Values = dict[str, float]
 
 
 class Nmea2000Parser(PacketParser):
-    """Decodes the frames of a bus; one source a PGN is used, all are counted in ``counters.messages``."""
+    """Decodes the frames of a bus; one source is used for each PGN, and all are counted in ``counters.messages``."""
 
     def __init__(self, settings: DeviceSettings, *, time_only: bool = False) -> None:
-        """Args: the device's table; ``time_only``: give time messages only, for the recorder.
+        """Prepare a parser for one bus.
+
+        Args:
+            settings: the device's table.
+            time_only: return time messages only, for the recorder.
 
         Raises:
-            DriverSettingsError: source_address is no address of a device.
+            DriverSettingsError: source_address is not the address of a device.
         """
         super().__init__()
         wanted = settings.config.get("source_address")
@@ -157,7 +161,7 @@ class Nmea2000Parser(PacketParser):
         return [record for _, records in sorted(found, key=lambda item: item[0]) for record in records]
 
     def close(self) -> list[Record]:
-        """Count the messages the end of the stream leaves unfinished."""
+        """Count the messages that the end of the stream leaves unfinished."""
         self._packets.close()
         self._take_packet_counts()
         return []
@@ -165,7 +169,7 @@ class Nmea2000Parser(PacketParser):
     # -- frames
 
     def _addresses(self, can_id: NDArray[np.uint32]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return PGN (−1: no data frame with 29 bits) and source address of each frame."""
+        """Return PGN (−1 unless it is a data frame with 29 bits) and source address of each frame."""
         flagged = can_id & np.uint32(CAN_ERR_FLAG | CAN_RTR_FLAG)
         errors = int(np.count_nonzero(flagged & np.uint32(CAN_ERR_FLAG)))
         remote = int(np.count_nonzero(flagged)) - errors
@@ -180,7 +184,7 @@ class Nmea2000Parser(PacketParser):
         self.counters.errors[code] += messages
 
     def _source_of(self, pgn: int, first: int) -> int:
-        """Return the source used for a PGN; ``first``: of the first message there is."""
+        """Return the source used for a PGN; ``first`` is the source of its first message."""
         return self._wanted if self._wanted is not None else self._used.setdefault(pgn, first)
 
     def _single_frames(
@@ -213,7 +217,7 @@ class Nmea2000Parser(PacketParser):
     def _fast_frames(
         self, where: NDArray[np.intp], source: NDArray[np.int64], table: StructArray, host_time_ns: Int64Array
     ) -> list[tuple[int, list[Record]]]:
-        """Return row and records of each 129029 that is completed; few of a bus's frames are."""
+        """Return row and records of each completed 129029, which make up few of a bus's frames."""
         found: list[tuple[int, list[Record]]] = []
         lengths = np.minimum(table["length"][where], 8).tolist()
         data = np.ascontiguousarray(table["data"][where][:, :8])
@@ -234,7 +238,7 @@ class Nmea2000Parser(PacketParser):
         return found
 
     def _take_packet_counts(self) -> None:
-        """Move what the reassembly counted into the parser's counters."""
+        """Move the counts of the reassembly into the parser's counters."""
         if self._packets.incomplete:
             self.counters.errors["fast_packet_incomplete"] += self._packets.incomplete
         if self._packets.bad_length:
@@ -244,7 +248,7 @@ class Nmea2000Parser(PacketParser):
     # -- records
 
     def _records_of(self, pgn: int, host_time_ns: int, values: Values) -> list[Record]:
-        """Return what one single-frame message says."""
+        """Return the records of one single-frame message."""
         if pgn == SYSTEM_TIME:
             return self._time_records(host_time_ns, values)
         records: list[Record] = [DeviceStatus(host_time_ns, {**values}, message=str(pgn))]
@@ -254,14 +258,14 @@ class Nmea2000Parser(PacketParser):
         return records
 
     def _tag(self, days: int, time: int) -> TimeTag | None:
-        """Return UTC of a date and time of day; None, counted, where they are no time."""
+        """Return UTC of a date and time of day; where they are invalid, count them and return None."""
         if time > DAY_UNITS:
             self._count_bad(1, "bad_value")
             return None
         return TimeTag(TimeScale.UTC, time * TIME_UNIT_NS, date=UNIX_EPOCH + dt.timedelta(days=days))
 
     def _time_records(self, host_time_ns: int, values: Values) -> list[Record]:
-        """Return 126992: valid where it comes from satellites."""
+        """Return the time message of 126992, valid where the time comes from satellites."""
         if "date" not in values or "time" not in values:
             self.counters.errors["time_not_available"] += 1
             return []
@@ -272,7 +276,7 @@ class Nmea2000Parser(PacketParser):
         return [TimeMessage(host_time_ns, tag, NamesEdge.PREVIOUS, valid=valid, message=str(SYSTEM_TIME))]
 
     def _position_records(self, host_time_ns: int, message: bytes) -> list[Record]:
-        """Return 129029: the fix, and what it says beside it."""
+        """Return the fix of 129029 and a status with its other values."""
         _, days, time, lat, lon, altitude, kinds, integrity, satellites, hdop, pdop, separation, _ = (
             GNSS_STRUCT.unpack_from(message)
         )
@@ -303,7 +307,7 @@ class Nmea2000Parser(PacketParser):
             time=tag,
             lat_rad=radians(lat_deg) if said else None,
             lon_rad=radians(lon_deg) if said else None,
-            height_m=None,  # senders disagree about what their altitude refers to
+            height_m=None,  # senders disagree about the reference of their altitude
             fix_type=fix_type,
             satellites=satellites if is_available(satellites, 8) else None,
             valid=fix_type is not FixType.NONE,
@@ -323,7 +327,7 @@ def pgn_and_source(can_id: NDArray[np.uint32]) -> tuple[NDArray[np.int64], NDArr
 
 
 def is_available(raw: int, bits: int) -> bool:
-    """Return whether a field is a number: ``bits`` are those of its largest value (15 for a signed field of 16)."""
+    """Return whether a field has a value; ``bits`` are those of its largest value (15 for a signed field of 16)."""
     return raw <= (1 << bits) - 1 - SPECIAL_VALUES
 
 
@@ -344,9 +348,9 @@ def decode_columns(layout: Layout, data: ByteRows) -> dict[str, list[float | Non
 
 
 def true_heading_rad(values: Values) -> float | None:
-    """Return heading from true north, 0 … 2π; None where 127250 does not say enough.
+    """Return the heading from true north, 0 … 2π; None where 127250 does not give enough.
 
-    A magnetic heading needs the variation (east positive); the compass's deviation is added where it is said.
+    A magnetic heading needs the variation (east positive); the compass's deviation is added where it is available.
     """
     heading = values.get("heading_rad")
     if heading is None:
@@ -359,7 +363,7 @@ def true_heading_rad(values: Values) -> float | None:
 
 
 def make_time_parser(settings: DeviceSettings) -> Nmea2000Parser:
-    """Return the recorder's parser: time messages only."""
+    """Make the recorder's parser, which returns time messages only."""
     return Nmea2000Parser(settings, time_only=True)
 
 
@@ -379,7 +383,7 @@ DRIVERS = (
 
 @dataclass(slots=True)
 class _Open:
-    """A message under way; ``data`` None: it is lost and its remaining frames are let go."""
+    """A message in progress; ``data`` is None once it is lost, and its remaining frames are discarded."""
 
     length: int
     next_frame: int
@@ -388,11 +392,11 @@ class _Open:
 
 
 class FastPackets:
-    """Puts the fast packets of one PGN together; at most one message a source and sequence number is held.
+    """Reassembles the fast packets of one PGN; keeps at most one message for each source and sequence number.
 
     Attributes:
-        incomplete: messages lost for a missing, repeated or late frame, or the end of the stream.
-        bad_length: first frames that announce more than 223 bytes, or none.
+        incomplete: messages lost by a missing, repeated or late frame, or by the end of the stream.
+        bad_length: first frames that announce more than 223 bytes, or 0.
     """
 
     def __init__(self) -> None:
@@ -401,7 +405,7 @@ class FastPackets:
         self._open: dict[tuple[int, int], _Open] = {}  # by source and sequence number: 256 · 8 at most
 
     def take(self, source: int, host_time_ns: int, data: bytes) -> bytes | None:
-        """Take the data bytes of a frame; return the message it completes."""
+        """Take the data bytes of a frame; return the message that it completes."""
         if not data:
             self.bad_length += 1
             return None
@@ -427,12 +431,12 @@ class FastPackets:
         return self._completed(key, message)
 
     def close(self) -> None:
-        """Count what the end of the stream leaves unfinished."""
+        """Count the messages that the end of the stream leaves unfinished."""
         self.incomplete += sum(message.data is not None for message in self._open.values())
         self._open.clear()
 
     def _begin(self, key: tuple[int, int], host_time_ns: int, data: bytes) -> bytes | None:
-        """Return frame 0: a message of the same number that is still open is lost."""
+        """Start a message with its frame 0; an open message of the same number is lost."""
         before = self._open.pop(key, None)
         if before is not None and before.data is not None:
             self.incomplete += 1
@@ -446,13 +450,13 @@ class FastPackets:
         return self._completed(key, message)
 
     def _completed(self, key: tuple[int, int], message: _Open) -> bytes | None:
-        """Return the message when all its bytes are there."""
+        """Return the message once all its bytes are present."""
         if message.data is None or len(message.data) < message.length:
             return None
         del self._open[key]
         return bytes(message.data[: message.length])
 
     def _lose(self, key: tuple[int, int], frame: int, host_time_ns: int) -> None:
-        """Count a lost message and let its remaining frames go."""
+        """Count a lost message and discard its remaining frames."""
         self.incomplete += 1
         self._open[key] = _Open(0, frame + 1, host_time_ns, None)

@@ -10,7 +10,7 @@ from swath.georef.records import ImuSamples, InsSolution
 
 
 def make_imu_parser(settings: DeviceSettings) -> NovatelParser:
-    """Return a parser of the receiver's stream that gives what is inertial."""
+    """Make a parser of the receiver's stream that returns inertial records only."""
     return NovatelParser(settings, wanted=(ImuSamples, InsSolution))
 
 

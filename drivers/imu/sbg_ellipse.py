@@ -1,8 +1,8 @@
-"""SBG Systems Ellipse (Ekinox, Apogee, Quanta alike) on CAN.
+"""SBG Systems Ellipse (also Ekinox, Apogee, Quanta) on CAN.
 
-The maker's own DBC (sbg-ellipse.dbc beside this file: github.com/SBG-Systems/sbgECom, can/sbgCan.dbc, MIT licence
-inside) and its document canProtocol.md agree on all that is read here. A sample is IMU_INFO with the time stamp in
-microseconds since power-on, then IMU_ACCEL and IMU_GYRO of the same cycle, which carry no time of their own. All
+The maker's own DBC (sbg-ellipse.dbc beside this file: github.com/SBG-Systems/sbgECom, can/sbgCan.dbc, which contains
+its MIT licence) and its document canProtocol.md agree on all fields read here. A sample is IMU_INFO with the time stamp
+in microseconds since power-on, then IMU_ACCEL and IMU_GYRO of the same cycle, which carry no time of their own. All
 identifiers are disabled until the user chooses them; those of the DBC are the document's.
 """
 
@@ -19,7 +19,7 @@ from swath.georef.records import DeviceClockSamples, ImuSamples
 
 DBC_PATH = Path(__file__).with_name("sbg-ellipse.dbc")
 PREFIX = "SBG_ECAN_MSG_"
-SIGNALS = {  # canProtocol.md; TIME_STAMP is in µs, which is what tick_hz is when absent
+SIGNALS = {  # canProtocol.md; TIME_STAMP is in µs, the default of tick_hz
     "specific_force": [f"{PREFIX}IMU_ACCEL.ACCEL_{axis}" for axis in "XYZ"],
     "angular_rate": [f"{PREFIX}IMU_GYRO.GYRO_{axis}" for axis in "XYZ"],
     "sample_ticks": f"{PREFIX}IMU_INFO.TIME_STAMP",
@@ -29,10 +29,10 @@ SIGNALS = {  # canProtocol.md; TIME_STAMP is in µs, which is what tick_hz is wh
 
 
 def signal_map(settings: DeviceSettings) -> SignalMap:
-    """Return where the signals lie; with ``pps_event``, the time of that Sync In's last event is the latched counter.
+    """Return the device's signal map; with ``pps_event``, the time of that Sync In's last event is the latched counter.
 
     Raises:
-        DriverSettingsError: naming the key and what would be right.
+        DriverSettingsError: a setting is invalid; the text names the key and a valid value.
     """
     event = settings.config.get("pps_event")
     latch = {"pps_ticks": f"{PREFIX}EVENT_INFO_{event}.TIME_STAMP"} if event else {}
@@ -40,12 +40,12 @@ def signal_map(settings: DeviceSettings) -> SignalMap:
 
 
 def make_parser(settings: DeviceSettings) -> DbcParser:
-    """Return the parser of everything."""
+    """Make the parser of all record types."""
     return DbcParser(settings, signal_map=signal_map(settings))
 
 
 def make_clock_parser(settings: DeviceSettings) -> DbcParser:
-    """Return the recorder's parser: the device's clock only."""
+    """Make the recorder's parser, which returns samples of the device's clock only."""
     return DbcParser(settings, clock_only=True, signal_map=signal_map(settings))
 
 

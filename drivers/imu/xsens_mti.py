@@ -1,16 +1,16 @@
 """Xsens (Movella) MTi-600 series on CAN.
 
-Layouts are those of "MTi 600-series MT CAN Protocol Documentation", MT1604P revision A (2019), as a public audit
-quotes them, and of XsCanDataIdentifier in the maker's SDK. No recording was at hand. Two things the makers' documents
+Layouts follow "MTi 600-series MT CAN Protocol Documentation", MT1604P revision A (2019), as a public audit quotes them,
+and XsCanDataIdentifier in the maker's SDK. No recording was available. Two facts that the maker's documents
 leave open are settings:
 
-- the unit of SampleTime: MT1604P and the SDK say microseconds, Movella's page on CAN messages 10 kHz: ``tick_hz`` has
+- the unit of SampleTime: MT1604P and the SDK give microseconds, Movella's page on CAN messages 10 kHz: ``tick_hz`` has
   no default;
-- the byte order, which MT1604P does not say: ``byte_order`` is big unless set, as three implementations have it and as
-  the maker's serial protocol is.
+- the byte order, which MT1604P does not give: ``byte_order`` is big unless set, as in three implementations and in the
+  maker's serial protocol.
 
-DeltaV, DeltaQ and the high-rate messages are not read: DeltaV's exponent and the identifiers of the high-rate ones are
-said by one document each, or contradicted, and DeltaQ resolves no more than 6e-5 rad a sample.
+DeltaV, DeltaQ and the high-rate messages are not read: DeltaV's exponent and the identifiers of the high-rate messages
+appear in one document each, or are contradicted, and DeltaQ resolves only 6e-5 rad a sample.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ class Message(NamedTuple):
     """One message: fields of equal width from its first byte on.
 
     Attributes:
-        name: as MT1604P has it, without its prefix.
-        identifier: default.
-        fields: names.
-        bits, signed: of each field.
-        scale: to the unit.
-        unit: as a DBC spells it.
+        name: name in MT1604P, without its prefix.
+        identifier: default CAN identifier.
+        fields: names of the fields.
+        bits, signed: width and sign of each field.
+        scale: factor to the unit.
+        unit: unit in a DBC's spelling.
     """
 
     name: str
@@ -67,7 +67,7 @@ SIGNALS = {
 
 
 def dbc_text(byte_order: str) -> str:
-    """Return the messages as a DBC, with the default identifiers."""
+    """Return a DBC of the messages, with the default identifiers."""
     order = BYTE_ORDERS[byte_order]
     lines = ['VERSION ""', "NS_ :", "BS_:", "BU_: MTi", ""]
     for message in MESSAGES:
@@ -82,10 +82,10 @@ def dbc_text(byte_order: str) -> str:
 
 
 def signal_map(settings: DeviceSettings) -> SignalMap:
-    """Return where the signals lie.
+    """Return the device's signal map.
 
     Raises:
-        DriverSettingsError: naming the key and what would be right.
+        DriverSettingsError: a setting is invalid; the text names the key and a valid value.
     """
     if settings.config.get("tick_hz") is None:
         raise DriverSettingsError(
@@ -98,7 +98,7 @@ def signal_map(settings: DeviceSettings) -> SignalMap:
 
 
 def make_parser(settings: DeviceSettings) -> DbcParser:
-    """Return the parser of everything."""
+    """Make the parser of all record types."""
     return DbcParser(settings, signal_map=signal_map(settings))
 
 

@@ -1,14 +1,14 @@
-"""Xsens (Movella) MTi over serial: Xbus messages of type MTData2, whatever their items, order and number formats.
+"""Xsens (Movella) MTi over serial: Xbus messages of type MTData2, with any items, order and number formats.
 
 Sources: the maker's MTi user manual MT0605P (4.9, 4.12, 5.3) and MTi family reference manual MT1600P (4.3); names,
 identifiers and number formats as in github.com/einride/xsens-go, whose decoding of two recordings the tests compare.
 
 - Acceleration and RateOfTurn are means over the interval between two samples (the device integrates and divides
-  again, MT0605P 4.9.3) in the axes of its housing. With ``sample = "increment"`` DeltaV and DeltaQ are taken instead,
+  again, MT0605P 4.9.3) in the axes of its housing. With ``sample = "increment"``, DeltaV and DeltaQ are used instead
   and divided by the interval 1/``rate_hz``.
 - SampleTimeFine counts 0.1 ms (MT0605P 4.12.3).
-- UtcTime names the UTC of the sample; the first sample of each second gives a time message.
-- Other items (orientation, position, high-rate data) are passed over by their length.
+- UtcTime gives the UTC of the sample; the first sample of each second makes a time message.
+- Other items (orientation, position, high-rate data) are skipped by their length.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from swath.georef.timescales.gps_time import SECOND_NS
 
 PREAMBLE = b"\xfa\xff"  # a device alone on its line is bus identifier FF
 ITEM_HEADER = struct.Struct(">HB")  # identifier, length (MT0605P 5.3)
-TYPE_BITS = 0xF8F0  # of an identifier: group and type
+TYPE_BITS = 0xF8F0  # bits of an identifier: group and type
 FORMAT_BITS = 0x0003  # number format; bits 2 and 3 are for orientations only (MT0101P, revision W)
 TICK_HZ = 10_000
 COUNTER_BITS = 16
@@ -67,7 +67,7 @@ INTEGERS = {
     STATUS_BYTE: struct.Struct(">B"),
     STATUS_WORD: struct.Struct(">I"),
 }
-NUMBERS = {TEMPERATURE: 1, DELTA_V: 3, ACCELERATION: 3, RATE_OF_TURN: 3, DELTA_Q: 4}  # how many numbers an item has
+NUMBERS = {TEMPERATURE: 1, DELTA_V: 3, ACCELERATION: 3, RATE_OF_TURN: 3, DELTA_Q: 4}  # number of values in an item
 FLOAT32, FP1220, FP1632, FLOAT64 = range(4)
 NUMBER_BYTES = (4, 4, 6, 8)
 
@@ -75,7 +75,7 @@ Values = tuple[float, ...]
 
 
 class Sample(NamedTuple):
-    """One message's worth: what goes into a row, and the raw ticks (−1: unsaid)."""
+    """Values of one message for a row, and its raw ticks (−1 where absent)."""
 
     host_time_ns: int
     ticks: int
@@ -89,7 +89,7 @@ class Sample(NamedTuple):
 
 
 def decode_numbers(data: bytes, number_format: int) -> Values:
-    """Return numbers of one format: float32, fixed point 12.20 and 16.32, float64, all high byte first.
+    """Decode numbers of one format: float32, fixed point 12.20 and 16.32, float64, all high byte first.
 
     16.32 comes as its 32 fraction bits, then its 16 whole bits.
     """
@@ -104,10 +104,10 @@ def decode_numbers(data: bytes, number_format: int) -> Values:
 
 
 def encode_numbers(values: Sequence[float], number_format: int) -> bytes:
-    """Return the inverse of `decode_numbers`, rounded to the format's resolution.
+    """Encode numbers as the inverse of `decode_numbers`, rounded to the format's resolution.
 
     Raises:
-        struct.error: a value that does not fit.
+        struct.error: a value does not fit.
     """
     if number_format == FLOAT32:
         return struct.pack(f">{len(values)}f", *values)
@@ -123,10 +123,10 @@ def encode_numbers(values: Sequence[float], number_format: int) -> bytes:
 
 
 def encode_message(identifier: int, data: bytes) -> bytes:
-    """Return one Xbus message, with an extended length where it needs one.
+    """Encode one Xbus message, with an extended length where it needs one.
 
     Raises:
-        ValueError: more data than a message can hold.
+        ValueError: the data exceed the length of a message.
     """
     if len(data) + 7 > XBUS.max_bytes:
         raise ValueError(f"an Xbus message cannot hold {len(data)} bytes")
@@ -136,7 +136,7 @@ def encode_message(identifier: int, data: bytes) -> bytes:
 
 
 def encode_item(kind: int, values: Sequence[float | int], number_format: int = FLOAT32) -> bytes:
-    """Return one item of MTData2: a counter or status by its one value, `UTC_TIME` by its eight fields, else
+    """Encode one item of MTData2: a counter or status by its one value, `UTC_TIME` by its eight fields, else
     numbers.
     """
     if kind in INTEGERS:
@@ -151,7 +151,7 @@ def encode_item(kind: int, values: Sequence[float | int], number_format: int = F
 
 
 def encode_mtdata2(*items: bytes) -> bytes:
-    """Return an MTData2 message of items."""
+    """Encode an MTData2 message of items."""
     return encode_message(XBUS_MTDATA2, b"".join(items))
 
 
@@ -159,7 +159,9 @@ def encode_mtdata2(*items: bytes) -> bytes:
 
 
 def split_items(data: bytes) -> dict[int, tuple[int, bytes]] | None:
-    """Return identifier without its format to format and contents; None where the items do not fill the message."""
+    """Return format and content of each item by identifier without format; None where the items do not fill the
+    message.
+    """
     items: dict[int, tuple[int, bytes]] = {}
     position = 0
     while position + ITEM_HEADER.size <= len(data):
@@ -171,7 +173,7 @@ def split_items(data: bytes) -> dict[int, tuple[int, bytes]] | None:
 
 
 def rotation_vector(quaternion: Values) -> Values:
-    """Return the rotation of a quaternion (scalar first) of any length as a vector, radians; the shorter way round."""
+    """Return the rotation of a quaternion (scalar first, any length) as a vector in radians, by the shorter way."""
     scalar, *vector = quaternion if quaternion[0] >= 0.0 else tuple(-part for part in quaternion)
     length = hypot(*vector)
     factor = 2.0 * atan2(length, scalar) / length if length else 0.0
@@ -179,7 +181,7 @@ def rotation_vector(quaternion: Values) -> Values:
 
 
 def read_items(data: bytes) -> dict[int, tuple[Any, ...]] | None:
-    """Return values of the items that are read here; None where a length is wrong."""
+    """Return values of the known items; None where a length is wrong."""
     found = split_items(data)
     if found is None:
         return None
@@ -199,13 +201,17 @@ def read_items(data: bytes) -> dict[int, tuple[Any, ...]] | None:
 
 
 class XbusParser(StreamParser):
-    """MTData2 to `ImuSamples` and, once a second, `TimeMessage`."""
+    """Converts MTData2 to `ImuSamples` and, once a second, to `TimeMessage`."""
 
     def __init__(self, settings: DeviceSettings, *, time_only: bool = False) -> None:
-        """Args: the device's table (``sample``, ``rate_hz``); ``time_only``: give time messages only.
+        """Prepare a parser for one device.
+
+        Args:
+            settings: of the device's table, ``sample`` and ``rate_hz`` are read.
+            time_only: return time messages only.
 
         Raises:
-            DriverSettingsError: increments without a rate to divide them by.
+            DriverSettingsError: increments are configured without a rate to divide them by.
         """
         super().__init__()
         self._framer = Framer((XBUS,), self.counters)
@@ -219,22 +225,22 @@ class XbusParser(StreamParser):
         self._last_second: tuple[Any, ...] | None = None
 
     def feed(self, chunk: Chunk) -> list[Record]:
-        """Take one read."""
+        """Take one read; return the records that it completed."""
         return self._decode_all(self._framer.feed(chunk.data, chunk.host_time_ns))
 
     def feed_batch(self, batch: ChunkBatch) -> list[Record]:
-        """Take consecutive reads; the samples of all of them are one array."""
+        """Take consecutive reads; return all their samples as one array."""
         frames: list[Frame] = []
         for host_time_ns, unit in zip(batch.host_time_ns.tolist(), batch.units, strict=True):
             frames += self._framer.feed(unit.tobytes(), host_time_ns)
         return self._decode_all(frames)
 
     def close(self) -> list[Record]:
-        """Release what was held back."""
+        """Return the records held back."""
         return self._decode_all(self._framer.close())
 
     def _decode_all(self, frames: list[Frame]) -> list[Record]:
-        """Return time messages in their order, then the samples of all frames."""
+        """Return time messages in order, then the samples of all frames."""
         records: list[Record] = []
         samples: list[Sample] = []
         packets: list[int] = []
@@ -259,7 +265,7 @@ class XbusParser(StreamParser):
         self.counters.errors[code] += 1
 
     def _time_message(self, host_time_ns: int, items: Mapping[int, Any]) -> list[TimeMessage]:
-        """Return the UTC of the first sample of each second; its edge is the one before its arrival."""
+        """Return a message with the UTC of the first sample of each second; its edge is the one before its arrival."""
         if UTC_TIME not in items:
             return []
         nanosecond, year, month, day, hour, minute, second, flags = items[UTC_TIME]
@@ -279,7 +285,9 @@ class XbusParser(StreamParser):
         return [TimeMessage(host_time_ns, tag, NamesEdge.PREVIOUS, valid=valid, message="UtcTime")]
 
     def _sample(self, host_time_ns: int, items: Mapping[int, Any]) -> list[Sample]:
-        """Return the sample of a message; nothing where it has none, counted where it has a part or the other kind."""
+        """Return the sample of a message; an empty list, counted, for a message with only a part of it or with the
+        other kind.
+        """
         kinds = (DELTA_V, DELTA_Q) if self._increments else (ACCELERATION, RATE_OF_TURN)
         force, rate = (items.get(kind) for kind in kinds)
         if force is None or rate is None:
@@ -302,7 +310,7 @@ class XbusParser(StreamParser):
         return [Sample(host_time_ns, ticks, force, rate, celsius, status)]
 
     def _rows(self, samples: list[Sample]) -> ImuSamples:
-        """Return samples as rows, their ticks unwrapped."""
+        """Convert samples to rows and unwrap their ticks."""
         rows = np.zeros(len(samples), IMU_DTYPE)
         host, ticks, force, rate, celsius, status = zip(*samples, strict=True)
         rows["host_time_ns"], rows["specific_force_b"], rows["angular_rate_b"] = host, force, rate
@@ -318,7 +326,7 @@ class XbusParser(StreamParser):
 
 
 def make_time_parser(settings: DeviceSettings) -> XbusParser:
-    """Return time messages only."""
+    """Make the recorder's parser, which returns time messages only."""
     return XbusParser(settings, time_only=True)
 
 

@@ -1,1 +1,1 @@
-"""Laser scanners: one file a protocol."""
+"""Drivers of laser scanners, one file or package for each protocol."""

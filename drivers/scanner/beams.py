@@ -1,7 +1,7 @@
-"""Where the beams of a spinning head leave and point: its table of beams, and the points that follow from it.
+"""The table of beams of a spinning head, with their origins and directions, and the points that follow from it.
 
-One table for all makers (frame s of CONVENTIONS: x right at azimuth 90°, y at azimuth 0, z the spin axis), from the
-manual's design values or from the file the maker delivers with the head.
+One table serves all makers (frame s of CONVENTIONS: x right at azimuth 90°, y at azimuth 0, z the spin axis). Its
+values are the manual's design values or come from the file that the maker delivers with the head.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ class BeamTable:
     """Beams by channel, each field (channels,).
 
     Attributes:
-        elevation_deg: above the plane perpendicular to the spin axis.
-        azimuth_deg: added to the head's azimuth.
-        range_m: added to what was measured.
-        right_m, forward_m, up_m: where the beam starts, in axes that turn with the beam's azimuth.
+        elevation_deg: angle above the plane perpendicular to the spin axis.
+        azimuth_deg: angle added to the head's azimuth.
+        range_m: distance added to the measured range.
+        right_m, forward_m, up_m: start of the beam, in axes that turn with the beam's azimuth.
     """
 
     elevation_deg: FloatArray
@@ -33,33 +33,34 @@ class BeamTable:
     up_m: FloatArray
 
     def __len__(self) -> int:
-        """Number of channels."""
+        """Return the number of channels."""
         return len(self.elevation_deg)
 
 
 def numbers(text: str) -> list[float]:
-    """Return a table written as words."""
+    """Parse a table of numbers separated by white space."""
     return [float(word) for word in text.split()]
 
 
 def beam_table(elevation_deg: object, **others: object) -> BeamTable:
-    """Return a table of what is given; zeros for the rest."""
+    """Make a table of the given fields, with zeros for the others."""
     elevation = np.array(elevation_deg, dtype=np.float64)
     given = {"elevation_deg": elevation, **{name: np.array(values, np.float64) for name, values in others.items()}}
     return BeamTable(**{field.name: given.get(field.name, np.zeros(len(elevation))) for field in fields(BeamTable)})
 
 
 def beam_points(rows: StructArray, beams: BeamTable) -> FloatArray:
-    """Return where returns lie, in the maker's frame.
+    """Return the points of returns in the maker's frame.
 
-    The formula is FORMULAS 2.2's for a spinning beam with a full table, written with the beam's start as a vector.
+    The formula is that of FORMULAS 2.2 for a spinning beam with a full table, written with the beam's start as a
+    vector.
 
     Args:
         rows: (n,) `RETURN_DTYPE`; ``encoder_rad`` is the azimuth at the channel's own firing.
-        beams: of the head.
+        beams: table of the head.
 
     Returns:
-        (n, 3) metres, s frame, no calibration but the table's.
+        (n, 3) metres, s frame, without any calibration but the table's.
     """
     channel = rows["channel"]
     azimuth = rows["encoder_rad"] + np.radians(beams.azimuth_deg)[channel]

@@ -1,6 +1,6 @@
-"""Follows a datagram counter: gaps, late and repeated datagrams, restarts; and thins clock samples out.
+"""Follows a datagram counter (gaps, late and repeated datagrams, restarts) and thins out clock samples.
 
-Both give the same answer however the datagrams are cut into batches.
+Both give the same result however the datagrams are cut into batches.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from swath.georef.arrays import BoolArray
 from swath.georef.records import Int64Array
 
 _U32 = 1 << 32
-LATE_DATAGRAMS = 64  # a datagram at most this far behind its place was delayed by the network; further: a restart
+LATE_DATAGRAMS = 64  # the network delays a datagram by at most so many places; a larger step back is a restart
 LATE_NS = 1_000_000_000
 
 
@@ -29,16 +29,16 @@ class _Last:
 
 
 class SequenceTracker:
-    """Unwraps a datagram counter and tells gaps from restarts.
+    """Unwraps a datagram counter and distinguishes gaps from restarts.
 
     Counted in ``errors``: ``sequence_gap`` (datagrams missing), ``out_of_order`` (datagrams that came late, each
     counted as missing before), ``duplicate``, ``restart`` (pps_count fell, or first_ticks went back: a new clock
-    segment, after which the numbering goes on without a gap).
+    segment, after which the numbering continues without a gap).
 
     Args:
         errors: the parser's ``counters.errors``.
-        modulus: where the counter wraps.
-        largest_gap: a longer step is a counter that was set anew, a restart; None: half the modulus, out of order.
+        modulus: number of values of the counter before it wraps.
+        largest_gap: a longer step counts as a restart; None: a step of half the modulus or more counts as out of order.
     """
 
     def __init__(self, errors: Counter[str], modulus: int = _U32, largest_gap: int | None = None) -> None:
@@ -46,10 +46,10 @@ class SequenceTracker:
         self._modulus = modulus
         self._largest_gap = largest_gap
         self._last: _Last | None = None
-        self._missing: set[int] = set()  # unwrapped numbers just behind the newest that have not come
+        self._missing: set[int] = set()  # unwrapped numbers just behind the newest that are missing
 
     def restart(self, sequence: int, first_time_ns: int) -> None:
-        """The device says itself that it began anew: the datagram of this counter will follow without a gap."""
+        """Note that the device reported a restart: the datagram with this counter will follow without a gap."""
         if self._last is not None:
             self._errors["restart"] += 1
             before = (sequence - 1) % self._modulus
@@ -64,7 +64,11 @@ class SequenceTracker:
     ) -> tuple[Int64Array, BoolArray]:
         """Take consecutive datagrams, all arrays (n,).
 
-        Args: their numbers, device time of their first pulse, number of their latest edge, and when they came.
+        Args:
+            sequence: the datagrams' numbers.
+            first_time_ns: device time of their first pulse.
+            pps_count: number of their latest edge.
+            host_time_ns: host time of their arrival.
 
         Returns:
             unwrapped: (n,) int64, the counter without wraps, never used twice.
@@ -86,7 +90,7 @@ class SequenceTracker:
     def _regular(
         self, sequence: NDArray[np.integer], first_time_ns: Int64Array, pps_count: NDArray[np.integer]
     ) -> bool:
-        """Return whether every datagram simply follows the one before."""
+        """Return whether every datagram directly follows the one before."""
         last = self._last
         if last is not None and (
             int(sequence[0]) != (last.sequence + 1) % self._modulus
@@ -101,7 +105,7 @@ class SequenceTracker:
         )
 
     def _step(self, sequence: int, first_time_ns: int, pps_count: int, host_time_ns: int) -> tuple[int, bool]:
-        """Return one datagram: its unwrapped number and whether it is a new one."""
+        """Take one datagram; return its unwrapped number and whether it is new."""
         last = self._last
         if last is None:
             return self._remember(sequence, sequence, first_time_ns, pps_count, host_time_ns), True
@@ -113,7 +117,7 @@ class SequenceTracker:
         if (
             0 < behind <= LATE_DATAGRAMS
             and 0 < last.first_time_ns - first_time_ns < LATE_NS
-            and host_time_ns - last.host_time_ns < LATE_NS  # else it was switched off and on soon after its first pulse
+            and host_time_ns - last.host_time_ns < LATE_NS  # else the head was restarted early
         ):
             return self._late(last.unwrapped - behind)
         set_anew = self._largest_gap is not None and ahead > self._largest_gap
@@ -132,7 +136,7 @@ class SequenceTracker:
         return self._remember(sequence, newest, first_time_ns, pps_count, host_time_ns), True
 
     def _late(self, at: int) -> tuple[int, bool]:
-        """Return a datagram behind the newest: late, or come before."""
+        """Classify a datagram behind the newest as late or as a duplicate; return its number and whether it is new."""
         if at not in self._missing:
             self._errors["duplicate"] += 1
             return at, False
@@ -146,7 +150,8 @@ class SequenceTracker:
 
 
 class SampleThinner:
-    """Chooses the first unit of each bin of host time: what a clock model needs of thousands of units a second.
+    """Chooses the first unit of each bin of host time, which is enough for a clock model of thousands of units a
+    second.
 
     Args:
         bin_ns: width of a bin.

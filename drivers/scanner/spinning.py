@@ -1,4 +1,4 @@
-"""What packets of spinning heads have in common, whoever made them: firings of one return mode, single or in pairs."""
+"""Common parts of packets of spinning heads of all makers: firings of one return mode, single or in pairs."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from swath.drivers.scanner.rows.slots import (
 from swath.georef.arrays import FloatArray
 from swath.georef.records import Int64Array, StructArray
 
-# A return as one 32-bit number: range, reflectivity, and 1 for a pair's second. ``strength`` is all but the range.
+# A return as one 32-bit number: range, reflectivity, and 1 for a pair's second. ``strength`` omits the range.
 _CONTENT = np.dtype(
     {
         "names": ["strength", "intensity", "range"],
@@ -41,14 +41,14 @@ class Firings:
         returns: (packets, blocks, places), fields ``range`` and ``reflectivity``; in dual return a firing's first and
             second return are in neighbouring blocks.
         range_unit_m: metres of one unit of range.
-        host_time_ns: (packets,).
+        host_time_ns: (packets,) host time of each packet.
         number: (packets,) running number of each packet.
-        most: firings a packet holds at most: packets' pulse ids are so far apart.
-        device_time_ns: of each firing, made of arrays (packets · rounds, 1), (1, lasers) or of both, as
-            `ReturnSlots.per_pulse` is.
-        azimuth_rad: of each firing, likewise.
-        channel: (lasers,) of a round.
-        flags: of all returns.
+        most: maximum number of firings in a packet, the step between the pulse ids of packets.
+        device_time_ns: makes the time of each firing from arrays (packets · rounds, 1), (1, lasers) or both, as
+            `ReturnSlots.per_pulse` does.
+        azimuth_rad: makes the azimuth of each firing in the same way.
+        channel: (lasers,) channels of a round.
+        flags: flags of all returns.
         pair: in dual return, whether one of the two is the strongest and whether one is the last return; else None.
     """
 
@@ -64,7 +64,7 @@ class Firings:
     pair: tuple[bool, bool] | None
 
     def slots(self) -> ReturnSlots:
-        """Return their places for returns."""
+        """Return the slots of these firings."""
         content = single_content(self.returns) if self.pair is None else pair_content(self.returns)
         packets, lasers = len(self.number), len(self.channel)
         rounds = len(content) // (packets * lasers)
@@ -87,11 +87,11 @@ class Firings:
 def returns_of_packets(
     mode: NDArray[np.uint8], most: int, firings_of: Callable[[slice], Firings], fill: Fill
 ) -> StructArray:
-    """Return returns of all packets in order, worked on in blocks of one return mode.
+    """Decode the returns of all packets in order, in blocks of one return mode.
 
     Args:
         mode: (n,) return mode of each packet.
-        most: returns a packet holds at most.
+        most: maximum number of returns in a packet.
         firings_of: makes the firings of a slice of the packets.
         fill: writes their rows.
     """
@@ -106,16 +106,16 @@ def returns_of_packets(
 
 
 def single_content(returns: StructArray) -> StructArray:
-    """Single returns (packets, blocks, lasers) as slots (firings, 1)."""
+    """Convert single returns (packets, blocks, lasers) to slots (firings, 1)."""
     return _as_numbers(returns).view(_CONTENT).reshape(-1, 1)
 
 
 def pair_content(returns: StructArray) -> StructArray:
-    """Return dual returns (packets, blocks, lasers), a pair in neighbouring blocks, as slots (firings, 2) of rising
+    """Convert dual returns (packets, blocks, lasers), a pair in neighbouring blocks, to slots (firings, 2) by rising
     range.
 
-    Equal ranges are one return, the first block's. The one of greater reflectivity is the stronger, the second block's
-    where they are equal, since a head puts the second strongest beside a strongest that is also the other.
+    Equal ranges are one return, the first block's. The return of greater reflectivity is the stronger, the second
+    block's where they are equal, since a head sends the second strongest beside a strongest that is also the other.
     """
     one, other = _as_numbers(returns[:, 0::2]), _as_numbers(returns[:, 1::2], second=1)
     other *= one ^ other > 0xFFFF
@@ -123,9 +123,7 @@ def pair_content(returns: StructArray) -> StructArray:
 
 
 def _as_numbers(returns: StructArray, second: int = 0) -> NDArray[np.uint32]:
-    """Return returns as `_CONTENT` in one number each, flat; to put them together takes half as long as to write
-    fields.
-    """
+    """Pack each return as `_CONTENT` into one number, flat; sorting numbers takes half as long as writing fields."""
     number = returns["range"].astype(np.uint32).reshape(-1)
     strength = returns["reflectivity"].astype(np.uint16).reshape(-1)
     number <<= 16

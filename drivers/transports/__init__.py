@@ -1,1 +1,1 @@
-"""Serial, CAN, UDP, PPS and capture files: bytes with host time, no meaning."""
+"""Serial, CAN, UDP, NTRIP and PPS inputs: bytes or edges with their times, no meaning."""

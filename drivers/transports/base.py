@@ -1,8 +1,8 @@
 """The contract of every transport: bytes with the kernel's time, no meaning.
 
-A transport is opened, read by one thread and closed. Its reads block for at most the time given, so that the thread
-that reads can always say that it is alive. A device that is absent or has gone raises `TransportError` with one
-line; the session that owns the transport closes it, waits and opens it again.
+A transport is opened, read by one thread and closed. Its reads block for at most the given time, so that the reading
+thread can always report that it is alive. A device that is absent or has gone raises `TransportError` with one line;
+the session that owns the transport closes it, waits and opens it again.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from dataclasses import dataclass
 
 from swath.georef.records import ByteRows, Int64Array
 
-HEAD_ROOM_BYTES = 31  # of a message's header in the log: opcode, length, channel, sequence, two times (MCAP)
+HEAD_ROOM_BYTES = 31  # size of a message's header in the log: opcode, length, channel, sequence, two times (MCAP)
 
 
 class TransportError(OSError):
-    """The device cannot be opened or has gone; the text is one line: what, where, what would be right."""
+    """The device cannot be opened or has gone; the text is one line with the cause, the place and the remedy."""
 
 
 def is_no_serial_port(error: BaseException) -> bool:
-    """Return whether a port could not be set because it is none: ENOTTY in or below what pyserial raises."""
+    """Return whether a port could not be set because it is not a serial port: ENOTTY in or below pyserial's error."""
     below: BaseException | None = error
     while below is not None:
         if isinstance(below, OSError | termios.error) and below.args[:1] == (errno.ENOTTY,):
@@ -33,15 +33,15 @@ def is_no_serial_port(error: BaseException) -> bool:
 
 @dataclass(slots=True)
 class UnitBlock:
-    """Consecutive units of equal length from one sender, as the kernel handed them over.
+    """Consecutive units of equal length from one sender, as the kernel delivered them.
 
     Attributes:
         units: (n, length) uint8, one row a unit; owned by the receiver of the block until its next read.
-        kernel_realtime_ns: (n,) CLOCK_REALTIME receive stamps; None where the kernel gives none (serial), and 0 in
-            the rows that came without one.
+        kernel_realtime_ns: (n,) CLOCK_REALTIME receive stamps; None where the kernel gives none (serial), and 0 in rows
+            without a stamp.
         peer: (address, port) of a UDP sender; None elsewhere.
-        rows: (n, `HEAD_ROOM_BYTES` + length) the memory that ``units`` lie in, without gaps, the receiver's for good:
-            the room before each unit may be written to. None where there is no such room.
+        rows: (n, `HEAD_ROOM_BYTES` + length) the memory that holds ``units``, without gaps; the receiver owns it for
+            good and may write to the room before each unit. None where there is no such room.
     """
 
     units: ByteRows
@@ -52,15 +52,15 @@ class UnitBlock:
 
 @dataclass(slots=True)
 class TransportCounters:
-    """What the kernel says of itself, cumulative since `Transport.open`.
+    """Counts that the kernel and the transport keep, cumulative since `Transport.open`.
 
     Attributes:
         lost_kernel: units the kernel dropped at the socket or descriptor.
-        receive_buffer_bytes: what was granted, read back; 0 where there is no such thing.
-        error_frames, bus_off: CAN controller trouble.
-        receive_buffer_asked_bytes: what was asked for; more than was granted means that the system's limit is lower.
-        refused: what arrived and is no unit: datagrams of other senders, lines or messages nobody can read.
-        line_errors: framing, parity and overrun errors of a serial line; bytes are missing or wrong, not units.
+        receive_buffer_bytes: size that the kernel granted, read back; 0 where the transport has no such buffer.
+        error_frames, bus_off: error frames of the CAN controller, and those that report bus-off.
+        receive_buffer_asked_bytes: requested size; if it exceeds the granted one, the system's limit is lower.
+        refused: arrivals that are not units: datagrams of other senders, unreadable lines or messages.
+        line_errors: framing, parity and overrun errors of a serial line; bytes, not units, are missing or wrong.
     """
 
     lost_kernel: int = 0
@@ -73,7 +73,7 @@ class TransportCounters:
 
 
 class Transport(ABC):
-    """One port, socket or bus."""
+    """The interface of one port, socket or bus."""
 
     def __init__(self) -> None:
         self.counters = TransportCounters()
@@ -83,12 +83,12 @@ class Transport(ABC):
         """Open the device.
 
         Raises:
-            TransportError: it is absent, busy, or not permitted.
+            TransportError: the device is absent, busy, or not permitted.
         """
 
     @abstractmethod
     def receive(self, timeout_s: float) -> list[UnitBlock]:
-        """Wait at most ``timeout_s`` and hand over what there is, in order; an empty list on silence.
+        """Wait at most ``timeout_s`` and return the units that came, in order; an empty list on silence.
 
         Raises:
             TransportError: the device has gone.
@@ -104,16 +104,16 @@ class Transport(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Close; a second call does nothing."""
+        """Close the device; a second call does nothing."""
 
     def poll_counters(self) -> TransportCounters:
-        """Return counters brought up to date with the kernel's."""
+        """Update the counters from the kernel's and return them."""
         return self.counters
 
 
 @dataclass(frozen=True, slots=True)
 class RawEdge:
-    """One PPS edge as the kernel or the line gave it, CLOCK_REALTIME."""
+    """One PPS edge with the time that the kernel or the line reader gave it, CLOCK_REALTIME."""
 
     realtime_ns: int
     sequence: int
@@ -122,7 +122,7 @@ class RawEdge:
 
 
 class PpsSource(ABC):
-    """A source of edges; the same life as a `Transport`."""
+    """A source of edges, with the same life cycle as a `Transport`."""
 
     @abstractmethod
     def open(self) -> None:
@@ -130,12 +130,12 @@ class PpsSource(ABC):
 
     @abstractmethod
     def receive(self, timeout_s: float) -> list[RawEdge]:
-        """Wait at most ``timeout_s`` for edges not yet handed over; an empty list on silence."""
+        """Wait at most ``timeout_s`` for new edges; return an empty list on silence."""
 
     def poll_counters(self) -> TransportCounters:
-        """Return what came and is no edge; nothing, of a source that gives edges only."""
+        """Return counts of arrivals that are not edges; all 0 for a source that delivers edges only."""
         return TransportCounters()
 
     @abstractmethod
     def close(self) -> None:
-        """Close; a second call does nothing."""
+        """Close the source; a second call does nothing."""

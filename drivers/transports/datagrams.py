@@ -1,7 +1,7 @@
-"""Many datagrams in one system call: recvmmsg(2) into slots laid out before, stamps and senders read as arrays.
+"""Receives many datagrams in one system call: recvmmsg(2) into prepared slots, stamps and senders read as arrays.
 
-Used for UDP and for SocketCAN, whose sockets differ only in the length of a unit and in having a sender. The layouts
-are those of <sys/socket.h>: `struct mmsghdr`, `struct iovec` and the one control message that is asked for,
+UDP and SocketCAN use it; their sockets differ only in the length of a unit and in having a sender. The layouts
+are those of <sys/socket.h>: `struct mmsghdr`, `struct iovec` and the one control message requested,
 SCM_TIMESTAMPNS (socket(7)).
 """
 
@@ -29,10 +29,10 @@ SO_RCVBUFFORCE = 33
 SO_MEMINFO = 55  # nine u32, <linux/sock_diag.h>
 SK_MEMINFO_DROPS = 8
 PEER_BYTES = 16  # struct sockaddr_in
-MEMORY_BYTES = 2 << 20  # taken at once; it is given back when the last block in it is written
-LEAST_OFFERED = 32  # slots; with fewer left a read begins new memory
-FIRST_EXPECTED_BYTES = 1248  # a guess: if it is wrong, the first read is copied
-STAMPING_WITHIN_S = 1.0  # a work queue's turn on a busy machine; half a millisecond on an idle one
+MEMORY_BYTES = 2 << 20  # allocated at once; freed when the last block in it is written
+LEAST_OFFERED = 32  # slots; with fewer left a read allocates new memory
+FIRST_EXPECTED_BYTES = 1248  # a guess; if it is wrong, the units of the first read are copied
+STAMPING_WITHIN_S = 1.0  # delay of a work queue on a busy machine; half a millisecond on an idle one
 STAMPING_LOOK_S = 0.0005
 
 _WORD = ctypes.sizeof(ctypes.c_void_p)
@@ -60,10 +60,10 @@ _recvmmsg.restype = ctypes.c_int
 class MessageReader:
     """Receives up to ``slots`` datagrams of at most ``unit_bytes`` each at once; one reader serves one thread.
 
-    Units are received where they will stand in the log: one after the other, with room for a message's header before
-    each, in memory that goes along with the blocks. That takes their length to be known, so the length of the last one
-    is expected of the next; what is longer runs over into slots of the reader's own, and units of another length than
-    the expected are copied.
+    Units are received at their final place in the log: one after the other, with room for a message's header before
+    each, in memory that is passed on with the blocks. This needs their length in advance, so the reader expects the
+    length of the last unit for the next. A longer unit overflows into the reader's own slots, and units of any other
+    length are copied.
     """
 
     def __init__(self, unit_bytes: int, slots: int, *, peers: bool) -> None:
@@ -72,7 +72,7 @@ class MessageReader:
         self._unit_bytes = unit_bytes
         self._overflow: ByteRows = np.frombuffer(mmap.mmap(-1, slots * unit_bytes), np.uint8).reshape(slots, unit_bytes)
         self._memory = np.empty(0, np.uint8)
-        self._taken = 0  # bytes of it that blocks have
+        self._taken = 0  # bytes of it that blocks use
         self._expected = min(unit_bytes, FIRST_EXPECTED_BYTES)
         self._peers = np.zeros((slots, PEER_BYTES), np.uint8)
         self._peer_keys: NDArray[np.uint64] = self._peers.view(np.uint64)[:, 0]  # family, port, address
@@ -97,10 +97,10 @@ class MessageReader:
         self._headers_at = self._headers.ctypes.data
 
     def read(self, fd: int) -> int:
-        """Fill slots with what ``fd`` holds, without waiting; the number filled, of ``offered``.
+        """Fill slots with the datagrams of ``fd``, without waiting; return the number filled, of ``offered``.
 
         Raises:
-            OSError: of the call, other than that there is nothing or that a signal came.
+            OSError: the call failed, other than for lack of data or by a signal.
         """
         self._offer()
         count: int = _recvmmsg(fd, self._headers_at, self.offered, socket.MSG_DONTWAIT, None)
@@ -112,7 +112,7 @@ class MessageReader:
         raise OSError(number, os.strerror(number))
 
     def _offer(self) -> None:
-        """Lay the slots of the next read behind what blocks have, or into new memory where too little is left."""
+        """Place the slots of the next read after the memory of blocks, or in new memory where too little is left."""
         stride = HEAD_ROOM_BYTES + self._expected
         least = min(self.slots, LEAST_OFFERED) * stride
         if len(self._memory) - self._taken < least:
@@ -123,7 +123,7 @@ class MessageReader:
         self._iovecs["len"][: self.offered] = self._expected, self._unit_bytes - self._expected
 
     def rows(self, count: int) -> ByteRows:
-        """Return (count, room + expected length) the first slots of the last read as they lie in memory."""
+        """Return the first slots of the last read, (count, room + expected length), as they lie in memory."""
         stride = HEAD_ROOM_BYTES + self._expected
         return self._memory[self._taken : self._taken + count * stride].reshape(count, stride)
 
@@ -154,8 +154,8 @@ class MessageReader:
         return UnitBlock(np.concatenate([units, beyond], axis=1), stamps[first:last], peer)
 
     def _take_stamps(self, count: int) -> Int64Array:
-        """Return (count,) nanoseconds of CLOCK_REALTIME, 0 where the kernel gave none; readies the headers for the
-        next.
+        """Return (count,) nanoseconds of CLOCK_REALTIME, 0 where the kernel gave none, and reset the headers for the
+        next read.
         """
         rows = self._stamps[:count]
         nanoseconds: Int64Array = rows["sec"].astype(np.int64) * 1_000_000_000 + rows["nsec"]
@@ -181,7 +181,7 @@ class MessageReader:
 
 
 class DropCounter:
-    """Datagrams the kernel dropped at one socket, from SO_MEMINFO, unwrapped over its 32 bits."""
+    """Counts the datagrams that the kernel dropped at one socket, from SO_MEMINFO, unwrapped over its 32 bits."""
 
     def __init__(self, sock: socket.socket) -> None:
         self._sock = sock
@@ -189,7 +189,7 @@ class DropCounter:
         self.total = 0
 
     def update(self) -> int:
-        """Return the exact total since the socket was made."""
+        """Read the kernel's count and return the exact total since the socket was made."""
         count = self._kernel_count()
         self.total += (count - self._last) & 0xFFFFFFFF
         self._last = count
@@ -201,10 +201,10 @@ class DropCounter:
 
 
 def ask_receive_buffer(sock: socket.socket, wanted_bytes: int) -> int:
-    """Ask for a receive buffer and read back what was granted, bytes.
+    """Request a receive buffer and return the granted size in bytes.
 
-    The kernel keeps, and getsockopt returns, twice the value asked for (its own bookkeeping, socket(7)); half of it
-    is returned here, so that it compares with what was asked and with net.core.rmem_max.
+    The kernel reserves, and getsockopt returns, twice the requested value (for its own bookkeeping, socket(7)); half of
+    it is returned here, so that it compares with the request and with net.core.rmem_max.
     """
     try:
         sock.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, wanted_bytes)
@@ -214,19 +214,21 @@ def ask_receive_buffer(sock: socket.socket, wanted_bytes: int) -> int:
 
 
 def ask_stamps(sock: socket.socket) -> None:
-    """Have the kernel stamp every datagram with CLOCK_REALTIME on arrival; before the socket hears its first."""
+    """Make the kernel stamp every datagram with CLOCK_REALTIME on arrival; call it before the socket receives its
+    first.
+    """
     with stamping():
         sock.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
 
 
 @contextlib.contextmanager
 def stamping() -> Iterator[None]:
-    """The kernel stamps what arrives, whatever its protocol, until a socket that asks for stamps has been opened.
+    """Keep the kernel's stamping of arrivals on while the caller opens a socket that requests stamps, for any protocol.
 
-    It does so only while some socket of the machine wants it, and begins a while after the first one asks
-    (net_enable_timestamp of net/core/dev.c leaves it to a work queue). What arrived before that is stamped when it is
-    read, late by what a reader waits for company, and nothing in the stamp tells. Where no datagram comes back from
-    this machine's own address it is not waited for.
+    The kernel stamps arrivals only while some socket of the machine requests stamps, and starts a while after the first
+    request (net_enable_timestamp of net/core/dev.c leaves it to a work queue). A datagram that arrived earlier is
+    stamped when it is read, late by the reader's batch wait, and its stamp does not show that. Where no datagram
+    returns from this machine's own address, the function does not wait.
     """
     with contextlib.ExitStack() as held:
         with contextlib.suppress(OSError):
@@ -241,7 +243,7 @@ def stamping() -> Iterator[None]:
 
 
 def _stamps_on_arrival(probe: socket.socket) -> bool:
-    """Return whether a datagram to itself has a stamp of before it was read."""
+    """Return whether a datagram that the probe sends to itself has a stamp from before the read."""
     probe.sendto(b"", probe.getsockname())
     time.sleep(STAMPING_LOOK_S)
     before_reading_ns = time.time_ns()

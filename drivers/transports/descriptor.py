@@ -1,4 +1,4 @@
-"""What transports on a file descriptor share: waiting for it, and a close that another thread may call at any time."""
+"""Common parts of transports on a file descriptor: waiting for it, and closing it from another thread at any time."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ HUNG_UP = select.POLLHUP | select.POLLERR | select.POLLNVAL
 
 
 class Gate:
-    """Waits until a descriptor is ready, its time is over, or `wake` is called from any thread."""
+    """Waits until a descriptor is ready, the time is over, or any thread calls `wake`."""
 
     def __init__(self, fd: int, events: int = select.POLLIN) -> None:
         self._wake_fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
@@ -31,23 +31,23 @@ class Gate:
         self._wake_poll.register(self._wake_fd, select.POLLIN)
 
     def wait(self, timeout_s: float) -> int:
-        """Return poll events of the descriptor; 0 when the time is over or the gate was woken."""
+        """Wait and return the descriptor's poll events; 0 when the time is over or the gate was woken."""
         ready = dict(self._poll.poll(max(0.0, timeout_s) * 1000.0))
         return 0 if self._wake_fd in ready else ready.get(self._fd, 0)
 
     def pause(self, time_s: float) -> None:
-        """Let time pass, whatever the descriptor has, until the gate is woken."""
+        """Wait for a time, ignoring the descriptor, until the gate is woken."""
         self._wake_poll.poll(max(0.0, time_s) * 1000.0)
 
     def wake(self) -> None:
-        """Let every present and coming `wait` return at once."""
+        """Make every present and future `wait` return at once."""
         self.woken = True
         with self._lock:
             if self._open:
                 os.eventfd_write(self._wake_fd, 1)
 
     def close(self) -> None:
-        """Release the gate's own descriptor, not the one waited for."""
+        """Close the gate's own descriptor, not the one that it waits for."""
         with self._lock:
             if self._open:
                 self._open = False
@@ -55,10 +55,10 @@ class Gate:
 
 
 class DescriptorTransport(Transport):
-    """A transport that waits on a descriptor; `close` may come from another thread than `receive`.
+    """A transport that waits on a descriptor; `close` may be called from another thread than `receive`.
 
     A subclass opens its device in `_open_device`, which returns the descriptor to wait on (-1: none), reads in
-    `_receive` and sends in `_send`. None of them is called on a closed transport.
+    `_receive` and sends in `_send`. `_receive` and `_send` are called on an open transport only.
     """
 
     def __init__(self, name: str) -> None:
@@ -83,10 +83,10 @@ class DescriptorTransport(Transport):
     def _send(self, data: bytes) -> None: ...
 
     def _refresh_counters(self) -> None:
-        """Bring `counters` up to date with the kernel's; the device is open."""
+        """Update `counters` from the kernel's; the device is open."""
 
     def open(self) -> None:
-        """Open the device; the counters start anew."""
+        """Open the device and reset the counters."""
         with self._reading, self._sending, self._counting:
             if self._gate is not None:
                 raise TransportError(f"{self.name}: is open already")
@@ -95,7 +95,7 @@ class DescriptorTransport(Transport):
             self._gate = Gate(self._open_device())
 
     def receive(self, timeout_s: float) -> list[UnitBlock]:
-        """See `Transport.receive`; returns at once, with nothing, when another thread closes."""
+        """Receive units as `Transport.receive` does; return an empty list at once when another thread closes."""
         with self._reading:
             held, self._held = self._held, None
             if held is not None:
@@ -103,13 +103,13 @@ class DescriptorTransport(Transport):
             return self._receive(self._opened(), timeout_s)
 
     def _fail_after(self, units: Sized, error: TransportError) -> None:
-        """Raise an error met while reading; after units that were read before it, with the next `receive` only."""
+        """Raise a read error at once, or with the next `receive` if units were read before it."""
         if not units:
             raise error
         self._held = error
 
     def send(self, data: bytes) -> None:
-        """See `Transport.send`."""
+        """Send one unit as `Transport.send` does."""
         with self._sending:
             self._opened()
             self._send(data)
@@ -129,7 +129,7 @@ class DescriptorTransport(Transport):
             self._close_device()
 
     def poll_counters(self) -> TransportCounters:
-        """Return counters brought up to date with the kernel's; the last values once closed."""
+        """Update the counters from the kernel's and return them; once closed, return the last values."""
         with self._counting:
             if self._gate is not None:
                 self._refresh_counters()
@@ -142,7 +142,7 @@ class DescriptorTransport(Transport):
 
 
 def wait_writable(fd: int, deadline_s: float) -> bool:
-    """Return whether ``fd`` takes data before ``deadline_s`` of `time.monotonic`."""
+    """Wait and return whether ``fd`` takes data before ``deadline_s`` of `time.monotonic`."""
     poll = select.poll()
     poll.register(fd, select.POLLOUT)
     ready = poll.poll(max(0.0, deadline_s - time.monotonic()) * 1000.0)

@@ -1,17 +1,17 @@
-"""Who holds a port or device: the name that makes "in use" a message one can act on."""
+"""Finds the process that holds a port or device, so that an "in use" message can name it."""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
 
-_UDP_TABLE = Path("/proc/self/net/udp")  # /proc/net is hidden where a service's /proc holds processes only
+_UDP_TABLE = Path("/proc/self/net/udp")  # /proc/net is hidden where a service's /proc shows processes only
 
 
 def process_holding(target: str) -> str:
-    """Name and id of a process with a descriptor whose link in /proc reads ``target``.
+    """Return name and id of a process with a descriptor whose link in /proc reads ``target``.
 
-    Processes of other users cannot be looked into; then, and where nobody is found, "another program".
+    Processes of other users cannot be examined; then, and where no process is found, the result is "another program".
     """
     for folder in Path("/proc").glob("[0-9]*/fd"):
         if _has_link(folder, target):
@@ -21,7 +21,7 @@ def process_holding(target: str) -> str:
 
 
 def udp_port_holder(port: int) -> str:
-    """Name and id of a process that has a UDP socket on local ``port``; "another program" where that cannot be seen."""
+    """Return name and id of a process with a UDP socket on local ``port``; "another program" where none is found."""
     try:
         table = _UDP_TABLE.read_text(encoding="ascii")
     except OSError:
@@ -36,14 +36,14 @@ def udp_port_holder(port: int) -> str:
 def _has_link(folder: Path, target: str) -> bool:
     try:
         return any(_link(entry) == target for entry in folder.iterdir())
-    except OSError:  # not ours to look into, or gone meanwhile
+    except OSError:  # another user's process, or one that has ended meanwhile
         return False
 
 
 def _link(entry: Path) -> str:
     try:
         return os.readlink(entry)
-    except FileNotFoundError:  # closed meanwhile, such as the descriptor the listing itself was read by
+    except FileNotFoundError:  # closed meanwhile, such as the descriptor that read the listing
         return ""
 
 

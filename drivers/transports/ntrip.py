@@ -1,7 +1,7 @@
 """NTRIP client, versions 1 and 2 (RTCM 10410.1): a caster's stream of corrections; a unit is the bytes of one read.
 
-Of a version 2 caster that sends in chunks (RFC 9112, 7.1) the chunks' contents are the units. The kernel gives no
-stamps here.
+If a version 2 caster sends in chunks (RFC 9112, 7.1), the chunks' contents are the units. The kernel gives no stamps
+here.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from swath.drivers.transports.base import TransportError, UnitBlock
 from swath.drivers.transports.descriptor import DescriptorTransport, Gate, wait_writable
 from swath.drivers.transports.spec import TransportSpec, ntrip_position
 
-CONNECT_S = 8.0  # for each address of the caster, and again for its answer
+CONNECT_S = 8.0  # limit for each address of the caster, and again for its answer
 SLICE_S = 0.1
-OPEN_S = 18.0  # for all of it: name, connection, answer; the watchdog takes 20 s of opening for stuck
-SILENT_S = 60.0  # then the connection is taken for dead
+OPEN_S = 18.0  # limit for name, connection and answer; after 20 s the watchdog considers the opening stuck
+SILENT_S = 60.0  # silence after which the connection counts as dead
 READ_BYTES = 65536
 MOST_HEADER_BYTES = 16384
 MOST_TABLE_BYTES = 1 << 18
-MOST_NAMED = 8  # mountpoints, of a table that has not the one asked for
+MOST_NAMED = 8  # mountpoints listed when the caster lacks the requested one
 GGA_S = 10.0
 SEND_TIMEOUT_S = 2.0
 _STATUS = re.compile(r"[0-9]{3}")  # RFC 9112, 4
-_CHUNK_LENGTH = re.compile(rb"[0-9A-Fa-f]{1,16}")  # RFC 9112, 7.1; more than 64 bits nobody sends
+_CHUNK_LENGTH = re.compile(rb"[0-9A-Fa-f]{1,16}")  # RFC 9112, 7.1; no caster sends more than 64 bits
 _KEEPALIVE = ((socket.TCP_KEEPIDLE, 10), (socket.TCP_KEEPINTVL, 5), (socket.TCP_KEEPCNT, 3))
 _REFUSALS = {
     401: "the caster refuses user or password",
@@ -46,12 +46,12 @@ _REFUSALS = {
 
 
 class NtripTransport(DescriptorTransport):
-    """One mountpoint of one caster.
+    """Receives one mountpoint of one caster.
 
     Args:
         spec: ``ntrip:<host>:<port>/<mountpoint>``; options user, password_env (the variable that holds the password),
             version, position (latitude, longitude, height, sent as GGA for casters that make a station near it).
-        stopped: whether nobody waits any more for the connection.
+        stopped: returns whether the opening should end early.
     """
 
     def __init__(self, spec: TransportSpec, stopped: Callable[[], bool] = lambda: False) -> None:
@@ -78,11 +78,11 @@ class NtripTransport(DescriptorTransport):
         return self._sock.fileno()
 
     def _connect(self) -> socket.socket:
-        """Return a connection on which data comes."""
+        """Connect, and return the connection once the caster begins to send data."""
         request = self._request()
         try:
             sock = socket.create_connection((self._spec.ntrip_host, self._spec.ntrip_port), CONNECT_S)
-        except (OSError, UnicodeError) as error:  # the latter of a name that cannot be encoded for the resolver
+        except (OSError, UnicodeError) as error:  # UnicodeError: the name cannot be encoded for the resolver
             raise TransportError(self._why(error)) from error
         try:
             self._converse(sock, request)
@@ -92,7 +92,7 @@ class NtripTransport(DescriptorTransport):
         return sock
 
     def _converse(self, sock: socket.socket, request: bytes) -> None:
-        """Ask, read the answer's head, and keep what of the data came with it."""
+        """Send the request, read the answer's head, and keep the data that came with it."""
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         for option, value in _KEEPALIVE:
             sock.setsockopt(socket.IPPROTO_TCP, option, value)
@@ -131,7 +131,9 @@ class NtripTransport(DescriptorTransport):
         return "\r\n".join([*lines, "", ""]).encode()
 
     def _head(self, sock: socket.socket, deadline_s: float) -> tuple[bytes, bytes]:
-        """Return the answer up to its empty line; of ICY 200 OK, which some casters send alone, its first line."""
+        """Return the answer up to its empty line, and the data after it; for a bare ICY 200 OK of some casters, its
+        first line.
+        """
         data = b""
         while len(data) < MOST_HEADER_BYTES:
             line, found, rest = data.partition(b"\r\n")
@@ -150,7 +152,7 @@ class NtripTransport(DescriptorTransport):
         raise TransportError(f"{self.name}: answers without an end; is it an NTRIP caster?")
 
     def _not_in_table(self, sock: socket.socket) -> str:
-        """Return what a source table that came in place of data says."""
+        """Read the source table that the caster sent in place of data, and explain it to the user."""
         table, deadline_s = self._first, time.monotonic() + CONNECT_S
         try:
             while b"ENDSOURCETABLE" not in table and len(table) < MOST_TABLE_BYTES and time.monotonic() < deadline_s:
@@ -159,7 +161,7 @@ class NtripTransport(DescriptorTransport):
                     break
                 table += data
         except OSError:
-            pass  # what came is told
+            pass  # the received part is enough
         rows = (row.split(";") for row in table.decode("latin-1").splitlines())
         names = [_printable(row[1]) for row in rows if row[0] == "STR" and len(row) > 1]
         shown = ", ".join(names[:MOST_NAMED]) or "none"
@@ -239,7 +241,7 @@ class NtripTransport(DescriptorTransport):
 
 
 class _Attempt(threading.Thread):
-    """Connects, however long a resolver takes; who waits for it may leave before."""
+    """Connects in its own thread, however long the resolver takes; the waiting caller may leave earlier."""
 
     def __init__(self, connect: Callable[[], socket.socket]) -> None:
         super().__init__(name="ntrip connect", daemon=True)
@@ -263,26 +265,28 @@ class _Attempt(threading.Thread):
                 self._sock = sock
 
     def wait(self, seconds: float) -> bool:
-        """Return whether it has an end."""
+        """Wait and return whether the attempt has ended."""
         self.join(seconds)
         return not self.is_alive()
 
     def leave(self) -> None:
-        """Nobody wants the connection any more."""
+        """Give the attempt up and close its connection, now or later."""
         with self._lock:
             self._left = True
             if self._sock is not None:
                 self._sock.close()
 
     def result(self) -> socket.socket:
-        """Return the connection; raises TransportError."""
+        """Return the connection, or raise the `TransportError` of the attempt."""
         if self._sock is None:
             raise self._error
         return self._sock
 
 
 def gga_sentence(lat_deg: float, lon_deg: float, height_m: float, now: datetime) -> bytes:
-    """Return a GGA of a position, as casters want it (NMEA 0183): fix 1, ten satellites, no geoid separation."""
+    """Return a GGA sentence of a position, as casters expect it (NMEA 0183): fix 1, ten satellites, no geoid
+    separation.
+    """
     parts = []
     for value, digits, letters in ((lat_deg, 2, "NS"), (lon_deg, 3, "EW")):
         minutes = round(abs(value) * 60.0, 4)
@@ -293,14 +297,14 @@ def gga_sentence(lat_deg: float, lon_deg: float, height_m: float, now: datetime)
 
 
 class _Chunks:
-    """Takes the chunked transfer coding away."""
+    """Decodes the chunked transfer coding."""
 
     def __init__(self) -> None:
         self._held = b""
         self._left = 0  # bytes of the chunk still to come, its line end included
 
     def feed(self, data: bytes) -> bytes:
-        """Return the contents; ValueError where it is none."""
+        """Return the contents; raises ValueError where the coding is invalid."""
         held, out = self._held + data, []
         while held:
             if self._left > 2:
@@ -323,5 +327,5 @@ class _Chunks:
 
 
 def _printable(text: str) -> str:
-    """Return a foreign line, short and without control characters."""
+    """Return a received line, shortened and without control characters."""
     return "".join(letter if letter.isprintable() else "·" for letter in text[:60]) or "nothing"

@@ -1,4 +1,4 @@
-"""Opens what a transport's address names (`swath.drivers.transports.spec`)."""
+"""Makes the transport or PPS source for a specification of `swath.drivers.transports.spec`."""
 
 from __future__ import annotations
 
@@ -16,8 +16,11 @@ from swath.drivers.transports.udp_socket import UdpTransport
 
 
 def open_transport(spec: TransportSpec, stopped: Callable[[], bool] = lambda: False) -> Transport:
-    """Return the transport for ``spec``, not yet opened; ``stopped`` is asked while opening waits for a distant
-    computer.
+    """Return the transport for ``spec``, not yet opened.
+
+    Args:
+        spec: the transport to make.
+        stopped: called while opening waits for a distant computer; True ends the wait.
 
     Raises:
         ValueError: the kind has no transport of its own (gnss).

@@ -1,8 +1,8 @@
 """Serial port: opened and set by pyserial, read with poll(2) and read(2); a unit is the bytes of one read.
 
-The kernel gives no stamps here. A receive overrun loses bytes, not units (the read that would have carried them still
-comes), so it is counted with framing and parity errors in `TransportCounters.line_errors` and not in `lost_kernel`;
-parsers see the gap as a checksum that fails.
+The kernel gives no stamps here. A receive overrun loses bytes, not units (the read that lacks them still comes), so
+it is counted with framing and parity errors in `TransportCounters.line_errors` and not in `lost_kernel`; parsers
+see the gap as a failed checksum.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from swath.drivers.transports.spec import TransportSpec
 
 DEFAULT_BAUD = 115200
 READ_BYTES = 65536
-BATCH_S = 0.010  # after the first byte, so that a fast port is not read byte by byte; 920 bytes at 921600 baud,
-BATCH_BYTES = 2048  # but no more than half of what a terminal holds (4096, n_tty(4))
+BATCH_S = 0.010  # wait after the first byte, so that a fast port is not read byte by byte; 920 bytes at 921600 baud
+BATCH_BYTES = 2048  # the wait never exceeds half the buffer of a terminal (4096, n_tty(4))
 SEND_TIMEOUT_S = 2.0
 
-_BITS_A_BYTE = 10  # with start and stop bit
+_BITS_A_BYTE = 10  # including start and stop bits
 _TIOCGICOUNT = 0x545D  # <asm-generic/ioctls.h>
 # struct serial_icounter_struct, <linux/serial.h>: cts dsr rng dcd rx tx frame overrun parity brk buf_overrun, reserved
 _ICOUNTER = struct.Struct("@11i36x")
@@ -38,7 +38,7 @@ _IFLAG = 0  # index in the list of termios.tcgetattr
 
 
 class SerialTransport(DescriptorTransport):
-    """One serial port, held exclusively.
+    """Receives from one serial port, which it holds exclusively.
 
     Args:
         spec: ``serial:<path>``; options baud, bytesize, parity, stopbits, rtscts, xonxoff, dsrdtr, as in pyserial.
@@ -77,10 +77,12 @@ class SerialTransport(DescriptorTransport):
         return self._fd
 
     def _set_up(self, port: serial.Serial) -> None:
-        """Low latency where the driver has it (FTDI holds bytes for 16 ms otherwise); breaks flush nothing."""
+        """Set low latency where the driver supports it (FTDI delays bytes by 16 ms otherwise), and keep breaks from
+        flushing.
+        """
         try:
             port.set_low_latency_mode(True)
-        except ValueError:  # pyserial's word for a driver without it
+        except ValueError:  # pyserial raises it for a driver without that mode
             pass
         try:
             attributes = termios.tcgetattr(self._fd)
@@ -118,7 +120,9 @@ class SerialTransport(DescriptorTransport):
             self.counters.line_errors = errors - self._errors_at_open
 
     def _line_errors(self) -> int | None:
-        """Return framing, parity and overrun errors since the driver was loaded; None where it does not count (pty)."""
+        """Return framing, parity and overrun errors since the driver was loaded; None where it does not count them
+        (pty).
+        """
         try:
             counts: tuple[int, ...] = _ICOUNTER.unpack(fcntl.ioctl(self._fd, _TIOCGICOUNT, bytes(_ICOUNTER.size)))
         except OSError:
@@ -139,7 +143,7 @@ class SerialTransport(DescriptorTransport):
         except OSError as error:
             raise TransportError(self._gone(error.strerror or "read error")) from error
         if not data:
-            # a readable line that reads nothing has been unplugged; ask again, as another reader may have been faster
+            # a readable line without data has been unplugged; poll again, as another reader may have taken the data
             if events & HUNG_UP or gate.wait(0.0):
                 raise TransportError(self._gone("hung up"))
             return []

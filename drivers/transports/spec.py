@@ -1,4 +1,4 @@
-"""Transport and PPS strings of the configuration: text to `TransportSpec`, and that to a transport.
+"""Parses transport and PPS texts of the configuration into `TransportSpec` and `PpsSpec`.
 
 serial:<path>?baud=921600&bytesize=8&parity=N&stopbits=1&rtscts=no&xonxoff=no&dsrdtr=no
 udp:<host>:<port>?group=239.1.2.3&source=192.168.1.201&interface=eth1&buffer_mb=32
@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 
 PPS_FORMS = "/dev/pps0, serial-dcd:/dev/ttyS0 or fixed:<path>"
 FORMS = "serial:<path>, udp:<host>:<port>, can:<interface>:<channel>, gnss:<name> or ntrip:<host>:<port>/<mountpoint>"
-MAX_BUFFER_MB = 1023  # the kernel keeps twice the value in an int
+MAX_BUFFER_MB = 1023  # the kernel stores twice the value in an int
 MAX_BAUD = 20_000_000  # no UART is faster; the kernel's speed is an int of 32 bits
 
 _TRUE = {"1", "true", "yes", "on"}
@@ -25,13 +25,13 @@ _FALSE = {"0", "false", "no", "off"}
 
 @dataclass(frozen=True, slots=True)
 class TransportSpec:
-    """One transport of the configuration, checked.
+    """One checked transport of the configuration.
 
     Attributes:
         kind: "serial", "udp", "can", "ntrip" or "gnss" (inside another device's stream: no transport of its own).
-        address: what stands between the kind and the options.
+        address: the text between the kind and the options.
         options: keyword to value, as text.
-        text: the whole, as configured.
+        text: the whole text, as configured.
     """
 
     kind: str
@@ -51,7 +51,7 @@ class TransportSpec:
 
     @property
     def interface(self) -> str:
-        """python-can's name of the kind of CAN interface (socketcan, slcan, …)."""
+        """Kind of CAN interface by python-can's name (socketcan, slcan, …)."""
         return self.address.partition(":")[0]
 
     @property
@@ -71,12 +71,14 @@ class TransportSpec:
 
     @property
     def mountpoint(self) -> str:
-        """Of a caster."""
+        """Mountpoint of a caster."""
         return self.address.partition("/")[2]
 
     @property
     def device(self) -> str:
-        """What only one source can have: equal for two texts that mean the same port, bus or device."""
+        """Identity of the port, bus or device: equal for two texts that mean the same one, which only one source can
+        have.
+        """
         if self.kind == "serial":
             return f"serial:{os.path.realpath(self.address)}"
         if self.kind == "udp":
@@ -84,15 +86,15 @@ class TransportSpec:
         return f"{self.kind}:{self.address}"
 
     def flag(self, key: str, default: bool = False) -> bool:
-        """Return an option that is yes or no."""
+        """Return the value of a yes-or-no option."""
         return _boolean(self.options[key]) if key in self.options else default
 
 
 def parse_transport(text: str) -> TransportSpec:
-    """Read a transport string.
+    """Parse and check a transport text.
 
     Raises:
-        ValueError: one line naming what is wrong and what would be right.
+        ValueError: the text is invalid; the message names the error and a valid form.
     """
     refuse_unprintable("transport", text)
     kind, colon, rest = text.partition(":")
@@ -106,7 +108,9 @@ def parse_transport(text: str) -> TransportSpec:
 
 
 def refuse_unprintable(what: str, text: str) -> None:
-    """No path, name or address has any, and the system takes none with a zero in it."""
+    """Refuse unprintable characters with `ValueError`: no path, name or address has any, and the system rejects a zero
+    byte.
+    """
     if not text.isprintable():
         raise ValueError(f"{what} {text!r}: has an unprintable character in it; want a path, name or address")
 
@@ -170,7 +174,9 @@ def _baud(value: str) -> bool:
 
 
 def ntrip_position(value: str) -> tuple[float, float, float]:
-    """Return latitude, longitude, degrees, height, m, of ``47.5,8.7,500``; ValueError where it is none."""
+    """Return latitude and longitude in degrees and height in m of ``47.5,8.7,500``; raises ValueError for any other
+    text.
+    """
     lat, lon, height = (float(part) for part in value.split(","))
     if not (abs(lat) <= 90.0 and abs(lon) <= 180.0 and abs(height) <= 10_000.0):
         raise ValueError("not on earth")
@@ -191,7 +197,7 @@ def _variable(value: str) -> bool:
 
 _Option = tuple[Callable[[str], object], str]
 
-# option: (check, what would be right)
+# option: (check, description of a valid value)
 SERIAL_OPTIONS: dict[str, _Option] = {
     "baud": (_baud, f"a whole number, 1 to {MAX_BAUD}, such as 921600"),
     "bytesize": (_one_of("5", "6", "7", "8"), "5, 6, 7 or 8"),
@@ -275,7 +281,7 @@ def _check_gnss(spec: TransportSpec) -> None:
 
 
 def _can_be_asked_for(host: str) -> bool:
-    """Return whether the resolver takes a name: it encodes it first, as Python does here."""
+    """Return whether the resolver accepts a name: it first encodes the name, as Python does here."""
     try:
         host.encode("idna")
     except UnicodeError:
@@ -317,7 +323,7 @@ class PpsSpec:
 
     Attributes:
         kind: "device" (the kernel's PPS API), "serial-dcd" or "fixed".
-        path: of the device, the serial port, or the file of edges.
+        path: path of the device, the serial port, or the file of edges.
         edge: "assert" or "clear".
     """
 
@@ -327,10 +333,10 @@ class PpsSpec:
 
 
 def parse_pps(text: str, edge: str = "assert") -> PpsSpec:
-    """Parse the text of a PPS source.
+    """Parse and check the text of a PPS source.
 
     Raises:
-        ValueError: one line naming what is wrong and what would be right.
+        ValueError: the text is invalid; the message names the error and a valid form.
     """
     refuse_unprintable("PPS source", text)
     if edge not in ("assert", "clear"):

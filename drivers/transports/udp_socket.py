@@ -1,9 +1,9 @@
-"""UDP port: unicast, broadcast or multicast, kernel stamps, exact count of what the kernel dropped.
+"""UDP port: unicast, broadcast or multicast, kernel stamps, exact count of datagrams that the kernel dropped.
 
-Datagrams of other senders than ``source`` are no units: they are let go after the kernel handed them over, and
+Datagrams of other senders than ``source`` are not units: they are discarded after the kernel delivered them, and
 counted in `TransportCounters.refused`. (A filter in the kernel would count them among the socket's drops, and a
-connected socket hears no broadcasts, which is what scanners send out of the box.) Bound to 0.0.0.0 a port hears
-broadcasts too; bound to one address of this machine it does not.
+connected socket receives no broadcasts, which scanners send by default.) A port bound to 0.0.0.0 receives broadcasts
+too; a port bound to one address of this machine does not.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from swath.drivers.transports.spec import TransportSpec
 
 MAX_DATAGRAM_BYTES = 65535  # total length of an IPv4 packet is 16 bits, RFC 791
 SLOTS = 512
-BATCH_S = 0.016  # 320 datagrams at 20 000 a second; the kernel has their stamps: nothing but the wake-ups feels it
+BATCH_S = 0.016  # 320 datagrams at 20 000 a second; the kernel stamps them, so that only wake-ups are delayed
 SMALL_BUFFER_BYTES = 4 << 20  # a receive buffer below this may hold less than a batch: the default holds 4.6 ms
 SMALL_BUFFER_BATCH_S = 0.002
-MAX_CALLS = 32  # bounds one receive to 16384 datagrams,
-MAX_BYTES = 8 << 20  # and to this and one call more
+MAX_CALLS = 32  # bounds one receive to 16384 datagrams
+MAX_BYTES = 8 << 20  # bounds one receive to this size and one more call
 DEFAULT_BUFFER_MB = 32
 
 _IP_ADD_SOURCE_MEMBERSHIP = 39  # <linux/in.h>
@@ -37,12 +37,12 @@ _IFREQ = struct.Struct("@16s24s")
 
 
 class UdpTransport(DescriptorTransport):
-    """One local UDP port (IPv4).
+    """Receives from one local UDP port (IPv4).
 
     Args:
         spec: ``udp:<host>:<port>``; options group, source, interface, buffer_mb.
-        batch_s: after the first datagram the reader waits this long for more, so that one call serves many. The
-            kernel's stamps are not touched by it.
+        batch_s: wait for more datagrams after the first, so that one call receives many. The kernel's stamps are
+            unaffected.
     """
 
     def __init__(self, spec: TransportSpec, batch_s: float = BATCH_S) -> None:
@@ -72,7 +72,7 @@ class UdpTransport(DescriptorTransport):
         return sock.fileno()
 
     def _configure(self, sock: socket.socket) -> None:
-        """Set the options, bind, join. A socket on a group binds to the group, so that it hears nothing else."""
+        """Set the options, bind, and join. A socket on a group binds to the group, so that it receives nothing else."""
         options = self._spec.options
         asked = int(options.get("buffer_mb", DEFAULT_BUFFER_MB)) << 20
         self.counters.receive_buffer_asked_bytes = asked
@@ -86,7 +86,7 @@ class UdpTransport(DescriptorTransport):
                 sock.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, interface.encode())
             sock.bind((self._spec.host, self._spec.port))
             return
-        # each listener of a group has its own copy of every datagram: sharing the port takes nothing from anyone
+        # each listener of a group has its own copy of every datagram, so sharing the port costs no listener any
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         sock.bind((group, self._spec.port))
         self._join(sock, group, _interface_address(sock, interface) if interface else self._spec.host)
@@ -136,9 +136,10 @@ class UdpTransport(DescriptorTransport):
         return self._drain()
 
     def _look_after_interface(self) -> None:
-        """On silence, once a second: a socket hears nothing of an interface that went and came back as another one.
+        """Check the interface on silence, once a second: a socket receives nothing after its interface went and came
+        back.
 
-        A group without a named interface is joined again where the route to it leads now.
+        A group without a named interface is joined again on the interface that its route now uses.
         """
         now_s = time.monotonic()
         if self._sock is None or now_s < self._looked_s + 1.0:
@@ -193,7 +194,7 @@ class UdpTransport(DescriptorTransport):
 
 
 def _interface_address(sock: socket.socket, interface: str) -> str:
-    """Return IPv4 address of an interface; OSError ENODEV where there is no such interface or it has none."""
+    """Return the IPv4 address of an interface; raise OSError ENODEV where the interface or its address is missing."""
     request = _IFREQ.pack(interface.encode()[:15], bytes(24))
     try:
         answer = fcntl.ioctl(sock, _SIOCGIFADDR, request)

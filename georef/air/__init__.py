@@ -1,1 +1,1 @@
-"""The light's way through the air: group index and refraction."""
+"""The light's path through the air: group index and refraction."""

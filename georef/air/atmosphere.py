@@ -1,15 +1,17 @@
-"""The air between the scanner and the ground: ranges of devices that count with the speed of light in vacuum, and
-beams that bend (FORMULAS 3.2, 4; ``[atmosphere]`` of the configuration).
+"""Correct for the air between scanner and ground: range corrections and beam bending.
 
-Group refractivity: the closed form of IAG 1999, in the International Standard Atmosphere (dry) or in one that goes
-through a measured temperature, pressure and humidity. Bending models bring their own air. Heights are ellipsoidal
-where the models count from the sea: with a geoid 50 m away ranges change by 1.3 ppm.
+Ranges of devices that count with the speed of light in vacuum are too long in air, and beams bend (FORMULAS 3.2, 4;
+``[atmosphere]`` of the configuration).
 
-Bending of beams by air: ARDC's K, spherical layers (FORMULAS 4; NGA Eq. 4 to 11).
+Group refractivity is the closed form of IAG 1999, in the International Standard Atmosphere (dry) or in one that goes
+through a measured temperature, pressure and humidity. Bending models bring their own air. Heights are ellipsoidal where
+the models count from the sea: with a geoid 50 m away ranges change by 1.3 ppm.
 
-A beam bends towards the vertical as the air gets denser: the point lies nearer to nadir than the beam leaves, by Δd.
-Heights are taken as they come, which are ellipsoidal; the models count them from the sea. With a geoid 50 m from the
-ellipsoid Δd changes by half a percent.
+Bending of beams by air: ARDC's K or spherical layers (FORMULAS 4; NGA Eq. 4 to 11).
+
+A beam bends towards the vertical as the air gets denser: the point lies nearer to nadir, by Δd, than the beam's first
+direction. Heights are used as given, ellipsoidal, although the models count them from the sea. With a geoid 50 m from
+the ellipsoid Δd changes by half a percent.
 """
 
 from __future__ import annotations
@@ -42,11 +44,11 @@ MODELS = {"none": STRAIGHT, "ardc": ARDC, "spherical": SPHERICAL}
 
 
 class AtmosphereError(ValueError):
-    """The air is described by something it is not."""
+    """Raised for an impossible description of the air."""
 
 
 def saturated_hpa(temperature_c: ArrayLike) -> FloatArray:
-    """Return pressure of saturated water vapour (FORMULAS 3.2, Magnus), (…,) °C."""
+    """Return the pressure of saturated water vapour in hPa (FORMULAS 3.2, Magnus) at (…,) °C."""
     temperature = np.asarray(temperature_c, dtype=np.float64)
     pressure: FloatArray = 6.112 * np.exp(17.62 * temperature / (243.12 + temperature))
     return pressure
@@ -59,8 +61,8 @@ def group_refractivity_ppm(
 
     Args:
         wavelength_nm: in vacuum.
-        pressure_hpa: total.
-        vapour_hpa: its part of water vapour.
+        pressure_hpa: total pressure.
+        vapour_hpa: partial pressure of water vapour.
     """
     wave = (1e-3 * wavelength_nm) ** -2
     standard = 287.6155 + 4.88660 * wave + 0.06800 * wave * wave
@@ -95,12 +97,11 @@ def standard_air(
 
 @dataclass(frozen=True, slots=True)
 class EdgeEffect:
-    """What air amounts to for a beam at the swath's edge, applied or not; metres.
+    """The effect of air on a beam at the swath's edge, corrected or not; metres.
 
     Attributes:
-        range_m: by how much a range counted with the speed of light in vacuum (or with the instrument's index) is too
-            long.
-        bending_m: by how much the point lies nearer to nadir than the beam's first direction says; of spherical layers
+        range_m: excess of a range that is counted with the speed of light in vacuum (or with the instrument's index).
+        bending_m: distance by which the point lies nearer to nadir than the beam's first direction; by spherical layers
             where no model is chosen.
     """
 
@@ -109,21 +110,21 @@ class EdgeEffect:
 
 
 class Air:
-    """The air for light of one wavelength; keys of ``[atmosphere]``.
+    """The air for light of one wavelength; its arguments are the keys of ``[atmosphere]``.
 
     Args:
-        ranges: "corrected": the device did it; "vacuum": corrected here.
+        ranges: "corrected": the device has corrected them; "vacuum": they are corrected here.
         model: "standard", or "measured": temperature, pressure and relative humidity at ``height_m``, and from there
-            the standard's lapse, hydrostatic pressure, the same relative humidity.
+            the standard lapse rate, hydrostatic pressure and the same relative humidity.
         refraction: "none", "ardc" or "spherical".
         wavelength_nm: in vacuum.
-        reference_index: group index the instrument divided by already; 1: none.
+        reference_index: group index by which the instrument has already divided; 1 if it has not.
 
     Attributes:
-        corrects_range, bends: what `apply` does.
+        corrects_range, bends: the corrections that `apply` makes.
 
     Raises:
-        AtmosphereError: a word that is none of these, or a number that no air has.
+        AtmosphereError: an unknown word, or a number that is impossible for air.
     """
 
     def __init__(
@@ -159,23 +160,21 @@ class Air:
         self._phase = _table(lambda heights_m: layer_refractivity(heights_m, self._constant_ppm))
 
     def mean_refractivity(self, from_height_m: ArrayLike, to_height_m: ArrayLike) -> FloatArray:
-        """Return (n,) mean n_g − 1 along straight paths between ellipsoidal heights; exact over height (FORMULAS
-        3.2).
-        """
+        """Return (n,) mean n_g − 1 on straight paths between ellipsoidal heights, exact over height (FORMULAS 3.2)."""
         start, end = np.broadcast_arrays(*(np.atleast_1d(np.asarray(h, float)) for h in (from_height_m, to_height_m)))
         out = np.empty(len(start))
         means(self._group, np.ascontiguousarray(start), np.ascontiguousarray(end), out)
         return out
 
     def apply(self, origin_e: FloatArray, points_e: FloatArray, travelled_m: FloatArray | None = None) -> None:
-        """Correct points in place, as far as this air does anything; each point's result depends on it alone.
+        """Correct points in place, as far as this air corrects anything; each result depends on its own point alone.
 
         Args:
-            origin_e: (n, 3) of the scanner, at the pulse.
-            points_e: (n, 3) as the device's ranges along the first directions have them; of rows that are no points
-                nothing is asked.
+            origin_e: (n, 3) position of the scanner at the pulse.
+            points_e: (n, 3) points by the device's ranges along the first directions; rows without a point may hold any
+                values.
             travelled_m: (n,) the part of each range that came from time of flight, (1 + range_scale) · ρ_measured;
-                None: the whole distance, which errs by 0.3 mm a metre of range offset.
+                None: the whole distance, which errs by 0.3 mm per metre of range offset.
         """
         if not (self.corrects_range or self.bends):
             return
@@ -185,9 +184,9 @@ class Air:
         apply_air(origin_e, points_e, travelled, *tables, self._index, self.corrects_range, bends)
 
     def at_edge(self, height_above_ground_m: float, half_angle_rad: float, ground_height_m: float = 0.0) -> EdgeEffect:
-        """Return what the models amount to for a beam this far from nadir over flat ground (ellipsoidal height).
+        """Return the models' effect on a beam at this angle from nadir over flat ground (ellipsoidal height).
 
-        Beams flatter than 80° are told as if they were at 80°.
+        Beams flatter than 80° are treated as if they were at 80°.
         """
         angle_rad = min(abs(half_angle_rad), FLATTEST_RAD)
         sensor_m = ground_height_m + height_above_ground_m
@@ -201,7 +200,7 @@ class Air:
         return EdgeEffect(length_m * (index / self._index - 1.0), length_m * bent)
 
     def warning(self, height_above_ground_m: float, half_angle_rad: float, ground_height_m: float = 0.0) -> str | None:
-        """Return a line where beams bend by more than 2 mm at the swath's edge and nothing is done about it."""
+        """Return a warning if beams bend by more than 2 mm at the swath's edge and the bending is not corrected."""
         bent_m = self.at_edge(height_above_ground_m, half_angle_rad, ground_height_m).bending_m
         if self.bends or bent_m <= WORTH_SAYING_M:
             return None
@@ -220,7 +219,7 @@ def _check(key: str, got: str, words: tuple[str, ...]) -> None:
 def _refractivity(
     height_m: FloatArray, wavelength_nm: float, measured: tuple[float, float, float, float] | None
 ) -> FloatArray:
-    """Return n_g − 1 over heights (…,); measured: °C, hPa, percent, at height."""
+    """Return n_g − 1 at heights (…,); measured: °C, hPa, percent, at height."""
     if measured is None:
         return 1e-6 * group_refractivity_ppm(wavelength_nm, *standard_air(height_m), 0.0)
     temperature_c, pressure_hpa, humidity_percent, known_m = measured
@@ -230,10 +229,10 @@ def _refractivity(
 
 
 def _table(refractivity: Callable[[FloatArray], FloatArray]) -> FloatArray:
-    """Return (CELLS, 5) of `swath.georef.air.kernels`: the cubic through four heights of each cell, and the integral
-    below it.
+    """Return the table (CELLS, 5) for `swath.georef.air.kernels`: a cubic and an integral for each cell.
 
-    Air is so smooth over a cell that this is exact to 1e-13.
+    The cubic goes through four heights of its cell; the integral is that of the cells below. Air is so smooth over a
+    cell that this is exact to 1e-13.
     """
     share = np.array([0.0, 0.25, 0.75, 1.0])  # Chebyshev's extrema
     floors = FLOOR_M + STEP_M * np.arange(CELLS)[:, np.newaxis]
@@ -246,15 +245,16 @@ def _table(refractivity: Callable[[FloatArray], FloatArray]) -> FloatArray:
 
 
 def layer_constant_ppm(wavelength_nm: float) -> float:
-    """Return C of NGA Eq. 9 in ppm K/hPa, re-derived: 0.27315/1.01325 · N_p of the closed form of IAG 1999 (FORMULAS
-    4.3).
+    """Return C of NGA Eq. 9 in ppm K/hPa, re-derived from the closed form of IAG 1999 (FORMULAS 4.3).
+
+    It is 0.27315/1.01325 · N_p.
     """
     wave = (1e-3 * wavelength_nm) ** -2
     return 273.15 / 1013.25 * (287.6155 + 1.62887 * wave + 0.01360 * wave * wave)
 
 
 def layer_air(height_m: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Return temperature in K and pressure in hPa at heights (…,) in metres (NGA Eq. 10, 11); the troposphere's."""
+    """Return temperature in K and pressure in hPa at heights (…,) in metres (NGA Eq. 10, 11), for the troposphere."""
     fahrenheit = 59.0 - 0.00356 * FT_PER_M * np.asarray(height_m, dtype=np.float64)
     pressure: FloatArray = HPA_PER_PSF * 2116.0 * ((fahrenheit + 459.7) / 518.6) ** 5.256
     return (fahrenheit + 459.67) * 5.0 / 9.0, pressure
@@ -268,8 +268,9 @@ def layer_refractivity(height_m: ArrayLike, constant_ppm: float) -> FloatArray:
 
 
 def ardc_k(sensor_m: ArrayLike, ground_m: ArrayLike) -> FloatArray:
-    """Return K of the ARDC model in radians (NGA Eq. 5, restored), Δd = K tan α (Eq. 4); heights (…,) in metres, above
-    0.
+    """Return K of the ARDC model in radians (NGA Eq. 5, restored), Δd = K tan α (Eq. 4).
+
+    Heights (…,) are in metres, above 0.
     """
     upper, lower = 1e-3 * np.asarray(sensor_m, dtype=np.float64), 1e-3 * np.asarray(ground_m, dtype=np.float64)
 
@@ -281,10 +282,10 @@ def ardc_k(sensor_m: ArrayLike, ground_m: ArrayLike) -> FloatArray:
 
 
 def spherical_bending(nadir_rad: ArrayLike, sensor_m: ArrayLike, ground_m: ArrayLike, constant_ppm: float) -> Any:
-    """Return δd in radians of rays through spherical layers (NGA Eq. 6 to 8, restored), for beams that go down.
+    """Return δd in radians of rays through spherical layers (NGA Eq. 6 to 8, restored), for downward beams.
 
     Args:
-        nadir_rad: (…,) of the beam as it leaves.
+        nadir_rad: (…,) angle of the beam from nadir at the sensor.
         sensor_m, ground_m: (…,) heights above a sphere of 6371 km.
         constant_ppm: `layer_constant_ppm`.
     """

@@ -1,9 +1,9 @@
-"""What air does to rays: how slow light is in it, how it bends them.
+"""Compute the effect of air on rays: the speed of light in it, and how it bends them.
 
-Returns go through in blocks, step by step: steps without a branch or a table are compiled for several returns at once,
-and the block stays in the nearest cache. Profiles over height are tables of cubics: cell i holds heights from FLOOR_M +
-i·STEP_M, and its polynomial runs in the share of the cell, 0 … 1. Beyond the table, 1 km below the sea and 20 km above
-it, there is no air.
+Returns are processed in blocks, step by step: steps without a branch or a table are compiled for several returns at
+once, and the block stays in the nearest cache. Profiles over height are tables of cubics: cell i holds heights from
+FLOOR_M + i·STEP_M, and its polynomial runs in the share of the cell, 0 … 1. Beyond the table, 1 km below the sea and 20
+km above it, the model has no air.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from swath.georef.geodesy.earth import A_M, B_M, E2, EP2
 FLOOR_M, STEP_M, CELLS = -1000.0, 250.0, 84
 TOP_M = FLOOR_M + STEP_M * CELLS
 STRAIGHT, ARDC, SPHERICAL = 0, 1, 2
-FLATTEST_COS = math.cos(math.radians(80.0))  # ARDC's tangent: flatter beams are bent like this one
-LEVEL_M = 0.01  # of a path that descends by less, the middle tells the mean
+FLATTEST_COS = math.cos(math.radians(80.0))  # limit for ARDC's tangent: flatter beams are bent like a beam at 80°
+LEVEL_M = 0.01  # over a path that descends by less, the middle gives the mean
 BLOCK = 128
 
-# Rows of a block: origin, direction (the point before), up, ellipsoidal height and radius of curvature at the origin,
-# cosine of the nadir angle, the range said, the range in air, Δd / sin α, the height reached, and of the group
-# refractivity value and integral at the origin and at the height reached; the part of the range that is corrected
+# Rows of a block: origin; direction (the point before); up, ellipsoidal height and radius of curvature at the origin;
+# cosine of the nadir angle; the given range; the range in air; Δd / sin α; the height reached; value and integral of
+# the group refractivity at the origin and at the height reached; the part of the range that is corrected
 (
     OX,
     OY,
@@ -58,8 +58,7 @@ NODES, WEIGHTS = 0.5 * (1.0 + _roots), 0.25 * _weights
 
 @jit_inline
 def vertical_of(x: float, y: float, z: float) -> tuple[float, float, float, float, float]:
-    """Return the ellipsoid's normal (up, in e), the height above it and its mean radius of curvature at an ECEF
-    position.
+    """Return the ellipsoid's normal (up, in e), height above it and its mean radius of curvature at an ECEF position.
 
     One step of Bowring (FORMULAS 1.2) without a trigonometric function: 1e-10 rad and 1e-9 m up to 20 km of height.
     """
@@ -78,7 +77,7 @@ def vertical_of(x: float, y: float, z: float) -> tuple[float, float, float, floa
 
 @jit_inline
 def cell_of(height_m: float) -> tuple[int, float]:
-    """Return cell of a height and the share of it that lies below; not-a-number is taken as low."""
+    """Return the cell of a height and the share of it that lies below; not-a-number is treated as low."""
     if not height_m > FLOOR_M:
         return 0, 0.0
     if height_m >= TOP_M:
@@ -90,7 +89,7 @@ def cell_of(height_m: float) -> tuple[int, float]:
 
 @jit_inline
 def value_of(table: FloatArray, height_m: float) -> float:
-    """Return refractivity at a height; columns 0 to 3 of the table are its cubic's coefficients."""
+    """Return the refractivity at a height; columns 0 to 3 of the table are its cubic's coefficients."""
     cell, x = cell_of(height_m)
     value: float = table[cell, 0] + x * (table[cell, 1] + x * (table[cell, 2] + x * table[cell, 3]))
     return value
@@ -98,7 +97,7 @@ def value_of(table: FloatArray, height_m: float) -> float:
 
 @jit_inline
 def slope_of(table: FloatArray, height_m: float) -> tuple[float, float]:
-    """Return refractivity and its derivative by height, 1/m."""
+    """Return the refractivity and its derivative by height, 1/m."""
     cell, x = cell_of(height_m)
     value = table[cell, 0] + x * (table[cell, 1] + x * (table[cell, 2] + x * table[cell, 3]))
     slope = table[cell, 1] + x * (2.0 * table[cell, 2] + x * 3.0 * table[cell, 3])
@@ -107,7 +106,7 @@ def slope_of(table: FloatArray, height_m: float) -> tuple[float, float]:
 
 @jit_inline
 def sum_of(table: FloatArray, height_m: float) -> tuple[float, float]:
-    """Return refractivity and its integral from the table's floor; column 4 holds it at the floors of the cells."""
+    """Return the refractivity and its integral from the table's floor; column 4 holds it at the floors of the cells."""
     cell, x = cell_of(height_m)
     first, second, third = table[cell, 1] * x, table[cell, 2] * x * x, table[cell, 3] * x * x * x
     value = table[cell, 0] + first + second + third
@@ -116,18 +115,16 @@ def sum_of(table: FloatArray, height_m: float) -> tuple[float, float]:
 
 @jit_inline
 def mean_of(from_m: float, from_sum: float, to_m: float, to_sum: float, value: float) -> float:
-    """Return mean refractivity between heights: the difference of integrals over theirs; level: the value at the
-    second.
-    """
+    """Return the mean refractivity between heights from the difference of integrals; for a level path ``value``."""
     apart = from_m - to_m
     return (from_sum - to_sum) / apart if abs(apart) > LEVEL_M else value
 
 
 @jit_inline
 def height_along(sensor_m: float, radius_m: float, range_m: float, cos: float) -> float:
-    """Return height reached along a straight line, on the sphere that touches the ellipsoid below the sensor.
+    """Return the height reached along a straight line, on the sphere that touches the ellipsoid below the sensor.
 
-    ``cos`` is of the nadir angle. The ellipsoid's other curvatures make 3 cm over 10 km, the series 5 µm.
+    ``cos`` is of the nadir angle. The ellipsoid's other curvatures contribute 3 cm over 10 km, the series 5 µm.
     """
     centre = radius_m + sensor_m - range_m * cos
     across = range_m * range_m * (1.0 - cos * cos)
@@ -138,7 +135,7 @@ def height_along(sensor_m: float, radius_m: float, range_m: float, cos: float) -
 def bent_by_ardc(sensor_m: float, ground_m: float, cos: float) -> float:
     """Return δd / sin α of the ARDC model (NGA Eq. 4, 5): K over the cosine of the nadir angle.
 
-    The model knows no air below the sea; beams above the horizon are left as they are.
+    The model has no air below the sea; it leaves beams above the horizon unchanged.
     """
     upper, lower = 1e-3 * sensor_m, 1e-3 * max(ground_m, 0.0)
     first = upper / (upper * upper - 6.0 * upper + 250.0)
@@ -149,12 +146,12 @@ def bent_by_ardc(sensor_m: float, ground_m: float, cos: float) -> float:
 
 @jit_inline
 def bent_by_layers(table: FloatArray, sensor_m: float, radius_m: float, range_m: float, cos: float) -> float:
-    """Return δd / sin α in spherical layers: what NGA Eq. 6 to 8 amount to, as an integral along the path.
+    """Return δd / sin α in spherical layers: NGA Eq. 6 to 8 as an integral along the path.
 
     A ray turns by −(n'/n) sin ψ a metre, ψ its angle from the vertical, for which Snell's law holds (Eq. 6); its chord
-    leaves the first direction by the integral of that, each metre weighted with the share of the path still to go. That
-    is good in any direction, also level or upward, where Eq. 8 is singular. The path lies below the straight line, as
-    if its curvature changed evenly on the way: 1e-9 rad up to 75° from nadir at 6 km, 70° at 10 km.
+    leaves the first direction by the integral of that, each metre weighted with the share of the path still to go. This
+    holds in any direction, also level or upward, where Eq. 8 is singular. The path lies below the straight line, as if
+    its curvature changed evenly along it: 1e-9 rad up to 75° from nadir at 6 km, 70° at 10 km.
     """
     value, slope = slope_of(table, sensor_m)
     last = slope_of(table, height_along(sensor_m, radius_m, range_m, cos))[1]
@@ -182,7 +179,7 @@ def take(block: FloatArray, origin_e: FloatArray, points_e: FloatArray, start: i
 
 @jit_inline
 def look(block: FloatArray, n: int) -> None:
-    """Directions, ranges, nadir angles."""
+    """Compute directions, ranges and nadir angles of a block."""
     for i in range(n):
         x, y, z = block[OX, i], block[OY, i], block[OZ, i]
         dx, dy, dz = block[UX, i] - x, block[UY, i] - y, block[UZ, i] - z
@@ -200,7 +197,7 @@ def look(block: FloatArray, n: int) -> None:
 
 @jit_inline
 def shorten(block: FloatArray, group: FloatArray, travelled_m: FloatArray, start: int, n: int, index: float) -> None:
-    """Ranges in the air at the sensor: 100 ppm from those in the mean air at worst."""
+    """Compute ranges with the air at the sensor; they differ by at most 100 ppm from those in the mean air."""
     for i in range(n):
         block[TOP_VALUE, i], block[TOP_SUM, i] = sum_of(group, block[SENSOR, i])
     if len(travelled_m):
@@ -213,7 +210,7 @@ def shorten(block: FloatArray, group: FloatArray, travelled_m: FloatArray, start
 
 @jit_inline
 def bend(block: FloatArray, phase: FloatArray, n: int, model: int) -> None:
-    """Δd / sin α."""
+    """Compute Δd / sin α by the chosen bending model."""
     if model == ARDC:
         for i in range(n):
             sensor, cos = block[SENSOR, i], block[COS, i]
@@ -227,10 +224,10 @@ def bend(block: FloatArray, phase: FloatArray, n: int, model: int) -> None:
 
 @jit_inline
 def turn(block: FloatArray, n: int) -> None:
-    """Directions towards nadir by Δd: u' = sin(α − Δd)/sin α u + sin Δd/sin α d (FORMULAS 4.1), good at nadir too."""
+    """Turn directions towards nadir by Δd: u' = sin(α − Δd)/sin α u + sin Δd/sin α d (FORMULAS 4.1), at nadir too."""
     for i in range(n):
         cos, turned = block[COS, i], block[TURNED, i]
-        square = turned * turned * (1.0 - cos * cos)  # Δd², below 1e-6: two terms of sine and cosine do
+        square = turned * turned * (1.0 - cos * cos)  # Δd², below 1e-6: two terms of sine and cosine suffice
         down = turned * (1.0 - square / 6.0)
         along = 1.0 - 0.5 * square - cos * down
         block[UX, i] = along * block[UX, i] - down * block[NX, i]
@@ -241,7 +238,7 @@ def turn(block: FloatArray, n: int) -> None:
 
 @jit_inline
 def measure(block: FloatArray, group: FloatArray, n: int, index: float) -> None:
-    """Ranges in the mean air of their paths; the mean depends on where they end, which one step of Newton settles."""
+    """Compute ranges in the mean air of their paths; one Newton step settles the mean, which depends on the range."""
     for i in range(n):
         block[GROUND, i] = height_along(block[SENSOR, i], block[RADIUS, i], block[LENGTH, i], block[COS, i])
     for i in range(n):
@@ -258,7 +255,7 @@ def measure(block: FloatArray, group: FloatArray, n: int, index: float) -> None:
 
 @jit_inline
 def give(block: FloatArray, points_e: FloatArray, start: int, n: int) -> None:
-    """Points out of a block; what has no range stays where it is."""
+    """Copy points out of a block; a row without a range keeps its point."""
     for i in range(n):
         if block[SAID, i] > 0.0:
             for axis in range(3):
@@ -280,10 +277,10 @@ def apply_air(
 
     Args:
         origin_e, points_e: (n, 3) metres.
-        travelled_m: (n,) the part of each range that was told by time of flight; empty: all of it.
+        travelled_m: (n,) the part of each range that came from time of flight; empty: all of it.
         group, phase: tables of group and phase refractivity.
         reference_index: of the instrument.
-        corrects: ranges are corrected.
+        corrects: whether ranges are corrected.
         bends: STRAIGHT, ARDC or SPHERICAL.
     """
     block = np.empty((ROWS, BLOCK))
@@ -303,7 +300,7 @@ def apply_air(
 
 @jit_cached
 def means(table: FloatArray, from_m: FloatArray, to_m: FloatArray, out: FloatArray) -> None:
-    """Mean refractivities over height, all (n,)."""
+    """Compute mean refractivities between heights, all (n,), into ``out``."""
     for i in range(len(out)):
         middle = value_of(table, 0.5 * (from_m[i] + to_m[i]))
         from_sum, to_sum = sum_of(table, from_m[i])[1], sum_of(table, to_m[i])[1]

@@ -1,1 +1,1 @@
-"""Files of the field, read and written: trajectories and point clouds. Functions take open files or bytes."""
+"""Read and write file formats of the field: trajectories and point clouds. Functions take open files or bytes."""

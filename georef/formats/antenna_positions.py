@@ -1,4 +1,4 @@
-"""Positions of an antenna from post-processing, as observations for navigation: RTKLIB .pos and Waypoint text."""
+"""Read post-processed antenna positions as observations for navigation: RTKLIB .pos and Waypoint text."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from swath.georef.trajectory.trajectory import DEFAULT_MAX_GAP_NS, TrajectoryErr
 def read_antenna_positions(
     data: bytes, name: str, *, span_ns: Span | None = None, week: int | None = None, leap_seconds: int | None = None
 ) -> TrajectoryColumns:
-    """Return rows of a file of positions, with sigmas, fix types and velocities as far as it says them.
+    """Return rows of a file of positions, with sigmas, fix types and velocities as far as the file gives them.
 
     Args:
-        data: the file.
+        data: the file's bytes.
         name: for messages.
-        span_ns: GPS time of the log's first and last record: tells the week of files that say none.
-        week: GPS week of the first row; goes before span_ns.
+        span_ns: GPS time of the log's first and last record, which gives the week of a file without one.
+        week: GPS week of the first row; takes precedence over span_ns.
         leap_seconds: GPS − UTC as the log knows it, for files in UTC.
 
     Raises:
-        TrajectoryError: in one line what is wrong; a file with attitudes is no antenna's.
+        TrajectoryError: one line that names the fault; a file with attitudes is not of an antenna.
     """
     text = decoded(data, "replace")
     if is_rtklib_pos(text):
@@ -38,7 +38,7 @@ def read_antenna_positions(
         raise TrajectoryError(f"{name}: is no file of an antenna's positions: RTKLIB .pos or Waypoint text is expected")
     if np.isfinite(columns.roll_rad).any():
         raise TrajectoryError(_finished(name))
-    trajectory_of(columns, name, DEFAULT_MAX_GAP_NS)  # refuses what cannot be meant
+    trajectory_of(columns, name, DEFAULT_MAX_GAP_NS)  # refuses rows that cannot be valid
     return columns
 
 

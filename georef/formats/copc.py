@@ -1,8 +1,8 @@
-"""Writes COPC 1.0: a LAZ file whose chunks are the nodes of an octree, coarse ones first, so that viewers read a part.
+"""Write COPC 1.0: a LAZ file whose chunks are nodes of an octree, coarse ones first, so that viewers read a part.
 
-A node has a random share, some `NODE_POINTS`, of the points in its cube that no coarser node has. The share depends on
-a point's place in the order alone, so the same points give the same bytes. Points are spooled, sorted by node into a
-second spool, and compressed node by node: memory holds a block of points, and one node.
+A node holds a random share, about `NODE_POINTS`, of the points in its cube that no coarser node holds. The share
+depends on a point's place in the order alone, so the same points give the same bytes. Points are spooled, sorted by
+node into a second spool, and compressed node by node: memory holds a block of points and one node.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from swath.georef.points import Points
 from swath.georef.records import Int64Array
 
 NODE_POINTS = 65_536
-ALL_OF = 1.5  # times that many: a node takes all that is left, rather than leave crumbs to eight others
+ALL_OF = 1.5  # times that many: a node takes all remaining points, rather than leave a few to each of eight others
 MAX_DEPTH = 10
-SPACINGS = 128  # points along the edge of the root's cube, which the header wants to know
+SPACINGS = 128  # points along the edge of the root's cube, for the spacing in the header
 READ_POINTS = 1 << 20
 ENTRY_DTYPE = np.dtype([("key", "<i4", (4,)), ("offset", "<u8"), ("bytes", "<i4"), ("points", "<i4")])
 _EVLR_HEAD_BYTES = 60
@@ -40,7 +40,8 @@ class CopcWriter:
 
     Args:
         stream: seekable, empty; the caller closes it.
-        spools: two temporary files, written and read, each as large as the points; the caller closes them.
+        spools: two temporary files, opened for reading and writing, each as large as the points; the caller closes
+            them.
         settings: of the run.
         strip: its number, which is the point source id.
     """
@@ -55,11 +56,11 @@ class CopcWriter:
 
     @property
     def clipped(self) -> Clipped:
-        """What did not fit so far."""
+        """The counts of clipped values so far."""
         return self._packer.clipped
 
     def write(self, points: Points, *, scanner: int = 0, intensity_factor: float = 1.0, withheld: bool = False) -> None:
-        """Append points, as `LasWriter.write`."""
+        """Append points; arguments and errors are those of `LasWriter.write`."""
         for first in range(0, len(points), BLOCK):
             records = self._packer.pack(
                 points, first, scanner=scanner, intensity_factor=intensity_factor, withheld=withheld
@@ -90,14 +91,14 @@ class CopcWriter:
         return self.header.encode(self._laszip.record_data(), encode_vlr("copc", 1, info, "COPC info"), 1)
 
     def _blocks(self) -> Iterator[tuple[int, NDArray[np.void]]]:
-        """Yield records in the order in which they came, with the first one's place."""
+        """Yield records in the order in which they came, with the number of the first one."""
         self._spool.seek(0)
         dtype = self.header.dtype
         for first in range(0, self.header.count, READ_POINTS):
             yield first, np.frombuffer(self._spool.read(READ_POINTS * dtype.itemsize), dtype)
 
     def _count_nodes(self, cube: _Cube, tree: _Tree) -> tuple[Int64Array, Int64Array]:
-        """Return nodes in the order of the file, and the points of each."""
+        """Return nodes in the order of the file, and the number of points in each."""
         found = [np.unique(tree.nodes(cube, first, records), return_counts=True) for first, records in self._blocks()]
         return _summed(found)
 
@@ -136,7 +137,7 @@ class CopcWriter:
 
 @dataclass(frozen=True)
 class _Cube:
-    """The root's cube in the units of the coordinate system, and how often it may be halved."""
+    """The root's cube in the units of the coordinate system, and the number of times it may be halved."""
 
     low: FloatArray
     size: float
@@ -162,11 +163,11 @@ class _Cube:
 
 @dataclass(frozen=True)
 class _Tree:
-    """Which share of a cell's points each level takes.
+    """The share of each cell's points that every level takes.
 
     Attributes:
-        cells: (k,) of the finest level, those that have points, rising.
-        left: (k, depth + 1) share of their points that is left when a level and all above it have taken theirs.
+        cells: (k,) cells of the finest level that have points, rising.
+        left: (k, depth + 1) share of their points that remains after a level and all above it have taken theirs.
     """
 
     cells: Int64Array
@@ -190,9 +191,7 @@ class _Tree:
         return cls(cells, left)
 
     def nodes(self, cube: _Cube, first: int, records: NDArray[np.void]) -> Int64Array:
-        """Return (n,) node of each record: level, x, y, z in the bits of a number that rises in the order of the
-        file.
-        """
+        """Return (n,) node of each record: level, x, y, z as bits of one number that rises in the order of the file."""
         nodes = np.empty(len(records), np.int64)
         _fill_nodes(cube.cells(records), first, self.cells, self.left, nodes)
         return nodes
@@ -220,7 +219,7 @@ def _fill_nodes(cells: Int64Array, first: int, known: Int64Array, left: FloatArr
 
 
 def _coarser(cells: Int64Array, levels: int) -> Int64Array:
-    """Return the cells in which cells lie, so many levels up."""
+    """Return the cells that contain the given ones, the given number of levels up."""
     x, y, z = (cells >> shift & _AXIS_MASK for shift in (2 * _AXIS_BITS, _AXIS_BITS, 0))
     coarse: Int64Array
     coarse = (x >> levels) << 2 * _AXIS_BITS | (y >> levels) << _AXIS_BITS | z >> levels
@@ -228,12 +227,12 @@ def _coarser(cells: Int64Array, levels: int) -> Int64Array:
 
 
 def _unpacked(nodes: Int64Array) -> list[Int64Array]:
-    """Return level, x, y, z of nodes."""
+    """Return level, x, y and z of nodes."""
     return [nodes >> shift * _AXIS_BITS & (_AXIS_MASK if shift < 3 else 15) for shift in (3, 2, 1, 0)]
 
 
 def _summed(found: list[tuple[Int64Array, Int64Array]]) -> tuple[Int64Array, Int64Array]:
-    """Return numbers that were found, rising, and how often over all."""
+    """Return the numbers found, rising, and the total count of each."""
     if not found:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     numbers, which = np.unique(np.concatenate([one for one, _ in found]), return_inverse=True)

@@ -1,7 +1,7 @@
-"""Writes LAZ 1.4: points as georeferenced into packed records in one compiled pass, and these through LASzip.
+"""Write LAZ 1.4: pack georeferenced points into records in one compiled pass, and compress these with LASzip.
 
 LAS 1.4-R15, point format 6; time is adjusted standard GPS time. The bytes depend on the points and their order, never
-on how they were cut into batches.
+on their division into batches.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from swath.georef.records import Int64Array
 ADJUSTED_GPS_EPOCH_S = 1_000_000_000
 SCAN_ANGLE_UNIT_RAD = math.radians(0.006)
 MAX_SCANNER_CHANNEL = 3
-BLOCK = 1 << 15  # points that are packed at a time: they stay in the cache until they are compressed
+BLOCK = 1 << 15  # points packed at a time: they stay in the cache until they are compressed
 _WITHHELD = 1 << 2
 _LARGEST = 2_147_483_647
 _TURN = 2.0 * math.pi
@@ -33,20 +33,20 @@ _AXES = ("easting", "northing", "height")
 
 
 class LasError(ValueError):
-    """Points that a LAS file cannot hold."""
+    """Raised for points that a LAS file cannot hold."""
 
 
 @dataclass(frozen=True, slots=True)
 class LasSettings:
-    """What all files of a run have in common.
+    """Settings shared by all files of a run.
 
     Attributes:
         wkt: coordinate system.
         offset: (3,) easting, northing, height near the points.
         scale: (3,) unit of the coordinates' integers, in the units of the coordinate system.
-        sigmas: three sigmas behind each point, uint16 of 0.1 mm.
-        creation_date: of the flight.
-        software, system_identifier: as the header names them.
+        sigmas: whether three sigmas follow each point, uint16 of 0.1 mm.
+        creation_date: date of the flight.
+        software, system_identifier: names for the header.
         provenance: see `LasHeader`.
     """
 
@@ -76,11 +76,11 @@ class LasSettings:
 
 @dataclass(slots=True)
 class Clipped:
-    """Points with a value larger than its field, in which its largest stands instead.
+    """Counts of points with a value larger than its field, which holds its largest value instead.
 
     Attributes:
         sigma: a sigma of 6.5535 m or more.
-        sigma_unknown: a sigma that is no number; 6.5535 m stands in the file.
+        sigma_unknown: a sigma that is not a number; the file holds 6.5535 m.
         intensity: an intensity above 65535.
     """
 
@@ -90,7 +90,7 @@ class Clipped:
 
 
 class PointPacker:
-    """Packs points into records as they stand in a file, and keeps what the header says of them.
+    """Packs points into records as a file holds them, and keeps the header's statistics.
 
     Args:
         header: of the file; its counts and extremes grow.
@@ -106,16 +106,16 @@ class PointPacker:
 
     @property
     def clipped(self) -> Clipped:
-        """What did not fit so far."""
+        """The counts of clipped values so far."""
         return Clipped(*self._clipped.tolist())
 
     def pack(
         self, points: Points, first: int, *, scanner: int = 0, intensity_factor: float = 1.0, withheld: bool = False
     ) -> NDArray[np.void]:
-        """Return records of at most `BLOCK` points from ``first`` on; the next call writes over them.
+        """Return records of at most `BLOCK` points from ``first`` on; the next call overwrites them.
 
         Raises:
-            LasError: coordinates beyond what the scale allows.
+            LasError: coordinates are beyond the range of the scale.
         """
         last = min(first + BLOCK, len(points))
         records = self._records[: last - first]
@@ -166,21 +166,21 @@ class LasWriter:
 
     @property
     def clipped(self) -> Clipped:
-        """What did not fit so far."""
+        """The counts of clipped values so far."""
         return self._packer.clipped
 
     def write(self, points: Points, *, scanner: int = 0, intensity_factor: float = 1.0, withheld: bool = False) -> None:
-        """Append points.
+        """Append points to the file.
 
         Args:
             points: any number.
-            scanner: number of the scanner, 0 …; those beyond 3 stand as 3.
-            intensity_factor: intensities are multiplied with it, and rounded.
-            withheld: points that are there, but not to be used.
+            scanner: number of the scanner, 0 …; numbers beyond 3 are written as 3.
+            intensity_factor: intensities are multiplied by it, and rounded.
+            withheld: whether the points are marked as not to be used.
 
         Raises:
-            LasError: coordinates beyond what the scale allows; the file cannot be finished then.
-            OSError: the stream's.
+            LasError: coordinates are beyond the range of the scale; the file cannot be finished then.
+            OSError: from the stream.
         """
         for first in range(0, len(points), BLOCK):
             records = self._packer.pack(
@@ -189,7 +189,7 @@ class LasWriter:
             self._compressor.compress_many(records.view(np.uint8))
 
     def close(self) -> None:
-        """Finish the points and write the header that tells of them."""
+        """Finish the points and write the header that describes them."""
         self._compressor.done()
         self._stream.seek(0)
         self._stream.write(self.header.encode(self._laszip.record_data()))
@@ -203,7 +203,7 @@ def _pack(
     intensity_factor: float, flags: int, source: int, least: FloatArray, largest: FloatArray,
     by_return: Int64Array, clipped: Int64Array,
 ) -> int:  # fmt: skip
-    """Pack as many points as there are records; the row of one that is out of bounds, else −1."""
+    """Pack as many points as there are records; return the row of a point that is out of bounds, or −1."""
     off_x, off_y, off_z = offset
     per_x, per_y, per_z = per_unit
     low_x, low_y, low_z = least
@@ -256,7 +256,7 @@ def _clip_sigmas(record: Any, east: float, north: float, height: float, clipped:
 
 @jit_cached
 def _pack_sigmas(out: Any, first: int, sigma_map: SingleArray, clipped: Int64Array) -> None:
-    """Three sigmas of each record; a sigma that is no number stands as the largest."""
+    """Write three sigmas of each record; a sigma that is not a number becomes the largest value."""
     per = 1.0 / SIGMA_SCALE_M
     for j in range(len(out)):
         i = first + j

@@ -1,4 +1,4 @@
-"""The bytes of a LAS 1.4 header and of the records behind it (LAS 1.4-R15; LASzip 3; COPC 1.0), nothing computed."""
+"""Encode a LAS 1.4 header and the records around the points (LAS 1.4-R15; LASzip 3; COPC 1.0), without computation."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _EXTRA_BYTES = struct.Struct("<2xBB32s4x24x24x24xd16x24x32s")
 _UINT16, _SCALED = 3, 1 << 3
 _COPC_INFO = struct.Struct("<5dQQ2d88x")
 
-# Bytes of a point as they stand in a file, those of format 6 first.
+# Bytes of a point as a file holds them; the fields of format 6 come first.
 _POINT_FIELDS = [
     ("x", "<i4"),
     ("y", "<i4"),
@@ -45,17 +45,17 @@ SIGMA_SCALE_M = 1e-4
 
 @dataclass(slots=True)
 class LasHeader:
-    """What a header says.
+    """The contents of a header.
 
     Attributes:
         scale, offset: (3,) coordinates = integer · scale + offset.
-        sigmas: the points have the three sigmas behind them.
+        sigmas: whether three sigmas follow each point.
         wkt: coordinate system.
-        creation_date: of the file; the flight's here, so that the same input gives the same bytes.
+        creation_date: of the file; here the date of the flight, so that the same input gives the same bytes.
         system_identifier, software: at most 32 bytes are kept.
-        file_source_id: of a file that is one strip, its number.
-        provenance: what the points were made with, JSON, as a record of ours; empty: none.
-        count, count_by_return, minimum, maximum: filled in when all points are written; the coordinates' integers.
+        file_source_id: number of the strip where the file is one strip.
+        provenance: inputs and settings behind the points, JSON, written as a record of this project; empty: no record.
+        count, count_by_return, minimum, maximum: set when all points are written; the coordinates' integers.
     """
 
     scale: NDArray[np.float64]
@@ -76,23 +76,23 @@ class LasHeader:
 
     @property
     def dtype(self) -> np.dtype[np.void]:
-        """Of a point."""
+        """The record type of a point."""
         return SIGMA_POINT_DTYPE if self.sigmas else POINT_DTYPE
 
     @property
     def bounds(self) -> NDArray[np.float64]:
-        """(2, 3) least and largest coordinates; zeros where there is no point."""
+        """Least and largest coordinates (2, 3); zeros without points."""
         if not self.count:
             return np.zeros((2, 3))
         bounds: NDArray[np.float64] = np.stack([self.minimum, self.maximum]) * self.scale + self.offset
         return bounds
 
     def encode(self, laszip: bytes, first_vlrs: bytes = b"", first_count: int = 0) -> bytes:
-        """Return header and records before the points.
+        """Return the header and the records before the points.
 
         Args:
-            laszip: the LASzip record's data.
-            first_vlrs, first_count: records that must stand first, and how many they are.
+            laszip: data of the LASzip record.
+            first_vlrs, first_count: records that must come first, and their number.
         """
         vlrs = first_vlrs + encode_vlr("LASF_Projection", 2112, _terminated(self.wkt), "OGC WKT coordinate system")
         count = first_count + 2
@@ -121,7 +121,7 @@ class LasHeader:
             count,
             POINT_FORMAT | COMPRESSED_BIT,
             self.dtype.itemsize,
-            *([0] * 6),  # the counts of LAS 1.3, which know no format 6
+            *([0] * 6),  # the counts of LAS 1.3, which does not have format 6
             *self.scale,
             *self.offset,
             *(max_x, min_x, max_y, min_y, max_z, min_z),
@@ -135,14 +135,18 @@ class LasHeader:
 
 
 def encode_vlr(user_id: str, record_id: int, data: bytes, description: str) -> bytes:
-    """Return a variable length record; raises ValueError where the data is longer than one can be."""
+    """Return a variable length record.
+
+    Raises:
+        ValueError: the data is too long for such a record.
+    """
     if len(data) > 0xFFFF:
         raise ValueError(f"record {user_id} {record_id} of {len(data)} bytes, more than 65535")
     return _VLR.pack(0, user_id.encode(), record_id, len(data), description.encode()) + data
 
 
 def encode_evlr(user_id: str, record_id: int, data: bytes, description: str) -> bytes:
-    """Return an extended record, which stands behind the points."""
+    """Return an extended variable length record, which follows the points."""
     return _EVLR.pack(0, user_id.encode(), record_id, len(data), description.encode()) + data
 
 
@@ -153,9 +157,7 @@ def encode_copc_info(
     hierarchy: tuple[int, int],
     gps_time: tuple[float, float],
 ) -> bytes:
-    """Return COPC's first record: the root's cube, the spacing of its points, offset and size of the root page, time
-    span.
-    """
+    """Return COPC's first record: the root's cube, its point spacing, offset and size of the root page, time span."""
     return _COPC_INFO.pack(*centre, half_size, spacing, *hierarchy, *gps_time)
 
 

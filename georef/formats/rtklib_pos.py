@@ -1,4 +1,4 @@
-"""RTKLIB .pos: positions of an antenna with sigmas, no attitude (RTKLIB manual 2.4.2, appendix B.1).
+"""Read RTKLIB .pos: antenna positions with sigmas, without attitude (RTKLIB manual 2.4.2, appendix B.1).
 
 Comment lines begin with %; the last one names the time system (GPST, UTC, JST) and the columns. Time is a date and a
 clock time, or week and seconds; positions are latitude, longitude and height, or ECEF.
@@ -22,7 +22,7 @@ from swath.georef.trajectory.trajectory import TrajectoryError
 TIME_SYSTEMS = ("GPST", "UTC", "JST")
 HEADER = re.compile(rf"^%\s*({'|'.join(TIME_SYSTEMS)})\s+(\S.*)$", re.MULTILINE)
 DMS = "(d'\")"
-LARGEST = 1e9  # no place, speed or sigma is so large
+LARGEST = 1e9  # no position, speed or sigma is this large
 GEODETIC, ECEF = ("latitude", "longitude", "height"), ("x-ecef", "y-ecef", "z-ecef")
 # Column Q (manual, appendix B.1): 1 fix, 2 float, 3 SBAS, 4 DGPS, 5 single, 6 PPP
 FIX_TYPES = {
@@ -41,7 +41,7 @@ def is_rtklib_pos(text: str) -> bool:
 
 
 def read_rtklib_pos(text: str, name: str, *, leap_seconds: int | None = None) -> TrajectoryColumns:
-    """Return rows of a .pos file; attitude is nan. ``leap_seconds``, GPS − UTC, is for files in UTC."""
+    """Return rows of a .pos file; attitude is nan. ``leap_seconds``, GPS − UTC, is used for files in UTC."""
     *_, found = HEADER.finditer(text)
     system, titles = found[1], found[2].split()
     if re.search(r"height=\S*/geodetic", text[: found.start()]):
@@ -72,7 +72,7 @@ def read_rtklib_pos(text: str, name: str, *, leap_seconds: int | None = None) ->
 
 
 def _columns(numbered: list[tuple[int, list[str]]], titles: list[str], name: str) -> dict[str, FloatArray]:
-    """Return columns by name without unit; degrees, minutes and seconds come as degrees."""
+    """Return columns by name without unit; degrees, minutes and seconds are converted to degrees."""
     widths = [3 if title.endswith(DMS) else 1 for title in titles]
     needed = 2 + sum(widths)
     for number, row in numbered:
@@ -82,7 +82,7 @@ def _columns(numbered: list[tuple[int, list[str]]], titles: list[str], name: str
         values = np.array([row[2:] for _, row in numbered], dtype=np.float64).reshape(len(numbered), -1)
     except ValueError as error:
         raise TrajectoryError(f"{name}: {error}") from None
-    large = (np.abs(values) > LARGEST).any(axis=1)  # nan: unsaid
+    large = (np.abs(values) > LARGEST).any(axis=1)  # nan: missing
     if large.any():
         raise TrajectoryError(f"{name}: line {numbered[int(np.argmax(large))][0]} has a number beyond {LARGEST:g}")
     table, begin = {}, 0
@@ -96,28 +96,26 @@ def _columns(numbered: list[tuple[int, list[str]]], titles: list[str], name: str
 
 
 def degrees_of(dms: FloatArray) -> FloatArray:
-    """Return (n,) degrees of degrees, minutes, seconds (n, 3); the sign is that of the degrees, be they −0."""
+    """Return (n,) degrees of degrees, minutes, seconds (n, 3); the sign is that of the degrees, also of −0."""
     size = np.abs(dms) @ np.array([1.0, 1.0 / 60.0, 1.0 / 3600.0])
     degrees: FloatArray = np.copysign(size, dms[:, 0])
     return degrees
 
 
 def fix_types(quality: FloatArray | None, known: dict[int, FixType]) -> NDArray[np.uint8] | None:
-    """Return (n,) `FixType` of a column of quality numbers; NONE of a number that is not known, None without a
-    column.
-    """
+    """Return (n,) `FixType` of a column of quality numbers: NONE for an unknown number; None without the column."""
     if quality is None:
         return None
     return np.array([known.get(int(q) if np.isfinite(q) else 0, FixType.NONE) for q in quality], dtype=np.uint8)
 
 
 def byte_counts(said: FloatArray) -> NDArray[np.uint8]:
-    """Return (n,) whole numbers from 0 to 255; 0 where none is said."""
+    """Return (n,) whole numbers from 0 to 255; missing ones become 0."""
     return np.clip(np.nan_to_num(said, nan=0.0), 0, 255).astype(np.uint8)
 
 
 def _correlation_l(table: dict[str, FloatArray], sigma_l: FloatArray) -> FloatArray | None:
-    """Return (n, 3) of north–east, north–down, east–down, of sdne, sdeu, sdun: roots of covariances with their sign."""
+    """Return correlations (n, 3), north–east, north–down, east–down, from sdne, sdeu, sdun: signed covariance roots."""
     if not all(column in table for column in ("sdne", "sdeu", "sdun")):
         return None
     mixed = _stacked(table, ("sdne", "sdun", "sdeu")) * np.array([1.0, -1.0, -1.0])

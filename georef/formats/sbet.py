@@ -1,10 +1,10 @@
-"""SBET and smrmsg, the binary trajectories of Applanix POSPac and of many others.
+"""Read and write SBET and smrmsg, the binary trajectories of Applanix POSPac and many others.
 
-SBET: 17 little-endian doubles a record: time (s of the GPS week), latitude, longitude (rad), height (m), velocity
-x, y, z (m/s), roll, pitch, platform heading, wander angle (rad), body accelerations x, y, z (m/s²), body rates (rad/s).
-The platform's x axis points wander angle α west of north, so true heading = platform heading − α. POSPac's y axis
-points left and z up, so that v_N = x cos α − y sin α, v_E = −x sin α − y cos α; others write right and down, and α = 0.
-Which it is, the positions tell.
+SBET: 17 little-endian doubles a record: time (s of the GPS week), latitude, longitude (rad), height (m), velocity x, y,
+z (m/s), roll, pitch, platform heading, wander angle (rad), body accelerations x, y, z (m/s²), body rates (rad/s). The
+platform's x axis points wander angle α west of north, so true heading = platform heading − α. POSPac's y axis points
+left and z up, so that v_N = x cos α − y sin α, v_E = −x sin α − y cos α; other writers use right and down, and α = 0.
+The positions show which convention a file follows.
 
 smrmsg: 10 doubles: time, sigmas of north, east, down (m), of the velocities (m/s), of roll, pitch and heading (arc
 minutes), once a second or as often as the SBET.
@@ -35,7 +35,8 @@ from swath.georef.trajectory.trajectory import Trajectory, TrajectoryError
 
 SBET_DOUBLES, SMRMSG_DOUBLES = 17, 10
 SBET_BYTES, SMRMSG_BYTES = 8 * SBET_DOUBLES, 8 * SMRMSG_DOUBLES
-LARGEST, USED_DOUBLES = 1e9, 11  # no place, speed or angle is so large; accelerations and rates behind are not taken
+# no position, speed or angle is this large; the accelerations and rates after the eleventh double are ignored
+LARGEST, USED_DOUBLES = 1e9, 11
 ARC_MINUTE = float(np.radians(1.0 / 60.0))
 # Signs of the platform's y and z axes against right and down: plain north, east, down; POSPac's; east, up
 AXES = ((1.0, 1.0), (-1.0, -1.0), (1.0, -1.0))
@@ -63,10 +64,10 @@ def read_sbet(
     """Return rows of an SBET.
 
     Args:
-        data: the file.
+        data: the file's bytes.
         name: for messages.
-        span_ns: GPS time of the first and last record of the log which it belongs to: tells the week.
-        week: GPS week of the first record; goes before span_ns.
+        span_ns: GPS time of the first and last record of its log, which gives the week.
+        week: GPS week of the first record; takes precedence over span_ns.
         sigmas: of the smrmsg beside it.
     """
     table = _table(data, name, "SBET", SBET_DOUBLES)
@@ -87,18 +88,22 @@ def read_sbet(
 
 
 def read_smrmsg(data: bytes, name: str) -> Sigmas:
-    """Return sigmas of a trajectory; TrajectoryError where the file is none."""
+    """Return sigmas of a trajectory.
+
+    Raises:
+        TrajectoryError: the file is not an smrmsg.
+    """
     table = _table(data, name, "smrmsg", SMRMSG_DOUBLES)
-    bad = (table[:, 1:] < 0.0).any(axis=1)  # nan: unsaid
+    bad = (table[:, 1:] < 0.0).any(axis=1)  # nan: missing
     if bad.any():
         raise TrajectoryError(f"{name}: a sigma at record {int(np.argmax(bad)) + 1} is negative; smrmsg is expected")
     return Sigmas(continuous_of_week(table[:, 0], name), table[:, 1:4], table[:, 4:7], table[:, 7:10] * ARC_MINUTE)
 
 
 def sbet_bytes(trajectory: Trajectory) -> bytes:
-    """Return the trajectory as an SBET: wander angle 0, velocities north, east, down, time running past the week's end.
+    """Return the trajectory as an SBET: wander angle 0, velocities north, east, down, time past the week's end.
 
-    Accelerations are those of the velocities relative to the earth, without gravity, and rates those relative to e.
+    Accelerations are derivatives of the velocities relative to the earth, without gravity; rates are relative to e.
     """
     trajectory.require_attitude()
     n = len(trajectory)
@@ -117,11 +122,11 @@ def sbet_bytes(trajectory: Trajectory) -> bytes:
 
 
 def smrmsg_bytes(trajectory: Trajectory, velocity_sigma_l: FloatArray | None = None) -> bytes:
-    """Return the trajectory's sigmas as an smrmsg, an epoch each; unsaid ones are nan.
+    """Return the trajectory's sigmas as an smrmsg, one record per epoch; missing ones are nan.
 
     Args:
-        trajectory: says those of position and attitude.
-        velocity_sigma_l: (n, 3) north, east, down, m/s; None: unsaid.
+        trajectory: gives sigmas of position and attitude.
+        velocity_sigma_l: (n, 3) north, east, down, m/s; None: missing.
     """
     table = np.full((len(trajectory), SMRMSG_DOUBLES), np.nan, dtype="<f8")
     if velocity_sigma_l is not None:
@@ -141,7 +146,7 @@ def _table(data: bytes, name: str, kind: str, doubles: int) -> FloatArray:
             f"{name}: {len(data)} bytes are {whole} records of {kind} ({size} bytes) and {over} over: truncated or none"
         )
     table = np.frombuffer(data, dtype="<f8").reshape(-1, doubles).astype(np.float64)
-    table[np.isnan(table)] = np.nan  # one that signals would, at the first reckoning
+    table[np.isnan(table)] = np.nan  # replaces signalling nans, which would raise at the first computation
     time_s = table[:, 0]
     wrong = ~((time_s >= 0.0) & (time_s < 10.0 * WEEK_S))
     if wrong.any():
@@ -149,7 +154,7 @@ def _table(data: bytes, name: str, kind: str, doubles: int) -> FloatArray:
         raise TrajectoryError(
             f"{name}: time {time_s[at]:.6g} at record {at + 1} is no second of a week; {kind} is expected"
         )
-    large = (np.abs(table[:, 1:USED_DOUBLES]) > LARGEST).any(axis=1)  # nan: unsaid
+    large = (np.abs(table[:, 1:USED_DOUBLES]) > LARGEST).any(axis=1)  # nan: missing
     if large.any():
         raise TrajectoryError(
             f"{name}: record {int(np.argmax(large)) + 1} has a number beyond {LARGEST:g}; {kind} is expected, "
@@ -159,9 +164,9 @@ def _table(data: bytes, name: str, kind: str, doubles: int) -> FloatArray:
 
 
 def _velocity_l(columns: TrajectoryColumns, wander_rad: FloatArray, whole: NDArray[np.bool_]) -> FloatArray:
-    """Return north, east, down, by those axes of the platform with which velocities go the way the positions go.
+    """Return velocities north, east, down, by the platform axes with which they agree with the positions' motion.
 
-    That is judged by the records that say everything, ``whole`` (n,).
+    Only complete records, ``whole`` (n,), decide this.
     """
     x, y, z = columns.velocity_l.T
     cos, sin = np.cos(wander_rad), np.sin(wander_rad)
@@ -178,10 +183,10 @@ def _velocity_l(columns: TrajectoryColumns, wander_rad: FloatArray, whole: NDArr
 
 
 def _sigmas_at(of_week_ns: Int64Array, sigmas: Sigmas | None, name: str) -> tuple[FloatArray, FloatArray]:
-    """Return position and attitude sigmas at the SBET's epochs, linear between theirs; unsaid before and after them."""
+    """Return position and attitude sigmas at the SBET's epochs, linear between their own, missing outside them."""
     if sigmas is None:
         return unsaid(len(of_week_ns)), unsaid(len(of_week_ns))
-    for shift_ns in (0, WEEK_NS, -WEEK_NS):  # one of the files may begin only after the week's end
+    for shift_ns in (0, WEEK_NS, -WEEK_NS):  # one of the two files may begin only after the week's end
         theirs = sigmas.of_week_ns + shift_ns
         if theirs[0] <= of_week_ns[-1] and of_week_ns[0] <= theirs[-1]:
             break
@@ -198,7 +203,7 @@ def _sigmas_at(of_week_ns: Int64Array, sigmas: Sigmas | None, name: str) -> tupl
 
 
 def _once_round(angle_rad: FloatArray) -> FloatArray:
-    """Return 0 … 2π, for angles within one turn of it: others stay as they are, to be refused."""
+    """Return angles in 0 … 2π where they lie within one turn of it; others stay as they are, to be refused."""
     return np.where(np.abs(angle_rad) <= 4 * np.pi, angle_rad % (2 * np.pi), angle_rad)
 
 

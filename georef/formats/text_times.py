@@ -1,4 +1,4 @@
-"""Dates, clock times and UTC in text files of trajectories."""
+"""Read dates, clock times and UTC in text files of trajectories."""
 
 from __future__ import annotations
 
@@ -21,13 +21,11 @@ from swath.georef.trajectory.trajectory import TrajectoryError
 
 CLOCK = re.compile(r"(\d\d?):(\d\d?):(\d\d?(?:\.\d*)?)", re.ASCII)
 WEEK, SECONDS = re.compile(r"\d{1,4}", re.ASCII), re.compile(r"\d{1,7}(\.\d*)?", re.ASCII)
-FIRST_YEAR, LAST_YEAR = 1980, 2125  # of GPS time in 64 bits of nanoseconds, with room for differences
+FIRST_YEAR, LAST_YEAR = 1980, 2125  # limits of GPS time in 64 bits of nanoseconds, with a margin for differences
 
 
 def gps_days(texts: Sequence[str], order: str, name: str) -> Int64Array:
-    """Return (n,) days since the GPS epoch of dates like ``2026/11/22`` in an order like YMD; two-digit years are
-    20yy.
-    """
+    """Return (n,) days since the GPS epoch of dates like ``2026/11/22`` in an order like YMD; years yy are 20yy."""
     distinct, which = np.unique(np.asarray(texts), return_inverse=True)
     days = [_date(str(text), order, name).toordinal() - GPS_EPOCH.toordinal() for text in distinct]
     return np.asarray(days, dtype=np.int64)[which]
@@ -39,7 +37,7 @@ def clock_ns(texts: Sequence[str], name: str) -> Int64Array:
 
 
 def weeks_ns(weeks: Sequence[str], seconds: Sequence[str], name: str) -> Int64Array:
-    """Return (n,) GPS time of weeks and seconds of the week."""
+    """Return (n,) GPS time from weeks and seconds of the week."""
     for week, second in zip(weeks, seconds, strict=True):
         if not (WEEK.fullmatch(week) and SECONDS.fullmatch(second)):
             raise TrajectoryError(
@@ -51,13 +49,13 @@ def weeks_ns(weeks: Sequence[str], seconds: Sequence[str], name: str) -> Int64Ar
 
 
 def gps_ns_of_day(days: Int64Array, of_day_ns: Int64Array) -> Int64Array:
-    """Return (n,) GPS time of days since the GPS epoch and nanoseconds of the day, both in GPS time."""
+    """Return (n,) GPS time from days since the GPS epoch and nanoseconds of the day, both in GPS time."""
     gps_ns: Int64Array = days * DAY_NS + of_day_ns
     return gps_ns
 
 
 def leap_seconds_on(day: int, said: int | None, name: str) -> int:
-    """Return GPS − UTC on a day since the GPS epoch: what was said, or the built-in table as far as it reaches."""
+    """Return GPS − UTC on a day since the GPS epoch: the given value, or the built-in table as far as it reaches."""
     if said is not None:
         return said
     date = GPS_EPOCH + dt.timedelta(days=int(day))

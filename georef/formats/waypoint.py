@@ -1,14 +1,14 @@
-"""Text of Waypoint's export profiles (Inertial Explorer, GrafNav): free columns under a line of names and one of units.
+"""Read text of Waypoint's export profiles (Inertial Explorer, GrafNav): columns under a line of names and one of units.
 
     Week     GPSTime       Latitude      Longitude      H-Ell         Roll        Pitch      Heading
                (sec)     (+/-D M S)     (+/-D M S)        (m)        (deg)        (deg)        (deg)
 
-Columns stand apart by blanks, or by commas, semicolons or tabs; with other marks than commas between them, numbers may
-have decimal commas.
+Columns are separated by blanks, or by commas, semicolons or tabs; with separators other than commas, numbers may have
+decimal commas.
 
 Attitude is that of a body whose y axis points forward: roll, pitch and heading mean the same as here. Its yaw counts
 the other way round (Inertial Explorer User Guide 8.50, 3.2.3) and is not taken for a heading. Time is GPS time by week
-and second of the week, or by date; UTC needs the offset which the header may say.
+and second of the week, or by date; UTC needs the offset, which the header may give.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from swath.georef.records import FixType, Int64Array
 from swath.georef.timescales.gps_time import DAY_NS, SECOND_NS, WEEK_NS, WEEK_S
 from swath.georef.trajectory.trajectory import TrajectoryError
 
-# What a column is called in export profiles, in lower case and without marks -> what it is
+# Names of columns in export profiles, in lower case and without marks, and the quantity behind each
 NAMES = {
     **dict.fromkeys(("week", "gpsweek"), "week"),
     **dict.fromkeys(("gpstime", "corrtime", "gpssow", "gpstow", "sow", "tow", "gpstod", "time"), "time"),
@@ -54,8 +54,8 @@ NAMES = {
     **dict.fromkeys(("q", "quality"), "quality"),
     **dict.fromkeys(("ns", "numsv", "numsats"), "satellites"),
 }
-# Quality number of Waypoint's programs: 1 fixed integer, 2 converged float or noisy fixed, 3 and 4 converging float,
-# 5 differential code, 6 less than that
+# Quality number of Waypoint's programs: 1 fixed integer, 2 converged float or noisy fixed, 3 and 4 converging float, 5
+# differential code, 6 worse
 FIX_TYPES = {
     1: FixType.RTK_FIXED,
     2: FixType.RTK_FLOAT,
@@ -71,14 +71,14 @@ UNIT = re.compile(r"\((sec|m|deg|rad|HMS|\+/-D M S|D M S)\)")
 DECIMAL_COMMA = re.compile(r"(?<=[0-9]),(?=[0-9])")
 UTC_OFFSET = re.compile(r"^[ \t]*UTC Offset:[ \t]*-?([0-9]{1,3})(?:\.0*)?[ \t]*s?[ \t]*$", re.MULTILINE | re.IGNORECASE)
 SCALING = re.compile(r"^[ \t]*(Position|Attitude):[ \t]*([0-9]{1,6}(?:\.[0-9]{1,9})?)[ \t]*$", re.MULTILINE)
-MOST_COLUMNS = 200  # of an export; profiles have some 30
+MOST_COLUMNS = 200  # maximum in an export; profiles have about 30
 DATE_ORDERS = {"(MDY)": "MDY", "(YMD)": "YMD", "(DMY)": "DMY"}
 RADIANS, METRES, METRES_PER_SECOND = {"(deg)": np.pi / 180, "(rad)": 1.0}, {"(m)": 1.0}, {"(m/s)": 1.0}
 
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """One column: what it is, its unit as printed, and the words of a line that are its."""
+    """One column: its unit as printed, and the words of a line that belong to it."""
 
     unit: str
     first: int
@@ -87,13 +87,13 @@ class Column:
 
 @dataclass(slots=True)
 class Sheet:
-    """The file taken apart.
+    """The parts of an export file.
 
     Attributes:
         header: the lines above the table.
-        columns: by what they are.
+        columns: by quantity.
         lines: of data.
-        first_line: number of the first of them.
+        first_line: number of the first line of data.
         name: of the file.
     """
 
@@ -104,12 +104,12 @@ class Sheet:
     name: str
 
     def words(self, what: str) -> list[str]:
-        """Return (n,) one word a line."""
+        """Return (n,) words of a column, one per line."""
         at = self.columns[what].first
         return [line.split()[at] for line in self.lines]
 
     def numbers(self, what: str) -> FloatArray:
-        """Return (n, words) or, of one word, (n,); nan where there is no such column."""
+        """Return the numbers of a column, (n, words) or, of one word, (n,); nan where the column is missing."""
         column = self.columns.get(what)
         if column is None:
             return np.full(len(self.lines), np.nan)
@@ -121,9 +121,7 @@ class Sheet:
         return table[:, 0] if column.words == 1 else table
 
     def quantity(self, what: str, units: dict[str, float]) -> FloatArray:
-        """Return (n,) of a column in SI units, of those that are taken; one that stands below no unit is in the
-        first.
-        """
+        """Return (n,) values of a column in SI units, given in one of ``units``; without one, in the first."""
         column = self.columns.get(what)
         unit = column.unit.lower() if column is not None and column.unit else next(iter(units))
         if unit not in units:
@@ -132,7 +130,7 @@ class Sheet:
         return self.numbers(what) * units[unit]
 
     def angle_rad(self, what: str) -> FloatArray:
-        """Return (n,) of a column in degrees, in degrees, minutes and seconds, or in radians."""
+        """Return (n,) radians of a column in degrees, in degrees, minutes and seconds, or in radians."""
         column = self.columns.get(what)
         if column is not None and column.words == 3:
             return np.radians(degrees_of(self.numbers(what)))
@@ -140,7 +138,7 @@ class Sheet:
 
 
 def is_waypoint(text: str) -> bool:
-    """Return whether a line of known names is followed by one of units."""
+    """Return whether the text has a line of known column names followed by a line of units."""
     return _title_line(text.splitlines()) is not None
 
 
@@ -152,9 +150,9 @@ def read_waypoint(
     Args:
         text: of the file.
         name: for messages.
-        span_ns: GPS time of the log's first and last record: the week where the file says none.
-        week: goes before span_ns.
-        leap_seconds: GPS − UTC for times in UTC; the file's header goes before it.
+        span_ns: GPS time of the log's first and last record, which gives the week of a file without one.
+        week: takes precedence over span_ns.
+        leap_seconds: GPS − UTC for times in UTC; the file's header takes precedence over it.
     """
     sheet = _sheet(text, name)
     if "height" not in sheet.columns and "height_above_geoid" in sheet.columns:
@@ -194,7 +192,7 @@ def read_waypoint(
 
 
 def _title_line(lines: list[str]) -> int | None:
-    """Number of the line of names: those of a position are among them, and units stand below."""
+    """Return the number of the line of names: it has those of a position, and units below; None without such a line."""
     for number, (line, below) in enumerate(pairwise(lines)):
         known = {NAMES.get(_plain(cell)) for cell in _cells(line, _separator(line))}
         if {"lat", "lon"} <= known and UNIT.search(below):
@@ -203,7 +201,7 @@ def _title_line(lines: list[str]) -> int | None:
 
 
 def _separator(titles: str) -> str | None:
-    """Return the mark between the names of columns; None: blanks."""
+    """Return the separator between the names of columns; None for blanks."""
     return next((mark for mark in SEPARATORS if titles.count(mark) > 1), None)
 
 
@@ -215,7 +213,7 @@ def _cells(line: str, separator: str | None) -> list[str]:
 
 
 def _names(titles: str, separator: str | None) -> list[str]:
-    """Return the names of columns; a mark behind the last one begins none."""
+    """Return the names of columns; a trailing separator does not begin another one."""
     cells = _cells(titles, separator)
     return cells[:-1] if cells and not cells[-1] else cells
 
@@ -228,7 +226,7 @@ def _blank_separated(lines: list[str], separator: str | None, columns: int) -> l
     made = []
     for line in lines:
         cells = _cells(line, separator) if line.strip() else []
-        if len(cells) == columns + 1 and not cells[-1]:  # a mark behind the last column
+        if len(cells) == columns + 1 and not cells[-1]:  # a trailing separator
             cells.pop()
         joined = " ".join(cell or "nan" for cell in cells)
         made.append(joined if separator == "," else DECIMAL_COMMA.sub(".", joined))
@@ -261,7 +259,7 @@ def _sheet(text: str, name: str) -> Sheet:
                 "cannot be told from commas between columns; export it with decimal points, or semicolons or blanks"
             )
         raise TrajectoryError(f"{name}: no line of {words} words, as its columns have, below line {at + 2}")
-    for number in range(rows[0], rows[-1]):  # a header and a footer may be there; a gap between may not
+    for number in range(rows[0], rows[-1]):  # a header and a footer are allowed, but not a gap between lines of data
         if counts[number] != words:
             what = f"{words} words are expected, {counts[number]} are there"
             raise TrajectoryError(f"{name}: line {number + at + 3}: {what}")
@@ -287,8 +285,9 @@ def _layout(titles: str, units: str, separator: str | None) -> tuple[dict[str, C
 
 
 def _unit_of(names: list[re.Match[str]], units: list[re.Match[str]]) -> dict[int, str]:
-    """Return the unit of names by their number: in their order, each below one name, all together as near as can be."""
-    cost = np.full((len(units) + 1, len(names) + 1), np.inf)  # of so many units below so many names
+    """Return units by number of the name above: in order, one per name, with the least total distance between them."""
+    # least total distance for the first j units below the first i names
+    cost = np.full((len(units) + 1, len(names) + 1), np.inf)
     cost[0] = 0.0
     for j, unit in enumerate(units):
         for i in range(j, len(names)):
@@ -334,7 +333,7 @@ def _gps_ns(sheet: Sheet, span_ns: Span | None, week: int | None, leap_seconds: 
 
 
 def _of_seconds(sheet: Sheet, time: str, days: Int64Array | None, span_ns: Span | None, week: int | None) -> Int64Array:
-    """Return seconds of the week, or of the day where a date says that they are."""
+    """Return GPS time (n,) of seconds of the week, or of the day where a date shows that they are."""
     seconds = sheet.numbers(time)
     if not ((seconds >= 0.0) & (seconds < 10.0 * WEEK_S)).all():
         raise TrajectoryError(f"{sheet.name}: a time is no number of seconds of a week")

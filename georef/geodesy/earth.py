@@ -1,7 +1,7 @@
 """The ellipsoid of WGS 84: geodetic and earth-centred coordinates, the local level frame (FORMULAS 1.2, 1.3).
 
-Latitude and longitude in radians, heights above the ellipsoid in metres, e is ECEF (EPSG:4978), l is north, east, down
-along the ellipsoid's normal.
+Latitude and longitude are in radians, heights above the ellipsoid in metres; e is ECEF (EPSG:4978), l is north, east,
+down along the ellipsoid's normal.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ EP2 = E2 / (1.0 - E2)
 
 
 def prime_vertical_radius_m(lat_rad: ArrayLike) -> FloatArray:
-    """Return radius of curvature N across the meridian (ISO/TS 19159-2 Eq. 7)."""
+    """Return the radius of curvature N across the meridian (ISO/TS 19159-2 Eq. 7)."""
     radius: FloatArray = A_M / np.sqrt(1.0 - E2 * np.sin(np.asarray(lat_rad, dtype=np.float64)) ** 2)
     return radius
 
 
 def meridian_radius_m(lat_rad: ArrayLike) -> FloatArray:
-    """Return radius of curvature M of the meridian."""
+    """Return the radius of curvature M of the meridian."""
     sin = np.sin(np.asarray(lat_rad, dtype=np.float64))
     radius: FloatArray = A_M * (1.0 - E2) / (1.0 - E2 * sin**2) ** 1.5
     return radius
 
 
 def e_from_geodetic(lat_rad: ArrayLike, lon_rad: ArrayLike, height_m: ArrayLike) -> FloatArray:
-    """Return ECEF (…, 3) of geodetic coordinates (ISO/TS 19159-2 Eq. 7, completed)."""
+    """Return ECEF positions (…, 3) of geodetic coordinates (ISO/TS 19159-2 Eq. 7, completed)."""
     lat, lon, height = np.broadcast_arrays(*(np.asarray(a, dtype=np.float64) for a in (lat_rad, lon_rad, height_m)))
     radius = prime_vertical_radius_m(lat)
     flat = (radius + height) * np.cos(lat)
@@ -43,8 +43,9 @@ def e_from_geodetic(lat_rad: ArrayLike, lon_rad: ArrayLike, height_m: ArrayLike)
 
 
 def geodetic_from_e(position_e: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return latitude, longitude (−π … π) and height (…,) of ECEF (…, 3), to 1e-9 m and better up to 100 km of
-    height.
+    """Return latitude, longitude (−π … π) and height (…,) of ECEF positions (…, 3).
+
+    They are exact to 1e-9 m or better up to 100 km of height.
     """
     position = np.asarray(position_e, dtype=np.float64)
     flat = np.ascontiguousarray(position.reshape(-1, 3))
@@ -55,7 +56,7 @@ def geodetic_from_e(position_e: ArrayLike) -> tuple[FloatArray, FloatArray, Floa
 
 
 def rot_e_from_l(lat_rad: ArrayLike, lon_rad: ArrayLike) -> FloatArray:
-    """Return (…, 3, 3), columns north, east, down in e (ISO/TS 19159-2 Eq. 4, whose caption is reversed)."""
+    """Return rotations (…, 3, 3), columns north, east, down in e (ISO/TS 19159-2 Eq. 4, whose caption is reversed)."""
     lat, lon = np.broadcast_arrays(np.asarray(lat_rad, dtype=np.float64), np.asarray(lon_rad, dtype=np.float64))
     sin_lat, cos_lat, sin_lon, cos_lon = np.sin(lat), np.cos(lat), np.sin(lon), np.cos(lon)
     zero = np.zeros_like(lat)

@@ -1,8 +1,8 @@
 """Normal gravity of WGS 84 in e, continued to height, and its gradient.
 
-Somigliana's formula on the ellipsoid, the expansion to second order in height above it, along the ellipsoid's normal
-(NIMA TR8350.2, 3rd ed., Eq. 4-1 and 4-3). Gravity is what a plumb bob at rest on the turning earth feels: the
-centrifugal acceleration is in it.
+Somigliana's formula holds on the ellipsoid, an expansion to second order in height above it, along the ellipsoid's
+normal (NIMA TR8350.2, 3rd ed., Eq. 4-1 and 4-3). Gravity is the acceleration of a plumb bob at rest on the turning
+earth: it includes the centrifugal acceleration.
 """
 
 from __future__ import annotations
@@ -25,10 +25,9 @@ GRAVITY_RATIO = 0.00344978650684  # m = ω² a² b / GM
 
 @jit_inline
 def normal_of(x: float, y: float, z: float) -> tuple[Three, float]:
-    """Return upward normal of the ellipsoid in e and the height of a point, without a trigonometric function (Bowring
-    1976).
+    """Return the ellipsoid's upward normal in e and the height of a point, without trigonometry (Bowring 1976).
 
-    At the poles, where the longitude is none, the normal is ±z; the direction is good to 1e-11 rad below 20 km.
+    At the poles, where longitude is undefined, the normal is ±z; the direction is good to 1e-11 rad below 20 km.
     """
     flat = math.sqrt(x * x + y * y)
     sin, cos = A_M * z, B_M * flat
@@ -43,7 +42,7 @@ def normal_of(x: float, y: float, z: float) -> tuple[Three, float]:
 
 @jit_inline
 def normal_gravity(sin: float, height_m: float) -> float:
-    """Return magnitude, m/s², at the sine of a latitude and a height."""
+    """Return the magnitude, m/s², at the sine of a latitude and a height."""
     square = sin * sin
     surface = EQUATOR_GRAVITY_MPS2 * (1.0 + SOMIGLIANA_K * square) / math.sqrt(1.0 - E2 * square)
     ratio = height_m / A_M
@@ -60,10 +59,10 @@ def gravity_of(x: float, y: float, z: float) -> Three:
 
 @jit_inline
 def gradient_of(x: float, y: float, z: float) -> Matrix:
-    """Return ∂ gravity / ∂ position in e, 1/s²: the normal turns by 1 / (M + h) and 1 / (N + h), the magnitude falls
-    upward.
+    """Return ∂ gravity / ∂ position in e, 1/s².
 
-    The magnitude's change to the north, 8e-9 1/s² at most, is in it too.
+    The normal turns by 1 / (M + h) and 1 / (N + h), and the magnitude falls upward. The magnitude's change to the
+    north, 8e-9 1/s² at most, is included.
     """
     up, height_m = normal_of(x, y, z)
     sin = up[2]
@@ -111,7 +110,7 @@ def _gradient_row(
 
 
 def gravity_e(position_e: ArrayLike) -> FloatArray:
-    """Return (…, 3) normal gravity in e, m/s², at positions (…, 3)."""
+    """Return normal gravity in e (…, 3), m/s², at positions (…, 3)."""
     position = np.asarray(position_e, dtype=np.float64)
     flat = np.ascontiguousarray(position.reshape(-1, 3))
     gravity = np.empty_like(flat)

@@ -1,4 +1,4 @@
-"""Arithmetic of quaternions (…, 4) of unit length, scalar first, in NumPy: no matrices on the way, little memory."""
+"""Arithmetic of unit quaternions (…, 4), scalar first, in NumPy, without matrices in between to save memory."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from swath.georef.arrays import FloatArray
 
 
 def about(axis: int, angle_rad: ArrayLike) -> FloatArray:
-    """Return (…, 4) of the right-handed turns by angles (…,) about axis 0, 1 or 2."""
+    """Return quaternions (…, 4) of right-handed turns by angles (…,) about axis 0, 1 or 2."""
     half = np.asarray(angle_rad, dtype=np.float64) / 2
     q = np.zeros((*half.shape, 4))
     q[..., 0], q[..., 1 + axis] = np.cos(half), np.sin(half)
@@ -17,7 +17,7 @@ def about(axis: int, angle_rad: ArrayLike) -> FloatArray:
 
 
 def conjugate(q: FloatArray) -> FloatArray:
-    """Return the turn back."""
+    """Return the inverse turn."""
     back: FloatArray = q * np.array([1.0, -1.0, -1.0, -1.0])
     return back
 
@@ -42,7 +42,7 @@ def rotated(q: FloatArray, vector: FloatArray) -> FloatArray:
 
 
 def rotation_vector(q: FloatArray) -> FloatArray:
-    """Return (…, 3) axis times angle, rad, the shorter way round (angle ≤ π)."""
+    """Return (…, 3) axis times angle, rad, of the shorter turn (angle ≤ π)."""
     sine = np.sqrt((q[..., 1:] ** 2).sum(axis=-1, keepdims=True))
     cosine = q[..., :1]
     half = np.arctan2(sine, np.abs(cosine))
@@ -53,5 +53,5 @@ def rotation_vector(q: FloatArray) -> FloatArray:
 
 
 def rotations_between(q: FloatArray) -> FloatArray:
-    """Return (n − 1, 3) from each of (n, 4) to the next, as `rotation_vector` in the axes of the first."""
+    """Return turns (n − 1, 3) from each of (n, 4) to the next, as `rotation_vector` in the axes of the first."""
     return rotation_vector(product(conjugate(q[:-1]), q[1:]))

@@ -1,7 +1,7 @@
 """Rotations: elementary matrices, attitude, boresight, quaternions, deflection of the vertical (FORMULAS 0, 1.4–1.8).
 
 All are active and right-handed: ``rot_b_from_s`` takes coordinates in s to coordinates in b. Quaternions are of unit
-length, scalar first. Functions take angles (…,) in radians and give (…, 3, 3).
+length, scalar first. Functions take angles (…,) in radians and return (…, 3, 3).
 """
 
 from __future__ import annotations
@@ -14,22 +14,22 @@ from swath.georef.geodesy.earth import rot_e_from_l
 
 
 def rot_x(angle_rad: ArrayLike) -> FloatArray:
-    """Return about x: y turns towards z."""
+    """Return the rotation about x: y turns towards z."""
     return _about(angle_rad, 1, 2)
 
 
 def rot_y(angle_rad: ArrayLike) -> FloatArray:
-    """Return about y: z turns towards x."""
+    """Return the rotation about y: z turns towards x."""
     return _about(angle_rad, 2, 0)
 
 
 def rot_z(angle_rad: ArrayLike) -> FloatArray:
-    """Return about z: x turns towards y."""
+    """Return the rotation about z: x turns towards y."""
     return _about(angle_rad, 0, 1)
 
 
 def _about(angle_rad: ArrayLike, first: int, second: int) -> FloatArray:
-    """Return the turn that takes axis `first` towards axis `second`."""
+    """Return the rotation that takes axis `first` towards axis `second`."""
     angle = np.asarray(angle_rad, dtype=np.float64)
     rotation = np.broadcast_to(np.eye(3), (*angle.shape, 3, 3)).copy()
     rotation[..., first, first] = rotation[..., second, second] = np.cos(angle)
@@ -39,7 +39,7 @@ def _about(angle_rad: ArrayLike, first: int, second: int) -> FloatArray:
 
 
 def rot_l_from_b(roll_rad: ArrayLike, pitch_rad: ArrayLike, heading_rad: ArrayLike) -> FloatArray:
-    """Return attitude, Rz(heading) Ry(pitch) Rx(roll) (ISO/TS 19159-2 Eq. 3, whose label is reversed)."""
+    """Return the attitude, Rz(heading) Ry(pitch) Rx(roll) (ISO/TS 19159-2 Eq. 3, whose label is reversed)."""
     return rot_z(heading_rad) @ rot_y(pitch_rad) @ rot_x(roll_rad)
 
 
@@ -53,12 +53,12 @@ def attitude_of(rot_l_from_b: ArrayLike) -> tuple[FloatArray, FloatArray, FloatA
 
 
 def boresight(omega_rad: ArrayLike, phi_rad: ArrayLike, kappa_rad: ArrayLike) -> FloatArray:
-    """Return rx(ω) Ry(φ) Rz(κ), from the installed scanner's axes to b (ISO/TS 19159-2 Eq. 2; FORMULAS 1.6)."""
+    """Return Rx(ω) Ry(φ) Rz(κ), from the installed scanner's axes to b (ISO/TS 19159-2 Eq. 2; FORMULAS 1.6)."""
     return rot_x(omega_rad) @ rot_y(phi_rad) @ rot_z(kappa_rad)
 
 
 def skew(vector: ArrayLike) -> FloatArray:
-    """Return (…, 3, 3) of vectors (…, 3): skew(v) @ a = v × a."""
+    """Return matrices (…, 3, 3) of vectors (…, 3): skew(v) @ a = v × a."""
     x, y, z = np.moveaxis(np.asarray(vector, dtype=np.float64), -1, 0)
     zero = np.zeros_like(x)
     rows = ((zero, -z, y), (z, zero, -x), (-y, x, zero))
@@ -66,10 +66,11 @@ def skew(vector: ArrayLike) -> FloatArray:
 
 
 def rot_l_from_plumb(lat_rad: ArrayLike, xi_rad: ArrayLike, eta_rad: ArrayLike) -> FloatArray:
-    """From axes of the plumb line (x towards geodetic north) to l, by the deflection of the vertical (FORMULAS 1.8).
+    """Return the rotation from axes of the plumb line (x towards geodetic north) to l (FORMULAS 1.8).
 
-    The astronomic frame of latitude + ξ and longitude + η / cos(latitude), turned back by the Laplace term
-    η tan(latitude), so that headings stay geodetic; plumb-down is (−ξ, −η, 1) in l to first order.
+    It is that of the deflection of the vertical: the astronomic frame of latitude + ξ and longitude + η /
+    cos(latitude), turned back by the Laplace term η tan(latitude), so that headings stay geodetic; plumb-down is (−ξ,
+    −η, 1) in l to first order.
     """
     lat, xi, eta = np.broadcast_arrays(*(np.asarray(a, dtype=np.float64) for a in (lat_rad, xi_rad, eta_rad)))
     east = eta / np.cos(lat)
@@ -78,12 +79,14 @@ def rot_l_from_plumb(lat_rad: ArrayLike, xi_rad: ArrayLike, eta_rad: ArrayLike) 
 
 
 def quaternion_from_rot(rotation: ArrayLike) -> FloatArray:
-    """Return (…, 4) of matrices (…, 3, 3), scalar first and ≥ 0, from the largest of the four components (Shepperd
-    1978).
+    """Return quaternions (…, 4) of matrices (…, 3, 3), scalar first and ≥ 0.
+
+    They follow from the largest of the four components (Shepperd 1978).
     """
     r = np.asarray(rotation, dtype=np.float64)
     xx, yy, zz = r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]
-    products = np.empty((*r.shape[:-2], 4, 4))  # 4 q qᵀ, whose row of the largest diagonal element is q but for length
+    # 4 q qᵀ, whose row with the largest diagonal element is q except for its length
+    products = np.empty((*r.shape[:-2], 4, 4))
     products[..., 0, 0] = 1.0 + xx + yy + zz
     products[..., 1, 1] = 1.0 + xx - yy - zz
     products[..., 2, 2] = 1.0 - xx + yy - zz
@@ -99,7 +102,7 @@ def quaternion_from_rot(rotation: ArrayLike) -> FloatArray:
 
 
 def rot_from_quaternion(quaternion: ArrayLike) -> FloatArray:
-    """Return (…, 3, 3) of quaternions (…, 4) of unit length, scalar first."""
+    """Return matrices (…, 3, 3) of unit quaternions (…, 4), scalar first."""
     w, x, y, z = np.moveaxis(np.asarray(quaternion, dtype=np.float64), -1, 0)
     rows = (
         (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),

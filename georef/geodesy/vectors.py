@@ -1,4 +1,4 @@
-"""Rotations on single vectors, numbers only."""
+"""Rotations of single vectors with plain numbers, for compiled loops."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from swath.georef.scanner.kernels.types import Matrix, Three
 SMALL_ANGLE_2 = 1e-2  # below 0.1 rad the series below are exact to the last bit
 LARGE_ANGLE = 1e5  # up to here a whole number of quarter turns times the first part of π/2 is exact
 _PER_QUARTER = 2.0 / math.pi
-_TO_WHOLE = 1.5 * 2.0**52  # added, it leaves no room for a fraction
+_TO_WHOLE = 1.5 * 2.0**52  # adding it rounds away the fraction
 _QUARTER = (1.5707963267341256, 6.077100506506192e-11, 2.022266248795951e-21)  # π/2 in three parts of 33 bits
 
 
@@ -35,13 +35,13 @@ def matrix_at(array: FloatArray, k: int) -> Matrix:
 
 @jit_inline
 def rot_at(q: FloatArray, k: int) -> Matrix:
-    """Return matrix of unit quaternion k of (n, 4), scalar first."""
+    """Return the matrix of unit quaternion k of (n, 4), scalar first."""
     return rot_of(q[k, 0], q[k, 1], q[k, 2], q[k, 3])
 
 
 @jit_inline
 def rot_of(w: float, x: float, y: float, z: float) -> Matrix:
-    """Return matrix of a unit quaternion."""
+    """Return the matrix of a unit quaternion."""
     return (
         (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
         (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
@@ -51,19 +51,19 @@ def rot_of(w: float, x: float, y: float, z: float) -> Matrix:
 
 @jit_inline
 def dot(a: Three, b: Three) -> float:
-    """Return inner product."""
+    """Return the inner product."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @jit_inline
 def times(m: Matrix, v: Three) -> Three:
-    """Return a matrix times a vector."""
+    """Return the product of a matrix and a vector."""
     return dot(m[0], v), dot(m[1], v), dot(m[2], v)
 
 
 @jit_inline
 def small_sine_cosine(square: float, angle: float) -> tuple[float, float]:
-    """Return factor · sin(x)/x and cos(x) of small x, of their square and the factor: of x itself, the sine."""
+    """Return factor · sin(x)/x and cos(x) of small x, from x² and the factor; with factor x, the sine."""
     sin = 1.0 - square * (1.0 / 6.0 - square * (1.0 / 120.0 - square * (1.0 / 5040.0 - square / 362880.0)))
     cos = 1.0 - square * (0.5 - square * (1.0 / 24.0 - square * (1.0 / 720.0 - square / 40320.0)))
     return angle * sin, cos
@@ -71,7 +71,7 @@ def small_sine_cosine(square: float, angle: float) -> tuple[float, float]:
 
 @jit_inline
 def sine_cosine(square: float, angle: float) -> tuple[float, float]:
-    """Return sin(angle), cos(angle) of mostly small angles; ``square`` is that of the angle."""
+    """Return sin(angle), cos(angle) of mostly small angles; ``square`` is the angle squared."""
     if square >= SMALL_ANGLE_2:
         return math.sin(angle), math.cos(angle)
     return small_sine_cosine(square, angle)
@@ -79,7 +79,7 @@ def sine_cosine(square: float, angle: float) -> tuple[float, float]:
 
 @jit_inline
 def sine_cosine_of_large(angle: float, sin: float, cos: float) -> tuple[float, float]:
-    """Return what `sin_cos` gave, or where it does not reach the library's."""
+    """Return the given `sin_cos` result, or the library's where the angle is beyond its limit."""
     if abs(angle) < LARGE_ANGLE:
         return sin, cos
     return math.sin(angle), math.cos(angle)
@@ -87,9 +87,9 @@ def sine_cosine_of_large(angle: float, sin: float, cos: float) -> tuple[float, f
 
 @jit_inline
 def sin_cos(angle: float) -> tuple[float, float]:
-    """Return sine and cosine at once, to the last bit or so: Cody and Waite's reduction, the polynomials of fdlibm.
+    """Return sine and cosine at once, to about the last bit: Cody and Waite's reduction, the polynomials of fdlibm.
 
-    Without a branch; beyond LARGE_ANGLE it means nothing.
+    It has no branch that stops vectorisation; beyond LARGE_ANGLE the result is meaningless.
     """
     quarters = (angle * _PER_QUARTER if abs(angle) < LARGE_ANGLE else 0.0) + _TO_WHOLE - _TO_WHOLE
     rest = angle - quarters * _QUARTER[0]
@@ -139,39 +139,39 @@ def plus(a: Three, factor: float, b: Three) -> Three:
 
 @jit_inline
 def unit(a: Three) -> Three:
-    """Return a vector's direction; of none, none."""
+    """Return a vector's direction; a zero vector for a zero vector."""
     per_length = 1.0 / math.sqrt(max(dot(a, a), 1e-300))
     return per_length * a[0], per_length * a[1], per_length * a[2]
 
 
 @jit_inline
 def cross(a: Three, b: Three) -> Three:
-    """Return vector product."""
+    """Return the vector product."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 @jit_inline
 def transposed_times(m: Matrix, v: Three) -> Three:
-    """Return a matrix, transposed, times a vector."""
+    """Return the product of a transposed matrix and a vector."""
     a, b, c = m
     return plus(plus((v[0] * a[0], v[0] * a[1], v[0] * a[2]), v[1], b), v[2], c)
 
 
 @jit_inline
 def product(a: Matrix, b: Matrix) -> Matrix:
-    """Of two matrices."""
+    """Return the product of two matrices."""
     return transposed_times(b, a[0]), transposed_times(b, a[1]), transposed_times(b, a[2])
 
 
 @jit_inline
 def turned_by(sin: float, cos: float, v: Three) -> Three:
-    """Return ry(angle) v, of the angle's sine and cosine."""
+    """Return Ry(angle) v, from the angle's sine and cosine."""
     return cos * v[0] + sin * v[2], v[1], cos * v[2] - sin * v[0]
 
 
 @jit_inline
 def small_turn_factors(square: float, share: float) -> tuple[float, float]:
-    """Return `turn_factors` of turns that are small for sure."""
+    """Return `turn_factors` of turns that are certainly small."""
     first = 1.0 - square * (1.0 / 6.0 - square * (1.0 / 120.0 - square * (1.0 / 5040.0 - square / 362880.0)))
     second = 0.5 - square * (1.0 / 24.0 - square * (1.0 / 720.0 - square * (1.0 / 40320.0 - square / 3628800.0)))
     return share * first, share * share * second

@@ -1,9 +1,9 @@
-"""Expansions of a map over cubes of space: what PROJ takes 300 ns for, in 15, to 0.1 mm of it.
+"""Approximate a map by expansions over cubes of space: 15 ns a point where PROJ takes 300 ns, within 0.1 mm.
 
-e is filled with cubes of 1024 m, each halved as often as needed down to 16 m. A cube has the map's value at its centre
-and the first and second derivatives, from 19 exact values, and is checked against 72 more when it is made. Where even
-16 m are too much (a grid's edge, a crease of a coarse geoid), its points are mapped exactly, one by one. A cube is a
-function of its place alone, so a point's result does not depend on the points before it.
+Cubes of 1024 m fill e, each halved as often as needed down to 16 m. A cube holds the map's value at its centre and the
+first and second derivatives, from 19 exact values, and is checked against 72 more when it is made. Where even 16 m are
+too large (a grid's edge, a crease of a coarse geoid), its points are mapped exactly, one by one. A cube depends on its
+place alone, so a point's result does not depend on the points before it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from swath.georef.compiled import jit_cached, jit_inline
 Exact = Callable[[FloatArray], FloatArray]
 
 APPROXIMATION_M = 1e-4
-TOLERANCE_M = 3e-5  # a crease between the points of the check can hide 2.4 times what they show
+TOLERANCE_M = 3e-5  # a crease between the checked points can hide 2.4 times the error that they show
 ROOT_M = 1024.0
 LEVELS = 6
 CELLS_KEPT = 100_000
@@ -39,15 +39,16 @@ _ABSENT, _BEYOND = -1, -2
 
 
 def _stencil() -> FloatArray:
-    """Return centre, six faces, twelve edges of a cube of half size 1: (19, 3)."""
+    """Return the centre, the faces' and the edges' centres of a cube of half size 1: (19, 3)."""
     lattice = np.array(list(itertools.product((0.0, -1.0, 1.0), repeat=3)))
     stencil: FloatArray = lattice[np.count_nonzero(lattice, axis=1) <= 2]
     return stencil
 
 
 def _checks() -> FloatArray:
-    """Return corners, where the neglected third order is largest and a crease cannot hide, and a lattice inside: (72,
-    3).
+    """Return the points (72, 3) at which a cube is checked: its corners and a lattice inside.
+
+    At the corners the neglected third order is largest and a crease cannot hide.
     """
     corners = itertools.product((-1.0, 1.0), repeat=3)
     inside = itertools.product((-0.75, -0.25, 0.25, 0.75), repeat=3)
@@ -74,9 +75,9 @@ _CROSS = {
 class MapCells:
     """The cubes made so far, for one map.
 
-    `exact` takes positions in e (n, 3) to map coordinates (n, 3), not finite where there is none; `unit_m` are the
-    metres in a unit of each map coordinate; `admit` is given the centres of new cubes (n, 3) and raises where the map
-    is not to be used; `alone` is `exact` for the points that no cube is good enough for, and may raise.
+    `exact` takes positions in e (n, 3) to map coordinates (n, 3), not finite where it has none; `unit_m` are the metres
+    in a unit of each map coordinate; `admit` takes the centres of new cubes (n, 3) and raises where the map must not be
+    used; `alone` replaces `exact` for points without a sufficiently accurate cube, and may raise.
     """
 
     def __init__(
@@ -89,14 +90,17 @@ class MapCells:
         return len(self._node_of)
 
     def map(self, points_e: FloatArray) -> FloatArray:
-        """Map coordinates (n, 3) of positions in e (n, 3); what has none is for `alone` to say."""
+        """Map positions in e (n, 3) to coordinates (n, 3); `alone` decides about points that have none."""
         mapped = np.empty((len(points_e), 3))
         for block in _blocks(len(points_e)):
             self._expand(points_e[block], mapped[block])
         return mapped
 
     def map_with_sigmas(self, points_e: FloatArray, covariance_e: FloatArray) -> tuple[FloatArray, NDArray[np.float32]]:
-        """As `map`; and sigmas (n, 3) in metres along the map's axes, of covariances in e (n, 6) xx xy xz yy yz zz."""
+        """Return `map`, and sigmas (n, 3) in metres along the map's axes.
+
+        Covariances are (n, 6) in e, xx xy xz yy yz zz.
+        """
         mapped, sigmas = np.empty((len(points_e), 3)), np.empty((len(points_e), 3), dtype=np.float32)
         for block in _blocks(len(points_e)):
             nodes = self._expand(points_e[block], mapped[block])
@@ -104,7 +108,7 @@ class MapCells:
         return mapped, sigmas
 
     def _expand(self, points: FloatArray, out: FloatArray) -> NDArray[np.int32]:
-        """Fill ``out``; the cubes of the points are returned."""
+        """Fill ``out`` with coordinates, and return the cubes of the points."""
         nodes = self._locate(points)
         if _expand(points, nodes, self._rows, self._kinds, out):
             beyond = (nodes < 0) | (self._kinds[nodes] == EXACT)
@@ -120,10 +124,10 @@ class MapCells:
         self._table_nodes = np.full(1024, _ABSENT, dtype=np.int32)
 
     def _locate(self, points: FloatArray) -> NDArray[np.int32]:
-        """Return the cube of each point, made where it is missing; negative for what is no place near the earth.
+        """Return the cube of each point, made if missing; negative for points not near the earth.
 
-        Old cubes go all at once, before a block: to make again the few hundred of one block costs less than to keep
-        account of their use.
+        All old cubes are dropped at once, before a block: making the few hundred of one block again costs less than
+        tracking their use.
         """
         if len(self._node_of) > CELLS_KEPT:
             self._clear()
@@ -140,7 +144,7 @@ class MapCells:
                 self._make(keys[start : start + CELLS_AT_ONCE])
 
     def _make(self, keys: IntArray) -> None:
-        """Make cubes and put them where they are found."""
+        """Make cubes and enter them in the tables."""
         level, corner = keys >> 60, np.stack([(keys >> shift & _MASK) - _OFFSET for shift in (40, 20, 0)], axis=-1)
         size = (ROOT_M / 2.0**level).astype(np.float64)
         centre = (corner + 0.5) * size[:, None]
@@ -192,9 +196,9 @@ class MapCells:
 def expand_cells(
     exact: Exact, centre: FloatArray, half_m: FloatArray, unit_m: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return expansions (n, 34) about centres (n, 3), and the largest error in metres (n,) that was found in each cube.
+    """Return expansions (n, 34) about centres (n, 3), and the largest error in metres (n,) found in each cube.
 
-    Central differences over the whole cube; infinite where the map has no value.
+    Derivatives are central differences over the whole cube; the error is infinite where the map has no value.
     """
     n = len(centre)
     offsets = np.concatenate([STENCIL, CHECKS])
@@ -264,7 +268,7 @@ def _descend(
     kinds: NDArray[np.int8],
     rows: FloatArray,
 ) -> tuple[int, int]:
-    """Return the cube of a point and 0, or −1 and the key of the cube that is missing."""
+    """Return the cube of a point and 0, or −1 and the key of the missing cube."""
     key = _key_at(0, x, y, z)
     slot = _slot_of(key, len(table_keys))
     while table_nodes[slot] >= 0 and table_keys[slot] != key:
@@ -291,7 +295,7 @@ def _find(
     kinds: NDArray[np.int8],
     rows: FloatArray,
 ) -> int:
-    """Fill in `nodes` where they are absent and known; the keys of the others are listed in `wanted`, and counted."""
+    """Fill in `nodes` that are absent and known; list the keys of the others in `wanted`, and return their number."""
     absent = 0
     x0 = x1 = y0 = y1 = z0 = z1 = 0.0
     last = _ABSENT
@@ -319,7 +323,7 @@ def _find(
 
 @jit_inline
 def _second_order(row: NDArray[np.float64], j: int, x: float, y: float, z: float, squares: tuple[float, ...]) -> float:
-    """Return coordinate j of an expansion, x, y, z from its centre."""
+    """Return coordinate j of an expansion at x, y, z from its centre."""
     a, b = np.uint64(7 + 3 * j), np.uint64(16 + 6 * j)
     xx, xy, xz, yy, yz, zz = squares
     ones = (np.uint64(1), np.uint64(2), np.uint64(3), np.uint64(4), np.uint64(5))
@@ -334,7 +338,7 @@ def _second_order(row: NDArray[np.float64], j: int, x: float, y: float, z: float
 def _expand(
     points: FloatArray, nodes: NDArray[np.int32], rows: FloatArray, kinds: NDArray[np.int8], out: FloatArray
 ) -> int:
-    """Evaluate the expansions; the count of points that have none is returned, and they are left as they are."""
+    """Evaluate the expansions; return the number of points without one, whose rows stay unchanged."""
     without = 0
     for i in range(len(points)):
         node = nodes[i]
@@ -352,7 +356,7 @@ def _expand(
 
 @jit_inline
 def _sigma(row: NDArray[np.float64], j: int, xx: float, xy: float, xz: float, yy: float, yz: float, zz: float) -> float:
-    """Return √(g Σ gᵀ) with g the first derivatives of coordinate j (law of propagation of variances)."""
+    """Return √(g Σ gᵀ), g the first derivatives of coordinate j (law of propagation of variances)."""
     at = np.uint64(7 + 3 * j)
     a, b, c = row[at], row[at + np.uint64(1)], row[at + np.uint64(2)]
     variance = a * (a * xx + 2.0 * (b * xy + c * xz)) + b * (b * yy + 2.0 * c * yz) + c * c * zz
@@ -367,7 +371,7 @@ def _project(
     unit_m: FloatArray,
     sigmas: NDArray[np.float32],
 ) -> None:
-    """Sigmas along the axes of the map; not a number beyond the reach of cubes."""
+    """Compute sigmas along the axes of the map; nan beyond the reach of cubes."""
     for i in range(len(nodes)):
         if nodes[i] < 0:
             sigmas[i, 0] = sigmas[i, 1] = sigmas[i, 2] = np.nan

@@ -1,10 +1,10 @@
-"""Which mapping frames are taken, and by which operation of PROJ positions come there: judged, or refused.
+"""Choose the PROJ operation that takes positions to a mapping frame, or refuse it.
 
 PROJ always answers: with an identity where it knows nothing better than 1 m, with ellipsoidal heights where a geoid's
-grid is missing. Here an operation is taken only if its steps are known to 5 cm, none is a guess ("ballpark"), and no
-better one is left out for a missing grid. Two things are stated and not judged: how well a geoid model stands for its
-vertical datum, since the grid is what defines the heights; and which member of a datum ensemble (ETRS89, WGS 84) the
-output stands for, since every member is a valid one.
+grid is missing. This module accepts an operation only if its steps are known to 5 cm, none is a guess ("ballpark"), and
+no better one is left out for a missing grid. Two things are stated and not judged: how well a geoid model realises its
+vertical datum, since the grid defines the heights; and which member of a datum ensemble (ETRS89, WGS 84) the output
+realises, since every member is a valid one.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ from swath.georef.geodesy.earth import A_M, B_M, e_from_geodetic, geodetic_from_
 Area = tuple[float, float, float, float]
 
 ACCURACY_M = 0.05
-ELLIPSOID_M = 0.01  # of its axes: GRS 80 and WGS 84 are a tenth of a millimetre apart
+ELLIPSOID_M = 0.01  # tolerance of its axes: GRS 80 and WGS 84 differ by a tenth of a millimetre
 WGS84 = "EPSG:4978"
 SAME = "same"
-# Geographic CRS of EPSG's that coordinates are often in: of plates (within metres of ITRF), and of older surveys.
+# Common geographic CRS of EPSG's: of plates (within metres of ITRF), and of older surveys.
 CONTINENTS = (4258, 6318, 4617, 7844, 4283, 4167, 6668, 4674, 4148)
 NATIONS = (4230, 4314, 4312, 4275, 4277, 4289, 4313, 4149, 4156, 4284, 4179, 4265, 4124, 4267, 4301, 4202, 4618, 4214)
 _NAMED = 'name their datum (gnss.datum or --trajectory-datum, such as "EPSG:7912", ITRF2014, with output.epoch)'
@@ -46,12 +46,12 @@ _GEOCENTRIC_AXES = [
 
 
 class MappingError(ValueError):
-    """A mapping frame, datum or position that is refused: one line that says what, and what would settle it."""
+    """Raised for a mapping frame, datum or position that is refused: one line with the fault and the remedy."""
 
 
 @dataclass(frozen=True)
 class Target:
-    """A mapping frame: its horizontal CRS (projected, or geocentric with `vertical` None), and what it is called."""
+    """A mapping frame: its horizontal CRS (projected, or geocentric with `vertical` None), and its name."""
 
     text: str
     crs: CRS
@@ -67,10 +67,10 @@ class Target:
 
 @dataclass(frozen=True)
 class Operation:
-    """How positions in e come to the mapping frame.
+    """The way from positions in e to the mapping frame.
 
-    `definition` is PROJ's pipeline; `accuracy_m` is of the steps that were judged, `stated_accuracy_m` is PROJ's own
-    sum, geoid and ensembles included (None: unknown); `realisation` is the member of the output's datum ensemble.
+    `definition` is PROJ's pipeline; `accuracy_m` is that of the judged steps, `stated_accuracy_m` is PROJ's own sum,
+    geoid and ensembles included (None: unknown); `realisation` is the member of the output's datum ensemble.
     """
 
     name: str
@@ -82,23 +82,24 @@ class Operation:
 
     @property
     def moves(self) -> bool:
-        """Whether it needs an epoch: rates of a frame, or a model of deformation."""
+        """True if it needs an epoch, for rates of a frame or a model of deformation."""
         return "t_epoch=" in self.definition or "proj=defmodel" in self.definition
 
 
 @dataclass(frozen=True)
 class _Judgement:
-    """One operation of PROJ, judged: `fault` is empty where it may be taken."""
+    """The verdict on one operation of PROJ: `fault` is empty if it may be used."""
 
     operation: Operation | None
     fault: str
 
 
 def read_target(text: str) -> Target:
-    """Return a mapping frame as the user wrote it (anything PROJ reads).
+    """Return a mapping frame as the user wrote it (any text that PROJ reads).
 
-    Raises MappingError for what is not projected (geocentric is taken: ECEF), for axes other than east and north, and
-    for depths.
+    Raises:
+        MappingError: the frame is not projected (a geocentric one is accepted: ECEF), has axes other than east and
+            north, or counts depths.
     """
     crs = _read(text, "output.crs")
     parts = crs.sub_crs_list if crs.is_compound else [crs]
@@ -119,11 +120,11 @@ def read_target(text: str) -> Target:
 
 
 def read_source(datum: str | None, target: Target) -> CRS:
-    """Return the geocentric CRS of positions in e: None is WGS 84 of unknown realisation, "same" is the target's own
-    datum.
+    """Return the geocentric CRS of positions in e: None is WGS 84 of unknown realisation, "same" the target's datum.
 
-    Raises MappingError for what is no datum of positions, and for datums on another ellipsoid than WGS 84's: latitudes,
-    longitudes and heights of receivers and files are taken to e on that one.
+    Raises:
+        MappingError: not a datum of positions, or on another ellipsoid than WGS 84's: latitudes, longitudes and heights
+            of receivers and files are converted to e on that one.
     """
     if datum is None:
         return CRS.from_user_input(WGS84)
@@ -145,8 +146,10 @@ def choose(
 ) -> tuple[Operation, bool]:
     """Return the best operation from positions to the mapping frame in an area (west, south, east, north in degrees).
 
-    Without an area the frame's own is looked at: False says that another operation may be best in a part of it. Raises
-    MappingError where the best is refused, or nothing in the frame's area could be taken.
+    Without an area the frame's own is used: False means that another operation may be best in a part of it.
+
+    Raises:
+        MappingError: the best operation is refused, or none in the frame's area is acceptable.
     """
     used = area or _area_of_use(target)
     flat = _candidates(_key(source), _key(target.horizontal), used)
@@ -179,7 +182,7 @@ def _area_of_use(target: Target) -> Area:
 
 @dataclass(frozen=True)
 class _Candidates:
-    """PROJ's operations from one CRS to another, best first, and the grids that the best of all lacks.
+    """PROJ's operations from one CRS to another, best first, and the missing grids of the best one.
 
     A grid is its file's name, and whether PROJ's server has it.
     """
@@ -191,14 +194,14 @@ class _Candidates:
 
 
 def _key(crs: CRS) -> str:
-    """Return a text of a CRS that PROJ reads back without loss."""
+    """Return a text for a CRS that PROJ reads back without loss."""
     authority = crs.to_authority(min_confidence=100)
     return ":".join(authority) if authority and CRS.from_user_input(":".join(authority)) == crs else crs.to_json()
 
 
 @functools.lru_cache(maxsize=64)
 def _candidates(source: str, target: str, area: Area) -> _Candidates:
-    """Ask PROJ, which takes up to a second, with grids looked for on this machine alone."""
+    """Ask PROJ for operations, which takes up to a second; grids are looked for on this machine alone."""
     set_network_enabled(False)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -220,7 +223,7 @@ def _candidates(source: str, target: str, area: Area) -> _Candidates:
 
 
 def _judge(candidate: Transformer, target: Target, accuracy_m: float) -> _Judgement:
-    """Sum up what the steps are good to; a step from a member of the output's own ensemble to the ensemble is none."""
+    """Sum up the accuracies of the steps; a step from a member of the output's ensemble to the ensemble counts as 0."""
     total, realisation, grids = 0.0, "", []
     for step in _steps(candidate):
         grids += [grid.short_name for grid in step.grids]
@@ -242,7 +245,7 @@ def _judge(candidate: Transformer, target: Target, accuracy_m: float) -> _Judgem
 
 
 def _steps(candidate: Transformer) -> tuple[CoordinateOperation, ...]:
-    """Return the steps of an operation; one that has a single step is that step."""
+    """Return the steps of an operation; an operation of one step is that step."""
     return tuple(candidate.operations or ()) or (CoordinateOperation.from_string(candidate.to_wkt()),)
 
 
@@ -258,7 +261,7 @@ def _operation(candidate: Transformer, accuracy_m: float, realisation: str, grid
 
 
 def _member(step: CoordinateOperation, target: Target) -> str:
-    """Return the realisation's name, if a step does nothing but call it by the name of the output's ensemble."""
+    """Return the realisation's name if a step only renames it to the output's ensemble; empty otherwise."""
     text: dict[str, Any] = step.to_json_dict()
     source, ensemble = text.get("source_crs") or {}, (text.get("target_crs") or {}).get("datum_ensemble")
     geodetic = target.horizontal.geodetic_crs
@@ -269,7 +272,7 @@ def _member(step: CoordinateOperation, target: Target) -> str:
 
 
 def _refusal(flat: _Candidates, judged: list[_Judgement], target: Target, datum: str | None) -> str:
-    """Return why the datum part is refused, and what would settle it."""
+    """Return why the datum part is refused, and the remedy."""
     if flat.missing:
         return f'PROJ\'s best operation, "{_short(flat.best_name)}", lacks {_how_to_get(flat.missing)}'
     first = judged[0]
@@ -294,7 +297,7 @@ def _guesses(candidate: Transformer) -> bool:
 
 
 def _with_heights(best: Transformer, flat: Operation, target: Target, area: Area, accuracy_m: float) -> Operation:
-    """Return the operation with heights, which has to agree with the judged one in the plane."""
+    """Return the operation with heights, which must agree with the judged one in the plane."""
     grids = tuple(grid.short_name for step in _steps(best) for grid in step.grids)
     operation = _operation(best, flat.accuracy_m, flat.realisation, grids or _named_grids(str(best.definition)))
     if _apart_m(operation, flat, area) > max(accuracy_m, flat.stated_accuracy_m or 0.0):
@@ -310,7 +313,7 @@ def _named_grids(definition: str) -> tuple[str, ...]:
 
 
 def _apart_m(one: Operation, other: Operation, area: Area) -> float:
-    """Return distance in the plane between two operations in the middle of an area (in units of the map)."""
+    """Return the distance in the plane between two operations in the middle of an area (in units of the map)."""
     lon, lat = (area[0] + area[2] + (360.0 if area[2] < area[0] else 0.0)) / 2.0, (area[1] + area[3]) / 2.0
     xyz = Transformer.from_pipeline("+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart")
     at = (*xyz.transform(lon, lat, 0.0), 2020.0)
@@ -320,8 +323,10 @@ def _apart_m(one: Operation, other: Operation, area: Area) -> float:
 
 
 def transformer_of(operation: Operation) -> Transformer:
-    """Return PROJ's transformer of an operation, the same in every process. Raises MappingError where a grid has
-    gone.
+    """Return PROJ's transformer of an operation, the same in every process.
+
+    Raises:
+        MappingError: a grid is no longer available.
     """
     set_network_enabled(False)
     try:
@@ -332,7 +337,7 @@ def transformer_of(operation: Operation) -> Transformer:
 
 
 def between_datums(positions_e: FloatArray, source: CRS, target: CRS, epoch: float) -> FloatArray | None:
-    """Return positions (n, 3) of one geocentric CRS in another at a decimal year; None where PROJ knows no way."""
+    """Return positions (n, 3) of one geocentric CRS in another at a decimal year; None if PROJ has no operation."""
     set_network_enabled(False)
     try:
         transformer = Transformer.from_crs(source, target, always_xy=True, allow_ballpark=False)
@@ -345,15 +350,16 @@ def between_datums(positions_e: FloatArray, source: CRS, target: CRS, epoch: flo
 
 
 def datum_that_explains(fix_e: FloatArray, apart_e: FloatArray, tolerance_m: float, epoch: float) -> str:
-    """Return the name of the datum in which a position would lie so far from where it is; empty: none known there.
+    """Return the name of the datum that explains the offset of a position from its true place; empty if none does.
 
     Datums of continents and nations whose area of use holds the place are tried, with their heights and with those of
-    the place as they are. Coordinates on another ellipsoid are taken to be read on that of WGS 84, as they were here.
+    the place unchanged. Coordinates on another ellipsoid are taken as if they had been read on that of WGS 84, as they
+    were here.
 
     Args:
-        fix_e: (3,) where it is, in WGS 84 or ITRF, m.
-        apart_e: (3,) where it is said to be, less that, m.
-        tolerance_m: difference that is none.
+        fix_e: (3,) the true place, in WGS 84 or ITRF, m.
+        apart_e: (3,) the given place minus fix_e, m.
+        tolerance_m: the difference below which a datum fits.
         epoch: decimal year.
     """
     lat, lon, height = (float(value[0]) for value in geodetic_from_e(fix_e[np.newaxis]))
@@ -370,7 +376,7 @@ def datum_that_explains(fix_e: FloatArray, apart_e: FloatArray, tolerance_m: flo
 
 
 def _misread(source: str, code: int, place: tuple[float, float, float], epoch: float) -> list[FloatArray]:
-    """Return where (3,) coordinates of a place in a geographic CRS lie if they are read on the ellipsoid of WGS 84."""
+    """Return positions (3,) of coordinates in a geographic CRS if they are read on the ellipsoid of WGS 84."""
     lon_deg, lat_deg, height = place
     area = CRS.from_epsg(code).area_of_use
     if area is None or not (area.south <= lat_deg <= area.north and _between_lon(lon_deg, area.west, area.east)):
@@ -390,7 +396,7 @@ def _between_lon(lon_deg: float, west_deg: float, east_deg: float) -> bool:
 
 @functools.lru_cache(maxsize=64)
 def _to_geographic(source: str, code: int) -> Transformer | None:
-    """Return the way to a geographic CRS with ellipsoidal heights, which takes PROJ some tenths of a second to find."""
+    """Return the transformer to a geographic CRS with ellipsoidal heights; PROJ takes tenths of a second to find it."""
     set_network_enabled(False)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -429,9 +435,7 @@ def _unbound(crs: CRS) -> CRS:
 
 
 def _has_our_ellipsoid(crs: CRS) -> bool:
-    """Return whether geodetic coordinates on it mean what they mean on the ellipsoid of
-    `swath.georef.geodesy.earth`.
-    """
+    """Return whether a CRS has the ellipsoid of `swath.georef.geodesy.earth`, within `ELLIPSOID_M`."""
     ellipsoid = crs.ellipsoid
     if ellipsoid is None:
         return False
@@ -449,7 +453,7 @@ def _refuse_ellipsoid(datum: str, crs: CRS) -> None:
 
 
 def _geocentric(crs: CRS) -> CRS:
-    """Return the geocentric CRS on the datum of another."""
+    """Return the geocentric CRS on the datum of the given one."""
     if crs.is_geocentric:
         return crs
     geodetic = crs.geodetic_crs
@@ -462,7 +466,7 @@ def _geocentric(crs: CRS) -> CRS:
 
 
 def _refuse_axes(text: str, crs: CRS, horizontal: CRS, vertical: CRS | None) -> None:
-    """PROJ swaps northing and easting, but leaves axes that point west or south as they are."""
+    """Refuse axes that point west, south or down, which PROJ leaves as they are; it swaps northing and easting."""
     if any(axis.direction == "west" for axis in horizontal.axis_info) and horizontal.is_projected:
         raise MappingError(
             f'output.crs = "{text}" ({crs.name}) counts towards the west and south: points are written as easting, '

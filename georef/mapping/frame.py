@@ -1,8 +1,8 @@
-"""From earth-centred positions to the coordinates that are delivered: any projected CRS, with heights, by PROJ.
+"""Convert earth-centred positions to the delivered coordinates: any projected CRS, with heights, by PROJ.
 
-`Mapping` gives easting, northing and height in this order and in the CRS's own units, whatever order the CRS lists its
-axes in. Which operation is taken and which are refused: georef/mapping/datums.py; how it is made quick:
-georef/mapping/cells.py. A geocentric CRS gives ECEF metres.
+`Mapping` returns easting, northing and height in this order and in the CRS's own units, whatever order the CRS lists
+its axes in. georef/mapping/datums.py chooses the operation and refuses unsuitable ones; georef/mapping/cells.py makes
+it quick. A geocentric CRS gives ECEF metres.
 """
 
 from __future__ import annotations
@@ -43,14 +43,14 @@ FAR_DEG = 9.0
 
 
 class Mapping:
-    """A mapping frame m and the way to it from e.
+    """A mapping frame m and the operation that leads there from e.
 
-    `crs` is whatever PROJ reads; `datum` names the realisation of the positions (None: WGS 84, realisation unknown;
-    "same": the user's word that it is the output's datum); `epoch` is the positions' (decimal years); `area` (west,
-    south, east, north, degrees) is where the points lie; `accuracy_m` is what the operation must be good to. Where PROJ
-    knows several operations and no area is said, the choice is made by `settle` or by the first point mapped.
+    `crs` is any text that PROJ reads; `datum` names the realisation of the positions (None: WGS 84, realisation
+    unknown; "same": the user states that it is the output's datum); `epoch` is the positions' (decimal years); `area`
+    (west, south, east, north, degrees) is where the points lie; `accuracy_m` is the accuracy that the operation must
+    have. Where PROJ knows several operations and no area is given, `settle` or the first mapped point decides.
 
-    Raises MappingError, now or then, for a frame or an operation that is refused.
+    Raises MappingError, at once or later, for a frame or an operation that is refused.
     """
 
     def __init__(
@@ -86,16 +86,16 @@ class Mapping:
 
     @property
     def wkt(self) -> str:
-        """Well-known text of the whole CRS: version 1 as LAS 1.4 demands (OGC 01-009), 2 where 1 has no words."""
+        """Well-known text of the whole CRS: version 1 as LAS 1.4 demands (OGC 01-009), or 2 if 1 cannot express it."""
         return _wkt(self._target.crs)
 
     @property
     def datum_crs(self) -> CRS:
-        """The geocentric CRS that positions in e are of."""
+        """The geocentric CRS of positions in e."""
         return self._source
 
     def convergence_rad(self, position_e: FloatArray) -> float:
-        """Return the direction of grid north at a position (3,), clockwise from true north, rad; 0: no projection."""
+        """Return the direction of grid north at a position (3,), clockwise from true north, rad; 0 if not projected."""
         if self._geocentric:
             return 0.0
         lat, lon, _ = (math.degrees(float(value[0])) for value in geodetic_from_e(position_e[np.newaxis]))
@@ -110,7 +110,7 @@ class Mapping:
         return np.array([*units, 1.0][:3])
 
     def misfit(self, points_e: FloatArray) -> str:
-        """Return why the frame does not suit positions in e (n, 3), as of `misfit_of`; empty: it suits."""
+        """Return why the frame does not suit positions in e (n, 3), by `misfit_of`; empty if it suits."""
         if self._geocentric or not len(points_e):
             return ""
         lat, lon, _ = (np.degrees(angle) for angle in geodetic_from_e(points_e))
@@ -119,9 +119,10 @@ class Mapping:
         )
 
     def settle(self, points_e: ArrayLike) -> None:
-        """Choose the operation for positions in e (n, 3), if that is still open: before work is shared out.
+        """Choose the operation for positions in e (n, 3) if it is still open; call this before sharing out work.
 
-        Raises MappingError where the best one is refused.
+        Raises:
+            MappingError: the best operation is refused.
         """
         if self._operation is None:
             _, datum, _, accuracy_m = self._said
@@ -133,7 +134,10 @@ class Mapping:
     def map_from_e(self, points_e: FloatArray) -> FloatArray:
         """Return easting, northing, height (n, 3) of positions in e (n, 3), within 0.1 mm of PROJ's own.
 
-        A point's result depends on the point alone. Raises MappingError where PROJ has none, and naming where.
+        A point's result depends on the point alone.
+
+        Raises:
+            MappingError: PROJ has no coordinates for a point; the message names the place.
         """
         points = np.ascontiguousarray(points_e, dtype=np.float64)
         self._settle_by_first(points)
@@ -142,11 +146,11 @@ class Mapping:
     def map_with_sigmas(
         self, points_e: FloatArray, covariance_e: FloatArray | None
     ) -> tuple[FloatArray, NDArray[np.float32] | None]:
-        """As `map_from_e`; and sigmas (n, 3) along easting, northing and up, in metres, where there are covariances.
+        """Return `map_from_e`, and sigmas (n, 3) along easting, northing and up, in metres, if covariances are given.
 
-        Covariances are (n, 6) xx xy xz yy yz zz in e, m². The sigmas are those of the coordinates as they stand in the
-        file: the projection's scale is left in (a part in a thousand in UTM), units other than metres are taken out.
-        Taken from the derivatives at the cube's centre.
+        Covariances are (n, 6) xx xy xz yy yz zz in e, m². The sigmas are those of the coordinates in the file: the
+        projection's scale is left in (a part in a thousand in UTM), units other than metres are taken out. They come
+        from the derivatives at the cube's centre.
         """
         if covariance_e is None:
             return self.map_from_e(points_e), None
@@ -155,9 +159,10 @@ class Mapping:
         return self._cells.map_with_sigmas(points, np.ascontiguousarray(covariance_e, dtype=np.float64))
 
     def reaches(self, points_e: FloatArray) -> NDArray[np.bool_]:
-        """Return whether `map_from_e` has coordinates for each of positions in e (n, 3); never raises for one of them.
+        """Return whether `map_from_e` has coordinates for each of positions in e (n, 3), without raising for any.
 
-        Raises MappingError where no operation can be chosen.
+        Raises:
+            MappingError: no operation can be chosen.
         """
         points = np.ascontiguousarray(points_e, dtype=np.float64)
         reached: NDArray[np.bool_] = np.logical_and.reduce(np.isfinite(points), axis=1)
@@ -176,7 +181,7 @@ class Mapping:
         return reached
 
     def exact(self, points_e: FloatArray) -> FloatArray:
-        """Return what `map_from_e` approximates: PROJ's own results (n, 3)."""
+        """Return PROJ's own results (n, 3), which `map_from_e` approximates."""
         points = np.ascontiguousarray(points_e, dtype=np.float64)
         self._settle_by_first(points)
         return _finite(self._forward(points), points, self._target.text)
@@ -193,7 +198,7 @@ class Mapping:
         return found
 
     def description(self) -> dict[str, Any]:
-        """Return what a sidecar states of the frame: plain numbers and texts."""
+        """Return the description of the frame for a sidecar file: plain numbers and texts."""
         target, (_, datum, epoch, accuracy_m) = self._target, self._said
         stated: dict[str, Any] = {
             "crs": target.text,
@@ -325,7 +330,7 @@ def _wrapped(lon_deg: float) -> float:
 
 
 def _finite(mapped: FloatArray, points_e: FloatArray, text: str) -> FloatArray:
-    """Return the same, or a refusal that names the first place without coordinates."""
+    """Return ``mapped`` if all of it is finite; else refuse it, naming the first place without coordinates."""
     wrong = np.flatnonzero(~np.isfinite(mapped).all(axis=1))
     if len(wrong):
         raise MappingError(

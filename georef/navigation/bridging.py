@@ -1,12 +1,13 @@
-"""How wrong made-up samples are, told by the flight's own unbroken ones.
+"""Estimate the error of made-up samples from the flight's own unbroken samples.
 
 `Sampler` bridges a gap of n samples by a straight line between the rates beside it. The same is done, as samples come,
-over unbroken ones: n of them are left out, and what the line gives for their sum is compared with it. The mean square
-of that, over the last seconds and axis by axis, is the variance that a gap of n samples adds to velocity and attitude.
-It holds what the motion does in between, and once more the noise of the two samples that the line rests on.
-It is taken for n = 1, 2, 4 … 64; in between it follows a power of n, beyond it grows with the square.
+over unbroken ones: n of them are left out, and the line's value for their sum is compared with the true sum. The mean
+square of the difference, over the last seconds and axis by axis, is the variance that a gap of n samples adds to
+velocity and attitude. It includes the motion in between, and once more the noise of the two samples at the ends of the
+line. It is computed for n = 1, 2, 4 … 64; in between it follows a power of n, beyond it grows with the square.
 
-Only samples before a gap are asked, so that a filter in flight and one that reads the log afterwards say the same.
+Only samples before a gap are used, so that a filter in flight and one that reads the log afterwards give the same
+result.
 """
 
 from __future__ import annotations
@@ -21,28 +22,28 @@ from swath.georef.compiled import jit_cached, jit_inline
 from swath.georef.navigation.filter.strapdown import Samples
 from swath.georef.records import Int64Array
 
-UNKNOWN_RATE_RADPS, UNKNOWN_FORCE_MPS2 = 0.05, 1.0  # how wrong a made-up sample may be while nothing is known
+UNKNOWN_RATE_RADPS, UNKNOWN_FORCE_MPS2 = 0.05, 1.0  # error of a made-up sample before any is known
 LEVELS = 7
 RING = 128  # samples remembered: more than the longest run that is left out, and its neighbours
-LASTS_S = 5.0  # e-folding time of the mean squares: the motion there, not the flight's
-ENOUGH = 20.0  # runs left out, from which on their mean square counts
-PRIMING_S = 60.0  # of a whole flight, that gaps in its first seconds are judged by
-GAP = 1.5  # intervals: a sample that comes later does not join the one before
+LASTS_S = 5.0  # e-folding time of the mean squares, so that they follow the present motion, not the whole flight's
+ENOUGH = 20.0  # number of left-out runs from which on their mean square is used
+PRIMING_S = 60.0  # length of the start of a whole flight that serves to judge gaps in its first seconds
+GAP = 1.5  # intervals: a sample that comes later leaves a gap
 
-# Columns of `Bridges.ring`: sums of angle and velocity so far, rates and forces, time so far
+# Columns of `Bridges.ring`: cumulative sums of angle and velocity, rates and forces, cumulative time
 SUM, RATE, TIME, COLUMNS = 0, 6, 12, 13
-# Elements of `Bridges.counters`: unbroken samples on end, made-up ones on end, end of the last
+# Elements of `Bridges.counters`: successive unbroken samples, successive made-up ones, end of the last
 WHOLE, RUN, END_NS = 0, 1, 2
 
 
 class Bridges(NamedTuple):
-    """What is known of made-up samples; changed as samples come.
+    """The knowledge about made-up samples; it changes as samples come.
 
     Attributes:
         ring: (RING, COLUMNS) the latest unbroken samples.
-        counters: (3,) see above.
-        square: (LEVELS, 6) mean squares of what the sum of a run differs by, angles (rad²) then velocities (m²/s²).
-        seen: (LEVELS,) runs that these are of.
+        counters: (3,) elements WHOLE, RUN and END_NS.
+        square: (LEVELS, 6) mean squares of the errors of a run's sum, angles (rad²) then velocities (m²/s²).
+        seen: (LEVELS,) number of runs behind these.
         spent: (7,) variance that the present run has added, and its length in seconds.
     """
 
@@ -54,14 +55,14 @@ class Bridges(NamedTuple):
 
 
 def new_bridges() -> Bridges:
-    """Return a memory that knows nothing."""
+    """Return an empty memory."""
     return Bridges(
         np.zeros((RING, COLUMNS)), np.zeros(3, np.int64), np.zeros((LEVELS, 6)), np.zeros(LEVELS), np.zeros(7)
     )
 
 
 def primed_bridges(samples: Samples) -> Bridges:
-    """Return a memory that knows the first minute of a flight whose samples begin with these."""
+    """Return a memory of the first minute of a flight whose samples begin with these."""
     bridges = new_bridges()
     if len(samples.time_ns):
         last = int(np.searchsorted(samples.time_ns, samples.time_ns[0] + round(1e9 * PRIMING_S)))
@@ -72,7 +73,7 @@ def primed_bridges(samples: Samples) -> Bridges:
 
 @jit_inline
 def _leave_out(bridges: Bridges, newest: int, span_s: float) -> None:
-    """Bridge over runs that end before the newest sample, and note by how much that is wrong."""
+    """Bridge over runs that end before the newest sample, and record the errors."""
     ring = bridges.ring
     after = ring[newest % RING]
     for level in range(LEVELS):
@@ -91,7 +92,7 @@ def _leave_out(bridges: Bridges, newest: int, span_s: float) -> None:
 
 @jit_inline
 def _variance_of(bridges: Bridges, run: int, axis: int, long_s: float) -> float:
-    """Return variance of the sum of a run of made-up samples."""
+    """Return the variance of the sum of a run of made-up samples."""
     known = 0
     while known < LEVELS and bridges.seen[known] >= ENOUGH:
         known += 1
@@ -114,7 +115,7 @@ def made_up_variance(samples: Samples, bridges: Bridges) -> FloatArray:
     """Return (n, 6) variances that made-up samples add: rad², m²/s² by axis of the body; 0 where a sample is real.
 
     Args:
-        samples: the next n of a stream, in any pieces.
+        samples: the next n of a stream, in pieces of any size.
         bridges: of the stream, changed.
     """
     count, spent, n = bridges.counters, bridges.spent, len(samples.time_ns)

@@ -1,4 +1,4 @@
-"""How the smoothed trajectory's errors at different moments go together: their joint covariance.
+"""Compute the joint covariance of the smoothed trajectory's errors at different moments.
 
 In the adjoint form of the smoother (`swath.georef.navigation.filter.smoother`) the smoothed error at node j is s_j =
 e_j − P_j λ_j with e_j the filter's own. λ_j is made of innovations, to which no smoothed error is correlated, so that
@@ -6,9 +6,9 @@ for j before k
 
     cov(s_j, s_k) = cov(e_j, s_k) = P_j Ψᵀ (I − Λ_k P_k)        Ψ = A_k … A_j+1        A = ∏ (I − K h) · Φ
 
-with A the way of the filter's error from a node to the next, over its observed components; for j = k it is the
+with A the transition of the filter's error from a node to the next, over its observed components; for j = k it is the
 smoothed covariance P − P Λ P (de Jong and MacKinnon 1988, "Covariances for smoothed estimates in state space models",
-Biometrika 75, 601–602; for one moment Bierman 1973). Nothing is inverted.
+Biometrika 75, 601–602; for one moment Bierman 1973). No matrix is inverted.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from swath.georef.navigation.filter.types import Nodes
 from swath.georef.navigation.inputs import NavigationError
 from swath.georef.records import Int64Array
 
-ERRORS = 6  # a moment: position north, east, down, then small turns of the body about north, east, down
+ERRORS = 6  # per moment: position north, east, down, then small turns of the body about north, east, down
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +38,7 @@ class ErrorChain:
     Attributes:
         time_ns: (k,) rising.
         left: (k, 6, n) rows of P_j, turned to l.
-        ways: (k, n, n) of the filter's error from the moment before; the first: from the start.
+        ways: (k, n, n) transition of the filter's error from the moment before; the first: from the start.
         right: (k, n, 6) columns of I − Λ_k P_k, turned to l.
     """
 
@@ -48,7 +48,7 @@ class ErrorChain:
     right: FloatArray
 
     def __len__(self) -> int:
-        """Number of moments."""
+        """Return the number of moments."""
         return len(self.time_ns)
 
     def covariance(self) -> FloatArray:
@@ -64,7 +64,7 @@ class ErrorChain:
         return joint.reshape(ERRORS * count, ERRORS * count)
 
     def at(self, time_ns: ArrayLike) -> ErrorChain:
-        """Of the moments nearest to some times, each once."""
+        """Return the chain at the moments nearest to the given times, each once."""
         chosen = _nearest(self.time_ns, time_ns)
         ways = np.empty((len(chosen), *self.ways.shape[1:]))
         begin = 0
@@ -77,7 +77,7 @@ class ErrorChain:
 
 
 def error_chain(run: FilterRun, time_ns: ArrayLike) -> ErrorChain:
-    """Return the chain at the smoother's nodes nearest to some times, each once.
+    """Return the chain at the smoother's nodes nearest to the given times, each once.
 
     Args:
         run: of the filter, with its nodes; the last one that was smoothed.
@@ -115,7 +115,7 @@ def error_chain(run: FilterRun, time_ns: ArrayLike) -> ErrorChain:
 
 
 def _nearest(times: Int64Array, wanted: ArrayLike) -> Int64Array:
-    """Return rising indexes, each once."""
+    """Return rising indices of the nearest times, each once."""
     asked = np.asarray(wanted, dtype=np.int64)
     after = np.clip(np.searchsorted(times, asked), 1, max(len(times) - 1, 1))
     before_is_nearer = asked - times[after - 1] <= np.abs(times[np.minimum(after, len(times) - 1)] - asked)
@@ -123,7 +123,7 @@ def _nearest(times: Int64Array, wanted: ArrayLike) -> Int64Array:
 
 
 def _from_the_end(blocks: list[Nodes], n: int) -> Iterator[tuple[Nodes, int, FloatArray, FloatArray]]:
-    """Each node, last first: its block and place there, A from the node before, and Φᵀ (its own information) Φ."""
+    """Yield each node, last first: block and index in it, A from the node before, and Φᵀ (its own information) Φ."""
     for block in reversed(blocks):
         end = len(block.h)
         for k in range(len(block.time_ns) - 1, -1, -1):
@@ -141,15 +141,16 @@ def _from_the_end(blocks: list[Nodes], n: int) -> Iterator[tuple[Nodes, int, Flo
 
 
 def _unpacked(packed: FloatArray, n: int) -> FloatArray:
-    """Lower triangle by rows to (n, n)."""
+    """Expand a lower triangle, stored by rows, to a symmetric matrix (n, n)."""
     full = np.zeros((n, n))
     full[np.tril_indices(n)] = packed
     return full + np.tril(full, -1).T
 
 
 def _rows_l(state: FloatArray, n: int, late: int) -> FloatArray:
-    """Return (6, n) what takes position and attitude out of the errors, turned to l; the position in GNSS's time, r +
-    v τ.
+    """Return rows (6, n) that select position and attitude from the errors, turned to l.
+
+    The position is in GNSS's time, r + v τ.
     """
     lat, lon, _ = geodetic_from_e(state[:3])
     rot_l_from_e = rot_e_from_l(lat, lon).T

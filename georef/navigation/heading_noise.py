@@ -1,15 +1,15 @@
-"""Find how large the errors of dual-antenna headings are on a flight, which part lasts, and for how long.
+"""Estimate the errors of dual-antenna headings on a flight: their size, their lasting part, and its time constant.
 
-Errors are a white part and a Gauss–Markov process, both in proportion to the sigma that the receiver tells. Gyroscopes
-know changes of heading over seconds far better than two antennas do, so that innovations tell the white part and how
-the other dies away. Both parts and the e-folding time are fitted together by Fisher scoring: steps of the inverse
-information times the slope of ln likelihood, the information being the sum of the squares of single innovations' slopes
-(Berndt, Hall, Hall and Hausman 1974). A prior about what was assumed goes along: one sigma of it is `PRIOR_SIGMA` of
-ln (lasting / white variance), and of ln of the time.
+Errors are a white part and a Gauss–Markov process, both in proportion to the receiver's sigma. Gyroscopes know changes
+of heading over seconds far better than two antennas do, so that innovations show the white part and the decay of the
+other. Both parts and the e-folding time are fitted together by Fisher scoring: steps of the inverse information times
+the slope of ln likelihood, the information being the sum of the squares of single innovations' slopes (Berndt, Hall,
+Hall and Hausman 1974). A prior about the assumed values is included: one sigma of it is `PRIOR_SIGMA` of ln (lasting /
+white variance), and of ln of the time.
 
-Three hypotheses are compared by the likelihood of the same innovations: what was assumed, with the scale that goes with
-it, the fit, and that all is white. That a part lasts needs `EVIDENCE` against white, and whatever is found needs it
-against what was assumed.
+Three hypotheses are compared by the likelihood of the same innovations: the assumed values with a matching scale, the
+fit, and white errors alone. A lasting part needs `EVIDENCE` against white errors, and either result needs it against
+the assumed values.
 """
 
 from __future__ import annotations
@@ -35,21 +35,21 @@ from swath.georef.navigation.noise import (
 from swath.georef.records import StructArray
 from swath.georef.timescales import SECOND_NS
 
-LONGEST_S = 1000.0  # beyond, an error lasts for the whole flight as far as ten minutes tell
+LONGEST_S = 1000.0  # an error beyond this cannot be told from a constant within ten minutes
 LEAST_SHARE = 1e-4
-DIFFERENCE = 0.02  # of a parameter, by which slopes are taken
+DIFFERENCE = 0.02  # of a parameter, for numerical slopes
 LARGEST_STEP = 1.5
 ROUNDS, HALVINGS = 6, 3
-STAYS = 0.1  # ln likelihood that a further round may win: it is left out
+STAYS = 0.1  # gain of ln likelihood below which no further round is made
 
 
 def find_heading_noise(found: NoiseFound, innovations: StructArray, stretch: Run) -> NoiseFound:
-    """Add to what was found of a receiver the noise of its headings.
+    """Add a receiver's heading noise to the noise found so far.
 
     Args:
-        found: of its positions and velocities.
-        innovations: of a whole run with the setup that was assumed.
-        stretch: gives the innovations of a run over a part of the flight with a setup, a row an observation.
+        found: for its positions and velocities.
+        innovations: of a whole run with the assumed setup.
+        stretch: returns the innovations of a run over a part of the flight with a setup, one row per observation.
     """
     rows = innovations[innovations["kind"] == Kind.HEADING]
     assumed = found.setup
@@ -67,13 +67,13 @@ def find_heading_noise(found: NoiseFound, innovations: StructArray, stretch: Run
 
 
 def _least_s(headings: StructArray) -> float:
-    """Return the usual time between headings: errors that last for less are white."""
+    """Return the median time between headings: errors that last less are white."""
     between = np.diff(headings["time_ns"])
     return float(np.median(between[between > 0])) / SECOND_NS
 
 
 def _fitted(judged: Judged, assumed: Setup, least_s: float) -> Hypothesis:
-    """Return the likeliest hypothesis of headings' white and lasting part and of the time for which that lasts."""
+    """Return the likeliest hypothesis of headings' white and lasting parts and of the lasting part's time."""
     at = _parameters(assumed)
     about, tightness = at @ _OF_PRIOR.T, np.full(2, PRIOR_SIGMA**-2)
     low = np.log([SCALES[0], SCALES[0], least_s])
@@ -106,19 +106,19 @@ def _fitted(judged: Judged, assumed: Setup, least_s: float) -> Hypothesis:
     return Hypothesis(float(each.sum()), _with_parameters(assumed, at))
 
 
-# Of ln white sigma, ln lasting sigma, ln time: what the prior is of, ln (lasting / white variance) and ln time
+# From ln white sigma, ln lasting sigma, ln time to the prior's variables: ln (lasting / white variance) and ln time
 _OF_PRIOR = np.array([[-2.0, 2.0, 0.0], [0.0, 0.0, 1.0]])
 
 
 def _parameters(setup: Setup) -> FloatArray:
-    """Return (3,) ln of the white and of the lasting sigma, over the one told, and of the e-folding time in s."""
+    """Return (3,) ln of the white and the lasting sigma, relative to the receiver's, and of the e-folding time in s."""
     scale, share = setup.gnss_heading_scale, max(setup.gnss_heading_share, LEAST_SHARE)
     white, lasting = scale * math.sqrt(1.0 - share), scale * math.sqrt(share)
     return np.log([white, lasting, setup.gnss_heading_correlation_s])
 
 
 def _with_parameters(setup: Setup, parameters: FloatArray) -> Setup:
-    """Return the setup with these."""
+    """Return the setup with these parameters."""
     white, lasting, time_s = np.exp(parameters).tolist()
     variance = white**2 + lasting**2
     return replace(

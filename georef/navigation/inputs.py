@@ -1,4 +1,4 @@
-"""What navigation takes and gives: inertial samples, observations, noise, installation, start, solution.
+"""Inputs and outputs of navigation: inertial samples, observations, noise, installation, start, solution.
 
 SI units, radians, GPS time in nanoseconds; frames as in `swath.georef.navigation`.
 """
@@ -15,37 +15,37 @@ from swath.georef.arrays import BoolArray, FloatArray
 from swath.georef.records import Int64Array, StructArray
 from swath.georef.trajectory.trajectory import DEFAULT_MAX_GAP_NS, Trajectory
 
-ARM_UNSAID_M = 2.0  # prior sigma of a lever arm that nobody says: it is estimated with the flight
+ARM_UNSAID_M = 2.0  # prior sigma of a lever arm that is not configured: it is estimated with the flight
 _SQRT_HOUR = 60.0  # √3600 s
 _HOUR_S = 3600.0
 _MILLI_G = 9.80665e-3  # m/s², the standard g₀ / 1000
 
 
 class NavigationError(ValueError):
-    """Input that cannot be navigated with; one line for the user."""
+    """Raised for input that navigation cannot use; one line for the user."""
 
 
 class Kind(IntEnum):
-    """What an observation is of."""
+    """The quantity of an observation."""
 
     POSITION = 0
     VELOCITY = 1
     HEADING = 2  # direction of the baseline between two antennas
     ZERO_VELOCITY = 3
-    NON_HOLONOMIC = 4  # no velocity across and through the floor of a ground vehicle
+    NON_HOLONOMIC = 4  # zero velocity of a ground vehicle sideways and through its floor
     HEIGHT = 5  # barometer
     ATTITUDE = 6  # roll, pitch, heading of a device's own solution
 
 
 class Fate(IntEnum):
-    """What became of an observation."""
+    """The fate of an observation."""
 
     TAKEN = 0
     INFLATED = 1  # beyond the gate, taken with a larger sigma
     REJECTED = 2  # far beyond the gate
-    REACQUIRED = 3  # beyond the gate after a time without, or once too often (then the state was widened): taken
-    UNUSABLE = 4  # not finite, no sigma, no fix, or nothing in it that the state can be compared with
-    OUTSIDE = 5  # before the start, after the last sample, or too late for a filter that has gone on
+    REACQUIRED = 3  # beyond the gate after a time without, or after many refusals (which widened the state): taken
+    UNUSABLE = 4  # not finite, without sigma or fix, or without anything comparable to the state
+    OUTSIDE = 5  # before the start, after the last sample, or too late for a filter that has moved on
 
 
 OBSERVATION_DTYPE = np.dtype(
@@ -55,9 +55,9 @@ OBSERVATION_DTYPE = np.dtype(
         ("fix_type", "u1"),  # records.FixType
         ("satellites", "u1"),
         ("antenna", "u1"),  # row of Setup.lever_arms_b
-        ("value", "<f8", (3,)),  # m in e | m/s north, east, down | heading, pitch (nan: unsaid) | height | rad
+        ("value", "<f8", (3,)),  # m in e | m/s north, east, down | heading, pitch (nan: missing) | height | rad
         ("sigma", "<f8", (3,)),  # m north, east, down | m/s north, east, down | rad
-        ("correlation", "<f8", (3,)),  # of north–east, north–down, east–down; 0 where unsaid
+        ("correlation", "<f8", (3,)),  # of north–east, north–down, east–down; 0 if missing
     ]
 )
 
@@ -69,7 +69,7 @@ INNOVATION_DTYPE = np.dtype(
         ("fix_type", "u1"),
         ("satellites", "u1"),
         ("antenna", "u1"),
-        ("dimension", "u1"),  # components that counted; the others are nan below
+        ("dimension", "u1"),  # number of components used; the others are nan below
         ("value", "<f8", (3,)),  # observed − computed; positions and velocities north, east, down
         ("sigma", "<f8", (3,)),  # predicted, of the innovation, before any inflation
         ("normalised", "<f8", (3,)),  # whitened by the Cholesky factor of the innovation's covariance
@@ -81,7 +81,7 @@ INNOVATION_DTYPE = np.dtype(
 
 
 def sort_observations(rows: StructArray) -> StructArray:
-    """By time; those of one time by kind and antenna, in the order given where these are equal."""
+    """Sort by time; rows of one time by kind and antenna, equal ones in the order given."""
     order = np.lexsort((rows["antenna"], rows["kind"], rows["time_ns"]))
     return rows[order]
 
@@ -105,7 +105,7 @@ class Inertial:
     bridged: BoolArray
 
     def __post_init__(self) -> None:
-        """NavigationError where columns differ in length or times do not rise."""
+        """Refuse columns that differ in length, or times that do not rise, with `NavigationError`."""
         n = len(self.time_ns)
         shapes = (self.interval_s.shape, self.angle_b.shape, self.velocity_b.shape, self.bridged.shape)
         if shapes != ((n,), (n, 3), (n, 3), (n,)):
@@ -115,11 +115,11 @@ class Inertial:
             raise NavigationError(f"inertial samples: time does not rise at sample {at}")
 
     def __len__(self) -> int:
-        """Number of samples."""
+        """Return the number of samples."""
         return len(self.time_ns)
 
     def between(self, first: int, last: int) -> Inertial:
-        """Return samples first to last − 1, views."""
+        """Return samples first to last − 1, as views."""
         part = slice(first, last)
         return Inertial(
             self.time_ns[part], self.interval_s[part], self.angle_b[part], self.velocity_b[part], self.bridged[part]
@@ -128,7 +128,7 @@ class Inertial:
 
 @dataclass(frozen=True)
 class ImuNoise:
-    """Noise of an inertial unit, one standard deviation, every axis alike.
+    """Noise of an inertial unit, one standard deviation, equal for every axis.
 
     Attributes:
         angle_random_walk: rad/√s.
@@ -136,8 +136,8 @@ class ImuNoise:
         gyro_bias, accel_bias: rad/s, m/s², Gauss–Markov of `bias_correlation_s`.
         bias_correlation_s: e-folding time.
         gyro_scale, accel_scale: errors of the scale factors, 1, constant.
-        misalignment: rad, of the angles by which axes of a triad lean towards each other, constant; 0: they do not, and
-            are not estimated.
+        misalignment: rad, of the angles by which axes of a triad lean towards each other, constant; 0: they are
+            perpendicular, and the angles are not estimated.
     """
 
     angle_random_walk: float
@@ -160,7 +160,7 @@ def imu_noise(
     accel_scale_ppm: float = 0.0,
     misalignment_mrad: float = 0.0,
 ) -> ImuNoise:
-    """Return `ImuNoise` in the units of data sheets and of the configuration."""
+    """Return `ImuNoise` from the units of data sheets and of the configuration."""
     return ImuNoise(
         angle_random_walk=float(np.radians(angle_random_walk_deg_per_sqrt_h)) / _SQRT_HOUR,
         velocity_random_walk=velocity_random_walk_m_per_s_per_sqrt_h / _SQRT_HOUR,
@@ -200,21 +200,22 @@ class Setup:
         lever_arms_b: (k, 3) body origin → phase centre of antenna 0 … k − 1, m.
         baseline_b: (3,) primary → secondary antenna, m; None: no dual-antenna heading.
         estimate_lever_arm: prior sigma of antenna 0's lever arm, m; 0: it is known.
-        estimate_time_offset_s: prior sigma of the GNSS time offset; 0: none. It is added to GNSS stamps to get the
+        estimate_time_offset_s: prior sigma of the GNSS time offset; 0: no offset. It is added to GNSS stamps to get the
             inertial unit's time (positive: GNSS stamps are early, or inertial ones late).
         gnss_correlation_s: e-folding time of the GNSS positions' common error.
         gnss_correlated_share: share (0 … 1) of the positions' variance that is time-correlated; 0: white.
         gnss_velocity_correlation_s, gnss_velocity_share: the same of the velocities.
         gnss_heading_correlation_s, gnss_heading_share: the same of dual-antenna headings and their pitch.
-        height_bias_m: prior sigma of a barometer's bias; 0: heights are taken as they are.
-        height_correlation_s: e-folding time of it.
-        position_floor_m, velocity_floor_mps: the least sigma believed; of positions more where the fix is no fixed one.
+        height_bias_m: prior sigma of a barometer's bias; 0: heights have no bias.
+        height_correlation_s: e-folding time of that bias.
+        position_floor_m, velocity_floor_mps: the least sigma used; for positions without a fixed solution it is larger.
         attitude_floor_rad: the same of headings and attitudes.
-        gate_probability: a sound observation exceeds the gate so often.
-        reject_factor: beyond so many times the gate's radius an observation is rejected, up to there inflated.
-        reacquire_after: so many rejected in a row of one kind, over at least `reacquire_s`, widen the state.
-        reacquire_s: see there, of positions that leapt six times as long (`gate.leapt`); and how long a state that has
-            drifted, or has just begun, may settle.
+        gate_probability: probability that a sound observation exceeds the gate.
+        reject_factor: times the gate's radius beyond which an observation is rejected; up to there it is inflated.
+        reacquire_after: number of successive rejections of one kind, over at least `reacquire_s`, that widens the
+            state.
+        reacquire_s: see there, for positions that leapt six times as long (`gate.leapt`); and the time for which a
+            state that has drifted, or has just begun, may settle.
         node_s: longest time between nodes of the smoother.
         step_s: longest step of the covariance.
         gnss_sigma_scale, gnss_velocity_scale: by fix type, factor on positions' and velocities' sigmas, floors included
@@ -254,7 +255,7 @@ class Setup:
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """Where navigation begins; the sensors' errors begin at zero with the sigmas of their noise.
+    """The start of navigation; the sensors' errors begin at zero with the sigmas of their noise.
 
     Attributes:
         time_ns: GPS time.
@@ -278,8 +279,8 @@ class Start:
 class Solution:
     """A navigated trajectory of the body's origin.
 
-    One of `swath.georef.navigation.solve` is in GNSS's time where a time offset was estimated; of the smoothed one the
-    positions' sigmas are those of that time, of the forward one those of where the filter had it then.
+    A solution of `swath.georef.navigation.solve` is in GNSS's time if a time offset was estimated. The smoothed one's
+    position sigmas hold at that time, the forward one's at the time that the filter assumed then.
 
     Attributes:
         time_ns: (n,) epochs.
@@ -287,7 +288,7 @@ class Solution:
         q_e_from_b: (n, 4) scalar first.
         position_sigma_l, velocity_sigma_l: (n, 3) north, east, down.
         attitude_sigma_rad: (n, 3) roll, pitch, heading.
-        bridged: (n,) the inertial sample that ends at the epoch was made up.
+        bridged: (n,) whether the inertial sample that ends at the epoch was made up.
         node_time_ns: (m,) the smoother's nodes.
         gyro_bias, accel_bias, gyro_scale, accel_scale: (m, 3) estimates, b.
         gyro_bias_sigma, accel_bias_sigma, gyro_scale_sigma, accel_scale_sigma: (m, 3).
@@ -295,11 +296,11 @@ class Solution:
             other, and their sigmas; (0, 3) where not estimated.
         lever_arm_b, lever_arm_sigma: (m, 3) of antenna 0, m; constant with sigma 0 where not estimated.
         time_offset_s, time_offset_sigma_s: (m,) of GNSS; 0 where not estimated.
-        innovations: INNOVATION_DTYPE, one an observation, whatever became of it.
-        counts: what happened, by name.
-        separation: (m, 9) forward − smoothed of position and velocity north, east, down, of roll, pitch, heading;
-            (0, 9) in a forward solution.
-        separation_sigma: (m, 9) what it should be, √(P forward − P smoothed).
+        innovations: INNOVATION_DTYPE, one per observation, whatever its fate.
+        counts: events, by name.
+        separation: (m, 9) forward − smoothed of position and velocity north, east, down, of roll, pitch, heading; (0,
+            9) in a forward solution.
+        separation_sigma: (m, 9) its predicted sigma, √(P forward − P smoothed).
     """
 
     time_ns: Int64Array
@@ -333,11 +334,11 @@ class Solution:
     accel_misalignment_sigma: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
 
     def __len__(self) -> int:
-        """Number of epochs."""
+        """Return the number of epochs."""
         return len(self.time_ns)
 
     def trajectory(self, max_gap_ns: int = DEFAULT_MAX_GAP_NS, name: str = "navigation") -> Trajectory:
-        """As georeferencing takes it."""
+        """Return the solution as a `Trajectory` for georeferencing."""
         return Trajectory(
             self.time_ns,
             self.position_e,

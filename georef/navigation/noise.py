@@ -1,21 +1,21 @@
-"""What a flight says of its receiver's noise: how large errors are, by kind and fix type, and which share lasts.
+"""Estimate a receiver's noise from a flight: the size of errors, by kind and fix type, and their lasting share.
 
-Innovations of a filter are white and as large as it predicts where its noise is right (Mehra 1970). Two things are
-asked of them.
+Innovations of a filter are white and as large as predicted if its noise is right (Mehra 1970). They answer two
+questions.
 
-How large: sigmas of positions and velocities of each fix type, and of headings, are scaled, up or down, until the mean
-square of normalised innovations is 1. A scale other than 1 needs `ENOUGH` observations and ln likelihood better by
-`EVIDENCE`, which n components with the mean square m give as n/2 (m − 1 − ln m).
+Size: sigmas of positions and velocities of each fix type, and of headings, are scaled, up or down, until the mean
+square of normalised innovations is 1. A scale other than 1 needs `ENOUGH` observations and a gain of ln likelihood of
+`EVIDENCE`; n components with the mean square m gain n/2 (m − 1 − ln m).
 
-Which share lasts: positions' errors are a white part and a Gauss–Markov process. Innovations show it through what the
-inertial unit knows better over seconds than the receiver: much at 5 Hz, little at 1 Hz. Shares are compared by the
-likelihood of the innovations, scales matched for each, together with a prior, `PRIOR_SIGMA` of ln (lasting / white
-variance) about the share that was assumed; another share than that needs `EVIDENCE` too. Against the hypothesis of a
-setup that says white, it needs `SIGNIFICANT`.
-
-Velocities' errors last for seconds where a receiver filters them. Their share is looked for likewise, with the times of
-`VELOCITY_TIMES_S`, before that of the positions, which takes their part where nobody says that they last; it needs
+Lasting share: positions' errors are a white part and a Gauss–Markov process. Innovations show it where the inertial
+unit knows more over seconds than the receiver: much at 5 Hz, little at 1 Hz. Shares are compared by the likelihood of
+the innovations, with scales matched for each, together with a prior, `PRIOR_SIGMA` of ln (lasting / white variance)
+about the assumed share; another share needs `EVIDENCE` too. Against a setup that assumes white errors it needs
 `SIGNIFICANT`.
+
+Velocities' errors last for seconds where a receiver filters them. Their share is estimated in the same way, with the
+times of `VELOCITY_TIMES_S`, before that of the positions, which otherwise absorbs it if the setup assumes white
+velocities; it needs `SIGNIFICANT`.
 """
 
 from __future__ import annotations
@@ -33,21 +33,22 @@ from swath.georef.records import StructArray
 
 Run = Callable[[Setup], StructArray]
 
-ENOUGH = 120  # components of one source: 60 positions' horizontal ones
-EVIDENCE = 2.0  # of ln likelihood: chance gives it to one in twenty
-SIGNIFICANT = 8.0  # the same, of a share against a setup that says white
+ENOUGH = 120  # components of one source: the horizontal ones of 60 positions
+EVIDENCE = 2.0  # of ln likelihood: chance reaches it once in twenty
+SIGNIFICANT = 8.0  # the same, for a share against a setup that assumes white errors
 SCALES = (0.02, 30.0)
-LARGEST = 5.0  # times what is told of positions: beyond, a time, a lever arm or a frame is wrong, and it is no noise
-NEAR = 0.03  # of 1: mean square that needs no other scale
-ROUNDS = 4  # runs, at most, until scales stay
-VELOCITY_TIMES_S = (0.7, 1.4, 2.8, 5.6)  # e-folding times of velocities' errors that are tried
-LITTLE = 0.2  # share of velocities' tried first: where even that is less likely than none, none lasts
-STEP = 0.7  # of ln (lasting / white variance) between shares tried
-MIDDLE, PRIOR_SIGMA, REACH = 0.5, 1.0, 7  # share tried first where none is assumed; steps either way, at most
-GREATEST = 50.0  # χ² that counts of an innovation
-OUTLIER = 20.0  # times the median square: an innovation beyond says nothing of the others
+LARGEST = 5.0  # times the stated sigma of positions: a larger scale means a wrong time, lever arm or frame, not noise
+NEAR = 0.03  # deviation of the mean square from 1 that needs no other scale
+ROUNDS = 4  # greatest number of runs until scales stay constant
+VELOCITY_TIMES_S = (0.7, 1.4, 2.8, 5.6)  # candidate e-folding times of velocities' errors
+LITTLE = 0.2  # first trial share of velocities': if even that is less likely than 0, there is no lasting share
+STEP = 0.7  # of ln (lasting / white variance) between trial shares
+# first trial share without an assumed one; greatest number of steps either way
+MIDDLE, PRIOR_SIGMA, REACH = 0.5, 1.0, 7
+GREATEST = 50.0  # limit of an innovation's χ² in the likelihood
+OUTLIER = 20.0  # times the median square: an innovation beyond carries no information about the others
 CHI2_MEDIAN = np.array([np.nan, 0.45494, 1.38629, 2.36597])  # of 1, 2, 3 degrees of freedom
-FEW = 0.1  # share of positions far beyond the gate: so few are blunders, more are noise that is larger than said
+FEW = 0.1  # share of positions far beyond the gate: fewer are blunders, more are noise larger than stated
 OF_GNSS = (Kind.POSITION, Kind.VELOCITY, Kind.HEADING)
 HORIZONTAL, VERTICAL = slice(0, 2), slice(2, 3)
 Source = tuple[int, int, bool]  # kind, fix type (of headings 0), whether it is the vertical
@@ -55,7 +56,7 @@ Source = tuple[int, int, bool]  # kind, fix type (of headings 0), whether it is 
 
 @dataclass(frozen=True)
 class Part:
-    """Name the fields of `Setup` that hold a share that lasts and the scales that go with it."""
+    """The names of the fields of `Setup` that hold a lasting share and its scales."""
 
     share: str
     scales: str
@@ -65,7 +66,7 @@ class Part:
         return float(getattr(setup, self.share))
 
     def with_share(self, setup: Setup, share: float) -> Setup:
-        """Return a setup with another share that lasts, and as large a white part."""
+        """Return a setup with another lasting share and an equally large white part."""
         white = math.sqrt((1.0 - self.of(setup)) / (1.0 - share))
         scales = getattr(setup, self.scales)
         every = {fix: white * scales.get(fix, 1.0) for fix in range(16)}
@@ -79,10 +80,10 @@ VELOCITIES = Part("gnss_velocity_share", "gnss_velocity_scale")
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """Hold shares of positions' and velocities' variances that last, with the scales that go with them.
+    """Lasting shares of positions' and velocities' variances, with their scales.
 
     Attributes:
-        log_likelihood: of the innovations, relative to the share that was assumed.
+        log_likelihood: of the innovations, relative to the assumed share.
         setup: with these shares, scales matched.
     """
 
@@ -91,23 +92,23 @@ class Hypothesis:
 
     @property
     def share(self) -> float:
-        """Share of the positions' variance."""
+        """The lasting share of the positions' variance."""
         return self.setup.gnss_correlated_share
 
 
 @dataclass(frozen=True)
 class NoiseFound:
-    """What was found.
+    """The receiver's noise as found from a flight.
 
     Attributes:
-        setup: that goes by it.
+        setup: with the noise found.
         tried: hypotheses, the assumed share first.
         second_moment: by source, mean square of normalised innovations of the first run.
-        count: by source, components that this is of.
-        evidence: ln likelihood won by the first scale of each source; of the share `share_evidence`.
-        velocity_evidence: of the share of velocities' errors that lasts; 0: none was found.
-        heading_evidence: of what was found of headings' errors (`heading_noise`); 0: they are as assumed.
-        doubted: positions are too far off to be noise; nothing was found.
+        count: by source, the number of components behind it.
+        evidence: gain of ln likelihood by the first scale of each source; by the share: `share_evidence`.
+        velocity_evidence: by the lasting share of velocities' errors; 0: no such share was found.
+        heading_evidence: by the headings' noise (`heading_noise`); 0: it is as assumed.
+        doubted: positions deviate too much for noise, so that nothing was estimated.
     """
 
     setup: Setup
@@ -122,14 +123,14 @@ class NoiseFound:
 
     @property
     def share(self) -> float:
-        """Share of the positions' variance that lasts."""
+        """The lasting share of the positions' variance."""
         return self.setup.gnss_correlated_share
 
 
 def not_blunders(run: StructArray) -> BoolArray:
-    """Tell which innovations (n,) are of no time at which a run refused or re-acquired a position.
+    """Return a mask (n,) of the innovations at times when a run neither refused nor re-acquired a position.
 
-    Seconds of a wrong fix are no noise, and would hide that of the other hours.
+    Seconds of a wrong fix are not noise, and would hide the noise of the other hours.
     """
     place = run[(run["kind"] == Kind.POSITION) & (run["fate"] <= Fate.REACQUIRED)]
     far = place[np.isin(place["fate"], (Fate.REJECTED, Fate.REACQUIRED))]
@@ -140,7 +141,7 @@ def not_blunders(run: StructArray) -> BoolArray:
 
 
 def second_moments(innovations: StructArray) -> tuple[dict[Source, float], dict[Source, int]]:
-    """Return mean square of normalised innovations, outliers left out, and of how many components it is, by source."""
+    """Return the mean square of normalised innovations, without outliers, and its number of components, by source."""
     rows = innovations[_usable(innovations)]
     fix = np.where(rows["kind"] == Kind.HEADING, 0, rows["fix_type"])
     moments: dict[Source, float] = {}
@@ -159,34 +160,34 @@ def second_moments(innovations: StructArray) -> tuple[dict[Source, float], dict[
 
 
 def _usable(innovations: StructArray) -> BoolArray:
-    """Tell which innovations (n,) are of GNSS and have a size."""
+    """Return a mask (n,) of the innovations that are of GNSS and have a size."""
     known = (innovations["fate"] <= Fate.REACQUIRED) & (innovations["dimension"] > 0)
     usable: BoolArray = known & np.isfinite(innovations["chi2"]) & np.isin(innovations["kind"], OF_GNSS)
     return usable
 
 
 def _not_outlying(rows: StructArray) -> BoolArray:
-    """Tell which innovations (n,) of one source are not far beyond all others."""
+    """Return a mask (n,) of one source's innovations that are not far larger than the others."""
     median = np.median(rows["chi2"] / CHI2_MEDIAN[rows["dimension"]]) if len(rows) else 0.0
     sound: BoolArray = rows["chi2"] <= OUTLIER * median
     return sound
 
 
 def log_likelihood(innovations: StructArray) -> float:
-    """Return −½ Σ (ln |S| + χ²) of innovations; a χ² beyond `GREATEST` counts as that."""
+    """Return −½ Σ (ln |S| + χ²) of innovations; χ² is limited to `GREATEST`."""
     return float(log_likelihoods(innovations).sum())
 
 
 def log_likelihoods(innovations: StructArray) -> FloatArray:
-    """Return (n,) ln likelihood of each innovation, as `log_likelihood` adds them up."""
+    """Return ln likelihood (n,) of each innovation, whose sum is `log_likelihood`."""
     each: FloatArray = -0.5 * (innovations["log_det"] + np.minimum(innovations["chi2"], GREATEST))
     return each
 
 
 def rescaled(setup: Setup, innovations: StructArray) -> tuple[Setup, dict[Source, float]]:
-    """Return the setup with scales that the innovations of a run with it ask for, and what each wins of ln likelihood.
+    """Return the setup with the scales that a run's innovations require, and each scale's gain of ln likelihood.
 
-    The setup itself, and nothing, where they ask for none.
+    If none is required, the setup itself and an empty dictionary.
     """
     moments, counts = second_moments(innovations)
     factors: dict[Source, float] = {}
@@ -201,7 +202,7 @@ def rescaled(setup: Setup, innovations: StructArray) -> tuple[Setup, dict[Source
 
 
 def _with_factors(setup: Setup, factors: Mapping[Source, float]) -> Setup:
-    """Return the setup with its scales multiplied."""
+    """Return the setup with its scales multiplied by factors."""
     position, velocity = dict(setup.gnss_sigma_scale), dict(setup.gnss_velocity_scale)
     up, rising = dict(setup.gnss_vertical_scale), dict(setup.gnss_velocity_vertical_scale)
     heading = setup.gnss_heading_scale
@@ -233,7 +234,7 @@ def find_noise(innovations: StructArray, stretch: Run, setup: Setup) -> NoiseFou
 
     Args:
         innovations: of a whole run with `setup`.
-        stretch: gives the innovations of a run over a part of the flight with another setup, a row an observation.
+        stretch: returns the innovations of a run over a part of the flight with another setup, one row per observation.
         setup: of the run.
     """
     sound = innovations[not_blunders(innovations)]
@@ -258,7 +259,7 @@ def find_noise(innovations: StructArray, stretch: Run, setup: Setup) -> NoiseFou
 
 
 def _of_positions(judged: Judged, first: Hypothesis) -> tuple[list[Hypothesis], Hypothesis]:
-    """Return hypotheses of the share of positions' errors that lasts, the assumed one first, and the one to go by."""
+    """Return hypotheses of the positions' lasting share, the assumed one first, and the one to use."""
     if POSITIONS.of(first.setup) > 0.0:
         tried, best = _shares(judged, first, POSITIONS)
         needed = EVIDENCE
@@ -269,12 +270,12 @@ def _of_positions(judged: Judged, first: Hypothesis) -> tuple[list[Hypothesis], 
 
 
 def _of_velocities(judged: Judged, white: Hypothesis) -> Hypothesis:
-    """Return the hypothesis of velocities' errors that last which has the evidence needed; else the one given."""
+    """Return a hypothesis with a lasting share of velocities' errors if the evidence suffices, else the given one."""
     if VELOCITIES.of(white.setup) > 0.0:
         return white
 
     def begun(place: int) -> Hypothesis:
-        """Return the hypothesis of a time from which its shares are climbed."""
+        """Return the hypothesis of a time from which the climb to its likeliest share begins."""
         setup = replace(white.setup, gnss_velocity_correlation_s=VELOCITY_TIMES_S[place])
         return judged.matched(VELOCITIES.with_share(setup, LITTLE))
 
@@ -284,7 +285,7 @@ def _of_velocities(judged: Judged, white: Hypothesis) -> Hypothesis:
     tried: dict[int, Hypothesis] = {}
 
     def worth(place: int) -> float:
-        """Return ln likelihood with the likeliest share for a time."""
+        """Return the ln likelihood with the likeliest share for a time."""
         if place not in tried:
             _, likeliest = _shares(judged, begun(place), VELOCITIES)
             tried[place] = judged.matched(likeliest.setup)
@@ -297,9 +298,9 @@ def _of_velocities(judged: Judged, white: Hypothesis) -> Hypothesis:
 
 
 def _too_large(found: Setup, asked: Setup, counts: Mapping[Source, int]) -> bool:
-    """Tell whether positions of a fix type would err more than `LARGEST` times as much as is told of them.
+    """Return whether positions of a fix type would err more than `LARGEST` times as much as stated.
 
-    Times that drift by milliseconds look like that. Scaled, positions would be averaged that are each right.
+    Times that drift by milliseconds have this effect. A scale would average positions that are each right.
     """
     fixes = {fix for kind, fix, _ in counts if kind == Kind.POSITION}
     horizontal = {fix: found.gnss_sigma_scale.get(fix, 1.0) / asked.gnss_sigma_scale.get(fix, 1.0) for fix in fixes}
@@ -307,10 +308,10 @@ def _too_large(found: Setup, asked: Setup, counts: Mapping[Source, int]) -> bool
 
 
 class Judged:
-    """Setups judged by the same innovations: those that are sound in the first run.
+    """Setups compared by the same innovations: the sound ones of the first run.
 
     Args:
-        stretch: gives the innovations of a run over a part of the flight with a setup, a row an observation.
+        stretch: returns the innovations of a run over a part of the flight with a setup, one row per observation.
     """
 
     def __init__(self, stretch: Run) -> None:
@@ -318,7 +319,7 @@ class Judged:
         self._kept: BoolArray | None = None
 
     def innovations(self, setup: Setup) -> StructArray:
-        """Return those of a run with a setup."""
+        """Return the sound innovations of a run with a setup."""
         found = self._stretch(setup)
         if self._kept is None:
             self._kept = not_blunders(found) & _usable(found)
@@ -326,7 +327,7 @@ class Judged:
         return found[self._kept]
 
     def matched(self, setup: Setup) -> Hypothesis:
-        """Return a setup with the scales that go with its shares."""
+        """Return a hypothesis with the scales that suit a setup's shares."""
         for left in reversed(range(ROUNDS)):
             found = self.innovations(setup)
             other, won = rescaled(setup, found)
@@ -337,14 +338,12 @@ class Judged:
 
 
 def _shares(judged: Judged, middle: Hypothesis, part: Part) -> tuple[list[Hypothesis], Hypothesis]:
-    """Return climb from an assumed share to the likeliest; all that were tried, and that one, on a parabola through
-    three.
-    """
+    """Climb from an assumed share to the likeliest; return all trials, and the peak of a parabola through three."""
     centre = math.log(part.of(middle.setup) / (1.0 - part.of(middle.setup)))
     known = {0: middle}
 
     def worth(place: int) -> float:
-        """Return ln likelihood and prior of a share so many steps from the middle."""
+        """Return ln likelihood and prior of a share, a number of steps from the middle."""
         if place not in known:
             share = 1.0 / (1.0 + math.exp(-(centre + STEP * place)))
             near = known[place - 1 if place > 0 else place + 1]

@@ -1,8 +1,8 @@
-"""Inertial samples as they come, made into increments over intervals that join: rotation, sample rule, gaps, order.
+"""Convert inertial samples to increments over adjoining intervals: rotation, sample rule, gaps, order.
 
-A sample's mean rate stands for the whole interval between the stamps, so that increment ÷ interval is what the sensor
-said however its stamps jitter, and the increments add up to the time that passed. A device that gives increments
-itself has integrated already: its increments are taken as they are, whatever its stamps do.
+A sample's mean rate is taken for the whole interval between the stamps, so that increment ÷ interval is the sensor's
+value whatever the jitter of its stamps, and the increments add up to the elapsed time. A device that gives increments
+has integrated already: its increments are used unchanged, whatever its stamps.
 """
 
 from __future__ import annotations
@@ -24,39 +24,40 @@ StampRule = Literal["end", "middle", "start"]
 DEFAULT_MAX_GAP_S = 0.5
 _UNLIMITED = (float("inf"), float("inf"))
 _LATE = {"end": 0.0, "middle": 0.5, "start": 1.0}  # intervals from the stamp to the interval's end
-_LONG = 1.2  # intervals: a shorter one has lost nothing
-_FOLLOWED = 0.05  # share of a stamp's lateness by which the even train follows it
-_SETTLED = 20  # samples from which on the train is trusted
-_BACK = 100 * SECOND_NS  # a stamp so far behind is no sample out of order, time itself has jumped
+_LONG = 1.2  # intervals: a shorter step has lost no sample
+_FOLLOWED = 0.05  # share of a stamp's lateness by which the regular sequence follows it
+_SETTLED = 20  # samples after which the regular sequence is trusted
+_BACK = 100 * SECOND_NS  # a stamp this far behind means that time itself has jumped, not a sample out of order
 
 
 class Sampler:
-    """IMU rows and the GPS times of their stamps, to `Inertial`; the output does not depend on how rows are cut.
+    """Converts IMU rows and the GPS times of their stamps to `Inertial`, whatever the division of the rows.
 
     An interval is the difference of stamps; nominal (1 / rate) at the first sample and after a gap. A gap of up to
-    `max_gap_s` is bridged: the intervals missing are made up from the samples beside it and marked. A longer one ends
-    the piece, and so does time that jumps forward. The one sample after such a jump is held until the next confirms
-    it; a stamp that lies alone is dropped. An instant sample stands for its moment: neighbours are averaged, and its
-    stamp rule says nothing.
+    `max_gap_s` is bridged: the missing intervals are made up from the samples beside it and marked. A longer gap ends
+    the piece, and so does time that jumps forward. The sample after such a jump is held until the next confirms it; a
+    single outlying stamp is dropped. An instant sample holds for its moment: neighbours are averaged, and its stamp
+    rule has no effect.
 
     Args:
         rate_hz: nominal rate.
-        sample: what the rows hold: "mean" over the interval, value of an "instant", or "increment" that the driver
+        sample: content of the rows: "mean" over the interval, value of an "instant", or "increment" that the driver
             divided by the nominal interval.
-        stamp: where in the interval the stamp lies.
+        stamp: position of the stamp in the interval.
         rot_b_from_imu: (3, 3) to the body's axes; None: the rows are in the body's axes.
         max_gap_s: longest gap bridged.
-        full_scale: greatest specific force m/s² and angular rate rad/s the unit can say: samples that reach it are
-            counted as saturated and marked as made up. Unlimited unless said.
+        full_scale: greatest specific force m/s² and angular rate rad/s of the unit: samples that reach it are counted
+            as saturated and marked as made up. Unlimited by default.
 
     Attributes:
-        counts: rows by what was wrong with them: not_finite, duplicate, out_of_order, time_jumped_back,
-            stamp_outlier (all dropped), saturated (kept, marked); and bridged, intervals made up.
-        gaps: (begin, end) GPS ns of what was not bridged.
-        left_out: (GPS ns of its stamp, of the end of the last sample taken, reason) of each that its stamp let drop.
+        counts: rows by their fault: not_finite, duplicate, out_of_order, time_jumped_back, stamp_outlier (all dropped),
+            saturated (kept, marked); and bridged, intervals made up.
+        gaps: (begin, end) GPS ns of gaps that were not bridged.
+        left_out: (GPS ns of its stamp, of the end of the last sample taken, reason) of each sample dropped for its
+            stamp.
 
     Raises:
-        NavigationError: a rate that is not positive, no rotation, or another word than those above.
+        NavigationError: a rate that is not positive, a matrix that is not a rotation, or an unknown word.
     """
 
     def __init__(
@@ -84,17 +85,17 @@ class Sampler:
         self._rot = _rotation(rot_b_from_imu)
         self._max_gap_ns = max(max_gap_s, 1.5 * self._nominal_s) * SECOND_NS
         self._full_scale = np.repeat(np.asarray(full_scale, dtype=np.float64), 3)
-        self._last_ns: int | None = None  # end of the last sample given
-        self._last = np.zeros(6)  # its values, b
-        self._lag_ns = 0.0  # of its stamp behind an even train of them
-        self._settled = 0  # samples that this train has followed
-        self._held: tuple[int, FloatArray, bool] | None = None  # the sample after a jump, unconfirmed
+        self._last_ns: int | None = None  # end of the last sample returned
+        self._last = np.zeros(6)  # values of that sample, b
+        self._lag_ns = 0.0  # of its stamp behind the regular sequence
+        self._settled = 0  # samples that this sequence has followed
+        self._held: tuple[int, FloatArray, bool] | None = None  # the unconfirmed sample after a jump
 
     def feed(self, rows: StructArray, time_ns: Int64Array) -> Inertial:
-        """Return samples made of the next rows (n,) `IMU_DTYPE` with the GPS times (n,) of their stamps.
+        """Return samples from the next rows (n,) `IMU_DTYPE` with the GPS times (n,) of their stamps.
 
         Returns:
-            In the body's axes; times rise over all that was ever given.
+            In the body's axes; times rise over all calls.
         """
         values = np.concatenate([rows["specific_force_b"], rows["angular_rate_b"]], axis=1)
         finite = np.isfinite(values).all(axis=1)
@@ -121,7 +122,7 @@ class Sampler:
         self.left_out.append((end_ns, end_ns if last_ns is None else last_ns, reason))
 
     def _in_order(self, ends_ns: Int64Array, values: FloatArray, saturated: BoolArray) -> NDArray[np.intp]:
-        """Return which rows to take; counts the others, holds the one that only the next can judge."""
+        """Return the rows to take; count the others, and hold a row that only the next can confirm."""
         if len(ends_ns) and self._last_ns is not None:
             steps = np.diff(ends_ns, prepend=self._last_ns)
             if ((steps > 0) & (steps <= self._max_gap_ns)).all():
@@ -150,7 +151,7 @@ class Sampler:
         return np.array(kept, dtype=np.intp)
 
     def _intervals(self, ends_ns: Int64Array, values: FloatArray, saturated: BoolArray) -> Inertial:
-        """Return increments of rows in order, and of what is missing between them."""
+        """Return increments of rows in order, and of missing samples between them."""
         n = len(ends_ns)
         if not n:
             return Inertial(ends_ns, np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, dtype=np.bool_))
@@ -167,7 +168,7 @@ class Sampler:
         pieces = 1 + self._missing(ends_ns - begins, fresh)
         self._count("bridged", int(pieces.sum() - n))
 
-        row = np.repeat(np.arange(n), pieces)  # each interval's sample, and which piece of its gap it is
+        row = np.repeat(np.arange(n), pieces)  # sample of each interval, and index within its gap
         piece = np.arange(len(row)) - np.repeat(np.cumsum(pieces) - pieces, pieces) + 1
         made_up = piece < pieces[row]
         own_ns = np.where(pieces > 1, round(self._nominal_ns), ends_ns - begins)
@@ -176,16 +177,16 @@ class Sampler:
         time_ns = np.where(made_up, begins[row] + share_ns, ends_ns[row])
         interval_s = np.diff(time_ns, prepend=begins[0]) / SECOND_NS
         interval_s[piece == 1] = ((time_ns - begins[row]) / SECOND_NS)[piece == 1]
-        share = (piece - 0.5 * (self._sample == "instant")) / pieces[row]  # of the way from sample to sample
+        share = (piece - 0.5 * (self._sample == "instant")) / pieces[row]  # position between the two samples
         means = values[row] - (1.0 - share[:, None]) * (values - before)[row]
         length_s = interval_s if self._sample != "increment" else np.where(made_up, interval_s, self._nominal_s)
         increments = means * length_s[:, None]
         return Inertial(time_ns, interval_s, increments[:, 3:], increments[:, :3], made_up | saturated[row])
 
     def _missing(self, steps_ns: Int64Array, fresh: BoolArray) -> Int64Array:
-        """Return (n,) samples lost before each: whole intervals by which it is later than an even train of stamps says.
+        """Return (n,) samples lost before each row: whole intervals by which it is late against a regular sequence.
 
-        A stamp's jitter is told from a loss by that train, which follows the stamps slowly.
+        That sequence follows the stamps slowly, and so distinguishes a stamp's jitter from a loss.
         """
         nominal, lag, settled, missing = self._nominal_ns, self._lag_ns, self._settled, []
         for step, begins_anew in zip(steps_ns.tolist(), fresh.tolist(), strict=True):
@@ -205,7 +206,7 @@ class Sampler:
 
 
 def _rotation(rot_b_from_imu: ArrayLike | None) -> FloatArray | None:
-    """Return the matrix, checked."""
+    """Return the rotation matrix after checking it."""
     if rot_b_from_imu is None:
         return None
     rotation = np.asarray(rot_b_from_imu, dtype=np.float64)

@@ -1,9 +1,9 @@
-"""A whole flight: filter, smoother, the noise found, and further passes from where the smoothed flight began.
+"""Solve a whole flight: filter, smoother, noise estimates, and further passes from the smoothed start.
 
-The filter is linear about its own state, which is poor while the heading is hardly known: a pass that begins with the
-smoothed attitude has small errors from its first sample on. What was known of the start stays as it was, its mean and
-its sigmas (`smoother`), so that nothing is learnt twice. A GNSS time offset is taken out of the observations' times
-likewise, so that what is left of it is small. The solutions are in GNSS's time, in which the laser fires too: the
+The filter is linear about its own state, which is inaccurate while the heading is hardly known: a pass that begins with
+the smoothed attitude has small errors from its first sample on. The prior knowledge of the start keeps its mean and its
+sigmas (`smoother`), so that no information counts twice. A GNSS time offset is removed from the observations' times in
+the same way, so that the remaining offset is small. The solutions are in GNSS's time, in which the laser fires too: the
 epochs of the inertial unit less the whole offset.
 """
 
@@ -30,24 +30,24 @@ from swath.georef.records import StructArray
 from swath.georef.timescales import SECOND_NS
 
 MOST_PASSES = 3
-STRETCH_S = 600.0  # of the flight, on which hypotheses of noise are compared
-MOST_RESCALED = 2  # times that the whole flight may correct the scales which the stretch told
-LINEAR_SHARE = 0.1  # of the sigma: what an angle's square may be
+STRETCH_S = 600.0  # part of the flight on which noise hypotheses are compared
+MOST_RESCALED = 2  # number of corrections by the whole flight to the scales found on that part
+LINEAR_SHARE = 0.1  # greatest square of the angle, in units of the sigma
 OFFSET_LEFT_S = 5e-4
-WEAK = 0.5  # of the prior sigma: an estimate that keeps so much has learnt little
+WEAK = 0.5  # of the prior sigma: an estimate that keeps more has learnt little
 
 
 @dataclass(frozen=True)
 class Report:
-    """What was found on the way.
+    """Results of solving besides the trajectory.
 
     Attributes:
-        passes: how many.
-        start_change_rad: (passes,) how far the smoothed attitude at the start was from the assumed one.
-        noise: of GNSS; None: not asked for.
+        passes: their number.
+        start_change_rad: (passes,) angle between the smoothed attitude at the start and the assumed one.
+        noise: of GNSS; None: not requested.
         time_offset_s: of GNSS, all passes together; 0 where not estimated.
-        weak: estimates that the flight says little of, by name.
-        setup: that the flight was smoothed with.
+        weak: names of the estimates that the flight hardly determines.
+        setup: of the smoothed flight.
     """
 
     passes: int
@@ -60,11 +60,12 @@ class Report:
 
 @dataclass(frozen=True, eq=False)
 class Solved:
-    """A flight: by what was known at each moment, and by all of it.
+    """A solved flight: forward, from data up to each moment, and smoothed, from all data.
 
     Attributes:
-        forward, smoothed: in GNSS's time, by the offset that the whole flight tells.
-        run: of the filter, that was smoothed; in the inertial unit's time.
+        forward, smoothed: in GNSS's time, by the offset from the whole flight.
+        report: further results.
+        run: the smoothed run of the filter; in the inertial unit's time.
     """
 
     forward: Solution
@@ -73,7 +74,7 @@ class Solved:
     run: FilterRun
 
     def error_chain(self, time_ns: ArrayLike) -> ErrorChain:
-        """Return how the smoothed errors at the nodes nearest to some times (GNSS's) go together; see `error_chain`."""
+        """Return the smoothed errors' chain at the nodes nearest to given times (GNSS's); see `error_chain`."""
         offset_ns = round(self.report.time_offset_s * SECOND_NS)
         chain = error_chain(self.run, np.asarray(time_ns, dtype=np.int64) + offset_ns)
         return replace(chain, time_ns=chain.time_ns - offset_ns)
@@ -91,10 +92,10 @@ def solve(
     """Filter and smooth a whole flight.
 
     Args:
-        inertial, observations: of it, observations in any order.
+        inertial, observations: of the flight, observations in any order.
         setup, start: of the first pass.
-        noise_from_flight: look how good GNSS is, and go by what is found: factors on the sigmas of positions and
-            velocities by fix type and of headings, and which share of their errors lasts; see `noise`, `heading_noise`.
+        noise_from_flight: whether to estimate and use GNSS's noise: factors on the sigmas of positions and velocities
+            by fix type and of headings, and the lasting share of their errors; see `noise`, `heading_noise`.
         storage: where the runs and the solutions are kept.
     """
     run = run_filter(inertial, observations, setup, start, storage=storage)
@@ -130,7 +131,7 @@ def _noise(inertial: Inertial, observations: StructArray, setup: Setup, start: S
 
 
 def stretch_of(inertial: Inertial, observations: StructArray, start: Start) -> Run:
-    """Return what gives the innovations of the first `STRETCH_S` seconds with a setup, a row an observation."""
+    """Return a function from a setup to the first `STRETCH_S` seconds' innovations, one row per observation."""
     end_ns = start.time_ns + round(STRETCH_S * SECOND_NS)
     part = inertial.between(0, int(np.searchsorted(inertial.time_ns, end_ns)))
     rows = observations[observations["time_ns"] < end_ns]
@@ -142,14 +143,14 @@ def stretch_of(inertial: Inertial, observations: StructArray, start: Start) -> R
 
 
 def _attitude(nodes: SmoothedNodes) -> FloatArray:
-    """Return (3,) smoothed roll, pitch, heading of the first node."""
+    """Return smoothed roll, pitch, heading (3,) of the first node."""
     lat, lon, _ = geodetic_from_e(nodes.state[0, :3])
     rot = rot_e_from_l(lat, lon).T @ rot_from_quaternion(nodes.state[0, ATTITUDE : ATTITUDE + 4])
     return np.array(attitude_of(rot), dtype=np.float64)
 
 
 def _mean(run: FilterRun, asked: Start, offset_s: float) -> FloatArray:
-    """Return the mean (n,) of a run's errors at its start, by the start asked for and the time offset taken out, s."""
+    """Return the mean (n,) of a run's errors at its start, given the requested start and the removed time offset, s."""
     mean = np.zeros(run.layout.size)
     difference(start_state(run.setup, asked), start_state(run.setup, run.start), mean[:MOVED])
     if run.layout.time_offset >= 0:
@@ -158,12 +159,12 @@ def _mean(run: FilterRun, asked: Start, offset_s: float) -> FloatArray:
 
 
 def _change(nodes: SmoothedNodes) -> float:
-    """Return angle between the smoothed attitude at the start and the assumed one."""
+    """Return the angle between the smoothed attitude at the start and the assumed one."""
     return float(np.linalg.norm(nodes.leave[0, 6:]))
 
 
 def _bent(nodes: SmoothedNodes) -> bool:
-    """Return whether the change at the start was too large for what is linear in it: its square against the sigma."""
+    """Return whether the square of the change at the start is too large against the sigma for a linear treatment."""
     return bool(_change(nodes) ** 2 > LINEAR_SHARE * nodes.sigma[0, 6:].min())
 
 
@@ -179,12 +180,12 @@ def _shifted(observations: StructArray, offset_s: float) -> StructArray:
 
 
 def _in_gnss_time(solution: Solution, taken_s: float, whole_s: float) -> Solution:
-    """Return a solution in the inertial unit's time, put into GNSS's: its epochs less the whole offset.
+    """Return a solution in the inertial unit's time converted to GNSS's: its epochs less the whole offset.
 
     Args:
-        solution: its innovations of GNSS are at the observations' times and what was taken.
-        taken_s: that had been added to the observations' times.
-        whole_s: what is added to GNSS's time to get the unit's.
+        solution: its innovations of GNSS are at the observations' times plus taken_s.
+        taken_s: the offset already added to the observations' times.
+        whole_s: the offset from GNSS's time to the unit's.
     """
     if taken_s == whole_s == 0.0:
         return solution

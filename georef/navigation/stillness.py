@@ -1,7 +1,7 @@
-"""Where a vehicle stands still, by its inertial unit and its receiver together; each such second is an observation.
+"""Find where a vehicle stands still, by its inertial unit and its receiver; each such second is an observation.
 
-Neither tells it alone: straight flight at an even speed feels like standing, and a receiver's velocity of nothing may
-be a hover or a slow roll.
+Neither is sufficient alone: to the inertial unit straight flight at constant speed equals rest, and a receiver's zero
+velocity may be a hover or a slow roll.
 """
 
 from __future__ import annotations
@@ -14,18 +14,18 @@ from swath.georef.navigation.inputs import OBSERVATION_DTYPE, Inertial, Kind, so
 from swath.georef.records import StructArray
 from swath.georef.timescales import SECOND_NS
 
-TURN_RADPS = 4e-3  # mean of a second: above it something turns; biases of a good unit are below
-FORCE_MPS2 = 0.08  # by which means of neighbouring seconds may differ
-SIGMAS = 3.0  # of a receiver's velocity or change of position: beyond them it moves, but
-MOVES_MPS = (0.05, 0.3)  # never below the first of these, and always above the second
-DRIFTS_M = (0.3, 1.0)  # the same of positions some time apart, where no velocity is said
-APART_NS = 5 * SECOND_NS // 2  # at least: epochs of a quick receiver are too near to each other to tell a slow flight
+TURN_RADPS = 4e-3  # mean of a second: above it the vehicle turns; biases of a good unit are smaller
+FORCE_MPS2 = 0.08  # greatest difference between means of neighbouring seconds
+SIGMAS = 3.0  # of a receiver's velocity or change of position: limit of standing still
+MOVES_MPS = (0.05, 0.3)  # range of that limit: below the first it never moves, above the second always
+DRIFTS_M = (0.3, 1.0)  # the same for positions some time apart, without observed velocities
+APART_NS = 5 * SECOND_NS // 2  # minimum: epochs of a fast receiver are too close to show slow motion
 SIGMA_MPS = 0.02  # a standing aircraft sways in the wind, and a running engine shakes it
 BESIDE = 2  # seconds on either side that must be still too
 
 
 def still_seconds(inertial: Inertial, observations: StructArray) -> StructArray:
-    """Return observations of no velocity, one in the middle of each whole second of GPS time that the vehicle stood.
+    """Return zero-velocity observations, one in the middle of each whole second of GPS time that the vehicle stood.
 
     Args:
         inertial: of a piece without gaps.
@@ -51,14 +51,12 @@ def still_seconds(inertial: Inertial, observations: StructArray) -> StructArray:
 
 
 def with_still_seconds(inertial: Inertial, observations: StructArray) -> StructArray:
-    """Return the observations and those of standing still."""
+    """Return the observations together with those of standing still."""
     return sort_observations(np.concatenate([observations, still_seconds(inertial, observations)]))
 
 
 def _feels_still(inertial: Inertial, first: int, count: int) -> BoolArray:
-    """Return (count,) of whole seconds from ``first`` on: no turn beside the earth's, and the same force as the
-    neighbours.
-    """
+    """Return (count,) whether whole seconds from ``first`` on have only the earth's turn and the neighbours' force."""
     number = (inertial.time_ns - 1) // SECOND_NS - first
     inside = (number >= 0) & (number < count)
     number = number[inside]
@@ -76,7 +74,7 @@ def _feels_still(inertial: Inertial, first: int, count: int) -> BoolArray:
 
 
 def _seen_still(observations: StructArray, first: int, count: int) -> BoolArray:
-    """Return (count,) a receiver's velocity says so, or its positions where it says none."""
+    """Return (count,) whether a receiver's velocities, or without them its positions, show no motion."""
     seen, moves = np.zeros(count, np.bool_), np.zeros(count, np.bool_)
     for kind, moving in ((Kind.VELOCITY, _by_velocity), (Kind.POSITION, _by_position)):
         rows = observations[observations["kind"] == kind]
@@ -96,7 +94,7 @@ def _by_velocity(rows: StructArray) -> BoolArray:
 
 
 def _by_position(rows: StructArray) -> BoolArray:
-    """Return against the position some time before: less than noise, and than what a slow roll makes."""
+    """Return whether each position moved since some time before: by more than its noise, or than a slow roll allows."""
     back = np.maximum(np.searchsorted(rows["time_ns"], rows["time_ns"] - APART_NS, side="right") - 1, 0)
     away = np.linalg.norm(rows["value"] - rows["value"][back], axis=1)
     moves: BoolArray = away > np.clip(SIGMAS * np.linalg.norm(rows["sigma"], axis=1), *DRIFTS_M)

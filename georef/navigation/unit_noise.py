@@ -1,7 +1,8 @@
-"""Whether a flight asks for another noise of its inertial unit than it was navigated with.
+"""Check whether a flight requires another noise of its inertial unit than it was navigated with.
 
-Setups are compared by the likelihood of the same innovations, GNSS's scales matched for each (`noise`). Another noise
-is named only where ln likelihood is better by `SIGNIFICANT`. A unit that is quieter than said shows likewise.
+Setups are compared by the likelihood of the same innovations, with GNSS's scales matched for each (`noise`). Another
+noise is reported only if ln likelihood is better by `SIGNIFICANT`. A unit that is quieter than stated shows in the same
+way.
 """
 
 from __future__ import annotations
@@ -13,20 +14,20 @@ from swath.georef.navigation.diagnosis.data import Finding
 from swath.georef.navigation.inputs import ImuNoise, Setup
 from swath.georef.navigation.noise import SIGNIFICANT, Judged, Run
 
-LARGER = 5.0  # times as large errors of a sensor are tried
-LEAST = {"gyro_scale": 1e-3, "accel_scale": 1e-3, "misalignment": 1e-3}  # that is tried at least
+LARGER = 5.0  # factor on a sensor's errors that is tried
+LEAST = {"gyro_scale": 1e-3, "accel_scale": 1e-3, "misalignment": 1e-3}  # least sigmas that are tried
 KEYS = {"gyro_scale": "gyro_scale_ppm", "accel_scale": "accel_scale_ppm", "misalignment": "misalignment_mrad"}
 IN_KEY = {"gyro_scale": 1e6, "accel_scale": 1e6, "misalignment": 1e3}
 
 
 @dataclass(frozen=True)
 class Asked:
-    """Another noise.
+    """Another noise that a flight requires.
 
     Attributes:
         name: of the grade, or of the field of `ImuNoise`.
-        noise: it.
-        gain: ln likelihood that it wins.
+        noise: the noise.
+        gain: its gain of ln likelihood.
     """
 
     name: str
@@ -35,10 +36,10 @@ class Asked:
 
 
 def better_grade(run: Run, setup: Setup, grades: Mapping[str, ImuNoise]) -> Asked | None:
-    """Return the grade that innovations fit best, where that is better than the setup's noise; None where none is.
+    """Return the grade that innovations fit best; None if none fits better than the setup's noise.
 
     Args:
-        run: gives the innovations of a run over a part of the flight with a setup.
+        run: returns the innovations of a run over a part of the flight with a setup.
         setup: of the flight, GNSS's noise found.
         grades: others, by name.
     """
@@ -54,7 +55,7 @@ def better_grade(run: Run, setup: Setup, grades: Mapping[str, ImuNoise]) -> Aske
 
 
 def contradicted(run: Run, setup: Setup) -> list[Asked]:
-    """Return scale factors and misalignments that the flight shows to be larger than the setup's noise has them.
+    """Return scale factors and misalignments that the flight shows to be larger than in the setup's noise.
 
     Args: as of `better_grade`.
     """
@@ -74,11 +75,12 @@ def contradicted(run: Run, setup: Setup) -> list[Asked]:
 
 
 def noise_findings(run: Run, setup: Setup, grade: str, grades: Mapping[str, ImuNoise], table: str) -> Iterator[Finding]:
-    """Say what `better_grade` and `contradicted` find.
+    """Yield the findings of `better_grade` and `contradicted`.
 
     Args:
-        grade: of the configuration, with whose name the setup's noise goes.
-        table: ``imu.main.noise``, where its keys are.
+        run, setup, grades: as of `better_grade`.
+        grade: the configured grade of the setup's noise.
+        table: ``imu.main.noise``, the table of its keys.
     """
     better = better_grade(run, setup, {name: noise for name, noise in grades.items() if name != grade})
     if better is not None:

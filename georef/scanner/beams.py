@@ -1,8 +1,8 @@
-"""Scanners by declaration: what deflects the beam, as a table for the kernel (FORMULAS 2.2).
+"""Declare scanners: convert the optics that deflect the beam to a table for the kernel (FORMULAS 2.2).
 
-A geometry says where the beam of a scan angle goes in the scanner's frame s. A new scanner is a table of these, not
-code. All but spinning heads: x forward, y right, z along the beam at scan angle 0. The laser of a swung mirror shines
-from the +y side, that of a Palmer mirror along +x.
+A geometry gives the direction of the beam at a scan angle in the scanner's frame s. A new scanner is a table of these,
+without code. All but spinning heads: x forward, y right, z along the beam at scan angle 0. The laser of an oscillating
+or rotating mirror shines from the +y side, that of a Palmer mirror along +x.
 """
 
 from __future__ import annotations
@@ -37,7 +37,10 @@ _NO_SWING = (*_NO_PLANE, "scan_angle_scale", "torsion_s2")
 
 
 class GeometryError(ValueError):
-    """A scanner that cannot be, or a calibration with what such a scanner does not have; one line for the user."""
+    """Raised for an impossible scanner, or a calibration with values that such a scanner does not have.
+
+    Its text is one line for the user.
+    """
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,34 +61,38 @@ class Deflection:
 
 
 class Geometry(Protocol):
-    """How a scanner deflects its beam."""
+    """The way in which a scanner deflects its beam."""
 
     @property
     def without(self) -> tuple[str, ...]:
         """Parameters of the model, by their names in SI units, that such a scanner does not have."""
 
     def deflection(self, calibration: Calibration) -> Deflection:
-        """Return the table; GeometryError where the calibration has what such a scanner has not."""
+        """Return the table of a geometry.
+
+        Raises:
+            GeometryError: the calibration has values that such a scanner does not have.
+        """
 
 
 @dataclass(frozen=True)
 class LineGeometry:
-    """Oscillating mirror, monogon or polygon: one plane of scan, of a polygon one a facet.
+    """Oscillating mirror, monogon or polygon: one plane of scan, for a polygon one per facet.
 
     Attributes:
-        facets: of a polygon, whose number comes in a return's channel; 1: no polygon.
+        facets: of a polygon, whose number is in a return's channel; 1: not a polygon.
     """
 
     facets: int = 1
     without: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self) -> None:
-        """GeometryError where there is no facet."""
+        """Refuse a scanner without facets with `GeometryError`."""
         if self.facets < 1:
             raise GeometryError(f"geometry.facets: got {self.facets}, want at least 1")
 
     def deflection(self, calibration: Calibration) -> Deflection:
-        """See `Geometry`."""
+        """Return the table as in `Geometry`."""
         _refuse(calibration, self.without, facets=self.facets if self.facets > 1 else 0)
         tilts = np.zeros(self.facets)
         for index, tilt_rad in calibration.facet_tilt_rad.items():
@@ -101,7 +108,7 @@ class FibreGeometry:
     Attributes:
         across_rad: (fibres,) scan angle of each, positive to the right.
         along_rad: (fibres,) out of the plane of scan, positive forward.
-        by_encoder: fibre k is in the light at 2π k / fibres of the mirror's shaft; False: a return's channel says it.
+        by_encoder: fibre k is lit at 2π k / fibres of the mirror's shaft; False: a return's channel gives it.
     """
 
     across_rad: FloatArray
@@ -110,12 +117,12 @@ class FibreGeometry:
     without: ClassVar[tuple[str, ...]] = _NO_ENCODER
 
     def __post_init__(self) -> None:
-        """GeometryError where the table has no rows."""
+        """Refuse a table without rows with `GeometryError`."""
         if not len(self.across_rad) or self.across_rad.shape != self.along_rad.shape or self.across_rad.ndim != 1:
             raise GeometryError("geometry.file: want the angles across and along of at least one fibre")
 
     def deflection(self, calibration: Calibration) -> Deflection:
-        """See `Geometry`."""
+        """Return the table as in `Geometry`."""
         _refuse(calibration, self.without)
         # a beam that leaves the plane of scan forward by ξ is a cone like that of Δη, which leaves it backward
         table = _line_table(calibration.value("scan_plane_tilt_rad") - self.along_rad, np.zeros(len(self.across_rad)))
@@ -129,7 +136,7 @@ class NutatingGeometry:
     """Palmer scan: a mirror whose normal leans from its shaft; the laser shines along +x.
 
     Attributes:
-        nutation_rad: ψ, of the normal from the shaft; at encoder 0 forward, so that the beam is forward by 2ψ.
+        nutation_rad: ψ, angle of the normal from the shaft; at encoder 0 forward, so that the beam is forward by 2ψ.
         shaft_angle_rad: between shaft and laser, in the plane x, z.
     """
 
@@ -138,7 +145,7 @@ class NutatingGeometry:
     without: ClassVar[tuple[str, ...]] = _NO_PLANE
 
     def deflection(self, calibration: Calibration) -> Deflection:
-        """See `Geometry`."""
+        """Return the table as in `Geometry`."""
         _refuse(calibration, self.without)
         psi, beta = self.nutation_rad, self.shaft_angle_rad
         table = _table(1, math.sin(psi), math.cos(psi), math.sin(beta), math.cos(beta))
@@ -147,12 +154,12 @@ class NutatingGeometry:
 
 @dataclass(frozen=True)
 class RisleyGeometry:
-    """Two prisms with flat entries and wedged exits, shone through along z; at encoder 0 both thin ends are forward.
+    """Two prisms with flat entries and wedged exits, lit along z; at encoder 0 both thin ends are forward.
 
     Attributes:
         wedge_rad: of the first and the second.
         refractive_index: of both.
-        prism_ratio: turns of the second a turn of the first, whose whole turns the encoder counts.
+        prism_ratio: turns of the second per turn of the first, whose whole turns the encoder counts.
     """
 
     wedge_rad: tuple[float, float]
@@ -161,10 +168,11 @@ class RisleyGeometry:
     without: ClassVar[tuple[str, ...]] = _NO_PLANE
 
     def __post_init__(self) -> None:
-        """GeometryError where light does not come through at every angle."""
+        """Refuse prisms that reflect the light totally at some angle with `GeometryError`."""
         index, (first, second) = self.refractive_index, map(abs, self.wedge_rad)
         leaving = math.asin(min(1.0, index * math.sin(first))) - first
-        steepest = second + math.asin(math.sin(leaving) / index)  # on the last surface, of the light that came so far
+        # on the last surface, of the light after the surfaces before
+        steepest = second + math.asin(math.sin(leaving) / index)
         passes = max(index * math.sin(first), index * math.sin(steepest)) < 1.0
         if not passes or max(first, steepest) >= math.pi / 2:
             degrees = ", ".join(f"{math.degrees(wedge):g}" for wedge in self.wedge_rad)
@@ -172,10 +180,10 @@ class RisleyGeometry:
             raise GeometryError(f"geometry.wedge_deg: {text}")
 
     def deflection(self, calibration: Calibration) -> Deflection:
-        """See `Geometry`; the ray is taken through three of the four surfaces here.
+        """Return the table as in `Geometry`, with the ray traced through three of the four surfaces.
 
-        Through the first, flat, at a right angle; through the exit of the first prism into air; and, bent towards z,
-        into the flat second prism, where its horizontal part shrinks by the refractive index.
+        It passes the first, flat, at a right angle; then the exit of the first prism into air; and, bent towards z, the
+        flat entry of the second prism, where its horizontal part shrinks by the refractive index.
         """
         _refuse(calibration, self.without)
         index, wedge = self.refractive_index, self.wedge_rad[0]
@@ -194,7 +202,7 @@ class SpinningGeometry:
     Attributes:
         elevation_deg: (channels,) above the plane perpendicular to the spin axis.
         azimuth_deg: added to the head's azimuth.
-        range_m: added to what was measured.
+        range_m: added to the measured range.
         right_m, forward_m, up_m: where the beam starts, in axes that turn with the beam's azimuth.
     """
 
@@ -207,7 +215,7 @@ class SpinningGeometry:
     without: ClassVar[tuple[str, ...]] = _NO_SWING
 
     def deflection(self, calibration: Calibration) -> Deflection:
-        """See `Geometry`."""
+        """Return the table as in `Geometry`."""
         count = len(self.elevation_deg)
         _refuse(calibration, self.without, channels=count)
         azimuth, elevation, range_m = _beam_corrections(calibration, count)
@@ -221,7 +229,7 @@ class SpinningGeometry:
 
 @dataclass(frozen=True, eq=False)
 class OusterGeometry:
-    """Ouster head in its sensor frame: its encoder turns x to y; ranges count from its axis over the beam's start.
+    """Ouster head in its sensor frame: its encoder turns x to y; ranges count from its axis through the beam's start.
 
     Attributes:
         altitude_rad, azimuth_rad: (channels,) of the metadata.
@@ -236,13 +244,13 @@ class OusterGeometry:
     without: ClassVar[tuple[str, ...]] = _NO_SWING
 
     def deflection(self, calibration: Calibration) -> Deflection:
-        """See `Geometry`: a spinning head whose azimuth falls, from y, as the encoder turns."""
+        """Return the table as in `Geometry`: a spinning head whose azimuth falls, from y, as the encoder turns."""
         count = len(self.altitude_rad)
         _refuse(calibration, self.without, channels=count)
         azimuth, elevation, range_m = _beam_corrections(calibration, count)
         azimuth, elevation = azimuth + self.azimuth_rad, elevation + self.altitude_rad
         start, above = self.beam_origin_m
-        before = math.hypot(start, above)  # of the range lies before the beam's start
+        before = math.hypot(start, above)  # part of the range before the beam's start
         right, forward = -start * np.sin(azimuth), start * np.cos(azimuth) - before * np.cos(elevation)
         up = above - before * np.sin(elevation)
         table = _table(count, np.sin(elevation), np.cos(elevation), azimuth + np.pi / 2, right, forward, up, -1.0)
@@ -291,14 +299,16 @@ def line_scanner(
 
 
 def read_fibres(text: str, name: str) -> FibreGeometry:
-    """Return a table of fibres: a line ``across_deg,along_deg``, then one a fibre, in the order the mirror lights them.
+    """Return a table of fibres from a file.
+
+    Its first line is ``across_deg,along_deg``; a line per fibre follows, in the order in which the mirror lights them.
 
     Args:
         text: of the file.
         name: of the file, for messages.
 
     Raises:
-        GeometryError: which line is wrong.
+        GeometryError: names the faulty line.
     """
     lines = [line.strip() for line in text.splitlines()]
     if not lines or lines[0].replace(" ", "") != "across_deg,along_deg":
@@ -330,7 +340,7 @@ def _line_table(plane_tilt_rad: FloatArray, mirror_tilt_rad: FloatArray) -> Floa
 
 
 def _beam_corrections(calibration: Calibration, count: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return (channels,) added to azimuths, elevations and ranges by [[beam]]."""
+    """Return corrections (channels,) of azimuths, elevations and ranges by [[beam]]."""
     corrections = np.zeros((3, count))
     for channel, beam in calibration.beams.items():
         corrections[:, channel] = beam.azimuth_rad, beam.elevation_rad, beam.range_m
@@ -338,7 +348,7 @@ def _beam_corrections(calibration: Calibration, count: int) -> tuple[FloatArray,
 
 
 def _refuse(calibration: Calibration, without: tuple[str, ...], *, facets: int = 0, channels: int = 0) -> None:
-    """What a calibration must not have; GeometryError."""
+    """Refuse a calibration with values that such a scanner does not have, with `GeometryError`."""
     where = f"calibration of {calibration.scanner}"
     for name in without:
         if calibration.value(name) != 0.0:

@@ -1,6 +1,6 @@
-"""What is known of a scanner's mounting and errors: the parameters of the model, their sigmas, and its tables.
+"""A scanner's calibration: the parameters of mounting and errors, their sigmas, and its tables.
 
-Read from a calibration file (CONVENTIONS, "Calibration file"), or nominal where there is none.
+It is read from a calibration file (CONVENTIONS, "Calibration file"), or nominal without one.
 """
 
 from __future__ import annotations
@@ -21,15 +21,16 @@ METHODS = ("nominal", "planes", "tie_points", "profiles", "control", "combined")
 RANGES = ("corrected", "vacuum")
 REFRACTIONS = ("none", "ardc", "spherical")
 ROTATION_TOLERANCE = 1e-6
-LARGEST, LEAST_SIGMA = 1e18, 1e-15  # in the units of the file: far beyond what anything is, and still to be squared
-MOST = 65_535  # of channels, which have 16 bits, and of what is fewer
+# in the units of the file: far beyond any true value, and within the range of squares
+LARGEST, LEAST_SIGMA = 1e18, 1e-15
+MOST = 65_535  # greatest number of channels, which have 16 bits, and limit of other counts
 ONE_TABLE = "want it once"
 TABLES = ("calibration", "parameters", "sigma", "held_sigma", "correlation", "ibrc", "range_offset", "facet", "beam")
 VERDICTS = ("good", "usable with care", "not to be used")
 
 
 class CalibrationError(ValueError):
-    """A calibration file that cannot be used; its text has one line a mistake: file, key, what would be right."""
+    """Raised for an unusable calibration file; its text has one line per mistake: file, key, remedy."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +41,7 @@ class Parameter:
         key: in calibration files.
         name: in the code, with its SI unit.
         factor: SI units per unit of the file.
-        likely: one sigma, in the file's unit, of its error where nobody has measured or calibrated it.
+        likely: one sigma, in the file's unit, of its error if it is neither measured nor calibrated.
         needed: whether a calibration file must give its value.
     """
 
@@ -52,7 +53,7 @@ class Parameter:
 
     @property
     def plausible(self) -> float:
-        """One sigma, SI, of its error where nobody has measured or calibrated it."""
+        """One sigma, SI, of its error if it is neither measured nor calibrated."""
         return self.likely * self.factor
 
 
@@ -81,7 +82,7 @@ _INDEX_OF_KEY = {parameter.key: index for index, parameter in enumerate(PARAMETE
 
 @dataclass(frozen=True, slots=True)
 class RangeOffset:
-    """Metres added to ``range_offset_m`` where all that is not None matches."""
+    """Metres added to ``range_offset_m`` for returns that match every field that is not None."""
 
     offset_m: float
     return_slot: int | None = None
@@ -91,7 +92,7 @@ class RangeOffset:
 
 @dataclass(frozen=True, slots=True)
 class BeamCorrection:
-    """Added to a beam of a multi-beam head."""
+    """Corrections added to a beam of a multi-beam head."""
 
     azimuth_rad: float = 0.0
     elevation_rad: float = 0.0
@@ -105,17 +106,17 @@ class Calibration:
     Attributes:
         id, scanner, method: of the file.
         parameters: (16,) in the order of `PARAMETERS`.
-        sigmas: (16,) one sigma of those that were estimated, with what the held ones may have wrong; 0: held.
+        sigmas: (16,) one sigma of the estimated ones, with the effect of possible errors of the held ones; 0: held.
         correlation: (16, 16) of the estimated and held ones together.
         installation_matrix: (3, 3) T, b from s (inside a gimbal: its innermost stage from s).
-        mirror_factor: of the encoder's angles it was estimated with; None: unsaid.
-        ranges, refraction: the [atmosphere] settings it was estimated with; None: unsaid.
+        mirror_factor: factor of the encoder's angles in the estimation; None: not given.
+        ranges, refraction: the [atmosphere] settings of the estimation; None: not given.
         ibrc: intensities, rising, and metres subtracted from the range; None: no table.
         range_offsets: each added to the range offset where it matches.
         facet_tilt_rad: tilt of facets by index.
         beams: corrections of beams by channel.
         header: all of the file's table [calibration].
-        held_sigmas: (16,) one sigma that is plausible of those that were held; 0: estimated, or nothing is said.
+        held_sigmas: (16,) plausible sigmas of the held ones; 0: estimated, or not given.
     """
 
     id: str
@@ -137,11 +138,11 @@ class Calibration:
 
     @property
     def is_nominal(self) -> bool:
-        """Return whether nobody estimated or judged it: its method is nominal, and the file says no verdict."""
+        """True if nothing was estimated or judged: its method is nominal, and the file has no verdict."""
         return self.method == "nominal" and "verdict" not in self.header
 
     def with_plausible_sigmas(self) -> Calibration:
-        """Return a nominal calibration with plausible sigmas of what nobody measured; others as they are."""
+        """Return a nominal calibration with plausible sigmas of unmeasured parameters; other calibrations unchanged."""
         if not self.is_nominal or self.all_sigmas.any():
             return self
         return replace(self, held_sigmas=np.array([parameter.plausible for parameter in PARAMETERS]))
@@ -152,22 +153,22 @@ class Calibration:
 
     @property
     def lever_arm_b(self) -> FloatArray:
-        """(3,) from the body's origin to the scanner's (to the first stage of its gimbal), metres."""
+        """The vector (3,) from the body's origin to the scanner's (to the first stage of its gimbal), metres."""
         return np.array([self.value(f"lever_arm_{axis}_m") for axis in "xyz"])
 
     @property
     def all_sigmas(self) -> FloatArray:
-        """(16,) one sigma of every parameter, estimated or held; 0: nothing is said of it."""
+        """One sigma (16,) of every parameter, estimated or held; 0: not given."""
         return self.sigmas + self.held_sigmas
 
     def covariance(self) -> FloatArray:
-        """Return (16, 16) of the parameters, estimated and held, SI units; zero where nothing is said of them."""
+        """Return the covariance (16, 16) of the parameters, estimated and held, SI units; zero where not given."""
         sigmas = self.all_sigmas
         scaled: FloatArray = self.correlation * np.outer(sigmas, sigmas)
         return scaled
 
     def changed(self, **values: float) -> Calibration:
-        """Return the same with some parameters by their names in SI units."""
+        """Return a copy with other values of some parameters, by their names in SI units."""
         parameters = self.parameters.copy()
         for name, value in values.items():
             parameters[INDEX[name]] = value
@@ -177,8 +178,9 @@ class Calibration:
 def nominal(
     scanner: str, lever_arm_b: Sequence[float] | FloatArray, installation: Sequence[Sequence[float]] | FloatArray
 ) -> Calibration:
-    """Return where there is no file: every parameter zero but the lever arm (3,), and the installation matrix T (3,
-    3).
+    """Return the calibration to use without a file.
+
+    Every parameter is zero but the lever arm (3,); the installation matrix T (3, 3) is as given.
     """
     parameters = np.zeros(len(PARAMETERS))
     first = INDEX["lever_arm_x_m"]
@@ -188,14 +190,14 @@ def nominal(
 
 
 def read_calibration(text: str, name: str) -> Calibration:
-    """Return a calibration file.
+    """Return a calibration read from a file.
 
     Args:
         text: of the file.
         name: of the file, for messages.
 
     Raises:
-        CalibrationError: one line a mistake.
+        CalibrationError: one line per mistake.
     """
     try:
         document = toml_tables(text)
@@ -209,7 +211,7 @@ def read_calibration(text: str, name: str) -> Calibration:
 
 
 class _Reader:
-    """Takes a document apart; what is wrong is noted, and stands in for itself by something harmless."""
+    """Reads a document; it notes each mistake and continues with a harmless value."""
 
     def __init__(self, document: Mapping[str, Any]) -> None:
         self._document = document
@@ -249,7 +251,7 @@ class _Reader:
         self.mistakes.append(f"{key}: {text}")
 
     def _known(self, table: Mapping[str, Any], where: str, keys: tuple[str, ...]) -> None:
-        """What nobody would look at, as a table or key that is misspelt, is wrong too."""
+        """Note tables or keys that are unknown, such as misspelt ones, which would otherwise be ignored."""
         for key in sorted(table.keys() - set(keys)):
             self._wrong(f"{where}{key_text(key)}", f"is not known; want {', '.join(keys)}")
 
@@ -271,7 +273,7 @@ class _Reader:
         return ""
 
     def _version(self, header: Mapping[str, Any]) -> None:
-        """Of the conventions, whose signs and units the numbers have."""
+        """Note a wrong version of the conventions, which define the signs and units of the numbers."""
         value = header.get("conventions", CONVENTIONS)
         if value != CONVENTIONS:
             self._wrong("calibration.conventions", f"got {value!r}, want {CONVENTIONS}: other signs or units, perhaps")
@@ -306,7 +308,7 @@ class _Reader:
         return value
 
     def _values(self, section: str) -> tuple[FloatArray, set[int]]:
-        """Return (16,) in SI units, and which of them were said."""
+        """Return values (16,) in SI units, and the indices of those given."""
         table = self._table(section, needed=section == "parameters")
         values, said = np.zeros(len(PARAMETERS)), set()
         for key in sorted(table.keys() - _INDEX_OF_KEY.keys()):
@@ -319,7 +321,7 @@ class _Reader:
         return values, said
 
     def _sigmas(self, section: str) -> tuple[FloatArray, set[int]]:
-        """Return (16,) sigmas in SI units, none negative or too small to be squared, and which of them were said."""
+        """Return sigmas (16,) in SI units, none negative or too small to be squared, and the indices of those given."""
         sigmas, said = self._values(section)
         in_units = sigmas / [parameter.factor for parameter in PARAMETERS]
         for index in np.flatnonzero((sigmas != 0.0) & (in_units < LEAST_SIGMA)).tolist():
@@ -328,7 +330,7 @@ class _Reader:
         return sigmas, said
 
     def _correlation(self, known: set[int]) -> FloatArray:
-        """Return (16, 16) from the names and the matrix of those whose sigmas were said."""
+        """Return the correlation (16, 16) from the names and the matrix of the parameters with sigmas."""
         whole = np.eye(len(PARAMETERS))
         table = self._table("correlation")
         if not table:
@@ -375,7 +377,7 @@ class _Reader:
         return intensity, correction
 
     def _rows(self, key: str, columns: tuple[str, ...]) -> Iterator[tuple[str, Mapping[str, Any]]]:
-        """Yield rows of an array of tables, with where each stands."""
+        """Yield rows of an array of tables, with the place of each."""
         rows = self._document.get(key, [])
         if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
             self._wrong(key, f"want tables [[{key}]]")
@@ -418,7 +420,7 @@ class _Reader:
 
 
 def is_rotation(matrix: FloatArray) -> bool:
-    """Return are the rows of (3, 3) perpendicular, of length 1 and right-handed?"""
+    """Return whether the rows of (3, 3) are perpendicular, of length 1 and right-handed."""
     error = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
     return error < ROTATION_TOLERANCE and float(np.linalg.det(matrix)) > 0.0
 
@@ -429,7 +431,7 @@ def _is_correlation(matrix: FloatArray) -> bool:
 
 
 def _array(value: object, shape: tuple[int, ...] | None) -> FloatArray | None:
-    """Return numbers of this shape (None: a list of any length), none beyond `LARGEST`, or None."""
+    """Return numbers of this shape (None: a list of any length), none beyond `LARGEST`; else None."""
     try:
         array = np.array(value)
     except ValueError:

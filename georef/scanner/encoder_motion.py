@@ -1,8 +1,8 @@
-"""dθ/dt and d²θ/dt² of encoder readings, for encoder latency and torsion (CONVENTIONS, the beam; FORMULAS 9).
+"""Compute dθ/dt and d²θ/dt² of encoder readings, for encoder latency and torsion (CONVENTIONS, the beam; FORMULAS 9).
 
-Readings are whole counts, stand in returns only, and repeat where a pulse has several. So each piece of 50 µs gets a
-polynomial by least squares over a window around it: 0.35 ms, or as much more as 24 pulses over 0.26 ms need, 2.45 ms
-at most. Of a ±30° sine at 50 Hz the rate is then good to 0.5 rad/s with an encoder of 17 bits and 100 000 pulses a
+Readings are whole counts, exist for returns only, and repeat if a pulse has several. Therefore each piece of 50 µs gets
+a polynomial by least squares over a window around it: 0.35 ms, or as much more as 24 pulses over 0.26 ms need, 2.45 ms
+at most. For a ±30° sine at 50 Hz the rate is then good to 0.5 rad/s with an encoder of 17 bits and 100 000 pulses a
 second, that is 5e-7 rad for a microsecond of latency, a hundredth of a count.
 """
 
@@ -21,25 +21,25 @@ Moving = tuple[StructArray, Int64Array, FloatArray, FloatArray]
 
 
 class TellsMotion(Protocol):
-    """Tells how the encoder moved when it was read."""
+    """A source of the encoder's motion at its readings."""
 
     def motion(self, rows: StructArray, time_ns: Int64Array) -> tuple[FloatArray, FloatArray]:
-        """Return (n,) rate and acceleration of the readings, rad/s, rad/s²."""
+        """Return rate and acceleration (n,) of the readings, rad/s, rad/s²."""
 
 
 class EncoderMotion:
-    """Rate and acceleration beside the rows of one scanner, as they come.
+    """Computes rate and acceleration for the rows of one scanner, as they come.
 
-    Holds back the last 1.2 ms. What is given does not depend on how rows are cut into batches.
+    It holds back the last 1.2 ms. The output does not depend on the division of rows into batches.
 
     Args:
-        steady: the shaft turns evenly (polygon, monogon, nutating mirror, prisms, spinning head): the rate is that of a
-            straight line, the acceleration 0. False: an oscillating mirror.
-        facets: the rows' channel is a polygon's facet: at its edges, as at every step of more than a radian, the
-            reading jumps, and no window crosses a jump.
+        steady: whether the shaft turns evenly (polygon, monogon, nutating mirror, prisms, spinning head): the rate is
+            then that of a straight line, the acceleration 0. False: an oscillating mirror.
+        facets: whether the rows' channel is a polygon's facet: at its edges, as at every step of more than a radian,
+            the reading jumps, and no window crosses a jump.
 
     Attributes:
-        lonely: pulses so far from others that nothing tells their rate, which is then given as 0.
+        lonely: pulses too far from others to determine their rate, which is then 0.
     """
 
     def __init__(self, *, steady: bool = False, facets: bool = False) -> None:
@@ -47,10 +47,10 @@ class EncoderMotion:
         self._steady, self._facets = steady, facets
         self._rows: StructArray = np.zeros(0, RETURN_DTYPE)
         self._time_ns: Int64Array = np.zeros(0, np.int64)
-        self._given = 0  # of the rows held, those that only others need
+        self._given = 0  # number of held rows that are kept only as neighbours of later ones
 
     def feed(self, rows: StructArray, time_ns: Int64Array) -> Moving:
-        """Return rows whose neighbourhood is known now.
+        """Take rows, and return those whose neighbourhood is complete now.
 
         Args:
             rows: (n,) `RETURN_DTYPE`, in the order of emission.
@@ -92,13 +92,13 @@ class EncoderMotion:
 
     @staticmethod
     def _complete(pieces: Int64Array) -> int:
-        """Return how many pieces have all the neighbours they can have: the train went on far enough, or ended."""
+        """Return the number of pieces with complete neighbourhoods: their train went on far enough, or ended."""
         last = pieces[-1]
         open_pieces = (pieces[:, TRAIN] == last[TRAIN]) & (last[PLACE] - pieces[:, PLACE] <= REACH)
         return int(np.argmax(open_pieces))
 
     def _forget(self, pieces: Int64Array, starts: Int64Array, done: int) -> None:
-        """Keep what later pieces need: their train, as far back as a window goes."""
+        """Drop rows that later pieces do not need; these need their train, as far back as a window reaches."""
         next_piece = pieces[done]
         needed = (pieces[:, TRAIN] == next_piece[TRAIN]) & (next_piece[PLACE] - pieces[:, PLACE] <= REACH)
         keep = int(starts[int(np.argmax(needed))])

@@ -1,7 +1,7 @@
-"""How a point moves with the parameters and the observations: analytic columns (FORMULAS 5.2; ISO/TS 19159-2 Eq. 14).
+"""Derivatives of a point by parameters and observations: analytic columns (FORMULAS 5.2; ISO/TS 19159-2 Eq. 14).
 
-The derivative of the model as it is, at what the rays were made with, in e; `columns_l` turns them to l. Left out are
-the bending of the beam and, of the time offset, the gimbal's own motion.
+They are the exact derivatives of the model, at the values of the rays, in e; `columns_l` turns them to l. The bending
+of the beam is left out, and in the column of the time offset the gimbal's own motion.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ def parameter_columns_e(rays: Rays, model: SensorModel, trajectory: Trajectory) 
     Args:
         rays: with axes, (n,).
         model: that made them.
-        trajectory: they were made on.
+        trajectory: on which they were made.
 
     Returns:
-        (n, 16, 3) in the order of `PARAMETERS`, metres a unit in SI; rows of returns that were not georeferenced mean
-        nothing.
+        (n, 16, 3) in the order of `PARAMETERS`, metres per SI unit; rows of returns that were not georeferenced are
+        undefined.
     """
     value = model.calibration.value
     arm, by_range, by_angle, by_tilt = _axes(rays)
     columns = np.zeros((len(rays.fate), len(PARAMETERS), 3))
-    turning = arm - model.calibration.lever_arm_b  # what the boresight turns
+    turning = arm - model.calibration.lever_arm_b  # the part of the arm that the boresight turns
     outer = rot_x(value("omega_rad"))
     slope = value("pitch_slope")
     outer_of_row = outer @ rot_y(value("phi_rad") + slope * rays.angle_rad)
@@ -89,7 +89,7 @@ def observation_columns_e(rays: Rays, model: SensorModel, trajectory: Trajectory
 
 
 def columns_l(columns_e: FloatArray, rays: Rays, trajectory: Trajectory) -> FloatArray:
-    """Return columns (n, m, 3) in e as north, east, down at the body."""
+    """Return columns (n, m, 3) in e converted to north, east, down at the body."""
     turned: FloatArray = columns_e @ _rot_e_from_l(_body_e(rays, trajectory))
     return turned
 
@@ -102,20 +102,20 @@ def _axes(rays: Rays) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
 
 
 def _column(values: FloatArray | None) -> FloatArray:
-    """Return (n, 1); absent: zero."""
+    """Return values as a column (n, 1); zero (1, 1) for None."""
     column: FloatArray = np.zeros((1, 1)) if values is None else values[:, np.newaxis]
     return column
 
 
 def _rot_b_from_e(rays: Rays) -> FloatArray:
-    """Return (n, 3, 3); rows of vectors in b times this are rows in e."""
+    """Return rotations (n, 3, 3); rows of vectors in b times these are rows in e."""
     if rays.q_e_from_b is None:
         raise ValueError("rays without axes; want rays(…, with_axes=True)")
     return np.swapaxes(rot_from_quaternion(rays.q_e_from_b), 1, 2)
 
 
 def _body_e(rays: Rays, trajectory: Trajectory) -> FloatArray:
-    """Return (n, 3) where the body was."""
+    """Return the body's positions (n, 3)."""
     if rays.epoch is None:
         raise ValueError("rays without axes; want rays(…, with_axes=True)")
     here, there = trajectory.position_e[rays.epoch], trajectory.position_e[rays.epoch + 1]
@@ -129,9 +129,9 @@ def _rot_e_from_l(body_e: FloatArray) -> FloatArray:
 
 
 def _motion(rays: Rays, imu_latency_s: float, trajectory: Trajectory) -> tuple[FloatArray, FloatArray]:
-    """Turn rate of the body against e, in b, at the attitude's time; velocity in e at the position's: both (n, 3).
+    """Return the body's turn rate against e, in b, at the attitude's time, and its velocity in e at the position's.
 
-    Those of the trajectory as it is interpolated: constant between two of its epochs.
+    Both (n, 3) are those of the interpolated trajectory: constant between two of its epochs.
     """
     if rays.epoch is None:
         raise ValueError("rays without axes; want rays(…, with_axes=True)")

@@ -4,7 +4,7 @@ From the outermost stage inwards a point is
 
     x_b = lever_arm_b + R(ω, φ, κ) · G₁ ( a₁ + G₂ ( a₂ + … T x_s ) )
 
-with G = Rz(yaw) Ry(pitch) Rx(roll) of each stage and a the vector from its centre to that of the next inner one (of
+with G = Rz(yaw) Ry(pitch) Rx(roll) of each stage and a the vector from its centre to that of the next inner one (for
 the last: to the scanner's origin), in the stage's own axes. The lever arm ends in the first stage's centre; the
 boresight is that between gimbal and body.
 """
@@ -25,7 +25,7 @@ DEFAULT_MAX_GAP_NS = 1_000_000_000
 
 
 class MountError(ValueError):
-    """A gimbal that cannot be; one line for the user."""
+    """Raised for an impossible gimbal; one line for the user."""
 
 
 def _zeros() -> FloatArray:
@@ -34,7 +34,7 @@ def _zeros() -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class AngleSeries:
-    """Angles of a stage over time; between two of them they are linear.
+    """Angles of a stage over time, linear in between.
 
     Attributes:
         time_ns: (n,) GPS time, strictly rising, at least two.
@@ -47,7 +47,7 @@ class AngleSeries:
     max_gap_ns: int = DEFAULT_MAX_GAP_NS
 
     def __post_init__(self) -> None:
-        """MountError where the columns do not fit, or times do not rise."""
+        """Refuse columns that do not fit, or times that do not rise, with `MountError`."""
         if len(self.time_ns) < 2 or self.angles_rad.shape != (len(self.time_ns), 3):
             raise MountError("gimbal angles: want at least two epochs of roll, pitch and yaw")
         if (np.diff(self.time_ns) <= 0).any():
@@ -55,11 +55,11 @@ class AngleSeries:
 
     @classmethod
     def of_solutions(cls, rows: StructArray, max_gap_ns: int = DEFAULT_MAX_GAP_NS) -> AngleSeries:
-        """Return roll, pitch and heading that a device told, as the angles of the stage it reads.
+        """Return a device's roll, pitch and heading as the angles of the stage that it measures.
 
         Args:
-            rows: `INS_DTYPE`, in the order in which they came; epochs that are told again or late, and those without
-                all three angles, are left out.
+            rows: `INS_DTYPE`, in the order in which they came; repeated or late epochs, and those without all three
+                angles, are left out.
             max_gap_ns: over longer intervals they are unknown.
 
         Raises:
@@ -73,7 +73,7 @@ class AngleSeries:
         return cls(time_ns[new], angles[new], max_gap_ns)
 
     def joined(self, other: AngleSeries) -> AngleSeries:
-        """With those of another recording; what both tell of is this one's."""
+        """Return this series joined with that of another recording; at common times this one's angles are kept."""
         time_ns, first = np.unique(np.concatenate([self.time_ns, other.time_ns]), return_index=True)
         return AngleSeries(time_ns, np.concatenate([self.angles_rad, other.angles_rad])[first], self.max_gap_ns)
 
@@ -82,7 +82,7 @@ class AngleSeries:
         return np.unwrap(self.angles_rad, axis=0)
 
     def at(self, time_ns: Int64Array) -> tuple[FloatArray, NDArray[np.bool_]]:
-        """Return (n, 3) angles at GPS times (n,), and where they are known."""
+        """Return angles (n, 3) at GPS times (n,), and whether they are known."""
         last = len(self.time_ns) - 2
         epoch = np.clip(np.searchsorted(self.time_ns, time_ns, side="right") - 1, 0, last)
         begin, end = self.time_ns[epoch], self.time_ns[epoch + 1]
@@ -97,9 +97,9 @@ class Stage:
     """A stage of a gimbal.
 
     Attributes:
-        angles_rad: (3,) roll, pitch, yaw; added to the series where there is one.
+        angles_rad: (3,) roll, pitch, yaw; added to the series if there is one.
         lever_arm: (3,) from this stage's centre to the next inner one's, metres, in its own axes.
-        series: angles over time; None: the stage stands still.
+        series: angles over time; None: the stage does not move.
     """
 
     angles_rad: FloatArray = field(default_factory=_zeros)
@@ -107,7 +107,7 @@ class Stage:
     series: AngleSeries | None = None
 
     def joined(self, other: Stage) -> Stage:
-        """Return the same stage in two recordings."""
+        """Return the same stage over the time of two recordings."""
         if self.series is None or other.series is None:
             return self
         return replace(self, series=self.series.joined(other.series))
@@ -121,17 +121,20 @@ class Mount:
 
     @property
     def moves(self) -> bool:
-        """Whether a stage has angles over time."""
+        """True if a stage has angles over time."""
         return any(stage.series is not None for stage in self.stages)
 
     def joined(self, other: Mount) -> Mount:
-        """Return the same mount in two recordings: its stages' angles over the time of both."""
+        """Return the same mount over the time of two recordings."""
         return Mount(tuple(one.joined(again) for one, again in zip(self.stages, other.stages, strict=True)))
 
     def poses(self, time_ns: Int64Array) -> tuple[FloatArray, FloatArray, NDArray[np.uint8]]:
-        """Of the innermost stage at GPS times (n,): rotations (m, 3, 3), origins (m, 3), where both are known (m,).
+        """Return poses of the innermost stage at GPS times (n,).
 
-        Outward from the installed scanner's axes to those the boresight turns; m = n where the mount moves, else 1.
+        They lead outward from the installed scanner's axes to those the boresight turns.
+
+        Returns:
+            rotations (m, 3, 3), origins (m, 3), whether both are known (m,); m = n if the mount moves, else 1.
         """
         count = len(time_ns) if self.moves else 1
         rotation = np.broadcast_to(np.eye(3), (count, 3, 3))

@@ -1,8 +1,8 @@
-"""Ranges of pulses in air, by their time of flight (FORMULAS 3.1, 3.3; PROTOCOLS, SREP's byte 15).
+"""Resolve ranges of pulses in air by their time of flight (FORMULAS 3.1, 3.3; PROTOCOLS, SREP's byte 15).
 
-A scanner that fires before the last echo is back measures from its last emission: the apparent range. The emission an
-echo belongs to is k − 1 pulses earlier (k is the zone, in the records z = k − 1), the range longer by the way light
-goes there and back in between.
+A scanner that fires before the last echo is back measures from its last emission: the apparent range. The emission of
+an echo is k − 1 pulses earlier (k is the zone, in the records z = k − 1), and the true range is longer by half the
+distance that light travels in between.
 """
 
 from __future__ import annotations
@@ -36,19 +36,19 @@ from swath.georef.scanner.kernels.zones import (
 )
 
 ZONE_UNKNOWN = 255
-CONTEXT_FLAG = 128  # of a row's flags: it is there for its neighbours only
+CONTEXT_FLAG = 128  # of a row's flags: the row serves only as a neighbour of others
 MOST_TICK_HZ = 1_000_000_000  # device times are whole nanoseconds
 
 
 class RangingError(ValueError):
-    """A scanner's ranging is described by something it cannot be."""
+    """Raised for an impossible description of a scanner's ranging."""
 
 
 class PulseRates:
-    """Pulse and tick rates that a scanner's headers tell, each from a pulse on; by ``pulse_id``, so that late rows
-    still find theirs.
+    """Pulse and tick rates from a scanner's headers, each valid from a pulse on.
 
-    A parser calls `note`; `ZoneResolver` and `swath.georef.georeference.Georeferencer` ask.
+    They are kept by ``pulse_id``, so that late rows still find theirs. A parser calls `note`; `ZoneResolver` and
+    `swath.georef.georeference.Georeferencer` ask.
     """
 
     def __init__(self) -> None:
@@ -56,13 +56,13 @@ class PulseRates:
         self._told: list[tuple[float, int]] = []
 
     def note(self, pulse_id: int, prf_hz: float, tick_hz: int) -> None:
-        """From this pulse on: pulse rate in Hz, 0 unsaid; nominal ticks a second of the counter."""
+        """Note the rates from a pulse on: pulse rate in Hz, 0 if not given; nominal ticks a second of the counter."""
         at = bisect_right(self._first, pulse_id)
         self._first.insert(at, pulse_id)
         self._told.insert(at, (prf_hz, tick_hz))
 
     def runs(self, pulse_id: Int64Array) -> list[tuple[int, int, float | None, int | None]]:
-        """Of pulses (n,): bounds of runs of the same rates, prf_hz and tick_hz; None: unsaid."""
+        """Return runs of the same rates among pulses (n,): bounds, prf_hz and tick_hz; None if not given."""
         if not len(pulse_id):
             return []
         at = np.searchsorted(np.array(self._first, np.int64), np.asarray(pulse_id, np.int64), side="right") - 1
@@ -75,41 +75,41 @@ class PulseRates:
 
 
 class ZoneResolver:
-    """Finds the emission of every return of one scanner that tells apparent ranges.
+    """Finds the emission of every return of a scanner that gives apparent ranges.
 
-    The range expected is a terrain model's, where the caller gives it, or that of the returns before: the median of
-    the last 60 that were accepted, along the scan angle's vertical; at the beginning the height above ground. Of the
-    emissions before the echo the one is taken whose range is nearest; every one counts from its own time, so that
-    a changing or jittered pulse rate does no harm. Dropped and counted:
+    The expected range is a terrain model's, if the caller gives it, or that of the returns before: the median of the
+    last 60 that were accepted, reduced to scan angle 0; at the beginning it is the height above ground. Of the
+    emissions before the echo the one with the nearest range is taken; every one counts from its own time, so that a
+    changing or jittered pulse rate does no harm. Dropped and counted:
 
-    - ``mta_gap``: the emission expected is not known: the sequence is broken before it, or it had no return of its
-      own and stands between others that do not tell when it was. Rows without a return (``number_of_returns`` 0) are
-      emissions too, and not given back: a parser that gives every pulse leaves no gap but those of the wire.
-    - ``mta_ambiguous``: the range nearest is so far from the expected one that the next zone is hardly farther; or
+    - ``mta_gap``: the expected emission is unknown: the sequence is broken before it, or it had no return of its own
+      and its neighbours do not determine its time. Rows without a return (``number_of_returns`` 0) are emissions too,
+      and are not returned: a parser that gives every pulse leaves no gaps but those of the network.
+    - ``mta_ambiguous``: the nearest range is so far from the expected one that the next zone is hardly farther; or
       nothing is expected yet; or the echo came in the blind time of a later pulse.
 
-    Returns of a pulse, which may stand in several records, are put together and numbered anew. What is given does not
-    depend on how rows are cut into batches. Rows whose zone is known pass as they are and break the sequence.
+    Returns of a pulse, which may be in several records, are put together and renumbered. The output does not depend on
+    the division of rows into batches. Rows with a known zone pass unchanged and break the sequence.
 
     Args:
-        range_max_m: of the scanner; how far back is looked, and how long a pulse is waited for.
-        height_above_ground_m: expected at first; None: returns are ambiguous until a terrain model says something.
+        range_max_m: of the scanner; limit of the search back, and of the wait for a pulse's returns.
+        height_above_ground_m: expected at first; None: returns are ambiguous until a terrain model gives a range.
         group_index: the scanner's own between ticks and metres; SREP counts with the speed of light in vacuum.
         tick_hz: of the counter behind ``device_time_ns``, whose floor these nanoseconds are: half a nanosecond would be
             7 cm. Up to 10⁹.
-        edge_share: of a zone, beside either edge, where nothing is accepted.
+        edge_share: of a zone, beside either edge, where no return is accepted.
         blind_m: apparent ranges below belong to flash and near field of the pulse just fired.
-        slanted: the encoder tells the beam's angle from the vertical (line scanners); False: a cone, all ranges alike.
-        every_pulse: rows tell of every pulse, also of those without a return: where a datagram follows another, its
+        slanted: the encoder gives the beam's angle from the vertical (line scanners); False: a cone, with equal ranges.
+        every_pulse: rows exist for every pulse, also for those without a return: if a datagram follows another, its
             first pulse follows that one's last, however long after.
-        rates: tell the tick rate instead, from a pulse on. Returns counted in more than 10⁹ ticks a second are gaps:
-            their device times do not tell the ticks.
+        rates: give the tick rate instead, from a pulse on. Returns counted in more than 10⁹ ticks a second are gaps:
+            their device times do not determine the ticks.
 
     Attributes:
-        counts: returns dropped, by reason; not those that stand there for their neighbours (flag `CONTEXT_FLAG`).
+        counts: returns dropped, by reason; without rows that serve only as neighbours (flag `CONTEXT_FLAG`).
 
     Raises:
-        RangingError: a number that cannot be.
+        RangingError: an impossible number.
     """
 
     def __init__(
@@ -143,15 +143,15 @@ class ZoneResolver:
 
     @property
     def waiting(self) -> int:
-        """Returns held back."""
+        """The number of returns held back."""
         return len(self._held)
 
     def feed(self, rows: StructArray, predicted_m: FloatArray | None = None) -> StructArray:
-        """Return rows of which all is known now, in the order of emission.
+        """Take rows, and return those that are complete now, in the order of emission.
 
         Args:
             rows: (n,) `RETURN_DTYPE`, in the order of their records.
-            predicted_m: (n,) range the beam of each row would have, nan where nothing is known.
+            predicted_m: (n,) predicted range of each row's beam, nan if unknown.
         """
         if self.rates is None:
             return self._fed(rows, predicted_m)
@@ -171,7 +171,7 @@ class ZoneResolver:
         self._scale = (metres_per_tick, self._flight_ticks)
 
     def _fed(self, rows: StructArray, predicted_m: FloatArray | None) -> StructArray:
-        """Return rows of one tick rate."""
+        """Take rows of one tick rate, and return those that are complete now."""
         unknown = rows["mta_zone"] == ZONE_UNKNOWN
         if not unknown.any():
             return self._passed(rows)
@@ -186,7 +186,7 @@ class ZoneResolver:
         return np.concatenate(given)
 
     def flush(self) -> StructArray:
-        """Return the rows held back, when no more will come; what is fed after begins a new sequence."""
+        """Return the rows held back, when no more will come; later rows begin a new sequence."""
         held = self._released(np.ones(len(self._held), np.bool_))
         self._restart()
         return held
@@ -201,14 +201,14 @@ class ZoneResolver:
         self._held_key = np.zeros((0, 2), np.int64)  # ordinal, ticks of emission
 
     def _passed(self, rows: StructArray) -> StructArray:
-        """Return rows whose ranges are whole."""
+        """Return rows with complete ranges, after any rows held back."""
         if not len(rows) or not len(self._pulses):
             return rows
         held = self.flush()
         return np.concatenate([held, rows]) if len(held) else rows
 
     def _resolved(self, rows: StructArray, predicted_m: FloatArray) -> StructArray:
-        """Return rows with apparent ranges: those that are complete now, with whole ones."""
+        """Take rows with apparent ranges, and return those that are complete now, with true ranges."""
         if self._tick_hz > MOST_TICK_HZ:
             self._count(np.where(rows["number_of_returns"] > 0, GAP, NO_RETURN), rows)
             return rows[:0]
@@ -229,7 +229,7 @@ class ZoneResolver:
         return self._released(old_train | (self._held_key[:, 1] < now - self._flight_ticks))
 
     def _oldest(self, pulses: Int64Array) -> int:
-        """Return ordinal of the oldest emission an echo may still come from."""
+        """Return the ordinal of the oldest emission from which an echo may still come."""
         ordinal, ticks = pulses[:, ORDINAL], pulses[:, TICKS]
         recent = (ordinal > ordinal[-1] - SEGMENT // 2) & (ticks >= ticks[-1] - self._flight_ticks)
         return int(ordinal[int(np.argmax(recent))])
@@ -242,7 +242,7 @@ class ZoneResolver:
                 self.counts[reason] += dropped
 
     def _hold(self, rows: StructArray, found: Int64Array, whole_m: FloatArray, angle_rad: FloatArray) -> None:
-        """Rows as those of their emission, to those that wait."""
+        """Add rows, with the values of their emissions, to those that wait."""
         zone, ordinal, ticks, pulse_id, channel = found.T
         rows["range_m"], rows["encoder_rad"] = whole_m, angle_rad
         rows["device_time_ns"] = _times(ticks, self._tick_hz)
@@ -252,7 +252,7 @@ class ZoneResolver:
         self._held_key = np.concatenate([self._held_key, np.stack([ordinal, ticks], axis=1)])
 
     def _released(self, which: NDArray[np.bool_]) -> StructArray:
-        """Held rows that are complete, by emission, then by range, numbered anew."""
+        """Remove complete rows from those held and return them, by emission, then by range, renumbered."""
         index, rest = np.flatnonzero(which), np.flatnonzero(~which)
         if not len(index):
             return self._held[:0]
@@ -271,7 +271,7 @@ class ZoneResolver:
 
 
 def _times(ticks: Int64Array, tick_hz: int) -> Int64Array:
-    """Return device times (n,) in nanoseconds of a counter."""
+    """Return device times (n,) in nanoseconds from a counter."""
     seconds = ticks // tick_hz
     time_ns: Int64Array = seconds * 1_000_000_000 + (ticks - seconds * tick_hz) * 1_000_000_000 // tick_hz
     return time_ns

@@ -2,9 +2,9 @@
 
     x_e = x_b^e + rot_e_from_b · ( lever_arm_b + R(ω, φ + slope · θ, κ) · G · T · x_s(ρ, θ) )
 
-with the position at the pulse's time, GPS stamp + time_offset, the attitude at that + imu_latency, and the gimbal G,
-where there is one (NGA Eq. 3). The beam is straight and the air does nothing: that comes after
-(`swath.georef.georeference`).
+with the position at the pulse's time, GPS stamp + time_offset, the attitude at that + imu_latency, and the gimbal G, if
+there is one (NGA Eq. 3). The beam is straight and air has no effect here: `swath.georef.georeference` applies it
+afterwards.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from swath.georef.scanner.uncertainty import Uncertainty
 from swath.georef.trajectory.trajectory import Trajectory
 
 IBRC_STEPS_A_KNOT = 16
-PRF_TOLERANCE = 0.01  # a nominal rate matches a measured one
+PRF_TOLERANCE = 0.01  # relative tolerance between a nominal and a measured pulse rate
 _SECOND_NS = 1e9
 _RIGID = Mount()
 
@@ -41,10 +41,10 @@ class SensorModel:
         geometry: of its beams.
         range_gate: least and greatest ρ, metres.
         mount: stages of a gimbal.
-        air: of the scanner's surroundings; kept for those who apply it.
+        air: of the scanner's surroundings; kept for callers that apply it.
 
     Raises:
-        GeometryError: the calibration has what such a scanner has not.
+        GeometryError: the calibration has values that such a scanner does not have.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class SensorModel:
 
     @property
     def needs_encoder_motion(self) -> bool:
-        """Whether encoder latency or torsion, or their sigmas, ask for the encoder's rate and acceleration."""
+        """True if encoder latency or torsion, or their sigmas, require the encoder's rate and acceleration."""
         asking = [INDEX["encoder_latency_s"], INDEX["torsion_s2"]]
         return bool(self.calibration.parameters[asking].any() or self.calibration.all_sigmas[asking].any())
 
@@ -84,23 +84,24 @@ class SensorModel:
         incidence_rad: FloatArray | None = None,
         prf_hz: float | None = None,
     ) -> Rays:
-        """Return points of returns.
+        """Return the rays of returns, with their points.
 
         Args:
-            rows: (n,) `RETURN_DTYPE`, best in the order of their times.
+            rows: (n,) `RETURN_DTYPE`, preferably in the order of their times.
             time_ns: (n,) GPS time of their emission by the scanner's stamps; negative: unknown.
             trajectory: of the body, with attitude.
             encoder_rate, encoder_acceleration: (n,) of the readings, rad/s, rad/s².
-            with_axes: the second half of `Rays` too, but for covariances.
-            uncertainty: gives these; they are nan where the trajectory says no sigma.
-            incidence_rad: (n,) between beam and the surface's normal, where the surface is known.
+            with_axes: whether to compute the second half of `Rays` too, except covariances.
+            uncertainty: computes these; they are nan where the trajectory has no sigmas.
+            incidence_rad: (n,) between beam and the surface's normal, if the surface is known.
             prf_hz: of the scanner, for range offsets by pulse rate.
 
         Returns:
-            Rays; their ``origin_e`` is where on the beam (1 + range_scale) · measured range counts from.
+            Rays; their ``origin_e`` is the point on the beam from which (1 + range_scale) · measured range counts.
 
         Raises:
-            ValueError: the calibration needs the encoder's motion; `TrajectoryError`: there is no attitude.
+            ValueError: the calibration needs the encoder's motion.
+            TrajectoryError: the trajectory has no attitude.
         """
         if self.needs_encoder_motion and (encoder_rate is None or encoder_acceleration is None):
             text = "encoder latency and torsion need the encoder's motion"
@@ -145,7 +146,7 @@ class SensorModel:
         acceleration: FloatArray | None,
         prf_hz: float | None,
     ) -> Model:
-        """For the kernels."""
+        """Return the model as the kernels take it."""
         offset_ns = self.calibration.value("time_offset_s") * _SECOND_NS
         return Model(
             self._ranging(prf_hz),
@@ -191,12 +192,15 @@ class SensorModel:
         )
 
     def _mounted(self, time_ns: Int64Array) -> Mounted:
-        """Return s to b at the pulses' times (n,), as far as it does not depend on θ: κ, gimbal, installation, head."""
+        """Return s to b at the pulses' times (n,), except for the part that depends on θ.
+
+        It comprises κ, gimbal, installation and head.
+        """
         gimbal, centre, known = self.mount.poses(time_ns)
         rot_mount_from_s = gimbal @ self.calibration.installation_matrix
         inner = self._kappa @ rot_mount_from_s @ self._deflection.rot_s_from_head
         shift = (centre + rot_mount_from_s @ self._deflection.head_s) @ self._kappa.T
-        # beams of line scanners start in the scanner's origin
+        # beams of line scanners start at the scanner's origin
         shifted = bool(shift.any()) or self._deflection.kind == SPINNING
         slope = self.calibration.value("pitch_slope")
         return Mounted(self._outer, slope, inner, shift, shifted, known, self.calibration.lever_arm_b[np.newaxis])
@@ -213,7 +217,7 @@ class SensorModel:
         )
 
     def _readings(self, rows: StructArray) -> FloatArray:
-        """Return (n,) what the scan angle's offset is subtracted from."""
+        """Return the readings (n,) from which the scan angle's offset is subtracted."""
         deflection, readings = self._deflection, rows["encoder_rad"]
         if deflection.select < FIBRE_BY_CHANNEL:
             return readings.copy()
@@ -226,7 +230,7 @@ class SensorModel:
 
 
 def _out(count: int) -> Out:
-    """Return room for what becomes of n returns."""
+    """Return room for the results of n returns."""
     return Out(
         fate=np.empty(count, np.uint8),
         time_ns=np.empty(count, np.int64),
@@ -239,7 +243,7 @@ def _out(count: int) -> Out:
 
 
 def _axes(count: int) -> Axes:
-    """Return room for their axes."""
+    """Return room for the axes of n returns."""
     return Axes(
         q_e_from_b=np.empty((4, count)),
         epoch=np.zeros(count, np.int64),
@@ -252,9 +256,7 @@ def _axes(count: int) -> Axes:
 
 
 def _range_offsets(calibration: Calibration, prf_hz: float | None) -> FloatArray:
-    """Return (256, 256) metres by return number and MTA zone at this pulse rate; (1, 1) where the file has no such
-    table.
-    """
+    """Return metres (256, 256) by return number and MTA zone at this pulse rate; zeros (1, 1) without such a table."""
     matching = [
         row
         for row in calibration.range_offsets
@@ -271,8 +273,9 @@ def _range_offsets(calibration: Calibration, prf_hz: float | None) -> FloatArray
 
 
 def _ibrc_tables(calibration: Calibration) -> tuple[FloatArray, FloatArray, FloatArray, Int64Array, float]:
-    """Return knots of the intensity-based range correction, and where to begin looking among them; as `Ranging` has
-    them.
+    """Return the tables of the intensity-based range correction, as `Ranging` has them.
+
+    They are its knots, and for each step of intensity the knot at which the search begins.
     """
     if calibration.ibrc is None:
         nothing = np.zeros(0)

@@ -1,4 +1,4 @@
-"""How good a point is: its covariance from trajectory, range, angle, time and calibration (FORMULAS 5.2, 6.2, 10.3).
+"""Compute the covariance of points from trajectory, range, angle, time and calibration (FORMULAS 5.2, 6.2, 10.3).
 
 Sigmas are of the errors of one point, not of the difference of two: the trajectory's and the calibration's errors are
 the same, or nearly, for neighbours.
@@ -50,7 +50,7 @@ _BEYOND_LENGTH = [*range(TURN_BY_ANGLE, TURN_BY_ANGLE + 3), *range(TILTED, COLUM
 
 
 class UncertaintyError(ValueError):
-    """A covariance that is none; one line for the user."""
+    """Raised for an invalid covariance; one line for the user."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +61,7 @@ class Noise:
         range_m: of the range.
         angle_rad: of the scan angle (of a spinning head's azimuth).
         time_s: of the pulse's time.
-        divergence_rad: full divergence of the beam; counts where the surface is known.
+        divergence_rad: full divergence of the beam; used if the surface is known.
     """
 
     range_m: float = 0.02
@@ -70,7 +70,7 @@ class Noise:
     divergence_rad: float = 3e-4
 
     def times(self, share: float) -> Noise:
-        """Return all of it so many times as large."""
+        """Return the noise multiplied by a factor."""
         return Noise(self.range_m * share, self.angle_rad * share, self.time_s * share, self.divergence_rad * share)
 
 
@@ -78,10 +78,10 @@ class Uncertainty:
     """Covariances of the points of one scanner, by `swath.georef.scanner.sensor_model.SensorModel.rays`."""
 
     def __init__(self, calibration: Calibration, noise: Noise) -> None:
-        """Take the parameters' covariance apart.
+        """Take the parameters' covariance apart into independent errors.
 
         Raises:
-            UncertaintyError: the calibration's correlations are no covariance.
+            UncertaintyError: the calibration's correlations are not a covariance.
         """
         sigmas = calibration.all_sigmas
         active = np.flatnonzero(sigmas > 0.0)
@@ -92,7 +92,7 @@ class Uncertainty:
             text = f"calibration {calibration.id}: its correlations are no covariance; want a positive definite matrix"
             raise UncertaintyError(text) from error
         errors = factor.T @ _effects(calibration)[active]
-        from_origin = errors.copy()  # turns about the body's origin, not about the scanner's
+        from_origin = errors.copy()  # turns about the body's origin instead of the scanner's
         from_origin[:, SHIFT : SHIFT + 3] -= np.cross(errors[:, TURN : TURN + 3], calibration.lever_arm_b)
         along = from_origin[:, ALONG_ONLY]
         self._known = Known(
@@ -108,16 +108,17 @@ class Uncertainty:
         )
 
     def doubt(self, trajectory: Trajectory, count: int, incidence_rad: FloatArray | None = None) -> Doubt:
-        """For the kernels, with room for the covariances of n returns."""
+        """Return the kernels' input, with room for the covariances of n returns."""
         columns = (contiguous(getattr(trajectory, name)) for name in Flown._fields)
         incidence_rad = _NONE if incidence_rad is None else contiguous(incidence_rad)
         return Doubt(Flown(*columns), self._known, incidence_rad, np.empty((count, 6)))
 
 
 def _effects(calibration: Calibration) -> FloatArray:
-    """Return (16, 18) what each parameter does (FORMULAS 5.2), columns as in `swath.georef.scanner.kernels.covariance`.
+    """Return the effect (16, 18) of each parameter, by the columns of `swath.georef.scanner.kernels.covariance`.
 
-    ω, φ and κ turn the beam about their own axes in b; that the pitch slope moves κ's is left out (1e-4 of its part).
+    ω, φ and κ turn the beam about their own axes in b (FORMULAS 5.2); the effect of the pitch slope on κ's axis is left
+    out (1e-4 of its part).
     """
     effects = np.zeros((len(PARAMETERS), COLUMNS))
     omega = rot_x(calibration.value("omega_rad"))

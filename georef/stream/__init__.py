@@ -1,1 +1,1 @@
-"""Points while data come: clocks, path and scanners side by side."""
+"""Georeferencing while data come: clocks, path and scanners side by side."""

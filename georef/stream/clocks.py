@@ -1,8 +1,8 @@
 """The clocks of a stream of records: the host's, those of its pulses per second, and one of each device.
 
-A clock's answer depends on what it was fed before the question. So records are only collected as they come, and taken
-by `StreamClocks.update` at the stream's ticks, in one order: readings of the host's clocks, then edges and time
-messages by host time, then what the devices said.
+A clock's answer depends on its input before the question. Therefore records are only collected as they come;
+`StreamClocks.update` processes them at the stream's ticks, in one order: readings of the host's clocks, then edges and
+time messages by host time, then the devices' clock samples.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from swath.georef.timescales import (
     WallComparison,
 )
 
-CELL_BITS = 24  # 16.8 ms of device time: within, a device's clock is taken as linear, which is good to 2 ns
-MAX_CELLS = 1024  # of one question; devices that restarted, and hours that turned, are asked row by row
+CELL_BITS = 24  # 16.8 ms of device time: within it a device's clock is taken as linear, which is accurate to 2 ns
+MAX_CELLS = 1024  # of one request; restarted devices, and turns of the hour, exceed it and are processed row by row
 MAX_RATE_OFF = 1e-3  # of device time against GPS time
 
 
@@ -54,7 +54,7 @@ def _bounds(device_ns: Int64Array, host_ns: Int64Array) -> tuple[int, int, int, 
 
 @dataclass(frozen=True, slots=True)
 class PpsPlan:
-    """A source of edges: leap seconds until a receiver says, and the delay that is subtracted from its stamps."""
+    """A source of edges: leap seconds assumed until a receiver gives them, and the delay that its stamps contain."""
 
     leap_seconds: int | None = None
     delay_ns: int = 0
@@ -62,7 +62,7 @@ class PpsPlan:
 
 @dataclass(frozen=True, slots=True)
 class GnssPlan:
-    """A receiver that names seconds: of which pulse (``pps/main``; None: of none), and an override of which edge."""
+    """A receiver that names seconds: its pulse (``pps/main``; None: no pulse), and an override of the named edge."""
 
     pps: str | None = None
     names_edge: NamesEdge | None = None
@@ -71,9 +71,9 @@ class GnssPlan:
 
 @dataclass(frozen=True, slots=True)
 class DevicePlan:
-    """A device with a clock of its own: the source that shows the host's time (``pps/main``), how its stamps count.
+    """A device with its own clock: the source that shows the host's time (``pps/main``), and the origin of its stamps.
 
-    stamps: what they are configured to count from; AUTO: found where the device does not say; None: not looked for.
+    stamps: their configured origin; AUTO: found if the device does not give it; None: not searched.
     """
 
     clock: str
@@ -83,7 +83,7 @@ class DevicePlan:
 
 @dataclass(frozen=True, slots=True)
 class ClockPlan:
-    """Which clocks there are, by source (``pps/main``, ``gnss/rover``, ``scanner/left``).
+    """The clocks that exist, by source (``pps/main``, ``gnss/rover``, ``scanner/left``).
 
     Attributes:
         host_minus_monotonic_ns: realtime_ns − monotonic_ns of the session.
@@ -96,12 +96,12 @@ class ClockPlan:
 
 
 class HostClocks:
-    """The host's clock in GPS time: one `PpsClock` a pulse per second, and one a receiver that is wired to none.
+    """The host's clock in GPS time: one `PpsClock` per pulse per second, and one per receiver without a pulse.
 
     Args:
         plan: the clocks.
-        keep_history: answers of all times stay possible.
-        wall_names: a disciplined wall clock may name the seconds of pulses that no receiver names.
+        keep_history: whether answers remain possible for all times.
+        wall_names: whether a disciplined wall clock may name the seconds of pulses that no receiver names.
     """
 
     def __init__(self, plan: ClockPlan, *, keep_history: bool = False, wall_names: bool = False) -> None:
@@ -120,25 +120,25 @@ class HostClocks:
         self._beside_wall = WallComparison("the recording computer's clock", whole_log=True) if keep_history else None
         self._readings: deque[tuple[int, int, int, float]] = deque()
         self._spoken: list[tuple[int, bool, str, PpsEdge | TimeMessage]] = []
-        # by a receiver: a wall clock decides between seconds, and is no time alone unless the caller takes it for one
+        # by a receiver: a wall clock only decides between seconds, unless the caller accepts it as the sole source
         self._told: set[PpsClock] = set(self.by_source.values()) if wall_names else set()
 
     def add_reading(
         self, realtime_ns: int, monotonic_ns: int, monotonic_raw_ns: int, max_error_s: float = math.inf
     ) -> None:
-        """The host's clocks side by side; max_error_s of the wall clock, inf: nobody keeps it."""
+        """Take the host's clocks read side by side; max_error_s of the wall clock, inf: not disciplined."""
         self._readings.append((realtime_ns, monotonic_ns, monotonic_raw_ns, max_error_s))
 
     def add_edge(self, source: str, edge: PpsEdge) -> None:
-        """An edge of ``pps/name``."""
+        """Take an edge of ``pps/name``."""
         self._spoken.append((edge.host_time_ns, False, source, edge))
 
     def add_message(self, source: str, message: TimeMessage) -> None:
-        """A time message of ``gnss/name``."""
+        """Take a time message of ``gnss/name``."""
         self._spoken.append((message.host_time_ns, True, source, message))
 
     def update(self) -> None:
-        """Take what has come since the last call."""
+        """Process the input since the last call."""
         for reading in self._readings:
             self.timeline.add(*reading[:3])
         self._spoken.sort(key=lambda said: said[:2])
@@ -157,7 +157,7 @@ class HostClocks:
         self._read_wall_clock(None)
 
     def _read_wall_clock(self, until_ns: int | None) -> None:
-        """Tell the clocks what the wall clock said up to a host time: as while recording, it may name a second."""
+        """Give the clocks the wall clock's readings up to a host time; as while recording, it may name a second."""
         readings, host_minus_ns = self._readings, self.timeline.host_minus_monotonic_ns
         while readings and (until_ns is None or readings[0][1] + host_minus_ns <= until_ns):
             realtime_ns, monotonic_ns, raw_ns, max_error_s = readings.popleft()
@@ -167,42 +167,40 @@ class HostClocks:
                 clock.set_wall_clock(raw_ns, realtime_ns, disciplined=math.isfinite(max_error_s), sigma_s=max_error_s)
 
     def add_coarse(self, source: str, host_ns: Int64Array, gps_ns: Int64Array) -> None:
-        """Tell the clock of a source that nothing else sets what GPS time it was at host times (n,), to some 0.1 s."""
+        """Give GPS times at host times (n,), to about 0.1 s, to the clock of a source without any other time."""
         for raw_ns, at_ns in zip(self.timeline.raw_from_host(host_ns).tolist(), gps_ns.tolist(), strict=True):
             self.by_source[source].add_coarse(raw_ns, at_ns)
 
     def gps_from_host(self, source: str, host_ns: Int64Array) -> tuple[Int64Array, NDArray[np.float64]]:
-        """Return GPS ns (n,) and sigma ns (n,; inf without time) of host times (n,), by the clock that a source
-        shows.
-        """
+        """Return GPS ns (n,) and sigma ns (n,; inf without time) of host times (n,), by a source's clock."""
         return self.by_source[source].gps_from_host(self.timeline.raw_from_host(host_ns))
 
     def settle(self) -> list[str]:
-        """Take the seconds that most messages of the whole log name, after all has been fed; lines for the user.
+        """Adopt the seconds that most messages of the whole log name, after all input; return lines for the user.
 
-        A line also of each receiver whose time is hours or days from the recording computer's clock.
+        Each receiver whose time is hours or days from the recording computer's clock also has a line.
         """
         lines = [line for clock in dict.fromkeys(self.by_source.values()) for line in clock.settle()]
         return lines + (self._beside_wall.lines() if self._beside_wall is not None else [])
 
     def tag_error_ns(self, source: str, host_ns: Int64Array, *, utc: bool) -> Int64Array:
-        """Return by how much (n,) a receiver's tags of one scale were ahead that arrived at host times (n,)."""
+        """Return how much (n,) a receiver's tags of one scale were ahead, for tags that arrived at host times (n,)."""
         error_s = self.by_source[source].tag_error_s(source, self.timeline.raw_from_host(host_ns), utc=utc)
         return error_s * 1_000_000_000
 
     def status(self, source: str, host_ns: int) -> ClockStatus:
-        """Of the clock that a source shows, at a host time."""
+        """Return the status of a source's clock at a host time."""
         return self.by_source[source].status(self.timeline.raw_at(host_ns))
 
     def drain_events(self) -> list[tuple[str, ClockEvent]]:
-        """Return what the clocks had to say since the last call, with the source that shows each."""
+        """Return the clocks' events since the last call, each with its source."""
         return [(source, event) for source, clock in self.by_source.items() for event in clock.drain_events()]
 
 
 class StreamClocks:
-    """The host's clocks and the devices' own; with ``frozen`` the host's are complete and take nothing more.
+    """The host's clocks and the devices' own; with ``frozen`` the host's are complete and take no more input.
 
-    stamps: what devices' stamps count from, where that was found beforehand.
+    stamps: the origins of devices' stamps as far as they were found beforehand.
     """
 
     def __init__(self, host: HostClocks, *, frozen: bool = False, stamps: Mapping[str, Stamps] | None = None) -> None:
@@ -223,32 +221,32 @@ class StreamClocks:
 
     @classmethod
     def growing(cls, plan: ClockPlan) -> StreamClocks:
-        """Return clocks that know what has been fed so far, and of that the last quarter of an hour."""
+        """Return clocks that know the input so far, and remember the last quarter of an hour of it."""
         return cls(HostClocks(plan))
 
     def add_reading(
         self, realtime_ns: int, monotonic_ns: int, monotonic_raw_ns: int, max_error_s: float = math.inf
     ) -> None:
-        """See `HostClocks.add_reading`."""
+        """Take readings as `HostClocks.add_reading` does, unless frozen."""
         if not self.frozen:
             self.host.add_reading(realtime_ns, monotonic_ns, monotonic_raw_ns, max_error_s)
 
     def add_edge(self, source: str, edge: PpsEdge) -> None:
-        """See `HostClocks.add_edge`."""
+        """Take an edge as `HostClocks.add_edge` does, unless frozen."""
         if not self.frozen:
             self.host.add_edge(source, edge)
 
     def add_message(self, source: str, message: TimeMessage) -> None:
-        """See `HostClocks.add_message`."""
+        """Take a message as `HostClocks.add_message` does, unless frozen."""
         if not self.frozen:
             self.host.add_message(source, message)
 
     def add_samples(self, source: str, rows: StructArray) -> None:
-        """What a device's clock said: `DEVICE_CLOCK_DTYPE` rows in order of arrival."""
+        """Take a device's clock samples: `DEVICE_CLOCK_DTYPE` rows in order of arrival."""
         self._samples[source].append(rows)
 
     def update(self) -> None:
-        """Take what has come since the last call."""
+        """Process the input since the last call."""
         if not self.frozen:
             self.host.update()
         for source, pieces in self._samples.items():
@@ -258,7 +256,7 @@ class StreamClocks:
                 pieces.clear()
 
     def place(self, source: str, rows: StructArray, max_sigma_ns: float) -> tuple[NDArray[np.bool_], Int64Array]:
-        """Return which rows (n,) have a time that is good enough, and GPS ns (n,), by device time and host time."""
+        """Return which rows (n,) have a sufficiently accurate time, and GPS ns (n,), by device time and host time."""
         if source not in self._devices or not len(rows):
             return np.zeros(len(rows), np.bool_), np.zeros(len(rows), np.int64)
         quick = self._by_cells(source, rows, max_sigma_ns)
@@ -270,14 +268,14 @@ class StreamClocks:
     def gps_from_device(
         self, source: str, device_ns: Int64Array, host_ns: Int64Array
     ) -> tuple[Int64Array, NDArray[np.float64]]:
-        """Return GPS ns (n,) and sigma ns (n,; inf: not known) of device times (n,) that came at host times (n,)."""
+        """Return GPS ns (n,) and sigma ns (n,; inf: unknown) of device times (n,) that arrived at host times (n,)."""
         return self._devices[source].gps_from_device(device_ns, self.host.timeline.raw_from_host(host_ns))
 
     def _by_cells(self, source: str, rows: StructArray, max_sigma_ns: float) -> Int64Array | None:
-        """Return GPS ns (n,) between the edges of cells of device time; None where rows must be asked one by one.
+        """Return GPS ns (n,), interpolated between edges of cells of device time; None if rows need single requests.
 
-        The edges are asked as if they had come first, and as if last: where the answers differ, or are not all good,
-        something happened between.
+        The edges are converted for the earliest and for the latest arrival: if the answers differ, or are not all good,
+        the clock changed in between.
         """
         device_ns, host_ns = rows["device_time_ns"], rows["host_time_ns"]
         least, most, earliest, latest = _bounds(device_ns, host_ns)
@@ -296,21 +294,21 @@ class StreamClocks:
         return placed
 
     def stamps(self, source: str) -> Stamps | None:
-        """Return what a device's stamps were found to count from; None: nothing was found or looked for."""
+        """Return the origin found for a device's stamps; None: not found or not searched."""
         return self._devices[source].stamps
 
     def refused(self, source: str) -> dict[str, int]:
-        """Return what a device's clock refused, by reason."""
+        """Return counts of input that a device's clock refused, by reason."""
         return self._devices[source].status().refused
 
 
 @dataclass(frozen=True, slots=True)
 class HeadTime:
-    """Hold what a scanner itself says of time in a log.
+    """A scanner's own statements about time in a log.
 
     Attributes:
-        messages: sentences or packets that it vouches for.
-        trouble: why its time cannot be used, and the remedy; empty: it can, or it says nothing.
+        messages: number of sentences or packets that it vouches for.
+        trouble: why its time cannot be used, and the remedy; empty if it can, or if there is none.
     """
 
     messages: int = 0
@@ -319,16 +317,16 @@ class HeadTime:
 
 @dataclass(frozen=True)
 class FrozenClocks:
-    """The host's clocks after all of a log has been fed to them; each stream gets its own devices' clocks beside.
+    """The host's clocks after processing a whole log; each stream adds its own devices' clocks.
 
-    Pickles. A device's clock lies in the same packets as its returns, so it is not complete before those are read; a
-    stream that reads a piece of a log is given the packets around the piece too.
+    It can be pickled. A device's clock lies in the same packets as its returns, so it is not complete before those are
+    read; a stream that reads a piece of a log also gets the packets around the piece.
 
     Attributes:
         host: the host's.
-        stamps: what devices' stamps count from, by source, as the whole log shows it.
-        heads: what scanners say of time themselves, by source; none that was not asked.
-        remarks: lines for the user on the dates that scanners were given, where one is the clock.
+        stamps: origins of devices' stamps, by source, found from the whole log.
+        heads: scanners' own statements about time, by source; only for those examined.
+        remarks: lines for the user on the dates given to scanners, where a scanner is the clock.
     """
 
     host: HostClocks
@@ -337,7 +335,7 @@ class FrozenClocks:
     remarks: tuple[str, ...] = ()
 
     def trouble(self, source: str | None) -> str:
-        """Return why what a scanner says of time cannot be used; empty: it can, or it says nothing."""
+        """Return why a scanner's own time cannot be used; empty if it can, or if there is none."""
         head = self.heads.get(source or "")
         return "" if head is None else head.trouble
 

@@ -1,4 +1,4 @@
-"""Where the aircraft was, for a stream of records: a complete trajectory, or one that grows with a device's INS."""
+"""The aircraft's path for a stream of records: a complete trajectory, or one that grows with a device's INS."""
 
 from __future__ import annotations
 
@@ -11,26 +11,26 @@ from swath.georef.timescales import SECOND_NS
 from swath.georef.trajectory.buffer import TrajectoryBuffer
 from swath.georef.trajectory.trajectory import Trajectory
 
-KEPT_BEHIND_S = 30.0  # of a growing trajectory, behind its newest epoch: longer than any return waits
+KEPT_BEHIND_S = 30.0  # length of a growing trajectory behind its newest epoch: longer than any return waits
 SHORTEST_TRAJECTORY = 2  # epochs
 
 
 class Path(Protocol):
-    """Where the aircraft was, as far as known."""
+    """The aircraft's path, as far as known."""
 
     @property
     def covered_until_ns(self) -> int | None:
-        """GPS time up to which poses are known; None: nothing is."""
+        """GPS time up to which poses are known; None: no poses."""
 
     def add(self, rows: StructArray) -> None:
-        """Solutions of a device's INS, `INS_DTYPE`."""
+        """Take solutions of a device's INS, `INS_DTYPE`."""
 
     def update(self) -> Trajectory | None:
-        """Take what has come since the last call; all that is known."""
+        """Process the input since the last call, and return the trajectory so far."""
 
 
 class CompletePath:
-    """A trajectory that is there from the beginning."""
+    """A trajectory that is complete from the start."""
 
     covered_until_ns = int(np.iinfo(np.int64).max)
 
@@ -38,19 +38,19 @@ class CompletePath:
         self._trajectory = trajectory
 
     def add(self, rows: StructArray) -> None:
-        """A device's own solution has no say."""
+        """Ignore a device's own solution."""
 
     def update(self) -> Trajectory:
-        """It."""
+        """Return the complete trajectory."""
         return self._trajectory
 
 
 class GrowingPath:
-    """A trajectory that grows with the solutions of a device's INS; the last half minute of it.
+    """The last half minute of a trajectory that grows with the solutions of a device's INS.
 
     Args:
         buffer: collects them.
-        deflection_rad: ξ, η where the device's attitude refers to the plumb line; None: to the ellipsoid's normal.
+        deflection_rad: ξ, η if the device's attitude refers to the plumb line; None: to the ellipsoid's normal.
     """
 
     def __init__(self, buffer: TrajectoryBuffer, deflection_rad: tuple[float, float] | None = None) -> None:
@@ -66,11 +66,11 @@ class GrowingPath:
         return None if self._trajectory is None else self._buffer.covered_until_ns
 
     def add(self, rows: StructArray) -> None:
-        """Solutions, in the order in which they came."""
+        """Take solutions, in the order in which they came."""
         self._new.append(rows)
 
     def update(self) -> Trajectory | None:
-        """Return all that came, at once."""
+        """Append all new solutions at once, and return the trajectory so far."""
         if not self._new:
             return self._trajectory
         self._buffer.append(np.concatenate(self._new))

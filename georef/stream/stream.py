@@ -1,8 +1,8 @@
 """Streaming georeferencing: records in the order of the log in, points out as soon as the trajectory covers them.
 
-Records are only collected when they come. All that is decided (what a clock says, whether a return is placed, waited
-for or given up) is decided in `Stream.advance`, at ticks of the log's own time. So the same log gives the same points
-however its records were cut, and whether it was still being written meanwhile.
+Records are only collected when they come. `Stream.advance` makes all decisions (a clock's answer, whether a return is
+placed, waits or is given up), at ticks of the log's own time. Therefore the same log gives the same points whatever the
+division of its records, and whether or not it was still being written.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 __all__ = ["CompletePath", "GrowingPath", "Path", "ScannerChain", "Stream", "StreamSettings"]
 
-CONTEXT_FLAG = 128  # of a return's flags: it is there for its neighbours only and gives no point itself
+CONTEXT_FLAG = 128  # of a return's flags: it serves only as a neighbour and gives no point itself
 FATES_BY_NAME = {name: fate for fate, name in FATE_NAMES.items()}
 NO_ROWS, NO_TIMES = np.empty(0, RETURN_DTYPE), np.empty(0, np.int64)
 ZONE_UNKNOWN = 255  # of a return's MTA zone
@@ -36,15 +36,17 @@ ZONE_UNKNOWN = 255  # of a return's MTA zone
 
 @dataclass(frozen=True, slots=True)
 class StreamSettings:
-    """How long what is waited for, in seconds of the log's time, and how much may wait.
+    """Waiting times, in seconds of the log's time, and limits of the amount that waits.
 
     Attributes:
-        trajectory_wait_s: a placed return for the trajectory to cover it.
-        time_wait_s: a return for a time that is good enough, as before the clocks are locked.
-        settle_s: so long a return is held before its time is asked, so that what the clocks hear after it counts too;
-            0: as soon as it comes.
-        max_time_sigma_ns: a worse time is none. A device that runs free is known by the arrival of its packets, 2 ms.
-        max_rows: of a scanner that wait for time, and as many that wait for the trajectory; the oldest are given up.
+        trajectory_wait_s: time for which a placed return waits for the trajectory to cover it.
+        time_wait_s: time for which a return waits for an accurate time, as before the clocks are locked.
+        settle_s: time for which a return is held before it gets its time, so that the clocks' later input counts too;
+            0: no delay.
+        max_time_sigma_ns: greatest sigma of a usable time. A free-running device is known by the arrival of its
+            packets, 2 ms.
+        max_rows: greatest number of a scanner's rows that wait for time, and of those that wait for the trajectory; the
+            oldest are given up.
     """
 
     trajectory_wait_s: float = 2.0
@@ -55,7 +57,7 @@ class StreamSettings:
 
 
 class Georeferences(Protocol):
-    """What makes points of a scanner's returns: `swath.georef.georeference.Georeferencer`."""
+    """A maker of points from a scanner's returns: `swath.georef.georeference.Georeferencer`."""
 
     def georeference(self, rows: StructArray, time_ns: Int64Array, trajectory: Trajectory) -> tuple[Points, ByteArray]:
         """Return points, and the fate of every row."""
@@ -68,41 +70,41 @@ class Resolver(Protocol):
 
     @property
     def waiting(self) -> int:
-        """Returns held back."""
+        """The number of returns held back."""
 
     def feed(self, rows: StructArray, predicted_m: NDArray[np.float64] | None = None) -> StructArray:
-        """Return rows of which all is known now, in the order of emission."""
+        """Take rows, and return those that are complete now, in the order of emission."""
 
     def flush(self) -> StructArray:
-        """Return the rest."""
+        """Return the rows held back, when no more will come."""
 
 
 Moving = tuple[StructArray, Int64Array, NDArray[np.float64], NDArray[np.float64]]
 
 
 class Motion(Protocol):
-    """Finds the encoder's rate and acceleration from readings around (`swath.georef.scanner.encoder_motion`)."""
+    """Finds the encoder's rate and acceleration from neighbouring readings (`swath.georef.scanner.encoder_motion`)."""
 
     def feed(self, rows: StructArray, time_ns: Int64Array) -> Moving:
-        """Return rows whose neighbourhood is known now, their GPS times, rad/s, rad/s²."""
+        """Take rows, and return those whose neighbourhood is complete now, their GPS times, rad/s, rad/s²."""
 
     def flush(self) -> Moving:
-        """Return the rest."""
+        """Return the rows held back, when no more will come."""
 
 
 class GivenMotion:
-    """Hands the encoder's motion of the rows at hand to a `swath.georef.georeference.Georeferencer`."""
+    """Holds the encoder's motion of the present rows for a `swath.georef.georeference.Georeferencer`."""
 
     def __init__(self) -> None:
         self.rate = self.acceleration = np.empty(0)
 
     def motion(self, rows: StructArray, time_ns: Int64Array) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return (n,) rad/s, rad/s² of the rows that are georeferenced now."""
+        """Return the motion (n,), rad/s and rad/s², of the rows that are georeferenced now."""
         del rows, time_ns
         return self.rate, self.acceleration
 
     def keep(self, which: NDArray[np.bool_]) -> None:
-        """Of those rows only the masked ones are georeferenced next."""
+        """Keep the motion of the masked rows, the only ones to be georeferenced next."""
         self.rate, self.acceleration = self.rate[which], self.acceleration[which]
 
 
@@ -112,18 +114,19 @@ LeftOut = Callable[[StructArray, Int64Array, ByteArray, "Trajectory | None"], No
 
 @dataclass(slots=True)
 class ScannerChain:
-    """What a scanner's returns go through.
+    """The processing steps of a scanner's returns.
 
     Attributes:
         name: of the configuration.
         georeferencer: makes points.
-        resolver: finds emissions where a return's zone is unknown; None: all are known.
-        predict: (n,) ranges that a terrain model expects of rows at GPS times; None: there is no model.
-        reach_ns: how much later than its stamp a return may ask the trajectory.
-        motion: tells how the encoder moved, where the calibration asks for it; holds back what it cannot tell yet.
-        given: where the georeferencer finds that; goes with ``motion``.
-        left_out: takes the returns that gave no point: rows, GPS times (-1: unknown), fates, and the trajectory where
-            one was asked. Those that the resolver drops it only counts.
+        resolver: finds emissions if a return's zone is unknown; None: all are known.
+        predict: (n,) ranges that a terrain model predicts for rows at GPS times; None: no model.
+        reach_ns: time after its stamp at which a return may need the trajectory.
+        motion: computes the encoder's motion if the calibration needs it; holds back rows with incomplete
+            neighbourhoods.
+        given: passes that motion to the georeferencer; goes with ``motion``.
+        left_out: takes the returns without a point: rows, GPS times (-1: unknown), fates, and the trajectory if one was
+            used. Returns that the resolver drops are only counted.
     """
 
     name: str
@@ -137,7 +140,7 @@ class ScannerChain:
 
 
 class _Lane:
-    """One scanner's returns on their way."""
+    """One scanner's returns in processing."""
 
     def __init__(self, chain: ScannerChain, settings: StreamSettings) -> None:
         self.chain = chain
@@ -146,16 +149,16 @@ class _Lane:
         self._settings = settings
         self._untimed: deque[WaitingReturns] = deque()
         self._timed: deque[WaitingReturns] = deque()
-        self._resolves = False  # a return of unknown zone has come
-        self._held_back = 0  # by resolver and motion
+        self._resolves = False  # whether a return of unknown zone has come
+        self._held_back = 0  # number of returns held back by resolver and motion
 
     @property
     def waiting(self) -> int:
-        """Returns that have no fate yet."""
+        """The number of returns without a fate yet."""
         return sum(len(held.rows) for queue in (self._untimed, self._timed) for held in queue) + self._held_back
 
     def advance(self, tick_ns: int, clocks: StreamClocks, path: Path, *, last: bool) -> Points | None:
-        """Move on what can move; ``last``: nothing more will come."""
+        """Process what is ready; ``last``: no more will come."""
         self._take(tick_ns)
         self._place(tick_ns, clocks, last=last)
         trajectory, covered_ns = path.update(), path.covered_until_ns
@@ -177,7 +180,7 @@ class _Lane:
             self._give_up(held.rows, Fate.NO_TIME)
 
     def _place(self, tick_ns: int, clocks: StreamClocks, *, last: bool) -> None:
-        """Give GPS times to what came and to what still has none; those that never will have one are counted."""
+        """Give GPS times to new and still waiting returns; count those that will never have one."""
         waiting, self._untimed = self._untimed, deque()
         worth_asking = self._is_worth_asking(waiting, tick_ns, clocks)
         for held in waiting:
@@ -207,9 +210,7 @@ class _Lane:
         return (tick_ns - held.since_ns) / SECOND_NS > self._settings.settle_s
 
     def _is_worth_asking(self, waiting: deque[WaitingReturns], tick_ns: int, clocks: StreamClocks) -> bool:
-        """Return whether the first or the last return that was asked in vain has a time by now, so that all are
-        asked.
-        """
+        """Return whether the first or the last return that got no time has one now, so that all should be tried."""
         asked = [held for held in waiting if self._was_asked(held, tick_ns)]
         if not asked:
             return False
@@ -220,13 +221,13 @@ class _Lane:
         return (tick_ns - held.since_ns) / SECOND_NS >= self._settings.trajectory_wait_s
 
     def _give_up_unseen(self, tick_ns: int, *, last: bool) -> None:
-        """Nothing is known of where the aircraft was."""
+        """Give up overdue returns while no trajectory exists."""
         while self._timed and (last or self._is_overdue(self._timed[0], tick_ns)):
             held = self._timed.popleft()
             self._give_up(held.rows, Fate.OUTSIDE_TRAJECTORY, held.time_ns)
 
     def _covered(self, tick_ns: int, covered_ns: int, *, last: bool) -> list[WaitingReturns]:
-        """Return taken from the queue: what the trajectory covers, and what has waited for it for too long."""
+        """Remove from the queue the returns that the trajectory covers, and overdue ones, and return them."""
         ready: list[WaitingReturns] = []
         waiting, self._timed = self._timed, deque()
         for held in waiting:
@@ -248,7 +249,7 @@ class _Lane:
         *,
         last: bool,
     ) -> tuple[StructArray, Int64Array]:
-        """Return rows with the times of their emissions, of those that have become known."""
+        """Return rows with the times of their emissions, as far as these are known now."""
         self._resolves = self._resolves or any_has(rows, "mta_zone", ZONE_UNKNOWN)
         if not self._resolves:
             return rows, time_ns
@@ -289,7 +290,7 @@ class _Lane:
         return points if len(points) else None
 
     def _moving(self, motion: Motion, rows: StructArray, time_ns: Int64Array, *, last: bool) -> Moving:
-        """Return rows with the encoder's motion, of those where it is known."""
+        """Return rows with the encoder's motion, as far as it is known now."""
         moving = motion.feed(rows, time_ns)
         if last:
             (one, at_ns, rate, acceleration), rest = moving, motion.flush()
@@ -303,7 +304,7 @@ class _Lane:
         return moving
 
     def _give_up(self, rows: StructArray, fate: Fate, time_ns: Int64Array | None = None) -> None:
-        """Count returns without a point, but for those of the margin; pulses that gave none are no returns."""
+        """Count returns without a point, except those of the margin; pulses without a return do not count."""
         own = (rows["flags"] & CONTEXT_FLAG == 0) & (rows["number_of_returns"] > 0)
         count = int(np.count_nonzero(own))
         self.fates[fate] += count
@@ -313,11 +314,11 @@ class _Lane:
 
 
 class Stream:
-    """Takes records by source; gives (scanner's name, points) at ticks, in order of names and of arrival.
+    """Takes records by source, and returns (scanner's name, points) at ticks, in order of names and of arrival.
 
     Attributes:
-        clocks: fed by whoever reads the log: readings, edges, messages, devices' samples.
-        path: fed alike with a device's INS solutions.
+        clocks: fed by the reader of the log: readings, edges, messages, devices' samples.
+        path: fed likewise with a device's INS solutions.
     """
 
     def __init__(
@@ -333,25 +334,25 @@ class Stream:
         self._tick_ns = 0
 
     def chain(self, name: str) -> ScannerChain:
-        """Return what a scanner's returns go through."""
+        """Return the processing steps of a scanner's returns."""
         return self._lanes[name].chain
 
     @property
     def scanners(self) -> list[str]:
-        """Names, in the order in which points come."""
+        """The names, in the order in which points come."""
         return list(self._lanes)
 
     def add_returns(self, name: str, rows: StructArray) -> None:
-        """Returns of a scanner in the order in which its parser gave them; those with `CONTEXT_FLAG` give no point."""
+        """Take returns of a scanner in its parser's order; those with `CONTEXT_FLAG` give no point."""
         self._lanes[name].new.append(rows)
 
     def advance(self, tick_ns: int) -> list[tuple[str, Points]]:
-        """Decide on all that came, at a time of the log that never goes back."""
+        """Decide on all input so far, at a time of the log that never goes back."""
         self._tick_ns = tick_ns
         return self._advance(last=False)
 
     def close(self) -> list[tuple[str, Points]]:
-        """Return the log is over: what still waits is georeferenced or given up."""
+        """End the stream: georeference or give up all waiting returns."""
         return self._advance(last=True)
 
     def _advance(self, *, last: bool) -> list[tuple[str, Points]]:
@@ -364,12 +365,12 @@ class Stream:
         return given
 
     def waiting(self, name: str) -> int:
-        """Return returns of a scanner whose fate is not known yet."""
+        """Return the number of a scanner's returns whose fate is open."""
         lane = self._lanes[name]
         return lane.waiting + sum(len(rows) for rows in lane.new)
 
     def fates(self, name: str) -> dict[Fate, int]:
-        """Return what became of a scanner's returns so far; those without a fate yet are `waiting`."""
+        """Return counts of a scanner's returns so far by fate; those without a fate yet are `waiting`."""
         lane = self._lanes[name]
         counts = {fate: int(lane.fates[fate]) for fate in Fate}
         if lane.chain.resolver is not None:

@@ -1,6 +1,6 @@
-"""Time: three clocks (host, device, GPS), one place. docs/time.md says how it works and what to wire.
+"""Time: three clocks (host, device, GPS) in one package. docs/time.md describes the method and the wiring.
 
-Imports nothing of the project but `swath.georef.records`; knows no clock and no I/O.
+It imports nothing of the project but `swath.georef.records`, reads no clock and does no I/O.
 """
 
 from swath.georef.timescales.clock_status import ClockEvent, ClockStatus, Severity, TimeState

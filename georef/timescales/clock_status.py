@@ -1,4 +1,4 @@
-"""What a clock says about itself."""
+"""The status of a clock, and its events."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ MAX_EVENTS = 1000
 
 
 class TimeState(StrEnum):
-    """How well the host's clock is known in GPS time."""
+    """The quality of the host's clock in GPS time."""
 
-    NO_TIME = "no_time"  # nothing has said the time yet
-    COARSE = "coarse"  # by messages only, some tenths of a second; or which second is not certain
+    NO_TIME = "no_time"  # no source has given the time yet
+    COARSE = "coarse"  # by messages only, to tenths of a second; or the second is not certain
     LOCKED = "locked"  # PPS edges, and their seconds are known
     HOLDOVER = "holdover"  # no edge for some seconds; sigma grows
-    LOST = "lost"  # too long without
+    LOST = "lost"  # no edge for too long
 
 
 class Severity(StrEnum):
-    """Of an event, as in ``/events``."""
+    """The severity of an event, as in ``/events``."""
 
     INFO = "info"
     WARNING = "warning"
@@ -28,7 +28,7 @@ class Severity(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class ClockEvent:
-    """Something the log should keep. host_ns is on the clock's own host scale."""
+    """An event for the log. host_ns is on the clock's own host scale."""
 
     host_ns: int
     severity: Severity
@@ -38,17 +38,18 @@ class ClockEvent:
 
 @dataclass(frozen=True, slots=True)
 class ClockStatus:
-    """A clock at one host time.
+    """A clock's status at one host time.
 
     Attributes:
-        state: see `TimeState`. sigma_ns: of gps_from_host there; inf without time.
-        offset_ns: GPS − host; None without time. drift_ppm: of the host clock, positive: fast; None without edges.
-        noise_ns: sigma of the edges' stamps as the data show it; None without edges.
-        source: who names the seconds ("gnss/rover RMC"), "wall_clock", or empty.
-        ambiguous: why the second is not certain; empty where it is.
-        leap_seconds, leap_origin: GPS − UTC in use, and who said so (receiver, second_60, configured, table, guess);
-            None: not needed yet. leap_doubt: why that is a guess, and the remedy; empty where it is none.
-        edges_used: edges in the line. edges_refused, messages_refused: counts by reason.
+        state, sigma_ns: see `TimeState`; of gps_from_host there, inf without time.
+        offset_ns, drift_ppm: GPS − host, None without time; of the host clock, positive: fast, None without edges.
+        noise_ns: sigma of the edges' stamps from the data; None without edges.
+        source: the source of the seconds' names ("gnss/rover RMC"), "wall_clock", or empty.
+        ambiguous: why the second is not certain; empty if it is.
+        leap_seconds, leap_origin: GPS − UTC in use, and its origin (receiver, second_60, configured, table, guess);
+        None: not needed yet.
+        leap_doubt: why that is a guess, and the remedy; empty if it is not.
+        edges_used, edges_refused, messages_refused: edges in the line; counts by reason.
     """
 
     state: TimeState
@@ -67,7 +68,7 @@ class ClockStatus:
 
 
 class EventLog:
-    """Events until they are fetched; the oldest go when nobody does."""
+    """Events until they are fetched; beyond a limit the oldest are dropped."""
 
     def __init__(self) -> None:
         self._events: list[ClockEvent] = []
@@ -79,7 +80,7 @@ class EventLog:
         del self._events[:-MAX_EVENTS]
 
     def add_once(self, host_ns: int, code: str, text: str) -> None:
-        """Keep a warning of a kind that is worth saying once a session."""
+        """Keep a warning of a kind that is given only once per session."""
         if code not in self._said:
             self._said.add(code)
             self.add(host_ns, Severity.WARNING, code, text)

@@ -1,4 +1,4 @@
-"""Time without edges: from the arrival of messages, or from the wall clock. Good to some tenths of a second."""
+"""Time without edges: from the arrival of messages, or from the wall clock. It is good to tenths of a second."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ MEMORY_S = 60
 TYPICAL_DELAY_NS = 250_000_000  # prior: messages come 5 ms to 0.9 s after their second
 COARSE_SIGMA_NS = 300_000_000.0
 AMBIGUOUS_SIGMA_NS = 1e9
-RATE_SPAN_NS = 20 * SECOND_NS  # messages of so long must advance with the host's clock
-SETTLED_SPAN_NS = 5 * SECOND_NS  # before so long nobody can tell at which rate they advance
-RATE_SPREAD_NS = 2 * SECOND_NS  # delays differ by less than this, stalls included
+RATE_SPAN_NS = 20 * SECOND_NS  # messages over this span must advance with the host's clock
+SETTLED_SPAN_NS = 5 * SECOND_NS  # minimum span for determining the messages' rate
+RATE_SPREAD_NS = 2 * SECOND_NS  # delays vary by less than this, stalls included
 RATE_MESSAGES = 4
 STEADY_READINGS = 3
 STEADY_SPAN_NS = 3 * SECOND_NS
-WALL_STEP_NS = 50_000_000  # a change of wall − host beyond this (and 500 ppm) starts the wall clock's probation anew
+WALL_STEP_NS = 50_000_000  # a change of wall − host beyond this (and 500 ppm) restarts the wall clock's probation
 WALL_MAX_AGE_NS = 120 * SECOND_NS
 WALL_DECIDES_SIGMA_S = 0.1
 
@@ -29,25 +29,26 @@ class CoarseClock:
         self.last_host_ns: int | None = None
 
     def add(self, host_ns: int, gps_ns: int) -> None:
-        """A message arrived at host_ns, naming the second gps_ns as just passed."""
+        """Take a message that arrived at host_ns and named the second gps_ns as just passed."""
         self._offsets.append((host_ns, gps_ns - host_ns))
         self.last_host_ns = host_ns
         while host_ns - self._offsets[0][0] > MEMORY_S * SECOND_NS:
             self._offsets.popleft()
 
     def shift(self, seconds: int) -> None:
-        """All seconds named so far were off by this (the leap count was)."""
+        """Shift all seconds named so far, after a correction of the leap count."""
         self._offsets = deque(((host, offset + seconds * SECOND_NS) for host, offset in self._offsets), maxlen=256)
 
     def settled(self) -> bool:
-        """Return messages have come for long enough to be believed, and advance with the host's clock."""
+        """Return whether messages have come for long enough, and advance with the host's clock."""
         if not self._offsets or self._offsets[-1][0] - self._offsets[0][0] < SETTLED_SPAN_NS:
             return False
         return not self.runs_at_another_rate()
 
     def runs_at_another_rate(self) -> bool:
-        """Return the last 20 s' messages drift from the host by more than delays can, the outermost on either side
-        aside.
+        """Return whether the last 20 s' messages drift from the host by more than delays can, outliers left out.
+
+        The outermost message on either side is the outlier.
         """
         if not self._offsets:
             return False
@@ -56,7 +57,7 @@ class CoarseClock:
         return len(recent) >= RATE_MESSAGES and recent[-2] - recent[1] > RATE_SPREAD_NS
 
     def offset_ns(self) -> int | None:
-        """Return GPS − host: of those near the median the least delayed, less a typical delay."""
+        """Return GPS − host: the least delayed of those near the median, less a typical delay."""
         if not self._offsets or self.runs_at_another_rate():
             return None
         ordered = sorted(offset for _, offset in self._offsets)
@@ -65,7 +66,7 @@ class CoarseClock:
 
 
 class WallClock:
-    """The host's wall clock against its continuous clock, and whether something disciplines it."""
+    """The host's wall clock against its continuous clock, and whether it is disciplined."""
 
     def __init__(self) -> None:
         self._host_ns = 0
@@ -76,7 +77,7 @@ class WallClock:
         self._steady = 0
 
     def set(self, host_ns: int, realtime_ns: int, disciplined: bool, sigma_s: float) -> None:
-        """One reading. A step, or a reading without discipline, starts its probation anew."""
+        """Take one reading; a step, or a reading without discipline, restarts the clock's probation."""
         offset = realtime_ns - host_ns
         previous = self._offset_ns
         allowed = WALL_STEP_NS + abs(host_ns - self._host_ns) // 2000
@@ -86,12 +87,15 @@ class WallClock:
         self._host_ns, self._offset_ns, self._disciplined, self._sigma_s = host_ns, offset, disciplined, sigma_s
 
     def on_probation(self, host_ns: int) -> bool:
-        """Disciplined and recent, but not yet watched for long enough to decide anything."""
+        """Return whether the clock is disciplined and recent, but not yet observed for long enough to decide."""
         recent = self._disciplined and abs(host_ns - self._host_ns) <= WALL_MAX_AGE_NS
         return recent and self._sigma_s <= WALL_DECIDES_SIGMA_S and self.utc_offset_ns(host_ns) is None
 
     def utc_offset_ns(self, host_ns: int) -> int | None:
-        """Return wall − host where it may decide between seconds: disciplined, steady, recent, sigma ≤ 0.1 s."""
+        """Return wall − host if it may decide between seconds, else None.
+
+        For that it is disciplined, steady, recent, and has a sigma ≤ 0.1 s.
+        """
         if self._offset_ns is None or not self._disciplined or self._sigma_s > WALL_DECIDES_SIGMA_S:
             return None
         if self._steady < STEADY_READINGS or self._host_ns - self._steady_since_ns < STEADY_SPAN_NS:
@@ -100,5 +104,5 @@ class WallClock:
 
     @property
     def sigma_ns(self) -> float:
-        """Sigma of the last reading."""
+        """The sigma of the last reading."""
         return self._sigma_s * SECOND_NS

@@ -1,8 +1,8 @@
 """A device's own clock in GPS time: by the PPS edges it latches, by its UTC-hour stamps, or by arrival times alone.
 
-A device that latches the edge in its own counter gives the best time there is; the host only says which second the
-edge was. The label of latched edges is found when asked for, from the host's clock as it then stands, so a late or
-corrected label reaches them.
+A device that latches the edge in its own counter gives the best time; the host only names the second of the edge. The
+label of latched edges is determined at each request, from the host's clock as it then is, so that a late or corrected
+label reaches them.
 """
 
 from __future__ import annotations
@@ -20,32 +20,37 @@ from swath.georef.timescales.gps_time import HOUR_NS, SECOND_NS, gps_ns_past_hou
 from swath.georef.timescales.pps_clock import PpsClock
 from swath.georef.timescales.stamp_scale import Stamps, StampScale, judge
 
-MAX_PAIRING_S = 0.3  # PROTOCOLS, SREP: further from the edge than this it is refused
+MAX_PAIRING_S = 0.3  # PROTOCOLS, SREP: an edge further from the second than this is refused
 MAX_DRIFT = 200e-6
-HELD_DRIFT = MAX_DRIFT / 2  # of a clock that the pulse set: nobody has seen yet at which rate it runs alone
+HELD_DRIFT = MAX_DRIFT / 2  # of a clock that the pulse set: its free-running rate is not yet known
 SPACING_FLOOR_NS = 2_000.0
-MAX_BRIDGED_S = 1_000  # longer without a latched edge the seconds can no longer be counted by ticks
-REFUSED_IN_A_ROW = 4  # spacings: then the first edge was the wrong one
-STEP_BACK_NS = 50_000_000  # device time going back further is a restart
-JUMP_NS = 5 * SECOND_NS  # … or passing the host's by more, which no stall of datagrams does: it was restarted, or set
-LABEL_KNOTS = 31  # latched edges around the time asked for whose labels are compared
+MAX_BRIDGED_S = 1_000  # limit of the time without a latched edge over which seconds can be counted by ticks
+REFUSED_IN_A_ROW = 4  # spacings refused in a row after which the first edge was the wrong one
+STEP_BACK_NS = 50_000_000  # a greater step back of device time is a restart
+# a greater jump against the host's time, which no stall of datagrams explains, is a restart or a setting
+JUMP_NS = 5 * SECOND_NS
+LABEL_KNOTS = 31  # number of latched edges around the requested time whose labels are compared
 LABEL_MAJORITY = 0.8
-LABEL_MAX_SIGMA_NS = 1e8  # the host's clock must be better than this to say which second
+LABEL_MAX_SIGMA_NS = 1e8  # greatest sigma of the host's clock that suffices to name a second
 SLOPE_KNOTS = 16
 LATCH_NOISE_NS = 100.0  # prior: one tick at 10 MHz
 WANDER_NS = 30.0  # prior of a device crystal in flight, ns/s per √s
 BIN_NS = 10 * SECOND_NS
-ARRIVAL_LATENCY_NS = 2_000_000.0  # prior of the least latency of a datagram or frame nobody has calibrated
-HOUR_STAMP_SIGMA_NS = 20_000.0  # maker's figure for a head locked to PPS is some 10 µs to 50 µs
+ARRIVAL_LATENCY_NS = 2_000_000.0  # prior of the least latency of an uncalibrated datagram or frame
+HOUR_STAMP_SIGMA_NS = 20_000.0  # makers state 10 µs to 50 µs for a head locked to PPS
 LIVE_KNOTS = 1800
-COARSE_MAX_SIGMA_NS = 4e8  # a host's clock as good as this says the hour, and the second where the head vouches for it
-JUDGED_AFTER_S = 10  # of stamps, while they come: what they count from; again after as many
-JUDGED_SECONDS = 120  # as many are looked at
+# greatest sigma of a host's clock that gives the hour, and the second if the head vouches for it
+COARSE_MAX_SIGMA_NS = 4e8
+JUDGED_AFTER_S = 10  # seconds of stamps before their origin is judged; judged again after as many
+JUDGED_SECONDS = 120  # greatest number of seconds used for that
 
 
 @dataclass(frozen=True, slots=True)
 class DeviceClockStatus:
-    """latched: by its own latch. drift_ppm: of the device, positive: fast; None unknown. segments: restarts + 1."""
+    """Status of a device's clock; latched: by its own latch.
+
+    drift_ppm: of the device, positive: fast; None: unknown. segments: restarts + 1.
+    """
 
     latched: bool
     drift_ppm: float | None
@@ -55,7 +60,7 @@ class DeviceClockStatus:
 
 
 class _Latch:
-    """Latched edges of one segment: device time, where the host saw it, and seconds counted since the first."""
+    """Latched edges of one segment: device time, the host's time of them, and seconds counted since the first."""
 
     def __init__(self) -> None:
         self.device = array("q")
@@ -64,7 +69,7 @@ class _Latch:
         self.refused_in_a_row = 0
 
     def add(self, device_ns: int, host_ns: int) -> str | None:
-        """Take an edge, or say why not."""
+        """Take an edge, or return the reason for refusing it."""
         if self.device:
             spacing = device_ns - self.device[-1]
             seconds = round(spacing / SECOND_NS)
@@ -86,13 +91,13 @@ class _Latch:
             del column[:-LIVE_KNOTS]
 
     def slope(self, at: int) -> float:
-        """Return GPS ns per device ns by the knots that end (or begin, at 0) at knot `at`."""
+        """Return GPS ns per device ns from the knots that end at knot `at`, or begin there for 0."""
         low, high = (max(0, at - SLOPE_KNOTS), at) if at else (0, min(SLOPE_KNOTS, len(self.device) - 1))
         ticks = self.device[high] - self.device[low]
         return (self.seconds[high] - self.seconds[low]) * SECOND_NS / ticks if ticks else 1.0
 
     def noise_ns(self) -> float:
-        """Return sigma of the latch by second differences of the last edges (1.48 MAD), beside the prior."""
+        """Return the latch's sigma from second differences of the last edges (1.48 MAD), at least that of the prior."""
         device = np.array(self.device[-256:], dtype=np.int64)
         seconds = np.array(self.seconds[-256:], dtype=np.int64)
         even = (np.diff(seconds)[:-1] == 1) & (np.diff(seconds)[1:] == 1)
@@ -103,7 +108,7 @@ class _Latch:
 
 
 class _Arrivals:
-    """Least delayed arrivals, one a bin: where a device has no latch."""
+    """The least delayed arrivals, one per bin, for a device without a latch."""
 
     def __init__(self) -> None:
         self.bins: dict[int, tuple[int, int]] = {}  # bin: (host − device, device ns)
@@ -144,7 +149,7 @@ class _Segment:
     """The device's clock from one power-on, or one change between kept and free, to the next."""
 
     def __init__(self, first_host_ns: int, *, free: bool, held: _Latch | None = None) -> None:
-        """held: of the segment before, whose time goes on where a head has just lost its pulse."""
+        """Begin a segment; held: the latch of the one before, whose time goes on if a head has just lost its pulse."""
         self.first_host_ns = first_host_ns
         self.free = free
         self.held = held
@@ -157,10 +162,10 @@ class _Segment:
 
 
 def _runs_free(rows: StructArray) -> NDArray[np.bool_]:
-    """Return (n,) where a head whose clock the PPS sets, and which counts no edges, has none: it drifts, and is set
-    again.
+    """Return (n,) whether a head whose clock the PPS sets, and which counts no edges, runs without it.
 
-    Its seconds before and after are no two points of one clock, as a counter's latches are.
+    Such a head drifts, and is set again; its seconds before and after do not belong to one clock, as a counter's
+    latches do.
     """
     free: NDArray[np.bool_] = (rows["locked"] == 0) & (rows["pps_time_ns"] < 0) & (rows["pps_count"] < 0)
     return free
@@ -178,10 +183,11 @@ class DeviceClock:
         wanted: StampScale | None = None,
         stamps: Stamps | None = None,
     ) -> None:
-        """past_utc_hour: device time counts from the UTC hour while `locked` is 1 (Velodyne), else from power-on.
+        """Prepare a clock of a device beside the host's.
 
-        wanted: what its stamps are configured to count from; AUTO: found while they come, where the device says nothing
-        of a lock; None: as the device itself says. stamps: what they count from, where that is known beforehand.
+        past_utc_hour: device time counts from the UTC hour while `locked` is 1 (Velodyne), else from power-on. wanted:
+        the configured origin of its stamps; AUTO: found while they come, if the device reports no lock; None: as the
+        device itself reports. stamps: their origin, if it is known beforehand.
         """
         self._clock = clock
         self._past_utc_hour = past_utc_hour
@@ -198,7 +204,7 @@ class DeviceClock:
         self.refused: dict[str, int] = {}
 
     def add(self, rows: StructArray, host_ns: Int64Array | None = None) -> None:
-        """Rows in order of arrival. host_ns (n,): their host times on the clock's scale; None: the rows' own are."""
+        """Take rows in order of arrival. host_ns (n,): host times on the clock's scale; None: the rows' own."""
         if not len(rows):
             return
         host = np.asarray(rows["host_time_ns"] if host_ns is None else host_ns, dtype=np.int64)
@@ -225,9 +231,9 @@ class DeviceClock:
         self._trim()
 
     def _note_stamps(self, rows: StructArray, device: Int64Array, host: Int64Array) -> None:
-        """Keep the least delayed stamp of each second; every so often judge what they count from."""
+        """Keep the least delayed stamp of each second, and judge the stamps' origin at intervals."""
         says = (rows["locked"] >= 0) | (rows["pps_time_ns"] >= 0)
-        if self._wanted is StampScale.AUTO and says.any():  # it says itself
+        if self._wanted is StampScale.AUTO and says.any():  # the device reports its lock itself
             if not self._past_utc_hour:
                 self._judges, self.stamps = False, None
                 return
@@ -264,8 +270,9 @@ class DeviceClock:
             self._lock_state.append(int(locked[place]))
 
     def _segment_for(self, device_ns: int, count: int, host_ns: int, *, free: bool) -> _Segment:
-        """Return the segment that goes on; a new one where count or device time went back, that jumped, or lock
-        changed.
+        """Return the present segment, or a new one after a step back, a jump or a change of lock.
+
+        A step back is one of the count or of device time, a jump one of device time against host time.
         """
         held = None
         if self._segments:
@@ -284,7 +291,8 @@ class DeviceClock:
     ) -> list[int]:
         """Take each new latch once: the host saw its edge (device time − latch) before the row's stamp.
 
-        Returns the rows at which the chain broke, and so another segment began.
+        Returns:
+            The rows at which the chain broke, so that another segment began.
         """
         broken: list[int] = []
         usable = np.flatnonzero((pps >= 0) & (count != 0))
@@ -311,7 +319,7 @@ class DeviceClock:
         return broken
 
     def _follow_up(self, segment: _Segment, host_ns: int) -> _Segment:
-        """Return a new segment where the chain of latched edges broke."""
+        """Return a new segment after a break in the chain of latched edges."""
         following = _Segment(host_ns, free=segment.free)
         following.last_pps_ns = segment.last_pps_ns
         self._segments.append(following)
@@ -330,10 +338,10 @@ class DeviceClock:
     def gps_from_device(
         self, device_time_ns: Int64Array, host_ns: Int64Array | None = None
     ) -> tuple[Int64Array, NDArray[np.float64]]:
-        """Return GPS ns (n,) and sigma ns (n,) of device times (n,). host_ns (n,), when they arrived, chooses among
-        restarts.
+        """Return GPS ns (n,) and sigma ns (n,) of device times (n,).
 
-        Without host_ns the time since the last restart is meant. Where nothing is known the sigma is inf.
+        host_ns (n,), their arrival times, select among restarts; without it the time since the last restart is used.
+        The sigma is inf where the time is unknown.
         """
         device = np.atleast_1d(np.asarray(device_time_ns, dtype=np.int64))
         gps, sigma = np.zeros_like(device), np.full(device.shape, math.inf)
@@ -363,7 +371,7 @@ class DeviceClock:
         if segment.held is None or held is None:
             return gps, sigma
         held_sigma = np.hypot(held[1], HELD_DRIFT * (device - segment.held.device[-1]))
-        better = held_sigma < sigma  # for some 20 s; within 10 s it is good enough for returns
+        better = held_sigma < sigma  # for about 20 s; within 10 s it is good enough for returns
         return np.where(better, held[0], gps), np.where(better, held_sigma, sigma)
 
     def _by_arrivals(self, segment: _Segment, device: Int64Array) -> tuple[Int64Array, NDArray[np.float64]]:
@@ -374,10 +382,9 @@ class DeviceClock:
         return gps, np.hypot(sigma, scatter)
 
     def _by_latch(self, latch: _Latch, device: Int64Array) -> tuple[Int64Array, NDArray[np.float64]] | None:
-        """Return piecewise linear between latched edges, by their last rate beyond; None where their second is not
-        known.
+        """Return GPS ns and sigma, linear between latched edges, by the last rate beyond; None without a known second.
 
-        One edge alone is none: it may be a register that reads 0 before the first pulse, or a glitch at power-on.
+        A single edge is not used: it may be a register that reads 0 before the first pulse, or a glitch at power-on.
         """
         knots = np.array(latch.device, dtype=np.int64)
         if len(knots) < 2:
@@ -399,7 +406,7 @@ class DeviceClock:
         return gps[anchor] + np.rint(rate * since).astype(np.int64), np.sqrt(variance)
 
     def _label(self, latch: _Latch, around: int) -> int | None:
-        """Return GPS second of the first latched edge: what most of the host-labelled edges around a knot say."""
+        """Return the GPS second of the first latched edge, by the majority of the host-labelled edges around a knot."""
         low = max(0, min(around - LABEL_KNOTS // 2, len(latch.host) - LABEL_KNOTS))
         host = np.array(latch.host[low : low + LABEL_KNOTS], dtype=np.int64)
         gps, sigma = self._clock.gps_from_host(host)
@@ -415,7 +422,7 @@ class DeviceClock:
     def _place_past_hour(
         self, device: Int64Array, host: Int64Array, gps: Int64Array, sigma: NDArray[np.float64]
     ) -> None:
-        """Overwrite, in place, what the locked head itself says better: stamps past the UTC hour."""
+        """Overwrite times, in place, by a locked head's more accurate stamps past the UTC hour."""
         near, near_sigma = self._clock.gps_from_host(host)
         leap = self._clock.leap_seconds_at(int(near[-1]))
         place = np.searchsorted(np.array(self._lock_host, dtype=np.int64), host, side="right") - 1
@@ -434,14 +441,14 @@ class DeviceClock:
 
     @staticmethod
     def _slack_ns(near_sigma: NDArray[np.float64]) -> Int64Array:
-        """Return how much farther from its arrival (n,) a stamp may lie: nothing where the host knows the second."""
+        """Return the added tolerance (n,) between a stamp and its arrival; 0 if the host knows the second."""
         coarse = (near_sigma > LABEL_MAX_SIGMA_NS) & (near_sigma <= COARSE_MAX_SIGMA_NS)
         return np.where(coarse, 3.0 * near_sigma, 0.0).astype(np.int64)
 
     def _place_absolute(
         self, device: Int64Array, host: Int64Array, gps: Int64Array, sigma: NDArray[np.float64]
     ) -> None:
-        """Overwrite, in place, with stamps that count from 1970, as far as they lie where they arrived."""
+        """Overwrite times, in place, by stamps that count from 1970, if these agree with their arrival."""
         assert self.stamps is not None
         near, near_sigma = self._clock.gps_from_host(host)
         placed = device + self.stamps.offset_ns
@@ -454,7 +461,7 @@ class DeviceClock:
         gps[good], sigma[good] = placed[good], self.stamps.sigma_ns
 
     def status(self) -> DeviceClockStatus:
-        """Return counts and drift."""
+        """Return the clock's counts and drift."""
         latch = self._segments[-1].latch if self._segments else _Latch()
         latched = len(latch.device) > 1
         drift = (1.0 / latch.slope(len(latch.device) - 1) - 1.0) * 1e6 if latched else None

@@ -1,4 +1,4 @@
-"""One train of PPS edges: found among what the interrupt delivers, followed through a gate, remembered knot by knot."""
+"""One train of PPS edges: found among the interrupts, followed through a gate, remembered knot by knot."""
 
 from __future__ import annotations
 
@@ -17,27 +17,26 @@ from swath.georef.timescales.line_fit import SHRINK_HORIZON, LineBank, excess_va
 
 MAX_DRIFT = 200e-6
 FIRST_LOCK_EDGES = 5
-NOISY_LOCK_EDGES = 10  # where stamps are too noisy for 200 ppm between neighbours
+NOISY_LOCK_EDGES = 10  # for stamps too noisy for 200 ppm between neighbours
 NOISY_TOLERANCE_NS = 2_000_000
 NOISY_AFTER_EDGES = 24
 MAX_CHAIN_GAP_S = 4
 GATE_FLOOR_NS = 50_000.0
-FIRST_GATE_FLOOR_NS = 1_000_000.0  # while the stamps' noise is only guessed
+FIRST_GATE_FLOOR_NS = 1_000_000.0  # while the stamps' noise is only a first guess
 FIRST_EDGES = 16
 GATE_SIGMAS = 5.0
 GATE_MISSED_MAX = 5.0
 MAX_REFUSED_IN_A_ROW = 8
 LIVE_KNOTS = 900
-FIRST_NOISE_FACTOR = 1.5  # five edges tell little: rather too much at first
+FIRST_NOISE_FACTOR = 1.5  # five edges determine little: the noise is assumed larger at first
 FIRST_NOISE_NS = 2_000.0  # prior of the stamps' noise, worth two edges beside the first lock's residuals
 
 
 def find_chain(edges: Sequence[int], train: EdgeTrain | None = None, *, noisy: bool) -> list[tuple[int, int]] | None:
-    """Return edges of one 1 Hz train that ends with the newest edge: (index from 0, host ns); None where there is none
-    yet.
+    """Return edges of one 1 Hz train that ends with the newest edge: (index from 0, host ns); None if none is found.
 
-    Neighbours lie whole seconds (up to MAX_CHAIN_GAP_S) ± 200 ppm apart. noisy allows NOISY_TOLERANCE_NS more and asks
-    for more edges. What a train there is has taken is not used: knots of two trains may not overlap.
+    Neighbours lie whole seconds (up to MAX_CHAIN_GAP_S) ± 200 ppm apart. noisy allows NOISY_TOLERANCE_NS more and
+    requires more edges. Edges that an existing train has taken are not used: knots of two trains must not overlap.
     """
     wanted = NOISY_LOCK_EDGES if noisy else FIRST_LOCK_EDGES
     chain = [(0, edges[-1])]
@@ -56,23 +55,24 @@ def find_chain(edges: Sequence[int], train: EdgeTrain | None = None, *, noisy: b
 
 
 def _chain_noise_ns(chain: Sequence[tuple[int, int]], edges: Sequence[int]) -> float:
-    """Return first guess of the stamps' noise: residuals of a line through the chain, beside the prior.
+    """Return a first guess of the stamps' noise: residuals of a line through the chain, with the prior.
 
-    The chain was chosen for being even; the other edges seen near the line (1.48 MAD) tell whether the stamps are.
+    The chain was chosen for its even spacing; the other edges near the line (1.48 MAD) show the noise of the stamps.
     """
     seconds = np.array([index for index, _ in chain], dtype=np.float64)
     phase = np.array([host - chain[0][1] - index * SECOND_NS for index, host in chain], dtype=np.float64)
     away, middle = seconds - seconds.mean(), phase.mean()
-    slope = float(away @ phase) / float(away @ away)  # by hand: LAPACK is not otherwise touched while recording
+    # written out, because LAPACK is not used otherwise while recording
+    slope = float(away @ phase) / float(away @ away)
     residual = phase - middle - slope * away
     chosen = math.sqrt((float(residual @ residual) + 2 * FIRST_NOISE_NS**2) / len(chain))
     since = np.array(edges, dtype=np.int64) - chain[0][1]
     whole = np.rint(since / SECOND_NS)
     off = np.abs(since - whole * SECOND_NS - middle - slope * (whole - seconds.mean()))
     near = np.sort(off[off < NOISY_TOLERANCE_NS])
-    if not len(near):  # of stray edges a chain may be made whose own lie nowhere near its line
+    if not len(near):  # a chain of stray edges may have no edges near its line
         return FIRST_NOISE_FACTOR * chosen
-    # by hand: NumPy's median loads numpy.ma from the disk when it is first asked, in flight, with edges waiting
+    # written out: NumPy's median loads numpy.ma from the disk at its first call, in flight, with edges waiting
     median = 0.5 * float(near[(len(near) - 1) // 2] + near[len(near) // 2])
     return FIRST_NOISE_FACTOR * max(chosen, 1.4826 * median)
 
@@ -81,7 +81,7 @@ class EdgeTrain:
     """A locked 1 Hz train with its line, its label and its history."""
 
     def __init__(self, chain: Sequence[tuple[int, int]], edges: Sequence[int], *, keep_history: bool) -> None:
-        """chain: (index, host ns) of its first edges, as `find_chain` gives them; edges: all seen of late."""
+        """Begin a train with the (index, host ns) of its first edges from `find_chain`; edges: all recent ones."""
         self.anchor_ns = chain[0][1]
         self.labeller = Labeller(keep_votes=keep_history)
         self.refused_in_a_row = 0
@@ -92,14 +92,14 @@ class EdgeTrain:
         self._whole = array("q")  # host ns of the knot's whole nanoseconds, index, doubt
         self._index = array("q")
         self._doubt = array("b")
-        self._numbers = array("d")  # KNOT_NUMBERS a knot
+        self._numbers = array("d")  # KNOT_NUMBERS per knot
         self.bank = LineBank(0, 0.0, _chain_noise_ns(chain, edges))
         self._remember()
         for index, host in chain[1:]:
             self._take(index, host)
 
     def index_at(self, host_ns: int) -> float:
-        """Return edge number (with fraction) at a host time."""
+        """Return the edge number (with fraction) at a host time."""
         knot = self.bank.knot
         since = host_ns - self.anchor_ns - knot.index * SECOND_NS - knot.phase_ns
         return knot.index + since / (SECOND_NS + knot.drift_ns_s)
@@ -112,11 +112,11 @@ class EdgeTrain:
         return whole + round(since * SECOND_NS / (SECOND_NS + knot.drift_ns_s))
 
     def sigma_at(self, host_ns: int) -> float:
-        """Return sigma (ns) of the line at a host time."""
+        """Return the sigma (ns) of the line at a host time."""
         return math.sqrt(self.bank.knot.variance_at(self.index_at(host_ns)))
 
     def offer(self, host_ns: int) -> str | None:
-        """Take an edge; or the reason for which it was refused."""
+        """Take an edge, or return the reason for refusing it."""
         knot = self.bank.knot
         index = round(self.index_at(host_ns))
         if index <= knot.index:
@@ -140,7 +140,7 @@ class EdgeTrain:
         return True
 
     def amend_last(self, correction_ns: float) -> None:
-        """Correct the last edge taken (a quantisation error told after its edge)."""
+        """Correct the last edge taken, for a quantisation error reported after its edge."""
         self.bank.amend_last(correction_ns)
         del self._whole[-1], self._index[-1], self._doubt[-1], self._numbers[-KNOT_NUMBERS:]
         self._remember()
@@ -151,7 +151,7 @@ class EdgeTrain:
         self._doubt = array("b", bytes([True]) * len(self._doubt))
 
     def believe(self) -> None:
-        """Take every doubt off: the seconds of all knots are known."""
+        """Remove every doubt: the seconds of all knots are known."""
         self.doubtful = False
         self._doubt = array("b", bytes(len(self._doubt)))
 
@@ -171,12 +171,12 @@ class EdgeTrain:
 
     @property
     def first_knot_ns(self) -> int:
-        """Host time of the first knot remembered."""
+        """The host time of the first knot remembered."""
         return self._whole[0]
 
     @property
     def last_knot_ns(self) -> int:
-        """Host time of the last knot."""
+        """The host time of the last knot."""
         return self._whole[-1]
 
     def knots_between(self, from_ns: int, to_ns: int) -> KnotTable:
@@ -198,10 +198,9 @@ KNOT_NUMBERS = 10  # fraction of a ns, drift, three (co)variances, wander, three
 
 
 def forget_later(edges: deque[int], train: EdgeTrain | None, host_ns: int) -> bool:
-    """Return whether an edge before the latest of some goes on with a train all the same; then those after it are
-    dropped.
+    """Return whether an edge before the latest one continues a train; if so, drop the edges after it.
 
-    They were none of the train's: an edge that is stamped in the future must stop no clock.
+    Those edges did not belong to the train: an edge with a stamp in the future must not stop a clock.
     """
     if train is None or host_ns <= train.last_host_ns or (edges and host_ns == edges[-1]):
         return False
@@ -228,7 +227,7 @@ class KnotTable:
         return np.asarray(since / (SECOND_NS + drift), dtype=np.float64)
 
     def variance(self, k: Int64Array, seconds: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return variance (ns²) of the line of knot k, seconds away from it (sign as in `seconds_from`)."""
+        """Return the variance (ns²) of the line of knot k, seconds away from it (sign as in `seconds_from`)."""
         xx, xy, yy, wander = self.numbers[k, 2], self.numbers[k, 3], self.numbers[k, 4], self.numbers[k, 5]
         away = np.abs(seconds)
         plain = xx + 2.0 * np.maximum(seconds * xy, 0.0) + away * away * (yy + wander * away / 3.0)

@@ -1,6 +1,6 @@
-"""GPS time, UTC and what lies between: leap seconds, weeks, roll-overs, incomplete time tags.
+"""Convert between GPS time and UTC: leap seconds, weeks, roll-overs, incomplete time tags.
 
-GPS time is int64 nanoseconds since 1980-01-06T00:00:00, continuous (FORMULAS 12). UTC exists at the edges only.
+GPS time is int64 nanoseconds since 1980-01-06T00:00:00, continuous (FORMULAS 12). UTC appears at interfaces only.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ LEAP_SECOND_TABLE: tuple[tuple[dt.date, int], ...] = (
     (dt.date(2015, 7, 1), 17),
     (dt.date(2017, 1, 1), 18),
 )
-# The table is knowledge up to here; later it is only the best guess. (Bulletin C 70: none at the end of 2025.)
+# The table is certain up to here; later it is only the best guess. (Bulletin C 70: none at the end of 2025.)
 LEAP_TABLE_VALID_UNTIL = dt.date(2026, 6, 28)
 _LEAP_DAYS = [day for day, _ in LEAP_SECOND_TABLE]
 
@@ -61,8 +61,9 @@ def table_leap_seconds(date: dt.date) -> tuple[int, bool]:
 
 
 def gps_ns_from_utc(date: dt.date, time_of_day_ns: int, leap_seconds: int) -> int:
-    """Return GPS ns of a UTC day and time. In a leap second time_of_day_ns ≥ 86 400 s and leap_seconds is the old
-    count.
+    """Return GPS ns of a UTC day and time.
+
+    In a leap second time_of_day_ns ≥ 86 400 s and leap_seconds is the old count.
     """
     return (date.toordinal() - GPS_EPOCH.toordinal()) * DAY_NS + time_of_day_ns + leap_seconds * SECOND_NS
 
@@ -78,7 +79,7 @@ def unix_ns_from_gps(gps_ns: int, leap_seconds: int) -> int:
 
 
 def utc_from_gps(gps_ns: int, leap_seconds: int) -> tuple[dt.date, int]:
-    """Return UTC date and nanoseconds of day of a GPS time; within a leap second it reads as the next day's first."""
+    """Return UTC date and nanoseconds of day of a GPS time; a leap second reads as the next day's first second."""
     days, time_of_day_ns = divmod(gps_ns - leap_seconds * SECOND_NS, DAY_NS)
     return dt.date.fromordinal(GPS_EPOCH.toordinal() + days), time_of_day_ns
 
@@ -109,9 +110,9 @@ def las_adjusted_s(gps_ns: int) -> float:
 
 
 def whole_gps_ns(tag: TimeTag, leap_seconds: int | None) -> int | None:
-    """Return GPS ns of a tag that says all (week or date); None where it does not, or where UTC has no leap count.
+    """Return GPS ns of a complete tag (week or date); None if it is incomplete, or if UTC lacks a leap count.
 
-    The tag's own leap count goes before the one given.
+    The tag's own leap count takes precedence over the given one.
     """
     if tag.scale is TimeScale.GPS:
         return None if tag.week is None else gps_ns_from_week(tag.week, tag.time_ns)
@@ -122,10 +123,9 @@ def whole_gps_ns(tag: TimeTag, leap_seconds: int | None) -> int | None:
 
 
 def nearest_gps_ns(tag: TimeTag, near_gps_ns: int, leap_seconds: int | None) -> int | None:
-    """Return GPS ns nearest to a prediction that has the tag's time of week (or day); its week and date are not looked
-    at.
+    """Return GPS ns nearest to a prediction with the tag's time of week (or day); its week and date are ignored.
 
-    That undoes 10-bit weeks and a week number that turned over before or after its time of week.
+    That repairs 10-bit weeks and a week number that turned over before or after its time of week.
     """
     if tag.scale is TimeScale.GPS:
         period_ns, offset_ns = WEEK_NS, tag.time_ns
@@ -140,11 +140,11 @@ def nearest_gps_ns(tag: TimeTag, near_gps_ns: int, leap_seconds: int | None) -> 
 def complete_time(
     tag: TimeTag, near_gps_ns: int | None, leap_seconds: int | None, *, max_age_ns: int = MAX_AGE_NS
 ) -> int | None:
-    """Return GPS ns of a device's time tag, or None where it cannot be placed.
+    """Return GPS ns of a device's time tag, or None if it cannot be placed.
 
     With a prediction (the GPS time of the message's arrival) the tag must lie between max_age_ns before it and 0.5 s
     after it: a week number that turned over at another moment than its time of week is repaired, anything else refused.
-    Without a prediction the tag must say everything itself.
+    Without a prediction the tag must be complete.
     """
     if near_gps_ns is None:
         return whole_gps_ns(tag, leap_seconds)
@@ -162,12 +162,12 @@ def gps_ns_past_hour(
     max_age_ns: int = SECOND_NS,
     slack_ns: Int64Array | int = 0,
 ) -> tuple[Int64Array, NDArray[np.bool_]]:
-    """Place stamps that count from the UTC hour (Velodyne, locked): GPS ns (n,) and which of them may be believed.
+    """Place stamps that count from the UTC hour (Velodyne, locked): GPS ns (n,), and whether each is credible.
 
-    The hour is the one that comes nearest to the prediction, the GPS time of arrival (so within ± 30 min); a stamp is
-    refused where it then lies more than max_age_ns before it (a stalled packet's does) or 0.5 s after it: a head that
-    is one second ahead comes out just less than that second ahead, by the packet's latency. slack_ns: as much farther
-    on either side, for a prediction that is coarse.
+    The hour is the one nearest to the prediction, the GPS time of arrival (so within ± 30 min); a stamp is refused if
+    it then lies more than max_age_ns before it (as in a stalled packet) or 0.5 s after it: a head that is one second
+    ahead appears ahead by that second less the packet's latency. slack_ns: added tolerance on either side, for a coarse
+    prediction.
     """
     near = np.asarray(near_gps_ns, dtype=np.int64)
     offset = np.asarray(past_hour_ns, dtype=np.int64) + leap_seconds * SECOND_NS

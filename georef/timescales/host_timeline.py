@@ -1,4 +1,4 @@
-"""Host time (CLOCK_MONOTONIC plus the session's constant) to CLOCK_MONOTONIC_RAW and back.
+"""Convert host time (CLOCK_MONOTONIC plus the session's constant) to CLOCK_MONOTONIC_RAW and back.
 
 MONOTONIC is slewed by NTP and RAW is not; a clock model must run in RAW (LOG_FORMAT, Time stamps).
 """
@@ -14,7 +14,7 @@ from swath.georef.records import Int64Array
 
 MAX_SLEW = 1e-3  # of MONOTONIC against RAW: adjtimex allows 500 ppm on each side
 READ_TOLERANCE_NS = 5_000  # the two clocks are not read at one instant
-REFUSALS_IN_A_ROW = 3  # after so many the new offset is the truth
+REFUSALS_IN_A_ROW = 3  # after this many the new offset is accepted
 SLOPE_SPAN_NS = 2_000_000_000  # the pairs of this last span give the slope for extrapolation
 
 
@@ -25,7 +25,10 @@ class HostTimeline:
     """
 
     def __init__(self, host_minus_monotonic_ns: int = 0, *, keep_history: bool = False) -> None:
-        """host_minus_monotonic_ns: realtime_ns − monotonic_ns of ``swath.session``. Live use keeps 10 minutes."""
+        """Prepare a timeline; host_minus_monotonic_ns: realtime_ns − monotonic_ns of ``swath.session``.
+
+        Without keep_history, for live use, it remembers 10 minutes.
+        """
         self.host_minus_monotonic_ns = host_minus_monotonic_ns
         self.refused = 0
         self._refused_in_a_row = 0
@@ -36,7 +39,7 @@ class HostTimeline:
         self._arrays: tuple[Int64Array, NDArray[np.float64], int] | None = None
 
     def add(self, realtime_ns: int, monotonic_ns: int, monotonic_raw_ns: int) -> None:
-        """One reading of the three clocks. realtime_ns has no say: a stepped wall clock changes nothing."""
+        """Take one reading of the three clocks; realtime_ns is ignored, so that a stepped wall clock has no effect."""
         del realtime_ns
         host = monotonic_ns + self.host_minus_monotonic_ns
         offset = monotonic_raw_ns - host
@@ -53,7 +56,7 @@ class HostTimeline:
         self._slope = (offset - recent[0][1]) / (host - recent[0][0]) if len(recent) > 1 else 0.0
 
     def _plausible(self, host: int, offset: int) -> bool:
-        """Return whether a reading continues the last one; counted where it does not."""
+        """Return whether a reading continues the last one; count it if not."""
         elapsed = host - self._host[-1]
         if elapsed <= 0:
             self.refused += 1
@@ -68,7 +71,7 @@ class HostTimeline:
         return True
 
     def raw_at(self, host_ns: int) -> int:
-        """Return RAW of one host time; the live path (usually at or after the last reading)."""
+        """Return RAW of one host time, for live use (usually at or after the last reading)."""
         if not self._host:
             return host_ns - self.host_minus_monotonic_ns
         last = self._host[-1]
@@ -84,7 +87,7 @@ class HostTimeline:
         return host + self._interpolate(host)
 
     def _interpolate(self, times: Int64Array) -> Int64Array:
-        """Return RAW − host at host times; last slope beyond the last reading."""
+        """Return RAW − host at host times, with the last slope beyond the last reading."""
         if self._arrays is None:
             first = self._offset[0]
             self._arrays = (

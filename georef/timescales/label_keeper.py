@@ -1,4 +1,4 @@
-"""Labels of edge trains: given once, held, doubted aloud, and moved only in a logged step."""
+"""Keep the labels of edge trains: given once, held, doubted with an event, and moved only in a logged step."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ WALL_FRACTION_S = 0.3  # a wall clock this far off the edges' whole second decid
 
 
 def outranks(verdict: Verdict, basis: Verdict) -> bool:
-    """Return whether a verdict may move a label that rests on another: only what is bound to its edge may."""
+    """Return whether a verdict may move a label with another basis: only a message bound to its edge may."""
     return verdict.basis == "bound" and basis.basis != "bound"
 
 
 class LabelKeeper:
-    """Applies what the voters and the wall clock say to the labels of trains."""
+    """Applies the votes of messages and the wall clock to the labels of trains."""
 
     def __init__(self, leaps: LeapBook, wall: WallClock, events: EventLog) -> None:
         self._leaps = leaps
@@ -29,7 +29,7 @@ class LabelKeeper:
         self._events = events
 
     def verdict(self, train: EdgeTrain, host_ns: int) -> Verdict:
-        """Return what is known of a train's seconds at a host time."""
+        """Return the verdict on a train's seconds at a host time."""
         wall = self._wall.utc_offset_ns(host_ns)
         index = math.floor(train.index_at(host_ns))
         if wall is None:
@@ -42,7 +42,7 @@ class LabelKeeper:
         return train.labeller.decide(index, round(offset), leap.trust)
 
     def decide(self, train: EdgeTrain, host_ns: int) -> None:
-        """Label the train, hold its label, or say why its seconds are not certain."""
+        """Label the train, hold its label, or record why its seconds are not certain."""
         labeller = train.labeller
         verdict = labeller.verdict = self.verdict(train, host_ns)
         if verdict.offset is None and not verdict.ambiguous:
@@ -81,9 +81,9 @@ class LabelKeeper:
 
     @staticmethod
     def _given_up_by_its_source(train: EdgeTrain, verdict: Verdict) -> str:
-        """Return by how many messages the source of the label has named another second for longer; empty: it has not.
+        """Return a text if the label's source has named another second in more messages; else an empty one.
 
-        All who are sure agree on the other second, or the verdict would be ambiguous.
+        All voters with a majority agree on the other second, or the verdict would be ambiguous.
         """
         labeller, basis = train.labeller, train.labeller.basis
         if basis.key is None or verdict.offset is None or BASIS_RANK[verdict.basis] < BASIS_RANK[basis.basis]:
@@ -102,7 +102,7 @@ class LabelKeeper:
             train.labeller.basis = verdict
 
     def set_conflict(self, train: EdgeTrain, host_ns: int, text: str) -> None:
-        """The train's seconds are not certain from here on."""
+        """Mark the train's seconds as uncertain from here on."""
         if not train.doubtful:
             self._events.add(host_ns, Severity.ERROR, "second_ambiguous", text)
         train.doubtful = True
@@ -115,7 +115,7 @@ class LabelKeeper:
         train.labeller.conflict = ""
 
     def give_up(self, train: EdgeTrain, host_ns: int, jump_s: float) -> None:
-        """Edges that have ended are outlived by others that contradict their seconds: all they named is doubtful."""
+        """Mark all seconds of ended edges as doubtful: later edges contradict them and have lasted longer."""
         train.doubt_all()
         text = f"by edges and messages that have outlived those before: time moves by {jump_s:+.1f} s"
         self._events.add(host_ns, Severity.ERROR, "relabelled", text)
@@ -126,9 +126,9 @@ class LabelKeeper:
         self._events.add(host_ns, Severity.ERROR, "relabelled", text)
 
     def leap_said(self, trains: list[EdgeTrain], host_ns: int, change: LeapChange) -> None:
-        """A receiver says the leap count that was assumed so far: votes and labels that rest on it move together.
+        """Move votes and labels that rest on an assumed leap count, as a receiver has given the count.
 
-        A count that cannot be that of the date moves what its own messages named, and nothing else.
+        A count that cannot be that of the date moves only the seconds that its own messages named.
         """
         seconds = change.now - change.before
         source = change.source if change.stale else None

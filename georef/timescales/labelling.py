@@ -1,7 +1,7 @@
-"""Which second an edge was: integer-offset votes, one voter a kind of message.
+"""Find the second of an edge by votes for an integer offset, one voter for each kind of message.
 
 Every message gives ``offset = second − edge number`` for the edge it names. A delay of nearly one second or more would
-make it name the next edge, so the age of the messages is watched, and voters are compared with each other.
+make it name the next edge; therefore the age of the messages is checked, and voters are compared with each other.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from typing import NamedTuple
 VOTES = 15
 MIN_VOTES = 5
 MAJORITY = 0.8
-SURE_AGE_S = 0.5  # up to this age five votes of one mind are enough
+SURE_AGE_S = 0.5  # up to this age five unanimous votes are enough
 YOUNG_AGE_S = 0.12  # below this (just after an edge, or a whole second late) only if they are …
 YOUNG_SPREAD_S = 0.02  # … that even, and …
-LEAST_AGE_S = 0.004  # … not impossibly quick
-STRADDLE_MEMORY_S = 600  # a message just before an edge makes those just after it suspect for so many edges
-LATE_AGE_S = 0.7  # a steady delay above this may be one second and a bit less or more
-LEAP_ERROR_S = 20  # a receiver that does not know GPS − UTC yet is wrong by at most all of it
-VOTER_FORGOTTEN_S = 60  # a voter silent for so many edges has no say
+LEAST_AGE_S = 0.004  # … not impossibly early
+STRADDLE_MEMORY_S = 600  # edges for which a message just before an edge makes messages just after it suspect
+LATE_AGE_S = 0.7  # a steady delay above this may be one second more or less
+LEAP_ERROR_S = 20  # error limit of a receiver that does not know GPS − UTC yet: all of it
+VOTER_FORGOTTEN_S = 60  # edges after which a silent voter no longer counts
 
 
 class VoterKey(NamedTuple):
@@ -35,11 +35,11 @@ class VoterKey(NamedTuple):
 
 
 class LeapTrust(IntEnum):
-    """How far the leap count behind a vote can be believed."""
+    """The credibility of the leap count behind a vote."""
 
-    GUESSED = 0  # neither receiver nor configuration nor a table that reaches so far: no label rests on it
-    ASSUMED = 1  # configuration or table: used until a receiver says
-    SAID = 2  # a receiver said it, or the message needs none
+    GUESSED = 0  # not from receiver, configuration or a valid table: no label rests on it
+    ASSUMED = 1  # configuration or table: used until a receiver gives the count
+    SAID = 2  # given by a receiver, or not needed by the message
 
 
 class Said(NamedTuple):
@@ -52,7 +52,10 @@ class Said(NamedTuple):
 
 
 class Vote(NamedTuple):
-    """offset: second − edge number; age_s: of the message since the edge before it; leap: behind its second."""
+    """A vote for an offset, second − edge number.
+
+    age_s: of the message since the edge before it; leap: trust in the leap count behind its second.
+    """
 
     offset: int
     age_s: float
@@ -60,7 +63,7 @@ class Vote(NamedTuple):
 
 
 class PastVote(NamedTuple):
-    """A vote of the log: when its message came, and who gave it."""
+    """A vote of the log: arrival of its message, and its voter."""
 
     host_ns: int
     key: VoterKey
@@ -69,13 +72,13 @@ class PastVote(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What the voters say together.
+    """The joint result of the voters.
 
     Attributes:
-        offset: the offset decided on, or the best guess where ambiguous; None: nobody is sure enough.
-        ambiguous: why it cannot be decided, empty where it is.
+        offset: the offset decided on, or the best guess if ambiguous; None: no voter has a majority.
+        ambiguous: why it cannot be decided, empty if it can.
         basis: "bound", "vote" or "wall_clock".
-        key: the voter (for the log). leap: the weakest leap count behind it.
+        key, leap: the voter (for the log); the weakest leap count behind it.
         late: ambiguous only because all messages come late; they agree with each other.
     """
 
@@ -88,11 +91,11 @@ class Verdict:
 
     @property
     def text(self) -> str:
-        """Who says so, for the log."""
+        """The source of the verdict, for the log."""
         return self.basis if self.key is None else f"{self.key.source} {self.key.message}".strip()
 
     def with_leap_said(self, seconds: int) -> Verdict:
-        """Return the same after the leap count turned out to be so many seconds more."""
+        """Return the verdict after the leap count turned out to be larger by this many seconds."""
         offset = None if self.offset is None else self.offset + seconds
         return replace(self, offset=offset, leap=LeapTrust.SAID)
 
@@ -109,7 +112,7 @@ class Voter:
         self.undecided = 0
 
     def add(self, index: int, vote: Vote) -> None:
-        """Take a vote for edge `index`. Two of one kind and two minds at one edge: one was stalled, neither counts."""
+        """Take a vote for edge `index`; two different ones at one edge cancel, as one message was stalled."""
         if index == self.last_index:
             if self.votes and self.votes[-1].offset != vote.offset:
                 self.votes.pop()
@@ -120,14 +123,14 @@ class Voter:
         self._count()
 
     def shift(self, seconds: int) -> None:
-        """Move the votes that rest on a leap count no receiver had said: now one has."""
+        """Move the votes that rest on a leap count that no receiver had given, now that one has."""
         said = LeapTrust.SAID
         moved = [v if v.leap is said else Vote(v.offset + seconds, v.age_s, said) for v in self.votes]
         self.votes = deque(moved, maxlen=VOTES)
         self._count()
 
     def _count(self) -> None:
-        """Set `offset` (None: no majority) and `late`."""
+        """Set `offset` (None: no majority) and `late` from the votes."""
         votes = self.votes
         counts: dict[int, int] = {}
         for vote in votes:
@@ -146,7 +149,7 @@ class Voter:
 
 
 def _surely_aged(ages: list[float]) -> bool:
-    """Return whether sorted ages leave no doubt which edge was before, with few votes."""
+    """Return whether sorted ages of few votes leave no doubt about the edge before them."""
     if ages[0] >= YOUNG_AGE_S:
         return ages[-1] <= SURE_AGE_S
     return ages[0] >= LEAST_AGE_S and ages[-1] - ages[0] <= YOUNG_SPREAD_S
@@ -156,16 +159,17 @@ class Labeller:
     """The voters of one edge train and the label they gave it."""
 
     def __init__(self, *, keep_votes: bool = False) -> None:
-        """keep_votes: all votes are remembered, for `swath.georef.timescales.settling`."""
+        """Prepare a labeller; keep_votes: remember all votes, for `swath.georef.timescales.settling`."""
         self.voters: dict[VoterKey, Voter] = {}
         self.history: list[PastVote] = []
         self._keep_votes = keep_votes
-        self._counts: dict[VoterKey, Counter[tuple[int, bool]]] = {}  # votes by offset and whether a leap count is said
+        # votes by offset and whether a receiver gave the leap count
+        self._counts: dict[VoterKey, Counter[tuple[int, bool]]] = {}
         self.label: int | None = None  # GPS second of edge 0
         self.verdict = Verdict()
-        self.basis = Verdict()  # the verdict that gave the label
+        self.basis = Verdict()  # the verdict behind the label
         self.conflict = ""
-        self._late_votes: dict[int, int] = {}  # offset: the last edge a message named just before the next one
+        self._late_votes: dict[int, int] = {}  # by offset: the last edge that a message named just before the next one
 
     def vote(self, key: VoterKey, index: int, vote: Vote, host_ns: int) -> None:
         """Take one vote for edge `index` of a message that came at a host time."""
@@ -183,7 +187,7 @@ class Labeller:
                 del self._late_votes[min(self._late_votes, key=self._late_votes.__getitem__)]
 
     def shift(self, seconds: int, source: str | None = None) -> None:
-        """Move all votes that rest on a leap count no receiver had said: now one has. source: only its own votes."""
+        """Move all votes that rest on a leap count not given by a receiver, now that one has; source: only its own."""
         moves = {key for key in self.voters if key.utc and source in (None, key.source)}
         for key in moves:
             self.voters[key].shift(seconds)
@@ -196,7 +200,7 @@ class Labeller:
             self._late_votes = {offset + seconds: index for offset, index in self._late_votes.items()}
 
     def named_by(self, source: str, offset: int, *, bound: bool) -> int:
-        """Return how many votes of a source, since these edges began, were for an offset; bound: of bound messages."""
+        """Return the number of a source's votes for an offset since these edges began; bound: of bound messages."""
         return sum(
             counts[offset, said]
             for key, counts in self._counts.items()
@@ -205,7 +209,7 @@ class Labeller:
         )
 
     def decide(self, index: int, wall_offset: int | None, wall_leap: LeapTrust) -> Verdict:
-        """Return the verdict as of edge `index`; wall_offset: what a disciplined wall clock says."""
+        """Return the verdict as of edge `index`; wall_offset: the offset by a disciplined wall clock."""
         sure = [v for v in self.voters.values() if v.offset is not None and index - v.last_index <= VOTER_FORGOTTEN_S]
         bound = [v for v in sure if v.key.bound]
         if bound and all(v.offset == bound[0].offset for v in bound):
@@ -232,14 +236,12 @@ class Labeller:
         return Verdict(sure[0].offset if sure else None, doubt, late=late)
 
     def _wall_may_say(self) -> set[int]:
-        """Return offsets a wall clock may decide for: what some message said, or what it meant if it came a second
-        late.
-        """
+        """Return the offsets that a wall clock may choose: those of messages, and the next ones for late messages."""
         said = {vote.offset for voter in self.voters.values() for vote in voter.votes}
         return said | {offset + 1 for offset in said}
 
     def _somebody_else(self, sure: Voter, index: int) -> bool:
-        """Return whether a voter not yet sure last said another second: a first label waits for it."""
+        """Return whether a voter without a majority last named another second; a first label then waits for it."""
         return any(
             v.offset is None and v.votes and index - v.last_index <= MIN_VOTES and v.votes[-1].offset != sure.offset
             for v in self.voters.values()
@@ -251,7 +253,7 @@ class Labeller:
         return Verdict(voter.offset, "", basis, voter.key, leap)
 
     def _doubt(self, sure: list[Voter], bound: list[Voter], index: int) -> str:
-        """Return why the voters that are sure of their offset cannot be believed together; empty: they can."""
+        """Return why the voters with a majority are not credible together; empty if they are."""
         if not sure:
             lost = [v for v in self.voters.values() if v.undecided > VOTES and index - v.last_index <= VOTES]
             return f"{lost[0].key.source} {lost[0].key.message} keeps to no second" if lost else ""
@@ -276,10 +278,10 @@ def _moved(past: PastVote, seconds: int) -> PastVote:
 
 
 def _leap_error_s(voters: list[Voter], wall_offset: int | None) -> int:
-    """By how many seconds UTC of which no receiver has said the leap count differs from the wall clock's, if by leaps.
+    """Return the seconds by which UTC with a leap count not given by a receiver differs from the wall clock's.
 
-    One second less is a message that came late, which the wall clock decides; more than `LEAP_ERROR_S` is a wall clock
-    that is wrong.
+    Only differences that leap seconds explain count, else 0: one second less is a message that came late, which the
+    wall clock decides; more than `LEAP_ERROR_S` means a wrong wall clock.
     """
     if wall_offset is None or any(vote.leap is LeapTrust.SAID for voter in voters for vote in voter.votes):
         return 0

@@ -1,4 +1,4 @@
-"""GPS − UTC as far as anybody has said it: the receivers, a second 23:59:60 seen, the configuration, the table."""
+"""GPS − UTC from all sources: receivers, an observed second 23:59:60, the configuration, the table."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ DAYS_A_YEAR = 365.25
 
 
 class LeapSeconds(NamedTuple):
-    """A leap count, where it comes from (receiver, second_60, configured, table or guess) and how wrong a guess may be.
+    """A leap count, its origin (receiver, second_60, configured, table or guess) and the possible error of a guess.
 
-    sigma_s: one sigma of a guess; 0 of what is known.
+    sigma_s: one sigma of a guess; 0 for a known count.
     """
 
     seconds: int
@@ -33,7 +33,7 @@ class LeapSeconds(NamedTuple):
 
     @property
     def trust(self) -> LeapTrust:
-        """How far a label may rest on it. A configured count that the table contradicts is no more than a guess."""
+        """The trust that a label may place in it. A configured count that the table contradicts is only a guess."""
         if self.origin in ("receiver", "second_60"):
             return LeapTrust.SAID
         return LeapTrust.GUESSED if self.origin == "guess" else LeapTrust.ASSUMED
@@ -41,9 +41,9 @@ class LeapSeconds(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class LeapChange:
-    """A receiver said another count than the one in use (before). said_before: a receiver had said that one, too.
+    """A receiver gave another count than the one in use (before). said_before: a receiver had given that one too.
 
-    stale: no count of that date, by the table: an old one of its firmware, which holds for its own messages alone.
+    stale: by the table not a count of that date: an old one of its firmware, which holds for its own messages alone.
     """
 
     source: str
@@ -54,7 +54,7 @@ class LeapChange:
 
 
 def is_stale(seconds: int, date: dt.date) -> bool:
-    """Return True if a count cannot be right on a UTC date (or the days beside it), as far as the table tells."""
+    """Return True if a count cannot be right on a UTC date (or the days beside it), as far as the table reaches."""
     count, known = table_leap_seconds(date)
     if not known:
         return abs(seconds - count) > 1 + _years_beyond_table(date) // YEARS_A_LEAP_SECOND
@@ -66,16 +66,16 @@ def _years_beyond_table(date: dt.date) -> int:
 
 
 class LeapBook:
-    """Who said which leap count."""
+    """The leap counts given by each source."""
 
     def __init__(self, assumed: int | None) -> None:
         self.assumed = assumed
-        self._date: dt.date | None = None  # of the latest message that had one: what is assumed goes by it
+        self._date: dt.date | None = None  # of the latest dated message, for which assumed counts are valid
         self._said: dict[str, int] = {}
         self._inserted: dict[str, tuple[dt.date, int]] = {}  # source: first day of the new count, the count
 
     def on(self, source: str, date: dt.date) -> LeapSeconds:
-        """Return the count for a UTC message of a source on a date; source "": as far as anybody knows."""
+        """Return the count for a UTC message of a source on a date; source "": the best known."""
         inserted = self._inserted.get(source)
         if inserted is None and not source:
             inserted = next(iter(self._inserted.values()), None)
@@ -98,7 +98,7 @@ class LeapBook:
         return LeapSeconds(self.assumed, "guess", max(beyond_s, float(abs(self.assumed - seconds))))
 
     def guess_text(self) -> str:
-        """Return why the count in use is no more than a guess, and the remedy; empty: it is none."""
+        """Return why the count in use is only a guess, and the remedy; empty if it is known."""
         if self._date is None:
             return ""
         leap = self.on("", self._date)
@@ -114,7 +114,7 @@ class LeapBook:
         return f"the built-in leap seconds end at {LEAP_TABLE_VALID_UNTIL}, and this is {self._date}: {remedy}"
 
     def hear(self, source: str, tag: TimeTag) -> LeapChange | None:
-        """Note what a tag says about leap seconds; the change, where it differs from what was in use."""
+        """Note a tag's leap count and second 60; return the change if the count differs from the one in use."""
         if tag.scale is TimeScale.UTC and tag.date is not None and tag.time_ns >= DAY_NS:
             self._see_second_60(source, tag.date, tag.leap_seconds)
         self._note_date(tag)
@@ -134,9 +134,10 @@ class LeapBook:
         return LeapChange(source, before.seconds, said, said_before, stale)
 
     def _note_date(self, tag: TimeTag) -> None:
-        """A leap count is often said without a date (NAV-TIMELS), also in a recording of years ago."""
+        """Note a tag's date, because leap counts often lack one (NAV-TIMELS), also in recordings of years ago."""
         if tag.scale is TimeScale.GPS and tag.week is not None:
-            leap = table_leap_seconds(dt.date.max)[0]  # of years ago there were fewer: no other date but at midnight
+            # years ago there were fewer, which changes the date only near midnight
+            leap = table_leap_seconds(dt.date.max)[0]
             self._date = utc_from_gps(gps_ns_from_week(tag.week, tag.time_ns), leap)[0]
         elif tag.date is not None:
             self._date = tag.date
@@ -146,7 +147,7 @@ class LeapBook:
         return LeapSeconds(inserted[1], "second_60") if inserted else self._without_insertion(source, dt.date.max)
 
     def _see_second_60(self, source: str, date: dt.date, said: int | None) -> None:
-        """A second 23:59:60 on the last day of a month: from the next day on there is one more."""
+        """Note a second 23:59:60 on the last day of a month: from the next day on the count is larger by one."""
         next_day = date + dt.timedelta(days=1)
         if next_day.day == 1 and source not in self._inserted:
             before = said if said is not None else self._without_insertion(source, date).seconds

@@ -1,13 +1,13 @@
-"""The line through the PPS edges: phase and drift of a clock, with an honest sigma.
+"""The line through the PPS edges: phase and drift of a clock, with a realistic sigma.
 
 Edge n is expected at host time ``anchor + n·1 s + x``, and x (the phase, ns) grows by y (the drift, ns/s; positive: the
-host clock runs fast). How many past edges should count depends on the stamps' noise and on the oscillator: 50 ns stamps
-want the last 16 s, user-space stamps of 300 µs several minutes, a crystal on a temperature ramp less again. So the line
-is not fitted over one fixed window: a bank of lines with fading memory (two-state filters, each assuming another wander
-of the frequency) runs side by side and the data weigh them; what is given is their weighted mean, with the spread
-between them in its variance. Robust: an innovation beyond 3 × 1.48 MAD of the last 64 is left out. Both the stamps'
-noise and the growth of prediction errors over 16 s to 256 s are estimated from the data, starting from the priors named
-here.
+host clock runs fast). The best number of past edges depends on the stamps' noise and on the oscillator: 50 ns stamps
+need the last 16 s, user-space stamps of 300 µs several minutes, a crystal on a temperature ramp fewer again. Therefore
+the line is not fitted over one fixed window: a bank of lines with fading memory (two-state filters, each assuming
+another wander of the frequency) runs side by side and the data weight them; the result is their weighted mean, with the
+spread between them in its variance. It is robust: an innovation beyond 3 × 1.48 MAD of the last 64 is left out. Both
+the stamps' noise and the growth of prediction errors over 16 s to 256 s are estimated from the data, starting from the
+priors in this module.
 """
 
 from __future__ import annotations
@@ -30,12 +30,13 @@ NOISE_MEMORY = 128  # edges
 MAD_WINDOW = 64
 OUTLIER_MAD = 3 * 1.4826
 TRUNCATED_VARIANCE = 0.9733  # of a normal distribution cut at 3 sigma
-QUIET_EDGES, TOO_QUIET, QUIET_MARGIN = 16, 0.35, 2.0  # innovations half as large as they should be: the noise is less
-TOO_LOUD = 1.2  # median of normalised innovations, 0.67 where all is well: a first lock on edges even by chance
-OUTLIERS_IN_A_ROW = 4  # after so many they are the truth
-HORIZONS = (16, 64, 256)  # seconds over which past predictions are compared with what came
+QUIET_EDGES, TOO_QUIET, QUIET_MARGIN = 16, 0.35, 2.0  # innovations half as large as predicted: the noise is smaller
+# median of normalised innovations, 0.67 for the right noise: the first lock was on edges that were even by chance
+TOO_LOUD = 1.2
+OUTLIERS_IN_A_ROW = 4  # after this many outliers in a row they are accepted
+HORIZONS = (16, 64, 256)  # seconds over which past predictions are compared with edges
 HORIZON_MEMORY = 1200  # edges
-SETTLING_EDGES = 64  # the first predictions say nothing about later ones
+SETTLING_EDGES = 64  # the first predictions carry no information about later ones
 SHRINK_HORIZON = 64
 SHRINK_BOUND = 0.25
 WORST_ERROR = 1e3  # a squared prediction error counts up to this multiple of its variance
@@ -43,13 +44,15 @@ WORST_ERROR = 1e3  # a squared prediction error counts up to this multiple of it
 
 @dataclass(slots=True)
 class Knot:
-    """The line as it stood after one edge: enough to predict with sigma at any time after (and before) it.
+    """The line as it was after one edge: enough to predict with sigma at any time after (and before) it.
 
     Attributes:
-        index: edge number n. phase_ns, drift_ns_s: x and y there; var_*: their covariance (ns², ns²/s, ns²/s²).
+        index: edge number n.
+        phase_ns, drift_ns_s: x and y there.
+        var_phase, var_cross, var_drift: their covariance (ns², ns²/s, ns²/s²).
         wander: variance of the frequency's random walk, (ns/s)²/s.
         excess: variance (ns²) by which predictions over HORIZONS were worse than that.
-        shrink: factor (≤ 1) where they were better.
+        shrink: factor (≤ 1) if they were better.
     """
 
     index: int
@@ -63,30 +66,31 @@ class Knot:
     shrink: float = 1.0
 
     def phase_at(self, index: float) -> float:
-        """Return phase (ns) extrapolated to an edge number."""
+        """Return the phase (ns) extrapolated to an edge number."""
         return self.phase_ns + self.drift_ns_s * (index - self.index)
 
     def variance_at(self, index: float) -> float:
-        """Return variance (ns²) of that phase: as the filters predict it, and what past predictions showed beyond."""
+        """Return the variance (ns²) of that phase: as the filters predict it, plus the excess of past predictions."""
         seconds = abs(index - self.index)
         plain = self.plain_variance(seconds) * shrink_factor(self.shrink, seconds)
         return plain + excess_variance(self.excess, seconds)
 
     def plain_variance(self, seconds: float) -> float:
-        """Return variance (ns²) seconds after the knot, as the filters predict it."""
+        """Return the variance (ns²) seconds after the knot, as the filters predict it."""
         return self.var_phase + seconds * (
             2.0 * self.var_cross + seconds * (self.var_drift + self.wander * seconds / 3.0)
         )
 
 
 def shrink_factor(shrink: float, seconds: float) -> float:
-    """Return factor of the predicted variance after some seconds: 1 at the knot, `shrink` from SHRINK_HORIZON on."""
+    """Return a factor on the predicted variance after some seconds: 1 at the knot, `shrink` from SHRINK_HORIZON on."""
     return 1.0 + (shrink - 1.0) * min(seconds / SHRINK_HORIZON, 1.0)
 
 
 def excess_variance(excess: tuple[float, ...], seconds: float) -> float:
-    """Return excess variance after some seconds: linear in their cube between HORIZONS (and 0), growing with it
-    beyond.
+    """Return the excess variance after some seconds, linear in their cube between HORIZONS (and 0).
+
+    Beyond the last horizon it grows with the cube.
     """
     near_s, near = 0.0, 0.0
     for far_s, far in zip(HORIZONS, excess, strict=True):
@@ -110,9 +114,9 @@ def excess_variances(excess: NDArray[np.float64], seconds: NDArray[np.float64]) 
 
 
 class _Excess:
-    """By how much squared errors of predictions over one horizon exceed noise plus predicted variance, on average.
+    """The mean excess of squared prediction errors over noise plus predicted variance, for one horizon.
 
-    Counted only as far as it is significant (1 sigma; errors over h seconds are independent every h seconds only).
+    It counts only as far as it is significant (1 sigma; errors over h seconds are independent every h seconds only).
     """
 
     def __init__(self, horizon: int) -> None:
@@ -124,7 +128,7 @@ class _Excess:
         self._ratio = 0.0
 
     def add(self, error_ns: float, variance: float, noise: float) -> None:
-        """One prediction error, with the variance it should have had and that of the stamp it was compared with."""
+        """Take one prediction error, its predicted variance and that of the stamp it was compared with."""
         squared = min(error_ns * error_ns, WORST_ERROR * (variance + noise))
         self._count = min(self._count + 1.0, HORIZON_MEMORY)
         share = 1.0 / self._count
@@ -144,14 +148,14 @@ class _Excess:
         return max(0.0, shrunk - 0.5 * chance)
 
     def shrink(self) -> float:
-        """Measured over predicted variance, at most 1: least squares of e² = R + f·V and a prior."""
+        """Return measured over predicted variance, at most 1: least squares of e² = R + f·V and a prior."""
         prior = float(self.horizon)
         ratio = (prior + self._count * self._ratio) / (prior + self._count * self._weight)
         return min(max(ratio, SHRINK_BOUND), 1.0)
 
 
 class LineBank:
-    """The weighted bank of lines; one `update` an edge (some 20 µs)."""
+    """The weighted bank of lines; one `update` per edge (about 20 µs)."""
 
     def __init__(self, index: int, phase_ns: float, noise_ns: float) -> None:
         """Start at one edge; noise_ns is a first guess of the stamps' noise, worth eight edges."""
@@ -178,11 +182,11 @@ class LineBank:
 
     @property
     def noise_ns(self) -> float:
-        """Sigma of the stamps as the data show it."""
+        """The sigma of the stamps from the data."""
         return math.sqrt(self._noise)
 
     def update(self, index: int, phase_ns: float) -> bool:
-        """Take the edge `index` seen at phase_ns; False where it was left out as an outlier."""
+        """Take the edge `index` seen at phase_ns; return False if it was left out as an outlier."""
         knot = self.knot
         innovation = phase_ns - knot.phase_at(index)
         variance = knot.variance_at(index)
@@ -225,7 +229,7 @@ class LineBank:
         return True
 
     def _noisier(self, factor: float) -> None:
-        """The stamps' variance was this much too small, and so was all that was computed with it."""
+        """Scale up the stamps' variance, and everything computed with it, as it was too small by this factor."""
         self._noise *= factor
         for i in range(len(self._pxx)):
             self._pxx[i] *= factor
@@ -235,21 +239,22 @@ class LineBank:
         self._past[-1] = self.knot
 
     def _learn_noise(self, normalised: float, variance: float) -> None:
-        """R = E[(1 − K) e²] = R·E[e²/S]: pulled towards what the inliers show, as fast as their number allows."""
+        """Update R = E[(1 − K) e²] = R·E[e²/S] towards the inliers' value, as fast as their number allows."""
         self._noise_count = min(self._noise_count + 1.0, NOISE_MEMORY)
-        share = self._noise / (self._noise + variance)  # after a long gap an innovation says little about the stamps
+        # after a long gap an innovation carries little information about the stamps
+        share = self._noise / (self._noise + variance)
         seen = self._noise * min(normalised * normalised, 9.0) / TRUNCATED_VARIANCE
         self._noise += (seen - self._noise) * share / self._noise_count
         self._noise = max(self._noise, NOISE_FLOOR_NS**2)
 
     def _learn_excess(self, index: int, phase_ns: float) -> None:
-        """Compare this edge with what was predicted for it HORIZONS seconds ago."""
+        """Compare this edge with its predictions from HORIZONS seconds ago."""
         past = self._past
         for excess in self._excess:
             wanted = index - excess.horizon
             if wanted < self._settled_index:
                 return
-            place = max(0, len(past) - 1 - (past[-1].index - wanted))  # exact where no edge is missing, else too early
+            place = max(0, len(past) - 1 - (past[-1].index - wanted))  # exact if no edge is missing, else too early
             while place < len(past) and past[place].index < wanted:
                 place += 1
             if place < len(past) and past[place].index == wanted:
@@ -257,7 +262,7 @@ class LineBank:
                 excess.add(phase_ns - knot.phase_at(index), knot.plain_variance(excess.horizon), self._noise)
 
     def _filter(self, index: int, phase_ns: float) -> None:
-        """One step of every line in the bank, and of their weights."""
+        """Advance every line in the bank by one step, and their weights."""
         seconds = float(index - self.knot.index)
         noise = self._noise
         scores = []

@@ -1,9 +1,9 @@
 """The host's clock in GPS time: PPS edges give the fraction, time messages the second.
 
-Edges pass a gate around the line's prediction (`edge_train`), the line carries an honest sigma (`line_fit`), every
-message votes for a whole number of seconds (`labelling`). A label once accepted is held; whatever contradicts it is an
-event and COARSE, never a silent change. All times given are on one continuous host scale (CLOCK_MONOTONIC_RAW, see
-`host_timeline`).
+Edges pass a gate around the line's prediction (`edge_train`), the line has a realistic sigma (`line_fit`), every
+message votes for a whole number of seconds (`labelling`). A label once accepted is held; a contradiction raises an
+event and gives COARSE, never a silent change. All times given are on one continuous host scale (CLOCK_MONOTONIC_RAW,
+see `host_timeline`).
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ from swath.georef.timescales.leap_book import LeapBook, LeapChange, LeapSeconds,
 from swath.georef.timescales.settling import Settlement, settle
 
 DOUBT_SIGMA_NS = 1e9
-BREAK_NS = SECOND_NS // 2  # two sides further apart than this are not blended
-LONG_GAP_S = 10.0  # beyond, the errors of both sides are independent; below they are the same
+BREAK_NS = SECOND_NS // 2  # two sides farther apart than this are not blended
+LONG_GAP_S = 10.0  # beyond, the errors of both sides are independent; below they are equal
 
-WHOLE_SECOND_TOLERANCE_NS = 1_000_000  # NAV-PVT's nano of an epoch on the second is some 100 µs
+WHOLE_SECOND_TOLERANCE_NS = 1_000_000  # NAV-PVT's nano of an epoch on the second is about 100 µs
 HOLDOVER_AFTER_NS = 5_500_000_000
 LOST_SIGMA_NS = 1_000_000.0
 COARSE_FOR_NS = 60 * SECOND_NS
@@ -51,12 +51,12 @@ RECENT_EDGES = 24
 MAX_QUANTISATION_AGE_NS = 1_100_000_000
 SAME_SECOND_NS = SECOND_NS // 2
 PHASE_JUMP_NS = 1_000_000
-NAMED_WITHIN_NS = 2_500_000_000  # of an edge that was taken: one may be missing. What has ended is given no name
-OUTLIVES = 2  # edges of a train against those of an ended one whose label it contradicts
+NAMED_WITHIN_NS = 2_500_000_000  # after the last edge taken, of which one may be missing; ended trains get no name
+OUTLIVES = 2  # ratio of a train's edges to those of an ended one whose label it contradicts
 
 
 class PpsClock:
-    """Maps host time to GPS time with a sigma and a state; fed edge by edge and message by message."""
+    """Maps host time to GPS time with a sigma and a state; its input is edges and messages one by one."""
 
     def __init__(
         self,
@@ -67,10 +67,11 @@ class PpsClock:
         keep_history: bool = False,
         lost_sigma_ns: float = LOST_SIGMA_NS,
     ) -> None:
-        """assumed_leap_seconds: GPS − UTC until a receiver says. names_edge: override of what messages say themselves.
+        """Prepare a clock; delay_ns: cable and capture delay, subtracted from every edge.
 
-        delay_ns: cable and capture delay, subtracted from every edge. keep_history: one knot a second is kept for
-        post-processing; otherwise the last quarter of an hour. lost_sigma_ns: HOLDOVER ends there.
+        assumed_leap_seconds: GPS − UTC until a receiver gives it. names_edge: override of the messages' own value.
+        keep_history: one knot a second is kept for post-processing; otherwise the last quarter of an hour.
+        lost_sigma_ns: HOLDOVER ends there.
         """
         self.leaps = LeapBook(assumed_leap_seconds)
         self._names_edge = names_edge
@@ -79,7 +80,7 @@ class PpsClock:
         self._lost_sigma_ns = lost_sigma_ns
         self._train: EdgeTrain | None = None
         self._candidate: EdgeTrain | None = None
-        self._contradicted = False  # by the candidate: messages alone confirm nothing then
+        self._contradicted = False  # by the candidate; messages alone then confirm nothing
         self._former: list[EdgeTrain] = []
         self._coarse = CoarseClock()
         self._wall = WallClock()
@@ -98,7 +99,7 @@ class PpsClock:
     # ---- edges
 
     def add_edge(self, host_ns: int, sequence: int = 0) -> None:
-        """One edge at a host time. sequence (the kernel's) is not needed: the edge's place is its time."""
+        """Take one edge at a host time; the kernel's sequence is ignored, as the edge's time determines its place."""
         del sequence
         host = int(host_ns) - self._delay_ns
         if self._edges and host <= self._edges[-1] and not forget_later(self._edges, self._train, host):
@@ -122,7 +123,7 @@ class PpsClock:
         self.edges_refused[reason] = self.edges_refused.get(reason, 0) + 1
 
     def _without_quantisation(self, host_ns: int) -> int:
-        """Return the edge less the receiver's own error, where a message before it told that."""
+        """Return the edge without the receiver's own error, if a message before it gave that error."""
         told = self._quantisation
         if told is None or not 0 < host_ns - told[0] <= MAX_QUANTISATION_AGE_NS:
             return host_ns
@@ -135,7 +136,7 @@ class PpsClock:
         return host_ns - round(told[2])
 
     def _follow_candidate(self, host_ns: int) -> None:
-        """Look for a train among the edges not used, and let it replace the current one when it may."""
+        """Look for a train among the unused edges, and let it replace the current one when it may."""
         candidate = self._candidate
         if candidate is not None:
             reason = candidate.offer(host_ns)
@@ -169,7 +170,7 @@ class PpsClock:
                 self._vote(train, said)
 
     def _replace_if_labelled(self) -> None:
-        """The candidate takes over once its seconds are known and do not contradict the ones held."""
+        """Adopt the candidate once its seconds are known and do not contradict the held ones."""
         old, new = self._train, self._candidate
         if old is None or new is None:
             return
@@ -205,7 +206,7 @@ class PpsClock:
     # ---- messages
 
     def add_message(self, source: str, message: TimeMessage) -> None:
-        """One time message of a source (``gnss/rover``)."""
+        """Take one time message of a source (``gnss/rover``)."""
         if not message.valid:
             self._refuse_message("invalid")
             return
@@ -234,11 +235,11 @@ class PpsClock:
                 self._labels.decide(train, said.host_ns)
 
     def add_coarse(self, host_ns: int, gps_ns: int) -> None:
-        """Take the GPS time of a host time as from the arrival of a message: good to some 0.1 s, and no vote."""
+        """Take the GPS time of a host time like that of a message's arrival, to about 0.1 s, without a vote."""
         self._coarse.add(host_ns, gps_ns)
 
     def coarse_gps_ns(self) -> int | None:
-        """Return the GPS time of the latest message, to some 0.1 s; None: none has come."""
+        """Return the GPS time of the latest message, to about 0.1 s; None before the first."""
         last, offset = self._coarse.last_host_ns, self._coarse.offset_ns()
         return None if last is None or offset is None else last + offset
 
@@ -246,8 +247,9 @@ class PpsClock:
         self.messages_refused[reason] = self.messages_refused.get(reason, 0) + 1
 
     def _place(self, source: str, tag: TimeTag, host_ns: int) -> tuple[int, LeapTrust] | None:
-        """Return GPS ns of a tag and the trust in its leap count; by what is known so far where it lacks week or
-        date.
+        """Return GPS ns of a tag and the trust in its leap count; None if it cannot be placed.
+
+        A tag without week or date is completed by the time known so far.
         """
         if tag.scale is TimeScale.GPS and tag.week is not None:
             return whole_gps_ns(tag, None) or 0, LeapTrust.SAID
@@ -270,7 +272,7 @@ class PpsClock:
         return None if gps is None else (gps, leap.trust)
 
     def _best_guess(self, host_ns: int) -> int | None:
-        """Return GPS ns at a host time by the best there is, without regard to its quality."""
+        """Return the best available GPS ns at a host time, whatever its quality."""
         train = self._train
         if train is not None and train.labeller.label is not None:
             return round(_gps_float(train, host_ns) * 1e6) * 1000
@@ -278,7 +280,7 @@ class PpsClock:
         return None if offset is None else host_ns + offset
 
     def _note_quantisation(self, message: TimeMessage, second: int, names_next: bool) -> None:
-        """Keep the error of the edge to come; correct the edge just taken."""
+        """Keep the error of the next edge, or correct the edge just taken."""
         if message.quantisation_ns == 0.0:
             return
         if names_next:
@@ -289,10 +291,10 @@ class PpsClock:
             train.amend_last(-message.quantisation_ns)
 
     def _vote(self, train: EdgeTrain, said: Said) -> bool:
-        """Let a message vote. Which edges surround it follows from the line, not from what came first.
+        """Let a message vote; the line, not the order of arrival, decides between which edges it lies.
 
-        A receiver may pulse anywhere before it knows the time, and move its pulses when it does: a line whose edges
-        have ended is no ground to name a second on.
+        A receiver may pulse at any phase before it knows the time, and move its pulses afterwards: a line whose edges
+        have ended must not name a second.
         """
         if train.labeller.label is None and said.host_ns - train.last_host_ns > NAMED_WITHIN_NS:
             return False
@@ -305,7 +307,7 @@ class PpsClock:
         return True
 
     def _leap_changed(self, host_ns: int, change: LeapChange) -> None:
-        """A receiver says another leap count: what rested on the assumed one moves, in one logged step."""
+        """Move everything that rests on an assumed leap count, in one logged step, as a receiver has given another."""
         text = f"{change.source} says GPS − UTC is {change.now} s, in use was {change.before} s"
         if change.stale:
             text += "; no count of this date: it holds for this receiver's own messages alone"
@@ -332,9 +334,9 @@ class PpsClock:
         return any(not said.key.utc for said in self._messages)
 
     def settle(self) -> list[str]:
-        """Take the second that most messages of the whole log name; lines for the user where others were named.
+        """Adopt the second that most messages of the whole log name; return lines for the user if others were named.
 
-        For clocks with ``keep_history``, after everything has been fed.
+        It is for clocks with ``keep_history``, after all input.
         """
         self._settlement = settle(self._trains())
         if self._settlement.conflict and self._train is not None:
@@ -342,20 +344,20 @@ class PpsClock:
         return self._settlement.lines
 
     def tag_error_s(self, source: str, host_ns: Int64Array, *, utc: bool) -> Int64Array:
-        """By how many seconds (n,) tags of a source that arrived at host times (n,) are ahead, as `settle` found."""
+        """Return the seconds (n,) by which a source's tags that arrived at host times (n,) are ahead, from `settle`."""
         errors = self._settlement.errors.get((source, utc))
         return np.zeros(len(host_ns), np.int64) if errors is None else errors.at(host_ns)
 
     # ---- wall clock
 
     def set_wall_clock(self, host_ns: int, realtime_ns: int, *, disciplined: bool, sigma_s: float) -> None:
-        """One reading of CLOCK_REALTIME beside the host scale; decides between seconds where disciplined and steady."""
+        """Take one reading of CLOCK_REALTIME on the host scale; a disciplined, steady one decides between seconds."""
         self._wall.set(host_ns, realtime_ns, disciplined, sigma_s)
 
     # ---- answers
 
     def status(self, host_ns: int) -> ClockStatus:
-        """State, sigma and counts at a host time."""
+        """Return state, sigma and counts at a host time."""
         state, offset, sigma = self._state(host_ns)
         train = self._train
         verdict = train.labeller.basis if train is not None else Verdict()
@@ -376,7 +378,7 @@ class PpsClock:
         )
 
     def _state(self, host_ns: int) -> tuple[TimeState, int | None, float]:
-        """State, GPS − host and sigma at a host time."""
+        """Return state, GPS − host and sigma at a host time."""
         train = self._train
         if train is not None and train.labeller.label is not None and not train.doubtful:
             gps_ns, sigma_ns = self._gps_at(train, host_ns)
@@ -408,10 +410,9 @@ class PpsClock:
         return TimeState.LOST, offset, sigma + 1e-4 * (host_ns - last)
 
     def gps_from_host(self, host_ns: Int64Array) -> tuple[Int64Array, NDArray[np.float64]]:
-        """Return GPS ns (n,) and sigma ns (n,) of host times (n,): by the line forward, between knots where later ones
-        exist.
+        """Return GPS ns (n,) and sigma ns (n,) of host times (n,), by the line forward, or between knots.
 
-        Without time the sigma is inf and the GPS time 0.
+        Knots on both sides are used where later ones exist. Without time the sigma is inf and the GPS time 0.
         """
         host = np.atleast_1d(np.asarray(host_ns, dtype=np.int64))
         if not host.size:
@@ -424,14 +425,14 @@ class PpsClock:
         return host + offset, np.full(host.shape, sigma)
 
     def leap_seconds_at(self, gps_ns: int) -> int:
-        """Return GPS − UTC as far as known, for labelling UTC stamps of devices that say no leap count themselves."""
+        """Return the best known GPS − UTC, for UTC stamps of devices that give no leap count themselves."""
         return self.leaps.on("", utc_from_gps(gps_ns, 18)[0]).seconds
 
     def _trains(self) -> list[EdgeTrain]:
         return [*self._former, self._train] if self._train is not None else []
 
     def _gps_at(self, train: EdgeTrain, host_ns: int) -> tuple[int, float]:
-        """Return GPS ns and sigma at one host time; quick from the last knot on, where live use asks."""
+        """Return GPS ns and sigma at one host time; this is quick after the last knot, as in live use."""
         if host_ns >= train.last_knot_ns and not train.doubtful:
             return train.gps_ns_at(host_ns), train.sigma_at(host_ns)
         gps, sigma = self._by_trains(np.array([host_ns], dtype=np.int64))
@@ -441,7 +442,7 @@ class PpsClock:
         return gps_of_trains([train for train in self._trains() if train.labeller.label is not None], host)
 
     def drain_events(self) -> list[ClockEvent]:
-        """Return what happened since the last call."""
+        """Return the events since the last call."""
         return self._events.drain()
 
 
@@ -498,7 +499,7 @@ def _blend(
     gps: Int64Array,
     sigma: NDArray[np.float64],
 ) -> None:
-    """Between two knots go over from the left one's line to the right one's, in place."""
+    """Change over from the left knot's line to the right knot's between two knots, in place."""
     k, host = left[inside], host_ns[inside]
     back = table.seconds_from(k + 1, host)
     from_right = np.rint(back * SECOND_NS).astype(np.int64) + knot_gps[k + 1]

@@ -1,8 +1,8 @@
-"""The second after the flight: what most messages of the whole log name, in place of what was named first.
+"""Settle the second after the flight: most messages of the whole log decide, instead of the first ones.
 
-In flight a label can only be held or moved by what has come so far. With the whole log every kind of message has its
-majority; where all kinds agree on one second, that one is taken, and where a receiver named another for a while (UTC
-by a stale leap count, wrong seconds after a cold start), those of its tags are set right by the difference.
+In flight only past messages can hold or move a label. With the whole log every kind of message has its majority; if all
+kinds agree on one second, that one is adopted, and if a receiver named another for a while (UTC by a stale leap count,
+wrong seconds after a cold start), those of its tags are corrected by the difference.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from swath.georef.timescales.edge_train import EdgeTrain
 from swath.georef.timescales.gps_time import SECOND_NS
 from swath.georef.timescales.labelling import LATE_AGE_S, MIN_VOTES, VOTES, LeapTrust, VoterKey
 
-JOINED_WITHIN = 0.25  # of a second: trains further from whole seconds of each other were pulses of another phase
-TAG_REACH_NS = 2 * SECOND_NS  # a tag belongs to the vote that arrived nearest to it, so near
-SURE_SHARE = 0.75  # of messages that name one second: fewer may be the wrong ones, as where a leap count comes late
+JOINED_WITHIN = 0.25  # of a second: trains farther from whole seconds of each other had pulses of another phase
+TAG_REACH_NS = 2 * SECOND_NS  # greatest distance of a tag from the vote nearest in arrival
+SURE_SHARE = 0.75  # of messages that name one second: a smaller majority may be wrong, as with a late leap count
 
 
 @dataclass(slots=True)
 class TagErrors:
-    """By how many seconds a source's tags of one scale were off, vote by vote.
+    """The errors of a source's tags of one scale in seconds, vote by vote.
 
     host_ns: (n,) arrivals, rising. error_s: (n,) whole seconds, positive: the tags are ahead.
     """
@@ -46,10 +46,10 @@ class TagErrors:
 
 @dataclass(slots=True)
 class Settlement:
-    """What the whole log says.
+    """The result from the whole log.
 
-    lines: for the user, each with the source. errors: of tags, by source and whether they are UTC.
-    conflict: why the second cannot be settled; empty: it is.
+    lines: for the user, each with the source. errors: of tags, by source and whether they are UTC. conflict: why the
+    second cannot be settled; empty if it is.
     """
 
     lines: list[str] = field(default_factory=list)
@@ -59,7 +59,7 @@ class Settlement:
 
 @dataclass(slots=True)
 class _Named:
-    """All votes of one kind of message, as offsets of the reference train, single stalls smoothed out."""
+    """All votes of one kind of message, as offsets of the reference train, with single stalls smoothed out."""
 
     host_ns: Int64Array
     offset: Int64Array
@@ -67,7 +67,10 @@ class _Named:
     guessed: NDArray[np.bool_]
 
     def majority(self) -> int | None:
-        """Return the offset that more than half of the messages name, not late and by a leap count that is known."""
+        """Return the offset that most of the messages name; None without a majority that is punctual and certain.
+
+        A majority is more than half; certain means that its leap count is known.
+        """
         counts = Counter(self.offset.tolist())
         offset, count = counts.most_common(1)[0]
         mine = self.offset == offset
@@ -77,10 +80,10 @@ class _Named:
 
 
 def settle(trains: Sequence[EdgeTrain]) -> Settlement:
-    """Give all trains whose edges go on from each other the second that most messages name.
+    """Give all trains with continuous seconds the second that most messages name.
 
-    Nothing is changed where a wall clock named the second, where no train has one, or where kinds of messages
-    contradict each other; in the last case all trains are doubtful from then on.
+    Nothing changes if a wall clock named the second, if no train has one, or if kinds of messages contradict each
+    other; in the last case all trains become doubtful.
     """
     found = Settlement()
     labelled = [train for train in trains if train.labeller.label is not None]
@@ -109,7 +112,7 @@ def settle(trains: Sequence[EdgeTrain]) -> Settlement:
 
 
 def _joined(trains: Sequence[EdgeTrain]) -> dict[EdgeTrain, int]:
-    """Return trains whose seconds go on from the one with most votes, and what brings their offsets to its own."""
+    """Return the trains whose seconds are continuous with the one with most votes, and their shifts to its offsets."""
     reference = max(trains, key=lambda train: len(train.labeller.history))
     shifts: dict[EdgeTrain, int] = {}
     for train in trains:
@@ -138,7 +141,7 @@ def _named(joined: dict[EdgeTrain, int]) -> dict[VoterKey, _Named]:
 
 
 def _smoothed(offset: Int64Array) -> Int64Array:
-    """Return the median of each value's neighbours (n,): stalled messages go, steps stay where they are."""
+    """Return the median of each value's neighbours (n,): it removes stalled messages and keeps steps in place."""
     half = min(VOTES // 2, (len(offset) - 1) // 2)
     padded = np.pad(offset, half, mode="reflect")
     windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1)
@@ -147,7 +150,7 @@ def _smoothed(offset: Int64Array) -> Int64Array:
 
 
 def _tell(found: Settlement, named: dict[VoterKey, _Named], winner: int) -> None:
-    """Keep the errors of tags, and a line of each source that named other seconds too."""
+    """Record the errors of tags, and a line for each source that named other seconds too."""
     widest: dict[tuple[str, bool], _Named] = {}
     for key, one in named.items():
         place = (key.source, key.utc)

@@ -1,9 +1,9 @@
-"""What a scanner's own stamps count from, where it says nothing of its lock: found by their arrival, or configured.
+"""Find the origin of a scanner's own stamps, if it does not report its lock: by their arrival, or as configured.
 
-A head that is set by PTP stamps nanoseconds since 1970 in TAI or UTC; a Velodyne that is locked stamps the time past
-the UTC hour, whether or not its position packets are recorded. Such stamps stand a constant from GPS time, that of
-their arrival less some milliseconds. A counter that runs from power-on stands within a tenth of a second of the UTC
-hour once in 36 000, and of TAI since 1970 never. Only the whole seconds are taken from the arrival; the fraction is the
+A head set by PTP stamps nanoseconds since 1970 in TAI or UTC; a locked Velodyne stamps the time past the UTC hour,
+whether or not its position packets are recorded. Such stamps differ from GPS time by a constant, and from their arrival
+by some milliseconds. A counter that runs from power-on is within a tenth of a second of the UTC hour once in 36 000
+cases, and never within that of TAI since 1970. Only the whole seconds come from the arrival; the fraction is the
 head's.
 """
 
@@ -19,20 +19,23 @@ from swath.georef.records import Int64Array
 from swath.georef.timescales.gps_time import GPS_EPOCH_UNIX_S, HOUR_NS, SECOND_NS
 
 TAI_MINUS_GPS_S = 19  # since 1980, by definition
-ABSOLUTE_FROM_NS = 1_000_000_000 * SECOND_NS  # from 2001-09-09 on: counted from 1970; a counter takes 30 years there
-LEAST_SPAN_S = 1.0  # of stamps: where they stand is no chance after one second; how they drift is said from five on
+# from 2001-09-09 on: counted from 1970; a counter needs 30 years to get there
+ABSOLUTE_FROM_NS = 1_000_000_000 * SECOND_NS
+# minimum span of stamps: after one second their origin is not chance; their drift is given from five on
+LEAST_SPAN_S = 1.0
 LEAST_SECONDS = 5
-GREATEST_LATENCY_NS = 100_000_000  # of the quickest datagram of a second
-AHEAD_NS = 5_000_000  # a datagram cannot come before its pulse; the host's clock may be that wrong
-LOCKED_SIGMA_NS = 20_000.0  # makers say 10 µs to 50 µs of a head locked to PPS; PTP is better
-GREATEST_DRIFT_NS = 2_000_000.0  # over the log, of the head's stamps against GPS time: more is a head that runs free
+GREATEST_LATENCY_NS = 100_000_000  # greatest latency of the quickest datagram of a second
+AHEAD_NS = 5_000_000  # a datagram cannot come before its pulse, but the host's clock may have this error
+LOCKED_SIGMA_NS = 20_000.0  # makers state 10 µs to 50 µs for a head locked to PPS; PTP is better
+# over the log, of the head's stamps against GPS time: a greater drift means a free-running head
+GREATEST_DRIFT_NS = 2_000_000.0
 SIGMAS = 3.0
 
 
 class StampScale(StrEnum):
-    """What stamps count from."""
+    """The origin from which stamps count."""
 
-    AUTO = "auto"  # configured: to be found
+    AUTO = "auto"  # in the configuration: the origin is to be found
     FREE = "free"
     HOUR = "utc-hour"
     TAI = "ptp-tai"
@@ -41,10 +44,10 @@ class StampScale(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Stamps:
-    """What a head's stamps were found, or are configured, to be.
+    """The origin of a head's stamps, found or configured.
 
-    offset_ns: GPS time less stamp, of absolute stamps. sigma_ns: of one stamp. text: why, with the figures.
-    brief: they are of less than a second, before the head itself said what they are.
+    offset_ns: GPS time less stamp, of absolute stamps. sigma_ns: of one stamp. text: the reason, with figures. brief:
+    they cover less than a second, before the head itself reports its origin.
     """
 
     scale: StampScale
@@ -63,15 +66,15 @@ def judge(
     past_hour: bool,
     wanted: StampScale = StampScale.AUTO,
 ) -> Stamps | None:
-    """Return what stamps count from; None: too few of them, or no time beside them.
+    """Return the origin of stamps; None if there are too few of them, or without a time beside them.
 
     Args:
         device_ns: (n,) stamps.
         near_gps_ns: (n,) GPS time of their arrival.
         near_sigma_ns: (n,) its sigma.
         leap_seconds: GPS − UTC there.
-        past_hour: the head stamps the time past the hour while locked.
-        wanted: what is configured; AUTO: to be found.
+        past_hour: whether the head stamps the time past the hour while locked.
+        wanted: the configured origin; AUTO: to be found.
     """
     if wanted is StampScale.FREE:
         return Stamps(StampScale.FREE, "configured so")
@@ -100,7 +103,7 @@ def judge(
 
 
 def _quickest(near: Int64Array, ahead: Int64Array) -> tuple[Int64Array, Int64Array]:
-    """Return GPS time and stamp less arrival of the least delayed datagram of each second."""
+    """Return GPS time, and stamp less arrival, of the least delayed datagram of each second."""
     second = near // SECOND_NS
     order = np.lexsort((ahead, second))
     last = np.append(np.flatnonzero(np.diff(second[order])), len(order) - 1)
@@ -124,10 +127,10 @@ def _of_hour(at: Int64Array, quickest: Int64Array, slack_ns: float, wanted: Stam
 def _absolute(at: Int64Array, quickest: Int64Array, slack_ns: float, leap_seconds: int, wanted: StampScale) -> Stamps:
     names = {TAI_MINUS_GPS_S: StampScale.TAI, -leap_seconds: StampScale.UTC}
     latest_ns = int(np.median(quickest))
-    whole_s = -(-(latest_ns - AHEAD_NS) // SECOND_NS)  # the stamps' second; they come some ms before their arrival
+    whole_s = -(-(latest_ns - AHEAD_NS) // SECOND_NS)  # the stamps' second; they precede their arrival by some ms
     nearest = min(names, key=lambda count: abs(count * SECOND_NS - latest_ns))
     if abs(nearest * SECOND_NS - latest_ns) <= GREATEST_LATENCY_NS + slack_ns:
-        whole_s = nearest  # a coarse host clock does not say the second better than the scale does
+        whole_s = nearest  # a coarse host clock determines the second no better than the scale does
     beside = quickest - whole_s * SECOND_NS
     drift_ns, why = _drift(at, quickest, slack_ns)
     offset_ns = -(GPS_EPOCH_UNIX_S + whole_s) * SECOND_NS
@@ -152,9 +155,9 @@ def _absolute(at: Int64Array, quickest: Int64Array, slack_ns: float, leap_second
 
 
 def _drift(at: Int64Array, quickest: Int64Array, slack_ns: float) -> tuple[float, str]:
-    """Return by how much stamps drift against GPS time over the log, ns, as far as it is no chance; and that in words.
+    """Return the significant drift of stamps against GPS time over the log, ns, and its description.
 
-    A host that no edges keep drifts itself: then nothing is said of the head's.
+    A host without edges drifts itself, so that the head's drift is then not determined.
     """
     span_s = float(at.max() - at.min()) / SECOND_NS
     x = (at - at.min()).astype(np.float64) / SECOND_NS - span_s / 2

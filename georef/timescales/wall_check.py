@@ -1,6 +1,6 @@
 """Compare a receiver's time with the clock of the computer that recorded it: a time zone off, or days.
 
-Nothing is decided by it, and a receiver's time is taken as it says it: the computer's clock may be the wrong one.
+The result decides nothing, and a receiver's time is used unchanged: the computer's clock may be the wrong one.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from swath.georef.timescales.gps_time import (
 )
 
 LEAST_MESSAGES = 10
-LIVE_MESSAGES = 60  # of which a growing comparison judges
-ALIKE_S = 2.0  # messages come late by less than this …
-ALIKE_SHARE = 0.8  # … or so many of them do
-APART_S = 30.0  # less is lateness, or leap seconds, which are judged elsewhere
+LIVE_MESSAGES = 60  # number of messages in a comparison during recording
+ALIKE_S = 2.0  # messages' delays differ by less than this …
+ALIKE_SHARE = 0.8  # … for at least this share of them
+APART_S = 30.0  # smaller differences are delays, or leap seconds, which other modules judge
 ZONES_S = 14 * 3600.0  # the farthest time zone from UTC
 HALF_HOUR_S = 1800.0
-ROUND_WITHIN_S = 60.0  # of whole half hours or days: a clock that nobody keeps, but that was set
+ROUND_WITHIN_S = 60.0  # tolerance from whole half hours or days, for a clock that was set but is not disciplined
 DAY_S = 86_400.0
 
 
 def ahead_s(tag: TimeTag, wall_ns: int) -> float | None:
-    """Return by how many seconds a device's time is ahead of a wall clock (Unix ns); None where it cannot be placed.
+    """Return the seconds by which a device's time is ahead of a wall clock (Unix ns); None if it cannot be placed.
 
     A time of day or of week alone is taken as the nearest such time.
     """
@@ -49,11 +49,12 @@ def ahead_s(tag: TimeTag, wall_ns: int) -> float | None:
 
 
 def distance_text(ahead: float, *, kept: bool, clock: str) -> str:
-    """Return what a difference means and its remedy, for the user; empty where it is none, or says nothing.
+    """Return the meaning of a difference and its remedy, for the user; empty if it is negligible or meaningless.
 
     Args:
         ahead: s, of the receiver's time against the computer's clock.
-        kept: somebody (chrony) keeps that clock. One that nobody keeps says something by whole half hours or days only.
+        kept: whether the clock is disciplined (chrony). Another clock's difference means something only at whole half
+            hours or days.
         clock: its name, as ``this computer's clock``.
     """
     size = abs(ahead)
@@ -79,11 +80,11 @@ def _is_round(size_s: float, unit_s: float) -> bool:
 
 
 class WallComparison:
-    """Collects by how much receivers' times and the computer's clock differ.
+    """Collects the differences between receivers' times and the computer's clock.
 
     Args:
         clock: name of the computer's clock, for the user.
-        whole_log: all messages count, not the latest alone.
+        whole_log: whether all messages count, instead of the latest alone.
     """
 
     def __init__(self, clock: str, *, whole_log: bool = False) -> None:
@@ -91,10 +92,10 @@ class WallComparison:
         self._length = None if whole_log else LIVE_MESSAGES
         self._step_ns = 0
         self._kept = False
-        self._heard: dict[str, deque[tuple[float, bool]]] = {}  # s ahead, whether the clock was kept
+        self._heard: dict[str, deque[tuple[float, bool]]] = {}  # s ahead, whether the clock was disciplined
 
     def set_wall(self, step_ns: int, *, kept: bool) -> None:
-        """Take a reading of the wall clock: its step against host time since the session began, whether it is kept."""
+        """Take a reading of the wall clock: its step against host time since the session began, and its discipline."""
         self._step_ns, self._kept = step_ns, kept
 
     def hear(self, source: str, message: TimeMessage) -> None:
@@ -106,7 +107,7 @@ class WallComparison:
             self._heard.setdefault(source, deque(maxlen=self._length)).append((ahead, self._kept))
 
     def verdict(self, source: str) -> str:
-        """Return what a receiver's difference means, see `distance_text`; empty where there is none, or no one yet."""
+        """Return the meaning of a receiver's difference, see `distance_text`; empty if it is negligible or unknown."""
         heard = self._heard.get(source, ())
         by_kept = [ahead for ahead, kept in heard if kept]
         kept = len(by_kept) >= LEAST_MESSAGES
@@ -119,5 +120,5 @@ class WallComparison:
         return distance_text(middle, kept=kept, clock=self._clock)
 
     def lines(self) -> list[str]:
-        """Return a line of each receiver whose time is far from the computer's clock."""
+        """Return a line for each receiver whose time is far from the computer's clock."""
         return [f"{source}: {text}" for source in sorted(self._heard) if (text := self.verdict(source))]

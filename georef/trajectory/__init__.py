@@ -1,1 +1,1 @@
-"""Trajectories: fixed ones and those that grow."""
+"""Trajectories, both complete ones and those that grow."""

@@ -1,4 +1,4 @@
-"""A trajectory that grows: solutions of a device's own INS, as they come."""
+"""A trajectory that grows with the solutions of a device's own INS."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from swath.georef.geodesy.quaternions import rotations_between
 from swath.georef.records import INS_DTYPE, Int64Array, StructArray
 from swath.georef.trajectory.trajectory import DEFAULT_MAX_GAP_NS, Trajectory
 
-SIGMA_HOLDS_NS = 2_500_000_000  # INSPVAX says sigmas once a second beside INSPVAS, which has none
+SIGMA_HOLDS_NS = 2_500_000_000  # INSPVAX gives sigmas once a second beside INSPVAS, which has none
 FIRST_CAPACITY = 4096
 NEVER = np.iinfo(np.int64).min
 NEEDED = ("lat_rad", "lon_rad", "height_m", "roll_rad", "pitch_rad", "heading_rad")
 SIGMAS = ("position_sigma_l", "attitude_sigma_rad")
 COLUMNS = ("time_ns", "position_e", "q_e_from_b", "velocity_e", *SIGMAS)
 
-# protocol -> which status words of `INS_DTYPE` are those of a solution; rows of other protocols are all believed
+# protocol -> test of `INS_DTYPE` status words for a solution; rows of other protocols are all accepted
 SOLUTION_STATUS: dict[str, Callable[[NDArray[np.uint32]], BoolArray]] = {
     # OEM7, inertial solution status: HIGH_VARIANCE, GOOD, FREE, ALIGNMENT_COMPLETE
     "novatel": lambda status: np.isin(status, (2, 3, 6, 7)),
@@ -31,19 +31,19 @@ SOLUTION_STATUS: dict[str, Callable[[NDArray[np.uint32]], BoolArray]] = {
 
 
 class TrajectoryBuffer:
-    """Rows of `INS_DTYPE` in, trajectories out; memory only for what has not been forgotten.
+    """Takes rows of `INS_DTYPE` and returns trajectories; memory holds only epochs that are not forgotten.
 
-    An epoch that comes twice is taken once; if the second one says sigmas where the first did not, it gives them. Until
-    the next ones, and at most 2.5 s, sigmas hold for epochs that say none.
+    A repeated epoch is taken once; if only the second one has sigmas, these are used. Until the next ones, and at most
+    2.5 s, sigmas hold for epochs without them.
 
     Args:
-        protocol: of the device, ``novatel`` or ``sbf``: tells by the status word what is a solution.
+        protocol: of the device, ``novatel`` or ``sbf``: it decides which status words are solutions.
         max_gap_ns: of the trajectory.
         name: of the trajectory.
 
     Attributes:
-        counts: rows by what became of them: taken, sigmas (only these were taken), no_solution (by status),
-            not_finite, out_of_order, repeated.
+        counts: rows by fate: taken, sigmas (only these were taken), no_solution (by status), not_finite, out_of_order,
+            repeated.
     """
 
     def __init__(self, protocol: str = "", *, max_gap_ns: int = DEFAULT_MAX_GAP_NS, name: str = "INS") -> None:
@@ -54,16 +54,16 @@ class TrajectoryBuffer:
         self._columns = {column: getattr(empty, column) for column in COLUMNS}
         self._rotvec_b = np.empty((0, 3))  # of the interval that begins with the epoch
         self._begin = self._end = 0
-        self._sigma = {column: (0, np.full(3, np.nan)) for column in SIGMAS}  # the last one said, and its time
+        self._sigma = {column: (0, np.full(3, np.nan)) for column in SIGMAS}  # the last ones given, and their time
         self._newest_ns: int | None = None
 
     @property
     def covered_until_ns(self) -> int | None:
-        """GPS time of the newest epoch; None: there has been none."""
+        """The GPS time of the newest epoch; None before the first."""
         return self._newest_ns
 
     def append(self, rows: StructArray) -> None:
-        """Rows in the order in which they came, `INS_DTYPE`."""
+        """Take rows of `INS_DTYPE`, in the order in which they came."""
         rows = self._usable(rows)
         time_ns = rows["gps_ns"]
         sigmas = {column: rows[column].astype(np.float64) for column in SIGMAS}
@@ -71,7 +71,7 @@ class TrajectoryBuffer:
         repeated, late = time_ns == newest[:-1], time_ns < newest[:-1]
         gives = np.zeros(len(rows), np.bool_)
         for at in map(int, np.flatnonzero(repeated)):
-            first = int(np.searchsorted(newest, time_ns[at])) - 1  # −1: in the buffer already
+            first = int(np.searchsorted(newest, time_ns[at])) - 1  # −1: already in the buffer
             for column in SIGMAS:
                 gives[at] |= self._taken(column, sigmas[column], first, at)
         new = ~repeated & ~late
@@ -84,15 +84,15 @@ class TrajectoryBuffer:
             self._write(_trajectory_of(rows[new], *held))
 
     def snapshot(self) -> Trajectory:
-        """Return all epochs not forgotten. It shares memory with the buffer and does not change when that grows."""
+        """Return all epochs not forgotten; they share the buffer's memory, but do not change when it grows."""
         columns: dict[str, Any] = {name: values[self._begin : self._end] for name, values in self._columns.items()}
         whole = Trajectory(**columns, max_gap_ns=self._max_gap_ns, name=self._name)
-        if len(whole):  # what the trajectory would compute of all its epochs at each tick anew
+        if len(whole):  # the trajectory would otherwise compute it for all epochs at every tick
             vars(whole)["rotvec_b"] = self._rotvec_b[self._begin : self._end - 1]
         return whole
 
     def forget_before(self, gps_ns: int) -> None:
-        """Poses before gps_ns will not be asked for any more."""
+        """Drop epochs before gps_ns, as no poses there are needed any more."""
         time_ns = self._columns["time_ns"][self._begin : self._end]
         self._begin += max(0, int(np.searchsorted(time_ns, gps_ns, side="right")) - 1)
 
@@ -116,12 +116,12 @@ class TrajectoryBuffer:
         wanted = self._sigma[column][0] != self._newest_ns
         if wanted:
             self._sigma[column] = (int(self._newest_ns or 0), said[again].copy())
-            self._columns[column] = self._columns[column].copy()  # snapshots stay as they are
+            self._columns[column] = self._columns[column].copy()  # earlier snapshots must not change
             self._columns[column][self._end - 1] = said[again]
         return wanted
 
     def _held(self, column: str, time_ns: Int64Array, said: FloatArray) -> FloatArray:
-        """Return (n, 3) sigmas, those of the last epoch that said some where an epoch says none."""
+        """Return sigmas (n, 3); an epoch without them gets those of the last epoch that had some."""
         held_ns, held = self._sigma[column]
         times, values = np.r_[held_ns, time_ns], np.vstack([held, said])
         speaks = np.isfinite(values).all(axis=1)
@@ -133,7 +133,7 @@ class TrajectoryBuffer:
         return filled[1:]
 
     def _write(self, new: Trajectory) -> None:
-        """Behind what is there, in new arrays when these are full: snapshots keep the old ones."""
+        """Append epochs, in new arrays when these are full: snapshots keep the old ones."""
         end = self._end + len(new)
         if end > len(self._columns["time_ns"]):
             kept = self._end - self._begin

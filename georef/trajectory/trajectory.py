@@ -1,7 +1,7 @@
-"""Trajectory: position and attitude of the body at any time between two of its epochs.
+"""A trajectory: position and attitude of the body at any time between two of its epochs.
 
 Position is linear in e, attitude the exact slerp of q_e_from_b (Shoemake 1985): a turn of constant rate about one axis,
-which is kept as a rotation vector for each interval, so that q(share) = q0 ⊗ exp(share · rotvec_b / 2). Nothing is
+stored as a rotation vector for each interval, so that q(share) = q0 ⊗ exp(share · rotvec_b / 2). Nothing is
 extrapolated, and intervals that are too long are gaps.
 """
 
@@ -32,14 +32,14 @@ OUTSIDE, GAP = int(Fate.OUTSIDE_TRAJECTORY), int(Fate.TRAJECTORY_GAP)
 
 
 class TrajectoryError(ValueError):
-    """A trajectory, or the file of one, that cannot be what it says; one line for the user."""
+    """Raised for an invalid trajectory or trajectory file; one line for the user."""
 
 
 class TrajectoryGapError(TrajectoryError):
-    """A time at which the trajectory says nothing: in a gap between two epochs, or before or after all of them.
+    """Raised for a time without a pose: in a gap between two epochs, or before or after all of them.
 
     Attributes:
-        start_ns, end_ns: GPS time from which on and until which nothing is known of the times asked for.
+        start_ns, end_ns: GPS times between which the requested poses are unknown.
     """
 
     def __init__(self, start_ns: int, end_ns: int, what: str) -> None:
@@ -49,15 +49,16 @@ class TrajectoryGapError(TrajectoryError):
 
 
 def gps_text(gps_ns: int) -> str:
-    """Return GPS time for people: ``GPS week 2445, 561618.000 s``."""
+    """Return a GPS time as text: ``GPS week 2445, 561618.000 s``."""
     week, of_week_ns = week_from_gps(int(gps_ns))
     return f"GPS week {week}, {of_week_ns / SECOND_NS:.3f} s"
 
 
 @jit_inline
 def locate_epoch(time_ns: Int64Array, t: int, guess: int) -> int:
-    """Return the epoch at or before t, 0 … n − 2; −1 where t lies outside. ``guess``, any number, only saves the
-    search.
+    """Return the epoch at or before t, 0 … n − 2; −1 if t lies outside.
+
+    A good ``guess``, which may be any number, only saves the search.
     """
     last = len(time_ns) - 1
     if last < 1 or t < time_ns[0] or t > time_ns[last]:
@@ -81,8 +82,9 @@ def locate_epoch(time_ns: Int64Array, t: int, guess: int) -> int:
 def slerp(
     w: float, x: float, y: float, z: float, rx: float, ry: float, rz: float, share: float
 ) -> tuple[float, float, float, float]:
-    """Return (w, x, y, z) ⊗ exp(share · (rx, ry, rz) / 2): a quaternion turned on by a share of its interval's
-    rotvec_b.
+    """Return (w, x, y, z) ⊗ exp(share · (rx, ry, rz) / 2): a quaternion turned by a share of its interval's turn.
+
+    (rx, ry, rz) is the interval's rotvec_b.
     """
     half = 0.5 * share
     angle2 = half * half * (rx * rx + ry * ry + rz * rz)
@@ -126,15 +128,15 @@ def _slerp_all(q: FloatArray, rotvec_b: FloatArray, epoch: Int64Array, share: Fl
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Poses:
-    """Where the body was at n times.
+    """Poses of the body at n times.
 
     Attributes:
         position_e: (n, 3) m.
         q_e_from_b: (n, 4) scalar first.
         velocity_e: (n, 3) m/s relative to the earth.
         rate_eb_b: (n, 3) rad/s, the turn of the body relative to e, in b: that of the whole interval.
-        position_sigma_l: (n, 3) m, north, east, down; nan: unsaid.
-        attitude_sigma_rad: (n, 3) roll, pitch, heading; nan: unsaid.
+        position_sigma_l: (n, 3) m, north, east, down; nan: not given.
+        attitude_sigma_rad: (n, 3) roll, pitch, heading; nan: not given.
     """
 
     position_e: FloatArray
@@ -147,16 +149,16 @@ class Poses:
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Epochs of one trajectory; it may have none.
+    """Epochs of one trajectory, which may be empty.
 
     Attributes:
         time_ns: (n,) GPS time, strictly rising.
         position_e: (n, 3) m.
-        q_e_from_b: (n, 4) scalar first; nan where the file has positions only.
-        velocity_e: (n, 3) m/s relative to the earth; nan: unsaid, and no epoch is near that would tell it.
-        position_sigma_l: (n, 3) m, north, east, down; nan: unsaid.
-        attitude_sigma_rad: (n, 3) roll, pitch, heading; nan: unsaid.
-        max_gap_ns: intervals that are longer are gaps.
+        q_e_from_b: (n, 4) scalar first; nan if the file has positions only.
+        velocity_e: (n, 3) m/s relative to the earth; nan: not given, and no near epoch determines it.
+        position_sigma_l: (n, 3) m, north, east, down; nan: not given.
+        attitude_sigma_rad: (n, 3) roll, pitch, heading; nan: not given.
+        max_gap_ns: longer intervals are gaps.
         name: for messages and sidecars.
     """
 
@@ -170,7 +172,7 @@ class Trajectory:
     name: str = ""
 
     def __post_init__(self) -> None:
-        """TrajectoryError where times do not rise or columns differ in length."""
+        """Refuse times that do not rise, or columns that differ in length, with `TrajectoryError`."""
         for column, shape in _COLUMNS.items():
             if getattr(self, column).shape != (len(self.time_ns), *shape):
                 raise TrajectoryError(f"trajectory {self.name}: column {column} has another length than time_ns")
@@ -196,7 +198,7 @@ class Trajectory:
         max_gap_ns: int = DEFAULT_MAX_GAP_NS,
         name: str = "",
     ) -> Trajectory:
-        """Make it from columns (n,), velocity and sigmas (n, 3) as files and receivers give them; no sigmas: nan."""
+        """Make a trajectory from columns (n,), velocity and sigmas (n, 3) as files give them; without sigmas: nan."""
         lat, lon = np.asarray(lat_rad, dtype=np.float64), np.asarray(lon_rad, dtype=np.float64)
         q_e_from_l = product(about(2, lon), about(1, -lat - np.pi / 2))
         q_l_from_b = product(product(about(2, heading_rad), about(1, pitch_rad)), about(0, roll_rad))
@@ -213,28 +215,32 @@ class Trajectory:
         )
 
     def __len__(self) -> int:
-        """Number of epochs."""
+        """Return the number of epochs."""
         return len(self.time_ns)
 
     @property
     def span(self) -> tuple[int, int]:
-        """GPS time of the first and the last epoch; TrajectoryError where there is none."""
+        """The GPS time of the first and the last epoch; TrajectoryError without epochs."""
         if not len(self):
             raise TrajectoryError(f"trajectory {self.name}: has no epochs")
         return int(self.time_ns[0]), int(self.time_ns[-1])
 
     @cached_property
     def rotvec_b(self) -> FloatArray:
-        """(n − 1, 3) rotation vector of each interval in b, rad, the shorter way: q1 = q0 ⊗ exp(rotvec_b / 2)."""
+        """Rotation vectors (n − 1, 3) of the intervals in b, rad, of the shorter turn: q1 = q0 ⊗ exp(rotvec_b / 2)."""
         return rotations_between(self.q_e_from_b)
 
     @cached_property
     def has_attitude(self) -> bool:
-        """Whether all epochs have one."""
+        """True if all epochs have an attitude."""
         return bool(np.isfinite(self.q_e_from_b).all())
 
     def poses(self, time_ns: ArrayLike) -> Poses:
-        """Return poses at GPS times (n,), best in order; TrajectoryGapError where one is outside or in a gap."""
+        """Return poses at GPS times (n,), preferably in order.
+
+        Raises:
+            TrajectoryGapError: a time is outside or in a gap.
+        """
         times = np.ascontiguousarray(time_ns, dtype=np.int64)
         epoch, fate = self._located(times)
         if fate.any():
@@ -268,10 +274,10 @@ class Trajectory:
         return np.stack([self.time_ns[at], self.time_ns[at + 1]], axis=1)
 
     def with_velocities(self) -> Trajectory:
-        """Return velocities where they are unsaid: those of the way from the epoch before to the next, never over a
-        gap.
+        """Return a trajectory in which positions determine missing velocities: from the epoch before to the next.
 
-        At an epoch beside a gap, or at the ends, that of the one interval there is; an epoch alone stays without.
+        They never span a gap. At an epoch beside a gap, or at the ends, the one adjacent interval is used; an isolated
+        epoch stays without velocity.
         """
         unsaid = np.logical_or.reduce(~np.isfinite(self.velocity_e), axis=1)
         if not unsaid.any():
@@ -285,29 +291,30 @@ class Trajectory:
         return self._with(velocity_e=np.where(unsaid[:, np.newaxis], moved_e, self.velocity_e))
 
     def between(self, first_ns: int, last_ns: int) -> Trajectory:
-        """Return the epochs that poses from first_ns to last_ns need: views, one epoch beyond either end."""
+        """Return the epochs that poses from first_ns to last_ns need, as views, with one epoch beyond either end."""
         begin = max(0, int(np.searchsorted(self.time_ns, first_ns, side="right")) - 1)
         end = int(np.searchsorted(self.time_ns, last_ns, side="right")) + 1
         return self._with(**{column: getattr(self, column)[begin:end] for column in _COLUMNS})
 
     def geodetic(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return (n,) latitude, longitude, rad, ellipsoidal height, m, of the epochs."""
+        """Return latitude, longitude, rad, and ellipsoidal height, m, of the epochs, each (n,)."""
         return geodetic_from_e(self.position_e)
 
     def attitude(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return (n,) roll, pitch and heading (0 … 2π) of the epochs, rad (FORMULAS 1.4)."""
+        """Return roll, pitch and heading (0 … 2π) of the epochs, rad, each (n,) (FORMULAS 1.4)."""
         w, x, y, z = self._q_l_from_b().T
         roll = np.arctan2(2 * (y * z + w * x), 1 - 2 * (x * x + y * y))
         nose_n, nose_e, nose_d = 1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)
         return roll, np.arctan2(-nose_d, np.hypot(nose_n, nose_e)), np.arctan2(nose_e, nose_n) % (2 * np.pi)
 
     def velocity_l(self) -> FloatArray:
-        """Return (n, 3) north, east, down of the epochs, m/s."""
+        """Return velocities (n, 3) north, east, down of the epochs, m/s."""
         return rotated(conjugate(self._q_e_from_l()), self.velocity_e)
 
     def turn_rates_b(self, relative_to: Literal["e", "l", "i"] = "e") -> FloatArray:
-        """Return (n − 1, 3) mean turn rate of the body over each interval, in b, rad/s: relative to e, l or inertial
-        space.
+        """Return the body's mean turn rates (n − 1, 3) over the intervals, in b, rad/s.
+
+        They are relative to e, l or inertial space.
         """
         turned = self.rotvec_b
         if relative_to == "l":
@@ -320,10 +327,10 @@ class Trajectory:
         return rate
 
     def at_body(self, offset_b: ArrayLike) -> Trajectory:
-        """Return brought to the body's origin from a point (antenna, scanner) at offset_b (3,) from it, m in b.
+        """Return the trajectory of the body's origin from that of a point (antenna, scanner) at offset_b (3,), m in b.
 
-        The velocity loses what the turn gives that point, by the turn over the intervals beside an epoch, gaps aside;
-        an epoch alone keeps its own. The sigmas stay.
+        The velocity loses the point's velocity by the turn over the intervals beside an epoch, except gaps; an isolated
+        epoch keeps its own. The sigmas do not change.
         """
         self.require_attitude()
         offset = np.asarray(offset_b, dtype=np.float64)
@@ -340,13 +347,13 @@ class Trajectory:
         )
 
     def with_deflection(self, xi_rad: float, eta_rad: float) -> Trajectory:
-        """For roll and pitch that refer to the plumb line: turned to the ellipsoid's normal (FORMULAS 1.8)."""
+        """Turn roll and pitch that refer to the plumb line to the ellipsoid's normal (FORMULAS 1.8)."""
         plumb = quaternion_from_rot(rot_l_from_plumb(self.geodetic()[0], xi_rad, eta_rad))
         turned = product(product(self._q_e_from_l(), plumb), self._q_l_from_b())
         return self._with(q_e_from_b=_sign_continuous(turned))
 
     def require_attitude(self) -> None:
-        """TrajectoryError where an epoch has none."""
+        """Refuse a trajectory in which an epoch has no attitude, with `TrajectoryError`."""
         if not self.has_attitude:
             raise TrajectoryError(
                 f"trajectory {self.name}: has positions but no attitude; georeferencing needs roll, pitch and heading"
@@ -389,7 +396,7 @@ _COLUMNS: dict[str, tuple[int, ...]] = {
 
 
 def _sign_continuous(q: FloatArray) -> FloatArray:
-    """Return q or −q, whichever is nearer to the one before: they mean the same attitude."""
+    """Return q or −q, whichever is nearer to the one before; both are the same attitude."""
     turned = np.where((q[1:] * q[:-1]).sum(axis=1) < 0, -1.0, 1.0)
     q[1:] *= np.cumprod(turned)[:, np.newaxis]
     return q

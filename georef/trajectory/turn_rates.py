@@ -1,7 +1,7 @@
-"""Does a trajectory belong to a log? Its turn rates against those that the log's IMU felt tell how far its time is off.
+"""Find a trajectory's time error by comparing its turn rates with those that the log's IMU measured.
 
-Both are averaged over the same short steps; the normalised cross-correlation over three axes has its peak where
-the trajectory's time is right. Whole days are tried as well, so that a wrong week or seconds of the day can be named.
+Both are averaged over the same short steps; the normalised cross-correlation over three axes has its peak where the
+trajectory's time is right. Whole days are tried as well, so that a wrong week or seconds of the day can be reported.
 """
 
 from __future__ import annotations
@@ -15,26 +15,26 @@ from swath.georef.records import Int64Array
 from swath.georef.timescales.gps_time import DAY_NS, SECOND_NS, table_leap_seconds, utc_from_gps
 from swath.georef.trajectory.trajectory import Trajectory, TrajectoryError
 
-STEP_NS = 50_000_000  # aircraft turn slower than 10 Hz, their engines faster
+STEP_NS = 50_000_000  # aircraft turn at less than 10 Hz, their engines vibrate faster
 REACH_S = 20.0  # more than all leap seconds
 REACH_STEPS = round(REACH_S * SECOND_NS / STEP_NS)
 SHORTEST_NS = 30 * SECOND_NS  # of flight in common
-CERTAIN = 0.6  # correlation from which on a shift is believed
-BETTER_BY = 0.05  # than at no shift at all
-UNNOTICED_S = 0.02  # below this nothing is said to be wrong
-NEAR_S = 0.25  # to whole leap seconds
-PARABOLA_S = 5e-4  # what a parabola through three steps may be off
+CERTAIN = 0.6  # minimum correlation of a credible shift
+BETTER_BY = 0.05  # minimum gain over the correlation without a shift
+UNNOTICED_S = 0.02  # smaller shifts are not reported
+NEAR_S = 0.25  # tolerance from whole leap seconds
+PARABOLA_S = 5e-4  # error of a parabola through three steps
 
 
 @dataclass(frozen=True, slots=True)
 class TimeShift:
-    """What must be added to a trajectory's time so that it turns when the IMU does.
+    """The shift to add to a trajectory's time so that it turns when the IMU does.
 
     Attributes:
         seconds: to be added, whole days included.
-        correlation: at that shift, −1 … 1; nan where there was too little to compare.
+        correlation: at that shift, −1 … 1; nan if there was too little to compare.
         sigma: of `seconds`, s.
-        unshifted: correlation with the times as they are; nan where they have too little in common.
+        unshifted: correlation with the given times; nan if they have too little in common.
         leap_seconds: GPS − UTC at the time of the log, by the built-in table.
     """
 
@@ -46,18 +46,18 @@ class TimeShift:
 
     @property
     def is_certain(self) -> bool:
-        """Whether motion and correlation suffice to tell."""
+        """True if motion and correlation suffice for a decision."""
         return self.correlation >= CERTAIN
 
     @property
     def is_wrong(self) -> bool:
-        """Whether the trajectory's time is certainly another than the log's."""
+        """True if the trajectory's time certainly differs from the log's."""
         better = not self.correlation - self.unshifted < BETTER_BY
         return self.is_certain and better and abs(self.seconds) > max(UNNOTICED_S, 5 * self.sigma)
 
     @property
     def what(self) -> str:
-        """What is wrong, in words that go behind a file's name; empty where nothing certainly is."""
+        """The fault in words that follow a file's name; empty without a certain fault."""
         if not self.is_wrong:
             return ""
         days = round(self.seconds * SECOND_NS / DAY_NS)
@@ -79,7 +79,7 @@ class TimeShift:
 
 @dataclass(frozen=True, slots=True)
 class Turning:
-    """Mean rates over steps from a whole multiple of a step on.
+    """Mean rates over successive steps; the first begins at a whole multiple of a step.
 
     Attributes:
         first: number of the first step since the GPS epoch.
@@ -126,7 +126,7 @@ def correlate_turn_rates(trajectory: Trajectory, imu_time_ns: Int64Array, imu_ra
 
 
 def _told_near(trajectory: Trajectory, felt: Turning, coarse: int) -> Turning | None:
-    """Return what a trajectory tells, some steps away, of the time that was felt and what is looked at around it."""
+    """Return a trajectory's turning over the IMU's time and the searched reach around it, some steps away."""
     first = felt.first - REACH_STEPS - coarse
     last = felt.first + len(felt.rate_b) + REACH_STEPS - coarse
     part = trajectory.between(first * STEP_NS, last * STEP_NS)
@@ -138,9 +138,10 @@ def _told_near(trajectory: Trajectory, felt: Turning, coarse: int) -> Turning | 
 
 
 def turning(time_ns: Int64Array, rate_b: FloatArray, max_gap_ns: int, steps: tuple[int, int]) -> Turning:
-    """Of rates (n − 1, 3) over the intervals between times (n,): what was turned, at the ends of steps, differenced.
+    """Return mean rates over steps, from rates (n − 1, 3) over the intervals between times (n,).
 
-    Gaps are unknown, and so is what has no number.
+    Rates are integrated, interpolated at the ends of steps, and differenced. Gaps and values that are not numbers are
+    unknown.
     """
     first, last = steps
     since_s = (time_ns - first * STEP_NS) / SECOND_NS
@@ -160,7 +161,7 @@ def turning(time_ns: Int64Array, rate_b: FloatArray, max_gap_ns: int, steps: tup
 
 
 def _best_shift(told: Turning, felt: Turning, coarse: int) -> tuple[float, float, float, float] | None:
-    """Return seconds, correlation, sigma and the correlation at the coarse shift itself; None: too little in common."""
+    """Return seconds, correlation, sigma and the correlation at the coarse shift; None if too little is in common."""
     begin = felt.first - REACH_STEPS - told.first - coarse  # of told's rows, which may lie outside
     wanted = np.arange(begin, begin + len(felt.rate_b) + 2 * REACH_STEPS)
     there = (wanted >= 0) & (wanted < len(told.rate_b))
@@ -180,7 +181,7 @@ def _best_shift(told: Turning, felt: Turning, coarse: int) -> tuple[float, float
     residual = max(energy_told[at] + energy_felt[at] - 2.0 * product[at], 0.0) / (3.0 * common[at])
     steepness = (np.diff(rate, axis=0) ** 2).sum() / (STEP_NS / SECOND_NS) ** 2
     sigma = float(np.sqrt(residual / steepness + PARABOLA_S**2)) if steepness > 0.0 else np.inf
-    # a later row of what is told fits: what is told comes later than it should
+    # if a later row of the trajectory fits, the trajectory's time is late
     lag = REACH_STEPS - at - _peak(correlation, at)
     shift_s = (coarse + lag) * STEP_NS / SECOND_NS
     unshifted = float(correlation[REACH_STEPS]) if enough[REACH_STEPS] else float("nan")
@@ -189,14 +190,14 @@ def _best_shift(told: Turning, felt: Turning, coarse: int) -> tuple[float, float
 
 def _at_lags(a: FloatArray, b: FloatArray) -> FloatArray:
     """Return Σ a[k + j] b[j] for every k at which b lies within a."""
-    size = 1 << (len(a) - 1).bit_length()  # what wraps round does so beyond these k
+    size = 1 << (len(a) - 1).bit_length()  # the wrap-around affects only values beyond these k
     spectrum = np.fft.rfft(a, size) * np.conj(np.fft.rfft(b, size))
     sums: FloatArray = np.fft.irfft(spectrum, size)[: len(a) - len(b) + 1]
     return sums
 
 
 def _peak(values: FloatArray, at: int) -> float:
-    """Return where between the neighbours of `at` the parabola through the three has its top, −0.5 … 0.5."""
+    """Return the top of the parabola through `at` and its neighbours, relative to `at`, −0.5 … 0.5."""
     if not 0 < at < len(values) - 1:
         return 0.0
     before, top, after = values[at - 1 : at + 2]

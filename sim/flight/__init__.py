@@ -1,1 +1,1 @@
-"""The aircraft's path, speed and attitude."""
+"""The path, speed and attitude of the aircraft."""

@@ -1,4 +1,4 @@
-"""What the aircraft can do, from the keys of ``[flight]``, and the lines it can therefore not fly."""
+"""The aircraft's limits, from the keys of ``[flight]``, and checks that refuse lines beyond them."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ Ground = Callable[[FloatArray, FloatArray], FloatArray]
 
 GRAVITY_MPS2 = 9.80665
 ROLL_RATE_RADPS = math.radians(12.0)
-PULL_UP_MPS2 = 1.5  # into a climb and out of it
-SPEED_UP_MPS2 = 1.0  # in the air
-STEEPEST = 0.35  # climb over speed
+PULL_UP_MPS2 = 1.5  # vertical acceleration into a climb and out of it
+SPEED_UP_MPS2 = 1.0  # acceleration in the air
+STEEPEST = 0.35  # rate of climb divided by speed
 SMOOTHING_LEAST_S = 1.0
 
 RADIUS_MOST_M = 20_000.0
-DISTANCE_MOST_M = 100_000.0  # of anything from the origin
+DISTANCE_MOST_M = 100_000.0  # largest distance of anything from the origin
 LINE_LEAST_S = 1.0
 CLEARANCE_M = 15.0
 CLIMB_MOST_S = 1800.0
 _GROUND_STEP_M = 5.0
-_MARGIN = 0.97  # crabbing and speeding up, nose up, take a little of the lift
+_MARGIN = 0.97  # crabbing and accelerating with the nose up take a little of the lift
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,8 +38,8 @@ class Envelope:
 
     Attributes:
         flight: the plan's table.
-        smoothing_s: half of what a turn takes to begin.
-        climb_smoothing_s: half of what a climb takes to begin.
+        smoothing_s: half the time that a turn takes to begin.
+        climb_smoothing_s: half the time that a climb takes to begin.
     """
 
     flight: FlightTable
@@ -48,10 +48,10 @@ class Envelope:
 
     @classmethod
     def of(cls, tables: Tables) -> Envelope:
-        """Make it for this flight.
+        """Derive the limits from a plan's tables.
 
         Raises:
-            PlanError: leads are too short to roll into a turn, or the wind is too strong.
+            PlanError: the leads are too short to roll into a turn, or the wind is too strong.
         """
         flight = tables.flight
         refuse_wind(tables)
@@ -72,7 +72,7 @@ class Envelope:
 
     @property
     def wait_s(self) -> float:
-        """Level flight before and behind a change of height, for its smoothing to end with the turn's."""
+        """Level flight before and after a change of height, so that its smoothing ends with that of the turn."""
         return self.climb_smoothing_s - self.smoothing_s
 
     def climb_mps(self, speed_mps: float) -> float:
@@ -80,9 +80,10 @@ class Envelope:
         return min(self.flight.climb_max_mps, STEEPEST * speed_mps)
 
     def turning(self, speed_mps: float, climb_mps: float) -> Turning:
-        """Return how tightly it turns at this speed while it climbs so fast.
+        """Return how tightly the aircraft can turn at this speed while it climbs at this rate.
 
-        The wings' lift across the path, g and what leads into the climb, bears the turn: v² / R = tan(bank) · lift.
+        The wings' lift across the path carries the turn: v² / R = tan(bank) · lift. The lift is g less the acceleration
+        that leads into the climb.
 
         Raises:
             PlanError: the plan's radius is tighter than that, or the bank allows no turn of reasonable size.
@@ -103,19 +104,19 @@ class Envelope:
             raise PlanError(
                 key, f"turns of {1e-3 * radius_m:.0f} km radius; want a bank and a speed that keep it below 20 km"
             )
-        reversal = ROLL_RATE_RADPS * self.smoothing_s / (2.0 * PEAK)  # tan of the bank it can roll through twice
+        reversal = ROLL_RATE_RADPS * self.smoothing_s / (2.0 * PEAK)  # tan of the bank that it can roll through twice
         return Turning(
             radius_m, max(radius_m, speed_squared / (lift_mps2 * reversal)), 2.0 * self.smoothing_s * speed_mps
         )
 
 
 def speed_mps(flight: FlightTable, line: LineTable) -> float:
-    """Of a line over the ground."""
+    """Return the speed of a line over the ground."""
     return flight.speed_mps if line.speed_mps is None else line.speed_mps
 
 
 def refuse_wind(tables: Tables) -> None:
-    """Raises PlanError where the wind would blow the aircraft about rather than carry it."""
+    """Refuse a wind above half the speed of the slowest line with `PlanError`."""
     wind_mps = math.hypot(*tables.flight.wind_mps)
     slowest_mps = min(speed_mps(tables.flight, line) for line in tables.line)
     if wind_mps > 0.5 * slowest_mps:
@@ -126,7 +127,7 @@ def refuse_wind(tables: Tables) -> None:
 
 
 def refuse_far(key: str, point_m: list[float]) -> None:
-    """Raises PlanError where a point is not on the site."""
+    """Refuse a point that is not on the site with `PlanError`."""
     distance_m = math.hypot(*point_m)
     if distance_m > DISTANCE_MOST_M:
         raise PlanError(
@@ -137,7 +138,7 @@ def refuse_far(key: str, point_m: list[float]) -> None:
 
 
 def refuse_lines(tables: Tables, ground_m: Ground) -> None:
-    """Raises PlanError for the first line that cannot be flown for itself."""
+    """Refuse the first line that cannot be flown even alone with `PlanError`."""
     names: dict[str, int] = {}
     for i, line in enumerate(tables.line):
         key = f"line[{i}]"

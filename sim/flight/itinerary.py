@@ -12,22 +12,22 @@ from swath.sim.flight.smoothing import SPLINE_REACH, STEP_S
 from swath.sim.plan.errors import PlanError
 from swath.sim.plan.tables import GroundStart, LineTable, Tables
 
-BEFORE_S = 8.0  # in the air, to the first lead
+BEFORE_S = 8.0  # flight before the first lead when the flight starts in the air
 
 GEAR_M = 1.5  # the body's origin above the runway
 TAXI_MPS = 8.0
 TAXI_MPS2 = 1.0
 RUN_MPS2 = 2.5
-LIFT_OFF_SHARE = 0.8  # of the first line's speed
-CLIMB_OUT_M = 100.0  # above the runway, straight on
-RUNWAY_OFF_M = 10.0  # of the terrain
+LIFT_OFF_SHARE = 0.8  # lift-off speed divided by the first line's speed
+CLIMB_OUT_M = 100.0  # straight climb above the runway
+RUNWAY_OFF_M = 10.0  # largest difference between the plan's runway height and the terrain
 
 
 def route_of(tables: Tables, envelope: Envelope, ground_m: Ground) -> Route:
-    """Return where the aircraft is when, before smoothing.
+    """Return the route of the flight, before smoothing.
 
     Raises:
-        PlanError: it cannot get from one line to the next, or from the runway to the first.
+        PlanError: the aircraft cannot get from one line to the next, or from the runway to the first.
     """
     legs: list[Leg] = []
     if tables.ground is not None:
@@ -41,7 +41,7 @@ def route_of(tables: Tables, envelope: Envelope, ground_m: Ground) -> Route:
 
 
 def lines_legs(tables: Tables, index: int, envelope: Envelope, before_s: float) -> list[Leg]:
-    """Return lead, line and lead."""
+    """Return the legs of one line: lead, line and lead."""
     line = tables.line[index]
     speed, lead_s = speed_mps(tables.flight, line), tables.flight.lead_s
     start = _start_of(line)
@@ -69,11 +69,11 @@ def _pose(point_m: list[float], course_rad: float) -> Pose:
 
 
 def transit(before: Leg, behind: Leg, envelope: Envelope, key: str) -> list[Leg]:
-    """From the end of one leg to the start of another, which are straight and level; of no leg where they meet.
+    """Return the legs from the end of one leg to the start of another, both straight and level; empty if they meet.
 
-    The way is as long as the change of speed and of height needs. A climb unloads the wings: how fast it is says how
-    tightly the aircraft may turn, and how tightly it turns says how fast it must climb, so that the rate is first
-    guessed as none, then as that which follows, then as the fastest.
+    The way is as long as the change of speed and of height needs. A climb unloads the wings: the rate of climb limits
+    how tightly the aircraft may turn, and the length of the turn sets the rate at which it must climb. The rate is
+    therefore first guessed as zero, then as the rate that this way needs, then as the fastest.
     """
     speeds = before.speeds_mps[1], behind.speeds_mps[0]
     heights = before.heights_m[1], behind.heights_m[0]
@@ -105,7 +105,9 @@ def _refuse_climb(key: str, rise_m: float, climb_mps: float) -> None:
 
 
 def take_off(tables: Tables, start: GroundStart, envelope: Envelope, ground_m: Ground) -> list[Leg]:
-    """Return standing, taxiing, the take-off run, the climb straight on and level flight at the first line's speed.
+    """Return the legs of a start on the ground, from standing still to level flight at the first line's speed.
+
+    The aircraft stands, taxis, makes its take-off run and climbs straight on.
 
     Raises:
         PlanError: the runway is not on the site's ground.

@@ -2,8 +2,8 @@
 
 Between two lines the way is the shortest of Dubins' six words (L. E. Dubins, "On curves of minimal length with a
 constraint on average curvature", Am. J. Math. 79, 1957), in the closed form of A. M. Shkel and V. Lumelsky,
-"Classification of the Dubins set", Robotics and Autonomous Systems 34, 2001. Courses are clockwise from north (y of
-the site), so that their "left" is right here; a right turn has positive curvature.
+"Classification of the Dubins set", Robotics and Autonomous Systems 34, 2001. Courses are clockwise from north (y of the
+site), so that their "left" is right here; a right turn has positive curvature.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from swath.georef.arrays import FloatArray
 
 TURN = 2.0 * math.pi
-_NO_TURN_RAD = 1e-9  # an angle this little short of a whole turn is rounding
+_NO_TURN_RAD = 1e-9  # an angle that falls short of a whole turn by less is rounding
 _EXTENSIONS = 200
 
 
@@ -30,7 +30,7 @@ class Pose:
     course_rad: float
 
     def ahead(self, distance_m: float) -> Pose:
-        """So far straight on, or back."""
+        """Return the pose this far straight ahead, or back if the distance is negative."""
         return Arc(self, distance_m, 0.0).end
 
 
@@ -39,9 +39,9 @@ class Arc:
     """Part of a circle, or a straight.
 
     Attributes:
-        start: where it begins.
-        length_m: of it.
-        curvature_per_m: positive to the right, 0: straight.
+        start: pose at its beginning.
+        length_m: its length.
+        curvature_per_m: positive to the right; 0 is a straight.
     """
 
     start: Pose
@@ -49,8 +49,9 @@ class Arc:
     curvature_per_m: float
 
     def positions(self, along_m: FloatArray) -> FloatArray:
-        """Return (n, 2) east, north at distances (n,) from the start, beyond either end too: chord and half the
-        turn.
+        """Return (n, 2) east, north at distances (n,) from the start, also beyond either end.
+
+        They follow from the chord and half the turn.
         """
         half_turn = 0.5 * self.curvature_per_m * along_m
         chord_m = along_m * np.sinc(half_turn / math.pi)
@@ -61,7 +62,7 @@ class Arc:
 
     @property
     def end(self) -> Pose:
-        """Where it ends."""
+        """Pose at the end."""
         half_turn = 0.5 * self.curvature_per_m * self.length_m
         chord_m = self.length_m * (math.sin(half_turn) / half_turn if half_turn else 1.0)
         course = self.start.course_rad + half_turn
@@ -73,18 +74,18 @@ Way = tuple[Arc, ...]
 
 
 def length_m(way: Way) -> float:
-    """Of a whole way."""
+    """Return the length of a whole way."""
     return sum(arc.length_m for arc in way)
 
 
 @dataclass(frozen=True, slots=True)
 class Turning:
-    """How tightly one can turn.
+    """The tightest turns that an aircraft can fly.
 
     Attributes:
-        radius_m: of any turn.
-        reversal_radius_m: of a turn that another to the other side follows at once.
-        reversal_gap_m: straight between two opposite turns that makes them two.
+        radius_m: radius of any turn.
+        reversal_radius_m: radius of a turn that a turn to the other side follows at once.
+        reversal_gap_m: straight between two opposite turns from which on they count as separate turns.
     """
 
     radius_m: float
@@ -93,13 +94,16 @@ class Turning:
 
 
 def shortest_way(start: Pose, end: Pose, turning: Turning) -> Way:
-    """Return the shortest way from pose to pose; of no arc where both are the same."""
+    """Return the shortest way from pose to pose; it has no arc if both are the same."""
     words = _words(start, end, turning)
     return _way(start, min(words, key=lambda word: word.radius_m * sum(word.parts)))
 
 
 def way_of_length(start: Pose, end: Pose, turning: Turning, least_m: float) -> Way:
-    """Return the shortest way, made at least ``least_m`` long: by whole circles first, the rest by turning later."""
+    """Return the shortest way that is at least ``least_m`` long.
+
+    Whole circles lengthen it first; turning later adds the rest.
+    """
     shortest = shortest_way(start, end, turning)
     missing_m = least_m - length_m(shortest)
     if missing_m <= 0.0:
@@ -117,7 +121,7 @@ def way_of_length(start: Pose, end: Pose, turning: Turning, least_m: float) -> W
 
 
 def _circles(start: Pose, way: Way, turning: Turning, count: int) -> Way:
-    """Return whole circles, to the side to which the way turns next."""
+    """Return whole circles, flown to the side to which the way turns next."""
     if count == 0:
         return ()
     curvature = next((arc.curvature_per_m for arc in way if arc.curvature_per_m != 0.0), 1.0)
@@ -126,21 +130,21 @@ def _circles(start: Pose, way: Way, turning: Turning, count: int) -> Way:
 
 @dataclass(frozen=True, slots=True)
 class _Word:
-    """Three turns (1 right, 0 none, −1 left) and how long they are, in radii."""
+    """Three turns (1 right, 0 straight, −1 left) and their lengths in radii."""
 
     turns: tuple[int, int, int]
     parts: tuple[float, float, float]
     radius_m: float
 
     def fits(self, turning: Turning) -> bool:
-        """Return whether the radius is as wide as the word needs."""
+        """Return True if the radius is as wide as the word needs."""
         near = self.parts[1] * self.radius_m < turning.reversal_gap_m
         reverses = self.turns[1] != 0 or (self.turns[0] != self.turns[2] and near)
         return self.radius_m >= (turning.reversal_radius_m if reverses else turning.radius_m)
 
 
 def _words(start: Pose, end: Pose, turning: Turning) -> Iterator[_Word]:
-    """Yield all there are, each with the radii it may be flown with."""
+    """Yield all words that connect two poses, each with the radii that it may be flown with."""
     east_m, north_m = end.east_m - start.east_m, end.north_m - start.north_m
     bearing, distance_m = math.atan2(east_m, north_m), math.hypot(east_m, north_m)
     for radius_m in (turning.radius_m, turning.reversal_radius_m):
@@ -170,7 +174,7 @@ def _right_words(
 
 
 def _positive(angle_rad: float) -> float:
-    """In [0, 2π)."""
+    """Return the same angle in [0, 2π)."""
     angle_rad %= TURN
     return 0.0 if angle_rad > TURN - _NO_TURN_RAD else angle_rad
 
@@ -185,16 +189,18 @@ def _way(start: Pose, word: _Word) -> Way:
 
 @dataclass(frozen=True, slots=True)
 class Leg:
-    """A way and how it is flown: speed changes evenly in time, and so does height but for a wait at either end.
+    """A way and how it is flown.
+
+    Speed changes evenly in time. Height changes evenly too, except for a wait at either end.
 
     Attributes:
         way: at least one arc.
-        duration_s: of it.
+        duration_s: time that it takes.
         speeds_mps: over the ground at its start and end.
         heights_m: ellipsoidal, at its start and end.
-        wait_s: level flight before and behind the change of height.
-        line: index of the flight line this is, −1: none.
-        airborne: not on the ground.
+        wait_s: level flight before and after the change of height.
+        line: index of the flight line that this leg is; −1 for any other leg.
+        airborne: False on the ground.
     """
 
     way: Way
@@ -207,16 +213,16 @@ class Leg:
 
     @classmethod
     def over(cls, way: Way, speeds_mps: tuple[float, float], heights_m: tuple[float, float], line: int = -1) -> Leg:
-        """As long as those speeds need."""
+        """Make a leg whose duration follows from its speeds and the length of its way."""
         return cls(way, 2.0 * length_m(way) / sum(speeds_mps), speeds_mps, heights_m, line=line)
 
     @property
     def end(self) -> Pose:
-        """Where it ends."""
+        """Pose at the end."""
         return self.way[-1].end
 
     def sample(self, time_s: FloatArray) -> FloatArray:
-        """Return (n, 4) east, north, height, airborne (0 or 1) at times (n,) since its start."""
+        """Return (n, 4) east, north, height, airborne (0 or 1) at times (n,) since the leg's start."""
         first, last = self.speeds_mps
         along_m = first * time_s + 0.5 * (last - first) / self.duration_s * time_s**2
         starts = np.cumsum([0.0, *(arc.length_m for arc in self.way[:-1])])
@@ -230,10 +236,10 @@ class Leg:
 
 
 class Route:
-    """Legs one after the other from time 0; before the first and behind the last it goes on as they begin and end.
+    """Consecutive legs from time 0; the motion continues unchanged before the first and after the last leg.
 
     Args:
-        legs: the first and last of them straight or at rest, at constant speed and height.
+        legs: the first and the last are straight or at rest, at constant speed and height.
     """
 
     def __init__(self, legs: list[Leg]) -> None:

@@ -1,4 +1,4 @@
-"""The flown trajectory of the virtual aircraft: where its body is, how it is turned and how that changes, at any time.
+"""The flown trajectory of the virtual aircraft: position and attitude of its body and their derivatives, at any time.
 
 It is one quintic spline through positions and quaternions at even knots, four times continuously differentiable.
 Everything else follows from it exactly: velocity and acceleration as its derivatives, the angular rate from
@@ -26,11 +26,11 @@ from swath.sim.plan.plan import Plan
 from swath.sim.plan.tables import FlightTable, Tables
 from swath.sim.site import Site, geodetic_from_e, rot_e_from_ned
 
-_ROLLING_MPS = 1.0  # slower, and the runway says where the nose points
+_ROLLING_MPS = 1.0  # at lower speed the runway gives the heading
 
 
-BEYOND_S = 5.0  # the trajectory is known this long before its start and after its end
-_GUARD = 8  # knots that two splines, one upon the other, lose at either end
+BEYOND_S = 5.0  # the trajectory extends this far before its start and after its end
+_GUARD = 8  # knots that two successive splines lose at either end
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,9 +38,9 @@ class FlownLine:
     """A flight line as it was flown, without leads.
 
     Attributes:
-        index: in the plan.
-        name: of it.
-        start_s, end_s: when.
+        index: its index in the plan.
+        name: its name.
+        start_s, end_s: times at which it begins and ends.
     """
 
     index: int
@@ -51,7 +51,7 @@ class FlownLine:
 
 @dataclass(frozen=True, slots=True)
 class Poses:
-    """Where the body is: ``position_e`` (n, 3) metres ECEF, ``rot_e_from_b`` (n, 3, 3)."""
+    """Positions and attitudes of the body: ``position_e`` (n, 3) metres ECEF, ``rot_e_from_b`` (n, 3, 3)."""
 
     position_e: FloatArray
     rot_e_from_b: FloatArray
@@ -59,7 +59,7 @@ class Poses:
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """How the body moves against the earth.
+    """Motion of the body relative to the earth.
 
     Attributes:
         position_e, velocity_e, acceleration_e: (n, 3) metres and seconds, ECEF.
@@ -75,14 +75,16 @@ class Motion:
 
 
 class Trajectory:
-    """A flight from 0 to ``end_s``; all times are seconds since the plan's start, `BEYOND_S` more at either
-    end; nan beyond.
+    """A flight from 0 to ``end_s``, in seconds since the plan's start.
+
+    The trajectory extends `BEYOND_S` beyond either end and is nan farther out.
 
     Args:
-        spline: columns 0 to 2 position in e less ``origin_e``, 3 to 6 quaternion of e from b (x, y, z, w), any length.
-        origin_e: (3,) of the site.
-        lines: in order of time.
-        end_s: of the last line's lead.
+        spline: columns 0 to 2 are the position in e less ``origin_e``, columns 3 to 6 the quaternion of e from b (x, y,
+            z, w), of any length.
+        origin_e: (3,) origin of the site.
+        lines: flown lines in order of time.
+        end_s: end of the last line's lead.
     """
 
     def __init__(self, spline: BSpline, origin_e: FloatArray, lines: tuple[FlownLine, ...], end_s: float) -> None:
@@ -108,13 +110,13 @@ class Trajectory:
         return Motion(values[:, :3] + self._origin_e, slopes[:, :3], self._second(time_s), _matrices(quaternion), rate)
 
     def line_at(self, time_s: FloatArray) -> NDArray[np.int16]:
-        """Return (n,) index of the line that is flown at each time, −1: none."""
+        """Return (n,) the index of the line flown at each time; −1 off the lines."""
         place = np.searchsorted(self._bounds_s, time_s, side="right")
         indices = np.array([line.index for line in self.lines], np.int16)
         return np.where(place % 2 == 1, indices[np.minimum(place // 2, len(indices) - 1)], np.int16(-1))
 
     def geodetic(self, time_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return latitude, longitude (radians) and ellipsoidal height, (n,) each."""
+        """Return latitude, longitude (radians) and ellipsoidal height at times (n,), (n,) each."""
         return geodetic_from_e(self._spline(time_s)[:, :3] + self._origin_e)
 
     def attitude(self, time_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -127,7 +129,7 @@ class Trajectory:
         return roll, pitch, np.arctan2(rot_l_from_b[:, 1, 0], rot_l_from_b[:, 0, 0]) % (2.0 * np.pi)
 
     def velocity_l(self, time_s: FloatArray) -> FloatArray:
-        """Return (n, 3) north, east, down, m/s."""
+        """Return (n, 3) velocities north, east, down, m/s."""
         lat_rad, lon_rad, _ = self.geodetic(time_s)
         velocity: FloatArray = np.einsum("nji,nj->ni", rot_e_from_ned(lat_rad, lon_rad), self._first(time_s)[:, :3])
         return velocity
@@ -138,11 +140,12 @@ def fly(plan: Plan, site: Site, ground_m: Ground) -> Trajectory:
 
     Args:
         plan: of the flight.
-        site: at its origin.
-        ground_m: (east_m, north_m), (n,) each, to ellipsoidal heights (n,); asked along lines and at the runway.
+        site: site frame at the plan's origin.
+        ground_m: function from (east_m, north_m), (n,) each, to ellipsoidal heights (n,); called along lines and at the
+            runway.
 
     Raises:
-        PlanError: it cannot be flown.
+        PlanError: the plan cannot be flown.
     """
     tables = plan.tables
     refuse_lines(tables, ground_m)
@@ -152,7 +155,7 @@ def fly(plan: Plan, site: Site, ground_m: Ground) -> Trajectory:
     knots = np.arange(math.floor(-BEYOND_S / STEP_S) - _GUARD, math.ceil((end_s + BEYOND_S) / STEP_S) + _GUARD + 1)
     path = _smooth_path(route, envelope, knots)
     values = _values(path, tables, site, int(knots[0]))
-    if tables.ground is not None:  # equal to the last bit, whatever the libraries do with neighbours in one array
+    if tables.ground is not None:  # bit-equal at rest: libraries may treat neighbours in an array differently
         still = ~np.any(path[4:-4, :3] - path[0, :3], axis=1)
         values[still] = values[0]
     lines = tuple(
@@ -164,10 +167,10 @@ def fly(plan: Plan, site: Site, ground_m: Ground) -> Trajectory:
 
 
 def _smooth_path(route: Route, envelope: Envelope, knots: NDArray[np.int64]) -> FloatArray:
-    """Return (n, 4) east, north, height, airborne at knots (n,), smooth; where the aircraft stands, the same to the
-    last bit.
+    """Return (n, 4) smooth east, north, height, airborne at knots (n,).
 
-    Taken from the first place, so that sums of zeros are zero.
+    Where the aircraft stands, values are equal to the last bit: they are taken relative to the first place, so that
+    sums of zeros are zero.
     """
     half, climb_half = (int(s / STEP_S) for s in (envelope.smoothing_s, envelope.climb_smoothing_s))
     raw = route.sample(STEP_S * np.arange(knots[0] - climb_half, knots[-1] + climb_half + 1))
@@ -181,9 +184,9 @@ def _smooth_path(route: Route, envelope: Envelope, knots: NDArray[np.int64]) -> 
 
 
 def _values(path: FloatArray, tables: Tables, site: Site, first: int) -> FloatArray:
-    """Return (n − 8, 7) positions less the site's origin and quaternions at all knots but four at either end.
+    """Return (n − 8, 7) positions less the site's origin, and quaternions, at all knots but four at either end.
 
-    The attitude is that of the path in still air; then the air shakes both.
+    The attitude is that of the path in still air; turbulence then moves both.
     """
     flight, inner = tables.flight, slice(4, -4)
     quiet = spline_through(first, _relative_e(path[:, :3], site))
@@ -200,13 +203,13 @@ def _values(path: FloatArray, tables: Tables, site: Site, first: int) -> FloatAr
 
 
 def _relative_e(points: FloatArray, site: Site) -> FloatArray:
-    """Return (n, 3) ECEF less the site's origin of east, north and ellipsoidal height (n, 3)."""
+    """Return (n, 3) ECEF less the site's origin for east, north and ellipsoidal height (n, 3)."""
     relative: FloatArray = site.site_from_ground(points[:, 0], points[:, 1], points[:, 2]) @ site.rot_site_from_e
     return relative
 
 
 def _matrices(quaternion: FloatArray) -> FloatArray:
-    """Return (n, 3, 3) rotations of quaternions (n, 4), x, y, z, w, of any length."""
+    """Return (n, 3, 3) rotation matrices of quaternions (n, 4), x, y, z, w, of any length."""
     x, y, z, w = (quaternion * np.sqrt(2.0 / np.sum(quaternion**2, axis=1, keepdims=True))).T
     matrices = np.empty((len(quaternion), 3, 3))
     matrices[:, 0, 0], matrices[:, 0, 1], matrices[:, 0, 2] = 1.0 - y * y - z * z, x * y - z * w, x * z + y * w
@@ -218,10 +221,10 @@ def _matrices(quaternion: FloatArray) -> FloatArray:
 def coordinated(
     motion_e: tuple[FloatArray, FloatArray, FloatArray], runway_e: FloatArray, airborne: FloatArray, flight: FlightTable
 ) -> FloatArray:
-    """Return (n, 3) roll, pitch and heading, radians.
+    """Return (n, 3) roll, pitch and heading of coordinated flight, radians.
 
-    The nose points along the air's velocity in the level plane and ``pitch_deg`` above the path; the roll is that at
-    which what the body feels (acceleration in inertial space less gravity) has nothing to the side. On the ground the
+    The nose points along the air's velocity in the level plane and ``pitch_deg`` above the path. The roll is the one at
+    which the specific force (acceleration in inertial space less gravity) has no sideways component. On the ground the
     wings and the nose are level and the wheels hold the course.
 
     Args:
@@ -248,7 +251,7 @@ def coordinated(
 
 
 def quaternions_e_from_b(position_e: FloatArray, angles_rad: FloatArray) -> FloatArray:
-    """Return (n, 4) x, y, z, w of roll, pitch, heading (n, 3) at places (n, 3), without a change of sign on the way."""
+    """Return (n, 4) quaternions x, y, z, w of roll, pitch, heading (n, 3) at places (n, 3), without changes of sign."""
     lat_rad, lon_rad, _ = geodetic_from_e(position_e)
     rot_e_from_l = Rotation.from_matrix(rot_e_from_ned(lat_rad, lon_rad))
     turned = rot_e_from_l * Rotation.from_euler("ZYX", angles_rad[:, ::-1])

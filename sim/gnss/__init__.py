@@ -1,1 +1,1 @@
-"""Parts of the virtual aircraft's GNSS receiver: its errors, its messages, its serial line."""
+"""Parts of the virtual aircraft's GNSS receiver: its errors, its messages and its serial line."""

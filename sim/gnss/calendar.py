@@ -1,4 +1,4 @@
-"""The stamps of a receiver: GPS week and time of week, UTC date and time of day."""
+"""The time stamps of a receiver: GPS week and time of week, UTC date and time of day."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class Stamp:
     """A moment on a whole millisecond of GPS time.
 
     Attributes:
-        second: of the plan, where it is a whole one, else None.
+        second: second of the plan if the moment is a whole second, else None.
         week, tow_ms: full GPS week and milliseconds of it.
         date, day_ns: UTC date and nanoseconds of that day.
     """
@@ -34,13 +34,13 @@ class Stamp:
 
 @dataclass(frozen=True, slots=True)
 class Calendar:
-    """GPS time of a plan's start, and GPS − UTC."""
+    """Converts a plan's time to stamps; holds the GPS time of the plan's start, and GPS − UTC."""
 
     start_gps_ns: int
     leap_seconds: int
 
     def at(self, time_s: float) -> Stamp:
-        """Return the nearest millisecond."""
+        """Return the stamp of the millisecond nearest to a time."""
         since_ms = round(time_s * 1000.0)
         gps_ns = self.start_gps_ns + since_ms * MILLISECOND_NS
         week, tow_ns = week_from_gps(gps_ns)

@@ -1,4 +1,4 @@
-"""What a solution of each grade is worth, and what a receiver says it is worth."""
+"""Accuracies of each grade of GNSS solution, and the accuracies that a receiver reports."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from swath.georef.records import FixType
 
 Axes = tuple[float, float, float]  # north, east, down; each axis has its own draws
 
-OPTIMISM = 0.8  # sigmas that receivers report, over the true ones
+OPTIMISM = 0.8  # sigmas that receivers report, divided by the true ones
 
 
 @dataclass(frozen=True, slots=True)
 class Grade:
-    """Errors of an antenna's solutions, one sigma an axis.
+    """Errors of an antenna's solutions, one sigma for each axis.
 
     Attributes:
-        fix: its usual type.
-        white_m: from epoch to epoch.
+        fix: its usual fix type.
+        white_m: part that changes from epoch to epoch.
         slow_m: correlated parts, each with its correlation time in seconds.
-        velocity_mps: white.
-        satellites: usually in use.
-        float_s: ambiguities are not fixed for so long after an outage.
+        velocity_mps: white noise of the velocity.
+        satellites: usual number in use.
+        float_s: time after an outage during which ambiguities are not fixed.
     """
 
     fix: FixType
@@ -33,7 +33,7 @@ class Grade:
 
     @property
     def total_m(self) -> Axes:
-        """All parts together."""
+        """Sigmas of all parts of the position error together."""
         parts = (self.white_m, *(sigma for sigma, _ in self.slow_m))
         north, east, down = (sum(part[axis] ** 2 for part in parts) ** 0.5 for axis in range(3))
         return north, east, down
@@ -77,5 +77,5 @@ BASELINE_SLOW_SHARE, BASELINE_TAU_S = 0.6, 60.0  # multipath: this share of the 
 INS_POSITION_M: tuple[Axes, float] = ((0.012, 0.012, 0.020), 60.0)
 INS_VELOCITY_MPS: tuple[Axes, float] = ((0.005, 0.005, 0.005), 30.0)
 INS_ATTITUDE_DEG: tuple[Axes, float] = ((0.005, 0.005, 0.010), 120.0)  # roll, pitch, heading
-INS_COAST_S = 20.0  # without satellites: position and velocity errors have doubled
+INS_COAST_S = 20.0  # time without satellites that doubles position and velocity errors
 INS_RECOVERY_S = 3.0

@@ -1,4 +1,4 @@
-"""Gauss–Markov noise at fixed steps: row k is the same however the rows are asked for."""
+"""Gauss–Markov noise at fixed steps; row k is the same however the rows are requested."""
 
 from __future__ import annotations
 
@@ -17,14 +17,15 @@ BLOCK_ROWS = 512
 class Noise:
     """Stationary noise of m components.
 
-    Autocorrelation exp(−t/τ); ``smooth``: (1 + t/τ) exp(−t/τ), which has a derivative; τ = 0: white.
+    Its autocorrelation is exp(−t/τ); with ``smooth`` it is (1 + t/τ) exp(−t/τ), which has a derivative. With τ = 0 the
+    noise is white.
 
     Args:
-        seed, names: of its draws.
+        seed, names: names that its random numbers depend on.
         sigma: (m,) one sigma of each component.
         tau_s: correlation time τ.
-        step_s: from row to row.
-        smooth: of second order.
+        step_s: time from row to row.
+        smooth: True makes a process of second order.
     """
 
     def __init__(
@@ -48,14 +49,14 @@ class Noise:
         self._recent: dict[int, FloatArray] = {}
 
     def rows(self, first: int, count: int) -> FloatArray:
-        """Return (count, m) from row ``first`` on."""
+        """Return (count, m) rows from row ``first`` on."""
         blocks = range(first // BLOCK_ROWS, (first + max(count, 1) - 1) // BLOCK_ROWS + 1)
         rows = np.concatenate([self._block(block) for block in blocks])
         offset = first - blocks[0] * BLOCK_ROWS
         return rows[offset : offset + count]
 
     def _stationary(self) -> FloatArray:
-        """State of the filter (order, m) behind two outputs of the stationary process."""
+        """Return the filter's state (order, m) after two outputs of the stationary process."""
         newest, other = generator(self._seed, *self._names, "start").standard_normal((2, len(self._sigma)))
         if len(self._poles) == 2:
             behind: FloatArray = -self._poles[1] * newest[None, :]
@@ -65,7 +66,7 @@ class Noise:
         return np.stack([-self._poles[1] * newest - self._poles[2] * before, -self._poles[2] * newest])
 
     def _block(self, block: int) -> FloatArray:
-        """Return a block of rows; blocks ahead of it are made first where their end is not known yet."""
+        """Return a block of rows; if the state before it is unknown, make the earlier blocks first."""
         if block in self._recent:
             return self._recent[block]
         rows = np.empty(0)

@@ -21,7 +21,7 @@ POSITION_TYPES = {NONE: POSITION_NONE, SINGLE: 16, FLOAT: 34, FIXED: 50}  # SING
 INS_TYPES = {NONE: 53, SINGLE: 53, FLOAT: 55, FIXED: 56}  # INS_PSRSP, INS_RTKFLOAT, INS_RTKFIXED
 HEADING_TYPES = {NONE: POSITION_NONE, SINGLE: 50, FLOAT: 34, FIXED: 50}  # the baseline's own ambiguities
 INS_HIGH_VARIANCE, INS_SOLUTION_GOOD = 2, 3
-INS_GOOD_S = 10.0  # without satellites
+INS_GOOD_S = 10.0  # longest time without satellites for a good solution
 WGS84_DATUM = 61
 STATION = b"BASE"
 DIFFERENTIAL_AGE_S = 1.0
@@ -29,22 +29,22 @@ CLOCK_SIGMA_S = 2e-9
 
 
 class NovatelMessages:
-    """Encodes the logs of an epoch.
+    """Encodes the NovAtel logs of an epoch.
 
     Args:
         table: of the receiver.
         calendar: of the plan.
-        pulse: the edges it drives.
+        pulse: the edges that the receiver drives.
     """
 
     def __init__(self, table: GnssTable, calendar: Calendar, pulse: Pulse) -> None:
         self._calendar, self._pulse = calendar, pulse
-        self._undulation_m = float(np.float32(table.undulation_m))  # as BESTPOS has it: height + undulation stays exact
+        self._undulation_m = float(np.float32(table.undulation_m))  # BESTPOS rounds so; height + undulation stays exact
         second = table.secondary_lever_arm_m
         self._baseline_m = math.dist(second, table.lever_arm_m) if second is not None else None
 
     def epoch(self, epochs: Epochs, row: int) -> list[bytes]:
-        """Return TIME on whole seconds, BESTPOS, BESTVEL, HEADING2."""
+        """Return TIME on whole seconds, BESTPOS, BESTVEL, and HEADING2 with a second antenna."""
         stamp = self._calendar.at(float(epochs.time_s[row]))
         logs: list[tuple[str, nov.Body]] = []
         if stamp.second is not None:
@@ -55,7 +55,7 @@ class NovatelMessages:
         return [encode_log(name, body, stamp.week, stamp.tow_ms) for name, body in logs]
 
     def ins_epoch(self, ins: InsEpochs, row: int) -> list[bytes]:
-        """Return INSPVAS, and on whole seconds INSPVAX."""
+        """Return the log INSPVAS, and on whole seconds INSPVAX too."""
         stamp = self._calendar.at(float(ins.time_s[row]))
         status = INS_SOLUTION_GOOD if ins.since_update_s[row] <= INS_GOOD_S else INS_HIGH_VARIANCE
         lat, lon = math.degrees(ins.lat_rad[row]), math.degrees(ins.lon_rad[row])
@@ -74,7 +74,7 @@ class NovatelMessages:
         return logs
 
     def _time(self, time_s: float, second: int) -> nov.Time:
-        """Return the edge just past; the pulse is early by what the receiver's clock is ahead."""
+        """Return the TIME log of the edge just past; the pulse is early by the lead of the receiver's clock."""
         stamp = self._calendar.at(time_s)
         hour, minute, ms = stamp.clock
         return nov.Time(
@@ -139,7 +139,7 @@ def _velocity(epochs: Epochs, row: int) -> nov.BestVel:
 
 
 def _heading(epochs: Epochs, row: int, baseline_m: float) -> nov.Heading2:
-    """Return master and rover are the primary and the secondary antenna."""
+    """Return the HEADING2 log; master and rover are the primary and the secondary antenna."""
     fix, satellites = int(epochs.fix[row]), int(epochs.satellites[row])
     there = fix != NONE
     return nov.Heading2(
@@ -165,7 +165,7 @@ def _heading(epochs: Epochs, row: int, baseline_m: float) -> nov.Heading2:
 
 
 def _ins_sigmas(ins: InsEpochs, row: int) -> tuple[float, float, float, float, float, float, float, float, float]:
-    """Of position, velocity, and of attitude in degrees."""
+    """Return the sigmas of position, velocity, and of attitude in degrees."""
     north_m, east_m, down_m = map(float, ins.position_sigma_l[row])
     north_mps, east_mps, down_mps = map(float, ins.velocity_sigma_l[row])
     roll, pitch, heading = map(math.degrees, ins.attitude_sigma_rad[row])

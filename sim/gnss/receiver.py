@@ -1,7 +1,7 @@
-"""A GNSS receiver: what its solutions say at its epochs, and how far that is from the truth.
+"""A GNSS receiver: its solutions at its epochs, and their errors.
 
-Epochs stand at whole multiples of the interval since the plan's start. Errors are local (north, east, down); grades
-and their sizes are in `swath.sim.gnss.grades`. Without noise only what the plan scripts is left: outages and jumps.
+Epochs stand at whole multiples of the interval since the plan's start. Errors are local (north, east, down); grades and
+their sizes are in `swath.sim.gnss.grades`. Without noise only the outages and jumps that the plan scripts remain.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from swath.sim.plan.tables import GnssTable
 from swath.sim.site import e_from_geodetic, geodetic_from_e, rot_e_from_ned
 
 INS_RATE_HZ = 100
-VELOCITY_AGE_S = {"novatel": 0.05, "ubx": 0.0, "nmea": 0.0}  # velocity lags its epoch; BESTVEL says by how much
+VELOCITY_AGE_S = {"novatel": 0.05, "ubx": 0.0, "nmea": 0.0}  # velocity lags its epoch; BESTVEL reports the lag
 
 
 class BodyMotion(Protocol):
@@ -50,20 +50,21 @@ class Flown(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Epochs:
-    """Solutions of n epochs. Where ``fix`` is `FixType.NONE` there is no solution, whatever the other columns hold.
+    """Solutions of n epochs; where ``fix`` is `FixType.NONE` there is no solution, whatever the other columns hold.
 
     Attributes:
-        index: (n,) of the epoch, 0 at the plan's start.
-        time_s: (n,) of the position, seconds since the plan's start.
-        lat_rad, lon_rad, height_m: (n,) of the antenna, as solved; ellipsoidal height.
-        velocity_l: (n, 3) of the antenna, north east down, ``velocity_age_s`` (n,) before ``time_s``.
+        index: (n,) number of the epoch, 0 at the plan's start.
+        time_s: (n,) time of the position, seconds since the plan's start.
+        lat_rad, lon_rad, height_m: (n,) solved position of the antenna; ellipsoidal height.
+        velocity_l: (n, 3) velocity of the antenna, north east down, ``velocity_age_s`` (n,) before ``time_s``.
         fix: (n,) values of `FixType`.
-        satellites: (n,) in use.
+        satellites: (n,) number in use.
         position_sigma_l, velocity_sigma_l: (n, 3) as reported.
-        heading_rad, pitch_rad: (n,) direction from the primary to the secondary antenna; nan without one.
+        heading_rad, pitch_rad: (n,) direction from the primary to the secondary antenna; nan without a secondary
+            antenna.
         heading_sigma_rad, pitch_sigma_rad: (n,) as reported.
         position_error_l, velocity_error_l: (n, 3) solution minus truth, jumps included.
-        heading_error_rad, pitch_error_rad: (n,).
+        heading_error_rad, pitch_error_rad: (n,) solution minus truth.
     """
 
     index: IntArray
@@ -89,14 +90,14 @@ class Epochs:
 
 @dataclass(frozen=True, slots=True)
 class InsEpochs:
-    """Solutions of the receiver's INS at n epochs, of the body's origin.
+    """Solutions of the receiver's INS for the body's origin, at n epochs.
 
     Attributes:
-        index: (n,) of the epoch at `INS_RATE_HZ`; time_s: (n,).
+        index: (n,) number of the epoch at `INS_RATE_HZ`; time_s: (n,).
         lat_rad, lon_rad, height_m: (n,), ellipsoidal height.
         velocity_l: (n, 3) north east down.
         attitude_rad: (n, 3) roll, pitch, heading 0 … 2π.
-        fix: (n,) `FixType` of the satellites behind it.
+        fix: (n,) `FixType` of the satellite solution that the INS uses.
         since_update_s: (n,) time without satellites.
         position_sigma_l, velocity_sigma_l, attitude_sigma_rad: (n, 3) as reported.
         position_error_l, velocity_error_l, attitude_error_rad: (n, 3) solution minus truth.
@@ -120,16 +121,16 @@ class InsEpochs:
 
 
 class Receiver:
-    """A receiver with one antenna or two, and perhaps an INS of its own.
+    """A receiver with one antenna or two, and optionally an INS of its own.
 
     Args:
         table: of the plan.
         trajectory: of the body.
-        seed, name: of its errors.
-        noise: False: no errors but the jumps.
+        seed, name: names that its errors depend on.
+        noise: False leaves only the jumps as errors.
 
     Raises:
-        PlanError: the second antenna stands where the first does.
+        PlanError: both antennas are at the same place.
     """
 
     def __init__(self, table: GnssTable, trajectory: Flown, *, seed: int, name: str, noise: bool) -> None:
@@ -154,7 +155,7 @@ class Receiver:
         ]
 
     def epochs(self, first: int, count: int) -> Epochs:
-        """Return ``count`` epochs from number ``first`` on; to rounding the same ones however they are asked for."""
+        """Return ``count`` epochs from number ``first`` on; they are equal to rounding however they are requested."""
         index = np.arange(first, first + count)
         time_s = index / self.table.rate_hz
         fix = self._fix(time_s)
@@ -198,7 +199,7 @@ class Receiver:
         )
 
     def ins_epochs(self, first: int, count: int) -> InsEpochs:
-        """Return ``count`` solutions of the INS at `INS_RATE_HZ`; without satellites it goes on, and drifts."""
+        """Return ``count`` solutions of the INS at `INS_RATE_HZ`; without satellites the INS continues and drifts."""
         index = np.arange(first, first + count)
         time_s = index / INS_RATE_HZ
         drift, since_update_s = self._coasting(time_s)
@@ -230,25 +231,25 @@ class Receiver:
     # --- geometry ---
 
     def _antenna(self, motion: BodyMotion) -> tuple[FloatArray, FloatArray]:
-        """Return position (n, 3) of the primary antenna in e, axes of the local level there (n, 3, 3)."""
+        """Return the position (n, 3) of the primary antenna in e and the axes of the local level there (n, 3, 3)."""
         position_e = motion.position_e + motion.rot_e_from_b @ self._lever_arm_b
         lat_rad, lon_rad, _ = geodetic_from_e(position_e)
         return position_e, rot_e_from_ned(lat_rad, lon_rad)
 
     def _velocity_l(self, motion: BodyMotion) -> FloatArray:
-        """Return (n, 3) north east down, of the primary antenna."""
+        """Return (n, 3) velocities of the primary antenna, north east down."""
         turning_b = np.cross(motion.rate_eb_b, self._lever_arm_b)
         velocity_e = motion.velocity_e + _turned(motion.rot_e_from_b, turning_b)
         _, rot_e_from_l = self._antenna(motion)
         return _turned(rot_e_from_l.swapaxes(-1, -2), velocity_e)
 
     def _baseline_direction(self, motion: BodyMotion, rot_e_from_l: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return heading and pitch of the baseline, the secondary antenna above the primary being positive pitch."""
+        """Return heading and pitch of the baseline; pitch is positive if the secondary antenna is above the primary."""
         baseline_e = motion.rot_e_from_b @ self._baseline_b
         north, east, down = _turned(rot_e_from_l.swapaxes(-1, -2), baseline_e).T
         return np.arctan2(east, north), np.arctan2(-down, np.hypot(north, east))
 
-    # --- what the plan scripts ---
+    # --- events scripted in the plan ---
 
     def _fix(self, time_s: FloatArray) -> IntArray:
         fix = np.full(len(time_s), int(self._grade.fix))
@@ -266,8 +267,9 @@ class Receiver:
         return offset_l
 
     def _coasting(self, time_s: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return factor on the errors of the INS (n, 1), growing with the square of the time without satellites
-        (n,).
+        """Return the factor on the errors of the INS (n, 1) and the time without satellites (n,).
+
+        The factor grows with the square of that time.
         """
         drift, since_s = np.ones(len(time_s)), np.zeros(len(time_s))
         for outage in self.table.outage:
@@ -286,7 +288,7 @@ class Receiver:
         return Noise(self._seed, ("gnss", self._name, *part), size, tau_s, step_s, smooth=smooth)
 
     def _direction_sigma_rad(self) -> FloatArray:
-        """Return (2,) of heading and pitch; nan without a second antenna."""
+        """Return (2,) sigmas of heading and pitch; nan without a second antenna."""
         sigma_rad: FloatArray = np.radians(grades.BASELINE_DEG_M) / np.linalg.norm(self._baseline_b)
         return sigma_rad
 
@@ -308,7 +310,7 @@ _INS_PARTS: tuple[tuple[ArrayLike, float], ...] = (
 
 
 def _baseline_b(table: GnssTable, name: str) -> FloatArray:
-    """Return (3,) from the primary to the secondary antenna; nan without one."""
+    """Return (3,) the vector from the primary to the secondary antenna; nan without a secondary antenna."""
     if table.secondary_lever_arm_m is None:
         return np.full(3, np.nan)
     baseline_b: FloatArray = np.array(table.secondary_lever_arm_m) - np.array(table.lever_arm_m)
@@ -318,13 +320,13 @@ def _baseline_b(table: GnssTable, name: str) -> FloatArray:
 
 
 def _turned(rotations: FloatArray, vectors: FloatArray) -> FloatArray:
-    """Return (n, 3) of (n, 3, 3) times (n, 3)."""
+    """Return the products (n, 3) of matrices (n, 3, 3) and vectors (n, 3)."""
     turned: FloatArray = np.einsum("nij,nj->ni", rotations, vectors)
     return turned
 
 
 def _summed(parts: list[Noise], first: int, count: int, columns: int) -> FloatArray:
-    """Return (count, columns), zero without parts."""
+    """Return (count, columns) the sum of the parts' rows; zero without parts."""
     rows = np.zeros((count, columns))
     for part in parts:
         rows += part.rows(first, count)

@@ -24,15 +24,16 @@ UNKNOWN_COURSE_1E5_DEG = 18_000_000
 
 
 class UbxMessages:
-    """Encodes the messages of an epoch; arguments as `swath.sim.gnss.novatel.NovatelMessages`."""
+    """Encodes the UBX messages of an epoch; arguments as for `swath.sim.gnss.novatel.NovatelMessages`."""
 
     def __init__(self, table: GnssTable, calendar: Calendar, pulse: Pulse) -> None:
         self._calendar, self._pulse = calendar, pulse
         self._undulation_m = table.undulation_m
 
     def epoch(self, epochs: Epochs, row: int) -> list[bytes]:
-        """Return NAV messages of the epoch with NAV-EOE behind them; on whole seconds NAV-TIMELS and TIM-TP of the
-        next.
+        """Return the NAV messages of the epoch with NAV-EOE after them.
+
+        On whole seconds they include NAV-TIMELS, and TIM-TP of the next second follows.
         """
         time_s = float(epochs.time_s[row])
         stamp = self._calendar.at(time_s)
@@ -50,7 +51,7 @@ class UbxMessages:
         return messages
 
     def ins_epoch(self, ins: InsEpochs, row: int) -> list[bytes]:
-        """Return UBX receivers have no INS here."""
+        """Return an empty list; simulated UBX receivers have no INS."""
         return []
 
     def _timegps(self, stamp: Stamp) -> ubx.NavTimegps:
@@ -58,13 +59,13 @@ class UbxMessages:
         return ubx.NavTimegps(stamp.tow_ms, 0, stamp.week, self._calendar.leap_seconds, valid, TIME_ACCURACY_NS)
 
     def _timels(self, stamp: Stamp) -> ubx.NavTimels:
-        """No leap second is announced."""
+        """Return NAV-TIMELS without an announced leap second."""
         return ubx.NavTimels(
             stamp.tow_ms, 0, SOURCE_GPS, self._calendar.leap_seconds, SOURCE_GPS, 0, 0, 0, 0, ubx.TIMELS_CURRENT
         )
 
     def _tim_tp(self, second: int) -> ubx.TimTp:
-        """Return edge = true second − quantisation error."""
+        """Return TIM-TP of a second; edge = true second − quantisation error."""
         week, tow_ns = week_from_gps(self._calendar.start_gps_ns + second * SECOND_NS)
         quantisation_ps = round(-1e12 * self._pulse.late_s(second))
         return ubx.TimTp(tow_ns // MILLISECOND_NS, 0, quantisation_ps, week, ubx.TP_UTC_AVAILABLE, ubx.TP_REFERENCE_GPS)
@@ -103,8 +104,9 @@ class UbxMessages:
         return ubx.NavHpposllh(0, 0, stamp.tow_ms, *mains, *rests, *accuracies)
 
     def _whole(self, epochs: Epochs, row: int) -> tuple[int, int, int, int]:
-        """Return latitude and longitude in 1e-9 degrees, heights above ellipsoid and geoid in tenths of a
-        millimetre.
+        """Return the position in whole numbers of NAV-HPPOSLLH's finest units.
+
+        They are latitude and longitude in 1e-9 degrees, heights above ellipsoid and geoid in tenths of a millimetre.
         """
         height_m = float(epochs.height_m[row])
         return (
@@ -116,18 +118,18 @@ class UbxMessages:
 
 
 def _main(value: int, scale: int) -> int:
-    """Return the part in the coarser unit, so that the finer one's is at most half of it."""
+    """Return the part in the coarser unit, so that the remainder is at most half of that unit."""
     return (value + scale // 2) // scale
 
 
 def _accuracies(epochs: Epochs, row: int) -> tuple[float, float]:
-    """Return horizontal (of both axes together) and vertical, metres."""
+    """Return the horizontal accuracy (both axes together) and the vertical one, metres."""
     north, east, down = map(float, epochs.position_sigma_l[row])
     return math.hypot(north, east), down
 
 
 def _velocity(epochs: Epochs, row: int) -> dict[str, int]:
-    """Return NAV-PVT's fields of velocity."""
+    """Return the velocity fields of NAV-PVT."""
     north, east, down = map(float, epochs.velocity_l[row])
     speed_mps = math.hypot(north, east)
     accuracy_mps = math.hypot(*map(float, epochs.velocity_sigma_l[row][:2]))
@@ -144,7 +146,7 @@ def _velocity(epochs: Epochs, row: int) -> dict[str, int]:
 
 
 def _empty_pvt(stamp: Stamp) -> ubx.NavPvt:
-    """Return time without a solution."""
+    """Return NAV-PVT with the time but without a solution."""
     hour, minute, ms = stamp.clock
     return ubx.NavPvt(
         itow_ms=stamp.tow_ms,

@@ -1,4 +1,4 @@
-"""What a GNSS receiver puts on its serial line, as the recorder reads it."""
+"""The bytes that a GNSS receiver sends on its serial line, as the recorder reads them."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ QUALITY = {FixType.SINGLE: 1, FixType.RTK_FIXED: 4, FixType.RTK_FLOAT: 5}  # GGA
 
 
 class NmeaMessages:
-    """Encodes the sentences of an epoch; arguments as `swath.sim.gnss.novatel.NovatelMessages`."""
+    """Encodes the NMEA sentences of an epoch; arguments as for `swath.sim.gnss.novatel.NovatelMessages`."""
 
     def __init__(self, table: GnssTable, calendar: Calendar, pulse: Pulse) -> None:
         self._calendar = calendar
@@ -44,18 +44,21 @@ class NmeaMessages:
         self._two_antennas = table.secondary_lever_arm_m is not None
 
     def epoch(self, epochs: Epochs, row: int) -> list[bytes]:
-        """Return GGA, RMC, on whole seconds ZDA, VTG, GST, with a second antenna HDT: the direction of the baseline."""
+        """Return the sentences of an epoch: GGA, RMC, on whole seconds ZDA, then VTG and GST.
+
+        With a second antenna HDT follows, which gives the direction of the baseline.
+        """
         stamp = self._calendar.at(float(epochs.time_s[row]))
         there = epochs.fix[row] != FixType.NONE
         sentences = self._solution(epochs, row, stamp) if there else _no_solution(stamp)
-        if stamp.second is not None:  # not last: what ends an epoch is in every epoch
+        if stamp.second is not None:  # not last: a sentence that ends an epoch must be in every epoch
             sentences.insert(2, encode_zda(stamp.day_ns, stamp.date))
         if self._two_antennas:
             sentences.append(encode_hdt(float(epochs.heading_rad[row])) if there else encode_sentence("GNHDT,,T"))
         return sentences
 
     def ins_epoch(self, ins: InsEpochs, row: int) -> list[bytes]:
-        """Return NMEA receivers have no INS here."""
+        """Return an empty list; simulated NMEA receivers have no INS."""
         return []
 
     def _solution(self, epochs: Epochs, row: int, stamp: Stamp) -> list[bytes]:
@@ -80,7 +83,7 @@ class NmeaMessages:
 
 
 def _no_solution(stamp: Stamp) -> list[bytes]:
-    """Return time goes on; what there is no solution for stays empty."""
+    """Return the sentences of an epoch without a solution; they have the time, and the solution's fields are empty."""
     hour, minute, ms = stamp.clock
     time = f"{hour:02d}{minute:02d}{ms / 1000.0:05.2f}"
     return [
@@ -93,18 +96,18 @@ def _no_solution(stamp: Stamp) -> list[bytes]:
 
 BITS_PER_BYTE = 10  # 8N1
 
-VARIATION_S = 0.002  # one sigma of what an epoch takes longer than the least
+VARIATION_S = 0.002  # one sigma of an epoch's delay beyond the least one
 GREATEST_VARIATION_S = 0.010
-NAMING_S = 0.9  # FORMULAS 12: later than this a message may be taken for the next second's
-SLACK = 1.1  # room on the line: numbers grow digits
+NAMING_S = 0.9  # FORMULAS 12: a later message may be taken for that of the next second
+SLACK = 1.1  # room on the line, because numbers may get more digits
 STANDARD_BAUDS = (9600, 19_200, 38_400, 57_600, 115_200, 230_400, 460_800, 921_600, 2_000_000, 4_000_000)
 
 
 class Messages(Protocol):
-    """A protocol's encoder."""
+    """An encoder of one protocol's messages."""
 
     def epoch(self, epochs: Epochs, row: int) -> list[bytes]:
-        """Return all messages of a solution, in the order they are sent."""
+        """Return all messages of a solution, in the order in which they are sent."""
 
     def ins_epoch(self, ins: InsEpochs, row: int) -> list[bytes]:
         """Return all messages of an inertial solution."""
@@ -118,17 +121,17 @@ PROTOCOLS: dict[str, Callable[[GnssTable, Calendar, Pulse], Messages]] = {
 
 
 class GnssWire:
-    """The bytes of a receiver, ``gnss/<name>``, cut wherever a read falls.
+    """The bytes of a receiver, ``gnss/<name>``, split wherever a read of the serial port falls.
 
     Args:
         plan: of the flight.
         name: of the receiver in it.
         receiver: its solutions.
-        pulse: what it drives; None: nothing is wired to it.
+        pulse: the pulse that it drives; None if no pulse is wired to it.
 
     Raises:
         PlanError: the messages do not fit on the line, come too late to name their second, or the protocol has no
-            message for what is asked.
+            message for what the plan requests.
     """
 
     def __init__(self, plan: Plan, name: str, receiver: Receiver, pulse: PulsePerSecond | None) -> None:
@@ -150,11 +153,12 @@ class GnssWire:
         self._until_s = 0.0
 
     def units(self, start_s: float, stop_s: float) -> list[WireUnit]:
-        """Return the reads with ``start_s`` <= time < ``stop_s`` that have bytes; a call goes on where the last one
-        ended.
+        """Return the reads with ``start_s`` <= time < ``stop_s`` that have bytes.
+
+        Each call must continue where the previous one ended.
 
         Raises:
-            ValueError: it does not.
+            ValueError: the call starts elsewhere.
         """
         if start_s != self._until_s:
             raise ValueError(f"units from {start_s} s on, but the last ones ended at {self._until_s} s")
@@ -167,7 +171,7 @@ class GnssWire:
         return [WireUnit(time_s, self._source, data) for time_s, data in self._line.read_until(stop_s)]
 
     def _bursts(self, first_tick: int, stop_tick: int) -> Iterator[tuple[float, bytes]]:
-        """Yield bytes of the epochs in these ticks, in the order they are sent, and when at the earliest."""
+        """Yield, in the order of sending, the earliest time and the bytes of each epoch in these ticks."""
         ticks = INS_RATE_HZ // self._table.rate_hz
         first, stop = -(-first_tick // ticks), -(-stop_tick // ticks)
         bursts: list[tuple[int, int, float, bytes]] = []  # tick, part, delay
@@ -185,13 +189,13 @@ class GnssWire:
             yield tick / INS_RATE_HZ + delay_s, data
 
     def _delays_s(self, part: int, first: int, count: int) -> list[float]:
-        """From an epoch to its first byte."""
+        """Return the delay of each epoch's first byte after the epoch."""
         variation_s = np.minimum(np.abs(self._variation[part].rows(first, count)[:, 0]), GREATEST_VARIATION_S)
         delays_s: list[float] = (self._table.latency_ms / 1000.0 + variation_s).tolist()
         return delays_s
 
     def _typical_second(self) -> list[tuple[float, int]]:
-        """Return (time, bytes) of a second's epochs while there are satellites."""
+        """Return (time, bytes) of one second's epochs while there are satellites."""
         epochs = self._receiver.epochs(0, self._table.rate_hz)
         epochs = replace(epochs, fix=np.full_like(epochs.fix, FixType.SINGLE))
         sizes = [(float(t), _size(self._messages.epoch(epochs, row))) for row, t in enumerate(epochs.time_s)]
@@ -202,13 +206,13 @@ class GnssWire:
 
 
 def config_table(table: GnssTable, name: str, transport: str, leap_seconds: int | None = None) -> dict[str, Any]:
-    """Return ``[gnss.<name>]`` of the configuration that records it (CONFIG).
+    """Return ``[gnss.<name>]`` of the configuration that records the receiver (CONFIG).
 
     Args:
         table: of the plan.
         name: of the receiver.
         transport: URI of its serial line.
-        leap_seconds: GPS − UTC, for a protocol that does not say it; None: the configuration's default.
+        leap_seconds: GPS − UTC, for a protocol that does not transmit it; None: the configuration's default.
     """
     config: dict[str, Any] = {"transport": transport, "protocol": table.protocol}
     if table.pps is not None:
@@ -234,7 +238,7 @@ def _check_protocol(table: GnssTable, name: str) -> None:
 
 
 def _check_line(table: GnssTable, name: str, second: list[tuple[float, int]], read_s: float) -> None:
-    """Refuse a line on which messages pile up, or name their second too late."""
+    """Refuse a serial line on which messages pile up or name their second too late."""
     bytes_per_s = math.ceil(SLACK * sum(size for _, size in second))
 
     def late_s(baud: int) -> float:
@@ -259,7 +263,10 @@ def _check_line(table: GnssTable, name: str, second: list[tuple[float, int]], re
 
 
 def _lateness_s(table: GnssTable, second: list[tuple[float, int]], read_s: float, baud: int) -> float:
-    """When the last byte of a whole second's messages is read, at the latest, if every second is as this one."""
+    """Return the latest time after its second at which the last byte of a whole second's messages is read.
+
+    Every second is taken to have the messages of this one.
+    """
     free_s = latest_s = 0.0
     for start_s in range(3):
         for time_s, size in second:
@@ -271,12 +278,12 @@ def _lateness_s(table: GnssTable, second: list[tuple[float, int]], read_s: float
 
 
 class SerialLine:
-    """From a device to the recorder.
+    """The serial line from a device to the recorder.
 
     Args:
         baud: bits a second.
-        read_s: from read to read.
-        first_read_s: when the recorder reads first.
+        read_s: time between two reads.
+        first_read_s: time of the recorder's first read.
     """
 
     def __init__(self, baud: int, read_s: float, first_read_s: float) -> None:
@@ -288,14 +295,15 @@ class SerialLine:
         self._reads = 0
 
     def send(self, time_s: float, data: bytes) -> None:
-        """Put bytes behind those still waiting, at this time at the earliest."""
+        """Put bytes behind those still waiting; they leave at this time at the earliest."""
         start_s = max(time_s, self._free_s)
         self._free_s = start_s + len(data) * self._byte_s
         self._queue.append((start_s, data))
 
     def read_until(self, stop_s: float) -> list[tuple[float, bytes]]:
-        """Return the reads before ``stop_s`` that have bytes, each with its time; whatever arrives by then must be
-        sent.
+        """Return the reads before ``stop_s`` that have bytes, each with its time.
+
+        All bytes that arrive by then must have been sent already.
         """
         reads = []
         while (time_s := self._first_read_s + self._reads * self._read_s) < stop_s:
@@ -306,7 +314,7 @@ class SerialLine:
         return reads
 
     def _arrived(self, time_s: float) -> bytes:
-        """Return bytes whose last bit is there and that no read has taken."""
+        """Return the bytes whose last bit has arrived and that no read has taken yet."""
         parts = []
         while self._queue and self._queue[0][0] < time_s:
             start_s, data = self._queue[0]

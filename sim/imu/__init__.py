@@ -1,1 +1,1 @@
-"""The inertial measurement unit and its CAN frames."""
+"""The inertial measurement unit, its errors and its CAN frames."""

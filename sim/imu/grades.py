@@ -1,21 +1,21 @@
-"""How good an inertial unit is: grades as data sheets say them, and the same in SI units.
+"""Grades of inertial units: figures in the units of data sheets, and the same in SI units.
 
-A grade gives what the plan leaves unsaid under ``[imu.<name>.noise]``. Figures are one sigma; "instability" is the
-greatest Allan deviation of the drifting part of a bias, which is what data sheets read off their curves' floor.
+A grade gives the values that the plan does not set under ``[imu.<name>.noise]``. Figures are one sigma; "instability"
+is the greatest Allan deviation of the drifting part of a bias, which data sheets read from the floor of their curves.
 
-- navigation: Honeywell HG9900 (brochure: 0.0035 °/h, 0.002 °/√h, 25 µg, 5 and 100 ppm); its sheet has no velocity
-  random walk: 8 µg/√Hz of the accelerometers in its class (iMAR iNAV-RQH).
-- tactical: iMAR IMU-FSAS (0.75 °/h, 0.1 °/√h, 1 mg, 0.03 m/s/√h, 300 ppm), Honeywell HG1700 and HG1900 beside it
-  (1 °/h, 0.09 to 0.125 °/√h, 1 mg).
+- navigation: Honeywell HG9900 (brochure: 0.0035 °/h, 0.002 °/√h, 25 µg, 5 and 100 ppm). Its sheet gives no velocity
+  random walk; the value here is the 8 µg/√Hz of the accelerometers in its class (iMAR iNAV-RQH).
+- tactical: iMAR IMU-FSAS (0.75 °/h, 0.1 °/√h, 1 mg, 0.03 m/s/√h, 300 ppm); Honeywell HG1700 and HG1900 are similar (1
+  °/h, 0.09 to 0.125 °/√h, 1 mg).
 - mems: gyroscopes of an Analog Devices ADIS16488 (in run 6 °/h, 0.3 °/√h, axes to 0.05°), accelerometers of a Sensonor
   STIM300 (in run 0.05 mg, 0.07 m/s/√h); biases at turn-on and scale factors are those of a unit calibrated over
   temperature, not the sheets' repeatability over years.
 - consumer: InvenSense MPU-6050 (PS-MPU-6000A 3.4: accelerometers ±50 and ±80 mg, 400 µg/√Hz, scale factors ±3 %, across
-  axes ±2 %, taken for limits; gyroscopes 0.005 °/s/√Hz); the gyroscopes' bias lies between the 0.1 °/s (El-Sheimy and
+  axes ±2 %, read as limits; gyroscopes 0.005 °/s/√Hz); the gyroscopes' bias lies between the 0.1 °/s (El-Sheimy and
   Youssef 2020, Satellite Navigation 1:2) and 1 °/s (Xsens MTi-G) of such units.
 
-What is named above is of the makers' sheets; the instabilities of the other grades, all other misalignments and the
-biases and scale factors of the third are of the size such units have, and of no sheet.
+The figures above come from the makers' sheets. The instabilities of the other grades, all other misalignments and the
+biases and scale factors of the third grade are typical of such units and come from no sheet.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ GRADES = {
 
 
 def noise_of(table: ImuTable) -> dict[str, float]:
-    """Return every key of `ImuNoiseTable` with its value: the plan's, else the grade's."""
+    """Return every key of `ImuNoiseTable` with its value: the plan's, or the grade's if the plan does not set it."""
     return GRADES[table.grade].model_dump() | table.noise.model_dump(exclude_none=True)
 
 
@@ -107,8 +107,8 @@ class SensorGrade:
         bias: at turn-on, base unit.
         instability: greatest Allan deviation of the drift, base unit.
         correlation_s: longest time constant of the drift.
-        scale: of a scale factor.
-        misalignment_rad: of the angles that axes lean towards each other.
+        scale: error of a scale factor.
+        misalignment_rad: angles by which axes lean towards each other.
     """
 
     random_walk: float
@@ -120,7 +120,7 @@ class SensorGrade:
 
 
 def sensor_grades(table: ImuTable) -> tuple[SensorGrade, SensorGrade]:
-    """Return accelerometers and gyroscopes of a unit of the plan."""
+    """Return the grades of the accelerometers and gyroscopes of a unit of the plan."""
     noise = noise_of(table)
     correlation_s, misalignment_rad = 3600.0 * noise["bias_correlation_h"], 1e-3 * noise["misalignment_mrad"]
     accelerometers = SensorGrade(

@@ -1,13 +1,13 @@
 """The inertial unit: exact increments from the trajectory, and the errors of its sensors.
 
-A gyroscope triad integrates the body's rotation against inertial space, an accelerometer triad the specific force,
-both in the turning body frame:
+A gyroscope triad integrates the body's rotation against inertial space, an accelerometer triad the specific force, both
+in the rotating body frame:
 
     ω_ib^b = ω_eb^b + R_e^b ω_ie^e        f^b = R_e^b (r̈_e + 2 Ω × ṙ_e − γ_e(r))
 
-The force is Newton's law with the derivatives taken in the turning earth frame: r̈ in inertial space is
-r̈_e + 2 Ω × ṙ_e + Ω × (Ω × r), the attraction's share is taken off, and the centrifugal term Ω × (Ω × r) is in normal
-gravity already (γ is attraction − Ω × (Ω × r)), so it must not be added again.
+The force is Newton's law with the derivatives taken in the rotating earth frame. r̈ in inertial space is
+r̈_e + 2 Ω × ṙ_e + Ω × (Ω × r), from which the attraction is subtracted. Normal gravity already contains the centrifugal
+term Ω × (Ω × r) (γ is attraction − Ω × (Ω × r)), so it must not be added again.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ if TYPE_CHECKING:
     from swath.sim.flight.trajectory import Motion, Trajectory
 
 
-PIECE_S = 0.006  # longest piece integrated in one go: a motion of 20 Hz is wrong by 1e-7 of itself, of 5 Hz by 2e-11
+PIECE_S = 0.006  # longest piece integrated at once: relative error 1e-7 for a motion of 20 Hz, 2e-11 for 5 Hz
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(3)
-DRIFT_RATIO = 4.0  # of neighbouring time constants of the drift
+DRIFT_RATIO = 4.0  # ratio of neighbouring time constants of the drift
 DRIFT_SHORTEST_S = 10.0  # below it white noise hides the drift of any unit
-ROTATION_TOLERANCE = 1e-6  # as the configuration's
+ROTATION_TOLERANCE = 1e-6  # the same as the configuration's
 
 
 @dataclass(frozen=True, slots=True)
 class Increments:
-    """Integrals over n intervals, in the body frame of each moment; with the lever arm, at the unit's point.
+    """Integrals over n intervals, in the body frame of each moment; with a lever arm they hold at the unit's point.
 
     Attributes:
         angle_b: (n, 3) ∫ ω_ib^b dt, rad.
@@ -50,13 +50,13 @@ class Increments:
 
 
 def true_increments(trajectory: Trajectory, edges_s: FloatArray, lever_arm_b: FloatArray | None = None) -> Increments:
-    """Return what perfect sensors integrate between neighbouring times, by Gauss and Legendre's rule of three points.
+    """Return the integrals of perfect sensors between neighbouring times, by the Gauss-Legendre rule of three points.
 
     Args:
         trajectory: of the body's origin.
         edges_s: (n + 1,) times, ascending.
-        lever_arm_b: (3,) from the trajectory's point to the sensors', metres; None: they are the same. Its force is
-            exact: ω̇ × l integrates to the difference of ω × l, the rest is integrated like everything else.
+        lever_arm_b: (3,) from the trajectory's point to the sensors' point, metres; None: they coincide. Its force is
+            exact: ω̇ × l integrates to the difference of ω × l, and the rule integrates the rest.
     """
     pieces = int(np.ceil(np.diff(edges_s).max() / PIECE_S))
     share = ((np.arange(pieces)[:, None] + 0.5 * (1.0 + NODES)) / pieces).ravel()
@@ -76,7 +76,7 @@ def true_increments(trajectory: Trajectory, edges_s: FloatArray, lever_arm_b: Fl
 
 
 def specific_force(motion: Motion, lever_arm_b: FloatArray | None = None) -> FloatArray:
-    """Return (n, 3) f^b, m/s², at the unit's point, but for the lever arm's ω̇ × l."""
+    """Return (n, 3) f^b, m/s², at the unit's point, without the lever arm's ω̇ × l."""
     rot_e_from_b = motion.rot_e_from_b
     position_e, velocity_e = motion.position_e, motion.velocity_e
     extra_b: FloatArray | float = 0.0
@@ -91,18 +91,18 @@ def specific_force(motion: Motion, lever_arm_b: FloatArray | None = None) -> Flo
 
 
 class SensorErrors:
-    """Errors of a unit: what it drew when it was switched on, and noise and drift of each sample.
+    """Errors of a unit: values drawn when it is switched on, and noise and drift of each sample.
 
-    Columns are specific force x, y, z, then angular rate x, y, z, in the unit's axes. An output is
-    (I + E) · truth + bias + drift + white noise. E has scale factors on its diagonal and, symmetric beside it, how far
-    axes lean towards each other: a rotation of the triad is not in it, for the body's axes are the triad's mean ones.
-    The drift is a sum of Gauss-Markov processes with time constants a factor of four apart, the longest as asked for:
-    flicker noise, its Allan deviation level at the instability asked for.
+    Columns are specific force x, y, z, then angular rate x, y, z, in the unit's axes. An output is (I + E) · truth +
+    bias + drift + white noise. E has scale factors on its diagonal and, symmetric beside it, the angles by which axes
+    lean towards each other. It contains no rotation of the triad, because the body's axes are the triad's mean axes.
+    The drift is a sum of Gauss-Markov processes with time constants a factor of four apart, the longest as requested.
+    The sum is flicker noise whose Allan deviation is level at the requested instability.
 
     Args:
         table: of the plan.
-        seed, name: of the draws.
-        noise: False: no errors.
+        seed, name: names that the random numbers depend on.
+        noise: False gives a unit without errors.
     """
 
     def __init__(self, table: ImuTable, seed: int, name: str, *, noise: bool) -> None:
@@ -124,7 +124,7 @@ class SensorErrors:
         self._white = np.repeat([grade.random_walk for grade in grades], 3) * np.sqrt(self._rate_hz)
         self._drift = np.repeat([grade.instability for grade in grades], 3) / level
         start = generator(*self._names, "drift").standard_normal((len(self.constants_s), 6))
-        self._starts = [start]  # of each second's drift, in units of its sigma
+        self._starts = [start]  # start of each second's drift, in units of its sigma
 
     def of_second(self, second: int) -> FloatArray:
         """Return (rate, 6) bias, drift and white noise of the samples of a second."""
@@ -137,7 +137,7 @@ class SensorErrors:
         return errors
 
     def _draws(self, second: int) -> FloatArray:
-        """Return (rate, processes + 1, 6): what drives the drift, then the white noise."""
+        """Return (rate, processes + 1, 6) random numbers that drive the drift, and last those of the white noise."""
         shape = (self._rate_hz, len(self.constants_s) + 1, 6)
         return generator(*self._names, "noise", second).standard_normal(shape)
 
@@ -159,16 +159,16 @@ def error_matrix(scale: FloatArray, lean_rad: FloatArray) -> FloatArray:
 
 
 def drift_constants(longest_s: float) -> FloatArray:
-    """Return (k,) time constants of the drift, seconds, from the longest down."""
+    """Return (k,) time constants of the drift, seconds, longest first."""
     count = 1 + max(int(np.log(longest_s / DRIFT_SHORTEST_S) / np.log(DRIFT_RATIO)), 0)
     constants_s: FloatArray = longest_s * DRIFT_RATIO ** -np.arange(count, dtype=np.float64)
     return constants_s
 
 
 def drift_level(constants_s: FloatArray) -> float:
-    """Return greatest Allan deviation of a sum of Gauss-Markov processes of sigma 1 with these time constants.
+    """Return the greatest Allan deviation of a sum of Gauss-Markov processes of sigma 1 with these time constants.
 
-    The Allan variance of one: IEEE Std 952-1997, annex C, Eq. C.20, with q_c² T_c = 2 σ².
+    The Allan variance of one process is IEEE Std 952-1997, annex C, Eq. C.20, with q_c² T_c = 2 σ².
     """
     tau_s = np.geomspace(constants_s.min() / 10, 10 * constants_s.max(), 2000)
     n = tau_s[:, None] / constants_s
@@ -177,22 +177,22 @@ def drift_level(constants_s: FloatArray) -> float:
 
 
 class InertialUnit:
-    """An inertial unit at the body's origin, sampling by an oscillator of its own.
+    """An inertial unit at the body's origin, sampled by its own oscillator.
 
-    Sample k ends when its counter has gained k · tick_hz / rate_hz since the plan's start, sample 1 is the first. It
-    reports the mean over the interval: the increment divided by the interval as its own clock counts it, 1 / rate_hz,
-    so that means are wrong by the parts per million of its clock, and times wander against GPS as they do in a real
-    unit. Values are worked out in whole seconds of samples, whatever is asked for.
+    Sample k ends when its counter has gained k · tick_hz / rate_hz since the plan's start; sample 1 is the first. The
+    unit reports the mean over the interval: the increment divided by the interval as its own clock counts it, 1 /
+    rate_hz. The means are therefore wrong by the parts per million of its clock, and times wander against GPS as in a
+    real unit. Values are computed in whole seconds of samples, whichever samples are requested.
 
     Args:
         table: of the plan.
         trajectory: of the body's origin.
-        seed, name: of its errors; the name is the plan's.
-        noise: False: perfect sensors.
+        seed, name: names that its errors depend on; the name is the plan's.
+        noise: False gives perfect sensors.
         lever_arm_b: (3,) from the trajectory's point to the unit, metres.
 
     Raises:
-        PlanError: rotation_b_imu is no rotation.
+        PlanError: rotation_b_imu is not a rotation.
     """
 
     def __init__(
@@ -216,14 +216,14 @@ class InertialUnit:
             raise PlanError(f"imu.{name}.rotation_b_imu", text)
         self._rot_imu_from_b = np.linalg.inv(rot_b_from_imu)
         self.last = self.count(trajectory.end_s)
-        self._kept: dict[int, FloatArray] = {}  # values of the last two seconds: who cuts time meets both
+        self._kept: dict[int, FloatArray] = {}  # values of the last two seconds: a request may span both
 
     def ends_s(self, number: FloatArray | IntArray) -> FloatArray:
         """Return (n,) true times at which samples (n,) end."""
         return self.oscillator.time_of(np.asarray(number, np.float64) * self.table.tick_hz / self.table.rate_hz)
 
     def count(self, stop_s: float) -> int:
-        """Return how many samples have ended at this time."""
+        """Return the number of samples that have ended at this time."""
         phase = self.oscillator.phase(np.array([stop_s]))
         number = np.floor(phase * self.table.rate_hz / self.table.tick_hz) + np.array([1.0, 0.0, -1.0])
         return max(int(number[np.argmax(self.ends_s(number) <= stop_s)]), 0)
@@ -232,8 +232,8 @@ class InertialUnit:
         """Return samples by number.
 
         Returns:
-            (n,) true times at which their intervals end, (n, 3) specific force m/s², (n, 3) angular rate rad/s, in
-            the unit's own axes.
+            (n,) true times at which their intervals end, (n, 3) specific force m/s², (n, 3) angular rate rad/s, in the
+            unit's own axes.
 
         Raises:
             ValueError: the flight has no such samples.
@@ -249,7 +249,7 @@ class InertialUnit:
         return self.ends_s(number), values[:, :3], values[:, 3:]
 
     def drawn(self) -> dict[str, FloatArray]:
-        """Return what the unit drew when it was switched on, in its own axes: biases (3,), error matrices (3, 3)."""
+        """Return the values drawn at switch-on, in the unit's own axes: biases (3,), error matrices (3, 3)."""
         return {
             "accel_bias_mps2": self.errors.bias[:3],
             "gyro_bias_radps": self.errors.bias[3:],
@@ -258,8 +258,9 @@ class InertialUnit:
         }
 
     def _second(self, second: int) -> FloatArray:
-        """Return (n, 6) values of the samples second · rate_hz and on, as far as there are any; there is no sample
-        0.
+        """Return (n, 6) values of the samples of a second, from second · rate_hz on.
+
+        The flight may end earlier, and there is no sample 0.
         """
         if second not in self._kept:
             rate_hz = self.table.rate_hz
@@ -270,7 +271,7 @@ class InertialUnit:
         return self._kept[second]
 
     def _means(self, begin: int, end: int) -> FloatArray:
-        """Return (n, 6) of the samples from ``begin`` to before ``end``, with scale factors and leaning axes."""
+        """Return (n, 6) means of samples ``begin`` to before ``end``, with scale factors and leaning axes."""
         increments = true_increments(self._trajectory, self.ends_s(np.arange(begin - 1, end)), self._lever_arm_b)
         accelerometers, gyroscopes = self.errors.matrices @ self._rot_imu_from_b
         sensed = [increments.velocity_b @ accelerometers.T, increments.angle_b @ gyroscopes.T]

@@ -1,8 +1,8 @@
-"""A strapdown navigator of the simulator's own: from increments back to the trajectory, to prove that they are right.
+"""A strapdown navigator of the simulator's own: it recovers the trajectory from increments to prove them right.
 
-Mechanised in e (Savage, Strapdown Inertial Navigation Integration Algorithm Design, J. Guidance 21(1) and 21(2),
+It is mechanised in e (Savage, Strapdown Inertial Navigation Integration Algorithm Design, J. Guidance 21(1) and 21(2),
 1998): attitude by quaternion with the coning of neighbouring increments, velocity with rotation compensation and
-sculling, normal gravity at the middle of each interval, Coriolis acceleration, position by the trapezium.
+sculling, normal gravity at the middle of each interval, Coriolis acceleration, position by the trapezium rule.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class States:
     Attributes:
         position_e: (n, 3) metres.
         velocity_e: (n, 3) m/s, against e.
-        rot_e_from_b: rotations, n of them.
+        rot_e_from_b: n rotations.
     """
 
     position_e: FloatArray
@@ -56,7 +56,7 @@ def navigate(
     return States(states[:, :3], states[:, 3:6], Rotation.from_quat(states[:, 6:], scalar_first=True))
 
 
-# Vectors and quaternions are tuples in what is compiled: no allocations, and it compiles in a fraction of the time.
+# Compiled functions use tuples as vectors and quaternions: they allocate nothing and compile in a fraction of the time.
 
 
 @jit_inline
@@ -72,7 +72,7 @@ def _plus(a: Vector, factor: float, b: Vector) -> Vector:
 
 @jit_inline
 def _product(p: Quaternion, q: Quaternion) -> Quaternion:
-    """Return hamilton's product, scalar first."""
+    """Return Hamilton's product of two quaternions, scalar first."""
     return (
         p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3],
         p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2],
@@ -83,7 +83,7 @@ def _product(p: Quaternion, q: Quaternion) -> Quaternion:
 
 @jit_inline
 def _turned(q: Quaternion, vector: Vector) -> Vector:
-    """Return q v q*, for a unit quaternion."""
+    """Return q v q* for a unit quaternion q."""
     axis = (q[1], q[2], q[3])
     once = _cross(axis, vector)
     return _plus(_plus(vector, 2.0 * q[0], once), 2.0, _cross(axis, once))
@@ -91,7 +91,7 @@ def _turned(q: Quaternion, vector: Vector) -> Vector:
 
 @jit_inline
 def _quaternion(angle: Vector) -> Quaternion:
-    """Of a rotation vector of a small angle."""
+    """Return the quaternion of a rotation vector of a small angle."""
     square = 0.25 * (angle[0] * angle[0] + angle[1] * angle[1] + angle[2] * angle[2])
     half_sine = 0.5 * (1.0 - square / 6.0 * (1.0 - square / 20.0 * (1.0 - square / 42.0)))
     cosine = 1.0 - square / 2.0 * (1.0 - square / 12.0 * (1.0 - square / 30.0))
@@ -100,7 +100,7 @@ def _quaternion(angle: Vector) -> Quaternion:
 
 @jit_inline
 def _force_increment(angle: Vector, force: Vector, angle_before: Vector, force_before: Vector) -> Vector:
-    """Return ∫ f in the axes of the interval's start: exact for steady turning, and sculling."""
+    """Return ∫ f in the axes of the interval's start, exact for a steady rotation, with sculling."""
     square = angle[0] * angle[0] + angle[1] * angle[1] + angle[2] * angle[2]
     first, second = 0.5 - square / 24.0 * (1.0 - square / 30.0), 1.0 / 6.0 - square / 120.0 * (1.0 - square / 42.0)
     once = _cross(angle, force)
@@ -119,7 +119,7 @@ def _navigate(start: FloatArray, angles: FloatArray, forces: FloatArray, spans: 
         span = spans[k]
         angle, force = (angles[k, 0], angles[k, 1], angles[k, 2]), (forces[k, 0], forces[k, 1], forces[k, 2])
         felt = _turned(attitude, _force_increment(angle, force, angle_before, force_before))
-        felt = _plus(felt, -0.5 * span, _cross(rate, felt))  # e turns on under the force: its axes at the middle
+        felt = _plus(felt, -0.5 * span, _cross(rate, felt))  # e rotates meanwhile: take its axes at the middle
         middle = _plus(position, 0.5 * span, velocity)
         pushed = _plus(felt, span, gravity_at(middle[0], middle[1], middle[2]))
         half_way = _plus(_plus(velocity, 0.5, pushed), -span, _cross(rate, velocity))

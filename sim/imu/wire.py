@@ -1,8 +1,8 @@
 """An inertial unit on CAN: its DBC, the configuration that records it, and its frames in order of time.
 
 One sample is four frames: X, Y and Z with specific force and angular rate of that axis, then SAMPLE with the counter at
-the interval's end. The counter at an edge of PPS comes in a message of its own, SYNC. Frames are written by
-`swath.drivers.imu.dbc.encoder` through the very DBC and signal map that the recorder reads them with.
+the interval's end. The counter at a PPS edge comes in a message of its own, SYNC. `swath.drivers.imu.dbc.encoder`
+writes the frames through the same DBC and signal map with which the recorder reads them.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from swath.sim.plan.errors import PlanError
 from swath.sim.plan.tables import ImuTable
 from swath.sim.shots import WireUnit
 
-FORCE_UNIT_MPS2 = 1e-7  # 32 bits reach 21 g; half a unit a sample is far below a navigation grade's noise
+FORCE_UNIT_MPS2 = 1e-7  # 32 bits reach 21 g; half a unit per sample is far below a navigation grade's noise
 RATE_UNIT_RADPS = 5e-9  # 32 bits reach 615 °/s
 LARGEST = np.repeat([FORCE_UNIT_MPS2, RATE_UNIT_RADPS], 3) * (2**31 - 1)
 TEMPERATURE_C = 38.0
 SAMPLE_FRAMES = 4
-FRAME_S = 120e-6  # 8 bytes at 1 Mbit/s: 111 bits, the stuffed ones, the gap
+FRAME_S = 120e-6  # 8 bytes at 1 Mbit/s: 111 bits, stuffed bits and the gap
 PROCESSING_S = 50e-6  # from the stamp to the first frame's begin
 LATCH_DELAY_S = (200e-6, 800e-6)  # from an edge to the end of its frame
-TICK_ROUNDING = 1e-3  # so that an edge or an end that stands on a tick is not cut to the one before by rounding
-CONFIGURED_NOISE = (  # keys of ImuNoiseTable that the configuration has too
+TICK_ROUNDING = 1e-3  # keeps rounding from moving an edge or an end on a tick to the tick before
+CONFIGURED_NOISE = (  # keys that ImuNoiseTable shares with the configuration
     "angle_random_walk_deg_per_sqrt_h",
     "velocity_random_walk_m_per_s_per_sqrt_h",
     "gyro_bias_deg_per_h",
@@ -110,7 +110,7 @@ def config_table(table: ImuTable, name: str, transport: str) -> dict[str, Any]:
 
 
 def _configured_noise(table: ImuTable) -> dict[str, Any]:
-    """Return what a filter is told; a perfect unit is the best there is to it, for no filter runs on zeros."""
+    """Return the noise table for a filter; a perfect unit gets the best grade, because no filter runs on zeros."""
     if table.grade == "perfect":
         return {"grade": "navigation"}
     noise = noise_of(table)
@@ -118,20 +118,20 @@ def _configured_noise(table: ImuTable) -> dict[str, Any]:
 
 
 class ImuWire:
-    """Frames of a unit as the host gets them.
+    """Frames of a unit as the host receives them.
 
     A sample's frames leave when its stamp has passed: the stamp is the unit's counter at the interval's end plus
     ``latency_us``. Frames follow each other at the bus's pace, the host's stamps lag by an exponential delay, and a
     frame's stamp is never before that of the frame ahead of it.
 
     Args:
-        unit: whose samples they are.
-        pulse: its PPS; None: none is wired to it.
-        can_jitter_us: mean delay of the host's stamps; none for a unit without noise.
+        unit: unit whose samples are sent.
+        pulse: its PPS; None if no pulse is wired to it.
+        can_jitter_us: mean delay of the host's stamps; it is 0 for a unit without noise.
         lost_pps: (from_s, to_s) in which the unit gets no edge.
 
     Raises:
-        PlanError: its counter is too slow for its samples, or wraps too soon to be told apart.
+        PlanError: its counter is too slow for its samples, or wraps too soon to be resolved.
     """
 
     def __init__(
@@ -153,9 +153,9 @@ class ImuWire:
         self._latest_s = -np.inf
 
     def units(self, start_s: float, stop_s: float) -> list[WireUnit]:
-        """Return frames that are through the bus from ``start_s`` to before ``stop_s``, in order.
+        """Return the frames that pass the bus from ``start_s`` to before ``stop_s``, in order.
 
-        Consecutive calls give the same frames and stamps however time is cut; a stamp may lie a little behind
+        Consecutive calls give the same frames and stamps however time is cut; a stamp may lie a little after
         ``stop_s``, by the host's delay.
         """
         parts = [self._sample_frames(start_s, stop_s), self._latch_frames(start_s, stop_s)]
@@ -170,7 +170,7 @@ class ImuWire:
         ]
 
     def _sample_frames(self, start_s: float, stop_s: float) -> tuple[FloatArray, FloatArray, list[bytes]]:
-        """When frames of samples are sent, how late they are stamped, and the frames; (n,) each."""
+        """Return the sending times of sample frames, the delays of their stamps, and the frames; (n,) each."""
         first = max(self._unit.count(start_s - self._sent_after_s[-1]), 1)
         last = min(self._unit.count(stop_s - self._sent_after_s[0]) + 1, self._unit.last)
         first = min(first, last + 1)
@@ -190,7 +190,7 @@ class ImuWire:
         return sent_s[sent], self._delays(number).ravel()[sent], [frame.tobytes() for frame in frames[sent]]
 
     def _latch_frames(self, start_s: float, stop_s: float) -> tuple[FloatArray, FloatArray, list[bytes]]:
-        """Return the same of edges' frames."""
+        """Return the sending times, delays and bytes of the edges' frames; (n,) each."""
         second = np.arange(max(int(start_s) - 1, 0), int(np.ceil(stop_s)) + 1)
         if self._pulse is None:
             second = second[:0]
@@ -225,9 +225,9 @@ class ImuWire:
 def _check_counter(table: ImuTable, name: str, jitter_s: float) -> None:
     """Refuse a counter whose readings cannot be made continuous; see `swath.drivers.imu.counters`.
 
-    Between samples the host's stamps tell how often it has wrapped (to half a wrap: forty mean delays are never
-    reached), a latched value is looked for up to seven eighths of a wrap before the sample behind it, one ahead of its
-    sample (stamps that are early) up to an eighth.
+    Between samples the host's stamps show how often the counter has wrapped, to half a wrap; forty mean delays never
+    occur. A latched value is searched up to seven eighths of a wrap before the sample after it; a value ahead of its
+    sample (its stamps are early) up to an eighth.
     """
     if table.tick_hz < table.rate_hz:
         raise PlanError(f"imu.{name}.tick_hz", f"got {table.tick_hz}, want rate_hz, {table.rate_hz}, or more")

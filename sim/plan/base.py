@@ -1,4 +1,4 @@
-"""What the tables of a plan are written with."""
+"""The field types and the base class of a plan's tables."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ NotNegative = Annotated[float, Field(ge=0.0)]
 
 
 def none_of_empty(value: Any) -> Any:
-    """Return TOML has no null."""
+    """Return None for an empty string, because TOML has no null."""
     return None if value == "" else value
 
 

@@ -1,14 +1,14 @@
-"""What a user of the virtual aircraft can get wrong."""
+"""The error that reports a user's mistakes in a plan."""
 
 from __future__ import annotations
 
 
 class PlanError(ValueError):
-    """A plan that cannot be flown; one line: the plan's key, what is wrong, what would be right.
+    """Reports a plan that cannot be flown, in one line: the plan's key, the fault and the remedy.
 
     Args:
-        key: dotted name in the plan, as ``line[2].height_m``.
-        text: what is wrong and what would be right.
+        key: dotted name in the plan, such as ``line[2].height_m``.
+        text: the fault and the remedy.
     """
 
     def __init__(self, key: str, text: str) -> None:

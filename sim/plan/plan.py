@@ -1,4 +1,4 @@
-"""Plans: TOML files (or presets by name) into tables, each error one line that names the plan's key."""
+"""Reads plans, TOML files or presets by name, into tables; each error is one line that names the plan's key."""
 
 from __future__ import annotations
 
@@ -22,12 +22,13 @@ PRESETS = ("small", "calibration", "corridor", "block", "bench")
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """A plan whose keys are all right; whether it can be flown is for `swath.sim.flight.trajectory` and
-    `swath.sim.scene.scene` to say.
+    """A plan whose keys are all valid.
+
+    `swath.sim.flight.trajectory` and `swath.sim.scene.scene` decide whether it can be flown.
 
     Attributes:
         tables: every key.
-        folder: that paths in it are relative to.
+        folder: folder to which its paths are relative.
         text: as it was read.
         leap_seconds: GPS − UTC on its day.
         start_gps_ns: GPS time of its start, from which all ``_s`` count.
@@ -40,20 +41,20 @@ class Plan:
     start_gps_ns: int
 
     def with_seed(self, seed: int) -> Plan:
-        """Return the same flight on another day: other noise."""
+        """Return the same flight with other noise, as on another day."""
         return self.changed({"flight": {"seed": seed}})
 
     def changed(self, changes: dict[str, Any]) -> Plan:
-        """With other values: nested tables as in the file; lists are replaced whole."""
+        """Return the plan with other values; nested tables are merged, lists are replaced whole."""
         document = _merged(self.tables.model_dump(exclude_unset=True), changes)
         return replace(self, tables=_validated(document), text=toml_text(document))
 
 
 def load_plan(name: str | Path) -> Plan:
-    """Return a preset by its name, else a file.
+    """Return a preset by its name, or else the plan in a file.
 
     Raises:
-        PlanError: no such plan, not TOML, or a key is wrong; one line.
+        PlanError: there is no such plan, it is not TOML, or a key is wrong; one line.
     """
     path = Path(name)
     if str(name) in PRESETS and not path.is_file():
@@ -69,7 +70,7 @@ def load_plan(name: str | Path) -> Plan:
 
 
 def parse_plan(text: str, folder: Path) -> Plan:
-    """Return a plan from its text; raises `PlanError`."""
+    """Return the plan in a text; raises `PlanError`."""
     try:
         document = toml_tables(text)
     except TomlError as error:

@@ -1,7 +1,7 @@
-"""Every key of a plan: its type, unit (in the name), bounds and default. Names are those of the configuration.
+"""Every key of a plan with its type, unit (in the name), bounds and default; names are those of the configuration.
 
-Positions on the ground are metres east and north of the origin, in the plane that touches the ellipsoid there (the
-site frame of `swath.sim.site`). Heights are ellipsoidal.
+Positions on the ground are metres east and north of the origin, in the plane that touches the ellipsoid there (the site
+frame of `swath.sim.site`). Heights are ellipsoidal.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ def _identity() -> list[list[float]]:
 
 
 class FlightTable(Section):
-    """``[flight]``: where, when and how."""
+    """``[flight]``: place, start time and manner of the flight."""
 
     name: Name = Field(description="begins the name of the log")
     seed: int = Field(1, ge=0, lt=2**63, description="same seed, same bytes")
@@ -44,7 +44,9 @@ class FlightTable(Section):
 
 
 class GroundStart(Section):
-    """``[ground]``: the flight begins on the ground; absent: in the air, on the way to the first line."""
+    """``[ground]``: a start on the ground; without this table the flight begins in the air, on the way to the first
+    line.
+    """
 
     runway_m: Point = Field(description="east, north of the point where the take-off run begins")
     heading_deg: float = Field(0.0, ge=0.0, le=360.0, description="of the runway")
@@ -100,7 +102,7 @@ class OscillatorTable(Section):
 
 
 class AtmosphereTable(Section):
-    """``[atmosphere]``: what the light does on its way; keys as in the configuration."""
+    """``[atmosphere]``: the air's effect on light; keys as in the configuration."""
 
     ranges: Literal["corrected", "vacuum"] = Field("corrected", description="vacuum: the scanner counts with c")
     model: Literal["standard", "measured"] = Field(
@@ -118,7 +120,7 @@ class AtmosphereTable(Section):
 
 
 class OutageTable(Section):
-    """``[[gnss.<name>.outage]]``: no satellites."""
+    """``[[gnss.<name>.outage]]``: a time without satellites."""
 
     at_s: NotNegative = Field(description="seconds after the start")
     for_s: Positive = Field(description="how long")
@@ -133,7 +135,7 @@ class JumpTable(Section):
 
 
 class GnssTable(Section):
-    """``[gnss.<name>]``: a receiver."""
+    """``[gnss.<name>]``: a GNSS receiver."""
 
     protocol: Literal["novatel", "ubx", "nmea"] = Field("novatel", description="that it speaks")
     pps: Wired = Field("main", description='[pps.<name>] that it drives; "": none')
@@ -150,7 +152,7 @@ class GnssTable(Section):
 
 
 class ImuNoiseTable(Section):
-    """``[imu.<name>.noise]``: keys of the configuration, and what only a simulator knows; they override the grade."""
+    """``[imu.<name>.noise]``: keys of the configuration and further ones of the simulator; they override the grade."""
 
     angle_random_walk_deg_per_sqrt_h: float | None = Field(None, ge=0.0, description="white noise of the gyroscopes")
     velocity_random_walk_m_per_s_per_sqrt_h: float | None = Field(
@@ -207,7 +209,7 @@ class ParameterTable(Section):
 
 
 class IbrcTable(Section):
-    """``[scanner.<name>.ibrc]``: what intensity does to the range; keys of a calibration file."""
+    """``[scanner.<name>.ibrc]``: the range correction that depends on intensity; keys of a calibration file."""
 
     intensity: list[float] = Field(min_length=2, description="rising")
     correction_m: list[float] = Field(min_length=2, description="subtracted from the range at each intensity")
@@ -240,7 +242,7 @@ ScannerKind = Literal["oscillating", "polygon", "monogon", "nutating", "risley",
 
 
 class ScannerTable(Section):
-    """``[scanner.<name>]``: a scanner; what a kind does not use is ignored for it, and named in docs/simulation.md."""
+    """``[scanner.<name>]``: a scanner; docs/simulation.md names the keys that a kind does not use and ignores."""
 
     kind: ScannerKind = Field("oscillating", description="how it deflects its beam")
     motion: Literal["sine", "triangle"] = Field("sine", description="oscillating: of the mirror")
@@ -294,7 +296,7 @@ FaultKind = Literal[
 
 
 class FaultTable(Section):
-    """``[[fault]]``: something goes wrong with a source for a while."""
+    """``[[fault]]``: a fault of a source for some time."""
 
     source: str = Field(
         pattern=r"^(host|(gnss|imu|scanner|pps)/[A-Za-z0-9_-]+(/aux)?)$", description="kind/name, or host"
@@ -308,7 +310,7 @@ class FaultTable(Section):
 
 
 class Tables(Section):
-    """The whole plan."""
+    """All tables of a plan."""
 
     flight: FlightTable
     ground: GroundStart | None = None

@@ -1,4 +1,4 @@
-"""``[terrain]`` of a plan: every key of the ground and of what stands on it."""
+"""``[terrain]`` of a plan: every key of the ground and of the objects on it."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class WaterTable(Section):
 
 
 class ForestTable(Section):
-    """``[[terrain.forest]]``: trees at random."""
+    """``[[terrain.forest]]``: trees at random places."""
 
     center_m: Point = Field(description="east, north")
     size_m: Point = Field(description="east, north extent")
@@ -74,7 +74,7 @@ class WireTable(Section):
 
 
 class CarTable(Section):
-    """``[[terrain.car]]``: drives from one point to the other and back again."""
+    """``[[terrain.car]]``: a car that drives from one point to the other and back again."""
 
     from_m: Point = Field(description="east, north")
     to_m: Point = Field(description="east, north")
@@ -82,7 +82,7 @@ class CarTable(Section):
 
 
 class TerrainTable(Section):
-    """``[terrain]``: the ground and what stands on it."""
+    """``[terrain]``: the ground and the objects on it."""
 
     height_m: float = Field(450.0, ge=-500.0, le=9000.0, description="ellipsoidal, at the origin")
     slope_percent: float = Field(0.0, ge=0.0, le=100.0, description="of the whole site")

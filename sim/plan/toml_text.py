@@ -1,4 +1,4 @@
-"""Tables as TOML text; the standard library reads TOML and does not write it."""
+"""Writes tables as TOML text; the standard library reads TOML but does not write it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,10 @@ from typing import Any
 
 
 def toml_text(document: Mapping[str, Any]) -> str:
-    """Return a document: nested mappings become tables, lists of mappings arrays of tables; None is left out."""
+    """Return a document as TOML: nested mappings become tables, lists of mappings arrays of tables.
+
+    Keys with the value None are left out.
+    """
     return "\n".join(_lines(document, "")).strip() + "\n"
 
 

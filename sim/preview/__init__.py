@@ -1,1 +1,1 @@
-"""A plan's coverage and picture."""
+"""The coverage of a plan, and its picture."""

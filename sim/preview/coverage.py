@@ -1,4 +1,4 @@
-"""What a plan covers, before any pulse is fired: swaths, density and overlap of its lines, on wings held level.
+"""Coverage of a plan before any pulse is fired: swaths, density and overlap of its lines, with the wings held level.
 
 Across a line a scanner is a fan of angles θ from nadir (positive to the right), each with its share of the pulses; at
 height H above ground a pulse meets the ground H tan θ beside the line. A line scanner's fan is its scan; a spinning
@@ -29,23 +29,24 @@ from swath.sim.site import Site
 NEIGHBOUR_DEG = 20.0  # lines whose directions, or opposites, differ by less are neighbours
 OS1_BEAMS, OS1_COLUMNS = 64, 1024
 VLP16_PULSE_HZ = 16 / 55.296e-6  # sixteen beams each 55.296 µs: VLP-16 User Manual, 63-9243, 9.4
-FLATTEST_RAD = math.radians(75.0)  # flatter beams reach too far to ask for ground there
+FLATTEST_RAD = math.radians(75.0)  # flatter beams reach too far to need ground there
 
-LOG_MESSAGE_BYTES = 80  # a message's own in the log, with its part of indexes
+LOG_MESSAGE_BYTES = 80  # overhead of a message in the log, with its part of the indexes
 IMU_SAMPLE_BYTES = 200
 GNSS_BYTES_PER_S = 12_000
 
 
 @dataclass(frozen=True, slots=True)
 class Fan:
-    """How one scanner spreads its pulses across the line of flight.
+    """The spread of one scanner's pulses across the line of flight.
 
     Attributes:
-        centre_rad: of the fan, from nadir.
+        centre_rad: centre of the fan, from nadir.
         half_angle_rad: to either side.
-        range_max_m: beyond which nothing is measured.
+        range_max_m: greatest range that is measured.
         rate_hz: pulses a second in the whole fan.
-        sine: the mirror swings as a sine, so that pulses are dense at the edges; else all angles get alike.
+        sine: True if the mirror swings as a sine, so that pulses are dense at the edges; else all angles get the same
+            density.
     """
 
     centre_rad: float
@@ -55,13 +56,13 @@ class Fan:
     sine: bool
 
     def limits(self, above_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return (n,) smallest and largest angle from nadir that is measured at heights above ground (n,)."""
+        """Return (n,) the smallest and the largest angle from nadir that is measured at heights above ground (n,)."""
         reach = np.arccos(np.clip(above_m / self.range_max_m, 0.0, 1.0))
         first = np.maximum(self.centre_rad - self.half_angle_rad, -reach)
         return first, np.minimum(self.centre_rad + self.half_angle_rad, reach)
 
     def share(self, angle_rad: FloatArray) -> FloatArray:
-        """Return (n,) share of the pulses at angles below these, 0 … 1."""
+        """Return (n,) the share of the pulses at angles below these, 0 … 1."""
         part = np.clip((angle_rad - self.centre_rad) / self.half_angle_rad, -1.0, 1.0)
         shares: FloatArray = 0.5 + (np.arcsin(part) / np.pi if self.sine else 0.5 * part)
         return shares
@@ -78,8 +79,9 @@ def fan_of(table: ScannerTable) -> Fan:
 
 
 def pulse_rate_hz(table: ScannerTable) -> float:
-    """Return pulses a second that leave while the laser is on: what a polygon or monogon fires beyond its scan is
-    lost.
+    """Return the pulses per second that leave while the laser is on.
+
+    The pulses that a polygon or monogon fires beyond its scan are lost.
     """
     if table.kind == "vlp16":
         return VLP16_PULSE_HZ
@@ -90,7 +92,7 @@ def pulse_rate_hz(table: ScannerTable) -> float:
 
 
 def _half_angle_rad(table: ScannerTable) -> float:
-    """Of the scan; of what goes round, as far as it reaches to the side."""
+    """Return the half angle of the scan; of a circular or rosette pattern, the angle that it reaches to the side."""
     if table.kind not in ("nutating", "risley"):
         return math.radians(table.half_angle_deg)
     turn = np.linspace(0.0, 2 * np.pi, 721)
@@ -108,7 +110,7 @@ class Strip:
 
     Attributes:
         name: of the line.
-        start_s, end_s: when it is flown.
+        start_s, end_s: times at which the line begins and ends.
         from_m: (2,) east, north of its beginning.
         ahead: (2,) unit vector along it; the right hand is (ahead[1], −ahead[0]).
         length_m, speed_mps, height_m: of the line, ellipsoidal height.
@@ -127,22 +129,22 @@ class Strip:
 
     @property
     def end_m(self) -> FloatArray:
-        """(2,) east, north of its end."""
+        """(2,) east, north of the line's end."""
         end: FloatArray = self.from_m + self.length_m * self.ahead
         return end
 
     def beside(self, east_m: FloatArray, north_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return distances along the line and to its right of points (n,)."""
+        """Return the distances along the line and to its right of points (n,)."""
         east_m, north_m = east_m - self.from_m[0], north_m - self.from_m[1]
         return east_m * self.ahead[0] + north_m * self.ahead[1], east_m * self.ahead[1] - north_m * self.ahead[0]
 
     def point(self, along_m: FloatArray, right_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return east and north of what is so far along and to the right."""
+        """Return east and north of the points at these distances along the line and to its right."""
         east_m = self.from_m[0] + along_m * self.ahead[0] + right_m * self.ahead[1]
         return east_m, self.from_m[1] + along_m * self.ahead[1] - right_m * self.ahead[0]
 
     def covers(self, east_m: FloatArray, north_m: FloatArray, ground_m: FloatArray) -> NDArray[np.bool_]:
-        """Return (n,) whether ground at these heights is within the swath."""
+        """Return (n,) True where ground at these heights is within the swath."""
         along_m, right_m = self.beside(east_m, north_m)
         above_m = self.height_m - ground_m
         angle_rad = np.arctan2(right_m, above_m)
@@ -153,7 +155,7 @@ class Strip:
         return seen & (along_m >= 0.0) & (along_m <= self.length_m) & (above_m > 0.0)
 
     def density(self, east_m: FloatArray, north_m: FloatArray, ground_m: FloatArray, cell_m: float) -> FloatArray:
-        """Return (n,) pulses per square metre of ground, mean over a cell's width across the line."""
+        """Return (n,) pulses per square metre of ground, averaged over a cell's width across the line."""
         _, right_m = self.beside(east_m, north_m)
         above_m = self.height_m - ground_m
         inner, outer = (np.arctan2(right_m + side * cell_m / 2, above_m) for side in (-1.0, 1.0))
@@ -165,7 +167,7 @@ class Strip:
         return np.where(self.covers(east_m, north_m, ground_m), per_m2, 0.0)
 
     def width_m(self, above_m: float) -> tuple[float, float]:
-        """Return the swath's edges at a height above flat ground, to the right of the line."""
+        """Return the swath's two edges at a height above flat ground, as distances to the right of the line."""
         limits = [fan.limits(np.array([above_m])) for fan in self.fans]
         first = min(float(low[0]) for low, _ in limits)
         return above_m * math.tan(first), above_m * math.tan(max(float(high[0]) for _, high in limits))
@@ -183,10 +185,10 @@ def strip_of(plan: Plan, index: int, start_s: float, end_s: float) -> Strip:
 
 
 def corners(plan: Plan) -> FloatArray:
-    """Return (k, 2) east and north of ground that must be there: around every line, as wide as it can be seen.
+    """Return (k, 2) east and north of the ground that must exist: around every line, as wide as its scanners see.
 
-    `swath.sim.scene.terrain.MARGIN_M` beyond is there anyway, which is enough for a wing that dips a little; corners
-    lie outside the swath only where it is not.
+    The ground extends `swath.sim.scene.terrain.MARGIN_M` farther in any case, which is enough for a wing that dips a
+    little; corners lie outside the swath only where that is not enough.
     """
     terrain, found = plan.tables.terrain, []
     for index in range(len(plan.tables.line)):
@@ -206,7 +208,7 @@ def corners(plan: Plan) -> FloatArray:
 
 
 def _tilt_rad(plan: Plan) -> float:
-    """Return how far beams may be from where level wings and the installation point them."""
+    """Return the largest angle of beams from the directions given by level wings and the installation."""
     trues = [scanner.true for scanner in plan.tables.scanner.values()]
     mounted_deg = max((math.hypot(true.omega_deg, true.phi_deg, true.kappa_deg) for true in trues), default=0.0)
     flight = plan.tables.flight
@@ -215,7 +217,7 @@ def _tilt_rad(plan: Plan) -> float:
 
 
 def control_points(plan: Plan, scene: Scene) -> FloatArray:
-    """Return (k, 3) site frame: the plan's ground control points, where some line sees them.
+    """Return (k, 3) the plan's ground control points in the site frame, at places that some line sees.
 
     Raises:
         PlanError: ``control.points``: there is no room for so many.
@@ -233,7 +235,7 @@ def control_points(plan: Plan, scene: Scene) -> FloatArray:
 
 
 def refuse_ranges(plan: Plan, ground_m: Ground) -> None:
-    """Raises PlanError for the first line from which a scanner cannot measure any ground straight below."""
+    """Refuse the first line from which a scanner can measure no ground straight below it, with `PlanError`."""
     for index in range(len(plan.tables.line)):
         strip = strip_of(plan, index, 0.0, 0.0)
         along_m = np.linspace(0.0, strip.length_m, 200)
@@ -250,13 +252,13 @@ def refuse_ranges(plan: Plan, ground_m: Ground) -> None:
 
 
 class Survey:
-    """A plan flown over its ground: what the summary and the picture are made of.
+    """A plan flown over its ground; the summary and the picture are made from it.
 
     Args:
         plan: of the flight.
 
     Raises:
-        PlanError: it cannot be flown.
+        PlanError: the plan cannot be flown.
     """
 
     def __init__(self, plan: Plan) -> None:
@@ -268,13 +270,14 @@ class Survey:
         self.strips = tuple(strip_of(plan, line.index, line.start_s, line.end_s) for line in self.trajectory.lines)
 
     def stations(self, strip: Strip, count: int = 200) -> tuple[FloatArray, FloatArray]:
-        """Return distances along a line, and heights above ground there."""
+        """Return distances along a line, and the line's heights above ground there."""
         along_m = np.linspace(0.0, strip.length_m, count)
         return along_m, strip.height_m - self.scene.ground_m(*strip.point(along_m, np.zeros(count)))
 
     def edges(self, strip: Strip, count: int = 60) -> FloatArray:
-        """Return (2·count, 2) east and north around a swath on the ground as it is: each edge found by going there
-        thrice.
+        """Return (2·count, 2) east and north around a swath on the real ground.
+
+        Each edge is found by iteration with the ground height at the last estimate.
         """
         along_m = np.linspace(0.0, strip.length_m, count)
         sides = []
@@ -290,11 +293,11 @@ class Survey:
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """A map of what is covered; rows from south to north.
+    """A map of the coverage; rows go from south to north.
 
     Attributes:
         east_m: (nx,) centres of cells.
-        north_m: (ny,)
+        north_m: (ny,) centres of cells.
         cell_m: size of a cell.
         density: (ny, nx) pulses per square metre, of all lines.
         lines: (ny, nx) number of lines that cover the cell.
@@ -308,7 +311,7 @@ class Grid:
 
 
 def grid_of(survey: Survey, cells: int = 90_000) -> Grid:
-    """Return density and overlap over all swaths, on about so many square cells."""
+    """Return density and overlap over all swaths, on about this many square cells."""
     outline = np.concatenate([survey.edges(strip) for strip in survey.strips])
     low, high = outline.min(axis=0), outline.max(axis=0)
     cell_m = math.sqrt(float(np.prod(high - low)) / cells)
@@ -325,17 +328,17 @@ def grid_of(survey: Survey, cells: int = 90_000) -> Grid:
 
 
 def plan_summary(plan: Plan) -> list[dict[str, Any]]:
-    """Return one row a line, then one named ``total``; see `summary_of`. Raises PlanError."""
+    """Return one row for each line, then one named ``total``; see `summary_of`. Raises PlanError."""
     return summary_of(Survey(plan))
 
 
 def summary_of(survey: Survey) -> list[dict[str, Any]]:
-    """Return what a plan covers.
+    """Return the coverage of a plan as rows.
 
-    Rows of lines: ``name``, ``length_m``, ``seconds``, ``height_min_m`` and ``height_mean_m`` above ground,
-    ``swath_m`` (2 H tan of the half angle on flat ground, H the mean), ``density_per_m2`` (pulses a second within the
-    swath over speed times swath) and ``overlap_percent`` (of the swath, that the neighbour which covers most of it
-    covers too; 0 without a neighbour). Last row: ``name`` total, ``seconds`` in the air and on the ground, ``line_s``,
+    Rows of lines: ``name``, ``length_m``, ``seconds``, ``height_min_m`` and ``height_mean_m`` above ground, ``swath_m``
+    (2 H tan of the half angle on flat ground, H the mean), ``density_per_m2`` (pulses a second within the swath over
+    speed times swath) and ``overlap_percent`` (share of the swath that is also covered by the neighbour which covers
+    most of it; 0 without a neighbour). Last row: ``name`` total, ``seconds`` in the air and on the ground, ``line_s``,
     ``pulses`` and ``log_bytes`` expected.
     """
     rows = [_row(survey, strip) for strip in survey.strips]
@@ -373,7 +376,7 @@ def _row(survey: Survey, strip: Strip) -> dict[str, Any]:
 
 
 def _overlap_percent(survey: Survey, strip: Strip) -> float:
-    """Of points spread evenly over the swath, those that the best neighbour covers."""
+    """Return the percentage of points, spread evenly over the swath, that the best neighbour covers."""
     along_m, above_m = survey.stations(strip)
     left_m, right_m = strip.width_m(float(above_m.mean()))
     across_m = left_m + (right_m - left_m) * (np.arange(400) + 0.5) / 400
@@ -393,7 +396,10 @@ def _always_on(table: ScannerTable) -> bool:
 
 
 def _pulse_bytes(table: ScannerTable) -> float:
-    """Of the log, a pulse: its part of a datagram (SREP/1, VLP-16's data packet, Ouster's RNG19_RFL8_SIG16_NIR16)."""
+    """Return the bytes of the log per pulse: the pulse's part of a datagram.
+
+    Datagrams are those of SREP/1, VLP-16's data packet and Ouster's RNG19_RFL8_SIG16_NIR16.
+    """
     if table.kind == "vlp16":
         return (1206 + LOG_MESSAGE_BYTES) / (192 if table.dual_return else 384)
     if table.kind == "os1":

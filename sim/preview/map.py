@@ -1,4 +1,4 @@
-"""The map of a plan's picture: shaded ground, what stands on it, swaths, lines and the way between them."""
+"""The map in a plan's picture: shaded ground, objects on it, swaths, lines and the way between them."""
 
 from __future__ import annotations
 
@@ -43,24 +43,24 @@ KILOMETRES_FROM_M = 30_000.0
 
 
 def colour_of(number: int) -> str:
-    """Of a flight line."""
+    """Return the colour of a flight line."""
     return LINE_COLOURS[number % len(LINE_COLOURS)]
 
 
 def shortened(name: str, most: int) -> str:
-    """Return a name of so many letters at most."""
+    """Return a name cut to at most this many letters."""
     return name if len(name) <= most else f"{name[: most - 1]}…"
 
 
 def page_of(axes: Axes) -> Figure:
-    """That a panel is on."""
+    """Return the figure that a panel is on."""
     figure = axes.get_figure()
     assert isinstance(figure, Figure)
     return figure
 
 
 def nice_step(size: float, *, up: bool = False) -> float:
-    """Return the largest of 1, 2, 5 × 10ⁿ not above a size; ``up``: the smallest not below it."""
+    """Return the largest of 1, 2, 5 × 10ⁿ not above a size; with ``up`` the smallest not below it."""
     if size <= 0.0:
         return 1.0
     power = 10.0 ** math.floor(math.log10(size))
@@ -75,14 +75,14 @@ def draw_map(
     ground_m: Ground,
     frame: tuple[FloatArray, FloatArray, float],
 ) -> None:
-    """The map between two corners.
+    """Draw the map between two corners.
 
     Args:
         axes: to draw in.
-        survey: the plan, flown.
+        survey: the flown plan.
         track: (n, 4) time, east, north and height of the aircraft.
-        ground_m: heights all over the map.
-        frame: (2,) east and north of either corner; north is drawn larger than east by the last.
+        ground_m: function that gives heights all over the map.
+        frame: (2,) east and north of either corner, then the factor by which north is drawn larger than east.
     """
     low, high, stretch = frame
     _relief(axes, ground_m, low, high)
@@ -109,7 +109,7 @@ def draw_map(
 
 
 def _relief(axes: Axes, ground_m: Ground, low: FloatArray, high: FloatArray) -> None:
-    """Heights as soft colours with shadows, and contour lines."""
+    """Draw heights as soft colours with shadows, and contour lines."""
     size = high - low
     shape = np.maximum((SHADE_CELLS * size / size.max()).astype(int), 40)
     east_m, north_m = (np.linspace(low[axis], high[axis], shape[axis]) for axis in (0, 1))
@@ -135,7 +135,7 @@ def _relief(axes: Axes, ground_m: Ground, low: FloatArray, high: FloatArray) -> 
 
 
 def draw_ground(axes: Axes, survey: Survey, *, outlines: bool = False) -> None:
-    """What stands on the ground; ``outlines``: over colours that are not to be hidden."""
+    """Draw the objects on the ground; ``outlines`` draws only outlines, which hide no colours beneath."""
     scene = survey.scene
     for forest in [] if outlines else survey.plan.tables.terrain.forest:
         corners = np.array(forest.center_m) + np.array(forest.size_m) / 2 * [[-1, -1], [1, -1], [1, 1], [-1, 1]]
@@ -183,7 +183,7 @@ def _swath(axes: Axes, outline: FloatArray, colour: str, alpha: float) -> None:
 
 
 def _line(axes: Axes, strip: Strip, colour: str) -> None:
-    """A line with an arrow and its name behind its beginning; a little to its right, where a pilot keeps."""
+    """Draw a line with an arrow, its name behind its beginning, a little to its right."""
     aside = np.array([strip.ahead[1], -strip.ahead[0]]) * 1.4 / 72.0
     moved = axes.transData + ScaledTranslation(aside[0], aside[1], page_of(axes).dpi_scale_trans)
     start, end = strip.from_m, strip.end_m
@@ -213,7 +213,7 @@ def _line(axes: Axes, strip: Strip, colour: str) -> None:
 
 
 def _scale_bar(axes: Axes, low: FloatArray, high: FloatArray) -> None:
-    """In metres or kilometres, a seventh of the map at most."""
+    """Draw a scale bar in metres or kilometres, at most 0.15 of the map's width."""
     length_m = nice_step(0.15 * float(high[0] - low[0]))
     part = length_m / float(high[0] - low[0])
     place = axes.transAxes
@@ -245,7 +245,7 @@ def _north_arrow(axes: Axes) -> None:
 
 
 def _legend(axes: Axes, survey: Survey) -> None:
-    """Below the map: what of it there is."""
+    """Draw the legend below the map, with entries only for what the map contains."""
     scene, control = survey.scene, survey.plan.tables.control
     entries: list[tuple[Any, str, Any]] = [
         (True, "flight line", Line2D([], [], color=LINE_COLOURS[0], lw=2)),
@@ -280,7 +280,7 @@ def _legend(axes: Axes, survey: Survey) -> None:
 
 
 def _origin(axes: Axes, survey: Survey, stretch: float) -> None:
-    """Where the site is on earth."""
+    """Write the site's place on earth above the map."""
     lat_deg, lon_deg = survey.plan.tables.flight.origin_deg
     crs = survey.plan.tables.flight.crs
     east_m, north_m = Transformer.from_crs("EPSG:4326", crs, always_xy=True).transform(lon_deg, lat_deg)[:2]
@@ -295,6 +295,6 @@ def _origin(axes: Axes, survey: Survey, stretch: float) -> None:
 
 
 def heading(axes: Axes, text: str, above: float, *, x: float = 0.0, **style: Any) -> None:
-    """A line of text so many points above a panel."""
+    """Write a line of text this many points above a panel."""
     look: dict[str, Any] = {"fontsize": 9.5, "color": INK, "va": "bottom"} | style
     axes.annotate(text, (x, 1.0), xytext=(0.0, above), xycoords="axes fraction", textcoords="offset points", **look)

@@ -1,4 +1,4 @@
-"""A plan as a picture: map, height profile, density, overlap and a table on one page."""
+"""Draws a plan as a picture: map, height profile, density, overlap and a table on one page."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from swath.sim.scene.terrain import build_ground
 
 FORMATS = (".pdf", ".png", ".svg")
 DPI = 150
-GROUND_CELLS = 500  # of the ground along the map's longer side
-WIDE = 1.7  # maps wider than this times their height stand above the rest instead of beside it
-STRETCH = 8.0  # and beyond this the shorter side is drawn larger than it is
+GROUND_CELLS = 500  # cells of the ground along the map's longer side
+WIDE = 1.7  # maps wider than this times their height are above the other panels, not beside them
+STRETCH = 8.0  # ratio of the sides from which on the shorter one is drawn at a larger scale
 OVERLAP_COLOURS = ("#f2ead3", "#a8d5ba", "#5fb0a5", "#2f7fa3", "#3d4f96", "#4b2a78")
 Box = tuple[float, float, float, float]  # left, bottom, width, height in inches
 TALL_PAGE, WIDE_PAGE = (17.0, 10.6), (17.0, 11.4)
@@ -37,20 +37,20 @@ WIDE_PANELS: dict[str, Box] = {
     "overlap": (6.1, 0.75, 4.2, 1.35),
     "table": (11.0, 0.3, 5.7, 4.35),
 }
-HEADER_IN, LARGEST_PITCH_IN, SMALLEST_PITCH_IN = 0.42, 0.24, 0.145  # of the table's rows
+HEADER_IN, LARGEST_PITCH_IN, SMALLEST_PITCH_IN = 0.42, 0.24, 0.145  # heights of the table's header and rows
 MOST_ROWS = 24
 
 
 def draw_plan(plan: Plan, path: Path) -> list[dict[str, Any]]:
-    """Draw a plan onto one page; gives its `swath.sim.preview.coverage.plan_summary`.
+    """Draw a plan onto one page and return its `swath.sim.preview.coverage.plan_summary`.
 
     Args:
         plan: of the flight.
         path: of a PNG, PDF or SVG.
 
     Raises:
-        PlanError: the plan cannot be flown, or the path's ending is another.
-        OSError: it cannot be written.
+        PlanError: the plan cannot be flown, or the path has another ending.
+        OSError: the picture cannot be written.
     """
     if path.suffix.lower() not in FORMATS:
         raise PlanError(str(path), f"want a picture's name that ends in one of {', '.join(FORMATS)}")
@@ -76,7 +76,10 @@ def draw_plan(plan: Plan, path: Path) -> list[dict[str, Any]]:
 
 
 def _tall_panels(rows: int, grid: Grid) -> dict[str, Box]:
-    """Return the map at the left; at the right the table takes what it needs, the small maps what suits their shape."""
+    """Return the panels of a tall page: the map at the left, the other panels at the right.
+
+    The table gets the height that it needs, the small maps the height that suits their shape.
+    """
     rows = min(rows, MOST_ROWS + 1)
     table = HEADER_IN + rows * float(np.clip(3.3 / rows, SMALLEST_PITCH_IN, LARGEST_PITCH_IN))
     bottom, left, width = 0.3 + table + 0.45, 10.35, 2.95
@@ -100,7 +103,7 @@ def _panel(figure: Figure, page: tuple[float, float], box: Box) -> Axes:
 
 
 def _track(survey: Survey) -> FloatArray:
-    """Return (n, 4) time, east, north and ellipsoidal height of the aircraft, every half second or so."""
+    """Return (n, 4) time, east, north and ellipsoidal height of the aircraft, about every half second."""
     end_s = survey.trajectory.end_s
     time_s = np.linspace(0.0, end_s, int(np.clip(2 * end_s, 200, 8000)))
     points = survey.site.site_from_e(survey.trajectory.poses(time_s).position_e)
@@ -108,7 +111,7 @@ def _track(survey: Survey) -> FloatArray:
 
 
 def _extent(survey: Survey, track: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return south-western and north-eastern corner of what is shown."""
+    """Return the south-western and the north-eastern corner of the map."""
     points = np.concatenate([track[:, 1:3], *(survey.edges(strip) for strip in survey.strips)])
     low, high = points.min(axis=0), points.max(axis=0)
     border = 0.05 * (high - low)
@@ -116,7 +119,7 @@ def _extent(survey: Survey, track: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _framed(low: FloatArray, high: FloatArray, box: Box) -> tuple[FloatArray, FloatArray, float]:
-    """Return the corners, moved apart until they fill a panel; and by how much north is drawn larger than east."""
+    """Return the corners, moved apart until they fill a panel, and the scale of north divided by that of east."""
     panel, middle = np.array(box[2:]), (low + high) / 2
     scale = (high - low) / panel
     if scale.max() < STRETCH * scale.min():
@@ -126,7 +129,10 @@ def _framed(low: FloatArray, high: FloatArray, box: Box) -> tuple[FloatArray, Fl
 
 
 def _wide_ground(survey: Survey, low: FloatArray, high: FloatArray) -> Ground:
-    """Return heights all over the map; of a raster only where the flight asks for them, and beyond as at the edge."""
+    """Return a function that gives heights all over the map.
+
+    A raster is read only where the flight needs it; beyond, heights are those at its edge.
+    """
     if survey.plan.tables.terrain.raster:
         return survey.scene.ground_m
     cell_m = float(np.clip((high - low).max() / GROUND_CELLS, 0.25, 100.0))
@@ -158,7 +164,7 @@ def _scanner_words(table: Any) -> str:
 
 
 def _profile(axes: Axes, survey: Survey, track: FloatArray, ground: Ground) -> None:
-    """Heights over time: the ground below, the aircraft, and how much is between them on each line."""
+    """Draw heights over time: the ground below, the aircraft, and the height above ground on each line."""
     unit_s, unit = (60.0, "min") if track[-1, 0] > 300.0 else (1.0, "s")
     time, height_m = track[:, 0] / unit_s, track[:, 3]
     ground_m = ground(track[:, 1], track[:, 2])
@@ -177,7 +183,7 @@ def _profile(axes: Axes, survey: Survey, track: FloatArray, ground: Ground) -> N
 
 
 def _profile_lines(axes: Axes, survey: Survey, unit_s: float, top: float) -> None:
-    """Each line's time in its colour, its height above ground in the middle; its name above where there is room."""
+    """Draw each line's time in its colour and its height above ground; its name is above if there is room."""
     crowded = len(survey.strips) > 10
     for number, strip in enumerate(survey.strips):
         start, end, colour = strip.start_s / unit_s, strip.end_s / unit_s, colour_of(number)
@@ -218,7 +224,7 @@ def _bounds(grid: Grid) -> tuple[float, float, float, float]:
 
 
 def _small_map(axes: Axes, survey: Survey, grid: Grid, title: str) -> None:
-    """Frame of a map of the swaths alone, with what stands on the ground for orientation."""
+    """Draw the frame of a map of the swaths alone, with the objects on the ground for orientation."""
     west, east, south, north = _bounds(grid)
     panel = axes.get_position().bounds
     figure = page_of(axes)
@@ -243,7 +249,7 @@ def _bar(axes: Axes, image: Any, labels: Sequence[str]) -> None:
     drawn.outline.set_visible(False)
 
 
-COLUMNS: tuple[tuple[str, float, Callable[[dict[str, Any]], str]], ...] = (  # heading, its place, how a row says it
+COLUMNS: tuple[tuple[str, float, Callable[[dict[str, Any]], str]], ...] = (  # heading, its place, text of a row
     ("line", 0.03, lambda row: shortened(row["name"], 24)),
     ("length", 0.32, lambda row: f"{row['length_m']:.0f} m"),
     ("time", 0.43, lambda row: f"{row['seconds']:.1f} s"),
@@ -255,7 +261,7 @@ COLUMNS: tuple[tuple[str, float, Callable[[dict[str, Any]], str]], ...] = (  # h
 
 
 def _table(axes: Axes, rows: Sequence[dict[str, Any]]) -> None:
-    """The summary's rows, each with its line's colour."""
+    """Draw the summary's rows, each with its line's colour."""
     lines, left_out = rows[:-1][:MOST_ROWS], len(rows) - 1 - MOST_ROWS
     figure = page_of(axes)
     inches = axes.get_position().height * figure.get_size_inches()[1]

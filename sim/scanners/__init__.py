@@ -1,1 +1,1 @@
-"""Scanners: how a head sends its pulses, what it measures of their echoes."""
+"""Scanners: how a head emits its pulses, how it measures their echoes, and the packets that it sends."""

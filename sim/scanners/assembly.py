@@ -1,4 +1,4 @@
-"""Which head and which wire a kind of scanner has."""
+"""Chooses the head and the wire of each kind of scanner."""
 
 from __future__ import annotations
 
@@ -18,27 +18,27 @@ from swath.sim.truth import StructArray
 
 
 class Head(Protocol):
-    """Where pulses come from."""
+    """The source of a scanner's pulses."""
 
     def pulses(self, start_s: float, stop_s: float) -> Pulses:
-        """Return those that leave in this time."""
+        """Return the pulses that leave in this time."""
 
 
 class Wire(Protocol):
-    """What the scanner says of them."""
+    """Encodes a scanner's measurements into the units that it sends."""
 
     def units(self, pulses: Pulses, measured: Measured, truth: StructArray) -> tuple[list[WireUnit], StructArray]:
-        """Return datagrams that are complete, and the truth of their returns."""
+        """Return the datagrams that are complete, and the truth of their returns."""
 
     def idle(self, start_s: float, stop_s: float) -> list[WireUnit]:
-        """Return what is said while the laser is off."""
+        """Return the units that are sent while the laser is off."""
 
     def close(self) -> tuple[list[WireUnit], StructArray]:
-        """Return what is left."""
+        """Return the units that are left at the end."""
 
 
 def head_and_wire(plan: Plan, name: str, pps: PulsePerSecond | None, trajectory: Trajectory) -> tuple[Head, Wire]:
-    """Return the parts of a scanner of the plan; raises `PlanError`."""
+    """Return the head and the wire of a scanner of the plan; raises `PlanError`."""
     tables = plan.tables
     table = tables.scanner[name]
     lost_pps = windows(tables, f"scanner/{name}", "pps_lost")

@@ -1,4 +1,4 @@
-"""Calibration files of a plan's scanners: what they really are, and what their papers say (CONVENTIONS)."""
+"""Calibration files of a plan's scanners: true and nominal ones (CONVENTIONS)."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ SPINNING = ("vlp16", "os1")
 
 
 def mirror_factor(table: ScannerTable) -> float:
-    """Return beam angle per encoder angle: 2 for a flat mirror that swings about an axis in its plane, else 1."""
+    """Return the beam angle per encoder angle: 2 for a flat mirror that swings about an axis in its plane, else 1."""
     return 2.0 if table.kind == "oscillating" else 1.0
 
 
 def check_latencies(tables: Tables) -> None:
-    """A scanner's IMU latency is the IMU's own: refuse it where it has no effect; raises `PlanError`."""
+    """Refuse a true IMU latency of a scanner with `PlanError`; the latency is the IMU's own and has no effect here."""
     for name, table in tables.scanner.items():
         if table.true.imu_latency_us != 0.0:
             key = f"scanner.{name}.true.imu_latency_us"
@@ -27,12 +27,12 @@ def check_latencies(tables: Tables) -> None:
 
 
 def _imu_latency_us(tables: Tables) -> float:
-    """Of the first IMU, which the attitude is taken from."""
+    """Return the latency of the first IMU, which supplies the attitude."""
     return next((table.latency_us for table in tables.imu.values()), 0.0)
 
 
 def calibration_text(plan: Plan, scanner: str, *, true: bool) -> str:
-    """Return a calibration file: the true one with every error there is, or the nominal one."""
+    """Return a calibration file: the true one with all errors, or the nominal one."""
     table = plan.tables.scanner[scanner]
     document: dict[str, Any] = {
         "calibration": _header(plan, scanner, table, "true" if true else "nominal"),

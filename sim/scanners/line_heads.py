@@ -1,12 +1,13 @@
-"""Line scanners: when pulses leave, where the light goes, and what the encoder says of it.
+"""Line scanners: emission times of pulses, directions of the light, and readings of the encoder.
 
 The light follows the mirrors (`swath.sim.scanners.mirrors`), the mirrors their motion (`swath.sim.scanners.motions`).
-The encoder says what makes CONVENTIONS' equation true, with the plan's true parameters:
+The encoder's reading is the one that fulfils CONVENTIONS' equation with the plan's true parameters:
 
     θ = (1 + scan_angle_scale) · (θ_encoder − scan_angle_offset) + encoder_latency · dθ/dt + torsion · d²θ/dt²
 
-dθ/dt and d²θ/dt² are the beam's own here. Who takes them from readings errs by the errors' own derivatives, of second
-order: latency² · d²θ/dt² (1 µs, 40 Hz, ±30°: 3e-8 rad) and torsion² · d⁴θ/dt⁴ (2e-9 s²: 1e-8 rad), less than a count.
+dθ/dt and d²θ/dt² are the beam's own here. Derivatives taken from readings instead are wrong by the errors' own
+derivatives, of second order: latency² · d²θ/dt² (1 µs, 40 Hz, ±30°: 3e-8 rad) and torsion² · d⁴θ/dt⁴ (2e-9 s²: 1e-8
+rad), less than a count.
 """
 
 from __future__ import annotations
@@ -27,10 +28,10 @@ from swath.sim.scanners import mirrors, motions
 from swath.sim.scanners.motions import Motion, Swing
 from swath.sim.shots import Pulses
 
-TICKS_PER_PULSE = 2  # fewer, and rounding to ticks would double or halve the time between two pulses
+TICKS_PER_PULSE = 2  # with fewer, rounding to ticks would double or halve the time between two pulses
 LARGEST_ERROR_DEG = 10.0
 LARGEST_SCALE_PPM = 100_000.0
-READING_COUNTS = 1.6 * 2**31  # of 2³² that a signed reading of 32 bits has: the rest is for errors
+READING_COUNTS = 1.6 * 2**31  # share of the 2³² counts of a 32-bit reading; the rest is for errors
 SHAFT_ANGLE_DEG = 45.0  # nutating: between the mirror's shaft and the laser's beam
 
 Direction = Callable[[Swing], FloatArray]
@@ -38,13 +39,13 @@ Direction = Callable[[Swing], FloatArray]
 
 @dataclass(frozen=True, slots=True)
 class Deflection:
-    """How a kind of line scanner deflects its beam.
+    """Deflection of the beam in one kind of line scanner.
 
     Attributes:
-        motion: of its mirror or prisms.
-        direction: (n, 3) unit vectors in s where it stands.
-        shaft_factor: beam angle a shaft angle.
-        half_angle_rad: pulses beyond leave no light; inf: all leave.
+        motion: motion of its mirror or prisms.
+        direction: function that gives (n, 3) unit vectors in s for a position of the deflector.
+        shaft_factor: beam angle per shaft angle.
+        half_angle_rad: pulses beyond this angle leave no light; inf: all pulses do.
     """
 
     motion: Motion
@@ -57,14 +58,14 @@ class LineHead:
     """A scanner of kind oscillating, polygon, monogon, nutating or risley.
 
     Pulse k leaves at tick round(k · tick_hz / prf_hz) of the device's counter, counted from the plan's start. A pulse's
-    true time is that of its tick plus the true ``time_offset``: the stamps are early by it.
+    true time is that of its tick plus the true ``time_offset``, because the stamps are early by that offset.
 
     Args:
         table: of the plan.
         name: of the scanner.
 
     Raises:
-        PlanError: a scanner that cannot be.
+        PlanError: such a scanner is impossible.
     """
 
     def __init__(self, table: ScannerTable, name: str) -> None:
@@ -100,7 +101,7 @@ class LineHead:
         )
 
     def _fired(self, start_s: float, stop_s: float) -> tuple[IntArray, FloatArray]:
-        """Return numbers and times of pulses in this time, also of those that leave no light."""
+        """Return numbers and times of the pulses in this time, including those that leave no light."""
         edges = self._oscillator.phase(np.array([start_s, stop_s]) - self._time_offset_s)
         first, last = np.floor(edges * (self._table.prf_hz / self._table.tick_hz)).astype(np.int64)
         number = np.arange(max(first - 1, 0), max(last + 3, 0))
@@ -113,7 +114,7 @@ class LineHead:
         return np.rint(self._shaft_rad(swing) * (self._table.encoder_counts / (2 * np.pi))).astype(np.int64)
 
     def _shaft_rad(self, swing: Swing) -> FloatArray:
-        """Return (n,) the same before they are rounded: CONVENTIONS' equation solved for θ_encoder, on the shaft."""
+        """Return (n,) readings before rounding: CONVENTIONS' equation solved for θ_encoder, on the shaft."""
         beam = swing.angle_rad - self._latency_s * swing.rate_rps - self._torsion_s2 * swing.acceleration_rps2
         shaft: FloatArray = swing.centre_rad + (beam / self._scale + self._offset_rad) / self._deflection.shaft_factor
         return shaft
@@ -133,7 +134,7 @@ class LineHead:
             self._check_facet(key, swing)
 
     def _check_facet(self, key: str, swing: Swing) -> None:
-        """A reading beyond its facet would be taken for one of the next."""
+        """Refuse a scan with readings beyond their facet, which would count as readings of the next one."""
         ends = np.array([-1.0, 1.0]) * self._deflection.half_angle_rad
         nothing = np.zeros(2)
         shaft = self._shaft_rad(Swing(ends, swing.rate_rps[:2], nothing, nothing, np.zeros(2, np.uint16)))
@@ -147,7 +148,7 @@ class LineHead:
 
 
 def emission_ticks(table: ScannerTable, number: IntArray) -> IntArray:
-    """Return (n,) ticks from the plan's start at which pulses of these numbers (n,) leave."""
+    """Return (n,) ticks from the plan's start at which the pulses with these numbers (n,) leave."""
     return np.rint(number * table.tick_hz / table.prf_hz).astype(np.int64)
 
 
@@ -226,9 +227,7 @@ def _risley(table: ScannerTable, name: str) -> Deflection:
 
 
 def _turns_until_both_are_back(table: ScannerTable, name: str) -> int:
-    """Return turns of the first prism, counted by its encoder, after which the second one stands as at the
-    beginning.
-    """
+    """Return the turns of the first prism, counted by its encoder, after which the second is as at the beginning."""
     most = int(READING_COUNTS / table.encoder_counts)
     turns = Fraction(table.prism_ratio).limit_denominator(most)
     if abs(float(turns) - table.prism_ratio) > 1e-12:

@@ -1,6 +1,6 @@
-"""How deflectors move: the angle CONVENTIONS counts (θ of the beam, γ of a shaft), its rate and its acceleration.
+"""Motions of deflectors: the angle that CONVENTIONS counts (θ of the beam, γ of a shaft), its rate and acceleration.
 
-All are closed forms of the true time, so a motion goes on evenly however time is cut.
+All are closed forms of the true time, so a motion is continuous however time is cut.
 """
 
 from __future__ import annotations
@@ -13,15 +13,15 @@ from numpy.typing import NDArray
 
 from swath.georef.arrays import FloatArray
 
-TURNING_SHARE = 0.2  # of the time of a triangle that its turning points take
+TURNING_SHARE = 0.2  # share of a triangle's time that its turning points take
 
 
 @dataclass(frozen=True, slots=True)
 class Swing:
-    """Where a deflector is at n times.
+    """Positions of a deflector at n times.
 
     Attributes:
-        angle_rad: (n,) true beam angle, or the shaft's where the beam goes round in a figure.
+        angle_rad: (n,) true beam angle, or the shaft's angle where the beam draws a figure.
         rate_rps, acceleration_rps2: (n,) its derivatives by time, radians.
         centre_rad: (n,) the shaft's reading at angle 0: of a polygon the centre of the facet, else 0.
         facet: (n,) of a polygon, else 0.
@@ -34,7 +34,7 @@ class Swing:
     facet: NDArray[np.uint16]
 
     def chosen(self, which: NDArray[np.bool_]) -> Swing:
-        """At some of the times."""
+        """Return the positions at the chosen times."""
         return Swing(
             self.angle_rad[which],
             self.rate_rps[which],
@@ -48,7 +48,7 @@ Motion = Callable[[FloatArray], Swing]
 
 
 def sine(half_angle_rad: float, scan_hz: float) -> Motion:
-    """Return θ = A sin 2πft."""
+    """Return the motion θ = A sin 2πft."""
     turn = 2 * np.pi * scan_hz
 
     def swing(time_s: FloatArray) -> Swing:
@@ -60,9 +60,10 @@ def sine(half_angle_rad: float, scan_hz: float) -> Motion:
 
 
 def triangle(half_angle_rad: float, scan_hz: float) -> Motion:
-    """Return even motion to and fro; while it turns round the rate goes from +v to −v as a cosine, so θ̈ is continuous.
+    """Return an even motion to and fro with smooth turning points.
 
-    Phases are in periods: from a zero crossing the even part goes to (1 − q)/4, the turning takes q/2.
+    At a turning point the rate goes from +v to −v as a cosine, so θ̈ is continuous. Phases are in periods: from a zero
+    crossing the even part goes to (1 − q)/4, the turning takes q/2.
     """
     even, turning = (1.0 - TURNING_SHARE) / 4, TURNING_SHARE / 2
     speed = half_angle_rad / (even + turning / np.pi)  # radians a period
@@ -82,7 +83,10 @@ def triangle(half_angle_rad: float, scan_hz: float) -> Motion:
 
 
 def turning(scan_hz: float, turns: int = 1) -> Motion:
-    """Return a shaft that turns evenly; its angle counts on through so many turns, from minus to plus half of them."""
+    """Return the motion of an evenly turning shaft.
+
+    Its angle counts through this many turns, from minus to plus half of them.
+    """
 
     def swing(time_s: FloatArray) -> Swing:
         angle = 2 * np.pi * turns * _within(scan_hz * time_s / turns)
@@ -92,7 +96,7 @@ def turning(scan_hz: float, turns: int = 1) -> Motion:
 
 
 def polygon(scan_hz: float, facets: int) -> Motion:
-    """Return a polygon that turns evenly: θ is twice the shaft's angle from the centre of the facet in the light."""
+    """Return the motion of an evenly turning polygon: θ is twice the shaft's angle from the centre of the lit facet."""
 
     def swing(time_s: FloatArray) -> Swing:
         turns = scan_hz * time_s
@@ -107,7 +111,7 @@ def polygon(scan_hz: float, facets: int) -> Motion:
 
 
 def _within(periods: FloatArray) -> FloatArray:
-    """Return (n,) without whole periods, −½ … ½."""
+    """Return (n,) the periods without whole periods, −½ … ½."""
     rest: FloatArray = periods - np.floor(periods + 0.5)
     return rest
 

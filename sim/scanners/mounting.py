@@ -1,6 +1,6 @@
-"""From the scanner's own frame to the ground's: how a head hangs in the aircraft, and where its beams go.
+"""The chain from the scanner's own frame to the site frame: how a head is mounted, and where its beams go.
 
-CONVENTIONS' chain in the direction of the light: s → b → e → site frame (ISO/TS 19159-2 Eq. 10).
+It is CONVENTIONS' chain in the direction of the light: s → b → e → site frame (ISO/TS 19159-2 Eq. 10).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Three = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class Beams:
-    """Axes of beams in the site frame, where they start, and the same in e for the truth."""
+    """Axes of beams: their origins and directions in the site frame, and the origins in e for the truth."""
 
     origin_e: FloatArray
     origin: FloatArray
@@ -41,7 +41,7 @@ class Mounting:
         self._rot_omega = Rotation.from_euler("x", true.omega_deg, degrees=True).as_matrix()
 
     def beams(self, pulses: Pulses, poses: Poses, site: Site) -> Beams:
-        """Return axes of pulses as they leave, at their poses of emission."""
+        """Return the axes of pulses as they leave, at their poses of emission."""
         origin_e, origin, direction = np.empty((3, len(pulses), 3))
         _axes(
             (pulses.origin_s, pulses.direction_s, pulses.phi_extra_rad),
@@ -55,7 +55,7 @@ class Mounting:
 
 @jit_inline
 def _turned(rotation: FloatArray, vector: FloatArray | Three) -> Three:
-    """Return a vector (3,) by a matrix (3, 3), as three numbers."""
+    """Return a vector (3,) multiplied by a matrix (3, 3), as three numbers."""
     return (
         rotation[0, 0] * vector[0] + rotation[0, 1] * vector[1] + rotation[0, 2] * vector[2],
         rotation[1, 0] * vector[0] + rotation[1, 1] * vector[1] + rotation[1, 2] * vector[2],
@@ -71,7 +71,10 @@ def _axes(
     site: tuple[FloatArray, FloatArray],
     out: tuple[FloatArray, FloatArray, FloatArray],
 ) -> None:
-    """s → b (installation and κ, then φ with each pulse's slope, then ω) → e → site frame, pulse by pulse."""
+    """Transform the pulses one by one: s → b → e → site frame.
+
+    The step s → b applies installation and κ, then φ with each pulse's slope, then ω.
+    """
     origin_s, direction_s, phi_extra = pulses
     rot_kappa_installation, phi, rot_omega, lever_arm_b = mounting
     position_e, rot_e_from_b = poses

@@ -1,7 +1,7 @@
-"""What an Ouster OS1 says: its metadata, and lidar packets, single (strongest) or dual return.
+"""The output of an Ouster OS1: its metadata, and lidar packets with single (strongest) or dual returns.
 
-Packets by `swath.drivers.scanner.ouster.layout`. The head counts nanoseconds in mode TIME_FROM_SYNC_PULSE_IN: a second
-a pulse since power-on (`swath.sim.scanners.spinning_wire.HeadClock`).
+Packets follow `swath.drivers.scanner.ouster.layout`. The head counts nanoseconds in mode TIME_FROM_SYNC_PULSE_IN: each
+pulse since power-on counts as one second (`swath.sim.scanners.spinning_wire.HeadClock`).
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ RANGE_UNIT_M = 0.001
 RANGE_MAX_RAW = (1 << 19) - 1
 SERIAL_BITS = 40
 FRAME_IDS = 1 << 16
-HALF_FIELD_DEG = 16.6  # of an OS1-64, evenly filled
+HALF_FIELD_DEG = 16.6  # half of the vertical field of an OS1-64, evenly filled
 STAGGER_DEG = (4.23, 1.41, -1.41, -4.23)  # four columns of diodes behind the lens
-STAGGER_COLUMNS = (24, 16, 8, 0)  # by which rows of the image are shifted against each other
+STAGGER_COLUMNS = (24, 16, 8, 0)  # columns by which rows of the image are shifted
 BEAM_ORIGIN_MM = 15.806
 LIDAR_ABOVE_SENSOR_MM = 36.18
 IMU_IN_SENSOR_MM = (6.253, -11.775, 7.645)
@@ -95,11 +95,11 @@ class OusterWire:
     Args:
         plan: of the flight.
         name: of the scanner.
-        pps: wired to SYNC_PULSE_IN; None: nothing is.
+        pps: pulse wired to SYNC_PULSE_IN; None: no pulse is wired.
         lost_pps: (from, to) in which the head gets no pulse.
 
     Raises:
-        PlanError: a serial number that its packets cannot carry.
+        PlanError: the packets cannot carry the serial number.
     """
 
     def __init__(self, plan: Plan, name: str, pps: PulsePerSecond | None, lost_pps: Windows = ()) -> None:
@@ -113,12 +113,11 @@ class OusterWire:
         self._arrivals = Arrivals(plan, self._source)
 
     def units(self, pulses: Pulses, measured: Measured, truth: StructArray) -> tuple[list[WireUnit], StructArray]:
-        """Return packets that are complete, and the truth of their returns in the order in which `OusterParser` gives
-        them.
+        """Return the packets that are complete, and the truth of their returns in the order of `OusterParser`.
 
         Args:
             pulses: of `Os1Head`, consecutive.
-            measured: of them, (n, R).
+            measured: of the pulses, (n, R).
             truth: `RETURN_TRUTH_DTYPE` (n, R), same slots.
         """
         raw, light = counts(measured, RANGE_UNIT_M, RANGE_MAX_RAW)
@@ -129,20 +128,20 @@ class OusterWire:
         fields: dict[str, IntArray] = {}
         for slot, which in zip(slots, ("", "2"), strict=False):
             fields[f"RANGE{which}"] = in_slot(raw, slot)
-            # the parser's intensity is the signal: it and the reflectivity are what the receiver says
+            # the parser reads the signal as intensity: signal and reflectivity are both the receiver's intensity
             fields[f"SIGNAL{which}"] = fields[f"REFLECTIVITY{which}"] = in_slot(light, slot)
         return self._packets(number, time_s, fields), _truth(raw, slots, truth)
 
     def idle(self, start_s: float, stop_s: float) -> list[WireUnit]:
-        """Return a head that does not fire says nothing."""
+        """Return an empty list; a head that does not fire sends nothing."""
         return []
 
     def close(self) -> tuple[list[WireUnit], StructArray]:
-        """Return a packet that is not full is not sent."""
+        """Return no packets; a packet that is not full is not sent."""
         return [], np.empty(0, RETURN_TRUTH_DTYPE)
 
     def _packets(self, number: IntArray, time_s: FloatArray, fields: dict[str, IntArray]) -> list[WireUnit]:
-        """Return packets of pulses (n,) with these fields (n,)."""
+        """Return the packets of pulses (n,) with these fields (n,)."""
         shape = (-1, COLUMNS_OF_PACKET, BEAMS)
         shaped = {name: values.reshape(shape) for name, values in fields.items()}
         fired_s = time_s.reshape(shape)[:, :, 0]
@@ -159,7 +158,7 @@ class OusterWire:
 
 
 def _strongest(raw: IntArray, light: IntArray, count: int) -> list[IntArray]:
-    """Return slots (n,) of the strongest return, and of the second-strongest where two are wanted."""
+    """Return the slots (n,) of the strongest return, and of the second-strongest if ``count`` is 2."""
     rank = np.where(raw > 0, light, -1)
     slots = [best_slot(rank)]
     if count == 2:
@@ -169,7 +168,10 @@ def _strongest(raw: IntArray, light: IntArray, count: int) -> list[IntArray]:
 
 
 def _truth(raw: IntArray, slots: list[IntArray], truth: StructArray) -> StructArray:
-    """Return truth of the returns in these slots, (n,) each, flattened: pulse by pulse, of two the nearer first."""
+    """Return the truth of the returns in these slots, (n,) each, flattened pulse by pulse.
+
+    Of two returns the nearer is first.
+    """
     pulse = np.arange(len(raw))
     rows = np.stack([truth[pulse, slot] for slot in slots], axis=1)
     there = np.stack([slot >= 0 for slot in slots], axis=1)
@@ -184,18 +186,19 @@ def _truth(raw: IntArray, slots: list[IntArray], truth: StructArray) -> StructAr
 
 
 def _check_serial(serial: str, key: str) -> None:
-    """A number of digits must be read back from packets as it stands; other texts are none to a head."""
+    """Refuse a serial number of digits that packets cannot return unchanged; other texts pass."""
     if serial.isdecimal() and (str(int(serial)) != serial or int(serial) >= 1 << SERIAL_BITS):
         raise PlanError(key, f'got "{serial}", want a number below 2^{SERIAL_BITS} without leading zeros')
 
 
 def config_table(table: ScannerTable, name: str, transport: str) -> dict[str, Any]:
-    """Return ``[scanner.<name>]`` of the configuration that records this head; its metadata beside it is
-    ``<name>.json``.
+    """Return ``[scanner.<name>]`` of the configuration that records this head.
+
+    The head's metadata is in ``<name>.json`` beside it.
 
     Args:
         table: of the plan.
         name: of the scanner.
-        transport: where its packets go.
+        transport: URI at which its packets arrive.
     """
     return head_config(table, transport, "ouster") | {"geometry": {"file": f"{name}.json"}}

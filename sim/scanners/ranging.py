@@ -1,4 +1,4 @@
-"""The receiver: what it says of echoes — ranges with every error of CONVENTIONS' model, intensities, pulse widths."""
+"""The receiver: ranges with every error of CONVENTIONS' model, intensities and pulse widths of echoes."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from swath.sim.shots import Echoes, Measured, Pulses
 from swath.sim.truth import StructArray
 
 LIGHT_MPS = 299_792_458.0
-THRESHOLD = 0.005  # of full intensity: weaker echoes are not detected
-STEEPEST_RAD = np.radians(85.0)  # flatter incidence is taken for this one, so that no footprint has infinite depth
+THRESHOLD = 0.005  # share of full intensity below which echoes are not detected
+STEEPEST_RAD = np.radians(85.0)  # flatter incidence counts as this one, so that no footprint has infinite depth
 LARGEST_SCALE_PPM = 100_000.0
-_SLOTS = 16  # more than any scanner has
+_SLOTS = 16  # more slots than any scanner has
 
 
 @dataclass(frozen=True, slots=True)
 class IntensityScale:
-    """Counts of a receiver.
+    """Intensity counts of a receiver.
 
     Attributes:
-        full: of a surface of reflectance 1 at the reference range, met perpendicularly, in clear air.
-        most: where it saturates.
+        full: counts of a surface of reflectance 1 at the reference range, met perpendicularly, in clear air.
+        most: counts at saturation.
     """
 
     full: float
@@ -45,13 +45,13 @@ class Ranging:
 
     Args:
         table: of the plan.
-        air: on the way.
-        seed, name: of its noise.
-        noise: False: ranges without noise.
-        intensity: its counts; None: by the kind.
+        air: air on the way.
+        seed, name: names that its noise depends on.
+        noise: False gives ranges without noise.
+        intensity: its intensity counts; None: those of the scanner's kind.
 
     Raises:
-        PlanError: a range gate without width, intensities of ``ibrc`` out of order.
+        PlanError: the range gate has no width, or intensities of ``ibrc`` are out of order.
     """
 
     def __init__(
@@ -72,16 +72,16 @@ class Ranging:
         _check(table, f"scanner.{name}")
 
     def measure(self, pulses: Pulses, echoes: Echoes, from_height_m: FloatArray, to_height_m: FloatArray) -> Measured:
-        """Return what the device says.
+        """Return the measurements that the device reports.
 
         Args:
-            pulses: n.
-            echoes: of them, R slots.
+            pulses: n pulses.
+            echoes: of the pulses, R slots.
             from_height_m: (n,) of the scanner, to_height_m (n, R) of the echoes, for the air.
 
         Returns:
-            slots as those of the echoes, which keep their places: a slot whose echo is too weak or outside the range
-            gate has range, intensity and width 0, also before one that has not (`packed` closes such gaps).
+            measurements in the slots of their echoes. A slot whose echo is too weak or outside the range gate has
+            range, intensity and width 0, even before a slot with a return (`packed` closes such gaps).
         """
         pulse, slot = np.nonzero(np.isfinite(echoes.range_m))
         range_m, incidence = echoes.range_m[pulse, slot], echoes.incidence_rad[pulse, slot]
@@ -99,8 +99,8 @@ class Ranging:
         return Measured(range_m=placed[0], intensity=placed[1], pulse_width_ns=placed[2])
 
     def _intensity(self, range_m: FloatArray, reflectance: FloatArray) -> FloatArray:
-        """Return (k,) whole counts: reflectance by the square of the distance and what the air leaves of it."""
-        near = np.maximum(range_m, 1e-3)  # an echo at the scanner itself is bright, not infinite
+        """Return (k,) whole counts: reflectance divided by the square of the distance, attenuated by the air."""
+        near = np.maximum(range_m, 1e-3)  # an echo at the scanner itself has a finite intensity
         power = reflectance * (self._table.reference_range_m / near) ** 2 * self._air.transmission(range_m)
         counts: FloatArray = np.clip(np.rint(self._counts.full * power), 0.0, self._counts.most)
         return counts
@@ -108,7 +108,7 @@ class Ranging:
     def _model_range(self, range_m: FloatArray, intensity: FloatArray, channel: NDArray[np.uint16]) -> FloatArray:
         """Return (k,) ρ_measured of CONVENTIONS: ρ = (1 + range_scale) ρ_measured + range_offset − ibrc(intensity).
 
-        A beam's own correction is added to the offset, as the calibration's other tables are.
+        A beam's own correction is added to the offset, like those of the calibration's other tables.
         """
         offset_m = self._table.true.range_offset_m + self._beam_m[np.minimum(channel, len(self._beam_m) - 1)]
         if self._table.ibrc is not None:
@@ -117,7 +117,7 @@ class Ranging:
         return measured_m
 
     def _sigma_m(self, intensity: FloatArray, depth_m: FloatArray) -> FloatArray:
-        """Return (k,) of the noise: less for bright echoes, more where the footprint lies on a slope."""
+        """Return (k,) sigmas of the noise: smaller for bright echoes, larger where the footprint lies on a slope."""
         noise = self._table.range_noise
         weak = 0.1 * self._counts.full / np.maximum(intensity, 1.0)
         sigma: FloatArray = np.sqrt(noise.sigma_m**2 * weak + (noise.footprint * depth_m) ** 2)
@@ -125,7 +125,9 @@ class Ranging:
 
 
 def packed(measured: Measured, truth: StructArray) -> tuple[Measured, StructArray]:
-    """Return the same, nearest first, slots without a return at the end; ``truth`` (n, R) goes along, renumbered.
+    """Return the measurements, nearest first, with the slots without a return at the end.
+
+    ``truth`` (n, R) is sorted likewise and renumbered.
 
     Args:
         measured: of n pulses.
@@ -167,7 +169,7 @@ def _check(table: ScannerTable, key: str) -> None:
 
 
 def _beam_corrections(table: ScannerTable) -> FloatArray:
-    """Return (channels + 1,) ``range_m`` of every beam; the last one, of all others, is 0."""
+    """Return (channels + 1,) ``range_m`` of every beam; the last element, for all other beams, is 0."""
     corrections = np.zeros(max((beam.channel for beam in table.beam), default=-1) + 2)
     for beam in table.beam:
         corrections[beam.channel] += beam.range_m
@@ -177,7 +179,7 @@ def _beam_corrections(table: ScannerTable) -> FloatArray:
 def _gauss(key: np.uint64, number: IntArray, slot: IntArray) -> FloatArray:
     """Return (k,) standard normal numbers, each a function of pulse number and slot (k,) alone.
 
-    Counters through SplitMix64's mixer (Steele, Lea, Flood 2014), pairs through Box and Muller.
+    Counters go through SplitMix64's mixer (Steele, Lea, Flood 2014), pairs through the Box-Muller transform.
     """
     counter = (number * _SLOTS + slot).astype(np.uint64)
     first = _mixed(_mixed(counter) ^ key)

@@ -1,7 +1,7 @@
-"""One scanner at work: pulses leave the moving aircraft, meet the scene, come back, are measured and told.
+"""One scanner at work: pulses leave the moving aircraft, meet the scene, come back, are measured and encoded.
 
 The chain is that of CONVENTIONS' beam, in the direction of the light: s → b → e → site frame, then the scene. A pulse
-leaves and returns at its pose of emission, as ISO/TS 19159-2 Eq. 10 has it.
+leaves and returns at its pose of emission, as in ISO/TS 19159-2 Eq. 10.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Scanner:
     Args:
         name, table: of the plan.
         head, ranging, wire: its parts.
-        trajectory, scene, site, air: what it flies through.
+        trajectory, scene, site, air: the flight and its surroundings.
         start_gps_ns: of the plan.
     """
 
@@ -55,10 +55,10 @@ class Scanner:
         self._trajectory, self._scene, self._site, self._air = trajectory, scene, site, air
         self._start_gps_ns = start_gps_ns
         self._mounting = Mounting(table)
-        self._first_number = zlib.crc32(name.encode()) << 31  # the scene draws by it: two scanners see other leaves
+        self._first_number = zlib.crc32(name.encode()) << 31  # gives two scanners different random leaves
 
     def work(self, stop_s: float) -> Iterator[tuple[list[WireUnit], StructArray]]:
-        """Yield everything until a time, block by block: units in order of time, truth of the returns in them."""
+        """Yield everything until a time, block by block: units in order of time, and the truth of their returns."""
         for start_s, end_s, laser_on in self._periods(stop_s):
             if laser_on:
                 for block_s in _cuts(start_s, end_s):
@@ -68,7 +68,7 @@ class Scanner:
         yield self._wire.close()
 
     def _periods(self, stop_s: float) -> Iterator[tuple[float, float, bool]]:
-        """(from, to, laser on), one behind the other."""
+        """Yield consecutive periods as (from, to, laser on)."""
         if not self._table.on_lines_only or self._table.kind in ("vlp16", "os1"):
             yield 0.0, stop_s, True
             return
@@ -90,7 +90,7 @@ class Scanner:
         return self._wire.units(pulses, measured, self._truth(pulses, beams, echoes))
 
     def _cast(self, pulses: Pulses, beams: Beams) -> Echoes:
-        """Return echoes along the beams; a bent beam is cast twice, since what it meets says how much it bends."""
+        """Return the echoes along the beams; a bent beam is cast twice, because its target determines the bend."""
         straight = self._cast_along(pulses, beams, beams.direction)
         if not self._air.bends:
             return straight
@@ -112,15 +112,13 @@ class Scanner:
         )
 
     def _down(self, origin: FloatArray) -> FloatArray:
-        """Return (n, 3) the plumb line, to the curvature of a sphere."""
+        """Return (n, 3) unit vectors of the plumb line, to the curvature of a sphere."""
         down = np.stack([-origin[:, 0], -origin[:, 1], np.full(len(origin), -EARTH_RADIUS_M)], axis=1)
         unit: FloatArray = down / np.linalg.norm(down, axis=1, keepdims=True)
         return unit
 
     def _heights(self, beams: Beams, echoes: Echoes) -> tuple[FloatArray, FloatArray]:
-        """Return heights above the ellipsoid of the scanner (n,) and of echoes (n, R), for the air: good to a
-        decimetre.
-        """
+        """Return ellipsoidal heights of the scanner (n,) and of echoes (n, R), for the air; accurate to a decimetre."""
         rho = echoes.range_m
         x = beams.origin[:, :1] + rho * beams.direction[:, :1]
         y = beams.origin[:, 1:2] + rho * beams.direction[:, 1:2]
@@ -129,7 +127,7 @@ class Scanner:
         return above, z + (x**2 + y**2) / (2 * EARTH_RADIUS_M)
 
     def _truth(self, pulses: Pulses, beams: Beams, echoes: Echoes) -> StructArray:
-        """Return (n, R) rows; those of empty slots mean nothing."""
+        """Return (n, R) rows of truth; the rows of empty slots have no meaning."""
         rows = np.zeros(echoes.range_m.shape, RETURN_TRUTH_DTYPE)
         directions_e = beams.direction @ self._site.rot_site_from_e
         points_e = beams.origin_e[:, np.newaxis] + echoes.range_m[:, :, np.newaxis] * directions_e[:, np.newaxis]
@@ -146,7 +144,7 @@ class Scanner:
 
 
 def _cuts(start_s: float, stop_s: float) -> Iterator[tuple[float, float]]:
-    """Yield the time between, cut at whole multiples of a block."""
+    """Yield the parts of a time span that is cut at whole multiples of a block."""
     at_s = start_s
     while at_s < stop_s:
         next_s = min(stop_s, (np.floor(at_s / BLOCK_S + 1e-9) + 1) * BLOCK_S)

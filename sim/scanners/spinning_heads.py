@@ -1,13 +1,13 @@
-"""Spinning multi-beam heads: when each beam fires, where it starts and points, in the maker's own frame.
+"""Spinning multi-beam heads: emission time, starting point and direction of each beam, in the maker's own frame.
 
 The formulas are the makers': Velodyne, VLP-16 User Manual 63-9243 rev. D, 9.2 (x right at azimuth 90°, y at azimuth 0,
-z up); Ouster, Firmware User Manual, "Sensor Data" (the sensor frame). The head's azimuth is what CONVENTIONS calls the
-scan angle, in the sense its packets count it:
+z up); Ouster, Firmware User Manual, "Sensor Data" (the sensor frame). The head's azimuth is CONVENTIONS' scan angle, in
+the sense in which its packets count it:
 
     θ = θ_encoder − scan_angle_offset + encoder_latency · dθ/dt
 
 `Pulses.origin_s` is the point on the beam's axis from which the head counts its ranges: for an Ouster as far behind the
-beam's start as that lies off the spin axis. What ``[[beam]]`` adds to ranges is for `swath.sim.scanners.ranging`.
+beam's start as that lies off the spin axis. `swath.sim.scanners.ranging` applies the range corrections of ``[[beam]]``.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ SEQUENCE_NS = 55_296  # from one firing of all sixteen lasers to the next, 9.4
 LASER_NS = 2_304  # from laser to laser
 LASERS = 16
 CENTIDEGREES = 36_000
-ENCODER_TICKS = 90_112  # a turn of an Ouster's encoder
+ENCODER_TICKS = 90_112  # encoder ticks in a turn of an Ouster
 VLP16_HZ = (5.0, 20.0)
 OS1_HZ = (10.0, 20.0)
 ROTATION_TOLERANCE = 1e-6
@@ -38,7 +38,9 @@ NOT_OF_HEADS = ("scan_angle_scale_ppm", "scan_plane_tilt_deg", "torsion_us2", "p
 
 
 class Vlp16Head:
-    """A Velodyne VLP-16: two sequences of sixteen lasers a group, whose first firing's azimuth goes into the packet.
+    """A Velodyne VLP-16, whose lasers fire in groups of two sequences of sixteen.
+
+    The azimuth of a group's first firing goes into the packet.
 
     Pulse k is laser k mod 16 of sequence k // 16; sequences follow each other by the head's oscillator, which also
     turns it.
@@ -48,7 +50,7 @@ class Vlp16Head:
         name: of the scanner.
 
     Raises:
-        PlanError: turns or errors that such a head does not have.
+        PlanError: the plan asks for turns or errors that such a head does not have.
     """
 
     def __init__(self, table: ScannerTable, name: str) -> None:
@@ -63,9 +65,7 @@ class Vlp16Head:
         self._up_m = VLP16.beams.up_m
 
     def pulses(self, start_s: float, stop_s: float) -> Pulses:
-        """Return every pulse with start_s <= time_s < stop_s, in order of firing, which is that of the packets'
-        places.
-        """
+        """Return every pulse with start_s <= time_s < stop_s, in order of firing, as in the packets."""
         number = _numbers(self._oscillator, SEQUENCE_NS, LASERS, start_s, stop_s)
         sequence, laser = np.divmod(number, LASERS)
         sequences = np.unique(sequence)
@@ -88,12 +88,12 @@ class Vlp16Head:
         )
 
     def _turn(self, head_ns: IntArray) -> FloatArray:
-        """Return where the encoder stands, turns 0 … 1, at times of the head's oscillator."""
+        """Return the encoder's position, turns 0 … 1, at times of the head's oscillator."""
         turned: FloatArray = np.mod(self._turns_per_ns * head_ns, 1.0)
         return turned
 
     def _directions(self, fired_ns: IntArray, laser: IntArray) -> FloatArray:
-        """Return (n, 3) x = cos ω sin α, y = cos ω cos α, z = sin ω (VLP-16 manual, 9.2)."""
+        """Return (n, 3) directions x = cos ω sin α, y = cos ω cos α, z = sin ω (VLP-16 manual, 9.2)."""
         azimuth = 2 * np.pi * self._turn(fired_ns) + self._ahead_rad + self._azimuth_rad[laser]
         flat = np.cos(self._elevation_rad)[laser]
         up = np.sin(self._elevation_rad)[laser]
@@ -110,7 +110,7 @@ class Os1Head:
         name: of the scanner.
 
     Raises:
-        PlanError: turns or errors that such a head does not have.
+        PlanError: the plan asks for turns or errors that such a head does not have.
     """
 
     def __init__(self, table: ScannerTable, name: str) -> None:
@@ -158,20 +158,26 @@ class Os1Head:
 
 
 def _numbers(oscillator: Oscillator, spacing_ns: float, each: int, start_s: float, stop_s: float) -> IntArray:
-    """Return numbers of all pulses that may leave in this time: ``each`` of them together, a spacing apart."""
+    """Return the numbers of all pulses that may leave in this time; ``each`` pulses leave together, a spacing apart."""
     first, last = np.floor(oscillator.phase(np.array([start_s, stop_s])) / spacing_ns).astype(np.int64)
     return np.arange(max(first - 1, 0) * each, max(last + 2, 0) * each)
 
 
 def _ahead_rad(table: ScannerTable, turning: float = 1.0) -> float:
-    """True azimuth less what the encoder says, of a head whose azimuth grows (1) or falls (−1) as it turns."""
+    """Return the true azimuth minus the encoder's reading.
+
+    Args:
+        table: of the plan.
+        turning: 1 for a head whose azimuth grows as it turns, −1 if it falls.
+    """
     rate_rps = turning * 2 * np.pi * table.scan_hz
     return float(1e-6 * table.true.encoder_latency_us * rate_rps - np.radians(table.true.scan_angle_offset_deg))
 
 
 def _checked(table: ScannerTable, name: str, beams: int) -> tuple[FloatArray, FloatArray]:
-    """Return what ``[[beam]]`` adds to azimuths and elevations, (beams,) each; refuses what a spinning head cannot
-    have.
+    """Return the amounts that ``[[beam]]`` adds to azimuths and elevations, (beams,) each.
+
+    Errors that a spinning head cannot have are refused with `PlanError`.
     """
     for key in NOT_OF_HEADS:
         if getattr(table.true, key) != 0.0:

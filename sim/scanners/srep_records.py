@@ -1,4 +1,4 @@
-"""Pulse records of SREP: which echo stands in which record, with whole ranges or with apparent ones."""
+"""Pulse records of SREP: assigns echoes to records, with whole ranges or with apparent ones."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ class Records:
 
     Attributes:
         ticks: (n,) of the emission, from the plan's start.
-        time_s: (n,) its true time.
-        zone: (n,) byte 15 of the datagram it belongs into.
+        time_s: (n,) true time of the emission.
+        zone: (n,) byte 15 of the datagram to which the record belongs.
         body: (n,) `pulse_dtype`, ``ticks`` still to be counted from the datagram's first.
         truth: (k,) of the returns in them, by record, then by slot.
     """
@@ -38,11 +38,11 @@ class Records:
     truth: StructArray
 
     def __len__(self) -> int:
-        """Number of records."""
+        """Return the number of records."""
         return len(self.ticks)
 
     def split(self, at: int) -> tuple[Records, Records]:
-        """Return the first so many, and the others."""
+        """Return the first ``at`` records, and the others."""
         returns = np.count_nonzero(self.body["slot"]["range"][:at])
         return (
             Records(self.ticks[:at], self.time_s[:at], self.zone[:at], self.body[:at], self.truth[:returns]),
@@ -50,7 +50,7 @@ class Records:
         )
 
     def followed_by(self, other: Records) -> Records:
-        """Return these and others."""
+        """Return these records followed by others."""
         if not len(self):
             return other
         return Records(
@@ -63,25 +63,25 @@ class Records:
 
 
 def no_records(return_slots: int) -> Records:
-    """Return none."""
+    """Return an empty set of records."""
     none = np.zeros(0, np.int64)
     return Records(none, np.zeros(0), none, np.zeros(0, pulse_dtype(return_slots)), np.zeros(0, RETURN_TRUTH_DTYPE))
 
 
 class RecordMaker(Protocol):
-    """Puts what is measured into records."""
+    """Puts measurements into records."""
 
     lost_echoes: int
 
     def take(self, pulses: Pulses, measured: Measured, truth: StructArray) -> Records:
-        """Return records that are complete with these pulses."""
+        """Return the records that are complete with these pulses."""
 
     def rest(self) -> Records:
-        """Return records of pulses after which none follows for long."""
+        """Return the records of pulses after which there is a long pause."""
 
 
 class WholeRanges:
-    """Ranges as they are, each in the record of its own pulse; a pulse's zone is that of its first return.
+    """Makes records with whole ranges, each in the record of its own pulse; a pulse's zone is that of its first return.
 
     Zone z holds ranges from z to z + 1 times c / (2 prf) (FORMULAS 3.3, z = k − 1, c of vacuum); a pulse without a
     return belongs to the zone of the one before.
@@ -104,7 +104,7 @@ class WholeRanges:
         return Records(ticks, pulses.time_s, zones, body, rows)
 
     def rest(self) -> Records:
-        """Return none wait."""
+        """Return an empty set; no records wait."""
         return no_records(self._table.return_slots)
 
     def _zones(self, first_m: FloatArray) -> IntArray:
@@ -117,11 +117,11 @@ class WholeRanges:
 
 
 class ApparentRanges:
-    """Ranges from the last emission before the echo, each in that emission's record.
+    """Makes records with ranges from the last emission before the echo, each in that emission's record.
 
-    Ticks are the device's own: it takes its counter's nominal rate and c of vacuum to turn them into metres. A record
-    is complete when the next pulse has left. Of more echoes than it has slots the latest are lost, so are those that
-    come at an emission itself, whose range would be 0; ``lost_echoes`` counts both.
+    Ticks are the device's own: it converts them into metres with its counter's nominal rate and c of vacuum. A record
+    is complete when the next pulse has left. If a record has more echoes than slots, the latest are lost. So are those
+    that arrive at an emission itself, whose range would be 0; ``lost_echoes`` counts both.
     """
 
     def __init__(self, table: ScannerTable) -> None:
@@ -132,7 +132,7 @@ class ApparentRanges:
         self._flying = _Flying(np.zeros(0, np.int64), np.zeros((3, 0)), np.zeros(0, RETURN_TRUTH_DTYPE))
 
     def take(self, pulses: Pulses, measured: Measured, truth: StructArray) -> Records:
-        """Return records of all pulses but the last, into which echoes may still come."""
+        """Return the records of all pulses but the last, for which echoes may still arrive."""
         ticks = emission_ticks(self._table, pulses.number)
         index = np.flatnonzero(measured.range_m > 0.0)
         columns = (measured.range_m, measured.intensity, measured.pulse_width_ns)
@@ -143,11 +143,11 @@ class ApparentRanges:
         return self._complete(len(self._emissions.ticks) - 1)
 
     def rest(self) -> Records:
-        """Return the last one."""
+        """Return the last record."""
         return self._complete(len(self._emissions.ticks))
 
     def _complete(self, n: int) -> Records:
-        """Return the first n records; what belongs to later ones waits."""
+        """Return the first n records; echoes of later records wait."""
         if n <= 0:
             return no_records(self._table.return_slots)
         emissions, flying = self._emissions, self._flying
@@ -165,7 +165,7 @@ class ApparentRanges:
         return Records(emissions.ticks[:n], emissions.time_s[:n], zones, body, flying.truth.take(echo))
 
     def _slots(self, record: IntArray, apparent_m: FloatArray, n: int) -> tuple[IntArray, IntArray]:
-        """Return which echoes find a slot in the first n records, and which slot: in the order in which they come."""
+        """Return the echoes that find a slot in the first n records, and their slots, in order of arrival."""
         come = np.flatnonzero(record < n)
         seen = come[np.rint(apparent_m[come] / RANGE_UNIT_M) > 0.0]
         echo = seen[np.lexsort((apparent_m[seen], record[seen]))]
@@ -212,7 +212,7 @@ class _Flying:
 
 
 def _fill(slot: StructArray, range_m: FloatArray, intensity: FloatArray, pulse_width_ns: FloatArray) -> None:
-    """Numbers into slots, all (n, R): rounded to the wire's units, at its limits where they are beyond."""
+    """Write numbers into slots, all (n, R), rounded to the wire's units and limited to its range."""
     slot["range"] = np.minimum(np.rint(range_m / RANGE_UNIT_M), _U32)
     slot["intensity"] = np.minimum(np.rint(intensity), _U16)
     slot["pulse_width"] = np.minimum(np.rint(pulse_width_ns / PULSE_WIDTH_UNIT_NS), _U16)

@@ -1,4 +1,4 @@
-"""SREP/1 datagrams of a line scanner (PROTOCOLS), and what the configuration says of it."""
+"""SREP/1 datagrams of a line scanner (PROTOCOLS), and its table in the configuration."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ from swath.sim.scanners.srep_records import ApparentRanges, RecordMaker, Records
 from swath.sim.shots import Measured, Pulses, WireUnit
 from swath.sim.truth import RETURN_TRUTH_DTYPE, StructArray
 
-PROCESSING_S = 250e-6  # from a datagram's last pulse to the wire; longer than light takes from 30 km
-HOLD_S = 0.1  # after so long without a pulse a datagram is not filled up any more
+PROCESSING_S = 250e-6  # from a datagram's last pulse to the wire; longer than light needs to 30 km and back
+HOLD_S = 0.1  # a datagram is sent unfilled after this long without a pulse
 HEARTBEATS_HZ = 10
-UNLOCKED_AFTER_S = 1.5  # without an edge
+UNLOCKED_AFTER_S = 1.5  # time without an edge
 LARGEST_UDP_BYTES = 65_507
 _EPOCH_BITS = 31  # datagrams end where the counter passes a multiple of 2³¹: ticks in one fit u32
 _U32 = 2**32 - 1
@@ -42,8 +42,8 @@ class PpsLatch:
     """The counter as latched at the edges of a pulse per second.
 
     Args:
-        pps: wired to the device; None: nothing.
-        oscillator: that drives the counter.
+        pps: pulse wired to the device; None: no pulse is wired.
+        oscillator: oscillator that drives the counter.
         ticks_at_start: the counter at the plan's start.
         lost: windows in which no edge arrives.
     """
@@ -61,9 +61,7 @@ class PpsLatch:
         self._ticks: UInt64Array = np.zeros(0, np.uint64)
 
     def seen(self, time_s: FloatArray) -> tuple[IntArray, UInt64Array, BoolArray]:
-        """Return edges latched so far, the counter at the latest one, and whether the device follows them; (n,)
-        each.
-        """
+        """Return (n,) the edges latched so far, the counter at the latest one, and True if the device follows them."""
         self._reach(float(time_s.max(initial=0.0)))
         count = np.searchsorted(self._edge_s, time_s, side="right")
         latched = count > 0
@@ -80,7 +78,7 @@ class PpsLatch:
         self._reached_s = seconds - 1.0
         edge_s = self._pps.edges(np.arange(seconds))
         ticks = np.floor(self._oscillator.phase(edge_s)).astype(np.int64)
-        there = ticks >= -min(self._ticks_at_start, 2**62)  # an edge before power-on is none
+        there = ticks >= -min(self._ticks_at_start, 2**62)  # an edge before power-on does not count
         for from_s, to_s in self._lost:
             there &= (edge_s < from_s) | (edge_s >= to_s)
         self._edge_s = edge_s[there]
@@ -88,20 +86,20 @@ class PpsLatch:
 
 
 class SrepWire:
-    """Encodes what a line scanner measures.
+    """Encodes the measurements of a line scanner.
 
     Args:
         table: of the plan.
-        name: of the scanner; units are of ``scanner/<name>``.
-        pps: that it latches; None: none is wired to it.
+        name: of the scanner; units have the source ``scanner/<name>``.
+        pps: pulse that it latches; None: no pulse is wired to it.
         host: of the plan, for the jitter of arrivals.
         seed: of that jitter.
-        noise: False: no jitter.
+        noise: False leaves the jitter out.
         lost_pps: windows (from_s, to_s) in which the device gets no edge: the count stays, the lock goes.
         scanner_id, first_sequence: for the header.
 
     Raises:
-        PlanError: datagrams that UDP cannot carry, more pulses in air than a byte counts.
+        PlanError: UDP cannot carry the datagrams, or there are more pulses in air than a byte counts.
     """
 
     def __init__(
@@ -134,31 +132,34 @@ class SrepWire:
 
     @property
     def lost_echoes(self) -> int:
-        """Echoes that found no slot in their record (apparent ranges)."""
+        """Number of echoes that found no slot in their record (apparent ranges)."""
         return self._records.lost_echoes
 
     def units(self, pulses: Pulses, measured: Measured, truth: StructArray) -> tuple[list[WireUnit], StructArray]:
-        """Return datagrams that are complete, and the truth of their returns in the order in which they are parsed.
+        """Return the datagrams that are complete, and the truth of their returns in the order in which they are parsed.
 
-        Truth of datagrams that `idle` sent comes first. What does not fill a datagram waits.
+        Truth of datagrams that `idle` sent comes first. Pulses that do not fill a datagram wait.
         """
         units, rows = self._send(self._records.take(pulses, measured, truth), ended=False)
         return units, self._with_owed(rows)
 
     def idle(self, start_s: float, stop_s: float) -> list[WireUnit]:
-        """Return the laser is off: what waited, then heartbeats (N = 0) at whole tenths of a second."""
+        """Return the datagrams sent while the laser is off: those that waited, then heartbeats.
+
+        Heartbeats (N = 0) are sent at whole tenths of a second.
+        """
         units, rows = self._send(self._records.rest(), ended=True)
         self._owed = self._with_owed(rows)
         time_s = np.arange(np.floor(HEARTBEATS_HZ * start_s), np.ceil(HEARTBEATS_HZ * stop_s) + 1) / HEARTBEATS_HZ
         time_s = time_s[(time_s >= start_s) & (time_s < stop_s)]
-        stamp_s = time_s - 1e-6 * self._table.true.time_offset_us  # as of a pulse, so that none seems to go back
+        stamp_s = time_s - 1e-6 * self._table.true.time_offset_us  # stamped like a pulse, so that stamps never go back
         ticks = np.maximum(np.floor(self._oscillator.phase(stamp_s)).astype(np.int64), self._newest_ticks)
         header = self._headers(ticks, time_s + PROCESSING_S, np.full(len(ticks), self._zone), laser=0)
         body = np.zeros((len(ticks), 0), pulse_dtype(self._table.return_slots))
         return units + self._arriving(time_s + PROCESSING_S, encode_datagrams(header, body))
 
     def close(self) -> tuple[list[WireUnit], StructArray]:
-        """Return what still waits."""
+        """Return the datagrams that still wait."""
         units, rows = self._send(self._records.rest(), ended=True)
         return units, self._with_owed(rows)
 
@@ -167,7 +168,7 @@ class SrepWire:
         return np.concatenate([owed, rows]) if len(owed) else rows
 
     def _send(self, records: Records, *, ended: bool) -> tuple[list[WireUnit], StructArray]:
-        """Return datagrams of what waited and of further records; ``ended``: also one that is not full."""
+        """Return datagrams of waiting and further records; with ``ended`` also one that is not full."""
         waiting = self._waiting.followed_by(records)
         edges = _datagram_edges(waiting, self._table.pulses_per_datagram)
         if not ended and len(edges) > 1 and edges[-1] - edges[-2] < self._table.pulses_per_datagram:
@@ -183,7 +184,7 @@ class SrepWire:
         return self._arriving(time_s, _encoded(header, sent.body, edges)), sent.truth
 
     def _headers(self, first_ticks: IntArray, time_s: FloatArray, zone: IntArray, laser: int) -> StructArray:
-        """Return (m,) of datagrams sent at these times."""
+        """Return (m,) headers of datagrams sent at these times."""
         table = self._table
         count, latched_ticks, locked = self._latch.seen(time_s)
         header = np.zeros(len(first_ticks), HEADER_DTYPE)
@@ -199,7 +200,7 @@ class SrepWire:
         return header
 
     def _arriving(self, time_s: FloatArray, datagrams: list[bytes]) -> list[WireUnit]:
-        """Return units of datagrams sent at these times (m,), none before the one ahead of it."""
+        """Return the units of datagrams sent at these times (m,); a unit never arrives before its predecessor."""
         if self._jitter_s > 0.0:
             time_s = time_s + self._random.exponential(self._jitter_s, len(time_s))
         arrive_s = np.maximum.accumulate(np.concatenate([[self._arrived_s], time_s]))
@@ -208,7 +209,7 @@ class SrepWire:
 
 
 def config_table(table: ScannerTable, name: str, transport: str) -> dict[str, Any]:
-    """Return ``[scanner.<name>]`` of the configuration that records it; raises `PlanError`."""
+    """Return ``[scanner.<name>]`` of the configuration that records the scanner; raises `PlanError`."""
     matrix = np.array(table.installation)
     if not np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-6) or np.linalg.det(matrix) < 0.0:
         text = "is no rotation: want rows of length 1, perpendicular, determinant +1"
@@ -242,7 +243,10 @@ def _check(table: ScannerTable, key: str) -> None:
 
 
 def _datagram_edges(records: Records, pulses: int) -> IntArray:
-    """Return (m + 1,) where datagrams begin and the last one ends: full, or zone or epoch changes, or a long pause."""
+    """Return (m + 1,) the records at which datagrams begin, and the end of the last one.
+
+    A datagram ends when it is full, when zone or epoch changes, or before a long pause.
+    """
     if not len(records):
         return np.zeros(1, np.int64)
     new = records.zone[1:] != records.zone[:-1]
@@ -253,8 +257,9 @@ def _datagram_edges(records: Records, pulses: int) -> IntArray:
 
 
 def _encoded(header: StructArray, body: StructArray, edges: IntArray) -> list[bytes]:
-    """Return datagrams between edges (m + 1,), those of one length at once: where zones alternate they are many and
-    short.
+    """Return the datagrams between edges (m + 1,).
+
+    Datagrams of equal length are encoded at once, because alternating zones make many short ones.
     """
     sizes = np.diff(edges)
     datagrams = [b""] * len(sizes)

@@ -1,4 +1,6 @@
-"""What a VLP-16 says: data packets, single (strongest) or dual return, and position packets with PPS status and RMC.
+"""The output of a VLP-16: data packets, single (strongest) or dual return, and position packets.
+
+Position packets carry PPS status and RMC sentences.
 
 Wire format: VLP-16 User Manual 63-9243 rev. D, 9.3. Its clock shows microseconds past the UTC hour while PPS is locked
 (`swath.sim.scanners.spinning_wire.HeadClock`).
@@ -37,21 +39,24 @@ MICROSECOND_HZ = 1_000_000
 RANGE_UNIT_M = 0.002
 RANGE_MAX_RAW = 65_535
 POSITIONS_HZ = 20
-RMC_DELAY_S = 0.15  # from an edge to the sentence that names it, as a receiver sends it by a slow port
+RMC_DELAY_S = 0.15  # delay from an edge to the sentence that names it, at a slow port's speed
 
 
 class Track(Protocol):
-    """Where the aircraft is, for the sentences its head is given; `swath.sim.flight.trajectory.Trajectory` is one."""
+    """The aircraft's motion, for the RMC sentences that a head receives.
+
+    `swath.sim.flight.trajectory.Trajectory` is one.
+    """
 
     def geodetic(self, time_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return latitude, longitude, height of (n,) times."""
+        """Return latitude, longitude and height at (n,) times."""
 
     def velocity_l(self, time_s: FloatArray) -> FloatArray:
-        """Return (n, 3) north, east, down."""
+        """Return (n, 3) velocities north, east, down."""
 
 
 class _Sent(NamedTuple):
-    """A packet whose last firing, or whose making, was at this true time."""
+    """A packet with the true time of its last firing, or of its making."""
 
     time_s: float
     source: str
@@ -64,8 +69,8 @@ class VelodyneWire:
     Args:
         plan: of the flight.
         name: of the scanner.
-        pps: wired to the head, with the NMEA of its receiver; None: neither is.
-        track: what the receiver's RMC sentences tell.
+        pps: pulse wired to the head, with the NMEA of its receiver; None: neither is wired.
+        track: motion that the receiver's RMC sentences describe.
         lost_pps: (from, to) in which the head gets no pulse.
     """
 
@@ -87,12 +92,13 @@ class VelodyneWire:
         self._positions = _Positions(plan, f"{self._source}/aux", self._clock, track if pps is not None else None)
 
     def units(self, pulses: Pulses, measured: Measured, truth: StructArray) -> tuple[list[WireUnit], StructArray]:
-        """Return packets that are complete, in order of time, and the truth of their returns as `VelodyneParser` gives
-        them.
+        """Return the packets that are complete, in order of time, and the truth of their returns.
+
+        The order of the truth is that of `VelodyneParser`.
 
         Args:
             pulses: of `Vlp16Head`, consecutive.
-            measured: of them, (n, R).
+            measured: of the pulses, (n, R).
             truth: `RETURN_TRUTH_DTYPE` (n, R), same slots.
         """
         raw, light = counts(measured, RANGE_UNIT_M, RANGE_MAX_RAW)
@@ -105,21 +111,21 @@ class VelodyneWire:
         return self._arriving(positions + self._packets(time_s, encoder, content)), rows
 
     def idle(self, start_s: float, stop_s: float) -> list[WireUnit]:
-        """Return position packets go on while the laser is off."""
+        """Return the position packets, which continue while the laser is off."""
         return self._arriving(self._positions.until(stop_s))
 
     def close(self) -> tuple[list[WireUnit], StructArray]:
-        """Return a packet that is not full is not sent."""
+        """Return no packets; a packet that is not full is not sent."""
         return [], np.empty(0, RETURN_TRUTH_DTYPE)
 
     def _arriving(self, sent: list[_Sent]) -> list[WireUnit]:
-        """Return packets of both ports as the host gets them: in the order of their sending."""
+        """Return the packets of both ports as the host receives them, in the order of their sending."""
         sent = sorted(sent, key=lambda packet: packet.time_s)
         times_s = self._arrivals.times(np.array([packet.time_s for packet in sent]))
         return [WireUnit(at_s, packet.source, packet.data) for at_s, packet in zip(times_s, sent, strict=True)]
 
     def _packets(self, time_s: FloatArray, encoder: IntArray, content: IntArray) -> list[_Sent]:
-        """Return data packets of pulses (n,), whose content is (returns, n, range and light)."""
+        """Return the data packets of pulses (n,), whose content is (returns, n, range and light)."""
         mode, returns = (MODE_DUAL, 2) if self._dual else (MODE_STRONGEST, 1)
         packets = len(time_s) // (self._groups * PLACES)
         # a group's returns are in neighbouring blocks
@@ -136,7 +142,7 @@ class VelodyneWire:
 
 
 class _Positions:
-    """The position packets of one head."""
+    """Makes the position packets of one head."""
 
     def __init__(self, plan: Plan, source: str, clock: HeadClock, track: Track | None) -> None:
         self._plan, self._source, self._clock, self._track = plan, source, clock, track
@@ -144,7 +150,7 @@ class _Positions:
         self._second, self._sentence = -1, ""
 
     def until(self, time_s: float) -> list[_Sent]:
-        """Return those assembled since the last call and not after this time."""
+        """Return the packets made since the last call and up to this time."""
         last = max(self._count, int(np.floor(time_s * POSITIONS_HZ + 0.5)))
         made_s = (np.arange(self._count, last) + 0.5) / POSITIONS_HZ
         self._count = last
@@ -156,7 +162,7 @@ class _Positions:
         ]
 
     def _rmc(self, time_s: float) -> str:
-        """Return the latest sentence the head was given; empty before the first."""
+        """Return the latest sentence that the head received; empty before the first."""
         second = int(np.floor(time_s - RMC_DELAY_S))
         if self._track is not None and second > self._second:
             self._second, self._sentence = second, self._rmc_of(self._track, second)
@@ -174,7 +180,7 @@ class _Positions:
 
 
 def _strongest(raw: IntArray, light: IntArray, truth: StructArray) -> tuple[IntArray, StructArray]:
-    """Return content (1, n, 2) of single returns: range and reflectivity of the strongest; and their truth."""
+    """Return the content (1, n, 2) of single returns (range and reflectivity of the strongest) and their truth."""
     slot = best_slot(np.where(raw > 0, light, -1))
     there = slot >= 0
     rows = truth[there, slot[there]]
@@ -183,10 +189,10 @@ def _strongest(raw: IntArray, light: IntArray, truth: StructArray) -> tuple[IntA
 
 
 def _pairs(raw: IntArray, light: IntArray, truth: StructArray) -> tuple[IntArray, StructArray]:
-    """Return content (2, n, 2) of dual returns; and their truth, of two the nearer first.
+    """Return the content (2, n, 2) of dual returns, and their truth, of which the nearer is first.
 
-    First the last return, then the strongest, or the second-strongest where the strongest is the last; an only one
-    stands in both places. Echoes of equal range are one, as bright as the brightest (9.3.2).
+    The content has the last return first, then the strongest, or the second-strongest where the strongest is the last;
+    a single return is in both places. Echoes of equal range are one, as bright as the brightest (9.3.2).
     """
     last = best_slot(np.where(raw > 0, (raw << 8) + light, -1))
     nearer = (raw > 0) & (raw < in_slot(raw, last)[:, np.newaxis])
@@ -210,6 +216,6 @@ def config_table(table: ScannerTable, name: str, transport: str, auxiliary: str)
     Args:
         table: of the plan.
         name: of the scanner.
-        transport, auxiliary: where its data and position packets go.
+        transport, auxiliary: URIs at which its data and position packets arrive.
     """
     return head_config(table, transport, "velodyne-vlp16") | {"auxiliary": auxiliary}

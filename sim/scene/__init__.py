@@ -1,1 +1,1 @@
-"""Terrain, village and objects, and rays that meet them."""
+"""Terrain, village and objects, and the echoes of rays that meet them."""

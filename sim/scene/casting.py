@@ -1,8 +1,8 @@
-"""Rays through the scene, compiled: each pulse on its own, one after the other, on one core.
+"""Casts rays through the scene, compiled: one pulse after the other, on one core.
 
-A ray goes from cell to cell (`swath.sim.scene.cells`) until it meets something hard; in a cell it looks at what the
-cell lists and at the ground. Crowns and wires it meets on the way take their share of its energy and let the rest
-through.
+A ray goes from cell to cell (`swath.sim.scene.cells`) until it meets something hard; in each cell it is tested against
+the objects that the cell lists and against the ground. Crowns and wires on the way take their share of its energy and
+let the rest through.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ Pulse = tuple[float, int, int]
 Hit = tuple[float, int, float, float]
 """Distance, index into `swath.sim.shots.SURFACES`, reflectance, cosine of incidence."""
 
-THINGS, COVERS = 4, 2  # how many kinds of each there are
+THINGS, COVERS = 4, 2  # number of kinds of each
 SOLIDS, TREES, WIRES, CARS = range(THINGS)
 ROADS, LAKES = range(COVERS)
 
-RIM_SHARE = 0.1  # of a pulse's energy, for each of four rays on the rim of the footprint; the axis has the rest
-LEAF_HITS = 4  # of one crown
-SPENT = 0.03  # energy below which nothing goes on
+RIM_SHARE = 0.1  # share of a pulse's energy in each of four rays on the footprint's rim; the axis has the rest
+LEAF_HITS = 4  # most leaves that a ray meets in one crown
+SPENT = 0.03  # energy below which a ray ends
 WIRE_REFLECTANCE = 0.4
 WATER_REFLECTANCE = 0.5
 # Mean square slope of water at 4 m/s of wind (Cox and Munk, J. Opt. Soc. Am. 44, 1954: 0.003 + 0.00512 W).
@@ -48,15 +48,15 @@ DROWNED_M = 0.1  # ground in a lake's circle no higher above its level than this
 ASPHALT, PAINT = 0.12, 0.6
 STRIPE_M, EDGE_M = 0.15, 0.3  # width of painted lines; from a road's edge to the middle of its edge line
 DASH_M, DASHES_M = 4.0, 12.0  # length of a dash of the middle line, from one to the next
-_WATER, _PATCHES, _GRAIN = whole(1 << 40), whole(1 << 41), whole(1 << 42)  # draws: no crown has so many
+_WATER, _PATCHES, _GRAIN = whole(1 << 40), whole(1 << 41), whole(1 << 42)  # numbers of draws, above those of any crown
 _NO_SEED = whole(0)
 
 
 class Frame(NamedTuple):
-    """Where the grids lie, metres, site frame.
+    """Position of the grids, metres, site frame.
 
     Attributes:
-        west, south: their corner.
+        west, south: their south-west corner.
         cell: between nodes of the ground; ``size``: of the cells that list objects.
         floor_z, roof_z: site z below and above everything.
         reflectance: of the ground.
@@ -72,12 +72,12 @@ class Frame(NamedTuple):
 
 
 class SceneArrays(NamedTuple):
-    """All that rays are cast at.
+    """Arrays of everything that rays can meet.
 
     Attributes:
-        frame: see there.
+        frame: see `Frame`.
         z: (rows, columns) the ground's nodes (`swath.sim.scene.terrain.Ground`).
-        top: (2, rows, columns) site z that nothing in a cell exceeds, and that its ground does not exceed.
+        top: (2, rows, columns) upper limit of site z of everything in a cell, and of its ground.
         first: (2, cells + 1) a cell's things are ``item[first[0, c] : first[0, c + 1]]``, its covers those of row 1.
         item: code of an object: where its row begins in ``rows``, times `THINGS` or `COVERS`, plus its kind.
         rows: the tables of `swath.sim.scene.objects.Things`, one behind the other.
@@ -95,7 +95,7 @@ class SceneArrays(NamedTuple):
 
 @jit_inline
 def clipped(at: float, step: float, low: float, high: float, start: float, stop: float) -> tuple[float, float]:
-    """Return distances between which a coordinate of a ray lies between limits."""
+    """Return the two distances between which a coordinate of a ray lies between limits."""
     if step == 0.0:
         return (start, stop) if low <= at <= high else (start, -1.0)
     one, other = (low - at) / step, (high - at) / step
@@ -104,7 +104,7 @@ def clipped(at: float, step: float, low: float, high: float, start: float, stop:
 
 @jit_inline
 def texture(x: float, y: float) -> float:
-    """Return a factor about 1 that belongs to a place: patches of some 25 m, and grain of half a metre."""
+    """Return a factor about 1 that depends on the place: patches of some 25 m, and grain of half a metre."""
     column, row = math.floor(x / 25.0), math.floor(y / 25.0)
     u, v = x / 25.0 - column, y / 25.0 - row
     u, v = u * u * (3.0 - 2.0 * u), v * v * (3.0 - 2.0 * v)
@@ -118,7 +118,7 @@ def texture(x: float, y: float) -> float:
 
 @jit_inline
 def on_road(rows: FloatArray, item: IntArray, first: int, last: int, x: float, y: float) -> int:
-    """Return what covers a place as far as roads go: `ROAD`, `MARKING` or `NO_SURFACE`; crossings bear no paint."""
+    """Return the road surface at a place: `ROAD`, `MARKING` or `NO_SURFACE`; crossings have no paint."""
     found, nearest, crossing, surface = -1.0, NEVER, False, NO_SURFACE
     for k in range(first, last):
         if item[k] & 1 != ROADS:
@@ -143,7 +143,7 @@ def on_road(rows: FloatArray, item: IntArray, first: int, last: int, x: float, y
 
 @jit_inline
 def on_water(rows: FloatArray, item: IntArray, first: int, last: int, ray: Ray, at: float, pulse: Pulse) -> Hit:
-    """Return the lake above the ground that a ray meets at a distance; most pulses do not come back from it."""
+    """Return the hit on a lake that a ray meets above the ground, if any; most pulses do not return from water."""
     for k in range(first, last):
         if item[k] & 1 != LAKES:
             continue
@@ -175,7 +175,7 @@ def on_ground(
     at: float,
     pulse: Pulse,
 ) -> Hit:
-    """Return what a ray meets that goes below the ground at a distance: the ground itself or what covers it."""
+    """Return the hit of a ray that reaches the ground at a distance: on the ground itself or on its cover."""
     x, y = ray[0] + at * ray[3], ray[1] + at * ray[4]
     surface, reflectance = GROUND, frame.reflectance
     if last > first:
@@ -194,8 +194,10 @@ def on_ground(
 def into_crown(
     rows: FloatArray, tree: int, ray: Ray, start: float, stop: float, pulse: Pulse, soft: FloatArray, count: int
 ) -> int:
-    """Return leaves a pulse meets in a crown entered between two distances: Beer's and Lambert's depths, shares at
-    random.
+    """Add the leaves that a pulse meets in a crown to ``soft``; return the rows in use.
+
+    The ray must enter the crown between the two distances. Depths of hits follow the Beer-Lambert law; their shares of
+    the energy are random.
     """
     at, leave = crown_span(rows, tree, ray)
     if at < start or at >= stop:
@@ -214,7 +216,10 @@ def into_crown(
 def into_wire(
     rows: FloatArray, wire: int, ray: Ray, start: float, stop: float, spread: float, soft: FloatArray, count: int
 ) -> int:
-    """Return a wire in the footprint between two distances: its share of the footprint's area returns."""
+    """Add a wire in the footprint between two distances to ``soft``; return the rows in use.
+
+    The wire returns its share of the footprint's area.
+    """
     at, miss, cos = wire_passage(rows, wire, ray)
     foot, radius = spread * at, rows[wire + 6]
     if start <= at < stop and miss < foot + radius:
@@ -228,7 +233,10 @@ def into_wire(
 
 @jit_inline
 def beside_car(frame: Frame, z: FloatArray, rows: FloatArray, car: int, ray: Ray, time_s: float) -> Ray:
-    """Return a ray as it is seen from a car: its rows stand at the middle of its floor, which moves over the ground."""
+    """Return a ray in the coordinates of a moving car, whose origin is the middle of the car's floor.
+
+    The floor follows the ground.
+    """
     length = rows[car + 10]
     driven = (rows[car + 11] * time_s) % (2.0 * length) if length > 0.0 else 0.0
     driven = min(driven, 2.0 * length - driven)
@@ -254,10 +262,10 @@ def meet(
     count: int,
     room: int,
 ) -> tuple[float, int, float, float, float, int]:
-    """Return what a cell lists, between two distances.
+    """Return the hits on the objects that a cell lists, between two distances.
 
-    Returns the four numbers of the nearest hard `Hit`, the distance of an edge within the beam's reach, and how many
-    rows of ``soft`` are in use.
+    Returns the four numbers of the nearest hard `Hit`, the distance of an edge within the beam's reach, and the number
+    of rows of ``soft`` in use.
     """
     best, surface, reflectance, cosine, edge, grow = NEVER, NO_SURFACE, 0.0, 1.0, NEVER, spread * stop
     for k in range(first, last):
@@ -293,7 +301,7 @@ def march(
     count: int,
     room: int,
 ) -> tuple[float, int, float, float, float, int]:
-    """As `meet`, for a whole ray."""
+    """Return the same as `meet` for a whole ray."""
     best, surface, reflectance, cosine, edge, fresh = NEVER, NO_SURFACE, 0.0, 1.0, NEVER, True
     deep, wide = top.shape[1], top.shape[2]
     at, stop = clipped(ray[2], ray[5], frame.floor_z, frame.roof_z, 0.0, NEVER)

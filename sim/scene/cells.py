@@ -1,4 +1,4 @@
-"""Which objects stand where: square cells that list them, and how high each cell reaches."""
+"""The grid of square cells that list the objects in them, and the height that each cell reaches."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from swath.georef.arrays import FloatArray, IntArray
 from swath.sim.scene.terrain import Ground
 
 CELL_M = 20.0
-MOST_CELLS = 4_000_000  # above, they are made larger
+MOST_CELLS = 4_000_000  # with more, cells are made larger
 
 
 class Cells(NamedTuple):
@@ -19,10 +19,10 @@ class Cells(NamedTuple):
 
     Attributes:
         size_m: of a cell.
-        top: (2, rows, columns) site z that nothing in a cell exceeds, and that its ground does not exceed.
-        first: (2, cells + 1) cell c lists ``item[first[0, c] : first[0, c + 1]]`` of what stands on the ground, by
-            row 1 what covers it.
-        item: codes as `Listed` had them.
+        top: (2, rows, columns) upper limit of site z of everything in a cell, and of its ground.
+        first: (2, cells + 1) cell c lists ``item[first[0, c] : first[0, c + 1]]`` of the objects on the ground, by row
+            1 its covers.
+        item: codes as in `Listed`.
     """
 
     size_m: float
@@ -33,11 +33,11 @@ class Cells(NamedTuple):
 
 @dataclass(frozen=True)
 class Listed:
-    """Objects to be listed.
+    """Objects that cells are to list.
 
     Attributes:
-        item: (n,) code of each.
-        box: (n, 4) west, south, east, north of where it may be met; one object may have several.
+        item: (n,) code of each object.
+        box: (n, 4) west, south, east, north of the area where a ray may meet it; one object may have several boxes.
         top_z: (n,) site z that it does not exceed.
     """
 
@@ -80,7 +80,7 @@ def _ground_top(ground: Ground, size_m: float, rows: int, columns: int) -> Float
         return first, last
 
     def highest(z: FloatArray, first: IntArray, last: IntArray) -> FloatArray:
-        """Over rows first … last of each span."""
+        """Return the highest values over rows first … last of each span."""
         top = z[first]
         for step in range(1, int(np.max(last - first)) + 1):
             top = np.maximum(top, z[np.minimum(first + step, last)])
@@ -93,7 +93,7 @@ def _ground_top(ground: Ground, size_m: float, rows: int, columns: int) -> Float
 def _spread(
     ground: Ground, size_m: float, listed: Listed, rows: int, columns: int
 ) -> tuple[IntArray, IntArray, FloatArray]:
-    """Return (cell, item, top_z) of every cell that every box touches; what lies off the grid is left out."""
+    """Return (cell, item, top_z) of every cell that each box touches; parts of boxes off the grid are left out."""
     origin = np.array([ground.west_m, ground.south_m])
     low = np.floor((listed.box[:, :2] - origin) / size_m).astype(np.int64)
     high = np.floor((listed.box[:, 2:] - origin) / size_m).astype(np.int64)
@@ -107,7 +107,7 @@ def _spread(
 
 
 def _lists(cell: IntArray, item: IntArray, cells: int) -> tuple[IntArray, IntArray]:
-    """Return first item of each cell (cells + 1,), and the items, each once a cell."""
+    """Return the first item of each cell (cells + 1,), and the items, each once per cell."""
     width = int(np.max(item, initial=0)) + 1
     pairs = np.unique(cell * width + item)
     first = np.searchsorted(pairs, width * np.arange(cells + 1, dtype=np.int64))

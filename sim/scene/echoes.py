@@ -1,4 +1,4 @@
-"""Echoes of pulses, compiled: what the axis and the rim of a beam meet, put in order, merged and cut to the slots."""
+"""Computes echoes of pulses, compiled: hits of a beam's axis and rim, put in order, merged and cut to the slots."""
 
 from __future__ import annotations
 
@@ -18,25 +18,25 @@ from swath.sim.scene.rays import NEVER, Ray
 
 SOFT_HITS = 24
 _NONE = whole(0)
-# Columns of soft hits: distance, share of the energy that comes so far, reflectance, cosine of incidence, surface.
+# Columns of soft hits: distance, share of the arriving energy, reflectance, cosine of incidence, surface.
 # Columns of echoes: distance, apparent reflectance, cosine of incidence, surface, 1 if on the axis.
 
 
 class Work(NamedTuple):
-    """Room to work in: soft hits and echoes."""
+    """Work arrays for soft hits and echoes."""
 
     soft: FloatArray
     echo: FloatArray
 
 
 def workspace_bytes() -> Work:
-    """For one call at a time."""
+    """Make the work arrays; they serve one call at a time."""
     return Work(np.empty((SOFT_HITS, 5)), np.empty((SOFT_HITS + 5, 5)))
 
 
 @jit_inline
 def in_order(rows: FloatArray, count: int) -> None:
-    """Sort the first rows by distance; they are few."""
+    """Sort the first rows by distance; insertion suffices because they are few."""
     for i in range(1, count):
         for j in range(i, 0, -1):
             if rows[j - 1, 0] <= rows[j, 0]:
@@ -47,7 +47,7 @@ def in_order(rows: FloatArray, count: int) -> None:
 
 @jit_inline
 def energy_at(soft: FloatArray, count: int, at: float) -> float:
-    """Return what soft hits, in order, leave of a pulse's energy for a distance."""
+    """Return the share of a pulse's energy that the sorted soft hits leave at a distance."""
     energy = 1.0
     for k in range(count):
         if soft[k, 0] >= at:
@@ -58,7 +58,7 @@ def energy_at(soft: FloatArray, count: int, at: float) -> float:
 
 @jit_inline
 def add(echo: FloatArray, count: int, at: float, strength: float, cos: float, surface: float, on_axis: float) -> int:
-    """Return one more echo, if there is any of it."""
+    """Append an echo if it has any strength and there is room; return the number of echoes."""
     if at < NEVER and strength > 0.0 and count < len(echo):
         echo[count, 0], echo[count, 1], echo[count, 2], echo[count, 3], echo[count, 4] = (
             at,
@@ -73,7 +73,7 @@ def add(echo: FloatArray, count: int, at: float, strength: float, cos: float, su
 
 @jit_inline
 def rim(ray: Ray, spread: float, side: int) -> Ray:
-    """Return one of four rays that leave with a beam's axis, ``spread`` radians from it."""
+    """Return one of the four rays that surround a beam's axis, ``spread`` radians from it."""
     ox, oy, oz, dx, dy, dz, _, _ = ray
     if abs(dx) < 0.8:
         ax, ay, az = 0.0, dz, -dy  # d × x
@@ -91,15 +91,16 @@ def rim(ray: Ray, spread: float, side: int) -> Ray:
 
 @jit_inline
 def move(echo: FloatArray, source: int, target: int) -> None:
-    """A row over another."""
+    """Copy a row over another."""
     for k in range(5):
         echo[target, k] = echo[source, k]
 
 
 @jit_inline
 def merged(echo: FloatArray, count: int, pulse_m: float) -> int:
-    """Return echoes in order, those nearer to each other than a pulse made one: the axis' stands, else the stronger
-    one.
+    """Merge echoes nearer to each other than a pulse; return the number that is left.
+
+    The echoes are in order. A merged echo keeps the place of the axis's echo, or else of the stronger one.
     """
     kept = _NONE
     for k in range(1, count):
@@ -128,7 +129,7 @@ def echoes_of(
     soft: FloatArray,
     echo: FloatArray,
 ) -> int:
-    """Return all echoes of a pulse, in order of distance; returns how many."""
+    """Write all echoes of a pulse in order of distance and return their number."""
     count, softs, room, share, wide, beam = _NONE, _NONE, len(soft), 1.0, spread, ray
     for side in range(5):
         at, surface, reflectance, cos, edge, softs = march(
@@ -153,7 +154,7 @@ def echoes_of(
 
 
 def _cast_pulses(sources: int) -> Callable[..., None]:
-    """Return `cast_pulses` as compiled from ``sources``."""
+    """Return `cast_pulses` compiled from sources with this digest."""
 
     @jit_cached
     def cast_pulses(
@@ -170,7 +171,7 @@ def _cast_pulses(sources: int) -> Callable[..., None]:
         incidence_rad: FloatArray,
         surface: NDArray[np.uint8],
     ) -> None:
-        """Echoes of n pulses into tables (n, slots), filled with what an empty slot says before."""
+        """Write echoes of n pulses into tables (n, slots), which hold the values of empty slots beforehand."""
         slots = range_m.shape[1] if sources else 0
         frame, seed = scene.frame, scene.seed
         z, top, first = borrowed(scene.z), borrowed(scene.top), borrowed(scene.first)

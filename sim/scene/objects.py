@@ -1,4 +1,4 @@
-"""What stands on the ground, as tables of numbers that rays are cast at; columns are described at `Things`."""
+"""Objects on the ground, as tables of numbers at which rays are cast; `Things` describes the columns."""
 
 from __future__ import annotations
 
@@ -23,15 +23,16 @@ _FLAT, _GABLED, _HIPPED = range(len(ROOFS))
 
 
 class Things(NamedTuple):
-    """Tables in the site frame, metres.
+    """Tables of objects in the site frame, metres.
 
     Attributes:
         plane: (p, 6) outward normal, its product with points of the plane, surface, reflectance.
-        solid: (n, 6) center and radius of the sphere around it; in `flat`, where its planes begin and end.
-        tree: (n, 7) crown's center, one by its radius and by its half height, interceptions a metre, reflectance.
+        solid: (n, 6) centre and radius of the sphere around it, then in `flat` the beginning and end of its planes.
+        tree: (n, 7) crown's centre, one divided by its radius and by its half height, interceptions a metre,
+            reflectance.
         wire: (n, 7) ends of a straight piece, radius.
         car: (n, 12) as ``solid``, about the middle of its floor; from, direction, length of its way, speed in m/s.
-        lake: (n, 8) center, normal, radius, share of pulses that return.
+        lake: (n, 8) centre, normal, radius, share of pulses that return.
         road: (n, 8) ends of a straight piece, half width, metres of road before it, 1 if painted, number of the road.
     """
 
@@ -45,7 +46,7 @@ class Things(NamedTuple):
 
 
 def flat(things: Things) -> tuple[FloatArray, dict[str, NDArray[np.int64]]]:
-    """Return all tables one behind the other, planes first, and where each row of each begins."""
+    """Return all tables one behind the other, planes first, and the position at which each row of each begins."""
     starts, at = {}, 0
     for name, table in things._asdict().items():
         starts[name] = at + table.shape[1] * np.arange(len(table), dtype=np.int64)
@@ -55,12 +56,12 @@ def flat(things: Things) -> tuple[FloatArray, dict[str, NDArray[np.int64]]]:
 
 @dataclass(frozen=True)
 class Solids:
-    """Buildings as bodies between planes; they have no floor, the ground is in the way.
+    """Buildings as bodies between planes; they have no floor, because the ground is in the way.
 
     Attributes:
         plane, solid: see `Things`.
         polygon: (n, 4, 2) east, north of the corners of the footprints.
-        box: (n, 4) west, south, east, north of them.
+        box: (n, 4) west, south, east, north of the footprints.
         top_z: (n,) site z of the highest point.
     """
 
@@ -72,7 +73,7 @@ class Solids:
 
 
 def build_solids(houses: Houses, ground: Ground, seed: int) -> Solids:
-    """Return walls and roofs; the eaves stand above the highest ground under each building."""
+    """Return the walls and roofs of houses; the eaves are above the highest ground under each building."""
     base, low_m = _bases(houses, ground)
     up = ups(ground.site, base)
     axes = _axes(houses.heading_rad, up)
@@ -97,8 +98,9 @@ def build_solids(houses: Houses, ground: Ground, seed: int) -> Solids:
 
 
 def _bases(houses: Houses, ground: Ground) -> tuple[FloatArray, FloatArray]:
-    """Return centers (n, 3) as high as the highest ground beneath, and how far the lowest lies below (n,), not
-    positive.
+    """Return centres (n, 3) at the highest ground beneath, and the height of the lowest ground against it (n,).
+
+    That height is never positive.
     """
     longest = float(np.max(houses.size_m, initial=0.0))
     count = int(np.clip(np.ceil(2 * longest / ground.cell_m), 4, 40)) + 1
@@ -114,9 +116,7 @@ def _bases(houses: Houses, ground: Ground) -> tuple[FloatArray, FloatArray]:
 
 
 def _axes(heading_rad: FloatArray, up: FloatArray) -> FloatArray:
-    """Return (n, 3, 3) rows: along the ridge, to its right, up; at right angles, the first two level where they
-    stand.
-    """
+    """Return (n, 3, 3) rows of orthogonal axes: along the ridge, to its right, up; the first two are level there."""
     along = np.stack([np.sin(heading_rad), np.cos(heading_rad), np.zeros(len(heading_rad))], axis=1)
     right = np.cross(along, up)
     right /= np.linalg.norm(right, axis=1, keepdims=True)
@@ -124,8 +124,9 @@ def _axes(heading_rad: FloatArray, up: FloatArray) -> FloatArray:
 
 
 def _planes(houses: Houses, base: FloatArray, axes: FloatArray, seed: int) -> tuple[FloatArray, BoolArray]:
-    """Return (n, 9, 6) planes that a building may have, and which it has (n, 9): four walls, a flat roof, slopes,
-    hips.
+    """Return (n, 9, 6) the planes that a building may have, and (n, 9) True for those that it has.
+
+    The planes are four walls, a flat roof, slopes and hips.
     """
     count = len(houses)
     sin, cos = np.sin(houses.pitch_rad), np.cos(houses.pitch_rad)
@@ -153,7 +154,7 @@ def _planes(houses: Houses, base: FloatArray, axes: FloatArray, seed: int) -> tu
 
 
 def build_trees(forests: list[ForestTable], ground: Ground, seed: int) -> FloatArray:
-    """Return `Things.tree`, also of trees that stand where something else does."""
+    """Return `Things.tree`, including trees at places that other objects occupy."""
     rows = [np.zeros((0, 7))]
     for index, table in enumerate(forests):
         draws = generator(seed, "terrain", "forest", index)
@@ -188,8 +189,9 @@ def build_wires(tables: list[WireTable], ground: Ground) -> FloatArray:
 
 
 def build_cars(tables: list[CarTable], seed: int, planes_before: int) -> tuple[FloatArray, FloatArray]:
-    """Return planes (5 n, 6) of boxes without a floor, which are to follow ``planes_before`` others, and
-    `Things.car`.
+    """Return planes (5 n, 6) of boxes without a floor, and `Things.car`.
+
+    The planes are to follow ``planes_before`` others.
     """
     paint = generator(seed, "terrain", "cars").uniform(0.1, 0.7, len(tables))
     planes, cars = [np.zeros((0, PLANE))], [np.zeros((0, 12))]
@@ -211,7 +213,7 @@ def build_cars(tables: list[CarTable], seed: int, planes_before: int) -> tuple[F
 
 
 def build_lakes(lakes: list[Lake]) -> FloatArray:
-    """Return `Things.lake`."""
+    """Return the rows of `Things.lake`."""
     rows = [[*lake.center, *lake.up, lake.radius_m, lake.returns] for lake in lakes]
     return np.array(rows, np.float64).reshape(-1, 8)
 
@@ -232,7 +234,7 @@ def build_roads(tables: list[RoadTable]) -> FloatArray:
 
 
 def near_circles(points: FloatArray, radius_m: FloatArray, centers: FloatArray, within_m: FloatArray) -> BoolArray:
-    """Return (n,) whether circles about points (n, 2) touch circles about centers (k, 2)."""
+    """Return (n,) True where circles about points (n, 2) touch circles about centres (k, 2)."""
     near = np.zeros(len(points), np.bool_)
     if len(points) and len(centers):
         tree = cKDTree(points)
@@ -245,7 +247,7 @@ def near_circles(points: FloatArray, radius_m: FloatArray, centers: FloatArray, 
 
 
 def near_pieces(points: FloatArray, radius_m: FloatArray, pieces: FloatArray, within_m: FloatArray) -> BoolArray:
-    """Return (n,) whether circles about points (n, 2) come within (k,) of straight pieces (k, 4) from, to."""
+    """Return (n,) True where circles about points (n, 2) come within (k,) of straight pieces (k, 4) from, to."""
     near = np.zeros(len(points), np.bool_)
     if not len(points) or not len(pieces):
         return near

@@ -23,7 +23,7 @@ Place = Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
 
 KEY = "terrain.raster"
 MOST_PIXELS = 100_000_000  # 800 MB of heights
-FARTHEST = 1e9  # units of the coordinates, of any map there is
+FARTHEST = 1e9  # largest coordinate of any map, in its units
 FARTHEST_HEIGHT_M = 100_000.0
 _CORNERS = ("south-west", "south-east", "north-west", "north-east")
 
@@ -32,14 +32,15 @@ class RasterHeights:
     """Heights of a raster on the grid of the ground, bilinear between the centres of its pixels.
 
     Args:
-        plan: names the raster and, in ``flight.crs``, the CRS it must have.
+        plan: names the raster and, in ``flight.crs``, the CRS that it must have.
         site: of the grid.
         east_m, north_m: first and last column and row.
-        of_height: makes a smooth function of place and height quick on that grid (`swath.sim.scene.terrain.OfHeight`).
+        of_height: makes a fast version, on that grid, of a smooth function of place and height
+            (`swath.sim.scene.terrain.OfHeight`).
 
     Raises:
-        PlanError: ``terrain.raster``, one line: no rasterio, no such file, another CRS, a corner not covered; when
-            called, a pixel without data.
+        PlanError: ``terrain.raster``, one line: rasterio is not installed, there is no such file, the CRS is another,
+            or a corner is not covered; when called, a pixel has no data.
     """
 
     def __init__(
@@ -61,7 +62,7 @@ class RasterHeights:
     def __call__(self, east_m: FloatArray, north_m: FloatArray) -> FloatArray:
         """Return (rows, columns) ellipsoidal heights at east (columns,) and north (rows,).
 
-        Where a place is on the map depends a little on its height: 0.8 m of 500 m at 10 km. Three turns settle it.
+        The position on the map depends a little on the height: 0.8 m for 500 m at 10 km. Three iterations suffice.
         """
         height_m = np.full((len(north_m), len(east_m)), self._height_m)
         for _ in range(3):
@@ -80,7 +81,7 @@ class RasterHeights:
 
 @dataclass(frozen=True)
 class _Projected:
-    """Easting and northing of site places."""
+    """Converts site places to easting and northing."""
 
     site: Site
     crs: CRS
@@ -94,14 +95,14 @@ class _Projected:
 
 
 class _Edges:
-    """Columns and rows of places on the map, by the six numbers of a raster's affine transform."""
+    """Converts places on the map to columns and rows, by the six numbers of a raster's affine transform."""
 
     def __init__(self, transform: Any) -> None:
         self._inverse = np.linalg.inv([[transform.a, transform.b], [transform.d, transform.e]])
         self._corner = np.array([transform.c, transform.f])
 
     def __call__(self, easting: FloatArray, northing: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return (n,) each."""
+        """Return columns and rows, (n,) each."""
         x, y = easting - self._corner[0], northing - self._corner[1]
         (to_column_x, to_column_y), (to_row_x, to_row_y) = self._inverse
         return to_column_x * x + to_column_y * y, to_row_x * x + to_row_y * y
@@ -112,9 +113,9 @@ class _Pixels:
     """A window of the raster.
 
     Attributes:
-        values: (rows, columns), nan where there is none.
+        values: (rows, columns), nan where there is no data.
         first: column and row of the window in the raster.
-        edges: takes the map to columns and rows of the raster, whole at the pixels' edges.
+        edges: converts the map to columns and rows of the raster, whole at the pixels' edges.
     """
 
     values: FloatArray
@@ -127,7 +128,7 @@ class _Pixels:
         return column - self.first[0] - 0.5, row - self.first[1] - 0.5
 
     def sample(self, column: FloatArray, row: FloatArray) -> FloatArray:
-        """Return bilinear; in the outer half of the outermost pixels as at their centres."""
+        """Return bilinear heights; in the outer half of the outermost pixels those at their centres."""
         rows, columns = self.values.shape
         column, row = np.clip(column, 0.0, columns - 1), np.clip(row, 0.0, rows - 1)
         left = np.minimum(column.astype(np.int64), max(columns - 2, 0))
@@ -185,8 +186,9 @@ def _read(plan: Plan, to_crs: _Projected, corners: FloatArray, height_m: float) 
 
 
 def _window(source: Any, first: NDArray[np.int64], size: NDArray[np.int64], path: Path) -> FloatArray:
-    """Return (rows, columns) of the first band, nan where it has none, or none of this Earth: a mark that it does not
-    name.
+    """Return (rows, columns) of the first band, nan where it has no data.
+
+    Values beyond any height on Earth count as no data too: they are marks that the file does not declare.
     """
     from rasterio.windows import Window
 
@@ -194,21 +196,21 @@ def _window(source: Any, first: NDArray[np.int64], size: NDArray[np.int64], path
     if columns * rows > MOST_PIXELS:
         raise PlanError(KEY, f"{path} has {columns} × {rows} pixels under the swaths; want at most {MOST_PIXELS}")
     window = Window(*map(int, first), columns, rows)
-    with np.errstate(invalid="ignore"):  # a NaN of any kind is none
+    with np.errstate(invalid="ignore"):  # a NaN of any kind means no data
         values: FloatArray = source.read(1, window=window, out_dtype="float64")
     values[(source.read_masks(1, window=window) == 0) | ~(np.abs(values) < FARTHEST_HEIGHT_M)] = np.nan
     return values
 
 
 def _check_pixels(source: Any, path: Path) -> None:
-    """Whether they can be heights of places on a map."""
+    """Refuse pixels that cannot be heights of places on a map."""
     place = source.transform
     steps, corner = np.abs([place.a, place.b, place.d, place.e]), np.abs([place.c, place.f])
     area = abs(place.a * place.e - place.b * place.d) if steps.max() < FARTHEST else 0.0
     if not (1 / FARTHEST < area and corner.max() < FARTHEST):
         raise PlanError(KEY, f"{path} has pixels that lie nowhere: {tuple(place)[:6]}; want a GeoTIFF of heights")
     rows, columns = source.block_shapes[0]
-    if rows * columns * source.count > MOST_PIXELS:  # a block may hold all bands, and is read as a whole
+    if rows * columns * source.count > MOST_PIXELS:  # a block may hold all bands and is read whole
         raise PlanError(KEY, f"{path} has {source.count} bands in blocks of {columns} × {rows}; want one of heights")
     if not source.dtypes[0].startswith(("int", "uint", "float")):
         raise PlanError(KEY, f"{path} has pixels of type {source.dtypes[0]}; want a GeoTIFF of heights")
@@ -231,7 +233,7 @@ def _name(crs: CRS) -> str:
 def _check_cover(
     pixels: FloatArray, size: tuple[int, int], easting: FloatArray, northing: FloatArray, path: Path
 ) -> None:
-    """Corners of the grid (4, 2) as columns and rows, against the raster's edges."""
+    """Refuse a raster that does not reach all corners of the grid (4, 2), given as columns and rows."""
     inside = np.all((pixels >= 0.0) & (pixels <= size), axis=1)
     for name, there, e, n in zip(_CORNERS, inside, easting, northing, strict=True):
         if not there:

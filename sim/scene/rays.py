@@ -1,7 +1,7 @@
-"""Where a ray meets one thing: compiled functions of plain numbers.
+"""Intersections of a ray with single objects: compiled functions of plain numbers.
 
 A ray is ``(x, y, z, dx, dy, dz, 1 / dx, 1 / dy)``: origin and unit direction in the site frame. Distances along it are
-metres from the origin; infinity: never.
+metres from the origin; infinity means never.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from swath.sim.compiled import jit_inline
 
 Ray = tuple[float, float, float, float, float, float, float, float]
 
-PLANE = 6  # numbers of a plane's row
+PLANE = 6  # length of a plane's row
 NEVER = math.inf
 UNDERGROUND = -1.0
 _MIX_1, _MIX_2 = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
@@ -26,8 +26,9 @@ _S11, _S27, _S30, _S31 = np.uint64(11), np.uint64(27), np.uint64(30), np.uint64(
 
 @jit_inline
 def uniform(seed: int, number: int, purpose: int, draw: int) -> float:
-    """Return a number in [0, 1) that hangs on its four names alone (the finaliser of SplitMix64, Steele et al.
-    2014).
+    """Return a number in [0, 1) that depends on the four arguments alone.
+
+    It is the finaliser of SplitMix64 (Steele et al. 2014).
     """
     state = np.uint64(seed) * _ODD_1 + np.uint64(number) * _ODD_2 + np.uint64(purpose) * _ODD_3
     state += np.uint64(draw) * _ODD_4
@@ -38,8 +39,9 @@ def uniform(seed: int, number: int, purpose: int, draw: int) -> float:
 
 @jit_inline
 def patch_root(height: float, slope: float, bend: float) -> float:
-    """Return smallest s > 0 with height + slope · s + bend · s² = 0, height > 0 at s = 0: where a ray goes below a
-    patch.
+    """Return the smallest s > 0 with height + slope · s + bend · s² = 0, for height > 0.
+
+    It is the distance at which a ray goes below a patch.
     """
     inside = slope * slope - 4.0 * bend * height
     if inside < 0.0:
@@ -53,7 +55,7 @@ def patch_root(height: float, slope: float, bend: float) -> float:
 
 @jit_inline
 def boundary(at: float, step: float, per_step: float, low: float, size: float, index: int) -> float:
-    """Return distance at which a ray leaves slice ``index`` of slices of this size, in one coordinate."""
+    """Return the distance at which a ray leaves slice ``index`` of slices of this size, in one coordinate."""
     if step > 0.0:
         return (low + (index + 1) * size - at) * per_step
     return (low + index * size - at) * per_step if step < 0.0 else NEVER
@@ -61,7 +63,7 @@ def boundary(at: float, step: float, per_step: float, low: float, size: float, i
 
 @jit_inline
 def slice_at(value: float, low: float, size: float, count: int) -> int:
-    """Return index of the slice that holds a value, the nearest one beyond the ends."""
+    """Return the index of the slice that holds a value; beyond the ends, that of the nearest slice."""
     return min(max(math.floor((value - low) / size), 0), count - 1)
 
 
@@ -69,10 +71,11 @@ def slice_at(value: float, low: float, size: float, count: int) -> int:
 def ground_entry(
     z: FloatArray, west: float, south: float, cell: float, ray: Ray, start: float, stop: float, fresh: bool
 ) -> float:
-    """Return where a ray goes below the bilinear ground between two distances.
+    """Return the distance, between two limits, at which a ray goes below the bilinear ground.
 
     Within a cell the height of the ray above the patch is a quadratic of the distance; it is set up at the ray's entry
-    into the cell, so that nothing large cancels. `UNDERGROUND` where a ``fresh`` ray begins below.
+    into the cell, so that no large numbers cancel. The result is `UNDERGROUND` if a ``fresh`` ray begins below the
+    ground.
     """
     ox, oy, oz, dx, dy, dz, per_dx, per_dy = ray
     columns, rows, per_cell = z.shape[1] - 1, z.shape[0] - 1, 1.0 / cell
@@ -107,7 +110,7 @@ def ground_entry(
 
 @jit_inline
 def ground_normal(z: FloatArray, west: float, south: float, cell: float, x: float, y: float) -> tuple[float, float]:
-    """Return slope of the bilinear ground at a place: (dz/dx, dz/dy)."""
+    """Return the slope of the bilinear ground at a place: (dz/dx, dz/dy)."""
     column = slice_at(x, west, cell, z.shape[1] - 1)
     row = slice_at(y, south, cell, z.shape[0] - 1)
     z00, z10, z01, z11 = z[row, column], z[row, column + 1], z[row + 1, column], z[row + 1, column + 1]
@@ -118,7 +121,7 @@ def ground_normal(z: FloatArray, west: float, south: float, cell: float, x: floa
 
 @jit_inline
 def ground_z(z: FloatArray, west: float, south: float, cell: float, x: float, y: float) -> float:
-    """Return site z of the bilinear ground at a place."""
+    """Return the site z of the bilinear ground at a place."""
     column = slice_at(x, west, cell, z.shape[1] - 1)
     row = slice_at(y, south, cell, z.shape[0] - 1)
     u, v = (x - west) / cell - column, (y - south) / cell - row
@@ -129,7 +132,7 @@ def ground_z(z: FloatArray, west: float, south: float, cell: float, x: float, y:
 
 @jit_inline
 def passes(ray: Ray, x: float, y: float, z: float, radius: float) -> float:
-    """Return distance at which a ray is nearest to a point, if ahead and within a radius; else never."""
+    """Return the distance at which a ray is nearest to a point, if that is ahead and within a radius; else `NEVER`."""
     ox, oy, oz, dx, dy, dz, _, _ = ray
     wx, wy, wz = x - ox, y - oy, z - oz
     along = wx * dx + wy * dy + wz * dz
@@ -140,10 +143,10 @@ def passes(ray: Ray, x: float, y: float, z: float, radius: float) -> float:
 
 @jit_inline
 def solid_entry(rows: FloatArray, first: int, last: int, ray: Ray, grow: float) -> tuple[float, int, float, float]:
-    """Return where a ray enters the body behind the planes in ``rows[first:last]`` (`Things.plane`).
+    """Return the entry of a ray into the body behind the planes in ``rows[first:last]`` (`Things.plane`).
 
-    Returns distance, where the plane's row begins, cosine of incidence, and the distance of an edge in reach: finite
-    where the beam's rim, ``grow`` from its axis, may meet something else than the axis does.
+    Returns the distance, the beginning of the plane's row, the cosine of incidence, and the distance of an edge in
+    reach. The last is finite where the beam's rim, ``grow`` from its axis, may meet something else than the axis does.
     """
     ox, oy, oz, dx, dy, dz, _, _ = ray
     enter, leave, wide_enter, wide_leave, through, cos = -NEVER, NEVER, -NEVER, NEVER, first, 1.0
@@ -176,7 +179,7 @@ def solid_entry(rows: FloatArray, first: int, last: int, ray: Ray, grow: float) 
 
 @jit_inline
 def crown_span(rows: FloatArray, tree: int, ray: Ray) -> tuple[float, float]:
-    """Return where a ray enters and leaves an upright ellipsoid (`Things.tree`, at ``rows[tree]``)."""
+    """Return the distances at which a ray enters and leaves an upright ellipsoid (`Things.tree`, at ``rows[tree]``)."""
     ox, oy, oz, dx, dy, dz, _, _ = ray
     across, upright = rows[tree + 3], rows[tree + 4]
     px, py, pz = (ox - rows[tree]) * across, (oy - rows[tree + 1]) * across, (oz - rows[tree + 2]) * upright
@@ -192,8 +195,9 @@ def crown_span(rows: FloatArray, tree: int, ray: Ray) -> tuple[float, float]:
 
 @jit_inline
 def wire_passage(rows: FloatArray, wire: int, ray: Ray) -> tuple[float, float, float]:
-    """Return where a ray passes a piece of wire (`Things.wire`): distance, miss distance, cosine; never beside its
-    ends.
+    """Return distance, miss distance and cosine at which a ray passes a piece of wire (`Things.wire`).
+
+    The distances are `NEVER` if it passes beside the ends.
     """
     ox, oy, oz, dx, dy, dz, _, _ = ray
     ux, uy, uz = rows[wire + 3] - rows[wire], rows[wire + 4] - rows[wire + 1], rows[wire + 5] - rows[wire + 2]

@@ -1,4 +1,4 @@
-"""The scene of a flight: the ground of the plan, what stands on it, and rays cast at it."""
+"""The scene of a flight: the ground of the plan, the objects on it, and rays cast at them."""
 
 from __future__ import annotations
 
@@ -39,23 +39,23 @@ from swath.sim.site import Site
 
 Seen = Callable[[FloatArray, FloatArray], NDArray[np.bool_]]
 
-FOOTPRINT_M = (1.0, 20.0)  # least and greatest radius of a beam for which objects are listed in the cells beside them
+FOOTPRINT_M = (1.0, 20.0)  # limits of the beam radius for which neighbouring cells list objects too
 CONTROL_CLEAR_M = 4.0
 _CAR_REACH_M = 3.0
 
 
 @dataclass(frozen=True)
 class Scene:
-    """What rays are cast at, and what a map shows of it; places are east and north, metres, site frame.
+    """Everything that rays are cast at and that a map shows; places are east and north, metres, site frame.
 
     Attributes:
         site: the frame.
-        ground: without what stands on it.
-        corners: (k, 2) what had to be covered.
+        ground: the ground without objects.
+        corners: (k, 2) corners of the area that had to be covered.
         buildings: (n, 4, 2) corners of footprints.
         roads: of the plan and of villages.
-        waters: (n, 3) centers and radii.
-        trees: (n, 3) centers and radii of crowns.
+        waters: (n, 3) centres and radii.
+        trees: (n, 3) centres and radii of crowns.
         wires: (n, 4) from, to.
         cars: (n, 4) from, to.
         arrays: for the compiled functions.
@@ -73,8 +73,9 @@ class Scene:
     arrays: SceneArrays
 
     def ground_m(self, east_m: FloatArray, north_m: FloatArray) -> FloatArray:
-        """Return (n,) ellipsoidal heights of the ground at site x and y (n,); beyond the area those of its nearest
-        place.
+        """Return (n,) ellipsoidal heights of the ground at site x and y (n,).
+
+        Beyond the area they are those of its nearest place.
         """
         return self.ground.ground_m(east_m, north_m)
 
@@ -92,15 +93,15 @@ class Scene:
         pulse_m: float,
         slots: int,
     ) -> Echoes:
-        """Return echoes of pulses; those of a pulse do not depend on what else is in the batch.
+        """Return echoes of pulses; those of a pulse do not depend on the other pulses of the batch.
 
         Args:
             origin: (n, 3) site frame, metres.
             direction: (n, 3) unit vectors, site frame.
-            time_s: (n,) when they leave: cars move.
-            number: (n,) of the pulses: what is random about a pulse hangs on the plan's seed and its number.
+            time_s: (n,) times of emission, which the positions of cars depend on.
+            number: (n,) numbers of the pulses; random effects on a pulse depend on the plan's seed and this number.
             divergence_rad: full angle of the beam; 0: a line.
-            pulse_m: echoes nearer to each other than this are one.
+            pulse_m: echoes nearer to each other than this are merged.
             slots: echoes kept of a pulse: the first ones and the last.
         """
         shape = (len(origin), slots)
@@ -123,13 +124,12 @@ class Scene:
         return Echoes(range_m, reflectance, incidence_rad, surface)
 
     def control_points(self, count: int, seed: int, seen: Seen | None = None) -> FloatArray:
-        """Return (count, 3) places on the ground, site frame: in the open, on the flatter half of it, far from each
-        other.
+        """Return (count, 3) open places on the flatter half of the ground, far from each other, site frame.
 
         Args:
-            count: how many.
+            count: number of places.
             seed: of the choice.
-            seen: which places (n,) east and north count; None: all between the corners.
+            seen: function that tells which places (n,) east and north count; None: all places between the corners.
 
         Raises:
             PlanError: ``control.points``: there are not so many.
@@ -150,7 +150,7 @@ class Scene:
         return self.ground.points(chosen[:, 0], chosen[:, 1])
 
     def _occupied(self, places: FloatArray, clear_m: float) -> NDArray[np.bool_]:
-        """Return (n,) whether something is nearer to places (n, 2) than this; roads are not something."""
+        """Return (n,) True where an object is nearer to places (n, 2) than this; roads do not count."""
         clear = np.full(len(places), clear_m)
         center = np.mean(self.buildings, axis=1)
         radius = np.max(np.linalg.norm(self.buildings - center[:, np.newaxis], axis=2), axis=1, initial=0.0)
@@ -163,7 +163,7 @@ class Scene:
 
 
 def _far_apart(places: FloatArray, count: int) -> FloatArray:
-    """Return some of the places, each as far as can be from those before."""
+    """Return some of the places, each as far as possible from those chosen before."""
     chosen = np.zeros((count, 2))
     distance = np.full(len(places), np.inf)
     at = 0
@@ -175,12 +175,13 @@ def _far_apart(places: FloatArray, count: int) -> FloatArray:
 
 
 def build_scene(plan: Plan, site: Site, corners: FloatArray) -> Scene:
-    """Return the scene over corners (k, 2) east, north, and `swath.sim.scene.terrain.MARGIN_M` around; what lies
-    beyond is left out.
+    """Return the scene over corners (k, 2) east, north, and `swath.sim.scene.terrain.MARGIN_M` around.
+
+    Objects beyond are left out.
 
     Raises:
-        PlanError: ``terrain.cell_m``: too large an area for it; ``terrain.raster``: it cannot be used;
-            ``terrain.village[i].houses``: no room for them.
+        PlanError: ``terrain.cell_m``: the area is too large for it; ``terrain.raster``: it cannot be used;
+            ``terrain.village[i].houses``: there is no room for them.
     """
     table = plan.tables.terrain
     corners = np.asarray(corners, np.float64)
@@ -221,7 +222,7 @@ def build_scene(plan: Plan, site: Site, corners: FloatArray) -> Scene:
 
 
 def _ends(tables: list[WireTable] | list[CarTable]) -> FloatArray:
-    """Return (n, 4) from, to."""
+    """Return (n, 4) the two ends, from and to."""
     return np.array([[*table.from_m, *table.to_m] for table in tables], np.float64).reshape(-1, 4)
 
 
@@ -253,7 +254,7 @@ def _on_grid(ground: Ground, houses: Houses) -> NDArray[np.bool_]:
 
 
 def _standing(trees: FloatArray, ground: Ground, houses: Houses, road: FloatArray, water: FloatArray) -> FloatArray:
-    """Return trees on the grid that touch no house, no water and no road."""
+    """Return the trees on the grid that touch no house, no water and no road."""
     place, radius = trees[:, :2], 1 / trees[:, 3]
     taken = near_circles(place, radius, houses.center_m, houses.radius_m)
     taken |= near_circles(place, radius, water[:, :2], water[:, 6])
@@ -262,7 +263,7 @@ def _standing(trees: FloatArray, ground: Ground, houses: Houses, road: FloatArra
 
 
 def _arrays(plan: Plan, ground: Ground, things: Things, solids: Solids, ways: FloatArray) -> SceneArrays:
-    """Return tables and lists for the compiled functions."""
+    """Return the tables and lists for the compiled functions."""
     foot_m = _footprint_m(list(plan.tables.scanner.values()))
     rows, starts = flat(things)
     tree, wire, lake = things.tree, things.wire, things.lake
@@ -295,7 +296,7 @@ def _around(center: FloatArray, radius: FloatArray) -> FloatArray:
 
 
 def _footprint_m(scanners: list[ScannerTable]) -> float:
-    """Return radius of the widest beam at the end of its range, as far as it counts."""
+    """Return the radius of the widest beam at the end of its range, within `FOOTPRINT_M`."""
     widest = max((0.5e-3 * one.divergence_mrad * one.range_max_m for one in scanners), default=0.0)
     return float(np.clip(widest, *FOOTPRINT_M))
 
@@ -303,7 +304,7 @@ def _footprint_m(scanners: list[ScannerTable]) -> float:
 def _listed(
     kinds: int, kind: int, start: IntArray, box: FloatArray, top_z: FloatArray, wider_m: FloatArray | float
 ) -> Listed:
-    """Return objects of a kind, in boxes made wider on all sides."""
+    """Return the objects of a kind, in boxes widened on all sides."""
     wider = np.broadcast_to(wider_m, len(box))[:, np.newaxis]
     return Listed(kinds * start + kind, np.concatenate([box[:, :2] - wider, box[:, 2:] + wider], axis=1), top_z)
 
@@ -322,7 +323,7 @@ def _pieces(lines: FloatArray) -> tuple[IntArray, FloatArray]:
 
 
 def _driven(ways: FloatArray, ground: Ground) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Return pieces of the cars' ways: the car of each, its box (m, 4), and what the car does not exceed there (m,)."""
+    """Return pieces of the cars' ways: the car of each, its box (m, 4), and the z limit of the car there (m,)."""
     row, box = _pieces(ways)
     across = np.linspace(0.0, 1.0, 2 + int(2 * CELL_M / ground.cell_m))
     x = box[:, np.newaxis, :1] + across[:, np.newaxis] * (box[:, 2:3] - box[:, :1])[:, np.newaxis]

@@ -1,4 +1,4 @@
-"""The ground of the virtual site: nodes on a square grid, bilinear between them, from hills of its own or a raster."""
+"""The ground of the virtual site: nodes on a square grid, bilinear between them, from analytic hills or a raster."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ class Ground:
     """The bilinear ground.
 
     Attributes:
-        site: whose frame it is in.
+        site: site whose frame it is in.
         west_m, south_m: site coordinates of the first node.
-        cell_m: between nodes.
+        cell_m: distance between nodes.
         z: (rows, columns) site z of the nodes, metres; rows go north, columns east.
     """
 
@@ -56,12 +56,12 @@ class Ground:
         return float(self.south_m + (self.z.shape[0] - 1) * self.cell_m)
 
     def covers(self, east_m: FloatArray, north_m: FloatArray) -> NDArray[np.bool_]:
-        """Return (n,) whether places lie on the grid."""
+        """Return (n,) True where places lie on the grid."""
         across = (east_m >= self.west_m) & (east_m <= self.east_m)
         return across & (north_m >= self.south_m) & (north_m <= self.north_m)
 
     def site_z(self, east_m: FloatArray, north_m: FloatArray) -> FloatArray:
-        """Return site z of the ground at site x and y, metres; beyond the grid that of its nearest place."""
+        """Return the site z of the ground at site x and y, metres; beyond the grid that of its nearest place."""
         rows, columns = self.z.shape
         across = np.clip((east_m - self.west_m) / self.cell_m, 0.0, columns - 1)
         along = np.clip((north_m - self.south_m) / self.cell_m, 0.0, rows - 1)
@@ -74,17 +74,17 @@ class Ground:
         return z
 
     def points(self, east_m: FloatArray, north_m: FloatArray) -> FloatArray:
-        """Return (…, 3) site coordinates on the ground."""
+        """Return (…, 3) site coordinates of points on the ground."""
         return np.stack([east_m, north_m, self.site_z(east_m, north_m)], axis=-1)
 
     def ground_m(self, east_m: FloatArray, north_m: FloatArray) -> FloatArray:
-        """Return ellipsoidal heights of the ground at site x and y; beyond the grid that of its nearest place."""
+        """Return the ellipsoidal heights of the ground at site x and y; beyond the grid those of its nearest places."""
         east = np.clip(np.asarray(east_m, np.float64), self.west_m, self.east_m)
         north = np.clip(np.asarray(north_m, np.float64), self.south_m, self.north_m)
         return self.site.heights(self.points(east, north))
 
     def slope(self, east_m: FloatArray, north_m: FloatArray) -> FloatArray:
-        """Return tangent of the steepest slope of the grid around places (n,), over two cells."""
+        """Return the tangent of the steepest slope of the grid around places (n,), over two cells."""
         step = self.cell_m
         across = self.site_z(east_m + step, north_m) - self.site_z(east_m - step, north_m)
         along = self.site_z(east_m, north_m + step) - self.site_z(east_m, north_m - step)
@@ -92,15 +92,15 @@ class Ground:
 
 
 class OfHeight:
-    """A smooth function of place and height on a grid: cubic between coarse nodes, a straight line in height.
+    """A smooth function of place and height on a grid, interpolated: cubic between coarse nodes, linear in height.
 
-    Site z of a height, or map coordinates: over 20 km their second derivative by height stays below 2e-12 a metre, and
-    what a cubic leaves out of the earth's curvature below a micrometre.
+    It serves for the site z of a height, or for map coordinates. Over 20 km their second derivative by height stays
+    below 2e-12 per metre, and the cubic's error from the earth's curvature below a micrometre.
 
     Args:
         function: of east, north, height (n,) each.
         east_m, north_m: of the grid's first and last column and row.
-        height_m: about which the line is drawn.
+        height_m: height about which it is linear.
     """
 
     def __init__(
@@ -119,7 +119,7 @@ class OfHeight:
         self._height_m = height_m
 
     def __call__(self, east_m: FloatArray, north_m: FloatArray, height_m: FloatArray | float) -> FloatArray:
-        """Return (rows, columns) at east (columns,), north (rows,) and heights (rows, columns)."""
+        """Return (rows, columns) values at east (columns,), north (rows,) and heights (rows, columns)."""
         value: FloatArray = self._middle(north_m, east_m) + self._gain(north_m, east_m) * (height_m - self._height_m)
         return value
 
@@ -128,7 +128,7 @@ def build_ground(plan: Plan, site: Site, corners: FloatArray) -> Ground:
     """Return the ground under corners (k, 2) east, north, and `MARGIN_M` around.
 
     Raises:
-        PlanError: ``terrain.cell_m``: too many nodes; ``terrain.raster``: see `swath.sim.scene.raster`.
+        PlanError: ``terrain.cell_m``: there are too many nodes; ``terrain.raster``: see `swath.sim.scene.raster`.
     """
     table = plan.tables.terrain
     cell_m = table.cell_m
@@ -164,8 +164,9 @@ def _check_size(cells: NDArray[np.int64], cell_m: float) -> None:
 
 
 def analytic_heights(table: TerrainTable) -> HeightsOnGrid:
-    """Return slope and hills of the plan: `TerrainTable.height_m` at the origin, hills of ``relief_m`` from foot to
-    top.
+    """Return a function that gives the plan's slope and hills on a grid.
+
+    The height is `TerrainTable.height_m` at the origin; hills rise by ``relief_m`` from foot to top.
     """
     draws = generator(table.seed, "terrain", "hills")
     turned = draws.uniform(0.0, 360.0)
@@ -190,7 +191,7 @@ def analytic_heights(table: TerrainTable) -> HeightsOnGrid:
 
 @dataclass(frozen=True)
 class Lake:
-    """Level water: a disc.
+    """Level water in the shape of a disc.
 
     Attributes:
         center: (3,) site coordinates on its surface.
@@ -205,7 +206,7 @@ class Lake:
 
 
 def fill_lake(ground: Ground, center_m: list[float], radius_m: float, returns: float) -> Lake:
-    """Return a lake as high as the lowest place of its rim; the ground within is dug out below it.
+    """Return a lake as high as the lowest place of its rim, and dig out the ground within.
 
     Only cells that lie wholly within the circle change, so the shore is the ground as it was.
     """

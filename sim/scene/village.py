@@ -23,7 +23,7 @@ VERGE_M = 2.0  # between a street and the lots
 LARGEST_LOT_M = (26.0, 30.0)  # along and away from the street
 SMALLEST_LOT_M = (13.0, 15.0)
 LOTS_BETWEEN_CROSSINGS = 5
-_TURN_DEG = 4.0  # one sigma of a house's heading against its street's
+_TURN_DEG = 4.0  # one sigma of a house's heading relative to its street
 
 
 @dataclass(frozen=True)
@@ -34,9 +34,9 @@ class Houses:
         center_m: (n, 2) east, north.
         size_m: (n, 2) along and across the ridge.
         heading_rad: (n,) azimuth of the ridge.
-        eaves_m: (n,) above the highest ground under the building.
+        eaves_m: (n,) height above the highest ground under the building.
         roof: (n,) index into `ROOFS`.
-        pitch_rad: (n,) of the roof.
+        pitch_rad: (n,) pitch of the roof.
     """
 
     center_m: FloatArray
@@ -59,33 +59,33 @@ class Houses:
         )
 
     def __len__(self) -> int:
-        """Number of buildings."""
+        """Return the number of buildings."""
         return len(self.eaves_m)
 
     @property
     def radius_m(self) -> FloatArray:
-        """(n,) of the circles around them."""
+        """(n,) radii of the circles around the buildings."""
         return 0.5 * np.hypot(self.size_m[:, 0], self.size_m[:, 1])
 
     def only(self, wanted: NDArray[np.bool_]) -> Houses:
-        """Return some of them."""
+        """Return the buildings that are wanted."""
         return Houses(*(getattr(self, name)[wanted] for name in self.__dataclass_fields__))
 
     def and_also(self, others: Houses) -> Houses:
-        """Return these, then others."""
+        """Return these buildings followed by others."""
         names = self.__dataclass_fields__
         return Houses(*(np.concatenate([getattr(self, name), getattr(others, name)]) for name in names))
 
 
 @dataclass(frozen=True)
 class _Lots:
-    """The streets' pattern, in metres along and across the village's heading.
+    """The pattern of the streets, in metres along and across the village's heading.
 
     Attributes:
-        center: (n, 2) of lots.
+        center: (n, 2) centres of lots.
         size: (2,) of a lot, along and away from the street.
-        along: where streets along the heading are, across it.
-        across: where streets across it are, along it.
+        along: positions, across the heading, of the streets along it.
+        across: positions, along the heading, of the streets across it.
     """
 
     center: FloatArray
@@ -95,10 +95,10 @@ class _Lots:
 
 
 def build_village(table: VillageTable, seed: int, index: int) -> tuple[Houses, list[RoadTable]]:
-    """Return houses and streets; ``index`` of the table names it in errors and makes its draws its own.
+    """Return houses and streets; ``index`` of the table names it in errors and gives it its own random numbers.
 
     Raises:
-        PlanError: ``terrain.village[i]``: no room for so many houses.
+        PlanError: ``terrain.village[i]``: there is no room for so many houses.
     """
     draws = generator(seed, "terrain", "village", index)
     extent = np.array([table.size_m[1], table.size_m[0]])  # north is along heading 0
@@ -115,7 +115,7 @@ def build_village(table: VillageTable, seed: int, index: int) -> tuple[Houses, l
 
 
 def _lots(extent: FloatArray, houses: int, key: str) -> _Lots:
-    """Return the largest lots on which the houses find room."""
+    """Return the largest lots that have room for the houses."""
     for scale in np.linspace(1.0, SMALLEST_LOT_M[0] / LARGEST_LOT_M[0], 25):
         lots = _lots_of_size(extent, scale * np.array(LARGEST_LOT_M))
         if len(lots.center) >= houses:
@@ -125,7 +125,7 @@ def _lots(extent: FloatArray, houses: int, key: str) -> _Lots:
 
 
 def _lots_of_size(extent: FloatArray, size: FloatArray) -> _Lots:
-    """Return rows of lots on both sides of streets along, a crossing street every few lots."""
+    """Return rows of lots on both sides of the streets along, with a crossing street every few lots."""
     street = STREET_M + 2 * VERGE_M
     strip = street + 2 * size[1]
     rows = int(extent[1] // strip)
@@ -139,7 +139,7 @@ def _lots_of_size(extent: FloatArray, size: FloatArray) -> _Lots:
 
 
 def _houses(table: VillageTable, draws: np.random.Generator, lots: _Lots, placed: Placed, used: IntArray) -> Houses:
-    """Return one house on each lot used; turned a little, no corner leaves its lot."""
+    """Return one house on each used lot; it is turned a little, and all its corners stay within its lot."""
     count = len(used)
     turn = np.radians(np.clip(_TURN_DEG * draws.standard_normal(count), -10.0, 10.0))
     crosswise = draws.random(count) < 0.5

@@ -1,4 +1,4 @@
-"""Compiled loops are kept between processes, and never outlive the text they were made of."""
+"""Compiled loops are jit_cached between processes, and never outlive the text they were made of."""
 
 from __future__ import annotations
 
@@ -10,14 +10,18 @@ from pathlib import Path
 
 import swath.georef
 
-INNER = (
-    "from swath.georef.compiled import kernel\n\n\n@kernel\ndef inner(x: float) -> float:\n    return {factor} * x\n"
-)
-OUTER = """from swath.georef.compiled import kept
+INNER = """from swath.georef.compiled import jit_inline
+
+
+@jit_inline
+def inner(x: float) -> float:
+    return {factor} * x
+"""
+OUTER = """from swath.georef.compiled import jit_cached
 from swath.georef.inner import inner
 
 
-@kept
+@jit_cached
 def outer(x: float) -> float:
     return inner(x)
 

@@ -1,1 +1,1 @@
-"""The MCAP container: chunks, records, index, writer."""
+"""The MCAP container format: chunks, records, index and writer."""

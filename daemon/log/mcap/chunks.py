@@ -1,4 +1,4 @@
-"""The messages inside a chunk, as runs of equal channel and length, and the channels they belong to."""
+"""Reads the messages inside a chunk, as runs of equal channel and length, and the channels that they belong to."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from swath.georef.records import ByteRows, Int64Array
 
 TopicFilter = Callable[[str], bool]
 _MESSAGE_HEAD = 31
-ONE_BY_ONE = 32  # messages at the head of a run
+ONE_BY_ONE = 32  # messages at the start of a run that are compared one by one
 _HEAD = struct.Struct("<BQ")
 
-# What a stranger's log may take of the memory; ours stay far below.
+# Limits on the memory that a foreign log may take; logs of swath stay far below.
 MAX_CHANNELS = 8192  # of a part
 MAX_CHANNEL_BYTES = 8192
 MAX_SCHEMAS = 256
@@ -31,7 +31,7 @@ MAX_JSON_BYTES = 1 << 20  # of a message
 
 @dataclass(frozen=True, slots=True)
 class LogBatch:
-    """Consecutive messages of equal length of one channel, as they stand in a chunk.
+    """Consecutive messages of one channel and equal length, as they are stored in a chunk.
 
     Attributes:
         log_time_ns: (n,) host time.
@@ -45,11 +45,11 @@ class LogBatch:
 
     @property
     def units(self) -> ByteRows:
-        """(n, length) uint8, the messages' data, a view into the chunk."""
+        """Data of the messages, (n, length) uint8, a view into the chunk."""
         return self.rows[:, _MESSAGE_HEAD:]
 
     def between(self, first: int, last: int) -> LogBatch:
-        """Return the messages from one to before another."""
+        """Return the messages with indices ``first`` to ``last`` − 1."""
         return LogBatch(self.channel, self.channel_id, self.log_time_ns[first:last], self.rows[first:last])
 
 
@@ -60,17 +60,17 @@ def chunk_batches(
     topics: TopicFilter | None = None,
     lost: Counter[str] | None = None,
 ) -> Iterator[LogBatch]:
-    """Yield messages of an unpacked chunk as runs of equal channel and length; learns its channels on the way.
+    """Yield the messages of an unpacked chunk as runs of equal channel and length, and learn the chunk's channels.
 
     Args:
         data: the chunk's records.
-        channels, schemas: known so far, by id.
-        topics: which are wanted.
-        lost: counts messages that cannot be used, by the reason: their channel's record is lost, or their time is
-            none; without it they are an error.
+        channels, schemas: known so far, by id; new ones are added.
+        topics: selects the wanted topics; None selects all.
+        lost: counts unusable messages by reason: their channel's record is lost, or their time is invalid; if None,
+            such messages are an error.
 
     Raises:
-        LogError: a record is malformed, or a channel is another than it was.
+        LogError: a record is malformed, or a channel differs from its earlier description.
     """
     at, size = 0, len(data)
     array = np.frombuffer(data, np.uint8)
@@ -101,7 +101,7 @@ def chunk_batches(
 
 
 def json_objects(batch: LogBatch) -> Iterator[tuple[int, dict[str, Any]]]:
-    """JSON messages with their log times; a stranger's that are no objects, or larger than 1 MiB, are left out."""
+    """Yield JSON objects with their log times; other JSON values and messages larger than 1 MiB are skipped."""
     if batch.units.shape[1] > MAX_JSON_BYTES:
         return
     for time_ns, row in zip(batch.log_time_ns.tolist(), batch.units, strict=True):
@@ -114,7 +114,7 @@ def json_objects(batch: LogBatch) -> Iterator[tuple[int, dict[str, Any]]]:
 
 
 def damage_within(chunk: Record, lost: Counter[str]) -> Damage:
-    """Return what is lost of a good chunk, with the reasons."""
+    """Describe the messages lost from an otherwise good chunk, with the reasons."""
     reasons = sorted(lost)
     more = f" and {len(reasons) - 3} reasons more" if len(reasons) > 3 else ""
     return Damage(chunk.offset, chunk.length, "; ".join(reasons[:3]) + more, lost.total())
@@ -127,9 +127,11 @@ def _lose(lost: Counter[str] | None, why: str, count: int) -> None:
 
 
 def _run_length(data: bytes, at: int, stride: int) -> int:
-    """Return messages from here on with the same opcode, length and channel as the first: their eleven first bytes."""
+    """Return the number of messages from here on with the same opcode, length and channel: the same first
+    eleven bytes.
+    """
     possible, head = (len(data) - at) // stride, data[at : at + 11]
-    # most runs in a chunk of several channels or lengths are short: one by one before all at once
+    # most runs in a chunk of several channels or lengths are short: compare one by one before all at once
     for count in range(1, min(possible, ONE_BY_ONE)):
         if not data.startswith(head, at + count * stride):
             return count
@@ -141,7 +143,7 @@ def _run_length(data: bytes, at: int, stride: int) -> int:
 def _batch(spec: ChannelSpec, channel_id: int, rows: ByteRows, lost: Counter[str] | None) -> LogBatch:
     times: Int64Array = rows[:, 15:23].copy().view("<i8")[:, 0]
     timeless = times < 0
-    if timeless.any():  # beyond the year 2262: what is signed everywhere else has no such time
+    if timeless.any():  # beyond the year 2262, which signed 64-bit times cannot hold
         _lose(lost, "messages with a time that cannot be", int(timeless.sum()))
         times, rows = times[~timeless], rows[~timeless]
     return LogBatch(spec, channel_id, times, rows)
@@ -151,7 +153,7 @@ def take_description(record: Record, channels: dict[int, ChannelSpec], schemas: 
     """Learn a channel or schema from a record outside chunks.
 
     Raises:
-        LogError: it is malformed, or a channel is another than it was.
+        LogError: it is malformed, or a channel differs from its earlier description.
     """
     if record.opcode == OP_CHANNEL:
         _take_channel(record.body, channels, schemas)

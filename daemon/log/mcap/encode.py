@@ -1,4 +1,4 @@
-"""Messages as they stand in a chunk, laid out in bulk by NumPy.
+"""Encodes messages in bulk with NumPy, in the form in which a chunk stores them.
 
 MCAP specification, version 0: a message record is opcode 5, length u64, channel u16, sequence u32, log time u64,
 publish time u64, data.
@@ -25,10 +25,10 @@ _FIRST = np.zeros(1, np.int64)
 
 @dataclass(frozen=True, slots=True)
 class EncodedBlock:
-    """Message records of one channel, ready to be laid into a chunk.
+    """Message records of one channel, ready to be put into a chunk.
 
     Attributes:
-        count: messages.
+        count: number of messages, n.
         log_time_ns: (n,) int64.
         offsets: (n,) int64, of each record within ``data``.
         data: the records.
@@ -43,7 +43,7 @@ class EncodedBlock:
 
 @lru_cache(maxsize=1024)
 def _layout(length: int) -> np.dtype[np.void]:
-    """Return a message record with ``length`` bytes of data."""
+    """Return the dtype of a message record with ``length`` bytes of data."""
     return np.dtype(
         [
             ("opcode", "u1"),
@@ -65,19 +65,19 @@ def encode_block(
     publish_time_ns: Int64Array | None = None,
     rows: ByteRows | None = None,
 ) -> EncodedBlock:
-    """Return messages of equal length, one a unit.
+    """Encode messages of equal length, one for each unit.
 
     Args:
-        channel_id: of all.
-        first_sequence: number of the first; u32, wraps.
+        channel_id: channel of all messages.
+        first_sequence: sequence number of the first message; u32, wraps.
         log_time_ns: (n,).
         units: (n, length) uint8.
-        publish_time_ns: (n,); the log time where None.
-        rows: (n, 31 + length) contiguous memory the units lie in already, behind room for the headers, which are
-            written there.
+        publish_time_ns: (n,); None uses the log time.
+        rows: (n, 31 + length) contiguous memory that already holds the units, each behind room for its header; the
+            headers are written there.
     """
     count, length = units.shape
-    if count == 1:  # a read of a serial port: NumPy's rows would cost several times the message
+    if count == 1:  # typical of a serial port: NumPy's overhead would be several times the cost of the message
         log_time = int(log_time_ns[0])
         publish_time = log_time if publish_time_ns is None else int(publish_time_ns[0])
         sequence = first_sequence & 0xFFFFFFFF
@@ -99,14 +99,14 @@ def encode_block(
 
 
 def encode_raw(channel_id: int, log_time_ns: Int64Array, rows: ByteRows) -> EncodedBlock:
-    """Return whole message records of a log, (n, 31 + length) uint8, to be written again as they are."""
+    """Wrap whole message records of a log, (n, 31 + length) uint8, so that they can be written again unchanged."""
     count, stride = rows.shape
     offsets = np.arange(count, dtype=np.int64) * stride
     return EncodedBlock(channel_id, count, log_time_ns, offsets, np.ascontiguousarray(rows).reshape(-1).data)
 
 
 def encode_json(channel_id: int, sequence: int, log_time_ns: int, value: Mapping[str, Any]) -> EncodedBlock:
-    """Return one JSON message."""
+    """Encode one JSON message."""
     text = json.dumps(value, separators=(",", ":"), allow_nan=False).encode()
     unit = np.frombuffer(text, np.uint8).reshape(1, -1)
     return encode_block(channel_id, sequence, np.array([log_time_ns], dtype=np.int64), unit)

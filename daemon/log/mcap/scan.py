@@ -1,8 +1,8 @@
-"""Reads an MCAP file record by record, whole or cut off, trusting nothing: lengths are bounded, every CRC is checked.
+"""Reads an MCAP file record by record, whole or cut off, and trusts nothing: lengths are bounded, every CRC is checked.
 
-One pass, forward, a chunk in memory at a time. What is wrong is given as `Damage` and the reading goes on at the next
-chunk that is whole. Records outside chunks have no CRC, so each must be what its opcode says: a damaged one that were
-believed would lead past good chunks without a word.
+It reads in one forward pass and holds one chunk in memory at a time. Errors are returned as `Damage`, and reading
+continues at the next whole chunk. Records outside chunks have no CRC, so the content of each must match its opcode:
+believing a damaged record could skip good chunks silently.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ from mcap.exceptions import McapError
 
 from swath.daemon.log.format import MAGIC, LogError
 
-# Chunks of ours are 1 MiB and one block: 16 MiB. A stranger's may be larger; beyond this they are refused. Its messages
-# may be as small as 31 bytes, each then an object of several hundred.
+# Chunks of swath have at most 1 MiB and one block: 16 MiB. Foreign chunks may be larger, up to this limit. Their
+# messages may be as small as 31 bytes, and each then becomes an object of several hundred bytes.
 MAX_CHUNK_BYTES = 32 << 20
 MAX_RECORD_BYTES = 64 << 20
 _HEAD = struct.Struct("<BQ")
 _CHUNK_HEAD = struct.Struct("<QQQII")  # start, end, uncompressed size, crc, length of the compression's name
 _COMPRESSION_NAME_MAX_BYTES = 32
-_CHUNK_HEAD_MAX_BYTES = _CHUNK_HEAD.size + _COMPRESSION_NAME_MAX_BYTES + 8  # and the length of the records
+_CHUNK_HEAD_MAX_BYTES = _CHUNK_HEAD.size + _COMPRESSION_NAME_MAX_BYTES + 8  # plus the length of the records
 _MESSAGE_FIXED_BYTES = 22  # channel, sequence, log time, publish time
 
 OP_HEADER, OP_FOOTER, OP_SCHEMA, OP_CHANNEL, OP_MESSAGE = 1, 2, 3, 4, 5
 OP_CHUNK, OP_MESSAGE_INDEX, OP_ATTACHMENT, OP_STATISTICS, OP_METADATA, OP_DATA_END = 6, 7, 9, 11, 12, 15
 OPCODES = frozenset(range(1, 16))
-# From 0x80 on opcodes are anybody's and passed over. One that is a bit away from the specification's is rather damage.
+# Opcodes from 0x80 on are private and skipped. One that differs by one bit from a specified opcode is probably damage.
 _FIRST_PRIVATE_OPCODE = 0x90
 _FOOTER_BYTES = 20
 _CONTENT: dict[int, type[records.McapRecord]] = {
@@ -46,7 +46,7 @@ _CONTENT: dict[int, type[records.McapRecord]] = {
     OP_METADATA: records.Metadata,
 }
 RecordT = TypeVar("RecordT", bound=records.McapRecord)
-ChannelFilter = Callable[[int], bool]  # by a channel's id
+ChannelFilter = Callable[[int], bool]  # takes a channel's id
 _RESYNC_STEP = 1 << 20
 
 
@@ -57,8 +57,8 @@ class Record:
     Attributes:
         opcode: of the MCAP specification.
         offset: of the record in the file.
-        length: with its head.
-        body: what follows the head; of a chunk, its records, decompressed.
+        length: including its head.
+        body: the bytes after the head; for a chunk, its decompressed records.
     """
 
     opcode: int
@@ -73,8 +73,8 @@ class Damage:
 
     Attributes:
         offset, length: bytes of the file.
-        what: in words.
-        messages: how many are lost with it, where an index beside it tells; None: unknown.
+        what: description of the damage.
+        messages: number of messages lost with it, if an index beside it gives the number; None if unknown.
     """
 
     offset: int
@@ -86,17 +86,17 @@ class Damage:
 def scan(
     file: BinaryIO, size: int, *, chunks: bool = True, wanted: ChannelFilter | None = None
 ) -> Iterator[Record | Damage]:
-    """Yield all records of the data section, in order, and every damage; ends at the data's end or the cut.
+    """Yield all records of the data section in order, and every damage, up to the end of the data or of the file.
 
     Args:
         file: seekable.
         size: read no further.
-        chunks: False passes over chunks without reading them.
-        wanted: asked of every channel that the index behind a chunk names; where none is, the chunk is given with an
-            empty body, unread.
+        chunks: False skips chunks without reading them.
+        wanted: called with every channel that the index behind a chunk names; if it accepts none, the chunk is given
+            unread, with an empty body.
 
     Raises:
-        LogError: it is no MCAP file.
+        LogError: it is not an MCAP file.
     """
     held: Damage | None = None
     for found in _scan(file, size, chunks=chunks, wanted=wanted):
@@ -154,7 +154,7 @@ def _joined(one: Damage, other: Damage) -> Damage:
 
 
 def summary_records(file: BinaryIO, offset: int, size: int) -> Iterator[Record]:
-    """Yield the records between the data's end, at ``offset``, and the footer, of a file whose end `scan` found
+    """Yield the records between the end of the data, at ``offset``, and the footer; `scan` must have found the end
     whole.
     """
     while offset + _HEAD.size <= size:
@@ -167,9 +167,7 @@ def summary_records(file: BinaryIO, offset: int, size: int) -> Iterator[Record]:
 
 
 def end_is_whole(file: BinaryIO, offset: int, size: int) -> bool:
-    """Return whether a summary that its CRC confirms, the footer and the magic stand from here to the end of the
-    file.
-    """
+    """Return True if a summary with correct CRC, the footer and the magic fill the file from ``offset`` to its end."""
     footer_at = size - len(MAGIC) - _FOOTER_BYTES - _HEAD.size
     if footer_at < offset:
         return False
@@ -201,7 +199,7 @@ def _is_cut(file: BinaryIO, offset: int, size: int) -> bool:
 def _read_record(
     file: BinaryIO, offset: int, size: int, *, chunks: bool = True, wanted: ChannelFilter | None = None
 ) -> Record | Damage:
-    """Return the record at an offset; `Damage` of length 0 where none can begin there."""
+    """Return the record at an offset; return `Damage` of length 0 if no record can begin there."""
     file.seek(offset)
     head = file.read(_HEAD.size)
     nothing = Damage(offset, 0, "")
@@ -236,7 +234,7 @@ def _read_record(
 
 
 def _may_begin(file: BinaryIO, offset: int, size: int) -> bool:
-    """Return whether the head of a record of the specification stands here, or the file ends."""
+    """Return True if the head of a specified record is at this offset, or the file ends there."""
     file.seek(offset)
     head = file.read(_HEAD.size)
     if len(head) < _HEAD.size:
@@ -246,7 +244,7 @@ def _may_begin(file: BinaryIO, offset: int, size: int) -> bool:
 
 
 def _outside_chunks(file: BinaryIO, opcode: int, offset: int, total: int, size: int) -> Record | Damage:
-    """Return a record that has no CRC of its own (but an attachment's): its content must be what its opcode says."""
+    """Return a record outside chunks if its content matches its opcode; only attachments have a CRC of their own."""
     nothing = Damage(offset, 0, "")
     length = total - _HEAD.size
     if opcode not in _CONTENT:
@@ -258,7 +256,7 @@ def _outside_chunks(file: BinaryIO, opcode: int, offset: int, total: int, size: 
             return Record(opcode, offset, total, body) if length == 4 else nothing
         if opcode == OP_MESSAGE and length >= _MESSAGE_FIXED_BYTES and _may_begin(file, offset + total, size):
             return Damage(offset, total, "messages outside a chunk, which no CRC covers", 1)
-        return nothing  # what else there is stands behind the data's end
+        return nothing  # all other records belong behind the data's end
     body = file.read(length)
     if opcode == OP_ATTACHMENT and not _attachment_is_whole(body):
         whole_frame = _may_begin(file, offset + total, size)
@@ -268,17 +266,17 @@ def _outside_chunks(file: BinaryIO, opcode: int, offset: int, total: int, size: 
         _parse(_CONTENT[opcode], stream)
     except LogError as error:
         return Damage(offset, total, str(error)) if _may_begin(file, offset + total, size) else nothing
-    # a later version may have appended fields, which are passed over
+    # a later version of the specification may have appended fields, which are skipped
     if stream.count != length and not _may_begin(file, offset + total, size):
         return nothing
     return Record(opcode, offset, total, body)
 
 
 def parse_record(kind: type[RecordT], body: bytes) -> RecordT:
-    """Return the content of a record.
+    """Parse the content of a record.
 
     Raises:
-        LogError: it is not what its opcode says.
+        LogError: it does not match its opcode.
     """
     return _parse(kind, ReadDataStream(io.BytesIO(body)))
 
@@ -292,7 +290,9 @@ def _parse(kind: type[RecordT], stream: ReadDataStream) -> RecordT:
 
 
 def _plausible_chunk(start: bytes, length: int) -> bool:
-    """Return whether a chunk of a length, in full, begins so: its lengths agree with each other."""
+    """Return True if these bytes can begin a whole chunk of this length, that is, if its lengths agree with
+    each other.
+    """
     if len(start) < _CHUNK_HEAD.size + 8:
         return False
     size, name_length = _CHUNK_HEAD.unpack_from(start)[2], _CHUNK_HEAD.unpack_from(start)[4]
@@ -304,10 +304,10 @@ def _plausible_chunk(start: bytes, length: int) -> bool:
 
 
 def unpack_chunk(body: bytes) -> bytes:
-    """Return the records of a chunk.
+    """Unpack the records of a chunk and check its CRC.
 
     Raises:
-        LogError: unknown compression, absurd size, undecodable, or a wrong CRC.
+        LogError: unknown compression, excessive size, undecodable data, or a wrong CRC.
     """
     _, _, size, crc, name_length = _CHUNK_HEAD.unpack_from(body)
     name = body[_CHUNK_HEAD.size : _CHUNK_HEAD.size + name_length]
@@ -324,12 +324,12 @@ def unpack_chunk(body: bytes) -> bytes:
 def _refuse_large_chunk(size: int, stored: int) -> None:
     if size > MAX_CHUNK_BYTES:
         raise LogError(f"chunk claims {size} bytes, more than {MAX_CHUNK_BYTES}")
-    if stored > MAX_CHUNK_BYTES + MAX_CHUNK_BYTES // 64:  # compression may make it a little longer
+    if stored > MAX_CHUNK_BYTES + MAX_CHUNK_BYTES // 64:  # compression can lengthen incompressible data a little
         raise LogError(f"chunk of {stored} bytes, more than {MAX_CHUNK_BYTES}")
 
 
 def _decompress(name: bytes, stored: bytes, size: int) -> bytes:
-    """Never more than ``size`` bytes and one, whatever the stored bytes would unfold to."""
+    """Decompress a chunk, but never more than ``size`` + 1 bytes, however far the stored bytes would expand."""
     if name == b"":
         return stored
     try:
@@ -350,13 +350,13 @@ def _attachment_is_whole(body: bytes) -> bool:
 
 
 def _indexed_messages(file: BinaryIO, offset: int, size: int) -> int | None:
-    """Return messages that the index records right behind a chunk speak of."""
+    """Return the number of messages that the index records right behind a chunk list; None without index records."""
     counts = [entries // 16 for _, entries in _indexed(file, offset, size)]
     return sum(counts) if counts else None
 
 
 def _indexed(file: BinaryIO, offset: int, size: int) -> Iterator[tuple[int, int]]:
-    """Yield channel, and bytes of entries, of the index records right behind a chunk."""
+    """Yield channel, and number of bytes of entries, of each index record right behind a chunk."""
     while offset + _HEAD.size <= size:
         file.seek(offset)
         opcode, length = _HEAD.unpack(file.read(_HEAD.size))
@@ -370,7 +370,7 @@ def _indexed(file: BinaryIO, offset: int, size: int) -> Iterator[tuple[int, int]
 
 
 def next_chunk(file: BinaryIO, offset: int, size: int) -> int | None:
-    """Return the next place where a chunk begins that can be unpacked."""
+    """Return the offset of the next chunk that can be unpacked; None if there is none."""
     while offset < size:
         file.seek(offset)
         window = file.read(_RESYNC_STEP + _HEAD.size)

@@ -1,4 +1,4 @@
-"""What the end of a part says: channels, statistics, and where the chunks, attachments and metadata are."""
+"""Collects and writes the end of a part: channels, statistics, and the index of chunks, attachments and metadata."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from swath.daemon.log.format import SCHEMA_IDS, SCHEMAS, ChannelSpec
 
 @dataclass(slots=True)
 class ChunkPieces:
-    """A chunk as it goes to disk, and what its index entry needs."""
+    """The bytes of a chunk as they go to disk, and the values for its index entry."""
 
     all: list[Any]
     start: int
@@ -30,7 +30,7 @@ class ChunkPieces:
 
 @dataclass(slots=True)
 class Summary:
-    """What the end of the file will say."""
+    """Collects the entries for the end of the file."""
 
     chunks: list[records.ChunkIndex] = field(default_factory=list)
     attachments: list[records.AttachmentIndex] = field(default_factory=list)
@@ -40,7 +40,7 @@ class Summary:
     end: int = 0
 
     def add_chunk(self, offset: int, pieces: ChunkPieces, counts: Counter[int]) -> None:
-        """Note a chunk that has been written at ``offset``."""
+        """Add a chunk that has been written at ``offset``."""
         self.messages.update(counts)
         self.start = pieces.start if self.start is None else min(self.start, pieces.start)
         self.end = max(self.end, pieces.end)
@@ -58,7 +58,7 @@ class Summary:
         self.chunks.append(index)
 
     def sections(self, specs: Mapping[int, ChannelSpec], schemas: SchemaTable) -> list[tuple[int, list[bytes]]]:
-        """Return the summary's groups: opcode and records, those of the channels that have messages."""
+        """Return the groups of the summary, each as opcode and records; channels without messages are left out."""
         used = {id_: specs[id_] for id_ in self.messages}
         names = sorted({spec.schema for spec in used.values() if spec.schema is not None})
         statistics = records.Statistics(
@@ -90,7 +90,7 @@ def record_bytes(record: records.McapRecord) -> bytes:
 
 
 class SchemaTable:
-    """The schemas of a part by name: ours, and a stranger's that are copied with its messages."""
+    """The schemas of a part by name: swath's own, and foreign ones that are copied with their messages."""
 
     def __init__(self) -> None:
         self._records = {
@@ -99,7 +99,7 @@ class SchemaTable:
         }
 
     def add(self, schema: records.Schema) -> None:
-        """Make a stranger's schema known, under an id of this part; one of a known name is not taken."""
+        """Add a foreign schema under an id of this part; a schema whose name is known already is ignored."""
         if schema.name not in self._records:
             number = len(self._records) + 1
             self._records[schema.name] = records.Schema(
@@ -107,7 +107,7 @@ class SchemaTable:
             )
 
     def record(self, name: str) -> records.Schema:
-        """Return the record of a schema."""
+        """Return the schema record of this name."""
         return self._records[name]
 
     def channel_record(self, channel_id: int, spec: ChannelSpec) -> records.Channel:

@@ -1,6 +1,6 @@
-"""Writes the parts of a log; every chunk goes to the kernel at once.
+"""Writes the parts of a log; every completed chunk goes to the kernel at once.
 
-Every chunk begins with the schemas and channels that it uses, so that it can be read alone.
+Every chunk begins with the schemas and channels that it uses, so that it can be read on its own.
 """
 
 from __future__ import annotations
@@ -39,18 +39,18 @@ from swath.daemon.log.mcap.encode import EncodedBlock, message_index
 from swath.daemon.log.mcap.summary import ChunkPieces, SchemaTable, Summary, record_bytes
 
 _OP_CHUNK, _OP_FOOTER = 6, 2
-WRITE_OUT_BYTES = 8 << 20  # that the disk is given to write at once; a second's worth is too much to wait for
-CHUNK_SPAN_NS = 2 * CHUNK_OPEN_NS  # of log time: a writer that stood still lays seconds at once
+WRITE_OUT_BYTES = 8 << 20  # passed to the disk early; syncing a whole second of data at once takes too long
+CHUNK_SPAN_NS = 2 * CHUNK_OPEN_NS  # of log time; a writer that was held up adds several seconds at once
 _FIXED_CHUNK_FIELDS = 40  # start u64, end u64, size u64, crc u32, compression length u32, records length u64
 
 
 class LogWriteError(OSError):
-    """The disk refused a record; the file was cut back to the last whole one and stays usable."""
+    """The disk refused a record; the file was cut back to the last whole record and stays usable."""
 
 
 @dataclass(slots=True)
 class _OpenChunk:
-    """Blocks that wait to be written together."""
+    """Blocks that are collected to be written together."""
 
     opened_ns: int
     first_log_ns: int
@@ -64,22 +64,22 @@ class _OpenChunk:
         self.size += len(piece)
 
     def counts(self) -> Counter[int]:
-        """Return messages by channel."""
+        """Return the number of messages by channel."""
         return Counter({id_: sum(block.count for _, block in blocks) for id_, blocks in self.blocks.items()})
 
 
 def create_exclusively(path: Path) -> int:
-    """Return a file for a part, open for writing.
+    """Create the file of a part and return its descriptor, open for writing.
 
     Raises:
-        FileExistsError: something stands there.
+        FileExistsError: the path exists already.
         OSError: it cannot be created.
     """
     return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o640)
 
 
 class PartWriter:
-    """Writes one part. Belongs to one thread; nothing is buffered here but the open chunks.
+    """Writes one part. It belongs to one thread and buffers only the open chunks.
 
     Attributes:
         written, lost: messages by channel whose chunk reached the kernel, or was refused.
@@ -93,9 +93,9 @@ class PartWriter:
 
         Args:
             path: of the file.
-            session, part: what its head says.
-            compression: of the chunks; ``auto``: by their class.
-            fd: the file where it was created and claimed by the caller; it is closed with the part.
+            session, part: content of its session record.
+            compression: of the chunks; ``auto`` chooses by their class.
+            fd: descriptor, if the caller has created and claimed the file; it is closed with the part.
 
         Raises:
             OSError: it exists, or cannot be created or written.
@@ -104,7 +104,7 @@ class PartWriter:
         self.written: Counter[int] = Counter()
         self.lost: Counter[int] = Counter()
         self.bytes_written = 0
-        self._written_out = 0  # of them the disk has been told of
+        self._written_out = 0  # of these, bytes already passed to the disk
         self._compression = compression
         self._specs: dict[int, ChannelSpec] = {}
         self._chunks: dict[ChunkClass, _OpenChunk] = {}
@@ -122,21 +122,23 @@ class PartWriter:
             raise
 
     def stands_at(self, path: Path) -> bool:
-        """Return whether a path names this very file."""
+        """Return whether a path still names this file."""
         return stands_at(self._fd, path)
 
     def is_unlinked(self) -> bool:
-        """Return whether no directory names this file any more: what is written to it is gone with the process."""
+        """Return True if no directory entry names this file any more; data written to it is lost when the
+        process ends.
+        """
         return self._fd < 0 or os.fstat(self._fd).st_nlink == 0
 
-    # ------------------------------------------------------------------ what stands outside chunks
+    # ------------------------------------------------------------------ records outside chunks
 
     def add_channel(self, channel_id: int, spec: ChannelSpec) -> None:
-        """Make a channel known; it is written with the first chunk that uses it, and every one after."""
+        """Register a channel; its record is written into the first chunk that uses it and into every later one."""
         self._specs[channel_id] = spec
 
     def add_schema(self, schema: records.Schema) -> None:
-        """Make a schema known that is not ours, for the channels that name it."""
+        """Register a foreign schema for the channels that name it."""
         self._schemas.add(schema)
 
     def add_metadata(self, name: str, values: dict[str, str]) -> None:
@@ -166,7 +168,8 @@ class PartWriter:
     # ------------------------------------------------------------------ messages
 
     def add(self, block: EncodedBlock) -> None:
-        """Lay a block into the open chunk of its class; close the chunk when it is full, and any that is long past.
+        """Add a block to the open chunk of its class; close the chunk when it is full, and any chunk whose span is
+        exceeded.
 
         Raises:
             LogWriteError: the chunk could not be written; its messages are counted in ``lost``.
@@ -195,7 +198,7 @@ class PartWriter:
                 self._close_chunk(chunk_class)
 
     def flush(self) -> None:
-        """Close all chunks; raises `LogWriteError` after having tried them all."""
+        """Close all chunks; raise `LogWriteError` only after having tried them all."""
         failed: LogWriteError | None = None
         for chunk_class in CHUNK_CLASSES:
             if chunk_class in self._chunks:
@@ -207,13 +210,16 @@ class PartWriter:
             raise failed
 
     def sync(self) -> None:
-        """Make durable what has been written."""
+        """Make all written data durable."""
         os.fdatasync(self._fd)
 
     def finish(self) -> None:
-        """Write index and footer, make them durable, close; raises `LogWriteError`. The file is closed either way.
+        """Write index and footer, make them durable and close the file, which is closed even on error.
 
-        Where the disk refuses the last chunks, the end may still find room: the file is whole without them.
+        If the disk refuses the last chunks, the end may still fit: the file is then whole without those chunks.
+
+        Raises:
+            LogWriteError: the last chunks or the end could not be written.
         """
         try:
             try:
@@ -232,7 +238,7 @@ class PartWriter:
         self.close()
 
     def close(self) -> None:
-        """Close without an end; a second call does nothing."""
+        """Close the file without writing an end; a second call does nothing."""
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1
@@ -240,7 +246,7 @@ class PartWriter:
     # ------------------------------------------------------------------ chunks
 
     def _introduce(self, chunk: _OpenChunk, channel_id: int, spec: ChannelSpec) -> None:
-        """The channel's record, and its schema's, before its first message in a chunk."""
+        """Add the record of a channel, and of its schema, before the channel's first message in a chunk."""
         chunk.blocks[channel_id] = []
         if spec.schema is not None and spec.schema not in chunk.schemas:
             chunk.schemas.add(spec.schema)
@@ -303,7 +309,9 @@ class PartWriter:
     # ------------------------------------------------------------------ the end
 
     def _write_end(self) -> None:
-        """In one piece: a file has its whole end or, where the disk refuses, none of it."""
+        """Write the end of the file in one piece, so that the file has its whole end or, if the disk refuses, no part
+        of it.
+        """
         data_end = record_bytes(records.DataEnd(data_section_crc=0))
         summary_start = self.bytes_written + len(data_end)
         sections = self._summary.sections(self._specs, self._schemas)
@@ -320,7 +328,7 @@ class PartWriter:
         self._write([data_end, body, offsets, footer_head, struct.pack("<I", crc), MAGIC])
 
     def _write(self, pieces: Sequence[Any]) -> int:
-        """Write all pieces at the end of the file; returns where they begin."""
+        """Write all pieces at the end of the file; return the offset where they begin."""
         start = self.bytes_written
         views = [memoryview(piece) for piece in pieces if len(piece)]
         total = sum(view.nbytes for view in views)
@@ -343,18 +351,18 @@ class PartWriter:
         return start
 
     def _cut_back(self, size: int) -> None:
-        """Leave no half record behind."""
+        """Truncate the file so that no partial record remains."""
         try:
             os.ftruncate(self._fd, size)
             os.lseek(self._fd, size, os.SEEK_SET)
         except OSError as error:
-            # the next write would stand behind garbage: there must be none
+            # a further write would follow a partial record, so the file is closed
             self.close()
             raise LogWriteError(error.errno, error.strerror or "cannot truncate", str(self.path)) from error
 
 
 def _after(views: list[memoryview], count: int) -> list[memoryview]:
-    """Return what is left of views after ``count`` bytes of them were written."""
+    """Return the remaining views after ``count`` bytes of them were written."""
     for number, view in enumerate(views):
         if count < view.nbytes:
             return [view[count:], *views[number + 1 :]]

@@ -1,1 +1,1 @@
-"""`swath calibrate` and `swath plan-calibration`."""
+"""Implements `swath calibrate` and `swath plan-calibration`."""

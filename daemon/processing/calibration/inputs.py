@@ -1,6 +1,7 @@
-"""What a user gives beside the logs: surveyed control, points picked in the strips, and polygons that planes fill.
+"""Reads what a user gives beside the logs: surveyed control, points picked in the strips, and polygons that planes
+fill.
 
-The last two are in the flight's coordinate system, ``output.crs``, as the strips' own points are.
+Picked points and polygons are in the flight's coordinate system, ``output.crs``, as the strips' own points are.
 """
 
 from __future__ import annotations
@@ -26,25 +27,26 @@ from swath.daemon.text_files import text_of
 from swath.georef.arrays import FloatArray
 
 COLUMNS = ("WKT", "name")
-FARTHEST = 1e9  # in any unit of a map
+FARTHEST = 1e9  # largest coordinate accepted, in any unit of a map
 _POLYGON = re.compile(r"^POLYGON\s*(?:Z\s*)?\(\(([^()]*)\)\)$", re.IGNORECASE)
 _WANT = 'want "POLYGON ((x y, x y, x y, x y))", one ring, no holes'
 
 
 class PolygonError(ValueError):
-    """A file of polygons that cannot be used; one line for the user."""
+    """Raised for a file of polygons that cannot be used; its text is one line for the user."""
 
 
 def control_of(path: Path, flight: Flight, suffered: Collection[str]) -> tuple[tuple[ControlPoint, ...], list[str]]:
-    """Surveyed points in the flight's frame, and what is doubtful of them, a line each.
+    """Return the surveyed points in the flight's frame, and doubts about them, one line each.
 
     Args:
         path: CSV as of `swath.calib.control.points.read_control`.
-        flight: with its points placed as well as is known.
-        suffered: kinds of doubts about the whole (`swath.calib.control.doubts.Doubt`) that are told only.
+        flight: the flight, with its points placed as well as is known.
+        suffered: kinds of doubts about the whole (`swath.calib.control.doubts.Doubt`) that are reported but not
+            refused.
 
     Raises:
-        UserError: it cannot be read, or is doubtful as a whole; ControlError: it is no such file.
+        UserError: the file cannot be read, or is doubtful as a whole; ControlError: it is not such a file.
     """
     points = in_t(read_control(text_of(path), str(path)), flight.frame)
     found = doubts(flight, points)
@@ -55,10 +57,10 @@ def control_of(path: Path, flight: Flight, suffered: Collection[str]) -> tuple[t
 
 
 def ties_of(path: Path, kept: KeptFlight) -> Features:
-    """Tie points that were picked in the strips' points as they lie with the calibrations to start from.
+    """Return tie points from points that were picked in the strips as placed with the initial calibrations.
 
     Raises:
-        UserError: the file cannot be read, or none of it is a tie point; PickedError: it is no such file.
+        UserError: the file cannot be read, or no tie point is left; PickedError: it is not such a file.
     """
     picked = read_picked(text_of(path), str(path))
     places_t = _t_from_map(kept, np.stack([one.place for one in picked]))
@@ -70,17 +72,17 @@ def ties_of(path: Path, kept: KeptFlight) -> Features:
 
 
 def read_polygons(text: str, name: str) -> dict[str, FloatArray]:
-    """Return a CSV with the columns WKT and name, as GIS programs write layers of polygons.
+    """Return the polygons of a CSV with the columns WKT and name, as GIS programs write layers of polygons.
 
     Args:
-        text: of the file.
-        name: of the file, for messages.
+        text: content of the file.
+        name: name of the file, for messages.
 
     Returns:
         By name, corners (k, 2) in the file's coordinates, not closed.
 
     Raises:
-        PolygonError: not such a file; line and what would be right.
+        PolygonError: it is not such a file; the message names the line and the remedy.
     """
     reader = csv.DictReader(io.StringIO(text), skipinitialspace=True)
     try:
@@ -126,7 +128,11 @@ def _ring(text: str, where: str) -> FloatArray:
 
 
 def rings_of(path: Path, kept: KeptFlight) -> dict[str, FloatArray]:
-    """By name, corners (k, 2) east and north in t; UserError, PolygonError: as of `text_of`, `read_polygons`."""
+    """Return the corners (k, 2) of polygons, east and north in t, by name.
+
+    Raises:
+        UserError: the file cannot be read, as of `text_of`; PolygonError: as of `read_polygons`.
+    """
     polygons = read_polygons(text_of(path), str(path))
     height = _height_on_map(kept)
     rings = {}
@@ -136,7 +142,9 @@ def rings_of(path: Path, kept: KeptFlight) -> dict[str, FloatArray]:
 
 
 def _height_on_map(kept: KeptFlight) -> float:
-    """Of the ground somewhere in the middle; that it is not so everywhere moves a corner by millimetres."""
+    """Return the height of a point in the middle of the flight; other ground heights move a corner
+    by millimetres only.
+    """
     mapping = kept.logged[0].setup.mapping
     swath = kept.flight.swaths[len(kept.flight.swaths) // 2]
     point_e = kept.flight.frame.e_from_t(np.asarray(swath.points_t[len(swath) // 2], np.float64)[np.newaxis])

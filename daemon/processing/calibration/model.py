@@ -1,8 +1,7 @@
-"""What a calibration is asked to estimate: by a model's name or a file, and options on top of it.
+"""Reads what a calibration estimates: from a model's name or a model file, and from options that override it.
 
-The file that says what a calibration estimates: ``--model FILE.toml``.
-
-Keys are those of a calibration file (CONVENTIONS), validated as the configuration is.
+The model file is given as ``--model FILE.toml``. Its keys are those of a calibration file (CONVENTIONS), validated as
+the configuration is.
 """
 
 from __future__ import annotations
@@ -53,7 +52,9 @@ def _state(value: object) -> str | float:
 
 
 def _by_key(table: object) -> object:
-    """With ``left.phi_deg`` as one key also where it stands without quotes, which TOML takes for a table in a table."""
+    """Return a table with dotted keys as ``left.phi_deg`` flat, also where TOML read them without quotes as nested
+    tables.
+    """
     if not isinstance(table, dict):
         return table
     found: dict[str, Any] = {}
@@ -77,7 +78,7 @@ State = Annotated[str | float, PlainValidator(_state)]
 
 
 class IbrcTable(Section):
-    """``[ibrc]``: a range correction by intensity is estimated."""
+    """``[ibrc]``: estimate a range correction by intensity."""
 
     knots: list[float] = Field(description="rising intensities, at least two")
     reference: float | None = Field(None, description="the knot whose correction is 0; absent: the middle one")
@@ -102,7 +103,7 @@ class IbrcTable(Section):
 
 
 class RangeOffsetTable(Section):
-    """``[range_offset]``: range offsets of their own, beside that of all returns."""
+    """``[range_offset]``: estimate separate range offsets, beside that of all returns."""
 
     return_slots: list[int] = Field(default_factory=list, description="return numbers, from 1")
     mta_zones: list[int] = Field(default_factory=list, description="zones (pulses in air − 1), from 0")
@@ -123,7 +124,7 @@ class RangeOffsetTable(Section):
 
 
 class BeamTable(Section):
-    """``[beam]``: corrections of the beams of a spinning head are estimated."""
+    """``[beam]``: estimate corrections of the beams of a spinning head."""
 
     estimate: list[Literal["azimuth_deg", "elevation_deg", "range_m"]] = Field(
         min_length=1, description='some of "azimuth_deg", "elevation_deg", "range_m"'
@@ -131,7 +132,7 @@ class BeamTable(Section):
 
 
 class ModelTables(Section):
-    """The file."""
+    """A model file's tables."""
 
     model: Literal["basic", "scanner", "full"] = Field("scanner", description="which parameters it begins from")
     parameters: Annotated[dict[str, State], BeforeValidator(_by_key)] = Field(
@@ -143,10 +144,10 @@ class ModelTables(Section):
 
 
 def read_model(file: Path) -> ModelTables:
-    """Return what a file says.
+    """Return the tables of a model file.
 
     Raises:
-        UserError: it cannot be read; ConfigError: all that is wrong with it, one line each.
+        UserError: the file cannot be read; ConfigError: it is invalid, with one line per error.
     """
     try:
         return ModelTables.model_validate(toml_tables(text_of(file, "a TOML file")))
@@ -158,7 +159,7 @@ def read_model(file: Path) -> ModelTables:
 
 
 FREE, FIXED = "free", "fixed"
-# of keys in files the names here, and SI units a unit of the key
+# by key in files: the name used here, and SI units per unit of the key
 _PARAMETERS = {parameter.key: (parameter.name, parameter.factor) for parameter in PARAMETERS}
 _BEAM_PARTS = {
     "azimuth_deg": ("azimuth_rad", math.pi / 180.0),
@@ -167,21 +168,23 @@ _BEAM_PARTS = {
 }
 
 Known = Mapping[str, tuple[str, float]]
-States = dict[tuple[str, str], str | float]  # by scanner (of all: empty) and name: FREE, FIXED, or a prior's sigma, SI
+States = dict[tuple[str, str], str | float]  # by scanner (empty: all) and name: FREE, FIXED, or a prior's sigma, SI
 
 
 def model_of(model: str, fix: str = "", free: str = "", priors: Sequence[str] = ()) -> ParameterOptions:
-    """Return a model, and keys of a calibration file as ``phi_deg`` or ``left.phi_deg``, to what the adjustment takes.
+    """Return the options of an adjustment from a model and keys of a calibration file as ``phi_deg`` or
+    ``left.phi_deg``.
 
-    An option stands above what a file says of the same parameter; that of all scanners also above what it says of one.
+    An option overrides a file's entry for the same parameter; an option for all scanners also overrides entries for
+    one.
 
     Args:
-        model: of `swath.calib.parameters.MODELS`, or a file (`swath.daemon.processing.calibration.model`).
-        fix, free: keys, with commas between.
-        priors: ``KEY=SIGMA``, each in its key's unit; of one that is fixed, how well its value is known.
+        model: one of `swath.calib.parameters.MODELS`, or a file (`swath.daemon.processing.calibration.model`).
+        fix, free: keys, separated by commas.
+        priors: ``KEY=SIGMA``, each in its key's unit; for a fixed parameter, how well its value is known.
 
     Raises:
-        UserError: there is no such model or file, a key is no parameter, or a sigma is none.
+        UserError: there is no such model or file, a key is not a parameter, or a sigma is invalid.
     """
     tables = _tables(model)
     wish = _of_tables(tables)
@@ -203,22 +206,22 @@ def model_of(model: str, fix: str = "", free: str = "", priors: Sequence[str] = 
 
 
 def file_of(model: str) -> Path | None:
-    """Return the file that a model is given as; None: by its name."""
+    """Return the path of a model that is given as a file; None if it is given by its name."""
     return Path(model) if model.lower().endswith(SUFFIX) else None
 
 
 def of_parameters(wish: ParameterOptions) -> ParameterOptions:
-    """Without what is asked for in tables: the parameters alone."""
+    """Return the options without the entries of tables: with the parameters alone."""
     entries = {name for name, _ in _entries(wish).values()}
     priors = {name: sigma for name, sigma in wish.priors.items() if not {name, name.partition(".")[2]} & entries}
     return ParameterOptions(wish.model, wish.fix, wish.free, priors)
 
 
 def key_of(name: str, knots: Sequence[float] = ()) -> tuple[str, float]:
-    """Return how people are told of an unknown, as ``phi_deg`` or ``ibrc.2 at 1500``; SI units a unit of it.
+    """Return the key of an unknown for people, as ``phi_deg`` or ``ibrc.2 at 1500``, and SI units per unit of it.
 
     Args:
-        name: without its scanner, as ``phi_rad``, ``ibrc.2``, ``beam.3.azimuth_rad``.
+        name: the unknown without its scanner, as ``phi_rad``, ``ibrc.2``, ``beam.3.azimuth_rad``.
         knots: intensities of the knots.
     """
     before, _, last = name.rpartition(".")
@@ -231,7 +234,7 @@ def key_of(name: str, knots: Sequence[float] = ()) -> tuple[str, float]:
 
 
 def in_words(wish: ParameterOptions) -> str:
-    """For reports: the model and all that is said beside it, in a file's keys and units."""
+    """Return the model and all options in words for reports, with a file's keys and units."""
     back = {name: (key, factor) for key, (name, factor) in (_PARAMETERS | _entries(wish)).items()}
 
     def told(name: str, sigma: float | None = None) -> str:
@@ -250,7 +253,7 @@ def in_words(wish: ParameterOptions) -> str:
 
 
 def tables_in_words(wish: ParameterOptions) -> list[str]:
-    """Return what is asked for in tables."""
+    """Return in words which entries of tables are estimated."""
     words = []
     if wish.ibrc_knots:
         reference = "" if wish.ibrc_reference is None else f" (reference {wish.ibrc_reference:g})"
@@ -274,7 +277,7 @@ def _tables(model: str) -> ModelTables:
 
 
 def _of_tables(tables: ModelTables) -> ParameterOptions:
-    """Return all but the parameters."""
+    """Return the options from all tables but the parameters."""
     wish, ibrc, offsets, beam = ParameterOptions(tables.model), tables.ibrc, tables.range_offset, tables.beam
     if ibrc is not None:
         wish = replace(
@@ -289,7 +292,7 @@ def _of_tables(tables: ModelTables) -> ParameterOptions:
 
 
 def _entries(wish: ParameterOptions) -> dict[str, tuple[str, float]]:
-    """Of the tables that are asked for, what priors may be of: as of `_PARAMETERS`."""
+    """Return the entries of the requested tables that may have priors, in the form of `_PARAMETERS`."""
     names = [f"range_offset_slot.{slot}" for slot in wish.range_offset_slots]
     names += [f"range_offset_zone.{zone}" for zone in wish.range_offset_zones]
     middle, reference = len(wish.ibrc_knots) // 2, wish.ibrc_reference
@@ -312,7 +315,7 @@ def _prior(entry: str) -> tuple[str, float]:
 
 
 def _states(said: Iterable[tuple[str, str | float]], before: str, known: Known) -> States:
-    """By the names here; ``before`` stands before keys in messages."""
+    """Return states by scanner and internal name; ``before`` stands before keys in messages."""
     found: States = {}
     for text, state in said:
         key = text.strip()
@@ -327,7 +330,7 @@ def _states(said: Iterable[tuple[str, str | float]], before: str, known: Known) 
 
 
 def _want(key: str, known: Known) -> str:
-    """Return what would be right, instead of a key of all scanners or of one."""
+    """Return a suggestion in place of an unknown key, for all scanners or for one."""
     scanner, _, own = key.partition(".")
     for before, text in (("", key), (f"{scanner}.", own)):
         close = difflib.get_close_matches(text, known, n=1, cutoff=0.6) if text else []

@@ -1,4 +1,4 @@
-"""What `swath calibrate` writes: a calibration file a scanner; where wanted report, record and outcome."""
+"""Writes the outputs of `swath calibrate`: a calibration file per scanner; if asked, report, record and outcome."""
 
 from __future__ import annotations
 
@@ -40,24 +40,24 @@ from swath.daemon.processing.trajectory.verdict import Level
 from swath.daemon.processing.user_errors import finite
 from swath.georef.scanner.calibration import INDEX, PARAMETERS
 
-Steps = Callable[[str, int, int], None]  # what is done, how much, of how much
-MAP_CELLS = 400  # across a map of differences
-BEYOND = 3.0  # sigmas, of strips and calibration together, beyond which strips contradict it
+Steps = Callable[[str, int, int], None]  # arguments: the step, how much is done, of how much
+MAP_CELLS = 400  # maximum cells across a map of differences
+BEYOND = 3.0  # sigmas, of strips and calibration together, above which strips contradict the calibration
 
 
 @dataclass(frozen=True)
 class Told:
-    """The outcome as values for scripts, and as lines for people."""
+    """The outcome: values for scripts, and lines for people."""
 
     record: dict[str, Any]
     lines: list[str]
 
 
 def write_products(wish: CalibrationOptions, done: Calibrated, tell: Steps) -> Told:
-    """Write all of it; what was there before is replaced last.
+    """Write all outputs; files from an earlier run are replaced last.
 
     Raises:
-        UserError: it cannot be written.
+        UserError: a file cannot be written.
     """
     tell("strips before and after", 0, 1)
     before, after = before_and_after(done.kept.flight, done.flight, done.kept.logged[0].setup.mapping)
@@ -107,7 +107,7 @@ def write_products(wish: CalibrationOptions, done: Calibrated, tell: Steps) -> T
 
 
 def trajectory_says(carried: Sequence[Carried]) -> list[Finding]:
-    """Return the verdicts on the trajectories, before all that was found with them: parameters took up their errors."""
+    """Return the verdicts on the trajectories as the first findings: parameters absorbed the trajectories' errors."""
     change = "mend the trajectory, then calibrate anew"
     return [Finding(one.sentence, change, math.inf, unusable=one.level is Level.UNUSABLE) for one in carried]
 
@@ -116,7 +116,7 @@ def strips_say(done: Calibrated, cell_m: float) -> list[Finding]:
     """Return effects that strips still show and that neither their sigmas nor the calibration's explain.
 
     Args:
-        done: the outcome.
+        done: the calibration's outcome.
         cell_m: side of the cells in which strips are compared.
     """
     seen = signatures(differences(done.flight, StripRules(cell_m=cell_m)).checks, SeenFrom.of(done.flight), done.prior)
@@ -135,7 +135,7 @@ def strips_say(done: Calibrated, cell_m: float) -> list[Finding]:
 def validation_says(done: Calibrated) -> list[Finding]:
     """Return the tests of a validation that the calibration fails on its own planes and control.
 
-    They have been adjusted with it, so what fails here fails in spite of that.
+    The calibration was adjusted to these observations, so a failed test counts all the more.
     """
     asked = Asked(done.control or None)
     outcome = validate(done.flight, done.features, done.adjusted.calibrations, asked, done.prior)
@@ -144,7 +144,9 @@ def validation_says(done: Calibrated) -> list[Finding]:
 
 
 def _judged(header: Header, done: Calibrated, name: str, verdict: Verdict) -> Header:
-    """Return the header with the verdict on all, and what of this scanner was asked for and held."""
+    """Return the header with the verdict on the calibration, and the requested parameters of this scanner that were
+    held.
+    """
     held = tuple(key_of(one.name)[0] for one in done.adjusted.held if one.scanner == name and one.name in INDEX)
     reasons = tuple(one_line(reason.what) for reason in verdict.reasons)
     return replace(header, verdict=verdict.level.words.lower(), verdict_reasons=reasons, held=held)
@@ -162,7 +164,7 @@ def _write(files: Mapping[Path, bytes]) -> None:
 
 
 def _inputs(wish: CalibrationOptions, done: Calibrated) -> list[tuple[str, str]]:
-    """Name and SHA-256 of every file that went in; logs first."""
+    """Return name and SHA-256 of every input file, logs first."""
     paths = [part.path for flight in done.kept.logged for part in flight.session.parts]
     given = (wish.logs.trajectory.file, wish.control, wish.ties, wish.polygons, wish.model_file)
     paths += [path for path in given if path is not None]
@@ -173,7 +175,7 @@ def _header(done: Calibrated, name: str, inputs: list[tuple[str, str]]) -> Heade
     now = dt.datetime.now(dt.UTC).replace(microsecond=0)
     found = done.adjusted.calibrations[name]
     digest = hashlib.sha256(found.parameters.tobytes() + "".join(sha for _, sha in inputs).encode()).hexdigest()
-    # a session may lack a scanner: its settings are those of its first, as of the heads
+    # a session may lack a scanner: its settings are those of its first session, as for the heads
     config = next(flight.setup.config for flight in done.kept.logged if name in flight.setup.scanners)
     table = config.scanner[name]
     logs = tuple(entry for entry in inputs if entry[0].endswith(".mcap"))
@@ -191,7 +193,7 @@ def _header(done: Calibrated, name: str, inputs: list[tuple[str, str]]) -> Heade
 
 
 def method_of(done: Calibrated) -> str:
-    """Return the word of a calibration file for what it was made of."""
+    """Return the word that a calibration file uses for the kinds of observations it was made from."""
     kinds = {"control" if plane.control else "planes" for plane in done.features.planes}
     kinds |= {"tie_points" for _ in done.features.ties[:1]}
     return kinds.pop() if len(kinds) == 1 else "combined"
@@ -204,7 +206,7 @@ def _record(
     after: FlightStrips,
     inputs: list[tuple[str, str]],
 ) -> dict[str, Any]:
-    """For scripts."""
+    """Return the outcome as values for scripts."""
     adjusted = done.adjusted
     return {
         "format": "swath.calibration",
@@ -247,7 +249,7 @@ def _record(
 
 
 def _considered_entry(adjusted: Adjusted, column: int) -> dict[str, Any]:
-    """Return what was held, how well it is known, and by how much one sigma of it moves what was estimated; SI."""
+    """Return a held parameter, its sigma, and by how much one sigma moves each estimated one; SI."""
     one, moved = adjusted.considered[column], adjusted.movements[:, column]
     told = {"told": one.told, "told_sigma": one.told_sigma} if math.isfinite(one.told) else {}
     moves = dict(zip(adjusted.names, moved.tolist(), strict=True))
@@ -255,12 +257,12 @@ def _considered_entry(adjusted: Adjusted, column: int) -> dict[str, Any]:
 
 
 def _need_entry(need: Need | None) -> dict[str, Any] | None:
-    """Return what is wanted and what the calibration leaves in points; SI."""
+    """Return the wanted accuracy and the errors that the calibration leaves in points; SI."""
     return None if need is None else finite(asdict(need))
 
 
 def strips_entry(strips: FlightStrips) -> dict[str, Any]:
-    """Return height differences of all pairs together, and pair by pair, and the quality level by them."""
+    """Return height differences of all pairs together and of each pair, and the quality level that follows."""
     told = strips.agreement.numbers or {}
     every = {"n": told.get("cells", 0)} | {key: told.get(key) for key in ("mean_m", "std_m", "rms_m")}
     pairs = [
@@ -271,7 +273,7 @@ def strips_entry(strips: FlightStrips) -> dict[str, Any]:
 
 
 def profiles_entry(check: Check) -> dict[str, Any]:
-    """Return what profiles say beside the adjustment, and each of them; SI."""
+    """Return how profiles compare with the adjustment, and each profile; SI."""
     profiles = [
         {
             "kind": one.kind,
@@ -322,7 +324,7 @@ def _report(
 
 
 def _middle_on_map(done: Calibrated) -> list[float]:
-    """Return east and north of the flight's middle, from which maps count."""
+    """Return east and north of the flight's middle, the origin of maps."""
     mapping, frame = done.kept.logged[0].setup.mapping, done.flight.frame
     return [0.0, 0.0] if mapping is None else mapping.map_from_e(frame.origin_e[np.newaxis])[0, :2].tolist()
 
@@ -336,7 +338,7 @@ def level_words(strips: FlightStrips) -> str:
 
 
 def _wanted(done: Calibrated) -> dict[str, float]:
-    """Return what the configuration wants, SI, by parameter's name."""
+    """Return the accuracies that the configuration asks for, SI, by parameter's name."""
     factors = {parameter.key: (parameter.name, parameter.factor) for parameter in PARAMETERS} | {
         "point_m": (POINT, 1.0)
     }
@@ -345,7 +347,7 @@ def _wanted(done: Calibrated) -> dict[str, float]:
 
 
 def _report_files(folder: Path, done: Calibrated, report: ReportInput, facts: Mapping[str, Plain]) -> dict[Path, bytes]:
-    """Return the page, the same on paper, and a record a scanner as XML and JSON with its matrices beside it."""
+    """Return the report as HTML and PDF, and per scanner a record as XML and JSON with its matrices."""
     from swath.calib.record.record import RecordInput, record_json, record_of, record_xml
     from swath.daemon.processing.calibration.report.page import html, pdf
     from swath.daemon.processing.calibration.report.profiles import pictures
@@ -408,7 +410,7 @@ def _lines(done: Calibrated, knots: Sequence[float], before: FlightStrips, after
 
 
 def _prealigned_lines(done: Calibrated) -> list[str]:
-    """Return where iterations began, which is not the start that was given."""
+    """Return lines on where the iterations began if that is not the given start."""
     starts = done.kept.flight.starts()
     lines = []
     for name, found in done.prealigned.items():

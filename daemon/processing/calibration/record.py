@@ -1,4 +1,6 @@
-"""What others tell of a calibration for its record: people by a file, configuration and navigation of instruments."""
+"""Collects facts for a calibration's record: from the user's file, and from the configuration and navigation of
+instruments.
+"""
 
 from __future__ import annotations
 
@@ -18,11 +20,11 @@ from swath.georef.toml_tables import TomlError, key_text, toml_tables
 
 
 def facts_of(file: Path) -> dict[str, Plain]:
-    """Return what people tell of a calibration, by ``CLASS.attribute``: a table a class, as ``[CA_GNSS]
-    numberSatellites``.
+    """Return the facts that a user gives about a calibration, by ``CLASS.attribute``: one table per class, as
+    ``[CA_GNSS] numberSatellites``.
 
     Raises:
-        UserError: it is no such file, or something in it is no attribute or not what the attribute takes.
+        UserError: the file is not such a file, or an entry is not an attribute or not a value that it takes.
     """
     try:
         tables = toml_tables(text_of(file, "a TOML file"))
@@ -43,10 +45,10 @@ def facts_of(file: Path) -> dict[str, Plain]:
 
 
 def instruments_of(kept: KeptFlight) -> dict[str, Value]:
-    """By ``CLASS.attribute``; nothing where the trajectory was not made here: then they are not known.
+    """Return facts about the instruments, by ``CLASS.attribute``; empty if the trajectory was not navigated here.
 
-    Of several sessions those of the first stand for all: they are of one installation.
-    ISO/TS 19159-1 types intervals as DateTime: they are told as durations of ISO 8601.
+    The first of several sessions stands for all: they are of one installation. ISO/TS 19159-1 types intervals as
+    DateTime: they are given as durations of ISO 8601.
     """
     navigated = kept.logged[0].navigated
     if navigated is None:

@@ -1,6 +1,6 @@
-"""From logs to a `swath.calib.flight.Flight`: all returns of the strips, as measured, kept in files that are mapped.
+"""Reads logs into a `swath.calib.flight.Flight`: all returns of the strips, as measured, in memory-mapped files.
 
-The first pass and the strips are those of `swath georef`; then each strip is a job, whose returns are kept as they came
+The first pass and the strips are those of `swath georef`; then each strip is a job, whose returns are kept as measured
 beside their points in t.
 """
 
@@ -40,12 +40,12 @@ from swath.georef.trajectory.trajectory import Trajectory
 if TYPE_CHECKING:
     from swath.georef.navigation.cross_covariance import ErrorChain
 
-KNOT_S = 0.2  # between knots of the trajectory's errors
+KNOT_S = 0.2  # time between knots of the trajectory's errors
 TRAJECTORY_MARGIN_NS = 2_000_000_000
 PLACED_ROWS = 1 << 18
-Steps = Callable[[str, int, int], None]  # what is done, how much, of how much
+Steps = Callable[[str, int, int], None]  # arguments: the step, how much is done, of how much
 
-COLUMNS: dict[str, tuple[np.dtype[np.generic], tuple[int, ...]]] = {  # a file each
+COLUMNS: dict[str, tuple[np.dtype[np.generic], tuple[int, ...]]] = {  # one file each
     "rows": (RETURN_DTYPE, ()),
     "time_ns": (np.dtype(np.int64), ()),
     "points_t": (np.dtype(np.float64), (3,)),
@@ -56,19 +56,19 @@ COLUMNS: dict[str, tuple[np.dtype[np.generic], tuple[int, ...]]] = {  # a file e
 
 @dataclass(frozen=True)
 class KeepPlan(JobPlan):
-    """Of jobs that keep returns: the frame of their points."""
+    """A plan of jobs that keep returns, with the frame of their points."""
 
     frame: Tangent
 
 
 @dataclass(frozen=True, eq=False)
 class KeptFlight:
-    """What was read.
+    """A flight that was read for calibration.
 
     Attributes:
-        flight: for the adjustment; its arrays are mapped from files in the folder.
+        flight: input of the adjustment; its arrays are mapped from files in the folder.
         logged: the sessions behind it, in the order of ``flight.trajectories``.
-        results: of the jobs.
+        results: results of the jobs.
     """
 
     flight: Flight
@@ -77,13 +77,13 @@ class KeptFlight:
 
     @property
     def notes(self) -> list[str]:
-        """Holes in what was asked for, then doubts of what is there, a line each."""
+        """Holes in the data asked for, then doubts about the data read, one line each."""
         holes = [line for flight in self.logged for line in flight.holes]
         return [*holes, *dict.fromkeys(line for flight in self.logged for line in flight.doubts)]
 
 
 def refuse_without_noise(kept: KeptFlight) -> None:
-    """UserError where returns of a scanner are said to be exact: by its noise an adjustment weighs them."""
+    """Refuse with `UserError` a scanner that is configured without noise: an adjustment weighs returns by it."""
     for head in kept.flight.heads:
         noise = head.noise
         if not max(noise.range_m, noise.angle_rad, noise.divergence_rad):
@@ -94,7 +94,7 @@ def refuse_without_noise(kept: KeptFlight) -> None:
 
 
 def smoothed_prior(kept: KeptFlight) -> TrajectoryPrior | None:
-    """Return the joint covariance of trajectories that were smoothed here; None: one was not, or in several legs."""
+    """Return the joint covariance of trajectories that were smoothed here; None if one was not, or has several legs."""
     chains: list[ErrorChain] = []
     knots = knots_of(kept.flight, KNOT_S)
     for number, flight in enumerate(kept.logged):
@@ -108,16 +108,16 @@ def smoothed_prior(kept: KeptFlight) -> TrajectoryPrior | None:
 def read_flight(
     wish: GeorefOptions, folder: Path, tell: Steps, check: Callable[[list[str]], None] = lambda scanners: None
 ) -> KeptFlight:
-    """Read logs.
+    """Read logs into a flight with all returns of its strips.
 
     Args:
-        wish: as of `swath georef`; what it says of products does not count.
-        folder: for the files, which are as large as 104 bytes a return.
-        tell: is told how far it is.
-        check: as of `read_flights`.
+        wish: options as of `swath georef`; those about products are ignored.
+        folder: folder for the files, which take 104 bytes per return.
+        tell: called with the progress.
+        check: called as by `read_flights`.
 
     Raises:
-        UserError: as of `read_flights`; StripError, MappingError, LogError, OSError.
+        UserError: for the reasons of `read_flights`; StripError, MappingError, LogError, OSError.
     """
     logged = read_flights(wish, tell, check)
     frame = Tangent.at(_middle(logged[0]))
@@ -164,9 +164,9 @@ def _job(flight: LoggedFlight, number: int, tile: Segment, folder: Path) -> Job:
 
 
 def _heads(logged: Sequence[LoggedFlight]) -> tuple[Head, ...]:
-    """Of all sessions, which are of one installation; a scanner's settings are those of its first.
+    """Return the scanner heads of all sessions, which are of one installation.
 
-    What a gimbal's angles were is of the time of all.
+    A scanner's settings are those of its first session; gimbal angles cover the times of all sessions.
     """
     found: dict[str, Head] = {}
     for flight in logged:
@@ -190,8 +190,8 @@ def _heads(logged: Sequence[LoggedFlight]) -> tuple[Head, ...]:
 
 
 def _under(config: Config, table: ScannerConfig, calibration: Calibration) -> Calibration:
-    """Return a calibration with the settings it is used under, so that one estimated from it is refused under
-    others.
+    """Return a calibration with the settings that it is used under; a calibration estimated from it is then refused
+    under others.
     """
     factor = calibration.mirror_factor if table.mirror_factor is None else table.mirror_factor
     air = config.atmosphere
@@ -230,16 +230,17 @@ def _mapped(path: Path, dtype: np.dtype[np.generic], shape: tuple[int, ...]) -> 
 def replaced(
     flight: Flight, calibrations: Mapping[str, Calibration], folder: Path, name: str, workers: int | None = None
 ) -> Flight:
-    """`Flight.placed`, with the points in mapped files of this name, which are made anew.
+    """Return `Flight.placed` with the points in newly written, mapped files of this name.
 
-    Strips are placed by so many threads, by default one a processor: nearly all of it goes on without the interpreter.
+    Strips are placed by ``workers`` threads, by default one per processor: nearly all of the work runs without the
+    interpreter's lock.
     """
 
     def placed(number: int) -> Swath:
         swath = flight.swaths[number]
         calibration = calibrations[flight.heads[swath.head].name]
         path = folder / f"{number:03d}.{name}.points_t"
-        path.unlink(missing_ok=True)  # whoever still has the old one mapped keeps it
+        path.unlink(missing_ok=True)  # a reader that still has the old file mapped keeps it
         with path.open("wb") as file:
             for start in range(0, len(swath), PLACED_ROWS):
                 points_t = flight.place(swath, calibration, slice(start, start + PLACED_ROWS))
@@ -255,10 +256,10 @@ def replaced(
 
 
 class _Keeper(Georeferencer):
-    """Stands where points are made: places returns in t and keeps them, with their points, as they came.
+    """Replaces the georeferencer of a chain: places returns in t and keeps them, with their points, as measured.
 
-    Range offsets by pulse rate are nobody's unknowns: the ranges that are kept have them, so that who places returns
-    anew need not know their rates.
+    No calibration estimates range offsets by pulse rate: the ranges that are kept include them, so that code that
+    places returns anew need not know their rates.
     """
 
     def __init__(self, georeferencer: Georeferencer, frame: Tangent, given: GivenMotion, files: dict[str, BinaryIO]):
@@ -266,7 +267,7 @@ class _Keeper(Georeferencer):
         self._frame, self._given, self._files = frame, given, files
 
     def georeference(self, rows: StructArray, time_ns: Int64Array, trajectory: Trajectory) -> tuple[Points, ByteArray]:
-        """No points; the fate of every row."""
+        """Keep the returns and their points; return no points, and the fate of every row."""
         given, rows = self._given, self._with_offsets_by_rate(rows)
         rays = self.model.rays(
             rows, time_ns, trajectory, encoder_rate=given.rate, encoder_acceleration=given.acceleration
@@ -299,7 +300,7 @@ def keep_job(plan: KeepPlan, job: Job, tell: Tell) -> JobResult:
     """Keep a strip's returns in files of the job's folder.
 
     Raises:
-        OSError: the log cannot be read or a file not be written.
+        OSError: the log cannot be read or a file cannot be written.
     """
     result = JobResult(job.session, job.segment.strip, job.segment.start_ns, job.segment.end_ns)
     assert job.trajectory is not None
@@ -323,7 +324,7 @@ def keep_job(plan: KeepPlan, job: Job, tell: Tell) -> JobResult:
 
 
 def refuse_installations(logged: Sequence[Any]) -> None:
-    """UserError where flights as logged are not of one installation."""
+    """Refuse with `UserError` logged flights that are not of one installation."""
     places = [flight.setup.config.profile.installation for flight in logged]
     for flight, place in zip(logged, places, strict=True):
         if place != places[0]:

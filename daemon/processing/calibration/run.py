@@ -1,12 +1,12 @@
 """`swath calibrate`: from the logs of a calibration flight to parameters, their sigmas and the proof.
 
-    returns of the strips as measured, and the trajectory's own joint covariance     calibration_flight
-    coarse boresight, so that the same roof is found in every strip                  swath.calib.prealign
-    planes, tie points, control                                                      swath.calib.planes.search, …
-    adjustment, with correspondences found anew until they stay                      swath.calib.adjust
-    height differences of strips, before and after; files, record, report            calibrate_products
+    returns of the strips as measured, and the trajectory's own joint covariance    calibration_flight
+    coarse boresight, so that the same roof is found in every strip                 swath.calib.prealign
+    planes, tie points, control                                                     swath.calib.planes.search, …
+    adjustment, with correspondences found anew until they stay                     swath.calib.adjust
+    height differences of strips, before and after; files, record, report           calibrate_products
 
-All files are made out of sight and put in their place at the end: what looks like a calibration is one.
+All files are written aside and renamed at the end, so that any calibration file is a complete one.
 """
 
 from __future__ import annotations
@@ -58,17 +58,17 @@ from swath.georef.scanner.calibration import Calibration
 from swath.georef.strips import StripError
 from swath.georef.trajectory.trajectory import TrajectoryError
 
-Steps = Callable[[str, int, int], None]  # what is done, how much, of how much
-COARSE_RAD = math.radians(0.05)  # to which heights of strips, laid on each other, tell an angle at best
+Steps = Callable[[str, int, int], None]  # arguments: the step, how much is done, of how much
+COARSE_RAD = math.radians(0.05)  # how well an angle can be found at best from heights of overlapping strips
 COARSE_SIGMAS = 3.0
-OUTCOME = "calibration.json"  # of a report
-# Enough to bring strips together, and for a trajectory of which only sigmas are known: what errors do from one patch to
-# the next is assumed there, and thousands of returns would be taken for better than that is.
+OUTCOME = "calibration.json"  # name of the outcome's file in a report's folder
+# Enough to bring strips together, and for a trajectory with sigmas only: how its errors change from one patch to the
+# next is then assumed, and thousands of returns would get more weight than this assumption deserves.
 PLANES = PlaneSettings(most_points=25)
-# Where the smoother's own covariance says what errors do: without control the range offset is told by noise averaged
-# over all the ground there is. Beyond 400 returns a patch it is the attitude between two knots that counts.
+# If the smoother's covariance describes the errors: without control the range offset is found by averaging noise over
+# all ground. Beyond 400 returns a patch the attitude between two knots dominates.
 EVERY = PlaneSettings(most_points=400, most_planes=4000, ground_planes=100)
-ROWS_MOST = 4_000_000  # in all: some seconds a pass, and 300 MB
+ROWS_MOST = 4_000_000  # in all: some seconds per pass, and 300 MB
 REFUSED = (
     ControlError,
     FlightError,
@@ -86,21 +86,21 @@ REFUSED = (
 
 @dataclass(frozen=True)
 class CalibrationOptions:
-    """What the command line asks for.
+    """The options of `swath calibrate` from the command line.
 
     Attributes:
-        logs: what is read and how; what it says of products does not count.
-        output: the calibration file; of several scanners a folder for theirs.
-        model: what is estimated.
-        model_file: that says so; None: none does.
+        logs: which logs are read and how; its options about products are ignored.
+        output: path of the calibration file; for several scanners the folder of their files.
+        model: the parameters that are estimated.
+        model_file: file of the model; None: the model is given by name.
         control: CSV of surveyed points.
-        ties: CSV of points picked in several strips; beside what is observed.
-        polygons: CSV of polygons that planes fill; instead of those that would be found.
-        observe: planes or ties, and markings: what is looked for.
-        report: folder for the report, the record and the pictures; None: none.
-        facts: of the record what only people know, by ``CLASS.attribute``.
-        limit_deg, limit_m: how far boresight and range offset may lead from where they began.
-        overwrite: files of an earlier run are replaced.
+        ties: CSV of points picked in several strips; used beside the observations found.
+        polygons: CSV of polygons that planes fill; used instead of a search for planes.
+        observe: kinds of features that are searched for: planes or ties, and markings.
+        report: folder of the report, the record and the pictures; None: no report.
+        facts: facts for the record that only the user knows, by ``CLASS.attribute``.
+        limit_deg, limit_m: how far boresight and range offset may move from the start.
+        overwrite: replace files of an earlier run.
     """
 
     logs: GeorefOptions
@@ -120,15 +120,15 @@ class CalibrationOptions:
 
 @dataclass(frozen=True, eq=False)
 class Calibrated:
-    """What came of it.
+    """The outcome of a calibration.
 
     Attributes:
         kept: the flight as read.
-        flight: placed with the calibrations found.
-        prealigned: by scanner, what the adjustment's iterations began with.
-        findings: what the pre-alignment says against angles that are held, for the verdict.
-        check: what profiles say of the outcome.
-        notes: for people, a line each.
+        flight: the flight placed with the estimated calibrations.
+        prealigned: by scanner, the initial values of the adjustment's iterations.
+        findings: contradictions between the pre-alignment and angles that are held, for the verdict.
+        check: results of profiles on the outcome.
+        notes: notes for people, one line each.
     """
 
     kept: KeptFlight
@@ -144,15 +144,15 @@ class Calibrated:
 
 
 def calibrate(wish: CalibrationOptions, folder: Path, tell: Steps) -> Calibrated:
-    """Calibrate.
+    """Calibrate a flight's scanners.
 
     Args:
-        wish: what is asked for.
-        folder: for the returns, some 150 bytes each, while it goes on.
-        tell: is told how far it is.
+        wish: options of the calibration.
+        folder: temporary folder for the returns, some 150 bytes each.
+        tell: called with the progress.
 
     Raises:
-        UserError: it cannot be, one line.
+        UserError: the flight cannot be calibrated; one line.
     """
     with as_user_error(folder, *REFUSED):
         return _calibrate(wish, folder, tell)
@@ -202,7 +202,7 @@ def _calibrated(wish: CalibrationOptions, kept: KeptFlight, folder: Path, tell: 
         nonlocal flight, planes, features, searched
         tell("planes again", 0, 1)
         flight = replaced(kept.flight, calibrations, folder, "matched", workers)
-        # once more: roofs at a swath's edges that the pre-alignment left apart lie on each other now
+        # search once more: roofs at a swath's edges that the pre-alignment left apart overlap now
         again = searched == 1 or rings is not None
         planes, searched = search() if again else match(), searched + 1
         features = observed()
@@ -233,10 +233,10 @@ def _calibrated(wish: CalibrationOptions, kept: KeptFlight, folder: Path, tell: 
 
 
 def _aligned(flight: Flight, fixed: frozenset[str]) -> tuple[dict[str, Calibration], dict[str, float]]:
-    """Return a coarse boresight by scanner, and by how much it contradicts the start, by name, SI.
+    """Return a coarse boresight by scanner, and the deviations that contradict the start, by name, SI.
 
-    The range offset stays, which heights of strips alone hardly tell. A coarse angle contradicts the start where it is
-    away from it by more than heights of strips may be wrong.
+    The range offset keeps its start: heights of strips alone hardly determine it. A coarse angle contradicts the start
+    if it deviates by more than the error that heights of strips may have.
     """
     starts = flight.starts()
     coarse = prealigned(flight, PrealignSettings(held=fixed))
@@ -251,11 +251,11 @@ def _aligned(flight: Flight, fixed: frozenset[str]) -> tuple[dict[str, Calibrati
 
 
 def prealigned_otherwise(away: Mapping[str, float], adjusted: Adjusted) -> tuple[Finding, ...]:
-    """Return what the pre-alignment says against angles that the adjustment held at their start.
+    """Return findings where the pre-alignment contradicts angles that the adjustment held at their start.
 
     Args:
-        away: by name, as ``left.kappa_rad``, by how much it contradicts the start, SI.
-        adjusted: the outcome.
+        away: by name, as ``left.kappa_rad``, the deviation that contradicts the start, SI.
+        adjusted: outcome of the adjustment.
     """
     found = []
     for held in adjusted.held:
@@ -269,14 +269,14 @@ def prealigned_otherwise(away: Mapping[str, float], adjusted: Adjusted) -> tuple
 
 
 def _refuse_existing(wish: CalibrationOptions, files: Iterable[Path]) -> None:
-    """UserError where a file is there that may not be replaced."""
+    """Refuse with `UserError` to replace files that exist, unless the user allows it."""
     for path in files:
         if path.exists() and not wish.overwrite:
             raise UserError(f"{path}: is there already; want another folder, or --overwrite", ExitCode.USAGE)
 
 
 def paths_of(wish: CalibrationOptions, scanners: Iterable[str]) -> dict[str, Path]:
-    """Return where each scanner's calibration goes."""
+    """Return the path of each scanner's calibration file."""
     names = list(scanners)
     if len(names) == 1 and not wish.output.is_dir():
         return dict.fromkeys(names, wish.output)
@@ -298,7 +298,7 @@ def _refuse_one_strip(kept: KeptFlight) -> None:
 
 
 def refuse_no_planes(log: str, planes: Features) -> None:
-    """UserError where strips have no plane in common."""
+    """Refuse with `UserError` strips that have no plane in common."""
     if planes.planes:
         return
     why = ", ".join(f"{count:,} {reason}" for reason, count in planes.refused.most_common(3))
@@ -309,7 +309,7 @@ def refuse_no_planes(log: str, planes: Features) -> None:
 
 
 def refuse_lost_control(control: Path | None, features: Features) -> None:
-    """UserError where control is given, and none of it says anything."""
+    """Refuse with `UserError` control of which no point can be used."""
     if control is None or any(plane.control for plane in features.planes):
         return
     why = ", ".join(f"{count:,} {reason}" for reason, count in features.refused.items() if "control" in reason)
@@ -326,10 +326,10 @@ def _control(wish: CalibrationOptions, flight: Flight) -> tuple[ControlPoint, ..
 
 
 def _doubts(flight: Flight, points: Sequence[ControlPoint]) -> tuple[str, ...]:
-    """Return what is doubtful of control; UserError where it cannot be used at all.
+    """Return doubts about control; refuse with `UserError` control that cannot be used at all.
 
-    That all its heights differ alike is only a doubt here: so does a range offset, which is to be found; what is more
-    than that may be, is refused in the end (`_refuse_far`).
+    An equal offset of all its heights is only a doubt here: the range offset that is to be found causes one too. An
+    offset too large for that is refused at the end (`_refuse_far`).
     """
     found = doubts(flight, points)
     whole = [doubt.text for doubt in found if doubt.kind not in ("point", "height")]
@@ -339,7 +339,7 @@ def _doubts(flight: Flight, points: Sequence[ControlPoint]) -> tuple[str, ...]:
 
 
 def _features(wish: CalibrationOptions, flight: Flight, planes: Features, points: Sequence[ControlPoint]) -> Features:
-    """Return what the adjustment takes: the planes or their intersections, never both, for they are of the same
+    """Return the observations of the adjustment: planes or their intersections, never both, as they share their
     returns.
     """
     found = [planes]
@@ -357,7 +357,7 @@ def _features(wish: CalibrationOptions, flight: Flight, planes: Features, points
 
 
 def prior_of(kept: KeptFlight) -> TrajectoryPrior:
-    """Return the trajectory's errors before: exactly, of those that were smoothed here, or by their sigmas."""
+    """Return the prior errors of the trajectory: the exact covariance if smoothed here, otherwise by its sigmas."""
     return smoothed_prior(kept) or gauss_markov(kept.flight)
 
 
@@ -365,7 +365,9 @@ def prior_of(kept: KeptFlight) -> TrajectoryPrior:
 
 
 def _refuse_far(wish: CalibrationOptions, flight: Flight, adjusted: Adjusted) -> None:
-    """Nothing is written that led away from what anybody would believe."""
+    """Refuse with `UserError` an adjustment that did not converge or moved implausibly far, before
+    any file is written.
+    """
     log = wish.logs.logs[0]
     if not adjusted.converged:
         raise UserError(f"{log}: the adjustment does not converge; look at the strips with swath view first")

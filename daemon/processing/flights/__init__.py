@@ -1,1 +1,1 @@
-"""Which logs and which trajectory belong together."""
+"""Finds out which logs and which trajectory belong together."""

@@ -1,4 +1,4 @@
-"""The first pass over logs: all but the returns is read; of these it is noted where they stand; strips are cut."""
+"""Makes the first pass over logs: reads all data but the returns, notes where returns are stored, and cuts strips."""
 
 from __future__ import annotations
 
@@ -41,33 +41,33 @@ if TYPE_CHECKING:
     from swath.daemon.processing.points.jobs import JobResult
     from swath.georef.timescales import ClockStatus
 
-    Tell = Callable[[str, int, int], None]  # what is done, how much, of how much
+    Tell = Callable[[str, int, int], None]  # arguments: the step, how much is done, of how much
     from swath.daemon.processing.setup.setup import Options
 
 
 UNSAID = "a datum that is not said"
 
-INTENSITY_FACTOR = 257.0  # eight bits, 0 … 255, fill the field of 16
+INTENSITY_FACTOR = 257.0  # scales eight bits, 0 … 255, to the 16-bit field
 
 
 @dataclass(frozen=True)
 class GeorefOptions:
-    """What the command line asks for.
+    """The options of `swath georef` from the command line.
 
     Attributes:
-        logs, output: where from, where to.
-        trajectory: see `TrajectoryOptions`.
-        options: over the logs' configuration.
-        config: instead of the logs' own; None: theirs.
-        strips: ``auto``, ``whole``, or a CSV file's name.
-        rules: what a strip is.
-        workers, scheduler: where the work is done.
-        sigmas: three sigmas with each point.
-        copc: COPC files.
-        scale: of the coordinates, in the coordinate system's units.
-        overwrite: products of an earlier run are replaced.
-        write_dropped: returns that are left out are written too, flagged or in a list.
-        accept_verdict: what is judged not to be used is no problem.
+        logs, output: logs that are read, and the folder of the products.
+        trajectory: options of `TrajectoryOptions`.
+        options: options that override the logs' configuration.
+        config: configuration instead of the logs' own; None: the logs' own.
+        strips: ``auto``, ``whole``, or the name of a CSV file.
+        rules: rules that define a strip.
+        workers, scheduler: number of worker processes, and the address of a Dask scheduler (None: none).
+        sigmas: write three sigmas with each point.
+        copc: write COPC files.
+        scale: scale of the coordinates, in the coordinate system's units.
+        overwrite: replace products of an earlier run.
+        write_dropped: also write returns that are left out, flagged or in a list.
+        accept_verdict: do not report an unusable verdict as a problem.
     """
 
     logs: Sequence[Path]
@@ -87,7 +87,7 @@ class GeorefOptions:
     accept_verdict: bool = False
 
     def record(self) -> dict[str, Any]:
-        """For the sidecar: what it was, but for what does not matter to the points."""
+        """Return the options for the sidecar, without those that do not affect the points."""
         return {
             "trajectory": None if self.trajectory.file is None else str(self.trajectory.file),
             "trajectory_at": self.trajectory.at,
@@ -108,19 +108,19 @@ class GeorefOptions:
 
 @dataclass
 class Flight:
-    """A session on its way.
+    """A session while it is processed.
 
     Attributes:
         span: GPS time of its first and last return; host_span likewise in log time.
-        trajectory: the body's.
-        solutions: of the device's INS that it is made of, by what became of them.
-        navigated: what the trajectory was smoothed from; None: it comes from elsewhere.
-        strips: spans of log time, and the number of the first.
-        lost: units that the recorder lost, by source.
-        verdicts: on its calibrations and its trajectory, those that are not good; `trajectory_verdicts` of them on the
-            latter, and `source` where that is from: ``navigated``, ``ins`` or ``file``.
-        troubles: with time or trajectory, a line each.
-        holes: what will be missing, a line each.
+        trajectory: trajectory of the body.
+        solutions: number of the device's INS solutions by fate.
+        navigated: the navigation that the trajectory was smoothed in; None: it comes from elsewhere.
+        strips: spans of log time; `first_number` is the number of the first.
+        lost: number of units that the recorder lost, by source.
+        verdicts: verdicts on calibrations and trajectory, other than good; `trajectory_verdicts` those on the
+            trajectory, and `source` where it is from: ``navigated``, ``ins`` or ``file``.
+        troubles: problems with time or trajectory, one line each.
+        holes: data that will be missing, one line each.
     """
 
     session: Session
@@ -143,33 +143,33 @@ class Flight:
 
     @property
     def log(self) -> Path:
-        """The session's first part, which stands for it in messages."""
+        """The session's first part, which names the log in messages."""
         return self.session.parts[0].path
 
     @property
     def doubts(self) -> list[str]:
-        """Doubts of its data, its time and its trajectory, a line each."""
+        """Doubts about its data, time and trajectory, one line each."""
         lost = [f"{self.log}: the recorder lost {count:,} units of {source}" for source, count in self.lost.items()]
         return [*lost, *self.troubles]
 
     @property
     def clock(self) -> str | None:
-        """The source that shows the host's time."""
+        """The source of the host's time."""
         devices = self.clocks.clocks.host.plan.devices
         return next((plan.clock for plan in devices.values()), None)
 
     def status(self, host_ns: int) -> ClockStatus | None:
-        """Of that clock."""
+        """Return the status of the clock that gives the host's time."""
         return None if self.clock is None else self.clocks.clocks.host.status(self.clock, host_ns)
 
     def gps_from_host(self, host_ns: Any) -> Any:
-        """Return GPS ns (n,) of log times."""
+        """Return GPS times (n,), ns, of log times."""
         assert self.clock is not None
         gps_ns, _ = self.clocks.clocks.host.gps_from_host(self.clock, np.asarray(host_ns, np.int64))
         return gps_ns
 
     def host_from_gps(self, gps_ns: Sequence[int]) -> list[int]:
-        """Log times of GPS times, to the nanosecond or so: the clocks differ by parts in a million."""
+        """Return log times of GPS times, to about a nanosecond: the clocks differ by parts in a million."""
         wanted = np.asarray(gps_ns, np.int64)
         host_ns = wanted - self.span[0] + self.host_span[0]
         for _ in range(3):
@@ -181,17 +181,17 @@ class Flight:
 def read_flights(
     wish: GeorefOptions, tell: Tell, check: Callable[[list[str]], None] = lambda scanners: None
 ) -> list[Flight]:
-    """Return the flights of a wish, with trajectories and strips; what of a directory is no log is a hole of the first.
+    """Return the flights of the logs, with trajectories and strips; note files that are not logs as holes of the first.
 
     Args:
         wish: which logs, and how.
-        tell: is told how far it is.
-        check: is called with the names of all scanners before anything long is done; what it raises goes on.
+        tell: called with the progress.
+        check: called with the names of all scanners before any long work; its exceptions pass through.
 
     Raises:
-        UserError: they cannot be georeferenced, or not together.
+        UserError: the logs cannot be georeferenced, or not together.
         LogError, OSError: a log cannot be read.
-        StripError, MappingError: in one line.
+        StripError, MappingError: strips or mapping are invalid; one line.
     """
     refuse_in_import()
     passed_over: list[str] = []
@@ -209,7 +209,7 @@ def read_flights(
         flights.append(_read(session, setup, positions=wish.trajectory.file is not None))
     flights[0].holes += [f"passed over: {line}" for line in passed_over]
     refuse_overlap({flight.log: flight.span for flight in flights})
-    flights.sort(key=lambda flight: flight.span)  # sessions come by their hosts' clocks, which may be wrong
+    flights.sort(key=lambda flight: flight.span)  # sessions come in host time, which may be wrong
     for flight in flights:
         _choose(wish, flight)
     _number_strips(wish, flights)
@@ -258,7 +258,7 @@ def _read(session: Session, setup: Setup, *, positions: bool) -> Flight:
 
 
 def _choose(wish: GeorefOptions, flight: Flight) -> None:
-    """The flight's trajectory; the mapping's operation for where it was."""
+    """Set the flight's trajectory, and settle the mapping for its area."""
     status = flight.status(flight.host_span[1])
     leap_seconds = status.leap_seconds if status is not None and status.leap_origin != "guess" else None
     chosen = choose_trajectory(wish.trajectory, flight.setup, flight.session, flight.clocks, flight.span, leap_seconds)
@@ -277,7 +277,7 @@ def _choose(wish: GeorefOptions, flight: Flight) -> None:
 
 
 def _judge(wish: GeorefOptions, flight: Flight) -> None:
-    """The verdicts that what is made of the flight has to carry."""
+    """Set the verdicts that products of the flight carry."""
     if wish.trajectory.file is not None:
         flight.trajectory_verdicts, flight.source = file_verdicts(wish.trajectory.file, flight.span)
     elif flight.navigated is not None:
@@ -298,12 +298,12 @@ def trajectory_verdicts_of(flights: Sequence[Flight]) -> list[Carried]:
 
 
 def verdict_of(wish: GeorefOptions, flights: Sequence[Flight]) -> dict[str, Any]:
-    """Return the verdict on a run, as its record says it: each reason once."""
+    """Return the verdict entry of a run, each reason once."""
     return verdict_entry(verdicts_of(flights), accepted=wish.accept_verdict)
 
 
 def _number_strips(wish: GeorefOptions, flights: Sequence[Flight]) -> None:
-    """Each flight's strips in log time, numbered through."""
+    """Set each flight's strips in log time, numbered throughout the run."""
     given = None if wish.strips in ("auto", "whole") else _given_strips(wish.strips)
     number = 1
     for flight in flights:
@@ -319,7 +319,7 @@ def _number_strips(wish: GeorefOptions, flights: Sequence[Flight]) -> None:
 
 
 def note_times(flights: Sequence[Flight], results: Sequence[JobResult]) -> None:
-    """Note in each flight's holes why returns of its strips have no time, a line a scanner."""
+    """Note in each flight's holes why returns of its strips have no time, one line per scanner."""
     for number, flight in enumerate(flights):
         own = [result for result in results if result.session == number and result.strip]
         status, clocks = flight.status(flight.host_span[1]), flight.clocks.clocks
@@ -354,9 +354,9 @@ def _strips(wish: GeorefOptions, flight: Flight, given: Sequence[Span] | None) -
 
 
 def _straight(wish: GeorefOptions, flight: Flight) -> list[Span]:
-    """Return straight flight in GPS time, and where the trajectory says nothing.
+    """Return the spans of straight flight in GPS time, and spans without a trajectory.
 
-    Before a device's own INS is aligned there is nothing to be had: that is told, and no strip.
+    Before a device's own INS is aligned there is no solution: this is noted as trouble, not as a strip.
     """
     trajectory = flight.trajectory
     assert trajectory is not None
@@ -378,14 +378,14 @@ def _straight(wish: GeorefOptions, flight: Flight) -> list[Span]:
 def refuse_different_settings(
     configs: Mapping[Path, Config], crs: str | None, datum: str | None = None, epoch: float | None = None
 ) -> None:
-    """Logs of one run share the mapping frame, and of their trajectory the antenna and the datum.
+    """Refuse logs of one run that differ in mapping frame, antenna or datum.
 
     Args:
-        configs: by log.
-        crs, datum, epoch: what the command line says, over the configurations.
+        configs: configurations by log.
+        crs, datum, epoch: values from the command line, which override the configurations.
 
     Raises:
-        UserError: they do not.
+        UserError: the settings differ.
     """
     for (one, first), (other, second) in pairwise(configs.items()):
         for key, said in (("crs", crs), ("epoch", epoch)):
@@ -414,10 +414,10 @@ def refuse_different_settings(
 
 
 def refuse_geocentric(crs: str) -> None:
-    """Files of points hold eastings, northings and heights; ``crs`` is one that PROJ reads.
+    """Refuse a CRS without eastings, northings and heights; ``crs`` is one that PROJ reads.
 
     Raises:
-        UserError: its coordinates are not those.
+        UserError: the CRS is geocentric.
     """
     read = CRS.from_user_input(crs)
     if read.is_geocentric:
@@ -429,14 +429,14 @@ def refuse_geocentric(crs: str) -> None:
 
 
 def of_log(log: Path, lines: Sequence[str], options: Options) -> list[str]:
-    """Return what is wrong with the configuration in a log names the log; what the command line said does not."""
+    """Put the log's name before lines about its configuration, but not before those about the command line."""
     files = [file for _, file in options.calibrations.values()]
     own = ("output.", "datum", *files) if options.crs or options.datum or options.epoch else ("--", *files)
     return [line if line.startswith(own) else f"{log}: {line}" for line in lines]
 
 
 def _datum_of(config: Config) -> str | None:
-    """As `swath.daemon.processing.setup.setup.Setup` takes it."""
+    """Return the datum of a configuration as `swath.daemon.processing.setup.setup.Setup` uses it."""
     return next((gnss.datum for gnss in config.gnss.values() if gnss.datum), None)
 
 
@@ -445,10 +445,10 @@ def _said(value: object) -> str:
 
 
 def refuse_overlap(spans: Mapping[Path, Span]) -> None:
-    """Logs of one run follow each other; spans in GPS ns.
+    """Refuse logs of one run that overlap in time; spans in GPS ns.
 
     Raises:
-        UserError: two overlap.
+        UserError: two logs overlap.
     """
     ordered = sorted(spans.items(), key=lambda item: item[1])
     for (one, (_, end_ns)), (other, (start_ns, _)) in pairwise(ordered):
@@ -461,10 +461,10 @@ def refuse_overlap(spans: Mapping[Path, Span]) -> None:
 
 
 def note_strips_elsewhere(file: str, strips: Sequence[Span], flights: Sequence[Flight]) -> None:
-    """Strips that a file asks for and that lie in no log will be missing; spans in GPS ns.
+    """Note strips of a file that lie in no log as missing; spans in GPS ns.
 
     Raises:
-        UserError: all of them.
+        UserError: none of the strips lies in a log.
     """
     elsewhere = [
         (start, end)

@@ -1,4 +1,4 @@
-"""Which trajectory a session is georeferenced with: of a file, of the device's own INS, or of IMU and GNSS."""
+"""Chooses the trajectory of a session: from a file, from the device's own INS, or navigated from IMU and GNSS."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ if TYPE_CHECKING:
     from swath.georef.trajectory.trajectory import Trajectory
 
 
-LATE_S = 0.06  # more than an IMU's samples are late at the host
-LOOKED_AT = 10_000  # epochs, whether the body flies forward and upright
-FLIES_MPS = 15.0  # nothing flies so fast sideways
-FORWARD = 0.5  # cosine between nose and course, below which it would
+LATE_S = 0.06  # longer than an IMU's samples are delayed at the host
+LOOKED_AT = 10_000  # epochs sampled to test whether the body flies forward and upright
+FLIES_MPS = 15.0  # no aircraft flies so fast sideways
+FORWARD = 0.5  # cosine between nose and course below which it would fly sideways
 AXES = (
     "want the attitude of axes forward, right, down: of a device's INS imu.….rotation_b_imu turns it, as it turns the "
     "samples"
@@ -41,15 +41,15 @@ FROM_LOG = "INS solution in the log"
 
 @dataclass(frozen=True, slots=True)
 class TrajectoryOptions:
-    """What the command line says of the trajectory.
+    """The options for the trajectory from the command line.
 
     Attributes:
-        file: None: the device's own.
-        week: GPS week of a file that says none; None: the one that fits the log.
-        at: the point it is of: body, antenna, scanner, or ``x,y,z`` from the body's origin in b, metres.
-        navigate: without a file IMU and GNSS are navigated and smoothed where the log has both, whatever the device's
-            own INS said.
-        force: a file that does not belong to the log is taken all the same, and warned of.
+        file: the trajectory's file; None: the device's own INS.
+        week: GPS week of a file without one; None: the week that fits the log.
+        at: the point that the file describes: body, antenna, scanner, or ``x,y,z`` from the body's origin in b, metres.
+        navigate: without a file, navigate and smooth IMU and GNSS if the log has both, even if the device's own INS has
+            a solution.
+        force: use a file that does not belong to the log all the same, with a warning.
     """
 
     file: Path | None = None
@@ -59,20 +59,21 @@ class TrajectoryOptions:
     force: bool = False
 
     def __post_init__(self) -> None:
-        """UserError where a file is forced that nobody named."""
+        """Refuse with `UserError` to force a file if no file is given."""
         if self.force and self.file is None:
             raise UserError("--force-trajectory: there is no file to be taken; want --trajectory too", ExitCode.USAGE)
 
 
 @dataclass(frozen=True, slots=True)
 class Chosen:
-    """The body's trajectory of a session.
+    """The body's trajectory in a session.
 
     Attributes:
-        trajectory: attitude refers to the ellipsoid's normal, whatever it referred to (``[attitude]``).
-        doubts: about it, a line each.
-        solutions: of the device's INS, by what became of them (`swath.georef.trajectory.buffer`); none of a file.
-        navigated: what it was smoothed from; None: it comes from elsewhere.
+        trajectory: the trajectory; its attitude refers to the ellipsoid's normal, whatever the source's did
+            (``[attitude]``).
+        doubts: doubts about it, one line each.
+        solutions: number of the device's INS solutions by fate (`swath.georef.trajectory.buffer`); empty for a file.
+        navigated: the navigation that it was smoothed in; None: it comes from elsewhere.
     """
 
     trajectory: Trajectory
@@ -89,10 +90,12 @@ def choose_trajectory(
     span: tuple[int, int],
     leap_seconds: int | None,
 ) -> Chosen:
-    """For a session whose returns lie in a span of GPS time; ``leap_seconds``, as the log knows them, for files in UTC.
+    """Return the trajectory of a session whose returns lie in a span of GPS time.
+
+    ``leap_seconds``, as the log knows them, are for files in UTC.
 
     Raises:
-        UserError: there is none, it cannot be read, or it is of another time.
+        UserError: there is no trajectory, it cannot be read, or it is of another time.
     """
     log = session.parts[0].path
     doubts: list[str] = []
@@ -132,7 +135,9 @@ def choose_trajectory(
 def _belonging(
     wish: TrajectoryOptions, file: Path, trajectory: Trajectory, setup: Setup, clocks: LogClocks, log: Path
 ) -> list[str]:
-    """Return what is doubtful of a file's trajectory against the log; UserError where it does not belong to it."""
+    """Return doubts about a file's trajectory against the log; refuse one that does not belong to
+    it with `UserError`.
+    """
     offset = offset_of(wish.at, setup) or (0.0, 0.0, 0.0)
     given = Given(str(file), trajectory, offset, points_of(setup), setup.options.datum is not None)
     found = judge_given(given, setup, clocks, log)
@@ -154,7 +159,7 @@ def _from_file(wish: TrajectoryOptions, file: Path, span: tuple[int, int], leap_
 
 
 def _from_device(setup: Setup, clocks: LogClocks) -> tuple[Trajectory, dict[str, int]]:
-    """Return what the device's own INS said, and what became of its solutions."""
+    """Return the solution of the device's own INS, and how many solutions met which fate."""
     buffer = TrajectoryBuffer(setup.sources.protocol(setup.sources.ins_source), name=FROM_LOG)
     buffer.append(clocks.ins_rows)
     solutions = buffer.snapshot().with_velocities()
@@ -162,7 +167,7 @@ def _from_device(setup: Setup, clocks: LogClocks) -> tuple[Trajectory, dict[str,
 
 
 def _navigated(setup: Setup, session: Session, solutions: dict[str, int]) -> Navigated:
-    """Smoothed from IMU and GNSS."""
+    """Return the session navigated and smoothed from IMU and GNSS."""
     from swath.daemon.processing.navigation.inputs import InputOptions
     from swath.daemon.processing.navigation.navigate import NavigationOptions, navigate_session
 
@@ -179,11 +184,12 @@ def _navigated(setup: Setup, session: Session, solutions: dict[str, int]) -> Nav
 
 
 def offset_of(at: str, setup: Setup) -> Vector | None:
-    """Return where a trajectory's point is, from the body's origin in b; None: there. The scanner's is its
-    calibration's.
+    """Return the offset of a trajectory's point from the body's origin in b; None: no offset.
+
+    The offset of the scanner comes from its calibration.
 
     Raises:
-        UserError: it is no such point.
+        UserError: there is no such point.
     """
     if at == "body":
         return None
@@ -211,10 +217,10 @@ def _vector(values: Sequence[float]) -> Vector:
 
 
 def refuse_no_overlap(trajectory: Trajectory, file: str, span: Span, log: Path) -> None:
-    """A trajectory and a log have some time in common.
+    """Refuse a trajectory that has no time in common with the log.
 
     Raises:
-        UserError: they have none; the line says from when to when each is.
+        UserError: they do not overlap; the line gives the start and end of both.
     """
     first_ns, last_ns = trajectory.span
     if first_ns <= span[1] and last_ns >= span[0]:
@@ -226,12 +232,13 @@ def refuse_no_overlap(trajectory: Trajectory, file: str, span: Span, log: Path) 
 
 
 def refuse_other_motion(clocks: LogClocks, trajectory: Trajectory, file: str, log: Path) -> list[str]:
-    """Return the trajectory turns when the log's IMU does; one in UTC or of another week does not.
+    """Refuse a trajectory that turns at other times than the log's IMU: one in UTC or of another week does.
 
-    Gives a line of doubt where it turns a little earlier or later.
+    Returns:
+        A line of doubt if it turns a little earlier or later; else no line.
 
     Raises:
-        UserError: it turns at other times; the line says by how much.
+        UserError: it turns at other times; the line gives the time offset.
     """
     if len(clocks.imu_gps_ns) < 2 or len(trajectory) < 2:
         return []
@@ -246,7 +253,7 @@ def refuse_other_motion(clocks: LogClocks, trajectory: Trajectory, file: str, lo
 
 
 def attitude_doubts(trajectory: Trajectory, named: str) -> list[str]:
-    """Return a line where the body would fly on its back or not forward: the attitude is of other axes than b's."""
+    """Return a line if the body would fly on its back or sideways: the attitude then refers to other axes than b's."""
     step = max(1, len(trajectory) // LOOKED_AT)
     seen = replace(trajectory, **{column: getattr(trajectory, column)[::step] for column in COLUMNS})
     roll, pitch, heading = seen.attitude()

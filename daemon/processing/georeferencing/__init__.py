@@ -1,1 +1,1 @@
-"""`swath georef`."""
+"""Implements `swath georef`: from logs to point files."""

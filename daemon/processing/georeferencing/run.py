@@ -1,8 +1,8 @@
-"""`swath georef`: from logs and a trajectory to one file a strip, the trajectory and the sidecar.
+"""`swath georef`: from logs and a trajectory to one file per strip, the trajectory and the sidecar.
 
-Two passes. The first reads all but the returns: clocks, the INS, turn rates; of the returns it only notes where they
-stand. Then the time is cut into segments, and each is a job (daemon/processing/points/jobs.py). All is written out of
-sight and put in its place at the end, the sidecar last.
+Two passes. The first reads all data but the returns: clocks, the INS, turn rates; of returns it only notes where they
+are stored. Then the time is cut into segments, and each is a job (daemon/processing/points/jobs.py). All files are
+written to a temporary folder and moved to their place at the end, the sidecar last.
 """
 
 from __future__ import annotations
@@ -46,25 +46,25 @@ from swath.georef.strips import Segment, StripError, segments
 from swath.georef.timescales.gps_time import table_leap_seconds, utc_from_gps
 
 DROPPED = ".dropped.csv.gz"
-ENDINGS = (".laz", DROPPED)  # of a strip's files
+ENDINGS = (".laz", DROPPED)  # endings of a strip's files
 OFFSET_STEP = 1000.0  # files' offsets are whole kilometres
 TRAJECTORY_MARGIN_NS = 2_000_000_000
-Tell = Callable[[str, int, int], None]  # what is done, how much, of how much
+Tell = Callable[[str, int, int], None]  # arguments: the step, how much is done, of how much
 
 
 @dataclass(frozen=True)
 class Report:
-    """What was made: the sidecar's content, and where it is."""
+    """The outcome: the sidecar's content and path."""
 
     record: dict[str, Any]
     sidecar: Path
 
 
 def georeference(wish: GeorefOptions, tell: Tell) -> Report:
-    """Make the products.
+    """Make the products of a run.
 
     Raises:
-        UserError: they cannot be made, one line; nothing that looks like a product is left then.
+        UserError: they cannot be made, one line; no file that looks like a product is left then.
     """
     with as_user_error(wish.output, StripError, JobError, MappingError):
         flights = read_flights(wish, tell)
@@ -96,7 +96,7 @@ def _job(wish: GeorefOptions, flight: Flight, number: int, tile: Segment, partia
 
 
 def _numbers(flights: Sequence[Flight]) -> dict[str, int]:
-    """Of scanners, by name, the same in all files: a session may lack one that another has."""
+    """Return numbers of scanners by name, the same in all files: a session may lack one that another has."""
     return {name: number for number, name in enumerate(sorted({n for one in flights for n in one.setup.scanners}))}
 
 
@@ -130,7 +130,7 @@ def _plan(
 
 
 def _origin(flights: Sequence[Flight]) -> tuple[float, float, float]:
-    """Return offset of all files: the middle of the trajectory, rounded; heights have none."""
+    """Return the coordinate offset of all files: the rounded middle of the trajectory; heights have no offset."""
     flight = flights[0]
     assert flight.trajectory is not None
     assert flight.setup.mapping is not None
@@ -140,12 +140,17 @@ def _origin(flights: Sequence[Flight]) -> tuple[float, float, float]:
     return float(east), float(north), 0.0
 
 
-# ---------------------------------------------------------------------- second pass, and what is written
+# ---------------------------------------------------------------------- second pass and output
 
 
 @contextmanager
 def _out_of_sight(wish: GeorefOptions, names: Sequence[str]) -> Iterator[tuple[Path, Callable[[list[Path]], None]]]:
-    """A folder for what is not finished, and what puts it in its place; it goes whatever happens. Names of sessions."""
+    """Provide a temporary folder and a function that moves files to their place; the folder is always removed.
+
+    Args:
+        wish: options of the run.
+        names: names of the sessions.
+    """
     output, name = wish.output, names[0]
     _refuse_existing(wish, names)
     output.mkdir(parents=True, exist_ok=True)
@@ -171,12 +176,12 @@ def _out_of_sight(wish: GeorefOptions, names: Sequence[str]) -> Iterator[tuple[P
 
 
 def _strips(folder: Path, name: str) -> list[Path]:
-    """Return files of a session's strips that are there."""
+    """Return the existing files of a session's strips."""
     return [file for file in sorted(folder.glob(f"{glob.escape(name)}_strip*")) if file.name.endswith(ENDINGS)]
 
 
 def _refuse_existing(wish: GeorefOptions, names: Sequence[str]) -> None:
-    """UserError where products of the sessions are there, or a trajectory of theirs that is read."""
+    """Refuse with `UserError` to replace the sessions' products, or a trajectory of theirs that is read."""
     for name in names:
         files = TrajectoryFiles.in_folder(wish.output, name, csv=True)
         trajectories = [path for path in (files.csv, files.sbet, files.smrmsg) if path is not None and path.exists()]
@@ -195,7 +200,7 @@ def _refuse_existing(wish: GeorefOptions, names: Sequence[str]) -> None:
 
 
 def _refuse_parts(folder: Path, names: Sequence[str]) -> None:
-    """UserError where a part of a run would be replaced, whose sidecar would then tell of files that are gone."""
+    """Refuse with `UserError` to replace a part of a run: its sidecar would then describe missing files."""
     for path in sorted(folder.glob("*.json")):
         sessions = sessions_in(read_sidecar(path))
         others = [session for session in sessions if session not in names]
@@ -230,7 +235,7 @@ def _make(
                 progress=lambda done: tell("points", done, total),
             )
             logs = [{"name": path.name, "sha256": found.result()} for path, found in zip(paths, hashes, strict=True)]
-        except BaseException:  # an interrupt too: nobody waits for the hashes of large logs then
+        except BaseException:  # an interrupt too: it must not wait for the hashes of large logs
             given_up.set()
             raise
     _note_troubles(flights, results)
@@ -247,14 +252,14 @@ def _make(
 
 
 def _files(job: Job, result: JobResult) -> tuple[Path | None, Path | None]:
-    """Return what a job made: points, and the list of what has no place."""
+    """Return the files that a job made: points, and the list of returns without a place."""
     if result.failed:
         return None, None
     return job.path if result.points or result.withheld else None, job.dropped if result.listed else None
 
 
 def _note_troubles(flights: Sequence[Flight], results: Sequence[JobResult]) -> None:
-    """Why returns have no time; UserError where no return at all could be placed."""
+    """Note why returns have no time; raise `UserError` if not one return could be placed."""
     note_times(flights, results)
     if not any(result.points or result.failed for result in results):
         lines = [line for flight in flights for line in (*flight.troubles, *flight.holes)]
@@ -264,10 +269,10 @@ def _note_troubles(flights: Sequence[Flight], results: Sequence[JobResult]) -> N
 
 
 def _write_trajectory(flight: Flight, folder: Path) -> list[Path]:
-    """As much of it as the returns needed: CSV, and SBET with smrmsg."""
+    """Write the part of the trajectory that the returns needed: CSV, and SBET with smrmsg."""
     assert flight.trajectory is not None
     used = flight.trajectory.between(*flight.span)
-    if flight.setup.deflection_rad is not None:  # to what its own attitude referred to: it may be used again
+    if flight.setup.deflection_rad is not None:  # back to the vertical of its source: it may be read again
         xi, eta = flight.setup.deflection_rad
         used = used.with_deflection(-xi, -eta)
     written = write_trajectory(TrajectoryFiles.in_folder(folder, flight.session.session_id, csv=True), used, None)
@@ -276,12 +281,12 @@ def _write_trajectory(flight: Flight, folder: Path) -> list[Path]:
 
 
 def refuse_nothing(log: Path, troubles: Sequence[str], became: str) -> NoReturn:
-    """Return where no return at all could be placed, there is no product.
+    """Raise the error of a run in which not one return could be placed.
 
     Args:
-        log: the first one.
-        troubles: lines that say why; empty: unknown.
-        became: what became of the returns.
+        log: the first log.
+        troubles: lines that give the reasons; empty: unknown.
+        became: fates of the returns, for people.
 
     Raises:
         UserError: always.

@@ -1,4 +1,4 @@
-"""The JSON beside the products: what they were made of, with what, and what became of every return."""
+"""Writes the JSON beside the products: their inputs, their settings, and the fate of every return."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ if TYPE_CHECKING:
 
 FORMAT = "swath.georef"
 FORMAT_VERSION = 1
-CARRIED = ("verdict", "verdict_reasons", "held", "trajectory", "installation")  # of a calibration's header
+CARRIED = ("verdict", "verdict_reasons", "held", "trajectory", "installation")  # entries of a calibration's header
 IN_FILES = Fate.GEOREFERENCED.name.lower()
 UNCOVERED = {"outside_trajectory": "are outside the trajectory", "trajectory_gap": "are in gaps of the trajectory"}
 
 
 def calibration_entry(calibration: Calibration) -> dict[str, Any]:
-    """Return a calibration with all its parameters, in the units of its file."""
+    """Return the entry of a calibration with all its parameters, in the units of its file."""
     parameters = {parameter.key: calibration.value(parameter.name) / parameter.factor for parameter in PARAMETERS}
     said = {key: calibration.header[key] for key in CARRIED if key in calibration.header}
     return {"id": calibration.id, "method": calibration.method, **said, "parameters": parameters}
 
 
 def settings_entry(setup: Setup) -> dict[str, Any]:
-    """Return what the configuration says that the points depend on."""
+    """Return the settings of the configuration that the points depend on."""
     config = setup.config
     return {
         "atmosphere": config.atmosphere.model_dump(mode="json"),
@@ -52,7 +52,7 @@ def settings_entry(setup: Setup) -> dict[str, Any]:
 
 
 def count_fates(results: Sequence[JobResult]) -> dict[str, dict[str, Any]]:
-    """By scanner: returns read, in files, and out of them by reason."""
+    """Return counts by scanner: returns read, returns written, and returns dropped by reason."""
     total: dict[str, Counter[str]] = {}
     for result in results:
         for scanner, fates in result.fates.items():
@@ -65,7 +65,7 @@ def count_fates(results: Sequence[JobResult]) -> dict[str, dict[str, Any]]:
 
 
 def count_unread(results: Sequence[JobResult]) -> dict[str, Counter[str]]:
-    """By scanner: messages that gave nothing, by reason."""
+    """Return counts by scanner of messages that gave no returns, by reason."""
     total: dict[str, Counter[str]] = {}
     for result in results:
         for scanner, counts in result.unread.items():
@@ -74,7 +74,7 @@ def count_unread(results: Sequence[JobResult]) -> dict[str, Counter[str]]:
 
 
 def reasons_text(fates: Iterable[Counter[str]]) -> str:
-    """Return what became of returns, for people."""
+    """Return the fates of returns as text for people."""
     total: Counter[str] = Counter()
     for counts in fates:
         total.update(counts)
@@ -83,13 +83,13 @@ def reasons_text(fates: Iterable[Counter[str]]) -> str:
 
 
 def counts_entry(fates: Counter[str]) -> dict[str, Any]:
-    """Read = written + dropped, and why."""
+    """Return counts of returns: read = written + dropped, the latter by reason."""
     dropped = {name: count for name, count in sorted(fates.items()) if name != IN_FILES and count}
     return {"read": fates.total(), "written": fates[IN_FILES], "dropped": dropped}
 
 
 def strip_entry(result: JobResult, file: Path | None, dropped: Path | None) -> dict[str, Any]:
-    """Return a strip: its files, its times, what is in it."""
+    """Return the entry of a strip: its files, times, bounds and counts."""
     entry: dict[str, Any] = {
         "number": result.strip,
         "file": None if file is None else file.name,
@@ -114,12 +114,12 @@ def strip_entry(result: JobResult, file: Path | None, dropped: Path | None) -> d
 def run_record(
     flights: Sequence[Flight], results: Sequence[JobResult], files: Mapping[int, tuple[Path | None, Path | None]]
 ) -> dict[str, Any]:
-    """Return what the sidecar says of the run, but for the user's wishes.
+    """Return the sidecar's record of a run, without the user's options.
 
     Args:
-        flights: of the run.
-        results: of all segments.
-        files: by strip, of its points and of what has no place.
+        flights: flights of the run.
+        results: results of all segments.
+        files: by strip, the file of its points and that of returns without a place.
     """
     warnings = [line for flight in flights for line in _warnings(flight, _of(results, flight, flights))]
     holes = [line for flight in flights for line in _holes(flight, _of(results, flight, flights))]
@@ -173,7 +173,7 @@ def _flight_entry(flight: Flight, results: Sequence[JobResult]) -> dict[str, Any
 
 
 def _edges(flight: Flight, results: Sequence[JobResult]) -> dict[str, Any]:
-    """By scanner: what the atmosphere's models amount to at the swath's edge, whether they were applied or not."""
+    """Return by scanner the size of the atmosphere's effects at the swath's edge, whether they were applied or not."""
     config, entries = flight.setup.config, {}
     for name, (angle_rad, above_m, ground_m) in _widest(results).items():
         effect = air_of(config, config.scanner[name]).at_edge(above_m, angle_rad, ground_m)
@@ -220,7 +220,7 @@ def _warnings(flight: Flight, results: Sequence[JobResult]) -> list[str]:
 
 
 def unit_doubts(flight: Flight) -> list[str]:
-    """Return where coordinates are feet and heights, of which the CRS says nothing, are metres."""
+    """Return a line if coordinates are in feet but heights in metres because the CRS has no vertical part."""
     assert flight.setup.mapping is not None
     frame = flight.setup.mapping.description()
     unit, _, unit_of_height = frame["units"]["names"]
@@ -264,5 +264,9 @@ def _holes(flight: Flight, results: Sequence[JobResult]) -> list[str]:
 
 
 def write_sidecar(path: Path, content: dict[str, Any]) -> None:
-    """Write it whole or not at all; raises OSError."""
+    """Write the sidecar completely or not at all.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
     write_whole({path: (json.dumps(content, indent=2, ensure_ascii=False) + "\n").encode()})

@@ -1,1 +1,1 @@
-"""`swath live`."""
+"""Implements `swath live`: points and status while the recorder runs."""

@@ -1,7 +1,7 @@
-"""Follows a growing log for work that may fall behind: what is too old is passed over, and nothing cold is ever read.
+"""Follows a growing log for work that may fall behind: data that is too old is skipped, and no data is read from disk.
 
-Whole chunks are passed over, and of them those of scanners only: clocks and trajectory go on, so that the points after
-a gap are as right as those before it. To the reader of the messages it is a log with a hole in it.
+Whole chunks are skipped, and only those of scanners: clocks and trajectory go on, so that the points after a gap are as
+right as those before it. To the reader of the messages it is a log with a hole in it.
 """
 
 from __future__ import annotations
@@ -23,21 +23,21 @@ from swath.daemon.log.mcap.chunks import LogBatch
 from swath.daemon.log.mcap.scan import OP_CHUNK, OP_DATA_END, OP_MESSAGE_INDEX, next_chunk
 from swath.daemon.log.parts import Sign, read_sign
 
-BEHIND_NS = 5_000_000_000  # more than this behind the end of the log, and scanners' chunks are passed over
-WARM_NS = 120_000_000_000  # of what lies before a late start: enough for clocks to lock and a trajectory to begin
-LOOK_S = 0.1  # between two looks at the end of the file while there is something to read
-GONE_S = 2.0  # nothing new for so long: is the recorder still there?
+BEHIND_NS = 5_000_000_000  # if farther behind the end of the log, scanners' chunks are skipped
+WARM_NS = 120_000_000_000  # log time before a late start that is read: clocks lock and a trajectory begins in it
+LOOK_S = 0.1  # between two checks of the end of the file while chunks wait
+GONE_S = 2.0  # without new data for so long, check whether the recorder still runs
 _CACHE_STEP = 8 << 20
 _CACHE_LIMIT = 4 << 30
 _HEAD = struct.Struct("<BQ")
 _PEEK_BYTES = _HEAD.size + 16
-_NUMBER = re.compile(r"0|[1-9][0-9]{0,5}")  # of a part
+_NUMBER = re.compile(r"0|[1-9][0-9]{0,5}")  # number of a part
 _PAGE = os.sysconf("SC_PAGESIZE")
 
 
 @dataclass(frozen=True, slots=True)
 class ChunkPlace:
-    """A whole chunk in a part: where it stands, and the log times of its first and last message."""
+    """A complete chunk in a part: its place, and the log times of its first and last message."""
 
     at: int
     length: int
@@ -47,7 +47,7 @@ class ChunkPlace:
 
 @dataclass(frozen=True, slots=True)
 class Skipped:
-    """Scanners' chunks from one log time to another were passed over."""
+    """Marks scanners' chunks between two log times that were skipped."""
 
     first_ns: int
     last_ns: int
@@ -57,18 +57,18 @@ class LivePart(PartFollower):
     """A part whose chunks are listed before they are read."""
 
     def __init__(self, path: Path) -> None:
-        """As `PartFollower`."""
+        """Open a part as `PartFollower` does."""
         super().__init__(path)
         self.first_chunk_at = self._at
         self.places: deque[ChunkPlace] = deque()
 
     @property
     def is_read(self) -> bool:
-        """All that will ever stand in it has been read."""
+        """True if the part has ended and all its chunks have been read."""
         return self.ended and not self.places
 
     def look_ahead(self) -> None:
-        """List the chunks that have become whole."""
+        """List the chunks that have become complete."""
         while not self.ended and (head := self._whole_record()) is not None:
             opcode, length = head
             if opcode == OP_CHUNK:
@@ -79,15 +79,13 @@ class LivePart(PartFollower):
             self._at += _HEAD.size + length
 
     def read(self, place: ChunkPlace, *, scanners: bool = True) -> Iterator[LogBatch]:
-        """Yield the messages of a chunk, on wish without those of scanners."""
+        """Yield the messages of a chunk, without those of scanners if ``scanners`` is False."""
         for batch in self._chunk(place.at, place.length):
             if scanners or batch.channel.chunk_class != "scanner":
                 yield batch
 
     def is_scanners(self, place: ChunkPlace) -> bool:
-        """Return whether a chunk is known to hold scanners' messages, by the index behind it; what is unknown is
-        not.
-        """
+        """Return True if the index behind a chunk shows that it holds scanners' messages; False if unknown."""
         peek = self._pread(place.at + _HEAD.size + place.length, _HEAD.size + 2)
         if len(peek) < _HEAD.size + 2 or peek[0] != OP_MESSAGE_INDEX:
             return False
@@ -95,11 +93,11 @@ class LivePart(PartFollower):
         return channel is not None and channel.chunk_class == "scanner"
 
     def is_cached(self, place: ChunkPlace) -> bool:
-        """Return whether a chunk can be read without the disk."""
+        """Return True if a chunk can be read from memory, without the disk."""
         return is_cached(self._file.fileno(), place.at, _HEAD.size + place.length)
 
     def go_to_cached(self) -> None:
-        """Go forward to where everything up to the end of the file can be read without the disk."""
+        """Go forward to where the file is in memory up to its end."""
         size = self._size()
         begin = cached_from(self._file.fileno(), size) if size > _CACHE_STEP else 0
         if begin > self._at:
@@ -111,15 +109,15 @@ class LiveFollower:
     """Follows the recording of a directory from part to part, until it ends.
 
     Attributes:
-        part: the file that is read; None: nothing is recorded yet.
-        skipped_ns: log time whose scanners' chunks were passed over; of a late start nothing is counted.
-        ended: why there will be no more; empty: there may.
-        newest_ns: log time of the newest message that is known to be in the log.
-        read_ns: up to where it has been read.
+        part: the file that is read; None: there is no recording yet.
+        skipped_ns: log time whose scanners' chunks were skipped; without those skipped at a late start.
+        ended: why there will be no more data; empty: there may be more.
+        newest_ns: log time of the newest message known in the log.
+        read_ns: log time up to which it has been read.
     """
 
     def __init__(self, directory: Path, *, from_start: bool = False) -> None:
-        """``from_start``: from the recording's beginning, however long ago, and without passing over anything old."""
+        """Follow a directory; ``from_start``: read from the recording's beginning and skip no old data."""
         self.part: LivePart | None = None
         self.skipped_ns = 0
         self.ended = ""
@@ -131,14 +129,14 @@ class LiveFollower:
         self._advanced_s = self._asked_s = time.monotonic()
 
     def close(self) -> None:
-        """Close the file."""
+        """Close the current file."""
         if self.part is not None:
             self.part.close()
 
     # ------------------------------------------------------------------ from chunk to chunk
 
     def poll(self) -> Iterator[LogBatch | Skipped]:
-        """Yield all that has become readable since the last call, in the file's order."""
+        """Yield all messages that have become readable since the last call, in the file's order."""
         sign = read_sign(self._directory)
         if self.part is None:
             if sign is None:
@@ -146,7 +144,7 @@ class LiveFollower:
             yield from self._begin(sign)
         while (part := self.part) is not None and not self.ended:
             yield from self._read_part(part, growing=sign is not None and sign.path == part.path)
-            sign = read_sign(self._directory)  # after the part's end was looked for: then it names the next one
+            sign = read_sign(self._directory)  # read after the search for the part's end: then it names the next part
             if not self._go_on(part, sign):
                 return
 
@@ -173,7 +171,7 @@ class LiveFollower:
             self._advanced_s = time.monotonic()
 
     def _pass_over(self, part: LivePart, *, counted: bool = True) -> Iterator[LogBatch | Skipped]:
-        """Go to the end; what is not scanners' and lies in memory is read on the way."""
+        """Go to the end; on the way read chunks in memory that are not scanners'."""
         first_ns = last_ns = 0
         for place in part.places:
             if part.is_scanners(place) or not part.is_cached(place):
@@ -189,7 +187,7 @@ class LiveFollower:
     # ------------------------------------------------------------------ from part to part
 
     def _begin(self, sign: Sign) -> Iterator[LogBatch | Skipped]:
-        """Yield the first part of all: with what lies before it, or with as much of that as clocks need."""
+        """Open the first file; yield the data before the present that clocks need, unless reading from the start."""
         path = sign.path
         if self._from_start:
             path = next(iter(_parts_before(self._directory, sign)), path)
@@ -212,13 +210,13 @@ class LiveFollower:
             yield from self._warm(part, limit_ns)
 
     def _warm(self, part: LivePart, limit_ns: int) -> Iterator[LogBatch | Skipped]:
-        """Of what came before a late start: since a time, what is in memory, without scanners."""
+        """Yield the cached messages since a time before a late start, without scanners."""
         while part.places and part.places[0].last_ns < limit_ns:
             part.places.popleft()
         yield from self._pass_over(part, counted=False)
 
     def _open(self, path: Path) -> LivePart | None:
-        """Go over to another file; None where it cannot be read (yet)."""
+        """Switch to another file and return it; None if it cannot be read (yet)."""
         part = _opened(path)
         if part is not None:
             if self.part is not None:
@@ -228,27 +226,27 @@ class LiveFollower:
         return part
 
     def _go_on(self, part: LivePart, sign: Sign | None) -> bool:
-        """Once a part is read to its end: open the session's next one, or say that there is none."""
+        """Open the session's next part once this one is read to its end, or note the end of the recording."""
         if not part.is_read and not self._is_abandoned(part):
             return False
         session_id = part.info.session_id
         following = self._directory / f"{session_id}_{part.number + 1}.mcap"
         if not os.path.exists(following) and sign is not None and sign.session_id == session_id:
-            following = sign.path  # a name that was taken is passed over
+            following = sign.path  # the recorder skips a file name that is taken
         if os.path.exists(following) and following != part.path:
             return self._open(following) is not None
         self.ended = "the recording has ended" if part.is_read else "the recorder is gone, and its log has no end"
         return False
 
     def _is_abandoned(self, part: LivePart) -> bool:
-        """Return whether nobody writes a part any more that has no end; asked seldom, and only when nothing comes."""
+        """Return True if a part without an end is no longer written; asked rarely, and only without new data."""
         now_s = time.monotonic()
         if now_s - max(self._advanced_s, self._asked_s) < GONE_S:
             return False
         self._asked_s = now_s
         if is_being_written(part.path):
             return False
-        part.look_ahead()  # what was written before the writer let go
+        part.look_ahead()  # data that was written before the writer let go
         return not part.places and not part.ended
 
 
@@ -256,11 +254,11 @@ def _opened(path: Path) -> LivePart | None:
     try:
         return LivePart(path)
     except (LogError, OSError):
-        return None  # not yet begun, or gone again: the next look tells
+        return None  # not begun yet, or deleted again: the next call will tell
 
 
 def _parts_before(directory: Path, sign: Sign) -> Iterator[Path]:
-    """Yield parts of the session that is recorded, the first one first."""
+    """Yield the earlier parts of the session that is recorded, the first one first."""
     names = (path.stem.rpartition("_")[2] for path in directory.glob(f"{sign.session_id}_*.mcap"))
     for number in sorted(int(name) for name in names if _NUMBER.fullmatch(name)):
         if number < sign.part:
@@ -278,9 +276,9 @@ _PROT_READ, _MAP_SHARED, _MAP_FAILED = 1, 1, ctypes.c_void_p(-1).value
 
 
 def is_cached(fd: int, at: int, length: int) -> bool:
-    """Return whether all of a stretch of a file is in memory (mincore(2)); where that cannot be known, it is not.
+    """Return True if a whole stretch of a file is in memory (mincore(2)); False if that cannot be determined.
 
-    The kernel tells it the file's owner and who may write it; for others everything looks cached.
+    The kernel answers only the file's owner and users who may write it; for others all pages look cached.
     """
     first = at // _PAGE * _PAGE
     span = at + length - first
@@ -297,7 +295,7 @@ def is_cached(fd: int, at: int, length: int) -> bool:
 
 
 def cached_from(fd: int, size: int) -> int:
-    """From where on a file is in memory up to its end, in steps of 8 MiB; its size where not even the end is."""
+    """Return from which byte on a file is in memory up to its end, in steps of 8 MiB; its size if no step is."""
     begin = size
     while begin > 0 and size - begin < _CACHE_LIMIT:
         before = max(0, begin - _CACHE_STEP)

@@ -1,4 +1,6 @@
-"""The frame ``local`` that people look at: east, north, up in metres, near the flight: for single precision."""
+"""Defines the frame ``local`` for viewers: east, north, up in metres, near the flight, so that single precision
+suffices.
+"""
 
 from __future__ import annotations
 
@@ -16,26 +18,26 @@ from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
 from swath.georef.geodesy.vectors import rot_of
 from swath.georef.points import Points
 
-ORIGIN_STEP = 100.0  # the origin's coordinates are whole hundreds, so that people can add them in their heads
-STEP_M = 10.0  # along the body's axes, to see where they point on the map
-POLAR_STEPS = 10  # as many as a map's scale of up to ten wants
+ORIGIN_STEP = 100.0  # the origin's coordinates are whole hundreds, which are easy to add in one's head
+STEP_M = 10.0  # steps along the body's axes, to find their direction on the map
+POLAR_STEPS = 10  # iterations that suffice for a map's scale of up to ten
 _ENU_OF_L = [1, 0, 2]
 _ENU_SIGNS = np.array([1.0, 1.0, -1.0])
 
 
 class Maps(Protocol):
-    """`swath.georef.mapping.frame.Mapping`, as far as it is wanted here."""
+    """The part of `swath.georef.mapping.frame.Mapping` that is used here."""
 
     @property
     def unit_m(self) -> FloatArray:
-        """(3,) metres in a unit of easting, northing, height."""
+        """Metres per unit (3,) of easting, northing, height."""
 
     @property
     def wkt(self) -> str:
-        """The CRS."""
+        """The CRS as WKT."""
 
     def map_from_e(self, points_e: FloatArray) -> FloatArray:
-        """Return (n, 3) east, north, height."""
+        """Return map coordinates (n, 3): east, north, height."""
 
 
 class LocalFrame:
@@ -44,13 +46,13 @@ class LocalFrame:
     The axes are the mapping frame's; where there is none, or an earth-centred one, they are level at the origin.
 
     Attributes:
-        origin: (3,) in the coordinates of the points: map, or e.
-        unit_m: (3,) metres in a unit of those.
-        is_level: the axes are not those of the points.
+        origin: (3,) in the coordinates of the points: map or e.
+        unit_m: (3,) metres per unit of those.
+        is_level: True if the axes are level at the origin, not those of the points' coordinates.
     """
 
     def __init__(self, position_e: FloatArray, mapping: Maps | None) -> None:
-        """``position_e``: (3,) the first position."""
+        """Place the frame at ``position_e`` (3,), the first position."""
         self._mapping = mapping
         self.is_level = mapping is None or bool(CRS.from_wkt(mapping.wkt).is_geocentric)
         self.unit_m: FloatArray = np.ones(3) if mapping is None else mapping.unit_m
@@ -66,12 +68,12 @@ class LocalFrame:
         return points_e if self._mapping is None else self._mapping.map_from_e(points_e)
 
     def of_points(self, points: FloatArray) -> FloatArray:
-        """Return (n, 3) of points as the georeferencer gives them."""
+        """Return local coordinates (n, 3) of points as the georeferencer gives them."""
         away: FloatArray = points - self.origin
         return away @ self._rot_points_from_enu if self.is_level else away * self.unit_m
 
     def cloud_of(self, points: Points, keep: NDArray[np.int64]) -> NDArray[Any]:
-        """Return those of the points, by number, of `CLOUD_DTYPE`."""
+        """Return the points with the indexes ``keep`` as `CLOUD_DTYPE`."""
         cloud = np.empty((len(keep), 4), np.float32)
         if self.is_level:
             cloud[:, :3] = self.of_points(points.points_map.take(keep, axis=0))
@@ -83,7 +85,7 @@ class LocalFrame:
     def pose_of(self, position_e: FloatArray, q_e_from_b: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return position (3,) and quaternion (4,), scalar first and ≥ 0, of the body.
 
-        The axes are those of the frame where the body is: three steps along b, mapped, made perpendicular.
+        The axes are those of the frame at the body's place: three steps along b, mapped and made perpendicular.
         """
         places, q_local_from_b = np.empty((4, 3)), np.empty(4)
         _step_along(position_e, q_e_from_b, places)
@@ -94,7 +96,7 @@ class LocalFrame:
 
 @jit_cached
 def _step_along(position_e: Any, q_e_from_b: Any, places: Any) -> None:
-    """(4, 3): a position, and a step from there along each axis of b."""
+    """Fill ``places`` (4, 3) with a position and a step from there along each axis of b."""
     rot = rot_of(q_e_from_b[0], q_e_from_b[1], q_e_from_b[2], q_e_from_b[3])
     for axis in range(3):
         places[:, axis] = position_e[axis]
@@ -104,11 +106,11 @@ def _step_along(position_e: Any, q_e_from_b: Any, places: Any) -> None:
 
 @jit_cached
 def _attitude_of(places: Any, q: Any) -> None:
-    """Quaternion (4,), scalar first, of the steps (4, 3) made perpendicular: the rotation that is nearest to them.
+    """Fill ``q`` (4,), scalar first, with the rotation nearest to the steps (4, 3), made perpendicular.
 
     Polar decomposition by Newton's iteration (Higham 1986, SIAM J. Sci. Stat. Comput. 7), then Shepperd 1978.
     """
-    m = np.empty((3, 3))  # a column each, but for the scale
+    m = np.empty((3, 3))  # one column each, up to scale
     for axis in range(3):
         m[:, axis] = (places[1 + axis] - places[0]) / STEP_M
     for _ in range(POLAR_STEPS):
@@ -132,7 +134,7 @@ def _attitude_of(places: Any, q: Any) -> None:
 
 @jit_cached
 def _fill_cloud(points: Any, intensity: Any, keep: Any, origin: Any, unit_m: Any, cloud: Any) -> None:
-    """Rows of x, y, z, intensity; the frame's axes are those of the points."""
+    """Fill ``cloud`` with rows of x, y, z, intensity; the frame's axes are those of the points."""
     for k in range(len(keep)):
         i = keep[k]
         for axis in range(3):

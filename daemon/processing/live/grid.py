@@ -1,4 +1,4 @@
-"""How many points lie where: counts in square cells, tile by tile, in memory that does not grow beyond a bound."""
+"""Counts points in square cells, tile by tile, in bounded memory."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from swath.georef.compiled import jit_cached
 
 TILE = 256  # cells along a side
 _TILE_BITS = 8
-TILES = 256  # held at most: 64 MiB
-_SLOTS = 1024  # of the table in which tiles are looked up
-_FREQUENCIES = 1 << 16  # points in a cell that quantiles tell apart
-_FAR = 1 << 20  # tiles from the origin: farther is no place on earth
+TILES = 256  # maximum number of tiles held: 64 MiB
+_SLOTS = 1024  # size of the hash table of tiles
+_FREQUENCIES = 1 << 16  # maximum points in a cell that quantiles resolve
+_FAR = 1 << 20  # tiles from the origin; no place on earth is farther
 _EMPTY = -(1 << 62)
 
 
 class CountGrid:
-    """Points by cell. Where more tiles are wanted than may be held, cells become twice as wide, exactly.
+    """Counts of points by cell. If more tiles are needed than may be held, cells become twice as wide, without loss.
 
     Attributes:
-        cell_m: present width of a cell.
-        points: counted; ``refused``: not finite, or farther from the origin than the earth is wide.
+        cell_m: current width of a cell.
+        points: points counted; ``refused``: points not finite, or farther from the origin than the earth is wide.
     """
 
     def __init__(self, cell_m: float, tiles: int = TILES) -> None:
@@ -34,16 +34,16 @@ class CountGrid:
         self._counts = np.zeros((tiles, TILE, TILE), dtype=np.uint32)
         self._keys = np.full(_SLOTS, _EMPTY, dtype=np.int64)
         self._slots = np.zeros(_SLOTS, dtype=np.int64)
-        self._places = np.zeros((tiles, 2), dtype=np.int64)  # column and row of each tile that is held
+        self._places = np.zeros((tiles, 2), dtype=np.int64)  # column and row of each tile held
         self._state = np.zeros(2, dtype=np.int64)  # tiles held, points refused
 
     def add(self, points: NDArray[np.float64], east: float = 0.0, north: float = 0.0, unit_m: float = 1.0) -> None:
-        """Count points (n, 3): east, north, up, the last of which is not looked at. Blocks may be cut anywhere.
+        """Count points (n, 3): east, north, up, of which up is ignored. Blocks may be cut anywhere.
 
         Args:
-            points: from anywhere.
-            east, north: of the grid's origin in their coordinates.
-            unit_m: metres in a unit of those.
+            points: coordinates of the points.
+            east, north: the grid's origin in their coordinates.
+            unit_m: metres per unit of the coordinates.
         """
         done = 0
         while done < len(points):
@@ -65,7 +65,7 @@ class CountGrid:
         self.points += len(points)
 
     def _coarsen(self) -> None:
-        """Cells of twice the width: the sums of four."""
+        """Double the width of the cells: each new count is the sum of four."""
         held = int(self._state[0])
         counts, places = self._counts[:held].copy(), self._places[:held].copy()
         self.cell_m *= 2.0
@@ -80,8 +80,8 @@ class CountGrid:
             self._counts[slot, top : top + half, left : left + half] += sums
 
     def extent(self) -> tuple[int, int, int, int] | None:
-        """Return west, south, east, north of what is held, in tiles (east and north beyond the last); None: nothing
-        is.
+        """Return west, south, east, north of the tiles held (east and north beyond the last); None
+        if there are none.
         """
         held = int(self._state[0])
         if not held:
@@ -103,7 +103,7 @@ class CountGrid:
         block = 1
         while max(east - west, north - south) * TILE > limit * block:
             block *= 2
-        tiles, side = max(1, block // TILE), max(1, TILE // block)  # a far point: tiles a cell; else cells a tile
+        tiles, side = max(1, block // TILE), max(1, TILE // block)  # a far point: tiles per cell; else cells per tile
         within = TILE // side
         rows, columns = -((south - north) // tiles) * side, -((west - east) // tiles) * side
         image = np.zeros((rows, columns), dtype=np.uint64)
@@ -115,9 +115,7 @@ class CountGrid:
         return image, west * TILE * self.cell_m, north * TILE * self.cell_m, width_m
 
     def numbers(self) -> dict[str, Any]:
-        """Return area that points fell into, their density there, and its quantiles over the cells, for people and
-        scripts.
-        """
+        """Return the covered area, the density there, and its quantiles over the cells, for people and scripts."""
         frequency = np.zeros(_FREQUENCIES, dtype=np.int64)
         _count_cells(self._counts, int(self._state[0]), frequency)
         cells, cell_m2 = int(frequency[1:].sum()), self.cell_m**2
@@ -139,7 +137,7 @@ class CountGrid:
 
 
 def _find_tile(column: int, row: int, keys: Any, slots: Any, places: Any, state: Any) -> int:
-    """Return the tile's number, a new one where it is not held; -1: there is no room."""
+    """Return the tile's slot, a new one if it is not held; -1 if all slots are taken."""
     key = column * (4 * _FAR) + row
     at = (column * 73_856_093 ^ row * 19_349_663) & (_SLOTS - 1)
     while keys[at] != _EMPTY and keys[at] != key:
@@ -169,7 +167,7 @@ def _count_points(
     places: Any,
     state: Any,
 ) -> int:
-    """Count points from ``first`` on; how far it came: less than all where a tile found no room."""
+    """Count points from ``first`` on; return how far it came: less than all if there was no slot for a tile."""
     column_before, row_before, tile = _FAR + 1, 0, -1
     for i in range(first, len(points)):
         x, y = (points[i, 0] - east) * per_unit, (points[i, 1] - north) * per_unit
@@ -192,7 +190,7 @@ count_points = jit_cached(_count_points)
 
 @jit_cached
 def _count_cells(counts: Any, held: int, frequency: Any) -> None:
-    """How many cells have so many points; the last number stands for all above."""
+    """Count into ``frequency`` how many cells hold each number of points; its last entry counts all larger numbers."""
     most = len(frequency) - 1
     for tile in range(held):
         for row in range(TILE):

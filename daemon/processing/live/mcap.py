@@ -1,7 +1,8 @@
-"""``live.mcap``: points, position and pose in Foxglove's own schemas, so that its viewer opens the file as it is.
+"""Writes ``live.mcap``: points, position and pose in Foxglove's own schemas, so that its viewer opens the file
+directly.
 
-The fixed frame is ``local``: east, north, up, in metres from an origin near the first position, which the file's
-metadata record ``swath.live`` and ``live.json`` say in the output's coordinates. ``body`` moves in it.
+The fixed frame is ``local``: east, north, up, in metres from an origin near the first position; the file's metadata
+record ``swath.live`` and ``live.json`` give the origin in the output's coordinates. ``body`` moves in it.
 """
 
 from __future__ import annotations
@@ -23,20 +24,20 @@ FRAME, BODY = "local", "body"
 NAME, PREVIOUS = "live.mcap", "live.previous.mcap"
 CLOUD_DTYPE = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4")])
 CHUNK_BYTES = 256 << 10
-END_BYTES = 64 << 10  # of the file's index and schemas, and for each chunk some more
+END_BYTES = 64 << 10  # of the file's index and schemas, plus some for each chunk
 END_BYTES_PER_CHUNK = 512
 
 
 @dataclass(frozen=True, slots=True)
 class LivePose:
-    """Where the body is.
+    """Position and attitude of the body.
 
     Attributes:
         time_ns: UTC as POSIX nanoseconds.
         lat_deg, lon_deg, height_m: ellipsoidal.
         position: (3,) in the frame ``local``.
         q_local_from_b: (4,) scalar first.
-        sigma_l: (3,) m, north, east, down; nan: unsaid.
+        sigma_l: (3,) m, north, east, down; nan: unknown.
     """
 
     time_ns: int
@@ -49,14 +50,18 @@ class LivePose:
 
 
 class LiveMcap:
-    """Writes ``live.mcap`` in a folder; the file of the run before stays as ``live.previous.mcap`` while there is room.
+    """Writes ``live.mcap`` in a folder; the previous run's file stays as ``live.previous.mcap`` while the quota allows.
 
     Attributes:
-        is_full: the quota is used up; nothing more is written.
+        is_full: True if the quota is used up; further messages are not written.
     """
 
     def __init__(self, folder: Path, quota_bytes: int, metadata: dict[str, str]) -> None:
-        """Raises OSError: the file cannot be made."""
+        """Create the file and rename that of the previous run.
+
+        Raises:
+            OSError: the file cannot be created.
+        """
         self.is_full = False
         self._quota_bytes = quota_bytes
         self._previous = folder / PREVIOUS
@@ -80,7 +85,7 @@ class LiveMcap:
 
     @property
     def size(self) -> int:
-        """Bytes that the file will have when it is closed now, at most."""
+        """Maximum size in bytes of the file if it is closed now."""
         written = self._file.tell()
         if written != self._last_size:  # a chunk was closed: at most the last message is in the next one
             self._chunks += 1
@@ -88,7 +93,7 @@ class LiveMcap:
         return written + self._since_flush + END_BYTES + END_BYTES_PER_CHUNK * self._chunks
 
     def add_cloud(self, topic: str, points: NDArray[Any], time_ns: int, log_time_ns: int) -> bool:
-        """Return points (n,) of `CLOUD_DTYPE` in the frame ``local``; whether they were written."""
+        """Add points (n,) of `CLOUD_DTYPE` in the frame ``local``; return True if they were written."""
         cloud = fox.PointCloud(
             timestamp=_stamp(time_ns),
             frame_id=FRAME,
@@ -100,7 +105,7 @@ class LiveMcap:
         return self._add(topic, cloud, log_time_ns)
 
     def add_pose(self, pose: LivePose, log_time_ns: int) -> bool:
-        """Return position, pose and the transform to the body; whether they were written."""
+        """Add position, pose and the transform to the body; return True if they were written."""
         stamp = _stamp(pose.time_ns)
         w, *xyz = pose.q_local_from_b.tolist()
         turned = fox.Quaternion(x=xyz[0], y=xyz[1], z=xyz[2], w=w)
@@ -141,7 +146,7 @@ class LiveMcap:
         return True
 
     def _is_beyond(self, length: int) -> bool:
-        """Return whether so much more is more than the quota; the run before gives way first."""
+        """Return True if a message would exceed the quota; the previous run's file is deleted first."""
         if self.is_full:
             return True
         size = self.size + length + 64
@@ -152,7 +157,11 @@ class LiveMcap:
         return self.is_full
 
     def close(self) -> None:
-        """Index and footer; raises OSError where the disk refuses them."""
+        """Write index and footer, and close the file.
+
+        Raises:
+            OSError: the files cannot be written to disk.
+        """
         try:
             self._writer.finish()
         finally:

@@ -1,4 +1,4 @@
-"""All points of a recording as one array, to compare one way of making them with another."""
+"""Writes all points of a recording as one array, to compare two ways of making them."""
 
 from __future__ import annotations
 
@@ -28,17 +28,26 @@ POINT_DTYPE = np.dtype(
 
 
 class PointsFile:
-    """All points of all scanners as one ``.npy`` array of `POINT_DTYPE`, in the order in which they came.
+    """One ``.npy`` array of `POINT_DTYPE` with all points of all scanners, in the order of their arrival.
 
-    ``scanner`` counts the names in alphabetical order. The length in the file's head is written at the end.
+    ``scanner`` counts the names in alphabetical order. The length in the file's header is written at the end.
 
     Attributes:
-        count: points in the file; ``left_out``: that came after its end.
-        trouble: why it ended before the points did, for people; empty: it did not.
+        count: points in the file; ``left_out``: points that came after its end.
+        trouble: why the file ends before the points do, for people; empty: it does not.
     """
 
     def __init__(self, path: Path, scanners: list[str], room: Room | None = None) -> None:
-        """``room``: the file ends where it is used up, or cannot be written to; None: OSError does. Raises OSError."""
+        """Create the file.
+
+        Args:
+            path: path of the file.
+            scanners: names of the scanners.
+            room: the file ends when the room is used up or a write fails; None: a failed write raises OSError.
+
+        Raises:
+            OSError: the file cannot be created.
+        """
         self.count = self.left_out = 0
         self.trouble = ""
         self._path, self._room = path, room
@@ -53,7 +62,7 @@ class PointsFile:
         self._file.write(b"\x93NUMPY\x01\x00" + struct.pack("<H", 502) + text.ljust(501).encode() + b"\n")
 
     def add(self, name: str, points: Points) -> None:
-        """Points of a scanner."""
+        """Add points of a scanner."""
         if self.trouble:
             self.left_out += len(points)
             return
@@ -71,7 +80,7 @@ class PointsFile:
         self.count += len(rows)
 
     def look_for_room(self) -> None:
-        """Once a second: may there be written?"""
+        """Check for free space and end the file if there is too little; call once a second."""
         if self.trouble or self._room is None:
             return
         try:
@@ -84,7 +93,11 @@ class PointsFile:
         self.trouble = f"{self._path.name} ends after {self.count:,} points: {why}"
 
     def close(self) -> None:
-        """Say in the head how many there are. Raises OSError, unless there is a room to look after."""
+        """Write the number of points into the header and close the file.
+
+        Raises:
+            OSError: the file cannot be written; if a ``room`` was given, this is only noted as trouble.
+        """
         try:
             with self._file:
                 self._write_head()

@@ -1,6 +1,6 @@
-"""What the operator looks at during the flight: points thinned for the eye, where the aircraft is, what is covered.
+"""Writes what the operator sees during the flight: thinned points, the aircraft's position, and the coverage.
 
-Counts and grids take every point; only what live.mcap shows is thinned. Nothing here has a say in the points.
+Counts and grids use every point; only live.mcap is thinned. Nothing here affects the points themselves.
 """
 
 from __future__ import annotations
@@ -31,19 +31,20 @@ from swath.georef.timescales.gps_time import SECOND_NS, table_leap_seconds, unix
 from swath.georef.trajectory.trajectory import Trajectory
 
 POSE_NS = 100_000_000  # between two poses
-ROOM_AGAIN = 1.05  # of the free space at which writing stopped: where it begins again
+ROOM_AGAIN = 1.05  # free space, relative to where writing stopped, at which it begins again
 IMAGE_CELLS = 2048
 COVERAGE, PICTURE = "coverage.json", "coverage.png"
-FIRST_STRIDE = 16  # of the thinning, until a second of points has been counted
-# Points a square metre, and the colour from there on; nothing is transparent.
+FIRST_STRIDE = 16  # of the thinning, until the points of one second have been counted
+# Points per square metre, and the colour from there on; empty cells are transparent.
 _COLOURS = ((0.0, 0x5A0F1E), (1.0, 0xB0282E), (2.0, 0xE8743B), (4.0, 0xF4C95D), (8.0, 0x86B66B), (16.0, 0x2F8C74),
             (32.0, 0x1F5F8B))  # fmt: skip
 
 
 class Thinning:
-    """Which points are for the eye: at most so many of a second of GPS time, spread over it.
+    """Selects points for display: at most so many per second of GPS time, spread over it.
 
-    The stride follows from the number in the second before; the rule knows points and their order, not their blocks.
+    The stride follows from the number of points in the second before; it depends on points and their order, not on
+    blocks.
     """
 
     def __init__(self, points_per_s: int) -> None:
@@ -51,16 +52,16 @@ class Thinning:
         self._state = np.array([np.iinfo(np.int64).min, 0, 0, FIRST_STRIDE, 0], dtype=np.int64)
 
     def keep(self, time_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return which (k,) of points in the order in which they came."""
+        """Return the indexes (k,) of the points to keep; points come in the order of their arrival."""
         kept_ones = np.empty(len(time_ns), dtype=np.int64)
         return kept_ones[: _thin(time_ns, self._limit, self._state, kept_ones)]
 
 
 @jit_cached
 def _thin(time_ns: Any, limit: int, state: Any, keep: Any) -> int:
-    """Return how many are kept.
+    """Fill ``keep`` with the indexes of points to keep and return their number.
 
-    state: first nanosecond after the second, points in it, of them kept, stride, points until the next is kept.
+    state: first nanosecond after the second, points in it, those of them kept, stride, points until the next is kept.
     """
     count = 0
     end, points, shown, stride, until = state[0], state[1], state[2], state[3], state[4]
@@ -83,7 +84,7 @@ def _thin(time_ns: Any, limit: int, state: Any, keep: Any) -> int:
 
 @dataclass(slots=True)
 class Room:
-    """Whether there is room on the disk: not from twice the recorder's reserve on, and again above it."""
+    """Checks free space on the disk: writing stops below twice the recorder's reserve, and begins again above it."""
 
     folder: Path
     least_bytes: int
@@ -91,7 +92,7 @@ class Room:
     is_enough: bool = True
 
     def look(self) -> bool:
-        """Look again."""
+        """Measure the free space and return True if it suffices."""
         disk = os.statvfs(self.folder)
         self.free_bytes = disk.f_bavail * disk.f_frsize
         wanted = self.least_bytes * (1.0 if self.is_enough else ROOM_AGAIN)
@@ -100,15 +101,19 @@ class Room:
 
 
 class LiveProducts:
-    """Takes points as they come, and writes what is to be looked at.
+    """Takes points as they come, and writes the operator's files.
 
     Attributes:
-        points: by scanner, all of them; ``shown``: written to live.mcap; ``unwritten``: thinned ones that were not.
-        trouble: why nothing is written, for people; empty: it is.
+        points: number of points by scanner; ``shown``: written to live.mcap; ``unwritten``: thinned but not written.
+        trouble: why no files are written, for people; empty: they are.
     """
 
     def __init__(self, folder: Path, live: LiveConfig, mapping: Maps | None, reserve_bytes: int, about: str) -> None:
-        """``about``: the mapping frame for people. Raises OSError: the folder cannot be written to."""
+        """Prepare the folder; ``about`` describes the mapping frame for people.
+
+        Raises:
+            OSError: the folder cannot be written to.
+        """
         folder.mkdir(parents=True, exist_ok=True)
         self.points: Counter[str] = Counter()
         self.shown = self.unwritten = 0
@@ -122,16 +127,15 @@ class LiveProducts:
         self._pose_ns = 0
 
     def begin(self, trajectory: Trajectory | None) -> None:
-        """Lay the local frame at the first position that is known; later calls change nothing.
+        """Lay the local frame at the first known position; later calls change nothing.
 
-        With the first of the trajectory and not of the points, which must not wait for what PROJ does when it is first
-        asked.
+        The trajectory sets it, not the points: these must not wait for PROJ, which is slow at its first use.
         """
         if self.frame is None and trajectory is not None and len(trajectory):
             self.frame = LocalFrame(trajectory.position_e[-1], self._mapping)
 
     def take(self, name: str, points: Points, trajectory: Trajectory | None, log_time_ns: int) -> None:
-        """Points of a scanner, in order; with what is known of the flight by then."""
+        """Take points of a scanner, in order, with the trajectory known by then."""
         self.points[name] += len(points)
         self.begin(trajectory)
         if self.frame is None:
@@ -151,7 +155,7 @@ class LiveProducts:
             self.unwritten += count * (not written)
 
     def take_pose(self, trajectory: Trajectory | None, log_time_ns: int) -> None:
-        """The newest pose, ten times a second of the log at most; the first one lays the frame."""
+        """Write the newest pose, at most ten times a second of log time; the first one lays the frame."""
         if trajectory is None or log_time_ns < self._pose_ns + POSE_NS:
             return
         self.begin(trajectory)
@@ -173,7 +177,7 @@ class LiveProducts:
         self._write(lambda mcap: mcap.add_pose(pose, log_time_ns))
 
     def look_for_room(self) -> None:
-        """Once a second: may there be written?"""
+        """Check for free space and stop or resume writing; call once a second."""
         try:
             is_enough = self.room.look()
         except OSError as error:
@@ -187,7 +191,7 @@ class LiveProducts:
         self.trouble = f"free space is down to {least_mb:.0f} MB, twice the recorder's reserve: nothing is written"
 
     def _write(self, add: Any) -> bool:
-        """Into live.mcap, if there is one and room for it."""
+        """Write to live.mcap, if there is a frame and room for it; return True if written."""
         if self.trouble or self.frame is None:
             return False
         try:
@@ -204,7 +208,7 @@ class LiveProducts:
         return written
 
     def origin(self) -> dict[str, Any]:
-        """Return what the coordinates of the products mean."""
+        """Return what the coordinates of the products refer to."""
         said: dict[str, Any] = {"crs": self._about, "axes": "east, north, up, metres"}
         if self.frame is not None:
             said["origin"] = [round(value, 4) for value in self.frame.origin.tolist()]
@@ -212,7 +216,7 @@ class LiveProducts:
         return said
 
     def save_coverage(self, latest: dict[str, Any]) -> None:
-        """The grid as numbers and as a picture, each replaced at once; nothing where there is no room."""
+        """Replace the coverage grid's numbers and picture, each at once; do nothing if there is no room."""
         if self.trouble.startswith("free space") or not self.grid.points:
             return
         counts, west_m, north_m, cell_m = self.grid.image(IMAGE_CELLS)
@@ -233,7 +237,7 @@ class LiveProducts:
             self.trouble = f"{COVERAGE}: {error.strerror or error}: nothing is written any more"
 
     def close(self) -> None:
-        """Finish live.mcap."""
+        """Finish and close live.mcap."""
         mcap, self._mcap = self._mcap, None
         if mcap is not None:
             try:
@@ -243,7 +247,9 @@ class LiveProducts:
 
 
 def unix_from_gps(gps_ns: int) -> int:
-    """Return POSIX nanoseconds of a GPS time, for stamps that people see: leap seconds by the built-in table."""
+    """Return POSIX nanoseconds of a GPS time for time stamps shown to people; leap seconds are from
+    the built-in table.
+    """
     second, rest_ns = divmod(gps_ns, SECOND_NS)
     return _unix_of_second(second) + rest_ns
 
@@ -256,21 +262,21 @@ def _unix_of_second(gps_s: int) -> int:
 
 
 def replace_file(path: Path, data: bytes) -> None:
-    """Put data in a file's place at once: whoever reads sees the old or the new one, never half."""
+    """Replace a file's content at once: a reader sees the old or the new one, never a part."""
     new = path.with_name(path.name + ".new")
     new.write_bytes(data)
     new.replace(path)
 
 
 def picture(counts: NDArray[Any], cell_m: float) -> bytes:
-    """Return a PNG (ISO/IEC 15948) of points in cells (rows, columns), a pixel each, coloured by density; none is
-    clear.
+    """Return a PNG (ISO/IEC 15948) of cells (rows, columns), one pixel each, coloured by density;
+    empty ones are clear.
     """
     index: NDArray[np.uint8] = np.zeros(counts.shape, dtype=np.uint8)
     for density, _ in _COLOURS:
         index += counts >= max(1, math.ceil(density * cell_m**2))
     rows, columns = index.shape
-    lines = np.zeros((rows, columns + 1), dtype=np.uint8)  # before each line the number of its filter: none
+    lines = np.zeros((rows, columns + 1), dtype=np.uint8)  # each line begins with the number of its filter: 0
     lines[:, 1:] = index
     palette = b"".join(colour.to_bytes(3, "big") for colour in (0, *(colour for _, colour in _COLOURS)))
     head = struct.pack(">IIBBBBB", columns, rows, 8, 3, 0, 0, 0)

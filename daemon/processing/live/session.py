@@ -1,7 +1,7 @@
-"""The live georeferencer: follows a recording, or reads finished logs by the same code, and says how it does.
+"""Runs the live georeferencer: follows a recording, or replays finished logs by the same code, and reports its status.
 
-The messages go in the file's order into a `LogFeed`; what comes out depends on the log alone. Only what is written for
-the operator, and what is passed over when this computer is too slow, depends on the clock on the wall.
+The messages go in the file's order into a `LogFeed`; the points depend on the log alone. Only the operator's files, and
+the chunks that are skipped when this computer is too slow, depend on the wall clock.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ Told = dict[str, Any]
 
 
 class _SeenPath:
-    """A stream's path, with what it last said."""
+    """A stream's path that remembers its last trajectory."""
 
     def __init__(self, path: Any) -> None:
         self.trajectory: Trajectory | None = None
@@ -57,11 +57,11 @@ class _SeenPath:
 
 
 class LiveSession:
-    """One recording on its way to points.
+    """One recording and its points.
 
     Attributes:
-        now_ns: host time as far as the log has been read; `live` reads the clock instead.
-        verdict: on the calibrations, as the status says it.
+        now_ns: host time up to which the log has been read; a live session uses the clock instead.
+        verdict: verdict on the calibrations, for the status.
     """
 
     def __init__(
@@ -75,7 +75,13 @@ class LiveSession:
         beside_recorder: bool = False,
         accept_verdict: bool = False,
     ) -> None:
-        """``points``: where all points go, for comparisons; None: nowhere. Raises OSError, UserError."""
+        """Prepare a session.
+
+        ``points`` is the file for all points, for comparisons; None: no such file.
+
+        Raises:
+            OSError: a file cannot be written; UserError: there is no source of a trajectory.
+        """
         self.info = info
         source = "navigated" if setup.sources.ins_source is None else "ins"
         self.verdict = verdict_entry(list(calibration_verdicts(setup, source)), accepted=accept_verdict)
@@ -102,7 +108,7 @@ class LiveSession:
         self._is_own = info.boot_id == read_boot_id()
 
     def take(self, batch: LogBatch, *, live: bool) -> None:
-        """The next messages."""
+        """Take the next messages."""
         self.now_ns = max(self.now_ns, int(batch.log_time_ns[-1]))
         self.status.note_batch(batch, self.host_now_ns(live=live))
         placed = self._feed.take(batch)
@@ -112,9 +118,7 @@ class LiveSession:
         self.products.take_pose(self._path.trajectory, self.now_ns)
 
     def host_now_ns(self, *, live: bool) -> int:
-        """Return host time of the session; of another computer's, whose clocks are not ours, that of what was read
-        last.
-        """
+        """Return the session's host time; if another computer recorded it, the time of the last message read."""
         if live and self._is_own:
             return time.monotonic_ns() + self.info.realtime_ns - self.info.monotonic_ns
         return self.now_ns
@@ -127,7 +131,7 @@ class LiveSession:
             self.status.note_points(name, points.time_ns, self.host_now_ns(live=live))
 
     def close(self, *, live: bool) -> None:
-        """The log is over: what still waits comes out, and files get their ends."""
+        """Flush the points that still wait at the log's end, and close the files."""
         self._give(self._feed.close(), live=live)
         self.look_for_room()
         self.products.close()
@@ -135,21 +139,21 @@ class LiveSession:
             self.points.close()
 
     def look_for_room(self) -> None:
-        """Once a second: may there be written?"""
+        """Check for free space; call once a second."""
         self.products.look_for_room()
         if self.points is not None:
             self.points.look_for_room()
 
 
 class Live:
-    """Follows what is recorded in a directory, once, until it ends.
+    """Follows one recording in a directory until it ends.
 
     Args:
-        directory: of the log.
-        live: what is written.
-        tell: takes the status each second, with its ``sentence``.
+        directory: directory of the log.
+        live: settings of the operator's files.
+        tell: called with the status each second, with its ``sentence``.
         prepare: called with the recording's setup before the first of its messages is taken, to compile what it needs.
-        accept_verdict: a calibration that is not to be used is taken.
+        accept_verdict: accept an unusable calibration.
     """
 
     def __init__(
@@ -172,10 +176,10 @@ class Live:
         self._trouble = ""
 
     def run(self, stopped: Callable[[], bool]) -> Told:
-        """Until the recording ends, or somebody says so; what was told last.
+        """Run until the recording ends or ``stopped`` returns True; return the last status.
 
         Raises:
-            UserError: the recording's configuration cannot be used, or nothing can be written.
+            UserError: the recording's configuration cannot be used, or no file can be written.
         """
         try:
             while not stopped() and not self._follower.ended:
@@ -194,7 +198,7 @@ class Live:
     def _take(self, item: LogBatch | Skipped) -> None:
         part = self._follower.part
         if isinstance(item, Skipped) or part is None:
-            return  # to the stream it is a hole in the log; the follower counts it
+            return  # the gap looks like a hole in the log to the stream; the follower counts it
         if self._session is None:
             setup = Setup.of_log(part.attachments, Options(uncertainty=False))
             if self._prepare is not None:
@@ -211,7 +215,7 @@ class Live:
         self._session.take(item, live=True)
 
     def _look_at_clock(self) -> None:
-        """The status once a second, the coverage now and then."""
+        """Report the status once a second, and save the coverage now and then."""
         now_s = time.monotonic()
         if now_s - self._told_s < STATUS_S:
             return
@@ -237,7 +241,7 @@ class Live:
                 found["points_file"] = self._session.points.trouble
         found["sentence"] = one_line(sentence(found))
         if self._session is not None:
-            with contextlib.suppress(OSError):  # the sentence is told all the same
+            with contextlib.suppress(OSError):  # the sentence is reported all the same
                 write_status(self._directory / FOLDER, found)
         self._tell(found)
         return found
@@ -259,7 +263,7 @@ def made_session(
     beside_recorder: bool = False,
     accept_verdict: bool = False,
 ) -> LiveSession:
-    """Return a session; UserError where its folder cannot be written to."""
+    """Return a session; refuse with `UserError` a folder that cannot be written to."""
     try:
         session = LiveSession(
             setup, info, folder, live, points, beside_recorder=beside_recorder, accept_verdict=accept_verdict
@@ -282,17 +286,17 @@ def replay(
     *,
     accept_verdict: bool = False,
 ) -> Told:
-    """Return the same over a finished session, as fast as it goes; the last status, which also stands in ``folder``.
+    """Run a session over a finished log at full speed; return the last status, which is also written to ``folder``.
 
     Args:
-        session: of `open_logs`.
-        points: where all points go; None: nowhere.
-        tell: takes the log time reached.
-        batches: instead of the session's own, cut otherwise.
-        accept_verdict: a calibration that is not to be used is taken.
+        session: session from `open_logs`.
+        points: file for all points; None: no such file.
+        tell: called with the log time reached.
+        batches: batches instead of the session's own, cut differently.
+        accept_verdict: accept an unusable calibration.
 
     Raises:
-        UserError: nothing can be written.
+        UserError: no file can be written.
     """
     run = made_session(setup, session.info, folder, live, points, accept_verdict=accept_verdict)
     try:

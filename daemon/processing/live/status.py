@@ -1,4 +1,6 @@
-"""How the live georeferencer does: rates, fates, latencies, time, coverage; as plain values and as a sentence."""
+"""Reports how the live georeferencer does: rates, fates, latencies, time, coverage; as plain values
+and as a sentence.
+"""
 
 from __future__ import annotations
 
@@ -22,28 +24,28 @@ from swath.georef.points import FATE_NAMES
 from swath.georef.stream.stream import Stream
 
 STATUS = "live.json"
-WINDOW_S = 10.0  # of which latencies are told
-EVERY = 97  # of a block's points, whose latency is looked at
+WINDOW_S = 10.0  # period that latencies are reported for
+EVERY = 97  # one of so many of a block's points is timed
 LATE_S = 1.0
 ASK_NS = 1_000_000_000
 LATENCIES = ("p50", "p95", "max")
 
 
 class Latencies:
-    """Seconds between two things, those of the last moments."""
+    """Time differences in seconds of the last moments."""
 
     def __init__(self) -> None:
         self._blocks: deque[tuple[float, NDArray[np.float64] | float]] = deque()
 
     def add(self, seconds: NDArray[np.float64] | float) -> None:
-        """Some more, or one, now."""
+        """Add time differences of the present moment."""
         now_s = time.monotonic()
         self._blocks.append((now_s, seconds))
         while self._blocks and now_s - self._blocks[0][0] > WINDOW_S:
             self._blocks.popleft()
 
     def plain(self) -> dict[str, float] | None:
-        """Return p50, p95 and max; None: there are none."""
+        """Return p50, p95 and max; None if there are no recent values."""
         now_s = time.monotonic()
         latest = [seconds for at_s, seconds in self._blocks if now_s - at_s <= WINDOW_S]
         if not latest:
@@ -53,7 +55,7 @@ class Latencies:
 
 
 class LiveStatus:
-    """Collects over one recording; `plain` says how things are.
+    """Collects the status of one recording; `plain` returns it.
 
     Attributes:
         navigation: what the navigator waits for, or how it began, in words; None: the device's own INS is used.
@@ -66,14 +68,14 @@ class LiveStatus:
         self._log: dict[str, Latencies] = {}
         self._newest_ns: dict[str, int] = {}  # log time of a source's newest unit
         self._sources: dict[str, str | None] = {}  # by topic
-        self._offsets: dict[str, tuple[int, int | None]] = {}  # by scanner: host time, GPS time less that
+        self._offsets: dict[str, tuple[int, int | None]] = {}  # by scanner: host time, and GPS time minus host time
         self._points_before: Counter[str] = Counter()
         self._fates_before: dict[str, Counter[str]] = {}
         self._refused_before: dict[str, Counter[str]] = {}
         self._told_s = time.monotonic()
 
     def note_batch(self, batch: LogBatch, now_ns: int) -> None:
-        """Messages have been read, at a host time."""
+        """Note that messages have been read, at a host time."""
         topic = batch.channel.topic
         if topic not in self._sources:
             self._sources[topic] = source_of_topic(topic)
@@ -87,14 +89,16 @@ class LiveStatus:
         self._log[source].add((now_ns - newest_ns) * 1e-9)
 
     def note_points(self, name: str, time_ns: NDArray[np.int64], now_ns: int) -> None:
-        """Points have come out, at a host time; time_ns (n,) is their pulses'."""
+        """Note that points have come out, at a host time; time_ns (n,) are their pulses' times."""
         offset_ns = self._gps_minus_host_ns(name, now_ns)
         if offset_ns is not None:
             latest: NDArray[np.float64] = (now_ns + offset_ns - time_ns[::EVERY]) / 1e9
             self._pulse.setdefault(f"scanner/{name}", Latencies()).add(latest)
 
     def _gps_minus_host_ns(self, name: str, host_ns: int) -> int | None:
-        """By the scanner's clock, asked once a second: none drifts so fast that a latency would show it."""
+        """Return GPS minus host time by the scanner's clock, asked once a second: clock drift within that is
+        negligible.
+        """
         asked_ns, offset_ns = self._offsets.get(name, (0, None))
         if offset_ns is not None and abs(host_ns - asked_ns) < ASK_NS:
             return offset_ns
@@ -108,7 +112,7 @@ class LiveStatus:
         return offset_ns
 
     def plain(self, follower: LiveFollower | None, now_ns: int) -> dict[str, Any]:
-        """Return how things are, at a host time; without a follower finished logs are read."""
+        """Return the status at a host time; without a follower, finished logs are being read."""
         stream, products = self._stream, self._products
         now_s = time.monotonic()
         passed_s = max(1e-3, now_s - self._told_s)
@@ -150,7 +154,7 @@ class LiveStatus:
         return {FATE_NAMES[fate]: count for fate, count in self._stream.fates(name).items()}
 
     def _without_time(self, name: str, now_ns: int) -> str:
-        """Return why returns of a scanner that came since the last time have no time; empty: few or none."""
+        """Return why new returns of a scanner have no time; empty if there are few or none."""
         source, clocks = f"scanner/{name}", self._stream.clocks
         fates, refused = Counter(self._fates(name)), Counter(clocks.refused(source))
         new_fates = fates - self._fates_before.get(name, Counter())
@@ -162,7 +166,7 @@ class LiveStatus:
 
     @property
     def _trajectory_source(self) -> str | None:
-        """A receiver that could tell an INS solution and tells none is not whose it is."""
+        """The source of the trajectory; a receiver that could send INS solutions but sends none is not the source."""
         return self._setup.sources.ins_source if self.navigation is None else "navigated"
 
     def _clock_states(self, now_ns: int) -> dict[str, Any]:
@@ -176,7 +180,7 @@ class LiveStatus:
 
 
 def sentence(found: dict[str, Any]) -> str:
-    """Return a line for people."""
+    """Return the status as one line for people."""
     if "points" not in found:
         return str(found["state"])
     rate = sum(found["points_per_s"].values())
@@ -204,9 +208,7 @@ def sentence(found: dict[str, Any]) -> str:
 
 
 def is_well(found: dict[str, Any]) -> bool:
-    """Return whether points come of every scanner, on time, and nothing is wrong: what an operator may take for
-    good.
-    """
+    """Return True if points of every scanner come in time and there is no trouble, so that an operator need not act."""
     if "points" not in found:
         return False
     wrong = [found.get(key) for key in ("trouble", "points_file", "live_skipped_s", "damaged_chunks", "without_time")]
@@ -215,7 +217,7 @@ def is_well(found: dict[str, Any]) -> bool:
 
 
 def _behind_s(found: dict[str, Any]) -> float | None:
-    """Return how far points are behind their pulses, 95 % of the worst scanner's; None: there are none."""
+    """Return how far points are behind their pulses: the worst scanner's 95 % quantile; None if there are no points."""
     return max((value["pulse"]["p95"] for value in found["latency_s"].values() if value["pulse"]), default=None)
 
 
@@ -224,5 +226,9 @@ def _not_locked(found: dict[str, Any]) -> list[str]:
 
 
 def write_status(folder: Path, found: dict[str, Any]) -> None:
-    """Replace ``live.json``; raises OSError."""
+    """Replace ``live.json``.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
     replace_file(folder / STATUS, (json.dumps(found, indent=2) + "\n").encode())

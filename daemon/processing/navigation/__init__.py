@@ -1,1 +1,1 @@
-"""From logs to a navigated trajectory."""
+"""Navigates logs: from their records to a trajectory."""

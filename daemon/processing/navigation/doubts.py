@@ -1,4 +1,4 @@
-"""What a log lacks for navigation, in a line, and what of it is to be doubted."""
+"""Names in one line each what a log lacks for navigation, and which of its data are doubtful."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from swath.georef.records import StructArray
 from swath.georef.trajectory.trajectory import gps_text
 
 FEWEST_HEIGHTS = 10
-TIME_IS_KNOWN_S = 1e-4  # a better time of the IMU's samples needs no offset to be found: 6 mm at 60 m/s
+TIME_IS_KNOWN_S = 1e-4  # if the IMU's times are better, no offset needs to be estimated: 6 mm at 60 m/s
 
 
 def refuse_nothing(found: NavigationLog, sources: NavigationSources, log: Path, *, outside: bool) -> None:
-    """Refuse a log that lacks samples, or positions where none come from ``outside``.
+    """Refuse a log that lacks samples, or lacks positions while there are none from ``outside``.
 
     Raises:
-        UserError: it lacks either.
+        UserError: samples or positions are missing.
     """
     if not len(found.imu):
         hint = "; it has an INS's own solutions: want --ins as-is for these" if len(found.ins) else ""
@@ -41,7 +41,7 @@ def refuse_nothing(found: NavigationLog, sources: NavigationSources, log: Path, 
 
 
 def _heard(found: NavigationLog, source: str) -> str:
-    """Return what came of a source that gave nothing, and what that means."""
+    """Return what a source without records sent, and what that suggests."""
     size, skipped, messages = found.heard.get(source, (0, 0, Counter()))
     if not size:
         return "not a byte of it is in the log; is its wire recorded?"
@@ -79,7 +79,7 @@ def refuse_elsewhere(
         outside: file of the positions; None: they are the receiver's.
 
     Raises:
-        UserError: they are so.
+        UserError: there is no position, or no common time.
     """
     positions = observations[observations["kind"] == Kind.POSITION]
     if not len(positions) and outside is not None:
@@ -98,7 +98,7 @@ def refuse_elsewhere(
         )
 
 
-# ---------------------------------------------------------------------- what is to be told
+# ---------------------------------------------------------------------- doubts and findings
 
 
 def input_doubts(
@@ -146,10 +146,10 @@ def input_doubts(
 
 
 def height_findings(found: NavigationLog, sources: NavigationSources) -> list[Finding]:
-    """Return a warning where a receiver's heights may be those above the geoid.
+    """Return a warning if a receiver's heights may be above the geoid.
 
-    GGA and GNS tell the height above the receiver's geoid and the geoid's height above the ellipsoid (NMEA 0183 v4.11).
-    A separation that is 0 in every sentence is none: the altitude may then be either height.
+    GGA and GNS give the height above the receiver's geoid and the geoid's height above the ellipsoid (NMEA 0183 v4.11).
+    A separation that is 0 in every sentence is not a real one: the altitude may then be either height.
     """
     told = [fix for fix in found.fixes if fix.message in ("GGA", "GNS") and fix.valid and fix.height_m is not None]
     if len(told) < FEWEST_HEIGHTS or any(fix.undulation_m != 0.0 for fix in told):
@@ -167,7 +167,7 @@ def height_findings(found: NavigationLog, sources: NavigationSources) -> list[Fi
 
 
 def _silent_antenna(found: NavigationLog, sources: NavigationSources, log: Path) -> list[str]:
-    """Nothing came of a second antenna that the configuration names: neither headings nor its own positions."""
+    """Return a line if a configured second antenna sent neither headings nor positions of its own."""
     if sources.gnss is None or sources.gnss.secondary_lever_arm_m is None or found.headings:
         return []
     if any(fix.antenna == "secondary" for fix in found.fixes):
@@ -179,7 +179,7 @@ def _silent_antenna(found: NavigationLog, sources: NavigationSources, log: Path)
 
 
 def _baseline_doubts(found: NavigationLog, sources: NavigationSources, log: Path) -> list[str]:
-    """Return the receiver measures the baseline too: another length is another lever arm."""
+    """Return a line if the baseline that the receiver measured has another length than the lever arms give."""
     told = [heading.baseline_m for heading in found.headings if heading.valid and heading.baseline_m]
     baseline = sources.setup().baseline_b
     if not told or baseline is None:

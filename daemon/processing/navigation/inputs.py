@@ -1,4 +1,4 @@
-"""From a log to what navigation takes: increments of the IMU in b, observations, setup; and what became of the rest."""
+"""Prepares a log for navigation: increments of the IMU in b, observations, setup; and accounts for refused data."""
 
 from __future__ import annotations
 
@@ -81,21 +81,21 @@ class Leg:
 
 @dataclass(frozen=True, eq=False)
 class NavigationInputs:
-    """What a session gives.
+    """The inputs of navigation from a session.
 
     Attributes:
-        legs: to be navigated one by one, in order.
-        setup: of the filter.
+        legs: pieces to be navigated one by one, in order.
+        setup: setup of the filter.
         ins: solutions of the device's own INS, `INS_DTYPE`, attitude of b.
         marks: event marks of all receivers.
-        imu_time: how the IMU's samples got their times, see `ImuTimes`, and their usual sigma, s.
-        samples: the IMU's, by what became of them.
-        observed: observations by kind (lower case).
-        refused: fixes, headings and solutions that are no observation, by reason, with their kind before it.
-        assumed: observations whose sigmas are defaults, by kind.
-        doubts: lines for the user; holes: what is missing, a line each.
-        missing: stretches of the samples that no leg holds, longer than `LEAST_HOLE_S`; each is a hole too.
-        findings: what the receiver's messages themselves show to be wrong, which the verdict goes by.
+        imu_time: source of the times of the IMU's samples, see `ImuTimes`, and their usual sigma, s.
+        samples: number of the IMU's samples by fate.
+        observed: number of observations by kind (lower case).
+        refused: number of fixes, headings and solutions that gave no observation, by kind and reason.
+        assumed: number of observations with default sigmas, by kind.
+        doubts: lines for the user; holes: missing data, one line each.
+        missing: stretches of samples longer than `LEAST_HOLE_S` that no leg holds; each is a hole too.
+        findings: errors that the receiver's messages themselves show, for the verdict.
     """
 
     session: Session
@@ -117,21 +117,21 @@ class NavigationInputs:
 
     @property
     def log(self) -> Path:
-        """The session's first part, which stands for it in messages."""
+        """The session's first part, which names the log in messages."""
         return self.session.parts[0].path
 
 
 @dataclass(frozen=True, slots=True)
 class InputOptions:
-    """What the command line says of the inputs.
+    """The options for the inputs from the command line.
 
     Attributes:
-        imu, gnss: names; None: the first.
-        config: instead of the log's own.
-        positions: of an antenna, from outside, instead of the receiver's; None: the receiver's.
-        week: of such a file that says none.
-        arm_b: x, y, z from the body's origin to its antenna, m; None: as the configuration has the receiver's.
-        ins: ``observe``: the attitude of the device's own INS too; ``ignore``: not.
+        imu, gnss: names; None: the first of each.
+        config: configuration instead of the log's own.
+        positions: file of an antenna's positions instead of the receiver's; None: the receiver's.
+        week: GPS week of such a file without one.
+        arm_b: x, y, z from the body's origin to its antenna, m; None: the receiver's in the configuration.
+        ins: ``observe``: also use the attitude of the device's own INS; ``ignore``: do not.
     """
 
     imu: str | None = None
@@ -144,10 +144,10 @@ class InputOptions:
 
 
 def read_inputs(session: Session, wish: InputOptions, storage: Storage = IN_MEMORY) -> NavigationInputs:
-    """Read a session; its samples are kept in the storage.
+    """Read a session's inputs of navigation; its samples are kept in the storage.
 
     Raises:
-        UserError: it cannot be navigated, in a line each.
+        UserError: the session cannot be navigated; one line per reason.
         LogError, OSError: the log cannot be read.
     """
     log = session.parts[0].path
@@ -212,7 +212,7 @@ def _sources(session: Session, wish: InputOptions) -> NavigationSources:
 
 
 def _sampled(times: ImuTimes, sources: NavigationSources, storage: Storage) -> tuple[Inertial, Sampler]:
-    """Return increments of all samples; what is missing between them shows in their times."""
+    """Return increments of all samples; gaps between them show in their times."""
     table = sources.imu
     try:
         sampler = Sampler(table.rate_hz, table.sample, table.stamp, sources.rot_b_from_imu)
@@ -233,7 +233,7 @@ def _sampled(times: ImuTimes, sources: NavigationSources, storage: Storage) -> t
 
 
 def _missing(times: ImuTimes, sampler: Sampler, short: Sequence[Stretch], rate_hz: float) -> list[Stretch]:
-    """Return, by time, what of the samples no leg holds; a gap that samples left out explain is told once."""
+    """Return the stretches of samples that no leg holds, by time; a gap left by unused samples is listed once."""
     rows = times.rows
     finite = np.isfinite(rows["specific_force_b"]).all(axis=1) & np.isfinite(rows["angular_rate_b"]).all(axis=1)
     dropped = [*times.dropped]
@@ -251,7 +251,9 @@ def _missing(times: ImuTimes, sampler: Sampler, short: Sequence[Stretch], rate_h
 
 
 def _explained(gaps: Sequence[Stretch], sampler: Sampler, rate_hz: float) -> list[Stretch]:
-    """Return the gaps, and the runs of samples that their stamps let drop: as the gap that they leave, or by them."""
+    """Return the gaps, and runs of samples dropped for their stamps: each as the gap that it
+    leaves, or by its stamps.
+    """
     words = {
         "time_jumped_back": "samples whose time jumped back",
         "out_of_order": "samples out of order",
@@ -280,7 +282,7 @@ def _explained(gaps: Sequence[Stretch], sampler: Sampler, rate_hz: float) -> lis
 
 
 def _legs(inertial: Inertial, observations: StructArray) -> tuple[list[Leg], list[Stretch]]:
-    """Return the pieces between gaps that are not bridged, with the observations of their time; and those too short."""
+    """Return the pieces between gaps that are not bridged, with their observations; and pieces that are too short."""
     begins_ns = inertial.time_ns - np.rint(inertial.interval_s * SECOND_NS).astype(np.int64)
     apart = np.flatnonzero(begins_ns[1:] - inertial.time_ns[:-1] > inertial.interval_s[1:] * SECOND_NS / 2) + 1
     bounds = [0, *apart.tolist(), len(inertial)]
@@ -316,7 +318,7 @@ class _Placed:
         self.heading_ns = heading_times(found.headings, given, found.fixes, self.fix_ns)
 
     def observations(self, outside: OutsidePositions | None, *, use_ins: bool) -> dict[str, Observed]:
-        """By what they are of."""
+        """Return observations by source: fix, outside, heading, ins."""
         found, sources = self.found, self.sources
         setup = sources.setup()
         fixes = fix_observations(found.fixes, self.fix_ns, len(setup.lever_arms_b))
@@ -335,7 +337,7 @@ class _Placed:
         return parts
 
     def leap_seconds(self) -> int | None:
-        """Return GPS − UTC as the receiver said it; None: it is a guess."""
+        """Return GPS − UTC as the receiver sent it; None if it is only a guess."""
         if self.sources.gnss_source is None:
             return None
         newest = max([int(self.found.imu["host_time_ns"][-1]), *(fix.host_time_ns for fix in self.found.fixes)])
@@ -343,7 +345,7 @@ class _Placed:
         return status.leap_seconds if status.leap_origin != "guess" else None
 
     def marks(self) -> list[Mark]:
-        """Of all receivers, by time of arrival."""
+        """Return event marks of all receivers, by time of arrival."""
         marks: list[Mark] = []
         for source in sorted({source for source, _ in self.found.marks}):
             if source not in self.found.host.by_source:
@@ -365,7 +367,7 @@ def _arrived(
 
 
 def protocol_of(sources: NavigationSources, source: str | None) -> str:
-    """Of ``gnss/name`` or ``imu/name``; empty of None."""
+    """Return the protocol of ``gnss/name`` or ``imu/name``; empty for None."""
     kind, _, name = (source or "").partition("/")
     tables: Mapping[str, object] = sources.config.imu if kind == "imu" else sources.config.gnss
     return str(getattr(tables.get(name), "protocol", ""))

@@ -1,7 +1,7 @@
-"""The way the aircraft goes while its log grows: samples and fixes of a stream, taken at its ticks, give poses.
+"""Navigates an aircraft while its log grows: takes a stream's samples and fixes at its ticks and gives poses.
 
-Everything is decided by what stands in the log and where its ticks fall, so a log followed while it grows and the same
-log read afterwards give the same poses.
+All decisions depend on the log's content and its ticks, so a log followed while it grows and the same log read
+afterwards give the same poses.
 """
 
 from __future__ import annotations
@@ -45,27 +45,27 @@ if TYPE_CHECKING:
     from swath.georef.navigation.filter.types import Path
     from swath.georef.stream.clocks import StreamClocks
 
-HOLD_S = 0.3  # fixes come so much later than the samples of their time, at most
-TIME_WAIT_NS = 5 * SECOND_NS  # for a clock that is not known yet
-MAX_TIME_SIGMA_NS = 1e7  # of a sample: a worse time is none
-REALIGN_NS = 30 * SECOND_NS  # of missing samples: after them attitude is found anew
-PAUSE_NS = SECOND_NS // 2  # of arrivals: after it a unit without a counter is taken to have missed samples
+HOLD_S = 0.3  # maximum delay of fixes after the samples of their time
+TIME_WAIT_NS = 5 * SECOND_NS  # longest wait for a clock that is not known yet
+MAX_TIME_SIGMA_NS = 1e7  # of a sample: a worse time is not used
+REALIGN_NS = 30 * SECOND_NS  # of missing samples: after them the attitude is aligned anew
+PAUSE_NS = SECOND_NS // 2  # of arrivals: after it a unit without a counter is assumed to have missed samples
 KEPT_NS = 10 * SECOND_NS  # of samples before the start that was found
-EPOCH_LASTS_NS = 2 * SECOND_NS  # messages of one epoch come within it
+EPOCH_LASTS_NS = 2 * SECOND_NS  # all messages of one epoch come within it
 NEVER_NS = 1 << 62
-GOOD_STATUS = 3  # as a device's INS says that its solution is good
+GOOD_STATUS = 3  # status of a good solution, as a device's INS would send it
 
 
 class Navigator:
-    """Finds the start and runs the filter.
+    """Finds the start of navigation and runs the filter.
 
     Args:
-        sources: which IMU and receiver.
-        clocks: of the stream; its plan has the IMU among its devices.
+        sources: the IMU and the receiver to use.
+        clocks: clocks of the stream; their plan has the IMU among its devices.
 
     Attributes:
-        counts: what became of what came, by name.
-        parsers: of the IMU and of all receivers, by source; whoever feeds them gives their records to `take`.
+        counts: number of records by fate.
+        parsers: of the IMU and of all receivers, by source; the caller feeds them and passes their records to `take`.
     """
 
     def __init__(self, sources: NavigationSources, clocks: StreamClocks) -> None:
@@ -80,7 +80,7 @@ class Navigator:
         self._imu: list[StructArray] = []
         self._fixes: list[GnssFix] = []
         self._headings: list[GnssHeading] = []
-        self._said: set[str] = set()  # names of messages
+        self._said: set[str] = set()  # names of messages received
         self._handed: set[tuple[int, int, int]] = set()  # time, kind, antenna of observations of the last seconds
         self._latest_heading_ns = -(1 << 62)
         self._kept: list[Inertial] = []
@@ -89,11 +89,11 @@ class Navigator:
 
     @property
     def state(self) -> str:
-        """In words: what it waits for, or how the start was found."""
+        """What it waits for, or how the start was found, in words."""
         return self._aligner.state
 
     def take(self, source: str, record: Record) -> None:
-        """A record of the stream; those of other sources and kinds are left."""
+        """Take a record of the stream; records of other sources and kinds are ignored."""
         if isinstance(record, ImuSamples) and source == self._sources.imu_source:
             self._imu.append(self._counter.told(record.rows, self._clocks, source))
         elif isinstance(record, GnssFix) and source == self._sources.gnss_source:
@@ -117,7 +117,7 @@ class Navigator:
         return np.empty(0, INS_DTYPE) if self._filter is None else poses(self._filter.new_path())
 
     def close(self) -> StructArray:
-        """Return the log is over: what still waits."""
+        """Return the last poses at the end of the log."""
         rows = self.advance(NEVER_NS)
         if self._filter is None:
             return rows
@@ -152,7 +152,7 @@ class Navigator:
         """Return samples whose times are known by now."""
         rows = np.concatenate([np.empty(0, IMU_DTYPE), *self._imu])
         time_ns, known = self._times(rows)
-        if not known.all():  # those behind one that waits wait too, so that they stay in order
+        if not known.all():  # samples behind a waiting one wait too and stay in order
             first = int(np.argmin(known))
             late = ~known & (tick_ns - rows["host_time_ns"] > TIME_WAIT_NS)
             self.counts["samples without time"] += int(late.sum())
@@ -166,7 +166,7 @@ class Navigator:
         return self._sampler.feed(rows, time_ns)
 
     def _times(self, rows: StructArray) -> tuple[Int64Array, NDArray[np.bool_]]:
-        """Return GPS ns (n,) of samples, and whether they are known."""
+        """Return GPS ns (n,) of samples, and flags (n,) of those that are known."""
         source = self._sources.imu_source
         own = rows["gps_week"] >= 0
         if own.any():
@@ -177,7 +177,7 @@ class Navigator:
         return gps_ns, sigma_ns <= MAX_TIME_SIGMA_NS
 
     def _observations(self, tick_ns: int) -> StructArray:
-        """Of fixes and headings that came before the tick; those whose time is not known yet wait."""
+        """Return observations of fixes and headings before the tick; those without a known time wait."""
         host, source = self._clocks.host, self._sources.gnss_source
         fixes, headings = self._fixes, self._headings
         fix_ns = gps_times(host, source, [fix.host_time_ns for fix in fixes], [fix.time for fix in fixes])
@@ -198,7 +198,9 @@ class Navigator:
         return sort_observations(np.concatenate([self._fresh(found.rows), self._directions(headings, heading_ns)]))
 
     def _fresh(self, rows: StructArray) -> StructArray:
-        """Without what an earlier tick had of the same epoch: a receiver says it in several messages."""
+        """Return the rows without those that an earlier tick had for the same epoch, as receivers split and repeat
+        epochs.
+        """
         keys = list(zip(rows["time_ns"].tolist(), rows["kind"].tolist(), rows["antenna"].tolist(), strict=True))
         fresh = np.array([key not in self._handed for key in keys], dtype=np.bool_)
         self.counts["fix repeated in epoch"] += int((~fresh).sum())
@@ -207,7 +209,7 @@ class Navigator:
         return rows[fresh]
 
     def _directions(self, headings: list[GnssHeading], time_ns: list[int | None]) -> StructArray:
-        """Return headings of the baseline that are later than those handed on before."""
+        """Return headings of the baseline that are later than those returned before."""
         if self._setup.baseline_b is None:
             return np.empty(0, OBSERVATION_DTYPE)
         found = heading_observations(headings, time_ns, float(np.linalg.norm(self._setup.baseline_b))).rows
@@ -218,7 +220,7 @@ class Navigator:
 
 
 def navigator_of(config: Config, attachments: Mapping[str, bytes], clocks: StreamClocks) -> Navigator | None:
-    """By a configuration; None where it has not an IMU and a receiver that can be navigated with."""
+    """Return a navigator for a configuration; None if it lacks an IMU or a receiver to navigate with."""
     if not config.imu or not config.gnss:
         return None
     try:
@@ -228,9 +230,9 @@ def navigator_of(config: Config, attachments: Mapping[str, bytes], clocks: Strea
 
 
 class _Counter:
-    """Tells the clock what the samples' counter said beside the host's time.
+    """Passes the samples' counters with the host's time to the clock.
 
-    Samples that have none are given one: one nominal interval each, and the host's time over pauses.
+    Samples without a counter get one: one nominal interval each, and the host's time over pauses.
     """
 
     def __init__(self, rate_hz: float) -> None:
@@ -239,7 +241,7 @@ class _Counter:
         self._host_ns: int | None = None
 
     def told(self, rows: StructArray, clocks: StreamClocks, source: str) -> StructArray:
-        """Return rows with a device time; those that say GPS time themselves need no clock."""
+        """Return rows with a device time; rows that have GPS time themselves need no clock."""
         if (rows["gps_week"] >= 0).any() or source not in clocks.host.plan.devices:
             return rows
         bare = np.flatnonzero(rows["device_time_ns"] < 0).tolist()

@@ -1,4 +1,4 @@
-"""All that a log says for navigation: the IMU's samples, fixes, headings, marks, and the clocks that place them."""
+"""Reads a log for navigation: the IMU's samples, fixes, headings, marks, and the clocks that place them in time."""
 
 from __future__ import annotations
 
@@ -36,20 +36,20 @@ if TYPE_CHECKING:
 
 @dataclass(slots=True)
 class NavigationLog:
-    """What was read of one session.
+    """The navigation data of one session.
 
     Attributes:
         host: the host's clocks, complete.
         imu: rows of the IMU, `IMU_DTYPE`, axes of the IMU itself.
-        fixes, headings: of the receiver, in order of arrival.
-        marks: of all receivers, with their source.
+        fixes, headings: records of the receiver, in order of arrival.
+        marks: event marks of all receivers, with their source.
         ins: solutions of a device's INS, `INS_DTYPE`, attitude of b.
-        counts: records by source.
-        refused: messages that gave nothing, by source and reason.
-        heard: bytes, those of them that belong to no message, and messages by name, by source.
-        lost: units that the recorder lost, by source.
-        doubts: what the sources' messages leave uncertain, a line each.
-        remarks: lines of parsers for the user.
+        counts: number of records by source and type.
+        refused: messages that gave no record, by source and reason.
+        heard: by source: number of bytes, of bytes outside any message, and of messages by name.
+        lost: number of units that the recorder lost, by source.
+        doubts: doubts about the sources' messages, one line each.
+        remarks: parsers' lines for the user.
     """
 
     session: Session
@@ -68,7 +68,7 @@ class NavigationLog:
 
 
 class _Reader:
-    """Collects the records of a session."""
+    """Collects the navigation records of a session."""
 
     def __init__(self, sources: NavigationSources, session: Session) -> None:
         unnamed = sources.gnss_name is None
@@ -80,7 +80,7 @@ class _Reader:
         self._ins: list[StructArray] = []
 
     def take(self, batch: LogBatch) -> None:
-        """The next messages."""
+        """Take the next messages."""
         topic, host = batch.channel.topic, self.found.host
         if topic == "/clock":
             for reading in readings_of(batch):
@@ -101,7 +101,7 @@ class _Reader:
                 self._take_records(name, self._parsers[name].feed_batch(units))
 
     def close(self) -> NavigationLog:
-        """Return tails of the streams; all clocks at once."""
+        """Read the tails of the streams, settle all clocks at once, and return the log's data."""
         found = self.found
         for name, parser in self._parsers.items():
             self._take_records(name, parser.close())
@@ -145,7 +145,7 @@ class _Reader:
 
 
 def read_navigation_log(session: Session, sources: NavigationSources) -> NavigationLog:
-    """Read all but the scanners' messages of a session, chunk by chunk.
+    """Read all messages of a session except the scanners', chunk by chunk.
 
     Raises:
         ConfigError: a driver cannot work with its settings.
@@ -162,7 +162,7 @@ def read_navigation_log(session: Session, sources: NavigationSources) -> Navigat
 
 
 def session_holes(session: Session) -> list[str]:
-    """Return what is missing of a session that has been read, a line each."""
+    """Return the gaps and damage of a session that has been read, one line each."""
     folder = session.parts[0].path.parent
     lines = [f"{folder}: part {number} of {session.session_id} is missing" for number in session.missing_parts]
     if session.growing is not None:

@@ -1,4 +1,4 @@
-"""Navigates logs: start, filter, smoother, diagnosis, leg by leg; one trajectory of each session."""
+"""Navigates logs: start, filter, smoother, diagnosis, leg by leg; gives one trajectory per session."""
 
 from __future__ import annotations
 
@@ -42,30 +42,30 @@ if TYPE_CHECKING:
     from swath.georef.navigation.inputs import Setup, Start
     from swath.georef.navigation.solve import Solved
 
-FEWEST = 20  # solutions to compare
+FEWEST = 20  # minimum number of solutions to compare
 STEP_NS = 1_000_000_000
-APART_M = 0.2  # from where on another point is meant
-STEADY = 0.5  # scatter of the offset in b, over its length, beyond which it is no point of the body
-NEAR = 0.3  # of the lever arm: so near to the antenna it is the antenna
+APART_M = 0.2  # offset from which on the INS gives another point
+STEADY = 0.5  # scatter of the offset in b, relative to its length, above which it is not a point of the body
+NEAR = 0.3  # of the lever arm: within this distance the point is the antenna
 
 SMALLEST_BYTES = 1 << 20  # smaller arrays are kept in memory
 
-Tell = Callable[[str, int, int], None]  # what is done, how much, of how much
-UNTIL_A_FIX_NS = 1_000_000_000  # a shorter wait for a position is that of a receiver's rate
+Tell = Callable[[str, int, int], None]  # arguments: the step, how much is done, of how much
+UNTIL_A_FIX_NS = 1_000_000_000  # a shorter wait for a position is due to the receiver's rate
 NAVIGATED = "navigation of the log's IMU and GNSS"
-GIVEN_SIGMA_RAD = tuple(map(math.radians, (1.0, 1.0, 3.0)))  # of an attitude that somebody says by hand
+GIVEN_SIGMA_RAD = tuple(map(math.radians, (1.0, 1.0, 3.0)))  # sigmas of an attitude that the user enters
 COLUMNS = ("time_ns", "position_e", "q_e_from_b", "velocity_e", "position_sigma_l", "attitude_sigma_rad")
 
 
 @dataclass(frozen=True, slots=True)
 class NavigationOptions:
-    """What the command line says of the run.
+    """The options of navigation from the command line.
 
     Attributes:
-        inputs: of what is read.
-        smooth: the smoother runs too; False: as it was in real time.
-        attitude_rad: roll, pitch, heading at the start; None: they are found.
-        compare_noise: find out whether the flight asks for another noise of the unit; takes some runs of ten minutes.
+        inputs: options of the inputs.
+        smooth: run the smoother too; False: as in real time.
+        attitude_rad: roll, pitch, heading at the start; None: they are estimated.
+        compare_noise: test whether the flight suggests another noise of the IMU; takes some runs of ten minutes.
     """
 
     inputs: InputOptions = field(default_factory=InputOptions)
@@ -76,7 +76,7 @@ class NavigationOptions:
 
 @dataclass(frozen=True, eq=False)
 class NavigatedLeg:
-    """A leg and what came of it."""
+    """A leg with its solution."""
 
     leg: Leg
     start: Start
@@ -85,11 +85,11 @@ class NavigatedLeg:
     findings: list[Finding]
 
     def solution(self, *, smooth: bool) -> Solution:
-        """Return the one asked for."""
+        """Return the smoothed or the forward solution."""
         return self.solved.smoothed if smooth else self.solved.forward
 
     def noise_found(self) -> dict[str, float]:
-        """Return factors on sigmas, the receiver's own or those assumed of it, with which it was navigated."""
+        """Return the factors on the receiver's sigmas, its own or assumed ones, with which the leg was navigated."""
         rows, setup = self.solved.forward.innovations, self.setup
         found: dict[str, float] = {}
         for kind, words, scales, of_vertical in (
@@ -112,10 +112,10 @@ class Navigated:
     """A session's trajectory and how it came about.
 
     Attributes:
-        legs: those that could be navigated.
-        holes: what is missing, a line each, those of the inputs included.
+        legs: legs that could be navigated.
+        holes: missing data, one line each, those of the inputs included.
         doubts: lines for the user.
-        missing: stretches of the samples without a trajectory, by time; a line of holes each.
+        missing: stretches of samples without a trajectory, by time; each has a line in holes.
     """
 
     inputs: NavigationInputs
@@ -127,24 +127,24 @@ class Navigated:
 
     @property
     def missing_s(self) -> float:
-        """Return how long in all samples have no trajectory."""
+        """Total time of samples without a trajectory, s."""
         return sum(part.seconds for part in self.missing)
 
     @property
     def session_id(self) -> str:
-        """The session's."""
+        """The session's identifier."""
         return self.inputs.session.session_id
 
     def solutions(self) -> list[Solution]:
-        """Of the legs, in order of time."""
+        """Return the solutions of the legs, in order of time."""
         return [leg.solution(smooth=self.smooth) for leg in self.legs]
 
     def trajectory(self, name: str = NAVIGATED) -> Trajectory:
-        """Of all legs; between them are gaps."""
+        """Return the trajectory of all legs, with gaps between them."""
         return joined_trajectory([solution.trajectory() for solution in self.solutions()], name)
 
     def velocity_sigma_l(self) -> FloatArray:
-        """Return (n, 3) m/s of the trajectory's epochs."""
+        """Return sigmas of velocity (n, 3), m/s, at the trajectory's epochs."""
         return np.concatenate([solution.velocity_sigma_l for solution in self.solutions()])
 
 
@@ -154,7 +154,7 @@ def navigate_session(
     """Read a session and navigate it.
 
     Raises:
-        UserError: it cannot be navigated, a line each.
+        UserError: the session cannot be navigated; one line per reason.
         LogError, OSError: the log cannot be read.
     """
     tell("clocks, IMU and GNSS", 0, 1)
@@ -170,10 +170,10 @@ def navigate_inputs(
     tell: Tell = lambda what, done, total: None,
     storage: Storage = IN_MEMORY,
 ) -> Navigated:
-    """Navigate what was read; runs and solutions are kept in the storage.
+    """Navigate inputs that were read; runs and solutions are kept in the storage.
 
     Raises:
-        UserError: no leg of it can be navigated, a line each.
+        UserError: no leg can be navigated; one line per reason.
     """
     legs: list[NavigatedLeg] = []
     holes, missing = list(inputs.holes), list(inputs.missing)
@@ -226,7 +226,7 @@ def _navigated(inputs: NavigationInputs, leg: Leg, wish: NavigationOptions, stor
 
 
 def _why_not(inputs: NavigationInputs, leg: Leg) -> list[str]:
-    """Return what is wrong with a leg's data that gave no start."""
+    """Return the faults in the data of a leg for which no start was found."""
     from swath.georef.navigation.diagnosis.diagnose import diagnose
 
     found = diagnose(leg.inertial, leg.observations, inputs.setup, None)
@@ -234,7 +234,7 @@ def _why_not(inputs: NavigationInputs, leg: Leg) -> list[str]:
 
 
 def _with_attitude(leg: Leg, attitude_rad: tuple[float, float, float]) -> StructArray:
-    """Return the observations, and an attitude that is known at the leg's beginning."""
+    """Return the observations together with a known attitude at the leg's beginning."""
     row = np.zeros(1, OBSERVATION_DTYPE)
     row["time_ns"], row["kind"] = leg.inertial.time_ns[0], Kind.ATTITUDE
     row["value"], row["sigma"] = attitude_rad, GIVEN_SIGMA_RAD
@@ -242,7 +242,7 @@ def _with_attitude(leg: Leg, attitude_rad: tuple[float, float, float]) -> Struct
 
 
 def _unreached(legs: Sequence[NavigatedLeg], *, smooth: bool) -> list[tuple[Stretch, bool]]:
-    """Return the stretches before the starts that were found, and for each whether it has positions to begin from."""
+    """Return the stretches before the starts, and for each whether it has positions to start from."""
     found: list[tuple[Stretch, bool]] = []
     for leg in legs:
         first, rows = int(leg.solution(smooth=smooth).time_ns[0]), leg.leg.observations
@@ -257,7 +257,7 @@ def _unreached(legs: Sequence[NavigatedLeg], *, smooth: bool) -> list[tuple[Stre
 
 
 def _ins_doubts(inputs: NavigationInputs, navigated: Trajectory) -> list[str]:
-    """Of the device's own INS, against what was navigated."""
+    """Return doubts about the device's own INS, compared with the navigated trajectory."""
     source = inputs.sources.ins_source
     if source is None or len(inputs.ins) < 2:
         return []
@@ -276,10 +276,10 @@ def joined_trajectory(parts: Sequence[Trajectory], name: str, max_gap_ns: int = 
 
 
 def arm_of_text(text: str) -> tuple[float, float, float]:
-    """Return a lever arm, m in b, of ``x,y,z`` in metres.
+    """Return the lever arm, m in b, from a text ``x,y,z`` in metres.
 
     Raises:
-        UserError: the text says none.
+        UserError: the text is not a lever arm.
     """
     try:
         x, y, z = (float(part) for part in text.split(","))
@@ -291,10 +291,10 @@ def arm_of_text(text: str) -> tuple[float, float, float]:
 
 
 def attitude_of_text(text: str) -> tuple[float, float, float]:
-    """Return ``roll,pitch,heading`` in degrees; rad.
+    """Return the attitude, rad, from a text ``roll,pitch,heading`` in degrees.
 
     Raises:
-        UserError: it is none.
+        UserError: the text is not an attitude.
     """
     try:
         roll, pitch, heading = (float(part) for part in text.split(","))
@@ -306,12 +306,12 @@ def attitude_of_text(text: str) -> tuple[float, float, float]:
 
 
 class MappedStorage(Storage):
-    """Large arrays stand in files without a name, which go with the arrays; `rest` takes them out of memory.
+    """Keeps large arrays in unnamed files, which vanish with the arrays; `rest` takes them out of memory.
 
-    Space is taken when an array is made, so that a full disk is met there; such an array is kept in memory.
+    Disk space is reserved when an array is made, so that a full disk is noticed then; such an array is kept in memory.
 
     Args:
-        folder: of the files; None: that of temporary files.
+        folder: folder of the files; None: that of temporary files.
         smallest_bytes: arrays from this size on are mapped.
     """
 
@@ -320,7 +320,7 @@ class MappedStorage(Storage):
         self._mapped: weakref.WeakSet[mmap.mmap] = weakref.WeakSet()
 
     def empty(self, shape: tuple[int, ...], dtype: Any) -> NDArray[Any]:
-        """Return an array of zeros, mapped where it is large."""
+        """Return an array, mapped and zeroed if it is large."""
         size = prod(shape) * np.dtype(dtype).itemsize
         if size < max(self._smallest_bytes, 1):
             return np.empty(shape, dtype)
@@ -334,14 +334,14 @@ class MappedStorage(Storage):
         return np.frombuffer(mapping, dtype).reshape(shape)
 
     def rest(self) -> None:
-        """Take what is mapped out of memory; it comes back from its file where it is asked for."""
+        """Take mapped arrays out of memory; they are read from their files again when used."""
         for mapping in self._mapped:
             mapping.madvise(mmap.MADV_DONTNEED)
 
 
 def offset_in_b(ins: Trajectory, navigated: Trajectory) -> tuple[FloatArray, FloatArray] | None:
-    """Return median and scatter (3,) of where an INS's point is, from the body's origin in b, m; None: too few to
-    tell.
+    """Return median and scatter (3,) of an INS's point, from the body's origin in b, m; None if there are too few
+    epochs.
     """
     _, first = np.unique(ins.time_ns // STEP_NS, return_index=True)
     first = first[navigated.fates(ins.time_ns[first]) == Fate.GEOREFERENCED]
@@ -355,7 +355,7 @@ def offset_in_b(ins: Trajectory, navigated: Trajectory) -> tuple[FloatArray, Flo
 
 
 def point_doubts(ins: Trajectory, navigated: Trajectory, lever_arms_b: Sequence[FloatArray], source: str) -> list[str]:
-    """Return a line where the INS's point is not the body's origin, and which it seems to be."""
+    """Return a line if the INS's point is not the body's origin, naming the likely point."""
     found = offset_in_b(ins, navigated)
     if found is None:
         return []

@@ -1,7 +1,8 @@
-"""A receiver's fixes and headings as observations: one position and one velocity an epoch, in GPS time, with sigmas.
+"""Turns a receiver's fixes and headings into observations: one position and velocity per epoch, in GPS time, with
+sigmas.
 
-Receivers say an epoch in several messages (BESTPOS and BESTVEL), or the same twice (BESTPOS and BESTGNSSPOS); some say
-no sigmas. Here each becomes at most one row of each kind, and what becomes none is counted by the reason.
+Receivers spread an epoch over several messages (BESTPOS and BESTVEL), or send it twice (BESTPOS and BESTGNSSPOS); some
+send no sigmas. Here each epoch gives at most one row of each kind, and refused messages are counted by reason.
 """
 
 from __future__ import annotations
@@ -22,8 +23,8 @@ from swath.georef.records import FixType, GnssFix, GnssHeading, StructArray, Tim
 from swath.georef.stream.clocks import HostClocks
 from swath.georef.timescales import complete_time
 
-# One standard deviation where a receiver says none: horizontal and vertical, of positions in m, of velocities in m/s.
-# Usual figures of an antenna in flight; a fix type that is not here is not navigated with.
+# One standard deviation for receivers that send none: horizontal and vertical, of positions in m, of velocities in m/s.
+# Usual figures of an antenna in flight; a fix type that is not listed is not used in navigation.
 DEFAULT_SIGMAS: dict[FixType, tuple[tuple[float, float], tuple[float, float]]] = {
     FixType.SINGLE: ((2.0, 4.0), (0.10, 0.20)),
     FixType.DIFFERENTIAL: ((0.8, 1.6), (0.08, 0.16)),
@@ -31,15 +32,15 @@ DEFAULT_SIGMAS: dict[FixType, tuple[tuple[float, float], tuple[float, float]]] =
     FixType.RTK_FIXED: ((0.02, 0.04), (0.03, 0.06)),
     FixType.PPP: ((0.1, 0.2), (0.05, 0.10)),
 }
-GREATEST_SIGMA = 1e4  # m or m/s: beyond, a receiver says that it does not know
-DEFAULT_BASELINE_SIGMA_M = 0.01  # across a baseline, whose length makes an angle of it
-DEFAULT_HEADING_SIGMA_RAD = math.radians(0.5)  # of a baseline of unknown length
+GREATEST_SIGMA = 1e4  # m or m/s: a larger one means that the receiver does not know
+DEFAULT_BASELINE_SIGMA_M = 0.01  # across a baseline; divided by its length it gives an angle
+DEFAULT_HEADING_SIGMA_RAD = math.radians(0.5)  # for a baseline of unknown length
 DEFAULT_INS_SIGMAS_RAD = (math.radians(0.05), math.radians(0.05), math.radians(0.2))
-HEADING_REACH_NS = 500_000_000  # a heading without time belongs to the fix that arrives nearest to it, so near
-BLENDED_BY_INS = {"BESTPOS": "BESTGNSSPOS", "BESTVEL": "BESTGNSSVEL"}  # message: the one of satellites alone
+HEADING_REACH_NS = 500_000_000  # a heading without time belongs to the nearest fix in this reach
+BLENDED_BY_INS = {"BESTPOS": "BESTGNSSPOS", "BESTVEL": "BESTGNSSVEL"}  # message: its counterpart from satellites alone
 
-# Errors of an INS's attitude last: neighbours repeat each other. One every so often is taken, with the sigma of a white
-# error that averages as slowly: share of sigma that is correlated, and for how long.
+# Errors of an INS's attitude last: neighbours repeat each other. One attitude per step is used, with the sigma of a
+# white error that averages as slowly: share of sigma that is correlated, and for how long.
 INS_STEP_NS, INS_SHARE, INS_TAU_S = 20_000_000_000, 1.0, 120.0
 RANK = {FixType.RTK_FIXED: 5, FixType.PPP: 4, FixType.RTK_FLOAT: 3, FixType.DIFFERENTIAL: 2, FixType.SINGLE: 1}
 
@@ -50,8 +51,8 @@ class Observed:
 
     Attributes:
         rows: OBSERVATION_DTYPE, sorted.
-        refused: what became no observation, by reason.
-        assumed: observations whose sigmas are defaults, by kind.
+        refused: number of messages that gave no observation, by reason.
+        assumed: number of observations with default sigmas, by kind.
     """
 
     rows: StructArray
@@ -62,13 +63,13 @@ class Observed:
 def gps_times(
     host: HostClocks, source: str | None, host_ns: Sequence[int], tags: Sequence[TimeTag | None]
 ) -> list[int | None]:
-    """Return GPS ns of a receiver's tags by what arrived when; None where one cannot be placed.
+    """Return GPS ns of a receiver's tags, from the tags and their arrival; None for one that cannot be placed.
 
     Args:
-        host: complete clocks.
-        source: of the receiver, ``gnss/rover``; None: there is none, and no tag.
-        host_ns: of arrival.
-        tags: None: it says no time.
+        host: the host's clocks, complete.
+        source: source of the receiver, ``gnss/rover``; None: there is none, and no tag.
+        host_ns: host times of arrival.
+        tags: time tags; None: the message has no time.
     """
     if source is None or not tags:
         return [None] * len(tags)
@@ -93,7 +94,7 @@ def fix_observations(
 ) -> Observed:
     """Return positions and velocities of fixes at GPS times; ``antennas`` of the receiver have a known lever arm.
 
-    ``said``: names of messages that came beside these, earlier.
+    ``said`` holds names of messages that the receiver sent earlier.
     """
     refused: Counter[str] = Counter()
     assumed: Counter[str] = Counter()
@@ -122,7 +123,7 @@ def fix_observations(
 
 
 def _why_not(fix: GnssFix, at_ns: int | None, antennas: int, said: set[str]) -> str | None:
-    """Return why a fix is no observation; None: it is one."""
+    """Return why a fix is not an observation; None if it is one."""
     if not fix.valid:
         return "not_valid"
     if fix.fix_type not in DEFAULT_SIGMAS:
@@ -160,7 +161,7 @@ def _fill_velocity(row: np.void, fix: GnssFix, assumed: Counter[str]) -> None:
 def _fill_sigmas(
     row: np.void, covariance: FloatArray | None, default: tuple[float, float, float], assumed: Counter[str], kind: str
 ) -> None:
-    """Sigmas and correlations of a covariance, axis by axis the default where it says nothing that can be."""
+    """Fill in sigmas and correlations of a covariance, and on each axis without a valid variance the default."""
     given = np.full((3, 3), np.nan) if covariance is None else np.asarray(covariance, np.float64)
     variance = np.diag(given)
     said = np.isfinite(variance) & (variance > 0.0) & (variance < GREATEST_SIGMA**2)
@@ -179,7 +180,7 @@ def heading_times(
     fixes: Sequence[GnssFix],
     fix_time_ns: Sequence[int | None],
 ) -> list[int | None]:
-    """Return GPS ns of headings; of one that says no time (HDT) that of the fix that arrived nearest to it."""
+    """Return GPS ns of headings; one without time (HDT) takes that of the fix that arrived nearest to it."""
     placed = [(fix.host_time_ns, at) for fix, at in zip(fixes, fix_time_ns, strict=True) if at is not None]
     placed.sort()
     arrived = np.array([host_ns for host_ns, _ in placed], np.int64)
@@ -196,7 +197,7 @@ def heading_times(
 def heading_observations(
     headings: Sequence[GnssHeading], time_ns: Sequence[int | None], baseline_m: float | None
 ) -> Observed:
-    """Return directions of a baseline at GPS times; ``baseline_m`` by the configuration, None: it names no second
+    """Return directions of a baseline at GPS times; ``baseline_m`` from the configuration, None without a second
     antenna.
     """
     refused: Counter[str] = Counter()
@@ -232,9 +233,7 @@ def _angle_sigma(said: float | None, usual: float) -> float:
 def ins_observations(
     rows: StructArray, is_solution: Callable[[NDArray[np.uint32]], NDArray[np.bool_]] | None
 ) -> Observed:
-    """Return attitudes of a device's own INS, now and then: its positions rest on the fixes, which are taken
-    already.
-    """
+    """Return attitudes of a device's own INS at intervals; its positions rest on fixes that are already used."""
     usable = np.isfinite(rows["roll_rad"]) & np.isfinite(rows["pitch_rad"]) & np.isfinite(rows["heading_rad"])
     if is_solution is not None:
         usable &= is_solution(rows["status"])
@@ -253,6 +252,6 @@ def ins_observations(
 
 
 def joined(parts: Sequence[Observed]) -> StructArray:
-    """Return all rows, sorted."""
+    """Return the rows of all parts, sorted."""
     rows = [part.rows for part in parts]
     return sort_observations(np.concatenate(rows) if rows else np.empty(0, OBSERVATION_DTYPE))

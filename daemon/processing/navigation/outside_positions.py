@@ -1,4 +1,4 @@
-"""Positions from post-processing as observations, in place of the receiver's own (``--gnss FILE``)."""
+"""Reads post-processed positions as observations, in place of the receiver's own (``--gnss FILE``)."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ from swath.georef.trajectory.trajectory import TrajectoryError, gps_text
 
 FEWEST_SHIFTED = 10
 MOST_SHIFT_S = 40  # TAI is 37 s from UTC, 19 s from GPS time
-SHIFTED_M, NEARER = 5.0, 5.0  # apart by more, and by so many times more than with the shift
+SHIFTED_M, NEARER = 5.0, 5.0  # apart by more, and by so many times the distance after the shift
 LARGEST_STEP_NS = 2 * SECOND_NS  # positions farther apart are not interpolated
 
 
 @dataclass(frozen=True, slots=True)
 class OutsidePositions:
-    """What a file of positions gave."""
+    """A file of positions and its observations."""
 
     file: Path
     observed: Observed
 
 
 def refuse_unreadable(file: Path) -> None:
-    """UserError where a file cannot be opened."""
+    """Refuse with `UserError` a file that cannot be opened."""
     try:
         file.open("rb").close()
     except OSError as error:
@@ -51,11 +51,11 @@ def outside_observations(
     Args:
         file: RTKLIB .pos or Waypoint text.
         span_ns: GPS time of the log's first and last inertial sample.
-        week: of a file that says none.
-        leap_seconds: as the log knows them, for files in UTC.
+        week: GPS week of a file without one.
+        leap_seconds: leap seconds as the log knows them, for files in UTC.
 
     Raises:
-        UserError: it cannot be read, or is of another time.
+        UserError: the file cannot be read, or is of another time.
     """
     refuse_unreadable(file)
     try:
@@ -74,14 +74,14 @@ def outside_observations(
 
 
 def refuse_shifted(outside: OutsidePositions, own: StructArray) -> None:
-    """Refuse positions that are the receiver's own, but whole seconds before or after them.
+    """Refuse positions that are the receiver's own, but shifted by whole seconds.
 
     Args:
-        outside: what a file gave.
+        outside: positions of a file.
         own: observations of the log's receiver.
 
     Raises:
-        UserError: a shift by whole seconds brings them together, and without it they are apart.
+        UserError: the positions agree after a shift by whole seconds, and not without it.
     """
     own = own[own["kind"] == Kind.POSITION]
     rows = outside.observed.rows
@@ -100,8 +100,8 @@ def refuse_shifted(outside: OutsidePositions, own: StructArray) -> None:
 
 
 def _apart_m(own: StructArray, rows: StructArray, shift_s: int) -> float:
-    """Return median distance of the receiver's positions from the file's so many seconds later; inf: too few have
-    both.
+    """Return the median distance of the receiver's positions from the file's ``shift_s`` later; inf
+    if too few overlap.
     """
     epochs = rows["time_ns"]
     wanted = own["time_ns"] + shift_s * SECOND_NS
@@ -132,7 +132,9 @@ def _observed(columns: TrajectoryColumns) -> Observed:
 
 
 def _fix_types(columns: TrajectoryColumns) -> NDArray[np.uint8]:
-    """Of a file that says none: the kind of fix that is as good as its horizontal sigmas; without them a single one."""
+    """Return the types of fixes; in a file without them, the type whose quality fits the horizontal sigmas, else
+    single.
+    """
     if columns.fix_type is not None:
         return columns.fix_type
     types = np.full(len(columns.time_ns), int(FixType.SINGLE), np.uint8)
@@ -151,7 +153,7 @@ def _rows(
     value: NDArray[np.float64],
     sigma: NDArray[np.float64] | None,
 ) -> tuple[StructArray, NDArray[np.bool_]]:
-    """Return rows of a kind, and where a default sigma stands in them."""
+    """Return rows of a kind, and flags (n,) of those in which a default sigma is used."""
     n = len(columns.time_ns)
     default = np.ones((n, 3))
     for known, sigmas in DEFAULT_SIGMAS.items():

@@ -1,4 +1,4 @@
-"""Which IMU and which receiver a log is navigated with, their parsers and clocks, and what the filter knows of them."""
+"""Chooses the IMU and the receiver that a log is navigated with; holds their parsers, clocks and the filter's setup."""
 
 from __future__ import annotations
 
@@ -27,29 +27,29 @@ if TYPE_CHECKING:
     from swath.daemon.log.reader import Session
 
 
-# Receivers' sigmas of positions are taken for those of all their error. Half of its variance lasts for a minute or so:
+# Receivers' sigmas of positions are taken as those of their total error. Half of its variance lasts for about a minute:
 # multipath, the atmosphere, the orbits. A whole flight's innovations correct both (`swath.georef.navigation.noise`).
 CORRELATED_SHARE, CORRELATION_S = 0.5, 60.0
-HEADING_SHARE, HEADING_CORRELATION_S = 0.36, 60.0  # the same of dual-antenna headings (multipath)
+HEADING_SHARE, HEADING_CORRELATION_S = 0.36, 60.0  # the same for dual-antenna headings (multipath)
 
 
 class NavigationSources:
-    """The sources of a session.
+    """The sources of a session that it is navigated with.
 
     Args:
-        config: of the log, or another one.
+        config: configuration of the log, or another one.
         attachments: the files that it names, by their names in a log.
-        imu, gnss: names; None: the first IMU that is no gimbal's, the first receiver.
-        outside: positions come from a file, so that a receiver is not needed.
+        imu, gnss: names; None: the first IMU and the first receiver that do not belong to a gimbal.
+        outside: True if positions come from a file, so that a receiver is not needed.
         arm_b: (3,) lever arm of the primary antenna, m, in place of the receiver's; None: the receiver's.
 
     Attributes:
-        imu_name, gnss_name: of the configuration; gnss_name is None where it has no receiver.
-        clock: source that shows the host's time beside the IMU.
-        ins_source: whose own INS there may be; None: nobody's.
+        imu_name, gnss_name: names in the configuration; gnss_name is None if it has no receiver.
+        clock: source of the host's time for the IMU.
+        ins_source: source whose own INS may send solutions; None: there is no such source.
 
     Raises:
-        ConfigError, UserError: there are none, or they cannot be used.
+        ConfigError, UserError: sources are missing or cannot be used.
     """
 
     def __init__(
@@ -79,22 +79,22 @@ class NavigationSources:
 
     @property
     def imu(self) -> ImuConfig:
-        """The IMU's table."""
+        """The IMU's table in the configuration."""
         return self.config.imu[self.imu_name]
 
     @property
     def gnss(self) -> GnssConfig | None:
-        """The receiver's table; None: there is no receiver."""
+        """The receiver's table in the configuration; None: there is no receiver."""
         return None if self.gnss_name is None else self.config.gnss[self.gnss_name]
 
     @property
     def imu_source(self) -> str:
-        """``imu/main``."""
+        """The IMU's source name, as ``imu/main``."""
         return f"imu/{self.imu_name}"
 
     @property
     def gnss_source(self) -> str | None:
-        """``gnss/rover``; None: there is no receiver."""
+        """The receiver's source name, as ``gnss/rover``; None: there is no receiver."""
         return None if self.gnss_name is None else f"gnss/{self.gnss_name}"
 
     @property
@@ -104,12 +104,12 @@ class NavigationSources:
 
     @property
     def imu_is_in_receiver(self) -> bool:
-        """An IMU that the receiver itself makes an INS of."""
+        """True if the IMU is inside the receiver, which makes an INS of it."""
         return self.imu.transport == f"gnss:{self.gnss_name}"
 
     @property
     def noise_by_grade(self) -> dict[str, float]:
-        """Keys of ``[imu.….noise]`` that the configuration does not set, with what their grade gives."""
+        """Keys of ``[imu.….noise]`` that the configuration does not set, with the values of its grade."""
         table = self.imu.noise
         noise = noise_of(table)
         one = imu_noise(**dict.fromkeys(_NOISE_FIELDS, 1.0))  # each key's unit
@@ -118,7 +118,7 @@ class NavigationSources:
         return {key: float(f"{found[key]:.6g}") for key in absent}
 
     def noise_words(self) -> str:
-        """In a line: which keys of the noise come from a grade, and whether somebody chose it; empty where none."""
+        """Return a line on which keys of the noise come from a grade and whether it was chosen; empty if none do."""
         table, given = self.imu.noise, self.noise_by_grade
         if not given:
             return ""
@@ -157,24 +157,24 @@ class NavigationSources:
         return found
 
     def inside(self, source: str) -> list[str]:
-        """Return sources whose messages stand in a wire's bytes."""
+        """Return the sources whose messages are in a wire's bytes."""
         return self._devices.inside(source)
 
     def edge_of(self, source: str) -> str | None:
-        """Return polarity of the edges of ``pps/name``; None: no such source."""
+        """Return the polarity of the edges of ``pps/name``; None: there is no such source."""
         return self._devices.edge_of(source)
 
     def clock_plan(self, info: SessionInfo) -> ClockPlan:
-        """Return the clocks of a session; the IMU's own is kept beside them."""
+        """Return the clocks of a session, the IMU's own among them."""
         plan = self._devices.clock_plan(info)
         devices = {} if self.clock is None else {self.imu_source: DevicePlan(self.clock)}
         return replace(plan, devices=devices)
 
-    # ------------------------------------------------------------------ what the filter knows of them
+    # ------------------------------------------------------------------ the filter's setup
 
     @property
     def rot_b_from_imu(self) -> FloatArray:
-        """(3, 3) of ``rotation_b_imu``."""
+        """Rotation (3, 3) from the IMU's axes to b, by ``rotation_b_imu``."""
         return np.array(self.imu.rotation_b_imu, dtype=np.float64)
 
     def ins_rows_in_b(self, rows: NDArray[np.void]) -> NDArray[np.void]:
@@ -182,8 +182,8 @@ class NavigationSources:
         return self._devices.ins_rows(rows)
 
     def setup(self, *, time_sigma_s: float = 0.0) -> Setup:
-        """Return lever arms, baseline and noise; ``time_sigma_s`` of the IMU's times, where an offset is to be
-        found.
+        """Return lever arms, baseline and noise; a ``time_sigma_s`` above 0 has an offset of the
+        IMU's times estimated.
         """
         table = self.gnss
         arms = [np.zeros(3) if table is None else np.array(table.lever_arm_m, dtype=np.float64)]
@@ -199,7 +199,7 @@ class NavigationSources:
 
 
 def filter_setup(noise: ImuNoise, arms_b: Sequence[FloatArray], *, time_sigma_s: float = 0.0) -> Setup:
-    """Return the filter's setup of a unit, and of a receiver with antennas (3,), primary first; see
+    """Return the filter's setup for an IMU and a receiver with antennas (3,), primary first; see
     `NavigationSources`.
     """
     return Setup(
@@ -215,8 +215,9 @@ def filter_setup(noise: ImuNoise, arms_b: Sequence[FloatArray], *, time_sigma_s:
 
 
 def files_of(session: Session, config: Config | None) -> dict[str, bytes]:
-    """Return what a configuration names, by the names in a log: of the log's own (or None) the log's, else those on
-    the disk.
+    """Return the files that a configuration names, by their names in a log: the log's own, or those on disk.
+
+    The log's are used for its own configuration or None.
 
     Raises:
         OSError: a file cannot be read.
@@ -231,7 +232,7 @@ def config_of_log(attachments: Mapping[str, bytes]) -> Config:
     """Return the configuration that is stored in a log.
 
     Raises:
-        UserError: there is none, or one that cannot be used.
+        UserError: there is no configuration, or it cannot be used.
     """
     try:
         config = stored_config(attachments)
@@ -243,7 +244,7 @@ def config_of_log(attachments: Mapping[str, bytes]) -> Config:
 
 
 def without_scanners(config: Config, **tables: Any) -> Config:
-    """Return scanners, their calibrations and the mapping frame do not matter to the way the aircraft went."""
+    """Return a configuration without scanners, calibrations and mapping frame, which navigation does not need."""
     update: dict[str, Any] = {
         "scanner": {},
         "output": OutputConfig.model_validate({}),
@@ -253,7 +254,7 @@ def without_scanners(config: Config, **tables: Any) -> Config:
 
 
 def _chosen(kind: str, wanted: str | None, known: list[str], usual: list[str]) -> str:
-    """Return a name of the configuration; the first of those usually meant where none is asked for."""
+    """Return the wanted name in the configuration; without one, the first of those usually meant."""
     if wanted is not None:
         if wanted in known:
             return wanted
@@ -284,7 +285,7 @@ _NOISE_FIELDS = {
 
 
 def noise_of(table: NoiseConfig) -> ImuNoise:
-    """Return what ``[imu.….noise]`` says; what it leaves out is its grade's."""
+    """Return the noise of ``[imu.….noise]``; values that it leaves out are its grade's."""
     said = {key: value for key, value in table.model_dump().items() if key != "grade" and value is not None}
     grade = GRADES[table.grade]
     in_si = imu_noise(**(dict.fromkeys(_NOISE_FIELDS, 0.0) | said))

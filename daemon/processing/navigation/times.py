@@ -1,4 +1,4 @@
-"""GPS time of an IMU's samples: by its own GPS time, its latch of the PPS, its counter, or by when they arrived."""
+"""Gives GPS times to an IMU's samples: from its own GPS time, its latch of the PPS, its counter, or their arrival."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from swath.georef.stream.clocks import HostClocks
 from swath.georef.timescales import SECOND_NS, WEEK_NS, DeviceClock
 from swath.georef.trajectory.trajectory import gps_text
 
-GREATEST_SIGMA_NS = 1e9  # of a time that is of any use: an offset of this size can still be found
-PAUSE_S = 0.5  # of arrivals: after it a unit without a counter is taken to have missed samples
-LEAST_HOLE_S = 0.5  # a longer stretch without samples is told by itself; shorter ones are bridged, and counted
+GREATEST_SIGMA_NS = 1e9  # of a usable time: an offset of this size can still be found
+PAUSE_S = 0.5  # of arrivals: after it a unit without a counter is assumed to have missed samples
+LEAST_HOLE_S = 0.5  # longer stretches without samples are reported one by one; shorter ones are bridged and counted
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,7 +24,7 @@ class Stretch:
     """A stretch of time in which samples do not become a trajectory.
 
     Attributes:
-        begin_ns, end_ns: GPS time; of samples without a time, as their arrival beside others tells it.
+        begin_ns, end_ns: GPS time; of samples without a time, estimated from their arrival beside others.
         why: the reason, which follows "from … to …, … s:".
     """
 
@@ -34,24 +34,24 @@ class Stretch:
 
     @property
     def seconds(self) -> float:
-        """Return its length."""
+        """Length in seconds."""
         return (self.end_ns - self.begin_ns) / SECOND_NS
 
     @property
     def text(self) -> str:
-        """Return it in words: begin, end, length and reason."""
+        """The stretch in words: begin, end, length and reason."""
         return f"from {gps_text(self.begin_ns)} to {gps_text(self.end_ns)}, {self.seconds:.1f} s: {self.why}"
 
 
 @dataclass(frozen=True, slots=True)
 class ImuTimes:
-    """Which samples have a time.
+    """The samples that have a time, with their times.
 
     Attributes:
-        rows: `IMU_DTYPE` of those that have.
-        gps_ns: (n,) of their stamps.
-        sigma_s: usual standard deviation (median).
-        by: gps (it says GPS time itself), latch (of the PPS), counter, arrival.
+        rows: `IMU_DTYPE` rows of these samples.
+        gps_ns: (n,) GPS times of their stamps.
+        sigma_s: usual standard deviation of a time (median).
+        by: source of the times: gps (the unit gives GPS time itself), latch (of the PPS), counter, arrival.
         refused: samples without a time, by reason.
         dropped: stretches of such samples that are longer than `LEAST_HOLE_S`.
     """
@@ -65,13 +65,13 @@ class ImuTimes:
 
 
 def imu_times(rows: StructArray, host: HostClocks, clock: str | None, rate_hz: float) -> ImuTimes:
-    """Place the samples of a session.
+    """Return the samples of a session with GPS times.
 
     Args:
-        rows: in order of arrival.
-        host: complete clocks.
-        clock: source that shows the host's time; None: there is none.
-        rate_hz: nominal rate, for a unit that says no time of its own.
+        rows: samples in order of arrival.
+        host: the host's clocks, complete.
+        clock: source of the host's time; None: there is none.
+        rate_hz: nominal rate, for a unit without times of its own.
     """
     own = rows["gps_week"] >= 0
     if own.any():
@@ -101,18 +101,18 @@ def imu_times(rows: StructArray, host: HostClocks, clock: str | None, rate_hz: f
 def stretches(
     host_ns: Int64Array, placed: NDArray[np.bool_], gps_ns: Int64Array, rate_hz: float, why: str
 ) -> tuple[Stretch, ...]:
-    """Return the stretches of samples left out that are longer than `LEAST_HOLE_S`.
+    """Return the stretches of unused samples that are longer than `LEAST_HOLE_S`.
 
     Args:
-        host_ns: (n,) of arrival.
-        placed: (n,) samples that are used.
+        host_ns: (n,) host times of arrival.
+        placed: (n,) flags of samples that are used.
         gps_ns: (m,) times of the m samples used.
-        rate_hz: nominal rate: so long is a stretch of many samples at the least.
-        why: reason to tell.
+        rate_hz: nominal rate, from which a stretch's least length follows.
+        why: reason given for the stretches.
     """
     if not len(gps_ns):
         return ()
-    number = np.cumsum(placed) - 1  # of the latest sample used
+    number = np.cumsum(placed) - 1  # index of the latest sample used
     edges = np.flatnonzero(np.diff(np.concatenate([[True], placed, [True]]).astype(np.int8)))
     used = np.flatnonzero(placed)
     found = []
@@ -149,9 +149,9 @@ def _by_device(
 
 
 def counted_arrivals(host_ns: Int64Array, rate_hz: float) -> Int64Array:
-    """Return a counter (n,), ns, for samples that have none: one interval each, and the host's time over pauses.
+    """Return a counter (n,), ns, for samples without one: one interval each, and the host's time over pauses.
 
-    Units arrive in bunches and late; the samples themselves are evenly spaced. The interval is the mean of those
+    Units arrive late and in bunches; the samples themselves are evenly spaced. The interval is the mean of those
     between the pauses, so that crystal and nominal rate may differ.
     """
     steps = np.diff(host_ns)

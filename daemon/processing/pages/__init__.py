@@ -1,1 +1,1 @@
-"""What all pages share: style, canvas, words."""
+"""Style, canvas and words that all HTML pages share."""

@@ -1,4 +1,4 @@
-"""What a report's pictures are drawn on: the same picture wide, narrow and on paper."""
+"""Draws a report's pictures: the same picture wide, narrow and on paper."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ INK, MUTED, LINE, PALE = "#1d242b", "#5d6770", "#b9bdb8", "#eef0ec"
 BEFORE, AFTER, GOOD, BAD = "#b8860b", "#0b5e8a", "#2f7d4f", "#b3261e"
 SERIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#7a5c00", "#56b4e9", "#8b1a1a", "#5b4fc4", "#444444")
 LIMITS_CM = (2.0, 3.0, 5.0)
-CLASSES = ("#2f9e4c", "#f4cc2a", "#e4572e", "#7d1d5a")  # up to each of the limits, and above
+CLASSES = ("#2f9e4c", "#f4cc2a", "#e4572e", "#7d1d5a")  # colours up to each of the limits, and above
 SETTINGS: Any = {
-    "svg.hashsalt": "calibration",  # the same picture gives the same text
+    "svg.hashsalt": "calibration",  # the same picture then gives the same text
     "svg.fonttype": "path",
     "pdf.fonttype": 42,
     "font.family": "DejaVu Sans",
@@ -30,7 +30,7 @@ SETTINGS: Any = {
 
 @dataclass(frozen=True, slots=True)
 class Format:
-    """Width of a picture, how many panels stand beside each other, and ticks on an axis."""
+    """The width of a picture, the number of panels side by side, and the number of ticks on an axis."""
 
     width_in: float
     columns: int
@@ -46,9 +46,9 @@ class Picture:
     """One picture of a report.
 
     Attributes:
-        title, words: above it.
-        height_in: of a format.
-        draw: onto a canvas of that height.
+        title, words: heading and text above it.
+        height_in: gives its height, in inches, in a format.
+        draw: draws it onto a canvas of that height.
     """
 
     title: str
@@ -57,7 +57,7 @@ class Picture:
     draw: Callable[[Canvas], None]
 
     def svg(self, form: Format) -> bytes:
-        """Return drawn alone; the same bytes each time."""
+        """Return the picture as an SVG file; the same picture gives the same bytes."""
         with rc_context(SETTINGS):
             height_in = self.height_in(form)
             figure = Figure(figsize=(form.width_in, height_in), facecolor="white")
@@ -68,11 +68,11 @@ class Picture:
 
 
 class Canvas:
-    """A figure, or a place on a page, measured in inches from its left upper corner.
+    """A figure, or an area of a page, measured in inches from its upper left corner.
 
     Attributes:
-        figure: Matplotlib's.
-        form, height_in: its size.
+        figure: the Matplotlib figure.
+        form, height_in: format and height of the canvas.
     """
 
     def __init__(
@@ -83,24 +83,24 @@ class Canvas:
         self._page_in = float(figure.get_figwidth()), float(figure.get_figheight())
 
     def place(self, left: float, top: float) -> tuple[float, float]:
-        """Return a place in the figure's own measure, 0 … 1 from its left lower corner."""
+        """Return a point in the figure's own coordinates, 0 … 1 from its lower left corner."""
         (across, up), (x, y) = self._page_in, self._corner_in
         return (x + left) / across, 1.0 - (y + top) / up
 
     def panel(self, left: float, top: float, width: float, height: float, **more: Any) -> Axes:
-        """Return axes of this size, dressed."""
+        """Return styled axes of this size."""
         x, y = self.place(left, top + height)
         axes: Axes = self.figure.add_axes((x, y, width / self._page_in[0], height / self._page_in[1]), **more)
         dress(axes)
         return axes
 
     def text(self, left: float, top: float, words: str, **style: Any) -> Any:
-        """Return words whose upper left corner is there."""
+        """Write words with their upper left corner at a point, and return Matplotlib's text."""
         look: dict[str, Any] = {"fontsize": 8.5, "color": INK, "va": "top", "ha": "left"} | style
         return self.figure.text(*self.place(left, top), words, **look)
 
     def legend(self, handles: Sequence[Any], columns: int | None = None, top: float = 0.0) -> None:
-        """Along the upper edge."""
+        """Draw a legend along the upper edge."""
         most = columns or (3 if self.form.narrow else 9)
         rows = -(-len(handles) // most)
         across = -(-len(handles) // rows)
@@ -122,10 +122,10 @@ class Canvas:
 
 
 class Panels:
-    """Equal panels in rows and columns, as many beside each other as the format takes.
+    """Equal panels in rows and columns, as many side by side as the format allows.
 
     Attributes:
-        axes: one a title.
+        axes: one per title.
     """
 
     GAP_IN, LEFT_IN, BOTTOM_IN = 0.62, 0.58, 0.5
@@ -146,13 +146,13 @@ class Panels:
 
     @classmethod
     def height_in(cls, form: Format, count: int, panel_in: float, columns: int | None = None) -> float:
-        """Make that of all rows together, without what stands above."""
+        """Return the height of all rows together, in inches, without what stands above."""
         rows = -(-count // min(columns or form.columns, count))
         return 0.25 + rows * (panel_in + cls.GAP_IN) - cls.GAP_IN + cls.BOTTOM_IN
 
 
 def dress(axes: Axes) -> None:
-    """A panel's colours."""
+    """Style the colours, ticks and grid of a panel."""
     axes.tick_params(labelsize=8, colors=MUTED, length=3)
     axes.spines[:].set_color(LINE)
     axes.spines[["top", "right"]].set_visible(False)
@@ -161,12 +161,12 @@ def dress(axes: Axes) -> None:
 
 
 def colour_of(index: int) -> str:
-    """Return the same one for a swath in every picture."""
+    """Return a swath's colour, the same in every picture."""
     return SERIES[index % len(SERIES)]
 
 
 def class_of(value_cm: float) -> str:
-    """Return colour of a residual's class."""
+    """Return the colour of a residual's class."""
     return CLASSES[sum(value_cm > limit for limit in LIMITS_CM)]
 
 

@@ -1,8 +1,8 @@
-"""The look of pages: light or dark, readable at any width, and on paper."""
+"""Styles of pages: light or dark, readable at any width, and on paper."""
 
 from __future__ import annotations
 
-REPORT_STYLE = """
+QUICKLOOK_STYLE = """
 :root { color-scheme: light dark; --ink: #1d242b; --muted: #5d6770; --paper: #fbfbf9; --card: #fff; --line: #d9dcd7;
   --good: #1d7a38; --bad: #b3261e; --note: #fff4d6; }
 @media (prefers-color-scheme: dark) { :root { --ink: #e6e8e6; --muted: #a3abb1; --paper: #16191c; --card: #1f2428;
@@ -27,7 +27,7 @@ th { color: var(--muted); font-weight: 600; } th:first-child, td:first-child, .l
 td.left { white-space: normal; min-width: 12rem; } .ok { color: var(--good); } .no { color: var(--bad); }
 """
 
-QUICKLOOK_STYLE = """
+REPORT_STYLE = """
 :root { color-scheme: light; --ink: #1d242b; --muted: #5d6770; --paper: #fbfbf9; --card: #fff; --line: #d9dcd7;
   --good: #1d7a38; --care: #e0a100; --bad: #b3261e; --note: #fff4d6; --accent: #0b5e8a; }
 * { box-sizing: border-box; }

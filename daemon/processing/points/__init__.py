@@ -1,1 +1,1 @@
-"""From logs to points: feed, jobs, workers."""
+"""Turns logs into points: feed, jobs, workers."""

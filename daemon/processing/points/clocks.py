@@ -1,4 +1,4 @@
-"""Reads a log's clocks, before its returns are placed in time."""
+"""Reads a log's clocks before its returns are placed in time."""
 
 from __future__ import annotations
 
@@ -36,18 +36,18 @@ from swath.georef.trajectory.buffer import SOLUTION_STATUS
 
 @dataclass(slots=True)
 class LogClocks:
-    """What all of a log says of time and motion, but for its scanners; pickles.
+    """A log's records of time and motion, from every source except scanners; pickles.
 
     Attributes:
         clocks: the host's clock by source, complete.
         ins_rows: solutions of the device's INS, `INS_DTYPE`, attitude of b.
         imu_gps_ns: (n,) GPS time of the samples' arrival; imu_rate_b: (n, 3) rad/s, axes of b. To check that a
             trajectory's motion is this flight's.
-        angles: of gimbals, by the source that told them.
-        counts: records by source.
+        angles: angles of gimbals, by source.
+        counts: number of records by source and type.
         imu_force_b: (n, 3) m/s², axes of b, and fixes: of receivers, by source. To check that a trajectory is of this
             flight; empty unless asked for.
-        remarks: lines for the user, of parsers.
+        remarks: parsers' lines for the user.
     """
 
     clocks: FrozenClocks
@@ -62,7 +62,7 @@ class LogClocks:
 
 
 class _ClockReader:
-    """Collects what all but the scanners say."""
+    """Collects records of every source except scanners."""
 
     def __init__(self, setup: Setup, session: Session, *, positions: bool) -> None:
         self.host = HostClocks(setup.sources.clock_plan(session.info), keep_history=True)
@@ -78,7 +78,7 @@ class _ClockReader:
         self._runs: dict[str, Run] = {}
 
     def take(self, batch: LogBatch) -> None:
-        """The next messages."""
+        """Take the next messages."""
         topic = batch.channel.topic
         source = source_of_topic(topic)
         if topic == "/clock":
@@ -89,7 +89,7 @@ class _ClockReader:
             for found in edges_of(batch, edge) if edge is not None else ():
                 if found is not None:
                     self.host.add_edge(source, found)
-        elif source is not None:  # its own order is enough: times are taken all at once
+        elif source is not None:  # only the source's own order matters: times are settled all at once
             run = self._runs.setdefault(source, Run(partial(self._parse, self._setup.sources.inside(source))))
             run.add(ChunkBatch(source, batch.log_time_ns, batch.units))
 
@@ -99,7 +99,7 @@ class _ClockReader:
                 self.take_records(name, self._parsers[name].feed_batches(batches))
 
     def close(self) -> None:
-        """Tails of the streams, and all times at once."""
+        """Read the tails of the streams and settle all times at once."""
         for run in self._runs.values():
             run.flush()
         for name, parser in self._parsers.items():
@@ -109,19 +109,19 @@ class _ClockReader:
         self.remarks += self.host.settle()
 
     def angles(self) -> dict[str, AngleSeries]:
-        """Of gimbals, from the sources that told some."""
+        """Return the angles of gimbals, from the sources that sent any."""
         found: dict[str, AngleSeries] = {}
         for source, pieces in sorted(self.gimbals.items()):
             rows = np.concatenate(pieces) if pieces else np.empty(0, INS_DTYPE)
             is_solution = SOLUTION_STATUS.get(self._setup.sources.protocol(source))
-            with suppress(MountError):  # fewer than two: who needs them says so
+            with suppress(MountError):  # fewer than two angles: the code that needs them reports it
                 found[source] = AngleSeries.of_solutions(
                     rows if is_solution is None else rows[is_solution(rows["status"])]
                 )
         return found
 
     def take_records(self, source: str, records: list[Record]) -> None:
-        """Of a parser."""
+        """Take the records of a parser."""
         counts = self.counts.setdefault(source, Counter())
         for record in records:
             rows = getattr(record, "rows", None)
@@ -139,10 +139,10 @@ class _ClockReader:
 
 
 def read_clocks(session: Session, setup: Setup, *, positions: bool = False) -> LogClocks:
-    """Read all but the scanners' messages of a session, a first pass before its returns are georeferenced.
+    """Read all messages of a session except the scanners', a first pass before its returns are georeferenced.
 
-    What belongs to scanners is passed over chunk by chunk: a chunk holds one class of channels. With ``positions``
-    the receivers' fixes and the IMU's specific forces are kept too.
+    Scanners' data are skipped chunk by chunk: a chunk holds one class of channels. With ``positions`` the receivers'
+    fixes and the IMU's specific forces are kept too.
     """
     reader = _ClockReader(setup, session, positions=positions)
     for batch in session.batches(lambda topic: not topic.startswith("/scanner/"), skim=True):
@@ -154,7 +154,7 @@ def read_clocks(session: Session, setup: Setup, *, positions: bool = False) -> L
     clock = setup.sources.clock_of_imu
     if len(imu) and clock is not None:
         gps_ns, sigma_ns = reader.host.gps_from_host(clock, imu["host_time_ns"])
-        known = sigma_ns <= StreamSettings().max_time_sigma_ns  # a worse clock says nothing of a trajectory's
+        known = sigma_ns <= StreamSettings().max_time_sigma_ns  # a worse clock cannot test a trajectory's time
         gps_ns, rate_b = gps_ns[known], setup.sources.in_b(imu["angular_rate_b"][known])
         if positions:
             force_b = setup.sources.in_b(imu["specific_force_b"][known])

@@ -1,5 +1,7 @@
-"""Returns that are no part of the products, where they were asked for: beyond the range gate they are points that are
-flagged as withheld; those without a place are listed with what is known of them.
+"""Writes returns that are left out of the products, if asked for.
+
+Returns beyond the range gate become points that are flagged as withheld; those without a place are listed with their
+known values.
 """
 
 from __future__ import annotations
@@ -21,23 +23,23 @@ from swath.georef.records import Int64Array, StructArray
 from swath.georef.stream.stream import Stream
 from swath.georef.trajectory.trajectory import Trajectory
 
-LIFTED_GATE_M = (0.0, 100_000.0)  # the least and the greatest that range_min_m and range_max_m can be
-BLOCK_ROWS = 1 << 15  # that are made text of at once
+LIFTED_GATE_M = (0.0, 100_000.0)  # smallest and largest values that range_min_m and range_max_m can have
+BLOCK_ROWS = 1 << 15  # converted to text at once
 COLUMNS = ("device_time_ns", "host_time_ns", "pulse_id", "return_number", "number_of_returns", "channel", "mta_zone")
 HEAD = ",".join(["scanner", "reason", "gps_ns", *COLUMNS, "range_m", "encoder_deg", "intensity"])
 GATED = (Fate.BELOW_RANGE_GATE, Fate.ABOVE_RANGE_GATE)
 
 
 class Dropped:
-    """Takes what a stream leaves out, in the stream's own order.
+    """Takes the returns that a stream leaves out, in the stream's own order.
 
     Args:
-        path: of the list, gzipped CSV; it is made with the first row.
-        stream: whose parsers are connected already.
+        path: path of the list, gzipped CSV; it is created with the first row.
+        stream: a stream whose parsers are already connected.
         put: takes points beyond the gate, with the scanner's name.
 
     Attributes:
-        withheld, rows: points given to ``put``, and rows of the list.
+        withheld, rows: number of points given to ``put``, and of rows of the list.
     """
 
     def __init__(self, path: Path, stream: Stream, put: Callable[[str, Points], None]) -> None:
@@ -51,7 +53,7 @@ class Dropped:
             chain.left_out = partial(self._take, name, without_gate(chain.georeferencer))
 
     def close(self) -> None:
-        """Finish the list."""
+        """Finish and close the list."""
         for file in (self._text, self._raw):
             if file is not None:
                 file.close()
@@ -75,10 +77,10 @@ class Dropped:
     def _placed(
         self, name: str, ungated: Georeferencer, rows: StructArray, time_ns: Int64Array, trajectory: Trajectory
     ) -> BoolArray:
-        """Put those of the rows that have a place; which these are (n,)."""
+        """Put the rows that have a place; return flags (n,) of these."""
         try:
             points, fates = ungated.georeference(rows, time_ns, trajectory)
-        except MappingError:  # the map has a place for none of them
+        except MappingError:  # the map has no place for any of them
             return np.zeros(len(rows), np.bool_)
         if len(points):
             self._put(name, points)
@@ -98,13 +100,15 @@ class Dropped:
     def _file(self) -> gzip.GzipFile:
         if self._text is None:
             self._raw = self._path.open("xb")
-            self._text = gzip.GzipFile("", "wb", fileobj=self._raw, mtime=0)  # no name and time: the same bytes
+            self._text = gzip.GzipFile(
+                "", "wb", fileobj=self._raw, mtime=0
+            )  # without name and time: same rows, same bytes
             self._text.write(f"{HEAD}\n".encode())
         return self._text
 
 
 def without_gate(gated: Georeferencer) -> Georeferencer:
-    """Return makes points as another does, but of the ranges that this one's gate shuts out."""
+    """Return a copy of a georeferencer whose range gate is lifted."""
     made = copy(gated)
     made.model = copy(gated.model)
     made.model.range_gate = LIFTED_GATE_M

@@ -1,8 +1,9 @@
-"""From a log's messages to a stream of points: parsers are fed in the order of the file, the stream decides at ticks.
+"""Turns a log's messages into a stream of points: parsers are fed in the order of the file, the stream decides at
+ticks.
 
 A tick is where the newest log time so far passes a multiple of 200 ms, or where 32 MiB have come since the last one.
-Both depend on the order of the messages alone, so it is the same for a log that is read whole, one that is followed
-while it is written, and one that comes message by message.
+Both depend on the order of the messages alone, so ticks are the same for a log that is read at once, one that is
+followed while it is written, and one that comes message by message.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ from swath.georef.trajectory.buffer import SOLUTION_STATUS
 TICK_NS = 200_000_000
 TICK_BYTES = 32 << 20
 Placed = list[tuple[str, Points]]
-Tick = tuple[int, int, int | None]  # messages from one to before another, and the tick that comes after them
+Tick = tuple[int, int, int | None]  # first message, the one after the last, and the tick that follows
 
 
 def _any_status(status: NDArray[np.uint32]) -> NDArray[np.bool_]:
@@ -49,10 +50,10 @@ class LogFeed:
 
     Args:
         setup: makes the sources' parsers.
-        stream: made by `Setup.stream`; its clocks are the session's.
+        stream: stream made by `Setup.stream`; its clocks are the session's.
 
     Attributes:
-        counts: by source, of records taken and of what was left out.
+        counts: by source, number of records taken and of those left out.
     """
 
     def __init__(self, setup: Setup, stream: Stream) -> None:
@@ -60,7 +61,7 @@ class LogFeed:
         self.counts: dict[str, Counter[str]] = {}
         self._setup = setup
         self._parsers = setup.sources.parsers(("gnss", "scanner")) | setup.sources.ins_parser()
-        # of a growing log; until the device's own INS has a solution
+        # for a growing log, until the device's own INS has a solution
         self.navigator: Navigator | None = None
         if not stream.clocks.frozen:
             self.navigator = navigator_of(setup.config, setup.sources.attachments, stream.clocks)
@@ -76,12 +77,12 @@ class LogFeed:
         self._runs: dict[str, Run] = {}
 
     def take(self, batch: LogBatch, *, context: bool = False) -> Placed:
-        """Return the next messages; the points that have become final.
+        """Take the next messages; return the points that have become final.
 
         Args:
-            batch: in the order of the file.
-            context: they stand around the piece of the log that is wanted: they feed clocks, trajectory and parsers,
-                and their returns give no points.
+            batch: messages in the order of the file.
+            context: True for messages around the wanted piece of the log: they feed clocks, trajectory and parsers, and
+                their returns give no points.
         """
         if context != self._context:
             self.flush()
@@ -103,12 +104,12 @@ class LogFeed:
                 self.stream.path.add(poses)
 
     def flush(self) -> None:
-        """Decode what is held to be decoded together."""
+        """Decode the units that wait to be decoded together."""
         for run in self._runs.values():
             run.flush()
 
     def close(self) -> Placed:
-        """Return the log is over."""
+        """Flush the stream at the end of the log and return the last points."""
         self.flush()
         for source, parser in self._parsers.items():
             self._take_records(source, parser.close())
@@ -120,9 +121,7 @@ class LogFeed:
         return self._parsers[source]
 
     def _pieces(self, batch: LogBatch) -> Iterator[Tick]:
-        """Yield runs of messages, and the tick that comes after each; the last run has none unless it fills the
-        bytes.
-        """
+        """Yield runs of messages and the tick after each; the last run has none unless it reaches `TICK_BYTES`."""
         times, size = batch.log_time_ns, batch.rows.shape[1]
         if self._newest_ns is None:
             self._newest_ns = int(times[0])
@@ -158,7 +157,7 @@ class LogFeed:
             taker(batch)
 
     def _taker(self, topic: str) -> Callable[[LogBatch], None] | None:
-        """Return what takes the messages of a topic; None: nobody wants them."""
+        """Return the function that takes the messages of a topic; None: the topic is not used."""
         if topic == "/clock":
             return self._take_readings
         source = source_of_topic(topic)
@@ -175,7 +174,7 @@ class LogFeed:
             for name in inside:
                 self._take_records(name, self._parsers[name].feed_batches(batches))
 
-        if source.startswith("scanner/"):  # whose records wait for the tick, each scanner's for themselves
+        if source.startswith("scanner/"):  # records of a scanner wait for the tick, separately for each scanner
             run = self._runs.setdefault(inside[0], Run(parse))
             return lambda batch: run.add(ChunkBatch(source, batch.log_time_ns, batch.units))
         return lambda batch: parse([ChunkBatch(source, batch.log_time_ns, batch.units)])
@@ -201,7 +200,8 @@ class LogFeed:
         for record in records:
             rows = getattr(record, "rows", None)
             if isinstance(record, ScannerReturns):
-                rows = np.flatnonzero(record.rows["number_of_returns"])  # the others are pulses that gave none
+                rows = np.flatnonzero(record.rows["number_of_returns"])  # the others are pulses without a return
+            # 228
             counts[type(record).__name__] += 1 if rows is None else len(rows)
             if isinstance(record, ScannerReturns):
                 self._take_returns(source, record.rows)
@@ -223,6 +223,3 @@ class LogFeed:
             rows = rows.copy()
             rows["flags"] |= CONTEXT_FLAG
         self.stream.add_returns(name, rows)
-
-
-# ---------------------------------------------------------------------- all of a log's clocks, before its returns

@@ -1,6 +1,6 @@
-"""A segment of a log as a job that stands alone: it reads its chunks, decodes, georeferences, writes its own file.
+"""Runs a segment of a log as an independent job: it reads its chunks, decodes, georeferences, and writes its own file.
 
-What a job gives depends on its input only, so it does not matter which process or computer does it, or when.
+A job's result depends on its input only, so it does not matter which process or computer runs it, or when.
 """
 
 from __future__ import annotations
@@ -40,23 +40,23 @@ from swath.georef.trajectory.trajectory import Trajectory
 
 MARGIN_NS = 5_000_000_000  # of log time read on either side: edges a device latched, revolutions, pulses in air
 BETWEEN_STRIPS = "between_strips"
-EDGE_SAMPLES = 50  # of the points of a tick
+EDGE_SAMPLES = 50  # points of a tick that are looked at
 MAX_EDGE_RAD = 1.31  # 75°; beams of spinning heads go to the horizon
-Tell = Callable[[int], None]  # bytes of the log that were read
+Tell = Callable[[int], None]  # called with the bytes of the log that were read
 
 
 class JobError(Exception):
-    """A strip that cannot be written at all; one line."""
+    """Raised for a strip that cannot be written; its text is one line."""
 
 
 @dataclass(frozen=True)
 class JobPlan:
-    """What all jobs of a session share, whatever they do; pickles.
+    """The data that all jobs of a session share; pickles.
 
     Attributes:
-        index: where the chunks stand.
-        setup: what makes points.
-        clocks: the host's, complete.
+        index: places of the chunks.
+        setup: setup of the georeferencing.
+        clocks: clocks of the host, complete.
     """
 
     index: LogIndex
@@ -66,13 +66,13 @@ class JobPlan:
 
 @dataclass(frozen=True)
 class SessionPlan(JobPlan):
-    """Of jobs that write files of points.
+    """A plan of jobs that write files of points.
 
     Attributes:
-        las: of the files.
-        intensity_factors: by scanner.
-        numbers: of scanners, as the files say them.
-        copc: the files are cloud optimised.
+        las: settings of the files.
+        intensity_factors: factors on intensities, by scanner.
+        numbers: numbers of scanners in the files.
+        copc: write cloud optimised files.
     """
 
     las: LasSettings
@@ -83,15 +83,15 @@ class SessionPlan(JobPlan):
 
 @dataclass(frozen=True)
 class Job:
-    """A segment to be done; pickles.
+    """A segment to be processed; pickles.
 
     Attributes:
         session: index of its plan.
-        segment: in log time.
-        places: its chunks, and those of the margin.
-        trajectory: as much as it needs; None between strips, where returns are only counted.
-        path: file to be written; None: none.
-        dropped: list of the returns that get no place, which go into no file otherwise; None: they are only counted.
+        segment: segment in log time.
+        places: places of its chunks, and of those of the margin.
+        trajectory: the part of the trajectory that it needs; None between strips, where returns are only counted.
+        path: file to be written; None: no file.
+        dropped: file for the list of returns without a place; None: they are only counted.
     """
 
     session: int
@@ -103,25 +103,25 @@ class Job:
 
     @property
     def size(self) -> int:
-        """Bytes of the log."""
+        """Bytes of the log that it reads."""
         return sum(place.length for place in self.places)
 
 
 @dataclass
 class JobResult:
-    """What became of a segment; plain values.
+    """The outcome of a segment, in plain values.
 
     Attributes:
-        fates: by scanner, returns by what became of them.
-        time_refused: by scanner, stamps that its clock did not believe, by reason.
+        fates: by scanner, number of returns by fate.
+        time_refused: by scanner, number of stamps that its clock rejected, by reason.
         unread: by scanner, messages that its parser refused, by reason, and those missing from its own sequence.
-        first_gps_ns, last_gps_ns: of the points; None: there are none.
-        bounds: least and largest coordinates.
-        edges: by scanner, of the points seen farthest from nadir among some: the angle, rad, the height of the scanner
+        first_gps_ns, last_gps_ns: times of the points; None: there are none.
+        bounds: smallest and largest coordinates.
+        edges: by scanner, for the sampled point seen farthest from nadir: the angle, rad, the height of the scanner
             above the point, m, and the point's ellipsoidal height, m.
-        file_bytes: of the file written.
-        withheld, listed: returns left out that are withheld points of the file, and that are rows of the list.
-        failed: why it could not be done; empty: it was.
+        file_bytes: size of the file written.
+        withheld, listed: number of returns left out that are withheld points of the file, and rows of the list.
+        failed: why the job failed; empty: it did not.
         seconds: CPU time.
     """
 
@@ -147,25 +147,25 @@ class JobResult:
 
 
 class PointSink(Protocol):
-    """What takes a strip's points: a LAZ or a COPC file."""
+    """A writer of a strip's points: a LAZ or a COPC file."""
 
     @property
     def clipped(self) -> Clipped:
-        """What did not fit."""
+        """Numbers of values that did not fit their fields."""
 
     def write(self, points: Points, *, scanner: int = 0, intensity_factor: float = 1.0, withheld: bool = False) -> None:
-        """Append points."""
+        """Append points to the file."""
 
     def close(self) -> None:
         """Finish the file."""
 
 
 def run_job(plan: SessionPlan, job: Job, tell: Tell = lambda size: None) -> JobResult:
-    """Do a job.
+    """Run a job that writes a file of points, or counts returns between strips.
 
     Raises:
-        JobError: its points cannot stand in a file.
-        OSError: the log cannot be read or the file not be written.
+        JobError: its points cannot be stored in a file.
+        OSError: the log cannot be read or the file cannot be written.
     """
     began = time.process_time()
     result = JobResult(job.session, job.segment.strip, job.segment.start_ns, job.segment.end_ns)
@@ -180,7 +180,7 @@ def run_job(plan: SessionPlan, job: Job, tell: Tell = lambda size: None) -> JobR
                 result.file_bytes = stream.tell()
         except (LasError, MappingError) as error:
             raise JobError(f"{job.path.name}: {error}") from error
-        except lazrs.LazrsError as error:  # which does not say what the file system said
+        except lazrs.LazrsError as error:  # this error does not give the file system's reason
             raise OSError(errno.EIO, "cannot be written; is the disk full?", str(job.path)) from error
         finally:
             if not result.points and not result.withheld:
@@ -231,13 +231,13 @@ def feed_job(
     write: Callable[[list[tuple[str, Points]]], None],
     tell: Tell,
 ) -> None:
-    """A job's messages through a feed of its own, which is closed; counts what became of them."""
+    """Pass a job's messages through its own feed, close the feed, and count the fates of returns."""
     stream = feed.stream
     unread = Unread({name: feed.parser(f"scanner/{name}") for name in stream.scanners})
     was_own = False
     for batch, own in _messages(plan, job, result, tell):
         if own is not was_own:
-            feed.flush()  # what is held is decoded, and so counted, as what it was when it came
+            feed.flush()  # units are decoded and counted as own or context, as when they came
             unread.note(own=was_own)
             was_own = own
         write(feed.take(batch, context=not own))
@@ -264,7 +264,7 @@ def _sink(plan: SessionPlan, job: Job, stream: BinaryIO, opened: ExitStack) -> P
 
 
 def _note_span(result: JobResult, points: Points) -> None:
-    columns = points.points_map.T  # one by one: all at once they take ten times as long
+    columns = points.points_map.T  # one by one: all at once takes ten times as long
     least, largest = np.array([column.min() for column in columns]), np.array([column.max() for column in columns])
     first, last = int(points.time_ns.min()), int(points.time_ns.max())
     if result.first_gps_ns is not None and result.last_gps_ns is not None:
@@ -275,7 +275,7 @@ def _note_span(result: JobResult, points: Points) -> None:
 
 
 def _note_edge(result: JobResult, name: str, points: Points, setup: Setup, trajectory: Trajectory) -> None:
-    """Look at some of the points from where the body was."""
+    """Note the sampled point that is farthest from nadir, as seen from the body."""
     assert setup.mapping is not None
     some = points.take(slice(None, None, max(1, len(points) // EDGE_SAMPLES)))
     some = some.take(trajectory.fates(some.time_ns) == Fate.GEOREFERENCED)
@@ -294,7 +294,7 @@ def _note_edge(result: JobResult, name: str, points: Points, setup: Setup, traje
 
 
 def _count(plan: SessionPlan, job: Job, result: JobResult, tell: Tell) -> None:
-    """Returns between strips: decoded and counted, no more."""
+    """Count returns between strips: they are decoded, but not georeferenced."""
     parsers = plan.setup.sources.parsers(("scanner",))
     counts = dict.fromkeys(parsers, 0)
     start_ns, end_ns = job.segment.start_ns, job.segment.end_ns
@@ -319,7 +319,9 @@ def _count(plan: SessionPlan, job: Job, result: JobResult, tell: Tell) -> None:
 
 
 def _messages(plan: JobPlan, job: Job, result: JobResult, tell: Tell) -> Iterator[tuple[LogBatch, bool]]:
-    """Yield messages of the job's chunks, in the order of the file, and whether they are its own or of the margin."""
+    """Yield messages of the job's chunks in the order of the file, each with whether it is the job's own or of the
+    margin.
+    """
     start_ns, end_ns = job.segment.start_ns, job.segment.end_ns
     own_damage: list[PartDamage] = []
     for place in job.places:
@@ -332,7 +334,7 @@ def _messages(plan: JobPlan, job: Job, result: JobResult, tell: Tell) -> Iterato
 
 
 def _runs(batch: LogBatch, start_ns: int, end_ns: int) -> Iterator[tuple[LogBatch, bool]]:
-    """Yield a batch split where messages of the span and others alternate."""
+    """Yield a batch in runs of messages inside and outside the span."""
     own = (batch.log_time_ns >= start_ns) & (batch.log_time_ns < end_ns)
     changes = np.flatnonzero(np.diff(own)) + 1
     for first, last in pairwise([0, *changes.tolist(), len(own)]):

@@ -1,4 +1,4 @@
-"""Joins chunks of one channel, so that each is decoded in one go."""
+"""Joins chunks of one channel so that they are decoded in one call."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from collections.abc import Callable
 
 from swath.georef.records import ChunkBatch
 
-JOINED_BYTES = 256 << 10  # of a source's units, that are decoded at once where others' stand between them
+JOINED_BYTES = 256 << 10  # units of a source that are decoded at once, although units of others stand between them
 
 
 class Run:
-    """Consecutive units of a source that wait to be decoded together, for a call of a parser costs as much as many."""
+    """Consecutive units of a source that are decoded together: a call of a parser costs as much as many units."""
 
     def __init__(self, parse: Callable[[list[ChunkBatch]], None]) -> None:
         self._parse = parse
@@ -18,7 +18,7 @@ class Run:
         self._bytes = 0
 
     def add(self, units: ChunkBatch) -> None:
-        """The next ones, of any length; those of another wire are decoded before them."""
+        """Add units, of any length; units of another wire are decoded first."""
         if self._held and self._held[0].source != units.source:
             self.flush()
         self._held.append(units)
@@ -27,7 +27,7 @@ class Run:
             self.flush()
 
     def flush(self) -> None:
-        """Decode them now."""
+        """Decode the units that wait."""
         held, self._held, self._bytes = self._held, [], 0
         if held:
             self._parse(held)

@@ -1,4 +1,4 @@
-"""Checks that a log knows its time well enough, and says why returns have none."""
+"""Checks that a log's time is known well enough, and explains why returns have no time."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 NO_TIME = Fate.NO_TIME.name.lower()
 GOOD_STATES = (TimeState.LOCKED, TimeState.HOLDOVER)
-MUCH = 0.01  # share of returns without time that is worth a warning
+MUCH = 0.01  # share of returns without time above which a warning is given
 
 
 def refuse_no_time(
@@ -27,18 +27,18 @@ def refuse_no_time(
     remarks: Sequence[str] = (),
     trouble: str = "",
 ) -> None:
-    """The log's own clock must be known well enough to say which second a pulse belongs to.
+    """Refuse a log whose clock is not known well enough to tell which second a pulse belongs to.
 
     Args:
-        log: stands for the session.
-        clock: the source that shows the time.
-        status: of that clock at the end.
-        config: of the session.
-        remarks: what the receivers' parsers have to say.
-        trouble: why what the head says of time cannot be used, where the clock is a head's own.
+        log: first part of the session, for messages.
+        clock: the source of the time.
+        status: status of that clock at the end.
+        config: configuration of the session.
+        remarks: remarks of the receivers' parsers.
+        trouble: why the head's time messages cannot be used, if the clock is a head's own.
 
     Raises:
-        UserError: it is not, and why.
+        UserError: the time is not known; the message gives the reason.
     """
     if trouble and status is not None and status.state is TimeState.NO_TIME:
         raise UserError(f"{log}: {clock}: no receiver is in the log, and the head {trouble}")
@@ -72,7 +72,7 @@ def refuse_no_time(
 
 
 def _refuse_by_remarks(log: Path, status: ClockStatus, remarks: Sequence[str]) -> None:
-    """Refuse a log without time by what parsers say of the dates that they did not believe."""
+    """Refuse a log without time with the parsers' remarks on dates that they rejected."""
     if status.state is TimeState.NO_TIME and remarks:
         raise UserError("\n".join(f"{log}: {remark}" for remark in remarks))
 
@@ -85,15 +85,15 @@ def time_trouble(
     stamps: Stamps | None = None,
     trouble: str = "",
 ) -> str:
-    """Return how many returns have no time good enough, and why; empty: few or none.
+    """Return how many returns lack a good time, and why; empty if few or none do.
 
     Args:
-        scanner: its name.
-        fates: of its returns.
-        refused: stamps that its clock did not believe, by reason.
-        status: of the host's clock.
-        stamps: what its stamps were found to count from; None: it says itself whether it is locked, or nobody knew.
-        trouble: why what it says of time itself cannot be used; empty: it can, or it says nothing.
+        scanner: name of the scanner.
+        fates: number of its returns by fate.
+        refused: number of stamps that its clock rejected, by reason.
+        status: status of the host's clock.
+        stamps: what its stamps count from; None: it reports itself whether it is locked, or it is not known.
+        trouble: why its own time messages cannot be used; empty if they can, or it sends none.
     """
     total = sum(fates.values())
     lost = fates.get(NO_TIME, 0)

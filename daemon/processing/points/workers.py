@@ -1,4 +1,4 @@
-"""Does jobs: here, in processes of this computer, or on a Dask cluster; the longest first, with the same results."""
+"""Runs jobs here, in processes of this computer, or on a Dask cluster; the longest first, with the same results."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ TELL_EVERY_S = 0.2
 CONNECT_S = 10
 DIED = "the process died, as it does when memory is short"
 UNGUARDED = 'want the call in a script under if __name__ == "__main__":, for processes import the script; or one worker'
-END_S = 5.0  # for a process to end when it was told to
+END_S = 5.0  # for a process to end after it was terminated
 Progress = Callable[[int], None]  # bytes done so far
-Do = Callable[[Any, Job, Progress], JobResult]  # with the plan of its session; is told bytes
+Do = Callable[[Any, Job, Progress], JobResult]  # takes the plan of its session and a function for the bytes done
 
-_plans: list[Any] = []  # of a worker process
-_done: Any = None  # its share of the bytes done
+_plans: list[Any] = []  # in a worker process
+_done: Any = None  # in a worker process: the shared count of bytes done
 
 
 def refuse_in_import() -> None:
-    """Refuse to begin anew in a worker process that is only importing the script which began it.
+    """Refuse to start workers in a worker process that is only importing the main script.
 
     Raises:
-        UserError: this is one.
+        UserError: this process is such a worker.
     """
-    if getattr(multiprocessing.current_process(), "_inheriting", False):  # as `multiprocessing.spawn` finds it
+    if getattr(multiprocessing.current_process(), "_inheriting", False):  # `multiprocessing.spawn` uses the same flag
         raise UserError(f"called while a worker process imports the script: {UNGUARDED}")
 
 
@@ -48,21 +48,21 @@ def run_jobs(
     progress: Progress,
     do: Do = run_job,
 ) -> list[JobResult]:
-    """Do all jobs.
+    """Run all jobs and return their results.
 
     Args:
-        plans: of the sessions, `swath.daemon.processing.points.jobs.JobPlan`.
-        jobs: in any order.
-        workers: processes here; 1: in this one.
-        scheduler: address of a Dask scheduler; None: none.
-        progress: is told the bytes done.
-        do: what is done; a function of a module, for it is named to the processes.
+        plans: plans of the sessions, `swath.daemon.processing.points.jobs.JobPlan`.
+        jobs: jobs in any order.
+        workers: number of processes on this computer; 1: this process.
+        scheduler: address of a Dask scheduler; None: no cluster.
+        progress: called with the bytes done.
+        do: function that does a job; of a module, because processes find it by name.
 
     Returns:
         Results in the order of the jobs. A job whose process died is one that failed.
 
     Raises:
-        JobError: the points of one cannot stand in a file.
+        JobError: points of a job cannot be stored in a file.
         OSError: reading or writing failed.
         UserError: there is no such scheduler, or a script that is only being imported calls this.
     """
@@ -98,7 +98,7 @@ def _failed(job: Job, why: str) -> JobResult:
 
 
 def _begin(plans: bytes, done: Any, begun: Any) -> None:
-    """What a worker process does first; on an interrupt the process that began it ends it."""
+    """Initialise a worker process; on an interrupt, the parent process ends it."""
     global _plans, _done
     begun.value = True
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -108,15 +108,15 @@ def _begin(plans: bytes, done: Any, begun: Any) -> None:
 
 @contextmanager
 def _held_interrupts() -> Iterator[None]:
-    """An interrupt waits till the end of the block; processes begun within hold theirs till they release them.
+    """Hold interrupts back until the end of the block; processes started within hold theirs until they release them.
 
-    A process that is begun reads the plans for seconds: one that the interrupt found there would be left behind.
+    A process that is starting reads the plans for seconds: if an interrupt hit it then, it would be left behind.
     """
     came: list[int] = []
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # which the processes inherit
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # the processes inherit it
     in_main = threading.current_thread() is threading.main_thread()
     before = signal.getsignal(signal.SIGINT)
-    if in_main and callable(before):  # another thread may take the signal, and Python hand it to this one
+    if in_main and callable(before):  # another thread may take the signal, and Python pass it to this one
         signal.signal(signal.SIGINT, lambda number, _: came.append(number))
     try:
         yield
@@ -207,7 +207,7 @@ def _on_cluster(
                 done += jobs[number].size
                 progress(done)
         except BaseException:
-            with suppress(Exception):  # what ends the run is told, not that a worker cannot be reached
+            with suppress(Exception):  # report the error that ends the run, not an unreachable worker
                 client.cancel(list(futures), force=True)
             raise
     return results
@@ -218,7 +218,7 @@ def _do_with(do: Do, plans: list[Any], job: Job) -> JobResult:
 
 
 def _result_of(future: Any, job: Job) -> JobResult:
-    """Return what a job on a cluster gave; a job whose worker was lost is one that failed."""
+    """Return the result of a job on a cluster; a job whose worker was lost has failed."""
     scheduler = importlib.import_module("distributed.scheduler")
     try:
         result: JobResult = future.result()

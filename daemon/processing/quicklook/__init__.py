@@ -1,1 +1,1 @@
-"""`swath view`."""
+"""Implements `swath view`: a page of pictures of point files."""

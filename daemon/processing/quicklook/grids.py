@@ -1,4 +1,4 @@
-"""Maps of cells that points are summed into: returns, pulses, heights, intensities, sigmas."""
+"""Sums points into maps of cells: returns, pulses, heights, intensities, sigmas."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from swath.georef.arrays import FloatArray
 from swath.georef.compiled import jit_cached
 
 MOST_CELLS = 2_000_000
-STEPS = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0)  # times a power of ten
+STEPS = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0)  # factors of a power of ten
 SMALLEST_CELL_M = 0.05
-PULSES_FOR_DENSITY = 25  # in a cell of the density map: its count is then good to 20 %
+PULSES_FOR_DENSITY = 25  # in a cell of the density map: its count is then accurate to 20 %
 COUNT, FIRST, HEIGHT, INTENSITY, SIGMAS, SIGMA_HEIGHT = range(6)
 
 
 def round_up(size: float) -> float:
-    """Return the smallest round size not below one."""
+    """Return the smallest round size that is not below ``size``."""
     power = 10.0 ** math.floor(math.log10(size))
     found = min(step * power for step in (*STEPS, 10.0) if step * power >= size * (1.0 - 1e-9))
     return float(f"{found:.6g}")
@@ -34,7 +34,7 @@ class Frame:
     Attributes:
         west_m, south_m: corner of the first cell.
         cell_m: side of a cell.
-        rows, columns: how many.
+        rows, columns: number of rows and columns.
     """
 
     west_m: float
@@ -45,30 +45,30 @@ class Frame:
 
     @property
     def extent_m(self) -> tuple[float, float, float, float]:
-        """West, east, south, north."""
+        """West, east, south and north edges."""
         east_m, north_m = self.west_m + self.columns * self.cell_m, self.south_m + self.rows * self.cell_m
         return self.west_m, east_m, self.south_m, north_m
 
     def centres(self, row: NDArray[Any], column: NDArray[Any]) -> FloatArray:
-        """Return (n, 2) east and north of the middles of cells."""
+        """Return the centres (n, 2) of cells, east and north."""
         east_m = self.west_m + (column + 0.5) * self.cell_m
         return np.stack([east_m, self.south_m + (row + 0.5) * self.cell_m], axis=1)
 
 
 def frame_of(low_m: FloatArray, high_m: FloatArray, cell_m: float) -> Frame:
-    """Return cells from a south-western (2,) to a north-eastern (2,) corner; larger ones where they would be too
-    many.
+    """Return cells from a south-western (2,) to a north-eastern (2,) corner; larger cells if there
+    would be too many.
     """
     while True:
         first = np.floor(low_m[:2] / cell_m)
-        columns, rows = (np.floor(high_m[:2] / cell_m) - first + 1.0).tolist()  # whole, and never beyond 64 bits
+        columns, rows = (np.floor(high_m[:2] / cell_m) - first + 1.0).tolist()  # as floats, which do not overflow
         if rows * columns <= MOST_CELLS:
             return Frame(float(first[0] * cell_m), float(first[1] * cell_m), cell_m, int(rows), int(columns))
         cell_m = round_up(cell_m * 1.01)
 
 
 def cell_for(density: float, points_a_cell: float) -> float:
-    """Return a round side of cells that hold so many points in the mean, of so many a square metre."""
+    """Return a round side of cells that hold ``points_a_cell`` in the mean at ``density`` per square metre."""
     return round_up(max(math.sqrt(points_a_cell / density), SMALLEST_CELL_M))
 
 
@@ -85,7 +85,7 @@ def _sum_up(
     cell_m: float,
     sums: FloatArray,
 ) -> int:
-    """Add points to sums (rows, columns, 6); gives how many lie outside."""
+    """Add points to sums (rows, columns, 6); return how many lie outside."""
     rows, columns = sums.shape[0], sums.shape[1]
     outside = 0
     for i in range(len(x_m)):
@@ -107,14 +107,14 @@ def _sum_up(
 
 @dataclass(slots=True)
 class Surface:
-    """What all strips together say of each cell.
+    """Sums over all strips together in each cell.
 
     Attributes:
-        frame: its cells.
+        frame: the cells.
         sums: (rows, columns, 6) by COUNT, FIRST … .
-        outside: points that lie beyond the frame.
-        with_sigma: points whose sigma of height is known.
-        unknown_sigma: points that have one that says nothing.
+        outside: number of points beyond the frame.
+        with_sigma: number of points whose sigma of height is known.
+        unknown_sigma: number of points whose sigma field holds no known value.
         low_m, high_m: (3,) corners of the points themselves.
     """
 
@@ -131,7 +131,7 @@ class Surface:
         self.sums = np.zeros((self.frame.rows, self.frame.columns, 6))
 
     def add(self, block: Block) -> None:
-        """Sum a block's points up."""
+        """Add a block's points to the sums."""
         if not len(block):
             return
         frame = self.frame
@@ -146,16 +146,14 @@ class Surface:
         self.outside += _sum_up(*columns, frame.west_m, frame.south_m, frame.cell_m, self.sums)
 
     def mean(self, what: int) -> FloatArray:
-        """Return (rows, columns) means of heights, intensities (of first returns) or sigmas; nan where there is
-        nothing.
-        """
+        """Return means (rows, columns) of heights, intensities (of first returns) or sigmas; nan in empty cells."""
         counts = self.sums[:, :, {INTENSITY: FIRST, SIGMA_HEIGHT: SIGMAS}.get(what, COUNT)]
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.asarray(np.where(counts > 0, self.sums[:, :, what] / counts, np.nan))
 
     def density(self) -> tuple[FloatArray, float]:
-        """Return pulses a square metre (rows, columns) in cells large enough to say so, nan where there are none;
-        their side.
+        """Return pulses per square metre (rows, columns) in cells large enough for it, nan in empty ones; and their
+        side.
 
         A pulse counts where its first return lies.
         """
@@ -171,7 +169,7 @@ class Surface:
 
 
 def inner(there: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return cells all of whose eight neighbours are there too: the others may be covered in part only."""
+    """Return the cells all of whose eight neighbours are covered: others may be covered only partly."""
     found = np.zeros_like(there)
     if min(there.shape) > 2:
         found[1:-1, 1:-1] = there[1:-1, 1:-1]
@@ -183,7 +181,7 @@ def inner(there: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def filled(values: FloatArray, times: int = 2) -> FloatArray:
-    """Return gaps of a few cells filled with the mean of their neighbours, for the eye."""
+    """Return values with gaps of a few cells filled by the mean of their neighbours, for display."""
     made = values.copy()
     for _ in range(times):
         known = np.isfinite(made)

@@ -1,4 +1,4 @@
-"""Maps of a quick look as pictures: height, intensity, density, sigma of height, differences of strips."""
+"""Draws the maps of a quick look: height, intensity, density, sigma of height, differences of strips."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ LEFT_IN, TOP_IN, BOTTOM_IN, LOWEST_PAGE_IN = 1.0, 0.8, 0.62, 4.9
 HALO = [withStroke(linewidth=2.4, foreground="white")]
 STRIP_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#7a5c00", "#56b4e9", "#8b1a1a", "#5b4fc4", "#444444")
 MOST_OUTLINES = 60
-# Leica HxMap's defaults of strip quality control: green to 3 cm, yellow to 5, red to 10
+# Defaults of strip quality control in Leica HxMap: green to 3 cm, yellow to 5, red to 10
 DZ_LIMITS_M = (0.03, 0.05, 0.10)
 DZ_COLOURS = ("#2f9e4c", "#f4cc2a", "#e4572e", "#7d1d5a")
 DZ_WORDS = ("≤ 3 cm", "3–5 cm", "5–10 cm", "> 10 cm")
 
 
 def strip_colour(number: int) -> str:
-    """Return the same one for a strip in every picture."""
+    """Return a strip's colour, the same in every picture."""
     return STRIP_COLOURS[number % len(STRIP_COLOURS)]
 
 
@@ -47,7 +47,7 @@ class MapPage:
 
     Attributes:
         figure: the page.
-        axes: the map's, in metres times the unit's inverse: the files' own coordinates.
+        axes: axes of the map, in the files' own coordinates.
     """
 
     def __init__(self, look: Look, title: str, under: str, side_in: float = NARROW_SIDE_IN) -> None:
@@ -82,7 +82,7 @@ class MapPage:
         return self._panel(self.side_in, self.page_in[1] - TOP_IN - top - height, width, height)
 
     def say(self, top: float, text: str, **style: Any) -> None:
-        """Words in the right column."""
+        """Write words in the right column."""
         look: dict[str, Any] = {"fontsize": 8.5, "color": INK, "va": "top", "linespacing": 1.5} | style
         x, y = self.side_in / self.page_in[0], (self.page_in[1] - TOP_IN - top) / self.page_in[1]
         self.figure.text(x, y, text, **look)
@@ -94,7 +94,7 @@ class MapPage:
         return west_m / units.east_m, east_m / units.east_m, south_m / units.north_m, north_m / units.north_m
 
     def image(self, values: NDArray[Any], frame: Frame, **style: Any) -> Any:
-        """Return cells (rows, columns[, colour]) on the map."""
+        """Draw cells (rows, columns[, colour]) on the map and return Matplotlib's image."""
         return self.axes.imshow(
             values, origin="lower", extent=self.box(frame), aspect=self.axes.get_aspect(), **({"zorder": 1} | style)
         )
@@ -120,7 +120,7 @@ class MapPage:
             label.set(rotation=90, va="center")
 
     def finish(self, path: Path) -> None:
-        """Grid lines, strips, scale bar; then the file."""
+        """Draw grid lines and scale bar, and save the file."""
         self.axes.grid(color="#7c858c", lw=0.4, alpha=0.35, zorder=2)
         self._scale_bar()
         self.figure.savefig(path, dpi=DPI)
@@ -139,7 +139,7 @@ class MapPage:
         self.axes.text(x + part / 2, y + 0.016, text, transform=place, ha="center", va="bottom", **style)
 
     def outlines(self, *, light: bool = False) -> None:
-        """Edges of the strips, with their names."""
+        """Draw the outlines of the strips with their names."""
         look, units = self.look, self.look.units
         for number in range(min(len(look.strips), MOST_OUTLINES)):
             coverage = look.cells.coverage(number)
@@ -167,7 +167,7 @@ class MapPage:
                 continue
             middle, axis = axis_of(places_m)
             along = (places_m - middle) @ axis
-            share = (0.5 + 0.13 * (number % 5 - 2)) * np.ptp(along) + along.min()  # neighbours' names not side by side
+            share = (0.5 + 0.13 * (number % 5 - 2)) * np.ptp(along) + along.min()  # keeps neighbours' names apart
             place = middle + axis * share
             self.axes.text(
                 place[0] / look.units.east_m,
@@ -184,7 +184,7 @@ class MapPage:
             )
 
     def bar(self, image: Any, label: str, **style: Any) -> None:
-        """A colour bar in the right column."""
+        """Draw a colour bar in the right column."""
         height = float(np.clip(self.page_in[1] - TOP_IN - BOTTOM_IN - 0.4, 1.5, 4.2))
         axes = self.side(0.35, 0.2, height)
         made = self.figure.colorbar(image, cax=axes, **style)
@@ -194,13 +194,13 @@ class MapPage:
 
 
 def round_down(size: float) -> float:
-    """Return the largest of 1, 2, 5 × 10ⁿ not above a size."""
+    """Return the largest of 1, 2, 5 × 10ⁿ that is not above a size."""
     power = 10.0 ** math.floor(math.log10(size))
     return max(step * power for step in (1.0, 2.0, 5.0) if step * power <= size * (1 + 1e-9))
 
 
 def _range_of(values: FloatArray, low: float = 2.0, high: float = 98.0) -> tuple[float, float]:
-    """Return percentiles that a colour scale spans; never nothing."""
+    """Return percentiles that a colour scale spans; never an empty range."""
     known = values[np.isfinite(values)]
     if not len(known):
         return 0.0, 1.0
@@ -210,7 +210,7 @@ def _range_of(values: FloatArray, low: float = 2.0, high: float = 98.0) -> tuple
 
 
 def shade_of(heights: FloatArray, cell_m: float) -> FloatArray:
-    """Return (rows, columns) 0 … 1 light on the ground from the north-west; gaps get the nearest height."""
+    """Return brightness (rows, columns), 0 … 1, of ground lit from the north-west; gaps take the nearest height."""
     missing = ~np.isfinite(heights)
     if missing.any():
         nearest = ndimage.distance_transform_edt(missing, return_distances=False, return_indices=True)
@@ -229,7 +229,7 @@ def _cells_words(look: Look) -> str:
 
 
 def draw_height(look: Look, path: Path) -> None:
-    """Mean height of all returns, shaded; the profile's line."""
+    """Draw the mean height of all returns, shaded, and the profile's line."""
     frame = look.surface.frame
     heights = filled(look.surface.mean(HEIGHT))
     low, high = _range_of(heights, 1.0, 99.0)
@@ -261,9 +261,9 @@ def _mark_profile(page: MapPage) -> None:
 
 
 def draw_intensity(look: Look, path: Path) -> None:
-    """Mean intensity of first returns."""
+    """Draw the mean intensity of first returns."""
     values = filled(look.surface.mean(INTENSITY))
-    norm = PowerNorm(0.6, *_range_of(values, 1.0, 99.5))  # few bright roofs and signs do not leave the rest black
+    norm = PowerNorm(0.6, *_range_of(values, 1.0, 99.5))  # keeps the rest visible beside a few bright roofs and signs
     page = MapPage(look, "Intensity", f"mean of first returns, as recorded, {_cells_words(look)}")
     image = page.image(values, look.surface.frame, cmap="gray", norm=norm, interpolation="antialiased")
     page.bar(image, "Intensity (no unit)", extend="both")
@@ -271,7 +271,7 @@ def draw_intensity(look: Look, path: Path) -> None:
 
 
 def draw_density(look: Look, path: Path) -> None:
-    """Pulses a square metre."""
+    """Draw the pulses per square metre."""
     values, cell_m = look.surface.density()
     frame = look.surface.frame
     cells = Frame(frame.west_m, frame.south_m, cell_m, *values.shape)
@@ -291,7 +291,7 @@ def draw_density(look: Look, path: Path) -> None:
 
 
 def draw_sigma(look: Look, path: Path) -> None:
-    """Sigma of height as the files' points carry it."""
+    """Draw the sigma of height from the files' points."""
     values = 100.0 * filled(look.surface.mean(SIGMA_HEIGHT))
     low, high = _range_of(values)
     under = f"one standard deviation, as the files say it, mean of all returns, {_cells_words(look)}"
@@ -303,7 +303,7 @@ def draw_sigma(look: Look, path: Path) -> None:
 
 
 def draw_differences(look: Look, path: Path) -> None:
-    """Differences of overlapping strips in smooth cells, by size, over the shaded ground."""
+    """Draw differences of overlapping strips in smooth cells, by size, over the shaded ground."""
     frame, overlap = look.cells.frame, look.overlap
     numbers = overlap.numbers()
     assert numbers is not None
@@ -339,7 +339,7 @@ def draw_differences(look: Look, path: Path) -> None:
 
 
 def _worst_pairs(look: Look) -> str:
-    """Return the pairs whose medians are farthest from zero."""
+    """Return lines on the pairs whose medians are farthest from zero."""
     rows = sorted(look.overlap.rows, key=lambda row: -abs(row["median_m"]))[:4]
     names = [f"{shortened(look.names[row['first']], 10)} − {shortened(look.names[row['second']], 10)}" for row in rows]
     told = [f"{name}:  {thousands(100 * row['median_m'], 1)} cm" for name, row in zip(names, rows, strict=True)]
@@ -356,7 +356,7 @@ def _pale_ground(page: MapPage) -> None:
 
 
 def _dz_histogram(page: MapPage) -> None:
-    """Signed differences, coloured like the map."""
+    """Draw a histogram of signed differences, coloured like the map."""
     room = page.page_in[1] - TOP_IN - 3.0 - 0.5
     if room < 0.6:
         return
@@ -364,7 +364,7 @@ def _dz_histogram(page: MapPage) -> None:
     counts = page.look.overlap.signed
     share = np.cumsum(np.bincount(np.abs(np.arange(len(counts)) - HISTOGRAM_HALF), counts)) / counts.sum()
     half_m = max(0.06, 1.1 * HISTOGRAM_STEP_M * float(np.searchsorted(share, 0.995)))
-    step = max(1, round(half_m / 0.025)) | 1  # odd, so that a bar stands in the middle
+    step = max(1, round(half_m / 0.025)) | 1  # odd, so that a bar is centred on zero
     width_m = step * HISTOGRAM_STEP_M
     bins = (np.arange(len(counts)) - HISTOGRAM_HALF + step // 2) // step
     totals = np.bincount(bins - bins.min(), counts)

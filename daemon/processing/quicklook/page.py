@@ -1,4 +1,4 @@
-"""The page of a quick look: pictures and tables in one file that needs no network."""
+"""Writes the page of a quick look: pictures and tables in one file that needs no network."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ PICTURES: tuple[tuple[str, str, Callable[[Look, Path], None], Callable[[Look], b
 
 
 def make_page(look: Look, folder: Path, title: str) -> Path:
-    """Draw all pictures into a folder, and write the page beside them; gives its path.
+    """Draw all pictures into a folder and write the page beside them; return its path.
 
     Raises:
         OSError: the folder cannot be written to.
@@ -46,7 +46,7 @@ def make_page(look: Look, folder: Path, title: str) -> Path:
     shown = []
     for name, words, draw, wanted in PICTURES:
         path = folder / f"{name}.png"
-        path.unlink(missing_ok=True)  # of an earlier look
+        path.unlink(missing_ok=True)  # left by an earlier run
         if wanted(look):
             draw(look, path)
             shown.append((words, path))
@@ -56,7 +56,7 @@ def make_page(look: Look, folder: Path, title: str) -> Path:
 
 
 def page_of(look: Look, title: str, pictures: Sequence[tuple[str, Path]]) -> str:
-    """Return the page's text."""
+    """Return the HTML text of the page."""
     parts = [
         f"<!doctype html><html lang='en'><head><meta charset='utf-8'><title>{escape(title)}: quick look</title>",
         "<meta name='viewport' content='width=device-width, initial-scale=1'>",
@@ -108,7 +108,7 @@ def _figures(look: Look) -> str:
 
 
 def _root_mean_square(look: Look) -> float | None:
-    """Of all points' sigmas of height."""
+    """Return the root mean square of all points' sigmas of height; None if they are not known."""
     known = [strip for strip in look.strips if strip.sigma_m is not None]
     points = sum(strip.points for strip in known)
     squares = sum(strip.points * float(strip.sigma_m[2]) ** 2 for strip in known if strip.sigma_m is not None)
@@ -125,7 +125,7 @@ def _notes(look: Look) -> str:
 
 
 def warnings_of(look: Look) -> list[str]:
-    """Return what the files' sidecars warn of, each once."""
+    """Return the warnings in the files' sidecars, each once."""
     return list(dict.fromkeys(line for source in look.sources for line in warnings_in(source.sidecar)))
 
 
@@ -135,7 +135,7 @@ def _picture(words: str, path: Path) -> str:
 
 
 def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return cells are HTML; whoever gives them has escaped what is foreign."""
+    """Return an HTML table of cells that are HTML themselves; the caller has escaped foreign text."""
     head = "".join(f"<th>{word}</th>" for word in heads)
     body = "".join(f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>" for row in rows[:MOST_ROWS])
     more = f"<p class='muted'>and {len(rows) - MOST_ROWS} more</p>" if len(rows) > MOST_ROWS else ""
@@ -191,7 +191,7 @@ def _cm(metres: float | None) -> str:
 
 
 def _percent(share: float) -> str:
-    return f"{100 * math.floor(share * 1e4) / 1e4:.2f} %"  # 100 % only where it is all
+    return f"{100 * math.floor(share * 1e4) / 1e4:.2f} %"  # 100 % only if it is all
 
 
 def _pairs(look: Look) -> str:
@@ -252,7 +252,7 @@ def _files(look: Look) -> str:
 
 
 def _sidecars(look: Look) -> str:
-    """Return what each sidecar says of how its files were made."""
+    """Return the parts about how files were made, from each different sidecar."""
     said: list[tuple[list[str], list[tuple[str, str]]]] = []
     for source in look.sources:
         rows = rows_of(source.sidecar)

@@ -1,4 +1,4 @@
-"""Points of LAS, LAZ and COPC files from any place on."""
+"""Reads points of LAS, LAZ and COPC files from any position on."""
 
 from __future__ import annotations
 
@@ -18,25 +18,24 @@ Points: TypeAlias = laspy.ScaleAwarePointRecord
 Selection: TypeAlias = laspy.DecompressionSelection
 UNREADABLE = (
     *(LaspyException, lazrs.LazrsError, ValueError, KeyError, IndexError, EOFError, OSError, struct.error),
-    *(TypeError, AttributeError, OverflowError, MemoryError),  # of laspy, where a record is none of its kind
+    *(TypeError, AttributeError, OverflowError, MemoryError),  # raised by laspy for records of a wrong kind
 )
 _HEADER_BYTES, _VLR_BYTES, _EVLR_BYTES = 375, 54, 60  # LAS 1.4-R15
-_SIZES = struct.Struct("<HII")  # of the header, offset of the points, number of records between
-_EXTENDED = struct.Struct("<QI")  # where extended records begin, and how many
+_SIZES = struct.Struct("<HII")  # size of the header, offset of the points, number of records between
+_EXTENDED = struct.Struct("<QI")  # where extended records begin, and their number
 _SIZES_AT, _MINOR_AT, _EXTENDED_AT = 94, 25, 235
-_POINT, _POINT_AT = struct.Struct("<BH"), 104  # format with the bit of LAZ, bytes of a point
+_POINT, _POINT_AT = struct.Struct("<BH"), 104  # format with the bit of LAZ, bytes per point
 _COMPRESSED, _MOST_POINT_BYTES = 0x80, 2048
 _VLR = struct.Struct("<2x16sHH32x")  # user, number and length of a record before the points
 _LASZIP = (b"laszip encoded", 22204)
 _CHUNK_POINTS, _CHUNK_POINTS_AT, _VARYING = struct.Struct("<I"), 12, 0xFFFF_FFFF  # in that record
-_MOST_CHUNK_BYTES = 1 << 30  # of points as read; lazrs has room made for a whole chunk. LASzip's own have 50,000 points
+_MOST_CHUNK_BYTES = 1 << 30  # of points as read; lazrs allocates a whole chunk. LASzip's own have 50,000 points
 
 
 def open_points(path: Path, selection: Selection | None = None) -> laspy.LasReader:
-    """Return a reader of a file whose header names no more records than the file has room for: laspy would read on for
-    hours.
+    """Return a reader of a file, after checking that the file has room for the records that its header counts.
 
-    Raises one of UNREADABLE.
+    Without the check laspy would read on for hours. Raises one of UNREADABLE.
     """
     size = path.stat().st_size
     with path.open("rb") as file:
@@ -59,7 +58,7 @@ def _refuse_records(head: bytes, size: int) -> None:
 
 
 def _refuse_chunks(file: BinaryIO, head: bytes, size: int) -> None:
-    """Points or chunks of a size that none has, or more chunks than there are bytes: lazrs would end the process."""
+    """Refuse impossible sizes of points or chunks, or more chunks than bytes: lazrs would end the process."""
     if len(head) < _POINT_AT + _POINT.size:
         return
     kind, point_bytes = _POINT.unpack_from(head, _POINT_AT)
@@ -75,11 +74,11 @@ def _refuse_chunks(file: BinaryIO, head: bytes, size: int) -> None:
         return
     file.seek(points_at)
     (table_at,) = struct.unpack("<q", file.read(8))
-    if table_at == -1:  # written to a pipe: it stands at the end
+    if table_at == -1:  # written to a pipe: the offset is at the end
         file.seek(size - 8)
         (table_at,) = struct.unpack("<q", file.read(8))
     if not 0 <= table_at <= size - 8:
-        return  # a file cut off, whose first points can be read
+        return  # a truncated file, whose first points can be read
     file.seek(table_at)
     _, count = struct.unpack("<II", file.read(8))
     if count > size:
@@ -87,7 +86,7 @@ def _refuse_chunks(file: BinaryIO, head: bytes, size: int) -> None:
 
 
 def _laszip_record(file: BinaryIO, head: bytes) -> bytes:
-    """Return the record that says how points were compressed; empty: there is none."""
+    """Return the record on the compression of the points; empty if there is none."""
     at, _, count = _SIZES.unpack_from(head, _SIZES_AT)
     for _ in range(count):
         file.seek(at)
@@ -100,11 +99,11 @@ def _laszip_record(file: BinaryIO, head: bytes) -> bytes:
 
 @contextmanager
 def _panics_told() -> Iterator[None]:
-    """A panic of lazrs, which is no Exception, as the ValueError that it should be."""
+    """Turn a panic of lazrs, which is not an Exception, into a ValueError."""
     try:
         yield
     except BaseException as error:
-        if type(error).__name__ == "PanicException":  # of pyo3, which lets nobody import it
+        if type(error).__name__ == "PanicException":  # of pyo3, which does not export the class
             raise ValueError(f"lazrs: {error}") from error
         raise
 
@@ -112,12 +111,12 @@ def _panics_told() -> Iterator[None]:
 class PointReader:
     """Reads a file's points forward.
 
-    Where chunks of LAZ vary in size, as in COPC, lazrs finds none but the first: from there on it gives points that are
-    none, without a word. In such files what lies before is read and left.
+    If chunks of LAZ vary in size, as in COPC, lazrs finds only the first: seeking beyond it silently gives wrong
+    points. In such files the points before are read and discarded.
     """
 
     def __init__(self, path: Path, selection: Selection) -> None:
-        """Raises one of UNREADABLE."""
+        """Open a file; raises one of UNREADABLE."""
         self._reader = open_points(path, selection)
         self._at = 0
         self._can_seek = not has_varying_chunks(self._reader.header)
@@ -131,7 +130,7 @@ class PointReader:
         self._reader.close()
 
     def go_to(self, number: int) -> None:
-        """The next point to be read is this one, which has not been read yet."""
+        """Go forward to a point that has not been read yet."""
         if number != self._at and self._can_seek:
             with _panics_told():
                 self._reader.seek(number)
@@ -141,7 +140,7 @@ class PointReader:
                 raise EOFError("the file ends too early")
 
     def read(self, count: int) -> Points:
-        """So many points, or as many as there are."""
+        """Read the next ``count`` points, or as many as are left."""
         with _panics_told():
             points = self._reader.read_points(count)
         self._at += len(points)
@@ -149,15 +148,14 @@ class PointReader:
 
 
 def has_varying_chunks(header: laspy.LasHeader) -> bool:
-    """Return whether a LAZ file's chunks vary in size."""
+    """Return True if a LAZ file's chunks vary in size."""
     found = header.vlrs.get("LasZipVlr")
     with _panics_told():
         return bool(found) and bool(lazrs.LazVlr(found[0].record_data).uses_variable_size_chunks())
 
 
 def sample_of(path: Path, size: int) -> Points:
-    """Return places of some points that follow each other: from the middle, or the first ones where that cannot be
-    found.
+    """Return some consecutive points: from the middle, or the first ones if the middle cannot be found.
 
     Raises one of UNREADABLE.
     """

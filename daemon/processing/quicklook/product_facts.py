@@ -1,4 +1,4 @@
-"""The JSON file beside products, as a page tells it: what made them, with which calibration, what it warns of."""
+"""Reads the JSON file beside products for a page: the software, the calibration and the warnings."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ CRS_KEYS = ("crs", "name", "heights", "datum", "realisation", "epoch", "operatio
 
 
 def sidecar_of(path: Path) -> Json:
-    """Return the JSON object that bears a file's name or lists it among its strips; empty: there is none."""
+    """Return the JSON object that is named after a file or lists it among its strips; empty if there is none."""
     named = (path.with_suffix(".json"), path.with_name(f"{path.name}.json"))
     for beside in named:
         if found := read_sidecar(beside):
@@ -25,7 +25,7 @@ def sidecar_of(path: Path) -> Json:
 
 
 def read_sidecar(path: Path) -> Json:
-    """Return the JSON object of a file; empty: there is none that can be read."""
+    """Return the JSON object of a file; empty if it is missing or cannot be read."""
     try:
         if not path.is_file() or path.stat().st_size > LARGEST_BYTES:
             return {}
@@ -42,7 +42,7 @@ def _files_of(sidecar: Json) -> set[str]:
 
 
 def find_key(tree: Any, name: str) -> Iterator[Any]:
-    """Yield every value of such a key anywhere in what JSON gave."""
+    """Yield every value of a key anywhere in a JSON tree."""
     if isinstance(tree, dict):
         for key, value in tree.items():
             if key == name:
@@ -55,14 +55,14 @@ def find_key(tree: Any, name: str) -> Iterator[Any]:
 
 
 def warnings_in(sidecar: Json) -> list[str]:
-    """Return what it warns of, and what it says is missing."""
+    """Return a sidecar's warnings, and its lines on missing data."""
     values = [value for key in ("warnings", "holes") for value in find_key(sidecar, key)]
     lines = [one for value in values for one in (value if isinstance(value, list) else [value])]
     return [_text(line) for line in lines if line]
 
 
 def calibrations_in(sidecar: Json) -> list[str]:
-    """Return ids of the calibrations, with the scanners' names where there are such."""
+    """Return ids of the calibrations, with the scanners' names if given."""
     told = [_text(value) for value in find_key(sidecar, "calibration_id")]
     for value in find_key(sidecar, "calibrations"):
         if isinstance(value, dict):
@@ -74,14 +74,14 @@ def calibrations_in(sidecar: Json) -> list[str]:
 
 
 def sessions_in(sidecar: Json) -> list[str]:
-    """Return the sessions of which its run is; empty: it does not say so."""
+    """Return the sessions of a sidecar's run; empty if it does not name them."""
     flights = sidecar.get("flights")
     entries = flights if isinstance(flights, list) else []
     return [str(entry["session"]) for entry in entries if isinstance(entry, dict) and entry.get("session")]
 
 
 def height_unit_in(sidecar: Json) -> float | None:
-    """Metres in a unit of the heights, which a CRS without a vertical one cannot say; None: it does not say so."""
+    """Return metres per unit of the heights, which a CRS without a vertical part cannot give; None if not stated."""
     crs = sidecar.get("crs")
     units = crs.get("units") if isinstance(crs, dict) else None
     metres = units.get("metres") if isinstance(units, dict) else None
@@ -90,7 +90,7 @@ def height_unit_in(sidecar: Json) -> float | None:
 
 
 def rows_of(sidecar: Json) -> list[tuple[str, str]]:
-    """Return what a reader of the page wants of it: labels and texts, as they came."""
+    """Return the rows about a sidecar for a reader of the page: labels and texts, unchanged."""
     rows = [("software", _text(sidecar["software"]))] if sidecar.get("software") else []
     if "complete" in sidecar:
         rows.append(("complete", "yes" if sidecar["complete"] is True else "no, partial"))
@@ -116,7 +116,7 @@ def _distinct(values: Iterator[Any]) -> list[Any]:
 
 
 def _text(value: Any) -> str:
-    """Return a value of JSON for people."""
+    """Return a JSON value as text for people."""
     if isinstance(value, bool) or value is None:
         return {True: "yes", False: "no", None: "none"}[value]
     if isinstance(value, int):

@@ -1,4 +1,4 @@
-"""A section through the points: where it best lies, which points are near it, and how far strips lie apart along it."""
+"""Cuts a section through the points: chooses its line, collects points near it, and compares strips along it."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from swath.daemon.processing.quicklook.read import Source, StripBook, Units, rea
 from swath.daemon.processing.quicklook.strips import ROUGHEST_M, Overlap, Pair, StripCells
 from swath.georef.arrays import FloatArray
 
-MOST_POINTS = 2_000_000  # kept of the corridor
-MOST_BLOCKS = 15  # read again for a line that was chosen
+MOST_POINTS = 2_000_000  # maximum points kept in the corridor
+MOST_BLOCKS = 15  # maximum blocks read again for an automatic line
 SHORTEST_M = 50.0
 BINS = 80
 FEWEST_IN_BIN = 5
-BORDER = 0.15  # of the overlap's width, shown beyond it
+BORDER = 0.15  # share of the overlap's width that is shown beyond it
 
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """A section's line.
+    """The line of a section.
 
     Attributes:
-        start_m, end_m: (2,) east and north.
-        half_width_m: of the corridor whose points are shown.
-        title: what the line is.
+        start_m, end_m: (2,) east and north of its ends.
+        half_width_m: half width of the corridor whose points are shown.
+        title: description of the line.
     """
 
     start_m: FloatArray
@@ -39,12 +39,12 @@ class Line:
 
     @property
     def length_m(self) -> float:
-        """From end to end."""
+        """Length from end to end."""
         return float(np.hypot(*(self.end_m - self.start_m)))
 
     @property
     def ahead(self) -> FloatArray:
-        """(2,) unit vector."""
+        """Unit vector (2,) along the line."""
         return (self.end_m - self.start_m) / self.length_m
 
 
@@ -53,11 +53,11 @@ class Profile:
     """Points near a line.
 
     Attributes:
-        line: it.
+        line: the line.
         along_m, aside_m, height_m: (n,) distance from the line's start, to its left, and height.
-        strip: (n,) numbers of strips.
-        single: (n,) the only return of its pulse.
-        complete: whether no point was left out for want of memory.
+        strip: (n,) numbers of the strips.
+        single: (n,) True for the only return of its pulse.
+        complete: True if no point was left out to save memory.
     """
 
     line: Line
@@ -86,9 +86,9 @@ def choose_line(
     sources: Sequence[Source],
     half_width_m: float,
 ) -> Line | None:
-    """Return across the overlap of the two strips with most smooth cells in common; else along the longest strip.
+    """Return a line across the overlap of the two strips with most common smooth cells; else along the longest strip.
 
-    A long strip's middle is shown only, so that not all points need be read again.
+    Of a long strip only the middle is shown, so that not all points need to be read again.
     """
     if overlap.best is not None:
         return _across(cells, overlap.best, names, half_width_m)
@@ -111,7 +111,7 @@ def choose_line(
 
 
 def _across(cells: StripCells, pair: Pair, names: Sequence[str], half_width_m: float) -> Line:
-    """At right angles to the first strip, through the richest part of the overlap."""
+    """Return a line at right angles to the first strip, through the part of the overlap with most cells."""
     points_m = cells.frame.centres(pair.row, pair.column)
     _, along = axis_of(cells.coverage(pair.first).centres())
     across = np.array([along[1], -along[0]])
@@ -119,7 +119,7 @@ def _across(cells: StripCells, pair: Pair, names: Sequence[str], half_width_m: f
     band = np.rint(points_m @ along / (4 * cells.frame.cell_m)).astype(int)
     values, counts = np.unique(band, return_counts=True)
     rich = values[counts >= 0.8 * counts.max()]
-    chosen = rich[np.argmin(np.abs(rich - np.median(band)))]  # of the richest the one nearest the middle
+    chosen = rich[np.argmin(np.abs(rich - np.median(band)))]  # of the bands with most cells, the one nearest the middle
     inside = points_m[band == chosen]
     centre, along_m = inside.mean(axis=0), inside @ across
     half = max(float(np.ptp(along_m)) * (0.5 + BORDER), 5 * cells.frame.cell_m)
@@ -129,15 +129,13 @@ def _across(cells: StripCells, pair: Pair, names: Sequence[str], half_width_m: f
 
 
 def line_through(ends: Sequence[float], units: Units, half_width_m: float) -> Line:
-    """Return a line between two points in the files' coordinates: x1, y1, x2, y2."""
+    """Return the line between two points in the files' coordinates: x1, y1, x2, y2."""
     corners = np.array(ends).reshape(2, 2) * [units.east_m, units.north_m]
     return Line(corners[0], corners[1], half_width_m, "as asked for")
 
 
 def read_profile(sources: Sequence[Source], units: Units, book: StripBook, line: Line, *, trim: bool) -> Profile:
-    """Return the points of a corridor; only blocks that touch it are read. ``trim``: a line without points at its
-    ends.
-    """
+    """Return the points of a corridor, reading only blocks that touch it; ``trim`` cuts empty ends off the line."""
     none = (np.empty(0, np.float32), np.empty(0, np.float32), np.empty(0), np.empty(0, np.int32), np.empty(0, bool))
     parts: list[tuple[NDArray[Any], ...]] = [none]
     found = 0
@@ -163,7 +161,7 @@ def read_profile(sources: Sequence[Source], units: Units, book: StripBook, line:
 
 
 def _trimmed(profile: Profile) -> Profile:
-    """Return its line from the first point to the last."""
+    """Return the profile with its line cut to the first and last points."""
     if len(profile.along_m) < 2 or np.ptp(profile.along_m) <= 0.0:
         return profile
     line = profile.line
@@ -175,7 +173,7 @@ def _trimmed(profile: Profile) -> Profile:
 
 
 def _touches(box: FloatArray, line: Line) -> bool:
-    """Return whether a box (west, south, east, north) may hold points of the corridor; never a false no."""
+    """Return False only if a box (west, south, east, north) holds no points of the corridor."""
     corners = np.array([[x, y] for x in (box[0], box[2]) for y in (box[1], box[3])])
     if not np.isfinite(corners).all():
         return False
@@ -188,11 +186,11 @@ def _touches(box: FloatArray, line: Line) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Steps:
-    """Heights of strips along a line, each less the mean of all strips there.
+    """Heights of strips along a line, relative to the mean of all strips.
 
     Attributes:
-        along_m: (n,) middles of the bins.
-        offset_m: strip → (n,); nan where the surface is rough or the strip alone.
+        along_m: (n,) centres of the bins.
+        offset_m: strip → (n,); nan if the surface is rough or no other strip is there.
     """
 
     along_m: FloatArray
@@ -200,7 +198,7 @@ class Steps:
 
 
 def steps_of(profile: Profile) -> Steps:
-    """Return strips against their mean, bin by bin; a slope common to all strips of a bin is taken out first."""
+    """Return strips against their mean, bin by bin, after removing a slope common to all strips of a bin."""
     line, keep = profile.line, profile.single
     bins = int(np.clip(line.length_m / max(2 * line.half_width_m, 0.5), 1, BINS))
     size_m = line.length_m / bins
@@ -235,7 +233,7 @@ def steps_of(profile: Profile) -> Steps:
 def _slopes(
     xx: FloatArray, xy: FloatArray, yy: FloatArray, xz: FloatArray, yz: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return least squares slopes along and aside; zero where points do not spread."""
+    """Return least squares slopes along and aside; zero if the points do not spread."""
     determinant = xx * yy - xy * xy
     spread = determinant > 1e-6 * (xx + yy) ** 2
     safe = np.where(spread, determinant, 1.0)

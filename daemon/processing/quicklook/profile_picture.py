@@ -1,4 +1,4 @@
-"""The profile of a quick look as a picture: heights along a line, and strips against their mean."""
+"""Draws the profile of a quick look: heights along a line, and strips against their mean."""
 
 from __future__ import annotations
 
@@ -18,11 +18,13 @@ from swath.daemon.processing.quicklook.run import Look
 PAGE_IN = (12.2, 6.4)
 MOST_DRAWN = 150_000
 MOST_IN_LEGEND = 12
-LEAST_HEIGHT_M = 1.0  # that the upper panel spans
+LEAST_HEIGHT_M = 1.0  # minimum height that the upper panel spans
 
 
 def draw_profile(look: Look, path: Path) -> None:
-    """Heights of the corridor's points by strip; below, where strips meet, how far each is off their mean."""
+    """Draw heights of the corridor's points by strip; below, if strips overlap, the deviation of
+    each from their mean.
+    """
     profile = look.profile
     assert profile is not None
     line, steps = profile.line, steps_of(profile)
@@ -58,7 +60,7 @@ def _points(axes: Axes, look: Look, profile: Profile) -> None:
     every = max(1, -(-len(profile.along_m) // MOST_DRAWN))
     along_m, height_m, strip = profile.along_m[::every], profile.height_m[::every], profile.strip[::every]
     size = float(np.clip(9000.0 / max(len(along_m), 1), 0.5, 9.0))
-    mixed = np.arange(len(along_m)) % 7  # no strip lies wholly over another
+    mixed = np.arange(len(along_m)) % 7  # so that no strip lies entirely over another
     for layer in range(7):
         for number in np.unique(strip):
             chosen = (strip == number) & (mixed == layer)

@@ -1,4 +1,4 @@
-"""LAS, LAZ and COPC files in blocks of points, in metres, with a number for every strip."""
+"""Reads LAS, LAZ and COPC files in blocks of points, in metres, with a number for every strip."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ SAMPLE_POINTS = 100_000
 SAMPLE_A_CELL = 8.0
 SIGMA_NAMES = ("sigma_easting", "sigma_northing", "sigma_height")
 NOISE_CLASSES = (7, 18)  # LAS 1.4 R15, table 17: low and high noise
-LARGEST_SCALE, FARTHEST = 1000.0, 1e9  # units of the coordinates, of any map there is
-MOST_CELLS = 1_000_000_000  # along a side, so that a cell's number has 64 bits
-FARTHEST_SCALE = 10.0  # of a map for one on the ground; beyond, the coordinates are of another map
-METRES_PER_DEGREE = 111_320.0  # of the equator; good to 0.5 % anywhere, for pictures only
-WANTED = (  # layers of LAZ that are decoded: all others would cost time and show nothing
+LARGEST_SCALE, FARTHEST = 1000.0, 1e9  # units of the coordinates, in any map
+MOST_CELLS = 1_000_000_000  # along a side, so that a cell's number fits 64 bits
+FARTHEST_SCALE = 10.0  # scale of a map on the ground; beyond it, the coordinates are of another map
+METRES_PER_DEGREE = 111_320.0  # on the equator; accurate to 0.5 % anywhere, for pictures only
+WANTED = (  # layers of LAZ that are decoded; others would cost time without use
     Selection.XY_RETURNS_CHANNEL
     | Selection.Z
     | Selection.CLASSIFICATION
@@ -53,17 +53,17 @@ BAD_CRS = (CRSError, LaspyException, ValueError, KeyError, IndexError, TypeError
 
 
 class QuickLookError(ValueError):
-    """The files cannot be looked at: one line that names the file and what would be right."""
+    """Raised for files that cannot be looked at; its text is one line that names the file and the remedy."""
 
 
 @dataclass(frozen=True, slots=True)
 class Units:
-    """What one unit of a file's coordinates is, and what the user is to know of it.
+    """The units of a file's coordinates, with a note for the user.
 
     Attributes:
-        east_m, north_m, up_m: metres in one unit.
-        name: of the horizontal unit.
-        note: what was taken for granted; empty: nothing.
+        east_m, north_m, up_m: metres per unit.
+        name: name of the horizontal unit.
+        note: assumption that was made; empty: no assumption.
     """
 
     east_m: float = 1.0
@@ -75,15 +75,15 @@ class Units:
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """Points of one strip-numbered block; noise and withheld points are gone.
+    """A block of points with numbered strips, without noise and withheld points.
 
     Attributes:
         x_m, y_m, z_m: (n,) metres, as in the file.
         intensity: (n,).
         strip: (n,) i4 number of the strip.
-        first, single: (n,) bool; of a pulse's returns the first, the only one.
-        sigma_m: (n, 3) f4 of easting, northing and height, nan where not known; (0, 3) where there are none.
-        skipped: noise and withheld points left out.
+        first, single: (n,) bool; True for the first return of a pulse, and for its only return.
+        sigma_m: (n, 3) f4 of easting, northing and height, nan if unknown; (0, 3) if the file has no sigmas.
+        skipped: number of noise and withheld points left out.
     """
 
     x_m: FloatArray
@@ -105,15 +105,15 @@ class Source:
     """A file of points.
 
     Attributes:
-        path: of it.
-        version, point_format, point_count: as its header says.
-        crs: None: it says none, or nothing PROJ knows.
-        trouble: why there is no CRS; empty: there is.
-        low, high: (3,) corners of its header, in its own unit.
-        sigmas: whether every point has three sigmas.
-        times: what its points' times are.
-        sidecar: of the JSON beside it; empty: there is none.
-        damage: why not all of it could be read; empty: it could.
+        path: path of the file.
+        version, point_format, point_count: from its header.
+        crs: None: it has no CRS, or one unknown to PROJ.
+        trouble: why there is no CRS; empty: there is one.
+        low, high: (3,) corners in its header, in its own unit.
+        sigmas: True if every point has three sigmas.
+        times: kind of its points' times.
+        sidecar: content of the JSON beside it; empty: there is none.
+        damage: why not all of it could be read; empty: all was read.
         boxes_m: (4,) west, south, east, north of each block read.
     """
 
@@ -133,17 +133,17 @@ class Source:
 
     @property
     def sessions(self) -> tuple[str, ...]:
-        """Of the run that wrote it, by the sidecar; empty: it does not say so."""
+        """Sessions of the run that wrote it, from the sidecar; empty if not stated."""
         return tuple(sessions_in(self.sidecar))
 
 
 class StripBook:
-    """Numbers from 0 for strips: a point source id is its run's; of points without, their file is the strip.
+    """Assigns numbers from 0 to strips: by run and point source id; points without an id get their file's number.
 
     Attributes:
-        names: by number; ``4/2`` is strip 4 of the second run that has one.
-        origins: by number, sessions of the run and point source id, 0 where there is none.
-        notes: where strips of equal ids are.
+        names: names by number; ``4/2`` is strip 4 of the second run that has one.
+        origins: by number, sessions of the run and point source id, 0 if there is none.
+        notes: notes on strips of equal ids.
     """
 
     def __init__(self) -> None:
@@ -184,10 +184,10 @@ class StripBook:
 
 
 def find_files(paths: Sequence[Path]) -> list[Path]:
-    """Return the files of points in folders and their folders, each once, by name.
+    """Return the point files among paths and in their folders, each once, by name.
 
     Raises:
-        QuickLookError: a path is not there, or there is no such file in it.
+        QuickLookError: a path does not exist, or holds no such file.
     """
     found: dict[Path, Path] = {}
     for path in paths:
@@ -204,10 +204,10 @@ def find_files(paths: Sequence[Path]) -> list[Path]:
 
 
 def open_source(path: Path) -> Source:
-    """Return a file's header and sidecar.
+    """Return a file with its header and sidecar read.
 
     Raises:
-        QuickLookError: it is no LAS or LAZ file, or its coordinates are geocentric.
+        QuickLookError: it is not a LAS or LAZ file, or its coordinates are geocentric.
     """
     try:
         with open_points(path) as reader:
@@ -223,7 +223,7 @@ def open_source(path: Path) -> Source:
         raise QuickLookError(f"{path}: the header's offsets are {offsets.tolist()}, want at most {FARTHEST:g}")
     low, high = np.array(header.mins, float), np.array(header.maxs, float)
     if not (np.abs([low, high]) <= FARTHEST).all():
-        low, high = np.full(3, np.nan), np.full(3, np.nan)  # the points themselves say it
+        low, high = np.full(3, np.nan), np.full(3, np.nan)  # the extent then follows from the points
     crs, trouble = _crs_of(header)
     if crs is not None and crs.is_geocentric:
         raise QuickLookError(f"{path}: coordinates are geocentric ({crs.name}); a map wants a projected CRS")
@@ -247,7 +247,7 @@ def _line(error: BaseException) -> str:
 
 
 def _crs_of(header: laspy.LasHeader) -> tuple[CRS | None, str]:
-    """Return the CRS in the header, or why there is none."""
+    """Return the CRS in the header, or the reason why there is none."""
     try:
         crs = header.parse_crs()
     except BAD_CRS:
@@ -256,7 +256,7 @@ def _crs_of(header: laspy.LasHeader) -> tuple[CRS | None, str]:
 
 
 def units_of(sources: Sequence[Source]) -> Units:
-    """Metres in a unit of each axis of files of one CRS; degrees at the first one's latitude, as on a sphere."""
+    """Return the units of files of one CRS in metres; degrees at the first file's latitude, as on a sphere."""
     known = [source for source in sources if source.crs is not None]
     crs = known[0].crs if known else None
     if crs is None:
@@ -279,7 +279,7 @@ def units_of(sources: Sequence[Source]) -> Units:
 
 
 def _projected(axes: Sequence[Any], across_m: float, name: str, known: Sequence[Source]) -> Units:
-    """Return units of a map's axes, as their CRS says."""
+    """Return the units of a map's axes from their CRS."""
     if len(axes) > 2:
         return Units(across_m, across_m, axes[2].unit_conversion_factor, name)
     if across_m == 1.0:
@@ -291,9 +291,9 @@ def _projected(axes: Sequence[Any], across_m: float, name: str, known: Sequence[
 
 
 def _on_the_ground(crs: CRS, sources: Sequence[Source]) -> tuple[float, str]:
-    """Return metres of a map for one on the ground in the files' middle, 1 where it is near; and what is wrong with it.
+    """Return the map's scale on the ground in the files' middle, or 1 if close to it; and a misfit in words.
 
-    Of a map that is far from true to scale there, as web Mercator's, or whose area of use is elsewhere.
+    A misfit is a map far from true scale there, as web Mercator, or one whose area of use is elsewhere.
     """
     flat = crs.sub_crs_list[0] if crs.is_compound and crs.sub_crs_list else crs
     middles = np.array([(source.low + source.high)[:2] / 2 for source in sources if source.point_count])
@@ -332,12 +332,12 @@ def check_one_crs(sources: Sequence[Source]) -> None:
 
 
 def read_blocks(source: Source, units: Units, book: StripBook, wanted: Sequence[int] | None = None) -> Iterator[Block]:
-    """Yield a file's points block by block; what cannot be read is noted in the source's ``damage``.
+    """Yield a file's points block by block; unreadable parts are noted in the source's ``damage``.
 
     Args:
-        source: the file; the boxes of its blocks are noted while it is read whole.
-        units: of all files of a map.
-        book: which numbers strips have.
+        source: the file; the boxes of its blocks are noted if it is read completely.
+        units: units of all files of a map.
+        book: assigns numbers to strips.
         wanted: numbers of blocks, rising; None: all.
     """
     numbers = range(-(-source.point_count // BLOCK_POINTS)) if wanted is None else wanted
@@ -360,7 +360,7 @@ def read_blocks(source: Source, units: Units, book: StripBook, wanted: Sequence[
 
 
 def _salvaged(source: Source, units: Units, book: StripBook, begin: int, why: str) -> Iterator[Block]:
-    """Yield behind a block that cannot be read as a whole: as many points as can, in small pieces."""
+    """Yield the readable points of a block that cannot be read at once, in small pieces, and note the damage."""
     try:
         with PointReader(source.path, WANTED) as reader:
             reader.go_to(begin)
@@ -377,9 +377,9 @@ def _salvaged(source: Source, units: Units, book: StripBook, begin: int, why: st
 
 
 def density_near(source: Source, units: Units) -> float:
-    """Return returns a square metre, roughly, by some of a file's points: its header cannot tell, a strip lies askew.
+    """Return returns per square metre, roughly, from a sample of points: the header's box is wrong for oblique strips.
 
-    Gives 0 where it cannot be read.
+    Return 0 if the sample cannot be read.
     """
     try:
         points = sample_of(source.path, SAMPLE_POINTS)
@@ -391,7 +391,7 @@ def density_near(source: Source, units: Units) -> float:
         return 0.0
     extent_m = np.maximum(np.ptp(places_m, axis=0), 1.0)
     side_m = math.sqrt(float(extent_m.prod()) / len(places_m))
-    for _ in range(8):  # cells shrink until they hold as few as are told apart from empty ones
+    for _ in range(8):  # cells shrink until they hold just enough points to tell them from empty ones
         cells = np.minimum(np.floor((places_m - places_m.min(axis=0)) / side_m), MOST_CELLS).astype(np.int64)
         covered = len(np.unique(cells[:, 0] * (min(int(extent_m[1] / side_m), MOST_CELLS) + 2) + cells[:, 1]))
         found = len(places_m) / covered
@@ -410,8 +410,8 @@ def _box(block: Block) -> FloatArray:
 
 
 def _sigma(points: Points, name: str) -> NDArray[np.float32]:
-    """Return (n,) metres, as in files of ours; the largest integer says that a sigma is larger than it, or not
-    known.
+    """Return sigmas (n,), metres, as in this software's files; the largest integer means larger or unknown, and gives
+    nan.
     """
     kind = points.array.dtype[name]
     values = np.array(points[name], np.float32)

@@ -1,4 +1,4 @@
-"""A quick look at files of points: read once into cells, then the numbers a surveyor asks for first."""
+"""Takes a quick look at files of points: reads them once into cells, and computes the most important numbers."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ from swath.daemon.processing.quicklook.strips import (
 from swath.daemon.processing.strip_agreement import Agreement
 from swath.georef.arrays import FloatArray
 
-RETURNS_A_CELL = 4  # of the pictures: two point spacings a side
+RETURNS_A_CELL = 4  # of the pictures: a side of two point spacings
 SAMPLED_FILES = 5
 
 Told = Callable[[int, int], None]
@@ -52,7 +52,7 @@ Told = Callable[[int, int], None]
 
 @dataclass(frozen=True, slots=True)
 class StripFacts:
-    """A strip in numbers; lengths in metres, sigmas (3,) of easting, northing and height as root mean squares."""
+    """The numbers of a strip; lengths in metres, sigmas (3,) of easting, northing and height as root mean squares."""
 
     name: str
     points: int
@@ -66,7 +66,7 @@ class StripFacts:
 
 @dataclass(slots=True)
 class StripSums:
-    """What is summed a strip while points are read."""
+    """Sums per strip while points are read."""
 
     sums: FloatArray = field(default_factory=lambda: np.zeros((0, 9)))
 
@@ -96,18 +96,18 @@ class StripSums:
 
 @dataclass(slots=True)
 class Look:
-    """All that is known after reading.
+    """The results of reading files.
 
     Attributes:
-        sources, units: files, their unit.
-        names, origins: of strips by number, and of which sessions' run and point source id they are.
+        sources, units: the files and the units of their coordinates.
+        names, origins: by number of the strip: its name; and the sessions of its run with its point source id.
         surface: cells of all strips together.
-        cells, overlap, agreement: strips apart, and against each other.
-        strips: their facts by number.
-        profile: None: no points for one.
-        density: mean pulses per m² of wholly covered cells; area_m2: of all covered ones.
-        skipped: noise and withheld points.
-        notes: what the reader of the page is to know.
+        cells, overlap, agreement: cells per strip, differences of strips, and their agreement.
+        strips: facts by number of the strip.
+        profile: None: there are no points for one.
+        density: mean pulses per m² of fully covered cells; area_m2: of all covered ones.
+        skipped: number of noise and withheld points.
+        notes: notes for the reader of the page.
     """
 
     sources: list[Source]
@@ -133,18 +133,18 @@ def look_at(
     told: Told = lambda done, of: None,
     strip_cell_m: float | None = None,
 ) -> Look:
-    """Read files and folders.
+    """Read files and folders into a quick look.
 
     Args:
-        paths: of them.
-        cell_m: side of the pictures' cells; None: from the density of points.
-        ends: x1, y1, x2, y2 of the profile in the files' coordinates; None: chosen.
-        told: called with points read and points there are.
-        strip_cell_m: side of the cells in which strips are compared; None: from the strips' density, beginning with
-            ``cell_m`` where that is given and not too fine.
+        paths: files and folders.
+        cell_m: side of the pictures' cells; None: by the density of points.
+        ends: x1, y1, x2, y2 of the profile in the files' coordinates; None: chosen automatically.
+        told: called with the number of points read, and of all points.
+        strip_cell_m: side of the cells in which strips are compared; None: by the strips' density, beginning with
+            ``cell_m`` if it is given and not too fine.
 
     Raises:
-        QuickLookError: there is nothing to look at, or not on one map.
+        QuickLookError: there are no points, or the files do not share one map.
     """
     sources = [open_source(path) for path in find_files(paths)]
     check_one_crs(sources)
@@ -180,7 +180,7 @@ def look_at(
 
 
 def _corners(sources: Sequence[Source], units: Units) -> tuple[FloatArray, FloatArray]:
-    """Return south-western and north-eastern corner (3,) by the headers; those of files without points say nothing."""
+    """Return south-western and north-eastern corners (3,) from the headers of files that have points."""
     metres = np.array([units.east_m, units.north_m, units.up_m])
     corners = np.array([[source.low * metres, source.high * metres] for source in sources if source.point_count])
     good = np.isfinite(corners).all(axis=(1, 2)) & (corners[:, 1] >= corners[:, 0]).all(axis=1)
@@ -190,7 +190,7 @@ def _corners(sources: Sequence[Source], units: Units) -> tuple[FloatArray, Float
 
 
 def _picture_side_m(sources: Sequence[Source], units: Units, corners: tuple[FloatArray, FloatArray]) -> float:
-    """Return the side of the pictures' cells in metres, by some of the files' points."""
+    """Return the side of the pictures' cells in metres, from a sample of the files' points."""
     full = [source for source in sources if source.point_count]
     sampled = full[:: -(-len(full) // SAMPLED_FILES)]
     size_m = np.maximum((corners[1] - corners[0])[:2], 1.0)
@@ -200,7 +200,7 @@ def _picture_side_m(sources: Sequence[Source], units: Units, corners: tuple[Floa
 
 
 class _Reading:
-    """Files read into cells."""
+    """Files that are read into cells."""
 
     def __init__(
         self,
@@ -221,7 +221,7 @@ class _Reading:
         self.sums, self.book, self.skipped = StripSums(), StripBook(), 0
 
     def read(self) -> None:
-        """All of it."""
+        """Read all files into the cells and sums."""
         done = 0
         for source in self.sources:
             source.boxes_m.clear()
@@ -236,9 +236,9 @@ class _Reading:
 
 
 def _read(sources: Sequence[Source], units: Units, given_m: tuple[float | None, float | None], told: Told) -> _Reading:
-    """Return all files; a second time where a header lies about its extent: the points themselves say it then.
+    """Read all files; once more if points lie outside the headers' extent, which then follows from the points.
 
-    ``given_m``: sides of the cells of the pictures and of the strips; None: to be found.
+    ``given_m``: sides of the cells of the pictures and of the strips; None: automatic.
     """
     corners = _corners(sources, units)
     cell_m, strip_cell_m = given_m
@@ -297,7 +297,7 @@ def _profile(
 
 
 def _notes(reading: _Reading, overlap: Overlap, cell_m: float | None, strip_cell_m: float | None) -> list[str]:
-    """Return what was taken for granted, left out or changed."""
+    """Return notes on assumptions, points left out, and changed cell sizes."""
     notes = [reading.units.note] if reading.units.note else []
     notes += reading.book.notes
     notes += time_notes([source.times for source in reading.sources])
@@ -324,7 +324,7 @@ def _notes(reading: _Reading, overlap: Overlap, cell_m: float | None, strip_cell
 
 
 def numbers_of(look: Look) -> dict[str, Any]:
-    """Return the page's numbers, for scripts."""
+    """Return the page's numbers for scripts."""
     return {
         "files": [
             {

@@ -1,10 +1,10 @@
-"""Strips against each other: a plane through each strip's returns in each cell, and the planes' heights compared.
+"""Compares strips: a plane goes through each strip's returns in each cell, and the planes' heights are compared.
 
 Means of heights would compare slopes: where two strips sample a cell differently, their means differ by the slope times
 the distance of their centroids. Planes do not, where the surface is smooth.
 
-Cells begin fine and are put together, two by two, until they hold returns enough of the thinnest strip: so that their
-size goes by the points themselves and by no order of them, and their places by no extent of a file.
+Cells begin fine and are merged, two by two, until they hold enough returns of the thinnest strip: their size depends on
+the points themselves, not on their order, and their places do not depend on the extent of a file.
 """
 
 from __future__ import annotations
@@ -23,21 +23,21 @@ from swath.daemon.processing.quicklook.read import Block
 from swath.georef.arrays import FloatArray
 from swath.georef.compiled import jit_cached
 
-TILE = 16  # cells along a side; memory is taken by tiles
+TILE = 16  # cells along a side; memory is allocated by tiles
 TILE_CELLS = TILE * TILE
 MOMENTS = 11  # first returns; then of single returns n, x, y, z, xx, xy, yy, xz, yz, zz
-MOST_TILES = 12_000  # of all strips: 3 M cells, 270 MB; then cells become twice as large
+MOST_TILES = 12_000  # of all strips: 3 M cells, 270 MB; with more, cells become twice as large
 MOST_STRIPS = 2000
-MOST_FRAME_CELLS = 16_000_000  # within the extent, points or not
-MOST_TILE_PLACES = 8_000_000  # of all strips, tiles or not
+MOST_FRAME_CELLS = 16_000_000  # within the extent, with or without points
+MOST_TILE_PLACES = 8_000_000  # of all strips, with or without tiles
 FINEST_CELL_M = 0.5
 LEVELS = 5  # doublings from the finest cell to the coarsest, 16 m
 RETURNS_A_CELL = 16.0  # single returns on open ground of the thinnest strip, within a factor of two
-RETURNS_TO_MEASURE = 64.0  # of a strip in a block of cells by which its density is measured
-OPEN = 0.7  # of a block's pulses have one return only: open ground
-LEAST_SHARE = 0.05  # of the largest strip's overlap; strips with less do not say how large cells are
-PULSES_FOR_DENSITY = 25.0  # in a cell of which density is told: its count is then good to 20 %
-FEWEST_CELLS, FEWEST_PLACES, FEWEST_IN_PLACE = 100, 3, 3  # of a verdict
+RETURNS_TO_MEASURE = 64.0  # of a strip in a block of cells from which its density is measured
+OPEN = 0.7  # share of a block's pulses with one return only: open ground
+LEAST_SHARE = 0.05  # of the largest strip's overlap; strips with less do not affect the cells' size
+PULSES_FOR_DENSITY = 25.0  # in a cell for which density is given: its count is then accurate to 20 %
+FEWEST_CELLS, FEWEST_PLACES, FEWEST_IN_PLACE = 100, 3, 3  # required for a verdict
 PLACE = TILE // 2  # cells along a side of a place
 FEWEST_RETURNS = 6
 STEEPEST_DEG = 10.0  # USGS Lidar Base Specification: overlap is judged where slopes are below 10 degrees
@@ -45,7 +45,7 @@ ROUGHEST_M = 0.10
 SMALLEST_CELL_M = 0.01
 COARSEST_CELL_M = 20.0
 PULSES_TO_COVER = 6.0
-NARROWEST = 0.125  # of a cell: the least spread (one sigma) of a strip's returns in it, in every direction
+NARROWEST = 0.125  # of a cell: the smallest spread (one sigma) of a strip's returns in it, in any direction
 HISTOGRAM_STEP_M, HISTOGRAM_HALF = 0.001, 10_000
 
 
@@ -63,7 +63,7 @@ def _sum_moments(
     used: int,
     moments: FloatArray,
 ) -> tuple[int, int, int]:
-    """Add points from ``begin`` on; gives where it stopped, for want of a tile, the tiles in use, and points outside.
+    """Add points from ``begin`` on; return where it stopped for lack of a tile, the tiles in use, and points outside.
 
     ``frame``: west, south, cell, reference height. ``tiles``: (strips, rows, columns) of tiles, −1 where there is none.
     """
@@ -108,9 +108,9 @@ class Pair:
         first, second: numbers of the strips.
         dz_m: (n,) differences.
         row, column: (n,) cells.
-        compared: cells where both strips have single returns enough, smooth or not.
-        scatter: of each strip the variances (m,) of its single returns about their planes, m², and their numbers (m,),
-            in level cells, smooth or not.
+        compared: number of cells where both strips have enough single returns, smooth or not.
+        scatter: for each strip, variances (m,) of its single returns about their planes, m², and the numbers (m,) of
+            these returns, in level cells, smooth or not.
     """
 
     first: int
@@ -137,30 +137,30 @@ class Pair:
 
 @dataclass(frozen=True, slots=True)
 class Coverage:
-    """Cells around a strip, and how many of its first returns lie in each."""
+    """Cells around a strip, with the number of its first returns in each."""
 
     frame: Frame
     pulses: FloatArray
 
     @property
     def there(self) -> NDArray[np.bool_]:
-        """Cells with a pulse."""
+        """Flags of cells with a pulse."""
         return np.asarray(self.pulses > 0)
 
     def centres(self) -> FloatArray:
-        """Return (n, 2) east and north of the cells with a pulse."""
+        """Return the centres (n, 2), east and north, of cells with a pulse."""
         return self.frame.centres(*np.nonzero(self.there))
 
 
 @dataclass(slots=True)
 class StripCells:
-    """Moments of every strip's single returns in cells, tile by tile where there are any.
+    """Moments of every strip's single returns in cells; tiles without returns take no memory.
 
     Attributes:
-        frame: of the cells; they grow where there are too many tiles.
+        frame: the cells; they are enlarged if there are too many tiles.
         reference_m: height that moments refer to.
-        left_out: points outside the frame or of strips beyond the most.
-        fixed: the cells' size is the user's word: `settle` leaves it.
+        left_out: number of points outside the frame, or of strips beyond the maximum.
+        fixed: True if the user gave the cells' size: `settle` keeps it.
     """
 
     frame: Frame
@@ -179,7 +179,7 @@ class StripCells:
         return np.full((strips, -(-self.frame.rows // TILE), -(-self.frame.columns // TILE)), -1, np.int32)
 
     def add(self, block: Block) -> None:
-        """Sum a block's points up."""
+        """Add a block's points to the moments."""
         if not len(block):
             return
         strips = min(int(block.strip.max()) + 1, MOST_STRIPS)
@@ -202,7 +202,7 @@ class StripCells:
                 self._coarsen()
 
     def _coarsen(self) -> None:
-        """Twice the cell: four cells' moments, brought to their common centre, in one."""
+        """Double the cells: merge the moments of four cells, referred to their common centre."""
         old, old_tiles, old_moments, used = self.frame, self.tiles, self.moments, self.used
         cell_m = 2 * old.cell_m
         self.frame = Frame(old.west_m, old.south_m, cell_m, -(-old.rows // 2), -(-old.columns // 2))
@@ -221,7 +221,7 @@ class StripCells:
             into[up % 2 * half : up % 2 * half + half, across % 2 * half : across % 2 * half + half] = part
 
     def settle(self) -> None:
-        """Make cells as large as the thinnest strip wants, after all points are in."""
+        """Enlarge the cells as the thinnest strip requires, after all points have been added."""
         if self.fixed:
             return
         known = [density for density in self.single_densities() if density > 0.0]
@@ -231,14 +231,14 @@ class StripCells:
             self._coarsen()
 
     def single_densities(self) -> list[float]:
-        """Return by strip its single returns a square metre, on open ground where it overlaps others.
+        """Return by strip its single returns per square metre, on open ground where it overlaps others.
 
         It is the median over blocks of cells. 0: the strip has no points, or hardly overlaps.
         """
         there = (self.tiles >= 0).reshape(len(self.tiles), -1)
         shared = there & (there.sum(axis=0) > 1)
         sizes = shared.sum(axis=1)
-        if not sizes.any():  # nothing overlaps: all there is
+        if not sizes.any():  # no strips overlap: use all cells
             shared, sizes = there, there.sum(axis=1)
         densities = []
         for strip in range(len(self.tiles)):
@@ -250,7 +250,7 @@ class StripCells:
         return densities
 
     def pulse_density(self) -> tuple[float, float]:
-        """Return mean pulses a square metre of all strips together where cells are covered wholly, and the area."""
+        """Return mean pulses per square metre of all strips together in fully covered cells, and the covered area."""
         ups, acrosses = np.nonzero((self.tiles >= 0).any(axis=0))
         if not len(ups):
             return math.nan, 0.0
@@ -268,7 +268,7 @@ class StripCells:
         return density, float(there.sum()) * cell_m**2
 
     def coverage(self, strip: int) -> Coverage:
-        """Return where a strip is, in cells that hold enough of its pulses to tell a gap from chance."""
+        """Return the coverage of a strip, in cells that hold enough of its pulses to tell a gap from chance."""
         ups, acrosses = np.nonzero(self.tiles[strip] >= 0) if strip < len(self.tiles) else (np.array([], int),) * 2
         if not len(ups):
             return Coverage(Frame(self.frame.west_m, self.frame.south_m, self.frame.cell_m, 1, 1), np.zeros((1, 1)))
@@ -312,9 +312,10 @@ class StripCells:
 
 @dataclass(frozen=True, slots=True)
 class _Planes:
-    """Planes (n,) through cells' returns: centroid, gradient, and whether the surface is smooth there.
+    """Planes (n,) through cells' returns: centroid, gradient, and whether the surface is smooth.
 
-    ``level``: gentle, and the returns spread over the cell; ``smooth``: their scatter ``variance_m2`` is small, too.
+    ``level``: gentle, with returns that spread over the cell; ``smooth``: in addition their scatter ``variance_m2`` is
+    small.
     """
 
     x_m: FloatArray
@@ -355,7 +356,7 @@ def _pooled(counts: NDArray[Any]) -> NDArray[Any]:
 
 
 def _open_density(moments: FloatArray, cell_m: float) -> float:
-    """Return single returns a square metre of tiles (n, 256, 2): pulses and single returns, on open ground."""
+    """Return single returns per square metre on open ground of tiles (n, 256, 2): pulses and single returns."""
     block = 1
     while True:
         sums = moments.reshape(-1, TILE // block, block, TILE // block, block, 2).sum(axis=(2, 4)).reshape(-1, 2)
@@ -373,8 +374,8 @@ def _open_density(moments: FloatArray, cell_m: float) -> float:
 def strip_frame(low_m: FloatArray, high_m: FloatArray, cell_m: float | None = None) -> Frame:
     """Return the fine cells that strips are summed into, of the given side or the finest.
 
-    They begin at whole multiples of the coarsest cells' tiles, so that cells put together are the same ones wherever
-    a file begins.
+    They begin at whole multiples of the coarsest cells' tiles, so that merged cells are the same wherever a file
+    begins.
     """
     side_m = FINEST_CELL_M if cell_m is None else max(cell_m, SMALLEST_CELL_M)
     step_m = TILE * side_m * 2**LEVELS
@@ -387,7 +388,7 @@ def strip_frame(low_m: FloatArray, high_m: FloatArray, cell_m: float | None = No
 
 
 def _halved(moments: FloatArray, cell_m: float) -> FloatArray:
-    """Return a tile (256, MOMENTS) as a quarter (8, 8, MOMENTS) of one with twice the cell."""
+    """Return a tile (256, MOMENTS) as a quarter (8, 8, MOMENTS) of one with cells twice as large."""
     cells = moments.reshape(TILE, TILE, MOMENTS)
     made = np.zeros((TILE // 2, TILE // 2, MOMENTS))
     for up in range(2):
@@ -414,11 +415,11 @@ def _halved(moments: FloatArray, cell_m: float) -> FloatArray:
 
 @dataclass(slots=True)
 class Overlap:
-    """All pairs together.
+    """The differences of all pairs together.
 
     Attributes:
-        worst_m: (rows, columns) f4 the difference of largest size in each cell, nan where none was compared.
-        counts: histogram of |dZ| in millimetres, the last bin is open.
+        worst_m: (rows, columns) f4 largest difference by size in each cell, nan if none was compared.
+        counts: histogram of |dZ| in millimetres, with an open last bin.
     """
 
     worst_m: NDArray[np.float32]
@@ -431,9 +432,9 @@ class Overlap:
     scatter: dict[int, list[tuple[FloatArray, FloatArray]]] = field(default_factory=dict)
 
     def add(self, pair: Pair) -> None:
-        """Take a pair in; the one with most cells is kept as the best."""
+        """Add a pair; the one with most cells is kept as the best."""
         before = self.worst_m[pair.row, pair.column]
-        larger = ~(np.abs(before) >= np.abs(pair.dz_m))  # also where there was none
+        larger = ~(np.abs(before) >= np.abs(pair.dz_m))  # also if there was no value
         self.worst_m[pair.row[larger], pair.column[larger]] = pair.dz_m[larger]
         steps = np.clip(np.rint(pair.dz_m / HISTOGRAM_STEP_M), -HISTOGRAM_HALF, HISTOGRAM_HALF).astype(int)
         self.signed += np.bincount(steps + HISTOGRAM_HALF, minlength=len(self.signed))
@@ -448,12 +449,12 @@ class Overlap:
 
     @property
     def compared_cells(self) -> int:
-        """Return the number of cells in which any two strips were compared."""
+        """Number of cells in which any two strips were compared."""
         return int(np.isfinite(self.worst_m).sum())
 
     @property
     def places(self) -> int:
-        """Return the number of places apart from each other: blocks with compared cells, of neighbouring blocks one."""
+        """Number of separate places: blocks with compared cells, of which neighbours count once."""
         rows, columns = (size // PLACE for size in self.worst_m.shape)
         cells = np.isfinite(self.worst_m).reshape(rows, PLACE, columns, PLACE).sum(axis=(1, 3))
         found = 0
@@ -472,7 +473,9 @@ class Overlap:
         }
 
     def numbers(self) -> dict[str, Any] | None:
-        """Of all pairs' cells; 95 % and 99 % of |dZ| to the millimetre. None: no cell was compared."""
+        """Return the numbers of all pairs' cells, 95 % and 99 % of |dZ| to the millimetre; None if no cell was
+        compared.
+        """
         if not self.cells:
             return None
         size = self.signed[HISTOGRAM_HALF:].copy()
@@ -494,7 +497,7 @@ class Overlap:
 
 
 def compare(cells: StripCells) -> Overlap:
-    """Return all strips against each other, in cells as large as `StripCells.settle` finds right."""
+    """Compare all pairs of strips, in cells of the size that `StripCells.settle` finds."""
     cells.settle()
     rows, columns = (size * TILE for size in cells.tiles.shape[1:])
     overlap = Overlap(np.full((rows, columns), np.nan, np.float32))

@@ -1,1 +1,1 @@
-"""What processing is set up with: sources, models, terrain."""
+"""Sets processing up from a configuration: sources, models, terrain."""

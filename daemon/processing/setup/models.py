@@ -1,4 +1,4 @@
-"""A scanner's model from its tables of the configuration: geometry, mount, air, noise."""
+"""Builds a scanner's model from its tables of the configuration: geometry, mount, air, noise."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ from swath.georef.trajectory.trajectory import Trajectory
 
 USUAL_WAVELENGTH_NM = 1064.0  # of airborne scanners
 INSTALLATION_TOLERANCE = 1e-6
-FAR_M = 1000.0  # along a beam, to tell its direction
-NO_ANGLES = AngleSeries(np.array([-2, -1]), np.zeros((2, 3)))  # at no time there is
+FAR_M = 1000.0  # along a beam, to find its direction
+NO_ANGLES = AngleSeries(np.array([-2, -1]), np.zeros((2, 3)))  # at impossible times
 
 
 def make_georeferencer(
@@ -50,20 +50,20 @@ def make_georeferencer(
     uncertainty: bool,
     angles: ByName[str, AngleSeries] | None = MappingProxyType({}),
 ) -> Georeferencer:
-    """Return what makes points of a scanner's returns.
+    """Return the georeferencer of a scanner's returns.
 
     Args:
-        config: with [scanner.<name>] and [atmosphere].
-        name: of the scanner.
-        calibration: in use.
-        parser: of the scanner: heads with several beams have their table there.
-        fibres: of a fibre scanner the file of its geometry.
-        mapping: None: points stay in e.
-        uncertainty: with sigmas.
-        angles: of the gimbal's stages, by the source that logged them; None: the log is yet to be read for them.
+        config: configuration with [scanner.<name>] and [atmosphere].
+        name: name of the scanner.
+        calibration: calibration in use.
+        parser: parser of the scanner: for heads with several beams it holds their table.
+        fibres: content of a fibre scanner's geometry file.
+        mapping: mapping of the points; None: they stay in e.
+        uncertainty: True to compute sigmas.
+        angles: angles of the gimbal's stages, by the source that logged them; None: they have not been read yet.
 
     Raises:
-        ValueError: something cannot be meant, one line.
+        ValueError: a setting is invalid; one line.
     """
     table = config.scanner[name]
     if not isinstance(parser, SrepParser) and any(row.prf_hz is not None for row in calibration.range_offsets):
@@ -86,10 +86,10 @@ def make_georeferencer(
 
 
 def geometry_of(table: ScannerConfig, parser: Parser, fibres: bytes | None = None) -> Geometry:
-    """Return how the beam goes: by the protocol's table of beams, or of a line scanner as the configuration declares.
+    """Return the geometry of the beams: from the protocol's table of beams, or as configured for a line scanner.
 
     Raises:
-        ValueError: the protocol says neither, one line.
+        ValueError: the protocol has neither; one line.
     """
     beams, head = getattr(parser, "beams", None), getattr(parser, "head", None)
     if isinstance(head, OusterHead):
@@ -119,14 +119,14 @@ def geometry_of(table: ScannerConfig, parser: Parser, fibres: bytes | None = Non
 
 
 def mount_of(gimbal: GimbalConfig | None, angles: ByName[str, AngleSeries] | None = None) -> Mount:
-    """Return stages of a gimbal: ``angles_deg`` and, where a source is named, the roll, pitch and heading it told.
+    """Return the stages of a gimbal: ``angles_deg`` and, with a source, the roll, pitch and heading that it sent.
 
     Args:
-        gimbal: of the scanner; None: a rigid mount.
-        angles: by source; None: nothing is known yet, returns of such a mount have no place.
+        gimbal: gimbal of the scanner; None: a rigid mount.
+        angles: angles by source; None: not known yet, so that returns on such a mount have no place.
 
     Raises:
-        ValueError: a source told no angles.
+        ValueError: a source sent no angles.
     """
     stages = []
     for number, stage in enumerate(gimbal.stages if gimbal is not None else []):
@@ -141,9 +141,7 @@ def mount_of(gimbal: GimbalConfig | None, angles: ByName[str, AngleSeries] | Non
 
 
 def gimbal_sources(config: Config, name: str) -> Iterator[tuple[int, str]]:
-    """Yield stages of a scanner's gimbal whose angles are logged: number, and the source, ``imu/name`` or
-    ``gnss/name``.
-    """
+    """Yield number and source (``imu/name`` or ``gnss/name``) of a gimbal's stages whose angles are logged."""
     gimbal = config.scanner[name].gimbal
     for number, stage in enumerate(gimbal.stages if gimbal is not None else []):
         if stage.source is not None:
@@ -151,7 +149,7 @@ def gimbal_sources(config: Config, name: str) -> Iterator[tuple[int, str]]:
 
 
 def tells_attitude(config: Config, source: str) -> bool:
-    """Return whether a source is one of the configuration's and gives an INS's solutions."""
+    """Return True if a source is in the configuration and gives an INS's solutions."""
     for kind, name, table in config.device_tables():
         if f"{kind}/{name}" == source:
             return InsSolution in find_driver(kind, table.protocol).yields
@@ -159,10 +157,10 @@ def tells_attitude(config: Config, source: str) -> bool:
 
 
 def refuse_logged_gimbals(config: Config, scanners: list[str]) -> None:
-    """For who cannot wait for the end of the log.
+    """Refuse scanners on gimbals with logged angles, for commands that cannot wait for the end of the log.
 
     Raises:
-        ValueError: a gimbal's angles are logged, one line.
+        ValueError: a gimbal's angles are logged; one line.
     """
     for name in scanners:
         for number, source in gimbal_sources(config, name):
@@ -171,14 +169,14 @@ def refuse_logged_gimbals(config: Config, scanners: list[str]) -> None:
 
 
 def air_of(config: Config, table: ScannerConfig) -> Air:
-    """Of [atmosphere], for a scanner's light."""
+    """Return the air of [atmosphere] at a scanner's wavelength."""
     usual = find_driver("scanner", table.protocol).wavelength_nm or USUAL_WAVELENGTH_NM
     return Air(**config.atmosphere.model_dump(), wavelength_nm=table.wavelength_nm or usual)
 
 
 def make_resolver(table: ScannerConfig, height_above_ground_m: float | None) -> ZoneResolver | None:
-    """Return what finds the emissions of a scanner that may have several pulses in air; None for heads that never
-    do.
+    """Return the resolver of emissions for a scanner with several pulses in air; None for heads
+    that never have them.
     """
     if table.protocol != "srep":
         return None
@@ -188,7 +186,7 @@ def make_resolver(table: ScannerConfig, height_above_ground_m: float | None) -> 
 
 
 def connect(chain: ScannerChain, parser: Parser) -> None:
-    """Have a parser tell the chain its returns go through every pulse that left, and at which rates."""
+    """Let a parser report to the chain of its returns every emitted pulse and the pulse rates."""
     if not isinstance(parser, SrepParser):
         return
     rates = PulseRates()
@@ -200,28 +198,26 @@ def connect(chain: ScannerChain, parser: Parser) -> None:
 
 
 def make_motion(table: ScannerConfig, model: SensorModel) -> EncoderMotion | None:
-    """Return what tells how the encoder moves; None where the calibration does not ask."""
+    """Return the estimator of the encoder's motion; None if the calibration does not need it."""
     return motion_of(table) if model.needs_encoder_motion else None
 
 
 def motion_of(table: ScannerConfig) -> EncoderMotion:
-    """Return what tells how a scanner's encoder moves."""
+    """Return the estimator of a scanner's encoder motion."""
     kind = table.geometry.type if table.geometry is not None else None
     swings = table.protocol == "srep" and kind in (None, "oscillating")
     return EncoderMotion(steady=not swings, facets=kind == "polygon")
 
 
 class TerrainRanges:
-    """Ranges that a terrain model expects of a scanner's beams: `swath.georef.stream.stream.ScannerChain.predict`."""
+    """Predicts ranges of a scanner's beams from a terrain model: `swath.georef.stream.stream.ScannerChain.predict`."""
 
     def __init__(self, model: SensorModel, terrain: CoarseTerrain) -> None:
         self._terrain = terrain
         self._model = SensorModel(model.calibration, model.geometry, mount=model.mount)
 
     def __call__(self, rows: StructArray, time_ns: Int64Array, trajectory: Trajectory) -> FloatArray:
-        """Return (n,) metres of rows at GPS times (n,); nan where nothing is known. The encoder's latency does not
-        count.
-        """
+        """Return ranges (n,), m, of rows at GPS times (n,); nan if unknown. The encoder's latency is ignored."""
         asked = np.flatnonzero(rows["number_of_returns"])  # the others are pulses without a return
         far, still = rows.take(asked), np.zeros(len(asked))
         far["range_m"] = FAR_M

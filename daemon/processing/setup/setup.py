@@ -1,6 +1,6 @@
-"""From a configuration, or the one in a log, to everything that makes points: parsers, clocks, models, mapping frame.
+"""Builds from a configuration, or the one in a log, all that makes points: parsers, clocks, models, mapping frame.
 
-What a configuration cannot mean is one line of a `ConfigError` before anything is read.
+An invalid setting gives one line of a `ConfigError` before any data is read.
 """
 
 from __future__ import annotations
@@ -42,22 +42,22 @@ from swath.georef.trajectory.buffer import TrajectoryBuffer
 from swath.georef.trajectory.trajectory import Trajectory
 
 ARCSEC = math.pi / 648_000
-REACH_NS = 1_000_000  # beyond its own stamp, of a return whose calibration shifts no times
-OFFICE = StreamSettings(settle_s=2.0)  # so that a latched edge on either side of a return is known
+REACH_NS = 1_000_000  # for a return whose calibration shifts no times: how far data beyond its stamp are needed
+OFFICE = StreamSettings(settle_s=2.0)  # long enough that latched edges on both sides of a return are known
 
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """What a command line says beside the configuration.
+    """The options of a command beside the configuration.
 
     Attributes:
-        crs, datum, epoch: of the products, over ``[output]`` and the receiver's ``datum``.
-        force_crs: a CRS that does not suit the place is taken, and warned of.
-        scanners: only these; empty: all.
-        calibrations: text of a calibration file and its name, by scanner; over the configuration's.
-        uncertainty: sigmas are computed with the points.
-        terrain: tells the zone of pulses in air; None: the returns before do.
-        height_above_ground_m: at the first return, for pulses in air without a terrain model.
+        crs, datum, epoch: mapping frame of the products; they override ``[output]`` and the receiver's ``datum``.
+        force_crs: accept a CRS that does not suit the place, with a warning.
+        scanners: scanners to use; empty: all.
+        calibrations: text of a calibration file and its name, by scanner; they override the configuration's.
+        uncertainty: compute sigmas with the points.
+        terrain: terrain model that gives the zone of pulses in air; None: the preceding returns do.
+        height_above_ground_m: height at the first return, for pulses in air without a terrain model.
     """
 
     crs: str | None = None
@@ -75,17 +75,17 @@ class Setup:
     """Everything that one log's georeferencing needs; pickles.
 
     Attributes:
-        config: of the log, or another one.
-        calibrations: by scanner, those in use.
-        mapping: frame of the points; None: they are in e.
-        sources: the devices; those of gimbals' angles are told by `take_angles`.
+        config: configuration of the log, or another one.
+        calibrations: calibrations in use, by scanner.
+        mapping: mapping frame of the points; None: they are in e.
+        sources: the devices; angles of gimbals are given by `take_angles`.
     """
 
     def __init__(self, config: Config, attachments: Mapping[str, bytes], options: Options | None = None) -> None:
-        """attachments: the files that the configuration names, by their names in a log.
+        """Build the setup; ``attachments`` are the files that the configuration names, by their names in a log.
 
         Raises:
-            ConfigError: something cannot be meant.
+            ConfigError: a setting is invalid.
         """
         self.config = config
         self.options = options or Options()
@@ -98,7 +98,7 @@ class Setup:
 
     @classmethod
     def of_log(cls, attachments: Mapping[str, bytes], options: Options | None = None) -> Setup:
-        """Make it by what is stored in a log.
+        """Make the setup from the configuration that is stored in a log.
 
         Raises:
             UserError: the log has no configuration, or one that cannot be used.
@@ -113,7 +113,7 @@ class Setup:
 
     @classmethod
     def of_config(cls, config: Config, options: Options | None = None) -> Setup:
-        """Make it by a configuration and the files beside it."""
+        """Make the setup from a configuration and the files beside it."""
         return cls(config, {name: data for name, _, data in config.attachments()}, options)
 
     def _chosen(self) -> list[str]:
@@ -146,19 +146,19 @@ class Setup:
         plan = self.sources.clock_plan(info)
         if (
             self.sources.imu_source is not None and self.sources.clock_of_imu is not None
-        ):  # by whose clock a navigator places samples
+        ):  # a navigator places samples by its clock
             plan = replace(
                 plan, devices={**plan.devices, self.sources.imu_source: DevicePlan(self.sources.clock_of_imu)}
             )
         return Stream(self._chains(), StreamClocks.growing(plan), path, settings)
 
     def office_stream(self, clocks: FrozenClocks, trajectory: Trajectory, settings: StreamSettings = OFFICE) -> Stream:
-        """Return a stream with all of a log's clock and a complete trajectory, which is taken as it is."""
+        """Return a stream with all of a log's clocks and a complete trajectory, which is used unchanged."""
         return Stream(self._chains(), clocks.for_stream(), CompletePath(trajectory), settings)
 
     @property
     def deflection_rad(self) -> tuple[float, float] | None:
-        """ξ, η of ``[attitude]``; None where the attitude refers to the ellipsoid."""
+        """Deflection ξ, η of ``[attitude]``; None if the attitude refers to the ellipsoid."""
         attitude = self.config.attitude
         if attitude.xi_arcsec is None or attitude.eta_arcsec is None:
             return None
@@ -187,16 +187,16 @@ class Setup:
         return self._georeferencers[name]
 
     def take_angles(self, angles: Mapping[str, AngleSeries]) -> None:
-        """What the sources of gimbals' angles told; before, returns of such a gimbal have no place.
+        """Take the angles that sources of gimbals sent; without them, returns on such a gimbal have no place.
 
         Raises:
-            ConfigError: one of them told none.
+            ConfigError: a source sent no angles.
         """
         if self.sources.gimbal_sources:
             self._georeferencers = self._made(angles)
 
     def _made(self, angles: Mapping[str, AngleSeries] | None) -> dict[str, Any]:
-        parsers = self.sources.parsers(("scanner",))  # their tables of beams; and their settings' mistakes are told now
+        parsers = self.sources.parsers(("scanner",))  # they hold tables of beams; and wrong settings are reported now
         return {name: self._georeferencer(name, parsers[f"scanner/{name}"], angles) for name in self.scanners}
 
     def _georeferencer(self, name: str, parser: Parser, angles: Mapping[str, AngleSeries] | None) -> Any:

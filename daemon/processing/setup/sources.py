@@ -1,4 +1,4 @@
-"""Which devices a configuration names: their parsers and files, their clocks, and the axes of the IMU.
+"""Finds the devices that a configuration names: their parsers and files, their clocks, and the axes of the IMU.
 
 Georeferencing and navigation share it.
 """
@@ -27,16 +27,16 @@ class Sources:
     """The devices of one log; pickles.
 
     Attributes:
-        config: of the log, or another one.
+        config: configuration of the log, or another one.
         attachments: the files that the configuration names, by their names in a log.
-        scanners: names of those that are read.
-        gimbal_sources: who tells the angles of gimbals; they do not tell where the aircraft is.
-        ins_source: whose INS gives the growing trajectory: the first IMU whose protocol tells one, else the first
-            receiver; None: nobody's.
+        scanners: names of the scanners that are read.
+        gimbal_sources: sources of gimbals' angles; they do not give the aircraft's position.
+        ins_source: source of the INS solutions for the growing trajectory: the first IMU whose protocol has them, else
+            the first receiver; None: there is no such source.
     """
 
     def __init__(self, config: Config, attachments: Mapping[str, bytes], scanners: Sequence[str] = ()) -> None:
-        """Find who tells what.
+        """Find the source of each kind of data.
 
         Raises:
             ConfigError: a protocol is unknown.
@@ -59,11 +59,11 @@ class Sources:
 
     @property
     def ins_protocol(self) -> str:
-        """Of `ins_source`; empty where there is none."""
+        """Protocol of `ins_source`; empty if there is none."""
         return self.protocol(self.ins_source)
 
     def protocol(self, source: str | None) -> str:
-        """Of ``gnss/name`` or ``imu/name``; empty of None."""
+        """Return the protocol of ``gnss/name`` or ``imu/name``; empty for None."""
         kind, _, name = (source or "").partition("/")
         tables: Mapping[str, GnssConfig | ImuConfig] = self.config.imu if kind == "imu" else self.config.gnss
         return tables[name].protocol if name else ""
@@ -75,18 +75,18 @@ class Sources:
 
     @property
     def clock_of_imu(self) -> str | None:
-        """The source that shows the host's time beside that IMU."""
+        """The source of the host's time for that IMU."""
         source = self.imu_source
         return None if source is None else self._clock_of(self.config.imu[source.removeprefix("imu/")].pps)
 
     def edge_of(self, source: str) -> str | None:
-        """Return polarity of the edges of ``pps/name``; None: no such source."""
+        """Return the polarity of the edges of ``pps/name``; None: there is no such source."""
         pps = self.config.pps.get(source.removeprefix("pps/"))
         return None if pps is None else pps.edge
 
     def inside(self, source: str) -> list[str]:
-        """Return sources whose messages stand in a wire's bytes: its own, and an IMU or INS inside a receiver's
-        stream.
+        """Return sources whose messages are in a wire's bytes: its own, and an IMU or INS inside a
+        receiver's stream.
         """
         kind, _, name = source.partition("/")
         within = [f"imu/{imu}" for imu, table in self.config.imu.items() if table.transport == f"gnss:{name}"]
@@ -95,7 +95,7 @@ class Sources:
     def parsers(self, kinds: tuple[DeviceKind, ...], *, whole: bool = False) -> dict[str, Parser]:
         """Return new parsers of these kinds of sources, by source.
 
-        A receiver's gives times only unless its INS is wanted, or all that it says (``whole``).
+        A receiver's parser gives times only, unless its INS is needed or all its messages are (``whole``).
 
         Raises:
             ConfigError: a driver cannot work with its settings.
@@ -117,7 +117,7 @@ class Sources:
         return made
 
     def scanner_time_parsers(self) -> dict[str, Parser]:
-        """Return new parsers of what the scanners say of time, without returns, by source.
+        """Return new parsers of the scanners' time messages, without returns, by source.
 
         Raises:
             ConfigError: a driver cannot work with its settings.
@@ -134,7 +134,7 @@ class Sources:
         return made
 
     def ins_parser(self) -> dict[str, Parser]:
-        """Of an IMU that is the INS too, its parser; empty where a receiver's own stream tells the solutions."""
+        """Return the parser of an IMU that is also the INS; empty if a receiver's own stream holds the solutions."""
         source = self.ins_source or ""
         return {source: self.parsers(("imu",))[source]} if source.startswith("imu/") else {}
 
@@ -154,13 +154,13 @@ class Sources:
             raise ConfigError(f"{kind}.{name}.protocol: {error}") from error
 
     def clock_plan(self, info: SessionInfo) -> ClockPlan:
-        """Return the clocks of a session."""
+        """Return the plan of a session's clocks."""
         config = self.config
         said = {
             gnss.pps: gnss.leap_seconds for gnss in config.gnss.values() if gnss.pps and gnss.leap_seconds is not None
         }
         devices: dict[str, DevicePlan] = {}
-        heads: dict[str, GnssPlan] = {}  # that say the time themselves, where nobody else does
+        heads: dict[str, GnssPlan] = {}  # heads that report the time themselves, if no other source does
         for name in self.scanners:
             table, source = config.scanner[name], f"scanner/{name}"
             driver = find_driver("scanner", table.protocol)
@@ -185,16 +185,14 @@ class Sources:
         )
 
     def _clock_of(self, pps: str | None) -> str | None:
-        """Return the clock of a device: its pulse's; of one that has none, the host's by the first that there is."""
+        """Return the clock of a device: its pulse's; for a device without one, the first that the host has."""
         if pps is not None:
             return f"pps/{pps}"
         shown = [*(f"pps/{name}" for name in self.config.pps), *(f"gnss/{name}" for name in self.config.gnss)]
         return shown[0] if shown else None
 
     def ins_rows(self, rows: StructArray) -> StructArray:
-        """Return solutions of the device's INS with the attitude of b instead of the IMU's own axes
-        (``rotation_b_imu``).
-        """
+        """Return the INS's solutions with the attitude of b instead of the IMU's own axes (``rotation_b_imu``)."""
         rot_b_from_imu = self._rotation_b_imu(self.ins_source)
         if np.array_equal(rot_b_from_imu, np.eye(3)):
             return rows
@@ -205,7 +203,7 @@ class Sources:
         return turned
 
     def in_b(self, measured: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return (n, 3) turn rates or specific forces of the IMU along the axes of b."""
+        """Return turn rates or specific forces (n, 3) of the IMU along the axes of b."""
         turned: NDArray[np.float64] = measured @ self._rotation_b_imu(self.imu_source).T
         return turned
 

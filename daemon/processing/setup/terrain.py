@@ -1,4 +1,4 @@
-"""The coarse terrain model of ``[mta]``: a GeoTIFF of ellipsoidal heights, read by rasterio (``swath[raster]``)."""
+"""Reads the coarse terrain model of ``[mta]``: a GeoTIFF of ellipsoidal heights, by rasterio (``swath[raster]``)."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from swath.georef.arrays import FloatArray
 from swath.georef.coarse_terrain import CoarseTerrain
 
 MAX_NODES = 25_000_000  # 200 MB of heights; a coarse model of a whole country has fewer
-FARTHEST = 1e9  # units of the coordinates, of any map there is
+FARTHEST = 1e9  # units of the coordinates, in any map
 FARTHEST_HEIGHT_M = 100_000.0
 KEY = "mta.terrain"
 
 
 class ToGrid:
-    """Easting and northing, or degrees, of latitudes and longitudes, for `CoarseTerrain`; pickles.
+    """Converts latitudes and longitudes to easting and northing, or degrees, for `CoarseTerrain`; pickles.
 
     Attributes:
-        turn: x once round the earth, 360 for degrees; None: x is no longitude.
+        turn: length of x once round the earth, 360 for degrees; None: x is not a longitude.
     """
 
     def __init__(self, wkt: str) -> None:
@@ -35,16 +35,16 @@ class ToGrid:
         self.turn = 2.0 * np.pi / crs.axis_info[0].unit_conversion_factor if crs.is_geographic else None
 
     def __call__(self, lat_rad: FloatArray, lon_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return (n,) x and y in the raster's CRS."""
+        """Return x and y (n,) in the raster's CRS."""
         x, y = self._transformer.transform(np.degrees(lon_rad), np.degrees(lat_rad))
         return np.asarray(x), np.asarray(y)
 
 
 def terrain_of(config: Config) -> CoarseTerrain | None:
-    """Of a configuration; None: it names none.
+    """Return the terrain model of a configuration; None if it names none.
 
     Raises:
-        ConfigError: it cannot be read.
+        ConfigError: the model cannot be read.
     """
     if not config.mta.terrain:
         return None
@@ -55,10 +55,11 @@ def terrain_of(config: Config) -> CoarseTerrain | None:
 
 
 def read_terrain(path: Path) -> CoarseTerrain:
-    """Return a terrain model of a raster's first band, its nodes at the pixels' centres.
+    """Return the terrain model of a raster's first band, its nodes at the pixels' centres.
 
     Raises:
-        ConfigError: ``mta.terrain``, one line: no rasterio, no heights, no CRS, no place, turned, or too large.
+        ConfigError: ``mta.terrain``, one line: rasterio, heights, CRS or place are missing, or the raster is rotated or
+            too large.
     """
     try:
         import rasterio
@@ -82,7 +83,11 @@ def read_terrain(path: Path) -> CoarseTerrain:
 
 
 def _check(raster: Any, path: Path) -> None:
-    """Whether it can be a grid of heights in a map; raises ConfigError."""
+    """Check that a raster can be a grid of heights in a map.
+
+    Raises:
+        ConfigError: it cannot be such a grid.
+    """
     place = raster.transform
     if raster.crs is None:
         raise ConfigError(f"{KEY}: {path} has no CRS; want a GeoTIFF that says its own")
@@ -102,10 +107,10 @@ def _check(raster: Any, path: Path) -> None:
 
 
 def _heights(raster: Any) -> FloatArray:
-    """Return (rows, columns) of its first band, nan where it has none, or none of this Earth: a mark that it does not
-    name.
+    """Return heights (rows, columns) of the first band; nan where it has none, or one beyond any on Earth (an unnamed
+    mark).
     """
-    with np.errstate(invalid="ignore"):  # a NaN of any kind is none
+    with np.errstate(invalid="ignore"):  # NaNs of any kind count as missing
         height_m: FloatArray = raster.read(1, out_dtype="float64")
     height_m[(raster.read_masks(1) == 0) | ~(np.abs(height_m) < FARTHEST_HEIGHT_M)] = np.nan
     return height_m

@@ -1,1 +1,1 @@
-"""`swath strips`."""
+"""Implements `swath strips`: comparison and adjustment of overlapping strips."""

@@ -1,9 +1,9 @@
 """`swath strips --adjust`: corrections of the trajectory, strip by strip, while the calibration is held.
 
-returns of the strips, placed with the calibration               calibration_flight
-planes, control                                                  swath.calib.planes.search, swath.calib.control.points
-corrections; planes found anew with them; corrections again      swath.calib.strips.corrections
-height differences of strips, before and after                   swath.calib.strips.differences
+returns of the strips, placed with the calibration             calibration_flight
+planes, control                                                swath.calib.planes.search, swath.calib.control.points
+corrections; planes found anew with them; corrections again    swath.calib.strips.corrections
+height differences of strips, before and after                 swath.calib.strips.differences
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ from swath.georef.mapping.frame import MappingError
 from swath.georef.strips import StripError as StripTimesError
 from swath.georef.trajectory.trajectory import TrajectoryError
 
-Steps = Callable[[str, int, int], None]  # what is done, how much, of how much
+Steps = Callable[[str, int, int], None]  # arguments: the step, how much is done, of how much
 
 AUTO = "auto"
 CHOICES = (*MODELS, AUTO)
@@ -67,14 +67,15 @@ REFUSED = (
 
 @dataclass(frozen=True)
 class AdjustOptions:
-    """What the command line asks for.
+    """The options of `swath strips --adjust` from the command line.
 
     Attributes:
-        logs: what is read and how; what it says of products does not count.
+        logs: which logs are read and how; its options about products are ignored.
         output: folder for the corrected trajectories and the record.
-        control: CSV of surveyed points; None: none.
-        model: that all strips get, of `swath.calib.strips.corrections.MODELS`; ``auto``: each what its returns ask for.
-        overwrite: files of an earlier run are replaced.
+        control: CSV of surveyed points; None: no control.
+        model: model for all strips, of `swath.calib.strips.corrections.MODELS`; ``auto``: chosen for each strip by its
+            returns.
+        overwrite: replace files of an earlier run.
     """
 
     logs: GeorefOptions
@@ -85,21 +86,21 @@ class AdjustOptions:
 
     @property
     def settings(self) -> Settings:
-        """Of the adjustment."""
+        """Settings of the adjustment."""
         return DEFAULTS if self.model == AUTO else replace(DEFAULTS, models=(self.model,))
 
 
 @dataclass(frozen=True, eq=False)
 class StripsCorrected:
-    """What came of it.
+    """The outcome of an adjustment of strips.
 
     Attributes:
         kept: the flight as read, placed with the calibration that is held.
-        features: by which it was corrected.
-        control: surveyed points; none: there are none.
+        features: planes and control that the corrections were estimated from.
+        control: surveyed points; empty if there are none.
         adjusted: corrections and trajectories.
         before, after: differences of strips.
-        notes: for people, a line each.
+        notes: notes for people, one line each.
     """
 
     kept: KeptFlight
@@ -112,7 +113,7 @@ class StripsCorrected:
 
 
 def _refuse_output(wish: AdjustOptions) -> None:
-    """UserError where no folder can be there, or it holds an adjustment already; before anything lasts long."""
+    """Refuse with `UserError` an unusable folder or one with an adjustment, before any long work."""
     there, permitted = nearest_there(wish.output.absolute())
     if permitted and not there.is_dir():
         raise UserError(f"--adjust {wish.output}: {there} is a file; want a folder", ExitCode.USAGE)
@@ -125,7 +126,9 @@ def _refuse_output(wish: AdjustOptions) -> None:
 
 
 def files_of(wish: AdjustOptions, flight: LoggedFlight) -> TrajectoryFiles:
-    """Return names of a session's files; UserError where they are there, or are what the trajectory was read from."""
+    """Return the paths of a session's files; refuse with `UserError` files that exist or that the trajectory was read
+    from.
+    """
     files = TrajectoryFiles.in_folder(wish.output, flight.session.session_id, csv=True)
     paths = [path for path in (files.sbet, files.smrmsg, files.csv) if path is not None]
     read = wish.logs.trajectory.file
@@ -138,15 +141,15 @@ def files_of(wish: AdjustOptions, flight: LoggedFlight) -> TrajectoryFiles:
 
 
 def correct_strips(wish: AdjustOptions, folder: Path, tell: Steps) -> StripsCorrected:
-    """Adjust strips; nothing is written.
+    """Estimate corrections of strips; write no files.
 
     Args:
-        wish: what is asked for.
-        folder: for the returns, some 150 bytes each, while it goes on.
-        tell: is told how far it is.
+        wish: options of the adjustment.
+        folder: temporary folder for the returns, some 150 bytes each.
+        tell: called with the progress.
 
     Raises:
-        UserError: it cannot be, one line.
+        UserError: the strips cannot be corrected; one line.
     """
     if wish.model not in CHOICES:
         raise UserError(f'--strip-model: got "{wish.model}", want one of {", ".join(CHOICES)}', ExitCode.USAGE)
@@ -186,7 +189,7 @@ def _of_flight(wish: AdjustOptions, kept: KeptFlight, folder: Path, tell: Steps)
     features = features_of(flight)
     tell("adjustment", 0, 1)
     first = adjust_strips(flight, features, calibrations, replace(wish.settings, linearisations=1))
-    tell("planes again", 0, 1)  # what errors of the trajectory had left apart lies on each other now
+    tell("planes again", 0, 1)  # strips that errors of the trajectory had kept apart overlap now
     features = features_of(moved(first, "matched"))
     refuse_lost_control(wish.control, features)
     tell("adjustment", 0, 1)

@@ -1,4 +1,4 @@
-"""What `swath strips --adjust` writes: each log's corrected trajectory, and a record of what was done to it."""
+"""Writes the outputs of `swath strips --adjust`: each log's corrected trajectory, and a record of the corrections."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ WHAT = (
 KEPT = "velocities and sigmas of the trajectories are those from before"
 AXES = ("north", "east", "down")
 UNCORRECTED = "none"
-TOLD = 0.7  # of its prior's sigma: returns say as much as the prior does
+TOLD = 0.7  # share of its prior's sigma: here returns contribute as much as the prior
 
 
 def write_adjustment(wish: AdjustOptions, done: StripsCorrected, tell: Callable[[str, int, int], None]) -> Told:
-    """Write all of it; the record last, as a folder with a record is whole.
+    """Write all files, the record last: a folder with a record is complete.
 
     Raises:
-        UserError: it cannot be written; nothing is left then.
+        UserError: a file cannot be written; no file is left then.
     """
     tell("trajectories", 0, 1)
     files = [files_of(wish, flight) for flight in done.kept.logged]
@@ -64,7 +64,9 @@ def write_adjustment(wish: AdjustOptions, done: StripsCorrected, tell: Callable[
 
 
 def _as_given(flight: LoggedFlight, trajectory: Trajectory) -> Trajectory:
-    """With the attitude referring to what the log's own refers to, as it is turned to the normal when it is read."""
+    """Return the trajectory with its attitude referred back to the log's own vertical; reading turns it to the
+    ellipsoid's normal.
+    """
     if flight.setup.deflection_rad is None:
         return trajectory
     xi_rad, eta_rad = flight.setup.deflection_rad
@@ -76,12 +78,12 @@ def _as_given(flight: LoggedFlight, trajectory: Trajectory) -> Trajectory:
 
 @dataclass(frozen=True, eq=False)
 class _Strip:
-    """What a strip got, and how far it was from the others, and is.
+    """A strip's corrections, and its distance from other strips before and after.
 
     Attributes:
-        time_ns: (k,) of its knots.
+        time_ns: (k,) times of its knots.
         corrections, sigmas, priors: (k, 6) north, east, down, metres, turns about these, rad; sigmas after and before.
-        before_m, after_m: RMSDz; nan: no other strip shares ground with it.
+        before_m, after_m: RMSDz; nan: no other strip overlaps it.
     """
 
     choice: StripChoice
@@ -94,7 +96,7 @@ class _Strip:
 
     @property
     def told(self) -> NDArray[np.bool_]:
-        """(6,) what its returns determine, more than the prior does."""
+        """Flags (6,) of components that the returns determine better than the prior does."""
         return np.asarray(self.sigmas.mean(axis=0) < TOLD * self.priors.mean(axis=0))
 
 
@@ -147,7 +149,7 @@ def _record(wish: AdjustOptions, done: StripsCorrected, written: list[tuple[Path
 
 
 def _strip_entry(done: StripsCorrected, strip: _Strip) -> dict[str, Any]:
-    """Return a strip without corrections has none, and no sigmas of them."""
+    """Return a strip's entry in the record; an uncorrected strip has no corrections and no sigmas."""
     corrected = strip.choice.model != UNCORRECTED
     knots = zip(strip.time_ns.tolist(), strip.corrections, strip.sigmas, strip.priors, strict=True)
     means = (strip.corrections.mean(axis=0), strip.sigmas.mean(axis=0), strip.priors.mean(axis=0))
@@ -163,7 +165,7 @@ def _strip_entry(done: StripsCorrected, strip: _Strip) -> dict[str, Any]:
 
 
 def _named(*sixes: FloatArray) -> dict[str, float]:
-    """Return a correction (6,), its sigmas and those before, by names with units."""
+    """Return a correction (6,), its sigmas and prior sigmas by names with units."""
     entry: dict[str, float] = {}
     for prefix, six in zip(("", "sigma_", "prior_sigma_"), sixes, strict=True):
         entry |= {f"{prefix}{axis}_m": float(value) for axis, value in zip(AXES, six[:3], strict=True)}
@@ -196,7 +198,7 @@ def _lines(done: StripsCorrected) -> list[str]:
 
 
 def _row(strip: _Strip) -> str:
-    """Return means along the strip; where nothing is corrected there is nothing to be unsure of."""
+    """Return a line of means along the strip; uncorrected components have no sigma."""
     factors = np.array([100.0] * 3 + [1e3 * 180.0 / np.pi] * 3)
     means, sigmas = factors * strip.corrections.mean(axis=0), factors * strip.sigmas.mean(axis=0)
     columns = [

@@ -1,4 +1,4 @@
-"""`swath strips`: how far strips are from each other, what it looks like, and what specifications say to it."""
+"""`swath strips`: measures how far strips are apart, which errors that suggests, and which specifications they keep."""
 
 from __future__ import annotations
 
@@ -32,15 +32,15 @@ POINT_SUFFIXES = (".las", ".laz")
 
 @dataclass(frozen=True)
 class StripsOptions:
-    """What the command line asks for.
+    """The options of `swath strips` from the command line.
 
     Attributes:
         paths: logs, or LAS or LAZ files, or folders of either.
-        before: likewise, of the same strips before; none: there is nothing to compare with.
-        logs: how logs are read; its logs are not looked at.
-        rules: of the comparison.
-        output: folder for pictures and record; None: none.
-        level: a USGS level that must be kept; None: none must.
+        before: paths of the same strips at an earlier state; empty: no comparison with one.
+        logs: how logs are read; its list of logs is ignored.
+        rules: rules of the comparison.
+        output: folder for pictures and record; None: no files.
+        level: a USGS level that must be kept; None: no level is required.
     """
 
     paths: Sequence[Path]
@@ -53,7 +53,7 @@ class StripsOptions:
 
 @dataclass(frozen=True)
 class Compared:
-    """The record for scripts, lines for people, and what is wrong: nothing, or a line."""
+    """The outcome: a record for scripts, lines for people, and the problem in a line (empty: no problem)."""
 
     record: dict[str, Any]
     lines: list[str]
@@ -61,15 +61,15 @@ class Compared:
 
 
 def compare_strips(wish: StripsOptions, folder: Path, told: Told) -> Compared:
-    """Compare.
+    """Compare strips and write the results.
 
     Args:
-        wish: what is asked for.
-        folder: for returns of logs, while it goes on.
-        told: is told how far it is.
+        wish: options of the comparison.
+        folder: temporary folder for returns of logs.
+        told: called with the progress.
 
     Raises:
-        UserError: it cannot be, one line.
+        UserError: the strips cannot be compared; one line.
     """
     with as_user_error(folder, FlightError, StripError, MappingError):
         now = _judged(_read(wish.paths, wish, folder / "now", told), wish, told)
@@ -86,14 +86,14 @@ def compare_strips(wish: StripsOptions, folder: Path, told: Told) -> Compared:
 
 
 def rules_of(most_cells: int, cell_m: float | None) -> StripRules:
-    """Return rules for so many cells of a side in metres; None: the side goes by the strips' density."""
+    """Return rules for at most so many cells of a side in metres; None: the side follows from the strips' density."""
     return StripRules(cell_m=cell_m, most_cells=most_cells)
 
 
 def is_of_logs(paths: Sequence[Path]) -> bool:
-    """Return whether paths are logs rather than points; UserError where they are neither, or both.
+    """Return True if paths are logs, False if they are points; refuse with `UserError` both together, or neither.
 
-    A folder with points in it is one of points.
+    A folder that holds points counts as points.
     """
     kinds = {_kind(path) for path in paths}
     if len(kinds) > 1:
@@ -131,12 +131,12 @@ def _read(paths: Sequence[Path], wish: StripsOptions, folder: Path, told: Told) 
     return strips
 
 
-# ---------------------------------------------------------------------- what is made of it
+# ---------------------------------------------------------------------- results
 
 
 @dataclass(frozen=True, eq=False)
 class Judgement:
-    """Strips, their differences, what these look like, and what they keep."""
+    """Strips with their differences, the errors that these suggest, and their quality."""
 
     strips: Strips
     report: StripReport
@@ -144,16 +144,16 @@ class Judgement:
 
     @property
     def agreement(self) -> Agreement:
-        """Return how well strips agree, by which they are judged."""
+        """The agreement of the strips, by which they are judged."""
         return self.strips.look.agreement
 
     def wrong(self) -> list[str]:
-        """Return sentences of effects that are in the strips and matter, or that strips are too far apart to tell."""
+        """Return sentences on effects that matter, and on strips that are too far apart to tell an effect."""
         found = () if self.signatures is None else self.signatures.found
         return list(dict.fromkeys(one.words for one in found if one.level in ("significant", "rough")))
 
     def problem(self, level: str | None) -> str:
-        """Return what is wrong, a line; empty: nothing."""
+        """Return the problem in a line; empty if there is none."""
         wrong = self.wrong()
         if self.agreement.no_verdict:
             wrong.append(self.agreement.no_verdict)
@@ -162,12 +162,12 @@ class Judgement:
         return f"{self.strips.what}: {'; '.join(wrong)}" if wrong else ""
 
     def _rows(self) -> dict[tuple[str, str], dict[str, Any]]:
-        """Return the rows of the overlap by names of strips."""
+        """Return the rows of the overlap by pair of strip names."""
         names = self.strips.look.names
         return {(names[row["first"]], names[row["second"]]): row for row in self.strips.look.overlap.rows}
 
     def record(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the comparison as values for JSON."""
         heights, to_plane = self._rows(), {(pair.first, pair.second): pair for pair in self.report.pairs}
         repeats = {self.strips.look.names[number]: one for number, one in self.agreement.repeatability_m.items()}
         densities = dict(zip(self.strips.look.names, self.strips.look.cells.single_densities(), strict=False))
@@ -201,7 +201,7 @@ class Judgement:
         return names.index(pair[0]), names.index(pair[1])
 
     def lines(self, before: Judgement | None) -> list[str]:
-        """For people."""
+        """Return the comparison as lines for people."""
         lines = [_row("strips", "cells", "mean", "RMSDz", "95 %", "max", "to plane", "RMS", "noise") + "  cm"]
         heights, to_plane = self._rows(), {(pair.first, pair.second): pair for pair in self.report.pairs}
         for pair in sorted({*heights, *to_plane}, key=self._place):
@@ -246,7 +246,7 @@ def _row(name: str, *values: str) -> str:
 
 
 def _line(name: str, heights: dict[str, Any] | None, to_plane: PairReport | None) -> str:
-    """Return a row of the table, centimetres: of heights, then of returns above planes."""
+    """Return a row of the table, centimetres: first heights, then distances of returns from planes."""
     values = ["–"] * 5
     if heights is not None:
         told = (heights["mean_m"], heights["rms_m"], heights["p95_m"], heights["max_m"])
@@ -259,7 +259,7 @@ def _line(name: str, heights: dict[str, Any] | None, to_plane: PairReport | None
 
 
 def _to_plane(pair: PairReport | None) -> dict[str, Any]:
-    """Return point to plane for JSON; ``dz`` is its vertical part, on slopes below 10°."""
+    """Return point-to-plane numbers for JSON; ``dz`` is the vertical part, on slopes below 10°."""
     if pair is None:
         return dict.fromkeys(("point_to_plane", "dz", "noise_m", "systematic_m"))
     return {
@@ -271,7 +271,7 @@ def _to_plane(pair: PairReport | None) -> dict[str, Any]:
 
 
 def _gridded(row: dict[str, Any] | None) -> dict[str, Any] | None:
-    """Return the heights of planes for JSON, the measure that is judged."""
+    """Return the height differences of planes for JSON, the measure that strips are judged by."""
     if row is None:
         return None
     kept = {key: value for key, value in row.items() if key not in ("first", "second")}

@@ -1,6 +1,6 @@
-"""Strips to be compared: products of `swath georef`, any LAS or LAZ files, or logs; all as one thing.
+"""Reads strips to be compared from products of `swath georef`, other LAS or LAZ files, or logs, into one form.
 
-What the quick look reads for its maps says where strips overlap; the returns there are read in a second pass.
+The quick look, which is read for maps, tells where strips overlap; the returns there are read in a second pass.
 """
 
 from __future__ import annotations
@@ -54,17 +54,17 @@ WANTED |= Selection.POINT_SOURCE_ID | Selection.GPS_TIME
 
 @dataclass(frozen=True, eq=False)
 class Strips:
-    """Strips as they were read.
+    """Strips as they were read for a comparison.
 
     Attributes:
-        what: the folder or log, for people.
-        look: of the quick look, for maps and gridded differences.
-        gathered: returns in cells of the overlap, in t where it is known, else in metres of the map.
-        cell_m: side of these.
-        seen: where from; None: no trajectory is known.
+        what: folder or log, for people.
+        look: their quick look, for maps and gridded differences.
+        gathered: returns in cells of the overlap, in t if it is known, otherwise in metres of the map.
+        cell_m: side of these cells.
+        seen: where the strips were seen from; None: no trajectory is known.
         prior: joint covariance of the trajectory's errors; None: it is not known.
         notes: what the user should know.
-        carried: verdicts on what the points were made with, those that are not good.
+        carried: verdicts on inputs of the points, other than good.
     """
 
     what: str
@@ -78,16 +78,16 @@ class Strips:
 
 
 def strips_of_files(paths: Sequence[Path], rules: StripRules, told: Told, week: int | None = None) -> Strips:
-    """Of LAS or LAZ files and folders.
+    """Return the strips in LAS or LAZ files and folders.
 
     Args:
-        paths: of them.
-        rules: of the comparison.
-        told: is told how far it is.
-        week: GPS week of times that say none; None: that of the trajectory beside the points.
+        paths: files and folders.
+        rules: rules of the comparison.
+        told: called with the progress.
+        week: GPS week of times that have none; None: that of the trajectory beside the points.
 
     Raises:
-        UserError: they cannot be read, or are one strip.
+        UserError: the files cannot be read, or hold one strip only.
     """
     what = ", ".join(map(str, paths))
     if week is not None and week > LATEST_NS // WEEK_NS:
@@ -121,17 +121,17 @@ def strips_of_flight(
     mapping: Mapping | None = None,
     prior: TrajectoryPrior | None = None,
 ) -> Strips:
-    """Of a flight as its points are placed.
+    """Return the strips of a flight, as its points are placed.
 
     Args:
         what: the logs, for people.
-        flight: its points stand in t.
-        rules: of the comparison.
-        mapping: of the products, settled: cells for heights are those of their files; None: they lie in t.
+        flight: a flight whose points are in t.
+        rules: rules of the comparison.
+        mapping: settled mapping of the products: cells for heights are those of their files; None: cells lie in t.
         prior: joint covariance of the trajectory's errors; None: it is not known.
 
     Raises:
-        UserError: it is one strip.
+        UserError: there is one strip only.
     """
     look = look_of_flight(flight, rules, mapping)
     refuse_one(what, look)
@@ -141,7 +141,7 @@ def strips_of_flight(
 
 
 def refuse_one(what: str, look: Look) -> None:
-    """UserError where there is nothing to compare."""
+    """Refuse with `UserError` inputs that have no two different, overlapping strips."""
     if len(look.names) < 2:
         raise UserError(f"{what}: one strip only; differences want at least two strips that overlap")
     if not look.overlap.cells:
@@ -155,7 +155,7 @@ def refuse_one(what: str, look: Look) -> None:
 
 
 def cells_of(look: Look, rules: StripRules) -> Cells:
-    """Return cells of the quick look in which two strips have returns enough."""
+    """Return cells of the quick look in which two or more strips have enough returns."""
     cells = look.cells
     found = []
     for strip in range(len(cells.tiles)):
@@ -172,7 +172,7 @@ def cells_of(look: Look, rules: StripRules) -> Cells:
 
 
 def _file_blocks(look: Look, clock: PointClock) -> Iterator[tuple[int, StripBlock]]:
-    """Yield blocks by strip, numbered as the quick look numbered them: it read the same files in the same order."""
+    """Yield blocks by strip, numbered as in the quick look, which read the same files in the same order."""
     book = StripBook()
     for source in look.sources:
         try:
@@ -181,11 +181,11 @@ def _file_blocks(look: Look, clock: PointClock) -> Iterator[tuple[int, StripBloc
                     strip = book.numbers(source, np.asarray(points["point_source_id"]))
                     yield from _by_strip(points, strip, _time_ns(points, source.path, clock), look)
         except UNREADABLE:
-            continue  # the quick look has noted the damage
+            continue  # the quick look has already noted the damage
 
 
 def _time_ns(points: Any, path: Path, clock: PointClock) -> Int64Array:
-    """Return GPS times (n,) of a file's points; 0 where it has none."""
+    """Return GPS times (n,) of a file's points; 0 if the file has no times."""
     if "gps_time" not in points.point_format.dimension_names:
         return np.zeros(len(points), np.int64)
     return clock.time_ns(path, np.asarray(points["gps_time"], np.float64))
@@ -206,14 +206,14 @@ def _by_strip(
 
 
 def _middle_ns(seen: SeenFrom) -> int | None:
-    """Return the middle of the flight by its trajectories; None: they are of more than one week."""
+    """Return the middle of the flight by its trajectories; None if they span half a week or more."""
     begin = min(trajectory.span[0] for trajectory in seen.trajectories)
     end = max(trajectory.span[1] for trajectory in seen.trajectories)
     return (begin + end) // 2 if end - begin < WEEK_NS // 2 else None
 
 
 def _times_apart(strips: Gathered, seen: SeenFrom) -> list[str]:
-    """Return a line where most returns are of other times than their strips' trajectories."""
+    """Return a line if most returns have times outside their strips' trajectories."""
     outside = 0
     for number, flown in enumerate(seen.flown):
         begin, end = seen.trajectories[flown].span
@@ -236,7 +236,7 @@ def _times_apart(strips: Gathered, seen: SeenFrom) -> list[str]:
 
 
 def _seen_from(look: Look) -> tuple[SeenFrom | None, Callable[[FloatArray], FloatArray]]:
-    """Return the trajectories beside the points, and the way from the map's metres to t."""
+    """Return the trajectories beside the points, and a function from the map's metres to t."""
     sidecars = [source.sidecar for source in look.sources]
     trajectories, of_session = _trajectories(look)
     if not trajectories or not all(sidecars):
@@ -251,13 +251,15 @@ def _seen_from(look: Look) -> tuple[SeenFrom | None, Callable[[FloatArray], Floa
         return frame.t_from_e(mapping.e_from_map(points / unit_m)) if len(points) else points
 
     flown = [_flown(look, number, trajectories, of_session) for number in range(len(look.names))]
-    # the files' directions are to the body's right and left, whatever the mounting
+    # the files' scan directions refer to the body's right and left, whatever the mounting
     mounted = [np.eye(3)] * len(look.names)
     return SeenFrom(frame, trajectories, flown, [1.0] * len(look.names), mounted), place
 
 
 def _mapping_of(crs: dict[str, Any]) -> Mapping:
-    """Return the frame of a sidecar's points, by what was said of it, on the command line or in the configuration."""
+    """Return the mapping frame of a sidecar's points, with the datum given on the command line or
+    in the configuration.
+    """
     if "datum_said" not in crs or "accuracy_wanted_m" not in crs:
         raise MappingError(
             "the sidecar beside the points does not say of which datum they are; want swath georef again"
@@ -266,7 +268,7 @@ def _mapping_of(crs: dict[str, Any]) -> Mapping:
 
 
 def _trajectories(look: Look) -> tuple[list[Trajectory], list[str]]:
-    """Return those beside the points, and of which session each is."""
+    """Return the trajectories beside the points, and the session of each."""
     folders = {source.path.parent for source in look.sources}
     files = sorted(file for folder in folders for file in folder.glob(f"*{TRAJECTORY}"))
     return (
@@ -276,7 +278,9 @@ def _trajectories(look: Look) -> tuple[list[Trajectory], list[str]]:
 
 
 def _flown(look: Look, number: int, trajectories: Sequence[Trajectory], of_session: Sequence[str]) -> int:
-    """Return the trajectory of a strip: of its run's sessions the one of the times that the sidecar says of it."""
+    """Return the index of a strip's trajectory: among those of its run's sessions, the one that covers its time in the
+    sidecar.
+    """
     sessions, source_id = look.origins[number]
     own = [at for at, session in enumerate(of_session) if session in sessions] or list(range(len(trajectories)))
     for source in look.sources:
@@ -293,7 +297,7 @@ def _flown(look: Look, number: int, trajectories: Sequence[Trajectory], of_sessi
 
 
 def look_of_flight(flight: Flight, rules: StripRules, mapping: Mapping | None = None) -> Look:
-    """Return a quick look at a flight's points, on the map of its products, or in t."""
+    """Return a quick look at a flight's points, on the map of its products or in t."""
     corners = low, high = corners_of(flight, mapping)
     area_m2 = max(float(np.prod((high - low)[:2])), 1.0)
     density = max((len(swath) for swath in flight.swaths), default=1) / area_m2

@@ -1,1 +1,1 @@
-"""`swath trajectory`: files, figures, pages, verdict."""
+"""Implements `swath trajectory`: files, figures, pages, verdict."""

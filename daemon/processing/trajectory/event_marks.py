@@ -1,4 +1,6 @@
-"""Event marks of a log (camera triggers) with the pose of the body at their time; each has a row in any case."""
+"""Lists event marks of a log (camera triggers) with the body's pose at their time; marks without a
+pose have a row too.
+"""
 
 from __future__ import annotations
 
@@ -25,17 +27,17 @@ FATES = {
     Fate.OUTSIDE_TRAJECTORY: "outside the trajectory",
     Fate.TRAJECTORY_GAP: "in a gap of the trajectory",
 }
-NUMBERS = (11, 11, 4, 6, 6, 6, 4, 4, 4, 6, 6, 6)  # digits behind the point, latitude to the sigma of heading
+NUMBERS = (11, 11, 4, 6, 6, 6, 4, 4, 4, 6, 6, 6)  # decimals, from latitude to sigma of heading
 NOTHING = "," * (len(NUMBERS) - 1)
 
 
 @dataclass(frozen=True, slots=True)
 class EventTable:
-    """Marks as a CSV file.
+    """Event marks as a CSV file.
 
     Attributes:
-        text: header and a line each, in the order in which they came.
-        fates: marks by what became of them.
+        text: header and one line per mark, in the order of their arrival.
+        fates: number of marks by fate.
     """
 
     text: str
@@ -45,7 +47,7 @@ class EventTable:
 def event_table(marks: Sequence[Mark], trajectory: Trajectory) -> EventTable:
     """Return position (of the body's origin), attitude and sigmas of marks.
 
-    A mark's own sigma of time is in the sigmas of the position, by the velocity.
+    A mark's own sigma of time enters the sigmas of the position through the velocity.
     """
     timed = np.array([mark.gps_ns for mark in marks if mark.gps_ns is not None], np.int64)
     fates = trajectory.fates(timed) if len(timed) else np.empty(0, np.uint8)
@@ -91,9 +93,7 @@ def _line(mark: Mark, row: FloatArray | None, fate: str) -> str:
 
 
 def _poses(trajectory: Trajectory, time_ns: NDArray[np.int64]) -> FloatArray:
-    """Return (n, 15) latitude to the sigma of heading as they stand in the file, then the velocity north, east, down,
-    m/s.
-    """
+    """Return (n, 15): latitude to sigma of heading as in the file, then velocity north, east, down, m/s."""
     if not len(time_ns):
         return np.empty((0, 15))
     poses = trajectory.poses(time_ns)

@@ -1,4 +1,4 @@
-"""What a navigated flight comes to in numbers: one dict, for the page, the summary and the verdict."""
+"""Computes the figures of a navigated flight: one dict, for the page, the summary and the verdict."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ SENSORS: tuple[tuple[str, str, str], ...] = (  # name, field of Solution, of Imu
     ("accel_misalignment", "accel_misalignment", "misalignment"),
 )
 CHI2_MEDIAN = np.array([np.nan, 0.45494, 1.38629, 2.36597])  # of 1, 2, 3 degrees of freedom
-MOST_SORTED = 400_000  # epochs a percentile is taken of
-FEWEST = 30  # observations of a kind whose spread is told
-WINDOW_NS = 30 * SECOND_NS  # as long as the root mean square of a whole flight may hide
+MOST_SORTED = 400_000  # maximum epochs that a percentile is computed from
+FEWEST = 30  # minimum observations of a kind for figures of their spread
+WINDOW_NS = 30 * SECOND_NS  # a disturbance of this length may be hidden in the root mean square of a whole flight
 
 
 def figures_of(flight: Flight, separation: Separation | None) -> Figures:
-    """Return all figures of a flight; sigmas are one standard deviation, of the smoother where it ran."""
+    """Return all figures of a flight; sigmas are one standard deviation, of the smoother if it ran."""
     best = flight.best
     intervals = np.diff(best.time_ns)
     return {
@@ -81,7 +81,7 @@ def figures_of(flight: Flight, separation: Separation | None) -> Figures:
 
 
 def _heading_s(setup: Setup) -> float | None:
-    """Return how long errors of headings are taken to last; None where none do."""
+    """Return the assumed correlation time of headings' errors; None if none is assumed."""
     lasts = setup.baseline_b is not None and setup.gnss_heading_share > 0.0
     return setup.gnss_heading_correlation_s if lasts else None
 
@@ -115,7 +115,7 @@ def _positions(flight: Flight) -> Figures:
 
 
 def _observations(innovations: StructArray) -> dict[str, Figures]:
-    """By kind: how many met which fate, and how innovations compare with their sigmas."""
+    """Return by kind the number of observations by fate, and how innovations compare with their sigmas."""
     found = {}
     for code in np.unique(innovations["kind"]):
         rows = innovations[innovations["kind"] == code]
@@ -131,9 +131,9 @@ def _observations(innovations: StructArray) -> dict[str, Figures]:
 
 
 def sigma_factor(rows: StructArray) -> float | None:
-    """By how much innovations are larger than their sigmas: 1 where these are honest; None of fewer than 30.
+    """Return the factor by which innovations exceed their sigmas: 1 if these are right; None for fewer than 30.
 
-    From the median of chi2 against that of its distribution, which neither outliers nor the gate move much.
+    From the median of chi2 against that of its distribution, which neither outliers nor the gate affect much.
     """
     rows = rows[np.isin(rows["fate"], (*USED, Fate.REJECTED)) & (rows["dimension"] > 0) & np.isfinite(rows["chi2"])]
     if len(rows) < FEWEST:
@@ -142,7 +142,9 @@ def sigma_factor(rows: StructArray) -> float | None:
 
 
 def correlation_of(rows: StructArray) -> float | None:
-    """Of each normalised innovation with the next of its antenna: 0 where they are white; None of fewer than 30."""
+    """Return the correlation of each normalised innovation with its antenna's next: 0 if white;
+    None for fewer than 30.
+    """
     products, squares, pairs = 0.0, 0.0, 0
     for antenna in np.unique(rows["antenna"]):
         mine = rows[(rows["antenna"] == antenna) & np.isin(rows["fate"], USED)]
@@ -168,7 +170,7 @@ def _percentile_95(column: FloatArray) -> float:
 
 
 def _sigmas(solution: Solution, told: Any) -> dict[str, float | None]:
-    """By name with unit, ``north_m`` to ``heading_deg``; None where no epoch has one."""
+    """Return figures of sigmas by name with unit, ``north_m`` to ``heading_deg``; None if no epoch has one."""
     found = {}
     for name, column, axes, unit, factor in SIGMAS:
         values = getattr(solution, column)
@@ -188,7 +190,7 @@ def _ratios(separation: Separation) -> dict[str, FloatArray]:
 
 
 def _separation(separation: Separation | None) -> Figures | None:
-    """Return root mean square of filter − smoother over its predicted sigma: 1 where both tell the truth."""
+    """Return the root mean square of filter − smoother over its predicted sigma: 1 if both sigmas are right."""
     if separation is None:
         return None
     return {
@@ -198,8 +200,9 @@ def _separation(separation: Separation | None) -> Figures | None:
 
 
 def _worst_separation(separation: Separation | None, start_ns: int) -> dict[str, Figures] | None:
-    """Return the same of the window in which it is largest, and its middle: seconds of a wrong fix in hours of a
-    flight.
+    """Return the same for the window in which it is largest, and its middle.
+
+    It shows seconds of a wrong fix in hours of a flight.
     """
     if separation is None:
         return None
@@ -220,7 +223,9 @@ def _worst_separation(separation: Separation | None, start_ns: int) -> dict[str,
 
 
 def _sensors(flight: Flight) -> dict[str, dict[str, Figures]]:
-    """Of each error of each axis: last estimate, its sigma, its size against what the configuration expects."""
+    """Return for each sensor error and axis: last estimate, its sigma, and its size relative to the
+    configured noise.
+    """
     best, noise = flight.best, flight.setup.noise
     found: dict[str, dict[str, Figures]] = {}
     for name, column, expected in SENSORS:
@@ -244,7 +249,7 @@ def _lever_arm(flight: Flight) -> Figures | None:
         return None
     given = np.asarray(flight.setup.lever_arms_b, np.float64)[0]
     estimate, sigma = best.lever_arm_b[-1], best.lever_arm_sigma[-1]
-    moved = np.abs(estimate - given) if prior_m < ARM_UNSAID_M else np.zeros(3)  # of what nobody said
+    moved = np.abs(estimate - given) if prior_m < ARM_UNSAID_M else np.zeros(3)  # it had no given value
     return {
         "given_m": given.tolist(),
         "estimate_m": estimate.tolist(),
@@ -263,7 +268,7 @@ def _time_offset(flight: Flight) -> Figures | None:
 
 
 def accuracy_words(figures: Figures) -> str:
-    """Return sigmas over the flight, as people say them."""
+    """Return the sigmas over the flight in words."""
     rms = figures["sigma_rms"]
     place = [rms["north_m"], rms["east_m"], rms["down_m"]]
     known = [value for value in place if value is not None]

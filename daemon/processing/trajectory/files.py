@@ -1,6 +1,7 @@
-"""The files of a trajectory: SBET and smrmsg, CSV, and what goes beside them; written out of sight, put in place whole.
+"""Writes the files of a trajectory: SBET and smrmsg, CSV, and those beside them, to temporary files that are then
+renamed.
 
-Epochs are written in blocks, so that five hours of them do not stand in memory twice.
+Epochs are written in blocks, so that five hours of them are not in memory twice.
 """
 
 from __future__ import annotations
@@ -27,12 +28,12 @@ COLUMNS = ("time_ns", "position_e", "q_e_from_b", "velocity_e", "position_sigma_
 
 @dataclass(frozen=True, slots=True)
 class TrajectoryFiles:
-    """Where the files of a run go.
+    """The paths of a run's files.
 
     Attributes:
-        sbet, smrmsg, csv: None: not wanted.
-        summary: the JSON, written last.
-        page: the plots.
+        sbet, smrmsg, csv: None: not written.
+        summary: path of the JSON, which is written last.
+        page: path of the plots.
     """
 
     sbet: Path | None
@@ -42,16 +43,17 @@ class TrajectoryFiles:
     page: Path
 
     def all(self) -> list[Path]:
-        """Return those wanted."""
+        """Return the paths of all files that are written."""
         named = (self.sbet, self.smrmsg, self.csv, self.page, self.summary)
         return [path for path in named if path is not None]
 
     @classmethod
     def of_output(cls, output: Path, session: str, *, csv: bool) -> TrajectoryFiles:
-        """Make it by what ``-o`` says: a file .sbet, .out or .csv, or a folder for files with the session's name.
+        """Return paths for the value of ``-o``: a file .sbet, .out or .csv, or a folder for files named after the
+        session.
 
         Raises:
-            UserError: it is neither.
+            UserError: the value is neither.
         """
         suffix = output.suffix.lower()
         if suffix == ".csv":
@@ -65,7 +67,7 @@ class TrajectoryFiles:
 
     @classmethod
     def in_folder(cls, folder: Path, session: str, *, csv: bool) -> TrajectoryFiles:
-        """Return files with the session's name."""
+        """Return paths in a folder, named after the session."""
 
         def ending(suffix: str) -> Path:
             return folder / f"{session}_trajectory{suffix}"
@@ -74,21 +76,21 @@ class TrajectoryFiles:
         return cls(ending(".sbet"), ending(".smrmsg"), text, ending(".json"), ending(".html"))
 
     def refuse_existing(self, *others: Path | None) -> None:
-        """UserError where a file is there already, another one that is to be written included."""
+        """Refuse with `UserError` to replace any of the files, or of ``others``, that exists."""
         for path in [*self.all(), *(other for other in others if other is not None)]:
             if path.exists():
                 raise UserError(f"{path}: is there already; want another name, or --overwrite", ExitCode.USAGE)
 
 
 def _smrmsg_of(sbet: Path) -> Path:
-    """Return the name under which the sigmas of an SBET are written."""
+    """Return the path under which the sigmas of an SBET are written."""
     if sbet.name.startswith("sbet") and sbet.suffix == ".out":
         return sbet.with_name("smrmsg" + sbet.name.removeprefix("sbet"))
     return sbet.with_suffix(".smrmsg")
 
 
 def smrmsg_beside(sbet: Path) -> Path | None:
-    """Return the sigmas that came with an SBET: as they are written here, or with the name's first word exchanged."""
+    """Return the path of the sigmas beside an SBET: named as this software does, or with the first word exchanged."""
     names = [_smrmsg_of(sbet)] if sbet.suffix.lower() in SBETS else []
     if sbet.name.startswith("sbet"):
         names.append(sbet.with_name("smrmsg" + sbet.name.removeprefix("sbet")))
@@ -98,18 +100,18 @@ def smrmsg_beside(sbet: Path) -> Path | None:
 def write_trajectory(
     files: TrajectoryFiles, trajectory: Trajectory, velocity_sigma_l: FloatArray | None
 ) -> list[tuple[Path, Path]]:
-    """Return SBET, smrmsg and CSV as far as they are wanted, under names that `put_in_place` takes away.
+    """Write SBET, smrmsg and CSV, as far as they have paths, to temporary files for `put_in_place`.
 
     Args:
-        files: where to.
-        trajectory: of the body's origin.
-        velocity_sigma_l: (n, 3) north, east, down; None: unsaid.
+        files: paths of the files.
+        trajectory: trajectory of the body's origin.
+        velocity_sigma_l: (n, 3) north, east, down; None: unknown.
 
     Returns:
         What was written, and where it belongs.
 
     Raises:
-        OSError: it cannot be written; nothing is left then.
+        OSError: a file cannot be written; no temporary file is left.
     """
     written: list[tuple[Path, Path]] = []
     wanted: tuple[tuple[Path | None, Callable[[IO[bytes]], None]], ...] = (
@@ -134,15 +136,17 @@ def _part(trajectory: Trajectory, first: int, last: int) -> Trajectory:
 
 
 def _of_week_s(trajectory: Trajectory, first: int, last: int) -> FloatArray:
-    """Return seconds of the week of the trajectory's first epoch, running past its end."""
+    """Return seconds of the week of the trajectory's first epoch, continued past its end."""
     week, _ = week_from_gps(trajectory.span[0])
     since: FloatArray = (trajectory.time_ns[first:last] - week * WEEK_NS) / SECOND_NS
     return since
 
 
 def _sbet_blocks(trajectory: Trajectory) -> Iterator[bytes]:
-    """Yield an epoch beyond the block gives its last one's acceleration and rates; the very last has those before
-    it.
+    """Yield blocks of SBET records.
+
+    One epoch beyond a block gives acceleration and rates of the block's last epoch; the very last epoch repeats those
+    before.
     """
     n = len(trajectory)
     for first in range(0, n, BLOCK):

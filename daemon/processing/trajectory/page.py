@@ -1,4 +1,4 @@
-"""The page of a navigated flight: verdict, tables and pictures in one file that needs no network."""
+"""Writes the page of a navigated flight: verdict, tables and pictures in one file that needs no network."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from swath.daemon.processing.trajectory.verdict import Found, Level, Verdict, ju
 from swath.georef.trajectory.trajectory import gps_text
 
 MOST_REASONS = 40
-NARROW_PX = 640  # of the window, up to which the narrow pictures are shown
+NARROW_PX = 640  # window width up to which the narrow pictures are shown
 Wanted = Callable[[Drawn], bool]
 
 
@@ -118,7 +118,7 @@ h2 + p.muted { margin-top: -.3rem; } td.left { min-width: 15rem; }
 
 
 def write_page(path: Path, flight: Flight, findings: Iterable[Found] = ()) -> tuple[Verdict, Figures]:
-    """Write the page of a flight; gives its verdict and its figures, as `summary_of` puts them into JSON.
+    """Write the page of a flight; return its verdict and its figures, as `summary_of` puts them into JSON.
 
     Raises:
         OSError: the file cannot be written.
@@ -138,7 +138,7 @@ def write_page(path: Path, flight: Flight, findings: Iterable[Found] = ()) -> tu
 
 
 def summary_of(flight: Flight, findings: Iterable[Found] = ()) -> dict[str, object]:
-    """Return verdict and figures without a page, for JSON."""
+    """Return verdict and figures for JSON, without a page."""
     figures = figures_of(flight, separation_of(flight))
     return {"verdict": judge(figures, findings).as_dict(), "figures": figures}
 
@@ -146,7 +146,7 @@ def summary_of(flight: Flight, findings: Iterable[Found] = ()) -> dict[str, obje
 def page_of(
     flight: Flight, figures: Figures, verdict: Verdict, pictures: Sequence[tuple[str, str, bytes, bytes]]
 ) -> str:
-    """Return the page's text; pictures are title, words, wide and narrow PNG."""
+    """Return the HTML text of the page; pictures are title, words, wide and narrow PNG."""
     parts = [
         f"<!doctype html><html lang='en'><head><meta charset='utf-8'><title>{escape(flight.title)}: trajectory</title>",
         "<meta name='viewport' content='width=device-width, initial-scale=1'>",
@@ -181,7 +181,7 @@ def _duration(seconds: float) -> str:
 
 
 def _length(metres: float | None) -> str:
-    """Of a sigma: centimetres below a metre."""
+    """Return the text of a sigma: below a metre in centimetres."""
     if metres is None:
         return "–"
     return f"{metres:.2f} m" if metres >= 1.0 else f"{100 * metres:.2f} cm"
@@ -212,7 +212,7 @@ def _cards(figures: Figures) -> str:
 
 
 def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Of words; they are escaped here."""
+    """Return an HTML table of words, which are escaped here."""
     head = "".join(f"<th>{escape(word)}</th>" for word in heads)
     body = "".join(f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in rows)
     return f"<div class='scroll'><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>"

@@ -1,4 +1,4 @@
-"""Panels over one axis of time, and what they show a flight from."""
+"""Draws panels over one time axis, and holds the data of a flight that they share."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ OUTAGE, BRIDGED = "#d9dcd7", "#f3b8a8"
 
 @dataclass(frozen=True, slots=True)
 class Format:
-    """Of a picture: its width, its panels' height, and how fine it is."""
+    """The format of a picture: its width, its panels' height, its resolution and its ticks."""
 
     width_in: float
     panel_in: float
@@ -43,7 +43,7 @@ WIDE, NARROW = Format(10.4, 1.45, 112, 8), Format(4.1, 1.3, 180, 4)
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """A flight with what several pictures need of it."""
+    """A flight with data that several pictures need."""
 
     flight: Flight
     course: Course
@@ -51,12 +51,12 @@ class Drawn:
 
     @cached_property
     def outages_s(self) -> FloatArray:
-        """(k, 2) seconds from the first epoch."""
+        """Outages (k, 2), seconds from the first epoch."""
         return (outages_of(self.flight) - self.flight.start_ns) / SECOND_NS
 
     @cached_property
     def bridged_s(self) -> FloatArray:
-        """(k, 2) seconds from the first epoch."""
+        """Spans of bridged samples (k, 2), seconds from the first epoch."""
         return (bridged_spans(self.flight.best) - self.flight.start_ns) / SECOND_NS
 
     @cached_property
@@ -64,7 +64,7 @@ class Drawn:
         return {}
 
     def band(self, pixels: Pixels, solution: Solution, column: str) -> FloatArray:
-        """Return (2, m, …) of a solution's column; found once, drawn twice."""
+        """Return the band (2, m, …) of a solution's column; it is computed once for both formats."""
         key = id(solution), column
         if key not in self._bands:
             self._bands[key] = pixels.band(getattr(solution, column))
@@ -72,22 +72,22 @@ class Drawn:
 
     @cached_property
     def filter_pixels(self) -> Pixels:
-        """Of the filter's epochs."""
+        """Pixels of the filter's epochs."""
         return Pixels(self.flight.forward.time_ns, self.flight.start_ns)
 
     @cached_property
     def node_pixels(self) -> Pixels:
-        """Of the nodes of the best solution."""
+        """Pixels of the nodes of the best solution."""
         return Pixels(self.flight.best.node_time_ns, self.flight.start_ns)
 
     def since_start_s(self, time_ns: Int64Array) -> FloatArray:
-        """Return (n,) of GPS times."""
+        """Return seconds (n,) from the first epoch to GPS times."""
         seconds: FloatArray = (time_ns - self.flight.start_ns) / SECOND_NS
         return seconds
 
 
 class Sheet:
-    """Panels one below the other over one axis of time."""
+    """Panels one below the other over one time axis."""
 
     def __init__(self, drawn: Drawn, form: Format, words: Sequence[str], panel: float = 1.0) -> None:
         self.drawn, self.form = drawn, form
@@ -139,21 +139,21 @@ class Sheet:
     def line(
         self, axes: Axes, pixels: Pixels, band: FloatArray, colour: str, broken: NDArray[np.bool_] | None = None
     ) -> None:
-        """Of bands (2, m); ``broken`` (m − 1,): where it is besides."""
+        """Draw a line through bands (2, m); ``broken`` (m − 1,) marks additional breaks."""
         at_s, values = pixels.line(band, broken)
         axes.plot(at_s / self.unit_s, values, color=colour, lw=0.9, solid_joinstyle="round")
 
     def fill(self, axes: Axes, pixels: Pixels, low: FloatArray, high: FloatArray, colour: str) -> None:
-        """Between two lines (m,)."""
+        """Fill between two lines (m,)."""
         axes.fill_between(pixels.at_s / self.unit_s, low, high, color=colour, lw=0.0, alpha=0.18)
 
     def legend(self, axes: Axes, handles: Sequence[tuple[str, str]]) -> None:
-        """Colours and words, at the right of a panel's title."""
+        """Draw a legend of colours and words, at the right of a panel's title."""
         lines = [Line2D([], [], color=colour, lw=1.8, label=word) for colour, word in handles]
         self.legend_of(axes, lines)
 
     def legend_of(self, axes: Axes, handles: Sequence[Any]) -> None:
-        """Any handles, likewise."""
+        """Draw a legend of any handles at the same place."""
         axes.legend(
             handles=list(handles),
             loc="lower right",
@@ -169,12 +169,12 @@ class Sheet:
         )
 
     def picture(self) -> bytes:
-        """As PNG."""
+        """Return the sheet as PNG."""
         return picture_of(self.figure, self.form)
 
 
 def dress(axes: Axes) -> None:
-    """A panel's colours."""
+    """Style the colours, ticks and grid of a panel."""
     axes.tick_params(labelsize=8, colors=MUTED, length=3)
     axes.spines[:].set_color("#b9bdb8")
     axes.grid(color="#7c858c", lw=0.4, alpha=0.35)
@@ -182,7 +182,7 @@ def dress(axes: Axes) -> None:
 
 
 def picture_of(figure: Figure, form: Format) -> bytes:
-    """Return PNG of few colours: a third of the bytes, and no difference to the eye."""
+    """Return a figure as PNG with few colours: a third of the bytes, without a visible difference."""
     figure.set_dpi(form.dpi)
     canvas: Any = FigureCanvasAgg(figure)
     canvas.draw()

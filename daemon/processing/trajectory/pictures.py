@@ -1,4 +1,4 @@
-"""Pictures of a navigated flight, each drawn twice: for a desk and for a telephone."""
+"""Draws pictures of a navigated flight, each in two formats: for a desktop and for a telephone."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from swath.georef.timescales.gps_time import SECOND_NS
 
 TRIPLE = ("#0072b2", "#d55e00", "#009e73")  # north, east, down; x, y, z; roll, pitch, heading
 FILTER, SMOOTHER = "#d55e00", "#0072b2"
-EDGE = 8.0  # normalised innovations beyond stand at the panel's edge
+EDGE = 8.0  # larger normalised innovations are drawn at the panel's edge
 FIX_LOOK: dict[int, tuple[str, str]] = {  # fix type, -1 for outages: colour, words
     FixType.RTK_FIXED: ("#1d7a38", "RTK fixed"),
     FixType.RTK_FLOAT: ("#e0a100", "RTK float"),
@@ -48,7 +48,7 @@ FATE_LOOK: dict[Fate, tuple[str, str, float, str]] = {  # marker, colour, size, 
 
 
 def draw_map(drawn: Drawn, form: Format) -> bytes:
-    """Return the flight from above, coloured by the fix type of its positions."""
+    """Return the flight's map, coloured by the fix type of its positions."""
     flight, course = drawn.flight, drawn.course
     lon, lat = course.place
     middle = math.radians(float(np.nanmean(lat)))
@@ -64,7 +64,7 @@ def draw_map(drawn: Drawn, form: Format) -> bytes:
     handles = []
     for code, (colour, word) in FIX_LOOK.items():
         if (types == code).any():
-            shown = (types == code) | np.append(False, types[:-1] == code)  # joins the next type's first point
+            shown = (types == code) | np.append(False, types[:-1] == code)  # extends to the next type's first point
             axes.plot(np.where(shown, lon, np.nan), np.where(shown, lat, np.nan), color=colour, lw=1.3)
             handles.append(Line2D([], [], color=colour, lw=2.0, label=word))
     _map_marks(drawn, axes, handles)
@@ -98,7 +98,7 @@ def _map_marks(drawn: Drawn, axes: Axes, handles: list[Line2D]) -> None:
 
 
 def _scale_bar(axes: Axes, lat_rad: float, width_deg: float, lon: FloatArray, lat: FloatArray) -> None:
-    """In the lower corner that the flight leaves emptier."""
+    """Draw a scale bar in the lower corner that holds less of the flight."""
     metre_deg = math.degrees(1.0 / 6_371_000.0)
     length_m = round_down(max(0.25 * width_deg / metre_deg, 1.0))
     (west, east), (south, north) = axes.get_xlim(), axes.get_ylim()
@@ -112,7 +112,7 @@ def _scale_bar(axes: Axes, lat_rad: float, width_deg: float, lon: FloatArray, la
 
 
 def draw_height(drawn: Drawn, form: Format) -> bytes:
-    """Return height, ground speed, climb."""
+    """Return a picture of height, ground speed and climb."""
     course = drawn.course
     sheet = Sheet(drawn, form, ("Ellipsoidal height (m)", "Speed over ground (m/s)", "Climb (m/s)"))
     for axes, band in zip(sheet.panels, (course.height_m, course.speed_mps, course.climb_mps), strict=True):
@@ -121,7 +121,7 @@ def draw_height(drawn: Drawn, form: Format) -> bytes:
 
 
 def draw_attitude(drawn: Drawn, form: Format) -> bytes:
-    """Return roll, pitch, heading."""
+    """Return a picture of roll, pitch and heading."""
     course = drawn.course
     sheet = Sheet(drawn, form, ("Roll (°)", "Pitch (°)", "Heading (°)"))
     for i, axes in enumerate(sheet.panels[:2]):
@@ -135,7 +135,7 @@ def draw_attitude(drawn: Drawn, form: Format) -> bytes:
 
 
 def _draw_sigmas(column: str, words: Sequence[str], factor: float) -> Callable[[Drawn, Format], bytes]:
-    """Filter and smoother on logarithmic scales."""
+    """Return a function that draws sigmas of filter and smoother on logarithmic scales."""
 
     def draw(drawn: Drawn, form: Format) -> bytes:
         flight = drawn.flight
@@ -158,7 +158,7 @@ def _draw_sigmas(column: str, words: Sequence[str], factor: float) -> Callable[[
 
 
 def _few_decades(axes: Axes) -> None:
-    """At least one decade, with ticks that read as numbers."""
+    """Scale an axis to whole decades, at least one, with ticks that read as numbers."""
     low, high = axes.get_ylim()
     low, high = 10 ** math.floor(math.log10(low) + 1e-9), 10 ** math.ceil(math.log10(high) - 1e-9)
     axes.set_ylim(low, high)
@@ -171,7 +171,7 @@ def _few_decades(axes: Axes) -> None:
 
 
 def draw_innovations(drawn: Drawn, form: Format) -> bytes:
-    """By kind, whitened, with the gate and the fates."""
+    """Return a picture of whitened innovations by kind, with the gate and the fates."""
     flight = drawn.flight
     rows = flight.forward.innovations
     kinds = [Kind(int(code)) for code in np.unique(rows["kind"])]
@@ -203,7 +203,7 @@ def draw_innovations(drawn: Drawn, form: Format) -> bytes:
 
 
 def _draw_sensors(names: Sequence[tuple[str, str, str, float]]) -> Callable[[Drawn, Format], bytes]:
-    """Return estimates by axis, each with a band of one sigma."""
+    """Return a function that draws estimates by axis, each with a band of one sigma."""
 
     def draw(drawn: Drawn, form: Format) -> bytes:
         best, pixels = drawn.flight.best, drawn.node_pixels
@@ -222,7 +222,7 @@ def _draw_sensors(names: Sequence[tuple[str, str, str, float]]) -> Callable[[Dra
 
 
 def draw_satellites(drawn: Drawn, form: Format) -> bytes:
-    """Return satellites used, and what kind of positions these were."""
+    """Return a picture of the satellites used and the fix types of the positions."""
     flight = drawn.flight
     rows = flight.forward.innovations
     rows = rows[rows["kind"] == Kind.POSITION]
@@ -252,7 +252,7 @@ def draw_satellites(drawn: Drawn, form: Format) -> bytes:
 
 
 def _draw_separation(name: str, words: Sequence[str], factor: float) -> Callable[[Drawn, Format], bytes]:
-    """Filter − smoother, and three times the sigma predicted for it."""
+    """Return a function that draws filter − smoother with three times its predicted sigma."""
 
     def draw(drawn: Drawn, form: Format) -> bytes:
         separation = drawn.separation
@@ -265,7 +265,7 @@ def _draw_separation(name: str, words: Sequence[str], factor: float) -> Callable
             sheet.fill(axes, pixels, -three[:, i], three[:, i], MUTED)
             sheet.line(axes, pixels, band[..., i], TRIPLE[i])
             half = max(float(np.nanmax(np.abs(band[..., i]))), float(np.percentile(three[:, i], 95.0)), 1e-9)
-            axes.set_ylim(-1.1 * half, 1.1 * half)  # a start that is hardly known would hide the rest
+            axes.set_ylim(-1.1 * half, 1.1 * half)  # a poorly known start would hide the rest
         handles = [Patch(fc=MUTED, alpha=0.18, ec="none", label="3 sigmas predicted")]
         sheet.legend_of(sheet.panels[0], handles)
         return sheet.picture()

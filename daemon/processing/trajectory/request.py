@@ -1,4 +1,4 @@
-"""Describes what the command line asks of a trajectory."""
+"""Defines the command line's request for a trajectory."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from swath.daemon.processing.navigation.navigate import NavigationOptions
 
 @dataclass(frozen=True, slots=True)
 class TrajectoryRequest:
-    """What the command line asks for.
+    """The options of `swath trajectory` from the command line.
 
     Attributes:
-        logs, output: where from, where to.
-        navigate: how.
-        csv: a CSV file too.
-        events: event marks go there; None: nowhere.
-        page: the page of plots is made.
-        overwrite: files of an earlier run are replaced.
+        logs, output: logs that are read, and where the files go.
+        navigate: options of navigation.
+        csv: write a CSV file too.
+        events: file for event marks; None: no file.
+        page: write the page of plots.
+        overwrite: replace files of an earlier run.
     """
 
     logs: Sequence[Path]

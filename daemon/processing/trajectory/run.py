@@ -33,14 +33,14 @@ if TYPE_CHECKING:
     from swath.daemon.config.config import Config
     from swath.daemon.log.reader import Session
 
-Tell = Callable[[str, int, int], None]  # what is done, how much, of how much
+Tell = Callable[[str, int, int], None]  # arguments: the step, how much is done, of how much
 Written = list[tuple[Path, Path]]
 AS_IS = "as-is"
 
 
 @dataclass(frozen=True)
 class TrajectoryReport:
-    """What was made: the summary's content, and where it is."""
+    """The outcome: the summary's content, its path, and all files."""
 
     record: dict[str, Any]
     summary: Path
@@ -48,10 +48,10 @@ class TrajectoryReport:
 
 
 def make_trajectory(wish: TrajectoryRequest, tell: Tell) -> TrajectoryReport:
-    """Make the files.
+    """Make the trajectory of logs and write its files.
 
     Raises:
-        UserError: there is no trajectory, a line each; no file is left then.
+        UserError: there is no trajectory, one line per reason; no file is left then.
     """
     with as_user_error(wish.output, TrajectoryError):
         passed_over: list[str] = []
@@ -95,7 +95,7 @@ def _write(
 def _write_as_is(
     wish: TrajectoryRequest, files: TrajectoryFiles, sessions: Sequence[Session], holes: Sequence[str]
 ) -> TrajectoryReport:
-    """Return the devices' own INS, without a page."""
+    """Write the solutions of the devices' own INS, without a page."""
     if wish.events is not None:
         raise UserError("--events: the marks are placed with a navigated trajectory; leave --ins as-is", ExitCode.USAGE)
     read = [(session, ins_as_is(session, wish.navigate.inputs.config)) for session in sessions]
@@ -120,7 +120,7 @@ def _write_as_is(
 
 
 def _joined(flights: Sequence[Navigated]) -> Trajectory:
-    """Return all sessions' trajectories as one; UserError where two are of one time."""
+    """Return all sessions' trajectories as one; refuse with `UserError` two that overlap in time."""
     parts = [flight.trajectory(flight.session_id) for flight in flights]
     _refuse_overlap([(flight.inputs.log, part) for flight, part in zip(flights, parts, strict=True)])
     return joined_trajectory(parts, parts[0].name)
@@ -137,7 +137,7 @@ def _refuse_overlap(parts: Sequence[tuple[Path, Trajectory]]) -> None:
 
 
 def _refuse_one_name(events: Path | None, files: TrajectoryFiles) -> None:
-    """UserError where the marks would go into a file of the trajectory."""
+    """Refuse with `UserError` to write the marks into a file of the trajectory."""
     if events is not None and events.resolve() in [path.resolve() for path in files.all()]:
         raise UserError(f"--events {events}: is a file of the trajectory itself; want another name", ExitCode.USAGE)
 
@@ -161,7 +161,7 @@ def _write_events(
 def _write_pages(
     wish: TrajectoryRequest, files: TrajectoryFiles, flights: Sequence[Navigated], written: Written
 ) -> tuple[list[Any], list[Any]]:
-    """Return a page a leg; verdicts and figures of all legs, in order."""
+    """Write one page per leg; return verdicts and figures of all legs, in order."""
     verdicts: list[Any] = []
     figures: list[Any] = []
     for page in pages_of(flights):
@@ -178,13 +178,13 @@ def _write_pages(
 
 @dataclass(frozen=True, eq=False)
 class AsIs:
-    """A session's INS.
+    """The solutions of a session's own INS.
 
     Attributes:
-        source: whose.
-        trajectory: attitude of b.
-        solutions: by what became of them.
-        holes: what is missing, a line each.
+        source: source of the solutions.
+        trajectory: trajectory with the attitude of b.
+        solutions: number of solutions by fate.
+        holes: missing data, one line each.
     """
 
     source: str
@@ -194,10 +194,10 @@ class AsIs:
 
 
 def ins_as_is(session: Session, config: Config | None) -> AsIs:
-    """Read it.
+    """Read the INS solutions of a session.
 
     Raises:
-        UserError: there is none.
+        UserError: there are none.
         LogError, OSError: the log cannot be read.
     """
     log = session.parts[0].path

@@ -1,4 +1,4 @@
-"""A navigated flight made small enough to draw: of each column of pixels the least and the largest value.
+"""Thins a navigated flight for drawing: keeps the smallest and the largest value of each column of pixels.
 
 Five hours at 200 Hz are 3.6 million epochs; a line drawn through every thousandth hides the spike between two of them.
 """
@@ -21,27 +21,27 @@ from swath.georef.trajectory.trajectory import Trajectory
 
 COLUMNS = 1000  # of pixels that a time axis spans
 BLOCK = 1 << 15  # epochs converted at once
-GROUP = 16  # epochs that share a vertical, if they are close
-MOST_COMPARED = 200_000  # epochs of the separation; it steps at updates and glides between them
-GAP_INTERVALS = 3.0  # so many usual intervals without a sample break a line
-OUTAGE_S = 5.0  # least time without a position that is called an outage
+GROUP = 16  # epochs that share a vertical if they are close
+MOST_COMPARED = 200_000  # epochs of the separation, which steps at updates and is smooth between them
+GAP_INTERVALS = 3.0  # a line is broken after so many usual intervals without a sample
+OUTAGE_S = 5.0  # minimum time without a position that counts as an outage
 USED = (int(Fate.TAKEN), int(Fate.INFLATED), int(Fate.REACQUIRED))
-SHORT = float(np.sqrt(0.02))  # sigma of a difference, of the filter's sigma, below which it says nothing
+SHORT = float(np.sqrt(0.02))  # sigma of a difference relative to the filter's, below which it is meaningless
 
 
 @dataclass(frozen=True, eq=False)
 class Flight:
-    """What a page is made of.
+    """The data of a page.
 
     Attributes:
-        title: what was navigated: the log's name.
+        title: name of the log that was navigated.
         forward: the filter's solution.
-        smoothed: the smoother's; None: the flight was not smoothed.
-        setup: installation and noise it was run with.
+        smoothed: the smoother's solution; None: the flight was not smoothed.
+        setup: installation and noise of the run.
         start: how the start was found, in words.
-        noise_found: factor on a kind's sigmas that the innovations ask for, by the name of what it is of.
-        notes: lines for the user, of whoever read the log.
-        missing_s: how long in all the log's samples have no trajectory.
+        noise_found: factors on sigmas that the innovations suggest, by kind of observation.
+        notes: lines for the user from the reading of the log.
+        missing_s: total time of the log's samples without a trajectory.
     """
 
     title: str
@@ -55,7 +55,7 @@ class Flight:
 
     @property
     def best(self) -> Solution:
-        """The smoothed solution where there is one."""
+        """The smoothed solution, or the filter's if there is none."""
         return self.forward if self.smoothed is None else self.smoothed
 
     @property
@@ -65,18 +65,18 @@ class Flight:
 
     @property
     def duration_s(self) -> float:
-        """From the first epoch to the last."""
+        """Time from the first epoch to the last."""
         return float(self.best.time_ns[-1] - self.best.time_ns[0]) / SECOND_NS
 
 
 class Pixels:
-    """Samples sorted into columns of pixels by their time.
+    """Samples grouped into columns of pixels by their time.
 
     Attributes:
-        time_ns: (n,) theirs.
-        starts: (m,) index of the first sample of each column that has any.
+        time_ns: (n,) times of the samples.
+        starts: (m,) index of the first sample of each column that has samples.
         at_s: (m,) mean time of the columns' samples since the page's zero.
-        broken: (m − 1,) nothing known between a column and the next.
+        broken: (m − 1,) True if there are no data between a column and the next.
     """
 
     def __init__(self, time_ns: Int64Array, zero_ns: int, columns: int = COLUMNS) -> None:
@@ -99,7 +99,7 @@ class Pixels:
         return len(self.starts)
 
     def blocks(self, most: int = BLOCK) -> Iterator[tuple[slice, slice]]:
-        """Yield columns, and the samples in them, some `most` at a time."""
+        """Yield slices of columns and of their samples, about `most` samples at a time."""
         first = 0
         while first < len(self):
             last = max(int(np.searchsorted(self.starts, self.starts[first] + most, side="right")) - 1, first + 1)
@@ -108,11 +108,11 @@ class Pixels:
             first = last
 
     def band(self, values: FloatArray) -> FloatArray:
-        """Return (2, m, …) least and largest of values (n, …) in each column; nan only where all are."""
+        """Return the smallest and largest (2, m, …) of values (n, …) in each column; nan only if all are."""
         return np.stack([np.fmin.reduceat(values, self.starts), np.fmax.reduceat(values, self.starts)])
 
     def line(self, band: FloatArray, broken: NDArray[np.bool_] | None = None) -> tuple[FloatArray, FloatArray]:
-        """Return (k,) times and values of a line that passes through both ends of each column, broken at gaps."""
+        """Return times and values (k,) of a line through both ends of each column, broken at gaps."""
         where = np.flatnonzero(self.broken if broken is None else self.broken | broken) + 1
         at_s = np.insert(self.at_s, where, np.nan)
         return np.repeat(at_s, 2), np.insert(band, where, np.nan, axis=1).T.reshape(-1)
@@ -123,7 +123,7 @@ class Course:
     """The best solution, thinned.
 
     Attributes:
-        pixels: of its epochs.
+        pixels: pixels of its epochs.
         place: (2, p) longitude and latitude, degrees, at `place_ns`.
         place_ns: (p,) GPS times.
         height_m, speed_mps, climb_mps: (2, m) bands.
@@ -151,7 +151,7 @@ def _trajectory(solution: Solution, part: slice | Int64Array) -> Trajectory:
 
 
 def course_of(flight: Flight) -> Course:
-    """Return where it flew, how fast, in what attitude: every epoch counts."""
+    """Return place, speed and attitude of a flight; every epoch enters the bands."""
     solution = flight.best
     pixels = Pixels(solution.time_ns, flight.start_ns)
     bands = np.empty((2, len(pixels), 6))
@@ -170,7 +170,7 @@ def course_of(flight: Flight) -> Course:
 def _local_rows(solution: Solution, part: slice) -> FloatArray:
     """Return (6, n) height, horizontal speed, climb, roll, pitch, heading (degrees, unwrapped) of consecutive epochs.
 
-    Epochs close in time share the vertical of the first of them: that is wrong by metres over the earth's radius.
+    Epochs close in time share the vertical of the first of them; the error is a few metres over the earth's radius.
     """
     time_ns = solution.time_ns[part]
     n = len(time_ns)
@@ -188,7 +188,7 @@ def _local_rows(solution: Solution, part: slice) -> FloatArray:
     velocity_l = (grouped(solution.velocity_e) @ to_e).reshape(-1, 3)[:n].T
     q_l_from_e = conjugate(product(about(2, lon), about(1, -lat - np.pi / 2)))
     units = np.eye(4)
-    turn = np.stack([product(q_l_from_e, units[i]) for i in range(4)], axis=1)  # rows: what each component becomes
+    turn = np.stack([product(q_l_from_e, units[i]) for i in range(4)], axis=1)  # rows: the image of each component
     w, x, y, z = np.ascontiguousarray((grouped(solution.q_e_from_b) @ turn).reshape(-1, 4)[:n].T)
     roll = np.arctan2(2 * (y * z + w * x), 1 - 2 * (x * x + y * y))
     pitch = np.arcsin(np.clip(2 * (w * y - x * z), -1.0, 1.0))
@@ -200,17 +200,17 @@ def _local_rows(solution: Solution, part: slice) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Separation:
-    """Filter − smoother, against the sigma it should have.
+    """The difference filter − smoother, and its predicted sigma.
 
-    The smoother's error is orthogonal to the difference, so its covariance is P_filter − P_smoother
-    (Fraser and Potter 1969).
+    The smoother's error is orthogonal to the difference, so its covariance is P_filter − P_smoother (Fraser and Potter
+    1969).
 
     Attributes:
-        time_ns: (k,) compared epochs.
+        time_ns: (k,) epochs that are compared.
         position_m, velocity_mps, attitude_rad: (k, 3) north, east, down; roll, pitch, heading.
         position_sigma_m, velocity_sigma_mps, attitude_sigma_rad: (k, 3); nan where the filter's and the smoother's
-            sigmas hardly differ and the difference says nothing. Where a time offset was estimated the positions' is
-            too large along the track: the smoother's is that of GNSS's time.
+            sigmas hardly differ, so that the difference is meaningless. If a time offset was estimated, the positions'
+            is too large along the track: the smoother's refers to GNSS's time.
     """
 
     time_ns: Int64Array
@@ -223,7 +223,7 @@ class Separation:
 
 
 def separation_of(flight: Flight) -> Separation | None:
-    """Return none where the flight was not smoothed, or no epoch is in both solutions."""
+    """Return filter − smoother; None if the flight was not smoothed, or the solutions share no epoch."""
     forward, smoothed = flight.forward, flight.smoothed
     if smoothed is None:
         return None
@@ -260,7 +260,7 @@ def _of_difference(forward: FloatArray, smoothed: FloatArray) -> FloatArray:
 
 
 def used_positions(solution: Solution) -> StructArray:
-    """Return (k,) innovations of the positions that the filter used, one a time."""
+    """Return innovations (k,) of the positions that the filter used, one per time."""
     rows = solution.innovations
     rows = rows[(rows["kind"] == Kind.POSITION) & np.isin(rows["fate"], USED)]
     chosen: StructArray = rows[np.unique(rows["time_ns"], return_index=True)[1]]
@@ -268,9 +268,7 @@ def used_positions(solution: Solution) -> StructArray:
 
 
 def outages_of(flight: Flight) -> Int64Array:
-    """Return (k, 2) GPS times from which and until which no position was used, the flight's ends counting as
-    positions.
-    """
+    """Return GPS times (k, 2) between which no position was used; the flight's ends count as positions."""
     used_ns = used_positions(flight.forward)["time_ns"]
     usual_ns = float(np.median(np.diff(used_ns))) if len(used_ns) > 2 else 0.0
     ends_ns = flight.best.time_ns[[0, -1]]
@@ -280,7 +278,9 @@ def outages_of(flight: Flight) -> Int64Array:
 
 
 def fix_types_at(flight: Flight, time_ns: Int64Array) -> NDArray[np.int16]:
-    """Return (n,) fix type of the position before each time, of the first before that; −1 in outages."""
+    """Return the fix type (n,) of the position before each time; −1 in outages. Earlier times have the first
+    position's.
+    """
     used = used_positions(flight.forward)
     last = np.searchsorted(used["time_ns"], time_ns, side="right") - 1
     types = np.full(len(time_ns), -1, np.int16)
@@ -292,7 +292,7 @@ def fix_types_at(flight: Flight, time_ns: Int64Array) -> NDArray[np.int16]:
 
 
 def bridged_spans(solution: Solution) -> Int64Array:
-    """Return (k, 2) GPS times of runs of made-up inertial samples; from the epoch before a run to its last."""
+    """Return GPS times (k, 2) of runs of bridged inertial samples, from the epoch before a run to its last."""
     if not solution.bridged.any():
         return np.empty((0, 2), np.int64)
     change = np.diff(np.concatenate([[0], solution.bridged.astype(np.int8), [0]]))

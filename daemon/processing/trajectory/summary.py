@@ -1,4 +1,4 @@
-"""The JSON beside a trajectory, and its page: what it was made of, how, and how good it is."""
+"""Writes the JSON beside a trajectory, and its page: inputs, settings and quality."""
 
 from __future__ import annotations
 
@@ -33,14 +33,18 @@ FORMAT_VERSION = 1
 
 @dataclass(frozen=True, eq=False)
 class Page:
-    """A leg's page."""
+    """The page of a leg."""
 
     flight: Flight
     findings: Sequence[Finding]
 
     def write(self, path: Path) -> tuple[Any, Any, Path]:
-        """Write it beside its place: verdict, figures, and where it stands; raises OSError."""
-        from swath.daemon.processing.trajectory.page import write_page  # matplotlib, which the rest does without
+        """Write the page to a temporary file; return verdict, figures, and the path of this file.
+
+        Raises:
+            OSError: the file cannot be written.
+        """
+        from swath.daemon.processing.trajectory.page import write_page  # matplotlib, which other functions do not need
 
         aside = path.with_name(path.name + PARTIAL)
         with gone_on_failure([(aside, path)]):
@@ -49,13 +53,13 @@ class Page:
         return verdict, figures, aside
 
     def judge(self) -> tuple[Any, Any]:
-        """Return verdict and figures alone."""
+        """Return verdict and figures without writing the page."""
         figures = figures_of(self.flight, separation_of(self.flight))
         return judge(figures, self.findings), figures
 
 
 def pages_of(flights: Sequence[Navigated]) -> Iterator[Page]:
-    """Yield a page a leg, in order."""
+    """Yield one page per leg, in order."""
     for flight in flights:
         noise = flight.inputs.sources.noise_words()
         notes = (*((noise,) if noise else ()), *flight.doubts, *flight.holes)
@@ -70,7 +74,7 @@ def pages_of(flights: Sequence[Navigated]) -> Iterator[Page]:
 
 
 def start_words(start: Start) -> str:
-    """Return how a leg's start was found, and its attitude."""
+    """Return in words how a leg's start was found, and its attitude."""
     how = getattr(start, "text", "")
     roll, pitch, heading = np.degrees(start.attitude_rad)
     sigma = np.degrees(start.attitude_sigma_rad)
@@ -81,7 +85,7 @@ def start_words(start: Start) -> str:
 def summary_head(
     wish: TrajectoryRequest, solution: str, sessions: Sequence[Session], holes: Sequence[str], warnings: Sequence[str]
 ) -> dict[str, Any]:
-    """Return what every summary says: the software, what it was made of, what is missing."""
+    """Return the part that every summary has: software, inputs, missing data, options."""
     wanted = wish.navigate.inputs
     outside = wanted.positions
     return {
@@ -116,7 +120,7 @@ def summary_of_run(
     figures: Sequence[Any],
     events: EventTable | None,
 ) -> dict[str, Any]:
-    """Return all but the names of the files."""
+    """Return the summary of a run, without the names of the files."""
     judged = iter(zip(verdicts, figures, strict=True))
     head = summary_head(
         wish,
@@ -133,7 +137,9 @@ def summary_of_run(
 
 
 def _worst(verdicts: Sequence[Any]) -> dict[str, Any]:
-    """Return the verdict on the whole: that of the worst leg, with what of it `swath georef` and others repeat."""
+    """Return the verdict on the whole run: that of the worst leg, with the parts that `swath
+    georef` and others repeat.
+    """
     worst = max(verdicts, key=lambda verdict: verdict.level)
     return {"level": worst.level.name.lower(), "sentence": worst.sentence}
 
@@ -176,7 +182,7 @@ def _session(flight: Navigated, judged: Iterator[tuple[Any, Any]]) -> dict[str, 
 
 
 def _setup(setup: Setup) -> dict[str, Any]:
-    """Return all its values, by name."""
+    """Return all values of a setup by name."""
     return {field.name: _plain(getattr(setup, field.name)) for field in dataclasses.fields(setup)}
 
 
@@ -194,7 +200,7 @@ def _leg(leg: NavigatedLeg, verdict: Any, figures: Any) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """Return what JSON can say: arrays as lists, dataclasses as objects, what is no number as null."""
+    """Return a value as JSON allows it: arrays as lists, dataclasses as objects, non-finite numbers as null."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {field.name: _plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
     if isinstance(value, np.ndarray | np.generic):
@@ -207,5 +213,5 @@ def _plain(value: Any) -> Any:
 
 
 def write_json(record: dict[str, Any], stream: IO[bytes]) -> None:
-    """A summary as text."""
+    """Write a summary as JSON text."""
     stream.write((json.dumps(_plain(record), indent=2, ensure_ascii=False) + "\n").encode())

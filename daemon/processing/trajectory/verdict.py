@@ -1,4 +1,4 @@
-"""Whether a navigated flight may be used: a table of limits on its figures, and a sentence."""
+"""Judges whether a navigated flight may be used: a table of limits on its figures, and a sentence."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Measure = Callable[[Figures], Iterator[tuple[str, float | None]]]
 
 
 class Level(IntEnum):
-    """Of a reason, and of the whole."""
+    """The level of a reason, and of the whole verdict."""
 
     GOOD = 0
     CARE = 1
@@ -21,20 +21,20 @@ class Level(IntEnum):
 
     @property
     def words(self) -> str:
-        """As the page says it."""
+        """The level in words, as on the page."""
         return ("good", "usable with care", "not to be used")[self]
 
 
 @dataclass(frozen=True, slots=True)
 class Reason:
-    """Why a flight is not simply good.
+    """A reason why a flight is not simply good.
 
     Attributes:
-        level: how bad it is.
-        name: of the rule or of the finding.
-        what: what is the matter, with the figure.
-        change: what to do about it.
-        excess: value over its limit, to put the worst first.
+        level: severity of the reason.
+        name: name of the rule or the finding.
+        what: description of the problem, with the figure.
+        change: remedy for it.
+        excess: value over its limit, for sorting the worst first.
     """
 
     level: Level
@@ -46,15 +46,15 @@ class Reason:
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """One limit.
+    """A limit on a figure.
 
     Attributes:
-        name: short.
-        measure: figures → (of what, value); None is not judged.
-        care, unusable: a value above is a reason of that level; None: never.
-        what: a sentence of ``{value}`` and ``{of}``.
-        change: what to do.
-        least: the limits are from below.
+        name: short name.
+        measure: gives pairs of (what is measured, value) from the figures; None is not judged.
+        care, unusable: a value above it is a reason of that level; None: no such limit.
+        what: a sentence with ``{value}`` and ``{of}``.
+        change: remedy.
+        least: True if the limits are minimum values.
     """
 
     name: str
@@ -66,7 +66,7 @@ class Rule:
     least: bool = False
 
     def judged(self, figures: Figures) -> Iterator[Reason]:
-        """Yield reasons that its measure gives, one for each thing measured."""
+        """Yield the reasons from its measure, one for each value beyond a limit."""
         for of, value in self.measure(figures):
             level, limit = self._level(value)
             if value is not None and level > Level.GOOD and limit is not None:
@@ -94,7 +94,7 @@ class Found(Protocol):
 
 
 def _one(*keys: str) -> Measure:
-    """Return the figure at a path of keys."""
+    """Return a measure of the figure at a path of keys."""
 
     def measure(figures: Figures) -> Iterator[tuple[str, float | None]]:
         value: Any = figures
@@ -106,7 +106,7 @@ def _one(*keys: str) -> Measure:
 
 
 def _largest(group: str, *keys: str) -> Measure:
-    """Return the largest of some figures of a group; not judged where none is known."""
+    """Return a measure of the largest of a group's figures; it is not judged if all are unknown."""
 
     def measure(figures: Figures) -> Iterator[tuple[str, float | None]]:
         known = [(figures[group][key], key) for key in keys if figures[group][key] is not None]
@@ -118,7 +118,7 @@ def _largest(group: str, *keys: str) -> Measure:
 
 
 def _share(*fates: str) -> Measure:
-    """Of observations of each kind, how many met one of these fates."""
+    """Return a measure of the share of observations of each kind that met one of these fates."""
 
     def measure(figures: Figures) -> Iterator[tuple[str, float | None]]:
         for kind, row in figures["observations"].items():
@@ -128,7 +128,7 @@ def _share(*fates: str) -> Measure:
 
 
 def _of_kinds(key: str, *, inverse: bool = False) -> Measure:
-    """Return a figure of each kind of observation."""
+    """Return a measure of a figure of each kind of observation."""
 
     def measure(figures: Figures) -> Iterator[tuple[str, float | None]]:
         for kind, row in figures["observations"].items():
@@ -139,12 +139,12 @@ def _of_kinds(key: str, *, inverse: bool = False) -> Measure:
 
 
 def _noise_found(figures: Figures) -> Iterator[tuple[str, float | None]]:
-    """Yield factors on sigmas that the flight asked for."""
+    """Yield the factors on sigmas that the innovations suggest."""
     yield from figures["noise_found"].items()
 
 
 def _sensor(*names: str) -> Measure:
-    """Return largest estimate of an axis, in sigmas that the configuration gives."""
+    """Return a measure of the largest estimate on an axis, in sigmas of the configured noise."""
 
     def measure(figures: Figures) -> Iterator[tuple[str, float | None]]:
         for name in names:
@@ -377,12 +377,12 @@ RULES: tuple[Rule, ...] = (
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """The judgement.
+    """The verdict on a flight.
 
     Attributes:
         level: the worst of the reasons.
-        sentence: it in words.
-        reasons: the worst first.
+        sentence: the verdict in words.
+        reasons: reasons, the worst first.
     """
 
     level: Level
@@ -390,7 +390,7 @@ class Verdict:
     reasons: tuple[Reason, ...]
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the verdict as values for JSON."""
         return {
             "level": self.level.name.lower(),
             "sentence": self.sentence,
@@ -402,7 +402,7 @@ class Verdict:
 
 
 def judge(figures: Figures, findings: Iterable[Found] = ()) -> Verdict:
-    """Return the verdict on figures; what the diagnosis found are reasons too."""
+    """Return the verdict on figures; findings of the diagnosis are reasons too."""
     reasons = [reason for rule in RULES for reason in rule.judged(figures)]
     reasons += [reason_of(finding) for finding in findings]
     reasons.sort(key=lambda reason: (-reason.level, -reason.excess))
@@ -411,7 +411,7 @@ def judge(figures: Figures, findings: Iterable[Found] = ()) -> Verdict:
 
 
 def reason_of(finding: Found) -> Reason:
-    """Return a finding's, which says in one sentence what is the matter and what to change."""
+    """Return a finding as a reason; its one sentence names the problem and the remedy."""
     level = Level.UNUSABLE if finding.severity == "error" else Level.CARE
     return Reason(level, finding.code, finding.text.rstrip("."), "", float("inf"))
 

@@ -1,1 +1,1 @@
-"""`swath validate`."""
+"""Implements `swath validate`: tests calibrations against other logs."""

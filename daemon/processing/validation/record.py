@@ -1,4 +1,4 @@
-"""A validation in the calibration's record: what `swath calibrate --report` wrote, written anew with it."""
+"""Adds a validation to a calibration's record: writes the record of `swath calibrate --report` anew with it."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from swath.georef.scanner.calibration import Calibration
 
 @dataclass(frozen=True)
 class Recorded:
-    """Records of what is validated.
+    """The records of calibrations that are validated.
 
     Attributes:
-        documents: by scanner.
-        notes: where there is none, a line each.
+        documents: records by scanner.
+        notes: one line per calibration without a record.
     """
 
     documents: Mapping[str, Document]
@@ -29,14 +29,14 @@ class Recorded:
 
 
 def records_of(files: Sequence[tuple[Path, Calibration]], where: Path | None) -> Recorded:
-    """Return the records of calibrations: beside their files, or where the user says.
+    """Return the records of calibrations, from beside their files or from where the user says.
 
     Args:
-        files: of the calibrations.
-        where: a record, or a folder of them; None: beside the files, and none may be there.
+        files: calibration files with their contents.
+        where: a record or a folder of records; None: beside the files, where they may be missing.
 
     Raises:
-        UserError: what the user names is no record, or of another calibration.
+        UserError: a file that the user names is not a record, or is of another calibration.
     """
     if where is not None and where.is_file() and len(files) > 1:
         raise UserError(f"--record {where}: of several calibrations want the folder of their records", ExitCode.USAGE)
@@ -73,13 +73,13 @@ def _document(path: Path, file: Path, calibration: Calibration) -> Document:
 def record_files(
     folder: Path, documents: Mapping[str, Document], validation: Validation, logs: Sequence[tuple[str, str]]
 ) -> dict[Path, bytes]:
-    """Return records with the validation in them, XML and JSON.
+    """Return records with the validation in them as XML and JSON, by path.
 
     Args:
-        folder: where they go.
-        documents: by scanner.
-        validation: what was found; methods that could not be applied are not among those named.
-        logs: name and SHA-256 of what it was validated against.
+        folder: where the files go.
+        documents: records by scanner.
+        validation: the result; methods that could not be applied are not listed.
+        logs: name and SHA-256 of the logs that it was validated against.
     """
     told = told_of(validation, logs, dt.datetime.now(dt.UTC))
     files: dict[Path, bytes] = {}
@@ -91,9 +91,7 @@ def record_files(
 
 
 def told_of(validation: Validation, logs: Sequence[tuple[str, str]], now: dt.datetime) -> dict[str, tuple[Plain, str]]:
-    """Return values and notes by ``CLASS.attribute``: methods with what each found, when, against what, check
-    points.
-    """
+    """Return values and notes by ``CLASS.attribute``: methods with results, time, logs and number of check points."""
     applied = [method for method in validation.methods if method.passed is not None]
     against = ", ".join(f"{name} (SHA-256 {sha256})" for name, sha256 in logs)
     told: dict[str, tuple[Plain, str]] = {

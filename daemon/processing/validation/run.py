@@ -1,4 +1,4 @@
-"""`swath validate`: a calibration against logs, control and its own history."""
+"""`swath validate`: validates a calibration against logs, control and its own history."""
 
 from __future__ import annotations
 
@@ -61,16 +61,16 @@ REFUSED = (FlightError, PlaneError, HistoryError, StripError, MappingError, Cali
 
 @dataclass(frozen=True)
 class ValidationOptions:
-    """What the command line asks for.
+    """The options of `swath validate` from the command line.
 
     Attributes:
-        calibrations: files to be validated, one a scanner.
-        logs: what is read and how; its calibrations are those.
-        control: CSV of surveyed points; None: none.
+        calibrations: files to be validated, one per scanner.
+        logs: which logs are read and how; their calibrations are replaced by those above.
+        control: CSV of surveyed points; None: no control.
         histories: calibration files, or folders of them.
-        anew: parameters are estimated anew from the logs, and compared.
-        output: folder for what was found, the picture, and records anew; None: none.
-        record: record of a calibration, or a folder of them, that shall tell of this; None: beside the files.
+        anew: estimate parameters anew from the logs and compare them.
+        output: folder for results, the picture and updated records; None: no files.
+        record: record, or folder of records, to add the validation to; None: beside the calibration files.
     """
 
     calibrations: Sequence[Path]
@@ -84,7 +84,7 @@ class ValidationOptions:
 
 @dataclass(frozen=True)
 class Validated:
-    """The record for scripts, lines for people, and what is wrong: nothing, or a line."""
+    """The outcome: a record for scripts, lines for people, and the problem in a line (empty: no problem)."""
 
     record: dict[str, Any]
     lines: list[str]
@@ -103,15 +103,15 @@ class _Found:
 
 
 def run_validation(wish: ValidationOptions, folder: Path, told: Told) -> Validated:
-    """Validate.
+    """Run a validation and write its results.
 
     Args:
-        wish: what is asked for.
-        folder: for returns, while it goes on.
-        told: is told how far it is.
+        wish: options of the validation.
+        folder: temporary folder for returns.
+        told: called with the progress.
 
     Raises:
-        UserError: it cannot be, one line.
+        UserError: the validation cannot be done; one line.
     """
     with as_user_error(folder, *REFUSED):
         calibrations = [read_file(path) for path in wish.calibrations]
@@ -127,7 +127,7 @@ def run_validation(wish: ValidationOptions, folder: Path, told: Told) -> Validat
 
 
 def read_file(path: Path) -> Calibration:
-    """Return a calibration file; UserError where it cannot be read."""
+    """Return the calibration in a file; refuse with `UserError` a file that cannot be read."""
     try:
         return read_calibration(text_of(path, "a calibration file"), str(path))
     except CalibrationError as error:
@@ -135,7 +135,7 @@ def read_file(path: Path) -> Calibration:
 
 
 def _histories(paths: Sequence[Path], validated: Sequence[Calibration]) -> tuple[History, ...]:
-    """Of the scanners and installations of those that are validated."""
+    """Return the histories of the scanners and installations that are validated."""
     files = [one for path in paths for one in (sorted(path.rglob("*.toml")) if path.is_dir() else [path])]
     entries = [entry for path in files if (entry := _entry(path, paths)) is not None]
     read = {one.id: one for one in [*entries, *validated]}
@@ -145,7 +145,7 @@ def _histories(paths: Sequence[Path], validated: Sequence[Calibration]) -> tuple
 
 
 def _entry(path: Path, named: Sequence[Path]) -> Calibration | None:
-    """Return a calibration; of a folder's files those that are none are passed over, as configurations are TOML too."""
+    """Return a file's calibration; None for a file of a folder that is not one, as configurations are TOML too."""
     if path in named or "[calibration]" in decoded(path.read_bytes(), "replace"):
         return read_file(path)
     return None
@@ -182,7 +182,7 @@ def _against_flight(wish: ValidationOptions, found: _Found, kept: KeptFlight, fo
 
 
 def _refuse_others(wish: ValidationOptions, found: _Found, kept: KeptFlight) -> None:
-    """UserError where the logs are not of the calibrations' scanners, or are one strip; what is odd is noted."""
+    """Refuse with `UserError` logs without the calibrations' scanners or with one strip; note odd installations."""
     scanners = {head.name for head in kept.flight.heads}
     log = kept.logged[0].log
     for name, calibration in found.calibrations.items():
@@ -196,7 +196,7 @@ def _refuse_others(wish: ValidationOptions, found: _Found, kept: KeptFlight) -> 
 
 
 def _along(kept: KeptFlight, found: _Found) -> None:
-    """Take the log's own calibration of scanners whose none was named; noted."""
+    """Add the log's own calibration for scanners without a named one, with a note."""
     for head in kept.flight.heads:
         if head.name not in found.calibrations:
             found.calibrations[head.name] = head.start
@@ -205,7 +205,7 @@ def _along(kept: KeptFlight, found: _Found) -> None:
 
 
 def _prior(kept: KeptFlight) -> TrajectoryPrior | None:
-    """Return the trajectory's errors as navigation knows them; None: a trajectory was given, and has sigmas at most."""
+    """Return the trajectory's errors from navigation; None if a trajectory was given, which has sigmas at most."""
     navigated = [flight.navigated for flight in kept.logged]
     if any(one is None or len(one.legs) != 1 for one in navigated):
         return None
@@ -213,7 +213,7 @@ def _prior(kept: KeptFlight) -> TrajectoryPrior | None:
 
 
 def _assumed(kept: KeptFlight) -> list[str]:
-    """Return a note for each trajectory that says no sigmas."""
+    """Return a note for each trajectory that has no sigmas."""
     filled = with_sigmas(kept.flight).trajectories
     return [
         f"{flight.log}: its trajectory lacks sigmas; {100 * SIGMAS_M:g} cm of position, {roll:g}° of roll and pitch "
@@ -230,7 +230,9 @@ def _assumed(kept: KeptFlight) -> list[str]:
 def _anew(
     wish: ValidationOptions, found: _Found, kept: KeptFlight, points: Sequence[ControlPoint], folder: Path, told: Told
 ) -> tuple[Mapping[str, Calibration], str]:
-    """Return parameters from these logs and control alone, as `swath calibrate` finds them, or none and why."""
+    """Return parameters estimated from these logs and control alone, as by `swath calibrate`; or
+    none and the reason.
+    """
 
     def features(flight: Flight) -> Features:
         told("parameters anew", 0, 1)
@@ -251,7 +253,7 @@ def _anew(
     return adjusted.calibrations, ""
 
 
-# ---------------------------------------------------------------------- what is told
+# ---------------------------------------------------------------------- output
 
 
 def _written(wish: ValidationOptions, found: _Found) -> Validated:
@@ -268,7 +270,7 @@ def _written(wish: ValidationOptions, found: _Found) -> Validated:
         record["history"] = [one.record() for one in found.histories]
         for one in found.histories:
             lines += _table(one) + list(one.sentences)
-            wrong += list(one.sentences) if one.moved or not one.steps else []  # no step: nothing could be tested
+            wrong += list(one.sentences) if one.moved or not one.steps else []  # without steps no test was made
     record["notes"] = found.notes
     record = finite(record)
     if wish.output is not None:
@@ -331,7 +333,7 @@ def _write(output: Path, record: dict[str, Any], found: _Found) -> list[str]:
 
 
 def history_png(histories: Sequence[History]) -> bytes:
-    """Return boresight angles with one sigma over time, a column a history."""
+    """Return a picture of boresight angles with one sigma over time, one column per history."""
     figure = Figure(figsize=(1.0 + 5.0 * max(len(histories), 1), 6.6), facecolor="white", layout="constrained")
     axes = figure.subplots(len(BORESIGHT), max(len(histories), 1), squeeze=False, sharex="col")
     for column, one in enumerate(histories):

@@ -1,15 +1,16 @@
 """NMEA 0183: GGA, GNS, RMC, ZDA, VTG, GST and HDT of any talker (v4.11; u-blox and NovAtel manuals agree).
 
-Time: RMC and ZDA name the previous PPS edge, in UTC. RMC vouches for its time by status A; ZDA says nothing itself and
-is believed while the stream's latest GGA, GNS or RMC has a fix, or where it has none of them. A tag off the whole
-second does not vote.
+Time: RMC and ZDA refer to the previous PPS edge, in UTC. RMC confirms its time by status A; ZDA has no status and is
+accepted while the stream's latest GGA, GNS or RMC has a fix, or if the stream has none of them. A tag off the whole
+second does not count.
 
 Fix: the sentences of one time of day make one `GnssFix` (`swath.drivers.gnss.epochs`): position and quality of GGA,
 else of GNS, else of RMC; date of RMC or ZDA of the same time; velocity of RMC, else of VTG, which carries no time and
-so belongs to the epoch it comes in; sigmas of GST. Height is the altitude plus the geoid separation of GGA or GNS, None
-where the receiver leaves either empty. No vertical velocity. Empty fields are a receiver without a fix, not an error.
-GNS has a mode for each constellation; the best of them is the fix's, as one position is made of all. Where a receiver
-adds a GNS for each constellation, these have no mode and tell satellites only: they are not taken.
+so belongs to the epoch in which it arrives; sigmas of GST. Height is the altitude plus the geoid separation of GGA or
+GNS, None where the receiver leaves either empty. There is no vertical velocity. Empty fields mean a receiver without a
+fix, not an error. GNS has a mode for each constellation; the best of them applies to the fix, as all constellations
+make one position. Where a receiver adds a GNS for each constellation, these have no mode and give satellites only: they
+are ignored.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ FIX_TYPE_BY_QUALITY = {
     8: FixType.SIMULATED,
     9: FixType.DIFFERENTIAL,
 }
-# mode indicator, RMC field 12, VTG field 9 and, of each constellation, GNS field 6; before NMEA 2.3 there was none
+# mode indicator: RMC field 12, VTG field 9, and GNS field 6 for each constellation; absent before NMEA 2.3
 FIX_TYPE_BY_MODE = {
     "": FixType.SINGLE,
     "A": FixType.SINGLE,
@@ -68,15 +69,15 @@ FIX_TYPE_BY_MODE = {
     "N": FixType.NONE,
 }
 MODES_BEST_FIRST = "RFDPAEMS"
-POSITION_SENTENCES = ("GGA", "GNS", "RMC")  # the first that is there says position and quality
+POSITION_SENTENCES = ("GGA", "GNS", "RMC")  # the first one present gives position and quality
 VOUCHED = frozenset(
-    {FixType.SINGLE, FixType.DIFFERENTIAL, FixType.RTK_FLOAT, FixType.RTK_FIXED}  # satellites, not a guess
+    {FixType.SINGLE, FixType.DIFFERENTIAL, FixType.RTK_FLOAT, FixType.RTK_FIXED}  # fixes from satellites, not estimates
 )
 
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """What one sentence says of its epoch."""
+    """Data of one sentence about its epoch."""
 
     host_time_ns: int
     time_ns: int | None
@@ -91,11 +92,11 @@ class Part:
 
 
 class NmeaParser(StreamParser):
-    """Sentences to records; UBX and RTCM3 on the same port are framed and counted.
+    """Converts sentences to records; UBX and RTCM3 on the same port are framed and counted.
 
     Args:
-        settings: ``date_floor`` is the oldest date believed, ``add_weeks`` is added to all.
-        time_only: time messages only, the same ones.
+        settings: ``date_floor`` is the oldest accepted date, ``add_weeks`` is added to all dates.
+        time_only: return the same time messages, and no other records.
     """
 
     def __init__(self, settings: DeviceSettings, *, time_only: bool = False) -> None:
@@ -104,7 +105,7 @@ class NmeaParser(StreamParser):
         self._framer = Framer(GNSS_KINDS, self.counters)
         self._epochs: EpochGatherer[Part] = EpochGatherer(self.counters)
         self._time_only = time_only
-        self._has_fix: bool | None = None  # by the latest GGA, GNS or RMC
+        self._has_fix: bool | None = None  # whether the latest GGA, GNS or RMC has a fix
         self._decoders: dict[bytes, Callable[[int, Sentence], list[Record]]] = {
             b"GGA": self._gga,
             b"GNS": self._gns,
@@ -115,16 +116,16 @@ class NmeaParser(StreamParser):
             self._decoders |= {b"VTG": self._vtg, b"GST": self._gst, b"HDT": self._hdt}
 
     def feed(self, chunk: Chunk) -> list[Record]:
-        """Take one read."""
+        """Take one read; return the records that it completed."""
         return self._decode(self._framer.feed(chunk.data, chunk.host_time_ns))
 
     def close(self) -> list[Record]:
-        """Release the tail and the last epoch."""
+        """Return the records of the tail and of the last epoch."""
         records = self._decode(self._framer.close())
         return records + self._fixes(self._epochs.end())
 
     def remarks(self) -> list[str]:
-        """Return what is to be said of the receiver's dates."""
+        """Return remarks on the receiver's dates."""
         return self._dates.remarks()
 
     def _decode(self, frames: list[Frame]) -> list[Record]:
@@ -209,7 +210,7 @@ class NmeaParser(StreamParser):
     def _time_message(
         self, host_time_ns: int, time_ns: int | None, date: dt.date | None, vouched: bool, name: str
     ) -> list[Record]:
-        """Return the previous edge's second; a date before the floor is a week rolled over, and counted."""
+        """Return the second of the previous edge; a date before the floor is a rolled-over week, and counted."""
         if time_ns is None:
             return []
         if date is not None and date < self._dates.floor:
@@ -234,7 +235,7 @@ class NmeaParser(StreamParser):
 
 
 def merge_epoch(parts: dict[str, Part]) -> GnssFix | None:
-    """Return one fix of an epoch's sentences; None where none that says a position is among them."""
+    """Merge an epoch's sentences into one fix; return None where none of them has a position."""
     message = next((name for name in POSITION_SENTENCES if name in parts), "")
     solution = parts.get(message)
     if solution is None or solution.fix_type is None or solution.time_ns is None:

@@ -1,7 +1,7 @@
-"""NMEA 0183 sentences: fields read by pynmea2's tables, times and numbers strictly; and an encoder for each.
+"""NMEA 0183 sentences: fields located by pynmea2's tables, times and numbers checked strictly, and an encoder for each.
 
-pynmea2 says which field is where and turns coordinates into degrees. Times are read here: second 60 of a leap second
-must pass and fractions stay exact, which ``datetime.time`` allows neither.
+pynmea2 locates the fields. Times are read here, since second 60 of a leap second must be accepted and fractions must
+stay exact, and ``datetime.time`` supports neither; numbers and coordinates are read here too.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ DATE_DDMMYY = re.compile(r"\d{6}")
 
 
 class FieldError(ValueError):
-    """A field that cannot be read; the sentence is counted as bad."""
+    """A field cannot be read; the sentence is counted as bad."""
 
 
 class Sentence:
-    """One sentence's fields by pynmea2's names.
+    """Gives access to one sentence's fields by pynmea2's names.
 
     Args:
-        kind: ``GGA``; a type pynmea2 knows.
-        frame: the whole sentence, its checksum known to be good.
+        kind: sentence type that pynmea2 knows, such as ``GGA``.
+        frame: the whole sentence, its checksum already verified.
     """
 
     def __init__(self, kind: str, frame: bytes) -> None:
@@ -43,13 +43,13 @@ class Sentence:
         self._message: Any = pynmea2.TalkerSentence.sentence_types[kind](fields[0][:-3], kind, fields[1:])
 
     def text(self, name: str) -> str:
-        """Return the field as it came; empty where the sentence is shorter."""
+        """Return the field's text, empty where the sentence is shorter."""
         place: int = self._message.name_to_idx[name]
         data: list[str] = self._message.data
         return data[place] if place < len(data) else ""
 
     def number(self, name: str) -> float | None:
-        """Return a number; None where the field is empty."""
+        """Return the field as a number; None where it is empty."""
         text = self.text(name)
         if not text:
             return None
@@ -74,7 +74,7 @@ class Sentence:
         return (hours * 3600 + minutes * 60 + seconds) * SECOND_NS + int(fraction)
 
     def position_rad(self) -> tuple[float, float] | None:
-        """Return latitude and longitude; None where empty."""
+        """Return latitude and longitude; None where a field is empty."""
         if not (self.text("lat") and self.text("lon")):
             return None
         if self.text("lat_dir") not in ("N", "S") or self.text("lon_dir") not in ("E", "W"):
@@ -84,7 +84,9 @@ class Sentence:
         return math.radians(-latitude if south else latitude), math.radians(-longitude if west else longitude)
 
     def _degrees(self, name: str, most: float) -> float:
-        """Of degrees and minutes; point and digits behind it may be missing (NMEA 0183)."""
+        """Return the degrees of a field in degrees and minutes; the point and later digits may be missing (NMEA
+        0183).
+        """
         text = self.text(name)
         match = DEGREES_MINUTES.fullmatch(text)
         if match is None or (degrees := float(match[1]) + float(match[2]) / 60.0) > most:
@@ -92,7 +94,7 @@ class Sentence:
         return degrees
 
     def date_ddmmyy(self) -> dt.date | None:
-        """Return RMC's date; two digits of the year are 1980 to 2079."""
+        """Return RMC's date; a year of two digits is 1980 to 2079."""
         text = self.text("datestamp")
         if not text:
             return None
@@ -112,10 +114,10 @@ class Sentence:
 
 
 def checked_date(year: int, month: int, day: int) -> dt.date:
-    """Return a date of the calendar.
+    """Return a date, checked against the calendar.
 
     Raises:
-        FieldError: it is not on the calendar.
+        FieldError: the date is not on the calendar.
     """
     try:
         return dt.date(year, month, day)
@@ -124,7 +126,7 @@ def checked_date(year: int, month: int, day: int) -> dt.date:
 
 
 def velocity_from_course(speed_mps: float | None, course_deg: float | None) -> tuple[float, float, float] | None:
-    """Return north, east and an unsaid down component; None where speed or course is empty."""
+    """Return north and east velocity, and nan for the unknown down component; None where speed or course is empty."""
     if speed_mps is None or course_deg is None:
         return None
     course = math.radians(course_deg)
@@ -135,7 +137,7 @@ def velocity_from_course(speed_mps: float | None, course_deg: float | None) -> t
 
 
 def encode_sentence(body: str) -> bytes:
-    """Return ``$body*hh`` and the line end."""
+    """Return ``$body*hh`` with the line end."""
     raw = body.encode("ascii")
     return b"$%s*%02X\r\n" % (raw, nmea_xor(raw))
 
@@ -173,7 +175,9 @@ def encode_gga(
     satellites: int = 12,
     talker: str = "GN",
 ) -> bytes:
-    """Return altitude above the receiver's geoid and the geoid's height above the ellipsoid; time of the UTC day."""
+    """Encode a GGA: altitude above the receiver's geoid, height of the geoid above the ellipsoid, and time of the UTC
+    day.
+    """
     return encode_sentence(
         f"{talker}GGA,{_time_text(time_ns)},{_position_text(lat_rad, lon_rad)},{quality},{satellites:02d},0.80,"
         f"{altitude_m:.4f},M,{separation_m:.4f},M,,"
@@ -191,7 +195,7 @@ def encode_rmc(
     valid: bool = True,
     talker: str = "GN",
 ) -> bytes:
-    """Return position, speed over ground and course; ``valid=False`` is status V, mode N."""
+    """Encode an RMC: position, speed over ground and course; ``valid=False`` gives status V and mode N."""
     return encode_sentence(
         f"{talker}RMC,{_time_text(time_ns)},{'A' if valid else 'V'},{_position_text(lat_rad, lon_rad)},"
         f"{speed_mps / MPS_PER_KNOT:.4f},{math.degrees(course_rad) % 360.0:.4f},{date:%d%m%y},,,{'A' if valid else 'N'}"
@@ -199,22 +203,22 @@ def encode_rmc(
 
 
 def encode_zda(time_ns: int, date: dt.date, *, talker: str = "GN") -> bytes:
-    """Return UTC time and date, local zone 0."""
+    """Encode a ZDA: UTC time and date, local zone 0."""
     return encode_sentence(f"{talker}ZDA,{_time_text(time_ns)},{date:%d,%m,%Y},00,00")
 
 
 def encode_gst(time_ns: int, sigma_n_m: float, sigma_e_m: float, sigma_d_m: float, *, talker: str = "GN") -> bytes:
-    """Return sigmas of latitude, longitude and height; the error ellipse is left empty."""
+    """Encode a GST: sigmas of latitude, longitude and height; the error ellipse is left empty."""
     return encode_sentence(f"{talker}GST,{_time_text(time_ns)},,,,,{sigma_n_m:.4f},{sigma_e_m:.4f},{sigma_d_m:.4f}")
 
 
 def encode_vtg(speed_mps: float, course_rad: float, *, talker: str = "GN") -> bytes:
-    """Return course over ground and speed."""
+    """Encode a VTG: course over ground and speed."""
     course = math.degrees(course_rad) % 360.0
     knots, kmph = speed_mps / MPS_PER_KNOT, speed_mps / MPS_PER_KMPH
     return encode_sentence(f"{talker}VTG,{course:.4f},T,,M,{knots:.4f},N,{kmph:.4f},K,A")
 
 
 def encode_hdt(heading_rad: float, *, talker: str = "GN") -> bytes:
-    """True heading."""
+    """Encode an HDT: true heading."""
     return encode_sentence(f"{talker}HDT,{math.degrees(heading_rad) % 360.0:.4f},T")

@@ -1,1 +1,1 @@
-"""NovAtel OEM logs, binary and ASCII."""
+"""NovAtel OEM binary logs: parser, layouts and start-up."""

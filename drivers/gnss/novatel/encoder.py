@@ -21,16 +21,16 @@ def encode_frame(
     message_type: int = 0,
     extra_header: bytes = b"",
 ) -> bytes:
-    """Return a log's frame: header, body, CRC.
+    """Build a log's frame: header, body, CRC.
 
     Args:
         message_id: the log's number.
-        body: its fields.
+        body: the log's packed fields.
         week, milliseconds: GPS reference time of the header.
-        short: with the short header, whose body has at most 255 bytes.
+        short: use the short header, whose body has at most 255 bytes.
         time_status: GPS reference time status, long header only.
         message_type: measurement source, format and response bits, long header only.
-        extra_header: bytes a later firmware's long header may have grown by.
+        extra_header: bytes that a later firmware may append to the long header.
     """
     if short:
         frame = bytearray(nov.SHORT_HEADER.pack(len(body), message_id, week, milliseconds))
@@ -48,11 +48,11 @@ def encode_frame(
 def encode_log(
     name: str, body: nov.Body, week: int, milliseconds: int, *, time_status: int = TIME_STATUS_FINESTEERING
 ) -> bytes:
-    """Return a log by name, with the header form that belongs to it.
+    """Encode a log by name, with the header form that belongs to it.
 
     Raises:
-        KeyError: no layout of that name.
-        TypeError: the body is another log's.
+        KeyError: no layout has that name.
+        TypeError: the body belongs to another log.
     """
     number = nov.IDS[name]
     layout = nov.LAYOUTS[number]

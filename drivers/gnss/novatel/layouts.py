@@ -1,7 +1,7 @@
-"""NovAtel OEM7 binary: headers and messages (docs.novatel.com/OEM7); status and scale tables: `novatel_tables`.
+"""NovAtel OEM7 binary: headers and messages (docs.novatel.com/OEM7); status and scale tables: `tables`.
 
-A message is a `NamedTuple` of its fields in wire order, and a `struct.Struct` in `LAYOUTS`. Angles are degrees and
-heights above the receiver's geoid where the manual has them so: `swath.drivers.gnss.novatel.parser` converts.
+A message is a `NamedTuple` of its fields in wire order, and a `struct.Struct` in `LAYOUTS`. Angles are in degrees and
+heights above the receiver's geoid where the manual defines them so: `swath.drivers.gnss.novatel.parser` converts them.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 
 class LongHeader(NamedTuple):
-    """Binary header, AA 44 12 (Messages, "Binary"); at least 28 bytes, its length says how many."""
+    """Binary header, AA 44 12 (Messages, "Binary"); at least 28 bytes, its first field gives its length."""
 
     header_bytes: int
     message_id: int
@@ -43,13 +43,13 @@ SYNC_SHORT = b"\xaa\x44\x13"
 LONG_HEADER = struct.Struct("<3xBHBBHHBBHIIHH")
 SHORT_HEADER = struct.Struct("<3xBHHI")
 CRC_BYTES = 4
-RESPONSE_BIT = 0x80  # of message_type: the answer to a command, no log
-FORMAT_BITS = 0x60  # of message_type: 0 binary
-SOURCE_BITS = 0x1F  # of message_type: 1 secondary antenna; other values are older firmware's, meaning nothing
+RESPONSE_BIT = 0x80  # in message_type: the answer to a command, not a log
+FORMAT_BITS = 0x60  # in message_type: 0 binary
+SOURCE_BITS = 0x1F  # in message_type: 1 secondary antenna; older firmware sends other values without meaning
 
 
 class BestPos(NamedTuple):
-    """BESTPOS (42) and its likes; height above the geoid."""
+    """BESTPOS (42) and logs of the same layout; height above the geoid."""
 
     solution_status: int
     position_type: int
@@ -75,7 +75,9 @@ class BestPos(NamedTuple):
 
 
 class BestVel(NamedTuple):
-    """BESTVEL (99): track over ground from true north, vertical speed up; latency belongs off the time."""
+    """BESTVEL (99): track over ground from true north, vertical speed up; the latency must be subtracted from the
+    time.
+    """
 
     solution_status: int
     velocity_type: int
@@ -149,7 +151,7 @@ class InsPvax(NamedTuple):
 
 
 class InsAtt(NamedTuple):
-    """INSATT (263), INSATTS (319)."""
+    """INSATT (263), INSATTS (319): attitude with its own time."""
 
     week: int
     seconds: float
@@ -160,7 +162,7 @@ class InsAtt(NamedTuple):
 
 
 class InsAttx(NamedTuple):
-    """INSATTX (1457)."""
+    """INSATTX (1457): attitude with its sigmas."""
 
     ins_status: int
     position_type: int
@@ -189,7 +191,7 @@ class RawImu(NamedTuple):
 
 
 class RawImux(NamedTuple):
-    """RAWIMUX (1461), RAWIMUSX (1462): the same, and which IMU it is."""
+    """RAWIMUX (1461), RAWIMUSX (1462): as RAWIMU, with the type of the IMU."""
 
     imu_info: int
     imu_type: int
@@ -207,8 +209,8 @@ class RawImux(NamedTuple):
 class CorrImuData(NamedTuple):
     """CORRIMUDATA (812), CORRIMUDATAS (813), IMURATECORRIMUS (1362): increments (rad, m/s) since the last log.
 
-    About and along the axes of the output frame: x right, y forward, z up. Gravity, earth rotation and the estimated
-    sensor errors are already taken out: this is motion, not specific force.
+    They are about and along the axes of the output frame: x right, y forward, z up. Gravity, earth rotation and the
+    estimated sensor errors are already removed: this is motion, not specific force.
     """
 
     week: int
@@ -222,7 +224,7 @@ class CorrImuData(NamedTuple):
 
 
 class CorrImu(NamedTuple):
-    """CORRIMUS (2264): the same, summed over `imu_samples` samples of the IMU."""
+    """CORRIMUS (2264): as CORRIMUDATA, summed over `imu_samples` samples of the IMU."""
 
     imu_samples: int
     pitch_rad: float
@@ -247,7 +249,7 @@ class MarkTime(NamedTuple):
 
 
 class Heading2(NamedTuple):
-    """HEADING2 (1335): from the master antenna to the rover's; baseline −1 where unknown."""
+    """HEADING2 (1335): heading from the master antenna to the rover's; baseline −1 where unknown."""
 
     solution_status: int
     position_type: int
@@ -270,7 +272,7 @@ class Heading2(NamedTuple):
 
 
 class InsConfig(NamedTuple):
-    """INSCONFIG (1945): its first field, which IMU it is."""
+    """INSCONFIG (1945): its first field, the type of the IMU."""
 
     imu_type: int
 
@@ -295,7 +297,7 @@ Body = (
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """A message's name, its fields and their wire format (the least bytes: newer firmware may append)."""
+    """A message's name, fields and wire format (a minimum length: newer firmware may append bytes)."""
 
     name: str
     body: type[Body]

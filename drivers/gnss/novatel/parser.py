@@ -1,17 +1,17 @@
 """NovAtel OEM7 (and OEM4 to OEM6) binary logs, long and short headers, with or without SPAN.
 
-Framing and checksum are `swath.drivers.framing.framer`'s; layouts and tables `swath.drivers.gnss.novatel.layouts`'.
+`swath.drivers.framing.framer` does framing and checksum; layouts and tables are in `swath.drivers.gnss.novatel`.
 Prompts (``[COM1]``), ASCII logs, NMEA and RTCM3 between the logs are framed or skipped, and counted.
 
-What each log gives:
+Records by log:
 
 - TIME: the second of the previous edge, and leap seconds when its UTC status is VALID. BESTPOS and INSPVAX on the whole
-  second name it too. All only while the receiver vouches for its time (FINE, FINESTEERING, FINEBACKUPSTEERING).
+  second give it too. All of them only while the receiver's time status is FINE, FINESTEERING or FINEBACKUPSTEERING.
 - BESTPOS, PPPPOS, BESTVEL: `GnssFix`. INSPVA(S), INSPVAX, INSATT(S), INSATTX: `InsSolution`, with the receiver's INS
-  status: before alignment it sends rows too, see `novatel_tables.INS_NAVIGATING`.
-- RAWIMU(S), RAWIMUX(S): `ImuSamples` in the axes marked on the IMU. Counts mean nothing without the IMU's type, which
-  RAWIMUX and INSCONFIG say, or the setting ``imu_type``; without it they are counted as ``imu_scale_unknown``.
-- CORRIMU…: motion of the vehicle with gravity and earth rotation taken out, so no `ImuSamples` but `DeviceStatus`.
+  status: the receiver sends rows before alignment too, see `tables.INS_NAVIGATING`.
+- RAWIMU(S), RAWIMUX(S): `ImuSamples` in the axes marked on the IMU. Scaling the counts needs the IMU's type, which
+  RAWIMUX and INSCONFIG give, or the setting ``imu_type``; without it they are counted as ``imu_scale_unknown``.
+- CORRIMU…: motion of the vehicle with gravity and earth rotation removed, so `DeviceStatus`, not `ImuSamples`.
 - HEADING2: `GnssHeading`. MARKxTIME: `EventMark`.
 """
 
@@ -42,11 +42,11 @@ from swath.georef.records import (
     TimeMessage,
 )
 
-TIME_NAMING = frozenset(("BESTPOS", "INSPVAX"))  # besides TIME: computed at the epoch in their header
-RAW_RANGES = {43: "RANGE", 140: "RANGECMP", 1273: "RANGECMP2", 2050: "RANGECMP4"}  # measured at the epoch in theirs
+TIME_NAMING = frozenset(("BESTPOS", "INSPVAX"))  # logs besides TIME that are computed at the epoch in their header
+RAW_RANGES = {43: "RANGE", 140: "RANGECMP", 1273: "RANGECMP2", 2050: "RANGECMP4"}  # measured at their header's epoch
 
 
-GIVES: dict[type[nov.Body], tuple[type, ...]] = {  # what a body can become; the rest need not be decoded for it
+GIVES: dict[type[nov.Body], tuple[type, ...]] = {  # record types of a body; a body without a wanted type is not decoded
     nov.Time: (TimeMessage,),
     nov.BestPos: (TimeMessage, GnssFix),
     nov.BestVel: (GnssFix,),
@@ -65,7 +65,9 @@ GIVES: dict[type[nov.Body], tuple[type, ...]] = {  # what a body can become; the
 
 
 def message_name(frame: bytes) -> str:
-    """Return ``BESTPOS``; ``NOVATEL-1234`` without a name here; answers to commands end in ``-response``."""
+    """Return a name such as ``BESTPOS``, or ``NOVATEL-1234`` without one here; answers to commands end in
+    ``-response``.
+    """
     number = int.from_bytes(frame[4:6], "little")
     layout = nov.LAYOUTS.get(number)
     name = layout.name if layout else nov.OTHER_NAMES.get(number, f"NOVATEL-{number}")
@@ -82,13 +84,17 @@ FRAME_KINDS = (
 
 
 class NovatelParser(StreamParser):
-    """Decodes the logs listed above; everything else is framed and counted."""
+    """Decodes the logs listed above; all others are framed and counted."""
 
     def __init__(self, settings: DeviceSettings, *, wanted: tuple[type, ...] | None = None) -> None:
-        """Args: the device's table (``imu_type`` and ``date_floor`` are read), and the record types to give; None: all.
+        """Prepare a parser for one receiver.
+
+        Args:
+            settings: of the device's table, ``imu_type``, ``date_floor`` and ``add_weeks`` are read.
+            wanted: the record types to return; None: all.
 
         Raises:
-            DriverSettingsError: an IMU type that is not in the table, or a floor that is no date.
+            DriverSettingsError: the IMU type is not in the table, or ``date_floor`` or ``add_weeks`` is invalid.
         """
         super().__init__()
         self._framer = Framer(FRAME_KINDS, self.counters)
@@ -96,18 +102,18 @@ class NovatelParser(StreamParser):
         self._bodies = {body for body, gives in GIVES.items() if wanted is None or not set(wanted).isdisjoint(gives)}
         self._state = State(self.counters, ReceiverDates(settings), imu_scale(settings))
         self._last_named: tuple[int, int] = (-1, -1)
-        self._has_solutions = False  # that name seconds: raw measurements come later and need not
+        self._has_solutions = False  # solutions give the second, so raw measurements, which come later, are not used
 
     def feed(self, chunk: Chunk) -> list[Record]:
-        """Take one read."""
+        """Take one read; return the records that it completed."""
         return self._decode_all(self._framer.feed(chunk.data, chunk.host_time_ns))
 
     def close(self) -> list[Record]:
-        """Release what was held back."""
+        """Return the records held back."""
         return self._decode_all(self._framer.close())
 
     def remarks(self) -> list[str]:
-        """Return what is to be said of the receiver's weeks."""
+        """Return remarks on the receiver's weeks."""
         return self._state.dates.remarks()
 
     def _decode_all(self, frames: list[Frame]) -> list[Record]:
@@ -115,7 +121,7 @@ class NovatelParser(StreamParser):
         return join_rows(item for log in logs for item in self._decode(log))
 
     def _decode(self, frame: Frame) -> list[Record | Row]:
-        """Return one frame; a short body is counted."""
+        """Decode one frame; a body that is too short is counted."""
         number = int.from_bytes(frame.data[4:6], "little")
         if number in RAW_RANGES:
             return self._second_of_raw(frame, RAW_RANGES[number])
@@ -136,7 +142,7 @@ class NovatelParser(StreamParser):
         return [item for item in items if (item.record if isinstance(item, Row) else type(item)) in self._wanted]
 
     def _named_second(self, header: Header) -> list[TimeMessage]:
-        """Return the whole second a synchronous solution names, once for all logs of an epoch."""
+        """Return the whole second of a synchronous solution, once for all logs of an epoch."""
         epoch = (header.week, header.milliseconds)
         if header.name not in TIME_NAMING or header.milliseconds % 1000 or epoch == self._last_named:
             return []
@@ -146,7 +152,7 @@ class NovatelParser(StreamParser):
         return [TimeMessage(header.host_time_ns, header.tag(), NamesEdge.PREVIOUS, message=header.name)]
 
     def _second_of_raw(self, frame: Frame, name: str) -> list[Record | Row]:
-        """Name the whole second of raw measurements, in a log for post-processing that holds no solution."""
+        """Return the whole second of raw measurements, in a log for post-processing that contains no solution."""
         header, _ = _split(frame, name, self._state.dates)
         wanted = self._wanted is None or TimeMessage in self._wanted
         if header is None or self._has_solutions or not wanted:
@@ -161,7 +167,7 @@ class NovatelParser(StreamParser):
 
 
 def _split(frame: Frame, name: str, dates: ReceiverDates) -> tuple[Header | None, bytes]:
-    """Return header and body of a frame; None for answers to commands and for other formats."""
+    """Split a frame into header and body; the header is None for answers to commands and for other formats."""
     data = frame.data
     if data[:3] == nov.SYNC_SHORT:
         short = nov.ShortHeader._make(nov.SHORT_HEADER.unpack_from(data))
@@ -181,7 +187,7 @@ def imu_scale(settings: DeviceSettings) -> tables.ImuScale | None:
     """Return the scale of the configured ``imu_type``, a name of INSCONFIG's table or its number; None without it.
 
     Raises:
-        DriverSettingsError: naming the types there are.
+        DriverSettingsError: the type is unknown; the text lists the known ones.
     """
     wanted = settings.config.get("imu_type")
     if wanted in (None, ""):
@@ -193,7 +199,7 @@ def imu_scale(settings: DeviceSettings) -> tables.ImuScale | None:
 
 
 def make_time_parser(settings: DeviceSettings) -> NovatelParser:
-    """Return the recorder's parser: time messages only."""
+    """Make the recorder's parser, which returns time messages only."""
     return NovatelParser(settings, wanted=(TimeMessage,))
 
 

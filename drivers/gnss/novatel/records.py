@@ -1,4 +1,4 @@
-"""NovAtel logs to records: one function a body, `DECODERS` says which."""
+"""Converts NovAtel logs to records: one function for each body, listed in `DECODERS`."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ from swath.georef.timescales.gps_time import MILLISECOND_NS, SECOND_NS
 WEEK_NS = 604_800 * SECOND_NS
 GREATEST_WEEK = 8191  # 13 bits in the modern navigation message, to the year 2137
 GREATEST_PPS_ERROR_S = 1e-3  # a clock offset beyond this is not the offset of a steered PPS
-GREATEST_LEAP_S = 255  # 8 bits in the navigation message
-IMU_ERROR_BIT, IMU_ENCRYPTED_BIT = 1, 2  # of RAWIMUX's IMU info
+GREATEST_LEAP_S = 255  # the navigation message has 8 bits
+IMU_ERROR_BIT, IMU_ENCRYPTED_BIT = 1, 2  # bits of RAWIMUX's IMU info
 
 
 class Header(NamedTuple):
-    """What both headers say, and the host time of the frame."""
+    """Fields common to both headers, and the host time of the frame."""
 
     name: str
     host_time_ns: int
@@ -51,12 +51,12 @@ class Header(NamedTuple):
 
     @property
     def before_floor(self) -> bool:
-        """Whether it has a week that is not believed: that of a receiver one roll-over behind."""
+        """Whether its week is known but before the floor, as from a receiver one roll-over behind."""
         return 0 < self.week < self.floor_week
 
     @property
     def time_valid(self) -> bool:
-        """Whether the receiver vouches for the time; a short header says nothing against it but its week."""
+        """Whether the receiver marks the time as valid; a short header has no status, so only its week counts."""
         known = is_week(self.week, self.floor_week)
         return known and (self.time_status is None or self.time_status in tables.TIME_VALID)
 
@@ -67,13 +67,13 @@ class Header(NamedTuple):
 
 @dataclass(slots=True)
 class State:
-    """What decoding needs besides the message.
+    """Holds the data that decoding needs besides the message.
 
     Attributes:
-        counters: the parser's.
-        dates: moves weeks by roll-overs, and knows the oldest believed.
-        configured_scale: of the setting ``imu_type``.
-        announced_scale: of the last INSCONFIG.
+        counters: the parser's counters.
+        dates: moves weeks by roll-overs and holds the oldest accepted week.
+        configured_scale: IMU scale of the setting ``imu_type``.
+        announced_scale: IMU scale of the last INSCONFIG.
     """
 
     counters: ParserCounters
@@ -83,25 +83,27 @@ class State:
 
     @property
     def floor_week(self) -> int:
-        """The oldest week believed."""
+        """Oldest accepted week."""
         return self.dates.floor_week
 
     def has_week(self, week: int) -> bool:
-        """Return whether a solution can be placed in time; counted where not."""
+        """Return whether a solution's week is usable, and count those that are not."""
         known = is_week(week, self.floor_week)
         if not known:
             self.counters.errors["date_before_floor" if 0 < week < self.floor_week else "time_unknown"] += 1
         return known
 
     def time_counts(self, header: Header) -> bool:
-        """Return whether what a header dates is valid in time; a week before the floor is counted."""
+        """Return whether a header's time is valid, and count weeks before the floor."""
         if header.before_floor:
             self.counters.errors["date_before_floor"] += 1
         return header.time_valid
 
 
 def time_message(state: State, header: Header, time: nov.Time) -> list[Record | Row]:
-    """Return TIME names the edge its own header says; the PPS is early by what the receiver's clock is ahead."""
+    """Return the second of the edge in a TIME's header; the PPS is early by the amount that the receiver's clock is
+    ahead.
+    """
     if not state.has_week(header.week):
         return []
     says_leap = time.utc_status == tables.UTC_VALID and abs(time.utc_offset_s) < GREATEST_LEAP_S
@@ -125,7 +127,7 @@ def time_message(state: State, header: Header, time: nov.Time) -> list[Record | 
 
 
 def _leap_of_fields(header: Header, time: nov.Time) -> int | None:
-    """Return GPS − UTC as header and calendar fields of a TIME imply it; None: they do not say."""
+    """Return GPS − UTC as header and calendar fields of a TIME imply it; None where they do not."""
     try:
         date = dt.date(time.utc_year, time.utc_month, time.utc_day)
     except ValueError:
@@ -135,7 +137,7 @@ def _leap_of_fields(header: Header, time: nov.Time) -> int | None:
 
 
 def position_fix(state: State, header: Header, position: nov.BestPos) -> list[Record | Row]:
-    """Return height above the geoid plus undulation is the ellipsoidal height."""
+    """Return a fix with ellipsoidal height, the sum of the height above the geoid and the undulation."""
     there = position.position_type != tables.POSITION_NONE
     sigmas = (position.lat_sigma_m, position.lon_sigma_m, position.height_sigma_m)
     return [
@@ -157,7 +159,7 @@ def position_fix(state: State, header: Header, position: nov.BestPos) -> list[Re
 
 
 def velocity_fix(state: State, header: Header, velocity: nov.BestVel) -> list[Record | Row]:
-    """Return the velocity holds `latency_s` before the header's time (BESTVEL, field 4)."""
+    """Return a fix with the velocity, which is valid `latency_s` before the header's time (BESTVEL, field 4)."""
     track = radians(velocity.track_deg) if isfinite(velocity.track_deg) else nan
     north, east = velocity.horizontal_mps * cos(track), velocity.horizontal_mps * sin(track)
     there = velocity.velocity_type != tables.POSITION_NONE
@@ -178,7 +180,7 @@ def velocity_fix(state: State, header: Header, velocity: nov.BestVel) -> list[Re
 
 
 def ins_pva(state: State, header: Header, pva: nov.InsPva) -> list[Record | Row]:
-    """Return its own time is finer than the header's."""
+    """Return a row with the log's own time, which is finer than the header's."""
     if not state.has_week(pva.week):
         return []
     time_ns = pva.week * WEEK_NS + _nanoseconds(pva.seconds)
@@ -186,7 +188,7 @@ def ins_pva(state: State, header: Header, pva: nov.InsPva) -> list[Record | Row]
 
 
 def ins_pvax(state: State, header: Header, pva: nov.InsPvax) -> list[Record | Row]:
-    """Return height and undulation make the ellipsoidal height."""
+    """Return a row with ellipsoidal height, the sum of height and undulation."""
     if not state.has_week(header.week):
         return []
     time_ns = header.week * WEEK_NS + header.milliseconds * MILLISECOND_NS
@@ -197,7 +199,7 @@ def ins_pvax(state: State, header: Header, pva: nov.InsPvax) -> list[Record | Ro
 def _ins_row(
     header: Header, time_ns: int, pva: nov.InsPva | nov.InsPvax, height_m: float, sigmas: tuple[float, ...]
 ) -> list[Record | Row]:
-    """Return a row of `INS_DTYPE`; sigmas of position, velocity (m, m/s) and attitude (rad)."""
+    """Return a row of `INS_DTYPE`; sigmas are those of position, velocity (m, m/s) and attitude (rad)."""
     values = (
         header.host_time_ns,
         time_ns,
@@ -215,7 +217,7 @@ def _ins_row(
 
 
 def ins_attitude(state: State, header: Header, attitude: nov.InsAtt | nov.InsAttx) -> list[Record | Row]:
-    """Return position and velocity of such a row are nan."""
+    """Return a row with the attitude only; its position and velocity are nan."""
     week = attitude.week if isinstance(attitude, nov.InsAtt) else header.week
     if not state.has_week(week):
         return []
@@ -232,13 +234,13 @@ def ins_attitude(state: State, header: Header, attitude: nov.InsAtt | nov.InsAtt
 
 
 def raw_imu(state: State, header: Header, imu: nov.RawImu | nov.RawImux) -> list[Record | Row]:
-    """Return counts to rates: increments of one sample, times the IMU's rate; axes of the wire are z, −y, x."""
+    """Convert counts to rates: a sample's increments times the IMU's rate; the wire has the axes z, −y, x."""
     scale = state.configured_scale or state.announced_scale
     if isinstance(imu, nov.RawImux):
         scale = state.configured_scale or tables.IMU_SCALES.get(imu.imu_type)
         if imu.imu_info & IMU_ERROR_BIT:
             state.counters.errors["imu_error"] += 1
-        if imu.imu_info & IMU_ENCRYPTED_BIT:  # "should not be used": counts that are none
+        if imu.imu_info & IMU_ENCRYPTED_BIT:  # "should not be used": not valid counts
             state.counters.errors["imu_encrypted"] += 1
             return []
     if scale is None:
@@ -260,7 +262,9 @@ def raw_imu(state: State, header: Header, imu: nov.RawImu | nov.RawImux) -> list
 
 
 def corrected_imu(state: State, header: Header, imu: nov.CorrImu | nov.CorrImuData) -> list[Record | Row]:
-    """Return increments since the last log, turned to forward, right, down; no specific force: gravity is taken out."""
+    """Return increments since the last log in forward, right, down; gravity is removed, so they are not specific
+    force.
+    """
     values: dict[str, float | int | str | bool] = {
         "delta_angle_x_rad": imu.roll_rad,
         "delta_angle_y_rad": imu.pitch_rad,
@@ -279,9 +283,9 @@ def corrected_imu(state: State, header: Header, imu: nov.CorrImu | nov.CorrImuDa
 
 
 def event_mark(state: State, header: Header, mark: nov.MarkTime) -> list[Record | Row]:
-    """Return GPS time of the mark is the receiver's less its clock's offset (MARKxTIME, fields 3 and 4).
+    """Return a mark with GPS time: the receiver's time less its clock's offset (MARKxTIME, fields 3 and 4).
 
-    It is of the pulse's leading edge, which is the falling one unless MARKCONTROL was told otherwise; no log says it.
+    The mark belongs to the pulse's leading edge, the falling one unless MARKCONTROL was set otherwise; no log shows it.
     """
     week = state.dates.week(mark.week, header.host_time_ns)
     return [
@@ -298,7 +302,7 @@ def event_mark(state: State, header: Header, mark: nov.MarkTime) -> list[Record 
 
 
 def baseline_heading(state: State, header: Header, heading: nov.Heading2) -> list[Record | Row]:
-    """From the master antenna to the rover's."""
+    """Return the heading from the master antenna to the rover's."""
     there = heading.position_type != tables.POSITION_NONE
     return [
         GnssHeading(
@@ -316,29 +320,29 @@ def baseline_heading(state: State, header: Header, heading: nov.Heading2) -> lis
 
 
 def ins_config(state: State, header: Header, config: nov.InsConfig) -> list[Record | Row]:
-    """Return says which IMU is connected, for the raw logs that do not."""
+    """Note the connected IMU's scale for raw logs that do not name the IMU."""
     state.announced_scale = tables.IMU_SCALES.get(config.imu_type)
     return []
 
 
 def is_week(week: int, floor_week: int) -> bool:
-    """Return whether a message has a week, and one that is believed."""
+    """Return whether a message has a week that is accepted."""
     return max(1, floor_week) <= week <= GREATEST_WEEK
 
 
 def gps_tag(week: int, time_ns: int, floor_week: int) -> TimeTag:
-    """Return GPS time of week, carried over the week's end; no week where the receiver has none that is believed."""
+    """Return GPS time of week, carried over the week's end; the week is None where the receiver has no accepted one."""
     weeks, time_ns = divmod(time_ns, WEEK_NS)
     return TimeTag(TimeScale.GPS, time_ns, week=week + weeks if is_week(week, floor_week) else None)
 
 
 def _nanoseconds(seconds: float) -> int:
-    """Return nearest nanosecond; 0 for what is no number."""
+    """Return the nearest nanosecond, 0 for a value out of range or not a number."""
     return round(seconds * SECOND_NS) if abs(seconds) < 1e9 else 0
 
 
 def _attitude(row: nov.InsPva | nov.InsPvax | nov.InsAtt | nov.InsAttx) -> tuple[float, float, float]:
-    """Return roll, pitch, heading as CONVENTIONS has them.
+    """Return roll, pitch and heading by the definitions of CONVENTIONS.
 
     SPAN's frame is x right, y forward, z up: its roll about y and its pitch about x are right-handed, its azimuth is
     clockwise from north; so right wing down, nose up and heading are positive, as here.

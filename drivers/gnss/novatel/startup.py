@@ -1,8 +1,9 @@
 """Start-up messages of NovAtel receivers: commands in abbreviated ASCII (OEM7 Commands and Logs).
 
-LOG without a port logs to the port the command came by. A receiver answers ``<OK`` or ``<ERROR:…`` on a line of its
-own and then its prompt (``[COM1]``); recordings in ``fixtures/novatel`` hold the former. The logs' triggers are those
-of NovAtel's own ROS driver (novatel_oem7_driver, ``std_init_commands.yaml``); of MARKxTIME, the LOG command's page.
+LOG without a port logs to the port that sent the command. A receiver answers ``<OK`` or ``<ERROR:…`` on a line of its
+own and then its prompt (``[COM1]``); recordings in ``fixtures/novatel`` contain such answers. The logs' triggers are
+those of NovAtel's ROS driver (novatel_oem7_driver, ``std_init_commands.yaml``), for MARKxTIME of the LOG command's
+page.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from swath.drivers.startup import PhraseListener, StartupMessage, StartupOptions
 ACCEPTED = re.compile(rb"<OK\r?\n")
 REFUSED = re.compile(rb"<ERROR:?([^\r\n]*)\r?\n")
 
-PULSE = "PPSCONTROL ENABLE_FINETIME POSITIVE 1.0 1000"  # no pulse before FINE; period s, width as from the factory
+PULSE = "PPSCONTROL ENABLE_FINETIME POSITIVE 1.0 1000"  # no pulse before FINE; period in s, factory width
 EVENT_LOGS = ("MARK1TIMEB ONNEW", "MARK2TIMEB ONNEW")
 HEADING_LOGS = ("HEADING2B ONNEW",)
 RAW_LOGS = (
@@ -26,17 +27,17 @@ RAW_LOGS = (
     "GALFNAVEPHEMERISB ONNEW",
     "BDSEPHEMERISB ONNEW",
 )
-# INSPVAS has no sigmas, INSPVAX says them once a second; georeferencing that takes the INS's attitude as it is logged
-# interpolates between epochs, so they are 20 ms apart
+# INSPVAS has no sigmas, INSPVAX gives them once a second; georeferencing that uses the INS's attitude as logged
+# interpolates between epochs, which are therefore 20 ms apart
 IMU_LOGS = ("RAWIMUSXB ONNEW", "INSPVASB ONTIME 0.02", "INSPVAXB ONTIME 1", "INSCONFIGB ONCHANGED")
 SAVE = "SAVECONFIG"
 
 
 def startup_messages(settings: DeviceSettings, wish: StartupOptions) -> tuple[StartupMessage, ...]:
-    """Return baud rate where it changes, PPS, logs of time, position, events and raw measurements.
+    """Return commands for the baud rate where it changes, PPS, and logs of time, position, events and raw measurements.
 
     Raises:
-        DriverSettingsError: a port is named, which a NovAtel needs not.
+        DriverSettingsError: a port is named, which a NovAtel receiver does not need.
     """
     setup = read_setup(settings)
     if setup.port is not None:
@@ -55,7 +56,7 @@ def startup_messages(settings: DeviceSettings, wish: StartupOptions) -> tuple[St
 
 
 def imu_startup_messages(settings: DeviceSettings, wish: StartupOptions) -> tuple[StartupMessage, ...]:
-    """Return logs of the IMU and INS in a receiver's stream."""
+    """Return commands for the logs of the IMU and INS in a receiver's stream."""
     return (*(_command(f"LOG {log}") for log in IMU_LOGS), *_saving(wish))
 
 

@@ -1,4 +1,4 @@
-"""NovAtel OEM7: status values and IMU scale factors, as the manual's tables have them (docs.novatel.com/OEM7)."""
+"""NovAtel OEM7: status values and IMU scale factors, by the manual's tables (docs.novatel.com/OEM7)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ FOOT_M = 0.3048
 STANDARD_GRAVITY = 9.80665
 FULL_SCALE_16 = 2.0**16
 
-# GPS reference time status (table of that name). The receiver vouches for its time, and steers its PPS to it, in these:
+# GPS reference time status (table of that name). The receiver's time is valid, and its PPS steered to it, in these:
 TIME_STATUS_FINE = 160
 TIME_STATUS_FINEBACKUPSTEERING = 170
 TIME_STATUS_FINESTEERING = 180
@@ -22,7 +22,7 @@ UTC_VALID = 1  # UTC status; 2 is WARNING: leap seconds guessed
 SOL_COMPUTED = 0  # solution status
 POSITION_NONE = 0
 
-# Position or velocity type -> the coarse class; what is not here is NONE.
+# Position or velocity type -> the coarse class; other types are NONE.
 FIX_TYPES: dict[int, FixType] = {
     1: FixType.MANUAL,  # FIXEDPOS
     2: FixType.SINGLE,  # FIXEDHEIGHT
@@ -49,7 +49,7 @@ FIX_TYPES: dict[int, FixType] = {
     66: FixType.DIFFERENTIAL,  # CDGPS
     68: FixType.PPP,  # PPP_CONVERGING
     69: FixType.PPP,
-    70: FixType.SINGLE,  # OPERATIONAL, WARNING, OUT_OF_BOUNDS: the type behind a user accuracy limit is not told
+    70: FixType.SINGLE,  # OPERATIONAL, WARNING, OUT_OF_BOUNDS: the type behind a user accuracy limit is unknown
     71: FixType.SINGLE,
     72: FixType.SINGLE,
     73: FixType.PPP,  # INS_PPP_CONVERGING
@@ -60,19 +60,19 @@ FIX_TYPES: dict[int, FixType] = {
     80: FixType.PPP,  # INS_PPP_BASIC
 }
 
-# Inertial solution status: of these a row is a navigation solution (HIGH_VARIANCE, GOOD, FREE, ALIGNMENT_COMPLETE).
+# Inertial solution status: in these a row is a navigation solution (HIGH_VARIANCE, GOOD, FREE, ALIGNMENT_COMPLETE).
 INS_NAVIGATING = frozenset((2, 3, 6, 7))
 
 
 @dataclass(frozen=True, slots=True)
 class ImuScale:
-    """What one count of RAWIMU means, and how many samples a second there are.
+    """The value of one count of RAWIMU, and the number of samples a second.
 
     Attributes:
         name: the manual's name of the IMU type.
         rad_per_count: angle increment.
         mps_per_count: velocity increment.
-        rate_hz: samples a second; the increments are over its inverse.
+        rate_hz: samples a second; an increment covers the inverse of it.
     """
 
     name: str
@@ -82,7 +82,7 @@ class ImuScale:
 
 
 def _rate_output(name: str, deg_per_s: float, milli_g: float, rate_hz: float) -> ImuScale:
-    """Return an IMU whose counts are rates in 1/65536 of a unit (Epson), as increments over one sample."""
+    """Return the scale of an IMU whose counts are rates in 1/65536 of a unit (Epson), as increments over one sample."""
     rad = radians(deg_per_s) / FULL_SCALE_16 / rate_hz
     return ImuScale(name, rad, milli_g / FULL_SCALE_16 * STANDARD_GRAVITY / 1000.0 / rate_hz, rate_hz)
 

@@ -1,1 +1,1 @@
-"""Septentrio Binary Format."""
+"""Septentrio Binary Format: parser, blocks and start-up."""

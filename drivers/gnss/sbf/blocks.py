@@ -1,7 +1,7 @@
 """Septentrio SBF blocks as tables: fields in wire order and in the wire's units.
 
 Sources: PolaRx5TR reference guide (firmware 5.5.0), 4.2; for the attitude, INS and external sensor blocks, which that
-receiver has not, Septentrio's own ROS driver (septentrio_gnss_driver, ``sbf_blocks.hpp`` and its messages). Fields that
+receiver lacks, Septentrio's own ROS driver (septentrio_gnss_driver, ``sbf_blocks.hpp`` and its messages). Fields that
 a later revision added have the do-not-use value as default. Reserved bytes are pad bytes.
 """
 
@@ -53,7 +53,7 @@ class PvtGeodetic(NamedTuple):
 
 
 class PvtCartesian(NamedTuple):
-    """PVTCartesian (4006, version 2): as PVTGeodetic, in ECEF."""
+    """PVTCartesian (4006, version 2): the content of PVTGeodetic in ECEF."""
 
     mode: int
     error: int
@@ -69,11 +69,11 @@ class PvtCartesian(NamedTuple):
     clock_drift_ppm: float
 
 
-MODE_TYPE_BITS = 0x0F  # of the mode: the type of solution
+MODE_TYPE_BITS = 0x0F  # bits of the mode with the type of solution
 
 
 class PosCovGeodetic(NamedTuple):
-    """PosCovGeodetic (5906), m²; b is the clock's bias, in metres."""
+    """PosCovGeodetic (5906): covariance of the position, m²; b is the clock's bias, in metres."""
 
     mode: int
     error: int
@@ -90,7 +90,7 @@ class PosCovGeodetic(NamedTuple):
 
 
 class VelCovGeodetic(NamedTuple):
-    """VelCovGeodetic (5908), page 395, m²/s²; t is the clock's drift."""
+    """VelCovGeodetic (5908), page 395: covariance of the velocity, m²/s²; t is the clock's drift."""
 
     mode: int
     error: int
@@ -121,7 +121,7 @@ END_OF_ATT = Layout(5943, NoFields, "")
 
 
 class ReceiverTime(NamedTuple):
-    """ReceiverTime (5914), page 423: every second; the UTC fields are those of its time stamp."""
+    """ReceiverTime (5914), page 423: sent every second; the UTC fields belong to its time stamp."""
 
     year: int  # two digits
     month: int
@@ -142,7 +142,7 @@ class XppsOffset(NamedTuple):
 
     sync_age_s: int
     time_scale: int  # SCALE_*
-    offset_ns: float  # of the pulse from its true place; negative: it came early
+    offset_ns: float  # pulse less true second; negative: it came early
 
 
 SCALE_GPS, SCALE_UTC, SCALE_RECEIVER, SCALE_GLONASS, SCALE_GALILEO, SCALE_BEIDOU = range(1, 7)
@@ -154,7 +154,7 @@ class ExtEvent(NamedTuple):
     source: int  # 1: EventA, 2: EventB
     polarity: int  # 0: rising, 1: falling
     offset_s: float
-    clock_bias_s: float  # unset without a position for ten minutes
+    clock_bias_s: float  # unset after ten minutes without a position
     pvt_age_s: int = U2_UNSET  # revision 1
 
 
@@ -169,7 +169,7 @@ class AttEuler(NamedTuple):
     """AttEuler (5938): attitude of the antennas; degrees, north east down."""
 
     satellites: int
-    error: int  # bits 0-1 and 2-3: of the baselines; bit 7: attitude is not asked for
+    error: int  # bits 0-1 and 2-3: the baselines; bit 7: attitude is not requested
     mode: int  # 0: none
     heading_deg: float
     pitch_deg: float
@@ -180,7 +180,7 @@ class AttEuler(NamedTuple):
 
 
 class AttCovEuler(NamedTuple):
-    """AttCovEuler (5939), deg²."""
+    """AttCovEuler (5939): covariance of the attitude, deg²."""
 
     error: int
     heading_heading: float
@@ -205,12 +205,12 @@ class InsNavGeod(NamedTuple):
     accuracy_cm: int
     latency_100us: int
     datum: int
-    sub_blocks: int  # INS_*: those that follow, lowest bit first
+    sub_blocks: int  # INS_*: sub-blocks that follow, lowest bit first
 
 
 INS_POSITION_SIGMA, INS_ATTITUDE, INS_ATTITUDE_SIGMA, INS_VELOCITY, INS_VELOCITY_SIGMA = 1, 2, 4, 8, 16
 INS_TRIPLE = struct.Struct("<3f")
-INS_SUB_BLOCKS = (  # what follows the fixed part, three numbers each
+INS_SUB_BLOCKS = (  # sub-blocks after the fixed part, three numbers each
     INS_POSITION_SIGMA,  # latitude, longitude, height; m
     INS_ATTITUDE,  # heading, pitch, roll; degrees
     INS_ATTITUDE_SIGMA,
@@ -230,7 +230,7 @@ class SensorSet(NamedTuple):
 
 
 class ExtSensorMeas(NamedTuple):
-    """ExtSensorMeas (4050): how many measurements follow, and their length."""
+    """ExtSensorMeas (4050): number of measurements that follow, and their length."""
 
     sets: int
     set_bytes: int
@@ -245,14 +245,14 @@ ATT_EULER = Layout(5938, AttEuler, "BBH2x6f")
 ATT_COV_EULER = Layout(5939, AttCovEuler, "xB6f")
 INS_NAV_GEOD = Layout(4226, InsNavGeod, "BBHHdddfHHBxH")
 EXT_SENSOR_MEAS = Layout(4050, ExtSensorMeas, "BB")
-MEAS_EPOCH = 4027  # its header says its time; the measurements are for post-processing
+MEAS_EPOCH = 4027  # its header has the time; the measurements are for post-processing
 
 
 def ins_triples(frame: bytes, block: InsNavGeod) -> dict[int, Triple]:
-    """Return the sub-blocks of an INSNavGeod that are there, by INS_*.
+    """Return the sub-blocks present in an INSNavGeod, by INS_*.
 
     Raises:
-        BlockError: shorter than the block says.
+        BlockError: the frame is shorter than the block's fields require.
     """
     found: dict[int, Triple] = {}
     offset = INS_NAV_GEOD.end
@@ -267,7 +267,7 @@ def ins_triples(frame: bytes, block: InsNavGeod) -> dict[int, Triple]:
 
 
 def encode_ins_nav_geod(block: InsNavGeod, triples: dict[int, Triple], tow_ms: int | None, week: int | None) -> bytes:
-    """Return the frame of an INSNavGeod; ``sub_blocks`` of the block is made from the triples."""
+    """Encode the frame of an INSNavGeod; its ``sub_blocks`` field is derived from the triples."""
     behind = b"".join(INS_TRIPLE.pack(*triples[bit]) for bit in INS_SUB_BLOCKS if bit in triples)
     return INS_NAV_GEOD.encode(block._replace(sub_blocks=sum(triples)), tow_ms, week, behind=behind)
 
@@ -276,7 +276,7 @@ def sensor_sets(frame: bytes) -> list[SensorSet]:
     """Return the measurements of an ExtSensorMeas.
 
     Raises:
-        BlockError: shorter than the block says.
+        BlockError: the frame is shorter than the block's fields require.
     """
     head = EXT_SENSOR_MEAS.decode(frame)
     start, step = EXT_SENSOR_MEAS.end, head.set_bytes
@@ -286,6 +286,6 @@ def sensor_sets(frame: bytes) -> list[SensorSet]:
 
 
 def encode_ext_sensor_meas(sets: list[SensorSet], tow_ms: int | None, week: int | None) -> bytes:
-    """Return the frame of an ExtSensorMeas."""
+    """Encode the frame of an ExtSensorMeas."""
     behind = b"".join(SENSOR_SET.pack(*one) for one in sets)
     return EXT_SENSOR_MEAS.encode(ExtSensorMeas(len(sets), SENSOR_SET.size), tow_ms, week, behind=behind)

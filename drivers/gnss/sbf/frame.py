@@ -1,4 +1,4 @@
-"""Septentrio SBF frames: header, time stamp, names of the blocks, a block's layout and its encoder.
+"""Septentrio SBF frames: header, time stamp, names of the blocks, and a block's layout and encoder.
 
 PolaRx5TR reference guide (firmware 5.5.0), 4.1. Numbers and names of blocks: its appendix A, the mosaic-X5's list of
 blocks, and for INS receivers Septentrio's own ROS driver (septentrio_gnss_driver, ``sbf_blocks.hpp``).
@@ -15,9 +15,9 @@ from swath.drivers.framing.kinds import SBF_CRC_START, SBF_HEADER, SBF_NUMBER_BI
 BlockT = TypeVar("BlockT", bound=tuple[float, ...])
 
 HEADER = struct.Struct("<2sHHHIH")  # sync, CRC, id, length (4.1.1); TOW, WNc (4.1.3)
-REVISION_SHIFT = 13  # of the id
+REVISION_SHIFT = 13  # position of the revision in the id
 SYNC = b"$@"
-ALIGNMENT_BYTES = 4  # of the length, by padding
+ALIGNMENT_BYTES = 4  # padding rounds the length up to a multiple of it
 
 TOW_UNSET, WEEK_UNSET = 0xFFFF_FFFF, 0xFFFF
 
@@ -48,11 +48,11 @@ NAMES = dict(zip(map(int, _WORDS[::2]), _WORDS[1::2], strict=True))
 
 
 class BlockError(ValueError):
-    """A block with a good checksum whose content cannot be; the text is the error it is counted as."""
+    """A block with a good checksum has impossible content; the text is the error under which it is counted."""
 
 
 class BlockHeader(NamedTuple):
-    """What every block begins with."""
+    """Number, revision and time stamp, with which every block begins."""
 
     number: int
     revision: int
@@ -66,16 +66,16 @@ def number_of(frame: bytes) -> int:
 
 
 def name_of(frame: bytes) -> str:
-    """Return ``PVTGeodetic``; ``SBF-4999`` without a name here."""
+    """Return a name such as ``PVTGeodetic``, or ``SBF-4999`` where the table has no name."""
     number = number_of(frame)
     return NAMES.get(number, f"SBF-{number}")
 
 
 def read_header(frame: bytes) -> BlockHeader:
-    """Number and time stamp of a whole frame.
+    """Read number and time stamp of a whole frame.
 
     Raises:
-        BlockError: too short for a time stamp.
+        BlockError: the frame is too short for a time stamp.
     """
     if len(frame) < HEADER.size:
         raise BlockError("bad_length")
@@ -89,12 +89,12 @@ def read_header(frame: bytes) -> BlockHeader:
 
 
 class Layout(Generic[BlockT]):
-    """Number and fields of a block.
+    """Encodes and decodes one block: its number and its fields.
 
     Args:
-        number: the block's.
-        block: the NamedTuple.
-        formats: struct formats of the fields: of revision 0, then of what each later revision added.
+        number: the block's number.
+        block: the NamedTuple class.
+        formats: struct formats of the fields of revision 0, then of the fields that each later revision added.
     """
 
     def __init__(self, number: int, block: type[BlockT], *formats: str) -> None:
@@ -105,14 +105,14 @@ class Layout(Generic[BlockT]):
 
     @property
     def end(self) -> int:
-        """Offset in the frame of what lies behind the fields of the latest revision."""
+        """Offset in the frame behind the fields of the latest revision."""
         return HEADER.size + self._wires[-1].size
 
     def decode(self, frame: bytes) -> BlockT:
-        """Return the block of a whole frame.
+        """Decode the block of a whole frame.
 
         Raises:
-            BlockError: shorter than its revision.
+            BlockError: the frame is shorter than its revision requires.
         """
         revision = SBF_HEADER.unpack_from(frame)[1] >> REVISION_SHIFT
         wire = self._wires[min(revision, len(self._wires) - 1)]
@@ -123,7 +123,7 @@ class Layout(Generic[BlockT]):
     def encode(
         self, block: BlockT, tow_ms: int | None, week: int | None, *, revision: int | None = None, behind: bytes = b""
     ) -> bytes:
-        """Return the whole frame, of the latest revision known unless said; ``behind`` are sub-blocks."""
+        """Encode a whole frame, of the latest revision by default; ``behind`` contains the sub-blocks."""
         revision = len(self._wires) - 1 if revision is None else revision
         known = min(revision, len(self._wires) - 1)
         body = self._wires[known].pack(*block[: self._fields[known]])
@@ -131,12 +131,12 @@ class Layout(Generic[BlockT]):
 
 
 def encode_frame(number: int, body: bytes, tow_ms: int | None, week: int | None, *, revision: int = 0) -> bytes:
-    """Return a block's frame: header, time stamp, body, padding.
+    """Build a block's frame: header, time stamp, body, padding.
 
     Args:
-        number, revision: of the block.
-        body: everything behind the time stamp.
-        tow_ms, week: the time stamp; None: unset.
+        number, revision: number and revision of the block.
+        body: all bytes behind the time stamp.
+        tow_ms, week: the time stamp; None for unset.
     """
     length = -(-(HEADER.size + len(body)) // ALIGNMENT_BYTES) * ALIGNMENT_BYTES
     stamp = (TOW_UNSET if tow_ms is None else tow_ms, WEEK_UNSET if week is None else week)

@@ -4,13 +4,13 @@ PVTGeodetic, PosCovGeodetic, VelCovGeodetic, PVTCartesian (time only), ReceiverT
 AttCovEuler, INSNavGeod and ExtSensorMeas are decoded. All other blocks, NMEA and RTCM3 on the same port are framed,
 checked and counted; the prompts and replies of the receiver's command line (``COM1>``, ``$R: …``) are skipped.
 
-Time: xPPSOffset is sent right after each pulse, so it names the previous edge and is bound to it; its offset is the
-edge's own error, negative when the pulse came early. ReceiverTime names the previous edge too, and says leap seconds.
-So do PVTGeodetic, PVTCartesian and INSNavGeod on the whole second, once an epoch. What they name is the second of
-their time stamp; the clock's bias is taken off the records' times only.
+Time: xPPSOffset is sent right after each pulse, so it refers to the previous edge and is bound to it; its offset is the
+edge's own error, negative when the pulse came early. ReceiverTime refers to the previous edge too, and gives leap
+seconds. So do PVTGeodetic, PVTCartesian and INSNavGeod on the whole second, once for each epoch. All of them give the
+second of their time stamp; the clock's bias is removed from the times of records only.
 
 Fix: PVTGeodetic, PosCovGeodetic and VelCovGeodetic of one time stamp make one `GnssFix` (`swath.drivers.gnss.epochs`),
-complete at EndOfPVT at the latest. So do AttEuler and AttCovEuler one `GnssHeading`.
+complete at EndOfPVT at the latest. AttEuler and AttCovEuler make one `GnssHeading` in the same way.
 """
 
 from __future__ import annotations
@@ -49,13 +49,13 @@ Items: TypeAlias = list[Record | Row]
 
 FRAME_KINDS = (replace(SBF, message_name=wire.name_of), NMEA, RTCM3)
 GREATEST_WEEK = 8191  # 13 bits in the modern navigation message, to the year 2137
-GREATEST_OFFSET_NS = 1e6  # of a pulse; beyond this it is no rounding to the receiver's clock
+GREATEST_OFFSET_NS = 1e6  # largest offset of a pulse that rounding to the receiver's clock can cause
 PULSE_SCALES = frozenset(
     (sbf.SCALE_GPS, sbf.SCALE_UTC, sbf.SCALE_GLONASS, sbf.SCALE_GALILEO, sbf.SCALE_BEIDOU)
-)  # whose seconds are GPS's; the receiver's own clock is up to half a millisecond off
+)  # scales with the seconds of GPS; the receiver's own clock is up to half a millisecond off
 
-_CLOCKED = (GnssHeading, InsSolution, ImuSamples)  # what needs the clock's bias of the positions
-GIVES: dict[int, tuple[type, ...]] = {  # what a block can become, or help to become
+_CLOCKED = (GnssHeading, InsSolution, ImuSamples)  # records that need the clock bias of a position
+GIVES: dict[int, tuple[type, ...]] = {  # record types to which a block contributes
     sbf.PVT_GEODETIC.number: (TimeMessage, GnssFix, *_CLOCKED),
     sbf.PVT_CARTESIAN.number: (TimeMessage, *_CLOCKED),
     sbf.POS_COV_GEODETIC.number: (GnssFix,),
@@ -74,11 +74,11 @@ GIVES: dict[int, tuple[type, ...]] = {  # what a block can become, or help to be
 
 
 class SbfParser(StreamParser):
-    """Decodes the blocks listed above; everything else is framed and counted.
+    """Decodes the blocks listed above; all others are framed and counted.
 
     Args:
-        settings: ``date_floor`` is the oldest week believed, ``add_weeks`` is added to all.
-        wanted: the record types to give; None: all.
+        settings: ``date_floor`` is the oldest accepted date, ``add_weeks`` is added to all weeks.
+        wanted: the record types to return; None: all.
     """
 
     def __init__(self, settings: DeviceSettings, *, wanted: tuple[type, ...] | None = None) -> None:
@@ -91,9 +91,9 @@ class SbfParser(StreamParser):
         self._imu = ImuPairs(self.counters)
         self._fixes: EpochGatherer[FixPart] = EpochGatherer(self.counters)
         self._headings: EpochGatherer[HeadingPart] = EpochGatherer(self.counters)
-        self._synchronised: bool | None = None  # by the latest ReceiverTime
+        self._synchronised: bool | None = None  # as the latest ReceiverTime reports
         self._last_named = -1
-        self._has_solutions = False  # that name seconds: raw measurements come later and need not
+        self._has_solutions = False  # solutions give the second, so raw measurements, which come later, are not used
         decoders: dict[int, Callable[[Stamp, bytes], Items]] = {
             sbf.PVT_GEODETIC.number: self._pvt_geodetic,
             sbf.PVT_CARTESIAN.number: self._pvt_cartesian,
@@ -117,16 +117,16 @@ class SbfParser(StreamParser):
         }
 
     def feed(self, chunk: Chunk) -> list[Record]:
-        """Take one read."""
+        """Take one read; return the records that it completed."""
         return self._join(self._decode(self._framer.feed(chunk.data, chunk.host_time_ns)))
 
     def close(self) -> list[Record]:
-        """Release the tail and the last epochs."""
+        """Return the records of the tail and of the last epochs."""
         items = self._decode(self._framer.close())
         return self._join(items + self._give_fixes(self._fixes.end()) + self._give_headings(self._headings.end()))
 
     def remarks(self) -> list[str]:
-        """Return what is to be said of the receiver's weeks."""
+        """Return remarks on the receiver's weeks."""
         return self._dates.remarks()
 
     def _join(self, items: Items) -> list[Record]:
@@ -148,10 +148,10 @@ class SbfParser(StreamParser):
         return items
 
     def _stamp(self, host_time_ns: int, frame: bytes) -> Stamp:
-        """Return the block's time stamp; a week before the floor is none.
+        """Return the block's time stamp; a week before the floor becomes None.
 
         Raises:
-            BlockError: too short, or a time that cannot be.
+            BlockError: the frame is too short, or its time is impossible.
         """
         header = wire.read_header(frame)
         week = header.week
@@ -202,7 +202,7 @@ class SbfParser(StreamParser):
         ]
 
     def _named_second(self, stamp: Stamp, computed: bool) -> Items:
-        """Return the whole second a solution names, once for all blocks of an epoch."""
+        """Return the whole second of a solution, once for all blocks of an epoch."""
         tag = stamp.tag()
         if tag is None or tag.time_ns % SECOND_NS or stamp.epoch == self._last_named:
             return []
@@ -211,7 +211,7 @@ class SbfParser(StreamParser):
         return [TimeMessage(stamp.host_time_ns, tag, NamesEdge.PREVIOUS, valid=valid, message=stamp.name)]
 
     def _meas_epoch(self, stamp: Stamp, frame: bytes) -> Items:
-        """Name the whole second of raw measurements, in a stream for post-processing that holds no solution."""
+        """Return the whole second of raw measurements, in a stream for post-processing that contains no solution."""
         tag = stamp.tag()
         if self._has_solutions or tag is None or tag.time_ns % SECOND_NS:
             return []
@@ -297,7 +297,7 @@ class SbfParser(StreamParser):
         return [*self._imu.add(stamp, self._clock.tag(stamp), sets)]
 
     def _is_timeless(self, stamp: Stamp) -> bool:
-        """Return whether a block cannot be placed in time; counted where so."""
+        """Return whether a block has no time, and count such blocks."""
         if stamp.tow_ms is None:
             self.counters.errors["time_unknown"] += 1
         return stamp.tow_ms is None
@@ -308,7 +308,7 @@ def _computed(block: sbf.PvtGeodetic | sbf.PvtCartesian) -> bool:
 
 
 def _leap_of_fields(block: sbf.ReceiverTime, stamp: Stamp) -> int | None:
-    """Return GPS − UTC as the calendar fields and the time stamp of a ReceiverTime imply it; None: they do not say."""
+    """Return GPS − UTC as the calendar fields and the time stamp of a ReceiverTime imply it; None where they do not."""
     try:
         date = dt.date(2000 + block.year, block.month, block.day)
     except ValueError:
@@ -318,7 +318,7 @@ def _leap_of_fields(block: sbf.ReceiverTime, stamp: Stamp) -> int | None:
 
 
 def make_time_parser(settings: DeviceSettings) -> SbfParser:
-    """Return the recorder's parser: time messages only."""
+    """Make the recorder's parser, which returns time messages only."""
     return SbfParser(settings, wanted=(TimeMessage,))
 
 

@@ -1,8 +1,8 @@
-"""Septentrio SBF blocks to records.
+"""Converts Septentrio SBF blocks to records.
 
 Time stamps are in the receiver's time scale (4.1.3), up to half a millisecond off GNSS time where the receiver's clock
-runs free. PVTGeodetic and ExtEvent say the clock's bias themselves; for the other blocks it is that of the last
-position, continued with its drift.
+runs free. PVTGeodetic and ExtEvent contain the clock's bias themselves; for the other blocks it is the bias of the last
+position, extrapolated with its drift.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ from swath.georef.timescales.gps_time import MILLISECOND_NS, SECOND_NS
 
 WEEK_MS = 604_800_000
 WEEK_NS = WEEK_MS * MILLISECOND_NS
-CLOCK_MODEL_MS = 600_000  # as long as the receiver itself relies on a bias (ExtEvent)
-GREATEST_BIAS_MS = 1000.0  # beyond these the receiver would have set its clock
+CLOCK_MODEL_MS = 600_000  # validity of a bias, as long as the receiver itself uses one (ExtEvent)
+GREATEST_BIAS_MS = 1000.0  # beyond these two limits the receiver would have set its clock
 GREATEST_DRIFT_PPM = 1000.0
-GREATEST_EVENT_OFFSET_S = 1.0  # the rest of a millisecond, and a delay that the user has set
-ERROR_SHIFT = 16  # INS status: the block's info, and above it its error
+GREATEST_EVENT_OFFSET_S = 1.0  # fraction of a millisecond plus a delay set by the user
+ERROR_SHIFT = 16  # INS status: the block's info in the low bits, its error above
 
-# Type of solution (mode, bits 0-3) -> the coarse class; what is not here is NONE. The reference guide has 9 and 11 not:
+# Type of solution (mode, bits 0-3) -> the coarse class; other types are NONE. The reference guide lacks 9 and 11:
 # Septentrio's sbfdef.h calls them PPP with fixed ambiguities, and RTK float with fixed widelane ambiguities
 FIX_TYPES: dict[int, FixType] = {
     1: FixType.SINGLE,
@@ -56,7 +56,7 @@ EVENT_CHANNELS = {1: "EventA", 2: "EventB"}
 
 
 class Stamp(NamedTuple):
-    """Name, arrival and time stamp of a block; week None where unset or before the date floor."""
+    """Name, arrival and time stamp of a block; the week is None where unset or before the date floor."""
 
     name: str
     host_time_ns: int
@@ -65,11 +65,11 @@ class Stamp(NamedTuple):
 
     @property
     def epoch(self) -> int:
-        """A number that is the same for the blocks of one epoch."""
+        """Number that is equal for all blocks of one epoch."""
         return (self.week or 0) * WEEK_MS + (self.tow_ms or 0)
 
     def tag(self, bias_ns: int = 0) -> TimeTag | None:
-        """Return GPS time, the clock's bias taken off; None while the receiver knows no time."""
+        """Return GPS time, corrected for the clock's bias; None while the receiver has no time."""
         if self.tow_ms is None:
             return None
         weeks, time_ns = divmod(self.tow_ms * MILLISECOND_NS - bias_ns, WEEK_NS)
@@ -82,10 +82,10 @@ HeadingPart: TypeAlias = tuple[Stamp, sbf.AttEuler | sbf.AttCovEuler]
 
 @dataclass(slots=True)
 class ReceiverClock:
-    """The receiver's clock as the last position found it.
+    """Models the receiver's clock from the bias and drift of the last position.
 
     Attributes:
-        counters: the parser's.
+        counters: the parser's counters.
     """
 
     counters: ParserCounters
@@ -94,14 +94,14 @@ class ReceiverClock:
     _drift_ppm: float = 0.0
 
     def learn(self, stamp: Stamp, pvt: sbf.PvtGeodetic | sbf.PvtCartesian) -> None:
-        """Take the bias of a position, where it says one."""
+        """Take the clock bias of a position block, where it contains one."""
         bias_ms, drift_ppm = usable(pvt.clock_bias_ms), usable(pvt.clock_drift_ppm)
         if stamp.tow_ms is not None and abs(bias_ms) < GREATEST_BIAS_MS:
             self._tow_ms, self._bias_ns = stamp.tow_ms, bias_ms * MILLISECOND_NS
             self._drift_ppm = drift_ppm if abs(drift_ppm) < GREATEST_DRIFT_PPM else 0.0
 
     def tag(self, stamp: Stamp) -> TimeTag | None:
-        """Return GPS time of a block that does not say the bias itself; counted where none is known."""
+        """Return GPS time of a block without its own bias; count the blocks for which no bias is known."""
         if stamp.tow_ms is None:
             return None
         since_ms = CLOCK_MODEL_MS + 1
@@ -114,12 +114,12 @@ class ReceiverClock:
 
 
 def usable(value: float) -> float:
-    """Return the value; nan where it is the do-not-use value or no number."""
+    """Return the value, or nan where it is the do-not-use value or not a finite number."""
     return value if value != sbf.FLOAT_UNSET and isfinite(value) else nan
 
 
 def usable_triple(values: sbf.Triple | None) -> sbf.Triple:
-    """Return the three values; nan where unset, or where there are none."""
+    """Return the three values, nan where unset or where ``values`` is None."""
     return (usable(values[0]), usable(values[1]), usable(values[2])) if values is not None else (nan, nan, nan)
 
 
@@ -156,7 +156,7 @@ def geodetic_fix(parts: dict[str, FixPart]) -> GnssFix | None:
 
 
 def _position_cov(parts: dict[str, FixPart], pvt: sbf.PvtGeodetic) -> NDArray[np.float64] | None:
-    """Of PosCovGeodetic, or of the accuracies: h² = 4 (NN + EE), v² = 4 DD."""
+    """Return the covariance of PosCovGeodetic, else one from the accuracies: h² = 4 (NN + EE), v² = 4 DD."""
     _, cov = parts.get("PosCovGeodetic", (None, None))
     if isinstance(cov, sbf.PosCovGeodetic):
         return _ned_cov(cov.lat_lat, cov.lon_lon, cov.height_height, cov.lat_lon, cov.lat_height, cov.lon_height)
@@ -174,7 +174,7 @@ def _velocity_cov(parts: dict[str, FixPart]) -> NDArray[np.float64] | None:
 
 
 def _ned_cov(nn: float, ee: float, uu: float, ne: float, nu: float, eu: float) -> NDArray[np.float64] | None:
-    """Return north, east, up to north, east, down; None where any is unset."""
+    """Convert a covariance of north, east, up to north, east, down; return None where any element is unset."""
     values = [usable(value) for value in (nn, ee, uu, ne, nu, eu)]
     if not all(map(isfinite, values)):
         return None
@@ -185,7 +185,7 @@ def _ned_cov(nn: float, ee: float, uu: float, ne: float, nu: float, eu: float) -
 
 
 def event_mark(stamp: Stamp, event: sbf.ExtEvent) -> EventMark | None:
-    """Return GPS time of an event; not valid without the clock's bias. None without time."""
+    """Return an event with its GPS time, not valid without the clock's bias; None without time."""
     bias_s, offset_s = usable(event.clock_bias_s), usable(event.offset_s)
     known = abs(bias_s) * 1000.0 < GREATEST_BIAS_MS and abs(offset_s) < GREATEST_EVENT_OFFSET_S
     tag = stamp.tag(round(bias_s * SECOND_NS) - round(offset_s * SECOND_NS) if known else 0)
@@ -202,7 +202,7 @@ def event_mark(stamp: Stamp, event: sbf.ExtEvent) -> EventMark | None:
 
 
 def antenna_heading(parts: dict[str, HeadingPart], clock: ReceiverClock) -> GnssHeading | None:
-    """Return heading of an epoch; None where there is none. Sigmas are those of AttCovEuler."""
+    """Return the heading of an epoch, None where it has none. Sigmas are those of AttCovEuler."""
     stamp, attitude = parts.get("AttEuler", (None, None))
     if stamp is None or not isinstance(attitude, sbf.AttEuler) or not isfinite(usable(attitude.heading_deg)):
         return None
@@ -255,7 +255,7 @@ def ins_row(stamp: Stamp, tag: TimeTag, block: sbf.InsNavGeod, triples: dict[int
 
 @dataclass(slots=True)
 class _Halves:
-    """What of a sample has come."""
+    """Parts of a sample that have arrived so far."""
 
     stamp: Stamp
     force: sbf.Triple | None = None
@@ -268,7 +268,7 @@ class ImuPairs:
     """Joins acceleration and angular rate of one sensor and time stamp to a sample.
 
     Attributes:
-        counters: the parser's; a half without the other is counted as ``imu_incomplete``, one with a do-not-use value
+        counters: the parser's counters; a half without the other counts as ``imu_incomplete``, one with an unset value
             as ``imu_value_unset``.
     """
 
@@ -277,7 +277,7 @@ class ImuPairs:
     _temperatures: dict[int, float] = field(default_factory=dict)  # °C, by source
 
     def add(self, stamp: Stamp, tag: TimeTag | None, sets: list[sbf.SensorSet]) -> list[Row]:
-        """Take the measurements of a block; the samples they completed."""
+        """Take the measurements of a block; return the samples that they completed."""
         rows: list[Row] = []
         for one in sets:
             if one.kind == sbf.SENSOR_INFO:
@@ -288,7 +288,7 @@ class ImuPairs:
         return rows
 
     def _fill(self, stamp: Stamp, one: sbf.SensorSet) -> bool:
-        """Return whether this measurement completed a sample."""
+        """Store one measurement; return whether it completed a sample."""
         values = usable_triple(sbf.SENSOR_TRIPLE.unpack(one.data))
         if not all(map(isfinite, values)):
             self.counters.errors["imu_value_unset"] += 1

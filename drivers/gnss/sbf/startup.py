@@ -2,7 +2,7 @@
 
 PolaRx5TR reference guide (firmware 5.5.0): 3.1 (replies: a copy of the command after ``$R: ``, or ``$R? `` and the
 reason; the prompt ends both), 1.3 and 3.2.16 (SBF streams), 3.2.9 (PPS). Baud rate: Septentrio's own ROS driver
-(septentrio_gnss_driver, ``communication_core.cpp``). The streams used here are redefined, others are left alone.
+(septentrio_gnss_driver, ``communication_core.cpp``). The streams used here are redefined, others stay unchanged.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ PORT = re.compile(r"(COM[1-4]|USB[12])")
 PROMPT = rb"(?:[^>$]*\n)?[A-Z]+[0-9]+>"
 REFUSED = re.compile(rb"\$R\? ?([^\r\n]*)\r\n" + PROMPT)
 
-PULSE = "setPPSParameters, sec1, Low2High, , GPS"  # an argument left out keeps its value: the delay
+PULSE = "setPPSParameters, sec1, Low2High, , GPS"  # an omitted argument, here the delay, keeps its value
 EVENT_BLOCKS = "xPPSOffset+ExtEvent"
 FIX_BLOCKS = "PVTGeodetic+PosCovGeodetic+VelCovGeodetic+EndOfPVT"
 SECOND_BLOCKS = "ReceiverTime"
@@ -28,10 +28,11 @@ EVENT_STREAM, FIX_STREAM, SECOND_STREAM, HEADING_STREAM, INS_STREAM, IMU_STREAM 
 
 
 def startup_messages(settings: DeviceSettings, wish: StartupOptions) -> tuple[StartupMessage, ...]:
-    """Return baud rate where it changes, PPS, streams of time, position, events and raw measurements.
+    """Return commands for the baud rate where it changes, PPS, and streams of time, position, events and raw
+    measurements.
 
     Raises:
-        DriverSettingsError: a port that there is not.
+        DriverSettingsError: the receiver has no such port.
     """
     setup, port = read_setup(settings), _port(settings)
     period = f"msec{1000 // setup.rate_hz}" if setup.rate_hz > 1 else "sec1"
@@ -51,7 +52,7 @@ def startup_messages(settings: DeviceSettings, wish: StartupOptions) -> tuple[St
 
 
 def imu_startup_messages(settings: DeviceSettings, wish: StartupOptions) -> tuple[StartupMessage, ...]:
-    """Return streams of the INS and of its IMU, by the port of the receiver's own ``setup``."""
+    """Return commands for the streams of the INS and its IMU, on the port in the receiver's own ``setup``."""
     port = _port(settings)
     commands = (
         _stream(INS_STREAM, port, "INSNavGeod", "msec20"),

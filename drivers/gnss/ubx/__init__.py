@@ -1,1 +1,1 @@
-"""u-blox UBX messages."""
+"""u-blox UBX: parser, messages and start-up."""

@@ -1,4 +1,4 @@
-"""One `GnssFix` of the NAV messages of an epoch."""
+"""Merges the NAV messages of an epoch into one `GnssFix`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Position: TypeAlias = tuple[float, float, float, NDArray[np.float64]]
 MS_NS = 1_000_000
 WEEK_NS = 604_800_000_000_000
 
-# NAV-PVT fixType: 0 none, 1 dead reckoning, 2 2D, 3 3D, 4 GNSS + dead reckoning, 5 time only, at a position given
+# NAV-PVT fixType: 0 none, 1 dead reckoning, 2 2D, 3 3D, 4 GNSS + dead reckoning, 5 time only, at a fixed position
 FIX_NONE = 0
 SPECIAL_TYPES = {FIX_NONE: FixType.NONE, 1: FixType.DEAD_RECKONING, 5: FixType.MANUAL}
 CARRIER_SHIFT = 6  # flags bits 6 and 7: 1 float, 2 fixed
@@ -25,7 +25,7 @@ CARRIER_TYPES = {1: FixType.RTK_FLOAT, 2: FixType.RTK_FIXED}
 
 
 def merge_epoch(parts: dict[str, tuple[int, NavMessage]], floor_week: int) -> GnssFix | None:
-    """Return the fix; None where the epoch has neither NAV-PVT nor NAV-HPPOSLLH."""
+    """Merge an epoch's messages into a fix; return None where it has neither NAV-PVT nor NAV-HPPOSLLH."""
     _, pvt = parts.get("NAV-PVT", (0, None))
     _, high = parts.get("NAV-HPPOSLLH", (0, None))
     _, cov = parts.get("NAV-COV", (0, None))
@@ -57,10 +57,9 @@ def merge_epoch(parts: dict[str, tuple[int, NavMessage]], floor_week: int) -> Gn
 
 
 def _epoch_tag(itow_ms: int, pvt: ubx.NavPvt | None, time: ubx.NavTimegps | None, floor_week: int) -> TimeTag:
-    """Return GPS time of the epoch, sub-millisecond part included; the week only where NAV-TIMEGPS of this iTOW says
-    it.
+    """Return GPS time of the epoch with its sub-millisecond part; the week only from a NAV-TIMEGPS of this iTOW.
 
-    The receiver's clock may be up to half a millisecond off the millisecond that iTOW names.
+    The receiver's clock may differ from the millisecond of iTOW by up to half a millisecond.
     """
     sub_ms_ns, week, leap = 0, None, None
     if time is not None and time.valid & ubx.TIMEGPS_TOW:
@@ -77,7 +76,7 @@ def _epoch_tag(itow_ms: int, pvt: ubx.NavPvt | None, time: ubx.NavTimegps | None
 
 
 def _position(pvt: ubx.NavPvt | None, high: ubx.NavHpposllh | None) -> Position | None:
-    """Return latitude, longitude (rad), ellipsoidal height (m) and the covariance of the accuracies."""
+    """Return latitude, longitude (rad), ellipsoidal height (m) and the covariance from the accuracies."""
     if high is not None:
         return (
             math.radians((high.lat_1e7_deg * 100 + high.lat_hp_1e9_deg) / 1e9),
@@ -96,13 +95,13 @@ def _position(pvt: ubx.NavPvt | None, high: ubx.NavHpposllh | None) -> Position 
 
 
 def _undulation_m(pvt: ubx.NavPvt | None, high: ubx.NavHpposllh | None) -> float | None:
-    """Return the geoid above the ellipsoid: the height above it less the height above mean sea level, m."""
+    """Return the geoid's height above the ellipsoid: ellipsoidal height less height above mean sea level, m."""
     told = high if high is not None else pvt
     return None if told is None else (told.height_mm - told.height_msl_mm) / 1e3
 
 
 def _accuracy_cov(horizontal: float, vertical: float) -> NDArray[np.float64]:
-    """Return the horizontal accuracy is that of both axes together, hAcc² = NN + EE; m or m/s."""
+    """Return the covariance of accuracies, m or m/s; the horizontal one covers both axes together, hAcc² = NN + EE."""
     return np.diag([horizontal**2 / 2.0, horizontal**2 / 2.0, vertical**2])
 
 
@@ -123,7 +122,9 @@ def _velocity(pvt: ubx.NavPvt | None) -> tuple[float, float, float] | None:
 
 
 def _velocity_cov(pvt: ubx.NavPvt | None, cov: ubx.NavCov | None) -> NDArray[np.float64] | None:
-    """Return NAV-COV, or the speed accuracy: with NAV-COV beside it, sAcc² is close to NN + EE and to DD."""
+    """Return NAV-COV's covariance, else one from the speed accuracy: compared with NAV-COV, sAcc² is close to NN + EE
+    and to DD.
+    """
     if cov is not None and cov.velocity_valid:
         return _symmetric(cov.vel_nn, cov.vel_ne, cov.vel_nd, cov.vel_ee, cov.vel_ed, cov.vel_dd)
     if pvt is None or _velocity(pvt) is None:
@@ -133,7 +134,7 @@ def _velocity_cov(pvt: ubx.NavPvt | None, cov: ubx.NavCov | None) -> NDArray[np.
 
 
 def _fix_type(pvt: ubx.NavPvt | None) -> FixType:
-    """Return a NAV-HPPOSLLH alone says no more than that there is a position."""
+    """Return the fix type; a NAV-HPPOSLLH alone shows only that a position exists."""
     if pvt is None:
         return FixType.SINGLE
     if pvt.fix_type in SPECIAL_TYPES:

@@ -1,7 +1,7 @@
 """UBX messages as tables: layout, fields in wire order, encoder (u-blox F9 HPG 1.32 and M8 interface descriptions).
 
-Each message is a NamedTuple whose fields are the wire's, in its units and order; its `Layout` packs and unpacks it.
-Bytes the manuals call reserved are pad bytes.
+Each message is a NamedTuple with the wire's fields, in wire units and order; its `Layout` packs and unpacks it.
+Bytes that the manuals call reserved are pad bytes.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ MessageT = TypeVar("MessageT", bound=tuple[float, ...])
 
 
 class Layout(Generic[MessageT]):
-    """Class and id, payload layout and the message it makes.
+    """Encodes and decodes one message: class and id, payload layout and the resulting NamedTuple.
 
     Args:
         key: class and id.
         payload: struct format of the fields.
-        message: the NamedTuple.
-        length: bytes of the payload as encoded; what lies behind the fields is zero.
-        min_length: bytes of the shortest payload that older receivers send.
+        message: the NamedTuple class.
+        length: bytes of the encoded payload; bytes behind the fields are zero.
+        min_length: bytes of the shortest payload, which older receivers send.
     """
 
     def __init__(self, key: bytes, payload: str, message: type[MessageT], length: int, min_length: int = 0) -> None:
@@ -33,19 +33,19 @@ class Layout(Generic[MessageT]):
         self._min_length = min_length or length
 
     def decode(self, frame: bytes) -> MessageT | None:
-        """Return the message of a whole frame; None where its length is not the message's."""
+        """Decode a whole frame; return None where it is shorter than the message."""
         payload_bytes = len(frame) - 8
         if payload_bytes < self._min_length:
             return None
         return self._message(*self._struct.unpack_from(frame, 6))
 
     def encode(self, message: MessageT) -> bytes:
-        """Return the whole frame."""
+        """Encode a message as a whole frame."""
         return encode_frame(self.key, self._struct.pack(*message).ljust(self._length, b"\0"))
 
 
 def encode_frame(key: bytes, payload: bytes) -> bytes:
-    """Sync, class and id (``key``), length, payload, checksum."""
+    """Build a frame: sync, class and id (``key``), length, payload, checksum."""
     body = key + struct.pack("<H", len(payload)) + payload
     return b"\xb5b" + body + bytes(ubx_fletcher(body))
 
@@ -71,7 +71,7 @@ class NavPvt(NamedTuple):
     lat_1e7_deg: int
     height_mm: int  # above the ellipsoid
     height_msl_mm: int
-    horizontal_accuracy_mm: int  # of both axes together: hAcc² = NN + EE of NAV-COV
+    horizontal_accuracy_mm: int  # both axes together: hAcc² = NN + EE of NAV-COV
     vertical_accuracy_mm: int
     vel_n_mmps: int
     vel_e_mmps: int
@@ -87,7 +87,7 @@ class NavPvt(NamedTuple):
 PVT_VALID_DATE, PVT_VALID_TIME, PVT_FULLY_RESOLVED = 1, 2, 4
 PVT_FIX_OK, PVT_DIFFERENTIAL = 1, 2
 PVT_INVALID_POSITION = 1
-PVT_FLAGS3_FRAME_BYTES = 92 + 8  # shorter ones have no flags3
+PVT_FLAGS3_FRAME_BYTES = 92 + 8  # shorter frames have no flags3
 
 
 class NavHpposllh(NamedTuple):
@@ -152,7 +152,7 @@ class NavTimels(NamedTuple):
     time_to_event_s: int
     event_week: int
     event_day: int
-    valid: int  # bit 0: current is valid, bit 1: the event is
+    valid: int  # bit 0: current is valid, bit 1: the event is valid
 
 
 TIMELS_CURRENT = 1
@@ -180,7 +180,7 @@ class NavCov(NamedTuple):
 
 
 class NavSol(NamedTuple):
-    """The beginning of NAV-SOL (u-blox 4 to M8): the older receivers' time."""
+    """Beginning of NAV-SOL (u-blox 4 to M8): the time of older receivers."""
 
     itow_ms: int
     ftow_ns: int
@@ -216,7 +216,7 @@ TP_REFERENCE_MASK, TP_REFERENCE_GPS = 0x0F, 0
 class RxmRawx(NamedTuple):
     """RXM-RAWX, 3.17.5, without its measurements."""
 
-    receiver_tow_s: float  # by the receiver's clock, some ten microseconds from GPS time, steered to whole milliseconds
+    receiver_tow_s: float  # receiver's clock, some ten microseconds from GPS time, steered to whole milliseconds
     week: int
     leap_seconds: int
     measurements: int
@@ -259,45 +259,45 @@ RXM_RAWX = Layout(b"\x02\x15", "dHbBB", RxmRawx, 16)
 
 
 def encode_nav_pvt(message: NavPvt) -> bytes:
-    """Return the frame of a NAV-PVT; the other ``encode_`` functions alike."""
+    """Encode the frame of a NAV-PVT."""
     return NAV_PVT.encode(message)
 
 
 def encode_nav_hpposllh(message: NavHpposllh) -> bytes:
-    """Return the frame of a NAV-HPPOSLLH."""
+    """Encode the frame of a NAV-HPPOSLLH."""
     return NAV_HPPOSLLH.encode(message)
 
 
 def encode_nav_timegps(message: NavTimegps) -> bytes:
-    """Return the frame of a NAV-TIMEGPS."""
+    """Encode the frame of a NAV-TIMEGPS."""
     return NAV_TIMEGPS.encode(message)
 
 
 def encode_nav_timeutc(message: NavTimeutc) -> bytes:
-    """Return the frame of a NAV-TIMEUTC."""
+    """Encode the frame of a NAV-TIMEUTC."""
     return NAV_TIMEUTC.encode(message)
 
 
 def encode_nav_timels(message: NavTimels) -> bytes:
-    """Return the frame of a NAV-TIMELS."""
+    """Encode the frame of a NAV-TIMELS."""
     return NAV_TIMELS.encode(message)
 
 
 def encode_nav_cov(message: NavCov) -> bytes:
-    """Return the frame of a NAV-COV."""
+    """Encode the frame of a NAV-COV."""
     return NAV_COV.encode(message)
 
 
 def encode_nav_eoe(message: NavEoe) -> bytes:
-    """Return the frame of a NAV-EOE."""
+    """Encode the frame of a NAV-EOE."""
     return NAV_EOE.encode(message)
 
 
 def encode_tim_tp(message: TimTp) -> bytes:
-    """Return the frame of a TIM-TP."""
+    """Encode the frame of a TIM-TP."""
     return TIM_TP.encode(message)
 
 
 def encode_tim_tm2(message: TimTm2) -> bytes:
-    """Return the frame of a TIM-TM2."""
+    """Encode the frame of a TIM-TM2."""
     return TIM_TM2.encode(message)

@@ -1,19 +1,19 @@
 """u-blox UBX: NAV-PVT, NAV-HPPOSLLH, NAV-COV, NAV-TIMEGPS, NAV-TIMEUTC, NAV-TIMELS, NAV-SOL, NAV-EOE, TIM-TP, TIM-TM2.
 
-RXM-RAWX gives its time where no other message of the stream gives one: a log of raw measurements for post-processing.
-Everything else, RTCM3 and NMEA on the same port included, is framed, checked and counted.
+RXM-RAWX gives its time where no other message of the stream gives one: in a log of raw measurements for
+post-processing. All other messages, RTCM3 and NMEA on the same port included, are framed, checked and counted.
 
-Time: NAV-TIMEGPS and NAV-SOL carry GPS week and time of week in one message, NAV-PVT the UTC date; they name the
-previous PPS edge, and so does NAV-TIMEUTC. TIM-TP names the next and is bound to it; its quantisation is the edge's own
-error, edge = true second − qErr (u-blox states no sign; a counter started by a reference and stopped by an F9T's pulse
-needed + qErr, anderswallin.net 2019/10). The epoch is a whole millisecond of iTOW by definition: a time message's tag
-is rounded to it, a fix's is not.
+Time: NAV-TIMEGPS and NAV-SOL carry GPS week and time of week in one message, NAV-PVT the UTC date; they refer to the
+previous PPS edge, and so does NAV-TIMEUTC. TIM-TP refers to the next edge and is bound to it; its quantisation is the
+edge's own error, edge = true second − qErr (u-blox states no sign; a counter started by a reference and stopped by an
+F9T's pulse needed + qErr, anderswallin.net 2019/10). The epoch is a whole millisecond of iTOW by definition: a time
+message's tag is rounded to it, a fix's tag is not.
 
 An iTOW is joined with a week of the same message or of the same iTOW only, so that a week's roll-over cannot put a
-fix of the new week into the old. NAV-PVT and NAV-TIMEUTC carry UTC and iTOW: their difference is the leap count that
-the receiver's UTC goes by, right or stale, and the second is iTOW's. Where NAV-TIMELS or NAV-TIMEGPS, valid bit set,
-vouch for another count, UTC is set right by theirs (``utc_contradicts_leap``). A UTC that is no whole number of
-seconds, up to 60, off its iTOW is not valid (``utc_contradicts_itow``).
+fix of the new week into the old one. NAV-PVT and NAV-TIMEUTC carry UTC and iTOW: their difference is the leap count
+that the receiver uses for its UTC, right or stale, and the second is that of iTOW. Where NAV-TIMELS or NAV-TIMEGPS
+gives another count with its valid bit set, UTC is corrected by that count (``utc_contradicts_leap``). A UTC that
+differs from its iTOW by anything but a whole number of seconds, up to 60, is not valid (``utc_contradicts_itow``).
 
 Fix: the NAV messages of one iTOW make one `GnssFix` (`swath.drivers.gnss.epochs`), complete at NAV-EOE at the latest:
 NAV-PVT, refined by NAV-HPPOSLLH, with the covariances of NAV-COV or else of the accuracies, and NAV-TIMEGPS's week.
@@ -62,15 +62,15 @@ _NavT = TypeVar("_NavT", bound=_HasItow)
 
 
 class MessageError(ValueError):
-    """A message with a good checksum whose content cannot be; counted as bad."""
+    """A message with a good checksum has impossible content; it is counted as bad."""
 
 
 class UbxParser(StreamParser):
-    """Frames to records.
+    """Converts UBX frames to records.
 
     Args:
-        settings: ``date_floor`` is the oldest date (or week) believed, ``add_weeks`` is added to all.
-        time_only: time messages only, the same ones.
+        settings: ``date_floor`` is the oldest accepted date (or week), ``add_weeks`` is added to all of them.
+        time_only: return the same time messages, and no other records.
     """
 
     def __init__(self, settings: DeviceSettings, *, time_only: bool = False) -> None:
@@ -79,8 +79,8 @@ class UbxParser(StreamParser):
         self._framer = Framer(GNSS_KINDS, self.counters)
         self._epochs: EpochGatherer[tuple[int, NavMessage]] = EpochGatherer(self.counters)
         self._gathers = not time_only
-        self._leap_seconds: int | None = None  # as NAV-TIMELS or NAV-TIMEGPS last vouched for
-        self._vouched: bool | None = None  # by the latest navigation message that carries time
+        self._leap_seconds: int | None = None  # the last valid count of NAV-TIMELS or NAV-TIMEGPS
+        self._vouched: bool | None = None  # whether the latest navigation message with time marks it as valid
         self._decoders: dict[bytes, Callable[[int, bytes], list[Record]]] = {
             ubx.NAV_PVT.key: self._nav_pvt,
             ubx.NAV_TIMEGPS.key: self._nav_timegps,
@@ -99,16 +99,16 @@ class UbxParser(StreamParser):
             }
 
     def feed(self, chunk: Chunk) -> list[Record]:
-        """Take one read."""
+        """Take one read; return the records that it completed."""
         return self._decode(self._framer.feed(chunk.data, chunk.host_time_ns))
 
     def close(self) -> list[Record]:
-        """Release the tail and the last epoch."""
+        """Return the records of the tail and of the last epoch."""
         records = self._decode(self._framer.close())
         return records + self._fixes(self._epochs.end())
 
     def remarks(self) -> list[str]:
-        """Return what is to be said of the receiver's dates."""
+        """Return remarks on the receiver's dates."""
         return self._dates.remarks()
 
     def _decode(self, frames: list[Frame]) -> list[Record]:
@@ -146,7 +146,7 @@ class UbxParser(StreamParser):
     def _utc_message(
         self, host_time_ns: int, message: ubx.NavPvt | ubx.NavTimeutc, has_date: bool, vouched: bool, name: str
     ) -> list[Record]:
-        """Return the previous edge's second in UTC, if it agrees with the message's own iTOW."""
+        """Return the second of the previous edge in UTC, valid if it agrees with the message's own iTOW."""
         tag = self._utc_tag(host_time_ns, message, has_date)
         agrees = tag.date is None or tag.leap_seconds is not None
         if not agrees:
@@ -158,7 +158,8 @@ class UbxParser(StreamParser):
     def _utc_tag(self, host_time_ns: int, message: ubx.NavPvt | ubx.NavTimeutc, has_date: bool) -> TimeTag:
         """Return UTC of a message to the millisecond, with the leap seconds that its own iTOW implies.
 
-        Where the receiver vouches for another count than its UTC goes by, UTC is set right by it: the second is iTOW's.
+        Where the receiver reports a valid leap count other than the one in its UTC, UTC is corrected by it: the second
+        is that of iTOW.
         """
         if message.hour > 23 or message.minute > 59 or message.second > 60 or abs(message.nano_ns) > 1_000_000_000:
             raise MessageError("time of day")
@@ -210,7 +211,7 @@ class UbxParser(StreamParser):
         name: str,
         leap_seconds: int | None = None,
     ) -> list[Record]:
-        """Return the previous edge's second by week and time of week of one message."""
+        """Return the second of the previous edge by week and time of week of one message."""
         self._vouched = vouched
         tag = TimeTag(TimeScale.GPS, itow_ms * MS_NS, week=week if has_week else None, leap_seconds=leap_seconds)
         valid = vouched and self._week_believed(week)
@@ -222,7 +223,7 @@ class UbxParser(StreamParser):
             return []
         self._leap_seconds = message.current
         tag = TimeTag(TimeScale.GPS, message.itow_ms * MS_NS, leap_seconds=message.current)
-        # its own flag is of the leap seconds alone
+        # its own flag covers the leap seconds only
         valid = self._vouched is not False
         return [TimeMessage(host_time_ns, tag, NamesEdge.PREVIOUS, valid=valid, message="NAV-TIMELS")]
 
@@ -240,7 +241,7 @@ class UbxParser(StreamParser):
         return self._fixes(self._epochs.end()) if message.itow_ms == self._epochs.key else []
 
     def _rxm_rawx(self, host_time_ns: int, frame: bytes) -> list[Record]:
-        """Name the second of raw measurements; of no use beside navigation messages, which do not come so late."""
+        """Return the second of raw measurements, in a stream without navigation messages, which arrive earlier."""
         if self._vouched is not None:
             return []
         message = _present(ubx.RXM_RAWX.decode(frame))
@@ -262,7 +263,7 @@ class UbxParser(StreamParser):
         utc = message.flags & ubx.TP_UTC_BASE != 0
         gps = message.reference & ubx.TP_REFERENCE_MASK == ubx.TP_REFERENCE_GPS
         if not utc and not gps:
-            self.counters.errors["tim_tp_time_base"] += 1  # GLONASS, BeiDou, Galileo time: another second or week
+            self.counters.errors["tim_tp_time_base"] += 1  # GLONASS, BeiDou, Galileo time has other seconds or weeks
         week = self._dates.week(message.week, host_time_ns)
         time_ns = message.tow_ms * MS_NS + round(message.tow_sub_ms * MS_NS / 2**32)
         known = message.flags & ubx.TP_UTC_AVAILABLE != 0 if utc else gps
@@ -311,7 +312,7 @@ class UbxParser(StreamParser):
 
     @staticmethod
     def _week_tag(week: int, time_ns: int, utc: bool) -> TimeTag:
-        """Return week and time of week in GPS time, or in UTC as a date and time of day."""
+        """Return week and time of week as GPS time, or as UTC with date and time of day."""
         if not utc:
             return TimeTag(TimeScale.GPS, time_ns, week=week)
         days, time_of_day_ns = divmod(time_ns, DAY_NS)
@@ -340,14 +341,14 @@ class UbxParser(StreamParser):
 
 
 def _present(message: _AnyT | None) -> _AnyT:
-    """Return the message, unless its length is not that of its kind."""
+    """Return the message; raise `MessageError` where its length is wrong."""
     if message is None:
         raise MessageError("length")
     return message
 
 
 def _checked(message: _NavT | None) -> _NavT:
-    """Return the message, unless its length is not that of its kind or its iTOW is beyond the week."""
+    """Return the message; raise `MessageError` where its length is wrong or its iTOW is beyond the week."""
     if message is None or message.itow_ms >= WEEK_MS:
         raise MessageError("length or iTOW")
     return message

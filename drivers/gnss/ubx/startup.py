@@ -1,7 +1,7 @@
 """Start-up messages of u-blox receivers of generation 9 and later: UBX-CFG-VALSET, acknowledged by UBX-ACK.
 
 u-blox ZED-F9P interface description (UBX-18010854): UBX-CFG-VALSET, UBX-ACK, constants of CFG-RATE-TIMEREF and CFG-TP.
-A message with one unknown key sets nothing, so each concern has its own: what a receiver lacks hinders nothing else.
+A message with one unknown key sets nothing, so each concern has its own message: a missing feature affects no other.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ from swath.drivers.parser import DeviceSettings, DriverSettingsError, ParserCoun
 from swath.drivers.startup import Answer, AnswerListener, StartupMessage, StartupOptions, read_setup
 
 CFG_VALSET = b"\x06\x8a"
-ACK_ACK, ACK_NAK = b"\x05\x01", b"\x05\x00"  # payload: class and id of what is answered
+ACK_ACK, ACK_NAK = b"\x05\x01", b"\x05\x00"  # payload: class and id of the answered message
 ACK_PAYLOAD = slice(6, 8)
 VALSET_HEADER = struct.Struct("<BB2x")  # version, layers, reserved
 LAYER_RAM, LAYER_BBR, LAYER_FLASH = 1, 2, 4
 
-KEY_SIZE_SHIFT, KEY_SIZE_BITS = 28, 7  # of a key's id: how its value is laid out
+KEY_SIZE_SHIFT, KEY_SIZE_BITS = 28, 7  # bits of a key's id that give the size of its value
 VALUE_FORMATS = {1: "B", 2: "B", 3: "H", 4: "I"}
 
-PORT_PLACES = {"UART1": 1, "UART2": 2, "USB": 3}  # a message's keys follow each other: I2C, UART1, UART2, USB, SPI
+PORT_PLACES = {"UART1": 1, "UART2": 2, "USB": 3}  # offsets of a message's keys: I2C, UART1, UART2, USB, SPI
 UBX_OUTPUT = {"UART1": 0x10740001, "UART2": 0x10760001, "USB": 0x10780001}
 BAUD_RATES = {"UART1": 0x40520001, "UART2": 0x40530001}
 
-MESSAGE_RATES = {  # CFG-MSGOUT-UBX_…, the key of I2C: once in so many epochs
+MESSAGE_RATES = {  # CFG-MSGOUT-UBX_…, the key of I2C; its value is a number of epochs
     "NAV_PVT": 0x20910006,
     "NAV_HPPOSLLH": 0x20910033,
     "NAV_COV": 0x20910083,
@@ -46,7 +46,7 @@ RAW_EACH_EPOCH, RAW_EACH_SECOND = ("RXM_SFRBX",), ("RXM_RAWX",)
 
 PERIOD_US = 1_000_000
 PULSE_US = 100_000
-TIME_PULSE = (  # 1 Hz, its rising edge at the top of the second of GPS time; none before the time is known
+TIME_PULSE = (  # 1 Hz, rising edge at the top of the second of GPS time; no pulse before the time is known
     ("CFG-TP-PULSE_DEF", 0x20050023, 0),  # PERIOD
     ("CFG-TP-PULSE_LENGTH_DEF", 0x20050030, 1),  # LENGTH
     ("CFG-TP-PERIOD_TP1", 0x40050002, PERIOD_US),
@@ -71,17 +71,17 @@ class Item(NamedTuple):
 
 
 class AckListener(AnswerListener):
-    """Waits for the acknowledgement of a UBX-CFG-VALSET between frames of any kind."""
+    """Finds the acknowledgement of a UBX-CFG-VALSET between frames of any kind."""
 
     def __init__(self) -> None:
         self._framer = Framer(GNSS_KINDS, ParserCounters())
 
     def hear(self, data: bytes) -> Answer | None:
-        """Take one read."""
+        """Take one read; return the answer once it is complete."""
         return self._find(self._framer.feed(data, 0))
 
     def close(self) -> Answer | None:
-        """Decide what a false sync held back."""
+        """Return the answer in the frames that a false sync held back."""
         return self._find(self._framer.close())
 
     @staticmethod
@@ -93,7 +93,7 @@ class AckListener(AnswerListener):
 
 
 def encode_valset(items: tuple[Item, ...], layers: int) -> bytes:
-    """Return UBX-CFG-VALSET, version 0: at most 64 keys and their values, into the layers."""
+    """Encode a UBX-CFG-VALSET, version 0: at most 64 keys with values, stored in the given layers."""
     payload = VALSET_HEADER.pack(0, layers)
     for item in items:
         size = item.key >> KEY_SIZE_SHIFT & KEY_SIZE_BITS
@@ -102,10 +102,10 @@ def encode_valset(items: tuple[Item, ...], layers: int) -> bytes:
 
 
 def startup_messages(settings: DeviceSettings, wish: StartupOptions) -> tuple[StartupMessage, ...]:
-    """Return output of UBX on the port, rates, time pulse, messages; the baud rate first where it changes.
+    """Return messages that set UBX output, rates, time pulse and messages; the baud rate first where it changes.
 
     Raises:
-        DriverSettingsError: a port that there is not.
+        DriverSettingsError: the receiver has no such port.
     """
     setup = read_setup(settings)
     port = setup.port or "UART1"

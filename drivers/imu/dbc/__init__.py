@@ -1,1 +1,1 @@
-"""CAN signals that a DBC file describes."""
+"""Inertial units on CAN whose signals a DBC file describes."""

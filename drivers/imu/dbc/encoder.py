@@ -1,6 +1,7 @@
-"""Writes the CAN frames of an inertial unit by the same signal map its parser reads them with.
+"""Encodes the CAN frames of an inertial unit with the signal map that its parser uses.
 
-For the virtual aircraft and the tests, for any unit described by a DBC: what `swath.drivers.imu.dbc.parser` reads back.
+It serves the virtual aircraft and the tests, for any unit described by a DBC; `swath.drivers.imu.dbc.parser` reads its
+frames.
 """
 
 from __future__ import annotations
@@ -29,22 +30,23 @@ def encode_samples(
     status: Int64Array | None = None,
     packet_counter: Int64Array | None = None,
 ) -> ByteRows:
-    """Return frames of n samples, sample after sample, each with the message that opens it first, that closes it last.
+    """Encode frames of n samples, sample after sample; an opening message comes first, a closing one last in its
+    sample.
 
-    Messages beside the samples are sent with every sample whose value for them is given.
+    Messages beside the samples are sent with every sample if their values are given.
 
     Args:
-        signals: what is where.
+        signals: the signal map.
         ticks: (n,) the device's counter; its low bits are sent.
         specific_force: (n, 3) m/s², in the device's axes.
         angular_rate: (n, 3) rad/s, in the device's axes.
-        temperature_c, status, packet_counter: (n,) each; absent: not sent, or 0 where their message is.
+        temperature_c, status, packet_counter: (n,) each; where absent, not sent, or 0 in a message that is sent.
 
     Returns:
-        (n · messages of a sample, 16) frames as the log and SocketCAN hold them.
+        (n · messages of a sample, 16) frames in the layout of the log and SocketCAN.
 
     Raises:
-        ValueError: a message of more than 8 bytes, a value that its signal cannot hold.
+        ValueError: a message has more than 8 bytes, or a value does not fit its signal.
     """
     scalars = (
         (signals.sample_ticks, ticks),
@@ -66,10 +68,10 @@ def encode_samples(
 
 
 def encode_latch(signals: SignalMap, ticks: int) -> bytes:
-    """Return the frame of the message with the counter at a PPS edge.
+    """Encode the frame of the message with the counter latched at a PPS edge.
 
     Raises:
-        ValueError: no such message of its own, or one of more than 8 bytes.
+        ValueError: the latched counter has no message of its own, or the message has more than 8 bytes.
     """
     latch = signals.pps_ticks
     if latch is None or latch.part < signals.grouped:
@@ -80,21 +82,21 @@ def encode_latch(signals: SignalMap, ticks: int) -> bytes:
 
 
 def _order(signals: SignalMap, sent: set[int]) -> Iterator[int]:
-    """Yield parts of a sample as they go out; the key part first or last, by the rule."""
+    """Yield the parts of a sample in sending order; the key part is first or last, by the rule."""
     key = signals.key_part
     others = sorted(sent - {key})
     yield from [*others, key] if signals.rule == "last" else [key, *others]
 
 
 def _raw_of_scalar(signals: SignalMap, signal: MappedSignal, column: Int64Array | FloatArray) -> NDArray[np.uint64]:
-    """Return counters and status words go out as they are, a temperature by its scale."""
+    """Return raw values: counters and status words unchanged, a temperature by its scale."""
     if signal is signals.temperature:
         return _raw_of_values(signal.layout, np.asarray(column, np.float64))
     return np.asarray(column, np.int64).astype(np.uint64)
 
 
 def _raw_of_values(layout: SignalLayout, values: FloatArray) -> NDArray[np.uint64]:
-    """Return bits of physical values, rounded to the signal's resolution."""
+    """Return the bits of physical values, rounded to the signal's resolution."""
     scaled = (values - layout.offset) / layout.scale
     if layout.is_float:
         unsigned, floating = FLOAT_TYPES[layout.length]
@@ -107,7 +109,7 @@ def _raw_of_values(layout: SignalLayout, values: FloatArray) -> NDArray[np.uint6
 
 
 def _placed(layout: SignalLayout, raw: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Return the signal's bits where they lie, in the word whose little-endian bytes are the frame's data."""
+    """Return the signal's bits at their position, in the word whose little-endian bytes are the frame's data."""
     if layout.needs_bytes > CLASSIC_BYTES:
         raise ValueError(f"{layout.name} lies beyond the 8 bytes of a classic frame")
     word = (raw & np.uint64((1 << layout.length) - 1)) << np.uint64(layout.shift)

@@ -1,15 +1,15 @@
-"""Which frames make one inertial sample, and the unwrapping of the counters they carry.
+"""Groups the frames of one inertial sample.
 
-A device sends one sample in several frames. `SampleGrouper` splits the run of frames into samples by one of three
+A device sends one sample in several frames. `SampleGrouper` splits the sequence of frames into samples by one of three
 rules, whole batches at a time, and keeps the frames of the unfinished sample for the next batch, so that the result
 does not depend on where a batch ends:
 
 - ``last``: the closing part (the one with the counter) ends a sample;
-- ``first``: the opening part begins one, the sample is complete when the next begins;
-- ``repeat``: a sample ends when every part was there, or before the first part that repeats.
+- ``first``: the opening part begins one, and the sample is complete when the next begins;
+- ``repeat``: a sample ends when every part was present, or before the first part that repeats.
 
-A sample is good when each part was there exactly once. Where the configuration states no rule, `closing_part` reads it
-from the frames: a device sends the frames of a sample one after the other and pauses before the next sample.
+A sample is good when each part was present exactly once. Where the configuration gives no rule, `closing_part` derives
+it from the frames: a device sends the frames of a sample one after the other and pauses before the next sample.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 from swath.georef.records import ByteRows, Int64Array
 
 GroupRule = Literal["last", "first", "repeat"]
-EVIDENCE = 32  # frames of each part that tell where a sample ends
-PAUSE = 3.0  # times the next longest gap: so much longer a pause between samples must be
+EVIDENCE = 32  # frames of each part needed to find where a sample ends
+PAUSE = 3.0  # a pause between samples must exceed the next longest gap by this factor
 IndexArray = NDArray[np.intp]
 
 
@@ -33,8 +33,8 @@ class Frames:
     """Frames of configured parts in the order of their arrival.
 
     Attributes:
-        part: (n,) index of the part each frame is.
-        host_time_ns: (n,).
+        part: (n,) index of each frame's part.
+        host_time_ns: (n,) host time of each frame.
         data: (n, 8 or 64) the data bytes.
     """
 
@@ -43,11 +43,11 @@ class Frames:
     data: ByteRows
 
     def take(self, index: NDArray[np.intp] | slice) -> Frames:
-        """Return some of the frames."""
+        """Return the selected frames."""
         return Frames(self.part[index], self.host_time_ns[index], self.data[index])
 
     def after(self, earlier: Frames) -> Frames:
-        """Return these frames, behind earlier ones."""
+        """Return these frames, appended to earlier ones."""
         if not len(earlier.part):
             return self
         return Frames(
@@ -64,13 +64,13 @@ def no_frames(width: int) -> Frames:
 
 @dataclass(slots=True)
 class Samples:
-    """Good samples and what was dropped.
+    """Good samples and counts of dropped ones.
 
     Attributes:
         frames: the frames that `index` points into.
-        index: (parts, m) which frame is each part of each sample.
-        closed_at: (m,) which frame completed the knowledge of the sample; ``len(frames.part)`` at the end.
-        incomplete, duplicate: samples dropped for a missing part, for two of a kind.
+        index: (parts, m) index of the frame with each part of each sample.
+        closed_at: (m,) index of the frame that showed the sample to be complete; ``len(frames.part)`` at the end.
+        incomplete, duplicate: samples dropped because a part was missing, or came twice.
     """
 
     frames: Frames
@@ -81,10 +81,17 @@ class Samples:
 
 
 class SampleGrouper:
-    """Splits frames into samples; see the module's text."""
+    """Splits frames into samples by a rule of this module."""
 
     def __init__(self, parts: int, rule: GroupRule, key_part: int, width: int) -> None:
-        """Args: number of parts, the rule, the part that closes or opens (last, first), data bytes of a frame."""
+        """Prepare a grouper.
+
+        Args:
+            parts: number of parts of a sample.
+            rule: the rule that separates samples.
+            key_part: the part that closes (last) or opens (first) a sample.
+            width: data bytes of a frame.
+        """
         self._parts = parts
         self._rule = rule
         self._key_part = key_part
@@ -92,7 +99,9 @@ class SampleGrouper:
         self._seen: list[int] = []
 
     def split(self, frames: Frames, *, at_end: bool = False) -> Samples:
-        """Take the next frames; return the samples they completed (``at_end``: the last one too, rule ``first``)."""
+        """Take the next frames; return the samples that they completed (``at_end``: with rule ``first``, the last one
+        too).
+        """
         frames = frames.after(self._pending)
         group, closed = self._groups(frames.part)
         if at_end and self._rule == "first" and len(group):
@@ -103,7 +112,7 @@ class SampleGrouper:
         return samples
 
     def _groups(self, part: NDArray[np.int8]) -> tuple[IndexArray, int]:
-        """Number of the group each frame belongs to, ascending, and how many groups are closed."""
+        """Number the group of each frame in ascending order, and return how many groups are closed."""
         if self._rule == "repeat":
             return self._groups_by_repeat(part)
         key = part == self._key_part
@@ -114,7 +123,7 @@ class SampleGrouper:
         return count, closed  # group 0: frames before the first opening, closed by it
 
     def _groups_by_repeat(self, part: NDArray[np.int8]) -> tuple[IndexArray, int]:
-        """Return groups by the rule of the first repeat: starts are chained, regular runs in one step."""
+        """Number groups by the rule ``repeat``: starts are chained, regular runs in one step."""
         n, parts = len(part), self._parts
         if parts == 1 or n == 0:
             return np.arange(n), n
@@ -147,7 +156,7 @@ class SampleGrouper:
         )
 
     def _thin(self, pending: Frames) -> Frames:
-        """At most two frames of each part say all that is needed of an unfinished sample."""
+        """Keep at most two frames of each part, which is enough to judge an unfinished sample."""
         if len(pending.part) <= 2 * self._parts:
             return pending
         keep = np.concatenate([np.flatnonzero(pending.part == number)[:2] for number in range(self._parts)])
@@ -155,17 +164,19 @@ class SampleGrouper:
 
 
 def has_evidence(part: NDArray[np.int8], parts: int) -> bool:
-    """Return whether frames (n,) of grouped parts are enough for `closing_part`; a part that never comes waits not."""
+    """Return whether frames (n,) of grouped parts are enough for `closing_part`; a part that never comes is not waited
+    for.
+    """
     counts = np.bincount(part, minlength=parts)
     return bool(counts.min() >= EVIDENCE or counts.max() >= 4 * EVIDENCE)
 
 
 def closing_part(part: NDArray[np.int8], host_time_ns: Int64Array, parts: int) -> int | None:
-    """Return the part after which the device pauses, which closes a sample; None where no pause stands out.
+    """Return the part before the device's pause, which closes a sample; None where no pause stands out.
 
     Args:
-        part: (n,) of grouped frames in the order of their arrival.
-        host_time_ns: (n,) of their arrival.
+        part: (n,) parts of the grouped frames in the order of their arrival.
+        host_time_ns: (n,) host times of their arrival.
         parts: number of parts of a sample.
     """
     gap_ns = np.diff(host_time_ns)
@@ -181,7 +192,7 @@ def closing_part(part: NDArray[np.int8], host_time_ns: Int64Array, parts: int) -
 
 
 def _next_start(part: NDArray[np.int8], parts: int) -> IndexArray:
-    """For a group that began at each frame: where the next would begin (n where it is still open)."""
+    """Return, for a group that begins at each frame, the start of the next group (n where the group is still open)."""
     n = len(part)
     previous = np.full(n, -1, np.intp)  # the previous frame of the same part
     for number in range(parts):

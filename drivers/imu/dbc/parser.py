@@ -1,10 +1,10 @@
 """Any inertial unit on CAN, by its DBC file and a map of its signals (protocol ``dbc``).
 
-The configuration names the signals (``[imu.NAME.signals]``, docs/configuration.md); the DBC says where they lie and
-in which unit. Frames are decoded in batches; the frames of one sample are put together by `SampleGrouper`, counters
-made continuous by `CounterUnwrapper`. Specific force and angular rate are those of the device's own axes: the
-configuration's rotation_b_imu, sample and stamp are applied where the samples are used, except that increments
-(sample = "increment") are divided by the nominal interval here.
+The configuration names the signals (``[imu.NAME.signals]``, docs/configuration.md); the DBC gives their positions and
+units. Frames are decoded in batches; `SampleGrouper` joins the frames of one sample, and `CounterUnwrapper` makes
+counters continuous. Specific force and angular rate are in the device's own axes: the configuration's rotation_b_imu,
+sample and stamp are applied where the samples are used, except that increments (sample = "increment") are divided by
+the nominal interval here.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from swath.georef.records import (
 
 
 class SideSignal:
-    """A signal of a message beside the samples: its value holds from its frame to the next."""
+    """A signal of a message beside the samples; its value holds from its frame to the next one."""
 
     def __init__(self, signal: MappedSignal) -> None:
         self._signal = signal
@@ -49,21 +49,21 @@ class SideSignal:
         self._bits = np.empty(0, np.uint64)
 
     def take(self, frames: Frames) -> None:
-        """Read it from the frames of one call."""
+        """Read the signal from the frames of one call."""
         if len(self._bits):
             self._last, self._known = self._bits[-1], True
         self._where = np.flatnonzero(frames.part == self._signal.part)
         self._bits = self._signal.layout.bits(frames.data[self._where])
 
     def before(self, position: NDArray[np.intp]) -> tuple[NDArray[np.uint64], NDArray[np.bool_]]:
-        """Return its bits as of positions (m,) among this call's frames, and whether there were any yet."""
+        """Return its bits as of positions (m,) among this call's frames, and whether a value existed by then."""
         place = np.searchsorted(self._where, position, side="left")
         bits = np.concatenate([[self._last], self._bits])[place]
         return bits, (place > 0) | self._known
 
 
 class DbcParser(PacketParser):
-    """Decodes CAN units to `ImuSamples`, and `DeviceClockSamples` where the device latches PPS."""
+    """Decodes CAN units to `ImuSamples`, and to `DeviceClockSamples` where the device latches PPS."""
 
     def __init__(
         self, settings: DeviceSettings, *, clock_only: bool = False, signal_map: SignalMap | None = None
@@ -72,11 +72,11 @@ class DbcParser(PacketParser):
 
         Args:
             settings: the device's table and the DBC's bytes (``files["dbc"]``).
-            clock_only: give `DeviceClockSamples` only, for the recorder.
-            signal_map: what a profile has found already; None: found here.
+            clock_only: return `DeviceClockSamples` only, for the recorder.
+            signal_map: a map that the caller has made already; None: made here.
 
         Raises:
-            DriverSettingsError: naming the key or signal and what would be right.
+            DriverSettingsError: a setting is invalid; the text names the key or signal and a valid value.
         """
         super().__init__()
         self._map = signal_map or map_signals(settings)
@@ -118,7 +118,9 @@ class DbcParser(PacketParser):
         return SampleGrouper(self._map.grouped, rule, key_part, self._width)
 
     def _settle_rule(self) -> None:
-        """Take the rule that the spacing of the first frames shows; where they come evenly, doubt the usual one."""
+        """Use the rule that the spacing of the first frames shows; if they come evenly, keep the default and note a
+        doubt.
+        """
         grouped = self._unread.part < self._map.grouped
         last = closing_part(self._unread.part[grouped], self._unread.host_time_ns[grouped], self._map.grouped)
         if last is not None:
@@ -134,7 +136,7 @@ class DbcParser(PacketParser):
     # -- frames
 
     def _configured_frames(self, host_time_ns: Int64Array, units: ByteRows) -> Frames:
-        """Return the data frames of configured parts; other identifiers are other devices' traffic."""
+        """Return the data frames of configured parts; other identifiers belong to other devices."""
         table = decode_can_frames(units)
         if table is None:
             self._count_bad(len(units))
@@ -151,7 +153,7 @@ class DbcParser(PacketParser):
         return Frames(part[mine], np.asarray(host_time_ns, np.int64)[mine], data)
 
     def _frames_of(self, kind: Part, table: StructArray, can_id: NDArray[np.uint32]) -> NDArray[np.intp]:
-        """Return indices of the frames of a kind that are whole; short ones are counted."""
+        """Return indices of the complete frames of a kind; short ones are counted."""
         where = np.flatnonzero(can_id == np.uint32(kind.can_id))
         if kind.selector is not None:
             data = _padded(table["data"][where], self._width)
@@ -170,7 +172,7 @@ class DbcParser(PacketParser):
         self.counters.errors["bad_length"] += frames
 
     def _count_gaps(self, frames: Frames) -> None:
-        """Count what the device's own counter says was sent and is not there."""
+        """Count the frames that the device's own counter shows to be missing."""
         packets = self._map.packet_counter
         if packets is not None and self._gaps is not None:
             missing = self._gaps.missing(packets.layout.bits(frames.data[frames.part == packets.part]))
@@ -178,7 +180,7 @@ class DbcParser(PacketParser):
                 self.counters.errors["packet_gap"] += missing
 
     def _count_flagged(self, can_id: NDArray[np.uint32]) -> None:
-        """Count error frames and remote requests; their identifiers match no message."""
+        """Count error frames and remote requests, whose identifiers match no message."""
         flagged = can_id[can_id & np.uint32(CAN_ERR_FLAG | CAN_RTR_FLAG) != 0]
         if len(flagged):
             errors = int(np.count_nonzero(flagged & np.uint32(CAN_ERR_FLAG)))
@@ -188,7 +190,7 @@ class DbcParser(PacketParser):
     # -- samples
 
     def _samples_of(self, frames: Frames, *, at_end: bool = False) -> list[Record]:
-        """Group frames to samples and decode them."""
+        """Group frames into samples and decode them."""
         grouped = np.flatnonzero(frames.part < self._map.grouped)
         samples = self._grouper.split(frames.take(grouped), at_end=at_end)
         for code, count in (("sample_incomplete", samples.incomplete), ("sample_duplicate", samples.duplicate)):
@@ -203,7 +205,7 @@ class DbcParser(PacketParser):
         return self._records(samples, place[samples.closed_at])
 
     def _records(self, samples: Samples, position: NDArray[np.intp]) -> list[Record]:
-        """Return rows of good samples; ``position``: where each was closed among this call's frames."""
+        """Return rows of good samples; ``position`` is where each was closed among this call's frames."""
         rows = np.zeros(samples.index.shape[1], IMU_DTYPE)
         rows["host_time_ns"] = samples.frames.host_time_ns[samples.index.max(axis=0)]
         data = [samples.frames.data[index] for index in samples.index]
@@ -217,7 +219,7 @@ class DbcParser(PacketParser):
         return records
 
     def _fill_times(self, rows: StructArray, data: list[ByteRows], position: NDArray[np.intp]) -> None:
-        """Device time and time of the latest PPS edge on its scale; −1 where the device has none."""
+        """Write device time and the time of the latest PPS edge on its scale, −1 where the device has none."""
         rows["device_time_ns"] = -1
         rows["pps_time_ns"] = -1
         rows["gps_week"] = -1
@@ -233,7 +235,7 @@ class DbcParser(PacketParser):
             rows["pps_time_ns"] = np.where(latched >= 0, nanoseconds(latched, self._map.tick_hz), -1)
 
     def _fill_values(self, rows: StructArray, data: list[ByteRows], position: NDArray[np.intp]) -> None:
-        """Specific force, angular rate, temperature and status (its low 32 bits)."""
+        """Write specific force, angular rate, temperature and status (its low 32 bits)."""
         for number, signal in enumerate(self._map.vectors):
             values = signal.layout.values(signal.layout.bits(data[signal.part]))
             field = "specific_force_b" if number < 3 else "angular_rate_b"
@@ -250,7 +252,9 @@ class DbcParser(PacketParser):
     def _bits_of(
         self, signal: MappedSignal, data: list[ByteRows], position: NDArray[np.intp]
     ) -> tuple[NDArray[np.uint64], NDArray[np.bool_]]:
-        """Return bits of an optional signal for each sample, from its own frames or from the message beside them."""
+        """Return the bits of an optional signal for each sample, from its own frames or from the message beside
+        them.
+        """
         if signal.part < self._map.grouped:
             bits = signal.layout.bits(data[signal.part])
             return bits, np.ones(len(bits), np.bool_)
@@ -258,14 +262,14 @@ class DbcParser(PacketParser):
 
 
 def _padded(data: ByteRows, width: int) -> ByteRows:
-    """Return data bytes cut or filled up with zeros to the width signals are read from."""
+    """Return data bytes cut or zero-padded to the width that signals are read from."""
     if data.shape[1] >= width:
         return data[:, :width]
     return np.pad(data, ((0, 0), (0, width - data.shape[1])))
 
 
 def _clock_rows(rows: StructArray) -> StructArray:
-    """Return what the samples say of the device's clock."""
+    """Return the device clock samples in rows of inertial samples."""
     clock = np.zeros(len(rows), DEVICE_CLOCK_DTYPE)
     for name in ("host_time_ns", "device_time_ns", "pps_time_ns"):
         clock[name] = rows[name]
@@ -275,7 +279,7 @@ def _clock_rows(rows: StructArray) -> StructArray:
 
 
 def make_clock_parser(settings: DeviceSettings) -> DbcParser:
-    """Return the recorder's parser: the device's clock only."""
+    """Make the recorder's parser, which returns samples of the device's clock only."""
     return DbcParser(settings, clock_only=True)
 
 

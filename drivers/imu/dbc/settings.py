@@ -1,4 +1,4 @@
-"""From the configuration's signal names to found signals, parts and units (`swath.drivers.imu.dbc.parser`)."""
+"""Resolves the configuration's signal names to signals, parts and units (`swath.drivers.imu.dbc.parser`)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from swath.drivers.imu.dbc.signals import FoundSignal, SignalLayout, find_signal
 from swath.drivers.parser import DeviceSettings, DriverSettingsError
 
 STANDARD_GRAVITY = 9.80665  # m/s², CGPM 1901
-UNITS = {  # as `_plain_unit` spells them -> factor to SI
+UNITS = {  # unit in the spelling of `_plain_unit` -> factor to SI
     "specific_force": {"m/s2": 1.0, "m/s/s": 1.0, "m.s-2": 1.0, "g": STANDARD_GRAVITY},
     "angular_rate": {"rad/s": 1.0, "rad.s-1": 1.0, "deg/s": radians(1.0)},
 }
@@ -35,9 +35,9 @@ class Part:
 
     Attributes:
         can_id: ``can_id`` word, extended flag included.
-        message: name in the DBC.
-        selector, selector_values: the multiplexer and its values; None: every frame of the message.
-        needs_bytes: the least data length that holds its configured signals.
+        message: its name in the DBC.
+        selector, selector_values: the multiplexer and its values; None selects every frame of the message.
+        needs_bytes: minimum data length that contains its configured signals.
     """
 
     can_id: int
@@ -58,17 +58,18 @@ class MappedSignal:
 
 @dataclass(frozen=True, slots=True)
 class SignalMap:
-    """Everything `DbcParser` needs of the configuration.
+    """Holds everything that `DbcParser` needs from the configuration.
 
     Attributes:
-        parts: the frames a sample is made of, then those beside it (a PPS latch or a temperature in a message of its
-            own), whose values hold until the next.
-        grouped: how many of `parts` make a sample.
+        parts: the frames that make a sample, then those beside it (a PPS latch or a temperature in a message of its
+            own), whose values hold until the next one.
+        grouped: number of `parts` that make a sample.
         vectors: specific force x y z, angular rate x y z.
         sample_ticks, pps_ticks, temperature, status, packet_counter: None where not configured.
         tick_hz: rate of the counters.
-        rule, key_part: how frames make samples.
-        rule_is_said: by the configuration; else the frames' spacing goes before it.
+        rule, key_part: rule by which frames make samples, and its opening or closing part.
+        rule_is_said: True if the configuration gives the rule or one part needs none; else frame spacing may replace
+            it.
     """
 
     parts: tuple[Part, ...]
@@ -87,12 +88,12 @@ class SignalMap:
 
 @dataclass(slots=True)
 class _PartList:
-    """Collects the parts signals lie in."""
+    """Collects the parts that contain signals."""
 
     parts: list[Part] = field(default_factory=list)
 
     def number(self, found: FoundSignal) -> int:
-        """Return the part that carries a signal, made where there is none yet."""
+        """Return the number of the part that carries a signal; add the part where it is new."""
         mine = [number for number, part in enumerate(self.parts) if part.can_id == found.can_id]
         for number in mine:
             part = self.parts[number]
@@ -113,7 +114,7 @@ class _PartList:
 
     @staticmethod
     def _widened(part: Part, found: FoundSignal, *, narrowed: bool = False) -> Part:
-        """Return the part with room for one more signal, and narrowed to its multiplexer values where it had none."""
+        """Return the part with room for one more signal; ``narrowed`` limits it to the signal's multiplexer values."""
         chooser = found if narrowed else part
         needs = max(part.needs_bytes, found.layout.needs_bytes, found.selector.needs_bytes if found.selector else 0)
         return Part(part.can_id, part.message, chooser.selector, chooser.selector_values, needs)
@@ -123,7 +124,7 @@ def map_signals(settings: DeviceSettings) -> SignalMap:
     """Find all configured signals in the device's DBC.
 
     Raises:
-        DriverSettingsError: naming the key, signal or unit, and what would be right.
+        DriverSettingsError: a setting is invalid; the text names the key, signal or unit, and a valid value.
     """
     config = settings.config
     if "dbc" not in settings.files:
@@ -197,7 +198,7 @@ def _refuse_axis_twice(names: Mapping[str, Any]) -> None:
 def _factors(
     config: Mapping[str, Any], found: Mapping[str, list[FoundSignal]], file_name: str
 ) -> dict[str, list[float]]:
-    """Return factors to SI of the vectors' components; increments are divided by the nominal interval."""
+    """Return the factors to SI of the vectors' components; increments are divided by the nominal interval."""
     increment = config.get("sample") == "increment"
     rate_hz = float(config.get("rate_hz") or 0.0)
     if increment and rate_hz <= 0.0:
@@ -218,16 +219,14 @@ def _factors(
 
 
 def _plain_unit(unit: str) -> str:
-    """Return one spelling for the many of a unit: lower case, no blanks or carets, deg for °."""
+    """Normalise the spelling of a unit: lower case, no blanks or carets, deg for °."""
     plain = unit.strip().lower().replace(" ", "").replace("^", "").replace("²", "2").replace("·", ".")
     plain = plain.replace("°", "deg").replace("degrees", "deg").replace("degree", "deg").replace("sec", "s")
     return plain.replace("dps", "deg/s") if plain == "dps" else plain
 
 
 def _group_rule(config: Mapping[str, Any], ticks: MappedSignal | None, grouped: int) -> GroupRule:
-    """Return ``group`` of the configuration; without ticks, or with one frame a sample, the first to repeat opens
-    one.
-    """
+    """Return ``group`` of the configuration; without ticks, or with one frame a sample, the rule is ``repeat``."""
     group = config.get("group") or "last"
     if group not in ("last", "first"):
         raise DriverSettingsError(f'group: got "{group}", want "last" or "first"')
@@ -237,7 +236,7 @@ def _group_rule(config: Mapping[str, Any], ticks: MappedSignal | None, grouped: 
 
 
 def _tick_hz(config: Mapping[str, Any], ticks: MappedSignal | None) -> Fraction:
-    """Return rate of the counters, exact."""
+    """Return the exact rate of the counters."""
     value = config.get("tick_hz")
     if ticks is None:
         return Fraction(1)

@@ -1,9 +1,9 @@
-"""Signals of a DBC file, found by name and cut out of whole batches of frames.
+"""Finds signals of a DBC file by name and extracts them from whole batches of frames.
 
 A DBC signal is a run of bits in a frame's data (start bit, length, byte order), read as unsigned, two's complement or
 IEEE 754, times scale plus offset. Little-endian ("Intel", ``@1``): the start bit is the lowest one, bits count up
 through the bytes. Big-endian ("Motorola", ``@0``): the start bit is the highest one, as ``byte * 8 + bit in byte``,
-and bits go on downwards into the next byte.
+and bits continue downwards into the next byte.
 """
 
 from __future__ import annotations
@@ -31,17 +31,17 @@ FLOAT_TYPES: dict[int, tuple[type[np.unsignedinteger[Any]], str]] = {
 
 @dataclass(frozen=True, slots=True)
 class SignalLayout:
-    """Where a signal lies and what its number means.
+    """Position and scaling of a signal.
 
     Attributes:
         name: ``MESSAGE.signal``.
-        first_byte: of the 64-bit word it is cut from.
-        shift: bits below it in that word; negative where it reaches into a ninth byte.
-        length: bits.
-        big_endian, signed, is_float: how its bits are read.
+        first_byte: first byte of the 64-bit word that contains it.
+        shift: number of bits below it in that word; negative where it reaches into a ninth byte.
+        length: number of bits.
+        big_endian, signed, is_float: interpretation of its bits.
         scale, offset: physical = raw · scale + offset.
-        unit: as the DBC says it.
-        needs_bytes: data bytes a frame must have to hold it.
+        unit: unit as written in the DBC.
+        needs_bytes: number of data bytes that a frame must have to contain it.
     """
 
     name: str
@@ -67,7 +67,7 @@ class SignalLayout:
         return self._with_ninth_byte(data, word) & mask
 
     def _with_ninth_byte(self, data: ByteRows, word: UInt64Array) -> UInt64Array:
-        """Return the same for a signal that begins inside one byte and ends in the ninth."""
+        """Return the bits of a signal that begins inside one byte and ends in the ninth."""
         ninth = data[:, self.first_byte + 8].astype(np.uint64)
         over = -self.shift
         if self.big_endian:
@@ -77,7 +77,7 @@ class SignalLayout:
 
     @np.errstate(invalid="ignore", over="ignore")
     def values(self, bits: UInt64Array) -> FloatArray:
-        """Return physical values of right-aligned bits, whatever float the wire holds: NaN and overflow included."""
+        """Return physical values of right-aligned bits; floats on the wire may be NaN or overflow."""
         if self.is_float:
             unsigned, floating = FLOAT_TYPES[self.length]
             raw = bits.astype(unsigned).view(floating).astype(np.float64)
@@ -98,11 +98,11 @@ class FoundSignal:
     """A configured signal: its layout and the frames that carry it.
 
     Attributes:
-        layout: where and what.
+        layout: its position and scaling.
         can_id: ``can_id`` word of its message, extended flag included.
         message: the message's name.
         selector: layout of the multiplexer that decides whether a frame carries it; None: every frame does.
-        selector_values: the multiplexer's values that do.
+        selector_values: the multiplexer's values in frames that carry it.
     """
 
     layout: SignalLayout
@@ -113,10 +113,10 @@ class FoundSignal:
 
 
 def signal_layout(message: Any, signal: Any) -> SignalLayout:
-    """Return layout of a cantools signal.
+    """Return the layout of a cantools signal.
 
     Raises:
-        DriverSettingsError: no such float, or longer than 64 bits.
+        DriverSettingsError: the signal is a float of another length than 16, 32 or 64 bits, or longer than 64 bits.
     """
     name = f"{message.name}.{signal.name}"
     length = int(signal.length)
@@ -134,7 +134,7 @@ def signal_layout(message: Any, signal: Any) -> SignalLayout:
     first_byte = first_bit // 8 if last_byte >= 8 else 0
     first_byte = min(first_byte, 56)
     inside = first_bit - first_byte * 8
-    past = inside + length - WORD_BITS  # bits that reach into a ninth byte
+    past = inside + length - WORD_BITS  # bits in a ninth byte
     shift = -past if big_endian or past > 0 else inside
     return SignalLayout(
         name=name,
@@ -152,16 +152,17 @@ def signal_layout(message: Any, signal: Any) -> SignalLayout:
 
 
 def load_database(contents: bytes, key: str = "dbc") -> Any:
-    """Return the cantools database of a DBC file's bytes (UTF-8, UTF-16 by its mark, else Windows-1252, the format's
-    own).
+    """Load the cantools database of a DBC file's bytes.
+
+    The text is UTF-8, UTF-16 by its mark, else Windows-1252, the format's own encoding.
 
     Raises:
-        DriverSettingsError: it is no DBC file.
+        DriverSettingsError: the file is not a DBC file.
     """
-    import cantools.database as dbc  # heavy, and needed only where a DBC is
+    import cantools.database as dbc  # slow to import, and needed only with a DBC
     from cantools.database import errors
 
-    logging.getLogger("cantools").setLevel(logging.ERROR)  # of a message there twice `find_signal` tells, if it matters
+    logging.getLogger("cantools").setLevel(logging.ERROR)  # `find_signal` reports relevant duplicates
     try:
         text = decoded(contents)
     except UnicodeDecodeError:
@@ -176,7 +177,7 @@ def find_signal(database: Any, path: str, file_name: str) -> FoundSignal:
     """Find ``MESSAGE.signal`` in a database.
 
     Raises:
-        DriverSettingsError: naming what there is instead.
+        DriverSettingsError: the message or signal is missing; the text lists the existing ones.
     """
     message_name, dot, signal_name = path.partition(".")
     if not dot or not signal_name:
@@ -202,7 +203,7 @@ def find_signal(database: Any, path: str, file_name: str) -> FoundSignal:
 
 
 def _multiplexing(message: Any, signals: dict[str, Any], signal: Any) -> tuple[SignalLayout | None, frozenset[int]]:
-    """Return the multiplexer that decides on a signal; one level is read, deeper ones are refused."""
+    """Return the multiplexer that selects a signal; one level is supported, deeper ones are refused."""
     if not signal.multiplexer_ids:
         return None, frozenset()
     selector = signals[signal.multiplexer_signal]
@@ -212,7 +213,7 @@ def _multiplexing(message: Any, signals: dict[str, Any], signal: Any) -> tuple[S
 
 
 def _instead(wanted: str, names: dict[str, Any], owner: str) -> str:
-    """Return ``; did you mean …?`` or what there is."""
+    """Return ``; did you mean …?`` and the list of existing names."""
     close = difflib.get_close_matches(wanted, names, n=3, cutoff=0.5)
     listed = ", ".join(list(names)[:12]) + (", …" if len(names) > 12 else "")
     meant = f"; did you mean {' or '.join(close)}?" if close else ""

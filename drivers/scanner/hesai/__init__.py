@@ -1,1 +1,1 @@
-"""Hesai heads."""
+"""Hesai spinning heads: parser, models and GPS data packets."""

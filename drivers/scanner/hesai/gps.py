@@ -2,11 +2,12 @@
 
 PandarXT-32 User Manual 3.2 (PandarQT the same): 512 bytes. FF EE, then year, month, day, second, minute, hour, two
 ASCII digits each, the lower first; u32 microseconds; 84 bytes NMEA; reserved; at 506 the positioning status (A or V
-of GPRMC, 0 to 9 of GPGGA as the receiver has it, NUL: none), at 507 the PPS lock flag (1 locked).
+of GPRMC, 0 to 9 of GPGGA as the receiver sends it, NUL: none), at 507 the PPS lock flag (1 locked).
 
 Each rising edge of the head's internal 1 Hz signal, which is the PPS while locked, triggers a packet, and the date
-and time in it are that edge's: the previous NMEA message's and one second (3.2, Appendix II). So a packet names the
-edge before its arrival, while the sentence in it is still the one of the edge before that, and is not used.
+and time in it are that edge's: those of the previous NMEA message plus one second (3.2, Appendix II). A packet
+therefore refers to the edge before its arrival, while the sentence in it still belongs to the edge before that, and is
+not used.
 """
 
 from __future__ import annotations
@@ -40,12 +41,12 @@ _STATUS = struct.Struct("<cB")
 _STATUS_AT = 506
 _FILL = 0xDF
 _STATUS_NAMES = {b"\0": "none", b"A": "valid", b"V": "invalid", b"0": "invalid", b"6": "estimated"}
-# 0 to 9 "as defined by the GPS device manufacturer", 4 and 5 of RTK (Pandar64 User Manual 3.2.2); 9 is NovAtel's SBAS
+# 0 to 9 "as defined by the GPS device manufacturer", 4 and 5 for RTK (Pandar64 User Manual 3.2.2); 9 is NovAtel's SBAS
 _STATUS_NAMES |= dict.fromkeys((b"1", b"2", b"3", b"4", b"5", b"9"), "valid") | {b"7": "manual", b"8": "simulated"}
 
 
 def encode_gps_packet(time: dt.datetime, sentence: str = "", status: bytes = b"A", *, locked: bool = True) -> bytes:
-    """Return one GPS data packet; ``time`` in UTC."""
+    """Encode one GPS data packet; ``time`` is in UTC."""
     packet = bytearray([_FILL] * GPS_BYTES)
     digits = f"{time:%y%m%d%S%M%H}"
     swapped = "".join(digits[at + 1] + digits[at] for at in range(0, len(digits), 2))
@@ -60,16 +61,16 @@ def encode_gps_packet(time: dt.datetime, sentence: str = "", status: bytes = b"A
 class GpsReader:
     """Reads the GPS data packets of one head, in order; counts ``bad_gps`` and ``date_before_floor``.
 
-    The date is that of the receiver at the head: one a roll-over behind is moved in the time message, one before the
-    floor is not valid. Device times stay as the head counts them.
+    The date is that of the receiver at the head: a date one roll-over behind is moved in the time message, a date
+    before the floor is not valid. Device times stay as the head counts them.
 
     Args:
-        counters: the parser's.
-        settings: of the head, whose source the remarks on dates name.
+        counters: the parser's counters.
+        settings: the head's settings, with the source that remarks on dates name.
 
     Attributes:
-        dates: what the head's dates were taken for.
-        locked: what the latest packet said: 1 PPS locked, 0 not, −1 before the first packet (and with PTP, where
+        dates: interpretation of the head's dates.
+        locked: lock flag of the latest packet: 1 PPS locked, 0 not, −1 before the first packet (and with PTP, where
             the head sends none).
     """
 
@@ -80,7 +81,9 @@ class GpsReader:
         self.locked = -1
 
     def read(self, host_time_ns: Int64Array, units: ByteRows) -> list[Record]:
-        """Decode packets (n, 512): a time message and a clock sample of each, and the status where it changed."""
+        """Decode packets (n, 512): return a time message and a clock sample of each, and the status where it
+        changed.
+        """
         records: list[Record] = []
         clock: list[tuple[int, int, int, int, int]] = []
         for at, host_ns in enumerate(host_time_ns.tolist()):
@@ -108,7 +111,7 @@ class GpsReader:
         of_day_ns = (time.hour * 3600 + time.minute * 60 + time.second) * NS
         valid = locked and _STATUS_NAMES[status] == "valid"
         date = time.date()
-        if valid:  # else it is the head's own virtual date
+        if valid:  # otherwise the date is the head's own virtual one
             date = self.dates.date(date, host_ns)
             if date < self.dates.floor:
                 self._counters.errors["date_before_floor"] += 1
@@ -123,7 +126,9 @@ class GpsReader:
 
 
 def _time(digits: bytes) -> dt.datetime | None:
-    """Return date and time of twelve digits, each pair's lower first; None if they are none. Years are 2000 to 2099."""
+    """Return date and time of twelve digits, each pair's lower first; None if they are invalid. Years are 2000 to
+    2099.
+    """
     if not digits.isdigit():
         return None
     year, month, day, second, minute, hour = (int(digits[at + 1 :: -1][:2]) for at in range(0, 12, 2))

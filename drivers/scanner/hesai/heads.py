@@ -1,4 +1,4 @@
-"""Hesai heads: layout of their packets, when their lasers fire, and where they point.
+"""Hesai heads: layout of their packets, firing times of their lasers, and directions of their beams.
 
 Sources: PandarXT-32 User Manual (3.1.2, Appendix I and II), PandarQT User Manual (3.1.2, Appendix I); the maker's
 HesaiLidar_SDK_2.0 (correction/firetime_correction, libhesai/UdpProtocol) and HesaiLidar_General_SDK (pandarXT.h,
@@ -19,19 +19,19 @@ from swath.georef.records import Int64Array
 
 @dataclass(frozen=True)
 class HesaiHead:
-    """One model.
+    """One model of head.
 
     Attributes:
-        name: as the maker writes it.
-        protocol_major: what its packets name it by.
-        blocks, channels: of a packet; a block is one round of firing, in dual return two blocks are.
+        name: the maker's name of it.
+        protocol_major: number that identifies it in its packets.
+        blocks, channels: size of a packet; a block is one round of firing, in dual return two blocks are.
         tail: fields of the tail in their order, `numpy` style.
-        without_sequence: its packets may come without the UDP sequence number.
-        round_ns: from one round of firing to the next.
-        stamped_round: the packet's time is that of its first or of its last round.
-        start_ns: from the time a round is stamped with to the reading of its azimuth.
+        without_sequence: whether its packets may lack the UDP sequence number.
+        round_ns: time from one round of firing to the next.
+        stamped_round: whether the packet's time is that of its first or of its last round.
+        start_ns: time from a round's stamp to the reading of its azimuth.
         offset_ns: (channels,) firing times after the reading of the azimuth.
-        beams: design values; the device's own are in its angle correction file.
+        beams: design values; a device's own values are in its angle correction file.
     """
 
     name: str
@@ -47,8 +47,8 @@ class HesaiHead:
     beams: BeamTable
 
     def packet_dtype(self, *, sequence: bool = True) -> np.dtype[np.void]:
-        """Return a point cloud packet: pre-header and header (12 bytes), body, tail (24 bytes), UDP sequence (4
-        bytes).
+        """Return the dtype of a point cloud packet: pre-header and header (12 bytes), body, tail (24 bytes), UDP
+        sequence (4 bytes).
         """
         channel = np.dtype([("range", "<u2"), ("reflectivity", "u1"), ("reserved", "u1")])
         block = np.dtype([("azimuth", "<u2"), ("returns", channel, (self.channels,))])
@@ -56,7 +56,7 @@ class HesaiHead:
         return np.dtype([*_HEADER, ("blocks", block, (self.blocks,)), *self.tail, *last])
 
     def round_start_ns(self, rounds: int) -> Int64Array:
-        """Return (rounds,) time of the azimuth's reading of each round of a packet after the packet's own time."""
+        """Return (rounds,) times from the packet's time to the reading of each round's azimuth."""
         number = np.arange(rounds) - (rounds - 1 if self.stamped_round == LAST_ROUND else 0)
         start: Int64Array = np.rint(number * self.round_ns).astype(np.int64) + self.start_ns
         return start
@@ -147,10 +147,10 @@ QT64 = HesaiHead(
 
 
 def read_angle_file(data: bytes, head: HesaiHead) -> BeamTable:
-    """Return beams of a head's own angle correction file: CSV of channel (from 1), elevation and azimuth in degrees.
+    """Read beams from a head's angle correction file: CSV of channel (from 1), elevation and azimuth in degrees.
 
     Raises:
-        DriverSettingsError: it is none, or not this model's.
+        DriverSettingsError: the file is not an angle correction file, or is of another model.
     """
     found: dict[int, tuple[float, float]] = {}
     below_names = data.decode("utf-8-sig", "replace").splitlines()[1:]

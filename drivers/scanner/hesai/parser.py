@@ -1,11 +1,12 @@
 """Hesai spinning heads of protocols 3.1 (PandarQT) and 6.1 (PandarXT-32): point cloud and GPS data packets.
 
 Wire format: the models' user manuals, 3.1.2 and Appendix II (`swath.drivers.scanner.hesai.heads`), 3.2
-(`swath.drivers.scanner.hesai.gps`). Device time is nanoseconds since 1970 of the UTC the head says, without leap
-seconds; from a virtual date on until it has been given a time. Its microseconds begin anew at each edge of its 1 Hz
-signal, so while the head says that this is locked to the PPS the beginning of its second is the latched edge.
+(`swath.drivers.scanner.hesai.gps`). Device time is nanoseconds since 1970 of the UTC in the packets, without leap
+seconds; until the head receives a time, it counts from a virtual date. Its microseconds restart at each edge of its
+1 Hz signal, so while the head reports that this signal is locked to the PPS, the beginning of its second is the latched
+edge.
 
-Azimuths are turned on from the block's to the channel's own firing with the motor's speed, as the maker's SDK does.
+Azimuths are extrapolated from the block's firing to the channel's own with the motor's speed, as in the maker's SDK.
 """
 
 from __future__ import annotations
@@ -44,11 +45,11 @@ from swath.georef.records import (
 SOP = 0xFFEE
 DISTANCE_UNIT_MM = 4
 FULL_CIRCLE = 36_000  # azimuth in 0.01°
-MAX_MICROSECOND = 1_999_999  # the manuals' range ends at 1 000 000; a head may run on until a late edge
+MAX_MICROSECOND = 1_999_999  # the manuals' range ends at 1 000 000; a head may count on until a late edge
 MODE_FIRST, MODE_STRONGEST, MODE_LAST = 0x33, 0x37, 0x38
 MODE_LAST_STRONGEST, MODE_LAST_FIRST, MODE_FIRST_STRONGEST = 0x39, 0x3B, 0x3C
 SINGLE_FLAGS = {MODE_FIRST: 0, MODE_STRONGEST: RETURN_FLAG_STRONGEST, MODE_LAST: RETURN_FLAG_LAST}
-DUAL_NAMES = {  # by mode: names the strongest, names the last
+DUAL_NAMES = {  # by mode: includes the strongest, includes the last
     MODE_LAST_STRONGEST: (True, True),
     MODE_LAST_FIRST: (False, True),
     MODE_FIRST_STRONGEST: (True, False),
@@ -68,10 +69,10 @@ def encode_point_packet(
     sequence: int | None = 1,
     motor_rpm: int = 600,
 ) -> bytes:
-    """Return one point cloud packet.
+    """Encode one point cloud packet.
 
     Args:
-        time: the packet's own, UTC.
+        time: the packet's own time, UTC.
         azimuth_0p01deg: (blocks,), in dual return pairs of equal ones.
         range_raw: (blocks, channels) in 4 mm, 0 = no return.
         reflectivity: (blocks, channels) or one value for all.
@@ -95,7 +96,7 @@ def encode_point_packet(
 
 
 class HesaiParser(PacketParser):
-    """Decodes point cloud and GPS data packets of one head, told apart by their length.
+    """Decodes point cloud and GPS data packets of one head, distinguished by their length.
 
     Counts ``bad_length``, ``bad_header``, ``wrong_product`` (another model answers), ``bad_return_mode``,
     ``bad_azimuth``, ``bad_time``, ``bad_gps``, ``date_before_floor``, and of the UDP sequence ``sequence_gap``,
@@ -104,10 +105,10 @@ class HesaiParser(PacketParser):
     Args:
         settings: ``geometry.file`` is the head's own angle correction file.
         head: the model.
-        clock_only: no returns, and the clock of one data packet in 50 ms of host time.
+        clock_only: return no returns, and clock samples of one data packet in 50 ms of host time.
 
     Attributes:
-        beams: the head's own where its file is given, else the design values.
+        beams: the head's own beams where its file is given, else the design values.
     """
 
     def __init__(self, settings: DeviceSettings, head: HesaiHead, *, clock_only: bool = False) -> None:
@@ -149,11 +150,11 @@ class HesaiParser(PacketParser):
         return self._decode(host_time_ns, packets, second_ns, number) if len(packets) else []
 
     def remarks(self) -> list[str]:
-        """Return what is to be said of the dates that the head was given."""
+        """Return remarks on the dates that the head received."""
         return self._gps.dates.remarks()
 
     def _check(self, packets: StructArray) -> BoolArray:
-        """Return (n,) True for packets of this model that can be decoded; the others are counted by what is wrong."""
+        """Return (n,) True for packets of this model that can be decoded; the others are counted by error."""
         head, utc = self._head, packets["utc"].copy().view(_UTC)
         good = np.ones(len(packets), dtype=np.bool_)
         numbered = "sequence" in (packets.dtype.names or ())
@@ -189,7 +190,7 @@ class HesaiParser(PacketParser):
     def _follow(
         self, host_time_ns: Int64Array, packets: StructArray, second_ns: Int64Array
     ) -> tuple[Int64Array, BoolArray]:
-        """Return running number of each packet, and False where it repeats the one before."""
+        """Return the running number of each packet, and False where it repeats the one before."""
         if "sequence" in (packets.dtype.names or ()):
             stamp_ns = second_ns + packets["microsecond"].astype(np.int64) * 1000
             none = np.zeros(len(packets), dtype=np.uint32)
@@ -219,8 +220,8 @@ class HesaiParser(PacketParser):
     def _clock_samples(
         self, host_time_ns: Int64Array, stamp_ns: Int64Array, second_ns: Int64Array, mode: NDArray[np.uint8]
     ) -> StructArray:
-        """Return one `DEVICE_CLOCK_DTYPE` row a packet: device time of its last firing, and the edge its second began
-        with.
+        """Return one `DEVICE_CLOCK_DTYPE` row a packet: device time of its last firing, and the edge that began its
+        second.
         """
         head = self._head
         last_ns = [
@@ -259,7 +260,7 @@ class HesaiParser(PacketParser):
 def _azimuths(
     azimuth: NDArray[np.uint16], motor_rpm: NDArray[np.uint16], head: HesaiHead
 ) -> Callable[[Chosen], FloatArray]:
-    """Return azimuths at each firing, radians, 0 … 2π, made of those of the rounds (n, rounds) and of the channels'
+    """Return a function for the azimuths at each firing, radians, 0 … 2π, from those of rounds (n, rounds) and channel
     times.
     """
     start = (azimuth * (2 * np.pi / FULL_CIRCLE)).reshape(-1, 1)
@@ -283,10 +284,10 @@ def _within(value: NDArray[np.uint8], least: int, most: int) -> BoolArray:
 def _utc_seconds(packets: StructArray) -> Int64Array:
     """Return seconds since 1970 (n,) of the packets' date and time.
 
-    Year minus 1900 and five more bytes; or, as the maker's SDK reads a first byte of 0, seconds since 1970 in the
-    last four, the highest first (udp_protocol_v6_1.h, GetMicroLidarTimeU64). Bytes that name no date give some time.
-    The SDK takes a PandarQT's year as counted from 2000 or from 1900 (udp_protocol_v3_1.h; the manual is silent), and
-    takes a century off an XT's from 200 on: so only its last two digits count, as 1970 to 2069.
+    The bytes are year minus 1900 and five more; or, as the maker's SDK reads a first byte of 0, seconds since 1970 in
+    the last four, the highest first (udp_protocol_v6_1.h, GetMicroLidarTimeU64). Bytes that are not a date give an
+    arbitrary time. The SDK counts a PandarQT's year from 2000 or from 1900 (udp_protocol_v3_1.h; the manual does not
+    say), and subtracts a century from an XT's year from 200 on: so only its last two digits count, as 1970 to 2069.
     """
     raw = packets["utc"].copy()
     utc = raw.view(_UTC)

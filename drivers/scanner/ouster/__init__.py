@@ -1,1 +1,1 @@
-"""Ouster heads."""
+"""Ouster spinning heads: parser, metadata, layouts and IMU packets."""

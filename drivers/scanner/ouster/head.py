@@ -1,7 +1,7 @@
-"""Ouster heads: what a head's metadata says of it, and the maker's formula for x, y, z.
+"""Ouster heads: the head's description from its metadata, and the maker's formula for x, y, z.
 
 The metadata is the JSON of the head's HTTP interface (``GET /api/v1/sensor/metadata``) or of Ouster's own recordings:
-flat up to firmware 2.x, in sections from then on. Nothing of it is guessed: what is missing and needed is refused.
+flat up to firmware 2.x, in sections from then on. Nothing is guessed: metadata that lacks a needed value is refused.
 Source: Ouster Firmware User Manual, "Sensor Data" and "API reference, Get lidar data format"; github.com/ouster-lidar/
 ouster-sdk @ 46b7bce for the names of the keys.
 """
@@ -21,14 +21,14 @@ from swath.georef.arrays import FloatArray
 from swath.georef.records import StructArray
 
 FILE = "geometry.file"
-LARGEST_PACKET_BYTES = 65_507  # of a UDP datagram
+LARGEST_PACKET_BYTES = 65_507  # payload of a UDP datagram
 COLUMNS_PER_FRAME = (512, 1024, 2048, 4096)
 HEADERS = {"STANDARD": "standard", "FUSA": "fusa"}
 FUSA_PROFILE = "FUSA_RNG15_RFL8_NIR8_DUAL"
 SYNC_PULSE = "TIME_FROM_SYNC_PULSE_IN"
 TIMESTAMP_MODES = ("TIME_FROM_INTERNAL_OSC", SYNC_PULSE, "TIME_FROM_PTP_1588")
 RETURN_ORDERS = ("STRONGEST_TO_WEAKEST", "FARTHEST_TO_NEAREST", "NEAREST_TO_FARTHEST")
-ROTATION_TOLERANCE = 1e-4  # of matrices whose numbers are printed with few digits
+ROTATION_TOLERANCE = 1e-4  # for matrices printed with few digits
 _SECTIONS = ("sensor_info", "beam_intrinsics", "lidar_intrinsics", "imu_intrinsics")
 
 
@@ -37,21 +37,21 @@ class OusterHead:
     """One head in one configuration.
 
     Attributes:
-        model: product line, as ``OS-1-128``.
-        serial: serial number; None where the metadata says none.
-        firmware: as the head says it.
-        init_id: number of the start the metadata was read in; None: unsaid.
-        profile: of the lidar packets, as ``RNG19_RFL8_SIG16_NIR16``.
+        model: product line, such as ``OS-1-128``.
+        serial: serial number; None where the metadata has none.
+        firmware: firmware version as text of the head.
+        init_id: number of the start in which the metadata was read; None: not in the metadata.
+        profile: profile of the lidar packets, such as ``RNG19_RFL8_SIG16_NIR16``.
         header: ``legacy``, ``standard`` or ``fusa``.
         beams: rows of a column.
-        columns_per_packet, columns_per_frame: as they say.
-        column_window: first and last measurement id that is sent; the first is the greater where 0 lies between.
+        columns_per_packet, columns_per_frame: number of columns in a packet and in a frame.
+        column_window: first and last measurement id sent; the first is the greater where 0 lies between.
         imu_profile: ``LEGACY``, ``ACCEL32_GYRO32_NMEA`` or ``OFF``.
-        imu_samples: of a packet, profile ACCEL32_GYRO32_NMEA.
-        timestamp_mode: one of `TIMESTAMP_MODES`; empty: the metadata does not say it.
-        nmea_input: the head gets NMEA by its multipurpose pin.
-        return_order: one of `RETURN_ORDERS`; firmware before 3.1 knows the first only.
-        altitude_rad, azimuth_rad: (beams,) of each row.
+        imu_samples: samples of a packet in profile ACCEL32_GYRO32_NMEA.
+        timestamp_mode: one of `TIMESTAMP_MODES`; empty where the metadata lacks it.
+        nmea_input: whether the head receives NMEA on its multipurpose pin.
+        return_order: one of `RETURN_ORDERS`; firmware before 3.1 has the first only.
+        altitude_rad, azimuth_rad: (beams,) angles of each row.
         pixel_shift: (beams,) columns by which a row of the staggered image is to be shifted.
         beam_origin_m: (x, z) of the beam origin in the frame that turns with the encoder.
         sensor_from_lidar: (4, 4) homogeneous, metres.
@@ -81,20 +81,20 @@ class OusterHead:
     rot_sensor_from_imu: FloatArray
 
     def __deepcopy__(self, memo: dict[int, object]) -> OusterHead:
-        """Return a head never changes: a parser's copy shares it."""
+        """Return the same object: a head never changes, so a parser's copy shares it."""
         return self
 
 
 def beam_points(rows: StructArray, head: OusterHead) -> FloatArray:
-    """Return where returns lie in the maker's sensor frame (Sensor Data, "Lidar Range to XYZ" and "Sensor Coordinate
-    Frame").
+    """Return the points of returns in the maker's sensor frame (Sensor Data, "Lidar Range to XYZ" and "Sensor
+    Coordinate Frame").
 
-    The range counts from the encoder's axis along the way the light goes: over the beam's origin, n off the axis. So
-    the beam is range − n long from there.
+    The range counts from the encoder's axis along the path of the light, via the beam's origin at distance n from the
+    axis. The beam from the origin is therefore range − n long.
 
     Args:
         rows: (n,) `RETURN_DTYPE`; ``encoder_rad`` is the encoder's angle, without the beam's own azimuth.
-        head: of these rows.
+        head: the head that sent these rows.
 
     Returns:
         (n, 3) metres, s frame of CONVENTIONS' multi-beam scanners.
@@ -121,7 +121,7 @@ def read_head(content: bytes) -> OusterHead:
     """Read a head's metadata.
 
     Raises:
-        DriverSettingsError: it is no metadata, or lacks something; the text names the key and what would be right.
+        DriverSettingsError: the metadata is invalid or incomplete; the text names the key and a valid value.
     """
     table = _merged(_json_object(content))
     layout = _Keys(
@@ -192,7 +192,7 @@ def _json_object(content: bytes) -> dict[str, Any]:
 
 
 def _merged(table: dict[str, Any]) -> _Keys:
-    """Return the sections of newer files laid flat, as older ones are."""
+    """Flatten the sections of newer files, so that they read like older ones."""
     flat = dict(table)
     for name in _SECTIONS:
         section = table.get(name)
@@ -205,20 +205,20 @@ def _merged(table: dict[str, Any]) -> _Keys:
 
 @dataclass(frozen=True)
 class _Keys:
-    """Reads a table's values; ``prefix`` is where it stands, for what is said of it."""
+    """Reads a table's values; ``prefix`` is the table's path for error messages."""
 
     table: dict[str, Any]
     prefix: str
 
     def plain(self, key: str, kind: type, want: str) -> Any:
-        """Return a value of this type."""
+        """Return a value of the given type."""
         value = self.table.get(key)
         if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
             raise _wrong(self.prefix + key, value, want)
         return value
 
     def optional(self, key: str, kind: type, default: Any) -> Any:
-        """Return the same, or the default where there is none."""
+        """Return a value of the given type, or the default where the key is missing."""
         wanted = {dict: "a table", str: "text", int: "a whole number"}[kind]
         return default if self.table.get(key) is None else self.plain(key, kind, wanted)
 
@@ -231,14 +231,14 @@ class _Keys:
         return value
 
     def number(self, key: str, bound: float) -> float:
-        """Return a number, not beyond ±bound."""
+        """Return a number within ±bound."""
         value = self.table.get(key)
         if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= bound:
             raise _wrong(self.prefix + key, value, f"a number within ±{bound:g}")
         return float(value)
 
     def numbers(self, key: str, count: int, bound: float) -> FloatArray:
-        """So many numbers, none beyond ±bound."""
+        """Return ``count`` numbers, all within ±bound."""
         want = f"{count} numbers within ±{bound:g}"
         values = self.plain(key, list, want)
         flat = [item for value in values for item in (value if isinstance(value, list) else [value])]
@@ -254,7 +254,7 @@ def _serial(table: _Keys) -> int | None:
 
 
 def _header(layout: _Keys, profile: str) -> str:
-    """Return which packet header comes; the FUSA profile brings its own without being asked."""
+    """Return the kind of packet header; the FUSA profile implies its own header."""
     if profile == "LEGACY":
         return "legacy"
     name = layout.optional("header_type", str, "FUSA" if profile == FUSA_PROFILE else "STANDARD")
@@ -284,7 +284,7 @@ def _angles(table: _Keys, key: str, beams: int, bound_deg: float) -> FloatArray:
 
 
 def _altitudes(table: _Keys, beams: int) -> FloatArray:
-    """Read each beam's altitude; a head that lost its factory calibration says 0 of all: all points in one plane."""
+    """Read each beam's altitude; refuse all zeros, which a head without its factory calibration reports."""
     altitude_rad = _angles(table, "beam_altitude_angles", beams, 90.0)
     if beams > 1 and not altitude_rad.any():
         raise _wrong("beam_altitude_angles", altitude_rad.tolist(), "the head's own: 0 of all beams is no calibration")
@@ -292,7 +292,7 @@ def _altitudes(table: _Keys, beams: int) -> FloatArray:
 
 
 def _transform(table: _Keys, key: str) -> FloatArray:
-    """Return (4, 4) of sixteen numbers, row by row, translations in millimetres."""
+    """Return a (4, 4) matrix from sixteen numbers, row by row, translations in millimetres."""
     matrix = table.numbers(key, 16, 10_000.0).reshape(4, 4)
     rotation = matrix[:3, :3]
     proper = np.abs(rotation @ rotation.T - np.eye(3)).max() < ROTATION_TOLERANCE and np.linalg.det(rotation) > 0
@@ -303,7 +303,9 @@ def _transform(table: _Keys, key: str) -> FloatArray:
 
 
 def _beam_origin(table: _Keys) -> tuple[float, float]:
-    """From the transform of newer files, else from the one number of older ones, which have no offset along z."""
+    """Read the beam origin from the transform of newer files, or the one number of older files without an offset along
+    z.
+    """
     if table.table.get("beam_to_lidar_transform") is not None:
         matrix = _transform(table, "beam_to_lidar_transform")
         return float(matrix[0, 3]), float(matrix[2, 3])

@@ -1,6 +1,6 @@
-"""Ouster's IMU packets: the head's own inertial samples, by its second port.
+"""Ouster's IMU packets: the head's own inertial samples, sent to a second port.
 
-LEGACY: 48 bytes, one sample in g and °/s, read from accelerometer and gyroscope 0.2 ms apart; the maker's advice is the
+LEGACY: 48 bytes, one sample in g and °/s, read from accelerometer and gyroscope 0.2 ms apart; the maker advises the
 mean of both stamps. ACCEL32_GYRO32_NMEA (firmware 3.2): packet header, the last NMEA sentence (100 bytes, not read
 here), samples of 36 bytes in m/s² and rad/s, footer. Source: Ouster Firmware User Manual, "IMU Data Legacy";
 github.com/ouster-lidar/ouster-sdk @ 46b7bce, ouster_client/src/parsing.cpp.
@@ -42,7 +42,7 @@ SAMPLE_DTYPE = np.dtype(
 
 
 def imu_packet_bytes(head: OusterHead) -> int:
-    """Return length of a head's IMU packets; 0 where it sends none that is known here."""
+    """Return the length of a head's IMU packets; 0 where it sends no packets of a known profile."""
     if head.imu_profile == "LEGACY":
         return LEGACY_DTYPE.itemsize
     if head.imu_profile != "ACCEL32_GYRO32_NMEA":
@@ -51,16 +51,16 @@ def imu_packet_bytes(head: OusterHead) -> int:
 
 
 def imu_samples(host_time_ns: Int64Array, units: ByteRows, head: OusterHead) -> tuple[StructArray, int]:
-    """Return samples of IMU packets in the axes of the maker's sensor frame, in order.
+    """Decode the samples of IMU packets in the axes of the maker's sensor frame, in order.
 
     Args:
-        host_time_ns: (n,).
+        host_time_ns: (n,) host time of each packet.
         units: (n, `imu_packet_bytes`).
-        head: of these packets.
+        head: the head that sent the packets.
 
     Returns:
         rows: (m,) `IMU_DTYPE`.
-        bad: how many samples were left out because their numbers are not finite or their stamp cannot be.
+        bad: number of samples left out because their numbers are not finite or their stamp is impossible.
     """
     if head.imu_profile == "LEGACY":
         table = np.ascontiguousarray(units).view(LEGACY_DTYPE)[:, 0]
@@ -92,10 +92,10 @@ def _doubles(values: NDArray[np.float32]) -> FloatArray:
 
 
 def encode_imu_packet(head: OusterHead, time_ns: ArrayLike, force: FloatArray, rate: FloatArray) -> bytes:
-    """Return one IMU packet of the head's profile.
+    """Encode one IMU packet of the head's profile.
 
     Args:
-        head: whose profile and axes are used.
+        head: the head whose profile and axes are used.
         time_ns: (samples,) device time; LEGACY takes one sample.
         force: (samples, 3) m/s², sensor frame.
         rate: (samples, 3) rad/s, sensor frame.

@@ -1,10 +1,10 @@
 """Layout of Ouster's lidar packets as tables, and their encoder.
 
 Little-endian. Packet header (32 bytes), columns, packet footer (32 bytes, CRC-64 last); a column is a header and one
-channel block a beam. The LEGACY profile has neither header nor footer: its columns say the frame and the encoder
+channel block a beam. The LEGACY profile has neither header nor footer: its columns contain the frame and the encoder
 count, and end with the status. Sources: Ouster Firmware User Manual, "Lidar Data" (firmware 2.x and 3.x);
 github.com/ouster-lidar/ouster-sdk @ 46b7bce, ouster_client/src/parsing.cpp. Firmware 4 describes another STANDARD
-header: its packets fail the serial number's check, none is misread.
+header: its packets fail the serial number's check, so that none is misread.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ IMU_PACKET = 2
 ZONE_PACKET = 3
 ZONE_BYTES = HEADER_BYTES + 8 + 32 + 16 * 36 + FOOTER_BYTES
 ENCODER_COUNTS = 90_112  # a revolution, LEGACY only
-NO_CRC = (0, 0xDEADBEEF0000C0DE)  # what firmware without a CRC leaves in its place, as 2.2 and 2.3 do
+NO_CRC = (0, 0xDEADBEEF0000C0DE)  # content in place of a CRC of firmware without one, such as 2.2 and 2.3
 RANGE_MM = 0.001
 
 
@@ -89,7 +89,7 @@ PROFILES: Mapping[str, Profile] = {
     "RNG15_RFL8_NIR8_ZONE16": Profile(2, _LOW_RATE),
 }
 
-# Fields that are not whole words are taken out of the words that hold them: init_id 24 bits, serial 40 bits.
+# Fields that are not whole words are extracted from the words around them: init_id 24 bits, serial 40 bits.
 _HEADERS = {
     "legacy": [],
     "standard": [
@@ -122,16 +122,16 @@ def _table(fields: list[tuple[str, Any, int]], itemsize: int) -> np.dtype[np.voi
 
 @dataclass(frozen=True, eq=False)
 class LidarLayout:
-    """The lidar packets of one head.
+    """Layout of the lidar packets of one head.
 
     Raises:
-        DriverSettingsError: the head's profile is not known here, or its packets cannot be.
+        DriverSettingsError: the head's profile is unknown, or its packets are impossible.
     """
 
     head: OusterHead
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be laid out."""
+        """Refuse an unknown profile or a packet larger than a datagram with `DriverSettingsError`."""
         if self.head.profile not in PROFILES:
             known = ", ".join(PROFILES)
             raise DriverSettingsError(
@@ -141,38 +141,38 @@ class LidarLayout:
             raise DriverSettingsError(f"{FILE}: data_format: its packets are larger than a datagram")
 
     def __deepcopy__(self, memo: dict[int, object]) -> LidarLayout:
-        """Return a layout never changes: a parser's copy shares it."""
+        """Return the same object: a layout never changes, so a parser's copy shares it."""
         return self
 
     @property
     def legacy(self) -> bool:
-        """Neither header nor footer."""
+        """Whether packets have neither header nor footer."""
         return self.head.header == "legacy"
 
     @property
     def profile(self) -> Profile:
-        """Of the channel blocks."""
+        """Profile of the channel blocks."""
         return PROFILES[self.head.profile]
 
     @property
     def dual(self) -> bool:
-        """Two returns a block."""
+        """Whether a block has two returns."""
         return "RANGE2" in self.profile.fields
 
     @property
     def has_crc(self) -> bool:
-        """Whether there is a place for one."""
+        """Whether a packet has a place for a CRC."""
         return self.head.header == "standard"
 
     @cached_property
     def packet_bytes(self) -> int:
-        """Of a packet."""
+        """Length of a packet."""
         around = 0 if self.legacy else HEADER_BYTES + FOOTER_BYTES
         return around + self.head.columns_per_packet * self._column.itemsize
 
     @cached_property
     def dtype(self) -> np.dtype[np.void]:
-        """Of a packet."""
+        """Numpy dtype of a packet."""
         at = 0 if self.legacy else HEADER_BYTES
         fields = [*_HEADERS[self.head.header], ("columns", (self._column, (self.head.columns_per_packet,)), at)]
         if self.has_crc:
@@ -192,13 +192,13 @@ class LidarLayout:
     # -- reading
 
     def field(self, pixels: NDArray[np.uint32], name: str) -> NDArray[np.uint32]:
-        """Return a field of channel blocks (…, words), in the units the maker gives it; (…)."""
+        """Return a field of channel blocks (…, words), in the maker's units; (…)."""
         bits = self.profile.fields[name]
         values = self.raw_field(pixels, name)
         return values << np.uint32(bits.dropped) if bits.dropped else values
 
     def raw_field(self, pixels: NDArray[np.uint32], name: str) -> NDArray[np.uint32]:
-        """Return the same without the low bits that are not sent."""
+        """Return a field of channel blocks without the low bits that are not sent."""
         bits = self.profile.fields[name]
         word = pixels[..., bits.first // 32]
         shift = bits.first % 32
@@ -207,37 +207,39 @@ class LidarLayout:
         return word & np.uint32((1 << bits.size) - 1) if shift + bits.size < 32 else word
 
     def headers(self, units: NDArray[np.uint8]) -> StructArray:
-        """Return (n,) headers of other packets than lidar's, (n, length); LEGACY heads send those with a STANDARD
-        one.
+        """Return (n,) headers of packets (n, length) other than lidar packets; LEGACY heads send those with a STANDARD
+        header.
         """
         kind = "standard" if self.legacy else self.head.header
         content = np.ascontiguousarray(units[:, :HEADER_BYTES])
         return content.view(_table(_HEADERS[kind], HEADER_BYTES)).reshape(-1)
 
     def valid(self, columns: StructArray) -> NDArray[np.bool_]:
-        """Return which columns hold a measurement: bit 0 of the status."""
+        """Return which columns contain a measurement: bit 0 of the status."""
         found: NDArray[np.bool_] = (columns["status"] & 1).astype(np.bool_)
         return found
 
     def first_id(self, columns: StructArray) -> NDArray[np.int64]:
-        """Return (n,) measurement id of the first column of packets' columns (n, columns), by the first valid one."""
+        """Return (n,) measurement id of the first column of packets' columns (n, columns), derived from the first valid
+        one.
+        """
         place = self.valid(columns).argmax(axis=1)
         found: NDArray[np.int64] = columns["id"][np.arange(len(columns)), place].astype(np.int64) - place
         return found
 
     def frame_id(self, packets: StructArray) -> NDArray[np.int64]:
-        """Return (n,) of packets (n,)."""
+        """Return (n,) frame ids of packets (n,)."""
         found: NDArray[Any] = packets["columns"]["frame_id"][:, 0] if self.legacy else packets["frame_id"]
         return found.astype(np.int64)
 
     @property
     def frame_ids(self) -> int:
-        """How many there are until they begin again."""
+        """Number of frame ids before they wrap."""
         return 1 << (32 if self.head.header == "fusa" else 16)
 
     def window_ranks(self) -> NDArray[np.int64]:
-        """Return (packets of a full frame,) which packet of a frame each place on the circle is, −1 where the window
-        has none.
+        """Return (packets of a full frame,) the rank of each place on the circle among a frame's packets, −1 outside
+        the window.
 
         Packets are sent whole, in the order of their measurement ids, where the window reaches into them.
         """
@@ -249,13 +251,13 @@ class LidarLayout:
         return np.where(sent, np.cumsum(sent) - 1, -1).astype(np.int64)
 
     def init_id(self, packets: StructArray) -> NDArray[np.int64]:
-        """Return (n,) number of the head's start; 0 in LEGACY, which does not say it."""
+        """Return (n,) number of the head's start; 0 in LEGACY, which does not contain it."""
         if self.legacy:
             return np.zeros(len(packets), dtype=np.int64)
         return ((packets["init_word"] >> _INIT_SHIFT[self.head.header]) & 0xFF_FFFF).astype(np.int64)
 
     def serial(self, packets: StructArray) -> NDArray[np.int64]:
-        """Return (n,) serial number of packets or headers; not in LEGACY's lidar packets."""
+        """Return (n,) serial number of packets or headers; LEGACY's lidar packets have none."""
         return (packets["serial_word"] & np.uint64((1 << 40) - 1)).astype(np.int64)
 
     # -- writing
@@ -270,12 +272,12 @@ class LidarLayout:
         init_id: int | None = None,
         serial: int | None = None,
     ) -> bytes:
-        """Return one packet, with its CRC where the header is STANDARD.
+        """Encode one packet, with its CRC where the header is STANDARD.
 
         Args:
-            frame_id: of the revolution.
+            frame_id: id of the revolution.
             first_id: measurement id of the first column.
-            time_ns: (columns,) of each column.
+            time_ns: (columns,) time of each column.
             fields: by name, (columns, beams) or one value for all, in the maker's units; absent ones are 0.
             status: (columns,) bit 0: valid.
             init_id, serial: the head's own by default.
@@ -301,12 +303,12 @@ class LidarLayout:
 
 
 def with_crc(packet: bytes) -> bytes:
-    """Return a packet whose last eight bytes are its CRC."""
+    """Replace the last eight bytes of a packet by its CRC."""
     return packet[:-8] + crc64_xz(packet[:-8]).to_bytes(8, "little")
 
 
 def crc_holds(units: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Return (n,) whether packets (n, length) have the CRC of their bytes, or were sent without one."""
+    """Return (n,) whether packets (n, length) have a correct CRC, or were sent without one."""
     said = np.ascontiguousarray(units[:, -8:]).view("<u8")[:, 0]
     holds: NDArray[np.bool_] = np.isin(said, np.array(NO_CRC, dtype=np.uint64))
     for row in np.flatnonzero(~holds).tolist():

@@ -1,13 +1,13 @@
-"""Ouster OS heads: lidar packets of the profiles in `ouster_layout`, IMU packets, told apart by their length.
+"""Ouster OS heads: lidar packets of the profiles in `layout`, and IMU packets, distinguished by their length.
 
-Device time is the column's stamp in nanoseconds, as the head's timestamp_mode lets it count: from power-on
+Device time is the column's stamp in nanoseconds, as the head's timestamp_mode makes it count: from power-on
 (TIME_FROM_INTERNAL_OSC, and TIME_FROM_SYNC_PULSE_IN until NMEA sets the second), or since 1970 on the PTP master's
-scale (TIME_FROM_PTP_1588). Under TIME_FROM_SYNC_PULSE_IN the head counts a second a pulse, so the pulse lies at the
-whole second of device time (Firmware User Manual, "Time Synchronization"). The packets do not say whether pulses
-come: that whole second is given as latched only where the configuration says that a PPS is wired to the head.
+scale (TIME_FROM_PTP_1588). Under TIME_FROM_SYNC_PULSE_IN the head counts one second for each pulse, so the pulse lies
+at the whole second of device time (Firmware User Manual, "Time Synchronization"). The packets do not show whether
+pulses come, so that whole second counts as latched only where the configuration says that a PPS is wired to the head.
 
-Two returns of a block are numbered by range; the manual's return_order says which of them is the strongest, and where
-it orders by range, the one with more signal is.
+Two returns of a block are numbered by range. The metadata's return_order determines which of them is the strongest;
+where it orders by range, the return with more signal is the strongest.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ _ID_AT = 8  # in a column, all profiles
 
 
 class OusterProbe(PacketParser):
-    """Counts what looks like lidar packets; decodes nothing."""
+    """Counts packets that look like lidar packets; decodes nothing."""
 
     def __init__(self, settings: DeviceSettings) -> None:
         super().__init__()
@@ -78,7 +78,7 @@ class OusterProbe(PacketParser):
 
 
 def looks_like_lidar(units: ByteRows) -> BoolArray:
-    """Return (n,) whether packets of one length are of sixteen columns, one behind the other.
+    """Return (n,) whether packets of one length consist of sixteen consecutive columns.
 
     Args:
         units: (n, length).
@@ -94,8 +94,8 @@ def looks_like_lidar(units: ByteRows) -> BoolArray:
 
 
 def _counts_on(units: ByteRows, start: int, column_bytes: int) -> BoolArray:
-    """Return (n,) whether the measurement ids of columns that begin at ``start`` are consecutive, from a multiple of
-    16 on.
+    """Return (n,) whether the measurement ids of columns from byte ``start`` on are consecutive and begin at a multiple
+    of 16.
     """
     at = start + _ID_AT + column_bytes * np.arange(COLUMNS_PER_PACKET)
     ids = units[:, at].astype(np.int64) + 256 * units[:, at + 1].astype(np.int64)
@@ -103,8 +103,8 @@ def _counts_on(units: ByteRows, start: int, column_bytes: int) -> BoolArray:
     return steady
 
 
-LARGEST_GAP_FRAMES = 600  # half a minute to a minute; more is a head that began anew
-# A return as one 64-bit number: range, then 1 for the second of a block, then its light.
+LARGEST_GAP_FRAMES = 600  # half a minute to a minute; a longer gap is a restart of the head
+# A return as one 64-bit number: range, then 1 for the second of a block, then its signal or reflectivity.
 _CONTENT = np.dtype([("intensity", "<u2"), ("second", "<u2"), ("range", "<u4")])
 _SINGLE_FLAGS = {"STRONGEST_TO_WEAKEST": RETURN_FLAG_STRONGEST, "FARTHEST_TO_NEAREST": RETURN_FLAG_LAST}
 
@@ -113,16 +113,16 @@ class OusterParser(PacketParser):
     """Decodes lidar and IMU packets of one head.
 
     Counts ``bad_length``, ``bad_packet_type``, ``wrong_serial`` (another head than the metadata's), ``bad_column``
-    (measurement ids or encoder counts that are none of this configuration), ``outside_window``, ``bad_timestamp``,
+    (measurement ids or encoder counts that this configuration does not have), ``outside_window``, ``bad_timestamp``,
     ``bad_sample`` (of the IMU), ``sequence_gap`` (packets missing), ``out_of_order``, ``duplicate`` and ``restart``;
     packets whose CRC is wrong are ``bad_checksums``.
 
     Args:
         settings: file ``geometry`` (the head's metadata) is needed; key ``pps`` says that a PPS is wired to the head.
-        clock_only: no returns and no IMU samples, and the clock of one lidar packet in 50 ms of host time.
+        clock_only: return no returns and no IMU samples, and clock samples of one lidar packet in 50 ms of host time.
 
     Raises:
-        DriverSettingsError: the metadata is missing, or cannot be worked with.
+        DriverSettingsError: the metadata is missing or unusable.
     """
 
     def __init__(self, settings: DeviceSettings, *, clock_only: bool = False) -> None:
@@ -173,21 +173,21 @@ class OusterParser(PacketParser):
             self.counters.bytes_skipped += count * length
 
     def _keep(self, units: ByteRows, packet_type: int, name: str) -> BoolArray:
-        """Return (n,) which packets with a header are of this kind and whole; all are counted."""
+        """Return (n,) which packets with a header are of this type and intact; count all of them."""
         good = np.ones(len(units), dtype=np.bool_) if self.head.header == "fusa" else crc_holds(units)
         self._select(good, self._origin(self.layout.headers(units), packet_type), units.shape[1])
         self._count(name, int(good.sum()), units.shape[1])
         return good
 
     def _select(self, good: BoolArray, criteria: list[tuple[str, BoolArray]], length: int) -> None:
-        """Strike out of ``good``, the packets with a good checksum, what fails a criterion; all others are counted."""
+        """Clear in ``good`` the packets that fail a criterion; count these and the packets with a bad checksum."""
         self._bad_checksums(int((~good).sum()), length)
         for code, passes in criteria:
             self._refuse(code, int((good & ~passes).sum()), length)
             good &= passes
 
     def _origin(self, headers: StructArray, packet_type: int) -> list[tuple[str, BoolArray]]:
-        """Return what a packet's header must say."""
+        """Return the criteria for a packet's header."""
         criteria: list[tuple[str, BoolArray]] = [("bad_packet_type", headers["type"] == packet_type)]
         if self.head.serial is not None:
             criteria.append(("wrong_serial", self.layout.serial(headers) == self.head.serial))
@@ -242,7 +242,7 @@ class OusterParser(PacketParser):
         return records
 
     def _criteria(self, packets: StructArray) -> list[tuple[str, BoolArray]]:
-        """Return what a lidar packet must pass, in this order."""
+        """Return the criteria for a lidar packet, in the order of their application."""
         criteria = [] if self.layout.legacy else self._origin(packets, LIDAR_PACKET)
         columns, per_packet = packets["columns"], self.head.columns_per_packet
         valid, first_id = self.layout.valid(columns), self.layout.first_id(columns)
@@ -259,7 +259,7 @@ class OusterParser(PacketParser):
         return criteria
 
     def _follow(self, host_time_ns: Int64Array, packets: StructArray) -> tuple[Int64Array, BoolArray]:
-        """Number the packets (n,), gaps left open; False for one that repeats the one before."""
+        """Number the packets (n,) with gaps left open; return False for one that repeats the one before."""
         place = self.layout.first_id(packets["columns"]) // self.head.columns_per_packet
         sequence = self.layout.frame_id(packets) * (int(self._rank.max()) + 1) + self._rank[place]
         time_ns = self._first_times(packets["columns"])
@@ -275,7 +275,7 @@ class OusterParser(PacketParser):
         return np.concatenate([at for at, _ in parts]), np.concatenate([new for _, new in parts])
 
     def _first_times(self, columns: StructArray) -> Int64Array:
-        """Return (n,) stamp of each packet's first valid column; the one before where a packet has none."""
+        """Return (n,) stamp of each packet's first valid column; the previous stamp where a packet has none."""
         valid = self.layout.valid(columns)
         time_ns = columns["time_ns"][np.arange(len(columns)), valid.argmax(axis=1)].astype(np.int64)
         last = np.maximum.accumulate(np.where(valid.any(axis=1), np.arange(len(columns)), -1))
@@ -284,7 +284,7 @@ class OusterParser(PacketParser):
         return filled
 
     def _clock(self, host_time_ns: Int64Array, packets: StructArray) -> StructArray:
-        """Return one `DEVICE_CLOCK_DTYPE` row a packet that has a valid column: the stamp of the last one."""
+        """Return one `DEVICE_CLOCK_DTYPE` row for each packet with a valid column: the stamp of the last one."""
         valid = self.layout.valid(packets["columns"])
         some = np.flatnonzero(valid.any(axis=1))
         last = valid.shape[1] - 1 - valid[some, ::-1].argmax(axis=1)
@@ -300,7 +300,7 @@ class OusterParser(PacketParser):
     # -- returns
 
     def _returns(self, host_time_ns: Int64Array, packets: StructArray, unwrapped: Int64Array) -> StructArray:
-        """Return returns of all packets in order."""
+        """Decode the returns of all packets in order."""
         pulses = self.head.columns_per_packet * self.head.beams
         slots = pulses * (2 if self.layout.dual else 1)
         table, filled = returns_table(len(packets) * slots), 0
@@ -317,7 +317,7 @@ class OusterParser(PacketParser):
         return table[:filled]
 
     def _block(self, columns: StructArray, number: Int64Array, host_time_ns: Int64Array) -> ReturnSlots:
-        """Return the slots of valid columns; ``number`` is each column's, counted from the first frame on."""
+        """Return the slots of valid columns; ``number`` is each column's number, counted from the first frame on."""
         beam = np.arange(self.head.beams)
         dual = self.layout.dual
         flags = 0 if dual else _SINGLE_FLAGS.get(self.head.return_order, 0)
@@ -337,7 +337,7 @@ class OusterParser(PacketParser):
         )
 
     def _content(self, pixels: NDArray[np.uint32]) -> StructArray:
-        """Return (pulses, slots) returns of all beams of all columns: two of rising range, as sent where it is
+        """Return (pulses, slots) returns of all beams of all columns; two are in order of range, or as sent where
         equal.
         """
         first = self._as_numbers(pixels)
@@ -346,7 +346,7 @@ class OusterParser(PacketParser):
         return in_order(first, self._as_numbers(pixels, "2") | np.uint64(1 << 16)).view(_CONTENT)
 
     def _as_numbers(self, pixels: NDArray[np.uint32], which: str = "") -> NDArray[np.uint64]:
-        """Return (pulses,) one of the returns of a block as `_CONTENT` in one number."""
+        """Pack one of the returns of a block as `_CONTENT` into one number, (pulses,)."""
         number = self.layout.raw_field(pixels, f"RANGE{which}").astype(np.uint64).reshape(-1)
         number <<= np.uint64(32)
         number |= self.layout.raw_field(pixels, f"{self._light}{which}").reshape(-1)
@@ -354,13 +354,13 @@ class OusterParser(PacketParser):
 
 
 def _first_is_stronger(returns: StructArray) -> NDArray[np.uint16]:
-    """Return the first of the block is the stronger."""
+    """Rank the first return of a block as the stronger."""
     strength: NDArray[np.uint16] = ~returns["second"]
     return strength
 
 
 def _more_light_is_stronger(returns: StructArray) -> NDArray[np.uint32]:
-    """Return the one of more light, of equal ones the first of the block."""
+    """Rank the return with more light as the stronger, of equal ones the first of the block."""
     strength: NDArray[np.uint32] = (returns["intensity"].astype(np.uint32) << np.uint32(1)) + (1 - returns["second"])
     return strength
 
@@ -387,14 +387,14 @@ DRIVERS = (
 
 
 class HealthReader:
-    """Tells a head's start, alerts and countdowns when they change, and what its metadata says beside them."""
+    """Reports a head's start, alerts and countdowns when they change, together with facts from its metadata."""
 
     def __init__(self, layout: LidarLayout) -> None:
         self._layout = layout
         self._last: tuple[int, ...] | None = None
 
     def read(self, host_time_ns: Int64Array, packets: StructArray) -> list[DeviceStatus]:
-        """Return one record a change in packets (n,), n at least 1, in order."""
+        """Return one record for each change in packets (n,), n at least 1, in order."""
         said = np.zeros((len(packets), 1 + len(HEALTH)), dtype=np.int64)
         said[:, 0] = self._layout.init_id(packets)
         if not self._layout.legacy:

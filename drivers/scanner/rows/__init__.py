@@ -1,1 +1,1 @@
-"""Slots of returns, filled by NumPy or by compiled loops."""
+"""Slots of returns, converted to rows by NumPy or by compiled loops."""

@@ -1,7 +1,7 @@
-"""The loop that writes rows, compiled by numba: what `ReturnSlots.fill` does column by column, in one go.
+"""Writes rows in one loop compiled by numba, with the same result as `ReturnSlots.fill`, which works by columns.
 
-numba comes with ``swath[process]``. The recorder does without: this module is imported where `DeviceSettings.compiled`
-asks for it, and nowhere else. To compile takes about a second for each kind of slots, once where numba may keep it on
+numba comes with ``swath[process]``. The recorder runs without it: this module is imported only where
+`DeviceSettings.compiled` is set. Compiling takes about a second for each kind of slots, once where numba may keep it on
 disk (beside this file, in the user's cache or in ``NUMBA_CACHE_DIR``), else in every process.
 """
 
@@ -16,7 +16,7 @@ import numpy as np
 from swath.drivers.scanner.rows.slots import ReturnSlots
 from swath.georef.records import RETURN_DTYPE, RETURN_FLAG_LAST, RETURN_FLAG_STRONGEST, StructArray
 
-# A row's last word is written as one number, as `slots.common_words` begins it.
+# A row's last word is written as one number, starting from `slots.common_words`.
 _WORDS = RETURN_DTYPE.itemsize // 8
 _NUMBER_SHIFT, _COUNT_SHIFT = np.uint64(16), np.uint64(24)
 _STRONGEST, _LAST = np.uint64(RETURN_FLAG_STRONGEST << 40), np.uint64(RETURN_FLAG_LAST << 40)
@@ -26,7 +26,7 @@ _NOT_NUMBERS = ~np.uint64(0xFFFF0000)
 
 
 def fill(slots: ReturnSlots, table: StructArray) -> int:
-    """As `ReturnSlots.fill`, bit for bit."""
+    """Write the same rows as `ReturnSlots.fill`, bit for bit."""
     content, pair, width_unit_ns = slots.content[:, slots.others :], slots.pair, slots.pulse_width_unit_ns
     of_pulse = {
         name: np.broadcast_to(made_of(lambda values: values), slots.shape) for name, made_of in slots.per_pulse.items()
@@ -72,8 +72,11 @@ def _rows_written(
     encoder_rad: Any,
     channel: Any,
 ) -> int:
-    """Return slots (m · n, s), what is the pulse's (m, n), ``pulse_id`` (m,); ``words`` are the table's."""
-    filled = np.uint64(0)  # unsigned, as the pulse: a signed index is looked at for counting from the end
+    """Write the rows and return their number.
+
+    The slots are (m · n, s), values of pulses (m, n), ``pulse_id`` (m,); ``words`` are the table's words.
+    """
+    filled = np.uint64(0)  # unsigned, like the pulse: numba checks a signed index for counting from the end
     for i in range(host_time_ns.shape[0]):
         for j in range(host_time_ns.shape[1]):
             pulse = np.uint64(i * host_time_ns.shape[1] + j)
@@ -118,7 +121,7 @@ _writers: dict[tuple[Any, ...], Callable[..., int]] = {}
 
 
 def _written(*arguments: Any) -> int:
-    """Return `_rows_written`, compiled once for each kind of slots, whatever the shapes and strides of its arrays."""
+    """Run `_rows_written`, compiled once for each kind of slots, for any shapes and strides of its arrays."""
     kind = tuple(getattr(argument, "dtype", type(argument)) for argument in arguments)
     writer = _writers.get(kind)
     if writer is None:
@@ -127,17 +130,17 @@ def _written(*arguments: Any) -> int:
 
 
 def _compiled(arguments: tuple[Any, ...]) -> Callable[..., int]:
-    """For arguments of these types, kept on disk where there is a place for it.
+    """Compile for arguments of these types, and keep the result on disk where a folder is writable.
 
-    Left alone, numba would compile anew for each combination of contiguous, strided and aligned arrays, and a batch of
-    one packet is another than one of two.
+    By default numba would compile again for each combination of contiguous, strided and aligned arrays, and batches of
+    one packet and of two differ in that.
     """
     table, words, *others = (_typeof(argument) for argument in arguments)
     signature = numba.types.int64(table, words, *(_any_strides(kind) for kind in others))
     compiled: Callable[..., int]
     try:
         compiled = _njit(signature, nogil=True, cache=True)(_rows_written)
-    except RuntimeError:  # no folder may be written to
+    except RuntimeError:  # no folder is writable
         compiled = _njit(signature, nogil=True)(_rows_written)
     return compiled
 

@@ -1,4 +1,4 @@
-"""Chooses who fills the rows of returns: NumPy, or the same loops compiled."""
+"""Selects the function that fills the rows of returns: NumPy or compiled loops."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from swath.drivers.scanner.rows.slots import Fill, ReturnSlots
 
 
 def filler(*, compiled: bool) -> Fill:
-    """Return `ReturnSlots.fill`, or the same compiled.
+    """Return `ReturnSlots.fill` or its compiled equivalent.
 
     Raises:
         DriverSettingsError: numba is not installed.

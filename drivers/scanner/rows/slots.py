@@ -1,4 +1,6 @@
-"""From slots to rows: datagrams keep a fixed number of places for returns, `ScannerReturns` has a row a return."""
+"""Converts slots to rows: datagrams have a fixed number of slots for returns, `ScannerReturns` has a row for each
+return.
+"""
 
 from __future__ import annotations
 
@@ -12,12 +14,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from swath.georef.records import RETURN_DTYPE, RETURN_FLAG_LAST, RETURN_FLAG_STRONGEST, Int64Array, StructArray
 
-# Slots worked on at once: so few that columns stay in the second-level cache, so many that what NumPy spends on each
-# call does not count.
+# Slots processed at once: few enough that columns stay in the second-level cache, many enough that NumPy's cost of
+# each call is negligible.
 BLOCK_SLOTS = 32768
 
-# Work is done column by column, where NumPy is quick, and rows are written once, in 64-bit words: columns of words are
-# transposed. `common_words` are the last of a row, its fields from the channel on.
+# Work is done column by column, where NumPy is fast, and rows are written once, in 64-bit words: columns of words are
+# transposed. `common_words` are the last word of a row, with its fields from the channel on.
 _WORDS = RETURN_DTYPE.itemsize // 8
 
 Chosen: TypeAlias = Callable[[NDArray[Any]], NDArray[Any]]
@@ -26,7 +28,7 @@ Fill: TypeAlias = "Callable[[ReturnSlots, StructArray], int]"
 
 @cache
 def _place(name: str) -> tuple[int, np.dtype[np.void]]:
-    """Return the word a field is in, and that word as a table of this field."""
+    """Return the word that contains a field, and the dtype of that word with this field."""
     fields = RETURN_DTYPE.fields
     assert fields is not None
     kind, at = fields[name][:2]
@@ -42,11 +44,11 @@ def _column(words: NDArray[np.uint64], name: str) -> NDArray[Any]:
 
 @dataclass(frozen=True, slots=True)
 class PairRule:
-    """How two returns of a pulse are flagged, of which the nearer comes first; an only one is strongest and last.
+    """Rule for the flags of two returns of a pulse, the nearer first; a single return is both strongest and last.
 
     Attributes:
-        strength: of returns (n,), fields as those of `ReturnSlots.content`: the greater of two is the stronger; never
-            equal.
+        strength: strength of returns (n,), with the fields of `ReturnSlots.content`: the greater of two is the
+            stronger; never equal.
         names_strongest: one of the two is the strongest return, that of greater strength.
         names_last: one of the two is the last return, the farther.
     """
@@ -56,9 +58,9 @@ class PairRule:
     names_last: bool
 
     def flags(self, returns: StructArray, number: NDArray[np.uint8], count: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Return (n,) of consecutive returns with their numbers, of pulses that have so many."""
+        """Return (n,) flags of consecutive returns, from their numbers and the counts of their pulses."""
         strength = np.ascontiguousarray(self.strength(returns))
-        # choices are multiplications by 0 or 1: np.where takes ten times as long on conditions that keep changing
+        # choices are multiplications by 0 or 1: np.where takes ten times as long on conditions that vary often
         second = (number[1:] == 2).view(np.uint8)
         near_strongest = (strength[:-1] > strength[1:]).view(np.uint8) * second
         strongest, last = np.uint8(RETURN_FLAG_STRONGEST * self.names_strongest), np.uint8(RETURN_FLAG_LAST)
@@ -70,24 +72,23 @@ class PairRule:
 
 @dataclass(slots=True)
 class ReturnSlots:
-    """The places for returns of consecutive pulses, in the order of emission.
+    """The slots for returns of consecutive pulses, in the order of emission.
 
-    The pulses are m times n, for example packets and their pulses, so that what only one of the two tells need not be
-    spread over all pulses: such arrays are (m, 1) or (1, n), others (m, n).
+    The pulses are m times n, for example packets and their pulses, so that a value of one dimension need not be
+    repeated for all pulses: such arrays are (m, 1) or (1, n), others (m, n).
 
     Attributes:
         content: (pulses, slots), contiguous, of 4 or 8 bytes, which are gathered at once; fields ``range`` (the
-            device's unit, 0 where there is no return), ``intensity`` and whatever `pair` and `pulse_width_unit_ns` ask
-            for.
+            device's unit, 0 without a return), ``intensity`` and the fields that `pair` and `pulse_width_unit_ns` need.
         range_unit_m: metres of one raw unit.
-        common: `common_words` of the pulses, an array as those.
+        common: `common_words` of the pulses, an array of such a shape.
         shape: (m, n).
-        pulse_id: (m,) of the first of n pulses; the others count on.
-        per_pulse: fields of `RETURN_DTYPE` that are the pulse's: what makes them of such arrays, elementwise, each
-            handed to its argument first, which spreads it over the pulses that are wanted.
-        pair: flags of returns in two slots beside the common ones; None: there are none.
+        pulse_id: (m,) id of the first of n pulses; the others count up from it.
+        per_pulse: functions that make the fields of `RETURN_DTYPE` with one value for each pulse from such arrays,
+            elementwise; each must first pass its arrays to its argument, which selects the values of the wanted pulses.
+        pair: rule for the flags of returns in two slots, beside the common flags; None: no such flags.
         pulse_width_unit_ns: nanoseconds of a unit of the field ``pulse_width``; None: unknown.
-        others: slots at the front of each pulse that hold something else.
+        others: slots at the front of each pulse with other content.
     """
 
     content: StructArray
@@ -101,10 +102,10 @@ class ReturnSlots:
     others: int = 0
 
     def fill(self, table: StructArray) -> int:
-        """Write the returns there are, ordered by pulse, then by slot, to the head of ``table``; returns their number.
+        """Write all returns, ordered by pulse, then by slot, to the head of ``table``; return their number.
 
         Args:
-            table: `RETURN_DTYPE`, at least as many rows as there are slots.
+            table: `RETURN_DTYPE`, with at least as many rows as slots.
         """
         slots, content = self.content.shape[1], self.content.reshape(-1)
         there = content["range"] != 0
@@ -126,16 +127,16 @@ class ReturnSlots:
         return len(index)
 
     def _write_all_pulses(self, words: NDArray[np.uint64]) -> None:
-        """What all returns of a pulse have in common, where every pulse has one."""
+        """Write the values common to all returns of a pulse, where every pulse has one return."""
         words[-1].reshape(self.shape)[:] = self.common
         _column(words, "pulse_id").reshape(self.shape)[:] = self.pulse_id[:, np.newaxis] + np.arange(self.shape[1])
         for name, made_of in self.per_pulse.items():
             _column(words, name).reshape(self.shape)[:] = made_of(lambda values: values)
 
     def _write_pulses(self, words: NDArray[np.uint64], pulse: NDArray[np.intp]) -> None:
-        """The same of these pulses, in order."""
+        """Write the values common to all returns of a pulse for these pulses, in order."""
         m, n = self.shape
-        # pulses of a row are neighbours: to repeat its value takes half as long as to gather it, unless it has but one
+        # pulses of a row are neighbours: repeating its value takes half as long as gathering it, unless it has one only
         counts = None if n == 1 else np.diff(pulse.searchsorted(np.arange(m + 1) * n))
         minor = np.zeros_like(pulse) if counts is None else pulse - np.repeat(np.arange(m) * n, counts)
 
@@ -155,15 +156,15 @@ class ReturnSlots:
     def _write_numbers(
         self, words: NDArray[np.uint64], returns: StructArray, number: NDArray[np.uint8], count: NDArray[np.uint8]
     ) -> None:
-        """Which return of how many, and what follows from it."""
-        # the two bytes after the channel's
+        """Write the number of each return, the count of its pulse, and the flags that follow from them."""
+        # the two bytes after the channel
         words[-1].view("<u2")[1::4] = number | count.astype(np.uint16) << 8
         if self.pair is not None:
             flags = _column(words, "flags")
             flags |= self.pair.flags(returns, number, count)
 
     def _write_returns(self, words: NDArray[np.uint64], returns: StructArray) -> None:
-        """What is the return's own."""
+        """Write the values of each single return."""
         np.multiply(returns["range"], self.range_unit_m, out=_column(words, "range_m"))
         _column(words, "intensity")[:] = returns["intensity"]
         width = _column(words, "pulse_width_ns")
@@ -174,7 +175,9 @@ class ReturnSlots:
 
 
 def _numbers(pulse: NDArray[np.intp], slots: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Return return_number and number_of_returns of returns of these pulses, in order, each with so many at most."""
+    """Return return_number and number_of_returns of returns in the order of their pulses; ``slots`` is the maximum of a
+    pulse.
+    """
     number, count = np.ones((2, len(pulse)), dtype=np.uint8)
     for lag in range(1, slots):
         same = (pulse[lag:] == pulse[:-lag]).view(np.uint8)
@@ -195,7 +198,7 @@ def in_order(one: NDArray[Any], other: NDArray[Any]) -> NDArray[Any]:
 def common_words(
     shape: tuple[int, int], channel: ArrayLike = 0, mta_zone: ArrayLike = 0, flags: ArrayLike = 0
 ) -> NDArray[np.uint64]:
-    """Return last words of the rows of pulses that have one return."""
+    """Return the last words of rows of pulses that have one return."""
     rows = np.zeros(shape, dtype=RETURN_DTYPE)
     rows["return_number"] = rows["number_of_returns"] = 1
     rows["channel"], rows["mta_zone"], rows["flags"] = channel, mta_zone, flags
@@ -203,5 +206,5 @@ def common_words(
 
 
 def returns_table(slots: int) -> StructArray:
-    """Return a `RETURN_DTYPE` table for at most so many returns; what is not written to takes no memory."""
+    """Return a `RETURN_DTYPE` table for at most ``slots`` returns; rows that are never written take no memory."""
     return np.empty(slots, dtype=RETURN_DTYPE)

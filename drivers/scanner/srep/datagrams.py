@@ -1,4 +1,4 @@
-"""SREP datagrams as they are handed over: blocks of equal length, the lengths of which alternate as a scan's do."""
+"""SREP datagrams as received: blocks of equal length; lengths alternate like those of a scan."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Datagrams:
 
     Attributes:
         host_time_ns: (n,) host time of each.
-        blocks: uint8, (mᵢ, lengthᵢ) each and possibly strided, n rows together; none is empty.
+        blocks: uint8, (mᵢ, lengthᵢ) each and possibly strided, n rows together; each has at least one row.
     """
 
     host_time_ns: Int64Array
@@ -31,12 +31,12 @@ class Datagrams:
         return len(self.host_time_ns)
 
     def lengths(self) -> Int64Array:
-        """Return (n,) bytes of each."""
+        """Return (n,) bytes of each datagram."""
         lengths = np.array([block.shape[1] for block in self.blocks], dtype=np.int64)
         return lengths.repeat([len(block) for block in self.blocks])
 
     def where(self, wanted: BoolArray) -> Datagrams:
-        """Return those that are wanted, (n,); nothing is copied where all are."""
+        """Return the wanted datagrams, (n,); data are not copied where all are wanted."""
         if wanted.all():
             return self
         blocks, first = [], 0
@@ -54,7 +54,7 @@ class Datagrams:
         return np.concatenate([block[:, :HEADER_BYTES] for block in self.blocks]).view(HEADER_DTYPE)[:, 0]
 
     def agree_with_crc(self) -> BoolArray:
-        """Return (n,) True where the last four bytes are the CRC of all before."""
+        """Return (n,) True where the last four bytes are the CRC of all bytes before."""
         if not self.blocks:
             return np.empty(0, dtype=np.bool_)
         said = np.concatenate([block[:, -CRC.size :] for block in self.blocks]).view("<u4")[:, 0]
@@ -63,24 +63,22 @@ class Datagrams:
         return agree
 
     def bodies(self) -> NDArray[np.uint64]:
-        """Return pulse records of all datagrams, one behind the other, in words: as many of each as `body_words`
-        tells.
-        """
+        """Return pulse records of all datagrams, one behind the other, in words: `body_words` of each datagram."""
         bodies = [block[:, HEADER_BYTES : -CRC.size] for block in self.blocks]
         words = np.empty(sum(body.size for body in bodies) // 8, dtype="<u8")
         data, at = words.view(np.uint8), 0
         for body in bodies:
-            # row by row: field by field it takes ten times as long
+            # row by row: copying field by field takes ten times as long
             data[at : at + body.size].reshape(body.shape)[:] = body
             at += body.size
         return words
 
 
 def clock_samples(host_time_ns: Int64Array, header: StructArray, words: NDArray[np.uint64]) -> StructArray:
-    """Return `DEVICE_CLOCK_DTYPE` rows (n,), one a datagram: the counter at its last pulse beside the latched one.
+    """Return `DEVICE_CLOCK_DTYPE` rows (n,), one a datagram: the counter at its last pulse and the latched counter.
 
     Args:
-        host_time_ns, header: (n,) of the datagrams.
+        host_time_ns, header: (n,) host times and headers of the datagrams.
         words: their `Datagrams.bodies`.
     """
     rows = np.empty(len(header), dtype=DEVICE_CLOCK_DTYPE)

@@ -56,24 +56,24 @@ _SECONDS = 1 << 32
 
 @cache
 def pulse_dtype(return_slots: int) -> np.dtype[np.void]:
-    """Return layout of one pulse record with R return slots: 8 + 8·R bytes."""
+    """Return the dtype of one pulse record with R return slots: 8 + 8·R bytes."""
     return np.dtype([("ticks", "<u4"), ("encoder", "<i4"), ("slot", SLOT_DTYPE, (return_slots,))])
 
 
 def datagram_bytes(pulses: int, return_slots: int) -> int:
-    """Return the only right length of a datagram."""
+    """Return the correct length of a datagram."""
     return HEADER_BYTES + pulses * (PULSE_HEAD_BYTES + SLOT_BYTES * return_slots) + CRC.size
 
 
 def body_words(header: StructArray) -> Int64Array:
-    """Return words of 64 bits that the pulses of datagrams take, (n,) of headers (n,)."""
+    """Return the number of 64-bit words of each datagram's pulses, (n,) of headers (n,)."""
     words: Int64Array = header["pulses"].astype(np.int64) * (1 + header["return_slots"].astype(np.int64))
     return words
 
 
 @dataclass(frozen=True, slots=True)
 class SrepHeader:
-    """What a datagram says beside its pulses; names and units of the protocol page."""
+    """Fields of a datagram beside its pulses; names and units of the protocol page."""
 
     sequence: int = 0
     scanner_id: int = 0
@@ -95,10 +95,10 @@ def encode_datagram(
     intensity: ArrayLike = 0,
     pulse_width_10ps: ArrayLike = 0,
 ) -> bytes:
-    """Return one datagram.
+    """Encode one datagram.
 
     Args:
-        header: all fields of the header but N and R.
+        header: all fields of the header except N and R.
         ticks: (N,) u32 since first_ticks.
         encoder: (N,) i32 counts.
         range_0p1mm: (N, R) u32, 0 = no return; its shape gives N and R.
@@ -115,7 +115,7 @@ def encode_datagram(
 
 
 def encode_datagrams(header: StructArray, body: StructArray) -> list[bytes]:
-    """Return datagrams of equal length.
+    """Encode datagrams of equal length.
 
     Args:
         header: (m,) `HEADER_DTYPE`; magic, version, N and R are filled in here.
@@ -132,17 +132,17 @@ def encode_datagrams(header: StructArray, body: StructArray) -> list[bytes]:
 
 
 def nanoseconds(ticks: NDArray[np.uint64], tick_hz: NDArray[np.uint32]) -> Int64Array:
-    """Return tick counter to device time, both (n,): floor(ticks · 10⁹ / tick_hz), seconds modulo 2³²."""
+    """Convert the tick counter to device time, both (n,): floor(ticks · 10⁹ / tick_hz), seconds modulo 2³²."""
     hz = tick_hz.astype(np.uint64)
     seconds, rest = np.divmod(ticks, hz)
     return ((seconds % np.uint64(_SECONDS)) * np.uint64(SECOND_NS) + rest * np.uint64(SECOND_NS) // hz).astype(np.int64)
 
 
 def header_checks(header: StructArray, length: Int64Array) -> list[tuple[str, BoolArray]]:
-    """Return what headers (n,) of datagrams of these lengths (n,) must say, by the code a failure is counted under.
+    """Check headers (n,) of datagrams of these lengths (n,).
 
     Returns:
-        (n,) True where it does, by code.
+        (error code, (n,) True where the check passes) of each check.
     """
     pulses, slots = header["pulses"], header["return_slots"]
     return [
@@ -161,10 +161,10 @@ def header_checks(header: StructArray, length: Int64Array) -> list[tuple[str, Bo
 
 @dataclass(frozen=True, slots=True)
 class PulseRows:
-    """How the pulses of datagrams are laid out: a row is a datagram where all have equally many, else a pulse.
+    """Arrangement of the pulses of datagrams: a row is a datagram where all have equally many pulses, else a pulse.
 
     Attributes:
-        shape: rows, pulses of each.
+        shape: number of rows, pulses of each.
         counts: pulses of each datagram (n,), where a row is a pulse.
     """
 
@@ -173,18 +173,20 @@ class PulseRows:
 
     @classmethod
     def of(cls, pulses: NDArray[np.uint16]) -> PulseRows:
-        """Make that of datagrams that have so many (n,)."""
+        """Make the arrangement for datagrams with these numbers of pulses (n,)."""
         if (pulses == pulses[0]).all():
             return cls((len(pulses), int(pulses[0])))
         counts = pulses.astype(np.intp)
         return cls((int(counts.sum()), 1), counts)
 
     def spread(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Return what is said of datagrams (n,), of each row."""
+        """Repeat values of datagrams (n,) for each row."""
         return values if self.counts is None else np.repeat(values, self.counts)
 
     def first_ids(self, ids: Int64Array) -> Int64Array:
-        """Of each row's first pulse, where the first of each datagram (n,) has these, and the others count on."""
+        """Return the id of each row's first pulse; ``ids`` are those of each datagram's first pulse (n,), and the
+        others count up.
+        """
         if self.counts is None:
             return ids
         before = np.cumsum(self.counts) - self.counts
@@ -196,7 +198,7 @@ class PulseRows:
 def pulse_times(header: StructArray, ticks: NDArray[np.uint32], rows: PulseRows) -> Int64Array:
     """Return device times of pulses ``ticks`` after each datagram's first, of datagrams (n,) with one tick_hz.
 
-    The whole seconds are split off before: (rest + ticks) · 10⁹ < 2³³ · 10⁹ fits int64. Ticks and times are laid out
+    The whole seconds are split off before: (rest + ticks) · 10⁹ < 2³³ · 10⁹ fits int64. Ticks and times are arranged
     as ``rows``.
     """
     hz = int(header["tick_hz"][0])

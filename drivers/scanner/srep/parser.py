@@ -53,14 +53,14 @@ from swath.georef.records import (
     StructArray,
 )
 
-FLAG_NO_POINT = 128  # of a row that stands there for its neighbours and is no return
-SAME_RATE = 1e-3  # pulse rates that differ by less, as measured ones do, are one
+FLAG_NO_POINT = 128  # marks a row without a return, which only gives a pulse's time and encoder reading
+SAME_RATE = 1e-3  # pulse rates that differ by less, relatively, count as equal: measured rates fluctuate
 
 __all__ = ["DRIVERS", "ScanAngle", "SrepHeader", "SrepParser", "encode_datagram"]
 
 
 class ScanAngle:
-    """Encoder reading to scan angle θ_encoder and facet (PROTOCOLS, "Encoder to scan angle").
+    """Converts an encoder reading to scan angle θ_encoder and facet (PROTOCOLS, "Encoder to scan angle").
 
     Args:
         config: the scanner's table; ``mirror_factor`` is mandatory, ``geometry.facets`` is for a polygon.
@@ -88,14 +88,14 @@ class ScanAngle:
     def angles(
         self, encoder: NDArray[np.int32], encoder_counts: int
     ) -> tuple[NDArray[np.float64], NDArray[np.uint16] | None]:
-        """Scan angles (n, N) in radians and, of a polygon, facets (n, N) of readings (n, N)."""
+        """Return scan angles (n, N) in radians and, for a polygon, facets (n, N) of readings (n, N)."""
         turned = encoder.astype(np.float64)
         if not self._facets:
             turned *= 2 * np.pi * self._factor / encoder_counts
             return turned, None
-        # Whole and half numbers below 2⁴⁸, of which every sum, difference and product here is exact, and the floor of a
-        # quotient too: one that is not whole is further from the next than its rounding goes. np.divmod takes ten times
-        # as long.
+        # Whole and half numbers below 2⁴⁸: every sum, difference and product here is exact, and so is the floor of a
+        # quotient, as one that is not whole differs from the next whole by more than its rounding. np.divmod takes ten
+        # times as long.
         turned *= self._facets
         facet = np.floor(turned / encoder_counts)
         turned -= (facet + 0.5) * encoder_counts
@@ -106,18 +106,19 @@ class ScanAngle:
 
 
 class SrepParser(PacketParser):
-    """Decodes datagrams; counts ``bad_length``, ``bad_magic``, ``bad_version``, ``bad_header`` and the CRC's failures.
+    """Decodes datagrams; counts ``bad_length``, ``bad_magic``, ``bad_version``, ``bad_header`` and bad CRCs.
 
     Args:
         settings: config keys ``mirror_factor``, ``geometry``.
-        clock_only: give clock samples (one in 50 ms of host time) and status, no returns; only the CRCs of those
+        clock_only: return clock samples (one in 50 ms of host time) and status, no returns; only the CRCs of those
             datagrams, and of those that break the sequence, are then computed.
 
     Attributes:
-        emissions: where ranges are apparent (byte 15 = 255) a pulse without a return is a row too, of range 0 and no
-            returns, flagged `FLAG_NO_POINT`: who looks for an echo's emission needs time and encoder of all of them.
-        tell_rates: told ``pulse_id``, pulse rate in Hz (0: unsaid) and tick_hz of the first datagram, and of each whose
-            rates are others, before its returns are given.
+        emissions: if True, where ranges are apparent (byte 15 = 255), a pulse without a return makes a row too, of
+            range 0 and no returns, flagged `FLAG_NO_POINT`: matching echoes to emissions needs time and encoder of all
+            pulses.
+        tell_rates: called with ``pulse_id``, pulse rate in Hz (0: unknown) and tick_hz of the first datagram, and of
+            each datagram with other rates, before its returns are handed over.
     """
 
     def __init__(self, settings: DeviceSettings, *, clock_only: bool = False) -> None:
@@ -138,7 +139,9 @@ class SrepParser(PacketParser):
         return self._parse(Datagrams(host_time_ns, [units])) if len(units) else []
 
     def feed_batches(self, batches: Sequence[ChunkBatch]) -> list[Record]:
-        """Decode datagrams of any lengths at once, for a scanner that ends one where its zone changes mixes lengths."""
+        """Decode datagrams of any lengths at once: a scanner that ends a datagram where its zone changes mixes
+        lengths.
+        """
         held = [batch for batch in batches if len(batch.units)]
         if not held:
             return []
@@ -172,7 +175,7 @@ class SrepParser(PacketParser):
         return records
 
     def _forward(self, unwrapped: Int64Array) -> BoolArray:
-        """Return (n,) True for datagrams that came in their place: a late one would look like a clock that went
+        """Return (n,) True for datagrams in order: the clock sample of a late one would look like a clock that went
         back.
         """
         newest = np.maximum.accumulate(np.concatenate([[self._newest], unwrapped]))
@@ -181,7 +184,7 @@ class SrepParser(PacketParser):
         return forward
 
     def _check(self, units: Datagrams) -> tuple[Datagrams, StructArray, BoolArray]:
-        """Return whole datagrams, their headers, and which of them are decoded; the others are counted."""
+        """Return valid datagrams, their headers, and which of them are decoded; the others are counted."""
         chosen = np.ones(len(units), dtype=np.bool_)
         if self._thinner is not None:
             chosen = self._thinner.choose(units.host_time_ns)
@@ -208,7 +211,7 @@ class SrepParser(PacketParser):
         return units, header, chosen
 
     def _breaks(self, sequence: NDArray[np.uint32], good: BoolArray) -> BoolArray:
-        """Return where a datagram does not follow the one before, beginning with the last of the batch before."""
+        """Return where a datagram does not follow the one before, starting from the last one of the previous batch."""
         follows = np.zeros(len(sequence), dtype=np.bool_)
         if not len(sequence):
             return follows
@@ -250,8 +253,8 @@ class SrepParser(PacketParser):
     def _returns(
         self, host_time_ns: Int64Array, header: StructArray, words: NDArray[np.uint64], unwrapped: Int64Array
     ) -> StructArray:
-        """Return returns of all datagrams, whose `Datagrams.bodies` these are, in order, decoded in blocks of one
-        layout.
+        """Decode the returns of all datagrams in order, in blocks of one layout; ``words`` are their
+        `Datagrams.bodies`.
         """
         fired = header["pulses"] > 0
         if not fired.all():
@@ -272,11 +275,11 @@ class SrepParser(PacketParser):
         return table[:filled]
 
     def _fill_all(self, block: ReturnSlots, apparent: BoolArray, table: StructArray) -> int:
-        """As `fill`; a pulse without a return is a row as well where ranges are ``apparent``, of pulses in order."""
+        """Fill rows in order of pulses, also a row for each pulse without a return where ranges are ``apparent``."""
         content = block.content.copy()
         returns = np.count_nonzero(content["range"][:, block.others :], axis=1)
         alone = (returns == 0) & apparent
-        content["range"][alone, block.others] = 1  # so that there is a row
+        content["range"][alone, block.others] = 1  # makes `fill` write a row
         block.content = content
         filled = self._fill(block, table)
         rows = np.where(alone, 1, returns)
@@ -289,7 +292,7 @@ class SrepParser(PacketParser):
     def _block(
         self, host_time_ns: Int64Array, header: StructArray, words: NDArray[np.uint64], unwrapped: Int64Array
     ) -> ReturnSlots:
-        """Return the slots of datagrams of one layout, whose pulses these words are."""
+        """Return the slots of datagrams of one layout; ``words`` are those of their pulses."""
         slots = int(header["return_slots"][0])
         rows = PulseRows.of(header["pulses"])
         words = words.reshape(-1, 1 + slots)
@@ -306,7 +309,7 @@ class SrepParser(PacketParser):
             per_pulse["channel"] = lambda at: at(facet)
         locked = (header["flags"] & FLAG_PPS_LOCKED) * np.uint8(RETURN_FLAG_PPS_LOCKED)
         common = common_words((len(header), 1), mta_zone=header["mta_zone"][:, np.newaxis], flags=locked[:, np.newaxis])
-        # a pulse's head lies as one more slot before its own; beside a single slot, which pulses mostly fill, it is
+        # a pulse's head takes one more slot before its own; beside a single slot, which pulses mostly fill, it is
         # left out
         content = np.ascontiguousarray(words[:, 1:] if slots == 1 else words).view(SLOT_DTYPE)
         return ReturnSlots(
@@ -324,7 +327,8 @@ class SrepParser(PacketParser):
 def _same_layout(header: StructArray, slots: Int64Array) -> list[tuple[int, int]]:
     """Return bounds of runs of datagrams of one layout: equal R, tick_hz and encoder_counts.
 
-    None is of more than `BLOCK_SLOTS` slots (or one datagram); ``slots`` are those of all to the end of each, (n,).
+    Each run has at most `BLOCK_SLOTS` slots, or one datagram; ``slots`` (n,) are cumulative counts to the end of each
+    datagram.
     """
     names = ("return_slots", "tick_hz", "encoder_counts")
     layout = np.stack([header[name].astype(np.int64) for name in names], axis=1)

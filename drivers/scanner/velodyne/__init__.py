@@ -1,1 +1,1 @@
-"""Velodyne heads."""
+"""Velodyne spinning heads: parser, models, calibration and position packets."""

@@ -1,8 +1,8 @@
-"""A Velodyne head's own calibration: the maker's db.xml, or the YAML file ROS makes of it.
+"""Reads a Velodyne head's own calibration: the maker's db.xml, or the YAML file that ROS makes from it.
 
 Facts from ros-drivers/velodyne (gen_calibration.py, calibration.cpp): the XML is in degrees and centimetres, the YAML
-in radians and metres; rotational corrections are subtracted from the azimuth. The beam's start and direction are
-FORMULAS 2.2's, as verified there against that driver.
+in radians and metres; rotational corrections are subtracted from the azimuth. The beam's start and direction follow
+FORMULAS 2.2, which was verified against that driver.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from swath.drivers.scanner.beams import BeamTable, beam_table
 from swath.drivers.scanner.velodyne.heads import SpinningHead
 
 _MOST_BYTES = 256 * 1024  # ten times the file of 128 lasers
-_MOST_LEVELS = 16  # a file has three
-_KEYS = (  # in the XML without its trailing underscore, in the YAML, the XML's unit
+_MOST_LEVELS = 16  # a valid file has three
+_KEYS = (  # key in the XML without its trailing underscore, key in the YAML, the XML's unit
     ("vertCorrection", "vert_correction", math.pi / 180),
     ("rotCorrection", "rot_correction", math.pi / 180),
     ("distCorrection", "dist_correction", 0.01),
@@ -32,10 +32,10 @@ _KEYS = (  # in the XML without its trailing underscore, in the YAML, the XML's 
 
 
 def read_calibration(data: bytes, head: SpinningHead) -> BeamTable:
-    """Return beams of a head by its calibration file.
+    """Read the beams of a head from its calibration file.
 
     Raises:
-        DriverSettingsError: it is none, or not this model's; two-point corrections (of an HDL-64E) are not known here.
+        DriverSettingsError: the file is invalid or of another model, or has two-point corrections (of an HDL-64E).
     """
     if len(data) > _MOST_BYTES:
         raise DriverSettingsError(
@@ -77,16 +77,16 @@ def _beams(lasers: list[dict[str, float]]) -> BeamTable:
 
 
 def _read_yaml(data: bytes) -> tuple[float | None, dict[int, dict[str, float]]]:
-    """Return distance resolution in metres, and corrections by laser id."""
-    import yaml  # only where a head has such a file
+    """Read distance resolution in metres, and corrections by laser id, from the YAML file."""
+    import yaml  # imported only for such a file
 
     try:
         depth = 0
         for event in yaml.parse(data, yaml.SafeLoader):
-            # by aliases a file of a few lines can mean more values than memory holds
+            # with aliases a file of a few lines can expand to more values than fit in memory
             if isinstance(event, yaml.AliasEvent):
                 raise ValueError("has an alias; want every value where it belongs")
-            # the scanner's time for a token grows with its depth: 20 kB of brackets were minutes
+            # the YAML scanner's time for a token grows with its depth: 20 kB of brackets took minutes
             depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
             if depth > _MOST_LEVELS:
                 raise ValueError(f"nested more than {_MOST_LEVELS} deep; want lasers, each a table of numbers")
@@ -103,7 +103,7 @@ def _read_yaml(data: bytes) -> tuple[float | None, dict[int, dict[str, float]]]:
 
 
 def _read_xml(data: bytes) -> tuple[float | None, dict[int, dict[str, float]]]:
-    """Return the same of the maker's file."""
+    """Read distance resolution in metres, and corrections by laser id, from the maker's file."""
     root = ElementTree.fromstring(data)
     lasers = {int(_text(px, "id_")): dict(_xml_values(px)) for px in root.iterfind("DB/points_/item/px")}
     if not lasers:

@@ -1,4 +1,4 @@
-"""Velodyne heads: how the lasers of a model are fired and where they point. A further model is an entry here."""
+"""Velodyne heads: firing order and beam directions of each model. A further model is an entry here."""
 
 from __future__ import annotations
 
@@ -9,27 +9,27 @@ from numpy.typing import NDArray
 
 from swath.drivers.scanner.beams import BeamTable, beam_table, numbers
 
-BLOCKS = 12  # of a data packet
-PLACES = 32  # of a block
+BLOCKS = 12  # blocks of a data packet
+PLACES = 32  # places of a block
 
 
 @dataclass(frozen=True)
 class SpinningHead:
-    """One model.
+    """One model of head.
 
     Blocks that carry one azimuth are a group: one block, or one for each bank of lasers. In dual return every block
-    is there twice, and what does not fill a group is empty.
+    appears twice, and blocks that do not fill a group are empty.
 
     Attributes:
-        name: as the maker writes it.
+        name: the maker's name of it.
         product_ids: second factory byte of its data packets.
         range_unit_m: metres of one unit of distance.
         channel: (places,) laser of each place in a group.
         offset_ns: (places,) firing time of each place after the group's first.
-        group_ns: from the time of one group's azimuth to the next one's.
+        group_ns: time from one group's azimuth to the next one's.
         beams: design values of its lasers.
         stamp_ns: the first firing's time less the packet's stamp.
-        block_flags: what the blocks of a group begin with.
+        block_flags: first two bytes of the blocks of a group.
     """
 
     name: str
@@ -43,11 +43,11 @@ class SpinningHead:
     block_flags: tuple[int, ...] = (0xEEFF,)  # FF EE on the wire
 
     def groups(self, *, dual: bool) -> int:
-        """Return how many groups a packet holds."""
+        """Return the number of groups in a packet."""
         return BLOCKS // (len(self.block_flags) * (2 if dual else 1))
 
     def used_block_flags(self, *, dual: bool) -> NDArray[np.uint16]:
-        """Return what the blocks of a packet begin with, as many as are used."""
+        """Return the flags of a packet's blocks, one for each block in use."""
         group = np.repeat(np.array(self.block_flags, dtype=np.uint16), 2 if dual else 1)
         return np.tile(group, self.groups(dual=dual))
 
@@ -73,10 +73,11 @@ VLP16 = SpinningHead(
 
 
 def _focal_beams(focal_m: float, elevation_deg: list[float], azimuth_deg: list[float]) -> BeamTable:
-    """Return beams that cross in one point so far from the spin axis: they leave the axis at other heights.
+    """Return beams that cross in one point at ``focal_m`` from the spin axis, so that they leave the axis at other
+    heights.
 
-    The focal distances are velodyne-decoder 3.1.0's (calib_db.cpp, which cites the maker's envelope drawings of other
-    models); the VLP-16 manual's vertical corrections follow from its 41.91 mm.
+    The focal distances are from velodyne-decoder 3.1.0 (calib_db.cpp, which cites the maker's envelope drawings of
+    other models); the VLP-16 manual's vertical corrections follow from its 41.91 mm.
     """
     height_m = -focal_m * np.tan(np.radians(elevation_deg))
     return beam_table(elevation_deg, azimuth_deg=azimuth_deg, up_m=height_m)

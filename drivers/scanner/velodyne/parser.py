@@ -1,13 +1,13 @@
-"""Velodyne spinning heads: data packets (1206 bytes) and position packets (512 bytes), told apart by their length.
+"""Velodyne spinning heads: data packets (1206 bytes) and position packets (512 bytes), distinguished by their length.
 
 Wire format: VLP-16 User Manual 63-9243 rev. D, sections 9.3 to 9.5. Device time is the packet's microseconds past
-the hour plus the laser's firing offset, nanoseconds, modulo one hour: *which* hour is for swath.georef.timescales to
-find. It is UTC's hour only while the PPS status is locked; otherwise the head counts from power-on.
+the hour plus the laser's firing offset, nanoseconds, modulo one hour; swath.georef.timescales finds *which* hour. It is
+UTC's hour only while the PPS status is locked; otherwise the head counts from power-on.
 
-Dual returns (9.3.2): even blocks hold the last return, odd blocks the strongest, or the second-strongest where the
+Dual returns (9.3.2): even blocks contain the last return, odd blocks the strongest, or the second-strongest where the
 strongest is the last. Equal ranges are one return. Of two returns the nearer is number 1, the farther is the last,
 and the one of greater reflectivity is the strongest (the odd block's where they are equal), since the packet does
-not say which case it is.
+not show which case applies.
 """
 
 from __future__ import annotations
@@ -44,17 +44,17 @@ from swath.georef.records import (
     TimeMessage,
 )
 
-LATE_PACKETS = 16  # a packet at most this far behind its place was delayed by the network; further: the clock was set
+LATE_PACKETS = 16  # the network delays a packet by at most so many places; a larger step back is a clock change
 
 DATA_BYTES = 1206
 MODE_STRONGEST, MODE_LAST, MODE_DUAL = 0x37, 0x38, 0x39  # first factory byte, table 9-2
 RETURN_MODES = (MODE_STRONGEST, MODE_LAST, MODE_DUAL)
 SINGLE_FLAGS = {MODE_STRONGEST: RETURN_FLAG_STRONGEST, MODE_LAST: RETURN_FLAG_LAST}
 FULL_CIRCLE = 36_000  # azimuth in 0.01°, 9.3.1.4
-MAX_GAP = 200  # 0.01° between groups: 20 rev/s make 79.6; more is a step of the field of view, not rotation
+MAX_GAP = 200  # 0.01° between groups: 20 rev/s give 79.6; more is a step across the field of view, not rotation
 HOUR_NS = 3_600_000_000_000
-MAX_TURN_US = 5_000  # a longer step of the stamps may hide a field of view's edge
-MAX_SILENCE_US = 10_000_000  # a longer step of the stamps is a clock that was set, not packets that were lost
+MAX_TURN_US = 5_000  # a longer step of the stamps may hide an edge of the field of view
+MAX_SILENCE_US = 10_000_000  # a longer step of the stamps means that the clock was set, not that packets were lost
 
 _RETURN = np.dtype([("range", "<u2"), ("reflectivity", "u1")])
 _BLOCK = np.dtype([("flag", "<u2"), ("azimuth", "<u2"), ("returns", _RETURN, (PLACES,))])
@@ -69,7 +69,7 @@ def encode_data_packet(
     mode: int = MODE_STRONGEST,
     head: SpinningHead = VLP16,
 ) -> bytes:
-    """Return one data packet (9.3.2).
+    """Encode one data packet (9.3.2).
 
     Args:
         stamp_us: time of the first firing, microseconds past the hour.
@@ -99,10 +99,10 @@ class VelodyneParser(PacketParser):
     Args:
         settings: ``geometry.file`` is the head's own calibration, db.xml or YAML.
         head: the model.
-        clock_only: no returns, and the clock of one data packet in 50 ms of host time.
+        clock_only: return no returns, and clock samples of one data packet in 50 ms of host time.
 
     Attributes:
-        beams: by the head's own calibration where it is given, else the design values.
+        beams: the head's own beams where its calibration is given, else the design values.
     """
 
     def __init__(self, settings: DeviceSettings, head: SpinningHead = VLP16, *, clock_only: bool = False) -> None:
@@ -141,7 +141,7 @@ class VelodyneParser(PacketParser):
         return self._decode(host_time_ns, packets, turn) if len(packets) else []
 
     def remarks(self) -> list[str]:
-        """Return what is to be said of the dates that the head was given."""
+        """Return remarks on the dates that the head received."""
         return self._position.dates.remarks()
 
     def _decode(self, host_time_ns: Int64Array, packets: StructArray, turn: FloatArray) -> list[Record]:
@@ -164,14 +164,14 @@ class VelodyneParser(PacketParser):
         return records
 
     def _check(self, packets: StructArray) -> BoolArray:
-        """Return (n,) True for packets of this model that can be decoded; the others are counted by what is wrong."""
+        """Return (n,) True for packets of this model that can be decoded; the others are counted by error."""
         flag, azimuth = packets["blocks"]["flag"], packets["blocks"]["azimuth"]
         dual, mode = packets["mode"] == MODE_DUAL, packets["mode"]
         flags_right, azimuths_right = np.empty((2, len(packets)), dtype=np.bool_)
         for rows, flags in ((~dual, self._flags[0]), (dual, self._flags[1])):
             used = slice(0, len(flags))
             flags_right[rows] = (flag[rows, used] == flags).all(axis=1)
-            # an HDL may say 36 000 where it means 0 (PointCloudLibrary/pcl #20)
+            # an HDL may send 36 000 for 0 (PointCloudLibrary/pcl #20)
             azimuths_right[rows] = (azimuth[rows, used] <= FULL_CIRCLE).all(axis=1)
         good = np.ones(len(packets), dtype=np.bool_)
         for code, passes in (
@@ -191,7 +191,7 @@ class VelodyneParser(PacketParser):
             self.counters.bytes_skipped += count * length
 
     def _follow(self, packets: StructArray) -> tuple[BoolArray, FloatArray]:
-        """Look for missing packets between the stamps; follow the rotation from packet to packet.
+        """Find missing packets between the stamps; follow the rotation from packet to packet.
 
         Returns:
             fresh: (n,) False for a packet that has come before.
@@ -211,7 +211,7 @@ class VelodyneParser(PacketParser):
         return fresh, self._turn(packets["blocks"]["azimuth"][:, 0], steps * groups, step_us, known=not first)
 
     def _turn(self, azimuth: NDArray[np.uint16], groups: Int64Array, step_us: Int64Array, *, known: bool) -> FloatArray:
-        """Return rotation a group (n,), from each packet's predecessor; the last one known where that does not tell
+        """Return rotation a group (n,) from each packet's predecessor, or the last known one where that does not show
         it.
         """
         before = np.concatenate([[self._last_azimuth], azimuth[:-1]])
@@ -244,7 +244,7 @@ class VelodyneParser(PacketParser):
 
 
 def _firing_times(stamp_us: NDArray[np.uint32], head: SpinningHead, groups: int) -> Callable[[Chosen], Int64Array]:
-    """Return device times of firings (9.4), made of those of the groups (n · groups, 1) and of the lasers' (1,
+    """Return a function for device times of firings (9.4), from those of groups (n · groups, 1) and lasers (1,
     places).
     """
     first = stamp_us.astype(np.int64)[:, np.newaxis] * 1000 + (np.arange(groups) * head.group_ns + head.stamp_ns)
@@ -257,10 +257,11 @@ def _firing_times(stamp_us: NDArray[np.uint32], head: SpinningHead, groups: int)
 def _firing_azimuths(
     azimuth: NDArray[np.uint16], turn: FloatArray, head: SpinningHead
 ) -> Callable[[Chosen], FloatArray]:
-    """Return azimuths of firings in radians, 0 … 2π, turned on from the groups' own (n, groups) (9.5).
+    """Return a function for azimuths of firings in radians, 0 … 2π, extrapolated from the groups' own (n, groups)
+    (9.5).
 
-    The rotation is that to the packet's next group, of the last group that to it; of a packet's only group it is
-    ``turn`` (n,).
+    The rotation is taken to the packet's next group; the last group uses the rotation to itself, and a packet's only
+    group uses ``turn`` (n,).
     """
     start = azimuth.astype(np.float64)
     gap = np.empty(start.shape)
@@ -288,7 +289,7 @@ def _firing_azimuths(
 def _clock_samples(
     host_time_ns: Int64Array, stamp_us: NDArray[np.uint32], mode: NDArray[np.uint8], head: SpinningHead
 ) -> StructArray:
-    """Return one `DEVICE_CLOCK_DTYPE` row a packet: device time of its last firing; it has no latch to tell of."""
+    """Return one `DEVICE_CLOCK_DTYPE` row a packet: device time of its last firing; the packet has no latched edge."""
     groups = np.where(mode == MODE_DUAL, head.groups(dual=True), head.groups(dual=False))
     last_ns = (groups - 1) * head.group_ns + int(head.offset_ns.max()) + head.stamp_ns
     rows = np.empty(len(stamp_us), dtype=DEVICE_CLOCK_DTYPE)
@@ -327,15 +328,17 @@ DRIVERS = (
 
 
 class StampTracker:
-    """Counted in ``errors``: ``cadence_gap`` (packets missing), ``out_of_order`` (packets that came late, each counted
-    as missing before), ``duplicate``, ``stamp_jump`` (the clock was set: no gap).
+    """Follows the stamps of packets and counts missing, late and repeated ones.
 
-    The same answer however the packets are cut into batches.
+    Counted in ``errors``: ``cadence_gap`` (packets missing), ``out_of_order`` (packets that came late, each counted as
+    missing before), ``duplicate``, ``stamp_jump`` (the clock was set: no gap).
+
+    The result is the same however the packets are cut into batches.
 
     Args:
         errors: the parser's ``counters.errors``.
-        wrap_us: where the stamps wrap.
-        max_silence_us: a longer step is a clock that was set, not packets that were lost.
+        wrap_us: value at which the stamps wrap.
+        max_silence_us: a longer step means that the clock was set, not that packets were lost.
     """
 
     def __init__(self, errors: Counter[str], wrap_us: int, max_silence_us: int) -> None:
@@ -346,7 +349,7 @@ class StampTracker:
         self._recent: deque[int] = deque(maxlen=LATE_PACKETS + 1)
 
     def follow(self, stamp_us: Int64Array, nominal_us: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Take packets (n,) and the time each spans; (n,) False for a packet that has come before."""
+        """Take packets (n,) and the time that each spans; return (n,) False for a packet that has come before."""
         if not len(stamp_us):
             return np.zeros(0, dtype=np.bool_)
         before = np.concatenate([[stamp_us[0] if self._newest_us is None else self._newest_us], stamp_us[:-1]])
@@ -362,7 +365,7 @@ class StampTracker:
         return np.ones(len(stamp_us), dtype=np.bool_)
 
     def _step(self, stamp_us: int, nominal_us: float) -> bool:
-        """Return one packet; whether it is a new one."""
+        """Take one packet; return whether it is new."""
         if stamp_us in self._recent:
             self._errors["duplicate"] += 1
             return False

@@ -1,4 +1,4 @@
-"""Velodyne position packets: the head's clock, its PPS status and the NMEA sentence it was given.
+"""Velodyne position packets: the head's clock, its PPS status and the NMEA sentence that it received.
 
 VLP-16 User Manual 63-9243 rev. D, 9.3.3, table 9-3: 198 unused bytes, u32 microseconds past the hour when the packet
 was assembled, u8 PPS status (table 9-4), 3 unused bytes, then the GPRMC sentence, CR LF, padded with NUL to 512.
@@ -39,7 +39,9 @@ _SECOND_US = 1_000_000
 
 
 def encode_position_packet(stamp_us: int, pps_status: int, sentence: str) -> bytes:
-    """Return one position packet; ``sentence`` from ``$`` to its checksum, without CR LF; empty before any came."""
+    """Encode one position packet; ``sentence`` runs from ``$`` to its checksum, without CR LF; empty before the first
+    one.
+    """
     packet = bytearray(POSITION_BYTES)
     _STATUS.pack_into(packet, _STAMP_AT, stamp_us, pps_status)
     text = f"{sentence}\r\n".encode("ascii") if sentence else b""
@@ -50,18 +52,18 @@ def encode_position_packet(stamp_us: int, pps_status: int, sentence: str) -> byt
 class PositionReader:
     """Reads the position packets of one head, in order.
 
-    A packet repeats the last sentence the head got until the next one comes, also beyond the next edge. So a
-    `TimeMessage` is made only of the first packet with a new sentence and, while the head is locked, only if the
-    sentence's second is the one the head's own clock stands in (else ``nmea_second_mismatch`` is counted). Its date is
-    read as a receiver's own: one a roll-over behind is moved, one before the floor not valid (``date_before_floor``).
+    A packet repeats the head's last sentence until the next one comes, also beyond the next edge. A `TimeMessage` is
+    therefore made only from the first packet with a new sentence and, while the head is locked, only if the sentence's
+    second agrees with the head's own clock (else ``nmea_second_mismatch`` is counted). Its date is treated like a
+    receiver's own: one roll-over behind it is moved, before the floor it is not valid (``date_before_floor``).
 
     Args:
-        counters: the parser's.
-        settings: of the head, whose source the remarks on dates name.
+        counters: the parser's counters.
+        settings: the head's settings, with the source that remarks on dates name.
 
     Attributes:
-        dates: what the sentences' dates were taken for.
-        locked: what the latest packet said: 1 PPS locked, 0 not, −1 before the first packet.
+        dates: interpretation of the sentences' dates.
+        locked: PPS status of the latest packet: 1 locked, 0 not, −1 before the first packet.
     """
 
     def __init__(self, counters: ParserCounters, settings: DeviceSettings) -> None:
@@ -72,14 +74,14 @@ class PositionReader:
         self.locked = -1
 
     def read(self, host_time_ns: Int64Array, units: ByteRows) -> list[Record]:
-        """Decode packets (n, 512): clock samples of all, and what changed, as events."""
+        """Decode packets (n, 512): return clock samples of all, and events for changes."""
         events: list[Record] = []
         rows = np.empty(len(units), dtype=DEVICE_CLOCK_DTYPE)
         keep = np.ones(len(units), dtype=np.bool_)
         for at, host_ns in enumerate(host_time_ns.tolist()):
             packet = units[at].tobytes()
             stamp_us, pps_status = _STATUS.unpack_from(packet, _STAMP_AT)
-            stamp_us %= HOUR_US  # a head whose pulse does not turn its hour counts on beyond it
+            stamp_us %= HOUR_US  # a head whose pulse does not wrap its hour counts beyond it
             if pps_status > PPS_ERROR:
                 keep[at] = False
                 continue
@@ -122,8 +124,8 @@ class PositionReader:
         return events
 
     def _time_message(self, host_ns: int, said: TimeTag, *, valid: bool) -> TimeMessage:
-        """Return the message of a sentence, with the date that its receiver means."""
-        if valid and said.date is not None:  # without a fix many a receiver says any date
+        """Return the message of a sentence, with its date moved by roll-overs."""
+        if valid and said.date is not None:  # without a fix many receivers send an arbitrary date
             said = replace(said, date=(date := self.dates.date(said.date, host_ns)))
             if date < self.dates.floor:
                 self._counters.errors["date_before_floor"] += 1
@@ -131,7 +133,9 @@ class PositionReader:
         return TimeMessage(host_ns, said, NamesEdge.PREVIOUS, valid=valid, message="position RMC")
 
     def _is_of_this_second(self, time: TimeTag, stamp_us: int, pps_status: int) -> bool:
-        """Return whether the sentence belongs to the edge just past: by the locked clock, else by being new."""
+        """Return whether the sentence belongs to the edge just past: by the locked clock, or without a lock by being
+        new.
+        """
         if pps_status != PPS_LOCKED:
             return self._sentence is not None
         if time.time_ns // SECOND_NS % 3600 == stamp_us // _SECOND_US:
@@ -141,7 +145,8 @@ class PositionReader:
 
 
 def rmc_time(sentence: bytes) -> tuple[TimeTag, bool] | None:
-    """Return UTC of an RMC sentence and whether the receiver vouches for it; None if it is none or is damaged.
+    """Return UTC of an RMC sentence and whether the receiver marks it as valid; None if it is another sentence or
+    damaged.
 
     NMEA 0183: ``$--RMC,hhmmss.sss,status,…,ddmmyy,…*hh``, checksum the XOR between ``$`` and ``*``. Years are 1980
     to 2079. Second 60 is a leap second: 86 400 s of the day and above.

@@ -1,9 +1,9 @@
-"""CAN through python-can: every interface it has, save SocketCAN, which has a way of its own.
+"""CAN through python-can: all its interfaces except SocketCAN, which has its own transport.
 
-python-can gives messages, one Python object each; they become SocketCAN frames here, so that a log holds the same
-whatever adapter was used. Where the interface is a datagram socket (udp_multicast) the kernel's stamps and its count of
-drops are used as for UDP; other adapters' stamps are of their own clocks or of the host's read, and are not handed
-over.
+python-can delivers messages, one Python object each; they become SocketCAN frames here, so that the log has the same
+form for every adapter. Where the interface is a datagram socket (udp_multicast), the kernel's stamps and its count of
+drops are used as for UDP; the stamps of other adapters come from their own clocks or from the host's read, and are not
+passed on.
 
 Units are frames of Linux: `struct can_frame` (16 bytes) and `struct canfd_frame` (72). <linux/can.h>: can_id u32 with
 its flags, len u8, flags u8 (FD only), two reserved bytes, 8 or 64 bytes of data; little-endian.
@@ -45,25 +45,25 @@ ERROR_BUS_OFF = 0x40  # <linux/can/error.h>, CAN_ERR_BUSOFF, in the identifier o
 FD_ERROR_STATE = 0x02  # CANFD_ESI
 
 SOCKETCAND = "can.interfaces.socketcand.socketcand"
-CONNECT_S = 2.0  # to a gateway
-# a gateway that loses its power says nothing: the connection counts as dead after 25 s
+CONNECT_S = 2.0  # limit for the connection to a gateway
+# a gateway that loses its power does not close the connection: it counts as dead after 25 s
 _KEEPALIVE = ((socket.TCP_KEEPIDLE, 10), (socket.TCP_KEEPINTVL, 5), (socket.TCP_KEEPCNT, 3))
 KERNEL_STAMPED = frozenset({"udp_multicast"})
 MAX_FRAMES = 1000  # bounds one receive
-SLICE_S = 0.1  # a bus without a descriptor is asked in slices, so that a close from outside is noticed
+SLICE_S = 0.1  # a bus without a descriptor is polled in slices, so that a close from outside is noticed
 BATCH_S = 0.032  # 260 frames of a full 1 Mbit/s bus; the kernel has their stamps
 BUFFER_BYTES = 4 << 20
 SEND_TIMEOUT_S = 1.0
 
 _UNREADABLE = (ValueError, KeyError, IndexError, TypeError, AttributeError, OverflowError, struct.error)
-_MISSING = re.compile(r"missing \d+ required .*arguments?: (.*)")  # Python's word for options that were not given
+_MISSING = re.compile(r"missing \d+ required .*arguments?: (.*)")  # Python's message about missing options
 _NAME = re.compile(r"'(\w+)'")
 _WORDS = {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False}
 
 
 def keyword_value(text: str) -> int | float | bool | str:
-    """Return an option's text as python-can's interfaces expect it: whole number, number, yes or no, else as it
-    stands.
+    """Convert an option's text to the type that python-can's interfaces expect: int, float, bool, or the text
+    itself.
     """
     if text.lower() in _WORDS:
         return _WORDS[text.lower()]
@@ -78,7 +78,7 @@ def keyword_value(text: str) -> int | float | bool | str:
 
 
 class PythonCanTransport(DescriptorTransport):
-    """One bus of python-can; a unit is a frame of 16 or 72 bytes.
+    """Receives one bus of python-can; a unit is a frame of 16 or 72 bytes.
 
     Args:
         spec: ``can:<interface>:<channel>``; every option is a keyword of that interface's bus.
@@ -102,7 +102,7 @@ class PythonCanTransport(DescriptorTransport):
                 vars(importlib.import_module(SOCKETCAND))["connect_to_server"] = _connect_once
             with stamping() if self._kernel_stamped else contextlib.nullcontext():
                 self._bus = can.Bus(interface=spec.interface, channel=spec.channel, ignore_config=True, **keywords)
-        except NameError as error:  # how a python-can interface says that its maker's library is not installed
+        except NameError as error:  # a python-can interface raises it when its maker's library is not installed
             raise TransportError(
                 f"{self.name}: the library of the {spec.interface} adapter is not installed"
             ) from error
@@ -122,7 +122,7 @@ class PythonCanTransport(DescriptorTransport):
         return _one_line(error)
 
     def _watch_socket(self) -> None:
-        """A bus on a datagram socket gets a larger buffer and its drops are counted."""
+        """Request a larger buffer and count drops, if the bus is on a datagram socket."""
         if self._fd < 0 or not stat.S_ISSOCK(os.fstat(self._fd).st_mode):
             return
         sock = socket.socket(fileno=os.dup(self._fd))
@@ -143,7 +143,7 @@ class PythonCanTransport(DescriptorTransport):
             return
         try:
             bus.shutdown()
-        except (can.CanError, OSError):  # slcan says goodbye to its device, which may have gone
+        except (can.CanError, OSError):  # slcan sends a last command to its device, which may have gone
             port = getattr(bus, "serialPortOrig", None)
             if port is not None:
                 port.close()
@@ -168,14 +168,14 @@ class PythonCanTransport(DescriptorTransport):
         return _blocks(frames, stamps if self._kernel_stamped else None)
 
     def _messages(self, gate: Gate, timeout_s: float) -> list[can.Message]:
-        """Return what the bus has, after waiting for the first."""
+        """Return the messages of the bus, after waiting for the first."""
         messages: list[can.Message] = []
         if self._fd >= 0:
             deadline_s = time.monotonic() + timeout_s
             events = gate.wait(timeout_s)
             if not events:
                 return []
-            if self._kernel_stamped:  # what is stamped may wait for company
+            if self._kernel_stamped:  # the kernel's stamps allow a wait for more
                 gate.pause(min(BATCH_S, deadline_s - time.monotonic()))
         else:
             messages += self._first_in_slices(gate, timeout_s)
@@ -209,7 +209,9 @@ class PythonCanTransport(DescriptorTransport):
         return []
 
     def _see_that_it_is_connected(self) -> None:
-        """On silence: socketcand's bus reads nothing for ever from a gateway that has closed, as fast as it can."""
+        """Raise `TransportError` if the gateway closed the connection; socketcand's bus would then read nothing in a
+        busy loop.
+        """
         try:
             ended = self._connection is not None and not self._connection.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT)
         except BlockingIOError:
@@ -220,7 +222,7 @@ class PythonCanTransport(DescriptorTransport):
             raise TransportError(f"{self.name}: the gateway closed the connection")
 
     def _read(self, timeout_s: float) -> can.Message | None:
-        """Return one message; None on silence or on input nobody can read, which is counted."""
+        """Return one message; None on silence, or on unreadable input, which is counted."""
         assert self._bus is not None
         try:
             return self._bus.recv(timeout_s)
@@ -235,7 +237,7 @@ class PythonCanTransport(DescriptorTransport):
         return None
 
     def _refuse(self, *, undecodable: bool) -> None:
-        """Count input nobody can read; slcan stumbles over an undecodable line again and again until it flushes."""
+        """Count unreadable input; slcan fails on an undecodable line again and again until it is flushed."""
         self.counters.refused += 1
         flush = getattr(self._bus, "flush", None)
         if undecodable and flush is not None:
@@ -244,7 +246,7 @@ class PythonCanTransport(DescriptorTransport):
     def _send(self, data: bytes) -> None:
         assert self._bus is not None
         message = unpack_frame(data)
-        message.timestamp = time.time()  # udp_multicast sends it along
+        message.timestamp = time.time()  # udp_multicast includes it in the datagram
         try:
             self._bus.send(message, timeout=SEND_TIMEOUT_S)
         except (can.CanError, OSError) as error:
@@ -259,22 +261,25 @@ def _descriptor(bus: can.BusABC) -> int:
 
 
 def _connect_once(connection: socket.socket, host: str, port: int) -> None:
-    """Connects socketcand's bus; raises OSError where no gateway listens.
+    """Connect socketcand's bus; raises OSError where no gateway listens.
 
-    Its own way asks for 10 s, thousands of times a second, with a line on stderr each time. To ask beforehand, by
-    another connection, would take the place of the only client that some gateways serve.
+    python-can's own function tries for 10 s, thousands of times a second, with a line on stderr each time. A separate
+    trial connection would occupy some gateways, which serve one client only.
     """
     connection.settimeout(CONNECT_S)
     try:
         connection.connect((host, port))
-    except BaseException:  # nobody else has it
+    except BaseException:  # no other code holds the socket
         connection.close()
         raise
     connection.settimeout(None)
 
 
 def _connection(bus: can.BusABC) -> socket.socket | None:
-    """Return the connection of a socketcand bus, which has no other way to it, kept alive; None of any other."""
+    """Return the connection of a socketcand bus, with keepalive set; None for any other bus.
+
+    python-can has no public access to it.
+    """
     found = getattr(bus, "_SocketCanDaemonBus__socket", None)
     if not isinstance(found, socket.socket):
         return None
@@ -285,7 +290,7 @@ def _connection(bus: can.BusABC) -> socket.socket | None:
 
 
 def _one_line(error: BaseException) -> str:
-    """Return what happened in the end: the system's word where there is one below the interface's own."""
+    """Return the root cause of an error: the system's text where one exists, else the interface's own."""
     root = error
     while root.__cause__ is not None or root.__context__ is not None:
         root = root.__cause__ or root.__context__ or root
@@ -295,7 +300,7 @@ def _one_line(error: BaseException) -> str:
 
 
 def _blocks(frames: list[bytes], stamps: list[int] | None) -> list[UnitBlock]:
-    """Return runs of equal length, in order."""
+    """Group frames into blocks of equal length, in order."""
     blocks: list[UnitBlock] = []
     first = 0
     for last in range(1, len(frames) + 1):
@@ -309,10 +314,10 @@ def _blocks(frames: list[bytes], stamps: list[int] | None) -> list[UnitBlock]:
 
 
 def pack_frame(message: can.Message) -> bytes:
-    """Return the frame of a python-can message: 16 bytes, or 72 for CAN FD.
+    """Pack a python-can message into a frame: 16 bytes, or 72 for CAN FD.
 
     Raises:
-        ValueError: the message does not fit a frame (its identifier or its length).
+        ValueError: the identifier or the length does not fit a frame.
     """
     flags = (
         (CAN_EFF_FLAG if message.is_extended_id else 0)
@@ -335,10 +340,10 @@ def pack_frame(message: can.Message) -> bytes:
 
 
 def unpack_frame(frame: bytes) -> can.Message:
-    """Return the python-can message of a frame; its time stamp is 0.
+    """Unpack a frame into a python-can message; its time stamp is 0.
 
     Raises:
-        ValueError: not 16 or 72 bytes, or a length field beyond the data.
+        ValueError: the frame has not 16 or 72 bytes, or its length field exceeds the data.
     """
     if len(frame) not in (CAN_FRAME_BYTES, CANFD_FRAME_BYTES):
         raise ValueError(f"a CAN frame has {CAN_FRAME_BYTES} or {CANFD_FRAME_BYTES} bytes, not {len(frame)}")

@@ -1,4 +1,4 @@
-"""What a CAN interface says of itself: its bit rate, by rtnetlink (RTM_GETLINK).
+"""Reads the bit rate of a CAN interface by rtnetlink (RTM_GETLINK).
 
 <linux/rtnetlink.h>, <linux/if_link.h>, <linux/can/netlink.h>.
 """
@@ -25,7 +25,7 @@ _TYPE_MASK = 0x3FFF  # without NLA_F_NESTED and NLA_F_NET_BYTEORDER
 
 
 def interface_bitrate(channel: str) -> int | None:
-    """Return bits per second a CAN interface is set to; None where it has none (vcan), is none or cannot be asked."""
+    """Return the bits per second of a CAN interface; None where it has none (vcan), is not CAN or cannot be queried."""
     try:
         index = socket.if_nametoindex(channel)
         with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW | socket.SOCK_CLOEXEC, _NETLINK_ROUTE) as sock:
@@ -39,7 +39,7 @@ def interface_bitrate(channel: str) -> int | None:
 
 
 def bitrate_of_link(message: bytes) -> int | None:
-    """Return bit rate in an RTM_NEWLINK message; None where there is none or the message is cut."""
+    """Return the bit rate in an RTM_NEWLINK message; None where it is missing or the message is cut."""
     body_at = _NLMSGHDR.size + _IFINFOMSG.size
     if len(message) < body_at or _NLMSGHDR.unpack_from(message)[1] != _RTM_NEWLINK:
         return None
@@ -52,7 +52,7 @@ def bitrate_of_link(message: bytes) -> int | None:
 
 
 def _attributes(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Yield type and value of each attribute; stops where a length does not fit."""
+    """Yield type and value of each attribute; stop where a length does not fit."""
     at = 0
     while at + _ATTRIBUTE.size <= len(data):
         length, kind = _ATTRIBUTE.unpack_from(data, at)

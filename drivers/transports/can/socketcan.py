@@ -1,7 +1,7 @@
 """SocketCAN: a raw AF_CAN socket with kernel stamps, drop count, CAN FD and error frames.
 
-Bit rate and state belong to the system (``ip link``, systemd-networkd), not to a socket: see
-`swath.drivers.transports.can.bitrate` for what the interface says.
+Bit rate and state belong to the system (``ip link``, systemd-networkd), not to a socket;
+`swath.drivers.transports.can.bitrate` reads the interface's bit rate.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ _ALL_ERRORS = struct.pack("@I", _ERROR_CLASSES)
 
 
 class SocketCanTransport(DescriptorTransport):
-    """One SocketCAN interface; a unit is a frame of 16 or 72 bytes, error frames among them.
+    """Receives one SocketCAN interface; a unit is a frame of 16 or 72 bytes, error frames included.
 
     Args:
         spec: ``can:socketcan:<interface>``; options bitrate, data_bitrate (compared by ``swath check``, not set),
             fd, buffer_mb.
-        batch_s: after the first frame the reader waits this long for more.
+        batch_s: wait for more frames after the first.
     """
 
     def __init__(self, spec: TransportSpec, batch_s: float = BATCH_S) -> None:
@@ -88,7 +88,7 @@ class SocketCanTransport(DescriptorTransport):
         sock.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FD_FRAMES, int(self._spec.flag("fd", default=True)))
         sock.setsockopt(_SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, _ALL_ERRORS)
         sock.bind((self._channel,))
-        pending = sock.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)  # an interface that is down is said so here
+        pending = sock.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)  # reports an interface that is down
         if pending:
             raise OSError(pending, os.strerror(pending))
 
@@ -151,4 +151,4 @@ class SocketCanTransport(DescriptorTransport):
                 if not full or time.monotonic() > deadline_s:
                     raise TransportError(self._why(error)) from error
             if wait_writable(self._sock.fileno(), deadline_s):
-                time.sleep(0.001)  # ENOBUFS: the interface's own queue is full, which poll does not see
+                time.sleep(0.001)  # ENOBUFS: the interface's own queue is full, which poll does not report

@@ -1,1 +1,1 @@
-"""Edges of pulse-per-second signals: the kernel's PPS API, a serial line's DCD, a fixed schedule."""
+"""Sources of pulse-per-second edges: the kernel's PPS API, a serial line's DCD, and a file of edges."""

@@ -1,7 +1,7 @@
 """PPS edges from a file or FIFO: one line an edge, ``realtime_ns sequence``, CLOCK_REALTIME.
 
 A file is read to its end and followed as it grows. A FIFO outlives its writers: one may close and another open it.
-What a writer leaves without a line end is let go with the writer. Lines that are no edge are counted and skipped.
+Text that a writer leaves without a line end is discarded when it closes. Invalid lines are counted and skipped.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from swath.drivers.transports.descriptor import Gate
 
 READ_BYTES = 65536
 MAX_LINE_BYTES = 64  # two 64-bit numbers have 41 characters
-FOLLOW_S = 0.02  # how often a file at its end, or a FIFO without a writer, is looked at again
+FOLLOW_S = 0.02  # interval for polling a file at its end, or a FIFO without a writer
 _INT64_MAX = 2**63 - 1
 
 
 class FixedPps(PpsSource):
-    """Edges from ``path``; every edge is taken to be of the polarity asked for.
+    """Reads edges from ``path``; every edge is assumed to have the requested polarity.
 
     Attributes:
-        garbage_lines: lines, or ends of lines, that were no edge.
+        garbage_lines: lines, or ends of lines, that are not an edge.
     """
 
     def __init__(self, path: str, edge: str = "assert") -> None:
@@ -44,7 +44,7 @@ class FixedPps(PpsSource):
         """Open the file or FIFO; a FIFO needs no writer yet.
 
         Raises:
-            TransportError: absent, not permitted, or a directory.
+            TransportError: the path is absent, not permitted, or a directory.
         """
         with self._reading:
             if self._gate is not None:
@@ -72,7 +72,7 @@ class FixedPps(PpsSource):
         return f"fixed:{self._path}: {error.strerror}"
 
     def receive(self, timeout_s: float) -> list[RawEdge]:
-        """See `PpsSource.receive`."""
+        """Receive edges as `PpsSource.receive` does."""
         deadline_s = time.monotonic() + timeout_s
         with self._reading:
             if self._gate is None:
@@ -86,7 +86,7 @@ class FixedPps(PpsSource):
                 self._wait(gate, left_s)
 
     def _wait(self, gate: Gate, left_s: float) -> None:
-        if self._at_end:  # poll calls a file's end, and a FIFO that its writer has left, ready
+        if self._at_end:  # poll reports a file's end, and a FIFO after its writer closed, as ready
             gate.pause(min(left_s, FOLLOW_S))
         elif not gate.wait(left_s):
             self._see_that_it_is_there()
@@ -109,7 +109,7 @@ class FixedPps(PpsSource):
         return []
 
     def _see_that_it_is_there(self) -> None:
-        """At an end: the path still names what is open, else the device counts as gone."""
+        """Raise `TransportError` if the path no longer names the open file, or the file was cut short."""
         try:
             now = os.stat(self._path)
         except OSError as error:
@@ -143,11 +143,11 @@ class FixedPps(PpsSource):
         return None
 
     def poll_counters(self) -> TransportCounters:
-        """Return lines that are no edge, as ``refused``."""
+        """Return the number of lines that are not an edge, as ``refused``."""
         return TransportCounters(refused=self.garbage_lines)
 
     def close(self) -> None:
-        """Wake a blocked `receive` and close."""
+        """Wake a blocked `receive` and close the file."""
         gate = self._gate
         if gate is None:
             return

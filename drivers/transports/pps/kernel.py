@@ -15,7 +15,7 @@ from swath.drivers.transports.pps.serial_dcd import SerialDcdPps
 
 __all__ = ["FixedPps", "KernelPps", "SerialDcdPps"]
 
-# _IOC(direction, 'p', number, size); the first three carry the size of a pointer, as the header has it
+# _IOC(direction, 'p', number, size); the header gives all of them the size of a pointer
 PPS_GETPARAMS = 0x8000_70A1 | struct.calcsize("@P") << 16
 PPS_SETPARAMS = 0x4000_70A2 | struct.calcsize("@P") << 16
 PPS_GETCAP = 0x8000_70A3 | struct.calcsize("@P") << 16
@@ -29,11 +29,11 @@ PARAMETERS = struct.Struct("=iiqiIqiI")
 
 PPS_CAPTUREASSERT = 0x01
 PPS_CAPTURECLEAR = 0x02
-LONGEST_FETCH_S = 0.4  # an edge that falls between two fetches is found by the next, before the one after it comes
+LONGEST_FETCH_S = 0.4  # an edge between two fetches is found by the next one, before the following edge
 
 
 class KernelPps(PpsSource):
-    """One kernel PPS source; stamps are taken in the interrupt."""
+    """Reads one kernel PPS source; stamps are taken in the interrupt."""
 
     def __init__(self, path: str, edge: str = "assert") -> None:
         self._path = path
@@ -43,10 +43,10 @@ class KernelPps(PpsSource):
         self._lock = threading.Lock()
 
     def open(self) -> None:
-        """Open the device and see that it captures the edge asked for.
+        """Open the device and make sure that it captures the requested edge.
 
         Raises:
-            TransportError: absent, not permitted, no PPS device, or without that edge.
+            TransportError: the device is absent, not permitted, not a PPS device, or does not capture that edge.
         """
         with self._lock:
             self._fd = self._opened()
@@ -96,7 +96,7 @@ class KernelPps(PpsSource):
             ) from error
 
     def _fetch(self, timeout_s: float) -> RawEdge:
-        """Return the latest edge, after waiting at most ``timeout_s`` for one that is newer than this call."""
+        """Return the latest edge, after waiting at most ``timeout_s`` for one newer than this call."""
         seconds, nanoseconds = divmod(round(timeout_s * 1e9), 1_000_000_000)
         request = FETCH_DATA.pack(*(0,) * 9, seconds, nanoseconds, 0)
         try:
@@ -106,7 +106,7 @@ class KernelPps(PpsSource):
         return edge_of(answer, self._edge)
 
     def receive(self, timeout_s: float) -> list[RawEdge]:
-        """See `PpsSource.receive`; one call waits 0.4 s at most, whatever is asked."""
+        """Receive edges as `PpsSource.receive` does; one call waits 0.4 s at most, whatever ``timeout_s`` is."""
         with self._lock:
             if self._fd < 0:
                 raise TransportError(f"{self._path}: is closed")
@@ -128,13 +128,15 @@ class KernelPps(PpsSource):
             return [edge]
 
     def _see_that_it_is_there(self) -> None:
-        """The path still names what is open; of a source that was unregistered the kernel says nothing, for ever."""
+        """Raise an error if the path no longer names the open device; the kernel does not report an unregistered
+        source.
+        """
         opened, now = os.fstat(self._fd), os.stat(self._path)
         if (now.st_dev, now.st_ino) != (opened.st_dev, opened.st_ino):
             raise TransportError(f"{self._path}: was replaced by another PPS device")
 
     def close(self) -> None:
-        """Close; waits for a `receive` under way, 0.4 s at most."""
+        """Close the device after a running `receive`, which takes 0.4 s at most."""
         with self._lock:
             if self._fd >= 0:
                 os.close(self._fd)

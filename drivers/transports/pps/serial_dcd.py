@@ -1,10 +1,10 @@
-"""PPS on a serial port's DCD line, waited for with TIOCMIWAIT and stamped right after the wake-up.
+"""PPS on a serial port's DCD line: waits with TIOCMIWAIT and stamps right after the wake-up.
 
-The wait cannot be ended from outside, neither by closing the port nor by a time limit. It is therefore made in a
-thread of its own, which owns its descriptor and ends with the next edge or with the device; `close` lets it go and
-returns at once. Who sets the line of such a port says so (`line_set`): the driver of a 16550 then no longer reports
-DCD to those who wait already, only to those who begin to. Stamps are 40 to 60 µs late and more on a busy machine: a
-kernel PPS (``ldattach PPS``) is better.
+The wait cannot be ended from outside, neither by closing the port nor by a time limit. It therefore runs in its own
+thread, which owns its descriptor and ends with the next edge or with the device; `close` abandons the thread and
+returns at once. Code that changes the settings of such a port calls `line_set`: the driver of a 16550 then reports DCD
+only to waits that begin later, not to those under way. Stamps are 40 to 60 µs late, more on a busy machine: a kernel
+PPS (``ldattach PPS``) is better.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from swath.drivers.transports.base import PpsSource, RawEdge, TransportError
 _TIOCMIWAIT = 0x545C  # <asm-generic/ioctls.h>
 _TIOCGICOUNT = 0x545D
 _ICOUNTER_DCD = struct.Struct("@12xi64x")  # field dcd of struct serial_icounter_struct, <linux/serial.h>
-_lines_set: Counter[int] = Counter()  # by device number: how often its line was set by this process
+_lines_set: Counter[int] = Counter()  # by device number: how often this process set its line
 
 
 def line_set(fd: int) -> None:
-    """Say that a port's line has just been set: whoever waits for its DCD begins anew.
+    """Note that a port's line has just been set, so that every wait for its DCD starts again.
 
     tcsetattr(3) turns a 16550's modem status interrupt off (`serial8250_do_set_termios`), and only the beginning of a
     TIOCMIWAIT turns it on (`uart_wait_modem_status`).
@@ -38,7 +38,7 @@ def line_set(fd: int) -> None:
 
 
 class SerialDcdPps(PpsSource):
-    """Edges of DCD; the line raised is "assert"."""
+    """Reads edges of DCD; "assert" is the rising line."""
 
     def __init__(self, path: str, edge: str = "assert") -> None:
         self._path = path
@@ -49,7 +49,7 @@ class SerialDcdPps(PpsSource):
         """Open the port without touching its settings and begin to wait.
 
         Raises:
-            TransportError: absent, not permitted, or a port without modem lines.
+            TransportError: the port is absent, not permitted, or has no modem lines.
         """
         if self._watch is not None:
             raise TransportError(f"serial-dcd:{self._path}: is open already")
@@ -80,7 +80,7 @@ class SerialDcdPps(PpsSource):
         return f"{name}: {self._path} failed: {error.strerror}"
 
     def receive(self, timeout_s: float) -> list[RawEdge]:
-        """See `PpsSource.receive`."""
+        """Receive edges as `PpsSource.receive` does."""
         watch = self._watch
         if watch is None:
             raise TransportError(f"serial-dcd:{self._path}: is closed")
@@ -95,16 +95,16 @@ class SerialDcdPps(PpsSource):
         return [item] if item is not None and item.edge == self._edge else []
 
     def _wait_anew(self, watch: _Watch) -> None:
-        """Another thread waits instead; the old one ends with the next edge."""
+        """Start another waiting thread; the old one ends with the next edge."""
         try:
             fd = os.dup(watch.fd)
-        except OSError:  # it has ended, with an error that comes next
+        except OSError:  # the thread has ended; its error is next in the queue
             return
         watch.stopped.set()
         self._begin(fd, watch.changes)
 
     def close(self) -> None:
-        """Let the waiting thread go; a `receive` under way returns."""
+        """Abandon the waiting thread; a running `receive` returns."""
         watch, self._watch = self._watch, None
         if watch is not None:
             watch.stopped.set()
@@ -112,7 +112,7 @@ class SerialDcdPps(PpsSource):
 
 
 class _Watch:
-    """The thread that waits, and its descriptor."""
+    """Waits for edges in a thread and owns the descriptor."""
 
     def __init__(self, fd: int, changes: int) -> None:
         self.fd = fd
@@ -124,7 +124,7 @@ class _Watch:
         self.edges: queue.SimpleQueue[RawEdge | OSError | None] = queue.SimpleQueue()
 
     def is_deaf(self) -> bool:
-        """Return whether the line was set since it began to wait."""
+        """Return whether the line was set after the wait began."""
         return not self._ended and _lines_set[self._device] != self._line
 
     def run(self) -> None:
@@ -149,9 +149,9 @@ class _Watch:
 def edge_at_wake_up(changes_before: int, changes: int, carrier: bool) -> tuple[str, int]:
     """Return which edge ended the wait, and its number.
 
-    The driver counts changes of the line. The first change after ``changes_before`` ended the wait; with an odd
-    number of changes since, the line is now where that edge left it, with an even number where it was before. Two
-    changes make a pulse, so that edges of one polarity number without gaps unless one was missed.
+    The driver counts changes of the line. The first change after ``changes_before`` ended the wait. With an odd number
+    of changes since, the line is now in the state after that edge, with an even number in the state before it. Two
+    changes make a pulse, so that edges of one polarity are numbered without gaps unless one was missed.
     """
     happened = max(changes - changes_before, 1)
     rose = carrier if happened % 2 else not carrier

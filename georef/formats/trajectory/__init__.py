@@ -1,1 +1,1 @@
-"""Trajectory files: their columns, CSV, and the choice of a reader by what a file is."""
+"""Read trajectory files: their common columns, CSV, and the choice of a reader by content."""

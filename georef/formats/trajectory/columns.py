@@ -1,4 +1,4 @@
-"""What every trajectory file comes to, and the checks that tell a wrong file from a wrong map."""
+"""Convert the rows of any trajectory file to a trajectory, and refuse files that are wrong before they spoil a map."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ Span = tuple[int, int]
 
 LOWEST_M, HIGHEST_M = -1000.0, 50_000.0
 GREATEST_SPEED_MPS = 1000.0
-GREATEST_SAID_MPS, GREATEST_SIGMA = 1e5, 1e6  # of single rows: beyond, numbers mean something else
+GREATEST_SAID_MPS, GREATEST_SIGMA = 1e5, 1e6  # limits for single rows: numbers beyond them have another meaning or unit
 EARLIEST_NS, LATEST_NS = 0, 1 << 62  # GPS time, 1980 to 2126: differences of times stay within 64 bits
 LONGEST_GAP_AT_WEEKS_END_S = 3600.0  # of epochs left out between Saturday and Sunday
 COURSE_FROM_MPS, GREATEST_COURSE_ERROR_RAD, COURSE_OUTLIERS = 20.0, float(np.radians(5.0)), 0.01
-COURSE_PIECE_NS, LONGEST_PIECE_NS = SECOND_NS, 3 * SECOND_NS  # pieces of flight whose course is looked at
+COURSE_PIECE_NS, LONGEST_PIECE_NS = SECOND_NS, 3 * SECOND_NS  # length of the pieces of flight whose course is checked
 HEADING_OFF_RAD = float(np.radians(45.0))  # more than any drift angle
 
 
 @dataclass(slots=True)
 class TrajectoryColumns:
-    """Rows of a file in SI units; (n,) or (n, 3); nan where the file does not say.
+    """Rows of a file in SI units; (n,) or (n, 3); nan where the file gives no value.
 
     Attributes:
         time_ns: GPS time.
@@ -37,13 +37,12 @@ class TrajectoryColumns:
         velocity_l: north, east, down.
         roll_rad, pitch_rad, heading_rad: heading from true north.
         position_sigma_l, attitude_sigma_rad: one standard deviation.
-        row: what a row is called in messages: record, line.
-        first_row: number of the first one.
-        angles_in: the unit which the file should have for attitudes and positions, for messages.
-        fix_type, satellites: (n,) of positions of an antenna, `swath.georef.records.FixType`; None: the file does not
-        say.
-        velocity_sigma_l: (n, 3) one standard deviation; None likewise.
-        position_correlation_l: (n, 3) of north–east, north–down, east–down; None likewise.
+        row: name of a row in messages: record, line.
+        first_row: number of the first row.
+        angles_in: the unit that the file should have for attitudes and positions, for messages.
+        fix_type, satellites: (n,) of antenna positions, `swath.georef.records.FixType`; None: not in the file.
+        velocity_sigma_l: (n, 3) one standard deviation; None: not in the file.
+        position_correlation_l: (n, 3) of north–east, north–down, east–down; None: not in the file.
     """
 
     time_ns: Int64Array
@@ -65,17 +64,21 @@ class TrajectoryColumns:
     position_correlation_l: FloatArray | None = None
 
     def at(self, where: NDArray[np.bool_]) -> str:
-        """Return the first row at which something is so, by name."""
+        """Return the name of the first row for which a condition holds."""
         return f"{self.row} {int(np.argmax(where)) + self.first_row}"
 
 
 def unsaid(n: int) -> FloatArray:
-    """Return (n, 3) of nan."""
+    """Return (n, 3) values of nan."""
     return np.full((n, 3), np.nan)
 
 
 def trajectory_of(columns: TrajectoryColumns, name: str, max_gap_ns: int) -> Trajectory:
-    """Return the trajectory of a file's rows; TrajectoryError where they cannot be meant."""
+    """Return the trajectory of a file's rows.
+
+    Raises:
+        TrajectoryError: the rows cannot be valid.
+    """
     if len(columns.time_ns) < 2:
         raise TrajectoryError(f"{name}: has {len(columns.time_ns)} epochs; a trajectory needs two")
     for check in CHECKS:
@@ -100,7 +103,7 @@ def trajectory_of(columns: TrajectoryColumns, name: str, max_gap_ns: int) -> Tra
 
 
 def continuous_of_week(time_s: FloatArray, name: str, row: str = "record", first_row: int = 1) -> Int64Array:
-    """Return nanoseconds since the start of the first one's week, of seconds of week that may begin anew at its end."""
+    """Return nanoseconds since the start of the first row's week from seconds of week, which may restart at its end."""
     steps = np.diff(time_s)
     crossing = (steps + WEEK_S >= -1.0) & (steps + WEEK_S <= LONGEST_GAP_AT_WEEKS_END_S)
     back = (steps < 0) & ~crossing
@@ -113,9 +116,9 @@ def continuous_of_week(time_s: FloatArray, name: str, row: str = "record", first
 
 
 def placed_in_week(of_week_ns: Int64Array, name: str, span_ns: Span | None, week: int | None) -> Int64Array:
-    """Return GPS time of nanoseconds of a week: the week given, or the one in which they overlap a log's span most."""
+    """Return GPS time of nanoseconds of a week: in the given week, or in the one that overlaps a log's span most."""
     if week is not None:
-        if not 0 <= week <= LATEST_NS // WEEK_NS:  # as 24233, which is a week and a day of it
+        if not 0 <= week <= LATEST_NS // WEEK_NS:  # such as 24233, a week with a day of the week appended
             raise TrajectoryError(f"{name}: --week {week} is no GPS week; want whole weeks since 1980, such as 2423")
         return of_week_ns + week * WEEK_NS
     if span_ns is None:
@@ -160,7 +163,7 @@ def _check_finite(columns: TrajectoryColumns, name: str) -> None:
 
 def _check_sigmas(columns: TrajectoryColumns, name: str) -> None:
     for what, sigma in (("position", columns.position_sigma_l), ("attitude", columns.attitude_sigma_rad)):
-        bad = np.logical_or.reduce(sigma < 0.0, axis=1)  # nan: unsaid
+        bad = np.logical_or.reduce(sigma < 0.0, axis=1)  # nan: missing
         if bad.any():
             raise TrajectoryError(f"{name}: a sigma of the {what} at {columns.at(bad)} is negative")
         bad = np.logical_or.reduce(sigma > GREATEST_SIGMA, axis=1)
@@ -169,7 +172,7 @@ def _check_sigmas(columns: TrajectoryColumns, name: str) -> None:
 
 
 def _check_velocity(columns: TrajectoryColumns, name: str) -> None:
-    fast = np.logical_or.reduce(np.abs(columns.velocity_l) > GREATEST_SAID_MPS, axis=1)  # nan: unsaid
+    fast = np.logical_or.reduce(np.abs(columns.velocity_l) > GREATEST_SAID_MPS, axis=1)  # nan: missing
     if fast.any():
         raise TrajectoryError(
             f"{name}: a velocity at {columns.at(fast)} is beyond {GREATEST_SAID_MPS:g} m/s; want metres a second"
@@ -223,7 +226,7 @@ def _check_time(columns: TrajectoryColumns, name: str) -> None:
 
 
 def _check_course(columns: TrajectoryColumns, name: str) -> None:
-    """The way the positions go against the velocities, and against the nose: wrong signs, swapped columns, units."""
+    """Refuse positions that contradict velocities or heading: wrong signs, swapped columns, wrong units."""
     pieces = course_pieces(columns.time_ns)
     if not len(pieces):
         return
@@ -241,7 +244,7 @@ def _check_course(columns: TrajectoryColumns, name: str) -> None:
         at = pieces[int(np.argmax(off)), 0]
         swapped = moved_l(columns.time_ns, columns.lon_rad, columns.lat_rad, columns.height_m, pieces)
         hint = "the velocities are not north, east, down, or the wander angle has another sign"
-        mirrored = said * np.array([1.0, -1.0, 1.0])  # axes of an SBET may have been taken wrongly after the positions
+        mirrored = said * np.array([1.0, -1.0, 1.0])  # the axes of an SBET may have been misjudged from such positions
         fits = [np.median(np.abs(_course_error(swapped, velocity))[fast]) for velocity in (said, mirrored)]
         if min(fits) < GREATEST_COURSE_ERROR_RAD:
             hint = "latitude and longitude are swapped"
@@ -253,7 +256,7 @@ def _check_course(columns: TrajectoryColumns, name: str) -> None:
 
 
 def _check_heading_unit(columns: TrajectoryColumns, name: str, pieces: Int64Array, moved: FloatArray) -> None:
-    """No heading is beyond 6.3°, and as radians they point where it flies: so they are radians."""
+    """Refuse headings in radians: none exceeds 6.3, and as radians, but not as degrees, they agree with the course."""
     fast = np.hypot(*moved[:, :2].T) > COURSE_FROM_MPS
     if columns.angles_in == "radians" or not fast.any() or np.degrees(np.abs(columns.heading_rad)).max() > 2 * np.pi:
         return
@@ -278,7 +281,7 @@ CHECKS = (
 
 
 def course_pieces(time_ns: Int64Array) -> Int64Array:
-    """Return (k, 2) rows at the ends of pieces of some second, none over a gap."""
+    """Return (k, 2) rows at the ends of pieces of about a second, none of which spans a gap."""
     begun = np.unique((time_ns - time_ns[0]) // COURSE_PIECE_NS, return_index=True)[1]
     rows = np.unique(np.r_[begun, len(time_ns) - 1])
     pieces = np.stack([rows[:-1], rows[1:]], axis=1)
@@ -289,7 +292,7 @@ def course_pieces(time_ns: Int64Array) -> Int64Array:
 def moved_l(
     time_ns: Int64Array, lat_rad: FloatArray, lon_rad: FloatArray, height_m: FloatArray, pieces: Int64Array
 ) -> FloatArray:
-    """Return (k, 3) mean velocity of each piece by its positions, north, east, down in its middle, m/s."""
+    """Return (k, 3) mean velocity of each piece by its positions, north, east, down at its middle, m/s."""
     begin, end = pieces[:, 0], pieces[:, 1]
     places_e = [e_from_geodetic(lat_rad[rows], lon_rad[rows], height_m[rows]) for rows in (begin, end)]
     lat = (lat_rad[begin] + lat_rad[end]) / 2
@@ -301,7 +304,7 @@ def moved_l(
 
 
 def mean_over(time_ns: Int64Array, values: FloatArray, pieces: Int64Array) -> FloatArray:
-    """Return (k, 3) mean of values (n, 3), linear between rows, over each piece; nan where a row of it says none."""
+    """Return (k, 3) mean of values (n, 3), linear between rows, over each piece; nan where a row of it has none."""
     steps = np.diff(time_ns)[:, np.newaxis] / SECOND_NS * (values[1:] + values[:-1]) / 2
     unsaid = np.isnan(steps)
 

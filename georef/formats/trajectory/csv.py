@@ -1,6 +1,6 @@
-"""Trajectory CSV, the project's own text: CONVENTIONS, "Trajectory and text files".
+"""Read and write trajectory CSV, the project's own text format: CONVENTIONS, "Trajectory and text files".
 
-A header line with the ten columns of `HEADER`, then any of `SIGMAS` (those of the position may also be in degrees of
+A header line has the ten columns of `HEADER`, then any of `SIGMAS` (those of the position may also be in degrees of
 latitude and longitude); other columns are refused.
 """
 
@@ -30,7 +30,11 @@ def is_csv(text: str) -> bool:
 
 
 def read_csv(text: str, name: str) -> TrajectoryColumns:
-    """Return rows of a trajectory CSV; TrajectoryError names the line which is wrong."""
+    """Return rows of a trajectory CSV.
+
+    Raises:
+        TrajectoryError: names the faulty line.
+    """
     lines = text.lstrip("\ufeff").splitlines()
     first = next(i for i, line in enumerate(lines) if line.strip())
     header = [column.strip() for column in lines[first].split(",")]
@@ -62,7 +66,7 @@ def read_csv(text: str, name: str) -> TrajectoryColumns:
 
 
 def csv_text(trajectory: Trajectory) -> str:
-    """Return the trajectory with its sigmas; latitude and longitude to 0.1 mm and better, angles to 1e-8°."""
+    """Return the trajectory with its sigmas as CSV; latitude and longitude to 0.1 mm or better, angles to 1e-8°."""
     trajectory.require_attitude()
     lat, lon, height = trajectory.geodetic()
     columns = (
@@ -96,7 +100,7 @@ def _numbers(lines: list[str], header: list[str], name: str, first_line: int) ->
 
 
 def _sigmas(table: NDArray[np.void], degrees: dict[str, FloatArray]) -> tuple[FloatArray, FloatArray]:
-    """Return (n, 3) of position in metres and of attitude in radians."""
+    """Return sigmas (n, 3) of position in metres and of attitude in radians."""
     position, attitude = unsaid(len(table)), unsaid(len(table))
     for column in table.dtype.names or ():
         metres = OTHER_NAMES.get(column, column)

@@ -1,4 +1,4 @@
-"""Trajectory files of every kind, told apart by what is in them."""
+"""Read trajectory files of every kind, recognised by their content."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from swath.georef.text_encoding import decoded, encoding_of
 from swath.georef.timescales.gps_time import SECOND_NS
 from swath.georef.trajectory.trajectory import DEFAULT_MAX_GAP_NS, Trajectory, TrajectoryError
 
-LOOKED_AT = 65_536  # bytes that tell text from numbers
+LOOKED_AT = 65_536  # bytes examined to distinguish text from binary numbers
 
 
 def read_trajectory(
@@ -30,17 +30,17 @@ def read_trajectory(
     """Return the trajectory in a file: SBET, Waypoint text, RTKLIB .pos or trajectory CSV.
 
     Args:
-        data: the file.
+        data: the file's bytes.
         name: for messages, and of the trajectory.
-        span_ns: GPS time of the first and last record of the log which it is for: the week of files that say none.
-        week: GPS week of the file's first record; goes before span_ns.
+        span_ns: GPS time of the first and last record of its log, which gives the week of a file without one.
+        week: GPS week of the file's first record; takes precedence over span_ns.
         leap_seconds: GPS − UTC as the log knows it, for files in UTC.
         smrmsg: the sigmas that came with an SBET.
         max_gap_ns: longer intervals are gaps.
-        needs_attitude: refuse positions alone.
+        needs_attitude: whether to refuse positions without attitude.
 
     Raises:
-        TrajectoryError: in one line what is wrong.
+        TrajectoryError: one line that names the fault.
     """
     text = _text_of(data)
     if text is None:
@@ -62,7 +62,7 @@ def read_trajectory(
 
 
 def _refuse_sparse(trajectory: Trajectory) -> None:
-    """A trajectory that is all gaps; TrajectoryError."""
+    """Refuse a trajectory that consists of gaps alone with `TrajectoryError`."""
     step_ns = int(np.median(np.diff(trajectory.time_ns)))
     if step_ns > trajectory.max_gap_ns:
         raise TrajectoryError(
@@ -72,7 +72,7 @@ def _refuse_sparse(trajectory: Trajectory) -> None:
 
 
 def _text_of(data: bytes) -> str | None:
-    """Return the text; None: these are numbers."""
+    """Return the text, or None for binary numbers."""
     if encoding_of(data[:4]) != "utf-8-sig":
         return decoded(data, "replace")
     head = data[:LOOKED_AT]
@@ -82,7 +82,7 @@ def _text_of(data: bytes) -> str | None:
 
 
 def _sbet(data: bytes, name: str, span_ns: Span | None, week: int | None, sigmas: Sigmas | None) -> TrajectoryColumns:
-    """Return an SBET; what is one of smrmsg instead is named."""
+    """Return the rows of an SBET; a message names an smrmsg given in its place."""
     if len(data) % SBET_BYTES and data and not len(data) % SMRMSG_BYTES:
         try:
             read_smrmsg(data, name)

@@ -1,10 +1,10 @@
-"""Where navigation begins: attitude, velocity and position of the body found from its own motion and GNSS.
+"""Find the start of navigation: attitude, velocity and position of the body from its own motion and GNSS.
 
-One method serves whatever the vehicle does: attitude, velocity, position and the sensors' errors at a moment are fitted
-to the last minute (`alignment_fit`), and the covariance says what that minute could tell. Standing still it levels, and
-compasses by the earth's rate as far as the gyroscopes are good enough; in motion, airborne or not, changes of velocity
-give the heading; before any, the course over ground does, with the sigma of crabbing; a second antenna or a device's
-own attitude are observations like others.
+One method serves any motion of the vehicle: attitude, velocity, position and sensor errors at a moment are fitted to
+the last minute (`alignment_fit`), and the covariance shows how much that minute determines. At rest the fit levels, and
+finds north by the earth's rate as far as the gyroscopes are good enough; in motion, airborne or not, changes of
+velocity give the heading; before any change, the course over ground gives it, with the sigma of crabbing. A second
+antenna or a device's own attitude are observations like others.
 """
 
 from __future__ import annotations
@@ -35,32 +35,32 @@ from swath.georef.records import Int64Array, StructArray
 from swath.georef.timescales.gps_time import SECOND_NS
 
 WINDOW_NS = 60 * SECOND_NS
-THINNED_NS = 9 * SECOND_NS // 10  # between observations of a kind that are used: noise of neighbours is alike
-FEWEST = 4  # observations
-SHORTEST_S = {"given": 5.0, "good": 10.0, "fair": 30.0, "still": 58.0}  # of data, by what they say
+THINNED_NS = 9 * SECOND_NS // 10  # minimum between used observations of a kind, since neighbours share their noise
+FEWEST = 4  # minimum number of observations
+SHORTEST_S = {"given": 5.0, "good": 10.0, "fair": 30.0, "still": 58.0}  # minimum seconds of data, by the kind of result
 GOOD_RAD, FAIR_RAD, TILT_RAD = np.radians([2.0, 12.0, 2.0])
 CRAB_RAD = float(np.radians(10.0))
-COURSE_MPS = 5.0  # from where on the course says where the nose points
+COURSE_MPS = 5.0  # from this speed on the course gives the heading
 KNOWN_RAD, BACKWARDS_RAD = np.radians([20.0, 60.0])
-MISFIT = 25.0  # reduced χ² beyond which nothing is believed
+MISFIT = 25.0  # reduced χ² beyond which no fit is accepted
 STILL_RADPS, STILL_MPS2, STILL_MPS = 2e-3, 0.05, 0.05
-CHANGE_MPS, CHANGE_SIGMAS = 0.3, 5.0  # of velocity, that tell a heading
+CHANGE_MPS, CHANGE_SIGMAS = 0.3, 5.0  # minimum change of velocity that determines a heading
 STILL_NS = 3 * SECOND_NS
 USED = (Kind.POSITION, Kind.VELOCITY, Kind.HEADING, Kind.ATTITUDE)
 CHUNK_NS = 10 * SECOND_NS
 
 
 class AlignmentError(NavigationError):
-    """The data give no attitude to begin with; says what was missing."""
+    """Raised if the data give no initial attitude; the message names the missing data."""
 
 
 @dataclass(frozen=True, eq=False)
 class AlignedStart(Start):
-    """A start that was found.
+    """A start found by alignment.
 
     Attributes:
         method: "still", "motion", "course", "dual antenna" or "given".
-        text: how it was found, and how well.
+        text: the method in words, with the sigmas.
     """
 
     method: str
@@ -70,16 +70,17 @@ class AlignedStart(Start):
 class Aligner:
     """Takes inertial samples and observations as they come, until the start is known.
 
-    What it finds depends on the data alone, not on how they are cut or which of the two comes first; observations must
-    come by time. An epoch is looked at when inertial samples and a later observation are there.
+    The result depends on the data alone, not on their division into batches or on which of the two comes first;
+    observations must come in order of time. An epoch is examined once inertial samples and a later observation are
+    available.
 
     Args:
         setup: lever arms, baseline and noise.
-        crab_sigma_rad: of heading − course.
+        crab_sigma_rad: sigma of heading − course.
 
     Attributes:
         start: where navigation may begin; None until it is known.
-        state: in words: what it waits for, or how the start was found.
+        state: in words: what the aligner waits for, or how it found the start.
         counts: observations not used, by reason: unusable, out_of_order.
     """
 
@@ -91,7 +92,7 @@ class Aligner:
         self._blocks = Blocks()
         self._waiting = np.zeros(0, OBSERVATION_DTYPE)
         self._window = np.zeros(0, OBSERVATION_DTYPE)
-        self._latest_ns: dict[tuple[int, int], int] = {}  # of kind and antenna
+        self._latest_ns: dict[tuple[int, int], int] = {}  # by kind and antenna
         self._done_ns: int | None = None
 
     def feed(self, inertial: Inertial) -> None:
@@ -111,7 +112,7 @@ class Aligner:
             self._work()
 
     def _work(self) -> None:
-        """Look at every epoch that nothing more will be said of."""
+        """Examine every epoch for which no more data will come."""
         while self.start is None and len(self._waiting):
             now_ns = int(self._waiting["time_ns"][0])
             count = int(np.searchsorted(self._waiting["time_ns"], now_ns, side="right"))
@@ -125,7 +126,7 @@ class Aligner:
                 self._look(now_ns)
 
     def _keep(self, rows: StructArray) -> bool:
-        """Keep the rows of an epoch that are not too close on those before; whether a position is among them."""
+        """Keep an epoch's rows that are not too close to the rows before; return whether a position is among them."""
         kept = []
         for number, row in enumerate(rows):
             key = int(row["kind"]), int(row["antenna"])
@@ -154,7 +155,7 @@ class Aligner:
         self._judge(now_ns, fitted, method if _moved(rows) or method in GIVEN else TOLD_LITTLE[method], seconds)
 
     def _fit(self, problem: Problem, *, standing: bool) -> tuple[Fitted, str]:
-        """Return the best fit, and what its heading comes from."""
+        """Return the best fit, and the source of its heading."""
         fitted = problem.fit(problem.first_guess())
         if problem.has_attitude:
             return fitted, "given"
@@ -168,7 +169,7 @@ class Aligner:
         sigma = float(fitted.sigma(TILT)[2])
         off = (course - heading + np.pi) % (2.0 * np.pi) - np.pi
         if sigma < KNOWN_RAD and abs(off) > BACKWARDS_RAD and fitted.misfit < MISFIT:
-            return fitted, "motion"  # it goes backwards
+            return fitted, "motion"  # the vehicle moves backwards
         given = course, float(np.hypot(self._crab_rad, fitted.sigma(VELOCITY)[:2].max() / speed))
         guesses = [fitted.rot_l_from_b]
         if abs(off) > KNOWN_RAD:
@@ -177,9 +178,9 @@ class Aligner:
         return best, "motion" if best.sigma(TILT)[2] < 0.6 * self._crab_rad else "course"
 
     def _judge(self, now_ns: int, fitted: Fitted, method: str, seconds: float) -> None:
-        """Take a fit as the start, or say what is waited for."""
+        """Accept a fit as the start, or describe the missing data."""
         sigma = fitted.sigma(TILT)
-        if method == "still":  # whatever the fit says: bias and earth rate look alike to a gyroscope
+        if method == "still":  # whatever the fit gives: a gyroscope cannot tell its bias from the earth's rate
             compass = self._setup.noise.gyro_bias / max(_level_earth_rate(fitted.position_e), 1e-9)
             sigma[2] = max(float(sigma[2]), min(compass, np.pi))
         north, east, heading = sigma.tolist()
@@ -222,7 +223,11 @@ FOUND = {
     "motion": "in motion",
     "course": "in motion, heading by the course over ground",
 }
-TOLD_LITTLE = {"still": "still", "motion": "still", "course": "course"}  # where the velocity hardly changed
+TOLD_LITTLE = {
+    "still": "still",
+    "motion": "still",
+    "course": "course",
+}  # methods to report if the velocity hardly changed
 AWAITED = {
     "given": "more data",
     "dual antenna": "more dual-antenna headings",
@@ -241,10 +246,10 @@ def align(
         inertial: samples.
         observations: `OBSERVATION_DTYPE`.
         setup: lever arms, baseline and noise.
-        crab_sigma_rad: of heading − course.
+        crab_sigma_rad: sigma of heading − course.
 
     Raises:
-        AlignmentError: none was found; says what was missing.
+        AlignmentError: no start was found; the message names the missing data.
     """
     aligner = Aligner(setup, crab_sigma_rad)
     rows = sort_observations(observations)
@@ -260,7 +265,7 @@ def align(
 
 
 def _sound(rows: StructArray, antennas: int) -> NDArray[np.bool_]:
-    """Return (n,) whether a row can be used: finite, with a sigma, of an antenna that is known."""
+    """Return (n,) whether a row is usable: finite, with a sigma, of a known antenna."""
     needed = np.where(rows["kind"] == Kind.HEADING, 1, 3)
     component = np.arange(3) < needed[:, None]
     sound = np.isfinite(rows["value"]) & np.isfinite(rows["sigma"]) & (rows["sigma"] > 0.0)
@@ -270,7 +275,7 @@ def _sound(rows: StructArray, antennas: int) -> NDArray[np.bool_]:
 
 
 def _still(felt: Felt, rows: StructArray, noise: ImuNoise) -> Int64Array:
-    """Return GPS times of positions up to the last at which nothing moved: neither sensors nor GNSS say that it did."""
+    """Return GPS times of the positions after the last movement seen by sensors or GNSS; none if too few seconds."""
     block_s = np.sqrt(np.maximum(np.diff(felt.before_s[::-1])[::-1], 1e-3))[:, None]
     rate = np.abs(felt.rate_b) > STILL_RADPS + 3.0 * noise.gyro_bias + 5.0 * noise.angle_random_walk / block_s
     usual = np.median(felt.force_b[-20:], axis=0)
@@ -299,11 +304,11 @@ def _moved(rows: StructArray) -> bool:
 
 
 def _level_earth_rate(position_e: FloatArray) -> float:
-    """Return horizontal component of the earth's rate, rad/s."""
+    """Return the horizontal component of the earth's rate, rad/s."""
     return float(EARTH_RATE_RADPS * np.cos(geodetic_from_e(position_e)[0]))
 
 
 def _degrees(angle_rad: float) -> str:
-    """With two figures that mean something."""
+    """Format an angle in degrees with about two significant figures."""
     degrees = np.degrees(angle_rad)
     return f"{degrees:.0f}°" if degrees >= 10.0 else f"{degrees:.1f}°" if degrees >= 0.1 else f"{degrees:.2g}°"

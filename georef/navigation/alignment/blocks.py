@@ -1,8 +1,8 @@
-"""Inertial samples in short blocks, and their integrals back from a moment: what alignment compares with GNSS.
+"""Sum inertial samples in short blocks, and integrate them back from a moment, for alignment to compare with GNSS.
 
-Everything is written in the axes that the body had at the moment T, held fixed in inertial space. There the attitude
-of an earlier time t is D(t), and what the accelerometers felt since is α(t) = ∫_t^T D f; only the attitude at T itself,
-the velocity and the position then are unknown (optimisation-based alignment; Wu and Pan, Velocity/position integration
+All results are in the axes that the body had at the moment T, held fixed in inertial space. There the attitude of an
+earlier time t is D(t), and the accelerometers' integral since then is α(t) = ∫_t^T D f; only the attitude at T itself
+and the velocity and position at T are unknown (optimisation-based alignment; Wu and Pan, Velocity/position integration
 formula part I, IEEE Trans. AES 49, 2013).
 """
 
@@ -20,8 +20,8 @@ from swath.georef.navigation.inputs import Inertial
 from swath.georef.records import Int64Array
 from swath.georef.timescales.gps_time import SECOND_NS
 
-BLOCK_NS = 50_000_000  # within it rate and force are taken as steady
-_APART_NS = 0.5 * SECOND_NS  # times the interval: samples farther apart do not join
+BLOCK_NS = 50_000_000  # rate and force are taken as constant within a block
+_APART_NS = 0.5 * SECOND_NS  # times the interval: samples farther apart leave a gap
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,13 +34,13 @@ class Felt:
         time_ns: (n + 1,) edges.
         before_s: (n + 1,) T − t.
         turn: (n + 1, 4) D, quaternions of rot_T_from_b.
-        angle_b: (n, 3) turned through in each block, b at its begin.
+        angle_b: (n, 3) angle turned in each block, b at its start.
         rate_b: (n, 3) mean rate against inertial space, rad/s.
         force_b: (n, 3) mean specific force, m/s².
         alpha: (n + 1, 3) ∫ D f, m/s.
         alpha_sum: (n + 1, 3) ∫ alpha, m.
         tilt_by_gyro: (n + 1, 3, 6) ∂ D by the gyroscopes' errors: D true = exp([tilt]×) D.
-        alpha_by_gyro, alpha_by_accel: (n + 1, 3, 6) ∂ alpha: true less computed.
+        alpha_by_gyro, alpha_by_accel: (n + 1, 3, 6) ∂ alpha: true − computed.
         sum_by_gyro, sum_by_accel: (n + 1, 3, 6) ∂ alpha_sum.
     """
 
@@ -59,14 +59,14 @@ class Felt:
     sum_by_accel: FloatArray
 
     def pushed(self, gyro: FloatArray) -> FloatArray:
-        """Return ∫ D f from each edge to the last, (n + 1, 3), of gyroscopes multiplied by (3, 3)."""
+        """Return ∫ D f from each edge to the last, (n + 1, 3), with gyroscopes multiplied by a matrix (3, 3)."""
         forward = _prefix(np.concatenate([[[1.0, 0.0, 0.0, 0.0]], _turned_by(self.angle_b @ gyro.T)]))
         rot = rot_from_quaternion(quaternions.product(quaternions.conjugate(forward[-1]), forward[:-1]))
         push = self.force_b * (np.diff(self.time_ns) / SECOND_NS)[:, None]
         return _back(np.einsum("nij,nj->ni", rot, push))
 
     def at(self, time_ns: Int64Array) -> FeltAt:
-        """Interpolated at times (m,) within the edges."""
+        """Interpolate the integrals at times (m,) within the edges."""
         after = np.clip(np.searchsorted(self.time_ns, time_ns), 1, len(self.time_ns) - 1)
         left_s = (self.time_ns[after] - time_ns) / SECOND_NS
         length_s = (self.time_ns[after] - self.time_ns[after - 1]) / SECOND_NS
@@ -98,7 +98,7 @@ class Felt:
 
 @dataclass(frozen=True, eq=False)
 class FeltAt:
-    """`Felt` at m moments; `rot` (m, 3, 3) is D, `rate_b` (m, 3) in b of the moment."""
+    """`Felt` at m moments; `rot` (m, 3, 3) is D, `rate_b` (m, 3) is in b of the moment."""
 
     before_s: FloatArray
     rot: FloatArray
@@ -113,15 +113,15 @@ class FeltAt:
 
 
 class Blocks:
-    """Samples summed over a fixed grid of GPS time; no number depends on how they are cut into batches.
+    """Samples summed over a fixed grid of GPS time; no number depends on their division into batches.
 
     Attributes:
-        covered_ns: end of the last whole block; None before the first.
+        covered_ns: end of the last complete block; None before the first.
     """
 
     def __init__(self) -> None:
         self.covered_ns: int | None = None
-        self._rest: Inertial | None = None  # samples of the block that is not whole yet
+        self._rest: Inertial | None = None  # samples of the incomplete block
         self._ends_ns = np.zeros(0, np.int64)
         self._lengths_s = np.zeros(0)
         self._begins_anew = np.zeros(0, np.bool_)
@@ -129,7 +129,7 @@ class Blocks:
         self._velocity_b = np.zeros((0, 3))
 
     def feed(self, inertial: Inertial) -> None:
-        """Take the next samples, later than all before."""
+        """Take the next samples, which must be later than all before."""
         joined = inertial if self._rest is None else _joined(self._rest, inertial)
         if not len(joined):
             return
@@ -149,10 +149,10 @@ class Blocks:
             setattr(self, name, getattr(self, name)[first:])
 
     def felt(self, begin_ns: int, end_ns: int) -> Felt | None:
-        """Return integrals back from `end_ns` over unbroken blocks, from the first that begins at `begin_ns` or later.
+        """Return integrals back from `end_ns` over gapless blocks, from the first that begins at `begin_ns` or later.
 
         Returns:
-            None where no block holds `end_ns`.
+            None if no block holds `end_ns`.
         """
         last = int(np.searchsorted(self._ends_ns, end_ns))
         if last >= len(self._ends_ns):
@@ -172,7 +172,7 @@ class Blocks:
         return _integrals(edges_ns, parts[0] * shares[:, None], parts[1] * shares[:, None])
 
     def _sum(self, samples: Inertial, first: NDArray[np.intp], begins_ns: Int64Array) -> None:
-        """Add whole blocks: total turn with coning, force in the axes of the block's begin with sculling."""
+        """Add complete blocks: total turn with coning, force in the axes of the block's start with sculling."""
         counts = np.diff(first, append=len(samples))
         angle, velocity, coning = np.zeros((3, len(first), 3))
         for k in range(int(counts.max())):  # the k-th sample of every block that has one
@@ -195,7 +195,7 @@ class Blocks:
 
 
 def _integrals(edges_ns: Int64Array, angle_b: FloatArray, velocity_b: FloatArray) -> Felt:
-    """Return `Felt` of blocks between edges."""
+    """Return the `Felt` of blocks between edges."""
     length_s = np.diff(edges_ns) / SECOND_NS
     step = length_s[:, None]
     rate, force = angle_b / step, velocity_b / step
@@ -208,7 +208,7 @@ def _integrals(edges_ns: Int64Array, angle_b: FloatArray, velocity_b: FloatArray
     push = np.einsum("nij,nj->ni", rot[:-1], velocity_b)
     tilt = _back(gyro)
     alpha = _back(push)
-    # ∫ φ × (D f) with φ = tilt · errors: −[D f]× tilt; at each block's middle.
+    # ∫ φ × (D f) with φ = tilt · errors: −[D f]× tilt, at each block's middle.
     alpha_by_gyro = _back(-skew(push) @ (0.5 * (tilt[1:] + tilt[:-1])))
     alpha_by_accel = _back(-accel)
 
@@ -251,13 +251,13 @@ def _prefix(q: FloatArray) -> FloatArray:
 
 
 def _turned_by(vector: FloatArray) -> FloatArray:
-    """Return (n, 4) quaternions of rotation vectors (n, 3)."""
+    """Return quaternions (n, 4) of rotation vectors (n, 3)."""
     half = 0.5 * np.linalg.norm(vector, axis=-1, keepdims=True)
     return np.concatenate([np.cos(half), 0.5 * np.sinc(half / np.pi) * vector], axis=-1)
 
 
 def _joined(a: Inertial, b: Inertial) -> Inertial:
-    """Return one after the other."""
+    """Return the samples of both, one after the other."""
     return Inertial(
         np.concatenate([a.time_ns, b.time_ns]),
         np.concatenate([a.interval_s, b.interval_s]),

@@ -1,7 +1,8 @@
-"""A start brought back to before it was known: the attitude by the gyroscopes, place and speed by GNSS of then.
+"""Move a start back to an earlier time: the attitude by the gyroscopes, position and velocity by GNSS at that time.
 
-An alignment is known at the end of the motion that told it; a flight that is processed afterwards need not lose what
-came before. Gyroscopes alone carry the attitude back (Savage 1998, attitude by products of rotation vectors).
+Alignment knows the start only at the end of the motion that determined it; a flight that is processed afterwards need
+not lose the time before. Gyroscopes alone carry the attitude back (Savage 1998, attitude by products of rotation
+vectors).
 """
 
 from __future__ import annotations
@@ -22,28 +23,27 @@ from swath.georef.trajectory.trajectory import EARTH_RATE_RADPS
 
 StartT = TypeVar("StartT", bound=Start)
 
-MOST_DRIFT_RAD = float(np.radians(2.0))  # of the attitude on its way back
-NEAR_NS = SECOND_NS // 2  # of a position to the velocity that is taken with it
-APART_NS = SECOND_NS  # of two positions that give a velocity where none is said
-ACCELERATION_MPS2 = 3.0  # of an aircraft between them
-CAREFUL = 3.0  # factor on the observations' sigmas: they are observed once more
-RATE_NS = SECOND_NS // 10  # over which the turn rate is taken, for the lever arm
+MOST_DRIFT_RAD = float(np.radians(2.0))  # greatest drift of the attitude on its way back
+NEAR_NS = SECOND_NS // 2  # greatest time between a position and the velocity used with it
+APART_NS = SECOND_NS  # minimum time between two positions that give a velocity where none is observed
+ACCELERATION_MPS2 = 3.0  # assumed acceleration of an aircraft between them
+CAREFUL = 3.0  # factor on the observations' sigmas, because the filter uses them again
+RATE_NS = SECOND_NS // 10  # time over which the turn rate for the lever arm is taken
 
 
 def drift_rad(noise: ImuNoise, seconds: float) -> float:
-    """Return standard deviation of what the gyroscopes drift in a time, an axis."""
+    """Return the standard deviation of the gyroscopes' drift over a time, per axis."""
     return float(np.hypot(noise.gyro_bias * seconds, noise.angle_random_walk * np.sqrt(seconds)))
 
 
 def earlier_start(inertial: Inertial, observations: StructArray, setup: Setup, start: StartT) -> StartT:
-    """Return the start at the earliest position that the gyroscopes reach back to; the start itself where there is
-    none.
+    """Return the start at the earliest position that the gyroscopes reach back to, or the given start if none is.
 
     Args:
         inertial: samples without gaps.
         observations: `OBSERVATION_DTYPE`, by time.
         setup: lever arms and noise.
-        start: as found.
+        start: the start from alignment.
     """
     if not len(inertial):
         return start
@@ -67,8 +67,9 @@ def earlier_start(inertial: Inertial, observations: StructArray, setup: Setup, s
 
 
 def _velocity(places: StructArray, observations: StructArray, time_ns: int) -> tuple[FloatArray, FloatArray] | None:
-    """Return (3,) of the antenna, north, east, down, m/s, and sigmas: as said near a time, else by positions from then
-    on.
+    """Return the antenna's velocity (3,), north, east, down, m/s, and its sigmas; None if unknown.
+
+    It is an observed velocity near the time, else that between the first position and a later one.
     """
     said = observations[(observations["kind"] == Kind.VELOCITY) & (observations["antenna"] == places[0]["antenna"])]
     away = np.abs(said["time_ns"] - time_ns)
@@ -93,7 +94,7 @@ def _at(
     moving: tuple[FloatArray, FloatArray],
     drift: float,
 ) -> StartT:
-    """Return the start at a position: the antenna's place and speed, brought to the body's origin."""
+    """Return the start at a position: the antenna's position and velocity, converted to the body's origin."""
     time_ns = int(place["time_ns"])
     rot_e_from_b = _rot_e_from_b(inertial, start, time_ns)
     arm = setup.lever_arms_b[place["antenna"]]
@@ -115,7 +116,7 @@ def _at(
 
 
 def _rot_e_from_b(inertial: Inertial, start: Start, time_ns: int) -> FloatArray:
-    """Return (3, 3) at an earlier time: back by the turns of the samples between, and by the earth's."""
+    """Return (3, 3) at an earlier time: back by the turns of the samples in between, and by the earth's."""
     first, last = np.searchsorted(inertial.time_ns, [time_ns, start.time_ns], side="right").tolist()
     turned = rot_from_quaternion(_chained(inertial.angle_b[first:last]))
     at_start = _rot_e_from_l(start.position_e) @ rot_l_from_b(*start.attitude_rad)
@@ -125,7 +126,7 @@ def _rot_e_from_b(inertial: Inertial, start: Start, time_ns: int) -> FloatArray:
 
 
 def _chained(angle_b: FloatArray) -> FloatArray:
-    """Return (4,) of turns (n, 3) one after the other, by pairs."""
+    """Return the product (4,) of successive turns (n, 3), computed by pairs."""
     size = np.linalg.norm(angle_b, axis=1, keepdims=True)
     q = np.concatenate([np.cos(size / 2), angle_b * (np.sinc(size / (2 * np.pi)) / 2)], axis=1)
     unit = np.array([[1.0, 0.0, 0.0, 0.0]])

@@ -1,14 +1,14 @@
-"""Attitude, velocity and position at a moment by least squares, so that what was felt fits what GNSS saw before it.
+"""Fit attitude, velocity and position at a moment by least squares, so that sensor integrals match GNSS before it.
 
 The frame of computation does not turn: it has the axes of l at the moment T. With the integrals of `alignment_blocks`,
 
     velocity of an antenna at t = v − R α(t) − ∫_t^T γ + R D(t) (ω × l)
     position of an antenna at t = p − v (T − t) + R ∫_t^T α + ∫∫ γ + R D(t) l
 
-γ is gravitation, R = rot_l_from_b at T. Unknown are R, v, p and the sensors' biases and scale factors, the last two
-with the sigmas of the unit's noise, so that the covariance says what the motion left undetermined: standing still, the
-heading is known as well as the gyroscopes tell the earth's rate from their bias. The sensors' noise correlates the
-residuals (random walks of attitude and velocity, integrated); its covariance goes in with GNSS's.
+γ is gravitation, R = rot_l_from_b at T. R, v, p and the sensors' biases and scale factors are unknown, the last two
+with the sigmas of the unit's noise, so that the covariance shows what the motion left undetermined: at rest, the
+heading is known as well as the gyroscopes distinguish the earth's rate from their bias. The sensors' noise correlates
+the residuals (random walks of attitude and velocity, integrated); its covariance is added to GNSS's.
 """
 
 from __future__ import annotations
@@ -41,25 +41,25 @@ TILT, VELOCITY, PLACE, GYRO, ACCEL, ARM = (
 )
 UNKNOWNS = 24
 NO_ROWS = np.zeros((0, 1 + UNKNOWNS))
-PRIOR = (2.0, 200.0, 200.0)  # rad, m/s, m: nothing is known, but numbers stay tame
+PRIOR = (2.0, 200.0, 200.0)  # rad, m/s, m: wide enough to mean no knowledge, but finite for a stable inversion
 ITERATIONS = 8
 CONVERGED = 1e-3  # sigmas
-OUTLIER, SOUND = 6.0, 3.0  # sigmas of a row, and misfit, from which on a row may be left out
+OUTLIER, SOUND = 6.0, 3.0  # sigmas of a row, and misfit, above which a row may be left out
 MOST_OUTLIERS = 4
-HELPED = 0.7  # times the misfit: what leaving a row out must win
+HELPED = 0.7  # times the misfit: the reduction that leaving a row out must achieve
 
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """What was found at T.
+    """The result of a fit at T.
 
     Attributes:
         rot_l_from_b: (3, 3).
         position_e: (3,) of the body's origin.
-        velocity_l: (3,) against the earth.
-        arm_b: (3,) by how much the antenna is elsewhere in b, m; zero where lever arms are held.
+        velocity_l: (3,) relative to the earth.
+        arm_b: (3,) correction of the lever arms in b, m; zero if they are held fixed.
         covariance: (24, 24) of attitude about north, east, down, of velocity, position, sensors' errors, lever arm.
-        cost: weighted sum of squares, that of the course and of the sensors' sigmas included.
+        cost: weighted sum of squares, with that of the course and of the sensors' sigmas.
         misfit: reduced χ² of GNSS's residuals.
         left: (m, 3) these residuals, velocities then positions.
         gyro_scale: (3,) scale factors of the gyroscopes.
@@ -76,21 +76,21 @@ class Fitted:
     gyro_scale: FloatArray
 
     def sigma(self, part: slice) -> FloatArray:
-        """Return (3,) of attitude, velocity or place; wider where the residuals are larger than their sigmas say."""
+        """Return sigmas (3,) of attitude, velocity or position; larger where the residuals exceed their sigmas."""
         variance: FloatArray = np.diag(self.covariance)[part] * max(self.misfit, 1.0)
         sigma: FloatArray = np.sqrt(variance)
         return sigma
 
 
 class Problem:
-    """Observations of a window beside what was felt in it.
+    """Observations of a window together with the sensor integrals over it.
 
     Args:
         felt: integrals back to T.
-        rows: observations within `felt`, sound, by time; POSITION among them.
+        rows: observations within `felt`, usable, by time; POSITION among them.
         setup: lever arms, baseline, noise, floors.
         still: (m,) GPS times at which the vehicle stands still.
-        arm_sigma_m: of the lever arms, all of them together; 0: they are held.
+        arm_sigma_m: sigma of a common correction of the lever arms; 0: they are held fixed.
     """
 
     def __init__(
@@ -134,7 +134,7 @@ class Problem:
         return len(self._attitude) > 0
 
     def first_guess(self) -> FloatArray:
-        """Return rot_l_from_b at T: from changes of velocity and what was felt between, and by given headings."""
+        """Return rot_l_from_b at T from changes of velocity and the forces between them, and from observed headings."""
         if self.has_attitude:
             last = self._attitude[-1]
             there = self._frame.rot_from_l(last["time_ns"][None])[0] @ rot_l_from_b(*last["value"])
@@ -148,11 +148,11 @@ class Problem:
         return rot
 
     def fit(self, rot: FloatArray, course: tuple[float, float] | None = None) -> Fitted:
-        """Return least squares from a first guess of R.
+        """Return the least-squares fit from a first guess of R, without outliers.
 
         Args:
             rot: (3, 3) first guess.
-            course: heading at T and its sigma, rad, by where the vehicle went; None: none.
+            course: heading at T and its sigma, rad, from the direction of travel; None: unused.
         """
         gone = np.zeros(len(self._speed_seen) + len(self._place_seen), np.bool_)
         self._weigh(gone)
@@ -176,7 +176,7 @@ class Problem:
         return noise_covariances(self._speed, self._place, *self._observed)
 
     def _converged(self, rot: FloatArray, course: tuple[float, float] | None) -> Fitted:
-        """Return Gauss and Newton's steps to the end."""
+        """Return the fit after Gauss–Newton steps until convergence."""
         state = np.zeros(UNKNOWNS)
         state[VELOCITY] = self._speed_seen[-1] if len(self._speed_seen) else self._mean_speed()
         for _ in range(ITERATIONS):
@@ -190,7 +190,7 @@ class Problem:
         return self._fitted(rot, state, residual, design)
 
     def _weigh(self, gone: NDArray[np.bool_]) -> None:
-        """What whitens residuals, without those of some rows."""
+        """Compute the matrices that whiten residuals, with negligible weight for the rows in ``gone``."""
         self._whiteners, self._shares = [], []
         for total, own in self._noise:
             wide = total + np.diag(np.where(gone, 1e6 * np.diag(total), 0.0))
@@ -205,25 +205,26 @@ class Problem:
         covariance = self._covariance(design)
         cost = float(residual @ residual)
         misfit = float(residual[:gnss] @ residual[:gnss]) / max(gnss - 9, 1)
-        there = rot_e_from_l(*geodetic_from_e(position_e)[:2]).T @ self._frame.rot_e_from_l  # l of the body's own place
+        # l at the body's own position
+        there = rot_e_from_l(*geodetic_from_e(position_e)[:2]).T @ self._frame.rot_e_from_l
         velocity_l = there @ (state[VELOCITY] - earth_l)
         left = np.concatenate(self._left(rot, state))
         scale = state[GYRO][3:]
         return Fitted(there @ rot, position_e, velocity_l, state[ARM], covariance, cost, misfit, left, scale)
 
     def _covariance(self, design: FloatArray) -> FloatArray:
-        """Return (24, 24) of the unknowns, inverted in units of what is known of them before."""
+        """Return (24, 24) of the unknowns, inverted in units of their prior sigmas."""
         scaled = design * self._prior
         return np.asarray(np.linalg.inv(scaled.T @ scaled), dtype=np.float64) * np.outer(self._prior, self._prior)
 
     def _speeds_seen(self, speed: StructArray, still: Int64Array) -> FloatArray:
-        """Return (m, 3) velocities against inertial space; of one that stands still, by its place."""
+        """Return (m, 3) velocities against inertial space; those at rest follow from the position."""
         rest = np.zeros(len(still), speed.dtype)
         rest["time_ns"] = still
         return self._frame.velocity(np.concatenate([speed, rest]))
 
     def _changes(self) -> tuple[FloatArray, FloatArray]:
-        """Return changes of velocity less gravitation's, and what was felt for them in the axes of b at T."""
+        """Return velocity changes without gravitation's share, and the sensors' values for them, in axes of b at T."""
         if len(self._speed_seen) >= len(self._place_seen):
             order = np.argsort(-self._speed.before_s, kind="stable")
             return np.diff(self._speed_seen[order], axis=0), np.diff((self._swing - self._speed.alpha)[order], axis=0)
@@ -238,7 +239,7 @@ class Problem:
         return mean
 
     def _turned(self, rot: FloatArray, state: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return (m, 3) what changed velocities and places since, by the sensors less their errors so far."""
+        """Return changes (m, 3) of velocity and position up to T, by the sensors less their current error estimates."""
         speed, place = self._speed, self._place
         alpha = speed.alpha + speed.alpha_by_gyro @ state[GYRO] + speed.alpha_by_accel @ state[ACCEL] - self._swing
         alpha -= self._swing_by_arm @ state[ARM]
@@ -247,7 +248,7 @@ class Problem:
         return -alpha @ rot.T, total @ rot.T
 
     def _left(self, rot: FloatArray, state: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return (m, 3) residuals of velocities and of places, observed − computed."""
+        """Return (m, 3) residuals of velocities and of positions, observed − computed."""
         pushed, moved = self._turned(rot, state)
         flown = state[PLACE] - self._place.before_s[:, None] * state[VELOCITY]
         return self._speed_seen - state[VELOCITY] - pushed, self._place_seen - flown - moved
@@ -255,13 +256,13 @@ class Problem:
     def _rows(
         self, rot: FloatArray, state: FloatArray, course: tuple[float, float] | None
     ) -> tuple[FloatArray, FloatArray]:
-        """Whitened residuals (k,) and design (k, 24): GNSS, headings, attitudes, course, what is known before."""
+        """Return whitened residuals (k,) and design (k, 24): GNSS, headings, attitudes, course, prior knowledge."""
         speed_left, place_left = self._left(rot, state)
         speed, place = self._speed, self._place
         by_speed, by_place = np.zeros((len(speed_left), 3, UNKNOWNS)), np.zeros((len(place_left), 3, UNKNOWNS))
         left = np.concatenate([speed_left, place_left])
-        # What turns with the attitude is the motion, not the noise in it: the inertial unit's share of the residuals
-        # goes, for else noise that a turn of R turns along passes for something that tells the attitude.
+        # Only the motion turns with the attitude, not the noise in it. Without removing the inertial unit's share of
+        # the residuals, noise that turns along with R would pass for information about the attitude.
         own = [
             share @ (white @ left[:, axis])
             for axis, (share, white) in enumerate(zip(self._shares, self._whiteners, strict=True))
@@ -290,7 +291,7 @@ class Problem:
         return rows[:, 0], rows[:, 1:]
 
     def _heading_rows(self, rot: FloatArray, state: FloatArray) -> FloatArray:
-        """Return directions of the baseline, and its slope where that is said."""
+        """Return rows for the baseline's direction, and for its slope where that is observed."""
         rows = []
         if not len(self._heading):
             return NO_ROWS
@@ -316,7 +317,7 @@ class Problem:
         return np.array(rows).reshape(-1, 1 + UNKNOWNS)
 
     def _attitude_rows(self, rot: FloatArray, state: FloatArray) -> FloatArray:
-        """Return a device's own attitudes."""
+        """Return rows for a device's own attitudes."""
         felt, seen = self._attitude_felt, self._attitude
         if not len(seen):
             return NO_ROWS
@@ -333,16 +334,14 @@ class Problem:
         return rows
 
     def _prior_rows(self, state: FloatArray) -> FloatArray:
-        """Return what is known of the unknowns before: of the sensors' errors their sigmas, of the others next to
-        nothing.
-        """
+        """Return rows for prior knowledge: sensor errors with their sigmas, other unknowns with very wide ones."""
         left = np.where(np.arange(UNKNOWNS) < 9, 0.0, -state)
         rows: FloatArray = np.column_stack([left, np.eye(UNKNOWNS)]) / self._prior[:, None]
         return rows
 
 
 def _course_row(rot: FloatArray, course_rad: float, sigma_rad: float) -> FloatArray:
-    """Return the heading is the course, but for crabbing."""
+    """Return the row that sets the heading equal to the course within the sigma of crabbing."""
     north, east, down = rot[:, 0]
     row = np.zeros((1, 1 + UNKNOWNS))
     row[0, 0] = (course_rad - np.arctan2(east, north) + np.pi) % (2.0 * np.pi) - np.pi
@@ -351,21 +350,22 @@ def _course_row(rot: FloatArray, course_rad: float, sigma_rad: float) -> FloatAr
 
 
 def _by_turn(north: float, east: float, down: float) -> FloatArray:
-    """Return (3,) by how much the heading of a vector grows when it is turned about north, east, down."""
+    """Return the derivatives (3,) of a vector's heading by turns about north, east, down."""
     square = max(north * north + east * east, 1e-12)
     return np.array([-down * north / square, -down * east / square, 1.0])
 
 
 def _turned_onto(seen: FloatArray, felt: FloatArray) -> FloatArray:
-    """Return (3, 3) rotation that takes vectors (n, 3) felt onto those seen, by least squares (Wahba 1965; Markley
-    1988).
+    """Return the rotation (3, 3) from vectors (n, 3) felt to those seen (Wahba 1965, Markley 1988).
+
+    It is that of least squares.
     """
     u, _, vt = np.linalg.svd(seen.T @ felt)
     return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt, dtype=np.float64)
 
 
 def _turn(vector: FloatArray) -> FloatArray:
-    """Return (3, 3) of a rotation vector (3,) (Rodrigues)."""
+    """Return the matrix (3, 3) of a rotation vector (3,) (Rodrigues)."""
     angle = float(np.linalg.norm(vector))
     cross = skew(vector)
     turned: FloatArray = (

@@ -1,7 +1,7 @@
-"""Noise by which GNSS's velocities and positions differ from what was felt: the covariance of alignment's residuals.
+"""Compute the covariance of alignment's residuals, between GNSS's velocities and positions and sensor integrals.
 
-White noise of the sensors is integrated into walks that neighbouring residuals share; an accelerometer's error wanders
-besides, under vibration and road, by a share of its bias. Headings are few enough, and white.
+White noise of the sensors is integrated into random walks that neighbouring residuals share; an accelerometer's error
+also wanders, under vibration and road, by a share of its bias. Headings are few enough to be taken as white.
 """
 
 from __future__ import annotations
@@ -16,16 +16,18 @@ from swath.georef.navigation.inputs import Setup
 from swath.georef.records import StructArray
 
 G_MPS2 = 9.80665
-STILL_MPS = 0.003  # what a vehicle that stands still moves
-HEADING_STEP_NS = 5_000_000_000  # between headings whose errors last: those between say little that is new
-WANDER, WANDER_S = 0.25, 5.0  # share of its bias by which an accelerometer's error changes under way, and how fast
+STILL_MPS = 0.003  # residual motion of a vehicle that stands still
+HEADING_STEP_NS = 5_000_000_000  # interval between headings whose errors last: those in between add little information
+# share of its bias by which an accelerometer's error changes in motion, and its time constant
+WANDER, WANDER_S = 0.25, 5.0
 
 
 def covariances(
     speed: FeltAt, place: FeltAt, speed_rows: StructArray, place_rows: StructArray, setup: Setup
 ) -> list[tuple[FloatArray, FloatArray]]:
-    """Return (m, m) of the residuals to the north, east and down, velocities then places: in all, and the inertial
-    unit's.
+    """Return residual covariances (m, m) by axis north, east, down, velocities then positions.
+
+    Each pair is the total and the inertial unit's share.
     """
     still = len(speed.before_s) - len(speed_rows)
     floor = np.array([1.0, 1.0, 1.5])
@@ -52,11 +54,10 @@ def covariances(
 
 
 def _walks(speed_s: FloatArray, place_s: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return covariances of velocities and places at times before T, of white rate noise under 1 m/s², of white force
-    noise.
+    """Return covariances of velocities and positions at times before T, of unit white noise of rates and of forces.
 
-    A disturbance at s before T has moved the velocity at t > s before T by (t − s) times the force if it was of the
-    rate, by 1 if of the force; the place by one integral more, and to the other side.
+    Rate noise acts under 1 m/s². A disturbance at s before T has changed the velocity at t > s before T by (t − s)
+    times the force for rate noise, by 1 for force noise; the position by one integral more, with the opposite sign.
     """
     age = np.concatenate([speed_s, place_s])
     order = np.concatenate([np.zeros(len(speed_s)), np.ones(len(place_s))])
@@ -86,7 +87,7 @@ def _powers(rest: FloatArray, degree: FloatArray) -> list[FloatArray]:
 
 
 def spaced_headings(rows: StructArray, setup: Setup) -> StructArray:
-    """Thin headings, sorted by time, whose errors last, with the sigma of a white error that averages as slowly."""
+    """Thin headings, sorted by time, whose errors last, and set their sigmas to those of equivalent white errors."""
     if setup.gnss_heading_share <= 0.0 or not len(rows):
         return rows
     spaced = rows[np.unique(rows["time_ns"] // HEADING_STEP_NS, return_index=True)[1]]
@@ -97,9 +98,9 @@ def spaced_headings(rows: StructArray, setup: Setup) -> StructArray:
 
 
 def white_factor(step_ns: int, share: float, tau_s: float) -> float:
-    """Return the factor on the sigma of values a step apart, a share of whose error is a Gauss–Markov process of tau.
+    """Return the sigma factor for values a step apart, a share of whose error is a Gauss–Markov process of tau.
 
-    With it the mean of many has the variance that it really has, as if their errors were white.
+    With it the mean of many has its true variance, although their errors are treated as white.
     """
     stays = math.exp(-step_ns * 1e-9 / tau_s)
     return math.sqrt(1.0 - share**2 + share**2 * (1.0 + stays) / (1.0 - stays))

@@ -1,1 +1,1 @@
-"""What innovations say of a flight's installation and timing."""
+"""Diagnose a flight's installation and timing from its data."""

@@ -1,4 +1,4 @@
-"""What is wrong with inertial samples or GNSS by themselves: times, gaps, fixes, units."""
+"""Find faults of inertial samples or GNSS by themselves: times, gaps, fixes, units."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ G_MPS2 = 9.80665
 MOSTLY = 0.5
 WEEK_S = 604_800.0
 BAD_SIGMA_M = 100.0
-BRIDGED = (0.01, 0.3)  # shares that are told, that mean another rate
-SIZE = (0.9, 1.1)  # of g: the mean specific force of anything that stands, drives or flies
-SPEED_OFF_MPS = 1.0  # between velocities and the positions' changes
+BRIDGED = (0.01, 0.3)  # shares of made-up intervals: worth a warning, and a sign of another rate
+SIZE = (0.9, 1.1)  # of g: limits of the mean specific force of anything that stands, drives or flies
+SPEED_OFF_MPS = 1.0  # greatest difference between velocities and the positions' changes
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """Something wrong.
+    """A fault of the input.
 
     Attributes:
         code: short name of the fault.
-        severity: error: the trajectory will be wrong or none; warning: it may be worse.
-        text: one sentence, with what to change.
+        severity: error: the trajectory will be wrong or missing; warning: it may be worse.
+        text: one sentence, with the remedy.
     """
 
     code: str
@@ -37,7 +37,7 @@ class Finding:
 
 
 def times(inertial: Inertial, place: StructArray) -> Iterator[Finding]:
-    """Have both a common time, without jumps?"""
+    """Yield a fault if IMU and GNSS have no common time, or if either's times jump by weeks."""
     for name, time_ns in (("the IMU's samples", inertial.time_ns), ("GNSS's positions", place["time_ns"])):
         if not len(time_ns):
             yield Finding("no_data", "error", f"there are none of {name}: look for the device in the log's sources")
@@ -70,7 +70,7 @@ def times(inertial: Inertial, place: StructArray) -> Iterator[Finding]:
 
 
 def gaps(inertial: Inertial) -> Iterator[Finding]:
-    """Yield samples that are missing."""
+    """Yield faults of missing or made-up samples."""
     begins_ns = inertial.time_ns - np.rint(inertial.interval_s * SECOND_NS).astype(np.int64)
     missing_s = (begins_ns[1:] - inertial.time_ns[:-1]) / SECOND_NS
     found = np.flatnonzero(missing_s > 0.5 * inertial.interval_s[1:])
@@ -101,7 +101,7 @@ def gaps(inertial: Inertial) -> Iterator[Finding]:
 
 
 def receiver(observations: StructArray, place: StructArray) -> Iterator[Finding]:
-    """Do positions come with a fix and a sigma worth having, and go with the velocities?"""
+    """Yield faults of positions without a fix or with a large sigma, or that contradict the velocities."""
     finite = np.isfinite(place["value"]).all(axis=1) & np.isfinite(place["sigma"]).all(axis=1)
     bad = ~finite | (place["sigma"].max(axis=1) > BAD_SIGMA_M) | (place["fix_type"] == FixType.NONE)
     if bad.mean() > MOSTLY:
@@ -122,7 +122,7 @@ def receiver(observations: StructArray, place: StructArray) -> Iterator[Finding]
 
 
 def _speed_off(speed: StructArray, place: StructArray) -> float | None:
-    """Return typical difference of velocities and positions' changes, m/s; None where it is small."""
+    """Return the typical difference between velocities and the positions' changes, m/s; None if it is small."""
     speed = speed[np.isfinite(speed["value"]).all(axis=1)]
     if len(place) < 10 or len(speed) < 10:
         return None
@@ -143,7 +143,7 @@ def _speed_off(speed: StructArray, place: StructArray) -> float | None:
 
 
 def force(inertial: Inertial) -> Iterator[Finding]:
-    """Is the mean specific force gravity's?"""
+    """Yield a fault if the mean specific force is not that of gravity."""
     total_s = float(inertial.interval_s.sum())
     size = float(np.linalg.norm(inertial.velocity_b, axis=1).sum()) / max(total_s, 1e-9)
     if not SIZE[0] * G_MPS2 < size < 2.0 * G_MPS2:

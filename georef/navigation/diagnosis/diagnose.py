@@ -1,7 +1,7 @@
-"""What is wrong with the input of navigation, in words and with what to change.
+"""Diagnose faults of navigation's input, in words and with the remedy.
 
-What stands first hides what comes later: of data without a common time nothing more is asked, and a lever arm means
-nothing before the axes are right.
+Earlier checks come first because their faults hide later ones: without a common time no further check is made, and a
+lever arm cannot be judged before the axes are right.
 """
 
 from __future__ import annotations
@@ -36,33 +36,33 @@ from swath.georef.timescales.gps_time import GPS_EPOCH, SECOND_NS, table_leap_se
 
 G_MPS2 = 9.80665
 SWAPPED_RAD, TURNED_RAD = np.radians([135.0, 10.0])
-ORIGIN_SHARE = 0.25  # of the lever arm: so near the origin positions are the body's
+ORIGIN_SHARE = 0.25  # of the lever arm: positions this close to the origin are taken as the body's
 ARM_OFF_M = 1.0
 AXES = "xyz"
-SHIFTED = 0.5  # times the misfit: what taking off a time offset must leave at most
+SHIFTED = 0.5  # times the misfit: the most that removing a time offset may leave
 ALONE = 5.0  # sigmas of an offset that no fit can confirm
-SHOWS = 0.5  # of the innovations that an offset would make: what the filter shows at least if there is one
-AGREES_S = 0.05  # a smaller offset is not looked at
+SHOWS = 0.5  # share of the innovations expected from an offset that the filter must show at least if the offset is real
+AGREES_S = 0.05  # a smaller offset is ignored
 
 
 class HasSolution(Protocol):
-    """Solved navigation."""
+    """A solved navigation with its smoothed solution."""
 
     @property
     def smoothed(self) -> Solution:
-        """With its innovations."""
+        """The smoothed solution, with its innovations."""
 
 
 def diagnose(
     inertial: Inertial, observations: StructArray, setup: Setup, solved: HasSolution | None = None
 ) -> list[Finding]:
-    """Return faults of the input that the data themselves show, the worst first; empty where nothing is wrong.
+    """Return faults of the input that the data themselves show, the worst first; empty if there are none.
 
     Args:
         inertial: samples.
         observations: `OBSERVATION_DTYPE`, by time.
         setup: as the filter takes it.
-        solved: of the same data; None: without what the filter rejected.
+        solved: of the same data; None: the filter's rejections are not checked.
     """
     place = observations[observations["kind"] == Kind.POSITION]
     findings = list(times(inertial, place))
@@ -82,13 +82,13 @@ def diagnose(
 def _motion(
     inertial: Inertial, observations: StructArray, setup: Setup, solved: HasSolution | None
 ) -> Iterator[Finding]:
-    """Do IMU and GNSS go together: in axes, time, headings, lever arm?
+    """Yield faults that IMU and GNSS show together: axes, time, headings, lever arm.
 
-    Axes come first: with wrong ones no time is right. A time offset is told where it mends what does not fit.
+    Axes come first: with wrong ones no time is right. A time offset is reported if removing it improves the fit.
     """
     taken_s = 0.0
     if solved is not None and setup.estimate_time_offset_s > 0.0 and len(solved.smoothed.time_offset_s):
-        taken_s = float(solved.smoothed.time_offset_s[-1])  # by the filter, whose times these are then
+        taken_s = float(solved.smoothed.time_offset_s[-1])  # estimated by the filter, so that these times include it
         observations = observations.copy()
         observations["time_ns"] += round(taken_s * SECOND_NS)
     chosen = windows(inertial, observations, setup)
@@ -127,7 +127,7 @@ def _motion(
 
 
 def _filter_denies(offset: TimeOffset, observations: StructArray, solved: HasSolution | None) -> bool:
-    """Return whether the filter knows better: its innovations show nothing of what the offset would make of them."""
+    """Return whether the filter's innovations contradict an offset, which would have made them larger."""
     if solved is None:
         return False
     rows = solved.smoothed.innovations
@@ -176,7 +176,10 @@ def _offset_finding(offset: TimeOffset, gps_ns: int) -> Finding:
 
 
 def _sensor_finding(mounting: Mounting, body: FloatArray | None) -> Finding:
-    """Return what of the sensors is taken wrongly, with the remedy; by the way the vehicle goes where that is known."""
+    """Return the finding for wrong sensor axes or units, with the remedy.
+
+    ``body`` is the turn that the direction of travel requires.
+    """
     turn = np.eye(3) if body is None else body
     gyro, accel = turn @ mounting.gyro, turn @ mounting.accel
     times = f"{np.sqrt(mounting.gain):.0f} times better"
@@ -264,7 +267,7 @@ def _axes_finding(matrix: FloatArray) -> Finding | None:
 
 
 def _gravity(inertial: Inertial) -> Finding | None:
-    """Return the mean specific force, for what never goes anywhere."""
+    """Return a finding if the mean specific force lies along a wrong axis, for a vehicle that never moves."""
     mean = inertial.velocity_b.sum(axis=0) / max(float(inertial.interval_s.sum()), 1e-9) / G_MPS2
     axis = int(np.argmax(np.abs(mean)))
     if (axis == 2 and mean[2] < 0.0) or abs(mean[axis]) < 0.8:
@@ -361,7 +364,7 @@ def _rejected(solved: HasSolution | None) -> Iterator[Finding]:
 
 
 def _axis(row: FloatArray) -> str:
-    """Return which axis, with its sign, a row of a signed permutation takes."""
+    """Return the axis, with its sign, that a row of a signed permutation selects."""
     axis = int(np.argmax(np.abs(row)))
     return f"{'-' if row[axis] < 0.0 else '+'}{AXES[axis]}"
 

@@ -1,8 +1,8 @@
-"""Do inertial samples and GNSS describe one motion of one body? Fits over windows tell what is mounted otherwise.
+"""Check whether inertial samples and GNSS describe one motion of one body, by fits over windows.
 
-The fit of `alignment_fit` takes nothing for granted about how the unit is mounted: it finds the attitude with which
-what was felt agrees with GNSS. Where that fails, other orders and signs of the gyroscopes' axes are tried; where it
-succeeds, the body's axes are compared with the way the vehicle went, and the lever arm is fitted as well.
+The fit of `alignment_fit` assumes nothing about the mounting of the unit: it finds the attitude with which the sensor
+integrals agree with GNSS. Where that fails, other orders and signs of the gyroscopes' axes are tried; where it
+succeeds, the body's axes are compared with the direction of travel, and the lever arm is fitted as well.
 """
 
 from __future__ import annotations
@@ -26,15 +26,17 @@ from swath.georef.timescales.gps_time import SECOND_NS
 WINDOW_NS = 40 * SECOND_NS
 MOST_WINDOWS = 6
 THINNED_NS = 9 * SECOND_NS // 10
-FEWEST = 8  # positions in a window
-FITS, FAILS = 20.0, 60.0  # reduced χ² of a fit that is right, of one that is not
-BETTER = 10.0  # times less χ² than the axes as they are
-ALIKE = 3.0  # times the best's χ²: what fits so well cannot be told from it
+FEWEST = 8  # minimum positions in a window
+FITS, FAILS = 20.0, 60.0  # reduced χ² of a fit that is right, and of one that is not
+BETTER = 10.0  # times less χ² than with the given axes
+ALIKE = 3.0  # times the best's χ²: fits below this cannot be told from the best
 SHORTLIST = 4  # pairs that are fitted, of those whose changes of velocity agree best
-FREE_SCALE, MOST_SCALE = 0.5, 0.1  # of the gyroscopes: its prior sigma where a unit is doubted, and its error then
+# of the gyroscopes: the scale's prior sigma when the unit is in doubt, and the greatest error then
+FREE_SCALE, MOST_SCALE = 0.5, 0.1
 COURSE_MPS = 5.0
-ALONG = 0.85  # of 1: how well the body's axes must lie along the vehicle's, turned by right angles
-ARM_SIGMA_M, NEAR_ARM = 5.0, 1.5  # prior sigma where it is looked for; times the arm where only its axes may differ
+ALONG = 0.85  # minimum cosine between the body's axes and the vehicle's, after a turn by right angles
+# prior sigma for a free lever arm; the same, times the arm, where only its axes may differ
+ARM_SIGMA_M, NEAR_ARM = 5.0, 1.5
 G_MPS2 = 9.80665
 NO_INDEX = np.zeros(0, np.int64)
 SCALE = slice(GYRO.start + 3, GYRO.stop)
@@ -42,7 +44,7 @@ SCALE = slice(GYRO.start + 3, GYRO.stop)
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """A stretch with motion.
+    """A stretch of data with motion.
 
     Attributes:
         inertial: samples.
@@ -59,15 +61,15 @@ class Window:
 
 @dataclass(frozen=True, eq=False)
 class Mounting:
-    """How the sensors' signals must be taken so that gyroscopes, accelerometers and GNSS describe one motion.
+    """The change of the sensors' axes and units with which gyroscopes, accelerometers and GNSS describe one motion.
 
     Attributes:
-        gyro, accel: (3, 3) signed permutations, good = matrix · as it is. Without the way the vehicle goes they are
-            known up to a turn that both share.
+        gyro, accel: (3, 3) signed permutations, good = matrix · given. Without the direction of travel they are known
+            up to a common turn.
         unit: factor on the gyroscopes' signals.
-        gain: how many times less misfit that leaves.
-        left: what misfit it leaves.
-        rivals: other ways, gyro and accel, that fit as well; empty: there are none.
+        gain: ratio of the misfit before to that after the change.
+        left: misfit after the change.
+        rivals: other pairs of gyro and accel that fit as well; may be empty.
     """
 
     gyro: FloatArray
@@ -79,12 +81,12 @@ class Mounting:
 
     @property
     def is_as_it_is(self) -> bool:
-        """True if the sensors go together as they are taken: what does not fit is elsewhere."""
+        """True if the sensors agree as given, so that any misfit has another cause."""
         return self.unit == 1.0 and np.array_equal(self.gyro, np.eye(3)) and np.array_equal(self.accel, np.eye(3))
 
 
 def windows(inertial: Inertial, observations: StructArray, setup: Setup) -> list[Window]:
-    """Return the stretches in which most happens, by time; fewer where data are few."""
+    """Return the stretches with the most motion, by time; fewer if data are few."""
     rows = _used(observations, len(setup.lever_arms_b))
     place = rows[rows["kind"] == Kind.POSITION]
     begins_ns = np.arange(max(_first(inertial.time_ns), _first(place["time_ns"])), _last(inertial.time_ns), WINDOW_NS)
@@ -99,19 +101,19 @@ def windows(inertial: Inertial, observations: StructArray, setup: Setup) -> list
 
 
 def median_misfit(chosen: list[Window]) -> float:
-    """Return the usual reduced χ² of the windows; 0 without any."""
+    """Return the median reduced χ² of the windows; 0 without any."""
     return float(np.median([window.fitted.misfit for window in chosen])) if chosen else 0.0
 
 
 def mounting_of(chosen: list[Window], setup: Setup) -> Mounting | None:
     """Find the order, signs or unit of the sensors' axes with which gyroscopes and accelerometers agree.
 
-    Both triads can be taken in 48 ways each; what turns both is no matter of theirs, so that 96 pairs are left: 48 of
-    the gyroscopes, with the accelerometers as they are or all negated. A wrong unit is looked for only where no pair
-    fits, and told only where the gyroscopes' scale, estimated with it, is 1 within its uncertainty.
+    Each triad allows 48 signed permutations; a turn of both together makes no difference here, so that 96 pairs remain:
+    48 of the gyroscopes, with the accelerometers as given or all negated. A wrong unit is tried only if no pair fits,
+    and reported only if the gyroscopes' scale, estimated with it, is 1 within its uncertainty.
 
     Returns:
-        None where everything fits as it is, or no way of taking the axes does.
+        None if everything fits as given, or if no permutation fits.
     """
     if median_misfit(chosen) < FITS:
         return None
@@ -121,7 +123,7 @@ def mounting_of(chosen: list[Window], setup: Setup) -> Mounting | None:
     for unit in (1.0, np.pi / 180.0, 180.0 / np.pi):
         unlike = sum(_unlikeness(window, _taken(window, unit)) for window in worst)
         best = np.argsort(np.ravel(unlike), kind="stable")[:SHORTLIST].tolist()
-        likely = [pairs[number] for number in dict.fromkeys([0, *best])]  # the first is as it is
+        likely = [pairs[number] for number in dict.fromkeys([0, *best])]  # the first is the given one
         asked = setup if unit == 1.0 else replace(setup, noise=replace(setup.noise, gyro_scale=FREE_SCALE))
         fitted = [(pair, *_fits(worst, unit, pair, asked)) for pair in likely]
         if unit == 1.0:
@@ -138,28 +140,28 @@ def mounting_of(chosen: list[Window], setup: Setup) -> Mounting | None:
 
 
 def _fits(worst: list[Window], unit: float, pair: tuple[FloatArray, FloatArray], setup: Setup) -> tuple[float, bool]:
-    """Return the larger misfit of a pair in windows, and whether the gyroscopes' scale comes out as 1 there."""
+    """Return a pair's larger misfit in windows, and whether the gyroscopes' scale is 1 there."""
     left, is_one = 0.0, False
     for window in worst:
         fitted = _fit(_taken(window, unit * pair[0], pair[1]), window.rows, setup, free_arm=True)
         left = max(left, fitted.misfit)
         sigma = fitted.sigma(SCALE)
-        best = int(np.argmin(sigma))  # of the axis that turned most
+        best = int(np.argmin(sigma))  # the axis that turned most
         known = float(sigma[best]) < MOST_SCALE
         is_one |= known and abs(float(fitted.gyro_scale[best])) < max(3.0 * float(sigma[best]), MOST_SCALE)
     return left, is_one
 
 
 def body_axes(chosen: list[Window], setup: Setup, mounting: Mounting | None = None) -> FloatArray | None:
-    """Return the turn by right angles (24) that takes the body's axes to the vehicle's; the identity where they are so.
+    """Return the turn by right angles (of 24) that takes the body's axes to the vehicle's; the identity if they agree.
 
     Args:
         chosen: windows.
         setup: lever arms and noise.
-        mounting: how the sensors are taken; None: as they are.
+        mounting: change of the sensors' axes; None: as given.
 
     Returns:
-        None where the vehicle did not go fast enough, or its axes lie between.
+        None if the vehicle was too slow, or if its axes lie between right angles.
     """
     total, count = np.zeros((3, 3)), 0
     for window in chosen:
@@ -183,9 +185,7 @@ def body_axes(chosen: list[Window], setup: Setup, mounting: Mounting | None = No
 
 
 def heading_offset(chosen: list[Window], setup: Setup) -> tuple[float, float] | None:
-    """Return dual-antenna heading less the heading of the baseline by motion, and its sigma, rad; None where either
-    lacks.
-    """
+    """Return dual-antenna heading minus the baseline's heading by motion, and its sigma, rad; None if either lacks."""
     if setup.baseline_b is None:
         return None
     offsets, sigmas = [], []
@@ -206,9 +206,7 @@ def heading_offset(chosen: list[Window], setup: Setup) -> tuple[float, float] | 
 
 
 def other_signs(arm_b: FloatArray, fitted_b: FloatArray, sigma_m: FloatArray) -> FloatArray | None:
-    """Return signs (3,) with which a lever arm fits clearly better than as it is; None where it does as it is, or none
-    do.
-    """
+    """Return signs (3,) with which a lever arm fits clearly better; None if it fits as given, or with no signs."""
     off = np.linalg.norm(fitted_b - arm_b)
     if off < max(0.3, 8.0 * float(sigma_m.max())):
         return None
@@ -220,7 +218,7 @@ def other_signs(arm_b: FloatArray, fitted_b: FloatArray, sigma_m: FloatArray) ->
 
 
 def lever_arm(chosen: list[Window], setup: Setup) -> tuple[FloatArray, FloatArray] | None:
-    """Return lever arm (3,) of antenna 0 that positions and velocities fit best, m in b, and its sigma (3,)."""
+    """Return the lever arm (3,) of antenna 0 that positions and velocities fit best, m in b, and its sigma (3,)."""
     information, weighted = np.zeros((3, 3)), np.zeros(3)
     for window in chosen:
         rows = window.rows[(window.rows["antenna"] == 0) & _is_motion(window.rows)]
@@ -239,7 +237,7 @@ def lever_arm(chosen: list[Window], setup: Setup) -> tuple[FloatArray, FloatArra
 
 
 def _taken(window: Window, gyro: FloatArray | float, accel: FloatArray | float = 1.0) -> Felt:
-    """Return what was felt with the sensors taken otherwise: summed anew, for axes matter within blocks too."""
+    """Return the integrals with other sensor axes, summed anew because axes matter within blocks too."""
     own = window.inertial
     blocks = Blocks()
     angle_b = own.angle_b @ (gyro * np.eye(3) if isinstance(gyro, float) else gyro).T
@@ -250,10 +248,10 @@ def _taken(window: Window, gyro: FloatArray | float, accel: FloatArray | float =
 
 
 def _unlikeness(window: Window, felt: Felt) -> FloatArray:
-    """Return (2, 48) how little changes of velocity seen and felt agree, for accelerometers as they are and negated.
+    """Return (2, 48) the disagreement of velocity changes seen and felt, with accelerometers as given and negated.
 
     The best turn of one onto the other is taken out (Kabsch 1976), gravity is that of a flat earth, and the lever arm
-    is left out: good enough to choose what is fitted.
+    is ignored: good enough to choose candidates for fits.
     """
     time_ns, velocity_l = velocities(window.rows)
     inside = (time_ns >= felt.time_ns[0]) & (time_ns <= felt.time_ns[-1])
@@ -274,7 +272,7 @@ def _unlikeness(window: Window, felt: Felt) -> FloatArray:
 
 
 def _fit(felt: Felt, rows: StructArray, setup: Setup, *, free_arm: bool = False) -> Fitted:
-    """Return the fit; with a free lever arm where the axes are in question, for in other axes it is another."""
+    """Return the fit, with a free lever arm if the axes are in question, since other axes change it."""
     arm_m = NEAR_ARM * float(np.linalg.norm(setup.lever_arms_b[0])) + MOST_SCALE if free_arm else 0.0
     problem = Problem(felt, rows[_is_motion(rows)], setup, NO_INDEX, arm_m)
     return problem.fit(problem.first_guess())
@@ -299,7 +297,7 @@ def _window(inertial: Inertial, rows: StructArray, setup: Setup, begin_ns: int) 
 
 
 def _used(observations: StructArray, antennas: int) -> StructArray:
-    """Return sound rows, thinned to about one a second of a kind."""
+    """Return usable rows, thinned to about one a second of each kind."""
     rows = observations[np.isin(observations["kind"], (Kind.POSITION, Kind.VELOCITY, Kind.HEADING))]
     needed = np.where(rows["kind"] == Kind.HEADING, 1, 3)
     sound = np.isfinite(rows["value"]) & np.isfinite(rows["sigma"]) & (rows["sigma"] > 0.0)
@@ -318,7 +316,7 @@ def _used(observations: StructArray, antennas: int) -> StructArray:
 
 
 def _eventfulness(inertial: Inertial, rows: StructArray, begin_ns: int) -> float:
-    """Return how much GNSS's velocity or the felt turning changes in a window; 0 where either has a gap."""
+    """Return how much GNSS's velocity or the sensed turn rate changes in a window; 0 if either has a gap."""
     end_ns = begin_ns + WINDOW_NS
     first, last = np.searchsorted(inertial.time_ns, [begin_ns, end_ns])
     speed = rows[(rows["kind"] == Kind.VELOCITY) & (rows["time_ns"] >= begin_ns) & (rows["time_ns"] < end_ns)]
@@ -335,7 +333,7 @@ def _is_motion(rows: StructArray) -> NDArray[np.bool_]:
 
 
 def _signed_permutations(*, proper: bool = False) -> Iterator[FloatArray]:
-    """Yield the 48 matrices that swap and mirror axes; of them the 24 rotations."""
+    """Yield the 48 matrices that swap and mirror axes; 24 of them are rotations."""
     for order in permutations(range(3)):
         for signs in product((1.0, -1.0), repeat=3):
             matrix = np.zeros((3, 3))

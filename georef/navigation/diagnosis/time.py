@@ -1,14 +1,14 @@
-"""Are GNSS and the inertial unit on one clock? Their motion compared at other times tells by how much they are off.
+"""Find a time offset between GNSS and the inertial unit by comparing their motion at other times.
 
 Three comparisons need neither an attitude nor the order, the signs or the unit of the sensors' axes. Over the intervals
-between velocities they hold the size of the specific force against what the change of velocity needed, the rate of the
-course against a mixture of the three gyroscopes, and the change of speed against a mixture of the three accelerometers;
-the shift at which the multiple correlation is greatest is the offset.
+between velocities they compare the size of the specific force with that needed for the change of velocity, the rate of
+the course with a mixture of the three gyroscopes, and the change of speed with a mixture of the three accelerometers;
+the shift with the greatest multiple correlation is the offset.
 
-Each offset has an uncertainty of two parts. What chance does to it a block bootstrap tells (Künsch 1989: stretches of
-20 s drawn with replacement). What the comparison leaves out, such as a nose that turns before the course does, no
-bootstrap tells: a part of the motion that is not explained may be shifted, and moves the peak by its share of the
-signal over the signal's rate. Comparisons that contradict each other give no offset.
+The uncertainty of an offset has two parts. A block bootstrap estimates the effect of chance (Künsch 1989: stretches of
+20 s drawn with replacement). It cannot estimate the effect of motion that the comparison leaves out, such as a nose
+that turns before the course does: the unexplained part of the motion may be shifted, and moves the peak by its share of
+the signal over the signal's rate. Comparisons that contradict each other give no offset.
 """
 
 from __future__ import annotations
@@ -26,27 +26,29 @@ from swath.georef.timescales.gps_time import SECOND_NS
 G_MPS2 = 9.80665
 REACH_S = 20.0  # more than all leap seconds
 COARSE_S, FINE_S = 0.2, 0.01
-LONGEST_S = 2.5  # between velocities that are compared
-SLOW_MPS = 3.0  # below it there is no course
-FEWEST = 40  # intervals
-MOST = 6000  # intervals that are compared: of longer recordings stretches all over them
+LONGEST_S = 2.5  # greatest interval between compared velocities
+SLOW_MPS = 3.0  # below this speed the course is undefined
+FEWEST = 40  # minimum number of intervals
+MOST = 6000  # greatest number of compared intervals: longer recordings are sampled in stretches throughout
 WHOLE = 0.98  # share of an interval that samples must cover
-CERTAIN, WEAK, BETTER_BY = 0.7, 0.5, 0.004  # correlation, and by how much it must beat that without a shift
-UNNOTICED_S = {"force": 0.1, "turn": 0.2, "speed": 0.1}  # an aircraft's course turns otherwise than its nose
+CERTAIN, WEAK, BETTER_BY = 0.7, 0.5, 0.004  # correlation, and its minimum gain over that without a shift
+UNNOTICED_S = {"force": 0.1, "turn": 0.2, "speed": 0.1}  # an aircraft's course turns differently from its nose
 BLOCK_S, DRAWS = 20.0, 40  # of the bootstrap
 COHERENT = 0.3  # share of the unexplained motion that may be the explained one at another time
-SIGMAS, APART = 3.0, 3.0  # an offset that may be told, where it mends the fit too; two that contradict each other
+# minimum size of an offset that may be reported, if it also improves the fit; distance of two that contradict each
+# other
+SIGMAS, APART = 3.0, 3.0
 
 
 @dataclass(frozen=True, slots=True)
 class Measure:
-    """GNSS's times less the inertial unit's, by one comparison.
+    """GNSS's times minus the inertial unit's, by one comparison.
 
     Attributes:
         compared: "force", "turn" or "speed".
         seconds: positive: GNSS's stamps are late.
-        sigma: of it, without what chance does (`TimeOffset` has that too).
-        correlation: of the motion when it is taken off; `unshifted`: as the times are.
+        sigma: of `seconds`, without the effect of chance (which `TimeOffset` includes).
+        correlation: of the motion after removing the offset; `unshifted`: before.
     """
 
     compared: str
@@ -58,14 +60,14 @@ class Measure:
 
 @dataclass(frozen=True, slots=True)
 class TimeOffset:
-    """GNSS's times less the inertial unit's, by all comparisons.
+    """GNSS's times minus the inertial unit's, by all comparisons.
 
     Attributes:
         seconds: of the most certain one; positive: GNSS's stamps are late.
-        sigma: of it.
-        correlation: of the motion when it is taken off; `unshifted`: as the times are.
-        compared: which comparison that is.
-        contradiction: what another comparison says against it; empty: nothing.
+        sigma: of `seconds`.
+        correlation: of the motion after removing the offset; `unshifted`: before.
+        compared: the comparison behind it.
+        contradiction: another comparison's contradicting result in words; may be empty.
     """
 
     seconds: float
@@ -77,19 +79,19 @@ class TimeOffset:
 
     @property
     def is_certain(self) -> bool:
-        """True if there was motion enough to tell, and no comparison says otherwise."""
+        """True if there was enough motion, and no comparison contradicts."""
         return self.correlation > CERTAIN and not self.contradiction
 
     @property
     def is_wrong(self) -> bool:
-        """True if the clocks certainly differ by more than small change."""
+        """True if the clocks certainly differ by more than a negligible amount."""
         better = self.correlation - self.unshifted > BETTER_BY
         large = abs(self.seconds) > max(UNNOTICED_S[self.compared], SIGMAS * self.sigma)
         return self.is_certain and better and large
 
 
 def time_offset(inertial: Inertial, observations: StructArray) -> TimeOffset | None:
-    """Return by how much GNSS's times are late; None where there is too little to compare."""
+    """Return the seconds by which GNSS's times are late; None if there is too little to compare."""
     time_ns, velocity_l = velocities(observations)
     if len(inertial) < FEWEST or len(time_ns) < FEWEST:
         return None
@@ -99,7 +101,8 @@ def time_offset(inertial: Inertial, observations: StructArray) -> TimeOffset | N
         return None
     clear = [pair for pair in found if pair[1].correlation > WEAK] or found
     best, measure = min(clear, key=lambda pair: pair[1].sigma)
-    if abs(measure.seconds) <= UNNOTICED_S[measure.compared]:  # nothing will be told, so that chance does not matter
+    # no offset will be reported, so that the effect of chance does not matter
+    if abs(measure.seconds) <= UNNOTICED_S[measure.compared]:
         return TimeOffset(measure.seconds, measure.sigma, measure.correlation, measure.unshifted, measure.compared)
     sigma = float(np.hypot(measure.sigma, best.spread_s()))
     against = ""
@@ -116,7 +119,8 @@ def time_offset(inertial: Inertial, observations: StructArray) -> TimeOffset | N
 def velocities(observations: StructArray) -> tuple[Int64Array, FloatArray]:
     """Return times (n,) and velocities (n, 3) north, east, down, the first of each fifth of a second.
 
-    Where there are none, those between the first positions of each second: between nearer ones noise hides the motion.
+    Without observed velocities, those between the first positions of each second: between nearer ones noise hides the
+    motion.
     """
     rows = observations[observations["kind"] == Kind.VELOCITY]
     rows = _apart(rows[np.isfinite(rows["value"]).all(axis=1)], SECOND_NS // 5)
@@ -133,14 +137,17 @@ def velocities(observations: StructArray) -> tuple[Int64Array, FloatArray]:
 
 
 def _apart(rows: StructArray, step_ns: int) -> StructArray:
-    """Return the first row of each step of time."""
+    """Return the first row of each time step."""
     cell = rows["time_ns"] // step_ns
     return rows[np.concatenate([[True], np.diff(cell) > 0])] if len(rows) else rows
 
 
 def _seen(time_ns: Int64Array, velocity_l: FloatArray) -> dict[str, FloatArray]:
-    """Return (n − 1,) specific force m/s² that changes of velocity needed, turn of the course rad/s, change of speed
-    m/s²; nan where unknown."""
+    """Return what GNSS shows by interval (n − 1,), nan where unknown.
+
+    It is the specific force m/s² that changes of velocity need, the turn of the course rad/s, and the change of speed
+    m/s².
+    """
     step_s = np.maximum(np.diff(time_ns) / SECOND_NS, 1e-3)
     needed = np.diff(velocity_l, axis=0) / step_s[:, None] - [0.0, 0.0, G_MPS2]
     course = np.arctan2(velocity_l[:, 1], velocity_l[:, 0])
@@ -157,7 +164,7 @@ def _seen(time_ns: Int64Array, velocity_l: FloatArray) -> dict[str, FloatArray]:
 def _comparisons(
     inertial: Inertial, time_ns: Int64Array, velocity_l: FloatArray
 ) -> dict[str, tuple[FloatArray, FloatArray, FloatArray, _Felt]]:
-    """Return by name begins and ends (n,), s, what was seen (n,), and what was felt."""
+    """Return by name the starts and ends (n,), s, GNSS's values (n,), and the sensors' sums."""
     step_s = np.diff(time_ns) / SECOND_NS
     first = int(inertial.time_ns[0])
     at_s = (time_ns - first) / SECOND_NS
@@ -174,7 +181,7 @@ def _comparisons(
     found = {}
     for name, seen in _seen(time_ns, velocity_l).items():
         used = np.flatnonzero(within & np.isfinite(seen))
-        if len(used) > MOST:  # whole blocks, evenly over the flight
+        if len(used) > MOST:  # complete blocks, evenly over the flight
             block = np.arange(len(used)) // 100
             used = used[block % -(-len(used) // MOST) == 0]
         if len(used) >= FEWEST and np.std(seen[used]) > 1e-6:
@@ -184,7 +191,7 @@ def _comparisons(
 
 @dataclass(frozen=True, eq=False)
 class _Felt:
-    """Running sums over a grid of times: of what was felt (m, k), and of the samples' intervals (m,)."""
+    """Cumulative sums over a grid of times: of the sensors' values (m, k), and of the samples' intervals (m,)."""
 
     GRID_S = 0.05
 
@@ -194,7 +201,7 @@ class _Felt:
 
 
 class _Comparison:
-    """One comparison at all shifts: sums of squares and products by blocks, of which any mixture of blocks is made."""
+    """One comparison at all shifts: sums of squares and products by blocks, which any mixture of blocks adds up."""
 
     def __init__(self, name: str, begins_s: FloatArray, ends_s: FloatArray, seen: FloatArray, felt: _Felt) -> None:
         self._name, self._begins_s, self._ends_s, self._seen, self._felt = name, begins_s, ends_s, seen, felt
@@ -208,7 +215,7 @@ class _Comparison:
         self._fine = self._sums(self._fine_s)
 
     def measure(self) -> Measure | None:
-        """Return the shift of the greatest correlation; None where nothing moves."""
+        """Return the shift with the greatest correlation; None without motion."""
         explained = _explained(self._fine.sum(axis=1))
         at_s, bend = self._top(explained)
         height = float(explained.max())
@@ -236,7 +243,7 @@ class _Comparison:
         return float(np.std(found))
 
     def _top(self, explained: FloatArray) -> tuple[float, float]:
-        """Return where a parabola about the greatest value has its top, s, and how fast it falls, 1/s²."""
+        """Return the position of a parabola's top about the greatest value, s, and its curvature, 1/s²."""
         peak = int(np.argmax(explained))
         low, high = max(peak - 10, 0), min(peak + 10, len(explained) - 1)
         near = self._fine_s[low : high + 1] - self._fine_s[peak]
@@ -245,11 +252,11 @@ class _Comparison:
         return float(self._fine_s[peak] + np.clip(inside, -0.1, 0.1)), float(-bend)
 
     def _sums(self, lates_s: FloatArray) -> FloatArray:
-        """Return (shifts, …) `_blocks` at each shift; tensordot wants the blocks second."""
+        """Return (shifts, …) `_blocks` at each shift; tensordot needs the blocks second."""
         return np.stack([self._blocks(float(late)) for late in lates_s])
 
     def _blocks(self, late_s: float) -> FloatArray:
-        """Return (blocks, k + 2, k + 2) sums of products of one, what was felt, and what was seen."""
+        """Return sums (blocks, k + 2, k + 2) of products of 1, the sensors' values and GNSS's value."""
         begins_s, ends_s, felt = self._begins_s - late_s, self._ends_s - late_s, self._felt
         length_s = ends_s - begins_s
         columns = [*felt.sums.T, felt.sampled_s]
@@ -264,9 +271,9 @@ class _Comparison:
 
 
 def _explained(sums: FloatArray) -> FloatArray:
-    """Return (…) the share of the variance that is explained, less what chance explains, of sums (…, k + 2, k + 2).
+    """Return (…) the share of the variance that is explained, less that by chance, of sums (…, k + 2, k + 2).
 
-    A size of one component explains only what grows with it.
+    A size of one component explains only values that grow with it.
     """
     count = sums[..., 0, 0]
     mean = sums[..., 0, 1:] / np.maximum(count, 1.0)[..., None]

@@ -1,16 +1,16 @@
-"""How errors of the state grow: transition and process noise over a step, and the covariance's way through it.
+"""Propagate the errors of the state: transition and process noise over a step, and the covariance.
 
 Errors are true − computed: δr, δv in e, ψ with rot_e_from_b true = exp([ψ]×) computed, sensors' biases and scales, then
-what `Layout` adds; misalignments l of a triad, with M(l) as in `strapdown.corrected`, are sensors' errors too. With
-C = rot_e_from_b, f and ω as corrected, Ω the earth's rate, Γ gravity's gradient (Groves 2013, 14.2.2, with the signs of
-this package):
+the optional errors of `Layout`; misalignments l of a triad, with M(l) as in `strapdown.corrected`, are sensors' errors
+too. With C = rot_e_from_b, f and ω as corrected, Ω the earth's rate, Γ gravity's gradient (Groves 2013, 14.2.2, with
+the signs of this package):
 
     d δr = δv
     d δv = ψ × C f + C δf − 2 Ω × δv + Γ δr          δf = −(δb_a + f δs_a) / (1 + s_a) − M(δl_a) f
     d ψ  = −Ω × ψ + C δω                             δω = −(δb_g + ω δs_g) / (1 + s_g) − M(δl_g) ω
 
-The first 9 rows of a transition matrix are kept whole, (9, core), core 21 or with misalignments 27: nothing else moves
-these nine. Below, it is diagonal.
+The first 9 rows of a transition matrix are kept in full, (9, core), core 21 or with misalignments 27: no other errors
+move these nine. The rows below are diagonal.
 """
 
 from __future__ import annotations
@@ -53,11 +53,11 @@ from swath.georef.scanner.kernels.types import Three
 E_POSITION, E_VELOCITY, E_ATTITUDE, E_SENSORS = 0, 3, 6, 9
 E_GYRO_BIAS, E_ACCEL_BIAS, E_GYRO_SCALE, E_ACCEL_SCALE = 9, 12, 15, 18
 MOVED, CORE = 9, 21  # rows of a transition that are not diagonal; its columns without misalignments
-E_GYRO_LEAN, E_ACCEL_LEAN, LEANS = 21, 24, 6  # where they are estimated
+E_GYRO_LEAN, E_ACCEL_LEAN, LEANS = 21, 24, 6  # columns of the misalignments if they are estimated
 
 
 class Layout(NamedTuple):
-    """Where the optional errors stand, −1: nowhere.
+    """Columns of the optional errors; −1: not estimated.
 
     Attributes:
         size: number of error states.
@@ -81,20 +81,20 @@ class Layout(NamedTuple):
 
     @property
     def core(self) -> int:
-        """Columns of a transition's first rows."""
+        """The number of columns in a transition's first rows."""
         return CORE if self.lean < 0 else CORE + LEANS
 
     @property
     def sums_size(self) -> int:
-        """Sums over a step that the transition needs."""
+        """The number of sums over a step that the transition needs."""
         return SUMS_SIZE if self.lean < 0 else SUMS_SIZE_ACROSS
 
 
 class Drive(NamedTuple):
-    """Process noise.
+    """The process noise of a setup.
 
     Attributes:
-        angle, velocity: variance a second, of the white noise of rates and forces.
+        angle, velocity: variance per second of the white noise of rates and forces.
         variance: (n,) of the Gauss–Markov errors, 0: constant.
         correlation_s: (n,) their e-folding times, inf: constant.
     """
@@ -106,7 +106,7 @@ class Drive(NamedTuple):
 
 
 def layout_of(setup: Setup, *, heights: bool = False) -> Layout:
-    """Return the errors that a setup asks for; of a barometer where there are heights."""
+    """Return the errors that a setup estimates; a barometer's bias if there are heights."""
     size, places = CORE, []
     for asked, count in (
         (setup.noise.misalignment > 0.0, LEANS),
@@ -123,7 +123,7 @@ def layout_of(setup: Setup, *, heights: bool = False) -> Layout:
 
 
 def prior_variance(setup: Setup, layout: Layout) -> FloatArray:
-    """Return (size,) variances at the start, of all but position, velocity and attitude."""
+    """Return variances (size,) at the start of all errors but position, velocity and attitude."""
     noise = setup.noise
     variance = np.zeros(layout.size)
     for first, sigma in (
@@ -148,7 +148,7 @@ def prior_variance(setup: Setup, layout: Layout) -> FloatArray:
 
 
 def drive_of(setup: Setup, layout: Layout) -> Drive:
-    """Return process noise of a setup."""
+    """Return the process noise of a setup."""
     correlation_s = np.full(layout.size, np.inf)
     correlation_s[E_GYRO_BIAS : E_ACCEL_BIAS + 3] = setup.noise.bias_correlation_s
     if layout.slow >= 0:
@@ -165,7 +165,7 @@ def drive_of(setup: Setup, layout: Layout) -> Drive:
 
 @jit_inline
 def _put_skew(top: FloatArray, i: int, j: int, factor: float, v: Three) -> None:
-    """Block (i, j) ← factor [v]×."""
+    """Set block (i, j) ← factor [v]×."""
     top[i, j], top[i, j + 1], top[i, j + 2] = 0.0, -factor * v[2], factor * v[1]
     top[i + 1, j], top[i + 1, j + 1], top[i + 1, j + 2] = factor * v[2], 0.0, -factor * v[0]
     top[i + 2, j], top[i + 2, j + 1], top[i + 2, j + 2] = -factor * v[1], factor * v[0], 0.0
@@ -173,9 +173,9 @@ def _put_skew(top: FloatArray, i: int, j: int, factor: float, v: Three) -> None:
 
 @jit_inline
 def _put_sensor(top: FloatArray, row: int, at: int, sums: FloatArray, first: int, gain: Three) -> None:
-    """Three columns of one sensor error: its sum with the minus sign, divided by 1 + scale.
+    """Set three columns of one sensor error: its sum with the minus sign, divided by 1 + scale.
 
-    Of gyroscopes too what the turn that they cause does to velocity and position within the step.
+    For gyroscopes this includes the effect of their turn on velocity and position within the step.
     """
     span_s = sums[SUM_TIME]
     force = _force_of(sums)
@@ -194,7 +194,7 @@ def _put_sensor(top: FloatArray, row: int, at: int, sums: FloatArray, first: int
 
 @jit_inline
 def _force_of(sums: FloatArray) -> Three:
-    """Return ∫ C f dt: row sums of the force's sums."""
+    """Return ∫ C f dt, the row sums of the force's sums."""
     return (
         sums[SUM_FORCE] + sums[SUM_FORCE + 1] + sums[SUM_FORCE + 2],
         sums[SUM_FORCE + 3] + sums[SUM_FORCE + 4] + sums[SUM_FORCE + 5],
@@ -204,11 +204,11 @@ def _force_of(sums: FloatArray) -> Three:
 
 @jit_cached
 def transition(sums: FloatArray, x: FloatArray, top: FloatArray) -> None:
-    """The first nine rows of the transition matrix over a step, to second order in its length.
+    """Compute the first nine rows of the transition matrix over a step, to second order in its length.
 
     Args:
         sums: (SUMS_SIZE,) of `strapdown.advance_part` over the step.
-        x: (STATE_SIZE,) the state, position of its end and the sensors' errors used.
+        x: (STATE_SIZE,) the state: position at the step's end, and the sensors' errors that were used.
         top: (9, core) is filled.
     """
     span_s = sums[SUM_TIME]
@@ -244,7 +244,7 @@ def transition(sums: FloatArray, x: FloatArray, top: FloatArray) -> None:
 
 @jit_cached
 def decays(drive: Drive, span_s: float, decay: FloatArray) -> None:
-    """(n,) e^(−t/τ) of every error; 1 where it is constant."""
+    """Compute (n,) e^(−t/τ) of every error; 1 where it is constant."""
     last_s, last = math.inf, 1.0
     for i in range(len(decay)):
         if drive.correlation_s[i] != last_s:
@@ -255,9 +255,10 @@ def decays(drive: Drive, span_s: float, decay: FloatArray) -> None:
 
 @jit_inline
 def fade(x: FloatArray, decay: FloatArray, layout: Layout) -> None:
-    """Bring the estimates of lasting errors of observations nearer to zero (STATE_SIZE,), as their expectation goes.
+    """Reduce the estimates of lasting observation errors (STATE_SIZE,) towards zero, as their expectation decays.
 
-    Not of the unit's biases, of which most was there at turn-on and stays: observed within minutes, they hardly fade.
+    The unit's biases are left out: most of a bias was present at turn-on and stays, so that over minutes it hardly
+    decays.
     """
     for first, count, column in (
         (layout.slow, 3, SLOW),
@@ -272,11 +273,11 @@ def fade(x: FloatArray, decay: FloatArray, layout: Layout) -> None:
 
 @jit_cached
 def propagate(p: FloatArray, top: FloatArray, decay: FloatArray, work: FloatArray) -> None:
-    """P ← Φ P Φᵀ.
+    """Propagate the covariance over a step: P ← Φ P Φᵀ.
 
     Args:
         p: (n, n) symmetric, stays so.
-        top: (9, core), decay: (n,), Φ's rows and diagonal.
+        top, decay: (9, core), (n,), Φ's rows and diagonal.
         work: (9, n).
     """
     n, core = len(p), top.shape[1]
@@ -302,11 +303,12 @@ def propagate(p: FloatArray, top: FloatArray, decay: FloatArray, work: FloatArra
 
 @jit_cached
 def add_noise(p: FloatArray, sums: FloatArray, drive: Drive, decay: FloatArray, bridged: FloatArray) -> None:
-    """P ← P + Q of a step: white noise of rates and forces, the drift of biases, made-up samples.
+    """Add a step's noise, P ← P + Q: white noise of rates and forces, the drift of biases, made-up samples.
 
     Args:
         p: (n, n).
-        sums: of the step; drive, decay: of it.
+        sums: of the step.
+        drive, decay: process noise, and decays over the step.
         bridged: (6, 3) covariances in e of attitude and velocity that made-up samples add; changed.
     """
     span_s = sums[SUM_TIME]
@@ -322,7 +324,8 @@ def add_noise(p: FloatArray, sums: FloatArray, drive: Drive, decay: FloatArray, 
             p[E_VELOCITY + j, i] = p[i, E_VELOCITY + j]
             p[E_VELOCITY + i, E_VELOCITY + j] += pushed[i, j]
             p[E_ATTITUDE + i, E_ATTITUDE + j] += turned[i, j]
-    for j in range(3):  # a turn pushes by −[∫ C f]× of it: half of that with the turn, a third with itself
+    # a turn changes the velocity by −[∫ C f]× of it: half of that in the covariance with the turn, a third in its own
+    for j in range(3):
         tilted = cross((turned[0, j], turned[1, j], turned[2, j]), force)
         for i in range(3):
             p[E_VELOCITY + i, E_ATTITUDE + j] += 0.5 * tilted[i]
@@ -340,7 +343,7 @@ def add_noise(p: FloatArray, sums: FloatArray, drive: Drive, decay: FloatArray, 
 def accumulate(
     total: FloatArray, total_decay: FloatArray, top: FloatArray, decay: FloatArray, work: FloatArray
 ) -> None:
-    """Φ of steps so far ← Φ of this step · Φ of steps so far.
+    """Accumulate transitions: Φ of all steps ← Φ of this step · Φ of the steps before.
 
     Args:
         total, total_decay: (9, core), (n,), changed.
@@ -364,7 +367,7 @@ def accumulate(
 
 @jit_cached
 def begin_accumulation(total: FloatArray, total_decay: FloatArray) -> None:
-    """Identity."""
+    """Set the accumulated transition to the identity."""
     total[:, :] = 0.0
     for i in range(MOVED):
         total[i, i] = 1.0
@@ -373,7 +376,7 @@ def begin_accumulation(total: FloatArray, total_decay: FloatArray) -> None:
 
 @jit_inline
 def turned_on_by(x: FloatArray, psi: Three) -> None:
-    """q ← exp(ψ / 2) ⊗ q, of unit length."""
+    """Turn the attitude by an error: q ← exp(ψ / 2) ⊗ q, of unit length."""
     size2 = 0.25 * (psi[0] * psi[0] + psi[1] * psi[1] + psi[2] * psi[2])
     cos, half = 1.0, 0.5
     if size2 > 0.0:

@@ -1,4 +1,4 @@
-"""The navigation filter: samples and observations go in as they come, the state advances; and a whole run at once."""
+"""The navigation filter: it takes samples and observations as they come, or a whole run at once."""
 
 from __future__ import annotations
 
@@ -48,19 +48,19 @@ from swath.georef.navigation.inputs import Fate, Inertial, Kind, Setup, Start
 from swath.georef.records import StructArray
 from swath.georef.timescales import SECOND_NS
 
-PIECE = 1 << 17  # samples, and rows of a path, between rests
+PIECE = 1 << 17  # samples, and rows of a path, between calls of the storage's `rest`
 
 
 @dataclass(frozen=True, eq=False)
 class FilterRun:
-    """What a run leaves for the smoother.
+    """The results of a run that the smoother needs.
 
     Attributes:
-        setup, start, layout: what it went by.
-        path: a row a sample.
+        setup, start, layout: the run's inputs.
+        path: one row per sample.
         nodes: blocks of the smoother's nodes.
         innovations: INNOVATION_DTYPE.
-        counts: what happened, by name.
+        counts: events, by name.
         storage: where it is kept.
     """
 
@@ -75,19 +75,19 @@ class FilterRun:
 
 
 class NavigationFilter:
-    """An error-state filter that samples and observations are given to as they come.
+    """An error-state filter that takes samples and observations as they come.
 
-    A sample is taken as soon as `hold_s` later ones are there: observations that arrive by then are used at their own
-    times. Those that come later still are told to be outside.
+    A sample is processed once samples `hold_s` later are available: observations that arrive by then are used at their
+    own times. Later ones are reported as outside.
 
     Args:
-        setup, start: installation and noise, and where it begins; samples before that are left out.
-        hold_s: by how much observations may lag behind samples.
-        heights: a barometer is among the observations.
-        smoothed: keep what the smoother needs, and all innovations.
+        setup, start: installation and noise, and the start; earlier samples are left out.
+        hold_s: the time by which observations may lag behind samples.
+        heights: whether a barometer is among the observations.
+        smoothed: whether to keep the smoother's input, and all innovations.
         storage: where blocks are kept.
-        expected: so many samples will come, if that is known.
-        bridges: what is known of made-up samples before the first comes; None: nothing.
+        expected: the number of samples to come, if known.
+        bridges: knowledge about made-up samples before the first comes; None: no knowledge.
     """
 
     def __init__(
@@ -118,27 +118,27 @@ class NavigationFilter:
 
     @property
     def time_ns(self) -> int:
-        """GPS time of the state."""
+        """The GPS time of the state."""
         return int(self._run.clock[NOW])
 
     @property
     def state(self) -> FloatArray:
-        """(STATE_SIZE,) a copy, by the columns of `strapdown`."""
+        """A copy of the state (STATE_SIZE,), by the columns of `strapdown`."""
         return self._run.x.copy()
 
     @property
     def covariance(self) -> FloatArray:
-        """(n, n) of the errors at the end of the latest step, a copy."""
+        """A copy of the errors' covariance (n, n) at the end of the latest step."""
         return self._run.p.copy()
 
     @property
     def sigmas(self) -> FloatArray:
-        """(9,) of position and velocity north, east, down, of roll, pitch, heading, at the end of the latest step."""
+        """Sigmas (9,) of position and velocity north, east, down, and of roll, pitch, heading, at the latest step."""
         return self._run.sigma.copy()
 
     @property
     def counts(self) -> Counter[str]:
-        """What happened so far, by name."""
+        """The events so far, by name."""
         counts = Counter(self._counts)
         counts["gaps not bridged"] += int(self._run.clock[GAPS])
         for (kind, fate), count in sorted(self._queue.fates.items()):
@@ -147,11 +147,11 @@ class NavigationFilter:
         return +counts
 
     def observe(self, rows: StructArray) -> None:
-        """Give observations (OBSERVATION_DTYPE), in any order."""
+        """Take observations (OBSERVATION_DTYPE), in any order."""
         self._queue.add(rows, self.time_ns)
 
     def feed(self, inertial: Inertial) -> None:
-        """Give samples, in order; the filter goes on as far as `hold_s` lets it."""
+        """Take samples, in order, and advance the filter as far as `hold_s` allows."""
         samples = samples_of(inertial)
         samples = samples._replace(made_up=made_up_variance(samples, self._bridges))
         self._counts["samples bridged"] += int(np.count_nonzero(samples.bridged))
@@ -161,7 +161,7 @@ class NavigationFilter:
             self._go(samples, int(samples.time_ns[-1]) - self._hold_ns)
 
     def flush(self) -> None:
-        """No more comes: take what waits, and set the last node."""
+        """Process all waiting data as no more will come, and set the last node."""
         if self._waiting is not None and len(self._waiting.time_ns):
             self._go(self._waiting, int(self._waiting.time_ns[-1]))
         self._queue.close()
@@ -172,11 +172,11 @@ class NavigationFilter:
         write_node(run, self._nodes.room(1, 0), run.x, int(run.clock[SCALAR]))
 
     def new_path(self) -> Path:
-        """Return what was written since the last call; for live use, with `smoothed` False."""
+        """Return the rows written since the last call; for live use, with `smoothed` False."""
         return self._path.taken()
 
     def finish(self) -> FilterRun:
-        """Return `flush`, and all that was written."""
+        """Flush the filter and return all results."""
         self.flush()
         return FilterRun(
             self.setup,
@@ -190,7 +190,7 @@ class NavigationFilter:
         )
 
     def _go(self, samples: Samples, until_ns: int) -> None:
-        """Take samples up to a time; the others wait."""
+        """Process samples up to a time; later ones wait."""
         count = int(np.searchsorted(samples.time_ns, until_ns, side="right"))
         self._waiting = Samples._make(column[count:] for column in samples)
         if not count:
@@ -220,7 +220,7 @@ class NavigationFilter:
 def run_filter(
     inertial: Inertial, observations: StructArray, setup: Setup, start: Start, *, storage: Storage = IN_MEMORY
 ) -> FilterRun:
-    """Filter a whole flight, in pieces, so that the storage may rest between them."""
+    """Filter a whole flight, in pieces, between which the storage may free memory."""
     heights = bool((observations["kind"] == Kind.HEIGHT).any())
     bridges = primed_bridges(samples_of(inertial.between(0, PIECE)))
     navigation = NavigationFilter(
@@ -246,7 +246,7 @@ def _model_of(setup: Setup, layout: Layout) -> Model:
 
 
 def _begin(setup: Setup, start: Start, layout: Layout) -> Running:
-    """Return the state at the start."""
+    """Return the filter's working state at the start."""
     n = layout.size
     clock = np.zeros(CLOCK_SIZE, np.int64)
     clock[NOW] = start.time_ns
@@ -279,7 +279,7 @@ def _begin(setup: Setup, start: Start, layout: Layout) -> Running:
 
 
 def start_state(setup: Setup, start: Start) -> FloatArray:
-    """Return (STATE_SIZE,) at the start."""
+    """Return the state (STATE_SIZE,) at the start."""
     lat, lon, _ = geodetic_from_e(start.position_e)
     of_level = rot_e_from_l(lat, lon)
     roll, pitch, heading = np.asarray(start.attitude_rad, dtype=np.float64)
@@ -292,7 +292,7 @@ def start_state(setup: Setup, start: Start) -> FloatArray:
 
 
 def start_covariance(setup: Setup, start: Start, layout: Layout) -> FloatArray:
-    """Return (n, n) of the errors at the start."""
+    """Return the errors' covariance (n, n) at the start."""
     lat, lon, _ = geodetic_from_e(start.position_e)
     of_level = rot_e_from_l(lat, lon)
     _, pitch, heading = np.asarray(start.attitude_rad, dtype=np.float64)

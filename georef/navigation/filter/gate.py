@@ -1,8 +1,9 @@
-"""What becomes of an observation: taken, taken with a larger sigma, refused, or taken though the state says no.
+"""Decide the fate of an observation: taken, taken with a larger sigma, refused, or taken against the state.
 
-A χ² gate bounds what a sound observation may differ by. Beyond it either the observation is worse than it says or the
-state is worse than its covariance says, and the two want opposite things: an outlier must not move the state, and a
-state that has drifted must be moved. Which of them it is, the state's share and the innovations before tell.
+A χ² gate bounds the innovation of a sound observation. Beyond it either the observation is worse than its sigma or the
+state is worse than its covariance, and the two need opposite treatment: an outlier must not move the state, and a state
+that has drifted must be moved. The state's share of the innovation's covariance and the innovations before decide which
+of the two applies.
 """
 
 from __future__ import annotations
@@ -38,18 +39,18 @@ _TAKEN, _INFLATED, _REJECTED, _REACQUIRED = (
 _POSITION, _VELOCITY, _HEADING = int(Kind.POSITION), int(Kind.VELOCITY), int(Kind.HEADING)
 _HEIGHT, _ATTITUDE = int(Kind.HEIGHT), int(Kind.ATTITUDE)
 
-STEADY, FEW = 30.0, 5.0  # observations that a mean is of; from how many on it counts
-TOLERATED = 1.5  # mean χ² a component that chance may give
-PERSISTENT = 0.5  # of it, mean product of neighbours: they are alike
+STEADY, FEW = 30.0, 5.0  # observations behind a mean; number from which on it counts
+TOLERATED = 1.5  # mean χ² per component that chance may give
+PERSISTENT = 0.5  # share of the mean χ² that the mean product of neighbours must exceed to count as correlated
 DRIFTED = 10.0  # an innovation's variance over the observation's own
-LEAP_NS = 2_500_000_000  # positions further apart than this may lie apart by the state's drift
+LEAP_NS = 2_500_000_000  # positions farther apart in time than this may differ by the state's drift
 PATIENCE = 6  # times `reacquire_ns` for which a leap is taken for a wrong fix
-SETTLING = 25.0  # factor on χ² beyond which even a state that settles has an observation refused
+SETTLING = 25.0  # factor on χ² beyond which even a settling state refuses an observation
 
 
 @jit_inline
 def widen(run: Running, kind: int, layout: Layout, nu: FloatArray, m: int) -> bool:
-    """Make the covariance as large as the innovation says; False: this kind says nothing of the state's truth."""
+    """Widen the covariance to the size of the innovation; return False if this kind cannot test the state."""
     square = 0.0
     for i in range(m):
         square = max(square, nu[i] * nu[i])
@@ -75,9 +76,7 @@ def widen(run: Running, kind: int, layout: Layout, nu: FloatArray, m: int) -> bo
 
 @jit_inline
 def drifted(kind: int, s: FloatArray, noise: FloatArray, m: int) -> bool:
-    """Return whether the state has so large a share of an innovation's covariance that it is to blame for a large
-    one.
-    """
+    """Return whether the state's share of an innovation's covariance is large enough to explain a large innovation."""
     if not (kind == _POSITION or kind == _VELOCITY or kind == _HEADING or kind == _ATTITUDE):
         return False
     whole, own = 0.0, 0.0
@@ -89,14 +88,14 @@ def drifted(kind: int, s: FloatArray, noise: FloatArray, m: int) -> bool:
 
 @jit_inline
 def noise_factor(run: Running, kind: int, white: FloatArray, chi2: float, m: int, limit: float) -> float:
-    """Return what the latest innovations of a kind say of this one's, which is then added to them.
+    """Return the factor that the latest innovations of a kind imply for this one, and add this one to them.
 
-    Of some `STEADY` observations the mean χ² a component and, of neighbours, the mean product. Innovations that are too
-    large and fall here and there mean that observations are worse than they say; too large and alike, that the state
-    is worse than its covariance.
+    Two means are kept over about `STEADY` observations: χ² per component, and the product of neighbours. Innovations
+    that are too large and uncorrelated mean that observations are worse than their sigmas; too large and correlated,
+    that the state is worse than its covariance.
 
     Returns:
-        Factor on the covariance of the observation; 0: the state is to blame.
+        Factor on the covariance of the observation; 0: the state is the cause.
     """
     lately = run.lately
     mean, count, alike = lately[MEAN, kind], lately[SEEN, kind], lately[ALIKE, kind]
@@ -115,10 +114,10 @@ def noise_factor(run: Running, kind: int, white: FloatArray, chi2: float, m: int
 
 @jit_inline
 def settling(run: Running, model: Model, kind: int, lost: bool, chi2: float, m: int) -> bool:
-    """Return whether the state has drifted more than predicted, or begun so, and is finding itself again.
+    """Return whether the state has drifted more than predicted, or began with such an error, and is still settling.
 
-    That lasts `reacquire_ns`: velocity and attitude, corrected by a wrong covariance, take as long to settle.
-    Observations are taken as they are then; smoothed, the drift spreads over the time without them.
+    Settling lasts `reacquire_ns`, because velocity and attitude, corrected by a wrong covariance, take that long.
+    During it observations are taken unchanged; the smoother spreads the drift over the time without them.
     """
     if lost and chi2 > model.rules.gate[m]:
         run.refused[SETTLED_NS, kind] = run.clock[NOW] + model.reacquire_ns
@@ -127,9 +126,10 @@ def settling(run: Running, model: Model, kind: int, lost: bool, chi2: float, m: 
 
 @jit_inline
 def still_away(run: Running, model: Model, kind: int, chi2: float, m: int) -> bool:
-    """Tell whether positions that leapt away are still beyond the gate, however badly the state is known by now.
+    """Return whether positions that leapt away are still beyond the gate, however uncertain the state has become.
 
-    Without velocities a state of seconds alone is worse than positions say they are, and would be blamed for the leap.
+    Without velocities the state is less certain after a few seconds than the positions, and would be blamed for the
+    leap.
     """
     since = run.refused[LEAPT_NS, kind]
     if kind != _POSITION or since == 0 or chi2 <= model.rules.gate[m]:
@@ -139,10 +139,11 @@ def still_away(run: Running, model: Model, kind: int, chi2: float, m: int) -> bo
 
 @jit_inline
 def leapt(run: Running, model: Model, kind: int, settles: bool, chi2: float, m: int) -> bool:
-    """Return whether positions lie far off since one leapt there: from within the gate, from one epoch to the next.
+    """Return whether positions stay far off after a leap, from within the gate, between one epoch and the next.
 
-    So does a wrong fix. A state that is worse than its covariance leaves the gate slowly, and one that was not known
-    much better than the positions is to blame itself. What lasts longer than a wrong fix may is judged like the rest.
+    A wrong fix behaves like this. A state that is worse than its covariance leaves the gate slowly, and a state that
+    was known little better than the positions is itself the cause. A leap that lasts longer than a wrong fix may is
+    judged like any other observation.
     """
     refused, now, gate = run.refused, run.clock[NOW], model.rules.gate[m]
     if kind != _POSITION:
@@ -160,7 +161,7 @@ def leapt(run: Running, model: Model, kind: int, settles: bool, chi2: float, m: 
 
 @jit_inline
 def judge(run: Running, model: Model, kind: int, settles: bool, chi2: float, m: int) -> int:
-    """Return fate of an innovation by its χ² and by how many of its kind were refused before it."""
+    """Return the fate of an innovation by its χ² and by the number of refusals of its kind before it."""
     gate = model.rules.gate[m]
     refused = run.refused
     if chi2 <= gate * model.rules.reject * (SETTLING if settles else 1.0):

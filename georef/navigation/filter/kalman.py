@@ -1,4 +1,4 @@
-"""Linear algebra of the filter: small Cholesky factors, whitening, one observed component after the other.
+"""Linear algebra of the filter: small Cholesky factors, whitening, updates by one observed component at a time.
 
 Observations of up to three components are whitened by the Cholesky factor of their covariance, so that their components
 are independent with variance 1 and can be taken one by one (Bierman 1977, II.4), each in Joseph's form, which stays
@@ -15,7 +15,7 @@ from swath.georef.compiled import jit_cached, jit_inline
 
 @jit_inline
 def factorise(matrix: FloatArray, m: int) -> bool:
-    """Lower Cholesky factor of the first m rows in place; False: not positive, and the matrix is spoilt."""
+    """Replace the first m rows by their lower Cholesky factor; return False, with the rows spoilt, if not positive."""
     for j in range(m):
         for i in range(j, m):
             value = matrix[i, j]
@@ -32,7 +32,7 @@ def factorise(matrix: FloatArray, m: int) -> bool:
 
 @jit_inline
 def whiten(factor: FloatArray, vector: FloatArray, m: int) -> None:
-    """vector ← L⁻¹ vector."""
+    """Whiten a vector: vector ← L⁻¹ vector."""
     for i in range(m):
         value = vector[i]
         for k in range(i):
@@ -42,7 +42,7 @@ def whiten(factor: FloatArray, vector: FloatArray, m: int) -> None:
 
 @jit_inline
 def whiten_rows(factor: FloatArray, rows: FloatArray, m: int) -> None:
-    """rows (m, n) ← L⁻¹ rows."""
+    """Whiten rows: rows (m, n) ← L⁻¹ rows."""
     for i in range(m):
         for k in range(i):
             for j in range(rows.shape[1]):
@@ -53,7 +53,7 @@ def whiten_rows(factor: FloatArray, rows: FloatArray, m: int) -> None:
 
 @jit_cached
 def innovation_covariance(p: FloatArray, rows: FloatArray, noise: FloatArray, m: int, s: FloatArray) -> None:
-    """s ← H P Hᵀ + R of the first m rows; p: (n, n), rows: (3, n), noise, s: (3, 3)."""
+    """Compute s ← H P Hᵀ + R of the first m rows; p: (n, n), rows: (3, n), noise, s: (3, 3)."""
     n = len(p)
     for i in range(m):
         for j in range(i + 1):
@@ -73,11 +73,13 @@ def innovation_covariance(p: FloatArray, rows: FloatArray, noise: FloatArray, m:
 def take_component(
     p: FloatArray, h: FloatArray, innovation: float, error: FloatArray, gain: FloatArray
 ) -> tuple[float, float]:
-    """Return one observed component of variance 1: P and the error estimate so far are changed.
+    """Take one observed component of variance 1; P and the error estimate so far change.
 
     Args:
-        p: (n, n); h: (n,); innovation: before this epoch's components.
-        error: (n,) estimated by the components before, added to.
+        p: (n, n).
+        h: (n,).
+        innovation: before this epoch's components.
+        error: (n,) estimate from the components before, added to.
         gain: (n,) is filled.
 
     Returns:
@@ -102,7 +104,7 @@ def take_component(
 
 @jit_inline
 def joseph(p: FloatArray, h: FloatArray, gain: FloatArray, variance: float) -> None:
-    """P ← (I − K h) P (I − K h)ᵀ + K Kᵀ, with P hᵀ = K · variance known."""
+    """Update P ← (I − K h) P (I − K h)ᵀ + K Kᵀ, with P hᵀ = K · variance known."""
     n = len(p)
     for i in range(n):
         seen = 0.0  # ((I − K h) P hᵀ)ᵢ

@@ -14,7 +14,7 @@ from swath.georef.scanner.kernels.types import Matrix, Three
 
 
 class Axes(NamedTuple):
-    """Of l, in e, and of the nose: what headings and sigmas are reckoned by."""
+    """The axes of l in e, the reference of headings and sigmas."""
 
     north: Three
     east: Three
@@ -23,7 +23,7 @@ class Axes(NamedTuple):
 
 @jit_inline
 def level_axes(x: FloatArray) -> Axes:
-    """Return north, east and down at the state's position, in e; at a pole those of longitude 0."""
+    """Return north, east and down in e at the state's position; at a pole those of longitude 0."""
     up, _ = normal_of(x[POSITION], x[POSITION + 1], x[POSITION + 2])
     flat = math.sqrt(up[0] * up[0] + up[1] * up[1])
     east = (-up[1] / flat, up[0] / flat, 0.0) if flat > 0.0 else (0.0, 1.0, 0.0)
@@ -32,13 +32,13 @@ def level_axes(x: FloatArray) -> Axes:
 
 @jit_inline
 def in_level(axes: Axes, v: Three) -> Three:
-    """Return components north, east, down of a vector in e."""
+    """Return the components north, east, down of a vector in e."""
     return dot(axes.north, v), dot(axes.east, v), dot(axes.down, v)
 
 
 @jit_inline
 def attitude_rows(axes: Axes, rot: Matrix) -> tuple[Three, Matrix]:
-    """Return roll, pitch, heading, and the rows that make errors of them out of ψ in e."""
+    """Return roll, pitch, heading, and the rows that convert ψ in e to their errors."""
     nose = in_level(axes, (rot[0][0], rot[1][0], rot[2][0]))
     flat = max(math.sqrt(nose[0] * nose[0] + nose[1] * nose[1]), 1e-9)
     cos, sin = nose[0] / flat, nose[1] / flat
@@ -54,5 +54,5 @@ def attitude_rows(axes: Axes, rot: Matrix) -> tuple[Three, Matrix]:
 
 @jit_inline
 def wrapped(angle: float) -> float:
-    """Return to −π … π."""
+    """Return an angle reduced to −π … π."""
     return angle - 2.0 * math.pi * math.floor(angle / (2.0 * math.pi) + 0.5)

@@ -1,7 +1,7 @@
-"""The filter's loop over samples, compiled: strapdown, steps of the covariance, observations at their own times, nodes.
+"""Run the filter over samples, compiled: strapdown, covariance steps, observations at their own times, nodes.
 
-Steps end with the first sample at or after whole multiples of their length in GPS time, and at observations: nothing
-depends on how the input is cut.
+Steps end with the first sample at or after whole multiples of their length in GPS time, and at observations, so that
+the result does not depend on the division of the input.
 """
 
 from __future__ import annotations
@@ -70,12 +70,12 @@ from swath.georef.navigation.inputs import Fate
 from swath.georef.scanner.kernels.types import Three
 
 _INFLATED, _REJECTED, _UNUSABLE = int(Fate.INFLATED), int(Fate.REJECTED), int(Fate.UNUSABLE)
-GAP_FACTOR = 1.5  # an interval that begins so much later than the one before has ended is a gap
+GAP_FACTOR = 1.5  # intervals: a sample that comes later than this leaves a gap
 
 
 @jit_inline
 def quadratic(p: FloatArray, first: int, v: Three) -> float:
-    """Return vᵀ P v of the 3×3 block at first."""
+    """Return vᵀ P v of the 3×3 block that begins at ``first``."""
     value: float = (
         p[first, first] * v[0] * v[0]
         + p[first + 1, first + 1] * v[1] * v[1]
@@ -92,7 +92,10 @@ def quadratic(p: FloatArray, first: int, v: Three) -> float:
 
 @jit_cached
 def level_sigmas(x: FloatArray, p: FloatArray, sigma: FloatArray) -> None:
-    """(9,) sigmas of position and velocity north, east, down, of roll, pitch, heading, of P's lower triangle."""
+    """Compute sigmas (9,) of position and velocity north, east, down, of roll, pitch, heading.
+
+    P's lower triangle is used.
+    """
     axes = level_axes(x)
     rot = rot_of(x[ATTITUDE], x[ATTITUDE + 1], x[ATTITUDE + 2], x[ATTITUDE + 3])
     _, by = attitude_rows(axes, rot)
@@ -104,7 +107,7 @@ def level_sigmas(x: FloatArray, p: FloatArray, sigma: FloatArray) -> None:
 
 @jit_cached
 def end_step(run: Running, model: Model) -> None:
-    """Bring the covariance to now, and the expectation of errors that die away."""
+    """Propagate the covariance to the present, and let the estimates of decaying errors decay."""
     if run.sums[SUM_TIME] <= 0.0:
         return
     transition(run.sums, run.x, run.top)
@@ -120,7 +123,7 @@ def end_step(run: Running, model: Model) -> None:
 
 @jit_cached
 def write_node(run: Running, nodes: Nodes, before: FloatArray, first: int) -> None:
-    """Keep what the smoother needs, and begin the way to the next node."""
+    """Store a node for the smoother, and begin the transition to the next one."""
     k = run.clock[NODE]
     nodes.time_ns[k] = run.clock[NOW]
     copy_into(nodes.before[k], before)
@@ -140,7 +143,7 @@ def write_node(run: Running, nodes: Nodes, before: FloatArray, first: int) -> No
 
 @jit_inline
 def tell(told: Told, r: int, nu: FloatArray, s: FloatArray, m: int, white: FloatArray) -> float:
-    """Write innovation, sigma, normalised innovation and χ²; returns χ². s becomes its factor."""
+    """Write innovation, sigma, normalised innovation and χ²; return χ². s becomes its Cholesky factor."""
     for i in range(3):
         told.figures[r, NU + i] = nu[i] if i < m else np.nan
         told.figures[r, SIGMA + i] = math.sqrt(s[i, i]) if i < m else np.nan
@@ -158,7 +161,7 @@ def tell(told: Told, r: int, nu: FloatArray, s: FloatArray, m: int, white: Float
 
 @jit_inline
 def chi2_of(nu: FloatArray, s: FloatArray, m: int, white: FloatArray) -> float:
-    """Return νᵀ S⁻¹ ν; ``white`` gets L⁻¹ ν, s its factor L. Infinite where S is not positive."""
+    """Return νᵀ S⁻¹ ν; ``white`` becomes L⁻¹ ν, s its factor L. The result is infinite if S is not positive."""
     for i in range(m):
         white[i] = nu[i]
     if not factorise(s, m):
@@ -172,7 +175,7 @@ def chi2_of(nu: FloatArray, s: FloatArray, m: int, white: FloatArray) -> float:
 
 @jit_inline
 def multiply(matrix: FloatArray, factor: float) -> None:
-    """(3, 3) times a number."""
+    """Multiply a matrix (3, 3) by a number."""
     for i in range(3):
         for j in range(3):
             matrix[i, j] *= factor
@@ -180,7 +183,7 @@ def multiply(matrix: FloatArray, factor: float) -> None:
 
 @jit_cached
 def observe(run: Running, model: Model, rows: Rows, r: int, nodes: Nodes, told: Told) -> None:
-    """Take observation r at the state's time, or say why not."""
+    """Take observation r at the state's time, or record why it is not taken."""
     nu, noise, s = run.small[0], run.small[1:4], run.small[4:7]
     kind = int(rows.what[r, 0])
     told.figures[r, INFLATION] = 1.0
@@ -246,7 +249,7 @@ def take(run: Running, model: Model, nodes: Nodes, m: int) -> None:
 
 @jit_inline
 def bridge_over(run: Running, made_up: FloatArray, gap_s: float) -> None:
-    """Add to the step what a made-up sample adds, (6,) by axis of b; over a gap that nobody bridged, what may be."""
+    """Add a made-up sample's variances, (6,) by axis of b, to the step; for an unbridged gap add the assumed ones."""
     unseen_turn, unseen_push = (UNKNOWN_RATE_RADPS * gap_s) ** 2, (UNKNOWN_FORCE_MPS2 * gap_s) ** 2
     x = run.x
     rot = rot_of(x[ATTITUDE], x[ATTITUDE + 1], x[ATTITUDE + 2], x[ATTITUDE + 3])
@@ -260,10 +263,10 @@ def bridge_over(run: Running, made_up: FloatArray, gap_s: float) -> None:
 
 @jit_inline
 def share_of(samples: Samples, i: int, now_ns: int, first: bool) -> float:
-    """Return which share of a sample's increments belongs to the time from now to its end.
+    """Return the factor on a sample's increments for the time from now to its end.
 
-    All of it, but for the sample in which the start lies (less), and where samples are missing that nobody bridged
-    (more: the gap is given the present sample's rates).
+    It is 1, except for the sample in which the start lies (less), and where samples are missing without bridging (more:
+    the gap takes the present sample's rates).
     """
     span_s: float = 1e-9 * (samples.time_ns[i] - now_ns)
     interval_s: float = samples.interval_s[i]
@@ -282,10 +285,11 @@ def advance(
 ) -> int:  # fmt: skip
     """Run over samples first to last − 1 and the observations up to the end of the last.
 
-    The outputs must have room: a path row a sample; a node a row and `node_ns`, and one; three components a row.
+    The outputs must have room: one path row per sample; one node per row and per `node_ns`, and one more; three
+    components per row.
 
     Returns:
-        The first row that lies behind.
+        The first row that is still to come.
     """
     clock, x = run.clock, run.x
     before = np.empty(10)
@@ -326,7 +330,7 @@ def advance(
 
 @jit_inline
 def end_sample(run: Running, model: Model, nodes: Nodes) -> None:
-    """End a step, and set a node, where they are due."""
+    """End a step and set a node where they are due."""
     now_ns = run.clock[NOW]
     if now_ns >= run.clock[NEXT_STEP] or now_ns >= run.clock[NEXT_NODE]:
         end_step(run, model)
@@ -339,7 +343,7 @@ def end_sample(run: Running, model: Model, nodes: Nodes) -> None:
 
 @jit_inline
 def write_path(run: Running, path: Path, bridged: bool) -> None:
-    """State and sigmas at the end of a sample."""
+    """Write the state and its sigmas at the end of a sample."""
     out = run.clock[OUT]
     path.time_ns[out] = run.clock[NOW]
     path.bridged[out] = bridged
@@ -352,7 +356,7 @@ def write_path(run: Running, path: Path, bridged: bool) -> None:
 
 @jit_inline
 def advance_share(x: FloatArray, sums: FloatArray, angle: Three, velocity: Three, part_s: float, span_s: float) -> None:
-    """Over a part of a sample, with its share of the increments."""
+    """Advance over a part of a sample, with its share of the increments."""
     if part_s <= 0.0:
         return
     if part_s == span_s:

@@ -1,6 +1,6 @@
-"""What the state predicts of each kind of observation, and how that depends on the errors.
+"""Predict each kind of observation from the state, with the derivatives by the errors.
 
-The innovation is observed − predicted, and H the derivative of what is predicted by the errors, both in l for positions
+The innovation is observed − predicted, and H the derivative of the prediction by the errors, both in l for positions
 and velocities (components north, east, down). With l the lever arm, C = rot_e_from_b, v and a the antenna's:
 
     position    r + C l + v τ + ½ a τ² + L √share c      τ the time offset, c the slow error, L Lᵀ its covariance
@@ -73,18 +73,18 @@ POSITION_FLOORS_M = {
 
 
 class Rules(NamedTuple):
-    """The installation and what is believed of observations.
+    """The installation and the assumptions about observations.
 
     Attributes:
-        arms_b: (k, 3) lever arms; baseline_b: (3,), nan: none.
-        share, velocity_share, heading_share: of GNSS positions', velocities' and headings' variance that is slow.
+        arms_b, baseline_b: (k, 3) lever arms; (3,), nan: no baseline.
+        share, velocity_share, heading_share: slow share of GNSS positions', velocities' and headings' variance.
         position_floor_m: (fix types,).
         position_scale, velocity_scale: (fix types, 2) of the horizontal and the vertical, floors included.
-        heading_scale: likewise.
+        heading_scale: the same of headings.
         velocity_floor_mps, attitude_floor_rad: the least sigmas.
         gate: (4,) χ² of the gate by number of components.
         reject: factor on it.
-        angle_variance: of the gyroscopes' white noise, a second.
+        angle_variance: of the gyroscopes' white noise, per second.
     """
 
     arms_b: FloatArray
@@ -104,7 +104,7 @@ class Rules(NamedTuple):
 
 
 def rules_of(setup: Setup) -> Rules:
-    """As compiled loops take them."""
+    """Return a setup's rules as compiled loops take them."""
     floors = [max(setup.position_floor_m, POSITION_FLOORS_M.get(fix, 0.0)) for fix in FixType]
     baseline = np.full(3, np.nan) if setup.baseline_b is None else np.array(setup.baseline_b, dtype=np.float64)
     gate = np.array([np.inf, *chdtri([1, 2, 3], setup.gate_probability)])
@@ -127,14 +127,14 @@ def rules_of(setup: Setup) -> Rules:
 
 
 def _scales_of(scale: Mapping[int, float], vertical: Mapping[int, float]) -> FloatArray:
-    """Return (fix types, 2) factors of the horizontal and the vertical."""
+    """Return factors (fix types, 2) of the horizontal and the vertical."""
     whole = np.array([float(scale.get(int(fix), 1.0)) for fix in FixType])
     return np.stack([whole, whole * [float(vertical.get(int(fix), 1.0)) for fix in FixType]], axis=1)
 
 
 @jit_inline
 def _acceleration(x: FloatArray, sums: FloatArray, rot: Matrix) -> tuple[Three, Three]:
-    """Return specific force in e, of the latest sample, and the body's acceleration relative to e by it."""
+    """Return the latest sample's specific force in e, and the body's resulting acceleration relative to e."""
     f = times(rot, three(sums, LAST_FORCE))
     g = gravity_of(x[POSITION], x[POSITION + 1], x[POSITION + 2])
     twice = 2.0 * EARTH_RATE_RADPS
@@ -143,7 +143,7 @@ def _acceleration(x: FloatArray, sums: FloatArray, rot: Matrix) -> tuple[Three, 
 
 @jit_inline
 def _arm_of(x: FloatArray, rules: Rules, layout: Layout, antenna: int) -> Three:
-    """Return lever arm of an antenna, as estimated where it is."""
+    """Return the lever arm of an antenna, as estimated if the filter estimates it."""
     if antenna == 0 and layout.lever_arm >= 0:
         return three(x, LEVER_ARM)
     return row(rules.arms_b, antenna)
@@ -151,7 +151,7 @@ def _arm_of(x: FloatArray, rules: Rules, layout: Layout, antenna: int) -> Three:
 
 @jit_inline
 def _swing_of(x: FloatArray, sums: FloatArray, rot: Matrix, arm: Three) -> tuple[Three, Three]:
-    """Return rate of the body relative to e, in b, and the velocity it gives the arm's end, in b."""
+    """Return the body's rate relative to e, in b, and the velocity that it gives the arm's end, in b."""
     earth = transposed_times(rot, (0.0, 0.0, EARTH_RATE_RADPS))
     rate = plus(three(sums, LAST_RATE), -1.0, earth)
     return rate, cross(rate, arm)
@@ -159,7 +159,7 @@ def _swing_of(x: FloatArray, sums: FloatArray, rot: Matrix, arm: Three) -> tuple
 
 @jit_inline
 def _set_noise(noise: FloatArray, sigma: Three, correlation: FloatArray, of: int) -> None:
-    """Covariance of three sigmas and the correlations (of, of + 1, of + 2) of pairs 01, 02, 12."""
+    """Set the covariance from three sigmas and the correlations (of, of + 1, of + 2) of pairs 01, 02, 12."""
     for i in range(3):
         noise[i, i] = sigma[i] * sigma[i]
     for i, j, k in ((0, 1, 0), (0, 2, 1), (1, 2, 2)):
@@ -174,7 +174,7 @@ def _position(
     x: FloatArray, sums: FloatArray, rules: Rules, layout: Layout, antenna: int, fix: int,
     figures: FloatArray, nu: FloatArray, rows: FloatArray, noise: FloatArray,
 ) -> None:  # fmt: skip
-    """Of an antenna's position."""
+    """Predict an antenna's position."""
     axes = level_axes(x)
     rot = rot_of(x[ATTITUDE], x[ATTITUDE + 1], x[ATTITUDE + 2], x[ATTITUDE + 3])
     arm = _arm_of(x, rules, layout, antenna)
@@ -212,7 +212,7 @@ def _position(
 
 @jit_inline
 def _add_slow(slow: Three, share: float, at: int, nu: FloatArray, rows: FloatArray, noise: FloatArray) -> None:
-    """Add the time-correlated share of a position's or velocity's error, whose place among the errors is ``at``."""
+    """Add the time-correlated share of a position's or velocity's error, which begins at ``at`` among the errors."""
     factor = noise.copy()
     if not factorise(factor, 3):
         return
@@ -230,7 +230,7 @@ def _velocity(
     x: FloatArray, sums: FloatArray, rules: Rules, layout: Layout, antenna: int, fix: int,
     figures: FloatArray, nu: FloatArray, rows: FloatArray, noise: FloatArray,
 ) -> None:  # fmt: skip
-    """Of an antenna's velocity."""
+    """Predict an antenna's velocity."""
     axes = level_axes(x)
     rot = rot_of(x[ATTITUDE], x[ATTITUDE + 1], x[ATTITUDE + 2], x[ATTITUDE + 3])
     arm = _arm_of(x, rules, layout, antenna)
@@ -280,7 +280,7 @@ def _heading(
     rows: FloatArray,
     noise: FloatArray,
 ) -> None:
-    """Direction of the baseline: heading and pitch."""
+    """Predict the direction of the baseline: heading and pitch."""
     axes = level_axes(x)
     rot = rot_of(x[ATTITUDE], x[ATTITUDE + 1], x[ATTITUDE + 2], x[ATTITUDE + 3])
     line_e = times(rot, three(rules.baseline_b, 0))
@@ -288,7 +288,7 @@ def _heading(
     flat2 = n * n + e * e
     flat, whole2 = math.sqrt(flat2), n * n + e * e + d * d
     zero = (0.0, 0.0, 0.0)
-    # ∂ heading, ∂ pitch by the baseline in e; by ψ then: ψ · (line × that)
+    # ∂ heading, ∂ pitch by the baseline in e; by ψ it is then ψ · (line × that)
     by_heading = plus(plus(zero, -e / flat2, axes.north), n / flat2, axes.east)
     by_pitch = plus(plus(zero, d * n / (flat * whole2), axes.north), d * e / (flat * whole2), axes.east)
     by_pitch = plus(by_pitch, -flat / whole2, axes.down)
@@ -311,7 +311,7 @@ def _heading(
 def _attitude(
     x: FloatArray, rules: Rules, figures: FloatArray, nu: FloatArray, rows: FloatArray, noise: FloatArray
 ) -> None:
-    """Roll, pitch and heading."""
+    """Predict roll, pitch and heading."""
     rot = rot_of(x[ATTITUDE], x[ATTITUDE + 1], x[ATTITUDE + 2], x[ATTITUDE + 3])
     angles, by = attitude_rows(level_axes(x), rot)
     for i in range(3):
@@ -323,7 +323,7 @@ def _attitude(
 
 @jit_inline
 def _standing(x: FloatArray, figures: FloatArray, nu: FloatArray, rows: FloatArray, noise: FloatArray) -> None:
-    """No velocity."""
+    """Predict the velocity zero of a vehicle at rest."""
     axes = level_axes(x)
     still = in_level(axes, three(x, VELOCITY))
     for i in range(3):
@@ -334,7 +334,7 @@ def _standing(x: FloatArray, figures: FloatArray, nu: FloatArray, rows: FloatArr
 
 @jit_inline
 def _rolling(x: FloatArray, figures: FloatArray, nu: FloatArray, rows: FloatArray, noise: FloatArray) -> None:
-    """No velocity along y and z of b: δ(Cᵀ v) = Cᵀ (δv + v × ψ)."""
+    """Predict zero velocity along y and z of b: δ(Cᵀ v) = Cᵀ (δv + v × ψ)."""
     rot = rot_of(x[ATTITUDE], x[ATTITUDE + 1], x[ATTITUDE + 2], x[ATTITUDE + 3])
     velocity = three(x, VELOCITY)
     nu[0] = np.nan
@@ -350,7 +350,7 @@ def _rolling(x: FloatArray, figures: FloatArray, nu: FloatArray, rows: FloatArra
 def _height(
     x: FloatArray, layout: Layout, figures: FloatArray, nu: FloatArray, rows: FloatArray, noise: FloatArray
 ) -> None:
-    """Ellipsoidal height of the body's origin, with a barometer's bias."""
+    """Predict the ellipsoidal height of the body's origin, with a barometer's bias."""
     up, height_m = normal_of(x[POSITION], x[POSITION + 1], x[POSITION + 2])
     nu[0], nu[1], nu[2] = figures[0] - height_m - x[HEIGHT_BIAS], np.nan, np.nan
     put(rows[0], E_POSITION, up)
@@ -364,12 +364,12 @@ def predict(
     x: FloatArray, sums: FloatArray, rules: Rules, layout: Layout, what: NDArray[np.uint8], figures: FloatArray,
     nu: FloatArray, rows: FloatArray, noise: FloatArray,
 ) -> int:  # fmt: skip
-    """Return innovation, its derivatives and the observation's covariance.
+    """Compute an innovation, its derivatives and the observation's covariance.
 
     Args:
-        x: (STATE_SIZE,); sums: (SUMS_SIZE,), for the latest rate and force.
-        what: (4,) kind, fix type, satellites, antenna; figures: (9,) value, sigma, correlation.
-        nu, rows, noise: (3,), (3, n), (3, 3) are filled, components that are said first.
+        x, sums: (STATE_SIZE,); (SUMS_SIZE,), for the latest rate and force.
+        what, figures: (4,) kind, fix type, satellites, antenna; (9,) value, sigma, correlation.
+        nu, rows, noise: (3,), (3, n), (3, 3) are filled, usable components first.
 
     Returns:
         Number of components; 0: the observation cannot be used.
@@ -397,7 +397,7 @@ def predict(
 
 @jit_inline
 def said_first(figures: FloatArray, nu: FloatArray, rows: FloatArray, noise: FloatArray) -> int:
-    """Bring components with a finite innovation and a sigma to the front; returns how many there are."""
+    """Move components with a finite innovation and a sigma to the front; return their number."""
     m = 0
     for i in range(3):
         if math.isfinite(nu[i]) and math.isfinite(noise[i, i]) and noise[i, i] > 0.0 and figures[3 + i] > 0.0:

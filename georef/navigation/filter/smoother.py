@@ -1,7 +1,7 @@
-"""The smoother: what all observations, those to come included, say of each moment (Rauch, Tung, Striebel 1965).
+"""The smoother: estimate each moment from all observations, later ones included (Rauch, Tung, Striebel 1965).
 
-In the adjoint form of Bryson and Frazier (Bierman 1973, "Fixed interval smoothing with discrete measurements"), which
-gives the same estimate and covariance without an inverse of a covariance, so that states known perfectly do no harm.
+It has the adjoint form of Bryson and Frazier (Bierman 1973, "Fixed interval smoothing with discrete measurements"),
+which gives the same estimate and covariance without inverting a covariance, so that perfectly known states do no harm.
 From the last node back, with the components taken and the transitions between nodes:
 
     λ ← (1 − K h)ᵀ λ + hᵀ ν / s        Λ ← (1 − K h)ᵀ Λ (1 − K h) + hᵀ h / s        over an observed component
@@ -9,13 +9,13 @@ From the last node back, with the components taken and the transitions between n
 
     smoothed error of the filter's state: P λ        smoothed covariance: P − P Λ P
 
-Where the filter began off the mean of what was known before (`solve` begins again from the smoothed attitude), its
-errors have a mean from the start on: m ← Φ m, m ← (1 − K h) m. An innovation ν counts as ν − h m then, the smoothed
-error is m + P λ: the same as if that had begun at the mean, but linear about the better state.
+If the filter did not begin at the mean of the prior knowledge (`solve` begins again from the smoothed attitude), its
+errors have a mean from the start on: m ← Φ m, m ← (1 − K h) m. An innovation ν then counts as ν − h m, and the smoothed
+error is m + P λ: the same as for a filter that began at the mean, but linear about the better state.
 
-At a node the error goes onto the filter's state by the exponential. Between two nodes the filter's own path is bent so
-that it leaves from the one smoothed state and arrives at the next: attitude and velocity linearly, position by the
-cubic that has these velocities at its ends.
+At a node the error is added to the filter's state by the exponential. Between two nodes the filter's own path is bent
+so that it leaves from one smoothed state and arrives at the next: attitude and velocity linearly, position by the cubic
+that has these velocities at its ends.
 """
 
 from __future__ import annotations
@@ -62,12 +62,12 @@ from swath.georef.navigation.filter.types import Nodes, Path
 from swath.georef.navigation.inputs import Solution
 from swath.georef.records import Int64Array
 
-SECOND = 1e-9  # of nanoseconds
+SECOND = 1e-9  # seconds in a nanosecond
 
 
 @dataclass(frozen=True, eq=False)
 class SmoothedNodes:
-    """What is known at m nodes.
+    """The smoothed results at m nodes.
 
     Attributes:
         time_ns: (m,).
@@ -95,7 +95,7 @@ def smooth(run: FilterRun) -> Solution:
 
 
 def forward(run: FilterRun) -> Solution:
-    """Return the filter's own solution, each epoch by what was known then."""
+    """Return the filter's own solution: each epoch from the observations up to it."""
     return solution_of(run, None)
 
 
@@ -103,7 +103,8 @@ def smooth_nodes(run: FilterRun, mean: FloatArray | None = None) -> SmoothedNode
     """Smooth the nodes of a run.
 
     Args:
-        mean: (n,) of the errors, true − begun with, at the start; None: 0.
+        run: of the filter.
+        mean: (n,) of the errors at the start, true − the run's start; None: 0.
     """
     n, m = run.layout.size, sum(len(block.time_ns) for block in run.nodes)
     out = SmoothedNodes(
@@ -142,7 +143,7 @@ def smooth_nodes(run: FilterRun, mean: FloatArray | None = None) -> SmoothedNode
 
 
 def _means(run: FilterRun, mean: FloatArray | None) -> tuple[FloatArray, list[FloatArray]]:
-    """Return means (m, n) of errors at nodes, no rows without one; by block, (k,) what innovations lose by them."""
+    """Return means (m, n) of errors at nodes, without rows if None; by block, (k,) their effect on innovations."""
     if mean is None:
         return np.zeros((0, 0)), [np.zeros(0) for _ in run.nodes]
     means = run.storage.empty((sum(len(block.time_ns) for block in run.nodes), run.layout.size), np.float64)
@@ -159,8 +160,10 @@ def _forward(nodes: Nodes, mean: FloatArray, means: FloatArray, felt: FloatArray
     """Carry the errors' mean (n,), which is changed, over a block of nodes.
 
     Args:
+        nodes: the block.
+        mean: (n,) changed.
         means: (c, n) is filled, with the nodes' observations.
-        felt: (k,) is filled: what each component's innovation over its variance loses.
+        felt: (k,) is filled: the amount by which each component's innovation over its variance is reduced.
     """
     n, core = len(mean), nodes.top.shape[2]
     moved = np.empty(MOVED)
@@ -185,7 +188,7 @@ def _forward(nodes: Nodes, mean: FloatArray, means: FloatArray, felt: FloatArray
 
 @jit_inline
 def _unpack(packed: FloatArray, p: FloatArray) -> None:
-    """Lower triangle by rows to (n, n)."""
+    """Expand a lower triangle, stored by rows, to (n, n)."""
     at = 0
     for i in range(len(p)):
         for j in range(i + 1):
@@ -195,7 +198,7 @@ def _unpack(packed: FloatArray, p: FloatArray) -> None:
 
 @jit_inline
 def _product(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
-    """out ← a b, (n, n)."""
+    """Compute out ← a b, (n, n)."""
     n = len(a)
     for i in range(n):
         out[i, :] = 0.0
@@ -210,7 +213,7 @@ def _product(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
 def _over_component(
     adjoint: FloatArray, information: FloatArray, h: FloatArray, gain: FloatArray, innovation: float, inverse: float
 ) -> None:
-    """Take λ and Λ from behind an observed component to before it.
+    """Carry λ and Λ back over an observed component.
 
     Args:
         adjoint, information: λ (n,) and Λ (n, n), which are changed.
@@ -238,7 +241,7 @@ def _over_component(
 def _over_way(
     adjoint: FloatArray, information: FloatArray, top: FloatArray, decay: FloatArray, work: FloatArray
 ) -> None:
-    """λ and Λ from a node back to the one before: Φᵀ λ, Φᵀ Λ Φ."""
+    """Carry λ and Λ from a node back to the one before: Φᵀ λ, Φᵀ Λ Φ."""
     n, core = len(adjoint), top.shape[1]
     for i in range(n):
         for j in range(n):
@@ -270,7 +273,7 @@ def _over_way(
 
 @jit_inline
 def difference(x: FloatArray, from_x: FloatArray, out: FloatArray) -> None:
-    """out (9,) ← x ⊟ from_x: what has to be added to the one to get the other."""
+    """Compute out (9,) ← x ⊟ from_x, the error to add to from_x to get x."""
     for i in range(6):
         out[i] = x[i] - from_x[i]
     a, b, c, d = x[ATTITUDE], x[ATTITUDE + 1], x[ATTITUDE + 2], x[ATTITUDE + 3]
@@ -288,7 +291,7 @@ def difference(x: FloatArray, from_x: FloatArray, out: FloatArray) -> None:
 
 @jit_inline
 def _separate(x: FloatArray, error: FloatArray, out: FloatArray) -> None:
-    """out (9,) ← −error north, east, down, and of roll, pitch, heading."""
+    """Compute out (9,) ← −error north, east, down, and of roll, pitch, heading."""
     axes = level_axes(x)
     _, by = attitude_rows(axes, rot_of(x[ATTITUDE], x[ATTITUDE + 1], x[ATTITUDE + 2], x[ATTITUDE + 3]))
     position, velocity = in_level(axes, three(error, 0)), in_level(axes, three(error, 3))
@@ -299,10 +302,10 @@ def _separate(x: FloatArray, error: FloatArray, out: FloatArray) -> None:
 
 @jit_inline
 def _position_sigmas_in_gnss_time(x: FloatArray, p: FloatArray, late: int, sigma: FloatArray) -> None:
-    """sigma (3,) ← of r + v τ, north, east, down, with τ the time offset, whose place among the errors is ``late``.
+    """Compute sigma (3,) of r + v τ, north, east, down, with τ the time offset, at ``late`` among the errors.
 
-    GNSS sees this sum, so that it is known better than r at a moment of the inertial unit's time. How far speed and
-    attitude change within τ's sigma is left out: in a flight with turns that is well below a millisecond.
+    GNSS observes this sum, so that it is known better than r at a moment of the inertial unit's time. The change of
+    speed and attitude within τ's sigma is ignored: in a flight with turns that is well below a millisecond.
     """
     axes = level_axes(x)
     for i in range(3):
@@ -357,7 +360,7 @@ def _bend(
     path: Path, node_ns: Int64Array, leave: FloatArray, arrive: FloatArray, node_sigma: FloatArray,
     position_e: FloatArray, velocity_e: FloatArray, q: FloatArray, sigma: FloatArray,
 ) -> None:  # fmt: skip
-    """Smoothed samples of the filter's path (n,) by corrections at nodes (m,), and their sigmas."""
+    """Correct samples of the filter's path (n,) by the smoothed corrections at nodes (m,), and interpolate sigmas."""
     k, last, x = 0, len(node_ns) - 1, np.empty(10)
     for i in range(len(path.time_ns)):
         t = path.time_ns[i]
@@ -386,7 +389,7 @@ def _write(
     path: Path, smoothed: SmoothedNodes | None, position_e: FloatArray, velocity_e: FloatArray, q: FloatArray,
     sigma: FloatArray,
 ) -> None:  # fmt: skip
-    """Fill a solution's rows: the path bent, or as it is."""
+    """Fill a solution's rows with the path, bent or unchanged."""
     if smoothed is not None:
         nodes = smoothed.time_ns, smoothed.leave, smoothed.arrive, smoothed.sigma
         _bend(path, *nodes, position_e, velocity_e, q, sigma)
@@ -396,7 +399,7 @@ def _write(
 
 
 def solution_of(run: FilterRun, smoothed: SmoothedNodes | None, first: int = 0, last: int | None = None) -> Solution:
-    """Return the solution at path rows first to last − 1: smoothed, or without that the filter's own."""
+    """Return the solution at path rows first to last − 1: smoothed, or the filter's own if ``smoothed`` is None."""
     path = Path._make(column[first:last] for column in run.path)
     position_e, velocity_e, q, sigma = (run.storage.empty((len(path.time_ns), k), np.float64) for k in (3, 3, 4, 9))
     for begin in range(0, len(path.time_ns), PIECE):
@@ -414,7 +417,7 @@ def solution_of(run: FilterRun, smoothed: SmoothedNodes | None, first: int = 0, 
         separation, separation_sigma = smoothed.separation, smoothed.separation_sigma
     lever, offset = run.layout.lever_arm - MOVED, run.layout.time_offset - MOVED
     none = np.zeros((len(time_ns), 3))
-    leans = len(time_ns) if run.layout.lean >= 0 else 0  # of the rows below
+    leans = len(time_ns) if run.layout.lean >= 0 else 0  # number of rows with misalignments
     gyro_lean, accel_lean = E_GYRO_LEAN - MOVED, E_ACCEL_LEAN - MOVED
     return Solution(
         time_ns=path.time_ns,
@@ -450,7 +453,7 @@ def solution_of(run: FilterRun, smoothed: SmoothedNodes | None, first: int = 0, 
 
 
 def _sensor_sigmas(packed: FloatArray, size: int) -> FloatArray:
-    """Return (m, size − 9) of covariances packed by rows."""
+    """Return sigmas (m, size − 9) from covariances packed by rows."""
     diagonal = [i * (i + 1) // 2 + i for i in range(E_SENSORS, size)]
     sigmas: FloatArray = np.sqrt(np.maximum(packed[:, diagonal], 0.0))
     return sigmas

@@ -1,4 +1,4 @@
-"""Growing blocks that the filter writes into: a path row a sample, a node and its components, what was told of rows."""
+"""Growing blocks for the filter's output: a path row per sample, a node and its components, the fates of rows."""
 
 from __future__ import annotations
 
@@ -32,26 +32,26 @@ LATEST_ROWS = 1000
 
 
 class Storage:
-    """Where the arrays of a run are kept: in memory, unless the caller has another one (files, for a long flight)."""
+    """The place of a run's arrays: memory, unless the caller provides another one (files, for a long flight)."""
 
     def empty(self, shape: tuple[int, ...], dtype: Any) -> NDArray[Any]:
-        """Return an array whose contents do not matter."""
+        """Return an array with undefined contents."""
         return np.empty(shape, dtype)
 
     def rest(self) -> None:
-        """Called now and then, between pieces of work: what can be had again may leave memory."""
+        """Free memory that can be read again; called now and then, between pieces of work."""
 
 
 IN_MEMORY = Storage()
 
 
 class PathStore:
-    """Blocks of path rows; the clock's OUT counts in the last.
+    """Blocks of path rows; the clock's OUT counts within the last.
 
     Args:
         clock: the filter's.
         storage: where blocks are kept.
-        expected: so many rows will come, if that is known: they are one block.
+        expected: the number of rows to come, if known: they become one block.
     """
 
     def __init__(self, clock: Int64Array, storage: Storage, expected: int = 0) -> None:
@@ -60,7 +60,7 @@ class PathStore:
         self._block = _path(0, IN_MEMORY)
 
     def room(self, rows: int) -> Path:
-        """Return a block that takes so many more."""
+        """Return a block with room for this many more rows."""
         if len(self._block.time_ns) - int(self._clock[OUT]) < rows:
             self._full.append(_cut(self._block, int(self._clock[OUT])))
             self._block = _path(max(rows, PATH_ROWS, self._expected), self._storage)
@@ -78,7 +78,7 @@ class PathStore:
         return Path._make(np.concatenate(columns) for columns in zip(*parts, strict=True))
 
     def taken(self) -> Path:
-        """Return all rows so far, which are forgotten."""
+        """Return all rows so far, and drop them."""
         whole = Path._make(column.copy() for column in self.whole())
         self._full.clear()
         self._clock[OUT] = 0
@@ -86,10 +86,10 @@ class PathStore:
 
 
 class NodeStore:
-    """Blocks of nodes; the clock's NODE and SCALAR count in the last.
+    """Blocks of nodes; the clock's NODE and SCALAR count within the last.
 
     Attributes:
-        kept: False: nothing is, for a filter that nobody will smooth.
+        kept: False: blocks are dropped, for a filter whose path is not smoothed.
     """
 
     def __init__(self, clock: Int64Array, layout: Layout, storage: Storage, *, kept: bool = True) -> None:
@@ -98,7 +98,7 @@ class NodeStore:
         self._block = _nodes(0, 0, layout, IN_MEMORY)
 
     def room(self, nodes: int, components: int) -> Nodes:
-        """Return a block that takes so many more."""
+        """Return a block with room for this many more nodes and components."""
         if not self.kept:
             self._clock[NODE] = self._clock[SCALAR] = 0
         free = len(self._block.time_ns) - int(self._clock[NODE])
@@ -110,7 +110,7 @@ class NodeStore:
         return self._block
 
     def blocks(self) -> list[Nodes]:
-        """Return all so far, in order; `first` counts in each block anew."""
+        """Return all blocks so far, in order; `first` counts within each block."""
         return [block for block in [*self._full, self._used()] if len(block.time_ns)]
 
     def _used(self) -> Nodes:
@@ -120,13 +120,13 @@ class NodeStore:
 
 
 class RowQueue:
-    """Observations that wait for samples, and what was told of those that need wait no more.
+    """Observations that wait for samples, and the fates of those that no longer wait.
 
     Args:
-        kept: False: only the latest `LATEST_ROWS` or so of what was told, for a filter that runs on and on.
+        kept: False: only about the latest `LATEST_ROWS` fates are kept, for a filter that runs without end.
 
     Attributes:
-        fates: how many rows of a kind met which fate, all of them counted.
+        fates: number of rows by kind and fate, all of them counted.
     """
 
     def __init__(self, *, kept: bool = True) -> None:
@@ -136,20 +136,20 @@ class RowQueue:
         self.fates: Counter[tuple[int, int]] = Counter()
 
     def add(self, rows: StructArray, not_before_ns: int) -> None:
-        """Into the queue, by time; those before the filter's time are told to be outside."""
+        """Insert rows into the queue by time; mark those before the filter's time as outside."""
         late = rows["time_ns"] < not_before_ns
         self.refuse(rows[late])
         both = np.concatenate([self._waiting, rows[~late]])
         self._waiting = both[np.lexsort((both["antenna"], both["kind"], both["time_ns"]))]
 
     def until(self, time_ns: int) -> StructArray:
-        """Take those up to a time out of the queue."""
+        """Remove the rows up to a time from the queue and return them."""
         count = int(np.searchsorted(self._waiting["time_ns"], time_ns, side="right"))
         due, self._waiting = self._waiting[:count], self._waiting[count:]
         return due
 
     def refuse(self, rows: StructArray) -> None:
-        """Tell rows to be outside."""
+        """Mark rows as outside."""
         if len(rows):
             told = told_of(len(rows))
             told.fate[:] = Fate.OUTSIDE
@@ -158,7 +158,7 @@ class RowQueue:
             self.tell(rows, told)
 
     def tell(self, rows: StructArray, told: Told) -> None:
-        """Keep what became of rows."""
+        """Record the fates of rows."""
         said = np.zeros(len(rows), INNOVATION_DTYPE)
         for name in ("time_ns", "kind", "fix_type", "satellites", "antenna"):
             said[name] = rows[name]
@@ -174,12 +174,12 @@ class RowQueue:
             self._told = [np.concatenate(self._told)[-LATEST_ROWS:]]
 
     def close(self) -> None:
-        """Nothing more comes: who still waits is outside."""
+        """Mark all waiting rows as outside, as no more samples come."""
         waiting, self._waiting = self._waiting, self._waiting[:0]
         self.refuse(waiting)
 
     def innovations(self) -> StructArray:
-        """Return what became of all rows so far (where they are kept), by time."""
+        """Return the fates of all rows so far (as far as they are kept), by time."""
         if not self._told:
             return np.zeros(0, INNOVATION_DTYPE)
         whole = np.concatenate(self._told)
@@ -195,7 +195,7 @@ def columns_of(rows: StructArray) -> Rows:
 
 
 def told_of(rows: int) -> Told:
-    """Return room for what is told."""
+    """Return room for the fates of rows."""
     return Told(np.empty(rows, np.uint8), np.empty(rows, np.uint8), np.empty((rows, TOLD_SIZE)))
 
 

@@ -1,11 +1,11 @@
-"""Strapdown mechanisation in e: from increments to position, velocity and attitude.
+"""Strapdown mechanisation in e: position, velocity and attitude from increments.
 
-Attitude by rotation vectors with the coning of the increments before and at hand, velocity with rotation compensation
-and sculling alike (Savage 1998, J. Guidance 21(1), 21(2)); e turns by the earth's rate, gravity and Coriolis
-acceleration at the middle of each interval, position by the trapezium. Nothing in it is singular at a pole or jumps at
-the antimeridian (Groves 2013, 5.3).
+Attitude is integrated by rotation vectors, with coning from the previous and the present increments; velocity likewise
+with rotation compensation and sculling (Savage 1998, J. Guidance 21(1), 21(2)); e turns by the earth's rate, gravity
+and Coriolis acceleration are taken at the middle of each interval, position by the trapezium rule. The equations are
+regular at a pole and do not jump at the antimeridian (Groves 2013, 5.3).
 
-The state is an array x; its columns are the constants below, in the order of the error states that belong to them.
+The state is an array x; its columns are the constants below, in the order of the corresponding error states.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ SLOW_VELOCITY = 36
 SLOW_HEADING = 39  # of the heading and of the pitch of a baseline
 STATE_SIZE = 41
 
-# Sums over a step of the covariance: ∫ C dt, ∫ C diag(ω) dt, ∫ C diag(f) dt by rows, ∫ dt, and the means of last
+# Sums over a step for the covariance: ∫ C dt, ∫ C diag(ω) dt, ∫ C diag(f) dt by rows, ∫ dt, and the last means
 SUM_TURN, SUM_RATE, SUM_FORCE, SUM_TIME = 0, 9, 18, 27
 LAST_RATE, LAST_FORCE = 28, 31  # rad/s and m/s² in b, corrected, of the latest part
 SUMS_SIZE = 34
-# Where misalignments are estimated: ∫ C (eⱼ ωₖ + eₖ ωⱼ) dt and that of f, a column by the axis that is neither
+# With misalignments estimated: ∫ C (eⱼ ωₖ + eₖ ωⱼ) dt and the same of f, a column for the axis that is neither
 SUM_RATE_ACROSS, SUM_FORCE_ACROSS = 34, 43
 SUMS_SIZE_ACROSS = 52
 
-_SMALL_2 = 1e-3  # rad², below it the series are exact to the last bit
+_SMALL_2 = 1e-3  # rad², below which the series are exact to the last bit
 
 
 class Samples(NamedTuple):
@@ -55,7 +55,7 @@ class Samples(NamedTuple):
 
 
 def samples_of(inertial: Inertial) -> Samples:
-    """Return the columns, contiguous."""
+    """Return the columns of inertial samples, contiguous."""
     return Samples(
         np.ascontiguousarray(inertial.time_ns, dtype=np.int64),
         np.ascontiguousarray(inertial.interval_s, dtype=np.float64),
@@ -86,16 +86,16 @@ def put(array: FloatArray, k: int, v: Three) -> None:
 
 @jit_inline
 def copy_into(out: FloatArray, of: FloatArray) -> None:
-    """out[i] ← of[i] as far as out goes; compiles in a tenth of the time that an assignment of slices takes."""
+    """Copy out[i] ← of[i] as far as out goes; this compiles ten times as quickly as an assignment of slices."""
     for i in range(len(out)):
         out[i] = of[i]
 
 
 @jit_inline
 def corrected(measured: Three, bias: Three, scale: Three, lean: Three, interval_s: float) -> Three:
-    """True increments of measured ones: u = (measured − bias · interval) / (1 + scale), less what axes see of others.
+    """Return true increments of measured ones: u = (measured − bias · interval) / (1 + scale), less cross-axis parts.
 
-    With axes that lean towards each other by angles l that is u − M(l) u, M = [[0, l_z, l_y], [l_z, 0, l_x],
+    With axes that lean towards each other by angles l the result is u − M(l) u, M = [[0, l_z, l_y], [l_z, 0, l_x],
     [l_y, l_x, 0]]: the triad's mean axes are the body's.
     """
     u = (measured[0] - bias[0] * interval_s) / (1.0 + scale[0])
@@ -116,7 +116,7 @@ def leaned(u: Three, lean: Three) -> Three:
 
 @jit_inline
 def rotated_velocity(angle: Three, velocity: Three) -> Three:
-    """Return ∫ exp([φ(t)]×) f dt over an interval of constant rate and force, in the axes at its begin.
+    """Return ∫ exp([φ(t)]×) f dt over an interval of constant rate and force, in the axes at its start.
 
     Savage 1998, part 2, Eq. 20:
     Velocity increment + (1 − cos φ) / φ² φ × Δv + (φ − sin φ) / φ³ φ × (φ × Δv).
@@ -147,13 +147,13 @@ def half_turn(angle: Three) -> tuple[float, float]:
 
 @jit_inline
 def turn(x: FloatArray, angle_b: Three, earth_rad: float) -> None:
-    """q ← exp(−earth / 2) ⊗ q ⊗ exp(angle_b / 2), of unit length again."""
+    """Turn the attitude, q ← exp(−earth / 2) ⊗ q ⊗ exp(angle_b / 2), and normalise it."""
     cos, half = half_turn(angle_b)
     i, j, k = half * angle_b[0], half * angle_b[1], half * angle_b[2]
     a, b, c, d = x[ATTITUDE], x[ATTITUDE + 1], x[ATTITUDE + 2], x[ATTITUDE + 3]
     w, u = a * cos - b * i - c * j - d * k, a * i + b * cos + c * k - d * j
     v, t = a * j - b * k + c * cos + d * i, a * k + b * j - c * i + d * cos
-    e = 0.5 * earth_rad  # 4e-5 rad a second: its sine is itself
+    e = 0.5 * earth_rad  # 4e-5 rad a second: its sine equals the angle
     w, u, v, t = w + e * t, u + e * v, v - e * u, t - e * w
     length = 1.0 / math.sqrt(w * w + u * u + v * v + t * t)
     x[ATTITUDE], x[ATTITUDE + 1] = w * length, u * length
@@ -162,7 +162,7 @@ def turn(x: FloatArray, angle_b: Three, earth_rad: float) -> None:
 
 @jit_inline
 def add_sums(sums: FloatArray, rot: Matrix, angle: Three, velocity: Three, span_s: float) -> None:
-    """Add a part to the sums, with the attitude in its middle."""
+    """Add a part of a sample to the sums, with the attitude at its middle."""
     for i in range(3):
         m = plus(rot[i], 0.5, cross(rot[i], angle))  # row i of C (I + ½ [φ]×)
         for j in range(3):
@@ -194,7 +194,7 @@ def advance_part(x: FloatArray, sums: FloatArray, angle_b: Three, velocity_b: Th
     add_sums(sums, rot, angle, velocity, span_s)
     earth = EARTH_RATE_RADPS * span_s
     p, v, q = times(rot, rotated_velocity(angle, velocity))
-    p, v = p + 0.5 * earth * v, v - 0.5 * earth * p  # e has turned by half of it on the mean
+    p, v = p + 0.5 * earth * v, v - 0.5 * earth * p  # on average e has turned by half of it
     vx, vy, vz = x[VELOCITY], x[VELOCITY + 1], x[VELOCITY + 2]
     half = 0.5 * span_s
     g = gravity_of(x[POSITION] + half * vx, x[POSITION + 1] + half * vy, x[POSITION + 2] + half * vz)
@@ -211,14 +211,15 @@ def advance_part(x: FloatArray, sums: FloatArray, angle_b: Three, velocity_b: Th
 
 @jit_inline
 def coning_and_sculling(before: FloatArray, angle: Three, velocity: Three, span_s: float) -> tuple[Three, Three]:
-    """Return what a linear course of rate and force over two intervals adds to the increments of the second.
+    """Return the second interval's increments with coning and sculling, for rate and force linear over two intervals.
 
     With h₁ and h₂ their lengths: h₂² / (6 h₁ (h₁ + h₂)) times the products of the increments, 1/12 of them where the
     lengths are equal (Savage 1998, Eq. 1-38 and 2-36).
 
     Args:
-        before: (7,) increments of the interval before and its length; 0 where there is none.
-        angle, velocity: increments; span_s: length.
+        before: (7,) increments of the interval before and its length; 0 if there is none.
+        angle, velocity: increments.
+        span_s: length.
     """
     ahead = before[6]
     if ahead <= 0.0:
@@ -232,7 +233,7 @@ def coning_and_sculling(before: FloatArray, angle: Three, velocity: Three, span_
 
 @jit_inline
 def keep_before(before: FloatArray, angle: Three, velocity: Three, span_s: float) -> None:
-    """This interval will be the one before."""
+    """Store this interval as the one before."""
     put(before, 0, angle)
     put(before, 3, velocity)
     before[6] = span_s
@@ -252,11 +253,11 @@ def _navigate(samples: Samples, begin_ns: int, x: FloatArray, states: FloatArray
 
 
 def navigate(inertial: Inertial, state: FloatArray) -> FloatArray:
-    """Navigate freely, with nothing but inertial samples.
+    """Navigate by inertial samples alone.
 
     Args:
-        inertial: n samples; the first begins where its interval says.
-        state: (STATE_SIZE,) at that begin, sensors' errors included.
+        inertial: n samples; the first begins its interval before its time.
+        state: (STATE_SIZE,) at that moment, sensors' errors included.
 
     Returns:
         (n, 10) position and velocity in e, q_e_from_b at the end of each sample.

@@ -1,4 +1,4 @@
-"""What the filter's compiled loop is given and writes, as tuples that numba knows by their names."""
+"""The inputs and outputs of the filter's compiled loop, as tuples that numba accesses by name."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ KINDS = len(Kind)
 # Columns of `Running.clock`
 NOW, NEXT_STEP, NEXT_NODE, STARTED, GAPS, OUT, NODE, SCALAR = range(8)
 CLOCK_SIZE = 8
-# Rows of `Running.refused`: how many in a row, since when, when one was taken last, until when the state settles; when
-# the last came if it was within the gate, when one leapt away
+# Rows of `Running.refused`: refusals in a row, time of the first, time when one was last taken, time until which the
+# state settles; time of the last one if it was within the gate, time of a leap
 COUNT, SINCE_NS, TAKEN_NS, SETTLED_NS, SOUND_NS, LEAPT_NS = 0, 1, 2, 3, 4, 5
-# Rows of `Running.lately`: mean χ² a component, of how many, mean product of neighbours, the last normalised (3)
+# Rows of `Running.lately`: mean χ² per component, its number, mean product of neighbours, the last normalised (3)
 MEAN, SEEN, ALIKE, WHITE = 0, 1, 2, 3
 # Columns of `Told.figures`
 NU, SIGMA, NORMALISED, CHI2, LOG_DET, INFLATION = 0, 3, 6, 9, 10, 11
@@ -37,16 +37,16 @@ class Rows(NamedTuple):
 
 
 class Running(NamedTuple):
-    """What the filter knows, all of it changed as it runs.
+    """The filter's knowledge, all of it changed as it runs.
 
     Attributes:
         clock: (CLOCK_SIZE,) times in ns and counters.
-        x: (STATE_SIZE,) the state; p: (n, n) covariance of its errors.
-        sums: (Layout.sums_size,) of the step; before: (7,) the sample before.
+        x, p: (STATE_SIZE,) the state; (n, n) covariance of its errors.
+        sums, before: (Layout.sums_size,) of the step; (7,) the sample before.
         total, total_decay: Φ since the last node.
         sigma: (9,) of position and velocity north, east, down, of roll, pitch, heading.
         bridge: (6, 3) covariances in e of attitude and velocity that made-up samples add to this step.
-        refused: (4, kinds); lately: (6, kinds), by the rows above.
+        refused, lately: (4, kinds), (6, kinds), by the rows above.
         top, work, decay: (9, core), (9, n), (n,) room for a step.
         rows, small, gain, error: (3, n), (8, 3), (n,), (n,) room for an observation.
     """
@@ -72,7 +72,7 @@ class Running(NamedTuple):
 
 
 class Model(NamedTuple):
-    """What it goes by."""
+    """The filter's fixed parameters."""
 
     layout: Layout
     drive: Drive
@@ -84,7 +84,7 @@ class Model(NamedTuple):
 
 
 class Path(NamedTuple):
-    """Written a sample: (c,) times, (c, 10) states, (c, 9) sigmas, (c,) bridged."""
+    """Output per sample: (c,) times, (c, 10) states, (c, 9) sigmas, (c,) bridged."""
 
     time_ns: Int64Array
     states: FloatArray
@@ -93,15 +93,15 @@ class Path(NamedTuple):
 
 
 class Nodes(NamedTuple):
-    """Written a node, and a component taken.
+    """Output per node, and per component taken.
 
     Attributes:
         time_ns: (c,).
         before, after: (c, 10), (c, STATE_SIZE) the state without and with the node's observations.
         covariance: (c, n (n + 1) / 2) after them, packed by rows of the lower triangle.
         top, decay: (c, 9, core), (c, n) Φ from the node before.
-        first: (c,) its first component, counted on; the last node's end with the counter.
-        h, gain: (k, n); weighed: (k, 2) innovation and 1, over the component's variance.
+        first: (c,) index of its first component; the last node's end with the counter.
+        h, gain, weighed: (k, n), (k, n), (k, 2) innovation and 1, over the component's variance.
     """
 
     time_ns: Int64Array
@@ -117,7 +117,7 @@ class Nodes(NamedTuple):
 
 
 class Told(NamedTuple):
-    """Written an observation: (m,) fate, number of components, (m, TOLD_SIZE) figures."""
+    """Output per observation: (m,) fate, number of components, (m, TOLD_SIZE) figures."""
 
     fate: ByteArray
     dimension: ByteArray

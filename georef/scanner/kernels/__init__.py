@@ -1,1 +1,1 @@
-"""Loops over single returns, compiled; what they compute is written in `georef.sensor_model` and `georef.beams`."""
+"""Compiled loops over single returns; `georef.sensor_model` and `georef.beams` describe their computation."""

@@ -1,6 +1,6 @@
-"""What stands between a point and its errors: vectors in b, for a block of returns that was made points of.
+"""Compute the vectors between a point and its errors: vectors in b, for a block of georeferenced returns.
 
-`swath.georef.scanner.kernels.rays` hands them over, or makes covariances of them
+`swath.georef.scanner.kernels.rays` returns them, or makes covariances of them
 (`swath.georef.scanner.kernels.covariance`).
 """
 
@@ -58,7 +58,10 @@ NOWHERE = (0.0, 0.0, 0.0)
 
 @jit_inline
 def through_mount(block: FloatArray, n: int, k: int, mounted: Mounted, source: int, target: int, moved: float) -> None:
-    """Vectors of the head as the boresight's ω and φ see them; ``moved`` 1: places, 0: directions."""
+    """Convert vectors of the head to the axes turned by ω and φ of the boresight.
+
+    ``moved`` is 1 for positions, 0 for directions.
+    """
     if len(mounted.inner) == 1:
         inner = matrix_at(mounted.inner, 0)
         shift = plus(NOWHERE, moved, vector_at(mounted.shift, 0))
@@ -72,7 +75,7 @@ def through_mount(block: FloatArray, n: int, k: int, mounted: Mounted, source: i
 
 @jit_inline
 def attitudes(block: FloatArray, n: int, k: int, q_e_from_b: FloatArray, w: float, v: Three, r: Three) -> None:
-    """(w, v) ⊗ exp(share · r / 2), scalar first, from rows SIN and COS of `half_turns`."""
+    """Compute (w, v) ⊗ exp(share · r / 2), scalar first, from rows SIN and COS of `half_turns`."""
     here = slice(k, k + n)
     q_w, q_x, q_y, q_z = q_e_from_b[0, here], q_e_from_b[1, here], q_e_from_b[2, here], q_e_from_b[3, here]
     for i in range(n):
@@ -87,7 +90,10 @@ def attitudes(block: FloatArray, n: int, k: int, q_e_from_b: FloatArray, w: floa
 
 @jit_inline
 def turn_axes(block: FloatArray, n: int, k: int, kind: int, mounted: Mounted, tilts: bool) -> None:
-    """Rows in b: HEAD the beam, START from the body's origin to the point, ACROSS ∂point/∂θ, TILT ∂point/∂Δη."""
+    """Compute rows in b: HEAD the beam, START the arm of the point, ACROSS ∂point/∂θ, TILT ∂point/∂Δη.
+
+    The arm begins at the body's origin.
+    """
     outer, lever, slope = matrix_at(mounted.outer, 0), vector_at(mounted.lever_arm_b, 0), mounted.slope
     by_phi = outer[0][1], outer[1][1], outer[2][1]
     swing(block, n, kind)
@@ -98,7 +104,7 @@ def turn_axes(block: FloatArray, n: int, k: int, kind: int, mounted: Mounted, ti
         along = times(outer, three(block, ALONG, i))
         put(block, HEAD, i, along)
         put(block, START, i, plus(times(outer, three(block, START, i)), block[RHO, i], along))
-    for i in range(n):  # where θ turns φ too, whose axis is Rx(ω) y
+    for i in range(n):  # θ also turns φ, whose axis is Rx(ω) y
         by_slope = cross(by_phi, three(block, START, i))
         put(block, ACROSS, i, plus(times(outer, three(block, ACROSS, i)), slope, by_slope))
     for i in range(n):
@@ -127,7 +133,7 @@ def fill_axes(block: FloatArray, n: int, k: int, track: Track, axes: Axes, turni
 
 @jit_inline
 def take_readings(block: FloatArray, n: int, part: Any, scanning: Scanning, rate: Any, acceleration: Any) -> None:
-    """The encoder's, as errors of its parameters see them."""
+    """Fill rows of encoder readings, as the errors of the encoder's parameters need them."""
     fixed = scanning.select >= FIBRE_BY_CHANNEL
     for i in range(n):
         reading = block[BEAM + FIXED_ANGLE, i] if fixed else part[i].encoder_rad
@@ -141,7 +147,7 @@ def take_readings(block: FloatArray, n: int, part: Any, scanning: Scanning, rate
 def fill_covariance(
     block: FloatArray, n: int, k: int, part: Any, track: Track, turning: int, interval: Interval, doubt: Doubt
 ) -> None:
-    """Of the n returns of a block, whose axes and readings are there, to row k and on."""
+    """Fill covariances of the n returns of a block, whose axes and readings are computed, from row k on."""
     take_axes(block, n, rot_at(track.q_e_from_b, turning), vector_at(track.rotvec_b, turning))
     for i in range(n):
         block[MEASURED, i] = part[i].range_m

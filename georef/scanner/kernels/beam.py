@@ -1,12 +1,12 @@
-"""One beam in the head's own axes: where it starts, where it points, and how both turn with the scan angle.
+"""One beam in the head's own axes: its start, its direction, and the derivatives of both by the scan angle.
 
-A geometry is a row of eight numbers a channel (`swath.georef.scanner.beams` fills them). In all of them column 7 is
+A geometry is a row of eight numbers per channel (`swath.georef.scanner.beams` fills them). In all of them column 7 is
 metres added to the range; columns 0 to 6 are
 
-    LINE       sin Δη, cos Δη, sin ε, cos ε of a mirror tilted by ε towards x; θ where the channel itself says it
+    LINE       sin Δη, cos Δη, sin ε, cos ε of a mirror tilted by ε towards x; θ if the channel itself gives it
     NUTATING   sin ψ, cos ψ of the normal from its shaft; sin β, cos β of the shaft from the laser's beam
     RISLEY     horizontal and vertical part of the ray before the last surface; sin, cos of the second wedge; refractive
-               index; turns of the second prism a turn of the first
+               index; turns of the second prism per turn of the first
     SPINNING   sin, cos of elevation; azimuth; right, forward, up of the beam's start; sense of turning (1, −1)
 """
 
@@ -26,17 +26,16 @@ _EIGHTH = 0.25 * math.pi
 
 @jit_inline
 def mirror_angle(theta: float) -> float:
-    """Of the normal of a line scanner's mirror."""
+    """Return the angle of the normal of a line scanner's mirror."""
     return _EIGHTH + 0.5 * theta
 
 
 @jit_inline
 def line_beam(row: Eight, sin: float, cos: float) -> Three:
-    """Return off a mirror whose normal stands at 45° − θ/2 to a laser on the +y side: u = u0 − 2 (u0·n) n (FORMULAS
-    2.2).
+    """Return the beam off a line scanner's mirror: u = u0 − 2 (u0·n) n (FORMULAS 2.2).
 
-    With ε = 0 this is ISO/TS 19159-2 Eq. 14's (−sin Δη, sin θ cos Δη, cos θ cos Δη). Sine and cosine are of
-    `mirror_angle`.
+    The mirror's normal stands at 45° − θ/2 to a laser on the +y side. With ε = 0 this is ISO/TS 19159-2 Eq. 14's (−sin
+    Δη, sin θ cos Δη, cos θ cos Δη). Sine and cosine are of `mirror_angle`.
     """
     twice = 2.0 * (row[0] * row[2] + row[1] * row[3] * sin)
     return twice * row[2] - row[0], twice * row[3] * sin - row[1], twice * row[3] * cos
@@ -58,7 +57,7 @@ def line_turn(row: Eight, sin: float, cos: float) -> tuple[Three, Three]:
 
 @jit_inline
 def nutating_beam(row: Eight, sin: float, cos: float) -> Three:
-    """Return off a mirror whose normal leans by ψ from its shaft, the laser along +x (FORMULAS 2.2, Palmer)."""
+    """Return the beam off a mirror whose normal leans by ψ from its shaft, laser along +x (FORMULAS 2.2, Palmer)."""
     aside = row[0] * cos
     x, y, z = aside * row[2] - row[1] * row[3], row[0] * sin, aside * row[3] + row[1] * row[2]
     return 1.0 - 2.0 * x * x, -2.0 * x * y, -2.0 * x * z
@@ -75,11 +74,11 @@ def nutating_turn(row: Eight, sin: float, cos: float) -> Three:
 
 @jit_inline
 def risley_beam(row: Eight, first: Two, second: Two) -> Three:
-    """Return through the last of a Risley pair's four surfaces by Snell's law as vectors (FORMULAS 2.2).
+    """Return the beam after the last of a Risley pair's four surfaces, by Snell's law as vectors (FORMULAS 2.2).
 
-    Before it the ray is a cone about z that turns with the first prism: the three surfaces before are passed once for
-    all, in `swath.georef.scanner.beams`. nan where the light is totally reflected. ``first``, ``second``: sine and
-    cosine of both prisms' angles.
+    Before it the ray is a cone about z that turns with the first prism: `swath.georef.scanner.beams` passes the three
+    surfaces before once for all returns. The result is nan where the light is totally reflected. ``first``, ``second``:
+    sine and cosine of both prisms' angles.
     """
     x, y, z = row[0] * first[1], row[0] * first[0], row[1]
     nx, ny, nz = row[2] * second[1], row[2] * second[0], row[3]
@@ -104,18 +103,18 @@ def risley_turn(row: Eight, first: Two, second: Two) -> Three:
 
 @jit_inline
 def spinning_angle(row: Eight, theta: float) -> float:
-    """Return azimuth of a channel of a spinning head."""
+    """Return the azimuth of a channel of a spinning head."""
     return row[6] * theta + row[2]
 
 
 @jit_inline
 def spinning_beam(row: Eight, sin: float, cos: float) -> tuple[Three, Three]:
-    """Return where a spinning head's beam starts (m), and its direction; azimuth from y towards x (FORMULAS 2.2)."""
+    """Return the start (m) and direction of a spinning head's beam; azimuth from y towards x (FORMULAS 2.2)."""
     start = row[4] * sin + row[3] * cos, row[4] * cos - row[3] * sin, row[5]
     return start, (row[1] * sin, row[1] * cos, row[0])
 
 
 @jit_inline
 def spinning_turn(row: Eight, start: Three, direction: Three, range_m: float) -> Three:
-    """Return ∂point/∂θ, m/rad."""
+    """Return ∂point/∂θ of `spinning_beam`, m/rad."""
     return row[6] * (start[1] + range_m * direction[1]), -row[6] * (start[0] + range_m * direction[0]), 0.0

@@ -1,4 +1,4 @@
-"""A block of returns on its way through `swath.georef.scanner.kernels.rays`: a table with a row for each quantity.
+"""A block of returns in `swath.georef.scanner.kernels.rays`: a table with a row for each quantity.
 
 Each step goes over the block once, reads some rows and fills others. Steps without a branch are compiled for several
 returns at once, and a block stays in the nearest cache.
@@ -45,17 +45,17 @@ from swath.georef.scanner.kernels.types import Eight, Matrix, Three
 
 BLOCK = 64
 
-# One row each: θ; ρ, its measured part and the rest; where in its interval of position and of attitude a return is;
+# One row each: θ; ρ, its measured part and the rest; a return's position in its intervals of position and of attitude;
 # factors of the turn since the interval began; sine and cosine of up to two angles of the beam, and of slope · θ
 THETA, RHO, COUNTED, MORE, SHARE, TURN_SHARE, A, B, ANGLE = (whole(row) for row in range(9))
 SIN, COS, SIN_2, COS_2, SLOPE_SIN, SLOPE_COS = (whole(row) for row in range(9, 15))
 # Three rows each: direction and start of the beam in the head, and then in the axes that the boresight's ω and φ turn;
-# ∂direction/∂θ and ∂direction/∂Δη (the first two of them are places for origin and point in e too)
+# ∂direction/∂θ and ∂direction/∂Δη (the first two of them also hold origin and point in e)
 HEAD, HEAD_START, ALONG, START, ACROSS, TILT = (whole(row) for row in range(15, 33, 3))
 BEAM = whole(33)  # the row of the geometry's table, eight rows
-# Of covariances: rot_e_from_b, three rows of three; what a later attitude and a later pulse do, per second; the
+# For covariances: rot_e_from_b, three rows of three; effect of a later attitude and of a later pulse, per second; the
 # covariance xx xy xz, yy yz zz. One each: range as measured; variance of the range; encoder reading from its offset on,
-# rate, acceleration, and what an error in these is in the scan angle
+# rate, acceleration, and the effect of an error in these on the scan angle
 ROT, ROT_2, ROT_3, TURNING, MOVED, COVARIANCE, COVARIANCE_2 = (whole(row) for row in range(41, 62, 3))
 MEASURED, VARIANCE, READING, RATE, ACCELERATION, ANGLE_OFF = (whole(row) for row in range(62, 68))
 ROWS = 68
@@ -63,26 +63,26 @@ ROWS = 68
 
 @jit_inline
 def three(block: FloatArray, at: int, i: int) -> Three:
-    """Return three rows."""
+    """Return the values of three successive rows."""
     return block[at, i], block[at + 1, i], block[at + 2, i]
 
 
 @jit_inline
 def put(block: FloatArray, at: int, i: int, v: Three) -> None:
-    """Into three rows."""
+    """Set the values of three successive rows."""
     block[at, i], block[at + 1, i], block[at + 2, i] = v
 
 
 @jit_inline
 def clear(block: FloatArray, at: int) -> None:
-    """Three rows to zero."""
+    """Set three successive rows to zero."""
     for i in range(BLOCK):
         put(block, at, i, (0.0, 0.0, 0.0))
 
 
 @jit_inline
 def beam_at(block: FloatArray, i: int) -> Eight:
-    """Return the geometry's row."""
+    """Return the geometry's row of a return."""
     return (
         block[BEAM, i],
         block[BEAM + 1, i],
@@ -97,7 +97,7 @@ def beam_at(block: FloatArray, i: int) -> Eight:
 
 @jit_inline
 def sines(block: FloatArray, n: int, sin: int, cos: int) -> None:
-    """Sine and cosine of row ANGLE."""
+    """Compute sine and cosine of row ANGLE."""
     large = 0
     for i in range(n):
         large += not abs(block[ANGLE, i]) < LARGE_ANGLE
@@ -110,7 +110,7 @@ def sines(block: FloatArray, n: int, sin: int, cos: int) -> None:
 
 @jit_inline
 def aim(block: FloatArray, n: int, kind: int) -> None:
-    """θ to the beam in the head."""
+    """Compute the beam in the head from θ."""
     if kind == LINE:
         for i in range(n):
             block[ANGLE, i] = mirror_angle(block[THETA, i])
@@ -143,7 +143,7 @@ def aim(block: FloatArray, n: int, kind: int) -> None:
 
 @jit_inline
 def swing(block: FloatArray, n: int, kind: int) -> None:
-    """∂point/∂θ and ∂point/∂Δη in the head, m/rad; Δη is of line scanners only."""
+    """Compute ∂point/∂θ and ∂point/∂Δη in the head, m/rad; only line scanners have Δη."""
     if kind == LINE:
         for i in range(n):
             rho = block[RHO, i]
@@ -168,7 +168,7 @@ def swing(block: FloatArray, n: int, kind: int) -> None:
 
 @jit_inline
 def lean(block: FloatArray, n: int, slope: float) -> None:
-    """Sine and cosine of slope · θ."""
+    """Compute sine and cosine of slope · θ."""
     if slope == 0.0:
         for i in range(n):
             block[SLOPE_SIN, i], block[SLOPE_COS, i] = 0.0, 1.0
@@ -180,14 +180,14 @@ def lean(block: FloatArray, n: int, slope: float) -> None:
 
 @jit_inline
 def mount(block: FloatArray, i: int, source: int, target: int, inner: Matrix, shift: Three) -> None:
-    """A vector of the head through κ, gimbal and installation, and about slope · θ."""
+    """Turn a vector of the head by κ, gimbal and installation, and about slope · θ."""
     v = plus(shift, 1.0, times(inner, three(block, source, i)))
     put(block, target, i, turned_by(block[SLOPE_SIN, i], block[SLOPE_COS, i], v))
 
 
 @jit_inline
 def factors(block: FloatArray, n: int, phi2: float) -> None:
-    """a, b of `turn_factors` for the share of the interval that has passed."""
+    """Compute a, b of `turn_factors` for the share of the interval that has passed."""
     if phi2 < SMALL_ANGLE_2:
         for i in range(n):
             share = block[TURN_SHARE, i]
@@ -200,7 +200,7 @@ def factors(block: FloatArray, n: int, phi2: float) -> None:
 
 @jit_inline
 def half_turns(block: FloatArray, n: int, phi2: float) -> None:
-    """Rows SIN and COS: of half the turn since the interval began, the sine by its whole length."""
+    """Compute rows SIN and COS of half the turn since the interval began, the sine divided by the turn's length."""
     if phi2 < SMALL_ANGLE_2:
         for i in range(n):
             half = 0.5 * block[TURN_SHARE, i]
@@ -215,14 +215,14 @@ def half_turns(block: FloatArray, n: int, phi2: float) -> None:
 
 @jit_inline
 def give(block: FloatArray, n: int, at: int, out: Any) -> None:
-    """Three rows to (n, 3)."""
+    """Copy three rows to (n, 3)."""
     for i in range(n):
         out[i, 0], out[i, 1], out[i, 2] = block[at, i], block[at + 1, i], block[at + 2, i]
 
 
 @jit_inline
 def hand_over(block: FloatArray, n: int, at: int, out: FloatArray, k: int) -> None:
-    """Three rows to those of (3, …) from column k on."""
+    """Copy three rows to those of (3, …) from column k on."""
     for axis in range(3):
         row = out[axis, k : k + n]
         for i in range(n):
@@ -231,5 +231,5 @@ def hand_over(block: FloatArray, n: int, at: int, out: FloatArray, k: int) -> No
 
 @jit_inline
 def new_block() -> FloatArray:
-    """Return room; its size is a constant here, so that rows are known to be apart."""
+    """Return room for a block; its size is a constant so that the compiler knows that rows do not overlap."""
     return np.zeros((ROWS, BLOCK))

@@ -1,12 +1,11 @@
-"""Covariance of points: what the errors of trajectory, range, angle, time and calibration do (FORMULAS 5.2, 6.2).
+"""Covariance of points: the effects of errors of trajectory, range, angle, time and calibration (FORMULAS 5.2, 6.2).
 
 The parameters' covariance is L Lᵀ: each column of L is one independent error of all parameters at once, and turns,
-shifts, lengthens and tilts the beam. The covariance of a point is the sum of the outer products of what these errors
-do to it, and of what trajectory, range, angle and time do. Where the errors only turn, shift and lengthen, their sum is
-taken before the returns. What turns with the body is summed in b.
+shifts, lengthens and tilts the beam. The covariance of a point is the sum of the outer products of the effects of these
+errors and of those of trajectory, range, angle and time. If the errors only turn, shift and lengthen, they are summed
+once before the returns. Effects that turn with the body are summed in b.
 
-These are steps over a block of returns (`swath.georef.scanner.kernels.block`) on its way through
-`swath.georef.scanner.kernels.rays`.
+These are steps over a block of returns (`swath.georef.scanner.kernels.block`) in `swath.georef.scanner.kernels.rays`.
 """
 
 from __future__ import annotations
@@ -47,15 +46,15 @@ from swath.georef.scanner.kernels.block import (
 )
 from swath.georef.scanner.kernels.types import Matrix, Six, Three
 
-# Columns of `Known.errors`: what one independent error does.
+# Columns of `Known.errors`: the effect of one independent error.
 TURN, TURN_BY_ANGLE, SHIFT = 0, 3, 6  # rotation vectors of the beam in b, the second times θ; metres in b
 LONGER, LONGER_BY_RANGE, TILTED, LATER, ATTITUDE_LATER = 9, 10, 11, 12, 13
 ANGLE, ANGLE_BY_READING, ANGLE_BY_RATE, ANGLE_BY_ACCELERATION = 14, 15, 16, 17
 COLUMNS = 18
 ALONG_ONLY = (*range(TURN, TURN + 3), *range(SHIFT, SHIFT + 3), LONGER, LONGER_BY_RANGE)  # columns of `Known.gram`
 
-# Of one interval of the trajectory: covariances of position in e and of attitude in b at its beginning, and what is
-# added to them until its end; velocity in e and rate in b
+# Of one interval of the trajectory: covariances of position in e and of attitude in b at its start, and their change
+# until its end; velocity in e and rate in b
 Interval: TypeAlias = tuple[Six, Six, Six, Six, Three, Three]
 NOTHING = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
@@ -72,12 +71,12 @@ class Flown(NamedTuple):
 
 
 class Known(NamedTuple):
-    """What the calibration says of itself, and the scanner's own noise.
+    """The calibration's covariance, and the scanner's own noise.
 
     Attributes:
         errors: (p, 18) independent errors of one sigma, columns as above.
         along_only: whether no error has more than turn, shift and length.
-        gram: (8, 8) the covariance of these, which do for all errors then; shifts are those of the body's origin.
+        gram: (8, 8) the covariance of these, which then stands for all errors; shifts are those of the body's origin.
         lever_arm_b: (3,).
         angle_offset_rad: of the parameters.
         range_sigma_m, angle_sigma_rad, time_sigma_s: of one return.
@@ -96,11 +95,11 @@ class Known(NamedTuple):
 
 
 class Doubt(NamedTuple):
-    """What covariances are made of, and where they go.
+    """Inputs and output of covariances.
 
     Attributes:
         flown, known: trajectory, and calibration and noise.
-        incidence_rad: (n,) between beam and the surface's normal; (0,): the surface is not known.
+        incidence_rad: (n,) between beam and the surface's normal; (0,): the surface is unknown.
         covariance_e: (n, 6) xx xy xz yy yz zz, m².
     """
 
@@ -112,7 +111,7 @@ class Doubt(NamedTuple):
 
 @jit_inline
 def with_outer(c: Six, factor: float, a: Three) -> Six:
-    """Return C + factor · a aᵀ; xx, xy, xz, yy, yz, zz."""
+    """Return C + factor · a aᵀ as xx, xy, xz, yy, yz, zz."""
     x, y, z = factor * a[0], factor * a[1], factor * a[2]
     return c[0] + x * a[0], c[1] + x * a[1], c[2] + x * a[2], c[3] + y * a[1], c[4] + y * a[2], c[5] + z * a[2]
 
@@ -157,7 +156,7 @@ def turned(c: Six, rows: Matrix) -> Six:
 
 @jit_inline
 def of_turn(c: Six, arm: Three) -> Six:
-    """Of δψ × arm, where C is that of the rotation vector δψ: −[arm]× C [arm]×, written out."""
+    """Return the covariance of δψ × arm, with C that of the rotation vector δψ: −[arm]× C [arm]×, written out."""
     x, y, z = arm
     xx, xy, xz, yy, yz, zz = c
     return (
@@ -172,27 +171,27 @@ def of_turn(c: Six, arm: Three) -> Six:
 
 @jit_inline
 def six(block: FloatArray, i: int) -> Six:
-    """Return the covariance so far."""
+    """Return a return's covariance so far."""
     at = COVARIANCE
     return block[at, i], block[at + 1, i], block[at + 2, i], block[at + 3, i], block[at + 4, i], block[at + 5, i]
 
 
 @jit_inline
 def keep(block: FloatArray, i: int, c: Six) -> None:
-    """The covariance so far."""
+    """Store a return's covariance so far."""
     put(block, COVARIANCE, i, (c[0], c[1], c[2]))
     put(block, COVARIANCE_2, i, (c[3], c[4], c[5]))
 
 
 @jit_inline
 def axes_at(block: FloatArray, i: int) -> Matrix:
-    """Return rows of rot_e_from_b."""
+    """Return the rows of rot_e_from_b."""
     return three(block, ROT, i), three(block, ROT_2, i), three(block, ROT_3, i)
 
 
 @jit_inline
 def put_axes(block: FloatArray, i: int, rows: Matrix) -> None:
-    """Rows of rot_e_from_b."""
+    """Store the rows of rot_e_from_b."""
     put(block, ROT, i, rows[0])
     put(block, ROT_2, i, rows[1])
     put(block, ROT_3, i, rows[2])
@@ -200,7 +199,7 @@ def put_axes(block: FloatArray, i: int, rows: Matrix) -> None:
 
 @jit_inline
 def take_axes(block: FloatArray, n: int, rot: Matrix, phi: Three) -> None:
-    """Axes of returns since the attitude ``rot``, by rows A and B of `turn_factors` about φ."""
+    """Compute rot_e_from_b of returns from the attitude ``rot``, by rows A and B of `turn_factors` about φ."""
     once = cross(rot[0], phi), cross(rot[1], phi), cross(rot[2], phi)  # r · (φ × v) = (r × φ) · v
     twice = cross(once[0], phi), cross(once[1], phi), cross(once[2], phi)
     for i in range(n):
@@ -212,9 +211,9 @@ def take_axes(block: FloatArray, n: int, rot: Matrix, phi: Three) -> None:
 
 @jit_cached
 def at_epoch(flown: Flown, k: int) -> tuple[Six, Six]:
-    """Return covariance of the position in e, m², and of the attitude as a rotation vector in b, rad², at an epoch.
+    """Return covariances at an epoch: position in e, m², and attitude as a rotation vector in b, rad².
 
-    Roll turns the body about its x, pitch about the level y, heading about down.
+    Roll turns the body about its x, pitch about the horizontal y, heading about down.
     """
     x, y, z = vector_at(flown.position_e, k)
     lat, lon, _ = geodetic_of(x, y, z)
@@ -233,7 +232,7 @@ def at_epoch(flown: Flown, k: int) -> tuple[Six, Six]:
 
 @jit_cached
 def interval_at(flown: Flown, at: int) -> Interval:
-    """Of the interval that begins with epoch ``at``."""
+    """Return the `Interval` that begins with epoch ``at``."""
     place, turn = at_epoch(flown, at)
     next_place, next_turn = at_epoch(flown, at + 1)
     per_s = 1e9 / (flown.time_ns[at + 1] - flown.time_ns[at])
@@ -246,7 +245,7 @@ def interval_at(flown: Flown, at: int) -> Interval:
 
 @jit_inline
 def doubt_range(block: FloatArray, n: int, known: Known, incidence_rad: Any) -> None:
-    """Row VARIANCE; a footprint on a surface that leans adds to it (FORMULAS 6.2)."""
+    """Fill row VARIANCE; the footprint on an inclined surface adds to it (FORMULAS 6.2)."""
     own, quarter = known.range_sigma_m * known.range_sigma_m, 0.25 * known.divergence_rad
     for i in range(n):
         block[VARIANCE, i] = own
@@ -258,14 +257,14 @@ def doubt_range(block: FloatArray, n: int, known: Known, incidence_rad: Any) -> 
 
 @jit_inline
 def add_along(block: FloatArray, n: int) -> None:
-    """What the range does."""
+    """Add the effect of the range."""
     for i in range(n):
         keep(block, i, with_outer(six(block, i), block[VARIANCE, i], three(block, HEAD, i)))
 
 
 @jit_inline
 def begin(block: FloatArray, n: int, interval: Interval, more: Six, known: Known) -> None:
-    """What attitude, scan angle and time do; ``more`` is added to the attitude's covariance."""
+    """Set the effects of attitude, scan angle and time; ``more`` is added to the attitude's covariance."""
     _, _, turn, by_share, velocity, rate = interval
     angle_variance = known.angle_sigma_rad * known.angle_sigma_rad
     time_variance = known.time_sigma_s * known.time_sigma_s
@@ -284,7 +283,7 @@ def begin(block: FloatArray, n: int, interval: Interval, more: Six, known: Known
 
 @jit_inline
 def add_gram(block: FloatArray, n: int, g: FloatArray) -> None:
-    """What all errors do that turn, shift and lengthen, but for the turns alone; and the range."""
+    """Add the effects of all errors that turn, shift and lengthen, except the turns alone; and the range's."""
     shift = g[3, 3], g[3, 4], g[3, 5], g[4, 4], g[4, 5], g[5, 5]
     by_x, by_y, by_z = (g[0, 3], g[1, 3], g[2, 3]), (g[0, 4], g[1, 4], g[2, 4]), (g[0, 5], g[1, 5], g[2, 5])
     turn_longer, turn_scaled = (g[0, 6], g[1, 6], g[2, 6]), (g[0, 7], g[1, 7], g[2, 7])
@@ -292,7 +291,8 @@ def add_gram(block: FloatArray, n: int, g: FloatArray) -> None:
     longer, both, scaled = g[6, 6], g[6, 7], g[7, 7]
     for i in range(n):
         c, arm = sum_of(six(block, i), 1.0, shift), three(block, START, i)
-        x, y, z = cross(by_x, arm), cross(by_y, arm), cross(by_z, arm)  # columns; their transpose counts too
+        # columns of a matrix, to which its transpose is added
+        x, y, z = cross(by_x, arm), cross(by_y, arm), cross(by_z, arm)
         mixed = 2.0 * x[0], x[1] + y[0], x[2] + z[0], 2.0 * y[1], y[2] + z[1], 2.0 * z[2]
         keep(block, i, sum_of(c, 1.0, mixed))
     for i in range(n):
@@ -305,7 +305,7 @@ def add_gram(block: FloatArray, n: int, g: FloatArray) -> None:
 
 @jit_inline
 def add_error(block: FloatArray, n: int, e: Any, lever: Three) -> None:
-    """What one error does."""
+    """Add the effect of one error."""
     turn, by_angle = (e[0], e[1], e[2]), (e[TURN_BY_ANGLE], e[TURN_BY_ANGLE + 1], e[TURN_BY_ANGLE + 2])
     shift, longer, by_range = (e[SHIFT], e[SHIFT + 1], e[SHIFT + 2]), e[LONGER], e[LONGER_BY_RANGE]
     tilted, later, attitude_later = e[TILTED], e[LATER], e[ATTITUDE_LATER]
@@ -326,9 +326,9 @@ def add_error(block: FloatArray, n: int, e: Any, lever: Three) -> None:
 
 @jit_inline
 def spread(block: FloatArray, n: int, interval: Interval, known: Known) -> None:
-    """Rows COVARIANCE, in e, of the others: vectors, share of the interval, angle, measured range and its variance.
+    """Fill rows COVARIANCE, in e, from the other rows: vectors, share of the interval, angle, measured range, variance.
 
-    READING, RATE and ACCELERATION count where errors are not ``along_only``.
+    READING, RATE and ACCELERATION are used if errors are not ``along_only``.
     """
     g = known.gram
     if known.along_only:
@@ -348,7 +348,7 @@ def spread(block: FloatArray, n: int, interval: Interval, known: Known) -> None:
 
 @jit_inline
 def give_six(block: FloatArray, n: int, covariance_e: Any) -> None:
-    """The covariance to (n, 6)."""
+    """Copy the covariances to (n, 6)."""
     for i in range(n):
         c = six(block, i)
         covariance_e[i, 0], covariance_e[i, 1], covariance_e[i, 2] = c[0], c[1], c[2]

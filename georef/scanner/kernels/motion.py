@@ -1,7 +1,7 @@
-"""How fast an encoder turns: local polynomials by least squares, piece by piece of the time.
+"""Compute an encoder's rate by local least-squares polynomials, for successive pieces of time.
 
-Pieces that follow each other are taken side by side, a column each of small tables, so that they are computed several
-at once. What comes of a piece depends on its own window alone, bit by bit.
+Successive pieces are processed side by side, a column each of small tables, so that several are computed at once. The
+result of a piece depends on its own window alone, bit for bit.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ PIECE_NS = 50_000  # pieces begin at whole multiples of it, whatever the batches
 TIERS = (3, 6, 12, 24)  # pieces to either side of a window: 0.175 to 1.225 ms
 REACH = TIERS[-1]
 JUMP_RAD = 1.0
-ENOUGH, FOR_QUARTIC, FOR_SQUARE = 24, 10, 6  # pulses in a window
-SPAN_NS = 260_000  # between its first and last, for anything but a line
+ENOUGH, FOR_QUARTIC, FOR_SQUARE = 24, 10, 6  # minimum pulses in a window
+SPAN_NS = 260_000  # minimum time between its first and last, for anything but a line
 ORDER, LINE = 5, 2  # coefficients of the longest polynomial, and of a line
-LANES, TILE = 16, 64  # pieces side by side; pulses of each that are taken at once
+LANES, TILE = 16, 64  # pieces side by side; pulses of each that are processed at once
 SUMS, RIGHT = 14, 9  # rows of sums: of x^0 to x^8, then of y to x^4 y
 
 # Columns of `pieces`: first pulse, train, place in time
@@ -42,11 +42,11 @@ def cut(
     angle: FloatArray,
     pieces: IntArray,
 ) -> tuple[int, int]:
-    """Return rows to pulses, and pulses to pieces of time; a piece, and a window, never crosses a jump.
+    """Divide rows into pulses, and pulses into pieces of time; neither a piece nor a window crosses a jump.
 
     Args:
-        rows: (n,) `RETURN_DTYPE` in the order of emission; time_ns: (n,) their GPS times; n > 0.
-        facets: the channel is a polygon's facet.
+        rows, time_ns: (n,) `RETURN_DTYPE` in the order of emission; (n,) their GPS times; n > 0.
+        facets: whether the channel is a polygon's facet.
         pulses, pulse_ns, angle: (n,) get the first row of each pulse, its time (ns) and reading.
         pieces: (n, 3) gets the pieces.
 
@@ -79,7 +79,7 @@ def cut(
 
 @jit_inline
 def window_of(pieces: IntArray, m: int, n: int, piece: int, reach: int) -> tuple[int, int]:
-    """Return pulses from, to of the pieces at most ``reach`` away in time, of the same train."""
+    """Return the range of pulses, from and to, of the pieces at most ``reach`` away in time and of the same train."""
     first, last = piece, piece
     train, place = pieces[piece, TRAIN], pieces[piece, PLACE]
     while first > 0 and pieces[first - 1, TRAIN] == train and place - pieces[first - 1, PLACE] <= reach:
@@ -91,7 +91,7 @@ def window_of(pieces: IntArray, m: int, n: int, piece: int, reach: int) -> tuple
 
 @jit_inline
 def solve(normal: FloatArray, right: FloatArray, size: int) -> bool:
-    """Return Cholesky in place; the solution in ``right``. False: the points do not tell."""
+    """Solve normal equations by Cholesky in place; the solution is in ``right``. False: they are singular."""
     for j in range(size):
         diagonal = normal[j, j]
         for k in range(j):
@@ -118,11 +118,12 @@ def solve(normal: FloatArray, right: FloatArray, size: int) -> bool:
 
 @jit_inline
 def take(pulse_ns: IntArray, angle: FloatArray, windows: IntArray, scale: FloatArray, begin: int, tile: Tile) -> int:
-    """Return times and readings from pulse ``begin`` of each window on into the tile, a column each, zeros behind its
-    end.
+    """Copy times and readings from pulse ``begin`` of each window on into the tile, a column each.
+
+    Rows after a window's end are zero.
 
     Returns:
-        How many rows of the tile are filled: an even number.
+        The number of filled rows of the tile, which is even.
     """
     x_of, y_of = tile
     rows = 0
@@ -142,7 +143,7 @@ def take(pulse_ns: IntArray, angle: FloatArray, windows: IntArray, scale: FloatA
 
 @jit_inline
 def add_up(tile: Tile, rows: int, sums: FloatArray) -> None:
-    """Sums of x^k, k from 1 to 8, and of x^k y, k from 0 to 4; two rows at a time, one after the other."""
+    """Add sums of x^k, k from 1 to 8, and of x^k y, k from 0 to 4; two rows at a time, one after the other."""
     x_of, y_of = tile
     for i in range(0, rows, 2):
         for lane in range(LANES):
@@ -173,7 +174,7 @@ def sum_up(
     tile: Tile,
     sums: FloatArray,
 ) -> None:
-    """Sums over the windows' pulses, a column each, in (t − middle) · scale and from the first reading on."""
+    """Sum over the windows' pulses, a column each, in (t − middle) · scale and relative to the first reading."""
     longest = 0
     for lane in range(LANES):
         count = windows[lane, TO] - windows[lane, FROM]
@@ -186,9 +187,7 @@ def sum_up(
 
 @jit_inline
 def fit(sums: FloatArray, lane: int, size: int, work: FloatArray) -> bool:
-    """Return coefficients of the polynomial with these sums, in its window's unit, into row 0 of ``work``, zeros
-    behind.
-    """
+    """Fit the polynomial with these sums, in its window's unit, into row 0 of ``work``, with zeros after its end."""
     work[0] = 0.0
     for j in range(size):
         work[0, j] = sums[RIGHT + j, lane]
@@ -199,8 +198,9 @@ def fit(sums: FloatArray, lane: int, size: int, work: FloatArray) -> bool:
 
 @jit_inline
 def choose(pulse_ns: IntArray, pieces: IntArray, piece: int, steady: bool) -> tuple[int, int, int, int]:
-    """Return window of a piece, as from pulse, to pulse, how many pieces to either side; number of coefficients, 0:
-    none.
+    """Return the window of a piece and the number of coefficients; 0 if a fit is impossible.
+
+    The window is from pulse, to pulse, and the number of pieces to either side.
     """
     first, last, reach, wide = 0, 0, 0, False
     for reach in TIERS:
@@ -218,13 +218,13 @@ def choose(pulse_ns: IntArray, pieces: IntArray, piece: int, steady: bool) -> tu
 
 @jit_inline
 def pulses_of(pieces: IntArray, piece: int, n: int) -> tuple[int, int]:
-    """Return pulses from, to of a piece."""
+    """Return the range of pulses, from and to, of a piece."""
     return pieces[piece, FIRST], pieces[piece + 1, FIRST] if piece + 1 < len(pieces) else n
 
 
 @jit_inline
 def give(work: FloatArray, told: bool, pulse_ns: Any, middle_ns: int, unit_ns: float, slope: Any, bend: Any) -> None:
-    """Rates and accelerations at times by the polynomial in row 0 of ``work``; 0 where nothing tells."""
+    """Evaluate rates and accelerations at times by the polynomial in row 0 of ``work``; 0 without a fit."""
     c1, c2, c3, c4 = work[0, 1], 2.0 * work[0, 2], 3.0 * work[0, 3], 4.0 * work[0, 4]
     per_s, per_s2 = 1e9 / unit_ns, 1e18 / (unit_ns * unit_ns)
     for i in range(len(pulse_ns)):
@@ -237,7 +237,7 @@ def give(work: FloatArray, told: bool, pulse_ns: Any, middle_ns: int, unit_ns: f
 
 @jit_inline
 def spread(pulses: IntArray, first: int, last: int, slope: FloatArray, bend: FloatArray, rate: Any, more: Any) -> None:
-    """From pulses first to last to their rows, of which a pulse may have several."""
+    """Copy values of pulses first to last to their rows, of which a pulse may have several."""
     for i in range(first, last):
         for row in range(pulses[i], pulses[i + 1] if i + 1 < len(pulses) else len(rate)):
             rate[row], more[row] = slope[i - first], bend[i - first]
@@ -255,16 +255,17 @@ def rates(
     rate: FloatArray,
     acceleration: FloatArray,
 ) -> int:
-    """Return dθ/dt and d²θ/dt² of the rows of some pieces.
+    """Compute dθ/dt and d²θ/dt² of the rows of some pieces.
 
     Args:
-        pulses, pulse_ns, angle: (n,) of `cut`; pieces: (m, 3).
-        steady: a turning shaft: a line, and no acceleration; else a polynomial of degree 4, less where pulses are few.
+        pulses, pulse_ns, angle: (n,) of `cut`.
+        pieces: (m, 3) of `cut`.
+        steady: a rotating shaft: a line, and no acceleration; else a polynomial of degree 4, or less if pulses are few.
         first_piece, last_piece: of those wanted.
-        rate, acceleration: of all rows, get rad/s and rad/s²; 0 where nothing tells.
+        rate, acceleration: of all rows, get rad/s and rad/s²; 0 without a fit.
 
     Returns:
-        How many pulses nothing tells about.
+        The number of pulses without a fit.
     """
     n = len(pulses)
     tile, sums, work = (np.empty((TILE, LANES)), np.empty((TILE, LANES))), np.empty((SUMS, LANES)), np.zeros((6, ORDER))

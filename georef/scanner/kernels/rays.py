@@ -1,8 +1,8 @@
-"""Returns to points in e, one pass over the rows (ISO/TS 19159-2 Eq. 10 with CONVENTIONS' parameters).
+"""Compute points in e from returns, in one pass over the rows (ISO/TS 19159-2 Eq. 10 with CONVENTIONS' parameters).
 
-The trajectory is followed by a moving pointer; what belongs to one of its intervals is computed when the pointer comes
-to it. Returns go through in blocks, none of them longer than an interval, so that all of a block's returns have the
-pose's constants in common.
+A moving pointer follows the trajectory; quantities of one of its intervals are computed when the pointer reaches it.
+Returns are processed in blocks, none of them longer than an interval, so that all of a block's returns share the pose's
+constants.
 """
 
 from __future__ import annotations
@@ -70,13 +70,13 @@ DONE, NO_TIME, OUTSIDE, GAP = (
 NEAR, FAR, NOT_FINITE = (int(fate) for fate in (Fate.BELOW_RANGE_GATE, Fate.ABOVE_RANGE_GATE, Fate.NOT_FINITE))
 TURN = 2.0 * math.pi
 MINOR_2 = 1.0 - E2  # b² / a²
-ORIGIN, POINT = ACROSS, TILT  # places in a block, free again when the axes are computed
+ORIGIN, POINT = ACROSS, TILT  # rows of a block that are free again once the axes are computed
 FIRST = whole(0)
 
 
 @jit_inline
 def ibrc_of(ranging: Ranging, intensity: float) -> float:
-    """Return linear between the knots, level beyond them."""
+    """Return the correction by intensity, linear between the knots, constant beyond them."""
     knots, values = ranging.ibrc_intensity, ranging.ibrc_m
     last = len(knots) - 1
     if intensity >= knots[last]:
@@ -91,8 +91,9 @@ def ibrc_of(ranging: Ranging, intensity: float) -> float:
 
 @jit_inline
 def interval_of(track: Track, t: int, guess: int) -> tuple[int, int, float, int, int]:
-    """Return interval of the trajectory with t: its times, 1 / ns between them, fate, epoch. Outside all one of no
-    length.
+    """Return the trajectory's interval with t: its times, 1 / ns between them, fate, epoch.
+
+    For a time outside the trajectory the interval has no length.
     """
     at = locate_epoch(track.time_ns, t, guess)
     if at < 0:
@@ -103,7 +104,7 @@ def interval_of(track: Track, t: int, guess: int) -> tuple[int, int, float, int,
 
 @jit_inline
 def way_at(track: Track, t: int, guess: int) -> tuple[int, int, float, int, int, Three, Three]:
-    """Return the interval with t, the position at its epoch, and the way to the next."""
+    """Return the interval with t, the position at its epoch, and the vector to the next."""
     begin, end, per_ns, fate, at = interval_of(track, t, guess)
     here = vector_at(track.position_e, at)
     return begin, end, per_ns, fate, at, here, plus(vector_at(track.position_e, at + 1), -1.0, here)
@@ -111,7 +112,7 @@ def way_at(track: Track, t: int, guess: int) -> tuple[int, int, float, int, int,
 
 @jit_inline
 def level_at(track: Track, at: int) -> tuple[Three, Three]:
-    """Return down, and level to the right of the nose, in e at an epoch."""
+    """Return down, and the horizontal direction to the right of the nose, in e at an epoch."""
     x, y, z = vector_at(track.position_e, at)
     down = unit((-x, -y, -z / MINOR_2))  # along the ellipsoid's normal, to 2 µrad at 3 km
     rot_e_from_b = rot_at(track.q_e_from_b, at)
@@ -120,7 +121,7 @@ def level_at(track: Track, at: int) -> tuple[Three, Three]:
 
 @jit_inline
 def turn_at(model: Model, t: int, guess: int) -> tuple[int, int, float, int, int, Matrix, Three, float, Matrix]:
-    """Return the interval with t, and its turn as the boresight's ω and φ see it.
+    """Return the interval with t, and its turn in the axes of the boresight's ω and φ.
 
     Returns:
         the interval; rot_e_from_b · outer at its epoch; the rotation vector to the next, outerᵀ φ; φ²; and three
@@ -138,7 +139,7 @@ def turn_at(model: Model, t: int, guess: int) -> tuple[int, int, float, int, int
 
 @jit_inline
 def channel_of(select: int, channels: int, channel: int, encoder_rad: float) -> int:
-    """Return row of the table; −1 where it has none."""
+    """Return the row of the table; −1 if it has none."""
     if select == ONE:
         return 0
     if select == FIBRE_BY_ENCODER:
@@ -148,7 +149,7 @@ def channel_of(select: int, channels: int, channel: int, encoder_rad: float) -> 
 
 @jit_inline
 def judge(part: Any, times_ns: Int64Array, fate: Any, known: Any, scanning: Scanning, covered: int) -> None:
-    """Fates before ranges are looked at; ``covered`` is what the trajectory says, ``known`` (1,) or (n,)."""
+    """Set fates before ranges are checked; ``covered`` is the trajectory's fate, ``known`` (1,) or (n,) the mount's."""
     select, channels, moves = scanning.select, len(scanning.table), len(known) > 1
     for i in range(len(part)):
         row = part[i]
@@ -162,7 +163,7 @@ def judge(part: Any, times_ns: Int64Array, fate: Any, known: Any, scanning: Scan
 
 @jit_inline
 def take_table(block: FloatArray, part: Any, scanning: Scanning) -> None:
-    """The table's row of each return; of returns without one the first."""
+    """Copy the table's row of each return; for returns without one the first."""
     table, select = scanning.table, scanning.select
     for i in range(len(part)):
         channel = max(channel_of(select, len(table), part[i].channel, part[i].encoder_rad), 0)
@@ -172,7 +173,7 @@ def take_table(block: FloatArray, part: Any, scanning: Scanning) -> None:
 
 @jit_inline
 def take(block: FloatArray, part: Any, ranging: Ranging, scanning: Scanning, rate: Any, acceleration: Any) -> None:
-    """Ranges and scan angles."""
+    """Compute ranges and scan angles."""
     n = len(part)
     scale, offset_m = ranging.scale, ranging.offset_m
     for i in range(n):
@@ -199,7 +200,7 @@ def take(block: FloatArray, part: Any, ranging: Ranging, scanning: Scanning, rat
 
 @jit_inline
 def gate(block: FloatArray, fate: Any, minimum_m: float, maximum_m: float) -> None:
-    """Fates by range, and where no light comes through."""
+    """Set fates by range, and where no light passes."""
     for i in range(len(fate)):
         if fate[i] == DONE:
             rho = block[RHO, i]
@@ -217,13 +218,13 @@ def to_e(
     arms: tuple[Three, Three, Three],
     shifted: bool,
 ) -> None:
-    """Beams from where ω and φ see them to e: rows ORIGIN and POINT."""
+    """Convert beams from the axes of ω and φ to e: rows ORIGIN and POINT."""
     turn, phi = turned
     for i in range(n):
         a, b = block[A, i], block[B, i]
         origin = plus(way[0], block[SHARE, i], way[1])
         put(block, ORIGIN, i, plus(origin, 1.0, plus(plus(arms[0], a, arms[1]), b, arms[2])))
-    if shifted:  # the beam does not start in the scanner's origin
+    if shifted:  # the beam does not start at the scanner's origin
         for i in range(n):
             start = times(turn, turned_on(phi, block[A, i], block[B, i], three(block, START, i)))
             put(block, ORIGIN, i, plus(three(block, ORIGIN, i), 1.0, start))
@@ -236,7 +237,7 @@ def to_e(
 
 @jit_inline
 def shares(block: FloatArray, row: int, stamps: Any, begin: int, offset_ns: float, per_ns: float) -> None:
-    """Where returns are in an interval that begins then."""
+    """Compute the positions of returns in an interval that begins at ``begin``."""
     for i in range(len(stamps)):
         passed = stamps[i] - begin
         block[row, i] = (passed + offset_ns) * per_ns
@@ -244,7 +245,7 @@ def shares(block: FloatArray, row: int, stamps: Any, begin: int, offset_ns: floa
 
 @jit_inline
 def beams(block: FloatArray, k: int, part: Any, model: Model, rate: Any, acceleration: Any) -> None:
-    """Ranges, scan angles, and the beams as the boresight's ω and φ see them; ``part`` are the rows from k on."""
+    """Compute ranges, scan angles, and the beams in the axes of ω and φ; ``part`` are the rows from k on."""
     ranging, scanning, mounted, _ = model
     n, kind = len(part), scanning.kind
     if scanning.select != ONE:
@@ -261,7 +262,7 @@ def beams(block: FloatArray, k: int, part: Any, model: Model, rate: Any, acceler
 
 @jit_inline
 def hand_out(block: FloatArray, n: int, here: Any, level: tuple[Three, Three], out: Out) -> None:
-    """What became of the returns of a block; ``level`` is down and to the right."""
+    """Copy a block's results to ``out``; ``level`` is down and to the right."""
     give(block, n, ORIGIN, out.origin_e[here])
     give(block, n, POINT, out.points_e[here])
     angles, ranges = out.angle_rad[here], out.range_m[here]
@@ -278,7 +279,7 @@ def hand_out(block: FloatArray, n: int, here: Any, level: tuple[Three, Three], o
 def cast(
     rows: StructArray, time_ns: Int64Array, model: Model, out: Out, axes: Axes | None, doubt: Doubt | None
 ) -> None:
-    """Fill ``out`` from rows (n,) `RETURN_DTYPE` at GPS times (n,); ``axes`` and ``doubt`` where they are asked for.
+    """Fill ``out`` from rows (n,) `RETURN_DTYPE` at GPS times (n,), and ``axes`` and ``doubt`` if given.
 
     The trajectory has at least two epochs, n > 0.
     """
@@ -337,5 +338,5 @@ def cast(
         if axes is not None:
             if doubt is None:
                 turn_axes(block, n, k, scanning.kind, mounted, True)
-            fill_axes(block, n, k, track, axes, turning, at, phi2)  # last: it works on the block's own rows
+            fill_axes(block, n, k, track, axes, turning, at, phi2)  # must be last, as it changes the block's own rows
         k += n

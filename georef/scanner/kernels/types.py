@@ -1,4 +1,4 @@
-"""What the kernels are given and fill, as tuples that numba knows by their names."""
+"""Inputs and outputs of the kernels, as tuples that numba accesses by name."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ Matrix: TypeAlias = tuple[Three, Three, Three]
 
 
 class Ranging(NamedTuple):
-    """Range as measured to ρ.
+    """Parameters from the measured range to ρ.
 
     Attributes:
         scale, offset_m: 1 + range_scale, range_offset.
-        minimum_m, maximum_m: of ρ; what lies beyond is left out.
-        delta_m: (256, 256) added by return number and MTA zone; (1, 1): nothing is.
-        ibrc_intensity, ibrc_m: (k,) knots; none: no table.
+        minimum_m, maximum_m: of ρ; returns beyond are left out.
+        delta_m: (256, 256) added by return number and MTA zone; (1, 1): no such offsets.
+        ibrc_intensity, ibrc_m: (k,) knots; empty: no table.
         ibrc_slope: (k − 1,) from each knot to the next.
         ibrc_bucket: (b,) the knot before each of b equal steps from the first knot on.
         ibrc_buckets_per_unit: of intensity.
@@ -43,13 +43,13 @@ class Ranging(NamedTuple):
 
 
 class Scanning(NamedTuple):
-    """Encoder reading to θ, θ to the beam.
+    """Parameters from the encoder reading to θ, and from θ to the beam.
 
     Attributes:
         kind, table: of the geometry (`swath.georef.scanner.kernels.beam`).
         select: how a row chooses its channel of the table.
         scale, offset_rad, latency_s, torsion_s2: of the parameters.
-        rate, acceleration: (n,) of the readings; (0,): none of them counts.
+        rate, acceleration: (n,) of the readings; (0,): not used.
     """
 
     kind: int
@@ -69,9 +69,9 @@ class Mounted(NamedTuple):
     Attributes:
         outer: (1, 3, 3) Rx(ω) Ry(φ).
         slope: of φ with θ.
-        inner, shift: (m, 3, 3), (m, 3): Rz(κ), gimbal, installation and the head's own frame; m = 1, or one a row.
-        shifted: whether beams start elsewhere than in the lever arm's end; False spares the way.
-        known: (m,) of a gimbal whose angles are known at the row's time.
+        inner, shift: (m, 3, 3), (m, 3): Rz(κ), gimbal, installation and the head's own frame; m = 1, or one per row.
+        shifted: whether beams start elsewhere than at the lever arm's end; False saves a step.
+        known: (m,) whether a gimbal's angles are known at the row's time.
         lever_arm_b: (1, 3).
     """
 
@@ -85,7 +85,7 @@ class Mounted(NamedTuple):
 
 
 class Track(NamedTuple):
-    """The trajectory, and when of it a pulse is.
+    """The trajectory, and the offsets from a pulse's stamp to its times.
 
     Attributes:
         time_ns, position_e, q_e_from_b, rotvec_b, max_gap_ns: of `swath.georef.trajectory.trajectory.Trajectory`.
@@ -102,7 +102,7 @@ class Track(NamedTuple):
 
 
 class Model(NamedTuple):
-    """All that a pass over returns is given."""
+    """All inputs of a pass over returns."""
 
     ranging: Ranging
     scanning: Scanning

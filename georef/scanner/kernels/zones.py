@@ -1,4 +1,4 @@
-"""Pulses in air: which earlier emission an echo belongs to, return by return in the order of their records."""
+"""Pulses in air: find the earlier emission of an echo, return by return in the order of their records."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from swath.georef.arrays import FloatArray, IntArray
 from swath.georef.compiled import jit_cached, jit_inline
 
 LIGHT_MPS = 299_792_458.0
-GAP, AMBIGUOUS, NO_RETURN = -1, -2, -3  # in the place of a zone
-MEDIAN_OF, ONE_IN = 15, 4  # accepted returns of which the median is taken: one in four
-BRIDGED = 4  # pulses without a return are told by their neighbours where these are no farther apart
+GAP, AMBIGUOUS, NO_RETURN = -1, -2, -3  # in place of a zone
+MEDIAN_OF, ONE_IN = 15, 4  # accepted returns in the median, of which one in four is used
+BRIDGED = 4  # neighbours at most this far apart determine pulses without a return between them
 DATAGRAM_BITS = 16  # of a pulse_id: the place in its datagram
-SEGMENT = 1 << 20  # between ordinals of pulses between which none are known
-FLATTEST_COS = 0.1  # of beams that look sideways or up, which no line scanner's ground returns do
-STEPS = 256  # single steps after which the narrowest and widest of them begin to be forgotten
+SEGMENT = 1 << 20  # step in the ordinals of pulses after a break
+FLATTEST_COS = 0.1  # limit for beams that look sideways or up, which no line scanner's ground returns do
+STEPS = 256  # single steps after which the shortest and longest of them begin to be forgotten
 
-# Columns of `pulses`, one row a known emission
+# Columns of `pulses`, one row per known emission
 ORDINAL, TICKS, PULSE_ID, CHANNEL = range(4)
 # State of the pulse train
 LAST_ORDINAL, LAST_TICKS, LAST_ID, PERIOD, LEAST, MOST, OLD_LEAST, OLD_MOST, SINGLES, COMPLETE = range(10)
@@ -28,14 +28,14 @@ STATE_SIZE = 10
 
 @jit_inline
 def ticks_of(time_ns: int, tick_hz: int) -> int:
-    """Return counter of a time that is floor(ticks · 10⁹ / tick_hz)."""
+    """Return the counter for a time that is floor(ticks · 10⁹ / tick_hz)."""
     seconds = time_ns // 1_000_000_000
     return seconds * tick_hz + ((time_ns - seconds * 1_000_000_000) * tick_hz + 999_999_999) // 1_000_000_000
 
 
 @jit_inline
 def note_step(state: IntArray, ticks: int) -> None:
-    """Remember the time between two pulses of which one follows the other: the extremes of the last few hundred."""
+    """Record the time between two successive pulses: the extremes of the last few hundred."""
     state[PERIOD] = ticks
     state[LEAST], state[MOST] = min(state[LEAST], ticks), max(state[MOST], ticks)
     state[SINGLES] += 1
@@ -46,11 +46,11 @@ def note_step(state: IntArray, ticks: int) -> None:
 
 @jit_inline
 def next_ordinal(state: IntArray, pulse_id: Any, ticks: int) -> int:
-    """Number of a pulse in the train; after a break it goes on far ahead.
+    """Return the number of a pulse in the train; after a break it continues far ahead.
 
-    Within a datagram the pulse_id counts. The datagram before ended with a pulse that may have had no return: how many
-    there were between is told by the time, which has to be near a whole number of periods; unless rows tell of every
-    pulse, when there were none.
+    Within a datagram the pulse_id counts. The datagram before ended with a pulse that may have had no return: the time
+    gives the number of pulses in between, and has to be near a whole number of periods; if rows exist for every pulse,
+    there were none in between.
     """
     last: int = state[LAST_ORDINAL]
     fresh = last + SEGMENT
@@ -68,7 +68,7 @@ def next_ordinal(state: IntArray, pulse_id: Any, ticks: int) -> int:
     place = pulse_id & ((1 << DATAGRAM_BITS) - 1)
     if state[COMPLETE] and ahead == 1 and place == 0:
         if state[PERIOD] == 0 or passed < 2 * state[PERIOD]:
-            state[PERIOD] = passed  # and not what the laser rested
+            state[PERIOD] = passed  # without the laser's pauses
         return last + 1
     if ahead != 1 or state[PERIOD] == 0 or passed > (SEGMENT // 2) * state[PERIOD]:
         return fresh
@@ -80,14 +80,17 @@ def next_ordinal(state: IntArray, pulse_id: Any, ticks: int) -> int:
 
 @jit_inline
 def median_of(sorted_m: FloatArray, count: int) -> float:
-    """Of so many values in rising order."""
+    """Return the median of the first ``count`` values, which are in rising order."""
     median: float = sorted_m[count // 2]
     return median
 
 
 @jit_inline
 def push(sorted_m: FloatArray, ring_m: FloatArray, counts: IntArray, value: float) -> None:
-    """A value into the running median's window, the oldest out; counts: values there, place in the ring, left out."""
+    """Insert a value into the running median's window, removing the oldest.
+
+    ``counts`` holds the number of values, the position in the ring, and the values still to skip.
+    """
     counts[2] -= 1
     if counts[2] > 0:
         return
@@ -108,7 +111,7 @@ def push(sorted_m: FloatArray, ring_m: FloatArray, counts: IntArray, value: floa
 
 @jit_inline
 def even(state: IntArray) -> bool:
-    """Return whether pulses come at even times: those between two of them are then known to the tick."""
+    """Return whether pulses are evenly spaced: the times between two of them are then known to the tick."""
     widest = max(state[MOST], state[OLD_MOST])
     return bool(widest > 0 and widest - min(state[LEAST], state[OLD_LEAST]) <= 1)
 
@@ -117,10 +120,10 @@ def even(state: IntArray) -> bool:
 def add_pulse(
     pulses: IntArray, angles_rad: FloatArray, known: int, state: IntArray, ordinal: int, ticks: int, row: Any
 ) -> int:
-    """Append an emission, and before it those without a return that the one before tells; gives how many there are.
+    """Append an emission, and before it known ones without a return; return the number of known emissions.
 
-    Between evenly spaced pulses ticks are exact, and the encoder bends from the line by θ̈ t²/8 over a time t: 3 µrad
-    where two pulses at 100 kHz stand around a missing one of a ±30° sine at 50 Hz.
+    Between evenly spaced pulses ticks are exact, and the encoder deviates from the line by θ̈ t²/8 over a time t: 3
+    µrad if two pulses at 100 kHz enclose a missing one of a ±30° sine at 50 Hz.
     """
     pulse_id, channel = np.int64(row.pulse_id), np.int64(row.channel)
     place = pulse_id & ((1 << DATAGRAM_BITS) - 1)
@@ -152,13 +155,14 @@ def nearest_emission(
     slanted: bool,
     scale: tuple[float, int],
 ) -> tuple[int, float]:
-    """Return the emission that gives a range nearest to the expected one, and by how much that is longer.
+    """Return the emission with the range nearest to the expected one, and the excess of that range.
 
-    Back from the record's own emission, whose range is the shortest, until the range is longer than expected.
+    The search goes back from the record's own emission, whose range is the shortest, until the range is longer than
+    expected.
 
     Args:
-        expected_m: the range; slanted: at scan angle 0.
-        scale: metres a tick; the longest time of flight in ticks.
+        expected_m, slanted: the range; whether it is that at scan angle 0.
+        scale: metres per tick; the longest time of flight in ticks.
     """
     best, best_miss = -1, math.inf
     ticks, ordinal = pulses[known - 1, TICKS], pulses[known - 1, ORDINAL]
@@ -177,9 +181,9 @@ def nearest_emission(
 
 @jit_inline
 def verdict(miss_m: float, period_m: float, margin: float, zone: int, apparent_m: float, blind_m: float) -> int:
-    """Return the zone, or why there is none."""
+    """Return the zone, or the code of the reason without one."""
     if abs(miss_m) > 0.5 * period_m:
-        return GAP  # the emission expected is not known
+        return GAP  # the expected emission is unknown
     if abs(miss_m) > (0.5 - margin) * period_m or (zone > 0 and apparent_m < blind_m):
         return AMBIGUOUS
     return zone
@@ -206,17 +210,17 @@ def resolve_zones(
 
     Args:
         rows: (n,) `RETURN_DTYPE`, in the order of their records.
-        predicted_m: (n,) expected range at each row, nan where unsaid; or empty.
-        pulses: (known + BRIDGED n, 4) emissions, the first ``known`` filled in; angles_rad: their encoder readings.
+        predicted_m: (n,) expected range at each row, nan if not given; or empty.
+        pulses, angles_rad: (known + BRIDGED n, 4) emissions, the first ``known`` filled in; their encoder readings.
         state, median: kept from call to call; the median's values in order, as they came, their counts.
-        scale: metres a tick; the longest time of flight in ticks.
+        scale: metres per tick; the longest time of flight in ticks.
         limits: expected range at first, nan: none; share of a zone beside its edges; blind range.
         slanted: ranges grow with 1/cos of the encoder's angle.
-        found: (n, 5) gets zone (or why there is none), ordinal, ticks, pulse_id and channel of the emission.
+        found: (n, 5) gets zone (or the reason without one), ordinal, ticks, pulse_id and channel of the emission.
         whole_m, angle_rad: (n,) get its range and encoder reading.
 
     Returns:
-        How many emissions are known now.
+        The number of known emissions.
     """
     first_m, margin, blind_m = limits
     sorted_m, ring_m, counts = median

@@ -12,10 +12,10 @@ import pytest
 from swath.daemon.cli.main import run_app
 from swath.daemon.exchange.export import export_session
 from swath.daemon.log.reader import open_logs
+from swath.daemon.processing import files as whole_files
 from swath.daemon.processing.calibration import products as calibrate_products
 from swath.daemon.processing.files import put_in_place, write_aside, write_whole
 from swath.daemon.processing.georeferencing.sidecar import write_sidecar
-from swath.daemon.processing.trajectory import files as trajectory_files
 from tests.daemon.log.test_log import INFO, write_part
 from tests.daemon.one_line import fly
 
@@ -93,7 +93,7 @@ def test_an_interruption_between_two_files(tmp_path: Path, monkeypatch: pytest.M
         aside.append(write_aside(path, write))
         return aside[0]
 
-    monkeypatch.setattr(trajectory_files, "write_aside", second_is_interrupted)
+    monkeypatch.setattr(whole_files, "write_aside", second_is_interrupted)
     with pytest.raises(KeyboardInterrupt):
         write_whole({tmp_path / "a": b"a", tmp_path / "b": b"b"})
     assert list(tmp_path.iterdir()) == []

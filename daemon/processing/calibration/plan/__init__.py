@@ -1,1 +1,1 @@
-"""`swath plan-calibration`."""
+"""Implements `swath plan-calibration`: predicts what a planned flight would determine."""

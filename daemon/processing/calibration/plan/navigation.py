@@ -1,9 +1,9 @@
-"""How good the trajectory of a planned flight will be: what navigation would say of itself, before anything is flown.
+"""Predicts how good the trajectory of a planned flight will be, as navigation would report it.
 
-The covariance of a filter and its smoother goes by the path and by the sigmas of the sensors, hardly by what these
-read. So the planned motion is navigated as a log's is, by the same filter: the inertial unit's samples are free of
-errors and its noise is the one that the configuration would tell; GNSS solutions have the errors of their grade, for
-the filter goes by the noise that it finds in them.
+The covariance of a filter and its smoother depends on the path and on the sigmas of the sensors, hardly on their
+readings. So the planned motion is navigated as a log's is, by the same filter: the inertial unit's samples are free of
+errors and have the noise that the configuration would give; GNSS solutions have the errors of their grade, because the
+filter adapts to the noise that it finds in them.
 """
 
 from __future__ import annotations
@@ -41,41 +41,41 @@ from swath.sim.imu.wire import config_table
 from swath.sim.plan.tables import GnssTable, ImuTable
 from swath.sim.preview.coverage import Survey
 
-KNOT_S = 1.0  # half as far apart sigmas become larger by a few per cent
+KNOT_S = 1.0  # at half this distance sigmas become larger by a few per cent
 BEGIN_S = 1.0
-# Of the start; a flight of minutes forgets them
+# sigmas of the start; a flight of minutes forgets them
 PLACE_SIGMA_M, VELOCITY_SIGMA_MPS = 0.05, 0.05
 ATTITUDE_SIGMA_RAD = np.radians([1.0, 1.0, 3.0])
 
 
 @dataclass(frozen=True, eq=False)
 class PlannedNavigation:
-    """What navigation would know.
+    """Navigation of a planned flight.
 
     Attributes:
-        run: of the filter, with the smoother's nodes.
-        sigmas: root mean squares along the lines: of position (m), of roll and pitch, of heading (degrees).
+        run: run of the filter, with the smoother's nodes.
+        sigmas: root mean squares along the lines: position (m), roll and pitch, heading (degrees).
     """
 
     run: FilterRun
     sigmas: tuple[float, float, float]
 
     def prior(self, flight: Flight) -> TrajectoryPrior:
-        """Return the errors' joint covariance at knots of a flight on this trajectory alone."""
+        """Return the errors' joint covariance at knots of a flight that has this trajectory alone."""
         knots = knots_of(flight, KNOT_S)
         return from_smoother(flight, [error_chain(self.run, knots.time_ns)], KNOT_S)
 
 
 def navigated(survey: Survey, begin_ns: int) -> PlannedNavigation | None:
-    """Navigate a plan with its first inertial unit and its first receiver; None: it lacks one of them.
+    """Navigate a plan with its first inertial unit and its first receiver; None if it lacks one of them.
 
     Args:
         survey: the plan, flown.
         begin_ns: GPS time of its start.
 
     Raises:
-        NavigationError: there are never satellites, or no filter runs on it.
-        PlanError: its receiver's antennas stand in one place.
+        NavigationError: there are no satellites during the whole flight, or the filter cannot run.
+        PlanError: the receiver's two antennas have the same place.
     """
     tables = survey.plan.tables
     unit, receiver = next(iter(tables.imu.items()), None), next(iter(tables.gnss.items()), None)
@@ -117,7 +117,7 @@ def _start(survey: Survey, begin_ns: int) -> Start:
 
 
 def _observations(survey: Survey, name: str, table: GnssTable, setup: Setup, begin_ns: int) -> StructArray:
-    """Of the receiver's epochs, its outages left out."""
+    """Return observations at the receiver's epochs without its outages."""
     seed = survey.plan.tables.flight.seed
     receiver = Receiver(table, survey.trajectory, seed=seed, name=name, noise=True)
     epochs = receiver.epochs(1, int(survey.trajectory.end_s * table.rate_hz) - 1)

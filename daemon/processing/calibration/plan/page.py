@@ -1,4 +1,4 @@
-"""The picture of a planned calibration: the plan's map with the planes that would be seen; sigmas and their limits."""
+"""Draws a planned calibration: the plan's map with the planes that would be seen, and sigmas with their limits."""
 
 from __future__ import annotations
 
@@ -29,20 +29,20 @@ MOST_RATIO, LEAST_RATIO = 30.0, 0.02
 
 
 def require_picture(path: Path) -> None:
-    """UserError where the path's ending is no picture's."""
+    """Refuse with `UserError` a path that does not end as a picture's."""
     if path.suffix.lower() not in FORMATS:
         raise UserError(f"{path}: want a picture's name that ends in one of {', '.join(FORMATS)}", ExitCode.USAGE)
 
 
 def draw_planned(planned: PlannedCalibration, path: Path) -> None:
-    """Draw it on one page.
+    """Draw a planned calibration on one page.
 
     Args:
-        planned: of `plan_calibration`.
-        path: of a PNG, PDF or SVG.
+        planned: result of `plan_calibration`.
+        path: path of a PNG, PDF or SVG file.
 
     Raises:
-        UserError: the path's ending is another; OSError: it cannot be written.
+        UserError: the path has another ending; OSError: the file cannot be written.
     """
     require_picture(path)
     figure = Figure(figsize=PAGE, facecolor="white")
@@ -70,7 +70,7 @@ def _title(figure: Figure, planned: PlannedCalibration) -> None:
 
 
 def _map(figure: Figure, planned: PlannedCalibration) -> None:
-    """The plan's own map; on it every plane, by how many swaths see it."""
+    """Draw the plan's own map, and on it every plane, coloured by the number of swaths that see it."""
     survey = planned.survey
     time_s = np.linspace(0.0, survey.trajectory.end_s, 2000)
     points = survey.site.site_from_e(survey.trajectory.poses(time_s).position_e)
@@ -95,7 +95,7 @@ def _map(figure: Figure, planned: PlannedCalibration) -> None:
 
 
 def _sigmas(axes: Axes, rows: Sequence[dict[str, Any]]) -> None:
-    """Bars of sigma over what is wanted, on a logarithmic scale; beyond 1 it is not determined."""
+    """Draw bars of sigma over wanted sigma on a logarithmic scale; beyond 1 a parameter is not determined."""
     place = np.arange(len(rows))[::-1]
     ratio = np.array([MOST_RATIO if row["sigma"] is None else row["sigma"] / row["wanted"] for row in rows])
     shown = np.clip(ratio, LEAST_RATIO, MOST_RATIO)
@@ -123,7 +123,7 @@ def _sigma_words(row: dict[str, Any]) -> str:
 
 
 def _words(figure: Figure, planned: PlannedCalibration) -> None:
-    """What is missing and what to fly for it; what the prediction assumes."""
+    """Write which parameters are not determined, what to fly for them, and what the prediction assumes."""
     left, line = WORDS[0] / PAGE[0], LINE_IN / PAGE[1]
     y = (SIGMAS[1] - 0.55) / PAGE[1]
     blocks = [

@@ -1,4 +1,6 @@
-"""From a virtual flight's plan to what a calibration of it would determine: terrain, trajectory, scanners, control."""
+"""Predicts from a virtual flight's plan what its calibration would determine: terrain, trajectory,
+scanners, control.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +41,7 @@ BEGIN_NS = 1_400_000_000 * SECOND_NS  # a plan's own date does not matter
 STEP_S = 0.02
 LINE_SCANNERS = ("oscillating", "polygon", "monogon")
 ANGLE_SIGMA_RAD = 2e-5
-SAMPLES, ASIDE_M, ABOVE_M = 12, 0.05, 500.0  # rays a side of a roof; beside each, for its slope; from where they fall
+SAMPLES, ASIDE_M, ABOVE_M = 12, 0.05, 500.0  # rays along a side of a roof; offset of rays beside each; height of fall
 LEAST_SAMPLES, MOST_SAMPLES, LEAST_AREA_M2 = 8, 36, 6.0
 GROUND_SIDE_M, GROUND_PLACES, FLAT_M = 8.0, 14, 0.02
 BASIC = {
@@ -48,8 +50,8 @@ BASIC = {
     "kappa_deg": "heading (κ)",
     "range_offset_m": "range offset",
 }
-# Smoothed with carrier-phase GNSS, of a plan that cannot be navigated for want of an IMU or a receiver: position (m,
-# each coordinate), roll and pitch, heading (degrees)
+# Expected after smoothing with carrier-phase GNSS, for a plan that cannot be navigated because it lacks an IMU or a
+# receiver: position (m, each coordinate), roll and pitch, heading (degrees)
 EXPECTED = {
     "perfect": (0.001, 0.0001, 0.0002),
     "navigation": (0.02, 0.0025, 0.005),
@@ -61,14 +63,14 @@ EXPECTED = {
 
 @dataclass(frozen=True)
 class PlanOptions:
-    """What is asked.
+    """The options of a prediction.
 
     Attributes:
-        model: what is estimated. Of it the parameters are predicted: pulses on paper return once, without intensity.
-        sigmas: position (m), roll and pitch, heading (degrees) expected of the trajectory; None: as navigation
-            with the plan's IMU and receiver would have them.
-        control: use the plan's control points.
-        control_sigma_m: of them.
+        model: parameters to estimate. Tables are not predicted: pulses on paper return once, without intensity.
+        sigmas: expected sigmas of the trajectory: position (m), roll and pitch, heading (degrees); None: those of
+            navigation with the plan's IMU and receiver.
+        control: True to use the plan's control points.
+        control_sigma_m: sigma of these points.
     """
 
     model: ParameterOptions = field(default_factory=lambda: ParameterOptions("scanner"))
@@ -77,7 +79,8 @@ class PlanOptions:
     control_sigma_m: float = 0.01
 
 
-# One sigma, in files' units, with which a parameter is of use to points of the usual flight; worse is not determined.
+# One sigma, in files' units, at which a parameter is still useful for points of a usual flight; a parameter with a
+# larger sigma is not determined.
 USEFUL = {
     "omega_deg": 0.005,
     "phi_deg": 0.005,
@@ -100,16 +103,16 @@ USEFUL = {
 
 @dataclass(frozen=True, eq=False)
 class PlannedCalibration:
-    """The answer, and what the picture is made of.
+    """A predicted calibration, and the data of its picture.
 
     Attributes:
-        survey: the plan, flown.
-        flight, features: as it would be read.
-        predicted: sigmas and what is held.
-        rows: a parameter each, for tables and JSON.
-        sigmas: that were expected of the trajectory.
+        survey: the plan as flown.
+        flight, features: as they would be read from logs.
+        predicted: sigmas and held parameters.
+        rows: one per parameter, for tables and JSON.
+        sigmas: sigmas assumed for the trajectory.
         control: number of control points on planes.
-        unplanned: what was asked for and is not predicted, in words.
+        unplanned: requested entries that are not predicted, in words.
     """
 
     survey: Survey
@@ -123,25 +126,25 @@ class PlannedCalibration:
 
     @property
     def fixed(self) -> list[str]:
-        """Of the boresight and the range offset what the user wants held, as ``left phi_deg``."""
+        """The boresight angles and range offsets that the user holds, as ``left phi_deg``."""
         keys = {parameter.name: parameter.key for parameter in PARAMETERS if parameter.key in BASIC}
         return [f"{one.scanner} {keys[one.name]}" for one in self.predicted.held if not one.remedy and one.name in keys]
 
     @property
     def notes(self) -> list[str]:
-        """What the prediction does not speak of, a line each."""
+        """What the prediction leaves out, one line each."""
         return [f"not predicted: {words}; pulses on paper return once, without intensity" for words in self.unplanned]
 
     @property
     def lacking(self) -> list[str]:
-        """Of the boresight and the range offset what would not be determined, in words."""
+        """The boresight angles and range offsets that would not be determined, in words."""
         several = len({row["scanner"] for row in self.rows}) > 1
         missing = [row for row in self.rows if row["basic"] and not row["determined"]]
         return [f"{BASIC[row['name']]}{' of ' + row['scanner'] if several else ''}" for row in missing]
 
     @property
     def sentence(self) -> str:
-        """The verdict."""
+        """The verdict in one sentence."""
         basic = [row for row in self.rows if row["basic"]]
         more = sum(row["determined"] for row in self.rows) - (len(basic) - len(self.lacking))
         if not self.lacking:
@@ -157,7 +160,7 @@ def plan_calibration(plan: Plan, wish: PlanOptions) -> PlannedCalibration:
     """Predict a plan's calibration.
 
     Raises:
-        PlanError: it cannot be flown; UserError: what it has cannot be calibrated, or the wish cannot be met.
+        PlanError: the plan cannot be flown; UserError: its scanners cannot be calibrated, or an option cannot be met.
     """
     survey = Survey(plan)
     frame = Tangent.at(survey.site.origin_e)
@@ -195,7 +198,7 @@ def _gps(time_s: float) -> int:
 
 
 def _rows(predicted: Predicted) -> list[dict[str, Any]]:
-    """Return a parameter each, in files' units, in the order of the model."""
+    """Return one row per parameter, in files' units, in the order of the model."""
     by_name = {parameter.name: (number, parameter) for number, parameter in enumerate(PARAMETERS)}
     found: list[tuple[str, float, FixedParameter | None]] = [
         (name, sigma, None) for name, sigma in zip(predicted.names, predicted.sigmas.tolist(), strict=True)
@@ -244,7 +247,7 @@ def _heads(plan: Plan) -> tuple[list[Head], list[Scan]]:
 
 
 def _trajectory(survey: Survey, sigmas: tuple[float, float, float]) -> Trajectory:
-    """As planned, with what is expected of its sigmas."""
+    """Return the planned trajectory with its expected sigmas."""
     time_s = np.arange(0.0, survey.trajectory.end_s, STEP_S)
     motion = survey.trajectory.motion(time_s)
     position_m, tilt_deg, heading_deg = sigmas
@@ -263,7 +266,7 @@ def _trajectory(survey: Survey, sigmas: tuple[float, float, float]) -> Trajector
 
 
 def _fallen(survey: Survey, places: FloatArray) -> tuple[FloatArray, NDArray[np.uint8]]:
-    """Return what rays that fall at places (…, 2) meet: site coordinates (…, 3) and the surface (…)."""
+    """Return where rays that fall at places (…, 2) hit: site coordinates (…, 3) and the kind of surface (…)."""
     flat = places.reshape(-1, 2)
     top = survey.scene.site_z(flat[:, 0], flat[:, 1]) + ABOVE_M
     origin = np.column_stack([flat, top])
@@ -274,7 +277,7 @@ def _fallen(survey: Survey, places: FloatArray) -> tuple[FloatArray, NDArray[np.
 
 
 def _roofs(survey: Survey, frame: Tangent) -> Iterator[Surface]:
-    """Yield the flat parts of every roof: where rays beside each other find one slope and one height."""
+    """Yield the flat parts of every roof: where neighbouring rays find the same slope and height."""
     corners = survey.scene.buildings
     if not len(corners):
         return
@@ -312,7 +315,7 @@ def _unit(survey: Survey, frame: Tangent, normal: FloatArray) -> FloatArray:
 
 
 def _ground(survey: Survey, frame: Tangent) -> Iterator[Surface]:
-    """Yield squares of bare ground all over the swaths."""
+    """Yield squares of bare ground spread over the swaths."""
     outline = np.concatenate([survey.edges(strip) for strip in survey.strips])
     low, high = outline.min(axis=0), outline.max(axis=0)
     east, north = (np.linspace(low[axis], high[axis], GROUND_PLACES) for axis in (0, 1))
@@ -323,7 +326,7 @@ def _ground(survey: Survey, frame: Tangent) -> Iterator[Surface]:
 
 
 def _control(survey: Survey, frame: Tangent, sigma_m: float) -> Iterator[Surface]:
-    """Yield the ground around every control point, with it."""
+    """Yield a square of ground around every control point, with the point."""
     for number, point in enumerate(control_points(survey.plan, survey.scene)):
         control = ControlPoint(f"{number + 1}", frame.t_from_e(survey.site.e_from_site(point[np.newaxis]))[0], sigma_m)
         surface = _square(survey, frame, point[:2], f"control {number + 1}", (control,))
@@ -334,7 +337,7 @@ def _control(survey: Survey, frame: Tangent, sigma_m: float) -> Iterator[Surface
 def _square(
     survey: Survey, frame: Tangent, centre: FloatArray, name: str, control: tuple[ControlPoint, ...] = ()
 ) -> Surface | None:
-    """Return none where it is no flat ground."""
+    """Return a square of flat ground; None if the place is not flat or not bare."""
     side = np.linspace(-0.5, 0.5, 6) * GROUND_SIDE_M
     points, surface = _fallen(survey, centre + np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2))
     if not np.isin(surface, [GROUND, ROAD, MARKING]).all():

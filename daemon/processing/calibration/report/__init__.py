@@ -1,1 +1,1 @@
-"""The calibration's report: pages, pictures, tables."""
+"""Builds the report of a calibration: contents, tables, pictures, HTML and PDF."""

@@ -1,4 +1,4 @@
-"""What a report holds, in order: words, tables and pictures, for the page and for paper alike."""
+"""Collects the contents of a report in order: words, tables and pictures, the same for HTML and PDF."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from swath.daemon.processing.pages.canvas import Picture
 
 @dataclass(frozen=True, slots=True)
 class Words:
-    """A paragraph, with a title above it where it has one."""
+    """A paragraph, with an optional title above it."""
 
     text: str
     title: str = ""
@@ -45,7 +45,7 @@ class Words:
 
 @dataclass(frozen=True, slots=True)
 class Notes:
-    """Sentences that stand out."""
+    """Sentences that are set apart from the text."""
 
     lines: Sequence[str]
 
@@ -55,7 +55,7 @@ MOST_REASONS = 40
 
 
 def blocks_of(report: ReportInput, verdict: Verdict) -> list[Block]:
-    """Return everything below the verdict."""
+    """Return all blocks below the verdict."""
     several = len(report.adjusted.calibrations) > 1
     notes = [plain(line, several=several) for line in (*report.notes, *report.adjusted.notes)]
     found: list[Block | None] = [
@@ -92,7 +92,7 @@ def blocks_of(report: ReportInput, verdict: Verdict) -> list[Block]:
 
 
 def cards_of(report: ReportInput) -> list[tuple[str, str]]:
-    """Return the figures one looks for first, with their words."""
+    """Return the most important figures with their labels."""
     adjusted, features = report.adjusted, report.features
     boresight, offset_m = sigma_of(report, BORESIGHT), sigma_of(report, ("range_offset_m",))
     before_m, after_m = overall_rms_m(dict(report.before)), overall_rms_m(dict(report.after))
@@ -112,7 +112,7 @@ def cards_of(report: ReportInput) -> list[tuple[str, str]]:
 
 
 def identity_rows(report: ReportInput) -> list[tuple[str, str]]:
-    """Whose calibration it is; what is not known is left out."""
+    """Return rows that identify the calibration; unknown entries are left out."""
     rows: list[tuple[str, str]] = []
     several = len(report.headers) > 1
     for scanner, header in report.headers.items():

@@ -1,4 +1,4 @@
-"""Cuts through roofs before and after: the picture that shows at a glance what a calibration does."""
+"""Draws cuts through roofs before and after: they show at a glance the effect of a calibration."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from swath.georef.scanner.calibration import Calibration
 MOST_CUTS = 3
 HALF_LENGTH_M, HALF_WIDTH_M, MARGIN_M = 11.0, 0.6, 6.0
 LEAST_SLOPE_DEG, MOST_SLOPE_DEG = 15.0, 65.0
-MOST_DRAWN = 1500  # points a swath
+MOST_DRAWN = 1500  # maximum points drawn per swath
 PANEL_IN = 1.75
 
 
@@ -30,8 +30,8 @@ class Cut:
     """Points along a line down a roof.
 
     Attributes:
-        name: of the roof's plane.
-        before, after: by index of the swath (n, 2): along the line and up from the plane's centre, metres.
+        name: name of the roof's plane.
+        before, after: points (n, 2) by index of the swath: along the line and up from the plane's centre, metres.
     """
 
     name: str
@@ -77,7 +77,7 @@ def _cut(flight: Flight, calibrations: Mapping[str, Calibration], plane: Plane) 
 
 
 def _near(points_t: FloatArray, centre_t: FloatArray, half_m: float) -> Int64Array:
-    """Return indexes of points within a square, found on mapped arrays piece by piece."""
+    """Return indexes of the points within a square, searching mapped arrays piece by piece."""
     found, step = [], 1 << 20
     for first in range(0, len(points_t), step):
         piece = np.asarray(points_t[first : first + step, :2])
@@ -87,7 +87,7 @@ def _near(points_t: FloatArray, centre_t: FloatArray, half_m: float) -> Int64Arr
 
 
 def cut_picture(report: ReportInput) -> Picture | None:
-    """Each cut with the calibrations at the start, and as found."""
+    """Return a picture of each cut with the initial and the estimated calibrations; None if there is no cut."""
     cuts = cuts_of(report)
     if not cuts:
         return None

@@ -1,4 +1,4 @@
-"""Where a calibration's planes, ties and control lie, and how strips differ over the ground."""
+"""Draws where a calibration's planes, ties and control lie, and how strips differ over the ground."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ DIFFERENCE_COLOURS = ("#3b0f70", "#2166ac", "#67a9cf", "#c6dbef", "#dff0d8", "#f
 
 
 def map_picture(report: ReportInput) -> Picture:
-    """Return strips and planes from above; planes coloured by the root mean square of their residuals."""
+    """Return a map of strips and planes; planes are coloured by the root mean square of their residuals."""
     shown = _Shown(report)
 
     def height_in(form: Format) -> float:
@@ -56,7 +56,7 @@ def map_picture(report: ReportInput) -> Picture:
 
 
 def difference_picture(report: ReportInput) -> Picture | None:
-    """Return height differences of overlapping strips before and after."""
+    """Return maps of height differences of overlapping strips before and after; None if there are none."""
     grid = report.differences
     if grid is None:
         return None
@@ -125,7 +125,7 @@ def _difference_legend() -> list[Line2D]:
 
 
 class _Shown:
-    """What of a flight the map shows, in t."""
+    """The parts of a flight that the map shows, in t."""
 
     def __init__(self, report: ReportInput) -> None:
         self.flight, self.features = report.flight, report.features
@@ -140,14 +140,14 @@ class _Shown:
         self.low_m, self.high_m = every.min(axis=0) - border, every.max(axis=0) + border
 
     def up_in(self, form: Format) -> float:
-        """Return height of the map's panel."""
+        """Return the height of the map's panel in inches."""
         width = form.width_in - 0.8
         size = self.high_m - self.low_m
         most = 1.1 if form.narrow else 0.66
         return float(np.clip(width * size[1] / size[0], 0.35 * width, most * width))
 
     def frame(self, axes: Axes, wide_to_high: float) -> None:
-        """Limits with equal scales in a panel of these proportions."""
+        """Set limits with equal scales in a panel of these proportions."""
         middle, half = (self.low_m + self.high_m) / 2.0, (self.high_m - self.low_m) / 2.0
         half = np.maximum(half, half[::-1] * [wide_to_high, 1.0 / wide_to_high])
         axes.set_xlim(middle[0] - half[0], middle[0] + half[0])
@@ -157,7 +157,7 @@ class _Shown:
         axes.yaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 2.5, 5, 10]))
 
     def draw(self, axes: Axes) -> None:
-        """All of it."""
+        """Draw strips, planes, tie points and control."""
         for i, (track, outline) in enumerate(zip(self.tracks, self.outlines, strict=True)):
             if len(outline):
                 axes.fill(outline[:, 0], outline[:, 1], color=colour_of(i), alpha=0.05, lw=0.0, zorder=1)
@@ -185,7 +185,7 @@ class _Shown:
                     axes.plot(mine[:, 0], mine[:, 1], MARKERS.get(kind, "o"), color=colour, **look)
 
     def legend(self) -> list[Line2D]:
-        """Return colours of residuals, then shapes."""
+        """Return legend entries: colours of residuals, then shapes of planes."""
         handles = [Line2D([], [], marker="o", ls="", ms=6, color=colour, label=word) for colour, word in class_words()]
         look: dict[str, Any] = {"ls": "", "ms": 5.5, "color": MUTED}
         kinds = sorted({plane.kind for plane in self.features.planes})
@@ -222,7 +222,7 @@ def _words(axes: Axes) -> None:
 
 
 def track_of(flight: Flight, swath: Swath) -> FloatArray:
-    """Return (k, 2) east, north in t of the body while a swath was flown."""
+    """Return the body's track (k, 2), east and north in t, while a swath was flown."""
     trajectory = flight.trajectories[swath.flown]
     if not len(swath.time_ns):
         return np.zeros((0, 2))
@@ -233,7 +233,7 @@ def track_of(flight: Flight, swath: Swath) -> FloatArray:
 
 
 def outline_of(swath: Swath) -> FloatArray:
-    """Return (k, 2) convex outline in t of a swath's points."""
+    """Return the convex outline (k, 2) of a swath's points in t."""
     points = np.asarray(swath.points_t[:: max(1, len(swath) // MOST_OUTLINE_POINTS), :2], np.float64)
     points = points[np.isfinite(points).all(axis=1)]
     try:
@@ -243,7 +243,9 @@ def outline_of(swath: Swath) -> FloatArray:
 
 
 def plane_rms_cm(report: ReportInput) -> FloatArray:
-    """Return (planes,) root mean square of residuals, centimetres; nan: none of its observations is left."""
+    """Return the root mean square of residuals (planes,), centimetres; nan if all observations of a plane were
+    rejected.
+    """
     count = len(report.features.planes)
     squares, counts = np.zeros(count), np.zeros(count)
     for group in report.adjusted.residuals:

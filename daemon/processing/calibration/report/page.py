@@ -1,4 +1,4 @@
-"""The report of a calibration: one page that needs no network, and the same on paper."""
+"""Writes the report of a calibration: one HTML page that needs no network, and the same as PDF."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from swath.daemon.processing.pages.style import REPORT_STYLE
 
 __all__ = ["Difference", "DifferenceMap", "PairDifference", "Profile", "ReportInput", "html", "judge", "pdf"]
 
-NARROW_PX = 640  # of the window, up to which the narrow pictures are shown
+NARROW_PX = 640  # window width up to which the narrow pictures are shown
 
 
 def html(report: ReportInput) -> str:
-    """Return the page; the same text for the same input."""
+    """Return the report as an HTML page; the same input gives the same text."""
     verdict = judge(report)
     parts = [
         f"<!doctype html><html lang='en'><head><meta charset='utf-8'><title>{escape(report.heading)}</title>",
@@ -37,7 +37,7 @@ def html(report: ReportInput) -> str:
 
 
 def pdf(report: ReportInput) -> bytes:
-    """Return the same on A4; the same bytes for the same input."""
+    """Return the report on A4 pages as PDF; the same input gives the same bytes."""
     verdict = judge(report)
     blocks = blocks_of(report, verdict)
     return pdf_of(report.heading, verdict, cards_of(report), identity_rows(report), blocks)
@@ -80,7 +80,9 @@ def _drawn(picture: Picture) -> list[bytes]:
 
 
 def _figure(title: str, words: str, svgs: Sequence[bytes], look: str = "drawn") -> str:
-    """Wide, and narrow where there is one; each an image of its own, so that their names do not meet."""
+    """Return a figure of a wide and, if given, a narrow picture; each is an image of its own so that their ids do not
+    collide.
+    """
     data = [f"data:image/svg+xml;base64,{base64.b64encode(svg).decode('ascii')}" for svg in svgs]
     narrow = f"<source media='(max-width: {NARROW_PX}px)' srcset='{data[1]}'>" if len(data) > 1 else ""
     told = f"<p class='muted'>{escape(words)}</p>" if words else ""

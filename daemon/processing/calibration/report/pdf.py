@@ -1,4 +1,4 @@
-"""A report on A4 pages: its words, tables and pictures set one below the other."""
+"""Sets a report on A4 pages: its words, tables and pictures one below the other."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ LINE_IN = SIZE * 1.42 / 72.0
 LEVEL_COLOURS = {Level.GOOD: GOOD, Level.CARE: "#e0a100", Level.UNUSABLE: BAD}
 MONO = "DejaVu Sans Mono"
 PROFILE_DPI, HIGHEST_PROFILE_IN = 220, 6.0
-SLACK = 1.02  # viewers set some words wider than their font says
+SLACK = 1.02  # viewers set some words wider than their font's metrics
 
 
 @dataclass(frozen=True, slots=True)
 class Set:
-    """A piece of a page: its height, how it is drawn, and whether the next piece must stand on the same page."""
+    """A piece of a page: its height, its drawing function, and whether the next piece must stand on the same page."""
 
     height_in: float
     draw: Callable[[Canvas], None]
@@ -49,7 +49,7 @@ def pdf_of(
     identity: Sequence[tuple[str, str]],
     blocks: Sequence[Block],
 ) -> bytes:
-    """Return the file."""
+    """Return a report as a PDF file."""
     pieces = [_head(title), _judged(verdict), *_cards(cards), *_identity(identity)]
     for block in blocks:
         pieces += _pieces(block)
@@ -63,7 +63,7 @@ def pdf_of(
 
 
 def _paged(pieces: Sequence[Set]) -> list[list[Set]]:
-    """Return pieces by page; one that must stand with its next goes over with it."""
+    """Return pieces by page; a piece that must stand with its next one moves with it."""
     room_in = PAGE_IN[1] - TOP_IN - FOOT_IN
     pages: list[list[Set]] = [[]]
     i = 0
@@ -91,13 +91,13 @@ def _page(pieces: Sequence[Set], foot: str) -> Figure:
 
 
 def width_in(words: str, size: float = SIZE, family: str = "DejaVu Sans") -> float:
-    """Of words as they are set."""
+    """Return the width of words as they are set, in inches."""
     return SLACK * sum(_advance(character, family) for character in words) * size / 72.0
 
 
 @cache
 def _advance(character: str, family: str) -> float:
-    """Of one character, in sizes of its font."""
+    """Return the advance of one character, in sizes of its font."""
     font = get_font(findfont(FontProperties(family=family)))
     font.set_size(SIZE, 72)
     glyph = font.load_char(ord(character), flags=LoadFlags.NO_HINTING)
@@ -105,7 +105,7 @@ def _advance(character: str, family: str) -> float:
 
 
 def wrapped(words: str, room_in: float, size: float = SIZE, family: str = "DejaVu Sans") -> list[str]:
-    """Return lines that fit; words that are too long (hashes) are broken."""
+    """Return lines that fit the room; words that are too long (hashes) are broken."""
     lines: list[str] = []
     line = ""
     for word in words.split():
@@ -237,7 +237,9 @@ def _profile(profile: Profile) -> list[Set]:
 
 
 def _table(table: Table) -> list[Set]:
-    """Return a piece a row, so that a long table goes over pages; its heads stand with the first."""
+    """Return one piece per row so that a long table can continue on further pages; its heads stand
+    with the first row.
+    """
     size = SMALL
     columns = range(len(table.heads))
     wide = _widths(table, size)
@@ -279,7 +281,7 @@ def _table(table: Table) -> list[Set]:
 
 
 def _widths(table: Table, size: float) -> list[float]:
-    """Return columns as wide as their words, those that may wrap sharing what is left."""
+    """Return column widths: as wide as their words, while columns that may wrap share the rest."""
     natural = []
     for j, head in enumerate(table.heads):
         family = MONO if j in table.hashes else "DejaVu Sans"

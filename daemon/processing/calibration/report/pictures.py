@@ -1,4 +1,4 @@
-"""Pictures of what was estimated: correlations, strips before and after, control, trajectory, tables."""
+"""Draws the estimates: correlations, strips before and after, control, trajectory, tables."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ from swath.daemon.processing.pages.canvas import (
 from swath.georef.arrays import FloatArray
 from swath.georef.timescales.gps_time import SECOND_NS
 
-MOST_CELLS = 60  # unknowns in the correlation matrix
+MOST_CELLS = 60  # maximum unknowns in the correlation matrix
 MOST_PAIRS = 30
 MOST_CONTROL = 60
-SUSPECT = 3.29  # |w| of one sound observation in a thousand (Baarda 1968)
+SUSPECT = 3.29  # exceeded by |w| of one sound observation in a thousand (Baarda 1968)
 SWATH_LIMITS_CM = ((4.0, "QL0"), (8.0, "QL1, QL2"))  # RMSDz of swath overlap, USGS Lidar Base Specification
 
 
 def correlation_picture(report: ReportInput) -> Picture | None:
-    """Return correlation matrix of the unknowns, with its numbers."""
+    """Return the correlation matrix of the unknowns with its numbers; None if there are fewer than two."""
     adjusted = report.adjusted
     if len(adjusted.names) < 2:
         return None
@@ -96,7 +96,7 @@ def _cells(axes: Axes, matrix: FloatArray, cell_in: float) -> None:
 
 
 def strips_picture(report: ReportInput) -> Picture | None:
-    """Return root mean square of height differences by pair of strips, before and after."""
+    """Return the root mean square of height differences by pair of strips, before and after; None without pairs."""
     pairs: list[Pair] = sorted(report.after, key=lambda pair: -report.after[pair].rms_m)[:MOST_PAIRS]
     if not pairs:
         return None
@@ -138,7 +138,7 @@ def strips_picture(report: ReportInput) -> Picture | None:
 
 
 def control_picture(report: ReportInput) -> Picture | None:
-    """Return misclosures of control."""
+    """Return the misclosures of control points; None if there are none."""
     points = report.adjusted.control[:MOST_CONTROL]
     if not points:
         return None
@@ -169,7 +169,7 @@ def control_picture(report: ReportInput) -> Picture | None:
 
 
 def trajectory_pictures(report: ReportInput) -> list[Picture]:
-    """Return corrections of each session's trajectory."""
+    """Return a picture of the corrections of each session's trajectory."""
     fit = report.adjusted.trajectory
     if fit is None:
         return []
@@ -223,7 +223,7 @@ def _trajectory_picture(fit: TrajectoryFit, flown: int, *, several: bool) -> Pic
 
 
 def _breaks(minutes: FloatArray) -> NDArray[np.int64]:
-    """Return where a line would join what was flown long apart."""
+    """Return the indexes at which a line would join stretches flown long apart."""
     steps = np.diff(minutes)
     return np.flatnonzero(steps > 5.0 * np.median(steps)) + 1 if len(steps) else np.zeros(0, np.int64)
 
@@ -235,7 +235,7 @@ def _tables(fit: TrajectoryFit, kind: str) -> tuple[FloatArray, FloatArray, Floa
 
 
 def intensity_picture(report: ReportInput) -> Picture | None:
-    """Return range corrections by intensity, where they were estimated or given."""
+    """Return range corrections by intensity if they were estimated or given; else None."""
     known = [(name, one.ibrc) for name, one in report.adjusted.calibrations.items() if one.ibrc is not None]
     if not known:
         return None

@@ -1,4 +1,6 @@
-"""Profiles in the report: what they say beside the adjustment, each of them with its formula, and the surest drawn."""
+"""Shows profiles in the report: their results beside the adjustment's, each with its formula, and pictures of the most
+precise.
+"""
 
 from __future__ import annotations
 
@@ -28,10 +30,10 @@ from swath.daemon.processing.calibration.report.tables import Table
 from swath.daemon.processing.pages.canvas import INK, MUTED
 
 PAGE_IN = (9.6, 4.6)
-COLOURS = ("#0072b2", "#d55e00")  # first, second; told apart without colour by their marks too
+COLOURS = ("#0072b2", "#d55e00")  # first, second; their marks differ too, for readers who cannot see the colours
 MARKS = ("o", "^")
-MOST_POINTS = 1500  # of each section; more would only make the file large
-WINDOW_M = 160.0  # shown of a profile along track: the part with the most relief
+MOST_POINTS = 1500  # of each section; more would only enlarge the file
+WINDOW_M = 160.0  # length of a profile along track that is shown: the part with the most relief
 _SVG: Any = {"svg.hashsalt": "profile", "svg.fonttype": "path"}
 
 MOST_DRAWN = 6
@@ -46,7 +48,9 @@ UNDER = (
 
 
 def comparison_table(checked: Check) -> Table | None:
-    """Return profiles say, adjustment says, difference in sigmas; and what has no profile."""
+    """Return a table of profiles' results, the adjustment's, and the difference in sigmas; also kinds without a
+    profile.
+    """
     if not checked.comparisons and not checked.missing:
         return None
     several = len({one.scanner for one in checked.comparisons} | {scanner for scanner, _ in checked.missing}) > 1
@@ -69,7 +73,7 @@ def _compared(one: Comparison, *, several: bool) -> list[str]:
 
 
 def profiles_table(checked: Check) -> Table | None:
-    """Return every profile: separation, baseline, formula."""
+    """Return a table of every profile: separation, baseline, formula."""
     rows = [
         [
             profile.kind,
@@ -88,14 +92,14 @@ def profiles_table(checked: Check) -> Table | None:
 
 
 def pictures(checked: Check, at_start: Flight, control: Sequence[ControlPoint] = ()) -> list[Picture]:
-    """Return the surest profiles of each kind as pictures: as the points lay at the start, and as they lie in the end.
+    """Return pictures of the most precise profiles of each kind, with points as at the start and as adjusted.
 
-    What a profile itself finds is not taken out of the second, so that it shows what the adjustment left.
+    The result of a profile is not applied to the second picture, so that it shows the errors that the adjustment left.
 
     Args:
         checked: profiles, measured with the points as adjusted.
-        at_start: the flight with the points as they lay before.
-        control: the surveyed points, which profiles for the range compare the ground with.
+        at_start: the flight with its points as placed at the start.
+        control: the surveyed points, which range profiles compare the ground with.
     """
     found = []
     for profile in _surest(checked.profiles):
@@ -107,7 +111,7 @@ def pictures(checked: Check, at_start: Flight, control: Sequence[ControlPoint] =
 
 
 def _surest(profiles: Sequence[Profile]) -> list[Profile]:
-    """Return one of every pair and kind, kinds in turn, no more than are worth looking at."""
+    """Return the most precise profile of every pair and kind, kinds in turn, up to `MOST_DRAWN`."""
     pairs: dict[tuple[str, int, int], Profile] = {}
     for profile in sorted(profiles, key=lambda one: one.noise_sigma):
         pairs.setdefault((profile.kind, profile.first, profile.second), profile)
@@ -120,7 +124,7 @@ def _surest(profiles: Sequence[Profile]) -> list[Profile]:
 
 
 def _sections(profile: Profile, flight: Flight, control: Sequence[ControlPoint]) -> tuple[Section, Section]:
-    """Return both strips' returns along it, as this flight places them."""
+    """Return both strips' returns along the profile, as this flight places them."""
     corridor = Corridor.between(profile.ends_t[0], profile.ends_t[1], profile.cells[0].half_width_m)
     first, second = (_section(corridor, Ground.of(flight.swaths[swath])) for swath in (profile.first, profile.second))
     return first, second
@@ -134,8 +138,9 @@ def _section(corridor: Corridor, ground: Ground) -> Section:
 
 
 def _targets(profile: Profile, flight: Flight, control: Sequence[ControlPoint]) -> tuple[Section, Section]:
-    """Return the ground that this flight shows at the profile's targets, less what was surveyed; those without any are
-    left out."""
+    """Return the flight's ground at the profile's targets less the surveyed heights; targets without ground are left
+    out.
+    """
     surveyed = {point.name: point.position_t for point in control}
     ground = Ground.of(flight.swaths[profile.first])
     right = profile.ends_t[1, :2] - profile.ends_t[0, :2]
@@ -155,7 +160,7 @@ def _targets(profile: Profile, flight: Flight, control: Sequence[ControlPoint]) 
 
 
 def draw(profile: Profile) -> Figure:
-    """Return two panels, before and after, over the distance along the profile (of a range: to the right of the
+    """Return a figure of two panels, before and after, over the distance along the profile (range profiles: right of
     track).
     """
     figure = Figure(figsize=PAGE_IN, facecolor="white")
@@ -185,7 +190,7 @@ def draw(profile: Profile) -> Figure:
 
 
 def svg(profile: Profile) -> str:
-    """Return the picture as SVG, the same for the same profile."""
+    """Return the figure as SVG; the same profile gives the same text."""
     text = io.StringIO()
     with mpl.rc_context(_SVG):
         draw(profile).savefig(text, format="svg", metadata={"Date": None, "Creator": None})
@@ -193,8 +198,8 @@ def svg(profile: Profile) -> str:
 
 
 def _window(profile: Profile) -> tuple[float, float]:
-    """From where to where it is drawn."""
-    section = profile.after[0] if profile.kind == "range" else profile.before[0]  # all targets are seen in the end
+    """Return the first and last distance that are drawn."""
+    section = profile.after[0] if profile.kind == "range" else profile.before[0]  # all targets are seen at the end
     low, high = (float(end) for end in (section.distance_m.min(), section.distance_m.max()))
     if profile.kind in ("roll", "range") or high - low <= WINDOW_M:
         return low - 0.5, high + 0.5

@@ -1,4 +1,6 @@
-"""Residuals after the adjustment: by strip, scan angle, range and intensity, and against the normal distribution."""
+"""Draws residuals after the adjustment: by strip, scan angle, range and intensity, and against the
+normal distribution.
+"""
 
 from __future__ import annotations
 
@@ -19,16 +21,16 @@ from swath.georef.arrays import FloatArray
 from swath.georef.records import Int64Array
 
 PANEL_IN, NORMAL_IN = 1.7, 2.0
-MOST_COLUMNS, MOST_ROWS, EACH = 40, 41, 400  # of the shaded panels; observations a column at least, about
+MOST_COLUMNS, MOST_ROWS, EACH = 40, 41, 400  # of the shaded panels; observations per column at least, about
 EDGE = 5.0  # sigmas shown
-SPREAD = 4.0  # of residuals shown, in their root mean square
-FEWEST = 20  # observations in a column whose quantiles are drawn
+SPREAD = 4.0  # residuals are shown up to this multiple of their root mean square
+FEWEST = 20  # observations in a column for which quantiles are drawn
 BLUES = LinearSegmentedColormap.from_list("pale to deep", ["#ffffff", "#cfe0ec", "#6fa3c7", "#0b4f7d"])
 
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """Observations on returns, one row each (n,): residual, and what it may depend on."""
+    """Observations on returns, one row each (n,): the residual and quantities that it may depend on."""
 
     misclosure_m: FloatArray
     swath: Int64Array
@@ -38,7 +40,7 @@ class Seen:
 
 
 def seen_of(report: ReportInput) -> Seen:
-    """Return those that were kept, of all groups."""
+    """Return the observations of all groups that were not rejected."""
     pieces: list[tuple[FloatArray, ...]] = []
     for group in report.adjusted.residuals:
         kept = (group.weight > 0.0) & (group.swath >= 0) & (group.at >= 0)
@@ -54,7 +56,7 @@ def seen_of(report: ReportInput) -> Seen:
 
 
 def residual_picture(report: ReportInput) -> Picture | None:
-    """Return their distribution by strip, scan angle, range and intensity."""
+    """Return the distribution of residuals by strip, scan angle, range and intensity; None if there are none."""
     seen = seen_of(report)
     if not len(seen.misclosure_m):
         return None
@@ -90,7 +92,7 @@ def residual_picture(report: ReportInput) -> Picture | None:
 
 
 def _columns(axes: Axes, values: NDArray[Any], seen: Seen, half_cm: float, edges: NDArray[Any]) -> None:
-    """Shares of residuals (cm) by columns of a variable, with their median and where two thirds lie."""
+    """Draw shares of residuals (cm) by columns of a variable, with their median and the range of two thirds."""
     residual_cm = 100.0 * seen.misclosure_m
     rows = int(np.clip(len(values) // (10 * len(edges)), 11, MOST_ROWS))
     levels = np.linspace(-half_cm, half_cm, rows + 1)
@@ -116,7 +118,7 @@ def _columns(axes: Axes, values: NDArray[Any], seen: Seen, half_cm: float, edges
 
 
 def normal_picture(report: ReportInput) -> Picture | None:
-    """Normalised residuals of each group beside the normal distribution."""
+    """Return normalised residuals of each group beside the normal distribution; None if there are none."""
     groups = [group for group in report.adjusted.residuals if np.isfinite(group.normalised).any()]
     if not groups:
         return None

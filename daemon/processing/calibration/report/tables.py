@@ -1,4 +1,4 @@
-"""What a report says in tables: rows of words, the same for the page and for paper."""
+"""Builds the tables of a report as rows of words, the same for HTML and PDF."""
 
 from __future__ import annotations
 
@@ -34,16 +34,16 @@ OBSERVED = {"range_m": "one range", "ties": "one coordinate of a tie point", "co
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Rows of words.
+    """A table of words.
 
     Attributes:
-        title: above it; empty: it follows what stands there.
+        title: heading above it; empty: it continues the block before.
         heads, rows: words; every row has as many as heads.
-        under: what to know of it.
-        left: columns whose words stand at the left and may wrap.
+        under: explanation below the table.
+        left: columns that are set flush left and may wrap.
         hashes: columns of long hexadecimal numbers.
-        pale: rows that are set back.
-        stacked: on narrow screens one cell stands below the other.
+        pale: rows that are set in a paler colour.
+        stacked: on narrow screens cells stand one below the other.
     """
 
     title: str
@@ -57,7 +57,7 @@ class Table:
 
 
 def parameter_tables(report: ReportInput) -> list[Table]:
-    """Return one a scanner: start, estimate, change, sigma, significance; what was held is set back."""
+    """Return one table per scanner: start, estimate, change, sigma, significance; held parameters are paler."""
     names = list(report.adjusted.calibrations)
     return [_parameters(report, scanner, several=len(names) > 1) for scanner in names]
 
@@ -117,7 +117,7 @@ def _estimated(one: Unknown, start: float, value: float, sigma: float, prior: fl
 
 
 def entries_table(report: ReportInput) -> Table | None:
-    """Return unknowns that are entries of tables: IBRC, beams, range offsets."""
+    """Return a table of unknowns that are entries of tables: IBRC, beams, range offsets; None if there are none."""
     adjusted = report.adjusted
     rows = []
     for i, name in enumerate(adjusted.names):
@@ -133,7 +133,7 @@ def entries_table(report: ReportInput) -> Table | None:
 
 
 def held_table(report: ReportInput) -> Table | None:
-    """Return what this flight does not determine, and what would."""
+    """Return a table of parameters that this flight does not determine, with remedies; None if there are none."""
     several = len(report.adjusted.calibrations) > 1
     held = [one for one in report.adjusted.held if is_undetermined(one)]
     if not held:
@@ -166,7 +166,7 @@ def _alike(held: FixedParameter) -> str:
 
 
 def strips_table(report: ReportInput) -> Table | None:
-    """Return height differences by pair of strips."""
+    """Return a table of height differences by pair of strips; None if there are none."""
     if not report.after:
         return None
     rows = []
@@ -186,7 +186,7 @@ def _more(count: int) -> str:
 
 
 def groups_table(report: ReportInput) -> Table:
-    """Fit of each group of observations."""
+    """Return a table of the fit of each group of observations."""
     rows = [
         [
             group.group,
@@ -203,7 +203,7 @@ def groups_table(report: ReportInput) -> Table:
 
 
 def outlier_tables(report: ReportInput) -> list[Table]:
-    """Return where rejected observations lie, and the largest that were kept."""
+    """Return tables of where rejected observations lie, and of the largest residuals that were kept."""
     rejected, suspects = [], []
     for group in report.adjusted.residuals:
         out = group.weight <= 0.0
@@ -246,13 +246,13 @@ def _strips(report: ReportInput, group: Residuals, rows: NDArray[np.bool_]) -> s
 
 
 def refused_table(report: ReportInput) -> Table | None:
-    """Return why candidates were not taken."""
+    """Return a table of the reasons why candidates were not used; None if all were."""
     rows = [[reason, thousands(count)] for reason, count in report.features.refused.most_common()]
     return Table("", ("candidates not taken", "number"), rows) if rows else None
 
 
 def control_table(report: ReportInput) -> Table | None:
-    """Return misclosures, and what leaving a point out would change."""
+    """Return a table of misclosures and of the effect of leaving a point out; None without control."""
     if not report.adjusted.control:
         return None
     several = len(report.adjusted.calibrations) > 1
@@ -278,7 +278,7 @@ def control_table(report: ReportInput) -> Table | None:
 
 
 def detectable_table(report: ReportInput) -> Table | None:
-    """Return smallest errors that would be found."""
+    """Return a table of the smallest errors that would be detected; None if there are none."""
     rows = [[OBSERVED.get(name, name), length(value)] for name, value in report.adjusted.least_detectable.items()]
     under = "An error of this size in one observation is found with probability 0.8 (significance 0.001)."
     return Table("Smallest errors that would be found", ("observation", "size"), rows, under) if rows else None

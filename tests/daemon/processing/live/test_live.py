@@ -344,7 +344,7 @@ class TestStatus:
         products: Any = SimpleNamespace(
             points=Counter(), shown=0, unwritten=0, trouble="", room=Mock(), origin=lambda: {}
         )
-        setup: Any = SimpleNamespace(ins_source="gnss/rover")
+        setup: Any = SimpleNamespace(sources=SimpleNamespace(ins_source="gnss/rover"))
         status = LiveStatus(setup, stream, products)
         assert status.plain(None, 0)["trajectory"] == {"source": "gnss/rover", "covered_until_gps_ns": 7}
         status.navigation = "aligned with dual-antenna heading"

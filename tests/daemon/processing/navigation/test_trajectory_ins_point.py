@@ -74,7 +74,7 @@ def test_an_ins_that_says_no_velocities_has_those_of_its_way() -> None:
     rows["gps_ns"], rows["velocity_l"] = body.time_ns, np.nan
     rows["lat_rad"], rows["lon_rad"], rows["height_m"] = body.geodetic()
     rows["roll_rad"], rows["pitch_rad"], rows["heading_rad"] = body.attitude()
-    setup: Any = SimpleNamespace(ins_source="imu/main", protocol=lambda source: "")
+    setup: Any = SimpleNamespace(sources=SimpleNamespace(ins_source="imu/main", protocol=lambda source: ""))
     told: Any = SimpleNamespace(ins_rows=rows)
     trajectory, counts = _from_device(setup, told)
     assert counts == {"taken": len(body)}

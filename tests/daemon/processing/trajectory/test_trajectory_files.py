@@ -138,7 +138,7 @@ def test_a_disk_that_refuses_leaves_nothing(
         if (tmp_path / f"a.smrmsg{PARTIAL}").exists():
             raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("swath.daemon.processing.trajectory.files.os.fsync", full)
+    monkeypatch.setattr("swath.daemon.processing.files.os.fsync", full)
     with pytest.raises(OSError, match="No space"):
         write_trajectory(files, trajectory, None)
     assert not list(tmp_path.iterdir())
