@@ -53,7 +53,7 @@ def arguments(made: Made, output: Path, *more: str) -> list[str]:
 
 def loops() -> set[str]:
     """Of calib, those that this process has compiled or read from the cache, with the types they are for."""
-    modules = [module for name, module in sys.modules.items() if name.startswith("calib.")]
+    modules = [module for name, module in sys.modules.items() if name.startswith("swath.calib.")]
     known = [one for module in modules for one in vars(module).values() if isinstance(one, Dispatcher)]
     return {f"{one.py_func.__qualname__} {types}" for one in known for types in one.overloads}
 
