@@ -85,6 +85,6 @@ def last_losses(content: LogContent, source: str) -> list[int]:
 
 @pytest.mark.parametrize("kind", ["ldisc", "dcd"])
 def test_pps_on_dcd_of_a_16550_with_nmea_on_the_same_port(tmp_path: Path, kind: str) -> None:
-    with at_serial_port(tmp_path, kind, 25.0) as receiver:
+    with at_serial_port(tmp_path, kind, 45.0) as receiver:  # uneven edges may take 20 s to get a second
         pass
     assert_pulses_are_named(tmp_path / "logs", receiver.pulses_utc_s, facts(tmp_path, "told")["ahead_ns"])
