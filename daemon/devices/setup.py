@@ -73,7 +73,7 @@ class DeviceSetup:
 
     @property
     def ok(self) -> bool:
-        """Whether nothing has gone wrong so far."""
+        """True if nothing has gone wrong so far."""
         return not self.problem and all(step.outcome in (Outcome.PLANNED, Outcome.ACCEPTED) for step in self.steps)
 
     def plain(self) -> dict[str, Any]:

@@ -124,7 +124,7 @@ class Monitor:
 
     @property
     def is_undecided(self) -> bool:
-        """Whether growth of the log could still prove a recording whose recorder cannot be asked."""
+        """True if growth of the log could still prove a recording whose recorder cannot be asked."""
         waiting = self._grown_s is None and time.monotonic() - self._began_s < STALE_S
         return waiting and self._follower.sign is not None and not _is_of_this_boot(self._follower.sign.boot_id)
 

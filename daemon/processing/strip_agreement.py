@@ -96,7 +96,7 @@ class Agreement:
 
     @property
     def no_verdict(self) -> str:
-        """Why there is no verdict, and the remedy; empty if there is one."""
+        """Reason why there is no verdict, and the remedy; empty if there is one."""
         if self.judged:
             return ""
         there = f"{self.cells:,} {'cell' if self.cells == 1 else 'cells'} of {self.cell_m:g} m in "

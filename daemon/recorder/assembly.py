@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 from swath.daemon.config import Config, DeviceEntry, GnssConfig
@@ -112,7 +113,7 @@ def _add_gnss_time(keeper: TimeKeeper, device: DeviceEntry, gnss: GnssConfig) ->
 def _add_pps(assembly: Assembly) -> None:
     for name, pps in assembly.config.pps.items():
         source = f"pps/{name}"
-        session = Session(lambda pps=pps: open_pps(parse_pps(pps.source, edge=pps.edge)))  # type: ignore[misc]
+        session = Session(partial(open_pps, parse_pps(pps.source, pps.edge)))
         edge_seen = assembly.timekeeper.edge_seen(source)
         overwrites = not pps.source.startswith("fixed:")
         receiver = PpsReceiver(name, session, assembly.shared, edge_seen, overwrites=overwrites)

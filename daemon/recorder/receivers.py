@@ -184,7 +184,7 @@ class Receiver(threading.Thread, ABC):
     @property
     @abstractmethod
     def opening(self) -> bool:
-        """Whether the device is being opened at this moment."""
+        """True if the device is being opened at this moment."""
 
     @abstractmethod
     def take(self, timeout_s: float) -> int | None:
@@ -293,7 +293,7 @@ class UnitReceiver(Receiver):
 
     @property
     def opening(self) -> bool:
-        """Whether the device is being opened at this moment."""
+        """True if the device is being opened at this moment."""
         return self._session.state is SessionState.OPENING
 
     def take(self, timeout_s: float) -> int | None:
@@ -428,7 +428,7 @@ class PpsReceiver(Receiver):
 
     @property
     def opening(self) -> bool:
-        """Whether the device is being opened at this moment."""
+        """True if the device is being opened at this moment."""
         return self._session.state is SessionState.OPENING
 
     def take(self, timeout_s: float) -> int | None:

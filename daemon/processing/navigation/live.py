@@ -89,7 +89,7 @@ class Navigator:
 
     @property
     def state(self) -> str:
-        """What it waits for, or how the start was found, in words."""
+        """Progress in words: what the navigator waits for, or how it found the start."""
         return self._aligner.state
 
     def take(self, source: str, record: Record) -> None:

@@ -51,12 +51,12 @@ class Header(NamedTuple):
 
     @property
     def before_floor(self) -> bool:
-        """Whether its week is known but before the floor, as from a receiver one roll-over behind."""
+        """True if its week is known but before the floor, as from a receiver one roll-over behind."""
         return 0 < self.week < self.floor_week
 
     @property
     def time_valid(self) -> bool:
-        """Whether the receiver marks the time as valid; a short header has no status, so only its week counts."""
+        """True if the receiver marks the time as valid; a short header has no status, so only its week counts."""
         known = is_week(self.week, self.floor_week)
         return known and (self.time_status is None or self.time_status in tables.TIME_VALID)
 

@@ -146,7 +146,7 @@ class LidarLayout:
 
     @property
     def legacy(self) -> bool:
-        """Whether packets have neither header nor footer."""
+        """True if packets have neither header nor footer."""
         return self.head.header == "legacy"
 
     @property
@@ -156,12 +156,12 @@ class LidarLayout:
 
     @property
     def dual(self) -> bool:
-        """Whether a block has two returns."""
+        """True if a block has two returns."""
         return "RANGE2" in self.profile.fields
 
     @property
     def has_crc(self) -> bool:
-        """Whether a packet has a place for a CRC."""
+        """True if a packet has a place for a CRC."""
         return self.head.header == "standard"
 
     @cached_property

@@ -132,7 +132,7 @@ class PlannedCalibration:
 
     @property
     def notes(self) -> list[str]:
-        """What the prediction leaves out, one line each."""
+        """Limits of the prediction: what it leaves out, one line each."""
         return [f"not predicted: {words}; pulses on paper return once, without intensity" for words in self.unplanned]
 
     @property
