@@ -43,15 +43,15 @@ class SessionConfig(Section):
     name: Name = Field(description="begins the name of every log")
     directory: Text = Field("/var/lib/swath", description="where logs go; relative to this file")
     compression: Literal["auto", "lz4", "zstd", "none"] = Field(
-        "auto", description="of chunks; auto: scanner none, the rest lz4"
+        "auto", description="compression of the chunks; auto: none for scanners, lz4 for the rest"
     )
     split_size_mb: float = Field(2048.0, ge=1.0, le=1_000_000.0, description="a new part after this size")
     split_minutes: float = Field(30.0, ge=0.01, le=1440.0, description="a new part after this time")
     fsync_s: float = Field(
-        1.0, ge=0.05, le=60.0, description="how often the log is forced to the disk; each second at the latest"
+        1.0, ge=0.05, le=60.0, description="interval at which the log is synced to the disk; in any case once a second"
     )
     reserve_mb: float = Field(
-        512.0, ge=1.0, le=10_000_000.0, description="free space at which recording stops cleanly, and resumes above"
+        512.0, ge=1.0, le=10_000_000.0, description="free space at which recording stops cleanly; it resumes 5 % above"
     )
 
 
@@ -73,8 +73,8 @@ class GnssSetupConfig(Section):
         description="the receiver's own name of the port that is wired to this computer: "
         "ubx: UART1, UART2, USB (absent: UART1); sbf: COM1 to COM4, USB1, USB2 (absent: COM1)",
     )
-    rate_hz: Literal[1, 2, 5, 10, 20] = Field(5, description="of positions and velocities")
-    raw: bool = Field(True, description="raw measurements and ephemerides too, for post-processing")
+    rate_hz: Literal[1, 2, 5, 10, 20] = Field(5, description="rate of positions and velocities")
+    raw: bool = Field(True, description="whether to send raw measurements and ephemerides too, for post-processing")
 
 
 class GnssConfig(Section):
@@ -86,32 +86,36 @@ class GnssConfig(Section):
     names_edge: Literal["auto", "previous", "next"] = Field(
         "auto", description="which edge its time message names; auto: by protocol"
     )
-    lever_arm_m: Vector = Field(default_factory=_zero_vector, description="antenna's phase centre x_a^b")
-    secondary_lever_arm_m: Vector | None = Field(None, description="second antenna, for dual-antenna heading")
+    lever_arm_m: Vector = Field(
+        default_factory=_zero_vector, description="vector from the body's origin to the antenna's phase centre, x_a^b"
+    )
+    secondary_lever_arm_m: Vector | None = Field(
+        None, description="the same vector to the second antenna, for dual-antenna heading"
+    )
     leap_seconds: int | None = Field(
         None,
         ge=0,
         le=60,
-        description="GPS − UTC, only used until the receiver says, for NMEA; absent: the built-in table by the date",
+        description="GPS − UTC, for NMEA and until the receiver sends it; absent: the built-in table by the date",
     )
     date_floor: dt.date | None = Field(
         None,
-        description="oldest date believed, for week numbers of ten bits; absent: 2009-01-01",
+        description="oldest date that is believed, for week numbers of ten bits; absent: 2009-01-01",
     )
     add_weeks: int = Field(
         0,
         ge=0,
         le=3072,
         multiple_of=1024,
-        description="added to its dates: 1024 a roll-over that its firmware is behind",
+        description="weeks added to its dates: 1024 for each roll-over that its firmware is behind",
     )
     datum: str | None = Field(
         None,
         min_length=1,
-        description='realisation of its positions, as "EPSG:7912"; absent: WGS 84, realisation unknown; '
-        '"same": the output\'s',
+        description='datum realisation of its positions, such as "EPSG:7912"; absent: WGS 84 of unknown realisation; '
+        '"same": that of the output',
     )
-    setup: GnssSetupConfig = Field(default_factory=GnssSetupConfig, description="what `swath setup` asks of it")
+    setup: GnssSetupConfig = Field(default_factory=GnssSetupConfig, description="settings that `swath setup` sends")
 
 
 class SignalsConfig(Section):
@@ -121,28 +125,45 @@ class SignalsConfig(Section):
     angular_rate: SignalTriple | None = Field(None, description="three signals, axes of the IMU")
     sample_ticks: Signal | None = Field(None, description="the device's counter when the sample was taken")
     pps_ticks: Signal | None = Field(None, description="the counter latched at the last PPS edge")
-    temperature: Signal | None = Field(None, description="°C")
+    temperature: Signal | None = Field(None, description="the temperature, °C")
     status: Signal | None = Field(None, description="the device's status word, kept with each sample")
-    packet_counter: Signal | None = Field(None, description="a counter of samples sent; what it skips is counted")
+    packet_counter: Signal | None = Field(
+        None, description="a counter of samples sent; samples that it skips are counted"
+    )
 
 
 class NoiseConfig(Section):
     """``[imu.<name>.noise]``: noise model of the navigation filter; single keys override the grade."""
 
     grade: Literal["navigation", "tactical", "mems", "consumer"] = Field(
-        "tactical", description="gives what is absent below"
+        "tactical", description="grade of the unit, which gives the keys that are absent below"
     )
-    angle_random_walk_deg_per_sqrt_h: float | None = Field(None, ge=0.0, le=100.0, description="default: the grade's")
+    angle_random_walk_deg_per_sqrt_h: float | None = Field(
+        None, ge=0.0, le=100.0, description="angle random walk; default: the grade's"
+    )
     velocity_random_walk_m_per_s_per_sqrt_h: float | None = Field(
-        None, ge=0.0, le=100.0, description="default: the grade's"
+        None, ge=0.0, le=100.0, description="velocity random walk; default: the grade's"
     )
-    gyro_bias_deg_per_h: float | None = Field(None, ge=0.0, le=100_000.0, description="default: the grade's")
-    accel_bias_mg: float | None = Field(None, ge=0.0, le=1_000.0, description="default: the grade's")
-    bias_correlation_h: float | None = Field(None, gt=0.0, le=10_000.0, description="default: the grade's")
-    gyro_scale_ppm: float | None = Field(None, ge=0.0, le=100_000.0, description="default: the grade's")
-    accel_scale_ppm: float | None = Field(None, ge=0.0, le=100_000.0, description="default: the grade's")
+    gyro_bias_deg_per_h: float | None = Field(
+        None, ge=0.0, le=100_000.0, description="bias of the gyroscopes; default: the grade's"
+    )
+    accel_bias_mg: float | None = Field(
+        None, ge=0.0, le=1_000.0, description="bias of the accelerometers; default: the grade's"
+    )
+    bias_correlation_h: float | None = Field(
+        None, gt=0.0, le=10_000.0, description="correlation time of the biases; default: the grade's"
+    )
+    gyro_scale_ppm: float | None = Field(
+        None, ge=0.0, le=100_000.0, description="scale error of the gyroscopes; default: the grade's"
+    )
+    accel_scale_ppm: float | None = Field(
+        None, ge=0.0, le=100_000.0, description="scale error of the accelerometers; default: the grade's"
+    )
     misalignment_mrad: float | None = Field(
-        None, ge=0.0, le=100.0, description="of axes towards each other; default: the grade's; 0: not estimated"
+        None,
+        ge=0.0,
+        le=100.0,
+        description="misalignment of the axes to each other; default: the grade's; 0: not estimated",
     )
 
 
@@ -153,7 +174,7 @@ class ImuConfig(Section):
     protocol: Text = Field(description="dbc, or a named profile (`swath devices` lists them)")
     dbc: Text | None = Field(None, description="the DBC file, relative to this file")
     imu_type: Text | None = Field(
-        None, description="novatel: the IMU as INSCONFIG names it (HG1900_CA50), where its stream does not say it"
+        None, description="novatel: the IMU's name as in INSCONFIG (HG1900_CA50), if its stream does not contain it"
     )
     source_address: int | None = Field(
         None, ge=0, le=253, description="nmea2000: the device to listen to; absent: the first that sends each PGN"
@@ -162,14 +183,16 @@ class ImuConfig(Section):
         None, description="sbg-ellipse, xsens-mti: CAN identifiers that differ from the maker's, by message name"
     )
     extended_ids: bool = Field(False, description="sbg-ellipse, xsens-mti: the identifiers have 29 bits")
-    byte_order: Literal["big", "little"] = Field("big", description="xsens-mti: of the numbers in a CAN frame")
+    byte_order: Literal["big", "little"] = Field(
+        "big", description="xsens-mti: byte order of the numbers in a CAN frame"
+    )
     pps_event: Literal["A", "B", "C", "D", "E"] | None = Field(
         None, description="sbg-ellipse: the Sync In that PPS is wired to; its event message latches the counter"
     )
     rate_hz: float = Field(200.0, gt=0.0, le=100_000.0, description="nominal rate of samples")
     rotation_b_imu: Matrix = Field(
         default_factory=_identity,
-        description="b from the IMU's axes, rows of the matrix; it turns its INS's attitude too",
+        description="matrix that takes the IMU's axes to b, by rows; it also turns the attitude of the IMU's INS",
     )
     tick_hz: float | None = Field(
         None,
@@ -181,14 +204,16 @@ class ImuConfig(Section):
     sample: Literal["mean", "instant", "increment"] = Field(
         "mean", description="mean over the interval, instant value, or increment (delta velocity, delta angle)"
     )
-    stamp: Literal["end", "middle", "start"] = Field("end", description="what of the interval the stamp is")
+    stamp: Literal["end", "middle", "start"] = Field(
+        "end", description="moment of the interval to which the stamp refers"
+    )
     group: Literal["last", "first"] | None = Field(
         None,
-        description="the message with sample_ticks closes (last) or opens (first) a sample; "
-        "absent: dbc: by the frames' spacing",
+        description="whether the message with sample_ticks closes (last) or opens (first) a sample; "
+        "absent, for dbc: by the frames' spacing",
     )
     signals: SignalsConfig | None = Field(None, description="the map of the DBC's signals")
-    noise: NoiseConfig = Field(default_factory=NoiseConfig, description="for the navigation filter")
+    noise: NoiseConfig = Field(default_factory=NoiseConfig, description="noise model of the navigation filter")
 
 
 _KEYS_OF_GEOMETRY = {
@@ -206,15 +231,17 @@ class GeometryConfig(Section):
     )
     facets: int | None = Field(None, ge=2, le=256, description="polygon: number of facets")
     nutation_deg: float | None = Field(
-        None, gt=0.0, le=20.0, description="nutating: of the mirror's normal from its shaft"
+        None, gt=0.0, le=20.0, description="nutating: angle between the mirror's normal and its shaft"
     )
     shaft_angle_deg: float | None = Field(
-        None, gt=0.0, lt=90.0, description="nutating: between the mirror's shaft and the laser's beam"
+        None, gt=0.0, lt=90.0, description="nutating: angle between the mirror's shaft and the laser's beam"
     )
     wedge_deg: Pair | None = Field(None, description="risley: angles of the two prisms")
-    refractive_index: float | None = Field(None, gt=1.0, le=4.0, description="risley: of both prisms")
+    refractive_index: float | None = Field(None, gt=1.0, le=4.0, description="risley: refractive index of both prisms")
     prism_ratio: float | None = Field(
-        None, description="risley: turns of the second prism a turn of the first, whose whole turns the encoder counts"
+        None,
+        description="risley: turns of the second prism for each turn of the first, "
+        "whose whole turns the encoder counts",
     )
     file: Text | None = Field(
         None, description="the device's own table (beam angles; ouster: its metadata, JSON), relative to this file"
@@ -241,7 +268,7 @@ class GimbalStage(Section):
         default_factory=_zero_vector, description="from this stage's centre to the next inner one"
     )
     source: str | None = Field(
-        None, pattern=r"^(gnss|imu|scanner)/[A-Za-z0-9_-]+$", description="a logged source of its angles"
+        None, pattern=r"^(gnss|imu|scanner)/[A-Za-z0-9_-]+$", description="a logged source of the stage's angles"
     )
 
 
@@ -262,11 +289,11 @@ class ScannerConfig(Section):
     pps: Name | None = Field(None, description="name of the [pps.<name>] wired to this head")
     clock: Literal["auto", "ptp-tai", "ptp-utc", "utc-hour", "free"] = Field(
         "auto",
-        description="what its stamps count from, where it does not say: 1970 in TAI or UTC (PTP), the hour of UTC "
+        description="origin of its stamps, if the head does not send it: 1970 in TAI or UTC (PTP), the hour of UTC "
         "(Velodyne, locked), its own start; auto: found by their arrival",
     )
-    model: str = Field("", description="maker's type; a calibration of another is refused")
-    serial: str = Field("", description="serial number; a calibration of another is refused")
+    model: str = Field("", description="maker's type; a calibration of another type is refused")
+    serial: str = Field("", description="serial number; a calibration of another number is refused")
     mirror_factor: float | None = Field(
         None, ge=-4.0, le=4.0, description="beam angle per encoder angle; srep: mandatory (2 flat mirror, 1 monogon)"
     )
@@ -274,14 +301,22 @@ class ScannerConfig(Section):
         None, description="T, b from s, rows of the matrix; mandatory for spinning heads, else identity"
     )
     calibration: Text | None = Field(None, description="calibration file, relative to this file")
-    lever_arm_m: Vector = Field(default_factory=_zero_vector, description="x_s^b, when no calibration file gives it")
+    lever_arm_m: Vector = Field(
+        default_factory=_zero_vector,
+        description="vector from the body's origin to the scanner, x_s^b, if no calibration file gives it",
+    )
     range_min_m: float = Field(0.0, ge=0.0, le=100_000.0, description="nearer returns are left out of products")
     range_max_m: float = Field(10_000.0, gt=0.0, le=100_000.0, description="farther returns are left out of products")
-    range_sigma_m: float = Field(0.02, ge=0.0, le=100.0, description="of one range, one sigma")
-    angle_sigma_deg: float = Field(0.001, ge=0.0, le=10.0, description="of the beam along the scan, one sigma")
-    divergence_mrad: float = Field(0.3, ge=0.0, le=100.0, description="of the beam, full")
+    range_sigma_m: float = Field(0.02, ge=0.0, le=100.0, description="one standard deviation of one range")
+    angle_sigma_deg: float = Field(
+        0.001, ge=0.0, le=10.0, description="one standard deviation of the beam's angle along the scan"
+    )
+    divergence_mrad: float = Field(0.3, ge=0.0, le=100.0, description="full divergence of the beam")
     wavelength_nm: float | None = Field(
-        None, ge=300.0, le=2000.0, description="of the light; absent: the maker's, 1064 where that is not known"
+        None,
+        ge=300.0,
+        le=2000.0,
+        description="wavelength of the light; absent: the maker's, or 1064 if that is unknown",
     )
     geometry: GeometryConfig | None = Field(None, description="how the beam is deflected")
     gimbal: GimbalConfig | None = Field(None, description="stages of a stabilised or pointed mount")
@@ -328,39 +363,44 @@ class AtmosphereConfig(Section):
     """``[atmosphere]``: the air between the scanner and the ground."""
 
     ranges: Literal["corrected", "vacuum"] = Field(
-        "corrected", description="corrected: by the device; vacuum: correct by the model below"
+        "corrected", description="corrected: the device corrects them; vacuum: Swath corrects them by the model below"
     )
     model: Literal["standard", "measured"] = Field("standard", description="standard atmosphere, or the values below")
-    temperature_c: float = Field(15.0, ge=-80.0, le=60.0, description="at height_m, for measured")
-    pressure_hpa: float = Field(1013.25, ge=100.0, le=1100.0, description="at height_m, for measured")
-    humidity_percent: float = Field(50.0, ge=0.0, le=100.0, description="relative, for measured")
-    height_m: float = Field(0.0, ge=-500.0, le=12_000.0, description="where it was measured")
-    refraction: Literal["none", "ardc", "spherical"] = Field("none", description="bending of the beam")
+    temperature_c: float = Field(15.0, ge=-80.0, le=60.0, description="air temperature at height_m, for measured")
+    pressure_hpa: float = Field(1013.25, ge=100.0, le=1100.0, description="air pressure at height_m, for measured")
+    humidity_percent: float = Field(50.0, ge=0.0, le=100.0, description="relative humidity, for measured")
+    height_m: float = Field(0.0, ge=-500.0, le=12_000.0, description="height at which the air was measured")
+    refraction: Literal["none", "ardc", "spherical"] = Field("none", description="model for the bending of the beam")
 
 
 class MtaConfig(Section):
     """``[mta]``: several pulses in the air at the same time."""
 
-    terrain: str = Field("", description="coarse DEM, GeoTIFF of ellipsoidal heights; empty: continuity")
+    terrain: str = Field(
+        "", description="coarse terrain model, a GeoTIFF of ellipsoidal heights; empty: the zone follows by continuity"
+    )
     height_above_ground_m: float | None = Field(
         None,
         gt=0.0,
         le=12_000.0,
-        description="usual flying height, for the first zone where there is no DEM; zone 255 needs one of both",
+        description="usual flying height, for the first zone if there is no terrain model; "
+        "zone 255 needs one of the two keys",
     )
 
 
 class ProfileConfig(Section):
     """``[profile]``: names of aircraft and installation for the records."""
 
-    aircraft: str = Field("", description="the aircraft")
+    aircraft: str = Field("", description="name of the aircraft")
     installation: str = Field("", description="id of this mounting")
 
 
 class OutputConfig(Section):
     """``[output]``: the mapping frame."""
 
-    crs: str | None = Field(None, min_length=1, description="any PROJ CRS; two-dimensional: ellipsoidal heights")
+    crs: str | None = Field(
+        None, min_length=1, description="any CRS that PROJ knows; if it is two-dimensional, heights are ellipsoidal"
+    )
     epoch: float | None = Field(None, ge=1900.0, le=2200.0, description="coordinate epoch (year), for dynamic datums")
     datum_accuracy_m: float = Field(
         0.05, gt=0.0, le=10.0, description="a change of datum that is less accurate than this is refused"
@@ -370,7 +410,9 @@ class OutputConfig(Section):
 class WantedConfig(Section):
     """``[calibration.wanted]``: the standard deviations that a calibration has to reach."""
 
-    point_m: float | None = Field(None, gt=0.0, le=100.0, description="what it may leave in points, of three axes")
+    point_m: float | None = Field(
+        None, gt=0.0, le=100.0, description="error that the calibration may leave in points, over three axes"
+    )
     omega_deg: float | None = Field(None, gt=0.0, le=10.0, description="boresight ω")
     phi_deg: float | None = Field(None, gt=0.0, le=10.0, description="boresight φ")
     kappa_deg: float | None = Field(None, gt=0.0, le=10.0, description="boresight κ")
@@ -384,17 +426,21 @@ class WantedConfig(Section):
 class CalibrationConfig(Section):
     """``[calibration]``: the criteria by which `swath calibrate` judges a calibration."""
 
-    wanted: WantedConfig = Field(default_factory=WantedConfig, description="what it has to reach")
+    wanted: WantedConfig = Field(default_factory=WantedConfig, description="accuracies that a calibration has to reach")
 
 
 class LiveConfig(Section):
     """``[live]``: size and density of the files that `swath live` writes beside the log."""
 
     live_quota_mb: float = Field(
-        4096.0, ge=1.0, le=10_000_000.0, description="of the disk for live.mcap, the one before it included"
+        4096.0, ge=1.0, le=10_000_000.0, description="disk space for live.mcap, including the one before it"
     )
-    points_per_s: int = Field(100_000, ge=1, le=100_000, description="in live.mcap, for the eye; grids take all")
-    cell_m: float = Field(1.0, ge=0.05, le=1000.0, description="of the density grid; doubled where the area wants it")
+    points_per_s: int = Field(
+        100_000, ge=1, le=100_000, description="most points in a second in live.mcap, for viewing; grids use all points"
+    )
+    cell_m: float = Field(
+        1.0, ge=0.05, le=1000.0, description="cell size of the density grid; it doubles if the area needs more cells"
+    )
 
 
 class Tables(Section):
