@@ -1,9 +1,10 @@
-"""What recording costs: CPU of the recorder's process, losses and memory, beside the machine's own limits.
+"""Measure what recording costs: CPU time of the recorder's process, losses and memory.
 
 python -m benchmarks.acquire [--seconds 60] [--repeats 3] [--only LINE] [--json FILE]
 
-The limit beside each figure is what the bare building blocks cost in the same run: recvmmsg into slots and one
-writev a batch to a file, without stamps, log format, checksums or index. Sender and receiver share the machine.
+Beside each CPU figure stands a limit: what the bare building blocks cost in the same run. They read with recvmmsg
+and write each batch to a file, without time stamps, log format, checksums or index. Sender and receiver share the
+machine.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ PAGE = os.sysconf("SC_PAGE_SIZE")
 
 @dataclass
 class Figure:
-    """One line of the table."""
+    """One line of the table, with the recorder's counts and costs."""
 
     name: str
     sent: int
@@ -49,18 +50,18 @@ class Figure:
 
 
 def cpu_s(pid: int) -> float:
-    """User and system seconds of a process so far."""
+    """Return the CPU seconds, user and system, that a process has used so far."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / TICKS
 
 
 def rss_mb(pid: int) -> float:
-    """Resident megabytes of a process now."""
+    """Return the resident memory of a process, in megabytes."""
     return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * PAGE / 1e6
 
 
 def free_port() -> int:
-    """A UDP port nobody has."""
+    """Return a UDP port that no process uses."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]
@@ -69,7 +70,13 @@ def free_port() -> int:
 
 @contextlib.contextmanager
 def recorder(folder: Path, tables: str) -> Iterator[subprocess.Popen[bytes]]:
-    """``swath run`` on a configuration, ready when given, ended cleanly when left."""
+    """Run ``swath run`` with these configuration tables.
+
+    Yields the process once it records; terminates it on exit and waits for its end.
+
+    Raises:
+        SystemExit: the recorder ended before it recorded.
+    """
     config = folder / "swath.toml"
     logs = folder / "logs"
     config.write_text(f'[session]\nname = "bench"\ndirectory = "{logs}"\nreserve_mb = 1\n{tables}')
@@ -88,18 +95,18 @@ def recorder(folder: Path, tables: str) -> Iterator[subprocess.Popen[bytes]]:
 
 
 def sender(*words: object) -> subprocess.Popen[str]:
-    """A sender process."""
+    """Start a process of `benchmarks.senders` with these arguments."""
     command = [sys.executable, "-m", "benchmarks.senders", *map(str, words)]
     return subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
 
 
 def scanner_table(port: int) -> str:
-    """A scanner on a port."""
+    """Return the configuration table of a scanner on a UDP port."""
     return f'[scanner.left]\ntransport = "udp:127.0.0.1:{port}"\nprotocol = "srep"\nmirror_factor = 1.0\n'
 
 
 def last_status(folder: Path) -> dict[str, dict[str, int]]:
-    """The newest status of each source in the log."""
+    """Return the last status of each source in the log."""
     statuses: dict[str, dict[str, int]] = {}
     for session in open_logs([folder / "logs"]):
         for batch in session.batches(lambda topic: topic.startswith("/status/")):
@@ -108,7 +115,7 @@ def last_status(folder: Path) -> dict[str, dict[str, int]]:
 
 
 def record_udp(length: int, rate: float, seconds: float) -> Figure:
-    """Datagrams to the log."""
+    """Record datagrams of one length and rate, and return the recorder's figures."""
     with tempfile.TemporaryDirectory() as scratch:
         folder, port = Path(scratch), free_port()
         with recorder(folder, scanner_table(port)) as process:
@@ -153,7 +160,7 @@ while True:
 
 
 def bare_udp(length: int, rate: float, seconds: float) -> float:
-    """CPU percent of the building blocks alone."""
+    """Return the CPU percent of the bare building blocks for these datagrams."""
     with tempfile.TemporaryDirectory() as name:
         port = free_port()
         command = [sys.executable, "-c", BARE, str(port), f"{name}/raw", str(length)]
@@ -170,7 +177,7 @@ def bare_udp(length: int, rate: float, seconds: float) -> float:
 
 
 def stall(seconds: float) -> Figure:
-    """20 000 datagrams a second while the recorder is stopped for half a second (SIGSTOP)."""
+    """Record 20 000 datagrams a second while the recorder is stopped for half a second (SIGSTOP)."""
     with tempfile.TemporaryDirectory() as name:
         folder, port = Path(name), free_port()
         with recorder(folder, scanner_table(port)) as process:
@@ -189,7 +196,7 @@ def stall(seconds: float) -> Figure:
 
 @contextlib.contextmanager
 def serial_port(folder: Path) -> Iterator[int]:
-    """A pseudo-terminal at ``folder``/rover; gives the descriptor to write on."""
+    """Open a pseudo-terminal at ``folder``/rover and yield the descriptor to write to."""
     master, slave = os.openpty()
     tty.setraw(slave)
     (folder / "rover").symlink_to(os.ttyname(slave))
@@ -202,9 +209,9 @@ def serial_port(folder: Path) -> Iterator[int]:
 
 @contextlib.contextmanager
 def other_load(master: int, seconds: float) -> Iterator[list[int]]:
-    """GNSS at 921600 baud through a pty and 1000 CAN frames a second on a udp_multicast bus, all the while.
+    """Send GNSS data at 921600 baud through a pseudo-terminal and 1000 CAN frames a second on a udp_multicast bus.
 
-    The number of frames sent stands in what it gives, afterwards.
+    Yields a list, to which the number of CAN frames sent is appended on exit.
     """
     writer = threading.Thread(target=_write_serial, args=(master, 92160.0, seconds))
     writer.start()
@@ -218,7 +225,10 @@ def other_load(master: int, seconds: float) -> Iterator[list[int]]:
 
 
 def with_others(seconds: float) -> Figure:
-    """A scanner of 20 000 datagrams a second alone, then with the other sensors: what they cost on top."""
+    """Measure what a GNSS receiver and a CAN unit cost in addition to a scanner.
+
+    The scanner sends 20 000 datagrams a second, in a first recording alone, in a second one beside the other sensors.
+    """
     cpu: list[float] = []
     for others in (False, True):
         with tempfile.TemporaryDirectory() as name, serial_port(Path(name)) as master:
@@ -263,7 +273,7 @@ frames()
 
 
 def bare_others(seconds: float) -> float:
-    """CPU percent of reading the same port and bus and writing the bytes to a file."""
+    """Return the CPU percent of reading the same port and bus and writing the bytes to a file."""
     with tempfile.TemporaryDirectory() as name, serial_port(Path(name)) as master:
         command = [sys.executable, "-c", BARE_OTHERS, f"{name}/rover", CAN_GROUP, f"{name}/raw"]
         process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
@@ -280,17 +290,18 @@ def bare_others(seconds: float) -> float:
 
 
 def no_data(seconds: float) -> Figure:
-    """What a recorder costs to which nothing comes."""
+    """Measure what a recorder costs that receives no data."""
     with tempfile.TemporaryDirectory() as name:
         with recorder(Path(name), scanner_table(free_port())) as process:
             before, started = cpu_s(process.pid), time.monotonic()
             time.sleep(seconds)
             cpu = (cpu_s(process.pid) - before) / (time.monotonic() - started) * 100
             memory = rss_mb(process.pid)
-    return Figure("no data at all", 0, 0, cpu, None, memory)
+    return Figure("no data", 0, 0, cpu, None, memory)
 
 
 def _write_serial(fd: int, bytes_per_s: float, seconds: float) -> None:
+    """Write NMEA sentences to a descriptor at a rate, for so many seconds."""
     body = b"PSWTH," + b"x" * 97
     line = b"$%s*%02X\r\n" % (body, functools.reduce(operator.xor, body))
     sent, start = 0, time.monotonic()
@@ -301,7 +312,7 @@ def _write_serial(fd: int, bytes_per_s: float, seconds: float) -> None:
 
 
 def sustained(length: int, rate: float, seconds: float, bare_seconds: float) -> Figure:
-    """Datagrams of one length and rate, beside the building blocks' cost of the same."""
+    """Record datagrams of one length and rate, and add what the bare building blocks cost for the same."""
     figure = record_udp(length, rate, seconds)
     figure.limit_cpu_percent = bare_udp(length, rate, bare_seconds)
     return figure
@@ -318,7 +329,7 @@ LOADS: dict[str, Callable[[float], Figure]] = {
 
 
 def median(runs: list[Figure]) -> Figure:
-    """The run in the middle by its CPU; the losses of all runs stand behind it."""
+    """Return the run with the median CPU; its note lists the losses and the CPU range of all runs."""
     middle = sorted(runs, key=lambda figure: figure.cpu_percent)[len(runs) // 2]
     lost = sum(figure.sent - figure.recorded for figure in runs)
     where = "; ".join(f"{key} {count}" for figure in runs for key, count in figure.lost.items())
@@ -330,12 +341,14 @@ def median(runs: list[Figure]) -> Figure:
 
 
 def main() -> None:
-    """Measure and print."""
+    """Measure and print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seconds", type=float, default=60.0, help="of the sustained loads")
-    parser.add_argument("--only", choices=LOADS, action="append", help="this line of the table")
-    parser.add_argument("--repeats", type=int, default=3, help="runs; the table gives their medians")
-    parser.add_argument("--json", type=Path, help="write the figures here too")
+    parser.add_argument("--seconds", type=float, default=60.0, help="duration of the sustained loads")
+    parser.add_argument(
+        "--only", choices=LOADS, action="append", help="measure only this line of the table; may be repeated"
+    )
+    parser.add_argument("--repeats", type=int, default=3, help="number of runs; the table gives their medians")
+    parser.add_argument("--json", type=Path, help="also write the figures to this file")
     arguments = parser.parse_args()
     chosen = [load for name, load in LOADS.items() if name in (arguments.only or LOADS)]
     runs = [[load(arguments.seconds) for load in chosen] for _ in range(arguments.repeats)]

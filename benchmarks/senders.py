@@ -1,7 +1,7 @@
-"""Load for the acquisition benchmarks, each sender a process of its own: datagrams by sendmmsg(2), CAN.
+"""Send loads for the recording benchmarks, each from a process of its own: datagrams by sendmmsg(2), and CAN frames.
 
 python -m benchmarks.senders udp PORT BYTES RATE SECONDS   prints the number sent and the seconds it took
-python -m benchmarks.senders can CHANNEL RATE SECONDS
+python -m benchmarks.senders can CHANNEL RATE SECONDS      prints the number sent
 """
 
 from __future__ import annotations
@@ -28,7 +28,10 @@ _IOVEC = np.dtype([("base", np.uintp), ("len", np.uintp)])
 
 
 def send_udp(port: int, length: int, rate: float, seconds: float) -> tuple[int, float]:
-    """Send numbered datagrams at a rate; (sent, seconds). Each begins with its number, u64 little-endian."""
+    """Send datagrams at a rate; return the number sent and the seconds it took.
+
+    Each datagram begins with its number, u64 little-endian.
+    """
     rng = np.random.default_rng(1)
     units = rng.integers(0, 256, (_SLOTS, length), dtype=np.uint8)
     numbers = units[:, :8].view("<u8")[:, 0]
@@ -57,7 +60,7 @@ def send_udp(port: int, length: int, rate: float, seconds: float) -> tuple[int, 
 
 
 def send_can(channel: str, rate: float, seconds: float) -> int:
-    """Send numbered 8-byte frames on a udp_multicast bus; frames sent."""
+    """Send numbered 8-byte frames on a udp_multicast bus and return their number."""
     import can
 
     sent, start = 0, time.monotonic()
@@ -71,7 +74,7 @@ def send_can(channel: str, rate: float, seconds: float) -> int:
 
 
 def main() -> None:
-    """Send what the command line says."""
+    """Send the load that the command line asks for, and print the number sent."""
     kind, *rest = sys.argv[1:]
     if kind == "udp":
         print(*send_udp(int(rest[0]), int(rest[1]), float(rest[2]), float(rest[3])))

@@ -1,12 +1,12 @@
-"""A recorder with a full set of sensors for a long time: does anything leak, drift, get lost or said that should not?
+"""Test a recorder with a full set of sensors over a long time for leaks, drift, losses and unexpected events.
 
 python -m benchmarks.soak [--minutes 60] [--rate 0.1] [--keep DIR]
 
-At rate 1: two scanners of 10 000 datagrams/s, GNSS receivers of 921600 and 115200 baud, inertial units of 1000 and
-200 samples/s on CAN, PPS. The rate is that share of all of it but the PPS and the time messages. Every finished part
-is read at once, with the official reader too, and removed (unless kept): the disk does not limit the length. Latency is
-the age of a chunk's oldest message, by the stamp of its arrival, when the chunk can be read; its others are younger.
-Exit status 1 when a check fails.
+At rate 1 the sensors are two scanners of 10 000 datagrams/s, GNSS receivers of 921600 and 115200 baud, inertial units
+of 1000 and 200 samples/s on CAN, and PPS. --rate is the share of these rates at which they send; PPS and time messages
+keep their rate. Every part is read as soon as it is finished, with the official MCAP reader too, and removed unless
+--keep is given, so that the disk does not limit the duration. Latency is the age of a chunk's oldest message, by its
+arrival stamp, when the chunk can be read; all other messages are younger. Exit status 1 if a check fails.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ EXPECTED_EVENTS = {
     "second_known",
     "part_opened",
     "part_closed",
-    "receive_buffer_small",  # of the machine, which need not be set up for flying
+    "receive_buffer_small",  # depends on the machine, whose kernel settings need not be those of an aircraft's
 }
-WARM_UP = 0.2  # share of the run before memory and descriptors are judged
-RSS_GROWTH_MB = 3.0  # from the second third of the rest to its last: a leak of 1 kB a second shows within the hour
-LATER = 1.5  # by which the median latency of the last third may be that of the first
+WARM_UP = 0.2  # share of the run that is left out where memory and descriptors are judged
+RSS_GROWTH_MB = 3.0  # from the second third after the warm-up to the last; an hour shows a leak of 1 kB/s
+LATER = 1.5  # greatest median latency of the last third, in multiples of the first third's
 PERCENTILES = (50.0, 95.0, 99.0, 99.9)
 PARTS = 12  # of a run, so that the index of the growing part rises and falls several times
-PART_MINUTES = 2.0  # at most: the disk holds a part that is read while the next one grows
+PART_MINUTES = 2.0  # at most, as the disk must hold a part that is read beside the one that grows
 
 TABLES = """[session]
 name = "soak"
@@ -87,7 +87,7 @@ CAN_GROUP = "239.74.163.98"
 
 @dataclass
 class Sample:
-    """What the recorder's process holds at one moment."""
+    """The memory and open files of the recorder at one moment."""
 
     seconds: float
     rss_mb: float
@@ -95,12 +95,13 @@ class Sample:
 
 
 class Soak:
-    """One run.
+    """One run of the soak, with all that was found.
 
     Args:
-        folder: for everything.
-        minutes, rate: how long, and the share of the sensors' full rates.
-        keep: leave the parts there.
+        folder: folder for all files.
+        minutes: duration of the run.
+        rate: share of the sensors' full rates.
+        keep: whether parts are left in the folder.
     """
 
     def __init__(self, folder: Path, minutes: float, rate: float, *, keep: bool) -> None:
@@ -130,7 +131,7 @@ class Soak:
         self.journal = ""
 
     def run(self, tell: Callable[[str], None]) -> None:
-        """Record, look every second, read every part that is finished; then end everything."""
+        """Run the recorder, sample its process every second and read every finished part; then stop everything."""
         logs = self._folder / "logs"
         command = [sys.executable, "-m", "swath.daemon.cli.main", "run", str(self._folder / "swath.toml")]
         with (self._folder / "journal.txt").open("w") as journal:
@@ -157,44 +158,48 @@ class Soak:
         self.journal = (self._folder / "journal.txt").read_text()
 
     def _start_as_opened(self, recorder: subprocess.Popen[bytes]) -> None:
-        """Start each sensor once its wire is open: none is silent, and nothing is sent to nobody."""
+        """Start each sensor once its device is open, so that all its data is received from the beginning."""
         journal = self._folder / "journal.txt"
         deadline = time.monotonic() + 60
         waiting = list(self.sensors)
         while waiting:
-            said = journal.read_text()
+            text = journal.read_text()
             if recorder.poll() is not None or time.monotonic() > deadline:
-                raise SystemExit(f"the recorder did not start:\n{said}")
-            for sensor in [sensor for sensor in waiting if f"{sensor.source} device_opened" in said]:
+                raise SystemExit(f"the recorder did not start:\n{text}")
+            for sensor in [sensor for sensor in waiting if f"{sensor.source} device_opened" in text]:
                 sensor.start()
                 waiting.remove(sensor)
             time.sleep(0.05)
 
     def _watch(self, recorder: subprocess.Popen[bytes], tell: Callable[[str], None]) -> None:
+        """Watch the recorder every second until the time is over, or until it or a sensor has failed."""
         start_s, before = time.monotonic(), cpu_s(recorder.pid)
-        told = 0
+        minute = 0
         while (elapsed := time.monotonic() - start_s) < self._minutes * 60:
             if recorder.poll() is not None or any(sensor.failed for sensor in self.sensors):
                 break
             self.samples.append(look(recorder.pid, elapsed))
-            if elapsed // 60 > told:
-                told = int(elapsed // 60)
+            if elapsed // 60 > minute:
+                minute = int(elapsed // 60)
                 self.cpu_percent = (cpu_s(recorder.pid) - before) / elapsed * 100
                 now = self.samples[-1]
-                tell(f"{told} min: {now.rss_mb:.1f} MB, {now.descriptors} files, {self.cpu_percent:.1f} % CPU")
+                tell(f"{minute} min: {now.rss_mb:.1f} MB, {now.descriptors} files, {self.cpu_percent:.1f} % CPU")
             time.sleep(1.0)
         self.cpu_percent = (cpu_s(recorder.pid) - before) / (time.monotonic() - start_s) * 100
 
 
 def look(pid: int, seconds: float) -> Sample:
-    """Memory that is the process's own, and its open files."""
+    """Return the process's own memory and the number of its open files."""
     status = Path(f"/proc/{pid}/status").read_text()
     anonymous_kb = next(int(line.split()[1]) for line in status.splitlines() if line.startswith("RssAnon"))
     return Sample(seconds, anonymous_kb * 1024 / 1e6, len(list(Path(f"/proc/{pid}/fd").iterdir())))
 
 
 def growth(samples: list[Sample]) -> tuple[float, float]:
-    """Megabytes from the second third of the run after its warm-up to the last, and the slope in MB an hour."""
+    """Return how much memory grew, in megabytes, and its slope in megabytes an hour.
+
+    The growth is from the second third of the run after its warm-up to the last third.
+    """
     judged = samples[int(len(samples) * WARM_UP) :]
     third = max(1, len(judged) // 3)
     later, last = judged[third : 2 * third], judged[2 * third :]
@@ -205,7 +210,7 @@ def growth(samples: list[Sample]) -> tuple[float, float]:
 
 
 def problems(soak: Soak) -> list[str]:
-    """Everything that is not as it should be."""
+    """Return a line for each check that failed."""
     wrong = soak.found.wrong + account_problems(soak) + process_problems(soak)
     wrong += [f"event: {event}" for event in soak.found.events if event["code"] not in EXPECTED_EVENTS]
     if (state := soak.found.status.get("gnss/rover", {}).get("time_state")) != "LOCKED":
@@ -214,21 +219,21 @@ def problems(soak: Soak) -> list[str]:
 
 
 def account_problems(soak: Soak) -> list[str]:
-    """Sources of which not all that was sent is in the status and in the log: units, of a serial line bytes."""
+    """Return a line for each source whose counts differ: sent, in the status, in the log (bytes for serial lines)."""
     wrong = []
     for sensor in soak.sensors:
         status = soak.found.status.get(sensor.source, {})
         if sensor.source.startswith("gnss/"):
-            sent, told, in_log = sensor.bytes, status.get("bytes"), soak.found.bytes[sensor.source]
+            sent, recorded, in_log = sensor.bytes, status.get("bytes"), soak.found.bytes[sensor.source]
         else:
-            sent, told, in_log = sensor.sent, status.get("written"), soak.found.units[sensor.source]
-        if sensor.failed is not None or not sent == told == in_log:
-            wrong.append(f"{sensor.source}: {sent} sent, {told} told, {in_log} in the log; {sensor.failed}")
+            sent, recorded, in_log = sensor.sent, status.get("written"), soak.found.units[sensor.source]
+        if sensor.failed is not None or not sent == recorded == in_log:
+            wrong.append(f"{sensor.source}: {sent} sent, {recorded} told, {in_log} in the log; {sensor.failed}")
     return wrong
 
 
 def process_problems(soak: Soak) -> list[str]:
-    """How it ended, and what its process held more and more of."""
+    """Return a line for each fault of the process: its exit status, its memory, files or latency."""
     wrong = [] if soak.exit_status == 0 else [f"the recorder ended with {soak.exit_status}"]
     grown, _ = growth(soak.samples)
     if grown > RSS_GROWTH_MB:
@@ -243,7 +248,7 @@ def process_problems(soak: Soak) -> list[str]:
 
 
 def latencies(ages: list[tuple[float, float]]) -> list[list[float]]:
-    """`PERCENTILES` of the ages of each third of a run, seconds; nothing of a run without chunks."""
+    """Return `PERCENTILES` of the ages (s) in each third of a run; an empty list if there are no chunks."""
     if not ages:
         return []
     at_s, age_s = np.array(ages).T
@@ -253,9 +258,9 @@ def latencies(ages: list[tuple[float, float]]) -> list[list[float]]:
 
 
 def report(soak: Soak) -> None:
-    """The figures."""
+    """Print the figures of the run."""
     found = soak.found
-    print(f"{'source':<14} {'sent':>12} {'in the log':>12} {'MB':>9}  longest pause of its sender")
+    print(f"{'source':<14} {'sent':>12} {'in the log':>12} {'MB':>9}  longest pause of the sender")
     for sensor in soak.sensors:
         print(
             f"{sensor.source:<14} {sensor.sent:>12,} {found.units[sensor.source]:>12,} "
@@ -275,7 +280,7 @@ def report(soak: Soak) -> None:
 
 
 def main() -> int:
-    """Run, report; 0 when nothing is wrong."""
+    """Run the soak and report; return 0 if all checks passed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--rate", type=float, default=0.1, help="share of the sensors' full rates")

@@ -1,4 +1,7 @@
-"""What a soak's recorder has written: read part by part, with both readers, as soon as a part is finished."""
+"""Read the log that a soak's recorder writes, part by part, with swath's reader and the official MCAP reader.
+
+`benchmarks.soak` runs this; it has no command of its own.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,7 @@ from swath.georef.records import ChunkBatch
 
 @dataclass
 class Found:
-    """What is in the parts read so far; parsers go on from one part to the next."""
+    """The contents of all parts read so far; parsers keep their state from one part to the next."""
 
     units: Counter[str] = field(default_factory=Counter)
     bytes: Counter[str] = field(default_factory=Counter)
@@ -30,7 +33,7 @@ class Found:
     parts: int = 0
 
     def read(self, path: Path) -> None:
-        """Read a finished part with both readers, which must agree on the number of messages of every topic."""
+        """Read a finished part with both readers, which must find the same number of messages of every topic."""
         (session,) = open_logs([path])
         if not self.parsers:
             self.parsers, troubles = stored_parsers(session.attachments())
@@ -48,7 +51,7 @@ class Found:
         self.parts += 1
 
     def without_parsers(self) -> Found:
-        """The same with what parsers counted among what is wrong, to be handed to another process."""
+        """Add the parsers' errors to what is wrong, and drop the parsers, which other processes cannot take."""
         for source, parser in self.parsers.items():
             counters = parser.counters
             if counters.errors or counters.bad_checksums or counters.bytes_skipped:
@@ -57,6 +60,7 @@ class Found:
         return self
 
     def _take(self, topic: str, times_ns: Any, units: Any) -> None:
+        """Count the messages of a batch, and parse or check them."""
         source = source_of_topic(topic)
         if source is not None:
             self.units[source] += len(units)
@@ -70,6 +74,7 @@ class Found:
                 self._check_status(topic.removeprefix("/status/"), json.loads(row.tobytes()))
 
     def _check_status(self, source: str, status: dict[str, Any]) -> None:
+        """Keep a status, and check its counts against each other and the log."""
         self.status[source] = status
         accounted = status["written"] + status["lost_kernel"] + status["lost_queue"] + status["lost_write"]
         if status["units"] != accounted or status["written"] != self.units[source]:
@@ -77,7 +82,7 @@ class Found:
 
 
 def is_finished(path: Path) -> bool:
-    """Whether a part has its end."""
+    """Return whether a part ends with the magic bytes of MCAP."""
     with path.open("rb") as file:
         file.seek(0, 2)
         file.seek(max(0, file.tell() - 8))

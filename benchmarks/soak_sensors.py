@@ -1,4 +1,7 @@
-"""A full set of sensors for the soak, each sending at its own rate, counting and numbering what it sends."""
+"""Simulate a full set of sensors for the soak; each sends at its own rate and counts and numbers what it sends.
+
+`benchmarks.soak` runs this; it has no command of its own.
+"""
 
 from __future__ import annotations
 
@@ -28,12 +31,15 @@ LONGEST_SLEEP_S = 0.005
 
 
 class Sensor(threading.Thread, ABC):
-    """Sends what is due, until told to stop.
+    """A thread that sends what is due, until it is stopped.
 
     Attributes:
         source: its name in the log.
-        sent, bytes: units (or, of a serial line, writes) and bytes sent.
-        late_s: the longest that a turn of it came after the one before; says how loaded the machine was.
+        sent: number of units sent, or of writes to a serial line.
+        bytes: number of bytes sent.
+        late_s: longest time between two turns of the thread; shows how loaded the machine was.
+        stop: set it to stop the thread.
+        failed: the error that ended the thread, or None.
     """
 
     def __init__(self, source: str) -> None:
@@ -45,7 +51,7 @@ class Sensor(threading.Thread, ABC):
         self.failed: BaseException | None = None
 
     def run(self) -> None:
-        """Send until told to stop."""
+        """Send until the thread is stopped."""
         start_s = before_s = time.monotonic()
         try:
             while not self.stop.is_set():
@@ -61,14 +67,14 @@ class Sensor(threading.Thread, ABC):
 
     @abstractmethod
     def send_due(self, elapsed_s: float) -> None:
-        """Send what is due so long after the start."""
+        """Send all data due at this time after the start."""
 
     def close(self) -> None:
         """Close the wire."""
 
 
 class Scanner(Sensor):
-    """SREP/1 datagrams with sequence, ticks and CRC right, the rest always the same."""
+    """A scanner of SREP/1 datagrams with correct sequence, ticks and CRC; the ranges are always the same."""
 
     def __init__(self, source: str, port: int, rate_hz: float) -> None:
         super().__init__(source)
@@ -80,7 +86,7 @@ class Scanner(Sensor):
         self._socket.connect(("127.0.0.1", port))
 
     def send_due(self, elapsed_s: float) -> None:
-        """Sequence at byte 8, first_ticks at 32, CRC at the end (PROTOCOLS, SREP/1)."""
+        """Send the datagrams due; sequence is at byte 8, first_ticks at 32, CRC at the end (PROTOCOLS, SREP/1)."""
         while self.sent < elapsed_s * self._rate_hz:
             struct.pack_into("<I", self._datagram, 8, self.sent & 0xFFFFFFFF)
             struct.pack_into("<Q", self._datagram, 32, int(self.sent * TICK_HZ / self._rate_hz))
@@ -94,7 +100,7 @@ class Scanner(Sensor):
 
 
 class Receiver(Sensor):
-    """A GNSS receiver on a pty: ZDA after every second, between them sentences of the maker's own to fill the line."""
+    """A GNSS receiver on a pseudo-terminal: ZDA after every second, and proprietary sentences to fill the line."""
 
     def __init__(self, source: str, link: Path, bytes_per_s: float) -> None:
         super().__init__(source)
@@ -108,7 +114,7 @@ class Receiver(Sensor):
         self.refused = 0
 
     def send_due(self, elapsed_s: float) -> None:
-        """Whole sentences only."""
+        """Send the sentences due, each of them whole."""
         second = int(time.time() - ZDA_DELAY_S)
         if second != self._second:
             self._second = second
@@ -117,6 +123,7 @@ class Receiver(Sensor):
             self._write(self._filler)
 
     def _write(self, data: bytes) -> None:
+        """Write a sentence, and wait while the line is full."""
         while data and not self.stop.is_set():
             try:
                 written = os.write(self._main, data)
@@ -131,16 +138,16 @@ class Receiver(Sensor):
         self.sent += 1
 
     def close(self) -> None:
-        """Nothing: a line that is closed is a device that has gone; `unplug` does that after the recorder's end."""
+        """Leave the line open, because the recorder takes a closed line for a lost device; `unplug` closes it later."""
 
     def unplug(self) -> None:
-        """Close the line."""
+        """Close the line, after the recorder has ended."""
         os.close(self._main)
         os.close(self._secondary)
 
 
 class InertialUnit(Sensor):
-    """Frames of fixtures/config/imu.dbc on a udp_multicast bus, three a sample."""
+    """An inertial unit of fixtures/config/imu.dbc on a udp_multicast bus, three frames a sample."""
 
     def __init__(self, source: str, group: str, port: int, rate_hz: float) -> None:
         super().__init__(source)
@@ -149,7 +156,7 @@ class InertialUnit(Sensor):
         self._bus = can.Bus(interface="udp_multicast", channel=group, port=port)
 
     def send_due(self, elapsed_s: float) -> None:
-        """ACC, GYR, and SAMPLE with the microsecond counter and the counter of samples, which closes it."""
+        """Send ACC and GYR, then SAMPLE, which has the microseconds and the count of samples and ends the sample."""
         while self._samples < elapsed_s * self._rate_hz:
             ticks = int(self._samples * 1e6 / self._rate_hz) & 0xFFFFFFFF
             self._send(257, struct.pack("<hhh", 1, 2, -1962))
@@ -158,18 +165,19 @@ class InertialUnit(Sensor):
             self._samples += 1
 
     def _send(self, identifier: int, data: bytes) -> None:
+        """Send a frame and count it."""
         message = can.Message(arbitration_id=identifier, data=data, is_extended_id=False, timestamp=time.time())
         self._bus.send(message)
         self.sent += 1
         self.bytes += 16
 
     def close(self) -> None:
-        """Leave the bus."""
+        """Leave the bus for good."""
         self._bus.shutdown()
 
 
 class Pulse(Sensor):
-    """An edge at every whole second of the wall clock, into a FIFO."""
+    """A PPS source that writes an edge at every whole second of the wall clock to a FIFO."""
 
     def __init__(self, source: str, fifo: Path) -> None:
         super().__init__(source)
@@ -178,7 +186,7 @@ class Pulse(Sensor):
         self._second = int(time.time())
 
     def send_due(self, elapsed_s: float) -> None:
-        """The edge of the second that has just begun."""
+        """Send the edge of the second that has just begun."""
         second = int(time.time())
         if second != self._second:
             self._second = second
@@ -186,13 +194,13 @@ class Pulse(Sensor):
             self.bytes += os.write(self._fd, b"%d %d\n" % (second * 1_000_000_000, self.sent))
 
     def close(self) -> None:
-        """Nothing: what the recorder has not read yet would be gone."""
+        """Leave the FIFO open, because edges that the recorder has not read yet would be lost."""
 
     def unplug(self) -> None:
-        """Close the FIFO."""
+        """Close the FIFO, after the recorder has ended."""
         os.close(self._fd)
 
 
 def nmea(body: str) -> bytes:
-    """A sentence with its checksum."""
+    """Return a sentence with its checksum."""
     return f"${body}*{functools.reduce(operator.xor, body.encode()):02X}\r\n".encode()

@@ -1,7 +1,8 @@
-"""What looks at a soak's logs beside the senders, each in a process of its own so that no sender waits for it.
+"""Watch the log of a soak from processes of their own, so that no sender waits for the reading.
 
-One reads every part that is finished; one follows the growing part by the heads of its chunks and notes how old
-messages are when they can be read: that is when `swath live` and the status line see them.
+One process reads every finished part. The other follows the growing part by the headers of its chunks and notes how old
+messages are when they can be read, which is when `swath live` and the status line see them. `benchmarks.soak` runs
+this; it has no command of its own.
 """
 
 from __future__ import annotations
@@ -20,13 +21,13 @@ from swath.daemon.log.mcap.scan import OP_CHUNK
 from swath.daemon.log.parts import read_sign
 
 POLL_S = 0.005
-FAR_S = 5.0  # no chunk is as old as this but for a clock that was set
-NICE = 10  # of the reader: senders and recorder come first
+FAR_S = 5.0  # a chunk is this old only if the clock was set
+NICE = 10  # niceness of the reader, so that senders and recorder come first
 _HEAD, _SPAN, _MAGIC_BYTES = struct.Struct("<BQ"), struct.Struct("<QQ"), 8
 
 
 class Watcher:
-    """A process that looks at a directory until it is told to stop, and then gives what it found."""
+    """A process that watches a directory until it is asked for what it found."""
 
     def __init__(self, look: Callable[[Path, bool, Connection], None], directory: Path, *, keep: bool = False) -> None:
         context = multiprocessing.get_context("spawn")
@@ -35,10 +36,10 @@ class Watcher:
         self._process.start()
 
     def found(self) -> Any:
-        """Tell it to stop; what it found.
+        """Stop the process and return what it found.
 
         Raises:
-            EOFError: it has failed.
+            EOFError: the process has failed.
         """
         self._ours.send(None)
         found = self._ours.recv()
@@ -47,7 +48,10 @@ class Watcher:
 
 
 def read_parts(directory: Path, keep: bool, ask: Connection) -> None:
-    """Read parts as they are finished, and remove them unless they are kept; in the end the last one, too."""
+    """Read each part once it is finished, and remove it unless parts are kept.
+
+    When asked, reads the last part too and sends what was found.
+    """
     os.nice(NICE)
     found, asked = Found(), False
     while not asked:
@@ -64,7 +68,10 @@ def read_parts(directory: Path, keep: bool, ask: Connection) -> None:
 
 
 def note_ages(directory: Path, keep: bool, ask: Connection) -> None:
-    """Seconds since the beginning, and age in seconds of the oldest message of each chunk when it was seen whole."""
+    """Record the age of each chunk's oldest message when the chunk is first seen whole.
+
+    When asked, sends a list of times and ages: seconds since the beginning, seconds.
+    """
     ages: list[tuple[float, float]] = []
     begun_s, path, file, at = time.monotonic(), Path(), -1, 0
     while not ask.poll(POLL_S):
@@ -85,7 +92,7 @@ def note_ages(directory: Path, keep: bool, ask: Connection) -> None:
 
 
 def _chunks_from(file: int, at: int, begun_s: float, ages: list[tuple[float, float]]) -> int:
-    """Note the chunks behind a place that are whole; where the next record begins."""
+    """Record the ages of the whole chunks after a position, and return the position of the next record."""
     size = os.fstat(file).st_size
     while at + _HEAD.size <= size:
         opcode, length = _HEAD.unpack(os.pread(file, _HEAD.size, at))
