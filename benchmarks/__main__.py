@@ -1,4 +1,8 @@
-"""All benchmarks, one after the other: ``python -m benchmarks``; each has options of its own, see its ``--help``."""
+"""Run every benchmark that takes minutes, one after the other: ``python -m benchmarks``.
+
+Each module has options of its own, which its ``--help`` lists. Benchmarks that take longer have only their own
+command.
+"""
 
 from benchmarks import (
     acquire,

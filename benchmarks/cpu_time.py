@@ -1,4 +1,7 @@
-"""How long work takes of this process's own CPU time, which other processes' work disturbs least."""
+"""Measure work by this process's own CPU time, which is hardly disturbed by other processes.
+
+The other benchmarks use it; it has no command of its own.
+"""
 
 from __future__ import annotations
 
@@ -8,12 +11,12 @@ from collections.abc import Callable
 
 
 def cpu_seconds(work: Callable[[], object], repeats: int, *, at_least_s: float = 0.0) -> float:
-    """Median over the repeats, after a first time that does not count.
+    """Return the median CPU time of the work over the repeats; a first execution is not counted.
 
     Args:
-        work: is done.
-        repeats: measurements.
-        at_least_s: how long one should take: shorter work is done as often within it.
+        work: what is measured.
+        repeats: number of measurements.
+        at_least_s: least duration of one measurement; shorter work is repeated within it.
     """
     work()
     rounds = 1
@@ -23,6 +26,7 @@ def cpu_seconds(work: Callable[[], object], repeats: int, *, at_least_s: float =
 
 
 def _seconds(work: Callable[[], object], rounds: int) -> float:
+    """Return the CPU seconds of so many rounds of the work."""
     start = time.process_time()
     for _ in range(rounds):
         work()

@@ -1,10 +1,10 @@
-"""What decoding costs on one core, beside the machine's own limit measured in the same run.
+"""Measure what decoding costs on one core, beside a limit of the machine measured in the same run.
 
 python -m benchmarks.decode [--repeats 15] [--json FILE]
 
-Figures are medians over the repeats, items a second of this process's own CPU time. The limit beside each figure is
-the least that any program must do with the same bytes: check them where the protocol has a CRC, touch them
-once, and copy rows of the output's size once. No decoder can be faster; the share says how far ours is from it.
+Figures are items a second of this process's own CPU time, medians over the repeats. The limit beside each figure is the
+least that a program must do with the same bytes: check their CRC where the protocol has one, read them once, and copy
+rows of the output's size once. No decoder can be faster; the share is the decoder's rate over the limit.
 """
 
 from __future__ import annotations
@@ -41,14 +41,14 @@ from swath.drivers.scanner.velodyne.parser import DATA_BYTES, MODE_DUAL, PACKET_
 from swath.georef.records import IMU_DTYPE, RETURN_DTYPE, ByteRows, ChunkBatch, ImuSamples, Record, ScannerReturns
 
 FIXTURES = Path(__file__).parents[1] / "fixtures"
-BATCH_BYTES = 1 << 20  # a chunk of the log
-NO_RECORDING = re.compile(r"\.(md|json|chk|csv|txt)(\.gz)?$")  # what lies beside the recordings
-READ_BYTES = 4096  # one read of a serial port
+BATCH_BYTES = 1 << 20  # of one chunk of the log
+NO_RECORDING = re.compile(r"\.(md|json|chk|csv|txt)(\.gz)?$")  # files beside the recordings
+READ_BYTES = 4096  # of one read of a serial port
 
 
 @dataclass
 class Figure:
-    """One line of the table; rates are items a second of CPU. ``plain`` is without compiled loops, where there are."""
+    """One line of the table; rates are items a second of CPU, ``plain`` is the rate without compiled loops, if any."""
 
     name: str
     item: str
@@ -60,12 +60,12 @@ class Figure:
 
 
 def rate(work: Callable[[], object], items: float, repeats: int) -> float:
-    """Median of items a second of CPU time."""
+    """Return the median of items a second of CPU time."""
     return items / cpu_seconds(work, repeats, at_least_s=0.03)
 
 
 def batches_of(units: ByteRows) -> list[ChunkBatch]:
-    """Rows as the log hands them over: 1 MiB a batch, 31 bytes of message header before each row."""
+    """Return rows as the log delivers them: 1 MiB a batch, 31 bytes of message header before each row."""
     n, length = units.shape
     table = np.zeros((n, length + 31), dtype=np.uint8)
     table[:, 31:] = units
@@ -75,17 +75,18 @@ def batches_of(units: ByteRows) -> list[ChunkBatch]:
 
 
 def copy_rows(dtype: np.dtype[np.void], count: int) -> Callable[[], object]:
-    """Work that copies so many rows of the output once, from and to memory that is already there."""
+    """Return work that copies so many rows of the output once, between arrays that already exist."""
     source, target = np.zeros(count * dtype.itemsize, np.uint8), np.zeros(count * dtype.itemsize, np.uint8)
     return lambda: np.copyto(target, source)
 
 
 def count_rows(records: list[Record]) -> int:
+    """Return the number of returns and samples in the records."""
     return sum(len(record.rows) for record in records if isinstance(record, ScannerReturns | ImuSamples))
 
 
 def decode_all(make: Callable[[], Parser], batches: list[ChunkBatch]) -> int:
-    """Rows a fresh parser gives for all batches, each batch's let go before the next."""
+    """Decode all batches with a new parser and return the number of rows; rows of a batch are not kept."""
     parser = make()
     return sum(count_rows(parser.feed_batch(batch)) for batch in batches)
 
@@ -94,7 +95,10 @@ def decode_all(make: Callable[[], Parser], batches: list[ChunkBatch]) -> int:
 
 
 def srep_units(pulses: int, slots: int, second_share: float) -> ByteRows:
-    """About 4 MB of datagrams: 200 kHz, every pulse with a first return, a share of them with further ones."""
+    """Make about 4 MB of SREP datagrams at a pulse rate of 200 kHz.
+
+    Every pulse has a first return; each further slot is used with the probability `second_share`.
+    """
     random = np.random.default_rng(1)
     header = SrepHeader(flags=5, pps_count=1, pps_ticks=1, prf_mhz=200_000_000)
     length = len(encode_datagram(header, np.zeros(pulses), np.zeros(pulses), np.ones((pulses, slots))))
@@ -110,7 +114,7 @@ def srep_units(pulses: int, slots: int, second_share: float) -> ByteRows:
 
 
 def measure_srep(repeats: int) -> Iterator[Figure]:
-    """SREP in three shapes."""
+    """Measure three kinds of SREP datagrams."""
     polygon = {"type": "polygon", "facets": 4}
     for name, shape, config in (
         ("SREP, 1 return a pulse", (512, 1, 0.0), {}),
@@ -134,7 +138,7 @@ def measure_srep(repeats: int) -> Iterator[Figure]:
 def both_rates(
     make: Callable[[DeviceSettings], Parser], settings: DeviceSettings, units: ByteRows, rows: int, repeats: int
 ) -> tuple[float, float]:
-    """Rates of decoding by compiled loops and without."""
+    """Return the rates of decoding with compiled loops and without."""
     batches = batches_of(units)
     compiled = replace(settings, compiled=True)
     return (
@@ -151,7 +155,7 @@ def head_figure(
     target: float,
     repeats: int,
 ) -> Figure:
-    """A spinning head's packets decoded, beside a copy of the packets and of the rows."""
+    """Measure the decoding of a spinning head's packets, beside a copy of packets and rows."""
     rows = decode_all(lambda: make(settings), batches_of(units))
     copy, taken = copy_rows(RETURN_DTYPE, rows), np.empty(units.shape, np.uint8)
 
@@ -164,7 +168,7 @@ def head_figure(
 
 
 def measure_hesai(repeats: int) -> Iterator[Figure]:
-    """PandarXT-32 and PandarQT, dual return, real packets with a sequence that goes on."""
+    """Measure PandarXT-32 and PandarQT in dual return, with real packets and a continuous sequence."""
     for name, head, recording in (
         ("PandarXT-32, dual return", XT32, "nebula_xt32.pcap.gz"),
         ("PandarQT, dual return", QT64, "nebula_qt64.pcap.gz"),
@@ -178,20 +182,20 @@ def measure_hesai(repeats: int) -> Iterator[Figure]:
 
 
 def velodyne_units(name: str, step_us: float) -> ByteRows:
-    """The data packets of a recording, several times over, with stamps that go on."""
+    """Return a recording's data packets, repeated several times with continuous time stamps."""
     packets = [unit.data for unit in read_pcap(FIXTURES / "velodyne" / name, port=2368)]
     once = np.frombuffer(b"".join(packets), dtype=np.uint8).reshape(-1, DATA_BYTES)
     return with_stamps(np.tile(once, (max(1, 3600 // len(once)), 1)), step_us)
 
 
 def with_stamps(units: ByteRows, step_us: float) -> ByteRows:
-    """Velodyne data packets with stamps that go on."""
+    """Write continuous time stamps into Velodyne data packets."""
     units.view(PACKET_DTYPE)["stamp_us"][:, 0] = np.rint(np.arange(len(units)) * step_us)
     return units
 
 
 def as_dual(units: ByteRows) -> ByteRows:
-    """Single-return packets of one azimuth a block as dual-return ones: each block's returns a pair with the next's."""
+    """Return single-return packets as dual-return ones, in which two neighbouring blocks share an azimuth."""
     dual = units.copy()
     packets = dual.view(PACKET_DTYPE)[:, 0]
     packets["mode"], packets["blocks"]["azimuth"] = (
@@ -202,7 +206,7 @@ def as_dual(units: ByteRows) -> ByteRows:
 
 
 def as_vls128(units: ByteRows) -> ByteRows:
-    """VLP-32C packets as a VLS-128's: four blocks a sequence with one azimuth."""
+    """Return VLP-32C packets as those of a VLS-128, in which four blocks have one azimuth."""
     other = units.copy()
     packets = other.view(PACKET_DTYPE)[:, 0]
     packets["product"], packets["blocks"]["flag"] = VLS128.product_ids[0], VLS128.used_block_flags(dual=False)
@@ -211,7 +215,10 @@ def as_vls128(units: ByteRows) -> ByteRows:
 
 
 def measure_velodyne(repeats: int) -> Iterator[Figure]:
-    """VLP-16 in both modes and VLP-32C, real packets; single ones as dual ones too, VLP-32C's as a VLS-128's."""
+    """Measure VLP-16, VLP-32C and VLS-128 with packets of real recordings.
+
+    Some dual-return packets are made of single-return ones, and those of the VLS-128 of the VLP-32C's.
+    """
     vlp16 = velodyne_units("mrpt_vlp16_gps.pcap.gz", 1327.104)
     vlp32c = velodyne_units("nebula_vlp32.pcap.gz", 663.552)
     for name, head, units in (
@@ -227,7 +234,7 @@ def measure_velodyne(repeats: int) -> Iterator[Figure]:
 
 
 def ouster_units(recording: str, layout: LidarLayout) -> ByteRows:
-    """The first frame of a recording, several times over, with frame numbers, stamps and CRCs that go on."""
+    """Return a recording's first frame, repeated with continuous frame numbers, time stamps and CRCs."""
     per_frame = layout.head.columns_per_frame // layout.head.columns_per_packet
     packets = [unit.data for unit in read_pcap(FIXTURES / "ouster" / f"{recording}.pcap.gz", port=7502)][:per_frame]
     once = np.frombuffer(b"".join(packets), dtype=np.uint8).reshape(per_frame, -1)
@@ -244,7 +251,7 @@ def ouster_units(recording: str, layout: LidarLayout) -> ByteRows:
 
 
 def measure_ouster(repeats: int) -> Iterator[Figure]:
-    """Ouster heads, real packets; those with a header got the CRC that newer firmware sends."""
+    """Measure Ouster heads with real packets; packets with a header get the CRC of newer firmware."""
     for name, recording, metadata in (
         ("Ouster, LEGACY, 32 beams", "OS-1-32-G_v2.1.1_1024x10", "OS-1-32-G_v2.1.1_1024x10"),
         ("Ouster, dual return, 32 beams", "OS-0-32-U1_v2.2.0_1024x10", "OS-0-32-U1_v2.2.0_1024x10"),
@@ -260,7 +267,7 @@ def measure_ouster(repeats: int) -> Iterator[Figure]:
 
 
 def imu_units(samples: int = 20_000) -> ByteRows:
-    """Frames of fixtures/config/imu.dbc as a 1 kHz unit sends them: ACC, GYR, SAMPLE, and SYNC each second."""
+    """Make frames of fixtures/config/imu.dbc as a 1 kHz unit sends them: ACC, GYR, SAMPLE, and SYNC each second."""
     frames = np.zeros((samples, 3), dtype=[("id", "<u4"), ("length", "<u4"), ("data", "u1", 8)])
     frames["id"], frames["length"] = [257, 258, 256], 6
     random = np.random.default_rng(1)
@@ -273,7 +280,7 @@ def imu_units(samples: int = 20_000) -> ByteRows:
 
 
 def measure_can(repeats: int) -> Iterator[Figure]:
-    """CAN frames a second through a DBC: a bus of an IMU alone, and a car's bus with a CANmod.gps on it."""
+    """Measure CAN frames decoded by a DBC: an IMU alone on its bus, and a CANmod.gps on the bus of a car."""
     signals = {
         "specific_force": [f"ACC.acc_{axis}" for axis in "xyz"],
         "angular_rate": [f"GYR.gyr_{axis}" for axis in "xyz"],
@@ -299,7 +306,7 @@ def measure_can(repeats: int) -> Iterator[Figure]:
             np.copyto(taken, units)
             copy()
 
-        # parsers are made once here: reading a DBC file is no part of decoding frames
+        # one parser serves all repeats, because reading a DBC file is not part of decoding frames
         parser = make()
         decode = rate(
             lambda p=parser, b=batches: [p.feed_batch(batch) for batch in b],  # type: ignore[misc]
@@ -313,13 +320,14 @@ def measure_can(repeats: int) -> Iterator[Figure]:
 
 
 def frames_in(path: Path) -> list[Frame]:
+    """Return the frames of a recording, which may be compressed."""
     data = path.read_bytes()
     framer = Framer(GNSS_KINDS, ParserCounters())
     return framer.feed(gzip.decompress(data) if path.suffix == ".gz" else data, 0) + framer.close()
 
 
 def mixed_stream() -> tuple[bytes, int]:
-    """Frames of real UBX, NMEA and RTCM3 recordings dealt out in turn, 2 MB, and how many frames it holds."""
+    """Return 2 MB of real UBX, NMEA and RTCM3 frames in turn, and the number of frames."""
     recordings = [path for kind in ("ubx", "nmea", "rtcm3") for path in sorted((FIXTURES / kind).glob("*"))]
     by_kind: dict[str, list[bytes]] = {}
     for path in recordings:
@@ -327,7 +335,7 @@ def mixed_stream() -> tuple[bytes, int]:
             for frame in frames_in(path):
                 by_kind.setdefault(frame.kind, []).append(frame.data)
     if set(by_kind) != {"ubx", "nmea", "rtcm3"}:
-        raise SystemExit(f"fixtures hold frames of {sorted(by_kind)} only; want ubx, nmea and rtcm3")
+        raise SystemExit(f"fixtures hold frames of {sorted(by_kind)} only; needs ubx, nmea and rtcm3")
     pieces: list[bytes] = []
     size, turn = 0, 0
     while size < 2_000_000:
@@ -339,7 +347,7 @@ def mixed_stream() -> tuple[bytes, int]:
 
 
 def measure_framing(repeats: int) -> Iterator[Figure]:
-    """Framing with checksums of the mixed stream, in reads of 4 KiB."""
+    """Measure the framing of the mixed stream, checksums included, in reads of 4 KiB."""
     stream, count = mixed_stream()
     reads = [stream[at : at + READ_BYTES] for at in range(0, len(stream), READ_BYTES)]
     sync = re.compile(rb"\$|\xb5\x62|\xd3[\x00-\x03]")
@@ -348,7 +356,7 @@ def measure_framing(repeats: int) -> Iterator[Figure]:
         framer = Framer(GNSS_KINDS, ParserCounters())
         found = sum(len(framer.feed(read, 0)) for read in reads) + len(framer.close())
         if found != count:
-            raise SystemExit(f"{found} frames framed of {count}")
+            raise SystemExit(f"{found} frames framed instead of {count}")
         return found
 
     def least() -> None:
@@ -358,16 +366,18 @@ def measure_framing(repeats: int) -> Iterator[Figure]:
 
     name = f"framing, {len(stream) / count:.0f} bytes a frame"
     limit = rate(least, len(stream), repeats)
-    yield Figure(name, "bytes", rate(frame_all, len(stream), repeats), 5e6, limit, "re over the syncs + CRC-32")
+    yield Figure(
+        name, "bytes", rate(frame_all, len(stream), repeats), 5e6, limit, "regular expression over the syncs + CRC-32"
+    )
 
 
 def main() -> None:
-    """Measure and print."""
+    """Measure and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--repeats", type=int, default=15, help="measurements a figure, of which the median counts")
-    parser.add_argument("--json", type=Path, help="write the figures here too")
+    parser.add_argument("--repeats", type=int, default=15, help="measurements per figure; the median counts")
+    parser.add_argument("--json", type=Path, help="also write the figures to this file")
     arguments = parser.parse_args()
-    keep_freed_memory()  # as every command of ours does
+    keep_freed_memory()  # as every command of swath does
     figures = []
     print(f"{'decoding, one core':<30} {'no numba':>9} {'rate':>9} {'asked':>8} {'limit':>9} {'share':>6}  item, limit")
     for measure in (measure_srep, measure_velodyne, measure_hesai, measure_ouster, measure_can, measure_framing):

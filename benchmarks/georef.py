@@ -1,13 +1,14 @@
-"""What georeferencing costs on one core: returns to ECEF, to a mapping frame, with covariances.
+"""Measure what georeferencing costs on one core: returns to ECEF, to a mapping frame, with covariances.
 
 python -m benchmarks.georef [--repeats 7] [--json FILE]
 
-Figures are medians over the repeats, returns a second of this process's own CPU time. Returns of a mirror scanner
-(400 000 a second, ±30°, 1000 m above ground) along a trajectory of 200 Hz that rolls, handed over in batches as a chunk
-of a log gives them, with every parameter of the model set. All rows together fit into the last cache: on the way from a
-log they come from the decoder. The kernel is what makes coordinates of returns; georeferencing makes points with all
-their columns, and says what became of each return. Beside each rate stands what it costs to read as many rows and to
-write as many results once.
+Figures are returns a second of this process's own CPU time, medians over the repeats. A mirror scanner (400 000 returns
+a second, ±30°, 1000 m above ground) moves along a rolling trajectory of 200 Hz. Its returns come in batches of a log's
+chunk, and all parameters of the model are set. All rows together fit into the last cache, as they do when they come
+from the decoder.
+
+The kernel makes coordinates of returns; georeferencing makes points with all their columns and gives each return its
+fate. The limit beside each rate is the cost of reading as many rows and writing as many results once.
 """
 
 from __future__ import annotations
@@ -74,12 +75,12 @@ class Figure:
 
 
 def rate(work: Callable[[], object], repeats: int) -> float:
-    """Median of returns a second of CPU time."""
+    """Return the median of returns a second of CPU time."""
     return PASSES * RETURNS / cpu_seconds(lambda: [work() for _ in range(PASSES)], repeats)
 
 
 def trajectory() -> Trajectory:
-    """A line east at 60 m/s, 200 Hz: roll 2° in 7 s and 0.3° in 0.9 s, pitch and heading less."""
+    """Make a line east at 60 m/s, 200 Hz, with roll of 2° in 7 s and 0.3° in 0.9 s, less pitch and heading."""
     time_s = np.arange(0.0, RETURNS / RATE_HZ + 1.0, 0.005) - 0.5
     roll = np.radians(2.0 * np.sin(2 * np.pi * time_s / 7.0) + 0.3 * np.sin(2 * np.pi * time_s / 0.9))
     pitch = np.radians(1.0 + 0.5 * np.sin(2 * np.pi * time_s / 5.0))
@@ -105,7 +106,11 @@ def trajectory() -> Trajectory:
 
 
 def returns() -> tuple[StructArray, NDArray[np.int64], FloatArray, FloatArray]:
-    """Rows, their GPS times, and the encoder's rate and acceleration: a sine of 50 Hz over flat ground."""
+    """Make returns of a sine of 50 Hz over flat ground.
+
+    Returns:
+        The rows, their GPS times (ns), and the encoder's rate (rad/s) and acceleration (rad/s²).
+    """
     time_s = np.arange(RETURNS) / RATE_HZ
     phase = 2 * np.pi * 50.0 * time_s
     rows = np.zeros(RETURNS, RETURN_DTYPE)
@@ -120,27 +125,27 @@ def returns() -> tuple[StructArray, NDArray[np.int64], FloatArray, FloatArray]:
 
 
 def calibration(names: tuple[str, ...]) -> Calibration:
-    """With these parameters set and the sigmas of a usual adjustment."""
+    """Return a calibration with these parameters set and the sigmas of a usual adjustment."""
     sigmas = np.array([SIGMAS.get(parameter.name, 0.0) for parameter in PARAMETERS])
     changed = nominal("left", np.zeros(3), np.eye(3)).changed(**{name: VALUES[name] for name in names})
     return replace(changed, sigmas=sigmas)
 
 
 class KnownMotion:
-    """The encoder's motion as the flight has it; what it costs to find it from readings is not of these figures."""
+    """The encoder's true motion, because the cost of finding it from readings is not measured here."""
 
     def __init__(self, rate: FloatArray, acceleration: FloatArray) -> None:
         self._rate, self._acceleration = rate, acceleration
 
     def motion(self, rows: StructArray, time_ns: NDArray[np.int64]) -> tuple[FloatArray, FloatArray]:
-        """Of consecutive pulses."""
+        """Return the encoder's rate and acceleration for consecutive pulses."""
         del time_ns
         first = int(rows["pulse_id"][0])
         return self._rate[first : first + len(rows)], self._acceleration[first : first + len(rows)]
 
 
 def measure(repeats: int) -> list[Figure]:
-    """All lines of the table."""
+    """Measure all lines of the table."""
     rows, time_ns, first, second = returns()
     path = trajectory()
     full, basic = calibration(tuple(VALUES)), calibration(BASIC)
@@ -188,7 +193,7 @@ def measure(repeats: int) -> list[Figure]:
 
 
 def least(rows: StructArray) -> None:
-    """Read every row, write a point of 24 bytes and a time of 8 for each."""
+    """Read every row, and write a point of 24 bytes and a time of 8 bytes for each."""
     for at in range(0, RETURNS, BATCH):
         part = rows[at : at + BATCH]
         part.copy()
@@ -196,12 +201,12 @@ def least(rows: StructArray) -> None:
 
 
 def main() -> None:
-    """Measure and print."""
+    """Measure and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--repeats", type=int, default=7, help="measurements a figure, of which the median counts")
-    parser.add_argument("--json", type=Path, help="write the figures here too")
+    parser.add_argument("--repeats", type=int, default=7, help="measurements per figure; the median counts")
+    parser.add_argument("--json", type=Path, help="also write the figures to this file")
     arguments = parser.parse_args()
-    keep_freed_memory()  # as every command of ours does
+    keep_freed_memory()  # as every command of swath does
     figures = measure(arguments.repeats)
     print(f"{'georeferencing, one core':<46} {'rate':>9} {'asked':>8} {'limit':>9}")
     for one in figures:

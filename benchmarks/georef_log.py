@@ -1,16 +1,16 @@
-"""What a return costs on its way from a log to a LAZ file, and to the live georeferencer's products.
+"""Measure what a return costs from the log to a LAZ file, and from the log to the live georeferencer's products.
 
 python -m benchmarks.georef_log [--seconds 70] [--repeats 3] [--log FOLDER] [--live FOLDER] [--json FILE]
 
-A virtual flight of 400 000 pulses a second with an INS in its log is made in a temporary folder, and for the live
-georeferencer another of two scanners of a million each. Figures are medians over the repeats: nanoseconds of this
-process's own CPU time a return. Each block is measured as what a pass takes longer than the one without it; beside
-their sum stands what the whole takes when it is done as `swath georef` does it. Whole runs by the clock on the wall:
-`benchmarks.georef_workers`.
+Two virtual flights are made in a temporary folder: one of 400 000 pulses a second with an INS in its log, and for the
+live georeferencer one of two scanners of a million pulses a second each. Figures are nanoseconds of this process's own
+CPU time a return, medians over the repeats. The figure of a block is the difference between passes with and without it;
+beside the sum of the blocks stands the time of the whole, done as `swath georef` does it. `benchmarks.georef_workers`
+measures whole runs in wall-clock time.
 
-What is asked was stated beside what LASzip alone took on the machine that the limits come from, 250 ns a point, 294
-with three sigmas. Machines differ, and so do minutes: the last column is what is asked in the measure of what LASzip
-takes here, in the same run.
+The column before the last is the limit asked for, stated for a machine on which LASzip alone took 250 ns a point, 294
+with three sigmas. As machines differ, the last column scales that limit by the time that LASzip takes here, in the
+same run.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ from swath.georef.strips import Segment
 from swath.georef.trajectory.buffer import TrajectoryBuffer
 
 CRS = "EPSG:32633"
-SOME_POINTS = 1_000_000  # for what is measured on points that are held: all would not fit into a small memory
-POINT_BYTES = 30  # of format 6, without what stands behind it
+SOME_POINTS = 1_000_000  # kept in memory for the costs of the file; a whole flight needs too much memory
+POINT_BYTES = 30  # of a record of format 6, without extra bytes
 PLAN = """
 [flight]
 name = "bench"
@@ -93,14 +93,14 @@ TWO_HEADS = [SCANNER.format(name=name, prf_hz=1_000_000.0, scan_hz=200.0, pulses
 LIVE_SECONDS = 15.0
 
 
-LASZIP_NS = {False: 250.0, True: 294.0}  # a point, by lazrs alone, where the limits were stated: without, with sigmas
+LASZIP_NS = {False: 250.0, True: 294.0}  # a point, where the limits were stated: without and with sigmas
 
 
 @dataclass
 class Figure:
-    """A line of a table: nanoseconds a return, or a rate; what was asked in the same unit; None: nothing.
+    """One line of a table: a value, and the limit asked for in the same unit, or None.
 
-    ``here`` is what was asked as many times what LASzip takes here as it was of what that took there.
+    ``here`` is that limit scaled by LASzip's time on this machine over its time where the limit was stated.
     """
 
     name: str
@@ -111,7 +111,7 @@ class Figure:
 
 
 class Bench:
-    """One flight's log, and all that can be done with it."""
+    """The log of one flight, with the steps that are measured on it."""
 
     def __init__(self, log: Path, folder: Path, *, sigmas: bool, count: bool = True) -> None:
         self.session: Session = open_logs([log])[0]
@@ -131,15 +131,15 @@ class Bench:
         self.returns = self.decode() if count else 0
 
     def batches(self) -> Iterator[LogBatch]:
-        """Messages of the scanner, in order."""
+        """Yield the scanners' messages, in order."""
         yield from read_chunks(self.index, self.places, lambda topic: topic.startswith(SCANNER_TOPICS), [])
 
     def read(self) -> int:
-        """All chunks, their CRCs checked."""
+        """Read all chunks, check their CRCs and return the number of messages."""
         return sum(len(batch.units) for batch in self.batches())
 
     def decode(self) -> int:
-        """All returns; how many."""
+        """Decode all messages and return the number of returns."""
         parsers, count = self.setup.sources.parsers(("scanner",)), 0
         for batch in self.batches():
             parser = parsers[source_of_topic(batch.channel.topic) or ""]
@@ -148,7 +148,7 @@ class Bench:
         return count
 
     def placed(self, *, whole: bool = True) -> Iterator[Points]:
-        """Points in the mapping frame; not ``whole``: returns with their GPS times only."""
+        """Yield points in the mapping frame; if not ``whole``, give returns GPS times but make no points of them."""
         setup = self.setup
         stream = setup.office_stream(self.clocks.clocks, self.trajectory)
         if not whole:
@@ -162,12 +162,12 @@ class Bench:
             yield points
 
     def pack(self, pieces: list[Points]) -> list[bytes]:
-        """Records of points."""
+        """Return the LAS records of these points."""
         packer = PointPacker(self.las.header(1), 1)
         return [packer.pack(piece, at).tobytes() for piece in pieces for at in range(0, len(piece), BLOCK)]
 
     def job(self) -> None:
-        """Log to LAZ, as a worker does it."""
+        """Write the log to a LAZ file, as a worker does it."""
         first, last = self.index.spans()
         self.path.unlink(missing_ok=True)
         numbers = {name: number for number, name in enumerate(self.setup.scanners)}
@@ -176,18 +176,18 @@ class Bench:
         run_job(plan, Job(0, segment, self.places, self.trajectory, self.path))
 
     def replay(self) -> None:
-        """All of the log through the live georeferencer."""
+        """Replay the whole log through the live georeferencer."""
         replay(self.session, self.setup, self.folder / "live", LiveConfig(), None)
 
     def live_points(self) -> int:
-        """The same without what is shown and told; how many."""
+        """Make the live georeferencer's points without any of its products, and return their number."""
         feed = LogFeed(self.setup, self.setup.live_stream(self.session.info))
         count = sum(len(points) for batch in self.session.batches() for _, points in feed.take(batch))
         return count + sum(len(points) for _, points in feed.close())
 
 
 class _Nothing:
-    """Takes returns where points would be made of them."""
+    """A georeferencer that takes returns and makes no points."""
 
     encoder_motion = None
 
@@ -195,18 +195,20 @@ class _Nothing:
         self._fates = fates
 
     def georeference(self, rows: Any, time_ns: Any, trajectory: Any) -> tuple[Points, Any]:
+        """Return no points, and a fate of 0 for each return."""
         del time_ns, trajectory
         return _no_points(), np.zeros(len(rows), np.uint8)
 
 
 def _no_points() -> Points:
+    """Return an empty set of points."""
     single, byte = np.zeros(0, np.float32), np.zeros(0, np.uint8)
     times, places, beams = np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0, np.uint16)
     return Points(times, places, None, single, single, single, byte, byte, beams, byte)
 
 
 def compress(blocks: list[bytes], extra: int) -> None:
-    """Through LASzip, and nothing else."""
+    """Compress the records with LASzip, without writing them."""
     out = io.BytesIO()
     compressor = lazrs.LasZipCompressor(out, lazrs.LazVlr.new_for_compression(POINT_FORMAT, extra))
     for block in blocks:
@@ -215,12 +217,12 @@ def compress(blocks: list[bytes], extra: int) -> None:
 
 
 def cost(work: Callable[[], object], returns: int, repeats: int) -> float:
-    """Median of nanoseconds of CPU time a return."""
+    """Return the median of nanoseconds of CPU time a return."""
     return cpu_seconds(work, repeats) / returns * 1e9
 
 
 def file_costs(bench: Bench, repeats: int) -> tuple[float, float]:
-    """Nanoseconds a point of making records of points, and of LASzip, over some of the flight's points."""
+    """Return nanoseconds a point of making records and of LASzip, for some of the flight's points."""
     some: list[Points] = []
     for points in bench.placed():
         some.append(points)
@@ -234,7 +236,7 @@ def file_costs(bench: Bench, repeats: int) -> tuple[float, float]:
 
 
 def blocks(bench: Bench, repeats: int) -> list[Figure]:
-    """The blocks of a way to LAZ, their sum and the whole."""
+    """Measure the blocks of the way to a LAZ file, their sum and the whole."""
     sigmas, count = bench.las.sigmas, bench.returns
 
     def ns(work: Callable[[], object]) -> float:
@@ -262,7 +264,7 @@ def blocks(bench: Bench, repeats: int) -> list[Figure]:
 
 
 def live_figures(log: Path, folder: Path, repeats: int) -> list[Figure]:
-    """What a point costs the live georeferencer, by replay of a flight of two million pulses a second."""
+    """Measure what a point costs the live georeferencer, by replay of a flight of two million pulses a second."""
     bench = Bench(log, folder, sigmas=False)
     slower = file_costs(bench, repeats)[1] / LASZIP_NS[False]
     points, live = (cost(work, bench.returns, repeats) for work in (bench.live_points, bench.replay))
@@ -270,24 +272,24 @@ def live_figures(log: Path, folder: Path, repeats: int) -> list[Figure]:
         Figure("log to points", points, "ns"),
         Figure("grid, thinning, live.mcap, status", live - points, "ns", 40.0, 40.0 * slower),
         Figure("all of it", live, "ns", 300.0, 300.0 * slower),
-        Figure("of a core, at 2 M points/s", live / 5.0, "%", 60.0, 60.0 * slower),
+        Figure("share of a core, at 2 M points/s", live / 5.0, "%", 60.0, 60.0 * slower),
     ]
 
 
 def measure(log: Path, live_log: Path, folder: Path, repeats: int) -> dict[str, list[Figure]]:
-    """All tables."""
+    """Measure the figures of all tables."""
     tables: dict[str, list[Figure]] = {}
     for sigmas in (False, True):
         name = "with three sigmas" if sigmas else "without sigmas"
         tables[name] = blocks(Bench(log, folder, sigmas=sigmas), repeats)
     tables["live, by replay, two heads of 1 MHz"] = live_figures(live_log, folder, repeats)
     most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    tables["memory"] = [Figure("most", most, "MB", 1000.0, 1000.0)]
+    tables["memory"] = [Figure("peak", most, "MB", 1000.0, 1000.0)]
     return tables
 
 
 def fly(folder: Path, seconds: float, heads: list[str]) -> Path:
-    """Make a flight's log with these scanners, in a folder that is made."""
+    """Make the log of a flight with these scanners in a new folder, and return the log's path."""
     folder.mkdir()
     (folder / "plan.toml").write_text(PLAN + "".join(heads))
     swath = [sys.executable, "-c", "from swath.daemon.cli.main import main; main()"]
@@ -297,15 +299,17 @@ def fly(folder: Path, seconds: float, heads: list[str]) -> Path:
 
 
 def main() -> None:
-    """Measure and print."""
+    """Measure and print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seconds", type=float, default=70.0, help="of the flight; the first nine are without returns")
-    parser.add_argument("--repeats", type=int, default=3, help="measurements a figure, of which the median counts")
-    parser.add_argument("--log", type=Path, help="a flight made before")
-    parser.add_argument("--live", type=Path, help="a flight of two scanners made before")
-    parser.add_argument("--json", type=Path, help="write the figures here too")
+    parser.add_argument(
+        "--seconds", type=float, default=70.0, help="duration of the flight; its first nine seconds have no returns"
+    )
+    parser.add_argument("--repeats", type=int, default=3, help="measurements per figure; the median counts")
+    parser.add_argument("--log", type=Path, help="use this log instead of making one")
+    parser.add_argument("--live", type=Path, help="use this log of two scanners instead of making one")
+    parser.add_argument("--json", type=Path, help="also write the figures to this file")
     arguments = parser.parse_args()
-    keep_freed_memory()  # as every command of ours does
+    keep_freed_memory()  # as every command of swath does
     with tempfile.TemporaryDirectory() as folder:
         log = arguments.log or fly(Path(folder, "one"), arguments.seconds, ONE_HEAD)
         live = arguments.live or fly(Path(folder, "two"), LIVE_SECONDS, TWO_HEADS)

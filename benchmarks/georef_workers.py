@@ -1,12 +1,11 @@
-"""`swath georef` as a whole, by the clock on the wall, with the start of its processes; beside LASzip alone.
+"""Measure whole runs of `swath georef` in wall-clock time, the start of processes included, beside LASzip alone.
 
 python -m benchmarks.georef_workers [--seconds 159] [--log FOLDER …] [--workers 1 2]
 
-A virtual flight of 400 000 pulses a second (60 million returns in 159 s) is made in a temporary folder, or logs are
-given that were made before: of several sizes, to see that the cost of a return and the memory do not grow with them.
-The flight is georeferenced in four strips, with as many worker processes as asked. Beside it stands what as many
-processes write that do nothing but LASzip at the same time: two of them are not twice as fast as one where a machine's
-two processors are one core's.
+A virtual flight of 400 000 pulses a second (60 million returns in 159 s) is made in a temporary folder, unless --log
+gives logs; logs of several sizes show whether the cost of a return and the memory grow with the size. The flight is
+georeferenced in four strips with each number of worker processes. Beside it stands the rate of as many processes that
+do only LASzip at the same time, because two processes are not twice as fast as one if both processors share one core.
 """
 
 from __future__ import annotations
@@ -31,20 +30,20 @@ from swath.daemon.system import keep_freed_memory
 
 STRIPS = 4
 ASKED = {False: 3.2e6, True: 2.5e6}  # returns a second with two workers: without and with three sigmas
-LIMIT = {False: 8.0e6, True: 6.8e6}  # points a second of LASzip on two cores, where these were stated
+LIMIT = {False: 8.0e6, True: 6.8e6}  # points a second of LASzip on two cores, where the above were stated
 SOME_POINTS = 1_000_000
 
 
 @dataclass(frozen=True)
 class Run:
-    """One run of `swath georef`.
+    """The figures of one run of `swath georef`.
 
     Attributes:
-        points: written.
-        seconds: by the clock on the wall.
-        cpu_ns: a point, of all its processes.
+        points: number of points written.
+        seconds: wall-clock time.
+        cpu_ns: CPU time a point, of all processes.
         most_mb: memory of the largest worker so far.
-        laszip: points a second of as many processes that do nothing else, at once.
+        laszip: points a second of as many processes that do only LASzip at the same time.
     """
 
     points: int
@@ -55,7 +54,7 @@ class Run:
 
 
 def strips_of(bench: Bench, path: Path) -> Path:
-    """A file with the strips: the flight in equal parts."""
+    """Write a file that divides the flight into strips of equal duration, and return its path."""
     first, last = bench.index.spans()
     (device, *_) = bench.clocks.clocks.host.plan.devices.values()
     gps_ns, _ = bench.clocks.clocks.host.gps_from_host(device.clock, np.array([first.min(), last.max()]))
@@ -67,13 +66,13 @@ def strips_of(bench: Bench, path: Path) -> Path:
 
 
 def run(log: Path, strips: Path, folder: Path, workers: int, *, sigmas: bool, laszip: float) -> Run:
-    """Georeference the log."""
+    """Run the georeferencing of the log and return its figures."""
     options = Options(crs=CRS, uncertainty=sigmas)
-    wish = GeorefOptions(
+    georef_options = GeorefOptions(
         [log], folder / "out", options=options, strips=str(strips), workers=workers, sigmas=sigmas, overwrite=True
     )
     before, start = _cpu_seconds(), time.perf_counter()
-    record = georeference(wish, lambda *_: None).record
+    record = georeference(georef_options, lambda *_: None).record
     seconds, cpu = time.perf_counter() - start, _cpu_seconds() - before
     points = sum(strip["points"] for strip in record["strips"])
     most = resource.getrusage(resource.RUSAGE_CHILDREN if workers > 1 else resource.RUSAGE_SELF).ru_maxrss / 1024
@@ -81,7 +80,7 @@ def run(log: Path, strips: Path, folder: Path, workers: int, *, sigmas: bool, la
 
 
 def laszip_rate(blocks: list[bytes], extra: int, processes: int) -> float:
-    """Points a second of processes that compress the same points at the same time."""
+    """Return the points a second of processes that compress the same points at the same time."""
     context = multiprocessing.get_context("fork")
     ready, go = context.Barrier(processes + 1), context.Barrier(processes + 1)
 
@@ -103,7 +102,7 @@ def laszip_rate(blocks: list[bytes], extra: int, processes: int) -> float:
 
 
 def packed_of(bench: Bench) -> tuple[list[bytes], int]:
-    """Records of some of the flight's points, and how many bytes stand behind the format's own."""
+    """Return records of some of the flight's points, and the number of extra bytes in each."""
     some, count = [], 0
     for points in bench.placed():
         some.append(points)
@@ -114,7 +113,7 @@ def packed_of(bench: Bench) -> tuple[list[bytes], int]:
 
 
 def runs(log: Path, folder: Path, numbers: list[int], *, sigmas: bool) -> Iterator[tuple[int, Run]]:
-    """Of one log, by the number of workers."""
+    """Run the georeferencing of a log with each number of workers, and yield the number and the figures."""
     bench = Bench(log, folder, sigmas=sigmas, count=False)
     strips = strips_of(bench, folder / "strips.csv")
     blocks, extra = packed_of(bench)
@@ -124,12 +123,13 @@ def runs(log: Path, folder: Path, numbers: list[int], *, sigmas: bool) -> Iterat
 
 
 def _cpu_seconds() -> float:
+    """Return the CPU seconds of this process and of its children that have ended."""
     used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     return sum(one.ru_utime + one.ru_stime for one in used)
 
 
 def line(one: Run, workers: int, *, sigmas: bool) -> str:
-    """Of the table."""
+    """Return one line of the table."""
     rate = one.points / one.seconds
     asked, share = (f"{ASKED[sigmas] / 1e6:.1f}", f"{ASKED[sigmas] / LIMIT[sigmas]:.2f}") if workers == 2 else ("", "")
     return (
@@ -139,19 +139,21 @@ def line(one: Run, workers: int, *, sigmas: bool) -> str:
 
 
 def main() -> None:
-    """Measure and print."""
+    """Measure and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seconds", type=float, default=159.0, help="of the flight; nine of them are without returns")
-    parser.add_argument("--log", type=Path, nargs="*", default=[], help="flights made before")
+    parser.add_argument(
+        "--seconds", type=float, default=159.0, help="duration of the flight; nine seconds of it have no returns"
+    )
+    parser.add_argument("--log", type=Path, nargs="*", default=[], help="use these logs instead of making one")
     parser.add_argument("--workers", type=int, nargs="*", default=[1, 2])
-    parser.add_argument("--folder", type=Path, help="for the files; otherwise a temporary one")
-    parser.add_argument("--no-sigmas", action="store_true", help="only without sigmas")
+    parser.add_argument("--folder", type=Path, help="parent of the temporary folder; default: that of the system")
+    parser.add_argument("--no-sigmas", action="store_true", help="measure only runs without sigmas")
     arguments = parser.parse_args()
-    keep_freed_memory()  # as every command of ours does
+    keep_freed_memory()  # as every command of swath does
     with tempfile.TemporaryDirectory(dir=arguments.folder) as name:
         folder = Path(name)
         logs = arguments.log or [fly(folder / "flight", arguments.seconds, ONE_HEAD)]
-        print("returns     sigmas workers      s   M/s  asked  CPU ns  most MB  LASzip M/s  share of it  asked")
+        print("returns     sigmas workers      s   M/s  asked  CPU ns  peak MB  LASzip M/s  rate/LASzip  asked")
         for log in logs:
             for sigmas in (False,) if arguments.no_sigmas else (False, True):
                 for workers, one in runs(log, folder, arguments.workers, sigmas=sigmas):

@@ -1,9 +1,10 @@
-"""What ray casting of the virtual aircraft costs on one core: rays a second of CPU, over four kinds of country.
+"""Measure what ray casting of the virtual aircraft costs on one core, over four kinds of country.
 
 python -m benchmarks.raycast [--repeats 5] [--json FILE]
 
-Figures are medians over the repeats. Each ray is a pulse of an oscillating mirror (±30°, 0.5 mrad) 800 m above hills of
-40 m; *limit* is what it costs to read as many origins and directions and to write as many echoes.
+Figures are rays a second of this process's own CPU time, medians over the repeats. Each ray is a pulse of an
+oscillating mirror (±30°, 0.5 mrad) 800 m above hills of 40 m. The limit is the cost of reading as many origins and
+directions and writing as many echoes.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ COUNTRY = {
 
 @dataclass
 class Figure:
-    """One line of the table: rays a second of CPU."""
+    """One line of the table; rates are rays a second of CPU."""
 
     name: str
     rate: float
@@ -58,19 +59,19 @@ class Figure:
 
 
 def rate(work: Callable[[], object], repeats: int) -> float:
-    """Median of rays a second of CPU time."""
+    """Return the median of rays a second of CPU time."""
     return RAYS / cpu_seconds(work, repeats)
 
 
 def scene_of(terrain: str) -> Scene:
-    """Hills with something on them."""
+    """Build the scene of hills with these objects on them."""
     plan = parse_plan(PLAN + terrain, Path())
     corners = HALF_M * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
     return build_scene(plan, Site.at(*plan.tables.flight.origin_deg), corners)
 
 
 def pulses() -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Origins, directions and times: a line flown north at 60 m/s, 100 000 pulses a second, 40 sweeps a second."""
+    """Return origins, directions and times of a line flown north at 60 m/s, 100 000 pulses and 40 sweeps a second."""
     time_s = np.arange(RAYS) / 100_000.0
     angle = np.radians(30.0) * np.sin(2 * np.pi * 40.0 * time_s)
     origin = np.column_stack([np.zeros(RAYS), -150.0 + 60.0 * time_s, np.full(RAYS, 1250.0)])
@@ -78,7 +79,7 @@ def pulses() -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def measure(repeats: int) -> list[Figure]:
-    """All countries."""
+    """Measure all kinds of country."""
     origin, direction, time_s = pulses()
     number = np.arange(RAYS)
 
@@ -103,12 +104,12 @@ def measure(repeats: int) -> list[Figure]:
 
 
 def main() -> None:
-    """Measure and print."""
+    """Measure and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--repeats", type=int, default=5, help="measurements a figure, of which the median counts")
-    parser.add_argument("--json", type=Path, help="write the figures here too")
+    parser.add_argument("--repeats", type=int, default=5, help="measurements per figure; the median counts")
+    parser.add_argument("--json", type=Path, help="also write the figures to this file")
     arguments = parser.parse_args()
-    keep_freed_memory()  # as every command of ours does
+    keep_freed_memory()  # as every command of swath does
     figures = measure(arguments.repeats)
     print(f"{'ray casting, one core':<30} {'rate':>9} {'asked':>8} {'limit':>9}")
     for one in figures:
