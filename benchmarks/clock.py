@@ -1,9 +1,9 @@
-"""How good the host's clock model is, and what it costs: simulated oscillators, edges and messages.
+"""Measure the errors of the host's clock model, and its cost, with simulated oscillators, edges and messages.
 
 python -m benchmarks.clock [--seconds 5400] [--seeds 3]
 
-Beside the model's error stands that of a robust line over fixed windows of 16, 64 and 256 edges on the same stamps. The
-first 15 min of each run are left out (noise and wander are being learnt).
+Beside the model's error stands the error of a robust line over fixed windows of 16, 64 and 256 edges of the same
+stamps. The first 15 min of each run are left out, because the model still learns noise and wander then.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Floats = NDArray[np.float64]
 
 
 def window_errors(simulation: Simulation, window: int) -> Floats:
-    """Errors (ns) in the middle of the next second of a robust line over a fixed window, every 20 s."""
+    """Return the errors (ns) of a robust line over a fixed window, half a second ahead, every 20 s."""
     stamps = [(host, simulation.true_gps_ns(host)) for host, kind, _, _ in simulation if kind == "edge"]
     seconds = np.array([round(gps / 1e9) for _, gps in stamps], dtype=np.int64)
     near = np.array([abs(gps - round(gps / 1e9) * 10**9) < 2_000_000 for _, gps in stamps])
@@ -49,7 +49,7 @@ def window_errors(simulation: Simulation, window: int) -> Floats:
 
 
 def settled(outcome: Outcome) -> tuple[Floats, Floats, Floats, Floats]:
-    """Locked errors and sigmas, errors and sigmas ahead, after the first LEARNING_S."""
+    """Return locked errors, their sigmas, errors ahead and their sigmas, all after the first LEARNING_S."""
     skip = next(k for k, second in enumerate(outcome.seconds) if second >= LEARNING_S)
     columns = (outcome.errors_ns, outcome.sigmas_ns, outcome.ahead_errors_ns, outcome.ahead_sigmas_ns)
     locked, sigma, ahead, ahead_sigma = (np.array(column[skip:]) for column in columns)
@@ -57,7 +57,7 @@ def settled(outcome: Outcome) -> tuple[Floats, Floats, Floats, Floats]:
 
 
 def row(noise_ns: float, ramps: bool, seconds: int, seeds: int) -> str:
-    """One line of the table."""
+    """Return one line of the table."""
     runs = [
         Simulation(START, Oscillator(seconds, seed=seed, ramps=ramps), Edges(noise_ns=noise_ns), [sender], seed=seed)
         for seed in range(seeds)
@@ -76,7 +76,7 @@ def row(noise_ns: float, ramps: bool, seconds: int, seeds: int) -> str:
 
 
 def cost_us(seconds: int = 3000) -> tuple[float, float]:
-    """CPU time (µs) of one second (an edge and four messages), and of one status."""
+    """Return the CPU time (µs) of one second (an edge and four messages), and that of one status."""
     senders = [Sender(name, utc_tag(18), delay_s=0.1 + 0.01 * k) for k, name in enumerate(("RMC", "ZDA", "GGA", "GST"))]
     events = list(Simulation(START, Oscillator(seconds), Edges(), senders))
     clock = PpsClock(18)
@@ -94,7 +94,7 @@ def cost_us(seconds: int = 3000) -> tuple[float, float]:
 
 
 def main() -> None:
-    """Print the table."""
+    """Measure and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seconds", type=int, default=5400)
     parser.add_argument("--seeds", type=int, default=3)

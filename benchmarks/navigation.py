@@ -1,11 +1,11 @@
-"""What navigating costs on one core, beside python-ins on the same samples, and how good it is.
+"""Measure what navigation costs on one core, beside python-ins on the same samples, and how large its errors are.
 
 python -m benchmarks.navigation [--repeats 5] [--json FILE]
 
-The reference flight (tactical unit, 200 Hz, positions at 1 Hz, 21 error states), medians of this process's own CPU time
-over the repeats; python-ins, of which a minute is enough, once. "Filter and smoother" has the covariance of every
-sample; "solved" has the noise found and further passes in it. Sample by sample is how they are fed live, a fix a second
-among them. Below stand the figures of both flights.
+The reference flight has a tactical unit (200 Hz), positions at 1 Hz and 21 error states. Figures are samples a second
+of this process's own CPU time, medians over the repeats; python-ins runs once, over a minute of the flight. "Filter and
+smoother" computes the covariance of every sample; "solved" also finds the noise and makes further passes. "Sample by
+sample" feeds the filter as in flight. The second table has the errors of both reference flights.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ LIVE_SAMPLES = 20_000
 
 @dataclass
 class Figure:
-    """One line of the speed's table."""
+    """One line of the table of speeds."""
 
     name: str
     samples_per_s: float
@@ -60,13 +60,13 @@ class Figure:
 
 
 def flight_of(name: str) -> Flight:
-    """A reference flight, positions only."""
+    """Return a reference flight with positions only."""
     flown = reference(name)
     return flown.inertial, flown.only(Kind.POSITION), flown.setup, start_of("reference_flight", name)
 
 
 def speeds(flight: Flight, repeats: int) -> list[Figure]:
-    """All lines of it."""
+    """Measure all lines of the table of speeds."""
     inertial, rows, setup, start = flight
     count = int(np.count_nonzero(inertial.time_ns > start.time_ns))
 
@@ -85,7 +85,7 @@ def speeds(flight: Flight, repeats: int) -> list[Figure]:
 
 
 def live(flight: Flight) -> float:
-    """Samples a second, each fed alone."""
+    """Return the samples a second of a filter that gets each sample alone."""
     inertial, rows, setup, start = flight
     machine = NavigationFilter(setup, start, smoothed=False, hold_s=0.3)
     machine.observe(rows)
@@ -98,7 +98,11 @@ def live(flight: Flight) -> float:
 
 
 def of_pyins(flight: Flight) -> list[tuple[str, float, int]]:
-    """Its filter over a minute of the flight: without a smoother, with the same errors of sensors."""
+    """Run the filter of python-ins over a minute of the flight, with the same sensor errors and without a smoother.
+
+    Returns:
+        Name, CPU seconds and number of samples.
+    """
     inertial, rows, setup, start = flight
     first = int(np.searchsorted(inertial.time_ns, start.time_ns, side="right"))
     part = inertial.between(first, first + round(PYINS_S * 200))
@@ -129,7 +133,7 @@ def of_pyins(flight: Flight) -> list[tuple[str, float, int]]:
 
 
 def quality(name: str) -> dict[str, Any]:
-    """RMS on the lines, and of outages, of filter and smoother."""
+    """Return the RMS errors on the lines and in outages, of filter and smoother."""
     inertial, rows, setup, start = flight_of(name)
     found: dict[str, Any] = {}
     solved = solve(inertial, rows, setup, start)
@@ -146,7 +150,7 @@ def quality(name: str) -> dict[str, Any]:
 
 
 def show(figures: list[Figure], found: dict[str, dict[str, Any]]) -> None:
-    """Print the tables."""
+    """Print the two tables."""
     print(f"{'navigation, 200 Hz, one core':<36} {'samples/s':>10} {'asked':>9}")
     for one in figures:
         asked = f"{one.asked:>9,.0f}" if one.asked else ""
@@ -163,10 +167,10 @@ def show(figures: list[Figure], found: dict[str, dict[str, Any]]) -> None:
 
 
 def main() -> None:
-    """Measure and print."""
+    """Measure and print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--repeats", type=int, default=5, help="measurements a figure, of which the median counts")
-    parser.add_argument("--json", type=Path, help="write the figures here too")
+    parser.add_argument("--repeats", type=int, default=5, help="measurements per figure; the median counts")
+    parser.add_argument("--json", type=Path, help="also write the figures to this file")
     arguments = parser.parse_args()
     figures = speeds(flight_of("tactical"), arguments.repeats)
     found = {name: quality(name) for name in ("tactical", "mems")}

@@ -1,25 +1,27 @@
-"""Whether sigmas are what errors are, over many flights: NEES of position, velocity, attitude; innovations.
+"""Test whether navigation's sigmas agree with its errors over many flights: NEES of position, velocity and attitude.
 
 python -m benchmarks.navigation_honesty [--seeds 50] [--receivers [NAME …] | --lasting | --headings [GRADE …]]
 
-Made flights of ten minutes at 60 m/s, 50 Hz, fixes at 1 Hz with white errors and with errors that last a minute (70 %
-of the variance), the filter told of it. Truth and inertial samples are the simulator's. The interval is that of χ² at
-99.8 % with as many independent samples as the flights' own scatter shows (`tests.georef.navigation.honesty`). Of
-innovations there is the second moment and the largest correlation of neighbours beside its one sigma.
+Virtual flights of ten minutes at 60 m/s, 50 Hz, have fixes at 1 Hz, with white errors or with errors of which 70 % of
+the variance lasts a minute; the filter knows the share. Truth and inertial samples come from the simulator. The
+interval is that of χ² at 99.8 %, for as many independent samples as the scatter between flights shows
+(`tests.georef.navigation.honesty`). For innovations, the second moment is printed, and the largest correlation of
+neighbours with its one-sigma bound.
 
-``--receivers``: instead of that, receivers whose sigmas are true, too small by 3, too large by 3, or not told at all
-(`tests.georef.navigation.receivers`), half of their variance lasting a minute; `solve` is not told which. Beside the
-NEES of what it makes, there is the largest ratio of its errors, RMS over the flights, to those of the smoother that
-knows; and, as "known", the NEES of that smoother on the same flights, which shows what their draws amount to. A flight
-is drawn once for the three sigmas, and takes some 2 s.
+``--receivers`` flies other receivers instead (`tests.georef.navigation.receivers`): their sigmas are true, too small by
+3, too large by 3, or missing, and half of their variance lasts a minute; `solve` does not know which. Beside the NEES
+of its solution stands the largest ratio of its RMS errors over the flights to those of a smoother that knows the noise.
+The lines "known" have the NEES of that smoother on the same flights, which shows the effect of the random draws. A
+flight is drawn once for the three kinds of sigmas, and takes some 2 s.
 
-``--lasting``: instead of that, the UBX receiver with the tactical unit where another part of the positions' variance
-lasts than `solve` assumes, or for another time: NEES of position, errors over those of the smoother that knows, and
-sigmas over that smoother's, RMS, the worst of three components and all three together.
+``--lasting`` flies the UBX receiver with the tactical unit, where another share of the positions' variance lasts than
+`solve` assumes, or for another time. Printed are the NEES of position; the RMS errors over those of the smoother that
+knows the noise, for the worst component; and the RMS sigmas over that smoother's, for all three components together.
 
-``--headings``: instead of that, the UBX receiver with a second antenna that tells headings to 0.1° at 5 Hz, on lines of
-90 s, sigmas true, too small by 3, too large by 3: NEES of attitude, and errors and sigmas over those of the smoother
-that knows, RMS, the largest of roll, pitch and heading, and of heading alone. A flight takes some 10 s.
+``--headings`` flies the UBX receiver with a second antenna that measures headings to 0.1° at 5 Hz, on lines of 90 s,
+with sigmas that are true, too small by 3 or too large by 3. Printed are the NEES of attitude; the RMS errors over those
+of the smoother that knows the noise, for the worst of roll, pitch and heading and for heading alone; and the RMS sigmas
+of heading over that smoother's. A flight takes some 10 s.
 """
 
 from __future__ import annotations
@@ -39,18 +41,18 @@ from tests.georef.navigation.honesty import judge, squares
 from tests.georef.navigation.receivers import DUAL_ANTENNAS, RECEIVERS, compared
 
 ARM = np.array([0.35, -0.12, -1.1])
-LASTING = ((0.5, 60.0), (0.0, 60.0), (0.2, 60.0), (0.5, 10.0), (0.5, 300.0))  # share, s
+LASTING = ((0.5, 60.0), (0.0, 60.0), (0.2, 60.0), (0.5, 10.0), (0.5, 300.0))  # lasting share of the variance, time in s
 OPTIMISMS = {"honest": 1.0, "optimistic by 3": 3.0, "pessimistic by 3": 1.0 / 3.0}
 
 
 @cache
 def flight() -> Truth:
-    """Ten minutes of it."""
+    """Make the true flight of ten minutes."""
     return fly(survey(), 600.0, 50.0)
 
 
 def flown(grade: str, share: float, seed: int) -> tuple[Solution, Solution]:
-    """Filtered and smoothed."""
+    """Return the filtered and the smoothed solution of a flight with the errors of this seed."""
     inertial, rows = noised(flight(), GRADES[grade], Fixes(share=share, tau_s=60.0), ARM, seed)
     setup = replace(setup_for(GRADES[grade], ARM), gnss_correlated_share=share, position_floor_m=0.001)
     run = run_filter(inertial, rows, setup, drawn_start(flight(), seed))
@@ -58,7 +60,7 @@ def flown(grade: str, share: float, seed: int) -> tuple[Solution, Solution]:
 
 
 def with_receivers(names: list[str], seeds: int) -> None:
-    """Fly receivers of all kinds with both units, and print a line each."""
+    """Fly these receivers with both inertial units, and print a line for each kind."""
     heads = "".join(f"{part:>30}" for part in ("position", "velocity", "attitude"))
     print(f"{'NEES (99.8 %), ' + str(seeds) + ' flights':<30}{heads}   error / best: position, velocity, attitude")
     for name in names:
@@ -72,16 +74,16 @@ def with_receivers(names: list[str], seeds: int) -> None:
                     errors[words] += one.squares(flight())
                 found["known"].append(squares(flight(), one.best, 5.0, 0.5))
             for words, squared in found.items():
-                told = "".join(f"{of.mean:>12.3f} ({of.low:.3f} … {of.high:.3f})" for of in judge(squared).values())
+                nees = "".join(f"{of.mean:>12.3f} ({of.low:.3f} … {of.high:.3f})" for of in judge(squared).values())
                 worst = ""
                 if words in errors:
                     ratio = np.sqrt(errors[words][0] / errors[words][1]).reshape(3, 3).max(axis=1)
                     worst = "".join(f"{value:>8.3f}" for value in ratio)
-                print(f"{f'{name}, {grade}, {words}':<34}{told}  {worst}", flush=True)
+                print(f"{f'{name}, {grade}, {words}':<34}{nees}  {worst}", flush=True)
 
 
 def with_lasting(seeds: int) -> None:
-    """Fly a receiver whose errors last otherwise than is assumed, and print a line each."""
+    """Fly a receiver whose errors last for other times than assumed, and print a line for each."""
     receiver = RECEIVERS["UBX"]
     print(f"{'NEES (99.8 %), ' + str(seeds) + ' flights':<30}{'position':>24}   known   error / best   sigma / best")
     for share, tau_s in LASTING:
@@ -94,12 +96,12 @@ def with_lasting(seeds: int) -> None:
             for row, solution in enumerate((one.solved.smoothed, one.best)):
                 found[row].append(squares(flight(), solution, 5.0, 0.5))
                 variances[row] += np.square(solution.position_sigma_l).mean(axis=0)
-        told, known = (judge(squared)["position"] for squared in found)
+        solved, known = (judge(squared)["position"] for squared in found)
         ratio = float(np.sqrt(errors[0] / errors[1])[:3].max())
         wider = float(np.sqrt(variances[0].sum() / variances[1].sum()))
-        interval = f"({told.low:.2f} … {told.high:.2f})"
+        interval = f"({solved.low:.2f} … {solved.high:.2f})"
         print(
-            f"{f'{share:.0%} lasting {tau_s:.0f} s':<30}{told.mean:>8.2f} {interval}{known.mean:>8.2f}{ratio:>15.3f}"
+            f"{f'{share:.0%} lasting {tau_s:.0f} s':<30}{solved.mean:>8.2f} {interval}{known.mean:>8.2f}{ratio:>15.3f}"
             f"{wider:>15.2f}",
             flush=True,
         )
@@ -107,12 +109,12 @@ def with_lasting(seeds: int) -> None:
 
 @cache
 def long_lines() -> Truth:
-    """Ten minutes of lines of 90 s, and turns of a minute between them: headings show in turns only."""
+    """Make a true flight of ten minutes with lines of 90 s; only the turns between them show the heading."""
     return fly(survey(line_s=150.0), 600.0, 50.0)
 
 
 def with_headings(grades: list[str], seeds: int) -> None:
-    """Fly a receiver with two antennas whose headings err in several ways, and print a line each."""
+    """Fly receivers with two antennas and several kinds of heading errors, and print a line for each."""
     head = f"{'NEES (99.8 %), ' + str(seeds) + ' flights':<50}{'attitude':>24}"
     print(f"{head}   errors / best: worst, heading   sigma / best")
     for grade in grades:
@@ -139,12 +141,17 @@ def with_headings(grades: list[str], seeds: int) -> None:
 
 
 def main() -> None:
-    """Fly and print."""
+    """Fly and print the table of the chosen kind."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=50, help="flights of each kind")
-    parser.add_argument("--receivers", nargs="*", choices=RECEIVERS, help="these receivers (none named: all)")
-    parser.add_argument("--lasting", action="store_true", help="errors that last otherwise than is assumed")
-    parser.add_argument("--headings", nargs="*", choices=("tactical", "mems"), help="two antennas (none named: both)")
+    parser.add_argument("--receivers", nargs="*", choices=RECEIVERS, help="fly these receivers; without a name, all")
+    parser.add_argument("--lasting", action="store_true", help="fly errors that last for other times than assumed")
+    parser.add_argument(
+        "--headings",
+        nargs="*",
+        choices=("tactical", "mems"),
+        help="fly two antennas with these grades; without a name, both",
+    )
     arguments = parser.parse_args()
     if arguments.receivers is not None:
         with_receivers(arguments.receivers or list(RECEIVERS), arguments.seeds)
@@ -163,9 +170,9 @@ def main() -> None:
                 ahead, behind = flown(grade, share, seed)
                 filtered.append(squares(flight(), ahead, 60.0, 0.5))
                 smoothed.append(squares(flight(), behind, 5.0, 0.5))
-                told = ahead.innovations[ahead.innovations["fate"] <= Fate.REACQUIRED]["normalised"][30:]
-                moments.append(np.mean(told**2))
-                neighbours.append((told[1:] * told[:-1]).mean(axis=0) / (told**2).mean(axis=0))
+                innovations = ahead.innovations[ahead.innovations["fate"] <= Fate.REACQUIRED]["normalised"][30:]
+                moments.append(np.mean(innovations**2))
+                neighbours.append((innovations[1:] * innovations[:-1]).mean(axis=0) / (innovations**2).mean(axis=0))
             name = f"{grade}, {'lasting' if share else 'white'}"
             for what, flights in (("filtered", filtered), ("smoothed", smoothed)):
                 for part, of in judge(flights).items():
@@ -175,7 +182,7 @@ def main() -> None:
                         f"{name + ', ' + what:<28}{part:<10} {of.mean:>6.3f} {text:>14} {of.independent:>12,.0f}{mark}"
                     )
             alike = float(np.abs(np.mean(neighbours, axis=0)).max())
-            chance = 1.0 / np.sqrt(arguments.seeds * len(told))
+            chance = 1.0 / np.sqrt(arguments.seeds * len(innovations))
             print(f"{name}: innovations' second moment {np.mean(moments):.3f}, neighbours {alike:.4f} ± {chance:.4f}")
 
 
