@@ -1,11 +1,11 @@
-"""What the adjustment of a calibration costs on one core: 10 million points on 1000 planes, 15 parameters.
+"""Measure what the adjustment of a calibration costs on one core: 10 million points on 1000 planes, 15 parameters.
 
 OPENBLAS_NUM_THREADS=1 python -m benchmarks.adjustment [--points 10000000] [--planes 1000] [--json FILE]
 
-Figures are of this process's own CPU time. A pass over the rows places every return with the calibration of the moment,
-makes its row of the design and adds it to the normal equations; beside it stands what it costs to place the returns
-with their axes, and to multiply rows of this width with themselves, each once: no pass is quicker than both together.
-The memory is the process's greatest over what it has with the flight's returns, which are mapped from files.
+Times are CPU time of this process. A pass over the rows places every return with the current calibration, makes its
+row of the design matrix and adds it to the normal equations. Two limits stand beside it, each measured once: placing
+the returns with their axes, and multiplying rows of this width with themselves. A pass cannot take less time than both
+together. Memory is the peak of the process above what it holds with the flight's returns, which are mapped from files.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ TRUTH = {"omega_rad": 0.0037, "phi_rad": -0.0061, "kappa_rad": 0.0021, "range_of
 
 @dataclass
 class Figures:
-    """Of a run; rates are rows a second of CPU time."""
+    """All figures of a run; rates are rows a second of CPU time."""
 
     rows: int
     parameters: int
@@ -63,7 +63,7 @@ class Figures:
 
 
 def plane_table(count: int) -> list[tuple[FloatArray, FloatArray]]:
-    """Centres and normals: four in five lean by 35°, in any direction."""
+    """Return centres and normals of planes: four in five are inclined by 35°, each in a random direction."""
     g, planes = np.random.default_rng(SEED), []
     for index in range(count):
         slope, aspect = np.radians(35.0 if index % 5 else 0.0), g.uniform(0.0, 2.0 * np.pi)
@@ -73,14 +73,14 @@ def plane_table(count: int) -> list[tuple[FloatArray, FloatArray]]:
 
 
 def mapped(folder: Path, name: str, array: NDArray[Any]) -> NDArray[Any]:
-    """The array from a file."""
+    """Save the array to a file and return it mapped from there."""
     np.save(folder / f"{name}.npy", array)
     loaded: NDArray[Any] = np.load(folder / f"{name}.npy", mmap_mode="r")
     return loaded
 
 
 def make(folder: Path, points: int, planes: int) -> tuple[Flight, Features]:
-    """Eight lines over the planes, with noise."""
+    """Make noisy returns of eight flight lines on the planes, and the features that hold them."""
     table, flown, g = plane_table(planes), trajectory(), np.random.default_rng(SEED)
     start: Calibration = nominal("left", (0.15, -0.08, 0.42), np.eye(3))
     truth = start.changed(**TRUTH)
@@ -112,26 +112,26 @@ def make(folder: Path, points: int, planes: int) -> tuple[Flight, Features]:
 
 
 def cpu(work: Any) -> tuple[float, Any]:
-    """Seconds, and what came of it."""
+    """Return the CPU seconds that the work takes, and its result."""
     begin = time.process_time()
     result = work()
     return time.process_time() - begin, result
 
 
 def measure(flight: Flight, features: Features) -> Figures:
-    """All figures."""
+    """Measure the passes, the adjustment and its memory."""
     prior = gauss_markov(flight, Taus(), 5.0)
-    wish = ParameterOptions("full", priors=PRIORS)
+    options = ParameterOptions("full", priors=PRIORS)
     part = Features(tuple(replace(plane, patches=plane.patches[:2]) for plane in features.planes[:4]))
-    adjust(flight, part, wish, prior)  # compiles
-    rows = Rows(flight, features.planes, unknowns(flight, wish), prior)
+    adjust(flight, part, options, prior)  # compile the loops before anything is measured
+    rows = Rows(flight, features.planes, unknowns(flight, options), prior)
     state, weight = rows.start(), np.ones(rows.count, np.float32)
     pass_s, _ = cpu(lambda: rows.summed(state, weight, 0.0))
     placed_s, _ = cpu(lambda: [None for _ in rows.placed(state)])
     panel = np.random.default_rng(1).normal(size=(len(rows.unknowns) + 12, 256))
     product_s, _ = cpu(lambda: [panel @ panel.T for _ in range(1000)])
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    adjust_s, found = cpu(lambda: adjust(flight, features, wish, prior))
+    adjust_s, found = cpu(lambda: adjust(flight, features, options, prior))
     done: Adjusted = found
     extra = 1024 * (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
     return Figures(
@@ -148,15 +148,15 @@ def measure(flight: Flight, features: Features) -> Figures:
 
 
 def main() -> None:
-    """Print the table."""
+    """Measure and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
     parser.add_argument("--points", type=int, default=10_000_000)
     parser.add_argument("--planes", type=int, default=1000)
     parser.add_argument("--json", type=Path)
-    wish = parser.parse_args()
+    arguments = parser.parse_args()
     keep_freed_memory()
     with tempfile.TemporaryDirectory() as folder:
-        figures = measure(*make(Path(folder), wish.points, wish.planes))
+        figures = measure(*make(Path(folder), arguments.points, arguments.planes))
     limit = 1.0 / (1.0 / figures.placed_rate + 1.0 / figures.product_rate)
     print(f"{figures.rows:,} rows, {figures.parameters} parameters, {figures.unknowns} unknowns with the trajectory's")
     wanted = f"want {TARGET_ROWS / 1e6:.0f}, limit {limit / 1e6:.2f}"
@@ -165,8 +165,8 @@ def main() -> None:
     print(f"  products    {figures.product_rate / 1e6:8.2f} M rows/s")
     print(f"adjustment    {figures.adjust_s:8.2f} s          want {TARGET_S:.0f}; {figures.iterations} linearisations")
     print(f"memory        {figures.extra_bytes / 1e6:8.0f} MB         want {TARGET_BYTES / 1e6:.0f} at most")
-    if wish.json:
-        wish.json.write_text(json.dumps(asdict(figures), indent=1))
+    if arguments.json:
+        arguments.json.write_text(json.dumps(asdict(figures), indent=1))
 
 
 if __name__ == "__main__":

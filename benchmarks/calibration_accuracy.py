@@ -1,13 +1,16 @@
-"""Whether a calibration is as good as it says, with the virtual aircraft's truth: over many runs, and end to end.
+"""Test the sigmas of a calibration against the virtual aircraft's truth, over many runs and over whole flights.
 
 python -m benchmarks.calibration_accuracy --runs 400 [--flight FOLDER] [--rows 200000] [--json FILE]
 python -m benchmarks.calibration_accuracy --seeds 5 [--json FILE]
 
-`--runs`: observations are made anew in every run (`benchmarks.calibration_runs`), with what the sensors' noise and the
-smoothed trajectory's own covariance say, and adjusted from what the papers say. NEES is the mean square of a
-parameter's error in its sigmas, coverage how often the truth lies within 1.96 of them. `--seeds`: whole flights of the
-preset `calibration`, with their own noise of every sensor, through `swath sim fly` and `swath calibrate` from the logs
-alone. All follows from the master seed in calibration_seed.toml. Exit status 1 where a limit is not kept.
+`--runs`: every run draws new observations (`benchmarks.calibration_runs`), with the sensors' noise and the covariance
+of the smoothed trajectory, and adjusts them; it starts from the nominal installation. NEES is the mean square of a
+parameter's error divided by its sigma; coverage is how often the truth lies within 1.96 sigmas.
+
+`--seeds`: whole flights of the preset `calibration`, with new noise of every sensor, go through `swath sim fly` and
+`swath calibrate`, which gets nothing but the logs and the control points.
+
+All random numbers follow from the master seed in calibration_seed.toml. Exit status 1 if a limit is not met.
 """
 
 from __future__ import annotations
@@ -38,23 +41,27 @@ NEES, COVERAGE = (0.8, 1.25), (92.0, 98.0)
 EACH = {"omega_deg": 0.004, "phi_deg": 0.004, "kappa_deg": 0.008, "range_offset_m": 0.01}
 RMS = {"omega_deg": 0.002, "phi_deg": 0.002, "kappa_deg": 0.004}
 SHOWN = {"range_offset_m": ("range_offset_mm", 1e3)}
-BATCH = 20  # runs whose errors a process is given at once
+BATCH = 20  # runs per task of a worker process
 
 _reference: list[Reference] = []
 
 
 def master_seed() -> int:
-    """The one everything follows from."""
+    """Return the seed from which all others follow."""
     return int(tomllib.loads(SEED_FILE.read_text("utf-8"))["master"])
 
 
 def flight_seeds(count: int) -> list[int]:
-    """Of the virtual flights: the first is that of the runs."""
+    """Return the seeds of the virtual flights; the first one is that of the runs' flight."""
     return [int(one.generate_state(1)[0]) for one in np.random.SeedSequence([master_seed(), 1]).spawn(count)]
 
 
 def swath(*arguments: str) -> str:
-    """A command of the program: what it prints; SystemExit: it failed."""
+    """Run a command of swath and return what it prints.
+
+    Raises:
+        SystemExit: the command failed.
+    """
     command = [sys.executable, "-m", "swath.daemon.cli.main", *arguments]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     if done.returncode:
@@ -66,17 +73,17 @@ def swath(*arguments: str) -> str:
 
 
 def take(file: str) -> None:
-    """Of a process, before its runs."""
+    """Load the reference into a worker process, before its first run."""
     _reference.append(pickle.loads(Path(file).read_bytes()))
 
 
 def runs_of(task: tuple[FloatArray, Sequence[np.random.SeedSequence]]) -> list[Outcome]:
-    """Some runs."""
+    """Return the outcomes of one task's runs."""
     return [run(_reference[0], errors, seed) for errors, seed in zip(*task, strict=True)]
 
 
 def many(folder: Path, work: Path, count: int, rows: int, workers: int) -> list[Outcome]:
-    """All runs, in order."""
+    """Return the outcomes of all runs, in order; worker processes share the runs."""
     begun_s = time.monotonic()
     reference, root = read_reference(folder, work, rows, workers)
     drawing, *seeds = np.random.SeedSequence([master_seed(), 2]).spawn(count + 1)
@@ -99,7 +106,7 @@ def many(folder: Path, work: Path, count: int, rows: int, workers: int) -> list[
 
 
 def unit_of(name: str) -> tuple[str, float]:
-    """Of a parameter as ``left.omega_rad``: the file's key, and keys' units an SI one."""
+    """Return the key and the factor from SI to the key's unit, for a parameter such as ``left.omega_rad``."""
     bare = name.split(".", 1)[1]
     for parameter in PARAMETERS:
         if parameter.name == bare:
@@ -108,7 +115,7 @@ def unit_of(name: str) -> tuple[str, float]:
 
 
 def judged(outcomes: Sequence[Outcome]) -> tuple[dict[str, dict[str, float]], bool]:
-    """Figures by parameter, and whether all limits are kept."""
+    """Return the figures of each parameter, and whether all limits are met."""
     error, sigma = (np.array([getattr(one, what) for one in outcomes]) for what in ("error", "sigma"))
     table, good = {}, all(one.converged for one in outcomes)
     for place, name in enumerate(outcomes[0].names):
@@ -127,7 +134,7 @@ def judged(outcomes: Sequence[Outcome]) -> tuple[dict[str, dict[str, float]], bo
 
 
 def show_runs(table: dict[str, dict[str, float]], outcomes: Sequence[Outcome]) -> None:
-    """Print."""
+    """Print the table of the runs."""
     want = f"{NEES[0]} … {NEES[1]}", f"{COVERAGE[0]:.0f} … {COVERAGE[1]:.0f} %"
     print(f"{'':<22}{'mean':>11}{'RMS':>11}{'sigma':>11}{'NEES':>12}{'95 %':>12}")
     print(f"{'':<22}{'':>33}{want[0]:>12}{want[1]:>12}")
@@ -137,15 +144,15 @@ def show_runs(table: dict[str, dict[str, float]], outcomes: Sequence[Outcome]) -
             f"{one['coverage']:>10.1f} %"
         )
     factors = {name: np.mean([one.groups[name] for one in outcomes]) for name in outcomes[0].groups}
-    told = ", ".join(f"{name} {factor:.3f}" for name, factor in factors.items())
-    print(f"variance factor {np.mean([one.variance_factor for one in outcomes]):.3f}: {told}")
+    by_group = ", ".join(f"{name} {factor:.3f}" for name, factor in factors.items())
+    print(f"variance factor {np.mean([one.variance_factor for one in outcomes]):.3f}: {by_group}")
 
 
 # ---------------------------------------------------------------------- whole flights
 
 
 def end_to_end(folder: Path, seed: int) -> dict[str, tuple[float, float]]:
-    """Error and sigma by key, of a flight of this seed from its logs."""
+    """Fly and calibrate a flight of this seed; return each parameter's error and sigma by key."""
     swath("sim", "fly", "calibration", "-o", str(folder), "--seed", str(seed), "--no-truth")
     made, control = folder / "found.toml", folder / "control.csv"
     swath("calibrate", str(folder), "-o", str(made), "--control", str(control), "--trajectory-datum", "same")
@@ -162,19 +169,22 @@ def end_to_end(folder: Path, seed: int) -> dict[str, tuple[float, float]]:
 
 
 def flights(work: Path, first: int, count: int) -> dict[int, dict[str, tuple[float, float]]]:
-    """All of them, told one by one."""
+    """Fly and calibrate the flights of all seeds, and print each result."""
     found = {}
     for seed in flight_seeds(first + count)[first:]:
         begun_s = time.monotonic()
         with tempfile.TemporaryDirectory(prefix="flight-", dir=work) as folder:
             found[seed] = end_to_end(Path(folder), seed)
-        told = ", ".join(f"{key} {error:+.5f} ± {sigma:.5f}" for key, (error, sigma) in found[seed].items())
-        print(f"seed {seed} ({time.monotonic() - begun_s:.0f} s): {told}", flush=True)
+        errors = ", ".join(f"{key} {error:+.5f} ± {sigma:.5f}" for key, (error, sigma) in found[seed].items())
+        print(f"seed {seed} ({time.monotonic() - begun_s:.0f} s): {errors}", flush=True)
     return found
 
 
 def show_flights(found: dict[int, dict[str, tuple[float, float]]], spread: dict[str, float]) -> bool:
-    """Print, beside what the runs' spread is where it was found; whether limits are kept."""
+    """Print the table of the whole flights, and return whether all limits are met.
+
+    Beside each parameter stands the RMS of its error in the runs, if these were made.
+    """
     keys = list(next(iter(found.values())))
     good = True
     print(f"{'':<22}{'greatest':>11}{'limit':>9}{'RMS':>11}{'limit':>9}{'in sigmas':>11}{'spread of runs':>16}")
@@ -190,39 +200,39 @@ def show_flights(found: dict[int, dict[str, tuple[float, float]]], spread: dict[
 
 
 def main() -> None:
-    """Fly, calibrate and print."""
+    """Measure and print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--runs", type=int, default=0, help="at observation level")
-    parser.add_argument("--seeds", type=int, default=0, help="flights end to end")
-    parser.add_argument("--first", type=int, default=0, help="of the seeds: where to begin, for a part of them")
-    parser.add_argument("--rows", type=int, default=200_000, help="returns on planes of a run")
-    parser.add_argument("--flight", type=Path, help="of the runs, made by swath sim fly; else it is made")
-    parser.add_argument("--work", type=Path, help="folder for flights and returns, some 5 GB; else a temporary one")
-    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes of the runs")
-    parser.add_argument("--json", type=Path, help="write the figures here too")
-    wish = parser.parse_args()
-    if not wish.runs and not wish.seeds:
-        parser.error("say --runs N or --seeds N, or both")
+    parser.add_argument("--runs", type=int, default=0, help="number of runs with drawn observations")
+    parser.add_argument("--seeds", type=int, default=0, help="number of whole flights, from simulation to calibration")
+    parser.add_argument("--first", type=int, default=0, help="index of the first seed, to fly only part of them")
+    parser.add_argument("--rows", type=int, default=200_000, help="number of returns on planes in a run")
+    parser.add_argument("--flight", type=Path, help="flight of the runs, made by swath sim fly; default: make one")
+    parser.add_argument("--work", type=Path, help="folder for flights and returns, some 5 GB; default: a temporary one")
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="number of worker processes")
+    parser.add_argument("--json", type=Path, help="also write the figures to this file")
+    arguments = parser.parse_args()
+    if not arguments.runs and not arguments.seeds:
+        parser.error("nothing to measure: give --runs N, --seeds N or both")
     print(f"master seed {master_seed()}")
-    told: dict[str, Any] = {"master": master_seed()}
+    figures: dict[str, Any] = {"master": master_seed()}
     good, spread = True, {}
-    with tempfile.TemporaryDirectory(prefix="swath-accuracy-", dir=wish.work) as folder:
+    with tempfile.TemporaryDirectory(prefix="swath-accuracy-", dir=arguments.work) as folder:
         work = Path(folder)
-        if wish.runs:
-            flight = wish.flight
+        if arguments.runs:
+            flight = arguments.flight
             if flight is None:
                 flight = work / "flight"
                 swath("sim", "fly", "calibration", "-o", str(flight), "--seed", str(flight_seeds(1)[0]), "--no-truth")
-            outcomes = many(flight, work, wish.runs, wish.rows, wish.workers)
-            told["runs"], kept = judged(outcomes)
-            show_runs(told["runs"], outcomes)
-            spread, good = {key: one["rms"] for key, one in told["runs"].items()}, good and kept
-        if wish.seeds:
-            told["seeds"] = flights(work, wish.first, wish.seeds)
-            good = show_flights(told["seeds"], spread) and good
-    if wish.json:
-        wish.json.write_text(json.dumps(told, indent=1))
-    print("all limits kept" if good else "a limit is not kept")
+            outcomes = many(flight, work, arguments.runs, arguments.rows, arguments.workers)
+            figures["runs"], kept = judged(outcomes)
+            show_runs(figures["runs"], outcomes)
+            spread, good = {key: one["rms"] for key, one in figures["runs"].items()}, good and kept
+        if arguments.seeds:
+            figures["seeds"] = flights(work, arguments.first, arguments.seeds)
+            good = show_flights(figures["seeds"], spread) and good
+    if arguments.json:
+        arguments.json.write_text(json.dumps(figures, indent=1))
+    print("all limits met" if good else "a limit is not met")
     raise SystemExit(0 if good else 1)
 
 

@@ -1,18 +1,19 @@
-"""How well a calibration flight could be calibrated at all: the bound that its returns and its trajectory set.
+"""Compute the least sigmas that a calibration of a flight can have, given its returns and its trajectory.
 
 python -m benchmarks.calibration_bound FOLDER [--every 5]
 
-FOLDER is a flight of `swath sim fly`, with its truth, of which are taken: the returns, where they lie, and the planes
-they lie on, exactly. Of the flight: the joint covariance of the smoothed trajectory's errors, as `swath calibrate`
-has it. The sensor equation's derivatives are written here anew and share nothing with the adjustment. Two bounds:
+FOLDER is a flight of `swath sim fly`, with truth. From the truth come the returns, their places and the exact planes on
+which they lie. From the log comes the joint covariance of the smoothed trajectory's errors, as `swath calibrate`
+uses it. The derivatives of the sensor equation are written here anew and share no code with the adjustment. Two bounds:
 
-    planes known      direction and place of every plane are known: what the ranges and the trajectory alone leave
-    planes unknown    every roof face and every piece of ground of 15 m is estimated along, as a calibration has to
+    planes known      direction and place of every plane are known: only ranges and trajectory are uncertain
+    planes unknown    every roof face and every ground tile of 15 m is estimated too, as a calibration must do
 
-each with the parameters of `--model scanner` estimated, and with those of `basic` and the others known exactly.
+Each bound is computed with the parameters of `--model scanner` estimated, and with those of `basic` estimated and the
+others known exactly.
 
-What gyroscopes walk between knots is left out, so that no adjustment reaches the bound; one that is near it has used
-what is there. Information is summed over every so many returns and multiplied.
+The random walk of the gyroscopes between knots is left out, so that an adjustment cannot quite reach the bound; an
+adjustment close to it has used all information. One return in `--every` is read and counts that many times.
 """
 
 from __future__ import annotations
@@ -43,27 +44,27 @@ MODELS = {"basic": 4, "scanner": 8}
 NAMES = ("omega", "phi", "kappa", "range offset", "range scale", "scan angle scale", "scan plane tilt", "time offset")
 UNITS = ("°", "°", "°", "m", "ppm", "ppm", "°", "µs")
 FACTORS = np.array([180 / np.pi] * 3 + [1.0, 1e6, 1e6, 180 / np.pi, 1e6])
-NEIGHBOURS, PLANE_M = 7, 0.003  # by which a return's plane is found in the truth, and how exactly they lie on it
+NEIGHBOURS, PLANE_M = 7, 0.003  # neighbours that define a return's plane, and their largest distance from it
 TILE_M = 15.0
 LEAST_RETURNS = 3
 SECOND_NS = 1e9
 TRACK = ("gps_ns", "lat_rad", "lon_rad", "height_m", "velocity_l", "roll_rad", "pitch_rad", "heading_rad")
 STEEPEST = np.cos(np.radians(65.0))
-LEAST_WIDTH_M2 = 1e-4  # variance of neighbours across their longest axis: less is a line, no plane
-FOOTPRINT_SIGMA = 0.25  # of its full width: two sigmas to each side of the middle
+LEAST_WIDTH_M2 = 1e-4  # least variance across the neighbours' longest axis; below it they form a line
+FOOTPRINT_SIGMA = 0.25  # as a share of the full width, which is two sigmas to each side
 
 
 @dataclass(frozen=True, eq=False)
 class Returns:
-    """Returns of the truth on planes.
+    """Returns of the truth that lie on planes.
 
     Attributes:
         time_ns: (n,) GPS time.
-        strip: (n,) number.
-        design: (n, 8) change of the distance from the plane with the parameters, SI.
-        normal_l: (n, 3) north, east, down.
-        lever_l: (n, 3) from the body to the point.
-        variance: (n,) m² of the distance by range, angle and footprint.
+        strip: (n,) number of the strip.
+        design: (n, 8) derivatives of the distance from the plane with respect to the parameters, SI.
+        normal_l: (n, 3) normal of the plane: north, east, down.
+        lever_l: (n, 3) vector from the body to the point: north, east, down, metres.
+        variance: (n,) variance of the distance due to range, angle and footprint, m².
         face: (n,) number of the plane.
         place: (n, 3) two coordinates in the plane, metres, and 1.
     """
@@ -79,7 +80,7 @@ class Returns:
 
 
 def returns_of(folder: Path, head: str, noise: Noise, every: int) -> Returns:
-    """Read every so many returns that lie on a plane of the truth."""
+    """Read one return in `every` of those that lie on a plane of the truth."""
     with np.load(folder / "truth.npz") as truth:
         strip, surface = truth[f"{head}.strip"], truth[f"{head}.surface"]
         there = np.flatnonzero((strip >= 0) & np.isin(surface, (GROUND, ROAD, MARKING, ROOF)))
@@ -113,7 +114,7 @@ def returns_of(folder: Path, head: str, noise: Noise, every: int) -> Returns:
 
 
 def planes_at(point_l: FloatArray, strip: IntArray, roof: NDArray[np.bool_], every: int) -> tuple[IntArray, FloatArray]:
-    """Return indexes (n,) of returns whose neighbours lie on one plane with them, and its normals (n, 3), upwards."""
+    """Return indexes (n,) of returns that lie on one plane with their neighbours, and upward normals (n, 3)."""
     taken, normals = [], []
     for number in np.unique(strip):
         for kind in (False, True):
@@ -125,7 +126,7 @@ def planes_at(point_l: FloatArray, strip: IntArray, roof: NDArray[np.bool_], eve
             around = point_l[mine][near]
             off = around - around.mean(axis=1, keepdims=True)
             variances, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", off, off))
-            normal = axes[:, :, 0] * -np.sign(axes[:, 2:3, 0])  # down is positive
+            normal = axes[:, :, 0] * -np.sign(axes[:, 2:3, 0])  # z is down, so an upward normal has z < 0
             good = np.abs(np.einsum("nki,ni->nk", off, normal)).max(axis=1) < PLANE_M
             good &= (-normal[:, 2] > STEEPEST) & (variances[:, 1] > LEAST_WIDTH_M2)
             taken.append(asked[good])
@@ -138,20 +139,22 @@ def equations(
 ) -> tuple[FloatArray, FloatArray]:
     """Return derivatives (n, 8) of the distance along the normal, and its variance (n,), in m².
 
-    Sensor and body axes count as alike; of a spinning head the first four columns and the last are right.
+    Sensor and body axes are taken to be the same. For a spinning head only the first four columns and the last
+    are valid.
 
     Args:
-        normal, lever: (n, 3) north, east, down: of the plane; from the body to the point, metres.
+        normal: (n, 3) normals of the planes: north, east, down.
+        lever: (n, 3) vectors from the body to the points: north, east, down, metres.
         rot_l_from_b: (n, 3, 3).
-        velocity: (n, 3) of the point that moves with the body, metres a second.
-        noise: of the scanner.
+        velocity: (n, 3) velocity of the point as part of the moving body, metres a second.
+        noise: noise of the scanner.
     """
     lever_b = np.einsum("nji,nj->ni", rot_l_from_b, lever)
     normal_b = np.einsum("nji,nj->ni", rot_l_from_b, normal)
     range_m = np.linalg.norm(lever_b, axis=1, keepdims=True)
     beam_b = lever_b / range_m
     turned = np.cross(lever_b, normal_b)  # n · (e × x) = e · (x × n)
-    angle = -np.arctan2(beam_b[:, 1], beam_b[:, 2])  # about x, from down
+    angle = -np.arctan2(beam_b[:, 1], beam_b[:, 2])  # about x, measured from down
     cosine = (beam_b * normal_b).sum(axis=1)
     columns = [*turned.T, cosine, cosine * range_m[:, 0], angle * turned[:, 0], normal_b[:, 0] * range_m[:, 0]]
     design = np.stack([*columns, (normal * velocity).sum(axis=1)], axis=1)
@@ -163,7 +166,7 @@ def equations(
 
 
 def faces(point_l: FloatArray, normal: FloatArray, roof: NDArray[np.bool_]) -> tuple[IntArray, FloatArray]:
-    """Return numbers (n,) of planes, by direction, place and tile of 15 m; places (n, 3) in them."""
+    """Return numbers (n,) of planes, by direction, place and tile of 15 m, and places (n, 3) in them."""
     distance = (normal * point_l).sum(axis=1)
     tile = np.floor(point_l[:, :2] / TILE_M)
     key = np.column_stack([tile, np.where(roof, 1, 0), np.where(roof[:, np.newaxis], np.rint(normal * 40.0), 0.0)])
@@ -174,7 +177,7 @@ def faces(point_l: FloatArray, normal: FloatArray, roof: NDArray[np.bool_]) -> t
 
 
 def bound(returns: Returns, prior: TrajectoryPrior, parameters: int, every: int, *, known: bool) -> FloatArray:
-    """Return sigmas (p,) of the parameters, SI."""
+    """Return the least sigmas (p,) of the parameters, SI."""
     size = parameters + 6 * len(prior)
     normal = np.zeros((size, size))
     normal[parameters:, parameters:] = prior.information
@@ -195,7 +198,10 @@ def bound(returns: Returns, prior: TrajectoryPrior, parameters: int, every: int,
 
 
 def states(returns: Returns, rows: IntArray, prior: TrajectoryPrior, parameters: int) -> tuple[IntArray, FloatArray]:
-    """Return unknowns (m,) behind returns of one plane and the design (n, m): parameters, then errors at knots."""
+    """Return the unknowns (m,) that affect returns of one plane, and their design matrix (n, m).
+
+    The unknowns are the parameters, followed by the trajectory's errors at knots.
+    """
     after = np.clip(np.searchsorted(prior.time_ns, returns.time_ns[rows]), 1, len(prior) - 1)
     share = (returns.time_ns[rows] - prior.time_ns[after - 1]) / (prior.time_ns[after] - prior.time_ns[after - 1])
     share = np.clip(share, 0.0, 1.0)[:, np.newaxis]
@@ -212,11 +218,11 @@ def states(returns: Returns, rows: IntArray, prior: TrajectoryPrior, parameters:
 
 
 def bounds(folder: Path, every: int, tell: Callable[[str], None] = print) -> dict[tuple[str, bool], FloatArray]:
-    """Return sigmas by model and whether planes are known, in the units of `UNITS`."""
+    """Return the sigmas, in the units of `UNITS`, by model and by whether planes are known."""
     options = Options(datum="same", uncertainty=False)
     with tempfile.TemporaryDirectory(prefix="swath-bound-") as work:
-        wish = Logs([folder], Path(work), TrajectoryOptions(navigate=True), options)
-        kept = read_flight(wish, Path(work), lambda *_: None)
+        georef_options = Logs([folder], Path(work), TrajectoryOptions(navigate=True), options)
+        kept = read_flight(georef_options, Path(work), lambda *_: None)
         (head,) = kept.flight.heads
         prior = prior_of(kept)
     returns = returns_of(folder, head.name, head.noise, every)
@@ -229,17 +235,17 @@ def bounds(folder: Path, every: int, tell: Callable[[str], None] = print) -> dic
 
 
 def main() -> None:
-    """Print the bounds."""
+    """Compute and print the bounds."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path, help="of a flight of one scanner, made by swath sim fly")
-    parser.add_argument("--every", type=int, default=5, help="one in so many returns is looked at")
-    wish = parser.parse_args()
-    found = bounds(wish.folder, wish.every)
+    parser.add_argument("folder", type=Path, help="flight of one scanner, made by swath sim fly")
+    parser.add_argument("--every", type=int, default=5, help="use one return in so many")
+    arguments = parser.parse_args()
+    found = bounds(arguments.folder, arguments.every)
     heads = [f"{model}, planes {'known' if known else 'unknown'}" for model, known in found]
     print(f"{'':<18}" + "".join(f"{head:>24}" for head in heads))
     for number, name in enumerate(NAMES):
-        told = (f"{sigmas[number]:.5f} {UNITS[number]}" if number < len(sigmas) else "" for sigmas in found.values())
-        print(f"{name:<18}" + "".join(f"{cell:>24}" for cell in told))
+        cells = (f"{sigmas[number]:.5f} {UNITS[number]}" if number < len(sigmas) else "" for sigmas in found.values())
+        print(f"{name:<18}" + "".join(f"{cell:>24}" for cell in cells))
 
 
 if __name__ == "__main__":

@@ -1,9 +1,10 @@
-"""A calibration flight whose observations are made anew in every run, from a truth that fits the model exactly.
+"""Make the observations of a calibration flight anew in every run, from a truth that fits the model exactly.
 
-The flight is read and matched once. Of its returns on planes the ranges are then set so that every point lies on its
-plane with the true calibration on the smoothed trajectory: these two are the truth. A run takes from it what sensors
-would have said: trajectory errors from the smoother's joint covariance at each of its own nodes, which lie closer than
-the knots of the adjustment, and between nodes what gyroscopes walk; noise of range, scan angle and control.
+The flight is read and matched once. The ranges of its returns on planes are then changed so that every point lies
+on its plane exactly, with the true calibration and the smoothed trajectory; these two are the truth. A run adds what
+the sensors would add: trajectory errors drawn from the smoother's joint covariance at its own nodes, which are closer
+together than the knots of the adjustment; the gyroscopes' random walk between nodes; noise of range, scan angle and
+control. `benchmarks.calibration_accuracy` runs this and prints the figures.
 """
 
 from __future__ import annotations
@@ -35,25 +36,25 @@ from swath.georef.records import Int64Array
 from swath.georef.scanner.calibration import Calibration, read_calibration
 
 MODEL = ParameterOptions("scanner")
-SETTINGS = Settings(huber=0.0, family=0.0)  # there are no blunders
-MOST_POINTS = 2000  # of a plane in a strip that are drawn from
-NODE_S = 0.02  # closer than the smoother's nodes, so that each is taken
-STEP_NS = 20_000_000  # between nodes
-JITTER = 1e-9  # of a variance: neighbouring nodes' errors are nearly one
+SETTINGS = Settings(huber=0.0, family=0.0)  # the observations have no outliers
+MOST_POINTS = 2000  # at most, of a plane in a strip
+NODE_S = 0.02  # less than the spacing of the smoother's nodes, so that each is used
+STEP_NS = 20_000_000  # step of the random walk between nodes
+JITTER = 1e-9  # share of a variance, added because errors of neighbouring nodes are nearly equal
 
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """The truth of all runs, and what they are adjusted with.
+    """The truth of all runs, and the prior for their adjustment.
 
     Attributes:
-        flight: its swaths have only what lies on planes, its heads start from what the papers say.
-        features: planes and control, every point on its plane.
-        truth: of the scanner.
-        prior: of the trajectory, at the adjustment's knots.
-        range_sigma_m: by swath, (n,) of the returns: of the range, and of the surface within the beam's footprint.
-        nodes: the smoother's.
-        walk: rad/√s of the attitude between them.
+        flight: its swaths hold only returns on planes; its heads start from the nominal installation.
+        features: planes and control points; every point lies on its plane.
+        truth: true calibration of the scanner.
+        prior: prior of the trajectory, at the adjustment's knots.
+        range_sigma_m: by swath, (n,) sigmas of the ranges, from their noise and the footprint on the surface.
+        nodes: nodes of the smoother.
+        walk: random walk of the attitude between nodes, rad/√s.
     """
 
     flight: Flight
@@ -67,12 +68,14 @@ class Reference:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Of a run.
+    """The result of one run.
 
     Attributes:
-        names: of the parameters.
-        error, sigma: (p,) of them, SI.
-        variance_factor: of all observations; groups: of each group.
+        names: names of the parameters.
+        error, sigma: (p,) errors and sigmas of the parameters, SI.
+        variance_factor: variance factor of all observations.
+        groups: variance factors by group of observations.
+        converged: whether the adjustment converged.
     """
 
     names: tuple[str, ...]
@@ -84,23 +87,23 @@ class Outcome:
 
 
 def read_reference(folder: Path, work: Path, rows: int, workers: int) -> tuple[Reference, FloatArray]:
-    """Read and match.
+    """Read and match a flight, and make the truth of all runs.
 
     Args:
-        folder: of the flight, as `swath sim fly` leaves it.
-        work: for its returns.
-        rows: wanted.
-        workers: processes.
+        folder: the flight, as `swath sim fly` writes it.
+        work: folder for the returns.
+        rows: most returns to use.
+        workers: number of processes.
 
     Returns:
         The reference, and the lower root (6k, 6k) of the nodes' joint covariance.
     """
     options = Options(datum="same", uncertainty=False)
-    wish = Logs([folder], work, TrajectoryOptions(navigate=True), options, workers=workers)
-    kept = read_flight(wish, work, lambda *_: None)
+    georef_options = Logs([folder], work, TrajectoryOptions(navigate=True), options, workers=workers)
+    kept = read_flight(georef_options, work, lambda *_: None)
     (head,) = kept.flight.heads
-    told = read_calibration((folder / f"{head.name}.true.toml").read_text("utf-8"), "truth")
-    truth = head.start.changed(**{name: told.value(name) for name in MODELS[MODEL.model]})
+    true_calibration = read_calibration((folder / f"{head.name}.true.toml").read_text("utf-8"), "truth")
+    truth = head.start.changed(**{name: true_calibration.value(name) for name in MODELS[MODEL.model]})
     flight = replaced(kept.flight, {head.name: truth}, work, "truth")
     surveyed = in_t(read_control((folder / "control.csv").read_text("utf-8"), "control.csv"), flight.frame)
     planes = find_planes(flight, PlaneSettings(most_points=MOST_POINTS))
@@ -119,10 +122,10 @@ def read_reference(folder: Path, work: Path, rows: int, workers: int) -> tuple[R
 
 
 def fewer(features: Features, rows: int) -> Features:
-    """With as many returns a patch that there are so many in all, at most."""
+    """Return the features with large patches thinned, so that they hold at most so many returns together."""
     sizes = np.sort([len(patch.at) for plane in features.planes for patch in plane.patches])
     before = np.concatenate([[0], np.cumsum(sizes)])[:-1]
-    caps = (rows - before) // np.arange(len(sizes), 0, -1)  # of the larger ones, if all smaller ones stay whole
+    caps = (rows - before) // np.arange(len(sizes), 0, -1)  # of the larger patches, if all smaller ones stay whole
     most = max(int(caps[int(np.argmax(caps <= sizes))]) if (caps <= sizes).any() else MOST_POINTS, 1)
     planes = tuple(
         replace(plane, patches=tuple(Patch(patch.swath, thinned(patch.at, most)) for patch in plane.patches))
@@ -132,7 +135,7 @@ def fewer(features: Features, rows: int) -> Features:
 
 
 def own_returns(flight: Flight, features: Features) -> tuple[Flight, Features]:
-    """A flight of nothing but these returns, each plane with its own."""
+    """Return a flight that holds only the returns of these features, and the features with its indexes."""
     swaths: list[Swath] = []
     patches: list[dict[int, Patch]] = [{} for _ in features.planes]
     for index, swath in enumerate(flight.swaths):
@@ -160,7 +163,7 @@ def own_returns(flight: Flight, features: Features) -> tuple[Flight, Features]:
 def consistent(
     flight: Flight, features: Features, truth: Calibration
 ) -> tuple[Flight, Features, tuple[FloatArray, ...]]:
-    """Ranges and control such that all lies on its plane; and the sigma of every range."""
+    """Change ranges and control points so that they lie on their planes; return also the sigma of every range."""
     swaths, sigmas = [], []
     for index, swath in enumerate(flight.swaths):
         normal, centre = np.zeros((len(swath), 3)), np.zeros((len(swath), 3))
@@ -195,7 +198,7 @@ def consistent(
 
 
 def walked(chain: ErrorChain, covariance: FloatArray) -> float:
-    """rad/√s that the attitude's errors move from node to node, where these are close."""
+    """Return the random walk of the attitude's errors from node to node, rad/√s, where nodes are close together."""
     count = len(chain)
     joint = covariance.reshape(count, 6, count, 6)
     at, apart_s = np.arange(count - 1), np.diff(chain.time_ns) / 1e9
@@ -208,7 +211,7 @@ def walked(chain: ErrorChain, covariance: FloatArray) -> float:
 
 
 def root_of(covariance: FloatArray) -> FloatArray:
-    """Lower root of it, in its place: it has as many as 1e8 elements."""
+    """Compute the lower root of a covariance in place, because it has up to 1e8 elements."""
     sigmas = np.sqrt(np.diag(covariance))
     covariance /= sigmas
     covariance /= sigmas[:, np.newaxis]
@@ -219,7 +222,10 @@ def root_of(covariance: FloatArray) -> FloatArray:
 
 
 def errors_along(reference: Reference, at_nodes: FloatArray, rng: np.random.Generator) -> tuple[Int64Array, FloatArray]:
-    """Times and errors (m, 6), nodes' errors (k, 6) being known; attitude walks between nodes, as a bridge."""
+    """Return times (m,) and trajectory errors (m, 6) that agree with given errors (k, 6) at the nodes.
+
+    Between nodes the attitude follows a Brownian bridge.
+    """
     nodes = reference.nodes.time_ns
     times = np.unique(np.concatenate([nodes, np.arange(nodes[0], nodes[-1], STEP_NS)]))
     near = np.abs(times - nodes[np.clip(np.searchsorted(nodes, times), 0, len(nodes) - 1)]) < 1_000_000_000
@@ -234,12 +240,12 @@ def errors_along(reference: Reference, at_nodes: FloatArray, rng: np.random.Gene
 
 
 def run(reference: Reference, at_nodes: FloatArray, seed: np.random.SeedSequence) -> Outcome:
-    """Make observations and adjust them from what the papers say.
+    """Draw the observations of one run and adjust them from the nominal installation.
 
     Args:
         reference: the truth.
         at_nodes: (k, 6) errors of the trajectory at the nodes.
-        seed: of everything else.
+        seed: seed of all other errors.
     """
     rng = np.random.default_rng(seed)
     times, errors = errors_along(reference, at_nodes, rng)
@@ -260,7 +266,7 @@ def run(reference: Reference, at_nodes: FloatArray, seed: np.random.SeedSequence
 
 
 def resurveyed(plane: Plane, rng: np.random.Generator) -> Plane:
-    """With errors of its control."""
+    """Return the plane with survey errors drawn for its control points."""
     points = (
         replace(point, position_t=point.position_t + point.sigma_m * rng.standard_normal(3)) for point in plane.control
     )

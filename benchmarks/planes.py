@@ -1,11 +1,11 @@
-"""What the search for planes costs on one core, beside a copy of the points.
+"""Measure what the search for planes costs on one core, beside a copy of the points.
 
 python -m benchmarks.planes [--repeats 3] [--returns 12] [--json FILE]
 
-Figures are medians over the repeats, returns a second of this process's own CPU time: of finding planes anew, of
-finding the same ones again after a calibration, and of reading all points and writing them once. A flight of six
-strips over houses on rolling ground, some five returns a square metre, made of heights alone: the search asks nothing
-else of a flight. Its returns are mapped from files, as `swath calibrate` has them; more of them are longer strips.
+Figures are returns a second of this process's own CPU time, medians over the repeats: for finding planes, for finding
+the same planes again after a calibration, and for reading all points and writing them once. The flight has six strips
+over houses on rolling ground, with some five returns a square metre. Its returns are computed from heights alone, which
+is all that the search needs, and are mapped from files, as in `swath calibrate`. More returns make longer strips.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from swath.georef.scanner.calibration import nominal
 from swath.georef.scanner.uncertainty import Noise
 from swath.georef.trajectory.trajectory import Trajectory
 
-STRIPS, RETURNS_PER_M = 6, 2_000  # of a strip
+STRIPS, RETURNS_PER_M = 6, 2_000  # number of strips, returns per metre of each
 HALF_WIDTH_M, HEIGHT_M = 200.0, 500.0
 HOUSE_M, LOT_M = 12.0, 40.0
 SPEED_MPS = 50.0
@@ -50,7 +50,7 @@ class Figure:
 
 
 def ground(east: FloatArray, north: FloatArray) -> FloatArray:
-    """Heights: hills, and a gabled roof on every lot."""
+    """Return the heights of hills with a gabled roof on every lot."""
     height = 4.0 * np.sin(east / 150.0) + 3.0 * np.cos(north / 120.0)
     x, y = np.mod(east, LOT_M) - 0.5 * LOT_M, np.mod(north, LOT_M) - 0.5 * LOT_M
     roof = (np.abs(x) < 0.5 * HOUSE_M) & (np.abs(y) < 0.5 * HOUSE_M)
@@ -61,7 +61,7 @@ def ground(east: FloatArray, north: FloatArray) -> FloatArray:
 
 
 def mapped(folder: Path, name: str, array: NDArray[Any]) -> NDArray[Any]:
-    """The array from a file."""
+    """Save the array to a file and return it mapped from there."""
     np.save(folder / f"{name}.npy", array)
     loaded: NDArray[Any] = np.load(folder / f"{name}.npy", mmap_mode="r")
     return loaded
@@ -70,7 +70,7 @@ def mapped(folder: Path, name: str, array: NDArray[Any]) -> NDArray[Any]:
 def strip(
     number: int, count: int, folder: Path, frame: Tangent, draws: np.random.Generator
 ) -> tuple[Swath, FloatArray, NDArray[np.int64]]:
-    """A swath, where its aircraft was (k, 3) in e, and when."""
+    """Make a swath; return it with the positions (k, 3) of its aircraft in frame e and their times (ns)."""
     length_m = count / RETURNS_PER_M
     second = np.arange(count) / (SPEED_MPS * RETURNS_PER_M)
     along = SPEED_MPS * second - 0.5 * length_m
@@ -93,20 +93,20 @@ def strip(
 
 
 def flight(returns: int, folder: Path) -> Flight:
-    """All strips."""
+    """Make a flight of all strips."""
     frame = Tangent.at(np.asarray(e_from_geodetic(np.radians(47.4), np.radians(8.9), 0.0)))
     draws = np.random.default_rng(7)
     made = [strip(number, returns // STRIPS, folder, frame, draws) for number in range(STRIPS)]
     position_e, time_ns = np.concatenate([one[1] for one in made]), np.concatenate([one[2] for one in made])
     level = np.tile([1.0, 0.0, 0.0, 0.0], (len(time_ns), 1))
-    unsaid = np.full_like(position_e, np.nan)
-    trajectory = Trajectory(time_ns, position_e, level, unsaid, unsaid, unsaid)
+    unknown = np.full_like(position_e, np.nan)
+    trajectory = Trajectory(time_ns, position_e, level, unknown, unknown, unknown)
     head = Head("left", nominal("left", np.zeros(3), np.eye(3)), LineGeometry(), Noise())
     return Flight(frame, (head,), (trajectory,), tuple(one[0] for one in made))
 
 
 def measure(repeats: int, asked: int, folder: Path) -> tuple[list[Figure], str]:
-    """All lines of the table, and what was found."""
+    """Measure all lines of the table; return them with a description of what was found."""
     whole = flight(asked, folder)
     returns = sum(len(swath) for swath in whole.swaths)
     found = find_planes(whole)
@@ -130,13 +130,13 @@ def measure(repeats: int, asked: int, folder: Path) -> tuple[list[Figure], str]:
 
 
 def main() -> None:
-    """Measure and print."""
+    """Measure and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--repeats", type=int, default=3, help="measurements a figure, of which the median counts")
-    parser.add_argument("--returns", type=float, default=12.0, help="millions of them")
-    parser.add_argument("--json", type=Path, help="write the figures here too")
+    parser.add_argument("--repeats", type=int, default=3, help="measurements per figure; the median counts")
+    parser.add_argument("--returns", type=float, default=12.0, help="returns of the flight, in millions")
+    parser.add_argument("--json", type=Path, help="also write the figures to this file")
     arguments = parser.parse_args()
-    keep_freed_memory()  # as every command of ours does
+    keep_freed_memory()  # as every command of swath does
     with tempfile.TemporaryDirectory() as folder:
         figures, what = measure(arguments.repeats, int(1e6 * arguments.returns), Path(folder))
     print(f"{'planes, one core: ' + what:<66} {'rate':>9} {'asked':>8} {'copy':>9}")

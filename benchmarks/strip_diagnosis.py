@@ -1,13 +1,13 @@
-"""Test the sigmas of the strips' diagnosis: a virtual flight, its trajectory wrong as navigation expects it.
+"""Test the sigmas of the strips' diagnosis on a virtual flight whose trajectory errs as navigation predicts.
 
 python -m benchmarks.strip_diagnosis [--runs 50] [--json FILE]
 
-A flight over a village (east, west, south, north) is flown into a log and navigated for the smoother's joint covariance
-of its errors along the four strips. Strips along the same lines over the same village are cast with the true
-calibration on a true trajectory. In every run the trajectory gets errors drawn from that covariance and every range its
-noise; the strips are compared and diagnosed with the covariance, and with nothing but the trajectory's sigmas. NEES is
-the mean square of what is told of an effect, as nothing is wrong with the calibration, in its sigmas. Exit status 1
-where, with the covariance, it is not within 0.8 to 1.25 for all effects together.
+A flight over a village (east, west, south, north) is simulated to a log and navigated, which gives the joint covariance
+of the smoother's errors along the four strips. Strips along the same lines are then cast with the true calibration on a
+true trajectory. Every run adds trajectory errors drawn from that covariance, and noise to every range. The strips are
+compared and diagnosed twice: with the covariance, and with the trajectory's sigmas alone. The calibration is right, so
+every effect found should be zero; NEES is the mean square of an effect divided by its sigma. Exit status 1 if, with the
+covariance, the NEES of all effects together is not within 0.8 to 1.25.
 """
 
 from __future__ import annotations
@@ -47,20 +47,20 @@ SEED = 20_261
 
 
 def prior_of(folder: Path) -> TrajectoryPrior:
-    """Fly a log, and navigate it for the joint covariance of its errors."""
+    """Make the log of a flight, navigate it and return the joint covariance of its trajectory errors."""
     made = village(folder, prf_hz=2_000.0, lines=(0, 1, 2, 3))
     work = folder / "navigated"
     work.mkdir()
-    wish = GeorefOptions(
+    georef_options = GeorefOptions(
         [made.flown.log], work, TrajectoryOptions(navigate=True), Options(datum="same", uncertainty=False)
     )
-    prior = smoothed_prior(read_flight(wish, work, lambda *_: None))
+    prior = smoothed_prior(read_flight(georef_options, work, lambda *_: None))
     assert prior is not None
     return prior
 
 
 def along(prior: TrajectoryPrior, flight: Flight) -> TrajectoryPrior:
-    """Return the covariance with its knots moved to the strips of another flight of the same lines, in order."""
+    """Return the covariance with its knots moved to the strips of another flight along the same lines, in order."""
     time_ns = prior.time_ns.copy()
     for swath, strip in zip(flight.swaths, np.unique(prior.strip).tolist(), strict=True):
         own = prior.strip == strip
@@ -70,16 +70,16 @@ def along(prior: TrajectoryPrior, flight: Flight) -> TrajectoryPrior:
 
 
 def with_sigmas(flight: Flight, prior: TrajectoryPrior) -> Flight:
-    """Return the flight with a trajectory that tells the sigmas which navigation has along the strips."""
+    """Return the flight with a trajectory whose sigmas are those of the covariance along the strips."""
     (trajectory,) = flight.trajectories
     sigmas = np.sqrt(np.mean(prior.sigmas() ** 2, axis=0))
     tilt = math.hypot(*sigmas[3:5]) / math.sqrt(2.0)
-    told = replace(
+    reported = replace(
         trajectory,
         position_sigma_l=np.tile(sigmas[:3], (len(trajectory), 1)),
         attitude_sigma_rad=np.tile([tilt, tilt, sigmas[5]], (len(trajectory), 1)),
     )
-    return replace(flight, trajectories=(told,))
+    return replace(flight, trajectories=(reported,))
 
 
 def once(
@@ -97,13 +97,13 @@ def once(
     checks, seen = differences(flight, RULES).checks, SeenFrom.of(flight)
     found = []
     for known in (prior, None):
-        told = signatures(checks, seen, known).found
-        found.append((np.array([one.value for one in told]), np.array([one.sigma for one in told])))
+        effects = signatures(checks, seen, known).found
+        found.append((np.array([one.value for one in effects]), np.array([one.sigma for one in effects])))
     return found
 
 
 def tell(runs: Sequence[Sequence[tuple[FloatArray, FloatArray]]]) -> dict[str, dict[str, float]]:
-    """Print the figures, and return them."""
+    """Print the figures and return them."""
     figures: dict[str, dict[str, float]] = {}
     for at, words in enumerate(WAYS):
         values, sigmas = (np.array([run[at][which] for run in runs]) for which in (0, 1))
@@ -122,8 +122,8 @@ def tell(runs: Sequence[Sequence[tuple[FloatArray, FloatArray]]]) -> dict[str, d
 
 
 def main() -> int:
-    """Fly, run, tell."""
-    parser = argparse.ArgumentParser(description="Whether the sigmas of the strips' diagnosis hold.")
+    """Measure and print the figures; return 1 if the NEES is outside its limits."""
+    parser = argparse.ArgumentParser(description="Test the sigmas of the strips' diagnosis on a virtual flight.")
     parser.add_argument("--runs", type=int, default=50)
     parser.add_argument("--json", type=Path)
     asked = parser.parse_args()
@@ -136,7 +136,7 @@ def main() -> int:
 
 
 def run_all(prior: TrajectoryPrior, count: int) -> list[list[tuple[FloatArray, FloatArray]]]:
-    """Return all runs."""
+    """Run all seeds and return their values and sigmas."""
     begun_s = time.monotonic()
     made = cast_flight(prf_hz=20_000.0, range_sigma_m=0.0, angle_sigma_rad=0.0)
     moved = along(prior, made.flight)
