@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
-from enum import IntEnum
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
 from swath.calib.labels import degrees, is_undetermined, length, listed, number, share, sized, unknown, words_of
 from swath.calib.outcome import Adjusted, Considered
 from swath.calib.summary import Difference, Pair, ReportInput
+from swath.georef.verdicts import Level, Reason, Rule, Verdict, worst_first
 
 DEG = 180.0 / math.pi
 BORESIGHT = ("omega_rad", "phi_rad", "kappa_rad")
@@ -19,69 +18,6 @@ MOST_CORRELATED = 0.95
 TOO_LARGE = 10.0  # ratio to the wanted sigma
 # Wanted sigmas if the user sets none and the flight's points do not imply them
 WANTED = {"omega_rad": 0.003 / DEG, "phi_rad": 0.003 / DEG, "kappa_rad": 0.006 / DEG, "range_offset_m": 0.02}
-
-
-class Level(IntEnum):
-    """Level of a reason, and of the whole verdict."""
-
-    GOOD = 0
-    CARE = 1
-    UNUSABLE = 2
-
-    @property
-    def words(self) -> str:
-        """Words for this level in a report."""
-        return ("Good", "Usable with care", "Not to be used")[self]
-
-
-@dataclass(frozen=True, slots=True)
-class Reason:
-    """A reason why a calibration is not simply good.
-
-    Attributes:
-        level: severity.
-        what: the problem, with the figure.
-        change: the remedy.
-        excess: value over its limit; the worst reasons come first.
-    """
-
-    level: Level
-    what: str
-    change: str
-    excess: float = 1.0
-
-
-@dataclass(frozen=True, slots=True)
-class Verdict:
-    """The judgement: the worst reason's level, the sentence, and the reasons with the worst first."""
-
-    level: Level
-    sentence: str
-    reasons: tuple[Reason, ...]
-
-
-Measure = Callable[[ReportInput], Iterator[tuple[str, float]]]  # yields the measured thing in words, and its size
-
-
-@dataclass(frozen=True, slots=True)
-class Rule:
-    """One limit: a value above ``care`` or ``unusable`` (None: never) is a reason of that level."""
-
-    measure: Measure
-    care: float | None
-    unusable: float | None
-    what: str
-    change: str
-    shown: Callable[[float], str] = number
-
-    def judged(self, report: ReportInput) -> Iterator[Reason]:
-        """Yield the reasons that its measure gives, one for each measured value; nan counts as the worst."""
-        for of, value in self.measure(report):
-            for level, limit in ((Level.UNUSABLE, self.unusable), (Level.CARE, self.care)):
-                if limit is not None and not value <= limit:
-                    excess = value / limit if limit > 0.0 and math.isfinite(value) else math.inf
-                    yield Reason(level, self.what.format(of=of, value=self.shown(value)), self.change, excess)
-                    break
 
 
 def overall_rms_m(pairs: Mapping[Pair, Difference]) -> float | None:
@@ -308,8 +244,9 @@ def _sigmas_words(value: float) -> str:
     return number(value, ".1f")
 
 
-RULES: tuple[Rule, ...] = (
+RULES: tuple[Rule[ReportInput], ...] = (
     Rule(
+        "not converged",
         _not_converged,
         None,
         0.5,
@@ -317,6 +254,7 @@ RULES: tuple[Rule, ...] = (
         "start from a better calibration (pre-alignment), or look for matches that are wrong",
     ),
     Rule(
+        "redundancy",
         _no_redundancy,
         1.0,
         10.0,
@@ -324,6 +262,7 @@ RULES: tuple[Rule, ...] = (
         "fly over more roofs and slopes, with more overlap of lines",
     ),
     Rule(
+        "held angles",
         _held_angles,
         0.0,
         TOO_LARGE,
@@ -331,6 +270,7 @@ RULES: tuple[Rule, ...] = (
         "fly the lines, or give the control, that stand below under Not determined",
     ),
     Rule(
+        "held range",
         _held_range,
         1.0,
         None,
@@ -338,6 +278,7 @@ RULES: tuple[Rule, ...] = (
         "control on flat, hard ground (at least 8 points of 1 cm)",
     ),
     Rule(
+        "wanted sigma",
         _beyond_wanted,
         1.0,
         TOO_LARGE,
@@ -345,6 +286,7 @@ RULES: tuple[Rule, ...] = (
         "fly more of the lines that determine it, or say [calibration] wanted where less will do",
     ),
     Rule(
+        "points",
         _points,
         1.0,
         TOO_LARGE,
@@ -352,6 +294,7 @@ RULES: tuple[Rule, ...] = (
         "more lines, control or heights; or say [calibration] wanted where less will do",
     ),
     Rule(
+        "contradicted",
         _contradicted,
         0.5,
         None,
@@ -359,6 +302,7 @@ RULES: tuple[Rule, ...] = (
         "free it (--free), or give it the value it has",
     ),
     Rule(
+        "profiles",
         _profiles,
         2.9,
         8.0,
@@ -366,13 +310,16 @@ RULES: tuple[Rule, ...] = (
         "look below at the profiles: which pairs say so, and whether all have one sign",
     ),
     Rule(
+        "variance factor",
         _variance,
         2.0,
         9.0,
         "residuals are larger than their sigmas say (variance factor {value})",
         "check the noise of scanner and trajectory; look below where residuals are large",
+        number,
     ),
     Rule(
+        "variance factor small",
         _variance_small,
         4.0,
         None,
@@ -380,6 +327,7 @@ RULES: tuple[Rule, ...] = (
         "the noise of scanner or trajectory is stated too large; sigmas here are too careful",
     ),
     Rule(
+        "rejected",
         _rejected,
         0.05,
         0.4,
@@ -388,6 +336,7 @@ RULES: tuple[Rule, ...] = (
         share,
     ),
     Rule(
+        "beyond prior",
         _beyond_prior,
         3.3,
         10.0,
@@ -396,6 +345,7 @@ RULES: tuple[Rule, ...] = (
         _sigmas_words,
     ),
     Rule(
+        "strips",
         _strips,
         0.08,
         0.5,
@@ -404,6 +354,7 @@ RULES: tuple[Rule, ...] = (
         length,
     ),
     Rule(
+        "strips worse",
         _worse,
         1.05,
         1.5,
@@ -411,6 +362,7 @@ RULES: tuple[Rule, ...] = (
         "look below which pairs do, and at the outliers",
     ),
     Rule(
+        "control",
         _control,
         3.29,
         10.0,
@@ -419,6 +371,7 @@ RULES: tuple[Rule, ...] = (
         _sigmas_words,
     ),
     Rule(
+        "control influence",
         _influence,
         1.5,
         6.0,
@@ -427,6 +380,7 @@ RULES: tuple[Rule, ...] = (
         _sigmas_words,
     ),
     Rule(
+        "trajectory",
         _trajectory,
         1.6,
         4.0,
@@ -435,11 +389,13 @@ RULES: tuple[Rule, ...] = (
         _sigmas_words,
     ),
     Rule(
+        "correlated",
         _correlated,
         MOST_CORRELATED,
         None,
         "{of} can hardly be told apart (correlation {value})",
         "a second flying height or speed, or hold one of them",
+        number,
     ),
 )
 
@@ -448,12 +404,11 @@ def judge(report: ReportInput) -> Verdict:
     """Judge the calibration of a report."""
     reasons = [reason for rule in RULES for reason in rule.judged(report)]
     reasons += [
-        Reason(Level.UNUSABLE if one.unusable else Level.CARE, one.what, one.change, one.excess)
+        Reason(Level.UNUSABLE if one.unusable else Level.CARE, "finding", one.what, one.change, one.excess)
         for one in report.findings
     ]
-    reasons.sort(key=lambda reason: (-reason.level, -reason.excess))
-    level = max((reason.level for reason in reasons), default=Level.GOOD)
-    return Verdict(level, _sentence(level, report, reasons), tuple(reasons))
+    level, ordered = worst_first(reasons)
+    return Verdict(level, _sentence(level, report, ordered), ordered)
 
 
 def accuracy_words(report: ReportInput) -> str:
@@ -466,9 +421,9 @@ def accuracy_words(report: ReportInput) -> str:
     return told + (f"; strips agree to {length(rms_m)} (RMSDz)" if rms_m is not None else "")
 
 
-def _sentence(level: Level, report: ReportInput, reasons: list[Reason]) -> str:
+def _sentence(level: Level, report: ReportInput, reasons: Sequence[Reason]) -> str:
     accuracy, missing = accuracy_words(report), undetermined(report)
     tail = f" Not determined by this flight: {listed(missing)}." if missing else ""
     if level is Level.GOOD:
-        return f"{level.words}: {accuracy}.{tail}"
-    return f"{level.words}: {reasons[0].what}. {accuracy[0].upper()}{accuracy[1:]}.{tail}"
+        return f"{level.heading}: {accuracy}.{tail}"
+    return f"{level.heading}: {reasons[0].what}. {accuracy[0].upper()}{accuracy[1:]}.{tail}"

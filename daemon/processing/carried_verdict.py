@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.processing.trajectory.figures import figures_of
 from swath.daemon.processing.trajectory.series import Flight, separation_of
-from swath.daemon.processing.trajectory.verdict import Level, judge
+from swath.daemon.processing.trajectory.verdict import judge
 from swath.georef.scanner.calibration import INDEX
+from swath.georef.verdicts import Level
 
 if TYPE_CHECKING:
     from swath.daemon.processing.navigation.navigate import Navigated

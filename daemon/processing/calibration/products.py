@@ -27,7 +27,7 @@ from swath.calib.strips.effects import SeenFrom
 from swath.calib.strips.signatures import signatures
 from swath.calib.summary import Finding, ReportInput
 from swath.calib.validation.methods import Asked, validate
-from swath.calib.verdict import DEG, Verdict, held_words, judge
+from swath.calib.verdict import DEG, held_words, judge
 from swath.daemon.errors import ExitCode, UserError, one_line
 from swath.daemon.processing.calibration.model import in_words, key_of
 from swath.daemon.processing.calibration.record import instruments_of
@@ -36,9 +36,9 @@ from swath.daemon.processing.carried_verdict import Carried, first_lines, verdic
 from swath.daemon.processing.files import sha256_of, write_whole
 from swath.daemon.processing.flights.read import trajectory_verdicts_of
 from swath.daemon.processing.strip_agreement import FlightStrips, before_and_after, difference_map
-from swath.daemon.processing.trajectory.verdict import Level
 from swath.daemon.processing.user_errors import finite
 from swath.georef.scanner.calibration import INDEX, PARAMETERS
+from swath.georef.verdicts import Level, Verdict
 
 Steps = Callable[[str, int, int], None]  # arguments: the step, how much is done, of how much
 MAP_CELLS = 400  # maximum cells across a map of differences
@@ -149,7 +149,7 @@ def _judged(header: Header, done: Calibrated, name: str, verdict: Verdict) -> He
     """
     held = tuple(key_of(one.name)[0] for one in done.adjusted.held if one.scanner == name and one.name in INDEX)
     reasons = tuple(one_line(reason.what) for reason in verdict.reasons)
-    return replace(header, verdict=verdict.level.words.lower(), verdict_reasons=reasons, held=held)
+    return replace(header, verdict=verdict.level.words, verdict_reasons=reasons, held=held)
 
 
 def _named(done: Calibrated, name: str, headers: Mapping[str, Header]) -> Any:

@@ -31,8 +31,9 @@ from swath.daemon.processing.trajectory.pictures import (
     draw_velocity_sigma,
 )
 from swath.daemon.processing.trajectory.series import Flight, course_of, separation_of
-from swath.daemon.processing.trajectory.verdict import Found, Level, Verdict, judge
+from swath.daemon.processing.trajectory.verdict import Found, judge
 from swath.georef.trajectory.trajectory import gps_text
+from swath.georef.verdicts import Level, Verdict
 
 MOST_REASONS = 40
 NARROW_PX = 640  # window width up to which the narrow pictures are shown

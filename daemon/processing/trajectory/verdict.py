@@ -2,82 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
-from enum import IntEnum
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, Protocol
 
 from swath.daemon.processing.trajectory.figures import ANGLES, AXES_B, AXES_L, Figures, accuracy_words
+from swath.georef.verdicts import Level, Reason, Rule, Verdict, worst_first
 
 Measure = Callable[[Figures], Iterator[tuple[str, float | None]]]
-
-
-class Level(IntEnum):
-    """The level of a reason, and of the whole verdict."""
-
-    GOOD = 0
-    CARE = 1
-    UNUSABLE = 2
-
-    @property
-    def words(self) -> str:
-        """The level in words, as on the page."""
-        return ("good", "usable with care", "not to be used")[self]
-
-
-@dataclass(frozen=True, slots=True)
-class Reason:
-    """A reason why a flight is not simply good.
-
-    Attributes:
-        level: severity of the reason.
-        name: name of the rule or the finding.
-        what: description of the problem, with the figure.
-        change: remedy for it.
-        excess: value over its limit, for sorting the worst first.
-    """
-
-    level: Level
-    name: str
-    what: str
-    change: str
-    excess: float = 1.0
-
-
-@dataclass(frozen=True, slots=True)
-class Rule:
-    """A limit on a figure.
-
-    Attributes:
-        name: short name.
-        measure: gives pairs of (what is measured, value) from the figures; None is not judged.
-        care, unusable: a value above it is a reason of that level; None: no such limit.
-        what: a sentence with ``{value}`` and ``{of}``.
-        change: remedy.
-        least: True if the limits are minimum values.
-    """
-
-    name: str
-    measure: Measure
-    care: float | None
-    unusable: float | None
-    what: str
-    change: str
-    least: bool = False
-
-    def judged(self, figures: Figures) -> Iterator[Reason]:
-        """Yield the reasons from its measure, one for each value beyond a limit."""
-        for of, value in self.measure(figures):
-            level, limit = self._level(value)
-            if value is not None and level > Level.GOOD and limit is not None:
-                excess = (limit / value if value else float("inf")) if self.least else value / max(limit, 1e-12)
-                yield Reason(level, self.name, self.what.format(value=value, of=of), self.change, excess)
-
-    def _level(self, value: float | None) -> tuple[Level, float | None]:
-        for level, limit in ((Level.UNUSABLE, self.unusable), (Level.CARE, self.care)):
-            if value is not None and limit is not None and ((value < limit) if self.least else not value <= limit):
-                return level, limit
-        return Level.GOOD, None
 
 
 class Found(Protocol):
@@ -178,7 +109,7 @@ def _offset_ms(figures: Figures) -> Iterator[tuple[str, float | None]]:
 
 
 NOISE = "the noise in [imu.NAME.noise] (grade, or its single keys)"
-RULES: tuple[Rule, ...] = (
+RULES: tuple[Rule[Figures], ...] = (
     Rule(
         "not finite",
         _one("not_finite"),
@@ -375,39 +306,12 @@ RULES: tuple[Rule, ...] = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class Verdict:
-    """The verdict on a flight.
-
-    Attributes:
-        level: the worst of the reasons.
-        sentence: the verdict in words.
-        reasons: reasons, the worst first.
-    """
-
-    level: Level
-    sentence: str
-    reasons: tuple[Reason, ...]
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the verdict as values for JSON."""
-        return {
-            "level": self.level.name.lower(),
-            "sentence": self.sentence,
-            "reasons": [
-                {"level": reason.level.name.lower(), "name": reason.name, "what": reason.what, "change": reason.change}
-                for reason in self.reasons
-            ],
-        }
-
-
 def judge(figures: Figures, findings: Iterable[Found] = ()) -> Verdict:
     """Return the verdict on figures; findings of the diagnosis are reasons too."""
     reasons = [reason for rule in RULES for reason in rule.judged(figures)]
     reasons += [reason_of(finding) for finding in findings]
-    reasons.sort(key=lambda reason: (-reason.level, -reason.excess))
-    level = max((reason.level for reason in reasons), default=Level.GOOD)
-    return Verdict(level, _sentence(level, figures, reasons), tuple(reasons))
+    level, ordered = worst_first(reasons)
+    return Verdict(level, _sentence(level, figures, ordered), ordered)
 
 
 def reason_of(finding: Found) -> Reason:
@@ -416,11 +320,10 @@ def reason_of(finding: Found) -> Reason:
     return Reason(level, finding.code, finding.text.rstrip("."), "", float("inf"))
 
 
-def _sentence(level: Level, figures: Figures, reasons: list[Reason]) -> str:
-    word = level.words[0].upper() + level.words[1:]
+def _sentence(level: Level, figures: Figures, reasons: Sequence[Reason]) -> str:
     if level is Level.GOOD:
-        return f"{word}: {accuracy_words(figures)}."
+        return f"{level.heading}: {accuracy_words(figures)}."
     told = [reason.what for reason in reasons if reason.level is level]
     more = len(reasons) - 1
     tail = f"; {more} more {'reason' if more == 1 else 'reasons'}" if more else ""
-    return f"{word}: {told[0]}{tail}."
+    return f"{level.heading}: {told[0]}{tail}."

@@ -25,8 +25,8 @@ from swath.daemon.processing.carried_verdict import (
     verdict_entry,
 )
 from swath.daemon.processing.setup.setup import Setup
-from swath.daemon.processing.trajectory.verdict import Level
 from swath.georef.scanner.calibration import INDEX, Calibration, nominal, read_calibration
+from swath.georef.verdicts import Level
 from tests.georef.flown import flown
 
 TEXT = """

@@ -8,7 +8,7 @@ from typing import TypeAlias
 
 from swath.calib.labels import degrees, is_undetermined, length, number, plain, thousands, words_of
 from swath.calib.summary import Profile, ReportInput
-from swath.calib.verdict import BORESIGHT, DEG, Verdict, overall_rms_m, sigma_of
+from swath.calib.verdict import BORESIGHT, DEG, overall_rms_m, sigma_of
 from swath.daemon.processing.calibration.report.cuts import cut_picture
 from swath.daemon.processing.calibration.report.maps import difference_picture, map_picture
 from swath.daemon.processing.calibration.report.pictures import (
@@ -33,6 +33,7 @@ from swath.daemon.processing.calibration.report.tables import (
     strips_table,
 )
 from swath.daemon.processing.pages.canvas import Picture
+from swath.georef.verdicts import Verdict
 
 
 @dataclass(frozen=True, slots=True)

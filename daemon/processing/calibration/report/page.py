@@ -7,12 +7,13 @@ from collections.abc import Sequence
 from html import escape
 
 from swath.calib.summary import Difference, DifferenceMap, PairDifference, Profile, ReportInput
-from swath.calib.verdict import Verdict, judge
+from swath.calib.verdict import judge
 from swath.daemon.processing.calibration.report.contents import Block, Notes, Words, blocks_of, cards_of, identity_rows
 from swath.daemon.processing.calibration.report.pdf import pdf_of
 from swath.daemon.processing.calibration.report.tables import Table
 from swath.daemon.processing.pages.canvas import NARROW, WIDE, Picture
 from swath.daemon.processing.pages.style import REPORT_STYLE
+from swath.georef.verdicts import Verdict
 
 __all__ = ["Difference", "DifferenceMap", "PairDifference", "Profile", "ReportInput", "html", "judge", "pdf"]
 

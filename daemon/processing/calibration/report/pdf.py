@@ -18,10 +18,10 @@ from matplotlib.image import imread
 from matplotlib.patches import Rectangle
 
 from swath.calib.summary import Profile
-from swath.calib.verdict import Level, Verdict
 from swath.daemon.processing.calibration.report.contents import Block, Notes, Words
 from swath.daemon.processing.calibration.report.tables import Table
 from swath.daemon.processing.pages.canvas import AFTER, BAD, GOOD, INK, MUTED, PAPER, SETTINGS, Canvas, Picture
+from swath.georef.verdicts import Level, Verdict
 
 PAGE_IN, MARGIN_IN = (8.27, 11.69), 0.585
 TOP_IN, FOOT_IN = 0.6, 0.65

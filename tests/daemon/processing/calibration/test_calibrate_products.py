@@ -11,13 +11,12 @@ import numpy as np
 import pytest
 
 from swath.calib.need import POINT, need_of
-from swath.calib.verdict import Level as CalibrationLevel
 from swath.calib.verdict import judge, wanted_of
 from swath.daemon.config import parse_config
 from swath.daemon.processing.calibration.products import _header, _wanted, trajectory_says
 from swath.daemon.processing.calibration.run import Calibrated
 from swath.daemon.processing.carried_verdict import Carried
-from swath.daemon.processing.trajectory.verdict import Level
+from swath.georef.verdicts import Level
 from tests.calib.made_outcome import made_outcome, made_report
 
 pytestmark = pytest.mark.xdist_group("kernels")
@@ -71,7 +70,7 @@ def test_what_a_configuration_wants_is_what_the_verdict_goes_by() -> None:
         else:
             (one,) = told
             assert one.what.endswith(" is wanted")
-            assert one.level is (CalibrationLevel.CARE if words == "not met" else CalibrationLevel.UNUSABLE)
+            assert one.level is (Level.CARE if words == "not met" else Level.UNUSABLE)
             assert one.excess > 1.0
-    assert found["far from met"].level is CalibrationLevel.UNUSABLE
+    assert found["far from met"].level is Level.UNUSABLE
     assert wanted("") == {}

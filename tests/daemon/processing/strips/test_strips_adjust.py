@@ -21,11 +21,11 @@ from swath.daemon.processing.setup.setup import Options
 from swath.daemon.processing.strips import adjust_products as strip_adjust_products
 from swath.daemon.processing.strips.adjust import AdjustOptions, StripsCorrected, correct_strips
 from swath.daemon.processing.strips.adjust_products import write_adjustment
-from swath.daemon.processing.trajectory.verdict import Level
 from swath.georef.formats.trajectory.csv import csv_text
 from swath.georef.formats.trajectory.file import read_trajectory
 from swath.georef.geodesy.earth import rot_e_from_l
 from swath.georef.trajectory.trajectory import Trajectory
+from swath.georef.verdicts import Level
 from tests.calib.village import Made, judge_unusable, village
 
 pytestmark = [pytest.mark.xdist_group("kernels"), pytest.mark.slow]

@@ -17,10 +17,11 @@ from scipy.stats import chi2
 from swath.daemon.processing.trajectory.figures import CHI2_MEDIAN, Figures, figures_of
 from swath.daemon.processing.trajectory.page import summary_of
 from swath.daemon.processing.trajectory.series import Flight, separation_of
-from swath.daemon.processing.trajectory.verdict import RULES, Level, judge
+from swath.daemon.processing.trajectory.verdict import RULES, judge
 from swath.georef.navigation.diagnosis.diagnose import Finding
 from swath.georef.navigation.inputs import Fate, Kind
 from swath.georef.timescales.gps_time import SECOND_NS
+from swath.georef.verdicts import Level
 from tests.daemon.navigation_flights import SMOOTHER_SIGMA, sound_flight, with_rows
 
 pytestmark = pytest.mark.xdist_group("kernels")
