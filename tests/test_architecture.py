@@ -32,6 +32,23 @@ SHARED_OF_GEOREF = {
     "swath.georef.timescales",
     "swath.georef.toml_tables",
 }
+# Modules outside the command line that import within functions, and what: an extra, or what is dear at start-up and
+# not needed by all who use the module.
+IMPORTED_LATE = {
+    "swath.daemon.log.directory": {"swath.daemon.config"},  # pydantic; commands given a folder read no configuration
+    "swath.daemon.processing.flights.trajectory_choice": {"swath.georef.trajectory.turn_rates"},  # scipy.signal
+    "swath.daemon.processing.setup.terrain": {"rasterio"},
+    "swath.daemon.processing.strips.compare": {"swath.daemon.processing.quicklook.maps"},  # matplotlib, with -o only
+    "swath.daemon.processing.trajectory.summary": {"swath.daemon.processing.trajectory.page"},  # matplotlib
+    "swath.daemon.simulate.plans": {"swath.sim"},  # the one door to the virtual aircraft
+    "swath.daemon.system": {"psutil"},
+    "swath.drivers.imu.dbc.signals": {"cantools.database"},
+    "swath.drivers.scanner.rows.filler": {"swath.drivers.scanner.rows.compiled"},  # numba
+    "swath.drivers.scanner.velodyne.calibration": {"yaml"},
+    "swath.drivers.transports.opening": {"swath.drivers.transports.can.adapter"},  # python-can
+    "swath.drivers.transports.spec": {"can.interfaces"},
+    "swath.sim.scene.raster": {"rasterio"},
+}
 PROCESSING_ONLY = {"numba", "scipy", "pyproj", "laspy", "matplotlib", "swath.calib"}
 
 
@@ -149,6 +166,32 @@ def test_no_module_imports_itself_by_way_of_others() -> None:
         TopologicalSorter(imports()).prepare()
     except CycleError as error:
         pytest.fail(" imports ".join(reversed(error.args[1])))
+
+
+def imported_in_functions(path: Path) -> set[str]:
+    """Modules that functions of a file import."""
+    functions = (ast.FunctionDef, ast.AsyncFunctionDef)
+    bodies = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, functions)]
+    found: set[str] = set()
+    for node in (node for body in bodies for node in ast.walk(body)):
+        if isinstance(node, ast.ImportFrom):
+            found.add(node.module or "")
+        elif isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+    return found
+
+
+def test_functions_import_only_extras_and_what_is_dear_at_start_up() -> None:
+    found = {name: imported_in_functions(path) for name, path in modules().items()}
+    late = {name: taken for name, taken in found.items() if taken and not name.startswith("swath.daemon.cli.")}
+    packages = {
+        name: {
+            next((one for one in IMPORTED_LATE.get(name, ()) if f"{module}.".startswith(f"{one}.")), module)
+            for module in taken
+        }
+        for name, taken in late.items()
+    }
+    assert packages == IMPORTED_LATE
 
 
 def test_files_are_rooms() -> None:

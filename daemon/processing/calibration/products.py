@@ -20,6 +20,7 @@ from swath.calib.need import POINT, Need, need_of
 from swath.calib.outcome import Adjusted
 from swath.calib.parameters import ANGLES
 from swath.calib.profiles.check import Check
+from swath.calib.record.record import RecordInput, record_json, record_of, record_xml
 from swath.calib.record.values import Plain
 from swath.calib.strips.cells import StripRules
 from swath.calib.strips.differences import differences
@@ -31,6 +32,8 @@ from swath.calib.verdict import DEG, held_words, judge
 from swath.daemon.errors import ExitCode, UserError, one_line
 from swath.daemon.processing.calibration.model import in_words, key_of
 from swath.daemon.processing.calibration.record import instruments_of
+from swath.daemon.processing.calibration.report.page import html, pdf
+from swath.daemon.processing.calibration.report.profiles import pictures
 from swath.daemon.processing.calibration.run import OUTCOME, Calibrated, CalibrationOptions, paths_of
 from swath.daemon.processing.carried_verdict import Carried, first_lines, verdict_entry
 from swath.daemon.processing.files import sha256_of, write_whole
@@ -348,10 +351,6 @@ def _wanted(done: Calibrated) -> dict[str, float]:
 
 def _report_files(folder: Path, done: Calibrated, report: ReportInput, facts: Mapping[str, Plain]) -> dict[Path, bytes]:
     """Return the report as HTML and PDF, and per scanner a record as XML and JSON with its matrices."""
-    from swath.calib.record.record import RecordInput, record_json, record_of, record_xml
-    from swath.daemon.processing.calibration.report.page import html, pdf
-    from swath.daemon.processing.calibration.report.profiles import pictures
-
     report = replace(report, profiles=pictures(done.check, done.kept.flight, done.control))
     files = {folder / "report.html": html(report).encode(), folder / "report.pdf": pdf(report)}
     for name, header in report.headers.items():

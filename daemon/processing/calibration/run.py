@@ -37,6 +37,8 @@ from swath.calib.prealign import PrealignError, PrealignSettings, prealigned
 from swath.calib.profiles.check import Check, check
 from swath.calib.record.values import Plain
 from swath.calib.summary import Finding
+from swath.calib.ties.intersections import find_ties
+from swath.calib.ties.markings import find_markings
 from swath.calib.ties.picked import PickedError
 from swath.calib.ties.picked import carried as carried_points
 from swath.daemon.errors import ExitCode, UserError
@@ -344,14 +346,10 @@ def _features(wish: CalibrationOptions, flight: Flight, planes: Features, points
     """
     found = [planes]
     if "ties" in wish.observe:
-        from swath.calib.ties.intersections import find_ties
-
         found = [find_ties(flight, planes)]
     if points:
         found.append(control_planes(flight, points))
     if "markings" in wish.observe:
-        from swath.calib.ties.markings import find_markings
-
         found.append(find_markings(flight))
     return Features.joined(found)
 

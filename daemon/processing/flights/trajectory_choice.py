@@ -11,6 +11,8 @@ import numpy as np
 
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.processing.given_trajectory import Given, judge_given, points_of
+from swath.daemon.processing.navigation.inputs import InputOptions
+from swath.daemon.processing.navigation.navigate import NavigationOptions, navigate_session
 from swath.daemon.processing.trajectory.files import smrmsg_beside
 from swath.georef.formats.trajectory.file import read_trajectory
 from swath.georef.stream.path import SHORTEST_TRAJECTORY
@@ -168,9 +170,6 @@ def _from_device(setup: Setup, clocks: LogClocks) -> tuple[Trajectory, dict[str,
 
 def _navigated(setup: Setup, session: Session, solutions: dict[str, int]) -> Navigated:
     """Return the session navigated and smoothed from IMU and GNSS."""
-    from swath.daemon.processing.navigation.inputs import InputOptions
-    from swath.daemon.processing.navigation.navigate import NavigationOptions, navigate_session
-
     log = session.parts[0].path
     if setup.sources.imu_source is None or not setup.config.gnss:
         told = f"{setup.sources.ins_source}: its INS had no solution" if solutions else "no INS solution in the log"

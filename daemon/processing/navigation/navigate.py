@@ -23,6 +23,9 @@ from swath.daemon.processing.navigation.sources import noise_of
 from swath.daemon.processing.navigation.times import Stretch
 from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.quaternions import conjugate, rotated
+from swath.georef.navigation.alignment.align import align
+from swath.georef.navigation.alignment.earlier_start import earlier_start
+from swath.georef.navigation.diagnosis.diagnose import diagnose
 from swath.georef.navigation.filter.stores import IN_MEMORY, Storage
 from swath.georef.navigation.inputs import (
     GRADES,
@@ -32,6 +35,9 @@ from swath.georef.navigation.inputs import (
     Solution,
     sort_observations,
 )
+from swath.georef.navigation.solve import solve, stretch_of
+from swath.georef.navigation.stillness import with_still_seconds
+from swath.georef.navigation.unit_noise import noise_findings
 from swath.georef.points import Fate
 from swath.georef.records import FixType, StructArray
 from swath.georef.trajectory.buffer import TrajectoryBuffer
@@ -202,13 +208,6 @@ def navigate_inputs(
 
 
 def _navigated(inputs: NavigationInputs, leg: Leg, wish: NavigationOptions, storage: Storage) -> NavigatedLeg:
-    from swath.georef.navigation.alignment.align import align
-    from swath.georef.navigation.alignment.earlier_start import earlier_start
-    from swath.georef.navigation.diagnosis.diagnose import diagnose
-    from swath.georef.navigation.solve import solve, stretch_of
-    from swath.georef.navigation.stillness import with_still_seconds
-    from swath.georef.navigation.unit_noise import noise_findings
-
     rows = leg.observations if wish.attitude_rad is None else _with_attitude(leg, wish.attitude_rad)
     start = align(leg.inertial, rows, inputs.setup)
     if wish.smooth:
@@ -227,8 +226,6 @@ def _navigated(inputs: NavigationInputs, leg: Leg, wish: NavigationOptions, stor
 
 def _why_not(inputs: NavigationInputs, leg: Leg) -> list[str]:
     """Return the faults in the data of a leg for which no start was found."""
-    from swath.georef.navigation.diagnosis.diagnose import diagnose
-
     found = diagnose(leg.inertial, leg.observations, inputs.setup, None)
     return [f"{inputs.log}: {finding.text}" for finding in found]
 
