@@ -113,9 +113,10 @@ def _follow(
 
     from swath.daemon.config import load_config
     from swath.daemon.config.tables import LiveConfig
+    from swath.daemon.processing.compiling import before_compiling
     from swath.daemon.processing.live.session import Live
     from swath.daemon.processing.setup.setup import Options, Setup
-    from swath.daemon.processing.warm_up import before_compiling, get_ready, warm_up
+    from swath.daemon.processing.warm_up import get_ready, warm_up
     from swath.daemon.recorder.service_manager import ServiceManager
     from swath.daemon.system import lower_priority
 

@@ -46,6 +46,7 @@ def command(
     require_installed("swath plan-calibration", "matplotlib")
     from rich.console import Console
 
+    from swath.daemon.cli.progress import compiling_noticed
     from swath.daemon.processing.calibration.model import model_of
     from swath.daemon.processing.calibration.plan.page import draw_planned, require_picture
     from swath.daemon.processing.calibration.plan.run import PlanOptions, plan_calibration
@@ -55,7 +56,8 @@ def command(
     require_picture(picture)
     asked = PlanOptions(model_of(model), None if sigmas is None else _three(sigmas), not no_control, control_sigma)
     wish = FlightOptions(plan)
-    with Console(stderr=True).status("flying on paper"), wish.told():
+    console = Console(stderr=True)
+    with console.status("flying on paper"), compiling_noticed(console), wish.told():
         planned = plan_calibration(wish.load(), asked)
         try:
             draw_planned(planned, picture)

@@ -7,9 +7,11 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from rich.console import Console
     from rich.progress import Progress
 
 Tell = Callable[[str, int, int], None]  # description, bytes done, bytes in total
+COMPILING = "compiling for this computer: this takes a minute or more and happens once"
 
 
 def transfer_bar() -> Progress:
@@ -28,9 +30,21 @@ def transfer_bar() -> Progress:
 
 
 @contextmanager
+def compiling_noticed(console: Console) -> Iterator[None]:
+    """Write a line when loops have to be compiled within the block, as on a new installation."""
+    from swath.daemon.processing.compiling import before_compiling
+
+    with before_compiling(lambda: console.print(COMPILING, markup=False, highlight=False, soft_wrap=True)):
+        yield
+
+
+@contextmanager
 def progress_bar() -> Iterator[Tell]:
-    """Show a bar on stderr, if that is a terminal, during the block; give the function that updates it."""
-    with transfer_bar() as bar:
+    """Show a bar on stderr, if that is a terminal, during the block; give the function that updates it.
+
+    Where loops have to be compiled first, a line says so.
+    """
+    with transfer_bar() as bar, compiling_noticed(bar.console):
         task = bar.add_task("reading", total=None)
 
         def tell(what: str, done: int, total: int) -> None:

@@ -145,12 +145,13 @@ def _print_lines(console: Console, rows: list[dict[str, Any]]) -> None:
 
 
 def _fly_into_log(console: Console, wish: FlightOptions, output: Path, *, with_truth: bool) -> None:
+    from swath.daemon.cli.progress import compiling_noticed
     from swath.daemon.simulate.folder import FlightFolder
 
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     started_s = time.monotonic()
     try:
-        with FlightFolder(output) as folder:
+        with compiling_noticed(console), FlightFolder(output) as folder:
             report, names = _make_log(console, wish, folder, with_truth=with_truth)
             logs = folder.keep(report.paths)
     except KeyboardInterrupt:

@@ -14,13 +14,12 @@ import math
 import pickle
 import time
 import tomllib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from typing import Any
 
-import numba.core.event
 import numpy as np
 import pyproj
 from numpy.typing import NDArray
@@ -34,6 +33,7 @@ from swath.calib.planes.search import find_planes
 from swath.daemon.config.config import Config
 from swath.daemon.config.tables import Tables
 from swath.daemon.log.format import SessionInfo
+from swath.daemon.processing.compiling import compilations
 from swath.daemon.processing.live.frame import LocalFrame, Maps
 from swath.daemon.processing.live.grid import CountGrid, count_points
 from swath.daemon.processing.live.products import Thinning
@@ -85,7 +85,6 @@ NAVIGATED_S, IMU_RATE_HZ = 12, 50
 NAVIGATED_FROM_NS = 1_465_000_000 * SECOND_NS
 PLACE = (np.radians(47.0), np.radians(9.0), 500.0)
 
-COMPILE_EVENT = "numba:compile"
 ROWS = 500
 LEAP_SECONDS = 18
 START_NS = (405_555 * 3600 + LEAP_SECONDS) * SECOND_NS  # GPS: a full UTC hour of 2026, where some stamps begin
@@ -146,36 +145,6 @@ class WarmUp:
             else "no folder to keep them in can be written to, so every process compiles in memory: set NUMBA_CACHE_DIR"
         )
         return f"{what} in {self.seconds:.1f} s; {where}"
-
-
-@contextlib.contextmanager
-def compilations() -> Iterator[list[str]]:
-    """Record the names of loops compiled within the block; those read from the cache are not listed."""
-    with numba.core.event.install_recorder(COMPILE_EVENT) as recorder:
-        names: list[str] = []
-        yield names
-        names += [str(event.data["dispatcher"]) for _, event in recorder.buffer if event.is_start]
-
-
-class _FirstCompilation(numba.core.event.Listener):
-    """Calls a function once, when the first loop is about to be compiled."""
-
-    def __init__(self, call: Callable[[], None]) -> None:
-        self._calls = [call]
-
-    def on_start(self, event: numba.core.event.Event) -> None:
-        while self._calls:
-            self._calls.pop()()
-
-    def on_end(self, event: numba.core.event.Event) -> None:
-        """Ignore the end of a compilation."""
-
-
-@contextlib.contextmanager
-def before_compiling(call: Callable[[], None]) -> Iterator[None]:
-    """Call a function before the first loop is compiled within the block; never if all come from the cache."""
-    with numba.core.event.install_listener(COMPILE_EVENT, _FirstCompilation(call)):
-        yield
 
 
 def cache_folder() -> Path | None:

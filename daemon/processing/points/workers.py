@@ -14,6 +14,7 @@ from contextlib import contextmanager, suppress
 from typing import Any
 
 from swath.daemon.errors import ExitCode, UserError
+from swath.daemon.processing.compiling import mark_compiling, tell_of_worker
 from swath.daemon.processing.points.jobs import Job, JobResult, run_job
 from swath.drivers.extras import how_to_install
 
@@ -97,12 +98,13 @@ def _failed(job: Job, why: str) -> JobResult:
 # ---------------------------------------------------------------------- processes of this computer
 
 
-def _begin(plans: bytes, done: Any, begun: Any) -> None:
+def _begin(plans: bytes, done: Any, begun: Any, compiling: Any) -> None:
     """Initialise a worker process; on an interrupt, the parent process ends it."""
     global _plans, _done
     begun.value = True
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    mark_compiling(compiling)
     _plans, _done = pickle.loads(plans), done
 
 
@@ -140,9 +142,9 @@ def _in_processes(
     plans: Sequence[Any], jobs: Sequence[Job], order: list[int], workers: int, progress: Progress, do: Do
 ) -> dict[int, JobResult]:
     context = multiprocessing.get_context("spawn")
-    done, begun = context.Value("q", 0), context.Value("b", False)
+    done, begun, compiling = context.Value("q", 0), context.Value("b", False), context.Value("b", False)
     before = set(multiprocessing.active_children())
-    pool = ProcessPoolExecutor(workers, context, _begin, (pickle.dumps(list(plans)), done, begun))
+    pool = ProcessPoolExecutor(workers, context, _begin, (pickle.dumps(list(plans)), done, begun, compiling))
     results: dict[int, JobResult] = {}
     futures: dict[Future[JobResult], int] = {}
     try:
@@ -161,6 +163,8 @@ def _in_processes(
                     results[number] = future.result()
                 except BrokenProcessPool:
                     results[number] = _failed(jobs[number], DIED)
+            if compiling.value:
+                tell_of_worker()
             progress(int(done.value))
         if futures and not begun.value:
             raise UserError(f"no worker process could be begun; {UNGUARDED}")

@@ -8,13 +8,12 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import numba
 import pytest
 
 from swath.daemon.cli.main import INTERRUPTED
-from swath.daemon.processing.warm_up import WarmUp, before_compiling, cache_folder, compilations
+from swath.daemon.processing.warm_up import WarmUp, cache_folder
 from tests.daemon.cli.test_cli import ROOT, swath
 from tests.daemon.rig import HANGS_S
 
@@ -35,7 +34,8 @@ FLY = (
     + """
 from swath.daemon.config.tables import LiveConfig
 from swath.daemon.processing.live.session import replay
-from swath.daemon.processing.warm_up import compilations, get_ready, warm_up
+from swath.daemon.processing.compiling import compilations
+from swath.daemon.processing.warm_up import get_ready, warm_up
 from tests.daemon.processing.live.test_live import Flown
 
 folder = Path(sys.argv[1])
@@ -85,30 +85,6 @@ def test_after_a_warm_up_a_flight_needs_no_loop_that_is_not_there(tmp_path: Path
     assert found["known"] > 15
     assert found["kept"] > 100_000, "what the garbage collector would go through while points are made"
     assert found["points"] > 20_000
-
-
-def test_what_is_compiled_is_noticed() -> None:
-    def twice(x: int) -> int:
-        return 2 * x
-
-    compiled: Any = numba.njit(twice)
-    with compilations() as names:
-        assert compiled(3) == 6
-    assert any("twice" in name for name in names)
-    with compilations() as names:
-        assert compiled(4) == 8
-    assert names == []
-
-
-def test_compiling_is_told_once_and_before_it_begins() -> None:
-    told: list[str] = []
-    with before_compiling(lambda: told.append("begins")):
-        numba.njit(lambda x: 3 * x)(2)
-        numba.njit(lambda x: 4 * x)(2)
-    assert told == ["begins"]
-    with before_compiling(lambda: told.append("again")):
-        pass
-    assert told == ["begins"]
 
 
 @pytest.mark.parametrize(
