@@ -7,7 +7,8 @@ SECONDS ?= 600
 MINUTES ?= 60
 RATE ?= 0.1
 SEEDS ?= 5
-PYTEST := $(BIN)/python -m pytest -p no:cacheprovider
+# RESULTS: a folder for a JUnit file of each run, which .ci/run sums up
+PYTEST = $(BIN)/python -m pytest -p no:cacheprovider $(if $(RESULTS),--junitxml=$(RESULTS)/$@$(1).xml)
 
 DESTDIR ?=
 PREFIX ?= /opt/swath
@@ -29,11 +30,11 @@ demo: $(VENV)/.flies ## play real recordings, then a virtual flight, through rea
 test: $(VENV)/.tests $(VENV)/.tools ## install and run: style, types, import rules, tests
 	@$(MAKE) -j 2 --output-sync=target lint ready
 	$(PYTEST) -n $(JOBS) --dist loadgroup -m "not slow and not long and not alone and not peers"
-	$(PYTEST) -n 0 -m "alone and not slow and not long"
+	$(call PYTEST,-alone) -n 0 -m "alone and not slow and not long"
 
 test-slow: $(VENV)/.tests $(VENV)/.tools ready ## the tests that take longer: whole flights, calibrated; the demo, the installation
 	$(PYTEST) -n $(JOBS) --dist loadgroup -m "slow and not long and not alone and not peers"
-	$(PYTEST) -n 0 -m "alone and slow and not long"
+	$(call PYTEST,-alone) -n 0 -m "alone and slow and not long"
 
 test-peers: $(VENV)/.tests ## beside gpsd and Foxglove's reader, which it installs (root, apt, npm)
 	@for program in gpsd npm; do command -v $$program >/dev/null || \
@@ -43,11 +44,11 @@ test-peers: $(VENV)/.tests ## beside gpsd and Foxglove's reader, which it instal
 
 test-vm: $(VENV)/.tests ## on real CAN, PPS, systemd and power cuts, in a virtual machine that it installs (root, apt, alone)
 	@bash tests/vm/setup.sh
-	$(BIN)/python -m tests.vm -m "not long"
+	$(PYTEST) -n 0 -v -m "not long" tests/vm
 
 test-vm-long: $(VENV)/.tests ## the same with 50 power cuts and three minutes of flight
 	@bash tests/vm/setup.sh
-	$(BIN)/python -m tests.vm
+	$(PYTEST) -n 0 -v tests/vm
 
 test-arm64: $(VENV)/.tests ## decoders, log and points on an emulated ARM64, which it installs (root, apt): the same as here
 	@bash tests/arm64/setup.sh $(VENV)
@@ -77,7 +78,7 @@ lint: $(VENV)/.tests ## style, import rules and types only
 ready: $(VENV)/.tests
 	$(BIN)/python -m swath.daemon.cli.main warm-up
 	@folder=$$(mktemp -d) && $(BIN)/python -m swath.daemon.cli.main sim fly small --seconds 14 -o $$folder >/dev/null; rm -r $$folder
-	@$(PYTEST) -n 0 -q --collect-only >/dev/null || true
+	@$(BIN)/python -m pytest -p no:cacheprovider -n 0 -q --collect-only >/dev/null || true
 
 bench: $(VENV)/.tests ## measure speed, each figure beside this machine's own limit
 	$(BIN)/python -m benchmarks

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from collections import Counter
 from collections.abc import Generator
 from pathlib import Path
 
@@ -11,13 +9,11 @@ import pytest
 
 from tests.named_only import is_asked_for, limit
 from tests.vm.beside import Moment
-from tests.vm.machine import BESIDE_OTHERS, stood_still
+from tests.vm.machine import stood_still
 
 HERE = Path(__file__).resolve().parent
 HANGS_S = 1500.0  # beyond it nothing is awaited; a machine has its own limit
-OTHERS = 0.2  # of the processors: with more beside it the emulated machine is another
 _BEGAN = pytest.StashKey[Moment]()
-_FAILURES = pytest.StashKey[list[tuple[str, str, float]]]()
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
@@ -40,20 +36,7 @@ def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestR
     if report.failed:
         share = item.stash[_BEGAN].share_of_others()
         report.sections.append(("this computer", f"others had {share:.0%} of its processors meanwhile"))
-        failures = item.config.stash.setdefault(_FAILURES, [])
-        failures.append((str(item.path), "failed" if report.when == "call" else "error", share))
     return report
-
-
-def pytest_sessionfinish(session: pytest.Session) -> None:
-    """Where others had much of it in all that failed, that is left for `tests.vm.__main__`."""
-    BESIDE_OTHERS.unlink(missing_ok=True)
-    failures = session.config.stash.get(_FAILURES, [])
-    if failures and all(share > OTHERS for _, _, share in failures):
-        kinds = Counter(kind for _, kind, _ in failures)
-        told = {"failed": kinds["failed"], "error": kinds["error"], "paths": sorted({path for path, _, _ in failures})}
-        BESIDE_OTHERS.parent.mkdir(exist_ok=True)
-        BESIDE_OTHERS.write_text(json.dumps(told))
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:

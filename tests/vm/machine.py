@@ -27,7 +27,6 @@ GUEST = HERE / "guest"
 MODULES = CACHE / "modules"  # pps_sim.ko
 UDEV = CACHE / "udev"  # a layer: the host may have no udev
 DCD_SHIM = CACHE / "dcd_shim.so"
-BESIDE_OTHERS = CACHE / "beside-others.json"  # what failed while this computer had other work
 
 BOOT_S = 120.0  # twenty times what it takes on an idle machine
 FIRST_WORD_S = 60.0  # from power on to VM-STAGE1, likewise
