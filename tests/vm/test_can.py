@@ -53,7 +53,7 @@ def decoded(logs: Path, source: str) -> int:
     return len(number)
 
 
-@pytest.mark.parametrize("seconds", [60])
+@pytest.mark.parametrize("seconds", [20, pytest.param(60, marks=pytest.mark.long)])
 def test_can_1_khz_without_loss_and_with_kernel_stamps(tmp_path: Path, seconds: int) -> None:
     finished = aboard(tmp_path, "aboard_can", "rate", seconds, seconds=seconds + 20)
     content = read_log(tmp_path / "logs")

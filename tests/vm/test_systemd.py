@@ -19,7 +19,7 @@ SERVICES = ("swathd.service", "swath-live.service")
 LOGS = aircraft.LOGS
 DISK_MB = 256
 COMES_BACK_S = 400.0  # measures nothing
-KILLS = 20
+KILLS = 10
 SESSION = "split_minutes = 1440\n"
 RULES = """\
 SUBSYSTEM=="tty", ATTRS{idVendor}=="0403", ATTRS{serial}=="FT4XYZ12", SYMLINK+="rover"
