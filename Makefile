@@ -24,7 +24,7 @@ export PIP_ROOT_USER_ACTION := ignore
 help: ## say what there is to make
 	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z0-9-]+):.*## (.*)/  make \1\t\2/' | expand -t 20
 
-demo: $(VENV)/.flies ## play real recordings, then a virtual flight, through real wires into a recorder, about 2 min
+demo: $(VENV)/.flies ## play real recordings and a virtual flight into a recorder, make points and a page of it, about 3 min
 	@$(BIN)/python -m demo
 
 test: $(VENV)/.tests $(VENV)/.tools ## install and run: style, types, import rules, tests
@@ -102,7 +102,7 @@ $(VENV)/bin/python:
 	@sh systemd/setup.sh venv "$(PYTHON)" "$(VENV)"
 
 $(VENV)/.flies: pyproject.toml | $(VENV)/bin/python
-	@sh systemd/setup.sh pip "$(VENV)" '.[sim]'
+	@sh systemd/setup.sh pip "$(VENV)" '.[sim,process]'
 	@touch $@
 
 $(VENV)/.tests: pyproject.toml | $(VENV)/bin/python

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import laspy
 import pytest
 from rich.console import Console
 
@@ -62,6 +63,15 @@ def test_it_passes_and_shows_what_a_person_wants_to_see(played: tuple[str, Path]
         content = read_log(folder / part / "logs")
         assert all(content.units[source] for source in sources)
         assert [event["severity"] for _, event in content.messages["/events"] if event["severity"] != "info"] == []
+
+
+def test_its_last_line_names_the_page_of_the_points(played: tuple[str, Path]) -> None:
+    text, folder = played
+    page = Path(text.splitlines()[-1])
+    assert page == folder / "flight/view/index.html"
+    points = sum(len(laspy.read(path)) for path in (folder / "flight/points").glob("*.laz"))
+    assert points > 100_000
+    assert f"{points:,}".replace(",", "\u202f") in page.read_text()
 
 
 @pytest.mark.parametrize(("part", "source"), EVERY)
