@@ -25,17 +25,17 @@ FASTEST_MESSAGE_NS = 50_000_000  # the edge is placed so long before the least d
 
 
 def gnss_units() -> Iterator[TimedUnit]:
-    """NovAtel ProPak6, the chunks as they arrived."""
+    """Yield the chunks of a NovAtel ProPak6 as they arrived."""
     return _from_zero(read_serial(GNSS, GNSS_CHUNKS), "gnss/rover")
 
 
 def can_units() -> Iterator[TimedUnit]:
-    """CANmod.gps between the other traffic of its bus."""
+    """Yield the frames of a CANmod.gps between the other traffic of its bus."""
     return _from_zero(read_candump(CAN), "imu/main")
 
 
 def scanner_units(seconds: float) -> Iterator[TimedUnit]:
-    """VLP-16 with its position packets: 0.4 s of recording, played over and over at its own pace."""
+    """Yield a VLP-16 and its position packets: 0.4 s of recording, played over and over at its own pace."""
     once = list(read_pcap(SCANNER))
     period_ns = once[-1].time_ns - once[0].time_ns + 1_327_000  # one packet's time behind the last, VLP-16 manual 9.3
     sources = {SCANNER_DATA_PORT: "scanner/top", SCANNER_POSITION_PORT: "scanner/top/aux"}
@@ -46,7 +46,7 @@ def scanner_units(seconds: float) -> Iterator[TimedUnit]:
 
 
 def pps_units(seconds: float) -> Iterator[TimedUnit]:
-    """Edges that belong to the GNSS recording: it was made without its PPS, so its own epochs place them.
+    """Yield edges that belong to the GNSS recording: it was made without its PPS, so its own epochs place them.
 
     Every epoch on a whole second names an edge; the least delay between the two is taken for all.
     """
@@ -65,7 +65,7 @@ def pps_units(seconds: float) -> Iterator[TimedUnit]:
 
 
 def until(units: Iterable[TimedUnit], seconds: float) -> Iterator[TimedUnit]:
-    """Those of the first seconds."""
+    """Yield the units of the first seconds."""
     return takewhile(lambda unit: unit.time_ns < seconds * SECOND_NS, units)
 
 

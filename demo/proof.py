@@ -1,4 +1,4 @@
-"""What the demonstration is made of: a real recorder, wires whose bytes are remembered, and the proof."""
+"""Plays a recording into a real recorder over wires whose bytes are remembered, and proves that all were logged."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Hashed(Output):
         self.bytes = 0
 
     def send(self, data: bytes, due_realtime_ns: int) -> bool:
-        """Send and remember."""
+        """Send the data, and remember them if they were sent."""
         sent = self._output.send(data, due_realtime_ns)
         if sent:
             self.digest.update(data)
@@ -43,11 +43,11 @@ class Hashed(Output):
         return sent
 
     def has_reader(self) -> bool:
-        """As the output itself."""
+        """Return whether the output has a reader."""
         return self._output.has_reader()
 
     def close(self) -> None:
-        """Close."""
+        """Close the output itself."""
         self._output.close()
 
 
@@ -71,7 +71,7 @@ class Show:
 
 
 def start_recorder(folder: Path, sources: int) -> subprocess.Popen[bytes]:
-    """``swath run`` on the folder's configuration, all its devices open."""
+    """Start ``swath run`` on the folder's configuration; return it when all its devices are open."""
     journal = folder / "journal.txt"
     with journal.open("w") as stderr:
         command = [sys.executable, "-m", "swath.daemon.cli.main", "run", str(folder / "swath.toml")]
@@ -86,7 +86,7 @@ def start_recorder(folder: Path, sources: int) -> subprocess.Popen[bytes]:
 
 
 def progress_table(show: Show, played_s: float, report: PlayReport) -> Table:
-    """What has been sent so far."""
+    """Return a table of what has been sent so far."""
     table = Table(title=f"{show.title}: {played_s:4.1f} of {show.seconds:.0f} s", title_justify="left")
     for column in ("source", "units", "bytes", "what"):
         table.add_column(column, justify="left" if column in ("source", "what") else "right")
@@ -96,7 +96,7 @@ def progress_table(show: Show, played_s: float, report: PlayReport) -> Table:
 
 
 def logged_by_source(logs: Path, sources: Iterable[str]) -> tuple[dict[str, str], Counter[str], Counter[str]]:
-    """Digest, bytes and units of each source in the log, read with the official reader, CRCs checked."""
+    """Return digest, bytes and units of each source in the log, read with the official reader, CRCs checked."""
     digests = {source: hashlib.sha256() for source in sources}
     sizes: Counter[str] = Counter()
     units: Counter[str] = Counter()

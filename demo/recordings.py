@@ -48,7 +48,7 @@ installation = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
 
 
 def all_units(seconds: float) -> Iterator[TimedUnit]:
-    """Everything, in order of time."""
+    """Yield the units of all sources in order of time."""
     streams = [
         until(stream, seconds) for stream in (gnss_units(), can_units(), scanner_units(seconds), pps_units(seconds))
     ]

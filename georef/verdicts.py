@@ -50,7 +50,7 @@ class Reason:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """The judgement.
+    """The judgement of a flight, a calibration or a product.
 
     Attributes:
         level: the worst of the reasons.

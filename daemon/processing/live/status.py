@@ -226,7 +226,7 @@ def _not_locked(found: dict[str, Any]) -> list[str]:
 
 
 def write_status(folder: Path, found: dict[str, Any]) -> None:
-    """Replace ``live.json``.
+    """Replace ``live.json`` by the newest status.
 
     Raises:
         OSError: the file cannot be written.
