@@ -25,7 +25,7 @@ FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 VERBS = set(
     """
     abandon accept accumulate add adjust adopt advance allocate append apply ask begin bridge build calibrate call
-    carry change check choose classify clear climb close collect combine compare compile complete compute
+    carry change check choose classify clear climb close collect combine compare compile compress complete compute
     concatenate connect convert copy correct count create cut decide decode decompress derive describe detect
     determine distribute divide do double draw drop encode end enlarge estimate evaluate examine expand feed fill
     filter find finish fit flatten flush fly follow forget format forward free georeference give go group grow
@@ -34,7 +34,7 @@ VERBS = set(
     move multiply name navigate normalise note number open overwrite pack parse pass place plan play post predict
     prepare print process propagate provide put queue raise rank read receive recognise record redirect reduce refit
     refuse register release remove rename repair repeat replace replay report request return rotate run sample say
-    scale scan select send set shift show skip smooth solve sort split spread start steer step stop store style sum
+    save scale scan select send set shift show skip smooth solve sort split spread start steer step stop store style sum
     summarise switch sync take tell terminate test thin transform truncate try turn unpack update use validate view
     wait wake warm watch whiten widen work wrap write yield
 """.split()
