@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$", max_length=64)]
 Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
@@ -19,7 +19,12 @@ def none_of_empty(value: Any) -> Any:
     return None if value == "" else value
 
 
-Wired = Annotated[Name | None, BeforeValidator(none_of_empty)]
+def empty_of_none(value: str | None) -> str:
+    """Return an empty string for None, the reverse of `none_of_empty`."""
+    return value or ""
+
+
+Wired = Annotated[Name | None, BeforeValidator(none_of_empty), PlainSerializer(empty_of_none)]
 
 
 class Section(BaseModel):
