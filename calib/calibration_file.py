@@ -6,15 +6,24 @@
 from __future__ import annotations
 
 import datetime as dt
-import json
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import tomlkit
+from tomlkit.items import Array
 
 from swath.georef.arrays import FloatArray
-from swath.georef.scanner.calibration import CONVENTIONS, PARAMETERS, Calibration, CalibrationError, read_calibration
+from swath.georef.scanner.calibration import (
+    CONVENTIONS,
+    PARAMETERS,
+    Calibration,
+    CalibrationError,
+    RangeOffset,
+    read_calibration,
+)
 
 _DEG = math.pi / 180.0
 ROUNDING = 1e-9  # tolerance for the correlation of a parameter with itself
@@ -69,13 +78,13 @@ def calibration_text(calibration: Calibration, header: Header) -> str:
         CalibrationFileError: the calibration is one that readers refuse: not finite, a negative sigma, no rotation, a
             time without zone.
     """
-    blocks = [
-        _header(calibration, header),
-        _parameters(calibration),
-        *_estimated(calibration),
-        *_tables(calibration),
-    ]
-    text = "\n\n".join("\n".join(block) for block in blocks) + "\n"
+    document: dict[str, Any] = {
+        "calibration": _header(calibration, header),
+        "parameters": _in_units(calibration.parameters),
+        **_estimated(calibration),
+        **_tables(calibration),
+    }
+    text = _encodable(tomlkit.dumps(document))
     try:
         read_calibration(text, f"calibration {header.id}")
     except CalibrationError as error:
@@ -83,76 +92,88 @@ def calibration_text(calibration: Calibration, header: Header) -> str:
     return text
 
 
-def _header(calibration: Calibration, header: Header) -> list[str]:
-    logs = ", ".join(f"{{ name = {_text(name)}, sha256 = {_text(sha256)} }}" for name, sha256 in header.logs)
-    rows: list[tuple[str, str | None]] = [
-        ("id", _text(header.id)),
-        ("scanner", _text(calibration.scanner)),
-        ("created", _time(header.created)),
-        ("conventions", str(CONVENTIONS)),
-        ("scanner_model", _text(header.scanner_model)),
-        ("scanner_serial", _text(header.scanner_serial)),
-        ("imu_serial", _text(header.imu_serial)),
-        ("installation", _text(header.installation)),
-        ("installation_matrix", _matrix(calibration.installation_matrix)),
-        ("mirror_factor", _optional(calibration.mirror_factor)),
-        ("ranges", _said(calibration.ranges)),
-        ("refraction", _said(calibration.refraction)),
-        ("method", _text(header.method or calibration.method)),
-        ("logs", f"[{logs}]"),
-        ("variance_factor", _optional(header.variance_factor)),
-        ("redundancy", None if header.redundancy is None else _number(header.redundancy)),
-        ("trajectory", _text(header.trajectory) if header.trajectory else None),
-        ("held", _texts(header.held) if header.verdict or header.held else None),
-        ("verdict", _text(header.verdict) if header.verdict else None),
-        ("verdict_reasons", _texts(header.verdict_reasons) if header.verdict else None),
-    ]
-    return ["[calibration]", *(f"{key} = {value}" for key, value in rows if value is not None)]
+def _encodable(text: str) -> str:
+    """Return the text; refuse it if a name holds bytes that are no text, as names of files may."""
+    try:
+        text.encode()
+    except UnicodeEncodeError as error:
+        line = text[text.rfind("\n", 0, error.start) + 1 : text.find("\n", error.start)]
+        raise CalibrationFileError(f"{line!r} is no text that UTF-8 can hold") from error
+    return text
 
 
-def _parameters(calibration: Calibration) -> list[str]:
-    values = calibration.parameters.tolist()
-    rows = zip(PARAMETERS, values, strict=True)
-    return ["[parameters]", *(f"{parameter.key} = {in_unit(value, parameter.factor)!r}" for parameter, value in rows)]
+def _header(calibration: Calibration, header: Header) -> dict[str, Any]:
+    rows: dict[str, Any] = {
+        "id": header.id,
+        "scanner": calibration.scanner,
+        "created": _utc(header.created),
+        "conventions": CONVENTIONS,
+        "scanner_model": header.scanner_model,
+        "scanner_serial": header.scanner_serial,
+        "imu_serial": header.imu_serial,
+        "installation": header.installation,
+        "installation_matrix": [_numbers(row) for row in np.asarray(calibration.installation_matrix).tolist()],
+        "mirror_factor": _optional(calibration.mirror_factor),
+        "ranges": calibration.ranges,
+        "refraction": calibration.refraction,
+        "method": header.method or calibration.method,
+        "logs": _logs(header.logs),
+        "variance_factor": _optional(header.variance_factor),
+        "redundancy": None if header.redundancy is None else _number(header.redundancy),
+        "trajectory": header.trajectory or None,
+        "held": header.held if header.verdict or header.held else None,
+        "verdict": header.verdict or None,
+        "verdict_reasons": header.verdict_reasons if header.verdict else None,
+    }
+    return {key: value for key, value in rows.items() if value is not None}
 
 
-def _estimated(calibration: Calibration) -> list[list[str]]:
+def _in_units(values: FloatArray) -> dict[str, float]:
+    """Return parameters or their sigmas (16,) by the file's keys, in the file's units."""
+    rows = zip(PARAMETERS, values.tolist(), strict=True)
+    return {parameter.key: in_unit(value, parameter.factor) for parameter, value in rows}
+
+
+def _estimated(calibration: Calibration) -> dict[str, Any]:
     """Return the tables [sigma], [held_sigma] and [correlation]; the correlation covers both kinds of parameters."""
-    blocks = []
+    tables: dict[str, Any] = {}
     for title, sigmas in (("sigma", calibration.sigmas), ("held_sigma", calibration.held_sigmas)):
-        rows = [
-            f"{parameter.key} = {in_unit(sigma, parameter.factor)!r}"
-            for parameter, sigma in zip(PARAMETERS, sigmas.tolist(), strict=True)
-            if sigma != 0.0
-        ]
-        blocks += [[f"[{title}]", *rows]] if rows else []
+        if rows := {key: sigma for key, sigma in _in_units(sigmas).items() if sigma != 0.0}:
+            tables[title] = rows
     at = np.flatnonzero(calibration.all_sigmas)
     if not len(at):
-        return []
+        return {}
     matrix = calibration.correlation[np.ix_(at, at)]
     np.fill_diagonal(matrix, np.where(np.abs(np.diag(matrix) - 1.0) < ROUNDING, 1.0, np.diag(matrix)))
-    names = ", ".join(_text(PARAMETERS[index].key) for index in at)
-    return [*blocks, ["[correlation]", f"names = [{names}]", f"matrix = {_long_matrix(matrix)}"]]
+    return tables | {"correlation": {"names": [PARAMETERS[index].key for index in at], "matrix": _long_matrix(matrix)}}
 
 
-def _tables(calibration: Calibration) -> list[list[str]]:
-    blocks = []
+def _tables(calibration: Calibration) -> dict[str, Any]:
+    tables: dict[str, Any] = {}
     if calibration.ibrc is not None:
-        intensity, correction_m = (_list(column.tolist()) for column in calibration.ibrc)
-        blocks.append(["[ibrc]", f"intensity = {intensity}", f"correction_m = {correction_m}"])
-    for offset in calibration.range_offsets:
-        rows = [("return_slot", offset.return_slot), ("mta_zone", offset.mta_zone)]
-        block = ["[[range_offset]]", *(f"{key} = {value:d}" for key, value in rows if value is not None)]
-        block += [f"prf_hz = {_number(offset.prf_hz)}"] if offset.prf_hz is not None else []
-        blocks.append([*block, f"offset_m = {in_unit(offset.offset_m, 1.0)!r}"])
-    for index, tilt_rad in sorted(calibration.facet_tilt_rad.items()):
-        blocks.append(["[[facet]]", f"index = {index:d}", f"tilt_deg = {in_unit(tilt_rad, _DEG, math.radians)!r}"])
-    for channel, beam in sorted(calibration.beams.items()):
-        angles = [("azimuth_deg", beam.azimuth_rad), ("elevation_deg", beam.elevation_rad)]
-        block = ["[[beam]]", f"channel = {channel:d}"]
-        block += [f"{key} = {in_unit(value, _DEG, math.radians)!r}" for key, value in angles]
-        blocks.append([*block, f"range_m = {in_unit(beam.range_m, 1.0)!r}"])
-    return blocks
+        intensity, correction_m = (_numbers(column.tolist()) for column in calibration.ibrc)
+        tables["ibrc"] = {"intensity": intensity, "correction_m": correction_m}
+    tables["range_offset"] = [_range_offset(offset) for offset in calibration.range_offsets]
+    tables["facet"] = [
+        {"index": int(index), "tilt_deg": in_unit(tilt_rad, _DEG, math.radians)}
+        for index, tilt_rad in sorted(calibration.facet_tilt_rad.items())
+    ]
+    tables["beam"] = [
+        {
+            "channel": int(channel),
+            "azimuth_deg": in_unit(beam.azimuth_rad, _DEG, math.radians),
+            "elevation_deg": in_unit(beam.elevation_rad, _DEG, math.radians),
+            "range_m": in_unit(beam.range_m, 1.0),
+        }
+        for channel, beam in sorted(calibration.beams.items())
+    ]
+    return {title: rows for title, rows in tables.items() if rows}
+
+
+def _range_offset(offset: RangeOffset) -> dict[str, float]:
+    matched = {"return_slot": offset.return_slot, "mta_zone": offset.mta_zone, "prf_hz": offset.prf_hz}
+    rows = {key: _number(value) for key, value in matched.items() if value is not None}
+    return rows | {"offset_m": in_unit(offset.offset_m, 1.0)}
 
 
 def in_unit(value: float, factor: float, back: Callable[[float], float] | None = None) -> float:
@@ -179,48 +200,52 @@ def in_unit(value: float, factor: float, back: Callable[[float], float] | None =
     return min(around, key=lambda number: (abs(read(number) - value), len(repr(number))))
 
 
-def _number(value: float) -> str:
-    """Format a number; whole numbers have no decimal point, as counts and rates are written."""
+def _number(value: float) -> float:
+    """Return a number as it is written; whole numbers become integers, because counts and rates have no decimal point.
+
+    Raises:
+        CalibrationFileError: the value is not finite.
+    """
     if not math.isfinite(value):
         raise CalibrationFileError(f"a calibration holds {value!r}; want finite numbers")
-    return str(int(value)) if float(value).is_integer() and abs(value) < 1e15 else repr(float(value))
+    return int(value) if float(value).is_integer() and abs(value) < 1e15 else float(value)
 
 
-def _optional(value: float | None) -> str | None:
-    return None if value is None else repr(in_unit(float(value), 1.0))
+def _numbers(values: Iterable[float]) -> Array:
+    """Return numbers on one line, added at once: tomlkit's time for adding them singly grows with their square."""
+    row = tomlkit.array()
+    items = [item for value in values for item in (tomlkit.ws(", "), _number(value))]
+    row.add_line(*items[1:], indent="", newline=False, add_comma=False)
+    return row
 
 
-def _said(value: str | None) -> str | None:
-    return None if value is None else _text(value)
+def _optional(value: float | None) -> float | None:
+    return None if value is None else in_unit(float(value), 1.0)
 
 
-def _text(value: str) -> str:
-    """Return a basic TOML string: JSON's escapes are valid in TOML, which also requires DEL to be escaped."""
-    try:
-        value.encode()
-    except UnicodeEncodeError as error:
-        raise CalibrationFileError(f"{value!r} is no text that UTF-8 can hold") from error
-    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-
-
-def _time(value: dt.datetime) -> str:
+def _utc(value: dt.datetime) -> dt.datetime:
     if value.utcoffset() is None:
         raise CalibrationFileError(f"created: {value.isoformat()} has no time zone; want UTC")
-    return value.astimezone(dt.UTC).replace(tzinfo=None).isoformat() + "Z"
+    return value.astimezone(dt.UTC)
 
 
-def _texts(values: Iterable[str]) -> str:
-    return f"[{', '.join(map(_text, values))}]"
+def _logs(logs: Iterable[tuple[str, str]]) -> Array:
+    """Return the logs as tables of one line each; as an array of tables they would follow all keys of [calibration]."""
+    rows = tomlkit.array()
+    for name, sha256 in logs:
+        row = tomlkit.inline_table()
+        row.add(tomlkit.ws(" "))
+        row.add("name", name)
+        row.add("sha256", sha256)
+        row.add(tomlkit.ws(" "))
+        rows.append(row)
+    return rows
 
 
-def _list(values: Iterable[float]) -> str:
-    return f"[{', '.join(_number(value) for value in values)}]"
-
-
-def _matrix(rows: Sequence[Sequence[float]] | FloatArray) -> str:
-    return f"[{', '.join(_list(row) for row in np.asarray(rows).tolist())}]"
-
-
-def _long_matrix(matrix: FloatArray) -> str:
+def _long_matrix(matrix: FloatArray) -> Array:
     """Return a matrix with one row on each line."""
-    return "".join(["[\n", *(f"  {_list(row)},\n" for row in matrix.tolist()), "]"])
+    rows = tomlkit.array()
+    for row in matrix.tolist():
+        rows.add_line(_numbers(row), indent="  ")
+    rows.add_line(indent="")
+    return rows

@@ -7,6 +7,7 @@ import io
 from typing import Any
 
 import numpy as np
+import tomlkit
 
 from swath.georef.arrays import FloatArray
 from swath.sim.clocks import generator
@@ -14,7 +15,6 @@ from swath.sim.gnss.wire import config_table as gnss_config
 from swath.sim.imu.wire import config_table as imu_config
 from swath.sim.imu.wire import dbc_text
 from swath.sim.plan.plan import Plan
-from swath.sim.plan.toml_text import toml_text
 from swath.sim.preview.coverage import control_points
 from swath.sim.scanners.calibration_files import calibration_text
 from swath.sim.scanners.ouster_wire import config_table as ouster_config
@@ -85,7 +85,7 @@ def config_text(plan: Plan, wires: dict[str, str], directory: str) -> str:
         "profile": {"aircraft": "virtual", "installation": f"virtual/{tables.flight.name}"},
         "output": {"crs": tables.flight.crs},
     }
-    return toml_text(document)
+    return tomlkit.dumps(document)
 
 
 def companion_files(plan: Plan, site: Site, scene: Scene) -> dict[str, bytes]:

@@ -8,6 +8,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import tomlkit
 from pydantic import ValidationError
 
 from swath.georef.text_encoding import decoded
@@ -15,7 +16,6 @@ from swath.georef.timescales import gps_ns_from_unix, table_leap_seconds
 from swath.georef.toml_tables import TomlError, toml_tables
 from swath.sim.plan.errors import PlanError
 from swath.sim.plan.tables import Tables
-from swath.sim.plan.toml_text import toml_text
 
 PRESETS = ("small", "calibration", "corridor", "block", "bench")
 
@@ -47,7 +47,7 @@ class Plan:
     def changed(self, changes: dict[str, Any]) -> Plan:
         """Return the plan with other values; nested tables are merged, lists are replaced whole."""
         document = _merged(self.tables.model_dump(exclude_unset=True), changes)
-        return replace(self, tables=_validated(document), text=toml_text(document))
+        return replace(self, tables=_validated(document), text=tomlkit.dumps(document))
 
 
 def load_plan(name: str | Path) -> Plan:

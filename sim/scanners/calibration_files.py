@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
+import tomlkit
+
 from swath.sim.plan.errors import PlanError
 from swath.sim.plan.plan import Plan
 from swath.sim.plan.tables import ScannerTable, Tables
-from swath.sim.plan.toml_text import toml_text
 
 CONVENTIONS_VERSION = 1
 SPINNING = ("vlp16", "os1")
@@ -41,7 +42,7 @@ def calibration_text(plan: Plan, scanner: str, *, true: bool) -> str:
     if true:
         document["parameters"]["imu_latency_us"] = _imu_latency_us(plan.tables)
         document |= _tables(table)
-    return toml_text(document)
+    return tomlkit.dumps(document)
 
 
 def _header(plan: Plan, scanner: str, table: ScannerTable, which: str) -> dict[str, Any]:

@@ -1,14 +1,11 @@
-"""Truth files of any length, and the TOML that stands beside them."""
+"""Truth files of any length."""
 
 from __future__ import annotations
 
-import datetime as dt
-import tomllib
 from pathlib import Path
 
 import numpy as np
 
-from swath.sim.plan.toml_text import toml_text
 from swath.sim.truth import POSE_TRUTH_DTYPE, RETURN_TRUTH_DTYPE, TruthWriter
 
 
@@ -46,14 +43,3 @@ def test_an_abandoned_truth_leaves_nothing(tmp_path: Path) -> None:
     writer.add("trajectory", np.ones(5, POSE_TRUTH_DTYPE))
     writer.abandon()
     assert list(tmp_path.iterdir()) == []
-
-
-def test_tables_read_back_as_they_were() -> None:
-    document = {
-        "session": {"name": 'a "b" \\ µ', "on": True, "when": dt.datetime(2026, 6, 15, 9, tzinfo=dt.UTC)},
-        "scanner": {"left": {"factor": 2.0, "count": 3, "matrix": [[1, 0.5], [0, 1e-7]], "geometry": {"type": "x"}}},
-        "facet": [{"index": 0, "tilt_deg": -0.01}, {"index": 1, "tilt_deg": 0.02}],
-        "empty": {},
-    }
-    assert tomllib.loads(toml_text(document)) == document
-    assert tomllib.loads(toml_text({"a": {"b": None, "c": 1}})) == {"a": {"c": 1}}

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import tomlkit
 
 from swath.daemon.config.tables import ImuConfig
 from swath.drivers.can_frames import CAN_FRAME_DTYPE
@@ -20,7 +21,6 @@ from swath.sim.imu.sensors import InertialUnit
 from swath.sim.imu.wire import FORCE_UNIT_MPS2, RATE_UNIT_RADPS, ImuWire, config_table, dbc_text
 from swath.sim.plan.errors import PlanError
 from swath.sim.plan.tables import ImuTable, OscillatorTable, PpsTable
-from swath.sim.plan.toml_text import toml_text
 from swath.sim.shots import WireUnit
 from tests.sim.inertial_motion import circling_the_pole, standing
 
@@ -194,7 +194,7 @@ def test_values_beyond_the_frames_range_are_held_at_its_end() -> None:
 @pytest.mark.parametrize("pps", ["main", None])
 def test_the_configuration_is_one_the_recorder_takes(grade: Any, pps: str | None) -> None:
     table = ImuTable(grade=grade, pps=pps, rate_hz=400, tick_hz=10_000_000)
-    text = toml_text({"imu": {"main": config_table(table, "main", "can:socketcan:can0?bitrate=1000000")}})
+    text = tomlkit.dumps({"imu": {"main": config_table(table, "main", "can:socketcan:can0?bitrate=1000000")}})
     read = ImuConfig.model_validate(tomllib.loads(text)["imu"]["main"])
     assert (read.pps, read.rate_hz, read.tick_hz, read.sample, read.stamp) == (pps, 400, 10_000_000, "mean", "end")
     assert read.noise.grade == ("navigation" if grade == "perfect" else grade)

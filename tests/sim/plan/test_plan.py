@@ -162,6 +162,14 @@ class TestChanges:
         assert (scanner.prf_hz, scanner.true.omega_deg, scanner.true.phi_deg) == (50_000.0, 0.3, 0.1)
         assert [line.name for line in changed.tables.line] == ["two"]
 
+    def test_the_text_of_a_changed_plan_reads_back_as_that_plan(self) -> None:
+        facet = [{"index": 0, "tilt_deg": -0.01}, {"index": 1, "tilt_deg": 1e-7}]
+        installation = [[1, 0.0, 0.0], [0.0, 0.5, 0.1 + 0.2], [0.0, 1e-7, 1.0]]
+        left = {"kind": "polygon", "model": 'a "b" \\ µ\x7f', "facet": facet, "installation": installation}
+        changed = self.plan().changed({"scanner": {"left": left}})
+        again = parse_plan(changed.text, Path())
+        assert (again.tables, again.start_gps_ns) == (changed.tables, changed.start_gps_ns)
+
     def test_a_change_is_validated_as_a_file_is(self) -> None:
         with pytest.raises(PlanError, match=r"^flight\.speed_mps: got 5\.0, want greater than or equal to 10$"):
             self.plan().changed({"flight": {"speed_mps": 5.0}})
