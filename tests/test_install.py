@@ -289,7 +289,7 @@ def test_a_program_that_cannot_be_built_leaves_the_one_that_is_there(
         assert told[1].splitlines()[1:] == [
             "no room" if venv != ":" else "no network",
             f"swath: the program in {root_before}/opt/swath stays as it was",
-            "swath: the program could not be installed; pip's words are above",
+            "swath: the program could not be installed; see the output of pip above",
         ]
 
 
