@@ -31,9 +31,9 @@ def demonstrate(console: Console, folder: Path, seconds: float, flight_seconds: 
 def main() -> int:
     """The demonstration; 0 when everything is as it should be."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seconds", type=float, default=30.0, help="of the recordings")
-    parser.add_argument("--flight-seconds", type=float, default=60.0, help="of the flight")
-    parser.add_argument("--keep", type=Path, help="folder for the logs; without it they are removed at the end")
+    parser.add_argument("--seconds", type=float, default=30.0, help="duration of the recordings")
+    parser.add_argument("--flight-seconds", type=float, default=60.0, help="duration of the flight")
+    parser.add_argument("--keep", type=Path, help="keep the logs in this folder; default: remove them at the end")
     arguments = parser.parse_args()
     console = Console(width=None if sys.stdout.isatty() else 110)
     folder = Path(tempfile.mkdtemp(prefix="swath-demo-")) if arguments.keep is None else arguments.keep.resolve()
