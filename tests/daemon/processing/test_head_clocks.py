@@ -226,7 +226,7 @@ def test_a_heads_date_that_nobody_believes_is_refused_and_named(tmp_path: Path) 
     )
     assert "connect a receiver with the right date to the head" in line
     status = clocks.host.status("scanner/top", START_UNIX_NS + 20 * NS)
-    with pytest.raises(UserError, match="scanner/top: says 2006-10-21"):
+    with pytest.raises(UserError, match="scanner/top: sends the date 2006-10-21"):
         refuse_no_time(tmp_path, "scanner/top", status, setup.config, clocks.remarks, clocks.trouble("scanner/top"))
 
 

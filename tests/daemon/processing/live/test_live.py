@@ -278,7 +278,7 @@ class TestStatus:
         ]
         styles = [str(cast(Text, page(found | one).renderables[0]).style) for one in wrong]
         assert styles == ["bold green", *["bold yellow"] * (len(wrong) - 1)]
-        assert "2 DAMAGED chunks in the log" in sentence(found | {"damaged_chunks": 2})
+        assert "2 chunks of the log DAMAGED" in sentence(found | {"damaged_chunks": 2})
 
     def test_a_latency_is_by_the_scanners_clock_as_it_is_now(self) -> None:
         """Which is asked once a second, and says something else each time here."""
@@ -397,7 +397,7 @@ class TestCommand:
         ("arguments", "told"),
         [
             (["--replay", "some.mcap"], "--replay needs logs and -o DIR: swath live --replay LOG… -o DIR [CONFIG]"),
-            (["-o", "x"], "-o belongs to --replay"),
+            (["-o", "x"], "-o needs --replay"),
             (["a", "b"], "too many arguments; give one CONFIG or DIR"),
         ],
     )

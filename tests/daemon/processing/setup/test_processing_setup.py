@@ -144,8 +144,8 @@ def test_only_the_scanners_that_are_asked_for(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("header", "said"),
     [
-        ('scanner = "right"', 'calibration.scanner: got "right", want "left"'),
-        ('scanner_serial = "77"', 'calibration.scanner_serial: got "77", but serial of the scanner is "1234"'),
+        ('scanner = "right"', 'calibration.scanner: is of scanner "right", want "left"'),
+        ('scanner_serial = "77"', 'calibration.scanner_serial: of another head: "77", the configuration says "1234"'),
         ('ranges = "vacuum"', 'was estimated with ranges = "vacuum", [atmosphere] says "corrected"'),
         ('refraction = "ardc"', 'was estimated with refraction = "ardc", [atmosphere] says "none"'),
         ("mirror_factor = 2.0", "was estimated with 2, the configuration says 1"),
