@@ -21,54 +21,54 @@ export PIP_ROOT_USER_ACTION := ignore
 .DEFAULT_GOAL := help
 .PHONY: help demo test test-slow test-peers test-vm test-vm-long test-arm64 test-long soak soak-short fuzz lint ready bench bench-calibration install uninstall clean
 
-help: ## say what there is to make
-	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z0-9-]+):.*## (.*)/  make \1\t\2/' | expand -t 20
+help: ## list the targets
+	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z0-9-]+):.*## (.*)/  make \1\t\2/' | expand -t 26
 
-demo: $(VENV)/.flies ## play real recordings and a virtual flight into a recorder, make points and a page of it, about 3 min
+demo: $(VENV)/.flies ## record real recordings and a simulated flight over real wires, make points and a page (about 3 min)
 	@$(BIN)/python -m demo
 
-test: $(VENV)/.tests $(VENV)/.tools ## install and run: style, types, import rules, tests
+test: $(VENV)/.tests $(VENV)/.tools ## install what they need, then run style, types, import rules and tests
 	@$(MAKE) -j 2 --output-sync=target lint ready
 	$(PYTEST) -n $(JOBS) --dist loadgroup -m "not slow and not long and not alone and not peers"
 	$(call PYTEST,-alone) -n 0 -m "alone and not slow and not long"
 
-test-slow: $(VENV)/.tests $(VENV)/.tools ready ## the tests that take longer: whole flights, calibrated; the demo, the installation
+test-slow: $(VENV)/.tests $(VENV)/.tools ready ## run the longer tests: whole flights and calibrations, the demo, the installation
 	$(PYTEST) -n $(JOBS) --dist loadgroup -m "slow and not long and not alone and not peers"
 	$(call PYTEST,-alone) -n 0 -m "alone and slow and not long"
 
-test-peers: $(VENV)/.tests ## beside gpsd and Foxglove's reader, which it installs (root, apt, npm)
+test-peers: $(VENV)/.tests ## run the tests against gpsd and Foxglove's reader, which it installs (root, apt, npm)
 	@for program in gpsd npm; do command -v $$program >/dev/null || \
 		{ apt-get -qq update && apt-get -qq install -y --no-install-recommends $$program >/dev/null; } || exit; done
 	npm ci --silent --no-audit --no-fund --prefix tests/peers
 	$(PYTEST) -n 0 -v tests/peers
 
-test-vm: $(VENV)/.tests ## on real CAN, PPS, systemd and power cuts, in a virtual machine that it installs (root, apt, alone)
+test-vm: $(VENV)/.tests ## run the tests of CAN, PPS, systemd and power cuts in a virtual machine, which it installs (root, apt, alone)
 	@bash tests/vm/setup.sh
 	$(PYTEST) -n 0 -v -m "not long" tests/vm
 
-test-vm-long: $(VENV)/.tests ## the same with 50 power cuts and three minutes of flight
+test-vm-long: $(VENV)/.tests ## run the same with 50 power cuts and three minutes of flight
 	@bash tests/vm/setup.sh
 	$(PYTEST) -n 0 -v tests/vm
 
-test-arm64: $(VENV)/.tests ## decoders, log and points on an emulated ARM64, which it installs (root, apt): the same as here
+test-arm64: $(VENV)/.tests ## compare decoders, log and points with an emulated ARM64, which it installs (root, apt)
 	@bash tests/arm64/setup.sh $(VENV)
 	$(PYTEST) -n 0 -v tests/arm64
 	tests/arm64/.cache/venv/bin/python -m tests.arm64 -n $(JOBS) --dist loadgroup
 
-test-long: $(VENV)/.tests $(VENV)/.tools ## the tests that take minutes
+test-long: $(VENV)/.tests $(VENV)/.tools ## run the tests that take minutes each
 	$(PYTEST) -n 0 -m long
 
-soak: $(VENV)/.tests ## two hours of all kinds of sensors at their full rates (root, for the buffers; alone)
+soak: $(VENV)/.tests ## record all kinds of sensors at full rate for two hours (root, for the buffers; alone)
 	$(BIN)/python -m benchmarks.soak --minutes 120 --rate 1
 
-soak-short: $(VENV)/.tests ## an hour of all kinds of sensors at a tenth of their rate (MINUTES=, RATE=)
+soak-short: $(VENV)/.tests ## record all kinds of sensors at a tenth of their rate for an hour (MINUTES=, RATE=)
 	$(BIN)/python -m benchmarks.soak --minutes $(MINUTES) --rate $(RATE)
 
-fuzz: $(VENV)/.tests ## inputs nobody would send, to every parser and reader: SECONDS=600 each, TARGETS=… for some, GUIDED=1 by coverage
+fuzz: $(VENV)/.tests ## fuzz every parser and reader (SECONDS=600 each, TARGETS=… for some, GUIDED=1 by coverage)
 	@if [ -n "$(GUIDED)" ]; then $(BIN)/python -m pip install -q 'atheris>=2.3'; fi
 	@$(BIN)/python -m tests.fuzz --seconds $(SECONDS) $(if $(GUIDED),--guided) $(TARGETS)
 
-lint: $(VENV)/.tests ## style, import rules and types only
+lint: $(VENV)/.tests ## check style, import rules and types only
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports --no-cache
@@ -80,13 +80,13 @@ ready: $(VENV)/.tests
 	@folder=$$(mktemp -d) && $(BIN)/python -m swath.daemon.cli.main sim fly small --seconds 14 -o $$folder >/dev/null; rm -r $$folder
 	@$(BIN)/python -m pytest -p no:cacheprovider -n 0 -q --collect-only >/dev/null || true
 
-bench: $(VENV)/.tests ## measure speed, each figure beside this machine's own limit
+bench: $(VENV)/.tests ## measure speed, and compare each figure with the limit of this computer
 	$(BIN)/python -m benchmarks
 
-bench-calibration: $(VENV)/.tests ## five whole calibration flights from their logs alone, truth known, about 40 min (SEEDS=)
+bench-calibration: $(VENV)/.tests ## calibrate five simulated flights and compare with the truth, about 40 min (SEEDS=)
 	$(BIN)/python -m benchmarks.calibration_accuracy --seeds $(SEEDS)
 
-install: ## install the service (root; DESTDIR= and PREFIX= are honoured)
+install: ## install the service (root; DESTDIR=, PREFIX=)
 	@DESTDIR="$(DESTDIR)" PREFIX="$(PREFIX)" sh systemd/install.sh install
 
 uninstall: ## remove what install put there; configuration and logs stay

@@ -19,5 +19,5 @@ def text_of(path: Path, want: str = "a CSV file") -> str:
             encoding = encoding_of(stream.read(4))
         return path.read_text(encoding=encoding)
     except (OSError, UnicodeError) as error:
-        why = (error.strerror if isinstance(error, OSError) else None) or f"no text; want {want}"
+        why = (error.strerror if isinstance(error, OSError) else None) or f"not text; want {want}"
         raise UserError(f"{path}: cannot be read: {why}", ExitCode.IO) from error

@@ -38,9 +38,11 @@ def demonstrate(console: Console, folder: Path, seconds: float, flight_seconds: 
 def main() -> int:
     """Run the demonstration; return 0 if everything is as it should be."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seconds", type=float, default=30.0, help="length of the recordings that are played")
-    parser.add_argument("--flight-seconds", type=float, default=60.0, help="length of the flight")
-    parser.add_argument("--keep", type=Path, help="folder for logs, points and page; default: only the page is kept")
+    parser.add_argument("--seconds", type=float, default=30.0, help="duration of the recordings")
+    parser.add_argument("--flight-seconds", type=float, default=60.0, help="duration of the flight")
+    parser.add_argument(
+        "--keep", type=Path, help="keep logs, points and page in this folder; default: only the page is kept"
+    )
     arguments = parser.parse_args()
     console = Console(width=None if sys.stdout.isatty() else 110)
     folder = Path(tempfile.mkdtemp(prefix="swath-demo-")) if arguments.keep is None else arguments.keep.resolve()

@@ -20,8 +20,8 @@ WHAT = {
     "pps/main": "the receiver's pulse, wired to computer, IMU and scanner",
 }
 REMARK = (
-    "All of it is one flight, made while it is flown: `swath sim fly small -o LOG` flies it into a log, with the "
-    "truth of every return beside it."
+    "All streams belong to one simulated flight; `swath sim fly small -o LOG` writes it into a log, with the truth "
+    "of every return."
 )
 
 
@@ -32,11 +32,11 @@ def take_off(seconds: float) -> Ahead:
 
 def prepare(console: Console, folder: Path, ahead: Ahead) -> Show:
     """Write the configuration and the files that it names."""
-    with console.status("getting the virtual aircraft ready (the first time, it is compiled)"):
+    with console.status("preparing the simulated flight (compiled at the first run)"):
         facts = ahead.facts
     plan = FlightOptions(PLAN).load()
     folder.mkdir(parents=True, exist_ok=True)
     wires = own_wires(folder, facts.sources, {f"gnss/{name}": table.baud for name, table in plan.tables.gnss.items()})
     for name, data in (facts.files | {"swath.toml": configuration(plan, wires, "logs")}).items():
         (folder / name).write_bytes(data)
-    return Show("the virtual aircraft, in real time", WHAT, ahead.units(), facts.duration_s, REMARK)
+    return Show("a simulated flight, in real time", WHAT, ahead.units(), facts.duration_s, REMARK)

@@ -16,11 +16,11 @@ WHAT = {
     "imu/main": "CANmod.gps, 2021, through a CAN bus (udp_multicast)",
     "scanner/top": "Velodyne VLP-16 with PPS, 2016, through UDP",
     "scanner/top/aux": "its position packets, second UDP port",
-    "pps/main": "edges that belong to the GNSS recording",
+    "pps/main": "edges of the GNSS recording",
 }
 REMARK = (
-    "The recordings are of different days and places: the time of each source stands on its own, "
-    "and only the GNSS recording has PPS edges here."
+    "The recordings are of different days and places, so each source has its own time; "
+    "only the GNSS recording has PPS edges."
 )
 CONFIG = """[session]
 name = "demo"
@@ -61,4 +61,4 @@ def prepare(folder: Path, seconds: float) -> Show:
     text = CONFIG.format(folder=folder, can_port=can_port, data_port=data_port, position_port=position_port)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "swath.toml").write_text(text)
-    return Show("real recordings, as fast as they were made", WHAT, all_units(seconds), seconds, REMARK)
+    return Show("real recordings, at their original speed", WHAT, all_units(seconds), seconds, REMARK)

@@ -55,7 +55,7 @@ def find_driver(kind: DeviceKind, protocol: str) -> Driver:
         return drivers[protocol]
     except KeyError:
         known = ", ".join(sorted(drivers))
-        raise UnknownProtocolError(f"no {kind} protocol {protocol!r}; there are: {known}") from None
+        raise UnknownProtocolError(f"unknown {kind} protocol {protocol!r}; there are: {known}") from None
 
 
 @dataclass(frozen=True, slots=True)

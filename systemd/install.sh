@@ -19,7 +19,7 @@ program=$DESTDIR$PREFIX
 building=$program.building # beside it: on the same disk, so that a rename puts it in place
 
 fail() { echo "swath: $*" >&2; exit 1; }
-case $PREFIX in /?*) ;; *) fail "PREFIX must be the absolute path of a folder of its own, as /opt/swath" ;; esac
+case $PREFIX in /?*) ;; *) fail "PREFIX must be the absolute path of a folder for swath alone, such as /opt/swath" ;; esac
 
 # file in this folder -> place on the computer; uninstall removes exactly these
 placed() {
@@ -41,10 +41,10 @@ on_this_computer() { [ -z "$DESTDIR" ] && [ -d /run/systemd/system ]; }
 check_python() {
     [ "$(id -u)" = 0 ] || [ -n "$DESTDIR" ] || fail "make install needs root: sudo make install"
     "$PYTHON" -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 15))' 2>/dev/null ||
-        fail "$PYTHON is not Python 3.11 to 3.14; say PYTHON=…"
+        fail "$PYTHON is not Python 3.11 to 3.14; set PYTHON=…"
     "$PYTHON" -c 'import ensurepip, venv' 2>/dev/null || fail "$PYTHON lacks its venv module: apt-get install python3-venv"
     case $(readlink -f "$(command -v "$PYTHON")") in
-        /root/* | /home/*) fail "$PYTHON lies in a home directory, which the service cannot see; say PYTHON=/usr/bin/python3" ;;
+        /root/* | /home/*) fail "$PYTHON is in a home directory, which the service cannot read; set PYTHON=/usr/bin/python3" ;;
     esac
 }
 
@@ -59,7 +59,7 @@ leave_whole() {
 install_program() {
     echo "installing the program into $program"
     if [ -d "$program" ] && [ ! -e "$program/pyvenv.cfg" ] && [ -n "$(ls -A "$program")" ]; then
-        fail "$program holds something else; give PREFIX a folder of its own, as /opt/swath"
+        fail "$program holds other files; set PREFIX to a folder for swath alone, such as /opt/swath"
     fi
     work=$(mktemp -d)
     trap leave_whole EXIT
@@ -84,8 +84,8 @@ build_program() {
                 "$building/bin/python" -m pip install -q "$work/swath${EXTRAS:+[$EXTRAS]}"
     } >"$work/log" 2>&1 </dev/null || {
         cat "$work/log" >&2
-        [ ! -e "$program/pyvenv.cfg" ] || echo "swath: the program in $program stays as it was" >&2
-        fail "the program could not be installed; pip's words are above"
+        [ ! -e "$program/pyvenv.cfg" ] || echo "swath: the program in $program is unchanged" >&2
+        fail "the program could not be installed; see the output of pip above"
     }
     # its scripts must name the place where they will be
     grep -rlIF "$building" "$building/bin" "$building/pyvenv.cfg" | while read -r file; do
@@ -115,7 +115,7 @@ keep_changed() {
         more=$((more + 1)) kept=$DESTDIR$2.old$more
     done
     cp -p "$DESTDIR$2" "$kept"
-    echo "replaced $DESTDIR$2; what it was is in $kept"
+    echo "replaced $DESTDIR$2; the previous file is $kept"
 }
 
 install_files() {
@@ -142,14 +142,14 @@ activate() {
     systemctl daemon-reload
     if command -v udevadm >/dev/null; then # devices that are there get their names and rights now
         udevadm control --reload && udevadm trigger --subsystem-match=pps --subsystem-match=tty ||
-            echo "udev is not running; its rules hold from the next start"
+            echo "udev is not running; its rules take effect at the next start"
     fi
-    echo "edit /etc/swath/swath.toml, then: swath check /etc/swath/swath.toml && systemctl enable --now swathd"
+    echo "next: edit /etc/swath/swath.toml, then run swath check /etc/swath/swath.toml && systemctl enable --now swathd"
 }
 
 tell_what_runs() {
     ! systemctl is-active --quiet swathd ||
-        echo "swathd runs the program that was there before; when nothing is recorded: systemctl restart swathd"
+        echo "swathd still runs the previous program; when no recording is running: systemctl restart swathd"
 }
 
 # What swath-live.service needs compiled, into the cache that it uses; without, it does this when it first starts.
@@ -158,7 +158,7 @@ warm_up() {
     echo "compiling, a minute or two the first time"
     mkdir -p -m 0750 "$cache"
     NUMBA_CACHE_DIR="$cache" "$PREFIX/bin/swath" warm-up ||
-        echo "swath warm-up failed, its words are above; nothing that records needs it"
+        echo "swath warm-up failed, see its output above; recording does not need it"
     ! id swath >/dev/null 2>&1 || chown -R swath:swath "$cache"
 }
 
@@ -169,11 +169,11 @@ install_all() {
     if on_this_computer; then
         activate /usr/lib/tmpfiles.d/swath.conf /usr/lib/sysctl.d/90-swath.conf
         warm_up
-        echo "points while you record: systemctl enable --now swath-live"
+        echo "for points during a recording: systemctl enable --now swath-live"
         tell_what_runs
     else
         warm_up
-        echo "installed; users, directories and kernel settings come with the next start of systemd"
+        echo "installed; users, directories and kernel settings take effect at the next start of systemd"
     fi
 }
 
@@ -199,5 +199,5 @@ case "${1-}" in
     install) install_all ;;
     files) install_files ;;
     uninstall) uninstall_all ;;
-    *) fail "use: install.sh install|files|uninstall" ;;
+    *) fail "usage: install.sh install|files|uninstall" ;;
 esac

@@ -22,9 +22,9 @@ apt_install() {
 
 make_venv() {
     python=$1 folder=$2
-    command -v "$python" >/dev/null || fail "there is no $python; install Python 3.11 or newer, or say PYTHON=…"
+    command -v "$python" >/dev/null || fail "$python does not exist; install Python 3.11 or newer, or set PYTHON=…"
     "$python" -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 15))' ||
-        fail "$python is $("$python" -V 2>&1); Python 3.11 to 3.14 is needed, say PYTHON=…"
+        fail "$python is $("$python" -V 2>&1); Python 3.11 to 3.14 is needed, set PYTHON=…"
     if ! "$python" -c 'import ensurepip, venv' 2>/dev/null; then
         version=$("$python" -c 'import sys; print("%d.%d" % sys.version_info[:2])')
         [ "$(id -u)" = 0 ] || fail "$python lacks its venv module: sudo apt-get install python$version-venv"
@@ -38,7 +38,7 @@ make_venv() {
 
 pip_install() {
     echo "installing $2 into $1 (a minute or two the first time)"
-    quietly "$1/bin/python" -m pip install -q -e "$2" || fail "pip could not install $2; its words are above"
+    quietly "$1/bin/python" -m pip install -q -e "$2" || fail "pip could not install $2; see its output above"
 }
 
 check_tools() {
@@ -56,5 +56,5 @@ case "${1-}" in
     venv) make_venv "$2" "$3" ;;
     pip) pip_install "$2" "$3" ;;
     tools) check_tools ;;
-    *) fail "use: setup.sh venv PYTHON FOLDER | pip FOLDER REQUIREMENT | tools" ;;
+    *) fail "usage: setup.sh venv PYTHON FOLDER | pip FOLDER REQUIREMENT | tools" ;;
 esac

@@ -131,7 +131,7 @@ def run_doctor(folder: Path) -> None:
 def run_offload(folder: Path) -> None:
     with tempfile.TemporaryDirectory(dir="/dev/shm", prefix="swath-") as usb:  # another disk, and nothing to mount
         said = swath("offload", record_a_little(folder), usb)
-        assert "may be deleted, 1 of the logs" in said
+        assert "safe to delete: 1 log" in said
         assert Path(usb, "SHA256SUMS").exists()
 
 

@@ -25,65 +25,73 @@ OBSERVE = ("planes", "ties", "markings")
 
 
 def command(
-    logs: Annotated[list[Path], typer.Argument(help="Logs, or directories of them.", metavar="LOG…", readable=False)],
+    logs: Annotated[list[Path], typer.Argument(help="Logs, or directories of logs.", metavar="LOG…", readable=False)],
     output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="FILE", help="FILE.toml; of several scanners a folder.")
+        Path, typer.Option("--output", "-o", metavar="FILE", help="FILE.toml to write; for several scanners, a folder.")
     ],
     scanner: Annotated[
-        list[str] | None, typer.Option(metavar="NAME", help="Only this one; may be repeated. Default: all.")
+        list[str] | None, typer.Option(metavar="NAME", help="Calibrate this scanner only; repeatable. Default: all.")
     ] = None,
     trajectory: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="SBET, Waypoint text or CSV; default: the log's IMU and GNSS, navigated."),
+        typer.Option(metavar="FILE", help="SBET, Waypoint text or CSV; default: computed from the log's IMU and GNSS."),
     ] = None,
     at: TrajectoryPoint = "body",
     week: TrajectoryWeek = None,
     control: Annotated[
-        Path | None, typer.Option(metavar="CSV", help="name,lat_deg,lon_deg,h_ellipsoidal_m,sigma_m")
+        Path | None, typer.Option(metavar="CSV", help="Control points: name,lat_deg,lon_deg,h_ellipsoidal_m,sigma_m")
     ] = None,
     ties: Annotated[
-        Path | None, typer.Option(metavar="CSV", help="Picked points: name,strip,x,y,z,sigma_m in output.crs.")
+        Path | None, typer.Option(metavar="CSV", help="Picked tie points: name,strip,x,y,z,sigma_m in output.crs.")
     ] = None,
     polygons: Annotated[
-        Path | None, typer.Option(metavar="CSV", help="Planes to use: WKT,name; polygons in output.crs.")
+        Path | None, typer.Option(metavar="CSV", help="Polygons of the planes to use: WKT,name in output.crs.")
     ] = None,
-    model: Annotated[str, typer.Option(help="basic, scanner, full, or a file FILE.toml.")] = "scanner",
-    fix: Annotated[str, typer.Option(metavar="KEY,…", help="Parameters that keep their value, as phi_deg.")] = "",
-    free: Annotated[str, typer.Option(metavar="KEY,…", help="Parameters beyond the model.")] = "",
+    model: Annotated[str, typer.Option(help="Parameters to estimate: basic, scanner, full, or FILE.toml.")] = "scanner",
+    fix: Annotated[
+        str, typer.Option(metavar="KEY,…", help="Parameters to hold at their start value, such as phi_deg.")
+    ] = "",
+    free: Annotated[str, typer.Option(metavar="KEY,…", help="Estimate these parameters too.")] = "",
     prior: Annotated[
-        list[str] | None, typer.Option(metavar="KEY=SIGMA", help="Held to its start by one sigma; may be repeated.")
+        list[str] | None, typer.Option(metavar="KEY=SIGMA", help="Constrain KEY to its start value; repeatable.")
     ] = None,
     observe: Annotated[
-        str, typer.Option(metavar="WHAT,…", help="planes or ties (their intersections); markings.")
+        str, typer.Option(metavar="WHAT,…", help="Observations: planes, or ties (their intersections); also markings.")
     ] = "planes",
     report: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Report as page and PDF, record by ISO 19159, pictures.")
+        Path | None, typer.Option(metavar="DIR", help="Folder for report (HTML, PDF, pictures) and record (ISO 19159).")
     ] = None,
     facts: Annotated[
-        Path | None, typer.Option(metavar="TOML", help="What only people know, for the record: CLASS.attribute = …")
+        Path | None, typer.Option(metavar="TOML", help="Facts for the record that no log holds: CLASS.attribute = …")
     ] = None,
     start: Annotated[
         list[str] | None,
-        typer.Option("--calibration", metavar="[SCANNER=]FILE", help="To begin with, instead of the log's own."),
+        typer.Option(
+            "--calibration", metavar="[SCANNER=]FILE", help="Start from FILE instead of the log's own calibration."
+        ),
     ] = None,
     datum: TrajectoryDatum = None,
-    crs: Annotated[str | None, typer.Option(help="Coordinate system; over output.crs.")] = None,
+    crs: Annotated[str | None, typer.Option(help="Coordinate system; overrides output.crs.")] = None,
     force_crs: ForceCrs = False,
-    config: Annotated[Path | None, typer.Option(metavar="FILE", help="Instead of the logs' own.")] = None,
-    strips: Annotated[str, typer.Option(help="auto, whole, or a CSV of times.")] = "auto",
-    limit_deg: Annotated[float, typer.Option("--limit-deg", help="Boresight may change by so much.", min=0.0)] = 5.0,
-    limit_m: Annotated[float, typer.Option("--limit-m", help="The range offset likewise.", min=0.0)] = 10.0,
-    workers: Annotated[int | None, typer.Option(help="Processes; default: one a processor.", min=1)] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")] = False,
+    config: Annotated[Path | None, typer.Option(metavar="FILE", help="Configuration; default: the logs' own.")] = None,
+    strips: Annotated[str, typer.Option(help="How to divide the flight: auto, whole, or a CSV of times.")] = "auto",
+    limit_deg: Annotated[
+        float, typer.Option("--limit-deg", help="Largest accepted boresight change, degrees.", min=0.0)
+    ] = 5.0,
+    limit_m: Annotated[
+        float, typer.Option("--limit-m", help="Largest accepted range offset change, metres.", min=0.0)
+    ] = 10.0,
+    workers: Annotated[int | None, typer.Option(help="Number of processes; default: one per processor.", min=1)] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")] = False,
     force_trajectory: ForceTrajectory = False,
     accept_verdict: AcceptVerdict = False,
-    as_json: Annotated[bool, typer.Option("--json", help="The outcome to stdout, for scripts.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the outcome as JSON, for scripts.")] = False,
 ) -> None:
-    """Calibrate: boresight, range offset and the rest of the sensor model, with sigmas, from logs alone.
+    """Estimate boresight, range offset and the rest of the sensor model, with sigmas, from logs alone.
 
-    What this flight cannot determine is held, and said. Exit code 1 where no calibration could be made that would
-    be worth its name, then no file is written; or where its verdict is "Not to be used", unless --accept-verdict
-    is given: the verdict stands in the file all the same.
+    Parameters that this flight cannot determine keep their start value, and the report names them. Exit code 1 if the
+    logs do not give a calibration (then no file is written), or if its verdict is "Not to be used", unless you give
+    --accept-verdict (the file is written and holds the verdict).
     """
     require_installed("swath calibrate", *(["matplotlib"] if report else []))
     from swath.daemon.cli.georef import calibrations_given
@@ -99,8 +107,8 @@ def command(
 
     _refuse(output, observe, overwrite=overwrite)
     if facts is not None and report is None:
-        raise UserError("--facts: they stand in the record; want --report DIR, too", ExitCode.USAGE)
-    wish = CalibrationOptions(
+        raise UserError("--facts needs --report DIR, because facts are written to the record", ExitCode.USAGE)
+    request = CalibrationOptions(
         logs=GeorefOptions(
             logs=logs,
             output=output,
@@ -132,10 +140,10 @@ def command(
         overwrite=overwrite,
     )
     with tempfile.TemporaryDirectory(prefix="swath-", dir=output.resolve().parent) as folder, progress_bar() as tell:
-        told = write_products(wish, calibrate(wish, Path(folder), tell), tell)
-    print(json.dumps(told.record, indent=2) if as_json else "\n".join(map(one_line, told.lines)))
-    if told.record["verdict"]["level"] == "unusable" and not accept_verdict:
-        raise UserError(f"{output}: {one_line(told.record['verdict']['sentence'])}")
+        products = write_products(request, calibrate(request, Path(folder), tell), tell)
+    print(json.dumps(products.record, indent=2) if as_json else "\n".join(map(one_line, products.lines)))
+    if products.record["verdict"]["level"] == "unusable" and not accept_verdict:
+        raise UserError(f"{output}: {one_line(products.record['verdict']['sentence'])}")
 
 
 def _refuse(output: Path, observe: str, *, overwrite: bool) -> None:
@@ -143,8 +151,8 @@ def _refuse(output: Path, observe: str, *, overwrite: bool) -> None:
     if unknown:
         raise UserError(f'--observe: got "{unknown[0]}", want {", ".join(OBSERVE)}', ExitCode.USAGE)
     if {"planes", "ties"} <= set(observe.split(",")):
-        raise UserError("--observe: planes and ties are of the same returns; want one of both", ExitCode.USAGE)
+        raise UserError("--observe: planes and ties use the same returns; give one of the two", ExitCode.USAGE)
     if output.is_file() and not overwrite:
-        raise UserError(f"{output}: is there already; want another name, or --overwrite", ExitCode.USAGE)
+        raise UserError(f"{output}: already exists; choose another name or use --overwrite", ExitCode.USAGE)
     if not output.resolve().parent.is_dir():
-        raise UserError(f"{output}: no such folder: {output.parent}", ExitCode.USAGE)
+        raise UserError(f"{output}: the folder {output.parent} does not exist; create it first", ExitCode.USAGE)

@@ -17,11 +17,11 @@ if TYPE_CHECKING:
 
 def command(
     config: Annotated[Path, typer.Argument(metavar="CONFIG", help="Configuration, for example /etc/swath/swath.toml.")],
-    offline: Annotated[bool, typer.Option("--offline", help="Validate only; open nothing.")] = False,
-    seconds: Annotated[float, typer.Option(help="How long to listen.", min=0.1, max=3600.0)] = 5.0,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
+    offline: Annotated[bool, typer.Option("--offline", help="Validate only; do not open any device.")] = False,
+    seconds: Annotated[float, typer.Option(help="Seconds to listen to the devices.", min=0.1, max=3600.0)] = 5.0,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object, for scripts.")] = False,
 ) -> None:
-    """Validate CONFIG, then open every device and say of each: opens, bytes, records, time, what is wrong."""
+    """Validate CONFIG, then listen to every device and report what it sends, its time status and its problems."""
     from swath.daemon.config import load_config
 
     loaded = load_config(config)

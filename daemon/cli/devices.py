@@ -26,9 +26,9 @@ def describe_driver(driver: Driver) -> dict[str, Any]:
 
 
 def command(
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object, for scripts.")] = False,
 ) -> None:
-    """List the protocols there are: how they come, what they yield, what the configuration must say."""
+    """List the supported protocols: their transports, their records and the configuration keys they need."""
     from swath.drivers.driver import KINDS, all_drivers
 
     listed = [describe_driver(driver) for kind in KINDS for driver in all_drivers(kind).values()]
@@ -45,7 +45,7 @@ def _print_table(listed: list[dict[str, Any]]) -> None:
     from rich.text import Text
 
     table = Table(box=SIMPLE_HEAD, pad_edge=False)
-    for title in ("kind", "protocol", "by", ""):
+    for title in ("kind", "protocol", "transports", ""):
         table.add_column(title, no_wrap=title != "")
     kind = ""
     for row in listed:

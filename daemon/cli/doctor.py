@@ -20,16 +20,16 @@ def command(
         Path | None,
         typer.Argument(
             metavar="[CONFIG]",
-            help="What is wired to it; without it /etc/swath/swath.toml, if there is one.",
+            help="Configuration of the recorder; default: /etc/swath/swath.toml if it exists.",
             show_default=False,
         ),
     ] = None,
     write: Annotated[bool, typer.Option(help="Measure the disk by writing 64 MiB to the log directory.")] = True,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object, for scripts.")] = False,
 ) -> None:
-    """Say what on this computer would cost data, each with what mends it; opens no device, changes nothing.
+    """Check whether this computer can record without losing data; show a remedy for each problem.
 
-    Exit code 1 when something would cost data.
+    Opens no device and changes no setting. Exit code 1 when a problem would cost data.
     """
     from swath.daemon.config import load_config
     from swath.daemon.doctor import Verdict, examine

@@ -16,14 +16,16 @@ if TYPE_CHECKING:
 
 
 def command(
-    logs: Annotated[list[Path], typer.Argument(help="Logs, or directories of them.", metavar="LOG…")],
-    directory: Annotated[Path, typer.Argument(help="Where to; a folder a session is made in it.", metavar="DIR")],
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
+    logs: Annotated[list[Path], typer.Argument(help="Logs, or directories of logs.", metavar="LOG…")],
+    directory: Annotated[
+        Path, typer.Argument(help="Destination; each session gets its own folder in it.", metavar="DIR")
+    ],
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object, for scripts.")] = False,
 ) -> None:
     """Write logs as serial streams (with RTKLIB's time tags), candump logs, pcap files and PPS text.
 
-    What such a file cannot hold goes into a small file beside it, by which `swath import` makes the same log again.
-    Exit code 4 when the log is damaged: what could be read is written.
+    What these formats cannot hold goes into a small file beside each; with it `swath import` makes the same log again.
+        Exit code 4 when the log is damaged; everything readable is still written.
     """
     from rich.console import Console
 
@@ -40,7 +42,7 @@ def command(
     except LogError as error:
         raise UserError(one_line(str(error)), ExitCode.IO) from error
     except OSError as error:
-        text = f"{directory}: {error.strerror or error}; nothing is left of what was begun"
+        text = f"{directory}: {error.strerror or error}; incomplete files were removed"
         raise UserError(one_line(text), ExitCode.IO) from error
     if as_json:
         print(json.dumps({"sessions": [_plain(*one) for one in done], "passed_over": passed_over}, indent=2))
@@ -77,10 +79,10 @@ def _print(session: Session, report: ExportReport) -> None:
     for number in session.missing_parts:
         print(f"  part {number} is missing")
     if session.growing is not None:
-        print(one_line(f"  {session.growing.name} is being recorded: what it held so far"))
+        print(one_line(f"  {session.growing.name} is still being recorded; exported up to now"))
 
 
 def _damage(session: Session) -> str:
     first = session.damage[0]
     more = f" ({len(session.damage)} such places)" if len(session.damage) > 1 else ""
-    return f"{first.path} at byte {first.damage.offset}: {first.damage.what}{more}; what could be read is written"
+    return f"{first.path} at byte {first.damage.offset}: {first.damage.what}{more}; everything readable was written"

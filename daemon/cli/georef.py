@@ -23,47 +23,59 @@ from swath.daemon.text_files import text_of
 
 
 def command(
-    logs: Annotated[list[Path], typer.Argument(help="Logs, or directories of them.", metavar="LOG…", readable=False)],
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="A folder for the products.")],
+    logs: Annotated[list[Path], typer.Argument(help="Logs, or directories of logs.", metavar="LOG…", readable=False)],
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Folder for the products.")],
     trajectory: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="SBET, Waypoint text or CSV; without it the log's INS, else IMU and GNSS."),
+        typer.Option(
+            metavar="FILE", help="SBET, Waypoint text or CSV; default: the log's INS, or else its IMU and GNSS."
+        ),
     ] = None,
     at: TrajectoryPoint = "body",
     datum: TrajectoryDatum = None,
     week: TrajectoryWeek = None,
     calibration: Annotated[
         list[str] | None,
-        typer.Option(metavar="[SCANNER=]FILE", help="Instead of the log's own; once a scanner."),
+        typer.Option(metavar="[SCANNER=]FILE", help="Use this calibration instead of the log's own; once per scanner."),
     ] = None,
-    crs: Annotated[str | None, typer.Option(help="Coordinate system, as EPSG:25832+7837; over output.crs.")] = None,
+    crs: Annotated[
+        str | None, typer.Option(help="Coordinate system, such as EPSG:25832+7837; overrides output.crs.")
+    ] = None,
     force_crs: ForceCrs = False,
-    epoch: Annotated[float | None, typer.Option(help="Of the positions, as 2026.9; over output.epoch.")] = None,
-    config: Annotated[Path | None, typer.Option(metavar="FILE", help="Instead of the logs' own.")] = None,
-    strips: Annotated[str, typer.Option(help="auto: by turns and laser; whole: by laser; or a CSV of times.")] = "auto",
-    min_strip: Annotated[float, typer.Option(metavar="SECONDS", help="Shorter is no strip.", min=0.0)] = 5.0,
-    workers: Annotated[int | None, typer.Option(help="Processes; default: one a processor.", min=1)] = None,
-    scheduler: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="Of a Dask cluster (tcp://…) that shall do the work.")
+    epoch: Annotated[
+        float | None, typer.Option(help="Epoch of the coordinates, such as 2026.9; overrides output.epoch.")
     ] = None,
-    no_sigma: Annotated[bool, typer.Option("--no-sigma", help="Leave the three sigmas out.")] = False,
-    copc: Annotated[bool, typer.Option("--copc", help="Cloud optimised files (.copc.laz).")] = False,
+    config: Annotated[Path | None, typer.Option(metavar="FILE", help="Configuration; default: the logs' own.")] = None,
+    strips: Annotated[
+        str, typer.Option(help="auto: split at turns and laser off; whole: at laser off only; or a CSV of times.")
+    ] = "auto",
+    min_strip: Annotated[
+        float, typer.Option(metavar="SECONDS", help="Minimum strip duration; shorter stretches are ignored.", min=0.0)
+    ] = 5.0,
+    workers: Annotated[int | None, typer.Option(help="Number of processes; default: one per processor.", min=1)] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="Compute on the Dask cluster at this address (tcp://…).")
+    ] = None,
+    no_sigma: Annotated[bool, typer.Option("--no-sigma", help="Do not write the three sigmas of each point.")] = False,
+    copc: Annotated[bool, typer.Option("--copc", help="Write cloud-optimised files (.copc.laz).")] = False,
     scale: Annotated[
-        float, typer.Option(help="Of the coordinates in the files, in their unit.", min=1e-9, max=1.0)
+        float, typer.Option(help="Resolution of stored coordinates, in their unit.", min=1e-9, max=1.0)
     ] = 0.001,
     write_dropped: Annotated[
         bool,
-        typer.Option("--write-dropped", help="Also returns left out: beyond the range gate flagged, others listed."),
+        typer.Option(
+            "--write-dropped", help="Also write discarded returns: out-of-range points flagged, others listed."
+        ),
     ] = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what an earlier run left there.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace products of an earlier run.")] = False,
     force_trajectory: ForceTrajectory = False,
     accept_verdict: AcceptVerdict = False,
-    as_json: Annotated[bool, typer.Option("--json", help="The sidecar to stdout, for scripts.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the sidecar as JSON, for scripts.")] = False,
 ) -> None:
-    """Georeference logs: one LAZ file a strip, the trajectory, and a JSON file that says what they are made of.
+    """Georeference logs; write one LAZ file per strip, the trajectory, and a JSON file that documents their origin.
 
-    Every return that was read is in a file or counted with the reason why not. Exit code 1 when the products are
-    partial: parts missing, data damaged, strips that failed; 2 and 3 when there are none.
+    Every return is either in a file or counted with the reason for leaving it out. Exit code 1 when the products are
+    partial: parts missing, data damaged, strips that failed; 2 or 3 when there are no products.
     """
     require_installed("swath georef")
     from swath.daemon.cli.progress import progress_bar
@@ -74,7 +86,7 @@ def command(
     from swath.daemon.processing.setup.setup import Options
     from swath.georef.strips import StripRules
 
-    wish = GeorefOptions(
+    request = GeorefOptions(
         logs=logs,
         output=output,
         trajectory=TrajectoryOptions(trajectory, week, at, force=force_trajectory),
@@ -99,7 +111,7 @@ def command(
         write_dropped=write_dropped,
     )
     with progress_bar() as tell:
-        report = georeference(wish, tell)
+        report = georeference(request, tell)
     _tell(report.record, report.sidecar, as_json=as_json)
 
 
@@ -112,7 +124,9 @@ def calibrations_given(given: list[str]) -> dict[str, tuple[str, str]]:
         text = text_of(file, "a calibration file")
         scanner = named if equals else _scanner_of(text, file)
         if scanner in found:
-            raise UserError(f"{file}: is the second calibration of scanner {scanner}", ExitCode.USAGE)
+            raise UserError(
+                f"{file}: a calibration of scanner {scanner} was already given; give one per scanner", ExitCode.USAGE
+            )
         found[scanner] = (text, str(file))
     return found
 
@@ -146,7 +160,8 @@ def _print(record: dict[str, Any], sidecar: Path) -> None:
         print(f"strip {strip['number']}: {strip['points']:,} points, {seconds:.1f} s, {strip['file'] or 'no file'}")
     for scanner, counts in record["counts"].items():
         reasons = ", ".join(f"{count:,} {reason.replace('_', ' ')}" for reason, count in counts["dropped"].items())
-        print(f"{one_line(scanner)}: {counts['read']:,} returns, {counts['written']:,} in files; {reasons or 'all'}")
+        left_out = f"; left out: {reasons}" if reasons else ""
+        print(f"{one_line(scanner)}: {counts['read']:,} returns, {counts['written']:,} in files{left_out}")
     for line in record["warnings"]:
         print(f"warning: {one_line(line)}")
     print(f"{'complete' if record['complete'] else 'partial'}: {one_line(str(sidecar))}")

@@ -26,39 +26,45 @@ ValueT = TypeVar("ValueT")
 
 
 def command(
-    config: Annotated[Path, typer.Argument(metavar="CONFIG", help="Configuration that says what the devices are.")],
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Directory of the log.")],
+    config: Annotated[Path, typer.Argument(metavar="CONFIG", help="Configuration that describes the devices.")],
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Directory for the log.")],
     files: Annotated[
-        list[Path] | None, typer.Argument(metavar="FILE…", help="pcap, pcapng, candump -L; the folder of an export.")
+        list[Path] | None,
+        typer.Argument(metavar="FILE…", help="pcap, pcapng or candump -L files, or the folder of an export."),
     ] = None,
     source: Annotated[
-        list[str] | None, typer.Option(metavar="KIND/NAME[:WHICH]=FILE", help="Whose bytes a file holds; repeatable.")
+        list[str] | None,
+        typer.Option(metavar="KIND/NAME[:WHICH]=FILE", help="The device whose bytes FILE holds; repeatable."),
     ] = None,
     start: Annotated[
         list[str] | None,
-        typer.Option(metavar="[SOURCE=]TIME", help="When a serial file without times begins: 2026-11-21T10:15:00Z."),
+        typer.Option(
+            metavar="[SOURCE=]TIME", help="Start time of a serial file without times, such as 2026-11-21T10:15:00Z."
+        ),
     ] = None,
     baud: Annotated[
         list[str] | None,
-        typer.Option(metavar="[SOURCE=]N", help="How fast its bytes came; 0: all at once. Else the configuration's."),
+        typer.Option(metavar="[SOURCE=]N", help="Baud rate of that file; 0: all bytes at once. Default: from CONFIG."),
     ] = None,
-    keep_copies: Annotated[bool, typer.Option("--keep-copies", help="Keep packets that were captured twice.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
+    keep_copies: Annotated[
+        bool, typer.Option("--keep-copies", help="Keep duplicate packets; default: drop the second copy.")
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object, for scripts.")] = False,
 ) -> None:
-    """Make a log of captures made with tcpdump, candump or str2str, or of what `swath export` wrote.
+    """Make a log from captures of tcpdump, candump or str2str, or from the files of `swath export`.
 
-    UDP ports and CAN interfaces of CONFIG say whose the units of a pcap file or candump log are; `--source` says it of
-    a serial stream. Exit code 4 when a capture is damaged, 1 when one holds nothing of CONFIG's devices.
+    CONFIG's UDP ports and CAN interfaces assign the units of pcap files and candump logs to devices; a serial stream
+    needs --source. Exit code 4 when a capture is damaged, 1 when a capture holds nothing from CONFIG's devices.
     """
     from swath.daemon.config import load_config
-    from swath.daemon.exchange.capture_files import Told, find_captures
+    from swath.daemon.exchange.capture_files import ImportOptions, find_captures
     from swath.daemon.exchange.routes import Routes
 
     logging.getLogger("swath").addHandler(logging.NullHandler())  # findings about captures are printed below
-    told = Told(source or (), _by_source(start, _time_ns), _by_source(baud, _baud), keep_copies)
+    options = ImportOptions(source or (), _by_source(start, _time_ns), _by_source(baud, _baud), keep_copies)
     loaded = load_config(config)
     routes = Routes.of(loaded)
-    captures = find_captures(routes, files or (), told)
+    captures = find_captures(routes, files or (), options)
     report = _import(loaded, routes, captures, output)
     if as_json:
         found = {"session_id": report.session_id, "log": [str(path) for path in report.paths], "units": report.units}
@@ -90,7 +96,9 @@ def _import(config: Config, routes: Routes, captures: list[Capture], output: Pat
     except TransportError as error:
         raise UserError(one_line(str(error)), ExitCode.IO) from error
     except OSError as error:
-        raise UserError(one_line(f"{output}: {error.strerror or error}; nothing is left of it"), ExitCode.IO) from error
+        raise UserError(
+            one_line(f"{output}: {error.strerror or error}; the incomplete log was removed"), ExitCode.IO
+        ) from error
     finally:
         os.close(lock)
 
@@ -120,10 +128,10 @@ def _time_ns(text: str) -> int:
     except ValueError as error:
         raise ValueError(want) from error
     if time.tzinfo is None:
-        raise ValueError(f"{want}: with Z or an offset from UTC")
+        raise ValueError(f"{want}, with Z or an offset from UTC")
     since = time - datetime(1970, 1, 1, tzinfo=UTC)
     if since.days < 0:
-        raise ValueError(f"{want}: after 1970")
+        raise ValueError(f"{want}, after 1970")
     return (since.days * 86_400 + since.seconds) * 1_000_000_000 + since.microseconds * 1000
 
 
@@ -139,12 +147,12 @@ def _baud(text: str) -> float:
 
 def _print(report: ImportReport, captures: list[Capture]) -> None:
     for capture in captures:
-        told = [f"{count} units of {source}" for source, count in sorted(capture.units.items())] or ["no unit"]
-        told += [f"{count} {what} passed over" for what, count in capture.tally.passed.items() if count]
+        parts = [f"{count} units of {source}" for source, count in sorted(capture.units.items())] or ["no units"]
+        parts += [f"{count} {what} passed over" for what, count in capture.tally.passed.items() if count]
         if capture.passed:
             most = ", ".join(f"{what} ({count})" for what, count in capture.passed.most_common(5))
-            told.append(f"{capture.passed.total()} of no device: {most}")
-        print(one_line(f"{capture.path}: {capture.kind}, {', '.join(told)}"))
+            parts.append(f"{capture.passed.total()} from unknown devices: {most}")
+        print(one_line(f"{capture.path}: {capture.kind}, {', '.join(parts)}"))
     for path in report.paths:
         print(path)
 
@@ -152,14 +160,14 @@ def _print(report: ImportReport, captures: list[Capture]) -> None:
 def _damage(capture: Capture) -> str:
     tally = capture.tally
     more = f" ({tally.damage} such places)" if tally.damage > 1 else ""
-    return f"{tally.first_damage}{more}; what could be read is in the log"
+    return f"{tally.first_damage}{more}; everything readable is in the log"
 
 
 def _of_nobody(capture: Capture, routes: Routes) -> str:
     there = ", ".join(f"{what} ({count})" for what, count in capture.passed.most_common(5))
     if not there:
-        return f"{capture.path}: holds no unit"
+        return f"{capture.path}: is empty"
     return (
-        f"{capture.path}: holds {there}, the configuration has {routes.described(capture.kind)}; "
-        "--source kind/name=FILE says whose it is"
+        f"{capture.path}: holds {there}, but the configuration has {routes.described(capture.kind)}; "
+        "give --source kind/name=FILE"
     )

@@ -16,11 +16,11 @@ if TYPE_CHECKING:
 
 
 def command(
-    logs: Annotated[list[Path], typer.Argument(help="Logs, or directories of them.", metavar="LOG…")],
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
-    quick: Annotated[bool, typer.Option("--quick", help="Count units only; decode nothing.")] = False,
+    logs: Annotated[list[Path], typer.Argument(help="Logs, or directories of logs.", metavar="LOG…")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object, for scripts.")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="Count units without decoding them.")] = False,
 ) -> None:
-    """Show duration, counts, rates, gaps, losses, time status, events and damage.
+    """Show duration, counts, rates, gaps, losses, time status, events and damage of logs.
 
     Exit code 1 when units are not accounted for or a part is missing, 4 when data is damaged.
     """
@@ -76,7 +76,7 @@ def _print_session(console: Console, numbers: dict[str, Any]) -> None:
     origin = _plain(f"{numbers['software']} on {numbers['host']}{imported}")
     console.print(f"{parts}, {origin}")
     if numbers["growing"] is not None:
-        console.print(f"{_plain(numbers['growing'])} is being recorded; so far", highlight=False)
+        console.print(f"{_plain(numbers['growing'])} is still being recorded; counted up to now", highlight=False)
     for number in numbers["missing_parts"]:
         console.print(f"[red]part {number} is missing[/]")
     table = Table(box=None, pad_edge=False, header_style="bold")
@@ -95,16 +95,16 @@ def _print_session(console: Console, numbers: dict[str, Any]) -> None:
     unaccounted = _unaccounted(numbers)
     if unaccounted:
         console.print(f"[red]{unaccounted} status messages do not account for all units[/]")
-    untold = [source for source, values in numbers["sources"].items() if not values["has_status"]]
-    if untold:
-        console.print(f"no status of {_plain(', '.join(untold))}: what was lost is not known", highlight=False)
+    without_status = [source for source, values in numbers["sources"].items() if not values["has_status"]]
+    if without_status:
+        console.print(f"no status of {_plain(', '.join(without_status))}: losses are unknown", highlight=False)
     if numbers["missing_parts"] or numbers["damage"]:
-        console.print("[red]not every unit is here: what missing parts and damaged places held is not counted above[/]")
-    elif not unaccounted and not untold:
+        console.print("[red]incomplete: units in missing parts and damaged places are not counted above[/]")
+    elif not unaccounted and not without_status:
         console.print("every unit is accounted for: units = written + lost_kernel + lost_queue + lost_write")
     for event in numbers["marks"]:
-        told = f"{clock_text(event.get('time_ns'))} mark: {_plain(event.get('text', '?'))}"
-        console.print(f"  {told}", highlight=False)
+        text_of_mark = f"{clock_text(event.get('time_ns'))} mark: {_plain(event.get('text', '?'))}"
+        console.print(f"  {text_of_mark}", highlight=False)
     for event in numbers["last_events"]:
         severity, origin, code, text = (_plain(event.get(key, "?")) for key in ("severity", "source", "code", "text"))
         console.print(f"  {severity}: {origin} {code}: {text}", highlight=False)
@@ -120,8 +120,8 @@ def _print_trouble(console: Console, numbers: dict[str, Any]) -> None:
     """Print the error counts that wires and controllers report themselves."""
     for source, values in numbers["sources"].items():
         if values["trouble"]:
-            told = ", ".join(f"{count:,} {key.replace('_', ' ')}" for key, count in values["trouble"].items())
-            console.print(f"[red]{_plain(source)}: {_plain(told)}[/]", highlight=False)
+            counts = ", ".join(f"{count:,} {key.replace('_', ' ')}" for key, count in values["trouble"].items())
+            console.print(f"[red]{_plain(source)}: {_plain(counts)}[/]", highlight=False)
 
 
 def _row(source: str, values: dict[str, Any]) -> tuple[str, ...]:
@@ -145,14 +145,14 @@ def _time(values: dict[str, Any]) -> str:
     if state is None:
         return ""
     sigma = values["time_sigma_ns"]
-    told = f" ±{sigma / 1e3:.1f}µs" if isinstance(sigma, (int, float)) and sigma < 1e6 else ""
-    return _plain(state) + told
+    sigma_text = f" ±{sigma / 1e3:.1f}µs" if isinstance(sigma, (int, float)) and sigma < 1e6 else ""
+    return _plain(state) + sigma_text
 
 
 def _decoded(decoded: dict[str, Any]) -> str:
-    told = [f"{count:,} {name}" for name, count in sorted(decoded["records"].items(), key=lambda item: -item[1])]
+    parts = [f"{count:,} {name}" for name, count in sorted(decoded["records"].items(), key=lambda item: -item[1])]
     for key, words in (("bad_checksums", "bad checksums"), ("bad_messages", "bad messages")):
         if decoded[key]:
-            told.append(f"{decoded[key]} {words}")
-    told += [f"{count} × {code}" for code, count in decoded["errors"].items()]
-    return ", ".join(told) or "nothing decoded"
+            parts.append(f"{decoded[key]} {words}")
+    parts += [f"{count} × {code}" for code, count in decoded["errors"].items()]
+    return ", ".join(parts) or "nothing decoded"

@@ -32,42 +32,47 @@ def command(
         list[Path] | None,
         typer.Argument(
             metavar="[CONFIG|DIR]",
-            help="Which recorder: its configuration or log directory. --replay: logs, and a configuration.",
+            help="Configuration or log directory of the recorder. --replay: logs and a configuration.",
             readable=False,
         ),
     ] = None,
     from_start: Annotated[
-        bool, typer.Option("--from-start", help="From the recording's beginning; reads what lies cold on the disk.")
+        bool,
+        typer.Option(
+            "--from-start", help="Begin at the start of the recording instead of now; reads older data from the disk."
+        ),
     ] = False,
-    replay: Annotated[bool, typer.Option("--replay", help="The same over finished logs, as fast as it goes.")] = False,
+    replay: Annotated[
+        bool, typer.Option("--replay", help="Process finished logs the same way, as fast as possible.")
+    ] = False,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", metavar="DIR", help="--replay: where its files go.")
+        Path | None, typer.Option("--output", "-o", metavar="DIR", help="--replay: folder for its files.")
     ] = None,
     points: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="All points as one array (.npy), for comparisons.")
+        Path | None, typer.Option(metavar="FILE", help="Also write all points as one array (.npy), for comparisons.")
     ] = None,
     accept_verdict: AcceptVerdict = False,
-    as_json: Annotated[bool, typer.Option("--json", help="The status as JSON, one object a line.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the status as JSON, one object per line.")] = False,
 ) -> None:
-    """Georeference what is being recorded, and show it.
+    """Georeference the running recording and show its progress.
 
     Follows the growing log until the recording ends. Writes live.mcap (opens in Foxglove), coverage.png, coverage.json
-    and live.json under live/ in the log directory. Positions are the device's own INS solution; where there is none,
-    they are navigated from IMU and GNSS. The recorder does not notice: not even when this is killed.
+    and live.json under live/ in the log directory. Positions come from the device's own INS solution if it has one,
+    otherwise from IMU and GNSS. The recorder does not depend on this program; it may be stopped at any time.
     """
     require_installed("swath live", "foxglove")
     _check(where, output, replay=replay)
     paths = where or [DEFAULT_CONFIG]
     if replay:
-        _told(_replay(paths, output or Path(), points, accept_verdict=accept_verdict, as_json=as_json))
+        _refuse_unusable(_replay(paths, output or Path(), points, accept_verdict=accept_verdict, as_json=as_json))
         return
     found = _follow(paths[0], points, from_start=from_start, accept_verdict=accept_verdict, as_json=as_json)
     if "no end" in found["state"]:
         raise typer.Exit(int(ExitCode.PROBLEM))
-    _told(found)
+    _refuse_unusable(found)
 
 
-def _told(found: dict[str, Any]) -> None:
+def _refuse_unusable(found: dict[str, Any]) -> None:
     """Refuse the result with `UserError` if its verdict is that the points are not to be used."""
     from swath.daemon.processing.carried_verdict import refusal
 
@@ -78,11 +83,13 @@ def _told(found: dict[str, Any]) -> None:
 
 def _check(where: list[Path] | None, output: Path | None, *, replay: bool) -> None:
     if replay and (not where or output is None):
-        raise UserError("say which logs, and where to: swath live --replay LOG… -o DIR [CONFIG]", ExitCode.USAGE)
+        raise UserError("--replay needs logs and -o DIR: swath live --replay LOG… -o DIR [CONFIG]", ExitCode.USAGE)
     if not replay and output is not None:
-        raise UserError("-o belongs to --replay; a recording's files go under live/ in its directory", ExitCode.USAGE)
+        raise UserError(
+            "-o needs --replay; files of a running recording go under live/ in its directory", ExitCode.USAGE
+        )
     if not replay and len(where or []) > 1:
-        raise UserError("one recorder at a time: give one CONFIG or DIR", ExitCode.USAGE)
+        raise UserError("too many arguments; give one CONFIG or DIR", ExitCode.USAGE)
 
 
 @contextlib.contextmanager
@@ -145,7 +152,7 @@ def _follow(
 
 
 def _tell_of_compiling() -> None:
-    text = "compiling, a minute or more; `swath warm-up` does this before a flight"
+    text = "compiling; this takes a minute or more. Run `swath warm-up` before a flight to avoid it"
     print(text, file=sys.stderr, flush=True)
 
 
@@ -191,7 +198,7 @@ def page(found: dict[str, Any]) -> Group:
     if "points" not in found:
         return Group(*parts)
     table = Table(box=None, pad_edge=False, header_style="bold")
-    for column in ("scanner", "points", "a second", "waiting", "behind the pulse: p50", "p95", "max"):
+    for column in ("scanner", "points", "a second", "waiting", "delay after pulse: p50", "p95", "max"):
         table.add_column(column, justify="left" if column == "scanner" else "right")
     for name, count in found["points"].items():
         latency = (found["latency_s"].get(f"scanner/{name}") or {}).get("pulse") or {}
@@ -200,8 +207,8 @@ def page(found: dict[str, Any]) -> Group:
         table.add_row(one_line(name), f"{count:,}", f"{rate:,}", f"{waiting:,}", *seconds)
     parts.append(table)
     for name, fates in found["fates"].items():
-        told = ", ".join(f"{count:,} {fate.replace('_', ' ')}" for fate, count in fates.items())
-        parts.append(Text(one_line(f"{name}: {told}"), style="dim"))
+        counts = ", ".join(f"{count:,} {fate.replace('_', ' ')}" for fate, count in fates.items())
+        parts.append(Text(one_line(f"{name}: {counts}"), style="dim"))
     clocks = ", ".join(f"{source} {one['state']}" for source, one in found["time"].items())
     parts.append(Text(f"\n{one_line(clocks)}; {found['free_bytes'] / 1e9:,.1f} GB free"))
     return Group(*parts)
@@ -229,7 +236,10 @@ def _replay(
         print(f"passed over: {one_line(line)}", file=sys.stderr)
     if len(sessions) != 1 or len(configs) > 1:
         names = ", ".join(session.session_id for session in sessions)
-        raise UserError(f"one session and one configuration at a time; these are {names}", ExitCode.USAGE)
+        raise UserError(
+            f"--replay takes one session and at most one configuration; got the sessions {names or 'none'}",
+            ExitCode.USAGE,
+        )
     config: Config | None = load_config(configs[0]) if configs else None
     options = Options(uncertainty=False)
     setup = Setup.of_log(sessions[0].attachments(), options) if config is None else Setup.of_config(config, options)

@@ -30,13 +30,13 @@ INTERRUPTED = 130  # 128 + SIGINT, as in shells
 PIPE_CLOSED = 141  # 128 + SIGPIPE
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
 
-HELP = """Airborne laser scanning: from the sensors' wires into a log that survives.
+HELP = """Record, georeference and calibrate an airborne laser scanner.
 
-`swath run CONFIG` records; `swath check CONFIG` asks every device before.
+`swath check CONFIG` tests every device; `swath run CONFIG` records.
 """
 EPILOG = (
-    "Exit codes: 0 ok, 1 a problem found, 2 wrong configuration or usage, 3 cannot read or write, 4 damaged data, "
-    "130 interrupted. `swath COMMAND --help` says more."
+    "Exit codes: 0 ok, 1 problem found, 2 wrong configuration or usage, 3 cannot read or write, 4 damaged data, "
+    "130 interrupted. See `swath COMMAND --help` for details."
 )
 
 
@@ -57,29 +57,29 @@ class Listed:
 
 COMMANDS = (
     Listed("run", "Record every byte of the configured sensors.", "Record"),
-    Listed("check", "Validate a configuration; say what every device answers.", "Record"),
-    Listed("mark", "Note something in the log being recorded.", "Record"),
+    Listed("check", "Validate a configuration; listen to every device.", "Record"),
+    Listed("mark", "Write a note into the log being recorded.", "Record"),
     Listed("split", "Begin a new part of the log being recorded.", "Record"),
     Listed("monitor", "Show a running recorder live: rates, losses, time, disk.", "Record"),
-    Listed("live", "Georeference what is being recorded, and show it.", "Record"),
-    Listed("info", "Say what logs hold: counts, gaps, losses, time status.", "Logs"),
-    Listed("replay", "Put the bytes of a log back on wires.", "Logs"),
-    Listed("import", "Make a log of captures: pcap, candump, serial bytes.", "Logs"),
-    Listed("export", "Write a log as the files that the devices' own tools read.", "Logs"),
-    Listed("recover", "Repair a log left open by a crash; say what was lost.", "Logs"),
-    Listed("offload", "Copy finished logs to another disk and prove each copy.", "Logs"),
-    Listed("trajectory", "Navigate logs: trajectory, accuracies, event marks.", "Products"),
-    Listed("georef", "Georeference logs: LAZ a strip, trajectory, sidecar.", "Products"),
+    Listed("live", "Georeference the running recording and show it.", "Record"),
+    Listed("info", "Report what logs hold: counts, gaps, losses, time.", "Logs"),
+    Listed("replay", "Play the bytes of a log back on wires.", "Logs"),
+    Listed("import", "Make a log from captures: pcap, candump, serial bytes.", "Logs"),
+    Listed("export", "Write a log as files for the devices' own tools.", "Logs"),
+    Listed("recover", "Repair a log left open by a crash; report losses.", "Logs"),
+    Listed("offload", "Copy finished logs to another disk; verify each copy.", "Logs"),
+    Listed("trajectory", "Compute the trajectory of logs, with accuracies.", "Products"),
+    Listed("georef", "Georeference logs: one LAZ file per strip.", "Products"),
     Listed("view", "Show products on one page: maps, differences, a profile.", "Products"),
-    Listed("calibrate", "Find boresight, range offset and more, with sigmas.", "Calibration"),
-    Listed("plan-calibration", "Say what a planned calibration flight will tell.", "Calibration"),
-    Listed("strips", "Say how well strips agree; judge them by specifications.", "Calibration"),
-    Listed("validate", "Prove a calibration with other planes, flights, heights.", "Calibration"),
-    Listed("sim", "Fly a virtual aircraft into a log or on wires.", "Simulation"),
-    Listed("warm-up", "Compile what live and georef run, before the flight.", "Setup"),
-    Listed("doctor", "Say what on this computer would cost data.", "Setup"),
-    Listed("setup", "Show, or send, what devices need before a survey.", "Setup"),
-    Listed("devices", "List the protocols there are and what they yield.", "Setup"),
+    Listed("calibrate", "Estimate boresight, range offset and more.", "Calibration"),
+    Listed("plan-calibration", "Predict the accuracy of a planned calibration.", "Calibration"),
+    Listed("strips", "Compare strips; judge them by specifications.", "Calibration"),
+    Listed("validate", "Test a calibration with independent data.", "Calibration"),
+    Listed("sim", "Simulate a flight into a log or on wires.", "Simulation"),
+    Listed("warm-up", "Compile the computing code before the flight.", "Setup"),
+    Listed("doctor", "Check whether this computer can record safely.", "Setup"),
+    Listed("setup", "Show or send the set-up messages of the devices.", "Setup"),
+    Listed("devices", "List the supported protocols and their records.", "Setup"),
 )
 
 
@@ -93,7 +93,7 @@ def _callback(
     version: Annotated[
         bool,
         typer.Option(
-            "--version", metavar="", callback=_print_version, is_eager=True, help="Say the version and leave."
+            "--version", metavar="", callback=_print_version, is_eager=True, help="Print the version and exit."
         ),
     ] = False,
 ) -> None:
@@ -169,7 +169,7 @@ def _end_unforeseen(error: Exception) -> int:
     if isinstance(error, typer.Abort):
         return INTERRUPTED
     if isinstance(error, OSError) and error.errno in NO_ROOM:
-        _say(f"{error.filename or 'what it was to write'}: {error.strerror}; make room and run it again")
+        _say(f"{error.filename or 'output'}: {error.strerror}; free some space and run the command again")
         try:
             sys.stdout.flush()
         except OSError:

@@ -26,19 +26,21 @@ EXIT = {"recording": ExitCode.OK, "degraded": ExitCode.PROBLEM, "not recording":
 def command(
     where: Annotated[
         Path,
-        typer.Argument(
-            metavar="[CONFIG|DIR]", help="Which recorder: its configuration or log directory.", readable=False
-        ),
+        typer.Argument(metavar="[CONFIG|DIR]", help="Configuration or log directory of the recorder.", readable=False),
     ] = DEFAULT_CONFIG,
-    once: Annotated[bool, typer.Option("--once", help="One line, and its verdict as exit code.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object, or one a line without --once.")] = False,
-    every: Annotated[float, typer.Option(help="Seconds between two looks.", min=0.1, max=60.0)] = 0.5,
-    decode: Annotated[bool, typer.Option(help="Look into the bytes: damaged messages, gaps, rates of records.")] = True,
+    once: Annotated[
+        bool, typer.Option("--once", help="Print one line and exit; the exit code is the verdict.")
+    ] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print one JSON object; without --once, one per line.")
+    ] = False,
+    every: Annotated[float, typer.Option(help="Seconds between updates.", min=0.1, max=60.0)] = 0.5,
+    decode: Annotated[bool, typer.Option(help="Decode the bytes, for damaged messages, gaps and record rates.")] = True,
 ) -> None:
-    """Show how each source does: state, rate, age, losses, time status; the disk; the last events.
+    """Show the state of each source (rate, age, losses, time status), the disk and the latest events.
 
-    Reads the growing log and never asks the recorder. With --once the exit code is 0 recording, 1 degraded, 2 not
-    recording.
+    Reads the growing log only; it does not contact the recorder. With --once the exit code is 0 for recording,
+    1 for degraded, 2 for not recording.
     """
     from rich.console import Console
     from rich.live import Live
@@ -93,8 +95,8 @@ def page(found: dict[str, Any]) -> Group:
         table.add_row(*_row(source, values))
     parts.append(table)
     for source, values in found["sources"].items():
-        if (told := _decoded(values.get("decoded"))) is not None:
-            parts.append(Text(one_line(f"{source}: {told}"), style="dim"))
+        if (text := _decoded(values.get("decoded"))) is not None:
+            parts.append(Text(one_line(f"{source}: {text}"), style="dim"))
     parts += [Text(one_line(note), style="yellow") for note in found["notes"]]
     parts.append(Text(f"\n{_disk(found)}\n"))
     for event in found["events"][-EVENTS_SHOWN:]:
@@ -131,11 +133,11 @@ def time_text(values: dict[str, Any]) -> str:
 def _decoded(decoded: dict[str, Any] | None) -> str | None:
     if decoded is None:
         return None
-    told = [f"{rate:,.1f} {name}/s" for name, rate in decoded["records_hz"].items()]
+    parts = [f"{rate:,.1f} {name}/s" for name, rate in decoded["records_hz"].items()]
     if decoded["bad"]:
-        told.append(f"{decoded['bad']} messages damaged")
-    told += [f"{count} × {code}" for code, count in decoded["errors"].items()]
-    text = ", ".join(told) or "nothing decoded"
+        parts.append(f"{decoded['bad']} messages damaged")
+    parts += [f"{count} × {code}" for code, count in decoded["errors"].items()]
+    text = ", ".join(parts) or "nothing decoded"
     share = decoded["share"]
     return text if share == 1.0 else f"{text} (of {share:.0%} of the seconds)"
 
@@ -143,7 +145,7 @@ def _decoded(decoded: dict[str, Any] | None) -> str | None:
 def _disk(found: dict[str, Any]) -> str:
     rate, hours = found["bytes_per_s"] / 1e6, found["hours_left"]
     left = "" if hours is None else f", {hours:,.1f} h left at this rate"
-    reserve = f", {found['reserve_bytes'] / 1e9:.1f} of them the reserve" if found["reserve_bytes"] else ""
+    reserve = f", of which {found['reserve_bytes'] / 1e9:.1f} GB reserve" if found["reserve_bytes"] else ""
     return f"{rate:,.2f} MB/s; {found['free_bytes'] / 1e9:,.1f} GB free{reserve}{left}"
 
 

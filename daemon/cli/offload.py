@@ -22,19 +22,19 @@ if TYPE_CHECKING:
 def command(
     where: Annotated[
         Path,
-        typer.Argument(metavar="DIR", help="Where the logs are, or the recorder's configuration.", readable=False),
+        typer.Argument(metavar="DIR", help="Log directory, or configuration of the recorder.", readable=False),
     ],
     destination: Annotated[
-        Path, typer.Argument(metavar="DEST", help="A folder on another disk, which must be there.", readable=False)
+        Path, typer.Argument(metavar="DEST", help="Existing folder on another disk.", readable=False)
     ],
-    verify: Annotated[bool, typer.Option("--verify", help="Read copies that are there already once more.")] = False,
-    same_disk: Annotated[bool, typer.Option("--same-disk", help="DEST may be on the disk of the logs.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
+    verify: Annotated[bool, typer.Option("--verify", help="Also read copies of earlier runs again.")] = False,
+    same_disk: Annotated[bool, typer.Option("--same-disk", help="Allow DEST on the same disk as the logs.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object, for scripts.")] = False,
 ) -> None:
-    """Copy finished logs to DEST, read each copy back, list their SHA-256 in DEST/SHA256SUMS, say what may be deleted.
+    """Copy finished logs to DEST, read each copy back, list checksums in DEST/SHA256SUMS, name logs safe to delete.
 
-    Goes on where an interrupted run ended. A log being recorded is passed over; nothing is deleted or overwritten.
-    Exit code 3 when a log could not be copied or DEST is full, 4 when a copy is not what the log holds.
+    Continues an interrupted run. Leaves out logs that are being recorded; deletes and overwrites nothing.
+    Exit code 3 when a log could not be copied or DEST is full, 4 when a copy differs from its log.
     """
     from swath.daemon.exchange.offload import is_growing, offload
     from swath.daemon.system import give_way
@@ -43,7 +43,7 @@ def command(
     if any(map(is_growing, directory.glob("*.mcap"))):
         give_way()
     report: OffloadReport | None = None
-    said = 0
+    printed = 0
     with transfer_bar() as bar:
         task = bar.add_task("", total=None)
 
@@ -51,12 +51,12 @@ def command(
             bar.update(task, description=one_line(name), completed=done, total=total)
 
         for report in offload(directory, destination, verify=verify, same_disk=same_disk, progress=tell):
-            if not as_json and len(report.copied) > said:
-                said = len(report.copied)
+            if not as_json and len(report.copied) > printed:
+                printed = len(report.copied)
                 copied = report.copied[-1]
                 print(f"{one_line(copied.name)}: copied and read back, {copied.bytes / 1e6:,.1f} MB", flush=True)
     if report is None:
-        raise UserError(f"{directory}: no logs (*.mcap) there", ExitCode.IO)
+        raise UserError(f"{directory}: contains no logs (*.mcap)", ExitCode.IO)
     if as_json:
         print(json.dumps(report.plain(), indent=2))
     else:
@@ -69,15 +69,15 @@ def command(
 def _print(report: OffloadReport, verify: bool) -> None:
     if report.there:
         count = len(report.there)
-        checked = "read again now" if verify else "checked when copied"
-        print(f"{count} log{'s' if count != 1 else ''} there already, {checked}")
+        checked = "read again now" if verify else "verified when copied"
+        print(f"{count} log{'s' if count != 1 else ''} already copied, {checked}")
     for name in report.recording:
         print(f"{one_line(name)}: is being recorded; not copied")
     for name in report.left_open:
-        print(f"{one_line(name)}: was left open by a crash and is copied as it is; swath recover completes it")
+        print(f"{one_line(name)}: was left open by a crash and is copied unchanged; run swath recover to complete it")
     sizes = _sizes(report.deletable)
     if sizes:
-        print(f"may be deleted, {len(sizes)} of the logs, {sum(sizes.values()) / 1e6:,.1f} MB:")
+        print(f"safe to delete: {len(sizes)} log{'s' if len(sizes) != 1 else ''}, {sum(sizes.values()) / 1e6:,.1f} MB")
         for path in sizes:
             print(f"  rm {one_line(shlex.quote(str(path)))}")
 

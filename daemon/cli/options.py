@@ -7,18 +7,24 @@ from typing import Annotated
 import typer
 
 TrajectoryPoint = Annotated[
-    str, typer.Option("--trajectory-at", metavar="POINT", help="body, antenna, scanner, or x,y,z from the body.")
+    str,
+    typer.Option(
+        "--trajectory-at",
+        metavar="POINT",
+        help="Point that the trajectory describes: body, antenna, scanner, or x,y,z from the body in metres.",
+    ),
 ]
-TrajectoryWeek = Annotated[int | None, typer.Option(help="GPS week of a trajectory that says none.", min=0)]
+TrajectoryWeek = Annotated[int | None, typer.Option(help="GPS week, if the trajectory file holds none.", min=0)]
 TrajectoryDatum = Annotated[
-    str | None, typer.Option("--trajectory-datum", metavar="CRS", help='Realisation of its positions, or "same".')
+    str | None,
+    typer.Option("--trajectory-datum", metavar="CRS", help='Datum of the trajectory, or "same" (as the output).'),
 ]
 ForceTrajectory = Annotated[
-    bool, typer.Option("--force-trajectory", help="Take a trajectory that does not agree with the log's fixes and IMU.")
+    bool, typer.Option("--force-trajectory", help="Use a trajectory that contradicts the log's fixes or IMU.")
 ]
 ForceCrs = Annotated[
-    bool, typer.Option("--force-crs", help="Take a CRS outside its area of use, or 0.5 % off in scale.")
+    bool, typer.Option("--force-crs", help="Use a CRS outside its area of use, or with a scale error above 0.5 %.")
 ]
 AcceptVerdict = Annotated[
-    bool, typer.Option("--accept-verdict", help="Exit 0 although trajectory or calibration are judged not to be used.")
+    bool, typer.Option("--accept-verdict", help='Exit with code 0 even if the verdict is "Not to be used".')
 ]

@@ -22,26 +22,34 @@ def command(
     plan: PlanArgument,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", metavar="FILE", help="PNG, PDF or SVG; else <plan>-calibration.png, here."),
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="FILE",
+            help="Picture to write: PNG, PDF or SVG; default: PLAN-calibration.png in this folder.",
+        ),
     ] = None,
-    model: Annotated[str, typer.Option(help="basic, scanner, full, or a file FILE.toml.")] = "scanner",
+    model: Annotated[str, typer.Option(help="Parameters to estimate: basic, scanner, full, or FILE.toml.")] = "scanner",
     sigmas: Annotated[
         str | None,
         typer.Option(
             metavar="P,R,H",
-            help="Expected of the trajectory: position (m), roll and pitch, heading (degrees); else by its sensors.",
+            help="Expected trajectory sigmas: position (m), roll and pitch, heading (degrees); default: from the plan.",
         ),
     ] = None,
-    no_control: Annotated[bool, typer.Option("--no-control", help="Without the plan's control points.")] = False,
+    no_control: Annotated[bool, typer.Option("--no-control", help="Leave out the plan's control points.")] = False,
     control_sigma: Annotated[
-        float, typer.Option("--control-sigma", metavar="M", help="Of control points.", min=0.0005, max=1.0)
+        float,
+        typer.Option(
+            "--control-sigma", metavar="M", help="Sigma of the control points, in metres.", min=0.0005, max=1.0
+        ),
     ] = 0.01,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object, for scripts.")] = False,
 ) -> None:
-    """Predict what a calibration of a planned flight would find: each parameter's sigma, or why it cannot be found.
+    """Predict how well a planned flight determines the calibration: the sigma of each parameter, or why it has none.
 
-    The plan is flown over its terrain on paper: roofs, ground and control points that the lines see go through the
-    equations of `swath calibrate`. Exit code 1 where boresight or range offset would not be determined.
+    Computes which roofs, ground and control points the flight lines see, and puts them through the equations of
+    `swath calibrate`. Exit code 1 when the flight would not determine boresight or range offset.
     """
     require_installed("swath plan-calibration", "matplotlib")
     from rich.console import Console
@@ -55,10 +63,10 @@ def command(
     picture = output if output is not None else Path(f"{Path(plan).stem}-calibration.png")
     require_picture(picture)
     asked = PlanOptions(model_of(model), None if sigmas is None else _three(sigmas), not no_control, control_sigma)
-    wish = FlightOptions(plan)
+    flight = FlightOptions(plan)
     console = Console(stderr=True)
-    with console.status("flying on paper"), compiling_noticed(console), wish.told():
-        planned = plan_calibration(wish.load(), asked)
+    with console.status("computing"), compiling_noticed(console), flight.as_user_errors():
+        planned = plan_calibration(flight.load(), asked)
         try:
             draw_planned(planned, picture)
         except OSError as error:
@@ -75,7 +83,7 @@ def _three(text: str) -> tuple[float, float, float]:
     try:
         position_m, tilt_deg, heading_deg = (float(part) for part in text.split(","))
     except ValueError as error:
-        wanted = "want three numbers: position (m), roll and pitch, heading (degrees), as 0.02,0.004,0.01"
+        wanted = "want three numbers: position (m), roll and pitch, heading (degrees), such as 0.02,0.004,0.01"
         raise UserError(f'--sigmas: got "{one_line(text)}", {wanted}', ExitCode.USAGE) from error
     if not 0.0 < min(position_m, tilt_deg, heading_deg) <= max(position_m, tilt_deg, heading_deg) < 100.0:
         raise UserError(f'--sigmas: got "{one_line(text)}", want numbers above 0 and below 100', ExitCode.USAGE)

@@ -15,18 +15,18 @@ if TYPE_CHECKING:
 
 
 def command(
-    logs: Annotated[list[Path], typer.Argument(help="Logs, or directories of them.", metavar="LOG…")],
+    logs: Annotated[list[Path], typer.Argument(help="Logs, or directories of logs.", metavar="LOG…")],
     output: Annotated[
-        Path | None, typer.Option(help="Folder of the repaired copies; beside the log without it.")
+        Path | None, typer.Option(help="Folder for the repaired copies; default: beside the log.")
     ] = None,
-    keep_free_mb: Annotated[float, typer.Option(help="Repair only while so much stays free.", min=0)] = 0.0,
-    background: Annotated[bool, typer.Option("--background", help="At idle CPU and I/O priority.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
+    keep_free_mb: Annotated[float, typer.Option(help="Repair only if this much disk stays free, in MB.", min=0)] = 0.0,
+    background: Annotated[bool, typer.Option("--background", help="Run at idle CPU and I/O priority.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object, for scripts.")] = False,
 ) -> None:
-    """Check every CRC, save what is whole into LOG.recovered.mcap, say exactly what was lost.
+    """Check every CRC, save all intact data into LOG.recovered.mcap and report exactly what was lost.
 
-    The log itself is never touched. Of a directory, logs that are being recorded and those already recovered are left
-    alone. Exit code 4 when damage was found, 3 when a log could not be recovered; the others are all the same.
+    The log itself stays unchanged. In a directory, logs that are being recorded or were already recovered are left
+    out. Exit code 4 when damage was found, 3 when a log could not be recovered (the others still are).
     """
     from swath.daemon.log.format import LogError
     from swath.daemon.log.recover import recover
@@ -50,7 +50,7 @@ def command(
     if as_json:
         print(json.dumps({"logs": [report.plain() for report in reports], "refused": refused}, indent=2))
     elif not reports and not refused:
-        print("nothing to recover: all are being recorded, or have been recovered before")
+        print("nothing to recover: every log is being recorded or was already recovered")
     if refused:
         raise UserError("\n".join(map(one_line, refused)), ExitCode.IO)
     if not all(report.whole for report in reports):
@@ -67,7 +67,7 @@ def _files(paths: list[Path], output: Path | None) -> list[Path]:
         if path.is_dir():
             found = sorted(path.glob("*.mcap"))
             if not found:
-                raise UserError(f"{path}: no logs (*.mcap) there", ExitCode.IO)
+                raise UserError(f"{path}: contains no logs (*.mcap)", ExitCode.IO)
             for file in found:
                 copy = (output or path) / (file.name.removesuffix(".mcap") + RECOVERED)
                 if not (file.name.endswith(RECOVERED) or copy.exists() or is_being_written(file)):
@@ -82,7 +82,7 @@ def _files(paths: list[Path], output: Path | None) -> list[Path]:
 def _print_report(report: RecoveryReport) -> None:
     count = sum(report.messages.values())
     if report.whole:
-        print(f"{report.path}: whole, {report.chunks} chunks, {count} messages; nothing to do")
+        print(f"{report.path}: intact, {report.chunks} chunks, {count} messages; nothing to do")
         return
     lost = "" if report.messages_lost is None else f", {report.messages_lost} lost"
     print(f"{report.path}: {report.chunks} good chunks, {count} messages saved in {report.recovered}{lost}")

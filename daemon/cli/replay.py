@@ -18,12 +18,12 @@ if TYPE_CHECKING:
 
 
 def command(
-    logs: Annotated[list[Path], typer.Argument(help="Logs, or a directory of them.", metavar="LOG…")],
-    wire: Annotated[Path, typer.Option(help="Configuration that names the ports, buses and FIFOs to play to.")],
-    pace: Annotated[float, typer.Option(help="Times as fast as recorded; other than 1 no PPS is written.")] = 1.0,
-    wait: Annotated[float, typer.Option(help="Seconds to wait for a reader at every port and FIFO.", min=0)] = 10.0,
+    logs: Annotated[list[Path], typer.Argument(help="Logs, or a directory of logs.", metavar="LOG…")],
+    wire: Annotated[Path, typer.Option(help="Configuration that names the ports, buses and FIFOs to write to.")],
+    pace: Annotated[float, typer.Option(help="Speed factor; PPS edges are written at 1 only.")] = 1.0,
+    wait: Annotated[float, typer.Option(help="Seconds to wait until every port and FIFO has a reader.", min=0)] = 10.0,
 ) -> None:
-    """Play a log's bytes back to ptys, CAN and UDP, and its PPS edges into fixed: FIFOs."""
+    """Play back the bytes of a log on ptys, CAN and UDP, and its PPS edges into fixed: FIFOs."""
     from rich.console import Console
 
     from swath.daemon.config import load_config
@@ -45,7 +45,7 @@ def command(
         raise UserError(str(error), exit_code=ExitCode.IO) from error
     try:
         for source in wait_for_readers(outputs, wait, lambda: bool(stop)):
-            console.print(f"{source}: nobody has opened it; playing all the same")
+            console.print(f"{source}: no reader has opened it; playing without one")
         for session in sessions:
             if stop:
                 break
@@ -78,12 +78,12 @@ def _play_session(
     from swath.daemon.replay.units import timed_units
     from swath.daemon.replay.wire_player import play
 
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TextColumn("{task.fields[told]}"))
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TextColumn("{task.fields[detail]}"))
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task(session.session_id, total=None, told="")
+        task = bar.add_task(session.session_id, total=None, detail="")
 
         def tell(seconds: float, report: PlayReport) -> None:
-            bar.update(task, told=f"{seconds:.0f} s, {sum(report.units.values())} units")
+            bar.update(task, detail=f"{seconds:.0f} s, {sum(report.units.values())} units")
 
         return play(timed_units(session, with_pps=pace == 1.0), outputs, pace=pace, progress=tell, stopped=stopped)
 
@@ -92,14 +92,12 @@ def _tell_report(
     report: PlayReport, session: Session, outputs: Mapping[str, Output], wire: Path, console: Console
 ) -> None:
     if report.jumps:
-        console.print(
-            f"{session.session_id}: {report.jumps} steps of more than an hour in its times were not waited for"
-        )
+        console.print(f"{session.session_id}: skipped the waiting at {report.jumps} time gaps of more than an hour")
     for source in sorted(report.passed_over):
-        console.print(f"{source}: in the log, not in {wire}; not played")
+        console.print(f"{source}: is in the log but not in {wire}; not played")
     for source in sorted(outputs):
         if not report.units[source] and not report.refused[source]:
-            console.print(f"{source}: nothing in {session.session_id} was played to it")
+            console.print(f"{source}: no data for it in {session.session_id}")
             continue
-        refused = f", {report.refused[source]} refused by a reader" if report.refused[source] else ""
+        refused = f", {report.refused[source]} rejected by a reader" if report.refused[source] else ""
         console.print(f"{source}: {report.units[source]} units, {report.bytes[source]} bytes{refused}")

@@ -25,9 +25,11 @@ def _log_to_stderr() -> None:
 
 def command(
     config: Annotated[Path, typer.Argument(metavar="CONFIG", help="Configuration, for example /etc/swath/swath.toml.")],
-    seconds: Annotated[float | None, typer.Option(help="Stop after so many seconds.", min=0.0)] = None,
+    seconds: Annotated[
+        float | None, typer.Option(help="Stop after this many seconds; default: run until stopped.", min=0.0)
+    ] = None,
 ) -> None:
-    """Record every byte of the sensors in CONFIG until SIGTERM or Ctrl-C; SIGHUP starts a new part."""
+    """Record every byte of the sensors in CONFIG until SIGTERM or Ctrl-C; SIGHUP begins a new part of the log."""
     from swath.daemon.config import load_config
     from swath.daemon.recorder.run import record
 

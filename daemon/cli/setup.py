@@ -20,21 +20,25 @@ MAX_BAUD = 20_000_000  # as in swath.drivers.transports.spec, whose import of Nu
 
 def command(
     config: Annotated[Path, typer.Argument(metavar="CONFIG", help="Configuration, for example /etc/swath/swath.toml.")],
-    apply: Annotated[bool, typer.Option("--apply", help="Send them, and say what the devices answer.")] = False,
+    apply: Annotated[bool, typer.Option("--apply", help="Send the messages and report each answer.")] = False,
     device: Annotated[
-        list[str] | None, typer.Option(metavar="KIND/NAME", help="This device only, as gnss/rover; may be repeated.")
+        list[str] | None, typer.Option(metavar="KIND/NAME", help="This device only, such as gnss/rover; repeatable.")
     ] = None,
-    save: Annotated[bool, typer.Option("--save", help="Let the devices keep it without power.")] = False,
+    save: Annotated[bool, typer.Option("--save", help="Make the devices store the settings permanently.")] = False,
     from_baud: Annotated[
         int | None,
-        typer.Option(help="The rate the device speaks at now; it is told the configured one.", min=1, max=MAX_BAUD),
+        typer.Option(
+            help="Present baud rate of the device, if it differs from CONFIG; it is switched to CONFIG's.",
+            min=1,
+            max=MAX_BAUD,
+        ),
     ] = None,
     timeout: Annotated[float, typer.Option(help="Seconds to wait for each answer.", min=0.1, max=60.0)] = 2.0,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object, for scripts.")] = False,
 ) -> None:
-    """Show what CONFIG's devices would be sent: rates, messages, PPS; with --apply send it.
+    """Show the messages that set up CONFIG's devices (rates, outputs, PPS); with --apply send them.
 
-    Exit code 1 when a device refuses a message, does not answer, or cannot be sent to.
+    Exit code 1 when a device rejects a message, does not answer, or cannot be reached.
     """
     from swath.daemon.config import load_config
     from swath.daemon.devices.setup import plan_setup
@@ -45,8 +49,8 @@ def command(
     devices = [found for wire in wires for found in wire.devices]
     ok = all(found.ok for found in devices)
     if as_json:
-        told = {"config": str(config), "applied": apply, "ok": ok}
-        print(json.dumps(told | {"devices": [found.plain() for found in devices]}, indent=2))
+        document = {"config": str(config), "applied": apply, "ok": ok}
+        print(json.dumps(document | {"devices": [found.plain() for found in devices]}, indent=2))
     else:
         _print_devices(devices, apply)
     if not ok:
@@ -59,7 +63,7 @@ def _apply(wires: list[WireSetup], timeout_s: float) -> None:
     from swath.daemon.devices.setup import apply_setup
 
     for wire in wires:
-        with Console(stderr=True).status(f"asking by {wire.spec.text}"):
+        with Console(stderr=True).status(f"setting up {wire.spec.text}"):
             apply_setup(wire, timeout_s)
 
 
@@ -74,9 +78,9 @@ def _print_devices(devices: list[DeviceSetup], applied: bool) -> None:
         if found.problem:
             console.print(f"  {found.problem}", style="red", markup=False)
         elif not found.steps:
-            console.print("  has no start-up messages", style="dim")
+            console.print("  needs no set-up messages", style="dim")
     if not applied and any(found.steps for found in devices):
-        console.print("nothing was sent; --apply sends it", style="dim")
+        console.print("nothing was sent; use --apply to send", style="dim")
 
 
 def _print_step(console: Console, step: Step, applied: bool) -> None:

@@ -33,10 +33,10 @@ SETTLE_S = 1.0  # from the last reader at a port to the first unit; readers of U
 LATE_S = 0.5  # a time message later than this after its edge may be taken as the next edge's
 INTERRUPTED = 130  # 128 + SIGINT
 
-PlanArgument = Annotated[str, typer.Argument(metavar="PLAN", help=f"A plan's file, or a preset: {PRESETS}.")]
+PlanArgument = Annotated[str, typer.Argument(metavar="PLAN", help=f"Plan file, or a preset: {PRESETS}.")]
 
 app = typer.Typer(
-    help="The virtual aircraft: a whole survey flight from a plan, into a log or on wires, with known truth.",
+    help="Simulate a survey flight from a plan, into a log or on wires, with known truth.",
     rich_markup_mode="markdown",
 )
 
@@ -48,30 +48,34 @@ def _callback(context: typer.Context) -> None:
         raise typer.Exit(int(ExitCode.USAGE))
 
 
-@app.command("fly", short_help="Fly a plan: into a log as fast as it goes, or on wires in real time.")
+@app.command("fly", short_help="Fly a plan: into a log as fast as possible, or on wires in real time.")
 def fly(
     plan: PlanArgument,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", metavar="LOG", help="A folder, or the log's name (….mcap). --wire: a folder."),
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="LOG",
+            help="Folder, or file name of the log (….mcap). --wire: folder for ports and configuration.",
+        ),
     ] = None,
-    wire: Annotated[bool, typer.Option("--wire", help="In real time on ptys, CAN, UDP and PPS FIFOs.")] = False,
+    wire: Annotated[bool, typer.Option("--wire", help="Fly in real time on ptys, CAN, UDP and PPS FIFOs.")] = False,
     config: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="--wire: the configuration whose wires to fly on.")
+        Path | None, typer.Option(metavar="FILE", help="--wire: use the wires of this configuration.")
     ] = None,
-    wait: Annotated[float, typer.Option(help="--wire: seconds to wait for a reader at every port.", min=0)] = 60.0,
+    wait: Annotated[float, typer.Option(help="--wire: seconds to wait until every port has a reader.", min=0)] = 60.0,
     set_clock: Annotated[
-        bool, typer.Option("--set-clock", help="--wire: faults may step this computer's clock (root).")
+        bool, typer.Option("--set-clock", help="--wire: let simulated faults step this computer's clock (root).")
     ] = False,
-    seed: Annotated[int | None, typer.Option(help="Instead of the plan's: other noise.", min=0)] = None,
-    seconds: Annotated[float | None, typer.Option(help="The first seconds only.", min=0.1)] = None,
-    no_truth: Annotated[bool, typer.Option("--no-truth", help="Leave truth.npz out.")] = False,
+    seed: Annotated[int | None, typer.Option(help="Seed of the noise, instead of the plan's.", min=0)] = None,
+    seconds: Annotated[float | None, typer.Option(help="Fly only this many seconds from the start.", min=0.1)] = None,
+    no_truth: Annotated[bool, typer.Option("--no-truth", help="Do not write truth.npz.")] = False,
 ) -> None:
     """Fly a plan.
 
-    With `-o` as fast as it goes, into a log as the recorder would have written it; beside it the configuration that
-    records it, nominal and true calibration, ground control and the truth. With `--wire` in real time, for a recorder
-    in another terminal.
+    With `-o`, as fast as possible into a log like one of the recorder; beside it go its configuration, nominal and
+    true calibration, ground control and the truth. With `--wire`, in real time for a recorder in another terminal.
     """
     from rich.console import Console
 
@@ -79,28 +83,37 @@ def fly(
 
     logging.getLogger("swath").addHandler(logging.NullHandler())  # events are written to the log, not to stderr
     console = Console(stderr=True, markup=False, highlight=False, soft_wrap=True)
-    wish = FlightOptions(plan, seed, seconds)
+    options = FlightOptions(plan, seed, seconds)
     if wire:
         if config is not None and output is not None:
-            raise UserError("-o makes wires, --config names some; give one of them", ExitCode.USAGE)
-        _fly_on_wires(console, wish, output, config, wait, set_clock=set_clock)
+            raise UserError(
+                "--wire takes -o (new wires in a folder) or --config (wires of a configuration), not both",
+                ExitCode.USAGE,
+            )
+        _fly_on_wires(console, options, output, config, wait, set_clock=set_clock)
         return
     if config is not None or set_clock:
-        raise UserError(f"{'--config' if config else '--set-clock'} belongs to --wire", ExitCode.USAGE)
+        raise UserError(f"{'--config' if config else '--set-clock'} needs --wire", ExitCode.USAGE)
     if output is None:
-        raise UserError("say where to: -o LOG, or --wire", ExitCode.USAGE)
-    _fly_into_log(console, wish, output, with_truth=not no_truth)
+        raise UserError("no output given; use -o LOG or --wire", ExitCode.USAGE)
+    _fly_into_log(console, options, output, with_truth=not no_truth)
 
 
-@app.command("plan", short_help="Draw a plan, and say what it covers.")
+@app.command("plan", short_help="Draw a plan and print what it covers.")
 def plan_(
     plan: PlanArgument,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", metavar="FILE", help="PNG, PDF or SVG; else <plan>.png, here.")
+        Path | None,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="FILE",
+            help="Picture to write: PNG, PDF or SVG; default: PLAN.png in this folder.",
+        ),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object, for scripts.")] = False,
 ) -> None:
-    """Draw a plan: map of lines, swaths and buildings, height profile, point density, overlap; the same as a table."""
+    """Draw a plan (lines, swaths, buildings, height profile, density, overlap) and print its figures as a table."""
     from rich.console import Console
 
     from swath.daemon.simulate.plans import FlightOptions, draw
@@ -127,11 +140,11 @@ def _print_lines(console: Console, rows: list[dict[str, Any]]) -> None:
     for row in rows[:-1]:
         figures = ("length_m", "seconds", "height_min_m", "height_mean_m", "swath_m", "density_per_m2")
         units = ("m", "s", "m", "m", "m", "")
-        told = [
+        cells = [
             f"{row[key]:,.{0 if unit == 'm' else 1}f} {unit}".strip() for key, unit in zip(figures, units, strict=True)
         ]
         overlap = f"{row['overlap_percent']:.0f} %" if row["overlap_percent"] else "–"
-        table.add_row(one_line(row["name"]), *told, overlap)
+        table.add_row(one_line(row["name"]), *cells, overlap)
     console.print(table)
     total = rows[-1]
     console.print(
@@ -144,7 +157,7 @@ def _print_lines(console: Console, rows: list[dict[str, Any]]) -> None:
 # ---------------------------------------------------------------------------------------------- into a log
 
 
-def _fly_into_log(console: Console, wish: FlightOptions, output: Path, *, with_truth: bool) -> None:
+def _fly_into_log(console: Console, options: FlightOptions, output: Path, *, with_truth: bool) -> None:
     from swath.daemon.cli.progress import compiling_noticed
     from swath.daemon.simulate.folder import FlightFolder
 
@@ -152,13 +165,15 @@ def _fly_into_log(console: Console, wish: FlightOptions, output: Path, *, with_t
     started_s = time.monotonic()
     try:
         with compiling_noticed(console), FlightFolder(output) as folder:
-            report, names = _make_log(console, wish, folder, with_truth=with_truth)
+            report, names = _make_log(console, options, folder, with_truth=with_truth)
             logs = folder.keep(report.paths)
     except KeyboardInterrupt:
-        console.print("interrupted: what was written of this flight has been removed")
+        console.print("interrupted: the incomplete files of this flight were removed")
         raise
     except OSError as error:
-        text = f"{error.filename or output}: {error.strerror or error}; nothing is left of this flight"
+        text = (
+            f"{error.filename or output}: {error.strerror or error}; the incomplete files of this flight were removed"
+        )
         raise UserError(one_line(text), ExitCode.IO) from error
     finally:
         signal.signal(signal.SIGTERM, before)
@@ -166,17 +181,17 @@ def _fly_into_log(console: Console, wish: FlightOptions, output: Path, *, with_t
 
 
 def _make_log(
-    console: Console, wish: FlightOptions, folder: FlightFolder, *, with_truth: bool
+    console: Console, options: FlightOptions, folder: FlightFolder, *, with_truth: bool
 ) -> tuple[SimReport, list[str]]:
     """Make all files of a flight in the hidden folder; return the report and the names of the files beside the log."""
     from swath.daemon.config import load_config
     from swath.daemon.simulate.into_log import fly_into_log, sim_session_info
     from swath.daemon.simulate.plans import configuration, make_flight
 
-    plan = wish.load()
+    plan = options.load()
     folder.refuse_taken([CONFIG_NAME])  # before anything that takes long
-    with console.status("getting ready"):
-        flight, files = make_flight(wish, folder.work / TRUTH_NAME if with_truth else None)
+    with console.status("preparing the flight"):
+        flight, files = make_flight(options, folder.work / TRUTH_NAME if with_truth else None)
     files[CONFIG_NAME] = configuration(plan, None, ".")
     names = sorted([*files, *([TRUTH_NAME] if with_truth else [])])
     folder.refuse_taken(names)
@@ -185,13 +200,13 @@ def _make_log(
     flight_seed = plan.tables.flight.seed
     folder.refuse_session(sim_session_info(config.session.name, flight.host_clock, flight_seed).session_id)
     with _progress(console) as bar:
-        task = bar.add_task(config.session.name, total=flight.duration_s, told="")
+        task = bar.add_task(config.session.name, total=flight.duration_s, detail="")
         begun_s = time.monotonic()
 
         def tell(flown_s: float, units: int, returns: int, size: int) -> None:
             mb_per_s = size / 1e6 / max(time.monotonic() - begun_s, 1e-3)
-            told = f"{flown_s:.0f} of {flight.duration_s:.0f} s flown, {units:,} units, {returns:,} returns"
-            bar.update(task, completed=flown_s, told=f"{told}, {mb_per_s:.1f} MB/s")
+            detail = f"{flown_s:.0f} of {flight.duration_s:.0f} s flown, {units:,} units, {returns:,} returns"
+            bar.update(task, completed=flown_s, detail=f"{detail}, {mb_per_s:.1f} MB/s")
 
         report = fly_into_log(config, folder.work, flight, flight_seed, tell)
     with console.status("packing the truth"):
@@ -202,7 +217,7 @@ def _make_log(
 def _progress(console: Console) -> Progress:
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TextColumn("{task.fields[told]}"))
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TextColumn("{task.fields[detail]}"))
     return Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
 
 
@@ -221,7 +236,7 @@ def _print_flown(report: SimReport, took_s: float, logs: list[Path], names: list
 
 def _fly_on_wires(
     console: Console,
-    wish: FlightOptions,
+    options: FlightOptions,
     folder: Path | None,
     config_path: Path | None,
     wait_s: float,
@@ -234,13 +249,13 @@ def _fly_on_wires(
     from swath.daemon.simulate.on_wires import check_steps, open_wires
     from swath.daemon.simulate.plans import make_flight_in_time
 
-    plan = wish.load()
+    plan = options.load()
     config = load_config(config_path) if config_path is not None else None
-    ahead = Ahead(partial(make_flight_in_time, wish))
+    ahead = Ahead(partial(make_flight_in_time, options))
     stop: list[int] = []
     before = {signum: signal.getsignal(signum) for signum in (signal.SIGINT, signal.SIGTERM)}
     try:
-        with console.status("getting ready"):
+        with console.status("preparing the flight"):
             facts = ahead.facts
         check_steps(facts, set_clock=set_clock)
         if config_path is None or config is None:
@@ -278,21 +293,21 @@ def _make_wires(console: Console, plan: Any, facts: FlightFacts, folder: Path | 
     files = facts.files | {CONFIG_NAME: configuration(plan, own_wires(place, facts.sources, baud), LOGS_NAME)}
     for name in (CONFIG_NAME, *facts.files):
         if (place / name).exists():
-            instead = f"fly on its wires with --config {path}, or " if name == CONFIG_NAME else ""
-            raise UserError(one_line(f"{place / name}: is there already; {instead}give another folder"), ExitCode.IO)
+            instead = f"use its wires with --config {path}, or " if name == CONFIG_NAME else ""
+            raise UserError(one_line(f"{place / name}: already exists; {instead}choose another folder"), ExitCode.IO)
     place.mkdir(parents=True, exist_ok=True)
     for name, data in files.items():
         (place / name).write_bytes(data)
-    console.print(f"the flight's wires are in {place}; record it in another terminal:\n\n  swath run {path}\n")
+    console.print(f"the wires of the flight are in {place}; record it in another terminal:\n\n  swath run {path}\n")
     return path
 
 
 def _await_readers(console: Console, outputs: Mapping[str, Output], wait_s: float, stopped: Callable[[], bool]) -> None:
     from swath.daemon.replay.wire_player import wait_for_readers
 
-    with console.status("waiting for somebody to open the ports"):
+    with console.status("waiting for a reader to open the ports"):
         for source in wait_for_readers(outputs, wait_s, stopped):
-            console.print(f"{source}: nobody has opened it; flying all the same")
+            console.print(f"{source}: no reader has opened it; flying without one")
         settled_s = time.monotonic() + SETTLE_S
         while time.monotonic() < settled_s and not stopped():
             time.sleep(0.05)
@@ -310,12 +325,12 @@ def _play(
 
     with _progress(console) as bar:
         duration_s = ahead.facts.duration_s
-        task = bar.add_task(name, total=duration_s, told="")
+        task = bar.add_task(name, total=duration_s, detail="")
 
         def tell(flown_s: float, report: PlayReport) -> None:
-            told = f"{flown_s:.0f} of {duration_s:.0f} s flown, {report.units.total():,} units"
-            told += f", {report.bytes.total() / 1e6:.1f} MB, latest {1e3 * report.latest_s:.0f} ms late"
-            bar.update(task, completed=flown_s, told=told)
+            detail = f"{flown_s:.0f} of {duration_s:.0f} s flown, {report.units.total():,} units"
+            detail += f", {report.bytes.total() / 1e6:.1f} MB, delay up to {1e3 * report.latest_s:.0f} ms"
+            bar.update(task, completed=flown_s, detail=detail)
 
         return fly_on_wires(ahead.units(), ahead.facts, outputs, others, progress=tell, stopped=stopped)
 
@@ -324,13 +339,13 @@ def _tell_report(
     console: Console, report: PlayReport, facts: FlightFacts, outputs: Mapping[str, Output], config: Path
 ) -> None:
     for source in sorted(report.passed_over):
-        console.print(f"{source}: in the flight, not in {config}; not flown")
+        console.print(f"{source}: is in the flight but not in {config}; not sent")
     for source in sorted(outputs):
         if source not in facts.sources:
-            console.print(f"{source}: in {config}, not in the flight")
+            console.print(f"{source}: is in {config} but not in the flight")
             continue
-        refused = f", {report.refused[source]:,} refused by a reader" if report.refused[source] else ""
+        refused = f", {report.refused[source]:,} rejected by a reader" if report.refused[source] else ""
         console.print(f"{source}: {report.units[source]:,} units, {report.bytes[source]:,} bytes{refused}")
     slow = report.latest_s > LATE_S and not report.refused  # otherwise it may have waited for a reader
-    remark = "; this computer is too slow for this flight in real time" if slow else ""
-    console.print(f"the latest unit left {report.latest_s:.3f} s after its time{remark}")
+    remark = "; this computer is too slow to fly this plan in real time" if slow else ""
+    console.print(f"largest delay of a unit: {report.latest_s:.3f} s{remark}")

@@ -25,57 +25,74 @@ LEVELS = ("QL0", "QL1", "QL2", "QL3")
 def command(
     paths: Annotated[
         list[Path],
-        typer.Argument(help="A folder of swath georef, LAS or LAZ files, or logs.", metavar="DIR|LOG…", readable=False),
+        typer.Argument(help="Folder of swath georef, LAS or LAZ files, or logs.", metavar="DIR|LOG…", readable=False),
     ],
     before: Annotated[
         list[Path] | None,
-        typer.Option(metavar="DIR|LOG", help="The same strips before, to compare with; may be repeated."),
+        typer.Option(metavar="DIR|LOG", help="An earlier version of the same strips, to compare with; repeatable."),
     ] = None,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", metavar="DIR", help="Difference maps and strips.json.")
+        Path | None, typer.Option("--output", "-o", metavar="DIR", help="Folder for difference maps and strips.json.")
     ] = None,
-    level: Annotated[str | None, typer.Option(help="QL0, QL1, QL2 or QL3, which the strips must keep.")] = None,
-    cells: Annotated[int, typer.Option(help="Of the overlap, that are looked into.", min=100)] = 20_000,
+    level: Annotated[
+        str | None, typer.Option(help="Quality level that the strips must meet: QL0, QL1, QL2 or QL3.")
+    ] = None,
+    cells: Annotated[int, typer.Option(help="Number of cells of the overlap to examine.", min=100)] = 20_000,
     cell: Annotated[
         float | None,
-        typer.Option("--cell", metavar="METRES", help="Side of a cell; default: by the thinnest strip's density."),
+        typer.Option(
+            "--cell", metavar="METRES", help="Side of a cell; default: from the density of the sparsest strip."
+        ),
     ] = None,
     trajectory: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Of logs: SBET, Waypoint text or CSV; default: their IMU and GNSS."),
+        typer.Option(
+            metavar="FILE", help="For logs: SBET, Waypoint text or CSV; default: computed from their IMU and GNSS."
+        ),
     ] = None,
     at: TrajectoryPoint = "body",
     week: Annotated[
-        int | None, typer.Option(help="GPS week of a trajectory or of points that say none.", min=0)
+        int | None, typer.Option(help="GPS week, if the trajectory or the point files hold none.", min=0)
     ] = None,
     calibration: Annotated[
-        list[str] | None, typer.Option(metavar="[SCANNER=]FILE", help="Of logs: instead of their own.")
+        list[str] | None,
+        typer.Option(metavar="[SCANNER=]FILE", help="For logs: use this calibration instead of their own."),
     ] = None,
     datum: TrajectoryDatum = None,
-    config: Annotated[Path | None, typer.Option(metavar="FILE", help="Of logs: instead of their own.")] = None,
-    strips: Annotated[str, typer.Option(help="Of logs: auto, whole, or a CSV of times.")] = "auto",
+    config: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="For logs: configuration; default: their own.")
+    ] = None,
+    strips: Annotated[
+        str, typer.Option(help="For logs: how to divide the flight: auto, whole, or a CSV of times.")
+    ] = "auto",
     adjust: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Correct each strip's trajectory, the calibration held.")
+        Path | None,
+        typer.Option(
+            metavar="DIR", help="Correct the trajectory of each strip with a fixed calibration; write to DIR."
+        ),
     ] = None,
     control: Annotated[
-        Path | None, typer.Option(metavar="CSV", help="To adjust to: name,lat_deg,lon_deg,h_ellipsoidal_m,sigma_m")
+        Path | None,
+        typer.Option(metavar="CSV", help="Control points for --adjust: name,lat_deg,lon_deg,h_ellipsoidal_m,sigma_m"),
     ] = None,
     strip_model: Annotated[
-        str, typer.Option("--strip-model", help="none, constant, linear, spline, or auto: chosen for each strip.")
+        str,
+        typer.Option(
+            "--strip-model", help="Correction for --adjust: none, constant, linear, spline, or auto (chosen per strip)."
+        ),
     ] = "auto",
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what an adjustment left there.")] = False,
-    workers: Annotated[int | None, typer.Option(help="Processes; default: one a processor.", min=1)] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files of an earlier adjustment.")] = False,
+    workers: Annotated[int | None, typer.Option(help="Number of processes; default: one per processor.", min=1)] = None,
     force_trajectory: ForceTrajectory = False,
     accept_verdict: AcceptVerdict = False,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object, for scripts.")] = False,
 ) -> None:
-    """Compare strips: point to plane and gridded, what the differences look like, and what specifications say.
+    """Compare overlapping strips, point to plane and gridded; find the pattern of the differences and judge them.
 
-    With --adjust: correct the trajectory of each strip instead, into files for swath georef --trajectory.
+    With --adjust, correct the trajectory of each strip instead and write files for swath georef --trajectory.
 
-    Exit code 1 when the differences show an error of the calibration that matters, when the level asked for is not
-    kept, when strips are too far apart to tell why, when there are too few cells for a verdict, or when nothing could
-    be compared; 2 and 3 as ever.
+    Exit code 1 when the differences show a significant calibration error, when --level is not met, when strips are
+    too far apart to find the cause, when there are too few cells for a verdict, or when no strips could be compared.
     """
     require_installed("swath strips", *(["matplotlib"] if output else []))
     from swath.daemon.cli.georef import calibrations_given
@@ -107,7 +124,7 @@ def command(
         return
     if control or overwrite or strip_model != "auto":
         named = "--control" if control else "--overwrite" if overwrite else "--strip-model"
-        raise UserError(f"{named}: is of an adjustment; want --adjust DIR too", ExitCode.USAGE)
+        raise UserError(f"{named} needs --adjust DIR, because only an adjustment uses it", ExitCode.USAGE)
     _compare(logs, before or (), (cells, cell), output, level, as_json=as_json)
 
 
@@ -123,9 +140,9 @@ def _compare(
     from swath.daemon.cli.progress import progress_bar
     from swath.daemon.processing.strips.compare import StripsOptions, compare_strips, rules_of
 
-    wish = StripsOptions(logs.logs, logs, before, rules_of(*cells), output, level)
+    request = StripsOptions(logs.logs, logs, before, rules_of(*cells), output, level)
     with tempfile.TemporaryDirectory(prefix="swath-") as folder, progress_bar() as tell:
-        done = compare_strips(wish, Path(folder), tell)
+        done = compare_strips(request, Path(folder), tell)
     print(json.dumps(done.record, indent=2) if as_json else "\n".join(map(one_line, done.lines)))
     if done.problem:
         raise UserError(done.problem)
@@ -139,15 +156,15 @@ def _adjust(
     from swath.daemon.processing.strips.adjust import AdjustOptions, correct_strips
     from swath.daemon.processing.strips.adjust_products import write_adjustment
 
-    wish = AdjustOptions(logs, folder, control, strip_model, overwrite)
+    request = AdjustOptions(logs, folder, control, strip_model, overwrite)
     with tempfile.TemporaryDirectory(prefix="swath-") as returns, progress_bar() as tell:
-        told = write_adjustment(wish, correct_strips(wish, Path(returns), tell), tell)
-    print(json.dumps(told.record, indent=2) if as_json else "\n".join(map(one_line, told.lines)))
-    if line := refusal(told.record["verdict"]):
+        products = write_adjustment(request, correct_strips(request, Path(returns), tell), tell)
+    print(json.dumps(products.record, indent=2) if as_json else "\n".join(map(one_line, products.lines)))
+    if line := refusal(products.record["verdict"]):
         raise UserError(line)
 
 
 def _refuse_besides(*given: tuple[str, object]) -> None:
     for option, value in given:
         if value:
-            raise UserError(f"{option}: is of a comparison; want it without --adjust", ExitCode.USAGE)
+            raise UserError(f"{option} is for a comparison; use it without --adjust", ExitCode.USAGE)

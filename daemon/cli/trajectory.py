@@ -13,47 +13,53 @@ from swath.daemon.processing.requirements import require_installed
 
 
 def command(
-    logs: Annotated[list[Path], typer.Argument(help="Logs, or directories of them.", metavar="LOG…", readable=False)],
+    logs: Annotated[list[Path], typer.Argument(help="Logs, or directories of logs.", metavar="LOG…", readable=False)],
     output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="FILE", help="FILE.sbet, FILE.out or FILE.csv; or a folder.")
+        Path,
+        typer.Option("--output", "-o", metavar="FILE", help="FILE.sbet, FILE.out or FILE.csv to write; or a folder."),
     ],
     smooth: Annotated[
-        bool, typer.Option("--smooth/--realtime", help="Forward and backward; or forward only, as in flight.")
+        bool, typer.Option("--smooth/--realtime", help="Filter forward and backward, or forward only, as in flight.")
     ] = True,
     gnss: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Post-processed positions of the antenna: RTKLIB .pos or Waypoint text."),
+        typer.Option(metavar="FILE", help="Post-processed antenna positions: RTKLIB .pos or Waypoint text."),
     ] = None,
-    week: Annotated[int | None, typer.Option(help="GPS week of such a file that says none.", min=0)] = None,
+    week: Annotated[int | None, typer.Option(help="GPS week, if the file of --gnss holds none.", min=0)] = None,
     lever_arm: Annotated[
         str | None,
         typer.Option(
-            "--lever-arm", metavar="X,Y,Z", help="Of such a file's antenna, metres from the IMU: forward, right, down."
+            "--lever-arm", metavar="X,Y,Z", help="Antenna of --gnss, from the IMU in metres: forward, right, down."
         ),
     ] = None,
-    csv: Annotated[bool, typer.Option("--csv", help="Also as CSV, with sigmas.")] = False,
+    csv: Annotated[bool, typer.Option("--csv", help="Also write the trajectory as CSV, with sigmas.")] = False,
     events: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="CSV of the event marks, each with its pose.")
+        Path | None, typer.Option(metavar="FILE", help="Write the event marks as CSV, each with its pose.")
     ] = None,
-    imu: Annotated[str | None, typer.Option(metavar="NAME", help="Of [imu.NAME]; default: the first.")] = None,
+    imu: Annotated[
+        str | None, typer.Option(metavar="NAME", help="IMU to use, NAME of [imu.NAME]; default: the first.")
+    ] = None,
     gnss_name: Annotated[
-        str | None, typer.Option("--gnss-name", metavar="NAME", help="Of [gnss.NAME]; default: the first.")
+        str | None,
+        typer.Option("--gnss-name", metavar="NAME", help="Receiver to use, NAME of [gnss.NAME]; default: the first."),
     ] = None,
     ins: Annotated[
-        str, typer.Option(metavar="HOW", help="A device's own INS: ignore, observe its attitude, or take it as-is.")
+        str,
+        typer.Option(metavar="HOW", help="The device's own INS solution: ignore, observe (its attitude), or as-is."),
     ] = "ignore",
     start: Annotated[
-        str | None, typer.Option(metavar="R,P,H", help="Roll, pitch, heading at the start, degrees; default: found.")
+        str | None,
+        typer.Option(metavar="R,P,H", help="Roll, pitch, heading at the start, in degrees; default: estimated."),
     ] = None,
-    config: Annotated[Path | None, typer.Option(metavar="FILE", help="Instead of the logs' own.")] = None,
-    no_page: Annotated[bool, typer.Option("--no-page", help="Leave the page of plots out.")] = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="The summary to stdout, for scripts.")] = False,
+    config: Annotated[Path | None, typer.Option(metavar="FILE", help="Configuration; default: the logs' own.")] = None,
+    no_page: Annotated[bool, typer.Option("--no-page", help="Do not write the page of plots.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON, for scripts.")] = False,
 ) -> None:
-    """Navigate a log: SBET (or CSV) of the body with its accuracies, a JSON summary and one page of plots.
+    """Compute the trajectory of a log: SBET (or CSV) with accuracies, a JSON summary and a page of plots.
 
-    Every fix that was read is used or counted with the reason why not. Exit code 1 when the trajectory is partial or
-    not to be used: data damaged, parts missing, inputs that do not go together; 2 and 3 when there is none.
+    Every fix is either used or counted with the reason for leaving it out. Exit code 1 when the trajectory is partial
+    or not to be used: data damaged, parts missing, inputs that contradict each other; 2 or 3 when there is none.
     """
     require_installed("swath trajectory", *([] if no_page else ["matplotlib"]))
     from swath.daemon.cli.progress import progress_bar
@@ -68,11 +74,11 @@ def command(
     arm = None if lever_arm is None else arm_of_text(lever_arm)
     if arm is not None and gnss is None:
         raise UserError(
-            "--lever-arm: is of the antenna of --gnss FILE; the log's own is gnss.….lever_arm_m", ExitCode.USAGE
+            "--lever-arm needs --gnss FILE; for the log's own receiver set gnss.<name>.lever_arm_m", ExitCode.USAGE
         )
     inputs = InputOptions(imu, gnss_name, None if config is None else load_config(config), gnss, week, arm, ins)
     attitude = None if start is None else attitude_of_text(start)
-    wish = TrajectoryRequest(
+    request = TrajectoryRequest(
         logs,
         output,
         NavigationOptions(inputs, smooth=smooth, attitude_rad=attitude, compare_noise=True),
@@ -82,7 +88,7 @@ def command(
         overwrite=overwrite,
     )
     with progress_bar() as tell:
-        report = make_trajectory(wish, tell)
+        report = make_trajectory(request, tell)
     if as_json:
         print(json.dumps(report.record, indent=2))
     else:
@@ -104,19 +110,18 @@ def _unusable(session: dict[str, Any]) -> list[str]:
 def _print(record: dict[str, Any], files: list[Path]) -> None:
     for session in record["sessions"]:
         if "ins" in session:
-            told = ", ".join(f"{count:,} {what.replace('_', ' ')}" for what, count in session["solutions"].items())
-            print(f"{one_line(session['session'])}: {session['ins']}: {told}")
+            text = ", ".join(f"{count:,} {what.replace('_', ' ')}" for what, count in session["solutions"].items())
+            print(f"{one_line(session['session'])}: {session['ins']}: {text}")
             continue
         seen = ", ".join(
             f"{count:,} {kind.replace('_', ' ')}" for kind, count in session["gnss"]["observations"].items()
         )
-        print(
-            f"{one_line(session['session'])}: {session['imu']['samples'].get('taken', 0):,} samples; observed: {seen}"
-        )
+        taken = session["imu"]["samples"].get("taken", 0)
+        print(f"{one_line(session['session'])}: {taken:,} samples; observations: {seen}")
         for what, counts in (("samples", session["imu"]["samples"]), ("GNSS", session["gnss"]["refused"])):
             left = ", ".join(f"{count:,} {why.replace('_', ' ')}" for why, count in counts.items() if why != "taken")
             if left:
-                print(f"not as they came, {what}: {left}")
+                print(f"left out or changed, {what}: {left}")
         if session["imu"]["noise_words"]:
             print(one_line(session["imu"]["noise_words"]))
         for leg in session["legs"]:
@@ -127,8 +132,8 @@ def _print(record: dict[str, Any], files: list[Path]) -> None:
     for line in record["warnings"]:
         print(f"warning: {one_line(line)}")
     if record.get("events") is not None:
-        told = ", ".join(f"{count:,} {fate}" for fate, count in record["events"].items())
-        print(f"event marks: {told or 'none in the log'}")
+        text = ", ".join(f"{count:,} {fate}" for fate, count in record["events"].items())
+        print(f"event marks: {text or 'none in the log'}")
     print(f"{'complete' if record['complete'] else 'partial'}: {', '.join(one_line(str(path)) for path in files)}")
 
 

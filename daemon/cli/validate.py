@@ -20,46 +20,56 @@ def command(
     calibration: Annotated[Path, typer.Argument(help="The calibration file.", metavar="CALIBRATION", readable=False)],
     logs: Annotated[
         list[Path] | None,
-        typer.Argument(help="Logs it was not made of, or directories of them.", metavar="LOG…", readable=False),
+        typer.Argument(
+            help="Logs that were not used for the calibration, or directories of logs.", metavar="LOG…", readable=False
+        ),
     ] = None,
     also: Annotated[
-        list[Path] | None, typer.Option(metavar="FILE", help="Calibration of another scanner of the same logs.")
+        list[Path] | None,
+        typer.Option(metavar="FILE", help="Calibration of another scanner in the same logs; repeatable."),
     ] = None,
     control: Annotated[
-        Path | None, typer.Option(metavar="CSV", help="name,lat_deg,lon_deg,h_ellipsoidal_m,sigma_m")
+        Path | None, typer.Option(metavar="CSV", help="Control points: name,lat_deg,lon_deg,h_ellipsoidal_m,sigma_m")
     ] = None,
     anew: Annotated[
-        bool, typer.Option("--anew", help="Estimate the parameters from these logs too, and compare.")
+        bool, typer.Option("--anew", help="Also estimate the parameters from these logs and compare.")
     ] = False,
     past: Annotated[
         list[Path] | None,
-        typer.Option("--history", metavar="DIR|FILE", help="Calibrations of the same installation: has it moved?"),
+        typer.Option(
+            "--history",
+            metavar="DIR|FILE",
+            help="Earlier calibrations of this installation, to detect that it moved; repeatable.",
+        ),
     ] = None,
     trajectory: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="SBET, Waypoint text or CSV; default: the logs' IMU and GNSS, navigated."),
+        typer.Option(metavar="FILE", help="SBET, Waypoint text or CSV; default: computed from the logs' IMU and GNSS."),
     ] = None,
     at: TrajectoryPoint = "body",
     week: TrajectoryWeek = None,
     datum: TrajectoryDatum = None,
-    config: Annotated[Path | None, typer.Option(metavar="FILE", help="Instead of the logs' own.")] = None,
-    strips: Annotated[str, typer.Option(help="auto, whole, or a CSV of times.")] = "auto",
+    config: Annotated[Path | None, typer.Option(metavar="FILE", help="Configuration; default: the logs' own.")] = None,
+    strips: Annotated[str, typer.Option(help="How to divide the flight: auto, whole, or a CSV of times.")] = "auto",
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", metavar="DIR", help="validation.json, history.png, records anew.")
+        Path | None,
+        typer.Option(
+            "--output", "-o", metavar="DIR", help="Folder for validation.json, history.png and updated records."
+        ),
     ] = None,
     record: Annotated[
         Path | None,
-        typer.Option(metavar="DIR|FILE", help="The calibration's record, which -o shall have with this validation."),
+        typer.Option(metavar="DIR|FILE", help="Record of the calibration; -o gets a copy with this validation added."),
     ] = None,
-    workers: Annotated[int | None, typer.Option(help="Processes; default: one a processor.", min=1)] = None,
+    workers: Annotated[int | None, typer.Option(help="Number of processes; default: one per processor.", min=1)] = None,
     force_trajectory: ForceTrajectory = False,
     accept_verdict: AcceptVerdict = False,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object, for scripts.")] = False,
 ) -> None:
-    """Validate a calibration by ISO/TS 19159-2, 6.8: six methods, each with numbers, a test and a sentence.
+    """Validate a calibration by the six methods of ISO/TS 19159-2, 6.8, each with numbers, a test and a sentence.
 
-    Exit code 1 when a test speaks against the calibration, when the boresight has moved, or when nothing, or not all
-    that was asked for, could be tested; 2 and 3 as ever.
+    Exit code 1 when a test rejects the calibration, when the boresight has moved, or when a requested test could not
+    be made.
     """
     require_installed("swath validate", *(["matplotlib"] if output else []))
     from swath.daemon.cli.progress import progress_bar
@@ -70,14 +80,19 @@ def command(
     from swath.daemon.processing.validation.run import ValidationOptions, read_file, run_validation
 
     if not logs and not past:
-        raise UserError("nothing to validate against; want LOG… or --history", ExitCode.USAGE)
+        raise UserError("nothing to validate against; give LOG… or --history", ExitCode.USAGE)
     if record is not None and not (logs and output):
-        raise UserError("--record: is written anew with what logs say; want LOG… and --output DIR", ExitCode.USAGE)
+        raise UserError(
+            "--record needs LOG… and --output DIR, because the new record holds the results from the logs",
+            ExitCode.USAGE,
+        )
     files = [calibration, *(also or [])]
     given = {read_file(path).scanner: (text_of(path, "a calibration file"), str(path)) for path in files}
     if len(given) < len(files):
-        raise UserError(f"{files[-1]}: is the second calibration of one scanner; want one a scanner", ExitCode.USAGE)
-    wish = ValidationOptions(
+        raise UserError(
+            f"{files[-1]}: a calibration of this scanner was already given; give one per scanner", ExitCode.USAGE
+        )
+    request = ValidationOptions(
         calibrations=files,
         logs=GeorefOptions(
             logs=logs or [],
@@ -96,7 +111,7 @@ def command(
         record=record,
     )
     with tempfile.TemporaryDirectory(prefix="swath-") as folder, progress_bar() as tell:
-        done = run_validation(wish, Path(folder), tell)
+        done = run_validation(request, Path(folder), tell)
     print(json.dumps(done.record, indent=2) if as_json else "\n".join(map(one_line, done.lines)))
     if done.problem:
         raise UserError(done.problem)

@@ -14,27 +14,29 @@ from swath.daemon.processing.requirements import require_installed
 
 
 def command(
-    paths: Annotated[list[Path], typer.Argument(help="LAS, LAZ or COPC files, or folders of them.", metavar="PATH…")],
+    paths: Annotated[
+        list[Path], typer.Argument(help="LAS, LAZ or COPC files, or folders of such files.", metavar="PATH…")
+    ],
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", metavar="DIR", help="Where to; else the folder `view` beside the files."),
+        typer.Option("--output", "-o", metavar="DIR", help="Folder for the page; default: `view` beside the files."),
     ] = None,
     cell: Annotated[
         float | None,
         typer.Option(
             metavar="M",
-            help="Side of a cell; else from the density of points. Strips are compared in cells as large or larger.",
+            help="Side of a cell; default: from the point density. Strips may be compared in larger cells.",
         ),
     ] = None,
     profile: Annotated[
         str | None,
-        typer.Option(metavar="X1,Y1,X2,Y2", help="The profile's ends; else across an overlap, or along a strip."),
+        typer.Option(metavar="X1,Y1,X2,Y2", help="Ends of the profile; default: across an overlap, or along a strip."),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object, for scripts.")] = False,
 ) -> None:
-    """Make maps of height, intensity, density, sigma and strip differences, a profile, and a page with all of it.
+    """Make a page with maps of height, intensity, density, sigma and strip differences, and a profile.
 
-    Exit code 4 when a file could be read in part only.
+    Exit code 4 when a file could be read only in part.
     """
     require_installed("swath view", "matplotlib")
     if cell is not None and not (math.isfinite(cell) and cell > 0.0):
@@ -83,12 +85,12 @@ def _make(
         try:
             page = make_page(look, folder, title)
         except OSError as error:
-            text = f"{folder}: cannot be written to ({error.strerror or error})"
+            text = f"{folder}: cannot write there ({error.strerror or error}); choose another folder with --output"
             raise UserError(one_line(text), ExitCode.IO) from error
     damaged = False
     for source in look.sources:
         if source.damage:
-            console.print(one_line(f"swath: {source.path}: {source.damage}; the page is of that part"))
+            console.print(one_line(f"swath: {source.path}: {source.damage}; the page shows the readable part"))
             damaged = True
     if as_json:
         print(json.dumps(finite(numbers_of(look)) | {"page": str(page)}, indent=2, allow_nan=False))

@@ -12,13 +12,14 @@ from swath.daemon.processing.requirements import require_installed
 
 def command(
     config: Annotated[
-        Path | None, typer.Argument(metavar="[CONFIG]", help="Also what this configuration needs.", readable=False)
+        Path | None,
+        typer.Argument(metavar="[CONFIG]", help="Also compile what this configuration needs.", readable=False),
     ] = None,
 ) -> None:
-    """Compile what swath live, georef and calibrate run, and keep it for later processes; says where.
+    """Compile the computing code of swath live, georef and calibrate, and store it for later runs.
 
-    It is kept in NUMBA_CACHE_DIR, else beside the program or in the user's cache. Once is enough, for as long as the
-    program and the computer stay the same.
+    The folder is NUMBA_CACHE_DIR, else beside the program or in the user's cache; it is printed. Once is enough until
+    the program or the computer changes.
     """
     require_installed("swath warm-up")
     from swath.daemon.config import load_config

@@ -67,7 +67,7 @@ def _check_pps(config: Config) -> Iterator[str]:
             continue
         device = (os.path.realpath(pps.source.partition(":")[2] or pps.source), pps.edge)
         if device in taken:
-            yield f"{taken[device]} and {key}: both are {pps.source}; one source may use a device"
+            yield f"{taken[device]} and {key}: both use {pps.source}; give each its own device or edge"
         taken.setdefault(device, key)
 
 
@@ -86,7 +86,7 @@ def _check_files(config: Config) -> Iterator[str]:
             if file_key == "dbc":
                 first_key, first_path = dbc_of.setdefault(path.name, (key, path))
                 if first_path.read_bytes() != path.read_bytes():
-                    yield f"{first_key} and {key}: two files named {path.name}; the log keeps them by name, rename one"
+                    yield f"{first_key} and {key}: two files are named {path.name}; rename one, logs store them by name"
     if config.mta.terrain:
         problem = _unreadable(config.resolve(config.mta.terrain))
         if problem:
@@ -102,12 +102,12 @@ def _unreadable(path: Path) -> str | None:
     except OSError as error:
         return error.strerror or str(error)
     except ValueError:
-        return "has a zero character in it"
+        return "contains a zero character"
 
 
 def _check_directory(config: Config) -> Iterator[str]:
     if "\0" in config.session.directory:
-        yield "session.directory: has a zero character in it; want a path"
+        yield "session.directory: contains a zero character; want a path"
 
 
 def _check_device(config: Config, kind: DeviceKind, name: str, table: DeviceTable) -> Iterator[str]:
@@ -152,7 +152,7 @@ def _check_clock(section: str, table: ScannerConfig, driver: Driver) -> Iterator
         can += ["ptp-tai", "ptp-utc", "free"]
     if table.clock not in can:
         wanted = " or ".join(f'"{one}"' for one in can)
-        yield f'{section}.clock: got "{table.clock}", which stamps of {table.protocol} cannot be; want {wanted}'
+        yield f'{section}.clock: got "{table.clock}", which {table.protocol} cannot have; want {wanted}'
 
 
 def _check_forwarding(config: Config, section: str, table: CorrectionsConfig) -> Iterator[str]:
@@ -161,9 +161,9 @@ def _check_forwarding(config: Config, section: str, table: CorrectionsConfig) ->
     kind, _, name = table.forward_to.partition(".")
     if kind != "gnss" or name not in config.gnss:
         known = ", ".join(f"gnss.{one}" for one in config.gnss) or "none"
-        yield f'{section}.forward_to: got "{table.forward_to}", want a receiver as gnss.<name>; there are: {known}'
+        yield f'{section}.forward_to: got "{table.forward_to}", want a receiver such as gnss.rover; there are: {known}'
     elif not config.gnss[name].transport.startswith("serial:"):
-        yield f"{section}.forward_to: {table.forward_to} has no serial port that could take corrections"
+        yield f"{section}.forward_to: {table.forward_to} has no serial port; choose a receiver with a serial: transport"
 
 
 def _check_needs(section: str, table: DeviceTable, driver: Driver) -> Iterator[str]:
@@ -172,7 +172,7 @@ def _check_needs(section: str, table: DeviceTable, driver: Driver) -> Iterator[s
         for part in need.split("."):
             value = getattr(value, part, None)
         if value is None:
-            yield f"{section}.{need}: missing; protocol {driver.protocol} needs it: {_described(type(table), need)}"
+            yield f"{section}.{need}: missing; {driver.protocol} needs it: {_described(type(table), need)}"
 
 
 def _described(model: type[BaseModel], key: str) -> str | None:
@@ -196,9 +196,9 @@ def _check_transport(config: Config, section: str, table: DeviceTable, driver: D
             known = ", ".join(config.gnss) or "none"
             yield f'{section}.transport: got "{table.transport}", want the name of a [gnss.<name>]; there are: {known}'
         elif spec.kind not in driver.transports:
-            yield f'{section}.transport: got "{table.transport}"; {driver.protocol} comes by: {allowed}'
+            yield f'{section}.transport: got "{table.transport}"; {driver.protocol} supports: {allowed}'
         elif spec.kind == "gnss" and config.gnss[spec.address].protocol != table.protocol:
-            wanted = f'"{config.gnss[spec.address].protocol}" as of [gnss.{spec.address}], whose stream it is in'
+            wanted = f'"{config.gnss[spec.address].protocol}" like [gnss.{spec.address}], whose stream carries it'
             yield f'{section}.protocol: got "{table.protocol}", want {wanted}'
     if isinstance(table, ScannerConfig) and table.auxiliary:
         try:
@@ -218,7 +218,7 @@ def check_antennas(section: str, table: GnssConfig) -> Iterator[str]:
     if length_m < MIN_BASELINE_M:
         yield (
             f"{section}.secondary_lever_arm_m: is {length_m:.2f} m from lever_arm_m; "
-            f"want the second antenna's place, {MIN_BASELINE_M:g} m or more away, or leave it out"
+            f"want the position of the second antenna, {MIN_BASELINE_M:g} m or more away, or remove the key"
         )
 
 
@@ -242,7 +242,7 @@ def rotation_problem(rows: list[list[float]]) -> str | None:
     if np.abs(matrix @ matrix.T - np.eye(3)).max() > ROTATION_TOLERANCE:
         return "not a rotation: its rows are not perpendicular to each other"
     if np.linalg.det(matrix) < 0.0:
-        return "not a rotation but a mirroring (determinant -1): turn the sign of one axis"
+        return "not a rotation but a reflection (determinant -1): change the sign of one axis"
     return None
 
 
@@ -353,7 +353,7 @@ def _check_header(header: Mapping[str, Any], scanner: str, table: ScannerConfig)
     for key in missing:
         yield f"calibration.{key}: missing; want text in quotes"
     if "scanner" not in missing and header["scanner"] != scanner:
-        yield f'calibration.scanner: is of scanner "{header["scanner"]}", want "{scanner}"'
+        yield f'calibration.scanner: got "{header["scanner"]}", want "{scanner}"'
     if "method" not in missing and header["method"] not in METHODS:
         yield f'calibration.method: got "{header["method"]}", want one of {", ".join(METHODS)}'
     version = header.get("conventions", CONVENTIONS_VERSION)
@@ -362,4 +362,4 @@ def _check_header(header: Mapping[str, Any], scanner: str, table: ScannerConfig)
     for key in ("model", "serial"):
         theirs, ours = header.get(f"scanner_{key}", ""), getattr(table, key)
         if theirs and ours and theirs != ours:
-            yield f'calibration.scanner_{key}: of another head: "{theirs}", the configuration says "{ours}"'
+            yield f'calibration.scanner_{key}: got "{theirs}", but {key} of the scanner is "{ours}"'

@@ -52,7 +52,7 @@ def load_config(path: str | Path) -> Config:
         text = f"{file}: {error.strerror}; give the path of a configuration file"
         raise UserError(text, ExitCode.USAGE) from error
     if len(content) > MAX_CONFIG_BYTES:
-        raise ConfigError(f"{file}: larger than {MAX_CONFIG_BYTES} bytes; want a TOML file of keys")
+        raise ConfigError(f"{file}: larger than {MAX_CONFIG_BYTES} bytes; want a TOML configuration")
     try:
         text = decoded(content)
     except UnicodeDecodeError as error:
@@ -103,7 +103,7 @@ def describe(details: ErrorDetails, tables: type[BaseModel] = Tables) -> str:
     kind, context = details["type"], details.get("ctx", {})
     key = _key_path(location)
     if details["loc"][-1:] == ("[key]",):
-        return f"{key}: a name becomes a topic; want 1 to 64 of A-Z a-z 0-9 _ -"
+        return f"{key}: invalid name; want 1 to 64 characters of A-Z a-z 0-9 _ -"
     if kind == "extra_forbidden":
         return f"{key}: unknown key; {_suggestion(location, tables)}"
     field = _walk(location, tables)[1]
@@ -161,7 +161,7 @@ def _wanted_of_pattern(pattern: str) -> str:
         return "MESSAGE.signal of the DBC"
     if "gnss|imu" in pattern:
         return "kind/name of a source"
-    return "1 to 64 of A-Z a-z 0-9 _ -"
+    return "1 to 64 characters of A-Z a-z 0-9 _ -"
 
 
 def _wanted_of_field(field: FieldInfo | None) -> str:
@@ -170,7 +170,7 @@ def _wanted_of_field(field: FieldInfo | None) -> str:
     if field.description:
         return field.description
     model = _model_in(field.annotation)
-    return f"the table with {', '.join(model.model_fields)}" if model else "a value"
+    return f"a table with {', '.join(model.model_fields)}" if model else "a value"
 
 
 def _bounds(field: FieldInfo | None) -> str:

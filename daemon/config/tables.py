@@ -40,18 +40,18 @@ class Section(BaseModel):
 class SessionConfig(Section):
     """``[session]``: name, directory and writing of the logs."""
 
-    name: Name = Field(description="begins the name of every log")
-    directory: Text = Field("/var/lib/swath", description="where logs go; relative to this file")
+    name: Name = Field(description="first part of the name of every log")
+    directory: Text = Field("/var/lib/swath", description="folder for the logs; relative to this file")
     compression: Literal["auto", "lz4", "zstd", "none"] = Field(
-        "auto", description="compression of the chunks; auto: none for scanners, lz4 for the rest"
+        "auto", description="compression of chunks; auto: none for scanners, lz4 for the rest"
     )
-    split_size_mb: float = Field(2048.0, ge=1.0, le=1_000_000.0, description="a new part after this size")
-    split_minutes: float = Field(30.0, ge=0.01, le=1440.0, description="a new part after this time")
+    split_size_mb: float = Field(2048.0, ge=1.0, le=1_000_000.0, description="size at which a new part begins")
+    split_minutes: float = Field(30.0, ge=0.01, le=1440.0, description="duration after which a new part begins")
     fsync_s: float = Field(
-        1.0, ge=0.05, le=60.0, description="interval at which the log is synced to the disk; in any case once a second"
+        1.0, ge=0.05, le=60.0, description="interval of forced writes to the disk; never more than one second"
     )
     reserve_mb: float = Field(
-        512.0, ge=1.0, le=10_000_000.0, description="free space at which recording stops cleanly; it resumes 5 % above"
+        512.0, ge=1.0, le=10_000_000.0, description="free space below which recording stops cleanly; it resumes above"
     )
 
 
@@ -59,9 +59,12 @@ class PpsConfig(Section):
     """``[pps.<name>]``: a source of one edge per second."""
 
     source: Text = Field(description="/dev/ppsN, serial-dcd:/dev/ttyS0 or fixed:<path>")
-    edge: Literal["assert", "clear"] = Field("assert", description="which edge is the second")
+    edge: Literal["assert", "clear"] = Field("assert", description="edge that marks the second")
     delay_ns: int = Field(
-        0, ge=-500_000_000, le=500_000_000, description="cable and capture delay, subtracted from the stamp"
+        0,
+        ge=-500_000_000,
+        le=500_000_000,
+        description="cable and capture delay, which is subtracted from the time stamp",
     )
 
 
@@ -70,11 +73,11 @@ class GnssSetupConfig(Section):
 
     port: Text | None = Field(
         None,
-        description="the receiver's own name of the port that is wired to this computer: "
+        description="the receiver's name for the port that is wired to this computer: "
         "ubx: UART1, UART2, USB (absent: UART1); sbf: COM1 to COM4, USB1, USB2 (absent: COM1)",
     )
     rate_hz: Literal[1, 2, 5, 10, 20] = Field(5, description="rate of positions and velocities")
-    raw: bool = Field(True, description="whether to send raw measurements and ephemerides too, for post-processing")
+    raw: bool = Field(True, description="send raw measurements and ephemerides too, for post-processing")
 
 
 class GnssConfig(Section):
@@ -84,51 +87,51 @@ class GnssConfig(Section):
     protocol: Text = Field(description="nmea, ubx, novatel, … (`swath devices` lists them)")
     pps: Name | None = Field(None, description="name of the [pps.<name>] wired to this receiver")
     names_edge: Literal["auto", "previous", "next"] = Field(
-        "auto", description="which edge its time message names; auto: by protocol"
+        "auto", description="the edge that a time message refers to; auto: according to the protocol"
     )
-    lever_arm_m: Vector = Field(
-        default_factory=_zero_vector, description="vector from the body's origin to the antenna's phase centre, x_a^b"
-    )
+    lever_arm_m: Vector = Field(default_factory=_zero_vector, description="antenna's phase centre from the body, x_a^b")
     secondary_lever_arm_m: Vector | None = Field(
-        None, description="the same vector to the second antenna, for dual-antenna heading"
+        None, description="second antenna from the body, for dual-antenna heading"
     )
     leap_seconds: int | None = Field(
         None,
         ge=0,
         le=60,
-        description="GPS − UTC, for NMEA and until the receiver sends it; absent: the built-in table by the date",
+        description="GPS − UTC for NMEA, used until the receiver sends it; absent: built-in table, by date",
     )
     date_floor: dt.date | None = Field(
         None,
-        description="oldest date that is believed, for week numbers of ten bits; absent: 2009-01-01",
+        description="oldest accepted date, which resolves ten-bit week numbers; absent: 2009-01-01",
     )
     add_weeks: int = Field(
         0,
         ge=0,
         le=3072,
         multiple_of=1024,
-        description="weeks added to its dates: 1024 for each roll-over that its firmware is behind",
+        description="weeks added to its dates: 1024 for each week roll-over that the firmware misses",
     )
     datum: str | None = Field(
         None,
         min_length=1,
-        description='datum realisation of its positions, such as "EPSG:7912"; absent: WGS 84 of unknown realisation; '
-        '"same": that of the output',
+        description='datum realisation of its positions, such as "EPSG:7912"; absent: WGS 84, realisation unknown; '
+        '"same": as the output',
     )
-    setup: GnssSetupConfig = Field(default_factory=GnssSetupConfig, description="settings that `swath setup` sends")
+    setup: GnssSetupConfig = Field(
+        default_factory=GnssSetupConfig, description="settings that `swath setup` sends to it"
+    )
 
 
 class SignalsConfig(Section):
     """``[imu.<name>.signals]``: the signals of the DBC for each quantity, as ``MESSAGE.signal``."""
 
-    specific_force: SignalTriple | None = Field(None, description="three signals, axes of the IMU")
-    angular_rate: SignalTriple | None = Field(None, description="three signals, axes of the IMU")
-    sample_ticks: Signal | None = Field(None, description="the device's counter when the sample was taken")
+    specific_force: SignalTriple | None = Field(None, description="three signals: x, y, z in the axes of the IMU")
+    angular_rate: SignalTriple | None = Field(None, description="three signals: x, y, z in the axes of the IMU")
+    sample_ticks: Signal | None = Field(None, description="the device's counter at the time of the sample")
     pps_ticks: Signal | None = Field(None, description="the counter latched at the last PPS edge")
-    temperature: Signal | None = Field(None, description="the temperature, °C")
-    status: Signal | None = Field(None, description="the device's status word, kept with each sample")
+    temperature: Signal | None = Field(None, description="°C")
+    status: Signal | None = Field(None, description="the device's status word, stored with each sample")
     packet_counter: Signal | None = Field(
-        None, description="a counter of samples sent; samples that it skips are counted"
+        None, description="counter of the samples sent; skipped numbers are counted as losses"
     )
 
 
@@ -136,84 +139,76 @@ class NoiseConfig(Section):
     """``[imu.<name>.noise]``: noise model of the navigation filter; single keys override the grade."""
 
     grade: Literal["navigation", "tactical", "mems", "consumer"] = Field(
-        "tactical", description="grade of the unit, which gives the keys that are absent below"
+        "tactical", description="class that gives the values absent below"
     )
-    angle_random_walk_deg_per_sqrt_h: float | None = Field(
-        None, ge=0.0, le=100.0, description="angle random walk; default: the grade's"
-    )
+    angle_random_walk_deg_per_sqrt_h: float | None = Field(None, ge=0.0, le=100.0, description="default: the grade's")
     velocity_random_walk_m_per_s_per_sqrt_h: float | None = Field(
-        None, ge=0.0, le=100.0, description="velocity random walk; default: the grade's"
+        None, ge=0.0, le=100.0, description="default: the grade's"
     )
-    gyro_bias_deg_per_h: float | None = Field(
-        None, ge=0.0, le=100_000.0, description="bias of the gyroscopes; default: the grade's"
-    )
-    accel_bias_mg: float | None = Field(
-        None, ge=0.0, le=1_000.0, description="bias of the accelerometers; default: the grade's"
-    )
-    bias_correlation_h: float | None = Field(
-        None, gt=0.0, le=10_000.0, description="correlation time of the biases; default: the grade's"
-    )
-    gyro_scale_ppm: float | None = Field(
-        None, ge=0.0, le=100_000.0, description="scale error of the gyroscopes; default: the grade's"
-    )
-    accel_scale_ppm: float | None = Field(
-        None, ge=0.0, le=100_000.0, description="scale error of the accelerometers; default: the grade's"
-    )
+    gyro_bias_deg_per_h: float | None = Field(None, ge=0.0, le=100_000.0, description="default: the grade's")
+    accel_bias_mg: float | None = Field(None, ge=0.0, le=1_000.0, description="default: the grade's")
+    bias_correlation_h: float | None = Field(None, gt=0.0, le=10_000.0, description="default: the grade's")
+    gyro_scale_ppm: float | None = Field(None, ge=0.0, le=100_000.0, description="default: the grade's")
+    accel_scale_ppm: float | None = Field(None, ge=0.0, le=100_000.0, description="default: the grade's")
     misalignment_mrad: float | None = Field(
-        None,
-        ge=0.0,
-        le=100.0,
-        description="misalignment of the axes to each other; default: the grade's; 0: not estimated",
+        None, ge=0.0, le=100.0, description="misalignment between the axes; default: the grade's; 0: not estimated"
     )
 
 
 class ImuConfig(Section):
     """``[imu.<name>]``: an inertial measurement unit."""
 
-    transport: Text = Field(description="can:<interface>:<channel>?…, serial:… or gnss:<name> (inside that stream)")
+    transport: Text = Field(
+        description="can:<interface>:<channel>?…, serial:…, or gnss:<name> (inside that receiver's stream)"
+    )
     protocol: Text = Field(description="dbc, or a named profile (`swath devices` lists them)")
     dbc: Text | None = Field(None, description="the DBC file, relative to this file")
     imu_type: Text | None = Field(
-        None, description="novatel: the IMU's name as in INSCONFIG (HG1900_CA50), if its stream does not contain it"
+        None, description="novatel: IMU type as in INSCONFIG (HG1900_CA50), needed if the stream does not name it"
     )
     source_address: int | None = Field(
-        None, ge=0, le=253, description="nmea2000: the device to listen to; absent: the first that sends each PGN"
+        None,
+        ge=0,
+        le=253,
+        description="nmea2000: address of the device to use; absent: for each PGN, the first device that sends it",
     )
     ids: dict[str, int] | None = Field(
-        None, description="sbg-ellipse, xsens-mti: CAN identifiers that differ from the maker's, by message name"
+        None, description="sbg-ellipse, xsens-mti: CAN identifiers, by message name, where they differ from the maker's"
     )
-    extended_ids: bool = Field(False, description="sbg-ellipse, xsens-mti: the identifiers have 29 bits")
+    extended_ids: bool = Field(False, description="sbg-ellipse, xsens-mti: identifiers have 29 bits")
     byte_order: Literal["big", "little"] = Field(
         "big", description="xsens-mti: byte order of the numbers in a CAN frame"
     )
     pps_event: Literal["A", "B", "C", "D", "E"] | None = Field(
-        None, description="sbg-ellipse: the Sync In that PPS is wired to; its event message latches the counter"
+        None,
+        description="sbg-ellipse: the Sync In input that PPS is wired to; its event message holds the latched counter",
     )
-    rate_hz: float = Field(200.0, gt=0.0, le=100_000.0, description="nominal rate of samples")
+    rate_hz: float = Field(200.0, gt=0.0, le=100_000.0, description="nominal sample rate")
     rotation_b_imu: Matrix = Field(
         default_factory=_identity,
-        description="matrix that takes the IMU's axes to b, by rows; it also turns the attitude of the IMU's INS",
+        description="rotation from the IMU's axes to the body, by rows; also applied to the attitude of its INS",
     )
     tick_hz: float | None = Field(
         None,
         gt=0.0,
         le=1e12,
-        description="of its counters, which wrap at their signals' width; absent: 1000000; xsens-mti needs it",
+        description="rate of its counters, which wrap at their signals' width; absent: 1000000; required for xsens-mti",
     )
-    pps: Name | None = Field(None, description="name of the [pps.<name>] its latched counter follows")
+    pps: Name | None = Field(None, description="name of the [pps.<name>] that latches its counter")
     sample: Literal["mean", "instant", "increment"] = Field(
-        "mean", description="mean over the interval, instant value, or increment (delta velocity, delta angle)"
+        "mean",
+        description="meaning of a sample: mean over the interval, instant value, or increment (of velocity and angle)",
     )
     stamp: Literal["end", "middle", "start"] = Field(
-        "end", description="moment of the interval to which the stamp refers"
+        "end", description="the point of the interval that the time stamp refers to"
     )
     group: Literal["last", "first"] | None = Field(
         None,
-        description="whether the message with sample_ticks closes (last) or opens (first) a sample; "
-        "absent, for dbc: by the frames' spacing",
+        description="whether the message with sample_ticks is the last or the first one of a sample; "
+        "absent: for dbc, found from the spacing of the frames",
     )
-    signals: SignalsConfig | None = Field(None, description="the map of the DBC's signals")
-    noise: NoiseConfig = Field(default_factory=NoiseConfig, description="noise model of the navigation filter")
+    signals: SignalsConfig | None = Field(None, description="signals of the DBC file, by quantity")
+    noise: NoiseConfig = Field(default_factory=NoiseConfig, description="noise model for the navigation filter")
 
 
 _KEYS_OF_GEOMETRY = {
@@ -227,7 +222,7 @@ class GeometryConfig(Section):
     """``[scanner.<name>.geometry]``: how the beam is deflected."""
 
     type: Literal["oscillating", "polygon", "monogon", "nutating", "fibre", "risley"] | None = Field(
-        None, description="srep: the kind of deflection"
+        None, description="srep: how the beam is deflected"
     )
     facets: int | None = Field(None, ge=2, le=256, description="polygon: number of facets")
     nutation_deg: float | None = Field(
@@ -236,15 +231,14 @@ class GeometryConfig(Section):
     shaft_angle_deg: float | None = Field(
         None, gt=0.0, lt=90.0, description="nutating: angle between the mirror's shaft and the laser's beam"
     )
-    wedge_deg: Pair | None = Field(None, description="risley: angles of the two prisms")
+    wedge_deg: Pair | None = Field(None, description="risley: wedge angles of the two prisms")
     refractive_index: float | None = Field(None, gt=1.0, le=4.0, description="risley: refractive index of both prisms")
     prism_ratio: float | None = Field(
         None,
-        description="risley: turns of the second prism for each turn of the first, "
-        "whose whole turns the encoder counts",
+        description="risley: turns of the second prism per turn of the first, which the encoder counts",
     )
     file: Text | None = Field(
-        None, description="the device's own table (beam angles; ouster: its metadata, JSON), relative to this file"
+        None, description="the head's own file (beam angles; ouster: metadata as JSON), relative to this file"
     )
 
     @model_validator(mode="after")
@@ -268,7 +262,7 @@ class GimbalStage(Section):
         default_factory=_zero_vector, description="from this stage's centre to the next inner one"
     )
     source: str | None = Field(
-        None, pattern=r"^(gnss|imu|scanner)/[A-Za-z0-9_-]+$", description="a logged source of the stage's angles"
+        None, pattern=r"^(gnss|imu|scanner)/[A-Za-z0-9_-]+$", description="logged source of its angles"
     )
 
 
@@ -276,7 +270,7 @@ class GimbalConfig(Section):
     """``[scanner.<name>.gimbal]``: a stabilised or pointed mount."""
 
     stages: list[GimbalStage] = Field(
-        default_factory=list, max_length=4, description="at most 4, outermost first; none: a rigid mount"
+        default_factory=list, max_length=4, description="up to 4 stages, outermost first; empty: a rigid mount"
     )
 
 
@@ -284,39 +278,40 @@ class ScannerConfig(Section):
     """``[scanner.<name>]``: a laser scanner."""
 
     transport: Text = Field(description="udp:<address>:<port>?group=…&source=…")
-    auxiliary: Text | None = Field(None, description="the same head's position, IMU or GPS packets")
+    auxiliary: Text | None = Field(None, description="transport of the same head's position, IMU or GPS packets")
     protocol: Text = Field(description="srep, velodyne-vlp16, … (`swath devices` lists them)")
     pps: Name | None = Field(None, description="name of the [pps.<name>] wired to this head")
     clock: Literal["auto", "ptp-tai", "ptp-utc", "utc-hour", "free"] = Field(
         "auto",
-        description="origin of its stamps, if the head does not send it: 1970 in TAI or UTC (PTP), the hour of UTC "
-        "(Velodyne, locked), its own start; auto: found by their arrival",
+        description="origin of its time stamps, if the data do not tell: 1970 in TAI or UTC (PTP), the hour of UTC "
+        "(Velodyne, locked), its own start (free); auto: found from their arrival times",
     )
     model: str = Field("", description="maker's type; a calibration of another type is refused")
-    serial: str = Field("", description="serial number; a calibration of another number is refused")
+    serial: str = Field("", description="serial number; a calibration of another head is refused")
     mirror_factor: float | None = Field(
-        None, ge=-4.0, le=4.0, description="beam angle per encoder angle; srep: mandatory (2 flat mirror, 1 monogon)"
+        None, ge=-4.0, le=4.0, description="beam angle per encoder angle; required for srep (2 flat mirror, 1 monogon)"
     )
     installation: Matrix | None = Field(
-        None, description="T, b from s, rows of the matrix; mandatory for spinning heads, else identity"
+        None, description="rotation T from scanner to body axes, by rows; required for spinning heads, else identity"
     )
     calibration: Text | None = Field(None, description="calibration file, relative to this file")
     lever_arm_m: Vector = Field(
         default_factory=_zero_vector,
-        description="vector from the body's origin to the scanner, x_s^b, if no calibration file gives it",
+        description="scanner's position from the body, x_s^b, if no calibration file gives it",
     )
-    range_min_m: float = Field(0.0, ge=0.0, le=100_000.0, description="nearer returns are left out of products")
-    range_max_m: float = Field(10_000.0, gt=0.0, le=100_000.0, description="farther returns are left out of products")
-    range_sigma_m: float = Field(0.02, ge=0.0, le=100.0, description="one standard deviation of one range")
+    range_min_m: float = Field(
+        0.0, ge=0.0, le=100_000.0, description="shortest range; nearer returns are left out of products"
+    )
+    range_max_m: float = Field(
+        10_000.0, gt=0.0, le=100_000.0, description="longest range; farther returns are left out of products"
+    )
+    range_sigma_m: float = Field(0.02, ge=0.0, le=100.0, description="standard deviation of a range")
     angle_sigma_deg: float = Field(
-        0.001, ge=0.0, le=10.0, description="one standard deviation of the beam's angle along the scan"
+        0.001, ge=0.0, le=10.0, description="standard deviation of the beam's direction along the scan"
     )
-    divergence_mrad: float = Field(0.3, ge=0.0, le=100.0, description="full divergence of the beam")
+    divergence_mrad: float = Field(0.3, ge=0.0, le=100.0, description="full divergence angle of the beam")
     wavelength_nm: float | None = Field(
-        None,
-        ge=300.0,
-        le=2000.0,
-        description="wavelength of the light; absent: the maker's, or 1064 if that is unknown",
+        None, ge=300.0, le=2000.0, description="wavelength of the laser; absent: the maker's, or 1064 if unknown"
     )
     geometry: GeometryConfig | None = Field(None, description="how the beam is deflected")
     gimbal: GimbalConfig | None = Field(None, description="stages of a stabilised or pointed mount")
@@ -335,13 +330,15 @@ class CorrectionsConfig(Section):
 
     transport: Text = Field(description="serial:… or ntrip:<host>:<port>/<mountpoint>?…")
     protocol: Text = Field("rtcm3", description="rtcm3")
-    forward_to: Text | None = Field(None, description="the receiver whose serial port gets the bytes, as gnss.rover")
+    forward_to: Text | None = Field(None, description="receiver whose serial port gets the bytes, such as gnss.rover")
 
 
 class AttitudeConfig(Section):
     """``[attitude]``: the vertical that the attitude refers to."""
 
-    vertical: Literal["ellipsoid", "plumb"] = Field("ellipsoid", description="plumb needs the two keys below")
+    vertical: Literal["ellipsoid", "plumb"] = Field(
+        "ellipsoid", description="reference of the attitude; plumb needs the two keys below"
+    )
     xi_arcsec: float | None = Field(
         None, ge=-120.0, le=120.0, description="deflection of the vertical ξ, north, astronomic − geodetic"
     )
@@ -363,56 +360,58 @@ class AtmosphereConfig(Section):
     """``[atmosphere]``: the air between the scanner and the ground."""
 
     ranges: Literal["corrected", "vacuum"] = Field(
-        "corrected", description="corrected: the device corrects them; vacuum: Swath corrects them by the model below"
+        "corrected",
+        description="corrected: the device corrects its ranges; vacuum: they are corrected with the model below",
     )
-    model: Literal["standard", "measured"] = Field("standard", description="standard atmosphere, or the values below")
+    model: Literal["standard", "measured"] = Field(
+        "standard", description="standard: standard atmosphere; measured: the values below"
+    )
     temperature_c: float = Field(15.0, ge=-80.0, le=60.0, description="air temperature at height_m, for measured")
     pressure_hpa: float = Field(1013.25, ge=100.0, le=1100.0, description="air pressure at height_m, for measured")
-    humidity_percent: float = Field(50.0, ge=0.0, le=100.0, description="relative humidity, for measured")
-    height_m: float = Field(0.0, ge=-500.0, le=12_000.0, description="height at which the air was measured")
-    refraction: Literal["none", "ardc", "spherical"] = Field("none", description="model for the bending of the beam")
+    humidity_percent: float = Field(50.0, ge=0.0, le=100.0, description="relative humidity at height_m, for measured")
+    height_m: float = Field(0.0, ge=-500.0, le=12_000.0, description="height of the measurement")
+    refraction: Literal["none", "ardc", "spherical"] = Field("none", description="model of the bending of the beam")
 
 
 class MtaConfig(Section):
     """``[mta]``: several pulses in the air at the same time."""
 
     terrain: str = Field(
-        "", description="coarse terrain model, a GeoTIFF of ellipsoidal heights; empty: the zone follows by continuity"
+        "", description="coarse terrain model, GeoTIFF of ellipsoidal heights; empty: zones follow by continuity"
     )
     height_above_ground_m: float | None = Field(
         None,
         gt=0.0,
         le=12_000.0,
-        description="usual flying height, for the first zone if there is no terrain model; "
-        "zone 255 needs one of the two keys",
+        description="usual flying height, for the first zone where terrain is empty; zone 255 needs one of the two",
     )
 
 
 class ProfileConfig(Section):
     """``[profile]``: names of aircraft and installation for the records."""
 
-    aircraft: str = Field("", description="name of the aircraft")
-    installation: str = Field("", description="id of this mounting")
+    aircraft: str = Field("", description="the aircraft")
+    installation: str = Field("", description="identifier of this mounting")
 
 
 class OutputConfig(Section):
     """``[output]``: the mapping frame."""
 
     crs: str | None = Field(
-        None, min_length=1, description="any CRS that PROJ knows; if it is two-dimensional, heights are ellipsoidal"
+        None, min_length=1, description="any CRS known to PROJ; if two-dimensional, heights are ellipsoidal"
     )
-    epoch: float | None = Field(None, ge=1900.0, le=2200.0, description="coordinate epoch (year), for dynamic datums")
+    epoch: float | None = Field(
+        None, ge=1900.0, le=2200.0, description="epoch of the coordinates (year), for dynamic datums"
+    )
     datum_accuracy_m: float = Field(
-        0.05, gt=0.0, le=10.0, description="a change of datum that is less accurate than this is refused"
+        0.05, gt=0.0, le=10.0, description="accuracy required of a change of datum; less accurate ones are refused"
     )
 
 
 class WantedConfig(Section):
     """``[calibration.wanted]``: the standard deviations that a calibration has to reach."""
 
-    point_m: float | None = Field(
-        None, gt=0.0, le=100.0, description="error that the calibration may leave in points, over three axes"
-    )
+    point_m: float | None = Field(None, gt=0.0, le=100.0, description="remaining error of a point, over all three axes")
     omega_deg: float | None = Field(None, gt=0.0, le=10.0, description="boresight ω")
     phi_deg: float | None = Field(None, gt=0.0, le=10.0, description="boresight φ")
     kappa_deg: float | None = Field(None, gt=0.0, le=10.0, description="boresight κ")
@@ -426,20 +425,20 @@ class WantedConfig(Section):
 class CalibrationConfig(Section):
     """``[calibration]``: the criteria by which `swath calibrate` judges a calibration."""
 
-    wanted: WantedConfig = Field(default_factory=WantedConfig, description="accuracies that a calibration has to reach")
+    wanted: WantedConfig = Field(default_factory=WantedConfig, description="standard deviations to reach")
 
 
 class LiveConfig(Section):
     """``[live]``: size and density of the files that `swath live` writes beside the log."""
 
     live_quota_mb: float = Field(
-        4096.0, ge=1.0, le=10_000_000.0, description="disk space for live.mcap, including the one before it"
+        4096.0, ge=1.0, le=10_000_000.0, description="disk space for live.mcap, including its predecessor"
     )
     points_per_s: int = Field(
-        100_000, ge=1, le=100_000, description="most points in a second in live.mcap, for viewing; grids use all points"
+        100_000, ge=1, le=100_000, description="points written to live.mcap for display; grids use all points"
     )
     cell_m: float = Field(
-        1.0, ge=0.05, le=1000.0, description="cell size of the density grid; it doubles if the area needs more cells"
+        1.0, ge=0.05, le=1000.0, description="cell size of the density grid; doubled when the area is too large"
     )
 
 

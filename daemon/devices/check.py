@@ -168,9 +168,9 @@ class Wire:
             if self._spec.kind == "can" and self._spec.interface == "socketcan":
                 report.problems += bitrate_problems(self._spec, interface_bitrate(self._spec.channel))
             if counters.refused:
-                what = "messages or lines that nobody can read; is the adapter's speed right?"
+                what = "unreadable messages or lines; check the speed of the adapter"
                 if self._spec.kind == "udp":
-                    what = "datagrams of other senders than the configured source"
+                    what = "datagrams from senders other than the configured source"
                 report.notes.append(f"{counters.refused} {what}")
 
 
@@ -224,8 +224,8 @@ def check_directory(directory: Path, reserve_mb: float) -> Report:
     existing, permitted = nearest_there(directory)
     if not permitted:
         report.problems.append(
-            f"session.directory {directory}: user {os.geteuid()} may not enter {existing}; ask as root, or as the user "
-            f"that records, or give a directory that he may enter"
+            f"session.directory {directory}: user {os.geteuid()} may not enter {existing}; run this as root "
+            f"or as the recording user, or choose another directory"
         )
         return report
     try:
@@ -236,7 +236,9 @@ def check_directory(directory: Path, reserve_mb: float) -> Report:
     free_mb = disk_usage(existing).free / 1e6
     report.notes.append(f"{directory}: {free_mb / 1000:.1f} GB free")
     if free_mb <= reserve_mb:
-        report.problems.append(f"session.directory {directory}: {free_mb:.0f} MB free, reserve_mb is {reserve_mb:g}")
+        report.problems.append(
+            f"session.directory {directory}: {free_mb:.0f} MB free, reserve_mb is {reserve_mb:g}; free some space"
+        )
     return report
 
 
@@ -248,23 +250,23 @@ def check_pps(report: Report, edge: str, span: Span) -> None:
         edges += got
     session.close()
     if refused := session.poll_counters().refused:
-        report.notes.append(f"{refused} lines that are no edge; want 'realtime_ns sequence', both whole numbers")
+        report.notes.append(f"{refused} lines are not edges; want 'realtime_ns sequence', both whole numbers")
     report.opens, report.units = session.openings > 0, len(edges)
     report.records["edges"] = len(edges)
     if session.last_error:
-        report.problems.append(f"went away: {session.last_error}" if report.opens else session.last_error)
+        report.problems.append(f"disconnected: {session.last_error}" if report.opens else session.last_error)
     elif not edges:
         report.problems.append(
-            f"no {edge} edge in {span.seconds:g} s; is the PPS wired, and does the receiver put it out?"
+            f"no {edge} edge in {span.seconds:g} s; check the wiring and the PPS output of the receiver"
         )
     stamps = np.array([item.realtime_ns for item in edges], dtype=np.int64)
     if len(stamps) > 1:
         spacing_s = float(np.median(np.diff(stamps))) * 1e-9
         report.time = f"every {spacing_s:.4f} s"
         if abs(spacing_s - round(spacing_s)) > EDGE_SPACING_TOLERANCE_S or spacing_s < 0.5:
-            report.problems.append(f"edges are {spacing_s:.4f} s apart, want 1 s: noise, or another pulse")
+            report.problems.append(f"edges are {spacing_s:.4f} s apart, want 1 s; check for noise or another signal")
     if any(not item.kernel_stamp for item in edges):
-        report.notes.append("stamped after a wake-up, not by the kernel: tens of microseconds")
+        report.notes.append("time-stamped by this program, not by the kernel; errors of tens of microseconds")
 
 
 def _batch(source: str, block: UnitBlock) -> ChunkBatch:
@@ -278,22 +280,22 @@ def _batch(source: str, block: UnitBlock) -> ChunkBatch:
 def _wire_problems(session: Session[Any], counters: TransportCounters, report: Report, seconds: float) -> Iterable[str]:
     """Yield the faults of the wire itself."""
     if not report.opens:
-        yield session.last_error or "not opened in the time; listen longer"
+        yield session.last_error or "did not open in time; listen longer (--seconds)"
         return
     if session.last_error:
-        yield f"went away: {session.last_error}"
+        yield f"disconnected: {session.last_error}"
     if not report.bytes:
-        yield f"silent: opened, but no byte in {seconds:g} s; is it powered, wired and sending here?"
+        yield f"opened, but sent nothing in {seconds:g} s; check its power, wiring and output port"
     granted, asked = counters.receive_buffer_bytes, counters.receive_buffer_asked_bytes
     if 0 < granted < asked:
         yield (
             f"receive buffer: asked for {asked} bytes, got {granted}; "
-            f"`sysctl -w net.core.rmem_max={asked}`, for good in /etc/sysctl.d"
+            f"run `sysctl -w net.core.rmem_max={asked}` (permanently: in /etc/sysctl.d)"
         )
     if counters.lost_kernel:
         yield f"the kernel dropped {counters.lost_kernel} units"
     if counters.error_frames or counters.bus_off:
-        yield f"CAN trouble: {counters.error_frames} error frames, {counters.bus_off} times bus-off"
+        yield f"CAN errors: {counters.error_frames} error frames, {counters.bus_off} times bus-off"
 
 
 def bitrate_problems(spec: TransportSpec, actual: int | None) -> list[str]:
@@ -306,7 +308,7 @@ def bitrate_problems(spec: TransportSpec, actual: int | None) -> list[str]:
     if wanted is None or actual is None or int(wanted) == actual:
         return []
     command = f"ip link set {spec.channel} down && ip link set {spec.channel} up type can bitrate {wanted}"
-    return [f"{spec.channel} runs at {actual} bit/s, configured is {wanted}; `{command}`"]
+    return [f"{spec.channel} runs at {actual} bit/s, but {wanted} is configured; run `{command}`"]
 
 
 def _answer_problems(reading: Reading) -> list[str]:
@@ -319,7 +321,9 @@ def _answer_problems(reading: Reading) -> list[str]:
     found: list[str] = []
     if not heard.counts and entry.kind != "corrections":  # of corrections only an occasional station message is decoded
         names = ", ".join(f"{name} {count}" for name, count in counters.messages.most_common(5))
-        found.append(f"speaks {entry.protocol}, but sends nothing that is decoded ({names})")
+        found.append(
+            f"sends {entry.protocol}, but no decoded message ({names}); enable the messages that swath setup shows"
+        )
     bad = counters.bad_checksums + counters.bad_messages
     if bad > DAMAGED_SHARE * good:
         found.append(f"{bad} of {bad + good} messages damaged")
@@ -332,19 +336,21 @@ def lock_notes(entry: DeviceEntry, heard: Heard) -> list[str]:
         return []
     if heard.sees_pps:
         void = heard.time_messages and heard.valid_time is None
-        return ["the sentences at its input are void: want their receiver to have a fix"] if void else []
+        return ["the time sentences at its input are void; wait until the receiver has a fix"] if void else []
     if heard.sees_pps is not None:
-        unlocked = "it says that it is not locked to a pulse; want the receiver's PPS wired to it"
+        unlocked = "it reports that it is not locked to a pulse; wire the receiver's PPS to it"
         return [] if entry.pps is not None else [unlocked]
     clock = entry.settings.config.get("clock", "auto")
     if clock != "auto":
-        return [f'nothing tells whether it is locked; its stamps are taken as configured (clock = "{clock}")']
-    taken = "its stamps will be used only if they are found to be UTC or TAI by their arrival, or clock says so"
+        return [
+            f'its data do not tell whether it is locked; its time stamps are used as configured (clock = "{clock}")'
+        ]
+    taken = "its time stamps are used only if their arrival shows that they are UTC or TAI, or if clock sets it"
     if TimeMessage not in find_driver(entry.kind, entry.protocol).yields:
-        return [f"nothing tells whether its clock is set by PTP or a pulse; {taken}"]
-    port = "none came at auxiliary" if entry.auxiliary is not None else "want auxiliary"
+        return [f"its data do not tell whether PTP or a pulse sets its clock; {taken}"]
+    port = "none arrived at auxiliary" if entry.auxiliary is not None else "set auxiliary"
     ports = "Velodyne port 8308, Hesai 10110"
-    return [f"no position packet ({ports}) tells whether it is locked to its PPS: {port}; without, {taken}"]
+    return [f"no position packet ({ports}) shows whether it is locked to its PPS ({port}); without it, {taken}"]
 
 
 def far_notes(heard: Heard, discipline: ClockDiscipline) -> list[str]:
@@ -365,11 +371,11 @@ def _time_problems(entry: DeviceEntry, heard: Heard) -> list[str]:
     """
     if entry.kind == "gnss":
         if heard.time_messages == 0:
-            return ["no time message: the clock cannot be set by it; switch one on"]
-        return [] if heard.valid_time is not None else ["its time is not valid (yet)"]
+            return ["sends no time message, so it cannot set the clock; enable one"]
+        return [] if heard.valid_time is not None else ["its time is not valid yet"]
     rate = heard.imu_clock_rate
     if entry.kind == "imu" and rate is not None and not 1.0 / CLOCK_RATE_FACTOR < rate < CLOCK_RATE_FACTOR:
-        return [f"its counter runs {rate:.3g} times as fast as time: is tick_hz right?"]
+        return [f"its counter runs {rate:.3g} times as fast as time; check tick_hz"]
     if entry.pps is not None and heard.sees_pps is False:
         return [f"does not see its PPS ({entry.pps})"]
     return []

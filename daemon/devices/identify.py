@@ -150,11 +150,11 @@ def not_understood(
         return None
     other = identify(entry, kept, than=messages)
     if other is not None:
-        return f"answers as {other}, configured as {entry.protocol}"
+        return f"sends {other}, but {entry.protocol} is configured"
     if messages:
         return None
-    hint = "; is the baud rate right?" if entry.transport.kind == "serial" else ""
-    return f"nothing of it is {entry.protocol} nor any other {entry.kind} protocol known{hint}"
+    hint = "; check the baud rate" if entry.transport.kind == "serial" else ""
+    return f"its data are neither {entry.protocol} nor another known {entry.kind} protocol{hint}"
 
 
 def _default_settings(entry: DeviceEntry, protocol: str) -> DeviceSettings:

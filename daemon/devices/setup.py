@@ -195,12 +195,12 @@ def _change_rate(wires: dict[str, WireSetup], present_baud: int) -> None:
     ]
     if len(changing) != 1:
         names = ", ".join(source for source, _ in changing)
-        found = f"there are: {names}; choose one with --device" if changing else "none has one that can be set"
-        raise UserError(f"--from-baud is for one serial device with ?baud=…; {found}", ExitCode.USAGE)
+        found = f"there are: {names}; choose one with --device" if changing else "no device has a baud rate to set"
+        raise UserError(f"--from-baud needs exactly one serial device with ?baud=…; {found}", ExitCode.USAGE)
     changing[0][1].present_baud = present_baud
 
 
-def _add_device(wire: WireSetup, entry: DeviceEntry, carrier: DeviceEntry, wish: StartupOptions) -> None:
+def _add_device(wire: WireSetup, entry: DeviceEntry, carrier: DeviceEntry, options: StartupOptions) -> None:
     device = DeviceSetup(entry.source, entry.protocol, entry.transport.text)
     wire.devices.append(device)
     startup = find_driver(entry.kind, entry.protocol).startup
@@ -211,7 +211,7 @@ def _add_device(wire: WireSetup, entry: DeviceEntry, carrier: DeviceEntry, wish:
         setup = carrier.settings.config.get("setup")
         settings = DeviceSettings(settings.source, {**settings.config, "setup": setup}, settings.files)
     known = {step.message.data for step in wire.steps()}
-    device.steps = [Step(message) for message in startup(settings, wish) if message.data not in known]
+    device.steps = [Step(message) for message in startup(settings, options) if message.data not in known]
     device.problem = _why_not_sent(wire.spec)
 
 
@@ -222,8 +222,8 @@ def _why_not_sent(spec: TransportSpec) -> str:
     """
     if spec.kind == "serial" or (spec.kind == "udp" and "source" in spec.options and "group" not in spec.options):
         return ""
-    hint = "; say ?source=<its address>, and no group" if spec.kind == "udp" else ""
-    return f"nothing can be sent by {spec.text}{hint}"
+    hint = "; add ?source=<its address> and remove group" if spec.kind == "udp" else ""
+    return f"{spec.text} cannot send{hint}"
 
 
 def _at_baud(spec: TransportSpec, baud: int) -> TransportSpec:
@@ -248,7 +248,7 @@ def apply_setup(wire: WireSetup, timeout_s: float) -> None:
 def _send_all(line: Line, steps: list[Step], timeout_s: float) -> None:
     for step in steps:
         if step.message.last and not _all_accepted(steps):
-            step.outcome, step.answer = Outcome.NOT_SENT, "not everything was accepted"
+            step.outcome, step.answer = Outcome.NOT_SENT, "the device did not accept every message"
             continue
         step.outcome = Outcome.NO_ANSWER  # kept if no answer arrives
         answer = line.ask(step.message, timeout_s)

@@ -93,7 +93,13 @@ def _disk(tree: Tree, config: Config | None, specs: list[TransportSpec], write: 
     yield from disk.room(free, reserve, rate)
     sign = read_sign(directory)
     if not write or (sign is not None and is_being_written(sign.path)) or free < reserve + 2 * disk.TEST_BYTES:
-        why = "a recorder is at work there" if sign is not None else "no room to try" if write else "as asked"
+        why = (
+            "a recorder is running there"
+            if sign is not None
+            else "not enough free space"
+            if write
+            else "switched off by --no-write"
+        )
         yield Finding("disk speed", Verdict.NOTE, f"not measured: {why}")
         return
     try:

@@ -26,7 +26,7 @@ def keepers(tree: Tree, discipline: ClockDiscipline) -> Iterator[Finding]:
     check = "wall clock"
     found = sorted(KEEPERS[name] for name in tree.processes() & set(KEEPERS))
     if len(found) > 1:
-        text = f"{' and '.join(found)} both keep the clock, against each other"
+        text = f"{' and '.join(found)} both set the clock and disturb each other"
         yield Finding(check, Verdict.WRONG, text, f"sudo systemctl disable --now {found[-1]}")
     for name in found:
         if name in STEPPERS:
@@ -34,13 +34,14 @@ def keepers(tree: Tree, discipline: ClockDiscipline) -> Iterator[Finding]:
     if "chrony" in found:
         yield from chrony_steps(tree)
     if not discipline.disciplined:
-        nobody = "nobody keeps it" if not found else f"{found[0]} has not got it right (yet)"
-        text = f"{nobody}: it cannot help to tell the second of a PPS, and may be stepped once somebody does"
+        reason = "no program sets the clock" if not found else f"{found[0]} has not synchronised the clock yet"
+        text = f"{reason}: it cannot name the second of a PPS edge, and it may be stepped later"
         yield Finding(check, Verdict.NOTE, text, _CHRONY if not found else "chronyc tracking; chronyc sources")
     elif not found:
-        yield Finding(check, Verdict.OK, f"kept to {discipline.max_error_s * 1e3:.1f} ms, by whom is not to be seen")
+        text = f"accurate to {discipline.max_error_s * 1e3:.1f} ms; the program that sets it is unknown"
+        yield Finding(check, Verdict.OK, text)
     else:
-        yield Finding(check, Verdict.OK, f"{found[0]} keeps it to {discipline.max_error_s * 1e3:.1f} ms")
+        yield Finding(check, Verdict.OK, f"{found[0]} keeps it accurate to {discipline.max_error_s * 1e3:.1f} ms")
 
 
 def chrony_steps(tree: Tree) -> Iterator[Finding]:
@@ -48,8 +49,8 @@ def chrony_steps(tree: Tree) -> Iterator[Finding]:
 
     The last ``makestep`` line is the one that chrony obeys.
     """
-    said = [(file, words) for file, words in _chrony_lines(tree) if words[0].lower() == "makestep"]
-    file, words = said[-1] if said else ("", [])
+    makesteps = [(file, words) for file, words in _chrony_lines(tree) if words[0].lower() == "makestep"]
+    file, words = makesteps[-1] if makesteps else ("", [])
     if len(words) > 2 and words[2].startswith("-"):
         text = f"{file} lets chrony step the clock at any time (makestep … -1)"
         anew = f"sudo sed -Ei 's/^\\s*makestep\\s.*/makestep 1 3/I' {shlex.quote(file)}"
@@ -109,12 +110,11 @@ def movement(step_ns: int, slew_ppm: float) -> Iterator[Finding]:
     """
     check = "clock movement"
     if abs(step_ns) > STEP_NOTICED_NS:
-        text = f"the wall clock was stepped by {step_ns * 1e-9:+.6f} s while it was watched"
-        yield Finding(
-            check, Verdict.WRONG, text, "end what sets the clock: ps aux | grep -E 'ntp|chrony|timesync|gpsd'"
-        )
+        text = f"the wall clock was stepped by {step_ns * 1e-9:+.6f} s during the check"
+        mend = "stop the program that sets the clock: ps aux | grep -E 'ntp|chrony|timesync|gpsd'"
+        yield Finding(check, Verdict.WRONG, text, mend)
     elif abs(slew_ppm) > SLEWED_PPM:
-        text = f"the clock is being turned by {slew_ppm:+.0f} ppm; wait until it is right before a flight"
+        text = f"the clock is being slewed by {slew_ppm:+.0f} ppm; wait until it is correct before a flight"
         yield Finding(check, Verdict.NOTE, text, "chronyc tracking")
     else:
         yield Finding(check, Verdict.OK, f"no step, {slew_ppm:+.1f} ppm against its oscillator")

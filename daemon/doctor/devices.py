@@ -71,28 +71,30 @@ def device_file(tree: Tree, path: str, user: User) -> Iterator[Finding]:
     try:
         status = tree.at(path).stat()
     except OSError:
-        yield Finding(check, Verdict.WRONG, f"{path} is not there", f"ls -l {Path(path).parent} /dev/serial/by-id")
+        yield Finding(check, Verdict.WRONG, f"{path} does not exist", f"ls -l {Path(path).parent} /dev/serial/by-id")
         return
     if user.may(status, 6):
         yield Finding(check, Verdict.OK, f"{user.name} may read and write {path}")
         return
     group, mode = group_name(tree, status.st_gid), stat.filemode(status.st_mode)
     text = f"{user.name} may not read and write {path} ({mode}, group {group})"
-    mend = f"sudo chgrp dialout {path} && sudo chmod g+rw {path}  # for good: a udev rule as in 90-swath.rules"
+    mend = f"sudo chgrp dialout {path} && sudo chmod g+rw {path}  # permanently: a udev rule as in 90-swath.rules"
     if status.st_mode & 0o060 == 0o060 and status.st_gid != 0:
-        mend = f"sudo usermod -aG {group} {user.name}  # then restart the service, or log in anew"
+        mend = f"sudo usermod -aG {group} {user.name}  # then restart the service, or log in again"
     yield Finding(check, Verdict.WRONG, text, mend)
 
 
 def device_policy(tree: Tree, path: str) -> Iterator[Finding]:
     """Check that the systemd unit lets the service open this class of devices (DeviceAllow)."""
     files = [tree.at(_UNIT), *sorted(tree.at("/etc/systemd/system/swathd.service.d").glob("*.conf"))]
-    said = [value for file in files for value in re.findall(r"^DeviceAllow=(\S+)", read_text(file) or "", re.MULTILINE)]
-    if not said or path in said:
+    allowed = [
+        value for file in files for value in re.findall(r"^DeviceAllow=(\S+)", read_text(file) or "", re.MULTILINE)
+    ]
+    if not allowed or path in allowed:
         return
     kind = re.sub(r"\d+$", "", tree.at(path).resolve().name)
-    if f"char-{kind}" not in said:
-        text = f"swathd.service is not allowed devices of the class char-{kind} ({path})"
+    if f"char-{kind}" not in allowed:
+        text = f"swathd.service may not open devices of the class char-{kind} ({path})"
         mend = f"sudo systemctl edit swathd  # [Service] DeviceAllow=char-{kind} rw"
         yield Finding("devices", Verdict.WRONG, text, mend)
 
@@ -101,13 +103,13 @@ def serial_port(tree: Tree, path: str) -> Iterator[Finding]:
     """Check a serial port for the kernel's console and for an adapter that holds bytes back."""
     name = tree.at(path).resolve().name
     if name in (tree.read("/sys/class/tty/console/active") or "").split():
-        text = f"{path} is the kernel's console: its messages are mixed into the device's"
+        text = f"{path} is the kernel's console: kernel messages mix with the data of the device"
         mend = f"remove console={name} from the kernel's command line; sudo systemctl disable --now serial-getty@{name}"
         yield Finding("serial ports", Verdict.WRONG, text, mend)
     latency = tree.number(f"/sys/bus/usb-serial/devices/{name}/latency_timer")
     if latency is not None and latency > SERIAL_LATENCY_MS:
-        text = f"the adapter of {path} holds bytes back for {latency} ms: times of messages are late by as much"
-        mend = f"echo 1 | sudo tee /sys/bus/usb-serial/devices/{name}/latency_timer  # for good: 90-swath.rules"
+        text = f"the adapter of {path} delays bytes by {latency} ms, and so the times of messages"
+        mend = f"echo 1 | sudo tee /sys/bus/usb-serial/devices/{name}/latency_timer  # permanently: 90-swath.rules"
         yield Finding("serial ports", Verdict.NOTE, text, mend)
 
 
@@ -115,7 +117,7 @@ def port_grabbers(tree: Tree) -> Iterator[Finding]:
     """Check for running programs that open any serial port they find."""
     for name, unit in (("ModemManager", "ModemManager"), ("brltty", "brltty"), ("gpsd", "gpsd.socket gpsd")):
         if name in tree.processes():
-            text = f"{name} runs: it opens serial ports and talks to receivers, in the middle of a flight too"
+            text = f"{name} is running: it opens serial ports and writes to receivers, even during a flight"
             yield Finding("serial ports", Verdict.WRONG, text, f"sudo systemctl disable --now {unit}")
 
 
@@ -130,18 +132,18 @@ def pps_device(tree: Tree, path: str, edge: str, now_s: float | None = None) -> 
     folder = tree.at("/sys/class/pps") / tree.at(path).resolve().name
     if not folder.exists():
         mend = (
-            "sudo systemctl start swath-pps@ttyS0  # the port's; for good: a udev rule as in 90-swath.rules; "
-            "or: sudo modprobe pps-gpio, with the board's overlay"
+            "sudo systemctl start swath-pps@ttyS0  # use your port; permanently: a udev rule as in 90-swath.rules; "
+            "or: sudo modprobe pps-gpio, with the overlay of the board"
         )
-        yield Finding(check, Verdict.WRONG, f"{path}: the kernel knows no such PPS source", mend)
+        yield Finding(check, Verdict.WRONG, f"{path}: the kernel has no such PPS source", mend)
         return
     if read_text(folder / "name") in TEST_PPS:
-        text = f"{path} is the kernel's test source: it is no receiver's second"
+        text = f"{path} is the kernel's test source, not the pulse of a receiver"
         yield Finding(check, Verdict.WRONG, text, "sudo modprobe -r pps-ktimer")
     last = re.match(r"(\d+\.\d+)#(\d+)", read_text(folder / edge) or "")
     age_s = None if last is None else (time.time() if now_s is None else now_s) - float(last.group(1))
     if last is None or last.group(2) == "0":
-        text = f"{path} has never seen an edge ({edge}): wiring, the receiver's settings, or the other edge?"
+        text = f"{path} has never seen an edge ({edge}); check the wiring, the receiver's settings and pps.….edge"
         yield Finding(check, Verdict.WRONG, text, f"sudo ppstest {path}")
     elif age_s is not None and abs(age_s) > EDGE_S:
         text = f"the last edge at {path} came {age_s:.0f} s ago"
@@ -163,25 +165,25 @@ def can_interface(
     set_up = f"sudo ip link set {name} up type can bitrate {wanted_bitrate or 1_000_000} restart-ms 100"
     if not folder.exists():
         mend = "ip -details link show type can; dmesg | grep -i can"
-        yield Finding(check, Verdict.WRONG, f"there is no interface {name}", mend)
+        yield Finding(check, Verdict.WRONG, f"interface {name} does not exist", mend)
         return
     if not int(read_text(folder / "flags") or "0", 16) & _IFF_UP:
         yield Finding(check, Verdict.WRONG, f"{name} is down", set_up)
     actual = bitrate_of(name)
     if wanted_bitrate is not None and actual is not None and actual != wanted_bitrate:
-        text = f"{name} runs at {actual} bit/s, configured is {wanted_bitrate}: no frame is understood"
+        text = f"{name} runs at {actual} bit/s, but {wanted_bitrate} is configured: no frame can be received"
         yield Finding(check, Verdict.WRONG, text, f"sudo ip link set {name} down && {set_up}")
     lost = {
         key: tree.number(f"/sys/class/net/{name}/statistics/{key}") or 0 for key in ("rx_dropped", "rx_over_errors")
     }
     if any(lost.values()):
-        told = ", ".join(f"{key} {count}" for key, count in lost.items() if count)
+        counts = ", ".join(f"{key} {count}" for key, count in lost.items() if count)
         yield Finding(
-            check, Verdict.NOTE, f"{name} has lost frames since it came up: {told}", f"ip -s link show {name}"
+            check, Verdict.NOTE, f"{name} has lost frames since it came up: {counts}", f"ip -s link show {name}"
         )
     queue = tree.number(f"/sys/class/net/{name}/tx_queue_len")
     if queue is not None and queue < CAN_QUEUE_FRAMES:
-        text = f"{name} queues {queue} frames for sending: enough to record, little for swath replay"
+        text = f"the send queue of {name} holds {queue} frames: enough to record, too few for swath replay"
         yield Finding(check, Verdict.NOTE, text, f"sudo ip link set {name} txqueuelen 1000")
     if actual is not None and actual == wanted_bitrate:
         yield Finding(check, Verdict.OK, f"{name} runs at {actual} bit/s")
@@ -191,7 +193,7 @@ def network_interface(tree: Tree, name: str) -> Iterator[Finding]:
     """Check that the network interface of a scanner has a link."""
     folder = tree.at(f"/sys/class/net/{name}")
     if not folder.exists():
-        yield Finding("network", Verdict.WRONG, f"there is no interface {name}", "ip link")
+        yield Finding("network", Verdict.WRONG, f"interface {name} does not exist", "ip link")
     elif read_text(folder / "operstate") == "down":
         text = f"{name} is down, or has no link"
         yield Finding("network", Verdict.WRONG, text, f"sudo ip link set {name} up; ethtool {name} | grep Link")

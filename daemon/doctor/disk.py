@@ -59,21 +59,23 @@ def file_system(mount: Mount | None, split_bytes: float) -> Iterator[Finding]:
     if mount is None:
         return
     where = f"{mount.point} ({mount.kind} on {mount.device})"
-    move = "mount a disk of its own there, ext4 or XFS; or say another session.directory"
+    move = "mount a separate ext4 or XFS disk there, or set another session.directory"
     if "ro" in mount.options:
         yield Finding(check, Verdict.WRONG, f"{where} is mounted read-only", f"sudo mount -o remount,rw {mount.point}")
     if mount.kind in _MEMORY:
-        yield Finding(check, Verdict.WRONG, f"{where} is in memory: gone with the power", move)
+        yield Finding(check, Verdict.WRONG, f"{where} is in memory: logs are lost at power off", move)
     elif mount.kind in _NETWORK:
-        yield Finding(check, Verdict.WRONG, f"{where} is another computer's: the recording waits for the network", move)
+        yield Finding(
+            check, Verdict.WRONG, f"{where} is on another computer: recording would depend on the network", move
+        )
     elif mount.kind in _FAT:
-        text = f"{where} has no journal: a power cut may cost whole logs"
+        text = f"{where} has no journal: a power cut may destroy whole logs"
         too_large = mount.kind != "exfat" and split_bytes > FAT_FILE_BYTES
-        text += ", and a part of more than 4 GB cannot be written" if too_large else ""
+        text += ", and it cannot hold a part of more than 4 GB" if too_large else ""
         yield Finding(check, Verdict.WRONG, text, move)
     elif unsafe := [option for option in mount.options if option in _UNSAFE_OPTIONS]:
-        text = f"{where} is mounted {','.join(unsafe)}: what is said to be written may not survive a power cut"
-        yield Finding(check, Verdict.WRONG, text, f"take {','.join(unsafe)} out of /etc/fstab, then mount it anew")
+        text = f"{where} is mounted {','.join(unsafe)}: written data may not survive a power cut"
+        yield Finding(check, Verdict.WRONG, text, f"remove {','.join(unsafe)} from /etc/fstab, then mount it again")
     else:
         yield Finding(check, Verdict.OK, where)
 
@@ -83,7 +85,7 @@ def room(free_bytes: float, reserve_bytes: float, bytes_per_s: float) -> Iterato
     left_s = max(0.0, free_bytes - reserve_bytes) / bytes_per_s
     text = f"{free_bytes / 1e9:.1f} GB free, {duration_text(left_s)} at {bytes_per_s / 1e6:.1f} MB/s"
     few = left_s < LITTLE_ROOM_S
-    mend = "swath offload copies logs away and says which may be deleted" if few else ""
+    mend = "copy logs with swath offload; it names the logs that are safe to delete" if few else ""
     yield Finding("disk space", Verdict.WRONG if few else Verdict.OK, text, mend)
 
 
@@ -97,10 +99,10 @@ def writable(tree: Tree, directory: Path, user: User) -> Iterator[Finding]:
     way = [*reversed(existing.parents), *([] if permitted else [existing])]
     closed = next((path for path in way if not user.may(tree.at(path).stat(), 1)), None)
     if closed is not None:
-        mend = f"sudo chmod o+x {shlex.quote(str(closed))}  # or say another session.directory"
-        yield Finding(check, Verdict.WRONG, f"{user.name} may not enter {closed}, in which {directory} lies", mend)
+        mend = f"sudo chmod o+x {shlex.quote(str(closed))}  # or set another session.directory"
+        yield Finding(check, Verdict.WRONG, f"{user.name} may not enter {closed}, which holds {directory}", mend)
     elif not permitted:
-        text = f"not looked at: who asks may not enter {existing}, in which {directory} lies; {user.name} may"
+        text = f"not checked: this user may not enter {existing}, which holds {directory}; {user.name} may"
         yield Finding(check, Verdict.NOTE, text, "sudo swath doctor")
     elif user.may(there.stat(), 3):
         yield Finding(check, Verdict.OK, f"{user.name} may write to {existing}")
@@ -130,9 +132,9 @@ def measure(folder: Path, size: int = TEST_BYTES) -> tuple[float, float]:
 def speed(bytes_per_s: float, longest_sync_s: float, needed_bytes_per_s: float) -> Iterator[Finding]:
     """Check that the disk is fast enough for the sensors."""
     check = "disk speed"
-    told = f"writes {bytes_per_s / 1e6:.0f} MB/s, longest sync {longest_sync_s * 1e3:.0f} ms"
-    text = f"{told}; the sensors may send {needed_bytes_per_s / 1e6:.1f} MB/s"
-    mend = "another disk, or another file system; what else writes to it: sudo iotop -oa"
+    measured = f"writes {bytes_per_s / 1e6:.0f} MB/s, longest sync {longest_sync_s * 1e3:.0f} ms"
+    text = f"{measured}; the sensors may send {needed_bytes_per_s / 1e6:.1f} MB/s"
+    mend = "use another disk or file system; find other programs that write to it: sudo iotop -oa"
     if bytes_per_s < 2 * needed_bytes_per_s or longest_sync_s > SYNC_WRONG_S:
         yield Finding(check, Verdict.WRONG, text, mend)
     elif longest_sync_s > SYNC_NOTE_S:

@@ -24,19 +24,19 @@ def receive_buffers(tree: Tree, asked_bytes: int) -> Iterator[Finding]:
     """
     check = "receive buffers"
     limit = tree.number("/proc/sys/net/core/rmem_max")
-    mend = f"sudo sysctl -w net.core.rmem_max={max(RMEM_MAX_BYTES, asked_bytes)}  # for good: sysctl.d/90-swath.conf"
+    mend = f"sudo sysctl -w net.core.rmem_max={max(RMEM_MAX_BYTES, asked_bytes)}  # permanently: sysctl.d/90-swath.conf"
     if limit is None:
         yield Finding(check, Verdict.NOTE, "net.core.rmem_max cannot be read")
     elif limit < asked_bytes:
-        told = f"net.core.rmem_max is {limit}, {asked_bytes} will be asked for: bursts and stalls overflow it"
-        yield Finding(check, Verdict.WRONG, told, mend)
+        text = f"net.core.rmem_max is {limit}, but the recorder needs {asked_bytes}: bursts and stalls lose data"
+        yield Finding(check, Verdict.WRONG, text, mend)
     else:
-        yield Finding(check, Verdict.OK, f"net.core.rmem_max is {limit}, {asked_bytes} will be asked for")
+        yield Finding(check, Verdict.OK, f"net.core.rmem_max is {limit}, the recorder needs {asked_bytes}")
     fragments = tree.number("/proc/sys/net/ipv4/ipfrag_high_thresh")
     if fragments is not None and fragments < FRAGMENTS_BYTES:
-        told = f"net.ipv4.ipfrag_high_thresh is {fragments}: datagrams above the MTU may be lost whole in bursts"
-        mend = f"sudo sysctl -w net.ipv4.ipfrag_high_thresh={FRAGMENTS_BYTES}  # for good: sysctl.d/90-swath.conf"
-        yield Finding("fragments", Verdict.NOTE, told, mend)
+        text = f"net.ipv4.ipfrag_high_thresh is {fragments}: datagrams above the MTU may be lost in bursts"
+        mend = f"sudo sysctl -w net.ipv4.ipfrag_high_thresh={FRAGMENTS_BYTES}  # permanently: sysctl.d/90-swath.conf"
+        yield Finding("fragments", Verdict.NOTE, text, mend)
 
 
 def dropped_datagrams(tree: Tree) -> Iterator[Finding]:
@@ -48,8 +48,8 @@ def dropped_datagrams(tree: Tree) -> Iterator[Finding]:
         return
     dropped = int(dict(zip(lines[0], lines[1], strict=False))["RcvbufErrors"])
     if dropped:
-        text = f"{dropped} datagrams were dropped since the computer's start, of whatever program"
-        yield Finding("receive buffers", Verdict.NOTE, text, "nstat -az UdpRcvbufErrors  # does it still count up?")
+        text = f"the kernel dropped {dropped} datagrams since the computer started (of any program)"
+        yield Finding("receive buffers", Verdict.NOTE, text, "nstat -az UdpRcvbufErrors  # is the count still rising?")
 
 
 def governor(tree: Tree) -> Iterator[Finding]:
@@ -59,15 +59,15 @@ def governor(tree: Tree) -> Iterator[Finding]:
     found = {(_word(folder / "scaling_governor"), _word(folder / "scaling_driver")) for folder in folders}
     mend = "sudo cpupower frequency-set -g performance"
     if not found:
-        yield Finding(check, Verdict.OK, "the processor's frequency is not the system's to choose")
+        yield Finding(check, Verdict.OK, "the operating system does not control the processor's frequency")
     for name, driver in sorted(found):
         if name == "performance":
             yield Finding(check, Verdict.OK, name)
         elif name == "powersave" and driver not in CLOSED_LOOP_DRIVERS:
-            text = f"{name} of {driver} holds the processor at its lowest frequency: the recorder may fall behind"
+            text = f"{name} of {driver} keeps the processor at its lowest frequency: the recorder may fall behind"
             yield Finding(check, Verdict.WRONG, text, mend)
         else:
-            text = f"{name} of {driver}: the frequency follows the load, some milliseconds late"
+            text = f"{name} of {driver}: the frequency follows the load with some milliseconds of delay"
             yield Finding(check, Verdict.NOTE, text, mend)
 
 
@@ -83,11 +83,11 @@ def idle_states(tree: Tree) -> Iterator[Finding]:
         if latency.isdecimal() and int(latency) > SLOW_IDLE_US and disabled != "1":
             slow[_word(folder / "name")] = int(latency)
     if slow:
-        told = ", ".join(f"{name} {latency} µs" for name, latency in slow.items())
-        text = f"waking up takes long from {told}: edges are stamped that much late, not always alike"
+        states = ", ".join(f"{name} {latency} µs" for name, latency in slow.items())
+        text = f"waking up from {states} takes long: time stamps of edges are late by as much, and vary"
         yield Finding("PPS latency", Verdict.NOTE, text, f"sudo cpupower idle-set -D {SLOW_IDLE_US}")
     else:
-        yield Finding("PPS latency", Verdict.OK, "no sleep of the processor that an interrupt waits for")
+        yield Finding("PPS latency", Verdict.OK, "no processor sleep state delays interrupts")
 
 
 def memory(tree: Tree) -> Iterator[Finding]:
@@ -98,7 +98,7 @@ def memory(tree: Tree) -> Iterator[Finding]:
             available = int(value.split()[0]) * 1024
             enough = available >= MEMORY_BYTES
             text = f"{available / 1e6:,.0f} MB available"
-            mend = "" if enough else "end other programs; ps aux --sort=-rss | head names the largest"
+            mend = "" if enough else "stop other programs; ps aux --sort=-rss | head lists the largest"
             yield Finding("memory", Verdict.OK if enough else Verdict.WRONG, text, mend)
 
 
@@ -111,7 +111,7 @@ def modules(tree: Tree, needed: Iterable[str]) -> Iterator[Finding]:
     release = tree.read("/proc/sys/kernel/osrelease") or platform.release()
     for name in needed:
         if tree.at(f"/sys/module/{name}").exists() or name in _known(tree, release, "modules.builtin"):
-            yield Finding("kernel modules", Verdict.OK, f"{name} is there")
+            yield Finding("kernel modules", Verdict.OK, f"{name} is loaded")
             continue
         there = name in _known(tree, release, "modules.dep")
         text = f"{name} is not loaded" if there else f"{name} is not part of this kernel ({release})"

@@ -32,7 +32,7 @@ _WANTED = "want kind/name=FILE, kind/name:<CAN interface>=FILE or kind/name:<UDP
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
+class ImportOptions:
     """The options of the command line besides the files.
 
     Attributes:
@@ -47,7 +47,7 @@ class Told:
     keep_copies: bool = False
 
 
-def find_captures(routes: Routes, files: Sequence[Path], told: Told) -> list[Capture]:
+def find_captures(routes: Routes, files: Sequence[Path], options: ImportOptions) -> list[Capture]:
     """Return every file with its kind and device.
 
     Raises:
@@ -55,25 +55,25 @@ def find_captures(routes: Routes, files: Sequence[Path], told: Told) -> list[Cap
     """
     found: dict[tuple[Path, str, str | None], Capture] = {}
     wrong: list[str] = [
-        f"{source}: is no source of the configuration; there are: {', '.join(routes.ports) or 'none'}"
-        for source in dict.fromkeys([*told.start_ns, *told.baud])
+        f"{source}: is not a source of the configuration; there are: {', '.join(routes.ports) or 'none'}"
+        for source in dict.fromkeys([*options.start_ns, *options.baud])
         if source and source not in routes.ports
     ]
-    unread = 0
-    items: list[str | Path] = [*told.named, *files]
+    unreadable = 0
+    items: list[str | Path] = [*options.named, *files]
     for item in items:
         try:
             for capture in _named(routes, item) if isinstance(item, str) else _found(routes, item):
-                _settle(capture, told)
+                _settle(capture, options)
                 source = capture.port.source if capture.port is not None else ""
                 found[capture.path, source, capture.selector] = capture
         except (UserError, TransportError) as error:
             wrong.append(one_line(str(error)))
-            unread += isinstance(error, TransportError)
+            unreadable += isinstance(error, TransportError)
     if not found and not wrong:
-        wrong.append("nothing to import: give captures, or the folder of an export")
+        wrong.append("nothing to import; give captures or the folder of an export")
     if wrong:
-        raise UserError("\n".join(wrong), ExitCode.IO if unread == len(wrong) else ExitCode.USAGE)
+        raise UserError("\n".join(wrong), ExitCode.IO if unreadable == len(wrong) else ExitCode.USAGE)
     return list(found.values())
 
 
@@ -91,10 +91,10 @@ def _named(routes: Routes, text: str) -> list[Capture]:
         forms = {
             "pcap": "a pcap file",
             "candump": "a log of candump -L",
-            "serial": "its bytes",
-            "pps": "lines of edges",
+            "serial": "a file of serial bytes",
+            "pps": "a file of edges",
         }
-        raise UserError(f"{path}: is {forms[kind]}; {source} comes by {port.kind}: want {forms[wanted]}")
+        raise UserError(f"{path}: is {forms[kind]}, but {source} uses {port.kind}; want {forms[wanted]}")
     return [Capture(path, wanted, port, selector or None)]
 
 
@@ -102,7 +102,7 @@ def _port(routes: Routes, source: str, where: str) -> Port:
     port = routes.ports.get(source)
     if port is None:
         known = ", ".join(routes.ports) or "none"
-        raise UserError(f"{where}: {source} is no source of the configuration; there are: {known}")
+        raise UserError(f"{where}: {source} is not a source of the configuration; there are: {known}")
     return port
 
 
@@ -116,11 +116,11 @@ def _found(routes: Routes, path: Path) -> list[Capture]:
         if damage:
             raise TransportError(f"{path}: cannot be read: {damage}")
         if other := next((what for magic, what in _NO_CAPTURE.items() if head.startswith(magic)), ""):
-            raise UserError(f"{path}: is {other}; want pcap, candump -L or a device's bytes")
+            raise UserError(f"{path}: is {other}; want pcap, candump -L or the bytes of a device")
         if any(map(is_shown_candump, _first_lines(head))):
-            raise UserError(f"{path}: is what candump shows for people to read; want what candump -L (or -l) writes")
+            raise UserError(f"{path}: is candump's format for people; want the output of candump -L (or -l)")
         raise UserError(
-            f"{path}: neither pcap nor candump -L; if it is a device's bytes, say --source kind/name={path}"
+            f"{path}: neither pcap nor candump -L; if it holds the bytes of a device, use --source kind/name={path}"
         )
     if routes.described(kind) == "none":
         raise UserError(f"{path}: the configuration has no {'UDP port' if kind == 'pcap' else 'CAN bus'} for it")
@@ -138,20 +138,20 @@ def _first_lines(head: bytes) -> list[str]:
     return [line.strip() for line in head.decode("ascii", "replace").splitlines()[:_LOOKED_AT_LINES]]
 
 
-def _settle(capture: Capture, told: Told) -> None:
+def _settle(capture: Capture, given: ImportOptions) -> None:
     """Apply the command line's options to a file: its times, and whether copies stay."""
-    capture.keep_copies = told.keep_copies
+    capture.keep_copies = given.keep_copies
     if capture.kind != "serial" or has_times(capture.path):
         return
     assert capture.port is not None
     source, options = capture.port.source, capture.port.options
-    start_ns = told.start_ns.get(source, told.start_ns.get(""))
+    start_ns = given.start_ns.get(source, given.start_ns.get(""))
     if start_ns is None:
         raise UserError(
-            f"{capture.path}: says no times, and no {capture.path.name}.tag or table of arrivals lies beside it; "
+            f"{capture.path}: has no times, and no {capture.path.name}.tag or table of arrivals is beside it; "
             "give --start"
         )
-    baud = told.baud.get(source, told.baud.get("", float(options.get("baud", 0))))
+    baud = given.baud.get(source, given.baud.get("", float(options.get("baud", 0))))
     parity = options.get("parity", "N") != "N"
     bits = 1 + int(options.get("bytesize", 8)) + parity + float(options.get("stopbits", 1))
     capture.time = BareTime(start_ns, baud, bits)
@@ -164,7 +164,7 @@ def _of_export(routes: Routes, folder: Path) -> list[Capture]:
     """Return the files that an export's manifest names; for a folder of exports, those of all exports."""
     folders = [folder] if (folder / MANIFEST).exists() else sorted(path.parent for path in folder.glob(f"*/{MANIFEST}"))
     if not folders:
-        raise UserError(f"{folder}: is a folder without {MANIFEST}; give captures, or the folder of an export")
+        raise UserError(f"{folder}: has no {MANIFEST}; give captures or the folder of an export")
     return [_exported(routes, one, name, entry) for one in folders for name, entry in _manifest(one / MANIFEST).items()]
 
 
@@ -178,7 +178,7 @@ def _manifest(path: Path) -> dict[str, Any]:
         raise UserError(f"{path}: {error.strerror}") from error
     except (ValueError, KeyError, TypeError, RecursionError):
         pass
-    raise UserError(f"{path}: is no manifest of `swath export`")
+    raise UserError(f"{path}: is not a manifest of `swath export`; export the log again")
 
 
 def _exported(routes: Routes, folder: Path, name: str, entry: dict[str, Any]) -> Capture:
@@ -188,12 +188,12 @@ def _exported(routes: Routes, folder: Path, name: str, entry: dict[str, Any]) ->
     except LogError as error:
         raise UserError(f"{folder / MANIFEST}: names {name!r}, which is not in its folder") from error
     if not os.path.isfile(path) or name.endswith(SUFFIX):
-        raise UserError(f"{path}: {MANIFEST} names it and it is not there")
+        raise UserError(f"{path}: does not exist, but {MANIFEST} names it; copy the whole folder of the export")
     if kind == "pcap":
         return Capture(path, "pcap")
     if kind not in _KIND_OF_PORT.values() or not isinstance(source, str):
-        raise UserError(f"{folder / MANIFEST}: does not say what {name} is")
+        raise UserError(f"{folder / MANIFEST}: does not describe {name}; export the log again")
     port = _port(routes, source, str(path))
     if _KIND_OF_PORT[port.kind] != kind:
-        raise UserError(f"{path}: {source} comes by {port.kind} in this configuration, and the file is of kind {kind}")
+        raise UserError(f"{path}: is of kind {kind}, but {source} uses {port.kind} in this configuration")
     return Capture(path, kind, port)

@@ -97,13 +97,13 @@ class Capture:
     def _port_of(self, unit: CapturedUnit, routes: Routes) -> Port | None:
         if self.port is not None and self.selector is None:
             return self.port
-        told = str(unit.destination[1]) if unit.destination is not None else unit.channel
+        destination = str(unit.destination[1]) if unit.destination is not None else unit.channel
         if self.port is not None:
-            found = self.port if told == self.selector else None
+            found = self.port if destination == self.selector else None
         else:
             found = routes.of_datagram(unit) if self.kind == "pcap" else routes.of_frame(unit)
         if found is None:
-            self.passed[f"port {told}" if unit.destination is not None else told] += 1
+            self.passed[f"port {destination}" if unit.destination is not None else destination] += 1
         return found
 
     def plain(self) -> dict[str, Any]:
@@ -134,7 +134,7 @@ def _edges(path: Path, edge: str, tally: CaptureTally) -> Iterator[CapturedUnit]
     for number, line in read_lines(path, tally):
         fields = line.split()
         if len(fields) != 2 or not all(text.isdecimal() and int(text) <= LATEST_NS for text in fields):
-            tally.damaged(f"{path}: line {number} is no edge; want realtime_ns sequence")
+            tally.damaged(f"{path}: line {number} is not an edge; want realtime_ns sequence")
             continue
         time_ns, sequence = map(int, fields)
         value = {"edge_time_ns": time_ns, "sequence": sequence, "edge": edge}

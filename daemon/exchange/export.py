@@ -65,11 +65,11 @@ def export_session(session: Session, directory: Path, progress: Callable[[int], 
     """
     target = safe_attachment_path(directory, session.session_id)
     if target.parent != directory or len(os.fsencode(target.name)) > _MOST_NAME_BYTES:
-        raise LogError(f"session {session.session_id[:60]!r}: is no name of a folder; nothing is written for it")
+        raise LogError(f"session {session.session_id[:60]!r}: cannot be a folder name; this session was not exported")
     unfinished = target.with_name(target.name + _UNFINISHED)
     for path in (target, unfinished):
         if os.path.lexists(path):
-            raise UserError(f"{path}: is there already; remove it or give another directory", ExitCode.IO)
+            raise UserError(f"{path}: already exists; remove it or choose another directory", ExitCode.IO)
     directory.mkdir(parents=True, exist_ok=True)
     unfinished.mkdir()
     try:
@@ -111,7 +111,9 @@ class _Export:
         finally:
             for file in self._files.values():
                 file.close()
-        self._report.notes += [f"{topic}: {count} messages of no known kind" for topic, count in strange.items()]
+        self._report.notes += [
+            f"{topic}: {count} messages of an unknown kind, not exported" for topic, count in strange.items()
+        ]
         self._report.notes += [f"{name}: {note}" for name, file in self._files.items() for note in file.notes()]
         self._write_manifest()
         return self._report
@@ -174,9 +176,11 @@ class _Export:
         for name, data in attachments.items():
             written = [self._write_attachment(place, data) for place in reversed(places[name])]
             if not all(written[:-1]):
-                self._report.notes.append(f"config.toml names {name} elsewhere: change it before `swath import`")
+                self._report.notes.append(f"config.toml names another path for {name}; change it before `swath import`")
             if not written[-1]:
-                self._report.notes.append(f"attachment {name[:60]!r} is left out: no file can be called so here")
+                self._report.notes.append(
+                    f"attachment {name[:60]!r} is left out: its name is not a valid file name here"
+                )
 
     def _write_attachment(self, place: str, data: bytes) -> bool:
         """Write an attachment, below the folder only, and return whether the file exists now."""

@@ -117,8 +117,10 @@ def import_captures(
 
 
 def _note(log: ImportLog, capture: Capture) -> None:
-    told = ", ".join(f"{count} units of {source}" for source, count in capture.units.items()) or "no unit"
-    log.event(Severity.INFO, "capture_imported", f"{capture.path.name}: {told}")
+    counts = ", ".join(f"{count} units of {source}" for source, count in capture.units.items()) or "no units"
+    log.event(Severity.INFO, "capture_imported", f"{capture.path.name}: {counts}")
     if capture.tally.damage:
-        text = f"{capture.tally.damage} places of {capture.path.name}; the first: {capture.tally.first_damage}"
+        text = (
+            f"{capture.path.name} is damaged in {capture.tally.damage} places; the first: {capture.tally.first_damage}"
+        )
         log.event(Severity.WARNING, "capture_damaged", text)

@@ -95,8 +95,8 @@ class MadeLog:
         first_ns = info.realtime_ns
         self.clock = MadeClock(first_ns, info.monotonic_ns)
         self.channels = ChannelTable()
-        self._told = BlockQueue(0)
-        self.events = Events(self.clock, self._told, self.channels)
+        self._events_queue = BlockQueue(0)
+        self.events = Events(self.clock, self._events_queue, self.channels)
         self._author = author
         attachments = [Attachment(*attachment) for attachment in config.attachments()]
         self._parts = Parts(directory, info, self.channels, attachments, config.session.compression)
@@ -104,7 +104,7 @@ class MadeLog:
         self._split_bytes = config.session.split_size_mb * 1e6
         self._split_ns = config.session.split_minutes * 60e9
         self.sources: dict[str, Source] = {}
-        self._newest_ns = self._flushed_ns = self._told_ns = self._part_opened_ns = first_ns
+        self._newest_ns = self._flushed_ns = self._status_ns = self._part_opened_ns = first_ns
         self._behind = 0
         self.paths: list[Path] = []
         self._open_part()
@@ -148,7 +148,7 @@ class MadeLog:
 
     def lay_told(self) -> None:
         """Write the messages and events that were posted since the last call."""
-        for item in self._told.take_all():
+        for item in self._events_queue.take_all():
             if item.block is not None:
                 self._parts.add(item.block)
 
@@ -189,12 +189,12 @@ class MadeLog:
             self._behind += 1
             if self._behind < _BEHIND:
                 return
-            self._flushed_ns = self._told_ns = self._part_opened_ns = now_ns
+            self._flushed_ns = self._status_ns = self._part_opened_ns = now_ns
         self._newest_ns = now_ns if self._behind >= _BEHIND else max(now_ns, self._newest_ns)
         self._behind = 0
         if self._newest_ns - self._flushed_ns >= CHUNK_OPEN_NS:
             self._flush()
-        if self._newest_ns - self._told_ns >= STATUS_NS:
+        if self._newest_ns - self._status_ns >= STATUS_NS:
             self._tell_status()
             if self._split_due():
                 self._split()
@@ -245,9 +245,9 @@ class MadeLog:
             self._parts.add(block)
         self.lay_told()
         self._flush()
-        self._told_ns += STATUS_NS
-        if self._newest_ns - self._told_ns >= STATUS_NS:  # after a gap: one status, not one for every second of it
-            self._told_ns = self._newest_ns
+        self._status_ns += STATUS_NS
+        if self._newest_ns - self._status_ns >= STATUS_NS:  # after a gap: one status, not one for every second of it
+            self._status_ns = self._newest_ns
 
     def _split_due(self) -> bool:
         part = self._parts.current
@@ -276,4 +276,4 @@ def refuse_session(directory: Path, session_id: str) -> None:
     if directory.is_dir():
         there = next(iter(sorted(directory.glob(f"{session_id}_*.mcap"))), None)
         if there is not None:
-            raise UserError(f"{there}: is there already; remove it or give another directory", ExitCode.IO)
+            raise UserError(f"{there}: already exists; remove it or choose another directory", ExitCode.IO)

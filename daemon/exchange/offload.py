@@ -138,7 +138,7 @@ def _sums_of(destination: Path) -> ChecksumList:
     try:
         return ChecksumList(destination)
     except OSError as error:
-        text = f"{destination / NAME}: {error.strerror}; want another folder, or to be the user who copied there before"
+        text = f"{destination / NAME}: {error.strerror}; choose another folder, or run this as its owner"
         raise UserError(text, ExitCode.IO) from error
 
 
@@ -150,22 +150,26 @@ def _nothing(name: str, done: int, total: int) -> None:
 def _taken(directory: Path, destination: Path, same_disk: bool) -> Iterator[None]:
     """Check the destination and lock it against other runs for the duration of the block."""
     if not destination.is_dir():
-        raise UserError(f"{destination}: no such directory; is the disk mounted?", ExitCode.IO)
+        raise UserError(f"{destination}: no such directory; check that the disk is mounted", ExitCode.IO)
     if destination.samefile(directory):
-        raise UserError(f"{destination}: is where the logs are; give a folder on another disk", ExitCode.USAGE)
+        raise UserError(f"{destination}: is the log directory itself; choose a folder on another disk", ExitCode.USAGE)
     if not same_disk and destination.stat().st_dev == directory.stat().st_dev:
         # if the other disk is not mounted, its empty mount point looks like the disk
-        text = f"{destination}: is on the same disk as {directory}; is the other disk mounted?"
-        raise UserError(f"{text} --same-disk copies all the same", ExitCode.IO)
+        text = f"{destination}: is on the same disk as {directory}; check that the other disk is mounted"
+        raise UserError(f"{text}, or use --same-disk", ExitCode.IO)
     if not os.access(destination, os.R_OK | os.W_OK | os.X_OK):
-        raise UserError(f"{destination}: cannot be written: mounted read-only, or not permitted", ExitCode.IO)
+        raise UserError(
+            f"{destination}: cannot be written; check its permissions and that it is not mounted read-only", ExitCode.IO
+        )
     folder = os.open(destination, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         with contextlib.suppress(OSError):  # some file systems have no locks
             try:
                 fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
-                raise UserError(f"{destination}: another swath offload is at work there", ExitCode.IO) from None
+                raise UserError(
+                    f"{destination}: another swath offload is running there; wait until it ends", ExitCode.IO
+                ) from None
         yield
     finally:
         os.close(folder)
@@ -216,7 +220,7 @@ def _check_there(path: Path, report: OffloadReport, sums: ChecksumList, verify: 
     """
     copy, size = report.destination / path.name, path.stat().st_size
     known = sums.sums.get(path.name)
-    differs = CopyDiffersError(f"{copy}: is there and is not {path}; nothing was overwritten")
+    differs = CopyDiffersError(f"{copy}: already exists and differs from {path}; it was not overwritten")
     if copy.stat().st_size != size:
         raise differs
     if known is None or verify or abs(copy.stat().st_mtime - path.stat().st_mtime) > SAME_TIME_S:
@@ -253,7 +257,7 @@ def _no_room(report: OffloadReport, path: Path, needed: int, free: int) -> str:
     room = f"{path.name} needs {needed / 1e6:,.0f} MB, {free / 1e6:,.0f} MB are free"
     return (
         f"{report.destination}: no space left: {room}; "
-        "make room or give another disk, the same command goes on from here"
+        "free some space or use another disk; the same command continues from here"
     )
 
 
@@ -272,7 +276,7 @@ def _copy_and_read_back(path: Path, partial: Path, progress: Progress) -> tuple[
         if not had:
             break
         digest, _ = _copy(path, partial, progress)
-    raise CopyDiffersError(f"{partial}: was read back otherwise than it was written; that disk is not to be trusted")
+    raise CopyDiffersError(f"{partial}: the data read back differ from the data written; do not trust this disk")
 
 
 def _copy(path: Path, partial: Path, progress: Progress) -> tuple[str, int]:

@@ -99,7 +99,7 @@ def _line(stream: BufferedIOBase, sidecar: Path) -> str:
     try:
         return stream.readline(_MAX_LINE_BYTES).decode("ascii", "replace")
     except (EOFError, OSError, zlib.error) as error:
-        raise CaptureDamageError(f"{sidecar}: cannot be read on: {error}") from error
+        raise CaptureDamageError(f"{sidecar}: cannot be read further: {error}") from error
 
 
 def _row(line: str) -> SidecarRow | None:
@@ -139,12 +139,14 @@ def _completed(units: Iterator[CapturedUnit], path: Path, within_ns: int | None)
         unit = next(units, None)
         if unit is None:
             if row is not None:
-                raise CaptureDamageError(f"{sidecar_of(path)}: speaks of unit {row.unit}, the file ends before")
+                raise CaptureDamageError(
+                    f"{sidecar_of(path)}: names unit {row.unit}, but the file beside it ends before"
+                )
             return
         if row is not None and row.unit == number:
             near = within_ns is None or abs(row.time_ns - unit.time_ns) < within_ns
             if not near or (row.data is None and len(unit.data) != row.length):
-                raise CaptureDamageError(f"{sidecar_of(path)}: unit {number} is another than in the file beside it")
+                raise CaptureDamageError(f"{sidecar_of(path)}: unit {number} differs from the file beside it")
             unit = replace(unit, time_ns=row.time_ns, data=unit.data if row.data is None else row.data)
             row = next(rows, None)
         yield unit
@@ -161,7 +163,9 @@ def cut_by_sidecar(path: Path) -> Iterator[CapturedUnit]:
         for row in read_sidecar(path):
             data = row.data if row.data is not None else read_bytes(stream, row.length, path)
             if len(data) < row.length:
-                raise CaptureDamageError(f"{sidecar_of(path)}: speaks of unit {row.unit}, the file ends before")
+                raise CaptureDamageError(
+                    f"{sidecar_of(path)}: names unit {row.unit}, but the file beside it ends before"
+                )
             yield CapturedUnit(row.time_ns, data, "serial")
         if read_bytes(stream, 1, path):
-            raise CaptureDamageError(f"{sidecar_of(path)}: ends before the file does")
+            raise CaptureDamageError(f"{sidecar_of(path)}: ends before the file beside it")

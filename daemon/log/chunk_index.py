@@ -154,7 +154,7 @@ def _read_chunk(
     batches: list[LogBatch] = []
     try:
         if len(record) < place.length or record[0] != OP_CHUNK:
-            raise LogError("no chunk where the index of the file says there is one")
+            raise LogError("no chunk at the place that the index of the file names")
         batches = list(
             chunk_batches(unpack_chunk(record[_RECORD_HEAD_BYTES:]), known.channels, known.schemas, topics, lost)
         )
@@ -169,28 +169,28 @@ class Listening(Session):
     """A session that keeps the latest status of each source while another caller reads it.
 
     Attributes:
-        said: latest ``/status/…`` message by source.
+        statuses: latest ``/status/…`` message by source.
     """
 
-    __slots__ = ("said",)
+    __slots__ = ("statuses",)
 
     def __init__(self, session: Session) -> None:
         super().__init__(session.info, session.parts, session.damage)
-        self.said: dict[str, dict[str, Any]] = {}
+        self.statuses: dict[str, dict[str, Any]] = {}
 
     def batches(self, topics: TopicFilter | None = None, *, skim: bool = False) -> Iterator[LogBatch]:
         """Yield all messages, as `Session.batches` does, and keep the statuses among them."""
         for batch in super().batches(topics, skim=skim):
             if batch.channel.topic.startswith(STATUS):
                 for _, value in json_objects(batch):
-                    self.said[batch.channel.topic.removeprefix(STATUS)] = value
+                    self.statuses[batch.channel.topic.removeprefix(STATUS)] = value
             yield batch
 
     def lost(self) -> dict[str, int]:
         """Return the number of units that the recorder lost, by source; sources without losses are left out."""
         counts = {
-            source: sum(value for key in LOSSES if isinstance(value := said.get(key), int))
-            for source, said in self.said.items()
+            source: sum(value for key in LOSSES if isinstance(value := status.get(key), int))
+            for source, status in self.statuses.items()
         }
         return {source: count for source, count in counts.items() if count}
 

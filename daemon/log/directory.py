@@ -14,7 +14,7 @@ DEFAULT_CONFIG = Path("/etc/swath/swath.toml")
 LOCK = ".swath.lock"  # in the log directory: held while a recorder is at work there
 CONTROL_LINK = ".swath.control"  # in the log directory: the control socket, or a link to it
 
-_WHO_MAY = "the group of the log directory may (swath, as installed), and root"
+_WHO_MAY = "run this as root or in the group of the log directory (swath, as installed)"
 _WANTED = "give the log directory or a configuration file"
 
 
@@ -32,7 +32,7 @@ def log_directory(where: Path) -> Path:
             raise UserError(f"{where}: no such file or directory; {_WANTED}", ExitCode.USAGE)
         directory = where if where.is_dir() else Path(load_config(where).session.directory)
         if not directory.is_dir():
-            raise UserError(f"{directory}: no such directory, so no recorder has written there", ExitCode.IO)
+            raise UserError(f"{directory}: no such directory; check the path, or start the recorder first", ExitCode.IO)
     except PermissionError as error:
         raise UserError(f"{error.filename}: not permitted; {_WHO_MAY}", ExitCode.IO) from error
     except OSError as error:  # a sentence given instead of a path can be longer than a file name may be
@@ -75,12 +75,12 @@ def take_directory(directory: Path, key: str = "session.directory") -> int:
         directory.mkdir(parents=True, exist_ok=True)
         return _lock(directory)
     except BlockingIOError as error:
-        text = f"{key} {directory}: another recorder is at work there; stop it or give another directory"
+        text = f"{key} {directory}: another recorder is running there; stop it or choose another directory"
         raise UserError(text, exit_code=ExitCode.IO) from error
     except OSError as error:
-        text = f"{key} {directory}: {error.strerror}; give a directory that user {os.getuid()} may write"
+        text = f"{key} {directory}: {error.strerror}; choose a directory that user {os.getuid()} may write"
         if os.path.lexists(directory / LOCK) and os.access(directory, os.W_OK | os.X_OK):
-            held = "left there by another user's recording: remove it when that one is at an end"
+            held = "a recording of another user left it; remove it when that recording has ended"
             text = f"{key} {directory}: {directory / LOCK}: {error.strerror}; {held}"
         raise UserError(text, exit_code=ExitCode.IO) from error
 

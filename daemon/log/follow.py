@@ -74,7 +74,7 @@ class PartFollower:
 
     def _read_head(self) -> tuple[SessionInfo, int]:
         if self._pread(0, len(MAGIC)) != MAGIC:
-            raise LogError(f"{self.path}: is no MCAP file")
+            raise LogError(f"{self.path}: is not an MCAP file")
         session: tuple[SessionInfo, int] | None = None
         while (head := self._whole_record()) is not None and head[0] not in (OP_CHUNK, OP_DATA_END):
             opcode, length = head

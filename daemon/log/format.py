@@ -98,7 +98,7 @@ class SessionInfo:
         except (KeyError, ValueError) as error:
             raise LogError(f"metadata {SESSION_METADATA}: {error} is missing or wrong") from error
         if not 0 <= part <= MAX_PART:
-            raise LogError(f"metadata {SESSION_METADATA}: part {part} is none, want 0 to {MAX_PART}")
+            raise LogError(f"metadata {SESSION_METADATA}: part {part} is not a part number, want 0 to {MAX_PART}")
         return info, part
 
 
@@ -170,7 +170,7 @@ def safe_attachment_path(folder: Path, name: str) -> Path:
     """
     parts = PurePosixPath(name).parts
     if not parts or name.startswith("/") or ".." in parts or "\\" in name or "\0" in name:
-        raise LogError(f"attachment {name!r}: is no name; nothing is written for it")
+        raise LogError(f"attachment {name!r}: is not a valid name; it was not written")
     return folder.joinpath(*parts)
 
 

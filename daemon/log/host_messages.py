@@ -25,8 +25,8 @@ def readings_of(batch: LogBatch) -> Iterator[tuple[int, int, int, float]]:
 
 
 def _error_of(value: Any) -> float:
-    said = isinstance(value, int | float) and not isinstance(value, bool) and value >= 0
-    return float(value) if said else math.inf
+    is_stated = isinstance(value, int | float) and not isinstance(value, bool) and value >= 0
+    return float(value) if is_stated else math.inf
 
 
 def edges_of(batch: LogBatch, edge: str) -> Iterator[PpsEdge | None]:

@@ -50,8 +50,10 @@ def read_sign(directory: Path) -> Sign | None:
     """Return the sign of a directory; None if nothing is being recorded, or the file is not a sign of swath."""
     try:
         with (directory / RECORDING_SIGN).open("rb") as file:
-            said = json.loads(file.read(_MOST_SIGN_BYTES))
-        sign = Sign(said["session_id"], said["part"], directory / PurePath(said["path"]).name, str(said["boot_id"]))
+            fields = json.loads(file.read(_MOST_SIGN_BYTES))
+        sign = Sign(
+            fields["session_id"], fields["part"], directory / PurePath(fields["path"]).name, str(fields["boot_id"])
+        )
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None
     names = isinstance(sign.session_id, str) and _NAME.fullmatch(sign.session_id) and _NAME.fullmatch(sign.path.stem)

@@ -135,7 +135,7 @@ class Session:
                     continue
                 size += len(record.body)
                 if size > MAX_ATTACHMENTS_BYTES:
-                    self._note(part, Damage(record.offset, record.length, "attachments beyond 128 MiB are not read"))
+                    self._note(part, Damage(record.offset, record.length, "attachments beyond 128 MiB were not read"))
                     return found
                 found[attachment.name] = attachment.data
         return found
@@ -177,7 +177,7 @@ class Session:
         if entry in self._noted or len(self.damage) > MAX_DAMAGE:
             return
         if len(self.damage) == MAX_DAMAGE:
-            entry = PartDamage(part.path, Damage(damage.offset, 0, "there is more damage, which is not listed"))
+            entry = PartDamage(part.path, Damage(damage.offset, 0, "more damage exists that is not listed"))
         self._noted.add(entry)
         self.damage.append(entry)
 
@@ -212,7 +212,7 @@ def open_logs(paths: Sequence[Path | str], passed_over: list[str] | None = None)
     if not by_session:
         why = f"; {passed_over[0]}" if passed_over else ""
         more = f", and {len(passed_over) - 1} more" if passed_over and len(passed_over) > 1 else ""
-        raise LogError(f"{', '.join(map(str, paths))}: no logs (*.mcap) there{why}{more}")
+        raise LogError(f"{', '.join(map(str, paths))}: no logs (*.mcap){why}{more}")
     sessions = [_session(parts) for parts in by_session.values()]
     return sorted(sessions, key=lambda session: session.info.realtime_ns)
 
@@ -221,7 +221,9 @@ def _session(parts: list[Part]) -> Session:
     parts.sort(key=lambda part: part.number)
     for one, other in pairwise(parts):
         if one.number == other.number:
-            raise LogError(f"{other.path}: is part {other.number} of its session, and so is {one.path}")
+            raise LogError(
+                f"{other.path}: is part {other.number} of its session, as is {one.path}; remove one of the two"
+            )
     return Session(parts[0].info, parts)
 
 
@@ -266,7 +268,7 @@ def read_part_head(path: Path) -> Part:
         raise LogError(text if text.startswith(str(path)) else f"{path}: {text}") from error
     except (OSError, struct.error, UnicodeDecodeError) as error:
         raise LogError(f"{path}: cannot be read: {error}") from error
-    raise LogError(f"{path}: no {SESSION_METADATA} at its beginning; not a log of swath, or cut off before it began")
+    raise LogError(f"{path}: no {SESSION_METADATA} at its beginning; not a log of swath, or cut off at its beginning")
 
 
 # ---------------------------------------------------------------------- merging by time

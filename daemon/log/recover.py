@@ -69,7 +69,7 @@ class RecoveryReport:
             self.damage.append(damage)
             return
         last = self.damage[-1]
-        self.damage[-1] = Damage(last.offset, last.length + damage.length, "here and in many places behind")
+        self.damage[-1] = Damage(last.offset, last.length + damage.length, "here and in many later places")
 
     @property
     def whole(self) -> bool:
@@ -124,7 +124,7 @@ def recover(path: Path, destination: Path | None = None, *, keep_free_bytes: int
     folder = path.parent if destination is None else destination
     target = folder / (path.name.removesuffix(".mcap") + RECOVERED)
     if is_being_written(path):
-        raise LogError(f"{path}: is being recorded; there is nothing to recover yet")
+        raise LogError(f"{path}: is being recorded; recover it after the recording has ended")
     report = examine(path)
     if report.whole:
         return report
@@ -147,7 +147,7 @@ def recover(path: Path, destination: Path | None = None, *, keep_free_bytes: int
 
 def _refuse_existing(target: Path, path: Path) -> None:
     if target.exists():
-        raise LogError(f"{target}: is there already; remove it to recover {path.name} again")
+        raise LogError(f"{target}: already exists; remove it to recover {path.name} again")
 
 
 @contextlib.contextmanager
@@ -229,9 +229,9 @@ def _pass(path: Path, writer: PartWriter | None) -> RecoveryReport:
                     end = found
                 elif writer is not None:
                     _copy_outside(found, writer)
-            said = None if end is None else _messages_said(file, end, size)
+            stated = None if end is None else _stated_messages(file, end, size)
             saved = report.messages.total()
-            report.messages_lost = None if said is None or said < saved else said - saved
+            report.messages_lost = None if stated is None or stated < saved else stated - saved
         if writer is not None:
             writer.finish()
     finally:
@@ -240,7 +240,7 @@ def _pass(path: Path, writer: PartWriter | None) -> RecoveryReport:
     return report
 
 
-def _messages_said(file: BinaryIO, end: Record, size: int) -> int | None:
+def _stated_messages(file: BinaryIO, end: Record, size: int) -> int | None:
     """Return the message count from the statistics of a file whose end is whole; None if it has no statistics."""
     for found in summary_records(file, end.offset + end.length, size):
         if found.opcode == OP_STATISTICS:

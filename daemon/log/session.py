@@ -17,8 +17,8 @@ def read_boot_id() -> str:
     """Return the id of this boot; the service's unit passes it in ``SWATH_BOOT_ID``, because its /proc shows processes
     only.
     """
-    said = os.environ.get("SWATH_BOOT_ID", "")
-    return str(uuid.UUID(said)) if said else Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+    boot_id = os.environ.get("SWATH_BOOT_ID", "")
+    return str(uuid.UUID(boot_id)) if boot_id else Path("/proc/sys/kernel/random/boot_id").read_text().strip()
 
 
 def make_session_info(name: str, clock: HostClock) -> SessionInfo:

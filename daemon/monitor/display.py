@@ -185,22 +185,22 @@ class Monitor:
         sign = self._follower.sign
         if sign is None:
             last = self._events[-1] if self._events else None
-            told = "" if last is None else f"; last event: {last.get('code')}: {last.get('text')}"
-            return f"nothing is being recorded in {self._directory}{told}"
+            reason = "" if last is None else f"; last event: {last.get('code')}: {last.get('text')}"
+            return f"no recording in {self._directory}{reason}"
         if self._part is None or now_ns is None:
-            return f"{sign.path.name} should grow and cannot be read (yet)"
+            return f"{sign.path.name} cannot be read yet"
         own = _is_of_this_boot(sign.boot_id)  # locks of another computer may be invisible here
         if own and sign.path == self._part.path and not is_being_written(sign.path):
-            return f"the recorder of {sign.path.name} is gone, and its log has no end"
+            return f"the recorder of {sign.path.name} has stopped without completing the log"
         if own:
             age_s = (now_ns - self._newest_ns) * 1e-9
         elif self._grown_s is not None:
             age_s = time.monotonic() - self._grown_s
         else:
             looked_s = time.monotonic() - self._began_s
-            return f"{sign.path.name}, of another computer or of before a restart, has not grown for {looked_s:.0f} s"
+            return f"{sign.path.name} (of another computer or before a restart) has not grown for {looked_s:.0f} s"
         if self._newest_ns and age_s > STALE_S:
-            return f"nothing has been written for {age_s:.0f} s"
+            return f"no data were written for {age_s:.0f} s"
         return None
 
     def _troubles(self, sources: dict[str, dict[str, Any]], room: dict[str, Any]) -> list[str]:
@@ -208,14 +208,14 @@ class Monitor:
         for source, values in sources.items():
             status = self._sources[source].status
             words = [source_trouble(source, status) if status else ""]
-            if "decoded" in values and (told := decoded_trouble(values["decoded"])):
-                words.append(told if words[0] else f"{source} {told}")
+            if "decoded" in values and (trouble := decoded_trouble(values["decoded"])):
+                words.append(trouble if words[0] else f"{source} {trouble}")
             troubles.append(", ".join(filter(None, words)))
         if self._damaged_chunks:
-            troubles.append(f"{self._damaged_chunks} chunks of the log DAMAGED")
+            troubles.append(f"{self._damaged_chunks} DAMAGED chunks in the log")
         hours = room["hours_left"]
         if hours is not None and hours * 3600 < LITTLE_LEFT_S:
-            troubles.append(f"room for {duration_text(hours * 3600)} only")
+            troubles.append(f"space for only {duration_text(hours * 3600)}")
         return list(filter(None, troubles))
 
 
@@ -232,13 +232,13 @@ def _modified(path: Path) -> float:
 
 def _sentence(found: dict[str, Any]) -> str:
     """Return the line of ``--once``."""
-    told = "; ".join(found["troubles"])
+    troubles = "; ".join(found["troubles"])
     if found["verdict"] == NOT_RECORDING:
-        return f"NOT RECORDING: {told}"
+        return f"NOT RECORDING: {troubles}"
     count = len(found["sources"])
-    coming = f"all {count} sources are coming in" if count else "begins"
+    coming = f"all {count} sources deliver data" if count else "starting"
     room = f"{found['free_bytes'] / 1e9:.1f} GB free"
     if found["hours_left"] is not None:
         room += f" ({duration_text(found['hours_left'] * 3600)})"
     word = "recording" if found["verdict"] == RECORDING else "DEGRADED: recording"
-    return f"{word} {found['session_id']} part {found['part']}: {told or coming}; {room}"
+    return f"{word} {found['session_id']} part {found['part']}: {troubles or coming}; {room}"

@@ -122,11 +122,11 @@ class Decoding:
         }
 
 
-def usable_status(said: dict[str, Any]) -> dict[str, Any]:
+def usable_status(received: dict[str, Any]) -> dict[str, Any]:
     """Return a status with only displayable values, because a log of another program may hold any value there."""
-    status: dict[str, Any] = {key: _number(said.get(key), int) or 0 for key in _COUNTS}
-    status |= {key: _number(said[key], int, float) for key in _MEASURED if key in said}
-    status |= {key: str(said[key])[:64] for key in _WORDS if key in said}
+    status: dict[str, Any] = {key: _number(received.get(key), int) or 0 for key in _COUNTS}
+    status |= {key: _number(received[key], int, float) for key in _MEASURED if key in received}
+    status |= {key: str(received[key])[:64] for key in _WORDS if key in received}
     return {"state": "opening", "last_unit_age_s": None} | status
 
 

@@ -93,9 +93,9 @@ def assemble(config: Config, queue_bytes: int = QUEUE_BYTES) -> Assembly:
 def make_timekeeper(config: Config, events: Events, host_minus_monotonic_ns: int) -> TimeKeeper:
     """Make a clock for each PPS of a configuration, and connect the receivers that name its seconds."""
     keeper = TimeKeeper(events, host_minus_monotonic_ns)
-    said = {gnss.pps: gnss.leap_seconds for gnss in config.gnss.values() if gnss.leap_seconds is not None}
+    leap_seconds = {gnss.pps: gnss.leap_seconds for gnss in config.gnss.values() if gnss.leap_seconds is not None}
     for name, pps in config.pps.items():
-        keeper.add_pps(f"pps/{name}", said.get(name), pps.delay_ns)
+        keeper.add_pps(f"pps/{name}", leap_seconds.get(name), pps.delay_ns)
     for device in config.devices():
         if device.kind == "gnss" and device.transport.kind != "gnss":
             _add_gnss_time(keeper, device, config.gnss[device.name])

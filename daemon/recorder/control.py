@@ -43,7 +43,7 @@ NOTES_AT_ONCE = 20
 NOTES_PER_S = 5.0
 SPLITS_AT_ONCE = 3  # a new part costs a few syncs
 SPLITS_PER_S = 1.0
-IGNORED_TOLD_S = 60.0
+IGNORED_REPORT_S = 60.0
 LOOK_S = 1.0  # between two checks that the socket is still at its path
 _SUN_PATH_BYTES = 107  # unix(7), without the terminating zero
 
@@ -104,9 +104,9 @@ def _make_way(place: Path) -> None:
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK) as probe:
             with contextlib.suppress(ConnectionRefusedError), socket_address(place) as address:
                 probe.connect(address)
-                raise OSError(errno.EADDRINUSE, "another recorder listens there")
+                raise OSError(errno.EADDRINUSE, "another recorder uses it")
     elif not stat.S_ISLNK(mode):
-        raise OSError(errno.EEXIST, "something else stands there")
+        raise OSError(errno.EEXIST, "the path is taken by something else")
     place.unlink()
 
 
@@ -117,7 +117,7 @@ def place_link(link: Path, target: Path) -> None:
     with contextlib.suppress(FileNotFoundError):
         mode = os.lstat(link).st_mode
         if not (stat.S_ISLNK(mode) or stat.S_ISSOCK(mode)):
-            raise OSError(errno.EEXIST, f"something else stands at {link}")
+            raise OSError(errno.EEXIST, f"{link} is taken by something else")
     new = link.with_name(f"{link.name}.new")
     new.unlink(missing_ok=True)
     new.symlink_to(target)
@@ -130,7 +130,7 @@ class _Peer:
 
     sock: socket.socket
     until_s: float
-    said: bytes = b""
+    received: bytes = b""
 
 
 @dataclass(slots=True)
@@ -190,7 +190,7 @@ class Control(threading.Thread):
         self._peers: list[_Peer] = []
         self._notes = _Allowance(NOTES_AT_ONCE, NOTES_PER_S)
         self._splits = _Allowance(SPLITS_AT_ONCE, SPLITS_PER_S)
-        self._told_ignored = (0, 0.0)  # count, CLOCK_MONOTONIC
+        self._reported_ignored = (0, 0.0)  # count, CLOCK_MONOTONIC
         self._look_s = 0.0  # CLOCK_MONOTONIC of the next check
 
     # ------------------------------------------------------------------ start and end
@@ -200,7 +200,7 @@ class Control(threading.Thread):
         try:
             self._listen()
         except OSError as error:
-            text = f"no control socket at {self.place}: {error.strerror or error}; swath mark and split cannot be used"
+            text = f"no control socket at {self.place}: {error.strerror or error}; swath mark and split do not work"
             self._events.post(Severity.WARNING, "recorder", "control_absent", text)
         if self._sock is not None:
             self.start()
@@ -247,7 +247,7 @@ class Control(threading.Thread):
                 self._turn()
                 self._end.wait(TURN_S)
         except Exception as error:
-            text = f"the control socket failed, the recording goes on: {type(error).__name__}: {error}"
+            text = f"the control socket failed, recording continues: {type(error).__name__}: {error}"
             self._events.post(Severity.ERROR, "recorder", "control_failed", text)
         finally:
             for peer in self._peers:
@@ -283,11 +283,11 @@ class Control(threading.Thread):
         """Read from a peer and return whether the connection is finished, answered or not."""
         try:
             if ready:
-                got = peer.sock.recv(LINE_BYTES - len(peer.said))
-                peer.said += got
+                got = peer.sock.recv(LINE_BYTES - len(peer.received))
+                peer.received += got
                 if b"\n" in got:
                     self._answer(peer)
-                elif got and len(peer.said) < LINE_BYTES:
+                elif got and len(peer.received) < LINE_BYTES:
                     return False
                 else:
                     self.ignored += 1
@@ -302,17 +302,17 @@ class Control(threading.Thread):
 
     def _answer(self, peer: _Peer) -> None:
         try:
-            answer = {"ok": True} | self._do(_parse(peer.said.partition(b"\n")[0]))
+            answer = {"ok": True} | self._do(_parse(peer.received.partition(b"\n")[0]))
         except BadRequestError as error:
             self.ignored += 1
             answer = {"ok": False, "error": str(error)}
         peer.sock.send(json.dumps(answer).encode() + b"\n")
 
     def _tell_ignored(self, now_s: float) -> None:
-        told, told_s = self._told_ignored
-        if self.ignored > told and now_s - told_s > IGNORED_TOLD_S:
-            self._told_ignored = self.ignored, now_s
-            text = f"{self.ignored - told} connections to the control socket brought no request that can be followed"
+        reported, reported_s = self._reported_ignored
+        if self.ignored > reported and now_s - reported_s > IGNORED_REPORT_S:
+            self._reported_ignored = self.ignored, now_s
+            text = f"{self.ignored - reported} connections to the control socket sent no valid request"
             self._events.post(Severity.WARNING, "recorder", "control_ignored", text)
 
     # ------------------------------------------------------------------ requests
@@ -332,23 +332,23 @@ class Control(threading.Thread):
             case "split":
                 self._split()
                 return answer
-        raise BadRequestError("this recorder knows the commands mark and split")
+        raise BadRequestError("unknown command; this recorder accepts mark and split")
 
     def _mark(self, text: object) -> dict[str, object]:
         note = one_line(text).strip() if isinstance(text, str) else ""
         if not note or len(note) > NOTE_CHARACTERS:
-            raise BadRequestError(f"a note is a text of 1 to {NOTE_CHARACTERS} characters")
+            raise BadRequestError(f"a note needs 1 to {NOTE_CHARACTERS} characters")
         if not self._notes.take():
-            raise BadRequestError(f"too many notes; {NOTES_PER_S:g} a second are taken")
+            raise BadRequestError(f"too many notes; at most {NOTES_PER_S:g} per second are accepted")
         event = self._events.post(Severity.INFO, "operator", "mark", note)
         return {"time_ns": event.time_ns, "text": note}
 
     def _split(self) -> None:
         recorder = self._recording.recorder
         if recorder.health.state is not Writing.RECORDING:
-            raise BadRequestError(f"nothing is being recorded: {recorder.health.reason}")
+            raise BadRequestError(f"no recording is running: {recorder.health.reason}")
         if not self._splits.take():
-            raise BadRequestError(f"too many new parts; {SPLITS_PER_S:g} a second is begun")
+            raise BadRequestError(f"too many new parts; at most {SPLITS_PER_S:g} per second is begun")
         recorder.new_part.set()
 
 
@@ -358,5 +358,5 @@ def _parse(line: bytes) -> dict[str, object]:
     except (ValueError, RecursionError):
         request = None
     if not isinstance(request, dict):
-        raise BadRequestError("a request is one JSON object in a line")
+        raise BadRequestError("a request must be one JSON object on one line")
     return request

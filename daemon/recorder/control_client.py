@@ -32,29 +32,29 @@ def ask(directory: Path, request: Mapping[str, str]) -> dict[str, Any]:
         UserError: no recorder runs there, this user may not ask it, it gives no valid answer, or it refuses.
     """
     try:
-        said = _exchange(directory / CONTROL_LINK, json.dumps(request).encode() + b"\n")
+        reply = _exchange(directory / CONTROL_LINK, json.dumps(request).encode() + b"\n")
     except (FileNotFoundError, ConnectionRefusedError) as error:
         raise UserError(f"{directory}: no recorder is running there", ExitCode.IO) from error
     except PermissionError as error:
-        text = f"{directory}: not permitted; only the recorder's own user and root may, such as with sudo"
+        text = f"{directory}: not permitted; run this as root (sudo) or as the user of the recorder"
         raise UserError(text, ExitCode.IO) from error
     except OSError as error:  # includes a time-out
-        raise UserError(f"{directory}: the recorder there does not answer", ExitCode.IO) from error
-    if not said:
-        raise UserError(f"{directory}: the recorder there does not answer", ExitCode.IO)
+        raise UserError(f"{directory}: the recorder there does not answer; see its journal", ExitCode.IO) from error
+    if not reply:
+        raise UserError(f"{directory}: the recorder there does not answer; see its journal", ExitCode.IO)
     try:
-        answer = _understood(said, _OF_ALL | _OF_COMMAND.get(request["command"], {}))
+        answer = _understood(reply, _OF_ALL | _OF_COMMAND.get(request["command"], {}))
     except (ValueError, RecursionError) as error:
-        text = f"{directory}: what answers there is no recorder of this version; start it anew after an update"
+        text = f"{directory}: the recorder there is of another version; restart it after an update"
         raise UserError(text, ExitCode.IO) from error
     if not answer["ok"]:
         raise UserError(f"{directory}: {answer['error']}", ExitCode.PROBLEM)
     return answer
 
 
-def _understood(said: bytes, wanted: Mapping[str, type]) -> dict[str, Any]:
+def _understood(reply: bytes, wanted: Mapping[str, type]) -> dict[str, Any]:
     """Parse an answer or a refusal; raises ValueError or RecursionError if it is neither."""
-    answer = json.loads(said)
+    answer = json.loads(reply)
     refused = isinstance(answer, dict) and answer.get("ok") is False
     wanted = {"ok": bool} | ({"error": str} if refused else dict(wanted))
     if not isinstance(answer, dict) or not all(type(answer.get(key)) is kind for key, kind in wanted.items()):

@@ -74,10 +74,10 @@ class Relay(threading.Thread):
 
     def _post(self, *, taken: bool) -> None:
         if taken:
-            text = f"{self.target} takes corrections again"
+            text = f"{self.target} accepts corrections again"
             self._events.post(Severity.INFO, self._source, "forwarding_again", text)
         else:
-            text = f"{self.target} does not take the corrections; they are recorded all the same"
+            text = f"{self.target} does not accept corrections; they are still recorded"
             self._events.post(Severity.WARNING, self._source, "forwarding_failed", text)
 
 

@@ -46,7 +46,7 @@ class JournalHandler(logging.Handler):
         """Queue a message; handlers are called one at a time (`logging.Handler.acquire`)."""
         try:
             if self._left_out:
-                self._lines.put_nowait(f"{self._left_out} lines left out: nobody read them")
+                self._lines.put_nowait(f"{self._left_out} lines left out, because no reader took them")
                 self._left_out = 0
             self._lines.put_nowait(self.format(record))
         except queue.Full:
@@ -76,4 +76,4 @@ def threads_text() -> str:
             file.seek(0)
             return file.read().decode(errors="replace")
     except OSError as error:
-        return f"no word of the threads: {error}"
+        return f"the state of the threads is unavailable: {error}"

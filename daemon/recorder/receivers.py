@@ -29,7 +29,7 @@ from swath.drivers.session import Session, SessionState
 from swath.drivers.transports.base import RawEdge, TransportCounters, UnitBlock
 from swath.georef.records import Int64Array
 
-TOLD_AGAIN_S = 30.0  # a continuing fault is reported at this interval, with the new counts
+REPORT_AGAIN_S = 30.0  # a continuing fault is reported at this interval, with the new counts
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,22 +43,20 @@ class _Kind:
 
 
 _KINDS = (
-    _Kind("bus_off", Severity.ERROR, "can_bus_off", "times the controller went off the bus; frames are missing since"),
+    _Kind("bus_off", Severity.ERROR, "can_bus_off", "times the controller went off the bus; frames were lost"),
     _Kind(
         "error_frames",
         Severity.WARNING,
         "can_errors",
-        "error frames, recorded as such; look at cabling, termination and bit rate",
+        "error frames (recorded); check cabling, termination and bit rate",
     ),
     _Kind(
         "line_errors",
         Severity.WARNING,
         "line_errors",
-        "framing, parity or overrun errors of the line; is the baud rate right?",
+        "framing, parity or overrun errors on the line; check the baud rate",
     ),
-    _Kind(
-        "refused", Severity.WARNING, "units_refused", "units refused: of another sender, or nothing that can be read"
-    ),
+    _Kind("refused", Severity.WARNING, "units_refused", "units rejected: from another sender, or unreadable"),
 )
 
 
@@ -75,8 +73,8 @@ class WireTrouble:
         self._source = source
         self._events = events
         self._monotonic_s = monotonic_s
-        self._told: dict[str, int] = {}
-        self._told_s: dict[str, float] = {}
+        self._reported: dict[str, int] = {}
+        self._reported_s: dict[str, float] = {}
 
     def look(self, counters: TransportCounters) -> dict[str, int]:
         """Report counters that have grown, and return all that are not zero."""
@@ -90,16 +88,16 @@ class WireTrouble:
 
     def _tell(self, kind: _Kind, count: int) -> None:
         now_s = self._monotonic_s()
-        grown = count - self._told.get(kind.counter, 0)
-        if grown > 0 and now_s - self._told_s.get(kind.counter, -TOLD_AGAIN_S) >= TOLD_AGAIN_S:
-            self._told[kind.counter], self._told_s[kind.counter] = count, now_s
+        grown = count - self._reported.get(kind.counter, 0)
+        if grown > 0 and now_s - self._reported_s.get(kind.counter, -REPORT_AGAIN_S) >= REPORT_AGAIN_S:
+            self._reported[kind.counter], self._reported_s[kind.counter] = count, now_s
             self._events.post(kind.severity, self._source, kind.code, f"{grown} {kind.text}")
 
 
 WAIT_S = 0.2  # a receive thread returns from its wait at least this often
 ACCOUNT_S = 0.25  # and reports its losses at least this often
 DRAIN_S = 1.0  # at the end, data that the kernel already holds is taken for no longer than this
-QUEUE_TOLD_S = 1.0  # the queue counts as having room again after so long without a refusal
+QUEUE_REPORT_S = 1.0  # the queue counts as having room again after so long without a refusal
 
 UnitsSeen = Callable[[Int64Array, UnitBlock], None]
 
@@ -160,9 +158,9 @@ class Receiver(threading.Thread, ABC):
         self.account = _Account()
         self.stamps = StampConverter(shared.clock)
         self._accounted_ns = 0
-        self._told_state = SessionState.CLOSED
-        self._told_error = ""
-        self._told_silent = False
+        self._reported_state = SessionState.CLOSED
+        self._reported_error = ""
+        self._reported_silent = False
         self._opened_ns = self._silent_since_ns = shared.clock.now_ns()
         self._refused_ns: int | None = None  # CLOCK_MONOTONIC when the queue last had no room
         self._lost_before = 0  # lost_queue before the queue refused blocks
@@ -214,13 +212,13 @@ class Receiver(threading.Thread, ABC):
         if not self.shared.queue.put(QueueItem(self.source, block, self.account.snapshot())):
             if self._refused_ns is None:
                 self._lost_before = self.account.lost_queue
-                text = "the writer does not keep up and its queue is full; units are being dropped and counted"
+                text = "the writer is too slow and its queue is full; units are being dropped and counted"
                 self.shared.events.post(Severity.CRITICAL, self.source, "queue_full", text)
             self._refused_ns = now_ns
             self.account.lost_queue += block.count
-        elif self._refused_ns is not None and now_ns - self._refused_ns > QUEUE_TOLD_S * 1e9:
+        elif self._refused_ns is not None and now_ns - self._refused_ns > QUEUE_REPORT_S * 1e9:
             self._refused_ns = None
-            text = f"the queue has room again; {self.account.lost_queue - self._lost_before} units were dropped"
+            text = f"the queue has space again; {self.account.lost_queue - self._lost_before} units were dropped"
             self.shared.events.post(Severity.WARNING, self.source, "queue_drained", text)
 
     def tell_account(self, *, now: bool = False) -> None:
@@ -232,12 +230,12 @@ class Receiver(threading.Thread, ABC):
 
     def tell_state(self, state: SessionState, last_error: str) -> None:
         """Post opening, loss, a changed reason for absence, silence and return as events, each once."""
-        if state is not self._told_state:
+        if state is not self._reported_state:
             self._tell_change(state, last_error)
-            self._told_state = state
-        elif state is SessionState.WAITING and last_error != self._told_error:
+            self._reported_state = state
+        elif state is SessionState.WAITING and last_error != self._reported_error:
             self.shared.events.post(Severity.WARNING, self.source, "device_absent", f"{last_error}; waiting for it")
-        self._told_error = last_error
+        self._reported_error = last_error
         self.account.state = self._state_word(state)
 
     def _tell_change(self, state: SessionState, last_error: str) -> None:
@@ -245,11 +243,11 @@ class Receiver(threading.Thread, ABC):
         if state is SessionState.OPEN:
             self.account.last_unit_ns = None
             self._opened_ns = self.shared.clock.now_ns()
-            self._told_silent = False
+            self._reported_silent = False
             post(Severity.INFO, self.source, "device_opened", "opened")
-        elif self._told_state is SessionState.OPEN:
+        elif self._reported_state is SessionState.OPEN:
             post(Severity.ERROR, self.source, "device_lost", f"{last_error}; waiting for it")
-        elif self._told_state is SessionState.CLOSED and state is SessionState.WAITING:
+        elif self._reported_state is SessionState.CLOSED and state is SessionState.WAITING:
             post(Severity.WARNING, self.source, "device_absent", f"{last_error}; waiting for it")
 
     def _state_word(self, state: SessionState) -> str:
@@ -259,16 +257,16 @@ class Receiver(threading.Thread, ABC):
         silent_s = (self.shared.clock.now_ns() - last) * 1e-9
         if silent_s <= SILENT_AFTER_S:
             return "receiving"
-        if not self._told_silent:
-            self._told_silent = True
+        if not self._reported_silent:
+            self._reported_silent = True
             self._silent_since_ns = last
             self.shared.events.post(Severity.WARNING, self.source, "silent", f"no data for {silent_s:.0f} s")
         return "silent"
 
     def note_units(self, count: int, length: int, last_ns: int) -> None:
         """Count units; post an event if they end a silence."""
-        if self._told_silent:
-            self._told_silent = False
+        if self._reported_silent:
+            self._reported_silent = False
             gap_s = (last_ns - self._silent_since_ns) * 1e-9
             self.shared.events.post(Severity.INFO, self.source, "resumed", f"data again after {gap_s:.1f} s")
         self.account.units += count
@@ -288,7 +286,7 @@ class UnitReceiver(Receiver):
         self._units_seen = units_seen
         self._channel_ids: dict[tuple[str, int] | None, int] = {}
         self._sequences: dict[int, int] = {}
-        self._told_buffer = False
+        self._reported_buffer = False
         self._trouble = WireTrouble(wire.source, shared.events)
 
     @property
@@ -370,7 +368,7 @@ class UnitReceiver(Receiver):
         if peer is not None:
             metadata |= {"source_address": peer[0], "source_port": str(peer[1])}
         elif self._channel_ids:
-            text = f"more than {MAX_SENDERS} senders; the further ones are recorded on one channel that names no sender"
+            text = f"more than {MAX_SENDERS} senders; all others are recorded on one channel without a sender"
             self.shared.events.post(Severity.WARNING, self.source, "many_senders", text)
         wire = self._wire
         spec = ChannelSpec(wire.topic, wire.encoding, metadata, None, wire.chunk_class)
@@ -394,8 +392,8 @@ class UnitReceiver(Receiver):
         granted = counters.receive_buffer_bytes
         self.account.receive_buffer_bytes = granted
         wanted = counters.receive_buffer_asked_bytes
-        if granted < wanted and not self._told_buffer:
-            self._told_buffer = True
+        if granted < wanted and not self._reported_buffer:
+            self._reported_buffer = True
             text = f"receive buffer of {granted} bytes granted, {wanted} wanted: sysctl -w net.core.rmem_max=67108864"
             self.shared.events.post(Severity.WARNING, self.source, "receive_buffer_small", text)
 

@@ -67,7 +67,7 @@ async def repair_left_open(
     up.
     """
     tried: set[Path] = set()
-    told: set[str] = set()
+    reported: set[str] = set()
     while True:
         candidates = await asyncio.to_thread(unfinished_logs, directory)
         waiting = [path for path in candidates if path not in tried and not is_current(path)]
@@ -75,7 +75,7 @@ async def repair_left_open(
             return
         path = next((path for path in waiting if not _is_being_recovered(path)), None)
         if path is None:
-            await _wait(f"{waiting[0].name} is being recovered by another process", told, events)
+            await _wait(f"{waiting[0].name} is being recovered by another process", reported, events)
             continue
         try:
             room = shutil.disk_usage(directory).free > reserve_bytes + path.stat().st_size
@@ -83,7 +83,9 @@ async def repair_left_open(
             tried.add(path)
             continue
         if not room:
-            await _wait(f"{path.name} was left open by a crash; no room to repair it now", told, events)
+            await _wait(
+                f"{path.name} was left open by a crash; the disk has no space to repair it now", reported, events
+            )
             continue
         await _repair(path, reserve_bytes, events)
         tried.add(path)
@@ -93,10 +95,10 @@ def _is_being_recovered(path: Path) -> bool:
     return is_being_written(path.with_suffix(".recovered.mcap.part"))
 
 
-async def _wait(text: str, told: set[str], events: Events) -> None:
+async def _wait(text: str, reported: set[str], events: Events) -> None:
     """Post the reason once, then wait before the next check."""
-    if text not in told:
-        told.add(text)
+    if text not in reported:
+        reported.add(text)
         events.post(Severity.WARNING, "recorder", "repair_waits", text)
     await asyncio.sleep(_LOOK_AGAIN_S)
 
@@ -122,7 +124,7 @@ async def _repair(path: Path, reserve_bytes: int, events: Events) -> None:
         await process.wait()
         raise
     if process.returncode in (0, 4):
-        text = f"{path.name}, left open by a crash, was repaired beside it"
+        text = f"{path.name}, left open by a crash, was repaired into a copy beside it"
         events.post(Severity.INFO, "recorder", "log_repaired", text)
         return
     lines = errors.decode(errors="replace").strip().splitlines()

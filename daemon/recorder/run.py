@@ -99,7 +99,7 @@ class RecorderProcess:
         try:
             assembly.recorder.open_first()
         except OSError as error:
-            text = f"session.directory {assembly.parts.directory}: {error.strerror}; cannot create a log there"
+            text = f"session.directory {assembly.parts.directory}: {error.strerror}; a log cannot be created there"
             raise UserError(text, exit_code=ExitCode.IO) from error
         self._sample_clock()
         text = f"session {assembly.info.session_id}, {len(assembly.receivers)} sources, {assembly.info.software}"
@@ -123,14 +123,14 @@ class RecorderProcess:
         # a receiver whose device is still opening has no data that could be lost
         left = [receiver.source for receiver in assembly.receivers if receiver.is_alive() and not receiver.opening]
         if left:
-            text = f"no end of {', '.join(left)}: its last units may be missing"
+            text = f"{', '.join(left)} did not end in time; the last units may be missing"
             assembly.shared.events.post(Severity.CRITICAL, "recorder", "stuck", text)
         text = f"session {assembly.info.session_id} ended"
         assembly.shared.events.post(Severity.INFO, "recorder", "session_ended", text)
         assembly.recorder.stop.set()
         assembly.recorder.join(WRITER_ENDS_S)
         if assembly.recorder.is_alive():
-            log.critical("recorder stuck: the disk does not take the end of the log; swath recover completes it")
+            log.critical("recorder stuck: the end of the log cannot be written; run swath recover to complete it")
         failed = any(receiver.failed for receiver in assembly.receivers)
         self._failed |= bool(left) or failed or assembly.recorder.is_alive()
 
@@ -163,11 +163,11 @@ class RecorderProcess:
         while not self._must_end():
             await asyncio.sleep(period_s)
             stuck = stuck_threads(self._assembly.receivers, self._assembly.recorder.health)
-            told = f"STUCK: {', '.join(stuck)}" if stuck else ""
+            stuck_text = f"STUCK: {', '.join(stuck)}" if stuck else ""
             if a_restart_helps_nobody(stuck, self._assembly.receivers):
-                self._service.notify(WATCHDOG="1", STATUS="; ".join(filter(None, [self._sentence(), told])))
+                self._service.notify(WATCHDOG="1", STATUS="; ".join(filter(None, [self._sentence(), stuck_text])))
             elif stuck != self._stuck:
-                self._service.notify(STATUS=told)
+                self._service.notify(STATUS=stuck_text)
             if stuck and stuck != self._stuck:
                 text = f"no progress in {', '.join(stuck)}"
                 self._assembly.shared.events.post(Severity.CRITICAL, "recorder", "stuck", text)
@@ -212,7 +212,7 @@ class RecorderProcess:
                 text = await asyncio.to_thread(judge, first.entry, kept)
                 if text is not None:
                     events = self._assembly.shared.events
-                    events.post(Severity.ERROR, first.entry.source, "wrong_protocol", f"{text}; recorded all the same")
+                    events.post(Severity.ERROR, first.entry.source, "wrong_protocol", f"{text}; recording continues")
 
     def _sentence(self) -> str:
         assembly = self._assembly
@@ -248,12 +248,12 @@ def sentence(session_id: str, part: int, writer: WriterHealth) -> str:
         return f"NOT RECORDING: {writer.reason}"
     troubles = [text for source, status in writer.statuses.items() if (text := source_trouble(source, status))]
     sources = len(writer.statuses)
-    told = "; ".join(troubles) if troubles else f"all {sources} sources are coming in" if sources else "begins"
+    state = "; ".join(troubles) if troubles else f"all {sources} sources deliver data" if sources else "starting"
     room = f"{writer.free_bytes / 1e9:.1f} GB free"
     if writer.bytes_per_s > 0:
         left_s = max(0, writer.free_bytes - writer.reserve_bytes) / writer.bytes_per_s
         room += f" ({duration_text(left_s)})"
-    return f"recording {session_id} part {part}: {told}; {room}"
+    return f"recording {session_id} part {part}: {state}; {room}"
 
 
 def record(config: Config, seconds: float | None = None, queue_bytes: int = QUEUE_BYTES) -> ExitCode:

@@ -33,25 +33,25 @@ class _TimeSource:
     units_ns: int = 0  # host times of the newest unit and time message
     message_ns: int | None = None
     longest_ns: int = 0  # between two messages
-    told: bool = False
+    reported: bool = False
     remarks: list[str] = field(default_factory=list)  # posted so far
 
     def note_message(self, host_ns: int) -> int | None:
         """Note a time message; return the length of the pause before it, if that pause had been reported."""
         pause_ns = 0 if self.message_ns is None else max(0, host_ns - self.message_ns)
         self.message_ns, self.longest_ns = host_ns, max(self.longest_ns, pause_ns)
-        told, self.told = self.told, False
-        return pause_ns if told else None
+        reported, self.reported = self.reported, False
+        return pause_ns if reported else None
 
     def note_stop(self) -> int | None:
         """Return the time without a time message while data arrived, once it is too long; None before and
         after that.
         """
-        if self.message_ns is None or self.told:
+        if self.message_ns is None or self.reported:
             return None
         pause_ns = self.units_ns - self.message_ns
-        self.told = pause_ns > min(max(STOPPED_NS, 3 * self.longest_ns), STOPPED_LONGEST_NS)
-        return pause_ns if self.told else None
+        self.reported = pause_ns > min(max(STOPPED_NS, 3 * self.longest_ns), STOPPED_LONGEST_NS)
+        return pause_ns if self.reported else None
 
 
 class TimeKeeper:
@@ -92,14 +92,14 @@ class TimeKeeper:
         def feed(log_time_ns: Int64Array, block: UnitBlock) -> None:
             time_source = self._sources[source]
             time_source.units_ns = int(log_time_ns[-1])
-            with self._defects_told(source):
+            with self._defects_reported(source):
                 self._take(time_source, time_source.parser.feed_batch(ChunkBatch(source, log_time_ns, block.units)))
                 self._tell_remarks(time_source)
 
         return feed
 
     @contextlib.contextmanager
-    def _defects_told(self, source: str) -> Iterator[None]:
+    def _defects_reported(self, source: str) -> Iterator[None]:
         """Report a defect in parser or clock once for each source; it may cost a time state, but never the
         recording.
         """
@@ -108,7 +108,7 @@ class TimeKeeper:
         except Exception as error:
             if source not in self._failed:
                 self._failed.add(source)
-                text = f"time keeping failed, bytes are recorded all the same: {type(error).__name__}: {error}"
+                text = f"time keeping failed, recording continues: {type(error).__name__}: {error}"
                 self._events.post(Severity.ERROR, source, "time_parser_failed", text)
 
     def _take(self, time_source: _TimeSource, records: list[Record]) -> None:
@@ -148,7 +148,7 @@ class TimeKeeper:
         """Return the function that a PPS receiver thread calls with an edge's host time and sequence number."""
 
         def feed(host_ns: int, sequence: int) -> None:
-            with self._defects_told(source), self._lock:
+            with self._defects_reported(source), self._lock:
                 self._clocks[source].add_edge(self._timeline.raw_at(host_ns), sequence)
                 self._drain(source, self._clocks[source])
 
@@ -160,7 +160,7 @@ class TimeKeeper:
         """
         realtime_ns, monotonic_ns = int(sample["realtime_ns"]), int(sample["monotonic_ns"])
         raw_ns = int(sample["monotonic_raw_ns"])
-        with self._defects_told("clock"), self._lock:
+        with self._defects_reported("clock"), self._lock:
             self._timeline.add(realtime_ns, monotonic_ns, raw_ns)
             step_ns = realtime_ns - monotonic_ns - self._timeline.host_minus_monotonic_ns
             self._beside_wall.set_wall(step_ns, kept=discipline.disciplined)
@@ -174,7 +174,7 @@ class TimeKeeper:
         clock = self._clocks.get(source)
         if clock is None:
             return {}
-        with self._defects_told(source), self._lock:
+        with self._defects_reported(source), self._lock:
             if source in self._sources:
                 self._tell_stop(self._sources[source])
             status = clock.status(self._timeline.raw_at(host_ns))
@@ -189,7 +189,7 @@ class TimeKeeper:
         """
         pause_ns = time_source.note_stop()
         if pause_ns is not None:
-            text = f"data, but no time message for {pause_ns * 1e-9:.0f} s: has its message set or baud rate changed?"
+            text = f"data, but no time message for {pause_ns * 1e-9:.0f} s; check its messages and baud rate"
             self._events.post(Severity.WARNING, time_source.source, "time_messages_stopped", text)
 
     def _drain(self, source: str, clock: PpsClock) -> None:

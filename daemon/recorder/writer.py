@@ -255,7 +255,7 @@ class Recorder(threading.Thread):
         free_mb, reserve_mb = self.health.free_bytes / 1e6, self._settings.reserve_bytes / 1e6
         return (
             f"{free_mb:.0f} MB free in {self._parts.directory}, reserve is {reserve_mb:.0f} MB: "
-            "recording stopped until there is room"
+            "recording is paused until there is more space"
         )
 
     def _look_after_part(self) -> None:
@@ -277,11 +277,11 @@ class Recorder(threading.Thread):
     def _go_on_elsewhere(self) -> None:
         part = self._parts.current
         assert part is not None
-        text = f"{part.path} is no longer there, removed or moved; recording goes on in a new part"
+        text = f"{part.path} was removed or moved; recording continues in a new part"
         self._events.post(Severity.CRITICAL, "disk", "log_gone", text)
         self._split()
         if self._parts.current is part and part.is_unlinked():
-            self._write_failed(OSError(errno.ENOENT, "the log was removed and no new one can be made"))
+            self._write_failed(OSError(errno.ENOENT, "the log was removed and a new one cannot be created"))
 
     def _write_failed(self, error: OSError) -> None:
         no_room = error.errno in _NO_ROOM
@@ -341,8 +341,8 @@ class Recorder(threading.Thread):
         try:
             self._parts.keep_directory()
         except OSError as error:
-            why = "another recorder is at work there" if isinstance(error, BlockingIOError) else error.strerror
-            text = f"{self._parts.directory} was made anew and is not locked: {why}; recording goes on"
+            why = "another recorder is running there" if isinstance(error, BlockingIOError) else error.strerror
+            text = f"{self._parts.directory} was created again and is not locked: {why}; recording continues"
             self._events.post(Severity.ERROR, "recorder", "directory_unlocked", text)
         return old
 
@@ -355,7 +355,7 @@ class Recorder(threading.Thread):
             old = self._open_next()
         except OSError as error:
             self._split_after_s = time.monotonic() + SPLIT_AGAIN_S
-            text = f"the next part cannot be opened ({error.strerror or error}); recording goes on in this one"
+            text = f"the next part cannot be opened ({error.strerror or error}); recording continues in this one"
             self._events.post(Severity.CRITICAL, "disk", "split_failed", text)
             return
         assert old is not None
@@ -389,5 +389,7 @@ class Recorder(threading.Thread):
             part.finish()
         except OSError as error:
             part.close()
-            text = f"{part.path.name} could not be finished: {error.strerror or error}; swath recover completes it"
+            text = (
+                f"{part.path.name} could not be finished: {error.strerror or error}; run swath recover to complete it"
+            )
             self._events.post(Severity.ERROR, "recorder", "part_unfinished", text)

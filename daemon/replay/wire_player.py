@@ -63,7 +63,7 @@ class PtyOutput(Output):
         if path.exists() and not (path.is_symlink() and path.resolve().is_relative_to(_PTYS)):
             # a link may be udev's, to a receiver: once replaced, it would be missing until the receiver is plugged in
             # again
-            text = "is there already and is no link to a pseudo-terminal; give a path that may be made"
+            text = "already exists and is not a link to a pseudo-terminal; choose another path"
             raise TransportError(f"{path}: {text}")
         self._master, slave = os.openpty()
         tty.setraw(slave)
@@ -171,7 +171,7 @@ class PpsOutput(Output):
         if not path.exists():
             os.mkfifo(path)
         elif not stat.S_ISFIFO(path.stat().st_mode):
-            raise TransportError(f"{path}: is there already and is no FIFO; remove it or give another path")
+            raise TransportError(f"{path}: already exists and is not a FIFO; remove it or choose another path")
         self._path = path
         self._fd = -1
         self._sequence = 0

@@ -117,7 +117,7 @@ class Ahead:
             try:
                 word = receiving.recv()
             except (EOFError, OSError):
-                word = _Failed("the process that makes the flight has ended")
+                word = _Failed("the process that computes the flight has ended unexpectedly")
             while not self._stop.is_set():
                 try:
                     self._words.put(word, timeout=0.2)

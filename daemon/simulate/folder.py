@@ -13,7 +13,7 @@ from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.exchange.log_maker import refuse_session
 from swath.daemon.log.durable import sync_directory
 
-_AGAIN = "is there already; remove it or give another place"
+_AGAIN = "already exists; remove it or choose another place"
 
 
 class FlightFolder:
@@ -39,12 +39,14 @@ class FlightFolder:
             self.place.mkdir(parents=True, exist_ok=True)
             self.work.mkdir()
         except FileExistsError as error:
-            text = f"{error.filename}: another flight is at work there, or was killed there; wait for it, or remove it"
+            text = f"{error.filename}: another flight runs there, or was killed there; wait for it or remove the folder"
             if error.filename == str(self.place):
-                text = f"{self.place}: is a file; give a folder, or a name that ends in .mcap"
+                text = f"{self.place}: is a file; give a folder or a name that ends in .mcap"
             raise UserError(text, ExitCode.IO) from error
         except OSError as error:
-            raise UserError(f"{error.filename}: {error.strerror}; cannot write there", ExitCode.IO) from error
+            raise UserError(
+                f"{error.filename}: {error.strerror}; choose a place that you may write to", ExitCode.IO
+            ) from error
 
     def __enter__(self) -> FlightFolder:
         return self

@@ -75,7 +75,7 @@ class _Line:
     opened_ns: int
     plugged: bool = True
     heard: bool = False
-    told_silent: bool = False
+    reported_silent: bool = False
     edges: JsonChannel | None = None
     sequence: int = 0
 
@@ -124,8 +124,8 @@ class SimLog(MadeLog):
         line = self._lines[source.port.source]
         silent = now_ns - line.since_ns > SILENT_AFTER_S * 1e9
         state = "absent" if not line.plugged else "silent" if silent else "receiving"
-        if silent and line.plugged and not line.told_silent:
-            line.told_silent = True
+        if silent and line.plugged and not line.reported_silent:
+            line.reported_silent = True
             text = f"no data for {(now_ns - line.since_ns) * 1e-9:.0f} s"
             self.events.post(Severity.WARNING, source.port.source, "silent", text)
         last_ns = source.last_ns if line.heard else None
@@ -143,7 +143,7 @@ class SimLog(MadeLog):
         now_ns = self._host.host_ns(unit.time_s)
         self.go_on(now_ns)
         line = self._lines[unit.source]
-        if line.told_silent:
+        if line.reported_silent:
             self._tell_resumed(line, now_ns)
         line.heard = True
         if line.edges is not None:
@@ -164,7 +164,7 @@ class SimLog(MadeLog):
 
     def _tell_resumed(self, line: _Line, now_ns: int) -> None:
         text = f"data again after {(now_ns - line.since_ns) * 1e-9:.1f} s"
-        line.told_silent = False
+        line.reported_silent = False
         self.events.post(Severity.INFO, line.source.port.source, "resumed", text)
         self.lay_told()
 
@@ -217,11 +217,11 @@ class SimLog(MadeLog):
         now_ns = self._host.host_ns(time_s)
         self.go_on(now_ns)
         line = self._lines[source]
-        line.plugged, line.opened_ns, line.heard, line.told_silent = plugged, now_ns, False, False
+        line.plugged, line.opened_ns, line.heard, line.reported_silent = plugged, now_ns, False, False
         if plugged:
             block = self.events.make(Severity.INFO, source, "device_opened", "opened")
         else:
-            block = self.events.make(Severity.ERROR, source, "device_lost", "unplugged; waiting for it")
+            block = self.events.make(Severity.ERROR, source, "device_lost", "disconnected; waiting for it")
         self._parts.add(block)
 
     def _add_line(self, port: Port, head: int) -> None:

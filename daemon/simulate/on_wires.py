@@ -75,7 +75,7 @@ class WallClock(Output):
         try:
             self._step(0)
         except PermissionError as error:
-            text = "--set-clock: this user may not set the clock; be root, with CAP_SYS_TIME"
+            text = "--set-clock: this user may not set the clock; run as root or with CAP_SYS_TIME"
             raise UserError(text, ExitCode.USAGE) from error
 
     def send(self, data: bytes, due_realtime_ns: int) -> bool:
@@ -152,9 +152,7 @@ def check_steps(facts: FlightFacts, *, set_clock: bool) -> None:
     """Refuse to step this computer's wall clock without permission; raises UserError."""
     if facts.wall_steps and not set_clock:
         steps = ", ".join(f"{step_s:+g} s at {at_s:g} s" for at_s, step_s in facts.wall_steps)
-        text = (
-            f"fault clock_step: refused, it would step this computer's wall clock ({steps}); say --set-clock, as root"
-        )
+        text = f"fault clock_step would step this computer's wall clock ({steps}); allow it with --set-clock, as root"
         raise UserError(text, ExitCode.USAGE)
 
 

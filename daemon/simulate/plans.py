@@ -43,12 +43,12 @@ class FlightOptions:
         _check_installed()
         from swath.sim.plan.plan import load_plan
 
-        with self.told():
+        with self.as_user_errors():
             plan = load_plan(self.plan)
             return plan if self.seed is None else plan.with_seed(self.seed)
 
     @contextlib.contextmanager
-    def told(self, *names: str) -> Iterator[None]:
+    def as_user_errors(self, *names: str) -> Iterator[None]:
         """Turn an error of the plan within the block into a `UserError`.
 
         Args:
@@ -66,29 +66,29 @@ class FlightOptions:
 def _check_installed() -> None:
     missing = [name for name in NEEDS if importlib.util.find_spec(name) is None]
     if missing:
-        text = f"swath sim needs {', '.join(missing)}, not installed here: {how_to_install('sim')}"
+        text = f"swath sim needs {', '.join(missing)}; install with: {how_to_install('sim')}"
         raise UserError(text, ExitCode.USAGE)
 
 
-def make_flight(wish: FlightOptions, truth: Path | None = None) -> tuple[Flight, dict[str, bytes]]:
+def make_flight(options: FlightOptions, truth: Path | None = None) -> tuple[Flight, dict[str, bytes]]:
     """Make a flight, and the files that accompany it except the configuration.
 
     Args:
-        wish: the plan to fly.
+        options: the plan to fly.
         truth: file for the truth; None writes no truth.
 
     Raises:
         UserError: it cannot be flown.
         OSError: the truth cannot be written.
     """
-    plan = wish.load()
+    plan = options.load()
     from swath.sim.companions import companion_files
     from swath.sim.fly import VirtualFlight, open_truth
 
     writer = None if truth is None else open_truth(plan, truth)
     try:
-        with wish.told():
-            flight = VirtualFlight(plan, writer, math.inf if wish.seconds is None else wish.seconds)
+        with options.as_user_errors():
+            flight = VirtualFlight(plan, writer, math.inf if options.seconds is None else options.seconds)
             return flight, companion_files(plan, flight.site, flight.scene)
     except BaseException:
         if writer is not None:
@@ -96,20 +96,20 @@ def make_flight(wish: FlightOptions, truth: Path | None = None) -> tuple[Flight,
         raise
 
 
-def make_flight_in_time(wish: FlightOptions) -> tuple[Flight, dict[str, bytes]]:
+def make_flight_in_time(options: FlightOptions) -> tuple[Flight, dict[str, bytes]]:
     """Make a flight as `make_flight` does, but for real time: all functions that are compiled on first use are compiled
     before.
 
     For this, a moment of the same flight is flown with all scanners on.
     """
-    plan = wish.load()
+    plan = options.load()
     from swath.sim.fly import VirtualFlight
 
     always_on = {name: {"on_lines_only": False} for name in plan.tables.scanner}
-    with wish.told():
+    with options.as_user_errors():
         for _ in VirtualFlight(plan.changed({"scanner": always_on}), None, WARM_UP_S).units():
             pass
-    return make_flight(wish)
+    return make_flight(options)
 
 
 def configuration(plan: Any, wires: dict[str, str] | None, directory: str) -> bytes:
@@ -126,11 +126,11 @@ def configuration(plan: Any, wires: dict[str, str] | None, directory: str) -> by
     return text.encode()
 
 
-def draw(wish: FlightOptions, picture: Path) -> list[dict[str, Any]]:
+def draw(options: FlightOptions, picture: Path) -> list[dict[str, Any]]:
     """Draw a plan and return its coverage: one row for each line and one for all. Raises UserError, OSError."""
-    plan = wish.load()
+    plan = options.load()
     from swath.sim.preview.picture import draw_plan
 
-    with wish.told(str(picture)):
+    with options.as_user_errors(str(picture)):
         rows: list[dict[str, Any]] = draw_plan(plan, picture)
         return rows

@@ -110,7 +110,7 @@ def read_bytes(stream: BufferedIOBase, count: int, path: Path) -> bytes:
     try:
         return stream.read(count)
     except (EOFError, OSError, zlib.error) as error:
-        raise CaptureDamageError(f"{path}: cannot be read on: {error}") from error
+        raise CaptureDamageError(f"{path}: cannot be read further: {error}") from error
 
 
 def read_lines(path: Path, tally: CaptureTally | None = None) -> Iterator[tuple[int, str]]:
@@ -133,4 +133,4 @@ def _read_line(stream: BufferedIOBase, path: Path) -> bytes:
     try:
         return stream.readline(MAX_LINE_BYTES + 1)
     except (EOFError, OSError, zlib.error) as error:
-        raise CaptureDamageError(f"{path}: cannot be read on: {error}") from error
+        raise CaptureDamageError(f"{path}: cannot be read further: {error}") from error

@@ -72,7 +72,7 @@ def _frames(path: Path, channel: str | None, tally: CaptureTally | None) -> Iter
         if dropped is not None and tally is not None:
             tally.passed["frames that candump missed"] += int(dropped[1])
         elif match is None or frame is None or time_ns > LATEST_NS:
-            report(tally, f"{path}: line {number} is no frame of candump -L: {text[:60]}")
+            report(tally, f"{path}: line {number} is not a frame of candump -L: {text[:60]}")
         elif channel is None or match[3] == channel:
             yield CapturedUnit(time_ns, frame, match[3])
 

@@ -103,7 +103,7 @@ def _tell(packets: IpPackets, path: Path, tally: CaptureTally) -> None:
     tally.passed.update({"packets captured twice": packets.copies, "packets without UDP": packets.others})
     missing = packets.incomplete + packets.waiting
     if missing:
-        tally.damaged(f"{path}: {missing} datagrams are not whole, fragments of them are missing")
+        tally.damaged(f"{path}: {missing} datagrams are incomplete, some of their fragments are missing")
 
 
 def _unit(
@@ -119,13 +119,13 @@ def _unit(
     if found is not None and len(found[2]) >= 8:
         from_port, to_port, length = struct.unpack_from(">HHH", found[2])
     if packets.cut > cut_before or (found is not None and length > len(found[2])):
-        report(tally, f"{path}: payloads were cut off when recording; record with snap length 0")
+        report(tally, f"{path}: payloads were cut off at capture; capture with snap length 0 (tcpdump -s 0)")
         return None
     if found is None:
         return None
     if length < 8 or not 0 <= time_ns <= LATEST_NS:
         if tally is not None:
-            tally.passed["packets that are no datagram"] += 1
+            tally.passed["packets that are not datagrams"] += 1
         return None
     source, destination, segment = found
     return CapturedUnit(time_ns, segment[8:length], "udp", (source, from_port), (destination, to_port))
@@ -189,7 +189,7 @@ class _PcapngReader:
             try:
                 packet = self._take(kind, body)
             except (struct.error, IndexError) as error:
-                raise self._damage("a block that does not hold what it should") from error
+                raise self._damage("a block with invalid content") from error
             if packet is not None:
                 yield packet
             head = read_bytes(self._stream, 4, self._path)

@@ -116,7 +116,7 @@ def _layout_of(start: bytes) -> TagLayout:
     """Return the first layout that makes the numbers plausible; for a short file, prefer one that its length fits."""
     possible = [layout for layout in _LAYOUTS if _makes_sense(layout, start)]
     if not possible:
-        raise ValueError("is of no known layout")
+        raise ValueError("has an unknown layout")
     if len(start) < _LOOKED_AT_BYTES:
         possible.sort(key=lambda layout: (len(start) - layout.time.size) % layout.entry.size != 0)
     return possible[0]
@@ -233,7 +233,7 @@ def _seek(stream: BufferedIOBase, offset: int, position: int, path: Path) -> Non
         if offset != position:
             stream.seek(offset)
     except (EOFError, OSError, zlib.error) as error:
-        raise CaptureDamageError(f"{path}: cannot be read on: {error}") from error
+        raise CaptureDamageError(f"{path}: cannot be read further: {error}") from error
 
 
 def _rows(table: Path) -> Iterator[tuple[int, int, int, int]]:
@@ -276,7 +276,7 @@ def _tagged(path: Path, tags: Path) -> Iterator[CapturedUnit]:
                     yield CapturedUnit(time_ns, data, "serial")
                 position = size
         if time_ns is None:
-            raise CaptureDamageError(f"{tags}: holds no time")
+            raise CaptureDamageError(f"{tags}: contains no time")
         while data := read_bytes(stream, _BARE_READ_BYTES, path):  # str2str was stopped between bytes and tag
             yield CapturedUnit(time_ns, data, "serial")
 
@@ -292,7 +292,7 @@ def _take(stream: BufferedIOBase, count: int, path: Path, tags: Path) -> Iterato
     while count:
         data = read_bytes(stream, min(count, MAX_READ_BYTES), path)
         if not data:
-            raise CaptureDamageError(f"{tags}: speaks of {count} bytes more than {path.name} has")
+            raise CaptureDamageError(f"{tags}: counts {count} bytes more than {path.name} holds")
         count -= len(data)
         yield data
 

@@ -38,7 +38,7 @@ def read_date_floor(settings: DeviceSettings) -> dt.date:
     try:
         return dt.date.fromisoformat(value)
     except (TypeError, ValueError):
-        raise DriverSettingsError(f"date_floor: {value!r} is no date; right would be 2009-01-01") from None
+        raise DriverSettingsError(f"date_floor: {value!r} is not a date; want a date such as 2009-01-01") from None
 
 
 def week_of(date: dt.date) -> int:
@@ -67,83 +67,83 @@ class ReceiverDates:
         self._is_head = settings.source.startswith("scanner/")  # a head passes on a receiver's date, without such keys
         weeks = settings.config.get("add_weeks") or 0
         if not isinstance(weeks, int) or weeks % ROLLOVER_WEEKS or weeks < 0:
-            raise DriverSettingsError(f"add_weeks: got {weeks!r}, want a multiple of {ROLLOVER_WEEKS}, as 1024")
+            raise DriverSettingsError(f"add_weeks: got {weeks!r}, want a multiple of {ROLLOVER_WEEKS}")
         self._add_weeks = weeks
         self._moved: tuple[dt.date, dt.date] | None = None  # the first moved date, as reported and as moved
         self._refused: tuple[dt.date, dt.date] | None = None  # the first refused date, as reported, and the host's date
         self._latest: tuple[dt.date | int, int, dt.date | int] | None = None  # as reported, host's day, as accepted
 
-    def date(self, said: dt.date, host_time_ns: int) -> dt.date:
+    def date(self, sent: dt.date, host_time_ns: int) -> dt.date:
         """Return a receiver's date after the move by roll-overs; compare it with `floor`."""
         latest = self._latest
-        if latest is None or latest[0] != said or latest[1] != host_time_ns // DAY_NS:
-            latest = self._latest = said, host_time_ns // DAY_NS, self._date(said, host_time_ns)
+        if latest is None or latest[0] != sent or latest[1] != host_time_ns // DAY_NS:
+            latest = self._latest = sent, host_time_ns // DAY_NS, self._date(sent, host_time_ns)
         assert isinstance(latest[2], dt.date)
         return latest[2]
 
-    def week(self, said: int, host_time_ns: int) -> int:
+    def week(self, sent: int, host_time_ns: int) -> int:
         """Return a receiver's GPS week after the move by roll-overs; compare it with `floor_week`."""
         latest = self._latest
-        if latest is None or latest[0] != said or latest[1] != host_time_ns // DAY_NS:
-            latest = self._latest = said, host_time_ns // DAY_NS, self._week(said, host_time_ns)
+        if latest is None or latest[0] != sent or latest[1] != host_time_ns // DAY_NS:
+            latest = self._latest = sent, host_time_ns // DAY_NS, self._week(sent, host_time_ns)
         assert isinstance(latest[2], int)
         return latest[2]
 
-    def _date(self, said: dt.date, host_time_ns: int) -> dt.date:
+    def _date(self, sent: dt.date, host_time_ns: int) -> dt.date:
         host = UNIX_EPOCH + dt.timedelta(days=min(max(host_time_ns // DAY_NS, 0), 100_000))
         days = 7 * self._add_weeks
         if not days:
-            behind = round((host - said).days / ROLLOVER_DAYS)
-            if behind > 0 and abs((host - said).days - behind * ROLLOVER_DAYS) <= HOST_DAY_TOLERANCE:
+            behind = round((host - sent).days / ROLLOVER_DAYS)
+            if behind > 0 and abs((host - sent).days - behind * ROLLOVER_DAYS) <= HOST_DAY_TOLERANCE:
                 days = behind * ROLLOVER_DAYS
-        if days and said.toordinal() + days <= dt.date.max.toordinal():
-            taken = said + dt.timedelta(days=days)
-            self._moved = self._moved or (said, taken)
+        if days and sent.toordinal() + days <= dt.date.max.toordinal():
+            taken = sent + dt.timedelta(days=days)
+            self._moved = self._moved or (sent, taken)
             return taken
-        if said < self.floor and self._refused is None:
-            self._refused = said, host
-        return said
+        if sent < self.floor and self._refused is None:
+            self._refused = sent, host
+        return sent
 
-    def _week(self, said: int, host_time_ns: int) -> int:
-        if said <= 0 or said > week_of(dt.date.max) - 1:
-            return said
-        middle = GPS_EPOCH + dt.timedelta(days=7 * said + 3)  # the host's day may be any day of the week
+    def _week(self, sent: int, host_time_ns: int) -> int:
+        if sent <= 0 or sent > week_of(dt.date.max) - 1:
+            return sent
+        middle = GPS_EPOCH + dt.timedelta(days=7 * sent + 3)  # the host's day may be any day of the week
         host = UNIX_EPOCH + dt.timedelta(days=min(max(host_time_ns // DAY_NS, 0), 100_000))
         weeks = self._add_weeks
         if not weeks:
-            behind = round((week_of(host) - said) / ROLLOVER_WEEKS)
+            behind = round((week_of(host) - sent) / ROLLOVER_WEEKS)
             apart = (host - middle).days - behind * ROLLOVER_DAYS
             if behind > 0 and abs(apart) <= 3 + HOST_DAY_TOLERANCE:
                 weeks = behind * ROLLOVER_WEEKS
-        first = GPS_EPOCH + dt.timedelta(days=7 * said)
+        first = GPS_EPOCH + dt.timedelta(days=7 * sent)
         if weeks:
-            self._moved = self._moved or (first, GPS_EPOCH + dt.timedelta(days=7 * (said + weeks)))
-            return said + weeks
-        if said < self.floor_week and self._refused is None:
+            self._moved = self._moved or (first, GPS_EPOCH + dt.timedelta(days=7 * (sent + weeks)))
+            return sent + weeks
+        if sent < self.floor_week and self._refused is None:
             self._refused = first, host
-        return said
+        return sent
 
     def remarks(self) -> list[str]:
         """Return lines for the user about moved dates, with the reason, and about refused dates, with the remedy."""
         lines = []
         if self._moved is not None:
-            said, taken = self._moved
-            behind = (taken - said).days // ROLLOVER_DAYS
-            why = "gnss.….add_weeks says so" if self._add_weeks else "the host's clock shows that day"
+            sent, taken = self._moved
+            behind = (taken - sent).days // ROLLOVER_DAYS
+            why = "gnss.….add_weeks is set" if self._add_weeks else "the host clock shows that date"
             lines.append(
-                f"{self._source}: says {said}, {behind} roll-over{'s' if behind > 1 else ''} of {ROLLOVER_WEEKS} weeks "
-                f"behind: taken as {taken}, for {why}"
+                f"{self._source}: sends the date {sent}, {behind} roll-over{'s' if behind > 1 else ''} of "
+                f"{ROLLOVER_WEEKS} weeks behind; corrected to {taken}, because {why}"
             )
         if self._refused is not None:
-            said, host = self._refused
-            later = said + dt.timedelta(days=ROLLOVER_DAYS)
+            sent, host = self._refused
+            later = sent + dt.timedelta(days=ROLLOVER_DAYS)
             floor = "" if self._is_head else f" (gnss.{self._name}.date_floor)"
-            remedy = f"want gnss.{self._name}.add_weeks = {ROLLOVER_WEEKS} if that is right, or an older date_floor"
+            remedy = f"if so, set gnss.{self._name}.add_weeks = {ROLLOVER_WEEKS}; otherwise set an older date_floor"
             if self._is_head:
-                remedy = "want a receiver at the head that knows the date, or a receiver in the log"
+                remedy = "connect a receiver with the right date to the head, or record a receiver"
             lines.append(
-                f"{self._source}: says {said}, before {self.floor}{floor}: probably one roll-over of {ROLLOVER_WEEKS} "
-                f"weeks behind, which makes {later}, and the host's clock says {host}; {remedy}"
+                f"{self._source}: sends the date {sent}, before {self.floor}{floor}: probably one roll-over of "
+                f"{ROLLOVER_WEEKS} weeks behind (then {later}; the host clock shows {host}); {remedy}"
             )
         return lines
 

@@ -30,7 +30,7 @@ def profile_map(
     """
     if settings.config.get("sample") == "increment":
         raise DriverSettingsError(
-            'sample: got "increment"; this device\'s messages are rates, want "mean" or "instant"'
+            'sample: got "increment"; this device\'s messages hold rates; want "mean" or "instant"'
         )
     config = {**settings.config, "signals": signals, "dbc": name, "group": settings.config.get("group") or "first"}
     found = map_signals(DeviceSettings(settings.source, config, {"dbc": contents}))
@@ -45,7 +45,7 @@ def _can_ids(config: Mapping[str, Any], defaults: Mapping[str, int]) -> dict[str
     given = dict(config.get("ids") or {})
     unknown = sorted(set(given) - set(defaults))
     if unknown:
-        raise DriverSettingsError(f"ids.{unknown[0]} is unknown; there are: {', '.join(sorted(defaults))}")
+        raise DriverSettingsError(f"ids.{unknown[0]}: unknown message; there are: {', '.join(sorted(defaults))}")
     numbers = {name: given.get(name, word & CAN_EFF_MASK) for name, word in defaults.items()}
     messages: dict[int, str] = {}
     for name, number in numbers.items():

@@ -297,16 +297,16 @@ class Nmea2000Parser(PacketParser):
         if tag is None:
             return records
         lat_deg, lon_deg = lat * 1e-16, lon * 1e-16
-        said = is_available(lat, 63) and is_available(lon, 63)
-        if said and (abs(lat_deg) > 90.0 or abs(lon_deg) > 180.0):
+        has_position = is_available(lat, 63) and is_available(lon, 63)
+        if has_position and (abs(lat_deg) > 90.0 or abs(lon_deg) > 180.0):
             self._count_bad(1, "bad_value")
             return records
-        fix_type = METHODS.get(method, FixType.NONE) if said else FixType.NONE
+        fix_type = METHODS.get(method, FixType.NONE) if has_position else FixType.NONE
         fix = GnssFix(
             host_time_ns=host_time_ns,
             time=tag,
-            lat_rad=radians(lat_deg) if said else None,
-            lon_rad=radians(lon_deg) if said else None,
+            lat_rad=radians(lat_deg) if has_position else None,
+            lon_rad=radians(lon_deg) if has_position else None,
             height_m=None,  # senders disagree about the reference of their altitude
             fix_type=fix_type,
             satellites=satellites if is_available(satellites, 8) else None,

@@ -89,7 +89,7 @@ def signal_map(settings: DeviceSettings) -> SignalMap:
     """
     if settings.config.get("tick_hz") is None:
         raise DriverSettingsError(
-            "tick_hz: say 1000000 or 10000: the maker's documents contradict each other on the unit of SampleTime"
+            "tick_hz: missing; want 1000000 or 10000, as the maker's documents differ on the unit of SampleTime"
         )
     order = settings.config.get("byte_order") or "big"
     if order not in BYTE_ORDERS:

@@ -89,7 +89,7 @@ class DescriptorTransport(Transport):
         """Open the device and reset the counters."""
         with self._reading, self._sending, self._counting:
             if self._gate is not None:
-                raise TransportError(f"{self.name}: is open already")
+                raise TransportError(f"{self.name}: is already open")
             self.counters = TransportCounters()
             self._held = None
             self._gate = Gate(self._open_device())

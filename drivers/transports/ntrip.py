@@ -38,8 +38,8 @@ _STATUS = re.compile(r"[0-9]{3}")  # RFC 9112, 4
 _CHUNK_LENGTH = re.compile(rb"[0-9A-Fa-f]{1,16}")  # RFC 9112, 7.1; no caster sends more than 64 bits
 _KEEPALIVE = ((socket.TCP_KEEPIDLE, 10), (socket.TCP_KEEPINTVL, 5), (socket.TCP_KEEPCNT, 3))
 _REFUSALS = {
-    401: "the caster refuses user or password",
-    403: "the caster does not let this user have the mountpoint",
+    401: "the caster rejects user or password; check user and password_env",
+    403: "the caster does not allow this user to read the mountpoint",
     404: "the caster has no such mountpoint",
     503: "the caster has no data for the mountpoint at present",
 }
@@ -68,10 +68,10 @@ class NtripTransport(DescriptorTransport):
         while not attempt.wait(SLICE_S):
             if self._stopped() and not attempt.wait(0.0):
                 attempt.leave()
-                raise TransportError(f"{self.name}: not connected in the time")
+                raise TransportError(f"{self.name}: not connected in time")
             if time.monotonic() > limit_s:
                 attempt.leave()
-                raise TransportError(f"{self.name}: no connection within {OPEN_S:g} s; is the network there?")
+                raise TransportError(f"{self.name}: no connection within {OPEN_S:g} s; check the network")
         self._sock = attempt.result()
         self._heard_s = time.monotonic()
         self._told_s = -math.inf
@@ -111,7 +111,7 @@ class NtripTransport(DescriptorTransport):
             or not words[0].startswith(("ICY", "HTTP/"))
             or fields.get("content-type", "").startswith("text/")
         ):
-            raise TransportError(f"{self.name}: answers {_printable(lines[0])}; is it an NTRIP caster?")
+            raise TransportError(f"{self.name}: answers {_printable(lines[0])}; check that this is an NTRIP caster")
         self._chunks = _Chunks() if "chunked" in fields.get("transfer-encoding", "") else None
         sock.setblocking(False)
 
@@ -124,7 +124,7 @@ class NtripTransport(DescriptorTransport):
         lines.append("User-Agent: NTRIP swath")
         user, variable = spec.options.get("user"), spec.options.get("password_env")
         if variable is not None and variable not in os.environ:
-            raise TransportError(f"{self.name}: password_env={variable}: there is no such environment variable")
+            raise TransportError(f"{self.name}: password_env={variable}: this environment variable is not set")
         if user is not None:
             secret = f"{user}:{os.environ[variable] if variable else ''}".encode()
             lines.append(f"Authorization: Basic {base64.b64encode(secret).decode()}")
@@ -149,7 +149,7 @@ class NtripTransport(DescriptorTransport):
                     return data.partition(b"\r\n")[0], data.partition(b"\r\n")[2]
                 raise TransportError(f"{self.name}: the caster closed the connection without an answer")
             data += more
-        raise TransportError(f"{self.name}: answers without an end; is it an NTRIP caster?")
+        raise TransportError(f"{self.name}: its answer does not end; check that this is an NTRIP caster")
 
     def _not_in_table(self, sock: socket.socket) -> str:
         """Read the source table that the caster sent in place of data, and explain it to the user."""
@@ -167,21 +167,21 @@ class NtripTransport(DescriptorTransport):
         shown = ", ".join(names[:MOST_NAMED]) or "none"
         more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
         if self._spec.mountpoint in names:
-            return "the caster sends its table in place of this mountpoint's data: may this user have it?"
+            return "the caster sends its table instead of this mountpoint's data; check that this user may read it"
         return f"the caster has no mountpoint {self._spec.mountpoint}; it has: {shown}{more}"
 
     def _why(self, error: OSError | UnicodeError) -> str:
         host, port = self._spec.ntrip_host, self._spec.ntrip_port
         if isinstance(error, UnicodeError):
-            return f"{self.name}: {host} is no name that can be looked up"
+            return f"{self.name}: {host} is not a valid host name"
         if isinstance(error, socket.gaierror):
-            return f"{self.name}: the name {host} is not known; is there a network?"
+            return f"{self.name}: the host name {host} is unknown; check the name and the network"
         if isinstance(error, TimeoutError):
             return f"{self.name}: no answer from {host} port {port} in {CONNECT_S:g} s"
         if error.errno == errno.ECONNREFUSED:
-            return f"{self.name}: {host} has nothing on port {port}; casters are mostly on 2101"
+            return f"{self.name}: {host} refuses port {port}; most casters use 2101"
         if error.errno in (errno.ENETUNREACH, errno.EHOSTUNREACH):
-            return f"{self.name}: no way to {host}; is there a network?"
+            return f"{self.name}: {host} is unreachable; check the network"
         return f"{self.name}: cannot connect: {error.strerror or error}"
 
     def _close_device(self) -> None:
@@ -231,7 +231,7 @@ class NtripTransport(DescriptorTransport):
         rest = memoryview(data)
         while rest:
             if not wait_writable(self._sock.fileno(), deadline_s):
-                raise TransportError(f"{self.name}: the caster takes no data")
+                raise TransportError(f"{self.name}: the caster accepts no data")
             try:
                 rest = rest[self._sock.send(rest) :]
             except BlockingIOError:

@@ -33,7 +33,7 @@ def open_transport(spec: TransportSpec, stopped: Callable[[], bool] = lambda: Fa
         return _open_can(spec)
     if spec.kind == "ntrip":
         return NtripTransport(spec, stopped)
-    raise ValueError(f"transport {spec.text!r}: is inside another device's stream, there is nothing to open")
+    raise ValueError(f"transport {spec.text!r}: is inside the stream of another device and cannot be opened itself")
 
 
 def _open_can(spec: TransportSpec) -> Transport:

@@ -96,10 +96,10 @@ class SerialTransport(DescriptorTransport):
 
     def _why_not_opened(self, error: BaseException) -> str:
         if is_no_serial_port(error):
-            return f"{self.name}: {self._path} is no serial port; see `ls /dev/serial/by-id`"
+            return f"{self.name}: {self._path} is not a serial port; see `ls /dev/serial/by-id`"
         number = getattr(error, "errno", None)
         if number == errno.ENOENT:
-            return f"{self.name}: there is no {self._path}"
+            return f"{self.name}: {self._path} does not exist"
         if number in (errno.EACCES, errno.EPERM):
             return f"{self.name}: {self._path} is not permitted to this user; add it to the group dialout"
         if number in (errno.EAGAIN, errno.EBUSY):
@@ -150,14 +150,14 @@ class SerialTransport(DescriptorTransport):
         return [UnitBlock(np.frombuffer(data, np.uint8)[np.newaxis, :])]
 
     def _gone(self, reason: str) -> str:
-        return f"{self.name}: {self._path} has gone ({reason.lower()})"
+        return f"{self.name}: {self._path} was disconnected ({reason.lower()})"
 
     def _send(self, data: bytes) -> None:
         deadline_s = time.monotonic() + SEND_TIMEOUT_S
         rest = memoryview(data)
         while rest:
             if not wait_writable(self._fd, deadline_s):
-                raise TransportError(f"{self.name}: {self._path} takes no data; is flow control on?")
+                raise TransportError(f"{self.name}: {self._path} accepts no data; check flow control")
             try:
                 rest = rest[os.write(self._fd, rest) :]
             except BlockingIOError:

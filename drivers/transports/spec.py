@@ -112,7 +112,7 @@ def refuse_unprintable(what: str, text: str) -> None:
     byte.
     """
     if not text.isprintable():
-        raise ValueError(f"{what} {text!r}: has an unprintable character in it; want a path, name or address")
+        raise ValueError(f"{what} {text!r}: contains an unprintable character; want a path, name or address")
 
 
 def _parse_options(text: str, query: str) -> dict[str, str]:
@@ -122,7 +122,7 @@ def _parse_options(text: str, query: str) -> dict[str, str]:
         if not key or not equals or not value:
             raise ValueError(f"transport {text!r}: option {item!r} should be <keyword>=<value>, joined by '&'")
         if key in options:
-            raise ValueError(f"transport {text!r}: option {key!r} stands twice")
+            raise ValueError(f"transport {text!r}: option {key!r} is given twice")
         options[key] = value
     return options
 
@@ -272,7 +272,7 @@ def _check_can(spec: TransportSpec) -> None:
         known = ", ".join(sorted(VALID_INTERFACES))
         raise ValueError(f"transport {spec.text!r}: unknown CAN interface {spec.interface!r}; python-can has: {known}")
     if taken := [key for key in ("interface", "channel", "ignore_config") if key in spec.options]:
-        raise ValueError(f"transport {spec.text!r}: {taken[0]} is no option; want can:<interface>:<channel>?…")
+        raise ValueError(f"transport {spec.text!r}: {taken[0]} is not an option; want can:<interface>:<channel>?…")
 
 
 def _check_gnss(spec: TransportSpec) -> None:
@@ -300,7 +300,7 @@ def _check_ntrip(spec: TransportSpec) -> None:
         raise ValueError(f"transport {spec.text!r}: port {port!r} should be 1 to 65535, such as 2101")
     if not _can_be_asked_for(spec.ntrip_host):
         raise ValueError(
-            f"transport {spec.text!r}: host {spec.ntrip_host!r} is no name that can be looked up: "
+            f"transport {spec.text!r}: host {spec.ntrip_host!r} is not a valid host name: "
             "want 1 to 63 letters between its dots"
         )
     _check_options(spec, NTRIP_OPTIONS)

@@ -105,13 +105,13 @@ class UdpTransport(DescriptorTransport):
         if error.errno == errno.EADDRINUSE:
             return f"{self.name}: port {port} is in use by {udp_port_holder(port)}"
         if error.errno == errno.EADDRNOTAVAIL:
-            return f"{self.name}: this machine has no address {host}; 0.0.0.0 listens on every interface"
+            return f"{self.name}: this computer has no address {host}; use 0.0.0.0 to listen on every interface"
         if error.errno == errno.EACCES:
-            return f"{self.name}: port {port} is not permitted to this user; ports below 1024 are the system's"
+            return f"{self.name}: port {port} is not permitted to this user; use a port of 1024 or above"
         if error.errno == errno.ENODEV and "interface" in self._spec.options:
             return f"{self.name}: no network interface {self._spec.options['interface']} with an IPv4 address"
         if error.errno == errno.ENODEV:
-            return f"{self.name}: no network interface reaches the group; say ?interface=<name>"
+            return f"{self.name}: no network interface reaches the group; add ?interface=<name>"
         return f"{self.name}: cannot open: {error.strerror or error}"
 
     def _close_device(self) -> None:
@@ -152,7 +152,7 @@ class UdpTransport(DescriptorTransport):
             except OSError:
                 same = False
             if not same:
-                raise TransportError(f"{self.name}: network interface {interface} has gone, or came back as another")
+                raise TransportError(f"{self.name}: network interface {interface} has gone or was replaced")
         elif group is not None:
             with contextlib.suppress(OSError):  # joined there already, or no route just now
                 self._join(self._sock, group, self._spec.host)
@@ -185,7 +185,7 @@ class UdpTransport(DescriptorTransport):
         """Send to the group, or to the accepted sender at the same port number."""
         target = self._spec.options.get("group") or self._source
         if target is None:
-            raise TransportError(f"{self.name}: has nobody to send to; say ?source=<address> or ?group=<address>")
+            raise TransportError(f"{self.name}: has no address to send to; add ?source=<address> or ?group=<address>")
         assert self._sock is not None
         try:
             self._sock.sendto(data, (target, self._spec.port))

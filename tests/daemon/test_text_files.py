@@ -41,7 +41,7 @@ def test_what_is_no_text_is_refused_in_one_line(tmp_path: Path, content: bytes) 
     file.write_bytes(content)
     with pytest.raises(UserError) as refused:
         text_of(file)
-    assert refused.value.message == f"{file}: cannot be read: no text; want a CSV file"
+    assert refused.value.message == f"{file}: cannot be read: not text; want a CSV file"
     assert refused.value.exit_code == ExitCode.IO
     with pytest.raises(ConfigError, match="not UTF-8 text; want a TOML file"):
         load_config(file)

@@ -106,7 +106,7 @@ def test_an_interface_that_goes_down_and_comes_up(vcan: str) -> None:
     receiver.open()
     timer = threading.Timer(0.3, ip, ("link", "set", "down", vcan))
     timer.start()
-    with pytest.raises(TransportError, match=f"{vcan} is down; `ip link set {vcan} up type can bitrate 500000`"):
+    with pytest.raises(TransportError, match=f"{vcan} is down; run `ip link set {vcan} up type can bitrate 500000`"):
         receiver.receive(30.0)
     timer.join()
     receiver.close()
@@ -132,7 +132,7 @@ def test_an_interface_that_is_taken_away(vcan: str) -> None:
     with pytest.raises(TransportError, match=f"{vcan} is gone"):
         receiver.send(encode_can_frame(1, b""))
     receiver.close()
-    with pytest.raises(TransportError, match=f"no network interface {vcan}"):
+    with pytest.raises(TransportError, match=f"network interface {vcan} does not exist"):
         receiver.open()
 
 

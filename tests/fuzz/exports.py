@@ -15,7 +15,7 @@ from unittest.mock import patch
 import numpy as np
 
 from swath.daemon.config import load_config
-from swath.daemon.exchange.capture_files import Told, find_captures
+from swath.daemon.exchange.capture_files import ImportOptions, find_captures
 from swath.daemon.exchange.export import MANIFEST, export_session
 from swath.daemon.exchange.import_ import merge
 from swath.daemon.exchange.offload import NAME, ChecksumList
@@ -110,7 +110,7 @@ def _imports(target: str, place: Place) -> Target:
 def _imported(folder: Path) -> Iterator[str]:
     """What `swath import` does before it writes."""
     routes = _routes()
-    captures = find_captures(routes, [folder], Told(start_ns={"": 0}))
+    captures = find_captures(routes, [folder], ImportOptions(start_ns={"": 0}))
     for unit in islice(merge(captures, routes), UNITS):
         yield f"{unit.port.source} {len(unit.data).bit_length()}"
     for capture in captures:

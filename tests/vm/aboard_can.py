@@ -181,7 +181,7 @@ def trouble() -> None:
             frames.append(bus.send(0x300, struct.pack("<Q", number)))
         time.sleep(0.5)
         sh("ip link delete vcan0")
-        recorder.wait_said("no network interface vcan0")
+        recorder.wait_said("network interface vcan0 does not exist")
         make_vcan(mtu=72)
         listening(recorder, 3)
         bus = Bus("vcan0")

@@ -78,9 +78,9 @@ def chunk_batches(
         opcode, length = _HEAD.unpack_from(data, at)
         end = at + _HEAD.size + length
         if end > size:
-            raise LogError("chunk in which a record reaches beyond its end")
+            raise LogError("chunk with a record that extends beyond its end")
         if opcode == 0:
-            raise LogError("chunk with a record of no kind")
+            raise LogError("chunk with a record of an unknown kind")
         if opcode == OP_MESSAGE and length >= _MESSAGE_HEAD - _HEAD.size:
             stride = end - at
             count = _run_length(data, at, stride)
@@ -116,7 +116,7 @@ def json_objects(batch: LogBatch) -> Iterator[tuple[int, dict[str, Any]]]:
 def damage_within(chunk: Record, lost: Counter[str]) -> Damage:
     """Describe the messages lost from an otherwise good chunk, with the reasons."""
     reasons = sorted(lost)
-    more = f" and {len(reasons) - 3} reasons more" if len(reasons) > 3 else ""
+    more = f" and {len(reasons) - 3} more reasons" if len(reasons) > 3 else ""
     return Damage(chunk.offset, chunk.length, "; ".join(reasons[:3]) + more, lost.total())
 
 
@@ -144,7 +144,7 @@ def _batch(spec: ChannelSpec, channel_id: int, rows: ByteRows, lost: Counter[str
     times: Int64Array = rows[:, 15:23].copy().view("<i8")[:, 0]
     timeless = times < 0
     if timeless.any():  # beyond the year 2262, which signed 64-bit times cannot hold
-        _lose(lost, "messages with a time that cannot be", int(timeless.sum()))
+        _lose(lost, "messages with an impossible time", int(timeless.sum()))
         times, rows = times[~timeless], rows[~timeless]
     return LogBatch(spec, channel_id, times, rows)
 

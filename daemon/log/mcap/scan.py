@@ -118,7 +118,7 @@ def scan(
 def _scan(file: BinaryIO, size: int, *, chunks: bool, wanted: ChannelFilter | None) -> Iterator[Record | Damage]:
     file.seek(0)
     if file.read(len(MAGIC)) != MAGIC:
-        raise LogError("is no MCAP file")
+        raise LogError("is not an MCAP file")
     offset = len(MAGIC)
     while offset < size:
         found = _read_record(file, offset, size, chunks=chunks, wanted=wanted)
@@ -144,7 +144,7 @@ def _scan(file: BinaryIO, size: int, *, chunks: bool, wanted: ChannelFilter | No
                 return
             yield Damage(offset, resumed - offset, "unreadable bytes")
             offset = resumed
-    yield Damage(size, 0, "the file has no end: its index and footer were never written")
+    yield Damage(size, 0, "the file is incomplete: its index and footer were never written")
 
 
 def _joined(one: Damage, other: Damage) -> Damage:

@@ -33,7 +33,7 @@ IMU_LOGS = ("RAWIMUSXB ONNEW", "INSPVASB ONTIME 0.02", "INSPVAXB ONTIME 1", "INS
 SAVE = "SAVECONFIG"
 
 
-def startup_messages(settings: DeviceSettings, wish: StartupOptions) -> tuple[StartupMessage, ...]:
+def startup_messages(settings: DeviceSettings, options: StartupOptions) -> tuple[StartupMessage, ...]:
     """Return commands for the baud rate where it changes, PPS, and logs of time, position, events and raw measurements.
 
     Raises:
@@ -41,7 +41,9 @@ def startup_messages(settings: DeviceSettings, wish: StartupOptions) -> tuple[St
     """
     setup = read_setup(settings)
     if setup.port is not None:
-        raise DriverSettingsError(f"setup.port: got {setup.port!r}; novatel logs to the port that it is asked by")
+        raise DriverSettingsError(
+            f"setup.port: got {setup.port!r}; a NovAtel receiver sends to the port that it is asked on; remove the key"
+        )
     period_s = f"{1 / setup.rate_hz:g}"
     logs = ["TIMEB ONTIME 1", f"BESTPOSB ONTIME {period_s}", f"BESTVELB ONTIME {period_s}", *EVENT_LOGS]
     if settings.config.get("secondary_lever_arm_m") is not None:
@@ -49,19 +51,19 @@ def startup_messages(settings: DeviceSettings, wish: StartupOptions) -> tuple[St
     if setup.raw:
         logs += RAW_LOGS
     messages = [_command(PULSE), *(_command(f"LOG {log}") for log in logs)]
-    if wish.baud is not None:
+    if options.baud is not None:
         # break detection off: bytes at another rate may look like a break, which sets the port back to 9600
-        messages.insert(0, _command(f"SERIALCONFIG THISPORT {wish.baud} N 8 1 N OFF", baud=wish.baud))
-    return (*messages, *_saving(wish))
+        messages.insert(0, _command(f"SERIALCONFIG THISPORT {options.baud} N 8 1 N OFF", baud=options.baud))
+    return (*messages, *_saving(options))
 
 
-def imu_startup_messages(settings: DeviceSettings, wish: StartupOptions) -> tuple[StartupMessage, ...]:
+def imu_startup_messages(settings: DeviceSettings, options: StartupOptions) -> tuple[StartupMessage, ...]:
     """Return commands for the logs of the IMU and INS in a receiver's stream."""
-    return (*(_command(f"LOG {log}") for log in IMU_LOGS), *_saving(wish))
+    return (*(_command(f"LOG {log}") for log in IMU_LOGS), *_saving(options))
 
 
-def _saving(wish: StartupOptions) -> tuple[StartupMessage, ...]:
-    return (_command(SAVE, last=True),) if wish.save else ()
+def _saving(options: StartupOptions) -> tuple[StartupMessage, ...]:
+    return (_command(SAVE, last=True),) if options.save else ()
 
 
 def _command(text: str, *, baud: int | None = None, last: bool = False) -> StartupMessage:

@@ -27,7 +27,7 @@ SAVE = "exeCopyConfigFile, Current, Boot"
 EVENT_STREAM, FIX_STREAM, SECOND_STREAM, HEADING_STREAM, INS_STREAM, IMU_STREAM = range(1, 7)
 
 
-def startup_messages(settings: DeviceSettings, wish: StartupOptions) -> tuple[StartupMessage, ...]:
+def startup_messages(settings: DeviceSettings, options: StartupOptions) -> tuple[StartupMessage, ...]:
     """Return commands for the baud rate where it changes, PPS, and streams of time, position, events and raw
     measurements.
 
@@ -46,19 +46,21 @@ def startup_messages(settings: DeviceSettings, wish: StartupOptions) -> tuple[St
     if settings.config.get("secondary_lever_arm_m") is not None:
         commands.append(_stream(HEADING_STREAM, port, HEADING_BLOCKS, period))
     messages = [_command(text) for text in commands]
-    if wish.baud is not None and port.startswith("COM"):
-        messages.insert(0, _command(f"setCOMSettings, {port}, baud{wish.baud}, bits8, No, bit1, none", baud=wish.baud))
-    return (*messages, *_saving(wish))
+    if options.baud is not None and port.startswith("COM"):
+        messages.insert(
+            0, _command(f"setCOMSettings, {port}, baud{options.baud}, bits8, No, bit1, none", baud=options.baud)
+        )
+    return (*messages, *_saving(options))
 
 
-def imu_startup_messages(settings: DeviceSettings, wish: StartupOptions) -> tuple[StartupMessage, ...]:
+def imu_startup_messages(settings: DeviceSettings, options: StartupOptions) -> tuple[StartupMessage, ...]:
     """Return commands for the streams of the INS and its IMU, on the port in the receiver's own ``setup``."""
     port = _port(settings)
     commands = (
         _stream(INS_STREAM, port, "INSNavGeod", "msec20"),
         _stream(IMU_STREAM, port, "ExtSensorMeas", "OnChange"),
     )
-    return (*(_command(text) for text in commands), *_saving(wish))
+    return (*(_command(text) for text in commands), *_saving(options))
 
 
 def _port(settings: DeviceSettings) -> str:
@@ -72,8 +74,8 @@ def _stream(number: int, port: str, blocks: str, interval: str) -> str:
     return f"setSBFOutput, Stream{number}, {port}, {blocks}, {interval}"
 
 
-def _saving(wish: StartupOptions) -> tuple[StartupMessage, ...]:
-    return (_command(SAVE, last=True),) if wish.save else ()
+def _saving(options: StartupOptions) -> tuple[StartupMessage, ...]:
+    return (_command(SAVE, last=True),) if options.save else ()
 
 
 def _command(text: str, *, baud: int | None = None, last: bool = False) -> StartupMessage:

@@ -96,8 +96,8 @@ def _position(pvt: ubx.NavPvt | None, high: ubx.NavHpposllh | None) -> Position 
 
 def _undulation_m(pvt: ubx.NavPvt | None, high: ubx.NavHpposllh | None) -> float | None:
     """Return the geoid's height above the ellipsoid: ellipsoidal height less height above mean sea level, m."""
-    told = high if high is not None else pvt
-    return None if told is None else (told.height_mm - told.height_msl_mm) / 1e3
+    best = high if high is not None else pvt
+    return None if best is None else (best.height_mm - best.height_msl_mm) / 1e3
 
 
 def _accuracy_cov(horizontal: float, vertical: float) -> NDArray[np.float64]:

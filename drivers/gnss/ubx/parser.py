@@ -171,11 +171,11 @@ class UbxParser(StreamParser):
             date = dt.date(message.year, message.month, message.day)
         except ValueError:
             raise MessageError("date") from None
-        leap, said = leap_seconds_of(date, milliseconds, message.itow_ms), self._leap_seconds
+        leap, known = leap_seconds_of(date, milliseconds, message.itow_ms), self._leap_seconds
         date = self._dates.date(date, host_time_ns)
-        if leap is not None and said is not None and said != leap:
+        if leap is not None and known is not None and known != leap:
             self.counters.errors["utc_contradicts_leap"] += 1
-            milliseconds, leap = milliseconds + (leap - said) * 1000, said
+            milliseconds, leap = milliseconds + (leap - known) * 1000, known
         if milliseconds < 0 and date > dt.date.min:
             date, milliseconds = date - dt.timedelta(days=1), milliseconds + DAY_MS
         elif milliseconds >= DAY_MS + 1000 and date < dt.date.max:

@@ -101,7 +101,7 @@ def encode_valset(items: tuple[Item, ...], layers: int) -> bytes:
     return encode_frame(CFG_VALSET, payload)
 
 
-def startup_messages(settings: DeviceSettings, wish: StartupOptions) -> tuple[StartupMessage, ...]:
+def startup_messages(settings: DeviceSettings, options: StartupOptions) -> tuple[StartupMessage, ...]:
     """Return messages that set UBX output, rates, time pulse and messages; the baud rate first where it changes.
 
     Raises:
@@ -111,7 +111,7 @@ def startup_messages(settings: DeviceSettings, wish: StartupOptions) -> tuple[St
     port = setup.port or "UART1"
     if port not in PORT_PLACES:
         raise DriverSettingsError(f"setup.port: got {port!r}, want one of: {', '.join(PORT_PLACES)}")
-    layers = LAYER_RAM | LAYER_BBR | (LAYER_FLASH if wish.save else 0)
+    layers = LAYER_RAM | LAYER_BBR | (LAYER_FLASH if options.save else 0)
     groups = [
         (Item(f"CFG-{port}OUTPROT-UBX", UBX_OUTPUT[port], 1),),
         (
@@ -126,9 +126,9 @@ def startup_messages(settings: DeviceSettings, wish: StartupOptions) -> tuple[St
     groups += [(_message_rate(name, port, 1),) for name in each_epoch]
     groups += [(_message_rate(name, port, setup.rate_hz),) for name in each_second]
     messages = [_valset(items, layers) for items in groups]
-    if wish.baud is not None and port in BAUD_RATES:
-        rate = Item(f"CFG-{port}-BAUDRATE", BAUD_RATES[port], wish.baud)
-        messages.insert(0, _valset((rate,), layers, wish.baud))
+    if options.baud is not None and port in BAUD_RATES:
+        rate = Item(f"CFG-{port}-BAUDRATE", BAUD_RATES[port], options.baud)
+        messages.insert(0, _valset((rate,), layers, options.baud))
     return tuple(messages)
 
 

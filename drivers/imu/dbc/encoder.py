@@ -71,11 +71,11 @@ def encode_latch(signals: SignalMap, ticks: int) -> bytes:
     """Encode the frame of the message with the counter latched at a PPS edge.
 
     Raises:
-        ValueError: the latched counter has no message of its own, or the message has more than 8 bytes.
+        ValueError: the latched counter needs a message of its own, or the message has more than 8 bytes.
     """
     latch = signals.pps_ticks
     if latch is None or latch.part < signals.grouped:
-        raise ValueError("the latched counter has no message of its own")
+        raise ValueError("the latched counter needs a message of its own")
     word = _placed(latch.layout, np.array([ticks], np.int64).astype(np.uint64))
     frame: bytes = _frames(signals, latch.part, word)[0].tobytes()
     return frame

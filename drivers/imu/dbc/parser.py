@@ -128,8 +128,8 @@ class DbcParser(PacketParser):
         elif grouped.any():
             names = " and ".join(dict.fromkeys(part.message for part in self._map.parts[: self._map.grouped]))
             self.doubts = (
-                f"the frames of {names} come evenly, so that which of them are one sample is not certain: specific "
-                'force and angular rate may be a sample apart; say group = "last" or "first"',
+                f"the frames of {names} are evenly spaced, so it is uncertain which of them form one sample: specific "
+                'force and angular rate may be one sample apart; set group = "last" or "first"',
             )
         self._rule_is_open, self._unread = False, no_frames(self._width)
 

@@ -101,7 +101,7 @@ class _PartList:
                 if found.selector is None and len(mine) > 1:
                     raise DriverSettingsError(
                         f"signal {found.layout.name} is in every frame of {found.message}, whose other signals are "
-                        "multiplexed in several: which frame makes the sample is not defined"
+                        "multiplexed in several: it is undefined which frame completes a sample"
                     )
                 self.parts[number] = self._widened(part, found)
                 return number
@@ -128,7 +128,7 @@ def map_signals(settings: DeviceSettings) -> SignalMap:
     """
     config = settings.config
     if "dbc" not in settings.files:
-        raise DriverSettingsError("dbc: the DBC file is missing")
+        raise DriverSettingsError("dbc: missing; want the DBC file")
     file_name = str(config.get("dbc") or "the DBC file")
     found = _find_all(config, load_database(settings.files["dbc"]), file_name)
     if "pps_ticks" in found and "sample_ticks" not in found:
@@ -172,7 +172,7 @@ def _find_all(config: Mapping[str, Any], database: Any, file_name: str) -> dict[
     names = {key: value for key, value in dict(config.get("signals") or {}).items() if value}
     unknown = sorted(set(names) - {*VECTORS, *SCALARS})
     if unknown:
-        raise DriverSettingsError(f"signals.{unknown[0]} is unknown; there are: {', '.join((*VECTORS, *SCALARS))}")
+        raise DriverSettingsError(f"signals.{unknown[0]}: unknown signal; there are: {', '.join((*VECTORS, *SCALARS))}")
     found: dict[str, list[FoundSignal]] = {}
     for key in VECTORS:
         value = names.get(key)
@@ -192,7 +192,7 @@ def _refuse_axis_twice(names: Mapping[str, Any]) -> None:
     axes = [str(path) for key in VECTORS for path in names[key]]
     twice = next((path for path in axes if axes.count(path) > 1), None)
     if twice is not None:
-        raise DriverSettingsError(f"signals: {twice} is named for two axes; want another signal for each")
+        raise DriverSettingsError(f"signals: {twice} is named for two axes; give each axis its own signal")
 
 
 def _factors(

@@ -121,9 +121,9 @@ def signal_layout(message: Any, signal: Any) -> SignalLayout:
     name = f"{message.name}.{signal.name}"
     length = int(signal.length)
     if length > WORD_BITS:
-        raise DriverSettingsError(f"signal {name} has {length} bits; 64 are the most that can be read")
+        raise DriverSettingsError(f"signal {name} has {length} bits; want at most 64")
     if signal.is_float and length not in FLOAT_TYPES:
-        raise DriverSettingsError(f"signal {name} is a float of {length} bits; 16, 32 and 64 are right")
+        raise DriverSettingsError(f"signal {name} is a float of {length} bits; want 16, 32 or 64")
     big_endian = signal.byte_order == "big_endian"
     start = int(signal.start)
     if big_endian:  # bits counted from the highest bit of byte 0
@@ -184,7 +184,9 @@ def find_signal(database: Any, path: str, file_name: str) -> FoundSignal:
         raise DriverSettingsError(f"signal {path!r} is not of the form MESSAGE.signal")
     messages = {message.name: message for message in database.messages}
     if sum(message.name == message_name for message in database.messages) > 1:
-        raise DriverSettingsError(f"message {message_name} stands in {file_name} more than once; want it once")
+        raise DriverSettingsError(
+            f"message {message_name} is defined more than once in {file_name}; keep one definition"
+        )
     if message_name not in messages:
         raise DriverSettingsError(f"no message {message_name} in {file_name}{_instead(message_name, messages, 'it')}")
     message = messages[message_name]

@@ -166,10 +166,10 @@ def read_angle_file(data: bytes, head: HesaiHead) -> BeamTable:
             ) from None
         if not (math.isfinite(azimuth) and abs(azimuth) <= 360 and abs(elevation) <= 90):
             raise DriverSettingsError(
-                f"geometry.file: line {line}: elevation {elevation}, azimuth {azimuth}: no angles"
+                f"geometry.file: line {line}: elevation {elevation}, azimuth {azimuth}: not angles in degrees"
             )
         if channel in found:
-            raise DriverSettingsError(f"geometry.file: line {line}: channel {channel} a second time")
+            raise DriverSettingsError(f"geometry.file: line {line}: channel {channel} appears twice")
         found[channel] = (elevation, azimuth)
     if sorted(found) != list(range(1, head.channels + 1)):
         raise DriverSettingsError(

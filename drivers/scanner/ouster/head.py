@@ -185,9 +185,9 @@ def _json_object(content: bytes) -> dict[str, Any]:
         table = json.loads(content)
     except (ValueError, RecursionError) as error:
         reason = "nested too deeply" if isinstance(error, RecursionError) else str(error).split("\n")[0]
-        raise DriverSettingsError(f"{FILE}: no JSON: {reason}; want the head's metadata") from error
+        raise DriverSettingsError(f"{FILE}: not JSON: {reason}; want the head's metadata") from error
     if not isinstance(table, dict):
-        raise DriverSettingsError(f"{FILE}: no table; want the head's metadata")
+        raise DriverSettingsError(f"{FILE}: not a JSON object; want the head's metadata")
     return table
 
 
@@ -287,7 +287,9 @@ def _altitudes(table: _Keys, beams: int) -> FloatArray:
     """Read each beam's altitude; refuse all zeros, which a head without its factory calibration reports."""
     altitude_rad = _angles(table, "beam_altitude_angles", beams, 90.0)
     if beams > 1 and not altitude_rad.any():
-        raise _wrong("beam_altitude_angles", altitude_rad.tolist(), "the head's own: 0 of all beams is no calibration")
+        raise _wrong(
+            "beam_altitude_angles", altitude_rad.tolist(), "the head's own angles; 0 for all beams is not a calibration"
+        )
     return altitude_rad
 
 

@@ -138,7 +138,9 @@ class LidarLayout:
                 f"{FILE}: udp_profile_lidar: {self.head.profile!r} is not known; there are: {known}"
             )
         if self.packet_bytes > LARGEST_PACKET_BYTES:
-            raise DriverSettingsError(f"{FILE}: data_format: its packets are larger than a datagram")
+            raise DriverSettingsError(
+                f"{FILE}: data_format: its packets would be larger than a datagram; want the head's own metadata"
+            )
 
     def __deepcopy__(self, memo: dict[int, object]) -> LidarLayout:
         """Return the same object: a layout never changes, so a parser's copy shares it."""
@@ -309,8 +311,8 @@ def with_crc(packet: bytes) -> bytes:
 
 def crc_holds(units: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """Return (n,) whether packets (n, length) have a correct CRC, or were sent without one."""
-    said = np.ascontiguousarray(units[:, -8:]).view("<u8")[:, 0]
-    holds: NDArray[np.bool_] = np.isin(said, np.array(NO_CRC, dtype=np.uint64))
+    stated = np.ascontiguousarray(units[:, -8:]).view("<u8")[:, 0]
+    holds: NDArray[np.bool_] = np.isin(stated, np.array(NO_CRC, dtype=np.uint64))
     for row in np.flatnonzero(~holds).tolist():
-        holds[row] = crc64_xz(units[row, :-8].data) == said[row]
+        holds[row] = crc64_xz(units[row, :-8].data) == stated[row]
     return holds

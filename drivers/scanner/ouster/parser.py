@@ -132,7 +132,9 @@ class OusterParser(PacketParser):
         self.head = read_head(settings.files["geometry"])
         serial = settings.config.get("serial") or ""
         if serial and self.head.serial is not None and serial != str(self.head.serial):
-            raise DriverSettingsError(f"{FILE}: it is of head {self.head.serial}, serial is {serial}; want its own")
+            raise DriverSettingsError(
+                f"{FILE}: is of head {self.head.serial}, but serial is {serial}; use the metadata of this head"
+            )
         self.layout = LidarLayout(self.head)
         self._latches = self.head.timestamp_mode == SYNC_PULSE and bool(settings.config.get("pps"))
         self._rank = self.layout.window_ranks()
@@ -395,21 +397,21 @@ class HealthReader:
 
     def read(self, host_time_ns: Int64Array, packets: StructArray) -> list[DeviceStatus]:
         """Return one record for each change in packets (n,), n at least 1, in order."""
-        said = np.zeros((len(packets), 1 + len(HEALTH)), dtype=np.int64)
-        said[:, 0] = self._layout.init_id(packets)
+        health = np.zeros((len(packets), 1 + len(HEALTH)), dtype=np.int64)
+        health[:, 0] = self._layout.init_id(packets)
         if not self._layout.legacy:
             for place, name in enumerate(HEALTH, start=1):
-                said[:, place] = packets[name]
-        changes = np.flatnonzero((said[1:] != said[:-1]).any(axis=1)) + 1
+                health[:, place] = packets[name]
+        changes = np.flatnonzero((health[1:] != health[:-1]).any(axis=1)) + 1
         statuses = []
         for at in (0, *changes.tolist()):
-            now = tuple(said[at].tolist())
+            now = tuple(health[at].tolist())
             if now != self._last:
                 self._last = now
                 statuses.append(self._describe(int(host_time_ns[at]), now))
         return statuses
 
-    def _describe(self, host_ns: int, said: tuple[int, ...]) -> DeviceStatus:
+    def _describe(self, host_ns: int, health: tuple[int, ...]) -> DeviceStatus:
         head = self._layout.head
         values: dict[str, float | int | str | bool] = {
             "model": head.model,
@@ -419,8 +421,8 @@ class HealthReader:
         if head.timestamp_mode == SYNC_PULSE:
             values["nmea_input"] = head.nmea_input
         if not self._layout.legacy:
-            values["init_id"] = said[0]
+            values["init_id"] = health[0]
             if head.init_id is not None:
-                values["metadata_of_this_start"] = said[0] == head.init_id
-            values |= dict(zip(HEALTH, said[1:], strict=True))
+                values["metadata_of_this_start"] = health[0] == head.init_id
+            values |= dict(zip(HEALTH, health[1:], strict=True))
         return DeviceStatus(host_ns, values, message="lidar")

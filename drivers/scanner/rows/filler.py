@@ -18,5 +18,7 @@ def filler(*, compiled: bool) -> Fill:
     try:
         from swath.drivers.scanner.rows.compiled import fill
     except ImportError as error:
-        raise DriverSettingsError(f"compiled decoding wants numba: {how_to_install('process')} ({error})") from error
+        raise DriverSettingsError(
+            f"compiled decoding needs numba; install with: {how_to_install('process')} ({error})"
+        ) from error
     return fill

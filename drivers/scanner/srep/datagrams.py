@@ -57,9 +57,9 @@ class Datagrams:
         """Return (n,) True where the last four bytes are the CRC of all bytes before."""
         if not self.blocks:
             return np.empty(0, dtype=np.bool_)
-        said = np.concatenate([block[:, -CRC.size :] for block in self.blocks]).view("<u4")[:, 0]
+        stated = np.concatenate([block[:, -CRC.size :] for block in self.blocks]).view("<u4")[:, 0]
         found = chain.from_iterable(map(crc32, block[:, : -CRC.size]) for block in self.blocks)
-        agree: BoolArray = np.fromiter(found, np.uint32, len(self)) == said
+        agree: BoolArray = np.fromiter(found, np.uint32, len(self)) == stated
         return agree
 
     def bodies(self) -> NDArray[np.uint64]:

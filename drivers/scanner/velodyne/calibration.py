@@ -39,16 +39,16 @@ def read_calibration(data: bytes, head: SpinningHead) -> BeamTable:
     """
     if len(data) > _MOST_BYTES:
         raise DriverSettingsError(
-            f"geometry.file: of {len(data)} bytes; a Velodyne head's has fewer than {_MOST_BYTES}"
+            f"geometry.file: has {len(data)} bytes; want the file of a Velodyne head, below {_MOST_BYTES} bytes"
         )
     try:
         resolution_m, lasers = _read_xml(data) if data.lstrip()[:1] == b"<" else _read_yaml(data)
     except (ValueError, TypeError, LookupError, OverflowError, RecursionError, ElementTree.ParseError) as error:
         text = (str(error).splitlines() or [type(error).__name__])[0]
-        raise DriverSettingsError(f"geometry.file: no db.xml nor YAML of a Velodyne head: {text}") from error
+        raise DriverSettingsError(f"geometry.file: neither db.xml nor YAML of a Velodyne head: {text}") from error
     if resolution_m is not None and not math.isclose(resolution_m, head.range_unit_m, rel_tol=1e-3):
         raise DriverSettingsError(
-            f"geometry.file: of another model: distances in {resolution_m:g} m, not {head.range_unit_m:g} m"
+            f"geometry.file: is of another model: distances in {resolution_m:g} m, want {head.range_unit_m:g} m"
         )
     missing = [laser for laser in range(len(head.beams)) if laser not in lasers]
     if missing:
@@ -64,7 +64,9 @@ def _beams(lasers: list[dict[str, float]]) -> BeamTable:
             wrong |= values != 0
         if wrong.any():
             laser = int(np.flatnonzero(wrong)[0])
-            raise DriverSettingsError(f"geometry.file: {name} of laser {laser} is {values[laser]}: not of this model")
+            raise DriverSettingsError(
+                f"geometry.file: {name} of laser {laser} is {values[laser]}: not valid for this model"
+            )
     elevation, offset = value["vert_correction"], value["vert_offset_correction"]
     return beam_table(
         np.degrees(elevation),
@@ -85,7 +87,7 @@ def _read_yaml(data: bytes) -> tuple[float | None, dict[int, dict[str, float]]]:
         for event in yaml.parse(data, yaml.SafeLoader):
             # with aliases a file of a few lines can expand to more values than fit in memory
             if isinstance(event, yaml.AliasEvent):
-                raise ValueError("has an alias; want every value where it belongs")
+                raise ValueError("contains an alias; write each value out")
             # the YAML scanner's time for a token grows with its depth: 20 kB of brackets took minutes
             depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
             if depth > _MOST_LEVELS:

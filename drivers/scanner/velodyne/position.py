@@ -123,14 +123,14 @@ class PositionReader:
             events.append(DeviceStatus(host_ns, values, message="position"))
         return events
 
-    def _time_message(self, host_ns: int, said: TimeTag, *, valid: bool) -> TimeMessage:
+    def _time_message(self, host_ns: int, tag: TimeTag, *, valid: bool) -> TimeMessage:
         """Return the message of a sentence, with its date moved by roll-overs."""
-        if valid and said.date is not None:  # without a fix many receivers send an arbitrary date
-            said = replace(said, date=(date := self.dates.date(said.date, host_ns)))
+        if valid and tag.date is not None:  # without a fix many receivers send an arbitrary date
+            tag = replace(tag, date=(date := self.dates.date(tag.date, host_ns)))
             if date < self.dates.floor:
                 self._counters.errors["date_before_floor"] += 1
                 valid = False
-        return TimeMessage(host_ns, said, NamesEdge.PREVIOUS, valid=valid, message="position RMC")
+        return TimeMessage(host_ns, tag, NamesEdge.PREVIOUS, valid=valid, message="position RMC")
 
     def _is_of_this_second(self, time: TimeTag, stamp_us: int, pps_status: int) -> bool:
         """Return whether the sentence belongs to the edge just past: by the locked clock, or without a lock by being

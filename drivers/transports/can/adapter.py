@@ -115,7 +115,7 @@ class PythonCanTransport(DescriptorTransport):
 
     def _why_not_opened(self, error: Exception) -> str:
         if is_no_serial_port(error):
-            return f"{self._spec.channel} is no serial port"
+            return f"{self._spec.channel} is not a serial port; see `ls /dev/serial/by-id`"
         if isinstance(error, TypeError) and (found := _MISSING.search(str(error))):
             wanted = "&".join(f"{name}=…" for name in _NAME.findall(found[1]))
             return f"{self._spec.interface} needs the options ?{wanted}"
@@ -193,7 +193,7 @@ class PythonCanTransport(DescriptorTransport):
                 break
             messages.append(message)
         if events & HUNG_UP and not messages and self.counters.refused == refused:
-            raise TransportError(f"{self.name}: the CAN adapter has gone")
+            raise TransportError(f"{self.name}: the CAN adapter was disconnected")
         return messages
 
     def _first_in_slices(self, gate: Gate, timeout_s: float) -> list[can.Message]:
@@ -328,7 +328,7 @@ def pack_frame(message: can.Message) -> bytes:
     data = b"" if message.is_remote_frame else bytes(message.data)
     length = message.dlc if message.is_remote_frame else len(data)
     if not 0 <= message.arbitration_id <= largest or not 0 <= length <= (64 if message.is_fd else 8):
-        raise ValueError(f"no CAN frame: identifier {message.arbitration_id:#x}, {length} bytes")
+        raise ValueError(f"not a CAN frame: identifier {message.arbitration_id:#x}, {length} bytes")
     if not message.is_fd:
         return HEADER.pack(message.arbitration_id | flags, length, 0) + data.ljust(8, b"\0")
     fd_flags = (

@@ -59,7 +59,9 @@ class SocketCanTransport(DescriptorTransport):
         try:
             socket.if_nametoindex(self._channel)
         except OSError as error:
-            raise TransportError(f"{self.name}: no network interface {self._channel}; see `ip link`") from error
+            raise TransportError(
+                f"{self.name}: network interface {self._channel} does not exist; see `ip link`"
+            ) from error
         sock = self._socket()
         try:
             self._configure(sock)
@@ -75,7 +77,7 @@ class SocketCanTransport(DescriptorTransport):
             return socket.socket(_AF_CAN, socket.SOCK_RAW | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC, _CAN_RAW)
         except OSError as error:
             if error.errno == errno.EAFNOSUPPORT:
-                text = "this kernel has no CAN (address family not supported); try `modprobe can_raw`"
+                text = "this kernel has no CAN support loaded; run `modprobe can_raw`"
             else:
                 text = f"cannot open a CAN socket: {error.strerror}"
             raise TransportError(f"{self.name}: {text}") from error
@@ -97,9 +99,9 @@ class SocketCanTransport(DescriptorTransport):
         if error.errno == errno.ENETDOWN:
             bitrate = self._spec.options.get("bitrate")
             setting = f" type can bitrate {bitrate}" if bitrate else ""
-            return f"{self.name}: {channel} is down; `ip link set {channel} up{setting}`"
+            return f"{self.name}: {channel} is down; run `ip link set {channel} up{setting}`"
         if error.errno in (errno.ENODEV, errno.ENXIO):
-            return f"{self.name}: {channel} is gone or is no CAN interface; see `ip link show type can`"
+            return f"{self.name}: {channel} is gone or is not a CAN interface; see `ip link show type can`"
         return f"{self.name}: CAN socket failed: {error.strerror}"
 
     def _close_device(self) -> None:

@@ -48,7 +48,7 @@ class FixedPps(PpsSource):
         """
         with self._reading:
             if self._gate is not None:
-                raise TransportError(f"fixed:{self._path}: is open already")
+                raise TransportError(f"fixed:{self._path}: is already open")
             self._fd = self._opened()
             self._is_fifo = stat.S_ISFIFO(os.fstat(self._fd).st_mode)
             self._gate = Gate(self._fd if self._is_fifo else -1)
@@ -66,7 +66,7 @@ class FixedPps(PpsSource):
 
     def _why(self, error: OSError) -> str:
         if error.errno == errno.ENOENT:
-            return f"fixed:{self._path}: there is no such file; edges come as lines of 'realtime_ns sequence'"
+            return f"fixed:{self._path}: no such file; want a file or FIFO with lines of 'realtime_ns sequence'"
         if error.errno in (errno.EACCES, errno.EPERM):
             return f"fixed:{self._path}: this user may not read it"
         return f"fixed:{self._path}: {error.strerror}"

@@ -68,21 +68,23 @@ class KernelPps(PpsSource):
 
     def _why(self, error: OSError) -> str:
         if error.errno in (errno.ENOENT, errno.ENXIO, errno.ENODEV):
-            return f"{self._path}: there is no such PPS device; is its driver loaded (pps-gpio, pps-ldisc)?"
+            return f"{self._path}: no such PPS device; check that its driver is loaded (pps-gpio, pps-ldisc)"
         if error.errno in (errno.EACCES, errno.EPERM):
             return (
                 f'{self._path}: not permitted to this user; install the udev rule (KERNEL=="pps[0-9]*", '
                 'GROUP="swath", MODE="0660") or add the user to the device\'s group'
             )
         if error.errno in (errno.ENOTTY, errno.EINVAL, errno.EISDIR):
-            return f"{self._path}: is no PPS device"
+            return f"{self._path}: is not a PPS device; want /dev/ppsN"
         return f"{self._path}: PPS device failed: {error.strerror}"
 
     def _select_edge(self) -> None:
         wanted = PPS_CAPTUREASSERT if self._edge == "assert" else PPS_CAPTURECLEAR
         capable = int.from_bytes(fcntl.ioctl(self._fd, PPS_GETCAP, bytes(4)), sys.byteorder)
         if not capable & wanted:
-            raise TransportError(f"{self._path}: its driver does not capture the {self._edge} edge; use the other one")
+            raise TransportError(
+                f"{self._path}: its driver does not capture the {self._edge} edge; set pps.….edge to the other one"
+            )
         parameters = PARAMETERS.unpack(fcntl.ioctl(self._fd, PPS_GETPARAMS, bytes(PARAMETERS.size)))
         if parameters[1] & wanted:
             return

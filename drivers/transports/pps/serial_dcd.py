@@ -52,7 +52,7 @@ class SerialDcdPps(PpsSource):
             TransportError: the port is absent, not permitted, or has no modem lines.
         """
         if self._watch is not None:
-            raise TransportError(f"serial-dcd:{self._path}: is open already")
+            raise TransportError(f"serial-dcd:{self._path}: is already open")
         try:
             fd = os.open(self._path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK | os.O_CLOEXEC)
         except OSError as error:
@@ -72,11 +72,11 @@ class SerialDcdPps(PpsSource):
     def _why(self, error: OSError) -> str:
         name = f"serial-dcd:{self._path}"
         if error.errno == errno.ENOENT:
-            return f"{name}: there is no {self._path}"
+            return f"{name}: {self._path} does not exist"
         if error.errno in (errno.EACCES, errno.EPERM):
             return f"{name}: {self._path} is not permitted to this user; add it to the group dialout"
         if error.errno in (errno.ENOTTY, errno.EINVAL):
-            return f"{name}: {self._path} has no DCD line to wait on (TIOCMIWAIT); a real serial port has one"
+            return f"{name}: {self._path} cannot wait for DCD (TIOCMIWAIT); use a hardware serial port"
         return f"{name}: {self._path} failed: {error.strerror}"
 
     def receive(self, timeout_s: float) -> list[RawEdge]:

@@ -84,7 +84,7 @@ def products(made: Made, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_what_of_a_directory_is_no_log_is_passed_over_and_told(products: Path) -> None:
     record = json.loads((products / "report" / "calibration.json").read_text())
-    assert record["notes"][0] == f"passed over: {products / 'logs' / 'begun_0.mcap'}: is no MCAP file"
+    assert record["notes"][0] == f"passed over: {products / 'logs' / 'begun_0.mcap'}: is not an MCAP file"
 
 
 def test_the_file_says_where_the_trajectory_came_from(products: Path) -> None:

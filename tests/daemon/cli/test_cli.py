@@ -168,7 +168,7 @@ class TestErrors:
             )
         assert run.returncode == ExitCode.IO
         [line] = run.stderr.splitlines()
-        assert line == "swath: what it was to write: No space left on device; make room and run it again"
+        assert line == "swath: output: No space left on device; free some space and run the command again"
 
     def test_a_closed_pipe_ends_it_quietly(self) -> None:
         process = subprocess.Popen(

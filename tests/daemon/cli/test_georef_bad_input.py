@@ -104,9 +104,9 @@ def test_what_of_a_directory_is_no_log_is_passed_over(
     arguments = flown.arguments(tmp_path / "out", "--no-sigma", log=log.parent)
     capsys.readouterr()
     assert run_app(arguments) == 1
-    assert f"partial: passed over: {begun}: is no MCAP file; " in capsys.readouterr().err
+    assert f"partial: passed over: {begun}: is not an MCAP file; " in capsys.readouterr().err
     told = json.loads(next((tmp_path / "out").glob("*.json")).read_text())
-    assert told["holes"][:2] == [f"passed over: {path}: is no MCAP file" for path in (begun, foreign)]
+    assert told["holes"][:2] == [f"passed over: {path}: is not an MCAP file" for path in (begun, foreign)]
     assert told["holes"][2:] == [hole.replace(str(flown.log), str(log)) for hole in alone["holes"]]
     assert told["counts"] == alone["counts"]
     named = flown.arguments(tmp_path / "named", "--no-sigma", log=begun)
@@ -183,7 +183,7 @@ def test_a_full_disk_is_one_line_and_leaves_nothing(
     ("text", "code", "words"),
     [
         (None, 3, "want auto, whole or a CSV file"),
-        (b"\x89\xff", 3, "no text; want a CSV file"),
+        (b"\x89\xff", 3, "not text; want a CSV file"),
         (b"start_gps_ns,end_gps_ns\n1,2\n", 1, "none of its strips lies in the logs"),
     ],
 )
@@ -210,7 +210,7 @@ def test_a_calibration_of_other_conventions_or_no_text(
     for file, code, words in (
         (tmp_path / "two.toml", 2, "calibration.conventions: got 2, want 1"),
         (tmp_path / "right.toml", 2, "scanner right: is not in the configuration"),
-        (flown.log, 3, "no text; want a calibration file"),
+        (flown.log, 3, "not text; want a calibration file"),
         (tmp_path / "none.toml", 3, "cannot be read: No such file"),
     ):
         arguments = flown.arguments(tmp_path / "out")

@@ -279,7 +279,7 @@ class TestRefusals:
         if command == "validate":
             arguments.insert(1, str(flown.folder / "left.true.toml"))
         assert run_app(arguments) == 2
-        assert "--force-trajectory: there is no file to be taken; want --trajectory too" in capsys.readouterr().err
+        assert "--force-trajectory: file to be taken; want --trajectory too does not exist" in capsys.readouterr().err
         assert list(tmp_path.iterdir()) == []
 
     def test_a_trajectory_in_the_folder_is_not_replaced_unasked_and_never_where_it_is_read(

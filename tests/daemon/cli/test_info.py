@@ -128,10 +128,10 @@ def test_a_long_name_and_a_wide_sigma_fit_and_what_is_not_known_is_not_told(
     text = page.getvalue()
     assert told in text
     assert ("0/0/0" in text, "every unit is accounted for" in text) == (has_status, has_status)
-    assert ("no status of scanner/left-front/aux: what was lost is not known" in text) != has_status
+    assert ("no status of scanner/left-front/aux: losses are unknown" in text) != has_status
     numbers["missing_parts"] = [1]
     _print_session(Console(file=page, width=80), numbers)
-    assert "not every unit is here" in page.getvalue().removeprefix(text)
+    assert "incomplete: units in missing parts" in page.getvalue().removeprefix(text)
     assert "every unit is accounted for" not in page.getvalue().removeprefix(text)
     assert "…" not in text
     assert "57.7µs" in text

@@ -107,7 +107,7 @@ def test_a_second_repair_does_not_overwrite_the_first(logs: Path) -> None:
     before = digest(copy)
     result = swath("recover", str(logs / CUT))
     assert result.returncode == 3
-    assert "is there already" in result.stderr
+    assert "already exists" in result.stderr
     assert digest(copy) == before
 
 
@@ -166,7 +166,7 @@ def test_of_many_that_begin_at_once_one_recovers(logs: Path) -> None:
                 recover(logs / CUT)
                 became["recovered"] += 1
             except LogError as error:
-                became["left" if "by another process" in str(error) or "there already" in str(error) else "?"] += 1
+                became["left" if "by another process" in str(error) or "already exists" in str(error) else "?"] += 1
 
         threads = [threading.Thread(target=one) for _ in range(4)]
         for thread in threads:

@@ -150,11 +150,11 @@ class TestIntoALog:
         folder, _ = flown
         [log] = folder.glob("*.mcap")
         before = {path.name: path.read_bytes() for path in folder.iterdir()}
-        line = f"swath: {folder / 'swath.toml'}: is there already; remove it or give another place\n"
+        line = f"swath: {folder / 'swath.toml'}: already exists; remove it or choose another place\n"
         assert in_process(capsys, "fly", plan, "-o", str(folder), "--seconds", SECONDS) == (ExitCode.IO, line)
         assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
         (tmp_path / log.name).write_bytes(before[log.name])
-        line = f"swath: {tmp_path / log.name}: is there already; remove it or give another directory\n"
+        line = f"swath: {tmp_path / log.name}: already exists; remove it or choose another directory\n"
         words = ("fly", plan, "-o", str(tmp_path), "--seconds", SECONDS, "--no-truth")
         assert in_process(capsys, *words) == (ExitCode.IO, line)
         assert [path.name for path in tmp_path.iterdir()] == [log.name]
@@ -169,7 +169,7 @@ class TestIntoALog:
             _, said = flying.communicate(timeout=HANGS_S)
         assert (flying.returncode, said.splitlines()) == (
             cli.INTERRUPTED,
-            ["interrupted: what was written of this flight has been removed"],
+            ["interrupted: the incomplete files of this flight were removed"],
         )
         assert list(tmp_path.iterdir()) == []
 
@@ -181,13 +181,15 @@ class TestIntoALog:
 
         monkeypatch.setattr("swath.daemon.log.mcap.writer.PartWriter.flush", refuse_chunk)
         words = ("fly", plan, "-o", str(tmp_path / "flight"), "--seconds", "2", "--no-truth")
-        line = f"swath: {tmp_path / 'flight'}: No space left on device; nothing is left of this flight\n"
+        line = (
+            f"swath: {tmp_path / 'flight'}: No space left on device; the incomplete files of this flight were removed\n"
+        )
         assert in_process(capsys, *words) == (ExitCode.IO, line)
         assert list(tmp_path.iterdir()) == []
 
     def test_two_flights_at_once_do_not_meet(self, tmp_path: Path) -> None:
         with FlightFolder(tmp_path / "logs") as folder:
-            with pytest.raises(UserError, match="another flight is at work there, or was killed there"):
+            with pytest.raises(UserError, match="another flight runs there, or was killed there"):
                 FlightFolder(tmp_path / "logs")
             folder.write({"one.txt": b"1"})
         assert list(tmp_path.iterdir()) == []
@@ -201,10 +203,13 @@ class TestErrors:
                 ("fly", "nowhere.toml", "-o", "x"),
                 "nowhere.toml: No such file or directory; want a plan's file or one of",
             ),
-            (("fly", "small"), "say where to: -o LOG, or --wire"),
-            (("fly", "small", "-o", "x", "--config", "y"), "--config belongs to --wire"),
-            (("fly", "small", "-o", "x", "--set-clock"), "--set-clock belongs to --wire"),
-            (("fly", "small", "--wire", "-o", "x", "--config", "y"), "-o makes wires, --config names some; give one"),
+            (("fly", "small"), "no output given; use -o LOG or --wire"),
+            (("fly", "small", "-o", "x", "--config", "y"), "--config needs --wire"),
+            (("fly", "small", "-o", "x", "--set-clock"), "--set-clock needs --wire"),
+            (
+                ("fly", "small", "--wire", "-o", "x", "--config", "y"),
+                "--wire takes -o (new wires in a folder) or --config",
+            ),
             (("fly", "small", "--wire", "--config", "nowhere.toml"), "nowhere.toml: No such file or directory; give"),
             (("fly", "small", "-o", "x", "--seed", str(2**63)), "small: flight.seed: got 9223372036854775808, want"),
             (("plan", "small", "-o", "x.gif"), "x.gif: want a picture's name that ends in one of"),
@@ -258,7 +263,7 @@ class TestErrors:
         missing = ("numba", "scipy")
         monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name in missing else real(name))
         monkeypatch.chdir(tmp_path)
-        line = f"swath: swath sim needs scipy, numba, not installed here: {how_to_install('sim')}\n"
+        line = f"swath: swath sim needs scipy, numba; install with: {how_to_install('sim')}\n"
         assert in_process(capsys, *words) == (ExitCode.USAGE, line)
         assert list(tmp_path.iterdir()) == []
 
@@ -340,7 +345,7 @@ class TestAhead:
             assert ahead(refuse).facts
         with pytest.raises(RuntimeError, match="ZeroDivisionError"):
             assert ahead(stumble).facts
-        with pytest.raises(RuntimeError, match="the process that makes the flight has ended"):
+        with pytest.raises(RuntimeError, match="the process that computes the flight has ended unexpectedly"):
             assert ahead(vanish).facts
 
 
@@ -440,7 +445,7 @@ class TestWires:
         path = tmp_path / "swath.toml"
         path.write_text("")
         code, said = in_process(capsys, "fly", plan, "--wire", "-o", str(tmp_path))
-        line = f"swath: {path}: is there already; fly on its wires with --config {path}, or give another folder\n"
+        line = f"swath: {path}: already exists; use its wires with --config {path}, or choose another folder\n"
         assert (code, said) == (ExitCode.IO, line)
         assert path.read_text() == ""
 
@@ -456,10 +461,10 @@ class TestWires:
             code, said = in_process(capsys, "fly", plan, "--wire", "--config", str(path), "--wait", "0")
         assert code == 0
         lines = said.splitlines()
-        assert "pps/main: nobody has opened it; flying all the same" in lines
-        assert f"imu/main: in the flight, not in {path}; not flown" in lines
-        assert f"pps/other: in {path}, not in the flight" in lines
-        assert "pps/main: 0 units, 0 bytes, 1 refused by a reader" in lines
+        assert "pps/main: no reader has opened it; flying without one" in lines
+        assert f"imu/main: is in the flight but not in {path}; not sent" in lines
+        assert f"pps/other: is in {path} but not in the flight" in lines
+        assert "pps/main: 0 units, 0 bytes, 1 rejected by a reader" in lines
         assert not (tmp_path / "pps").exists()
 
     def test_stepping_the_clock_is_refused_before_anything_is_made(
@@ -468,7 +473,5 @@ class TestWires:
         monkeypatch.setattr("swath.daemon.simulate.plans.make_flight_in_time", stepping_for)
         code, said = in_process(capsys, "fly", plan, "--wire", "-o", str(tmp_path / "wires"))
         assert (code, said.count("\n")) == (ExitCode.USAGE, 1)
-        assert said.startswith(
-            "swath: fault clock_step: refused, it would step this computer's wall clock (+60 s at 1 s)"
-        )
+        assert said.startswith("swath: fault clock_step would step this computer's wall clock (+60 s at 1 s)")
         assert list(tmp_path.iterdir()) == []

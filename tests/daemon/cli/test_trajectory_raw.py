@@ -119,7 +119,7 @@ def test_without_a_file_raw_measurements_cannot_be_navigated(flown: Flown) -> No
 def test_a_lever_arm_of_no_file_is_refused(flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = [str(flown.log), "-o", str(tmp_path / "a.sbet"), "--lever-arm"]
     assert run_app(["trajectory", *arguments, "0,0,-1"]) == 2
-    assert "is of the antenna of --gnss FILE" in capsys.readouterr().err
+    assert "--lever-arm needs --gnss FILE" in capsys.readouterr().err
     assert run_app(["trajectory", *arguments, "up", "--gnss", str(flown.folder / "ppk.pos")]) == 2
     assert "want x,y,z in metres" in capsys.readouterr().err
 

@@ -239,7 +239,11 @@ def test_a_record_elsewhere_is_named_and_one_of_another_calibration_left_alone(
         ("other", "is the record of calibration c0, .*c1.toml is c1", ExitCode.USAGE),
         ("none", r"x\.json: no record of a calibration; want NAME\.record\.json", ExitCode.USAGE),
         ("absent", "no.json: cannot be read: No such file", ExitCode.IO),
-        ("no output", "--record: is written anew with what logs say; want LOG… and --output DIR", ExitCode.USAGE),
+        (
+            "no output",
+            "--record needs LOG… and --output DIR, because the new record holds the results from the logs",
+            ExitCode.USAGE,
+        ),
     ],
 )
 def test_a_record_that_cannot_be_told_is_one_line(
@@ -349,7 +353,7 @@ def test_a_scanner_that_the_log_has_not_is_named(log: Path, tmp_path: Path) -> N
         ("nothing", "nothing to validate against", ExitCode.USAGE),
         ("absent", "cannot be read: No such file", ExitCode.IO),
         ("no calibration", "calibration: missing", ExitCode.USAGE),
-        ("twice", "is the second calibration of one scanner", ExitCode.USAGE),
+        ("twice", "a calibration of this scanner was already given", ExitCode.USAGE),
     ],
 )
 def test_wrong_use_is_one_line(what: str, said: str, code: ExitCode, tmp_path: Path) -> None:

@@ -213,7 +213,7 @@ def test_rotations_of_seven_digits_pass_and_others_do_not() -> None:
     assert rotation_problem([[0.7071068, -0.7071068, 0], [0.7071068, 0.7071068, 0], [0, 0, 1]]) is None
     assert rotation_problem([[0, 1, 0], [0, 0, 1], [1, 0, 0]]) is None
     assert "length" in str(rotation_problem([[0.70711, -0.70711, 0], [0.70711, 0.70711, 0], [0, 0, 1]]))
-    assert "mirroring" in str(rotation_problem([[0, 1, 0], [1, 0, 0], [0, 0, 1]]))
+    assert "reflection" in str(rotation_problem([[0, 1, 0], [1, 0, 0], [0, 0, 1]]))
     assert "length 0" in str(rotation_problem([[0, 0, 0], [0, 1, 0], [0, 0, 1]]))
 
 

@@ -136,8 +136,8 @@ class TestAllWell:
     @pytest.mark.parametrize(
         ("pps", "status", "said"),
         [
-            (PPS_LOCKED, "V", "the sentences at its input are void: want their receiver to have a fix"),
-            (PPS_ABSENT, "A", "it says that it is not locked to a pulse; want the receiver's PPS wired to it"),
+            (PPS_LOCKED, "V", "the time sentences at its input are void; wait until the receiver has a fix"),
+            (PPS_ABSENT, "A", "it reports that it is not locked to a pulse; wire the receiver's PPS to it"),
         ],
     )
     def test_a_head_without_fix_or_pulse_is_said(self, tmp_path: Path, pps: int, status: str, said: str) -> None:
@@ -170,7 +170,7 @@ class TestAllWell:
             (note,) = check(text, tmp_path, 0.5)["scanner/roof"].notes
             (configured,) = check(text + 'clock = "utc-hour"\n', tmp_path, 0.5)["scanner/roof"].notes
         assert "no position packet (Velodyne port 8308" in note
-        assert "want auxiliary" in note
+        assert "set auxiliary" in note
         assert 'clock = "utc-hour"' in configured
 
     def test_a_head_is_read_by_the_metadata_beside_the_configuration(self, tmp_path: Path) -> None:
@@ -239,7 +239,7 @@ class TestAbsent:
         with pty() as path:
             report = check(gnss(path), tmp_path, 0.3)["gnss/rover"]
         assert report.opens
-        assert report.problems == ["silent: opened, but no byte in 0.3 s; is it powered, wired and sending here?"]
+        assert report.problems == ["opened, but sent nothing in 0.3 s; check its power, wiring and output port"]
 
     def test_a_pps_without_edges(self, tmp_path: Path) -> None:
         os.mkfifo(tmp_path / "edges")
@@ -259,7 +259,7 @@ class TestSomethingElse:
     def test_a_receiver_of_another_protocol_is_named(self, tmp_path: Path) -> None:
         with pty(epoch) as path:
             report = check(gnss(path, "novatel"), tmp_path)["gnss/rover"]
-        assert report.problems == ["answers as nmea, configured as novatel"]
+        assert report.problems == ["sends nmea, but novatel is configured"]
 
     def test_a_scanner_of_another_protocol_is_named(self, tmp_path: Path) -> None:
         port = free_udp_port()
@@ -267,7 +267,7 @@ class TestSomethingElse:
         with udp_sender(port, srep_datagram):
             identity = "installation = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\n"
             report = check(text + identity, tmp_path, 0.5)["scanner/left"]
-        assert report.problems == ["answers as srep, configured as velodyne-vlp16"]
+        assert report.problems == ["sends srep, but velodyne-vlp16 is configured"]
 
     @pytest.mark.parametrize(
         ("configured", "recording", "answers_as"),
@@ -290,7 +290,7 @@ class TestSomethingElse:
         data = gzip.decompress((ROOT / "fixtures" / recording).read_bytes())
         with pty(lambda number: data[number * 2000 % len(data) :][:2000]) as path:
             report = check(gnss(path, configured), tmp_path)["gnss/rover"]
-        assert report.problems == [f"answers as {answers_as}, configured as {configured}"]
+        assert report.problems == [f"sends {answers_as}, but {configured} is configured"]
 
     def test_a_real_recording_of_another_scanner_is_named(self, tmp_path: Path) -> None:
         """A VLP-16, where a line scanner is configured."""
@@ -298,14 +298,14 @@ class TestSomethingElse:
         recorded = [unit.data for unit in read_pcap(ROOT / "fixtures/velodyne/nebula_vlp16.pcap.gz")]
         with udp_sender(port, lambda number: recorded[number % len(recorded)]):
             report = check(srep(port), tmp_path, 0.5)["scanner/left"]
-        assert report.problems == ["answers as velodyne-vlp16, configured as srep"]
+        assert report.problems == ["sends velodyne-vlp16, but srep is configured"]
 
     def test_a_head_that_needs_its_metadata_is_named_by_the_form_of_its_packets(self, tmp_path: Path) -> None:
         port = free_udp_port()
         recorded = [unit.data for unit in read_pcap(ROOT / "fixtures/ouster/crc_test.pcap.gz", port=7502)]
         with udp_sender(port, lambda number: recorded[number % len(recorded)]):
             report = check(srep(port), tmp_path, 0.5)["scanner/left"]
-        assert report.problems == ["answers as ouster, configured as srep"]
+        assert report.problems == ["sends ouster, but srep is configured"]
 
     @pytest.mark.parametrize(
         ("unit", "frames", "protocol"),
@@ -349,13 +349,13 @@ class TestSomethingElse:
             udp_sender(position, lambda number: packets[number % len(packets)] if number % 9 == 0 else b""),
         ):
             report = check(text, tmp_path, 0.5)["scanner/roof"]
-        assert report.problems == [f"answers as {answers_as}, configured as velodyne-vlp16"]
+        assert report.problems == [f"sends {answers_as}, but velodyne-vlp16 is configured"]
 
     def test_garbage_is_no_protocol_and_asks_for_the_baud_rate(self, tmp_path: Path) -> None:
         noise = np.random.default_rng(7).integers(128, 255, 4000, dtype=np.uint8).tobytes()
         with pty(lambda _: noise) as path:
             report = check(gnss(path), tmp_path, 0.5)["gnss/rover"]
-        want = "nothing of it is nmea nor any other gnss protocol known; is the baud rate right?"
+        want = "its data are neither nmea nor another known gnss protocol; check the baud rate"
         assert report.problems == [want]
 
     def test_damaged_messages_are_counted(self, tmp_path: Path) -> None:
@@ -412,7 +412,7 @@ class TestCan:
             assert report.problems == []
         else:
             [problem] = report.problems
-            said = re.fullmatch(r"its counter runs (\S+) times as fast as time: is tick_hz right\?", problem)
+            said = re.fullmatch(r"its counter runs (\S+) times as fast as time; check tick_hz", problem)
             assert said
             assert float(said[1]) == pytest.approx(rate, rel=0.1)
 
@@ -424,14 +424,14 @@ class TestCan:
             'angular_rate = ["GYR.gyr_x", "GYR.gyr_y", "GYR.gyr_z"]\n'
         )
         report = check(text, tmp_path)["imu/main"]
-        assert report.problems == ["answers as canmod-gps, configured as dbc"]
+        assert report.problems == ["sends canmod-gps, but dbc is configured"]
 
 
 class TestTime:
     def test_a_receiver_without_valid_time(self, tmp_path: Path) -> None:
         with pty(lambda number: epoch(number, valid=False)) as path:
             report = check(gnss(path), tmp_path)["gnss/rover"]
-        assert report.problems == ["its time is not valid (yet)"]
+        assert report.problems == ["its time is not valid yet"]
         assert report.time == "not valid"
 
     def test_a_receiver_that_says_local_time_is_told_and_not_refused(self, tmp_path: Path) -> None:
@@ -457,7 +457,7 @@ class TestTime:
     def test_edges_of_another_pulse(self, tmp_path: Path) -> None:
         with pps_fifo(tmp_path / "edges", spacing_ns=200_000_000) as edges:
             report = check(f'[pps.main]\nsource = "{edges}"\n', tmp_path)["pps/main"]
-        assert report.problems == ["edges are 0.2000 s apart, want 1 s: noise, or another pulse"]
+        assert report.problems == ["edges are 0.2000 s apart, want 1 s; check for noise or another signal"]
 
     @pytest.mark.parametrize(
         ("tag", "text"),
@@ -480,7 +480,9 @@ class TestComputer:
     def test_a_can_interface_of_another_bitrate_is_named_with_the_command_that_mends_it(self) -> None:
         spec = parse_transport("can:socketcan:can0?bitrate=1000000")
         command = "ip link set can0 down && ip link set can0 up type can bitrate 1000000"
-        assert bitrate_problems(spec, 250_000) == [f"can0 runs at 250000 bit/s, configured is 1000000; `{command}`"]
+        assert bitrate_problems(spec, 250_000) == [
+            f"can0 runs at 250000 bit/s, but 1000000 is configured; run `{command}`"
+        ]
         assert bitrate_problems(spec, 1_000_000) == []
         assert bitrate_problems(spec, None) == []
 
@@ -497,7 +499,9 @@ class TestComputer:
         assert found["ok"] is False
         [problem] = found["devices"][0]["problems"]
         limit = int(Path("/proc/sys/net/core/rmem_max").read_text())
-        want = f"receive buffer: asked for {1023 << 20} bytes, got {limit}; `sysctl -w net.core.rmem_max={1023 << 20}`"
+        want = (
+            f"receive buffer: asked for {1023 << 20} bytes, got {limit}; run `sysctl -w net.core.rmem_max={1023 << 20}`"
+        )
         assert problem.startswith(want)
 
     def test_the_table_has_a_line_a_device_and_a_line_a_problem(self, tmp_path: Path) -> None:

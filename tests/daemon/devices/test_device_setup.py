@@ -150,7 +150,7 @@ class TestNovatel:
         with receiver(split_lines, novatel_replies(refuses=b"MARK2TIME"), NOVATEL_DATA) as device:
             found = apply(gnss(device.path, "novatel"), tmp_path, save=True)["gnss/rover"]
         assert outcome_of(found, "MARK2TIME") == (Outcome.REFUSED, "Invalid Message ID")
-        assert outcome_of(found, "SAVECONFIG") == (Outcome.NOT_SENT, "not everything was accepted")
+        assert outcome_of(found, "SAVECONFIG") == (Outcome.NOT_SENT, "the device did not accept every message")
         assert outcomes(found).count(Outcome.ACCEPTED) == len(found.steps) - 2
         assert b"SAVECONFIG" not in device.commands
 
@@ -166,7 +166,7 @@ class TestNovatel:
     def test_a_device_without_an_address_of_its_own_cannot_be_sent_to(self, tmp_path: Path, options: str) -> None:
         text = f'[gnss.rover]\ntransport = "udp:127.0.0.1:{free_udp_port()}{options}"\nprotocol = "novatel"\n'
         found = apply(text, tmp_path)["gnss/rover"]
-        assert found.problem.endswith("say ?source=<its address>, and no group")
+        assert found.problem.endswith("add ?source=<its address> and remove group")
         assert set(outcomes(found)) == {Outcome.NOT_SENT}
 
 
@@ -199,7 +199,7 @@ class TestPlan:
 
     def test_an_absent_device_is_one_line_and_nothing_is_sent(self, tmp_path: Path) -> None:
         found = apply(gnss(f"{tmp_path}/gone", "ubx"), tmp_path)["gnss/rover"]
-        assert "there is no" in found.problem
+        assert "does not exist" in found.problem
         assert set(outcomes(found)) == {Outcome.NOT_SENT}
 
     def test_one_device_of_several(self, tmp_path: Path) -> None:
@@ -214,7 +214,7 @@ class TestPlan:
         assert error.value.exit_code == ExitCode.USAGE
 
     def test_a_present_rate_is_for_one_device_whose_rate_is_configured(self, tmp_path: Path) -> None:
-        with pytest.raises(UserError, match=r"one serial device with \?baud=…; none has one"):
+        with pytest.raises(UserError, match=r"one serial device with \?baud=…; no device has a baud rate"):
             apply(gnss("/dev/ttyS99", "ubx"), tmp_path, present_baud=9600)
         both = gnss("/dev/ttyS99", "ubx", "?baud=460800")
         both += '[gnss.base]\ntransport = "serial:/dev/ttyS98?baud=115200"\nprotocol = "novatel"\n'
@@ -234,7 +234,7 @@ class TestCommand:
         lines = [line.strip() for line in run.stdout.splitlines()]
         assert lines[0] == "gnss/rover: ubx by serial:/dev/ttyS99?baud=460800"
         assert {"UBX-CFG-VALSET RAM+BBR", "CFG-RATE-MEAS = 200", "CFG-MSGOUT-UBX_NAV_PVT_UART1 = 1"} <= set(lines)
-        assert lines[-1] == "nothing was sent; --apply sends it"
+        assert lines[-1] == "nothing was sent; use --apply to send"
 
     def test_the_present_rate_has_the_bound_of_the_configured_one(self) -> None:
         assert setup.MAX_BAUD == uri.MAX_BAUD

@@ -159,9 +159,16 @@ def test_nothing_is_wrong_with_a_good_computer(tree: Tree, question: str) -> Non
         ("governor", f"{CPU}/cpufreq/scaling_governor", "powersave", "wrong", "lowest frequency", "cpupower"),
         ("governor", f"{CPU}/cpufreq/scaling_governor", "ondemand", "note", "follows the load", "cpupower"),
         ("idle", f"{CPU}/cpuidle/state1/disable", "0", "note", "C6 133 µs", "cpupower idle-set -D 50"),
-        ("memory", "/proc/meminfo", "MemAvailable: 100000 kB\n", "wrong", "102 MB", "end other programs"),
+        ("memory", "/proc/meminfo", "MemAvailable: 100000 kB\n", "wrong", "102 MB", "stop other programs"),
         ("modules", "/lib/modules/6.1.0-test/modules.builtin", "", "wrong", "pps_core is not part", "kernel"),
-        ("clock", "/proc/301/comm", "systemd-timesyn\n", "wrong", "both keep", "disable --now systemd-timesyncd"),
+        (
+            "clock",
+            "/proc/301/comm",
+            "systemd-timesyn\n",
+            "wrong",
+            "both set the clock",
+            "disable --now systemd-timesyncd",
+        ),
         ("clock", "/proc/300/comm", "systemd-timesyn\n", "wrong", "may step", "install chrony"),
         ("clock", "/etc/chrony/chrony.conf", "makestep 0.1 -1\n", "wrong", "at any time", "makestep 1 3"),
         ("file system", "/proc/mounts", "none /var/lib/swath tmpfs rw 0 0", "wrong", "in memory", "ext4"),
@@ -171,7 +178,14 @@ def test_nothing_is_wrong_with_a_good_computer(tree: Tree, question: str) -> Non
         ("file system", "/proc/mounts", "/dev/sdb1 / ext4 rw,nobarrier 0 0", "wrong", "nobarrier", "fstab"),
         ("serial", "/sys/class/tty/console/active", "tty0 ttyUSB0", "wrong", "console", "console=ttyUSB0"),
         ("serial", "/sys/bus/usb-serial/devices/ttyUSB0/latency_timer", "16", "note", "16 ms", "echo 1"),
-        ("grabbers", "/proc/400/comm", "ModemManager\n", "wrong", "ModemManager runs", "disable --now ModemManager"),
+        (
+            "grabbers",
+            "/proc/400/comm",
+            "ModemManager\n",
+            "wrong",
+            "ModemManager is running",
+            "disable --now ModemManager",
+        ),
         ("device", "/etc/group", "dialout:x:20:pilot\n", "wrong", "may not read", "usermod -aG dialout swath"),
         (
             "policy",
@@ -254,14 +268,14 @@ def test_what_is_not_there_is_said(tree: Tree) -> None:
     (can,) = devices.can_interface(tree, "can7", None, bitrate)
     (network,) = devices.network_interface(tree, "eth7")
     assert {one.verdict for one in (device, pps, can, network)} == {Verdict.WRONG}
-    assert device.text == "/dev/ttyUSB7 is not there"
+    assert device.text == "/dev/ttyUSB7 does not exist"
     assert pps.mend.startswith("sudo systemctl start swath-pps@ttyS0 ")
 
 
 def test_another_bit_rate_is_mended_by_ip_link(tree: Tree) -> None:
     found = worst(devices.can_interface(tree, "can0", 500_000, bitrate))
     assert found is not None
-    assert found.text == "can0 runs at 1000000 bit/s, configured is 500000: no frame is understood"
+    assert found.text == "can0 runs at 1000000 bit/s, but 500000 is configured: no frame can be received"
     assert found.mend == "sudo ip link set can0 down && sudo ip link set can0 up type can bitrate 500000 restart-ms 100"
 
 
@@ -269,7 +283,7 @@ def test_a_clock_that_nobody_keeps(tree: Tree) -> None:
     tree.at("/proc/300/comm").unlink()
     (found,) = clock.keepers(tree, FREE_RUNNING)
     assert found.verdict is Verdict.NOTE
-    assert "nobody keeps it" in found.text
+    assert "no program sets the clock" in found.text
     (found,) = clock.keepers(tree, KEPT)
     assert found.verdict is Verdict.OK
 
@@ -328,7 +342,7 @@ def test_a_directory_is_judged_by_the_folder_that_is_there(tree: Tree) -> None:
 def test_a_directory_that_its_user_may_not_get_to(tree: Tree) -> None:
     tree.at("/var/lib").chmod(0o750)
     (found,) = disk.writable(tree, Path("/var/lib/swath"), SWATH)
-    assert (found.verdict, found.text) == (Verdict.WRONG, "swath may not enter /var/lib, in which /var/lib/swath lies")
+    assert (found.verdict, found.text) == (Verdict.WRONG, "swath may not enter /var/lib, which holds /var/lib/swath")
     assert found.mend.startswith("sudo chmod o+x /var/lib ")
 
 
@@ -356,7 +370,7 @@ def test_this_computer_is_judged_by_what_it_says_itself(tmp_path: Path) -> None:
     found = json.loads(run.stdout)
     assert found["ok"] is False
     rows = {(row["check"], row["verdict"]): row for row in found["findings"]}
-    assert rows["devices", "wrong"]["text"] == f"{tmp_path}/absent is not there"
+    assert rows["devices", "wrong"]["text"] == f"{tmp_path}/absent does not exist"
     limit = int(Path("/proc/sys/net/core/rmem_max").read_text())
     verdict = "wrong" if limit < 900 << 20 else "ok"
     assert str(limit) in rows["receive buffers", verdict]["text"]
@@ -371,7 +385,7 @@ def test_the_page_shows_every_finding(tmp_path: Path) -> None:
     config.write_text(session_table(tmp_path))
     run = swath("doctor", str(config), "--no-write")
     assert run.returncode in (0, 1)
-    assert "not measured: as asked" in run.stdout
+    assert "not measured: switched off by --no-write" in run.stdout
     for line in run.stdout.splitlines():
         assert line.startswith(("ok    ", "note  ", "wrong ", "     "))
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from swath.daemon.config import Config, load_config
-from swath.daemon.exchange.capture_files import Told, find_captures
+from swath.daemon.exchange.capture_files import ImportOptions, find_captures
 from swath.daemon.exchange.captures import Capture
 from swath.daemon.exchange.import_ import ImportReport, import_captures
 from swath.daemon.exchange.routes import Routes
@@ -92,9 +92,9 @@ def content_of(*paths: Path) -> Content:
 
 
 def run_import(
-    config: Config, files: list[Path], output: Path, told: Told | None = None
+    config: Config, files: list[Path], output: Path, told: ImportOptions | None = None
 ) -> tuple[ImportReport, list[Capture]]:
     """An import within this process, and what was found in each file."""
     routes = Routes.of(config)
-    captures = find_captures(routes, files, told or Told())
+    captures = find_captures(routes, files, told or ImportOptions())
     return import_captures(config, routes, captures, output), captures

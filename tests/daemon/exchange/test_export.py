@@ -151,7 +151,7 @@ class TestFiles:
         config = write_config(tmp_path / "here", text.replace('calibration = "left.toml"\n', ""))
         report = export(write_log(tmp_path / "log", config, [("gnss/rover", START_NS, b"$", None)]), tmp_path / "out")
         assert (report.folder / "config/dbc/imu.dbc").read_bytes() == dbc.read_bytes()
-        assert report.notes == ["config.toml names dbc/imu.dbc elsewhere: change it before `swath import`"]
+        assert report.notes == ["config.toml names another path for dbc/imu.dbc; change it before `swath import`"]
 
 
 # --- there and back -------------------------------------------------------------------------------------------------
@@ -317,7 +317,7 @@ class TestCommand:
         before = {path: path.stat().st_mtime_ns for path in (tmp_path / "out").rglob("*")}
         result = swath("export", str(log), str(tmp_path / "out"))
         assert result.returncode == 3
-        assert result.stderr.startswith(f"swath: {tmp_path / 'out' / log.stem[:-2]}: is there already")
+        assert result.stderr.startswith(f"swath: {tmp_path / 'out' / log.stem[:-2]}: already exists")
         assert result.stderr.count("\n") == 1
         assert {path: path.stat().st_mtime_ns for path in (tmp_path / "out").rglob("*")} == before
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from swath.daemon.errors import UserError
-from swath.daemon.exchange.capture_files import Told
+from swath.daemon.exchange.capture_files import ImportOptions
 from swath.daemon.exchange.export import export_session
 from swath.daemon.exchange.sidecar import read_sidecar, sidecar_of
 from swath.daemon.log.directory import take_directory
@@ -62,7 +62,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "-o", str(folder / "logs"),
     )  # fmt: skip
     assert result.returncode == 0, result.stderr
-    assert "5367 of no device: can2 (5367)" in result.stdout
+    assert "5367 from unknown devices: can2 (5367)" in result.stdout
     return folder / "logs"
 
 
@@ -124,7 +124,7 @@ class TestRealCaptures:
         named = f"gnss/rover={NOVATEL}"
         result = swath("import", str(made.parent / "swath.toml"), "--source", named, "-o", str(made))
         assert result.returncode == 3
-        assert "is there already; remove it or give another directory" in result.stderr
+        assert "already exists; remove it or choose another directory" in result.stderr
         assert {path.name: path.stat().st_mtime_ns for path in made.glob("*.mcap")} == before
 
 
@@ -150,11 +150,11 @@ class TestWhose:
         both = tmp_path / "both.pcap"
         one, two = write_pcap(tmp_path / "1.pcap", [b"a"], 7000), write_pcap(tmp_path / "2.pcap", [b"b"], 7001)
         both.write_bytes(one.read_bytes() + two.read_bytes()[24:])
-        told = Told([f"scanner/top:7000={both}", f"scanner/top/aux:7001={both}", f"imu/main:can2={CANDUMP}"])
+        told = ImportOptions([f"scanner/top:7000={both}", f"scanner/top/aux:7001={both}", f"imu/main:can2={CANDUMP}"])
         report, _ = run_import(config, [], tmp_path / "logs", told)
         assert report.units == {"scanner/top": 1, "scanner/top/aux": 1, "imu/main": 5367}
         assert [data for _, data, _ in content_of(tmp_path / "logs")["/scanner/top/aux/raw"]] == [b"b"]
-        report, _ = run_import(config, [], tmp_path / "all", Told([f"imu/main={CANDUMP}"]))
+        report, _ = run_import(config, [], tmp_path / "all", ImportOptions([f"imu/main={CANDUMP}"]))
         assert report.units == {"imu/main": 5588}
 
     def test_a_name_that_two_buses_have_is_nobodys(self, tmp_path: Path) -> None:
@@ -164,7 +164,7 @@ class TestWhose:
         path.write_text("(1.000000) 239.74.163.2 123#00\n")
         report, [capture] = run_import(config, [path], tmp_path / "none")
         assert (report.units, capture.passed) == ({}, {"239.74.163.2": 1})
-        report, _ = run_import(config, [], tmp_path / "logs", Told([f"imu/other={path}"]))
+        report, _ = run_import(config, [], tmp_path / "logs", ImportOptions([f"imu/other={path}"]))
         assert report.units == {"imu/other": 1}
 
     def test_senders_have_channels_of_their_own(self, tmp_path: Path) -> None:
@@ -249,12 +249,12 @@ class TestStamps:
         path.write_bytes(b"abcdef")
         rows = ["-5.5,0,2", "1.5,2,2", "9999999999.0,4,2"]
         (tmp_path / "rover.chunks.csv").write_text("\n".join(["arrival_unix_s,offset,length", *rows]) + "\n")
-        _, [capture] = run_import(write_config(tmp_path), [], tmp_path / "logs", Told([f"gnss/rover={path}"]))
+        _, [capture] = run_import(write_config(tmp_path), [], tmp_path / "logs", ImportOptions([f"gnss/rover={path}"]))
         assert [data for _, data, _ in content_of(tmp_path / "logs")["/gnss/rover/raw"]] == [b"cd"]
         assert capture.tally.damage == 2
         assert "no time between 1970 and 2262" in capture.tally.first_damage
         (tmp_path / "rover.chunks.csv").unlink()
-        told = Told([f"gnss/rover={path}"], {"": 9_999_999_999 * 10**9})
+        told = ImportOptions([f"gnss/rover={path}"], {"": 9_999_999_999 * 10**9})
         report, [capture] = run_import(write_config(tmp_path), [], tmp_path / "none", told)
         assert (report.units, capture.tally.damage) == ({}, 1)
 
@@ -271,7 +271,7 @@ class TestSerialTimes:
         tags += b"".join(struct.pack("<II", 20 * n, end) for n, end in enumerate(ends))
         (tmp_path / "rover.ubx.tag").write_bytes(tags)
         text = CONFIG.replace('"novatel"', '"ubx"')
-        run_import(write_config(tmp_path, text), [], tmp_path / "logs", Told([f"gnss/rover={path}"]))
+        run_import(write_config(tmp_path, text), [], tmp_path / "logs", ImportOptions([f"gnss/rover={path}"]))
         units = content_of(tmp_path / "logs")["/gnss/rover/raw"]
         assert b"".join(unit for _, unit, _ in units) == data
         assert [time_ns for time_ns, _, _ in units] == [
@@ -330,7 +330,7 @@ class TestSerialTimes:
         result = swath("import", str(tmp_path / "swath.toml"), *named, *given, "-o", str(tmp_path / "logs"))
         assert result.returncode == 2
         assert result.stderr.startswith("swath: ")
-        assert "want" in result.stderr or "--start" in result.stderr or "is no source" in result.stderr
+        assert "want" in result.stderr or "--start" in result.stderr or "is not a source" in result.stderr
         assert not list((tmp_path / "logs").glob("*.mcap"))
 
 
@@ -366,7 +366,7 @@ class TestWrong:
         (tmp_path / "short.log.gz").write_bytes(whole[: len(whole) // 2])
         code, error, found = self.run(tmp_path, str(tmp_path / "short.log.gz"))
         assert (code, error.count("\n")) == (4, 1)
-        assert "short.log.gz: cannot be read on: " in error
+        assert "short.log.gz: cannot be read further: " in error
         assert 50 < found["units"]["imu/main"] < 150
 
     @pytest.mark.parametrize(
@@ -378,7 +378,7 @@ class TestWrong:
     )
     def test_what_candump_shows_people_is_named(self, tmp_path: Path, line: str) -> None:
         (tmp_path / "shown.log").write_text(f"{line}\n{line}\n")
-        want = "shown.log: is what candump shows for people to read; want what candump -L (or -l) writes"
+        want = "shown.log: is candump's format for people; want the output of candump -L (or -l)"
         code, error, _ = self.run(tmp_path, str(tmp_path / "shown.log"))
         assert (code, error) == (2, f"swath: {tmp_path}/{want}\n")
 
@@ -395,14 +395,14 @@ class TestWrong:
         """By the first bytes that SQLite, rosbag, MCAP and python-can's BLF reader give."""
         (tmp_path / "flight.bag").write_bytes(begins + bytes(100))
         code, error, _ = self.run(tmp_path, str(tmp_path / "flight.bag"))
-        want = f"swath: {tmp_path}/flight.bag: is {what}; want pcap, candump -L or a device's bytes\n"
+        want = f"swath: {tmp_path}/flight.bag: is {what}; want pcap, candump -L or the bytes of a device\n"
         assert (code, error) == (2, want)
 
     def test_a_capture_of_other_ports(self, tmp_path: Path) -> None:
         path = write_pcap(tmp_path / "other.pcap", [b"x"] * 3, 5000)
         code, error, found = self.run(tmp_path, str(path))
-        want = f"{path}: holds port 5000 (3), the configuration has 2368 (scanner/top), 8308 (scanner/top/aux); "
-        want += "--source kind/name=FILE says whose it is"
+        want = f"{path}: holds port 5000 (3), but the configuration has 2368 (scanner/top), 8308 (scanner/top/aux); "
+        want += "give --source kind/name=FILE"
         assert (code, error, found["log"]) == (1, f"swath: {want}\n", [])
         assert found["captures"][0]["of_no_device"] == {"port 5000": 3}
 
@@ -420,17 +420,23 @@ class TestWrong:
     @pytest.mark.parametrize(
         ("arguments", "line"),
         [
-            (["{}/port.bin"], "neither pcap nor candump -L; if it is a device's bytes, say --source kind/name="),
-            (["{}"], "is a folder without swath-export.json"),
+            (
+                ["{}/port.bin"],
+                "neither pcap nor candump -L; if it holds the bytes of a device, use --source kind/name=",
+            ),
+            (["{}"], "has no swath-export.json"),
             ([], "nothing to import"),
             (["--source", "gnss/rover"], "want kind/name=FILE"),
-            (["--source", "gnss/base={}/port.bin"], "gnss/base is no source of the configuration; there are: pps/main"),
+            (
+                ["--source", "gnss/base={}/port.bin"],
+                "gnss/base is not a source of the configuration; there are: pps/main",
+            ),
             (
                 ["--source", "gnss/rover={}/a.pcap"],
-                "a.pcap: is a pcap file; gnss/rover comes by serial: want its bytes",
+                "a.pcap: is a pcap file, but gnss/rover uses serial; want a file of serial bytes",
             ),
-            (["--source", "scanner/top={}/port.bin"], "scanner/top comes by udp: want a pcap file"),
-            (["--source", "gnss/rover={}/port.bin"], "says no times"),
+            (["--source", "scanner/top={}/port.bin"], "scanner/top uses udp; want a pcap file"),
+            (["--source", "gnss/rover={}/port.bin"], "has no times"),
         ],
     )
     def test_what_cannot_be_imported(self, tmp_path: Path, arguments: list[str], line: str) -> None:
@@ -456,7 +462,7 @@ class TestWrong:
         lock = take_directory(tmp_path / "logs")
         code, error, _ = self.run(tmp_path, str(path))
         assert (code, lock > 0) == (3, True)
-        assert "another recorder is at work there" in error
+        assert "another recorder is running there" in error
 
     def test_a_full_disk_leaves_nothing(self, tmp_path: Path) -> None:
         path = write_pcap(tmp_path / "a.pcap", [bytes(60_000)] * 100)
@@ -467,7 +473,7 @@ class TestWrong:
         code += f"sys.exit(cli.run_app({words!r}))"
         done = run_python(code)
         assert done.returncode == 3, done.stderr
-        assert "nothing is left of it" in done.stderr
+        assert "the incomplete log was removed" in done.stderr
         assert not list((tmp_path / "logs").glob("*.mcap"))
 
     def test_an_export_that_was_changed_is_told(self, tmp_path: Path) -> None:
@@ -481,16 +487,16 @@ class TestWrong:
         serial.write_bytes(serial.read_bytes()[:-1])
         code, error, found = self.run(tmp_path, str(tmp_path / "out"))
         assert code == 4
-        assert "gnss-rover.gps.swath.csv.gz: speaks of unit 8, the file ends before" in error
+        assert "gnss-rover.gps.swath.csv.gz: names unit 8, but the file beside it ends before" in error
         assert found["units"] == {"gnss/rover": 8}
         manifest = folder / "swath-export.json"
         for text, line in (
-            ("{", "is no manifest"),
+            ("{", "is not a manifest"),
             ('{"files": {"../x": {"kind": "serial"}}}', "which is not in its folder"),
-            ('{"files": {"gone.log": {"kind": "candump"}}}', "it is not there"),
-            ('{"files": {"gnss-rover.gps": {"kind": "strange"}}}', "does not say what gnss-rover.gps is"),
-            ('{"files": {"gnss-rover.gps": {"kind": "serial", "source": "gnss/base"}}}', "is no source"),
-            ('{"files": {"gnss-rover.gps": {"kind": "serial", "source": "imu/main"}}}', "comes by can"),
+            ('{"files": {"gone.log": {"kind": "candump"}}}', "does not exist, but swath-export.json names it"),
+            ('{"files": {"gnss-rover.gps": {"kind": "strange"}}}', "does not describe gnss-rover.gps"),
+            ('{"files": {"gnss-rover.gps": {"kind": "serial", "source": "gnss/base"}}}', "is not a source"),
+            ('{"files": {"gnss-rover.gps": {"kind": "serial", "source": "imu/main"}}}', "uses can"),
         ):
             manifest.write_text(text)
             code, error, _ = self.run(tmp_path, str(folder))
@@ -515,7 +521,7 @@ def test_captures_cut_and_damaged_anywhere_never_break_an_import(tmp_path: Path,
     rng = np.random.default_rng(5)
     folder = tmp_path / "captures"
     folder.mkdir()
-    told = Told()
+    told = ImportOptions()
     if kind == "pcap":
         target = write_pcap(folder / "a.pcap", [bytes([n]) * 30 for n in range(5)])
     elif kind == "candump":
@@ -526,13 +532,13 @@ def test_captures_cut_and_damaged_anywhere_never_break_an_import(tmp_path: Path,
         target = folder / "a.gps.tag"
         tags = b"TIMETAG RTKLIB".ljust(64, b"\0") + struct.pack("<Id", 1_800_000_018, 0.5)
         target.write_bytes(tags + b"".join(struct.pack("<II", n, 10 * n + 10) for n in range(6)))
-        told = Told([f"gnss/rover={folder / 'a.gps'}"])
+        told = ImportOptions([f"gnss/rover={folder / 'a.gps'}"])
     elif kind in ("table", "bytes"):
         (folder / "a.gps.gz").write_bytes(gzip.compress(bytes(range(60))))
         rows = [f"{1_800_000_000 + n}.5,{n * 10},10" for n in (0, 1, 3, 2, 5)]  # as a table may have them: not in order
         (folder / "a.chunks.csv").write_text("\n".join(["arrival_unix_s,offset,length", *rows]) + "\n")
         target = folder / ("a.chunks.csv" if kind == "table" else "a.gps.gz")
-        told = Told([f"gnss/rover={folder / 'a.gps.gz'}"])
+        told = ImportOptions([f"gnss/rover={folder / 'a.gps.gz'}"])
     else:
         log = write_log(
             tmp_path / "log", config, [("imu/main", START_NS + n, encode_can_frame(n, b"ab"), None) for n in range(9)]

@@ -174,7 +174,7 @@ def test_a_disk_that_gives_back_something_else_is_told(logs: Path, disk: Path) -
 
     report = run_all(logs, disk, progress=change)
     assert (report.copied, report.deletable) == ([], [])
-    assert "read back otherwise" in report.differ[0]
+    assert "the data read back differ" in report.differ[0]
     assert names(disk) == []
 
 
@@ -185,7 +185,7 @@ def test_a_file_that_is_there_and_differs_is_not_overwritten(logs: Path, disk: P
     (disk / path.name).write_bytes(b"something of somebody's")
     code, report, stderr = offload_json(logs, disk)
     assert code == 4
-    assert stderr == f"swath: {disk / path.name}: is there and is not {path}; nothing was overwritten\n"
+    assert stderr == f"swath: {disk / path.name}: already exists and differs from {path}; it was not overwritten\n"
     assert (disk / path.name).read_bytes() == b"something of somebody's"
     assert [one["name"] for one in report["copied"]] == [other.name]
     assert report["may_be_deleted"] == [str(other)]
@@ -230,7 +230,7 @@ def test_another_log_of_the_same_name_and_size_is_not_taken_for_the_one_that_was
     os.utime(other, ns=(later_ns, later_ns))
     code, report, stderr = offload_json(others, disk)
     assert (code, report["may_be_deleted"], report["there"]) == (4, [], [])
-    assert "is there and is not" in stderr
+    assert "already exists and differs from" in stderr
     os.utime(path, ns=(later_ns, later_ns))  # the log itself, its time changed by whoever: compared, and found there
     assert offload_json(logs, disk)[1]["may_be_deleted"] == [str(path)]
 
@@ -240,7 +240,7 @@ def test_a_log_that_a_crash_left_open_is_copied_and_said(logs: Path, disk: Path)
     write_part(path, finish=False)
     run = swath("offload", str(logs), str(disk), "--same-disk")
     assert run.returncode == 0
-    assert f"{path.name}: was left open by a crash and is copied as it is" in run.stdout
+    assert f"{path.name}: was left open by a crash and is copied unchanged" in run.stdout
     assert (disk / path.name).read_bytes() == path.read_bytes()
 
 
@@ -299,9 +299,9 @@ def test_what_is_neither_a_directory_nor_a_configuration_is_one_line(disk: Path,
 def test_what_cannot_be_a_destination_is_one_line(logs: Path, disk: Path, tmp_path: Path) -> None:
     write_part(logs / "flight_0.mcap")
     for where, to, code, said in (
-        (logs, tmp_path / "not mounted", 3, "no such directory; is the disk mounted?"),
-        (logs, logs, 2, "is where the logs are"),
-        (disk, tmp_path, 3, "no logs (*.mcap) there"),
+        (logs, tmp_path / "not mounted", 3, "no such directory; check that the disk is mounted"),
+        (logs, logs, 2, "is the log directory itself"),
+        (disk, tmp_path, 3, "contains no logs (*.mcap)"),
     ):
         run = swath("offload", str(where), str(to), "--same-disk")
         assert (run.returncode, run.stderr.count("\n")) == (code, 1)
@@ -313,7 +313,7 @@ def test_a_list_of_sums_that_cannot_be_read_is_one_line(logs: Path, disk: Path) 
     (disk / "SHA256SUMS").mkdir()
     run = swath("offload", "--same-disk", str(logs), str(disk))
     assert (run.returncode, run.stderr.count("\n")) == (3, 1)
-    assert run.stderr.startswith(f"swath: {disk}/SHA256SUMS: Is a directory; want another folder")
+    assert run.stderr.startswith(f"swath: {disk}/SHA256SUMS: Is a directory; choose another folder")
     assert names(disk) == ["SHA256SUMS"]
 
 
@@ -326,7 +326,7 @@ def test_the_folder_of_a_disk_that_is_not_mounted_is_not_taken_for_it(
     run = swath("offload", str(logs), str(usb))
     assert (run.returncode, run.stdout) == (3, "")
     assert run.stderr == (
-        f"swath: {usb}: is on the same disk as {logs}; is the other disk mounted? --same-disk copies all the same\n"
+        f"swath: {usb}: is on the same disk as {logs}; check that the other disk is mounted, or use --same-disk\n"
     )
     assert names(usb) == []
     run = swath("offload", str(logs), str(small_disk))
@@ -364,7 +364,10 @@ def test_a_disk_mounted_read_only_is_one_line(logs: Path, small_disk: Path) -> N
     subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=True)
     run = swath("offload", str(logs), str(small_disk))
     assert run.returncode == 3
-    assert run.stderr == f"swath: {small_disk}: cannot be written: mounted read-only, or not permitted\n"
+    assert (
+        run.stderr
+        == f"swath: {small_disk}: cannot be written; check its permissions and that it is not mounted read-only\n"
+    )
 
 
 def test_one_run_at_a_time(logs: Path, disk: Path) -> None:
@@ -372,7 +375,10 @@ def test_one_run_at_a_time(logs: Path, disk: Path) -> None:
     first = offload(logs, disk, same_disk=True)
     next(first)
     run = swath("offload", str(logs), str(disk), "--same-disk")
-    assert (run.returncode, run.stderr) == (3, f"swath: {disk}: another swath offload is at work there\n")
+    assert (run.returncode, run.stderr) == (
+        3,
+        f"swath: {disk}: another swath offload is running there; wait until it ends\n",
+    )
     first.close()
     assert swath("offload", str(logs), str(disk), "--same-disk").returncode == 0
 

@@ -62,14 +62,16 @@ def test_check_and_doctor_say_which_folder_is_closed(closed: Path, directory: st
     found = json.loads(done.stdout)
     (problem,) = found["check"]["problems"]
     uid = os.geteuid() or 65534
-    assert problem.startswith(f"session.directory {closed / directory}: user {uid} may not enter {closed}; ask as root")
+    assert problem.startswith(
+        f"session.directory {closed / directory}: user {uid} may not enter {closed}; run this as root"
+    )
     (check, verdict, text, mend), of_another = found["doctor"]
     assert (check, verdict) == ("log directory", "wrong")
-    assert text.endswith(f" may not enter {closed}, in which {closed / directory} lies")
-    assert mend == f"sudo chmod o+x {closed}  # or say another session.directory"
+    assert text.endswith(f" may not enter {closed}, which holds {closed / directory}")
+    assert mend == f"sudo chmod o+x {closed}  # or set another session.directory"
     assert of_another[1:] == [
         "note",
-        f"not looked at: who asks may not enter {closed}, in which {closed / directory} lies; another may",
+        f"not checked: this user may not enter {closed}, which holds {closed / directory}; another may",
         "sudo swath doctor",
     ]
 

@@ -53,8 +53,8 @@ def test_the_owner_of_a_directory_records_where_root_did(logs: Path) -> None:
 def test_a_lock_that_is_not_his_is_named(logs: Path) -> None:
     (logs / LOCK).touch(0o600)
     assert said_to_nobody(logs) == (
-        f"session.directory .: {LOCK}: Permission denied; left there by another user's recording: "
-        "remove it when that one is at an end\n"
+        f"session.directory .: {LOCK}: Permission denied; a recording of another user left it; "
+        "remove it when that recording has ended\n"
     )
 
 

@@ -203,7 +203,7 @@ def test_recovered_file_is_good_for_the_doctor_and_supersedes(tmp_path: Path, wh
     (session,) = open_logs([tmp_path])
     assert [part.path for part in session.parts] == [report.recovered]
     assert session.attachments() == {"config.toml": b"[session]\n"}
-    with pytest.raises(LogError, match="is there already"):
+    with pytest.raises(LogError, match="already exists"):
         recover(path)
     assert recover(report.recovered).whole
 
@@ -286,7 +286,7 @@ def test_absurd_lengths_and_bombs_are_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["../evil", "/etc/passwd", "a/../../b", "", "a\\b", "a\0b"])
 def test_attachment_names_that_are_paths_are_refused(tmp_path: Path, name: str) -> None:
-    with pytest.raises(LogError, match="is no name"):
+    with pytest.raises(LogError, match="is not a valid name"):
         safe_attachment_path(tmp_path, name)
     assert safe_attachment_path(tmp_path, "dbc/imu.dbc") == tmp_path / "dbc" / "imu.dbc"
 
@@ -353,7 +353,7 @@ def test_parts_are_ordered_and_a_missing_one_is_named(tmp_path: Path) -> None:
     (session,) = open_logs([tmp_path])
     assert session.missing_parts == [2]
     shutil.copy(tmp_path / "z9.mcap", tmp_path / "copy.mcap")
-    with pytest.raises(LogError, match="is part 0 of its session, and so is"):
+    with pytest.raises(LogError, match="is part 0 of its session, as is"):
         open_logs([tmp_path])
 
 
@@ -378,7 +378,7 @@ def test_of_a_directory_without_a_log_it_is_said_why(tmp_path: Path) -> None:
         (tmp_path / f"{name}.mcap").touch()
     with pytest.raises(LogError) as error:
         open_logs([tmp_path], [])
-    assert str(error.value) == f"{tmp_path}: no logs (*.mcap) there; {tmp_path}/a.mcap: is no MCAP file, and 1 more"
+    assert str(error.value) == f"{tmp_path}: no logs (*.mcap); {tmp_path}/a.mcap: is not an MCAP file, and 1 more"
 
 
 # ------------------------------------------------------------------ a disk that refuses

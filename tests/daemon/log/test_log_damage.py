@@ -264,7 +264,7 @@ def test_a_log_that_is_being_recorded_is_read_without_blame_and_not_recovered(tm
     told = swath("info", "--json", str(tmp_path))
     assert told.returncode == 0, told.stderr
     assert json.loads(told.stdout)["sessions"][0]["growing"] == path.name
-    assert "is being recorded" in swath("info", str(tmp_path)).stdout
+    assert "is still being recorded" in swath("info", str(tmp_path)).stdout
     told = swath("recover", str(tmp_path))
     assert (told.returncode, "nothing to recover" in told.stdout) == (0, True)
     writer.close()

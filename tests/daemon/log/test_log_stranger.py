@@ -309,7 +309,7 @@ def test_times_that_cannot_be_are_counted_and_the_others_kept(tmp_path: Path) ->
     path = write(tmp_path, times_beyond_reason())
     report = recover(path)
     said = [(damage.what, damage.messages) for damage in report.damage if damage.messages]
-    assert said == [("messages with a time that cannot be", 2)] * 2
+    assert said == [("messages with an impossible time", 2)] * 2
     assert report.recovered is not None
     kept = sorted(2 * [0, 1, START_NS, START_NS + 10**9, YEAR_2200_NS, (1 << 63) - 1])
     assert sorted(time for time, _ in official(report.recovered)["/gnss/rover/raw"]) == kept

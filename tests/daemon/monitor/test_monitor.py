@@ -132,7 +132,7 @@ def test_says_what_comes_and_that_all_is_well(tmp_path: Path, logs: Path) -> Non
     assert found["hours_left"] == pytest.approx(hours, rel=0.01)
     assert [event["code"] for event in found["events"]] == ["session_started", "device_opened"]
     assert line.returncode == 0
-    assert line.stdout.startswith(f"recording {found['session_id']} part 0: all 1 sources are coming in; ")
+    assert line.stdout.startswith(f"recording {found['session_id']} part 0: all 1 sources deliver data; ")
     assert line.stdout.count("\n") == 1
 
 
@@ -212,7 +212,7 @@ def test_a_silent_source_degrades_and_an_absent_one(tmp_path: Path, logs: Path) 
 def test_nothing_recorded_is_2_and_says_why(tmp_path: Path, logs: Path) -> None:
     logs.mkdir()
     run = swath("monitor", "--once", str(logs))
-    assert (run.returncode, run.stdout) == (2, f"NOT RECORDING: nothing is being recorded in {logs}\n")
+    assert (run.returncode, run.stdout) == (2, f"NOT RECORDING: no recording in {logs}\n")
     with Recorder(tmp_path, session_table(logs)) as recorder:
         assert recorder.stop() == 0
     code, found = once(logs)
@@ -223,7 +223,7 @@ def test_nothing_recorded_is_2_and_says_why(tmp_path: Path, logs: Path) -> None:
         recorder.kill()
     code, found = once(logs)
     assert code == 2
-    assert "is gone, and its log has no end" in found["sentence"]
+    assert "has stopped without completing the log" in found["sentence"]
 
 
 @pytest.mark.slow
@@ -247,8 +247,8 @@ def test_stopped_at_the_reserve_is_not_recording(tmp_path: Path) -> None:
     assert (code, again) == (2, 0)
     assert "last event: disk_reserve: " in found["sentence"]
     assert (note.returncode, split.returncode) == (1, 1)
-    assert "the note waits for it" in note.stderr
-    assert "nothing is being recorded" in split.stderr
+    assert "the note is written when it resumes" in note.stderr
+    assert "no recording is running" in split.stderr
     assert notes == ["while it is full"]
 
 
@@ -262,7 +262,7 @@ def test_a_writer_that_stands_still_is_not_recording(tmp_path: Path, logs: Path)
         recorder.process.send_signal(signal.SIGCONT)
         assert recorder.stop() == 0
     assert code == 2
-    assert "nothing has been written for" in found["sentence"]
+    assert "no data were written for" in found["sentence"]
 
 
 @pytest.mark.long
@@ -307,7 +307,7 @@ def test_the_log_of_a_power_cut_is_not_called_recording_after_the_restart(tmp_pa
     code, found = once(logs)
     assert code == 2
     assert found["sentence"].startswith("NOT RECORDING: ")
-    assert "of another computer or of before a restart, has not grown for 5 s" in found["sentence"]
+    assert "(of another computer or before a restart) has not grown for 5 s" in found["sentence"]
 
 
 @pytest.mark.parametrize("seed", range(40))
@@ -431,7 +431,7 @@ def test_a_damaged_chunk_of_the_growing_log_degrades(tmp_path: Path) -> None:
     monitor.poll()
     found = monitor.snapshot()
     assert (found["verdict"], found["damaged_chunks"]) == ("degraded", 1)
-    assert "1 chunks of the log DAMAGED" in found["sentence"]
+    assert "1 DAMAGED chunks in the log" in found["sentence"]
     other = replace(INFO, session_id="later-20261121T110000Z-ab12")
     later = PartWriter(tmp_path / f"{other.session_id}_0.mcap", other, 0)
     later.add_channel(1, SCANNER)

@@ -213,16 +213,20 @@ def test_a_roll_over_of_the_heads_receiver_is_moved_as_one_of_a_receivers_own(tm
     error, _ = errors_ns(clocks, HOURS, 1)
     assert max(map(abs, error)) < 1_000
     (line,) = clocks.remarks
-    assert line.startswith("scanner/top: says 2006-10-30, 1 roll-over of 1024 weeks behind: taken as 2026-06-15, for")
+    assert line.startswith(
+        "scanner/top: sends the date 2006-10-30, 1 roll-over of 1024 weeks behind; corrected to 2026-06-15, because"
+    )
 
 
 def test_a_heads_date_that_nobody_believes_is_refused_and_named(tmp_path: Path) -> None:
     setup, clocks = found(tmp_path, WITH_AUX, [*velodyne(), *positions(off=-ROLLOVER - dt.timedelta(days=9))])
     (line,) = clocks.remarks
-    assert line.startswith("scanner/top: says 2006-10-21, before 2009-01-01: probably one roll-over of 1024 weeks")
-    assert "want a receiver at the head that knows the date" in line
+    assert line.startswith(
+        "scanner/top: sends the date 2006-10-21, before 2009-01-01: probably one roll-over of 1024 weeks"
+    )
+    assert "connect a receiver with the right date to the head" in line
     status = clocks.host.status("scanner/top", START_UNIX_NS + 20 * NS)
-    with pytest.raises(UserError, match="scanner/top: says 2006-10-21"):
+    with pytest.raises(UserError, match="scanner/top: sends the date 2006-10-21"):
         refuse_no_time(tmp_path, "scanner/top", status, setup.config, clocks.remarks, clocks.trouble("scanner/top"))
 
 

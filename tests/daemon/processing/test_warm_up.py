@@ -96,7 +96,10 @@ def test_live_says_that_it_compiles_and_can_be_ended_then(tmp_path: Path, signum
     with subprocess.Popen(command, cwd=ROOT, env=environment, stderr=subprocess.PIPE, text=True) as live:
         assert live.stderr is not None
         try:
-            assert live.stderr.readline() == "compiling, a minute or more; `swath warm-up` does this before a flight\n"
+            assert (
+                live.stderr.readline()
+                == "compiling; this takes a minute or more. Run `swath warm-up` before a flight to avoid it\n"
+            )
             live.send_signal(signum)
             assert live.wait(HANGS_S) == code
             rest = live.stderr.read()

@@ -92,8 +92,8 @@ def test_configuration_of_another_aircraft(tmp_path: Path) -> None:
             assert recorder.stop() == 0
     log = read_log(tmp_path / "logs")
     assert {event["source"]: event["text"] for event in log.events("wrong_protocol")} == {
-        "gnss/rover": "answers as ubx, configured as novatel; recorded all the same",
-        "scanner/right": "answers as velodyne-vlp16, configured as srep; recorded all the same",
+        "gnss/rover": "sends ubx, but novatel is configured; recording continues",
+        "scanner/right": "sends velodyne-vlp16, but srep is configured; recording continues",
     }
     assert all(log.units[source] for source in ("gnss/rover", "scanner/left", "scanner/right"))
 

@@ -123,7 +123,7 @@ def test_split_begins_a_part_and_loses_nothing(tmp_path: Path, logs: Path) -> No
         assert recorder.stop() == 0, recorder.stderr()
     paths = sorted(logs.glob("*.mcap"))
     assert [path.stem.rsplit("_", 1)[1] for path in paths] == ["0", "1", "2"]
-    assert told.stdout == f"recording goes on in {paths[1].name}\n"
+    assert told.stdout == f"recording continues in {paths[1].name}\n"
     assert answer["new_part"] == paths[2].name
     content = read_log(*paths)
     assert [int.from_bytes(data[:8], "little") for _, data in content.units["scanner/left"]] == list(range(300))
@@ -152,7 +152,7 @@ def test_what_is_no_note_is_said_before_it_is_sent(logs: Path, text: str) -> Non
     logs.mkdir()
     run = swath("mark", text, str(logs))
     assert run.returncode == 2
-    assert run.stderr == f"swath: a note is a text of 1 to {NOTE_CHARACTERS} characters\n"
+    assert run.stderr == f"swath: TEXT has {len(text)} characters; want 1 to {NOTE_CHARACTERS}, not only spaces\n"
 
 
 def test_only_its_owner_can_connect(tmp_path: Path, open_folder: Path) -> None:
@@ -222,7 +222,7 @@ def test_a_living_socket_is_left_alone(tmp_path: Path, monkeypatch: pytest.Monke
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(runtime))
     first, second = tmp_path / "first", tmp_path / "second"
     with Recorder(tmp_path / "a", session_table(first)) as one, Recorder(tmp_path / "b", session_table(second)) as two:
-        two.wait_said("another recorder listens there")
+        two.wait_said("another recorder uses it")
         assert swath("mark", "for one", str(first)).returncode == 0
         assert "no recorder" in swath("mark", "for two", str(second)).stderr
         assert two.stop() == 0
@@ -296,7 +296,7 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 def test_new_parts_without_end_are_refused(running: Path) -> None:
     answers = [say(running / ".swath.control", b'{"command": "split"}\n') for _ in range(SPLITS_AT_ONCE + 2)]
     assert [answer["ok"] for answer in answers[:SPLITS_AT_ONCE]] == [True] * SPLITS_AT_ONCE
-    assert answers[-1] == {"ok": False, "error": "too many new parts; 1 a second is begun"}
+    assert answers[-1] == {"ok": False, "error": "too many new parts; at most 1 per second is begun"}
 
 
 class Nuisance:

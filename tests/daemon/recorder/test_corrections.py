@@ -201,7 +201,10 @@ def test_check_says_what_answers(tmp_path: Path) -> None:
     assert (base.opens, base.bytes, base.problems) == (True, 4000, [])
     assert base.records["DeviceStatus"] > 0
     (problem,) = other.problems
-    assert problem == f"ntrip:127.0.0.1:{closed.port}/ZIMM0: the caster refuses user or password"
+    assert (
+        problem
+        == f"ntrip:127.0.0.1:{closed.port}/ZIMM0: the caster rejects user or password; check user and password_env"
+    )
 
 
 @pytest.mark.parametrize(
@@ -209,16 +212,19 @@ def test_check_says_what_answers(tmp_path: Path) -> None:
     [
         (
             {"transport": "udp:0.0.0.0:1"},
-            'corrections.base.transport: got "udp:0.0.0.0:1"; rtcm3 comes by: serial, ntrip',
+            'corrections.base.transport: got "udp:0.0.0.0:1"; rtcm3 supports: serial, ntrip',
         ),
-        ({"transport": "ntrip:a:1/B", "protocol": "nmea"}, "corrections.base.protocol: no corrections protocol 'nmea'"),
+        (
+            {"transport": "ntrip:a:1/B", "protocol": "nmea"},
+            "corrections.base.protocol: unknown corrections protocol 'nmea'",
+        ),
         (
             {"transport": "ntrip:a:1/B", "forward_to": "gnss.left"},
-            'forward_to: got "gnss.left", want a receiver as gnss.<name>; there are: gnss.rover, gnss.net',
+            'forward_to: got "gnss.left", want a receiver such as gnss.rover; there are: gnss.rover, gnss.net',
         ),
         (
             {"transport": "ntrip:a:1/B", "forward_to": "gnss.net"},
-            "corrections.base.forward_to: gnss.net has no serial port that could take corrections",
+            "corrections.base.forward_to: gnss.net has no serial port; choose a receiver with a serial: transport",
         ),
         (
             {"transport": "serial:/dev/ttyS9"},

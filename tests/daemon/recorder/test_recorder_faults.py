@@ -234,7 +234,7 @@ def test_lock_and_control_socket_come_back_with_the_directory(tmp_path: Path, lo
         recorder.wait_said("part_opened")
         wait_until((logs / ".swath.control").is_socket, "the socket is back")
         assert swath("mark", "still here", str(logs)).returncode == 0
-        with pytest.raises(UserError, match="another recorder is at work there"):
+        with pytest.raises(UserError, match="another recorder is running there"):
             take_directory(logs)
         assert recorder.stop() == 0, recorder.stderr()
     assert not (logs / ".swath.control").exists()
@@ -255,7 +255,7 @@ def test_another_recorder_that_takes_the_directory_made_anew_is_told_and_not_dis
         new.rename(logs)
         recorder.wait_said("directory_unlocked")
         assert recorder.stop() == 0, recorder.stderr()
-    with pytest.raises(UserError, match="another recorder is at work there"):
+    with pytest.raises(UserError, match="another recorder is running there"):
         take_directory(logs)
     os.close(lock)
     assert (logs / ".swath.control").is_file()

@@ -291,7 +291,7 @@ def health_of(**states: dict[str, object]) -> WriterHealth:
 
 def test_sentence_says_what_an_operator_must_know() -> None:
     assert sentence("s", 2, health_of(gnss_rover={}, scanner_left={})) == (
-        "recording s part 2: all 2 sources are coming in; 100.0 GB free (2 h 46 min)"
+        "recording s part 2: all 2 sources deliver data; 100.0 GB free (2 h 46 min)"
     )
     text = sentence(
         "s",
@@ -307,7 +307,7 @@ def test_sentence_says_what_an_operator_must_know() -> None:
     assert "imu/spare no data yet" in text
     stopped = WriterHealth(state=Writing.RESERVE, reason="3 MB free")
     assert sentence("s", 0, stopped) == "NOT RECORDING: 3 MB free"
-    assert "begins" in sentence("s", 0, WriterHealth())
+    assert "starting" in sentence("s", 0, WriterHealth())
 
 
 def test_the_time_left_is_that_until_the_reserve_where_recording_stops(bench: Bench) -> None:

@@ -141,7 +141,7 @@ def test_a_second_recorder_gets_the_same_bytes_edges_and_seconds(
     delays = [arrival_after_edge(log) for log in (before, after)]
     later = [abs(new - old) for old, new in zip(*delays, strict=True)]
     assert median(later) < 0.1, delays
-    assert "scanner/right: nothing in" in said
+    assert "scanner/right: no data for it in" in said
 
 
 def arrival_after_edge(content: LogContent) -> list[float]:

@@ -198,7 +198,7 @@ class TestFaults:
         assert told(content, "gnss/rover") == [
             ("info", "device_opened", "opened"),
             ("info", "second_known", "by gnss/rover TIME"),
-            ("error", "device_lost", "unplugged; waiting for it"),
+            ("error", "device_lost", "disconnected; waiting for it"),
             ("info", "device_opened", "opened"),
         ]
         assert states(content, "gnss/rover")[4:9] == ["receiving", "absent", "absent", "absent", "receiving"]
@@ -245,7 +245,7 @@ class TestParts:
         report, logs = made
         before = report.paths[0].read_bytes()
         config = aircraft_config(logs.parent)
-        with pytest.raises(UserError, match=f"{report.paths[0].name}: is there already"):
+        with pytest.raises(UserError, match=f"{report.paths[0].name}: already exists"):
             fly_into_log(config, logs, Standin(SECONDS), SEED)
         assert report.paths[0].read_bytes() == before
 

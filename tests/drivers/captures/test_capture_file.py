@@ -340,7 +340,7 @@ def test_bad_pcaps_are_one_line(tmp_path: Path) -> None:
         "packet": (data[:-3], "at byte 86"),
         "length": (data[:32] + b"\xff\xff\xff\xff" + data[36:], "is damaged, at byte 24"),
         "link": (data[:20] + b"\x93\0\0\0" + data[24:], "link type 147"),
-        "gzip": (gzip.compress(data)[:-12], "cannot be read on"),
+        "gzip": (gzip.compress(data)[:-12], "cannot be read further"),
     }
     for name, (content, text) in cases.items():
         path = tmp_path / name
@@ -419,7 +419,7 @@ def test_lines_that_are_no_frame_are_named(tmp_path: Path, line: str) -> None:
     path.write_text(f"(1.0) vcan0 123#00\n{line}\n")
     reader = read_candump(path)
     assert next(reader).channel == "vcan0"
-    with pytest.raises(TransportError, match=r"bad.log: line 2 is no frame"):
+    with pytest.raises(TransportError, match=r"bad.log: line 2 is not a frame of candump -L: \S"):
         next(reader)
 
 
@@ -444,7 +444,7 @@ def test_bad_lines_are_counted_and_the_rest_is_read(tmp_path: Path) -> None:
     tally = CaptureTally()
     list(read_candump(packed, tally=tally))
     assert tally.damage == 1
-    assert "cannot be read on" in tally.first_damage
+    assert "cannot be read further" in tally.first_damage
 
 
 def test_real_frames_are_written_as_they_were_read(tmp_path: Path) -> None:

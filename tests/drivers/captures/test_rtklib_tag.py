@@ -130,8 +130,8 @@ def test_a_stream_whose_line_ends_were_changed_does_not_fit_its_tags() -> None:
     for _ in read_tagged(FIXTURES / "imu_1934.csv.gz", FIXTURES / "imu_1934.csv.tag.gz", tally):
         pass
     assert tally.damage == 1
-    assert "speaks of " in tally.first_damage
-    assert "bytes more than imu_1934.csv.gz has" in tally.first_damage
+    assert "counts " in tally.first_damage
+    assert "bytes more than imu_1934.csv.gz holds" in tally.first_damage
 
 
 def test_tags_that_do_not_fit_are_told_after_the_good_bytes(tmp_path: Path) -> None:
@@ -142,7 +142,7 @@ def test_tags_that_do_not_fit_are_told_after_the_good_bytes(tmp_path: Path) -> N
     units = list(read_tagged(path, tags, tally))
     assert sum(len(unit.data) for unit in units) == 350
     assert tally.damage == 1
-    assert "speaks of 50 bytes more than rover.ubx has" in tally.first_damage
+    assert "counts 50 bytes more than rover.ubx holds" in tally.first_damage
 
 
 @given(

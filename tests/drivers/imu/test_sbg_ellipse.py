@@ -166,7 +166,7 @@ def test_pps_on_a_sync_in_latches_the_counter(event: str) -> None:
 @pytest.mark.parametrize(
     ("config", "text"),
     [
-        ({"ids": {"GYRO": 1}}, "ids.GYRO is unknown; there are: IMU_ACCEL, IMU_GYRO, IMU_INFO"),
+        ({"ids": {"GYRO": 1}}, "ids.GYRO: unknown message; there are: IMU_ACCEL, IMU_GYRO, IMU_INFO"),
         ({"ids": {"IMU_GYRO": 0x120}}, "ids: IMU_GYRO and IMU_INFO are both 0x120; give each its own"),
         ({"ids": {"IMU_GYRO": 0x800}}, "0x800 does not fit 11 bits; want 0 to 0x7FF; 29 bits need extended_ids = true"),
         ({"ids": {"IMU_GYRO": -1}}, "does not fit 11 bits"),

@@ -119,9 +119,12 @@ def test_the_layout_is_a_dbc_whose_frames_have_the_documented_lengths() -> None:
 @pytest.mark.parametrize(
     ("config", "text"),
     [
-        ({"tick_hz": None}, "tick_hz: say 1000000 or 10000"),
+        ({"tick_hz": None}, "tick_hz: missing; want 1000000 or 10000"),
         ({"byte_order": "middle"}, 'byte_order: got "middle", want "big" or "little"'),
-        ({"ids": {"Gyro": 1}}, "ids.Gyro is unknown; there are: Acceleration, GroupCounter, RateOfTurn, SampleTime"),
+        (
+            {"ids": {"Gyro": 1}},
+            "ids.Gyro: unknown message; there are: Acceleration, GroupCounter, RateOfTurn, SampleTime",
+        ),
         ({"sample": "increment"}, 'sample: got "increment"'),
     ],
 )

@@ -103,7 +103,7 @@ def test_send_to_a_line_that_takes_nothing(device: Device, monkeypatch: pytest.M
     monkeypatch.setattr("swath.drivers.transports.serial_port.SEND_TIMEOUT_S", 0.1)
     serial = port(device.path)
     serial.open()
-    with pytest.raises(TransportError, match="takes no data"):
+    with pytest.raises(TransportError, match="accepts no data"):
         serial.send(bytes(1 << 20))
     serial.close()
 
@@ -113,10 +113,10 @@ def test_unplugged_while_waiting(device: Device) -> None:
     serial.open()
     unplug = threading.Timer(0.1, device.unplug)
     unplug.start()
-    with pytest.raises(TransportError, match=f"{device.path} has gone"):
+    with pytest.raises(TransportError, match=f"{device.path} was disconnected"):
         serial.receive(30.0)
     unplug.join()
-    with pytest.raises(TransportError, match="has gone"):
+    with pytest.raises(TransportError, match="was disconnected"):
         serial.send(b"x")
     serial.close()
 
@@ -134,12 +134,12 @@ def test_replugged_under_its_stable_name(device: Device, tmp_path: Path) -> None
     device.unplug()
     assert session.receive(5.0) == []
     assert session.state.value == SessionState.WAITING.value
-    assert "has gone" in session.last_error
+    assert "was disconnected" in session.last_error
 
     deadline = time.monotonic() + 30.0
-    while "there is no" not in session.last_error and time.monotonic() < deadline:
+    while "does not exist" not in session.last_error and time.monotonic() < deadline:
         session.receive(0.0)
-    assert f"there is no {link}" in session.last_error
+    assert f"{link} does not exist" in session.last_error
 
     again = Device()
     link.symlink_to(again.path)
@@ -183,9 +183,9 @@ def test_another_process_holds_the_port(device: Device) -> None:
 @pytest.mark.parametrize(
     ("path", "says"),
     [
-        ("/nonexistent/ttyUSB0", "there is no /nonexistent/ttyUSB0"),
-        ("/dev/null", "/dev/null is no serial port"),
-        (__file__, "test_transport_serial.py is no serial port"),
+        ("/nonexistent/ttyUSB0", "/nonexistent/ttyUSB0 does not exist"),
+        ("/dev/null", "/dev/null is not a serial port; see `ls /dev/serial/by-id`"),
+        (__file__, "test_transport_serial.py is not a serial port; see `ls /dev/serial/by-id`"),
         ("/tmp", "cannot open /tmp as a serial port: Is a directory"),
     ],
 )

@@ -273,7 +273,7 @@ def test_an_interface_that_is_another_one_now_is_gone(monkeypatch: pytest.Monkey
 
     monkeypatch.setattr(socket, "if_nametoindex", now)
     udp._looked_s = 0.0
-    with pytest.raises(TransportError, match="network interface lo has gone, or came back as another"):
+    with pytest.raises(TransportError, match="network interface lo has gone or was replaced"):
         udp.receive(0.05)
     udp.close()
 
@@ -336,7 +336,7 @@ def test_port_in_use_names_the_holder() -> None:
 @pytest.mark.parametrize(
     ("options", "host", "says"),
     [
-        ("", "203.0.113.7", "this machine has no address 203.0.113.7"),
+        ("", "203.0.113.7", "this computer has no address 203.0.113.7"),
         ("?interface=nosuch0", "0.0.0.0", "no network interface nosuch0"),
         (f"?group={GROUP}&interface=nosuch0", "0.0.0.0", "no network interface nosuch0"),
     ],
@@ -421,7 +421,7 @@ def test_send_reaches_the_sender_filtered_for() -> None:
 def test_send_without_anyone_to_send_to() -> None:
     udp = transport()
     udp.open()
-    with pytest.raises(TransportError, match="has nobody to send to"):
+    with pytest.raises(TransportError, match="has no address to send to"):
         udp.send(b"x")
     udp.close()
 

@@ -56,7 +56,7 @@ def test_can(text: str, interface: str, channel: str, transport: type) -> None:
 def test_inside_a_gnss_stream_is_nothing_to_open() -> None:
     spec = parse_transport("gnss:rover")
     assert (spec.kind, spec.address) == ("gnss", "rover")
-    with pytest.raises(ValueError, match="nothing to open"):
+    with pytest.raises(ValueError, match="cannot be opened itself"):
         open_transport(spec)
 
 
@@ -77,7 +77,7 @@ def test_inside_a_gnss_stream_is_nothing_to_open() -> None:
         ("udp:0.0.0.0:2368?buffer_mb=4000", "buffer_mb=4000 should be whole mebibytes, 1 to 1023"),
         ("udp:0.0.0.0:2368?", "option '' should be <keyword>=<value>"),
         ("udp:0.0.0.0:2368?group", "option 'group' should be <keyword>=<value>"),
-        ("udp:0.0.0.0:2368?buffer_mb=1&buffer_mb=2", "option 'buffer_mb' stands twice"),
+        ("udp:0.0.0.0:2368?buffer_mb=1&buffer_mb=2", "option 'buffer_mb' is given twice"),
         ("serial:", "want serial:<path>"),
         ("serial:/dev/ttyUSB0?baud=fast", "baud=fast should be a whole number, 1 to 20000000"),
         ("serial:/dev/ttyUSB0?baud=-1", "baud=-1 should be a whole number"),
@@ -89,12 +89,12 @@ def test_inside_a_gnss_stream_is_nothing_to_open() -> None:
         ("serial:/dev/ttyUSB0?rtscts=maybe", "rtscts=maybe should be yes or no"),
         ("can:can0", "want can:<interface>:<channel>"),
         ("can:sockecan:can0", "unknown CAN interface 'sockecan'; python-can has: "),
-        ("can:slcan:/dev/ttyUSB0?channel=3", "channel is no option; want can:<interface>:<channel>?…"),
-        ("can:virtual:x?interface=y", "interface is no option"),
+        ("can:slcan:/dev/ttyUSB0?channel=3", "channel is not an option; want can:<interface>:<channel>?…"),
+        ("can:virtual:x?interface=y", "interface is not an option"),
         ("can:socketcan:can0?bitrat=5", "unknown option 'bitrat'"),
-        ("serial:/dev/a\0b", "has an unprintable character in it"),
-        ("can:socketcan:a\0b", "has an unprintable character in it"),
-        ("udp:0.0.0.0:2368?interface=eth1\n", "has an unprintable character in it"),
+        ("serial:/dev/a\0b", "contains an unprintable character"),
+        ("can:socketcan:a\0b", "contains an unprintable character"),
+        ("udp:0.0.0.0:2368?interface=eth1\n", "contains an unprintable character"),
         ("gnss:", "want gnss:<name>"),
         ("gnss:rover?baud=5", "want gnss:<name>"),
     ],
@@ -130,7 +130,7 @@ def test_wrong_pps_text_says_what_would_be_right(text: str) -> None:
 
 @pytest.mark.parametrize("text", ["fixed:x\0y", "/dev/pps\0", "serial-dcd:/dev/tty\x1bS0"])
 def test_a_pps_text_with_a_control_character_is_refused(text: str) -> None:
-    with pytest.raises(ValueError, match="has an unprintable character in it"):
+    with pytest.raises(ValueError, match="contains an unprintable character"):
         parse_pps(text)
 
 

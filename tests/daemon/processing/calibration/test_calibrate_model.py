@@ -215,7 +215,7 @@ def test_a_file_of_nested_tables_is_a_line(tmp_path: Path) -> None:
 
 def test_no_text_is_a_line(tmp_path: Path) -> None:
     (tmp_path / "model.toml").write_bytes(b"\xff\xfe\x00")
-    assert "model.toml: cannot be read: no text; want a TOML file" in refused(str(tmp_path / "model.toml"))
+    assert "model.toml: cannot be read: not text; want a TOML file" in refused(str(tmp_path / "model.toml"))
 
 
 def test_what_is_asked_for_is_told_in_keys_of_files(tmp_path: Path) -> None:

@@ -396,9 +396,9 @@ class TestCommand:
     @pytest.mark.parametrize(
         ("arguments", "told"),
         [
-            (["--replay", "some.mcap"], "say which logs, and where to: swath live --replay LOG… -o DIR [CONFIG]"),
-            (["-o", "x"], "-o belongs to --replay"),
-            (["a", "b"], "one recorder at a time"),
+            (["--replay", "some.mcap"], "--replay needs logs and -o DIR: swath live --replay LOG… -o DIR [CONFIG]"),
+            (["-o", "x"], "-o needs --replay"),
+            (["a", "b"], "too many arguments; give one CONFIG or DIR"),
         ],
     )
     def test_wrong_use_is_a_line(self, arguments: list[str], told: str) -> None:

@@ -124,7 +124,7 @@ class TestIndex:
         damage: list[object] = []
         list(read_chunks(index, index.chunks[:6], None, damage))  # type: ignore[arg-type]
         assert len(damage) == 2
-        assert "no chunk where the index" in str(damage[0])
+        assert "no chunk at the place that the index" in str(damage[0])
 
 
 def counts(plan: SessionPlan, job: Job, tell: Tell) -> JobResult:

@@ -221,7 +221,7 @@ def test_mistakes_are_one_line_and_leave_nothing(
     points = [full[0], str(tmp_path / "points"), *full[2:]]
     for given, code, words in (
         ([*full, "--strip-model", "cubic"], 2, 'got "cubic", want one of none, constant, linear, spline, auto'),
-        ([*full, "--level", "QL1"], 2, "--level: is of a comparison"),
+        ([*full, "--level", "QL1"], 2, "--level is for a comparison"),
         (points, 2, "holds points; want the logs they are of"),
         (nominal, 2, "left: has the nominal calibration only"),
         ([*full, "--control", str(tmp_path / "no.csv")], 3, "no.csv: cannot be read"),
@@ -249,7 +249,7 @@ def test_files_that_are_there_stay(
     assert {path: path.read_bytes() for path in adjusted.iterdir()} == was
     code, line = refused(capsys, ["strips", str(made.flown.log), "--strip-model", "linear"])
     assert code == 2
-    assert "want --adjust DIR too" in line
+    assert "needs --adjust DIR" in line
 
 
 @pytest.fixture(scope="module")

@@ -127,8 +127,8 @@ def test_a_receiver_one_rollover_behind_is_set_right_by_the_hosts_day() -> None:
     assert [fix.time.date for fix in fixes(records) if fix.valid and fix.time.date] == [at.date()]
     assert parser.counters.errors["date_before_floor"] == 0
     assert parser.remarks() == [
-        "gnss/test: says 1999-08-22, 1 roll-over of 1024 weeks behind: taken as 2019-04-07, for the host's clock shows "
-        "that day"
+        "gnss/test: sends the date 1999-08-22, 1 roll-over of 1024 weeks behind; corrected to 2019-04-07, because "
+        "the host clock shows that date"
     ]
 
 
@@ -145,7 +145,7 @@ def test_dates_roll_overs_behind_are_set_right(weeks: int, name: str) -> None:
     assert (message.valid, message.time.date) == (True, DAY)
     (line,) = parser.remarks()
     behind = "1 roll-over of" if weeks == 1024 else "2 roll-overs of"
-    assert f"says {said}, {behind} 1024 weeks behind: taken as 2026-11-21" in line
+    assert f"sends the date {said}, {behind} 1024 weeks behind; corrected to 2026-11-21" in line
 
 
 def test_however_it_is_cut() -> None:

@@ -414,12 +414,12 @@ def test_weeks_one_roll_over_behind_are_moved_on_request_or_by_the_hosts_day(sai
         assert not gps.valid
         assert not utc.valid
         assert "2007-04-01, before 2009-01-01" in line
-        assert "1024 weeks behind, which makes 2026-11-15" in line
-        assert "want gnss.rover.add_weeks = 1024" in line
+        assert "1024 weeks behind (then 2026-11-15;" in line
+        assert "set gnss.rover.add_weeks = 1024" in line
         return
     assert [whole_gps_ns(item.time, None) for item in (gps, utc)] == [gps_ns_from_week(WEEK, NOON_MS * MS)] * 2
     assert (gps.valid, utc.valid) == (True, True)
-    assert "1 roll-over of 1024 weeks behind: taken as 2026-11-15" in line
+    assert "1 roll-over of 1024 weeks behind; corrected to 2026-11-15" in line
 
 
 def test_second_60_is_a_second() -> None:

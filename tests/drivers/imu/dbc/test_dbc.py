@@ -407,7 +407,7 @@ def test_a_signal_of_all_pages_beside_signals_of_two_is_refused() -> None:
         ({"signals": {**without(), "specific_force": ["ACC.acc_x"]}}, "signals.specific_force must name three signals"),
         (
             {"signals": {**without(), "angular_rates": "x"}},
-            "signals.angular_rates is unknown; there are: specific_force",
+            "signals.angular_rates: unknown signal; there are: specific_force",
         ),
         ({"signals": without("angular_rate")}, "signals.angular_rate must name three signals"),
         ({"signals": without("sample_ticks")}, "signals.pps_ticks needs signals.sample_ticks"),
@@ -526,5 +526,5 @@ def test_frames_that_come_evenly_leave_the_group_in_doubt() -> None:
     rows = imu_rows(feed(parser, frames) + parser.close())
     assert len(rows) > 70
     (doubt,) = parser.doubts
-    assert 'say group = "last" or "first"' in doubt
+    assert 'set group = "last" or "first"' in doubt
     assert DbcParser(settings()).doubts == ()

@@ -133,7 +133,7 @@ def test_a_latched_edge_is_a_frame_of_its_own() -> None:
         [*parser.feed_batch(ChunkBatch("imu/main", np.arange(7), np.vstack([pulse, frames]))), *parser.close()]
     )
     assert rows["pps_time_ns"].tolist() == [4_000_000, 4_000_000]
-    with pytest.raises(ValueError, match="no message of its own"):
+    with pytest.raises(ValueError, match="needs a message of its own"):
         encode_latch(UNITS["sbg-ellipse"][0], 1)
 
 

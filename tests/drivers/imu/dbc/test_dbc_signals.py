@@ -156,5 +156,7 @@ def test_a_message_that_stands_twice_is_refused_where_it_is_needed(caplog: pytes
     database = load_database(f"{IMU_DBC}\n\n{message}\n".encode())
     assert not caplog.records
     signal = message.split("SG_ ")[1].split()[0]
-    with pytest.raises(DriverSettingsError, match=rf"^message {name} stands in imu.dbc more than once; want it once$"):
+    with pytest.raises(
+        DriverSettingsError, match=rf"^message {name} is defined more than once in imu.dbc; keep one definition$"
+    ):
         find_signal(database, f"{name}.{signal}", "imu.dbc")

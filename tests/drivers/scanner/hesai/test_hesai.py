@@ -263,7 +263,7 @@ def test_design_angles_are_used_without_a_file() -> None:
     [
         (lambda text: text.replace("7,8.917419,", "7,up,"), "line 8"),
         (lambda text: text.replace("7,8.917419,", "7,98.9,"), "line 8"),
-        (lambda text: text.replace("\n7,", "\n6,"), "channel 6 a second time"),
+        (lambda text: text.replace("\n7,", "\n6,"), "channel 6 appears twice"),
         (lambda text: text[: text.index("\n32,")], "31 channels, want channels 1 to 32"),
         (lambda text: text + "33,0,0\n", "33 channels"),
         (lambda _: "", "0 channels"),
@@ -472,8 +472,8 @@ def test_a_date_a_roll_over_behind_is_moved_in_the_time_message() -> None:
         clock_of(records)["device_time_ns"][0] == int(dt.datetime(2006, 11, 6, 12, tzinfo=dt.UTC).timestamp()) * 10**9
     )
     assert [line.partition(",")[0] for line in parser.remarks()] == [
-        "scanner/left: says 2006-11-06",
-        "scanner/left: says 2005-01-01",
+        "scanner/left: sends the date 2006-11-06",
+        "scanner/left: sends the date 2005-01-01",
     ]
 
 

@@ -107,7 +107,7 @@ def changed(path: str, value: Any) -> bytes:
         (
             "beam_intrinsics/beam_altitude_angles",
             [0, 0.0] * 8,
-            "beam_altitude_angles: got a list of 16, want the head's own: 0 of all beams is no calibration",
+            "beam_altitude_angles: got a list of 16, want the head's own angles; 0 for all beams is not a calibration",
         ),
         (
             "beam_intrinsics/beam_to_lidar_transform",
@@ -146,13 +146,13 @@ def test_what_cannot_be_is_refused_in_one_line(path: str, value: Any, line: str)
 @pytest.mark.parametrize(
     ("content", "reason"),
     [
-        (b"", "no JSON"),
-        (b"\xff\xfe{}", "no JSON"),
-        (b"[1]", "no table"),
+        (b"", "not JSON"),
+        (b"\xff\xfe{}", "not JSON"),
+        (b"[1]", "not a JSON object"),
         (b'{"data_format": NaN}', "data_format: got NaN, want the head's"),
         (b'{"a":' * 100_000, "nested too deeply"),
-        (b"[[1]" * 50, "no JSON"),
-        (b'{"data_format": ' + b"9" * 5000 + b"}", "no JSON"),
+        (b"[[1]" * 50, "not JSON"),
+        (b'{"data_format": ' + b"9" * 5000 + b"}", "not JSON"),
     ],
 )
 def test_what_is_no_metadata_is_refused(content: bytes, reason: str) -> None:
@@ -169,7 +169,7 @@ def test_without_metadata_there_is_no_parser() -> None:
 def test_metadata_of_another_head_than_the_configured_one_is_refused() -> None:
     assert parser_of(metadata(), serial="").head.serial == SERIAL
     assert parser_of(metadata(), serial=str(SERIAL)).head.serial == SERIAL
-    with pytest.raises(DriverSettingsError, match=f"it is of head {SERIAL}, serial is 99; want its own"):
+    with pytest.raises(DriverSettingsError, match=f"is of head {SERIAL}, but serial is 99; use the metadata"):
         parser_of(metadata(), serial="99")
 
 

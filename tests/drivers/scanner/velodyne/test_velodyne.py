@@ -442,8 +442,8 @@ def test_a_date_a_roll_over_behind_is_moved_and_an_older_one_is_not_valid() -> N
     assert (refused.time.date, refused.valid) == (dt.date(1998, 8, 21), False)
     assert parser.counters.errors == {"date_before_floor": 1}
     first, second = parser.remarks()
-    assert "1 roll-over of 1024 weeks behind: taken as 2019-04-07" in first
-    assert "says 1998-08-21, before 2009-01-01" in second
+    assert "1 roll-over of 1024 weeks behind; corrected to 2019-04-07" in first
+    assert "sends the date 1998-08-21, before 2009-01-01" in second
 
 
 def test_a_date_without_a_fix_is_not_remarked_on() -> None:

@@ -152,7 +152,7 @@ def test_replaced_fifo_is_opened_again_by_its_session(fifo: Path) -> None:
     session.receive(0.0)
     fifo.unlink()
     assert session.receive(0.1) == []
-    assert "there is no such file" in session.last_error
+    assert "no such file" in session.last_error
     os.mkfifo(fifo)
     deadline_s = time.monotonic() + 30.0
     while session.openings < 2 and time.monotonic() < deadline_s:
@@ -195,13 +195,13 @@ def test_close_from_another_thread_ends_a_blocked_receive(tmp_path: Path, name: 
 @pytest.mark.parametrize(
     ("source", "says"),
     [
-        (FixedPps("/nonexistent/edges"), "there is no such file; edges come as lines of 'realtime_ns sequence'"),
+        (FixedPps("/nonexistent/edges"), "no such file; want a file or FIFO with lines of 'realtime_ns sequence'"),
         (FixedPps("/tmp"), "is a directory"),
-        (KernelPps("/dev/pps_absent"), "there is no such PPS device; is its driver loaded"),
-        (KernelPps("/dev/null"), "/dev/null: is no PPS device"),
-        (KernelPps("/tmp"), "/tmp: is no PPS device"),
-        (SerialDcdPps("/dev/ttyS_absent"), "there is no /dev/ttyS_absent"),
-        (SerialDcdPps("/dev/null"), "has no DCD line to wait on"),
+        (KernelPps("/dev/pps_absent"), "no such PPS device; check that its driver is loaded"),
+        (KernelPps("/dev/null"), "/dev/null: is not a PPS device; want /dev/ppsN"),
+        (KernelPps("/tmp"), "/tmp: is not a PPS device; want /dev/ppsN"),
+        (SerialDcdPps("/dev/ttyS_absent"), "/dev/ttyS_absent does not exist"),
+        (SerialDcdPps("/dev/null"), "cannot wait for DCD"),
     ],
 )
 def test_what_cannot_be_opened_says_why(source: PpsSource, says: str) -> None:
@@ -228,7 +228,7 @@ def test_unreadable_device_names_the_rule(monkeypatch: pytest.MonkeyPatch) -> No
 
 def test_a_pty_has_no_dcd() -> None:
     master, slave = os.openpty()
-    with pytest.raises(TransportError, match="has no DCD line to wait on"):
+    with pytest.raises(TransportError, match="cannot wait for DCD"):
         SerialDcdPps(os.ttyname(slave)).open()
     os.close(master)
     os.close(slave)
@@ -249,7 +249,7 @@ def test_kernel_source_that_vanishes_or_is_another_one_is_said(tmp_path: Path, m
         return values[request]
 
     monkeypatch.setattr("fcntl.ioctl", silent)
-    for replaced, says in ((False, "there is no such PPS device"), (True, "was replaced by another PPS device")):
+    for replaced, says in ((False, "no such PPS device"), (True, "was replaced by another PPS device")):
         device.write_bytes(b"")
         source = KernelPps(str(device))
         source.open()
