@@ -44,8 +44,8 @@ AS_USUAL = Settings()
 STABLE = 0.1  # sigmas; a parameter that new correspondences move by less is stable
 CONTRADICTED = 4.0  # sigmas; a flight that disagrees by more with a held value contradicts it
 _NO_PRIOR = (
-    "the trajectory's errors were taken as independent from return to return: sigmas are too small, perhaps by a "
-    "factor of 5 to 10; want a trajectory with sigmas and its errors estimated along"
+    "the adjustment took the trajectory's errors as independent from return to return, so the sigmas are too small, "
+    "perhaps by a factor of 5 to 10; use a trajectory with sigmas and estimate its errors too"
 )
 
 
@@ -85,7 +85,7 @@ def adjust(
         ParameterError: the wish cannot be met; NormalError: nothing can be solved.
     """
     if not features.planes and not features.ties:
-        raise NormalError("no planes and no tie points: nothing to adjust; want strips that overlap over roofs")
+        raise NormalError("the flight has neither planes nor tie points to adjust; use strips that overlap over roofs")
     asked, placed_with = unknowns(flight, wish, start, first, doubted), None
     found: Solved | None = None
     for matching in range(1, settings.matchings + 1):
@@ -144,8 +144,8 @@ def _of_noise(told: Flight, found: Flight) -> tuple[str, ...]:
         share = sum(astuple(own.noise)) / sum(astuple(head.noise))  # all noise terms share one scale, and some may be 0
         if share < 1.0:
             lines.append(
-                f"returns of {head.name} scatter {share:.2f} times what range_sigma_m, angle_sigma_deg and "
-                "divergence_mrad let expect, and were weighed by that"
+                f"returns of {head.name} scatter {share:.2f} times the value that range_sigma_m, angle_sigma_deg and "
+                "divergence_mrad predict; the adjustment weights them by the larger value"
             )
     return tuple(lines)
 

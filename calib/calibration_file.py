@@ -167,7 +167,7 @@ def in_unit(value: float, factor: float, back: Callable[[float], float] | None =
         CalibrationFileError: the value is not finite.
     """
     if not math.isfinite(value):
-        raise CalibrationFileError(f"a calibration holds {value!r}; want finite numbers")
+        raise CalibrationFileError(f"a calibration contains {value!r}; every number must be finite")
     if value == 0.0:
         return 0.0
 
@@ -182,7 +182,7 @@ def in_unit(value: float, factor: float, back: Callable[[float], float] | None =
 def _number(value: float) -> str:
     """Format a number; whole numbers have no decimal point, as counts and rates are written."""
     if not math.isfinite(value):
-        raise CalibrationFileError(f"a calibration holds {value!r}; want finite numbers")
+        raise CalibrationFileError(f"a calibration contains {value!r}; every number must be finite")
     return str(int(value)) if float(value).is_integer() and abs(value) < 1e15 else repr(float(value))
 
 
@@ -199,13 +199,13 @@ def _text(value: str) -> str:
     try:
         value.encode()
     except UnicodeEncodeError as error:
-        raise CalibrationFileError(f"{value!r} is no text that UTF-8 can hold") from error
+        raise CalibrationFileError(f"{value!r} cannot be encoded as UTF-8") from error
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def _time(value: dt.datetime) -> str:
     if value.utcoffset() is None:
-        raise CalibrationFileError(f"created: {value.isoformat()} has no time zone; want UTC")
+        raise CalibrationFileError(f"created: {value.isoformat()} has no time zone; give it in UTC")
     return value.astimezone(dt.UTC).replace(tzinfo=None).isoformat() + "Z"
 
 

@@ -121,7 +121,7 @@ def held_words(adjusted: Adjusted) -> list[str]:
             if abs(float(moved[i, column])) > own[i]
         ]
         if told:
-            found.append(f"{_held(one, several)}, would move {listed(told)}")
+            found.append(f"{_held(one, several)}, which would move {listed(told)}")
     return found
 
 
@@ -134,7 +134,7 @@ def unknown_words(name: str, several: bool) -> str:
 def _held(one: Considered, several: bool) -> str:
     """Describe a held parameter and its plausible error."""
     name = f"{one.scanner}.{one.name}"
-    return f"{unknown_words(name, several)}, held, plausible to {sized(name, one.sigma)}"
+    return f"{unknown_words(name, several)}, held, has a plausible error of {sized(name, one.sigma)}"
 
 
 def undetermined(report: ReportInput) -> list[str]:
@@ -184,7 +184,8 @@ def _beyond_wanted(report: ReportInput) -> Iterator[tuple[str, float]]:
         limit = wanted.get(unknown(name).name)
         if limit is not None:
             words = (
-                f"{unknown_words(name, several)} is known to {sized(name, sigma)} only, {sized(name, limit)} is wanted"
+                f"{unknown_words(name, several)} is known to {sized(name, sigma)} only; {sized(name, limit)} is "
+                "required"
             )
             yield words, sigma / limit
 
@@ -198,7 +199,7 @@ def _points(report: ReportInput) -> Iterator[tuple[str, float]]:
     for scanner, left_m in need.left_m.items():
         of = f" of {scanner}" if several else ""
         if math.isfinite(left_m):
-            yield f"leaves {length(left_m)} in points{of}, {length(need.point_m)} is wanted", left_m / need.point_m
+            yield f"leaves {length(left_m)} in points{of}; {length(need.point_m)} is required", left_m / need.point_m
 
 
 def _contradicted(report: ReportInput) -> Iterator[tuple[str, float]]:
@@ -208,7 +209,7 @@ def _contradicted(report: ReportInput) -> Iterator[tuple[str, float]]:
         if one.contradicted:
             name = f"{one.scanner}.{one.name}"
             told = f"{sized(name, one.told, sign=True)} ± {sized(name, one.told_sigma)}"
-            yield f"{unknown_words(name, several)} that is held: it would change it by {told}", 1.0
+            yield f"the held value of {unknown_words(name, several)}: it would change the value by {told}", 1.0
 
 
 def _profiles(report: ReportInput) -> Iterator[tuple[str, float]]:
@@ -314,85 +315,85 @@ RULES: tuple[Rule, ...] = (
         None,
         0.5,
         "the adjustment did not converge{of}",
-        "start from a better calibration (pre-alignment), or look for matches that are wrong",
+        "start from a better calibration (pre-alignment), or look for wrong matches",
     ),
     Rule(
         _no_redundancy,
         1.0,
         10.0,
-        "only {of} observations beyond the unknowns",
+        "there are only {of} observations more than unknowns",
         "fly over more roofs and slopes, with more overlap of lines",
     ),
     Rule(
         _held_angles,
         0.0,
         TOO_LARGE,
-        "not a boresight calibration: {of}",
-        "fly the lines, or give the control, that stand below under Not determined",
+        "the boresight is not calibrated: {of}",
+        "fly the lines or measure the control listed below under Not determined",
     ),
     Rule(
         _held_range,
         1.0,
         None,
         "{of}",
-        "control on flat, hard ground (at least 8 points of 1 cm)",
+        "measure control on flat, hard ground (at least 8 points of 1 cm)",
     ),
     Rule(
         _beyond_wanted,
         1.0,
         TOO_LARGE,
         "{of}",
-        "fly more of the lines that determine it, or say [calibration] wanted where less will do",
+        "fly more of the lines that determine it, or set [calibration] wanted if a lower accuracy is enough",
     ),
     Rule(
         _points,
         1.0,
         TOO_LARGE,
         "the calibration {of}",
-        "more lines, control or heights; or say [calibration] wanted where less will do",
+        "add lines, control or flying heights, or set [calibration] wanted if a lower accuracy is enough",
     ),
     Rule(
         _contradicted,
         0.5,
         None,
         "the flight contradicts {of}",
-        "free it (--free), or give it the value it has",
+        "free it (--free), or set its true value",
     ),
     Rule(
         _profiles,
         2.9,
         8.0,
         "{of}",
-        "look below at the profiles: which pairs say so, and whether all have one sign",
+        "see the profiles below: which pairs differ, and whether all differ with the same sign",
     ),
     Rule(
         _variance,
         2.0,
         9.0,
-        "residuals are larger than their sigmas say (variance factor {value})",
-        "check the noise of scanner and trajectory; look below where residuals are large",
+        "residuals are larger than their sigmas predict (variance factor {value})",
+        "check the noise settings of scanner and trajectory; see below where residuals are large",
     ),
     Rule(
         _variance_small,
         4.0,
         None,
-        "residuals are far smaller than their sigmas say (variance factor {of})",
-        "the noise of scanner or trajectory is stated too large; sigmas here are too careful",
+        "residuals are far smaller than their sigmas predict (variance factor {of})",
+        "lower the stated noise of scanner or trajectory; the sigmas here are too large",
     ),
     Rule(
         _rejected,
         0.05,
         0.4,
         "{value} of the observations ({of}) were rejected as outliers",
-        "look below at which planes, strips and angles they lie",
+        "see below on which planes, in which strips and at which angles they lie",
         share,
     ),
     Rule(
         _beyond_prior,
         3.3,
         10.0,
-        "{of} has moved {value} times the sigma it was given before",
-        "check what was measured on the ground, or give it a larger sigma",
+        "{of} has moved by {value} times its prior sigma",
+        "check the measurement on the ground, or set a larger prior sigma",
         _sigmas_words,
     ),
     Rule(
@@ -400,46 +401,46 @@ RULES: tuple[Rule, ...] = (
         0.08,
         0.5,
         "strips differ by {value} (RMSDz) after the calibration",
-        "look below which pairs do: a strip of its own kind has a bad trajectory",
+        "see below which pairs differ: a strip that differs from all others has a bad trajectory",
         length,
     ),
     Rule(
         _worse,
         1.05,
         1.5,
-        "strips agree worse than before ({of})",
-        "look below which pairs do, and at the outliers",
+        "strips agree less well than before ({of})",
+        "see below which pairs do, and the outliers",
     ),
     Rule(
         _control,
         3.29,
         10.0,
         "control point {of} is {value} sigmas off",
-        "check its height system (ellipsoidal?), its place, and what grows on it; leave it out",
+        "check its height system (ellipsoidal?), its position and the vegetation on it, or leave it out",
         _sigmas_words,
     ),
     Rule(
         _influence,
         1.5,
         6.0,
-        "control point {of} by {value} sigmas when it is left out",
-        "more control: no single point should carry a parameter",
+        "leaving out control point {of} by {value} sigmas",
+        "measure more control: no parameter should depend on a single point",
         _sigmas_words,
     ),
     Rule(
         _trajectory,
         1.6,
         4.0,
-        "corrections of the trajectory's {of} are {value} times what its sigmas let expect",
-        "process the trajectory anew; its sigmas are too small",
+        "corrections of the trajectory's {of} are {value} times the value that its sigmas predict",
+        "process the trajectory again; its sigmas are too small",
         _sigmas_words,
     ),
     Rule(
         _correlated,
         MOST_CORRELATED,
         None,
-        "{of} can hardly be told apart (correlation {value})",
-        "a second flying height or speed, or hold one of them",
+        "{of} can hardly be separated (correlation {value})",
+        "fly a second height or speed, or hold one of them",
     ),
 )
 
