@@ -83,7 +83,7 @@ def told_before(carried: Sequence[Carried], *refused: type[Exception]) -> Iterat
         bad = next((one.line for one in carried if one.level is Level.UNUSABLE), "")
         if wrong_use or not bad:
             raise
-        raise UserError(f"{bad}; so: {error}") from error
+        raise UserError(f"{bad}; therefore: {error}") from error
 
 
 def refusal(entry: Mapping[str, Any]) -> str:
@@ -92,7 +92,7 @@ def refusal(entry: Mapping[str, Any]) -> str:
     """
     if entry.get("level") != Level.UNUSABLE.words or entry.get("accepted"):
         return ""
-    return f"{first_lines(entry)[0]}; --accept-verdict takes it all the same"
+    return f"{first_lines(entry)[0]}; use --accept-verdict to accept it"
 
 
 # ---------------------------------------------------------------------- calibrations
@@ -118,15 +118,16 @@ def calibration_verdicts(setup: Setup, source: str = "") -> Iterator[Carried]:
         if made and flown and made != flown:
             yield Carried(
                 Level.UNUSABLE,
-                f'calibration {calibration.id} of {name}: is of installation "{made}", the log of "{flown}"; want '
-                "that of this mounting",
+                f'calibration {calibration.id} of {name}: belongs to installation "{made}", the log to "{flown}"; use '
+                "the calibration of this mounting",
             )
         before = str(header.get("trajectory", ""))
         if {before, source} == {"navigated", "ins"}:
             yield Carried(
                 Level.CARE,
-                f"calibration {calibration.id} of {name}: was made with {MADE_WITH[before]}, here is "
-                f"{MADE_WITH[source]}, whose alignment is another; want the same (swath trajectory, --trajectory)",
+                f"calibration {calibration.id} of {name}: was made with {MADE_WITH[before]}, this run uses "
+                f"{MADE_WITH[source]}, whose alignment differs; use the same kind of trajectory (swath trajectory, "
+                "--trajectory)",
             )
 
 
@@ -135,8 +136,8 @@ def nominal_words(name: str, calibration: Calibration) -> str:
     sigmas = calibration.with_plausible_sigmas().all_sigmas
     off_m = RANGE_M * math.hypot(sigmas[INDEX["omega_rad"]], sigmas[INDEX["phi_rad"]])
     return (
-        f"calibration {calibration.id} of {name} is nominal: points may lie {off_m:.1f} m off for {RANGE_M:g} m of "
-        "range (one sigma); calibrate (swath calibrate), or give --calibration FILE"
+        f"calibration {calibration.id} of {name} is nominal: points may lie {off_m:.1f} m off at {RANGE_M:g} m of "
+        "range (one sigma); run swath calibrate, or give --calibration FILE"
     )
 
 

@@ -60,7 +60,7 @@ def _by_key(table: object) -> object:
     found: dict[str, Any] = {}
     for key, value in _flat("", table):
         if key in found:
-            raise ValueError(f"{key} stands there twice; want it once")
+            raise ValueError(f"{key} is given twice; give it once")
         found[key] = value
     return found
 
@@ -321,9 +321,11 @@ def _states(said: Iterable[tuple[str, str | float]], before: str, known: Known) 
         key = text.strip()
         scanner, _, own = ("", "", key) if key in known else key.partition(".")
         if own not in known:
-            raise UserError(one_line(f"{before}{key}: is no parameter; {_want(key, known)}"), ExitCode.USAGE)
+            raise UserError(one_line(f"{before}{key}: unknown parameter; {_want(key, known)}"), ExitCode.USAGE)
         if isinstance(state, str) and own not in _PARAMETERS:
-            raise UserError(f"{before}{key}: its table asks for it; want a prior, or nothing", ExitCode.USAGE)
+            raise UserError(
+                f"{before}{key}: its table already requests it; give a prior, or leave it out", ExitCode.USAGE
+            )
         name, factor = known[own]
         found[scanner, name] = state if isinstance(state, str) else state * factor
     return found
@@ -336,4 +338,4 @@ def _want(key: str, known: Known) -> str:
         close = difflib.get_close_matches(text, known, n=1, cutoff=0.6) if text else []
         if close:
             return f"did you mean {before}{close[0]}?"
-    return f"want one of {', '.join(known)}"
+    return f"use one of {', '.join(known)}"

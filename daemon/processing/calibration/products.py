@@ -108,7 +108,7 @@ def write_products(wish: CalibrationOptions, done: Calibrated, tell: Steps) -> T
 
 def trajectory_says(carried: Sequence[Carried]) -> list[Finding]:
     """Return the verdicts on the trajectories as the first findings: parameters absorbed the trajectories' errors."""
-    change = "mend the trajectory, then calibrate anew"
+    change = "correct the trajectory, then calibrate again"
     return [Finding(one.sentence, change, math.inf, unusable=one.level is Level.UNUSABLE) for one in carried]
 
 
@@ -127,8 +127,11 @@ def strips_say(done: Calibrated, cell_m: float) -> list[Finding]:
         known = max(float(each.all_sigmas[INDEX[one.effect.parameter]]) for each in done.adjusted.calibrations.values())
         excess = abs(one.value) / (BEYOND * math.hypot(one.sigma, known))
         if excess > 1.0:
-            change = "look at swath strips: a strip of its own kind, a bad trajectory, too few strips to part effects"
-            found.append(Finding(f"strips still show {one.words}", change, excess))
+            change = (
+                "run swath strips: one strip may differ from all others, the trajectory may be bad, or the strips "
+                "may be too few to separate effects"
+            )
+            found.append(Finding(f"strips still show this effect: {one.words}", change, excess))
     return found
 
 
@@ -139,7 +142,7 @@ def validation_says(done: Calibrated) -> list[Finding]:
     """
     asked = Asked(done.control or None)
     outcome = validate(done.flight, done.features, done.adjusted.calibrations, asked, done.prior)
-    change = "look at swath validate: its planes and pairs say where the calibration does not hold"
+    change = "run swath validate: its planes and pairs show where the calibration does not hold"
     return [Finding(f"validation: {one.sentence}", change) for one in outcome.methods if one.passed is False]
 
 
@@ -334,7 +337,7 @@ def level_words(strips: FlightStrips) -> str:
     agreement = strips.agreement
     if not agreement.judged:
         return f"too few cells for a quality level ({agreement.cells:,} in {agreement.places} places)"
-    return f"strips keep {agreement.best or 'no quality level'}"
+    return f"strips meet {agreement.best or 'no quality level'}"
 
 
 def _wanted(done: Calibrated) -> dict[str, float]:

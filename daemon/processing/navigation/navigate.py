@@ -188,7 +188,7 @@ def navigate_inputs(
             holes += _why_not(inputs, leg)
     if not legs:
         why = holes[len(inputs.holes) :] or [
-            f"{inputs.log}: {inputs.sources.imu_source}: no run of samples without a gap is long enough to be navigated"
+            f"{inputs.log}: {inputs.sources.imu_source}: no run of samples without a gap is long enough for navigation"
         ]
         raise UserError("\n".join(why))
     doubts = list(inputs.doubts)
@@ -252,7 +252,7 @@ def _unreached(legs: Sequence[NavigatedLeg], *, smooth: bool) -> list[tuple[Stre
             part = Stretch(leg.leg.span[0], min(fix_ns, first), "no trajectory before the first position")
             found.append((part, False))
         if first - fix_ns > UNTIL_A_FIX_NS:
-            found.append((Stretch(fix_ns, first, "no trajectory: no start was found earlier"), True))
+            found.append((Stretch(fix_ns, first, "no trajectory: alignment found no earlier start"), True))
     return found
 
 
@@ -371,6 +371,6 @@ def point_doubts(ins: Trajectory, navigated: Trajectory, lever_arms_b: Sequence[
             what, point = "its antenna", "antenna"
             break
     return [
-        f"{source}: its own INS tells the way of {what}, {length_m:.2f} m from the body's origin ({place} m in b); "
-        f"with that solution want --trajectory-at {point}, or the receiver set to give it at the IMU"
+        f"{source}: its own INS gives the trajectory of {what}, {length_m:.2f} m from the body's origin ({place} m in "
+        f"b); use --trajectory-at {point} with that solution, or let the device give its solution at the IMU"
     ]

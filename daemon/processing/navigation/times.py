@@ -93,7 +93,7 @@ def imu_times(rows: StructArray, host: HostClocks, clock: str | None, rate_hz: f
     refused = _reasons(no_device_time=len(rows) - len(taken), no_clock=int((~good).sum()))
     placed = counted.copy() if counted.any() else np.ones(len(rows), np.bool_)
     placed[placed] = good
-    why = f"the clock of {clock} gives these samples no time that is good to {GREATEST_SIGMA_NS / 1e9:.0f} s"
+    why = f"the clock of {clock} cannot time these samples to {GREATEST_SIGMA_NS / 1e9:.0f} s"
     dropped = stretches(rows["host_time_ns"], placed, gps_ns[good], rate_hz, why)
     return ImuTimes(taken[good], gps_ns[good], sigma_s, by, refused, dropped)
 

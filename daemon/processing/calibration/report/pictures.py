@@ -73,7 +73,9 @@ def correlation_picture(report: ReportInput) -> Picture | None:
         axes.spines[:].set_visible(False)
 
     more = f" The first {count} of {len(adjusted.names)} unknowns." if len(adjusted.names) > count else ""
-    text = "Of the unknowns after the adjustment; beyond ±0.95 two of them can hardly be told apart." + more
+    text = (
+        "Correlations of the unknowns after the adjustment; beyond ±0.95 two unknowns can hardly be separated." + more
+    )
     return Picture("Correlations", text, lambda form: room + cell_in(form) * count + 0.1, draw)
 
 
@@ -133,7 +135,7 @@ def strips_picture(report: ReportInput) -> Picture | None:
         )
 
     more = f" The {MOST_PAIRS} worst of {len(report.after)}." if len(report.after) > MOST_PAIRS else ""
-    words = "Dashed: limits of RMSDz in swath overlap, USGS Lidar Base Specification." + more
+    words = "Dashed lines: limits of RMSDz in swath overlap, USGS Lidar Base Specification." + more
     return Picture("Strips against each other", words, lambda form: 0.35 + row_in * len(pairs) + 0.55, draw)
 
 
@@ -165,7 +167,7 @@ def control_picture(report: ReportInput) -> Picture | None:
     def height_in(form: Format) -> float:
         return 2.35 + (room if form.narrow or len(points) > 16 else 0.0)
 
-    return Picture("Control", "Surveyed − laser, up positive, with one sigma.", height_in, draw)
+    return Picture("Control", "Surveyed − laser height, positive upwards, with one sigma.", height_in, draw)
 
 
 def trajectory_pictures(report: ReportInput) -> list[Picture]:
@@ -218,7 +220,7 @@ def _trajectory_picture(fit: TrajectoryFit, flown: int, *, several: bool) -> Pic
         )
 
     title = f"Corrections of the trajectory{f', session {flown + 1}' if several else ''}"
-    words = "What is added to the trajectory to make it true, estimated along with the calibration."
+    words = "Corrections that are added to the trajectory, estimated together with the calibration."
     return Picture(title, words, lambda form: 0.3 + Panels.height_in(form, 6, panel_in), draw)
 
 
@@ -248,4 +250,6 @@ def intensity_picture(report: ReportInput) -> Picture | None:
         axes.set_ylabel("mm", fontsize=8.5, color=MUTED)
         canvas.legend([Line2D([], [], color=colour_of(i), label=name) for i, (name, _) in enumerate(known)])
 
-    return Picture("Range correction by intensity", "Subtracted from the range.", lambda form: 2.55, draw)
+    return Picture(
+        "Range correction by intensity", "This correction is subtracted from the range.", lambda form: 2.55, draw
+    )

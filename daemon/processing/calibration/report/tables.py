@@ -85,12 +85,17 @@ def _parameters(report: ReportInput, scanner: str, *, several: bool) -> Table:
             rows.append([one.words, one.unit, told, plausible, told, why, "–", "–"])
     heads = ("parameter", "unit", "estimate", "sigma", "start", "change", "change / sigma", "sigma before")
     honest = adjusted.trajectory is not None
-    words = "errors of the trajectory included" if honest else "too small: without what the trajectory's errors share"
-    under = f"Sigmas are one standard deviation, {words}, and what held parameters may have wrong."
+    words = (
+        "including the trajectory's errors and the plausible errors of held parameters"
+        if honest
+        else "including the plausible errors of held parameters, but too small, because they leave out the common part "
+        "of the trajectory's errors"
+    )
+    under = f"Sigmas are one standard deviation, {words}."
     for told in held_words(adjusted):
         under += f" {told[0].upper()}{told[1:]}."
     if any(row[6].endswith("·") for row in rows):
-        under += f" · the change is below {INSIGNIFICANT:g} sigmas: the start may have been as good."
+        under += f" · the change is below {INSIGNIFICANT:g} sigmas: the initial value may have been as good."
     title = f"Parameters of {scanner}" if several else "Parameters"
     return Table(title, heads, rows, under, pale=frozenset(range(estimated, len(rows))))
 
@@ -148,8 +153,10 @@ def held_table(report: ReportInput) -> Table | None:
         ]
         for one in held
     ]
-    heads = ("parameter", "sigma it would have", "not to be told apart from", "why", "what would determine it")
-    under = "Held at the values they had before; what the calibration gives holds as far as these are right."
+    heads = ("parameter", "sigma if estimated", "cannot be separated from", "why", "remedy")
+    under = (
+        "These parameters keep their previous values; the calibration is valid only as far as these values are right."
+    )
     return Table("Not determined by this flight", heads, rows, under, left=(0, 2, 3, 4), stacked=True)
 
 
@@ -229,7 +236,8 @@ def outlier_tables(report: ReportInput) -> list[Table]:
     if suspects:
         heads = ("where", "group", "residual", "w", "strip")
         under = (
-            f"The largest normalised residuals that were kept; |w| above {SUSPECT:g} has one sound one in a thousand."
+            "The largest normalised residuals that were accepted; one good observation in a thousand exceeds |w| "
+            f"= {SUSPECT:g}."
         )
         tables.append(Table("", heads, suspects, under, left=(0, 4)))
     return tables
@@ -248,7 +256,7 @@ def _strips(report: ReportInput, group: Residuals, rows: NDArray[np.bool_]) -> s
 def refused_table(report: ReportInput) -> Table | None:
     """Return a table of the reasons why candidates were not used; None if all were."""
     rows = [[reason, thousands(count)] for reason, count in report.features.refused.most_common()]
-    return Table("", ("candidates not taken", "number"), rows) if rows else None
+    return Table("", ("rejected candidates", "number"), rows) if rows else None
 
 
 def control_table(report: ReportInput) -> Table | None:
@@ -272,13 +280,16 @@ def control_table(report: ReportInput) -> Table | None:
     values = np.array([point.misclosure_m for point in report.adjusted.control])
     rms, mean = (length(float(x)) for x in (np.sqrt(np.mean(values**2)), values.mean()))
     under = f"{len(values)} points: RMS {rms}, mean {mean}. "
-    under += "Each was used; at the right, what leaving it out would change most."
-    heads = ("point", "misclosure cm", "sigma cm", "w", "left out, changes most")
+    under += (
+        "The adjustment used every point; the rightmost column shows the parameter that changes most when the point "
+        "is left out."
+    )
+    heads = ("point", "misclosure cm", "sigma cm", "w", "changes most if left out")
     return Table("", heads, rows, under, left=(0, 4))
 
 
 def detectable_table(report: ReportInput) -> Table | None:
     """Return a table of the smallest errors that would be detected; None if there are none."""
     rows = [[OBSERVED.get(name, name), length(value)] for name, value in report.adjusted.least_detectable.items()]
-    under = "An error of this size in one observation is found with probability 0.8 (significance 0.001)."
-    return Table("Smallest errors that would be found", ("observation", "size"), rows, under) if rows else None
+    under = "An error of this size in one observation is detected with probability 0.8 (significance 0.001)."
+    return Table("Smallest detectable errors", ("observation", "size"), rows, under) if rows else None
