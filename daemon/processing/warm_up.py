@@ -143,7 +143,7 @@ class WarmUp:
         where = (
             f"kept in {self.cache}"
             if self.cache is not None
-            else "no folder to keep them in can be written to, so every process compiles in memory: set NUMBA_CACHE_DIR"
+            else "no cache folder is writable, so every process compiles in memory; set NUMBA_CACHE_DIR"
         )
         return f"{what} in {self.seconds:.1f} s; {where}"
 

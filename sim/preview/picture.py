@@ -177,7 +177,7 @@ def _profile(axes: Axes, survey: Survey, track: FloatArray, ground: Ground) -> N
     _profile_lines(axes, survey, unit_s, top)
     axes.set_xlabel(f"time ({unit})", fontsize=8, color=MUTED)
     axes.set_ylabel("ellipsoidal height (m)", fontsize=8, color=MUTED)
-    heading(axes, "Height along the flight, above ground on the lines", 16.0, weight="bold")
+    heading(axes, "Height during the flight, and above ground on the lines", 16.0, weight="bold")
     axes.grid(axis="y", color="#dddddd", lw=0.5)
     axes.set_axisbelow(True)
 
@@ -213,7 +213,7 @@ def _overlap(axes: Axes, survey: Survey, grid: Grid) -> None:
     image = axes.imshow(
         shown, extent=_bounds(grid), origin="lower", cmap=colours, norm=norm, aspect="auto", interpolation="nearest"
     )
-    _small_map(axes, survey, grid, "Lines that see it")
+    _small_map(axes, survey, grid, "Number of lines that see the ground")
     more = int(grid.lines.max()) > most
     _bar(axes, image, [f"{n}{' or more' if more and n == most else ''}" for n in range(1, most + 1)])
 

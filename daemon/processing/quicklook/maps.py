@@ -294,7 +294,7 @@ def draw_sigma(look: Look, path: Path) -> None:
     """Draw the sigma of height from the files' points."""
     values = 100.0 * filled(look.surface.mean(SIGMA_HEIGHT))
     low, high = _range_of(values)
-    under = f"one standard deviation, as the files say it, mean of all returns, {_cells_words(look)}"
+    under = f"one standard deviation, as stored in the files, mean of all returns, {_cells_words(look)}"
     page = MapPage(look, "Sigma of height", under)
     image = page.image(values, look.surface.frame, cmap="viridis", vmin=low, vmax=high, interpolation="antialiased")
     page.bar(image, "σ of height (cm)", extend="both")

@@ -97,7 +97,7 @@ def is_of_logs(paths: Sequence[Path]) -> bool:
     """
     kinds = {_kind(path) for path in paths}
     if len(kinds) > 1:
-        raise UserError("logs and points together; want logs, or LAS or LAZ files", ExitCode.USAGE)
+        raise UserError("the input mixes logs and points; give logs only, or LAS or LAZ files only", ExitCode.USAGE)
     return kinds == {"logs"}
 
 
@@ -108,7 +108,7 @@ def _kind(path: Path) -> str:
             return "points"
         if LOG_SUFFIX in inside:
             return "logs"
-        raise UserError(f"{path}: holds neither LAS or LAZ files nor logs", ExitCode.IO)
+        raise UserError(f"{path}: has neither LAS or LAZ files nor logs", ExitCode.IO)
     if not path.exists():
         raise UserError(f"{path}: no such file or folder", ExitCode.IO)
     return "points" if path.suffix.lower() in POINT_SUFFIXES else "logs"
@@ -158,7 +158,7 @@ class Judgement:
         if self.agreement.no_verdict:
             wrong.append(self.agreement.no_verdict)
         elif level is not None and (broken := self.agreement.broken(level)):
-            wrong.append(f"{level} is not kept, for its limit of {', '.join(broken)}")
+            wrong.append(f"strips do not meet {level}, because of its limit of {', '.join(broken)}")
         return f"{self.strips.what}: {'; '.join(wrong)}" if wrong else ""
 
     def _rows(self) -> dict[tuple[str, str], dict[str, Any]]:
@@ -237,7 +237,7 @@ def _draw(wish: StripsOptions, now: Judgement, then: Judgement | None) -> list[P
                 draw_differences(one.strips.look, wish.output / name)
                 made.append(wish.output / name)
     except OSError as error:
-        raise UserError(f"{wish.output}: cannot be written to ({error.strerror or error})", ExitCode.IO) from error
+        raise UserError(f"{wish.output}: is not writable ({error.strerror or error})", ExitCode.IO) from error
     return made
 
 

@@ -64,7 +64,11 @@ def event_table(marks: Sequence[Mark], trajectory: Trajectory) -> EventTable:
 
 
 def _untimed(mark: Mark) -> str:
-    return "the receiver does not vouch for its time" if not mark.event.valid else "its time cannot be placed"
+    return (
+        "the receiver does not vouch for its time"
+        if not mark.event.valid
+        else "its time cannot be converted to GPS time"
+    )
 
 
 def _line(mark: Mark, row: FloatArray | None, fate: str) -> str:
