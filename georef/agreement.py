@@ -379,9 +379,9 @@ def _conventions(told: FloatArray, ends: FloatArray) -> Iterator[tuple[str, Floa
                 continue
             angles = ends[:, :, [1, 0, 2]] if swapped else ends
             negated = [name for name, sign in zip(names, signs, strict=True) if sign < 0.0]
-            parts = ["roll and pitch are exchanged"] if swapped else []
+            parts = ["roll and pitch are swapped"] if swapped else []
             if negated:
-                parts.append(f"{' and '.join(negated)} {'has' if len(negated) == 1 else 'have'} the other sign")
+                parts.append(f"{' and '.join(negated)} {'has' if len(negated) == 1 else 'have'} the opposite sign")
             extra = " (axes forward, left, up against east, north, up)" if negated == ["pitch", "heading"] else ""
             yield " and ".join(parts) + extra, _centred(_rates_of(angles * np.array(signs)))
     for quarter, words in ((1, "right"), (2, "back"), (3, "left")):

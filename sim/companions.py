@@ -44,9 +44,9 @@ README = """# A flight of the virtual aircraft: {name}
 - `trajectory.*`: the body's true poses at the IMU's rate: `gps_ns` (since 1980-01-06, continuous), `lat_rad`,
   `lon_rad`, `height_m` (ellipsoidal), `velocity_l` (north, east, down), `roll_rad`, `pitch_rad`, `heading_rad`, `strip`
 - `<scanner>.*`: one row for each return, in the order of the returns in the scanner's packets, including packets that
-  a fault kept from the log: `gps_ns` and `pulse` of the emission, `point_e` (ECEF, the echo on the beam's axis), `range_m`,
-  `incidence_rad`, `strip` (index of the flight line, −1 between lines), `channel` (facet or beam), `return_number`,
-  `surface` (index into `surfaces`)
+  a fault kept from the log: `gps_ns` and `pulse` of the emission, `point_e` (ECEF, the echo on the beam's axis),
+  `range_m`, `incidence_rad`, `strip` (index of the flight line, −1 between lines), `channel` (facet or beam),
+  `return_number`, `surface` (index into `surfaces`)
 - `surfaces`, `lines`: names; `control_e`: the true positions of the control points
 - `imu.<name>.*`: the errors that were drawn for each IMU
 """

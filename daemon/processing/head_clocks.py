@@ -59,7 +59,7 @@ def find_stamps(index: LogIndex, setup: Setup, host: HostClocks) -> FrozenClocks
     plans = {source: plan for source, plan in host.plan.devices.items() if plan.stamps is not None}
     own = {source for source, plan in plans.items() if plan.clock == source}
     if not plans or (not own and all(plan.stamps is StampScale.FREE for plan in plans.values())):
-        return FrozenClocks(host, {source: Stamps(StampScale.FREE, "configured so") for source in plans})
+        return FrozenClocks(host, {source: Stamps(StampScale.FREE, "as configured") for source in plans})
     read = _Reader(setup, plans)
     read.take(index, _pieces(index.scanner_chunks()))
     for source in own:

@@ -143,7 +143,9 @@ def refuse_lines(tables: Tables, ground_m: Ground) -> None:
     for i, line in enumerate(tables.line):
         key = f"line[{i}]"
         if line.name in names:
-            raise PlanError(f"{key}.name", f"{line.name!r} is the name of line[{names[line.name]}] too; want another")
+            raise PlanError(
+                f"{key}.name", f"{line.name!r} is also the name of line[{names[line.name]}]; choose another"
+            )
         names[line.name] = i
         refuse_far(f"{key}.from_m", line.from_m)
         refuse_far(f"{key}.to_m", line.to_m)

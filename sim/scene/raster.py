@@ -145,7 +145,9 @@ def _plan_crs(plan: Plan) -> CRS:
     try:
         crs = CRS(plan.tables.flight.crs)
     except CRSError:
-        raise PlanError("flight.crs", f"PROJ knows no {plan.tables.flight.crs!r}; want as EPSG:25832") from None
+        raise PlanError(
+            "flight.crs", f"PROJ does not know {plan.tables.flight.crs!r}; write it like EPSG:25832"
+        ) from None
     return _horizontal(crs)
 
 

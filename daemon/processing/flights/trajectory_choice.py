@@ -251,7 +251,7 @@ def refuse_other_motion(clocks: LogClocks, trajectory: Trajectory, file: str, lo
 
     shift = correlate_turn_rates(trajectory, clocks.imu_gps_ns, clocks.imu_rate_b)
     if shift.is_wrong:
-        raise UserError(f"{file}: {shift.what}, by comparison of its turn rates with those of the IMU in {log}")
+        raise UserError(f"{file}: {shift.what} (by comparison of its turn rates with those of the IMU in {log})")
     if shift.is_certain and abs(shift.seconds) > LATE_S:
         return [
             f"{file}: its turns lag those of the IMU in {log} by {-shift.seconds:.3f} s; its time may be off by this "

@@ -119,10 +119,10 @@ def placed_in_week(of_week_ns: Int64Array, name: str, span_ns: Span | None, week
     """Return GPS time of nanoseconds of a week: in the given week, or in the one that overlaps a log's span most."""
     if week is not None:
         if not 0 <= week <= LATEST_NS // WEEK_NS:  # such as 24233, a week with a day of the week appended
-            raise TrajectoryError(f"{name}: --week {week} is no GPS week; want whole weeks since 1980, such as 2423")
+            raise TrajectoryError(f"{name}: --week {week} is not a GPS week; give whole weeks since 1980, such as 2423")
         return of_week_ns + week * WEEK_NS
     if span_ns is None:
-        raise TrajectoryError(f"{name}: says seconds of the week but no week; give the GPS week (--week)")
+        raise TrajectoryError(f"{name}: has seconds of the week without the week; give the GPS week (--week)")
     first, last = int(of_week_ns[0]), int(of_week_ns[-1])
     near = week_from_gps(span_ns[0])[0]
 
@@ -168,14 +168,15 @@ def _check_sigmas(columns: TrajectoryColumns, name: str) -> None:
             raise TrajectoryError(f"{name}: a sigma of the {what} at {columns.at(bad)} is negative")
         bad = np.logical_or.reduce(sigma > GREATEST_SIGMA, axis=1)
         if bad.any():
-            raise TrajectoryError(f"{name}: a sigma of the {what} at {columns.at(bad)} is beyond {GREATEST_SIGMA:g}")
+            raise TrajectoryError(f"{name}: a sigma of the {what} at {columns.at(bad)} exceeds {GREATEST_SIGMA:g}")
 
 
 def _check_velocity(columns: TrajectoryColumns, name: str) -> None:
     fast = np.logical_or.reduce(np.abs(columns.velocity_l) > GREATEST_SAID_MPS, axis=1)  # nan: missing
     if fast.any():
         raise TrajectoryError(
-            f"{name}: a velocity at {columns.at(fast)} is beyond {GREATEST_SAID_MPS:g} m/s; want metres a second"
+            f"{name}: a velocity at {columns.at(fast)} exceeds {GREATEST_SAID_MPS:g} m/s; metres per second are "
+            "expected"
         )
 
 
@@ -192,7 +193,7 @@ def _check_position(columns: TrajectoryColumns, name: str) -> None:
         raise TrajectoryError(f"{name}: latitude {said:.6g} at {columns.at(beyond)}: {hint}")
     around: NDArray[np.bool_] = np.abs(columns.lon_rad) > 2 * np.pi
     if around.any():
-        raise TrajectoryError(f"{name}: longitude at {columns.at(around)} is more than once round the earth")
+        raise TrajectoryError(f"{name}: longitude at {columns.at(around)} exceeds a full turn")
     high: NDArray[np.bool_] = (columns.height_m < LOWEST_M) | (columns.height_m > HIGHEST_M)
     if high.any():
         height = columns.height_m[int(np.argmax(high))]
@@ -216,7 +217,7 @@ def _check_attitude(columns: TrajectoryColumns, name: str) -> None:
 def _check_time(columns: TrajectoryColumns, name: str) -> None:
     far = (columns.time_ns < EARLIEST_NS) | (columns.time_ns > LATEST_NS)
     if far.any():
-        raise TrajectoryError(f"{name}: time at {columns.at(far)} is before 1980 or after 2125: no GPS time")
+        raise TrajectoryError(f"{name}: time at {columns.at(far)} is before 1980 or after 2125, so it is not GPS time")
     steps = np.diff(columns.time_ns)
     stuck = np.r_[False, steps <= 0]
     if stuck.any():
@@ -234,7 +235,7 @@ def _check_course(columns: TrajectoryColumns, name: str) -> None:
     speed = np.linalg.norm(moved, axis=1)
     if np.median(speed) > GREATEST_SPEED_MPS:
         raise TrajectoryError(
-            f"{name}: its positions move at {np.median(speed):.0f} m/s; latitude, longitude or time has another unit"
+            f"{name}: its positions move at {np.median(speed):.0f} m/s; check the units of latitude, longitude and time"
         )
     said = mean_over(columns.time_ns, columns.velocity_l, pieces)
     fast = (np.hypot(*moved[:, :2].T) > COURSE_FROM_MPS) & (np.hypot(*said[:, :2].T) > COURSE_FROM_MPS)

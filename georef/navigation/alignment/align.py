@@ -147,7 +147,7 @@ class Aligner:
         most = max(int((rows["kind"] == kind).sum()) for kind in (Kind.POSITION, Kind.VELOCITY))
         told = np.isin((Kind.HEADING, Kind.ATTITUDE), rows["kind"]).any()
         if most < FEWEST or seconds < SHORTEST_S["given" if told else "good"]:
-            self.state = f"has {seconds:.0f} s of GNSS and inertial samples together, wants {SHORTEST_S['good']:.0f} s"
+            self.state = f"has {seconds:.0f} s of GNSS and inertial samples together, needs {SHORTEST_S['good']:.0f} s"
             return
         still_ns = _still(felt, rows, self._setup.noise)
         problem = Problem(felt, rows, self._setup, still_ns)
