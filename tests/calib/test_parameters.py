@@ -49,7 +49,7 @@ def test_several_heads_stand_in_one_vector() -> None:
     assert "scan_plane_tilt_rad" not in top  # a spinning head has none
     assert "kappa_rad" in top
     held = {(one.scanner, one.name): one for one in asked.held}
-    assert held["left", "kappa_rad"].why == "held at your word"
+    assert held["left", "kappa_rad"].why == "held by your choice"
     assert held["left", "kappa_rad"].remedy == ""
     assert ("top", "scan_angle_scale") in held
     assert asked.start[asked.names.index("top.lever_arm_z_m")] == -0.2
@@ -237,7 +237,7 @@ def test_what_is_held_keeps_the_start_and_what_is_estimated_begins_elsewhere() -
         (ParameterOptions(priors={"phi_rad": 0.0}), "want a sigma above 0"),
         (
             ParameterOptions(fix=frozenset(["right.omega_rad"])),
-            "parameters of right: no such scanner in this flight, but ",
+            "parameters of right: this flight has no such scanner; its scanners are ",
         ),
         (ParameterOptions(priors={"fie_rad": 0.1}), "prior fie_rad"),
         (ParameterOptions(ibrc_knots=(5.0, 5.0)), "rising intensities"),

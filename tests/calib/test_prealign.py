@@ -194,7 +194,9 @@ def test_no_points_are_told(cast: Cast) -> None:
 
 def test_a_wrong_installation_is_told(cast: Cast) -> None:
     """Ten degrees are no error of a mounting."""
-    with pytest.raises(PrealignError, match=r"left: \w+ came to .*° from the start; want the installation matrix"):
+    with pytest.raises(
+        PrealignError, match=r"left: \w+ moved .*° from its initial value; check the installation matrix"
+    ):
         prealign(cast.flight, COARSE, off(cast, (0.0, 9.0, 0.0)))
 
 

@@ -182,7 +182,7 @@ def test_many_strips_get_one_model(clean: tuple[Flight, Features], monkeypatch: 
     bad = spoilt(flight, 3, np.tile([0.0, 0.0, 0.3, 0.0, 0.0, 0.0], (2, 1)))
     result = adjusted(bad, features)
     assert {choice.model for choice in result.choices} == {"constant"}
-    assert "6 strips, more than 3: all got the same model" in result.notes
+    assert "6 strips, more than 3, so all use the same model" in result.notes
 
 
 @pytest.mark.parametrize(

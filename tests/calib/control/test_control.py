@@ -61,7 +61,7 @@ def test_a_file_is_read_with_comments_blanks_and_a_byte_order_mark() -> None:
         ("", "control.csv: is empty; want the header"),
         (f"{HEADER}\n", "no points behind the header"),
         (HEADER.replace(",", ";") + f"\n{ROW}", "line 1: want the header .*columns apart by commas"),
-        (HEADER.replace("h_ellipsoidal_m", "h_m") + f"\n{ROW}", "line 1: want .*h_ellipsoidal_m not there"),
+        (HEADER.replace("h_ellipsoidal_m", "h_m") + f"\n{ROW}", "line 1: the header must be .*h_ellipsoidal_m missing"),
         (f"{HEADER}\n{ROW}\nG2,47.4,8.9,500", "line 3: 4 fields, want 5"),
         (f"{HEADER}\nG1,47,4,8,9,500,0.01", "line 2: 7 fields, want 5"),
         (f"{HEADER}\n,47.4,8.9,500,0.01", "line 2: the point has no name"),
@@ -138,7 +138,7 @@ def tilted(slope: float, roughness_m: float) -> Flight:
     [
         (tilted(0.0, 0.3), (0.0, 0.0, 0.0), "control: no plane|control: too rough"),
         (tilted(1.5, 0.01), (0.0, 0.0, 0.0), "control: too steep"),
-        (tilted(0.0, 0.01), (-6.9, 0.0, 0.0), "control: not within the returns"),
+        (tilted(0.0, 0.01), (-6.9, 0.0, 0.0), "control: returns do not surround it"),
         (tilted(0.0, 0.01), (-8.5, 0.0, 0.0), "control: no returns"),
         (tilted(0.0, 0.01), (-6.9, -6.9, 0.0), "control: too few returns"),
         (tilted(0.0, 0.01), (0.0, 0.0, 30.0), "control: far above or below"),

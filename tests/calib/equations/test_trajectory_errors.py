@@ -173,7 +173,7 @@ def test_the_prior_of_a_smoothed_run_has_its_strips_and_is_positive() -> None:
     walk_is_that_of_the_nodes_between(prior, chain)
     with pytest.raises(FlightError, match=r"says nothing near GPS week .*; want the run of all strips"):
         from_smoother(made([(0, 1, 5, 9), (0, 2, 46, 49)], [path], begin=int(ns(0.0))), [chain.at(chain.time_ns[:-12])])
-    with pytest.raises(FlightError, match="0 runs of 1 trajectories; want all"):
+    with pytest.raises(FlightError, match="0 runs for 1 trajectories; every trajectory needs its run"):
         from_smoother(flight, [])
 
 
@@ -316,7 +316,7 @@ def test_a_trajectory_without_sigmas_is_refused(column: str) -> None:
     told = replace(path, **{column: silent})
     what = column.split("_", maxsplit=1)[0]
     assert len(gauss_markov(made([(0, 1, 5, 15)], [told]))) == 4
-    with pytest.raises(FlightError, match=rf"trajectory ins says no {what} sigma at GPS week .*: give them \(smrmsg"):
+    with pytest.raises(FlightError, match=rf"trajectory ins has no {what} sigma at GPS week .*: put an smrmsg"):
         gauss_markov(made([(0, 1, 5, 30)], [told]))
 
 

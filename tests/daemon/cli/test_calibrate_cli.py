@@ -349,7 +349,7 @@ def test_what_the_flight_does_not_show_of_a_model_s_tables_is_held_and_said(
     """No return is so bright, and next to none is a second one; all are in one zone."""
     tables = "[ibrc]\nknots = [500, 1000, 2500, 60000]\n[range_offset]\nreturn_slots = [2]\nmta_zones = [0]\n"
     told, found = asked(by_intensity, tmp_path, capsys, f'model = "basic"\n{tables}')
-    held = {one["name"]: one for one in told["held"] if one["why"] != "held at your word"}
+    held = {one["name"]: one for one in told["held"] if one["why"] != "held by your choice"}
     assert {"ibrc.3", "range_offset_slot.2", "range_offset_zone.0"} <= set(held)
     assert not [one for one in told["unknowns"] if one["name"].removeprefix("left.") in held]
     for one in held.values():

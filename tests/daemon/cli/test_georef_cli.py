@@ -279,7 +279,7 @@ class TestRefusals:
         if command == "validate":
             arguments.insert(1, str(flown.folder / "left.true.toml"))
         assert run_app(arguments) == 2
-        assert "--force-trajectory: there is no file to be taken; want --trajectory too" in capsys.readouterr().err
+        assert "--force-trajectory: needs --trajectory FILE, because it accepts that file" in capsys.readouterr().err
         assert list(tmp_path.iterdir()) == []
 
     def test_a_trajectory_in_the_folder_is_not_replaced_unasked_and_never_where_it_is_read(
@@ -325,8 +325,8 @@ class TestRefusals:
     @pytest.mark.parametrize(
         ("shift_s", "words"),
         [
-            (18, "its time is UTC, not GPS: +18 s would be right"),
-            (-7 * 86_400, "its week is another: -1 would be right"),
+            (18, "its time is UTC, not GPS: add +18 s"),
+            (-7 * 86_400, "its week is wrong: add -1"),
             (3 * 3600, "do not overlap; want the trajectory of this flight, or --week"),
         ],
     )
@@ -431,7 +431,7 @@ def test_points_of_a_nominal_calibration_end_with_a_first_line_and_exit_code_1(
     said = capsys.readouterr()
     first = said.out.splitlines()[0]
     assert first.startswith("not to be used: calibration ")
-    assert "is nominal: points may lie 2.5 m off for 100 m of range" in first
+    assert "is nominal: points may lie 2.5 m off at 100 m of range" in first
     assert "--accept-verdict" in said.err
     told = record(tmp_path / "points")
     assert told["complete"]

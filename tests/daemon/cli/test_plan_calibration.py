@@ -159,7 +159,9 @@ def test_a_model_s_file_is_predicted_as_far_as_paper_goes(tmp_path: Path, capsys
     assert set(sigmas_of(told)) == {"omega_deg", "phi_deg", "range_offset_m", *known}
     assert sigmas_of(told)["phi_deg"] < 0.0001
     words = ("ibrc at 100, 1000, smooth to 0.02 m", "range offset of return slot 1, 2")
-    assert told["notes"] == [f"not predicted: {one}; pulses on paper return once, without intensity" for one in words]
+    assert told["notes"] == [
+        f"not predicted: {one}; planned pulses have one return, without intensity" for one in words
+    ]
     with pytest.raises(UserError, match=r"does not determine roll"):
         planned(plan, picture, model=str(model), as_json=False)
     assert "not predicted: ibrc at 100, 1000" in capsys.readouterr().out

@@ -258,7 +258,7 @@ class TestErrors:
         missing = ("numba", "scipy")
         monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name in missing else real(name))
         monkeypatch.chdir(tmp_path)
-        line = f"swath: swath sim needs scipy, numba, not installed here: {how_to_install('sim')}\n"
+        line = f"swath: swath sim needs scipy, numba, which are not installed: {how_to_install('sim')}\n"
         assert in_process(capsys, *words) == (ExitCode.USAGE, line)
         assert list(tmp_path.iterdir()) == []
 

@@ -136,7 +136,7 @@ def test_before_and_after_stand_beside_each_other(tmp_path: Path, capsys: pytest
     run(str(now), "--before", str(then), "-o", str(tmp_path / "out"))
     told = capsys.readouterr().out
     assert "before: RMSDz 20.0 cm, largest 20.0 cm; now: RMSDz 1.0 cm, largest 1.0 cm" in told
-    assert "strips keep QL2; QL1 not for its limit of 8 pulses per m²" in told
+    assert "strips meet QL2; QL1 fails its limit of 8 pulses per m²" in told
     assert "confirm them against the edition in the contract" in told
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
         "differences.png",
@@ -148,7 +148,7 @@ def test_before_and_after_stand_beside_each_other(tmp_path: Path, capsys: pytest
 def test_a_level_that_is_not_kept_is_a_problem(tmp_path: Path) -> None:
     folder = lifted(tmp_path / "now", 0.12)
     run(str(folder), "--level", "QL3")
-    with pytest.raises(UserError, match=r"QL2 is not kept, for its limit of 0\.08 m RMSDz") as caught:
+    with pytest.raises(UserError, match=r"strips do not meet QL2, because of its limit of 0\.08 m RMSDz") as caught:
         run(str(folder), "--level", "QL2")
     assert caught.value.exit_code == ExitCode.PROBLEM
 
@@ -246,7 +246,7 @@ def test_equal_numbers_of_two_runs_are_strips_of_their_own(made: Cast, tmp_path:
     (row,) = (row for row in strips.look.overlap.rows if (row["first"], row["second"]) == (0, 2))
     assert row["median_m"] == pytest.approx(-0.07, abs=2e-3)
     assert strips.notes == [
-        f"strip {number}/2 is that of {second / f'a_strip0{number}.laz'}, of other sessions than {number}"
+        f"strip {number}/2 comes from {second / f'a_strip0{number}.laz'}, which belongs to other sessions than {number}"
         for number in (1, 2)
     ]
     assert strips.seen is not None
@@ -298,7 +298,7 @@ def test_what_cannot_be_compared_is_one_line(what: str, tmp_path: Path) -> None:
     arguments, said = [str(folder)], ""
     if what == "one":
         (folder / "s2.laz").unlink()
-        said = "now: one strip only; differences want at least two strips that overlap"
+        said = "now: has one strip only; differences need at least two strips that overlap"
     elif what == "apart":
         said = "now: no two of the 2 strips share smooth ground"
     elif what == "twice":
@@ -330,7 +330,8 @@ def logged(name: str, installation: str) -> Any:
 def test_logs_of_different_installations_are_refused() -> None:
     refuse_installations([logged("a.mcap", "HB-ABC/1"), logged("b.mcap", "HB-ABC/1")])
     with pytest.raises(
-        UserError, match=r'b\.mcap: is of installation "HB-ABC/2", a\.mcap of "HB-ABC/1"; want logs of one'
+        UserError,
+        match=r'b\.mcap: was recorded with installation "HB-ABC/2", a\.mcap with "HB-ABC/1"; use logs of one',
     ):
         refuse_installations([logged("a.mcap", "HB-ABC/1"), logged("b.mcap", "HB-ABC/2")])
 

@@ -236,7 +236,7 @@ def test_a_record_elsewhere_is_named_and_one_of_another_calibration_left_alone(
 @pytest.mark.parametrize(
     ("what", "said", "code"),
     [
-        ("other", "is the record of calibration c0, .*c1.toml is c1", ExitCode.USAGE),
+        ("other", "is the record of calibration c0, but .*c1.toml is c1", ExitCode.USAGE),
         ("none", r"x\.json: no record of a calibration; want NAME\.record\.json", ExitCode.USAGE),
         ("absent", "no.json: cannot be read: No such file", ExitCode.IO),
         ("no output", "--record: is written anew with what logs say; want LOG… and --output DIR", ExitCode.USAGE),
@@ -302,7 +302,9 @@ def test_control_of_which_too_little_is_seen_is_a_problem(
     header, *lines = control.read_text().splitlines()
     away = [line.replace(",47.", ",48.") for line in lines[2:]]
     control.write_text("\n".join([header, *lines[:2], *away]))
-    with pytest.raises(UserError, match=r"^not validated as asked: .*control: control is seen \d times only") as caught:
+    with pytest.raises(
+        UserError, match=r"^not validated as requested: .*control: strips see control \d times only"
+    ) as caught:
         run(str(file_of(tmp_path / "good.toml", boresight(0.0))), str(log), "--control", str(control), "--json")
     assert caught.value.exit_code == ExitCode.PROBLEM
     record = json.loads(capsys.readouterr().out)["validation"]

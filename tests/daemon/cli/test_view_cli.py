@@ -118,7 +118,7 @@ def test_tables_say_what_was_put_in(page: Page) -> None:
     assert rows["s1.laz"][1:] == ["24\u202f000", "1.4, 6", "ETRS89 / UTM zone 32N", "left: cal-2026", "whole"]
     assert rows["QL0"][2:5] == ["not kept", "≤ 4 cm", "not kept"]
     assert rows["QL2"][1:5] == ["≥ 2", "kept", "≤ 8 cm", "kept"]
-    assert "strips keep the 10 cm class" in page.words
+    assert "strips meet the 10 cm class" in page.words
     assert "ETRS89 / UTM zone 32N (EPSG:25832)" in page.words
 
 

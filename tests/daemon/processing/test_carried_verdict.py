@@ -62,7 +62,7 @@ def test_a_nominal_calibration_is_not_to_be_used_and_says_by_how_much_points_may
     for one in (nominal("left", [0.0, 0.0, 0.0], np.eye(3)), calibration(method="nominal")):
         (said,) = said_of(one)
         assert said.level is Level.UNUSABLE
-        assert "is nominal: points may lie 2.5 m off for 100 m of range" in said.sentence
+        assert "is nominal: points may lie 2.5 m off at 100 m of range" in said.sentence
     assert said_of(calibration('verdict = "good"', method="nominal")) == []
     assert said_of(calibration()) == []
 
@@ -155,7 +155,7 @@ def test_the_worst_comes_first_and_only_what_is_not_to_be_used_is_a_problem() ->
     care, bad = Carried(Level.CARE, "a"), Carried(Level.UNUSABLE, "b")
     entry = verdict_entry([care, bad], accepted=False)
     assert first_lines(entry) == ["not to be used: b", "usable with care: a"]
-    assert refusal(entry) == "not to be used: b; --accept-verdict takes it all the same"
+    assert refusal(entry) == "not to be used: b; use --accept-verdict to accept it"
     assert refusal(verdict_entry([care, bad], accepted=True)) == ""
     assert refusal(verdict_entry([care], accepted=False)) == ""
     assert verdict_entry([], accepted=False) == {"level": "good", "reasons": [], "accepted": False}

@@ -161,7 +161,10 @@ def test_metres_off_fixes_that_are_no_better_are_a_doubt_of_both(single: Log, me
     found = single.judged(up_by(single, 0.1, metres=metres))
     assert found.refused == []
     assert len(found.warnings) == int(warned)
-    assert all(line.endswith(": such fixes may be wrong by that, or the trajectory is") for line in found.warnings)
+    assert all(
+        line.endswith(": fixes of this kind may be wrong by this amount, or the trajectory may be")
+        for line in found.warnings
+    )
 
 
 def test_a_trajectory_48_m_low_is_above_the_geoid(log: Log, single: Log) -> None:
@@ -260,15 +263,15 @@ def test_time_that_is_off_is_named_by_the_way_flown(log: Log) -> None:
 
 
 FLIPS = {
-    "pitch has the other sign": lambda roll, pitch, heading: (roll, -pitch, heading),
-    "roll has the other sign": lambda roll, pitch, heading: (-roll, pitch, heading),
-    "heading has the other sign": lambda roll, pitch, heading: (roll, pitch, -heading),
-    "pitch and heading have the other sign (axes forward, left, up": lambda roll, pitch, heading: (
+    "pitch has the opposite sign": lambda roll, pitch, heading: (roll, -pitch, heading),
+    "roll has the opposite sign": lambda roll, pitch, heading: (-roll, pitch, heading),
+    "heading has the opposite sign": lambda roll, pitch, heading: (roll, pitch, -heading),
+    "pitch and heading have the opposite sign (axes forward, left, up": lambda roll, pitch, heading: (
         roll,
         -pitch,
         np.pi / 2 - heading,
     ),
-    "roll and pitch are exchanged": lambda roll, pitch, heading: (pitch, roll, heading),
+    "roll and pitch are swapped": lambda roll, pitch, heading: (pitch, roll, heading),
 }
 
 

@@ -71,8 +71,8 @@ def test_files_that_mix_times_are_named_by_the_quick_look_too(tmp_path: Path) ->
     for number in range(5):
         tile(tmp_path, f"b{number}.laz", ADJUSTED_S, adjusted=True, west_m=20.0)
     assert (
-        "files mix times: seconds of the GPS week in a.laz; adjusted standard GPS time in b0.laz, b1.laz, b2.laz and "
-        "2 more; a file merged of them needs one kind" in look_at([tmp_path]).notes
+        "files have different kinds of times: seconds of the GPS week in a.laz; adjusted standard GPS time in b0.laz, "
+        "b1.laz, b2.laz and 2 more; convert them to one kind before you merge them into a file" in look_at([tmp_path]).notes
     )
 
 
@@ -119,8 +119,8 @@ def test_seconds_of_no_week_count_among_themselves_and_say_so(tmp_path: Path) ->
     one = tile(tmp_path, "a.laz", 345_600.0, adjusted=False)
     clock = PointClock([one])
     assert clock.notes == [
-        "a.laz: times are seconds of the GPS week, and nothing says of which; they count among themselves only: "
-        "give it with --week"
+        "a.laz: times are seconds of the GPS week, and no file gives the week, so times are only relative to "
+        "each other; give the week with --week"
     ]
     assert np.diff(clock.time_ns(one.path, np.array([345_600.0, 345_601.5]))).tolist() == [1_500_000_000]
 

@@ -282,7 +282,7 @@ DEGREES = 180 / np.pi
         ({"c8": lambda t: np.where(t[:, 0] > SECOND + 2, np.nan, t[:, 8])}, "no number for roll, .* record 42"),
         ({"c0": lambda t: np.where(t[:, 0] > SECOND + 2, t[:, 0] - 3, t[:, 0])}, r"goes back by 2\.950 s at record 42"),
         ({"c0": lambda t: np.round(t[:, 0], 1)}, "time stands still at record"),
-        ({"c0": lambda t: t[:, 0] * 1000}, "is no second of a week; SBET is expected"),
+        ({"c0": lambda t: t[:, 0] * 1000}, "is not a second of the week; SBET is expected"),
         ({"c10": lambda t: np.full(len(t), 0.2)}, "from record 1 on .* differ in course by 11°: .* wander angle"),
         ({"c4": lambda t: t[:, 5], "c5": lambda t: t[:, 4]}, "velocities differ in course by"),
     ],

@@ -54,7 +54,7 @@ def test_wgs_84_of_unknown_realisation_is_not_etrs89() -> None:
     line = refusal("EPSG:25832")
     assert "good to 1 m only" in line
     assert 'gnss.datum or --trajectory-datum, such as "EPSG:7912"' in line
-    assert 'or say "same" if they are in ETRS89 already' in line
+    assert 'or set "same" if they are already in ETRS89' in line
     assert refusal("EPSG:25832", datum="EPSG:4979").count("good to 1 m only") == 1
 
 

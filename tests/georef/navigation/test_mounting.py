@@ -94,7 +94,7 @@ def test_each_of_the_48_ways_of_taking_the_axes_is_found(sensor: str, number: in
 def test_degrees_for_radians_are_found_by_the_gain() -> None:
     (finding,) = diagnose(*mounted("gyro", np.eye(3), unit=180.0 / np.pi))
     assert finding.code == "gyro_unit"
-    assert "degrees are taken for radians" in finding.text
+    assert "degrees are read as radians" in finding.text
 
 
 @pytest.mark.parametrize("unit", [0.6, 1.7, 20.0])

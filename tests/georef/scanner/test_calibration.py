@@ -171,8 +171,8 @@ def test_changed_leaves_the_old_one() -> None:
 @pytest.mark.parametrize(
     ("old", "new", "wrong"),
     [
-        ('id = "x"', "", "calibration.id: missing; want text in quotes"),
-        ('scanner = "left"', "scanner = 3", "calibration.scanner: not text; want text in quotes"),
+        ('id = "x"', "", "calibration.id: missing; give text in quotes"),
+        ('scanner = "left"', "scanner = 3", "calibration.scanner: not text; give text in quotes"),
         ('"nominal"', '"guess"', "calibration.method: got 'guess', want one of nominal, planes"),
         ('method = "nominal"', 'method = "nominal"\nranges = "wet"', "calibration.ranges: got 'wet', want one of corr"),
         ("omega_deg = 0", "", "parameters.omega_deg: missing, want a number"),
@@ -200,7 +200,7 @@ def test_mistakes_of_header_and_parameters(old: str, new: str, wrong: str) -> No
     ("added", "wrong"),
     [
         ("[sigma]\nomega_deg = -1", "sigma.omega_deg: got -1, want at least 0"),
-        ("sigma = 3", "sigma: not a table; want [sigma]"),
+        ("sigma = 3", "sigma: not a table; add [sigma]"),
         ("[correlation]\nnames = ['omega_deg']\nmatrix = [[1]]", "correlation.names: want a list of keys of [sigma]"),
         (
             "[sigma]\nomega_deg = 1\nphi_deg = 1\n[correlation]\nnames = ['omega_deg', 'phi_deg']\n"
@@ -219,14 +219,14 @@ def test_mistakes_of_header_and_parameters(old: str, new: str, wrong: str) -> No
         ("[[range_offset]]\nmta_zone = -1\noffset_m = 1", "range_offset[0].mta_zone: got -1, want a whole number"),
         ("[[facet]]\ntilt_deg = 1", "facet[0].index: missing, want a whole number"),
         ("[[facet]]\nindex = 1\ntilt_deg = 1\n[[facet]]\nindex = 1\ntilt_deg = 2", "facet[1].index: facet 1 stands"),
-        ("[[beam]]\nchannel = 1\n[[beam]]\nchannel = 1", "beam[1].channel: beam 1 stands there twice; want it once"),
-        ("[beam]\nchannel = 1", "beam: want tables [[beam]]"),
-        ("[[range_offsets]]\nreturn_slot = 1\noffset_m = 1", "range_offsets: is not known; want calibration, param"),
+        ("[[beam]]\nchannel = 1\n[[beam]]\nchannel = 1", "beam[1].channel: beam 1 is given twice; give it once"),
+        ("[beam]\nchannel = 1", "beam: must be tables [[beam]]"),
+        ("[[range_offsets]]\nreturn_slot = 1\noffset_m = 1", "range_offsets: is unknown; use calibration, param"),
         (
             "[ibrcs]\nintensity = [1]",
-            "ibrcs: is not known; want calibration, parameters, sigma, held_sigma, correlation, ibrc",
+            "ibrcs: is unknown; use calibration, parameters, sigma, held_sigma, correlation, ibrc",
         ),
-        ("[[beam]]\nchannel = 1\nazimuth_rad = 0.1", "beam[0].azimuth_rad: is not known; want channel, azimuth_deg"),
+        ("[[beam]]\nchannel = 1\nazimuth_rad = 0.1", "beam[0].azimuth_rad: is unknown; use channel, azimuth_deg"),
         ("[[range_offset]]\nreturn_slot = 0\noffset_m = 1", "range_offset[0].return_slot: got 0, want a whole"),
         ("[[beam]]\nchannel = 70000", "beam[0].channel: got 70000, want a whole number from 0 to 65535"),
         ("[correlation]\nnames = [['a']]\nmatrix = [[1]]", "correlation.names: want a list of keys of [sigma]"),
@@ -254,7 +254,7 @@ def test_a_line_each() -> None:
     ("text", "wrong"),
     [
         ("[calibration", "left.toml: not TOML: "),
-        ("", "left.toml: calibration: missing; want [calibration]\nleft.toml: parameters: missing; want [parameters]"),
+        ("", "left.toml: calibration: missing; add [calibration]\nleft.toml: parameters: missing; add [parameters]"),
     ],
 )
 def test_what_is_no_calibration_file(text: str, wrong: str) -> None:

@@ -135,7 +135,7 @@ def test_the_configuration_decides(wanted: StampScale) -> None:
     gps = truth_ns()
     found = judged(hour_stamps(gps), gps, past_hour=True, wanted=wanted)
     assert found.scale is wanted
-    assert found.text.startswith("configured so")
+    assert found.text.startswith("as configured")
 
 
 def test_too_little_or_no_time_beside_is_no_judgement() -> None:

@@ -524,12 +524,12 @@ def test_after_the_flight_only_what_is_on_the_way_comes() -> None:
         ),
         (
             {"latency_ms": 950.0},
-            r"gnss\.rover\.latency_ms: 950: messages would come 0\.98 s after .*; want at most 87\d",
+            r"gnss\.rover\.latency_ms: 950: messages would come 0\.98 s after .*; set at most 87\d",
         ),
         ({"protocol": "ubx", "secondary_lever_arm_m": SECOND_ARM}, r"gnss\.rover\.secondary_lever_arm_m: .*novatel"),
         (
             {"protocol": "nmea", "ins": True},
-            r'gnss\.rover\.ins: "nmea" has no such messages; want protocol = "novatel"',
+            r'gnss\.rover\.ins: "nmea" has no such messages; use protocol = "novatel"',
         ),
     ],
 )

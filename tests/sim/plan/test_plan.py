@@ -90,11 +90,11 @@ class TestRefusals:
     @pytest.mark.parametrize(
         ("text", "key", "words"),
         [
-            (text_of(flight="sped_mps = 50.0"), "flight.sped_mps", "no such key"),
-            (text_of(line="higth_m = 50.0"), "line[0].higth_m", "no such key"),
+            (text_of(flight="sped_mps = 50.0"), "flight.sped_mps", "unknown key"),
+            (text_of(line="higth_m = 50.0"), "line[0].higth_m", "unknown key"),
             (text_of(flight='speed_mps = "50"'), "flight.speed_mps", "got '50', want a valid number"),
             (text_of(flight='bank_max_deg = "25 deg"'), "flight.bank_max_deg", "got '25 deg', want a valid number"),
-            (text_of(flight="bank_max_rad = 0.4"), "flight.bank_max_rad", "no such key"),
+            (text_of(flight="bank_max_rad = 0.4"), "flight.bank_max_rad", "unknown key"),
             (text_of(flight="bank_max_deg = 75.0"), "flight.bank_max_deg", "got 75.0, want less than or equal to 60"),
             (text_of(flight="speed_mps = nan"), "flight.speed_mps", "got nan, want"),
             (text_of(flight="origin_deg = [47.5]"), "flight.origin_deg", "at least 2 items"),

@@ -72,7 +72,7 @@ def test_polygons() -> None:
         ('WKT,name\n"POLYGON ((0 0, 1, 2 2))",a\n', "got the corner '1'"),
         ('WKT,name\n"POLYGON ((0 0, 1 0, 1 1), (0 0, 1 0, 1 1))",a\n', "no holes"),
         ('WKT,name\n"POLYGON ((0 0, 1 0, 1 1))",\n', "name: is missing"),
-        (GOOD + '"POLYGON ((0 0, 1 0, 1 1))",roof 2\n', "line 4: name: roof 2 is there twice"),
+        (GOOD + '"POLYGON ((0 0, 1 0, 1 1))",roof 2\n', "line 4: name: roof 2 is given twice"),
     ],
 )
 def test_polygons_that_are_none(text: str, said: str) -> None:

@@ -87,7 +87,7 @@ def test_sessions_with_positions_in_different_datums() -> None:
     )
     with pytest.raises(UserError) as refused:
         refuse_different_settings({A: config(), B: other}, None)
-    words = ("b.mcap", "in EPSG:7912", "in a datum that is not said", "--trajectory-datum")
+    words = ("b.mcap", "in EPSG:7912", "in an unspecified datum", "--trajectory-datum")
     assert all(word in line(refused) for word in words)
     refuse_different_settings({A: config(), B: other}, None, "EPSG:7912")
     refuse_different_settings({A: other, B: other}, None)
@@ -218,7 +218,7 @@ def test_messages_that_were_not_read() -> None:
     ]
     assert warnings == [
         "a.mcap: 2 messages of scanner/left were not read: no sign of the protocol",
-        "a.mcap: 7 messages of scanner/right did not come, by its own numbers",
+        "a.mcap: 7 messages of scanner/right did not arrive, by their sequence numbers",
     ]
 
 

@@ -77,7 +77,7 @@ def test_returns_have_no_place_until_the_angles_are_known() -> None:
 
 
 def test_a_source_that_told_nothing_is_one_line() -> None:
-    with pytest.raises(ValueError, match=r'^gimbal\.stages\[0\]\.source: "imu/gimbal" told no angles$'):
+    with pytest.raises(ValueError, match=r'^gimbal\.stages\[0\]\.source: "imu/gimbal" sent no angles$'):
         mount_of(GimbalConfig.model_validate(STAGES), {})
 
 

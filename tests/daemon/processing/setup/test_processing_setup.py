@@ -144,11 +144,14 @@ def test_only_the_scanners_that_are_asked_for(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("header", "said"),
     [
-        ('scanner = "right"', 'calibration.scanner: is of scanner "right", want "left"'),
-        ('scanner_serial = "77"', 'calibration.scanner_serial: of another head: "77", the configuration says "1234"'),
+        ('scanner = "right"', 'calibration.scanner: belongs to scanner "right"; use a calibration of "left"'),
+        (
+            'scanner_serial = "77"',
+            'calibration.scanner_serial: belongs to another head: "77", the configuration has "1234"',
+        ),
         ('ranges = "vacuum"', 'was estimated with ranges = "vacuum", [atmosphere] says "corrected"'),
         ('refraction = "ardc"', 'was estimated with refraction = "ardc", [atmosphere] says "none"'),
-        ("mirror_factor = 2.0", "was estimated with 2, the configuration says 1"),
+        ("mirror_factor = 2.0", "was estimated with 2, the configuration has 1; set both alike, or calibrate again"),
         ("installation_matrix = [[0,1,0],[-1,0,0],[0,0,1]]", "is not the configuration's installation"),
         ('method = "guessed"', "guessed"),
     ],

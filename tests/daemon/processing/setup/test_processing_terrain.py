@@ -92,7 +92,9 @@ def test_bands_that_share_blocks_too_large_to_read_are_refused(tmp_path: Path) -
         tmp_path / "dem.tif", "w", driver="GTiff", width=9, height=9, count=100, dtype="float64", **profile, **blocks
     ):
         pass
-    with pytest.raises(ConfigError, match="has 100 bands in blocks of 512 × 512; want one of heights"):
+    with pytest.raises(
+        ConfigError, match="has 100 bands in blocks of 512 × 512; use a raster with one band of heights"
+    ):
         read_terrain(tmp_path / "dem.tif")
 
 

@@ -130,7 +130,7 @@ def test_the_calibration_file_stays_and_the_table_says_what_was_done(
     assert (file.read_bytes(), file.stat().st_mtime_ns) == was
     told = capsys.readouterr().out
     assert f"no calibration; held: left {made.truth.id}" in told
-    assert "all strips got constant; the calibration was held" in told
+    assert "model of all strips: constant; the calibration parameters were held" in told
     row = next(line for line in told.splitlines() if line.startswith(f"{made.flight.swaths[LIFTED].strip:02d} "))
     assert "constant" in row
     assert "not told" in row  # its place in plan, over hardly anything but level ground
@@ -165,7 +165,7 @@ def test_a_trajectory_not_to_be_used_is_said_to_be_first_and_stays_so(
     told = capsys.readouterr()
     line = f"not to be used: trajectory {file}: the lever arm has another sign"
     assert told.out.splitlines()[0] == line
-    assert f"{line}; --accept-verdict takes it all the same" in told.err
+    assert f"{line}; use --accept-verdict to accept it" in told.err
     (said,), source = file_verdicts(trajectory_of(output, ".sbet"), made.trajectory.span)
     assert (said.level, source) == (Level.UNUSABLE, "navigated")
     assert run_app(arguments(made, file, output, "--strip-model", "constant", "--overwrite", "--accept-verdict")) == 0
@@ -242,7 +242,7 @@ def test_files_that_are_there_stay(
     was = {path: path.read_bytes() for path in adjusted.iterdir()}
     code, line = refused(capsys, arguments(made, lifted, adjusted))
     assert code == 2
-    assert f"{ADJUSTMENT}: is there already; want another folder, or --overwrite" in line
+    assert f"{ADJUSTMENT}: already exists; choose another folder or use --overwrite" in line
     own = arguments(made, trajectory_of(adjusted, ".sbet"), adjusted, "--overwrite")
     assert "is what is corrected; want another folder" in refused(capsys, own)[1]
     assert "is a file; want a folder" in refused(capsys, arguments(made, lifted, lifted))[1]
