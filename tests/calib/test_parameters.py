@@ -232,8 +232,8 @@ def test_what_is_held_keeps_the_start_and_what_is_estimated_begins_elsewhere() -
     ("wish", "text"),
     [
         (ParameterOptions("everything"), "want one of basic, scanner, full"),
-        (ParameterOptions(fix=frozenset(["omega"])), "omega: is no parameter"),
-        (ParameterOptions(free=frozenset(["top.pitch_slope"])), "top.pitch_slope: cannot be freed"),
+        (ParameterOptions(fix=frozenset(["omega"])), "omega: unknown parameter"),
+        (ParameterOptions(free=frozenset(["top.pitch_slope"])), "top.pitch_slope: cannot be estimated"),
         (ParameterOptions(priors={"phi_rad": 0.0}), "want a sigma above 0"),
         (
             ParameterOptions(fix=frozenset(["right.omega_rad"])),
@@ -252,5 +252,5 @@ def test_wishes_that_cannot_be_met_are_refused(wish: ParameterOptions, text: str
 
 def test_a_beam_s_correction_needs_a_spinning_head() -> None:
     only = replace(flight(), heads=flight().heads[:1])
-    with pytest.raises(ParameterError, match="no scanner of this flight is a spinning head"):
+    with pytest.raises(ParameterError, match="this flight has no spinning head"):
         unknowns(only, ParameterOptions(beams=frozenset(["range_m"])))

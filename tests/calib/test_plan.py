@@ -118,7 +118,7 @@ def test_a_second_height_tells_time_from_pitch_and_control_the_range() -> None:
 def test_a_lone_line_has_no_planes_but_with_control() -> None:
     trajectory, lines = path(ONE_HEIGHT[:1])
     scan = Scan(30.0 * DEG, 1e5)
-    with pytest.raises(FlightError, match="no roof and no ground is seen from two lines; want lines that overlap"):
+    with pytest.raises(FlightError, match="no two lines see the same roof or ground; plan lines that overlap"):
         planned(FRAME, [scanner()], [scan], [trajectory], lines, surfaces(), MOST_MADE)
     piece = surfaces()[24]
     controlled = replace(piece, control=(ControlPoint("1", piece.points_t[24], 0.01),))

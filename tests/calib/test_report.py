@@ -184,7 +184,7 @@ def test_findings_are_reasons(report: ReportInput) -> None:
     ("changes", "level", "words"),
     [
         ({"converged": False}, Level.UNUSABLE, "did not converge"),
-        ({"redundancy": 4.0}, Level.UNUSABLE, "only 4 observations beyond"),
+        ({"redundancy": 4.0}, Level.UNUSABLE, "there are only 4 observations more than"),
         ({"variance_factor": 3.0}, Level.CARE, "variance factor 3"),
         ({"variance_factor": 0.1}, Level.CARE, "far smaller"),
         ({"variance_factor": math.nan}, Level.UNUSABLE, "variance factor –"),

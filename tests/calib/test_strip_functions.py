@@ -55,7 +55,7 @@ def off_planes(flight: Flight, features: Features, strip: int) -> float:
 
 
 def test_without_features_nothing_is_adjusted(clean: tuple[Flight, Features]) -> None:
-    with pytest.raises(StripError, match="no planes or ties that several strips see"):
+    with pytest.raises(StripError, match="several strips share neither planes nor tie points"):
         adjusted(clean[0], Features(()))
 
 

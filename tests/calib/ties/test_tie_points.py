@@ -137,7 +137,7 @@ def test_far_from_the_patch_it_is_less_certain() -> None:
     ("change", "reason"),
     [
         ({"reach_m": 0.01, "least_returns": 12}, "the planes do not intersect in two swaths"),
-        ({"least_angle_rad": np.radians(80.0)}, "planes nearly parallel"),
+        ({"least_angle_rad": np.radians(80.0)}, "the planes are nearly parallel"),
         ({"greatest_sigma_m": 1e-4}, "too uncertain"),
         ({"least_length_m": 30.0}, "the swaths share too little of it"),
     ],

@@ -117,7 +117,7 @@ def test_nominal_values_are_listed_and_not_tested() -> None:
     (one,) = history([made(1, sigmas=np.zeros(3)), made(2)])
     assert [row["omega_deg_sigma"] for row in one.table()] == [None, pytest.approx(0.001)]
     assert one.steps == ()
-    assert "fewer than two calibrations with sigmas" in one.sentences[0]
+    assert "fewer than two calibrations have sigmas" in one.sentences[0]
     assert not one.moved
 
 
@@ -184,14 +184,14 @@ def test_each_installation_has_its_own_history() -> None:
 @pytest.mark.parametrize(
     ("header", "said"),
     [
-        ({"created": dt.datetime(2026, 1, 1, tzinfo=dt.UTC)}, "names no installation"),
-        ({"installation": "a"}, "created is no time"),
+        ({"created": dt.datetime(2026, 1, 1, tzinfo=dt.UTC)}, "has no calibration.installation"),
+        ({"installation": "a"}, "created is not a time"),
     ],
 )
 def test_what_is_no_history_is_one_line(header: dict[str, object], said: str) -> None:
     with pytest.raises(HistoryError, match=said):
         history([replace(made(1), header=header)])
-    with pytest.raises(HistoryError, match="stands twice"):
+    with pytest.raises(HistoryError, match="is given twice"):
         history([made(1), made(1)])
 
 

@@ -24,7 +24,7 @@ pytestmark = [pytest.mark.xdist_group("kernels"), pytest.mark.slow]
 ARM, MIRRORED = "[0.4, -0.25, -1.2]", "[-0.4, 0.25, 1.2]"
 SIGN = "the lever arm has another sign"
 ELSEWHERE = "lies 7.5 km off the fixes of gnss/rover"
-SAID = {"away": [ELSEWHERE], "other": ["want the trajectory of this flight", "it may be of another flight"]}
+SAID = {"away": [ELSEWHERE], "other": ["give the trajectory of this flight", "it may belong to another flight"]}
 
 
 def plan(seed: int, half_m: float, norths_m: tuple[float, float]) -> str:
@@ -239,7 +239,7 @@ def test_a_map_of_elsewhere_is_refused_with_the_one_to_take_unless_forced(
     assert run_app(judged.georef(output, "--crs", crs)) == ExitCode.USAGE
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith(f'swath: output.crs = "{crs}" {words}')
-    assert 'want "EPSG:32632" (WGS 84 / UTM zone 32N)' in line
+    assert 'use "EPSG:32632" (WGS 84 / UTM zone 32N)' in line
     assert line.endswith("; use --force-crs to accept it")
     assert not list(tmp_path.glob("out/*"))
     assert run_app(judged.georef(output, "--crs", crs, "--force-crs")) == 0

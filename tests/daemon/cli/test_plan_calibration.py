@@ -221,11 +221,11 @@ def test_a_poor_unit_is_said_before_the_flight(tmp_path: Path, capsys: pytest.Ca
             {},
             "a nutating scanner cannot be planned for; want one of oscillating, polygon, monogon",
         ),
-        ({"lines": OPPOSITE[:1]}, {"no_control": True}, "no roof and no ground is seen from two lines"),
+        ({"lines": OPPOSITE[:1]}, {"no_control": True}, "no two lines see the same roof or ground"),
         (
             {"more": "[[gnss.rover.outage]]\nat_s = 0.0\nfor_s = 3000.0\n"},
             {},
-            "gnss.rover.outage: lasts the whole flight; want an end",
+            "gnss.rover.outage: lasts the whole flight; let it end",
         ),
         ({}, {"model": "all"}, '--model: got "all", want basic, scanner, full, or a file FILE.toml'),
         ({}, {"sigmas": "0.02,0.004"}, '--sigmas: got "0.02,0.004", want three numbers'),

@@ -199,7 +199,7 @@ class TestErrors:
         [
             (
                 ("fly", "nowhere.toml", "-o", "x"),
-                "nowhere.toml: No such file or directory; want a plan's file or one of",
+                "nowhere.toml: No such file or directory; give a plan file or one of",
             ),
             (("fly", "small"), "say where to: -o LOG, or --wire"),
             (("fly", "small", "-o", "x", "--config", "y"), "--config belongs to --wire"),
@@ -227,7 +227,7 @@ class TestErrors:
     @pytest.mark.parametrize(
         ("before", "after", "line"),
         [
-            ("prf_hz", "prf_khz", "scanner.left.prf_khz: no such key"),
+            ("prf_hz", "prf_khz", "scanner.left.prf_khz: unknown key"),
             ("height_m = 700.0", "height_m = 460.0", "line[0].height_m: "),
             ("prf_hz", 'kind = "maser"\nprf_hz', "scanner.left.kind: got 'maser', want "),
             (

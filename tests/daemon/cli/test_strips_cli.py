@@ -207,7 +207,7 @@ def test_one_cloud_has_one_figure_and_one_level_wherever_it_is_told(
     assert told["best"] is not None
     assert seen["best"] == calibrated["quality"]["best"] == told["best"]
     assert seen["measure"] == calibrated["quality"]["measure"] == told["measure"]
-    assert level_words(after) == f"strips keep {told['best']}"
+    assert level_words(after) == f"strips meet {told['best']}"
 
 
 @pytest.mark.slow
@@ -269,7 +269,7 @@ def test_seconds_of_the_week_are_of_the_trajectory_beside_them(
     strips = strips_of_files([folder], StripRules(), lambda what, done, of: None)
     begin, end = made.flight.trajectories[0].span
     assert ((strips.gathered.time_ns >= begin) & (strips.gathered.time_ns <= end)).all()
-    mixed = "files mix times: seconds of the GPS week in a_strip02.laz; adjusted standard GPS time in a_strip01.laz"
+    mixed = "files have different kinds of times: seconds of the GPS week in a_strip02.laz; adjusted standard GPS time in a_strip01.laz"
     assert [note.startswith(mixed) for note in strips.notes] == [True] * (of_week == (2,))
 
 
@@ -278,8 +278,8 @@ def test_points_of_another_time_than_their_trajectory_are_said_to_be(made: Cast,
     week = made.flight.trajectories[0].span[0] // WEEK_NS
     strips = strips_of_files([folder], StripRules(), lambda what, done, of: None, week - 1)
     assert len(strips.notes) == 1
-    assert strips.notes[0].startswith("100 % of the points are of other times")
-    with pytest.raises(UserError, match="--week 24233 is no GPS week; want whole weeks since 1980"):
+    assert strips.notes[0].startswith("100 % of the points lie at other times")
+    with pytest.raises(UserError, match="--week 24233 is not a GPS week; give whole weeks since 1980"):
         strips_of_files([folder], StripRules(), lambda what, done, of: None, 24233)
 
 
@@ -289,7 +289,7 @@ def test_a_sidecar_that_says_no_datum_is_noted(made: Cast, tmp_path: Path) -> No
     del sidecar["crs"]["datum_said"]
     (folder / "a.json").write_text(json.dumps(sidecar))
     (note,) = strips_of_files([folder], StripRules(), lambda what, done, of: None).notes
-    assert "no signatures: the sidecar beside the points does not say of which datum they are" in note
+    assert "no signatures: the sidecar beside the points does not give their datum" in note
 
 
 @pytest.mark.parametrize("what", ["one", "apart", "twice", "nothing", "absent", "level", "cell"])
@@ -304,10 +304,10 @@ def test_what_cannot_be_compared_is_one_line(what: str, tmp_path: Path) -> None:
     elif what == "twice":
         x, y = lattice(EAST_M, NORTH_M, 120.0, 50.0, 0.5)
         write(folder / "s2.laz", x, y, plane(x, y), 2, crs=CRS.from_epsg(25832))
-        said = "strips 1 and 2 are the same returns under two names"
+        said = "strips 1 and 2 contain the same returns under two names"
     elif what == "nothing":
         (tmp_path / "empty").mkdir()
-        arguments, said = [str(tmp_path / "empty")], "holds neither LAS or LAZ files nor logs"
+        arguments, said = [str(tmp_path / "empty")], "has neither LAS or LAZ files nor logs"
     elif what == "absent":
         arguments, said = [str(tmp_path / "no")], "no such file or folder"
     elif what == "cell":

@@ -160,7 +160,7 @@ class TestOtherwise:
         assert run_app(["trajectory", str(flown.log), *arguments]) == 1
         why, *findings = capsys.readouterr().err.splitlines()
         assert "no alignment: inertial samples do not fit" in why
-        assert "the antennas are swapped; exchange lever_arm_m and secondary_lever_arm_m" in findings[0]
+        assert "the antennas are exchanged; swap lever_arm_m and secondary_lever_arm_m" in findings[0]
         assert all(line.startswith(f"swath: {flown.log}: ") for line in (why, *findings))
         assert not list(tmp_path.iterdir())
 

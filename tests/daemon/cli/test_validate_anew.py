@@ -71,4 +71,4 @@ def test_a_wrong_one_is_told_by_how_much(made: Made, tmp_path: Path) -> None:
 def test_a_file_without_sigmas_is_not_compared(made: Made, tmp_path: Path) -> None:
     _, method = validated(made, tmp_path, 0.0, sigmas=False)
     assert method["passed"] is None
-    assert "no parameter was estimated in both; want a calibration file with sigmas" in method["sentence"]
+    assert "both calibrations estimated no common parameter; give a calibration file with sigmas" in method["sentence"]

@@ -229,7 +229,9 @@ def test_a_heads_date_that_nobody_believes_is_refused_and_named(tmp_path: Path) 
 def test_a_head_that_was_given_local_time_is_told(tmp_path: Path) -> None:
     _, clocks = found(tmp_path, WITH_AUX, [*velodyne(), *positions(off=dt.timedelta(hours=2))])
     (line,) = clocks.remarks
-    assert line.startswith("scanner/top: its time is 2 h ahead of the recording computer's clock, as by a time zone")
+    assert line.startswith(
+        "scanner/top: its time is 2 h ahead of the recording computer's clock, as a wrong time zone would cause"
+    )
 
 
 def test_counters_that_go_on_beyond_the_hour_are_modulo_the_hour_in_both_packets(tmp_path: Path) -> None:
@@ -252,14 +254,14 @@ def test_a_configured_hour_needs_neither_receiver_nor_position_packets(tmp_path:
 @pytest.mark.parametrize(
     ("pps", "status", "words"),
     [
-        (PPS_LOCKED, "V", r"passes on 20 sentences, all void \(no fix yet\); want the receiver's antenna under open"),
-        (PPS_LOCKED, None, "passes on no NMEA sentence that names a time; want RMC"),
+        (PPS_LOCKED, "V", r"passes on 20 sentences, all void \(no fix yet\); place the receiver's antenna under open"),
+        (PPS_LOCKED, None, "passes on no NMEA sentence with a time; connect RMC"),
         (
             PPS_ABSENT,
             "V",
             "reports that no pulse reaches it; wire the receiver's PPS to it; it passes on 19 sen",
         ),
-        (PPS_SYNCHRONIZING, None, r"says that it is not locked to its pulse \(synchronizing\); want a steady PPS"),
+        (PPS_SYNCHRONIZING, None, r"reports that it is not locked to its pulse \(synchronizing\); wire a steady PPS"),
     ],
 )
 def test_a_head_without_fix_or_pulse_is_refused_by_that(
@@ -268,7 +270,7 @@ def test_a_head_without_fix_or_pulse_is_refused_by_that(
     setup, clocks = found(tmp_path, WITH_AUX, [*velodyne(), *positions(pps=pps, status=status)])
     plan = clocks.host.plan.devices["scanner/top"]
     state, trouble = clocks.host.status(plan.clock, START_UNIX_NS + 20 * NS), clocks.trouble(plan.clock)
-    with pytest.raises(UserError, match="no receiver is in the log, and the head " + words) as refused:
+    with pytest.raises(UserError, match="the log has no receiver, and the head " + words) as refused:
         refuse_no_time(tmp_path, plan.clock, state, setup.config, (), trouble)
     assert "configuration" not in refused.value.message
 

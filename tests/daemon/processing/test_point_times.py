@@ -72,7 +72,8 @@ def test_files_that_mix_times_are_named_by_the_quick_look_too(tmp_path: Path) ->
         tile(tmp_path, f"b{number}.laz", ADJUSTED_S, adjusted=True, west_m=20.0)
     assert (
         "files have different kinds of times: seconds of the GPS week in a.laz; adjusted standard GPS time in b0.laz, "
-        "b1.laz, b2.laz and 2 more; convert them to one kind before you merge them into a file" in look_at([tmp_path]).notes
+        "b1.laz, b2.laz and 2 more; convert them to one kind before you merge them into a file"
+        in look_at([tmp_path]).notes
     )
 
 
@@ -91,8 +92,14 @@ def test_times_that_contradict_their_header_are_told(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("first_s", "told"),
     [
-        (1_174_893_536.0, "are of 2048-12-06, which is to come; they look like GPS seconds: take 1,000,000,000 s off"),
-        (1_490_858_318.0, "are of 2058-12-11, which is to come; they look like seconds since 1970: take 1,315,964,800"),
+        (
+            1_174_893_536.0,
+            "then belong to 2048-12-06, in the future; they look like GPS seconds: subtract 1,000,000,000 s from",
+        ),
+        (
+            1_490_858_318.0,
+            "then belong to 2058-12-11, in the future; they look like seconds since 1970: subtract 1,315,964,800",
+        ),
         (3_900_000_000.0, "are of 2135-"),
     ],
 )

@@ -146,7 +146,7 @@ def test_few_cells_give_no_verdict_and_say_what_to_do(tmp_path: Path, capsys: py
     near = cloud["x"] < EAST_M + 14.0
     small = tiles(tmp_path / "small", cloud, np.flatnonzero(near & (cloud["y"] < NORTH_M + 50.0)))
     with pytest.raises(
-        UserError, match=r"no verdict: .* cells of 2 m in \d place.*it takes 100 in 3: want more"
+        UserError, match=r"no verdict: .* cells of 2 m in \d place.*a verdict needs 100 in 3: add"
     ) as caught:
         run(strips.command, str(small), "--level", "QL3")
     assert caught.value.exit_code == ExitCode.PROBLEM

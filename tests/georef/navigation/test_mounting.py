@@ -56,7 +56,7 @@ def remedy(text: str) -> FloatArray:
     said = re.search(r"by (\[\[.*\]\])", text)
     if said is not None:
         return np.array([[float(value) for value in row.split(",")] for row in re.findall(r"\[([^\[\]]+)\]", said[1])])
-    taken = re.search(r"taken as \(([^)]*)\)", text)
+    taken = re.search(r"read as \(([^)]*)\)", text)
     assert taken is not None, text
     matrix = np.zeros((3, 3))
     for row, axis in enumerate(taken[1].split(", ")):

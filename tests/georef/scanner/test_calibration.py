@@ -178,12 +178,16 @@ def test_changed_leaves_the_old_one() -> None:
         ("omega_deg = 0", "", "parameters.omega_deg: missing, want a number"),
         ("omega_deg = 0", "omega_deg = true", "parameters.omega_deg: got True, want a number"),
         ("omega_deg = 0", "omega_deg = nan", "parameters.omega_deg: got nan, want a number"),
-        ("omega_deg = 0", "omega_deg = 0\nomega_rad = 0", "parameters.omega_rad: no parameter of the model"),
-        ("[parameters]", "installation_matrix = [[1, 0, 0]]\n[parameters]", "calibration.installation_matrix: no rot"),
+        ("omega_deg = 0", "omega_deg = 0\nomega_rad = 0", "parameters.omega_rad: not a parameter of the model"),
+        (
+            "[parameters]",
+            "installation_matrix = [[1, 0, 0]]\n[parameters]",
+            "calibration.installation_matrix: not a rot",
+        ),
         (
             "[parameters]",
             "installation_matrix = [[1, 0, 0], [0, 1, 0], [0, 0, -1]]\n[parameters]",
-            "calibration.installation_matrix: no rotation; want 3 × 3 numbers",
+            "calibration.installation_matrix: not a rotation; give 3 × 3 numbers",
         ),
         ("[parameters]", "mirror_factor = 'two'\n[parameters]", "calibration.mirror_factor: got 'two', want a number"),
     ],
@@ -201,7 +205,10 @@ def test_mistakes_of_header_and_parameters(old: str, new: str, wrong: str) -> No
     [
         ("[sigma]\nomega_deg = -1", "sigma.omega_deg: got -1, want at least 0"),
         ("sigma = 3", "sigma: not a table; add [sigma]"),
-        ("[correlation]\nnames = ['omega_deg']\nmatrix = [[1]]", "correlation.names: want a list of keys of [sigma]"),
+        (
+            "[correlation]\nnames = ['omega_deg']\nmatrix = [[1]]",
+            "correlation.names: must be a list of keys of [sigma]",
+        ),
         (
             "[sigma]\nomega_deg = 1\nphi_deg = 1\n[correlation]\nnames = ['omega_deg', 'phi_deg']\n"
             "matrix = [[1, 0.5], [0.4, 1]]",
@@ -212,13 +219,13 @@ def test_mistakes_of_header_and_parameters(old: str, new: str, wrong: str) -> No
             "matrix = [[1, 1.5], [1.5, 1]]",
             "correlation.matrix: want 2 × 2 numbers: symmetric",
         ),
-        ("[ibrc]\nintensity = [1, 2]\ncorrection_m = [1]", "ibrc: want intensity and correction_m"),
-        ("[ibrc]\nintensity = [1, 1]\ncorrection_m = [1, 2]", "ibrc.intensity: want rising values"),
-        ("[[range_offset]]\noffset_m = 1", "range_offset[0]: matches everything; want return_slot"),
+        ("[ibrc]\nintensity = [1, 2]\ncorrection_m = [1]", "ibrc: needs intensity and correction_m"),
+        ("[ibrc]\nintensity = [1, 1]\ncorrection_m = [1, 2]", "ibrc.intensity: values must increase"),
+        ("[[range_offset]]\noffset_m = 1", "range_offset[0]: matches every return; give return_slot"),
         ("[[range_offset]]\nreturn_slot = 1", "range_offset[0].offset_m: missing, want a number"),
         ("[[range_offset]]\nmta_zone = -1\noffset_m = 1", "range_offset[0].mta_zone: got -1, want a whole number"),
         ("[[facet]]\ntilt_deg = 1", "facet[0].index: missing, want a whole number"),
-        ("[[facet]]\nindex = 1\ntilt_deg = 1\n[[facet]]\nindex = 1\ntilt_deg = 2", "facet[1].index: facet 1 stands"),
+        ("[[facet]]\nindex = 1\ntilt_deg = 1\n[[facet]]\nindex = 1\ntilt_deg = 2", "facet[1].index: facet 1 is given"),
         ("[[beam]]\nchannel = 1\n[[beam]]\nchannel = 1", "beam[1].channel: beam 1 is given twice; give it once"),
         ("[beam]\nchannel = 1", "beam: must be tables [[beam]]"),
         ("[[range_offsets]]\nreturn_slot = 1\noffset_m = 1", "range_offsets: is unknown; use calibration, param"),
@@ -229,7 +236,7 @@ def test_mistakes_of_header_and_parameters(old: str, new: str, wrong: str) -> No
         ("[[beam]]\nchannel = 1\nazimuth_rad = 0.1", "beam[0].azimuth_rad: is unknown; use channel, azimuth_deg"),
         ("[[range_offset]]\nreturn_slot = 0\noffset_m = 1", "range_offset[0].return_slot: got 0, want a whole"),
         ("[[beam]]\nchannel = 70000", "beam[0].channel: got 70000, want a whole number from 0 to 65535"),
-        ("[correlation]\nnames = [['a']]\nmatrix = [[1]]", "correlation.names: want a list of keys of [sigma]"),
+        ("[correlation]\nnames = [['a']]\nmatrix = [[1]]", "correlation.names: must be a list of keys of [sigma]"),
     ],
 )
 def test_mistakes_of_tables(added: str, wrong: str) -> None:

@@ -250,7 +250,7 @@ def test_waypoint_columns_may_stand_apart_by_marks(mark: str, comma: bool, dms_c
 
 def test_waypoint_decimal_commas_between_commas_name_what_to_export() -> None:
     told = refusal(separated(",", True))
-    assert "decimal commas cannot be told from commas between columns; export it with decimal points" in told
+    assert "decimal commas cannot be distinguished from commas between columns; export it with decimal points" in told
 
 
 def test_waypoint_sigmas_are_scaled_back_to_one() -> None:
@@ -322,7 +322,7 @@ def test_waypoint_utc_takes_the_offset_of_its_header() -> None:
     unsaid = export(trajectory, seconds, "UTCTime", "(sec)")
     assert "its time is UTC, of unknown leap seconds; export GPSTime and Week" in refusal(unsaid, span_ns=SPAN)
     unsure = export(trajectory, times, "UTCDate UTCTime", "(MDY) (HMS)")
-    assert "leap seconds are known here until 2026-06-28 only; export it in GPS time" in refusal(unsure)
+    assert "this program knows leap seconds only until 2026-06-28; export it in GPS time" in refusal(unsure)
 
 
 def test_waypoint_that_is_wrong_is_refused() -> None:
@@ -461,8 +461,8 @@ def test_rtklib_that_is_wrong_is_refused() -> None:
         ELLIPSOIDAL.replace("ellipsoidal", "geodetic") + DRIVE
     )
     assert "Japan Standard Time; export it in GPST" in refusal(DRIVE.replace("GPST", "JST "))
-    assert "'19-34-18.499' is no time of day" in refusal(DRIVE.replace("19:34:18.499", "19-34-18.499"))
-    assert "'19:34:inf' is no time of day" in refusal(DRIVE.replace("19:34:18.749", "19:34:inf"))
+    assert "'19-34-18.499' is not a time of day" in refusal(DRIVE.replace("19:34:18.499", "19-34-18.499"))
+    assert "'19:34:inf' is not a time of day" in refusal(DRIVE.replace("19:34:18.749", "19:34:inf"))
     for date in ("2025-07-08 19:34:18.499", "237x 243258.499", "2374 nan"):
         said = f"'{date}' is neither a date with a time of day nor a GPS week with its seconds"
         assert said in refusal(DRIVE.replace("2025/07/08 19:34:18.499", date))
@@ -474,4 +474,4 @@ def test_rtklib_that_is_wrong_is_refused() -> None:
 
 @pytest.mark.parametrize("text", ["<kml></kml>", "time lat lon\n1 2 3\n", "% a comment\n1 2 3\n", " \n"])
 def test_other_texts_are_no_trajectory(text: str) -> None:
-    assert "is no trajectory: SBET, Waypoint text, RTKLIB .pos or trajectory CSV" in refusal(text)
+    assert "is not a trajectory; give SBET, Waypoint text, RTKLIB .pos or trajectory CSV" in refusal(text)

@@ -516,11 +516,11 @@ def test_after_the_flight_only_what_is_on_the_way_comes() -> None:
 @pytest.mark.parametrize(
     ("keys", "error"),
     [
-        ({"baud": 9600, "rate_hz": 20}, r"gnss\.rover\.baud: 9600 is too slow for \d+ bytes a second; want 57600 or"),
-        ({"baud": 57_600, "ins": True}, r"gnss\.rover\.baud: 57600 is too slow for \d+ bytes a second; want 230400 or"),
+        ({"baud": 9600, "rate_hz": 20}, r"gnss\.rover\.baud: 9600 is too slow for \d+ bytes a second; set 57600 or"),
+        ({"baud": 57_600, "ins": True}, r"gnss\.rover\.baud: 57600 is too slow for \d+ bytes a second; set 230400 or"),
         (
             {"baud": 9600, "rate_hz": 1, "latency_ms": 700.0},
-            r"gnss\.rover\.baud: 9600: messages would come 1\.\d\d s after the second they name; want 19200 or more",
+            r"gnss\.rover\.baud: 9600: messages would come 1\.\d\d s after the second they name; set 19200 or more",
         ),
         (
             {"latency_ms": 950.0},

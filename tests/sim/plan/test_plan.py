@@ -114,7 +114,11 @@ class TestRefusals:
             ),
             (text_of(more='[[terrain.building]]\nroof = "round"'), "terrain.building[0].center_m", "is missing"),
             (text_of(more='[gnss."two words"]'), "gnss.two words.[key]", "got 'two words', want"),
-            (text_of(flight="start = 2026-06-15T09:00:00"), "flight.start", "has no offset; want UTC, as 2026-06-15"),
+            (
+                text_of(flight="start = 2026-06-15T09:00:00"),
+                "flight.start",
+                "has no UTC offset; write UTC as 2026-06-15",
+            ),
             ('[flight]\nname = "none"', "line", "is missing"),
             ('line = []\n[flight]\nname = "none"', "line", "at least 1 item"),
             (text_of().replace("height_m = 900.0", ""), "line[0].height_m", "is missing"),

@@ -194,7 +194,7 @@ def test_mistakes_in_a_file_are_a_line_each(tmp_path: Path, text: str, said: str
         (("basic", "", "left.fie"), "--free left.fie: unknown parameter; use one of omega_deg"),
         (("basic", "", "", ["phi_deg=much"]), "--prior phi_deg=much: want KEY=SIGMA, above 0"),
         (("basic", "", "", ["phi_deg=-1"]), "--prior phi_deg=-1: want KEY=SIGMA, above 0"),
-        (("basic", "", "", ["ibrc.1=1"]), "--prior ibrc.1: is no parameter"),
+        (("basic", "", "", ["ibrc.1=1"]), "--prior ibrc.1: unknown parameter"),
     ],
 )
 def test_mistakes_in_options_are_a_line_each(given: tuple[object, ...], said: str) -> None:
@@ -210,7 +210,7 @@ def test_all_that_is_wrong_with_a_file_is_said_at_once(tmp_path: Path) -> None:
 
 def test_a_file_of_nested_tables_is_a_line(tmp_path: Path) -> None:
     deep = "[parameters]\n" + 2000 * "a." + "b = 'free'"
-    assert "nested too deeply; want tables at most 32 deep" in refused(file(tmp_path, deep))
+    assert "nested too deeply; nest tables at most 32 deep" in refused(file(tmp_path, deep))
 
 
 def test_no_text_is_a_line(tmp_path: Path) -> None:

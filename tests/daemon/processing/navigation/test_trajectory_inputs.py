@@ -201,7 +201,7 @@ class TestRefusals:
 
     def test_names_that_are_not_there(self, flown: Flown) -> None:
         assert self.refused(flown, InputOptions(imu="other")).endswith(
-            "--imu: the configuration has no [imu.other]; there are: main"
+            "--imu: the configuration has no [imu.other]; it has: main"
         )
         assert "--gnss-name" in self.refused(flown, InputOptions(gnss="base"))
 
@@ -264,13 +264,13 @@ class TestDoubts:
         arm = "lever_arm_m = [0.1, -0.05, -1.2]"
         config = flown.changed("two.toml", **{arm: f"{arm}\nsecondary_lever_arm_m = [0.9, 0.6, -1.2]"})
         (line,) = read_inputs(flown.session(), InputOptions(config=config)).doubts
-        assert "gnss/rover sent no heading that is known here, though secondary_lever_arm_m" in line
+        assert "gnss/rover sent no heading that this program reads, although secondary_lever_arm_m" in line
 
     def test_an_imu_timed_by_its_arrival(self, flown: Flown) -> None:
         config = flown.changed("untimed.toml", **{"sample_ticks": "# ", "pps_ticks": "# ", 'group = "last"': ""})
         inputs = read_inputs(flown.session(), InputOptions(config=config))
         assert inputs.imu_time[0] == "arrival"
-        assert "placed by their arrival" in inputs.doubts[0]
+        assert "timed by their arrival" in inputs.doubts[0]
         assert inputs.setup.estimate_time_offset_s > 1e-3
         latched = read_inputs(flown.session(), InputOptions()).legs[0].inertial.time_ns
         off_ns = inputs.legs[0].inertial.time_ns[200:1200] - latched[200:1200]

@@ -155,7 +155,7 @@ def test_lengths_on_a_map_far_from_true_to_scale_are_those_on_the_ground(tmp_pat
     assert look.density == pytest.approx(4.0 / np.cos(lat) ** 2, rel=0.02)
     (note,) = look.notes
     assert "a metre on the ground is 1.4" in note
-    assert note.endswith("lengths and areas here are those on the ground")
+    assert note.endswith("lengths and areas shown are those on the ground")
     assert '"EPSG:32632"' in note
 
 

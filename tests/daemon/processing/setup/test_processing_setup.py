@@ -149,10 +149,10 @@ def test_only_the_scanners_that_are_asked_for(tmp_path: Path) -> None:
             'scanner_serial = "77"',
             'calibration.scanner_serial: belongs to another head: "77", the configuration has "1234"',
         ),
-        ('ranges = "vacuum"', 'was estimated with ranges = "vacuum", [atmosphere] says "corrected"'),
-        ('refraction = "ardc"', 'was estimated with refraction = "ardc", [atmosphere] says "none"'),
+        ('ranges = "vacuum"', 'was estimated with ranges = "vacuum", [atmosphere] has "corrected"'),
+        ('refraction = "ardc"', 'was estimated with refraction = "ardc", [atmosphere] has "none"'),
         ("mirror_factor = 2.0", "was estimated with 2, the configuration has 1; set both alike, or calibrate again"),
-        ("installation_matrix = [[0,1,0],[-1,0,0],[0,0,1]]", "is not the configuration's installation"),
+        ("installation_matrix = [[0,1,0],[-1,0,0],[0,0,1]]", "differs from the configuration's installation"),
         ('method = "guessed"', "guessed"),
     ],
 )
@@ -176,7 +176,7 @@ def test_a_calibration_that_is_none_of_this_flights_is_refused(tmp_path: Path, h
         (
             {"angles_deg = [0, 0, 0]": 'source = "imu/main", angles_deg = [0, 0, 0]'},
             {},
-            'scanner.left: gimbal.stages[0].source: "imu/main" tells no angles of a gimbal',
+            'scanner.left: gimbal.stages[0].source: "imu/main" sends no gimbal angles',
         ),
     ],
 )

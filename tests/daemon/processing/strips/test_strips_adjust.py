@@ -222,10 +222,10 @@ def test_mistakes_are_one_line_and_leave_nothing(
     for given, code, words in (
         ([*full, "--strip-model", "cubic"], 2, 'got "cubic", want one of none, constant, linear, spline, auto'),
         ([*full, "--level", "QL1"], 2, "--level: is of a comparison"),
-        (points, 2, "holds points; want the logs they are of"),
-        (nominal, 2, "left: has the nominal calibration only"),
+        (points, 2, "contains points; give the logs of these points"),
+        (nominal, 2, "left: has only the nominal calibration"),
         ([*full, "--control", str(tmp_path / "no.csv")], 3, "no.csv: cannot be read"),
-        ([*full, "--control", str(far)], 1, "no control point lies in the flight"),
+        ([*full, "--control", str(far)], 1, "no control point lies within the flight"),
         ([*full, *spans(tmp_path, times[0])], 1, "1 strip with returns; an adjustment compares strips"),
     ):
         found, line = refused(capsys, given)
@@ -244,8 +244,8 @@ def test_files_that_are_there_stay(
     assert code == 2
     assert f"{ADJUSTMENT}: already exists; choose another folder or use --overwrite" in line
     own = arguments(made, trajectory_of(adjusted, ".sbet"), adjusted, "--overwrite")
-    assert "is what is corrected; want another folder" in refused(capsys, own)[1]
-    assert "is a file; want a folder" in refused(capsys, arguments(made, lifted, lifted))[1]
+    assert "is the trajectory to correct; choose another folder" in refused(capsys, own)[1]
+    assert "is a file; give a folder" in refused(capsys, arguments(made, lifted, lifted))[1]
     assert {path: path.read_bytes() for path in adjusted.iterdir()} == was
     code, line = refused(capsys, ["strips", str(made.flown.log), "--strip-model", "linear"])
     assert code == 2

@@ -221,7 +221,7 @@ def test_made_up_samples(sound: Flight) -> None:
     bridged = np.zeros(len(sound.smoothed), bool)
     bridged[1000:1008] = True  # 1.6 s
     found = told(replace(sound, smoothed=replace(sound.smoothed, bridged=bridged)))
-    assert found == {"bridged run": "inertial samples are missing for 1.6 s on end"}
+    assert found == {"bridged run": "inertial samples are missing for 1.6 s without a break"}
 
 
 def test_lever_arm_and_time_offset(sound: Flight) -> None:

@@ -118,7 +118,7 @@ class TestNames:
         assert (files.sbet, files.smrmsg, files.csv) == (None, None, tmp_path / "f1.csv")
 
     def test_another_ending_is_refused(self, tmp_path: Path) -> None:
-        with pytest.raises(UserError, match=r"want a name that ends in \.sbet, \.out or \.csv, or a folder"):
+        with pytest.raises(UserError, match=r"the name must end in \.sbet, \.out or \.csv, or be a folder"):
             TrajectoryFiles.of_output(tmp_path / "f1.txt", "x", csv=False)
 
     def test_what_is_there_is_named(self, tmp_path: Path) -> None:
