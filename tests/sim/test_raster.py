@@ -105,7 +105,7 @@ def test_far_from_the_origin_places_are_found_at_their_height(tmp_path: Path) ->
 
 
 def test_a_raster_that_is_not_there_or_no_raster(tmp_path: Path) -> None:
-    assert refused(tmp_path).startswith(f"terrain.raster: there is no file {tmp_path / 'dem.tif'}; want")
+    assert refused(tmp_path).startswith(f"terrain.raster: the file {tmp_path / 'dem.tif'} does not exist; give")
     (tmp_path / "dem.tif").write_text("no raster")
     assert refused(tmp_path).startswith(f"terrain.raster: {tmp_path / 'dem.tif'} cannot be read: ")
 

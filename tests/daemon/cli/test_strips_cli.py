@@ -269,7 +269,10 @@ def test_seconds_of_the_week_are_of_the_trajectory_beside_them(
     strips = strips_of_files([folder], StripRules(), lambda what, done, of: None)
     begin, end = made.flight.trajectories[0].span
     assert ((strips.gathered.time_ns >= begin) & (strips.gathered.time_ns <= end)).all()
-    mixed = "files have different kinds of times: seconds of the GPS week in a_strip02.laz; adjusted standard GPS time in a_strip01.laz"
+    mixed = (
+        "files have different kinds of times: seconds of the GPS week in a_strip02.laz; adjusted standard GPS time in "
+        "a_strip01.laz"
+    )
     assert [note.startswith(mixed) for note in strips.notes] == [True] * (of_week == (2,))
 
 

@@ -151,7 +151,7 @@ def test_few_cells_give_no_verdict_and_say_what_to_do(tmp_path: Path, capsys: py
         run(strips.command, str(small), "--level", "QL3")
     assert caught.value.exit_code == ExitCode.PROBLEM
     told = capsys.readouterr().out
-    assert "strips keep" not in told
+    assert "strips meet" not in told
     assert "RMSDz" in told
     run(view.command, str(small), "-o", str(tmp_path / "view"), "--json")
     quality = json.loads(capsys.readouterr().out)["quality"]

@@ -101,7 +101,7 @@ def test_stamps_of_a_locked_head_are_found_to_be_the_hours_of_utc() -> None:
     gps = truth_ns() + 3570 * NS
     found = judged(hour_stamps(gps), gps, past_hour=True)
     assert (found.scale, found.sigma_ns) == (StampScale.HOUR, 20_000.0)
-    assert "before their arrival" in found.text
+    assert "they count from the hour of UTC" in found.text
 
 
 @pytest.mark.parametrize(("off_s", "drift_ppm"), [(1.0, 0.0), (-1.0, 0.0), (0.3, 0.0), (777.7, 12.0), (0.0, 30.0)])

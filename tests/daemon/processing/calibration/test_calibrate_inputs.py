@@ -103,7 +103,7 @@ def test_picked_points_become_ties(read: Any, tmp_path: Path) -> None:
     (tie,) = ties_of(path, read).ties
     assert [sighting.swath for sighting in tie.sightings] == [0, 1]
     path.write_text("name,strip,x,y,z,sigma_m\n" + rows[0] + "\n" + "corner,02,1,2,3,0.03\n")
-    with pytest.raises(UserError, match=r"no tie point is left .* want places in output\.crs"):
+    with pytest.raises(UserError, match=r"no tie point remains .* give positions in output\.crs"):
         ties_of(path, read)
     path.write_text("name,x,y\n")
     with pytest.raises(PickedError, match="line 1: has name, x, y; the columns must be"):
