@@ -348,9 +348,9 @@ def _plausible(head: Head, base: Calibration, name: str, wish: ParameterOptions)
     """
     if name in head.geometry.without:
         return 0.0
-    said = wish.priors.get(f"{head.name}.{name}", wish.priors.get(name))
-    if said is not None:
-        return said
+    prior = wish.priors.get(f"{head.name}.{name}", wish.priors.get(name))
+    if prior is not None:
+        return prior
     if name == _BY_CONVENTION:
         return 0.0
     stated = 0.0 if base.method == "nominal" else float(base.all_sigmas[INDEX[name]])

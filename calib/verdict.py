@@ -100,8 +100,8 @@ def sigma_of(report: ReportInput, names: tuple[str, ...]) -> float | None:
 
 def wanted_of(report: ReportInput) -> dict[str, float]:
     """Return the wanted sigmas (SI), by parameter's name."""
-    told = {} if report.need is None else report.need.wanted
-    return {**WANTED, **{name: sigma for name, sigma in told.items() if math.isfinite(sigma)}}
+    required = {} if report.need is None else report.need.wanted
+    return {**WANTED, **{name: sigma for name, sigma in required.items() if math.isfinite(sigma)}}
 
 
 def held_words(adjusted: Adjusted) -> list[str]:
@@ -115,13 +115,13 @@ def held_words(adjusted: Adjusted) -> list[str]:
     found = []
     for column, one in enumerate(adjusted.considered):
         at = np.argsort(-np.abs(moved[:, column]) / np.maximum(own, 1e-300)).tolist()
-        told = [
+        moves = [
             f"{unknown_words(adjusted.names[i], several)} by {sized(adjusted.names[i], abs(float(moved[i, column])))}"
             for i in at
             if abs(float(moved[i, column])) > own[i]
         ]
-        if told:
-            found.append(f"{_held(one, several)}, which would move {listed(told)}")
+        if moves:
+            found.append(f"{_held(one, several)}, which would move {listed(moves)}")
     return found
 
 
@@ -208,8 +208,8 @@ def _contradicted(report: ReportInput) -> Iterator[tuple[str, float]]:
     for one in report.adjusted.considered:
         if one.contradicted:
             name = f"{one.scanner}.{one.name}"
-            told = f"{sized(name, one.told, sign=True)} ± {sized(name, one.told_sigma)}"
-            yield f"the held value of {unknown_words(name, several)}: it would change the value by {told}", 1.0
+            change = f"{sized(name, one.told, sign=True)} ± {sized(name, one.told_sigma)}"
+            yield f"the held value of {unknown_words(name, several)}: it would change the value by {change}", 1.0
 
 
 def _profiles(report: ReportInput) -> Iterator[tuple[str, float]]:
@@ -217,10 +217,10 @@ def _profiles(report: ReportInput) -> Iterator[tuple[str, float]]:
     several = len(report.adjusted.calibrations) > 1
     for one in () if report.check is None else report.check.comparisons:
         name = f"{one.scanner}.{one.parameter}"
-        told = sized(name, one.told - one.adjusted, sign=True)
+        apart = sized(name, one.told - one.adjusted, sign=True)
         sigmas = number(one.normalised, "+.1f")
         yield (
-            f"{one.profiles} profiles put {unknown_words(name, several)} {told} from the adjustment ({sigmas} sigmas)",
+            f"{one.profiles} profiles put {unknown_words(name, several)} {apart} from the adjustment ({sigmas} sigmas)",
             abs(one.normalised),
         )
 
@@ -463,8 +463,8 @@ def accuracy_words(report: ReportInput) -> str:
     words = [f"boresight to {degrees(boresight * DEG)}"] if boresight is not None else []
     words += [f"range offset to {length(offset_m)}"] if offset_m is not None else []
     rms_m = overall_rms_m(dict(report.after))
-    told = ", ".join(words) or "the model has neither boresight nor range offset"
-    return told + (f"; strips agree to {length(rms_m)} (RMSDz)" if rms_m is not None else "")
+    accuracy = ", ".join(words) or "the model has neither boresight nor range offset"
+    return accuracy + (f"; strips agree to {length(rms_m)} (RMSDz)" if rms_m is not None else "")
 
 
 def _sentence(level: Level, report: ReportInput, reasons: list[Reason]) -> str:

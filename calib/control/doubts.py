@@ -122,8 +122,8 @@ def _outside(flight: Flight, points: Sequence[ControlPoint], seen: set[int], rul
 
 
 def _some(names: tuple[str, ...]) -> str:
-    told = ", ".join(names[:3]) + (f" and {len(names) - 3} more points" if len(names) > 3 else "")
-    return f"{told} {'lies' if len(names) == 1 else 'lie'}"
+    listed = ", ".join(names[:3]) + (f" and {len(names) - 3} more points" if len(names) > 3 else "")
+    return f"{listed} {'lies' if len(names) == 1 else 'lie'}"
 
 
 def _length(metres: float) -> str:
@@ -153,8 +153,8 @@ def _heights(
     if known is None and ORTHOMETRIC_M[0] <= abs(middle_m) <= ORTHOMETRIC_M[1]:
         text = f"{what}, as orthometric heights would lie where the undulation is {-middle_m:.1f} m"
         return (Doubt("orthometric", f"{text}; give heights above the ellipsoid", names),)
-    told = "" if known is None else f"; this is not the undulation of {known[1]}, which is {known[0]:.1f} m there"
-    text = f"{what} (± {spread_m / math.sqrt(len(above_m)):.2f} m), as in another height reference or datum{told}"
+    not_geoid = "" if known is None else f"; this is not the undulation of {known[1]}, which is {known[0]:.1f} m there"
+    text = f"{what} (± {spread_m / math.sqrt(len(above_m)):.2f} m), as in another height reference or datum{not_geoid}"
     return (Doubt("height", text, names),)
 
 

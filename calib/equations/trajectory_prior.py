@@ -253,10 +253,10 @@ def _told(trajectory: Trajectory, time_ns: Int64Array) -> tuple[FloatArray, Floa
     since, epochs = (times - trajectory.time_ns[0] for times in (time_ns, trajectory.time_ns))
     told = np.concatenate([trajectory.position_sigma_l, trajectory.attitude_sigma_rad], axis=1)
     sigmas = np.stack([np.interp(since, epochs, column) for column in told.T], axis=1)
-    said = np.isfinite(sigmas) & (sigmas >= 0.0)
-    if not said.all():
-        first = int(np.argmax(~said.all(axis=1)))
-        what = "position" if not said[first, :3].all() else "attitude"
+    known = np.isfinite(sigmas) & (sigmas >= 0.0)
+    if not known.all():
+        first = int(np.argmax(~known.all(axis=1)))
+        what = "position" if not known[first, :3].all() else "attitude"
         where = f"trajectory {trajectory.name} has no {what} sigma at {gps_text(int(time_ns[first]))}"
         want = "put an smrmsg beside the SBET, add sigma_… columns to the CSV, or let swath navigate"
         raise FlightError(f"{where}; a calibration needs sigmas: {want}")

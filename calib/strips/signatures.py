@@ -346,12 +346,12 @@ def _told(effect: Effect, value: float, sigma: float, edge: float) -> Signature:
     number = f"{size:+.{digits}f} ± {spread:.{digits}f} {effect.unit}".replace(" °", "°")
     if times < SIGNIFICANT:
         return Signature(effect, value, sigma, moves_m, "none", f"{effect.name}: not significant ({number})")
-    told = f"{times:.0f} σ, {100.0 * moves_m:.1f} cm at the edge"
+    size_words = f"{times:.0f} σ, {100.0 * moves_m:.1f} cm at the edge"
     if moves_m < MATTERS_M:
         return Signature(
-            effect, value, sigma, moves_m, "small", f"{effect.name}: {number}, too small to matter ({told})"
+            effect, value, sigma, moves_m, "small", f"{effect.name}: {number}, too small to matter ({size_words})"
         )
-    words = f"{effect.name}: {effect.look}; add {number} to {effect.key} ({told})"
+    words = f"{effect.name}: {effect.look}; add {number} to {effect.key} ({size_words})"
     return Signature(effect, value, sigma, moves_m, "significant", words)
 
 

@@ -482,16 +482,16 @@ def _testfield(
 
 def _anew(calibrations: Mapping[str, Calibration], anew: Mapping[str, Calibration] | None) -> Method:
     name = "measurementActualParameters"
-    told: list[tuple[str, Compared]] = []
+    compared: list[tuple[str, Compared]] = []
     for scanner in sorted(set(calibrations) & set(anew or {})):
         assert anew is not None
-        told.append((scanner, compare(calibrations[scanner], anew[scanner])))
-    told = [one for one in told if one[1].freedom]
-    if not told:
+        compared.append((scanner, compare(calibrations[scanner], anew[scanner])))
+    compared = [one for one in compared if one[1].freedom]
+    if not compared:
         return Method(name, None, (), f"{name} ({CODES[name]}): not applied: {NOT_BOTH if anew else WANTS[name]}")
-    squares, freedom = sum(one.chi2 for _, one in told), sum(one.freedom for _, one in told)
+    squares, freedom = sum(one.chi2 for _, one in compared), sum(one.freedom for _, one in compared)
     test = Test("chi2", squares, float(freedom), float(stats.chi2.sf(squares, freedom)))
-    rows = [row for _, one in told for row in one.rows]
+    rows = [row for _, one in compared for row in one.rows]
     largest = max(rows, key=lambda row: abs(row.difference) / row.sigma)
     verdict = "agree with the calibration" if test.passed else "do not agree with the calibration"
     sentence = (
@@ -501,7 +501,7 @@ def _anew(calibrations: Mapping[str, Calibration], anew: Mapping[str, Calibratio
     shift = math.sqrt(_noncentrality(freedom))
     smallest = tuple(
         Detectable(scanner, row.name, shift / math.sqrt(weight))
-        for scanner, one in told
+        for scanner, one in compared
         for row, weight in zip(one.rows, one.weights, strict=True)
     )
     return Method(name, None, (test,), sentence, {"parameters": [row.record() for row in rows]}, smallest)

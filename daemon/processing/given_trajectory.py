@@ -117,8 +117,10 @@ def _nearest(given: Given, setup: Setup, clocks: LogClocks) -> tuple[Apart | Non
         apart = apart_from_fixes(given.trajectory, rows, np.array(arms, dtype=np.float64))
         if apart is None or (best[0] is not None and max(best[0].fix_sigma_l) <= max(apart.fix_sigma_l)):
             continue
-        told = [fix.undulation_m for fix in fixes if fix.undulation_m is not None and math.isfinite(fix.undulation_m)]
-        best = apart, source, float(np.median(told)) if told else None
+        undulations = [
+            fix.undulation_m for fix in fixes if fix.undulation_m is not None and math.isfinite(fix.undulation_m)
+        ]
+        best = apart, source, float(np.median(undulations)) if undulations else None
     return best
 
 
@@ -147,9 +149,9 @@ def _datum_of(given: Given, setup: Setup) -> CRS | None:
 
 
 def _epoch(given: Given, setup: Setup) -> float:
-    said = setup.options.epoch if setup.options.epoch is not None else setup.config.output.epoch
+    epoch = setup.options.epoch if setup.options.epoch is not None else setup.config.output.epoch
     day, _ = utc_from_gps(given.trajectory.span[0], 0)
-    return said if said is not None else day.year + (day.timetuple().tm_yday - 0.5) / 365.25
+    return epoch if epoch is not None else day.year + (day.timetuple().tm_yday - 0.5) / 365.25
 
 
 def _judge_place(
@@ -304,15 +306,16 @@ def _judge_motion(given: Given, setup: Setup, clocks: LogClocks, log: Path, foun
     if motion is None:
         return
     axes = ", ".join(f"{value:+.2f}" for value in motion.by_axis)
-    told = f"(correlations about the axes forward, right, down {axes}; {motion.correlation:+.2f} in all)"
+    correlations = f"(correlations about the axes forward, right, down {axes}; {motion.correlation:+.2f} in all)"
     if motion.convention:
         found.refused.append(
-            f"{given.file}: turns like the IMU in {log} only if {motion.convention} ({motion.converted:+.2f} then) "
-            f"{told}; give axes forward, right, down relative to north, east, down, or correct imu.….rotation_b_imu"
+            f"{given.file}: turns like the IMU in {log} only if {motion.convention} ({motion.converted:+.2f} "
+            f"then) {correlations}; give axes forward, right, down relative to north, east, down, or correct "
+            "imu.….rotation_b_imu"
         )
     elif motion.is_other:
         found.refused.append(
-            f"{given.file}: does not turn like the IMU in {log} {told}; give the trajectory of this flight, or "
+            f"{given.file}: does not turn like the IMU in {log} {correlations}; give the trajectory of this flight, or "
             "correct imu.….rotation_b_imu"
         )
     elif motion.gusts_are_others:
@@ -323,7 +326,7 @@ def _judge_motion(given: Given, setup: Setup, clocks: LogClocks, log: Path, foun
         )
     elif motion.correlation < UNLIKE:
         found.warnings.append(
-            f"{given.file}: does not turn like the IMU in {log} {told}; it may belong to another flight, or "
+            f"{given.file}: does not turn like the IMU in {log} {correlations}; it may belong to another flight, or "
             "imu.….rotation_b_imu may be wrong"
         )
     if not found.refused:

@@ -148,8 +148,8 @@ def _trouble(read: _Reader, source: str, *, own: bool) -> str:
         if states == {"absent"}:
             facts.append("reports that no pulse reaches it; wire the receiver's PPS to it")
         else:
-            told = f" ({', '.join(sorted(states))})" if states else ""
-            facts.append(f"reports that it is not locked to its pulse{told}; wire a steady PPS to it")
+            states_text = f" ({', '.join(sorted(states))})" if states else ""
+            facts.append(f"reports that it is not locked to its pulse{states_text}; wire a steady PPS to it")
     messages = read.messages[source]
     valid = [message.host_time_ns for message in messages if message.valid]
     if own and not messages:

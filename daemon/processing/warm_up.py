@@ -270,9 +270,9 @@ def _placed(setup: Setup) -> tuple[list[tuple[str, Points]], Trajectory | None]:
         for source in clocks.host.plan.pps:
             clocks.add_edge(source, PpsEdge(host_ns, second))
         week, of_week_ns = week_from_gps(START_NS + passed_ns)
-        said = TimeTag(TimeScale.GPS, of_week_ns, week=week, leap_seconds=LEAP_SECONDS)
+        tag = TimeTag(TimeScale.GPS, of_week_ns, week=week, leap_seconds=LEAP_SECONDS)
         for source in clocks.host.plan.gnss:
-            clocks.add_message(source, TimeMessage(host_ns + 50_000_000, said, NamesEdge.PREVIOUS, bound=True))
+            clocks.add_message(source, TimeMessage(host_ns + 50_000_000, tag, NamesEdge.PREVIOUS, bound=True))
         for source in clocks.host.plan.devices:
             clocks.add_samples(source, _device_clock(host_ns, passed_ns, second))
         stream.path.add(setup.sources.ins_rows(_solutions(setup, START_NS + passed_ns)))

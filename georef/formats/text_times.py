@@ -83,7 +83,7 @@ def _date(text: str, order: str, name: str) -> dt.date:
 
 
 def _of_day_ns(text: str, name: str) -> int:
-    said = CLOCK.fullmatch(text)
-    if said is None:
+    match = CLOCK.fullmatch(text)
+    if match is None:
         raise TrajectoryError(f"{name}: {text!r} is not a time of day; hh:mm:ss is expected")
-    return (int(said[1]) * 60 + int(said[2])) * 60 * SECOND_NS + round(float(said[3]) * SECOND_NS)
+    return (int(match[1]) * 60 + int(match[2])) * 60 * SECOND_NS + round(float(match[3]) * SECOND_NS)

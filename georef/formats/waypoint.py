@@ -221,8 +221,8 @@ def _names(titles: str, separator: str | None) -> list[str]:
 def _blank_separated(lines: list[str], separator: str | None, columns: int) -> list[str]:
     """Return lines of data with blanks between columns and decimal points; an empty cell becomes ``nan``."""
     if separator is None:
-        told = " ".join(lines)
-        return [DECIMAL_COMMA.sub(".", line) for line in lines] if "," in told and "." not in told else lines
+        text = " ".join(lines)
+        return [DECIMAL_COMMA.sub(".", line) for line in lines] if "," in text and "." not in text else lines
     made = []
     for line in lines:
         cells = _cells(line, separator) if line.strip() else []
@@ -339,10 +339,10 @@ def _of_seconds(sheet: Sheet, time: str, days: Int64Array | None, span_ns: Span 
     if not ((seconds >= 0.0) & (seconds < 10.0 * WEEK_S)).all():
         raise TrajectoryError(f"{sheet.name}: a time is not a number of seconds of the week")
     if "week" in sheet.columns and week is None:
-        said = sheet.numbers("week")
-        if not ((said >= 0.0) & (said < 10_000.0)).all():
+        week_numbers = sheet.numbers("week")
+        if not ((week_numbers >= 0.0) & (week_numbers < 10_000.0)).all():
             raise TrajectoryError(f"{sheet.name}: a week is not a GPS week; whole numbers up to 9999 are expected")
-        weeks = np.rint(said).astype(np.int64)
+        weeks = np.rint(week_numbers).astype(np.int64)
         gps_ns: Int64Array = weeks * WEEK_NS + np.rint(seconds * SECOND_NS).astype(np.int64)
         return gps_ns
     if days is not None:

@@ -310,7 +310,7 @@ class _Reader:
     def _values(self, section: str) -> tuple[FloatArray, set[int]]:
         """Return values (16,) in SI units, and the indices of those given."""
         table = self._table(section, needed=section == "parameters")
-        values, said = np.zeros(len(PARAMETERS)), set()
+        values, given = np.zeros(len(PARAMETERS)), set()
         for key in sorted(table.keys() - _INDEX_OF_KEY.keys()):
             self._wrong(
                 f"{section}.{key_text(key)}", "not a parameter of the model; use the keys of docs/conventions.md"
@@ -319,17 +319,17 @@ class _Reader:
             needed = parameter.needed and section == "parameters" and bool(table)
             if parameter.key in table or needed:
                 values[index] = self._number(table, parameter.key, section) * parameter.factor
-                said.add(index)
-        return values, said
+                given.add(index)
+        return values, given
 
     def _sigmas(self, section: str) -> tuple[FloatArray, set[int]]:
         """Return sigmas (16,) in SI units, none negative or too small to be squared, and the indices of those given."""
-        sigmas, said = self._values(section)
+        sigmas, given = self._values(section)
         in_units = sigmas / [parameter.factor for parameter in PARAMETERS]
         for index in np.flatnonzero((sigmas != 0.0) & (in_units < LEAST_SIGMA)).tolist():
             want = "at least 0" if sigmas[index] < 0.0 else f"0, which is held, or at least {LEAST_SIGMA:g}"
             self._wrong(f"{section}.{PARAMETERS[index].key}", f"got {in_units[index]:g}, want {want}")
-        return sigmas, said
+        return sigmas, given
 
     def _correlation(self, known: set[int]) -> FloatArray:
         """Return the correlation (16, 16) from the names and the matrix of the parameters with sigmas."""

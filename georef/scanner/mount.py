@@ -66,8 +66,8 @@ class AngleSeries:
             MountError: fewer than two epochs are left.
         """
         angles = np.stack([rows["roll_rad"], rows["pitch_rad"], rows["heading_rad"]], axis=1)
-        told = np.isfinite(angles).all(axis=1) & (rows["gps_ns"] >= 0)
-        time_ns, angles = rows["gps_ns"][told], angles[told]
+        known = np.isfinite(angles).all(axis=1) & (rows["gps_ns"] >= 0)
+        time_ns, angles = rows["gps_ns"][known], angles[known]
         newest = np.maximum.accumulate(np.concatenate([[-1], time_ns]))
         new = time_ns > newest[:-1]
         return cls(time_ns[new], angles[new], max_gap_ns)

@@ -114,8 +114,8 @@ def correlate_turn_rates(trajectory: Trajectory, imu_time_ns: Int64Array, imu_ra
     best = TimeShift(0.0, np.nan, np.nan, np.nan, table_leap_seconds(day)[0])
     for days in sorted({0, apart_days - 1, apart_days, apart_days + 1}, key=abs):
         coarse = days * (DAY_NS // STEP_NS)
-        told = _told_near(trajectory, felt, coarse)
-        found = None if told is None else _best_shift(told, felt, coarse)
+        near = _told_near(trajectory, felt, coarse)
+        found = None if near is None else _best_shift(near, felt, coarse)
         if found is None:
             continue
         shift_s, correlation, sigma, unshifted = found

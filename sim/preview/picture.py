@@ -142,8 +142,8 @@ def _wide_ground(survey: Survey, low: FloatArray, high: FloatArray) -> Ground:
 
 def _title(figure: Figure, page: tuple[float, float], survey: Survey, rows: Sequence[dict[str, Any]]) -> None:
     tables, total = survey.plan.tables, rows[-1]
-    told = [f"{name}: {_scanner_words(table)}" for name, table in tables.scanner.items()]
-    scanners = "; ".join(told) if len(told) < 4 else f"{len(told)} scanners"
+    scanner_words = [f"{name}: {_scanner_words(table)}" for name, table in tables.scanner.items()]
+    scanners = "; ".join(scanner_words) if len(scanner_words) < 4 else f"{len(scanner_words)} scanners"
     length_m = sum(row["length_m"] for row in rows[:-1])
     words = [
         f"{len(rows) - 1} line{'s' if len(rows) > 2 else ''}, {length_m / 1000:.1f} km",

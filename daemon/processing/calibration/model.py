@@ -189,12 +189,12 @@ def model_of(model: str, fix: str = "", free: str = "", priors: Sequence[str] = 
     tables = _tables(model)
     wish = _of_tables(tables)
     known = _PARAMETERS | _entries(wish)
-    said = _states(tables.parameters.items(), f"{model}: parameters.", known)
+    configured = _states(tables.parameters.items(), f"{model}: parameters.", known)
     own = _states(((key, FREE) for key in free.split(",") if key), "--free ", known)
     sigmas = _states(map(_prior, priors), "--prior ", known)
     own |= sigmas
     own |= _states(((key, FIXED) for key in fix.split(",") if key), "--fix ", known)
-    left = {at: state for at, state in said.items() if at not in own and ("", at[1]) not in own}
+    left = {at: state for at, state in configured.items() if at not in own and ("", at[1]) not in own}
     states = {f"{scanner}.{name}" if scanner else name: state for (scanner, name), state in (left | own).items()}
     held = {f"{scanner}.{name}" if scanner else name: sigma for (scanner, name), sigma in sigmas.items()}
     return replace(

@@ -254,9 +254,16 @@ def _record(
 def _considered_entry(adjusted: Adjusted, column: int) -> dict[str, Any]:
     """Return a held parameter, its sigma, and by how much one sigma moves each estimated one; SI."""
     one, moved = adjusted.considered[column], adjusted.movements[:, column]
-    told = {"told": one.told, "told_sigma": one.told_sigma} if math.isfinite(one.told) else {}
+    estimate = {"told": one.told, "told_sigma": one.told_sigma} if math.isfinite(one.told) else {}
     moves = dict(zip(adjusted.names, moved.tolist(), strict=True))
-    return {"scanner": one.scanner, "name": one.name, "value": one.value, "sigma": one.sigma, **told, "moves": moves}
+    return {
+        "scanner": one.scanner,
+        "name": one.name,
+        "value": one.value,
+        "sigma": one.sigma,
+        **estimate,
+        "moves": moves,
+    }
 
 
 def _need_entry(need: Need | None) -> dict[str, Any] | None:
@@ -266,8 +273,8 @@ def _need_entry(need: Need | None) -> dict[str, Any] | None:
 
 def strips_entry(strips: FlightStrips) -> dict[str, Any]:
     """Return height differences of all pairs together and of each pair, and the quality level that follows."""
-    told = strips.agreement.numbers or {}
-    every = {"n": told.get("cells", 0)} | {key: told.get(key) for key in ("mean_m", "std_m", "rms_m")}
+    numbers = strips.agreement.numbers or {}
+    every = {"n": numbers.get("cells", 0)} | {key: numbers.get(key) for key in ("mean_m", "std_m", "rms_m")}
     pairs = [
         {"first": first, "second": second, "n": one.count, "mean_m": one.mean_m, "std_m": one.std_m, "rms_m": one.rms_m}
         for (first, second), one in strips.pairs().items()
@@ -424,8 +431,8 @@ def _prealigned_lines(done: Calibrated) -> list[str]:
 
 
 def _profile_lines(check: Check) -> list[str]:
-    told = [f"{one.scanner}.{key_of(one.parameter)[0]} {one.normalised:+.1f}" for one in check.comparisons]
-    return [f"profiles less adjustment, in sigmas: {', '.join(told)}"] if told else []
+    differences = [f"{one.scanner}.{key_of(one.parameter)[0]} {one.normalised:+.1f}" for one in check.comparisons]
+    return [f"profiles less adjustment, in sigmas: {', '.join(differences)}"] if differences else []
 
 
 def _parameter_lines(adjusted: Adjusted, knots: Sequence[float]) -> list[str]:

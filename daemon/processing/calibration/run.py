@@ -227,9 +227,9 @@ def _calibrated(wish: CalibrationOptions, kept: KeptFlight, folder: Path, tell: 
     flight = replaced(kept.flight, adjusted.calibrations, folder, "calibrated", workers)
     tell("profiles", 0, 1)
     checked = check(flight, adjusted, prior, points)
-    told = (*kept.notes, *notes, *adjusted.notes)
+    all_notes = (*kept.notes, *notes, *adjusted.notes)
     findings = prealigned_otherwise(away, adjusted)
-    return Calibrated(kept, flight, features, prior, first, adjusted, points, checked, told, findings)
+    return Calibrated(kept, flight, features, prior, first, adjusted, points, checked, all_notes, findings)
 
 
 def _aligned(flight: Flight, fixed: frozenset[str]) -> tuple[dict[str, Calibration], dict[str, float]]:
@@ -261,8 +261,8 @@ def prealigned_otherwise(away: Mapping[str, float], adjusted: Adjusted) -> tuple
     for held in adjusted.held:
         apart = away.get(f"{held.scanner}.{held.name}")
         if apart is not None:
-            words, told = unknown(f"{held.scanner}.{held.name}").words, number(math.degrees(apart), "+.2f")
-            what = f"the pre-alignment puts {words} {told}° from the initial value at which it is held"
+            words, apart_text = unknown(f"{held.scanner}.{held.name}").words, number(math.degrees(apart), "+.2f")
+            what = f"the pre-alignment puts {words} {apart_text}° from the initial value at which it is held"
             change = "fly the lines that determine it, or start from a calibration that holds"
             found.append(Finding(what, change, abs(apart) / COARSE_RAD, unusable=True))
     return tuple(found)

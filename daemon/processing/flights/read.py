@@ -388,9 +388,9 @@ def refuse_different_settings(
         UserError: the settings differ.
     """
     for (one, first), (other, second) in pairwise(configs.items()):
-        for key, said in (("crs", crs), ("epoch", epoch)):
+        for key, given in (("crs", crs), ("epoch", epoch)):
             ours, theirs = getattr(first.output, key), getattr(second.output, key)
-            if said is None and ours != theirs:
+            if given is None and ours != theirs:
                 raise UserError(
                     f"{other}: its output.{key} is {_said(theirs)}, that of {one} {_said(ours)}; set one with --{key} "
                     "(of swath georef) or --config, or process the logs one by one",

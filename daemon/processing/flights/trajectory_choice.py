@@ -98,7 +98,7 @@ def choose_trajectory(
         UserError: there is no trajectory, it cannot be read, or it is of another time.
     """
     log = session.parts[0].path
-    doubts: list[str] = []
+    warnings: list[str] = []
     solutions: dict[str, int] = {}
     navigated: Navigated | None = None
     both = setup.sources.imu_source is not None and bool(setup.config.gnss)
@@ -110,28 +110,28 @@ def choose_trajectory(
                 navigated = _navigated(setup, session, solutions)
                 trajectory = navigated.trajectory()
                 findings = [finding.text for leg in navigated.legs for finding in leg.findings]
-                doubts = [*navigated.doubts, *navigated.holes, *findings]
+                warnings = [*navigated.doubts, *navigated.holes, *findings]
         else:
             trajectory = _from_file(wish, wish.file, span, leap_seconds)
-            doubts = refuse_other_motion(clocks, trajectory, str(wish.file), log)
+            warnings = refuse_other_motion(clocks, trajectory, str(wish.file), log)
         refuse_no_overlap(trajectory, str(wish.file or trajectory.name), span, log)
         trajectory.require_attitude()
         if navigated is None:
-            doubts += attitude_doubts(trajectory, str(wish.file or f"{log}: {FROM_LOG}"))
+            warnings += attitude_doubts(trajectory, str(wish.file or f"{log}: {FROM_LOG}"))
         if setup.deflection_rad is not None:
             trajectory = trajectory.with_deflection(*setup.deflection_rad)
         if offset is not None and navigated is not None:
-            doubts.append(
+            warnings.append(
                 f"{log}: the trajectory navigated from IMU and GNSS is that of the body; leave --trajectory-at out"
             )
         elif offset is not None:
             trajectory = trajectory.at_body(offset)
         if wish.file is not None:
-            doubts += _belonging(wish, wish.file, trajectory, setup, clocks, log)
+            warnings += _belonging(wish, wish.file, trajectory, setup, clocks, log)
     except TrajectoryError as error:
         named = str(error) if str(log) in str(error) else f"{error} ({log})"
         raise UserError(named) from error
-    return Chosen(trajectory, doubts, solutions, navigated)
+    return Chosen(trajectory, warnings, solutions, navigated)
 
 
 def _belonging(
@@ -175,9 +175,11 @@ def _navigated(setup: Setup, session: Session, solutions: dict[str, int]) -> Nav
 
     log = session.parts[0].path
     if setup.sources.imu_source is None or not setup.config.gnss:
-        told = f"{setup.sources.ins_source}: its INS had no solution" if solutions else "the log has no INS solution"
+        reason = f"{setup.sources.ins_source}: its INS had no solution" if solutions else "the log has no INS solution"
         missing = "no receiver" if setup.sources.imu_source is not None else "no IMU"
-        raise UserError(f"{log}: {told}, and {missing} to compute a trajectory; give --trajectory FILE", ExitCode.USAGE)
+        raise UserError(
+            f"{log}: {reason}, and {missing} to compute a trajectory; give --trajectory FILE", ExitCode.USAGE
+        )
     try:
         return navigate_session(session, NavigationOptions(InputOptions(config=setup.config)))
     except UserError as error:

@@ -91,8 +91,8 @@ def _job(wish: GeorefOptions, flight: Flight, number: int, tile: Segment, partia
     trajectory = flight.trajectory.between(begin - reach, end + reach)
     name = f"{flight.session.session_id}_strip{tile.strip:02d}"
     path = partial / (name + (".copc.laz" if wish.copc else ".laz"))
-    dropped = partial / f"{name}{DROPPED}" if wish.write_dropped else None
-    return Job(number, tile, places, trajectory, path, dropped)
+    dropped_file = partial / f"{name}{DROPPED}" if wish.write_dropped else None
+    return Job(number, tile, places, trajectory, path, dropped_file)
 
 
 def _numbers(flights: Sequence[Flight]) -> dict[str, int]:
@@ -264,7 +264,7 @@ def _note_troubles(flights: Sequence[Flight], results: Sequence[JobResult]) -> N
     note_times(flights, results)
     if not any(result.points or result.failed for result in results):
         lines = [line for flight in flights for line in (*flight.troubles, *flight.holes)]
-        lines += [line for told in unread_lines(str(flights[0].log), count_unread(results)) for line in told]
+        lines += [line for part in unread_lines(str(flights[0].log), count_unread(results)) for line in part]
         became = reasons_text(fates for result in results for fates in result.fates.values())
         refuse_nothing(flights[0].log, lines, became)
 

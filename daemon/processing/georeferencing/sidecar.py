@@ -33,8 +33,8 @@ UNCOVERED = {"outside_trajectory": "are outside the trajectory", "trajectory_gap
 def calibration_entry(calibration: Calibration) -> dict[str, Any]:
     """Return the entry of a calibration with all its parameters, in the units of its file."""
     parameters = {parameter.key: calibration.value(parameter.name) / parameter.factor for parameter in PARAMETERS}
-    said = {key: calibration.header[key] for key in CARRIED if key in calibration.header}
-    return {"id": calibration.id, "method": calibration.method, **said, "parameters": parameters}
+    carried = {key: calibration.header[key] for key in CARRIED if key in calibration.header}
+    return {"id": calibration.id, "method": calibration.method, **carried, "parameters": parameters}
 
 
 def settings_entry(setup: Setup) -> dict[str, Any]:
@@ -57,9 +57,9 @@ def count_fates(results: Sequence[JobResult]) -> dict[str, dict[str, Any]]:
     for result in results:
         for scanner, fates in result.fates.items():
             total.setdefault(scanner, Counter()).update(fates)
-    unread = count_unread(results)
+    undecoded = count_unread(results)
     return {
-        scanner: counts_entry(fates) | {"messages_not_read": dict(sorted(unread.get(scanner, {}).items()))}
+        scanner: counts_entry(fates) | {"messages_not_read": dict(sorted(undecoded.get(scanner, {}).items()))}
         for scanner, fates in sorted(total.items())
     }
 
@@ -84,8 +84,8 @@ def reasons_text(fates: Iterable[Counter[str]]) -> str:
 
 def counts_entry(fates: Counter[str]) -> dict[str, Any]:
     """Return counts of returns: read = written + dropped, the latter by reason."""
-    dropped = {name: count for name, count in sorted(fates.items()) if name != IN_FILES and count}
-    return {"read": fates.total(), "written": fates[IN_FILES], "dropped": dropped}
+    discarded = {name: count for name, count in sorted(fates.items()) if name != IN_FILES and count}
+    return {"read": fates.total(), "written": fates[IN_FILES], "dropped": discarded}
 
 
 def strip_entry(result: JobResult, file: Path | None, dropped: Path | None) -> dict[str, Any]:

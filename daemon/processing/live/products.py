@@ -211,11 +211,11 @@ class LiveProducts:
 
     def origin(self) -> dict[str, Any]:
         """Return what the coordinates of the products refer to."""
-        said: dict[str, Any] = {"crs": self._about, "axes": "east, north, up, metres"}
+        entry: dict[str, Any] = {"crs": self._about, "axes": "east, north, up, metres"}
         if self.frame is not None:
-            said["origin"] = [round(value, 4) for value in self.frame.origin.tolist()]
-            said["origin_unit_m"] = self.frame.unit_m.tolist()
-        return said
+            entry["origin"] = [round(value, 4) for value in self.frame.origin.tolist()]
+            entry["origin_unit_m"] = self.frame.unit_m.tolist()
+        return entry
 
     def save_coverage(self, latest: dict[str, Any]) -> None:
         """Replace the coverage grid's numbers and picture, each at once; do nothing if there is no room."""

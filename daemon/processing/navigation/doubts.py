@@ -45,9 +45,11 @@ def _heard(found: NavigationLog, source: str) -> str:
     size, skipped, messages = found.heard.get(source, (0, 0, Counter()))
     if not size:
         return "the log has no byte of it; check that its wire is recorded"
-    told = [f"{count:,} {name}" for name, count in messages.most_common(4)]
-    told += [f"{count:,} with {why.replace('_', ' ')}" for why, count in found.refused.get(source, Counter()).items()]
-    of_it = f" ({', '.join(told)})" if told else ""
+    received = [f"{count:,} {name}" for name, count in messages.most_common(4)]
+    received += [
+        f"{count:,} with {why.replace('_', ' ')}" for why, count in found.refused.get(source, Counter()).items()
+    ]
+    of_it = f" ({', '.join(received)})" if received else ""
     share = f", {skipped / size:.0%} of them in no known message" if skipped else ""
     return f"{size:,} bytes came{share}{of_it}; set another protocol, or let the device send other messages"
 
@@ -153,15 +155,15 @@ def height_findings(found: NavigationLog, sources: NavigationSources) -> list[Fi
     GGA and GNS give the height above the receiver's geoid and the geoid's height above the ellipsoid (NMEA 0183 v4.11).
     A separation that is 0 in every sentence is not a real one: the altitude may then be either height.
     """
-    told = [fix for fix in found.fixes if fix.message in ("GGA", "GNS") and fix.valid and fix.height_m is not None]
-    if len(told) < FEWEST_HEIGHTS or any(fix.undulation_m != 0.0 for fix in told):
+    fixes = [fix for fix in found.fixes if fix.message in ("GGA", "GNS") and fix.valid and fix.height_m is not None]
+    if len(fixes) < FEWEST_HEIGHTS or any(fix.undulation_m != 0.0 for fix in fixes):
         return []
-    fix = told[len(told) // 2]
+    fix = fixes[len(fixes) // 2]
     place = [np.nan if value is None else value for value in (fix.lat_rad, fix.lon_rad, fix.height_m)]
     known = geoid_undulation(e_from_geodetic(*place))
     size = "up to 107 m" if known is None else f"{known[0]:.1f} m ({known[1]})"
     text = (
-        f"all {len(told):,} {fix.message} of {sources.gnss_source} report a geoid separation of 0.0 m, which no "
+        f"all {len(fixes):,} {fix.message} of {sources.gnss_source} report a geoid separation of 0.0 m, which no "
         "flight has throughout: unless its altitudes are ellipsoidal already, heights are wrong by the geoid's "
         f"height, {size}; let the receiver send its geoid separation, or compare with control"
     )
@@ -182,11 +184,11 @@ def _silent_antenna(found: NavigationLog, sources: NavigationSources, log: Path)
 
 def _baseline_doubts(found: NavigationLog, sources: NavigationSources, log: Path) -> list[str]:
     """Return a line if the baseline that the receiver measured has another length than the lever arms give."""
-    told = [heading.baseline_m for heading in found.headings if heading.valid and heading.baseline_m]
+    baselines = [heading.baseline_m for heading in found.headings if heading.valid and heading.baseline_m]
     baseline = sources.setup().baseline_b
-    if not told or baseline is None:
+    if not baselines or baseline is None:
         return []
-    measured, configured = float(np.median(told)), float(np.linalg.norm(baseline))
+    measured, configured = float(np.median(baselines)), float(np.linalg.norm(baseline))
     if abs(measured - configured) <= max(0.05, 0.05 * configured):
         return []
     return [

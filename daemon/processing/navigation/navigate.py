@@ -191,12 +191,12 @@ def navigate_inputs(
             f"{inputs.log}: {inputs.sources.imu_source}: no run of samples without a gap is long enough for navigation"
         ]
         raise UserError("\n".join(why))
-    doubts = list(inputs.doubts)
+    warnings = list(inputs.doubts)
     for part, has_fixes in _unreached(legs, smooth=wish.smooth):
         if wish.smooth and has_fixes:
             missing.append(part)
-        (holes if wish.smooth and has_fixes else doubts).append(f"{inputs.log}: {part.text}")
-    navigated = Navigated(inputs, wish.smooth, legs, holes, doubts, sorted(missing, key=lambda part: part.begin_ns))
+        (holes if wish.smooth and has_fixes else warnings).append(f"{inputs.log}: {part.text}")
+    navigated = Navigated(inputs, wish.smooth, legs, holes, warnings, sorted(missing, key=lambda part: part.begin_ns))
     navigated.doubts.extend(_ins_doubts(inputs, navigated.trajectory()))
     return navigated
 

@@ -162,9 +162,9 @@ def _rows(
         horizontal, vertical = sigmas[0 if kind == Kind.POSITION else 1]
         default[fix == int(known)] = (horizontal, horizontal, vertical)
     given = np.full((n, 3), np.nan) if sigma is None else sigma
-    said = np.isfinite(given) & (given > 0.0)
+    has_sigma = np.isfinite(given) & (given > 0.0)
     rows = np.zeros(n, OBSERVATION_DTYPE)
     rows["time_ns"], rows["kind"], rows["fix_type"] = columns.time_ns, kind, fix
     rows["satellites"] = 0 if columns.satellites is None else columns.satellites
-    rows["value"], rows["sigma"] = value, np.where(said, given, default)
-    return rows, np.asarray(~said.all(axis=1))
+    rows["value"], rows["sigma"] = value, np.where(has_sigma, given, default)
+    return rows, np.asarray(~has_sigma.all(axis=1))

@@ -123,8 +123,8 @@ class NavigationSources:
         if not given:
             return ""
         chosen = "" if "grade" in table.model_fields_set else ", the default"
-        told = ", ".join(f"{key} {value:g}" for key, value in given.items())
-        return f"Noise by grade {table.grade}{chosen} (imu.{self.imu_name}.noise does not set these): {told}"
+        values = ", ".join(f"{key} {value:g}" for key, value in given.items())
+        return f"Noise by grade {table.grade}{chosen} (imu.{self.imu_name}.noise does not set these): {values}"
 
     # ------------------------------------------------------------------ reading
 
@@ -286,8 +286,8 @@ _NOISE_FIELDS = {
 
 def noise_of(table: NoiseConfig) -> ImuNoise:
     """Return the noise of ``[imu.….noise]``; values that it leaves out are its grade's."""
-    said = {key: value for key, value in table.model_dump().items() if key != "grade" and value is not None}
+    configured = {key: value for key, value in table.model_dump().items() if key != "grade" and value is not None}
     grade = GRADES[table.grade]
-    in_si = imu_noise(**(dict.fromkeys(_NOISE_FIELDS, 0.0) | said))
-    chosen = {_NOISE_FIELDS[key]: getattr(in_si, _NOISE_FIELDS[key]) for key in said}
+    in_si = imu_noise(**(dict.fromkeys(_NOISE_FIELDS, 0.0) | configured))
+    chosen = {_NOISE_FIELDS[key]: getattr(in_si, _NOISE_FIELDS[key]) for key in configured}
     return ImuNoise(**({field.name: getattr(grade, field.name) for field in fields(grade)} | chosen))

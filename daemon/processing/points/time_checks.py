@@ -57,9 +57,9 @@ def refuse_no_time(
             f"{log}: {clock}: the second of an edge is uncertain: {status.ambiguous}; record the time messages of the "
             "receiver that gives the pulse (gnss.….pps)"
         )
-    said = {f"pps/{gnss.pps}": name for name, gnss in config.gnss.items() if gnss.pps}
-    if status.state is TimeState.NO_TIME and clock.startswith("pps/") and clock not in said:
-        heard = "; ".join(f'gnss.{name}.pps is "{pps.removeprefix("pps/")}"' for pps, name in said.items())
+    by_pps = {f"pps/{gnss.pps}": name for name, gnss in config.gnss.items() if gnss.pps}
+    if status.state is TimeState.NO_TIME and clock.startswith("pps/") and clock not in by_pps:
+        heard = "; ".join(f'gnss.{name}.pps is "{pps.removeprefix("pps/")}"' for pps, name in by_pps.items())
         raise UserError(
             f"{log}: {clock}: no receiver names the second of its edges ({heard or 'no gnss.….pps is set'}); set "
             "gnss.….pps of the receiver that gives the pulse, with --config"
@@ -99,27 +99,28 @@ def time_trouble(
     lost = fates.get(NO_TIME, 0)
     if not total or lost <= MUCH * total:
         return ""
-    told = f"scanner/{scanner}: {lost:,} of {total:,} returns have no time"
+    lost_text = f"scanner/{scanner}: {lost:,} of {total:,} returns have no time"
     if refused.get("past_hour"):
         return (
-            f"{told}: its stamps contradict the host's clock by more than half a second: the head is locked to "
+            f"{lost_text}: its stamps contradict the host's clock by more than half a second: the head is locked to "
             "another second; connect the NMEA sentences and the pulse of one receiver to the head"
         )
     if trouble:
-        return f"{told}: the head {trouble}"
+        return f"{lost_text}: the head {trouble}"
     if status is not None and status.state not in GOOD_STATES:
-        return f"{told}: the host's clock is {status.state.value}; record PPS edges and time messages throughout"
+        return f"{lost_text}: the host's clock is {status.state.value}; record PPS edges and time messages throughout"
     if refused.get("spacing"):
         return (
-            f"{told}: {refused['spacing']:,} edges that it latched are not a second apart; connect the receiver's PPS"
+            f"{lost_text}: {refused['spacing']:,} edges that it latched are not a second apart; connect the "
+            "receiver's PPS"
         )
     if refused.get("stamp_jump"):
         return (
-            f"{told}: {refused['stamp_jump']:,} stamps differ by more than a second from their arrival, because its "
-            "clock was set; do not set it during a recording"
+            f"{lost_text}: {refused['stamp_jump']:,} stamps differ by more than a second from their arrival, "
+            "because its clock was set; do not set it during a recording"
         )
     found = "" if stamps is None or stamps.scale is not StampScale.FREE else f" ({stamps.text})"
     return (
-        f"{told}: its stamps run free{found}; lock the head to the PPS, let it latch the PPS, or set "
+        f"{lost_text}: its stamps run free{found}; lock the head to the PPS, let it latch the PPS, or set "
         f"scanner.{scanner}.clock if its stamps are UTC or TAI nevertheless"
     )

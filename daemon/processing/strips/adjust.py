@@ -234,11 +234,11 @@ def _notes(wish: AdjustOptions, kept: KeptFlight, features: Features, cell_m: fl
     found = signatures(
         differences(flight, StripRules(cell_m=cell_m)).checks, SeenFrom.of(flight), smoothed_prior(kept)
     ).found
-    told = dict.fromkeys(one.words for one in found if one.level in ("significant", "rough"))
+    effects = dict.fromkeys(one.words for one in found if one.level in ("significant", "rough"))
     notes += [
         "before the correction, strips differed as an error of the calibration would make them differ; correct "
         f"it with swath calibrate: {words}"
-        for words in told
+        for words in effects
     ]
     return notes
 

@@ -60,8 +60,8 @@ def write_adjustment(wish: AdjustOptions, done: StripsCorrected, tell: Callable[
         if made and wish.output.is_dir() and not any(wish.output.iterdir()):
             wish.output.rmdir()
         raise UserError(f"{error.filename or wish.output}: {error.strerror or error}", ExitCode.IO) from error
-    told = [str(path) for _, path in written]
-    return Told(record | {"files": told}, [*first_lines(record["verdict"]), *_lines(done), *told])
+    paths = [str(path) for _, path in written]
+    return Told(record | {"files": paths}, [*first_lines(record["verdict"]), *_lines(done), *paths])
 
 
 def _as_given(flight: LoggedFlight, trajectory: Trajectory) -> Trajectory:
@@ -203,8 +203,8 @@ def _row(strip: _Strip) -> str:
     factors = np.array([100.0] * 3 + [1e3 * 180.0 / np.pi] * 3)
     means, sigmas = factors * strip.corrections.mean(axis=0), factors * strip.sigmas.mean(axis=0)
     columns = [
-        f"{mean:+.1f} ± {sigma:.1f}" if told else "undetermined"
-        for mean, sigma, told in zip(means, sigmas, strip.told, strict=True)
+        f"{mean:+.1f} ± {sigma:.1f}" if determined else "undetermined"
+        for mean, sigma, determined in zip(means, sigmas, strip.told, strict=True)
     ]
     if strip.choice.model == UNCORRECTED:
         columns = ["–"] * len(columns)

@@ -212,8 +212,8 @@ class Judgement:
         lines += self.signatures.lines if self.signatures else []
         lines += self.agreement.verdicts()
         if before is not None and (was := before.agreement.numbers) and (now := self.agreement.numbers):
-            told = [f"RMSDz {100 * one['rms_m']:.1f} cm, largest {100 * one['max_m']:.1f} cm" for one in (was, now)]
-            lines.append(f"before: {told[0]}; now: {told[1]}")
+            figures = [f"RMSDz {100 * one['rms_m']:.1f} cm, largest {100 * one['max_m']:.1f} cm" for one in (was, now)]
+            lines.append(f"before: {figures[0]}; now: {figures[1]}")
         return lines + self.strips.notes
 
 
@@ -249,8 +249,8 @@ def _line(name: str, heights: dict[str, Any] | None, to_plane: PairReport | None
     """Return a row of the table, centimetres: first heights, then distances of returns from planes."""
     values = ["–"] * 5
     if heights is not None:
-        told = (heights["mean_m"], heights["rms_m"], heights["p95_m"], heights["max_m"])
-        values = [f"{heights['cells']:,}", *(f"{100.0 * value:.1f}" for value in told)]
+        gridded = (heights["mean_m"], heights["rms_m"], heights["p95_m"], heights["max_m"])
+        values = [f"{heights['cells']:,}", *(f"{100.0 * value:.1f}" for value in gridded)]
     if to_plane is None or not to_plane.distance.count:
         return _row(name, *values, "–", "–", "–")
     distance = to_plane.distance

@@ -217,8 +217,8 @@ def _middle_ns(seen: SeenFrom) -> int | None:
 def _times_apart(strips: Gathered, seen: SeenFrom) -> list[str]:
     """Return a line if most returns have times outside their strips' trajectories."""
     outside = 0
-    for number, flown in enumerate(seen.flown):
-        begin, end = seen.trajectories[flown].span
+    for number, trajectory_number in enumerate(seen.flown):
+        begin, end = seen.trajectories[trajectory_number].span
         times = strips.time_ns[strips.strip == number]
         outside += int(((times < begin) | (times > end)).sum())
     if 2 * outside <= len(strips.time_ns):
@@ -252,10 +252,10 @@ def _seen_from(look: Look) -> tuple[SeenFrom | None, Callable[[FloatArray], Floa
     def place(points: FloatArray) -> FloatArray:
         return frame.t_from_e(mapping.e_from_map(points / unit_m)) if len(points) else points
 
-    flown = [_flown(look, number, trajectories, of_session) for number in range(len(look.names))]
+    trajectory_numbers = [_flown(look, number, trajectories, of_session) for number in range(len(look.names))]
     # the files' scan directions refer to the body's right and left, whatever the mounting
     mounted = [np.eye(3)] * len(look.names)
-    return SeenFrom(frame, trajectories, flown, [1.0] * len(look.names), mounted), place
+    return SeenFrom(frame, trajectories, trajectory_numbers, [1.0] * len(look.names), mounted), place
 
 
 def _mapping_of(crs: dict[str, Any]) -> Mapping:

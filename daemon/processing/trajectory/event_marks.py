@@ -79,10 +79,10 @@ def _line(mark: Mark, row: FloatArray | None, fate: str) -> str:
         values = row[:12].copy()
         along_m = row[12:15] * (sigma_s or 0.0)
         values[6:9] = np.hypot(values[6:9], along_m)
-        told = (
+        words = (
             f"{value:.{digits}f}" if np.isfinite(value) else "" for value, digits in zip(values, NUMBERS, strict=True)
         )
-        pose = ",".join(told)
+        pose = ",".join(words)
     fields = (
         mark.source,
         event.channel,

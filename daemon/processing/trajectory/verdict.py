@@ -421,7 +421,7 @@ def _sentence(level: Level, figures: Figures, reasons: list[Reason]) -> str:
     word = level.words[0].upper() + level.words[1:]
     if level is Level.GOOD:
         return f"{word}: {accuracy_words(figures)}."
-    told = [reason.what for reason in reasons if reason.level is level]
+    problems = [reason.what for reason in reasons if reason.level is level]
     more = len(reasons) - 1
     tail = f"; {more} more {'reason' if more == 1 else 'reasons'}" if more else ""
-    return f"{word}: {told[0]}{tail}."
+    return f"{word}: {problems[0]}{tail}."

@@ -81,10 +81,10 @@ def record_files(
         validation: the result; methods that could not be applied are not listed.
         logs: name and SHA-256 of the logs that it was validated against.
     """
-    told = told_of(validation, logs, dt.datetime.now(dt.UTC))
+    values = told_of(validation, logs, dt.datetime.now(dt.UTC))
     files: dict[Path, bytes] = {}
     for scanner, document in documents.items():
-        validated = with_told(document, told)
+        validated = with_told(document, values)
         files[folder / f"{scanner}.record.xml"] = document_xml(validated).encode()
         files[folder / f"{scanner}.record.json"] = document_json(validated).encode()
     return files
@@ -94,7 +94,7 @@ def told_of(validation: Validation, logs: Sequence[tuple[str, str]], now: dt.dat
     """Return values and notes by ``CLASS.attribute``: methods with results, time, logs and number of check points."""
     applied = [method for method in validation.methods if method.passed is not None]
     against = ", ".join(f"{name} (SHA-256 {sha256})" for name, sha256 in logs)
-    told: dict[str, tuple[Plain, str]] = {
+    values: dict[str, tuple[Plain, str]] = {
         "CA_GeometryValidation.validationMethod": (
             ", ".join(method.name for method in applied),
             ". ".join([validation.sentence, *(method.sentence for method in applied), *validation.dependent]),
@@ -107,5 +107,5 @@ def told_of(validation: Validation, logs: Sequence[tuple[str, str]], now: dt.dat
     for method in applied:
         if method.name == "testfield":
             note = "points given to the validation; the user must make sure that the calibration did not use them"
-            told["CA_TestRange.numberCheckPoints"] = (int(method.more["points"]), note)
-    return told
+            values["CA_TestRange.numberCheckPoints"] = (int(method.more["points"]), note)
+    return values

@@ -193,10 +193,14 @@ def _refuse_others(wish: ValidationOptions, found: _Found, kept: KeptFlight) -> 
                 f"{log}: has no scanner {name}, to which calibration {calibration.id} belongs; it has "
                 f"{sorted(scanners)}"
             )
-        made, flown = calibration.header.get("installation", ""), kept.logged[0].setup.config.profile.installation
-        if made and flown and made != flown:
+        made, installation = (
+            calibration.header.get("installation", ""),
+            kept.logged[0].setup.config.profile.installation,
+        )
+        if made and installation and made != installation:
             found.notes.append(
-                f'{log}: was recorded with installation "{flown}", but calibration {calibration.id} belongs to "{made}"'
+                f'{log}: was recorded with installation "{installation}", but calibration {calibration.id} '
+                f'belongs to "{made}"'
             )
     if len({(swath.flown, swath.strip) for swath in kept.flight.swaths}) < 2:
         raise UserError(f"{log}: has one strip only; a validation needs at least two strips that overlap")

@@ -184,13 +184,13 @@ def _check_position(columns: TrajectoryColumns, name: str) -> None:
     beyond: NDArray[np.bool_] = np.abs(columns.lat_rad) > np.pi / 2
     if beyond.any():
         value = columns.lat_rad[int(np.argmax(beyond))]
-        said = value if columns.angles_in == "radians" else np.degrees(value)
+        shown = value if columns.angles_in == "radians" else np.degrees(value)
         hint = f"{columns.angles_in} north are expected"
-        if columns.angles_in == "radians" and abs(said) <= 90.0:
+        if columns.angles_in == "radians" and abs(shown) <= 90.0:
             hint += "; these look like degrees"
         elif (np.abs(columns.lon_rad) <= np.pi / 2).all():
             hint += "; latitude and longitude may be swapped"
-        raise TrajectoryError(f"{name}: latitude {said:.6g} at {columns.at(beyond)}: {hint}")
+        raise TrajectoryError(f"{name}: latitude {shown:.6g} at {columns.at(beyond)}: {hint}")
     around: NDArray[np.bool_] = np.abs(columns.lon_rad) > 2 * np.pi
     if around.any():
         raise TrajectoryError(f"{name}: longitude at {columns.at(around)} exceeds a full turn")
@@ -208,10 +208,10 @@ def _check_attitude(columns: TrajectoryColumns, name: str) -> None:
         beyond: NDArray[np.bool_] = np.abs(angle) > limit + 1e-6
         if beyond.any():
             value = angle[int(np.argmax(beyond))]
-            said = value if columns.angles_in == "radians" else np.degrees(value)
+            shown = value if columns.angles_in == "radians" else np.degrees(value)
             hint = "; these look like degrees" if columns.angles_in == "radians" else ""
             where = columns.at(beyond)
-            raise TrajectoryError(f"{name}: {what} {said:.6g} at {where}: {columns.angles_in} are expected{hint}")
+            raise TrajectoryError(f"{name}: {what} {shown:.6g} at {where}: {columns.angles_in} are expected{hint}")
 
 
 def _check_time(columns: TrajectoryColumns, name: str) -> None:
@@ -237,16 +237,18 @@ def _check_course(columns: TrajectoryColumns, name: str) -> None:
         raise TrajectoryError(
             f"{name}: its positions move at {np.median(speed):.0f} m/s; check the units of latitude, longitude and time"
         )
-    said = mean_over(columns.time_ns, columns.velocity_l, pieces)
-    fast = (np.hypot(*moved[:, :2].T) > COURSE_FROM_MPS) & (np.hypot(*said[:, :2].T) > COURSE_FROM_MPS)
-    error = _course_error(moved, said)
+    stated = mean_over(columns.time_ns, columns.velocity_l, pieces)
+    fast = (np.hypot(*moved[:, :2].T) > COURSE_FROM_MPS) & (np.hypot(*stated[:, :2].T) > COURSE_FROM_MPS)
+    error = _course_error(moved, stated)
     off = fast & (np.abs(error) > GREATEST_COURSE_ERROR_RAD)
     if off.sum() > COURSE_OUTLIERS * fast.sum():
         at = pieces[int(np.argmax(off)), 0]
         swapped = moved_l(columns.time_ns, columns.lon_rad, columns.lat_rad, columns.height_m, pieces)
         hint = "the velocities are not north, east, down, or the wander angle has another sign"
-        mirrored = said * np.array([1.0, -1.0, 1.0])  # the axes of an SBET may have been misjudged from such positions
-        fits = [np.median(np.abs(_course_error(swapped, velocity))[fast]) for velocity in (said, mirrored)]
+        mirrored = stated * np.array(
+            [1.0, -1.0, 1.0]
+        )  # the axes of an SBET may have been misjudged from such positions
+        fits = [np.median(np.abs(_course_error(swapped, velocity))[fast]) for velocity in (stated, mirrored)]
         if min(fits) < GREATEST_COURSE_ERROR_RAD:
             hint = "latitude and longitude are swapped"
         degrees = np.degrees(np.median(np.abs(error[off])))

@@ -133,12 +133,12 @@ def _speed_off(speed: StructArray, place: StructArray) -> float | None:
     middle_ns = first["time_ns"][:-1] + np.diff(first["time_ns"]) // 2
     since_s = (speed["time_ns"] - speed["time_ns"][0]) / SECOND_NS
     at_s = (middle_ns - speed["time_ns"][0]) / SECOND_NS
-    said = np.interp(at_s, since_s, np.linalg.norm(speed["value"], axis=1))
+    speeds = np.interp(at_s, since_s, np.linalg.norm(speed["value"], axis=1))
     used = (step_s < 2.5) & (at_s > since_s[0]) & (at_s < since_s[-1])
     if used.sum() < 10:
         return None
     noise = 2.0 * (first["sigma"].max(axis=1)[1:] / np.maximum(step_s, 0.5) + np.median(speed["sigma"].max(axis=1)))
-    off = np.abs(moved - said)[used]
+    off = np.abs(moved - speeds)[used]
     typical = float(np.percentile(off, 75))
     return typical if typical > SPEED_OFF_MPS + float(np.median(noise[used])) else None
 

@@ -213,8 +213,10 @@ def _rows(predicted: Predicted) -> list[dict[str, Any]]:
         parameter = by_name[short][1]
         wanted = USEFUL[parameter.key]
         useful = held is None and sigma <= wanted * parameter.factor
-        told, need = (f"{value:.3g} {parameter.key.rpartition('_')[2]}" for value in (sigma / parameter.factor, wanted))
-        poor = f"would be known to {told}; {need} or better is useful"
+        predicted_words, need = (
+            f"{value:.3g} {parameter.key.rpartition('_')[2]}" for value in (sigma / parameter.factor, wanted)
+        )
+        poor = f"would be known to {predicted_words}; {need} or better is useful"
         rows.append(
             {
                 "scanner": scanner,

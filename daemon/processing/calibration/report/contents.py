@@ -152,8 +152,8 @@ def _observed(report: ReportInput) -> Words:
         kinds[plane.kind or "other"] = kinds.get(plane.kind or "other", 0) + 1
     patches = sum(len(plane.patches) for plane in features.planes)
     points = sum(plane.points for plane in features.planes)
-    told = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items(), key=lambda item: -item[1]))
-    words = f"{len(features.planes)} planes ({told}) in {patches} patches of {thousands(points)} returns"
+    counts = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items(), key=lambda item: -item[1]))
+    words = f"{len(features.planes)} planes ({counts}) in {patches} patches of {thousands(points)} returns"
     return Words(words + (f"; {len(features.ties)} tie points." if features.ties else "."))
 
 
@@ -170,8 +170,8 @@ def _outliers(report: ReportInput) -> list[Block]:
         return [Words("No observation was rejected.", "Outliers")]
     rejected = sum(group.rejected for group in report.adjusted.groups)
     every = max(sum(group.observations for group in report.adjusted.groups), 1)
-    told = f"{thousands(rejected)} of {thousands(every)} observations were rejected."
-    return [Words(told, "Outliers"), *tables]
+    text = f"{thousands(rejected)} of {thousands(every)} observations were rejected."
+    return [Words(text, "Outliers"), *tables]
 
 
 MODEL = (
@@ -210,16 +210,16 @@ def _method(report: ReportInput) -> list[Block]:
             "; with so many observations the test detects differences that do not matter, so judge by the factor itself"
         )
     )
-    told = (
+    text = (
         f"{len(adjusted.names)} unknowns, redundancy {thousands(adjusted.redundancy)}. The adjustment {ended} after "
         f"{adjusted.iterations} iterations; matches were searched again {adjusted.matchings} "
         f"{'time' if adjusted.matchings == 1 else 'times'}. Variance factor {number(adjusted.variance_factor, '.3f')} "
         f"(global test: p = {number(adjusted.global_test, '.2g')}{test}).{weakest}"
     )
     if adjusted.scaled:
-        told += " The global test failed: all sigmas are multiplied by the square root of the variance factor."
+        text += " The global test failed: all sigmas are multiplied by the square root of the variance factor."
     stochastic = NO_TRAJECTORY if adjusted.trajectory is None else STOCHASTIC
-    return [Words(MODEL, "How it was computed"), Words(stochastic), Words(told)]
+    return [Words(MODEL, "How it was computed"), Words(stochastic), Words(text)]
 
 
 def _run(report: ReportInput) -> Table | None:

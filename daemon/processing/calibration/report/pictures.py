@@ -92,9 +92,9 @@ def _cells(axes: Axes, matrix: FloatArray, cell_in: float) -> None:
         face = "#e4e7e2" if own else colours(norm(float(value)))
         axes.add_patch(Rectangle((column + 0.03, row + 0.03), 0.94, 0.94, fc=face, ec="none"))
         if size >= 3.4:
-            told = "1" if own else number(float(value), ".2f").replace("0.", ".", 1)
+            text = "1" if own else number(float(value), ".2f").replace("0.", ".", 1)
             ink = MUTED if own else "white" if abs(value) > 0.75 else INK
-            axes.text(column + 0.5, row + 0.52, told, fontsize=size, color=ink, ha="center", va="center")
+            axes.text(column + 0.5, row + 0.52, text, fontsize=size, color=ink, ha="center", va="center")
 
 
 def strips_picture(report: ReportInput) -> Picture | None:
@@ -176,7 +176,7 @@ def trajectory_pictures(report: ReportInput) -> list[Picture]:
     if fit is None:
         return []
     sessions = np.unique(fit.flown)
-    return [_trajectory_picture(fit, int(flown), several=len(sessions) > 1) for flown in sessions]
+    return [_trajectory_picture(fit, int(number), several=len(sessions) > 1) for number in sessions]
 
 
 TURNS = ("Turn about north (0.001°)", "Turn about east (0.001°)", "Turn about down (0.001°)")

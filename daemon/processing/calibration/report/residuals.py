@@ -67,11 +67,11 @@ def residual_picture(report: ReportInput) -> Picture | None:
 
     def draw(canvas: Canvas) -> None:
         panels = Panels(canvas, titles, PANEL_IN, 0.25)
-        flown = np.unique(seen.swath)
-        _columns(panels.axes[0], np.searchsorted(flown, seen.swath), seen, half_cm, np.arange(len(flown) + 1) - 0.5)
-        words = [names[index] for index in flown.tolist()]
+        swaths = np.unique(seen.swath)
+        _columns(panels.axes[0], np.searchsorted(swaths, seen.swath), seen, half_cm, np.arange(len(swaths) + 1) - 0.5)
+        words = [names[index] for index in swaths.tolist()]
         long = max(len(word) for word in words) * len(words) > (44 if not canvas.form.narrow else 34)
-        panels.axes[0].set_xticks(np.arange(len(flown)), words, rotation=90 if long else 0, fontsize=7.5)
+        panels.axes[0].set_xticks(np.arange(len(swaths)), words, rotation=90 if long else 0, fontsize=7.5)
         for axes, values in zip(panels.axes[1:], (seen.angle_deg, seen.range_m, seen.intensity), strict=True):
             low, high = np.percentile(values, [0.2, 99.8])
             _columns(axes, values, seen, half_cm, np.linspace(low, max(high, low + 1e-6), columns + 1))
