@@ -238,7 +238,7 @@ def test_another_point_than_said_is_named(log: Log) -> None:
     assert log.judged(of_antenna, "antenna").refused == []
     assert "use --trajectory-at body" in log.refused(sure, "antenna")
     mirrored = sure.at_body([-0.8, 0.5, 2.4])
-    assert "lever arm has another sign" in log.refused(mirrored)
+    assert "lever arm has the opposite sign" in log.refused(mirrored)
 
 
 def test_an_antenna_whose_place_nobody_said_is_no_reason_to_refuse(log: Log) -> None:

@@ -232,7 +232,7 @@ def test_mistakes_are_one_line_and_leave_nothing(
         assert found == code, line
         assert words in line
         assert not output.exists()
-    assert "no plane is seen by two strips" in refused(capsys, [*full, *spans(tmp_path, *beginnings)])[1]
+    assert "no two strips see a common plane" in refused(capsys, [*full, *spans(tmp_path, *beginnings)])[1]
     assert not output.exists()
 
 
