@@ -240,7 +240,7 @@ def test_what_is_held_keeps_the_start_and_what_is_estimated_begins_elsewhere() -
             "parameters of right: this flight has no such scanner; its scanners are ",
         ),
         (ParameterOptions(priors={"fie_rad": 0.1}), "prior fie_rad"),
-        (ParameterOptions(ibrc_knots=(5.0, 5.0)), "rising intensities"),
+        (ParameterOptions(ibrc_knots=(5.0, 5.0)), "increasing intensities"),
         (ParameterOptions(beams=frozenset(["roll_rad"])), "beams: got 'roll_rad'"),
     ],
 )

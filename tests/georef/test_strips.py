@@ -127,7 +127,7 @@ def test_times_of_strips_are_read() -> None:
         ("start_gps_ns,end_gps_ns\n5,5\n", "line 2: the strip ends"),
         ("start_gps_ns,end_gps_ns\n1,5\n4,8\n", "overlaps"),
         ("start_gps_ns,end_gps_ns\n", "has no strips"),
-        ("", "no column"),
+        ("", "column start_gps_ns is missing"),
     ],
 )
 def test_wrong_times_of_strips_are_refused_by_line(text: str, message: str) -> None:

@@ -234,7 +234,7 @@ def test_what_cannot_be_told_apart_is_said_with_its_remedy() -> None:
     assert one.why.startswith("this flight cannot separate it from left.phi_rad (correlation -1.000)")
     assert "second height, at least 1.7 times" in one.remedy
     angle = held_of("two heights", True, "scan_angle_offset_rad")["scan_angle_offset_rad"]
-    assert "one and the same" in angle.remedy
+    assert "the same rotation" in angle.remedy
     assert angle.with_others[0][0] == "left.omega_rad"
     assert angle.with_others[0][1] == pytest.approx(-1.0, abs=1e-6)
 

@@ -212,12 +212,12 @@ def test_mistakes_of_header_and_parameters(old: str, new: str, wrong: str) -> No
         (
             "[sigma]\nomega_deg = 1\nphi_deg = 1\n[correlation]\nnames = ['omega_deg', 'phi_deg']\n"
             "matrix = [[1, 0.5], [0.4, 1]]",
-            "correlation.matrix: want 2 × 2 numbers: symmetric",
+            "correlation.matrix: must be 2 × 2 numbers: symmetric",
         ),
         (
             "[sigma]\nomega_deg = 1\nphi_deg = 1\n[correlation]\nnames = ['omega_deg', 'phi_deg']\n"
             "matrix = [[1, 1.5], [1.5, 1]]",
-            "correlation.matrix: want 2 × 2 numbers: symmetric",
+            "correlation.matrix: must be 2 × 2 numbers: symmetric",
         ),
         ("[ibrc]\nintensity = [1, 2]\ncorrection_m = [1]", "ibrc: needs intensity and correction_m"),
         ("[ibrc]\nintensity = [1, 1]\ncorrection_m = [1, 2]", "ibrc.intensity: values must increase"),

@@ -482,7 +482,7 @@ MISTAKES = {
     ),
     "line[2].to_m": (
         line_changed(2, to_m=[1460.0, -200.0]),
-        "a line of 40.0 m; make it at least 60 m long, one second",
+        "a line of 40.0 m; make it at least 60 m long, one second of flight",
     ),
     "line[1].height_m": (
         line_changed(1, height_m=460.0),
@@ -535,7 +535,7 @@ def test_a_line_below_a_hill_says_where() -> None:
         return np.asarray(TERRAIN_M + 500.0 * np.exp(-((east_m - 600.0) ** 2 + (north_m + 200.0) ** 2) / 200.0**2))
 
     below = r"^line\[0\]\.height_m: 900 m is 50\.0 m below the terrain 2100 m from its start \(east 600, north -200\);"
-    with pytest.raises(PlanError, match=below + " want at least 965 m$"):
+    with pytest.raises(PlanError, match=below + " plan at least 965 m$"):
         fly(plan, Site.at(*plan.tables.flight.origin_deg), hill)
 
 
