@@ -247,7 +247,7 @@ def test_a_configured_hour_needs_neither_receiver_nor_position_packets(tmp_path:
     error, _ = errors_ns(clocks, HOURS, -1)
     assert max(map(abs, error)) < 1_000
     (line, _) = stamp_lines(clocks)
-    assert "by the head's own stamps, as configured, and the hour by the recording computer's clock" in line
+    assert "from the head's own stamps, as configured, and the hour by the recording computer's clock" in line
     assert "sentences" not in line
 
 
@@ -304,7 +304,7 @@ def test_a_head_that_says_nothing_and_no_receiver_is_refused_with_what_would_do(
     setup, clocks = found(tmp_path, VLP16, velodyne())
     plan = clocks.host.plan.devices["scanner/top"]
     status = clocks.host.status(plan.clock, START_UNIX_NS + 20 * NS)
-    with pytest.raises(UserError, match=r"no source of time .*position packets .*scanner\.top\.clock"):
+    with pytest.raises(UserError, match=r"has no source of time; .*position packets .*scanner\.top\.clock"):
         refuse_no_time(tmp_path, plan.clock, status, setup.config)
 
 

@@ -84,7 +84,7 @@ def test_times_that_contradict_their_header_are_told(tmp_path: Path) -> None:
     assert "its header says seconds of the GPS week, but its times, from 465,7" in unset.doubt
     small = tile(tmp_path, "small.laz", 345_600.0, adjusted=True)
     assert small.kind is TimeKind.ADJUSTED
-    assert "are of 2011-09-18; if they are seconds of the GPS week, clear bit 0" in small.doubt
+    assert "belong to 2011-09-18; if they are seconds of the GPS week, clear bit 0" in small.doubt
     assert time_notes([unset, small]) == [unset.doubt, small.doubt]
 
 
@@ -100,7 +100,7 @@ def test_times_that_contradict_their_header_are_told(tmp_path: Path) -> None:
             1_490_858_318.0,
             "then belong to 2058-12-11, in the future; they look like seconds since 1970: subtract 1,315,964,800",
         ),
-        (3_900_000_000.0, "are of 2135-"),
+        (3_900_000_000.0, "belong to 2135-"),
     ],
 )
 def test_times_of_the_future_are_told_with_what_they_look_like(

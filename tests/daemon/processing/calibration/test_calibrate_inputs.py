@@ -67,7 +67,7 @@ def test_polygons() -> None:
         ("WKT,id\n", "line 1: column name is missing"),
         ("WKT,name\n", "has no polygons"),
         ('WKT,name\n"POINT (1 2)",a\n', "line 2: WKT: got 'POINT (1 2)'"),
-        ('WKT,name\n"POLYGON ((0 0, 1 0))",a\n', "got 2 corners"),
+        ('WKT,name\n"POLYGON ((0 0, 1 0))",a\n', "has 2 corners"),
         ('WKT,name\n"POLYGON ((0 0, 1 nan, 2 2))",a\n', "the corner is '1 nan'"),
         ('WKT,name\n"POLYGON ((0 0, 1, 2 2))",a\n', "the corner is '1'"),
         ('WKT,name\n"POLYGON ((0 0, 1 0, 1 1), (0 0, 1 0, 1 1))",a\n', "without holes"),

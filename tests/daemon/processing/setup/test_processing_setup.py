@@ -171,7 +171,7 @@ def test_a_calibration_that_is_none_of_this_flights_is_refused(tmp_path: Path, h
 @pytest.mark.parametrize(
     ("changes", "options", "said"),
     [
-        ({}, {"scanners": ("front",)}, "scanner front: is not in the configuration; there are: left, top"),
+        ({}, {"scanners": ("front",)}, "scanner front: is not in the configuration, which has: left, top"),
         ({}, {"crs": "EPSG:99999"}, "EPSG:99999"),
         (
             {"angles_deg = [0, 0, 0]": 'source = "imu/main", angles_deg = [0, 0, 0]'},

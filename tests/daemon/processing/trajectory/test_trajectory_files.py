@@ -125,7 +125,7 @@ class TestNames:
         files = TrajectoryFiles.of_output(tmp_path / "f1.sbet", "x", csv=False)
         files.refuse_existing(tmp_path / "events.csv")
         (tmp_path / "events.csv").touch()
-        with pytest.raises(UserError, match=r"events\.csv: is there already; .* --overwrite"):
+        with pytest.raises(UserError, match=r"events\.csv: already exists; .* --overwrite"):
             files.refuse_existing(tmp_path / "events.csv")
 
 
