@@ -44,8 +44,8 @@ AS_USUAL = Settings()
 STABLE = 0.1  # sigmas; a parameter that new correspondences move by less is stable
 CONTRADICTED = 4.0  # sigmas; a flight that disagrees by more with a held value contradicts it
 _NO_PRIOR = (
-    "the trajectory's errors were taken as independent from return to return: sigmas are too small, perhaps by a "
-    "factor of 5 to 10; want a trajectory with sigmas and its errors estimated along"
+    "the adjustment took the trajectory's errors as independent from return to return, so the sigmas are too small, "
+    "perhaps by a factor of 5 to 10; use a trajectory with sigmas and estimate its errors too"
 )
 
 
@@ -85,7 +85,7 @@ def adjust(
         ParameterError: the wish cannot be met; NormalError: nothing can be solved.
     """
     if not features.planes and not features.ties:
-        raise NormalError("no planes and no tie points: nothing to adjust; want strips that overlap over roofs")
+        raise NormalError("the flight has neither planes nor tie points to adjust; use strips that overlap over roofs")
     asked, placed_with = unknowns(flight, wish, start, first, doubted), None
     found: Solved | None = None
     for matching in range(1, settings.matchings + 1):
@@ -144,8 +144,8 @@ def _of_noise(told: Flight, found: Flight) -> tuple[str, ...]:
         share = sum(astuple(own.noise)) / sum(astuple(head.noise))  # all noise terms share one scale, and some may be 0
         if share < 1.0:
             lines.append(
-                f"returns of {head.name} scatter {share:.2f} times what range_sigma_m, angle_sigma_deg and "
-                "divergence_mrad let expect, and were weighed by that"
+                f"returns of {head.name} scatter {share:.2f} times the value that range_sigma_m, angle_sigma_deg and "
+                "divergence_mrad predict; the adjustment weights them by the larger value"
             )
     return tuple(lines)
 
@@ -214,7 +214,7 @@ def considered_of(asked: Unknowns, effects: HeldEffects, factor: float) -> tuple
     likely = np.array([PARAMETERS[item.kind].plausible for item in asked.considered], dtype=np.float64)
     information, own = effects.information, np.diag(effects.information)
     seen = own * likely**2 > 1e-2  # otherwise rounding dominates: sigma ≥ 10 × plausible
-    told = np.where(seen, effects.score / np.where(seen, own, 1.0), np.nan)
+    in_sigmas = np.where(seen, effects.score / np.where(seen, own, 1.0), np.nan)
     wrong = np.zeros(len(sigmas), np.bool_)
     words = {(one.scanner, one.name) for one in asked.held if not one.remedy}
     at_word = np.array([tuple(item.name.split(".", 1)) in words for item in asked.considered], np.bool_)
@@ -223,16 +223,18 @@ def considered_of(asked: Unknowns, effects: HeldEffects, factor: float) -> tuple
         spread = np.diag(factor * information + (information * sigmas**2) @ information)
         spread = spread / np.where(seen, own, 1.0) ** 2 - np.where(seen & at_word, sigmas, 0.0) ** 2
         spread = np.sqrt(np.maximum(spread, 0.0))
-        beyond = np.where(seen & ~wrong, np.abs(told) / np.where(seen & (spread > 0.0), spread, 1.0), 0.0)
+        beyond = np.where(seen & ~wrong, np.abs(in_sigmas) / np.where(seen & (spread > 0.0), spread, 1.0), 0.0)
         worst = int(np.argmax(beyond)) if len(beyond) else -1
         if worst < 0 or beyond[worst] <= CONTRADICTED:
             break
-        wrong[worst], sigmas[worst] = True, max(abs(float(told[worst])), float(sigmas[worst]))
+        wrong[worst], sigmas[worst] = True, max(abs(float(in_sigmas[worst])), float(sigmas[worst]))
     found = []
     for at, item in enumerate(asked.considered):
         scanner, _, name = item.name.partition(".")
         told_sigma = float(spread[at]) if seen[at] else np.inf
-        one = Considered(scanner, name, item.start, float(sigmas[at]), float(told[at]), told_sigma, bool(wrong[at]))
+        one = Considered(
+            scanner, name, item.start, float(sigmas[at]), float(in_sigmas[at]), told_sigma, bool(wrong[at])
+        )
         found.append(one)
     return tuple(found)
 

@@ -98,7 +98,7 @@ def _encodable(text: str) -> str:
         text.encode()
     except UnicodeEncodeError as error:
         line = text[text.rfind("\n", 0, error.start) + 1 : text.find("\n", error.start)]
-        raise CalibrationFileError(f"{line!r} is no text that UTF-8 can hold") from error
+        raise CalibrationFileError(f"{line!r} cannot be encoded as UTF-8") from error
     return text
 
 
@@ -188,7 +188,7 @@ def in_unit(value: float, factor: float, back: Callable[[float], float] | None =
         CalibrationFileError: the value is not finite.
     """
     if not math.isfinite(value):
-        raise CalibrationFileError(f"a calibration holds {value!r}; want finite numbers")
+        raise CalibrationFileError(f"a calibration contains {value!r}; every number must be finite")
     if value == 0.0:
         return 0.0
 
@@ -207,7 +207,7 @@ def _number(value: float) -> float:
         CalibrationFileError: the value is not finite.
     """
     if not math.isfinite(value):
-        raise CalibrationFileError(f"a calibration holds {value!r}; want finite numbers")
+        raise CalibrationFileError(f"a calibration contains {value!r}; every number must be finite")
     return int(value) if float(value).is_integer() and abs(value) < 1e15 else float(value)
 
 
@@ -225,7 +225,7 @@ def _optional(value: float | None) -> float | None:
 
 def _utc(value: dt.datetime) -> dt.datetime:
     if value.utcoffset() is None:
-        raise CalibrationFileError(f"created: {value.isoformat()} has no time zone; want UTC")
+        raise CalibrationFileError(f"created: {value.isoformat()} has no time zone; give it in UTC")
     return value.astimezone(dt.UTC)
 
 

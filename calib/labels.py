@@ -132,8 +132,8 @@ def sized(name: str, value: float, *, sign: bool = False) -> str:
     """Format a sigma or a difference (SI) of an unknown, as ``left.omega_rad``, in the unit of reports."""
     one = unknown(name)
     if one.unit == "m":
-        told = length(value)
-        return f"+{told}" if sign and value > 0.0 else told
+        words = length(value)
+        return f"+{words}" if sign and value > 0.0 else words
     size = value * one.factor
     digits = decimals_of(abs(size))
     return number(size, f"{'+' if sign else ''}.{digits}f") + ("°" if one.unit == "°" else SPACE + one.unit)

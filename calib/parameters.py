@@ -328,14 +328,14 @@ def _word(head: Head, name: str, wish: ParameterOptions) -> str | None:
     asked = _asked(head, name, wish)
     if name in head.geometry.without:
         if asked in ("free", "prior"):
-            raise ParameterError(f"{head.name}.{name}: cannot be freed: this scanner has no such parameter")
-        return "such a scanner has no such parameter"
+            raise ParameterError(f"{head.name}.{name}: cannot be estimated, because this scanner has no such parameter")
+        return "this kind of scanner has no such parameter"
     if asked == "fix":
-        return "held at your word"
+        return "held by your choice"
     if asked:
         return None
     if name == _BY_CONVENTION:
-        return "held by convention: it cannot be told apart from the boresight; free it by name to estimate it"
+        return "held by convention, because it cannot be separated from the boresight; free it by name to estimate it"
     return None if name in MODELS[wish.model] else "not in the model"
 
 
@@ -348,9 +348,9 @@ def _plausible(head: Head, base: Calibration, name: str, wish: ParameterOptions)
     """
     if name in head.geometry.without:
         return 0.0
-    said = wish.priors.get(f"{head.name}.{name}", wish.priors.get(name))
-    if said is not None:
-        return said
+    prior = wish.priors.get(f"{head.name}.{name}", wish.priors.get(name))
+    if prior is not None:
+        return prior
     if name == _BY_CONVENTION:
         return 0.0
     stated = 0.0 if base.method == "nominal" else float(base.all_sigmas[INDEX[name]])
@@ -433,7 +433,9 @@ def check_scanners(scanners: Sequence[str], wish: ParameterOptions) -> None:
     for name in sorted({*wish.fix, *wish.free, *wish.priors}):
         scanner, dot, _ = name.partition(".")
         if dot and scanner not in scanners and not name.startswith(EXTRA):
-            raise ParameterError(f"parameters of {scanner}: no such scanner in this flight, but {', '.join(scanners)}")
+            raise ParameterError(
+                f"parameters of {scanner}: this flight has no such scanner; its scanners are {', '.join(scanners)}"
+            )
 
 
 def check_wish(flight: Flight, wish: ParameterOptions) -> None:
@@ -448,15 +450,17 @@ def check_wish(flight: Flight, wish: ParameterOptions) -> None:
     check_scanners(heads, wish)
     known = set(INDEX) | {f"{head}.{name}" for head in heads for name in INDEX}
     for name in sorted({*wish.fix, *wish.free} - known):
-        raise ParameterError(f"{name}: is no parameter; want one of {', '.join(INDEX)}, or with {heads[0]}. before it")
+        raise ParameterError(
+            f"{name}: unknown parameter; use one of {', '.join(INDEX)}, or the same with {heads[0]}. before it"
+        )
     for name, sigma in wish.priors.items():
         if name not in known and not name.split(".", 1)[-1].startswith(EXTRA) and not name.startswith(EXTRA):
-            raise ParameterError(f"prior {name}: is no parameter; want one of {', '.join(INDEX)}")
+            raise ParameterError(f"prior {name}: unknown parameter; use one of {', '.join(INDEX)}")
         if not sigma > 0.0:
             raise ParameterError(f"prior {name}: got {sigma:g}, want a sigma above 0")
     if wish.ibrc_knots and (len(wish.ibrc_knots) < 2 or bool((np.diff(wish.ibrc_knots) <= 0.0).any())):
-        raise ParameterError("ibrc_knots: want at least two rising intensities")
+        raise ParameterError("ibrc_knots: needs at least two increasing intensities")
     for part in sorted(wish.beams - BEAM_PARTS.keys()):
         raise ParameterError(f"beams: got {part!r}, want some of {', '.join(BEAM_PARTS)}")
     if wish.beams and not any(_spins(head) for head in flight.heads):
-        raise ParameterError("beams: no scanner of this flight is a spinning head on a rigid mount; want none")
+        raise ParameterError("beams: this flight has no spinning head on a rigid mount; leave beams out")

@@ -187,7 +187,7 @@ def planned(
         if len(mine) > 1 or (mine and surface.control)
     )
     if not planes:
-        raise FlightError("no roof and no ground is seen from two lines; want lines that overlap over buildings")
+        raise FlightError("no two lines see the same roof or ground; plan lines that overlap over buildings")
     return Flight(frame, tuple(heads), tuple(trajectories), tuple(swaths)), Features(planes)
 
 

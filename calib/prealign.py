@@ -46,7 +46,7 @@ _OVERLAP_WIDTHS = 0.1  # side of the cells that find overlap, in widths of a swa
 _BACK = 0.5  # share of a step that the next one reverses where steps oscillate
 _HELD = 1e-9  # rad, or m, by which a held parameter may move
 _STEP_MOST_RAD = np.radians(2.0)
-_NO_POINTS = "a swath has no points; want a trajectory and a calibration that place them"
+_NO_POINTS = "a swath has no points; use a trajectory and a calibration that georeference them"
 # One sigma of the horizontal distance between matched surfaces, as a share of the finest smoothing: houses hide ground
 # from one strip that another strip sees, and that biases all matches the same way. 0.01 to 0.25 on four flights 20 m,
 # 60 m and 600 m above houses.
@@ -131,7 +131,9 @@ def prealigned(
 ) -> Prealigned:
     """Return coarse calibrations with sigmas; see `prealign` for arguments and errors."""
     if len(flight.swaths) < 2:
-        raise PrealignError(f"prealignment: got {len(flight.swaths)} swath, want at least two that overlap")
+        raise PrealignError(
+            f"prealignment: the flight has {len(flight.swaths)} swath; at least two that overlap are needed"
+        )
     found = dict(start or flight.starts())
     began = {name: one.parameters.copy() for name, one in found.items()}
     samples, scale = _samples(flight, found, settings.returns)
@@ -155,7 +157,7 @@ def prealigned(
             if np.abs(step[:, :3]).max() < coarser * settings.settled_rad:
                 break
     if improved is None:
-        raise PrealignError("prealignment: the swaths do not overlap; want strips over the same ground")
+        raise PrealignError("prealignment: the swaths do not overlap; use strips over the same ground")
     _refuse(found, began, step, settings)
     arms_m = np.array([scale.height_m, scale.height_m, 0.5 * scale.width_m])
     sigma[:, :3] = np.hypot(sigma[:, :3], _LEANS * levels[-1] / arms_m)
@@ -169,14 +171,12 @@ def _refuse(
         for parameter in NAMES[:3]:
             turned = calibration.value(parameter) - float(began[name][INDEX[parameter]])
             if abs(turned) > settings.greatest_rad:
-                text = f"{parameter.removesuffix('_rad')} came to {np.degrees(turned):.1f}° from the start"
-                raise PrealignError(f"prealignment of {name}: {text}; want the installation matrix and mount checked")
+                text = f"{parameter.removesuffix('_rad')} moved {np.degrees(turned):.1f}° from its initial value"
+                raise PrealignError(f"prealignment of {name}: {text}; check the installation matrix and the mount")
     last = float(np.abs(step[:, :3]).max())
     if last > 10.0 * settings.settled_rad:
         text = f"the last step still turned a scanner by {np.degrees(last):.2f}°"
-        raise PrealignError(
-            f"prealignment: does not come to rest, {text}; want strips that overlap over relief or roofs"
-        )
+        raise PrealignError(f"prealignment: does not converge, {text}; use strips that overlap over relief or roofs")
 
 
 @dataclass(frozen=True, eq=False)

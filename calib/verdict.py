@@ -36,8 +36,8 @@ def sigma_of(report: ReportInput, names: tuple[str, ...]) -> float | None:
 
 def wanted_of(report: ReportInput) -> dict[str, float]:
     """Return the wanted sigmas (SI), by parameter's name."""
-    told = {} if report.need is None else report.need.wanted
-    return {**WANTED, **{name: sigma for name, sigma in told.items() if math.isfinite(sigma)}}
+    required = {} if report.need is None else report.need.wanted
+    return {**WANTED, **{name: sigma for name, sigma in required.items() if math.isfinite(sigma)}}
 
 
 def held_words(adjusted: Adjusted) -> list[str]:
@@ -51,13 +51,13 @@ def held_words(adjusted: Adjusted) -> list[str]:
     found = []
     for column, one in enumerate(adjusted.considered):
         at = np.argsort(-np.abs(moved[:, column]) / np.maximum(own, 1e-300)).tolist()
-        told = [
+        moves = [
             f"{unknown_words(adjusted.names[i], several)} by {sized(adjusted.names[i], abs(float(moved[i, column])))}"
             for i in at
             if abs(float(moved[i, column])) > own[i]
         ]
-        if told:
-            found.append(f"{_held(one, several)}, would move {listed(told)}")
+        if moves:
+            found.append(f"{_held(one, several)}, which would move {listed(moves)}")
     return found
 
 
@@ -70,7 +70,7 @@ def unknown_words(name: str, several: bool) -> str:
 def _held(one: Considered, several: bool) -> str:
     """Describe a held parameter and its plausible error."""
     name = f"{one.scanner}.{one.name}"
-    return f"{unknown_words(name, several)}, held, plausible to {sized(name, one.sigma)}"
+    return f"{unknown_words(name, several)}, held, has a plausible error of {sized(name, one.sigma)}"
 
 
 def undetermined(report: ReportInput) -> list[str]:
@@ -120,7 +120,8 @@ def _beyond_wanted(report: ReportInput) -> Iterator[tuple[str, float]]:
         limit = wanted.get(unknown(name).name)
         if limit is not None:
             words = (
-                f"{unknown_words(name, several)} is known to {sized(name, sigma)} only, {sized(name, limit)} is wanted"
+                f"{unknown_words(name, several)} is known to {sized(name, sigma)} only; {sized(name, limit)} is "
+                "required"
             )
             yield words, sigma / limit
 
@@ -134,7 +135,7 @@ def _points(report: ReportInput) -> Iterator[tuple[str, float]]:
     for scanner, left_m in need.left_m.items():
         of = f" of {scanner}" if several else ""
         if math.isfinite(left_m):
-            yield f"leaves {length(left_m)} in points{of}, {length(need.point_m)} is wanted", left_m / need.point_m
+            yield f"leaves {length(left_m)} in points{of}; {length(need.point_m)} is required", left_m / need.point_m
 
 
 def _contradicted(report: ReportInput) -> Iterator[tuple[str, float]]:
@@ -143,8 +144,8 @@ def _contradicted(report: ReportInput) -> Iterator[tuple[str, float]]:
     for one in report.adjusted.considered:
         if one.contradicted:
             name = f"{one.scanner}.{one.name}"
-            told = f"{sized(name, one.told, sign=True)} ± {sized(name, one.told_sigma)}"
-            yield f"{unknown_words(name, several)} that is held: it would change it by {told}", 1.0
+            change = f"{sized(name, one.told, sign=True)} ± {sized(name, one.told_sigma)}"
+            yield f"the held value of {unknown_words(name, several)}: it would change the value by {change}", 1.0
 
 
 def _profiles(report: ReportInput) -> Iterator[tuple[str, float]]:
@@ -152,10 +153,10 @@ def _profiles(report: ReportInput) -> Iterator[tuple[str, float]]:
     several = len(report.adjusted.calibrations) > 1
     for one in () if report.check is None else report.check.comparisons:
         name = f"{one.scanner}.{one.parameter}"
-        told = sized(name, one.told - one.adjusted, sign=True)
+        apart = sized(name, one.told - one.adjusted, sign=True)
         sigmas = number(one.normalised, "+.1f")
         yield (
-            f"{one.profiles} profiles put {unknown_words(name, several)} {told} from the adjustment ({sigmas} sigmas)",
+            f"{one.profiles} profiles put {unknown_words(name, several)} {apart} from the adjustment ({sigmas} sigmas)",
             abs(one.normalised),
         )
 
@@ -251,14 +252,14 @@ RULES: tuple[Rule[ReportInput], ...] = (
         None,
         0.5,
         "the adjustment did not converge{of}",
-        "start from a better calibration (pre-alignment), or look for matches that are wrong",
+        "start from a better calibration (pre-alignment), or look for wrong matches",
     ),
     Rule(
         "redundancy",
         _no_redundancy,
         1.0,
         10.0,
-        "only {of} observations beyond the unknowns",
+        "there are only {of} observations more than unknowns",
         "fly over more roofs and slopes, with more overlap of lines",
     ),
     Rule(
@@ -266,8 +267,8 @@ RULES: tuple[Rule[ReportInput], ...] = (
         _held_angles,
         0.0,
         TOO_LARGE,
-        "not a boresight calibration: {of}",
-        "fly the lines, or give the control, that stand below under Not determined",
+        "the boresight is not calibrated: {of}",
+        "fly the lines or measure the control listed below under Not determined",
     ),
     Rule(
         "held range",
@@ -275,7 +276,7 @@ RULES: tuple[Rule[ReportInput], ...] = (
         1.0,
         None,
         "{of}",
-        "control on flat, hard ground (at least 8 points of 1 cm)",
+        "measure control on flat, hard ground (at least 8 points of 1 cm)",
     ),
     Rule(
         "wanted sigma",
@@ -283,7 +284,7 @@ RULES: tuple[Rule[ReportInput], ...] = (
         1.0,
         TOO_LARGE,
         "{of}",
-        "fly more of the lines that determine it, or say [calibration] wanted where less will do",
+        "fly more of the lines that determine it, or set [calibration] wanted if a lower accuracy is enough",
     ),
     Rule(
         "points",
@@ -291,7 +292,7 @@ RULES: tuple[Rule[ReportInput], ...] = (
         1.0,
         TOO_LARGE,
         "the calibration {of}",
-        "more lines, control or heights; or say [calibration] wanted where less will do",
+        "add lines, control or flying heights, or set [calibration] wanted if a lower accuracy is enough",
     ),
     Rule(
         "contradicted",
@@ -299,7 +300,7 @@ RULES: tuple[Rule[ReportInput], ...] = (
         0.5,
         None,
         "the flight contradicts {of}",
-        "free it (--free), or give it the value it has",
+        "free it (--free), or set its true value",
     ),
     Rule(
         "profiles",
@@ -307,15 +308,15 @@ RULES: tuple[Rule[ReportInput], ...] = (
         2.9,
         8.0,
         "{of}",
-        "look below at the profiles: which pairs say so, and whether all have one sign",
+        "see the profiles below: which pairs differ, and whether all differ with the same sign",
     ),
     Rule(
         "variance factor",
         _variance,
         2.0,
         9.0,
-        "residuals are larger than their sigmas say (variance factor {value})",
-        "check the noise of scanner and trajectory; look below where residuals are large",
+        "residuals are larger than their sigmas predict (variance factor {value})",
+        "check the noise settings of scanner and trajectory; see below where residuals are large",
         number,
     ),
     Rule(
@@ -323,8 +324,8 @@ RULES: tuple[Rule[ReportInput], ...] = (
         _variance_small,
         4.0,
         None,
-        "residuals are far smaller than their sigmas say (variance factor {of})",
-        "the noise of scanner or trajectory is stated too large; sigmas here are too careful",
+        "residuals are far smaller than their sigmas predict (variance factor {of})",
+        "lower the stated noise of scanner or trajectory; the sigmas here are too large",
     ),
     Rule(
         "rejected",
@@ -332,7 +333,7 @@ RULES: tuple[Rule[ReportInput], ...] = (
         0.05,
         0.4,
         "{value} of the observations ({of}) were rejected as outliers",
-        "look below at which planes, strips and angles they lie",
+        "see below on which planes, in which strips and at which angles they lie",
         share,
     ),
     Rule(
@@ -340,8 +341,8 @@ RULES: tuple[Rule[ReportInput], ...] = (
         _beyond_prior,
         3.3,
         10.0,
-        "{of} has moved {value} times the sigma it was given before",
-        "check what was measured on the ground, or give it a larger sigma",
+        "{of} has moved by {value} times its prior sigma",
+        "check the measurement on the ground, or set a larger prior sigma",
         _sigmas_words,
     ),
     Rule(
@@ -350,7 +351,7 @@ RULES: tuple[Rule[ReportInput], ...] = (
         0.08,
         0.5,
         "strips differ by {value} (RMSDz) after the calibration",
-        "look below which pairs do: a strip of its own kind has a bad trajectory",
+        "see below which pairs differ: a strip that differs from all others has a bad trajectory",
         length,
     ),
     Rule(
@@ -358,8 +359,8 @@ RULES: tuple[Rule[ReportInput], ...] = (
         _worse,
         1.05,
         1.5,
-        "strips agree worse than before ({of})",
-        "look below which pairs do, and at the outliers",
+        "strips agree less well than before ({of})",
+        "see below which pairs do, and the outliers",
     ),
     Rule(
         "control",
@@ -367,7 +368,7 @@ RULES: tuple[Rule[ReportInput], ...] = (
         3.29,
         10.0,
         "control point {of} is {value} sigmas off",
-        "check its height system (ellipsoidal?), its place, and what grows on it; leave it out",
+        "check its height system (ellipsoidal?), its position and the vegetation on it, or leave it out",
         _sigmas_words,
     ),
     Rule(
@@ -375,8 +376,8 @@ RULES: tuple[Rule[ReportInput], ...] = (
         _influence,
         1.5,
         6.0,
-        "control point {of} by {value} sigmas when it is left out",
-        "more control: no single point should carry a parameter",
+        "leaving out control point {of} by {value} sigmas",
+        "measure more control: no parameter should depend on a single point",
         _sigmas_words,
     ),
     Rule(
@@ -384,8 +385,8 @@ RULES: tuple[Rule[ReportInput], ...] = (
         _trajectory,
         1.6,
         4.0,
-        "corrections of the trajectory's {of} are {value} times what its sigmas let expect",
-        "process the trajectory anew; its sigmas are too small",
+        "corrections of the trajectory's {of} are {value} times the value that its sigmas predict",
+        "process the trajectory again; its sigmas are too small",
         _sigmas_words,
     ),
     Rule(
@@ -393,8 +394,8 @@ RULES: tuple[Rule[ReportInput], ...] = (
         _correlated,
         MOST_CORRELATED,
         None,
-        "{of} can hardly be told apart (correlation {value})",
-        "a second flying height or speed, or hold one of them",
+        "{of} can hardly be separated (correlation {value})",
+        "fly a second height or speed, or hold one of them",
         number,
     ),
 )
@@ -417,8 +418,8 @@ def accuracy_words(report: ReportInput) -> str:
     words = [f"boresight to {degrees(boresight * DEG)}"] if boresight is not None else []
     words += [f"range offset to {length(offset_m)}"] if offset_m is not None else []
     rms_m = overall_rms_m(dict(report.after))
-    told = ", ".join(words) or "the model has neither boresight nor range offset"
-    return told + (f"; strips agree to {length(rms_m)} (RMSDz)" if rms_m is not None else "")
+    accuracy = ", ".join(words) or "the model has neither boresight nor range offset"
+    return accuracy + (f"; strips agree to {length(rms_m)} (RMSDz)" if rms_m is not None else "")
 
 
 def _sentence(level: Level, report: ReportInput, reasons: Sequence[Reason]) -> str:

@@ -212,8 +212,8 @@ def apart_from_fixes(trajectory: Trajectory, positions: StructArray, arms_b: Flo
 def _compared(trajectory: Trajectory, rows: StructArray, fix_type: FixType, arm_b: FloatArray) -> Compared:
     poses = trajectory.poses(rows["time_ns"])
     antenna_e = poses.position_e + rotated(poses.q_e_from_b, np.broadcast_to(arm_b, (len(rows), 3)))
-    said = np.isfinite(poses.position_sigma_l)
-    own = np.median(np.where(said, poses.position_sigma_l, UNSAID_M), axis=0)
+    known = np.isfinite(poses.position_sigma_l)
+    own = np.median(np.where(known, poses.position_sigma_l, UNSAID_M), axis=0)
     return Compared(
         fix_type,
         np.asarray(rows["time_ns"], np.int64),
@@ -322,17 +322,17 @@ def compare_motion(trajectory: Trajectory, imu_time_ns: Int64Array, imu_rate_b: 
     pair = _turned(trajectory, imu_time_ns, imu_rate_b)
     if pair is None:
         return None
-    told, felt, ends = pair
-    as_it_is = _power(felt - told)
-    best, words, rates = as_it_is.sum(), "", told
-    for name, other in _conventions(told, ends):
+    turned, felt, ends = pair
+    as_it_is = _power(felt - turned)
+    best, words, rates = as_it_is.sum(), "", turned
+    for name, other in _conventions(turned, ends):
         power = _power(felt - other)
         if power.sum() < best and _is_better(as_it_is, power):
             best, words, rates = power.sum(), name, other
-    correlation = _correlation(told, felt)
-    other_motion = not words and all(_is_other(_coarser(told, n), _coarser(felt, n)) for n in (1, SLOW_STEPS))
-    by_axis = np.array([_correlation(told[:, [k]], felt[:, [k]]) for k in range(3)])
-    shaken = gusts(told, felt)
+    correlation = _correlation(turned, felt)
+    other_motion = not words and all(_is_other(_coarser(turned, n), _coarser(felt, n)) for n in (1, SLOW_STEPS))
+    by_axis = np.array([_correlation(turned[:, [k]], felt[:, [k]]) for k in range(3)])
+    shaken = gusts(turned, felt)
     by_gusts = float("nan") if shaken is None else _correlation(*shaken)
     other_gusts = shaken is not None and not words and _is_other(*shaken)
     return Motion(correlation, by_axis, words, _correlation(rates, felt), other_motion, by_gusts, other_gusts)
@@ -379,9 +379,9 @@ def _conventions(told: FloatArray, ends: FloatArray) -> Iterator[tuple[str, Floa
                 continue
             angles = ends[:, :, [1, 0, 2]] if swapped else ends
             negated = [name for name, sign in zip(names, signs, strict=True) if sign < 0.0]
-            parts = ["roll and pitch are exchanged"] if swapped else []
+            parts = ["roll and pitch are swapped"] if swapped else []
             if negated:
-                parts.append(f"{' and '.join(negated)} {'has' if len(negated) == 1 else 'have'} the other sign")
+                parts.append(f"{' and '.join(negated)} {'has' if len(negated) == 1 else 'have'} the opposite sign")
             extra = " (axes forward, left, up against east, north, up)" if negated == ["pitch", "heading"] else ""
             yield " and ".join(parts) + extra, _centred(_rates_of(angles * np.array(signs)))
     for quarter, words in ((1, "right"), (2, "back"), (3, "left")):
@@ -482,7 +482,7 @@ def heading_offset(trajectory: Trajectory, imu_time_ns: Int64Array, imu_force_b:
     seconds = _whole_seconds(trajectory, imu_time_ns)
     if len(seconds) < 2 or not np.isfinite(trajectory.velocity_e).all():
         return None
-    flown = trajectory.with_velocities()
+    with_velocities = trajectory.with_velocities()
     number = np.searchsorted(seconds, imu_time_ns, side="right") - 1
     inside = (number >= 0) & (number < len(seconds))
     inside[inside] = (imu_time_ns[inside] - seconds[number[inside]]) < SECOND_NS
@@ -490,13 +490,13 @@ def heading_offset(trajectory: Trajectory, imu_time_ns: Int64Array, imu_force_b:
     step = max(1, round(len(times) / len(seconds) / 50))
     times, number, force_b = times[::step], number[::step], imu_force_b[inside][::step]
     count = np.bincount(number, minlength=len(seconds)).astype(np.float64)
-    poses = flown.poses(times)
+    poses = with_velocities.poses(times)
     felt_e = np.stack([np.bincount(number, column, len(seconds)) for column in rotated(poses.q_e_from_b, force_b).T], 1)
     full = count >= 0.8 * np.median(count)
-    middle = flown.poses(seconds + SECOND_NS // 2)
+    middle = with_velocities.poses(seconds + SECOND_NS // 2)
     q_l_from_e = conjugate(_q_e_from_l(middle.position_e))
     felt_l = rotated(q_l_from_e, felt_e / np.maximum(count, 1.0)[:, np.newaxis])
-    flown_l = _force_flown(flown, seconds, q_l_from_e, middle.position_e, middle.velocity_e)
+    flown_l = _force_flown(with_velocities, seconds, q_l_from_e, middle.position_e, middle.velocity_e)
     heavy = full & (np.hypot(flown_l[:, 0], flown_l[:, 1]) > ACCELERATES)
     if heavy.sum() < FEWEST_TURNS:
         return None

@@ -48,7 +48,7 @@ def misfit_of(crs: CRS, said: str, lat_deg: FloatArray, lon_deg: FloatArray) -> 
             f"{away_m[at] / 1e3:.0f} km away,"
         )
     return (
-        f"{said}{outside} at {where} a metre on the ground is {scale:.4f} m of the map; "
+        f"{said}{outside} at {where} a metre on the ground is {scale:.4f} m in the map; "
         f"{_better(crs, float(lat_deg[at]), float(lon_deg[at]))}"
     )
 
@@ -74,8 +74,8 @@ def _better(crs: CRS, lat: float, lon: float) -> str:
         for info in query_utm_crs_info(datum_name=datum, area_of_interest=place):
             zone = info.name.removeprefix(f"{datum} / UTM zone ")
             if len(zone) <= len("32N"):  # excludes zones with axes in another order
-                return f'want "EPSG:{info.code}" ({info.name}), or another that is used there'
-    return "want one that is used there"
+                return f'use "EPSG:{info.code}" ({info.name}), or another CRS that is used there'
+    return "use a CRS that is used there"
 
 
 def degrees_text(lat_deg: float, lon_deg: float, digits: int) -> str:

@@ -147,7 +147,9 @@ def segments(strips: Sequence[Span], first_ns: int, end_ns: int, *, first_number
     at = first_ns
     for number, (start, end) in enumerate(strips, start=first_number):
         if number > MAX_STRIPS:
-            raise StripError(f"more than {MAX_STRIPS} strips, which is what a point source id can number")
+            raise StripError(
+                f"the flight has more than {MAX_STRIPS} strips, the most that a point source id can number"
+            )
         start, end = max(start, at), min(end, end_ns)
         if start >= end:
             continue
@@ -172,7 +174,7 @@ def read_strips(text: str, name: str) -> list[Span]:
     try:
         strips = sorted(_spans(rows, name))
     except csv.Error as error:
-        raise StripError(f"{name}: line {rows.reader.line_num}: no CSV: {error}") from None
+        raise StripError(f"{name}: line {rows.reader.line_num}: not CSV: {error}") from None
     for (_, end), (start, _) in pairwise(strips):
         if start < end:
             raise StripError(f"{name}: the strip that begins at {start} overlaps the one before, which ends at {end}")
@@ -184,16 +186,16 @@ def read_strips(text: str, name: str) -> list[Span]:
 def _spans(rows: csv.DictReader[str], name: str) -> Iterator[Span]:
     missing = [column for column in CSV_COLUMNS if column not in (rows.fieldnames or [])]
     if missing:
-        raise StripError(f"{name}: no column {missing[0]}; want a first line {','.join(CSV_COLUMNS)}")
+        raise StripError(f"{name}: column {missing[0]} is missing; the first line must be {','.join(CSV_COLUMNS)}")
     for row in rows:
         try:
             start, end = (int(row[column]) for column in CSV_COLUMNS)
         except (TypeError, ValueError):
-            raise StripError(f"{name}: line {rows.line_num}: want two integers, GPS nanoseconds") from None
+            raise StripError(f"{name}: line {rows.line_num}: needs two integers, GPS nanoseconds") from None
         if end <= start:
             raise StripError(f"{name}: line {rows.line_num}: the strip ends at {end}, before it begins")
         if not 0 <= start < end <= LATEST_NS:
             raise StripError(
-                f"{name}: line {rows.line_num}: {start} to {end} is beyond all GPS time; want nanoseconds since 1980"
+                f"{name}: line {rows.line_num}: {start} to {end} is outside GPS time; give nanoseconds since 1980"
             )
         yield start, end

@@ -29,14 +29,14 @@ def toml_tables(text: str) -> dict[str, Any]:
     except tomllib.TOMLDecodeError as error:
         raise TomlError(f"not TOML: {' '.join(str(error).split())}") from error
     except RecursionError as error:
-        raise TomlError(f"not readable: nested too deeply; want tables at most {DEEPEST} deep") from error
+        raise TomlError(f"not readable: nested too deeply; nest tables at most {DEEPEST} deep") from error
     except ValueError as error:  # more digits than Python converts to a number
-        raise TomlError("a whole number of thousands of digits; want numbers of 64 bits") from error
+        raise TomlError("a whole number of thousands of digits; use numbers of 64 bits") from error
     waiting: list[tuple[Any, str, int]] = [(document, "", 0)]
     while waiting:
         value, where, depth = waiting.pop()
         if depth > DEEPEST:
-            raise TomlError(f"{where[:40]}…: nested too deeply; want tables at most {DEEPEST} deep")
+            raise TomlError(f"{where[:40]}…: nested too deeply; nest tables at most {DEEPEST} deep")
         if isinstance(value, dict):
             waiting += [
                 (one, f"{where}.{key_text(key)}" if where else key_text(key), depth + 1) for key, one in value.items()
@@ -44,7 +44,7 @@ def toml_tables(text: str) -> dict[str, Any]:
         elif isinstance(value, list):
             waiting += [(one, where, depth + 1) for one in value]
         elif isinstance(value, int) and not LEAST <= value <= MOST:
-            raise TomlError(f"{where}: a whole number of {value.bit_length()} bits; want numbers of 64 bits")
+            raise TomlError(f"{where}: a whole number of {value.bit_length()} bits; use numbers of 64 bits")
     return document
 
 

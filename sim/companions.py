@@ -28,26 +28,27 @@ FIRST_UDP_PORT = 2368
 FIRST_POSITION_PORT = 8308
 README = """# A flight of the virtual aircraft: {name}
 
-Made by `swath sim fly` from the plan in `plan.toml`, seed {seed}. Starts {start}, GPS − UTC {leap_seconds} s.
+`swath sim fly` made this flight from the plan in `plan.toml` with seed {seed}. It starts at {start}; GPS − UTC is
+{leap_seconds} s.
 
 | file | what |
 |---|---|
-| `*.mcap` | the log, as the recorder would have written it |
+| `*.mcap` | the log, in the form that the recorder writes |
 | `swath.toml` | the configuration that records this flight; a copy is in the log |
 {calibrations}
-| `control.csv` | ground control points as surveyed: {control} of σ {sigma_m} m a coordinate, ellipsoidal heights |
-| `truth.npz` | the truth, below |
+| `control.csv` | surveyed ground control: {control} points, σ {sigma_m} m in each coordinate, ellipsoidal heights |
+| `truth.npz` | the true values, described below |
 
-`truth.npz` (`numpy.load`), one array a column:
+`truth.npz` (read it with `numpy.load`) has one array for each column:
 
 - `trajectory.*`: the body's true poses at the IMU's rate: `gps_ns` (since 1980-01-06, continuous), `lat_rad`,
   `lon_rad`, `height_m` (ellipsoidal), `velocity_l` (north, east, down), `roll_rad`, `pitch_rad`, `heading_rad`, `strip`
-- `<scanner>.*`: one row a return, in the order of the returns in the scanner's packets, also of packets that a fault
-  kept from the log: `gps_ns` and `pulse` of the emission, `point_e` (ECEF, the echo on the beam's axis), `range_m`,
-  `incidence_rad`, `strip` (index of the flight line, −1 between lines), `channel` (facet or beam), `return_number`,
-  `surface` (index into `surfaces`)
-- `surfaces`, `lines`: names; `control_e`: the true places of the control points
-- `imu.<name>.*`: the errors drawn for each IMU
+- `<scanner>.*`: one row for each return, in the order of the returns in the scanner's packets, including packets that
+  a fault kept from the log: `gps_ns` and `pulse` of the emission, `point_e` (ECEF, the echo on the beam's axis),
+  `range_m`, `incidence_rad`, `strip` (index of the flight line, −1 between lines), `channel` (facet or beam),
+  `return_number`, `surface` (index into `surfaces`)
+- `surfaces`, `lines`: names; `control_e`: the true positions of the control points
+- `imu.<name>.*`: the errors that were drawn for each IMU
 """
 
 
@@ -140,7 +141,7 @@ def _scanner_config(plan: Plan, name: str, wires: dict[str, str]) -> dict[str, A
 def _readme(plan: Plan) -> str:
     tables = plan.tables
     calibrations = "\n".join(
-        f"| `{name}.nominal.toml`, `{name}.true.toml` | calibration of {name}: what its papers say, what it really is |"
+        f"| `{name}.nominal.toml`, `{name}.true.toml` | calibration of {name}: the nominal one and the true one |"
         for name in tables.scanner
     )
     return README.format(

@@ -142,7 +142,7 @@ class VirtualFlight:
             return None
         if name not in self._pulses:
             known = ", ".join(sorted(self._pulses)) or "none"
-            raise PlanError(f"{key}.pps", f"the plan has no [pps.{name}]; there are: {known}")
+            raise PlanError(f"{key}.pps", f"the plan has no [pps.{name}]; it has: {known}")
         return self._pulses[name]
 
     def _windows(self, source: str, *kinds: str) -> list[Window]:

@@ -112,18 +112,18 @@ def _outside(flight: Flight, points: Sequence[ControlPoint], seen: set[int], rul
     names = tuple(name for name, _ in far)
     nearest, least_m = min(far, key=lambda one: one[1])
     if len(far) < len(points):
-        text = f"{_some(names)} outside the flight: {_length(least_m)} or more from its returns; not used"
+        text = f"{_some(names)} outside the flight, {_length(least_m)} or more from its returns, and will not be used"
         return (Doubt("point", text, names),)
     text = (
-        f"no control point lies in the flight: the nearest, {nearest}, is {_length(least_m)} from its returns; "
-        "want geodetic latitude and longitude in degrees, of the place that was flown"
+        f"no control point lies within the flight: the nearest, {nearest}, is {_length(least_m)} from its returns; "
+        "give geodetic latitude and longitude in degrees, in the area of the flight"
     )
     return (Doubt("outside", text, names),)
 
 
 def _some(names: tuple[str, ...]) -> str:
-    told = ", ".join(names[:3]) + (f" and {len(names) - 3} more points" if len(names) > 3 else "")
-    return f"{told} {'lies' if len(names) == 1 else 'lie'}"
+    listed = ", ".join(names[:3]) + (f" and {len(names) - 3} more points" if len(names) > 3 else "")
+    return f"{listed} {'lies' if len(names) == 1 else 'lie'}"
 
 
 def _length(metres: float) -> str:
@@ -146,15 +146,15 @@ def _heights(
     names = tuple(point.name for point in points)
     known = undulation(places_e)
     if known is not None and abs(known[0]) > 1.0 and abs(middle_m + known[0]) < max(1.0, 0.1 * abs(known[0])):
-        text = f"{what}, as orthometric heights would: undulation there {known[0]:.1f} m ({known[1]})"
-        return (Doubt("orthometric", f"{text}; want heights above the ellipsoid", names),)
+        text = f"{what}, as orthometric heights would lie; the undulation there is {known[0]:.1f} m ({known[1]})"
+        return (Doubt("orthometric", f"{text}; give heights above the ellipsoid", names),)
     if ground_m > 30.0 and abs((ground_m + middle_m) / ground_m - FEET) < 0.1:
-        return (Doubt("height", f"{what}, as heights in feet would; want metres above the ellipsoid", names),)
+        return (Doubt("height", f"{what}, as heights in feet would lie; give metres above the ellipsoid", names),)
     if known is None and ORTHOMETRIC_M[0] <= abs(middle_m) <= ORTHOMETRIC_M[1]:
-        text = f"{what}, as orthometric heights would where the undulation is {-middle_m:.1f} m"
-        return (Doubt("orthometric", f"{text}; want heights above the ellipsoid", names),)
-    told = "" if known is None else f"; no undulation of {known[1]}, which is {known[0]:.1f} m there"
-    text = f"{what} (± {spread_m / math.sqrt(len(above_m)):.2f} m), as in another height reference or datum{told}"
+        text = f"{what}, as orthometric heights would lie where the undulation is {-middle_m:.1f} m"
+        return (Doubt("orthometric", f"{text}; give heights above the ellipsoid", names),)
+    not_geoid = "" if known is None else f"; this is not the undulation of {known[1]}, which is {known[0]:.1f} m there"
+    text = f"{what} (± {spread_m / math.sqrt(len(above_m)):.2f} m), as in another height reference or datum{not_geoid}"
     return (Doubt("height", text, names),)
 
 
@@ -194,7 +194,7 @@ def _shift(points: Sequence[ControlPoint], grounds: Sequence[Ground]) -> tuple[D
     way = COMPASS[round(math.degrees(math.atan2(shift[0], shift[1])) / 45.0) % 8]
     text = (
         f"control lies {size:.2f} m (± {sigma_m:.2f} m) to the {way} of where the laser sees the same slopes, as "
-        "positions in another datum or epoch would; want those of the trajectory's datum"
+        "positions in another datum or epoch would lie; give positions in the trajectory's datum"
     )
     return (Doubt("shift", text, tuple(points[number].name for number in numbers)),)
 

@@ -99,16 +99,16 @@ def read_control(text: str, name: str) -> tuple[Surveyed, ...]:
     lines = [(number, line.strip()) for number, line in enumerate(text.lstrip("\ufeff").splitlines(), start=1)]
     lines = [(number, line) for number, line in lines if line and not line.startswith("#")]
     if not lines:
-        raise ControlError(f"{name}: is empty; want the header {HEADER} and a line a point")
+        raise ControlError(f"{name}: the file is empty; it needs the header {HEADER} and one line for each point")
     number, header = lines[0]
     if tuple(column.strip() for column in header.split(",")) != COLUMNS:
-        raise ControlError(f"{name}: line {number}: want the header {HEADER}{_other_header(header)}")
+        raise ControlError(f"{name}: line {number}: the header must be {HEADER}{_other_header(header)}")
     mistakes: list[str] = []
     points = [(number, _point(line, number, mistakes)) for number, line in lines[1:]]
     read = [(number, point) for number, point in points if point is not None]
     mistakes += _twice(read)
     if not points:
-        mistakes.append(f"line {number}: no points behind the header; want a line a point")
+        mistakes.append(f"line {number}: no points follow the header; add one line for each point")
     if mistakes:
         raise ControlError("\n".join(f"{name}: {mistake}" for mistake in mistakes[:MOST_MISTAKES]))
     return tuple(point for _, point in read)
@@ -117,15 +117,15 @@ def read_control(text: str, name: str) -> tuple[Surveyed, ...]:
 def _other_header(header: str) -> str:
     """Return a hint about the likely mistake in a wrong header."""
     if ";" in header or "\t" in header:
-        return ", columns apart by commas"
+        return ", with commas between the columns"
     missing = [column for column in COLUMNS if column not in header]
-    return f"; {', '.join(missing)} not there" if len(missing) < len(COLUMNS) and missing else ""
+    return f"; {', '.join(missing)} missing" if len(missing) < len(COLUMNS) and missing else ""
 
 
 def _point(line: str, number: int, mistakes: list[str]) -> Surveyed | None:
     fields = [field.strip() for field in line.split(",")]
     if len(fields) != len(COLUMNS):
-        mistakes.append(f"line {number}: {len(fields)} fields, want {len(COLUMNS)}: {HEADER}")
+        mistakes.append(f"line {number}: {len(fields)} fields instead of {len(COLUMNS)}: {HEADER}")
         return None
     before = len(mistakes)
     if not fields[0]:
@@ -147,7 +147,9 @@ def _number(field: str, column: str, line: int, mistakes: list[str]) -> float:
     least, most = (0.0 if column == "sigma_m" else -LIMITS[column]), LIMITS[column]
     if not least <= value <= most or (column == "sigma_m" and value < SMALLEST_SIGMA_M):
         unit = column.rpartition("_")[2].replace("deg", "degrees").replace("m", "metres", 1)
-        hint = "; are these metres of a map?" if column in ("lat_deg", "lon_deg") and abs(value) > 1000.0 else ""
+        hint = (
+            "; are these map coordinates in metres?" if column in ("lat_deg", "lon_deg") and abs(value) > 1000.0 else ""
+        )
         want = f"{unit} above 0, at most {most:g}" if column == "sigma_m" else f"{unit} from {least:g} to {most:g}"
         mistakes.append(f'line {line}: {column}: got "{field}", want {want}{hint}')
     return value
@@ -160,7 +162,7 @@ def _twice(read: Sequence[tuple[int, Surveyed]]) -> list[str]:
     for line, point in read:
         if point.name in names:
             mistakes.append(
-                f"line {line}: {point.name} stands in line {names[point.name]} already; want each point once"
+                f"line {line}: {point.name} already stands in line {names[point.name]}; list each point once"
             )
         names.setdefault(point.name, line)
     if len(read) > 1:
@@ -171,7 +173,8 @@ def _twice(read: Sequence[tuple[int, Surveyed]]) -> list[str]:
             (line, one), (other_line, other) = read[one_at], read[other_at]
             if one.name != other.name:
                 mistakes.append(
-                    f"line {other_line}: {other.name} is where {one.name} of line {line} is; want each point once"
+                    f"line {other_line}: {other.name} has the position of {one.name} in line {line}; list each "
+                    "point once"
                 )
     return mistakes
 
@@ -301,7 +304,7 @@ def _ground(
     if plane is None:
         return None, reason
     if not is_inside(place_t[:2], returns_t[kept, :2]):
-        return None, "not within the returns"
+        return None, "returns do not surround it"
     return Ground(point, number, at[kept], plane, plane.above_m(place_t)), ""
 
 

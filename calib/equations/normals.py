@@ -95,7 +95,7 @@ class TrajectoryWeight:
         try:
             self.normal = self.to_e(self.to_e(prior.information).T)
         except np.linalg.LinAlgError as error:
-            text = "the trajectory's prior covariance is not positive definite; want sigmas above 0 at every knot"
+            text = "the trajectory's prior covariance is not positive definite; every knot needs sigmas above 0"
             raise NormalError(text) from error
 
     def to_e(self, rows: FloatArray) -> FloatArray:
@@ -162,9 +162,7 @@ class Normals:
         try:
             return inverted(self.normal)
         except np.linalg.LinAlgError as error:
-            raise NormalError(
-                "a parameter is not determined by these observations; hold it, or give it a prior"
-            ) from error
+            raise NormalError("these observations do not determine a parameter; hold it, or give it a prior") from error
 
     @cached_property
     def of_parameters(self) -> FloatArray:
@@ -323,7 +321,7 @@ def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
     try:
         factor = cho_factor(matrix * np.outer(scale, scale), lower=True)
     except np.linalg.LinAlgError as error:
-        raise NormalError("a parameter is not determined by these observations; hold it, or give it a prior") from error
+        raise NormalError("these observations do not determine a parameter; hold it, or give it a prior") from error
     shaped = scale if right.ndim == 1 else scale[:, np.newaxis]
     done: FloatArray = cho_solve(factor, right * shaped) * shaped
     return done

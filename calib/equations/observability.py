@@ -46,9 +46,9 @@ class Rule:
 
 _DEG = float(np.pi / 180.0)
 _HEIGHT = "fly the same area at a second height, at least 1.7 times the first above ground"
-_CONTROL = "ground control: at least 8 points at 1 cm on flat hard ground"
+_CONTROL = "measure ground control: at least 8 points at 1 cm on flat hard ground"
 _SPEED = "fly a second height at least 1.7 times the first, or one line at another speed"
-_EDGE = "lines of which the edge of one overlaps the middle of the other over flat ground, and ground control"
+_EDGE = "fly lines where the edge of one overlaps the middle of the other over flat ground, and measure ground control"
 
 
 def _plausible(name: str) -> float:
@@ -71,18 +71,22 @@ RULES: Mapping[str, Rule] = {  # in the order in which they are kept: the last i
     ),
     "range_offset_m": Rule(
         _plausible("range_offset_m"),
-        "it lowers all points alike, and roofs only by how steeply the beam meets them",
-        f"{_CONTROL}; or roofs seen from several lines with a side overlap of half a swath, and crossing lines",
+        "it lowers all points alike; on roofs the effect depends on how steeply the beam meets them",
+        f"{_CONTROL}; or fly roofs from several lines with a side overlap of half a swath, and crossing lines",
     ),
     "range_scale": Rule(
-        _plausible("range_scale"), "it lowers points by their distance", f"{_HEIGHT}; or {_CONTROL} at both heights"
+        _plausible("range_scale"),
+        "it lowers points in proportion to their distance",
+        f"{_HEIGHT}; or {_CONTROL} at both heights",
     ),
     "scan_angle_scale": Rule(_plausible("scan_angle_scale"), "it bends the swath up at both edges", _EDGE),
-    "time_offset_s": Rule(_plausible("time_offset_s"), "it shifts points along the track by the speed", _SPEED),
+    "time_offset_s": Rule(
+        _plausible("time_offset_s"), "it shifts points along the track in proportion to the speed", _SPEED
+    ),
     "scan_plane_tilt_rad": Rule(
         _plausible("scan_plane_tilt_rad"),
-        "it shifts points backwards, hardly more at the edges",
-        "only a much wider swath shows it",
+        "it shifts points backwards, by almost the same amount at the edges",
+        "fly a much wider swath; nothing else shows it",
     ),
     "lever_arm_y_m": Rule(
         _plausible("lever_arm_y_m"), "it shifts points across the track, as roll does at one height", _HEIGHT
@@ -98,37 +102,41 @@ RULES: Mapping[str, Rule] = {  # in the order in which they are kept: the last i
     ),
     "encoder_latency_s": Rule(
         _plausible("encoder_latency_s"),
-        "it tears lines of the two mirror directions apart",
-        "a scan of both directions over flat ground",
+        "it separates the scan lines of the two mirror directions",
+        "scan flat ground in both mirror directions",
     ),
     "torsion_s2": Rule(
         _plausible("torsion_s2"),
-        "at one scan rate it bends the swath as a scale of the scan angle does",
+        "at one scan rate it bends the swath in the same way as a scale of the scan angle",
         "fly a second scan rate",
     ),
-    "range_offset_slot": Rule(0.02, "it acts on returns of one number only", "more of such returns on planes"),
-    "range_offset_zone": Rule(
-        0.02, "it acts on one number of pulses in air only", "lines over the same roofs in both zones"
+    "range_offset_slot": Rule(
+        0.02, "it acts only on returns of one return number", "collect more of such returns on planes"
     ),
-    "ibrc": Rule(0.02, "it acts on returns of one intensity only", "planes of that brightness in several strips"),
-    "beam.range_m": Rule(0.02, "it acts on one beam only", "planes that this beam sees in several strips"),
+    "range_offset_zone": Rule(
+        0.02, "it acts only on one number of pulses in the air", "fly lines over the same roofs in both zones"
+    ),
+    "ibrc": Rule(0.02, "it acts only on returns of one intensity", "fly planes of that brightness in several strips"),
+    "beam.range_m": Rule(0.02, "it acts on one beam only", "fly planes that this beam sees in several strips"),
     "beam.azimuth_rad": Rule(0.05 * _DEG, "it acts on one beam only", "roofs that this beam sees in many strips"),
     "beam.elevation_rad": Rule(0.05 * _DEG, "it acts on one beam only", "roofs that this beam sees in many strips"),
     "pitch_slope": Rule(
-        _plausible("pitch_slope"), "it skews the swath as heading does", "nothing but a bench measurement of the mirror"
+        _plausible("pitch_slope"),
+        "it skews the swath in the same way as heading",
+        "measure the mirror on a bench; no flight shows it",
     ),
     "scan_angle_offset_rad": Rule(
         _plausible("scan_angle_offset_rad"),
-        "it turns the swath about the track as roll does",
-        "none is needed: roll takes it",
+        "it turns the swath about the track in the same way as roll",
+        "none is needed, because roll absorbs it",
     ),
 }
 _OTHER = Rule(1.0, "", "")
 
 PAIRS: Mapping[frozenset[str], str] = {  # remedies that separate two parameters, where more is needed than for one
-    frozenset(("omega_rad", "scan_angle_offset_rad")): "none is needed: they are one and the same turn",
-    frozenset(("phi_rad", "scan_plane_tilt_rad")): "only a much wider swath: their difference grows as 1/cos θ",
-    frozenset(("kappa_rad", "pitch_slope")): "nothing but a bench measurement of the mirror",
+    frozenset(("omega_rad", "scan_angle_offset_rad")): "none is needed, because both describe the same rotation",
+    frozenset(("phi_rad", "scan_plane_tilt_rad")): "fly a much wider swath: their difference grows as 1/cos θ",
+    frozenset(("kappa_rad", "pitch_slope")): "measure the mirror on a bench; no flight shows it",
     frozenset(("phi_rad", "lever_arm_x_m")): _HEIGHT,
     frozenset(("omega_rad", "lever_arm_y_m")): _HEIGHT,
     frozenset(("phi_rad", "time_offset_s")): _SPEED,
@@ -313,12 +321,12 @@ class _Case:
         rule = self._rules.of(self._names[at])
         if alike:
             others = " and ".join(f"{other} (correlation {rho:+.3f})" for other, rho in alike[:3])
-            text = f"this flight cannot tell it apart from {others}"
+            text = f"this flight cannot separate it from {others}"
         elif np.isinf(sigma):
             text = "nothing in this flight shows it"
         else:
             found, before = (sized(self._names[at], size) for size in (sigma, rule.plausible))
-            text = f"this flight would find it to {found}, and its start is plausible to {before}"
+            text = f"this flight would estimate it to {found}, and its initial value is plausible to {before}"
         return f"{text}: {rule.looks}" if rule.looks else text
 
     def _remedy(self, at: int, others: Sequence[str]) -> str:

@@ -146,10 +146,10 @@ def knots_of(flight: Flight, knot_s: float, most: int = MOST_KNOTS) -> Knots:
         FlightError: there are no strips, or the distance is not a positive time.
     """
     if not (np.isfinite(knot_s) and knot_s > 0.0):
-        raise FlightError(f"trajectory errors: knots {knot_s:g} s apart; want more than 0 s")
+        raise FlightError(f"trajectory errors: the knots are {knot_s:g} s apart; the interval must exceed 0 s")
     strips = _strips(flight)
     if not strips:
-        raise FlightError("trajectory errors: the flight has no strip with returns; want at least one")
+        raise FlightError("trajectory errors: the flight has no strip with returns; at least one is needed")
     return knots_within(strips, knot_s, most)
 
 
@@ -253,13 +253,13 @@ def _told(trajectory: Trajectory, time_ns: Int64Array) -> tuple[FloatArray, Floa
     since, epochs = (times - trajectory.time_ns[0] for times in (time_ns, trajectory.time_ns))
     told = np.concatenate([trajectory.position_sigma_l, trajectory.attitude_sigma_rad], axis=1)
     sigmas = np.stack([np.interp(since, epochs, column) for column in told.T], axis=1)
-    said = np.isfinite(sigmas) & (sigmas >= 0.0)
-    if not said.all():
-        first = int(np.argmax(~said.all(axis=1)))
-        what = "position" if not said[first, :3].all() else "attitude"
-        where = f"trajectory {trajectory.name} says no {what} sigma at {gps_text(int(time_ns[first]))}"
-        want = "smrmsg beside SBET, sigma_… columns in CSV, or let swath navigate"
-        raise FlightError(f"{where}; a calibration needs sigmas: give them ({want})")
+    known = np.isfinite(sigmas) & (sigmas >= 0.0)
+    if not known.all():
+        first = int(np.argmax(~known.all(axis=1)))
+        what = "position" if not known[first, :3].all() else "attitude"
+        where = f"trajectory {trajectory.name} has no {what} sigma at {gps_text(int(time_ns[first]))}"
+        want = "put an smrmsg beside the SBET, add sigma_… columns to the CSV, or let swath navigate"
+        raise FlightError(f"{where}; a calibration needs sigmas: {want}")
     lat, lon, _ = geodetic_from_e(trajectory.position_e[at])
     rot_l_from_b = np.swapaxes(rot_e_from_l(lat, lon), 1, 2) @ rot_from_quaternion(trajectory.q_e_from_b[at])
     _, pitch, heading = attitude_of(rot_l_from_b)
@@ -284,7 +284,10 @@ def from_smoother(flight: Flight, chains: Sequence[ErrorChain], knot_s: float = 
         FlightError: the number of chains differs from that of trajectories, or a chain does not cover the strips.
     """
     if len(chains) != len(flight.trajectories):
-        raise FlightError(f"trajectory errors: {len(chains)} runs of {len(flight.trajectories)} trajectories; want all")
+        raise FlightError(
+            f"trajectory errors: {len(chains)} runs for {len(flight.trajectories)} trajectories; every trajectory "
+            "needs its run"
+        )
     knots = knots_of(flight, knot_s)
     times, strips, flown, blocks = [], [], [], []
     for number, chain in enumerate(chains):
@@ -338,7 +341,9 @@ def _strip_at(time_ns: Int64Array, knots: Knots, at: Int64Array, name: str) -> I
     )
     if near.max() > max(NEAR_NS, round(knots.apart_s * SECOND_NS)):
         lost = gps_text(int(wanted[int(np.argmax(near))]))
-        raise FlightError(f"trajectory {name}: the smoother's run says nothing near {lost}; want the run of all strips")
+        raise FlightError(
+            f"trajectory {name}: the smoother's run does not cover {lost}; use the run that covers all strips"
+        )
     back = np.clip(np.searchsorted(wanted, time_ns), 1, max(len(wanted) - 1, 1))
     second = np.minimum(back, len(wanted) - 1)
     nearer = np.abs(wanted[back - 1] - time_ns) <= np.abs(wanted[second] - time_ns)
@@ -350,7 +355,7 @@ def _prior(knots: Knots, covariance: FloatArray, source: str) -> TrajectoryPrior
     square = covariance.reshape(size, size)
     notes = [f"{source}; {len(knots)} knots, {knots.apart_s:.3g} s apart"]
     if knots.widened:
-        notes.append(f"knots were set {knots.apart_s:.3g} s apart so that they are no more than {MOST_KNOTS}")
+        notes.append(f"the knots are {knots.apart_s:.3g} s apart, so that there are at most {MOST_KNOTS}")
     return TrajectoryPrior(knots.flown, knots.time_ns, knots.strip, positive(square), tuple(notes))
 
 

@@ -122,7 +122,7 @@ def cell_size(flight: Flight, settings: PlaneSettings) -> float:
     sizes = [spacing_m(swath) for swath in flight.swaths if len(swath)]
     sizes = [size for size in sizes if np.isfinite(size)]
     if not sizes:
-        raise PlaneError("planes: the swaths have no points; want a trajectory and a calibration that place them")
+        raise PlaneError("planes: the swaths have no points; use a trajectory and a calibration that georeference them")
     wanted = max(settings.cell_m, float(np.median(sizes)) * np.sqrt(settings.cell_points))
     large = [size for size in CELL_SIZES_M if size >= wanted - CELL_SHORT_M] or [CELL_SIZES_M[-1]]
     return next((size for size in large if _fill(flight, size) > _FILL_LEAST), large[-1])

@@ -47,7 +47,7 @@ def given_planes(flight: Flight, polygons: Rings, settings: PlaneSettings = _DEF
         for name, at in _inside(swath, rings, cell_m).items():
             on_it = _consensus(flight, swath, at, settings)
             if len(on_it) < _SHARE_LEAST * len(at):
-                refused["mixed: under 70 % of a polygon's returns in a swath lie on one plane"] += 1
+                refused["mixed: less than 70 % of the returns inside a polygon lie on one plane in a swath"] += 1
             elif len(on_it):
                 found[name][index] = on_it
     planes: list[Plane] = []
@@ -64,13 +64,17 @@ def _checked(polygons: Rings) -> dict[str, FloatArray]:
     for name, ring in pairs:
         corners = np.asarray(ring, dtype=np.float64)
         if corners.ndim != 2 or corners.shape[1:] != (2,) or len(corners) < 3 or not np.isfinite(corners).all():
-            raise PlaneError(f"polygon {name}: got corners of shape {corners.shape}, want (k, 2) numbers, k at least 3")
+            raise PlaneError(
+                f"polygon {name}: corners have the shape {corners.shape}; (k, 2) numbers are needed, k at least 3"
+            )
         east_m, north_m = np.ptp(corners, axis=0).tolist()
         if max(east_m, north_m) > _LONGEST_M:
             size = f"{east_m:,.0f} m by {north_m:,.0f} m"
-            raise PlaneError(f"polygon {name}: got {size}, want about one face, at most {_LONGEST_M:,.0f} m a side")
+            raise PlaneError(
+                f"polygon {name}: measures {size}; draw it around one face, at most {_LONGEST_M:,.0f} m a side"
+            )
         if name in rings:
-            raise PlaneError(f"polygon {name}: there are two of this name; want each name once")
+            raise PlaneError(f"polygon {name}: two polygons have this name; use each name once")
         rings[name] = corners
     return rings
 

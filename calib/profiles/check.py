@@ -105,12 +105,12 @@ def check(
         refused.update({f"{kind}: {why}": count for why, count in seen.refused.items() if count})
         profiles += seen.profiles
     comparisons = compare(flight, profiles, adjusted, prior, control, settings)
-    told = {(one.scanner, one.parameter) for one in comparisons}
+    compared = {(one.scanner, one.parameter) for one in comparisons}
     missing = {
         (head.name, kind): MISSING[kind]
         for head in flight.heads
         for kind in KINDS
-        if (head.name, PARAMETER[kind]) not in told
+        if (head.name, PARAMETER[kind]) not in compared
     }
     return Check(tuple(profiles), comparisons, missing, refused)
 

@@ -59,10 +59,10 @@ def trajectory_sigmas(flight: Flight, swath: int, unsaid: tuple[float, float]) -
     trajectory = flight.trajectories[one.flown]
     part = trajectory.between(int(one.time_ns[0]), int(one.time_ns[-1]))
     columns = np.concatenate([part.position_sigma_l, part.attitude_sigma_rad], axis=1)
-    said = np.isfinite(columns)
-    mean = np.where(said, columns, 0.0).sum(axis=0) / np.maximum(said.sum(axis=0), 1)
+    known = np.isfinite(columns)
+    mean = np.where(known, columns, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
     assumed = np.repeat(unsaid, 3) * [1.0, 1.0, 1.0, 1.0, 1.0, 2.0]
-    sigmas: FloatArray = np.where(said.any(axis=0), mean, assumed)
+    sigmas: FloatArray = np.where(known.any(axis=0), mean, assumed)
     return sigmas
 
 

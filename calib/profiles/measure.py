@@ -33,10 +33,10 @@ ITERATIONS = 6
 DONE = 0.02  # sigmas
 LEAST_SLOPE = 0.06  # along the profile, of pieces for pitch and heading: flatter ones do not show the angle
 CHUNK = 8192  # neighbouring returns that are examined or skipped together
-NO_TRACK = "a swath without a straight track"
+NO_TRACK = "a swath has no straight track"
 TOO_FEW_RETURNS = "too few returns"
-TOO_FEW_PIECES = "too few pieces of smooth ground in both swaths"
-TOO_FEW_SLOPES = "too few pieces of smooth slopes along it in both swaths"
+TOO_FEW_PIECES = "both swaths share too few pieces of smooth ground"
+TOO_FEW_SLOPES = "both swaths share too few smooth slopes along the profile"
 TOO_UNSURE = "too uncertain"
 
 

@@ -139,10 +139,12 @@ class Stepwise:
 
 
 MISSING = {
-    "roll": "no two lines flown in opposite directions over one track across flat ground",
-    "pitch": "no two lines flown in opposite directions over one track with slopes along it below the aircraft",
-    "heading": "no two overlapping lines side by side with slopes along them where one looks down on the other's edge",
-    "range": "no control on flat targets within a swath",
+    "roll": "the flight has no two lines in opposite directions along one track over flat ground",
+    "pitch": "the flight has no two lines in opposite directions along one track over ground that slopes along it "
+    "below the aircraft",
+    "heading": "the flight has no two overlapping parallel lines over ground that slopes along them where the nadir of "
+    "one lies on the edge of the other",
+    "range": "no swath contains control on flat targets",
 }
 
 
@@ -259,7 +261,7 @@ def _sort(
     """Append the most certain profiles to ``taken``, and count the others."""
     good = sorted((one for one in outcomes if isinstance(one, Measured)), key=lambda one: one.fit.noise_sigma)
     refused.update(one for one in outcomes if isinstance(one, str))
-    refused["others of this pair are surer"] += max(0, len(good) - most)
+    refused["other profiles of this pair are more certain"] += max(0, len(good) - most)
     taken.extend(_profile(flight, calibrations, tracks, one) for one in good[:most])
 
 

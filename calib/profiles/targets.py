@@ -33,7 +33,7 @@ def measure_range(
     seen = [(point, _target(flight, track, ground, point, calibration, settings, margin_m)) for point in control]
     shown = [(point, target) for point, target in seen if target is not None]
     if not shown:
-        return "no flat target in a swath"
+        return "no swath contains a flat target"
     height_m, sigma_m, lever, aside_m = np.array([target.figures for _, target in shown]).T
     prior = {swath: trajectory_sigmas(flight, swath, settings.unsaid_sigma)}
     fit = solve(height_m, sigma_m, lever, {swath: np.stack([target.levers for _, target in shown])}, prior)

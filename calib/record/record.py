@@ -115,7 +115,7 @@ def told_value(key: str, value: Plain, note: str = "as told") -> Value:
     if row is None:
         near = get_close_matches(key[:_LONGEST_KEY], BY_KEY, 1, 0.0)
         named = ".".join(map(key_text, key.split(".")))
-        raise RecordError(f"{named} is no attribute of the record; did you mean {near[0]}?")
+        raise RecordError(f"{named}: the record has no such attribute; did you mean {near[0]}?")
     if not is_plain(value):
         raise RecordError(f"{key}: got {value!r}, want text, a number, or a list of numbers")
     choices = {"CA_ValidationMethod": tuple(VALIDATION_METHODS), "CA_CalibrationType": CALIBRATION_TYPES}.get(row.type)
@@ -256,7 +256,9 @@ def read_document(text: str, name: str) -> Document:
     except (ValueError, KeyError, TypeError, RecursionError):
         known, named, lost = False, [], []
     if not known or any(f"{owner}.{one}" not in BY_KEY for owner, one in (*named, *lost)):
-        raise RecordError(f"{name}: no record of a calibration; want NAME.record.json of swath calibrate --report")
+        raise RecordError(
+            f"{name}: not a calibration record; give the NAME.record.json that swath calibrate --report writes"
+        )
     told: Document = document
     return told
 

@@ -136,7 +136,10 @@ def adjust_strips(
     """
     _check(settings)
     if not features.ties and not any(plane.points for plane in features.planes):
-        raise StripError("no planes or ties that several strips see: nothing says how to correct them")
+        raise StripError(
+            "several strips share neither planes nor tie points, so no correction can be estimated; use strips that "
+            "overlap over roofs or open ground"
+        )
     knots = knots_of(flight, settings.knot_s)
     free = TrajectoryPrior(knots.flown, knots.time_ns, knots.strip, np.eye(ERRORS * len(knots)))
     case = _Equations(flight, features, calibrations, free, settings, row_weight)
@@ -359,10 +362,12 @@ class _Choice:
         """Return notes on the choice for display."""
         name = "Schwarz's" if self._settings.criterion == "bic" else "Akaike's corrected"
         models = self._settings.models
-        how = f"models chosen by {name} information criterion" if len(models) > 1 else f"all strips got {models[0]}"
-        notes = [f"{how}; the calibration was held"]
+        how = (
+            f"models chosen by {name} information criterion" if len(models) > 1 else f"model of all strips: {models[0]}"
+        )
+        notes = [f"{how}; the calibration parameters were held"]
         if len(self._keys) > MOST_CHOSEN_SINGLY:
-            notes.append(f"{len(self._keys)} strips, more than {MOST_CHOSEN_SINGLY}: all got the same model")
+            notes.append(f"{len(self._keys)} strips, more than {MOST_CHOSEN_SINGLY}, so all use the same model")
         return tuple(notes)
 
     def _tried(self, of_all: _Quadratic, number: int) -> dict[str, float]:

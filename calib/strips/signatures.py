@@ -114,7 +114,10 @@ def signatures(
         return Signatures(few, len(checks), math.nan, math.nan, math.nan)
     rms_m = float(np.sqrt(np.mean(checks.distance_m**2)))
     if rms_m > ROUGH_M:
-        words = f"rough: strips differ by {rms_m:.2f} m (RMS point to plane), too much to tell why: run swath calibrate"
+        words = (
+            f"rough: strips differ by {rms_m:.2f} m (RMS point to plane), too much to find the cause; run swath "
+            "calibrate"
+        )
         rough = tuple(Signature(effect, math.nan, math.nan, math.nan, "rough", words) for effect in EFFECTS)
         return Signatures(rough, len(checks), rms_m, math.nan, math.nan)
     prior = assumed_prior(checks, seen) if prior is None else prior
@@ -155,7 +158,7 @@ def assumed_prior(checks: Checks, seen: SeenFrom) -> TrajectoryPrior:
     trajectories = [_with_sigmas(trajectory) for trajectory in seen.trajectories]
     prior = gauss_markov_at(knots_within(spans, KNOT_S, MOST_KNOTS), trajectories, ASSUMED)
     lasting = f"{100 * ASSUMED.lasting_tilt:.0f} % of roll and pitch, {100 * ASSUMED.lasting_heading:.0f} % of heading"
-    note = f"trajectory's errors by its sigmas; assumed to last all flight: {lasting}"
+    note = f"trajectory errors follow its sigmas; share assumed to last the whole flight: {lasting}"
     return replace(prior, notes=(note,))
 
 
@@ -318,15 +321,15 @@ def _choose(fit: _Fit, edges: FloatArray, worst_m: float) -> tuple[list[int], di
     refused: dict[int, str] = {}
     for number, effect in enumerate(EFFECTS):
         if edges[number] == 0.0:
-            refused[number] = f"nothing here shows it; it wants {effect.remedy}"
+            refused[number] = f"nothing in these strips shows it; it needs {effect.remedy}"
             continue
         before = fit.sigmas(taken) if taken else np.zeros(0)
         after = fit.sigmas([*taken, number])
         if after[-1] * edges[number] > worst_m:
-            refused[number] = f"this flight does not tell it; it wants {effect.remedy}"
+            refused[number] = f"this flight does not determine it; it needs {effect.remedy}"
         elif len(before) and (growth := after[:-1] / before).max() > NOT_APART:
             other = EFFECTS[taken[int(growth.argmax())]].name
-            refused[number] = f"not to be told apart from {other} here; it wants {effect.remedy}"
+            refused[number] = f"this flight cannot separate it from {other}; it needs {effect.remedy}"
         else:
             taken.append(number)
     return taken, refused
@@ -342,13 +345,13 @@ def _told(effect: Effect, value: float, sigma: float, edge: float) -> Signature:
     size, spread = effect.factor * value, effect.factor * sigma
     number = f"{size:+.{digits}f} ± {spread:.{digits}f} {effect.unit}".replace(" °", "°")
     if times < SIGNIFICANT:
-        return Signature(effect, value, sigma, moves_m, "none", f"{effect.name}: no sign of it ({number})")
-    told = f"{times:.0f} σ, {100.0 * moves_m:.1f} cm at the edge"
+        return Signature(effect, value, sigma, moves_m, "none", f"{effect.name}: not significant ({number})")
+    size_words = f"{times:.0f} σ, {100.0 * moves_m:.1f} cm at the edge"
     if moves_m < MATTERS_M:
         return Signature(
-            effect, value, sigma, moves_m, "small", f"{effect.name}: {number}, too small to matter ({told})"
+            effect, value, sigma, moves_m, "small", f"{effect.name}: {number}, too small to matter ({size_words})"
         )
-    words = f"{effect.name}: {effect.look}; add {number} to {effect.key} ({told})"
+    words = f"{effect.name}: {effect.look}; add {number} to {effect.key} ({size_words})"
     return Signature(effect, value, sigma, moves_m, "significant", words)
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-TO_CONFIRM = "limits as of the editions named; confirm them against the edition in the contract"
+TO_CONFIRM = "the limits are those of the editions named; confirm them against the edition in the contract"
 USGS = "USGS Lidar Base Specification 2.x"
 ASPRS_2014 = "ASPRS Positional Accuracy Standards, edition 1, 2014"
 

@@ -165,7 +165,7 @@ class _Search:
             if abs(self._planes[first].normal_t @ self._planes[second].normal_t) > np.cos(
                 self._settings.least_angle_rad
             ):
-                self.refused["ridge: planes nearly parallel"] += 1
+                self.refused["ridge: the planes are nearly parallel"] += 1
                 continue
             tie = self._ridge(first, second)
             if isinstance(tie, str):
@@ -184,10 +184,10 @@ class _Search:
                 stretches[swath] = stretch
         self._meeting[first, second] = frozenset(stretches)
         if len(stretches) < 2:
-            return "planes do not meet in two swaths"
+            return "the planes do not intersect in two swaths"
         low, high = max(low for low, _ in stretches.values()), min(high for _, high in stretches.values())
         if high - low < self._settings.least_length_m:
-            return "swaths share too little of it"
+            return "the swaths share too little of it"
         line = (direction, 0.5 * (low + high), self._settings.along_sigma_m**2)
         seen = {swath: meet((one[swath], other[swath]), line) for swath in stretches}
         good = {
@@ -237,7 +237,7 @@ class _Search:
     def _corner(self, *three: int) -> TiePoint | str:
         volume = abs(float(np.linalg.det([self._planes[index].normal_t for index in three])))
         if volume < self._settings.least_volume:
-            return "planes nearly in one line"
+            return "the planes are nearly in one line"
         swaths = frozenset.intersection(*(self._meeting[pair] for pair in combinations(three, 2)))
         good: dict[int, tuple[FloatArray, FloatArray]] = {}
         met = 0
@@ -251,7 +251,7 @@ class _Search:
             if np.sqrt(np.linalg.eigvalsh(covariance)[-1]) <= self._settings.greatest_sigma_m:
                 good[swath] = point, covariance
         if len(good) < 2:
-            return "planes do not meet in two swaths" if met < 2 else "too uncertain"
+            return "the planes do not intersect in two swaths" if met < 2 else "too uncertain"
         names = "/".join(self._planes[index].name for index in three)
         return self._tie(f"corner {names}", "corner", good, three)
 

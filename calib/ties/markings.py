@@ -105,7 +105,7 @@ def find_markings(flight: Flight, settings: MarkingSettings = _DEFAULT) -> Featu
     for index, swath in enumerate(flight.swaths):
         for square in squares_of(swath, grid, settings.least_density):
             if not (square.rms_m <= settings.rms_m and square.slope <= settings.flat_slope):
-                refused["marking: ground not flat"] += 1
+                refused["marking: the ground is not flat"] += 1
             else:
                 squares.setdefault(square.number, {})[index] = square
     shared = {number: seen for number, seen in squares.items() if len(seen) > 1}
@@ -224,18 +224,18 @@ def _cells(metres: float, cell_m: float) -> int:
 def shifted(image: Image, other: Image, settings: MarkingSettings) -> Shift | str:
     """Return the shift of the same pattern in the other image; a string is the reason of failure."""
     if not (image.whole and other.whole):
-        return "holes in the ground"
+        return "the ground has holes"
     search = _cells(settings.search_m, settings.cell_m)
     template = image.value[search:-search, search:-search]
     if np.ptp(template) <= 0.0 or np.ptp(other.value) <= 0.0:
-        return "no pattern"
+        return "the ground has no pattern"
     correlation = _correlations(template, other.value)
     row, column = np.unravel_index(np.argmax(correlation), correlation.shape)
     peak = float(correlation[row, column])
     if peak < settings.least_correlation:
-        return "too little in common"
+        return "the strips have too little in common"
     if not (1 <= row <= 2 * search - 1 and 1 <= column <= 2 * search - 1):
-        return "farther apart than the search"
+        return "the shift exceeds the search radius"
     surface = _surface(correlation[row - 1 : row + 2, column - 1 : column + 2])
     curvature = -np.array([[2.0 * surface[3], surface[4]], [surface[4], 2.0 * surface[5]]])
     if np.linalg.eigvalsh(curvature)[0] <= 0.0:
@@ -245,12 +245,12 @@ def shifted(image: Image, other: Image, settings: MarkingSettings) -> Shift | st
         return "no single peak"
     away = _away(correlation, int(row), int(column), settings)
     if away > peak - settings.unique:
-        return "several places look alike"
+        return "several places match equally well"
     area_m2 = (template.shape[0] * settings.cell_m) ** 2
     unexplained = 2.0 * (1.0 - min(peak, 1.0)) * 4.0 * np.pi * image.smooth_m**2 / area_m2
     covariance = unexplained * np.linalg.inv(curvature) * settings.cell_m**2
     if np.sqrt(np.linalg.eigvalsh(covariance)[1]) > settings.greatest_sigma_m:
-        return "pattern without a second direction"
+        return "the pattern has one direction only"
     shift_m = settings.cell_m * (np.array([column - search, row - search]) + off)
     return Shift(shift_m, covariance, peak)
 
@@ -262,7 +262,7 @@ def there_and_back(image: Image, other: Image, settings: MarkingSettings) -> Shi
         return there if isinstance(there, str) else str(back)
     apart = there.shift_m + back.shift_m
     if apart @ np.linalg.solve(there.covariance + back.covariance, apart) > BACK:
-        return "another place the other way"
+        return "matching in reverse gives another place"
     return there
 
 

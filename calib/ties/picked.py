@@ -74,18 +74,18 @@ def read_picked(text: str, name: str) -> tuple[Picked, ...]:
     try:
         rows = [(reader.line_num, cells) for cells in reader]
     except csv.Error as error:
-        raise PickedError(f"{name}: line {reader.line_num}: no CSV: {error}") from None
+        raise PickedError(f"{name}: line {reader.line_num}: not CSV: {error}") from None
     header = [cell.strip() for cell in rows[0][1]] if rows else []
     if sorted(header) != sorted(HEADER):
         got = " ".join(", ".join(header).split()) or "nothing"
-        raise PickedError(f"{name}: line 1: got {got}; want the columns {', '.join(HEADER)}")
+        raise PickedError(f"{name}: line 1: has {got}; the columns must be {', '.join(HEADER)}")
     picked = [
         _row(dict(zip(header, cells, strict=False)), f"{name}: line {number}")
         for number, cells in rows[1:]
         if any(cell.strip() for cell in cells) and not cells[0].lstrip().startswith("#")
     ]
     if not picked:
-        raise PickedError(f"{name}: no points; want at least one seen in two strips")
+        raise PickedError(f"{name}: has no points; give at least one point that two strips see")
     return tuple(picked)
 
 
@@ -94,7 +94,7 @@ def _row(cells: dict[str, str], where: str) -> Picked:
     for key in HEADER:
         cell = cells.get(key, "").strip()
         if not cell:
-            raise PickedError(f"{where}: {key} is missing; want {', '.join(HEADER)}")
+            raise PickedError(f"{where}: {key} is missing; each line needs {', '.join(HEADER)}")
         values[key] = cell
     numbers = []
     for key in HEADER[2:]:
@@ -122,9 +122,9 @@ def picked_ties(flight: Flight, picked: Sequence[Picked], settings: PickedSettin
         index = _swath(flight, one)
         at, away_m = _nearest(flight.swaths[index], one.place, settings.nearest_m)
         if not away_m <= settings.nearest_m:
-            refused["picked: no return of the strip near it"] += 1
+            refused["picked: the strip has no return near it"] += 1
         elif index in named.setdefault(one.name, {}):
-            refused["picked: twice in one strip"] += 1
+            refused["picked: given twice in one strip"] += 1
         else:
             named[one.name][index] = Sighting(index, at, one.place, one.sigma_m**2 * np.eye(3))
     ties = []
@@ -133,11 +133,11 @@ def picked_ties(flight: Flight, picked: Sequence[Picked], settings: PickedSettin
         places = np.array([one.point_t for one in seen]).reshape(-1, 3)
         near = np.linalg.norm(places - np.median(places, axis=0), axis=1) <= settings.apart_m if len(seen) else []
         kept = tuple(one for one, good in zip(seen, near, strict=True) if good)
-        refused["picked: far from its other sightings"] += len(seen) - len(kept)
+        refused["picked: far from its places in other strips"] += len(seen) - len(kept)
         if len(kept) > 1:
             ties.append(TiePoint(name, kept, kind="picked"))
         else:
-            refused["picked: seen in one strip only"] += 1
+            refused["picked: given in one strip only"] += 1
     return Features(ties=tuple(ties), refused=+refused)
 
 
@@ -162,9 +162,9 @@ def _swath(flight: Flight, one: Picked) -> int:
     numbered = [index for index, swath in enumerate(flight.swaths) if str(swath.strip) == one.strip.lstrip("0")]
     if len(numbered) == 1:
         return numbered[0]
-    got = "is none of the flight's" if not numbered else "is of several scanners"
+    got = "is not a strip of the flight" if not numbered else "was scanned by several scanners"
     choice = ", ".join(names if not numbered else [names[index] for index in numbered])
-    raise PickedError(f"{one.where}: strip {one.strip} {got}; want one of {choice}")
+    raise PickedError(f"{one.where}: strip {one.strip} {got}; use one of {choice}")
 
 
 def _nearest(swath: Swath, place_t: FloatArray, within_m: float) -> tuple[int, float]:

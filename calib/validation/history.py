@@ -225,15 +225,18 @@ def history(calibrations: Sequence[Calibration]) -> tuple[History, ...]:
     for one in calibrations:
         installation, created = one.header.get("installation"), one.header.get("created")
         if not installation:
-            raise HistoryError(f"calibration {one.id}: names no installation; a history wants calibration.installation")
+            raise HistoryError(f"calibration {one.id}: has no calibration.installation; a history needs it")
         if not isinstance(created, dt.datetime):
-            raise HistoryError(f"calibration {one.id}: calibration.created is no time; want 2026-11-21T10:15:00Z")
+            raise HistoryError(
+                f"calibration {one.id}: calibration.created is not a time; write it like 2026-11-21T10:15:00Z"
+            )
         if not EARLIEST <= created.year <= LATEST:
             raise HistoryError(
-                f"calibration {one.id}: calibration.created is of the year {created.year}; want its own time"
+                f"calibration {one.id}: calibration.created lies in the year {created.year}; give the time when "
+                "it was made"
             )
         if one.id in seen:
-            raise HistoryError(f"calibration {one.id}: stands twice; want each once")
+            raise HistoryError(f"calibration {one.id}: is given twice; give each calibration once")
         seen.add(one.id)
         time = (created if created.tzinfo else created.replace(tzinfo=dt.UTC)).timestamp()
         groups.setdefault((one.scanner, str(installation)), []).append((time, one))
@@ -249,7 +252,7 @@ def _history(key: tuple[str, str], group: list[tuple[float, Calibration]]) -> Hi
         step = compare(one, two, BORESIGHT)
         why = difference_between(one, two, min((row.sigma for row in step.rows), default=math.inf))
         if why:
-            notes.append(f"{key[0]}: not judged between {when[one.id]} and {when[two.id]}: {why}")
+            notes.append(f"{key[0]}: the step between {when[one.id]} and {when[two.id]} was not tested: {why}")
         else:
             steps.append(step)
     trends = (
@@ -276,7 +279,7 @@ def _trend(name: str, tested: Sequence[tuple[float, Calibration]]) -> Trend:
 
 def _sentences(scanner: str, steps: Sequence[Compared], trends: Sequence[Trend], when: Mapping[str, str]) -> list[str]:
     if not steps:
-        return [f"{scanner}: fewer than two calibrations with sigmas: no drift can be tested"]
+        return [f"{scanner}: drift cannot be tested, because fewer than two calibrations have sigmas"]
     found = []
     for step in steps:
         if step.moved:
@@ -320,7 +323,7 @@ def _differences(one: Calibration, other: Calibration, limit_rad: float) -> Iter
         values = float(one.parameters[index]), float(other.parameters[index])
         estimated = bool(one.sigmas[index] > 0.0) + bool(other.sigmas[index] > 0.0)
         if estimated < 2 and abs(values[1] - values[0]) * TURNS.get(parameter.name, 1.0) > limit_rad:
-            held = "held in one" if estimated else "held"
+            held = "held in one of them" if estimated else "held"
             yield f"{parameter.key}, {held}, is {values[0] / parameter.factor:g} and {values[1] / parameter.factor:g}"
     for word, apart_rad in (
         ("range corrections by intensity", METRE * _ibrc_apart_m(one, other)),

@@ -58,14 +58,16 @@ WORDS = {
     "other": "planes seen by any two strips",
 }
 WANTS = {
-    "testfield": "want control (--control)",
-    "crossStripFlight": "want strips that cross",
-    "secondFlight": "want the log of a second flight",
-    "secondAltitude": f"want strips at heights above ground that differ by {100 * (HEIGHTS_RATIO - 1):.0f} % or more",
-    "measurementActualParameters": "want the parameters measured anew (--anew)",
-    "other": "want strips that share planes",
+    "testfield": "needs control (--control)",
+    "crossStripFlight": "needs strips that cross",
+    "secondFlight": "needs the log of a second flight",
+    "secondAltitude": f"needs strips at heights above ground that differ by {100 * (HEIGHTS_RATIO - 1):.0f} % or more",
+    "measurementActualParameters": "needs independently measured parameters (--anew)",
+    "other": "needs strips that share planes",
 }
-NOT_BOTH = "no parameter was estimated in both; want a calibration file with sigmas, as swath calibrate writes it"
+NOT_BOTH = (
+    "both calibrations estimated no common parameter; give a calibration file with sigmas, as swath calibrate writes it"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,16 +200,16 @@ class Validation:
         """The verdict, with unfulfilled requests and undetectable errors."""
         applied = [method for method in self.methods if method.passed is not None]
         failed = [method.name for method in applied if not method.passed]
-        undone = f"what was asked for could not be done: {'; '.join(self.undone)}" if self.undone else ""
+        undone = f"a requested check could not be done: {'; '.join(self.undone)}" if self.undone else ""
         if not applied:
             return f"nothing could be validated{'; ' if undone else ''}{undone}"
         alone = " (not independent)" if self.dependent else ""
         if failed:
             verdict = f"the calibration does not hold{alone}: {', '.join(failed)} of {len(applied)} methods failed"
             return f"{verdict}{'; ' if undone else ''}{undone}"
-        could = f"{len(applied)} of 6 methods could be applied, none speaks against it"
+        could = f"{len(applied)} of 6 methods could be applied, and all passed"
         if undone:
-            return f"not validated as asked{alone}: {undone}; {could}{self._unseen()}"
+            return f"not validated as requested{alone}: {undone}; {could}{self._unseen()}"
         return f"the calibration holds{alone}: {could}{self._unseen()}"
 
     def _unseen(self) -> str:
@@ -216,8 +218,12 @@ class Validation:
         several = len({one.scanner for one in found}) > 1
         below = [f"{one.scanner} {one.words}" if several else one.words for one in found if one.seen]
         blind = [f"{one.scanner} {one.name}" if several else one.name for one in found if not one.seen]
-        words = f"; errors below {', '.join(below)} would not be seen ({POWER:.0%} of larger ones are)" if below else ""
-        return words + (f"; none of {', '.join(blind)} would be seen" if blind else "")
+        words = (
+            f"; errors below {', '.join(below)} would not be detected ({POWER:.0%} of larger ones would)"
+            if below
+            else ""
+        )
+        return words + (f"; errors of {', '.join(blind)} would not be detected" if blind else "")
 
 
 @dataclass(frozen=True, eq=False)
@@ -293,15 +299,17 @@ def _undone(flight: Flight, validation: Validation, found: Mapping[str, Method],
     if asked.control is not None and found["testfield"].passed is None:
         lines.append(f"control: {_why(found['testfield'])}")
     if asked.anew is not None and found["measurementActualParameters"].passed is None:
-        lines.append(f"parameters anew: {asked.why_not_anew or _why(found['measurementActualParameters'])}")
+        lines.append(
+            f"independently measured parameters: {asked.why_not_anew or _why(found['measurementActualParameters'])}"
+        )
     if len(flight.trajectories) > 1 and found["secondFlight"].passed is None:
         lines.append(
-            f"{len(flight.trajectories)} flights: fewer than {FEWEST} distances of planes that two of them see"
+            f"{len(flight.trajectories)} flights: two of them share fewer than {FEWEST} distances between planes"
         )
     if validation.passed is not None:
         seen = {one.scanner for one in validation.detectable if one.seen}
         wanted = [head.name for head in flight.heads] if asked.scanners is None else asked.scanners
-        lines += [f"{name}: no error of its calibration would be seen" for name in wanted if name not in seen]
+        lines += [f"{name}: no method would detect an error of its calibration" for name in wanted if name not in seen]
     return tuple(lines)
 
 
@@ -313,7 +321,7 @@ def same_logs(calibration: Calibration, logs: Sequence[tuple[str, str]]) -> tupl
     """Return a sentence for each log (name, SHA-256) from which the calibration was made."""
     used = {entry.get("sha256", ""): entry.get("name", "") for entry in calibration.header.get("logs", [])}
     return tuple(
-        f"{name}: calibration {calibration.id} was made of this log; this is no independent validation of it"
+        f"{name}: calibration {calibration.id} was made from this log, so this validation is not independent"
         for name, sha256 in logs
         if sha256 in used
     )
@@ -435,13 +443,13 @@ def _sentence(name: str, what: str, numbers: Numbers, tests: Sequence[Test]) -> 
     elif len(tests) > 3 and not tests[3].passed:
         verdict = f"{tests[3].words}: p {tests[3].p:.2g}"
     elif not chi2.passed:
-        verdict = f"more than is expected (χ² {chi2.value:,.0f} of {chi2.freedom:,.0f}, p {chi2.p:.2g})"
+        verdict = f"more than expected (χ² {chi2.value:,.0f} of {chi2.freedom:,.0f}, p {chi2.p:.2g})"
     elif not mean.passed:
-        verdict = f"their mean is not zero (z {mean.value:.1f}, p {mean.p:.2g})"
+        verdict = f"the mean is not zero (z {mean.value:.1f}, p {mean.p:.2g})"
     elif stats.chi2.cdf(chi2.value, chi2.freedom) < ALPHA:
         verdict = (
-            f"less than is expected (χ² {chi2.value:,.0f} of {chi2.freedom:,.0f}): the trajectory's sigmas are larger "
-            "than its errors, so the test sees less than it could"
+            f"less than expected (χ² {chi2.value:,.0f} of {chi2.freedom:,.0f}): the trajectory's sigmas are larger "
+            "than its errors, so the test is less sensitive than it could be"
         )
     else:
         verdict = f"as expected (χ² {chi2.value:,.0f} of {chi2.freedom:,.0f}, p {chi2.p:.2g})"
@@ -460,7 +468,11 @@ def _testfield(
 ) -> Method:
     rows = control_rows(flight, control, calibrations, replace(rules, farthest_m=math.inf), prior)
     if len(rows) < FEWEST:
-        why = WANTS["testfield"] if not control else f"control is seen {len(rows)} times only; want {FEWEST} or more"
+        why = (
+            WANTS["testfield"]
+            if not control
+            else f"strips see control {len(rows)} times only; {FEWEST} or more are needed"
+        )
         return Method("testfield", None, (), f"testfield ({CODES['testfield']}): not applied: {why}")
     numbers, tests = Numbers.of(rows.value_m), distance_tests(rows)
     what = f"laser above control: {numbers.count:,} distances at {len(set(rows.name))} points"
@@ -470,26 +482,26 @@ def _testfield(
 
 def _anew(calibrations: Mapping[str, Calibration], anew: Mapping[str, Calibration] | None) -> Method:
     name = "measurementActualParameters"
-    told: list[tuple[str, Compared]] = []
+    compared: list[tuple[str, Compared]] = []
     for scanner in sorted(set(calibrations) & set(anew or {})):
         assert anew is not None
-        told.append((scanner, compare(calibrations[scanner], anew[scanner])))
-    told = [one for one in told if one[1].freedom]
-    if not told:
+        compared.append((scanner, compare(calibrations[scanner], anew[scanner])))
+    compared = [one for one in compared if one[1].freedom]
+    if not compared:
         return Method(name, None, (), f"{name} ({CODES[name]}): not applied: {NOT_BOTH if anew else WANTS[name]}")
-    squares, freedom = sum(one.chi2 for _, one in told), sum(one.freedom for _, one in told)
+    squares, freedom = sum(one.chi2 for _, one in compared), sum(one.freedom for _, one in compared)
     test = Test("chi2", squares, float(freedom), float(stats.chi2.sf(squares, freedom)))
-    rows = [row for _, one in told for row in one.rows]
+    rows = [row for _, one in compared for row in one.rows]
     largest = max(rows, key=lambda row: abs(row.difference) / row.sigma)
     verdict = "agree with the calibration" if test.passed else "do not agree with the calibration"
     sentence = (
-        f"{name} ({CODES[name]}): {freedom} parameters measured anew {verdict} (χ² {squares:.1f} of {freedom}, "
-        f"p {test.p:.2g}); largest: {largest.words}"
+        f"{name} ({CODES[name]}): {freedom} independently measured parameters {verdict} (χ² {squares:.1f} of "
+        f"{freedom}, p {test.p:.2g}); largest: {largest.words}"
     )
     shift = math.sqrt(_noncentrality(freedom))
     smallest = tuple(
         Detectable(scanner, row.name, shift / math.sqrt(weight))
-        for scanner, one in told
+        for scanner, one in compared
         for row, weight in zip(one.rows, one.weights, strict=True)
     )
     return Method(name, None, (test,), sentence, {"parameters": [row.record() for row in rows]}, smallest)

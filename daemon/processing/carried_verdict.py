@@ -84,7 +84,7 @@ def told_before(carried: Sequence[Carried], *refused: type[Exception]) -> Iterat
         bad = next((one.line for one in carried if one.level is Level.UNUSABLE), "")
         if wrong_use or not bad:
             raise
-        raise UserError(f"{bad}; so: {error}") from error
+        raise UserError(f"{bad}; therefore: {error}") from error
 
 
 def refusal(entry: Mapping[str, Any]) -> str:
@@ -93,7 +93,7 @@ def refusal(entry: Mapping[str, Any]) -> str:
     """
     if entry.get("level") != Level.UNUSABLE.words or entry.get("accepted"):
         return ""
-    return f"{first_lines(entry)[0]}; --accept-verdict takes it all the same"
+    return f"{first_lines(entry)[0]}; use --accept-verdict to accept it"
 
 
 # ---------------------------------------------------------------------- calibrations
@@ -106,7 +106,7 @@ def calibration_verdicts(setup: Setup, source: str = "") -> Iterator[Carried]:
         setup: the setup of a log.
         source: source of its trajectory, ``navigated``, ``ins`` or ``file``; empty if it is not known.
     """
-    flown = setup.config.profile.installation
+    installation = setup.config.profile.installation
     for name, calibration in setup.calibrations.items():
         header = calibration.header
         level, reasons = LEVELS.get(str(header.get("verdict", "")), Level.GOOD), header.get("verdict_reasons")
@@ -116,18 +116,19 @@ def calibration_verdicts(setup: Setup, source: str = "") -> Iterator[Carried]:
         elif level is not Level.GOOD:
             yield Carried(level, f"calibration {calibration.id} of {name}{why}")
         made = str(header.get("installation", ""))
-        if made and flown and made != flown:
+        if made and installation and made != installation:
             yield Carried(
                 Level.UNUSABLE,
-                f'calibration {calibration.id} of {name}: is of installation "{made}", the log of "{flown}"; want '
-                "that of this mounting",
+                f'calibration {calibration.id} of {name}: belongs to installation "{made}", the log to '
+                f'"{installation}"; use the calibration of this mounting',
             )
         before = str(header.get("trajectory", ""))
         if {before, source} == {"navigated", "ins"}:
             yield Carried(
                 Level.CARE,
-                f"calibration {calibration.id} of {name}: was made with {MADE_WITH[before]}, here is "
-                f"{MADE_WITH[source]}, whose alignment is another; want the same (swath trajectory, --trajectory)",
+                f"calibration {calibration.id} of {name}: was made with {MADE_WITH[before]}, this run uses "
+                f"{MADE_WITH[source]}, whose alignment differs; use the same kind of trajectory (swath trajectory, "
+                "--trajectory)",
             )
 
 
@@ -136,8 +137,8 @@ def nominal_words(name: str, calibration: Calibration) -> str:
     sigmas = calibration.with_plausible_sigmas().all_sigmas
     off_m = RANGE_M * math.hypot(sigmas[INDEX["omega_rad"]], sigmas[INDEX["phi_rad"]])
     return (
-        f"calibration {calibration.id} of {name} is nominal: points may lie {off_m:.1f} m off for {RANGE_M:g} m of "
-        "range (one sigma); calibrate (swath calibrate), or give --calibration FILE"
+        f"calibration {calibration.id} of {name} is nominal: points may lie {off_m:.1f} m off at {RANGE_M:g} m of "
+        "range (one sigma); run swath calibrate, or give --calibration FILE"
     )
 
 
@@ -214,12 +215,12 @@ def _of_sidecar(file: Path, record: Mapping[str, Any], span_ns: tuple[int, int])
     carried: list[Carried] = []
     source = "file"
     for flight in record.get("flights", []):
-        told = flight.get("trajectory", {})
-        if told.get("first_gps_ns", 0) <= span_ns[1] and told.get("last_gps_ns", 1 << 62) >= span_ns[0]:
-            source = str(told.get("source", source))
+        entry = flight.get("trajectory", {})
+        if entry.get("first_gps_ns", 0) <= span_ns[1] and entry.get("last_gps_ns", 1 << 62) >= span_ns[0]:
+            source = str(entry.get("source", source))
             carried += [
                 Carried(LEVELS[one["level"]], f"trajectory {file}: {one['what']}")
-                for one in told.get("verdict", [])
+                for one in entry.get("verdict", [])
                 if one.get("level") in LEVELS
             ]
     return carried, source if source in MADE_WITH else "file"
@@ -234,7 +235,7 @@ def _reason(verdict: Mapping[str, Any]) -> str:
 
 def points_verdicts(sidecars: Sequence[Mapping[str, Any]]) -> list[Carried]:
     """Return the verdicts in the sidecars beside points, each reason once; sidecars of other software are ignored."""
-    told = [sidecar.get("verdict") for sidecar in sidecars if sidecar.get("format") == OF_POINTS]
-    reasons = [one for verdict in told if isinstance(verdict, dict) for one in verdict.get("reasons", [])]
+    entries = [sidecar.get("verdict") for sidecar in sidecars if sidecar.get("format") == OF_POINTS]
+    reasons = [one for verdict in entries if isinstance(verdict, dict) for one in verdict.get("reasons", [])]
     found = [Carried(LEVELS[one["level"]], str(one["what"])) for one in reasons if one.get("level") in LEVELS]
     return list(dict.fromkeys(found))

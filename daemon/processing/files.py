@@ -116,4 +116,4 @@ def refuse_no_name(session_id: str, log: Path) -> None:
     leads = session_id != Path(session_id).name or session_id in ("", ".", "..")
     if leads or not session_id.isprintable() or len(session_id.encode()) > LONGEST_NAME:
         shown = one_line(session_id[:80])
-        raise UserError(f'{log}: its session_id "{shown}" is no name of a file; is it a log of Swath\'s?')
+        raise UserError(f'{log}: its session_id "{shown}" is not a valid file name; give a log that Swath recorded')

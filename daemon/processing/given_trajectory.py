@@ -117,8 +117,10 @@ def _nearest(given: Given, setup: Setup, clocks: LogClocks) -> tuple[Apart | Non
         apart = apart_from_fixes(given.trajectory, rows, np.array(arms, dtype=np.float64))
         if apart is None or (best[0] is not None and max(best[0].fix_sigma_l) <= max(apart.fix_sigma_l)):
             continue
-        told = [fix.undulation_m for fix in fixes if fix.undulation_m is not None and math.isfinite(fix.undulation_m)]
-        best = apart, source, float(np.median(told)) if told else None
+        undulations = [
+            fix.undulation_m for fix in fixes if fix.undulation_m is not None and math.isfinite(fix.undulation_m)
+        ]
+        best = apart, source, float(np.median(undulations)) if undulations else None
     return best
 
 
@@ -147,9 +149,9 @@ def _datum_of(given: Given, setup: Setup) -> CRS | None:
 
 
 def _epoch(given: Given, setup: Setup) -> float:
-    said = setup.options.epoch if setup.options.epoch is not None else setup.config.output.epoch
+    epoch = setup.options.epoch if setup.options.epoch is not None else setup.config.output.epoch
     day, _ = utc_from_gps(given.trajectory.span[0], 0)
-    return said if said is not None else day.year + (day.timetuple().tm_yday - 0.5) / 365.25
+    return epoch if epoch is not None else day.year + (day.timetuple().tm_yday - 0.5) / 365.25
 
 
 def _judge_place(
@@ -165,11 +167,11 @@ def _judge_place(
     if unsaid:
         key = f"{source.replace('/', '.')}.lever_arm_m"
         reason = (
-            f"{key} is not configured, so that the antenna is taken to be at the body's origin; want it, to compare"
+            f"{key} is not configured, so the antenna is assumed at the body's origin; set it to allow the comparison"
         )
     line = f"{given.file}: {_figures(apart, source, log)}"
     if not reason and not refused and apart.sigmas < WARNED_SIGMAS:
-        reason = "such fixes may be wrong by that, or the trajectory is"
+        reason = "fixes of this kind may be wrong by this amount, or the trajectory may be"
     line += f": {reason or _unknown(apart, setup)}"
     (found.refused if refused and not by_datum and not unsaid else found.warnings).append(line)
 
@@ -209,8 +211,8 @@ def _reasons(given: Given, apart: Apart, undulation_m: float | None, setup: Setu
         named = datum_that_explains(fix_e, size_e, min(tolerance, 15.0), _epoch(given, setup))
         if named:
             yield (
-                f"its datum is another, as {named} lies against the fixes'; want --trajectory-datum, and the "
-                "receiver's in gnss.….datum, or coordinates of the fixes' datum"
+                f"its datum differs as {named} differs from that of the fixes; set --trajectory-datum, and the "
+                "receiver's datum in gnss.….datum, or give coordinates in the fixes' datum"
             )
 
 
@@ -224,10 +226,13 @@ def _other_point(given: Given, apart: Apart) -> Iterator[str]:
     for words, point in given.points_b.items():
         shift = np.array(point) - np.array(given.offset_b)
         if np.linalg.norm(shift) > tolerance and (np.abs(median_b - shift) < tolerance).all():
-            yield f"it is of another point; want --trajectory-at {words}"
+            yield f"it describes another point; use --trajectory-at {words}"
     arm = apart.of.arm_b
     if np.linalg.norm(arm) > tolerance and (np.abs(np.abs(median_b) - 2.0 * np.abs(arm)) < tolerance).all():
-        yield "the antenna's lever arm has another sign there than in gnss.….lever_arm_m; want both alike"
+        yield (
+            "the antenna's lever arm has the opposite sign in the trajectory and in gnss.….lever_arm_m; use one sign "
+            "in both"
+        )
 
 
 def _other_height(apart: Apart, undulation_m: float | None) -> Iterator[str]:
@@ -239,19 +244,22 @@ def _other_height(apart: Apart, undulation_m: float | None) -> Iterator[str]:
     if undulation_m is not None and abs(undulation_m) > tolerance:
         for sign, words in ((-1.0, "are above the geoid"), (1.0, "have the geoid's undulation added twice")):
             if abs(up - sign * undulation_m) < tolerance:
-                yield f"its heights {words}, which lies {undulation_m:+.1f} m from the ellipsoid there; {_ELLIPSOIDAL}"
+                yield (
+                    f"its heights {words}, which lies {undulation_m:+.1f} m from the ellipsoid at this place; "
+                    f"{_ELLIPSOIDAL}"
+                )
     height = float(np.median(geodetic_from_e(apart.of.fix_e)[2])) + float(apart.of.arm_b[2])  # of the body
     for above in (height, height - (undulation_m or 0.0)):
         if abs(up + height - above / FOOT_M) < tolerance:
-            yield "its heights are in feet; want metres"
+            yield "its heights are in feet; give metres"
         if abs(up + height - above * FOOT_M) < tolerance:
-            yield "its heights were taken for feet, and are metres; want metres"
+            yield "its heights were converted from feet, but were metres; give metres"
     sure = float(np.median(np.abs(apart.of.in_l(apart.of.apart_e)[:, 2] - up))) < tolerance
     if undulation_m is None and REFUSED_M <= abs(up) < GREATEST_UNDULATION_M and sure:
-        yield f"its heights may be above the geoid, whose height no receiver says; {_ELLIPSOIDAL}"
+        yield f"its heights may be above the geoid, and no receiver reports the geoid's height; {_ELLIPSOIDAL}"
 
 
-_ELLIPSOIDAL = "want ellipsoidal heights"
+_ELLIPSOIDAL = "give ellipsoidal heights"
 
 
 def _other_time(apart: Apart) -> Iterator[str]:
@@ -283,10 +291,10 @@ def _other_angles(apart: Apart) -> Iterator[str]:
 
 def _unknown(apart: Apart, setup: Setup) -> str:
     if apart.metres >= 1000.0:
-        return "it is of another place: of another flight, or in coordinates of another kind"
+        return "it lies in another place: it belongs to another flight, or its coordinates are of another kind"
     return (
-        "it may be of another flight, another datum, another point (--trajectory-at), or gnss.….lever_arm_m or the "
-        "place of the corrections' base may be wrong"
+        "it may belong to another flight, datum or point (--trajectory-at), or gnss.….lever_arm_m or the position of "
+        "the corrections' base station may be wrong"
     )
 
 
@@ -298,26 +306,28 @@ def _judge_motion(given: Given, setup: Setup, clocks: LogClocks, log: Path, foun
     if motion is None:
         return
     axes = ", ".join(f"{value:+.2f}" for value in motion.by_axis)
-    told = f"(correlations about the axes forward, right, down {axes}; {motion.correlation:+.2f} in all)"
+    correlations = f"(correlations about the axes forward, right, down {axes}; {motion.correlation:+.2f} in all)"
     if motion.convention:
         found.refused.append(
-            f"{given.file}: turns as the IMU in {log} does if {motion.convention} ({motion.converted:+.2f} then) "
-            f"{told}; want axes forward, right, down against north, east, down; or imu.….rotation_b_imu is another"
+            f"{given.file}: turns like the IMU in {log} only if {motion.convention} ({motion.converted:+.2f} "
+            f"then) {correlations}; give axes forward, right, down relative to north, east, down, or correct "
+            "imu.….rotation_b_imu"
         )
     elif motion.is_other:
         found.refused.append(
-            f"{given.file}: does not turn as the IMU in {log} does {told}; want the trajectory of this flight, or "
-            "imu.….rotation_b_imu is another"
+            f"{given.file}: does not turn like the IMU in {log} {correlations}; give the trajectory of this flight, or "
+            "correct imu.….rotation_b_imu"
         )
     elif motion.gusts_are_others:
         found.refused.append(
-            f"{given.file}: turns as the IMU in {log} does, but gusts shake it otherwise (correlation "
-            f"{motion.gusts:+.2f} from 0.5 to 2.5 Hz): it is of another flight over the same lines; want this one's"
+            f"{given.file}: turns like the IMU in {log}, but its response to gusts differs (correlation "
+            f"{motion.gusts:+.2f} from 0.5 to 2.5 Hz): it belongs to another flight over the same lines; give that of "
+            "this flight"
         )
     elif motion.correlation < UNLIKE:
         found.warnings.append(
-            f"{given.file}: does not turn as the IMU in {log} does {told}; it may be of another flight, or "
-            "imu.….rotation_b_imu be another"
+            f"{given.file}: does not turn like the IMU in {log} {correlations}; it may belong to another flight, or "
+            "imu.….rotation_b_imu may be wrong"
         )
     if not found.refused:
         _judge_heading(given, setup, clocks, log, found)
@@ -340,11 +350,11 @@ def _judge_heading(given: Given, setup: Setup, clocks: LogClocks, log: Path, fou
         middle = given.trajectory.position_e[len(given.trajectory) // 2]
         grid_deg = math.degrees(setup.mapping.convergence_rad(middle))
     line = (
-        f"{given.file}: its heading is {offset_deg:+.2f} ± {sigma_deg:.3f}° off, by the accelerations flown against "
-        f"those that the IMU in {log} felt"
+        f"{given.file}: its heading is {offset_deg:+.2f} ± {sigma_deg:.3f}° off, by comparison of its accelerations "
+        f"with those of the IMU in {log}"
     )
     if abs(grid_deg) > 0.1 and abs(offset_deg + grid_deg) < max(3.0 * sigma_deg, 0.1):
-        line += f": it counts from grid north, which lies {grid_deg:+.2f}° from true north; want true headings"
+        line += f": it counts from grid north, which lies {grid_deg:+.2f}° from true north; give true headings"
     else:
-        line += "; want headings from true north, of the body's x axis"
+        line += "; give headings of the body's x axis from true north"
     (found.refused if abs(offset_deg) >= REFUSED_HEADING_DEG else found.warnings).append(line)

@@ -59,7 +59,7 @@ def find_stamps(index: LogIndex, setup: Setup, host: HostClocks) -> FrozenClocks
     plans = {source: plan for source, plan in host.plan.devices.items() if plan.stamps is not None}
     own = {source for source, plan in plans.items() if plan.clock == source}
     if not plans or (not own and all(plan.stamps is StampScale.FREE for plan in plans.values())):
-        return FrozenClocks(host, {source: Stamps(StampScale.FREE, "configured so") for source in plans})
+        return FrozenClocks(host, {source: Stamps(StampScale.FREE, "as configured") for source in plans})
     read = _Reader(setup, plans)
     read.take(index, _pieces(index.scanner_chunks()))
     for source in own:
@@ -146,22 +146,24 @@ def _trouble(read: _Reader, source: str, *, own: bool) -> str:
     if not (locked == 1).any():
         states = {str(status.values["pps_status"]) for status in read.statuses[source] if "pps_status" in status.values}
         if states == {"absent"}:
-            facts.append("says that no pulse reaches it; want the receiver's PPS wired to it")
+            facts.append("reports that no pulse reaches it; wire the receiver's PPS to it")
         else:
-            told = f" ({', '.join(sorted(states))})" if states else ""
-            facts.append(f"says that it is not locked to its pulse{told}; want a steady PPS, wired to it")
+            states_text = f" ({', '.join(sorted(states))})" if states else ""
+            facts.append(f"reports that it is not locked to its pulse{states_text}; wire a steady PPS to it")
     messages = read.messages[source]
     valid = [message.host_time_ns for message in messages if message.valid]
     if own and not messages:
-        facts.append("passes on no NMEA sentence that names a time; want RMC of a receiver with a fix at its input")
+        facts.append("passes on no NMEA sentence with a time; connect RMC of a receiver with a fix to its input")
     elif own and not valid and any(is_void(status) for status in read.statuses[source]):
         facts.append(
-            f"passes on {len(messages):,} sentences, all void (no fix yet); want the receiver's antenna under open "
-            "sky, and a recording that begins with its fix"
+            f"passes on {len(messages):,} sentences, all void (no fix yet); place the receiver's antenna under open "
+            "sky, and start recording after its fix"
         )
     elif own and valid and valid[-1] - valid[0] < LEAST_SENTENCES_NS:
         span_s = (valid[-1] - valid[0]) / SECOND_NS
-        facts.append(f"names the time over {span_s:.0f} s only; want {LEAST_SENTENCES_NS // SECOND_NS} s of sentences")
+        facts.append(
+            f"sends the time over {span_s:.0f} s only; record {LEAST_SENTENCES_NS // SECOND_NS} s of sentences"
+        )
     return "; it ".join(facts)
 
 
@@ -242,13 +244,13 @@ def stamp_lines(clocks: FrozenClocks) -> list[str]:
     host = clocks.host
     own = [source for source, plan in host.plan.devices.items() if plan.clock == source]
     lines = [
-        f"{source}: no receiver is in the log: GPS time is by {_own_words(clocks, source)}, with "
+        f"{source}: the log has no receiver, so GPS time comes from {_own_words(clocks, source)}, with "
         f"{host.by_source[source].leap_seconds_at(near_ns)} leap seconds"
         for source in sorted(own)
         if (near_ns := host.by_source[source].coarse_gps_ns()) is not None
     ]
     return lines + [
-        f"{source}: its stamps are taken as {found.scale.value}: {found.text}"
+        f"{source}: its stamps are read as {found.scale.value}: {found.text}"
         for source, found in sorted(clocks.stamps.items())
         if found.scale is not StampScale.FREE and not found.brief
     ]

@@ -104,8 +104,8 @@ def _weighed(path: Path, said: TimeKind, seconds: FloatArray) -> PointTimes:
     remedy = future or "set bit 0 of the header's global encoding"
     if said is TimeKind.OF_WEEK and not 0.0 <= low <= high < OF_WEEK_BELOW_S:
         doubt = (
-            f"{path}: its header says {said.value}, but its times, from {low:,.0f} s on, are none; "
-            f"taken for {TimeKind.ADJUSTED.value}: {remedy}"
+            f"{path}: its header says {said.value}, but its times, from {low:,.0f} s on, are not; they are read as "
+            f"{TimeKind.ADJUSTED.value}: {remedy}"
         )
         return PointTimes(path, TimeKind.ADJUSTED, seconds, doubt)
     if said is TimeKind.ADJUSTED and future:
@@ -113,8 +113,8 @@ def _weighed(path: Path, said: TimeKind, seconds: FloatArray) -> PointTimes:
     if said is TimeKind.ADJUSTED and 0.0 <= low <= high <= WEEK_S:
         day = GPS_EPOCH + dt.timedelta(seconds=LAS_ADJUSTED_ZERO_S + low)
         doubt = (
-            f"{path}: its header says {said.value}, by which its times, from {low:,.0f} s on, are of {day}; if they "
-            f"are {TimeKind.OF_WEEK.value}, clear bit 0 of the header's global encoding"
+            f"{path}: its header says {said.value}, so its times, from {low:,.0f} s on, belong to {day}; if they are "
+            f"{TimeKind.OF_WEEK.value}, clear bit 0 of the header's global encoding"
         )
         return PointTimes(path, said, seconds, doubt)
     return PointTimes(path, said, seconds)
@@ -129,11 +129,11 @@ def _of_the_future(adjusted_s: float) -> str:
     if adjusted_s + LAS_ADJUSTED_ZERO_S <= now_s + DAY_S:
         return ""
     day = GPS_EPOCH + dt.timedelta(seconds=LAS_ADJUSTED_ZERO_S + adjusted_s)
-    words = f"by that its times, from {adjusted_s:,.0f} s on, are of {day}, which is to come"
+    words = f"its times, from {adjusted_s:,.0f} s on, then belong to {day}, in the future"
     for what, zero_s in (("GPS seconds", 0), ("seconds since 1970", GPS_EPOCH_UNIX_S)):
         if adjusted_s - zero_s <= now_s + DAY_S:
             leap = ", and add the leap seconds" if zero_s else ""
-            return f"{words}; they look like {what}: take {LAS_ADJUSTED_ZERO_S + zero_s:,} s off them{leap}"
+            return f"{words}; they look like {what}: subtract {LAS_ADJUSTED_ZERO_S + zero_s:,} s from them{leap}"
     return words
 
 
@@ -144,8 +144,9 @@ def time_notes(times: Sequence[PointTimes]) -> list[str]:
     adjusted = [one.path.name for one in times if one.kind is TimeKind.ADJUSTED]
     if of_week and adjusted:
         notes.append(
-            f"files mix times: {TimeKind.OF_WEEK.value} in {_named(of_week)}; {TimeKind.ADJUSTED.value} in "
-            f"{_named(adjusted)}; a file merged of them needs one kind"
+            f"files have different kinds of times: {TimeKind.OF_WEEK.value} in {_named(of_week)}; "
+            f"{TimeKind.ADJUSTED.value} in {_named(adjusted)}; convert them to one kind before you merge them into a "
+            "file"
         )
     return notes
 
@@ -217,6 +218,6 @@ def _span_of_week(seconds: FloatArray) -> tuple[int, int]:
 
 def _untold(names: Sequence[str]) -> str:
     return (
-        f"{_named(names)}: times are {TimeKind.OF_WEEK.value}, and nothing says of which; they count among themselves "
-        "only: give it with --week"
+        f"{_named(names)}: times are {TimeKind.OF_WEEK.value}, and no file gives the week, so times are only relative "
+        "to each other; give the week with --week"
     )

@@ -16,5 +16,5 @@ def require_installed(command: str, *others: str) -> None:
     missing = [name for name in (*PROCESS, *others) if importlib.util.find_spec(name) is None]
     if missing:
         extras = ",".join(dict.fromkeys(["process", *(EXTRA_OF[name] for name in others)]))
-        text = f"{command} needs {', '.join(missing)}, not installed here: {how_to_install(extras)}"
+        text = f"{command} needs {', '.join(missing)}, which are not installed: {how_to_install(extras)}"
         raise UserError(text, ExitCode.USAGE)

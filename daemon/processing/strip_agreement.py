@@ -37,7 +37,7 @@ LIMITS = {
     "pulses_m2": "{:g} pulses per m²",
     "within_m": "{:g} m within strips",
     "overlap_m": "{:g} m RMSDz",
-    "overlap_max_m": "{:g} m for the largest difference, which 99 % of cells must keep",
+    "overlap_max_m": "{:g} m for the largest difference, which 99 % of cells must meet",
     "rmse_z_m": "{:g} m RMSEz",
 }
 
@@ -102,8 +102,8 @@ class Agreement:
         there = f"{self.cells:,} {'cell' if self.cells == 1 else 'cells'} of {self.cell_m:g} m in "
         there += f"{self.places} {'place' if self.places == 1 else 'places'}"
         return (
-            f"no verdict: strips were compared in {there}, and it takes {FEWEST_CELLS} in {FEWEST_PLACES}: want more "
-            "tiles with smooth open ground where strips overlap, or another --cell"
+            f"no verdict: strips were compared in {there}, but a verdict needs {FEWEST_CELLS} in {FEWEST_PLACES}: add "
+            "tiles with smooth open ground where strips overlap, or set another --cell"
         )
 
     def broken(self, level: str) -> list[str]:
@@ -116,13 +116,13 @@ class Agreement:
         if not self.judged:
             return [self.no_verdict]
         best = self.best
-        usgs = f"strips keep {best}" if best else "strips keep no quality level"
+        usgs = f"strips meet {best}" if best else "strips meet no quality level"
         levels = [one for one in self.judged if one.standard == USGS]
         above = levels[: next((k for k, one in enumerate(levels) if one.level == best), len(levels))]
         if above:
-            usgs += f"; {above[-1].level} not for its limit of {', '.join(_broken(above[-1]))}"
+            usgs += f"; {above[-1].level} fails its limit of {', '.join(_broken(above[-1]))}"
         asprs = next(one for one in self.judged if one.standard == ASPRS_2014)
-        fits = f"strips keep the {asprs.level} class" if asprs.all_kept else "strips keep no class"
+        fits = f"strips meet the {asprs.level} class" if asprs.all_kept else "strips meet no class"
         return [f"{USGS}: {usgs}", f"{ASPRS_2014}: {fits}", TO_CONFIRM]
 
     def record(self) -> dict[str, Any]:
@@ -305,7 +305,7 @@ def difference_map(
 
 
 def _words(strips: FlightStrips) -> str:
-    return f"RMSDz {100.0 * strips.rms_m:.1f} cm" if math.isfinite(strips.rms_m) else "nothing compared"
+    return f"RMSDz {100.0 * strips.rms_m:.1f} cm" if math.isfinite(strips.rms_m) else "no comparison"
 
 
 def _largest(grid: NDArray[np.float32], times: int) -> FloatArray:

@@ -63,7 +63,9 @@ def unread_lines(log: str, unread: Mapping[str, Mapping[str, int]]) -> tuple[lis
         for reason, count in sorted(counts.items()):
             if reason == SEQUENCE_GAP:
                 if len(counts) == 1:  # what was refused is missing from the sequence too
-                    warnings.append(f"{log}: {count:,} messages of scanner/{scanner} did not come, by its own numbers")
+                    warnings.append(
+                        f"{log}: {count:,} messages of scanner/{scanner} did not arrive, by their sequence numbers"
+                    )
                 continue
             why = WHY.get(reason, reason.replace("_", " "))
             line = f"{log}: {count:,} messages of scanner/{scanner} were not read: {why}"

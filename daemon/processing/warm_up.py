@@ -142,7 +142,7 @@ class WarmUp:
         where = (
             f"kept in {self.cache}"
             if self.cache is not None
-            else "no folder to keep them in can be written to, so every process compiles in memory: set NUMBA_CACHE_DIR"
+            else "no cache folder is writable, so every process compiles in memory; set NUMBA_CACHE_DIR"
         )
         return f"{what} in {self.seconds:.1f} s; {where}"
 
@@ -239,9 +239,9 @@ def _placed(setup: Setup) -> tuple[list[tuple[str, Points]], Trajectory | None]:
         for source in clocks.host.plan.pps:
             clocks.add_edge(source, PpsEdge(host_ns, second))
         week, of_week_ns = week_from_gps(START_NS + passed_ns)
-        said = TimeTag(TimeScale.GPS, of_week_ns, week=week, leap_seconds=LEAP_SECONDS)
+        tag = TimeTag(TimeScale.GPS, of_week_ns, week=week, leap_seconds=LEAP_SECONDS)
         for source in clocks.host.plan.gnss:
-            clocks.add_message(source, TimeMessage(host_ns + 50_000_000, said, NamesEdge.PREVIOUS, bound=True))
+            clocks.add_message(source, TimeMessage(host_ns + 50_000_000, tag, NamesEdge.PREVIOUS, bound=True))
         for source in clocks.host.plan.devices:
             clocks.add_samples(source, _device_clock(host_ns, passed_ns, second))
         stream.path.add(setup.sources.ins_rows(_solutions(setup, START_NS + passed_ns)))

@@ -206,8 +206,8 @@ class Air:
             return None
         return (
             f'atmosphere.refraction is "none": beams bend by {1e3 * bent_m:.1f} mm at the swath\'s edge '
-            f"({math.degrees(half_angle_rad):.0f}° from nadir, {height_above_ground_m:.0f} m above ground); "
-            '"spherical" corrects it'
+            f"({math.degrees(half_angle_rad):.0f}° from nadir, {height_above_ground_m:.0f} m above ground); set "
+            '"spherical" to correct it'
         )
 
 

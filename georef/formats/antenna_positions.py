@@ -35,7 +35,7 @@ def read_antenna_positions(
     elif is_csv(text):
         raise TrajectoryError(_finished(name))
     else:
-        raise TrajectoryError(f"{name}: is no file of an antenna's positions: RTKLIB .pos or Waypoint text is expected")
+        raise TrajectoryError(f"{name}: is not a file of antenna positions; give RTKLIB .pos or Waypoint text")
     if np.isfinite(columns.roll_rad).any():
         raise TrajectoryError(_finished(name))
     trajectory_of(columns, name, DEFAULT_MAX_GAP_NS)  # refuses rows that cannot be valid
@@ -43,6 +43,4 @@ def read_antenna_positions(
 
 
 def _finished(name: str) -> str:
-    return (
-        f"{name}: has attitudes, so it is a finished trajectory and no antenna's positions; want GNSS positions alone"
-    )
+    return f"{name}: has attitudes, so it is a finished trajectory; give a file of GNSS positions alone"

@@ -130,7 +130,7 @@ class PointPacker:
             raise LasError(self._out_of_bounds(points.points_map[wrong]))
         if head.sigmas:
             if points.sigma_map is None:
-                raise LasError("points without sigmas for a file with sigmas; want sigmas=False")
+                raise LasError("the points have no sigmas, but the file stores sigmas; open it with sigmas=False")
             _pack_sigmas(records, first, points.sigma_map, self._clipped)
         head.count += len(records)
         return records
@@ -141,8 +141,8 @@ class PointPacker:
         axis = int(np.argmin(inside))
         reach = _LARGEST * float(head.scale[axis])
         return (
-            f"{_AXES[axis]} {point[axis]:.3f} is beyond what a LAS file of scale {head.scale[axis]:g} can hold, "
-            f"{reach:,.0f} either side of {head.offset[axis]:,.0f}; want a larger scale or another coordinate system"
+            f"{_AXES[axis]} {point[axis]:.3f} exceeds the range of a LAS file of scale {head.scale[axis]:g}, "
+            f"{reach:,.0f} on either side of {head.offset[axis]:,.0f}; set a larger scale or another coordinate system"
         )
 
 

@@ -77,7 +77,7 @@ def _columns(numbered: list[tuple[int, list[str]]], titles: list[str], name: str
     needed = 2 + sum(widths)
     for number, row in numbered:
         if len(row) != needed:
-            raise TrajectoryError(f"{name}: line {number}: {needed} fields are expected, {len(row)} are there")
+            raise TrajectoryError(f"{name}: line {number}: {needed} fields are expected, {len(row)} were found")
     try:
         values = np.array([row[2:] for _, row in numbered], dtype=np.float64).reshape(len(numbered), -1)
     except ValueError as error:

@@ -143,7 +143,8 @@ def _table(data: bytes, name: str, kind: str, doubles: int) -> FloatArray:
     if not data or over:
         whole = len(data) // size
         raise TrajectoryError(
-            f"{name}: {len(data)} bytes are {whole} records of {kind} ({size} bytes) and {over} over: truncated or none"
+            f"{name}: {len(data)} bytes are {whole} records of {kind} ({size} bytes) and {over} over: the file is "
+            "truncated or of another kind"
         )
     table = np.frombuffer(data, dtype="<f8").reshape(-1, doubles).astype(np.float64)
     table[np.isnan(table)] = np.nan  # replaces signalling nans, which would raise at the first computation
@@ -152,7 +153,7 @@ def _table(data: bytes, name: str, kind: str, doubles: int) -> FloatArray:
     if wrong.any():
         at = int(np.argmax(wrong))
         raise TrajectoryError(
-            f"{name}: time {time_s[at]:.6g} at record {at + 1} is no second of a week; {kind} is expected"
+            f"{name}: time {time_s[at]:.6g} at record {at + 1} is not a second of the week; {kind} is expected"
         )
     large = (np.abs(table[:, 1:USED_DOUBLES]) > LARGEST).any(axis=1)  # nan: missing
     if large.any():
@@ -191,7 +192,7 @@ def _sigmas_at(of_week_ns: Int64Array, sigmas: Sigmas | None, name: str) -> tupl
         if theirs[0] <= of_week_ns[-1] and of_week_ns[0] <= theirs[-1]:
             break
     else:
-        raise TrajectoryError(f"{name}: the smrmsg beside it is of another time")
+        raise TrajectoryError(f"{name}: the smrmsg beside it covers another time")
     inside = (of_week_ns >= theirs[0]) & (of_week_ns <= theirs[-1])
 
     def linear(column: FloatArray) -> FloatArray:

@@ -41,7 +41,7 @@ def weeks_ns(weeks: Sequence[str], seconds: Sequence[str], name: str) -> Int64Ar
     for week, second in zip(weeks, seconds, strict=True):
         if not (WEEK.fullmatch(week) and SECONDS.fullmatch(second)):
             raise TrajectoryError(
-                f"{name}: '{week} {second}' is no date and clock time, nor a GPS week and its seconds"
+                f"{name}: '{week} {second}' is neither a date with a time of day nor a GPS week with its seconds"
             )
     of_week = np.rint(np.array(seconds, dtype=np.float64) * SECOND_NS).astype(np.int64)
     gps_ns: Int64Array = np.array(weeks, dtype=np.int64) * WEEK_NS + of_week
@@ -62,8 +62,8 @@ def leap_seconds_on(day: int, said: int | None, name: str) -> int:
     leap, certain = table_leap_seconds(date)
     if not certain:
         raise TrajectoryError(
-            f"{name}: its time is UTC, and leap seconds are known here until {LEAP_TABLE_VALID_UNTIL} only; "
-            f"export it in GPS time"
+            f"{name}: its time is UTC, and this program knows leap seconds only until {LEAP_TABLE_VALID_UNTIL}; "
+            "export it in GPS time"
         )
     return leap
 
@@ -74,16 +74,16 @@ def _date(text: str, order: str, name: str) -> dt.date:
         fields = {letter: int(part) for letter, part in zip(order, parts, strict=True)}
         year = fields["Y"] + (2000 if fields["Y"] < 100 else 0)
         if not FIRST_YEAR <= year <= LAST_YEAR:
-            raise TrajectoryError(f"{name}: {text[:20]!r} is of no year from {FIRST_YEAR} to {LAST_YEAR}")
+            raise TrajectoryError(f"{name}: {text[:20]!r} is not in a year from {FIRST_YEAR} to {LAST_YEAR}")
         return dt.date(year, fields["M"], fields["D"])
     except TrajectoryError:
         raise
     except (ValueError, KeyError, OverflowError):
-        raise TrajectoryError(f"{name}: {text!r} is no date in the order {order}") from None
+        raise TrajectoryError(f"{name}: {text!r} is not a date in the order {order}") from None
 
 
 def _of_day_ns(text: str, name: str) -> int:
-    said = CLOCK.fullmatch(text)
-    if said is None:
-        raise TrajectoryError(f"{name}: {text!r} is no time of day; hh:mm:ss is expected")
-    return (int(said[1]) * 60 + int(said[2])) * 60 * SECOND_NS + round(float(said[3]) * SECOND_NS)
+    match = CLOCK.fullmatch(text)
+    if match is None:
+        raise TrajectoryError(f"{name}: {text!r} is not a time of day; hh:mm:ss is expected")
+    return (int(match[1]) * 60 + int(match[2])) * 60 * SECOND_NS + round(float(match[3]) * SECOND_NS)

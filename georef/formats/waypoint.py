@@ -221,8 +221,8 @@ def _names(titles: str, separator: str | None) -> list[str]:
 def _blank_separated(lines: list[str], separator: str | None, columns: int) -> list[str]:
     """Return lines of data with blanks between columns and decimal points; an empty cell becomes ``nan``."""
     if separator is None:
-        told = " ".join(lines)
-        return [DECIMAL_COMMA.sub(".", line) for line in lines] if "," in told and "." not in told else lines
+        text = " ".join(lines)
+        return [DECIMAL_COMMA.sub(".", line) for line in lines] if "," in text and "." not in text else lines
     made = []
     for line in lines:
         cells = _cells(line, separator) if line.strip() else []
@@ -256,12 +256,13 @@ def _sheet(text: str, name: str) -> Sheet:
         if separator == "," and words < most <= 2 * words:
             raise TrajectoryError(
                 f"{name}: line {at + 3 + counts.index(most)} has {most} cells for {words} columns: decimal commas "
-                "cannot be told from commas between columns; export it with decimal points, or semicolons or blanks"
+                "cannot be distinguished from commas between columns; export it with decimal points, or with "
+                "semicolons or blanks between columns"
             )
-        raise TrajectoryError(f"{name}: no line of {words} words, as its columns have, below line {at + 2}")
+        raise TrajectoryError(f"{name}: no line with {words} words, the number of its columns, follows line {at + 2}")
     for number in range(rows[0], rows[-1]):  # a header and a footer are allowed, but not a gap between lines of data
         if counts[number] != words:
-            what = f"{words} words are expected, {counts[number]} are there"
+            what = f"{words} words are expected, {counts[number]} were found"
             raise TrajectoryError(f"{name}: line {number + at + 3}: {what}")
     data = below[rows[0] : rows[-1] + 1]
     return Sheet("\n".join(lines[:at]), columns, data, at + 3 + rows[0], name)
@@ -336,12 +337,12 @@ def _of_seconds(sheet: Sheet, time: str, days: Int64Array | None, span_ns: Span 
     """Return GPS time (n,) of seconds of the week, or of the day where a date shows that they are."""
     seconds = sheet.numbers(time)
     if not ((seconds >= 0.0) & (seconds < 10.0 * WEEK_S)).all():
-        raise TrajectoryError(f"{sheet.name}: a time is no number of seconds of a week")
+        raise TrajectoryError(f"{sheet.name}: a time is not a number of seconds of the week")
     if "week" in sheet.columns and week is None:
-        said = sheet.numbers("week")
-        if not ((said >= 0.0) & (said < 10_000.0)).all():
-            raise TrajectoryError(f"{sheet.name}: a week is no GPS week; whole numbers up to 9999 are expected")
-        weeks = np.rint(said).astype(np.int64)
+        week_numbers = sheet.numbers("week")
+        if not ((week_numbers >= 0.0) & (week_numbers < 10_000.0)).all():
+            raise TrajectoryError(f"{sheet.name}: a week is not a GPS week; whole numbers up to 9999 are expected")
+        weeks = np.rint(week_numbers).astype(np.int64)
         gps_ns: Int64Array = weeks * WEEK_NS + np.rint(seconds * SECOND_NS).astype(np.int64)
         return gps_ns
     if days is not None:

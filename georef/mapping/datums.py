@@ -36,7 +36,7 @@ SAME = "same"
 CONTINENTS = (4258, 6318, 4617, 7844, 4283, 4167, 6668, 4674, 4148)
 NATIONS = (4230, 4314, 4312, 4275, 4277, 4289, 4313, 4149, 4156, 4284, 4179, 4265, 4124, 4267, 4301, 4202, 4618, 4214)
 _NAMED = 'name their datum (gnss.datum or --trajectory-datum, such as "EPSG:7912", ITRF2014, with output.epoch)'
-_SAME = 'say "same" if they are in {datum} already'
+_SAME = 'set "same" if they are already in {datum}'
 _NOTHING = "PROJ knows no operation there"
 _METRE = "metre"
 _GEOCENTRIC_AXES = [
@@ -106,15 +106,17 @@ def read_target(text: str) -> Target:
     horizontal, vertical = _unbound(parts[0]), parts[1] if crs.is_compound else None
     if horizontal.is_geographic:
         raise MappingError(
-            f'output.crs = "{text}" ({crs.name}) is geographic, in degrees: a projected one is wanted, such as '
-            f'"EPSG:326ZZ" for UTM zone ZZ north on WGS 84'
+            f'output.crs = "{text}" ({crs.name}) is geographic, in degrees; use a projected CRS, such as "EPSG:326ZZ" '
+            "for UTM zone ZZ north on WGS 84"
         )
     if horizontal.is_vertical:
         raise MappingError(
-            f'output.crs = "{text}" ({crs.name}) is heights alone: write it behind a projected one, "EPSG:25832+7837"'
+            f'output.crs = "{text}" ({crs.name}) has heights only; write it after a projected CRS, "EPSG:25832+7837"'
         )
     if not (horizontal.is_projected or (horizontal.is_geocentric and vertical is None)):
-        raise MappingError(f'output.crs = "{text}" ({crs.name}) is neither projected nor geocentric')
+        raise MappingError(
+            f'output.crs = "{text}" ({crs.name}) is neither projected nor geocentric; use a projected CRS'
+        )
     _refuse_axes(text, crs, horizontal, vertical)
     return Target(text=text, crs=crs, horizontal=horizontal, vertical=vertical)
 
@@ -136,7 +138,7 @@ def read_source(datum: str | None, target: Target) -> CRS:
     if not (crs.is_geographic or crs.is_geocentric):
         geodetic = crs.geodetic_crs
         base = "" if geodetic is None else f', "{":".join(geodetic.to_authority() or (geodetic.name,))}"'
-        raise MappingError(f'datum = "{datum}" ({crs.name}) is no datum of positions: name its geodetic CRS{base}')
+        raise MappingError(f'datum = "{datum}" ({crs.name}) is not a datum of positions; name its geodetic CRS{base}')
     _refuse_ellipsoid(datum, crs)
     return _geocentric(crs)
 
@@ -240,7 +242,9 @@ def _judge(candidate: Transformer, target: Target, accuracy_m: float) -> _Judgem
             total += step.accuracy
     operation = _operation(candidate, total, realisation, tuple(grids))
     if total > accuracy_m + 1e-9:
-        return _Judgement(operation, f'PROJ\'s best operation, "{_short(operation.name)}", is good to {total:g} m only')
+        return _Judgement(
+            operation, f'PROJ\'s best operation, "{_short(operation.name)}", is accurate to {total:g} m only'
+        )
     return _Judgement(operation, "")
 
 
@@ -282,14 +286,17 @@ def _refusal(flat: _Candidates, judged: list[_Judgement], target: Target, datum:
     fault = f'the positions are in "{datum}", and {first.fault}: name another datum{same}'
     if first.operation is None:
         return fault
-    return f"{fault}; or take it with output.datum_accuracy_m = {first.operation.accuracy_m:g}"
+    return f"{fault}; or accept it with output.datum_accuracy_m = {first.operation.accuracy_m:g}"
 
 
 def _vertical_fault(whole: _Candidates) -> str:
     """Return why the heights are refused."""
     if whole.missing:
-        return f"its heights lack {_how_to_get(whole.missing)}"
-    return "PROJ knows no geoid model for its heights: take a vertical CRS it has one for, or ellipsoidal heights"
+        return f"its heights need {_how_to_get(whole.missing)}"
+    return (
+        "PROJ knows no geoid model for its heights: use a vertical CRS with a geoid model in PROJ, or ellipsoidal "
+        "heights"
+    )
 
 
 def _guesses(candidate: Transformer) -> bool:
@@ -303,7 +310,7 @@ def _with_heights(best: Transformer, flat: Operation, target: Target, area: Area
     if _apart_m(operation, flat, area) > max(accuracy_m, flat.stated_accuracy_m or 0.0):
         raise MappingError(
             f'output.crs = "{target.text}": PROJ\'s operation with heights, "{_short(operation.name)}", is not '
-            f'"{_short(flat.name)}" in the plane: take ellipsoidal heights, or another datum'
+            f'"{_short(flat.name)}" in the plane: use ellipsoidal heights, or another datum'
         )
     return operation
 
@@ -411,7 +418,7 @@ def _how_to_get(grids: tuple[tuple[str, bool], ...]) -> str:
     command = " ".join(f"--file {name}" for name, offered in grids if offered)
     get = f"`projsync {command}` (or `pyproj sync`), or " if command else ""
     return (
-        f"the grid {listed}, which is not installed: {get}a copy in {get_user_data_dir()}, PROJ's folder of this user"
+        f"the grid {listed}, which is not installed: {get}copy it to {get_user_data_dir()}, PROJ's folder of this user"
     )
 
 
@@ -426,7 +433,7 @@ def _read(text: str, key: str) -> CRS:
         return CRS.from_user_input(text)
     except CRSError as error:
         raise MappingError(
-            f'{key} = "{text}" is none that PROJ knows (EPSG:CODE, EPSG:CODE+CODE with heights, WKT): {error}'
+            f'{key} = "{text}" is unknown to PROJ (write EPSG:CODE, EPSG:CODE+CODE with heights, or WKT): {error}'
         ) from error
 
 
@@ -447,8 +454,8 @@ def _refuse_ellipsoid(datum: str, crs: CRS) -> None:
     if not _has_our_ellipsoid(crs):
         ellipsoid = "unknown" if crs.ellipsoid is None else crs.ellipsoid.name
         raise MappingError(
-            f'datum = "{datum}": {crs.name} is on the ellipsoid {ellipsoid}, positions are read on that of WGS 84 and '
-            f'GRS 1980: name the datum that the receiver or its corrections were in, such as "EPSG:7912"'
+            f'datum = "{datum}": {crs.name} is on the ellipsoid {ellipsoid}, but positions are read on that of WGS 84 '
+            'and GRS 1980: name the datum of the receiver or its corrections, such as "EPSG:7912"'
         )
 
 
@@ -458,7 +465,7 @@ def _geocentric(crs: CRS) -> CRS:
         return crs
     geodetic = crs.geodetic_crs
     if geodetic is None:
-        raise MappingError(f"{crs.name} has no datum that positions could be in")
+        raise MappingError(f"{crs.name} has no datum for positions")
     text = geodetic.to_json_dict()
     kept = {key: text[key] for key in ("name", "datum", "datum_ensemble", "prime_meridian") if key in text}
     system = {"subtype": "Cartesian", "axis": _GEOCENTRIC_AXES}
@@ -470,7 +477,7 @@ def _refuse_axes(text: str, crs: CRS, horizontal: CRS, vertical: CRS | None) -> 
     if any(axis.direction == "west" for axis in horizontal.axis_info) and horizontal.is_projected:
         raise MappingError(
             f'output.crs = "{text}" ({crs.name}) counts towards the west and south: points are written as easting, '
-            f"northing, height, so take the frame's version with these axes"
+            "northing, height, so use the version of the CRS with these axes"
         )
     if vertical is not None and any(axis.direction == "down" for axis in vertical.axis_info):
-        raise MappingError(f'output.crs = "{text}" ({crs.name}) counts depths: take heights, which count upwards')
+        raise MappingError(f'output.crs = "{text}" ({crs.name}) counts depths downwards; use a CRS with heights')

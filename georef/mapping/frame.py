@@ -189,12 +189,14 @@ class Mapping:
     def e_from_map(self, points_map: FloatArray) -> FloatArray:
         """Return positions in e (n, 3) of easting, northing, height (n, 3), by PROJ. The operation must be settled."""
         if self._operation is None:
-            raise MappingError(f'output.crs = "{self._target.text}": which operation leads there is still open')
+            raise MappingError(
+                f'output.crs = "{self._target.text}": the operation that leads to this CRS is not yet chosen'
+            )
         points = np.ascontiguousarray(points_map, dtype=np.float64)
         found = self._transform(points, TransformDirection.INVERSE)
         wrong = np.flatnonzero(~np.isfinite(found).all(axis=1))
         if len(wrong):
-            raise MappingError(f"{points[wrong[0]].tolist()} is no place in {self._target.crs.name}")
+            raise MappingError(f"{points[wrong[0]].tolist()} is not a place in {self._target.crs.name}")
         return found
 
     def description(self) -> dict[str, Any]:
@@ -261,8 +263,8 @@ class Mapping:
     def _refuse_timeless(self, operation: Operation) -> None:
         if operation.moves and self._epoch is None:
             raise MappingError(
-                f'output.crs = "{self._target.text}": "{operation.name.split(" + ")[0]}" moves with time: say when the '
-                f"positions were measured, as output.epoch = 2026.9"
+                f'output.crs = "{self._target.text}": "{operation.name.split(" + ")[0]}" changes with time: give the '
+                "epoch of the positions, such as output.epoch = 2026.9"
             )
 
     def _take(self, operation: Operation) -> None:
@@ -304,7 +306,7 @@ def _checked_epoch(epoch: float | None) -> float | None:
     if epoch is None:
         return None
     if not EPOCHS[0] <= epoch <= EPOCHS[1]:
-        raise MappingError(f"output.epoch = {epoch:g} is no decimal year from 1980 to 2100, such as 2026.9")
+        raise MappingError(f"output.epoch = {epoch:g} is not a decimal year from 1980 to 2100, such as 2026.9")
     return float(epoch)
 
 
@@ -313,7 +315,9 @@ def _area_of(points_e: FloatArray) -> Area:
     lat, lon, _ = (np.degrees(angle) for angle in geodetic_from_e(points_e))
     finite = np.isfinite(lat) & np.isfinite(lon)
     if not finite.any():
-        raise MappingError("the first position is not a number: there is no place to choose a datum operation for")
+        raise MappingError(
+            "the first position is not a number, so no datum operation can be chosen; give finite positions"
+        )
     lat, lon = lat[finite], np.sort(lon[finite])
     south, north = max(float(lat.min()) - NEARBY_DEG, -90.0), min(float(lat.max()) + NEARBY_DEG, 90.0)
     gaps = np.diff(np.append(lon, lon[0] + 360.0))
@@ -335,7 +339,7 @@ def _finite(mapped: FloatArray, points_e: FloatArray, text: str) -> FloatArray:
     if len(wrong):
         raise MappingError(
             f'output.crs = "{text}" has no coordinates for {len(wrong)} points, the first at '
-            f"{_place(points_e[wrong[0]])}: outside the projection, or outside its grids"
+            f"{_place(points_e[wrong[0]])}: they lie outside the domain of the projection or of its grids"
         )
     return mapped
 

@@ -89,7 +89,7 @@ def error_chain(run: FilterRun, time_ns: ArrayLike) -> ErrorChain:
     n = run.layout.size
     times = np.concatenate([block.time_ns for block in run.nodes]) if run.nodes else np.zeros(0, np.int64)
     if not len(times):
-        raise NavigationError("the filter's run has no nodes; want one that was kept for the smoother")
+        raise NavigationError("the filter's run has no nodes; use a run that was kept for the smoother")
     wanted = _nearest(times, time_ns)
     chain = ErrorChain(
         times[wanted],

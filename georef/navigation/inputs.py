@@ -112,7 +112,7 @@ class Inertial:
             raise NavigationError(f"inertial samples: columns of {n} times have shapes {shapes}")
         if n > 1 and not (np.diff(self.time_ns) > 0).all():
             at = int(np.argmax(np.diff(self.time_ns) <= 0)) + 1
-            raise NavigationError(f"inertial samples: time does not rise at sample {at}")
+            raise NavigationError(f"inertial samples: time does not increase at sample {at}")
 
     def __len__(self) -> int:
         """Return the number of samples."""

@@ -252,10 +252,10 @@ def find_noise(innovations: StructArray, stretch: Run, setup: Setup) -> NoiseFou
             of_speeds, first = lasting.log_likelihood - white.log_likelihood, lasting
     tried, best = _of_positions(judged, first)
     gain = best.log_likelihood - first.log_likelihood
-    told = tuple(replace(one, log_likelihood=one.log_likelihood - first.log_likelihood) for one in tried)
+    relative = tuple(replace(one, log_likelihood=one.log_likelihood - first.log_likelihood) for one in tried)
     if _too_large(best.setup, setup, counts):
-        return NoiseFound(setup, told, moments, counts, doubted=True)
-    return NoiseFound(best.setup, told, moments, counts, evidence, gain, of_speeds)
+        return NoiseFound(setup, relative, moments, counts, doubted=True)
+    return NoiseFound(best.setup, relative, moments, counts, evidence, gain, of_speeds)
 
 
 def _of_positions(judged: Judged, first: Hypothesis) -> tuple[list[Hypothesis], Hypothesis]:

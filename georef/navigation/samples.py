@@ -212,5 +212,5 @@ def _rotation(rot_b_from_imu: ArrayLike | None) -> FloatArray | None:
     rotation = np.asarray(rot_b_from_imu, dtype=np.float64)
     sound = rotation.shape == (3, 3) and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-5)
     if not sound or np.linalg.det(rotation) < 0.0:
-        raise NavigationError("rotation_b_imu: the rows are no rotation, want three orthonormal right-handed rows")
+        raise NavigationError("rotation_b_imu: the rows are not a rotation, want three orthonormal right-handed rows")
     return rotation

@@ -93,10 +93,10 @@ def noise_findings(run: Run, setup: Setup, grade: str, grades: Mapping[str, ImuN
         return
     for asked in contradicted(run, setup):
         key, factor = KEYS[asked.name], IN_KEY[asked.name]
-        said, tried = factor * getattr(setup.noise, asked.name), factor * getattr(asked.noise, asked.name)
+        configured, tried = factor * getattr(setup.noise, asked.name), factor * getattr(asked.noise, asked.name)
         yield Finding(
             "imu_noise",
             "warning",
-            f"the flight contradicts {key} = {said:g}: {tried:g} fits better (ln likelihood +{asked.gain:.0f}); set "
-            f"{table}.{key} larger, or calibrate the unit",
+            f"the flight contradicts {key} = {configured:g}: {tried:g} fits better (ln likelihood "
+            f"+{asked.gain:.0f}); set {table}.{key} larger, or calibrate the unit",
         )

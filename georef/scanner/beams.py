@@ -119,7 +119,7 @@ class FibreGeometry:
     def __post_init__(self) -> None:
         """Refuse a table without rows with `GeometryError`."""
         if not len(self.across_rad) or self.across_rad.shape != self.along_rad.shape or self.across_rad.ndim != 1:
-            raise GeometryError("geometry.file: want the angles across and along of at least one fibre")
+            raise GeometryError("geometry.file: needs the angles across and along of at least one fibre")
 
     def deflection(self, calibration: Calibration) -> Deflection:
         """Return the table as in `Geometry`."""
@@ -176,7 +176,7 @@ class RisleyGeometry:
         passes = max(index * math.sin(first), index * math.sin(steepest)) < 1.0
         if not passes or max(first, steepest) >= math.pi / 2:
             degrees = ", ".join(f"{math.degrees(wedge):g}" for wedge in self.wedge_rad)
-            text = f"got [{degrees}], want smaller ones: light is totally reflected"
+            text = f"got [{degrees}], want smaller angles: the prism reflects the light totally"
             raise GeometryError(f"geometry.wedge_deg: {text}")
 
     def deflection(self, calibration: Calibration) -> Deflection:
@@ -312,7 +312,7 @@ def read_fibres(text: str, name: str) -> FibreGeometry:
     """
     lines = [line.strip() for line in text.splitlines()]
     if not lines or lines[0].replace(" ", "") != "across_deg,along_deg":
-        raise GeometryError(f"{name}: line 1: want across_deg,along_deg")
+        raise GeometryError(f"{name}: line 1: the header must be across_deg,along_deg")
     rows = []
     for number, line in enumerate(lines[1:], start=2):
         try:
@@ -323,7 +323,7 @@ def read_fibres(text: str, name: str) -> FibreGeometry:
             rows.append((across, along))
     table = np.radians(np.array(rows, dtype=np.float64).reshape(-1, 2))
     if not len(table) or not np.isfinite(table).all():
-        raise GeometryError(f"{name}: want the two angles of at least one fibre, all finite")
+        raise GeometryError(f"{name}: needs the two angles of at least one fibre, all finite")
     return FibreGeometry(table[:, 0].copy(), table[:, 1].copy())
 
 
@@ -355,10 +355,10 @@ def _refuse(calibration: Calibration, without: tuple[str, ...], *, facets: int =
             text = f"{name} is {calibration.value(name):g}, want 0: this scanner has no such error"
             raise GeometryError(f"{where}: {text}")
     if not is_rotation(calibration.installation_matrix):
-        raise GeometryError(f"{where}: installation matrix: no rotation; want perpendicular rows of length 1")
+        raise GeometryError(f"{where}: installation matrix: is not a rotation; it needs perpendicular rows of length 1")
     for index in calibration.facet_tilt_rad:
         if index >= facets:
-            raise GeometryError(f"{where}: facet.index: got {index}, the scanner has {facets} facets")
+            raise GeometryError(f"{where}: facet.index: got {index}, but the scanner has {facets} facets")
     for channel in calibration.beams:
         if channel >= channels:
-            raise GeometryError(f"{where}: beam.channel: got {channel}, the scanner has {channels} beams")
+            raise GeometryError(f"{where}: beam.channel: got {channel}, but the scanner has {channels} beams")

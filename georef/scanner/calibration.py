@@ -24,7 +24,7 @@ ROTATION_TOLERANCE = 1e-6
 # in the units of the file: far beyond any true value, and within the range of squares
 LARGEST, LEAST_SIGMA = 1e18, 1e-15
 MOST = 65_535  # greatest number of channels, which have 16 bits, and limit of other counts
-ONE_TABLE = "want it once"
+ONE_TABLE = "give it once"
 TABLES = ("calibration", "parameters", "sigma", "held_sigma", "correlation", "ibrc", "range_offset", "facet", "beam")
 VERDICTS = ("good", "usable with care", "not to be used")
 
@@ -225,7 +225,7 @@ class _Reader:
         sigmas, estimated = self._sigmas("sigma")
         held_sigmas, held = self._sigmas("held_sigma")
         for index in np.flatnonzero((sigmas != 0.0) & (held_sigmas != 0.0)).tolist():
-            self._wrong(f"held_sigma.{PARAMETERS[index].key}", "is in [sigma] too; want it in one of the two tables")
+            self._wrong(f"held_sigma.{PARAMETERS[index].key}", "is also in [sigma]; give it in one of the two tables")
         if "verdict" in header:
             self._choice(header, "verdict", VERDICTS)
         return Calibration(
@@ -253,14 +253,14 @@ class _Reader:
     def _known(self, table: Mapping[str, Any], where: str, keys: tuple[str, ...]) -> None:
         """Note tables or keys that are unknown, such as misspelt ones, which would otherwise be ignored."""
         for key in sorted(table.keys() - set(keys)):
-            self._wrong(f"{where}{key_text(key)}", f"is not known; want {', '.join(keys)}")
+            self._wrong(f"{where}{key_text(key)}", f"is unknown; use {', '.join(keys)}")
 
     def _table(self, key: str, *, needed: bool = False) -> Mapping[str, Any]:
         table = self._document.get(key)
         if isinstance(table, dict):
             return table
         if table is not None or needed:
-            self._wrong(key, f"{'missing' if table is None else 'not a table'}; want [{key}]")
+            self._wrong(key, f"{'missing' if table is None else 'not a table'}; add [{key}]")
         return {}
 
     def _text(self, header: Mapping[str, Any], key: str) -> str:
@@ -268,8 +268,8 @@ class _Reader:
         if isinstance(value, str) and value.splitlines() == [value]:
             return value
         if header:
-            got = "missing" if value is None else "no line" if isinstance(value, str) and value else "not text"
-            self._wrong(f"calibration.{key}", f"{got}; want text in quotes")
+            got = "missing" if value is None else "not one line" if isinstance(value, str) and value else "not text"
+            self._wrong(f"calibration.{key}", f"{got}; give text in quotes")
         return ""
 
     def _version(self, header: Mapping[str, Any]) -> None:
@@ -310,24 +310,26 @@ class _Reader:
     def _values(self, section: str) -> tuple[FloatArray, set[int]]:
         """Return values (16,) in SI units, and the indices of those given."""
         table = self._table(section, needed=section == "parameters")
-        values, said = np.zeros(len(PARAMETERS)), set()
+        values, given = np.zeros(len(PARAMETERS)), set()
         for key in sorted(table.keys() - _INDEX_OF_KEY.keys()):
-            self._wrong(f"{section}.{key_text(key)}", "no parameter of the model; want the keys of CONVENTIONS")
+            self._wrong(
+                f"{section}.{key_text(key)}", "not a parameter of the model; use the keys of docs/conventions.md"
+            )
         for index, parameter in enumerate(PARAMETERS):
             needed = parameter.needed and section == "parameters" and bool(table)
             if parameter.key in table or needed:
                 values[index] = self._number(table, parameter.key, section) * parameter.factor
-                said.add(index)
-        return values, said
+                given.add(index)
+        return values, given
 
     def _sigmas(self, section: str) -> tuple[FloatArray, set[int]]:
         """Return sigmas (16,) in SI units, none negative or too small to be squared, and the indices of those given."""
-        sigmas, said = self._values(section)
+        sigmas, given = self._values(section)
         in_units = sigmas / [parameter.factor for parameter in PARAMETERS]
         for index in np.flatnonzero((sigmas != 0.0) & (in_units < LEAST_SIGMA)).tolist():
             want = "at least 0" if sigmas[index] < 0.0 else f"0, which is held, or at least {LEAST_SIGMA:g}"
             self._wrong(f"{section}.{PARAMETERS[index].key}", f"got {in_units[index]:g}, want {want}")
-        return sigmas, said
+        return sigmas, given
 
     def _correlation(self, known: set[int]) -> FloatArray:
         """Return the correlation (16, 16) from the names and the matrix of the parameters with sigmas."""
@@ -337,12 +339,12 @@ class _Reader:
             return whole
         names = table.get("names")
         if not isinstance(names, list) or any(_INDEX_OF_KEY.get(str(name)) not in known for name in names):
-            self._wrong("correlation.names", "want a list of keys of [sigma] and [held_sigma]")
+            self._wrong("correlation.names", "must be a list of keys of [sigma] and [held_sigma]")
             return whole
         matrix = _array(table.get("matrix"), (len(names), len(names)))
         if matrix is None or len(set(names)) < len(names) or not _is_correlation(matrix):
             size = f"{len(names)} × {len(names)}"
-            self._wrong("correlation.matrix", f"want {size} numbers: symmetric, 1 on its diagonal, none below −1")
+            self._wrong("correlation.matrix", f"must be {size} numbers: symmetric, 1 on its diagonal, none below −1")
             return whole
         at = [_INDEX_OF_KEY[name] for name in names]
         whole[np.ix_(at, at)] = matrix
@@ -354,7 +356,7 @@ class _Reader:
             return np.eye(3)
         matrix = _array(header[key], (3, 3))
         if matrix is None or not is_rotation(matrix):
-            self._wrong(f"calibration.{key}", "no rotation; want 3 × 3 numbers, perpendicular rows of length 1")
+            self._wrong(f"calibration.{key}", "not a rotation; give 3 × 3 numbers, perpendicular rows of length 1")
             return np.eye(3)
         return matrix
 
@@ -369,10 +371,10 @@ class _Reader:
             return None
         intensity, correction = _array(table.get("intensity"), None), _array(table.get("correction_m"), None)
         if intensity is None or correction is None or len(intensity) != len(correction) or not len(intensity):
-            self._wrong("ibrc", "want intensity and correction_m, lists of as many numbers, at least one")
+            self._wrong("ibrc", "needs intensity and correction_m, lists of equal length with at least one number")
             return None
         if any(after <= before for before, after in pairwise(intensity.tolist())):
-            self._wrong("ibrc.intensity", "want rising values")
+            self._wrong("ibrc.intensity", "values must increase")
             return None
         return intensity, correction
 
@@ -380,7 +382,7 @@ class _Reader:
         """Yield rows of an array of tables, with the place of each."""
         rows = self._document.get(key, [])
         if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
-            self._wrong(key, f"want tables [[{key}]]")
+            self._wrong(key, f"must be tables [[{key}]]")
             return
         for place, row in enumerate(rows):
             self._known(row, f"{key}[{place}].", columns)
@@ -389,7 +391,7 @@ class _Reader:
     def _range_offsets(self) -> Iterator[RangeOffset]:
         for where, row in self._rows("range_offset", ("return_slot", "mta_zone", "prf_hz", "offset_m")):
             if not row.keys() & {"return_slot", "mta_zone", "prf_hz"}:
-                self._wrong(where, "matches everything; want return_slot, mta_zone or prf_hz")
+                self._wrong(where, "matches every return; give return_slot, mta_zone or prf_hz")
             yield RangeOffset(
                 self._number(row, "offset_m", where),
                 self._whole(row, "return_slot", where, least=1) if "return_slot" in row else None,
@@ -402,7 +404,7 @@ class _Reader:
         for where, row in self._rows("facet", ("index", "tilt_deg")):
             index = self._whole(row, "index", where)
             if index in tilts:
-                self._wrong(f"{where}.index", f"facet {index} stands there twice; {ONE_TABLE}")
+                self._wrong(f"{where}.index", f"facet {index} is given twice; {ONE_TABLE}")
             tilts[index] = math.radians(self._number(row, "tilt_deg", where))
         return tilts
 
@@ -411,7 +413,7 @@ class _Reader:
         for where, row in self._rows("beam", ("channel", "azimuth_deg", "elevation_deg", "range_m")):
             channel = self._whole(row, "channel", where)
             if channel in beams:
-                self._wrong(f"{where}.channel", f"beam {channel} stands there twice; {ONE_TABLE}")
+                self._wrong(f"{where}.channel", f"beam {channel} is given twice; {ONE_TABLE}")
             azimuth_deg, elevation_deg, range_m = (
                 self._number(row, key, where, default=0.0) for key in ("azimuth_deg", "elevation_deg", "range_m")
             )

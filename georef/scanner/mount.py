@@ -49,9 +49,9 @@ class AngleSeries:
     def __post_init__(self) -> None:
         """Refuse columns that do not fit, or times that do not rise, with `MountError`."""
         if len(self.time_ns) < 2 or self.angles_rad.shape != (len(self.time_ns), 3):
-            raise MountError("gimbal angles: want at least two epochs of roll, pitch and yaw")
+            raise MountError("gimbal angles: at least two epochs of roll, pitch and yaw are needed")
         if (np.diff(self.time_ns) <= 0).any():
-            raise MountError("gimbal angles: time does not rise")
+            raise MountError("gimbal angles: time does not increase")
 
     @classmethod
     def of_solutions(cls, rows: StructArray, max_gap_ns: int = DEFAULT_MAX_GAP_NS) -> AngleSeries:
@@ -66,8 +66,8 @@ class AngleSeries:
             MountError: fewer than two epochs are left.
         """
         angles = np.stack([rows["roll_rad"], rows["pitch_rad"], rows["heading_rad"]], axis=1)
-        told = np.isfinite(angles).all(axis=1) & (rows["gps_ns"] >= 0)
-        time_ns, angles = rows["gps_ns"][told], angles[told]
+        known = np.isfinite(angles).all(axis=1) & (rows["gps_ns"] >= 0)
+        time_ns, angles = rows["gps_ns"][known], angles[known]
         newest = np.maximum.accumulate(np.concatenate([[-1], time_ns]))
         new = time_ns > newest[:-1]
         return cls(time_ns[new], angles[new], max_gap_ns)

@@ -89,7 +89,10 @@ class Uncertainty:
             correlation = calibration.correlation[np.ix_(active, active)]
             factor = sigmas[active, np.newaxis] * np.linalg.cholesky(correlation)
         except np.linalg.LinAlgError as error:
-            text = f"calibration {calibration.id}: its correlations are no covariance; want a positive definite matrix"
+            text = (
+                f"calibration {calibration.id}: its correlations do not form a covariance; the matrix must be "
+                "positive definite"
+            )
             raise UncertaintyError(text) from error
         errors = factor.T @ _effects(calibration)[active]
         from_origin = errors.copy()  # turns about the body's origin instead of the scanner's

@@ -110,7 +110,7 @@ class LeapBook:
                 f"leap_seconds = {leap.seconds} is configured, and GPS − UTC was {seconds} s on {self._date}: "
                 "leave gnss.….leap_seconds out"
             )
-        remedy = f"set gnss.….leap_seconds (IERS Bulletin C), or let the receiver say it; {leap.seconds} s is a guess"
+        remedy = f"set gnss.….leap_seconds (IERS Bulletin C), or let the receiver send it; {leap.seconds} s is a guess"
         return f"the built-in leap seconds end at {LEAP_TABLE_VALID_UNTIL}, and this is {self._date}: {remedy}"
 
     def hear(self, source: str, tag: TimeTag) -> LeapChange | None:

@@ -163,10 +163,10 @@ def _tell(found: Settlement, named: dict[VoterKey, _Named], winner: int) -> None
             continue
         found.errors[source, utc] = TagErrors(one.host_ns, error_s)
         agree, total = int((error_s == 0).sum()), len(error_s)
-        differ = ", ".join(f"{count} one {error:+d} s from it" for error, count in others.most_common(3))
-        doubt = "" if agree >= SURE_SHARE * total else "; the majority is narrow: all times may be off by that"
+        differ = ", ".join(f"{count} name a second {error:+d} s from it" for error, count in others.most_common(3))
+        doubt = "" if agree >= SURE_SHARE * total else "; the majority is small, so all times may be off by that"
         found.lines.append(
-            f"{source}: {agree} of {total} messages name the second that is taken; {differ}: these are set right{doubt}"
+            f"{source}: {agree} of {total} messages name the second in use; {differ}; these are corrected{doubt}"
         )
 
 
@@ -174,6 +174,6 @@ def _conflict(chosen: dict[VoterKey, int]) -> str:
     (one, first), *others = chosen.items()
     other, second = next((key, offset) for key, offset in others if offset != first)
     return (
-        f"over the whole log most of {one.source} {one.message} name a second {first - second:+d} s from what most of "
-        f"{other.source} {other.message} name"
+        f"over the whole log most messages {one.source} {one.message} name a second {first - second:+d} s from that "
+        f"of most messages {other.source} {other.message}"
     )

@@ -77,7 +77,7 @@ def judge(
         wanted: the configured origin; AUTO: to be found.
     """
     if wanted is StampScale.FREE:
-        return Stamps(StampScale.FREE, "configured so")
+        return Stamps(StampScale.FREE, "as configured")
     known = np.isfinite(near_sigma_ns)
     device, near, sigma = device_ns[known], near_gps_ns[known], near_sigma_ns[known]
     if not len(device) or int(near.max() - near.min()) < LEAST_SPAN_S * SECOND_NS:
@@ -114,13 +114,13 @@ def _of_hour(at: Int64Array, quickest: Int64Array, slack_ns: float, wanted: Stam
     drift_ns, why = _drift(at, quickest, slack_ns)
     least_ms, most_ms = -int(quickest.max()) / 1e6, -int(quickest.min()) / 1e6
     within = (quickest >= -GREATEST_LATENCY_NS - slack_ns) & (quickest <= AHEAD_NS + slack_ns)
-    told = f"they stand {least_ms:.1f} to {most_ms:.1f} ms before their arrival past the hour of UTC, {why}"
+    told = f"they count from the hour of UTC and lie {least_ms:.1f} to {most_ms:.1f} ms before their arrival, {why}"
     if wanted is StampScale.HOUR:
-        return Stamps(StampScale.HOUR, f"configured so; {told}", 0, max(LOCKED_SIGMA_NS, drift_ns / 2))
+        return Stamps(StampScale.HOUR, f"as configured; {told}", 0, max(LOCKED_SIGMA_NS, drift_ns / 2))
     if not within.all():
-        return Stamps(StampScale.FREE, f"{told}: not those of a head that is locked")
+        return Stamps(StampScale.FREE, f"{told}: a locked head sends no such stamps")
     if drift_ns > GREATEST_DRIFT_NS:
-        return Stamps(StampScale.FREE, f"{told}: they drift as those of a head that has lost its pulse")
+        return Stamps(StampScale.FREE, f"{told}: they drift like those of a head that has lost its pulse")
     return Stamps(StampScale.HOUR, told, 0, max(LOCKED_SIGMA_NS, drift_ns / 2))
 
 
@@ -140,17 +140,20 @@ def _absolute(at: Int64Array, quickest: Int64Array, slack_ns: float, leap_second
     named = scale.value.removeprefix("ptp-").upper() if scale is not None else f"GPS {whole_s:+d} s"
     told = f"they count from 1970 in {named}, {least_ms:.1f} to {most_ms:.1f} ms before their arrival, {why}"
     if wanted in (StampScale.TAI, StampScale.UTC):
-        other = "" if scale is wanted else "; the whole seconds are those of the arrival"
-        return Stamps(wanted, f"configured so; {told}{other}", offset_ns, sigma_ns)
+        other = "" if scale is wanted else "; the whole seconds come from their arrival"
+        return Stamps(wanted, f"as configured; {told}{other}", offset_ns, sigma_ns)
     within = (beside >= -GREATEST_LATENCY_NS - slack_ns) & (beside <= AHEAD_NS + slack_ns)
     if int(np.ptp(beside)) > SECOND_NS // 2:
-        return Stamps(StampScale.FREE, f"{told}: they change their scale on the way")
+        return Stamps(StampScale.FREE, f"{told}: their time scale changes during the log")
     if scale is None:
-        return Stamps(StampScale.FREE, f"{told}: neither TAI nor UTC; if PTP set them, say so (clock)")
+        return Stamps(StampScale.FREE, f"{told}: neither TAI nor UTC; if PTP set them, configure it (clock)")
     if not within.all():
-        return Stamps(StampScale.FREE, f"{told}: of PTP they stand 0 to 100 ms before; if it set them, say so (clock)")
+        return Stamps(
+            StampScale.FREE,
+            f"{told}: stamps set by PTP lie 0 to 100 ms before their arrival; if PTP set these, configure it (clock)",
+        )
     if drift_ns > GREATEST_DRIFT_NS:
-        return Stamps(StampScale.FREE, f"{told}: they drift as those of a head that PTP has lost")
+        return Stamps(StampScale.FREE, f"{told}: they drift like those of a head that has lost PTP")
     return Stamps(scale, told, offset_ns, sigma_ns)
 
 

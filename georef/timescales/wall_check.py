@@ -62,16 +62,19 @@ def distance_text(ahead: float, *, kept: bool, clock: str) -> str:
     if size < APART_S or not (kept or zone or _is_round(size, DAY_S)):
         return ""
     if zone:
-        apart, why = f"{round(size / HALF_HOUR_S) / 2:g} h", "as by a time zone: want a receiver that says UTC"
+        apart, why = f"{round(size / HALF_HOUR_S) / 2:g} h", "as a wrong time zone would cause; set the receiver to UTC"
     elif size < DAY_S:
-        apart, why = (f"{size / 60:.0f} min" if size >= 120 else f"{size:.0f} s"), "want the receiver set right"
+        apart, why = (f"{size / 60:.0f} min" if size >= 120 else f"{size:.0f} s"), "correct the receiver"
     else:
         days = round(size / DAY_S) if _is_round(size, DAY_S) else round(size / DAY_S, 1)
         apart = f"{days:,} day{'' if days == 1 else 's'}"
-        why = "as by an old date: want the receiver restarted or set right"
+        why = "as an old date would cause; restart or correct the receiver"
     side = "ahead of" if ahead > 0 else "behind"
     keeper = " (kept by a time server or receiver)" if kept else ""
-    return f"its time is {apart} {side} {clock}{keeper}, {why}, or that clock (timedatectl); it is taken as it says"
+    return (
+        f"its time is {apart} {side} {clock}{keeper}, {why}, or that clock (timedatectl); the receiver's time is used "
+        "unchanged"
+    )
 
 
 def _is_round(size_s: float, unit_s: float) -> bool:

@@ -175,11 +175,11 @@ class Trajectory:
         """Refuse times that do not rise, or columns that differ in length, with `TrajectoryError`."""
         for column, shape in _COLUMNS.items():
             if getattr(self, column).shape != (len(self.time_ns), *shape):
-                raise TrajectoryError(f"trajectory {self.name}: column {column} has another length than time_ns")
+                raise TrajectoryError(f"trajectory {self.name}: column {column} differs in length from time_ns")
         steps = np.diff(self.time_ns)
         if (steps <= 0).any():
             back = self.time_ns[int(np.argmax(steps <= 0)) + 1]
-            raise TrajectoryError(f"trajectory {self.name}: time does not rise at {gps_text(back)}")
+            raise TrajectoryError(f"trajectory {self.name}: time does not increase at {gps_text(back)}")
 
     @classmethod
     def from_geodetic(

@@ -64,16 +64,16 @@ class TimeShift:
         rest_s = self.seconds - days * (DAY_NS // SECOND_NS)
         parts = []
         if days and days % 7 == 0:
-            parts.append(f"its week is another: {days // 7:+d} would be right")
+            parts.append(f"its week is wrong: add {days // 7:+d}")
         elif days:
             seconds = days * (DAY_NS // SECOND_NS)
-            parts.append(f"its day is another, or its time is seconds of the day: {seconds:+d} s would be right")
+            parts.append(f"its day is wrong, or its time is in seconds of the day: add {seconds:+d} s")
         if self.leap_seconds and abs(rest_s - self.leap_seconds) < NEAR_S:
-            parts.append(f"its time is UTC, not GPS: {self.leap_seconds:+d} s would be right")
+            parts.append(f"its time is UTC, not GPS: add {self.leap_seconds:+d} s")
         elif self.leap_seconds and abs(rest_s + self.leap_seconds) < NEAR_S:
-            parts.append(f"leap seconds were added to it twice: {-self.leap_seconds:+d} s would be right")
+            parts.append(f"leap seconds were added to it twice: add {-self.leap_seconds:+d} s")
         elif not days or abs(rest_s) > max(UNNOTICED_S, 5 * self.sigma):
-            parts.append(f"its time is off: {rest_s:+.3f} s would be right")
+            parts.append(f"its time is off: add {rest_s:+.3f} s")
         return "; ".join(parts)
 
 
@@ -105,7 +105,7 @@ def correlate_turn_rates(trajectory: Trajectory, imu_time_ns: Int64Array, imu_ra
     """
     trajectory.require_attitude()
     if len(trajectory) < 2 or len(imu_time_ns) < 2:
-        raise TrajectoryError(f"trajectory {trajectory.name}: too few epochs or inertial samples to compare")
+        raise TrajectoryError(f"trajectory {trajectory.name}: has too few epochs or inertial samples for a comparison")
     steps = -(-int(imu_time_ns[0]) // STEP_NS), int(imu_time_ns[-1]) // STEP_NS
     felt = turning(imu_time_ns, imu_rate_b[1:], 2 * int(np.median(np.diff(imu_time_ns))) + STEP_NS, steps)
     first_ns, last_ns = trajectory.span
@@ -114,8 +114,8 @@ def correlate_turn_rates(trajectory: Trajectory, imu_time_ns: Int64Array, imu_ra
     best = TimeShift(0.0, np.nan, np.nan, np.nan, table_leap_seconds(day)[0])
     for days in sorted({0, apart_days - 1, apart_days, apart_days + 1}, key=abs):
         coarse = days * (DAY_NS // STEP_NS)
-        told = _told_near(trajectory, felt, coarse)
-        found = None if told is None else _best_shift(told, felt, coarse)
+        near = _told_near(trajectory, felt, coarse)
+        found = None if near is None else _best_shift(near, felt, coarse)
         if found is None:
             continue
         shift_s, correlation, sigma, unshifted = found

@@ -64,8 +64,8 @@ class Envelope:
             least_lead_s = math.ceil(10.0 * (least_s + SPLINE_REACH * STEP_S)) / 10.0
             raise PlanError(
                 "flight.lead_s",
-                f"{flight.lead_s:g} s are too short to roll out of a bank of {flight.bank_max_deg:g}° at "
-                f"{math.degrees(ROLL_RATE_RADPS):.0f}°/s; want at least {least_lead_s:g} s",
+                f"{flight.lead_s:g} s is too short to roll out of a bank of {flight.bank_max_deg:g}° at "
+                f"{math.degrees(ROLL_RATE_RADPS):.0f}°/s; set at least {least_lead_s:g} s",
             )
         smoothing_s = min(room_s, max(2.0 * roll_s, SMOOTHING_LEAST_S))
         return cls(flight, smoothing_s, max(smoothing_s, flight.climb_max_mps * PEAK / PULL_UP_MPS2))
@@ -97,12 +97,12 @@ class Envelope:
         bank = f"flight.bank_max_deg of {flight.bank_max_deg:g}° at {speed_mps:g} m/s"
         if radius_m < tightest_m:
             raise PlanError(
-                "flight.turn_radius_m", f"{radius_m:g} m is tighter than {bank} allows; want {tightest_m:.0f} m or more"
+                "flight.turn_radius_m", f"{radius_m:g} m is tighter than {bank} allows; set {tightest_m:.0f} m or more"
             )
         if radius_m > RADIUS_MOST_M:
             key = "flight.bank_max_deg" if flight.turn_radius_m is None else "flight.turn_radius_m"
             raise PlanError(
-                key, f"turns of {1e-3 * radius_m:.0f} km radius; want a bank and a speed that keep it below 20 km"
+                key, f"turns of {1e-3 * radius_m:.0f} km radius; set a bank and a speed that keep it below 20 km"
             )
         reversal = ROLL_RATE_RADPS * self.smoothing_s / (2.0 * PEAK)  # tan of the bank that it can roll through twice
         return Turning(
@@ -122,7 +122,7 @@ def refuse_wind(tables: Tables) -> None:
     if wind_mps > 0.5 * slowest_mps:
         raise PlanError(
             "flight.wind_mps",
-            f"{wind_mps:.1f} m/s are more than half the speed of the slowest line, {slowest_mps:g} m/s; want less",
+            f"{wind_mps:.1f} m/s is more than half the speed of the slowest line, {slowest_mps:g} m/s; set less",
         )
 
 
@@ -132,8 +132,8 @@ def refuse_far(key: str, point_m: list[float]) -> None:
     if distance_m > DISTANCE_MOST_M:
         raise PlanError(
             key,
-            f"{1e-3 * distance_m:.0f} km from flight.origin_deg; want metres east and north of it, "
-            f"at most {1e-3 * DISTANCE_MOST_M:.0f} km away",
+            f"{1e-3 * distance_m:.0f} km from flight.origin_deg; give metres east and north of it, at most "
+            f"{1e-3 * DISTANCE_MOST_M:.0f} km away",
         )
 
 
@@ -143,14 +143,19 @@ def refuse_lines(tables: Tables, ground_m: Ground) -> None:
     for i, line in enumerate(tables.line):
         key = f"line[{i}]"
         if line.name in names:
-            raise PlanError(f"{key}.name", f"{line.name!r} is the name of line[{names[line.name]}] too; want another")
+            raise PlanError(
+                f"{key}.name", f"{line.name!r} is also the name of line[{names[line.name]}]; choose another"
+            )
         names[line.name] = i
         refuse_far(f"{key}.from_m", line.from_m)
         refuse_far(f"{key}.to_m", line.to_m)
         length_m = math.dist(line.from_m, line.to_m)
         least_m = LINE_LEAST_S * speed_mps(tables.flight, line)
         if length_m < least_m:
-            raise PlanError(f"{key}.to_m", f"a line of {length_m:.1f} m; want at least {least_m:.0f} m, one second")
+            raise PlanError(
+                f"{key}.to_m",
+                f"a line of {length_m:.1f} m; make it at least {least_m:.0f} m long, one second of flight",
+            )
         _refuse_low(f"{key}.height_m", line, length_m, ground_m)
 
 
@@ -165,4 +170,4 @@ def _refuse_low(key: str, line: LineTable, length_m: float, ground_m: Ground) ->
         where = f"{share[worst] * length_m:.0f} m from its start (east {east_m[worst]:.0f}, north {north_m[worst]:.0f})"
         what = f"{-above_m:.1f} m below" if above_m < 0.0 else f"only {above_m:.1f} m above"
         want_m = math.ceil(terrain_m[worst] + CLEARANCE_M)
-        raise PlanError(key, f"{line.height_m:g} m is {what} the terrain {where}; want at least {want_m} m")
+        raise PlanError(key, f"{line.height_m:g} m is {what} the terrain {where}; plan at least {want_m} m")

@@ -99,8 +99,8 @@ def _refuse_climb(key: str, rise_m: float, climb_mps: float) -> None:
     if rise_m > CLIMB_MOST_S * climb_mps:
         raise PlanError(
             key,
-            f"{rise_m:.0f} m of height to get there take {rise_m / climb_mps / 60.0:.0f} min at {climb_mps:g} m/s; "
-            f"want at most {CLIMB_MOST_S * climb_mps:.0f} m, or a larger flight.climb_max_mps",
+            f"{rise_m:.0f} m of climb to this line takes {rise_m / climb_mps / 60.0:.0f} min at {climb_mps:g} m/s; "
+            f"plan at most {CLIMB_MOST_S * climb_mps:.0f} m, or a larger flight.climb_max_mps",
         )
 
 
@@ -145,6 +145,7 @@ def _runway_height_m(start: GroundStart, ground_m: Ground) -> float:
     if abs(start.height_m - terrain_m) > RUNWAY_OFF_M:
         raise PlanError(
             "ground.height_m",
-            f"{start.height_m:g} m is not where the terrain is, {terrain_m:.1f} m; want it within {RUNWAY_OFF_M:g} m",
+            f"{start.height_m:g} m differs from the terrain's height, {terrain_m:.1f} m; give a height within "
+            f"{RUNWAY_OFF_M:g} m of it",
         )
     return start.height_m

@@ -315,7 +315,9 @@ def _baseline_b(table: GnssTable, name: str) -> FloatArray:
         return np.full(3, np.nan)
     baseline_b: FloatArray = np.array(table.secondary_lever_arm_m) - np.array(table.lever_arm_m)
     if not baseline_b.any():
-        raise PlanError(f"gnss.{name}.secondary_lever_arm_m", "is lever_arm_m; want the place of another antenna")
+        raise PlanError(
+            f"gnss.{name}.secondary_lever_arm_m", "equals lever_arm_m; give the position of the second antenna"
+        )
     return baseline_b
 
 

@@ -231,9 +231,9 @@ def _size(messages: list[bytes]) -> int:
 
 def _check_protocol(table: GnssTable, name: str) -> None:
     if table.ins and table.protocol != "novatel":
-        raise PlanError(f"gnss.{name}.ins", f'"{table.protocol}" has no such messages; want protocol = "novatel"')
+        raise PlanError(f"gnss.{name}.ins", f'"{table.protocol}" has no such messages; use protocol = "novatel"')
     if table.secondary_lever_arm_m is not None and table.protocol == "ubx":
-        text = '"ubx" sends no heading here; want protocol = "novatel" or "nmea"'
+        text = '"ubx" sends no heading here; use protocol = "novatel" or "nmea"'
         raise PlanError(f"gnss.{name}.secondary_lever_arm_m", text)
 
 
@@ -251,15 +251,15 @@ def _check_line(table: GnssTable, name: str, second: list[tuple[float, int]], re
         return
     better = next((baud for baud in STANDARD_BAUDS if carries(baud) and late_s(baud) < NAMING_S), None)
     if better is not None and not carries(table.baud):
-        text = f"{table.baud} is too slow for {bytes_per_s} bytes a second; want {better} or more, or a lower rate_hz"
+        text = f"{table.baud} is too slow for {bytes_per_s} bytes a second; set {better} or more, or a lower rate_hz"
         raise PlanError(f"gnss.{name}.baud", text)
     baud = table.baud if carries(table.baud) else STANDARD_BAUDS[-1]
     late = f"messages would come {late_s(baud):.2f} s after the second they name"
     if better is not None:
-        text = f"{baud}: {late}; want {better} or more, or less latency_ms"
+        text = f"{baud}: {late}; set {better} or more, or a lower latency_ms"
         raise PlanError(f"gnss.{name}.baud", text)
     most_ms = math.floor(table.latency_ms - 1000.0 * (late_s(baud) - NAMING_S)) - 1
-    raise PlanError(f"gnss.{name}.latency_ms", f"{table.latency_ms:g}: {late}; want at most {max(most_ms, 0)}")
+    raise PlanError(f"gnss.{name}.latency_ms", f"{table.latency_ms:g}: {late}; set at most {max(most_ms, 0)}")
 
 
 def _lateness_s(table: GnssTable, second: list[tuple[float, int]], read_s: float, baud: int) -> float:

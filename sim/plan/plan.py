@@ -65,7 +65,7 @@ def load_plan(name: str | Path) -> Plan:
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "is not UTF-8"
         presets = ", ".join(PRESETS)
-        raise PlanError(str(name), f"{reason}; want a plan's file or one of the presets {presets}") from None
+        raise PlanError(str(name), f"{reason}; give a plan file or one of the presets {presets}") from None
     return parse_plan(text, path.resolve().parent)
 
 
@@ -78,7 +78,7 @@ def parse_plan(text: str, folder: Path) -> Plan:
     tables = _validated(document)
     start = tables.flight.start
     if start.tzinfo is None:
-        raise PlanError("flight.start", f"{start} has no offset; want UTC, as {start.isoformat()}Z")
+        raise PlanError("flight.start", f"{start} has no UTC offset; write UTC as {start.isoformat()}Z")
     leap_seconds, _ = table_leap_seconds(start.date())
     start_gps_ns = gps_ns_from_unix(round(start.timestamp()) * 1_000_000_000, leap_seconds)
     return Plan(tables, folder, text, leap_seconds, start_gps_ns)
@@ -101,7 +101,7 @@ def _key(location: Sequence[int | str]) -> str:
 
 def _what(error: Any) -> str:
     if error["type"] == "extra_forbidden":
-        return "no such key"
+        return "unknown key"
     if error["type"] == "missing":
         return "is missing"
     text = str(error["msg"]).removeprefix("Input should be ")

@@ -246,7 +246,7 @@ def refuse_ranges(plan: Plan, ground_m: Ground) -> None:
                 bound = f"to {scanner.range_max_m:g} m" if far.all() else f"from {scanner.range_min_m:g} m on"
                 raise PlanError(
                     f"line[{index}].height_m",
-                    f"{above_m.mean():.0f} m above ground, but scanner.{name} measures {bound}; want a height, or a "
+                    f"{above_m.mean():.0f} m above ground, but scanner.{name} measures {bound}; set a height, or a "
                     f"range_{'max' if far.all() else 'min'}_m, that meets the ground",
                 )
 

@@ -142,8 +142,8 @@ def _wide_ground(survey: Survey, low: FloatArray, high: FloatArray) -> Ground:
 
 def _title(figure: Figure, page: tuple[float, float], survey: Survey, rows: Sequence[dict[str, Any]]) -> None:
     tables, total = survey.plan.tables, rows[-1]
-    told = [f"{name}: {_scanner_words(table)}" for name, table in tables.scanner.items()]
-    scanners = "; ".join(told) if len(told) < 4 else f"{len(told)} scanners"
+    scanner_words = [f"{name}: {_scanner_words(table)}" for name, table in tables.scanner.items()]
+    scanners = "; ".join(scanner_words) if len(scanner_words) < 4 else f"{len(scanner_words)} scanners"
     length_m = sum(row["length_m"] for row in rows[:-1])
     words = [
         f"{len(rows) - 1} line{'s' if len(rows) > 2 else ''}, {length_m / 1000:.1f} km",
@@ -177,7 +177,7 @@ def _profile(axes: Axes, survey: Survey, track: FloatArray, ground: Ground) -> N
     _profile_lines(axes, survey, unit_s, top)
     axes.set_xlabel(f"time ({unit})", fontsize=8, color=MUTED)
     axes.set_ylabel("ellipsoidal height (m)", fontsize=8, color=MUTED)
-    heading(axes, "Height along the flight, above ground on the lines", 16.0, weight="bold")
+    heading(axes, "Height during the flight, and above ground on the lines", 16.0, weight="bold")
     axes.grid(axis="y", color="#dddddd", lw=0.5)
     axes.set_axisbelow(True)
 
@@ -213,7 +213,7 @@ def _overlap(axes: Axes, survey: Survey, grid: Grid) -> None:
     image = axes.imshow(
         shown, extent=_bounds(grid), origin="lower", cmap=colours, norm=norm, aspect="auto", interpolation="nearest"
     )
-    _small_map(axes, survey, grid, "Lines that see it")
+    _small_map(axes, survey, grid, "Number of lines that see the ground")
     more = int(grid.lines.max()) > most
     _bar(axes, image, [f"{n}{' or more' if more and n == most else ''}" for n in range(1, most + 1)])
 

@@ -24,7 +24,7 @@ def check_latencies(tables: Tables) -> None:
     for name, table in tables.scanner.items():
         if table.true.imu_latency_us != 0.0:
             key = f"scanner.{name}.true.imu_latency_us"
-            raise PlanError(key, "want 0, and imu.<name>.latency_us instead: it is the IMU's stamps that are late")
+            raise PlanError(key, "set 0 and use imu.<name>.latency_us instead, because the IMU's stamps are late")
 
 
 def _imu_latency_us(tables: Tables) -> float:

@@ -180,7 +180,7 @@ def _polygon(table: ScannerTable, name: str) -> Deflection:
         if facet.index >= table.facets:
             raise PlanError(key, f"got {facet.index}, want 0 to {table.facets - 1}: facets = {table.facets}")
         if facet.index in given:
-            raise PlanError(key, f"facet {facet.index} stands there twice, want one tilt each")
+            raise PlanError(key, f"facet {facet.index} is given twice, want one tilt for each facet")
         given.add(facet.index)
         tilts[facet.index] = math.radians(facet.tilt_deg)
     return Deflection(
@@ -221,7 +221,9 @@ def _risley(table: ScannerTable, name: str) -> Deflection:
     around = np.linspace(-np.pi, np.pi, 361)
     down = mirrors.risley(np.zeros_like(around), around, wedges, table.refractive_index)[:, 2]
     if max(map(abs, table.wedge_deg)) >= 90.0 or not (down > 0.0).all():
-        text = f"got {table.wedge_deg}, want smaller ones: light of this refractive_index does not come through"
+        text = (
+            f"got {table.wedge_deg}, want smaller angles: at this refractive_index the prism reflects the light totally"
+        )
         raise PlanError(f"scanner.{name}.wedge_deg", text)
     return Deflection(motions.turning(table.scan_hz, turns), direction, 1.0, math.inf)
 
@@ -233,7 +235,7 @@ def _turns_until_both_are_back(table: ScannerTable, name: str) -> int:
     if abs(float(turns) - table.prism_ratio) > 1e-12:
         text = (
             f"got {table.prism_ratio!r}, want a fraction whose denominator is at most {most}, as {float(turns)!r} = "
-            f"{turns}: the readings of encoder_counts = {table.encoder_counts} go through no more turns in 32 bits"
+            f"{turns}: the readings of encoder_counts = {table.encoder_counts} allow no larger denominator in 32 bits"
         )
         raise PlanError(f"scanner.{name}.prism_ratio", text)
     return turns.denominator

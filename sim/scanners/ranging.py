@@ -165,7 +165,7 @@ def _check(table: ScannerTable, key: str) -> None:
         raise PlanError(f"{key}.ibrc.correction_m", text)
     for before, after in pairwise(intensity):
         if after <= before:
-            raise PlanError(f"{key}.ibrc.intensity", f"{after:g} stands behind {before:g}, want increasing values")
+            raise PlanError(f"{key}.ibrc.intensity", f"{after:g} follows {before:g}, want increasing values")
 
 
 def _beam_corrections(table: ScannerTable) -> FloatArray:

@@ -76,7 +76,7 @@ class RasterHeights:
     def _refuse_hole(self, east_m: float, north_m: float) -> None:
         easting, northing = self._to_crs(*(np.array([value]) for value in (east_m, north_m, self._height_m)))
         place = f"{easting[0]:.1f}, {northing[0]:.1f}"
-        raise PlanError(KEY, f"has no data at {place}; want heights all over the lines' swaths")
+        raise PlanError(KEY, f"has no data at {place}; use a raster with heights below all swaths")
 
 
 @dataclass(frozen=True)
@@ -145,7 +145,9 @@ def _plan_crs(plan: Plan) -> CRS:
     try:
         crs = CRS(plan.tables.flight.crs)
     except CRSError:
-        raise PlanError("flight.crs", f"PROJ knows no {plan.tables.flight.crs!r}; want as EPSG:25832") from None
+        raise PlanError(
+            "flight.crs", f"PROJ does not know {plan.tables.flight.crs!r}; write it like EPSG:25832"
+        ) from None
     return _horizontal(crs)
 
 
@@ -158,10 +160,10 @@ def _read(plan: Plan, to_crs: _Projected, corners: FloatArray, height_m: float) 
     try:
         import rasterio
     except ImportError:
-        raise PlanError(KEY, f"rasters need rasterio: {how_to_install('raster')}; or no raster") from None
+        raise PlanError(KEY, f"rasters need rasterio: {how_to_install('raster')}; or leave the raster out") from None
     path = plan.folder / plan.tables.terrain.raster
     if not path.is_file():
-        raise PlanError(KEY, f"there is no file {path}; want a GeoTIFF, its path relative to the plan")
+        raise PlanError(KEY, f"the file {path} does not exist; give the path of a GeoTIFF relative to the plan")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", rasterio.errors.NotGeoreferencedWarning)
@@ -179,10 +181,10 @@ def _read(plan: Plan, to_crs: _Projected, corners: FloatArray, height_m: float) 
     except PlanError:
         raise
     except rasterio.errors.NotGeoreferencedWarning:
-        raise PlanError(KEY, f"{path} does not say where it lies; want a GeoTIFF of heights") from None
+        raise PlanError(KEY, f"{path} has no georeference; use a georeferenced GeoTIFF of heights") from None
     except (rasterio.errors.RasterioError, ProjError, ValueError) as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise PlanError(KEY, f"{path} cannot be read: {reason}; want a GeoTIFF of heights") from None
+        raise PlanError(KEY, f"{path} cannot be read: {reason}; use a GeoTIFF of heights") from None
 
 
 def _window(source: Any, first: NDArray[np.int64], size: NDArray[np.int64], path: Path) -> FloatArray:
@@ -194,7 +196,9 @@ def _window(source: Any, first: NDArray[np.int64], size: NDArray[np.int64], path
 
     columns, rows = map(int, size)
     if columns * rows > MOST_PIXELS:
-        raise PlanError(KEY, f"{path} has {columns} × {rows} pixels under the swaths; want at most {MOST_PIXELS}")
+        raise PlanError(
+            KEY, f"{path} has {columns} × {rows} pixels under the swaths; use a raster with at most {MOST_PIXELS}"
+        )
     window = Window(*map(int, first), columns, rows)
     with np.errstate(invalid="ignore"):  # a NaN of any kind means no data
         values: FloatArray = source.read(1, window=window, out_dtype="float64")
@@ -208,21 +212,24 @@ def _check_pixels(source: Any, path: Path) -> None:
     steps, corner = np.abs([place.a, place.b, place.d, place.e]), np.abs([place.c, place.f])
     area = abs(place.a * place.e - place.b * place.d) if steps.max() < FARTHEST else 0.0
     if not (1 / FARTHEST < area and corner.max() < FARTHEST):
-        raise PlanError(KEY, f"{path} has pixels that lie nowhere: {tuple(place)[:6]}; want a GeoTIFF of heights")
+        raise PlanError(KEY, f"{path} has an invalid georeference: {tuple(place)[:6]}; use a GeoTIFF of heights")
     rows, columns = source.block_shapes[0]
     if rows * columns * source.count > MOST_PIXELS:  # a block may hold all bands and is read whole
-        raise PlanError(KEY, f"{path} has {source.count} bands in blocks of {columns} × {rows}; want one of heights")
+        raise PlanError(
+            KEY,
+            f"{path} has {source.count} bands in blocks of {columns} × {rows}; use a raster with one band of heights",
+        )
     if not source.dtypes[0].startswith(("int", "uint", "float")):
-        raise PlanError(KEY, f"{path} has pixels of type {source.dtypes[0]}; want a GeoTIFF of heights")
+        raise PlanError(KEY, f"{path} has pixels of type {source.dtypes[0]}; use a GeoTIFF of heights")
 
 
 def _check_crs(found: Any, wanted: CRS, path: Path) -> None:
     if not found:
-        raise PlanError(KEY, f"{path} has no CRS; want flight.crs, {_name(wanted)}")
+        raise PlanError(KEY, f"{path} has no CRS; use a raster in flight.crs, {_name(wanted)}")
     crs = _horizontal(CRS.from_wkt(found.to_wkt()))
     same_code = crs.to_epsg() is not None and crs.to_epsg() == wanted.to_epsg()
     if not same_code and not crs.equals(wanted, ignore_axis_order=True):
-        raise PlanError(KEY, f"{path} is in {_name(crs)}; want flight.crs, {_name(wanted)}")
+        raise PlanError(KEY, f"{path} is in {_name(crs)}; use a raster in flight.crs, {_name(wanted)}")
 
 
 def _name(crs: CRS) -> str:
@@ -239,6 +246,6 @@ def _check_cover(
         if not there:
             raise PlanError(
                 KEY,
-                f"{path} does not reach the {name} corner at {e:.0f}, {n:.0f}; want heights under all swaths and "
-                "100 m around",
+                f"{path} does not reach the {name} corner at {e:.0f}, {n:.0f}; use a raster that covers all swaths "
+                "and 100 m around them",
             )

@@ -143,7 +143,9 @@ class Scene:
             places = places[seen(places[:, 0], places[:, 1])]
         places = places[~self._occupied(places, CONTROL_CLEAR_M)]
         if len(places) < 2 * count:
-            raise PlanError("control.points", f"no room for {count} in the open; want at most {len(places) // 2}")
+            raise PlanError(
+                "control.points", f"the open ground has no room for {count}; set at most {len(places) // 2}"
+            )
         slope = self.ground.slope(places[:, 0], places[:, 1])
         places = places[np.argsort(slope, kind="stable")[: max(2 * count, len(places) // 2)]]
         chosen = _far_apart(places, count)

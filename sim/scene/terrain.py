@@ -159,7 +159,7 @@ def _check_size(cells: NDArray[np.int64], cell_m: float) -> None:
         raise PlanError(
             "terrain.cell_m",
             f"{cell_m:g} m over {width:.1f} × {depth:.1f} km makes {nodes / 1e6:.0f} million nodes, more than "
-            f"{LARGEST_NODES / 1e6:.0f}; want {least:g} m or more",
+            f"{LARGEST_NODES / 1e6:.0f}; set {least:g} m or more",
         )
 
 

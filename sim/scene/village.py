@@ -121,7 +121,7 @@ def _lots(extent: FloatArray, houses: int, key: str) -> _Lots:
         if len(lots.center) >= houses:
             return lots
     place = f"{extent[1]:g} × {extent[0]:g} m"
-    raise PlanError(key, f"{houses} do not fit into {place}; want at most {len(lots.center)}, or a larger size_m")
+    raise PlanError(key, f"{houses} do not fit into {place}; set at most {len(lots.center)}, or a larger size_m")
 
 
 def _lots_of_size(extent: FloatArray, size: FloatArray) -> _Lots:

@@ -420,7 +420,7 @@ def test_the_trajectory_comes_out_with_sigmas_below_the_prior() -> None:
 
 
 def test_without_observations_there_is_one_plain_line() -> None:
-    with pytest.raises(NormalError, match="nothing to adjust; want strips that overlap"):
+    with pytest.raises(NormalError, match="tie points to adjust; use strips that overlap"):
         adjust(made(lines=LINES[:1]).flight, Features(), ParameterOptions())
 
 

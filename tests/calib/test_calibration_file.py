@@ -185,9 +185,9 @@ def test_the_verdict_and_the_held_parameters_stand_in_the_file() -> None:
 @pytest.mark.parametrize(
     ("said", "instead", "message"),
     [
-        ("omega_deg = 0.01", "omega_deg = 0.01\nscan_angle_scale_ppm = 1.0", "is in [sigma] too"),
+        ("omega_deg = 0.01", "omega_deg = 0.01\nscan_angle_scale_ppm = 1.0", "is also in [sigma]"),
         ("scan_angle_scale_ppm = 300.0", "scan_angle_scale_ppm = -1.0", "held_sigma.scan_angle_scale_ppm: got -1"),
-        ("scan_angle_scale_ppm = 300.0", "twist_deg = 1.0", "held_sigma.twist_deg: no parameter of the model"),
+        ("scan_angle_scale_ppm = 300.0", "twist_deg = 1.0", "held_sigma.twist_deg: not a parameter of the model"),
         ('"usable with care"', '"fine"', "calibration.verdict: got 'fine', want one of good, usable with care"),
     ],
 )
@@ -217,7 +217,7 @@ def test_tables_match_as_they_did() -> None:
         ({"sigmas": np.full(16, -1.0)}, "sigma.omega_deg"),
         ({"installation_matrix": np.diag([1.0, 1.0, -1.0])}, "installation_matrix"),
         ({"correlation": np.full((16, 16), np.nan), "sigmas": np.ones(16)}, "nan"),
-        ({"range_offsets": (RangeOffset(0.1),)}, "matches everything"),
+        ({"range_offsets": (RangeOffset(0.1),)}, "matches every return"),
         ({"scanner": ""}, "calibration.scanner"),
     ],
 )

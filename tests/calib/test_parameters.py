@@ -49,7 +49,7 @@ def test_several_heads_stand_in_one_vector() -> None:
     assert "scan_plane_tilt_rad" not in top  # a spinning head has none
     assert "kappa_rad" in top
     held = {(one.scanner, one.name): one for one in asked.held}
-    assert held["left", "kappa_rad"].why == "held at your word"
+    assert held["left", "kappa_rad"].why == "held by your choice"
     assert held["left", "kappa_rad"].remedy == ""
     assert ("top", "scan_angle_scale") in held
     assert asked.start[asked.names.index("top.lever_arm_z_m")] == -0.2
@@ -232,15 +232,15 @@ def test_what_is_held_keeps_the_start_and_what_is_estimated_begins_elsewhere() -
     ("wish", "text"),
     [
         (ParameterOptions("everything"), "want one of basic, scanner, full"),
-        (ParameterOptions(fix=frozenset(["omega"])), "omega: is no parameter"),
-        (ParameterOptions(free=frozenset(["top.pitch_slope"])), "top.pitch_slope: cannot be freed"),
+        (ParameterOptions(fix=frozenset(["omega"])), "omega: unknown parameter"),
+        (ParameterOptions(free=frozenset(["top.pitch_slope"])), "top.pitch_slope: cannot be estimated"),
         (ParameterOptions(priors={"phi_rad": 0.0}), "want a sigma above 0"),
         (
             ParameterOptions(fix=frozenset(["right.omega_rad"])),
-            "parameters of right: no such scanner in this flight, but ",
+            "parameters of right: this flight has no such scanner; its scanners are ",
         ),
         (ParameterOptions(priors={"fie_rad": 0.1}), "prior fie_rad"),
-        (ParameterOptions(ibrc_knots=(5.0, 5.0)), "rising intensities"),
+        (ParameterOptions(ibrc_knots=(5.0, 5.0)), "increasing intensities"),
         (ParameterOptions(beams=frozenset(["roll_rad"])), "beams: got 'roll_rad'"),
     ],
 )
@@ -252,5 +252,5 @@ def test_wishes_that_cannot_be_met_are_refused(wish: ParameterOptions, text: str
 
 def test_a_beam_s_correction_needs_a_spinning_head() -> None:
     only = replace(flight(), heads=flight().heads[:1])
-    with pytest.raises(ParameterError, match="no scanner of this flight is a spinning head"):
+    with pytest.raises(ParameterError, match="this flight has no spinning head"):
         unknowns(only, ParameterOptions(beams=frozenset(["range_m"])))

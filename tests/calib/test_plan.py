@@ -118,17 +118,17 @@ def test_a_second_height_tells_time_from_pitch_and_control_the_range() -> None:
 def test_a_lone_line_has_no_planes_but_with_control() -> None:
     trajectory, lines = path(ONE_HEIGHT[:1])
     scan = Scan(30.0 * DEG, 1e5)
-    with pytest.raises(FlightError, match="no roof and no ground is seen from two lines; want lines that overlap"):
+    with pytest.raises(FlightError, match="no two lines see the same roof or ground; plan lines that overlap"):
         planned(FRAME, [scanner()], [scan], [trajectory], lines, surfaces(), MOST_MADE)
     piece = surfaces()[24]
     controlled = replace(piece, control=(ControlPoint("1", piece.points_t[24], 0.01),))
     _, features = planned(FRAME, [scanner()], [scan], [trajectory], lines, [controlled], MOST_MADE)
     assert [len(plane.patches) for plane in features.planes] == [1]
     assert len(planned(FRAME, [scanner()], [scan], [trajectory], lines * 2, surfaces(), MOST_MADE)[1].planes) > 9
-    with pytest.raises(FlightError, match="no roof"):  # too few pulses for a patch to be found
+    with pytest.raises(FlightError, match="no two lines see"):  # too few pulses for a patch to be found
         planned(FRAME, [scanner()], [Scan(30.0 * DEG, 2000.0)], [trajectory], lines * 2, surfaces(), MOST_MADE)
     near = replace(scanner(), range_gate=(20.0, 300.0))
-    with pytest.raises(FlightError, match="no roof"):  # out of range
+    with pytest.raises(FlightError, match="no two lines see"):  # out of range
         planned(FRAME, [near], [scan], [trajectory], lines * 2, surfaces(), MOST_MADE)
 
 

@@ -263,7 +263,7 @@ def test_mapped_points_and_several_swaths_at_a_time_give_the_same(
 
 def test_without_points_it_says_so(flight: Flight) -> None:
     empty = tuple(replace(swath, points_t=np.full_like(swath.points_t, np.nan)) for swath in flight.swaths)
-    with pytest.raises(PlaneError, match="no points; want a trajectory"):
+    with pytest.raises(PlaneError, match="no points; use a trajectory"):
         find_planes(replace(flight, swaths=empty))
 
 
@@ -310,9 +310,12 @@ def test_a_polygon_over_a_ridge_is_mixed(cast: Cast, flight: Flight) -> None:
 @pytest.mark.parametrize(
     ("polygons", "text"),
     [
-        ([("a", [[0, 0], [1, 1]])], r"polygon a: got corners of shape \(2, 2\), want \(k, 2\)"),
-        ([("a", [[0, 0], [1, 1], [1, 0]])] * 2, "polygon a: there are two of this name"),
-        ({"a": [[0, 0], [20, 0], [-5e5, -5e6]]}, "polygon a: got 500,020 m by 5,000,000 m, want about one face"),
+        ([("a", [[0, 0], [1, 1]])], r"polygon a: corners have the shape \(2, 2\); \(k, 2\)"),
+        ([("a", [[0, 0], [1, 1], [1, 0]])] * 2, "polygon a: two polygons have this name"),
+        (
+            {"a": [[0, 0], [20, 0], [-5e5, -5e6]]},
+            "polygon a: measures 500,020 m by 5,000,000 m; draw it around one face",
+        ),
     ],
 )
 def test_a_wrong_polygon_is_told(flight: Flight, polygons: list[tuple[str, FloatArray]], text: str) -> None:

@@ -176,7 +176,7 @@ def test_what_the_flight_does_not_show_stays_near_the_start() -> None:
 
 
 def test_one_strip_only_is_told(cast: Cast) -> None:
-    with pytest.raises(PrealignError, match="got 1 swath, want at least two that overlap"):
+    with pytest.raises(PrealignError, match="the flight has 1 swath; at least two that overlap"):
         prealign(replace(cast.flight, swaths=cast.flight.swaths[:1]), FAST)
 
 
@@ -188,13 +188,15 @@ def test_no_overlap_is_told() -> None:
 
 def test_no_points_are_told(cast: Cast) -> None:
     late = tuple(replace(swath, time_ns=swath.time_ns + 10**15) for swath in cast.flight.swaths)
-    with pytest.raises(PrealignError, match="no points; want a trajectory"):
+    with pytest.raises(PrealignError, match="no points; use a trajectory"):
         prealign(replace(cast.flight, swaths=late), FAST)
 
 
 def test_a_wrong_installation_is_told(cast: Cast) -> None:
     """Ten degrees are no error of a mounting."""
-    with pytest.raises(PrealignError, match=r"left: \w+ came to .*° from the start; want the installation matrix"):
+    with pytest.raises(
+        PrealignError, match=r"left: \w+ moved .*° from its initial value; check the installation matrix"
+    ):
         prealign(cast.flight, COARSE, off(cast, (0.0, 9.0, 0.0)))
 
 

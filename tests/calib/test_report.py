@@ -83,7 +83,7 @@ def test_verdict_names_what_is_not_determined(report: ReportInput) -> None:
     pitch = FixedParameter("left", "phi_rad", "flat ground", "slopes along track", 1e-3)
     verdict = judge(sound(report, held=(pitch,)))
     assert verdict.level is Level.CARE
-    assert verdict.sentence.startswith("Usable with care: not a boresight calibration: boresight φ (pitch), held, ")
+    assert verdict.sentence.startswith("Usable with care: the boresight is not calibrated: boresight φ (pitch), held, ")
 
 
 @pytest.mark.parametrize(("left_m", "level"), [(0.04, Level.GOOD), (0.06, Level.CARE)])
@@ -102,11 +102,14 @@ def test_a_correlated_pair_is_a_reason_unless_points_are_known_as_well_as_is_wan
 @pytest.mark.parametrize(("sigma_deg", "level"), [(0.01, Level.CARE), (1.0, Level.UNUSABLE)])
 def test_a_held_angle_is_no_boresight_calibration(report: ReportInput, sigma_deg: float, level: Level) -> None:
     """At the user's word too; how well it is known decides how bad that is, and stands among the sigmas."""
-    held = (FixedParameter("left", "kappa_rad", "held at your word"),)
+    held = (FixedParameter("left", "kappa_rad", "held by your choice"),)
     considered = (Considered("left", "kappa_rad", 0.0, math.radians(sigma_deg)),)
     verdict = judge(sound(report, held=held, considered=considered))
     assert verdict.level is level
-    assert f"not a boresight calibration: boresight κ (heading), held, plausible to {sigma_deg:.2g}" in verdict.sentence
+    assert (
+        f"the boresight is not calibrated: boresight κ (heading), held, has a plausible error of {sigma_deg:.2g}"
+        in verdict.sentence
+    )
     assert "Boresight to 0.0100°" in verdict.sentence or "Boresight to 1.00°" in verdict.sentence
 
 
@@ -120,7 +123,7 @@ def test_a_held_parameter_that_moves_an_estimated_one_is_named_with_its_size(rep
     moved[3] = 0.2, 1e-4
     sigmas = np.sqrt(adjusted.sigmas**2 + (moved**2).sum(axis=1))
     assert held_words(replace(adjusted, considered=considered, moved=moved, sigmas=sigmas)) == [
-        "torsion, held, plausible to 2000\u00a0µs², would move range offset by 20.0\u00a0cm"
+        "torsion, held, has a plausible error of 2000\u00a0µs², which would move range offset by 20.0\u00a0cm"
     ]
 
 
@@ -128,17 +131,20 @@ def test_what_the_flight_says_against_a_held_parameter_is_a_reason(report: Repor
     considered = (Considered("left", "torsion_s2", 0.0, 2e-9, 9e-9, 1e-9, contradicted=True),)
     verdict = judge(sound(report, considered=considered))
     assert verdict.level is Level.CARE
-    assert "the flight contradicts torsion that is held: it would change it by +9000\u00a0µs²" in verdict.sentence
+    assert (
+        "the flight contradicts the held value of torsion: it would change the value by +9000\u00a0µs²"
+        in verdict.sentence
+    )
 
 
 def test_the_verdict_goes_by_what_is_wanted(report: ReportInput) -> None:
     """An angle and the points against what the user wants of them."""
     need = Need(0.05, {"kappa_rad": math.radians(0.001)}, 0.1, {"left": 0.04})
     (reason,) = judge(replace(sound(report), need=need)).reasons
-    assert reason.what == "boresight κ (heading) is known to 0.0014° only, 0.0010° is wanted"
+    assert reason.what == "boresight κ (heading) is known to 0.0014° only; 0.0010° is required"
     assert not judge(replace(sound(report), need=replace(need, wanted={}))).reasons
     (reason,) = judge(replace(sound(report), need=replace(need, wanted={}, point_m=0.03))).reasons
-    assert reason.what == "the calibration leaves 4.0\u00a0cm in points, 3.0\u00a0cm is wanted"
+    assert reason.what == "the calibration leaves 4.0\u00a0cm in points; 3.0\u00a0cm is required"
     assert judge(replace(sound(report), need=replace(need, wanted={}, point_m=0.003))).level is Level.UNUSABLE
 
 
@@ -178,7 +184,7 @@ def test_findings_are_reasons(report: ReportInput) -> None:
     ("changes", "level", "words"),
     [
         ({"converged": False}, Level.UNUSABLE, "did not converge"),
-        ({"redundancy": 4.0}, Level.UNUSABLE, "only 4 observations beyond"),
+        ({"redundancy": 4.0}, Level.UNUSABLE, "there are only 4 observations more than"),
         ({"variance_factor": 3.0}, Level.CARE, "variance factor 3"),
         ({"variance_factor": 0.1}, Level.CARE, "far smaller"),
         ({"variance_factor": math.nan}, Level.UNUSABLE, "variance factor –"),
@@ -205,7 +211,7 @@ def test_strips_that_became_worse(report: ReportInput) -> None:
     pair = ("01", "02")
     before, after = {pair: PairDifference(0.0, 0.02, 0.02, 0.1, 10)}, {pair: PairDifference(0.0, 0.09, 0.09, 0.3, 10)}
     words = [reason.what for reason in judge(replace(sound(report), before=before, after=after)).reasons]
-    assert words[0].startswith("strips agree worse than before (2.0\u00a0cm before, 9.0\u00a0cm after)")
+    assert words[0].startswith("strips agree less well than before (2.0\u00a0cm before, 9.0\u00a0cm after)")
     assert words[1].startswith("strips differ by 9.0\u00a0cm")
 
 
@@ -223,7 +229,7 @@ def test_trajectory_corrections_beyond_their_sigmas(report: ReportInput) -> None
     large = replace(fit, position_l=np.full_like(fit.position_l, 0.02) * 2.0)
     reasons = judge(sound(report, trajectory=large)).reasons
     assert [reason.what for reason in reasons] == [
-        "corrections of the trajectory's positions are 1.8 times what its sigmas let expect"
+        "corrections of the trajectory's positions are 1.8 times the value that its sigmas predict"
     ]
 
 
@@ -284,7 +290,7 @@ def test_the_page_has_all_its_parts(page: str) -> None:
         "Corrections of the trajectory",
         "How it was computed",
         "Fit by group of observations",
-        "Smallest errors that would be found",
+        "Smallest detectable errors",
         "Software and settings",
         "Inputs",
     ]
@@ -379,7 +385,7 @@ def test_a_report_of_little(report: ReportInput) -> None:
     assert text == html(bare)
     assert "<h2>Parameters</h2>" in text
     assert "the sigmas here are too small" in text
-    assert "errors of the trajectory included" not in text
+    assert "including the trajectory's errors" not in text
     assert "<h2>Control</h2>" not in text
     assert "<script>" not in text
     assert "<h1>&lt;b&gt;A &amp; B&lt;/b&gt;</h1>" in text
@@ -426,7 +432,7 @@ def test_pdf(report: ReportInput) -> None:
 
 
 def test_lines_of_the_pdf_fit() -> None:
-    words = "Points of one plane in several strips fulfil n · x = d, " * 5 + "ab12" * 60
+    words = "Points of one plane in several strips satisfy n · x = d, " * 5 + "ab12" * 60
     for line in wrapped(words, 3.0):
         assert 0.0 < width_in(line) <= 3.0
     assert "".join(wrapped(words, 3.0)).replace(" ", "") == words.replace(" ", "")

@@ -55,7 +55,7 @@ def off_planes(flight: Flight, features: Features, strip: int) -> float:
 
 
 def test_without_features_nothing_is_adjusted(clean: tuple[Flight, Features]) -> None:
-    with pytest.raises(StripError, match="no planes or ties that several strips see"):
+    with pytest.raises(StripError, match="several strips share neither planes nor tie points"):
         adjusted(clean[0], Features(()))
 
 
@@ -182,7 +182,7 @@ def test_many_strips_get_one_model(clean: tuple[Flight, Features], monkeypatch: 
     bad = spoilt(flight, 3, np.tile([0.0, 0.0, 0.3, 0.0, 0.0, 0.0], (2, 1)))
     result = adjusted(bad, features)
     assert {choice.model for choice in result.choices} == {"constant"}
-    assert "6 strips, more than 3: all got the same model" in result.notes
+    assert "6 strips, more than 3, so all use the same model" in result.notes
 
 
 @pytest.mark.parametrize(

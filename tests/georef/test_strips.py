@@ -121,13 +121,13 @@ def test_times_of_strips_are_read() -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("start,end\n1,2\n", "no column start_gps_ns"),
-        ("start_gps_ns,end_gps_ns\n1,2\n1.5,3\n", "line 3: want two integers"),
-        ("start_gps_ns,end_gps_ns\n1\n", "line 2: want two integers"),
+        ("start,end\n1,2\n", "column start_gps_ns is missing"),
+        ("start_gps_ns,end_gps_ns\n1,2\n1.5,3\n", "line 3: needs two integers"),
+        ("start_gps_ns,end_gps_ns\n1\n", "line 2: needs two integers"),
         ("start_gps_ns,end_gps_ns\n5,5\n", "line 2: the strip ends"),
         ("start_gps_ns,end_gps_ns\n1,5\n4,8\n", "overlaps"),
         ("start_gps_ns,end_gps_ns\n", "has no strips"),
-        ("", "no column"),
+        ("", "column start_gps_ns is missing"),
     ],
 )
 def test_wrong_times_of_strips_are_refused_by_line(text: str, message: str) -> None:

@@ -30,14 +30,14 @@ def test_numbers_of_64_bits_are_whole(number: int) -> None:
 
 @pytest.mark.parametrize("number", [LEAST - 1, MOST + 1])
 def test_a_number_beyond_64_bits_is_named_with_its_key(number: int) -> None:
-    told = f"a whole number of {number.bit_length()} bits; want numbers of 64 bits"
+    told = f"a whole number of {number.bit_length()} bits; use numbers of 64 bits"
     assert refused(f"a = {number}") == f"a: {told}"
     assert refused(f"[scanner.left]\nb = [1, [{number}]]") == f"scanner.left.b: {told}"
     assert refused(f'["two words"]\n"c\\n" = {number}') == rf'"two words"."c\n": {told}'
 
 
 def test_a_number_of_more_digits_than_python_takes() -> None:
-    assert refused(f"a = {'9' * 5000}") == "a whole number of thousands of digits; want numbers of 64 bits"
+    assert refused(f"a = {'9' * 5000}") == "a whole number of thousands of digits; use numbers of 64 bits"
 
 
 def nested(depth: int) -> str:
@@ -47,13 +47,13 @@ def nested(depth: int) -> str:
 
 def test_tables_may_lie_as_deep_as_is_said_and_no_deeper() -> None:
     assert toml_tables(nested(DEEPEST))["a"]
-    assert refused(nested(DEEPEST + 1)) == f"a…: nested too deeply; want tables at most {DEEPEST} deep"
+    assert refused(nested(DEEPEST + 1)) == f"a…: nested too deeply; nest tables at most {DEEPEST} deep"
     assert refused("[" + ".".join(["a"] * 40) + "]").startswith("a.a.a.")
 
 
 @pytest.mark.parametrize("text", ["a = " + "[" * 20_000, "a = " + "{a=" * 20_000])
 def test_nesting_without_an_end_is_refused(text: str) -> None:
-    assert refused(text) == f"not readable: nested too deeply; want tables at most {DEEPEST} deep"
+    assert refused(text) == f"not readable: nested too deeply; nest tables at most {DEEPEST} deep"
 
 
 @pytest.mark.parametrize(("text", "place"), [("a = 1\nb c", "line 2"), ("a = '''\n\n", "end of document"), ("a\0", "")])

@@ -208,5 +208,5 @@ def test_a_late_imu_is_in_the_true_calibration_and_only_there() -> None:
     late = plan(imu={"main": {"latency_us": 300.0}})
     assert "imu_latency_us = 300.0" in calibration_text(late, "left", true=True)
     assert "imu_latency_us = 0.0" in calibration_text(late, "left", true=False)
-    with pytest.raises(PlanError, match=r"^scanner\.left\.true\.imu_latency_us: want 0, and imu\.<name>\.latency_us"):
+    with pytest.raises(PlanError, match=r"^scanner\.left\.true\.imu_latency_us: set 0 and use imu\.<name>\.latency_us"):
         VirtualFlight(plan(scanner={"left": {"true": {"imu_latency_us": 300.0}}}))

@@ -105,7 +105,7 @@ def test_far_from_the_origin_places_are_found_at_their_height(tmp_path: Path) ->
 
 
 def test_a_raster_that_is_not_there_or_no_raster(tmp_path: Path) -> None:
-    assert refused(tmp_path).startswith(f"terrain.raster: there is no file {tmp_path / 'dem.tif'}; want")
+    assert refused(tmp_path).startswith(f"terrain.raster: the file {tmp_path / 'dem.tif'} does not exist; give")
     (tmp_path / "dem.tif").write_text("no raster")
     assert refused(tmp_path).startswith(f"terrain.raster: {tmp_path / 'dem.tif'} cannot be read: ")
 
@@ -117,14 +117,22 @@ def test_bands_that_share_blocks_too_large_to_read_are_refused(tmp_path: Path) -
         tmp_path / "dem.tif", "w", driver="GTiff", width=9, height=9, count=400, dtype="float64", **profile, **blocks
     ):
         pass
-    assert refused(tmp_path).endswith("dem.tif has 400 bands in blocks of 512 × 512; want one of heights")
+    assert refused(tmp_path).endswith(
+        "dem.tif has 400 bands in blocks of 512 × 512; use a raster with one band of heights"
+    )
 
 
 def test_another_crs_is_named_with_the_one_that_is_wanted(tmp_path: Path) -> None:
     write(tmp_path, crs="EPSG:25832")
-    assert refused(tmp_path) == f"terrain.raster: {tmp_path / 'dem.tif'} is in EPSG:25832; want flight.crs, EPSG:32632"
+    assert (
+        refused(tmp_path)
+        == f"terrain.raster: {tmp_path / 'dem.tif'} is in EPSG:25832; use a raster in flight.crs, EPSG:32632"
+    )
     write(tmp_path, crs=None)
-    assert refused(tmp_path) == f"terrain.raster: {tmp_path / 'dem.tif'} has no CRS; want flight.crs, EPSG:32632"
+    assert (
+        refused(tmp_path)
+        == f"terrain.raster: {tmp_path / 'dem.tif'} has no CRS; use a raster in flight.crs, EPSG:32632"
+    )
 
 
 def test_a_compound_crs_is_asked_for_its_horizontal_part(tmp_path: Path) -> None:
@@ -137,7 +145,7 @@ def test_a_compound_crs_is_asked_for_its_horizontal_part(tmp_path: Path) -> None
 def test_a_crs_that_nobody_knows_is_the_flight_s_mistake(tmp_path: Path) -> None:
     write(tmp_path)
     plan = plan_of("raster = 'dem.tif'", tmp_path).changed({"flight": {"crs": "EPSG:0"}})
-    with pytest.raises(PlanError, match=r"^flight\.crs: PROJ knows no 'EPSG:0'; want as EPSG:25832$"):
+    with pytest.raises(PlanError, match=r"^flight\.crs: PROJ does not know 'EPSG:0'; write it like EPSG:25832$"):
         build_scene(plan, Site.at(47.5, 8.9), SQUARE)
 
 

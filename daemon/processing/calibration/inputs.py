@@ -29,7 +29,7 @@ from swath.georef.arrays import FloatArray
 COLUMNS = ("WKT", "name")
 FARTHEST = 1e9  # largest coordinate accepted, in any unit of a map
 _POLYGON = re.compile(r"^POLYGON\s*(?:Z\s*)?\(\(([^()]*)\)\)$", re.IGNORECASE)
-_WANT = 'want "POLYGON ((x y, x y, x y, x y))", one ring, no holes'
+_WANT = 'write "POLYGON ((x y, x y, x y, x y))", one ring without holes'
 
 
 class PolygonError(ValueError):
@@ -67,7 +67,9 @@ def ties_of(path: Path, kept: KeptFlight) -> Features:
     found = picked_ties(kept.flight, [replace(one, place=at) for one, at in zip(picked, places_t, strict=True)])
     if not found.ties:
         why = ", ".join(f"{count} {reason}" for reason, count in found.refused.most_common(3))
-        raise UserError(f"{path}: no tie point is left ({why}); want places in output.crs, as the strips' points are")
+        raise UserError(
+            f"{path}: no tie point remains ({why}); give positions in output.crs, like the points of the strips"
+        )
     return found
 
 
@@ -88,22 +90,22 @@ def read_polygons(text: str, name: str) -> dict[str, FloatArray]:
     try:
         return _rings(reader, name)
     except csv.Error as error:
-        raise PolygonError(f"{name}: line {reader.reader.line_num}: no CSV: {error}") from None
+        raise PolygonError(f"{name}: line {reader.reader.line_num}: not CSV: {error}") from None
 
 
 def _rings(reader: csv.DictReader[str], name: str) -> dict[str, FloatArray]:
     missing = [column for column in COLUMNS if column not in (reader.fieldnames or ())]
     if missing:
-        raise PolygonError(f"{name}: line 1: no column {missing[0]}; want the columns {', '.join(COLUMNS)}")
+        raise PolygonError(f"{name}: line 1: column {missing[0]} is missing; the columns must be {', '.join(COLUMNS)}")
     found: dict[str, FloatArray] = {}
     for row in reader:
         where, key = f"{name}: line {reader.line_num}", (row["name"] or "").strip()
         if not key or key in found:
-            wrong = f"{' '.join(key.split())} is there twice" if key else "is missing"
-            raise PolygonError(f"{where}: name: {wrong}; want one each")
+            wrong = f"{' '.join(key.split())} is given twice" if key else "is missing"
+            raise PolygonError(f"{where}: name: {wrong}; give every polygon its own name")
         found[key] = _ring(row["WKT"] or "", where)
     if not found:
-        raise PolygonError(f"{name}: no polygons; want at least one")
+        raise PolygonError(f"{name}: has no polygons; give at least one")
     return found
 
 
@@ -118,12 +120,12 @@ def _ring(text: str, where: str) -> FloatArray:
         except ValueError:
             x = y = math.nan
         if not (abs(x) <= FARTHEST and abs(y) <= FARTHEST):
-            raise PolygonError(f"{where}: WKT: got the corner {corner.strip()!r}; {_WANT}")
+            raise PolygonError(f"{where}: WKT: the corner is {corner.strip()!r}; {_WANT}")
         corners.append((x, y))
     if len(corners) > 1 and corners[0] == corners[-1]:
         corners.pop()
     if len(corners) < 3:
-        raise PolygonError(f"{where}: WKT: got {len(corners)} corners; want at least three")
+        raise PolygonError(f"{where}: WKT: has {len(corners)} corners; at least three are needed")
     return np.array(corners)
 
 

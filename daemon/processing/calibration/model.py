@@ -60,7 +60,7 @@ def _by_key(table: object) -> object:
     found: dict[str, Any] = {}
     for key, value in _flat("", table):
         if key in found:
-            raise ValueError(f"{key} stands there twice; want it once")
+            raise ValueError(f"{key} is given twice; give it once")
         found[key] = value
     return found
 
@@ -189,12 +189,12 @@ def model_of(model: str, fix: str = "", free: str = "", priors: Sequence[str] = 
     tables = _tables(model)
     wish = _of_tables(tables)
     known = _PARAMETERS | _entries(wish)
-    said = _states(tables.parameters.items(), f"{model}: parameters.", known)
+    configured = _states(tables.parameters.items(), f"{model}: parameters.", known)
     own = _states(((key, FREE) for key in free.split(",") if key), "--free ", known)
     sigmas = _states(map(_prior, priors), "--prior ", known)
     own |= sigmas
     own |= _states(((key, FIXED) for key in fix.split(",") if key), "--fix ", known)
-    left = {at: state for at, state in said.items() if at not in own and ("", at[1]) not in own}
+    left = {at: state for at, state in configured.items() if at not in own and ("", at[1]) not in own}
     states = {f"{scanner}.{name}" if scanner else name: state for (scanner, name), state in (left | own).items()}
     held = {f"{scanner}.{name}" if scanner else name: sigma for (scanner, name), sigma in sigmas.items()}
     return replace(
@@ -321,9 +321,11 @@ def _states(said: Iterable[tuple[str, str | float]], before: str, known: Known) 
         key = text.strip()
         scanner, _, own = ("", "", key) if key in known else key.partition(".")
         if own not in known:
-            raise UserError(one_line(f"{before}{key}: is no parameter; {_want(key, known)}"), ExitCode.USAGE)
+            raise UserError(one_line(f"{before}{key}: unknown parameter; {_want(key, known)}"), ExitCode.USAGE)
         if isinstance(state, str) and own not in _PARAMETERS:
-            raise UserError(f"{before}{key}: its table asks for it; want a prior, or nothing", ExitCode.USAGE)
+            raise UserError(
+                f"{before}{key}: its table already requests it; give a prior, or leave it out", ExitCode.USAGE
+            )
         name, factor = known[own]
         found[scanner, name] = state if isinstance(state, str) else state * factor
     return found
@@ -336,4 +338,4 @@ def _want(key: str, known: Known) -> str:
         close = difflib.get_close_matches(text, known, n=1, cutoff=0.6) if text else []
         if close:
             return f"did you mean {before}{close[0]}?"
-    return f"want one of {', '.join(known)}"
+    return f"use one of {', '.join(known)}"

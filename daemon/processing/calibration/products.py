@@ -111,7 +111,7 @@ def write_products(wish: CalibrationOptions, done: Calibrated, tell: Steps) -> T
 
 def trajectory_says(carried: Sequence[Carried]) -> list[Finding]:
     """Return the verdicts on the trajectories as the first findings: parameters absorbed the trajectories' errors."""
-    change = "mend the trajectory, then calibrate anew"
+    change = "correct the trajectory, then calibrate again"
     return [Finding(one.sentence, change, math.inf, unusable=one.level is Level.UNUSABLE) for one in carried]
 
 
@@ -130,8 +130,11 @@ def strips_say(done: Calibrated, cell_m: float) -> list[Finding]:
         known = max(float(each.all_sigmas[INDEX[one.effect.parameter]]) for each in done.adjusted.calibrations.values())
         excess = abs(one.value) / (BEYOND * math.hypot(one.sigma, known))
         if excess > 1.0:
-            change = "look at swath strips: a strip of its own kind, a bad trajectory, too few strips to part effects"
-            found.append(Finding(f"strips still show {one.words}", change, excess))
+            change = (
+                "run swath strips: one strip may differ from all others, the trajectory may be bad, or the strips "
+                "may be too few to separate effects"
+            )
+            found.append(Finding(f"strips still show this effect: {one.words}", change, excess))
     return found
 
 
@@ -142,7 +145,7 @@ def validation_says(done: Calibrated) -> list[Finding]:
     """
     asked = Asked(done.control or None)
     outcome = validate(done.flight, done.features, done.adjusted.calibrations, asked, done.prior)
-    change = "look at swath validate: its planes and pairs say where the calibration does not hold"
+    change = "run swath validate: its planes and pairs show where the calibration does not hold"
     return [Finding(f"validation: {one.sentence}", change) for one in outcome.methods if one.passed is False]
 
 
@@ -254,9 +257,16 @@ def _record(
 def _considered_entry(adjusted: Adjusted, column: int) -> dict[str, Any]:
     """Return a held parameter, its sigma, and by how much one sigma moves each estimated one; SI."""
     one, moved = adjusted.considered[column], adjusted.movements[:, column]
-    told = {"told": one.told, "told_sigma": one.told_sigma} if math.isfinite(one.told) else {}
+    estimate = {"told": one.told, "told_sigma": one.told_sigma} if math.isfinite(one.told) else {}
     moves = dict(zip(adjusted.names, moved.tolist(), strict=True))
-    return {"scanner": one.scanner, "name": one.name, "value": one.value, "sigma": one.sigma, **told, "moves": moves}
+    return {
+        "scanner": one.scanner,
+        "name": one.name,
+        "value": one.value,
+        "sigma": one.sigma,
+        **estimate,
+        "moves": moves,
+    }
 
 
 def _need_entry(need: Need | None) -> dict[str, Any] | None:
@@ -266,8 +276,8 @@ def _need_entry(need: Need | None) -> dict[str, Any] | None:
 
 def strips_entry(strips: FlightStrips) -> dict[str, Any]:
     """Return height differences of all pairs together and of each pair, and the quality level that follows."""
-    told = strips.agreement.numbers or {}
-    every = {"n": told.get("cells", 0)} | {key: told.get(key) for key in ("mean_m", "std_m", "rms_m")}
+    numbers = strips.agreement.numbers or {}
+    every = {"n": numbers.get("cells", 0)} | {key: numbers.get(key) for key in ("mean_m", "std_m", "rms_m")}
     pairs = [
         {"first": first, "second": second, "n": one.count, "mean_m": one.mean_m, "std_m": one.std_m, "rms_m": one.rms_m}
         for (first, second), one in strips.pairs().items()
@@ -337,7 +347,7 @@ def level_words(strips: FlightStrips) -> str:
     agreement = strips.agreement
     if not agreement.judged:
         return f"too few cells for a quality level ({agreement.cells:,} in {agreement.places} places)"
-    return f"strips keep {agreement.best or 'no quality level'}"
+    return f"strips meet {agreement.best or 'no quality level'}"
 
 
 def _wanted(done: Calibrated) -> dict[str, float]:
@@ -420,8 +430,8 @@ def _prealigned_lines(done: Calibrated) -> list[str]:
 
 
 def _profile_lines(check: Check) -> list[str]:
-    told = [f"{one.scanner}.{key_of(one.parameter)[0]} {one.normalised:+.1f}" for one in check.comparisons]
-    return [f"profiles less adjustment, in sigmas: {', '.join(told)}"] if told else []
+    differences = [f"{one.scanner}.{key_of(one.parameter)[0]} {one.normalised:+.1f}" for one in check.comparisons]
+    return [f"profiles less adjustment, in sigmas: {', '.join(differences)}"] if differences else []
 
 
 def _parameter_lines(adjusted: Adjusted, knots: Sequence[float]) -> list[str]:

@@ -33,7 +33,9 @@ def facts_of(file: Path) -> dict[str, Plain]:
     facts: dict[str, Plain] = {}
     for owner, table in tables.items():
         if not isinstance(table, dict):
-            raise UserError(f"{file}: {key_text(owner)}: want a table a class, as [CA_GNSS] with numberSatellites = 14")
+            raise UserError(
+                f"{file}: {key_text(owner)}: give each class a table, such as [CA_GNSS] with numberSatellites = 14"
+            )
         for name, value in table.items():
             key = f"{owner}.{name}"
             facts[key] = tuple(value) if isinstance(value, list) else value

@@ -89,7 +89,7 @@ def refuse_without_noise(kept: KeptFlight) -> None:
         if not max(noise.range_m, noise.angle_rad, noise.divergence_rad):
             raise UserError(
                 f"{kept.logged[0].log}: scanner.{head.name}: range_sigma_m, angle_sigma_deg and divergence_mrad are "
-                "all 0; want the scanner's own: an adjustment weighs returns by them"
+                "all 0; set the scanner's values, because the adjustment weights returns by them"
             )
 
 
@@ -182,7 +182,7 @@ def _heads(logged: Sequence[LoggedFlight]) -> tuple[Head, ...]:
             if len(there.mount.stages) != len(head.mount.stages):
                 raise UserError(
                     f"{flight.log}: scanner.{name}.gimbal: has {len(head.mount.stages)} stages, in {logged[0].log} "
-                    f"{len(there.mount.stages)}; want logs of one installation"
+                    f"{len(there.mount.stages)}; use logs of one installation"
                 )
             if there is not head:
                 found[name] = replace(there, mount=there.mount.joined(head.mount))
@@ -329,5 +329,6 @@ def refuse_installations(logged: Sequence[Any]) -> None:
     for flight, place in zip(logged, places, strict=True):
         if place != places[0]:
             raise UserError(
-                f'{flight.log}: is of installation "{place}", {logged[0].log} of "{places[0]}"; want logs of one'
+                f'{flight.log}: was recorded with installation "{place}", {logged[0].log} with "{places[0]}"; use '
+                "logs of one installation"
             )

@@ -229,9 +229,9 @@ def _calibrated(wish: CalibrationOptions, kept: KeptFlight, folder: Path, tell: 
     flight = replaced(kept.flight, adjusted.calibrations, folder, "calibrated", workers)
     tell("profiles", 0, 1)
     checked = check(flight, adjusted, prior, points)
-    told = (*kept.notes, *notes, *adjusted.notes)
+    all_notes = (*kept.notes, *notes, *adjusted.notes)
     findings = prealigned_otherwise(away, adjusted)
-    return Calibrated(kept, flight, features, prior, first, adjusted, points, checked, told, findings)
+    return Calibrated(kept, flight, features, prior, first, adjusted, points, checked, all_notes, findings)
 
 
 def _aligned(flight: Flight, fixed: frozenset[str]) -> tuple[dict[str, Calibration], dict[str, float]]:
@@ -263,8 +263,8 @@ def prealigned_otherwise(away: Mapping[str, float], adjusted: Adjusted) -> tuple
     for held in adjusted.held:
         apart = away.get(f"{held.scanner}.{held.name}")
         if apart is not None:
-            words, told = unknown(f"{held.scanner}.{held.name}").words, number(math.degrees(apart), "+.2f")
-            what = f"the pre-alignment puts {words} {told}° from the start at which it is held"
+            words, apart_text = unknown(f"{held.scanner}.{held.name}").words, number(math.degrees(apart), "+.2f")
+            what = f"the pre-alignment puts {words} {apart_text}° from the initial value at which it is held"
             change = "fly the lines that determine it, or start from a calibration that holds"
             found.append(Finding(what, change, abs(apart) / COARSE_RAD, unusable=True))
     return tuple(found)
@@ -274,7 +274,7 @@ def _refuse_existing(wish: CalibrationOptions, files: Iterable[Path]) -> None:
     """Refuse with `UserError` to replace files that exist, unless the user allows it."""
     for path in files:
         if path.exists() and not wish.overwrite:
-            raise UserError(f"{path}: is there already; want another folder, or --overwrite", ExitCode.USAGE)
+            raise UserError(f"{path}: already exists; choose another folder or use --overwrite", ExitCode.USAGE)
 
 
 def paths_of(wish: CalibrationOptions, scanners: Iterable[str]) -> dict[str, Path]:
@@ -292,7 +292,7 @@ def _refuse_one_strip(kept: KeptFlight) -> None:
         raise UserError("\n".join(holes))
     if len(strips) < 2:
         raise UserError(
-            f"{log}: {len(strips) or 'no'} strip with returns; a calibration compares strips: want at least two that "
+            f"{log}: {len(strips) or 'no'} strip with returns; a calibration compares strips: fly at least two that "
             "overlap, better opposite, crossing and parallel ones at two heights"
         )
     refuse_installations(kept.logged)
@@ -305,8 +305,8 @@ def refuse_no_planes(log: str, planes: Features) -> None:
         return
     why = ", ".join(f"{count:,} {reason}" for reason, count in planes.refused.most_common(3))
     raise UserError(
-        f"{log}: no plane is seen by two strips ({why or 'no candidates'}); want strips that overlap over roofs and "
-        "open ground, with some 2 returns a square metre"
+        f"{log}: no two strips see a common plane ({why or 'no candidates'}); fly strips that overlap over roofs and "
+        "open ground, with about 2 returns per square metre"
     )
 
 
@@ -315,7 +315,7 @@ def refuse_lost_control(control: Path | None, features: Features) -> None:
     if control is None or any(plane.control for plane in features.planes):
         return
     why = ", ".join(f"{count:,} {reason}" for reason, count in features.refused.items() if "control" in reason)
-    raise UserError(f"{control}: no point lies on ground that a strip shows as a plane ({why or 'no returns'})")
+    raise UserError(f"{control}: no point lies on ground where a strip has a plane ({why or 'no returns'})")
 
 
 # ---------------------------------------------------------------------- observations
@@ -368,7 +368,7 @@ def _refuse_far(wish: CalibrationOptions, flight: Flight, adjusted: Adjusted) ->
     """
     log = wish.logs.logs[0]
     if not adjusted.converged:
-        raise UserError(f"{log}: the adjustment does not converge; look at the strips with swath view first")
+        raise UserError(f"{log}: the adjustment does not converge; inspect the strips with swath view first")
     for head in flight.heads:
         found = adjusted.calibrations[head.name]
         for name in ANGLES:
@@ -376,11 +376,11 @@ def _refuse_far(wish: CalibrationOptions, flight: Flight, adjusted: Adjusted) ->
             if abs(away_deg) > wish.limit_deg:
                 raise UserError(
                     f"{log}: {head.name}: {name.removesuffix('_rad')} would change by {away_deg:.2f}°, more than "
-                    f"--limit-deg {wish.limit_deg:g}; is the installation matrix right?"
+                    f"--limit-deg {wish.limit_deg:g}; check the installation matrix"
                 )
         away_m = found.value("range_offset_m") - head.start.value("range_offset_m")
         if abs(away_m) > wish.limit_m:
             raise UserError(
                 f"{log}: {head.name}: the range offset would change by {away_m:.2f} m, more than --limit-m "
-                f"{wish.limit_m:g}; are the control's heights ellipsoidal, and of this datum?"
+                f"{wish.limit_m:g}; check that the control's heights are ellipsoidal and in this datum"
             )

@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from swath.daemon.processing.setup.setup import Options
 
 
-UNSAID = "a datum that is not said"
+UNSAID = "an unspecified datum"
 
 INTENSITY_FACTOR = 257.0  # scales eight bits, 0 … 255, to the 16-bit field
 
@@ -207,7 +207,7 @@ def read_flights(
     for number, (session, setup) in enumerate(zip(sessions, setups, strict=True)):
         tell("clocks and trajectory", number, len(sessions))
         flights.append(_read(session, setup, positions=wish.trajectory.file is not None))
-    flights[0].holes += [f"passed over: {line}" for line in passed_over]
+    flights[0].holes += [f"skipped: {line}" for line in passed_over]
     refuse_overlap({flight.log: flight.span for flight in flights})
     flights.sort(key=lambda flight: flight.span)  # sessions come in host time, which may be wrong
     for flight in flights:
@@ -227,7 +227,7 @@ def _setup(wish: GeorefOptions, session: Session) -> Setup:
         setup = Setup.of_config(wish.config, wish.options)
     crs = wish.options.crs or setup.config.output.crs
     if crs is None:
-        raise UserError(f"{session.parts[0].path}: its configuration has no output.crs; want --crs", ExitCode.USAGE)
+        raise UserError(f"{session.parts[0].path}: its configuration has no output.crs; give --crs", ExitCode.USAGE)
     refuse_geocentric(crs)
     return setup
 
@@ -244,7 +244,7 @@ def _read(session: Session, setup: Setup, *, positions: bool) -> Flight:
     index = index_log(session)
     first, last = index.spans()
     if not len(first):
-        raise UserError(f"{log}: no scanner's data in the log")
+        raise UserError(f"{log}: the log has no scanner data")
     clocks.clocks = find_stamps(index, setup, clocks.clocks.host)
     clocks.remarks += clocks.clocks.remarks
     flight = Flight(session, setup, clocks, index, (0, 0), (int(first.min()), int(last.max()) + 1))
@@ -272,7 +272,7 @@ def _choose(wish: GeorefOptions, flight: Flight) -> None:
     misfit = flight.setup.mapping.misfit(places_e)
     if misfit and not wish.options.force_crs:
         lines = of_log(flight.log, [misfit], wish.options)
-        raise UserError(f"{lines[0]}; --force-crs takes it as it is", ExitCode.USAGE)
+        raise UserError(f"{lines[0]}; use --force-crs to accept it", ExitCode.USAGE)
     flight.troubles += [misfit] if misfit else []
 
 
@@ -313,8 +313,8 @@ def _number_strips(wish: GeorefOptions, flights: Sequence[Flight]) -> None:
         note_strips_elsewhere(wish.strips, given, flights)
     if number == 1:
         raise UserError(
-            f"{flights[0].log}: no strip: nowhere straight flight with data for {wish.rules.min_strip_s:g} s; "
-            "want --strips whole, or --strips FILE with their times"
+            f"{flights[0].log}: has no strip: no straight flight with data lasts {wish.rules.min_strip_s:g} s; use "
+            "--strips whole, or --strips FILE with the strips' times"
         )
 
 
@@ -337,7 +337,7 @@ def note_times(flights: Sequence[Flight], results: Sequence[JobResult]) -> None:
 
 def _given_strips(name: str) -> list[Span]:
     if not Path(name).exists():
-        raise UserError(f"--strips {name}: no such file; want auto, whole or a CSV file", ExitCode.IO)
+        raise UserError(f"--strips {name}: no such file; give auto, whole or a CSV file", ExitCode.IO)
     return read_strips(text_of(Path(name), "a CSV file with start_gps_ns,end_gps_ns"), name)
 
 
@@ -367,7 +367,7 @@ def _straight(wish: GeorefOptions, flight: Flight) -> list[Span]:
         unknown += outside
     else:
         flight.troubles += [
-            f"{flight.log}: {(stop - start) / 1e9:.1f} s of the log have no INS solution: no strips there"
+            f"{flight.log}: {(stop - start) / 1e9:.1f} s of the log have no INS solution and therefore no strips"
             for start, stop in outside
             if stop - start >= wish.rules.min_strip_s * 1e9
         ]
@@ -388,18 +388,18 @@ def refuse_different_settings(
         UserError: the settings differ.
     """
     for (one, first), (other, second) in pairwise(configs.items()):
-        for key, said in (("crs", crs), ("epoch", epoch)):
+        for key, given in (("crs", crs), ("epoch", epoch)):
             ours, theirs = getattr(first.output, key), getattr(second.output, key)
-            if said is None and ours != theirs:
+            if given is None and ours != theirs:
                 raise UserError(
-                    f"{other}: its output.{key} is {_said(theirs)}, that of {one} {_said(ours)}; "
-                    f"say one with --{key} (of swath georef) or --config, or take them one by one",
+                    f"{other}: its output.{key} is {_said(theirs)}, that of {one} {_said(ours)}; set one with --{key} "
+                    "(of swath georef) or --config, or process the logs one by one",
                     ExitCode.USAGE,
                 )
         if datum is None and (theirs := _datum_of(second)) != (ours := _datum_of(first)):
             raise UserError(
                 f"{other}: its positions are in {theirs or UNSAID}, those of {one} in {ours or UNSAID} "
-                "(gnss.….datum); say one with --trajectory-datum, or georeference them one by one",
+                "(gnss.….datum); set one with --trajectory-datum, or georeference the logs one by one",
                 ExitCode.USAGE,
             )
         arms = {name: list(gnss.lever_arm_m) for name, gnss in first.gnss.items()}
@@ -408,7 +408,7 @@ def refuse_different_settings(
             name = next(name for name in {**arms, **others} if arms.get(name) != others.get(name))
             raise UserError(
                 f"{other}: gnss.{name}.lever_arm_m is {_said(others.get(name))}, in {one} {_said(arms.get(name))}: "
-                "another antenna; georeference them one by one",
+                "the antennas differ; georeference the logs one by one",
                 ExitCode.USAGE,
             )
 
@@ -422,7 +422,7 @@ def refuse_geocentric(crs: str) -> None:
     read = CRS.from_user_input(crs)
     if read.is_geocentric:
         raise UserError(
-            f'output.crs = "{crs}" ({read.name}) is geocentric: files of points want a projected one, such as '
+            f'output.crs = "{crs}" ({read.name}) is geocentric; point files need a projected CRS, such as '
             '"EPSG:326ZZ" for UTM zone ZZ north on WGS 84',
             ExitCode.USAGE,
         )
@@ -454,8 +454,8 @@ def refuse_overlap(spans: Mapping[Path, Span]) -> None:
     for (one, (_, end_ns)), (other, (start_ns, _)) in pairwise(ordered):
         if start_ns < end_ns:
             raise UserError(
-                f"{other}: begins at {gps_text(start_ns)}, before {one} ends at {gps_text(end_ns)}: "
-                "two recordings of one time; georeference them one by one",
+                f"{other}: begins at {gps_text(start_ns)}, before {one} ends at {gps_text(end_ns)}: the recordings "
+                "overlap in time; georeference them one by one",
                 ExitCode.USAGE,
             )
 
@@ -473,7 +473,9 @@ def note_strips_elsewhere(file: str, strips: Sequence[Span], flights: Sequence[F
     ]
     if len(elsewhere) == len(strips):
         logs = ", ".join(f"{gps_text(flight.span[0])} to {gps_text(flight.span[1])}" for flight in flights)
-        raise UserError(f"{file}: none of its strips lies in the logs, {logs}; want GPS nanoseconds since 1980-01-06")
+        raise UserError(
+            f"{file}: none of its strips lies in the logs, {logs}; give times in GPS nanoseconds since 1980-01-06"
+        )
     flights[0].holes += [
         f"{file}: its strip from {gps_text(start)} to {gps_text(end)} lies in no log" for start, end in elsewhere
     ]

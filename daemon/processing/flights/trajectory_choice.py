@@ -33,8 +33,8 @@ LOOKED_AT = 10_000  # epochs sampled to test whether the body flies forward and 
 FLIES_MPS = 15.0  # no aircraft flies so fast sideways
 FORWARD = 0.5  # cosine between nose and course below which it would fly sideways
 AXES = (
-    "want the attitude of axes forward, right, down: of a device's INS imu.….rotation_b_imu turns it, as it turns the "
-    "samples"
+    "give the attitude of the axes forward, right, down; imu.….rotation_b_imu rotates the attitude of a device's INS "
+    "as it rotates the samples"
 )
 
 Vector = tuple[float, float, float]
@@ -63,7 +63,7 @@ class TrajectoryOptions:
     def __post_init__(self) -> None:
         """Refuse with `UserError` to force a file if no file is given."""
         if self.force and self.file is None:
-            raise UserError("--force-trajectory: there is no file to be taken; want --trajectory too", ExitCode.USAGE)
+            raise UserError("--force-trajectory: needs --trajectory FILE, because it accepts that file", ExitCode.USAGE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +100,7 @@ def choose_trajectory(
         UserError: there is no trajectory, it cannot be read, or it is of another time.
     """
     log = session.parts[0].path
-    doubts: list[str] = []
+    warnings: list[str] = []
     solutions: dict[str, int] = {}
     navigated: Navigated | None = None
     both = setup.sources.imu_source is not None and bool(setup.config.gnss)
@@ -112,26 +112,28 @@ def choose_trajectory(
                 navigated = _navigated(setup, session, solutions)
                 trajectory = navigated.trajectory()
                 findings = [finding.text for leg in navigated.legs for finding in leg.findings]
-                doubts = [*navigated.doubts, *navigated.holes, *findings]
+                warnings = [*navigated.doubts, *navigated.holes, *findings]
         else:
             trajectory = _from_file(wish, wish.file, span, leap_seconds)
-            doubts = refuse_other_motion(clocks, trajectory, str(wish.file), log)
+            warnings = refuse_other_motion(clocks, trajectory, str(wish.file), log)
         refuse_no_overlap(trajectory, str(wish.file or trajectory.name), span, log)
         trajectory.require_attitude()
         if navigated is None:
-            doubts += attitude_doubts(trajectory, str(wish.file or f"{log}: {FROM_LOG}"))
+            warnings += attitude_doubts(trajectory, str(wish.file or f"{log}: {FROM_LOG}"))
         if setup.deflection_rad is not None:
             trajectory = trajectory.with_deflection(*setup.deflection_rad)
         if offset is not None and navigated is not None:
-            doubts.append(f"{log}: navigated from IMU and GNSS, which is the body's trajectory: no --trajectory-at")
+            warnings.append(
+                f"{log}: the trajectory navigated from IMU and GNSS is that of the body; leave --trajectory-at out"
+            )
         elif offset is not None:
             trajectory = trajectory.at_body(offset)
         if wish.file is not None:
-            doubts += _belonging(wish, wish.file, trajectory, setup, clocks, log)
+            warnings += _belonging(wish, wish.file, trajectory, setup, clocks, log)
     except TrajectoryError as error:
         named = str(error) if str(log) in str(error) else f"{error} ({log})"
         raise UserError(named) from error
-    return Chosen(trajectory, doubts, solutions, navigated)
+    return Chosen(trajectory, warnings, solutions, navigated)
 
 
 def _belonging(
@@ -144,7 +146,7 @@ def _belonging(
     given = Given(str(file), trajectory, offset, points_of(setup), setup.options.datum is not None)
     found = judge_given(given, setup, clocks, log)
     if found.refused and not wish.force:
-        raise UserError("\n".join(f"{line}; --force-trajectory takes it as it is" for line in found.refused))
+        raise UserError("\n".join(f"{line}; use --force-trajectory to accept it" for line in found.refused))
     return [*found.refused, *found.warnings]
 
 
@@ -172,9 +174,11 @@ def _navigated(setup: Setup, session: Session, solutions: dict[str, int]) -> Nav
     """Return the session navigated and smoothed from IMU and GNSS."""
     log = session.parts[0].path
     if setup.sources.imu_source is None or not setup.config.gnss:
-        told = f"{setup.sources.ins_source}: its INS had no solution" if solutions else "no INS solution in the log"
+        reason = f"{setup.sources.ins_source}: its INS had no solution" if solutions else "the log has no INS solution"
         missing = "no receiver" if setup.sources.imu_source is not None else "no IMU"
-        raise UserError(f"{log}: {told}, and {missing} to make one; want --trajectory FILE", ExitCode.USAGE)
+        raise UserError(
+            f"{log}: {reason}, and {missing} to compute a trajectory; give --trajectory FILE", ExitCode.USAGE
+        )
     try:
         return navigate_session(session, NavigationOptions(InputOptions(config=setup.config)))
     except UserError as error:
@@ -200,7 +204,10 @@ def offset_of(at: str, setup: Setup) -> Vector | None:
     if at == "scanner":
         heads = [setup.calibrations[name].lever_arm_b for name in setup.scanners]
         if len(heads) != 1:
-            raise UserError(f"--trajectory-at scanner: there are {len(heads)} scanners; want x,y,z", ExitCode.USAGE)
+            raise UserError(
+                f"--trajectory-at scanner: the configuration has {len(heads)} scanners; give x,y,z instead",
+                ExitCode.USAGE,
+            )
         return _vector(heads[0].tolist())
     try:
         x, y, z = (float(part) for part in at.split(","))
@@ -225,8 +232,8 @@ def refuse_no_overlap(trajectory: Trajectory, file: str, span: Span, log: Path) 
     if first_ns <= span[1] and last_ns >= span[0]:
         return
     raise UserError(
-        f"{file}: is from {gps_text(first_ns)} to {gps_text(last_ns)}, {log} from {gps_text(span[0])} to "
-        f"{gps_text(span[1])}: they do not overlap; want the trajectory of this flight, or --week"
+        f"{file}: covers {gps_text(first_ns)} to {gps_text(last_ns)}, {log} from {gps_text(span[0])} to "
+        f"{gps_text(span[1])}: they do not overlap; give the trajectory of this flight, or --week"
     )
 
 
@@ -245,9 +252,12 @@ def refuse_other_motion(clocks: LogClocks, trajectory: Trajectory, file: str, lo
 
     shift = correlate_turn_rates(trajectory, clocks.imu_gps_ns, clocks.imu_rate_b)
     if shift.is_wrong:
-        raise UserError(f"{file}: {shift.what}, by how it turns and how the IMU in {log} does")
+        raise UserError(f"{file}: {shift.what} (by comparison of its turn rates with those of the IMU in {log})")
     if shift.is_certain and abs(shift.seconds) > LATE_S:
-        return [f"{file}: turns {-shift.seconds:.3f} s later than the IMU in {log} does; its time may be off by that"]
+        return [
+            f"{file}: its turns lag those of the IMU in {log} by {-shift.seconds:.3f} s; its time may be off by this "
+            "amount"
+        ]
     return []
 
 
@@ -260,7 +270,7 @@ def attitude_doubts(trajectory: Trajectory, named: str) -> list[str]:
     flies = np.hypot(north, east) > FLIES_MPS
     lines = []
     if len(seen) and np.median(np.cos(roll) * np.cos(pitch)) < 0.0:
-        lines.append(f"{named}: its z axis points up, the body would fly on its back; {AXES}")
+        lines.append(f"{named}: its z axis points up, so the body would fly upside down; {AXES}")
     if flies.any():
         apart = heading[flies] - np.arctan2(east[flies], north[flies])
         if np.median(np.cos(apart)) < FORWARD:

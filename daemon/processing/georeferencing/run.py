@@ -91,8 +91,8 @@ def _job(wish: GeorefOptions, flight: Flight, number: int, tile: Segment, partia
     trajectory = flight.trajectory.between(begin - reach, end + reach)
     name = f"{flight.session.session_id}_strip{tile.strip:02d}"
     path = partial / (name + (".copc.laz" if wish.copc else ".laz"))
-    dropped = partial / f"{name}{DROPPED}" if wish.write_dropped else None
-    return Job(number, tile, places, trajectory, path, dropped)
+    dropped_file = partial / f"{name}{DROPPED}" if wish.write_dropped else None
+    return Job(number, tile, places, trajectory, path, dropped_file)
 
 
 def _numbers(flights: Sequence[Flight]) -> dict[str, int]:
@@ -187,14 +187,12 @@ def _refuse_existing(wish: GeorefOptions, names: Sequence[str]) -> None:
         trajectories = [path for path in (files.csv, files.sbet, files.smrmsg) if path is not None and path.exists()]
         read = wish.trajectory.file
         if read is not None and read.exists() and any(path.samefile(read) for path in trajectories):
-            raise UserError(
-                f"{read}: is read, and would be replaced by what is used of it; want another folder", ExitCode.USAGE
-            )
+            raise UserError(f"{read}: is an input and would be overwritten; choose another folder", ExitCode.USAGE)
         there = [path for path in (wish.output / f"{name}.json", *_strips(wish.output, name)) if path.exists()]
         if (there or trajectories) and not wish.overwrite:
             first = [*there, *trajectories][0]
             raise UserError(
-                f"{first}: is there from an earlier run; want another folder, or --overwrite", ExitCode.USAGE
+                f"{first}: exists from an earlier run; choose another folder or use --overwrite", ExitCode.USAGE
             )
     _refuse_parts(wish.output, names)
 
@@ -205,7 +203,10 @@ def _refuse_parts(folder: Path, names: Sequence[str]) -> None:
         sessions = sessions_in(read_sidecar(path))
         others = [session for session in sessions if session not in names]
         if others and len(others) < len(sessions):
-            text = f"{path}: is of one run with {', '.join(others)}; want all its sessions at once, or another folder"
+            text = (
+                f"{path}: belongs to one run with {', '.join(others)}; process all its sessions at once, or choose "
+                "another folder"
+            )
             raise UserError(text, ExitCode.USAGE)
 
 
@@ -263,7 +264,7 @@ def _note_troubles(flights: Sequence[Flight], results: Sequence[JobResult]) -> N
     note_times(flights, results)
     if not any(result.points or result.failed for result in results):
         lines = [line for flight in flights for line in (*flight.troubles, *flight.holes)]
-        lines += [line for told in unread_lines(str(flights[0].log), count_unread(results)) for line in told]
+        lines += [line for part in unread_lines(str(flights[0].log), count_unread(results)) for line in part]
         became = reasons_text(fates for result in results for fates in result.fates.values())
         refuse_nothing(flights[0].log, lines, became)
 

@@ -33,8 +33,8 @@ UNCOVERED = {"outside_trajectory": "are outside the trajectory", "trajectory_gap
 def calibration_entry(calibration: Calibration) -> dict[str, Any]:
     """Return the entry of a calibration with all its parameters, in the units of its file."""
     parameters = {parameter.key: calibration.value(parameter.name) / parameter.factor for parameter in PARAMETERS}
-    said = {key: calibration.header[key] for key in CARRIED if key in calibration.header}
-    return {"id": calibration.id, "method": calibration.method, **said, "parameters": parameters}
+    carried = {key: calibration.header[key] for key in CARRIED if key in calibration.header}
+    return {"id": calibration.id, "method": calibration.method, **carried, "parameters": parameters}
 
 
 def settings_entry(setup: Setup) -> dict[str, Any]:
@@ -57,9 +57,9 @@ def count_fates(results: Sequence[JobResult]) -> dict[str, dict[str, Any]]:
     for result in results:
         for scanner, fates in result.fates.items():
             total.setdefault(scanner, Counter()).update(fates)
-    unread = count_unread(results)
+    undecoded = count_unread(results)
     return {
-        scanner: counts_entry(fates) | {"messages_not_read": dict(sorted(unread.get(scanner, {}).items()))}
+        scanner: counts_entry(fates) | {"messages_not_read": dict(sorted(undecoded.get(scanner, {}).items()))}
         for scanner, fates in sorted(total.items())
     }
 
@@ -79,13 +79,13 @@ def reasons_text(fates: Iterable[Counter[str]]) -> str:
     for counts in fates:
         total.update(counts)
     became = (f"{count:,} {reason.replace('_', ' ')}" for reason, count in sorted((+total).items()))
-    return ", ".join(became) or "none came"
+    return ", ".join(became) or "no returns were recorded"
 
 
 def counts_entry(fates: Counter[str]) -> dict[str, Any]:
     """Return counts of returns: read = written + dropped, the latter by reason."""
-    dropped = {name: count for name, count in sorted(fates.items()) if name != IN_FILES and count}
-    return {"read": fates.total(), "written": fates[IN_FILES], "dropped": dropped}
+    discarded = {name: count for name, count in sorted(fates.items()) if name != IN_FILES and count}
+    return {"read": fates.total(), "written": fates[IN_FILES], "dropped": discarded}
 
 
 def strip_entry(result: JobResult, file: Path | None, dropped: Path | None) -> dict[str, Any]:
@@ -208,14 +208,13 @@ def _warnings(flight: Flight, results: Sequence[JobResult]) -> list[str]:
         sum(getattr(result.clipped, name) for result in results) for name in ("sigma", "sigma_unknown", "intensity")
     )
     if sigma:
-        lines.append(f"{sigma:,} points have a sigma of 6.5535 m or more, which stands in the file as 6.5535 m")
+        lines.append(f"{sigma:,} points have a sigma of 6.5535 m or more, which the file stores as 6.5535 m")
     if unknown:
         lines.append(
-            f"{unknown:,} points have a sigma that is not known, as the trajectory says none; "
-            "6.5535 m stands in the file"
+            f"{unknown:,} points have an unknown sigma, because the trajectory has no sigmas; the file stores 6.5535 m"
         )
     if intensity:
-        lines.append(f"{intensity:,} points have an intensity above 65535, which stands in the file as 65535")
+        lines.append(f"{intensity:,} points have an intensity above 65535, which the file stores as 65535")
     return lines
 
 
@@ -227,9 +226,9 @@ def unit_doubts(flight: Flight) -> list[str]:
     if unit == unit_of_height or not frame["heights"].startswith("ellipsoidal"):
         return []
     return [
-        f"easting and northing are in {unit}, heights in {unit_of_height} above the ellipsoid: {frame['crs']} says "
-        f"nothing of heights, and other programs may take them for {unit}; want output.crs with a vertical CRS, "
-        f"such as EPSG:6529+5703"
+        f"easting and northing are in {unit}, heights in {unit_of_height} above the ellipsoid: {frame['crs']} does "
+        f"not define heights, and other programs may read them as {unit}; set output.crs with a vertical CRS, such as "
+        "EPSG:6529+5703"
     ]
 
 
@@ -240,7 +239,7 @@ def _holes(flight: Flight, results: Sequence[JobResult]) -> list[str]:
         f"{flight.log.parent}: part {number} of {session.session_id} is missing" for number in session.missing_parts
     ]
     if session.growing is not None:
-        lines.append(f"{session.growing}: is still being recorded; the products are of what it held so far")
+        lines.append(f"{session.growing}: is still being recorded; the products cover the part recorded so far")
     for part in damages:
         damage = part.damage
         lines.append(f"{part.path}: at byte {damage.offset}: {damage.length} bytes, {damage.what}")

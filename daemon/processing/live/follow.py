@@ -235,7 +235,7 @@ class LiveFollower:
             following = sign.path  # the recorder skips a file name that is taken
         if os.path.exists(following) and following != part.path:
             return self._open(following) is not None
-        self.ended = "the recording has ended" if part.is_read else "the recorder is gone, and its log has no end"
+        self.ended = "the recording has ended" if part.is_read else "the recorder stopped without closing its log"
         return False
 
     def _is_abandoned(self, part: LivePart) -> bool:

@@ -188,7 +188,7 @@ class LiveProducts:
                 self.trouble = ""
             return
         least_mb = self.room.least_bytes / 1e6
-        self.trouble = f"free space is down to {least_mb:.0f} MB, twice the recorder's reserve: nothing is written"
+        self.trouble = f"free space is down to {least_mb:.0f} MB, twice the recorder's reserve; writing is suspended"
 
     def _write(self, add: Any) -> bool:
         """Write to live.mcap, if there is a frame and room for it; return True if written."""
@@ -204,16 +204,18 @@ class LiveProducts:
             self.trouble = f"{NAME}: {error.strerror or error}: nothing is written any more"
             return False
         if self._mcap.is_full:
-            self.trouble = f"{NAME} has reached live_quota_mb = {self._live.live_quota_mb:g}: nothing is added to it"
+            self.trouble = (
+                f"{NAME} has reached live_quota_mb = {self._live.live_quota_mb:g}; no more data is added to it"
+            )
         return written
 
     def origin(self) -> dict[str, Any]:
         """Return what the coordinates of the products refer to."""
-        said: dict[str, Any] = {"crs": self._about, "axes": "east, north, up, metres"}
+        entry: dict[str, Any] = {"crs": self._about, "axes": "east, north, up, metres"}
         if self.frame is not None:
-            said["origin"] = [round(value, 4) for value in self.frame.origin.tolist()]
-            said["origin_unit_m"] = self.frame.unit_m.tolist()
-        return said
+            entry["origin"] = [round(value, 4) for value in self.frame.origin.tolist()]
+            entry["origin_unit_m"] = self.frame.unit_m.tolist()
+        return entry
 
     def save_coverage(self, latest: dict[str, Any]) -> None:
         """Replace the coverage grid's numbers and picture, each at once; do nothing if there is no room."""
@@ -243,7 +245,7 @@ class LiveProducts:
             try:
                 mcap.close()
             except OSError as error:
-                self.trouble = f"{NAME}: {error.strerror or error}: it has no index"
+                self.trouble = f"{NAME}: {error.strerror or error}: the file has no index"
 
 
 def unix_from_gps(gps_ns: int) -> int:

@@ -92,9 +92,9 @@ class LiveSession:
         self._feed = LogFeed(setup, self._stream)
         if setup.sources.ins_source is None and self._feed.navigator is None:
             raise UserError(
-                f"{info.session_id}: no configured device tells its own INS solution, nor are there both an IMU and a "
-                "receiver to navigate by, and without a trajectory nothing is made while it is recorded; add them, or "
-                "georeference afterwards",
+                f"{info.session_id}: the configuration has neither a device with an INS solution nor both an IMU and "
+                "a receiver, and without a trajectory there are no live products; add these devices, or georeference "
+                "after the recording",
                 ExitCode.USAGE,
             )
         reserve_bytes = int(setup.config.session.reserve_mb * 1e6)
@@ -271,7 +271,7 @@ def made_session(
         session.look_for_room()
         return session
     except OSError as error:
-        text = f"{error.filename or folder}: {error.strerror or error}; swath live writes what it shows there"
+        text = f"{error.filename or folder}: {error.strerror or error}; swath live writes its products there"
         raise UserError(one_line(text), ExitCode.IO) from error
 
 

@@ -171,12 +171,12 @@ class LiveStatus:
 
     def _clock_states(self, now_ns: int) -> dict[str, Any]:
         host = self._stream.clocks.host
-        told = {}
+        states = {}
         for source in host.by_source:
             status = host.status(source, now_ns)
             sigma_ns = round(status.sigma_ns, 1) if np.isfinite(status.sigma_ns) else None
-            told[source] = {"state": status.state.name, "sigma_ns": sigma_ns}
-        return told
+            states[source] = {"state": status.state.name, "sigma_ns": sigma_ns}
+        return states
 
 
 def sentence(found: dict[str, Any]) -> str:

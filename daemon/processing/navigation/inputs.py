@@ -169,7 +169,7 @@ def read_inputs(session: Session, wish: InputOptions, storage: Storage = IN_MEMO
     observations = joined(list(parts.values()))
     refuse_elsewhere(inertial, observations, sources, wish.positions, log)
     legs, short = _legs(inertial, observations)
-    doubts = input_doubts(found, sources, times, parts, log)
+    warnings = input_doubts(found, sources, times, parts, log)
     missing = _missing(times, sampler, short, sources.imu.rate_hz)
     holes = [*session_holes(session), *(f"{log}: {sources.imu_source}: {part.text}" for part in missing)]
     samples = sampler.counts + times.refused + Counter(taken=len(inertial))
@@ -189,7 +189,7 @@ def read_inputs(session: Session, wish: InputOptions, storage: Storage = IN_MEMO
         ),
         assumed=sum((part.assumed for part in parts.values()), Counter()),
         counts=found.counts,
-        doubts=doubts,
+        doubts=warnings,
         holes=holes,
         missing=missing,
         findings=height_findings(found, sources) if outside is None else [],
@@ -236,18 +236,20 @@ def _missing(times: ImuTimes, sampler: Sampler, short: Sequence[Stretch], rate_h
     """Return the stretches of samples that no leg holds, by time; a gap left by unused samples is listed once."""
     rows = times.rows
     finite = np.isfinite(rows["specific_force_b"]).all(axis=1) & np.isfinite(rows["angular_rate_b"]).all(axis=1)
-    dropped = [*times.dropped]
-    dropped += stretches(rows["host_time_ns"], finite, times.gps_ns[finite], rate_hz, "samples that are not numbers")
+    stretches_without = [*times.dropped]
+    stretches_without += stretches(
+        rows["host_time_ns"], finite, times.gps_ns[finite], rate_hz, "samples that are not numbers"
+    )
     gaps = [Stretch(begin, end, "no samples") for begin, end in sampler.gaps]
     gaps = [
         gap
         for gap in gaps
         if not any(
             min(gap.end_ns, one.end_ns) - max(gap.begin_ns, one.begin_ns) > 0.5 * (gap.end_ns - gap.begin_ns)
-            for one in dropped
+            for one in stretches_without
         )
     ]
-    return sorted([*dropped, *_explained(gaps, sampler, rate_hz), *short], key=lambda part: part.begin_ns)
+    return sorted([*stretches_without, *_explained(gaps, sampler, rate_hz), *short], key=lambda part: part.begin_ns)
 
 
 def _explained(gaps: Sequence[Stretch], sampler: Sampler, rate_hz: float) -> list[Stretch]:

@@ -166,7 +166,7 @@ def session_holes(session: Session) -> list[str]:
     folder = session.parts[0].path.parent
     lines = [f"{folder}: part {number} of {session.session_id} is missing" for number in session.missing_parts]
     if session.growing is not None:
-        lines.append(f"{session.growing}: is still being recorded; the trajectory is of what it held so far")
+        lines.append(f"{session.growing}: is still being recorded; the trajectory covers the part recorded so far")
     for part in session.damage:
         damage = part.damage
         lines.append(f"{part.path}: at byte {damage.offset}: {damage.length} bytes, {damage.what}")

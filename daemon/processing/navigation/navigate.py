@@ -194,15 +194,15 @@ def navigate_inputs(
             holes += _why_not(inputs, leg)
     if not legs:
         why = holes[len(inputs.holes) :] or [
-            f"{inputs.log}: {inputs.sources.imu_source}: no run of samples without a gap is long enough to be navigated"
+            f"{inputs.log}: {inputs.sources.imu_source}: no run of samples without a gap is long enough for navigation"
         ]
         raise UserError("\n".join(why))
-    doubts = list(inputs.doubts)
+    warnings = list(inputs.doubts)
     for part, has_fixes in _unreached(legs, smooth=wish.smooth):
         if wish.smooth and has_fixes:
             missing.append(part)
-        (holes if wish.smooth and has_fixes else doubts).append(f"{inputs.log}: {part.text}")
-    navigated = Navigated(inputs, wish.smooth, legs, holes, doubts, sorted(missing, key=lambda part: part.begin_ns))
+        (holes if wish.smooth and has_fixes else warnings).append(f"{inputs.log}: {part.text}")
+    navigated = Navigated(inputs, wish.smooth, legs, holes, warnings, sorted(missing, key=lambda part: part.begin_ns))
     navigated.doubts.extend(_ins_doubts(inputs, navigated.trajectory()))
     return navigated
 
@@ -249,7 +249,7 @@ def _unreached(legs: Sequence[NavigatedLeg], *, smooth: bool) -> list[tuple[Stre
             part = Stretch(leg.leg.span[0], min(fix_ns, first), "no trajectory before the first position")
             found.append((part, False))
         if first - fix_ns > UNTIL_A_FIX_NS:
-            found.append((Stretch(fix_ns, first, "no trajectory: no start was found earlier"), True))
+            found.append((Stretch(fix_ns, first, "no trajectory: alignment found no earlier start"), True))
     return found
 
 
@@ -368,6 +368,6 @@ def point_doubts(ins: Trajectory, navigated: Trajectory, lever_arms_b: Sequence[
             what, point = "its antenna", "antenna"
             break
     return [
-        f"{source}: its own INS tells the way of {what}, {length_m:.2f} m from the body's origin ({place} m in b); "
-        f"with that solution want --trajectory-at {point}, or the receiver set to give it at the IMU"
+        f"{source}: its own INS gives the trajectory of {what}, {length_m:.2f} m from the body's origin ({place} m in "
+        f"b); use --trajectory-at {point} with that solution, or let the device give its solution at the IMU"
     ]

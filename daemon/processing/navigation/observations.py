@@ -84,8 +84,8 @@ def gps_times(
             continue
         leap = clock.leap_seconds_at(near_ns) if known else None
         error_ns = ahead[tag.scale][at]
-        told = complete_time(tag, near_ns + error_ns if known else None, leap)
-        placed.append(None if told is None else told - error_ns)
+        completed = complete_time(tag, near_ns + error_ns if known else None, leap)
+        placed.append(None if completed is None else completed - error_ns)
     return placed
 
 
@@ -164,13 +164,13 @@ def _fill_sigmas(
     """Fill in sigmas and correlations of a covariance, and on each axis without a valid variance the default."""
     given = np.full((3, 3), np.nan) if covariance is None else np.asarray(covariance, np.float64)
     variance = np.diag(given)
-    said = np.isfinite(variance) & (variance > 0.0) & (variance < GREATEST_SIGMA**2)
-    sigma = np.sqrt(np.where(said, variance, np.square(default)))
+    known = np.isfinite(variance) & (variance > 0.0) & (variance < GREATEST_SIGMA**2)
+    sigma = np.sqrt(np.where(known, variance, np.square(default)))
     row["sigma"] = sigma
-    if not said.all():
+    if not known.all():
         assumed[kind] += 1
     for place, (i, j) in enumerate(((0, 1), (0, 2), (1, 2))):
-        correlation = given[i, j] / (sigma[i] * sigma[j]) if said[i] and said[j] else 0.0
+        correlation = given[i, j] / (sigma[i] * sigma[j]) if known[i] and known[j] else 0.0
         row["correlation"][place] = correlation if abs(correlation) < 1.0 else 0.0
 
 
@@ -244,10 +244,10 @@ def ins_observations(
     found["time_ns"], found["kind"] = taken["gps_ns"], Kind.ATTITUDE
     found["value"] = np.stack([taken["roll_rad"], taken["pitch_rad"], taken["heading_rad"]], axis=1)
     sigma = taken["attitude_sigma_rad"].astype(np.float64)
-    said = np.isfinite(sigma) & (sigma > 0.0)
+    known = np.isfinite(sigma) & (sigma > 0.0)
     careful = white_factor(INS_STEP_NS, INS_SHARE, INS_TAU_S)
-    found["sigma"] = careful * np.where(said, sigma, np.array(DEFAULT_INS_SIGMAS_RAD))
-    assumed = Counter({"attitude": int((~said.all(axis=1)).sum())})
+    found["sigma"] = careful * np.where(known, sigma, np.array(DEFAULT_INS_SIGMAS_RAD))
+    assumed = Counter({"attitude": int((~known.all(axis=1)).sum())})
     return Observed(sort_observations(found), Counter({"no_solution": int((~usable).sum())}), +assumed)
 
 

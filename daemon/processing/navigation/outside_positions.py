@@ -67,8 +67,9 @@ def outside_observations(
     first, last = int(columns.time_ns[0]), int(columns.time_ns[-1])
     if last < span_ns[0] or first > span_ns[1]:
         raise UserError(
-            f"--gnss {file}: is from {gps_text(first)} to {gps_text(last)}, the log's samples from "
-            f"{gps_text(span_ns[0])} to {gps_text(span_ns[1])}: of another flight, or of another time scale"
+            f"--gnss {file}: covers {gps_text(first)} to {gps_text(last)}, the log's samples from "
+            f"{gps_text(span_ns[0])} to {gps_text(span_ns[1])}: it belongs to another flight, or its time scale "
+            "differs; give the positions of this flight in GPS time"
         )
     return OutsidePositions(file, _observed(columns))
 
@@ -94,8 +95,9 @@ def refuse_shifted(outside: OutsidePositions, own: StructArray) -> None:
         return
     raise UserError(
         f"--gnss {outside.file}: its positions are those of the log's receiver {abs(best_s)} s "
-        f"{'later' if best_s > 0 else 'earlier'} ({apart_m[0]:.0f} m apart as they are, {apart_m[best_s]:.1f} m so): "
-        "written with another number of leap seconds, or in another time scale (GPS for UTC); write it in GPS time"
+        f"{'later' if best_s > 0 else 'earlier'} ({apart_m[0]:.0f} m apart unshifted, {apart_m[best_s]:.1f} m "
+        "shifted): the file uses another number of leap seconds or another time scale (GPS instead of UTC); write it "
+        "in GPS time"
     )
 
 
@@ -160,9 +162,9 @@ def _rows(
         horizontal, vertical = sigmas[0 if kind == Kind.POSITION else 1]
         default[fix == int(known)] = (horizontal, horizontal, vertical)
     given = np.full((n, 3), np.nan) if sigma is None else sigma
-    said = np.isfinite(given) & (given > 0.0)
+    has_sigma = np.isfinite(given) & (given > 0.0)
     rows = np.zeros(n, OBSERVATION_DTYPE)
     rows["time_ns"], rows["kind"], rows["fix_type"] = columns.time_ns, kind, fix
     rows["satellites"] = 0 if columns.satellites is None else columns.satellites
-    rows["value"], rows["sigma"] = value, np.where(said, given, default)
-    return rows, np.asarray(~said.all(axis=1))
+    rows["value"], rows["sigma"] = value, np.where(has_sigma, given, default)
+    return rows, np.asarray(~has_sigma.all(axis=1))

@@ -122,9 +122,9 @@ class NavigationSources:
         table, given = self.imu.noise, self.noise_by_grade
         if not given:
             return ""
-        chosen = "" if "grade" in table.model_fields_set else ", which nobody chose"
-        told = ", ".join(f"{key} {value:g}" for key, value in given.items())
-        return f"Noise by grade {table.grade}{chosen} (imu.{self.imu_name}.noise sets none of these): {told}"
+        chosen = "" if "grade" in table.model_fields_set else ", the default"
+        values = ", ".join(f"{key} {value:g}" for key, value in given.items())
+        return f"Noise by grade {table.grade}{chosen} (imu.{self.imu_name}.noise does not set these): {values}"
 
     # ------------------------------------------------------------------ reading
 
@@ -260,16 +260,16 @@ def _chosen(kind: str, wanted: str | None, known: list[str], usual: list[str]) -
             return wanted
         option = "--imu" if kind == "imu" else "--gnss-name"
         raise UserError(
-            f"{option}: the configuration has no [{kind}.{wanted}]; there are: {', '.join(known) or 'none'}",
+            f"{option}: the configuration has no [{kind}.{wanted}]; it has: {', '.join(known) or 'none'}",
             ExitCode.USAGE,
         )
     if usual:
         return usual[0]
     what = {
-        "imu": "no IMU of the aircraft: want [imu.NAME], or a finished trajectory from elsewhere",
-        "gnss": "no GNSS receiver, which tells where it was and when: want [gnss.NAME], or --gnss FILE",
+        "imu": "no IMU of the aircraft; add [imu.NAME], or give a finished trajectory",
+        "gnss": "no GNSS receiver; add [gnss.NAME], or give --gnss FILE",
     }[kind]
-    raise UserError(f"the configuration names {what}", ExitCode.USAGE)
+    raise UserError(f"the configuration has {what}", ExitCode.USAGE)
 
 
 _NOISE_FIELDS = {
@@ -286,8 +286,8 @@ _NOISE_FIELDS = {
 
 def noise_of(table: NoiseConfig) -> ImuNoise:
     """Return the noise of ``[imu.….noise]``; values that it leaves out are its grade's."""
-    said = {key: value for key, value in table.model_dump().items() if key != "grade" and value is not None}
+    configured = {key: value for key, value in table.model_dump().items() if key != "grade" and value is not None}
     grade = GRADES[table.grade]
-    in_si = imu_noise(**(dict.fromkeys(_NOISE_FIELDS, 0.0) | said))
-    chosen = {_NOISE_FIELDS[key]: getattr(in_si, _NOISE_FIELDS[key]) for key in said}
+    in_si = imu_noise(**(dict.fromkeys(_NOISE_FIELDS, 0.0) | configured))
+    chosen = {_NOISE_FIELDS[key]: getattr(in_si, _NOISE_FIELDS[key]) for key in configured}
     return ImuNoise(**({field.name: getattr(grade, field.name) for field in fields(grade)} | chosen))

@@ -77,8 +77,8 @@ def imu_times(rows: StructArray, host: HostClocks, clock: str | None, rate_hz: f
     if own.any():
         taken = rows[own]
         gps_ns = taken["gps_week"].astype(np.int64) * WEEK_NS + taken["device_time_ns"]
-        dropped = stretches(rows["host_time_ns"], own, gps_ns, rate_hz, "samples without a GPS week")
-        return ImuTimes(taken, gps_ns, 0.0, "gps", _reasons(no_gps_week=int((~own).sum())), dropped)
+        untimed = stretches(rows["host_time_ns"], own, gps_ns, rate_hz, "samples without a GPS week")
+        return ImuTimes(taken, gps_ns, 0.0, "gps", _reasons(no_gps_week=int((~own).sum())), untimed)
     if clock is None or not len(rows):
         return ImuTimes(rows[:0], np.empty(0, np.int64), 0.0, "arrival", _reasons(no_clock=len(rows)))
     counted = rows["device_time_ns"] >= 0
@@ -93,9 +93,9 @@ def imu_times(rows: StructArray, host: HostClocks, clock: str | None, rate_hz: f
     refused = _reasons(no_device_time=len(rows) - len(taken), no_clock=int((~good).sum()))
     placed = counted.copy() if counted.any() else np.ones(len(rows), np.bool_)
     placed[placed] = good
-    why = f"the clock of {clock} gives these samples no time that is good to {GREATEST_SIGMA_NS / 1e9:.0f} s"
-    dropped = stretches(rows["host_time_ns"], placed, gps_ns[good], rate_hz, why)
-    return ImuTimes(taken[good], gps_ns[good], sigma_s, by, refused, dropped)
+    why = f"the clock of {clock} cannot time these samples to {GREATEST_SIGMA_NS / 1e9:.0f} s"
+    untimed = stretches(rows["host_time_ns"], placed, gps_ns[good], rate_hz, why)
+    return ImuTimes(taken[good], gps_ns[good], sigma_s, by, refused, untimed)
 
 
 def stretches(

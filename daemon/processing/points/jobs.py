@@ -212,15 +212,15 @@ def _write(
             _note_span(result, points)
             _note_edge(result, name, points, setup, trajectory)
 
-    dropped = None
+    dropped_file = None
     if job.dropped is not None:
-        dropped = Dropped(job.dropped, georeferenced, partial(put, withheld=True))
-        opened.callback(dropped.close)
+        dropped_file = Dropped(job.dropped, georeferenced, partial(put, withheld=True))
+        opened.callback(dropped_file.close)
     feed_job(plan, job, result, feed, write, tell)
     sink.close()
     result.clipped = sink.clipped
-    if dropped is not None:
-        result.withheld, result.listed = dropped.withheld, dropped.rows
+    if dropped_file is not None:
+        result.withheld, result.listed = dropped_file.withheld, dropped_file.rows
 
 
 def feed_job(
@@ -233,17 +233,17 @@ def feed_job(
 ) -> None:
     """Pass a job's messages through its own feed, close the feed, and count the fates of returns."""
     stream = feed.stream
-    unread = Unread({name: feed.parser(f"scanner/{name}") for name in stream.scanners})
+    undecoded = Unread({name: feed.parser(f"scanner/{name}") for name in stream.scanners})
     was_own = False
     for batch, own in _messages(plan, job, result, tell):
         if own is not was_own:
             feed.flush()  # units are decoded and counted as own or context, as when they came
-            unread.note(own=was_own)
+            undecoded.note(own=was_own)
             was_own = own
         write(feed.take(batch, context=not own))
     write(feed.close())
-    unread.note(own=was_own)
-    result.unread = unread.counts
+    undecoded.note(own=was_own)
+    result.unread = undecoded.counts
     for name in stream.scanners:
         fates = stream.fates(name)
         result.fates[name] = Counter({fate.name.lower(): count for fate, count in fates.items()})
@@ -305,14 +305,14 @@ def _count(plan: SessionPlan, job: Job, result: JobResult, tell: Tell) -> None:
                 host_ns = record.rows["host_time_ns"]
                 counts[source] += int(np.count_nonzero((host_ns >= start_ns) & (host_ns < end_ns)))
 
-    unread = Unread({source.removeprefix("scanner/"): parser for source, parser in parsers.items()})
+    undecoded = Unread({source.removeprefix("scanner/"): parser for source, parser in parsers.items()})
     for batch, own in _messages(plan, job, result, tell):
         wire = source_of_topic(batch.channel.topic) or ""
         source = wire.removesuffix("/aux")
         if source in parsers:
             count(source, parsers[source].feed_batch(ChunkBatch(wire, batch.log_time_ns, batch.units)))
-        unread.note(own=own)
-    result.unread = unread.counts
+        undecoded.note(own=own)
+    result.unread = undecoded.counts
     for source, parser in parsers.items():
         count(source, parser.close())
         result.fates[source.removeprefix("scanner/")] = Counter({BETWEEN_STRIPS: counts[source]})

@@ -41,7 +41,7 @@ def refuse_no_time(
         UserError: the time is not known; the message gives the reason.
     """
     if trouble and status is not None and status.state is TimeState.NO_TIME:
-        raise UserError(f"{log}: {clock}: no receiver is in the log, and the head {trouble}")
+        raise UserError(f"{log}: {clock}: the log has no receiver, and the head {trouble}")
     if remarks and clock is not None and clock.startswith("scanner/") and status is not None:
         _refuse_by_remarks(log, status, remarks)
     if status is None or clock is None or (clock.startswith("scanner/") and status.state is TimeState.NO_TIME):
@@ -50,25 +50,25 @@ def refuse_no_time(
             f"; or the head's position packets (auxiliary), or {key} where its stamps are UTC or TAI" if clock else ""
         )
         raise UserError(
-            f"{log}: no source of time in its configuration; want [pps.…] or [gnss.…]{hint}", ExitCode.USAGE
+            f"{log}: its configuration has no source of time; add [pps.…] or [gnss.…]{hint}", ExitCode.USAGE
         )
     if status.ambiguous:
         raise UserError(
-            f"{log}: {clock}: which second an edge is, is not certain: {status.ambiguous}; "
-            "want the time messages of the receiver that gives the pulse (gnss.….pps)"
+            f"{log}: {clock}: the second of an edge is uncertain: {status.ambiguous}; record the time messages of the "
+            "receiver that gives the pulse (gnss.….pps)"
         )
-    said = {f"pps/{gnss.pps}": name for name, gnss in config.gnss.items() if gnss.pps}
-    if status.state is TimeState.NO_TIME and clock.startswith("pps/") and clock not in said:
-        heard = "; ".join(f'gnss.{name}.pps is "{pps.removeprefix("pps/")}"' for pps, name in said.items())
+    by_pps = {f"pps/{gnss.pps}": name for name, gnss in config.gnss.items() if gnss.pps}
+    if status.state is TimeState.NO_TIME and clock.startswith("pps/") and clock not in by_pps:
+        heard = "; ".join(f'gnss.{name}.pps is "{pps.removeprefix("pps/")}"' for pps, name in by_pps.items())
         raise UserError(
-            f"{log}: {clock}: no receiver says which second its edges are ({heard or 'no gnss.….pps is set'}); "
-            "want the receiver that gives the pulse there, with --config"
+            f"{log}: {clock}: no receiver names the second of its edges ({heard or 'no gnss.….pps is set'}); set "
+            "gnss.….pps of the receiver that gives the pulse, with --config"
         )
     if status.leap_doubt:
-        raise UserError(f"{log}: {clock}: UTC cannot be brought to GPS time: {status.leap_doubt}")
+        raise UserError(f"{log}: {clock}: UTC cannot be converted to GPS time: {status.leap_doubt}")
     _refuse_by_remarks(log, status, remarks)
     if status.state is TimeState.NO_TIME:
-        raise UserError(f"{log}: {clock}: nothing in the log says the time; want PPS edges and time messages")
+        raise UserError(f"{log}: {clock}: the log has no time; record PPS edges and time messages")
 
 
 def _refuse_by_remarks(log: Path, status: ClockStatus, remarks: Sequence[str]) -> None:
@@ -99,22 +99,28 @@ def time_trouble(
     lost = fates.get(NO_TIME, 0)
     if not total or lost <= MUCH * total:
         return ""
-    told = f"scanner/{scanner}: {lost:,} of {total:,} returns have no time"
+    lost_text = f"scanner/{scanner}: {lost:,} of {total:,} returns have no time"
     if refused.get("past_hour"):
         return (
-            f"{told}: its stamps contradict the host's clock by more than half a second: the head is locked to another "
-            "second; want the NMEA sentences and the pulse of one receiver at the head"
+            f"{lost_text}: its stamps contradict the host's clock by more than half a second: the head is locked to "
+            "another second; connect the NMEA sentences and the pulse of one receiver to the head"
         )
     if trouble:
-        return f"{told}: the head {trouble}"
+        return f"{lost_text}: the head {trouble}"
     if status is not None and status.state not in GOOD_STATES:
-        return f"{told}: the host's clock is {status.state.value}; want PPS edges and time messages all through"
+        return f"{lost_text}: the host's clock is {status.state.value}; record PPS edges and time messages throughout"
     if refused.get("spacing"):
-        return f"{told}: {refused['spacing']:,} edges that it latched are not a second apart; want the receiver's PPS"
+        return (
+            f"{lost_text}: {refused['spacing']:,} edges that it latched are not a second apart; connect the "
+            "receiver's PPS"
+        )
     if refused.get("stamp_jump"):
-        return f"{told}: {refused['stamp_jump']:,} stamps lie more than a second from their arrival: its clock was set"
+        return (
+            f"{lost_text}: {refused['stamp_jump']:,} stamps differ by more than a second from their arrival, "
+            "because its clock was set; do not set it during a recording"
+        )
     found = "" if stamps is None or stamps.scale is not StampScale.FREE else f" ({stamps.text})"
     return (
-        f"{told}: its stamps run free{found}; want a head that is locked to the PPS, or latches it, or "
-        f"scanner.{scanner}.clock where its stamps are UTC or TAI all the same"
+        f"{lost_text}: its stamps run free{found}; lock the head to the PPS, let it latch the PPS, or set "
+        f"scanner.{scanner}.clock if its stamps are UTC or TAI nevertheless"
     )

@@ -20,8 +20,11 @@ from swath.drivers.extras import how_to_install
 
 TELL_EVERY_S = 0.2
 CONNECT_S = 10
-DIED = "the process died, as it does when memory is short"
-UNGUARDED = 'want the call in a script under if __name__ == "__main__":, for processes import the script; or one worker'
+DIED = "the process died, possibly because memory ran out"
+UNGUARDED = (
+    'put the call in the script under if __name__ == "__main__":, because worker processes import the script; or use '
+    "one worker"
+)
 END_S = 5.0  # for a process to end after it was terminated
 Progress = Callable[[int], None]  # bytes done so far
 Do = Callable[[Any, Job, Progress], JobResult]  # takes the plan of its session and a function for the bytes done
@@ -167,7 +170,7 @@ def _in_processes(
                 tell_of_worker()
             progress(int(done.value))
         if futures and not begun.value:
-            raise UserError(f"no worker process could be begun; {UNGUARDED}")
+            raise UserError(f"no worker process could start; {UNGUARDED}")
     except BaseException:
         pool.shutdown(wait=False, cancel_futures=True)
         ours = set(multiprocessing.active_children()) - before
@@ -190,12 +193,12 @@ def _on_cluster(
         distributed: Any = importlib.import_module("distributed")
     except ImportError:
         raise UserError(
-            f"--scheduler wants dask and distributed: {how_to_install('cluster')}", ExitCode.USAGE
+            f"--scheduler needs dask and distributed: {how_to_install('cluster')}", ExitCode.USAGE
         ) from None
     try:
         client = distributed.Client(scheduler, timeout=CONNECT_S)
     except (OSError, ValueError) as error:
-        raise UserError(f"{scheduler}: no Dask scheduler answers there: {error}", ExitCode.IO) from error
+        raise UserError(f"{scheduler}: no Dask scheduler answers: {error}", ExitCode.IO) from error
     results: dict[int, JobResult] = {}
     done = 0
     with client:
@@ -227,5 +230,5 @@ def _result_of(future: Any, job: Job) -> JobResult:
     try:
         result: JobResult = future.result()
     except (scheduler.KilledWorker, CancelledError) as error:
-        return _failed(job, f"lost by the cluster: {type(error).__name__}")
+        return _failed(job, f"the cluster lost the task: {type(error).__name__}")
     return result

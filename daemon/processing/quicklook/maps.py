@@ -294,7 +294,7 @@ def draw_sigma(look: Look, path: Path) -> None:
     """Draw the sigma of height from the files' points."""
     values = 100.0 * filled(look.surface.mean(SIGMA_HEIGHT))
     low, high = _range_of(values)
-    under = f"one standard deviation, as the files say it, mean of all returns, {_cells_words(look)}"
+    under = f"one standard deviation, as stored in the files, mean of all returns, {_cells_words(look)}"
     page = MapPage(look, "Sigma of height", under)
     image = page.image(values, look.surface.frame, cmap="viridis", vmin=low, vmax=high, interpolation="antialiased")
     page.bar(image, "σ of height (cm)", extend="both")
@@ -328,11 +328,11 @@ def draw_differences(look: Look, path: Path) -> None:
     )
     made.get_title().set(fontsize=8.5, color=INK)
     made.set_alignment("left")
-    told = (
+    figures = (
         f"RMSDz {100 * numbers['rms_m']:.1f} cm (all pairs)\n95 % ≤ {100 * numbers['p95_m']:.1f} cm\n"
         f"largest {100 * numbers['max_m']:.1f} cm"
     )
-    page.say(1.2, told)
+    page.say(1.2, figures)
     page.say(1.95, _worst_pairs(look), color=MUTED, fontsize=8)
     _dz_histogram(page)
     page.finish(path)
@@ -342,8 +342,8 @@ def _worst_pairs(look: Look) -> str:
     """Return lines on the pairs whose medians are farthest from zero."""
     rows = sorted(look.overlap.rows, key=lambda row: -abs(row["median_m"]))[:4]
     names = [f"{shortened(look.names[row['first']], 10)} − {shortened(look.names[row['second']], 10)}" for row in rows]
-    told = [f"{name}:  {thousands(100 * row['median_m'], 1)} cm" for name, row in zip(names, rows, strict=True)]
-    return "\n".join(["medians" if len(rows) == len(look.overlap.rows) else "largest medians", *told])
+    lines = [f"{name}:  {thousands(100 * row['median_m'], 1)} cm" for name, row in zip(names, rows, strict=True)]
+    return "\n".join(["medians" if len(rows) == len(look.overlap.rows) else "largest medians", *lines])
 
 
 def _pale_ground(page: MapPage) -> None:

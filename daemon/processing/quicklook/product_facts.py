@@ -63,14 +63,14 @@ def warnings_in(sidecar: Json) -> list[str]:
 
 def calibrations_in(sidecar: Json) -> list[str]:
     """Return ids of the calibrations, with the scanners' names if given."""
-    told = [_text(value) for value in find_key(sidecar, "calibration_id")]
+    ids = [_text(value) for value in find_key(sidecar, "calibration_id")]
     for value in find_key(sidecar, "calibrations"):
         if isinstance(value, dict):
-            told += [f"{name}: {_text(one.get('id', '?'))}" for name, one in value.items() if isinstance(one, dict)]
-    if not told:
+            ids += [f"{name}: {_text(one.get('id', '?'))}" for name, one in value.items() if isinstance(one, dict)]
+    if not ids:
         values = find_key(sidecar, "calibration")
-        told = [_text(value.get("id", "")) if isinstance(value, dict) else _text(value) for value in values]
-    return list(dict.fromkeys(line for line in told if line))
+        ids = [_text(value.get("id", "")) if isinstance(value, dict) else _text(value) for value in values]
+    return list(dict.fromkeys(line for line in ids if line))
 
 
 def sessions_in(sidecar: Json) -> list[str]:
@@ -99,8 +99,8 @@ def rows_of(sidecar: Json) -> list[tuple[str, str]]:
         rows += [(label, _text(value)) for value in _distinct(find_key(sidecar, key))]
     crs = sidecar.get("crs")
     if isinstance(crs, dict):
-        told = [(key, crs[key]) for key in CRS_KEYS if crs.get(key) not in (None, [], "")]
-        rows += [(f"CRS: {key.replace('_', ' ')}", _text(value)) for key, value in told]
+        crs_rows = [(key, crs[key]) for key in CRS_KEYS if crs.get(key) not in (None, [], "")]
+        rows += [(f"CRS: {key.replace('_', ' ')}", _text(value)) for key, value in crs_rows]
     counts = sidecar.get("counts")
     if isinstance(counts, dict):
         rows += [(f"returns of {name}", _text(value)) for name, value in counts.items()]

@@ -104,12 +104,12 @@ def _words(figure: Figure, axes: Axes, look: Look, profile: Profile) -> None:
         f"{letter} {thousands(end[0] / units.east_m, digits)}, {thousands(end[1] / units.north_m, digits)}"
         for letter, end in (("A", line.start_m), ("B", line.end_m))
     ]
-    told = [
+    parts = [
         *ends,
         f"{thousands(line.length_m)} m long, {2 * line.half_width_m:g} m wide",
         f"{thousands(len(profile.along_m))}{'' if profile.complete else ' of the first'} points",
         f"heights {exaggeration:.3g} × exaggerated" if exaggeration >= 1.05 else "",
     ]
     figure.text(0.02, 0.955, f"Profile {line.title}", fontsize=15, weight="bold", color=INK, va="center")
-    text = "   ·   ".join(words for words in told if words)
+    text = "   ·   ".join(words for words in parts if words)
     figure.text(0.02, 0.907, text, fontsize=9, color=MUTED, va="center")

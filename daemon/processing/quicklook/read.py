@@ -179,7 +179,7 @@ class StripBook:
         if not before:
             return str(source_id)
         name = f"{source_id}/{before + 1}"
-        self.notes.append(f"strip {name} is that of {source.path}, of other sessions than {source_id}")
+        self.notes.append(f"strip {name} comes from {source.path}, which belongs to other sessions than {source_id}")
         return name
 
 
@@ -194,7 +194,7 @@ def find_files(paths: Sequence[Path]) -> list[Path]:
         if path.is_dir():
             inside = sorted(one for one in path.rglob("*") if one.suffix.lower() in SUFFIXES and one.is_file())
             if not inside:
-                raise QuickLookError(f"{path}: holds no LAS or LAZ file")
+                raise QuickLookError(f"{path}: has no LAS or LAZ file")
         elif path.exists():
             inside = [path]
         else:
@@ -214,7 +214,7 @@ def open_source(path: Path) -> Source:
             header = reader.header
             names = set(header.point_format.extra_dimension_names)
     except UNREADABLE as error:
-        raise QuickLookError(f"{path}: not a LAS or LAZ file that can be read ({_line(error)})") from error
+        raise QuickLookError(f"{path}: cannot be read as a LAS or LAZ file ({_line(error)})") from error
     scales, offsets = np.asarray(header.scales, float), np.asarray(header.offsets, float)
     if not ((scales > 0) & (scales <= LARGEST_SCALE)).all():
         wrong = f"the header's scale factors are {scales.tolist()}, want numbers above 0, at most {LARGEST_SCALE:g}"
@@ -226,7 +226,7 @@ def open_source(path: Path) -> Source:
         low, high = np.full(3, np.nan), np.full(3, np.nan)  # the extent then follows from the points
     crs, trouble = _crs_of(header)
     if crs is not None and crs.is_geocentric:
-        raise QuickLookError(f"{path}: coordinates are geocentric ({crs.name}); a map wants a projected CRS")
+        raise QuickLookError(f"{path}: coordinates are geocentric ({crs.name}); a map needs a projected CRS")
     return Source(
         path=path,
         version=str(header.version),
@@ -260,7 +260,7 @@ def units_of(sources: Sequence[Source]) -> Units:
     known = [source for source in sources if source.crs is not None]
     crs = known[0].crs if known else None
     if crs is None:
-        return Units(note=f"{sources[0].trouble}: coordinates taken for metres")
+        return Units(note=f"{sources[0].trouble}: coordinates are assumed to be in metres")
     plain = crs.source_crs if crs.is_bound and crs.source_crs is not None else crs
     axes = plain.axis_info
     if plain.is_geographic or any("degree" in axis.unit_name for axis in axes):
@@ -268,9 +268,11 @@ def units_of(sources: Sequence[Source]) -> Units:
         up_m = axes[2].unit_conversion_factor if len(axes) > 2 else 1.0
         lat_deg = float(np.clip(np.nan_to_num(sources[0].low[1] + sources[0].high[1]) / 2, -89.9, 89.9))
         east_m = north_m * math.cos(math.radians(lat_deg))
-        return Units(east_m, north_m, up_m, "°", "coordinates in degrees: lengths and areas are good to 1 % only")
+        return Units(
+            east_m, north_m, up_m, "°", "coordinates in degrees, so lengths and areas are accurate to 1 % only"
+        )
     if not axes:
-        return Units(note="the CRS names no unit: coordinates taken for metres")
+        return Units(note="the CRS names no unit: coordinates are assumed to be in metres")
     across_m, name = axes[0].unit_conversion_factor, axes[0].unit_name.replace("metre", "m")
     flat_m, misfit = _on_the_ground(plain, known)
     units = _projected(axes, across_m, name, known)
@@ -287,7 +289,7 @@ def _projected(axes: Sequence[Any], across_m: float, name: str, known: Sequence[
     said_m = height_unit_in(known[0].sidecar)
     if said_m is not None:
         return Units(across_m, across_m, said_m, name)
-    return Units(across_m, across_m, across_m, name, f"no vertical CRS: heights taken for {name}")
+    return Units(across_m, across_m, across_m, name, f"no vertical CRS: heights are assumed to be in {name}")
 
 
 def _on_the_ground(crs: CRS, sources: Sequence[Source]) -> tuple[float, str]:
@@ -303,14 +305,14 @@ def _on_the_ground(crs: CRS, sources: Sequence[Source]) -> tuple[float, str]:
     lon_deg, lat_deg = Proj(flat)(middles[:, 0], middles[:, 1], inverse=True)
     there = np.isfinite(lon_deg) & np.isfinite(lat_deg)
     if not there.any():
-        return 1.0, f"{crs.name}: the coordinates are none of it; want the files' own CRS"
+        return 1.0, f"{crs.name}: the coordinates do not belong to it; give the files' own CRS"
     misfit = misfit_of(flat, crs.name, lat_deg[there], lon_deg[there])
     if not misfit:
         return 1.0, ""
     scale = float(np.sqrt(np.median(scales_at(flat, lat_deg[there], lon_deg[there]).prod(axis=0))))
     if not 1.0 / FARTHEST_SCALE < scale < FARTHEST_SCALE:
         return 1.0, misfit
-    return scale, f"{misfit}; lengths and areas here are those on the ground"
+    return scale, f"{misfit}; lengths and areas shown are those on the ground"
 
 
 def check_one_crs(sources: Sequence[Source]) -> None:
@@ -326,8 +328,8 @@ def check_one_crs(sources: Sequence[Source]) -> None:
             assert first.crs is not None
             assert other.crs is not None
             raise QuickLookError(
-                f"{other.path} is in {other.crs.name}, {first.path} in {first.crs.name}: "
-                "one map wants one CRS; view them one by one"
+                f"{other.path} is in {other.crs.name}, {first.path} in {first.crs.name}: one map needs one CRS; view "
+                "the files one by one"
             )
 
 

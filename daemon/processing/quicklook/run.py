@@ -283,7 +283,7 @@ def _profile(
     if ends is not None:
         line = line_through(ends, reading.units, half_width_m)
         if line.length_m <= 0.0:
-            raise QuickLookError("--profile: both ends are the same point; want x1,y1,x2,y2")
+            raise QuickLookError("--profile: both ends are the same point; give x1,y1,x2,y2")
     else:
         line = choose_line(reading.cells, overlap, reading.book.names, longest, reading.sources, half_width_m)
     if line is None:
@@ -304,9 +304,9 @@ def _notes(reading: _Reading, overlap: Overlap, cell_m: float | None, strip_cell
     notes += [f"{source.path.name}: {source.damage}: partial" for source in reading.sources if source.damage]
     if any(source.crs is not None for source in reading.sources):
         without = [source.path.name for source in reading.sources if source.crs is None]
-        notes += [f"{', '.join(without)}: {reading.sources[0].trouble or 'no CRS'}, taken for the others'"] * bool(
-            without
-        )
+        notes += [
+            f"{', '.join(without)}: {reading.sources[0].trouble or 'no CRS'}, so the CRS of the other files is assumed"
+        ] * bool(without)
     if cell_m and reading.surface.frame.cell_m > cell_m:
         notes.append(f"cells of {cell_m:g} m would be too many; they are {reading.surface.frame.cell_m:g} m")
     if strip_cell_m and reading.cells.frame.cell_m > strip_cell_m:
@@ -315,9 +315,9 @@ def _notes(reading: _Reading, overlap: Overlap, cell_m: float | None, strip_cell
     if reading.skipped:
         notes.append(f"{reading.skipped:,} points left out: noise (classes 7 and 18) or withheld")
     if reading.surface.unknown_sigma:
-        notes.append(f"{reading.surface.unknown_sigma:,} points have sigmas that are not known or beyond their field")
+        notes.append(f"{reading.surface.unknown_sigma:,} points have sigmas that are unknown or exceed their field")
     if len(reading.book.names) > 1 and not overlap.cells:
-        notes.append(f"no two strips share a smooth cell of {reading.cells.frame.cell_m:g} m: they are not compared")
+        notes.append(f"no two strips share a smooth cell of {reading.cells.frame.cell_m:g} m, so they are not compared")
     if len(reading.book.names) > MOST_STRIPS:
         notes.append(f"only the first {MOST_STRIPS:,} of {len(reading.book.names):,} strips were compared")
     return notes

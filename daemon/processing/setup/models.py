@@ -67,11 +67,11 @@ def make_georeferencer(
     """
     table = config.scanner[name]
     if not isinstance(parser, SrepParser) and any(row.prf_hz is not None for row in calibration.range_offsets):
-        text = f"{table.protocol} tells no pulse rate; want return_slot or mta_zone"
+        text = f"{table.protocol} sends no pulse rate; use return_slot or mta_zone"
         raise ValueError(f"calibration {calibration.id}: range_offset.prf_hz: {text}")
     for number, source in gimbal_sources(config, name):
         if not tells_attitude(config, source):
-            text = f'"{source}" tells no angles of a gimbal; want angles_deg, or an imu/name or gnss/name with an INS'
+            text = f'"{source}" sends no gimbal angles; set angles_deg, or name an imu/name or gnss/name with an INS'
             raise ValueError(f"gimbal.stages[{number}].source: {text}")
     model = SensorModel(
         calibration,
@@ -99,7 +99,10 @@ def geometry_of(table: ScannerConfig, parser: Parser, fibres: bytes | None = Non
             beams.elevation_deg, beams.azimuth_deg, beams.range_m, beams.right_m, beams.forward_m, beams.up_m
         )
     if not find_driver("scanner", table.protocol).line_scanner:
-        raise ValueError(f"protocol {table.protocol}: its parser has no beams and it is no line scanner; want either")
+        raise ValueError(
+            f"protocol {table.protocol}: its parser has no beam table and it is not a line scanner; use a protocol "
+            "with either"
+        )
     geometry = table.geometry
     if geometry is None:
         return line_scanner(None)
@@ -134,7 +137,7 @@ def mount_of(gimbal: GimbalConfig | None, angles: ByName[str, AngleSeries] | Non
         if stage.source is not None:
             series = NO_ANGLES if angles is None else angles.get(stage.source)
             if series is None:
-                raise ValueError(f'gimbal.stages[{number}].source: "{stage.source}" told no angles')
+                raise ValueError(f'gimbal.stages[{number}].source: "{stage.source}" sent no angles')
         angles_rad = np.radians(np.array(stage.angles_deg, dtype=np.float64))
         stages.append(Stage(angles_rad, np.array(stage.lever_arm_m, dtype=np.float64), series))
     return Mount(tuple(stages))
@@ -165,7 +168,10 @@ def refuse_logged_gimbals(config: Config, scanners: list[str]) -> None:
     for name in scanners:
         for number, source in gimbal_sources(config, name):
             where = f"scanner.{name}.gimbal.stages[{number}].source"
-            raise ValueError(f'{where}: angles of "{source}" are known when the log is whole: want swath georef')
+            raise ValueError(
+                f'{where}: angles of "{source}" are known only from a complete log; use swath georef after the '
+                "recording"
+            )
 
 
 def air_of(config: Config, table: ScannerConfig) -> Air:
@@ -235,30 +241,30 @@ def calibration_mistakes(
 ) -> Iterator[str]:
     """Yield why a calibration is not this scanner's, or was estimated under other settings than those in use."""
     if calibration.scanner != name:
-        yield f'calibration.scanner: is of scanner "{calibration.scanner}", want "{name}"'
+        yield f'calibration.scanner: belongs to scanner "{calibration.scanner}"; use a calibration of "{name}"'
     for key in ("model", "serial"):
         theirs, ours = calibration.header.get(f"scanner_{key}", ""), getattr(table, key)
         if theirs and ours and theirs != ours:
-            yield f'calibration.scanner_{key}: of another head: "{theirs}", the configuration says "{ours}"'
+            yield f'calibration.scanner_{key}: belongs to another head: "{theirs}", the configuration has "{ours}"'
     for key, theirs, ours in (
         ("ranges", calibration.ranges, air.ranges),
         ("refraction", calibration.refraction, air.refraction),
     ):
         if theirs is not None and theirs != ours:
             yield (
-                f'calibration.{key}: was estimated with {key} = "{theirs}", [atmosphere] says "{ours}"; '
-                "set that alike, or calibrate anew"
+                f'calibration.{key}: was estimated with {key} = "{theirs}", [atmosphere] has "{ours}"; set both '
+                "alike, or calibrate again"
             )
     ours_factor = table.mirror_factor
     if None not in (calibration.mirror_factor, ours_factor) and calibration.mirror_factor != ours_factor:
         yield (
-            f"calibration.mirror_factor: was estimated with {calibration.mirror_factor:g}, "
-            f"the configuration says {ours_factor:g}"
+            f"calibration.mirror_factor: was estimated with {calibration.mirror_factor:g}, the configuration has "
+            f"{ours_factor:g}; set both alike, or calibrate again"
         )
     if table.installation is not None:
         apart = np.abs(calibration.installation_matrix - np.array(table.installation)).max()
         if apart > INSTALLATION_TOLERANCE:
             yield (
-                "calibration.installation_matrix: is not the configuration's installation; "
-                "make both the same, or leave the configuration's out"
+                "calibration.installation_matrix: differs from the configuration's installation; make both equal, or "
+                "leave the configuration's out"
             )

@@ -122,7 +122,7 @@ class Setup:
         for name in [*self.options.scanners, *self.options.calibrations]:
             if name not in known:
                 raise ConfigError(
-                    f"{files.get(name, '')}scanner {name}: is not in the configuration; there are: "
+                    f"{files.get(name, '')}scanner {name}: is not in the configuration, which has: "
                     f"{', '.join(known) or 'none'}"
                 )
         return [name for name in known if not self.options.scanners or name in self.options.scanners]
@@ -251,5 +251,7 @@ class Setup:
             return None
         stored = self.sources.attachments.get(attachment_name("calibration", name, Path(table.calibration)))
         if stored is None:
-            raise ConfigError(f"scanner.{name}.calibration: {table.calibration} is not in the log; give it by hand")
+            raise ConfigError(
+                f"scanner.{name}.calibration: {table.calibration} is not in the log; give it with --calibration"
+            )
         return decoded(stored, "replace"), table.calibration

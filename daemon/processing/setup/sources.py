@@ -156,7 +156,7 @@ class Sources:
     def clock_plan(self, info: SessionInfo) -> ClockPlan:
         """Return the plan of a session's clocks."""
         config = self.config
-        said = {
+        configured = {
             gnss.pps: gnss.leap_seconds for gnss in config.gnss.values() if gnss.pps and gnss.leap_seconds is not None
         }
         devices: dict[str, DevicePlan] = {}
@@ -171,7 +171,7 @@ class Sources:
             devices[source] = DevicePlan(clock or source, driver.past_hour, wanted)
         return ClockPlan(
             host_minus_monotonic_ns=info.realtime_ns - info.monotonic_ns,
-            pps={f"pps/{name}": PpsPlan(said.get(name), pps.delay_ns) for name, pps in config.pps.items()},
+            pps={f"pps/{name}": PpsPlan(configured.get(name), pps.delay_ns) for name, pps in config.pps.items()},
             gnss={
                 f"gnss/{name}": GnssPlan(
                     f"pps/{gnss.pps}" if gnss.pps else None,

@@ -50,7 +50,9 @@ def terrain_of(config: Config) -> CoarseTerrain | None:
         return None
     path = config.resolve(config.mta.terrain)
     if not path.exists():
-        raise ConfigError(f"mta.terrain: {path} is not there, and no log holds it; put it there, or take it out")
+        raise ConfigError(
+            f"mta.terrain: {path} does not exist, and logs do not contain it; put the file there, or remove the key"
+        )
     return read_terrain(path)
 
 
@@ -76,7 +78,7 @@ def read_terrain(path: Path) -> CoarseTerrain:
         to_grid = ToGrid(wkt)
         return CoarseTerrain(height_m, first, (transform.a, transform.e), to_grid, to_grid.turn)
     except rasterio.errors.NotGeoreferencedWarning as error:
-        raise ConfigError(f"{KEY}: {path} does not say where it lies; want a GeoTIFF that does") from error
+        raise ConfigError(f"{KEY}: {path} has no georeference; use a georeferenced GeoTIFF") from error
     except (rasterio.errors.RasterioError, ProjError, ValueError) as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise ConfigError(f"{KEY}: {path} cannot be read: {reason}") from error
@@ -90,20 +92,21 @@ def _check(raster: Any, path: Path) -> None:
     """
     place = raster.transform
     if raster.crs is None:
-        raise ConfigError(f"{KEY}: {path} has no CRS; want a GeoTIFF that says its own")
+        raise ConfigError(f"{KEY}: {path} has no CRS; use a GeoTIFF with a CRS")
     if place.b or place.d:
-        raise ConfigError(f"{KEY}: {path} is turned against its axes; want columns east and rows north")
+        raise ConfigError(f"{KEY}: {path} is rotated; use a raster with columns to the east and rows to the north")
     if not (max(abs(place.c), abs(place.f)) < FARTHEST and all(1 / FARTHEST < abs(x) < FARTHEST for x in place[:5:4])):
         raise ConfigError(f"{KEY}: {path} has pixels of {place.a:g} × {place.e:g} from {place.c:g}, {place.f:g} on")
     if raster.width * raster.height > MAX_NODES:
-        raise ConfigError(f"{KEY}: {path} has {raster.width} × {raster.height} pixels; want a coarse model")
+        raise ConfigError(f"{KEY}: {path} has {raster.width} × {raster.height} pixels; use a coarser model")
     rows, columns = raster.block_shapes[0]
     if rows * columns * raster.count > MAX_NODES:  # a block may hold all bands, and is read as a whole
         raise ConfigError(
-            f"{KEY}: {path} has {raster.count} bands in blocks of {columns} × {rows}; want one of heights"
+            f"{KEY}: {path} has {raster.count} bands in blocks of {columns} × {rows}; use a raster with one band "
+            "of heights"
         )
     if not raster.dtypes[0].startswith(("int", "uint", "float")):
-        raise ConfigError(f"{KEY}: {path} has pixels of type {raster.dtypes[0]}; want heights")
+        raise ConfigError(f"{KEY}: {path} has pixels of type {raster.dtypes[0]}; use a raster of heights")
 
 
 def _heights(raster: Any) -> FloatArray:

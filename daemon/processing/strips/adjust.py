@@ -116,12 +116,12 @@ def _refuse_output(wish: AdjustOptions) -> None:
     """Refuse with `UserError` an unusable folder or one with an adjustment, before any long work."""
     there, permitted = nearest_there(wish.output.absolute())
     if permitted and not there.is_dir():
-        raise UserError(f"--adjust {wish.output}: {there} is a file; want a folder", ExitCode.USAGE)
+        raise UserError(f"--adjust {wish.output}: {there} is a file; give a folder", ExitCode.USAGE)
     if not permitted or not os.access(there, os.W_OK | os.X_OK):
-        raise UserError(f"--adjust {wish.output}: {there} cannot be written to", ExitCode.IO)
+        raise UserError(f"--adjust {wish.output}: {there} is not writable", ExitCode.IO)
     if (wish.output / ADJUSTMENT).exists() and not wish.overwrite:
         raise UserError(
-            f"{wish.output / ADJUSTMENT}: is there already; want another folder, or --overwrite", ExitCode.USAGE
+            f"{wish.output / ADJUSTMENT}: already exists; choose another folder or use --overwrite", ExitCode.USAGE
         )
 
 
@@ -134,9 +134,9 @@ def files_of(wish: AdjustOptions, flight: LoggedFlight) -> TrajectoryFiles:
     read = wish.logs.trajectory.file
     for path in paths:
         if path.exists() and read is not None and path.samefile(read):
-            raise UserError(f"--adjust: {path} is what is corrected; want another folder", ExitCode.USAGE)
+            raise UserError(f"--adjust: {path} is the trajectory to correct; choose another folder", ExitCode.USAGE)
         if path.exists() and not wish.overwrite:
-            raise UserError(f"{path}: is there already; want another folder, or --overwrite", ExitCode.USAGE)
+            raise UserError(f"{path}: already exists; choose another folder or use --overwrite", ExitCode.USAGE)
     return files
 
 
@@ -155,7 +155,8 @@ def correct_strips(wish: AdjustOptions, folder: Path, tell: Steps) -> StripsCorr
         raise UserError(f'--strip-model: got "{wish.model}", want one of {", ".join(CHOICES)}', ExitCode.USAGE)
     if not is_of_logs(wish.logs.logs):
         raise UserError(
-            f"--adjust: corrects the trajectory of logs, {wish.logs.logs[0]} holds points; want the logs they are of",
+            f"--adjust: corrects the trajectory of logs, but {wish.logs.logs[0]} contains points; give the logs "
+            "of these points",
             ExitCode.USAGE,
         )
     _refuse_output(wish)
@@ -205,7 +206,7 @@ def _refuse(wish: AdjustOptions, kept: KeptFlight) -> None:
     strips = {(swath.flown, swath.strip) for swath in kept.flight.swaths}
     if len(strips) < 2:
         raise UserError(
-            f"{log}: {len(strips) or 'no'} strip with returns; an adjustment compares strips: want at least two that "
+            f"{log}: {len(strips) or 'no'} strip with returns; an adjustment compares strips: fly at least two that "
             "overlap"
         )
     refuse_installations(kept.logged)
@@ -213,8 +214,8 @@ def _refuse(wish: AdjustOptions, kept: KeptFlight) -> None:
     for head in kept.flight.heads:
         if head.start.method == "nominal" and head.name not in wish.logs.options.calibrations:
             raise UserError(
-                f"{log}: {head.name}: has the nominal calibration only, whose errors would go into the trajectory; "
-                "want --calibration FILE of swath calibrate",
+                f"{log}: {head.name}: has only the nominal calibration, whose errors would distort the trajectory; "
+                "give --calibration FILE of swath calibrate",
                 ExitCode.USAGE,
             )
 
@@ -224,19 +225,20 @@ def _notes(wish: AdjustOptions, kept: KeptFlight, features: Features, cell_m: fl
     if not wish.control:
         settings = wish.settings
         notes.append(
-            "no control: what all strips have in common, a shift or a tilt, is held by its prior of "
+            "no control: a shift or tilt common to all strips is held by its prior of "
             f"{100 * settings.position_m:.0f} cm and {_mdeg(settings.turn_rad):.0f} mdeg; the datum is not determined"
         )
     seen = {flight.swaths[patch.swath].strip for plane in features.planes for patch in plane.patches}
     for strip in sorted({swath.strip for swath in flight.swaths} - seen):
-        notes.append(f"strip {strip:02d}: no plane of it is seen by another: not corrected")
+        notes.append(f"strip {strip:02d}: no other strip sees one of its planes, so it is not corrected")
     found = signatures(
         differences(flight, StripRules(cell_m=cell_m)).checks, SeenFrom.of(flight), smoothed_prior(kept)
     ).found
-    told = dict.fromkeys(one.words for one in found if one.level in ("significant", "rough"))
+    effects = dict.fromkeys(one.words for one in found if one.level in ("significant", "rough"))
     notes += [
-        f"before, strips differed as by an error of the calibration, which is for swath calibrate: {words}"
-        for words in told
+        "before the correction, strips differed as an error of the calibration would make them differ; correct "
+        f"it with swath calibrate: {words}"
+        for words in effects
     ]
     return notes
 

@@ -29,9 +29,10 @@ from swath.georef.trajectory.trajectory import Trajectory
 
 WHAT = (
     "Correction of the trajectory by strips (ISO/TS 19159-2, 6.3.3). No calibration: the scanners' parameters were "
-    "held. Corrections are what was added: position north, east, down, then small turns of the body about these axes."
+    "held. Corrections were added to the trajectory: position north, east, down, then small turns of the body about "
+    "these axes."
 )
-KEPT = "velocities and sigmas of the trajectories are those from before"
+KEPT = "velocities and sigmas of the trajectories are unchanged"
 AXES = ("north", "east", "down")
 UNCORRECTED = "none"
 TOLD = 0.7  # share of its prior's sigma: here returns contribute as much as the prior
@@ -59,8 +60,8 @@ def write_adjustment(wish: AdjustOptions, done: StripsCorrected, tell: Callable[
         if made and wish.output.is_dir() and not any(wish.output.iterdir()):
             wish.output.rmdir()
         raise UserError(f"{error.filename or wish.output}: {error.strerror or error}", ExitCode.IO) from error
-    told = [str(path) for _, path in written]
-    return Told(record | {"files": told}, [*first_lines(record["verdict"]), *_lines(done), *told])
+    paths = [str(path) for _, path in written]
+    return Told(record | {"files": paths}, [*first_lines(record["verdict"]), *_lines(done), *paths])
 
 
 def _as_given(flight: LoggedFlight, trajectory: Trajectory) -> Trajectory:
@@ -193,7 +194,7 @@ def _lines(done: StripsCorrected) -> list[str]:
     rms = [100.0 * strips.rms_m for strips in (done.before, done.after)]
     lines.append(f"all strips: RMSDz {rms[0]:.1f} → {rms[1]:.1f} cm")
     if any(not strip.told.all() for strip in strips if strip.choice.model != UNCORRECTED):
-        lines.append("not told: the planes of the strip do not determine it, so it is left as it was")
+        lines.append("undetermined: the planes of the strip do not determine the component, so it is unchanged")
     return [*lines, *(f"note: {note}" for note in (*done.notes, KEPT))]
 
 
@@ -202,8 +203,8 @@ def _row(strip: _Strip) -> str:
     factors = np.array([100.0] * 3 + [1e3 * 180.0 / np.pi] * 3)
     means, sigmas = factors * strip.corrections.mean(axis=0), factors * strip.sigmas.mean(axis=0)
     columns = [
-        f"{mean:+.1f} ± {sigma:.1f}" if told else "not told"
-        for mean, sigma, told in zip(means, sigmas, strip.told, strict=True)
+        f"{mean:+.1f} ± {sigma:.1f}" if determined else "undetermined"
+        for mean, sigma, determined in zip(means, sigmas, strip.told, strict=True)
     ]
     if strip.choice.model == UNCORRECTED:
         columns = ["–"] * len(columns)

@@ -97,7 +97,7 @@ def is_of_logs(paths: Sequence[Path]) -> bool:
     """
     kinds = {_kind(path) for path in paths}
     if len(kinds) > 1:
-        raise UserError("logs and points together; want logs, or LAS or LAZ files", ExitCode.USAGE)
+        raise UserError("the input mixes logs and points; give logs only, or LAS or LAZ files only", ExitCode.USAGE)
     return kinds == {"logs"}
 
 
@@ -108,7 +108,7 @@ def _kind(path: Path) -> str:
             return "points"
         if LOG_SUFFIX in inside:
             return "logs"
-        raise UserError(f"{path}: holds neither LAS or LAZ files nor logs", ExitCode.IO)
+        raise UserError(f"{path}: has neither LAS or LAZ files nor logs", ExitCode.IO)
     if not path.exists():
         raise UserError(f"{path}: no such file or folder", ExitCode.IO)
     return "points" if path.suffix.lower() in POINT_SUFFIXES else "logs"
@@ -158,7 +158,7 @@ class Judgement:
         if self.agreement.no_verdict:
             wrong.append(self.agreement.no_verdict)
         elif level is not None and (broken := self.agreement.broken(level)):
-            wrong.append(f"{level} is not kept, for its limit of {', '.join(broken)}")
+            wrong.append(f"strips do not meet {level}, because of its limit of {', '.join(broken)}")
         return f"{self.strips.what}: {'; '.join(wrong)}" if wrong else ""
 
     def _rows(self) -> dict[tuple[str, str], dict[str, Any]]:
@@ -212,8 +212,8 @@ class Judgement:
         lines += self.signatures.lines if self.signatures else []
         lines += self.agreement.verdicts()
         if before is not None and (was := before.agreement.numbers) and (now := self.agreement.numbers):
-            told = [f"RMSDz {100 * one['rms_m']:.1f} cm, largest {100 * one['max_m']:.1f} cm" for one in (was, now)]
-            lines.append(f"before: {told[0]}; now: {told[1]}")
+            figures = [f"RMSDz {100 * one['rms_m']:.1f} cm, largest {100 * one['max_m']:.1f} cm" for one in (was, now)]
+            lines.append(f"before: {figures[0]}; now: {figures[1]}")
         return lines + self.strips.notes
 
 
@@ -237,7 +237,7 @@ def _draw(wish: StripsOptions, now: Judgement, then: Judgement | None) -> list[P
                 draw_differences(one.strips.look, wish.output / name)
                 made.append(wish.output / name)
     except OSError as error:
-        raise UserError(f"{wish.output}: cannot be written to ({error.strerror or error})", ExitCode.IO) from error
+        raise UserError(f"{wish.output}: is not writable ({error.strerror or error})", ExitCode.IO) from error
     return made
 
 
@@ -249,8 +249,8 @@ def _line(name: str, heights: dict[str, Any] | None, to_plane: PairReport | None
     """Return a row of the table, centimetres: first heights, then distances of returns from planes."""
     values = ["–"] * 5
     if heights is not None:
-        told = (heights["mean_m"], heights["rms_m"], heights["p95_m"], heights["max_m"])
-        values = [f"{heights['cells']:,}", *(f"{100.0 * value:.1f}" for value in told)]
+        gridded = (heights["mean_m"], heights["rms_m"], heights["p95_m"], heights["max_m"])
+        values = [f"{heights['cells']:,}", *(f"{100.0 * value:.1f}" for value in gridded)]
     if to_plane is None or not to_plane.distance.count:
         return _row(name, *values, "–", "–", "–")
     distance = to_plane.distance

@@ -91,7 +91,7 @@ def strips_of_files(paths: Sequence[Path], rules: StripRules, told: Told, week: 
     """
     what = ", ".join(map(str, paths))
     if week is not None and week > LATEST_NS // WEEK_NS:
-        raise UserError(f"--week {week} is no GPS week; want whole weeks since 1980, such as 2423", ExitCode.USAGE)
+        raise UserError(f"--week {week} is not a GPS week; give whole weeks since 1980, such as 2423", ExitCode.USAGE)
     try:
         look = look_at(paths, strip_cell_m=rules.cell_m, told=lambda done, of: told(f"reading {what}", done, of))
     except QuickLookError as error:
@@ -99,7 +99,7 @@ def strips_of_files(paths: Sequence[Path], rules: StripRules, told: Told, week: 
     notes = list(look.notes)
     refuse_one(what, look)
     cells = cells_of(look, rules)
-    seen, place, trouble = None, None, "there is no trajectory beside the points; want a folder of swath georef"
+    seen, place, trouble = None, None, "the points have no trajectory beside them; give a folder of swath georef"
     try:
         seen, place = _seen_from(look)
     except (TrajectoryError, MappingError, OSError, KeyError, TypeError, AttributeError, ValueError) as error:
@@ -143,15 +143,17 @@ def strips_of_flight(
 def refuse_one(what: str, look: Look) -> None:
     """Refuse with `UserError` inputs that have no two different, overlapping strips."""
     if len(look.names) < 2:
-        raise UserError(f"{what}: one strip only; differences want at least two strips that overlap")
+        raise UserError(f"{what}: has one strip only; differences need at least two strips that overlap")
     if not look.overlap.cells:
         raise UserError(
-            f"{what}: no two of the {len(look.names)} strips share smooth ground; differences want strips that overlap"
+            f"{what}: no two of the {len(look.names)} strips share smooth ground; differences need strips that overlap"
         )
     for row in look.overlap.rows:
         if row["max_m"] == 0.0:
             names = look.names[row["first"]], look.names[row["second"]]
-            raise UserError(f"{what}: strips {names[0]} and {names[1]} are the same returns under two names; want one")
+            raise UserError(
+                f"{what}: strips {names[0]} and {names[1]} contain the same returns under two names; give one of them"
+            )
 
 
 def cells_of(look: Look, rules: StripRules) -> Cells:
@@ -215,8 +217,8 @@ def _middle_ns(seen: SeenFrom) -> int | None:
 def _times_apart(strips: Gathered, seen: SeenFrom) -> list[str]:
     """Return a line if most returns have times outside their strips' trajectories."""
     outside = 0
-    for number, flown in enumerate(seen.flown):
-        begin, end = seen.trajectories[flown].span
+    for number, trajectory_number in enumerate(seen.flown):
+        begin, end = seen.trajectories[trajectory_number].span
         times = strips.time_ns[strips.strip == number]
         outside += int(((times < begin) | (times > end)).sum())
     if 2 * outside <= len(strips.time_ns):
@@ -230,8 +232,8 @@ def _times_apart(strips: Gathered, seen: SeenFrom) -> list[str]:
     ]
     share = 100.0 * outside / len(strips.time_ns)
     return [
-        f"{share:.0f} % of the points are of other times, {spans[0]}, than the trajectory beside them, {spans[1]}: "
-        "the differences have no signatures; correct the GPS time type in the header, or --week"
+        f"{share:.0f} % of the points lie at other times, {spans[0]}, than the trajectory beside them, {spans[1]}, so "
+        "the differences have no signatures; correct the GPS time type in the header, or give --week"
     ]
 
 
@@ -250,10 +252,10 @@ def _seen_from(look: Look) -> tuple[SeenFrom | None, Callable[[FloatArray], Floa
     def place(points: FloatArray) -> FloatArray:
         return frame.t_from_e(mapping.e_from_map(points / unit_m)) if len(points) else points
 
-    flown = [_flown(look, number, trajectories, of_session) for number in range(len(look.names))]
+    trajectory_numbers = [_flown(look, number, trajectories, of_session) for number in range(len(look.names))]
     # the files' scan directions refer to the body's right and left, whatever the mounting
     mounted = [np.eye(3)] * len(look.names)
-    return SeenFrom(frame, trajectories, flown, [1.0] * len(look.names), mounted), place
+    return SeenFrom(frame, trajectories, trajectory_numbers, [1.0] * len(look.names), mounted), place
 
 
 def _mapping_of(crs: dict[str, Any]) -> Mapping:
@@ -261,9 +263,7 @@ def _mapping_of(crs: dict[str, Any]) -> Mapping:
     in the configuration.
     """
     if "datum_said" not in crs or "accuracy_wanted_m" not in crs:
-        raise MappingError(
-            "the sidecar beside the points does not say of which datum they are; want swath georef again"
-        )
+        raise MappingError("the sidecar beside the points does not give their datum; run swath georef again")
     return Mapping(crs["crs"], datum=crs["datum_said"], epoch=crs.get("epoch"), accuracy_m=crs["accuracy_wanted_m"])
 
 

@@ -64,7 +64,11 @@ def event_table(marks: Sequence[Mark], trajectory: Trajectory) -> EventTable:
 
 
 def _untimed(mark: Mark) -> str:
-    return "the receiver does not vouch for its time" if not mark.event.valid else "its time cannot be placed"
+    return (
+        "the receiver does not vouch for its time"
+        if not mark.event.valid
+        else "its time cannot be converted to GPS time"
+    )
 
 
 def _line(mark: Mark, row: FloatArray | None, fate: str) -> str:
@@ -75,10 +79,10 @@ def _line(mark: Mark, row: FloatArray | None, fate: str) -> str:
         values = row[:12].copy()
         along_m = row[12:15] * (sigma_s or 0.0)
         values[6:9] = np.hypot(values[6:9], along_m)
-        told = (
+        words = (
             f"{value:.{digits}f}" if np.isfinite(value) else "" for value, digits in zip(values, NUMBERS, strict=True)
         )
-        pose = ",".join(told)
+        pose = ",".join(words)
     fields = (
         mark.source,
         event.channel,

@@ -102,12 +102,12 @@ def _positions(flight: Flight) -> Figures:
     used, outages = used_positions(flight.forward), outages_of(flight)
     lengths_s = (outages[:, 1] - outages[:, 0]) / SECOND_NS
     types, counts = np.unique(used["fix_type"], return_counts=True)
-    told = used["satellites"][used["satellites"] > 0]
+    counted = used["satellites"][used["satellites"] > 0]
     return {
         "used": len(used),
         "fix_types": {FixType(int(code)).name.lower(): int(count) for code, count in zip(types, counts, strict=True)},
-        "satellites_median": float(np.median(told)) if len(told) else None,
-        "satellites_least": int(told.min()) if len(told) else None,
+        "satellites_median": float(np.median(counted)) if len(counted) else None,
+        "satellites_least": int(counted.min()) if len(counted) else None,
         "outages": len(outages),
         "outages_s": float(lengths_s.sum()),
         "longest_outage_s": float(lengths_s.max()) if len(lengths_s) else 0.0,

@@ -62,7 +62,7 @@ class TrajectoryFiles:
             text = output.with_suffix(".csv") if csv else None
             return cls(output, _smrmsg_of(output), text, output.with_suffix(".json"), output.with_suffix(".html"))
         if suffix and not output.is_dir():
-            raise UserError(f"-o {output}: want a name that ends in .sbet, .out or .csv, or a folder", ExitCode.USAGE)
+            raise UserError(f"-o {output}: the name must end in .sbet, .out or .csv, or be a folder", ExitCode.USAGE)
         return cls.in_folder(output, session, csv=csv)
 
     @classmethod
@@ -79,7 +79,7 @@ class TrajectoryFiles:
         """Refuse with `UserError` to replace any of the files, or of ``others``, that exists."""
         for path in [*self.all(), *(other for other in others if other is not None)]:
             if path.exists():
-                raise UserError(f"{path}: is there already; want another name, or --overwrite", ExitCode.USAGE)
+                raise UserError(f"{path}: already exists; choose another name or use --overwrite", ExitCode.USAGE)
 
 
 def _smrmsg_of(sbet: Path) -> Path:

@@ -229,8 +229,8 @@ def draw_satellites(drawn: Drawn, form: Format) -> bytes:
     sheet = Sheet(drawn, form, ("Satellites used", "Fix type"))
     if len(rows):
         pixels = Pixels(rows["time_ns"], flight.start_ns)
-        told = np.where(rows["satellites"] > 0, rows["satellites"], np.nan).astype(np.float64)
-        sheet.line(sheet.panels[0], pixels, pixels.band(told), SMOOTHER)
+        satellites = np.where(rows["satellites"] > 0, rows["satellites"], np.nan).astype(np.float64)
+        sheet.line(sheet.panels[0], pixels, pixels.band(satellites), SMOOTHER)
     sheet.panels[0].set_ylim(bottom=0.0)
     span_s = max(flight.duration_s, 1e-3)
     edges_s = np.linspace(0.0, span_s, 2 * COLUMNS + 1)

@@ -58,7 +58,7 @@ def make_trajectory(wish: TrajectoryRequest, tell: Tell) -> TrajectoryReport:
         sessions = open_logs(wish.logs, passed_over)
         for session in sessions:
             refuse_no_name(session.session_id, session.parts[0].path)
-        holes = [f"passed over: {line}" for line in passed_over]
+        holes = [f"skipped: {line}" for line in passed_over]
         files = TrajectoryFiles.of_output(wish.output, sessions[0].session_id, csv=wish.csv)
         _refuse_one_name(wish.events, files)
         if not wish.overwrite:
@@ -97,7 +97,9 @@ def _write_as_is(
 ) -> TrajectoryReport:
     """Write the solutions of the devices' own INS, without a page."""
     if wish.events is not None:
-        raise UserError("--events: the marks are placed with a navigated trajectory; leave --ins as-is", ExitCode.USAGE)
+        raise UserError(
+            "--events: only a navigated trajectory gives event marks their place; leave --ins as-is out", ExitCode.USAGE
+        )
     read = [(session, ins_as_is(session, wish.navigate.inputs.config)) for session in sessions]
     read.sort(key=lambda pair: pair[1].trajectory.span)  # the hosts' clocks may be wrong
     sessions, found = [session for session, _ in read], [one for _, one in read]
@@ -130,8 +132,8 @@ def _refuse_overlap(parts: Sequence[tuple[Path, Trajectory]]) -> None:
     for (first, one), (second, other) in pairwise(parts):
         if other.span[0] <= one.span[1]:
             raise UserError(
-                f"{second}: begins at {gps_text(other.span[0])}, before {first} ends at {gps_text(one.span[1])}: two "
-                "recordings of one time; navigate them one by one",
+                f"{second}: begins at {gps_text(other.span[0])}, before {first} ends at {gps_text(one.span[1])}: the "
+                "recordings overlap in time; navigate them one by one",
                 ExitCode.USAGE,
             )
 
@@ -139,7 +141,7 @@ def _refuse_overlap(parts: Sequence[tuple[Path, Trajectory]]) -> None:
 def _refuse_one_name(events: Path | None, files: TrajectoryFiles) -> None:
     """Refuse with `UserError` to write the marks into a file of the trajectory."""
     if events is not None and events.resolve() in [path.resolve() for path in files.all()]:
-        raise UserError(f"--events {events}: is a file of the trajectory itself; want another name", ExitCode.USAGE)
+        raise UserError(f"--events {events}: is a file of the trajectory itself; choose another name", ExitCode.USAGE)
 
 
 def _write_events(
@@ -209,7 +211,7 @@ def ins_as_is(session: Session, config: Config | None) -> AsIs:
         raise UserError("\n".join(lines), error.exit_code) from error
     clocks = read_clocks(session, setup)
     if setup.sources.ins_source is None or not len(clocks.ins_rows):
-        raise UserError(f"{log}: no INS solution in the log; without --ins as-is its IMU and GNSS are navigated")
+        raise UserError(f"{log}: the log has no INS solution; leave --ins as-is out to navigate from its IMU and GNSS")
     buffer = TrajectoryBuffer(setup.sources.ins_protocol, name=session.session_id)
     buffer.append(clocks.ins_rows)
     trajectory = buffer.snapshot().with_velocities()

@@ -116,31 +116,31 @@ RULES: tuple[Rule[Figures], ...] = (
         0,
         0,
         "{value:.0f} epochs are not numbers",
-        "look for damage in the log with swath info; navigate without the source that breaks off",
+        "look for damage in the log with swath info; navigate without the source that stops early",
     ),
     Rule(
         "missing",
         _one("missing_s"),
         0.5,
         None,
-        "{value:.1f} s of the log's inertial samples have no trajectory",
-        "the holes below say from when to when and why; navigate anew when their cause is mended",
+        "{value:.1f} s of the log's inertial samples are outside the trajectory",
+        "the gaps listed below show when and why; remove their cause and navigate again",
     ),
     Rule(
         "missing share",
         _one("missing_share"),
         None,
         0.5,
-        "{value:.0%} of the log's inertial samples have no trajectory",
-        "the holes below say from when to when and why; navigate anew when their cause is mended",
+        "{value:.0%} of the log's inertial samples are outside the trajectory",
+        "the gaps listed below show when and why; remove their cause and navigate again",
     ),
     Rule(
         "positions used",
         _one("positions", "used"),
         60,
         10,
-        "only {value:.0f} positions were used",
-        "give positions that cover the flight (--gnss), or look below for why they were rejected",
+        "the filter used only {value:.0f} positions",
+        "give positions that cover the flight (--gnss), or see below why they were rejected",
         least=True,
     ),
     Rule(
@@ -172,8 +172,8 @@ RULES: tuple[Rule[Figures], ...] = (
         _one("positions", "longest_outage_s"),
         30.0,
         600.0,
-        "{value:.0f} s passed without a position that could be used",
-        "give post-processed positions (--gnss); do not use lines flown meanwhile unless their sigma suits",
+        "{value:.0f} s passed without a usable position",
+        "give post-processed positions (--gnss); do not use the lines of that time unless their sigma suffices",
     ),
     Rule(
         "rejected",
@@ -181,15 +181,15 @@ RULES: tuple[Rule[Figures], ...] = (
         0.02,
         0.25,
         "{value:.1%} of the {of} observations were rejected",
-        "look when it happens; check lever_arm_m, the time source, and the receiver's sigmas",
+        "find out when this happens; check lever_arm_m, the time source and the receiver's sigmas",
     ),
     Rule(
         "inflated",
         _share("inflated", "reacquired"),
         0.05,
         0.5,
-        "{value:.1%} of the {of} observations were beyond the gate and taken with a larger sigma",
-        "the receiver's sigmas are too small, or the lever arm or the time of one sensor is wrong",
+        "{value:.1%} of the {of} observations exceeded the gate and were used with a larger sigma",
+        "check the receiver's sigmas, which may be too small, the lever arm and the time of each sensor",
     ),
     Rule(
         "unusable",
@@ -204,7 +204,7 @@ RULES: tuple[Rule[Figures], ...] = (
         _of_kinds("sigma_factor"),
         1.5,
         4.0,
-        "innovations of {of} are {value:.1f} times as large as their sigmas say",
+        "innovations of {of} are {value:.1f} times as large as their sigmas predict",
         f"check lever_arm_m, rotation_b_imu, the time source and {NOISE}",
     ),
     Rule(
@@ -212,7 +212,7 @@ RULES: tuple[Rule[Figures], ...] = (
         _of_kinds("sigma_factor", inverse=True),
         5.0,
         None,
-        "innovations of {of} are {value:.1f} times smaller than their sigmas say: sigmas here are too careful",
+        "innovations of {of} are {value:.1f} times smaller than their sigmas predict, so the sigmas here are too large",
         f"check {NOISE}",
     ),
     Rule(
@@ -220,8 +220,9 @@ RULES: tuple[Rule[Figures], ...] = (
         _noise_found,
         5.0,
         None,
-        "errors of {of} are {value:.1f} times what the receiver says, or what is assumed of it; they were taken so",
-        "check lever_arm_m and the time source: a fault there looks like a receiver's noise",
+        "errors of {of} are {value:.1f} times the values that the receiver reports or that are assumed for it; "
+        "the filter used the larger values",
+        "check lever_arm_m and the time source: a fault there looks like noise of the receiver",
     ),
     Rule(
         "innovations correlated",
@@ -229,46 +230,46 @@ RULES: tuple[Rule[Figures], ...] = (
         0.5,
         None,
         "innovations of {of} are correlated from one to the next ({value:.2f})",
-        "their errors change slowly: sigmas of the trajectory may be too small unless that is in the noise model",
+        "include slow errors in the noise model: without them the sigmas of the trajectory may be too small",
     ),
     Rule(
         "separation",
         _separations,
         2.0,
         5.0,
-        "filter and smoother differ in {of} by {value:.1f} times what their sigmas say",
-        f"check {NOISE}; a disturbance in the middle of the flight shows in the separation's plot",
+        "filter and smoother differ in {of} by {value:.1f} times the value that their sigmas predict",
+        f"check {NOISE}; the plot of the separation shows a disturbance in the middle of the flight",
     ),
     Rule(
         "separation at worst",
         _worst_separations,
         8.0,
         None,
-        "filter and smoother differ in {of} by {value:.0f} times what their sigmas say, over 30 s",
-        "do not use lines flown then, or leave out the positions of that time (--gnss): a wrong fix looks like this",
+        "filter and smoother differ in {of} by {value:.0f} times the value that their sigmas predict, over 30 s",
+        "do not use the lines of that time, or leave out its positions (--gnss): a wrong fix has this effect",
     ),
     Rule(
         "bridged share",
         _one("bridged", "share"),
         0.001,
         0.05,
-        "{value:.2%} of the inertial samples are missing and were made up",
-        "look with swath info why samples are missing: bus load, wiring, a host too busy",
+        "{value:.2%} of the inertial samples are missing and were interpolated",
+        "find out with swath info why samples are missing: bus load, wiring or a busy host",
     ),
     Rule(
         "bridged run",
         _one("bridged", "longest_s"),
         1.0,
         30.0,
-        "inertial samples are missing for {value:.1f} s on end",
-        "do not use lines flown meanwhile; look with swath info why samples are missing",
+        "inertial samples are missing for {value:.1f} s without a break",
+        "do not use the lines of that time; find out with swath info why samples are missing",
     ),
     Rule(
         "bias",
         _sensor("gyro_bias", "accel_bias"),
         4.0,
         20.0,
-        "{of} is {value:.1f} times what the noise lets expect",
+        "{of} is {value:.1f} times the value that the noise predicts",
         f"check {NOISE}, rotation_b_imu and the units of the samples",
     ),
     Rule(
@@ -276,7 +277,7 @@ RULES: tuple[Rule[Figures], ...] = (
         _sensor("gyro_scale", "accel_scale", "gyro_misalignment", "accel_misalignment"),
         4.0,
         20.0,
-        "{of} is {value:.1f} times what the noise lets expect",
+        "{of} is {value:.1f} times the value that the noise predicts",
         f"check {NOISE} and the units of the samples",
     ),
     Rule(
@@ -284,7 +285,7 @@ RULES: tuple[Rule[Figures], ...] = (
         _arm("moved_m"),
         0.05,
         1.0,
-        "the antenna was found {value:.2f} m from where lever_arm_m has it ({of})",
+        "the antenna was estimated {value:.2f} m from its place by lever_arm_m ({of})",
         "measure the lever arm again, or enter the estimate below and navigate once more",
     ),
     Rule(
@@ -292,8 +293,8 @@ RULES: tuple[Rule[Figures], ...] = (
         _arm("sigma_over_prior"),
         0.5,
         None,
-        "lever arm {of} can hardly be told from this flight (its sigma is {value:.0%} of what it was before)",
-        "measure it and do not estimate it; the vertical one shows in steep turns only",
+        "this flight hardly determines lever arm {of} (its sigma is {value:.0%} of the prior one)",
+        "measure it instead of estimating it; only steep turns determine the vertical component",
     ),
     Rule(
         "time offset",
@@ -301,7 +302,7 @@ RULES: tuple[Rule[Figures], ...] = (
         2.0,
         None,
         "GNSS stamps are {value:.1f} ms {of} against the inertial unit's; the trajectory is corrected for it",
-        "correct the time where it comes from: pps, names_edge, stamp, or the device's delay",
+        "correct the time at its source: pps, names_edge, stamp, or the device's delay",
     ),
 )
 
@@ -323,7 +324,7 @@ def reason_of(finding: Found) -> Reason:
 def _sentence(level: Level, figures: Figures, reasons: Sequence[Reason]) -> str:
     if level is Level.GOOD:
         return f"{level.heading}: {accuracy_words(figures)}."
-    told = [reason.what for reason in reasons if reason.level is level]
+    problems = [reason.what for reason in reasons if reason.level is level]
     more = len(reasons) - 1
     tail = f"; {more} more {'reason' if more == 1 else 'reasons'}" if more else ""
-    return f"{level.heading}: {told[0]}{tail}."
+    return f"{level.heading}: {problems[0]}{tail}."

@@ -39,7 +39,7 @@ def records_of(files: Sequence[tuple[Path, Calibration]], where: Path | None) ->
         UserError: a file that the user names is not a record, or is of another calibration.
     """
     if where is not None and where.is_file() and len(files) > 1:
-        raise UserError(f"--record {where}: of several calibrations want the folder of their records", ExitCode.USAGE)
+        raise UserError(f"--record {where}: for several calibrations, give the folder of their records", ExitCode.USAGE)
     documents: dict[str, Document] = {}
     notes: list[str] = []
     for file, calibration in files:
@@ -47,7 +47,7 @@ def records_of(files: Sequence[tuple[Path, Calibration]], where: Path | None) ->
         path = file.parent / name if where is None else where / name if where.is_dir() else where
         if where is None and not path.exists():
             notes.append(
-                f"{file}: no {name} beside it; --record says where it lies, if it shall tell of this validation"
+                f"{file}: no {name} beside it; give its place with --record to add this validation to the record"
             )
             continue
         try:
@@ -55,7 +55,7 @@ def records_of(files: Sequence[tuple[Path, Calibration]], where: Path | None) ->
         except UserError as error:
             if where is not None:
                 raise
-            notes.append(f"{error.message}; left alone")
+            notes.append(f"{error.message}; the record is unchanged")
     return Recorded(documents, tuple(notes))
 
 
@@ -65,7 +65,7 @@ def _document(path: Path, file: Path, calibration: Calibration) -> Document:
     except RecordError as error:
         raise UserError(str(error), ExitCode.USAGE) from error
     if document["id"] != calibration.id:
-        what = f"is the record of calibration {document['id']}, {file} is {calibration.id}"
+        what = f"is the record of calibration {document['id']}, but {file} is {calibration.id}"
         raise UserError(f"{path}: {what}", ExitCode.USAGE)
     return document
 
@@ -81,10 +81,10 @@ def record_files(
         validation: the result; methods that could not be applied are not listed.
         logs: name and SHA-256 of the logs that it was validated against.
     """
-    told = told_of(validation, logs, dt.datetime.now(dt.UTC))
+    values = told_of(validation, logs, dt.datetime.now(dt.UTC))
     files: dict[Path, bytes] = {}
     for scanner, document in documents.items():
-        validated = with_told(document, told)
+        validated = with_told(document, values)
         files[folder / f"{scanner}.record.xml"] = document_xml(validated).encode()
         files[folder / f"{scanner}.record.json"] = document_json(validated).encode()
     return files
@@ -94,7 +94,7 @@ def told_of(validation: Validation, logs: Sequence[tuple[str, str]], now: dt.dat
     """Return values and notes by ``CLASS.attribute``: methods with results, time, logs and number of check points."""
     applied = [method for method in validation.methods if method.passed is not None]
     against = ", ".join(f"{name} (SHA-256 {sha256})" for name, sha256 in logs)
-    told: dict[str, tuple[Plain, str]] = {
+    values: dict[str, tuple[Plain, str]] = {
         "CA_GeometryValidation.validationMethod": (
             ", ".join(method.name for method in applied),
             ". ".join([validation.sentence, *(method.sentence for method in applied), *validation.dependent]),
@@ -106,6 +106,6 @@ def told_of(validation: Validation, logs: Sequence[tuple[str, str]], now: dt.dat
     }
     for method in applied:
         if method.name == "testfield":
-            note = "points given to the validation; that the calibration did not use them is the user's to see to"
-            told["CA_TestRange.numberCheckPoints"] = (int(method.more["points"]), note)
-    return told
+            note = "points given to the validation; the user must make sure that the calibration did not use them"
+            values["CA_TestRange.numberCheckPoints"] = (int(method.more["points"]), note)
+    return values

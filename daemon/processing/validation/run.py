@@ -169,7 +169,9 @@ def _against_flight(wish: ValidationOptions, found: _Found, kept: KeptFlight, fo
     told("planes", 0, 1)
     planes = find_planes(flight)
     if not planes.planes:
-        raise UserError(f"{wish.logs.logs[0]}: no planes that two strips see; a validation wants strips that overlap")
+        raise UserError(
+            f"{wish.logs.logs[0]}: no two strips see a common plane; a validation needs strips that overlap"
+        )
     anew, why_not = _anew(wish, found, kept, points or (), folder, told) if wish.anew else (None, "")
     told("tests", 0, 1)
     asked = Asked(points, anew, why_not, named)
@@ -187,12 +189,21 @@ def _refuse_others(wish: ValidationOptions, found: _Found, kept: KeptFlight) -> 
     log = kept.logged[0].log
     for name, calibration in found.calibrations.items():
         if name not in scanners:
-            raise UserError(f"{log}: has no scanner {name}, whose calibration {calibration.id} is; {sorted(scanners)}")
-        made, flown = calibration.header.get("installation", ""), kept.logged[0].setup.config.profile.installation
-        if made and flown and made != flown:
-            found.notes.append(f'{log}: is of installation "{flown}", calibration {calibration.id} of "{made}"')
+            raise UserError(
+                f"{log}: has no scanner {name}, to which calibration {calibration.id} belongs; it has "
+                f"{sorted(scanners)}"
+            )
+        made, installation = (
+            calibration.header.get("installation", ""),
+            kept.logged[0].setup.config.profile.installation,
+        )
+        if made and installation and made != installation:
+            found.notes.append(
+                f'{log}: was recorded with installation "{installation}", but calibration {calibration.id} '
+                f'belongs to "{made}"'
+            )
     if len({(swath.flown, swath.strip) for swath in kept.flight.swaths}) < 2:
-        raise UserError(f"{log}: one strip only; a validation wants at least two strips that overlap")
+        raise UserError(f"{log}: has one strip only; a validation needs at least two strips that overlap")
 
 
 def _along(kept: KeptFlight, found: _Found) -> None:
@@ -200,7 +211,10 @@ def _along(kept: KeptFlight, found: _Found) -> None:
     for head in kept.flight.heads:
         if head.name not in found.calibrations:
             found.calibrations[head.name] = head.start
-            note = f"{kept.logged[0].log}: {head.name}: no calibration named; validated along with {head.start.id}"
+            note = (
+                f"{kept.logged[0].log}: {head.name}: no calibration was given; its own calibration {head.start.id} is "
+                "used"
+            )
             found.notes.append(note)
 
 
@@ -216,8 +230,8 @@ def _assumed(kept: KeptFlight) -> list[str]:
     """Return a note for each trajectory that has no sigmas."""
     filled = with_sigmas(kept.flight).trajectories
     return [
-        f"{flight.log}: its trajectory lacks sigmas; {100 * SIGMAS_M:g} cm of position, {roll:g}° of roll and pitch "
-        f"and {heading:g}° of heading are assumed where it does"
+        f"{flight.log}: its trajectory has no sigmas at some times; {100 * SIGMAS_M:g} cm of position, {roll:g}° of "
+        f"roll and pitch and {heading:g}° of heading are assumed there"
         for flight, before, after in zip(kept.logged, kept.flight.trajectories, filled, strict=True)
         for roll, _, heading in [SIGMAS_DEG]
         if not (
@@ -328,7 +342,7 @@ def _write(output: Path, record: dict[str, Any], found: _Found) -> list[str]:
     try:
         write_whole(files)
     except OSError as error:
-        raise UserError(f"{output}: cannot be written to ({error.strerror or error})", ExitCode.IO) from error
+        raise UserError(f"{output}: is not writable ({error.strerror or error})", ExitCode.IO) from error
     return [str(path) for path in files]
 
 

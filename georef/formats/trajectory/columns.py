@@ -119,10 +119,10 @@ def placed_in_week(of_week_ns: Int64Array, name: str, span_ns: Span | None, week
     """Return GPS time of nanoseconds of a week: in the given week, or in the one that overlaps a log's span most."""
     if week is not None:
         if not 0 <= week <= LATEST_NS // WEEK_NS:  # such as 24233, a week with a day of the week appended
-            raise TrajectoryError(f"{name}: --week {week} is no GPS week; want whole weeks since 1980, such as 2423")
+            raise TrajectoryError(f"{name}: --week {week} is not a GPS week; give whole weeks since 1980, such as 2423")
         return of_week_ns + week * WEEK_NS
     if span_ns is None:
-        raise TrajectoryError(f"{name}: says seconds of the week but no week; give the GPS week (--week)")
+        raise TrajectoryError(f"{name}: has seconds of the week without the week; give the GPS week (--week)")
     first, last = int(of_week_ns[0]), int(of_week_ns[-1])
     near = week_from_gps(span_ns[0])[0]
 
@@ -168,14 +168,15 @@ def _check_sigmas(columns: TrajectoryColumns, name: str) -> None:
             raise TrajectoryError(f"{name}: a sigma of the {what} at {columns.at(bad)} is negative")
         bad = np.logical_or.reduce(sigma > GREATEST_SIGMA, axis=1)
         if bad.any():
-            raise TrajectoryError(f"{name}: a sigma of the {what} at {columns.at(bad)} is beyond {GREATEST_SIGMA:g}")
+            raise TrajectoryError(f"{name}: a sigma of the {what} at {columns.at(bad)} exceeds {GREATEST_SIGMA:g}")
 
 
 def _check_velocity(columns: TrajectoryColumns, name: str) -> None:
     fast = np.logical_or.reduce(np.abs(columns.velocity_l) > GREATEST_SAID_MPS, axis=1)  # nan: missing
     if fast.any():
         raise TrajectoryError(
-            f"{name}: a velocity at {columns.at(fast)} is beyond {GREATEST_SAID_MPS:g} m/s; want metres a second"
+            f"{name}: a velocity at {columns.at(fast)} exceeds {GREATEST_SAID_MPS:g} m/s; metres per second are "
+            "expected"
         )
 
 
@@ -183,16 +184,16 @@ def _check_position(columns: TrajectoryColumns, name: str) -> None:
     beyond: NDArray[np.bool_] = np.abs(columns.lat_rad) > np.pi / 2
     if beyond.any():
         value = columns.lat_rad[int(np.argmax(beyond))]
-        said = value if columns.angles_in == "radians" else np.degrees(value)
+        shown = value if columns.angles_in == "radians" else np.degrees(value)
         hint = f"{columns.angles_in} north are expected"
-        if columns.angles_in == "radians" and abs(said) <= 90.0:
+        if columns.angles_in == "radians" and abs(shown) <= 90.0:
             hint += "; these look like degrees"
         elif (np.abs(columns.lon_rad) <= np.pi / 2).all():
             hint += "; latitude and longitude may be swapped"
-        raise TrajectoryError(f"{name}: latitude {said:.6g} at {columns.at(beyond)}: {hint}")
+        raise TrajectoryError(f"{name}: latitude {shown:.6g} at {columns.at(beyond)}: {hint}")
     around: NDArray[np.bool_] = np.abs(columns.lon_rad) > 2 * np.pi
     if around.any():
-        raise TrajectoryError(f"{name}: longitude at {columns.at(around)} is more than once round the earth")
+        raise TrajectoryError(f"{name}: longitude at {columns.at(around)} exceeds a full turn")
     high: NDArray[np.bool_] = (columns.height_m < LOWEST_M) | (columns.height_m > HIGHEST_M)
     if high.any():
         height = columns.height_m[int(np.argmax(high))]
@@ -207,16 +208,16 @@ def _check_attitude(columns: TrajectoryColumns, name: str) -> None:
         beyond: NDArray[np.bool_] = np.abs(angle) > limit + 1e-6
         if beyond.any():
             value = angle[int(np.argmax(beyond))]
-            said = value if columns.angles_in == "radians" else np.degrees(value)
+            shown = value if columns.angles_in == "radians" else np.degrees(value)
             hint = "; these look like degrees" if columns.angles_in == "radians" else ""
             where = columns.at(beyond)
-            raise TrajectoryError(f"{name}: {what} {said:.6g} at {where}: {columns.angles_in} are expected{hint}")
+            raise TrajectoryError(f"{name}: {what} {shown:.6g} at {where}: {columns.angles_in} are expected{hint}")
 
 
 def _check_time(columns: TrajectoryColumns, name: str) -> None:
     far = (columns.time_ns < EARLIEST_NS) | (columns.time_ns > LATEST_NS)
     if far.any():
-        raise TrajectoryError(f"{name}: time at {columns.at(far)} is before 1980 or after 2125: no GPS time")
+        raise TrajectoryError(f"{name}: time at {columns.at(far)} is before 1980 or after 2125, so it is not GPS time")
     steps = np.diff(columns.time_ns)
     stuck = np.r_[False, steps <= 0]
     if stuck.any():
@@ -234,18 +235,20 @@ def _check_course(columns: TrajectoryColumns, name: str) -> None:
     speed = np.linalg.norm(moved, axis=1)
     if np.median(speed) > GREATEST_SPEED_MPS:
         raise TrajectoryError(
-            f"{name}: its positions move at {np.median(speed):.0f} m/s; latitude, longitude or time has another unit"
+            f"{name}: its positions move at {np.median(speed):.0f} m/s; check the units of latitude, longitude and time"
         )
-    said = mean_over(columns.time_ns, columns.velocity_l, pieces)
-    fast = (np.hypot(*moved[:, :2].T) > COURSE_FROM_MPS) & (np.hypot(*said[:, :2].T) > COURSE_FROM_MPS)
-    error = _course_error(moved, said)
+    stated = mean_over(columns.time_ns, columns.velocity_l, pieces)
+    fast = (np.hypot(*moved[:, :2].T) > COURSE_FROM_MPS) & (np.hypot(*stated[:, :2].T) > COURSE_FROM_MPS)
+    error = _course_error(moved, stated)
     off = fast & (np.abs(error) > GREATEST_COURSE_ERROR_RAD)
     if off.sum() > COURSE_OUTLIERS * fast.sum():
         at = pieces[int(np.argmax(off)), 0]
         swapped = moved_l(columns.time_ns, columns.lon_rad, columns.lat_rad, columns.height_m, pieces)
         hint = "the velocities are not north, east, down, or the wander angle has another sign"
-        mirrored = said * np.array([1.0, -1.0, 1.0])  # the axes of an SBET may have been misjudged from such positions
-        fits = [np.median(np.abs(_course_error(swapped, velocity))[fast]) for velocity in (said, mirrored)]
+        mirrored = stated * np.array(
+            [1.0, -1.0, 1.0]
+        )  # the axes of an SBET may have been misjudged from such positions
+        fits = [np.median(np.abs(_course_error(swapped, velocity))[fast]) for velocity in (stated, mirrored)]
         if min(fits) < GREATEST_COURSE_ERROR_RAD:
             hint = "latitude and longitude are swapped"
         degrees = np.degrees(np.median(np.abs(error[off])))

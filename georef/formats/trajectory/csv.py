@@ -42,10 +42,10 @@ def read_csv(text: str, name: str) -> TrajectoryColumns:
         raise TrajectoryError(f"{name}: the header of a trajectory CSV begins with {HEADER}")
     unknown = set(header[len(COLUMNS) :]) - {*SIGMAS, *OTHER_NAMES, *IN_DEGREES, *UNUSED}
     if unknown:
-        raise TrajectoryError(f"{name}: column {min(unknown)} is not known; sigmas are {', '.join(SIGMAS)}")
+        raise TrajectoryError(f"{name}: column {min(unknown)} is unknown; sigmas are {', '.join(SIGMAS)}")
     if len(set(header)) < len(header):
         twice = next(column for column in header if header.count(column) > 1)
-        raise TrajectoryError(f"{name}: column {twice} is there twice; want each once")
+        raise TrajectoryError(f"{name}: column {twice} is given twice; give each column once")
     table = _numbers(lines[first + 1 :], header, name, first + 2)
     degrees = {column: np.radians(table[column]) for column in header if column.endswith("_deg")}
     position_sigma_l, attitude_sigma_rad = _sigmas(table, degrees)

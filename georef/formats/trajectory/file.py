@@ -53,7 +53,7 @@ def read_trajectory(
     elif is_waypoint(text):
         columns = read_waypoint(text, name, span_ns=span_ns, week=week, leap_seconds=leap_seconds)
     else:
-        raise TrajectoryError(f"{name}: is no trajectory: SBET, Waypoint text, RTKLIB .pos or trajectory CSV")
+        raise TrajectoryError(f"{name}: is not a trajectory; give SBET, Waypoint text, RTKLIB .pos or trajectory CSV")
     trajectory = trajectory_of(columns, name, max_gap_ns)
     if needs_attitude:
         trajectory.require_attitude()
@@ -66,8 +66,8 @@ def _refuse_sparse(trajectory: Trajectory) -> None:
     step_ns = int(np.median(np.diff(trajectory.time_ns)))
     if step_ns > trajectory.max_gap_ns:
         raise TrajectoryError(
-            f"{trajectory.name}: its epochs are {step_ns / SECOND_NS:.3f} s apart, and what lies more than "
-            f"{trajectory.max_gap_ns / SECOND_NS:.3f} s apart is a gap: export it at 10 Hz or more"
+            f"{trajectory.name}: its epochs are {step_ns / SECOND_NS:.3f} s apart, and epochs more than "
+            f"{trajectory.max_gap_ns / SECOND_NS:.3f} s apart count as a gap: export it at 10 Hz or more"
         )
 
 
@@ -89,5 +89,7 @@ def _sbet(data: bytes, name: str, span_ns: Span | None, week: int | None, sigmas
         except TrajectoryError:
             pass
         else:
-            raise TrajectoryError(f"{name}: is an smrmsg, the sigmas of a trajectory; give the SBET (sbet_….out)")
+            raise TrajectoryError(
+                f"{name}: is an smrmsg, which has the sigmas of a trajectory; give the SBET (sbet_….out)"
+            )
     return read_sbet(data, name, span_ns=span_ns, week=week, sigmas=sigmas)

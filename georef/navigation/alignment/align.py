@@ -145,9 +145,9 @@ class Aligner:
         rows = self._window[self._window["time_ns"] >= felt.time_ns[0]]
         seconds = (now_ns - int(rows["time_ns"][0])) / SECOND_NS
         most = max(int((rows["kind"] == kind).sum()) for kind in (Kind.POSITION, Kind.VELOCITY))
-        told = np.isin((Kind.HEADING, Kind.ATTITUDE), rows["kind"]).any()
-        if most < FEWEST or seconds < SHORTEST_S["given" if told else "good"]:
-            self.state = f"has {seconds:.0f} s of GNSS and inertial samples together, wants {SHORTEST_S['good']:.0f} s"
+        has_attitude = np.isin((Kind.HEADING, Kind.ATTITUDE), rows["kind"]).any()
+        if most < FEWEST or seconds < SHORTEST_S["given" if has_attitude else "good"]:
+            self.state = f"has {seconds:.0f} s of GNSS and inertial samples together, needs {SHORTEST_S['good']:.0f} s"
             return
         still_ns = _still(felt, rows, self._setup.noise)
         problem = Problem(felt, rows, self._setup, still_ns)

@@ -71,10 +71,12 @@ def _velocity(places: StructArray, observations: StructArray, time_ns: int) -> t
 
     It is an observed velocity near the time, else that between the first position and a later one.
     """
-    said = observations[(observations["kind"] == Kind.VELOCITY) & (observations["antenna"] == places[0]["antenna"])]
-    away = np.abs(said["time_ns"] - time_ns)
-    if len(said) and away.min() <= NEAR_NS and np.isfinite(said[int(np.argmin(away))]["value"]).all():
-        near = said[int(np.argmin(away))]
+    velocities = observations[
+        (observations["kind"] == Kind.VELOCITY) & (observations["antenna"] == places[0]["antenna"])
+    ]
+    away = np.abs(velocities["time_ns"] - time_ns)
+    if len(velocities) and away.min() <= NEAR_NS and np.isfinite(velocities[int(np.argmin(away))]["value"]).all():
+        near = velocities[int(np.argmin(away))]
         return near["value"], np.hypot(near["sigma"], ACCELERATION_MPS2 * away.min() / SECOND_NS)
     same = places[places["antenna"] == places[0]["antenna"]]
     later = same[same["time_ns"] - time_ns >= APART_NS]

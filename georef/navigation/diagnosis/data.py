@@ -49,8 +49,9 @@ def times(inertial: Inertial, place: StructArray) -> Iterator[Finding]:
             yield Finding(
                 "week_jump",
                 "error",
-                f"the times of {name} jump by {step_s[jumps[0]]:.0f} s after {_time(time_ns[jumps[0]])}, about a week: "
-                "at a week crossing the week number changed too early or too late; give each part its own week",
+                f"the times of {name} jump by {step_s[jumps[0]]:.0f} s after {_time(time_ns[jumps[0]])}, about a "
+                "week: the week number changed too early or too late at the change of weeks; give each part its own "
+                "week",
             )
             return
     spans = [(int(time_ns[0]), int(time_ns[-1])) for time_ns in (inertial.time_ns, place["time_ns"])]
@@ -58,7 +59,7 @@ def times(inertial: Inertial, place: StructArray) -> Iterator[Finding]:
         return
     off_s = (sum(spans[1]) - sum(spans[0])) / 2 / SECOND_NS
     weeks_off = round(off_s / WEEK_S)
-    hint = "check which clock stamps the IMU (pps, device time) and what week or date GNSS gives"
+    hint = "check which clock stamps the IMU (pps, device time) and which week or date GNSS gives"
     if weeks_off and abs(off_s - weeks_off * WEEK_S) < max(np.diff(spans).max() / SECOND_NS, 60.0):
         hint = f"they are {weeks_off:+d} weeks apart: the week number of one of them is wrong"
     yield Finding(
@@ -88,14 +89,14 @@ def gaps(inertial: Inertial) -> Iterator[Finding]:
         yield Finding(
             "imu_rate",
             "warning",
-            f"{100.0 * share:.0f} % of the IMU's intervals had to be made up: the samples come more seldom than "
-            "rate_hz says; set it to their true rate",
+            f"{100.0 * share:.0f} % of the IMU's intervals had to be interpolated: the samples are rarer than "
+            "rate_hz; set rate_hz to their true rate",
         )
     elif share > BRIDGED[0]:
         yield Finding(
             "imu_bridged",
             "warning",
-            f"{100.0 * share:.1f} % of the IMU's intervals had to be made up over short gaps: look for losses "
+            f"{100.0 * share:.1f} % of the IMU's intervals had to be interpolated over short gaps: look for losses "
             "(cable, bus load)",
         )
 
@@ -109,15 +110,15 @@ def receiver(observations: StructArray, place: StructArray) -> Iterator[Finding]
             "gnss_bad",
             "error" if bad.all() else "warning",
             f"{100.0 * bad.mean():.0f} % of GNSS's positions have no fix or a sigma above {BAD_SIGMA_M:.0f} m: check "
-            "antenna, sky view and that the receiver puts out its solution",
+            "the antenna, its view of the sky, and that the receiver sends its solution",
         )
     off = _speed_off(observations[observations["kind"] == Kind.VELOCITY], place[~bad])
     if off is not None:
         yield Finding(
             "positions_and_velocities",
             "error",
-            f"GNSS's velocities and the changes of its positions differ by {off:.1f} m/s: they are not of one "
-            "receiver, or the velocities' unit is another; take both from the same messages",
+            f"GNSS's velocities and the changes of its positions differ by {off:.1f} m/s: they come from different "
+            "receivers, or the velocities have another unit; take both from the same messages",
         )
 
 
@@ -132,12 +133,12 @@ def _speed_off(speed: StructArray, place: StructArray) -> float | None:
     middle_ns = first["time_ns"][:-1] + np.diff(first["time_ns"]) // 2
     since_s = (speed["time_ns"] - speed["time_ns"][0]) / SECOND_NS
     at_s = (middle_ns - speed["time_ns"][0]) / SECOND_NS
-    said = np.interp(at_s, since_s, np.linalg.norm(speed["value"], axis=1))
+    speeds = np.interp(at_s, since_s, np.linalg.norm(speed["value"], axis=1))
     used = (step_s < 2.5) & (at_s > since_s[0]) & (at_s < since_s[-1])
     if used.sum() < 10:
         return None
     noise = 2.0 * (first["sigma"].max(axis=1)[1:] / np.maximum(step_s, 0.5) + np.median(speed["sigma"].max(axis=1)))
-    off = np.abs(moved - said)[used]
+    off = np.abs(moved - speeds)[used]
     typical = float(np.percentile(off, 75))
     return typical if typical > SPEED_OFF_MPS + float(np.median(noise[used])) else None
 
@@ -151,7 +152,7 @@ def force(inertial: Inertial) -> Iterator[Finding]:
         yield Finding(
             "force_size",
             "error",
-            f"the specific force is {size:.3g} m/s² on average where gravity alone gives {G_MPS2:.2f}: {hint}",
+            f"the specific force is {size:.3g} m/s² on average, but gravity alone gives {G_MPS2:.2f}: {hint}",
         )
 
 

@@ -152,8 +152,8 @@ def _doubted_offset(offset: TimeOffset) -> Finding:
         "time_unclear",
         "warning",
         f"comparisons of the motion disagree about the time between GNSS and IMU: by the {offset.compared} "
-        f"{1000.0 * offset.seconds:+.0f} ± {1000.0 * offset.sigma:.0f} ms, {offset.contradiction}; nothing is taken "
-        "for an offset: check how the IMU is stamped (pps, sample, stamp)",
+        f"{1000.0 * offset.seconds:+.0f} ± {1000.0 * offset.sigma:.0f} ms, {offset.contradiction}; no offset is "
+        "applied: check how the IMU is stamped (pps, sample, stamp)",
     )
 
 
@@ -164,9 +164,12 @@ def _offset_finding(offset: TimeOffset, gps_ns: int) -> Finding:
     words = f"{1000.0 * size:.0f} ms" if size < 2.0 else f"{size:.2f} s"
     hint = "check how the IMU is stamped (pps, sample, stamp) or let the filter estimate the offset"
     if size > 0.5:
-        hint = "positions written with other leap seconds (want GPS time), a second named wrongly, or " + hint
+        hint = (
+            "check that the positions are in GPS time (not with other leap seconds) and that seconds are named "
+            "correctly, or " + hint
+        )
     if abs(size - leap) < 0.5:
-        hint = f"GPS and UTC differ by these {leap} s: one of the two is taken for the other"
+        hint = f"GPS and UTC differ by these {leap} s: give both sensors' times in one of the two time scales"
     return Finding(
         "time_offset",
         "error",
@@ -191,15 +194,16 @@ def _sensor_finding(mounting: Mounting, body: FloatArray | None) -> Finding:
         return Finding(
             "axes_unclear",
             "error",
-            f"the gyroscopes do not go with the accelerometers and GNSS, and the motion tells not which way is right: "
-            f"for body x, y, z {ways} fit alike; fly banked turns and pull up between them, or look at the mounting",
+            "the gyroscopes do not fit the accelerometers and GNSS, and the motion does not show which axes are "
+            f"right: for body x, y, z {ways} fit equally well; fly banked turns and pull up between them, or inspect "
+            "the mounting",
         )
-    unit = "degrees are taken for radians" if mounting.unit < 1.0 else "radians are taken for degrees"
+    unit = "degrees are read as radians" if mounting.unit < 1.0 else "radians are read as degrees"
     if mounting.unit != 1.0 and _is_one(gyro) and _is_one(accel):
         return Finding(
             "gyro_unit",
             "error",
-            f"the gyroscopes do not go with the accelerometers and GNSS: {mounting.unit:.4g} times as large they fit "
+            f"the gyroscopes do not fit the accelerometers and GNSS: {mounting.unit:.4g} times as large they fit "
             f"{times}; angular_rate has the wrong unit: {unit}",
         )
     also = "" if mounting.unit == 1.0 else f"; angular_rate has the wrong unit too: {unit}"
@@ -207,8 +211,8 @@ def _sensor_finding(mounting: Mounting, body: FloatArray | None) -> Finding:
         return Finding(
             "axes_mirrored",
             "error",
-            f"both triads are mirrored, which no rotation_b_imu mends: taken as ({_taken(gyro)}) for body x, y, z "
-            f"they fit {times}; put specific_force's and angular_rate's signals into that order and sign{also}",
+            f"both triads are mirrored, which rotation_b_imu cannot correct: read as ({_taken(gyro)}) for body x, y, "
+            f"z they fit {times}; put specific_force's and angular_rate's signals into that order and sign{also}",
         )
     if _is_one(accel) or _is_one(gyro) or body is None:
         name, other, key, matrix = ("gyroscopes", "accelerometers", "angular_rate", gyro)
@@ -218,15 +222,15 @@ def _sensor_finding(mounting: Mounting, body: FloatArray | None) -> Finding:
         return Finding(
             f"{name[:4] if name[0] == 'g' else name[:5]}_axes",
             "error",
-            f"the {name} do not go with the {other} and GNSS: taken as ({_taken(matrix)}) for body x, y, z they fit "
+            f"the {name} do not fit the {other} and GNSS: read as ({_taken(matrix)}) for body x, y, z they fit "
             f"{times}; put {key}'s signals into that order and sign{mirrored}{also}",
         )
     return Finding(
         "sensor_axes",
         "error",
-        f"gyroscopes and accelerometers are taken wrongly, each in its way: as ({_taken(gyro)}) and ({_taken(accel)}) "
-        f"for body x, y, z they fit {times}; put angular_rate's signals into the first order and sign, "
-        f"specific_force's into the second{also}",
+        f"gyroscopes and accelerometers both have wrong axes, each in its own way: read as ({_taken(gyro)}) and "
+        f"({_taken(accel)}) for body x, y, z they fit {times}; put angular_rate's signals into the first order and "
+        f"sign, specific_force's into the second{also}",
     )
 
 
@@ -245,8 +249,8 @@ def _matched(chosen: list[Window]) -> Finding | None:
     return Finding(
         "not_one_motion",
         "error",
-        f"GNSS does not move as the IMU feels (residuals {np.sqrt(misfit):.0f} times their sigma): they may "
-        "be on different vehicles, or a sensor's axes, units or times are wrong; check which receiver it is",
+        f"GNSS and IMU show different motion (residuals {np.sqrt(misfit):.0f} times their sigma): they may be on "
+        "different vehicles, or a sensor's axes, units or times are wrong; check which receiver it is",
     )
 
 
@@ -256,7 +260,7 @@ def _axes_finding(matrix: FloatArray) -> Finding | None:
     rows = "[" + ", ".join("[" + ", ".join(f"{value:.0f}" for value in row + 0.0) + "]" for row in matrix) + "]"
     read = np.array([0.0, 0.0, -1.0]) @ matrix
     axis = int(np.argmax(np.abs(read)))
-    gravity = f"body {AXES[axis]} reads {read[axis]:+.0f} g" if axis != 2 or read[2] > 0.0 else "z does point down"
+    gravity = f"body {AXES[axis]} reads {read[axis]:+.0f} g" if axis != 2 or read[2] > 0.0 else "z points down"
     ahead = _axis(matrix[0])
     return Finding(
         "axes",
@@ -285,8 +289,8 @@ def _gravity(inertial: Inertial) -> Finding | None:
         "gravity_axis",
         "error",
         f"body {AXES[axis]} reads {mean[axis]:+.2f} g on average where z, down, should read -1 g: multiply "
-        f"rotation_b_imu from the left by {rows}, or by another turn that brings gravity there (which way is forward, "
-        "motion will tell)",
+        f"rotation_b_imu from the left by {rows}, or by another rotation that brings gravity to z (motion shows which "
+        "way is forward)",
     )
 
 
@@ -299,8 +303,8 @@ def _headings(chosen: list[Window], setup: Setup) -> Iterator[Finding]:
         yield Finding(
             "antennas_swapped",
             "error",
-            f"dual-antenna headings are {np.degrees(abs(off)):.0f}° off the motion's: the antennas are swapped; "
-            "exchange lever_arm_m and secondary_lever_arm_m, or the cables",
+            f"dual-antenna headings are {np.degrees(abs(off)):.0f}° off the motion's: the antennas are exchanged; "
+            "swap lever_arm_m and secondary_lever_arm_m, or the cables",
         )
     elif abs(off) > max(TURNED_RAD, 5.0 * sigma):
         yield Finding(
@@ -326,24 +330,25 @@ def _arms(chosen: list[Window], setup: Setup) -> Iterator[Finding]:
         yield Finding(
             "lever_arm_sign",
             "error",
-            f"{what} the lever_arm_m given, {_vector(arm)} m: {_vector(fitted)} m (±{sigma.max():.2f}) fits; x is "
+            f"{what} the given lever_arm_m, {_vector(arm)} m: {_vector(fitted)} m (±{sigma.max():.2f}) fits; x is "
             "forward, y right, z down, from the body's origin to the antenna",
         )
     elif np.linalg.norm(arm) > clear and np.linalg.norm(fitted) < ORIGIN_SHARE * off:
         yield Finding(
             "position_at_body",
             "error",
-            f"GNSS's positions are of the body's origin, not of an antenna at {_vector(arm)} m ({_vector(fitted)} m "
-            f"fits, ±{sigma.max():.2f}): they were brought there already; set lever_arm_m to zero for them",
+            f"GNSS's positions are those of the body's origin, not of an antenna at {_vector(arm)} m "
+            f"({_vector(fitted)} m fits, ±{sigma.max():.2f}): they are already reduced to the origin; set lever_arm_m "
+            "to zero for them",
         )
     elif max(abs(fitted - arm)[1:]) > max(ARM_OFF_M, clear):
         given_none = np.linalg.norm(arm) < 0.1
-        hint = "they may be an INS solution given at the antenna" if given_none else "measure it again"
+        hint = "check whether they are an INS solution at the antenna" if given_none else "measure it again"
         yield Finding(
             "lever_arm",
             "warning",
             f"GNSS's positions fit a lever arm of {_vector(fitted)} m (±{sigma.max():.2f}), {off:.1f} m from the "
-            f"{_vector(arm)} m given: {hint}",
+            f"{_vector(arm)} m configured: {hint}",
         )
 
 
@@ -358,8 +363,8 @@ def _rejected(solved: HasSolution | None) -> Iterator[Finding]:
             yield Finding(
                 "gnss_rejected",
                 "warning",
-                f"the filter refused {100.0 * refused.mean():.0f} % of GNSS's {name}: their sigmas are too small, or "
-                "lever_arm_m, times or noise of the IMU are wrong",
+                f"the filter rejected {100.0 * refused.mean():.0f} % of GNSS's {name}: check their sigmas, which may "
+                "be too small, lever_arm_m, the times and the noise of the IMU",
             )
 
 

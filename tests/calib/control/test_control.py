@@ -58,20 +58,20 @@ def test_a_file_is_read_with_comments_blanks_and_a_byte_order_mark() -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("", "control.csv: is empty; want the header"),
-        (f"{HEADER}\n", "no points behind the header"),
-        (HEADER.replace(",", ";") + f"\n{ROW}", "line 1: want the header .*columns apart by commas"),
-        (HEADER.replace("h_ellipsoidal_m", "h_m") + f"\n{ROW}", "line 1: want .*h_ellipsoidal_m not there"),
-        (f"{HEADER}\n{ROW}\nG2,47.4,8.9,500", "line 3: 4 fields, want 5"),
-        (f"{HEADER}\nG1,47,4,8,9,500,0.01", "line 2: 7 fields, want 5"),
+        ("", "control.csv: the file is empty; it needs the header"),
+        (f"{HEADER}\n", "no points follow the header"),
+        (HEADER.replace(",", ";") + f"\n{ROW}", "line 1: the header must be .*commas between the columns"),
+        (HEADER.replace("h_ellipsoidal_m", "h_m") + f"\n{ROW}", "line 1: the header must be .*h_ellipsoidal_m missing"),
+        (f"{HEADER}\n{ROW}\nG2,47.4,8.9,500", "line 3: 4 fields instead of 5"),
+        (f"{HEADER}\nG1,47,4,8,9,500,0.01", "line 2: 7 fields instead of 5"),
         (f"{HEADER}\n,47.4,8.9,500,0.01", "line 2: the point has no name"),
         (f"{HEADER}\nG1,abc,8.9,500,0.01", 'line 2: lat_deg: got "abc", want degrees from -90 to 90'),
-        (f"{HEADER}\nG1,5250000.0,8.9,500,0.01", "line 2: lat_deg: .*metres of a map"),
+        (f"{HEADER}\nG1,5250000.0,8.9,500,0.01", "line 2: lat_deg: .*map coordinates in metres"),
         (f"{HEADER}\nG1,47.4,8.9,nan,0.01", 'line 2: h_ellipsoidal_m: got "nan", want metres from -9000'),
         (f"{HEADER}\nG1,47.4,8.9,500,0", 'line 2: sigma_m: got "0", want metres above 0, at most 10'),
         (f"{HEADER}\nG1,47.4,8.9,500,-1", "line 2: sigma_m"),
-        (f"{HEADER}\n{ROW}\n\n{ROW}", "line 4: GCP1 stands in line 2 already"),
-        (f"{HEADER}\n{ROW}\n{ROW.replace('GCP1', 'GCP9')}", "line 3: GCP9 is where GCP1 of line 2 is"),
+        (f"{HEADER}\n{ROW}\n\n{ROW}", "line 4: GCP1 already stands in line 2"),
+        (f"{HEADER}\n{ROW}\n{ROW.replace('GCP1', 'GCP9')}", "line 3: GCP9 has the position of GCP1 in line 2"),
     ],
 )
 def test_a_mistake_is_one_line_that_names_where(text: str, said: str) -> None:
@@ -138,7 +138,7 @@ def tilted(slope: float, roughness_m: float) -> Flight:
     [
         (tilted(0.0, 0.3), (0.0, 0.0, 0.0), "control: no plane|control: too rough"),
         (tilted(1.5, 0.01), (0.0, 0.0, 0.0), "control: too steep"),
-        (tilted(0.0, 0.01), (-6.9, 0.0, 0.0), "control: not within the returns"),
+        (tilted(0.0, 0.01), (-6.9, 0.0, 0.0), "control: returns do not surround it"),
         (tilted(0.0, 0.01), (-8.5, 0.0, 0.0), "control: no returns"),
         (tilted(0.0, 0.01), (-6.9, -6.9, 0.0), "control: too few returns"),
         (tilted(0.0, 0.01), (0.0, 0.0, 30.0), "control: far above or below"),
@@ -200,7 +200,7 @@ def test_orthometric_heights_are_named_with_the_undulation_of_the_geoid() -> Non
     doubt = only(doubts(flight(), points, undulation=lambda position_e: (48.1, "EGM96")))
     assert (doubt.kind, doubt.refuses) == ("orthometric", True)
     assert "control lies 48.3 m below the laser's ground everywhere, as orthometric heights would" in doubt.text
-    assert "undulation there 48.1 m (EGM96)" in doubt.text
+    assert "the undulation there is 48.1 m (EGM96)" in doubt.text
 
 
 def test_without_a_geoid_the_constant_is_named() -> None:
@@ -267,7 +267,7 @@ def test_points_outside_the_flight_are_told_and_all_of_them_refuse_it() -> None:
     points[0] = ControlPoint("P0", np.array([900.0, 0.0, 500.0]), 0.01)
     one = only(doubts(flight(), points, undulation=unknown))
     assert (one.kind, one.refuses) == ("point", False)
-    assert "P0 lies outside the flight: 84" in one.text
+    assert "P0 lies outside the flight, 84" in one.text
     elsewhere = surveyed(np.zeros(1), np.array([9000.0, 0.0, 0.0]))
     everyone = only(doubts(flight(), elsewhere, undulation=unknown))
     assert (everyone.kind, everyone.refuses) == ("outside", True)

@@ -219,7 +219,8 @@ def test_opposite_lines_over_flat_ground_say_nothing_of_the_range() -> None:
     held = held_of("opposite", False)
     assert set(held) == {"range_offset_m"}
     assert held["range_offset_m"].why.startswith(
-        "this flight would find it to 12.54\u00a0m, and its start is plausible to 20.0\u00a0cm: it lowers all points"
+        "this flight would estimate it to 12.54\u00a0m, and its initial value is plausible to 20.0\u00a0cm: "
+        "it lowers all points"
     )
     assert "at least 8 points at 1 cm" in held["range_offset_m"].remedy
     assert held["range_offset_m"].sigma == pytest.approx(12.6, rel=0.03)
@@ -230,10 +231,10 @@ def test_what_cannot_be_told_apart_is_said_with_its_remedy() -> None:
     assert one.scanner == "left"
     assert one.with_others[0][0] == "left.phi_rad"
     assert one.with_others[0][1] == pytest.approx(-1.0, abs=1e-3)
-    assert one.why.startswith("this flight cannot tell it apart from left.phi_rad (correlation -1.000)")
+    assert one.why.startswith("this flight cannot separate it from left.phi_rad (correlation -1.000)")
     assert "second height, at least 1.7 times" in one.remedy
     angle = held_of("two heights", True, "scan_angle_offset_rad")["scan_angle_offset_rad"]
-    assert "one and the same" in angle.remedy
+    assert "the same rotation" in angle.remedy
     assert angle.with_others[0][0] == "left.omega_rad"
     assert angle.with_others[0][1] == pytest.approx(-1.0, abs=1e-6)
 
@@ -275,7 +276,7 @@ def test_what_is_held_is_said_with_what_is_plausible() -> None:
     names = ["left.kappa_rad", "left.pitch_slope"]
     (heading,) = held_by(information(np.diag([17.0**2, 0.1**2]), names), names)
     assert heading.sigma == pytest.approx(17.0 * RULES["kappa_rad"].plausible, rel=1e-3)
-    assert heading.why.startswith("this flight would find it to 17°, and its start is plausible to 1.0°")
+    assert heading.why.startswith("this flight would estimate it to 17°, and its initial value is plausible to 1.0°")
 
 
 def test_rounding_that_makes_an_eigenvalue_negative_is_no_knowledge() -> None:

@@ -171,9 +171,9 @@ def test_the_prior_of_a_smoothed_run_has_its_strips_and_is_positive() -> None:
     assert np.linalg.eigvalsh(prior.covariance).min() > -1e-12 * np.linalg.eigvalsh(prior.covariance).max()
     np.testing.assert_allclose(prior.covariance, chain.at(prior.time_ns).covariance(), atol=1e-15)
     walk_is_that_of_the_nodes_between(prior, chain)
-    with pytest.raises(FlightError, match=r"says nothing near GPS week .*; want the run of all strips"):
+    with pytest.raises(FlightError, match=r"does not cover GPS week .*; use the run that covers all strips"):
         from_smoother(made([(0, 1, 5, 9), (0, 2, 46, 49)], [path], begin=int(ns(0.0))), [chain.at(chain.time_ns[:-12])])
-    with pytest.raises(FlightError, match="0 runs of 1 trajectories; want all"):
+    with pytest.raises(FlightError, match="0 runs for 1 trajectories; every trajectory needs its run"):
         from_smoother(flight, [])
 
 
@@ -316,14 +316,14 @@ def test_a_trajectory_without_sigmas_is_refused(column: str) -> None:
     told = replace(path, **{column: silent})
     what = column.split("_", maxsplit=1)[0]
     assert len(gauss_markov(made([(0, 1, 5, 15)], [told]))) == 4
-    with pytest.raises(FlightError, match=rf"trajectory ins says no {what} sigma at GPS week .*: give them \(smrmsg"):
+    with pytest.raises(FlightError, match=rf"trajectory ins has no {what} sigma at GPS week .*: put an smrmsg"):
         gauss_markov(made([(0, 1, 5, 30)], [told]))
 
 
 def test_what_cannot_be_is_refused() -> None:
-    with pytest.raises(FlightError, match="no strip with returns; want at least one"):
+    with pytest.raises(FlightError, match="no strip with returns; at least one is needed"):
         knots_of(made([], [level_path(10)]), 5.0)
-    with pytest.raises(FlightError, match="knots 0 s apart; want more"):
+    with pytest.raises(FlightError, match="the knots are 0 s apart; the interval must"):
         knots_of(made([(0, 1, 1, 5)], [level_path(10)]), 0.0)
 
 

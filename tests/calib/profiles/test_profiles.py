@@ -200,7 +200,7 @@ def test_flat_ground_gives_roll_only() -> None:
     assert set(result.sigmas) == {"left.omega_rad"}
     assert set(result.missing) == {("left", "pitch"), ("left", "heading"), ("left", "range")}
     assert result.calibrations["left"].value("omega_rad") == pytest.approx(0.004, abs=2e-5)
-    assert result.refused["pitch: too few pieces of smooth slopes along it in both swaths"] > 0
+    assert result.refused["pitch: both swaths share too few smooth slopes along the profile"] > 0
 
 
 def test_even_slope_gives_pitch_as_in_the_lecture() -> None:

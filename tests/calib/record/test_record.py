@@ -416,6 +416,6 @@ def test_what_is_told_later_stands_where_it_would_have_stood(outcome: Outcome) -
     ],
 )
 def test_what_is_no_record_is_said_in_a_line(text: str) -> None:
-    with pytest.raises(RecordError, match=r"left\.record\.json: no record of a calibration") as caught:
+    with pytest.raises(RecordError, match=r"left\.record\.json: not a calibration record") as caught:
         read_document(text, "left.record.json")
     assert "\n" not in str(caught.value)

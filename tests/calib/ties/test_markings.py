@@ -129,9 +129,9 @@ def test_shift_of_images_to_the_east_and_north() -> None:
 @pytest.mark.parametrize(
     ("first", "second", "why"),
     [
-        (pattern(SIDE, 1), pattern(SIDE, 2), "too little in common"),
+        (pattern(SIDE, 1), pattern(SIDE, 2), "the strips have too little in common"),
         (pattern(SIDE, 1, lines_only=True), pattern(SIDE, 1, lines_only=True), "no single peak"),
-        (np.ones((SIDE, SIDE)), pattern(SIDE, 1), "no pattern"),
+        (np.ones((SIDE, SIDE)), pattern(SIDE, 1), "the ground has no pattern"),
         (np.tile(pattern(8, 1), (20, 20))[:SIDE, :SIDE], np.tile(pattern(8, 1), (20, 20))[:SIDE, :SIDE], "alike"),
     ],
 )
@@ -140,12 +140,12 @@ def test_ambiguous_images_are_refused(first: FloatArray, second: FloatArray, why
     noisy = second + rng.normal(0.0, 0.02, second.shape)
     said = shifted(Image(first, 0.4, True), Image(noisy, 0.4, True), SETTINGS)
     assert isinstance(said, str)
-    assert why in said or (why == "no single peak" and said in ("several places look alike", "no single peak"))
+    assert why in said or (why == "no single peak" and said in ("several places match equally well", "no single peak"))
 
 
 def test_holes_are_refused() -> None:
     image = Image(pattern(SIDE, 1), 0.4, True)
-    assert shifted(image, replace(image, whole=False), SETTINGS) == "holes in the ground"
+    assert shifted(image, replace(image, whole=False), SETTINGS) == "the ground has holes"
 
 
 def test_what_does_not_become_a_tie_is_counted() -> None:
@@ -157,7 +157,7 @@ def test_what_does_not_become_a_tie_is_counted() -> None:
     rough = replace(flight, swaths=tuple(replace(one, points_t=_rough(one.points_t)) for one in flight.swaths))
     found = find_markings(rough)
     assert not found.ties
-    assert found.refused["marking: ground not flat"] > 10
+    assert found.refused["marking: the ground is not flat"] > 10
     assert not find_markings(replace(flight, swaths=())).ties
 
 

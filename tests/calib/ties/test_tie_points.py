@@ -136,10 +136,10 @@ def test_far_from_the_patch_it_is_less_certain() -> None:
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        ({"reach_m": 0.01, "least_returns": 12}, "planes do not meet in two swaths"),
-        ({"least_angle_rad": np.radians(80.0)}, "planes nearly parallel"),
+        ({"reach_m": 0.01, "least_returns": 12}, "the planes do not intersect in two swaths"),
+        ({"least_angle_rad": np.radians(80.0)}, "the planes are nearly parallel"),
         ({"greatest_sigma_m": 1e-4}, "too uncertain"),
-        ({"least_length_m": 30.0}, "swaths share too little of it"),
+        ({"least_length_m": 30.0}, "the swaths share too little of it"),
     ],
 )
 def test_what_is_no_ridge_is_counted(change: dict[str, Any], reason: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -157,7 +157,7 @@ def test_faces_of_two_houses_are_no_ridge() -> None:
     flight, planes = flight_of(swaths, (NORTH, SOUTH))
     found = find_ties(flight, planes)
     assert not found.ties
-    assert found.refused["ridge: planes do not meet in two swaths"] == 1
+    assert found.refused["ridge: the planes do not intersect in two swaths"] == 1
 
 
 def test_one_swath_gives_nothing() -> None:
@@ -195,8 +195,8 @@ def test_file_of_picked_points() -> None:
     distance = np.linalg.norm(flight.swaths[1].points_t - [0.3, 0.8, 5.4], axis=1)
     assert tie.sightings[1].at == np.argmin(distance)
     assert found.refused == {
-        "picked: no return of the strip near it": 1,
-        "picked: seen in one strip only": 2,
+        "picked: the strip has no return near it": 1,
+        "picked: given in one strip only": 2,
     }
 
 
@@ -217,14 +217,14 @@ def test_sighting_far_from_the_others_is_counted() -> None:
     )
     found = picked_ties(flight, read_picked(text, "t"), PickedSettings(apart_m=20.0))
     assert [one.swath for one in found.ties[0].sightings] == [0, 1]
-    assert found.refused == {"picked: far from its other sightings": 1}
+    assert found.refused == {"picked: far from its places in other strips": 1}
 
 
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("", "t.csv: line 1: got nothing; want the columns name, strip, x, y, z, sigma_m"),
-        ("name,x\n", "t.csv: line 1: got name, x; want the columns"),
+        ("", "t.csv: line 1: has nothing; the columns must be name, strip, x, y, z, sigma_m"),
+        ("name,x\n", "t.csv: line 1: has name, x; the columns must be"),
         ("name,strip,x,y,z,sigma_m\n", "t.csv: no points"),
         ("name,strip,x,y,z,sigma_m\na,1,2,3\n", "t.csv: line 2: z is missing"),
         ("name,strip,x,y,z,sigma_m\na,1,2,3,four,1\n", "t.csv: line 2: z: got 'four', want a number"),
@@ -242,5 +242,7 @@ def test_files_that_cannot_be_used(text: str, said: str) -> None:
 def test_strip_the_flight_does_not_have() -> None:
     flight, _ = roof(1, SHIFTS)
     (one,) = read_picked("name,strip,x,y,z,sigma_m\na,9,0,1,5.3,0.05\n", "t.csv")
-    with pytest.raises(PickedError, match=r"t\.csv: line 2: strip 9 is none of the flight's; want one of 01, 02, 03"):
+    with pytest.raises(
+        PickedError, match=r"t\.csv: line 2: strip 9 is not a strip of the flight; use one of 01, 02, 03"
+    ):
         picked_ties(flight, [one])

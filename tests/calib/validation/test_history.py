@@ -117,7 +117,7 @@ def test_nominal_values_are_listed_and_not_tested() -> None:
     (one,) = history([made(1, sigmas=np.zeros(3)), made(2)])
     assert [row["omega_deg_sigma"] for row in one.table()] == [None, pytest.approx(0.001)]
     assert one.steps == ()
-    assert "fewer than two calibrations with sigmas" in one.sentences[0]
+    assert "fewer than two calibrations have sigmas" in one.sentences[0]
     assert not one.moved
 
 
@@ -148,7 +148,7 @@ def test_what_was_held_otherwise_is_no_move(other: dict[str, Any], said: str) ->
     assert len(one.steps) == 2
     assert one.trends == ()
     assert one.sentences[0].startswith("left: the boresight has not moved: 2 steps")
-    assert one.sentences[1] == f"left: not judged between 2026-03-01 and 2026-04-01: {said}"
+    assert one.sentences[1] == f"left: the step between 2026-03-01 and 2026-04-01 was not tested: {said}"
     (alone,) = history(entries[2:])
     assert alone.sentences == one.sentences[1:]
 
@@ -168,7 +168,8 @@ def test_what_one_held_and_the_other_estimated_is_compared_where_values_agree() 
     assert one.moved
     (one,) = history([made(1), estimated.changed(scan_plane_tilt_rad=np.radians(0.003))])
     assert one.sentences == (
-        "left: not judged between 2026-01-01 and 2026-02-01: scan_plane_tilt_deg, held in one, is 0 and 0.003",
+        "left: the step between 2026-01-01 and 2026-02-01 was not tested: scan_plane_tilt_deg, held in one "
+        "of them, is 0 and 0.003",
     )
     both = replace(made(1), sigmas=sigmas)
     (one,) = history([both, estimated.changed(scan_plane_tilt_rad=np.radians(0.003))])
@@ -183,14 +184,14 @@ def test_each_installation_has_its_own_history() -> None:
 @pytest.mark.parametrize(
     ("header", "said"),
     [
-        ({"created": dt.datetime(2026, 1, 1, tzinfo=dt.UTC)}, "names no installation"),
-        ({"installation": "a"}, "created is no time"),
+        ({"created": dt.datetime(2026, 1, 1, tzinfo=dt.UTC)}, "has no calibration.installation"),
+        ({"installation": "a"}, "created is not a time"),
     ],
 )
 def test_what_is_no_history_is_one_line(header: dict[str, object], said: str) -> None:
     with pytest.raises(HistoryError, match=said):
         history([replace(made(1), header=header)])
-    with pytest.raises(HistoryError, match="stands twice"):
+    with pytest.raises(HistoryError, match="is given twice"):
         history([made(1), made(1)])
 
 

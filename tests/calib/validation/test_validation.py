@@ -104,7 +104,7 @@ def test_a_true_calibration_passes_all_that_the_flight_can_show(
         assert f"({CODES[name]})" in method.sentence
         assert "as expected" in method.sentence
     assert found["secondFlight"].passed is None
-    assert "want the log of a second flight" in found["secondFlight"].sentence
+    assert "needs the log of a second flight" in found["secondFlight"].sentence
     assert found["measurementActualParameters"].passed is None
 
 
@@ -300,7 +300,7 @@ def test_the_verdict_names_the_errors_that_would_not_have_been_seen(made: Cast, 
     validation = validate(made.at_truth(), roofs, calibrations)
     smallest = {one.parameter: one for one in validation.detectable}
     assert f"errors below {smallest['omega_rad'].words}, {smallest['phi_rad'].words}, " in validation.sentence
-    assert "would not be seen (80% of larger ones are)" in validation.sentence
+    assert "would not be detected (80% of larger ones would)" in validation.sentence
     assert 1e-5 < smallest["omega_rad"].size < 5e-4
     for name in ("omega_rad", "phi_rad"):
         wrong = {"left": made.truth.changed(**{name: 2.0 * smallest[name].size})}
@@ -324,8 +324,8 @@ def test_a_test_without_power_says_so(made: Cast, roofs: Features) -> None:
     )
     flight = replace(made.flight, trajectories=(trajectory,)).placed({"left": made.truth})
     validation = validate(flight, roofs, {"left": made.truth})
-    assert "less than is expected" in validation.methods[-1].sentence
-    assert "the test sees less than it could" in validation.methods[-1].sentence
+    assert "less than expected" in validation.methods[-1].sentence
+    assert "the test is less sensitive than it could be" in validation.methods[-1].sentence
     assert {one.parameter: one for one in validation.detectable}["omega_rad"].size > 0.01
 
 
@@ -337,8 +337,8 @@ def test_control_that_was_asked_for_and_not_seen_is_no_holding(
     validation = validate(made.at_truth(), roofs, calibrations, Asked(away))
     assert validation.passed is True
     assert validation.holds is False
-    assert validation.undone == ("control: control is seen 0 times only; want 5 or more",)
-    assert validation.sentence.startswith("not validated as asked: what was asked for could not be done: control: ")
+    assert validation.undone == ("control: strips see control 0 times only; 5 or more are needed",)
+    assert validation.sentence.startswith("not validated as requested: a requested check could not be done: control: ")
     assert validate(made.at_truth(), roofs, calibrations).holds is True
 
 
@@ -353,7 +353,7 @@ def test_parameters_anew_and_flights_that_could_not_be_compared_are_told(made: C
     alone = [plane for plane in elsewhere if {patch.swath // 2 for patch in plane.patches} == {0}]
     assert len(alone) > 5
     (line,) = validate(flight, Features(planes=tuple(alone)), calibrations).undone
-    assert line == "2 flights: fewer than 5 distances of planes that two of them see"
+    assert line == "2 flights: two of them share fewer than 5 distances between planes"
 
 
 def test_a_scanner_whose_calibration_no_test_sees_is_told(made: Cast, roofs: Features) -> None:
@@ -362,7 +362,7 @@ def test_a_scanner_whose_calibration_no_test_sees_is_told(made: Cast, roofs: Fea
     flight = replace(made.flight, heads=(*made.flight.heads, head)).placed({"left": made.truth, "right": made.truth})
     calibrations = {"left": made.truth, "right": made.truth}
     both = validate(flight, roofs, calibrations, Asked(scanners=["left", "right"]))
-    assert both.undone == ("right: no error of its calibration would be seen",)
+    assert both.undone == ("right: no method would detect an error of its calibration",)
     assert both.holds is False
     assert validate(flight, roofs, calibrations, Asked(scanners=["left"])).holds is True
 
@@ -382,7 +382,7 @@ def test_the_logs_of_the_calibration_itself_are_told(made: Cast) -> None:
     calibration = replace(made.truth, header=header)
     (line,) = same_logs(calibration, [("b.mcap", "12ab"), ("a.mcap", "34cd")])
     assert line.startswith("b.mcap: ")
-    assert "no independent validation" in line
+    assert "so this validation is not independent" in line
     assert same_logs(made.truth, [("b.mcap", "12ab")]) == ()
 
 

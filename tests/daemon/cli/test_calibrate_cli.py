@@ -123,7 +123,7 @@ def test_a_calibration_is_refused_under_other_settings_than_its_own(
     config.write_text(text.replace('ranges = "corrected"', 'ranges = "vacuum"'))
     given = ["--config", str(config), "--calibration", str(products / "left.toml"), "--trajectory-datum", "same"]
     assert run_app(["georef", str(made.flown.log), "-o", str(tmp_path / "points"), *given]) == ExitCode.USAGE
-    assert 'was estimated with ranges = "corrected", [atmosphere] says "vacuum"' in capsys.readouterr().err
+    assert 'was estimated with ranges = "corrected", [atmosphere] has "vacuum"' in capsys.readouterr().err
 
 
 def list_of(name: str) -> int:
@@ -215,7 +215,7 @@ def test_control_that_lies_on_nothing_is_refused(
     control.write_text("\n".join([lines[0], *raised]) + "\n")
     output = tmp_path / "left.toml"
     line = refused(capsys, output, arguments(made, output, "--control", str(control)))
-    assert "control.csv: no point lies on ground that a strip shows as a plane" in line
+    assert "control.csv: no point lies on ground where a strip has a plane" in line
 
 
 def picked(made: Made, path: Path) -> Path:
@@ -349,13 +349,13 @@ def test_what_the_flight_does_not_show_of_a_model_s_tables_is_held_and_said(
     """No return is so bright, and next to none is a second one; all are in one zone."""
     tables = "[ibrc]\nknots = [500, 1000, 2500, 60000]\n[range_offset]\nreturn_slots = [2]\nmta_zones = [0]\n"
     told, found = asked(by_intensity, tmp_path, capsys, f'model = "basic"\n{tables}')
-    held = {one["name"]: one for one in told["held"] if one["why"] != "held at your word"}
+    held = {one["name"]: one for one in told["held"] if one["why"] != "held by your choice"}
     assert {"ibrc.3", "range_offset_slot.2", "range_offset_zone.0"} <= set(held)
     assert not [one for one in told["unknowns"] if one["name"].removeprefix("left.") in held]
     for one in held.values():
         assert one["why"]
         assert one["remedy"]
-    assert "cannot tell it apart from left.range_offset_m" in held["range_offset_zone.0"]["why"]
+    assert "cannot separate it from left.range_offset_m" in held["range_offset_zone.0"]["why"]
     assert "Not determined by this flight: " in told["verdict"]["sentence"]
     assert found.range_offsets == ()
 
@@ -382,9 +382,12 @@ def test_wrong_use(
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("[CA_GNSS]\nnumberSatelites = 14\n", "facts.toml: CA_GNSS.numberSatelites is no attribute of the record; did"),
+        (
+            "[CA_GNSS]\nnumberSatelites = 14\n",
+            "facts.toml: CA_GNSS.numberSatelites: the record has no such attribute; did",
+        ),
         ("[CA_GNSS]\nnumberSatellites = 1.5\n", "facts.toml: CA_GNSS.numberSatellites: got 1.5, want a whole number"),
-        ("CA_GNSS = 3\n", "facts.toml: CA_GNSS: want a table a class"),
+        ("CA_GNSS = 3\n", "facts.toml: CA_GNSS: give each class a table"),
         ("[CA_GNSS\n", "facts.toml: not TOML: "),
     ],
 )
@@ -411,7 +414,7 @@ def test_a_line_of_control_that_is_none_is_named(
 
 def test_where_strips_have_no_plane_in_common_it_says_why() -> None:
     refuse_no_planes("log", Features((Plane("roof 1", np.zeros(3), np.array([0.0, 0.0, 1.0]), ()),)))
-    with pytest.raises(UserError, match=r"log: no plane is seen by two strips \(7 too rough, 2 curved\)"):
+    with pytest.raises(UserError, match=r"log: no two strips see a common plane \(7 too rough, 2 curved\)"):
         refuse_no_planes("log", Features(refused=Counter({"curved": 2, "too rough": 7})))
 
 

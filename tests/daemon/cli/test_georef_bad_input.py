@@ -182,7 +182,7 @@ def test_a_full_disk_is_one_line_and_leaves_nothing(
 @pytest.mark.parametrize(
     ("text", "code", "words"),
     [
-        (None, 3, "want auto, whole or a CSV file"),
+        (None, 3, "give auto, whole or a CSV file"),
         (b"\x89\xff", 3, "not text; want a CSV file"),
         (b"start_gps_ns,end_gps_ns\n1,2\n", 1, "none of its strips lies in the logs"),
     ],

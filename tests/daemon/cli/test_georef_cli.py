@@ -164,7 +164,7 @@ class TestProducts:
         del arguments[arguments.index("--trajectory") : arguments.index("--trajectory") + 2]
         line = refused(capsys, tmp_path / "x", arguments)
         assert "no IMU" in line
-        assert "want --trajectory FILE" in line
+        assert "give --trajectory FILE" in line
 
 
 class TestStrips:
@@ -279,7 +279,7 @@ class TestRefusals:
         if command == "validate":
             arguments.insert(1, str(flown.folder / "left.true.toml"))
         assert run_app(arguments) == 2
-        assert "--force-trajectory: file to be taken; want --trajectory too does not exist" in capsys.readouterr().err
+        assert "--force-trajectory: needs --trajectory FILE, because it accepts that file" in capsys.readouterr().err
         assert list(tmp_path.iterdir()) == []
 
     def test_a_trajectory_in_the_folder_is_not_replaced_unasked_and_never_where_it_is_read(
@@ -291,10 +291,10 @@ class TestRefusals:
         before = there.stat().st_mtime_ns
         arguments = flown.arguments(tmp_path)
         assert run_app(arguments) == 2
-        assert f"{there}: is there from an earlier run" in capsys.readouterr().err
+        assert f"{there}: exists from an earlier run" in capsys.readouterr().err
         arguments[arguments.index("--trajectory") + 1] = str(there)
         assert run_app([*arguments, "--overwrite"]) == 2
-        assert f"{there}: is read, and would be replaced" in capsys.readouterr().err
+        assert f"{there}: is an input and would be overwritten" in capsys.readouterr().err
         assert [path.name for path in tmp_path.iterdir()] == [made.name]
         assert there.stat().st_mtime_ns == before
 
@@ -305,7 +305,7 @@ class TestRefusals:
         (made, *_) = products.glob("*_strip*.laz")
         shutil.copy(made, tmp_path)
         assert run_app(flown.arguments(tmp_path)) == 2
-        assert f"{tmp_path / made.name}: is there from an earlier run" in capsys.readouterr().err
+        assert f"{tmp_path / made.name}: exists from an earlier run" in capsys.readouterr().err
         assert [path.name for path in tmp_path.iterdir()] == [made.name]
 
     def test_one_of_several_sessions_is_not_replaced_where_the_sidecar_is_of_all(
@@ -318,16 +318,16 @@ class TestRefusals:
         there.write_text(json.dumps(record))
         assert run_app([*flown.arguments(tmp_path), "--overwrite"]) == 2
         said = capsys.readouterr().err
-        assert f"{there}: is of one run with 20260101T080000-first; want all its sessions at once" in said
+        assert f"{there}: belongs to one run with 20260101T080000-first; process all its sessions at once" in said
         assert said.count("\n") == 1
         assert [path.name for path in tmp_path.iterdir()] == [there.name]
 
     @pytest.mark.parametrize(
         ("shift_s", "words"),
         [
-            (18, "its time is UTC, not GPS: +18 s would be right"),
-            (-7 * 86_400, "its week is another: -1 would be right"),
-            (3 * 3600, "do not overlap; want the trajectory of this flight, or --week"),
+            (18, "its time is UTC, not GPS: add +18 s"),
+            (-7 * 86_400, "its week is wrong: add -1"),
+            (3 * 3600, "do not overlap; give the trajectory of this flight, or --week"),
         ],
     )
     def test_a_trajectory_of_another_time_is_named(
@@ -356,7 +356,7 @@ class TestRefusals:
         [
             (("--strips", "nowhere.csv"), "nowhere.csv"),
             (("--min-strip", "500"), "no strip"),
-            (("--scale", "0.0000001"), "beyond what a LAS file"),
+            (("--scale", "0.0000001"), "exceeds the range of a LAS file"),
             (("--trajectory-at", "nose"), "want body, antenna, scanner or x,y,z"),
             (("--scheduler", "tcp://127.0.0.1:1"), "no Dask scheduler"),
             (("--calibration", "right=left.true.toml"), "left.true.toml"),
@@ -401,7 +401,7 @@ class TestRefusals:
         assert run_app(flown.arguments(output, "--config", str(config))) == 1
         line = capsys.readouterr().err
         assert line.startswith(f"swath: {flown.log}: scanner/left: ")
-        assert "want PPS edges and time messages all through" in line
+        assert "record PPS edges and time messages throughout" in line
         assert not list(output.glob("*"))
 
     def test_earth_centred_coordinates_are_no_map(
@@ -418,7 +418,7 @@ class TestRefusals:
         renamed = log.read_bytes().replace(flown.name.encode(), flown.name[:-4].encode() + b"0000")
         log.write_bytes(renamed)
         line = refused(capsys, tmp_path / "out", flown.arguments(tmp_path / "out", str(log)))
-        assert "two recordings of one time" in line
+        assert "the recordings overlap in time" in line
 
 
 def test_points_of_a_nominal_calibration_end_with_a_first_line_and_exit_code_1(
@@ -431,7 +431,7 @@ def test_points_of_a_nominal_calibration_end_with_a_first_line_and_exit_code_1(
     said = capsys.readouterr()
     first = said.out.splitlines()[0]
     assert first.startswith("not to be used: calibration ")
-    assert "is nominal: points may lie 2.5 m off for 100 m of range" in first
+    assert "is nominal: points may lie 2.5 m off at 100 m of range" in first
     assert "--accept-verdict" in said.err
     told = record(tmp_path / "points")
     assert told["complete"]

@@ -81,5 +81,5 @@ def test_a_source_that_told_no_angles_is_one_line(tmp_path: Path, capsys: pytest
     capsys.readouterr()
     assert run_app(flown.arguments(tmp_path / "out", "--config", str(flown.folder / "swath.toml"))) == 1
     line = capsys.readouterr().err
-    assert line == f'swath: {flown.log}: scanner.left: gimbal.stages[0].source: "gnss/rover" told no angles\n'
+    assert line == f'swath: {flown.log}: scanner.left: gimbal.stages[0].source: "gnss/rover" sent no angles\n'
     assert not (tmp_path / "out").exists()

@@ -24,7 +24,7 @@ pytestmark = [pytest.mark.xdist_group("kernels"), pytest.mark.slow]
 ARM, MIRRORED = "[0.4, -0.25, -1.2]", "[-0.4, 0.25, 1.2]"
 SIGN = "the lever arm has another sign"
 ELSEWHERE = "lies 7.5 km off the fixes of gnss/rover"
-SAID = {"away": [ELSEWHERE], "other": ["want the trajectory of this flight", "it may be of another flight"]}
+SAID = {"away": [ELSEWHERE], "other": ["give the trajectory of this flight", "it may belong to another flight"]}
 
 
 def plan(seed: int, half_m: float, norths_m: tuple[float, float]) -> str:
@@ -111,8 +111,8 @@ def test_points_on_a_trajectory_that_was_navigated_with_a_wrong_lever_arm_are_a_
     said = capsys.readouterr()
     first = said.out.splitlines()[0]
     assert first.startswith("not to be used: navigated trajectory of ")
-    assert "the data fit -l better than the lever_arm_m given, [-0.40, 0.25, 1.20] m" in first
-    assert f"{first}; --accept-verdict takes it all the same" in said.err
+    assert "the data fit -l better than the given lever_arm_m, [-0.40, 0.25, 1.20] m" in first
+    assert f"{first}; use --accept-verdict to accept it" in said.err
     told = sidecar(tmp_path)
     assert told["complete"]
     assert (told["verdict"]["level"], told["verdict"]["accepted"]) == ("not to be used", False)
@@ -147,7 +147,7 @@ def test_points_that_are_not_to_be_used_are_a_problem_however_well_strips_agree(
     assert run_app(["strips", str(points)]) == ExitCode.PROBLEM
     said, line = capsys.readouterr(), f"not to be used: trajectory {judged.trajectory('judged')}: {SIGN}"
     assert said.out.splitlines()[0] == line
-    assert said.err == f"swath: {line}; --accept-verdict takes it all the same\n"  # and nothing of the strips
+    assert said.err == f"swath: {line}; use --accept-verdict to accept it\n"  # and nothing of the strips
 
 
 def test_strips_of_such_points_are_compared_at_the_user_s_word(
@@ -176,7 +176,7 @@ def test_a_trajectory_of_something_else_makes_no_points_unless_forced(
     for line, words in zip(lines, SAID[name], strict=True):
         assert words in line
         assert line.startswith(f"swath: {judged.trajectory(name)}: ")
-        assert line.endswith("; --force-trajectory takes it as it is")
+        assert line.endswith("; use --force-trajectory to accept it")
     assert not list(tmp_path.glob("out/*"))
     assert run_app(judged.georef(output, "--force-trajectory", trajectory=name)) == 0
     capsys.readouterr()
@@ -193,7 +193,7 @@ def test_no_command_takes_a_trajectory_of_another_place(
     said = capsys.readouterr()
     (line,) = said.err.splitlines()
     assert ELSEWHERE in line
-    assert line.endswith("; --force-trajectory takes it as it is")
+    assert line.endswith("; use --force-trajectory to accept it")
     assert said.out == ""
     assert not (tmp_path / "out.toml").exists()
 
@@ -239,8 +239,8 @@ def test_a_map_of_elsewhere_is_refused_with_the_one_to_take_unless_forced(
     assert run_app(judged.georef(output, "--crs", crs)) == ExitCode.USAGE
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith(f'swath: output.crs = "{crs}" {words}')
-    assert 'want "EPSG:32632" (WGS 84 / UTM zone 32N)' in line
-    assert line.endswith("; --force-crs takes it as it is")
+    assert 'use "EPSG:32632" (WGS 84 / UTM zone 32N)' in line
+    assert line.endswith("; use --force-crs to accept it")
     assert not list(tmp_path.glob("out/*"))
     assert run_app(judged.georef(output, "--crs", crs, "--force-crs")) == 0
     capsys.readouterr()

@@ -57,7 +57,7 @@ def test_points_have_the_time_and_place_of_their_pulses(
     flown = flown_by(tmp_path, SCALES_S[scale])
     capsys.readouterr()
     assert run_app(flown.arguments(tmp_path / "out", "--strips", "whole")) == 0
-    assert f"scanner/left: its stamps are taken as {scale}: " in capsys.readouterr().out
+    assert f"scanner/left: its stamps are read as {scale}: " in capsys.readouterr().out
     las = laspy.read(next((tmp_path / "out").glob("*_strip01.laz")))
     truth = flown.truth
     assert len(las) == len(truth["left.gps_ns"]) > 100_000

@@ -159,7 +159,9 @@ def test_a_model_s_file_is_predicted_as_far_as_paper_goes(tmp_path: Path, capsys
     assert set(sigmas_of(told)) == {"omega_deg", "phi_deg", "range_offset_m", *known}
     assert sigmas_of(told)["phi_deg"] < 0.0001
     words = ("ibrc at 100, 1000, smooth to 0.02 m", "range offset of return slot 1, 2")
-    assert told["notes"] == [f"not predicted: {one}; pulses on paper return once, without intensity" for one in words]
+    assert told["notes"] == [
+        f"not predicted: {one}; planned pulses have one return, without intensity" for one in words
+    ]
     with pytest.raises(UserError, match=r"does not determine roll"):
         planned(plan, picture, model=str(model), as_json=False)
     assert "not predicted: ibrc at 100, 1000" in capsys.readouterr().out
@@ -219,11 +221,11 @@ def test_a_poor_unit_is_said_before_the_flight(tmp_path: Path, capsys: pytest.Ca
             {},
             "a nutating scanner cannot be planned for; want one of oscillating, polygon, monogon",
         ),
-        ({"lines": OPPOSITE[:1]}, {"no_control": True}, "no roof and no ground is seen from two lines"),
+        ({"lines": OPPOSITE[:1]}, {"no_control": True}, "no two lines see the same roof or ground"),
         (
             {"more": "[[gnss.rover.outage]]\nat_s = 0.0\nfor_s = 3000.0\n"},
             {},
-            "gnss.rover.outage: lasts the whole flight; want an end",
+            "gnss.rover.outage: lasts the whole flight; let it end",
         ),
         ({}, {"model": "all"}, '--model: got "all", want basic, scanner, full, or a file FILE.toml'),
         ({}, {"sigmas": "0.02,0.004"}, '--sigmas: got "0.02,0.004", want three numbers'),

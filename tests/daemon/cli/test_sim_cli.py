@@ -201,7 +201,7 @@ class TestErrors:
         [
             (
                 ("fly", "nowhere.toml", "-o", "x"),
-                "nowhere.toml: No such file or directory; want a plan's file or one of",
+                "nowhere.toml: No such file or directory; give a plan file or one of",
             ),
             (("fly", "small"), "no output given; use -o LOG or --wire"),
             (("fly", "small", "-o", "x", "--config", "y"), "--config needs --wire"),
@@ -232,7 +232,7 @@ class TestErrors:
     @pytest.mark.parametrize(
         ("before", "after", "line"),
         [
-            ("prf_hz", "prf_khz", "scanner.left.prf_khz: no such key"),
+            ("prf_hz", "prf_khz", "scanner.left.prf_khz: unknown key"),
             ("height_m = 700.0", "height_m = 460.0", "line[0].height_m: "),
             ("prf_hz", 'kind = "maser"\nprf_hz', "scanner.left.kind: got 'maser', want "),
             (
@@ -263,7 +263,7 @@ class TestErrors:
         missing = ("numba", "scipy")
         monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name in missing else real(name))
         monkeypatch.chdir(tmp_path)
-        line = f"swath: swath sim needs scipy, numba; install with: {how_to_install('sim')}\n"
+        line = f"swath: swath sim needs scipy, numba, which are not installed: {how_to_install('sim')}\n"
         assert in_process(capsys, *words) == (ExitCode.USAGE, line)
         assert list(tmp_path.iterdir()) == []
 

@@ -136,7 +136,7 @@ def test_before_and_after_stand_beside_each_other(tmp_path: Path, capsys: pytest
     run(str(now), "--before", str(then), "-o", str(tmp_path / "out"))
     told = capsys.readouterr().out
     assert "before: RMSDz 20.0 cm, largest 20.0 cm; now: RMSDz 1.0 cm, largest 1.0 cm" in told
-    assert "strips keep QL2; QL1 not for its limit of 8 pulses per m²" in told
+    assert "strips meet QL2; QL1 fails its limit of 8 pulses per m²" in told
     assert "confirm them against the edition in the contract" in told
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
         "differences.png",
@@ -148,7 +148,7 @@ def test_before_and_after_stand_beside_each_other(tmp_path: Path, capsys: pytest
 def test_a_level_that_is_not_kept_is_a_problem(tmp_path: Path) -> None:
     folder = lifted(tmp_path / "now", 0.12)
     run(str(folder), "--level", "QL3")
-    with pytest.raises(UserError, match=r"QL2 is not kept, for its limit of 0\.08 m RMSDz") as caught:
+    with pytest.raises(UserError, match=r"strips do not meet QL2, because of its limit of 0\.08 m RMSDz") as caught:
         run(str(folder), "--level", "QL2")
     assert caught.value.exit_code == ExitCode.PROBLEM
 
@@ -207,7 +207,7 @@ def test_one_cloud_has_one_figure_and_one_level_wherever_it_is_told(
     assert told["best"] is not None
     assert seen["best"] == calibrated["quality"]["best"] == told["best"]
     assert seen["measure"] == calibrated["quality"]["measure"] == told["measure"]
-    assert level_words(after) == f"strips keep {told['best']}"
+    assert level_words(after) == f"strips meet {told['best']}"
 
 
 @pytest.mark.slow
@@ -246,7 +246,7 @@ def test_equal_numbers_of_two_runs_are_strips_of_their_own(made: Cast, tmp_path:
     (row,) = (row for row in strips.look.overlap.rows if (row["first"], row["second"]) == (0, 2))
     assert row["median_m"] == pytest.approx(-0.07, abs=2e-3)
     assert strips.notes == [
-        f"strip {number}/2 is that of {second / f'a_strip0{number}.laz'}, of other sessions than {number}"
+        f"strip {number}/2 comes from {second / f'a_strip0{number}.laz'}, which belongs to other sessions than {number}"
         for number in (1, 2)
     ]
     assert strips.seen is not None
@@ -269,7 +269,10 @@ def test_seconds_of_the_week_are_of_the_trajectory_beside_them(
     strips = strips_of_files([folder], StripRules(), lambda what, done, of: None)
     begin, end = made.flight.trajectories[0].span
     assert ((strips.gathered.time_ns >= begin) & (strips.gathered.time_ns <= end)).all()
-    mixed = "files mix times: seconds of the GPS week in a_strip02.laz; adjusted standard GPS time in a_strip01.laz"
+    mixed = (
+        "files have different kinds of times: seconds of the GPS week in a_strip02.laz; adjusted standard GPS time in "
+        "a_strip01.laz"
+    )
     assert [note.startswith(mixed) for note in strips.notes] == [True] * (of_week == (2,))
 
 
@@ -278,8 +281,8 @@ def test_points_of_another_time_than_their_trajectory_are_said_to_be(made: Cast,
     week = made.flight.trajectories[0].span[0] // WEEK_NS
     strips = strips_of_files([folder], StripRules(), lambda what, done, of: None, week - 1)
     assert len(strips.notes) == 1
-    assert strips.notes[0].startswith("100 % of the points are of other times")
-    with pytest.raises(UserError, match="--week 24233 is no GPS week; want whole weeks since 1980"):
+    assert strips.notes[0].startswith("100 % of the points lie at other times")
+    with pytest.raises(UserError, match="--week 24233 is not a GPS week; give whole weeks since 1980"):
         strips_of_files([folder], StripRules(), lambda what, done, of: None, 24233)
 
 
@@ -289,7 +292,7 @@ def test_a_sidecar_that_says_no_datum_is_noted(made: Cast, tmp_path: Path) -> No
     del sidecar["crs"]["datum_said"]
     (folder / "a.json").write_text(json.dumps(sidecar))
     (note,) = strips_of_files([folder], StripRules(), lambda what, done, of: None).notes
-    assert "no signatures: the sidecar beside the points does not say of which datum they are" in note
+    assert "no signatures: the sidecar beside the points does not give their datum" in note
 
 
 @pytest.mark.parametrize("what", ["one", "apart", "twice", "nothing", "absent", "level", "cell"])
@@ -298,16 +301,16 @@ def test_what_cannot_be_compared_is_one_line(what: str, tmp_path: Path) -> None:
     arguments, said = [str(folder)], ""
     if what == "one":
         (folder / "s2.laz").unlink()
-        said = "now: one strip only; differences want at least two strips that overlap"
+        said = "now: has one strip only; differences need at least two strips that overlap"
     elif what == "apart":
         said = "now: no two of the 2 strips share smooth ground"
     elif what == "twice":
         x, y = lattice(EAST_M, NORTH_M, 120.0, 50.0, 0.5)
         write(folder / "s2.laz", x, y, plane(x, y), 2, crs=CRS.from_epsg(25832))
-        said = "strips 1 and 2 are the same returns under two names"
+        said = "strips 1 and 2 contain the same returns under two names"
     elif what == "nothing":
         (tmp_path / "empty").mkdir()
-        arguments, said = [str(tmp_path / "empty")], "holds neither LAS or LAZ files nor logs"
+        arguments, said = [str(tmp_path / "empty")], "has neither LAS or LAZ files nor logs"
     elif what == "absent":
         arguments, said = [str(tmp_path / "no")], "no such file or folder"
     elif what == "cell":
@@ -330,7 +333,8 @@ def logged(name: str, installation: str) -> Any:
 def test_logs_of_different_installations_are_refused() -> None:
     refuse_installations([logged("a.mcap", "HB-ABC/1"), logged("b.mcap", "HB-ABC/1")])
     with pytest.raises(
-        UserError, match=r'b\.mcap: is of installation "HB-ABC/2", a\.mcap of "HB-ABC/1"; want logs of one'
+        UserError,
+        match=r'b\.mcap: was recorded with installation "HB-ABC/2", a\.mcap with "HB-ABC/1"; use logs of one',
     ):
         refuse_installations([logged("a.mcap", "HB-ABC/1"), logged("b.mcap", "HB-ABC/2")])
 

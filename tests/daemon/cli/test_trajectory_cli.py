@@ -160,7 +160,7 @@ class TestOtherwise:
         assert run_app(["trajectory", str(flown.log), *arguments]) == 1
         why, *findings = capsys.readouterr().err.splitlines()
         assert "no alignment: inertial samples do not fit" in why
-        assert "the antennas are swapped; exchange lever_arm_m and secondary_lever_arm_m" in findings[0]
+        assert "the antennas are exchanged; swap lever_arm_m and secondary_lever_arm_m" in findings[0]
         assert all(line.startswith(f"swath: {flown.log}: ") for line in (why, *findings))
         assert not list(tmp_path.iterdir())
 
@@ -192,7 +192,7 @@ class TestOtherwise:
         capsys.readouterr()
         arguments = ["-o", str(tmp_path / "a.sbet"), "--config", str(flown.folder / "alone.toml")]
         assert run_app(["trajectory", str(flown.log), *arguments, "--start", "-1.3,2.0,90.3", "--imu", "main"]) == 0
-        words = "(imu.main.noise sets none of these): accel_scale_ppm 300"
+        words = "(imu.main.noise does not set these): accel_scale_ppm 300"
         assert words in capsys.readouterr().out
         assert words in (tmp_path / "a.html").read_text()
         (leg,) = summary(tmp_path)["sessions"][0]["legs"]
@@ -222,7 +222,7 @@ class TestRefusals:
             (["--imu", "none"], "--imu: the configuration has no [imu.none]"),
             (["--start", "north"], '--start: got "north", want roll,pitch,heading in degrees'),
             (["--ins", "maybe"], "want ignore, observe, as-is"),
-            (["--ins", "as-is"], "no INS solution in the log"),
+            (["--ins", "as-is"], "the log has no INS solution"),
             (["--gnss", "nowhere.pos"], "--gnss nowhere.pos: cannot be read"),
         ],
     )

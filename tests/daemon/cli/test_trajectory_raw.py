@@ -108,7 +108,7 @@ def test_a_lever_arm_that_nobody_says_is_estimated_and_told(flown: Flown) -> Non
     wish = InputOptions(positions=flown.folder / "ppk.pos", config=load_config(without_receiver(flown)))
     inputs = read_inputs(flown.session(), wish)
     assert inputs.setup.estimate_lever_arm == 2.0
-    assert any("want --lever-arm X,Y,Z" in line for line in inputs.doubts)
+    assert any("give --lever-arm X,Y,Z" in line for line in inputs.doubts)
 
 
 def test_without_a_file_raw_measurements_cannot_be_navigated(flown: Flown) -> None:

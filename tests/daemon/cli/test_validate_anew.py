@@ -49,9 +49,9 @@ def test_a_true_calibration_is_measured_again(made: Made, tmp_path: Path) -> Non
     code, method = validated(made, tmp_path, 0.0)
     assert code == 1  # control is seen twice: too little for the test field that was asked for
     told = json.loads((tmp_path / "out" / "validation.json").read_text())["validation"]
-    assert told["undone"] == ["control: control is seen 2 times only; want 5 or more"]
+    assert told["undone"] == ["control: strips see control 2 times only; 5 or more are needed"]
     assert method["passed"] is True
-    assert "2 parameters measured anew agree with the calibration" in method["sentence"]
+    assert "2 independently measured parameters agree with the calibration" in method["sentence"]
     found = {row["parameter"]: row for row in method["parameters"]}
     assert set(found) == {"omega_deg", "range_offset_m"}
     for row in found.values():
@@ -71,4 +71,4 @@ def test_a_wrong_one_is_told_by_how_much(made: Made, tmp_path: Path) -> None:
 def test_a_file_without_sigmas_is_not_compared(made: Made, tmp_path: Path) -> None:
     _, method = validated(made, tmp_path, 0.0, sigmas=False)
     assert method["passed"] is None
-    assert "no parameter was estimated in both; want a calibration file with sigmas" in method["sentence"]
+    assert "both calibrations estimated no common parameter; give a calibration file with sigmas" in method["sentence"]

@@ -86,11 +86,15 @@ def test_a_history_that_stayed_is_fine(tmp_path: Path, capsys: pytest.CaptureFix
 
 def test_a_history_in_which_nothing_can_be_tested_is_a_problem(tmp_path: Path) -> None:
     first = file_of(tmp_path / "c1.toml", boresight(0.1))
-    with pytest.raises(UserError, match="fewer than two calibrations with sigmas: no drift can be tested") as caught:
+    with pytest.raises(
+        UserError, match="drift cannot be tested, because fewer than two calibrations have sigmas"
+    ) as caught:
         run(str(first), "--history", str(first))
     assert caught.value.exit_code == ExitCode.PROBLEM
     second = file_of(tmp_path / "c2.toml", boresight(0.1).changed(scan_plane_tilt_rad=1e-3), 2)
-    with pytest.raises(UserError, match="not judged between 2026-01-01 and 2026-02-01: scan_plane_tilt_deg, held"):
+    with pytest.raises(
+        UserError, match="the step between 2026-01-01 and 2026-02-01 was not tested: scan_plane_tilt_deg, held"
+    ):
         run(str(second), "--history", str(first))
 
 
@@ -178,7 +182,7 @@ def test_the_calibrations_own_log_is_no_independent_proof(
     run(str(path), str(log))
     told = capsys.readouterr().out
     assert "the calibration holds (not independent)" in told
-    assert "flight.mcap: calibration own was made of this log" in told
+    assert "flight.mcap: calibration own was made from this log" in told
 
 
 def record_beside(path: Path, calibration_id: str) -> Path:
@@ -236,8 +240,8 @@ def test_a_record_elsewhere_is_named_and_one_of_another_calibration_left_alone(
 @pytest.mark.parametrize(
     ("what", "said", "code"),
     [
-        ("other", "is the record of calibration c0, .*c1.toml is c1", ExitCode.USAGE),
-        ("none", r"x\.json: no record of a calibration; want NAME\.record\.json", ExitCode.USAGE),
+        ("other", "is the record of calibration c0, but .*c1.toml is c1", ExitCode.USAGE),
+        ("none", r"x\.json: not a calibration record; give the NAME\.record\.json", ExitCode.USAGE),
         ("absent", "no.json: cannot be read: No such file", ExitCode.IO),
         (
             "no output",
@@ -306,12 +310,14 @@ def test_control_of_which_too_little_is_seen_is_a_problem(
     header, *lines = control.read_text().splitlines()
     away = [line.replace(",47.", ",48.") for line in lines[2:]]
     control.write_text("\n".join([header, *lines[:2], *away]))
-    with pytest.raises(UserError, match=r"^not validated as asked: .*control: control is seen \d times only") as caught:
+    with pytest.raises(
+        UserError, match=r"^not validated as requested: .*control: strips see control \d times only"
+    ) as caught:
         run(str(file_of(tmp_path / "good.toml", boresight(0.0))), str(log), "--control", str(control), "--json")
     assert caught.value.exit_code == ExitCode.PROBLEM
     record = json.loads(capsys.readouterr().out)["validation"]
     assert record["passed"] is True
-    assert record["undone"][0].startswith("control: control is seen")
+    assert record["undone"][0].startswith("control: strips see control")
 
 
 def test_parameters_that_cannot_be_measured_anew_are_a_problem(
@@ -327,7 +333,9 @@ def test_parameters_that_cannot_be_measured_anew_are_a_problem(
 def test_a_history_that_says_nothing_is_a_problem_beside_logs_that_agree(log: Path, tmp_path: Path) -> None:
     good, other = file_of(tmp_path / "good.toml", boresight(0.0)), tmp_path / "other.toml"
     file_of(other, boresight(0.0), 2, place="elsewhere")
-    with pytest.raises(UserError, match="fewer than two calibrations with sigmas: no drift can be tested") as caught:
+    with pytest.raises(
+        UserError, match="drift cannot be tested, because fewer than two calibrations have sigmas"
+    ) as caught:
         run(str(good), str(log), "--history", str(other))
     assert caught.value.exit_code == ExitCode.PROBLEM
 
@@ -343,7 +351,7 @@ def test_the_verdict_says_what_would_not_have_been_seen(
 
 
 def test_a_scanner_that_the_log_has_not_is_named(log: Path, tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="has no scanner right, whose calibration right is"):
+    with pytest.raises(UserError, match="has no scanner right, to which calibration right belongs"):
         run(str(file_of(tmp_path / "right.toml", boresight(0.0, "right"))), str(log))
 
 

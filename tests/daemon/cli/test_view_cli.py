@@ -118,7 +118,7 @@ def test_tables_say_what_was_put_in(page: Page) -> None:
     assert rows["s1.laz"][1:] == ["24\u202f000", "1.4, 6", "ETRS89 / UTM zone 32N", "left: cal-2026", "whole"]
     assert rows["QL0"][2:5] == ["not kept", "≤ 4 cm", "not kept"]
     assert rows["QL2"][1:5] == ["≥ 2", "kept", "≤ 8 cm", "kept"]
-    assert "strips keep the 10 cm class" in page.words
+    assert "strips meet the 10 cm class" in page.words
     assert "ETRS89 / UTM zone 32N (EPSG:25832)" in page.words
 
 
@@ -153,9 +153,9 @@ def test_json_has_the_numbers(products: Path, tmp_path: Path, capsys: pytest.Cap
     ("content", "arguments", "code", "words"),
     [
         (None, [], 3, "no such file or folder"),
-        (b"", [], 3, "not a LAS or LAZ file"),
-        (b"PK\x03\x04 something else entirely", [], 3, "not a LAS or LAZ file"),
-        (b"LASF" + bytes(500), [], 3, "not a LAS or LAZ file"),
+        (b"", [], 3, "cannot be read as a LAS or LAZ file"),
+        (b"PK\x03\x04 something else entirely", [], 3, "cannot be read as a LAS or LAZ file"),
+        (b"LASF" + bytes(500), [], 3, "cannot be read as a LAS or LAZ file"),
         (b"", ["--cell", "-1"], 2, "--cell: got -1, want metres above 0"),
         (b"", ["--profile", "1,2,3"], 2, "--profile: got 1,2,3, want x1,y1,x2,y2"),
     ],
@@ -181,7 +181,7 @@ def test_files_without_points_and_folders_without_files_are_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run_app(["view", str(tmp_path)]) == 3
-    assert "holds no LAS or LAZ file" in capsys.readouterr().err
+    assert "has no LAS or LAZ file" in capsys.readouterr().err
     x, y = lattice(0.0, 0.0, 1.0, 1.0, 0.5)
     path = write(tmp_path / "none.las", x, y, x)
     raw = bytearray(path.read_bytes())[:375]

@@ -62,7 +62,7 @@ def test_a_nominal_calibration_is_not_to_be_used_and_says_by_how_much_points_may
     for one in (nominal("left", [0.0, 0.0, 0.0], np.eye(3)), calibration(method="nominal")):
         (said,) = said_of(one)
         assert said.level is Level.UNUSABLE
-        assert "is nominal: points may lie 2.5 m off for 100 m of range" in said.sentence
+        assert "is nominal: points may lie 2.5 m off at 100 m of range" in said.sentence
     assert said_of(calibration('verdict = "good"', method="nominal")) == []
     assert said_of(calibration()) == []
 
@@ -85,12 +85,12 @@ def test_a_calibration_s_own_verdict_is_told_with_its_reason() -> None:
 def test_another_mounting_is_refused_and_another_source_of_the_trajectory_warned_of() -> None:
     (said,) = said_of(calibration('installation = "HB-ABC/2"'))
     assert said.level is Level.UNUSABLE
-    assert 'is of installation "HB-ABC/2", the log of "HB-ABC/1"' in said.sentence
+    assert 'belongs to installation "HB-ABC/2", the log to "HB-ABC/1"' in said.sentence
     assert said_of(calibration('installation = "HB-ABC/2"'), installation="") == []
     one = calibration('trajectory = "navigated"')
     (said,) = said_of(one, "ins")
     assert said.level is Level.CARE
-    assert "the device's own INS, whose alignment is another" in said.sentence
+    assert "the device's own INS, whose alignment differs" in said.sentence
     assert said_of(one, "navigated") == said_of(one, "file") == said_of(one, "") == []
 
 
@@ -134,7 +134,7 @@ def test_the_record_of_a_strip_adjustment_says_it_of_the_trajectories_it_has_cor
 
 def test_what_cannot_be_done_with_something_bad_says_first_that_it_is_bad() -> None:
     care, bad = Carried(Level.CARE, "a"), Carried(Level.UNUSABLE, "lever arm")
-    told = r"^not to be used: lever arm; so: does not come to rest$"
+    told = r"^not to be used: lever arm; therefore: does not come to rest$"
     for error in (UserError("does not come to rest"), PrealignError("does not come to rest")):
         with pytest.raises(UserError, match=told), told_before([care, bad], PrealignError):
             raise error
@@ -155,7 +155,7 @@ def test_the_worst_comes_first_and_only_what_is_not_to_be_used_is_a_problem() ->
     care, bad = Carried(Level.CARE, "a"), Carried(Level.UNUSABLE, "b")
     entry = verdict_entry([care, bad], accepted=False)
     assert first_lines(entry) == ["not to be used: b", "usable with care: a"]
-    assert refusal(entry) == "not to be used: b; --accept-verdict takes it all the same"
+    assert refusal(entry) == "not to be used: b; use --accept-verdict to accept it"
     assert refusal(verdict_entry([care, bad], accepted=True)) == ""
     assert refusal(verdict_entry([care], accepted=False)) == ""
     assert verdict_entry([], accepted=False) == {"level": "good", "reasons": [], "accepted": False}

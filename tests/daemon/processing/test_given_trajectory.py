@@ -161,20 +161,23 @@ def test_metres_off_fixes_that_are_no_better_are_a_doubt_of_both(single: Log, me
     found = single.judged(up_by(single, 0.1, metres=metres))
     assert found.refused == []
     assert len(found.warnings) == int(warned)
-    assert all(line.endswith(": such fixes may be wrong by that, or the trajectory is") for line in found.warnings)
+    assert all(
+        line.endswith(": fixes of this kind may be wrong by this amount, or the trajectory may be")
+        for line in found.warnings
+    )
 
 
 def test_a_trajectory_48_m_low_is_above_the_geoid(log: Log, single: Log) -> None:
     for one in (log, single):
         line = one.refused(raised(one.truth, lambda lat, lon, height: (lat, lon, height - UNDULATION_M)))
-        assert "its heights are above the geoid, which lies +48.0 m from the ellipsoid there" in line
+        assert "its heights are above the geoid, which lies +48.0 m from the ellipsoid at this place" in line
     assert "up -48.0" in log.refused(raised(log.truth, lambda lat, lon, height: (lat, lon, height - UNDULATION_M)))
 
 
 def test_a_trajectory_7_km_east_is_of_another_place(log: Log) -> None:
     line = log.refused(raised(log.truth, lambda lat, lon, height: (lat, lon + np.radians(0.1), height)))
     assert "lies 7.5 km off the fixes of gnss/rover" in line
-    assert "of another place" in line
+    assert "in another place" in line
     assert "latitude and longitude are exchanged" in log.refused(
         raised(log.truth, lambda lat, lon, height: (lon, lat, height))
     )
@@ -187,7 +190,7 @@ def test_on_a_straight_line_a_place_far_ahead_is_no_matter_of_time(log: Log) -> 
     east = raised(log.truth, lambda lat, lon, height: (lat, lon + np.radians(0.1), height))
     line = replace(log, clocks=clocks).refused(east)
     assert "its time were" not in line
-    assert "of another place" in line
+    assert "in another place" in line
 
 
 def test_heights_in_feet_are_named(log: Log) -> None:
@@ -207,7 +210,7 @@ def test_another_datum_is_named(log: Log, code: str, words: str) -> None:
         return np.radians(north_deg), np.radians(east_deg), height
 
     line = log.refused(raised(log.truth, lambda lat, lon, height: moved(lat, lon, height)))
-    assert "its datum is another" in line
+    assert "its datum differs" in line
     assert words in line
 
 
@@ -221,21 +224,21 @@ def test_the_frame_of_a_continent_is_told_from_that_of_the_world(log: Log) -> No
     assert 0.6 < apart_m < 1.0
     sure = replace(log.truth, position_e=moved, position_sigma_l=np.full((len(moved), 3), 0.01))
     line = log.refused(sure)
-    assert "its datum is another" in line
+    assert "its datum differs" in line
     assert "ETRS89" in line or "ETRF" in line
     found = log.judged(sure, datum_is_said=True)  # the receiver's may be the other one then
     assert not found.refused
-    assert "its datum is another" in found.warnings[0]
+    assert "its datum differs" in found.warnings[0]
 
 
 def test_another_point_than_said_is_named(log: Log) -> None:
     sure = replace(log.truth, position_sigma_l=np.full((len(log.truth), 3), 0.01))
     of_antenna = sure.at_body([-0.4, 0.25, 1.2])
-    assert "want --trajectory-at antenna" in log.refused(of_antenna)
+    assert "use --trajectory-at antenna" in log.refused(of_antenna)
     assert log.judged(of_antenna, "antenna").refused == []
-    assert "want --trajectory-at body" in log.refused(sure, "antenna")
+    assert "use --trajectory-at body" in log.refused(sure, "antenna")
     mirrored = sure.at_body([-0.8, 0.5, 2.4])
-    assert "lever arm has another sign" in log.refused(mirrored)
+    assert "lever arm has the opposite sign" in log.refused(mirrored)
 
 
 def test_an_antenna_whose_place_nobody_said_is_no_reason_to_refuse(log: Log) -> None:
@@ -260,15 +263,15 @@ def test_time_that_is_off_is_named_by_the_way_flown(log: Log) -> None:
 
 
 FLIPS = {
-    "pitch has the other sign": lambda roll, pitch, heading: (roll, -pitch, heading),
-    "roll has the other sign": lambda roll, pitch, heading: (-roll, pitch, heading),
-    "heading has the other sign": lambda roll, pitch, heading: (roll, pitch, -heading),
-    "pitch and heading have the other sign (axes forward, left, up": lambda roll, pitch, heading: (
+    "pitch has the opposite sign": lambda roll, pitch, heading: (roll, -pitch, heading),
+    "roll has the opposite sign": lambda roll, pitch, heading: (-roll, pitch, heading),
+    "heading has the opposite sign": lambda roll, pitch, heading: (roll, pitch, -heading),
+    "pitch and heading have the opposite sign (axes forward, left, up": lambda roll, pitch, heading: (
         roll,
         -pitch,
         np.pi / 2 - heading,
     ),
-    "roll and pitch are exchanged": lambda roll, pitch, heading: (pitch, roll, heading),
+    "roll and pitch are swapped": lambda roll, pitch, heading: (pitch, roll, heading),
 }
 
 
@@ -276,7 +279,7 @@ FLIPS = {
 def test_angles_of_another_convention_are_seen_and_named(log: Log, words: str) -> None:
     found = log.judged(turned(log.truth, FLIPS[words]))
     assert words in found.refused[0]
-    assert "turns as the IMU" in found.refused[0]
+    assert "turns like the IMU" in found.refused[0]
 
 
 @pytest.mark.parametrize("words", list(FLIPS)[:3])
@@ -305,8 +308,8 @@ def test_a_trajectory_of_another_flight_is_refused_by_how_it_turns(log: Log) -> 
     assert wobble.shape == (3, count)
     other = turned(log.truth, lambda roll, pitch, heading: tuple(wobble + np.array([[0.0], [0.0], [1.0]])))
     line = log.judged(other).refused[0]
-    assert "does not turn as the IMU" in line
-    assert "want the trajectory of this flight" in line
+    assert "does not turn like the IMU" in line
+    assert "give the trajectory of this flight" in line
 
 
 @pytest.fixture(scope="module")
@@ -325,7 +328,7 @@ def test_another_flight_over_the_same_lines_is_refused_by_what_gusts_do(rough: l
     for one, other in (rough, rough[::-1]):
         assert one.judged(one.truth).refused == []
         line = one.refused(other.truth)
-        assert "gusts shake it otherwise (correlation" in line
+        assert "its response to gusts differs (correlation" in line
         assert "another flight over the same lines" in line
 
 

@@ -154,7 +154,7 @@ def test_a_locked_head_without_position_packets_is_found_by_its_stamps(tmp_path:
     assert max(map(abs, error)) < 1_000
     assert sigma_ns <= 1e5
     (line,) = stamp_lines(clocks)
-    assert line.startswith("scanner/top: its stamps are taken as utc-hour: they stand 0.")
+    assert line.startswith("scanner/top: its stamps are read as utc-hour: they count from the hour of UTC and lie 0.")
 
 
 @pytest.mark.parametrize("off_us", [1_000_000, 300_000, 1_234_567_890])
@@ -176,7 +176,7 @@ def test_position_packets_are_the_clock_where_no_receiver_is_in_the_log(tmp_path
     assert max(map(abs, error)) < 1_000
     assert sigma_ns == 20_000.0
     (line,) = stamp_lines(clocks)
-    assert "scanner/top: no receiver is in the log: GPS time is by the head's own sentences" in line
+    assert "scanner/top: the log has no receiver, so GPS time comes from the head's own sentences" in line
     assert "18 leap seconds" in line
 
 
@@ -233,7 +233,9 @@ def test_a_heads_date_that_nobody_believes_is_refused_and_named(tmp_path: Path) 
 def test_a_head_that_was_given_local_time_is_told(tmp_path: Path) -> None:
     _, clocks = found(tmp_path, WITH_AUX, [*velodyne(), *positions(off=dt.timedelta(hours=2))])
     (line,) = clocks.remarks
-    assert line.startswith("scanner/top: its time is 2 h ahead of the recording computer's clock, as by a time zone")
+    assert line.startswith(
+        "scanner/top: its time is 2 h ahead of the recording computer's clock, as a wrong time zone would cause"
+    )
 
 
 def test_counters_that_go_on_beyond_the_hour_are_modulo_the_hour_in_both_packets(tmp_path: Path) -> None:
@@ -249,21 +251,21 @@ def test_a_configured_hour_needs_neither_receiver_nor_position_packets(tmp_path:
     error, _ = errors_ns(clocks, HOURS, -1)
     assert max(map(abs, error)) < 1_000
     (line, _) = stamp_lines(clocks)
-    assert "by the head's own stamps, as configured, and the hour by the recording computer's clock" in line
+    assert "from the head's own stamps, as configured, and the hour by the recording computer's clock" in line
     assert "sentences" not in line
 
 
 @pytest.mark.parametrize(
     ("pps", "status", "words"),
     [
-        (PPS_LOCKED, "V", r"passes on 20 sentences, all void \(no fix yet\); want the receiver's antenna under open"),
-        (PPS_LOCKED, None, "passes on no NMEA sentence that names a time; want RMC"),
+        (PPS_LOCKED, "V", r"passes on 20 sentences, all void \(no fix yet\); place the receiver's antenna under open"),
+        (PPS_LOCKED, None, "passes on no NMEA sentence with a time; connect RMC"),
         (
             PPS_ABSENT,
             "V",
-            "says that no pulse reaches it; want the receiver's PPS wired to it; it passes on 19 sen",
+            "reports that no pulse reaches it; wire the receiver's PPS to it; it passes on 19 sen",
         ),
-        (PPS_SYNCHRONIZING, None, r"says that it is not locked to its pulse \(synchronizing\); want a steady PPS"),
+        (PPS_SYNCHRONIZING, None, r"reports that it is not locked to its pulse \(synchronizing\); wire a steady PPS"),
     ],
 )
 def test_a_head_without_fix_or_pulse_is_refused_by_that(
@@ -272,7 +274,7 @@ def test_a_head_without_fix_or_pulse_is_refused_by_that(
     setup, clocks = found(tmp_path, WITH_AUX, [*velodyne(), *positions(pps=pps, status=status)])
     plan = clocks.host.plan.devices["scanner/top"]
     state, trouble = clocks.host.status(plan.clock, START_UNIX_NS + 20 * NS), clocks.trouble(plan.clock)
-    with pytest.raises(UserError, match="no receiver is in the log, and the head " + words) as refused:
+    with pytest.raises(UserError, match="the log has no receiver, and the head " + words) as refused:
         refuse_no_time(tmp_path, plan.clock, state, setup.config, (), trouble)
     assert "configuration" not in refused.value.message
 
@@ -283,7 +285,7 @@ def test_a_head_that_says_only_that_it_is_not_locked_is_not_said_to_have_no_puls
     seconds = [(START_UNIX_NS + k * NS + LATENCY_NS, START + dt.timedelta(seconds=k)) for k in range(SECONDS)]
     aux = [("scanner/top/aux", at_ns, encode_gps_packet(time, locked=False)) for at_ns, time in seconds]
     _, clocks = found(tmp_path, text, [*receiver(), *hesai(0), *aux])
-    assert clocks.trouble("scanner/top") == ("says that it is not locked to its pulse; want a steady PPS, wired to it")
+    assert clocks.trouble("scanner/top") == ("reports that it is not locked to its pulse; wire a steady PPS to it")
 
 
 @pytest.mark.parametrize("status", ["A", "V"])
@@ -294,7 +296,7 @@ def test_a_head_without_pulse_beside_a_receiver_is_told_by_that(tmp_path: Path, 
     state = clocks.host.status("pps/main", START_UNIX_NS + 20 * NS)
     trouble = clocks.trouble("scanner/top")
     line = time_trouble("top", {"no_time": 9, "georeferenced": 1}, {}, state, None, trouble)
-    assert line.endswith("the head says that no pulse reaches it; want the receiver's PPS wired to it")
+    assert line.endswith("the head reports that no pulse reaches it; wire the receiver's PPS to it")
 
 
 def test_a_head_with_fix_and_pulse_is_in_no_trouble(tmp_path: Path) -> None:
@@ -306,7 +308,7 @@ def test_a_head_that_says_nothing_and_no_receiver_is_refused_with_what_would_do(
     setup, clocks = found(tmp_path, VLP16, velodyne())
     plan = clocks.host.plan.devices["scanner/top"]
     status = clocks.host.status(plan.clock, START_UNIX_NS + 20 * NS)
-    with pytest.raises(UserError, match=r"no source of time .*position packets .*scanner\.top\.clock"):
+    with pytest.raises(UserError, match=r"has no source of time; .*position packets .*scanner\.top\.clock"):
         refuse_no_time(tmp_path, plan.clock, status, setup.config)
 
 

@@ -71,8 +71,9 @@ def test_files_that_mix_times_are_named_by_the_quick_look_too(tmp_path: Path) ->
     for number in range(5):
         tile(tmp_path, f"b{number}.laz", ADJUSTED_S, adjusted=True, west_m=20.0)
     assert (
-        "files mix times: seconds of the GPS week in a.laz; adjusted standard GPS time in b0.laz, b1.laz, b2.laz and "
-        "2 more; a file merged of them needs one kind" in look_at([tmp_path]).notes
+        "files have different kinds of times: seconds of the GPS week in a.laz; adjusted standard GPS time in b0.laz, "
+        "b1.laz, b2.laz and 2 more; convert them to one kind before you merge them into a file"
+        in look_at([tmp_path]).notes
     )
 
 
@@ -83,7 +84,7 @@ def test_times_that_contradict_their_header_are_told(tmp_path: Path) -> None:
     assert "its header says seconds of the GPS week, but its times, from 465,7" in unset.doubt
     small = tile(tmp_path, "small.laz", 345_600.0, adjusted=True)
     assert small.kind is TimeKind.ADJUSTED
-    assert "are of 2011-09-18; if they are seconds of the GPS week, clear bit 0" in small.doubt
+    assert "belong to 2011-09-18; if they are seconds of the GPS week, clear bit 0" in small.doubt
     assert time_notes([unset, small]) == [unset.doubt, small.doubt]
 
 
@@ -91,9 +92,15 @@ def test_times_that_contradict_their_header_are_told(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("first_s", "told"),
     [
-        (1_174_893_536.0, "are of 2048-12-06, which is to come; they look like GPS seconds: take 1,000,000,000 s off"),
-        (1_490_858_318.0, "are of 2058-12-11, which is to come; they look like seconds since 1970: take 1,315,964,800"),
-        (3_900_000_000.0, "are of 2135-"),
+        (
+            1_174_893_536.0,
+            "then belong to 2048-12-06, in the future; they look like GPS seconds: subtract 1,000,000,000 s from",
+        ),
+        (
+            1_490_858_318.0,
+            "then belong to 2058-12-11, in the future; they look like seconds since 1970: subtract 1,315,964,800",
+        ),
+        (3_900_000_000.0, "belong to 2135-"),
     ],
 )
 def test_times_of_the_future_are_told_with_what_they_look_like(
@@ -119,8 +126,8 @@ def test_seconds_of_no_week_count_among_themselves_and_say_so(tmp_path: Path) ->
     one = tile(tmp_path, "a.laz", 345_600.0, adjusted=False)
     clock = PointClock([one])
     assert clock.notes == [
-        "a.laz: times are seconds of the GPS week, and nothing says of which; they count among themselves only: "
-        "give it with --week"
+        "a.laz: times are seconds of the GPS week, and no file gives the week, so times are only relative to "
+        "each other; give the week with --week"
     ]
     assert np.diff(clock.time_ns(one.path, np.array([345_600.0, 345_601.5]))).tolist() == [1_500_000_000]
 

@@ -146,12 +146,12 @@ def test_few_cells_give_no_verdict_and_say_what_to_do(tmp_path: Path, capsys: py
     near = cloud["x"] < EAST_M + 14.0
     small = tiles(tmp_path / "small", cloud, np.flatnonzero(near & (cloud["y"] < NORTH_M + 50.0)))
     with pytest.raises(
-        UserError, match=r"no verdict: .* cells of 2 m in \d place.*it takes 100 in 3: want more"
+        UserError, match=r"no verdict: .* cells of 2 m in \d place.*a verdict needs 100 in 3: add"
     ) as caught:
         run(strips.command, str(small), "--level", "QL3")
     assert caught.value.exit_code == ExitCode.PROBLEM
     told = capsys.readouterr().out
-    assert "strips keep" not in told
+    assert "strips meet" not in told
     assert "RMSDz" in told
     run(view.command, str(small), "-o", str(tmp_path / "view"), "--json")
     quality = json.loads(capsys.readouterr().out)["quality"]

@@ -125,7 +125,7 @@ def test_says_where_the_cache_is_or_that_there_is_none(tmp_path: Path) -> None:
     assert folder.is_dir()
     assert WarmUp(12, 3.25, tmp_path).text() == f"12 loops compiled in 3.2 s; kept in {tmp_path}"
     assert "already" in WarmUp(0, 0.5, tmp_path).text()
-    assert "compiles in memory: set NUMBA_CACHE_DIR" in WarmUp(12, 3.25, None).text()
+    assert "compiles in memory; set NUMBA_CACHE_DIR" in WarmUp(12, 3.25, None).text()
 
 
 def test_a_wrong_configuration_is_a_line(tmp_path: Path) -> None:

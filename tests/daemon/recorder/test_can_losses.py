@@ -79,7 +79,7 @@ def test_what_is_left_is_navigated_and_what_is_missing_is_said(
     output = tmp_path / "t.csv"
     assert run_app(["trajectory", str(lossy[0]), "-o", str(output), "--no-page"]) == 1
     told = capsys.readouterr()
-    assert "of the inertial samples are missing and were made up: look with swath info" in told.out
+    assert "of the inertial samples are missing and were interpolated: find out with swath info" in told.out
     assert told.err.strip().endswith("3.0 s: no samples")
     got, truth = read_trajectory(output.read_bytes(), "t.csv"), flown.truth()
     off = got.position_e[50:-50] - truth.poses(got.time_ns[50:-50]).position_e

@@ -52,16 +52,16 @@ def test_itrf_to_etrs89_is_not_the_identity() -> None:
 
 def test_wgs_84_of_unknown_realisation_is_not_etrs89() -> None:
     line = refusal("EPSG:25832")
-    assert "good to 1 m only" in line
+    assert "accurate to 1 m only" in line
     assert 'gnss.datum or --trajectory-datum, such as "EPSG:7912"' in line
-    assert 'or say "same" if they are in ETRS89 already' in line
-    assert refusal("EPSG:25832", datum="EPSG:4979").count("good to 1 m only") == 1
+    assert 'or set "same" if they are already in ETRS89' in line
+    assert refusal("EPSG:25832", datum="EPSG:4979").count("accurate to 1 m only") == 1
 
 
 def test_an_operation_that_moves_needs_its_epoch() -> None:
     assert "output.epoch = 2026.9" in refusal("EPSG:25832", datum="EPSG:7912")
-    assert "26.47 is no decimal year" in refusal("EPSG:25832", datum="EPSG:7912", epoch=26.47)
-    assert "nan is no decimal year" in refusal("EPSG:32632", epoch=float("nan"))
+    assert "26.47 is not a decimal year" in refusal("EPSG:25832", datum="EPSG:7912", epoch=26.47)
+    assert "nan is not a decimal year" in refusal("EPSG:32632", epoch=float("nan"))
     early, late = (
         Mapping("EPSG:25832", datum="EPSG:7912", epoch=epoch).exact(at(47.55, 9.0)) for epoch in (2016, 2026)
     )
@@ -106,7 +106,7 @@ def test_a_datum_on_another_ellipsoid_is_refused(crs: str, datum: str, ellipsoid
     """Latitudes on Bessel's read as those on WGS 84's would be 67 m and 700 m of height off in Switzerland."""
     line = refusal(crs, datum=datum, accuracy_m=1000.0)
     assert line.startswith(f'datum = "{datum}": ')
-    assert f"is on the ellipsoid {ellipsoid}, positions are read on that of WGS 84 and GRS 1980" in line
+    assert f"is on the ellipsoid {ellipsoid}, but positions are read on that of WGS 84 and GRS 1980" in line
 
 
 def test_same_is_no_advice_where_it_would_be_refused() -> None:
@@ -130,7 +130,7 @@ def test_an_accuracy_of_a_decimetre_is_taken_when_the_user_allows_it() -> None:
 
 def test_an_operation_of_a_single_step_is_judged_too() -> None:
     """To geocentric frames PROJ's operation is one transformation, without conversions around it."""
-    assert "good to 1 m only" in refusal("EPSG:4936")
+    assert "accurate to 1 m only" in refusal("EPSG:4936")
     stated = Mapping("EPSG:7789", datum="EPSG:9988", epoch=2020.0).description()
     assert stated["operation"] == "Inverse of ITRF2014 to ITRF2020 (1)"
     assert stated["accuracy_m"] == pytest.approx(0.001)
@@ -154,7 +154,7 @@ def test_a_guess_is_refused() -> None:
 def test_a_missing_grid_is_named_with_the_way_to_get_it(crs: str, datum: str | None, grid: str) -> None:
     line = refusal(crs, datum=datum)
     assert f"`projsync --file {grid}" in line
-    assert f"a copy in {get_user_data_dir()}" in line
+    assert f"copy it to {get_user_data_dir()}" in line
 
 
 def test_a_vertical_frame_without_any_model_is_refused() -> None:
@@ -167,12 +167,12 @@ def test_a_vertical_frame_without_any_model_is_refused() -> None:
         ("EPSG:4326", "is geographic, in degrees"),
         ("EPSG:4979", "is geographic, in degrees"),
         ("EPSG:4326+5773", "is geographic, in degrees"),
-        ("EPSG:5773", "is heights alone"),
+        ("EPSG:5773", "has heights only"),
         ("EPSG:2048", "counts towards the west and south"),
         ("EPSG:5513", "counts towards the west and south"),
         ("EPSG:32632+5715", "counts depths"),
-        ("EPSG:999999", "is none that PROJ knows"),
-        ("UTM 32", "is none that PROJ knows"),
+        ("EPSG:999999", "is unknown to PROJ"),
+        ("UTM 32", "is unknown to PROJ"),
     ],
 )
 def test_what_is_no_mapping_frame(crs: str, said: str) -> None:
@@ -183,14 +183,14 @@ def test_what_is_no_mapping_frame(crs: str, said: str) -> None:
 
 def test_what_is_no_datum() -> None:
     assert 'name its geodetic CRS, "EPSG:4258"' in refusal("EPSG:25832", datum="EPSG:25832")
-    assert 'datum = "ITRF14" is none that PROJ knows' in refusal("EPSG:25832", datum="ITRF14")
+    assert 'datum = "ITRF14" is unknown to PROJ' in refusal("EPSG:25832", datum="ITRF14")
 
 
 def test_the_first_point_chooses_where_several_operations_do() -> None:
     """Around the Baltic PROJ's best operation to ETRS89 takes a grid of velocities, in Germany none."""
     mapping = Mapping("EPSG:25832", datum="EPSG:7912", epoch=2026.0)
     assert mapping.description()["operation"] is None
-    with pytest.raises(MappingError, match="still open"):
+    with pytest.raises(MappingError, match="not yet chosen"):
         mapping.e_from_map(np.zeros((1, 3)))
     mapping.map_from_e(at(47.5, 9.0))
     west, south, east, north = mapping.description()["area"]

@@ -56,7 +56,7 @@ def remedy(text: str) -> FloatArray:
     said = re.search(r"by (\[\[.*\]\])", text)
     if said is not None:
         return np.array([[float(value) for value in row.split(",")] for row in re.findall(r"\[([^\[\]]+)\]", said[1])])
-    taken = re.search(r"taken as \(([^)]*)\)", text)
+    taken = re.search(r"read as \(([^)]*)\)", text)
     assert taken is not None, text
     matrix = np.zeros((3, 3))
     for row, axis in enumerate(taken[1].split(", ")):
@@ -94,7 +94,7 @@ def test_each_of_the_48_ways_of_taking_the_axes_is_found(sensor: str, number: in
 def test_degrees_for_radians_are_found_by_the_gain() -> None:
     (finding,) = diagnose(*mounted("gyro", np.eye(3), unit=180.0 / np.pi))
     assert finding.code == "gyro_unit"
-    assert "degrees are taken for radians" in finding.text
+    assert "degrees are read as radians" in finding.text
 
 
 @pytest.mark.parametrize("unit", [0.6, 1.7, 20.0])

@@ -215,8 +215,11 @@ def test_how_rows_are_cut_changes_nothing(sample: SampleRule) -> None:
         ({"rate_hz": 0.0}, "rate_hz: got 0.0"),
         ({"rate_hz": 100.0, "sample": "means"}, 'sample: got "means"'),
         ({"rate_hz": 100.0, "stamp": "begin"}, 'stamp: got "begin"'),
-        ({"rate_hz": 100.0, "rot_b_from_imu": np.diag([1.0, 1.0, -1.0])}, "rotation_b_imu: the rows are no rotation"),
-        ({"rate_hz": 100.0, "rot_b_from_imu": 2 * np.eye(3)}, "rotation_b_imu: the rows are no rotation"),
+        (
+            {"rate_hz": 100.0, "rot_b_from_imu": np.diag([1.0, 1.0, -1.0])},
+            "rotation_b_imu: the rows are not a rotation",
+        ),
+        ({"rate_hz": 100.0, "rot_b_from_imu": 2 * np.eye(3)}, "rotation_b_imu: the rows are not a rotation"),
     ],
 )
 def test_what_a_user_did_wrong_is_said(options: dict[str, Any], words: str) -> None:

@@ -114,7 +114,7 @@ def test_risley_counts_whole_turns() -> None:
 
 
 def test_risley_that_lets_no_light_through() -> None:
-    with pytest.raises(GeometryError, match=r"geometry.wedge_deg: got \[30, 30\], want smaller ones"):
+    with pytest.raises(GeometryError, match=r"geometry.wedge_deg: got \[30, 30\], want smaller angles"):
         RisleyGeometry((np.radians(30.0), np.radians(30.0)), 1.51)
     RisleyGeometry((np.radians(20.0), np.radians(20.0)), 1.51)
 
@@ -169,10 +169,10 @@ def test_fibres_by_the_mirror_that_lights_them() -> None:
 @pytest.mark.parametrize(
     ("text", "wrong"),
     [
-        ("10,0\n", "fibres.csv: line 1: want across_deg,along_deg"),
+        ("10,0\n", "fibres.csv: line 1: the header must be across_deg,along_deg"),
         ("across_deg,along_deg\n1,2\n3\n", "fibres.csv: line 3: got '3', want two numbers"),
-        ("across_deg,along_deg\n", "fibres.csv: want the two angles of at least one fibre"),
-        ("across_deg,along_deg\n1,nan\n", "fibres.csv: want the two angles of at least one fibre, all finite"),
+        ("across_deg,along_deg\n", "fibres.csv: needs the two angles of at least one fibre"),
+        ("across_deg,along_deg\n1,nan\n", "fibres.csv: needs the two angles of at least one fibre, all finite"),
     ],
 )
 def test_tables_of_fibres_that_cannot_be(text: str, wrong: str) -> None:
@@ -186,11 +186,11 @@ ONE_BEAM = spinning()
 @pytest.mark.parametrize(
     ("geometry", "changes", "wrong"),
     [
-        (LineGeometry(), {"facet_tilt_rad": {0: 0.1}}, "facet.index: got 0, the scanner has 0 facets"),
-        (LineGeometry(4), {"facet_tilt_rad": {4: 0.1}}, "facet.index: got 4, the scanner has 4 facets"),
-        (LineGeometry(4), {"beams": {0: BeamCorrection()}}, "beam.channel: got 0, the scanner has 0 beams"),
-        (ONE_BEAM, {"beams": {1: BeamCorrection()}}, "beam.channel: got 1, the scanner has 1 beams"),
-        (LineGeometry(), {"installation_matrix": 2.0 * np.eye(3)}, "installation matrix: no rotation"),
+        (LineGeometry(), {"facet_tilt_rad": {0: 0.1}}, "facet.index: got 0, but the scanner has 0 facets"),
+        (LineGeometry(4), {"facet_tilt_rad": {4: 0.1}}, "facet.index: got 4, but the scanner has 4 facets"),
+        (LineGeometry(4), {"beams": {0: BeamCorrection()}}, "beam.channel: got 0, but the scanner has 0 beams"),
+        (ONE_BEAM, {"beams": {1: BeamCorrection()}}, "beam.channel: got 1, but the scanner has 1 beams"),
+        (LineGeometry(), {"installation_matrix": 2.0 * np.eye(3)}, "installation matrix: is not a rotation"),
     ],
 )
 def test_tables_that_belong_to_another_scanner(geometry: Geometry, changes: dict[str, object], wrong: str) -> None:

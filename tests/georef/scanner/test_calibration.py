@@ -171,19 +171,23 @@ def test_changed_leaves_the_old_one() -> None:
 @pytest.mark.parametrize(
     ("old", "new", "wrong"),
     [
-        ('id = "x"', "", "calibration.id: missing; want text in quotes"),
-        ('scanner = "left"', "scanner = 3", "calibration.scanner: not text; want text in quotes"),
+        ('id = "x"', "", "calibration.id: missing; give text in quotes"),
+        ('scanner = "left"', "scanner = 3", "calibration.scanner: not text; give text in quotes"),
         ('"nominal"', '"guess"', "calibration.method: got 'guess', want one of nominal, planes"),
         ('method = "nominal"', 'method = "nominal"\nranges = "wet"', "calibration.ranges: got 'wet', want one of corr"),
         ("omega_deg = 0", "", "parameters.omega_deg: missing, want a number"),
         ("omega_deg = 0", "omega_deg = true", "parameters.omega_deg: got True, want a number"),
         ("omega_deg = 0", "omega_deg = nan", "parameters.omega_deg: got nan, want a number"),
-        ("omega_deg = 0", "omega_deg = 0\nomega_rad = 0", "parameters.omega_rad: no parameter of the model"),
-        ("[parameters]", "installation_matrix = [[1, 0, 0]]\n[parameters]", "calibration.installation_matrix: no rot"),
+        ("omega_deg = 0", "omega_deg = 0\nomega_rad = 0", "parameters.omega_rad: not a parameter of the model"),
+        (
+            "[parameters]",
+            "installation_matrix = [[1, 0, 0]]\n[parameters]",
+            "calibration.installation_matrix: not a rot",
+        ),
         (
             "[parameters]",
             "installation_matrix = [[1, 0, 0], [0, 1, 0], [0, 0, -1]]\n[parameters]",
-            "calibration.installation_matrix: no rotation; want 3 × 3 numbers",
+            "calibration.installation_matrix: not a rotation; give 3 × 3 numbers",
         ),
         ("[parameters]", "mirror_factor = 'two'\n[parameters]", "calibration.mirror_factor: got 'two', want a number"),
     ],
@@ -200,36 +204,39 @@ def test_mistakes_of_header_and_parameters(old: str, new: str, wrong: str) -> No
     ("added", "wrong"),
     [
         ("[sigma]\nomega_deg = -1", "sigma.omega_deg: got -1, want at least 0"),
-        ("sigma = 3", "sigma: not a table; want [sigma]"),
-        ("[correlation]\nnames = ['omega_deg']\nmatrix = [[1]]", "correlation.names: want a list of keys of [sigma]"),
+        ("sigma = 3", "sigma: not a table; add [sigma]"),
+        (
+            "[correlation]\nnames = ['omega_deg']\nmatrix = [[1]]",
+            "correlation.names: must be a list of keys of [sigma]",
+        ),
         (
             "[sigma]\nomega_deg = 1\nphi_deg = 1\n[correlation]\nnames = ['omega_deg', 'phi_deg']\n"
             "matrix = [[1, 0.5], [0.4, 1]]",
-            "correlation.matrix: want 2 × 2 numbers: symmetric",
+            "correlation.matrix: must be 2 × 2 numbers: symmetric",
         ),
         (
             "[sigma]\nomega_deg = 1\nphi_deg = 1\n[correlation]\nnames = ['omega_deg', 'phi_deg']\n"
             "matrix = [[1, 1.5], [1.5, 1]]",
-            "correlation.matrix: want 2 × 2 numbers: symmetric",
+            "correlation.matrix: must be 2 × 2 numbers: symmetric",
         ),
-        ("[ibrc]\nintensity = [1, 2]\ncorrection_m = [1]", "ibrc: want intensity and correction_m"),
-        ("[ibrc]\nintensity = [1, 1]\ncorrection_m = [1, 2]", "ibrc.intensity: want rising values"),
-        ("[[range_offset]]\noffset_m = 1", "range_offset[0]: matches everything; want return_slot"),
+        ("[ibrc]\nintensity = [1, 2]\ncorrection_m = [1]", "ibrc: needs intensity and correction_m"),
+        ("[ibrc]\nintensity = [1, 1]\ncorrection_m = [1, 2]", "ibrc.intensity: values must increase"),
+        ("[[range_offset]]\noffset_m = 1", "range_offset[0]: matches every return; give return_slot"),
         ("[[range_offset]]\nreturn_slot = 1", "range_offset[0].offset_m: missing, want a number"),
         ("[[range_offset]]\nmta_zone = -1\noffset_m = 1", "range_offset[0].mta_zone: got -1, want a whole number"),
         ("[[facet]]\ntilt_deg = 1", "facet[0].index: missing, want a whole number"),
-        ("[[facet]]\nindex = 1\ntilt_deg = 1\n[[facet]]\nindex = 1\ntilt_deg = 2", "facet[1].index: facet 1 stands"),
-        ("[[beam]]\nchannel = 1\n[[beam]]\nchannel = 1", "beam[1].channel: beam 1 stands there twice; want it once"),
-        ("[beam]\nchannel = 1", "beam: want tables [[beam]]"),
-        ("[[range_offsets]]\nreturn_slot = 1\noffset_m = 1", "range_offsets: is not known; want calibration, param"),
+        ("[[facet]]\nindex = 1\ntilt_deg = 1\n[[facet]]\nindex = 1\ntilt_deg = 2", "facet[1].index: facet 1 is given"),
+        ("[[beam]]\nchannel = 1\n[[beam]]\nchannel = 1", "beam[1].channel: beam 1 is given twice; give it once"),
+        ("[beam]\nchannel = 1", "beam: must be tables [[beam]]"),
+        ("[[range_offsets]]\nreturn_slot = 1\noffset_m = 1", "range_offsets: is unknown; use calibration, param"),
         (
             "[ibrcs]\nintensity = [1]",
-            "ibrcs: is not known; want calibration, parameters, sigma, held_sigma, correlation, ibrc",
+            "ibrcs: is unknown; use calibration, parameters, sigma, held_sigma, correlation, ibrc",
         ),
-        ("[[beam]]\nchannel = 1\nazimuth_rad = 0.1", "beam[0].azimuth_rad: is not known; want channel, azimuth_deg"),
+        ("[[beam]]\nchannel = 1\nazimuth_rad = 0.1", "beam[0].azimuth_rad: is unknown; use channel, azimuth_deg"),
         ("[[range_offset]]\nreturn_slot = 0\noffset_m = 1", "range_offset[0].return_slot: got 0, want a whole"),
         ("[[beam]]\nchannel = 70000", "beam[0].channel: got 70000, want a whole number from 0 to 65535"),
-        ("[correlation]\nnames = [['a']]\nmatrix = [[1]]", "correlation.names: want a list of keys of [sigma]"),
+        ("[correlation]\nnames = [['a']]\nmatrix = [[1]]", "correlation.names: must be a list of keys of [sigma]"),
     ],
 )
 def test_mistakes_of_tables(added: str, wrong: str) -> None:
@@ -254,7 +261,7 @@ def test_a_line_each() -> None:
     ("text", "wrong"),
     [
         ("[calibration", "left.toml: not TOML: "),
-        ("", "left.toml: calibration: missing; want [calibration]\nleft.toml: parameters: missing; want [parameters]"),
+        ("", "left.toml: calibration: missing; add [calibration]\nleft.toml: parameters: missing; add [parameters]"),
     ],
 )
 def test_what_is_no_calibration_file(text: str, wrong: str) -> None:

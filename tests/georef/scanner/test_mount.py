@@ -95,9 +95,9 @@ def test_pulses_without_gimbal_angles_give_no_point() -> None:
 
 
 def test_series_that_cannot_be() -> None:
-    with pytest.raises(MountError, match="gimbal angles: want at least two epochs of roll, pitch and yaw"):
+    with pytest.raises(MountError, match="gimbal angles: at least two epochs of roll, pitch and yaw are needed"):
         AngleSeries(np.array([1]), np.zeros((1, 3)))
-    with pytest.raises(MountError, match="gimbal angles: time does not rise"):
+    with pytest.raises(MountError, match="gimbal angles: time does not increase"):
         AngleSeries(np.array([1, 1]), np.zeros((2, 3)))
 
 

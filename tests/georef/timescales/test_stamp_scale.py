@@ -80,7 +80,7 @@ def test_absolute_stamps_of_no_known_scale_run_free_until_they_are_configured() 
     assert "GPS +20 s" in found.text
     said = judged(stamps, gps, wanted=StampScale.TAI)
     assert said.scale is StampScale.TAI
-    assert "whole seconds are those of the arrival" in said.text
+    assert "whole seconds come from their arrival" in said.text
     assert np.array_equal(stamps + said.offset_ns, gps)
 
 
@@ -101,7 +101,7 @@ def test_stamps_of_a_locked_head_are_found_to_be_the_hours_of_utc() -> None:
     gps = truth_ns() + 3570 * NS
     found = judged(hour_stamps(gps), gps, past_hour=True)
     assert (found.scale, found.sigma_ns) == (StampScale.HOUR, 20_000.0)
-    assert "before their arrival past the hour of UTC" in found.text
+    assert "they count from the hour of UTC" in found.text
 
 
 @pytest.mark.parametrize(("off_s", "drift_ppm"), [(1.0, 0.0), (-1.0, 0.0), (0.3, 0.0), (777.7, 12.0), (0.0, 30.0)])
@@ -135,7 +135,7 @@ def test_the_configuration_decides(wanted: StampScale) -> None:
     gps = truth_ns()
     found = judged(hour_stamps(gps), gps, past_hour=True, wanted=wanted)
     assert found.scale is wanted
-    assert found.text.startswith("configured so")
+    assert found.text.startswith("as configured")
 
 
 def test_too_little_or_no_time_beside_is_no_judgement() -> None:
@@ -226,7 +226,7 @@ def test_stamps_that_change_their_scale_on_the_way_are_none() -> None:
     stamps = np.where(np.arange(len(gps)) < len(gps) // 2, absolute(gps, 19), absolute(gps, -LEAP))
     found = judged(stamps, gps)
     assert found.scale is StampScale.FREE
-    assert "they change their scale on the way" in found.text
+    assert "their time scale changes during the log" in found.text
     assert "neither" not in found.text
 
 

@@ -45,8 +45,8 @@ def test_wrong_seconds_at_the_start_cost_nothing_after_the_flight(error_s: int, 
     assert line.startswith("gnss/rover: ")
     assert abs(named - (SECONDS - wrong_s)) <= 5
     assert abs(total - SECONDS) <= 5
-    assert f"one {error_s:+d} s from it: these are set right" in line
-    assert ("the majority is narrow: all times may be off by that" in line) == (named < 0.75 * total)
+    assert f"name a second {error_s:+d} s from it; these are corrected" in line
+    assert ("the majority is small, so all times may be off by that" in line) == (named < 0.75 * total)
 
 
 @pytest.mark.parametrize("error_s", [1, -1, 20])

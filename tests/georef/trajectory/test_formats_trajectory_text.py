@@ -84,7 +84,7 @@ def test_csv_that_is_wrong_is_refused() -> None:
     lines = good.splitlines()
     swapped = good.replace("lat_deg,lon_deg", "lon_deg,lat_deg")
     assert "header of a trajectory CSV begins with gps_ns,lat_deg" in refusal(swapped)
-    assert "column sigma_north is not known; sigmas are sigma_n_m," in refusal(good.replace("sigma_n_m", "sigma_north"))
+    assert "column sigma_north is unknown; sigmas are sigma_n_m," in refusal(good.replace("sigma_n_m", "sigma_north"))
     assert "line 4:" in refusal("\n".join([*lines[:3], lines[3].replace(",", ";", 1), *lines[4:]]))
     assert "16 numbers are expected" in refusal("\n".join([*lines[:3], lines[3].replace(",", ";", 1), *lines[4:]]))
     assert "time goes back by 0.050 s at line 4" in refusal("\n".join([*lines[:2], lines[3], lines[2], *lines[4:]]))
@@ -112,7 +112,7 @@ def test_a_gap_takes_no_memory() -> None:
 def test_a_trajectory_that_is_all_gaps_is_refused() -> None:
     lines = csv_text(flown(100)).splitlines()
     line = refusal("\n".join([lines[0], *lines[1::4]]))
-    assert "its epochs are 0.200 s apart, and what lies more than 0.150 s apart is a gap: export it at 10 Hz" in line
+    assert "its epochs are 0.200 s apart, and epochs more than 0.150 s apart count as a gap: export it at 10 Hz" in line
     assert len(read("\n".join([lines[0], *lines[1::2]]))) == 50
 
 
@@ -250,7 +250,7 @@ def test_waypoint_columns_may_stand_apart_by_marks(mark: str, comma: bool, dms_c
 
 def test_waypoint_decimal_commas_between_commas_name_what_to_export() -> None:
     told = refusal(separated(",", True))
-    assert "decimal commas cannot be told from commas between columns; export it with decimal points" in told
+    assert "decimal commas cannot be distinguished from commas between columns; export it with decimal points" in told
 
 
 def test_waypoint_sigmas_are_scaled_back_to_one() -> None:
@@ -322,7 +322,7 @@ def test_waypoint_utc_takes_the_offset_of_its_header() -> None:
     unsaid = export(trajectory, seconds, "UTCTime", "(sec)")
     assert "its time is UTC, of unknown leap seconds; export GPSTime and Week" in refusal(unsaid, span_ns=SPAN)
     unsure = export(trajectory, times, "UTCDate UTCTime", "(MDY) (HMS)")
-    assert "leap seconds are known here until 2026-06-28 only; export it in GPS time" in refusal(unsure)
+    assert "this program knows leap seconds only until 2026-06-28; export it in GPS time" in refusal(unsure)
 
 
 def test_waypoint_that_is_wrong_is_refused() -> None:
@@ -333,7 +333,7 @@ def test_waypoint_that_is_wrong_is_refused() -> None:
     assert "heights are above the geoid (H-MSL); export H-Ell" in refusal(good.replace("H-Ell ", "H-MSL "))
     assert "has no column of time; export GPSTime and Week" in refusal(good.replace("GPSTime", "Epoch  "))
     short = [*lines[: first + 5], lines[first + 5].rsplit(" ", 1)[0], *lines[first + 6 :]]
-    assert f"line {first + 6}: 22 words are expected, 21 are there" in refusal("\n".join(short))
+    assert f"line {first + 6}: 22 words are expected, 21 were found" in refusal("\n".join(short))
     letters = [*lines[: first + 5], lines[first + 5].replace("8 54", "8 x4"), *lines[first + 6 :]]
     assert f"counted from line {first + 1}" in refusal("\n".join(letters))
     turned = [*lines[:first], lines[first + 1], lines[first], *lines[first + 2 :]]
@@ -461,17 +461,17 @@ def test_rtklib_that_is_wrong_is_refused() -> None:
         ELLIPSOIDAL.replace("ellipsoidal", "geodetic") + DRIVE
     )
     assert "Japan Standard Time; export it in GPST" in refusal(DRIVE.replace("GPST", "JST "))
-    assert "'19-34-18.499' is no time of day" in refusal(DRIVE.replace("19:34:18.499", "19-34-18.499"))
-    assert "'19:34:inf' is no time of day" in refusal(DRIVE.replace("19:34:18.749", "19:34:inf"))
+    assert "'19-34-18.499' is not a time of day" in refusal(DRIVE.replace("19:34:18.499", "19-34-18.499"))
+    assert "'19:34:inf' is not a time of day" in refusal(DRIVE.replace("19:34:18.749", "19:34:inf"))
     for date in ("2025-07-08 19:34:18.499", "237x 243258.499", "2374 nan"):
-        said = f"'{date}' is no date and clock time, nor a GPS week and its seconds"
+        said = f"'{date}' is neither a date with a time of day nor a GPS week with its seconds"
         assert said in refusal(DRIVE.replace("2025/07/08 19:34:18.499", date))
     assert "has no positions" in refusal(DRIVE.splitlines()[0] + "\n")
-    assert "line 3: 24 fields are expected, 23 are there" in refusal(DRIVE.replace("-0.0060000 ", ""))
+    assert "line 3: 24 fields are expected, 23 were found" in refusal(DRIVE.replace("-0.0060000 ", ""))
     baseline = DRIVE.replace("latitude(deg) longitude(deg) height(m)", "e-baseline(m) n-baseline(m) u-baseline(m)")
     assert "has neither latitude, longitude and height nor ECEF" in refusal(baseline)
 
 
 @pytest.mark.parametrize("text", ["<kml></kml>", "time lat lon\n1 2 3\n", "% a comment\n1 2 3\n", " \n"])
 def test_other_texts_are_no_trajectory(text: str) -> None:
-    assert "is no trajectory: SBET, Waypoint text, RTKLIB .pos or trajectory CSV" in refusal(text)
+    assert "is not a trajectory; give SBET, Waypoint text, RTKLIB .pos or trajectory CSV" in refusal(text)

@@ -286,7 +286,7 @@ def test_part_of_a_trajectory_gives_the_same_poses() -> None:
 def test_time_that_does_not_rise_is_refused() -> None:
     times = START_NS + 10 * MS * np.arange(5)
     times[3] = times[2]
-    with pytest.raises(TrajectoryError, match=r"wild: time does not rise at GPS week 2445, 561618\.020 s"):
+    with pytest.raises(TrajectoryError, match=r"wild: time does not increase at GPS week 2445, 561618\.020 s"):
         wild(5, time_ns=times)
 
 

@@ -81,15 +81,15 @@ def test_right_time_is_called_right(flight: Flight) -> None:
 @pytest.mark.parametrize(
     ("seconds", "what"),
     [
-        (18.0, r"^its time is UTC, not GPS: \+18 s would be right$"),
-        (-18.0, r"^leap seconds were added to it twice: -18 s would be right$"),
-        (3.3, r"^its time is off: \+3\.\d+ s would be right$"),
-        (-0.25, r"^its time is off: -0\.2\d+ s would be right$"),
-        (7.0 * DAY_S, r"^its week is another: \+1 would be right$"),
-        (-14.0 * DAY_S, r"^its week is another: -2 would be right$"),
-        (7.0 * DAY_S + 18.0, r"^its week is another: \+1 would be right; its time is UTC, not GPS: \+18 s"),
-        (6.0 * DAY_S, r"^its day is another, or its time is seconds of the day: \+518400 s would be right$"),
-        (1024 * 7.0 * DAY_S, r"^its week is another: \+1024 would be right$"),
+        (18.0, r"^its time is UTC, not GPS: add \+18 s$"),
+        (-18.0, r"^leap seconds were added to it twice: add -18 s$"),
+        (3.3, r"^its time is off: add \+3\.\d+ s$"),
+        (-0.25, r"^its time is off: add -0\.2\d+ s$"),
+        (7.0 * DAY_S, r"^its week is wrong: add \+1$"),
+        (-14.0 * DAY_S, r"^its week is wrong: add -2$"),
+        (7.0 * DAY_S + 18.0, r"^its week is wrong: add \+1; its time is UTC, not GPS: add \+18 s"),
+        (6.0 * DAY_S, r"^its day is wrong, or its time is in seconds of the day: add \+518400 s$"),
+        (1024 * 7.0 * DAY_S, r"^its week is wrong: add \+1024$"),
     ],
 )
 def test_wrong_time_is_named(flight: Flight, seconds: float, what: str) -> None:
@@ -104,7 +104,7 @@ def test_before_leap_seconds_utc_is_no_wrong_time(flight: Flight) -> None:
     early_ns = START_NS - 10**9 * 604_800 * 10
     trajectory = replace(flight.trajectory, time_ns=flight.trajectory.time_ns - early_ns)
     shift = correlate_turn_rates(late(trajectory, 7.0 * DAY_S), flight.felt.time_ns - early_ns, flight.felt.rate_b)
-    assert shift.what == "its week is another: +1 would be right"
+    assert shift.what == "its week is wrong: add +1"
 
 
 def test_sigma_is_honest(flight: Flight) -> None:
@@ -161,7 +161,7 @@ def test_an_epoch_days_before_takes_no_memory(flight: Flight) -> None:
     shift = correlate_turn_rates(stray, *flight.felt)
     most = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert shift.what == "its time is UTC, not GPS: +18 s would be right"
+    assert shift.what == "its time is UTC, not GPS: add +18 s"
     assert most < 50_000_000
 
 

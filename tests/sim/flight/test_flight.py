@@ -475,43 +475,46 @@ def line_changed(index: int, **changes: Any) -> dict[str, Any]:
 
 
 MISTAKES = {
-    "line[1].name": (line_changed(1, name="east"), "'east' is the name of line[0] too; want another"),
+    "line[1].name": (line_changed(1, name="east"), "'east' is also the name of line[0]; choose another"),
     "line[0].from_m": (
         line_changed(0, from_m=[500_000.0, 5_200_000.0]),
-        "5224 km from flight.origin_deg; want metres east and north of it, at most 100 km away",
+        "5224 km from flight.origin_deg; give metres east and north of it, at most 100 km away",
     ),
-    "line[2].to_m": (line_changed(2, to_m=[1460.0, -200.0]), "a line of 40.0 m; want at least 60 m, one second"),
+    "line[2].to_m": (
+        line_changed(2, to_m=[1460.0, -200.0]),
+        "a line of 40.0 m; make it at least 60 m long, one second of flight",
+    ),
     "line[1].height_m": (
         line_changed(1, height_m=460.0),
-        "460 m is only 10.0 m above the terrain 0 m from its start (east 300, north 1200); want at least 465 m",
+        "460 m is only 10.0 m above the terrain 0 m from its start (east 300, north 1200); plan at least 465 m",
     ),
     "line[2].height_m": (
         line_changed(2, height_m=11000.0),
-        "9960 m of height to get there take 33 min at 5 m/s; want at most 9000 m, or a larger flight.climb_max_mps",
+        "9960 m of climb to this line takes 33 min at 5 m/s; plan at most 9000 m, or a larger flight.climb_max_mps",
     ),
     "flight.lead_s": (
         {"flight": {"lead_s": 1.0}},
-        "1 s are too short to roll out of a bank of 25° at 12°/s; want at least 1.7 s",
+        "1 s is too short to roll out of a bank of 25° at 12°/s; set at least 1.7 s",
     ),
     "flight.wind_mps": (
         {"flight": {"wind_mps": [-20.0, 15.0]}},
-        "25.0 m/s are more than half the speed of the slowest line, 45 m/s; want less",
+        "25.0 m/s is more than half the speed of the slowest line, 45 m/s; set less",
     ),
     "flight.turn_radius_m": (
         {"flight": {"turn_radius_m": 500.0}},
-        "500 m is tighter than flight.bank_max_deg of 25° at 60 m/s allows; want 812 m or more",
+        "500 m is tighter than flight.bank_max_deg of 25° at 60 m/s allows; set 812 m or more",
     ),
     "flight.bank_max_deg": (
         {"flight": {"bank_max_deg": 5.0, "speed_mps": 140.0}},
-        "turns of 24 km radius; want a bank and a speed that keep it below 20 km",
+        "turns of 24 km radius; set a bank and a speed that keep it below 20 km",
     ),
     "ground.height_m": (
         {"ground": GROUND | {"height_m": 500.0}},
-        "500 m is not where the terrain is, 450.0 m; want it within 10 m",
+        "500 m differs from the terrain's height, 450.0 m; give a height within 10 m of it",
     ),
     "ground.runway_m": (
         {"ground": GROUND | {"runway_m": [0.0, -150_000.0]}},
-        "150 km from flight.origin_deg; want metres east and north of it, at most 100 km away",
+        "150 km from flight.origin_deg; give metres east and north of it, at most 100 km away",
     ),
 }
 
@@ -532,7 +535,7 @@ def test_a_line_below_a_hill_says_where() -> None:
         return np.asarray(TERRAIN_M + 500.0 * np.exp(-((east_m - 600.0) ** 2 + (north_m + 200.0) ** 2) / 200.0**2))
 
     below = r"^line\[0\]\.height_m: 900 m is 50\.0 m below the terrain 2100 m from its start \(east 600, north -200\);"
-    with pytest.raises(PlanError, match=below + " want at least 965 m$"):
+    with pytest.raises(PlanError, match=below + " plan at least 965 m$"):
         fly(plan, Site.at(*plan.tables.flight.origin_deg), hill)
 
 

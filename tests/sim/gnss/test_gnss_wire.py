@@ -516,20 +516,20 @@ def test_after_the_flight_only_what_is_on_the_way_comes() -> None:
 @pytest.mark.parametrize(
     ("keys", "error"),
     [
-        ({"baud": 9600, "rate_hz": 20}, r"gnss\.rover\.baud: 9600 is too slow for \d+ bytes a second; want 57600 or"),
-        ({"baud": 57_600, "ins": True}, r"gnss\.rover\.baud: 57600 is too slow for \d+ bytes a second; want 230400 or"),
+        ({"baud": 9600, "rate_hz": 20}, r"gnss\.rover\.baud: 9600 is too slow for \d+ bytes a second; set 57600 or"),
+        ({"baud": 57_600, "ins": True}, r"gnss\.rover\.baud: 57600 is too slow for \d+ bytes a second; set 230400 or"),
         (
             {"baud": 9600, "rate_hz": 1, "latency_ms": 700.0},
-            r"gnss\.rover\.baud: 9600: messages would come 1\.\d\d s after the second they name; want 19200 or more",
+            r"gnss\.rover\.baud: 9600: messages would come 1\.\d\d s after the second they name; set 19200 or more",
         ),
         (
             {"latency_ms": 950.0},
-            r"gnss\.rover\.latency_ms: 950: messages would come 0\.98 s after .*; want at most 87\d",
+            r"gnss\.rover\.latency_ms: 950: messages would come 0\.98 s after .*; set at most 87\d",
         ),
         ({"protocol": "ubx", "secondary_lever_arm_m": SECOND_ARM}, r"gnss\.rover\.secondary_lever_arm_m: .*novatel"),
         (
             {"protocol": "nmea", "ins": True},
-            r'gnss\.rover\.ins: "nmea" has no such messages; want protocol = "novatel"',
+            r'gnss\.rover\.ins: "nmea" has no such messages; use protocol = "novatel"',
         ),
     ],
 )

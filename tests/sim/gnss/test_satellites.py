@@ -298,5 +298,5 @@ def test_ins_drifts_without_satellites_and_comes_back() -> None:
 
 
 def test_second_antenna_where_the_first_is() -> None:
-    with pytest.raises(PlanError, match=r"^gnss\.rover\.secondary_lever_arm_m: is lever_arm_m; want"):
+    with pytest.raises(PlanError, match=r"^gnss\.rover\.secondary_lever_arm_m: equals lever_arm_m; give"):
         receiver(secondary_lever_arm_m=LEVER_ARM)

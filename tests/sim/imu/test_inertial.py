@@ -335,7 +335,7 @@ def test_grades_get_worse_and_single_keys_override_them() -> None:
             'grade = "best"',
             r"^imu\.main\.grade: got 'best', want 'navigation', 'tactical', 'mems', 'consumer' or 'perfect'$",
         ),
-        ("noise = { gyro_bias = 1.0 }", r"^imu\.main\.noise\.gyro_bias: no such key$"),
+        ("noise = { gyro_bias = 1.0 }", r"^imu\.main\.noise\.gyro_bias: unknown key$"),
         ("noise = { accel_bias_mg = -1.0 }", r"^imu\.main\.noise\.accel_bias_mg: got -1\.0, want greater"),
     ],
 )

@@ -92,11 +92,11 @@ class TestRefusals:
     @pytest.mark.parametrize(
         ("text", "key", "words"),
         [
-            (text_of(flight="sped_mps = 50.0"), "flight.sped_mps", "no such key"),
-            (text_of(line="higth_m = 50.0"), "line[0].higth_m", "no such key"),
+            (text_of(flight="sped_mps = 50.0"), "flight.sped_mps", "unknown key"),
+            (text_of(line="higth_m = 50.0"), "line[0].higth_m", "unknown key"),
             (text_of(flight='speed_mps = "50"'), "flight.speed_mps", "got '50', want a valid number"),
             (text_of(flight='bank_max_deg = "25 deg"'), "flight.bank_max_deg", "got '25 deg', want a valid number"),
-            (text_of(flight="bank_max_rad = 0.4"), "flight.bank_max_rad", "no such key"),
+            (text_of(flight="bank_max_rad = 0.4"), "flight.bank_max_rad", "unknown key"),
             (text_of(flight="bank_max_deg = 75.0"), "flight.bank_max_deg", "got 75.0, want less than or equal to 60"),
             (text_of(flight="speed_mps = nan"), "flight.speed_mps", "got nan, want"),
             (text_of(flight="origin_deg = [47.5]"), "flight.origin_deg", "at least 2 items"),
@@ -116,7 +116,11 @@ class TestRefusals:
             ),
             (text_of(more='[[terrain.building]]\nroof = "round"'), "terrain.building[0].center_m", "is missing"),
             (text_of(more='[gnss."two words"]'), "gnss.two words.[key]", "got 'two words', want"),
-            (text_of(flight="start = 2026-06-15T09:00:00"), "flight.start", "has no offset; want UTC, as 2026-06-15"),
+            (
+                text_of(flight="start = 2026-06-15T09:00:00"),
+                "flight.start",
+                "has no UTC offset; write UTC as 2026-06-15",
+            ),
             ('[flight]\nname = "none"', "line", "is missing"),
             ('line = []\n[flight]\nname = "none"', "line", "at least 1 item"),
             (text_of().replace("height_m = 900.0", ""), "line[0].height_m", "is missing"),

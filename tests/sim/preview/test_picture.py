@@ -110,8 +110,8 @@ class TestSummary:
     @pytest.mark.parametrize(
         ("ranges", "words"),
         [
-            ("range_max_m = 350.0", "400 m above ground, but scanner.left measures to 350 m; want a height"),
-            ("range_min_m = 500.0", "400 m above ground, but scanner.left measures from 500 m on; want a height"),
+            ("range_max_m = 350.0", "400 m above ground, but scanner.left measures to 350 m; set a height"),
+            ("range_min_m = 500.0", "400 m above ground, but scanner.left measures from 500 m on; set a height"),
         ],
     )
     def test_a_line_out_of_range_is_refused(self, ranges: str, words: str) -> None:

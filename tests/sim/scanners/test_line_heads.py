@@ -346,7 +346,7 @@ def test_the_configuration_takes_the_geometry(kind: str) -> None:
         ),
         (
             {"kind": "polygon", "facet": [{"index": 1, "tilt_deg": 1.0}, {"index": 1, "tilt_deg": 2.0}]},
-            r"facet\[1\]\.index: facet 1 stands there twice",
+            r"facet\[1\]\.index: facet 1 is given twice",
         ),
         (
             {"kind": "nutating", "true": {"scan_plane_tilt_deg": 0.1}},

@@ -240,7 +240,7 @@ def test_without_noise_there_is_none() -> None:
         ),
         (
             {"ibrc": {"intensity": [0.0, 5.0, 5.0], "correction_m": [0.0, 1.0, 2.0]}},
-            r"ibrc\.intensity: 5 stands behind 5, want increasing values",
+            r"ibrc\.intensity: 5 follows 5, want increasing values",
         ),
         ({"true": {"range_scale_ppm": -1e6}}, r"true\.range_scale_ppm: got -1e\+06, want -100000 to 100000"),
     ],

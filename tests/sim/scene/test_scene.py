@@ -256,7 +256,7 @@ def test_control_points_keep_to_the_flatter_ground() -> None:
 
 def test_no_room_for_control_points_names_the_key() -> None:
     scene = scene_of("[[terrain.water]]\ncenter_m = [0, 0]\nradius_m = 290")
-    with pytest.raises(PlanError, match=r"^control\.points: no room for 10 in the open; want at most \d+$"):
+    with pytest.raises(PlanError, match=r"^control\.points: the open ground has no room for 10; set at most \d+$"):
         scene.control_points(10, 1)
     assert scene.control_points(0, 1).shape == (0, 3)
 

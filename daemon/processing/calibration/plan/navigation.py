@@ -123,7 +123,7 @@ def _observations(survey: Survey, name: str, table: GnssTable, setup: Setup, beg
     epochs = receiver.epochs(1, int(survey.trajectory.end_s * table.rate_hz) - 1)
     there = epochs.fix != FixType.NONE
     if not there.any():
-        raise NavigationError(f"gnss.{name}.outage: lasts the whole flight; want an end before that of the last line")
+        raise NavigationError(f"gnss.{name}.outage: lasts the whole flight; let it end before the last line ends")
     time_ns, age_ns = _gps(begin_ns, epochs.time_s[there]), _gps(0, epochs.velocity_age_s[there])
     place_e = e_from_geodetic(epochs.lat_rad, epochs.lon_rad, epochs.height_m)
     position, velocity = np.zeros((2, len(time_ns)), OBSERVATION_DTYPE)

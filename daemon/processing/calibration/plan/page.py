@@ -112,13 +112,13 @@ def _sigmas(axes: Axes, rows: Sequence[dict[str, Any]]) -> None:
     for y, width, row in zip(place, shown, rows, strict=True):
         axes.text(width * 1.15, y, _sigma_words(row), fontsize=7.5, color=INK, va="center")
     axes.set_title(
-        "Predicted sigma, against the largest that is of use", fontsize=9, weight="bold", color=INK, loc="left"
+        "Predicted sigma relative to the largest useful one", fontsize=9, weight="bold", color=INK, loc="left"
     )
 
 
 def _sigma_words(row: dict[str, Any]) -> str:
     if row["sigma"] is None:
-        return "not at all"
+        return "undetermined"
     return f"± {row['sigma']:,.0f}" if row["sigma"] >= 1000.0 else f"± {row['sigma']:.3g}"
 
 

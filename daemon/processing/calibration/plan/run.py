@@ -133,7 +133,9 @@ class PlannedCalibration:
     @property
     def notes(self) -> list[str]:
         """Limits of the prediction: what it leaves out, one line each."""
-        return [f"not predicted: {words}; pulses on paper return once, without intensity" for words in self.unplanned]
+        return [
+            f"not predicted: {words}; planned pulses have one return, without intensity" for words in self.unplanned
+        ]
 
     @property
     def lacking(self) -> list[str]:
@@ -150,7 +152,7 @@ class PlannedCalibration:
         if not self.lacking:
             rest = len(self.rows) - len(basic)
             extra = f", and {more} of {rest} others" if rest else ""
-            extra += f"; {', '.join(self.fixed)} held at your word" if self.fixed else ""
+            extra += f"; {', '.join(self.fixed)} held by your choice" if self.fixed else ""
             return f"This flight determines boresight and range offset{extra}."
         words = " and ".join(part for part in (", ".join(self.lacking[:-1]), self.lacking[-1]) if part)
         return f"This flight does not determine {words}."
@@ -211,8 +213,10 @@ def _rows(predicted: Predicted) -> list[dict[str, Any]]:
         parameter = by_name[short][1]
         wanted = USEFUL[parameter.key]
         useful = held is None and sigma <= wanted * parameter.factor
-        told, need = (f"{value:.3g} {parameter.key.rpartition('_')[2]}" for value in (sigma / parameter.factor, wanted))
-        poor = f"would be known to {told}, where {need} is of use"
+        predicted_words, need = (
+            f"{value:.3g} {parameter.key.rpartition('_')[2]}" for value in (sigma / parameter.factor, wanted)
+        )
+        poor = f"would be known to {predicted_words}; {need} or better is useful"
         rows.append(
             {
                 "scanner": scanner,

@@ -132,7 +132,7 @@ def _reasons(verdict: Verdict) -> Table | None:
     if not verdict.reasons:
         return None
     rows = [[reason.what, reason.change] for reason in verdict.reasons[:MOST_REASONS]]
-    return Table("Reasons", ("what", "what to do"), rows, left=(0, 1), stacked=True)
+    return Table("Reasons", ("what", "remedy"), rows, left=(0, 1), stacked=True)
 
 
 def _by_wish(report: ReportInput) -> Words | None:
@@ -153,8 +153,8 @@ def _observed(report: ReportInput) -> Words:
         kinds[plane.kind or "other"] = kinds.get(plane.kind or "other", 0) + 1
     patches = sum(len(plane.patches) for plane in features.planes)
     points = sum(plane.points for plane in features.planes)
-    told = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items(), key=lambda item: -item[1]))
-    words = f"{len(features.planes)} planes ({told}) in {patches} patches of {thousands(points)} returns"
+    counts = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items(), key=lambda item: -item[1]))
+    words = f"{len(features.planes)} planes ({counts}) in {patches} patches of {thousands(points)} returns"
     return Words(words + (f"; {len(features.ties)} tie points." if features.ties else "."))
 
 
@@ -171,26 +171,27 @@ def _outliers(report: ReportInput) -> list[Block]:
         return [Words("No observation was rejected.", "Outliers")]
     rejected = sum(group.rejected for group in report.adjusted.groups)
     every = max(sum(group.observations for group in report.adjusted.groups), 1)
-    told = f"{thousands(rejected)} of {thousands(every)} observations were rejected."
-    return [Words(told, "Outliers"), *tables]
+    text = f"{thousands(rejected)} of {thousands(every)} observations were rejected."
+    return [Words(text, "Outliers"), *tables]
 
 
 MODEL = (
     "Each point is x_e = x_b + R_e_l · R_l_b · (a + R_b_s · x_s) at the pulse's time (ISO/TS 19159-2, Eq. 10), with "
-    "the beam, range and scan angle corrected by the parameters above. Points of one plane in several strips fulfil "
-    "n · x = d (Eq. 16, 17), |n| = 1 held exactly. Parameters and planes are estimated together (Gauss–Helmert, "
-    "Eq. 19, 20; Skaloud and Lichti 2006): eight observables a point (position and attitude of the body, range, scan "
+    "the beam, range and scan angle corrected by the parameters above. Points of one plane in several strips satisfy "
+    "n · x = d (Eq. 16, 17), |n| = 1 held exactly. Parameters and planes are estimated together (Gauss–Helmert, Eq. "
+    "19, 20; Skaloud and Lichti 2006): eight observables a point (position and attitude of the body, range, scan "
     "angle), planes eliminated one by one (Schur complement)."
 )
 STOCHASTIC = (
-    "Range and scan angle carry the scanner's noise, each return its own. Errors of the trajectory are the same for "
-    "neighbouring returns: they are estimated along, as corrections at knots in time with the trajectory's own sigmas "
-    "and correlation. Gross errors are weighted down, then tested one by one (data snooping; Baarda 1968, Pope 1976)."
+    "Range and scan angle have the scanner's noise, independent for each return. Errors of the trajectory are the "
+    "same for neighbouring returns: the adjustment estimates them too, as corrections at knots in time with the "
+    "trajectory's own sigmas and correlation. Gross errors are weighted down, then tested one by one (data snooping; "
+    "Baarda 1968, Pope 1976)."
 )
 NO_TRAJECTORY = (
-    "Range and scan angle carry the scanner's noise. The trajectory's errors were taken as each return's own, which "
-    "they are not: the sigmas here are too small. Gross errors are weighted down, then tested one by one (data "
-    "snooping; Baarda 1968, Pope 1976)."
+    "Range and scan angle have the scanner's noise. The adjustment took the trajectory's errors as independent for "
+    "each return, which they are not: the sigmas here are too small. Gross errors are weighted down, then tested one "
+    "by one (data snooping; Baarda 1968, Pope 1976)."
 )
 
 
@@ -206,18 +207,20 @@ def _method(report: ReportInput) -> list[Block]:
     test = (
         ""
         if adjusted.global_test >= 0.001
-        else ("; with so many observations the test notices what does not matter, so look at the factor itself")
+        else (
+            "; with so many observations the test detects differences that do not matter, so judge by the factor itself"
+        )
     )
-    told = (
+    text = (
         f"{len(adjusted.names)} unknowns, redundancy {thousands(adjusted.redundancy)}. The adjustment {ended} after "
-        f"{adjusted.iterations} iterations; matches were found anew {adjusted.matchings} "
+        f"{adjusted.iterations} iterations; matches were searched again {adjusted.matchings} "
         f"{'time' if adjusted.matchings == 1 else 'times'}. Variance factor {number(adjusted.variance_factor, '.3f')} "
         f"(global test: p = {number(adjusted.global_test, '.2g')}{test}).{weakest}"
     )
     if adjusted.scaled:
-        told += " The global test rejected: all sigmas are multiplied by the square root of the variance factor."
+        text += " The global test failed: all sigmas are multiplied by the square root of the variance factor."
     stochastic = NO_TRAJECTORY if adjusted.trajectory is None else STOCHASTIC
-    return [Words(MODEL, "How it was computed"), Words(stochastic), Words(told)]
+    return [Words(MODEL, "How it was computed"), Words(stochastic), Words(text)]
 
 
 def _run(report: ReportInput) -> Table | None:

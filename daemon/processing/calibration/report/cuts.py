@@ -117,8 +117,8 @@ def cut_picture(report: ReportInput) -> Picture | None:
         canvas.legend(look, 4 if canvas.form.narrow else 10)
 
     words = (
-        f"Points of all strips within {100 * HALF_WIDTH_M:.0f} cm of a line down a roof, heights from its middle. "
-        "Calibration only: corrections of the trajectory are not applied."
+        f"Points of all strips within {100 * HALF_WIDTH_M:.0f} cm of a line down a roof, heights relative to its "
+        "middle. The calibration alone is applied, without corrections of the trajectory."
     )
     height = Panels.height_in
     return Picture("Profiles", words, lambda form: top_in(form) + height(form, len(titles), PANEL_IN), draw)

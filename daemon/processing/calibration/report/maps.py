@@ -51,7 +51,7 @@ def map_picture(report: ReportInput) -> Picture:
         canvas.legend(shown.legend(), 3 if canvas.form.narrow else 10)
         _words(axes)
 
-    words = "Colour: root mean square of a plane's residuals. Arrows: strips as flown."
+    words = "Colour: root mean square of a plane's residuals. Arrows: strips in the direction of flight."
     return Picture("Strips and planes", words, height_in, draw)
 
 
@@ -84,7 +84,9 @@ def difference_picture(report: ReportInput) -> Picture | None:
             _words(axes)
         canvas.legend(_difference_legend(), 3 if form.narrow else 9)
 
-    words = "Height differences of overlapping strips, first − second, of each cell the largest; RMSDz is of all pairs."
+    words = (
+        "Height differences of overlapping strips, first − second, the largest in each cell; RMSDz covers all pairs."
+    )
     return Picture("Difference maps", words, height_in, draw)
 
 

@@ -73,7 +73,9 @@ def correlation_picture(report: ReportInput) -> Picture | None:
         axes.spines[:].set_visible(False)
 
     more = f" The first {count} of {len(adjusted.names)} unknowns." if len(adjusted.names) > count else ""
-    text = "Of the unknowns after the adjustment; beyond ±0.95 two of them can hardly be told apart." + more
+    text = (
+        "Correlations of the unknowns after the adjustment; beyond ±0.95 two unknowns can hardly be separated." + more
+    )
     return Picture("Correlations", text, lambda form: room + cell_in(form) * count + 0.1, draw)
 
 
@@ -90,9 +92,9 @@ def _cells(axes: Axes, matrix: FloatArray, cell_in: float) -> None:
         face = "#e4e7e2" if own else colours(norm(float(value)))
         axes.add_patch(Rectangle((column + 0.03, row + 0.03), 0.94, 0.94, fc=face, ec="none"))
         if size >= 3.4:
-            told = "1" if own else number(float(value), ".2f").replace("0.", ".", 1)
+            text = "1" if own else number(float(value), ".2f").replace("0.", ".", 1)
             ink = MUTED if own else "white" if abs(value) > 0.75 else INK
-            axes.text(column + 0.5, row + 0.52, told, fontsize=size, color=ink, ha="center", va="center")
+            axes.text(column + 0.5, row + 0.52, text, fontsize=size, color=ink, ha="center", va="center")
 
 
 def strips_picture(report: ReportInput) -> Picture | None:
@@ -133,7 +135,7 @@ def strips_picture(report: ReportInput) -> Picture | None:
         )
 
     more = f" The {MOST_PAIRS} worst of {len(report.after)}." if len(report.after) > MOST_PAIRS else ""
-    words = "Dashed: limits of RMSDz in swath overlap, USGS Lidar Base Specification." + more
+    words = "Dashed lines: limits of RMSDz in swath overlap, USGS Lidar Base Specification." + more
     return Picture("Strips against each other", words, lambda form: 0.35 + row_in * len(pairs) + 0.55, draw)
 
 
@@ -165,7 +167,7 @@ def control_picture(report: ReportInput) -> Picture | None:
     def height_in(form: Format) -> float:
         return 2.35 + (room if form.narrow or len(points) > 16 else 0.0)
 
-    return Picture("Control", "Surveyed − laser, up positive, with one sigma.", height_in, draw)
+    return Picture("Control", "Surveyed − laser height, positive upwards, with one sigma.", height_in, draw)
 
 
 def trajectory_pictures(report: ReportInput) -> list[Picture]:
@@ -174,7 +176,7 @@ def trajectory_pictures(report: ReportInput) -> list[Picture]:
     if fit is None:
         return []
     sessions = np.unique(fit.flown)
-    return [_trajectory_picture(fit, int(flown), several=len(sessions) > 1) for flown in sessions]
+    return [_trajectory_picture(fit, int(number), several=len(sessions) > 1) for number in sessions]
 
 
 TURNS = ("Turn about north (0.001°)", "Turn about east (0.001°)", "Turn about down (0.001°)")
@@ -218,7 +220,7 @@ def _trajectory_picture(fit: TrajectoryFit, flown: int, *, several: bool) -> Pic
         )
 
     title = f"Corrections of the trajectory{f', session {flown + 1}' if several else ''}"
-    words = "What is added to the trajectory to make it true, estimated along with the calibration."
+    words = "Corrections that are added to the trajectory, estimated together with the calibration."
     return Picture(title, words, lambda form: 0.3 + Panels.height_in(form, 6, panel_in), draw)
 
 
@@ -248,4 +250,6 @@ def intensity_picture(report: ReportInput) -> Picture | None:
         axes.set_ylabel("mm", fontsize=8.5, color=MUTED)
         canvas.legend([Line2D([], [], color=colour_of(i), label=name) for i, (name, _) in enumerate(known)])
 
-    return Picture("Range correction by intensity", "Subtracted from the range.", lambda form: 2.55, draw)
+    return Picture(
+        "Range correction by intensity", "This correction is subtracted from the range.", lambda form: 2.55, draw
+    )

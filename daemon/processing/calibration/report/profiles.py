@@ -39,11 +39,11 @@ _SVG: Any = {"svg.hashsalt": "profile", "svg.fonttype": "path"}
 MOST_DRAWN = 6
 MOST_RETURNS = 8000
 DOUBTFUL = 3.0
-TITLE = "Profiles, an independent check"
+TITLE = "Profiles as an independent check"
 UNDER = (
-    "Roll, pitch, heading and range from profile pairs over the areas of the stepwise procedure, on the trajectory as "
-    "it came, all other parameters as adjusted. Both share the flight and its trajectory's errors: the sigma of the "
-    "difference is what the two do not share."
+    "Roll, pitch, heading and range from profile pairs over the areas of the stepwise procedure, on the uncorrected "
+    "trajectory, with all other parameters as adjusted. Both methods share the flight and its trajectory's errors: "
+    "the sigma of the difference covers only the errors that they do not share."
 )
 
 
@@ -55,8 +55,8 @@ def comparison_table(checked: Check) -> Table | None:
         return None
     several = len({one.scanner for one in checked.comparisons} | {scanner for scanner, _ in checked.missing}) > 1
     rows = [_compared(one, several=several) for one in checked.comparisons]
-    lost = "; ".join(f"{kind} has none: {why}" for (_, kind), why in checked.missing.items())
-    heads = ("parameter", "unit", "profiles", "profiles say", "sigma", "adjustment says", "sigma", "difference / sigma")
+    lost = "; ".join(f"{kind} has no profiles: {why}" for (_, kind), why in checked.missing.items())
+    heads = ("parameter", "unit", "profiles", "by profiles", "sigma", "by adjustment", "sigma", "difference / sigma")
     return Table(TITLE, heads, rows, f"{UNDER} {lost[:1].upper()}{lost[1:]}{'.' if lost else ''}".strip())
 
 
@@ -87,7 +87,7 @@ def profiles_table(checked: Check) -> Table | None:
         for profile in checked.profiles
     ]
     heads = ("kind", "strips", "separation, m", "sigma", "baseline, m", "pieces", "formula")
-    under = "Measured with the points as adjusted: the separations are what is left."
+    under = "Measured on the adjusted points: the separations are residual."
     return Table("", heads, rows, under, left=(0, 1, 6)) if rows else None
 
 

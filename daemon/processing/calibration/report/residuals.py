@@ -67,11 +67,11 @@ def residual_picture(report: ReportInput) -> Picture | None:
 
     def draw(canvas: Canvas) -> None:
         panels = Panels(canvas, titles, PANEL_IN, 0.25)
-        flown = np.unique(seen.swath)
-        _columns(panels.axes[0], np.searchsorted(flown, seen.swath), seen, half_cm, np.arange(len(flown) + 1) - 0.5)
-        words = [names[index] for index in flown.tolist()]
+        swaths = np.unique(seen.swath)
+        _columns(panels.axes[0], np.searchsorted(swaths, seen.swath), seen, half_cm, np.arange(len(swaths) + 1) - 0.5)
+        words = [names[index] for index in swaths.tolist()]
         long = max(len(word) for word in words) * len(words) > (44 if not canvas.form.narrow else 34)
-        panels.axes[0].set_xticks(np.arange(len(flown)), words, rotation=90 if long else 0, fontsize=7.5)
+        panels.axes[0].set_xticks(np.arange(len(swaths)), words, rotation=90 if long else 0, fontsize=7.5)
         for axes, values in zip(panels.axes[1:], (seen.angle_deg, seen.range_m, seen.intensity), strict=True):
             low, high = np.percentile(values, [0.2, 99.8])
             _columns(axes, values, seen, half_cm, np.linspace(low, max(high, low + 1e-6), columns + 1))
@@ -80,13 +80,13 @@ def residual_picture(report: ReportInput) -> Picture | None:
         canvas.legend(
             [
                 Line2D([], [], color=BAD, lw=1.4, label="median"),
-                Line2D([], [], color=BAD, lw=0.8, ls=(0, (3, 2)), label="two thirds lie between"),
+                Line2D([], [], color=BAD, lw=0.8, ls=(0, (3, 2)), label="limits of the middle two thirds"),
             ]
         )
 
     words = (
-        "Along the plane's normal, of all observations that were kept. Each column is shaded by how many lie where; a "
-        "median that leaves zero tells of an error the model does not hold."
+        "Residuals along the plane's normal, of all accepted observations. The shade shows how many lie at each "
+        "place of a column; a median away from zero shows an error that the model does not describe."
     )
     return Picture("Residuals", words, lambda form: 0.25 + Panels.height_in(form, 4, PANEL_IN), draw)
 
@@ -133,7 +133,7 @@ def normal_picture(report: ReportInput) -> Picture | None:
             _bars(axes, group, SERIES[i])
         canvas.legend([Line2D([], [], color=INK, lw=1.1, label="normal distribution, sigma 1")])
 
-    words = "Residuals over their own sigmas (w of data snooping); those beyond ±5 stand at the edge."
+    words = "Residuals divided by their sigmas (w of data snooping); those beyond ±5 are drawn at the edge."
 
     def height_in(form: Format) -> float:
         return 0.3 + Panels.height_in(form, len(groups), NORMAL_IN, columns_of(form))

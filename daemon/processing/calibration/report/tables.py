@@ -78,19 +78,24 @@ def _parameters(report: ReportInput, scanner: str, *, several: bool) -> Table:
     for parameter in PARAMETERS:
         if parameter.name in held:
             one = unknown(f"{scanner}.{parameter.name}")
-            told = number(calibration.value(parameter.name) * one.factor, ".6g")
+            value = number(calibration.value(parameter.name) * one.factor, ".6g")
             why = "not determined" if is_undetermined(held[parameter.name]) else "held"
             sigma = float(calibration.held_sigmas[INDEX[parameter.name]]) * one.factor
             plausible = number(sigma, f".{decimals_of(sigma)}f") if sigma > 0.0 else "–"
-            rows.append([one.words, one.unit, told, plausible, told, why, "–", "–"])
+            rows.append([one.words, one.unit, value, plausible, value, why, "–", "–"])
     heads = ("parameter", "unit", "estimate", "sigma", "start", "change", "change / sigma", "sigma before")
     honest = adjusted.trajectory is not None
-    words = "errors of the trajectory included" if honest else "too small: without what the trajectory's errors share"
-    under = f"Sigmas are one standard deviation, {words}, and what held parameters may have wrong."
-    for told in held_words(adjusted):
-        under += f" {told[0].upper()}{told[1:]}."
+    words = (
+        "including the trajectory's errors and the plausible errors of held parameters"
+        if honest
+        else "including the plausible errors of held parameters, but too small, because they leave out the common part "
+        "of the trajectory's errors"
+    )
+    under = f"Sigmas are one standard deviation, {words}."
+    for sentence in held_words(adjusted):
+        under += f" {sentence[0].upper()}{sentence[1:]}."
     if any(row[6].endswith("·") for row in rows):
-        under += f" · the change is below {INSIGNIFICANT:g} sigmas: the start may have been as good."
+        under += f" · the change is below {INSIGNIFICANT:g} sigmas: the initial value may have been as good."
     title = f"Parameters of {scanner}" if several else "Parameters"
     return Table(title, heads, rows, under, pale=frozenset(range(estimated, len(rows))))
 
@@ -100,8 +105,8 @@ def _estimated(one: Unknown, start: float, value: float, sigma: float, prior: fl
     start, value, sigma, prior = (one.factor * number_ for number_ in (start, value, sigma, prior))
     pattern = f".{digits}f"
     ratio = abs(value - start) / sigma if sigma > 0.0 else math.inf
-    told = thousands(ratio, 0) if ratio >= 100.0 else number(ratio, ".1f")
-    told += " ·" if ratio < INSIGNIFICANT else ""
+    ratio_text = thousands(ratio, 0) if ratio >= 100.0 else number(ratio, ".1f")
+    ratio_text += " ·" if ratio < INSIGNIFICANT else ""
     change = number(value - start, f"+{pattern}")
     told_value, told_sigma, told_start = (number(x, pattern) for x in (value, sigma, start))
     return [
@@ -111,7 +116,7 @@ def _estimated(one: Unknown, start: float, value: float, sigma: float, prior: fl
         told_sigma,
         told_start,
         change,
-        told,
+        ratio_text,
         number(prior, f".{decimals_of(prior)}f"),
     ]
 
@@ -148,8 +153,10 @@ def held_table(report: ReportInput) -> Table | None:
         ]
         for one in held
     ]
-    heads = ("parameter", "sigma it would have", "not to be told apart from", "why", "what would determine it")
-    under = "Held at the values they had before; what the calibration gives holds as far as these are right."
+    heads = ("parameter", "sigma if estimated", "cannot be separated from", "why", "remedy")
+    under = (
+        "These parameters keep their previous values; the calibration is valid only as far as these values are right."
+    )
     return Table("Not determined by this flight", heads, rows, under, left=(0, 2, 3, 4), stacked=True)
 
 
@@ -174,8 +181,8 @@ def strips_table(report: ReportInput) -> Table | None:
     for pair in pairs[:MOST_ROWS]:
         before, after = report.before.get(pair), report.after[pair]
         early = "–" if before is None else number(100.0 * before.rms_m, ".1f")
-        told = [number(100.0 * x, ".1f") for x in (after.rms_m, after.mean_m, after.std_m, after.max_m)]
-        rows.append([f"{pair[0]} – {pair[1]}", thousands(after.count), early, *told])
+        figures = [number(100.0 * x, ".1f") for x in (after.rms_m, after.mean_m, after.std_m, after.max_m)]
+        rows.append([f"{pair[0]} – {pair[1]}", thousands(after.count), early, *figures])
     heads = ("strips", "compared", "RMSDz before", "RMSDz after", "mean", "std", "largest")
     measure = f" {report.measure}." if report.measure else ""
     return Table("", heads, rows, f"Centimetres.{measure}{_more(len(pairs))}")
@@ -213,8 +220,10 @@ def outlier_tables(report: ReportInput) -> list[Table]:
             for index in np.argsort(-count, kind="stable")[: MOST_ROWS // 2].tolist():
                 if count[index]:
                     name = _feature(report, group, index)
-                    told = f"{thousands(count[index])} of {thousands(of[index])}"
-                    rejected.append([name, group.group, told, _strips(report, group, out & (group.feature == index))])
+                    share_text = f"{thousands(count[index])} of {thousands(of[index])}"
+                    rejected.append(
+                        [name, group.group, share_text, _strips(report, group, out & (group.feature == index))]
+                    )
         kept = np.flatnonzero(~out & (np.abs(group.normalised) > SUSPECT))
         for row in kept[np.argsort(-np.abs(group.normalised[kept]), kind="stable")][:8].tolist():
             one = np.zeros(len(out), np.bool_)
@@ -229,7 +238,8 @@ def outlier_tables(report: ReportInput) -> list[Table]:
     if suspects:
         heads = ("where", "group", "residual", "w", "strip")
         under = (
-            f"The largest normalised residuals that were kept; |w| above {SUSPECT:g} has one sound one in a thousand."
+            "The largest normalised residuals that were accepted; one good observation in a thousand exceeds |w| "
+            f"= {SUSPECT:g}."
         )
         tables.append(Table("", heads, suspects, under, left=(0, 4)))
     return tables
@@ -248,7 +258,7 @@ def _strips(report: ReportInput, group: Residuals, rows: NDArray[np.bool_]) -> s
 def refused_table(report: ReportInput) -> Table | None:
     """Return a table of the reasons why candidates were not used; None if all were."""
     rows = [[reason, thousands(count)] for reason, count in report.features.refused.most_common()]
-    return Table("", ("candidates not taken", "number"), rows) if rows else None
+    return Table("", ("rejected candidates", "number"), rows) if rows else None
 
 
 def control_table(report: ReportInput) -> Table | None:
@@ -258,27 +268,30 @@ def control_table(report: ReportInput) -> Table | None:
     several = len(report.adjusted.calibrations) > 1
     rows = []
     for point in report.adjusted.control:
-        told = "–"
+        change = "–"
         if point.influence:
             name, moved = max(point.influence.items(), key=lambda item: abs(item[1]))
             one = unknown(name)
-            told = f"{words_of(one.scanner, one.name, several=several)}: {number(moved, '+.2f')} sigmas"
+            change = f"{words_of(one.scanner, one.name, several=several)}: {number(moved, '+.2f')} sigmas"
         fit = (
             number(100.0 * point.misclosure_m, "+.1f"),
             number(100.0 * point.sigma_m, ".1f"),
             number(point.normalised, "+.2f"),
         )
-        rows.append([point.name, *fit, told])
+        rows.append([point.name, *fit, change])
     values = np.array([point.misclosure_m for point in report.adjusted.control])
     rms, mean = (length(float(x)) for x in (np.sqrt(np.mean(values**2)), values.mean()))
     under = f"{len(values)} points: RMS {rms}, mean {mean}. "
-    under += "Each was used; at the right, what leaving it out would change most."
-    heads = ("point", "misclosure cm", "sigma cm", "w", "left out, changes most")
+    under += (
+        "The adjustment used every point; the rightmost column shows the parameter that changes most when the point "
+        "is left out."
+    )
+    heads = ("point", "misclosure cm", "sigma cm", "w", "changes most if left out")
     return Table("", heads, rows, under, left=(0, 4))
 
 
 def detectable_table(report: ReportInput) -> Table | None:
     """Return a table of the smallest errors that would be detected; None if there are none."""
     rows = [[OBSERVED.get(name, name), length(value)] for name, value in report.adjusted.least_detectable.items()]
-    under = "An error of this size in one observation is found with probability 0.8 (significance 0.001)."
-    return Table("Smallest errors that would be found", ("observation", "size"), rows, under) if rows else None
+    under = "An error of this size in one observation is detected with probability 0.8 (significance 0.001)."
+    return Table("Smallest detectable errors", ("observation", "size"), rows, under) if rows else None

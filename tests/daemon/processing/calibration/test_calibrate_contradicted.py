@@ -70,7 +70,7 @@ def test_nothing_speaks_against_what_was_found(done: Calibrated) -> None:
 
 def test_strips_speak_against_a_roll_that_is_off(done: Calibrated) -> None:
     (said,) = strips_say(wrong(done, omega_rad=ROLL_RAD), CELL_M)
-    assert said.what.startswith("strips still show roll: ")
+    assert said.what.startswith("strips still show this effect: roll: ")
     assert "to omega_deg" in said.what
     assert "swath strips" in said.change
     assert said.excess > 1.0
@@ -101,7 +101,7 @@ def test_all_three_are_told_in_the_verdict_of_a_calibration(done: Calibrated, wi
     bad = wrong(done, omega_rad=ROLL_RAD)
     bad = replace(bad, check=Check((), (comparison,)))
     words = [
-        "strips still show roll: ",
+        "strips still show this effect: roll: ",
         "validation: crossStripFlight (002): ",
         "8 profiles put boresight φ (pitch) −0.0026° from the adjustment (−3.0 sigmas)",
     ]

@@ -49,7 +49,7 @@ def test_a_scanner_without_noise_is_refused() -> None:
 
     for noise in (Noise(0.02, 0.0, 0.0, 0.0), Noise(0.0, 2e-5, 0.0, 0.0), Noise(0.0, 0.0, 0.0, 3e-4)):
         refuse_without_noise(kept_with(noise))
-    with pytest.raises(UserError, match=r"a\.mcap: scanner\.left: range_sigma_m, .* are all 0; want") as raised:
+    with pytest.raises(UserError, match=r"a\.mcap: scanner\.left: range_sigma_m, .* are all 0; set") as raised:
         refuse_without_noise(kept_with(Noise(0.0, 0.0, divergence_rad=0.0)))
     assert "\n" not in str(raised.value)
 
@@ -63,16 +63,16 @@ def test_polygons() -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("", "line 1: no column WKT"),
-        ("WKT,id\n", "line 1: no column name"),
-        ("WKT,name\n", "no polygons"),
+        ("", "line 1: column WKT is missing"),
+        ("WKT,id\n", "line 1: column name is missing"),
+        ("WKT,name\n", "has no polygons"),
         ('WKT,name\n"POINT (1 2)",a\n', "line 2: WKT: got 'POINT (1 2)'"),
-        ('WKT,name\n"POLYGON ((0 0, 1 0))",a\n', "got 2 corners"),
-        ('WKT,name\n"POLYGON ((0 0, 1 nan, 2 2))",a\n', "got the corner '1 nan'"),
-        ('WKT,name\n"POLYGON ((0 0, 1, 2 2))",a\n', "got the corner '1'"),
-        ('WKT,name\n"POLYGON ((0 0, 1 0, 1 1), (0 0, 1 0, 1 1))",a\n', "no holes"),
+        ('WKT,name\n"POLYGON ((0 0, 1 0))",a\n', "has 2 corners"),
+        ('WKT,name\n"POLYGON ((0 0, 1 nan, 2 2))",a\n', "the corner is '1 nan'"),
+        ('WKT,name\n"POLYGON ((0 0, 1, 2 2))",a\n', "the corner is '1'"),
+        ('WKT,name\n"POLYGON ((0 0, 1 0, 1 1), (0 0, 1 0, 1 1))",a\n', "without holes"),
         ('WKT,name\n"POLYGON ((0 0, 1 0, 1 1))",\n', "name: is missing"),
-        (GOOD + '"POLYGON ((0 0, 1 0, 1 1))",roof 2\n', "line 4: name: roof 2 is there twice"),
+        (GOOD + '"POLYGON ((0 0, 1 0, 1 1))",roof 2\n', "line 4: name: roof 2 is given twice"),
     ],
 )
 def test_polygons_that_are_none(text: str, said: str) -> None:
@@ -103,10 +103,10 @@ def test_picked_points_become_ties(read: Any, tmp_path: Path) -> None:
     (tie,) = ties_of(path, read).ties
     assert [sighting.swath for sighting in tie.sightings] == [0, 1]
     path.write_text("name,strip,x,y,z,sigma_m\n" + rows[0] + "\n" + "corner,02,1,2,3,0.03\n")
-    with pytest.raises(UserError, match=r"no tie point is left .* want places in output\.crs"):
+    with pytest.raises(UserError, match=r"no tie point remains .* give positions in output\.crs"):
         ties_of(path, read)
     path.write_text("name,x,y\n")
-    with pytest.raises(PickedError, match="line 1: got name, x, y; want the columns"):
+    with pytest.raises(PickedError, match="line 1: has name, x, y; the columns must be"):
         ties_of(path, read)
     with pytest.raises(UserError, match=r"nowhere\.csv: cannot be read: No such file"):
         ties_of(tmp_path / "nowhere.csv", read)

@@ -127,24 +127,24 @@ def test_options_stand_above_the_file(
         ('model = "all"', 'model.toml: model: got "all", want "basic", "scanner" or "full"'),
         ("[parameter]", "model.toml: parameter: unknown key; did you mean parameters?"),
         ("[beams]\nestimate = []", "model.toml: beams: unknown key; did you mean beam?"),
-        ("[parameters]\nphi_dg = 'free'", "model.toml: parameters.phi_dg: is no parameter; did you mean phi_deg?"),
+        ("[parameters]\nphi_dg = 'free'", "model.toml: parameters.phi_dg: unknown parameter; did you mean phi_deg?"),
         (
             "[parameters]\nleft.phi = 'free'",
-            "model.toml: parameters.left.phi: is no parameter; did you mean left.phi_d",
+            "model.toml: parameters.left.phi: unknown parameter; did you mean left.phi_d",
         ),
         ("[parameters]\nphi_deg = 'fre'", 'parameters.phi_deg: got "fre", want "free", "fixed" or { prior = SIGMA }'),
         ("[parameters]\nphi_deg = { prior = 0 }", "parameters.phi_deg: got prior = 0, want "),
         ("[parameters]\nphi_deg = { priro = 0.1 }", "parameters.phi_deg: got a table, want "),
         ("[parameters]\nphi_deg = { prior = true }", "parameters.phi_deg: got prior = true, want "),
         ("[parameters]\nphi_deg = 0.1", "parameters.phi_deg: got 0.1, want "),
-        ("[parameters]\n'ibrc.1' = { prior = 0.1 }", "parameters.ibrc.1: is no parameter; want one of omega_deg"),
+        ("[parameters]\n'ibrc.1' = { prior = 0.1 }", "parameters.ibrc.1: unknown parameter; use one of omega_deg"),
         (
             "[parameters]\n'ibrc.1' = { prior = 0.1 }\n[ibrc]\nknots = [1, 2]",
-            "parameters.ibrc.1: is no parameter; did you mean ibrc.0?",  # that is the reference
+            "parameters.ibrc.1: unknown parameter; did you mean ibrc.0?",  # that is the reference
         ),
         (
             "[parameters]\n'range_offset_slot.1' = 'free'\n[range_offset]\nreturn_slots = [1]",
-            "parameters.range_offset_slot.1: its table asks for it; want a prior, or nothing",
+            "parameters.range_offset_slot.1: its table already requests it; give a prior, or leave it out",
         ),
         (
             "[parameters]\nphi_deg = { prior = 1" + 400 * "0" + " }",
@@ -152,9 +152,9 @@ def test_options_stand_above_the_file(
         ),
         (
             "[parameters]\nleft.phi_deg = 'free'\n'left.phi_deg' = 'fixed'",
-            "model.toml: parameters: left.phi_deg stands there twice; want it once",
+            "model.toml: parameters: left.phi_deg is given twice; give it once",
         ),
-        ('[parameters]\n"a\\nb" = "free"', "parameters.a b: is no parameter; want one of"),
+        ('[parameters]\n"a\\nb" = "free"', "parameters.a b: unknown parameter; use one of"),
         ("parameters = 1", "model.toml: parameters: got 1, want a table"),
         ("[ibrc]", "model.toml: ibrc.knots: missing; want rising intensities, at least two"),
         ("[ibrc]\nknots = [1]", "ibrc.knots: got [1.0], want at least two rising intensities"),
@@ -190,11 +190,11 @@ def test_mistakes_in_a_file_are_a_line_each(tmp_path: Path, text: str, said: str
     [
         (("all",), '--model: got "all", want basic, scanner, full, or a file FILE.toml'),
         (("nowhere.toml",), "nowhere.toml: cannot be read: No such file"),
-        (("basic", "phi"), "--fix phi: is no parameter; did you mean phi_deg?"),
-        (("basic", "", "left.fie"), "--free left.fie: is no parameter; want one of omega_deg"),
+        (("basic", "phi"), "--fix phi: unknown parameter; did you mean phi_deg?"),
+        (("basic", "", "left.fie"), "--free left.fie: unknown parameter; use one of omega_deg"),
         (("basic", "", "", ["phi_deg=much"]), "--prior phi_deg=much: want KEY=SIGMA, above 0"),
         (("basic", "", "", ["phi_deg=-1"]), "--prior phi_deg=-1: want KEY=SIGMA, above 0"),
-        (("basic", "", "", ["ibrc.1=1"]), "--prior ibrc.1: is no parameter"),
+        (("basic", "", "", ["ibrc.1=1"]), "--prior ibrc.1: unknown parameter"),
     ],
 )
 def test_mistakes_in_options_are_a_line_each(given: tuple[object, ...], said: str) -> None:
@@ -210,7 +210,7 @@ def test_all_that_is_wrong_with_a_file_is_said_at_once(tmp_path: Path) -> None:
 
 def test_a_file_of_nested_tables_is_a_line(tmp_path: Path) -> None:
     deep = "[parameters]\n" + 2000 * "a." + "b = 'free'"
-    assert "nested too deeply; want tables at most 32 deep" in refused(file(tmp_path, deep))
+    assert "nested too deeply; nest tables at most 32 deep" in refused(file(tmp_path, deep))
 
 
 def test_no_text_is_a_line(tmp_path: Path) -> None:

@@ -76,7 +76,7 @@ def test_a_held_heading_that_houses_contradict_is_told_and_makes_the_calibration
     assert heading.sigma >= away["left.kappa_rad"] > 10.0 * KNOWN_RAD
     (one,) = findings
     assert one.unusable
-    assert f"boresight κ (heading) {math.degrees(away['left.kappa_rad']):+.2f}° from the start" in one.what
+    assert f"boresight κ (heading) {math.degrees(away['left.kappa_rad']):+.2f}° from the initial value" in one.what
     assert one.excess == pytest.approx(away["left.kappa_rad"] / COARSE_RAD)
 
 

@@ -69,7 +69,7 @@ def test_what_a_configuration_wants_is_what_the_verdict_goes_by() -> None:
             assert told == []
         else:
             (one,) = told
-            assert one.what.endswith(" is wanted")
+            assert one.what.endswith(" is required")
             assert one.level is (Level.CARE if words == "not met" else Level.UNUSABLE)
             assert one.excess > 1.0
     assert found["far from met"].level is Level.UNUSABLE

@@ -73,7 +73,7 @@ def test_parameters_of_no_scanner_of_the_log_are_refused_before_it_is_read(
     trajectory = str(made.flown.folder / "true_trajectory.csv")
     log, output, same = str(made.flown.log), str(tmp_path / "left.toml"), ("--trajectory-datum", "same")
     assert run_app(["calibrate", log, "-o", output, "--trajectory", trajectory, *same, *option]) != 0
-    assert "parameters of right: no such scanner in this flight, but left" in capsys.readouterr().err
+    assert "parameters of right: this flight has no such scanner; its scanners are left" in capsys.readouterr().err
 
 
 def test_returns_without_time_are_noted(made: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -108,7 +108,7 @@ def test_a_navigated_trajectory_is_the_bodys_whatever_is_said(made: Made, tmp_pa
     assert made.flown.config.gnss["rover"].lever_arm_m != [0.0, 0.0, 0.0]
     np.testing.assert_array_equal(plain, asked)
     assert [line for line in told if line not in before] == [
-        f"{made.flown.log}: navigated from IMU and GNSS, which is the body's trajectory: no --trajectory-at"
+        f"{made.flown.log}: the trajectory navigated from IMU and GNSS is that of the body; leave --trajectory-at out"
     ]
 
 

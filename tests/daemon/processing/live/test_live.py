@@ -223,7 +223,7 @@ class TestPoints:
         text = attachments["config.toml"].replace(b'"novatel"', b'"nmea"')
         attachments["config.toml"] = re.sub(rb"(?ms)^\[imu\..*?(?=^\[(?!imu))", b"", text)
         setup = Setup.of_log(attachments, Options(datum="same", uncertainty=False))
-        with pytest.raises(UserError, match="no configured device tells its own INS solution"):
+        with pytest.raises(UserError, match="the configuration has neither a device with an INS solution"):
             replay(flown.session(), setup, tmp_path, LiveConfig(), None)
 
 
@@ -362,7 +362,7 @@ class TestStatus:
         session = LiveSession(setup, flown.session().info, tmp_path, LiveConfig(), None)
         told = [one["what"] for one in session.verdict["reasons"]]
         assert len(told) == (len(setup.calibrations) if other else 0)
-        assert all("here is the device's own INS, whose alignment is another" in one for one in told)
+        assert all("this run uses the device's own INS, whose alignment differs" in one for one in told)
 
     def test_the_folder_cannot_be_written_to(self, flown: Flown, tmp_path: Path) -> None:
         (tmp_path / "file").touch()

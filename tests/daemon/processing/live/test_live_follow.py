@@ -152,7 +152,7 @@ class TestFollowing:
         for _ in range(3):
             seen += units_of(follower.poll())
         assert seen == recording.units
-        assert follower.ended == "the recorder is gone, and its log has no end"
+        assert follower.ended == "the recorder stopped without closing its log"
 
 
 class TestPassingOver:

@@ -201,24 +201,24 @@ class TestRefusals:
 
     def test_names_that_are_not_there(self, flown: Flown) -> None:
         assert self.refused(flown, InputOptions(imu="other")).endswith(
-            "--imu: the configuration has no [imu.other]; there are: main"
+            "--imu: the configuration has no [imu.other]; it has: main"
         )
         assert "--gnss-name" in self.refused(flown, InputOptions(gnss="base"))
 
     def test_an_imu_that_says_nothing(self, flown: Flown) -> None:
         config = flown.changed("other_wire.toml", **{"[imu.main": "[imu.second"})
         said = self.refused(flown, InputOptions(config=config))
-        assert said.endswith("no samples of imu/second: not a byte of it is in the log; is its wire recorded?")
+        assert said.endswith("no samples of imu/second: the log has no byte of it; check that its wire is recorded")
 
     def test_a_receiver_that_speaks_otherwise(self, flown: Flown) -> None:
         config = flown.changed("nmea.toml", **{'protocol = "novatel"': 'protocol = "nmea"'})
         said = self.refused(flown, InputOptions(config=config))
         assert "no position of gnss/rover" in said
-        assert "of no message it knows; want another protocol, or other messages of the device" in said
+        assert "in no known message; set another protocol, or let the device send other messages" in said
 
     def test_a_log_without_a_configured_receiver(self, flown: Flown) -> None:
         config = flown.changed("other_receiver.toml", **{"[gnss.rover]": "[gnss.away]"})
-        assert "no position of gnss/away, and an IMU alone cannot be navigated: not a byte" in self.refused(
+        assert "no position of gnss/away, and an IMU alone gives no trajectory: the log has no byte" in self.refused(
             flown, InputOptions(config=config)
         )
 
@@ -264,13 +264,13 @@ class TestDoubts:
         arm = "lever_arm_m = [0.1, -0.05, -1.2]"
         config = flown.changed("two.toml", **{arm: f"{arm}\nsecondary_lever_arm_m = [0.9, 0.6, -1.2]"})
         (line,) = read_inputs(flown.session(), InputOptions(config=config)).doubts
-        assert "gnss/rover sent no heading that is known here, though secondary_lever_arm_m" in line
+        assert "gnss/rover sent no heading that this program reads, although secondary_lever_arm_m" in line
 
     def test_an_imu_timed_by_its_arrival(self, flown: Flown) -> None:
         config = flown.changed("untimed.toml", **{"sample_ticks": "# ", "pps_ticks": "# ", 'group = "last"': ""})
         inputs = read_inputs(flown.session(), InputOptions(config=config))
         assert inputs.imu_time[0] == "arrival"
-        assert "placed by their arrival" in inputs.doubts[0]
+        assert "timed by their arrival" in inputs.doubts[0]
         assert inputs.setup.estimate_time_offset_s > 1e-3
         latched = read_inputs(flown.session(), InputOptions()).legs[0].inertial.time_ns
         off_ns = inputs.legs[0].inertial.time_ns[200:1200] - latched[200:1200]
@@ -485,7 +485,7 @@ def test_keys_of_the_noise_that_a_grade_gives_are_named(flown: Flown) -> None:
     assert bare.noise_by_grade["accel_bias_mg"] == 1.0
     assert bare.noise_by_grade["misalignment_mrad"] == 0.1
     assert bare.noise_by_grade["bias_correlation_h"] == 1.0
-    assert bare.noise_words().startswith("Noise by grade tactical, which nobody chose (imu.main.noise sets none of")
+    assert bare.noise_words().startswith("Noise by grade tactical, the default (imu.main.noise does not set")
     every = NoiseConfig.model_validate({"grade": "mems"} | dict.fromkeys(keys, 1.0))
     table = {"imu": {"main": sources.imu.model_copy(update={"noise": every})}}
     whole = NavigationSources(without_scanners(flown.config, **table), {})

@@ -47,8 +47,8 @@ def test_the_offset_is_that_of_the_point() -> None:
 def test_the_antenna_is_named() -> None:
     body = turning()
     (line,) = point_doubts(body.at_body(-ARM - [0.02, 0.0, 0.05]), body, [ARM], "gnss/rover")
-    assert line.startswith("gnss/rover: its own INS tells the way of its antenna, 1.")
-    assert "want --trajectory-at antenna" in line
+    assert line.startswith("gnss/rover: its own INS gives the trajectory of its antenna, 1.")
+    assert "use --trajectory-at antenna" in line
 
 
 def test_another_point_is_told_by_its_place() -> None:

@@ -175,7 +175,7 @@ class TestWorkers:
             return
         assert ended.returncode == 1
         last = ended.stderr.strip().splitlines()[-1]
-        assert 'no worker process could be begun; want the call in a script under if __name__ == "__main__":' in last
+        assert 'no worker process could start; put the call in the script under if __name__ == "__main__":' in last
         assert "called while a worker process imports the script" in ended.stderr
         assert "memory" not in ended.stderr
 

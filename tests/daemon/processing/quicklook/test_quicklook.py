@@ -222,7 +222,7 @@ def test_feet_become_metres(tmp_path: Path) -> None:
     assert row["median_m"] == pytest.approx(-0.1 * 0.3048, abs=2e-4)
     assert look.strips[0].density == pytest.approx(0.3048**-2, rel=0.01)
     assert look.units.name == "foot"
-    assert look.notes == ["no vertical CRS: heights taken for foot"]
+    assert look.notes == ["no vertical CRS: heights are assumed to be in foot"]
 
 
 def test_degrees_become_metres(tmp_path: Path) -> None:
@@ -239,7 +239,7 @@ def test_files_without_point_source_ids_are_strips_of_their_own(tmp_path: Path) 
     look = look_at([tmp_path])
     assert look.names == ["north", "south"]
     assert look.overlap.rows[0]["median_m"] == pytest.approx(-0.05, abs=2e-4)
-    assert look.notes == ["no CRS in the header: coordinates taken for metres"]
+    assert look.notes == ["no CRS in the header: coordinates are assumed to be in metres"]
 
 
 def test_a_strip_in_two_files_is_one_strip(tmp_path: Path) -> None:

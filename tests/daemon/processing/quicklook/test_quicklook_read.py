@@ -121,7 +121,7 @@ def test_heights_are_in_the_unit_that_crs_or_sidecar_says(tmp_path: Path) -> Non
         assert look.units.name == "US survey foot"
         assert look.strips[0].density == pytest.approx((2.0 * FOOT_M) ** -2, rel=0.02)
     assert metres.notes == of_feet.notes == []
-    assert nothing.notes == ["no vertical CRS: heights taken for US survey foot"]
+    assert nothing.notes == ["no vertical CRS: heights are assumed to be in US survey foot"]
 
 
 def test_sigmas_are_metres_in_feet_too(tmp_path: Path) -> None:
@@ -155,7 +155,7 @@ def test_lengths_on_a_map_far_from_true_to_scale_are_those_on_the_ground(tmp_pat
     assert look.density == pytest.approx(4.0 / np.cos(lat) ** 2, rel=0.02)
     (note,) = look.notes
     assert "a metre on the ground is 1.4" in note
-    assert note.endswith("lengths and areas here are those on the ground")
+    assert note.endswith("lengths and areas shown are those on the ground")
     assert '"EPSG:32632"' in note
 
 

@@ -50,7 +50,9 @@ STAGES = {
 def test_a_scanner_that_says_nothing_of_its_beams_is_not_taken_for_a_line_scanner() -> None:
     """Of srep's parser, which has no table of beams, under the name of a head that has one."""
     table = ScannerConfig.model_validate({"transport": "udp:0.0.0.0:2368", "protocol": "velodyne-vlp16"})
-    with pytest.raises(ValueError, match="protocol velodyne-vlp16: its parser has no beams and it is no line scanner"):
+    with pytest.raises(
+        ValueError, match="protocol velodyne-vlp16: its parser has no beam table and it is not a line scanner"
+    ):
         geometry_of(table, SrepParser(DeviceSettings("scanner/left", {"mirror_factor": 2.0})))
 
 
@@ -77,7 +79,7 @@ def test_returns_have_no_place_until_the_angles_are_known() -> None:
 
 
 def test_a_source_that_told_nothing_is_one_line() -> None:
-    with pytest.raises(ValueError, match=r'^gimbal\.stages\[0\]\.source: "imu/gimbal" told no angles$'):
+    with pytest.raises(ValueError, match=r'^gimbal\.stages\[0\]\.source: "imu/gimbal" sent no angles$'):
         mount_of(GimbalConfig.model_validate(STAGES), {})
 
 
@@ -95,7 +97,7 @@ def test_sources_of_gimbals(tmp_path: Path) -> None:
 
 
 def test_a_source_without_an_ins_is_refused_in_one_line(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r'^gimbal.stages.0..source: "imu/main" tells no angles') as caught:
+    with pytest.raises(ValueError, match=r'^gimbal.stages.0..source: "imu/main" sends no gimbal angles') as caught:
         georeferencer(logged(tmp_path, "imu/main"), "srep")
     assert "\n" not in str(caught.value)
 
@@ -112,7 +114,7 @@ def test_who_cannot_wait_for_logged_angles_says_so(tmp_path: Path) -> None:
     refuse_logged_gimbals(config, [])
     with pytest.raises(ValueError, match=r'^scanner\.left\.gimbal\.stages\[0\]\.source: angles of "gnss/rover" are'):
         refuse_logged_gimbals(config, ["left"])
-    with pytest.raises(ValueError, match="told no angles"):
+    with pytest.raises(ValueError, match="sent no angles"):
         georeferencer(config, "srep")
     assert georeferencer(config, "srep", angles=None).model.mount.moves
 
@@ -129,7 +131,7 @@ def georeferencer(config: Config, protocol: str, **keys: Any) -> Georeferencer:
 def test_an_offset_by_a_pulse_rate_that_nobody_tells_is_one_line(tmp_path: Path) -> None:
     config = aircraft_config(tmp_path, {})
     assert georeferencer(config, "srep").rates is None
-    with pytest.raises(ValueError, match=r"range_offset\.prf_hz: velodyne-vlp16 tells no pulse rate; want") as caught:
+    with pytest.raises(ValueError, match=r"range_offset\.prf_hz: velodyne-vlp16 sends no pulse rate; use") as caught:
         georeferencer(config, "velodyne-vlp16")
     assert "\n" not in str(caught.value)
 

@@ -144,12 +144,15 @@ def test_only_the_scanners_that_are_asked_for(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("header", "said"),
     [
-        ('scanner = "right"', 'calibration.scanner: is of scanner "right", want "left"'),
-        ('scanner_serial = "77"', 'calibration.scanner_serial: of another head: "77", the configuration says "1234"'),
-        ('ranges = "vacuum"', 'was estimated with ranges = "vacuum", [atmosphere] says "corrected"'),
-        ('refraction = "ardc"', 'was estimated with refraction = "ardc", [atmosphere] says "none"'),
-        ("mirror_factor = 2.0", "was estimated with 2, the configuration says 1"),
-        ("installation_matrix = [[0,1,0],[-1,0,0],[0,0,1]]", "is not the configuration's installation"),
+        ('scanner = "right"', 'calibration.scanner: belongs to scanner "right"; use a calibration of "left"'),
+        (
+            'scanner_serial = "77"',
+            'calibration.scanner_serial: belongs to another head: "77", the configuration has "1234"',
+        ),
+        ('ranges = "vacuum"', 'was estimated with ranges = "vacuum", [atmosphere] has "corrected"'),
+        ('refraction = "ardc"', 'was estimated with refraction = "ardc", [atmosphere] has "none"'),
+        ("mirror_factor = 2.0", "was estimated with 2, the configuration has 1; set both alike, or calibrate again"),
+        ("installation_matrix = [[0,1,0],[-1,0,0],[0,0,1]]", "differs from the configuration's installation"),
         ('method = "guessed"', "guessed"),
     ],
 )
@@ -168,12 +171,12 @@ def test_a_calibration_that_is_none_of_this_flights_is_refused(tmp_path: Path, h
 @pytest.mark.parametrize(
     ("changes", "options", "said"),
     [
-        ({}, {"scanners": ("front",)}, "scanner front: is not in the configuration; there are: left, top"),
+        ({}, {"scanners": ("front",)}, "scanner front: is not in the configuration, which has: left, top"),
         ({}, {"crs": "EPSG:99999"}, "EPSG:99999"),
         (
             {"angles_deg = [0, 0, 0]": 'source = "imu/main", angles_deg = [0, 0, 0]'},
             {},
-            'scanner.left: gimbal.stages[0].source: "imu/main" tells no angles of a gimbal',
+            'scanner.left: gimbal.stages[0].source: "imu/main" sends no gimbal angles',
         ),
     ],
 )

@@ -69,8 +69,8 @@ def test_a_grid_in_degrees_goes_on_where_longitudes_begin_anew(tmp_path: Path, w
 @pytest.mark.parametrize(
     ("others", "words"),
     [
-        ({"crs": None}, "has no CRS; want a GeoTIFF that says its own"),
-        ({"transform": Affine(20.0, 10.0, 0.0, 10.0, -20.0, 0.0)}, "is turned against its axes"),
+        ({"crs": None}, "has no CRS; use a GeoTIFF with a CRS"),
+        ({"transform": Affine(20.0, 10.0, 0.0, 10.0, -20.0, 0.0)}, "is rotated"),
         ({"transform": Affine(1e300, 0.0, 0.0, 0.0, -1.0, 0.0)}, r"has pixels of 1e\+300 × -1 from 0, 0 on"),
     ],
 )
@@ -81,7 +81,7 @@ def test_what_is_no_terrain_is_refused(tmp_path: Path, others: dict[str, Any], w
 
 
 def test_a_raster_that_lies_nowhere_is_refused() -> None:
-    with pytest.raises(ConfigError, match="does not say where it lies; want a GeoTIFF that does"):
+    with pytest.raises(ConfigError, match="has no georeference; use a georeferenced GeoTIFF"):
         read_terrain(Path(__file__).parents[3] / "fuzz/seeds/terrain/nowhere")
 
 
@@ -92,7 +92,9 @@ def test_bands_that_share_blocks_too_large_to_read_are_refused(tmp_path: Path) -
         tmp_path / "dem.tif", "w", driver="GTiff", width=9, height=9, count=100, dtype="float64", **profile, **blocks
     ):
         pass
-    with pytest.raises(ConfigError, match="has 100 bands in blocks of 512 × 512; want one of heights"):
+    with pytest.raises(
+        ConfigError, match="has 100 bands in blocks of 512 × 512; use a raster with one band of heights"
+    ):
         read_terrain(tmp_path / "dem.tif")
 
 

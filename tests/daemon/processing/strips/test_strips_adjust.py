@@ -130,7 +130,7 @@ def test_the_calibration_file_stays_and_the_table_says_what_was_done(
     assert (file.read_bytes(), file.stat().st_mtime_ns) == was
     told = capsys.readouterr().out
     assert f"no calibration; held: left {made.truth.id}" in told
-    assert "all strips got constant; the calibration was held" in told
+    assert "model of all strips: constant; the calibration parameters were held" in told
     row = next(line for line in told.splitlines() if line.startswith(f"{made.flight.swaths[LIFTED].strip:02d} "))
     assert "constant" in row
     assert "not told" in row  # its place in plan, over hardly anything but level ground
@@ -165,7 +165,7 @@ def test_a_trajectory_not_to_be_used_is_said_to_be_first_and_stays_so(
     told = capsys.readouterr()
     line = f"not to be used: trajectory {file}: the lever arm has another sign"
     assert told.out.splitlines()[0] == line
-    assert f"{line}; --accept-verdict takes it all the same" in told.err
+    assert f"{line}; use --accept-verdict to accept it" in told.err
     (said,), source = file_verdicts(trajectory_of(output, ".sbet"), made.trajectory.span)
     assert (said.level, source) == (Level.UNUSABLE, "navigated")
     assert run_app(arguments(made, file, output, "--strip-model", "constant", "--overwrite", "--accept-verdict")) == 0
@@ -222,17 +222,17 @@ def test_mistakes_are_one_line_and_leave_nothing(
     for given, code, words in (
         ([*full, "--strip-model", "cubic"], 2, 'got "cubic", want one of none, constant, linear, spline, auto'),
         ([*full, "--level", "QL1"], 2, "--level is for a comparison"),
-        (points, 2, "holds points; want the logs they are of"),
-        (nominal, 2, "left: has the nominal calibration only"),
+        (points, 2, "contains points; give the logs of these points"),
+        (nominal, 2, "left: has only the nominal calibration"),
         ([*full, "--control", str(tmp_path / "no.csv")], 3, "no.csv: cannot be read"),
-        ([*full, "--control", str(far)], 1, "no control point lies in the flight"),
+        ([*full, "--control", str(far)], 1, "no control point lies within the flight"),
         ([*full, *spans(tmp_path, times[0])], 1, "1 strip with returns; an adjustment compares strips"),
     ):
         found, line = refused(capsys, given)
         assert found == code, line
         assert words in line
         assert not output.exists()
-    assert "no plane is seen by two strips" in refused(capsys, [*full, *spans(tmp_path, *beginnings)])[1]
+    assert "no two strips see a common plane" in refused(capsys, [*full, *spans(tmp_path, *beginnings)])[1]
     assert not output.exists()
 
 
@@ -242,10 +242,10 @@ def test_files_that_are_there_stay(
     was = {path: path.read_bytes() for path in adjusted.iterdir()}
     code, line = refused(capsys, arguments(made, lifted, adjusted))
     assert code == 2
-    assert f"{ADJUSTMENT}: is there already; want another folder, or --overwrite" in line
+    assert f"{ADJUSTMENT}: already exists; choose another folder or use --overwrite" in line
     own = arguments(made, trajectory_of(adjusted, ".sbet"), adjusted, "--overwrite")
-    assert "is what is corrected; want another folder" in refused(capsys, own)[1]
-    assert "is a file; want a folder" in refused(capsys, arguments(made, lifted, lifted))[1]
+    assert "is the trajectory to correct; choose another folder" in refused(capsys, own)[1]
+    assert "is a file; give a folder" in refused(capsys, arguments(made, lifted, lifted))[1]
     assert {path: path.read_bytes() for path in adjusted.iterdir()} == was
     code, line = refused(capsys, ["strips", str(made.flown.log), "--strip-model", "linear"])
     assert code == 2

@@ -118,7 +118,7 @@ def test_almost_nothing_makes_a_page(flight: Flight, tmp_path: Path) -> None:
     little = replace(flight, forward=replace(flight.forward, **first), smoothed=None)
     path = tmp_path / "page.html"
     verdict, figures = write_page(path, little)
-    assert verdict.sentence.startswith("Not to be used: only 0 positions were used")
+    assert verdict.sentence.startswith("Not to be used: the filter used only 0 positions")
     assert figures["observations"] == {}
     assert "Filter − smoother" not in path.read_text(encoding="utf-8")
 

@@ -168,7 +168,7 @@ def test_rows_outside_the_run_are_no_share_of_it(sound: Flight) -> None:
 def test_an_outage_is_told_with_its_length(sound: Flight) -> None:
     at_s = seconds_of(sound)
     gone = with_rows(sound, sound.forward.innovations[(at_s <= 600) | (at_s >= 645)])
-    assert told(gone) == {"outage": "45 s passed without a position that could be used"}
+    assert told(gone) == {"outage": "45 s passed without a usable position"}
     rejected = sound.forward.innovations.copy()
     rejected["fate"][(at_s > 600) & (at_s < 645)] = Fate.REJECTED
     assert told(with_rows(sound, rejected))["outage"] == told(gone)["outage"]
@@ -222,7 +222,7 @@ def test_made_up_samples(sound: Flight) -> None:
     bridged = np.zeros(len(sound.smoothed), bool)
     bridged[1000:1008] = True  # 1.6 s
     found = told(replace(sound, smoothed=replace(sound.smoothed, bridged=bridged)))
-    assert found == {"bridged run": "inertial samples are missing for 1.6 s on end"}
+    assert found == {"bridged run": "inertial samples are missing for 1.6 s without a break"}
 
 
 def test_lever_arm_and_time_offset(sound: Flight) -> None:
@@ -237,8 +237,10 @@ def test_lever_arm_and_time_offset(sound: Flight) -> None:
     arms = np.array([[0.35, 0.12, -0.8]])
     setup = replace(sound.setup, estimate_lever_arm=0.3, estimate_time_offset_s=0.2, lever_arms_b=arms)
     found = told(replace(sound, smoothed=best, setup=setup))
-    assert found["lever arm moved"] == "the antenna was found 0.24 m from where lever_arm_m has it (y)"
-    assert found["lever arm unseen"].startswith("lever arm z")  # and its 0.3 m are within three sigmas
+    assert found["lever arm moved"] == "the antenna was estimated 0.24 m from its place by lever_arm_m (y)"
+    assert found["lever arm unseen"].startswith(
+        "this flight hardly determines lever arm z"
+    )  # and its 0.3 m are within three sigmas
     assert found["time offset"].startswith("GNSS stamps are 125.0 ms early")
 
 
@@ -246,7 +248,7 @@ def test_no_position_at_all(sound: Flight) -> None:
     none = with_rows(sound, sound.forward.innovations[:0])
     verdict = judge(figures_of(none, separation_of(none)))
     assert verdict.level is Level.UNUSABLE
-    assert "only 0 positions were used" in [reason.what for reason in verdict.reasons]
+    assert "the filter used only 0 positions" in [reason.what for reason in verdict.reasons]
 
 
 @pytest.mark.parametrize(("severity", "words"), [("warning", "Usable with care"), ("error", "Not to be used")])

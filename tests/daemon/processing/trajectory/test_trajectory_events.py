@@ -84,7 +84,7 @@ def test_what_has_no_pose_says_why_and_keeps_its_place(trajectory: Trajectory) -
         "outside the trajectory",
         PLACED,
         "in a gap of the trajectory",
-        "its time cannot be placed",
+        "its time cannot be converted to GPS time",
         "the receiver does not vouch for its time",
         "outside the trajectory",
         PLACED,

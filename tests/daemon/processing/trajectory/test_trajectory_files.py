@@ -118,14 +118,14 @@ class TestNames:
         assert (files.sbet, files.smrmsg, files.csv) == (None, None, tmp_path / "f1.csv")
 
     def test_another_ending_is_refused(self, tmp_path: Path) -> None:
-        with pytest.raises(UserError, match=r"want a name that ends in \.sbet, \.out or \.csv, or a folder"):
+        with pytest.raises(UserError, match=r"the name must end in \.sbet, \.out or \.csv, or be a folder"):
             TrajectoryFiles.of_output(tmp_path / "f1.txt", "x", csv=False)
 
     def test_what_is_there_is_named(self, tmp_path: Path) -> None:
         files = TrajectoryFiles.of_output(tmp_path / "f1.sbet", "x", csv=False)
         files.refuse_existing(tmp_path / "events.csv")
         (tmp_path / "events.csv").touch()
-        with pytest.raises(UserError, match=r"events\.csv: is there already; .* --overwrite"):
+        with pytest.raises(UserError, match=r"events\.csv: already exists; .* --overwrite"):
             files.refuse_existing(tmp_path / "events.csv")
 
 

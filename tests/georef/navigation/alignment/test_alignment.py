@@ -362,7 +362,7 @@ def states() -> list[tuple[Inertial, StructArray, str]]:
         (part.inertial.between(0, 0), rows, "waits for GNSS positions and inertial samples"),
         (part.inertial, late, "waits for GNSS positions and inertial samples"),
         (part.inertial, part.only(Kind.VELOCITY), "waits for GNSS positions and inertial samples"),
-        (part.inertial.between(0, 700), rows, r"has \d s of GNSS and inertial samples together, wants 10 s"),
+        (part.inertial.between(0, 700), rows, r"has \d s of GNSS and inertial samples together, needs 10 s"),
         (wrong, rows, r"do not fit GNSS's velocities \(residuals \d+ times their sigma\): check rotation_b_imu"),
     ]
 
