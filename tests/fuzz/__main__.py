@@ -7,6 +7,7 @@ x86-64; ``pip install atheris``), and what it learns stays under fuzz/corpus. ``
 from __future__ import annotations
 
 import argparse
+import contextlib
 import hashlib
 import os
 import random
@@ -19,7 +20,7 @@ from pathlib import Path
 from tests.fuzz.engine import Target, check, fuzz_for
 
 CRASHES, CORPUS = Path("fuzz/crashes"), Path("fuzz/corpus")
-MINIMISING_S = 60
+MINIMISING_S, STEP_S = 300, 20  # in all; of a process that looks for one smaller input
 
 
 def main() -> int:
@@ -31,7 +32,11 @@ def main() -> int:
     parser.add_argument("--guided", action="store_true", help="by atheris")
     parser.add_argument("--input", type=Path, help="run this input of one target only")
     parser.add_argument("--list", action="store_true")
-    parser.add_argument("--libfuzzer", nargs=argparse.REMAINDER, help="options of libFuzzer, of one target")
+    parser.add_argument(
+        "--libfuzzer",
+        nargs=argparse.REMAINDER,
+        help="its options; of one target",
+    )
     given = parser.parse_args()
     targets = _targets(guided=given.guided)
     if unknown := set(given.targets) - set(targets):
@@ -98,14 +103,16 @@ def _guided_in_a_child(build: Callable[[], Target], name: str, seconds: float, s
     found = sorted(set(crashes.iterdir()) - known)
     for path in found:
         small = path.with_name(f"minimised-{path.name}")
-        minimise = ["-minimize_crash=1", f"-max_total_time={MINIMISING_S}", f"-exact_artifact_path={small}", str(path)]
-        subprocess.run([*_command(name), *minimise], check=False, capture_output=True)
+        minimise = ["-minimize_crash=1", f"-max_total_time={STEP_S}", f"-exact_artifact_path={small}", str(path)]
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            quiet = subprocess.DEVNULL
+            subprocess.run([*_command(name), *minimise], stdout=quiet, stderr=quiet, timeout=MINIMISING_S, check=False)
         _tell(name, small if small.exists() else path, "FOUND")
     return bool(found)
 
 
 def _command(name: str) -> list[str]:
-    return [sys.executable, "-m", "tests.fuzz", name, "--guided", "--libfuzzer"]
+    return [sys.executable, "-m", "tests.fuzz", name, "--libfuzzer"]
 
 
 def _guided(target: Target, options: list[str]) -> None:
