@@ -1,9 +1,9 @@
 """What a target is and the rules that every input is held to; Hypothesis chooses inputs and minimises findings.
 
 A path is a seed and a few mutations, of the seed or of what the mutation before made; every input on it is checked.
-Hypothesis draws seed and mutations, and shrinks a path that fails to the fewest. A mutation is drawn as the seed of its
-random generator: drawing each of its decisions makes an input cost several times as much (decision 0031). That seed is
-bytes, because Hypothesis prefers small integers and would repeat mutations.
+Hypothesis draws the seed, how many mutations there are, and the key of their random generators; it shrinks a path that
+fails to the fewest. Drawing each decision of a mutation makes an input cost several times as much, and drawing a key
+for each mutation repeats most of them, because Hypothesis varies what it has drawn before (decision 0031).
 """
 
 from __future__ import annotations
@@ -97,13 +97,11 @@ def _measured(target: Target, data: bytes) -> Iterable[str]:
     return seen
 
 
-def inputs_of(target: Target, seed: bytes, mutations: list[bytes]) -> Iterator[bytes]:
-    """Yield the inputs of a path; the seed itself where the path has no mutation."""
+def inputs_of(target: Target, seed: bytes, key: bytes, length: int) -> Iterator[bytes]:
+    """Yield the inputs of a path: mutations of the seed, or of the input before."""
     data = seed
-    if not mutations:
-        yield data
-    for key in mutations:
-        rng = random.Random(key)
+    for number in range(length):
+        rng = random.Random(key + bytes([number]))
         # a text that is broken is refused whatever else is changed in it
         data = target.mutate(rng, seed if rng.random() < FROM_SEED else data)
         yield data
@@ -123,11 +121,12 @@ def fuzz(target: Target, paths: int, *, number: int | None = None, report: Repor
     @settings(SETTINGS, max_examples=paths, derandomize=number is None)
     @given(
         st.sampled_from(target.seeds),
-        st.lists(st.binary(min_size=8, max_size=8), max_size=MUTATIONS_OF_A_PATH),
+        st.binary(min_size=8, max_size=8),
+        st.integers(1, MUTATIONS_OF_A_PATH),
         st.integers(0, MEASURED_OF_PATHS - 1),
     )
-    def run(seed: bytes, mutations: list[bytes], turn: int) -> None:
-        for data in inputs_of(target, seed, mutations):
+    def run(seed: bytes, key: bytes, length: int, turn: int) -> None:
+        for data in inputs_of(target, seed, key, length):
             found.executions += 1
             try:
                 found.seen |= check(target, data, memory=turn == MEASURED_OF_PATHS - 1)
