@@ -1,24 +1,38 @@
-"""Runs a target on mutated inputs and tells what it cannot stand: an exception, a warning, time, memory.
+"""What a target is and the rules that every input is held to; Hypothesis chooses inputs and minimises findings.
 
-An input that showed a message, counter or record not seen before joins the seeds, so that mutations go on from there.
-Everything follows from the seed: the n-th input of a run is the same on every machine.
+A path is a seed and a few mutations, of the seed or of what the mutation before made; every input on it is checked.
+Hypothesis draws the seed, how many mutations there are, and the key of their random generators; it shrinks a path that
+fails to the fewest. Drawing each decision of a mutation makes an input cost several times as much, and drawing a key
+for each mutation repeats most of them, because Hypothesis varies what it has drawn before (decision 0031).
 """
 
 from __future__ import annotations
 
-import hashlib
 import random
 import time
 import traceback
 import tracemalloc
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-SECONDS_OF_A_CASE = 5.0  # of processor time, for at most `mutation.LARGEST_CASE_BYTES`
-LARGEST_CORPUS = 400
-PEAK_EVERY = 64  # inputs between two whose memory is measured, which makes them several times slower
+import hypothesis
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
+
+SECONDS_OF_AN_INPUT = 5.0  # of processor time, for at most `mutation.LARGEST_CASE_BYTES`
+MUTATIONS_OF_A_PATH = 10
+FROM_SEED = 0.5  # of mutations begin at the seed again, the others go on from the mutation before
+MEASURED_OF_PATHS = 16  # one path in so many has its memory measured, which makes it several times slower
+INPUTS_OF_A_LIFE = 300
+PATHS_OF_A_ROUND = 100  # between two looks at the clock
+SETTINGS = settings(
+    database=None,
+    deadline=None,
+    phases=(Phase.generate, Phase.shrink),
+    suppress_health_check=list(HealthCheck),
+)
 
 
 class FindingError(AssertionError):
@@ -48,24 +62,11 @@ class Target:
 
 @dataclass(slots=True)
 class Report:
-    """A run's figures; ``crashes`` by the place where they happened: the input and the traceback."""
+    """A run's figures; ``findings`` by the place where they happened: the input and the error."""
 
-    name: str
     executions: int = 0
-    seconds: float = 0.0
-    corpus: int = 0
     seen: set[str] = field(default_factory=set)
-    slowest_s: float = 0.0
-    crashes: dict[str, tuple[bytes, str]] = field(default_factory=dict)
-
-    def line(self) -> str:
-        """For the eye."""
-        rate = self.executions / self.seconds if self.seconds else 0.0
-        found = f"{len(self.crashes)} FOUND" if self.crashes else "nothing found"
-        return (
-            f"{self.name:24s} {self.seconds:6.0f} s {self.executions:9,} inputs {rate:7.0f}/s "
-            f"{len(self.seen):5d} things seen, slowest {self.slowest_s * 1e3:.0f} ms: {found}"
-        )
+    findings: dict[str, tuple[bytes, Exception]] = field(default_factory=dict)
 
 
 def check(target: Target, data: bytes, *, memory: bool = False) -> set[str]:
@@ -79,7 +80,7 @@ def check(target: Target, data: bytes, *, memory: bool = False) -> set[str]:
         warnings.simplefilter("error")
         seen = set(_measured(target, data) if memory else target.run(data))
     took = time.process_time() - started
-    if took > SECONDS_OF_A_CASE * (4 if memory else 1):
+    if took > SECONDS_OF_AN_INPUT * (4 if memory else 1):
         raise FindingError(f"{len(data)} bytes took {took:.1f} s")
     return seen
 
@@ -96,73 +97,70 @@ def _measured(target: Target, data: bytes) -> Iterable[str]:
     return seen
 
 
-def fuzz(target: Target, *, seconds: float, seed: int = 0, executions: int | None = None) -> Report:
-    """Run for so many seconds of processor time, which no other work takes from it, or for so many inputs."""
-    report = Report(target.name)
-    corpus = list(target.seeds) or [b""]
-    started = time.process_time()
-    for data in corpus:
-        _take(target, data, report, memory=False)
-    while time.process_time() - started < seconds and (executions is None or report.executions < executions):
-        rng = random.Random(f"{target.name}:{seed}:{report.executions}")
-        # what was found last leads on
-        recent = rng.random() < 0.3
-        base = corpus[-1 - rng.randrange(min(8, len(corpus)))] if recent else rng.choice(corpus)
-        data = target.mutate(rng, base)
-        if _take(target, data, report, memory=report.executions % PEAK_EVERY == PEAK_EVERY - 1):
-            corpus.append(data)
-            if len(corpus) > LARGEST_CORPUS:
-                del corpus[rng.randrange(len(target.seeds), len(corpus) - 1)]
+def inputs_of(target: Target, seed: bytes, key: bytes, length: int) -> Iterator[bytes]:
+    """Yield the inputs of a path: mutations of the seed, or of the input before."""
+    data = seed
+    for number in range(length):
+        rng = random.Random(key + bytes([number]))
+        # a text that is broken is refused whatever else is changed in it
+        data = target.mutate(rng, seed if rng.random() < FROM_SEED else data)
+        yield data
+
+
+def fuzz(target: Target, paths: int, *, number: int | None = None, report: Report | None = None) -> Report:
+    """Check the inputs of so many paths; a finding ends the search once its path is minimal.
+
+    Args:
+        target: reads the inputs.
+        paths: examples that Hypothesis makes.
+        number: seed of Hypothesis; None: the same paths each time.
+        report: is continued.
+    """
+    found = report or Report()
+
+    @settings(SETTINGS, max_examples=paths, derandomize=number is None)
+    @given(
+        st.sampled_from(target.seeds),
+        st.binary(min_size=8, max_size=8),
+        st.integers(1, MUTATIONS_OF_A_PATH),
+        st.integers(0, MEASURED_OF_PATHS - 1),
+    )
+    def run(seed: bytes, key: bytes, length: int, turn: int) -> None:
+        for data in inputs_of(target, seed, key, length):
+            found.executions += 1
+            try:
+                found.seen |= check(target, data, memory=turn == MEASURED_OF_PATHS - 1)
+            except Exception as error:
+                _keep(found, data, error)
+                raise
+
+    try:
+        (run if number is None else hypothesis.seed(number)(run))()
+    except Exception:  # Hypothesis groups several
+        if not found.findings:
+            raise
+    return found
+
+
+def fuzz_for(target: Target, seconds: float, *, number: int) -> Report:
+    """Fuzz for so many seconds of processor time, which no other work takes from it, then for a life of many inputs."""
+    report, started, turns = Report(), time.process_time(), 0
+    while not report.findings and time.process_time() - started < seconds:
+        fuzz(target, PATHS_OF_A_ROUND, number=number + turns, report=report)
+        turns += 1
     if target.endure is not None:
-        _endure(target, corpus, report, seed)
-    report.seconds, report.corpus = time.process_time() - started, len(corpus)
+        rng = random.Random(number)
+        cases = [target.mutate(rng, rng.choice(target.seeds)) for _ in range(INPUTS_OF_A_LIFE)]
+        try:
+            target.endure(cases)
+        except Exception as error:  # the last input stands for all where something grows
+            _keep(report, cases[-1], error)
     return report
 
 
-def _take(target: Target, data: bytes, report: Report, *, memory: bool) -> bool:
-    """Whether the input showed something new."""
-    report.executions += 1
-    started = time.process_time()
-    try:
-        seen = check(target, data, memory=memory)
-    except Exception as error:
-        _keep(error, data, report)
-        return False
-    if not memory:
-        report.slowest_s = max(report.slowest_s, time.process_time() - started)
-    new = seen - report.seen
-    report.seen |= new
-    return bool(new)
-
-
-def _endure(target: Target, corpus: list[bytes], report: Report, seed: int) -> None:
-    """A life of many inputs; its last input stands for all where it grows."""
-    rng = random.Random(f"{target.name}:{seed}:life")
-    cases = [target.mutate(rng, rng.choice(corpus)) for _ in range(300)]
-    try:
-        assert target.endure is not None
-        target.endure(cases)
-    except Exception as error:
-        _keep(error, cases[-1], report)
-
-
-def _keep(error: Exception, data: bytes, report: Report) -> None:
-    """One input a place; the shortest of those that came."""
-    frames = traceback.extract_tb(error.__traceback__)
-    last = frames[-1]
-    own = [frame for frame in frames if "/site-packages/" not in frame.filename][-1]
-    place = f"{type(error).__name__} {Path(own.filename).name}:{own.lineno} {Path(last.filename).name}:{last.lineno}"
-    if place not in report.crashes or len(data) < len(report.crashes[place][0]):
-        report.crashes[place] = (data, "".join(traceback.format_exception(error)))
-
-
-def save_crashes(report: Report, folder: Path) -> list[Path]:
-    """Write the inputs and their tracebacks to ``folder/<target>/``."""
-    paths = []
-    for place, (data, text) in report.crashes.items():
-        path = folder / report.name / hashlib.sha256(data).hexdigest()[:16]
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(data)
-        path.with_suffix(".txt").write_text(f"{place}\n{text}")
-        paths.append(path)
-    return paths
+def _keep(report: Report, data: bytes, error: Exception) -> None:
+    """Keep one input a place, the shortest."""
+    own = [frame for frame in traceback.extract_tb(error.__traceback__) if "/site-packages/" not in frame.filename][-1]
+    place = f"{type(error).__name__} {Path(own.filename).name}:{own.lineno}"
+    if place not in report.findings or len(data) <= len(report.findings[place][0]):
+        report.findings[place] = (data, error)

@@ -1,14 +1,17 @@
-"""A short run of every target, the same each time; ``make fuzz`` is the long one.
+"""Run every target for a short time, the same each time; ``make fuzz`` is the long run.
 
-The harness itself is held to what it promises: sealed frames are good ones, and a defect behind a checksum is found.
+The harness itself is tested too: sealed frames are good ones, and planted defects are found.
 """
 
 from __future__ import annotations
 
+import csv
 import random
-from collections.abc import Iterator
+import traceback
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from swath.drivers.framing import framer as framing
@@ -18,24 +21,28 @@ from swath.drivers.parser import DeviceSettings, ParserCounters
 from swath.georef.records import Chunk
 from tests.fuzz.engine import Target, check, fuzz
 from tests.fuzz.frames import KINDS, SEALS, FramePool, mutate_stream, split_frames
-from tests.fuzz.mcap_parts import take_apart
+from tests.fuzz.mcap_parts import MESSAGE, take_apart
 from tests.fuzz.mutation import damage
+from tests.fuzz.parsers import unpack
 from tests.fuzz.recordings import PAGES
 from tests.fuzz.targets import all_targets
 
 SEEDS = Path(__file__).parent / "seeds"
 TARGETS = all_targets()
-SHORT_S = 0.3
-SHORT_EXECUTIONS = 12
+SHORT_PATHS = 4
 
 
 @pytest.mark.parametrize("name", TARGETS)
 def test_a_short_run_finds_nothing(name: str) -> None:
     target = TARGETS[name]()
-    few = Target(name, target.seeds[:2], target.mutate, target.run, None, target.peak_bytes)
-    report = fuzz(few, seconds=SHORT_S, executions=SHORT_EXECUTIONS)
-    assert not report.crashes, "\n".join(text for _, text in report.crashes.values())
-    assert report.seen
+    assert all(check(target, data) for data in target.seeds[:2])
+    report = fuzz(target, SHORT_PATHS)
+    assert not report.findings, "\n".join(_traceback(error) for _, error in report.findings.values())
+    assert report.executions >= SHORT_PATHS
+
+
+def _traceback(error: Exception) -> str:
+    return "".join(traceback.format_exception(error))
 
 
 @pytest.mark.slow
@@ -72,32 +79,91 @@ def test_a_log_taken_apart_is_put_together_again_as_it_was() -> None:
         assert len(again) == len(data)
 
 
-@pytest.mark.slow
-def test_a_defect_behind_a_checksum_is_found() -> None:
-    """A decoder that cannot stand one value of one field of one message."""
+def _planted(name: str, is_reached: Callable[[bytes], bool]) -> Target:
+    """Return a target that cannot stand what is reached, and reads nothing else."""
+    target = TARGETS[name]()
 
     def run(data: bytes) -> Iterator[str]:
-        parser = UbxParser(DeviceSettings("gnss/fuzz"))
-        records = [*parser.feed(Chunk("gnss/fuzz", 0, data)), *parser.close()]
-        if any(getattr(record, "satellites", 0) == 0x7F for record in records):
+        if is_reached(data):
             raise OverflowError("planted")
-        return iter(parser.counters.messages)
+        return iter(())
 
-    target = TARGETS["gnss-ubx"]()
-    report = fuzz(Target("planted", target.seeds, target.mutate, run), seconds=60, executions=8000)
-    assert any("planted" in text for _, text in report.crashes.values())
-    plain = Target("planted", target.seeds, lambda rng, base: damage(rng, base), run)
-    assert not fuzz(plain, seconds=60, executions=1000).crashes, "found without any seal: the test says nothing"
+    return Target("planted", target.seeds, target.mutate, run)
+
+
+def _has_127_satellites(data: bytes) -> bool:
+    """One value of one field of one message, behind a checksum."""
+    parser = UbxParser(DeviceSettings("gnss/fuzz"))
+    records = [*parser.feed(Chunk("gnss/fuzz", 0, data)), *parser.close()]
+    return any(getattr(record, "satellites", 0) == 0x7F for record in records)
+
+
+def _has_frame_of_ones(data: bytes) -> bool:
+    return any(unit[8:] == b"\xff" * 8 for _, unit in unpack(data))
+
+
+def _has_tiny_sigma(data: bytes) -> bool:
+    rows = csv.reader(data.decode(errors="replace").splitlines())
+    return any(len(row) == 5 and row[4] == "1e-320" for row in rows)
+
+
+def _has_edge_without_time(data: bytes) -> bool:
+    """A value of a message of JSON within a compressed chunk."""
+    pieces = [inner for piece in take_apart(data).pieces for inner in piece.inner or [piece]]
+    return any(piece.opcode == MESSAGE and b'"edge_time_ns": null' in piece.body for piece in pieces)
+
+
+@pytest.mark.parametrize(
+    ("name", "is_reached", "paths"),
+    [
+        ("imu-dbc", _has_frame_of_ones, 200),
+        ("control-points", _has_tiny_sigma, 1000),
+        pytest.param("log-followed", _has_edge_without_time, 2000, marks=pytest.mark.slow),
+        pytest.param("gnss-ubx", _has_127_satellites, 4000, marks=pytest.mark.slow),
+    ],
+)
+def test_a_planted_defect_is_found(name: str, is_reached: Callable[[bytes], bool], paths: int) -> None:
+    target = _planted(name, is_reached)
+    assert not any(is_reached(data) for data in target.seeds)
+    (finding,) = fuzz(target, paths).findings.values()
+    assert is_reached(finding[0])
+
+
+@pytest.mark.slow
+def test_a_defect_behind_a_checksum_needs_seals() -> None:
+    target = _planted("gnss-ubx", _has_127_satellites)
+    plain = Target("planted", target.seeds, lambda rng, base: damage(rng, base), target.run)
+    assert not fuzz(plain, 200).findings
 
 
 def test_a_warning_is_a_finding() -> None:
     def run(data: bytes) -> Iterator[str]:
-        import numpy as np
-
         np.array([1e300]).astype(np.int32)
         return iter(())
 
-    assert fuzz(Target("cast", [b"x"], lambda rng, base: base, run), seconds=5, executions=2).crashes
+    assert fuzz(Target("cast", [b"x"], lambda rng, base: base, run), 2).findings
+
+
+def test_an_input_that_takes_much_memory_is_a_finding() -> None:
+    def run(data: bytes) -> Iterator[str]:
+        bytearray(len(data) << 24)
+        return iter(())
+
+    target = Target("large", [b"x"], lambda rng, base: base, run)
+    (finding,) = fuzz(target, 200).findings.values()
+    assert "bytes of memory" in str(finding[1])
+
+
+def test_a_finding_is_minimised() -> None:
+    def run(data: bytes) -> Iterator[str]:
+        assert len(data) < 4
+        return iter(())
+
+    def mutate(rng: random.Random, base: bytes) -> bytes:
+        return base + rng.randbytes(rng.randrange(1, 4))
+
+    (finding,) = fuzz(Target("long", [b"", b"x"], mutate, run), 100).findings.values()
+    assert len(finding[0]) == 4
 
 
 def test_names_from_noise_take_bounded_memory() -> None:
