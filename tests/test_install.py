@@ -13,7 +13,7 @@ from tests.daemon.rig import HANGS_S
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("daemon", "drivers", "georef", "calib", "sim")
-PROCESSING_ONLY = ("numba", "scipy", "pyproj", "laspy", "matplotlib")
+PROCESSING_ONLY = ("numba", "scipy", "pyproj", "laspy", "matplotlib", "jinja2", "weasyprint")
 PLACED = {
     "etc/chrony/conf.d/swath.conf",
     "etc/swath/swath.toml",

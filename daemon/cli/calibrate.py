@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 import tempfile
 from pathlib import Path
 from typing import Annotated
@@ -19,7 +20,7 @@ from swath.daemon.cli.options import (
     TrajectoryWeek,
 )
 from swath.daemon.errors import ExitCode, UserError, one_line
-from swath.daemon.processing.requirements import require_installed
+from swath.daemon.processing.requirements import PRINTED_PAGES, require_installed
 
 OBSERVE = ("planes", "ties", "markings")
 
@@ -85,7 +86,7 @@ def command(
     be worth its name, then no file is written; or where its verdict is "Not to be used", unless --accept-verdict
     is given: the verdict stands in the file all the same.
     """
-    require_installed("swath calibrate", *(["matplotlib"] if report else []))
+    require_installed("swath calibrate", *(PRINTED_PAGES if report else ()))
     from swath.daemon.cli.georef import calibrations_given
     from swath.daemon.cli.progress import progress_bar
     from swath.daemon.config import load_config
@@ -134,6 +135,8 @@ def command(
     with tempfile.TemporaryDirectory(prefix="swath-", dir=output.resolve().parent) as folder, progress_bar() as tell:
         told = write_products(wish, calibrate(wish, Path(folder), tell), tell)
     print(json.dumps(told.record, indent=2) if as_json else "\n".join(map(one_line, told.lines)))
+    for line in told.warnings:
+        print(one_line(f"swath: {line}"), file=sys.stderr)
     if told.record["verdict"]["level"] == "unusable" and not accept_verdict:
         raise UserError(f"{output}: {one_line(told.record['verdict']['sentence'])}")
 

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from swath.daemon.errors import ExitCode, UserError, one_line
-from swath.daemon.processing.requirements import require_installed
+from swath.daemon.processing.requirements import PAGES, require_installed
 
 
 def command(
@@ -55,7 +55,7 @@ def command(
     Every fix that was read is used or counted with the reason why not. Exit code 1 when the trajectory is partial or
     not to be used: data damaged, parts missing, inputs that do not go together; 2 and 3 when there is none.
     """
-    require_installed("swath trajectory", *([] if no_page else ["matplotlib"]))
+    require_installed("swath trajectory", *(() if no_page else PAGES))
     from swath.daemon.cli.progress import progress_bar
     from swath.daemon.config import load_config
     from swath.daemon.processing.navigation.inputs import INS_USES, InputOptions

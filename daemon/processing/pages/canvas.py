@@ -21,7 +21,6 @@ CLASSES = ("#2f9e4c", "#f4cc2a", "#e4572e", "#7d1d5a")  # colours up to each of 
 SETTINGS: Any = {
     "svg.hashsalt": "calibration",  # the same picture then gives the same text
     "svg.fonttype": "path",
-    "pdf.fonttype": 42,
     "font.family": "DejaVu Sans",
     "font.size": 8.5,
     "path.simplify": True,
@@ -68,29 +67,24 @@ class Picture:
 
 
 class Canvas:
-    """A figure, or an area of a page, measured in inches from its upper left corner.
+    """A figure, measured in inches from its upper left corner.
 
     Attributes:
         figure: the Matplotlib figure.
         form, height_in: format and height of the canvas.
     """
 
-    def __init__(
-        self, figure: Figure, form: Format, height_in: float, corner_in: tuple[float, float] = (0.0, 0.0)
-    ) -> None:
+    def __init__(self, figure: Figure, form: Format, height_in: float) -> None:
         self.figure, self.form, self.height_in = figure, form, height_in
-        self._corner_in = corner_in
-        self._page_in = float(figure.get_figwidth()), float(figure.get_figheight())
 
     def place(self, left: float, top: float) -> tuple[float, float]:
         """Return a point in the figure's own coordinates, 0 … 1 from its lower left corner."""
-        (across, up), (x, y) = self._page_in, self._corner_in
-        return (x + left) / across, 1.0 - (y + top) / up
+        return left / self.form.width_in, 1.0 - top / self.height_in
 
     def panel(self, left: float, top: float, width: float, height: float, **more: Any) -> Axes:
         """Return styled axes of this size."""
         x, y = self.place(left, top + height)
-        axes: Axes = self.figure.add_axes((x, y, width / self._page_in[0], height / self._page_in[1]), **more)
+        axes: Axes = self.figure.add_axes((x, y, width / self.form.width_in, height / self.height_in), **more)
         dress(axes)
         return axes
 

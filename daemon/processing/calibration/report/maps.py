@@ -20,6 +20,7 @@ from swath.calib.summary import DifferenceMap, ReportInput
 from swath.daemon.processing.pages.canvas import (
     INK,
     MUTED,
+    PAPER,
     Canvas,
     Format,
     Picture,
@@ -74,15 +75,15 @@ def difference_picture(report: ReportInput) -> Picture | None:
         form = canvas.form
         width = (form.width_in - 0.1) / form.columns - 0.7
         panels = (("Before", grid.before_m, grid.before_words), ("After", grid.after_m, grid.after_words))
-        for i, (words, values_m, told) in enumerate(panels):
+        for i, (words, values_m, overall) in enumerate(panels):
             row, column = divmod(i, form.columns)
             top = 0.75 + row * (height(form) + 0.75)
             axes = canvas.panel(0.62 + column * (width + 0.7), top, width, height(form))
             _differences(axes, grid, 100.0 * values_m)
-            axes.set_title(f"{words}: {told}" if told else words, loc="left", fontsize=8.5, color=INK, pad=4)
+            axes.set_title(f"{words}: {overall}" if overall else words, loc="left", fontsize=8.5, color=INK, pad=4)
             shown.frame(axes, width / height(form))
             _words(axes)
-        canvas.legend(_difference_legend(), 3 if form.narrow else 9)
+        canvas.legend(_difference_legend(), 3 if form.narrow else 5 if form is PAPER else 9)
 
     words = "Height differences of overlapping strips, first − second, of each cell the largest; RMSDz is of all pairs."
     return Picture("Difference maps", words, height_in, draw)

@@ -9,7 +9,6 @@ import math
 import textwrap
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import matplotlib as mpl
@@ -26,7 +25,7 @@ from swath.calib.profiles.measure import Ground
 from swath.calib.profiles.sections import Corridor, fit_pieces
 from swath.calib.profiles.stepwise import Profile, Section
 from swath.calib.summary import Profile as Picture
-from swath.daemon.processing.calibration.report.tables import Table
+from swath.daemon.processing.pages.blocks import Table
 from swath.daemon.processing.pages.canvas import INK, MUTED
 
 PAGE_IN = (9.6, 4.6)
@@ -106,7 +105,7 @@ def pictures(checked: Check, at_start: Flight, control: Sequence[ControlPoint] =
         before = _targets if profile.kind == "range" else _sections
         shown = replace(profile, before=before(profile, at_start, control), after=profile.before)
         title = f"Profile for {profile.kind}: {profile.names[0]} and {profile.names[1]}"
-        found.append(Picture(title, "", svg(shown), partial(draw, shown)))
+        found.append(Picture(title, "", svg(shown)))
     return found
 
 
