@@ -141,6 +141,14 @@ def test_presets_are_installed(installed: Path) -> None:
     assert "'small.toml'" in done.stdout, done.stderr
 
 
+def test_templates_of_pages_are_installed(installed: Path) -> None:
+    folder = "(importlib.resources.files('swath.daemon') / 'processing/pages/templates')"
+    code = f"import importlib.resources; print(sorted(path.name for path in {folder}.iterdir()))"
+    done = run_installed(installed, "-c", code)
+    templates = (ROOT / "daemon/processing/pages/templates").iterdir()
+    assert done.stdout.strip() == str(sorted(path.name for path in templates)), done.stderr
+
+
 def test_bare_install_lists_its_devices(installed: Path) -> None:
     done = run_installed(installed, "-m", "swath.daemon.cli.main", "devices", "--json")
     assert done.returncode == 0, done.stderr
