@@ -19,6 +19,7 @@ from swath.calib.flight import Flight, Swath
 from swath.calib.summary import DifferenceMap, ReportInput
 from swath.daemon.processing.pages.canvas import (
     INK,
+    MOST_MARKS,
     MUTED,
     PAPER,
     Canvas,
@@ -183,6 +184,7 @@ class _Shown:
                 mine = np.array([p.centre_t[:2] for p, rms in known if p.kind == kind and class_of(rms) == colour])
                 if len(mine):
                     look: dict[str, Any] = {"ms": size, "mec": "white", "mew": 0.3, "zorder": 5}
+                    look["rasterized"] = len(known) > MOST_MARKS
                     axes.plot(mine[:, 0], mine[:, 1], MARKERS.get(kind, "o"), color=colour, **look)
 
     def legend(self) -> list[Line2D]:

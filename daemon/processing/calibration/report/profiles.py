@@ -26,7 +26,7 @@ from swath.calib.profiles.sections import Corridor, fit_pieces
 from swath.calib.profiles.stepwise import Profile, Section
 from swath.calib.summary import Profile as Picture
 from swath.daemon.processing.pages.blocks import Table
-from swath.daemon.processing.pages.canvas import INK, MUTED
+from swath.daemon.processing.pages.canvas import INK, MOST_MARKS, MUTED, RASTER_DPI
 
 PAGE_IN = (9.6, 4.6)
 COLOURS = ("#0072b2", "#d55e00")  # first, second; their marks differ too, for readers who cannot see the colours
@@ -169,7 +169,8 @@ def draw(profile: Profile) -> Figure:
         for section, name, colour, mark in zip(sections, profile.names, COLOURS, MARKS, strict=True):
             distance_m, height_m = _thinned(section, low, high)
             size = float(np.clip(5000.0 / max(len(distance_m), 1), 2.0, 30.0))
-            axes.scatter(distance_m, height_m, s=size, marker=mark, color=colour, lw=0, alpha=0.6, label=name)
+            points = axes.scatter(distance_m, height_m, s=size, marker=mark, color=colour, lw=0, alpha=0.6, label=name)
+            points.set_rasterized(len(distance_m) > MOST_MARKS)
         axes.set_title(title, loc="left", fontsize=9, color=INK)
         axes.set_xlabel(
             "To the right of the track (m)" if profile.kind == "range" else "Along the profile (m)",
@@ -192,7 +193,7 @@ def svg(profile: Profile) -> str:
     """Return the figure as SVG; the same profile gives the same text."""
     text = io.StringIO()
     with mpl.rc_context(_SVG):
-        draw(profile).savefig(text, format="svg", metadata={"Date": None, "Creator": None})
+        draw(profile).savefig(text, format="svg", metadata={"Date": None, "Creator": None}, dpi=RASTER_DPI)
     return text.getvalue()
 
 
