@@ -8,7 +8,7 @@ import io
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -52,7 +52,7 @@ class Told:
 
     record: dict[str, Any]
     lines: list[str]
-    warnings: list[str]
+    warnings: list[str] = field(default_factory=list)
 
 
 def write_products(wish: CalibrationOptions, done: Calibrated, tell: Steps) -> Told:

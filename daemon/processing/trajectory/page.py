@@ -113,7 +113,13 @@ def write_page(path: Path, flight: Flight, findings: Iterable[Found] = ()) -> tu
     verdict = judge(figures, findings)
     drawn = Drawn(flight, course_of(flight), separation)
     pictures = [
-        Image(title, *(data_uri(draw(drawn, form), "image/png") for form in (WIDE, NARROW)), title=title, words=words)
+        Image(
+            title,
+            data_uri(draw(drawn, WIDE), "image/png"),
+            data_uri(draw(drawn, NARROW), "image/png"),
+            title=title,
+            words=words,
+        )
         for title, words, draw, wanted in PICTURES
         if wanted(drawn)
     ]

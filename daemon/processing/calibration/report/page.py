@@ -58,7 +58,7 @@ def paper_page(report: ReportInput) -> str:
     return _page(report, PAPER)
 
 
-def _page(report: ReportInput, *forms: Format) -> str:
+def _page(report: ReportInput, form: Format, narrow: Format | None = None) -> str:
     """Return the page's text with pictures in one format, or in one for wide and one for narrow windows."""
     verdict = judge(report)
     return render(
@@ -66,18 +66,19 @@ def _page(report: ReportInput, *forms: Format) -> str:
         heading=report.heading,
         verdict=verdict,
         cards=cards_of(report),
-        blocks=[_block(content, forms) for content in contents_of(report, verdict)],
+        blocks=[_block(content, form, narrow) for content in contents_of(report, verdict)],
     )
 
 
-def _block(content: Content, forms: tuple[Format, ...]) -> Block:
+def _block(content: Content, form: Format, narrow: Format | None) -> Block:
     """Return contents as they are, and pictures as images: each is a file of its own, so that ids do not collide."""
     if isinstance(content, Picture):
-        uris = [data_uri(content.svg(form), SVG) for form in forms]
-        return Image(content.title, *uris, title=content.title, words=content.words)
+        wide = data_uri(content.svg(form), SVG)
+        other = "" if narrow is None else data_uri(content.svg(narrow), SVG)
+        return Image(content.title, wide, other, content.title, content.words)
     if isinstance(content, Profile):
         uri = data_uri(content.svg.encode(), SVG)
-        return Image(content.title, uri, title=content.title, words=content.caption, limited=True)
+        return Image(content.title, uri, "", content.title, content.caption, limited=True)
     return content
 
 

@@ -206,7 +206,7 @@ def _trajectory_picture(fit: TrajectoryFit, flown: int, *, several: bool) -> Pic
             axes.plot(at, value, color=AFTER, lw=1.0)
             axes.axhline(0.0, color=INK, lw=0.5)
             (dots,) = axes.plot(at[on_strips], value[on_strips], ".", ms=2.6, color=SERIES[1])
-            dots.set_rasterized(6 * np.count_nonzero(on_strips) > MOST_MARKS)
+            dots.set_rasterized(bool(6 * np.count_nonzero(on_strips) > MOST_MARKS))
             axes.margins(x=0.0)
         for axes in panels.axes[-canvas.form.columns :]:
             axes.set_xlabel("Time since the first knot (min)", fontsize=8.5, color=MUTED)

@@ -91,9 +91,17 @@ def profiles_table(checked: Check) -> Table | None:
 
 
 def pictures(checked: Check, at_start: Flight, control: Sequence[ControlPoint] = ()) -> list[Picture]:
-    """Return pictures of the most precise profiles of each kind, with points as at the start and as adjusted.
+    """Return pictures of the profiles that `most_precise` chooses."""
+    return [
+        Picture(f"Profile for {shown.kind}: {shown.names[0]} and {shown.names[1]}", "", svg(shown))
+        for shown in most_precise(checked, at_start, control)
+    ]
 
-    The result of a profile is not applied to the second picture, so that it shows the errors that the adjustment left.
+
+def most_precise(checked: Check, at_start: Flight, control: Sequence[ControlPoint] = ()) -> list[Profile]:
+    """Return the most precise profiles of each kind, with points before as at the start and after as adjusted.
+
+    The result of a profile is not applied to the points after, so that they show the errors that the adjustment left.
 
     Args:
         checked: profiles, measured with the points as adjusted.
@@ -103,9 +111,7 @@ def pictures(checked: Check, at_start: Flight, control: Sequence[ControlPoint] =
     found = []
     for profile in _surest(checked.profiles):
         before = _targets if profile.kind == "range" else _sections
-        shown = replace(profile, before=before(profile, at_start, control), after=profile.before)
-        title = f"Profile for {profile.kind}: {profile.names[0]} and {profile.names[1]}"
-        found.append(Picture(title, "", svg(shown)))
+        found.append(replace(profile, before=before(profile, at_start, control), after=profile.before))
     return found
 
 
