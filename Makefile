@@ -109,7 +109,7 @@ $(VENV)/.tests: pyproject.toml | $(VENV)/bin/python
 	@sh systemd/setup.sh pip "$(VENV)" '.[test]'
 	@touch $@ $(VENV)/.flies
 
-# the units and rules are tested with systemd's own tools
+# the units and rules are tested with systemd's own tools, PDF with Pango
 $(VENV)/.tools: | $(VENV)/bin/python
 	@sh systemd/setup.sh tools
 	@touch $@

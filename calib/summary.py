@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Protocol
 
 from swath.calib.calibration_file import Header
 from swath.calib.features import Features
@@ -74,14 +74,12 @@ class Profile:
 
     Attributes:
         title, caption: text above and below.
-        svg: the picture for the page.
-        figure: creates the picture as a figure of Matplotlib, for the PDF; None: only the page shows it.
+        svg: the picture.
     """
 
     title: str
     caption: str
     svg: str
-    figure: Callable[[], Any] | None = None
 
 
 @dataclass(frozen=True, slots=True)

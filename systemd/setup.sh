@@ -2,7 +2,7 @@
 # What `make demo` and `make test` need before they start; quiet unless it goes wrong.
 #   setup.sh venv PYTHON FOLDER      a virtual environment
 #   setup.sh pip FOLDER REQUIREMENT  this project and its dependencies in it
-#   setup.sh tools                   systemd's own checkers of units, users and temporary files
+#   setup.sh tools                   systemd's own checkers of units, users and temporary files; Pango, which sets PDF
 set -eu
 
 fail() { echo "swath: $*" >&2; exit 1; }
@@ -52,9 +52,18 @@ check_tools() {
     apt_install systemd || fail "the tests need$missing, and apt-get could not install systemd"
 }
 
+check_pango() {
+    packages="libpango-1.0-0 libpangoft2-1.0-0"
+    ! PATH="$PATH:/sbin:/usr/sbin" ldconfig -p | grep -q 'libpangoft2-1\.0\.so\.0' || return 0
+    [ "$(id -u)" = 0 ] || fail "the tests print PDF with Pango: sudo apt-get install $packages"
+    echo "installing Pango"
+    # shellcheck disable=SC2086
+    apt_install $packages || fail "the tests print PDF with Pango, and apt-get could not install $packages"
+}
+
 case "${1-}" in
     venv) make_venv "$2" "$3" ;;
     pip) pip_install "$2" "$3" ;;
-    tools) check_tools ;;
-    *) fail "usage: setup.sh venv PYTHON FOLDER | pip FOLDER REQUIREMENT | tools" ;;
+    tools) check_tools && check_pango ;;
+    *) fail "use: setup.sh venv PYTHON FOLDER | pip FOLDER REQUIREMENT | tools" ;;
 esac

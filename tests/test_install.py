@@ -13,7 +13,7 @@ from tests.daemon.rig import HANGS_S
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("daemon", "drivers", "georef", "calib", "sim")
-PROCESSING_ONLY = ("numba", "scipy", "pyproj", "laspy", "matplotlib", "tomlkit")
+PROCESSING_ONLY = ("numba", "scipy", "pyproj", "laspy", "matplotlib", "jinja2", "tomlkit", "weasyprint")
 PLACED = {
     "etc/chrony/conf.d/swath.conf",
     "etc/swath/swath.toml",
@@ -139,6 +139,14 @@ def test_presets_are_installed(installed: Path) -> None:
     code = f"import importlib.resources; print(sorted(path.name for path in {folder}.iterdir()))"
     done = run_installed(installed, "-c", code)
     assert "'small.toml'" in done.stdout, done.stderr
+
+
+def test_templates_of_pages_are_installed(installed: Path) -> None:
+    folder = "(importlib.resources.files('swath.daemon') / 'processing/pages/templates')"
+    code = f"import importlib.resources; print(sorted(path.name for path in {folder}.iterdir()))"
+    done = run_installed(installed, "-c", code)
+    templates = (ROOT / "daemon/processing/pages/templates").iterdir()
+    assert done.stdout.strip() == str(sorted(path.name for path in templates)), done.stderr
 
 
 def test_bare_install_lists_its_devices(installed: Path) -> None:

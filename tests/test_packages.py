@@ -24,6 +24,12 @@ heights, out = np.array([100.0]), np.zeros(1)
 means(np.zeros((CELLS, 5)), heights, heights + 100.0, out)
 print(swath.__file__)
 """
+RENDER = """
+from swath.daemon.processing.pages.blocks import Words
+from swath.daemon.processing.pages.render import render
+page = render("quicklook.html", heading="Points", crs="", cards=[], blocks=[Words("a line of words")])
+print(page.count("a line of words"), page.count("@page"))
+"""
 OTHER_DAEMON = """
 import sys
 import daemon
@@ -105,6 +111,13 @@ def test_scripts_called_as_the_packages_are_do_not_stand_before_them(tmp_path: P
     assert (folder / "small.png").stat().st_size > 10_000
     place.run("python", "-m", "swath.daemon.cli.main", "devices", folder=folder)
     place.run("python", "-c", "import swath.calib.adjust, swath.georef.georeference", folder=folder)
+
+
+@pytest.mark.parametrize("options", [(), ("--editable",)])
+def test_pages_find_their_templates(tmp_path: Path, options: tuple[str, ...]) -> None:
+    place = Place(tmp_path)
+    place.install_swath(*options)
+    assert place.run("python", "-c", RENDER) == "1 1\n"
 
 
 def test_an_editable_installation_works_over_what_an_ordinary_one_left(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 import tempfile
 from pathlib import Path
 from typing import Annotated
@@ -19,7 +20,7 @@ from swath.daemon.cli.options import (
     TrajectoryWeek,
 )
 from swath.daemon.errors import ExitCode, UserError, one_line
-from swath.daemon.processing.requirements import require_installed
+from swath.daemon.processing.requirements import PRINTED_PAGES, require_installed
 
 OBSERVE = ("planes", "ties", "markings")
 
@@ -93,7 +94,7 @@ def command(
     logs do not give a calibration (then no file is written), or if its verdict is "Not to be used", unless you give
     --accept-verdict (the file is written and holds the verdict).
     """
-    require_installed("swath calibrate", *(["matplotlib"] if report else []))
+    require_installed("swath calibrate", *(PRINTED_PAGES if report else ()))
     from swath.daemon.cli.georef import calibrations_given
     from swath.daemon.cli.progress import progress_bar
     from swath.daemon.config import load_config
@@ -142,6 +143,8 @@ def command(
     with tempfile.TemporaryDirectory(prefix="swath-", dir=output.resolve().parent) as folder, progress_bar() as tell:
         products = write_products(request, calibrate(request, Path(folder), tell), tell)
     print(json.dumps(products.record, indent=2) if as_json else "\n".join(map(one_line, products.lines)))
+    for line in products.warnings:
+        print(one_line(f"swath: {line}"), file=sys.stderr)
     if products.record["verdict"]["level"] == "unusable" and not accept_verdict:
         raise UserError(f"{output}: {one_line(products.record['verdict']['sentence'])}")
 

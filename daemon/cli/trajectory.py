@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from swath.daemon.errors import ExitCode, UserError, one_line
-from swath.daemon.processing.requirements import require_installed
+from swath.daemon.processing.requirements import PAGES, require_installed
 
 
 def command(
@@ -61,7 +61,7 @@ def command(
     Every fix is either used or counted with the reason for leaving it out. Exit code 1 when the trajectory is partial
     or not to be used: data damaged, parts missing, inputs that contradict each other; 2 or 3 when there is none.
     """
-    require_installed("swath trajectory", *([] if no_page else ["matplotlib"]))
+    require_installed("swath trajectory", *(() if no_page else PAGES))
     from swath.daemon.cli.progress import progress_bar
     from swath.daemon.config import load_config
     from swath.daemon.processing.navigation.inputs import INS_USES, InputOptions

@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from swath.daemon.errors import ExitCode, UserError, one_line
-from swath.daemon.processing.requirements import require_installed
+from swath.daemon.processing.requirements import PAGES, require_installed
 
 
 def command(
@@ -38,7 +38,7 @@ def command(
 
     Exit code 4 when a file could be read only in part.
     """
-    require_installed("swath view", "matplotlib")
+    require_installed("swath view", *PAGES)
     if cell is not None and not (math.isfinite(cell) and cell > 0.0):
         raise UserError(f"--cell: got {cell:g}, want metres above 0", ExitCode.USAGE)
     ends = _ends(profile)

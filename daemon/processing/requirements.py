@@ -8,13 +8,15 @@ from swath.daemon.errors import ExitCode, UserError
 from swath.drivers.extras import how_to_install
 
 PROCESS = ("numba", "scipy", "pyproj", "laspy", "lazrs")
-EXTRA_OF = {"foxglove": "live", "matplotlib": "process"}  # package: the extra that installs it
+PAGES = ("matplotlib", "jinja2")  # for HTML pages
+PRINTED_PAGES = (*PAGES, "weasyprint")  # for HTML pages that are written as PDF too
+EXTRA_OF = {"foxglove": "live"}  # package: the extra that installs it, if not process
 
 
 def require_installed(command: str, *others: str) -> None:
     """Refuse to run a command with `UserError` if a package is missing; the message tells how to install it."""
     missing = [name for name in (*PROCESS, *others) if importlib.util.find_spec(name) is None]
     if missing:
-        extras = ",".join(dict.fromkeys(["process", *(EXTRA_OF[name] for name in others)]))
+        extras = ",".join(dict.fromkeys(["process", *(EXTRA_OF.get(name, "process") for name in others)]))
         text = f"{command} needs {', '.join(missing)}, which are not installed: {how_to_install(extras)}"
         raise UserError(text, ExitCode.USAGE)

@@ -5,31 +5,35 @@ from __future__ import annotations
 import base64
 import math
 import re
+import sys
+import time
 import xml.etree.ElementTree as ET
+import zlib
 from collections import Counter
 from dataclasses import replace
 from html.parser import HTMLParser
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 from swath.calib.features import Features
 from swath.calib.labels import decimals_of, degrees, length, number, plain, share, unknown
 from swath.calib.need import Need
 from swath.calib.outcome import Adjusted, Considered, ControlFit, FixedParameter, GroupFit
 from swath.calib.profiles.check import Check, Comparison
-from swath.calib.summary import Finding
-from swath.calib.verdict import Level, held_words
+from swath.calib.summary import Finding, PairDifference, ReportInput
+from swath.calib.verdict import Level, held_words, judge
+from swath.daemon.processing.calibration.products import pages
 from swath.daemon.processing.calibration.report.cuts import cuts_of
 from swath.daemon.processing.calibration.report.maps import plane_rms_cm
-from swath.daemon.processing.calibration.report.page import PairDifference, Profile, ReportInput, html, judge, pdf
-from swath.daemon.processing.calibration.report.pdf import width_in, wrapped
+from swath.daemon.processing.calibration.report.page import html, paper_page, pdf
 from swath.daemon.processing.calibration.report.residuals import residual_picture, seen_of
 from swath.daemon.processing.calibration.report.tables import entries_table, held_table, parameter_tables
-from swath.daemon.processing.pages.canvas import NARROW, PAPER
+from swath.daemon.processing.pages.canvas import NARROW
 from tests.calib.made_outcome import RISE, Outcome, made_outcome, made_report
+from tests.same_bytes import numbers_of
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("kernels")]
 
@@ -416,28 +420,54 @@ def test_two_scanners(report: ReportInput) -> None:
     assert "<title>Calibration of left and right, HB-ABC/left/2026-03</title>" in html(bare_of(two, title=two.heading))
 
 
-def test_pdf(report: ReportInput) -> None:
-    """Pages of A4, with the profile's figure when there is one; the same bytes each time."""
+def test_the_pdf_is_the_same_bytes_each_time(report: ReportInput) -> None:
+    """Its fonts too, which are cut to the characters in use and could hold the time."""
     bare = bare_of(report, notes=["$100 & <b>"])
-    assert pdf(bare) == pdf(bare)
-    drawn = Profile("Roll", "words", "<svg xmlns='http://www.w3.org/2000/svg'/>", lambda: Figure(figsize=(8.0, 3.0)))
-    file = pdf(replace(report, profiles=[drawn]))
+    file = pdf(bare)
+    time.sleep(1.1)
+    assert pdf(bare) == file
+    assert b"CreationDate" not in inflated(file)
+
+
+def inflated(file: bytes) -> bytes:
+    """A PDF's compressed streams, most objects among them, one after the other."""
+    return b"\n".join(map(zlib.decompress, re.findall(rb"stream\n(.*?)\nendstream", file, re.DOTALL)))
+
+
+def test_the_pdf_has_a_title_a4_pages_and_its_fonts_within(report: ReportInput) -> None:
+    file = pdf(report)
     assert file.startswith(b"%PDF-")
-    assert 6 <= len(re.findall(rb"/Type /Page\b", file)) <= 16
-    boxes = re.findall(rb"/MediaBox \[ ([\d. ]+)\]", file)
+    objects = inflated(file)
+    assert b"/Title (Calibration of left, HB-ABC/left/2026-03)" in objects
+    assert 6 <= len(re.findall(rb"/Type /Page\b", objects)) <= 16
+    boxes = re.findall(rb"/MediaBox \[([\d. ]+)\]", objects)
     assert {tuple(round(float(x)) for x in box.split()) for box in boxes} == {(0, 0, 595, 842)}
-    assert b"CreationDate" not in file
-    # 8 × 3 inches at 220 points an inch
-    assert re.search(rb"/Width 1760\b", file)
+    used = set(re.findall(rb"/BaseFont /[A-Z]{6}\+([\w-]+)", objects))
+    assert used == {b"DejaVu-Sans", b"DejaVu-Sans-Bold", b"DejaVu-Sans-Mono"}
+    assert len(re.findall(rb"/FontFile2 \d", objects)) == 3
 
 
-def test_lines_of_the_pdf_fit() -> None:
-    words = "Points of one plane in several strips satisfy n · x = d, " * 5 + "ab12" * 60
-    for line in wrapped(words, 3.0):
-        assert 0.0 < width_in(line) <= 3.0
-    assert "".join(wrapped(words, 3.0)).replace(" ", "") == words.replace(" ", "")
-    assert width_in("mm") == pytest.approx(2 * width_in("m"))
-    assert PAPER.width_in < 8.27
+def test_what_is_printed_shows_the_numbers_of_the_page(report: ReportInput, page: str) -> None:
+    assert numbers_of(paper_page(report)) == numbers_of(page)
+
+
+def test_without_pango_the_page_is_written_and_a_line_says_what_to_install(
+    report: ReportInput, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    def dlopen(ffi: object, name: str, flags: int = 0) -> None:
+        raise OSError(f"cannot load library {name!r}")
+
+    for name in [name for name in sys.modules if name.split(".")[0] == "weasyprint"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setattr("cffi.FFI.dlopen", dlopen)
+    warnings: list[str] = []
+    files = pages(tmp_path, bare_of(report), warnings)
+    assert list(files) == [tmp_path / "report.html"]
+    assert warnings == [
+        f"{tmp_path / 'report.pdf'}: not written, because Pango is missing: apt-get install libpango-1.0-0 "
+        "libpangoft2-1.0-0; report.html shows the same"
+    ]
+    assert capfd.readouterr() == ("", "")
 
 
 def test_numbers_as_people_read_them() -> None:

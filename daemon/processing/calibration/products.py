@@ -8,7 +8,7 @@ import io
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -44,16 +44,18 @@ from swath.georef.scanner.calibration import INDEX, PARAMETERS
 from swath.georef.verdicts import Level, Verdict
 
 Steps = Callable[[str, int, int], None]  # arguments: the step, how much is done, of how much
+PAGE, PRINTED = "report.html", "report.pdf"
 MAP_CELLS = 400  # maximum cells across a map of differences
 BEYOND = 3.0  # sigmas, of strips and calibration together, above which strips contradict the calibration
 
 
 @dataclass(frozen=True)
 class Told:
-    """The outcome: values for scripts, and lines for people."""
+    """The outcome: values for scripts, lines for people, and warnings about files that could not be made."""
 
     record: dict[str, Any]
     lines: list[str]
+    warnings: list[str] = field(default_factory=list)
 
 
 def write_products(wish: CalibrationOptions, done: Calibrated, tell: Steps) -> Told:
@@ -92,11 +94,15 @@ def write_products(wish: CalibrationOptions, done: Calibrated, tell: Steps) -> T
         "need": _need_entry(report.need),
         "carried": verdict_entry(carried, accepted=wish.logs.accept_verdict),
     }
+    warnings: list[str] = []
     if wish.report is not None:
         tell("report", 0, 1)
-        files |= _report_files(wish.report, done, report, wish.facts)
+        files |= pages(wish.report, _with_profiles(report, done), warnings)
+        files |= _records(wish.report, done, report, wish.facts)
         files[wish.report / OUTCOME] = (json.dumps(record, indent=2) + "\n").encode()
     _write(files)
+    if wish.report is not None and wish.report / PRINTED not in files:
+        (wish.report / PRINTED).unlink(missing_ok=True)  # of an earlier run
     written = [str(path) for path in files]
     reasons = [f"also: {reason.what}" for reason in verdict.reasons[1:]]
     return Told(
@@ -106,6 +112,7 @@ def write_products(wish: CalibrationOptions, done: Calibrated, tell: Steps) -> T
             *_lines(done, wish.model.ibrc_knots, before, after),
             *(verdict.sentence, *reasons, *written),
         ],
+        warnings,
     )
 
 
@@ -359,10 +366,26 @@ def _wanted(done: Calibrated) -> dict[str, float]:
     return {factors[key][0]: sigma * factors[key][1] for key, sigma in wanted.items()}
 
 
-def _report_files(folder: Path, done: Calibrated, report: ReportInput, facts: Mapping[str, Plain]) -> dict[Path, bytes]:
-    """Return the report as HTML and PDF, and per scanner a record as XML and JSON with its matrices."""
-    report = replace(report, profiles=pictures(done.check, done.kept.flight, done.control))
-    files = {folder / "report.html": html(report).encode(), folder / "report.pdf": pdf(report)}
+def _with_profiles(report: ReportInput, done: Calibrated) -> ReportInput:
+
+    return replace(report, profiles=pictures(done.check, done.kept.flight, done.control))
+
+
+def pages(folder: Path, report: ReportInput, warnings: list[str]) -> dict[Path, bytes]:
+    """Return the report as HTML and PDF; where this computer cannot make a PDF, add a warning instead."""
+    from swath.daemon.processing.pages.pdf import PdfUnavailableError
+
+    files = {folder / PAGE: html(report).encode()}
+    try:
+        files[folder / PRINTED] = pdf(report)
+    except PdfUnavailableError as error:
+        warnings.append(f"{folder / PRINTED}: not written, {error}; {PAGE} shows the same")
+    return files
+
+
+def _records(folder: Path, done: Calibrated, report: ReportInput, facts: Mapping[str, Plain]) -> dict[Path, bytes]:
+    """Return per scanner a record as XML and JSON with its matrices."""
+    files = {}
     for name, header in report.headers.items():
         matrices, known = f"{name}.record.npz", instruments_of(done.kept)
         one = RecordInput(

@@ -16,12 +16,12 @@ from matplotlib.ticker import MaxNLocator
 INK, MUTED, LINE, PALE = "#1d242b", "#5d6770", "#b9bdb8", "#eef0ec"
 BEFORE, AFTER, GOOD, BAD = "#b8860b", "#0b5e8a", "#2f7d4f", "#b3261e"
 SERIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#7a5c00", "#56b4e9", "#8b1a1a", "#5b4fc4", "#444444")
+MOST_MARKS = 400  # that are drawn as lines; more become an image, because each takes a millisecond to print
+RASTER_DPI = 220
 LIMITS_CM = (2.0, 3.0, 5.0)
 CLASSES = ("#2f9e4c", "#f4cc2a", "#e4572e", "#7d1d5a")  # colours up to each of the limits, and above
 SETTINGS: Any = {
     "svg.hashsalt": "calibration",  # the same picture then gives the same text
-    "svg.fonttype": "path",
-    "pdf.fonttype": 42,
     "font.family": "DejaVu Sans",
     "font.size": 8.5,
     "path.simplify": True,
@@ -30,15 +30,20 @@ SETTINGS: Any = {
 
 @dataclass(frozen=True, slots=True)
 class Format:
-    """The width of a picture, the number of panels side by side, and the number of ticks on an axis."""
+    """The width of a picture, the number of panels side by side, and the number of ticks on an axis.
+
+    Attributes:
+        fonttype: how SVG holds text: "path" as outlines, since a reader's computer may lack the font; "none" as text.
+    """
 
     width_in: float
     columns: int
     ticks: int
     narrow: bool = False
+    fonttype: str = "path"
 
 
-WIDE, NARROW, PAPER = Format(10.4, 2, 8), Format(4.1, 1, 4, narrow=True), Format(7.1, 2, 6)
+WIDE, NARROW, PAPER = Format(10.4, 2, 8), Format(4.1, 1, 4, narrow=True), Format(7.1, 2, 6, fonttype="none")
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,39 +63,34 @@ class Picture:
 
     def svg(self, form: Format) -> bytes:
         """Return the picture as an SVG file; the same picture gives the same bytes."""
-        with rc_context(SETTINGS):
+        with rc_context(SETTINGS | {"svg.fonttype": form.fonttype}):
             height_in = self.height_in(form)
             figure = Figure(figsize=(form.width_in, height_in), facecolor="white")
             self.draw(Canvas(figure, form, height_in))
             held = io.BytesIO()
-            figure.savefig(held, format="svg", metadata={"Date": None, "Creator": None}, dpi=150)
+            figure.savefig(held, format="svg", metadata={"Date": None, "Creator": None}, dpi=RASTER_DPI)
         return held.getvalue()
 
 
 class Canvas:
-    """A figure, or an area of a page, measured in inches from its upper left corner.
+    """A figure, measured in inches from its upper left corner.
 
     Attributes:
         figure: the Matplotlib figure.
         form, height_in: format and height of the canvas.
     """
 
-    def __init__(
-        self, figure: Figure, form: Format, height_in: float, corner_in: tuple[float, float] = (0.0, 0.0)
-    ) -> None:
+    def __init__(self, figure: Figure, form: Format, height_in: float) -> None:
         self.figure, self.form, self.height_in = figure, form, height_in
-        self._corner_in = corner_in
-        self._page_in = float(figure.get_figwidth()), float(figure.get_figheight())
 
     def place(self, left: float, top: float) -> tuple[float, float]:
         """Return a point in the figure's own coordinates, 0 … 1 from its lower left corner."""
-        (across, up), (x, y) = self._page_in, self._corner_in
-        return (x + left) / across, 1.0 - (y + top) / up
+        return left / self.form.width_in, 1.0 - top / self.height_in
 
     def panel(self, left: float, top: float, width: float, height: float, **more: Any) -> Axes:
         """Return styled axes of this size."""
         x, y = self.place(left, top + height)
-        axes: Axes = self.figure.add_axes((x, y, width / self._page_in[0], height / self._page_in[1]), **more)
+        axes: Axes = self.figure.add_axes((x, y, width / self.form.width_in, height / self.height_in), **more)
         dress(axes)
         return axes
 

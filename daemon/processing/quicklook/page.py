@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import base64
 import math
 from collections.abc import Callable, Sequence
-from html import escape
 from pathlib import Path
 
 from swath.calib.strips.standards import ASPRS_OVERLAP, QUALITY_LEVELS, TO_CONFIRM, USGS
-from swath.daemon.processing.pages.style import QUICKLOOK_STYLE
+from swath.daemon.processing.pages.blocks import Block, Card, Cell, Image, Judged, Notes, Table, Words, data_uri
+from swath.daemon.processing.pages.render import render
 from swath.daemon.processing.pages.words import thousands
 from swath.daemon.processing.quicklook.maps import (
     draw_density,
@@ -44,37 +43,30 @@ def make_page(look: Look, folder: Path, title: str) -> Path:
     """
     folder.mkdir(parents=True, exist_ok=True)
     shown = []
-    for name, words, draw, wanted in PICTURES:
+    for name, alt, draw, wanted in PICTURES:
         path = folder / f"{name}.png"
         path.unlink(missing_ok=True)  # left by an earlier run
         if wanted(look):
             draw(look, path)
-            shown.append((words, path))
+            shown.append(Image(alt, data_uri(path.read_bytes(), "image/png")))
     page = folder / PAGE_NAME
     page.write_text(page_of(look, title, shown), encoding="utf-8")
     return page
 
 
-def page_of(look: Look, title: str, pictures: Sequence[tuple[str, Path]]) -> str:
+def page_of(look: Look, title: str, pictures: Sequence[Image]) -> str:
     """Return the HTML text of the page."""
-    parts = [
-        f"<!doctype html><html lang='en'><head><meta charset='utf-8'><title>{escape(title)}: quick look</title>",
-        "<meta name='viewport' content='width=device-width, initial-scale=1'>",
-        f"<style>{QUICKLOOK_STYLE}</style></head><body>",
-        f"<h1>{escape(title)}</h1>",
-        f"<p class='muted'>{escape(_crs_words(look))}</p>",
-        _figures(look),
-        _notes(look),
-        *(_picture(words, path) for words, path in pictures),
-        _quality(look),
-        _pairs(look),
+    blocks: list[Block] = [
+        *_notes(look),
+        *pictures,
+        *_quality(look),
+        *_pairs(look),
         _strips(look),
         _files(look),
-        _sidecars(look),
+        *_sidecars(look),
         _method(look),
-        "</body></html>\n",
     ]
-    return "\n".join(part for part in parts if part)
+    return render("quicklook.html", heading=title, crs=_crs_words(look), cards=_cards(look), blocks=blocks)
 
 
 def _crs_words(look: Look) -> str:
@@ -85,7 +77,7 @@ def _crs_words(look: Look) -> str:
     return f"{crs.name}{f' ({code[0]}:{code[1]})' if code else ''}"
 
 
-def _figures(look: Look) -> str:
+def _cards(look: Look) -> list[Card]:
     agreement = look.agreement
     cards = [
         (thousands(look.surface.points), "points"),
@@ -101,10 +93,7 @@ def _figures(look: Look) -> str:
     sigma_m = _root_mean_square(look)
     if sigma_m is not None:
         cards.append((f"{100 * sigma_m:.1f} cm", "sigma of height"))
-    told = "".join(
-        f"<div><b>{escape(value)}</b><span class='muted'>{escape(word)}</span></div>" for value, word in cards
-    )
-    return f"<div class='figures'>{told}</div>"
+    return cards
 
 
 def _root_mean_square(look: Look) -> float | None:
@@ -119,9 +108,9 @@ def _area(area_m2: float) -> str:
     return f"{area_m2 / 1e6:.3g} km²" if area_m2 >= 1e5 else f"{thousands(area_m2)} m²"
 
 
-def _notes(look: Look) -> str:
+def _notes(look: Look) -> list[Block]:
     notes = [*look.notes, *warnings_of(look)]
-    return f"<ul class='notes'>{''.join(f'<li>{escape(note)}</li>' for note in notes)}</ul>" if notes else ""
+    return [Notes(notes)] if notes else []
 
 
 def warnings_of(look: Look) -> list[str]:
@@ -129,61 +118,52 @@ def warnings_of(look: Look) -> list[str]:
     return list(dict.fromkeys(line for source in look.sources for line in warnings_in(source.sidecar)))
 
 
-def _picture(words: str, path: Path) -> str:
-    data = base64.b64encode(path.read_bytes()).decode("ascii")
-    return f"<figure><img alt='{escape(words)}' src='data:image/png;base64,{data}'></figure>"
+def _table(title: str, heads: Sequence[str], rows: Sequence[Sequence[Cell]], under: str = "") -> Table:
+    """Return a table of the first rows."""
+    return Table(title, heads, rows[:MOST_ROWS], under, omitted=max(len(rows) - MOST_ROWS, 0))
 
 
-def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return an HTML table of cells that are HTML themselves; the caller has escaped foreign text."""
-    head = "".join(f"<th>{word}</th>" for word in heads)
-    body = "".join(f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>" for row in rows[:MOST_ROWS])
-    more = f"<p class='muted'>and {len(rows) - MOST_ROWS} more</p>" if len(rows) > MOST_ROWS else ""
-    return f"<div class='scroll'><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>{more}"
+def _kept(kept: bool | None) -> Cell:
+    return "–" if kept is None else Judged("kept" if kept else "not kept", kept)
 
 
-def _judged(kept: bool | None) -> str:
-    return "–" if kept is None else "<span class='ok'>kept</span>" if kept else "<span class='no'>not kept</span>"
-
-
-def _quality(look: Look) -> str:
+def _quality(look: Look) -> list[Block]:
     agreement = look.agreement
     if not agreement.judged:
-        return f"<h2>Quality levels</h2><p>{escape(_unjudged(look))}</p>"
+        return [Words(_unjudged(look), "Quality levels")]
     numbers = agreement.numbers
     assert numbers is not None
     within_m = agreement.record()["within_m"]
     kept = {one.level: one.kept for one in agreement.judged if one.standard == USGS}
     rows = []
     for level in QUALITY_LEVELS:
-        row = [level.name]
+        row: list[Cell] = [level.name]
         for limit, word in (
             (f"≥ {level.pulses_m2:g}", "pulses_m2"),
             (f"≤ {100 * level.overlap_m:g} cm", "overlap_m"),
             (f"≤ {100 * level.overlap_max_m:g} cm", "overlap_max_m"),
             (f"≤ {100 * level.within_m:g} cm", "within_m"),
         ):
-            row += [limit, _judged(kept[level.name][word])]
+            row += [limit, _kept(kept[level.name][word])]
         rows.append(row)
     heads = ["level", "pulses per m²", f"here {agreement.pulses_m2:.3g}", "RMSDz", f"here {_cm(numbers['rms_m'])}"]
     heads += ("99 % of |dZ|", f"here {_cm(numbers['p99_m'])}", "within strips", f"here {_cm(within_m)}")
-    told = " ".join(f"{escape(line)}." for line in agreement.verdicts() if line != TO_CONFIRM)
-    return (
-        "<h2>Quality levels</h2>"
-        + _table(heads, rows)
-        + f"<p>{told}</p><p class='muted'>{escape(agreement.measure)}. Density: first returns per m² where cells are "
+    verdicts = " ".join(f"{line}." for line in agreement.verdicts() if line != TO_CONFIRM)
+    words = (
+        f"{agreement.measure}. Density: first returns per m² where cells are "
         "covered wholly, all strips together. Single cars or leaves decide over a largest |dZ|, so 99 % of the cells "
         f"must keep its limit. ASPRS asks for an RMSDz between swaths of at most {ASPRS_OVERLAP:g} × the vertical "
         f"accuracy class. {TO_CONFIRM[0].upper()}{TO_CONFIRM[1:]}. Absolute accuracy wants check points; nothing here "
-        "says it.</p>"
+        "says it."
     )
+    return [_table("Quality levels", heads, rows), Words(verdicts), Words(words, muted=True)]
 
 
 def _unjudged(look: Look) -> str:
     if look.agreement.numbers is None:
         return "No strips overlap on smooth ground: relative accuracy is not judged."
-    told = look.agreement.no_verdict
-    return f"{told[0].upper()}{told[1:]}."
+    reason = look.agreement.no_verdict
+    return f"{reason[0].upper()}{reason[1:]}."
 
 
 def _cm(metres: float | None) -> str:
@@ -194,92 +174,85 @@ def _percent(share: float) -> str:
     return f"{100 * math.floor(share * 1e4) / 1e4:.2f} %"  # 100 % only if it is all
 
 
-def _pairs(look: Look) -> str:
+def _pairs(look: Look) -> list[Block]:
     if not look.overlap.rows:
-        return ""
+        return []
     rows = [
         [
-            f"{escape(look.names[row['first']])} − {escape(look.names[row['second']])}",
+            f"{look.names[row['first']]} − {look.names[row['second']]}",
             f"{thousands(row['cells'])}{' (few)' if row['cells'] < FEW_CELLS else ''}",
             thousands(100 * row["median_m"], 1),
             thousands(100 * row["mean_m"], 1),
             f"{100 * row['rms_m']:.1f}",
             f"{100 * row['p95_m']:.1f}",
             f"{100 * row['max_m']:.1f}",
-            f"{_percent(row['cells'] / row['compared_cells'])}",
+            _percent(row["cells"] / row["compared_cells"]),
         ]
         for row in sorted(look.overlap.rows, key=lambda row: -row["rms_m"])
     ]
     heads = ("strips", "smooth cells", "median dZ", "mean", "RMSDz", "95 % of |dZ|", "largest", "of cells smooth")
-    under = f"<p class='muted'>Centimetres. {escape(look.agreement.measure)}.</p>"
-    return "<h2>Strips against each other</h2>" + _table(heads, rows) + under
+    return [_table("Strips against each other", heads, rows, f"Centimetres. {look.agreement.measure}.")]
 
 
-def _strips(look: Look) -> str:
+def _strips(look: Look) -> Table:
     sigmas = any(strip.sigma_m is not None for strip in look.strips)
     heads = ["strip", "points", "pulses", "length m", "area", "pulses per m²"]
     heads += ["σ east cm", "σ north cm", "σ height cm", "largest σ height"] if sigmas else []
     rows = []
     for strip in look.strips:
-        row = [escape(strip.name), thousands(strip.points), thousands(strip.pulses), thousands(strip.length_m)]
+        row = [strip.name, thousands(strip.points), thousands(strip.pulses), thousands(strip.length_m)]
         row += [_area(strip.area_m2), "–" if math.isnan(strip.density) else f"{strip.density:.3g}"]
         if strip.sigma_m is not None and strip.largest_sigma_m is not None:
             row += [f"{100 * value:.2f}" for value in (*strip.sigma_m, strip.largest_sigma_m[2])]
         elif sigmas:
             row += ["–"] * 4
         rows.append(row)
-    under = (
-        "<p class='muted'>Sigmas: root mean square over the strip's points, as the files say them.</p>"
-        if sigmas
-        else ""
-    )
-    return "<h2>Strips</h2>" + _table(heads, rows) + under
+    under = "Sigmas: root mean square over the strip's points, as the files say them." if sigmas else ""
+    return _table("Strips", heads, rows, under)
 
 
-def _files(look: Look) -> str:
+def _files(look: Look) -> Table:
     rows = [
         [
-            escape(source.path.name),
+            source.path.name,
             thousands(source.point_count),
-            f"{escape(source.version)}, {source.point_format}",
-            escape(source.crs.name if source.crs is not None else source.trouble),
-            escape(", ".join(calibrations_in(source.sidecar)) or "–"),
-            "<span class='no'>partial</span>" if source.damage else "whole",
+            f"{source.version}, {source.point_format}",
+            source.crs.name if source.crs is not None else source.trouble,
+            ", ".join(calibrations_in(source.sidecar)) or "–",
+            Judged("partial", good=False) if source.damage else "whole",
         ]
         for source in look.sources
     ]
-    return "<h2>Files</h2>" + _table(("file", "points", "LAS, format", "CRS", "calibration", "read"), rows)
+    return _table("Files", ("file", "points", "LAS, format", "CRS", "calibration", "read"), rows)
 
 
-def _sidecars(look: Look) -> str:
+def _sidecars(look: Look) -> list[Block]:
     """Return the parts about how files were made, from each different sidecar."""
-    said: list[tuple[list[str], list[tuple[str, str]]]] = []
+    known: list[tuple[list[str], list[tuple[str, str]]]] = []
     for source in look.sources:
         rows = rows_of(source.sidecar)
-        same = next((names for names, known in said if known == rows), None)
+        same = next((names for names, others in known if others == rows), None)
         if same is not None:
             same.append(source.path.name)
         elif rows:
-            said.append(([source.path.name], rows))
-    parts = []
-    for names, rows in said[:MOST_ROWS]:
-        told = ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
-        cells = "".join(
-            f"<tr><td>{escape(label)}</td><td class='left'>{escape(text)}</td></tr>" for label, text in rows
-        )
-        parts.append(f"<p class='muted'>{escape(told)}</p><div class='scroll'><table>{cells}</table></div>")
-    return f"<h2>How the points were made</h2>{''.join(parts)}" if parts else ""
+            known.append(([source.path.name], rows))
+    blocks: list[Block] = []
+    for names, rows in known[:MOST_ROWS]:
+        files = ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
+        title = "" if blocks else "How the points were made"
+        blocks += [Words(files, title, muted=True), Table("", ("", ""), rows, left=(0, 1))]
+    return blocks
 
 
-def _method(look: Look) -> str:
+def _method(look: Look) -> Words:
     frame = look.cells.frame
-    return (
-        "<h2>How dZ was found</h2><p class='muted'>"
+    text = (
         f"In each cell of {frame.cell_m:g} m a least squares plane goes through each strip's single returns; the "
         "planes' heights at the middle of the two strips' centroids are compared, so that a slope does not count as a "
         "difference. A cell counts "
         f"where both strips have at least {FEWEST_RETURNS} returns that spread over it, lie within "
         f"{100 * ROUGHEST_M:g} cm (one sigma) of their plane, and the plane is no steeper than {STEEPEST_DEG:g}°. "
         "Trees, walls, eaves and steep ground drop out. A cell's dZ holds noise of its own: the median says more of a "
-        "pair than its largest.</p>"
+        "pair than its largest."
     )
+    return Words(text, "How dZ was found", muted=True)

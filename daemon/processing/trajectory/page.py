@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Callable, Iterable, Sequence
-from html import escape
 from pathlib import Path
 
 import numpy as np
 
-from swath.daemon.processing.pages.style import QUICKLOOK_STYLE
+from swath.daemon.processing.pages.blocks import Block, Card, Image, Judged, Notes, Table, data_uri
+from swath.daemon.processing.pages.render import render
 from swath.daemon.processing.pages.words import thousands
 from swath.daemon.processing.trajectory.figures import ANGLES, AXES_B, AXES_L, Figures, figures_of
 from swath.daemon.processing.trajectory.panels import NARROW, WIDE, Drawn, Format
@@ -36,7 +35,6 @@ from swath.georef.trajectory.trajectory import gps_text
 from swath.georef.verdicts import Level, Verdict
 
 MOST_REASONS = 40
-NARROW_PX = 640  # window width up to which the narrow pictures are shown
 Wanted = Callable[[Drawn], bool]
 
 
@@ -103,19 +101,6 @@ PICTURES: tuple[tuple[str, str, Callable[[Drawn, Format], bytes], Wanted], ...] 
     ),
     ("Satellites and fix types", "", draw_satellites, _observed),
 )
-OWN_STYLE = """
-.verdict { border-left: 6px solid; border-radius: 8px; background: var(--card); padding: .8rem 1.1rem; margin: 1.2rem 0;
-  font-size: 1.1rem; } .verdict.good { border-color: var(--good); } .verdict.care { border-color: #e0a100; }
-.verdict.unusable { border-color: var(--bad); }
-h2 + p.muted { margin-top: -.3rem; } td.left { min-width: 15rem; }
-@media (max-width: 640px) { body { padding: 1rem .7rem 3rem; } h1 { font-size: 1.25rem; overflow-wrap: anywhere; }
-  h2 { margin-top: 1.6rem; } .figures { gap: .5rem; }
-  .figures div { min-width: 0; flex: 1 1 42%; padding: .45rem .6rem; }
-  .figures b { font-size: 1.1rem; } th, td { padding: .28rem .45rem; } td.left { min-width: 11rem; }
-  .reasons tr { display: block; border-bottom: 1px solid var(--line); padding: .3rem 0; }
-  .reasons thead { display: none; }
-  .reasons td { display: block; border: 0; text-align: left; padding: .1rem 0; } }
-"""
 
 
 def write_page(path: Path, flight: Flight, findings: Iterable[Found] = ()) -> tuple[Verdict, Figures]:
@@ -129,8 +114,14 @@ def write_page(path: Path, flight: Flight, findings: Iterable[Found] = ()) -> tu
     verdict = judge(figures, findings)
     drawn = Drawn(flight, course_of(flight), separation)
     pictures = [
-        (words, under, draw(drawn, WIDE), draw(drawn, NARROW))
-        for words, under, draw, wanted in PICTURES
+        Image(
+            title,
+            data_uri(draw(drawn, WIDE), "image/png"),
+            data_uri(draw(drawn, NARROW), "image/png"),
+            title=title,
+            words=words,
+        )
+        for title, words, draw, wanted in PICTURES
         if wanted(drawn)
     ]
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -144,28 +135,25 @@ def summary_of(flight: Flight, findings: Iterable[Found] = ()) -> dict[str, obje
     return {"verdict": judge(figures, findings).as_dict(), "figures": figures}
 
 
-def page_of(
-    flight: Flight, figures: Figures, verdict: Verdict, pictures: Sequence[tuple[str, str, bytes, bytes]]
-) -> str:
-    """Return the HTML text of the page; pictures are title, words, wide and narrow PNG."""
-    parts = [
-        f"<!doctype html><html lang='en'><head><meta charset='utf-8'><title>{escape(flight.title)}: trajectory</title>",
-        "<meta name='viewport' content='width=device-width, initial-scale=1'>",
-        f"<style>{QUICKLOOK_STYLE}{OWN_STYLE}</style></head><body>",
-        f"<h1>{escape(flight.title)}</h1>",
-        f"<p class='muted'>{escape(_span_words(figures))}</p>",
-        f"<p class='verdict {verdict.level.name.lower()}'>{escape(verdict.sentence)}</p>",
-        _cards(figures),
+def page_of(flight: Flight, figures: Figures, verdict: Verdict, pictures: Sequence[Image]) -> str:
+    """Return the HTML text of the page."""
+    blocks: list[Block | None] = [
         _reasons(verdict),
         _notes(flight),
-        *(_picture(*picture) for picture in pictures),
+        *pictures,
         _sigmas(figures),
         _observations(figures),
         _sensors(figures),
         _run(figures),
-        "</body></html>\n",
     ]
-    return "\n".join(part for part in parts if part)
+    return render(
+        "trajectory.html",
+        heading=flight.title,
+        span=_span_words(figures),
+        verdict=verdict,
+        cards=_cards(figures),
+        blocks=[block for block in blocks if block is not None],
+    )
 
 
 def _span_words(figures: Figures) -> str:
@@ -192,63 +180,39 @@ def _number(value: float | None, pattern: str = ".3g") -> str:
     return "–" if value is None else format(value, pattern).replace("-", "−")
 
 
-def _cards(figures: Figures) -> str:
+def _cards(figures: Figures) -> list[Card]:
     rms, positions = figures["sigma_rms"], figures["positions"]
     rate = figures["rate_hz"]
     place = [rms["north_m"], rms["east_m"], rms["down_m"]]
     flat = None if None in place else float(np.hypot(place[0], place[1]))
-    cards = [
+    return [
         (_duration(figures["duration_s"]), "flight"),
         (f"{_number(rate)} Hz", f"{thousands(figures['epochs'])} epochs"),
-        (f"{_length(flat)}", "sigma, horizontal"),
-        (f"{_length(place[2])}", "sigma, vertical"),
+        (_length(flat), "sigma, horizontal"),
+        (_length(place[2]), "sigma, vertical"),
         (f"{_number(rms['heading_deg'], '.4f')}°", "sigma of heading"),
         (thousands(positions["used"]), "positions used"),
         (str(positions["outages"]), f"outages, longest {_duration(positions['longest_outage_s'])}"),
     ]
-    told = "".join(
-        f"<div><b>{escape(value)}</b><span class='muted'>{escape(word)}</span></div>" for value, word in cards
-    )
-    return f"<div class='figures'>{told}</div>"
 
 
-def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return an HTML table of words, which are escaped here."""
-    head = "".join(f"<th>{escape(word)}</th>" for word in heads)
-    body = "".join(f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in rows)
-    return f"<div class='scroll'><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>"
-
-
-def _reasons(verdict: Verdict) -> str:
+def _reasons(verdict: Verdict) -> Table | None:
     if not verdict.reasons:
-        return ""
-    rows = "".join(
-        f"<tr><td class='left {'no' if reason.level is Level.UNUSABLE else ''}'>{escape(reason.what)}</td>"
-        f"<td class='left muted'>{escape(reason.change)}</td></tr>"
+        return None
+    rows = [
+        [Judged(reason.what, good=False) if reason.level is Level.UNUSABLE else reason.what, reason.change]
         for reason in verdict.reasons[:MOST_REASONS]
-    )
-    more = len(verdict.reasons) - MOST_REASONS
-    tail = f"<p class='muted'>and {more} more</p>" if more > 0 else ""
-    head = "<thead><tr><th class='left'>what</th><th class='left'>what to change</th></tr></thead>"
-    return f"<h2>Reasons</h2><table class='reasons'>{head}<tbody>{rows}</tbody></table>{tail}"
+    ]
+    omitted = len(verdict.reasons) - len(rows)
+    return Table("Reasons", ("what", "what to change"), rows, left=(0, 1), stacked=True, omitted=omitted)
 
 
-def _notes(flight: Flight) -> str:
+def _notes(flight: Flight) -> Notes | None:
     notes = [*((f"Start: {flight.start}",) if flight.start else ()), *flight.notes]
-    return f"<ul class='notes'>{''.join(f'<li>{escape(note)}</li>' for note in notes)}</ul>" if notes else ""
+    return Notes(notes) if notes else None
 
 
-def _picture(words: str, under: str, wide: bytes, narrow: bytes) -> str:
-    data = {name: base64.b64encode(png).decode("ascii") for name, png in (("wide", wide), ("narrow", narrow))}
-    told = f"<p class='muted'>{escape(under)}</p>" if under else ""
-    return (
-        f"<h2>{escape(words)}</h2>{told}<figure><picture>"
-        f"<source media='(max-width: {NARROW_PX}px)' srcset='data:image/png;base64,{data['narrow']}'>"
-        f"<img alt='{escape(words)}' src='data:image/png;base64,{data['wide']}'></picture></figure>"
-    )
-
-
-def _sigmas(figures: Figures) -> str:
+def _sigmas(figures: Figures) -> Table:
     rows = []
     for key, words, unit, factor, pattern in (
         *((f"{axis}_m", f"position {axis}", "cm", 100.0, ".2f") for axis in AXES_L),
@@ -256,18 +220,18 @@ def _sigmas(figures: Figures) -> str:
         *((f"{angle}_deg", angle, "°", 1.0, ".4f") for angle in ANGLES),
     ):
         columns = [figures[name][key] for name in ("sigma_rms", "sigma_p95", "sigma_largest", "filter_sigma_rms")]
-        told = [_number(None if value is None else factor * value, pattern) for value in columns]
-        rows.append([f"{words} ({unit})", *told])
+        shown = [_number(None if value is None else factor * value, pattern) for value in columns]
+        rows.append([f"{words} ({unit})", *shown])
     heads: tuple[str, ...] = ("", "RMS", "95 %", "largest", "filter, RMS")
     if figures["solution"] == "filter":
         heads, rows = heads[:4], [row[:4] for row in rows]
-    return "<h2>Sigmas over the flight</h2>" + _table(heads, rows)
+    return Table("Sigmas over the flight", heads, rows)
 
 
 FATES = ("taken", "inflated", "reacquired", "rejected", "unusable", "outside")
 
 
-def _observations(figures: Figures) -> str:
+def _observations(figures: Figures) -> Table | None:
     rows = [
         [
             kind.replace("_", " "),
@@ -280,13 +244,13 @@ def _observations(figures: Figures) -> str:
     ]
     heads = ("observation", "seen", *FATES, "size / sigma", "correlation")
     under = (
-        "<p class='muted'>Size / sigma: how large innovations are against their sigmas, 1 where these are honest. "
-        "Correlation: of an innovation with the next, 0 where they are white.</p>"
+        "Size / sigma: how large innovations are against their sigmas, 1 where these are honest. Correlation: of an "
+        "innovation with the next, 0 where they are white."
     )
-    return "<h2>Observations</h2>" + _table(heads, rows) + under if rows else ""
+    return Table("Observations", heads, rows, under) if rows else None
 
 
-def _sensors(figures: Figures) -> str:
+def _sensors(figures: Figures) -> Table | None:
     rows = []
     units = {
         "gyro_bias": ("gyro bias", "°/h", np.degrees(1.0) * 3600.0),
@@ -300,22 +264,22 @@ def _sensors(figures: Figures) -> str:
         words, unit, factor = units[name]
         for axis, row in axes.items():
             value, sigma = factor * row["estimate"], factor * row["sigma"]
-            told = _number(row["largest_over_expected"], ".2f")
-            rows.append([f"{words} {axis} ({unit})", _number(value, ".3f"), _number(sigma, ".3f"), told])
+            ratio = _number(row["largest_over_expected"], ".2f")
+            rows.append([f"{words} {axis} ({unit})", _number(value, ".3f"), _number(sigma, ".3f"), ratio])
     arm, offset = figures["lever_arm"], figures["time_offset"]
     if arm is not None:
         for i, axis in enumerate(AXES_B):
-            told = f"given {_number(arm['given_m'][i], '.3f')}"
+            given = f"given {_number(arm['given_m'][i], '.3f')}"
             value, sigma = arm["estimate_m"][i], arm["sigma_m"][i]
-            rows.append([f"lever arm {axis} (m)", _number(value, ".3f"), _number(sigma, ".3f"), told])
+            rows.append([f"lever arm {axis} (m)", _number(value, ".3f"), _number(sigma, ".3f"), given])
     if offset is not None:
         value, sigma = 1e3 * offset["estimate_s"], 1e3 * offset["sigma_s"]
         rows.append(["time offset of GNSS (ms)", _number(value, ".2f"), _number(sigma, ".2f"), ""])
     heads = ("at the end", "estimate", "sigma", "largest / expected")
-    return "<h2>Sensors</h2>" + _table(heads, rows) if rows else ""
+    return Table("Sensors", heads, rows) if rows else None
 
 
-def _run(figures: Figures) -> str:
+def _run(figures: Figures) -> Table:
     bridged, positions, separation = figures["bridged"], figures["positions"], figures["separation"] or {}
     rows = [
         ["inertial samples made up", f"{thousands(bridged['epochs'])} ({bridged['share']:.3%})"],
@@ -332,4 +296,4 @@ def _run(figures: Figures) -> str:
         ["how long headings' errors last, s", _number(figures["lasting_heading_s"], ".1f")],
         *([name.replace("_", " "), thousands(count)] for name, count in figures["counts"].items()),
     ]
-    return "<h2>The run</h2>" + _table(("", ""), rows)
+    return Table("The run", ("", ""), rows)

@@ -147,6 +147,6 @@ def test_in_the_report(flight: Flight, prior: TrajectoryPrior) -> None:
     assert every is not None
     assert len(compared.rows) == 4
     assert len(every.rows) == len(checked.profiles)
-    assert all("=" in row[-1] for row in every.rows)
+    assert all("=" in str(row[-1]) for row in every.rows)
     assert pictures(checked, flight, CONTROL)[0].svg.startswith("<?xml")
     assert compare(flight, (), known(flight), prior) == ()

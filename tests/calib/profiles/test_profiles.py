@@ -28,7 +28,7 @@ from swath.calib.profiles.stepwise import (
     stepwise,
     survey,
 )
-from swath.daemon.processing.calibration.report.profiles import draw, pictures, svg
+from swath.daemon.processing.calibration.report.profiles import draw, most_precise, svg
 from swath.georef.arrays import FloatArray
 from tests.calib.analytic_scene import Line, Scanner, fly, gables, only, retold, truth_of
 
@@ -303,9 +303,8 @@ def test_the_report_shows_a_range_as_it_lay_before_and_as_it_lies_after() -> Non
     for left_m in (0.0, 0.2):
         adjusted = {"left": start.changed(range_offset_m=1.37 - left_m)}
         profiles = survey(flight.placed(adjusted), "range", CONTROL, calibrations=adjusted).profiles
-        (picture,) = pictures(Check(profiles, ()), flight, CONTROL)
-        assert picture.figure is not None
-        before, after = picture.figure().axes
+        (shown,) = most_precise(Check(profiles, ()), flight, CONTROL)
+        before, after = draw(shown).axes
         heights = [np.asarray(axes.collections[0].get_offsets())[:, 1] for axes in (before, after)]
         assert len(heights[0]) == len(heights[1]) > 1
         # along the vertical a range error counts by the cosine of the beam, 24° from it at most here
@@ -320,10 +319,9 @@ def test_the_report_shows_what_the_adjustment_left_of_a_roll() -> None:
     flight = village((THERE, BACK), omega_rad=0.01)
     adjusted = {"left": flight.heads[0].start.changed(omega_rad=0.006)}
     profiles = survey(flight.placed(adjusted), "roll", calibrations=adjusted).profiles[:1]
-    (picture,) = pictures(Check(profiles, ()), flight)
-    assert picture.figure is not None
+    (shown,) = most_precise(Check(profiles, ()), flight)
     apart = []
-    for axes in picture.figure().axes:
+    for axes in draw(shown).axes:
         sections = [np.asarray(one.get_offsets(), np.float64) for one in axes.collections]
         lines = [np.polyfit(section[:, 0], section[:, 1], 1)[0] for section in sections]
         apart.append(abs(lines[0] - lines[1]))

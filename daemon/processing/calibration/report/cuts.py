@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from swath.calib.features import Plane
 from swath.calib.flight import Flight
 from swath.calib.summary import ReportInput
-from swath.daemon.processing.pages.canvas import INK, MUTED, Canvas, Format, Panels, Picture, colour_of
+from swath.daemon.processing.pages.canvas import INK, MOST_MARKS, MUTED, Canvas, Format, Panels, Picture, colour_of
 from swath.georef.arrays import FloatArray
 from swath.georef.records import Int64Array
 from swath.georef.scanner.calibration import Calibration
@@ -125,9 +125,10 @@ def cut_picture(report: ReportInput) -> Picture | None:
 
 
 def _points(axes: Axes, points: Mapping[int, FloatArray]) -> None:
+    many = sum(map(len, points.values())) > MOST_MARKS
     for index, place in points.items():
         shown = place[:: max(1, len(place) // MOST_DRAWN)]
         size = float(np.clip(60.0 / math.sqrt(max(len(shown), 1)), 1.2, 3.0))
         (line,) = axes.plot(shown[:, 0], shown[:, 1], "o", ms=size, color=colour_of(index), mew=0.0, alpha=0.8)
-        line.set_rasterized(len(shown) > 400)
+        line.set_rasterized(many)
     axes.axvline(0.0, color=INK, lw=0.4, alpha=0.4)

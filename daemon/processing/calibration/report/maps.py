@@ -19,7 +19,9 @@ from swath.calib.flight import Flight, Swath
 from swath.calib.summary import DifferenceMap, ReportInput
 from swath.daemon.processing.pages.canvas import (
     INK,
+    MOST_MARKS,
     MUTED,
+    PAPER,
     Canvas,
     Format,
     Picture,
@@ -74,15 +76,15 @@ def difference_picture(report: ReportInput) -> Picture | None:
         form = canvas.form
         width = (form.width_in - 0.1) / form.columns - 0.7
         panels = (("Before", grid.before_m, grid.before_words), ("After", grid.after_m, grid.after_words))
-        for i, (words, values_m, told) in enumerate(panels):
+        for i, (words, values_m, overall) in enumerate(panels):
             row, column = divmod(i, form.columns)
             top = 0.75 + row * (height(form) + 0.75)
             axes = canvas.panel(0.62 + column * (width + 0.7), top, width, height(form))
             _differences(axes, grid, 100.0 * values_m)
-            axes.set_title(f"{words}: {told}" if told else words, loc="left", fontsize=8.5, color=INK, pad=4)
+            axes.set_title(f"{words}: {overall}" if overall else words, loc="left", fontsize=8.5, color=INK, pad=4)
             shown.frame(axes, width / height(form))
             _words(axes)
-        canvas.legend(_difference_legend(), 3 if form.narrow else 9)
+        canvas.legend(_difference_legend(), 3 if form.narrow else 5 if form is PAPER else 9)
 
     words = (
         "Height differences of overlapping strips, first − second, the largest in each cell; RMSDz covers all pairs."
@@ -184,6 +186,7 @@ class _Shown:
                 mine = np.array([p.centre_t[:2] for p, rms in known if p.kind == kind and class_of(rms) == colour])
                 if len(mine):
                     look: dict[str, Any] = {"ms": size, "mec": "white", "mew": 0.3, "zorder": 5}
+                    look["rasterized"] = len(known) > MOST_MARKS
                     axes.plot(mine[:, 0], mine[:, 1], MARKERS.get(kind, "o"), color=colour, **look)
 
     def legend(self) -> list[Line2D]:

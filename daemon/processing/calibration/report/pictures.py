@@ -22,6 +22,7 @@ from swath.daemon.processing.pages.canvas import (
     BAD,
     BEFORE,
     INK,
+    MOST_MARKS,
     MUTED,
     SERIES,
     Canvas,
@@ -206,7 +207,8 @@ def _trajectory_picture(fit: TrajectoryFit, flown: int, *, several: bool) -> Pic
             axes.fill_between(at, value - sigma, value + sigma, color=AFTER, alpha=0.25, lw=0.0)
             axes.plot(at, value, color=AFTER, lw=1.0)
             axes.axhline(0.0, color=INK, lw=0.5)
-            axes.plot(at[on_strips], value[on_strips], ".", ms=2.6, color=SERIES[1])
+            (dots,) = axes.plot(at[on_strips], value[on_strips], ".", ms=2.6, color=SERIES[1])
+            dots.set_rasterized(bool(6 * np.count_nonzero(on_strips) > MOST_MARKS))
             axes.margins(x=0.0)
         for axes in panels.axes[-canvas.form.columns :]:
             axes.set_xlabel("Time since the first knot (min)", fontsize=8.5, color=MUTED)

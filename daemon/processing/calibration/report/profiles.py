@@ -9,7 +9,6 @@ import math
 import textwrap
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import matplotlib as mpl
@@ -26,8 +25,8 @@ from swath.calib.profiles.measure import Ground
 from swath.calib.profiles.sections import Corridor, fit_pieces
 from swath.calib.profiles.stepwise import Profile, Section
 from swath.calib.summary import Profile as Picture
-from swath.daemon.processing.calibration.report.tables import Table
-from swath.daemon.processing.pages.canvas import INK, MUTED
+from swath.daemon.processing.pages.blocks import Table
+from swath.daemon.processing.pages.canvas import INK, MOST_MARKS, MUTED, RASTER_DPI
 
 PAGE_IN = (9.6, 4.6)
 COLOURS = ("#0072b2", "#d55e00")  # first, second; their marks differ too, for readers who cannot see the colours
@@ -92,9 +91,17 @@ def profiles_table(checked: Check) -> Table | None:
 
 
 def pictures(checked: Check, at_start: Flight, control: Sequence[ControlPoint] = ()) -> list[Picture]:
-    """Return pictures of the most precise profiles of each kind, with points as at the start and as adjusted.
+    """Return pictures of the profiles that `most_precise` chooses."""
+    return [
+        Picture(f"Profile for {shown.kind}: {shown.names[0]} and {shown.names[1]}", "", svg(shown))
+        for shown in most_precise(checked, at_start, control)
+    ]
 
-    The result of a profile is not applied to the second picture, so that it shows the errors that the adjustment left.
+
+def most_precise(checked: Check, at_start: Flight, control: Sequence[ControlPoint] = ()) -> list[Profile]:
+    """Return the most precise profiles of each kind, with points before as at the start and after as adjusted.
+
+    The result of a profile is not applied to the points after, so that they show the errors that the adjustment left.
 
     Args:
         checked: profiles, measured with the points as adjusted.
@@ -104,9 +111,7 @@ def pictures(checked: Check, at_start: Flight, control: Sequence[ControlPoint] =
     found = []
     for profile in _surest(checked.profiles):
         before = _targets if profile.kind == "range" else _sections
-        shown = replace(profile, before=before(profile, at_start, control), after=profile.before)
-        title = f"Profile for {profile.kind}: {profile.names[0]} and {profile.names[1]}"
-        found.append(Picture(title, "", svg(shown), partial(draw, shown)))
+        found.append(replace(profile, before=before(profile, at_start, control), after=profile.before))
     return found
 
 
@@ -170,7 +175,8 @@ def draw(profile: Profile) -> Figure:
         for section, name, colour, mark in zip(sections, profile.names, COLOURS, MARKS, strict=True):
             distance_m, height_m = _thinned(section, low, high)
             size = float(np.clip(5000.0 / max(len(distance_m), 1), 2.0, 30.0))
-            axes.scatter(distance_m, height_m, s=size, marker=mark, color=colour, lw=0, alpha=0.6, label=name)
+            points = axes.scatter(distance_m, height_m, s=size, marker=mark, color=colour, lw=0, alpha=0.6, label=name)
+            points.set_rasterized(len(distance_m) > MOST_MARKS)
         axes.set_title(title, loc="left", fontsize=9, color=INK)
         axes.set_xlabel(
             "To the right of the track (m)" if profile.kind == "range" else "Along the profile (m)",
@@ -193,7 +199,7 @@ def svg(profile: Profile) -> str:
     """Return the figure as SVG; the same profile gives the same text."""
     text = io.StringIO()
     with mpl.rc_context(_SVG):
-        draw(profile).savefig(text, format="svg", metadata={"Date": None, "Creator": None})
+        draw(profile).savefig(text, format="svg", metadata={"Date": None, "Creator": None}, dpi=RASTER_DPI)
     return text.getvalue()
 
 

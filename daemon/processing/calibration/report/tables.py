@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,35 +23,12 @@ from swath.calib.outcome import FixedParameter, Residuals
 from swath.calib.summary import ReportInput
 from swath.calib.verdict import held_words
 from swath.daemon.processing.calibration.report.pictures import SUSPECT
+from swath.daemon.processing.pages.blocks import Table
 from swath.georef.scanner.calibration import INDEX, PARAMETERS
 
 MOST_ROWS = 25
 INSIGNIFICANT = 2.0
 OBSERVED = {"range_m": "one range", "ties": "one coordinate of a tie point", "control": "one control point"}
-
-
-@dataclass(frozen=True, slots=True)
-class Table:
-    """A table of words.
-
-    Attributes:
-        title: heading above it; empty: it continues the block before.
-        heads, rows: words; every row has as many as heads.
-        under: explanation below the table.
-        left: columns that are set flush left and may wrap.
-        hashes: columns of long hexadecimal numbers.
-        pale: rows that are set in a paler colour.
-        stacked: on narrow screens cells stand one below the other.
-    """
-
-    title: str
-    heads: Sequence[str]
-    rows: Sequence[Sequence[str]]
-    under: str = ""
-    left: tuple[int, ...] = (0,)
-    hashes: tuple[int, ...] = ()
-    pale: frozenset[int] = frozenset()
-    stacked: bool = False
 
 
 def parameter_tables(report: ReportInput) -> list[Table]:
@@ -102,21 +77,17 @@ def _parameters(report: ReportInput, scanner: str, *, several: bool) -> Table:
 
 def _estimated(one: Unknown, start: float, value: float, sigma: float, prior: float) -> list[str]:
     digits = decimals_of(sigma * one.factor)
-    start, value, sigma, prior = (one.factor * number_ for number_ in (start, value, sigma, prior))
+    start, value, sigma, prior = (one.factor * x for x in (start, value, sigma, prior))
     pattern = f".{digits}f"
     ratio = abs(value - start) / sigma if sigma > 0.0 else math.inf
-    ratio_text = thousands(ratio, 0) if ratio >= 100.0 else number(ratio, ".1f")
-    ratio_text += " ·" if ratio < INSIGNIFICANT else ""
-    change = number(value - start, f"+{pattern}")
-    told_value, told_sigma, told_start = (number(x, pattern) for x in (value, sigma, start))
+    significance = thousands(ratio, 0) if ratio >= 100.0 else number(ratio, ".1f")
+    significance += " ·" if ratio < INSIGNIFICANT else ""
     return [
         one.words,
         one.unit,
-        told_value,
-        told_sigma,
-        told_start,
-        change,
-        ratio_text,
+        *(number(x, pattern) for x in (value, sigma, start)),
+        number(value - start, f"+{pattern}"),
+        significance,
         number(prior, f".{decimals_of(prior)}f"),
     ]
 
@@ -181,8 +152,8 @@ def strips_table(report: ReportInput) -> Table | None:
     for pair in pairs[:MOST_ROWS]:
         before, after = report.before.get(pair), report.after[pair]
         early = "–" if before is None else number(100.0 * before.rms_m, ".1f")
-        figures = [number(100.0 * x, ".1f") for x in (after.rms_m, after.mean_m, after.std_m, after.max_m)]
-        rows.append([f"{pair[0]} – {pair[1]}", thousands(after.count), early, *figures])
+        late = [number(100.0 * x, ".1f") for x in (after.rms_m, after.mean_m, after.std_m, after.max_m)]
+        rows.append([f"{pair[0]} – {pair[1]}", thousands(after.count), early, *late])
     heads = ("strips", "compared", "RMSDz before", "RMSDz after", "mean", "std", "largest")
     measure = f" {report.measure}." if report.measure else ""
     return Table("", heads, rows, f"Centimetres.{measure}{_more(len(pairs))}")
@@ -220,9 +191,9 @@ def outlier_tables(report: ReportInput) -> list[Table]:
             for index in np.argsort(-count, kind="stable")[: MOST_ROWS // 2].tolist():
                 if count[index]:
                     name = _feature(report, group, index)
-                    share_text = f"{thousands(count[index])} of {thousands(of[index])}"
+                    share_of_all = f"{thousands(count[index])} of {thousands(of[index])}"
                     rejected.append(
-                        [name, group.group, share_text, _strips(report, group, out & (group.feature == index))]
+                        [name, group.group, share_of_all, _strips(report, group, out & (group.feature == index))]
                     )
         kept = np.flatnonzero(~out & (np.abs(group.normalised) > SUSPECT))
         for row in kept[np.argsort(-np.abs(group.normalised[kept]), kind="stable")][:8].tolist():
@@ -268,17 +239,17 @@ def control_table(report: ReportInput) -> Table | None:
     several = len(report.adjusted.calibrations) > 1
     rows = []
     for point in report.adjusted.control:
-        change = "–"
+        effect = "–"
         if point.influence:
             name, moved = max(point.influence.items(), key=lambda item: abs(item[1]))
             one = unknown(name)
-            change = f"{words_of(one.scanner, one.name, several=several)}: {number(moved, '+.2f')} sigmas"
+            effect = f"{words_of(one.scanner, one.name, several=several)}: {number(moved, '+.2f')} sigmas"
         fit = (
             number(100.0 * point.misclosure_m, "+.1f"),
             number(100.0 * point.sigma_m, ".1f"),
             number(point.normalised, "+.2f"),
         )
-        rows.append([point.name, *fit, change])
+        rows.append([point.name, *fit, effect])
     values = np.array([point.misclosure_m for point in report.adjusted.control])
     rms, mean = (length(float(x)) for x in (np.sqrt(np.mean(values**2)), values.mean()))
     under = f"{len(values)} points: RMS {rms}, mean {mean}. "

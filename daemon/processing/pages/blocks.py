@@ -1,0 +1,93 @@
+"""Defines the blocks of a page, which the templates show in the order given: words, notes, tables and images."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar, TypeAlias
+
+
+@dataclass(frozen=True, slots=True)
+class Words:
+    """A paragraph, with an optional title above it; muted: in a paler colour."""
+
+    kind: ClassVar = "words"
+    text: str
+    title: str = ""
+    muted: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Notes:
+    """Sentences that are set apart from the text."""
+
+    kind: ClassVar = "notes"
+    lines: Sequence[str]
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """A cell of a table whose colour says whether its content is good or bad."""
+
+    text: str
+    good: bool
+
+
+Cell: TypeAlias = str | Judged
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """A table of words.
+
+    Attributes:
+        title: heading above it; empty: it continues the block before.
+        heads, rows: words; every row has as many as heads. Empty heads are not shown.
+        under: explanation below the table.
+        left: columns that are set flush left and may wrap.
+        hashes: columns of long hexadecimal numbers.
+        pale: rows that are set in a paler colour.
+        stacked: on narrow screens cells stand one below the other.
+        omitted: number of further rows that are not shown.
+    """
+
+    kind: ClassVar = "table"
+    title: str
+    heads: Sequence[str]
+    rows: Sequence[Sequence[Cell]]
+    under: str = ""
+    left: tuple[int, ...] = (0,)
+    hashes: tuple[int, ...] = ()
+    pale: frozenset[int] = frozenset()
+    stacked: bool = False
+    omitted: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Image:
+    """A picture within the page.
+
+    Attributes:
+        alt: words for readers who do not see it.
+        wide, narrow: the picture as data URI, and the one for narrow windows; empty: the same.
+        title, words: heading and text above it; empty: none.
+        limited: its height is limited, because its proportions are not known.
+    """
+
+    kind: ClassVar = "image"
+    alt: str
+    wide: str
+    narrow: str = ""
+    title: str = ""
+    words: str = ""
+    limited: bool = False
+
+
+Block: TypeAlias = Words | Notes | Table | Image
+Card: TypeAlias = tuple[str, str]  # a figure and its label
+
+
+def data_uri(data: bytes, media_type: str) -> str:
+    """Return a file's content as data URI, so that the page needs no other file."""
+    return f"data:{media_type};base64,{base64.b64encode(data).decode('ascii')}"
