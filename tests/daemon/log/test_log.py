@@ -378,9 +378,7 @@ def test_of_a_directory_without_a_log_it_is_said_why(tmp_path: Path) -> None:
         (tmp_path / f"{name}.mcap").touch()
     with pytest.raises(LogError) as error:
         open_logs([tmp_path], [])
-    assert (
-        str(error.value) == f"{tmp_path}: no logs (*.mcap); {tmp_path}/a.mcap: is not an MCAP file, and 1 more"
-    )
+    assert str(error.value) == f"{tmp_path}: no logs (*.mcap); {tmp_path}/a.mcap: is not an MCAP file, and 1 more"
 
 
 # ------------------------------------------------------------------ a disk that refuses
