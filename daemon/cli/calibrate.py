@@ -40,13 +40,14 @@ def command(
     at: TrajectoryPoint = "body",
     week: TrajectoryWeek = None,
     control: Annotated[
-        Path | None, typer.Option(metavar="CSV", help="Control points: name,lat_deg,lon_deg,h_ellipsoidal_m,sigma_m")
+        Path | None,
+        typer.Option(metavar="CSV", help="Control points: name, lat_deg, lon_deg, h_ellipsoidal_m, sigma_m"),
     ] = None,
     ties: Annotated[
-        Path | None, typer.Option(metavar="CSV", help="Picked tie points: name,strip,x,y,z,sigma_m in output.crs.")
+        Path | None, typer.Option(metavar="CSV", help="Picked tie points: name, strip, x, y, z, sigma_m in output.crs.")
     ] = None,
     polygons: Annotated[
-        Path | None, typer.Option(metavar="CSV", help="Polygons of the planes to use: WKT,name in output.crs.")
+        Path | None, typer.Option(metavar="CSV", help="Polygons of the planes to use: WKT, name in output.crs.")
     ] = None,
     model: Annotated[str, typer.Option(help="Parameters to estimate: basic, scanner, full, or FILE.toml.")] = "scanner",
     fix: Annotated[

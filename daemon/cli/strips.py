@@ -73,7 +73,9 @@ def command(
     ] = None,
     control: Annotated[
         Path | None,
-        typer.Option(metavar="CSV", help="Control points for --adjust: name,lat_deg,lon_deg,h_ellipsoidal_m,sigma_m"),
+        typer.Option(
+            metavar="CSV", help="Control points for --adjust: name, lat_deg, lon_deg, h_ellipsoidal_m, sigma_m"
+        ),
     ] = None,
     strip_model: Annotated[
         str,

@@ -29,7 +29,8 @@ def command(
         typer.Option(metavar="FILE", help="Calibration of another scanner in the same logs; repeatable."),
     ] = None,
     control: Annotated[
-        Path | None, typer.Option(metavar="CSV", help="Control points: name,lat_deg,lon_deg,h_ellipsoidal_m,sigma_m")
+        Path | None,
+        typer.Option(metavar="CSV", help="Control points: name, lat_deg, lon_deg, h_ellipsoidal_m, sigma_m"),
     ] = None,
     anew: Annotated[
         bool, typer.Option("--anew", help="Also estimate the parameters from these logs and compare.")
@@ -68,8 +69,8 @@ def command(
 ) -> None:
     """Validate a calibration by the six methods of ISO/TS 19159-2, 6.8, each with numbers, a test and a sentence.
 
-    Exit code 1 when a test rejects the calibration, when the boresight has moved, or when a requested test could not
-    be made.
+    Exit code 1 when a test rejects the calibration, when the boresight has moved, or when a requested test, or any test
+    at all, could not be made.
     """
     require_installed("swath validate", *(["matplotlib"] if output else []))
     from swath.daemon.cli.progress import progress_bar

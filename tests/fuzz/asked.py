@@ -109,8 +109,8 @@ def _say(one: Control, ours: socket.socket, theirs: socket.socket, data: bytes) 
         data = data[size:]
         if one._is_done(peer, True, time.monotonic()):
             return
-        if len(peer.said) >= LINE_BYTES:
-            raise FindingError(f"{len(peer.said)} bytes are kept of a peer")
+        if len(peer.received) >= LINE_BYTES:
+            raise FindingError(f"{len(peer.received)} bytes are kept of a peer")
     theirs.shutdown(socket.SHUT_WR)
     if not one._is_done(peer, True, time.monotonic()):
         raise FindingError("a peer that has left is waited for")
