@@ -51,7 +51,8 @@ def mark_compiling(flag: Any) -> None:
     def mark() -> None:
         flag.value = True
 
-    numba.core.event.register(COMPILE_EVENT, _FirstCompilation(mark))
+    register: Any = numba.core.event.register
+    register(COMPILE_EVENT, _FirstCompilation(mark))
 
 
 def tell_of_worker() -> None:

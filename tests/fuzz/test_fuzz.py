@@ -150,7 +150,7 @@ def test_an_input_that_takes_much_memory_is_a_finding() -> None:
         return iter(())
 
     target = Target("large", [b"x"], lambda rng, base: base, run)
-    (finding,) = fuzz(target, 200).findings.values()
+    (finding,) = fuzz(target, 500).findings.values()
     assert "bytes of memory" in str(finding[1])
 
 

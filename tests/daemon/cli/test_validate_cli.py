@@ -21,9 +21,9 @@ from swath.daemon.cli import validate
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.processing.calibration.returns import KeptFlight
 from swath.daemon.processing.carried_verdict import Carried
-from swath.daemon.processing.trajectory.verdict import Level
 from swath.daemon.processing.validation import run as validate_run
 from swath.georef.scanner.calibration import INDEX, Calibration, nominal, read_calibration
+from swath.georef.verdicts import Level
 from tests.calib.cast_flight import Cast, cast_flight
 
 pytestmark = pytest.mark.xdist_group("kernels")
