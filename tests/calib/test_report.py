@@ -96,7 +96,7 @@ def test_a_correlated_pair_is_a_reason_unless_points_are_known_as_well_as_is_wan
     need = Need(0.05, {}, 0.1, {"left": left_m})
     verdict = judge(replace(sound(report, correlation=correlation), need=need))
     assert verdict.level is level
-    assert any("told apart" in reason.what for reason in verdict.reasons) is (level is Level.CARE)
+    assert any("hardly be separated" in reason.what for reason in verdict.reasons) is (level is Level.CARE)
 
 
 @pytest.mark.parametrize(("sigma_deg", "level"), [(0.01, Level.CARE), (1.0, Level.UNUSABLE)])
