@@ -558,7 +558,10 @@ def test_a_geoid_separation_of_zero_in_every_gga_is_none(monkeypatch: pytest.Mon
         monkeypatch.setattr(navigation_doubts, "geoid_undulation", lambda place, known=known: known)
         (finding,) = findings_of(fixes)
         assert finding.severity == "warning"
-        assert f"heights are wrong by the geoid's, {size}; let the receiver send its geoid separation" in finding.text
+        assert (
+            f"heights are wrong by the geoid's height, {size}; let the receiver send its geoid separation"
+            in finding.text
+        )
 
 
 def test_a_geoid_separation_that_is_said_or_once_zero_is_no_finding() -> None:
