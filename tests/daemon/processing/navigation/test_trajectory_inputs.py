@@ -225,7 +225,7 @@ class TestRefusals:
     def test_positions_of_another_day(self, flown: Flown, tmp_path: Path) -> None:
         file = tmp_path / "ppk.pos"
         file.write_text(POS.format("2026/11/01"))
-        assert "of another flight" in self.refused(flown, InputOptions(positions=file))
+        assert "belongs to another flight" in self.refused(flown, InputOptions(positions=file))
 
     def test_a_finished_trajectory_is_no_antenna(self, flown: Flown, tmp_path: Path) -> None:
         file = tmp_path / "done.csv"
@@ -255,7 +255,7 @@ class TestDoubts:
         inputs = read_inputs(flown.session(), InputOptions(config=config))
         assert inputs.observed["heading"] == 0
         assert inputs.refused["heading_no_secondary_lever_arm"] > 60
-        assert "want gnss.rover.secondary_lever_arm_m" in inputs.doubts[0]
+        assert "set gnss.rover.secondary_lever_arm_m" in inputs.doubts[0]
 
     def test_a_second_antenna_that_tells_nothing(self, tmp_path: Path) -> None:
         one = PLAN.replace("secondary_lever_arm_m = [0.9, 0.6, -1.2]", "")
@@ -558,7 +558,10 @@ def test_a_geoid_separation_of_zero_in_every_gga_is_none(monkeypatch: pytest.Mon
         monkeypatch.setattr(navigation_doubts, "geoid_undulation", lambda place, known=known: known)
         (finding,) = findings_of(fixes)
         assert finding.severity == "warning"
-        assert f"heights are wrong by the geoid's, {size}; let the receiver send its geoid separation" in finding.text
+        assert (
+            f"heights are wrong by the geoid's height, {size}; let the receiver send its geoid separation"
+            in finding.text
+        )
 
 
 def test_a_geoid_separation_that_is_said_or_once_zero_is_no_finding() -> None:
