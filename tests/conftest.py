@@ -15,7 +15,7 @@ LEAN = TESTS / "lean"
 
 
 def prepare_processes() -> None:
-    """Let what a test starts be on its feet quickly, as an installed one is."""
+    """Make interpreters started by tests start as quickly as installed ones."""
     paths = os.environ.get("PYTHONPATH", "").split(os.pathsep)
     if str(LEAN) not in paths:
         os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(LEAN), *paths]))
@@ -27,7 +27,7 @@ def prepare_processes() -> None:
 
 
 def heed_interrupts() -> None:
-    """A job that a shell runs in the background begins deaf to SIGINT, and so would all it starts."""
+    """Restore SIGINT, which a background job of a shell ignores and passes on to its children."""
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 

@@ -59,7 +59,7 @@ PROCESSING_ONLY = {"numba", "scipy", "pyproj", "laspy", "matplotlib", "jinja2", 
 
 
 def project() -> dict[str, Any]:
-    """pyproject.toml."""
+    """Return the content of pyproject.toml."""
     return tomllib.loads((ROOT / "pyproject.toml").read_text())
 
 
@@ -94,7 +94,7 @@ def test_data_files_of_packages_are_listed_for_installation() -> None:
     assert lying <= listed, f"not installed: {sorted(str(path) for path in lying - listed)}"
 
 
-def test_sim_is_forbidden_every_module_of_georef_but_the_shared_ones() -> None:
+def test_sim_may_import_only_the_shared_modules_of_georef() -> None:
     modules = {
         f"swath.georef.{path.stem}"
         for path in (ROOT / "georef").iterdir()
@@ -117,7 +117,7 @@ def georef_modules_imported(path: Path) -> set[str]:
     return {".".join(name.split(".")[:3]) for name in found if name.startswith("swath.georef.")}
 
 
-def test_drivers_and_the_shared_modules_use_of_georef_only_what_is_shared() -> None:
+def test_drivers_and_shared_modules_import_only_shared_modules_of_georef() -> None:
     shared = [ROOT / "georef/__init__.py", ROOT / "georef/records.py", *(ROOT / "georef/timescales").rglob("*.py")]
     files = [*(ROOT / "drivers").rglob("*.py"), *shared]
     others = {path.name: georef_modules_imported(path) - SHARED_OF_GEOREF for path in files}
@@ -132,7 +132,7 @@ def test_files_and_checkout_stay_small() -> None:
     assert sum(sizes.values()) <= LARGEST_CHECKOUT_BYTES
 
 
-def test_no_file_names_a_place_on_somebodys_computer() -> None:
+def test_no_file_contains_a_path_of_a_users_computer() -> None:
     place = re.compile(rb"(?<![\w.$}/~-])/(?:root|work|home|Users)/[\w.-]+")
     for path in tracked():
         if "fixtures" in path.relative_to(ROOT).parts:
@@ -166,7 +166,7 @@ def imports() -> dict[str, set[str]]:
     return found
 
 
-def test_no_module_imports_itself_by_way_of_others() -> None:
+def test_no_module_imports_itself_through_others() -> None:
     """Imports for type checkers only count too."""
     try:
         TopologicalSorter(imports()).prepare()
@@ -200,19 +200,19 @@ def test_functions_import_only_extras_and_what_is_dear_at_start_up() -> None:
     assert packages == IMPORTED_LATE
 
 
-def test_files_are_rooms() -> None:
+def test_files_stay_within_the_line_limit() -> None:
     lines = {name: path.read_text().count("\n") for name, path in modules().items()}
     assert {name: count for name, count in lines.items() if count > MOST_LINES} == {}
 
 
-def test_folders_are_subjects() -> None:
+def test_folders_stay_within_the_module_limit() -> None:
     """Commands have a file each."""
     folders = Counter(path.parent for path in modules().values() if path.stem != "__init__")
     crowded = {str(folder.relative_to(ROOT)): count for folder, count in folders.items() if count > MOST_MODULES}
     assert set(crowded) <= {"daemon/cli"}, crowded
 
 
-def test_a_prefix_that_three_files_share_is_a_folder() -> None:
+def test_three_files_with_a_common_prefix_form_a_folder() -> None:
     families: dict[tuple[Path, str], set[str]] = defaultdict(set)
     for path in modules().values():
         if path.stem != "__init__":
@@ -220,7 +220,7 @@ def test_a_prefix_that_three_files_share_is_a_folder() -> None:
     assert [sorted(names) for names in families.values() if len(names) > 2] == []
 
 
-def test_a_small_module_that_one_other_uses_is_part_of_that_one() -> None:
+def test_a_small_module_used_by_one_other_is_part_of_it() -> None:
     """Unless the two stand in different packages, whose border lies between them."""
     users: dict[str, set[str]] = defaultdict(set)
     for name, taken in imports().items():
@@ -244,7 +244,7 @@ def test_every_device_has_a_page() -> None:
     assert protocols - pages == set()
 
 
-def test_every_counter_of_a_driver_is_on_a_page() -> None:
+def test_every_counter_of_a_driver_is_documented() -> None:
     """`swath info` and `swath monitor` show it by its code alone."""
     sources = [path.read_text() for path in (ROOT / "drivers").rglob("*.py")]
     codes = {code for text in sources for code in re.findall(r'errors\["([a-z0-9_]+)"\]', text)}
@@ -253,7 +253,7 @@ def test_every_counter_of_a_driver_is_on_a_page() -> None:
     assert {code for code in codes if f"`{code}`" not in pages} == set()
 
 
-def test_links_between_pages_lead_somewhere() -> None:
+def test_links_between_pages_are_valid() -> None:
     for page in [ROOT / "README.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").rglob("*.md")]:
         for target in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", page.read_text()):
             if "://" not in target:
@@ -282,7 +282,7 @@ def event_codes() -> set[str]:
     return codes
 
 
-def test_every_event_is_explained() -> None:
+def test_every_event_is_documented() -> None:
     codes = event_codes()
     assert len(codes) > 25
     explained = set(re.findall(r"`([a-z_]+)`", (ROOT / "docs/recording.md").read_text()))
@@ -313,7 +313,7 @@ def loaded_by(code: str) -> set[str]:
     return {".".join(name.split(".")[: 2 if name.startswith("swath.") else 1]) for name in names}
 
 
-def test_importing_the_recorder_loads_nothing_of_processing() -> None:
+def test_importing_the_recorder_loads_no_processing_module() -> None:
     loaded = loaded_by(
         "import swath.daemon.recorder.run, swath.drivers.driver as r; [r.all_drivers(k) for k in r.KINDS]"
     )
@@ -321,7 +321,7 @@ def test_importing_the_recorder_loads_nothing_of_processing() -> None:
     assert loaded & (PROCESSING_ONLY | {"swath.sim"}) == set()
 
 
-def test_importing_the_command_line_loads_nothing_of_processing_or_of_the_virtual_aircraft() -> None:
+def test_importing_the_command_line_loads_no_processing_or_simulator_module() -> None:
     commands = sorted(f"swath.daemon.cli.{path.stem}" for path in (ROOT / "daemon/cli").glob("[a-z]*.py"))
     assert {
         "swath.daemon.cli.georef",
@@ -335,8 +335,8 @@ def test_importing_the_command_line_loads_nothing_of_processing_or_of_the_virtua
     assert loaded & (PROCESSING_ONLY | {"swath.sim"}) == set()
 
 
-def test_few_modules_take_the_virtual_aircraft_into_the_daemon() -> None:
-    """And but for them the folder of processing alone is let through the contract that keeps the recorder light."""
+def test_few_modules_of_the_daemon_import_the_simulator() -> None:
+    """The contract that keeps the recorder light lets only the folder of processing through besides them."""
     light = contract("the recorder stays light")
     assert light["source_modules"] == ["swath.daemon", "swath.drivers"]
     assert PROCESSING_ONLY | {"swath.sim"} <= set(light["forbidden_modules"])

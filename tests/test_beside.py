@@ -10,7 +10,7 @@ from tests.vm.beside import Moment
 SPIN = "import time\nwhile time.process_time() < 0.4: pass\nprint(flush=True); input()"
 
 
-def test_what_descends_from_this_process_is_its_own_alive_and_ended() -> None:
+def test_processor_time_of_running_and_ended_descendants_counts_as_own() -> None:
     before = Moment.here()
     inner = [sys.executable, "-c", SPIN]
     script = f"import subprocess; subprocess.run({inner!r})"

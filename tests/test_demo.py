@@ -25,7 +25,7 @@ EVERY = [(part, source) for part, sources in SOURCES.items() for source in (*sou
 
 
 class Nowhere(Output):
-    """Takes everything."""
+    """Output that accepts everything."""
 
     def send(self, data: bytes, due_realtime_ns: int) -> bool:
         return True
@@ -53,7 +53,7 @@ def sent_as_logged(content: LogContent, report: PlayReport, sources: tuple[str, 
     return outputs | {"pps/main": Hashed(Nowhere())}
 
 
-def test_it_passes_and_shows_what_a_person_wants_to_see(played: tuple[str, Path]) -> None:
+def test_the_demonstration_passes_and_shows_its_results(played: tuple[str, Path]) -> None:
     text, folder = played
     assert "demonstration passed" in text
     assert text.count("every unit is accounted for") == 2
@@ -75,7 +75,9 @@ def test_its_last_line_names_the_page_of_the_points(played: tuple[str, Path]) ->
 
 
 @pytest.mark.parametrize(("part", "source"), EVERY)
-def test_its_proof_fails_when_anything_differs(played: tuple[str, Path], part: str, source: str) -> None:
+def test_the_comparison_of_the_demonstration_fails_on_any_difference(
+    played: tuple[str, Path], part: str, source: str
+) -> None:
     logs = played[1] / part / "logs"
     content, report = read_log(logs), PlayReport()
     quiet = Console(quiet=True)

@@ -75,11 +75,11 @@ def run_installed(root: Path, *arguments: str) -> subprocess.CompletedProcess[st
     return subprocess.run(command, cwd=root, capture_output=True, text=True, timeout=HANGS_S, check=False)
 
 
-def test_every_file_is_in_its_place_and_no_other(installed: Path) -> None:
+def test_exactly_the_expected_files_are_installed(installed: Path) -> None:
     assert files_below(installed) == PLACED | {"opt/swath"}
 
 
-def test_nothing_installed_names_the_packagers_folder(installed: Path) -> None:
+def test_no_installed_file_names_the_build_folder(installed: Path) -> None:
     texts = [installed / name for name in PLACED] + sorted((installed / "opt/swath/bin").iterdir())
     for path in texts:
         if not path.is_symlink():
@@ -92,7 +92,7 @@ def test_scripts_start_with_the_python_beside_them(installed: Path) -> None:
     assert os.readlink(installed / "usr/local/bin/swath") == "/opt/swath/bin/swath"
 
 
-def test_bare_install_imports_all_packages_and_nothing_of_processing(installed: Path) -> None:
+def test_bare_install_imports_all_packages_and_no_processing_module(installed: Path) -> None:
     packages = ", ".join(f"swath.{name}" for name in PACKAGES)
     code = f"import importlib.util as u, {packages}; print([n for n in {PROCESSING_ONLY} if u.find_spec(n)])"
     done = run_installed(installed, "-c", code)
@@ -126,7 +126,7 @@ def test_bare_install_has_every_module_of_the_project(installed: Path) -> None:
     assert (done.returncode, done.stdout.strip()) == (0, "[]"), done.stderr
 
 
-def test_bare_install_says_what_the_virtual_aircraft_wants(installed: Path, tmp_path: Path) -> None:
+def test_bare_install_names_the_packages_needed_by_the_simulator(installed: Path, tmp_path: Path) -> None:
     done = run_installed(installed, "-m", "swath.daemon.cli.main", "sim", "fly", "small", "-o", str(tmp_path / "small"))
     assert done.returncode == 2
     assert "pip install '.[sim]'" in done.stderr
@@ -190,7 +190,7 @@ def install_files(root: Path, prefix: str) -> str:
     return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=HANGS_S, check=True).stdout
 
 
-def test_another_prefix_reaches_the_unit(tmp_path: Path) -> None:
+def test_another_prefix_is_written_to_the_unit(tmp_path: Path) -> None:
     install_files(tmp_path, "/srv/lidar")
     unit = (tmp_path / "usr/lib/systemd/system/swathd.service").read_text()
     assert "ExecStart=/srv/lidar/bin/swath run /etc/swath/swath.toml" in unit
@@ -198,7 +198,7 @@ def test_another_prefix_reaches_the_unit(tmp_path: Path) -> None:
     assert os.readlink(tmp_path / "usr/local/bin/swath") == "/srv/lidar/bin/swath"
 
 
-def test_own_configuration_is_never_overwritten(tmp_path: Path) -> None:
+def test_an_existing_configuration_is_never_overwritten(tmp_path: Path) -> None:
     own = tmp_path / "etc/swath/swath.toml"
     own.parent.mkdir(parents=True)
     own.write_text("mine\n")
@@ -206,7 +206,7 @@ def test_own_configuration_is_never_overwritten(tmp_path: Path) -> None:
     assert own.read_text() == "mine\n"
 
 
-def test_a_configuration_on_a_disk_that_is_not_mounted_is_not_replaced_by_the_example(tmp_path: Path) -> None:
+def test_a_configuration_on_an_unmounted_disk_is_not_replaced_by_the_example(tmp_path: Path) -> None:
     """Else the next start would record with the example's devices."""
     link = tmp_path / "etc/swath/swath.toml"
     link.parent.mkdir(parents=True)
@@ -215,7 +215,7 @@ def test_a_configuration_on_a_disk_that_is_not_mounted_is_not_replaced_by_the_ex
     assert link.readlink() == tmp_path / "data/aircraft.toml"
 
 
-def test_what_was_changed_in_etc_is_kept_beside(tmp_path: Path) -> None:
+def test_modified_files_in_etc_are_kept_beside_the_new_ones(tmp_path: Path) -> None:
     assert ".old" not in install_files(tmp_path, "/opt/swath") + install_files(tmp_path, "/opt/swath")
     placed = tmp_path / "etc/chrony/conf.d/swath.conf"
     as_installed = placed.read_text()
@@ -229,7 +229,7 @@ def test_what_was_changed_in_etc_is_kept_beside(tmp_path: Path) -> None:
     assert kept == ["maxslewrate 20\n", "an earlier version's\n"], "the second does not take the first's place"
 
 
-def test_a_folder_with_other_things_is_not_overwritten(tmp_path: Path) -> None:
+def test_a_folder_with_other_files_is_not_overwritten(tmp_path: Path) -> None:
     (tmp_path / "usr/lib").mkdir(parents=True)
     done = make("install", f"DESTDIR={tmp_path}", "PREFIX=/usr", *python_for_services())
     assert done.returncode != 0
@@ -286,9 +286,7 @@ def all_below(folder: Path) -> set[str]:
         (":", "kill -INT $PPID; sleep 0.2", 130),
     ],
 )
-def test_a_program_that_cannot_be_built_leaves_the_one_that_is_there(
-    root_before: Path, venv: str, pip: str, status: int
-) -> None:
+def test_a_failed_build_keeps_the_installed_program(root_before: Path, venv: str, pip: str, status: int) -> None:
     told = install_with(root_before, venv=venv, pip=pip)
     assert told[0] == status, told[1]
     assert all_below(root_before) == BEFORE
@@ -301,7 +299,7 @@ def test_a_program_that_cannot_be_built_leaves_the_one_that_is_there(
         ]
 
 
-def test_a_program_takes_the_place_of_the_one_before_it_whole(root_before: Path) -> None:
+def test_a_new_program_replaces_the_previous_one_completely(root_before: Path) -> None:
     in_place = f'[ -e "{root_before}/opt/swath/lib/only_before.py" ] || exit 1'
     status, told = install_with(root_before, venv=in_place, pip=in_place, prefix="/opt/swath/")
     assert status == 0, told
@@ -311,14 +309,14 @@ def test_a_program_takes_the_place_of_the_one_before_it_whole(root_before: Path)
     assert (root_before / "opt/swath/pyvenv.cfg").read_text().endswith("-m venv /opt/swath\n")
 
 
-def test_a_power_cut_between_two_renames_is_mended_by_the_next_run(root_before: Path) -> None:
+def test_a_power_cut_between_two_renames_is_repaired_by_the_next_run(root_before: Path) -> None:
     (root_before / "opt/swath").rename(root_before / "opt/swath.old")
     assert install_with(root_before, pip="exit 1")[0] == 1
     assert all_below(root_before) == BEFORE
 
 
 @pytest.mark.parametrize("prefix", ["/", "swath"])
-def test_a_prefix_is_an_absolute_path(tmp_path: Path, prefix: str) -> None:
+def test_a_prefix_must_be_an_absolute_path(tmp_path: Path, prefix: str) -> None:
     status, told = install_with(tmp_path / "root", prefix)
     assert (status, told.count("\n")) == (1, 1)
     assert "absolute path" in told
@@ -326,7 +324,7 @@ def test_a_prefix_is_an_absolute_path(tmp_path: Path, prefix: str) -> None:
 
 
 @pytest.mark.parametrize(("active", "told"), [("true", True), ("false", False)])
-def test_a_recorder_that_runs_is_said_to_need_a_restart(tmp_path: Path, active: str, told: bool) -> None:
+def test_a_running_recorder_is_reported_to_need_a_restart(tmp_path: Path, active: str, told: bool) -> None:
     (tmp_path / "systemctl").write_text(f'#!/bin/sh\n[ "$*" = "is-active --quiet swathd" ] && {active}\n')
     (tmp_path / "systemctl").chmod(0o755)
     script = "set -- files; . ./install.sh; tell_what_runs"

@@ -91,7 +91,7 @@ class Place:
 
 
 @pytest.mark.parametrize("first", ["swath", "python-daemon"])
-def test_python_daemon_and_swath_work_side_by_side(tmp_path: Path, first: str) -> None:
+def test_python_daemon_and_swath_can_be_used_together(tmp_path: Path, first: str) -> None:
     place = Place(tmp_path)
     installs = [place.install_swath, place.install_python_daemon]
     for install in installs if first == "swath" else reversed(installs):
@@ -100,7 +100,7 @@ def test_python_daemon_and_swath_work_side_by_side(tmp_path: Path, first: str) -
     assert len(json.loads(place.run("swath", "devices", "--json"))["devices"]) > 10
 
 
-def test_scripts_called_as_the_packages_are_do_not_stand_before_them(tmp_path: Path) -> None:
+def test_scripts_named_like_the_packages_do_not_shadow_them(tmp_path: Path) -> None:
     place = Place(tmp_path)
     place.install_swath()
     folder = tmp_path / "working"
@@ -120,7 +120,7 @@ def test_pages_find_their_templates(tmp_path: Path, options: tuple[str, ...]) ->
     assert place.run("python", "-c", RENDER) == "1 1\n"
 
 
-def test_an_editable_installation_works_over_what_an_ordinary_one_left(tmp_path: Path) -> None:
+def test_an_editable_installation_works_over_the_remains_of_an_ordinary_one(tmp_path: Path) -> None:
     """pip leaves the caches of compiled loops, and with them the folders that they stand in."""
     place = Place(tmp_path)
     place.install_swath()

@@ -51,7 +51,7 @@ def swath(*arguments: str | Path) -> str:
 
 
 def make_target(name: str, *what_it_runs: str) -> Callable[[Path], None]:
-    """make test cannot run itself: what it would run is looked at."""
+    """Check the dry run of a make target, because `make test` cannot run itself."""
 
     def check(_: Path) -> None:
         planned = run("make", "-n", name).stdout
@@ -218,16 +218,16 @@ EXERCISED: dict[str, Callable[[Path], None]] = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("line", commands())
-def test_command_of_the_readme(line: str, tmp_path: Path) -> None:
+def test_each_command_of_the_readme_works(line: str, tmp_path: Path) -> None:
     EXERCISED[line](tmp_path)
 
 
-def test_every_command_of_the_readme_is_exercised_and_no_other() -> None:
+def test_exactly_the_commands_of_the_readme_are_exercised() -> None:
     assert set(commands()) - set(EXERCISED) == set(), "say in EXERCISED how these are tested"
     assert set(EXERCISED) - set(commands()) == set()
 
 
-def test_what_wants_more_than_the_group_is_typed_with_sudo() -> None:
+def test_commands_that_need_root_are_written_with_sudo() -> None:
     """Root opens devices and the control socket; only the logs' owner makes a copy that the group may read."""
     for page in (ROOT / "README.md", ROOT / "docs/installation.md", ROOT / "docs/recording.md"):
         for line in re.findall(
@@ -238,12 +238,12 @@ def test_what_wants_more_than_the_group_is_typed_with_sudo() -> None:
             assert line.startswith("sudo -u swath swath" if " recover " in line else "sudo swath"), page.name
 
 
-def test_first_commands_are_the_two_that_set_everything_up() -> None:
+def test_the_first_two_commands_set_everything_up() -> None:
     assert commands()[:2] == ["make demo", "make test"]
     assert blocks("console")[0] == "$ make demo\n$ make test\n"
 
 
-def test_configuration_of_the_readme_is_a_whole_aircraft(tmp_path: Path) -> None:
+def test_the_configuration_of_the_readme_is_a_complete_aircraft(tmp_path: Path) -> None:
     config = load_config(aircraft_of_readme(tmp_path))
     assert [device.source for device in config.devices()] == ["gnss/rover", "imu/main", "scanner/left"]
 
@@ -265,7 +265,7 @@ def options(command: Any, name: str = "swath") -> Iterator[tuple[str, list[str]]
             yield name, written
 
 
-def test_every_option_stands_in_a_page() -> None:
+def test_every_option_is_documented() -> None:
     pages = README + "".join(page.read_text() for page in (ROOT / "docs").rglob("*.md"))
     stands = set(re.findall(r"(?<![\w-])--[a-z][a-z-]*", pages))
     known = options(get_command(make_app(None)))
@@ -279,5 +279,5 @@ def test_make_help_lists_every_target() -> None:
     assert listed == {"help", "demo", "lint", "bench", "bench-calibration", "install", "uninstall", "clean"} | tests
 
 
-def test_make_is_here() -> None:
+def test_make_is_installed() -> None:
     assert shutil.which("make") is not None, "apt-get install make"

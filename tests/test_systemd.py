@@ -49,12 +49,12 @@ def unit_with_program(tmp_path: Path) -> Path:
     return tmp_path / UNIT.name
 
 
-def test_unit_is_without_fault(unit_with_program: Path) -> None:
+def test_the_unit_passes_verification(unit_with_program: Path) -> None:
     found = run_tool("systemd-analyze", "verify", "--man=no", unit_with_program)
     assert (found.returncode, found.stderr, found.stdout) == (0, "", "")
 
 
-def test_the_checker_notices_an_unknown_key(unit_with_program: Path) -> None:
+def test_verification_detects_an_unknown_key(unit_with_program: Path) -> None:
     unit_with_program.write_text(unit_with_program.read_text().replace("WatchdogSec=", "WatchdogSecs="))
     assert "WatchdogSecs" in run_tool("systemd-analyze", "verify", "--man=no", unit_with_program).stderr
 
@@ -70,7 +70,7 @@ def test_exposure_is_at_most_two() -> None:
 class TestLive:
     """The live georeferencer's unit, beside the recorder's."""
 
-    def test_is_without_fault(self, unit_with_program: Path) -> None:
+    def test_the_unit_passes_verification(self, unit_with_program: Path) -> None:
         found = run_tool("systemd-analyze", "verify", "--man=no", unit_with_program.with_name(LIVE.name))
         assert (found.returncode, found.stderr, found.stdout) == (0, "", "")
 
@@ -79,19 +79,19 @@ class TestLive:
         assert "Overall exposure level for swath-live.service" in found.stdout, found.stderr
         assert found.returncode == 0, found.stdout
 
-    def test_depends_on_the_recorder_and_never_the_other_way(self) -> None:
+    def test_the_unit_depends_on_the_recorder_and_not_the_reverse(self) -> None:
         for key in ("BindsTo", "PartOf", "After"):
             assert unit_values(key, LIVE) == ["swathd.service"], key
         assert "swath-live" not in UNIT.read_text()
         assert unit_values("WantedBy", LIVE) == ["swathd.service"]
 
-    def test_gives_way_in_everything(self) -> None:
+    def test_the_unit_yields_to_everything_else(self) -> None:
         assert unit_values("Nice", LIVE) == ["10"]
         assert unit_values("IOSchedulingClass", LIVE) == ["idle"]
         assert unit_values("CPUSchedulingPolicy", LIVE) == ["other"]
         assert int(unit_values("OOMScoreAdjust", LIVE)[0]) > int(unit_values("OOMScoreAdjust")[0])
 
-    def test_may_write_beside_the_logs_and_into_its_own_cache_only(self) -> None:
+    def test_the_unit_may_write_only_beside_the_logs_and_into_its_cache(self) -> None:
         assert unit_values("ProtectSystem", LIVE) == ["strict"]
         assert unit_values("StateDirectory", LIVE) == ["swath/live"]
         assert unit_values("ReadWritePaths", LIVE) == []
@@ -99,13 +99,13 @@ class TestLive:
         assert f"NUMBA_CACHE_DIR=/var/cache/{cache}" in unit_values("Environment", LIVE)
         assert f"cache=/var/cache/{cache}" in (SYSTEMD / "install.sh").read_text().splitlines()
 
-    def test_compiles_before_it_starts_and_may(self) -> None:
+    def test_the_unit_compiles_before_it_starts(self) -> None:
         [before] = unit_values("ExecStartPre", LIVE)
         assert before == "-/opt/swath/bin/swath warm-up /etc/swath/swath.toml"
         assert unit_values("MemoryDenyWriteExecute", LIVE) == ["no"]
         assert unit_values("RestartPreventExitStatus", LIVE) == ["2"]
 
-    def test_hardened_like_the_recorder_but_for_what_it_does_not_need(self) -> None:
+    def test_the_unit_is_hardened_like_the_recorder_except_where_unneeded(self) -> None:
         """Every restriction of the recorder's unit is one of this unit too, as strict or stricter."""
         for name in HARDENING:
             assert unit_values(name, LIVE) == unit_values(name) != [], name
@@ -113,7 +113,7 @@ class TestLive:
         assert unit_values("PrivateNetwork", LIVE) == ["yes"]
         assert unit_values("SystemCallFilter", LIVE) == [*unit_values("SystemCallFilter")[:2], "mincore"]
 
-    def test_may_ask_what_lies_in_memory(self) -> None:
+    def test_the_unit_may_query_the_page_cache(self) -> None:
         """mincore(2) stands in no group of systemd's; where it is not permitted, everything looks cold."""
         allowed: set[str] = set()
         waiting = [word for line in unit_values("SystemCallFilter", LIVE) if line[0] != "~" for word in line.split()]
@@ -129,7 +129,7 @@ class TestLive:
 class TestPps:
     """The unit that holds the kernel's PPS line discipline on a serial port."""
 
-    def test_is_without_fault(self, tmp_path: Path) -> None:
+    def test_the_unit_passes_verification(self, tmp_path: Path) -> None:
         program = tmp_path / "ldattach"
         program.write_text("#!/bin/sh\n")
         program.chmod(0o755)
@@ -146,14 +146,14 @@ class TestPps:
         assert "/dev/ttyS0:rw" in found.stdout
         assert found.returncode == 0, found.stdout
 
-    def test_stays_in_the_foreground_as_long_as_its_port_is_there(self) -> None:
-        """Of ldattach's options only --debug does not go into the background."""
+    def test_the_unit_stays_in_the_foreground_while_its_port_exists(self) -> None:
+        """Only ldattach's option --debug keeps it in the foreground."""
         assert unit_values("ExecStart", PPS) == ["/usr/sbin/ldattach --debug PPS /dev/%I"]
         assert unit_values("Type", PPS) == ["exec"]
         assert unit_values("BindsTo", PPS) == ["dev-%i.device"]
         assert unit_values("Restart", PPS) == ["always"]
 
-    def test_hardened_like_the_recorder(self) -> None:
+    def test_the_unit_is_hardened_like_the_recorder(self) -> None:
         for name in HARDENING:
             assert unit_values(name, PPS) == unit_values(name) != [], name
         assert unit_values("DeviceAllow", PPS) == ["/dev/%I rw"]
@@ -162,7 +162,7 @@ class TestPps:
         assert module == "modprobe@pps_ldisc.service"
         assert module in unit_values("After", PPS)[0].split()
 
-    def test_is_pulled_in_by_the_example_rule(self) -> None:
+    def test_the_unit_is_started_by_the_example_rule(self) -> None:
         (rule,) = [line for line in _udev_examples() if "ttyS0" in line]
         (wanted,) = re.findall(r'ENV\{SYSTEMD_WANTS\}\+="([^"]*)"', rule)
         assert wanted == PPS.name.replace("@", "@ttyS0")
@@ -174,20 +174,20 @@ def test_no_rule_starts_a_program() -> None:
     assert not [line for line in _udev_rules() + _udev_examples() if "RUN" in line]
 
 
-def test_no_capability_and_no_root() -> None:
+def test_the_service_has_no_capability_and_is_not_root() -> None:
     assert unit_values("CapabilityBoundingSet") == [""]
     assert unit_values("AmbientCapabilities") == [""]
     assert unit_values("NoNewPrivileges") == ["yes"]
     assert unit_values("User") == ["swath"]
 
 
-def test_a_wrong_configuration_is_not_retried_and_everything_else_is() -> None:
+def test_only_a_wrong_configuration_is_not_retried() -> None:
     assert unit_values("RestartPreventExitStatus") == ["2"]
     assert unit_values("Restart") == ["always"]
     assert unit_values("StartLimitIntervalSec") == ["0"]
 
 
-def test_the_repairing_child_may_become_idle_and_the_clock_may_be_read() -> None:
+def test_the_recovering_child_may_become_idle_and_read_the_clock() -> None:
     """What the recorder calls beyond the ordinary is let through by name; the last filter line wins."""
     last = unit_values("SystemCallFilter")[-1].split()
     assert set(last) >= {"adjtimex", "ioprio_set", "setpriority", "sched_setscheduler"}
@@ -252,7 +252,7 @@ def _udev_rules() -> list[str]:
 
 
 @pytest.mark.parametrize("rule", _udev_rules())
-def test_udev_rule_matches_and_assigns(rule: str) -> None:
+def test_udev_rules_match_and_assign(rule: str) -> None:
     terms = rule.split(", ")
     matches = [_UDEV_TERM.fullmatch(term) for term in terms]
     assert all(matches), rule
@@ -266,7 +266,7 @@ def _udev_examples() -> list[str]:
     return [line[1:] for line in lines if line.startswith("#SUBSYSTEM")]
 
 
-def test_example_rules_are_as_good_as_working_ones() -> None:
+def test_example_rules_are_as_valid_as_the_active_ones() -> None:
     examples = _udev_examples()
     assert len(examples) == 2
     assert all(_UDEV_TERM.fullmatch(term) for line in examples for term in line.split(", "))

@@ -1,4 +1,4 @@
-"""A plugin of pytest: skips what `tests.arm64.suite` leaves out, saying why."""
+"""Plugin of pytest that skips the tests which `tests.arm64.suite` leaves out, with the reason."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from tests.arm64.suite import LEFT_OUT
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Skip what cannot be; refuse names that no test has any more."""
+    """Skip tests that cannot run here; refuse names that no longer match a test."""
     unmet = set(LEFT_OUT)
     for item in items:
         for name, reason in LEFT_OUT.items():

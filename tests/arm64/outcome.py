@@ -28,7 +28,7 @@ CRS = "EPSG:32632"
 
 
 def main(log: Path, file: Path) -> None:
-    """Write what became of a log."""
+    """Write the digest of everything made of the log."""
     (flight,) = read_flights(GeorefOptions([log], log, options=Options(crs=CRS)), lambda *_: None)
     assert flight.trajectory is not None
     found: dict[str, Any] = {f"digest {source}": digest for source, digest in digests(log).items()}
@@ -42,7 +42,7 @@ def main(log: Path, file: Path) -> None:
 
 
 def digests(log: Path) -> dict[str, str]:
-    """By source, of every byte of every record that its parser gives."""
+    """Return by source a digest of every byte of every record that its parser gives."""
     (session,) = open_logs([log])
     parsers, troubles = stored_parsers(session.attachments())
     assert not troubles
@@ -60,7 +60,7 @@ def digests(log: Path) -> dict[str, str]:
 
 
 def told(digest: Any, record: Any) -> None:
-    """A record's type and fields: arrays by their bytes, numbers by the shortest decimals that tell them apart."""
+    """Return a record's type and fields as text: arrays by their bytes, numbers by their shortest unique decimals."""
     digest.update(type(record).__name__.encode())
     for field in fields(record):
         value = getattr(record, field.name)
@@ -72,7 +72,7 @@ def told(digest: Any, record: Any) -> None:
 
 
 def placed(flight: Flight) -> Points:
-    """All points of a flight, in order of the log."""
+    """Return all points of a flight in the order of the log."""
     assert flight.trajectory is not None
     feed = LogFeed(flight.setup, flight.setup.office_stream(flight.clocks.clocks, flight.trajectory))
     points = [points for batch in flight.session.batches() for _, points in feed.take(batch)]
@@ -80,7 +80,7 @@ def placed(flight: Flight) -> Points:
 
 
 def columns(points: Points) -> dict[str, Any]:
-    """By name."""
+    """Return the columns by name."""
     return {field.name: getattr(points, field.name) for field in fields(points)}
 
 

@@ -34,7 +34,7 @@ LEFT_OUT = {  # by the beginning of the test's name
     f"{_CAN}received_and_lost_are_exactly_what_was_sent": _UDP,
     f"{_CAN}close_from_another_thread_ends_a_blocked_receive[can:udp_multicast": _UDP,
     f"{_CAN}the_readers_slots_for_frames_keep_classic_and_fd_apart": _UDP,
-    "tests/drivers/transports/pps/test_transport_pps.py::test_what_cannot_be_opened_says_why[source3": _PPS,
-    "tests/drivers/transports/test_transport_serial.py::test_another_process_holds_the_port": _HOLDER,
-    f"{_EXPORT}::test_what_was_on_the_wire_is_in_the_files_and_comes_back": f"records UDP: {_UDP}",
+    "tests/drivers/transports/pps/test_transport_pps.py::test_error_on_opening_gives_the_reason[source3": _PPS,
+    "tests/drivers/transports/test_transport_serial.py::test_a_port_held_by_another_process_is_refused": _HOLDER,
+    f"{_EXPORT}::test_units_on_the_wire_are_exported_and_restored": f"records UDP: {_UDP}",
 }

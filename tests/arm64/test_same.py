@@ -34,21 +34,21 @@ OF_A_SIGMA = 1e-5  # what rounding may amount to in a filter and smoother of tho
 
 @dataclass(frozen=True)
 class Both:
-    """Where the same command's products lie."""
+    """Folders of the products of one command on both processors."""
 
     host: Path
     arm64: Path
 
 
 def run(python: str | Path, *words: str | Path, status: int = 0) -> None:
-    """A module of the project's in the tree, which must end with a status."""
+    """Run a module of the project in the tree; it must end with the given status."""
     line = [str(word) for word in (python, "-m", *words)]
     done = subprocess.run(line, cwd=TREE, capture_output=True, text=True, timeout=HANGS_S, check=False)
     assert done.returncode == status, f"{line}\n{done.stdout[-4000:]}{done.stderr[-4000:]}"
 
 
 def on_both(folder: Path, *words: str | Path, status: int = 0) -> Both:
-    """A module run by either Python; ``{}`` in a word is its own folder, which may be there."""
+    """Run a module with either Python; ``{}`` in an argument stands for that run's own folder, which may exist."""
     both = Both(folder / "host", folder / "arm64")
     for python, own in ((sys.executable, both.host), (ARM64, both.arm64)):
         own.mkdir(parents=True, exist_ok=True)
@@ -57,13 +57,13 @@ def on_both(folder: Path, *words: str | Path, status: int = 0) -> Both:
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    """Of all files, by their paths in it."""
+    """Return the contents of all files below a folder by their relative paths."""
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 @pytest.fixture(scope="module", autouse=True)
 def other_processor() -> None:
-    """It is there and another one; without it there is nothing to prove."""
+    """Fail unless the emulated processor is available and of another kind than the host's."""
     if not ARM64.exists():
         pytest.fail("there is no Python for ARM64: make test-arm64 installs it (tests/arm64/setup.sh)")
     said = subprocess.run([ARM64, "-c", "import os; print(os.uname().machine)"], capture_output=True, text=True)
@@ -72,7 +72,7 @@ def other_processor() -> None:
 
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the log of a virtual flight and what lies beside it, made on the host."""
+    """Return a folder with the log of a virtual flight and its files, made on the host."""
     folder = tmp_path_factory.mktemp("flight")
     run(
         sys.executable, "swath.daemon.cli.main", "sim", "fly", "small", "--seconds", FLOWN_S, "--no-truth", "-o", folder
@@ -82,7 +82,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def outcomes(flight: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
-    """What either makes of the log: `tests.arm64.outcome`."""
+    """Return the outcome of `tests.arm64.outcome` on both processors."""
     both = on_both(tmp_path_factory.mktemp("outcomes"), "tests.arm64.outcome", flight, "{}/outcome.npz")
     return np.load(both.host / "outcome.npz"), np.load(both.arm64 / "outcome.npz")
 
@@ -94,7 +94,7 @@ def test_every_record_of_every_decoder_is_the_same(outcomes: tuple[Mapping[str, 
 
 
 @pytest.mark.parametrize("what", ["trajectory", "e"])
-def test_trajectory_and_points_in_e_are_the_same_bit_for_bit(
+def test_trajectory_and_earth_centred_points_are_the_same_bit_for_bit(
     outcomes: tuple[Mapping[str, Any], Mapping[str, Any]], what: str
 ) -> None:
     host, arm64 = outcomes
@@ -103,7 +103,7 @@ def test_trajectory_and_points_in_e_are_the_same_bit_for_bit(
     assert {name for name in names if host[name].tobytes() != arm64[name].tobytes()} == set()
 
 
-def test_points_in_the_map_differ_by_projs_last_places_only(
+def test_map_points_differ_only_by_the_last_digits_of_proj(
     outcomes: tuple[Mapping[str, Any], Mapping[str, Any]],
 ) -> None:
     host, arm64 = outcomes
@@ -114,7 +114,7 @@ def test_points_in_the_map_differ_by_projs_last_places_only(
 
 
 @pytest.mark.parametrize("scale_m", [1e-3, FINE_SCALE_M])
-def test_files_of_points_are_within_a_unit_of_their_scale(flight: Path, tmp_path: Path, scale_m: float) -> None:
+def test_point_files_differ_by_at_most_a_unit_of_their_scale(flight: Path, tmp_path: Path, scale_m: float) -> None:
     words = (
         "swath.daemon.cli.main",
         "georef",
@@ -147,8 +147,8 @@ def test_exported_captures_are_the_same(flight: Path, tmp_path: Path) -> None:
     assert host == contents(both.arm64)
 
 
-def test_a_repaired_log_is_the_same(flight: Path, tmp_path: Path) -> None:
-    """The end is missing, and within the rest a byte is wrong: chunks are read, checked, written and summed anew."""
+def test_a_recovered_log_is_the_same(flight: Path, tmp_path: Path) -> None:
+    """Recover a log without its end and with one wrong byte: chunks are read, checked, written and summed."""
     (log,) = flight.glob("*.mcap")
     damaged = bytearray(log.read_bytes()[: -(2 << 20)])
     damaged[len(damaged) // 2] ^= 0x10
@@ -161,7 +161,7 @@ def test_a_repaired_log_is_the_same(flight: Path, tmp_path: Path) -> None:
     assert host == contents(both.arm64)
 
 
-def test_navigated_trajectory_is_the_same_far_below_its_sigma(flight: Path, tmp_path: Path) -> None:
+def test_navigated_trajectories_differ_by_far_less_than_their_sigma(flight: Path, tmp_path: Path) -> None:
     """Sums of products in an order that BLAS chooses; columns of SBET and smrmsg as Applanix lists them."""
     both = on_both(tmp_path, "swath.daemon.cli.main", "trajectory", flight, "-o", "{}")
     ((host, sigma), (arm64, _)) = (

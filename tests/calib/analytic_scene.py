@@ -40,7 +40,7 @@ class Line:
 
 @dataclass(frozen=True)
 class Scanner:
-    """Of the flights here; a triangle of scan angles."""
+    """Line scanner of the flights here, with a triangle of scan angles."""
 
     prf_hz: float = 20_000.0
     scan_hz: float = 40.0
@@ -109,7 +109,7 @@ def fly(
 def retold(
     flight: Flight, lines: Sequence[Line], errors: FloatArray, sigmas: tuple[float, float] = (0.02, 5e-5)
 ) -> Flight:
-    """The same flight with other errors of the trajectory told (lines, 6)."""
+    """Return the same flight with other trajectory errors (lines, 6) in its stated trajectory."""
     begins = [START_NS + number * BETWEEN_NS for number in range(len(lines))]
     told = [
         _told(line, begin, flight.frame, one, sigmas) for line, begin, one in zip(lines, begins, errors, strict=True)
@@ -211,7 +211,7 @@ def _met(from_t: FloatArray, beam_t: FloatArray, ground: Surface, limits_m: tupl
 
 
 def only(flight: Flight, keep: Callable[[FloatArray], NDArray[np.bool_]]) -> Flight:
-    """With the returns whose points (n, 3) are wanted."""
+    """Keep only the returns whose points (n, 3) are wanted."""
     swaths = []
     for swath in flight.swaths:
         at = np.flatnonzero(keep(swath.points_t))

@@ -50,7 +50,7 @@ SPEED_MPS, HALF_ANGLE_RAD, SCAN_HZ, POSE_S = 50.0, np.radians(30.0), 50.0, 0.01
 
 @dataclass(frozen=True, eq=False)
 class Cast:
-    """What was flown.
+    """Flight over a scene with its truth.
 
     Attributes:
         flight: with nominal calibration.
@@ -69,7 +69,7 @@ class Cast:
     planes: FloatArray
 
     def at_truth(self) -> Flight:
-        """With the points where the true calibration puts them."""
+        """Return the flight with its points placed by the true calibration."""
         return self.flight.placed({"left": self.truth})
 
     def faces(self, swath: int, at: NDArray[np.int64], within_m: float = 1e-3) -> NDArray[np.bool_]:
@@ -135,7 +135,7 @@ def _plan(terrain: str, lines: Sequence[Line]) -> str:
 
 
 def _corners(lines: Sequence[Line], half_angle_rad: float) -> FloatArray:
-    """All of the lines, and as far to all sides as the scanner sees."""
+    """Return the corners of the area of all lines, widened by the scanner's range."""
     ends = np.array([[line[0:2], line[2:4]] for line in lines]).reshape(-1, 2)
     reach = 1.1 * np.tan(half_angle_rad) * max(line[4] - 380.0 for line in lines)
     low, high = ends.min(axis=0) - reach, ends.max(axis=0) + reach

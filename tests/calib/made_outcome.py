@@ -45,7 +45,7 @@ SIGMAS = (1.05e-5, 1.2e-5, 2.4e-5, 0.0041, 1.8e-5, 4.2e-6, 1.9e-4)
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What a report is made of."""
+    """Everything that a report is made of."""
 
     flight: Flight
     features: Features
@@ -125,7 +125,7 @@ def made_flight(returns: int = RETURNS, *, true: Calibration | None = None) -> t
 
 
 def _ranges(flight: Flight, swath: Swath, found: Calibration) -> FloatArray:
-    """As measured to the surface: along each beam by halving."""
+    """Return the ranges measured to the surface, found by halving along each beam."""
     rays = flight.rays(swath, found, with_axes=False)
     origin = flight.frame.t_from_e(rays.origin_e)
     beam = flight.frame.t_from_e(rays.points_e) - origin
@@ -170,7 +170,7 @@ def _plane(
 
 
 def made_outcome(returns: int = RETURNS) -> Outcome:
-    """With control on some ground planes, a few outliers, a bad control point, corrections of the trajectory."""
+    """Return an outcome with control, a few outliers, a bad control point and trajectory corrections."""
     flight, found = made_flight(returns)
     random = np.random.default_rng(5)
     planes = list(made_planes(flight, found))
@@ -333,7 +333,7 @@ def _trajectory_fit(flight: Flight, random: np.random.Generator) -> TrajectoryFi
 
 
 def made_report(outcome: Outcome) -> ReportInput:
-    """With everything a report may show."""
+    """Return the input of a report with everything that it may show."""
     random = np.random.default_rng(3)
     names = [swath.name for swath in outcome.flight.swaths]
     before, after = {}, {}

@@ -70,7 +70,7 @@ def surfaces(*, roofs: bool = True, count: int = 7, spread_m: float = 300.0) -> 
 
 
 def scanner(name: str = "left", **values: float) -> Head:
-    """With some parameters."""
+    """Return a scanner with some parameters changed."""
     start: Calibration = nominal(name, [0.15, -0.08, 0.42], np.eye(3)).changed(**values)
     return Head(name, exactly_known(start), LineGeometry(), NOISE, (20.0, 3000.0))
 
@@ -78,14 +78,14 @@ def scanner(name: str = "left", **values: float) -> Head:
 def flown(
     lines: Sequence[tuple[float, float, float]], *, roofs: bool = True, sigma_m: float = 0.02, sigma_deg: float = 0.003
 ) -> tuple[Flight, Features]:
-    """A flight of such lines."""
+    """Return a flight of such lines."""
     trajectory, planned_lines = path(lines, sigma_m, sigma_deg)
     scan = Scan(float(np.radians(30.0)), 100_000.0, 40.0, "sine")
     return planned(FRAME, [scanner()], [scan], [trajectory], planned_lines, surfaces(roofs=roofs), MOST_MADE)
 
 
 def noised(flight: Flight, seed: int) -> Flight:
-    """With noise on ranges and angles, as large as the heads say."""
+    """Add noise to ranges and angles as large as the heads state."""
     rng = np.random.default_rng(seed)
     swaths = []
     for swath in flight.swaths:

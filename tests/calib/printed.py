@@ -72,7 +72,7 @@ class Printed:
     line: Int64Array
 
     def flight(self) -> tuple[Flight, Features]:
-        """An epoch of the trajectory a return; a swath a line."""
+        """Return a flight with an epoch of the trajectory for each return and a swath for each line."""
         at, count = frame(), len(self.observed)
         times = START_NS + 1_000_000 * np.arange(count + 1)
         position_t = self.observed[:, :3] @ ENU_FROM_NED.T
@@ -113,14 +113,14 @@ class Printed:
         return flight.placed({"left": head.start}), Features(found)
 
     def with_blunder(self) -> Printed:
-        """0.6 m in the range of point 137."""
+        """Add a blunder of 0.6 m to the range of point 137."""
         observed = self.observed.copy()
         observed[137, 6] += 0.6
         return replace(self, observed=observed)
 
 
 def printed() -> Printed:
-    """All observations."""
+    """Return all observations of the printed example."""
     aims, noise = np.random.default_rng(11), np.random.default_rng(5)
     shots, plane_of, line_of = [], [], []
     for index, (centre, normal) in enumerate(planes_ned()):

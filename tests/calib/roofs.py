@@ -29,7 +29,7 @@ NOISE = Noise(range_m=0.02, angle_rad=np.radians(0.001), time_s=0.0, divergence_
 
 
 def exactly_known(calibration: Calibration) -> Calibration:
-    """Return a start whose parameters count as measured: what is held of it adds nothing to any sigma."""
+    """Return a start whose parameters count as measured, so that held ones add nothing to any sigma."""
     held = 1e-9 * np.array([parameter.plausible for parameter in PARAMETERS])
     return replace(calibration, method="control", held_sigmas=held)
 
@@ -68,7 +68,7 @@ def roofs(slope_deg: float = 35.0) -> list[tuple[FloatArray, FloatArray]]:
 
 @dataclass(frozen=True, eq=False)
 class Made:
-    """A flight with what it sees.
+    """Flight with its features.
 
     Attributes:
         flight: with the head's start, points placed with it.
@@ -82,7 +82,7 @@ class Made:
 
 
 def frame() -> Tangent:
-    """Of all."""
+    """Return the frame of all flights."""
     return Tangent.at(np.asarray(e_from_geodetic(np.radians(47.2), np.radians(9.0), 450.0)))
 
 
@@ -188,7 +188,7 @@ def made(
     true: Trajectory | None = None,
     ibrc: tuple[FloatArray, FloatArray] | None = None,
 ) -> Made:
-    """Fly.
+    """Fly the lines over the planes.
 
     Args:
         truth: parameters of the scanner, SI; None: a boresight and a range offset.

@@ -43,7 +43,7 @@ def adjusted_as_printed() -> Adjusted:
     return adjust(flight, features, ParameterOptions(), None, PLAIN)
 
 
-def test_the_printed_adjustment() -> None:
+def test_the_printed_adjustment_is_reproduced() -> None:
     found = adjusted_as_printed()
     assert found.names == ("left.omega_rad", "left.phi_rad", "left.kappa_rad", "left.range_offset_m")
     assert len(worked().observed) == 1522
@@ -66,7 +66,7 @@ def test_the_printed_adjustment() -> None:
     assert any("independent from return to return" in note for note in found.notes)
 
 
-def test_the_printed_blunder_is_the_largest_w_and_is_taken_out() -> None:
+def test_the_printed_blunder_has_the_largest_w_and_is_removed() -> None:
     flight, features = worked().with_blunder().flight()
     plain = adjust(flight, features, ParameterOptions(), None, PLAIN)
     (residuals,) = plain.residuals
@@ -158,7 +158,7 @@ def test_reduced_equations_give_the_whole_dense_solution(weighted: bool) -> None
     np.testing.assert_allclose(of_planes.ravel() / sigma[u:], step[u:] / sigma[u:], atol=1e-6)
 
 
-def test_the_hard_constraint_is_the_limit_of_a_weighted_one() -> None:
+def test_the_hard_constraint_equals_the_limit_of_a_weighted_one() -> None:
     """Four unknowns a plane and s1² + s2² + s3² = 1 with σ = 1e-7 (ISO/TS 19159-2 Eq. 18, 20)."""
     built = small()
     rows, ties, weight = block(built.flight, built.features, ParameterOptions(priors={"range_offset_m": 0.05}), None)
@@ -205,7 +205,7 @@ def tied(built: Made, noise_m: float, seed: int) -> tuple[TiePoint, ...]:
     return tuple(ties)
 
 
-def test_tie_points_alone_find_the_truth() -> None:
+def test_tie_points_alone_determine_the_truth() -> None:
     built = made(noise=0.0)
     prior = gauss_markov(built.flight, Taus(), 4.0)
     control = ControlPoint("a", built.features.planes[0].centre_t, 0.01)
@@ -222,7 +222,7 @@ def test_tie_points_alone_find_the_truth() -> None:
     assert json.loads(json.dumps(figures))
 
 
-def test_a_wrong_sighting_is_taken_out() -> None:
+def test_a_wrong_sighting_is_removed() -> None:
     built = made(noise=0.0)
     prior = gauss_markov(built.flight, Taus(), 4.0)
     ties = list(tied(built, 0.05, 2))
@@ -252,7 +252,7 @@ def controlled(built: Made, seed: int = 9) -> Features:
     return Features(tuple(planes))
 
 
-def test_control_determines_the_range_offset_and_says_what_each_point_does() -> None:
+def test_control_determines_the_range_offset_and_reports_each_point() -> None:
     built = made()
     prior = gauss_markov(built.flight, Taus(), 4.0)
     features = controlled(built)
@@ -286,7 +286,7 @@ def test_control_that_is_too_high_is_seen() -> None:
     assert worst.normalised > 5.0
 
 
-def test_a_surveyed_plane_gives_the_height() -> None:
+def test_a_surveyed_plane_determines_the_height() -> None:
     built = made()
     prior = gauss_markov(built.flight, Taus(), 4.0)
     given = tuple(replace(plane, given_sigma_m=0.005, given_sigma_rad=1e-4) for plane in built.features.planes)
@@ -296,7 +296,7 @@ def test_a_surveyed_plane_gives_the_height() -> None:
     assert (np.abs(found.values - built.truth.parameters[:4]) < 3.5 * found.sigmas).all()
 
 
-def test_ten_percent_of_gross_errors_change_nothing_by_a_sigma() -> None:
+def test_ten_percent_of_gross_errors_change_results_by_less_than_a_sigma() -> None:
     built = made()
     prior = gauss_markov(built.flight, Taus(), 4.0)
     good = adjust(built.flight, built.features, ParameterOptions(), prior)
@@ -314,7 +314,7 @@ def test_ten_percent_of_gross_errors_change_nothing_by_a_sigma() -> None:
     assert 0.9 < found.variance_factor < 1.1
 
 
-def test_sigmas_grow_where_the_observations_are_worse_than_they_say() -> None:
+def test_sigmas_grow_if_observations_are_worse_than_stated() -> None:
     built = made(noise=2.0)
     prior = gauss_markov(built.flight, Taus(), 4.0)
     found = adjust(built.flight, built.features, ParameterOptions(), prior, Settings(family=0.0))
@@ -325,7 +325,7 @@ def test_sigmas_grow_where_the_observations_are_worse_than_they_say() -> None:
     np.testing.assert_allclose(found.sigmas, said.sigmas * np.sqrt(found.variance_factor), rtol=1e-9)
 
 
-def test_what_is_not_determined_is_held_at_its_start() -> None:
+def test_undetermined_parameters_are_held_at_their_start() -> None:
     built = made(lines=LINES[:2], planes=roofs(0.0))
     prior = gauss_markov(built.flight, Taus(), 4.0)
     found = adjust(built.flight, built.features, ParameterOptions(), prior)
@@ -335,7 +335,7 @@ def test_what_is_not_determined_is_held_at_its_start() -> None:
     assert found.calibrations["left"].sigmas[0] == found.sigmas[0] > 0.0
 
 
-def test_prediction_is_what_the_adjustment_finds() -> None:
+def test_predicted_sigmas_match_the_adjustment() -> None:
     built = made()
     prior = gauss_markov(built.flight, Taus(), 4.0)
     at_truth = {"left": built.truth}
@@ -345,7 +345,7 @@ def test_prediction_is_what_the_adjustment_finds() -> None:
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), found.sigmas, rtol=1e-3)
 
 
-def test_correspondences_are_found_anew_until_they_are_stable() -> None:
+def test_correspondences_are_repeated_until_stable() -> None:
     built = made()
     prior = gauss_markov(built.flight, Taus(), 4.0)
     asked = []
@@ -363,7 +363,7 @@ def test_correspondences_are_found_anew_until_they_are_stable() -> None:
     assert more.matchings == 3
 
 
-def test_everything_that_was_observed_is_adjusted_once_correspondences_stay() -> None:
+def test_all_observations_are_adjusted_once_correspondences_are_stable() -> None:
     built = made()
     prior = gauss_markov(built.flight, Taus(), 4.0)
     part = Features(tuple(built.features.planes[::2]))
@@ -385,7 +385,7 @@ def test_everything_that_was_observed_is_adjusted_once_correspondences_stay() ->
     np.testing.assert_array_equal(same.values, less.values)
 
 
-def test_returns_that_scatter_less_than_is_said_are_weighed_by_what_they_scatter() -> None:
+def test_returns_with_less_scatter_than_stated_are_weighted_by_their_scatter() -> None:
     built = made(noise=0.5, points=30)
     prior = gauss_markov(built.flight, Taus(), 4.0)
     found = adjust(built.flight, built.features, ParameterOptions(), prior, entire=lambda _: built.features)
@@ -399,7 +399,7 @@ def test_returns_that_scatter_less_than_is_said_are_weighed_by_what_they_scatter
 
 
 @pytest.mark.parametrize("noise", [1.0, 1.5])
-def test_returns_that_scatter_as_is_said_or_more_keep_their_sigmas(noise: float) -> None:
+def test_returns_with_at_least_the_stated_scatter_keep_their_sigmas(noise: float) -> None:
     built = made(noise=noise, points=30)
     prior = gauss_markov(built.flight, Taus(), 4.0)
     found = adjust(built.flight, built.features, ParameterOptions(), prior, entire=lambda _: built.features)
@@ -408,7 +408,7 @@ def test_returns_that_scatter_as_is_said_or_more_keep_their_sigmas(noise: float)
     assert not any("scatter" in note for note in found.notes)
 
 
-def test_the_trajectory_comes_out_with_sigmas_below_the_prior() -> None:
+def test_adjusted_trajectory_sigmas_are_below_the_prior() -> None:
     built = made()
     prior = gauss_markov(built.flight, Taus(), 4.0)
     found = adjust(built.flight, built.features, ParameterOptions(), prior).trajectory
@@ -419,7 +419,7 @@ def test_the_trajectory_comes_out_with_sigmas_below_the_prior() -> None:
     assert (np.abs(found.position_l) < 5 * found.prior_position_sigma_l).all()
 
 
-def test_without_observations_there_is_one_plain_line() -> None:
+def test_without_observations_one_line_is_reported() -> None:
     with pytest.raises(NormalError, match="tie points to adjust; use strips that overlap"):
         adjust(made(lines=LINES[:1]).flight, Features(), ParameterOptions())
 
@@ -435,12 +435,12 @@ CROSSING = (LINES[0], LINES[4])
 
 
 def unknown_start(built: Made) -> dict[str, Calibration]:
-    """A start of which nothing is known but what is plausible."""
+    """Return a start of which only plausible bounds are known."""
     return {"left": nominal("left", built.flight.heads[0].start.lever_arm_b, np.eye(3))}
 
 
 @pytest.mark.parametrize("lines", [CROSSING, LINES[:3]], ids=["two crossing", "three"])
-def test_a_held_scale_stands_in_the_sigma_of_the_range_offset(lines: tuple[Line, ...]) -> None:
+def test_a_held_scale_enters_the_sigma_of_the_range_offset(lines: tuple[Line, ...]) -> None:
     """A scan angle scale 250 ppm off moves the range offset by decimetres; taken as exact it would be many sigmas."""
     built = made(truth=SCALED, lines=lines, points=100)
     prior, start = gauss_markov(built.flight, Taus(), 4.0), unknown_start(built)
@@ -458,8 +458,8 @@ def test_a_held_scale_stands_in_the_sigma_of_the_range_offset(lines: tuple[Line,
     assert crossed == pytest.approx(found.moved[3, column] * 3e-4)
 
 
-def test_what_two_lines_tell_in_part_is_estimated_with_its_start() -> None:
-    """Of the model `scanner`: each sigma is at most what is plausible, and the scale is no reason for a wrong range."""
+def test_parameters_partly_determined_by_two_lines_use_their_start_as_observation() -> None:
+    """With the model `scanner` each sigma is at most the plausible one, and the scale spoils no range."""
     built = made(truth=SCALED, lines=CROSSING, points=100)
     prior, start = gauss_markov(built.flight, Taus(), 4.0), unknown_start(built)
     found = adjust(built.flight, built.features, ParameterOptions("scanner"), prior, PLAIN, start)
@@ -469,7 +469,7 @@ def test_what_two_lines_tell_in_part_is_estimated_with_its_start() -> None:
     assert (np.abs(found.values - built.truth.parameters[kinds]) < 3.0 * found.sigmas).all()
 
 
-def test_what_a_held_parameter_does_is_what_another_start_of_it_does() -> None:
+def test_the_effect_of_a_held_parameter_equals_that_of_another_start() -> None:
     """Against the adjustment itself, started with the parameter one sigma away."""
     built = made(lines=LINES[:6])
     prior, start = gauss_markov(built.flight, Taus(), 4.0), unknown_start(built)
@@ -482,8 +482,8 @@ def test_what_a_held_parameter_does_is_what_another_start_of_it_does() -> None:
         assert (np.abs(other.values - found.values - moved) < 1e-3 * (np.abs(moved) + found.sigmas)).all()
 
 
-def test_a_flight_that_contradicts_what_is_held_says_so() -> None:
-    """A scale said to be known to 5 ppm that is 250 ppm off: the flight sees it, and its sigma is not believed."""
+def test_a_flight_that_contradicts_a_held_parameter_reports_it() -> None:
+    """A scale declared known to 5 ppm is 250 ppm off: the flight reveals it, and its sigma is rejected."""
     built = made(truth=SCALED)
     prior, start = gauss_markov(built.flight, Taus(), 4.0), unknown_start(built)
     wish = ParameterOptions(fix=frozenset(["scan_angle_scale"]), priors={"scan_angle_scale": 5e-6})
@@ -498,7 +498,7 @@ def test_a_flight_that_contradicts_what_is_held_says_so() -> None:
 
 
 @pytest.mark.parametrize("name", ["kappa_rad", "scan_angle_scale"])
-def test_what_is_held_at_the_user_s_word_is_said_to_be_wrong_where_the_flight_knows_better(name: str) -> None:
+def test_a_fixed_parameter_is_reported_as_wrong_if_the_flight_contradicts_it(name: str) -> None:
     """However plausible its error is; its sigma stays what is plausible."""
     built = made(truth=SCALED)
     prior, start = gauss_markov(built.flight, Taus(), 4.0), {"left": replace(built.truth, method="nominal")}
@@ -513,7 +513,7 @@ def test_what_is_held_at_the_user_s_word_is_said_to_be_wrong_where_the_flight_kn
     assert one.sigma == pytest.approx(PARAMETERS[INDEX[name]].plausible)
 
 
-def test_where_nothing_is_determined_all_is_held() -> None:
+def test_all_parameters_are_held_if_none_is_determined() -> None:
     built = made(lines=LINES[:1], planes=roofs(0.0))
     prior = gauss_markov(built.flight, Taus(), 4.0)
     found = adjust(built.flight, built.features, ParameterOptions(), prior)
@@ -528,7 +528,7 @@ LOGARITHM = 0.3 * np.log((INTENSITY + 30.0) / (KNOTS[3] + 30.0))
 
 
 def by_intensity(correction_m: FloatArray, noise: float = 1.0) -> Adjusted:
-    """Of a scanner with this correction at `INTENSITY`."""
+    """Return the calibration of a scanner with this correction at `INTENSITY`."""
     built = made(ibrc=(INTENSITY, correction_m), points=24, noise=noise)
     wish = ParameterOptions(ibrc_knots=tuple(KNOTS.tolist()), ibrc_reference=45.0, ibrc_smoothness_m=1.0)
     return adjust(built.flight, built.features, wish, gauss_markov(built.flight, Taus(), 4.0))
@@ -553,7 +553,7 @@ def test_a_correction_by_intensity_lies_within_its_sigmas(share: float) -> None:
     assert (np.abs(error_m) < 3.0 * sigma_m).all()
 
 
-def test_a_smooth_correction_is_nearer_than_any_line_from_knot_to_knot() -> None:
+def test_a_smooth_correction_is_closer_than_any_piecewise_linear_one() -> None:
     """With hardly any noise: against the best that lines between the same knots could be."""
     hats = np.stack([np.interp(INTENSITY, KNOTS, one) for one in np.eye(len(KNOTS))], axis=1)
     best = hats @ np.linalg.lstsq(hats, LOGARITHM)[0]

@@ -20,7 +20,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("kernels")]
 RUNS = 100
 
 
-def test_errors_over_many_runs_are_as_large_as_the_sigmas_say() -> None:
+def test_errors_over_many_runs_are_as_large_as_their_sigmas() -> None:
     """NEES of every parameter, and its intervals, with trajectory errors drawn from their prior."""
     lines = LINES[:6]
     flown = trajectory(lines)

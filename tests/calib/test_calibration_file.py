@@ -72,12 +72,12 @@ def calibrations(draw: st.DrawFn) -> Calibration:
 
 
 def close(read: Any, written: Any) -> None:
-    """The same to the last binary digit but one unit of it, relative to each number."""
+    """True if two numbers agree to one unit of their last binary digit."""
     np.testing.assert_array_max_ulp(np.asarray(read, np.float64), np.asarray(written, np.float64), maxulp=1)
 
 
 def same(read: Calibration, written: Calibration, *, exactly: bool) -> None:
-    """All that a file holds agrees."""
+    """Assert that everything in two files agrees."""
     check = np.testing.assert_array_equal if exactly else close
     for name in ("parameters", "sigmas", "held_sigmas"):
         check(getattr(read, name), getattr(written, name))
@@ -99,7 +99,7 @@ def same(read: Calibration, written: Calibration, *, exactly: bool) -> None:
 
 @settings(max_examples=120, deadline=None)
 @given(calibrations(), TEXT, TEXT)
-def test_what_is_written_is_read(calibration: Calibration, identity: str, serial: str) -> None:
+def test_a_written_calibration_is_read_back(calibration: Calibration, identity: str, serial: str) -> None:
     header = Header(identity, CREATED, "combined", scanner_serial=serial, logs=((serial, "ab"),))
     text = calibration_text(calibration, header)
     read = read_calibration(text, "test")
@@ -112,7 +112,7 @@ def test_what_is_written_is_read(calibration: Calibration, identity: str, serial
     same(read_calibration(again, "test"), read, exactly=True)
 
 
-def test_numbers_that_people_wrote_stay_as_they_wrote_them() -> None:
+def test_numbers_written_by_users_keep_their_digits() -> None:
     """0.0009° in radians and back is 0.0008999999999999999 by plain division."""
     rows = {"omega_deg": "0.2513", "phi_deg": "-0.4021", "kappa_deg": "0.611", "range_offset_m": "0.3502"}
     rows |= {"range_scale_ppm": "12.7", "lever_arm_x_m": "0.12", "lever_arm_y_m": "-0.03", "lever_arm_z_m": "0.28"}
@@ -124,7 +124,7 @@ def test_numbers_that_people_wrote_stay_as_they_wrote_them() -> None:
     assert [line for key, value in rows.items() if (line := f"{key} = {value}") not in written] == []
 
 
-def test_the_file_of_the_conventions() -> None:
+def test_the_file_follows_the_conventions_page() -> None:
     """Keys and their order are those of the page; what was held has no sigma; all sixteen parameters stand there."""
     sigmas, correlation = np.zeros(16), np.eye(16)
     sigmas[INDEX["omega_rad"]], sigmas[INDEX["range_scale"]] = math.radians(0.001), 2e-6
@@ -169,7 +169,7 @@ def judged() -> tuple[Calibration, Header]:
     return Calibration("x", "left", "nominal", np.zeros(16), sigmas, correlation, held_sigmas=held), header
 
 
-def test_the_verdict_and_the_held_parameters_stand_in_the_file() -> None:
+def test_verdict_and_held_parameters_are_written_to_the_file() -> None:
     calibration, header = judged()
     read = read_calibration(calibration_text(calibration, header), "test")
     assert read.header["verdict"] == "usable with care"
@@ -198,7 +198,7 @@ def test_a_file_that_contradicts_itself_is_refused(said: str, instead: str, mess
         read_calibration(text.replace(said, instead), "test")
 
 
-def test_tables_match_as_they_did() -> None:
+def test_table_rows_keep_their_matching_keys() -> None:
     """Each row keeps what it matches on, and nothing else."""
     offsets = (RangeOffset(0.012, return_slot=2), RangeOffset(-0.03, mta_zone=0, prf_hz=400_000.0))
     calibration = Calibration("x", "left", "planes", np.zeros(16), range_offsets=offsets)
@@ -221,14 +221,14 @@ def test_tables_match_as_they_did() -> None:
         ({"scanner": ""}, "calibration.scanner"),
     ],
 )
-def test_nothing_is_written_that_only_looks_valid(change: dict[str, Any], message: str) -> None:
+def test_invalid_calibrations_are_not_written(change: dict[str, Any], message: str) -> None:
     given = {"id": "x", "scanner": "left", "method": "planes", "parameters": np.zeros(16)} | change
     with pytest.raises(CalibrationFileError, match=message) as caught:
         calibration_text(Calibration(**given), HEADER)
     assert "\n" not in str(caught.value)
 
 
-def test_a_time_has_a_zone() -> None:
+def test_a_time_needs_a_time_zone() -> None:
     calibration = Calibration("x", "left", "planes", np.zeros(16))
     with pytest.raises(CalibrationFileError, match="time zone"):
         calibration_text(calibration, Header("id", dt.datetime(2026, 1, 1, tzinfo=dt.UTC).replace(tzinfo=None)))

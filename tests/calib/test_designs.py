@@ -19,7 +19,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("kernels")]
 ANGLES = {"left.omega_rad", "left.phi_rad", "left.kappa_rad"}
 
 
-def test_no_parameter_of_forty_flights_is_beyond_four_of_its_sigmas() -> None:
+def test_no_parameter_of_forty_flights_exceeds_four_sigmas() -> None:
     offsets, flights = run(range(1, 41), minutes=60.0)
     assert flights == 40
     assert len({one.case.design for one in offsets}) == 7  # one line, …, two heights
@@ -30,7 +30,7 @@ def test_no_parameter_of_forty_flights_is_beyond_four_of_its_sigmas() -> None:
 
 
 def with_points(features: Features, each: int, seed: int) -> Features:
-    """With so many control points of 1 cm on every level plane."""
+    """Add so many control points of 1 cm to every level plane."""
     rng = np.random.default_rng(seed)
     planes = []
     for plane in features.planes:
@@ -41,7 +41,7 @@ def with_points(features: Features, each: int, seed: int) -> Features:
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_six_lines_and_thirty_control_points_tell_the_boresight_of_a_mems_unit(seed: int) -> None:
+def test_six_lines_and_thirty_control_points_determine_the_boresight_with_a_mems_imu(seed: int) -> None:
     """Attitude errors six times those of a tactical unit: no angle is held, and each is within its sigmas."""
     case = Case(seed, "six", "MEMS", "basic", 1.0, 35.0, control=False)
     built, planes = flight_of(case)

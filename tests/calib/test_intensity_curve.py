@@ -37,7 +37,7 @@ def test_the_curve_is_the_monotone_cubic(table: tuple[FloatArray, FloatArray]) -
 
 @given(tables())
 def test_monotone_knots_give_a_monotone_table(table: tuple[FloatArray, FloatArray]) -> None:
-    """And so does each piece between two knots, whatever the others do."""
+    """Each piece between two knots is monotone, whatever the others do."""
     knots, correction_m = table
     for values in (correction_m, np.sort(correction_m), np.sort(correction_m)[::-1]):
         found = curve(knots, values)
@@ -48,8 +48,8 @@ def test_monotone_knots_give_a_monotone_table(table: tuple[FloatArray, FloatArra
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_derivatives_are_differences(seed: int) -> None:
-    """By complex steps there are none, as slopes compare signs: central ones, where no secant is near zero."""
+def test_derivatives_match_finite_differences(seed: int) -> None:
+    """Complex steps fail because slopes compare signs, so central differences are used away from zero secants."""
     g = np.random.default_rng(seed)
     knots = np.cumsum(g.uniform(2.0, 40.0, 6))
     correction_m = np.cumsum(g.uniform(0.01, 0.05, 6) * (g.choice([-1.0, 1.0], 6) if seed % 2 else 1.0))
@@ -61,8 +61,8 @@ def test_derivatives_are_differences(seed: int) -> None:
     np.testing.assert_allclose(curve_by_knots(knots, correction_m), moved, atol=1e-7)
 
 
-def test_where_all_knots_are_alike_derivatives_are_those_of_a_gentle_rise() -> None:
-    """An adjustment begins there: columns that tell the knots apart, and move all points where all knots move."""
+def test_equal_knots_have_the_derivatives_of_a_gentle_rise() -> None:
+    """An adjustment begins there, so its columns must separate the knots and together move all points."""
     knots = np.array([0.0, 10.0, 30.0, 60.0, 100.0])
     found = curve_by_knots(knots, np.zeros(5))
     np.testing.assert_allclose(found.sum(axis=0), 1.0, atol=1e-14)
@@ -70,7 +70,7 @@ def test_where_all_knots_are_alike_derivatives_are_those_of_a_gentle_rise() -> N
     assert np.linalg.matrix_rank(found) == 5
 
 
-def test_two_knots_are_a_line() -> None:
+def test_two_knots_give_a_straight_line() -> None:
     knots, correction_m = np.array([5.0, 25.0]), np.array([-0.01, 0.03])
     np.testing.assert_allclose(curve(knots, correction_m), np.interp(nodes_of(knots), knots, correction_m), atol=1e-15)
     np.testing.assert_allclose(

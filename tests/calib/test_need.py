@@ -27,7 +27,7 @@ def known(built: Made) -> Calibration:
 
 
 def prior() -> TrajectoryFit:
-    """Of one knot."""
+    """Return the prior of one knot."""
     one, none = np.ones((1, 3)), np.zeros((1, 3))
     attitude = np.array([[TILT_RAD, TILT_RAD, HEADING_RAD]])
     time_ns = np.zeros(1, np.int64)
@@ -39,7 +39,7 @@ def of(built: Made, wanted: dict[str, float] | None = None) -> Need:
     return need_of(flight, {"left": known(built)}, prior(), wanted)
 
 
-def test_what_is_left_in_points_is_the_scatter_of_drawn_calibrations() -> None:
+def test_expected_point_errors_match_the_scatter_of_drawn_calibrations() -> None:
     built = made(lines=LINES[:4])
     calibration, rng = known(built), np.random.default_rng(8)
     draws = rng.multivariate_normal(calibration.parameters, calibration.covariance(), 300, method="eigh")
@@ -56,7 +56,7 @@ def test_what_is_left_in_points_is_the_scatter_of_drawn_calibrations() -> None:
 
 
 @pytest.mark.parametrize("height_m", [60.0, 800.0])
-def test_an_angle_is_wanted_by_the_height(height_m: float) -> None:
+def test_the_needed_accuracy_of_an_angle_follows_the_height(height_m: float) -> None:
     """Half of what points of that flight have wrong anyway, over the distance from which they were measured."""
     lines = [Line(0.0, height_m), Line(180.0, height_m)]
     built = made(lines=lines)
@@ -70,7 +70,7 @@ def test_an_angle_is_wanted_by_the_height(height_m: float) -> None:
     assert need.wanted["kappa_rad"] > need.wanted["phi_rad"]
 
 
-def test_what_the_user_wants_stands_above() -> None:
+def test_user_requirements_have_precedence() -> None:
     need = of(made(lines=LINES[:2]), {POINT: 0.1, "kappa_rad": 1e-3, "range_scale": 1e-5})
     assert need.point_m == need.wanted["range_offset_m"] == 0.1
     assert need.wanted["kappa_rad"] == 1e-3

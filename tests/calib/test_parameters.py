@@ -17,19 +17,19 @@ from tests.calib.roofs import LINES, frame, trajectory
 
 
 def spinning() -> SpinningGeometry:
-    """Three beams."""
+    """Return a head with three beams."""
     nothing = np.zeros(3)
     return SpinningGeometry(np.array([-10.0, 0.0, 10.0]), nothing, nothing, nothing, nothing, nothing)
 
 
 def flight() -> Flight:
-    """A line scanner and a spinning head."""
+    """Return a flight with a line scanner and a spinning head."""
     left, top = nominal("left", (0.1, 0.2, 0.3), np.eye(3)), nominal("top", (0.5, 0.0, -0.2), np.eye(3))
     heads = (Head("left", left, LineGeometry()), Head("top", top, spinning()))
     return Flight(frame(), heads, (trajectory(LINES[:1]),), ())
 
 
-def test_models_are_those_of_the_program() -> None:
+def test_models_match_the_program() -> None:
     assert MODELS["basic"] == ("omega_rad", "phi_rad", "kappa_rad", "range_offset_m")
     assert set(MODELS["scanner"]) - set(MODELS["basic"]) == {
         "scan_angle_scale",
@@ -40,7 +40,7 @@ def test_models_are_those_of_the_program() -> None:
     assert set(MODELS["full"]) == set(INDEX)
 
 
-def test_several_heads_stand_in_one_vector() -> None:
+def test_several_heads_share_one_vector() -> None:
     asked = unknowns(
         flight(), ParameterOptions("scanner", fix=frozenset(["left.kappa_rad"]), priors={"lever_arm_z_m": 0.02})
     )
@@ -57,7 +57,7 @@ def test_several_heads_stand_in_one_vector() -> None:
     assert np.isinf(asked.prior_sigmas[asked.names.index("top.omega_rad")])
 
 
-def test_the_scan_angle_s_offset_is_held_unless_it_is_freed() -> None:
+def test_the_scan_angle_offset_is_held_unless_freed() -> None:
     held = unknowns(flight(), ParameterOptions("full"))
     assert "left.scan_angle_offset_rad" not in held.names
     assert any(one.name == "scan_angle_offset_rad" and "boresight" in one.why for one in held.held)
@@ -65,7 +65,7 @@ def test_the_scan_angle_s_offset_is_held_unless_it_is_freed() -> None:
     assert "left.scan_angle_offset_rad" in freed.names
 
 
-def test_what_is_said_of_one_scanner_stands_above_what_is_said_of_all() -> None:
+def test_settings_of_one_scanner_override_those_of_all() -> None:
     asked = unknowns(
         flight(),
         ParameterOptions(
@@ -84,7 +84,7 @@ def test_what_is_said_of_one_scanner_stands_above_what_is_said_of_all() -> None:
 
 
 def extras() -> Unknowns:
-    """All that is beyond the model."""
+    """Return everything beyond the standard model."""
     made = flight()
     old = replace(
         made.heads[1].start,
@@ -103,7 +103,7 @@ def extras() -> Unknowns:
     return unknowns(made, wish)
 
 
-def test_tables_start_from_those_there_are_and_come_back() -> None:
+def test_tables_start_from_the_existing_ones_and_are_returned() -> None:
     asked = extras()
     start = asked.calibrations(asked.start)["top"]
     assert start.ibrc is not None
@@ -128,7 +128,7 @@ def test_tables_start_from_those_there_are_and_come_back() -> None:
     assert done.value("phi_rad") == by_name["top.phi_rad"]
 
 
-def test_a_curve_comes_back_at_the_same_knots() -> None:
+def test_a_curve_is_returned_at_the_same_knots() -> None:
     """A calibration goes on from what another one wrote."""
     asked = extras()
     done = asked.calibrations(asked.start + np.arange(1, len(asked) + 1) * 1e-3)
@@ -161,7 +161,7 @@ def test_pseudo_observations_are_priors_and_bends() -> None:
     assert misclosure[0] == pytest.approx(0.5)
 
 
-def test_sigmas_and_correlations_go_to_their_head() -> None:
+def test_sigmas_and_correlations_are_returned_to_their_head() -> None:
     asked = unknowns(flight(), ParameterOptions())
     root = np.random.default_rng(5).normal(size=(8, 8))
     covariance = root @ root.T
@@ -184,8 +184,8 @@ def held_sigma(name: str, wish: ParameterOptions, start: Calibration | None = No
     return {one.name: one.plausible for one in asked.considered}.get(f"left.{name}", 0.0)
 
 
-def test_how_well_a_held_parameter_is_known() -> None:
-    """By the user, by an earlier calibration, by what is plausible of it, in this order."""
+def test_sigma_of_a_held_parameter_comes_from_user_calibration_or_plausibility() -> None:
+    """Precedence: the user, then an earlier calibration, then what is plausible."""
     scale, fixed = INDEX["scan_angle_scale"], frozenset(["scan_angle_scale"])
     assert held_sigma("scan_angle_scale", ParameterOptions()) == pytest.approx(3e-4)
     assert held_sigma("scan_angle_scale", ParameterOptions("scanner", fix=fixed)) == pytest.approx(3e-4)
@@ -212,7 +212,7 @@ def test_how_well_a_held_parameter_is_known() -> None:
     assert held_sigma("scan_angle_offset_rad", ParameterOptions("full")) == 0.0
 
 
-def test_what_is_held_keeps_the_start_and_what_is_estimated_begins_elsewhere() -> None:
+def test_held_parameters_keep_their_start_and_estimated_ones_begin_at_nominal_values() -> None:
     starts = flight().starts()
     near = {name: one.changed(omega_rad=0.01, kappa_rad=0.02, range_offset_m=9.0) for name, one in starts.items()}
     asked = unknowns(flight(), ParameterOptions(fix=frozenset(["kappa_rad"])), starts, near)
@@ -244,13 +244,13 @@ def test_what_is_held_keeps_the_start_and_what_is_estimated_begins_elsewhere() -
         (ParameterOptions(beams=frozenset(["roll_rad"])), "beams: got 'roll_rad'"),
     ],
 )
-def test_wishes_that_cannot_be_met_are_refused(wish: ParameterOptions, text: str) -> None:
+def test_impossible_options_are_refused(wish: ParameterOptions, text: str) -> None:
     with pytest.raises(ParameterError, match=text.replace(".", r"\.")) as refused:
         unknowns(flight(), wish)
     assert "\n" not in str(refused.value)
 
 
-def test_a_beam_s_correction_needs_a_spinning_head() -> None:
+def test_a_beam_correction_needs_a_spinning_head() -> None:
     only = replace(flight(), heads=flight().heads[:1])
     with pytest.raises(ParameterError, match="this flight has no spinning head"):
         unknowns(only, ParameterOptions(beams=frozenset(["range_m"])))

@@ -66,7 +66,7 @@ def test_returns_lie_on_the_planes(looks: str) -> None:
 
 
 @pytest.mark.slow
-def test_sigmas_are_those_of_flights_with_such_errors() -> None:
+def test_sigmas_match_flights_with_simulated_errors() -> None:
     """60 flights: new trajectory errors, noise on range and angle, one step of the adjustment: χ² of four parameters.
 
     A trajectory taken as white would make these four sigmas several times too small.
@@ -93,7 +93,7 @@ def test_sigmas_are_those_of_flights_with_such_errors() -> None:
     assert np.mean(white) > 4.0
 
 
-def test_a_second_height_tells_time_from_pitch_and_control_the_range() -> None:
+def test_a_second_height_separates_time_from_pitch_and_control_fixes_the_range() -> None:
     """What each design adds."""
     one, two = flown(ONE_HEIGHT), flown(TWO_HEIGHTS)
     model = ParameterOptions("scanner")
@@ -115,7 +115,7 @@ def test_a_second_height_tells_time_from_pitch_and_control_the_range() -> None:
     assert sigmas.sigmas[sigmas.names.index("left.range_offset_m")] < 0.02
 
 
-def test_a_lone_line_has_no_planes_but_with_control() -> None:
+def test_a_single_line_has_planes_only_with_control() -> None:
     trajectory, lines = path(ONE_HEIGHT[:1])
     scan = Scan(30.0 * DEG, 1e5)
     with pytest.raises(FlightError, match="no two lines see the same roof or ground; plan lines that overlap"):
@@ -150,13 +150,13 @@ def test_cells_hold_several_lines(scan: Scan, speed_mps: float, cell_m: float) -
     assert search_cell_m(scan, np.full(9, per_m2), speed_mps) == cell_m
 
 
-def test_roofs_lose_their_rims_and_the_more_the_larger_the_cells_are() -> None:
+def test_larger_cells_lose_more_of_the_rim_of_a_roof() -> None:
     roof = replace(surfaces()[0], area_m2=100.0, kind="roof")
     assert [roof.taken_m2(cell_m) for cell_m in (0.5, 1.0, 4.0, 12.0)] == [81.0, 81.0, 36.0, 0.0]
     assert replace(roof, kind="ground").taken_m2(4.0) == 100.0
 
 
-def test_the_encoder_moves_as_the_scan_does() -> None:
+def test_encoder_rates_are_derivatives_of_the_scan() -> None:
     """Rates and accelerations against differences of the motion itself."""
     t, h = np.linspace(0.001, 0.011, 7), 1e-6
 

@@ -46,7 +46,7 @@ def settled(flight: Flight) -> Features:
 
 
 def sets(features: Features) -> dict[tuple[str, int], set[int]]:
-    """Returns by plane and swath."""
+    """Return the returns by plane and swath."""
     return {(plane.name, patch.swath): set(patch.at.tolist()) for plane in features.planes for patch in plane.patches}
 
 
@@ -69,13 +69,13 @@ def moved(cast: Cast, **by: float) -> Flight:
 
 
 def shifted(flight: Flight, swath: int, by_m: float) -> Flight:
-    """One swath higher than it was."""
+    """Raise one swath."""
     swaths = list(flight.swaths)
     swaths[swath] = replace(swaths[swath], points_t=swaths[swath].points_t + np.array([0.0, 0.0, by_m]))
     return replace(flight, swaths=tuple(swaths))
 
 
-def test_where_nothing_moves_nothing_changes(flight: Flight, settled: Features) -> None:
+def test_unmoved_points_keep_their_planes(flight: Flight, settled: Features) -> None:
     """All but a patch or two at once; after that, bit for bit."""
     again = rematch(flight, settled)
     assert len(again.planes) == len(settled.planes)
@@ -86,7 +86,7 @@ def test_where_nothing_moves_nothing_changes(flight: Flight, settled: Features) 
         np.testing.assert_array_equal(one.normal_t, other.normal_t)
 
 
-def test_matched_planes_are_those_that_were_found(flight: Flight, settled: Features) -> None:
+def test_matched_planes_equal_the_planes_found(flight: Flight, settled: Features) -> None:
     found = find_planes(flight)
     assert len(settled.planes) >= len(found.planes) - 1
     assert np.median(common(found, settled)) > 0.9
@@ -94,8 +94,8 @@ def test_matched_planes_are_those_that_were_found(flight: Flight, settled: Featu
         assert one.normal_t @ other.normal_t > np.cos(np.radians(0.5))
 
 
-def test_found_astray_they_are_found_again_where_they_belong(cast: Cast, flight: Flight) -> None:
-    """As after the first adjustment: planes found with 0.03° of error in all angles, then the points move by 0.4 m."""
+def test_displaced_planes_are_found_again_after_alignment(cast: Cast, flight: Flight) -> None:
+    """After the first adjustment, planes were found with 0.03° of error in all angles, and points move by 0.4 m."""
     wrong = moved(cast, omega_rad=5e-4, phi_rad=-5e-4, kappa_rad=1e-3)
     first = find_planes(wrong)
     matched = rematch(flight, first)
@@ -109,7 +109,7 @@ def test_found_astray_they_are_found_again_where_they_belong(cast: Cast, flight:
             assert plane.normal_t @ true[:3] > np.cos(np.radians(0.5)), plane.name
 
 
-def test_a_swath_that_lies_elsewhere_is_left_out(flight: Flight, settled: Features) -> None:
+def test_a_displaced_swath_is_dropped(flight: Flight, settled: Features) -> None:
     """Half a metre higher than the other two, which hold the planes."""
     matched = rematch(shifted(flight, 1, 0.5), settled)
     kept = [plane for plane in matched.planes if {patch.swath for patch in plane.patches} == {0, 2}]
@@ -119,7 +119,7 @@ def test_a_swath_that_lies_elsewhere_is_left_out(flight: Flight, settled: Featur
     assert matched.refused[LOST] >= both
 
 
-def test_a_swath_that_shows_a_plane_comes_in(flight: Flight, settled: Features) -> None:
+def test_a_swath_that_shows_a_plane_is_added(flight: Flight, settled: Features) -> None:
     full = [plane for plane in settled.planes if len(plane.patches) == 3]
     without = tuple(replace(plane, patches=plane.patches[:2]) for plane in full)
     matched = rematch(flight, Features(planes=without))
@@ -128,7 +128,7 @@ def test_a_swath_that_shows_a_plane_comes_in(flight: Flight, settled: Features) 
     assert np.median(again) > 0.95
 
 
-def test_surveyed_planes_need_one_swath_and_keep_what_is_known(flight: Flight, settled: Features) -> None:
+def test_surveyed_planes_need_one_swath_and_keep_their_known_values(flight: Flight, settled: Features) -> None:
     plane = settled.planes[0]
     control = ControlPoint("c1", plane.centre_t, 0.01)
     surveyed = replace(plane, patches=plane.patches[:1], control=(control,), kind="control")
@@ -141,7 +141,7 @@ def test_surveyed_planes_need_one_swath_and_keep_what_is_known(flight: Flight, s
     assert lost.refused[LOST] == 1
 
 
-def test_points_that_are_gone_are_not_matched(flight: Flight, settled: Features) -> None:
+def test_missing_points_are_not_matched(flight: Flight, settled: Features) -> None:
     swaths = list(flight.swaths)
     swaths[0] = replace(swaths[0], points_t=np.full_like(swaths[0].points_t, np.nan))
     matched = rematch(replace(flight, swaths=tuple(swaths)), settled)
@@ -149,7 +149,7 @@ def test_points_that_are_gone_are_not_matched(flight: Flight, settled: Features)
     assert all(patch.swath != 0 for plane in matched.planes for patch in plane.patches)
 
 
-def test_what_is_no_plane_is_handed_on(flight: Flight, settled: Features) -> None:
+def test_other_features_are_passed_on(flight: Flight, settled: Features) -> None:
     sighting = Sighting(0, 3, np.zeros(3), np.eye(3))
     tie = TiePoint("ridge 1", (sighting, replace(sighting, swath=1)))
     features = replace(settled, ties=(tie,), refused=settled.refused.copy())
@@ -168,7 +168,7 @@ def test_a_patch_without_a_plane_is_dropped(flight: Flight) -> None:
 
 
 @pytest.mark.parametrize("rows", [16, 60, 190, 240, 1000])
-def test_so_many_returns_in_all_are_taken_from_the_largest_patches(rows: int) -> None:
+def test_a_limit_on_returns_shortens_the_largest_patches(rows: int) -> None:
     """Take as many of each as make the limit: no other number that is the same for all patches comes closer."""
     sizes = [[5, 100], [40], [7, 90]]
     planes = [

@@ -79,7 +79,7 @@ def of_kind(features: Features, kind: str) -> list[Plane]:
 
 
 def made_of(cast: Cast, plane: Plane) -> NDArray[np.int64]:
-    """(10,) returns by surface."""
+    """Return (10,) numbers of returns by surface."""
     parts = [np.bincount(cast.surface[patch.swath][patch.at], minlength=10) for patch in plane.patches]
     counts: NDArray[np.int64] = np.sum(parts, axis=0)
     return counts
@@ -117,8 +117,8 @@ def test_a_roof_is_one_face_of_the_scene_and_has_its_direction(cast: Cast, found
     assert 0.7 < np.sqrt(np.mean(np.square(offsets))) < 1.3
 
 
-def test_normals_are_as_sure_as_they_say(cast: Cast, flight: Flight, found: Features) -> None:
-    """Of each swath's own plane, in its sigma: angles of two components, one of which is surer."""
+def test_errors_of_normals_are_as_large_as_their_sigmas(cast: Cast, flight: Flight, found: Features) -> None:
+    """Errors of each swath's own normals are compared with their sigmas in two components of different sigma."""
     ratios = []
     for plane, face, share in built_roofs(cast, found):
         for patch in plane.patches:
@@ -142,7 +142,7 @@ def test_almost_every_large_roof_is_found(cast: Cast, flight: Flight, found: Fea
     assert len(large & faces) >= 0.95 * len(large)
 
 
-def test_two_roofs_beside_each_other_that_face_alike_are_two_planes(cast: Cast, found: Features) -> None:
+def test_two_neighbouring_roofs_with_equal_slope_are_two_planes(cast: Cast, found: Features) -> None:
     faces = Counter(face for plane, face, _ in built_roofs(cast, found) if plane.centre_t[0] < -98.0)
     alike = [
         (one, other)
@@ -153,7 +153,7 @@ def test_two_roofs_beside_each_other_that_face_alike_are_two_planes(cast: Cast, 
     assert alike  # both are there, and `true_face` says that no plane is of both
 
 
-def test_nothing_of_trees_water_walls_or_cars_is_a_plane(cast: Cast, found: Features) -> None:
+def test_trees_water_walls_and_cars_give_no_planes(cast: Cast, found: Features) -> None:
     total = np.sum([made_of(cast, plane) for plane in found.planes], axis=0)
     assert min((surface == LEAVES).sum() for surface in cast.surface) > 1000
     assert total[[LEAVES, CAR, WATER]].sum() == 0
@@ -164,7 +164,7 @@ def test_nothing_of_trees_water_walls_or_cars_is_a_plane(cast: Cast, found: Feat
 
 
 def test_no_plane_is_curved(cast: Cast, flight: Flight, found: Features) -> None:
-    """By the ground without noise, whose tiles are bent by some centimetres: more than the surest swath could tell."""
+    """Tiles of noiseless ground are bent by some centimetres, more than the best swath could detect."""
     settings = PlaneSettings()
     bent, told = [], []
     for plane in of_kind(found, "ground"):
@@ -181,7 +181,7 @@ def test_no_plane_is_curved(cast: Cast, flight: Flight, found: Features) -> None
     assert found.refused["curved"] > 0
 
 
-def test_no_return_is_of_two_planes_and_names_are_unique(found: Features) -> None:
+def test_no_return_belongs_to_two_planes_and_names_are_unique(found: Features) -> None:
     taken = Counter((patch.swath, at) for plane in found.planes for patch in plane.patches for at in patch.at.tolist())
     assert max(taken.values()) == 1
     assert len({plane.name for plane in found.planes}) == len(found.planes)
@@ -192,13 +192,13 @@ def test_no_return_is_of_two_planes_and_names_are_unique(found: Features) -> Non
         assert plane.normal_t[2] > np.cos(np.radians(66.0))
 
 
-def test_why_places_bear_no_plane_is_said(found: Features) -> None:
+def test_reasons_for_places_without_a_plane_are_reported(found: Features) -> None:
     assert found.refused["several returns a pulse"] + found.refused["too rough"] > 0
     assert found.refused["seen by one swath only"] > 0
     assert min(found.refused.values()) > 0
 
 
-def test_ground_is_spread_over_every_pair_of_swaths(flight: Flight, found: Features) -> None:
+def test_ground_planes_are_spread_over_every_pair_of_swaths(flight: Flight, found: Features) -> None:
     """In the middle and toward both edges of every swath, with each of the others."""
     for one in range(3):
         for other in range(3):
@@ -216,7 +216,7 @@ def test_ground_is_spread_over_every_pair_of_swaths(flight: Flight, found: Featu
     assert len(of_kind(found, "ground")) < 80
 
 
-def test_returns_of_pulses_with_several_are_left_out(flight: Flight, found: Features) -> None:
+def test_pulses_with_several_returns_are_ignored(flight: Flight, found: Features) -> None:
     for plane in found.planes:
         for patch in plane.patches:
             assert (flight.swaths[patch.swath].rows["number_of_returns"][patch.at] == 1).all()
@@ -225,7 +225,7 @@ def test_returns_of_pulses_with_several_are_left_out(flight: Flight, found: Feat
 # --- settings, input ------------------------------------------------------------------------------------------------
 
 
-def test_planes_and_points_have_limits(flight: Flight) -> None:
+def test_numbers_of_planes_and_points_are_limited(flight: Flight) -> None:
     few = find_planes(flight, PlaneSettings(most_planes=12, most_points=40))
     assert 8 <= len(few.planes) <= 12
     assert max(len(patch.at) for plane in few.planes for patch in plane.patches) <= 40
@@ -234,8 +234,8 @@ def test_planes_and_points_have_limits(flight: Flight) -> None:
     assert few.refused["enough of them"] > 0
 
 
-def test_a_large_face_is_cut(cast: Cast, found: Features) -> None:
-    """The roof of 40 m: three pieces a side, none longer than a tile and its diagonal."""
+def test_a_large_face_is_divided(cast: Cast, found: Features) -> None:
+    """The roof of 40 m is divided into three pieces a side, none longer than a tile's diagonal."""
     long = [plane for plane, face, _ in built_roofs(cast, found) if np.hypot(*(plane.centre_t[:2] - (-110, 20))) < 22]
     assert len(long) >= 4
     for plane in found.planes:
@@ -246,7 +246,7 @@ def _points(cast: Cast, plane: Plane) -> FloatArray:
     return np.concatenate([cast.true_t[patch.swath][patch.at] for patch in plane.patches])
 
 
-def test_mapped_points_and_several_swaths_at_a_time_give_the_same(
+def test_memory_mapped_points_and_swaths_in_parts_give_the_same_planes(
     flight: Flight, found: Features, tmp_path: Path
 ) -> None:
     swaths = []
@@ -261,19 +261,19 @@ def test_mapped_points_and_several_swaths_at_a_time_give_the_same(
     assert mapped.refused == found.refused
 
 
-def test_without_points_it_says_so(flight: Flight) -> None:
+def test_a_flight_without_points_is_refused(flight: Flight) -> None:
     empty = tuple(replace(swath, points_t=np.full_like(swath.points_t, np.nan)) for swath in flight.swaths)
     with pytest.raises(PlaneError, match="no points; use a trajectory"):
         find_planes(replace(flight, swaths=empty))
 
 
-def test_one_swath_alone_gives_nothing(flight: Flight) -> None:
+def test_a_single_swath_gives_no_planes(flight: Flight) -> None:
     alone = find_planes(replace(flight, swaths=flight.swaths[:1]))
     assert alone.planes == ()
     assert alone.refused["seen by one swath only"] > 100
 
 
-def test_rows_for_a_report_say_what_was_taken(flight: Flight, found: Features) -> None:
+def test_report_rows_describe_the_planes(flight: Flight, found: Features) -> None:
     row = plane_rows(flight, found)[0]
     plane = found.planes[0]
     assert (row.name, row.points, row.rms_m) == (plane.name, plane.points, plane.rms_m)
@@ -299,7 +299,7 @@ def test_a_polygon_on_a_roof_gives_its_plane(cast: Cast, flight: Flight, found: 
         assert (place <= ring[2]).all()
 
 
-def test_a_polygon_over_a_ridge_is_mixed(cast: Cast, flight: Flight) -> None:
+def test_a_polygon_across_a_ridge_is_mixed(cast: Cast, flight: Flight) -> None:
     east, north, _ = cast.flight.frame.t_from_e(cast.scene.site.e_from_site(np.array([[-110.0, 20.0, 0.0]])))[0]
     ring = np.array([[east - 7, north - 7], [east + 7, north - 7], [east + 7, north + 7], [east - 7, north + 7]])
     given = given_planes(flight, [("ridge", ring)])
@@ -318,7 +318,7 @@ def test_a_polygon_over_a_ridge_is_mixed(cast: Cast, flight: Flight) -> None:
         ),
     ],
 )
-def test_a_wrong_polygon_is_told(flight: Flight, polygons: list[tuple[str, FloatArray]], text: str) -> None:
+def test_a_wrong_polygon_is_reported(flight: Flight, polygons: list[tuple[str, FloatArray]], text: str) -> None:
     with pytest.raises(PlaneError, match=text):
         given_planes(flight, polygons)
 
@@ -326,7 +326,7 @@ def test_a_wrong_polygon_is_told(flight: Flight, polygons: list[tuple[str, Float
 # --- kernels --------------------------------------------------------------------------------------------------------
 
 
-def test_cells_have_the_planes_of_their_points() -> None:
+def test_planes_of_cells_match_those_of_their_points() -> None:
     """Against NumPy's eigenvectors and covariances, far from the origin and from height 0."""
     draws = np.random.default_rng(3)
     corner, shape = (3000.0, -7000.0, 2.0), (3, 4)
@@ -365,7 +365,7 @@ def _grown_over(slope_rad: float, sigma_m: float, limit_rad: float) -> NDArray[n
     return label.reshape(shape)
 
 
-def test_sloping_ground_ends_where_tiles_end_whatever_single_cells_look_like() -> None:
+def test_sloping_ground_ends_at_tile_borders() -> None:
     """A cell of it may look steeper than ground is, and what began there went on over all the ground of a swath."""
     label = _grown_over(np.radians(7.0), 0.04, np.radians(10.0))
     tile = np.add.outer(4 * (np.arange(40) // 10), np.arange(40) // 10)
@@ -373,12 +373,12 @@ def test_sloping_ground_ends_where_tiles_end_whatever_single_cells_look_like() -
         assert len(np.unique(tile[label == plane])) == 1
 
 
-def test_a_steep_face_goes_on_beyond_tiles() -> None:
+def test_a_steep_face_continues_across_tiles() -> None:
     label = _grown_over(np.radians(20.0), 0.04, np.radians(10.0))
     assert np.bincount(label[label >= 0]).max() > 0.9 * label.size
 
 
-def test_the_table_of_cells_finds_what_a_search_through_all_finds() -> None:
+def test_the_cell_table_finds_what_an_exhaustive_search_finds() -> None:
     draws = np.random.default_rng(4)
     points = draws.uniform(-40.0, 40.0, (20_000, 3))
     column, row = draws.integers(-40, 40, (2, 900))

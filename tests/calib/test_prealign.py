@@ -54,7 +54,7 @@ def cast() -> Cast:
 
 
 def off(cast: Cast, degrees: tuple[float, float, float], range_m: float = 0.0) -> dict[str, Calibration]:
-    """A start that is so far from the truth."""
+    """Return a start that differs from the truth by the given amounts."""
     values = [*np.radians(degrees).tolist(), range_m]
     changed = {name: cast.truth.value(name) + value for name, value in zip(NAMES, values, strict=True)}
     return {"left": cast.truth.changed(**changed)}
@@ -68,7 +68,7 @@ def errors_deg(cast: Cast, found: dict[str, Calibration]) -> list[float]:
     ("degrees", "range_m"),
     [((-3.0, 3.0, -3.0), 5.0), ((3.0, -3.0, -3.0), -5.0)],
 )
-def test_three_degrees_and_five_metres_become_small(
+def test_errors_of_three_degrees_and_five_metres_become_small(
     cast: Cast, degrees: tuple[float, float, float], range_m: float
 ) -> None:
     found = prealign(cast.flight, FAST, off(cast, degrees, range_m))
@@ -77,7 +77,7 @@ def test_three_degrees_and_five_metres_become_small(
 
 
 @pytest.mark.parametrize("seed", [2])
-def test_so_also_over_flat_ground_where_houses_are_all_there_is(seed: int) -> None:
+def test_errors_become_small_over_flat_ground_with_houses_only(seed: int) -> None:
     flat = cast_flight(TERRAIN.format(relief=0.0), LINES, prf_hz=9_000.0, seed=seed)
     signs = np.random.default_rng(seed).choice([-3.0, 3.0], 3).tolist()
     found = prealign(flat.flight, FAST, off(flat, (signs[0], signs[1], signs[2])))
@@ -121,7 +121,7 @@ def test_strips_of_any_height_become_good_enough_for_planes(
 
 @pytest.mark.slow
 def test_a_long_line_is_aligned_by_the_part_that_a_short_one_crosses() -> None:
-    """Of 2 km and 60 m beside: samples spread over all of the long line would lie too far apart."""
+    """On a line of 2 km beside one of 60 m, samples over the whole long line would be too far apart."""
     corridor: tuple[Line, ...] = ((-1000, 0, 1000, 0, 510), (40, 5, -40, 5, 510), (0, -60, 0, 60, 510))
     flight = cast_flight(
         YARD.format(size=150.0, houses=30), corridor, prf_hz=4_000.0, half_angle_rad=np.radians(15.0), speed_mps=20.0
@@ -131,8 +131,8 @@ def test_a_long_line_is_aligned_by_the_part_that_a_short_one_crosses() -> None:
     assert np.hypot(roll, pitch) < 0.2
 
 
-def test_afterwards_planes_are_found() -> None:
-    """From 1° off there are none that all see; aligned, the roofs of the scene."""
+def test_planes_are_found_after_prealignment() -> None:
+    """With 1° of error the swaths have no common planes; after alignment they have the roofs of the scene."""
     dense = cast_flight(TERRAIN.format(relief=8.0), LINES, prf_hz=16_000.0)
     start = off(dense, (1.0, -1.0, -1.0), 2.0)
     before = find_planes(dense.flight.placed(start))
@@ -155,7 +155,7 @@ def test_two_heads_are_aligned_together(cast: Cast) -> None:
     assert np.abs(errors_deg(cast, {"left": found["right"]})).max() < 0.1
 
 
-def test_control_says_how_high(cast: Cast) -> None:
+def test_control_determines_the_height(cast: Cast) -> None:
     """The true ground, 5 m of range off; one line flown twice shows no height, control does."""
     flight = replace(cast.flight, swaths=cast.flight.swaths[:2])
     bare = np.isin(cast.surface[0], (1, 4)) & (np.abs(cast.true_t[0][:, 1]) < 40.0)
@@ -165,8 +165,8 @@ def test_control_says_how_high(cast: Cast) -> None:
     assert abs(found["left"].value("range_offset_m") - cast.truth.value("range_offset_m")) < 0.1
 
 
-def test_what_the_flight_does_not_show_stays_near_the_start() -> None:
-    """Over bare level ground, one line both ways: heading is not to be had, and is not invented."""
+def test_undetermined_parameters_stay_near_the_start() -> None:
+    """One level line flown both ways does not determine heading, which must stay near its start."""
     bare = cast_flight("height_m = 450.0", LINES[:2], prf_hz=5_000.0)
     found = prealign(bare.flight, COARSE, off(bare, (2.0, 0.5, 0.5)))
     roll, pitch, heading = errors_deg(bare, found)
@@ -175,24 +175,24 @@ def test_what_the_flight_does_not_show_stays_near_the_start() -> None:
     assert abs(heading) < 1.0
 
 
-def test_one_strip_only_is_told(cast: Cast) -> None:
+def test_a_single_strip_is_reported(cast: Cast) -> None:
     with pytest.raises(PrealignError, match="the flight has 1 swath; at least two that overlap"):
         prealign(replace(cast.flight, swaths=cast.flight.swaths[:1]), FAST)
 
 
-def test_no_overlap_is_told() -> None:
+def test_missing_overlap_is_reported() -> None:
     apart = cast_flight("height_m = 450.0", ((-1200, 0, -1000, 0, 850), (1000, 0, 1200, 0, 850)), prf_hz=3_000.0)
     with pytest.raises(PrealignError, match="do not overlap"):
         prealign(apart.flight, FAST)
 
 
-def test_no_points_are_told(cast: Cast) -> None:
+def test_missing_points_are_reported(cast: Cast) -> None:
     late = tuple(replace(swath, time_ns=swath.time_ns + 10**15) for swath in cast.flight.swaths)
     with pytest.raises(PrealignError, match="no points; use a trajectory"):
         prealign(replace(cast.flight, swaths=late), FAST)
 
 
-def test_a_wrong_installation_is_told(cast: Cast) -> None:
+def test_a_wrong_installation_is_reported(cast: Cast) -> None:
     """Ten degrees are no error of a mounting."""
     with pytest.raises(
         PrealignError, match=r"left: \w+ moved .*° from its initial value; check the installation matrix"
@@ -200,7 +200,7 @@ def test_a_wrong_installation_is_told(cast: Cast) -> None:
         prealign(cast.flight, COARSE, off(cast, (0.0, 9.0, 0.0)))
 
 
-def test_a_surface_changes_as_moved_points_make_it() -> None:
+def test_a_moved_surface_equals_the_surface_of_moved_points() -> None:
     """Against the same surface made of points that were moved: up, aside and tilted."""
     draws = np.random.default_rng(1)
     place = draws.uniform(0.0, 200.0, (60_000, 2))
@@ -220,7 +220,7 @@ def test_a_surface_changes_as_moved_points_make_it() -> None:
         assert np.std(change - by * one.change[a, index]) < 0.12 * np.sqrt(np.mean(change**2))
 
 
-def test_steps_that_go_to_and_fro_are_halved() -> None:
+def test_oscillating_steps_are_halved() -> None:
     """A fine level with few edges: x → −0.9 x for ever with whole steps; at rest within five with damped ones."""
     away, share, last = np.array([[0.0, 0.0, 1e-3, 0.0]]), 1.0, np.zeros((1, 4))
     for _ in range(5):

@@ -40,31 +40,31 @@ pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("kernels")]
 
 @pytest.fixture(scope="module")
 def outcome() -> Outcome:
-    """Of 40 000 returns a strip."""
+    """Return an outcome with 40 000 returns a strip."""
     return made_outcome(40_000)
 
 
 @pytest.fixture(scope="module")
 def report(outcome: Outcome) -> ReportInput:
-    """With everything."""
+    """Return the input of a report with every part."""
     return made_report(outcome)
 
 
 @pytest.fixture(scope="module")
 def page(report: ReportInput) -> str:
-    """The page."""
+    """Return the text of the page."""
     return html(report)
 
 
 def sound(report: ReportInput, **changes: Any) -> ReportInput:
-    """Without the bad control point, the correlated pair and what is not determined; then changed."""
+    """Remove the bad control point, the correlated pair and undetermined parameters; then apply changes."""
     adjusted = report.adjusted
     correlation = np.eye(len(adjusted.names))
     plain = replace(adjusted, control=adjusted.control[:4], correlation=correlation, held=())
     return replace(report, adjusted=replace(plain, **changes))
 
 
-def test_verdict_of_a_good_calibration(report: ReportInput) -> None:
+def test_verdict_of_a_good_calibration_is_good(report: ReportInput) -> None:
     verdict = judge(sound(report))
     assert verdict.level is Level.GOOD
     assert not verdict.reasons
@@ -75,7 +75,7 @@ def test_verdict_of_a_good_calibration(report: ReportInput) -> None:
     )
 
 
-def test_verdict_names_what_is_not_determined(report: ReportInput) -> None:
+def test_verdict_names_undetermined_parameters(report: ReportInput) -> None:
     held = (
         FixedParameter("left", "lever_arm_z_m", "why", "control"),
         FixedParameter("left", "lever_arm_x_m", "at the user's word"),
@@ -91,7 +91,7 @@ def test_verdict_names_what_is_not_determined(report: ReportInput) -> None:
 
 
 @pytest.mark.parametrize(("left_m", "level"), [(0.04, Level.GOOD), (0.06, Level.CARE)])
-def test_a_correlated_pair_is_a_reason_unless_points_are_known_as_well_as_is_wanted(
+def test_a_correlated_pair_is_a_reason_unless_points_are_accurate_enough(
     report: ReportInput, left_m: float, level: Level
 ) -> None:
     """Count what a calibration leaves in points, which holds the correlation: where it is little, the sum suffices."""
@@ -104,7 +104,9 @@ def test_a_correlated_pair_is_a_reason_unless_points_are_known_as_well_as_is_wan
 
 
 @pytest.mark.parametrize(("sigma_deg", "level"), [(0.01, Level.CARE), (1.0, Level.UNUSABLE)])
-def test_a_held_angle_is_no_boresight_calibration(report: ReportInput, sigma_deg: float, level: Level) -> None:
+def test_a_held_angle_makes_the_boresight_calibration_incomplete(
+    report: ReportInput, sigma_deg: float, level: Level
+) -> None:
     """At the user's word too; how well it is known decides how bad that is, and stands among the sigmas."""
     held = (FixedParameter("left", "kappa_rad", "held by your choice"),)
     considered = (Considered("left", "kappa_rad", 0.0, math.radians(sigma_deg)),)
@@ -117,7 +119,7 @@ def test_a_held_angle_is_no_boresight_calibration(report: ReportInput, sigma_deg
     assert "Boresight to 0.0100°" in verdict.sentence or "Boresight to 1.00°" in verdict.sentence
 
 
-def test_a_held_parameter_that_moves_an_estimated_one_is_named_with_its_size(report: ReportInput) -> None:
+def test_a_held_parameter_that_affects_an_estimated_one_is_named_with_its_effect(report: ReportInput) -> None:
     adjusted = report.adjusted
     considered = (
         Considered("left", "torsion_s2", 0.0, 2e-9),
@@ -131,7 +133,7 @@ def test_a_held_parameter_that_moves_an_estimated_one_is_named_with_its_size(rep
     ]
 
 
-def test_what_the_flight_says_against_a_held_parameter_is_a_reason(report: ReportInput) -> None:
+def test_a_contradiction_between_flight_and_held_parameter_is_a_reason(report: ReportInput) -> None:
     considered = (Considered("left", "torsion_s2", 0.0, 2e-9, 9e-9, 1e-9, contradicted=True),)
     verdict = judge(sound(report, considered=considered))
     assert verdict.level is Level.CARE
@@ -141,7 +143,7 @@ def test_what_the_flight_says_against_a_held_parameter_is_a_reason(report: Repor
     )
 
 
-def test_the_verdict_goes_by_what_is_wanted(report: ReportInput) -> None:
+def test_the_verdict_follows_the_requirements(report: ReportInput) -> None:
     """An angle and the points against what the user wants of them."""
     need = Need(0.05, {"kappa_rad": math.radians(0.001)}, 0.1, {"left": 0.04})
     (reason,) = judge(replace(sound(report), need=need)).reasons
@@ -164,7 +166,7 @@ def test_the_verdict_goes_by_what_is_wanted(report: ReportInput) -> None:
         (-8.25, Level.UNUSABLE),
     ],
 )
-def test_profiles_that_say_otherwise_are_a_reason(report: ReportInput, sigmas: float, level: Level) -> None:
+def test_contradicting_profiles_are_a_reason(report: ReportInput, sigmas: float, level: Level) -> None:
     """Vary by how many sigmas of the difference eight pairs are off together, to either side."""
     sigma = 2.0**-16
     one = Comparison("left", "omega_rad", 8, sigmas * sigma, sigma, 0.0, sigma, sigma)
@@ -204,14 +206,14 @@ def test_findings_are_reasons(report: ReportInput) -> None:
         ({"control": (ControlFit("K9", 0.0, 0.01, 0.1, {"left.phi_rad": -2.0}),)}, Level.CARE, "moves boresight φ"),
     ],
 )
-def test_what_is_wrong_is_a_reason(report: ReportInput, changes: dict[str, Any], level: Level, words: str) -> None:
+def test_each_problem_is_a_reason(report: ReportInput, changes: dict[str, Any], level: Level, words: str) -> None:
     verdict = judge(sound(report, **changes))
     assert verdict.level is level
     assert words in verdict.sentence
     assert all(reason.change for reason in verdict.reasons)
 
 
-def test_strips_that_became_worse(report: ReportInput) -> None:
+def test_strips_that_agree_worse_than_before_are_a_reason(report: ReportInput) -> None:
     pair = ("01", "02")
     before, after = {pair: PairDifference(0.0, 0.02, 0.02, 0.1, 10)}, {pair: PairDifference(0.0, 0.09, 0.09, 0.3, 10)}
     words = [reason.what for reason in judge(replace(sound(report), before=before, after=after)).reasons]
@@ -220,14 +222,14 @@ def test_strips_that_became_worse(report: ReportInput) -> None:
 
 
 def test_the_worst_comes_first(report: ReportInput) -> None:
-    """Of equal levels, by how far beyond the limit."""
+    """Reasons of equal level are ordered by how far they exceed their limit."""
     points = tuple(ControlFit(f"K{w}", 0.01 * w, 0.01, float(w)) for w in (4, 9, 6))
     verdict = judge(sound(report, control=points, variance_factor=2.1))
     assert [reason.what.split()[2] for reason in verdict.reasons[:3]] == ["K9", "K6", "K4"]
     assert "below" not in verdict.sentence
 
 
-def test_trajectory_corrections_beyond_their_sigmas(report: ReportInput) -> None:
+def test_trajectory_corrections_beyond_their_sigmas_are_a_reason(report: ReportInput) -> None:
     fit = report.adjusted.trajectory
     assert fit is not None
     large = replace(fit, position_l=np.full_like(fit.position_l, 0.02) * 2.0)
@@ -311,7 +313,7 @@ def test_the_same_input_gives_the_same_picture(report: ReportInput) -> None:
     assert first.svg(NARROW) == second.svg(NARROW)
 
 
-def test_parameters_stand_as_the_file_has_them(report: ReportInput) -> None:
+def test_parameters_are_shown_as_in_the_file(report: ReportInput) -> None:
     (table,) = parameter_tables(report)
     rows = {row[0]: dict(zip(table.heads, row, strict=True)) for row in table.rows}
     kappa = rows["boresight κ (heading)"]
@@ -326,7 +328,7 @@ def test_parameters_stand_as_the_file_has_them(report: ReportInput) -> None:
     assert rows["lever arm z"]["change"] == "not determined"
 
 
-def test_what_is_not_determined_comes_with_its_remedy(report: ReportInput) -> None:
+def test_undetermined_parameters_are_shown_with_their_remedy(report: ReportInput) -> None:
     table = held_table(report)
     assert table is not None
     assert [row[0] for row in table.rows] == ["lever arm z", "scan plane tilt Δη"]
@@ -338,7 +340,7 @@ def test_what_is_not_determined_comes_with_its_remedy(report: ReportInput) -> No
     assert again.rows[0][1] == "976 µs"
 
 
-def test_residuals_by_what_they_may_depend_on(report: ReportInput) -> None:
+def test_residuals_are_shown_by_possible_causes(report: ReportInput) -> None:
     """Outliers are left out; strip 04 stands 6 mm higher, as it was made."""
     seen = seen_of(report)
     kept = sum(int((one.weight > 0).sum()) for one in report.adjusted.residuals if one.group != "control")
@@ -360,7 +362,7 @@ def test_planes_are_coloured_by_their_own_residuals(report: ReportInput) -> None
     assert rms_cm[7] < 4.0  # its outliers of 12 cm and more are out
 
 
-def test_cuts_show_the_roof_once_calibrated(report: ReportInput) -> None:
+def test_sections_show_one_roof_after_calibration(report: ReportInput) -> None:
     """Before, strips stand metres apart; after, all lie on the roof's slope."""
     cuts = cuts_of(report)
     assert len(cuts) == 3
@@ -375,14 +377,14 @@ def test_cuts_show_the_roof_once_calibrated(report: ReportInput) -> None:
 
 
 def bare_of(report: ReportInput, **more: Any) -> ReportInput:
-    """No planes, ties, control, corrections of the trajectory or strips."""
+    """Remove planes, ties, control, trajectory corrections and strips."""
     adjusted = replace(
         report.adjusted, residuals=(), groups=(), control=(), trajectory=None, least_detectable={}, spectrum=np.zeros(0)
     )
     return ReportInput(report.flight, Features(), adjusted, {}, **more)
 
 
-def test_a_report_of_little(report: ReportInput) -> None:
+def test_a_report_with_little_input_is_complete_and_reproducible(report: ReportInput) -> None:
     """What is there is shown, the words of others as words; and the same each time."""
     bare = bare_of(report, title="<b>A & B</b>", notes=["<script>x</script>"])
     text = html(bare)
@@ -395,7 +397,7 @@ def test_a_report_of_little(report: ReportInput) -> None:
     assert "<h1>&lt;b&gt;A &amp; B&lt;/b&gt;</h1>" in text
 
 
-def test_two_scanners(report: ReportInput) -> None:
+def test_two_scanners_have_separate_tables(report: ReportInput) -> None:
     """Each has a table, and words say whose a parameter is."""
     adjusted = report.adjusted
     right = replace(adjusted.calibrations["left"], scanner="right")
@@ -470,7 +472,7 @@ def test_without_pango_the_page_is_written_and_a_line_says_what_to_install(
     assert capfd.readouterr() == ("", "")
 
 
-def test_numbers_as_people_read_them() -> None:
+def test_numbers_are_formatted_for_readers() -> None:
     assert [length(x) for x in (1.764, 0.0181, 0.0041, 0.0004, math.nan)] == [
         "1.76\u00a0m",
         "1.8\u00a0cm",

@@ -15,7 +15,7 @@ LOWEST = Scale(20.0, 28.0, 0.03)
 HIGHEST = Scale(3000.0, 2500.0, 3.0)
 
 
-def test_height_width_and_spacing_are_those_of_the_plan() -> None:
+def test_height_width_and_spacing_match_the_plan() -> None:
     """60 m above flat ground with a scan of ±15°: 32.2 m across, 4,000 pulses a second at 10 m/s over that width."""
     half_rad = np.radians(15.0)
     lines = ((-70, 0, 70, 0, 510), (70, 0, -70, 0, 510))
@@ -29,12 +29,12 @@ def test_height_width_and_spacing_are_those_of_the_plan() -> None:
 
 
 @pytest.mark.parametrize("side_m", [10.0, 300.0, 4000.0])
-def test_spacing_is_that_of_the_points_at_any_size(side_m: float) -> None:
+def test_spacing_matches_the_points_at_any_size(side_m: float) -> None:
     points = np.random.default_rng(3).uniform(0.0, side_m, (20_000, 2))
     assert area_spacing_m(points) == pytest.approx(side_m / np.sqrt(20_000), rel=0.05)
 
 
-def test_spacing_of_a_swath_across_the_grid_is_not_that_of_its_box() -> None:
+def test_spacing_of_a_diagonal_swath_is_not_that_of_its_bounding_box() -> None:
     """A strip of 10 m by 2 km to the north-east."""
     along, across = np.random.default_rng(4).uniform([0.0, 0.0], [2000.0, 10.0], (40_000, 2)).T
     points = np.stack([along - across, along + across, 0.0 * along], axis=1) / np.sqrt(2.0)
@@ -45,7 +45,7 @@ def test_a_swath_without_points_has_no_spacing() -> None:
     assert spacing_m(swath_of(np.full((200, 3), np.nan))) == np.inf
 
 
-def test_at_the_usual_height_settings_stay_as_they_are() -> None:
+def test_settings_are_unchanged_at_the_reference_height() -> None:
     assert PlaneSettings().scaled(REFERENCE) == PlaneSettings()
 
 
@@ -56,7 +56,7 @@ def test_narrow_swaths_have_several_pieces_side_by_side() -> None:
     assert settings.displacement_m == PlaneSettings().displacement_m
 
 
-def test_from_high_up_strips_may_lie_farther_apart() -> None:
+def test_strips_flown_higher_may_lie_farther_apart() -> None:
     settings = PlaneSettings().scaled(HIGHEST)
     angle_rad = PlaneSettings().displacement_m / 800.0
     assert settings.displacement_m == pytest.approx(angle_rad * 3000.0)

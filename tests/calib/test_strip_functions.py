@@ -60,7 +60,7 @@ def test_without_features_nothing_is_adjusted(clean: tuple[Flight, Features]) ->
 
 
 def test_a_sound_flight_gets_no_corrections(clean: tuple[Flight, Features]) -> None:
-    """And its misclosures are as large as its noise."""
+    """Its misclosures are as large as its noise."""
     flight, features = clean
     result = adjusted(flight, features)
     assert [choice.model for choice in result.choices] == ["none"] * 6
@@ -101,7 +101,7 @@ def test_a_shift_and_a_drift_are_found_in_their_strips(clean: tuple[Flight, Feat
     assert 0.0 < gains["linear"] < gains["spline"]
 
 
-def test_a_bend_is_a_spline_and_only_with_knots_to_bend_at(clean: tuple[Flight, Features]) -> None:
+def test_a_bend_needs_a_spline_with_knots(clean: tuple[Flight, Features]) -> None:
     """A height that swells by 12 cm in the middle of a strip."""
     flight, features = clean
     swell = np.zeros((9, 6))
@@ -120,8 +120,8 @@ def test_a_bend_is_a_spline_and_only_with_knots_to_bend_at(clean: tuple[Flight, 
 
 
 @pytest.mark.parametrize("lifts", [{1: 0.15}, {6: 0.15}, {1: 0.15, 3: 0.1}, {1: -0.1, 2: 0.1}])
-def test_the_strips_that_are_moved_are_those_apart(clean: tuple[Flight, Features], lifts: dict[int, float]) -> None:
-    """Whichever they are: the others agree, and none of them goes where one that is wrong lies."""
+def test_only_the_displaced_strips_are_corrected(clean: tuple[Flight, Features], lifts: dict[int, float]) -> None:
+    """The other strips agree, so none of them may be moved to the wrong one, whichever it is."""
     flight, features = clean
     bad = flight
     for strip, lift in lifts.items():
@@ -135,7 +135,7 @@ def test_the_strips_that_are_moved_are_those_apart(clean: tuple[Flight, Features
         assert (off < 3.5 * result.fit.position_sigma_l[mine, 2]).all()
 
 
-def test_a_common_shift_is_seen_by_control_alone(clean: tuple[Flight, Features]) -> None:
+def test_a_common_shift_is_found_only_with_control(clean: tuple[Flight, Features]) -> None:
     """All strips 12 cm too high: nothing without control; with it, within a centimetre."""
     flight, features = clean
     low = flight
@@ -154,7 +154,9 @@ def test_a_common_shift_is_seen_by_control_alone(clean: tuple[Flight, Features])
     assert max(down) < 0.03 < off_planes(low, features, 1)
 
 
-def test_what_hardly_shows_is_not_corrected(clean: tuple[Flight, Features], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_poorly_determined_corrections_are_not_applied(
+    clean: tuple[Flight, Features], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Level ground, and three returns of a roof: their noise would move the strip in plan, where nothing is wrong."""
     flight, features = clean
     seen = [plane for plane in features.planes if 3 in [flight.swaths[patch.swath].strip for patch in plane.patches]]
@@ -176,7 +178,9 @@ def test_what_hardly_shows_is_not_corrected(clean: tuple[Flight, Features], monk
     assert np.abs(adjusted(bad, poor).fit.position_l[mine, :2]).max() > 0.02
 
 
-def test_many_strips_get_one_model(clean: tuple[Flight, Features], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_more_strips_than_the_limit_share_one_model(
+    clean: tuple[Flight, Features], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(strip_functions, "MOST_CHOSEN_SINGLY", 3)
     flight, features = clean
     bad = spoilt(flight, 3, np.tile([0.0, 0.0, 0.3, 0.0, 0.0, 0.0], (2, 1)))
@@ -193,7 +197,7 @@ def test_many_strips_get_one_model(clean: tuple[Flight, Features], monkeypatch: 
         ({"models": ()}, "strip model: got none at all"),
     ],
 )
-def test_settings_that_cannot_be_are_refused(
+def test_impossible_settings_are_refused(
     clean: tuple[Flight, Features], settings: dict[str, object], words: str
 ) -> None:
     with pytest.raises(StripError, match=words):

@@ -91,7 +91,7 @@ TRUE = {"omega_deg": 0.25, "phi_deg": -0.4, "kappa_deg": 0.6, "range_offset_m": 
 
 @dataclass(frozen=True, eq=False)
 class Made:
-    """What was flown.
+    """Flight with its truth.
 
     Attributes:
         flight: as read, with nominal calibration, on the true trajectory (its sigmas say what the INS's do).
@@ -108,7 +108,7 @@ class Made:
     plan: str
 
     def at_truth(self) -> Flight:
-        """With the points where the true calibration puts them."""
+        """Return the flight with its points placed by the true calibration."""
         return self.flight.placed({"left": self.truth})
 
 
@@ -153,7 +153,7 @@ def village(
 
 
 def told(trajectory: Trajectory, sigma_m: float, sigma_deg: float) -> Trajectory:
-    """With sigmas."""
+    """Return the trajectory with stated sigmas."""
     position = np.full((len(trajectory), 3), sigma_m)
     attitude = np.radians(np.tile([sigma_deg, sigma_deg, 2.0 * sigma_deg], (len(trajectory), 1)))
     return replace(trajectory, position_sigma_l=position, attitude_sigma_rad=attitude)

@@ -67,7 +67,7 @@ class Starter:
         )
 
     def run(self, arguments: list[str], environment: dict[str, str]) -> subprocess.CompletedProcess[str]:
-        """Its exit code, and what it said."""
+        """Run a command; return its exit code and output."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         with tempfile.TemporaryDirectory() as folder:
@@ -83,14 +83,14 @@ class Starter:
             return subprocess.CompletedProcess(arguments, code, output.read_text(), errors.read_text())
 
     def close(self) -> None:
-        """End it, and what it has started."""
+        """End the process and its children."""
         if self._process.poll() is None:
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.communicate()
 
 
 def serve() -> None:
-    """Run a command for every line on standard input; its exit code is the answer."""
+    """Run a command for every line on standard input; write its exit code back."""
     for name in LOADED:
         importlib.import_module(name)
     for kind in KINDS:
@@ -106,7 +106,7 @@ def serve() -> None:
 
 
 def become(arguments: list[str], environment: dict[str, str], says_to: list[str]) -> None:
-    """Have the arguments, the environment and the outputs of a process that was started so."""
+    """Adopt the arguments, environment and outputs of a separately started process."""
     sys.argv[1:] = arguments
     os.environ.clear()
     os.environ.update(environment)

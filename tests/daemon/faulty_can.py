@@ -33,7 +33,7 @@ class FaultyBus(can.BusABC):
         super().__init__(channel, **keywords)
 
     def fileno(self) -> int:
-        """What to wait on."""
+        """Return a file descriptor to wait on."""
         return self._socket.fileno()
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
@@ -46,7 +46,7 @@ class FaultyBus(can.BusABC):
         return unpack_frame(data), False
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Nobody listens."""
+        """Discard a frame."""
 
     def shutdown(self) -> None:
         """Close and take the socket away."""

@@ -10,7 +10,7 @@ from swath.daemon.log.events import Severity
 
 
 class Said(NamedTuple):
-    """An event's line."""
+    """Line of an event."""
 
     severity: Severity
     source: str

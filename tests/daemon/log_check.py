@@ -22,11 +22,11 @@ class LogContent:
     damage: int = 0
 
     def data(self, source: str) -> bytes:
-        """All bytes of a source, joined."""
+        """Return all bytes of a source, joined."""
         return b"".join(data for _, data in self.units[source])
 
     def events(self, code: str) -> list[dict[str, Any]]:
-        """Events of a code."""
+        """Return the events of a code."""
         return [value for _, value in self.messages["/events"] if value["code"] == code]
 
 
@@ -54,7 +54,7 @@ def read_log(*paths: Path) -> LogContent:
 
 
 def check_status(topic: str, value: dict[str, Any], seen: Counter[str]) -> None:
-    """The equation, and that ``written`` is what stands before this status in the file."""
+    """Check the equation of counters, and that ``written`` equals the number of units before this status."""
     source = topic.removeprefix("/status/")
     accounted = value["written"] + value["lost_kernel"] + value["lost_queue"] + value["lost_write"]
     assert value["units"] == accounted, (source, value)

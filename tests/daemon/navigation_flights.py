@@ -91,7 +91,7 @@ def innovations_of(truth: Array, random: np.random.Generator) -> Array:
 
 
 def sound_flight(seed: int = 1, every: int = 4) -> Flight:
-    """Nothing wrong with it. 30 min, epochs at 20 Hz / every."""
+    """Return a sound flight of 30 min with epochs at 20 Hz / every."""
     random = np.random.default_rng(seed)
     truth = reference_truth()[::every]
     rows = innovations_of(truth, random)
@@ -112,6 +112,6 @@ def sound_flight(seed: int = 1, every: int = 4) -> Flight:
 
 
 def with_rows(flight: Flight, rows: Array) -> Flight:
-    """The same with other innovations."""
+    """Return the flight with other innovations."""
     smoothed = None if flight.smoothed is None else replace(flight.smoothed, innovations=rows)
     return replace(flight, forward=replace(flight.forward, innovations=rows), smoothed=smoothed)

@@ -55,17 +55,17 @@ class Flown:
 
     @property
     def log(self) -> Path:
-        """Its one part."""
+        """Return the only part."""
         return next(self.folder.glob("*.mcap"))
 
     @property
     def name(self) -> str:
-        """The session's."""
+        """Return the name of the session."""
         return self.log.stem.removesuffix("_0")
 
     @property
     def truth(self) -> Any:
-        """Arrays by name."""
+        """Return the arrays of the truth by name."""
         return np.load(self.folder / "truth.npz")
 
     @property
@@ -97,13 +97,13 @@ class Flown:
         return [*given, *([] if "--workers" in more or "--scheduler" in more else ["--workers", "1"]), *more]
 
     def copy_of_log(self, folder: Path) -> Path:
-        """To be damaged."""
+        """Copy the log, to be damaged."""
         folder.mkdir(parents=True, exist_ok=True)
         return Path(shutil.copy(self.log, folder))
 
 
 def fly(folder: Path) -> Flown:
-    """Fly it."""
+    """Fly the plan into a folder."""
     plan = folder / "line.toml"
     plan.write_text(PLAN)
     assert run_app(["sim", "fly", str(plan), "-o", str(folder / "flight")]) == 0

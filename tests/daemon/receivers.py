@@ -62,7 +62,7 @@ class Receiver:
             os.write(self.main, data if self._in_tune() else bytes(byte ^ 0xA5 for byte in data))
 
     def close(self) -> None:
-        """Unplug."""
+        """Unplug the device."""
         self._stop.set()
         self._thread.join()
         os.close(self.main)
@@ -76,7 +76,7 @@ def receiver(
     chatter: bytes = b"",
     speed: int | None = None,
 ) -> Iterator[Receiver]:
-    """A serial device for as long as the block lasts."""
+    """Provide a serial device while the block runs."""
     device = Receiver(split, reply, chatter, speed)
     try:
         yield device
@@ -85,13 +85,13 @@ def receiver(
 
 
 def split_lines(data: bytes) -> tuple[bytes, bytes] | None:
-    """A command line."""
+    """Split a command line off the buffer."""
     line, end, rest = data.partition(b"\r\n")
     return (line, rest) if end else None
 
 
 def split_ubx(data: bytes) -> tuple[bytes, bytes] | None:
-    """A UBX frame."""
+    """Split a UBX frame off the buffer."""
     length = 8 + int.from_bytes(data[4:6], "little") if len(data) >= 6 else 8
     return (data[:length], data[length:]) if len(data) >= length else None
 
@@ -111,12 +111,12 @@ def ubx_acknowledges(refuses: str = "", silent: str = "") -> Reply:
 
 
 def novatel_replies(refuses: bytes = b"nothing") -> Reply:
-    """As recorded of a receiver: ``<OK`` and the prompt."""
+    """Reply as a recorded receiver did: ``<OK`` and the prompt."""
     return lambda line: b"\r\n<ERROR:Invalid Message ID\r\n[COM1]" if refuses in line else b"\r\n<OK\r\n[COM1]"
 
 
 def septentrio_replies(refuses: bytes = b"nothing") -> Reply:
-    """As the PolaRx5TR reference guide has it (3.1.3)."""
+    """Reply as the PolaRx5TR reference guide states (3.1.3)."""
 
     def reply(line: bytes) -> bytes:
         name = line.split(b",")[0]
@@ -129,7 +129,7 @@ def septentrio_replies(refuses: bytes = b"nothing") -> Reply:
 
 @contextmanager
 def udp_receiver(port: int, reply: Reply) -> Iterator[list[bytes]]:
-    """A device on the network at 127.0.0.2 that answers whoever asks; the commands it got."""
+    """Provide a network device at 127.0.0.2 that replies to every command; yield the commands it received."""
     commands: list[bytes] = []
     stop = threading.Event()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:

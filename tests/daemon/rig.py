@@ -20,7 +20,7 @@ HANGS_S = 900.0  # measures nothing: it ends what would never end, below what py
 
 
 def free_udp_port() -> int:
-    """A UDP port that nobody has at the moment."""
+    """Return a UDP port that is free at the moment."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("0.0.0.0", 0))
         port: int = probe.getsockname()[1]
@@ -57,19 +57,19 @@ class NotifySocket:
         self.messages: list[dict[str, str]] = []
 
     def poll(self, timeout_s: float = 0.0) -> None:
-        """Take what has come."""
+        """Receive the pending messages."""
         while select.select([self._socket], [], [], timeout_s)[0]:
             text = self._socket.recv(4096).decode()
             self.messages.append(dict(line.split("=", 1) for line in text.splitlines() if "=" in line))
             timeout_s = 0.0
 
     def count(self, key: str) -> int:
-        """How many messages had a key."""
+        """Return the number of messages with a key."""
         self.poll()
         return sum(key in message for message in self.messages)
 
     def last(self, key: str) -> str:
-        """The newest value of a key, or nothing."""
+        """Return the newest value of a key, or an empty text."""
         self.poll()
         return next((message[key] for message in reversed(self.messages) if key in message), "")
 
@@ -123,7 +123,7 @@ class Recorder:
         self.notify.close()
 
     def wait_ready(self) -> None:
-        """Until READY; fails with what the recorder said."""
+        """Wait for READY; fail with the recorder's output."""
 
         def ready() -> bool:
             if self.process.poll() is not None:
@@ -133,20 +133,20 @@ class Recorder:
         wait_until(ready, "READY")
 
     def stderr(self) -> str:
-        """What it has said."""
+        """Return the output on standard error."""
         return self.stderr_path.read_text()
 
     def wait_said(self, text: str, times: int = 1, timeout_s: float = HANGS_S) -> None:
-        """Until its journal has a text so many times."""
+        """Wait until the journal contains a text so many times."""
         wait_until(lambda: self.stderr().count(text) >= times, f"{text!r} in the journal: {self.stderr()}", timeout_s)
 
     def stop(self, timeout_s: float = HANGS_S) -> int:
-        """SIGTERM; its exit status."""
+        """Send SIGTERM; return the exit status."""
         self.process.send_signal(signal.SIGTERM)
         return self.process.wait(timeout_s)
 
     def thread(self, name: str) -> int:
-        """Kernel id of a thread by the name it gave itself."""
+        """Return the kernel id of a thread by its name."""
         for task in Path(f"/proc/{self.process.pid}/task").iterdir():
             if (task / "comm").read_text().strip() == name:
                 return int(task.name)
@@ -178,7 +178,7 @@ class Recorder:
             libc.ptrace(detach, thread, None, None)
 
     def _others_go_on(self) -> bool:
-        """Whether the main thread, which says how things are each second, still does."""
+        """True if the main thread still reports its status each second."""
         before = self.notify.count("STATUS")
         deadline = time.monotonic() + 2.5
         while time.monotonic() < deadline:
@@ -188,13 +188,13 @@ class Recorder:
         return False
 
     def kill(self) -> None:
-        """SIGKILL, as a power cut would."""
+        """Send SIGKILL, which ends it as a power cut does."""
         self.process.kill()
         self.process.wait()
 
 
 def session_table(directory: Path, **keys: object) -> str:
-    """[session] with small defaults."""
+    """Return a [session] table with small defaults."""
     values: Mapping[str, object] = {"name": '"test"', "directory": f'"{directory}"', "reserve_mb": 1, **keys}
     return "[session]\n" + "".join(f"{key} = {value}\n" for key, value in values.items())
 

@@ -47,22 +47,22 @@ class Flown:
 
     @property
     def log(self) -> Path:
-        """Its one part."""
+        """Return the only part."""
         return next(self.folder.glob("logs/*.mcap"))
 
     def session(self) -> Session:
-        """Opened anew."""
+        """Open the log again."""
         (session,) = open_logs([self.folder / "logs"])
         return session
 
     def truth(self) -> Trajectory:
-        """Of the body, 200 Hz."""
+        """Return the truth of the body at 200 Hz."""
         told: Any = np.load(self.folder / "truth.npz")
         keys = ("gps_ns", "lat_rad", "lon_rad", "height_m", "velocity_l", "roll_rad", "pitch_rad", "heading_rad")
         return Trajectory.from_geodetic(*(told[f"trajectory.{key}"] for key in keys), name="truth")
 
     def changed(self, name: str, **changes: str) -> Config:
-        """Its configuration with words replaced, under another name."""
+        """Write its configuration under another name with words replaced."""
         text = (self.folder / "swath.toml").read_text()
         for old, new in changes.items():
             assert old in text, old

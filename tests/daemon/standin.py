@@ -29,7 +29,7 @@ TICKS = 10_000_000  # of the scanner's counter, a second
 
 @dataclass(frozen=True)
 class Unit:
-    """One unit."""
+    """Unit of a source."""
 
     time_s: float
     source: str
@@ -78,7 +78,7 @@ class Standin:
         self._quiet = pulled + silent
 
     def units(self) -> Iterator[Unit]:
-        """In order of time."""
+        """Yield the units in time order."""
         streams = (self._edges(), self._receiver(), self._frames(), self._datagrams(), self._positions())
         for unit in heapq.merge(*streams, key=lambda unit: unit.time_s):
             if not any(unit.source == source and start <= unit.time_s < end for source, start, end in self._quiet):
@@ -125,32 +125,32 @@ class Standin:
 
 
 def make_standin(*arguments: object) -> tuple[Standin, dict[str, bytes]]:
-    """For a process of its own: the flight and its files."""
+    """Return the stand-in flight and its files, for a process of its own."""
     return Standin(*arguments), {"README.md": b"none"}  # type: ignore[arg-type]
 
 
 def standin_for(wish: object) -> tuple[Standin, dict[str, bytes]]:
-    """In the place of `swath.daemon.simulate.plans.make_flight_in_time`: a second."""
+    """Replace `swath.daemon.simulate.plans.make_flight_in_time` by a stand-in of one second."""
     return Standin(1.0), {}
 
 
 def stepping_for(wish: object) -> tuple[Standin, dict[str, bytes]]:
-    """The same, and it steps the wall clock."""
+    """Return the same stand-in with a wall clock step."""
     return Standin(1.0, ((1.0, 60.0),)), {}
 
 
 def refuse() -> tuple[Standin, dict[str, bytes]]:
-    """A plan that cannot be flown."""
+    """Raise the error of a plan that cannot be flown."""
     raise UserError("it cannot be flown", ExitCode.USAGE)
 
 
 def stumble() -> tuple[Standin, dict[str, bytes]]:
-    """A defect."""
+    """Raise an unforeseen error."""
     raise ZeroDivisionError
 
 
 def vanish() -> tuple[Standin, dict[str, bytes]]:
-    """A process that ends."""
+    """End the process."""
     sys.exit(9)
 
 

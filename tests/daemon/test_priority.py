@@ -16,7 +16,7 @@ ASK = "import ctypes; print(ctypes.CDLL(None).syscall({number}, 1, 0))"
 
 
 @pytest.mark.parametrize("way", ["swath.daemon.system:give_way", "swath.daemon.system:lower_priority"])
-def test_the_disk_is_left_to_others(way: str) -> None:
+def test_disk_access_runs_at_idle_priority(way: str) -> None:
     number = IOPRIO_GET.get(os.uname().machine)
     assert number is not None, "what is ioprio_get's number on this processor?"
     module, name = way.split(":")

@@ -25,7 +25,7 @@ def test_control_points_are_read_by_their_byte_order_mark(tmp_path: Path, encodi
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
-def test_a_configuration_and_a_plan_likewise(tmp_path: Path, encoding: str) -> None:
+def test_configurations_and_plans_are_read_by_their_byte_order_mark(tmp_path: Path, encoding: str) -> None:
     text = session_table(tmp_path / "Flüge")
     (tmp_path / "swath.toml").write_bytes(text.encode(encoding))
     assert load_config(tmp_path / "swath.toml").text == text
@@ -35,7 +35,7 @@ def test_a_configuration_and_a_plan_likewise(tmp_path: Path, encoding: str) -> N
 
 
 @pytest.mark.parametrize("content", [b"\x89\xff", b"\xff\xfea\x00b", b"caf\xe9"])
-def test_what_is_no_text_is_refused_in_one_line(tmp_path: Path, content: bytes) -> None:
+def test_a_file_that_is_not_text_is_refused_in_one_line(tmp_path: Path, content: bytes) -> None:
     """Two bytes of nothing, UTF-16 that ends within a letter, and Latin-1."""
     file = tmp_path / "control.csv"
     file.write_bytes(content)

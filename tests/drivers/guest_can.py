@@ -31,7 +31,7 @@ def can(channel: str, options: str = "") -> SocketCanTransport:
 
 
 def frames(transport: Transport) -> list[bytes]:
-    """Everything until 0.5 s were silent."""
+    """Return all frames until 0.5 s of silence."""
     got: list[bytes] = []
     while blocks := transport.receive(0.5):
         got += [row.tobytes() for block in blocks for row in block.units]
@@ -53,7 +53,7 @@ def raw(vcan: str) -> Iterator[socket.socket]:
         yield sock
 
 
-def test_frames_come_in_order_with_the_kernels_stamps(vcan: str) -> None:
+def test_frames_arrive_in_order_with_kernel_timestamps(vcan: str) -> None:
     sender, receiver = can(vcan), can(vcan)
     sender.open()
     receiver.open()
@@ -77,7 +77,7 @@ def test_frames_come_in_order_with_the_kernels_stamps(vcan: str) -> None:
     receiver.close()
 
 
-def test_received_and_lost_are_exactly_what_was_sent(vcan: str, raw: socket.socket) -> None:
+def test_received_and_lost_counts_equal_the_frames_sent(vcan: str, raw: socket.socket) -> None:
     receiver = can(vcan)
     receiver.open()
     assert receiver._sock is not None
@@ -91,7 +91,7 @@ def test_received_and_lost_are_exactly_what_was_sent(vcan: str, raw: socket.sock
     receiver.close()
 
 
-def test_error_frames_and_bus_off_are_units_and_counted(vcan: str, raw: socket.socket) -> None:
+def test_error_frames_and_bus_off_are_delivered_and_counted(vcan: str, raw: socket.socket) -> None:
     receiver = can(vcan)
     receiver.open()
     for error_class in (0x04, 0x40):
@@ -101,7 +101,7 @@ def test_error_frames_and_bus_off_are_units_and_counted(vcan: str, raw: socket.s
     receiver.close()
 
 
-def test_an_interface_that_goes_down_and_comes_up(vcan: str) -> None:
+def test_an_interface_that_goes_down_and_up_again_is_reopened(vcan: str) -> None:
     receiver = can(vcan, "?bitrate=500000")
     receiver.open()
     timer = threading.Timer(0.3, ip, ("link", "set", "down", vcan))
@@ -121,7 +121,7 @@ def test_an_interface_that_goes_down_and_comes_up(vcan: str) -> None:
     receiver.close()
 
 
-def test_an_interface_that_is_taken_away(vcan: str) -> None:
+def test_an_interface_that_is_removed_raises_a_transport_error(vcan: str) -> None:
     receiver = can(vcan)
     receiver.open()
     timer = threading.Timer(0.3, ip, ("link", "del", vcan))
@@ -136,12 +136,12 @@ def test_an_interface_that_is_taken_away(vcan: str) -> None:
         receiver.open()
 
 
-def test_what_is_no_can_interface() -> None:
+def test_opening_an_interface_that_is_not_can_is_refused() -> None:
     with pytest.raises(TransportError, match="lo is gone or is no CAN interface"):
         can("lo").open()
 
 
-def test_controllers_with_a_bit_rate() -> None:
+def test_controllers_with_a_bit_rate_exchange_frames() -> None:
     for channel in ("can0", "can1"):
         ip("link", "set", channel, "type", "can", "bitrate", "500000")
         ip("link", "set", "up", channel)

@@ -16,7 +16,7 @@ from swath.drivers.transports.spec import parse_transport
 PORT = "/dev/ttyS1"
 
 
-def test_both_edges_and_the_data_of_one_port() -> None:
+def test_both_edges_and_the_data_of_one_port_are_received() -> None:
     serial = SerialTransport(parse_transport(f"serial:{PORT}?baud=38400"))
     rising, falling = SerialDcdPps(PORT), SerialDcdPps(PORT, edge="clear")
     serial.open()
@@ -41,7 +41,7 @@ def test_both_edges_and_the_data_of_one_port() -> None:
         source.close()
 
 
-def test_close_while_waiting_and_open_again() -> None:
+def test_close_ends_a_wait_and_the_port_can_be_opened_again() -> None:
     source = SerialDcdPps(PORT)
     source.open()
     while source.receive(0.3):  # until it is between two edges

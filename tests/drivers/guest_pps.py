@@ -35,7 +35,7 @@ def edges(source: KernelPps, time_s: float) -> list[RawEdge]:
     return found
 
 
-def test_one_edge_a_second_none_twice_none_missed(pps: KernelPps) -> None:
+def test_each_second_gives_exactly_one_edge(pps: KernelPps) -> None:
     found = edges(pps, 5.5)
     assert 5 <= len(found) <= 6
     for before, after in pairwise(found):
@@ -44,20 +44,20 @@ def test_one_edge_a_second_none_twice_none_missed(pps: KernelPps) -> None:
     assert all(edge.kernel_stamp and edge.edge == "assert" for edge in found)
 
 
-def test_no_old_edge_on_opening(pps: KernelPps) -> None:
+def test_opening_delivers_no_old_edge(pps: KernelPps) -> None:
     opened_ns = time.time_ns()
     [first, *_] = edges(pps, 1.5)
     assert first.realtime_ns > opened_ns - 50_000_000
 
 
-def test_a_reader_that_was_away_gets_the_latest_and_sees_the_gap(pps: KernelPps) -> None:
+def test_a_late_reader_gets_the_latest_edge_and_sees_the_gap(pps: KernelPps) -> None:
     last = edges(pps, 1.5)[-1]
     time.sleep(3.0)
     first = edges(pps, 0.2)[0]
     assert 2 <= first.sequence - last.sequence <= 3
 
 
-def test_silence(pps: KernelPps) -> None:
+def test_silence_gives_no_edges(pps: KernelPps) -> None:
     (PARAMETERS / "on").write_text("0")
     edges(pps, 1.2)
     assert pps.receive(0.3) == []
@@ -65,12 +65,12 @@ def test_silence(pps: KernelPps) -> None:
     assert edges(pps, 2.5)
 
 
-def test_edge_the_driver_does_not_capture() -> None:
+def test_an_edge_that_the_driver_does_not_capture_is_refused() -> None:
     with pytest.raises(TransportError, match="does not capture the clear edge"):
         KernelPps("/dev/pps0", edge="clear").open()
 
 
-def test_unprivileged_user_is_told_the_rule_and_needs_no_capability() -> None:
+def test_an_unprivileged_user_is_shown_the_udev_rule_and_needs_no_capability() -> None:
     assert opened_as_nobody() == "not permitted"
     os.chmod("/dev/pps0", 0o666)
     assert opened_as_nobody() == "open"

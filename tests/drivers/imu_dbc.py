@@ -69,7 +69,7 @@ def settings(dbc: str = IMU_DBC, signals: dict[str, Any] | None = None, **config
 
 
 def without(*keys: str) -> dict[str, Any]:
-    """The signal map without some keys."""
+    """Return the signal map without some keys."""
     return {key: value for key, value in SIGNALS.items() if key not in keys}
 
 

@@ -38,16 +38,16 @@ class AsciiLog:
 
     @property
     def time_ns(self) -> int:
-        """Nanoseconds of the week in the header."""
+        """Return the nanoseconds of the week in the header."""
         return round(self.seconds * 1000) * 1_000_000
 
     def numbers(self, *places: int) -> list[float]:
-        """Fields as numbers, places counted from 0."""
+        """Return fields as numbers, by positions counted from 0."""
         return [float(self.fields[place]) for place in places]
 
 
 def ascii_logs(name: str, *wanted: str) -> list[AsciiLog]:
-    """The logs of an expectation file, those named only."""
+    """Return the logs of an expectation file with the given names."""
     text = gzip.decompress((FIXTURES / f"{name}.edie.ascii.gz").read_bytes()).decode("ascii", "replace")
     logs: list[AsciiLog] = []
     for line in text.splitlines():

@@ -63,7 +63,7 @@ def samples_of(records: list[Record]) -> StructArray:
 
 
 def measurement_ids(rows: StructArray, columns: int) -> np.ndarray[Any, np.dtype[np.int64]]:
-    """Which column of a frame each return is of."""
+    """Return the column of a frame to which each return belongs."""
     return np.rint(-rows["encoder_rad"] / (2 * np.pi) * columns).astype(np.int64) % columns
 
 
@@ -74,7 +74,7 @@ def metadata(
     window: tuple[int, int] | None = None,
     **config: Any,
 ) -> bytes:
-    """Metadata in sections of a head that is nowhere but here."""
+    """Return sectioned metadata of an invented head."""
     unit = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
     table = {
         "sensor_info": {"prod_line": f"OS-1-{beams}", "prod_sn": str(SERIAL), "initialization_id": 77},
@@ -113,7 +113,7 @@ def frames_of(layout: LidarLayout, packets: int, first: int = 0, seed: int = 1) 
 
 
 def random_fields(layout: LidarLayout, random: np.random.Generator) -> dict[str, np.ndarray[Any, np.dtype[np.int64]]]:
-    """By name (columns, beams): whatever the field can hold, one in three ranges 0."""
+    """Return random values (columns, beams) by field name within each field's range, one in three ranges 0."""
     shape = (layout.head.columns_per_packet, layout.head.beams)
     fields = {}
     for name, bits in PROFILES[layout.head.profile].fields.items():

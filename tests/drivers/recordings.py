@@ -14,7 +14,7 @@ FAMILIES = ("nmea", "ubx", "rtcm3")
 
 @cache
 def expected(family: str) -> dict[str, dict[str, Any]]:
-    """By file: the decoders' counts and the checksum-only scan of ``fixtures/<family>/expected.json``."""
+    """Return by file the contents of ``fixtures/<family>/expected.json``."""
     found: dict[str, dict[str, Any]] = json.loads((FIXTURES / family / "expected.json").read_text())
     return found
 

@@ -27,7 +27,7 @@ DRIVERS = [driver for kind in KINDS for driver in all_drivers(kind).values()]
 
 
 def families(protocol: str) -> list[str]:
-    """The protocol's name and what is left of it before each hyphen."""
+    """Return the protocol's name and its beginnings before each hyphen."""
     return list(accumulate(protocol.split("-"), lambda head, part: f"{head}-{part}"))
 
 
@@ -35,12 +35,12 @@ def of_protocol(driver: Driver) -> str:
     return driver.protocol
 
 
-def test_there_are_drivers_of_every_kind() -> None:
+def test_every_kind_of_driver_is_registered() -> None:
     assert {driver.kind for driver in DRIVERS} == set(KINDS)
 
 
 @pytest.mark.parametrize("driver", DRIVERS, ids=of_protocol)
-def test_every_driver_has_recordings_with_their_source(driver: Driver) -> None:
+def test_every_driver_has_recordings_with_a_named_source(driver: Driver) -> None:
     folders = [FIXTURES / name for name in families(driver.protocol)]
     found = [folder for folder in folders if (folder / "SOURCE.md").is_file()]
     assert found, f"{driver.protocol}: no fixtures/{driver.protocol}/SOURCE.md, nor of its family"
@@ -50,7 +50,7 @@ def test_every_driver_has_recordings_with_their_source(driver: Driver) -> None:
 
 
 @pytest.mark.parametrize("driver", DRIVERS, ids=of_protocol)
-def test_every_driver_says_what_it_is(driver: Driver) -> None:
+def test_every_driver_declares_its_identity(driver: Driver) -> None:
     assert driver.summary
     assert len(driver.summary) <= 110
     assert driver.transports
@@ -59,7 +59,7 @@ def test_every_driver_says_what_it_is(driver: Driver) -> None:
 
 
 @pytest.mark.parametrize("driver", all_drivers("scanner").values(), ids=of_protocol)
-def test_every_scanner_says_how_its_beams_go(driver: Driver) -> None:
+def test_every_scanner_declares_its_beam_geometry(driver: Driver) -> None:
     parsers = []
     for found in settings_of(driver):
         with suppress(DriverSettingsError):  # a file of the fixtures that is another head's
@@ -69,8 +69,8 @@ def test_every_scanner_says_how_its_beams_go(driver: Driver) -> None:
         assert driver.line_scanner != (hasattr(parser, "beams") or hasattr(parser, "head"))
 
 
-def test_the_pages_example_is_a_driver_as_any_other() -> None:
-    """Of docs/adding-a-device.md."""
+def test_the_example_driver_of_the_documentation_works() -> None:
+    """The example is part of docs/adding-a-device.md."""
     page = (FIXTURES.parent / "docs/adding-a-device.md").read_text()
     [block] = re.findall(r"^```python\n(.*?)^```", page, re.M | re.S)
     module: dict[str, Any] = {}
@@ -84,14 +84,14 @@ def test_the_pages_example_is_a_driver_as_any_other() -> None:
     assert (parser.counters.bytes, parser.counters.bytes_skipped) == (3, 3)
 
 
-def test_a_driver_without_a_page_is_told_to_have_one() -> None:
+def test_a_driver_without_a_documentation_page_is_reported() -> None:
     driver = replace(find_driver("gnss", "ubx"), protocol="unwritten")
     with pytest.raises(AssertionError, match=r"unwritten: write docs/devices/unwritten\.md first"):
         settings_of(driver)
 
 
 def refusal(driver: Driver) -> str:
-    """What the driver says when it is made without settings; empty where it can be."""
+    """Return the error of a driver made without settings, or an empty text."""
     try:
         driver.make_parser(DeviceSettings(f"{driver.kind}/test"))
     except DriverSettingsError as error:
@@ -100,12 +100,12 @@ def refusal(driver: Driver) -> str:
 
 
 @pytest.mark.parametrize("driver", DRIVERS, ids=of_protocol)
-def test_only_a_driver_that_declares_needs_refuses_to_work_without_settings(driver: Driver) -> None:
+def test_only_drivers_that_declare_needs_refuse_empty_settings(driver: Driver) -> None:
     said = refusal(driver)
     assert not said or any(key in said for key in driver.needs), f"names none of {driver.needs}: {said}"
 
 
-def test_an_unknown_protocol_names_those_there_are() -> None:
+def test_error_for_an_unknown_protocol_lists_the_known_ones() -> None:
     with pytest.raises(UnknownProtocolError, match=r"nmea, .*ubx"):
         find_driver("gnss", "nema")
 

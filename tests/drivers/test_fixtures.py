@@ -71,7 +71,7 @@ def content(path: Path) -> bytes:
 
 
 def run(kind: DeviceKind, protocol: str, data: bytes) -> tuple[Parser, list[Record]]:
-    """A stream's parser after all of it."""
+    """Return the parser of a stream after all of it."""
     parser = find_driver(kind, protocol).make_parser(DeviceSettings(f"{kind}/main"))
     return parser, [*parser.feed(Chunk(f"{kind}/main", 0, data)), *parser.close()]
 
@@ -288,7 +288,7 @@ CHECKS: dict[str, Check] = {  # by the beginning of an entry's name; the longest
 ACQUISITION = sorted(name for name in entries() if not name.startswith(tuple(LATER)))
 
 
-def test_no_entry_is_passed_over() -> None:
+def test_every_fixture_entry_is_tested() -> None:
     for name in ACQUISITION:
         assert name in files(), f"{name} is in EXPECTED.json and not in FILES.csv"
         assert files()[name]["copy"], f"{name} has no copy"
@@ -298,12 +298,12 @@ def test_no_entry_is_passed_over() -> None:
 
 
 @pytest.mark.parametrize("name", ACQUISITION)
-def test_an_entry_is_what_the_driver_reads(name: str) -> None:
+def test_each_fixture_entry_matches_the_output_of_its_driver(name: str) -> None:
     beginning = max((one for one in CHECKS if name.startswith(one)), key=len)
     CHECKS[beginning](FIXTURES / files()[name]["copy"], entries()[name])
 
 
-def test_every_file_of_the_collection_has_a_copy_or_says_why_not() -> None:
+def test_every_file_of_the_collection_has_a_copy_or_a_stated_reason() -> None:
     assert {name for name, row in files().items() if not row["copy"]} == set(WITHOUT_COPY)
     for name, row in files().items():
         if row["copy"]:
@@ -327,7 +327,7 @@ print(json.dumps(frames))
 
 
 @pytest.mark.parametrize("name", ["2F6913DB_00000004_00000001", "3BA199E2_00000164_00000005"])
-def test_frames_of_a_candump_log_are_those_of_the_loggers_own_file(name: str, tmp_path: Path) -> None:
+def test_frames_of_a_candump_log_match_the_loggers_own_file(name: str, tmp_path: Path) -> None:
     """The logger's MF4, as python-can reads it by asammdf, in a process that has it; both write microseconds."""
     own = tmp_path / "own.MF4"
     own.write_bytes(content(FIXTURES / "canmod-gps" / f"{name}.MF4.gz"))
@@ -349,7 +349,7 @@ def test_frames_of_a_candump_log_are_those_of_the_loggers_own_file(name: str, tm
         ("velodyne", "nebula_vlp32", 5),
     ],
 )
-def test_captures_from_rosbags_lie_where_the_bag_does(device: str, name: str, messages: int) -> None:
+def test_captures_from_rosbags_span_the_time_of_their_bag(device: str, name: str, messages: int) -> None:
     """The bag's first message, a scan, came with the first scan's last packet; the last with the capture's last."""
     text = (FIXTURES / device / f"{name}_rosbag_metadata.yaml").read_text()
     bag = yaml.safe_load(text)["rosbag2_bagfile_information"]

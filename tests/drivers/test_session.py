@@ -64,7 +64,7 @@ def numbers(blocks: list[UnitBlock]) -> list[int]:
     return [int.from_bytes(row.tobytes(), "big") for block in blocks for row in block.units]
 
 
-def test_opens_on_the_first_receive_and_then_delivers(bench: Bench) -> None:
+def test_a_session_opens_on_the_first_receive_and_then_delivers(bench: Bench) -> None:
     assert state_of(bench.session) == SessionState.CLOSED
     assert bench.session.receive(0.1) == []
     assert state_of(bench.session) == SessionState.OPEN
@@ -72,7 +72,7 @@ def test_opens_on_the_first_receive_and_then_delivers(bench: Bench) -> None:
     assert bench.changes == [("opening", ""), ("open", "")]
 
 
-def test_absent_at_start_the_wait_doubles_up_to_its_limit(bench: Bench) -> None:
+def test_the_retry_delay_of_an_absent_device_doubles_up_to_its_limit(bench: Bench) -> None:
     bench.refuse_open = True
     times = bench.attempt_times(8)
     waits = [after - before for before, after in pairwise(times)]
@@ -81,7 +81,7 @@ def test_absent_at_start_the_wait_doubles_up_to_its_limit(bench: Bench) -> None:
     assert bench.session.last_error == "switch: there is no device"
 
 
-def test_what_a_driver_did_not_foresee_is_waited_for_too() -> None:
+def test_an_unforeseen_error_on_opening_is_retried() -> None:
     """An error of the system while opening ends no thread: the next try may succeed."""
 
     class Odd(SwitchTransport):
@@ -102,7 +102,7 @@ def test_a_pause_is_never_longer_than_the_time_given(bench: Bench) -> None:
     assert len(bench.made) > 3
 
 
-def test_vanishes_and_returns(bench: Bench) -> None:
+def test_a_device_that_vanishes_is_reopened_when_it_returns(bench: Bench) -> None:
     bench.raise_after = 2
     bench.session.receive(0.1)
     assert numbers(bench.session.receive(0.1) + bench.session.receive(0.1)) == [1, 2]
@@ -124,7 +124,7 @@ def test_vanishes_and_returns(bench: Bench) -> None:
     ]
 
 
-def test_data_makes_the_wait_short_again(bench: Bench) -> None:
+def test_data_resets_the_retry_delay(bench: Bench) -> None:
     bench.refuse_open = True
     bench.attempt_times(6)
     bench.refuse_open = False
@@ -136,13 +136,13 @@ def test_data_makes_the_wait_short_again(bench: Bench) -> None:
     assert bench.attempt_times(1)[0] - gone_s == FIRST_WAIT_S
 
 
-def test_a_device_that_opens_and_goes_at_once_waits_ever_longer(bench: Bench) -> None:
+def test_the_retry_delay_grows_while_a_device_closes_at_once(bench: Bench) -> None:
     bench.raise_after = 0
     times = bench.attempt_times(8)
     assert times[-1] - times[-2] == LONGEST_WAIT_S
 
 
-def test_a_silent_device_that_was_open_long_waits_shortly(bench: Bench) -> None:
+def test_a_silent_device_that_was_open_long_is_retried_soon(bench: Bench) -> None:
     bench.refuse_open = True
     bench.attempt_times(6)
     bench.refuse_open = False
@@ -158,7 +158,7 @@ def test_a_silent_device_that_was_open_long_waits_shortly(bench: Bench) -> None:
     assert bench.attempt_times(1)[0] - gone_s == FIRST_WAIT_S
 
 
-def test_counters_add_up_over_openings(bench: Bench) -> None:
+def test_counters_are_summed_over_openings(bench: Bench) -> None:
     bench.raise_after = 10
     bench.session.receive(0.1)
     bench.made[0].drop_every = 5
@@ -176,7 +176,7 @@ def test_counters_add_up_over_openings(bench: Bench) -> None:
     assert bench.session.poll_counters() == counters
 
 
-def test_send_goes_out_while_open_and_says_when_it_cannot(bench: Bench) -> None:
+def test_send_works_while_open_and_raises_otherwise(bench: Bench) -> None:
     assert not bench.session.send(b"early")
     bench.session.receive(0.1)
     assert bench.session.send(b"now")
@@ -186,7 +186,7 @@ def test_send_goes_out_while_open_and_says_when_it_cannot(bench: Bench) -> None:
     assert bench.session.last_error == "switch: is closed"
 
 
-def test_closed_gives_nothing_and_opens_nothing(bench: Bench) -> None:
+def test_a_closed_session_delivers_and_opens_nothing(bench: Bench) -> None:
     bench.session.receive(0.1)
     bench.session.close()
     bench.session.close()
@@ -211,7 +211,7 @@ def test_close_ends_the_wait_of_the_receiving_thread() -> None:
     assert state_of(session) == SessionState.CLOSED
 
 
-def test_closed_while_a_stalled_device_is_read() -> None:
+def test_a_session_can_be_closed_while_a_stalled_device_is_read() -> None:
     transport = SwitchTransport()
     transport.stall_s = 0.3
     session = Session(lambda: transport)

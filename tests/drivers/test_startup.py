@@ -43,7 +43,7 @@ def recording(name: str) -> bytes:
 
 
 def heard(listener: AnswerListener, data: bytes, size: int) -> Answer | None:
-    """The answer in data that comes in reads of a size."""
+    """Return the response found in data that arrive in reads of a size."""
     for start in range(0, len(data), size):
         answer = listener.hear(data[start : start + size])
         if answer is not None:
@@ -60,7 +60,7 @@ class TestUbx:
     @pytest.mark.parametrize("port", ["UART1", "UART2", "USB"])
     @pytest.mark.parametrize("rate_hz", [1, 2, 5, 10, 20])
     @pytest.mark.parametrize("save", [False, True])
-    def test_pyubx2_reads_back_the_keys_and_values_that_are_shown(self, port: str, rate_hz: int, save: bool) -> None:
+    def test_pyubx2_reads_back_the_displayed_keys_and_values(self, port: str, rate_hz: int, save: bool) -> None:
         wish = StartupOptions(save=save, baud=460800)
         for message in ubx_startup.startup_messages(settings(port=port, rate_hz=rate_hz), wish):
             parsed = UBXReader.parse(message.data, msgmode=SET)
@@ -74,7 +74,7 @@ class TestUbx:
             known = [name for name in vars(parsed) if name.startswith("CFG_")]
             assert len(known) == len(message.lines) - 1
 
-    def test_every_key_is_that_of_the_interface_description_as_pyubx2_has_it(self) -> None:
+    def test_every_key_matches_the_interface_description_in_pyubx2(self) -> None:
         named = {name.replace("-", "_"): key for name, key, _ in ubx_startup.TIME_PULSE}
         for port, place in ubx_startup.PORT_PLACES.items():
             named |= {f"CFG_MSGOUT_UBX_{name}_{port}": key + place for name, key in ubx_startup.MESSAGE_RATES.items()}
@@ -82,50 +82,50 @@ class TestUbx:
         named |= {f"CFG_{port}_BAUDRATE": key for port, key in ubx_startup.BAUD_RATES.items()}
         assert named == {name: UBX_CONFIG_DATABASE[name][0] for name in named}
 
-    def test_a_u_blox_message_asked_for_is_one_of_its_name(self) -> None:
+    def test_every_requested_message_has_a_ubx_name(self) -> None:
         names = {name.replace("-", "_") for name in UBX_NAMES.values()}
         assert set(ubx_startup.MESSAGE_RATES) <= names
 
-    def test_a_rate_is_of_positions_and_raw_measurements_come_once_a_second(self) -> None:
+    def test_rate_applies_to_positions_and_raw_measurements_are_sent_once_a_second(self) -> None:
         lines = texts(ubx_startup.startup_messages(settings(rate_hz=10), StartupOptions()))
         assert {"CFG-RATE-MEAS = 100", "CFG-RATE-NAV = 1", "CFG-RATE-TIMEREF = 1"} <= set(lines)
         assert "CFG-MSGOUT-UBX_NAV_PVT_UART1 = 1" in lines
         assert "CFG-MSGOUT-UBX_RXM_RAWX_UART1 = 10" in lines
         assert "CFG-MSGOUT-UBX_NAV_TIMELS_UART1 = 10" in lines
 
-    def test_the_pulse_is_1_hz_in_gps_time_rising_and_only_when_the_time_is_known(self) -> None:
+    def test_the_pulse_is_1_hz_gps_time_rising_and_only_with_valid_time(self) -> None:
         lines = texts(ubx_startup.startup_messages(settings(), StartupOptions()))
         shown = {line.split(" = ")[0]: int(line.split(" = ")[1]) for line in lines if " = " in line}
         assert shown["CFG-TP-PERIOD_LOCK_TP1"] == 1_000_000
         assert shown["CFG-TP-LEN_TP1"] == 0
         assert shown["CFG-TP-TIMEGRID_TP1"] == shown["CFG-TP-POL_TP1"] == shown["CFG-TP-ALIGN_TO_TOW_TP1"] == 1
 
-    def test_without_raw_none_is_asked_for(self) -> None:
+    def test_raw_measurements_are_not_requested_with_raw_off(self) -> None:
         assert "RXM" not in " ".join(texts(ubx_startup.startup_messages(settings(raw=False), StartupOptions())))
 
-    def test_usb_has_no_rate(self) -> None:
+    def test_usb_port_has_no_baud_rate(self) -> None:
         messages = ubx_startup.startup_messages(settings(port="USB"), StartupOptions(baud=460800))
         assert all(message.baud is None for message in messages)
 
-    def test_a_port_that_there_is_not(self) -> None:
+    def test_an_unknown_port_is_refused(self) -> None:
         with pytest.raises(DriverSettingsError, match=r"setup\.port: got 'COM1', want one of: UART1, UART2, USB"):
             ubx_startup.startup_messages(settings(port="COM1"), StartupOptions())
 
     @pytest.mark.parametrize(("reply", "answer"), [(ACK, Answer(True)), (NAK, Answer(False, "UBX-ACK-NAK"))])
-    def test_an_answer_is_found_amid_data_however_it_is_cut(self, reply: bytes, answer: Answer) -> None:
+    def test_a_response_within_data_is_found_however_it_is_cut(self, reply: bytes, answer: Answer) -> None:
         data = recording("ubx/pygpsdata-NAVHPPOS.log.gz")[:3000]
         for size in (1, 7, 64, 4096):
             assert heard(AckListener(), data + OTHER_ACK + reply + data, size) == answer
 
-    def test_data_holds_no_answer(self) -> None:
+    def test_data_without_a_response_gives_none(self) -> None:
         for path in sorted((FIXTURES / "ubx").glob("*.log.gz")):
             assert heard(AckListener(), gzip.decompress(path.read_bytes()), 4096) is None, path.name
 
-    def test_a_damaged_answer_and_that_to_another_message_are_none(self) -> None:
+    def test_a_damaged_response_and_one_to_another_message_are_ignored(self) -> None:
         damaged = ACK[:-1] + bytes([ACK[-1] ^ 1])
         assert heard(AckListener(), damaged + OTHER_ACK, 5) is None
 
-    def test_an_answer_behind_the_beginning_of_a_message_that_never_ends(self) -> None:
+    def test_a_response_after_a_false_sync_is_found_at_the_timeout(self) -> None:
         """A false sync holds back what follows until the time is over."""
         listener = AckListener()
         assert listener.hear(b"\xb5b\x01\x07\x00\x10" + ACK) is None
@@ -133,7 +133,7 @@ class TestUbx:
 
 
 class TestNovatel:
-    def test_logs_are_those_that_are_known(self) -> None:
+    def test_requested_logs_are_known_to_the_driver(self) -> None:
         wish = StartupOptions()
         config = {"secondary_lever_arm_m": [0, 1, 0], "setup": {"rate_hz": 10}}
         messages = novatel_startup.startup_messages(DeviceSettings("gnss/rover", config), wish)
@@ -147,17 +147,17 @@ class TestNovatel:
         assert set(logs) - raw <= layouts
         assert "LOG BESTPOSB ONTIME 0.1" in texts(messages)
 
-    def test_the_rate_comes_first_and_saving_last(self) -> None:
+    def test_the_baud_rate_is_set_first_and_saved_last(self) -> None:
         messages = novatel_startup.startup_messages(settings(), StartupOptions(save=True, baud=460800))
         assert messages[0].data == b"SERIALCONFIG THISPORT 460800 N 8 1 N OFF\r\n"
         assert (messages[0].baud, messages[-1].data, messages[-1].last) == (460800, b"SAVECONFIG\r\n", True)
 
-    def test_a_port_is_not_named(self) -> None:
+    def test_a_named_port_is_refused(self) -> None:
         with pytest.raises(DriverSettingsError, match=r"setup\.port"):
             novatel_startup.startup_messages(settings(port="COM1"), StartupOptions())
 
     @pytest.mark.parametrize("name", ["novatel/bestpos.gps", "novatel/oemv_200911218.gps.gz"])
-    def test_a_receivers_answer_is_found_in_its_recording_however_it_is_cut(self, name: str) -> None:
+    def test_a_response_in_a_recording_is_found_however_it_is_cut(self, name: str) -> None:
         data = recording(name)
         first = data.index(b"<OK\r\n")
         for size in (1, 5, 4096):
@@ -166,19 +166,19 @@ class TestNovatel:
             listener = novatel_startup.startup_messages(settings(), StartupOptions())[0].listen()
             assert heard(listener, data[max(0, first - 9000) : first + 4], size) is None
 
-    def test_data_holds_no_answer(self) -> None:
+    def test_data_without_a_response_gives_none(self) -> None:
         for name in ("ins1.gps", "time.gps", "align.gps", "rxstatus.gps", "propak6-basic-fix.gps.gz"):
             listener = novatel_startup.startup_messages(settings(), StartupOptions())[0].listen()
             assert heard(listener, recording(f"novatel/{name}"), 4096) is None, name
 
-    def test_a_refusal_says_why(self) -> None:
+    def test_a_refusal_gives_its_reason(self) -> None:
         listener = novatel_startup.startup_messages(settings(), StartupOptions())[0].listen()
         answer = heard(listener, recording("novatel/time.gps") + b"\r\n<ERROR:Invalid Message ID\r\n[COM1]", 3)
         assert answer == Answer(False, "Invalid Message ID")
 
 
 class TestSbf:
-    def test_blocks_are_those_that_are_known(self) -> None:
+    def test_requested_blocks_are_known_to_the_driver(self) -> None:
         config = {"secondary_lever_arm_m": [0, 1, 0], "setup": {"port": "USB1"}}
         messages = sbf_startup.startup_messages(DeviceSettings("gnss/rover", config), StartupOptions())
         messages += sbf_startup.imu_startup_messages(settings(port="USB1"), StartupOptions())
@@ -190,16 +190,16 @@ class TestSbf:
         assert set(blocks) <= set(sbf_frame.NAMES.values())
         assert [stream[4] for stream in streams] == ["OnChange", "msec200", "sec1", "msec200", "msec20", "OnChange"]
 
-    def test_one_hertz_is_said_in_seconds(self) -> None:
+    def test_one_hertz_is_written_as_seconds(self) -> None:
         assert "EndOfPVT, sec1" in "\n".join(texts(sbf_startup.startup_messages(settings(rate_hz=1), StartupOptions())))
 
-    def test_the_rate_comes_first_and_saving_last(self) -> None:
+    def test_the_baud_rate_is_set_first_and_saved_last(self) -> None:
         messages = sbf_startup.startup_messages(settings(port="COM2"), StartupOptions(save=True, baud=460800))
         assert messages[0].data == b"setCOMSettings, COM2, baud460800, bits8, No, bit1, none\r\n"
         assert messages[-1].data == b"exeCopyConfigFile, Current, Boot\r\n"
         assert messages[-1].last
 
-    def test_a_port_that_there_is_not(self) -> None:
+    def test_an_unknown_port_is_refused(self) -> None:
         with pytest.raises(DriverSettingsError, match=r"setup\.port: got 'UART1', want COM1 to COM4, USB1 or USB2"):
             sbf_startup.startup_messages(settings(port="UART1"), StartupOptions())
 
@@ -216,10 +216,10 @@ class TestSbf:
             assert heard(sbf_listener(SBF_COMMAND), data + reply + data, size) == answer
             assert heard(sbf_listener(SBF_COMMAND), data + reply[:-1], size) is None
 
-    def test_the_reply_to_another_command_is_none(self) -> None:
+    def test_the_reply_to_another_command_is_ignored(self) -> None:
         assert heard(sbf_listener(sbf_startup.PULSE), SBF_REPLY, 4096) is None
 
-    def test_data_holds_no_answer(self) -> None:
+    def test_data_without_a_reply_gives_none(self) -> None:
         for path in sorted((FIXTURES / "sbf").glob("*.gz")):
             data = gzip.decompress(path.read_bytes())
             assert heard(sbf_listener(sbf_startup.PULSE), data, 4096) is None, path.name

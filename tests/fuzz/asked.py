@@ -59,7 +59,7 @@ def asked_targets() -> Iterator[tuple[str, Callable[[], Target]]]:
 
 
 class _Heard(Events):
-    """Events that are kept."""
+    """Event sink that keeps events."""
 
     def __init__(self, clock: Any) -> None:
         super().__init__(clock, BlockQueue(1 << 20), ChannelTable())
@@ -71,7 +71,7 @@ class _Heard(Events):
 
 
 def _control(folder: Path) -> Control:
-    """Of a recorder at work, which notes and begins parts."""
+    """Return the control of a working recorder that notes and begins parts."""
     clock: Any = SimpleNamespace(now_ns=lambda: NOW_NS)
     recording: Any = SimpleNamespace(
         parts=SimpleNamespace(directory=folder, part=3),
@@ -100,7 +100,7 @@ def _requests() -> Target:
 
 
 def _say(one: Control, ours: socket.socket, theirs: socket.socket, data: bytes) -> None:
-    """Piece by piece, until the peer is through with."""
+    """Send the input in pieces until the peer is finished."""
     peer = control._Peer(ours, time.monotonic() + 60.0)
     sizes = random.Random(len(data))
     while data:
@@ -161,7 +161,7 @@ def _answers() -> Target:
 
 
 def _printed(command: Callable[[], None]) -> Iterator[str]:
-    """On a terminal that wants lines of text in UTF-8."""
+    """Print on a terminal that expects lines in UTF-8."""
     out = io.BytesIO()
     terminal = io.TextIOWrapper(out, encoding="utf-8", write_through=True)
     with contextlib.redirect_stdout(terminal):
@@ -203,7 +203,7 @@ def _casters() -> Target:
 
 
 def _received(transport: NtripTransport, sock: socket.socket, most: int) -> set[str]:
-    """What came, up to the line that says why there is no more."""
+    """Return the data received, and the line that reports the end."""
     seen, count, gate = set(), 0, Gate(sock.fileno())
     try:
         transport._sock = transport._connect()

@@ -35,7 +35,7 @@ Protocols = tuple[tuple[DeviceKind, str], ...]
 
 
 def device_file_targets() -> Iterator[tuple[str, Callable[[], Target]]]:
-    """Each with the drivers that read such a file."""
+    """Return the targets of device files, each with the drivers that read such a file."""
     yield "geometry-hesai", partial(_files, "geometry-hesai", (("scanner", "hesai-xt32"), ("scanner", "hesai-qt64")))
     yield "geometry-ouster", partial(_files, "geometry-ouster", (("scanner", "ouster"),))
     heads: Protocols = (("scanner", "velodyne-vlp16"), ("scanner", "velodyne-vlp32c"))

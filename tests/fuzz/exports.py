@@ -149,7 +149,7 @@ def _log() -> bytes:
 
 
 def _export(path: Path, out: Path) -> Iterator[str]:
-    """And what was exported is read again, unit for unit."""
+    """Export and read the export again, unit for unit."""
     for session in open_logs([path]):
         report = export_session(session, out)
         yield f"{len(report.files)} files, {len(report.notes)} notes"
@@ -161,7 +161,7 @@ def _export(path: Path, out: Path) -> Iterator[str]:
 
 
 def _checksums() -> Target:
-    """Read, one added, read again: every sum that was there stays."""
+    """Read checksums, add one and read again: every existing one must remain."""
     text = "".join(f"{bytes([n]).hex() * 32}  log_{n}.mcap\n" for n in range(3)) + f"\\{'0' * 64} *a\\nb\n# x\n"
 
     def run(data: bytes) -> Iterator[str]:

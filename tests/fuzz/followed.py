@@ -86,7 +86,7 @@ def _polled(folder: Path) -> Iterator[str]:
 
 
 def _monitored(folder: Path) -> Iterator[str]:
-    """`swath monitor`, both forms."""
+    """Run `swath monitor` in both forms."""
     monitor = Monitor(folder)
     monitor.poll()
     found = monitor.snapshot()
@@ -123,7 +123,7 @@ def _followed() -> Target:
 
 
 def _said_otherwise(rng: random.Random, base: bytes) -> bytes:
-    """Values of statuses, events, edges and clocks replaced, or left out."""
+    """Replace or remove values of statuses, events, edges and clocks."""
     parts = take_apart(base)
     pieces = [inner for piece in parts.pieces for inner in (piece.inner or [piece])]
     messages = [piece for piece in pieces if piece.opcode == MESSAGE and piece.body[22:23] == b"{"]

@@ -186,7 +186,7 @@ _CRC64 = _crc64_table()
 
 
 def crc64_xz(data: bytes) -> int:
-    """CRC-64 as the .xz format has it."""
+    """Return CRC-64 as defined by the .xz format."""
     crc = (1 << 64) - 1
     for byte in data:
         crc = _CRC64[(crc ^ byte) & 0xFF] ^ crc >> 8

@@ -58,7 +58,7 @@ BATCHES = 4000  # read of one input; a log has no bound, a test has
 
 
 def log_targets() -> Iterator[tuple[str, Callable[[], Target]]]:
-    """The one there is."""
+    """Return the only target of logs."""
     yield "log", lambda: Target("log", log_seeds(), mutate_log, run, None, lambda size: (48 << 20) + 200 * size)
 
 

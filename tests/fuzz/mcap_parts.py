@@ -17,7 +17,7 @@ _CHUNK_HEAD = struct.Struct("<QQQII")
 
 
 def text(value: bytes | str) -> bytes:
-    """A string as MCAP has it."""
+    """Return a string in MCAP encoding."""
     content = value.encode() if isinstance(value, str) else value
     return struct.pack("<I", len(content)) + content
 
@@ -66,7 +66,7 @@ class Piece:
     claimed: int | None = None  # the size a chunk says it has, where not the right one
 
     def encode(self) -> bytes:
-        """With its head, its CRC made right."""
+        """Encode with its head and a valid CRC."""
         if self.inner is not None:
             return record(CHUNK, chunk_body(b"".join(one.encode() for one in self.inner), self.body, self.claimed))
         if self.opcode == ATTACHMENT and len(self.body) >= 4:
@@ -111,7 +111,7 @@ class LogParts:
 
 
 def take_apart(data: bytes) -> LogParts:
-    """As far as the lengths lead."""
+    """Split a file into records as far as its lengths allow."""
     pieces, at = _records(data, len(MAGIC))
     for piece in pieces:
         if piece.opcode == CHUNK:

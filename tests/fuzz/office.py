@@ -172,7 +172,7 @@ def _calibration() -> Target:
 
 
 def _presets() -> list[bytes]:
-    """As short as they come."""
+    """Return presets as short as possible."""
     keys = ("omega_deg", "phi_deg", "kappa_deg", "range_offset_m", "lever_arm_x_m", "lever_arm_y_m", "lever_arm_z_m")
     head = '[calibration]\nid = "a"\nscanner = "left"\nmethod = "nominal"\n[parameters]\n'
     return [(head + "".join(f"{key} = 0\n" for key in keys)).encode()]
@@ -198,7 +198,7 @@ def _histories() -> Target:
 
 
 def _model() -> Target:
-    """What `--model` says is to be estimated."""
+    """Read a file of `--model`."""
     text = (
         'model = "full"\n[parameters]\nomega_deg = "free"\nleft.phi_deg = "fixed"\n"left.kappa_deg" = { prior = 0.1 }\n'
         "[ibrc]\nknots = [0.0, 100.0, 200.5]\nreference = 100\n[range_offset]\nreturn_slots = [2]\nmta_zones = [0, 1]\n"

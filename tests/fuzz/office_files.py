@@ -104,7 +104,7 @@ def _texts() -> list[bytes]:
 
 
 def _used(trajectory: Trajectory) -> Iterator[str]:
-    """What every command does with one."""
+    """Use a trajectory as every command does."""
     trajectory.require_attitude()
     trajectory.fates((trajectory.time_ns[:-1] + trajectory.time_ns[1:]) // 2)
     trajectory.turn_rates_b()

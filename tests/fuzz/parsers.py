@@ -63,7 +63,7 @@ def _made(make: Callable[[DeviceSettings], Parser], variants: list[DeviceSetting
 
 
 def _number(data: bytes) -> int:
-    """Decides what is not in the input itself, the same for the same input."""
+    """Return a number that depends only on the input."""
     return int.from_bytes(hashlib.blake2b(data, digest_size=6).digest(), "little")
 
 
@@ -125,7 +125,7 @@ Units = list[tuple[int, bytes]]  # host time and content
 
 
 def pack(units: Units) -> bytes:
-    """Units as one input."""
+    """Pack units into one input."""
     return b"".join(_UNIT.pack(len(data), time_ns) + data for time_ns, data in units)
 
 

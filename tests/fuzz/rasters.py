@@ -30,7 +30,7 @@ PEAK_BYTES = 64 << 20
 
 
 def raster_targets() -> Iterator[tuple[str, Callable[[], Target]]]:
-    """Both readers, on the same files."""
+    """Return the targets of both readers on the same files."""
     yield "terrain", lambda: Target("terrain", _seeds(), _changed, _terrain, None, _peak)
     yield "plan-raster", lambda: Target("plan-raster", _seeds(), _changed, _ground, None, _peak)
 
@@ -40,7 +40,7 @@ def _peak(size: int) -> int:
 
 
 def _seeds() -> list[bytes]:
-    """Small ones of several layouts."""
+    """Return small rasters of several layouts."""
     kinds: list[dict[str, Any]] = [
         {"dtype": "float32"},
         {"dtype": "float64", "compress": "deflate", "tiled": True, "blockxsize": 16, "blockysize": 16},

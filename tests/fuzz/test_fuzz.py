@@ -47,7 +47,7 @@ def _traceback(error: Exception) -> str:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", sorted(SEEDS.glob("*/*")), ids=lambda path: f"{path.parent.name}/{path.name}")
-def test_what_was_once_found_stays_mended(path: Path) -> None:
+def test_earlier_findings_stay_fixed(path: Path) -> None:
     check(TARGETS[path.parent.name](), path.read_bytes(), memory=True)
 
 
@@ -58,7 +58,7 @@ def test_every_driver_is_a_target() -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_sealed_frame_is_a_good_frame(kind: str) -> None:
+def test_a_sealed_frame_is_valid(kind: str) -> None:
     """Whatever the content; a kind of frame without a seal would be fuzzed before its checksum only."""
     rng = random.Random(kind)
     for _ in range(300):
@@ -69,7 +69,7 @@ def test_a_sealed_frame_is_a_good_frame(kind: str) -> None:
         assert split_frames(b"\0" + frame) == [("", b"\0"), (kind, frame)]
 
 
-def test_a_log_taken_apart_is_put_together_again_as_it_was() -> None:
+def test_a_log_taken_apart_is_reassembled_unchanged() -> None:
     """Records, chunks of every compression, footer: byte for byte where nothing was compressed."""
     for data in TARGETS["log"]().seeds:
         again = take_apart(data).encode()

@@ -28,7 +28,7 @@ EPOCH = dt.datetime(1980, 1, 6, tzinfo=dt.UTC)
 
 
 def gps_second(moment: dt.datetime, leap: int) -> int:
-    """GPS second of a UTC moment with the leap count then in force."""
+    """Return the GPS second of a UTC moment."""
     return int((moment - EPOCH).total_seconds()) + leap
 
 
@@ -112,13 +112,13 @@ class Simulation:
         return self.oscillator.seconds
 
     def host_ns(self, true_s: float) -> int:
-        """Host time at a true second since the start."""
+        """Return the host time at a true second since the start."""
         whole = min(int(true_s), self.seconds - 1)
         part = true_s - whole
         return HOST_START_NS + round(self._host[whole] * (1.0 - part) + self._host[whole + 1] * part)
 
     def true_gps_ns(self, host_ns: int) -> int:
-        """True GPS time of a host time."""
+        """Return the true GPS time of a host time."""
         since = float(host_ns - HOST_START_NS)
         whole = min(max(bisect.bisect_right(self._host, since) - 1, 0), self.seconds - 1)
         part = (since - self._host[whole]) / (self._host[whole + 1] - self._host[whole])

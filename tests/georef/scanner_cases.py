@@ -46,7 +46,7 @@ IBRC = (np.array([0.0, 40.0, 55.0, 300.0, 2000.0]), np.array([0.03, 0.02, -0.01,
 
 
 def rows_of(encoder_rad: object, range_m: object, **others: object) -> StructArray:
-    """Returns with these columns."""
+    """Return rows with these columns."""
     encoder, measured = np.broadcast_arrays(
         np.asarray(encoder_rad, dtype=np.float64), np.asarray(range_m, dtype=np.float64)
     )
@@ -67,7 +67,7 @@ def still_trajectory() -> Trajectory:
 
 
 def calibration_of(geometry: Geometry, **changes: float) -> Calibration:
-    """Every error that such a scanner has, and the tables."""
+    """Return a calibration with every error that such a scanner has, and the tables."""
     values = {name: 0.0 if name in geometry.without else value for name, value in EVERYTHING.items()}
     offsets = (RangeOffset(0.012, return_slot=1), RangeOffset(-0.03, mta_zone=2), RangeOffset(0.5, prf_hz=1e5))
     calibration = replace(nominal("left", (0.15, -0.08, 0.42), TURNED), ibrc=IBRC, range_offsets=offsets)
@@ -91,7 +91,7 @@ def bent(ray: FloatArray, normal: FloatArray, ratio: float) -> FloatArray:
 
 
 def scaled(direction: FloatArray, rho: FloatArray) -> FloatArray:
-    """Points."""
+    """Multiply unit vectors by ranges."""
     points: FloatArray = direction * rho[:, np.newaxis]
     return points
 

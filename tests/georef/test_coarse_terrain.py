@@ -37,7 +37,7 @@ def aimed(n: int, height_m: FloatArray, sensor_m: float, aside_deg: float) -> tu
     return np.stack([ground[0] + aside[0], ground[1] + aside[1], np.full(n, sensor_m)], 1), np.stack(ground, 1)
 
 
-def test_heights_are_bilinear() -> None:
+def test_heights_are_interpolated_bilinearly() -> None:
     height_m, rng = hills(), np.random.default_rng(1)
     row, column = rng.uniform(0, 159, 500), rng.uniform(0, 129, 500)
     row[:2], column[:2] = (0, 159), (129, 0)  # corners too
@@ -51,7 +51,7 @@ def test_heights_are_bilinear() -> None:
 
 @pytest.mark.parametrize("step_deg", [0.001, -0.001])
 @pytest.mark.parametrize("middle_deg", [0.0, 180.0, -180.0, 360.0])
-def test_a_grid_across_the_beginning_of_longitudes_is_whole(middle_deg: float, step_deg: float) -> None:
+def test_a_grid_across_the_antimeridian_is_continuous(middle_deg: float, step_deg: float) -> None:
     height_m = hills()
     first, step = (np.radians(middle_deg - 64.5 * step_deg), np.radians(47.6)), np.radians((step_deg, -0.0008))
     model = CoarseTerrain(height_m, first, (step[0], step[1]))
@@ -82,7 +82,7 @@ def test_holes_are_not_filled() -> None:
     assert np.isnan(terrain(height_m).height_at(lat, lon))
 
 
-def test_beams_end_where_they_were_aimed() -> None:
+def test_beams_end_at_their_targets() -> None:
     height_m = hills()
     sensors, ground = aimed(600, height_m, 1900.0, 0.006)
     origin, target = (np.stack(TO_E.transform(*place.T), axis=1) for place in (sensors, ground))
@@ -109,7 +109,7 @@ def test_beams_on_steep_slopes_end_on_the_ground() -> None:
     assert np.nanmax(missed) < 1.0
 
 
-def test_a_grid_of_a_map() -> None:
+def test_a_grid_in_map_coordinates_is_supported() -> None:
     to_map = Transformer.from_crs("EPSG:4326", "EPSG:32632", always_xy=True)
 
     def to_grid(lat_rad: FloatArray, lon_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -122,7 +122,7 @@ def test_a_grid_of_a_map() -> None:
     assert float(model.height_at(np.radians([lat]), np.radians([lon]))[0]) == pytest.approx(430.0, abs=1e-3)
 
 
-def test_beams_that_meet_nothing() -> None:
+def test_beams_that_miss_the_terrain_have_no_predicted_range() -> None:
     height_m = hills()
     sensors, _ = aimed(3, height_m, 1900.0, 0.001)
     origin = np.stack(TO_E.transform(*sensors.T), axis=1)
@@ -137,6 +137,6 @@ def test_beams_that_meet_nothing() -> None:
 @pytest.mark.parametrize(
     ("height_m", "step", "says"), [([[1.0, 2.0]], (1.0, 1.0), "shape"), (np.zeros((3, 3)), (1.0, 0.0), "steps")]
 )
-def test_refuses_what_is_no_grid(height_m: FloatArray, step: tuple[float, float], says: str) -> None:
+def test_impossible_grids_are_refused(height_m: FloatArray, step: tuple[float, float], says: str) -> None:
     with pytest.raises(TerrainError, match=says):
         CoarseTerrain(height_m, (0.0, 0.0), step)

@@ -54,7 +54,7 @@ def test_a_kernel_changed_in_another_file_is_compiled_anew(tmp_path: Path) -> No
     assert run(3.0) == "3.0 0"
 
 
-def test_without_a_folder_to_write_to_it_is_compiled_all_the_same(tmp_path: Path) -> None:
+def test_a_kernel_is_compiled_without_a_writable_cache_folder(tmp_path: Path) -> None:
     package = tmp_path / "swath/georef"
     package.mkdir(parents=True)
     (tmp_path / "swath/__init__.py").touch()

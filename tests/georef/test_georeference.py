@@ -48,7 +48,7 @@ def flight() -> Trajectory:
 
 
 def returns() -> tuple[StructArray, Int64Array]:
-    """All over the flight, a few beyond its ends, some too near."""
+    """Return returns all over the flight, a few beyond its ends, some too near."""
     rng = np.random.default_rng(1)
     rows = rows_of(rng.uniform(-0.5, 0.5, COUNT), rng.uniform(900.0, 1500.0, COUNT), intensity=np.arange(COUNT))
     rows["range_m"][::50] = 3.0
@@ -57,13 +57,13 @@ def returns() -> tuple[StructArray, Int64Array]:
 
 
 def model(air: Air | None = None, **errors: float) -> SensorModel:
-    """An oscillating mirror."""
+    """Return the model of an oscillating mirror."""
     calibration = nominal("left", [0.1, 0.2, 0.3], np.eye(3)).changed(omega_rad=0.01, **errors)
     return SensorModel(calibration, LineGeometry(), (10.0, 5000.0), air=air)
 
 
 def same_points(a: Points, b: Points) -> None:
-    """Bit by bit."""
+    """Assert that points are equal bit by bit."""
     for name in Points.__slots__:
         one, other = getattr(a, name), getattr(b, name)
         assert (one is None) == (other is None)
@@ -118,13 +118,13 @@ def test_scan_angles_are_positive_to_the_right_however_the_head_is_mounted() -> 
     np.testing.assert_allclose(scan_angles(LINE, TURNED, 0.0, readings), -degrees, atol=0.06)
 
 
-def test_scan_angles_have_the_aircrafts_roll() -> None:
+def test_scan_angles_include_the_roll_of_the_aircraft() -> None:
     """Right wing down: beams of the scanner's own nadir go to the left. LAS 1.4: from the vertical of the data."""
     level = np.degrees(np.arctan2(-np.sin(0.2), np.cos(0.2) * np.cos(0.06)))
     np.testing.assert_allclose(scan_angles(LINE, np.eye(3), 0.2, [0.0]), level, atol=1e-4)
 
 
-def test_scan_angles_of_spinning_heads_are_the_beams_own() -> None:
+def test_scan_angles_of_spinning_heads_follow_the_beam_direction() -> None:
     """A head whose axis lies along the way: not its azimuth, but where it looks, all the way round."""
     readings = np.radians([0.0, 90.0, 179.0, 181.0, 270.0]).tolist()
     found = scan_angles(SPINNING, SIDEWAYS, 0.0, readings)
@@ -133,13 +133,13 @@ def test_scan_angles_of_spinning_heads_are_the_beams_own() -> None:
     assert found[2] > 0.0 > found[3]
 
 
-def test_angles_are_arctangents_all_round() -> None:
+def test_angles_match_arctangents_all_round() -> None:
     angle = np.concatenate([np.linspace(-np.pi, np.pi, 4001)[1:], np.radians([-90.0, -45.0, 0.0, 45.0, 90.0])])
     found = [angle_of(1e3 * np.sin(one), 1e3 * np.cos(one)) for one in angle.tolist()]
     np.testing.assert_allclose(found, angle, rtol=0, atol=2e-8)
 
 
-def test_onto_the_map() -> None:
+def test_points_are_converted_to_map_coordinates() -> None:
     rows, time_ns = returns()
     in_e, _ = Georeferencer(model()).georeference(rows, time_ns, flight())
     mapped, _ = Georeferencer(model(), Mapping("EPSG:32632", datum=None, epoch=None)).georeference(
@@ -153,7 +153,7 @@ def test_onto_the_map() -> None:
     assert np.abs(mapped.points_map - np.stack([east, north, height], axis=1)).max() < 1e-4
 
 
-def test_blocks_do_not_show(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_results_do_not_depend_on_the_block_size(monkeypatch: pytest.MonkeyPatch) -> None:
     rows, time_ns = returns()
     calibration = replace(model().calibration, sigmas=np.full(16, 1e-4))
     mapping, air = Mapping("EPSG:32632", datum=None, epoch=None), Air("vacuum", refraction="ardc")
@@ -167,7 +167,7 @@ def test_blocks_do_not_show(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (whole.sigma_map > 0.02).all()
 
 
-def test_air_slows_what_was_measured_and_not_the_offset() -> None:
+def test_air_affects_the_measured_range_and_not_the_offset() -> None:
     rows, time_ns = rows_of(0.0, [1000.0]), np.array([500 * MS])
     air = Air("vacuum")
     straight = model(range_offset_m=50.0, range_scale=1e-3)
@@ -185,7 +185,7 @@ def test_air_slows_what_was_measured_and_not_the_offset() -> None:
     assert abs(between - 50.0 * (1 - 1e-6 * ppm)) > 5e-3
 
 
-def test_sigmas_in_e_where_there_is_no_map() -> None:
+def test_sigmas_are_earth_centred_without_a_map() -> None:
     rows, time_ns = returns()
     uncertainty = Uncertainty(model().calibration, Noise())
     points, fates = Georeferencer(model(), uncertainty=uncertainty).georeference(rows, time_ns, flight())
@@ -207,7 +207,7 @@ class Steady:
         return np.full(len(rows), 40.0), np.zeros(len(rows))
 
 
-def test_motion_of_the_encoder(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_encoder_motion_is_used_only_with_an_encoder_latency(monkeypatch: pytest.MonkeyPatch) -> None:
     rows, time_ns = returns()
     monkeypatch.setattr(georeference, "BLOCK_ROWS", 100)
     late, motion = model(encoder_latency_s=1e-6), Steady()
@@ -219,14 +219,14 @@ def test_motion_of_the_encoder(monkeypatch: pytest.MonkeyPatch) -> None:
     assert motion.asked == 1  # nobody needs it
 
 
-def test_no_rows_no_points() -> None:
+def test_no_rows_give_no_points() -> None:
     rows, time_ns = returns()
     for mapping in (None, Mapping("EPSG:32632", datum=None, epoch=None)):
         points, fates = Georeferencer(model(), mapping).georeference(rows[:0], time_ns[:0], flight())
         assert len(points) == len(fates) == 0
 
 
-def test_points_that_the_map_has_no_place_for() -> None:
+def test_points_outside_the_projection_are_not_finite() -> None:
     rows, time_ns = returns()
     clean, fates = Georeferencer(model(), Mapping("EPSG:32632")).georeference(rows, time_ns, flight())
     wild = rows.copy()
@@ -243,7 +243,7 @@ def test_points_that_the_map_has_no_place_for() -> None:
     assert np.array_equal(points.points_map[kept], clean.points_map[np.isin(clean.time_ns, points.time_ns[kept])])
 
 
-def test_a_map_that_does_not_reach_there_at_all_is_refused_at_first() -> None:
+def test_a_map_whose_domain_contains_no_point_is_refused_at_once() -> None:
     rows, time_ns = returns()
     with pytest.raises(MappingError, match="outside"):
         Georeferencer(model(), Mapping("EPSG:32756")).georeference(rows, time_ns, flight())

@@ -34,29 +34,29 @@ def flown(*legs: tuple[float, float, float], rate_hz: float = 50.0, gusts_rad: f
 
 
 def seconds(spans: list[tuple[int, int]]) -> list[tuple[float, float]]:
-    """Since the start."""
+    """Return seconds since the start."""
     return [((start - START) / S, (end - START) / S) for start, end in spans]
 
 
-def test_a_turn_stands_between_two_lines() -> None:
+def test_two_lines_are_separated_by_a_turn() -> None:
     found = seconds(straight_spans(*flown((60, 0, 0), (60, 3, 22), (60, 0, 0))))
     assert np.allclose(found, [(0, 60), (120, 180)], atol=2.0)  # half a window
 
 
-def test_heading_through_north_is_no_turn() -> None:
+def test_heading_through_north_is_not_a_turn() -> None:
     assert len(straight_spans(*flown((300, 0.05, 0)))) == 1
 
 
-def test_a_flat_turn_and_a_banked_slip_both_count() -> None:
+def test_a_flat_turn_and_a_banked_slip_both_count_as_turns() -> None:
     assert len(straight_spans(*flown((60, 0, 0), (30, 2, 0), (60, 0, 0)))) == 2
     assert len(straight_spans(*flown((60, 0, 0), (30, 0, 15), (60, 0, 0)))) == 2
 
 
-def test_gusts_are_averaged_and_a_short_correction_is_no_turn() -> None:
+def test_gusts_and_short_corrections_are_not_turns() -> None:
     assert len(straight_spans(*flown((60, 0, 0), (1.5, 0.2, 12), (60, 0, 0), gusts_rad=0.02))) == 1
 
 
-def test_the_rate_of_the_trajectory_does_not_matter() -> None:
+def test_strips_do_not_depend_on_the_trajectory_rate() -> None:
     legs = ((60, 0, 0), (60, 3, 22), (60, 0, 0))
     few = np.array(straight_spans(*flown(*legs, rate_hz=10)))
     many = np.array(straight_spans(*flown(*legs, rate_hz=200)))
@@ -64,12 +64,12 @@ def test_the_rate_of_the_trajectory_does_not_matter() -> None:
 
 
 @pytest.mark.parametrize("epochs", [0, 1])
-def test_a_trajectory_of_no_length_has_no_strip(epochs: int) -> None:
+def test_a_trajectory_of_no_duration_has_no_strip(epochs: int) -> None:
     time_ns, heading, roll = flown((1, 0, 0))
     assert straight_spans(time_ns[:epochs], heading[:epochs], roll[:epochs]) == []
 
 
-def test_laser_spans_join_what_is_less_than_a_gap_apart() -> None:
+def test_laser_spans_separated_by_less_than_a_gap_are_joined() -> None:
     first = np.array([30, 0, 10, 40]) * S  # two scanners' chunks stand in any order
     last = np.array([40, 9.5, 20, 45]) * S
     assert laser_spans(first, last.astype(np.int64)) == [(0, 20 * S + 1), (30 * S, 45 * S + 1)]
@@ -87,7 +87,7 @@ def test_strips_are_straight_flight_with_the_laser_on() -> None:
     assert len(cut(straight, laser, StripRules(min_strip_s=2.5))) == 3
 
 
-def test_segments_tile_the_time() -> None:
+def test_segments_cover_the_time_without_overlap() -> None:
     tiles = segments([(10, 20), (20, 25), (40, 90)], 5, 50, first_number=4)
     assert tiles == [
         Segment(0, 5, 10),
@@ -130,7 +130,7 @@ def test_times_of_strips_are_read() -> None:
         ("", "column start_gps_ns is missing"),
     ],
 )
-def test_wrong_times_of_strips_are_refused_by_line(text: str, message: str) -> None:
+def test_wrong_strip_times_are_refused_with_their_line(text: str, message: str) -> None:
     with pytest.raises(StripError, match=message) as refused:
         read_strips(text, "times.csv")
     assert str(refused.value).startswith("times.csv: ")

@@ -16,7 +16,7 @@ def refused(text: str) -> str:
     return str(error.value)
 
 
-def test_tables_are_those_of_the_standard_library() -> None:
+def test_tables_match_the_standard_library() -> None:
     text = 'a = 1\nday = 2026-11-21\n[b]\nc = [1.5, "x"]\n[[b.d]]\ne = true\n'
     expected = {"a": 1, "day": dt.date(2026, 11, 21), "b": {"c": [1.5, "x"], "d": [{"e": True}]}}
     assert toml_tables(text) == expected
@@ -24,19 +24,19 @@ def test_tables_are_those_of_the_standard_library() -> None:
 
 
 @pytest.mark.parametrize("number", [LEAST, MOST, 0])
-def test_numbers_of_64_bits_are_whole(number: int) -> None:
+def test_integers_of_64_bits_are_exact(number: int) -> None:
     assert toml_tables(f"a = {number}\nb = [{{ c = {number} }}]") == {"a": number, "b": [{"c": number}]}
 
 
 @pytest.mark.parametrize("number", [LEAST - 1, MOST + 1])
-def test_a_number_beyond_64_bits_is_named_with_its_key(number: int) -> None:
+def test_error_for_an_integer_beyond_64_bits_names_its_key(number: int) -> None:
     told = f"a whole number of {number.bit_length()} bits; use numbers of 64 bits"
     assert refused(f"a = {number}") == f"a: {told}"
     assert refused(f"[scanner.left]\nb = [1, [{number}]]") == f"scanner.left.b: {told}"
     assert refused(f'["two words"]\n"c\\n" = {number}') == rf'"two words"."c\n": {told}'
 
 
-def test_a_number_of_more_digits_than_python_takes() -> None:
+def test_an_integer_with_more_digits_than_python_accepts_is_refused() -> None:
     assert refused(f"a = {'9' * 5000}") == "a whole number of thousands of digits; use numbers of 64 bits"
 
 
@@ -45,19 +45,19 @@ def nested(depth: int) -> str:
     return f"a = {'[' * depth}{']' * depth}"
 
 
-def test_tables_may_lie_as_deep_as_is_said_and_no_deeper() -> None:
+def test_tables_may_be_nested_up_to_the_limit() -> None:
     assert toml_tables(nested(DEEPEST))["a"]
     assert refused(nested(DEEPEST + 1)) == f"a…: nested too deeply; nest tables at most {DEEPEST} deep"
     assert refused("[" + ".".join(["a"] * 40) + "]").startswith("a.a.a.")
 
 
 @pytest.mark.parametrize("text", ["a = " + "[" * 20_000, "a = " + "{a=" * 20_000])
-def test_nesting_without_an_end_is_refused(text: str) -> None:
+def test_unlimited_nesting_is_refused(text: str) -> None:
     assert refused(text) == f"not readable: nested too deeply; nest tables at most {DEEPEST} deep"
 
 
 @pytest.mark.parametrize(("text", "place"), [("a = 1\nb c", "line 2"), ("a = '''\n\n", "end of document"), ("a\0", "")])
-def test_what_is_no_toml_is_told_with_its_place(text: str, place: str) -> None:
+def test_error_for_invalid_toml_gives_its_position(text: str, place: str) -> None:
     message = refused(text)
     assert message.startswith("not TOML: ")
     assert place in message
@@ -70,7 +70,7 @@ def test_what_is_no_toml_is_told_with_its_place(text: str, place: str) -> None:
         *(("\U0001f681", '"\U0001f681"'), ("\x7f", r'"\u007f"'), ("\u2028", r'"\u2028"'), ('"\\', r'"\"\\"')),
     ],
 )
-def test_a_key_stands_in_a_line_as_toml_takes_it_back(key: str, text: str) -> None:
+def test_a_quoted_key_is_read_back(key: str, text: str) -> None:
     assert key_text(key) == text
     assert len(text.splitlines()) == 1
     assert toml_tables(f"{text} = 1") == {key: 1}

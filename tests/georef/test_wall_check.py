@@ -27,7 +27,7 @@ DAY_S = 86_400.0
         (45.0, True, "45 s ahead of"),
     ],
 )
-def test_a_difference_is_said_in_words(ahead: float, kept: bool, said: str) -> None:
+def test_a_time_difference_is_described_in_words(ahead: float, kept: bool, said: str) -> None:
     text = distance_text(ahead, kept=kept, clock=CLOCK)
     assert f"its time is {said} {CLOCK}" in text
     assert ("time zone" in text) == (" h " in said)
@@ -44,7 +44,7 @@ def test_a_difference_is_said_in_words(ahead: float, kept: bool, said: str) -> N
         (15 * 3600.0, False),  # no time zone is that far
     ],
 )
-def test_what_is_small_or_beside_a_clock_that_nobody_set_says_nothing(ahead: float, kept: bool) -> None:
+def test_small_differences_and_unset_clocks_give_no_warning(ahead: float, kept: bool) -> None:
     assert distance_text(ahead, kept=kept, clock=CLOCK) == ""
 
 
@@ -74,17 +74,17 @@ def heard(ahead: list[float], *, kept: bool, whole_log: bool, step_s: int = 0) -
     return comparison
 
 
-def test_the_whole_log_says_what_most_messages_say() -> None:
+def test_the_whole_log_is_judged_by_the_majority_of_messages() -> None:
     """A receiver that found its date after some seconds is right; live it was wrong at that time."""
     ahead = [7200.0] * 20 + [-0.2] * 200
     assert heard(ahead, kept=True, whole_log=True).lines() == []
     assert heard(ahead[:20], kept=True, whole_log=False).lines() != []
 
 
-def test_few_messages_and_messages_that_do_not_agree_say_nothing() -> None:
+def test_few_or_contradicting_messages_give_no_warning() -> None:
     assert heard([7200.0] * 5, kept=True, whole_log=True).lines() == []
     assert heard([0.0, 3600.0, 7200.0] * 20, kept=True, whole_log=True).lines() == []
 
 
-def test_a_clock_that_was_set_during_the_session_is_taken_as_it_is_then() -> None:
+def test_a_clock_set_during_the_session_gives_no_warning() -> None:
     assert heard([0.0] * 20, kept=True, whole_log=True, step_s=-90_000).lines() == []

@@ -27,7 +27,7 @@ SCHEMAS = {
 
 
 def swath(*arguments: str | Path) -> str:
-    """Run a command that must succeed; what it printed."""
+    """Run a command that must succeed; return its output."""
     command = [sys.executable, "-m", "swath.daemon.cli.main", *map(str, arguments)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=200, check=False, cwd=HERE.parents[1])
     assert done.returncode == 0, done.stderr
@@ -56,7 +56,7 @@ def read(live: Path) -> dict[str, Any]:
     return found
 
 
-def test_every_topic_has_foxgloves_schema_as_it_is_published(read: dict[str, Any]) -> None:
+def test_every_topic_has_the_published_foxglove_schema(read: dict[str, Any]) -> None:
     assert {topic: found["schema"] for topic, found in read["topics"].items()} == SCHEMAS
     for topic, found in read["topics"].items():
         assert found["encoding"] == "protobuf"
@@ -64,7 +64,7 @@ def test_every_topic_has_foxgloves_schema_as_it_is_published(read: dict[str, Any
         assert found["fields"] == found["published"], topic
 
 
-def test_all_messages_and_points_are_there(live: Path, read: dict[str, Any]) -> None:
+def test_all_messages_and_points_are_present(live: Path, read: dict[str, Any]) -> None:
     with (live / "live.mcap").open("rb") as file:
         written = Counter(channel.topic for _, channel, _ in make_reader(file).iter_messages())
     assert {topic: found["messages"] for topic, found in read["topics"].items()} == written
@@ -72,7 +72,7 @@ def test_all_messages_and_points_are_there(live: Path, read: dict[str, Any]) -> 
     assert read["topics"]["/points/left"]["points"] == status["live_mcap"]["points_written"] > 0
 
 
-def test_a_cloud_is_where_the_aircraft_is(read: dict[str, Any]) -> None:
+def test_a_cloud_lies_below_the_aircraft_in_the_local_frame(read: dict[str, Any]) -> None:
     """All in the frame ``local``; points below the body, position as the pose, in degrees."""
     topics, metadata = read["topics"], read["metadata"]["swath.live"]
     cloud, pose, fix = (topics[name]["first"] for name in ("/points/left", "/pose", "/position"))

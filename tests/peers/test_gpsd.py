@@ -80,7 +80,7 @@ def recorded(folder: Path, case: Case) -> Path:
 
 
 def utc(fix: GnssFix) -> dt.datetime:
-    """When a fix was taken."""
+    """Return the time of a fix."""
     if fix.time.scale is TimeScale.UTC:
         assert fix.time.date is not None
         start = dt.datetime.combine(fix.time.date, dt.time(), dt.UTC)
@@ -160,7 +160,7 @@ def played_to_gpsd(folder: Path, config: Path) -> list[dict[str, Any]]:
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
-def test_gpsd_says_what_we_say(tmp_path: Path, case: Case) -> None:
+def test_fixes_match_gpsd(tmp_path: Path, case: Case) -> None:
     config = recorded(tmp_path, case)
     told = played_to_gpsd(tmp_path, config)
     ours = {round(utc(fix).timestamp() * 1000): fix for fix in our_fixes(tmp_path)}

@@ -40,7 +40,7 @@ def ned_from_e(lat_rad: FloatArray, lon_rad: FloatArray) -> Rotation:
 
 
 def derivative(function: object, time_s: FloatArray) -> FloatArray:
-    """Of (n,) → (n, k), by five points: error of fourth order."""
+    """Return the derivative (n,) → (n, k) by five points, with an error of fourth order."""
     assert callable(function)
     one = function(time_s + STEP_S) - function(time_s - STEP_S)
     two = function(time_s + 2 * STEP_S) - function(time_s - 2 * STEP_S)
@@ -61,14 +61,14 @@ class Circling:
         self._site = ned_from_e(np.radians([LAT_DEG]), np.radians([LON_DEG])).inv()
 
     def position_e(self, time_s: FloatArray) -> FloatArray:
-        """(n, 3) of the body's origin."""
+        """Return (n, 3) positions of the body's origin."""
         angle = RATE_RAD_S * time_s
         down = 20.0 * np.cos(0.3 * time_s)
         ned = np.stack([RADIUS_M * np.sin(angle), -RADIUS_M * np.cos(angle), down], axis=-1)
         return np.asarray(self._origin_e + self._site.apply(ned))
 
     def attitude(self, time_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Roll, pitch, heading."""
+        """Return roll, pitch and heading."""
         size = 0.0 if self.level else 1.0
         return (
             size * (0.3 + 0.1 * np.sin(time_s)),
@@ -77,7 +77,7 @@ class Circling:
         )
 
     def turned(self, time_s: FloatArray) -> Rotation:
-        """e from b."""
+        """Return the rotation from b to e."""
         roll, pitch, heading = self.attitude(time_s)
         lat_rad, lon_rad, _ = geodetic(self.position_e(time_s))
         return ned_from_e(lat_rad, lon_rad).inv() * Rotation.from_euler("ZYX", np.stack([heading, pitch, roll], -1))
@@ -97,11 +97,11 @@ class Circling:
         return geodetic(self.position_e(time_s))
 
     def velocity_l(self, time_s: FloatArray) -> FloatArray:
-        """North, east, down."""
+        """Return velocities north, east, down."""
         return self.velocity_of([0.0, 0.0, 0.0], time_s)
 
     def point_e(self, lever_arm_b: list[float], time_s: FloatArray) -> FloatArray:
-        """(n, 3) of a point of the body."""
+        """Return (n, 3) positions of a point of the body."""
         return np.asarray(self.position_e(time_s) + self.turned(time_s).apply(lever_arm_b))
 
     def velocity_of(self, lever_arm_b: list[float], time_s: FloatArray) -> FloatArray:
@@ -119,21 +119,21 @@ class Standing(Circling):
         self._motion = super().motion(np.zeros(1))
 
     def motion(self, time_s: FloatArray) -> Motion:
-        """Always the same."""
+        """Return a constant motion."""
         n = len(time_s)
         still = np.zeros((n, 3))
         position_e = np.broadcast_to(self._motion.position_e, (n, 3))
         return Motion(position_e, still, np.broadcast_to(self._motion.rot_e_from_b, (n, 3, 3)), still)
 
     def attitude(self, time_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Zeros."""
+        """Return zeros."""
         return np.zeros(len(time_s)), np.zeros(len(time_s)), np.zeros(len(time_s))
 
     def geodetic(self, time_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Always the same."""
+        """Return a constant position."""
         lat, lon, height = geodetic(self._motion.position_e)
         return np.full(len(time_s), lat), np.full(len(time_s), lon), np.full(len(time_s), height)
 
     def velocity_l(self, time_s: FloatArray) -> FloatArray:
-        """Zeros."""
+        """Return zeros."""
         return np.zeros((len(time_s), 3))

@@ -38,7 +38,7 @@ class Calibration:
 
     @classmethod
     def read(cls, text: str) -> Calibration:
-        """From the file's text."""
+        """Read the calibration from the text of its file."""
         document: dict[str, Any] = tomllib.loads(text)
         facets = {row["index"]: float(np.radians(row["tilt_deg"])) for row in document.get("facet", [])}
         table = document.get("ibrc")
@@ -50,7 +50,7 @@ class Calibration:
         )
 
     def value(self, key: str) -> float:
-        """A parameter in SI units by its key."""
+        """Return a parameter in SI units by its key."""
         factor = {"deg": np.pi / 180, "ppm": 1e-6, "us": 1e-6, "us2": 1e-12, "m": 1.0}[key.rsplit("_", 1)[1]]
         return float(self.parameters[key] * factor)
 
@@ -106,7 +106,7 @@ def line_direction(calibration: Calibration, theta: FloatArray) -> FloatArray:
 
 
 def corrected_range(calibration: Calibration, range_m: FloatArray, intensity: FloatArray) -> FloatArray:
-    """ρ of CONVENTIONS."""
+    """Return the corrected range ρ of CONVENTIONS."""
     rho = (1 + calibration.value("range_scale_ppm")) * range_m + calibration.value("range_offset_m")
     if calibration.ibrc is not None:
         rho = rho - np.interp(intensity, *calibration.ibrc)

@@ -39,7 +39,7 @@ def plan_of(kind: str, *, noise: bool = False, **keys: Any) -> Plan:
 
 
 def pulse(plan: Plan) -> PulsePerSecond:
-    """Its PPS."""
+    """Return the PPS of a plan."""
     return PulsePerSecond(plan.tables.pps["main"], plan.tables.flight.seed, "main", noise=plan.tables.flight.noise)
 
 
@@ -90,7 +90,7 @@ def feed(parser: PacketParser, units: Iterable[WireUnit]) -> list[Record]:
 
 
 def rows_of(records: Sequence[Record], kind: type[ScannerReturns | DeviceClockSamples]) -> StructArray:
-    """The rows of all records of a kind."""
+    """Return the rows of all records of a type."""
     return np.concatenate([record.rows for record in records if isinstance(record, kind)])
 
 

@@ -25,19 +25,19 @@ height_m = 1250
 
 
 def plan_of(terrain: str, folder: Path = Path()) -> Plan:
-    """A plan with these lines of its table ``[terrain]`` and tables below it."""
+    """Return a plan with these lines in its table ``[terrain]`` and the tables after it."""
     return parse_plan(HEAD + terrain, folder)
 
 
 def scene_of(terrain: str, half_m: float = 200.0, center_m: tuple[float, float] = (0.0, 0.0)) -> Scene:
-    """The scene of a square."""
+    """Return the scene of a square."""
     plan = plan_of(terrain)
     corners = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]) * half_m + center_m
     return build_scene(plan, Site.at(*plan.tables.flight.origin_deg), corners)
 
 
 def towards(origin: FloatArray, target: FloatArray) -> FloatArray:
-    """(n, 3) unit vectors."""
+    """Return (n, 3) unit vectors towards places."""
     way = target - origin
     unit: FloatArray = way / np.linalg.norm(way, axis=1, keepdims=True)
     return unit

@@ -54,7 +54,7 @@ def measured_of(pulses: Pulses, slots: int, near_m: float, far_m: float) -> tupl
 
 @dataclass
 class Spoken:
-    """All that a scanner said."""
+    """Everything that a scanner sent."""
 
     table: ScannerTable
     wire: SrepWire

@@ -47,7 +47,7 @@ def air_of(wavelength_nm: float = 1064.0, **keys: Any) -> Air:
         (50, 120, 100, 28792.4),
     ],
 )
-def test_phase_index_is_ciddors(
+def test_phase_index_matches_ciddor(
     temperature_c: float, pressure_kpa: float, humidity_percent: float, published: float
 ) -> None:
     # Ciddor 1996, tables 1 and 3: 633 nm, 450 ppm of CO2, 1e8 (n − 1)
@@ -66,7 +66,7 @@ def test_phase_index_is_ciddors(
         (19.534, 103_599.2, 951, 610, 27802.2),
     ],
 )
-def test_phase_index_of_the_air_of_a_laboratory(
+def test_phase_index_matches_laboratory_air(
     temperature_c: float, pressure_pa: float, vapour_pa: float, co2_ppm: float, published: float
 ) -> None:
     # Ciddor 1996, table 2
@@ -78,7 +78,7 @@ def test_phase_index_of_the_air_of_a_laboratory(
 @pytest.mark.parametrize(
     ("wavelength_um", "sheet"), [(0.532, 289.404), (0.905, 277.965), (1.064, 276.360), (1.550, 274.164)]
 )
-def test_group_refractivity_is_that_of_the_formula_sheet(wavelength_um: float, sheet: float) -> None:
+def test_group_refractivity_matches_the_formula_sheet(wavelength_um: float, sheet: float) -> None:
     # 15 °C, 1013.25 hPa, 10 hPa of vapour: FORMULAS 3.2 by 50 digits
     temperature_k, pressure_pa = one(288.15), one(101_325.0)
     saturated = vapour_fraction(temperature_k, pressure_pa, 1.0)
@@ -99,7 +99,7 @@ def closed_refractivity_ppm(height_m: float, wavelength_um: float) -> float:
 
 @pytest.mark.parametrize(("low_m", "high_m"), [(0.0, 300.0), (200.0, 3000.0), (450.0, 9000.0)])
 @pytest.mark.parametrize("wavelength_nm", [905.0, 1064.0, 1550.0])
-def test_mean_over_a_path_agrees_with_closed_forms(low_m: float, high_m: float, wavelength_nm: float) -> None:
+def test_path_means_match_closed_forms(low_m: float, high_m: float, wavelength_nm: float) -> None:
     air = air_of(wavelength_nm)
     closed = quad(closed_refractivity_ppm, low_m, high_m, args=(1e-3 * wavelength_nm,), epsabs=1e-6)[0]
     mean = air.group_refractivity_ppm(one(high_m), one(low_m))[0]
@@ -116,14 +116,14 @@ def test_mean_over_a_path_is_exact_to_a_hundredth_of_a_ppm() -> None:
     assert np.abs(air.group_refractivity_ppm(heights_m, heights_m + 1.001) - local).max() < 0.02
 
 
-def test_measured_air_is_what_was_measured_at_its_height() -> None:
+def test_measured_air_is_reproduced_at_its_height() -> None:
     air = air_of(model="measured", temperature_c=-10.0, pressure_hpa=850.0, humidity_percent=0.0, height_m=1200.0)
     local = air.group_refractivity_ppm(one(1200.0), one(1200.0))[0]
     closed = 273.15 / 1013.25 * 291.984975 * 850.0 / 263.15  # FORMULAS 3.2, dry
     assert local == pytest.approx(closed, abs=0.1)
 
 
-def test_measured_at_the_standard_is_the_standard() -> None:
+def test_standard_values_as_measurement_give_the_standard_atmosphere() -> None:
     measured = air_of(model="measured", temperature_c=2.0, pressure_hpa=794.9522, humidity_percent=0.0, height_m=2000.0)
     standard = air_of()  # ISO 2533 at 2000 m: 275.15 K, 794.952 hPa
     path = one(3500.0), one(300.0)
@@ -132,7 +132,7 @@ def test_measured_at_the_standard_is_the_standard() -> None:
     )
 
 
-def test_measured_humidity_makes_light_faster() -> None:
+def test_humidity_makes_light_faster() -> None:
     dry, wet = (
         air_of(model="measured", temperature_c=30.0, humidity_percent=humidity).group_refractivity_ppm(
             one(0.0), one(0.0)
@@ -144,7 +144,7 @@ def test_measured_humidity_makes_light_faster() -> None:
     assert wet - dry == pytest.approx(wanted, abs=0.02)
 
 
-def test_a_device_that_counts_with_c_says_too_much() -> None:
+def test_a_device_that_uses_the_vacuum_speed_measures_too_long() -> None:
     ranges = np.array([[1000.0, 1200.0, np.nan], [0.0, np.nan, np.nan], [900.0, 0.0, np.nan]])
     from_m = np.array([1500.0, 1500.0, 1400.0])
     to_m = np.array([[520.0, 330.0, np.nan], [np.nan, np.nan, np.nan], [510.0, np.nan, np.nan]])
@@ -162,7 +162,7 @@ def test_a_device_that_counts_with_c_says_too_much() -> None:
 # --- bending --------------------------------------------------------------------------------------------------------
 
 
-def test_ardc_is_the_formula_sheets_number() -> None:
+def test_ardc_bending_matches_the_formula_sheet() -> None:
     air = air_of(refraction="ardc")
     bent = air.bending(np.radians(one(20.0)), one(3000.0), one(200.0))
     assert 1e6 * bent[0] == pytest.approx(10.872107, abs=6e-7)
@@ -171,13 +171,13 @@ def test_ardc_is_the_formula_sheets_number() -> None:
 @pytest.mark.parametrize(
     ("nadir_deg", "sheet_urad"), [(20.0, 11.6109), (45.0, 31.906), (60.0, 55.285), (75.0, 119.377)]
 )
-def test_rays_through_layers_are_the_formula_sheets(nadir_deg: float, sheet_urad: float) -> None:
+def test_layer_bending_matches_the_formula_sheet(nadir_deg: float, sheet_urad: float) -> None:
     # visible light, C = 78.83 ppm K / hPa
     bent = bending_by_layers(np.radians(one(nadir_deg)), one(3000.0), one(200.0), 78.83)
     assert 1e6 * bent[0] == pytest.approx(sheet_urad, abs=6e-4)
 
 
-def test_spherical_bending_knows_the_wavelength() -> None:
+def test_spherical_bending_depends_on_the_wavelength() -> None:
     angle = np.radians(one(20.0))
     infrared = air_of(1064.0, refraction="spherical").bending(angle, one(3000.0), one(200.0))
     assert 1e6 * infrared[0] == pytest.approx(11.4777, abs=0.001)
@@ -187,7 +187,7 @@ def test_spherical_bending_knows_the_wavelength() -> None:
 
 @pytest.mark.parametrize("height_m", [300.0, 3000.0, 9000.0])
 @pytest.mark.parametrize("nadir_deg", [5.0, 45.0, 79.0])
-def test_rays_agree_with_another_integration_of_the_ray(height_m: float, nadir_deg: float) -> None:
+def test_ray_bending_matches_another_integration(height_m: float, nadir_deg: float) -> None:
     # the vector ray equation d/ds (n t) = ∇n in the plane, by an adaptive integrator
     radius_m, constant = 6_371_000.0, 78.83
 
@@ -220,7 +220,7 @@ def test_rays_agree_with_another_integration_of_the_ray(height_m: float, nadir_d
 
 
 @pytest.mark.parametrize("refraction", ["ardc", "spherical"])
-def test_beams_bend_towards_the_vertical_by_the_bending(refraction: str) -> None:
+def test_beams_bend_towards_the_vertical(refraction: str) -> None:
     rng = np.random.default_rng(3)
     nadir, heading = np.arccos(rng.uniform(np.cos(1.2), 1.0, 500)), rng.uniform(0, 2 * np.pi, 500)
     direction = np.stack([np.sin(nadir) * np.sin(heading), np.sin(nadir) * np.cos(heading), -np.cos(nadir)], axis=1)
@@ -237,7 +237,7 @@ def test_beams_bend_towards_the_vertical_by_the_bending(refraction: str) -> None
 
 
 @pytest.mark.parametrize("refraction", ["ardc", "spherical"])
-def test_beams_that_no_survey_uses_stay_finite(refraction: str) -> None:
+def test_unusual_beams_stay_finite(refraction: str) -> None:
     air = air_of(refraction=refraction)
     direction = np.array([[0, 0, -1.0], [1e-12, 0, -1.0], [1.0, 0, 0], [0, 1.0, 0.01], [0, 0, 1.0], [1, 0, -0.01]])
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
@@ -250,7 +250,7 @@ def test_beams_that_no_survey_uses_stay_finite(refraction: str) -> None:
     np.testing.assert_allclose(below, 0.0, rtol=0, atol=1e-12)
 
 
-def test_without_refraction_nothing_bends() -> None:
+def test_without_refraction_beams_are_straight() -> None:
     air = air_of()
     direction = np.array([[0.6, 0.0, -0.8]])
     assert not air.bends
@@ -262,7 +262,7 @@ def test_without_refraction_nothing_bends() -> None:
 # --- dimming --------------------------------------------------------------------------------------------------------
 
 
-def test_visibility_is_where_two_percent_of_contrast_are_left() -> None:
+def test_visibility_is_the_distance_of_two_percent_contrast() -> None:
     # there and back over half the visibility is once over all of it, at 550 nm
     for sight_km in (3.0, 23.0, 80.0):
         air = air_of(550.0, visibility_km=sight_km)

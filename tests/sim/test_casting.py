@@ -36,7 +36,7 @@ def random_rays(
 # --- ground ---------------------------------------------------------------------------------------------------------
 
 
-def test_a_slope_is_met_where_its_plane_is() -> None:
+def test_a_slope_is_hit_on_its_plane() -> None:
     """Close to the origin the ellipsoid differs from the site's plane by d²/2R alone: 0.8 mm at 100 m."""
     scene = scene_of("height_m = 450\nslope_percent = 20\nslope_towards_deg = 90\ncell_m = 2")
     origin, direction = random_rays(1, 500, half_m=50.0, lift_m=100.0)
@@ -62,7 +62,7 @@ def ray_above(scene: Scene, origin: FloatArray, direction: FloatArray, at: float
 
 
 @pytest.mark.parametrize("cell_m", [0.7, 5.0, 60.0])
-def test_hills_are_met_where_a_root_finder_meets_the_bilinear_ground(cell_m: float) -> None:
+def test_hills_are_hit_where_a_root_finder_meets_the_bilinear_ground(cell_m: float) -> None:
     scene = scene_of(f"height_m = 450\nrelief_m = 120\nwavelength_m = 150\nslope_percent = 5\ncell_m = {cell_m}")
     origin, direction = random_rays(2, 60)
     found = cast(scene, origin, direction)
@@ -86,7 +86,7 @@ def test_ranges_end_on_the_bilinear_ground() -> None:
     assert np.abs(hit[met, 2] - scene.site_z(hit[met, 0], hit[met, 1])).max() < 1e-9
 
 
-def test_what_points_up_or_leaves_the_area_meets_nothing() -> None:
+def test_beams_that_point_up_or_leave_the_area_hit_nothing() -> None:
     scene = scene_of("height_m = 450\nrelief_m = 30")
     origin = np.array(
         [[0.0, 0.0, 900.0], [0.0, 0.0, 900.0], [5000.0, 0.0, 900.0], [0.0, 0.0, 400.0], [0.0, 0.0, 900.0]]
@@ -191,7 +191,7 @@ def nearest_triangle(origin: FloatArray, direction: FloatArray, triangles: Float
 
 
 @pytest.mark.parametrize("center_m", [(0.0, 0.0), FAR_M])
-def test_buildings_are_met_where_their_triangles_are(center_m: tuple[float, float]) -> None:
+def test_buildings_are_hit_on_their_triangles(center_m: tuple[float, float]) -> None:
     scene = scene_of(houses_at(center_m), 60.0, center_m)
     x, y = center_m
     tan = [np.tan(np.radians(pitch)) for pitch in (38.0, 27.0, 45.0)]
@@ -212,7 +212,7 @@ def test_buildings_are_met_where_their_triangles_are(center_m: tuple[float, floa
     assert (found.surface[built, 0] == WALL).mean() > 0.1
 
 
-def test_a_roof_s_incidence_is_its_pitch_from_above() -> None:
+def test_incidence_on_a_roof_seen_from_above_is_its_pitch() -> None:
     scene = scene_of(houses_at((0.0, 0.0)))
     along = np.radians(33.0)
     right = np.array([np.cos(along), -np.sin(along)])
@@ -222,7 +222,7 @@ def test_a_roof_s_incidence_is_its_pitch_from_above() -> None:
     np.testing.assert_allclose(np.degrees(found.incidence_rad[:, 0]), 38.0, rtol=0, atol=1e-3)
 
 
-def test_a_footprint_over_an_edge_gives_two_echoes_that_share_the_light() -> None:
+def test_a_footprint_across_an_edge_gives_two_echoes_that_share_the_light() -> None:
     """Straight down beside a wall 9 m high: four rim rays of a tenth each, one or two of them on the roof."""
     scene = scene_of(
         "height_m = 450\n[[terrain.building]]\ncenter_m = [0, 0]\nsize_m = [40, 40]\nroof = 'flat'\neaves_m = 9"
@@ -251,7 +251,7 @@ trees_per_ha = 300
 """
 
 
-def test_several_echoes_of_trees_come_in_order_and_ground_comes_last() -> None:
+def test_echoes_of_trees_come_in_order_before_the_ground() -> None:
     scene = scene_of(FOREST)
     origin, direction = random_rays(5, 20_000)
     pulse_m = 0.45
@@ -267,7 +267,7 @@ def test_several_echoes_of_trees_come_in_order_and_ground_comes_last() -> None:
     assert set(last[count > 0]) == {GROUND, LEAVES}
 
 
-def test_what_leaves_return_the_ground_below_lacks() -> None:
+def test_leaves_and_ground_share_the_light() -> None:
     """Each leaf echo is its share of the light times a reflectance of 0.35 … 0.6; the ground gets what is left."""
     origin, direction = random_rays(6, 20_000)
     wooded = cast(scene_of(FOREST), origin, direction, slots=30, pulse_m=0.0)
@@ -283,7 +283,7 @@ def test_what_leaves_return_the_ground_below_lacks() -> None:
     assert left.min() >= 0.03 - 1e-9
 
 
-def test_light_that_passes_a_crown_fades_after_beer_and_lambert() -> None:
+def test_transmission_through_a_crown_follows_beer_and_lambert() -> None:
     """Through the middle of a crown of height h: no interception with probability exp(−rate · h)."""
     scene = scene_of(FOREST)
     apart = np.linalg.norm(scene.trees[:, np.newaxis, :2] - scene.trees[:, :2], axis=2)
@@ -306,7 +306,7 @@ def test_light_that_passes_a_crown_fades_after_beer_and_lambert() -> None:
     assert abs((depth < half).mean() - 0.5) < 0.02
 
 
-def test_a_wire_is_met_where_it_hangs() -> None:
+def test_a_wire_is_hit_on_its_catenary() -> None:
     """Between masts 20 m high and 200 m apart, sagging 4 m: 16 m above the ground in the middle, 17 m halfway to it."""
     scene = scene_of(
         "height_m = 450\n[[terrain.wire]]\nfrom_m = [-100, 0]\nto_m = [100, 0]\n"
@@ -333,7 +333,7 @@ def test_a_wire_is_met_where_it_hangs() -> None:
 
 
 @pytest.mark.parametrize(("time_s", "east_m"), [(0.0, -50.0), (3.0, -20.0), (10.0, 50.0), (13.0, 20.0), (20.0, -50.0)])
-def test_a_car_is_where_it_is_at_the_time(time_s: float, east_m: float) -> None:
+def test_a_car_is_at_its_place_at_each_time(time_s: float, east_m: float) -> None:
     """100 m at 10 m/s, there and back in 20 s; 4.4 m long, 1.5 m high."""
     scene = scene_of("height_m = 450\n[[terrain.car]]\nfrom_m = [-50, 8]\nto_m = [50, 8]\nspeed_mps = 10")
     east = np.arange(-60.0, 60.0, 0.05) + 0.01
@@ -345,7 +345,7 @@ def test_a_car_is_where_it_is_at_the_time(time_s: float, east_m: float) -> None:
     np.testing.assert_allclose(found.range_m[on_car, 0], 900.0 - 450.0 - 1.5, rtol=0, atol=1e-3)
 
 
-def test_most_pulses_do_not_come_back_from_water_and_fewer_at_a_slant() -> None:
+def test_few_pulses_return_from_water_and_fewer_at_oblique_incidence() -> None:
     """A tenth near nadir; at angle i exp(−tan² i / 0.0235) of that (slopes of Cox and Munk)."""
     scene = scene_of(
         "height_m = 450\nslope_percent = 3\n[[terrain.water]]\ncenter_m = [0, 0]\nradius_m = 80\nreturns = 0.1"
@@ -389,7 +389,7 @@ def test_markings_lie_along_the_edges_and_in_dashes_in_the_middle() -> None:
     assert painted.min() > 3 * asphalt.max()
 
 
-def test_a_crossing_bears_no_paint_and_a_road_can_have_none() -> None:
+def test_a_crossing_has_no_paint_and_a_road_may_have_none() -> None:
     scene = scene_of(
         "height_m = 450\n[[terrain.road]]\npoints_m = [[-90, 0], [90, 0]]\n"
         "[[terrain.road]]\npoints_m = [[0, -90], [0, 90]]\n[[terrain.road]]\npoints_m = [[-90, 60], [90, 60]]\n"

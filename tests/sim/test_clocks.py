@@ -14,7 +14,7 @@ def test_an_oscillator_runs_fast_by_its_offset_and_drift() -> None:
     np.testing.assert_allclose(rate / 1e7 - 1, [2.0e-6 + 0.0005e-6, 2.0e-6 + 1.0005e-6], rtol=0, atol=1e-12)
 
 
-def test_the_wave_returns_to_nothing_after_its_period() -> None:
+def test_the_periodic_error_is_zero_after_its_period() -> None:
     oscillator = Oscillator(1_000_000, OscillatorTable(wander_ppm=0.5))
     np.testing.assert_allclose(oscillator.phase(np.array([600.0])), 600e6, rtol=0, atol=0.3e3)
     half = oscillator.phase(np.array([300.0]))[0] - 300e6
@@ -27,12 +27,12 @@ def test_time_of_is_the_inverse_of_the_phase() -> None:
     np.testing.assert_allclose(oscillator.phase(oscillator.time_of(ticks)), ticks, rtol=0, atol=2e-5)
 
 
-def test_ticks_are_whole_and_begin_where_the_plan_says() -> None:
+def test_ticks_are_integers_and_begin_where_the_plan_states() -> None:
     oscillator = Oscillator(1000, OscillatorTable(ticks_at_start=4_294_967_290))
     assert oscillator.ticks(np.array([0.0, 0.0059, 0.006])).tolist() == [4_294_967_290, 4_294_967_295, 4_294_967_296]
 
 
-def test_edges_are_the_same_for_everybody_and_however_they_are_asked() -> None:
+def test_edges_do_not_depend_on_how_they_are_requested() -> None:
     one = PulsePerSecond(PpsTable(jitter_ns=50.0), 7, "main", noise=True)
     other = PulsePerSecond(PpsTable(jitter_ns=50.0), 7, "main", noise=True)
     first = one.edges(np.arange(3))
@@ -42,19 +42,19 @@ def test_edges_are_the_same_for_everybody_and_however_they_are_asked() -> None:
     assert not np.array_equal(first, PulsePerSecond(PpsTable(), 8, "main", noise=True).edges(np.arange(3)))
 
 
-def test_the_latest_edge_is_the_one_that_has_come() -> None:
+def test_the_latest_edge_is_the_last_one_that_has_arrived() -> None:
     pps = PulsePerSecond(PpsTable(jitter_ns=1000.0), 1, "main", noise=True)
     edges = pps.edges(np.arange(10))
     np.testing.assert_array_equal(pps.latest(edges), np.arange(10))
     np.testing.assert_array_equal(pps.latest(edges - 1e-9), np.arange(10) - 1)
 
 
-def test_no_noise_no_jitter() -> None:
+def test_without_noise_edges_have_no_jitter() -> None:
     pps = PulsePerSecond(PpsTable(jitter_ns=1000.0), 1, "main", noise=False)
     np.testing.assert_array_equal(pps.edges(np.arange(10)), np.arange(10))
 
 
-def test_a_purpose_has_its_own_numbers() -> None:
+def test_each_purpose_has_its_own_random_numbers() -> None:
     draws = {generator(1, "imu", name).random() for name in ("main", "second")} | {generator(2, "imu", "main").random()}
     assert len(draws) == 3
     assert generator(1, "imu", "main").random() == generator(1, "imu", "main").random()

@@ -26,7 +26,7 @@ height_m = 1000
 
 
 def plan(*faults: dict[str, Any]) -> Plan:
-    """A plan with these faults."""
+    """Return a plan with these faults."""
     return parse_plan(PLAN, Path()).changed({"fault": list(faults)})
 
 
@@ -36,11 +36,11 @@ def units(source: str = "scanner/left", count: int = 1000) -> list[WireUnit]:
 
 
 def flown(*faults: dict[str, Any], source: str = "scanner/left") -> list[WireUnit]:
-    """What is left of them."""
+    """Return the units that remain."""
     return list(with_faults(plan(*faults), iter(units(source))))
 
 
-def test_another_sources_units_pass_as_they_are() -> None:
+def test_units_of_other_sources_are_unchanged() -> None:
     assert flown({"source": "imu/main", "kind": "silent", "at_s": 0, "for_s": 100}) == units()
 
 
@@ -50,17 +50,17 @@ def test_a_silent_source_sends_nothing_in_its_window(kind: str) -> None:
     assert left == [unit for unit in units() if not 2 <= unit.time_s < 5]
 
 
-def test_a_share_of_the_units_is_hit() -> None:
+def test_the_given_share_of_units_is_affected() -> None:
     left = flown({"source": "scanner/left", "kind": "silent", "at_s": 0, "for_s": 10, "share": 0.3})
     assert 640 < len(left) < 760  # binomial of 1000 with 0.7: four sigma
 
 
-def test_a_fault_without_length_hits_one_unit() -> None:
+def test_a_fault_without_duration_affects_one_unit() -> None:
     left = flown({"source": "scanner/left", "kind": "silent", "at_s": 2.001})
     assert [unit for unit in units() if unit not in left] == [units()[201]]
 
 
-def test_late_units_come_later_and_let_others_pass() -> None:
+def test_late_units_arrive_after_later_ones() -> None:
     late = flown({"source": "scanner/left", "kind": "late", "at_s": 2, "for_s": 1, "delay_s": 0.255})
     assert Counter(unit.data for unit in late) == Counter(unit.data for unit in units())
     assert [unit.time_s for unit in late] == sorted(unit.time_s for unit in late)
@@ -94,12 +94,12 @@ def test_reordered_units_change_places() -> None:
 
 
 def edges(*faults: dict[str, Any]) -> list[float]:
-    """Times of ten edges."""
+    """Return times of ten edges."""
     pulses = (WireUnit(float(second), "pps/main", b"") for second in range(10))
     return [unit.time_s for unit in with_faults(plan(*faults), pulses)]
 
 
-def test_lost_edges_are_lost_to_the_host() -> None:
+def test_lost_edges_do_not_reach_the_host() -> None:
     assert edges({"source": "pps/main", "kind": "pps_lost", "at_s": 2.5, "for_s": 3}) == [0, 1, 2, 6, 7, 8, 9]
 
 
@@ -118,7 +118,7 @@ def test_spurious_edges_stand_between_the_true_ones() -> None:
     assert times == sorted(times)
 
 
-def test_faults_of_one_source_add_up_in_their_order() -> None:
+def test_faults_of_one_source_are_applied_in_their_order() -> None:
     silent = {"source": "scanner/left", "kind": "silent", "at_s": 2, "for_s": 3}
     twice = {"source": "scanner/left", "kind": "duplicated", "at_s": 4, "for_s": 3}
     assert len(flown(silent, twice)) == 1000 - 300 + 200
@@ -137,11 +137,11 @@ def bad() -> Iterator[tuple[dict[str, Any], str]]:
 
 
 @pytest.mark.parametrize(("fault", "words"), list(bad()))
-def test_nonsense_is_refused(fault: dict[str, Any], words: str) -> None:
+def test_impossible_faults_are_refused(fault: dict[str, Any], words: str) -> None:
     with pytest.raises(PlanError, match=words):
         check_faults(plan(fault).tables)
 
 
-def test_an_unknown_fault_names_its_key() -> None:
+def test_error_for_an_unknown_fault_names_its_key() -> None:
     with pytest.raises(PlanError, match=r"^fault\[0\]\.kind: got 'gremlins', want 'silent', "):
         plan({"source": "scanner/left", "kind": "gremlins", "at_s": 0})

@@ -60,7 +60,7 @@ TOP = {
 
 
 def plan(**changes: Any) -> Plan:
-    """The plan with changes."""
+    """Return the plan with changes."""
     return parse_plan(PLAN, Path()).changed(changes)
 
 
@@ -71,7 +71,7 @@ def flown(changed: Plan, stop_s: float = 3.2) -> tuple[VirtualFlight, list[WireU
 
 
 def digest(units: list[WireUnit]) -> dict[str, str]:
-    """Of times and bytes, by source."""
+    """Return a digest of times and bytes by source."""
     sums: dict[str, Any] = defaultdict(hashlib.sha256)
     for unit in units:
         sums[unit.source].update(f"{unit.time_s!r} ".encode() + unit.data)
@@ -80,7 +80,7 @@ def digest(units: list[WireUnit]) -> dict[str, str]:
 
 @pytest.fixture(scope="module")
 def flight_and_units() -> tuple[VirtualFlight, list[WireUnit]]:
-    """The plan as it is."""
+    """Return the flight of the unchanged plan and its units."""
     return flown(plan(scanner={"top": TOP}))
 
 
@@ -112,7 +112,7 @@ def test_an_early_stop_changes_nothing_before_it(flight_and_units: tuple[Virtual
     assert of_gnss[1][: len(of_gnss[0])] == of_gnss[0]
 
 
-def test_positions_of_the_receiver_lie_at_its_antenna(tmp_path: Path) -> None:
+def test_receiver_positions_lie_at_its_antenna(tmp_path: Path) -> None:
     """With everything else exact, the receiver's fix less its lever arm is the body of the truth."""
     changed = plan(flight={"noise": False}, scanner={"left": {"prf_hz": 1000}})
     flight = VirtualFlight(changed, open_truth(changed, tmp_path / "truth.npz"), stop_s=3.2)
@@ -181,7 +181,7 @@ def test_truth_has_a_row_for_every_return(tmp_path: Path) -> None:
         assert (np.diff(truth["trajectory.gps_ns"]) == 5_000_000).all()
 
 
-def test_a_device_without_its_edges_says_so() -> None:
+def test_a_device_without_its_edges_reports_it() -> None:
     fault = {"source": "scanner/left", "kind": "pps_lost", "at_s": 0.5, "for_s": 10.0}
     _, units = flown(plan(fault=[fault]), stop_s=4.0)
     parser = find_driver("scanner", "srep").make_parser(DeviceSettings("scanner/left", {"mirror_factor": 2.0}))
@@ -199,12 +199,12 @@ def test_a_device_without_its_edges_says_so() -> None:
     assert sum(unit.source == "pps/main" for unit in units) == 5  # the host has them all
 
 
-def test_an_unknown_pps_names_the_key() -> None:
+def test_error_for_an_unknown_pps_names_the_key() -> None:
     with pytest.raises(PlanError, match=r"^scanner\.left\.pps: the plan has no \[pps\.second\]"):
         VirtualFlight(plan(scanner={"left": {"pps": "second"}}))
 
 
-def test_a_late_imu_is_in_the_true_calibration_and_only_there() -> None:
+def test_a_late_imu_is_in_the_true_calibration_only() -> None:
     late = plan(imu={"main": {"latency_us": 300.0}})
     assert "imu_latency_us = 300.0" in calibration_text(late, "left", true=True)
     assert "imu_latency_us = 0.0" in calibration_text(late, "left", true=False)

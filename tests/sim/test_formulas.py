@@ -33,7 +33,7 @@ Three = tuple[float, float, float]
 
 
 def radians(first_deg: float, second_deg: float, third_deg: float) -> Three:
-    """Of three angles."""
+    """Convert three angles to radians."""
     return float(np.radians(first_deg)), float(np.radians(second_deg)), float(np.radians(third_deg))
 
 
@@ -53,7 +53,7 @@ class Shot:
     moved_l: Three = (0.0, 0.0, 0.0)
 
     def ground_e(self) -> FloatArray:
-        """(3,) where it lands, through `Mounting`."""
+        """Return the ground point (3,), computed with `Mounting`."""
         omega, phi, kappa = np.degrees(self.boresight).tolist()
         x, y, z = LEVER_ARM_B
         true = ParameterTable(
@@ -70,14 +70,14 @@ class Shot:
         return ground
 
     def pulse(self) -> Pulses:
-        """Through the mirror."""
+        """Return the pulse after its reflection by the mirror."""
         one = np.zeros(1)
         direction = swung_mirror(np.array([self.angle]), 0.0, self.tilt)
         whole = np.zeros(1, np.int64)
         return Pulses(whole, one, whole, np.zeros(1, np.uint16), np.zeros((1, 3)), direction, one)
 
 
-def test_the_point_of_2_1() -> None:
+def test_ground_point_matches_formula_sheet_2_1() -> None:
     shot = Shot(radians(0.21, -0.35, 0.12))
     np.testing.assert_allclose(
         shot.ground_e(), [4297745.87263879, 657512.472772624, 4651743.38727272], rtol=0, atol=2e-8
@@ -101,7 +101,7 @@ ANGLE_RATE = float(np.radians(4200.0))
 
 
 def turned(part: Three, number: int, by: float) -> Three:
-    """One of three angles changed."""
+    """Return the shot with one of three angles changed."""
     values = list(part)
     values[number] += by
     return values[0], values[1], values[2]
@@ -145,7 +145,7 @@ COLUMNS = {  # north, east, down: metres a radian, a metre or a second
 
 
 @pytest.mark.parametrize("name", COLUMNS)
-def test_a_column_of_5_2(name: str) -> None:
+def test_derivatives_match_formula_sheet_5_2(name: str) -> None:
     step = {"range": 1.0, "encoder_latency": 1e-6, "time": 1e-2, "imu_latency": 1e-2}.get(name, 1e-4)
     difference = (CHANGED[name](step).ground_e() - CHANGED[name](-step).ground_e()) / (2 * step)
     to_ned = rot_e_from_ned(np.radians([LAT_DEG]), np.radians([LON_DEG]))[0].T

@@ -185,7 +185,7 @@ def disciplined_times(flight: VirtualFlight, rows: NDArray[np.void]) -> FloatArr
 
 
 def misses(flown: Flown, points_e: FloatArray) -> FloatArray:
-    """Distances from the truth."""
+    """Return the distances from the truth."""
     assert np.isfinite(points_e).all()
     distances: FloatArray = np.linalg.norm(points_e - flown.truth["left.point_e"], axis=1)
     return distances
@@ -209,7 +209,9 @@ def line_points(flown: Flown, theta: FloatArray, direction: FloatArray) -> Float
 
 
 @pytest.mark.parametrize(("refraction", "bending"), [("ardc", ardc), ("spherical", flat_layers)])
-def test_through_air_that_slows_and_bends(tmp_path: Path, refraction: str, bending: Bending) -> None:
+def test_points_are_recovered_through_air_that_slows_and_bends(
+    tmp_path: Path, refraction: str, bending: Bending
+) -> None:
     scanner = {"kind": "monogon", "half_angle_deg": 40.0, "scan_hz": 60.0}
     air = {"ranges": "vacuum", "refraction": refraction}
     line = [{"name": "1", "from_m": [-200, -20], "to_m": [200, 20], "height_m": 2450.0}]  # high: 13 mm at 40°
@@ -228,7 +230,7 @@ def test_through_air_that_slows_and_bends(tmp_path: Path, refraction: str, bendi
 
 
 def heights(points_e: FloatArray) -> FloatArray:
-    """Ellipsoidal."""
+    """Return ellipsoidal heights."""
     x, y, z = points_e.T
     _, _, above_m = TO_GEODETIC.transform(x, y, z)
     return np.asarray(above_m)
@@ -249,7 +251,7 @@ SREP_24_BIT = {"range_quantum_m": 1e-4, "angle_quantum_rad": 2 * 2 * np.pi / 2**
 
 
 @pytest.mark.parametrize("motion", ["sine", "triangle"])
-def test_oscillating_mirror_with_every_error(tmp_path: Path, motion: str) -> None:
+def test_points_of_an_oscillating_mirror_are_recovered_with_every_error(tmp_path: Path, motion: str) -> None:
     true = dict(EVERY_ERROR)
     if motion == "triangle":  # at its turning points nobody knows a derivative by the readings alone
         true |= {"encoder_latency_us": 0.0, "torsion_us2": 0.0}
@@ -263,7 +265,7 @@ def test_oscillating_mirror_with_every_error(tmp_path: Path, motion: str) -> Non
     assert missed.max() <= 2e-3
 
 
-def test_polygon_with_facets_of_their_own_tilt(tmp_path: Path) -> None:
+def test_points_of_a_polygon_are_recovered_with_facet_tilts(tmp_path: Path) -> None:
     true = EVERY_ERROR | {"torsion_us2": 0.0}
     facets = [{"index": 0, "tilt_deg": 0.03}, {"index": 1, "tilt_deg": -0.02}, {"index": 3, "tilt_deg": 0.01}]
     scanner = {"kind": "polygon", "facets": 4, "half_angle_deg": 35.0, "true": true, "facet": facets}
@@ -292,7 +294,7 @@ def mirrored(ray: FloatArray, normal: FloatArray) -> FloatArray:
     return behind
 
 
-def test_monogon_with_every_error(tmp_path: Path) -> None:
+def test_points_of_a_monogon_are_recovered_with_every_error(tmp_path: Path) -> None:
     true = EVERY_ERROR | {"torsion_us2": 0.0}
     scanner = {"kind": "monogon", "half_angle_deg": 50.0, "scan_hz": 60.0, "true": true}
     flown = fly_and_decode(tmp_path, {"scanner": {"left": scanner}})
@@ -320,7 +322,7 @@ def shaft_angle(flown: Flown, scan_hz: float) -> FloatArray:
     return angle
 
 
-def test_nutating_mirror(tmp_path: Path) -> None:
+def test_points_of_a_nutating_mirror_are_recovered(tmp_path: Path) -> None:
     scanner = {"kind": "nutating", "nutation_deg": 7.0, "scan_hz": 30.0, "true": ROUND_ERRORS}
     flown = fly_and_decode(tmp_path, {"scanner": {"left": scanner}})
     gamma, psi = shaft_angle(flown, 30.0), np.radians(7.0)
@@ -332,7 +334,7 @@ def test_nutating_mirror(tmp_path: Path) -> None:
     assert (missed <= bound(flown, **SREP_24_BIT)).all(), missed.max()
 
 
-def test_risley_pair(tmp_path: Path) -> None:
+def test_points_of_a_risley_pair_are_recovered(tmp_path: Path) -> None:
     scanner = {"kind": "risley", "wedge_deg": [10.0, 12.0], "prism_ratio": -0.75, "scan_hz": 40.0, "true": ROUND_ERRORS}
     flown = fly_and_decode(tmp_path, {"scanner": {"left": scanner}})
     gamma = shaft_angle(flown, 40.0)
@@ -381,7 +383,7 @@ SIDEWAYS = [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]  # spin axis forw
 
 
 @pytest.mark.parametrize("dual", [False, True])
-def test_vlp16(tmp_path: Path, dual: bool) -> None:
+def test_points_of_a_vlp16_are_recovered(tmp_path: Path, dual: bool) -> None:
     scanner = {"kind": "vlp16", "scan_hz": 10.0, "true": SPINNING_ERRORS, "installation": SIDEWAYS, "dual_return": dual}
     scanner |= {"range_min_m": 1.0, "range_max_m": 120.0, "reference_range_m": 60.0}
     flown = fly_and_decode(tmp_path, LOW_AND_SLOW | {"scanner": {"left": scanner}}, stop_s=1.3)
@@ -402,7 +404,7 @@ def vlp16_quanta(pulse: NDArray[np.int64], groups: int) -> FloatArray:
     return np.where(last, 1.0 + 2.0 * share, 1.0)
 
 
-def test_os1(tmp_path: Path) -> None:
+def test_points_of_an_os1_are_recovered(tmp_path: Path) -> None:
     scanner = {"kind": "os1", "scan_hz": 10.0, "true": SPINNING_ERRORS, "installation": SIDEWAYS, "serial": "1"}
     scanner |= {"range_min_m": 1.0, "range_max_m": 120.0, "reference_range_m": 60.0}
     flown = fly_and_decode(tmp_path, LOW_AND_SLOW | {"scanner": {"left": scanner}}, stop_s=1.3)

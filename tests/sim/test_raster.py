@@ -37,7 +37,7 @@ def pixel_centers(transform: Affine, count: int) -> tuple[FloatArray, FloatArray
 
 
 def write(folder: Path, half_m: float = 400.0, pixel_m: float = 5.0, **others: Any) -> None:
-    """``dem.tif`` around the site's origin."""
+    """Write ``dem.tif`` around the site's origin."""
     transform = Affine(pixel_m, 0.0, CENTER[0] - half_m, 0.0, -pixel_m, CENTER[1] + half_m)
     count = int(2 * half_m / pixel_m)
     values = heights_at(*pixel_centers(transform, count))
@@ -50,13 +50,13 @@ def write(folder: Path, half_m: float = 400.0, pixel_m: float = 5.0, **others: A
 
 
 def scene_in(folder: Path, text: str = "", corners: FloatArray = SQUARE) -> Scene:
-    """The scene over the raster."""
+    """Return the scene on the raster."""
     plan = plan_of(f"raster = 'dem.tif'\nheight_m = 480\n{text}", folder)
     return build_scene(plan, Site.at(*plan.tables.flight.origin_deg), corners)
 
 
 def refused(folder: Path, text: str = "", corners: FloatArray = SQUARE) -> str:
-    """The one line that says why not."""
+    """Return the single error line."""
     with pytest.raises(PlanError) as error:
         scene_in(folder, text, corners)
     assert "\n" not in str(error.value)
@@ -64,7 +64,7 @@ def refused(folder: Path, text: str = "", corners: FloatArray = SQUARE) -> str:
 
 
 @pytest.mark.parametrize("rotated", [False, True])
-def test_heights_are_those_of_the_map_at_every_node(tmp_path: Path, rotated: bool) -> None:
+def test_heights_match_the_map_at_every_node(tmp_path: Path, rotated: bool) -> None:
     write(tmp_path)
     if rotated:
         cos, sin = 5.0 * np.cos(np.radians(30.0)), 5.0 * np.sin(np.radians(30.0))
@@ -86,7 +86,7 @@ def test_heights_are_those_of_the_map_at_every_node(tmp_path: Path, rotated: boo
     np.testing.assert_allclose(scene.ground_m(east, north), height_m, rtol=0, atol=1e-9)
 
 
-def test_far_from_the_origin_places_are_found_at_their_height(tmp_path: Path) -> None:
+def test_places_far_from_the_origin_are_found_at_their_height(tmp_path: Path) -> None:
     """At 8 km, 300 m of height move a place on the map by 0.4 m: 40 mm on a slope of a tenth."""
     east_m = 8000.0
     transform = Affine(10.0, 0.0, CENTER[0] + east_m - 600.0, 0.0, -10.0, CENTER[1] + 600.0)
@@ -104,13 +104,13 @@ def test_far_from_the_origin_places_are_found_at_their_height(tmp_path: Path) ->
     np.testing.assert_allclose(height_m, 800.0 + 0.1 * (found - CENTER[0] - east_m), rtol=0, atol=1e-5)
 
 
-def test_a_raster_that_is_not_there_or_no_raster(tmp_path: Path) -> None:
+def test_a_missing_or_unreadable_raster_is_refused(tmp_path: Path) -> None:
     assert refused(tmp_path).startswith(f"terrain.raster: the file {tmp_path / 'dem.tif'} does not exist; give")
     (tmp_path / "dem.tif").write_text("no raster")
     assert refused(tmp_path).startswith(f"terrain.raster: {tmp_path / 'dem.tif'} cannot be read: ")
 
 
-def test_bands_that_share_blocks_too_large_to_read_are_refused(tmp_path: Path) -> None:
+def test_rasters_with_blocks_too_large_to_read_are_refused(tmp_path: Path) -> None:
     profile = {"crs": CRS, "transform": Affine(5.0, 0.0, CENTER[0], 0.0, -5.0, CENTER[1]), "SPARSE_OK": True}
     blocks = {"tiled": True, "blockxsize": 512, "blockysize": 512, "interleave": "pixel"}
     with rasterio.open(
@@ -122,7 +122,7 @@ def test_bands_that_share_blocks_too_large_to_read_are_refused(tmp_path: Path) -
     )
 
 
-def test_another_crs_is_named_with_the_one_that_is_wanted(tmp_path: Path) -> None:
+def test_error_for_another_crs_names_the_required_one(tmp_path: Path) -> None:
     write(tmp_path, crs="EPSG:25832")
     assert (
         refused(tmp_path)
@@ -135,21 +135,21 @@ def test_another_crs_is_named_with_the_one_that_is_wanted(tmp_path: Path) -> Non
     )
 
 
-def test_a_compound_crs_is_asked_for_its_horizontal_part(tmp_path: Path) -> None:
+def test_a_compound_crs_is_compared_by_its_horizontal_part(tmp_path: Path) -> None:
     write(tmp_path)
     plan = plan_of("raster = 'dem.tif'", tmp_path).changed({"flight": {"crs": "EPSG:32632+7837"}})
     scene = build_scene(plan, Site.at(47.5, 8.9), SQUARE)
     assert scene.ground_m(np.zeros(1), np.zeros(1))[0] == pytest.approx(500.0, abs=0.01)
 
 
-def test_a_crs_that_nobody_knows_is_the_flight_s_mistake(tmp_path: Path) -> None:
+def test_an_unknown_crs_is_reported_for_the_flight(tmp_path: Path) -> None:
     write(tmp_path)
     plan = plan_of("raster = 'dem.tif'", tmp_path).changed({"flight": {"crs": "EPSG:0"}})
     with pytest.raises(PlanError, match=r"^flight\.crs: PROJ does not know 'EPSG:0'; write it like EPSG:25832$"):
         build_scene(plan, Site.at(47.5, 8.9), SQUARE)
 
 
-def test_a_raster_too_small_names_the_corner_it_does_not_reach(tmp_path: Path) -> None:
+def test_error_for_a_raster_that_is_too_small_names_the_missing_corner(tmp_path: Path) -> None:
     write(tmp_path, half_m=250.0)
     assert "does not reach the south-west corner at" in refused(tmp_path)
     write(tmp_path)
@@ -157,7 +157,7 @@ def test_a_raster_too_small_names_the_corner_it_does_not_reach(tmp_path: Path) -
 
 
 @pytest.mark.parametrize("nothing", [-9999.0, np.nan])
-def test_a_hole_is_named_with_its_place(tmp_path: Path, nothing: float) -> None:
+def test_error_for_a_hole_gives_its_place(tmp_path: Path, nothing: float) -> None:
     def pierced(values: FloatArray) -> FloatArray:
         values[60, 100] = nothing
         return values
@@ -178,6 +178,6 @@ def test_holes_outside_the_area_do_no_harm(tmp_path: Path) -> None:
     assert np.isfinite(scene_in(tmp_path).ground.z).all()
 
 
-def test_without_rasterio_it_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_rasterio_the_error_names_the_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rasterio", None)
     assert "pip install '.[raster]'" in refused(tmp_path)

@@ -9,7 +9,7 @@ from swath.sim.site import Site, e_from_geodetic, geodetic_from_e, rot_e_from_ne
 LAT, LON = 47.1234567, 8.7
 
 
-def test_earth_centred_coordinates_are_those_of_the_formula_sheet() -> None:
+def test_earth_centred_coordinates_match_the_formula_sheet() -> None:
     xyz = e_from_geodetic(np.radians([LAT]), np.radians([LON]), np.array([512.3]))
     np.testing.assert_allclose(xyz[0], [4297959.983892308, 657680.2964883694, 4651489.774063125], rtol=0, atol=1e-6)
     lat, lon, height = geodetic_from_e(xyz)
@@ -17,7 +17,7 @@ def test_earth_centred_coordinates_are_those_of_the_formula_sheet() -> None:
     np.testing.assert_allclose(height, 512.3, rtol=0, atol=1e-8)
 
 
-def test_north_east_down_are_those_of_the_formula_sheet() -> None:
+def test_north_east_down_axes_match_the_formula_sheet() -> None:
     rotation = rot_e_from_ned(np.radians([LAT]), np.radians([LON]))[0]
     expected = [
         [-0.7243895948, -0.1512608202, -0.6725919113],
@@ -37,7 +37,7 @@ def test_the_site_frame_points_east_north_and_up() -> None:
     np.testing.assert_allclose(site.site_from_e(site.e_from_site(points)), points, rtol=0, atol=2e-9)
 
 
-def test_ground_points_have_the_height_they_were_asked_for() -> None:
+def test_ground_points_have_their_requested_height() -> None:
     site = Site.at(LAT, LON)
     east, north = np.array([0.0, 2e4, -4e4]), np.array([0.0, 3e4, 1e4])
     points = site.site_from_ground(east, north, np.array([450.0, 450.0, 1200.0]))

@@ -47,7 +47,7 @@ def resolved(units: list[WireUnit], tick_hz: int, about_m: tuple[float, float]) 
 
 
 @pytest.mark.parametrize("prf_hz", [50_000.0, 333_333.3, 900_000.0])
-def test_apparent_ranges_lead_back_to_their_pulse(prf_hz: float) -> None:
+def test_apparent_ranges_are_assigned_to_their_pulse(prf_hz: float) -> None:
     table = scanner(zone="apparent", prf_hz=prf_hz, return_slots=3)
     about_m = (1000.0, 1000.0 + 0.9 * C_MPS / (2 * prf_hz))  # less than a zone, so that a reader can tell
     n = 3000
@@ -90,7 +90,7 @@ def test_of_more_echoes_than_slots_the_latest_are_lost_and_counted() -> None:
     assert ranges == [0, 0, round(0.2 * unambiguous_m * 1e4), 0, 0, 0]
 
 
-def test_echoes_of_the_last_pulses_stand_in_the_last_record() -> None:
+def test_echoes_of_the_last_pulses_are_in_the_last_record() -> None:
     table = scanner(zone="apparent", prf_hz=500_000.0, oscillator={})
     pulses = LineHead(table, "left").pulses(0.0, 4e-6)
     range_m = np.zeros((2, 3))

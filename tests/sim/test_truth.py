@@ -9,7 +9,7 @@ import numpy as np
 from swath.sim.truth import POSE_TRUTH_DTYPE, RETURN_TRUTH_DTYPE, TruthWriter
 
 
-def test_pieces_come_back_as_whole_columns(tmp_path: Path) -> None:
+def test_pieces_are_read_back_as_whole_columns(tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
     rows = np.zeros(1000, RETURN_TRUTH_DTYPE)
     rows["point_e"], rows["pulse"], rows["surface"] = rng.normal(size=(1000, 3)), np.arange(1000), 4
@@ -38,7 +38,7 @@ def test_the_same_rows_give_the_same_file(tmp_path: Path) -> None:
     assert contents[0] == contents[1]
 
 
-def test_an_abandoned_truth_leaves_nothing(tmp_path: Path) -> None:
+def test_an_abandoned_truth_file_is_removed(tmp_path: Path) -> None:
     writer = TruthWriter(tmp_path / "truth.npz", {"trajectory": POSE_TRUTH_DTYPE})
     writer.add("trajectory", np.ones(5, POSE_TRUTH_DTYPE))
     writer.abandon()

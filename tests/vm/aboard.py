@@ -33,7 +33,7 @@ AS_THE_SERVICE = (
 
 
 def wait_until(condition: Callable[[], object], what: str) -> None:
-    """Wait for something to become true; fails with its name."""
+    """Wait until something becomes true; fail with its name."""
     deadline_s = time.monotonic() + WAIT_S
     while not condition():
         if time.monotonic() > deadline_s:
@@ -42,14 +42,14 @@ def wait_until(condition: Callable[[], object], what: str) -> None:
 
 
 def sh(command: str) -> str:
-    """Run a line of shell; its words."""
+    """Run a line of shell; return its output."""
     found = subprocess.run(["sh", "-c", command], capture_output=True, text=True, check=False)
     assert found.returncode == 0, f"{command}: {found.stdout}{found.stderr}"
     return found.stdout
 
 
 def say(text: str) -> None:
-    """To the host's test."""
+    """Print a line for the host's test."""
     sys.stdout.write(text + "\n")
     sys.stdout.flush()
 
@@ -94,15 +94,15 @@ class Recorder:
         self._notify = notify  # what else it says, nobody reads: it does not wait for that
 
     def words(self) -> str:
-        """What it has said."""
+        """Return its output."""
         return self._words.read_text()
 
     def wait_said(self, text: str, times: int = 1) -> None:
-        """Until it has said something so many times."""
+        """Wait until its output contains a text so many times."""
         wait_until(lambda: self.words().count(text) >= times, f"{times} times {text!r} in: {self.words()}")
 
     def stop(self) -> None:
-        """End it, which ends well."""
+        """End it; it must exit without error."""
         self.process.send_signal(signal.SIGTERM)
         status = self.process.wait(WAIT_S)
         assert status == 0, f"status {status}: {self.words()}"

@@ -38,7 +38,7 @@ packet_counter = "SAMPLE.packet_counter"
 
 
 def imu(name: str, channel: str, rate_hz: int, options: str = "") -> str:
-    """[imu.<name>] on an interface."""
+    """Return an [imu.<name>] table for an interface."""
     WORK.mkdir(parents=True, exist_ok=True)
     dbc = shutil.copy(TREE / "fixtures/config/imu.dbc", WORK)  # the project may lie where only root looks
     return IMU.format(name=name, channel=channel, rate_hz=rate_hz, dbc=dbc, options=options)
@@ -65,7 +65,7 @@ class Bus:
             time.sleep(0.001)
 
     def try_frame(self, frame: bytes) -> bool:
-        """The same; False where no queue takes it."""
+        """Send a frame; return False if no queue accepts it."""
         try:
             self._socket.send(frame)
         except OSError as error:
@@ -113,17 +113,17 @@ def send_samples(buses: list[Bus], rate_hz: int, count: int, first: int = 0, to:
 
 
 def received(channel: str) -> int:
-    """Frames that an interface has handed on."""
+    """Return the number of frames that an interface has received."""
     return int(Path(f"/sys/class/net/{channel}/statistics/rx_packets").read_text())
 
 
 def listening(recorder: Recorder, times: int = 1) -> None:
-    """Until the recorder has opened interfaces so many times."""
+    """Wait until the recorder has opened interfaces so many times."""
     recorder.wait_said("device_opened", times)
 
 
 def make_vcan(mtu: int = 16) -> None:
-    """vcan0, up."""
+    """Make vcan0 and set it up."""
     sh(f"modprobe -a vcan can_raw; ip link add vcan0 type vcan; ip link set vcan0 mtu {mtu} up")
 
 
@@ -199,12 +199,12 @@ def set_state(state: str) -> None:
 
 
 def wait_state(state: str) -> None:
-    """Until the kernel says this of the controller."""
+    """Wait until the kernel reports this state of the controller."""
     wait_until(lambda: f" state {state} " in sh("ip -details link show can0"), state)
 
 
 def send_numbers(bus: Bus, identifier: int) -> list[bytes]:
-    """A hundred frames."""
+    """Send a hundred numbered frames."""
     return [bus.send(identifier, struct.pack("<Q", number)) for number in range(100)]
 
 

@@ -31,7 +31,7 @@ ADJ_STATUS, ADJ_FREQUENCY, ADJ_TICK = 0x0010, 0x0002, 0x4000
 
 
 def sentence(body: str) -> bytes:
-    """NMEA 0183."""
+    """Return an NMEA 0183 sentence with its checksum."""
     check = 0
     for character in body.encode():
         check ^= character
@@ -88,12 +88,12 @@ class _Timex(ctypes.Structure):
 
 
 def raw_ns() -> int:
-    """CLOCK_MONOTONIC_RAW."""
+    """Return CLOCK_MONOTONIC_RAW, ns."""
     return time.clock_gettime_ns(time.CLOCK_MONOTONIC_RAW)
 
 
 def adjtimex(modes: int, **fields: int) -> None:
-    """adjtimex(2)."""
+    """Call adjtimex(2)."""
     timex = _Timex(modes=modes, **fields)
     found = ctypes.CDLL(None, use_errno=True).adjtimex(ctypes.byref(timex))
     assert found >= 0, os.strerror(ctypes.get_errno())

@@ -27,7 +27,7 @@ class Moment:
 
     @classmethod
     def here(cls) -> Moment:
-        """This one."""
+        """Return the present moment."""
         user, nice, system, _idle, _waiting, irq, softirq, stolen = Path("/proc/stat").read_text().split()[1:9]
         busy = sum(map(int, (user, nice, system, irq, softirq, stolen)))
         ended = os.times()

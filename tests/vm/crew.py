@@ -71,7 +71,7 @@ def embark(
     environment: dict[str, str] | None = None,
     seconds: float,
 ) -> Machine:
-    """The same, left running."""
+    """Start a program of this package in the machine and leave it running."""
     return start(
         command(module, *arguments, before=before),
         shared=shared,
@@ -83,7 +83,7 @@ def embark(
 
 
 def facts(shared: Path, name: str) -> dict[str, Any]:
-    """What a program in the machine left by `tests.vm.aboard.keep`."""
+    """Return the facts that a program left by `tests.vm.aboard.keep`."""
     value: dict[str, Any] = json.loads((shared / f"{name}.json").read_text())
     return value
 

@@ -89,12 +89,12 @@ class Machine:
 
     @property
     def output(self) -> str:
-        """What the command has said so far."""
+        """Return the output of the command so far."""
         return _text(self.shared / "output")
 
     @property
     def console(self) -> str:
-        """What kernel and systemd have said so far, and qemu."""
+        """Return the output of kernel, systemd and qemu so far."""
         return _text(self.shared / "console")
 
     def said(self, pattern: str, timeout_s: float = BOOT_S) -> re.Match[str]:
@@ -137,7 +137,7 @@ class Machine:
         return Finished(int(status.read_text()), _text(answered / f"{self._asked}.output"), "")
 
     def told(self, command: str, timeout_s: float = BOOT_S) -> str:
-        """The words of a command in a `SERVE` machine, without the last line's end; its status must be 0."""
+        """Return the output of a command in a `SERVE` machine without the last line end; its status must be 0."""
         done = self.shell(command, timeout_s)
         assert done.status == 0, f"status {done.status}: {command}\n{done.output[-8000:]}"
         return done.output.rstrip("\n")

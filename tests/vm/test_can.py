@@ -20,7 +20,7 @@ KVASER = ["-object", "can-bus,id=bus", *["-device", "kvaser_pci,canbus=bus"] * 2
 
 
 def last_status(content: LogContent, source: str) -> dict[str, int]:
-    """The last account of a source."""
+    """Return the last status of a source."""
     status: dict[str, int] = content.messages[f"/status/{source}"][-1][1]
     return status
 
@@ -54,7 +54,7 @@ def decoded(logs: Path, source: str) -> int:
 
 
 @pytest.mark.parametrize("seconds", [20, pytest.param(60, marks=pytest.mark.long)])
-def test_can_1_khz_without_loss_and_with_kernel_stamps(tmp_path: Path, seconds: int) -> None:
+def test_can_at_1_khz_is_recorded_without_loss_and_with_kernel_timestamps(tmp_path: Path, seconds: int) -> None:
     finished = aboard(tmp_path, "aboard_can", "rate", seconds, seconds=seconds + 20)
     content = read_log(tmp_path / "logs")
     assert units(content, "imu/main") == frames_of(range(1000 * seconds), 1000), finished.output
@@ -71,7 +71,7 @@ def test_can_1_khz_without_loss_and_with_kernel_stamps(tmp_path: Path, seconds: 
     assert last_status(content, "imu/main").get("stamp_ambiguous", 0) == 0
 
 
-def test_can_overrun_is_counted_exactly(tmp_path: Path) -> None:
+def test_can_overruns_are_counted_exactly(tmp_path: Path) -> None:
     sent = 20_000  # into a buffer for about 2700
     aboard(tmp_path, "aboard_can", "overrun", sent, seconds=25)
     content = read_log(tmp_path / "logs")
@@ -86,7 +86,7 @@ def test_can_overrun_is_counted_exactly(tmp_path: Path) -> None:
     assert content.events("lost_kernel")
 
 
-def test_can_fd_error_frames_and_interface_down_and_up(tmp_path: Path) -> None:
+def test_can_fd_error_frames_and_an_interface_down_and_up_are_recorded(tmp_path: Path) -> None:
     aboard(tmp_path, "aboard_can", "trouble", seconds=35)
     content = read_log(tmp_path / "logs")
     sent = [bytes.fromhex(frame) for frame in facts(tmp_path, "sent")["frames"]]
@@ -106,7 +106,7 @@ def _without_flags(frame: bytes) -> bytes:
     return frame if len(frame) == 16 else frame[:5] + b"\0" + frame[6:]
 
 
-def test_can_controller_goes_off_the_bus_and_comes_back_by_itself_and_when_it_is_told_to(tmp_path: Path) -> None:
+def test_a_can_controller_recovers_from_bus_off_by_itself_and_on_request(tmp_path: Path) -> None:
     aboard(tmp_path, "aboard_can", "bus_off", MODULES / "can_sim.ko", seconds=30)
     content = read_log(tmp_path / "logs")
     recorded = units(content, "imu/main")
@@ -122,7 +122,7 @@ def test_can_controller_goes_off_the_bus_and_comes_back_by_itself_and_when_it_is
     assert len(content.events("device_lost")) == 1
 
 
-def test_can_two_controllers_200_hz(tmp_path: Path) -> None:
+def test_two_can_controllers_are_recorded_at_200_hz(tmp_path: Path) -> None:
     seconds = 10
     aboard(tmp_path, "aboard_can", "controllers", seconds, qemu=KVASER, seconds=2 * seconds + 30)
     content = read_log(tmp_path / "logs")

@@ -12,7 +12,7 @@ from tests.vm.machine import MODULES
 from tests.vm.seconds import labelled, wrong_seconds
 
 
-def test_clock_stepped_slewed_and_with_a_leap_second_no_wrong_second_and_no_gap(tmp_path: Path) -> None:
+def test_a_clock_stepped_slewed_and_with_a_leap_second_gives_no_wrong_second(tmp_path: Path) -> None:
     aboard(tmp_path, "aboard_time", "wall_clock", MODULES / "pps_sim.ko", seconds=75)
     told = facts(tmp_path, "told")
     assert told["inserted"], "the kernel inserted no leap second"

@@ -152,7 +152,7 @@ class Lines:
 
 
 def aboard(folder: Path, clock_port: int) -> Path:
-    """The overlay of the aircraft's computer."""
+    """Return the overlay of the aircraft's computer."""
     plan = parse_plan(PLAN, Path())
     flight = VirtualFlight(plan, None, 1.0)
     overlay = aircraft.aboard(folder)
@@ -186,7 +186,7 @@ class Ends:
 
 @contextmanager
 def flown(folder: Path, seconds: float) -> Iterator[tuple[machine.Machine, Lines]]:
-    """The flight, to its end; the machine still runs."""
+    """Return the completed flight while the machine still runs."""
     plan, wires, disk = folder / "plan.toml", folder / "wires", machine.make_disk(folder / "disk", 512)
     plan.write_text(PLAN)
     fly = ("sim", "fly", plan, "--wire", "-o", wires, "--seconds", f"{seconds:g}", "--wait", f"{HANGS_S:g}")
@@ -232,7 +232,7 @@ def flown(folder: Path, seconds: float) -> Iterator[tuple[machine.Machine, Lines
 @pytest.mark.parametrize(
     "seconds", [SECONDS, pytest.param(SECONDS_LONG, marks=pytest.mark.long)], ids=["minute", "three minutes"]
 )
-def test_flight_from_the_wires_to_points(
+def test_a_flight_is_recorded_from_the_wires_and_georeferenced(
     tmp_path: Path, seconds: float, record_property: Callable[[str, object], None]
 ) -> None:
     with flown(tmp_path, seconds) as (computer, _):

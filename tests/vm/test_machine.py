@@ -17,7 +17,7 @@ exec {qemu} "$@"
 """
 
 
-def test_status_and_words_come_back_from_one_that_stood_still_at_first(
+def test_status_and_output_are_returned_by_a_machine_that_first_hung(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     told: list[Path] = []

@@ -61,7 +61,7 @@ class Cut:
     begun_ns: int
 
     def log(self) -> Path:
-        """The log of the flight."""
+        """Return the log of the flight."""
         logs = sorted(self.logs.glob("*.mcap"))
         assert len(logs) == 1, f"{len(logs)} logs: the recorder was started again in flight, the machine is starved"
         return logs[0]
@@ -123,7 +123,7 @@ def fly_and_cut(folder: Path, disk: Path, after_s: float, *, syncs: bool = True)
 
 
 def synced(path: Path) -> list[Synced]:
-    """What the witness wrote."""
+    """Return the records of the witness."""
     lines = path.read_text().split("\n")[:-1] if path.exists() else []
     return [Synced(int(a), int(b), int(c), d) for a, b, c, d in (line.split() for line in lines)]
 
@@ -162,19 +162,21 @@ def flown(place: Path, number: int) -> Cut:
     "number",
     [*range(CUTS), *(pytest.param(number, marks=pytest.mark.long) for number in range(CUTS, CUTS_LONG))],
 )
-def test_what_was_durable_is_there(place: Path, number: int, record_property: Callable[[str, object], None]) -> None:
+def test_durable_data_survive_a_power_cut(
+    place: Path, number: int, record_property: Callable[[str, object], None]
+) -> None:
     for name, value in check(flown(place, number)).items():
         record_property(name, value)
 
 
-def test_without_sync_more_is_lost(place: Path) -> None:
+def test_without_sync_more_data_are_lost(place: Path) -> None:
     """The control: were it the same without, the machine would not lose what a computer loses."""
     cut = fly_and_cut(place / "control", place / "disk", 6.0, syncs=False)
     logs = list(cut.logs.glob("*.mcap"))
     assert not logs or logs[0].stat().st_size == 0 or cut.lost_s() > FSYNC_S + CHUNK_OPEN_S + 1.0
 
 
-def test_recording_begins_by_itself_and_the_repair_follows(place: Path) -> None:
+def test_recording_begins_by_itself_and_recovery_follows(place: Path) -> None:
     """On the disk that the first of these cuts left."""
     disk, folder = place / "first", place / "0"
     old = flown(place, 0).log()

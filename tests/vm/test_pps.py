@@ -16,7 +16,7 @@ from tests.vm.machine import DCD_SHIM, MODULES, Machine
 from tests.vm.seconds import labelled, states_between, wrong_seconds
 
 
-def test_pps_seconds_are_never_wrong_whatever_befalls_the_edges(tmp_path: Path) -> None:
+def test_pps_seconds_are_never_wrong_whatever_happens_to_the_edges(tmp_path: Path) -> None:
     aboard(tmp_path, "aboard_time", "edges", MODULES / "pps_sim.ko", seconds=90)
     told = facts(tmp_path, "told")
     content = read_log(tmp_path / "logs")
@@ -98,7 +98,7 @@ def last_losses(content: LogContent, source: str) -> list[int]:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_pps_on_dcd_of_a_16550_with_nmea_on_the_same_port(
+def test_pps_on_dcd_of_a_16550_works_with_nmea_on_the_same_port(
     recorded: dict[str, tuple[Path, list[int]]], kind: str
 ) -> None:
     folder, pulses_utc_s = recorded[kind]

@@ -14,7 +14,7 @@ def numbers(content: LogContent) -> list[int]:
     return [int.from_bytes(data[:8], "little") for _, data in content.units["scanner/left"]]
 
 
-def test_stall_of_half_a_second_loses_nothing_and_with_the_default_buffer_is_counted(
+def test_a_stall_of_half_a_second_loses_no_data_or_is_counted_with_a_small_buffer(
     tmp_path: Path, record_property: Callable[[str, object], None]
 ) -> None:
     aboard(tmp_path, "aboard_stall", "stall", seconds=60)

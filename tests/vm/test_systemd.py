@@ -84,18 +84,18 @@ def service(place: Path) -> Iterator[Machine]:
 
 
 def shown(service: Machine, name: str, unit: str = "swathd") -> str:
-    """A property of a unit."""
+    """Return a property of a unit."""
     return service.told(f"systemctl show --timestamp=us+utc -P {name} {unit}")
 
 
 def newest_log(service: Machine) -> str:
-    """The name of the log that grows."""
+    """Return the name of the growing log."""
     name: str = json.loads(service.told(f"cat {LOGS}/recording.json"))["path"]
     return name
 
 
 def next_part(service: Machine) -> str:
-    """Begin one; its name."""
+    """Begin a part and return its name."""
     old = newest_log(service)
     service.told("systemctl reload swathd")
     service.until(f"! grep -q {old} {LOGS}/recording.json")
@@ -103,7 +103,7 @@ def next_part(service: Machine) -> str:
 
 
 def fetched(service: Machine, place: Path) -> Path:
-    """A copy of the logs as they are, on the host."""
+    """Copy the logs in their present state to the host."""
     service.told(f"rm -rf /vm/logs; mkdir /vm/logs; cp {LOGS}/*.mcap /vm/logs/")
     return place / "vm/logs"
 
@@ -116,7 +116,7 @@ def without_live(service: Machine) -> None:
 
 @pytest.fixture
 def with_live(service: Machine) -> None:
-    """As it is at boot."""
+    """Run with the live service, as at boot."""
     service.told("systemctl unmask --runtime swath-live; systemctl start --no-block swath-live")
 
 
@@ -129,7 +129,7 @@ def test_both_services_are_enabled_and_started_at_boot(service: Machine) -> None
     service.until("systemctl show -P ActiveState swath-live | grep -E '^(activating|active)$'")
 
 
-def test_ready_is_said_after_recording_has_begun(service: Machine) -> None:
+def test_readiness_is_notified_after_recording_has_begun(service: Machine) -> None:
     _, day, time_of_day, _ = shown(service, "ActiveEnterTimestamp").split()
     ready = dt.datetime.fromisoformat(f"{day}T{time_of_day}+00:00")
     begun = service.told(f"stat -c %.6W {LOGS}/{newest_log(service)}")
@@ -151,7 +151,7 @@ def test_devices_have_their_names_and_rights(service: Machine) -> None:
 
 
 @pytest.mark.usefixtures("without_live")
-def test_a_rule_makes_a_pulse_of_a_serial_port(service: Machine) -> None:
+def test_a_rule_makes_a_pps_source_of_a_serial_port(service: Machine) -> None:
     """By the line discipline that the unit holds; the recorder has the same port open."""
     service.until("systemctl is-active swath-pps@ttyS1 && ls /dev/pps1")
     service.told("sleep 5")  # what a rule itself starts does not live so long
@@ -162,7 +162,7 @@ def test_a_rule_makes_a_pulse_of_a_serial_port(service: Machine) -> None:
 
 @pytest.mark.usefixtures("without_live")
 @pytest.mark.parametrize("unit", SERVICES)
-def test_sandbox_denies_what_it_should(service: Machine, unit: str) -> None:
+def test_the_sandbox_denies_forbidden_access(service: Machine, unit: str) -> None:
     service.told(f"install -d -o swath -g swath {LOGS}/live; systemctl start probe-{unit}", COMES_BACK_S)
     found = json.loads(service.told(f"journalctl --sync; journalctl -b -o cat -t python3 -u probe-{unit} | tail -1"))
     recorder = unit == "swathd.service"
@@ -176,7 +176,7 @@ def test_sandbox_denies_what_it_should(service: Machine, unit: str) -> None:
 
 
 @pytest.mark.usefixtures("without_live")
-def test_a_silent_sensor_is_no_reason_to_restart(service: Machine) -> None:
+def test_a_silent_sensor_does_not_cause_a_restart(service: Machine) -> None:
     service.until("systemctl show -P StatusText swathd | grep 'gnss/rover no data yet'")
     pid = shown(service, "MainPID")
     service.told("sleep 15")  # its watchdog has ten
@@ -186,7 +186,7 @@ def test_a_silent_sensor_is_no_reason_to_restart(service: Machine) -> None:
 
 @pytest.mark.usefixtures("without_live")
 def test_a_port_in_use_is_waited_for(service: Machine) -> None:
-    """Whose it is the service cannot see; it records the others meanwhile, and the scanner once the port is free."""
+    """The service cannot see the holder; it records the other devices, and the scanner once the port is free."""
     holder = "import socket, time; s = socket.socket(2, 2); s.bind(('127.0.0.1', 2368)); time.sleep(3600)"
     service.told("systemctl stop swathd", COMES_BACK_S)
     service.told(f'systemd-run -q --unit=viewer /usr/bin/python3 -c "{holder}"')
@@ -204,7 +204,7 @@ def test_a_port_in_use_is_waited_for(service: Machine) -> None:
 
 @pytest.mark.usefixtures("without_live")
 @pytest.mark.parametrize("thread", ["scanner/left", "writer"])
-def test_a_thread_that_hangs_costs_a_restart_and_no_more(service: Machine, place: Path, thread: str) -> None:
+def test_a_hanging_thread_costs_only_a_restart(service: Machine, place: Path, thread: str) -> None:
     """systemd's watchdog ends it; the next one records at once, and repairs the old log beside it."""
     old, pid = next_part(service), shown(service, "MainPID")  # a long one is repaired for minutes here
     service.told("sleep 3")
@@ -239,7 +239,7 @@ def test_sighup_begins_a_part(service: Machine, place: Path) -> None:
 
 
 @pytest.mark.usefixtures("with_live")
-def test_the_live_service_killed_again_and_again_costs_the_log_nothing(service: Machine, place: Path) -> None:
+def test_killing_the_live_service_repeatedly_does_not_affect_the_log(service: Machine, place: Path) -> None:
     pid, moments = shown(service, "MainPID"), random.Random(20)
     first = newest_log(service)
     processes = "/sys/fs/cgroup/system.slice/swath-live.service/cgroup.procs"  # of the warm-up, then of the service
@@ -261,7 +261,7 @@ def test_the_live_service_killed_again_and_again_costs_the_log_nothing(service: 
 
 
 @pytest.mark.usefixtures("without_live")
-def test_a_full_disk_ends_the_part_and_room_begins_another(service: Machine, place: Path) -> None:
+def test_a_full_disk_ends_the_part_and_free_space_begins_another(service: Machine, place: Path) -> None:
     old = newest_log(service)
     free = f"$(( $(stat -fc '%a * %S' {LOGS}) ))"
     service.told(f"fallocate -l $(( {free} - 15000000 )) {LOGS}/filler")

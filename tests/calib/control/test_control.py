@@ -20,7 +20,7 @@ ROW = "GCP1,47.4001,8.9001,512.34,0.02"
 
 
 def unknown(position_e: FloatArray) -> None:
-    """Nobody knows the undulation."""
+    """Return no undulation."""
     return
 
 
@@ -40,7 +40,7 @@ def surveyed(flight_height: FloatArray, shift: FloatArray, count: int = 12) -> l
 
 
 def flight() -> Flight:
-    """Two swaths over it."""
+    """Return two swaths over the rolling ground."""
     return surface_flight([rolling, rolling])
 
 
@@ -74,20 +74,20 @@ def test_a_file_is_read_with_comments_blanks_and_a_byte_order_mark() -> None:
         (f"{HEADER}\n{ROW}\n{ROW.replace('GCP1', 'GCP9')}", "line 3: GCP9 has the position of GCP1 in line 2"),
     ],
 )
-def test_a_mistake_is_one_line_that_names_where(text: str, said: str) -> None:
+def test_each_mistake_is_one_line_that_names_its_place(text: str, said: str) -> None:
     with pytest.raises(ControlError, match=said) as caught:
         read_control(text, "control.csv")
     assert all(line.startswith("control.csv: ") for line in str(caught.value).splitlines())
 
 
-def test_all_mistakes_are_told_at_once_a_line_each() -> None:
+def test_all_mistakes_are_reported_at_once_in_one_line_each() -> None:
     text = f"{HEADER}\nG1,abc,8.9,500,0.01\nG2,47.4,8.9,500\n{ROW}"
     with pytest.raises(ControlError) as caught:
         read_control(text, "c")
     assert [line.split(": ")[1] for line in str(caught.value).splitlines()] == ["line 2", "line 3"]
 
 
-def test_points_come_to_the_tangent_frame() -> None:
+def test_points_are_converted_to_the_tangent_frame() -> None:
     (point,) = in_t(read_control(f"{HEADER}\n{ROW}", "c"), FRAME)
     x, y, z = Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True).transform(8.9001, 47.4001, 512.34)
     assert FRAME.e_from_t(point.position_t) == pytest.approx([x, y, z], abs=1e-6)
@@ -99,7 +99,7 @@ def test_points_come_to_the_tangent_frame() -> None:
 # ---------------------------------------------------------------------- planes
 
 
-def test_a_plane_a_point_with_the_returns_of_every_swath() -> None:
+def test_each_control_point_gives_a_plane_with_the_returns_of_every_swath() -> None:
     found = control_planes(flight(), surveyed(np.zeros(1), np.zeros(3)))
     assert [plane.name for plane in found.planes] == [f"control P{number}" for number in range(12)]
     assert not found.refused
@@ -114,7 +114,7 @@ def test_a_plane_a_point_with_the_returns_of_every_swath() -> None:
         assert plane.normal_t @ (point.position_t - plane.centre_t) == pytest.approx(0.0, abs=0.03)
 
 
-def test_returns_that_are_no_ground_are_left_out_and_their_indexes_are_right() -> None:
+def test_returns_off_the_ground_are_dropped_and_the_other_indices_are_right() -> None:
     made = surface_flight([lambda east, north: 0.0 * east])
     points = made.swaths[0].points_t.copy()
     bush = (np.hypot(points[:, 0], points[:, 1]) < 1.4) & (np.arange(len(points)) % 4 == 0)
@@ -144,7 +144,7 @@ def tilted(slope: float, roughness_m: float) -> Flight:
         (tilted(0.0, 0.01), (0.0, 0.0, 30.0), "control: far above or below"),
     ],
 )
-def test_what_is_refused_is_counted_by_reason(made: Flight, place: tuple[float, ...], reason: str) -> None:
+def test_refused_points_are_counted_by_reason(made: Flight, place: tuple[float, ...], reason: str) -> None:
     found = control_planes(made, [ControlPoint("A", np.array(place), 0.01)], ControlRules(widest_m=1.5))
     assert found.planes == ()
     assert sum(found.refused.values()) == 1
@@ -158,13 +158,13 @@ def test_a_swath_that_shows_another_surface_is_not_joined() -> None:
     assert found.refused == {"control: another surface": 1}
 
 
-def test_no_return_has_a_place_no_plane_and_no_complaint() -> None:
+def test_unusable_returns_raise_no_error() -> None:
     empty = Flight(FRAME, (), (), (swath_of(np.full((5, 3), np.nan)),))
     found = control_planes(empty, [ControlPoint("A", np.zeros(3), 0.01)])
     assert found.refused == {"control: no returns": 1}
 
 
-def test_a_robust_plane_stands_a_third_of_outliers() -> None:
+def test_a_robust_plane_withstands_a_third_of_outliers() -> None:
     draws = np.random.default_rng(1)
     places = draws.uniform(-1.0, 1.0, (60, 2))
     up = 0.2 * places[:, 0] - 0.1 * places[:, 1] + draws.normal(0.0, 0.01, 60)
@@ -178,7 +178,7 @@ def test_a_robust_plane_stands_a_third_of_outliers() -> None:
 
 
 @pytest.mark.parametrize(("place", "inside"), [((0.2, 0.2), True), ((0.9, 0.9), False), ((1.0, 0.0), True)])
-def test_a_place_is_within_a_triangle(place: tuple[float, float], inside: bool) -> None:
+def test_a_place_inside_a_triangle_is_recognised(place: tuple[float, float], inside: bool) -> None:
     assert is_inside(np.array(place), np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])) is inside
 
 
@@ -186,16 +186,16 @@ def test_a_place_is_within_a_triangle(place: tuple[float, float], inside: bool) 
 
 
 def only(found: tuple[Doubt, ...]) -> Doubt:
-    """The one there is."""
+    """Return the only warning."""
     (doubt,) = found
     return doubt
 
 
-def test_good_control_raises_no_doubt() -> None:
+def test_good_control_gives_no_warning() -> None:
     assert doubts(flight(), surveyed(np.zeros(1), np.zeros(3)), undulation=unknown) == ()
 
 
-def test_orthometric_heights_are_named_with_the_undulation_of_the_geoid() -> None:
+def test_orthometric_heights_are_recognised_by_the_geoid_undulation() -> None:
     points = surveyed(np.zeros(1), np.array([0.0, 0.0, -48.3]))
     doubt = only(doubts(flight(), points, undulation=lambda position_e: (48.1, "EGM96")))
     assert (doubt.kind, doubt.refuses) == ("orthometric", True)
@@ -203,14 +203,14 @@ def test_orthometric_heights_are_named_with_the_undulation_of_the_geoid() -> Non
     assert "the undulation there is 48.1 m (EGM96)" in doubt.text
 
 
-def test_without_a_geoid_the_constant_is_named() -> None:
+def test_without_a_geoid_the_constant_offset_is_named() -> None:
     doubt = only(doubts(flight(), surveyed(np.zeros(1), np.array([0.0, 0.0, 31.2])), undulation=unknown))
     assert doubt.kind == "orthometric"
     assert "31.2 m above" in doubt.text
     assert "undulation is -31.2 m" in doubt.text
 
 
-def test_a_constant_that_is_no_undulation_is_another_height_reference() -> None:
+def test_a_constant_unlike_the_undulation_is_another_height_reference() -> None:
     points = surveyed(np.zeros(1), np.array([0.0, 0.0, 0.8]))
     doubt = only(doubts(flight(), points, undulation=lambda position_e: (48.1, "EGM96")))
     assert doubt.kind == "height"
@@ -218,7 +218,7 @@ def test_a_constant_that_is_no_undulation_is_another_height_reference() -> None:
     assert "48.1 m there" in doubt.text
 
 
-def test_heights_in_feet_are_told() -> None:
+def test_heights_in_feet_are_reported() -> None:
     points = [
         ControlPoint(point.name, point.position_t * [1.0, 1.0, 1.0 / 0.3048], 0.01)
         for point in surveyed(np.zeros(1), np.zeros(3))
@@ -228,7 +228,7 @@ def test_heights_in_feet_are_told() -> None:
     assert "feet" in doubt.text
 
 
-def test_another_datum_is_found_by_the_slopes() -> None:
+def test_another_datum_is_recognised_from_slopes() -> None:
     points = surveyed(np.zeros(1), np.array([0.9, 0.9, 0.0]), count=30)
     doubt = only(doubts(flight(), points, undulation=unknown))
     assert (doubt.kind, doubt.refuses) == ("shift", True)
@@ -237,7 +237,7 @@ def test_another_datum_is_found_by_the_slopes() -> None:
     assert found == pytest.approx(0.9 * np.sqrt(2.0), abs=0.2)
 
 
-def test_swaths_that_disagree_say_nothing_of_a_datum() -> None:
+def test_disagreeing_swaths_give_no_datum_warning() -> None:
     """What a boresight that is wrong does: each swath beside its place, and their middle too."""
     points = surveyed(np.zeros(1), np.zeros(3), count=30)
     beside = surface_flight(
@@ -246,14 +246,14 @@ def test_swaths_that_disagree_say_nothing_of_a_datum() -> None:
     assert not any(doubt.kind == "shift" for doubt in doubts(beside, points, undulation=unknown))
 
 
-def test_on_level_ground_no_shift_is_claimed() -> None:
+def test_on_level_ground_no_shift_is_reported() -> None:
     level = surface_flight([lambda east, north: 0.0 * east])
     places = np.random.default_rng(2).uniform(-50.0, 50.0, (20, 2))
     points = [ControlPoint(f"P{k}", np.array([*place, 0.01 * (k % 3)]), 0.01) for k, place in enumerate(places)]
     assert doubts(level, points, undulation=unknown) == ()
 
 
-def test_a_single_point_that_disagrees_is_named_and_refuses_nothing() -> None:
+def test_a_single_disagreeing_point_is_named_and_not_refused() -> None:
     points = surveyed(np.zeros(1), np.zeros(3))
     points[4] = ControlPoint("P4", points[4].position_t + np.array([0.0, 0.0, 0.6]), 0.01)
     doubt = only(doubts(flight(), points, undulation=unknown))
@@ -262,7 +262,7 @@ def test_a_single_point_that_disagrees_is_named_and_refuses_nothing() -> None:
     assert "2 swaths" in doubt.text
 
 
-def test_points_outside_the_flight_are_told_and_all_of_them_refuse_it() -> None:
+def test_points_outside_the_flight_are_reported_and_refused_if_all_lie_outside() -> None:
     points = surveyed(np.zeros(1), np.zeros(3))
     points[0] = ControlPoint("P0", np.array([900.0, 0.0, 500.0]), 0.01)
     one = only(doubts(flight(), points, undulation=unknown))
@@ -274,7 +274,7 @@ def test_points_outside_the_flight_are_told_and_all_of_them_refuse_it() -> None:
     assert "km from its returns" in everyone.text
 
 
-def test_where_returns_are_thin_the_circle_grows_to_its_limit() -> None:
+def test_the_search_radius_grows_to_its_limit_where_returns_are_sparse() -> None:
     thin = surface_flight([lambda east, north: 0.1 * east], step_m=1.5)
     point = ControlPoint("A", np.array([0.0, 0.0, 0.0]), 0.01)
     at = control_planes(thin, [point]).planes[0].patches[0].at

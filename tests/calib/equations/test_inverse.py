@@ -13,7 +13,7 @@ from swath.calib.parameters import ParameterOptions, unknowns
 from tests.calib.roofs import LINES, made
 
 
-def test_an_inverse_is_that_of_numpy_in_spite_of_its_units() -> None:
+def test_the_inverse_matches_numpy_despite_mixed_units() -> None:
     g = np.random.default_rng(8)
     unit = 10.0 ** g.uniform(-8.0, 3.0, 40)
     root = g.normal(size=(40, 60))
@@ -24,13 +24,13 @@ def test_an_inverse_is_that_of_numpy_in_spite_of_its_units() -> None:
 
 
 @pytest.mark.parametrize("last", [1.0, 2.0, np.nan])
-def test_what_is_not_positive_definite_has_none(last: float) -> None:
+def test_a_matrix_that_is_not_positive_definite_is_refused(last: float) -> None:
     matrix = np.array([[1.0, last], [last, 1.0]])
     with pytest.raises(np.linalg.LinAlgError):
         inverted(matrix)
 
 
-def test_the_trajectorys_weight_and_variances_are_turned_with_the_axes() -> None:
+def test_weights_and_variances_of_the_trajectory_are_rotated_with_the_axes() -> None:
     flight = made(lines=LINES[:2], points=2).flight
     prior = gauss_markov(flight, knot_s=5.0)
     weight = TrajectoryWeight(Rows(flight, (), unknowns(flight, ParameterOptions()), prior))

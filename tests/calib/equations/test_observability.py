@@ -145,7 +145,7 @@ def reduced(name: str, roofs: bool, names: tuple[str, ...]) -> FloatArray:
 
 
 def held_by(*given: Any) -> tuple[FixedParameter, ...]:
-    """Return what `decide` holds."""
+    """Return the parameters that `decide` holds."""
     return decide(*given)[0]
 
 
@@ -183,7 +183,7 @@ TABLE = [  # row, lines, roofs, what is added, printed sigmas (unit, print's las
     [row[1:] for row in TABLE],
     ids=[row[0] for row in TABLE],
 )
-def test_the_table_of_designs(
+def test_printed_table_of_designs_is_reproduced(
     lines: str,
     roofs: bool,
     added: tuple[str, ...],
@@ -214,7 +214,7 @@ def held_of(lines: str, roofs: bool, *added: str) -> dict[str, FixedParameter]:
     return {held.name: held for held in held_by(reduced(lines, roofs, (*BASIC, *added)), names)}
 
 
-def test_opposite_lines_over_flat_ground_say_nothing_of_the_range() -> None:
+def test_opposite_lines_over_flat_ground_do_not_determine_the_range_offset() -> None:
     """In plain words, with the control that would. A poor sigma of an angle is no reason to hold it."""
     held = held_of("opposite", False)
     assert set(held) == {"range_offset_m"}
@@ -226,7 +226,7 @@ def test_opposite_lines_over_flat_ground_say_nothing_of_the_range() -> None:
     assert held["range_offset_m"].sigma == pytest.approx(12.6, rel=0.03)
 
 
-def test_what_cannot_be_told_apart_is_said_with_its_remedy() -> None:
+def test_inseparable_parameters_are_reported_with_their_remedy() -> None:
     one = held_of("one height", True, "lever_arm_x_m")["lever_arm_x_m"]
     assert one.scanner == "left"
     assert one.with_others[0][0] == "left.phi_rad"
@@ -239,7 +239,7 @@ def test_what_cannot_be_told_apart_is_said_with_its_remedy() -> None:
     assert angle.with_others[0][1] == pytest.approx(-1.0, abs=1e-6)
 
 
-def test_the_whole_model_keeps_the_boresight() -> None:
+def test_the_whole_model_determines_the_boresight() -> None:
     """All sixteen at once, of two heights: rank defects and all; what looks alike shares what is plausible of it."""
     names = tuple(parameter.name for parameter in PARAMETERS)
     normal = reduced("two heights", True, names)
@@ -263,8 +263,8 @@ def information(covariance: FloatArray, names: list[str]) -> FloatArray:
     return np.asarray(np.linalg.inv(covariance * np.outer(plausible, plausible)), dtype=np.float64)
 
 
-def test_what_a_prior_holds_is_never_held() -> None:
-    """A lever arm of which the flight knows nothing: with the user's prior it stays, without it goes."""
+def test_a_parameter_with_a_prior_is_not_held() -> None:
+    """Decide on a lever arm that the flight does not determine: with a prior it is estimated, without one held."""
     names = ["left.phi_rad", "left.lever_arm_x_m"]
     normal = information(np.diag([1e-4, 1e4]), names)
     assert [held.name for held in held_by(normal, names)] == ["lever_arm_x_m"]
@@ -272,14 +272,14 @@ def test_what_a_prior_holds_is_never_held() -> None:
     assert decide(np.zeros((1, 1)), names[1:], np.array([1.0])) == ((), {})
 
 
-def test_what_is_held_is_said_with_what_is_plausible() -> None:
+def test_a_held_parameter_is_reported_with_its_plausible_error() -> None:
     names = ["left.kappa_rad", "left.pitch_slope"]
     (heading,) = held_by(information(np.diag([17.0**2, 0.1**2]), names), names)
     assert heading.sigma == pytest.approx(17.0 * RULES["kappa_rad"].plausible, rel=1e-3)
     assert heading.why.startswith("this flight would estimate it to 17°, and its initial value is plausible to 1.0°")
 
 
-def test_rounding_that_makes_an_eigenvalue_negative_is_no_knowledge() -> None:
+def test_an_eigenvalue_made_negative_by_rounding_is_not_information() -> None:
     names = ["left.omega_rad", "left.scan_angle_offset_rad"]
     normal = 1e6 * np.array([[1.0, 1.0 + 1e-9], [1.0 + 1e-9, 1.0]]) / RULES["scan_angle_offset_rad"].plausible ** 2
     held = held_by(normal, names)
@@ -287,7 +287,7 @@ def test_rounding_that_makes_an_eigenvalue_negative_is_no_knowledge() -> None:
     assert np.isinf(held[0].sigma) or held[0].sigma > 30 * RULES["scan_angle_offset_rad"].plausible
 
 
-def test_what_nothing_shows_is_said() -> None:
+def test_parameters_without_any_information_are_reported() -> None:
     names = ["left.omega_rad", "left.torsion_s2", "left.beam.12.azimuth_rad"]
     normal = np.diag([1e14, 0.0, 0.0])
     held = held_by(normal, names)
@@ -297,7 +297,7 @@ def test_what_nothing_shows_is_said() -> None:
     assert decide(np.zeros((0, 0)), []) == ((), {})
 
 
-def test_limits_are_the_callers() -> None:
+def test_limits_of_plausibility_are_given_by_the_caller() -> None:
     """A start that is plausible to half as much: the same matrix is decided otherwise."""
     names = ["left.omega_rad", "left.phi_rad"]
     normal = information(np.array([[4.0, 0.0], [0.0, 0.1]]), names)
@@ -306,7 +306,7 @@ def test_limits_are_the_callers() -> None:
     assert [held.name for held in held_by(normal, names, None, Rules(table))] == ["omega_rad"]
 
 
-def test_what_is_told_in_part_is_estimated_with_its_start() -> None:
+def test_partly_determined_parameters_are_estimated_with_their_start_as_observation() -> None:
     """Held, the one would leave what is plausible of it in the other."""
     names = ["left.range_offset_m", "left.scan_angle_scale"]
     alike = np.array([[1.0, 0.999], [0.999, 1.0]])
@@ -316,8 +316,8 @@ def test_what_is_told_in_part_is_estimated_with_its_start() -> None:
     assert decide(information(1e-4 * alike, names), names) == ((), {})
 
 
-def test_heads_that_share_their_trajectorys_errors_keep_their_own_parameters() -> None:
-    """Known to 1 mm relative to each other and to 1 cm both: told apart, though they go together by 0.995."""
+def test_heads_with_a_common_trajectory_keep_their_own_parameters() -> None:
+    """Decide on two offsets known to 1 mm relative to each other and to 1 cm absolutely (correlation 0.995)."""
     names = ("left.range_offset_m", "right.range_offset_m")
     normal: FloatArray = np.linalg.inv(1e-4 * np.array([[1.0, 0.995], [0.995, 1.0]])).astype(np.float64)
     assert held_by(normal, names) == ()

@@ -46,7 +46,7 @@ def prior(flight: Flight) -> TrajectoryPrior:
 
 
 def known(flight: Flight) -> Adjusted:
-    """An outcome that is the truth, for sure."""
+    """Return an outcome that equals the truth and is known exactly."""
     none = np.zeros(len(NAMES))
     return Adjusted(
         calibrations=flight.starts(),
@@ -71,7 +71,7 @@ def known(flight: Flight) -> Adjusted:
 
 
 def flown_wrong(flight: Flight, prior: TrajectoryPrior, errors: FloatArray) -> Flight:
-    """On a trajectory that would need these errors added to be true."""
+    """Place the flight on a trajectory that needs these errors added to be true."""
     wrong = tuple(apply(one, number, prior, -errors) for number, one in enumerate(flight.trajectories))
     moved = replace(flight, trajectories=wrong)
     return moved.placed(moved.starts())
@@ -82,7 +82,7 @@ def profile_of(flight: Flight, kind: str) -> Profile:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_what_moves_a_profile(flight: Flight, prior: TrajectoryPrior, kind: str) -> None:
+def test_each_parameter_moves_a_profile_as_predicted(flight: Flight, prior: TrajectoryPrior, kind: str) -> None:
     """Foretold, and seen with the parameter or the trajectory really changed."""
     profile = profile_of(flight, kind)
     told = influence(flight, profile, flight.starts(), prior, NAMES)
@@ -97,7 +97,7 @@ def test_what_moves_a_profile(flight: Flight, prior: TrajectoryPrior, kind: str)
         assert other.found - same.found == pytest.approx(expected, abs=2.0 * same.noise_sigma + 0.1 * abs(expected))
 
 
-def test_sigmas_hold_when_the_trajectorys_errors_change_in_time(flight: Flight, prior: TrajectoryPrior) -> None:
+def test_sigmas_hold_with_time_varying_trajectory_errors(flight: Flight, prior: TrajectoryPrior) -> None:
     rng = np.random.default_rng(7)
     normalised = []
     for _ in range(DRAWS):
@@ -111,7 +111,7 @@ def test_sigmas_hold_when_the_trajectorys_errors_change_in_time(flight: Flight, 
     assert np.abs(normalised).max() < 4.0
 
 
-def test_opposite_lines_side_by_side_do_not_tell_heading_from_pitch(prior: TrajectoryPrior) -> None:
+def test_opposite_lines_side_by_side_do_not_separate_heading_from_pitch(prior: TrajectoryPrior) -> None:
     opposite = fly((LINES[0], Line(145, 90, 270, 290, 300)), gables(), scanner=Scanner(prf_hz=10_000.0))
     checked = check(opposite, known(opposite), gauss_markov(opposite, TAUS, knot_s=0.5))
     assert "phi_rad" not in {one.parameter for one in checked.comparisons}
@@ -140,7 +140,7 @@ def test_planes_and_profiles_agree_within_their_sigmas(flight: Flight, prior: Tr
         assert any(one.parameter == parameter and one.normalised < -4.0 for one in seen.comparisons)
 
 
-def test_in_the_report(flight: Flight, prior: TrajectoryPrior) -> None:
+def test_profile_check_appears_in_the_report(flight: Flight, prior: TrajectoryPrior) -> None:
     checked = check(flight, known(flight), prior, CONTROL)
     compared, every = comparison_table(checked), profiles_table(checked)
     assert compared is not None

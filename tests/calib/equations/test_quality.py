@@ -27,14 +27,14 @@ pytestmark = pytest.mark.xdist_group("kernels")
 PLAIN = Settings(huber=0.0, family=0.0)
 
 
-def test_printed_limits() -> None:
+def test_limits_match_the_printed_values() -> None:
     assert least_shift() == pytest.approx(4.13215, abs=1e-5)
     assert w_critical(10) == pytest.approx(3.2905, abs=1e-4)
     assert w_critical(10_000_000) == pytest.approx(stats.norm.isf(0.05 / 2e7))
     np.testing.assert_allclose(least_detectable(np.array([4.0]), np.array([0.25])), 4.13215 * 4.0, rtol=1e-5)
 
 
-def test_the_printed_huber_weight() -> None:
+def test_huber_weight_matches_the_printed_value() -> None:
     """Four times six steps with weights of the last solution; a blunder of 0.6 m gets 0.185."""
     flight, features = printed().with_blunder().flight()
     block = Block.of(flight, features, unknowns(flight, ParameterOptions()), None, None)
@@ -49,7 +49,7 @@ def test_the_printed_huber_weight() -> None:
     assert every == pytest.approx(float(np.where(np.abs(size) > HUBER, HUBER * np.abs(size), size**2).sum()), rel=1e-5)
 
 
-def test_redundancy_is_that_of_the_dense_solution() -> None:
+def test_redundancy_matches_the_dense_solution() -> None:
     built = made(lines=LINES[:4], points=5)
     prior = gauss_markov(built.flight, Taus(), 5.0)
     features = controlled(built)
@@ -106,7 +106,7 @@ def sharing(rows: Rows, state: State) -> tuple[Int64Array, FloatArray, FloatArra
     return np.concatenate(run_of), np.concatenate(variance), np.concatenate(common)
 
 
-def test_redundancy_is_that_of_rows_that_share_an_error() -> None:
+def test_redundancy_of_correlated_rows_matches_the_dense_solution() -> None:
     """What residuals are expected to be, (I − H) V (I − H)ᵀ with V of noise and of what a run's rows have in common."""
     built = made(lines=LINES[:4], points=25)
     prior = gauss_markov(built.flight, Taus(), 5.0)
@@ -142,8 +142,8 @@ def test_redundancy_is_that_of_rows_that_share_an_error() -> None:
     assert np.quantile(of_w, 0.99) < 1.15
 
 
-def test_the_variance_factor_of_rows_that_share_an_error_is_one() -> None:
-    """A flight whose runs of returns are off by a common error each, as much as the prior says."""
+def test_variance_factor_of_correlated_rows_is_one() -> None:
+    """A common error is added to each run of returns, as large as the prior states."""
     built, factors, rejected = made(lines=LINES[:4], points=25), [], 0
     prior = gauss_markov(built.flight, Taus(), 5.0)
     prior = replace(prior, walk_rad2=np.full(len(prior), (8e-5) ** 2))
@@ -166,7 +166,7 @@ def test_the_variance_factor_of_rows_that_share_an_error_is_one() -> None:
     assert rejected <= 3
 
 
-def test_variance_components_tell_which_group_is_worse() -> None:
+def test_variance_components_show_which_group_is_worse() -> None:
     """Points at 5 cm that say 1 cm."""
     built = made()
     prior = gauss_markov(built.flight, Taus(), 4.0)
@@ -184,7 +184,7 @@ def test_variance_components_tell_which_group_is_worse() -> None:
     assert 0.9 < groups["planes"].variance_factor < 1.1
 
 
-def test_returns_that_are_no_points_count_for_nothing() -> None:
+def test_unusable_returns_are_not_counted() -> None:
     built = made(lines=LINES[:4])
     prior = gauss_markov(built.flight, Taus(), 4.0)
     head = replace(built.flight.heads[0], range_gate=(0.0, 850.0))
@@ -197,7 +197,7 @@ def test_returns_that_are_no_points_count_for_nothing() -> None:
     assert 0.85 < found.variance_factor < 1.15
 
 
-def test_least_detectable_range_error_is_found_as_often_as_it_says() -> None:
+def test_errors_of_the_minimal_detectable_size_are_found_as_often_as_stated() -> None:
     """With 0.8 probability at |w| > 3.29: errors of that size in one range each."""
     built = made(lines=LINES[:4])
     prior = gauss_markov(built.flight, Taus(), 4.0)

@@ -79,7 +79,7 @@ def design(rows: Rows, state: State) -> tuple[FloatArray, FloatArray, FloatArray
     return np.concatenate(columns), np.concatenate(misclosures), np.concatenate(variances), planes
 
 
-def test_columns_are_those_of_georef() -> None:
+def test_columns_match_georef() -> None:
     flight, planes, start = line_flight()
     flight = replace(flight, heads=(replace(flight.heads[0], noise=SURE),))
     asked = unknowns(flight, EVERYTHING)
@@ -102,7 +102,7 @@ def test_columns_are_those_of_georef() -> None:
     np.testing.assert_allclose(misclosures, np.concatenate(wanted_f), atol=2e-8)
 
 
-def test_variance_is_that_of_the_eight_observations() -> None:
+def test_variance_combines_the_eight_observations() -> None:
     flight, planes, start = line_flight()
     told = flight.trajectories[0]
     told = replace(told, position_sigma_l=np.full((len(told), 3), 0.03))
@@ -129,20 +129,20 @@ def test_variance_is_that_of_the_eight_observations() -> None:
 
 
 def spinning() -> SpinningGeometry:
-    """Four beams, in the maker's frame."""
+    """Return a scanner with four beams in the manufacturer's frame."""
     table = np.array([[-15, -5, 5, 14], [1, -1, 2, -2], [0.01, 0.02, 0.0, 0.0], [0.02] * 4, [0.04] * 4, [0.01] * 4])
     return SpinningGeometry(*table)
 
 
 def ouster() -> OusterGeometry:
-    """Four beams."""
+    """Return an Ouster head with four beams."""
     turn = np.eye(4)
     turn[:3, :3], turn[:3, 3] = Rotation.from_euler("z", 180, degrees=True).as_matrix(), (0.0, 0.0, 0.036)
     return OusterGeometry(np.radians([-15.0, -5, 5, 14]), np.radians([3.0, -3, 3, -3]), (0.0158, 0.001), turn)
 
 
 def head_flight(geometry: Geometry) -> Flight:
-    """A spinning head low over something."""
+    """Return a flight of a spinning head low over planes."""
     g = np.random.default_rng(7)
     rows = np.zeros(160, RETURN_DTYPE)
     rows["range_m"], rows["encoder_rad"] = g.uniform(60, 90, 160), g.uniform(0, 2 * np.pi, 160)
@@ -156,7 +156,7 @@ def head_flight(geometry: Geometry) -> Flight:
 
 
 @pytest.mark.parametrize("geometry", [spinning(), ouster()])
-def test_columns_of_beams_slots_zones_and_intensities_are_differences_of_the_model(geometry: Geometry) -> None:
+def test_columns_of_beams_slots_zones_and_intensities_match_differences_of_the_model(geometry: Geometry) -> None:
     flight = head_flight(geometry)
     wish = ParameterOptions(
         ibrc_knots=(0.0, 20.0, 50.0, 100.0),
@@ -189,7 +189,7 @@ def test_columns_of_beams_slots_zones_and_intensities_are_differences_of_the_mod
 
 
 def placed(flight: Flight, asked: Unknowns, values: FloatArray, column: int, step: float) -> FloatArray:
-    """(n, 3) ∂point/∂unknown by central differences."""
+    """Return (n, 3) ∂point/∂unknown by central differences."""
     moved = []
     for sign in (-1.0, 1.0):
         there = values.copy()
@@ -207,7 +207,7 @@ def shifted(flown: Trajectory, prior: TrajectoryPrior, errors_e: FloatArray) -> 
     return replace(flown, position_e=flown.position_e + error[:, :3], q_e_from_b=turned.as_quat()[:, [3, 0, 1, 2]])
 
 
-def test_columns_of_the_trajectory_are_differences_of_the_model() -> None:
+def test_columns_of_the_trajectory_match_differences_of_the_model() -> None:
     flight, planes, start = line_flight()
     flight = replace(flight, heads=(replace(flight.heads[0], noise=SURE),), swaths=flight.swaths[:1])
     planes = tuple(replace(plane, patches=plane.patches[:1]) for plane in planes)
@@ -237,7 +237,7 @@ def test_columns_of_the_trajectory_are_differences_of_the_model() -> None:
             np.testing.assert_allclose(column, expected, atol=1e-4 * max(1.0, np.abs(expected).max()))
 
 
-def test_what_the_attitude_does_between_knots_is_no_noise_of_each_return() -> None:
+def test_attitude_error_between_knots_is_common_to_a_run() -> None:
     """Rows of a run count like their mean: of the variance M / n + c, c that of a bridge between the run's knots.
 
     n is as many as the rows that are taken stand for: some are not taken, the others stand for four.
@@ -287,9 +287,7 @@ def looks_of(flight: Flight, planes: tuple[Plane, ...], wish: ParameterOptions) 
     ("name", "noise", "errors", "tolerance"),
     [("range_m", RANGES_ONLY, 1.2, 2e-6), ("encoder_rad", Noise(1e-9, 4e-4, 0.0, 0.0), 1e-3, 2e-4)],
 )
-def test_rows_are_those_of_the_observations_as_adjusted(
-    name: str, noise: Noise, errors: float, tolerance: float
-) -> None:
+def test_rows_use_the_adjusted_observations(name: str, noise: Noise, errors: float, tolerance: float) -> None:
     """Adjust ranges, or angles, where only these err: they are the true ones then, and so are all coefficients."""
     normal = np.array([0.5, -0.3, 0.81])
     planes = [(np.array([150.0, 0.0, 400.0]), normal / np.linalg.norm(normal))]

@@ -60,7 +60,7 @@ def dense(packed: FloatArray, n: int) -> FloatArray:
 
 
 def batch(run: FilterRun) -> FloatArray:
-    """(m, n, m, n) of all nodes' errors by least squares in one piece: the whole process, then all observations."""
+    """Return the estimates (m, n, m, n) of all nodes' errors by least squares in one piece."""
     n, [block] = run.layout.size, run.nodes
     m, ends = len(block.time_ns), [*block.first[1:].tolist(), len(block.h)]
     process, rows = np.zeros((m, n, m, n)), []
@@ -90,7 +90,7 @@ def batch(run: FilterRun) -> FloatArray:
     return whole
 
 
-def test_the_chain_is_least_squares_in_one_piece() -> None:
+def test_the_chain_equals_least_squares_in_one_piece() -> None:
     """All pairs of nodes of a short flight, 27 errors estimated, within 1e-8 of their sigmas."""
     run = navigated(fly(survey(line_s=8.0), 24.0, 50.0), 1)
     [block], whole = run.nodes, batch(run)
@@ -117,7 +117,7 @@ def test_the_chain_is_least_squares_in_one_piece() -> None:
         np.testing.assert_allclose(shorter.covariance() / unit, flat[np.ix_(at, at)] / unit, atol=1e-8)
 
 
-def test_errors_of_navigated_flights_go_together_as_the_chain_says() -> None:
+def test_errors_of_navigated_flights_are_correlated_as_the_chain_states() -> None:
     """80 flights with other noise: χ² of 24 joint errors at four moments, far apart and close; and their differences.
 
     A joint covariance without the correlations would give a χ² several times too small or large.
@@ -144,7 +144,7 @@ def test_errors_of_navigated_flights_go_together_as_the_chain_says() -> None:
 
 
 def off(truth: Truth, time_ns: NDArray[np.int64], state: FloatArray) -> FloatArray:
-    """(6k,) true − found position in l, and turns about n, e, d."""
+    """Return (6k,) true − found positions in l, and rotations about north, east, down."""
     at = truth.flight.motion((time_ns - ns(0.0)) / SECOND)
     level = rot_e_from_l(*geodetic_from_e(at.position_e)[:2])
     shift = np.einsum("nji,nj->ni", level, at.position_e - state[:, :3])
@@ -197,7 +197,7 @@ def walk_is_that_of_the_nodes_between(prior: TrajectoryPrior, chain: ErrorChain)
 
 
 def level_path(seconds: float, begin: int = BEGIN, heading_deg: float = 30.0, sigma: float = 1.0) -> Trajectory:
-    """Eastwards and turned, sigmas that grow along."""
+    """Return an eastward trajectory with attitude and growing sigmas."""
     t = np.arange(0.0, seconds, 0.1)
     grown = sigma * (1.0 + 0.01 * t)[:, np.newaxis]
     return Trajectory.from_geodetic(
@@ -233,7 +233,7 @@ def made(strips: Sequence[tuple[int, int, float, float]], paths: list[Trajectory
     return Flight(Tangent.at(paths[0].position_e[0]), (head,), tuple(paths), swaths)
 
 
-def test_a_covariance_that_rounding_made_negative_has_an_inverse() -> None:
+def test_a_covariance_made_negative_by_rounding_has_an_inverse() -> None:
     """Break correlations of 1 by 4 %, as a heading's that was known to degrees before it was to thousandths."""
     built = made([(0, 1, 5.0, 15.0)], [level_path(50, begin=int(ns(0.0)))], begin=int(ns(0.0)))
     sound = gauss_markov(built, Taus(heading_s=1e5), 1.0)
@@ -253,7 +253,7 @@ def test_a_covariance_that_rounding_made_negative_has_an_inverse() -> None:
     np.testing.assert_allclose(np.diag(mean), np.diag(wanted), rtol=0.05)
 
 
-def test_sigmas_become_processes_of_gauss_and_markov() -> None:
+def test_sigmas_become_gauss_markov_processes() -> None:
     """Entries against the definition, for roll and pitch through the axes they turn about."""
     path = level_path(200)
     flight = made([(0, 1, 10, 30), (0, 2, 100, 110)], [path])
@@ -281,7 +281,7 @@ def test_sigmas_become_processes_of_gauss_and_markov() -> None:
 
 
 def test_trajectories_of_two_sessions_are_independent() -> None:
-    """And strips of theirs with one number are two strips."""
+    """Strips of the two sessions with the same number are different strips."""
     second = level_path(60, BEGIN + 100 * SECOND)
     flight = made([(0, 1, 5, 20), (1, 1, 105, 120)], [level_path(60), second])
     prior = gauss_markov(flight)
@@ -292,7 +292,7 @@ def test_trajectories_of_two_sessions_are_independent() -> None:
     assert (np.diff(prior.time_ns[prior.flown == 1]) > 0).all()
 
 
-def test_knots_are_widened_and_said_where_they_would_be_too_many() -> None:
+def test_knots_are_widened_and_reported_if_there_would_be_too_many() -> None:
     """At most so many, evenly over all strips; strips that meet keep their knots apart."""
     flight = made([(0, 1, 10, 60), (0, 2, 60.4, 90), (0, 3, 120, 180)], [level_path(200)])
     knots = knots_of(flight, 1.0, most=40)
@@ -320,7 +320,7 @@ def test_a_trajectory_without_sigmas_is_refused(column: str) -> None:
         gauss_markov(made([(0, 1, 5, 30)], [told]))
 
 
-def test_what_cannot_be_is_refused() -> None:
+def test_impossible_trajectory_priors_are_refused() -> None:
     with pytest.raises(FlightError, match="no strip with returns; at least one is needed"):
         knots_of(made([], [level_path(10)]), 5.0)
     with pytest.raises(FlightError, match="the knots are 0 s apart; the interval must"):
@@ -350,7 +350,7 @@ def test_drawn_errors_have_the_covariance() -> None:
     np.testing.assert_allclose(found, factor / np.outer(sigma, sigma), atol=0.04)  # 4 √2 / √20000
 
 
-def test_applied_errors_move_and_turn_the_body() -> None:
+def test_applied_errors_move_and_rotate_the_body() -> None:
     """Linear between knots, held beyond them; of one trajectory only; a turn about down changes the heading."""
     path = level_path(60)
     time_ns = BEGIN + np.array([10, 20, 40], np.int64) * SECOND

@@ -58,13 +58,13 @@ def village(lines: tuple[Line, ...] = LINES, *, rear: bool = False, **true: floa
     return fly(lines, gables(), true=true, installation=REAR if rear else FRONT, scanner=THIN)
 
 
-def test_lectures_numbers() -> None:
+def test_angles_match_the_numbers_of_the_lecture() -> None:
     assert roll_rad(4.8, 1002.0) == pytest.approx(0.00479038, abs=5e-9)
     assert pitch_rad(17.92, 902.5) == pytest.approx(0.00992765, abs=5e-9)
     assert heading_rad(0.61, 493.0) == pytest.approx(0.0012373, abs=5e-8)
 
 
-def test_range_of_beams_that_are_not_vertical() -> None:
+def test_range_offset_uses_the_cosine_of_oblique_beams() -> None:
     cosine = np.cos(np.radians([0.0, 10.0, 25.0]))
     assert range_m(0.2 * cosine, cosine) == pytest.approx(0.2)
 
@@ -77,7 +77,7 @@ def test_range_of_beams_that_are_not_vertical() -> None:
         ("heading", -0.61, 493.0, "left rearward", -0.07089, ""),
     ],
 )
-def test_lectures_corrections_in_words_and_by_mounting(
+def test_corrections_of_the_lecture_are_described_in_words_and_by_mounting(
     kind: str, separation_m: float, baseline_m: float, words: str, front_deg: float, rear_deg: str
 ) -> None:
     front = formula(kind, separation_m, baseline_m, FRONT)
@@ -91,7 +91,7 @@ def test_lectures_corrections_in_words_and_by_mounting(
 
 @pytest.mark.parametrize(("sign", "rear"), [(1.0, False), (-1.0, True)])
 @pytest.mark.parametrize(("parameter", "kind"), ONE_AT_A_TIME)
-def test_one_error_at_a_time(parameter: str, kind: str, sign: float, rear: bool) -> None:
+def test_each_single_error_is_found(parameter: str, kind: str, sign: float, rear: bool) -> None:
     size = {"omega_rad": 0.004, "phi_rad": 0.006, "kappa_rad": 0.008, "range_offset_m": 0.15}[parameter] * sign
     lines = {"heading": (THERE, BESIDE), "range": (THERE,)}.get(kind, (THERE, BACK))
     found = survey(village(lines, rear=rear, **{parameter: size}), kind, CONTROL).profiles
@@ -103,7 +103,7 @@ def test_one_error_at_a_time(parameter: str, kind: str, sign: float, rear: bool)
         assert np.sign(profile.separation_m) == sign
 
 
-def test_what_is_right_is_left_alone() -> None:
+def test_a_flight_without_errors_gives_no_corrections() -> None:
     flight = village()
     found = measure(flight, CONTROL)
     assert {profile.kind for profile in found} == {"roll", "pitch", "heading", "range"}
@@ -111,7 +111,7 @@ def test_what_is_right_is_left_alone() -> None:
         assert abs(profile.found) < 4.0 * profile.noise_sigma
 
 
-def test_procedure_finds_all_and_repeats() -> None:
+def test_the_procedure_finds_all_errors_and_is_reproducible() -> None:
     true = {"omega_rad": 0.012, "phi_rad": -0.01, "kappa_rad": 0.01, "range_offset_m": 0.35}
     result = stepwise(village(**true), CONTROL)
     assert [step.kind for step in result.steps] == 2 * ["roll", "pitch", "heading", "range"]
@@ -122,7 +122,7 @@ def test_procedure_finds_all_and_repeats() -> None:
     assert abs(first - true["omega_rad"]) > 0.5 * abs(second)  # the first round did leave something
 
 
-def test_errors_of_the_trajectory_move_it_as_its_sigma_says() -> None:
+def test_trajectory_errors_move_the_result_within_its_sigma() -> None:
     right = village((THERE, BACK))
     given = [
         Given("roll", 0, 1, np.array([-132.0, -120.0]), np.array([-132.0, 120.0])),
@@ -164,7 +164,7 @@ def _told_wrong(number: int, line: Line, state: int) -> FloatArray:
     return errors
 
 
-def test_noise_moves_it_as_its_noise_sigma_says() -> None:
+def test_noise_moves_the_result_within_its_noise_sigma() -> None:
     flight = village((THERE, BACK))
     flight = only(flight, lambda points: np.abs(points[:, 1] - 12.0) < 6.0)
     given = [Given("pitch", 0, 1, np.array([-140.0, 12.0]), np.array([140.0, 12.0]))]
@@ -184,7 +184,7 @@ def test_noise_moves_it_as_its_noise_sigma_says() -> None:
     assert np.std(found) / np.mean(sigmas) == pytest.approx(1.0, abs=0.5)  # 18 draws: ± 3 × 0.17
 
 
-def test_given_profile() -> None:
+def test_a_given_profile_is_measured() -> None:
     flight = village((THERE, BACK), omega_rad=0.004)
     ends = np.array([-132.0, -120.0, 0.0]), np.array([-132.0, 120.0, 0.0])
     given = Given("roll", 0, 1, *ends)
@@ -204,7 +204,7 @@ def test_flat_ground_gives_roll_only() -> None:
 
 
 def test_even_slope_gives_pitch_as_in_the_lecture() -> None:
-    """One slope for all of the profile: a height of one line is taken for a shift along it, and the sigma says so."""
+    """The profile has one slope, so a height error looks like a shift along it, which the sigma must include."""
     slope = 0.25
     flight = fly(
         [THERE, BACK],
@@ -222,7 +222,7 @@ def test_even_slope_gives_pitch_as_in_the_lecture() -> None:
         assert sum(abs(effect[2]) for effect in profile.by_trajectory.values()) > 0.7 * 2 * 0.002 / slope / 600.0
 
 
-def test_lines_that_do_not_fit_give_nothing() -> None:
+def test_unsuitable_lines_give_no_profile() -> None:
     crossing = [THERE, Line(0, 145, 180, 290, 300)]
     flight = fly(crossing, gables(), scanner=Scanner(prf_hz=4_000.0))
     result = stepwise(flight)
@@ -231,7 +231,7 @@ def test_lines_that_do_not_fit_give_nothing() -> None:
     assert not any(step.profiles for step in result.steps)
 
 
-def test_opposite_lines_side_by_side_do_not_tell_heading_from_pitch() -> None:
+def test_opposite_lines_side_by_side_do_not_separate_heading_from_pitch() -> None:
     opposite = (THERE, Line(145, 90, 270, 290, 300))
     result = stepwise(village(opposite, phi_rad=0.006), settings=Settings(rounds=1))
     assert not result.sigmas
@@ -242,7 +242,7 @@ def test_opposite_lines_side_by_side_do_not_tell_heading_from_pitch() -> None:
     assert abs(result.calibrations["left"].value("kappa_rad")) < result.sigmas["left.kappa_rad"]
 
 
-def test_trees_do_no_harm() -> None:
+def test_trees_are_harmless() -> None:
     flight = village((THERE, BACK), phi_rad=0.006)
     rng = np.random.default_rng(2)
     swaths = []
@@ -259,7 +259,7 @@ def test_trees_do_no_harm() -> None:
         assert abs(profile.found - 0.006) < profile.sigma
 
 
-def test_after_lies_on_each_other() -> None:
+def test_corrected_sections_coincide() -> None:
     flight = village((THERE, BACK), omega_rad=0.004)
     profile = survey(flight, "roll").profiles[0]
     for pair, tilt in ((profile.before, 2.0 * 0.004), (profile.after, 0.0)):
@@ -270,7 +270,7 @@ def test_after_lies_on_each_other() -> None:
         assert abs(slopes[0] - slopes[1]) == pytest.approx(tilt, abs=3e-4)
 
 
-def test_truth_of_the_scene() -> None:
+def test_points_lie_on_the_ground_with_the_true_calibration() -> None:
     """The scene itself: with the true calibration the points lie on the ground."""
     true = {"omega_rad": 0.004, "phi_rad": -0.006, "kappa_rad": 0.01, "range_offset_m": 0.15}
     flight = fly(
@@ -285,7 +285,7 @@ def test_truth_of_the_scene() -> None:
     np.testing.assert_allclose(points[:, 2], 0.1 * points[:, 0], atol=1e-4)
 
 
-def test_picture() -> None:
+def test_the_picture_is_valid_svg_with_formula_and_strip_names() -> None:
     profile = survey(village((THERE, BACK), phi_rad=0.006), "pitch").profiles[0]
     text = svg(profile)
     ElementTree.fromstring(text)  # one well-formed drawing
@@ -296,7 +296,7 @@ def test_picture() -> None:
     assert {"Before", "After", *profile.names} <= set(words.split())
 
 
-def test_the_report_shows_a_range_as_it_lay_before_and_as_it_lies_after() -> None:
+def test_the_report_shows_a_range_section_before_and_after() -> None:
     """A laser 1.37 m off: before the ground lies that much too high, after on the survey but for what is left."""
     flight = village((THERE,), range_offset_m=1.37)
     start = flight.heads[0].start
@@ -314,7 +314,7 @@ def test_the_report_shows_a_range_as_it_lay_before_and_as_it_lies_after() -> Non
         assert before.get_xlim() == after.get_xlim()
 
 
-def test_the_report_shows_what_the_adjustment_left_of_a_roll() -> None:
+def test_the_report_shows_the_roll_left_by_the_adjustment() -> None:
     """Not what the profile's own finding would make of it, which always lies on each other."""
     flight = village((THERE, BACK), omega_rad=0.01)
     adjusted = {"left": flight.heads[0].start.changed(omega_rad=0.006)}
@@ -329,8 +329,8 @@ def test_the_report_shows_what_the_adjustment_left_of_a_roll() -> None:
     assert apart[1] == pytest.approx(2.0 * 0.004, rel=0.3)
 
 
-def test_a_pitch_found_for_one_scanner_is_not_known_of_another() -> None:
-    """Left over lines that tell pitch; right over opposite lines side by side, which move by either."""
+def test_a_pitch_found_for_one_scanner_does_not_apply_to_another() -> None:
+    """Scanner left flew lines that determine pitch; right flew opposite lines side by side, which heading moves too."""
     one = village(phi_rad=0.006)
     other = village((THERE, Line(145, 90, 270, 290, 300)), phi_rad=0.006)
     right = replace(other.heads[0], name="right", start=replace(other.heads[0].start, scanner="right"))

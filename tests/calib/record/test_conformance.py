@@ -22,7 +22,7 @@ UNLESS_TOLD = {"CA_Intensity.intensityCorrection"}  # the flight at hand has no 
 
 
 def section(title: str) -> str:
-    """What stands below a heading."""
+    """Return the text below a heading."""
     return PAGE.split(f"\n## {title}\n", 1)[1].split("\n## ", 1)[0]
 
 
@@ -45,14 +45,14 @@ def keys(owner: str, cell: str) -> set[str]:
 
 @cache
 def functions(path: str) -> frozenset[str]:
-    """Tests of a file."""
+    """Return the names of the tests of a file."""
     nodes = ast.walk(ast.parse((ROOT / path).read_text()))
     return frozenset(node.name for node in nodes if isinstance(node, ast.FunctionDef) and node.name.startswith("test_"))
 
 
 @pytest.fixture(scope="module")
 def record() -> Record:
-    """Of a calibration of which nobody told anything."""
+    """Return the record of a calibration without facts given by the user."""
     outcome = made_outcome(40_000)
     settings = {"Swath": "0.1.0"}
     return record_of(
@@ -61,7 +61,7 @@ def record() -> Record:
 
 
 @pytest.mark.parametrize("row", [*LASER, *CAMERA], ids=lambda row: row[0].split(":")[0])
-def test_every_row_names_tests_that_there_are(row: list[str]) -> None:
+def test_every_row_names_existing_tests(row: list[str]) -> None:
     words = re.findall(r"`([^`]+)`", row[3])
     assert words
     for word in words:
@@ -71,14 +71,14 @@ def test_every_row_names_tests_that_there_are(row: list[str]) -> None:
             assert word in functions(TESTS), word
 
 
-def test_what_else_the_page_names_is_there() -> None:
+def test_every_other_name_on_the_page_exists() -> None:
     for path in re.findall(r"`(tests/[^`]+)`", PAGE):
         assert (ROOT / path).is_file(), path
     for name in re.findall(r"`(test_\w+)`", PAGE):
         assert name in functions(TESTS), name
 
 
-def test_the_tables_name_the_dictionary_once_and_whole() -> None:
+def test_the_tables_list_every_attribute_of_the_dictionary_once() -> None:
     """Each attribute has its row; those of validation are in both parts."""
     named = [key for row in LASER for key in sorted(keys(row[0], row[1]))]
     also = [key for row in CAMERA for cell in row[1:3] for key in sorted(keys(row[0], cell))]
@@ -91,7 +91,7 @@ def test_the_tables_name_the_dictionary_once_and_whole() -> None:
     assert {row.key for row in ROWS if row.standard == OPTICAL and row.owner not in both} <= set(also)
 
 
-def test_what_is_said_to_stand_in_the_record_does(record: Record) -> None:
+def test_attributes_declared_as_present_are_in_the_record(record: Record) -> None:
     for owner, items, where, _, _ in LASER:
         for key in keys(owner, items) - UNLESS_TOLD:
             assert (key in record.missing) == where.startswith("missing"), key
@@ -103,7 +103,7 @@ def test_what_is_said_to_stand_in_the_record_does(record: Record) -> None:
             assert (key in record.missing) == (BY_KEY[key].obligation == "M"), key
 
 
-def test_what_is_said_to_be_unconfirmed_is(record: Record) -> None:
+def test_attributes_declared_as_unconfirmed_are_unconfirmed(record: Record) -> None:
     for owner, items, _, _, state in LASER:
         for key in keys(owner, items):
             assert BY_KEY[key].confirmed != ("not confirmed" in state or "no attribute's name is confirmed" in state)

@@ -61,16 +61,16 @@ KEYS = {f"{owner}.{name}" for owner, names in MANDATORY.items() for name in name
 
 @pytest.fixture(scope="module")
 def outcome() -> Outcome:
-    """Small."""
+    """Return a small outcome of a calibration."""
     return made_outcome(40_000)
 
 
 def given(outcome: Outcome, **more: Any) -> RecordInput:
-    """Of the one scanner."""
+    """Return the input of a record for the only scanner."""
     return RecordInput(outcome.flight, outcome.features, outcome.adjusted, "left", outcome.header, **more)
 
 
-def test_what_is_mandatory_is_there_or_said_to_be_missing(outcome: Outcome) -> None:
+def test_mandatory_attributes_are_present_or_listed_as_missing(outcome: Outcome) -> None:
     record = record_of(given(outcome))
     assert KEYS == {row.key for row in ROWS if row.obligation == "M"}
     assert KEYS <= record.values.keys() | set(record.missing)
@@ -103,7 +103,7 @@ def test_uncertain_names_are_flagged(outcome: Outcome) -> None:
 
 
 def from_json(text: str) -> dict[str, Any]:
-    """Flat: path → word."""
+    """Return the flattened JSON record: text by path."""
     document = json.loads(text)
     found: dict[str, Any] = {"id": document["id"], "version": str(document["version"])}
     found["missing"] = [f"{one['class']}.{one['name']}" for one in document["missing"]]
@@ -123,7 +123,7 @@ def from_json(text: str) -> dict[str, Any]:
 
 
 def from_xml(text: str) -> dict[str, Any]:
-    """Likewise."""
+    """Return the flattened XML record: text by path."""
     root = ET.fromstring(text)
     space = {"cr": NAMESPACE}
     found: dict[str, Any] = {"id": root.get("id"), "version": root.get("version")}
@@ -142,7 +142,7 @@ def from_xml(text: str) -> dict[str, Any]:
     return found
 
 
-def test_json_and_xml_say_the_same(outcome: Outcome) -> None:
+def test_json_and_xml_have_the_same_content(outcome: Outcome) -> None:
     told = {
         "CA_GNSS.numberSatellites": 14,
         "SD_Calibration.calibrationAgency": "Geo & <Sons> «Zürich»",
@@ -159,7 +159,7 @@ def test_json_and_xml_say_the_same(outcome: Outcome) -> None:
     assert "CA_GNSS.numberSatellites" not in flat["missing"]
 
 
-def test_large_matrices_are_told_and_attached(outcome: Outcome) -> None:
+def test_large_matrices_are_mentioned_and_attached(outcome: Outcome) -> None:
     record = record_of(given(outcome, attachment="left.npz"))
     held = io.BytesIO()
     attached: dict[str, Any] = record.arrays()
@@ -178,7 +178,7 @@ def test_large_matrices_are_told_and_attached(outcome: Outcome) -> None:
     assert len(flat["CA_LidarCalComputation.corrections1.rows"][0]) == len(outcome.adjusted.names)
 
 
-def test_matrices_are_the_derivatives_they_claim(outcome: Outcome) -> None:
+def test_matrices_equal_the_derivatives_of_the_sensor_model(outcome: Outcome) -> None:
     """A1 and B against differences of the sensor model itself, on the first plane's returns."""
     arrays = record_of(given(outcome)).arrays()
     group = outcome.adjusted.residuals[0]
@@ -218,7 +218,7 @@ def test_matrices_are_the_derivatives_they_claim(outcome: Outcome) -> None:
     assert abs(plane_e[:3] @ arrays["lidarObjectPoint"][0] + plane_e[3]) < 0.15
 
 
-def test_figures_of_the_flight(outcome: Outcome) -> None:
+def test_figures_of_the_flight_match_the_plan(outcome: Outcome) -> None:
     """Flown at 750 m over ground at 450 m and roofs; level, at the turn of the wave at most 0.6°."""
     record = record_of(given(outcome))
     number = {key: value.content for key, value in record.values.items()}
@@ -233,12 +233,12 @@ def test_figures_of_the_flight(outcome: Outcome) -> None:
 
 
 def numbers(outcome: Outcome, **more: Any) -> dict[str, Any]:
-    """By ``CLASS.attribute``: values, and matrices as arrays."""
+    """Return the values by ``CLASS.attribute``, matrices as arrays."""
     values = record_of(given(outcome, **more)).values.items()
     return {key: value.content.array if isinstance(value.content, Matrix) else value.content for key, value in values}
 
 
-def test_instruments_are_those_of_the_calibration(outcome: Outcome) -> None:
+def test_instruments_match_the_calibration(outcome: Outcome) -> None:
     """A boresight of ω, φ, κ on an installation that turns nothing, and the trajectory's sigmas."""
     calibration, number = outcome.adjusted.calibrations["left"], numbers(outcome)
     angles = [calibration.value(name) for name in ("omega_rad", "phi_rad", "kappa_rad")]
@@ -249,7 +249,7 @@ def test_instruments_are_those_of_the_calibration(outcome: Outcome) -> None:
     np.testing.assert_allclose(np.degrees(number["CA_IMU.attitudeAccuracy"]), [0.003, 0.003, 0.006])
 
 
-def test_control_is_that_of_the_calibration(outcome: Outcome) -> None:
+def test_control_matches_the_calibration(outcome: Outcome) -> None:
     number = numbers(outcome)
     points = [point for plane in outcome.features.planes for point in plane.control]
     assert number["CA_TestRange.numberControlPoints"] == len(points) == 10
@@ -260,7 +260,7 @@ def test_control_is_that_of_the_calibration(outcome: Outcome) -> None:
     assert number["CA_PositionalError.quantityType"] == "mean"
 
 
-def test_papers_are_those_of_the_calibration(outcome: Outcome) -> None:
+def test_documentation_attributes_match_the_calibration(outcome: Outcome) -> None:
     number = numbers(outcome, settings={"Swath": "0.1.0"})
     assert number["CA_CalibrationValidation.calibrationType"] == "inFlight"
     assert number["CA_OpticsSensorGeometry.geometryCalibrationDate"] == "2026-11-21T10:15:00+00:00"
@@ -274,8 +274,8 @@ def test_papers_are_those_of_the_calibration(outcome: Outcome) -> None:
     assert number["SD_Calibration.calibrationDate"] == "2026-11-21"
 
 
-def test_errors_are_values_with_sigmas(outcome: Outcome) -> None:
-    """Of the scanner; of the trajectory root mean squares of what the adjustment corrected."""
+def test_errors_are_recorded_as_values_with_sigmas(outcome: Outcome) -> None:
+    """Scanner errors are estimated values; trajectory errors are root mean squares of the corrections."""
     calibration, number = outcome.adjusted.calibrations["left"], numbers(outcome)
     for key, names in {
         "boresight": ("omega_rad", "phi_rad", "kappa_rad"),
@@ -291,7 +291,7 @@ def test_errors_are_values_with_sigmas(outcome: Outcome) -> None:
         np.testing.assert_allclose(number[f"CA_ErrorModel.{key}"], np.sqrt(np.mean(corrections**2, axis=0)))
 
 
-def test_angles_and_ranges_are_those_of_the_returns(outcome: Outcome) -> None:
+def test_angles_and_ranges_match_the_returns(outcome: Outcome) -> None:
     """In the order of the residuals, as corrected: θ and ρ give back where a return lies in the sensor's frame."""
     arrays, group = record_of(given(outcome)).arrays(), outcome.adjusted.residuals[0]
     rows = np.flatnonzero(group.weight > 0.0)
@@ -306,7 +306,7 @@ def test_angles_and_ranges_are_those_of_the_returns(outcome: Outcome) -> None:
         assert arrays["thetaTarget"][row, 0] == pytest.approx(angle, abs=1e-9)
 
 
-def test_planes_stand_with_their_derivatives(outcome: Outcome) -> None:
+def test_planes_are_recorded_with_their_derivatives(outcome: Outcome) -> None:
     """A2 · (s1 … s4) of a plane about its centre is the distance from it; G_c is that of unit normals; δ2 leads
     to those adjusted.
     """
@@ -327,7 +327,7 @@ def test_planes_stand_with_their_derivatives(outcome: Outcome) -> None:
 
 
 @pytest.mark.parametrize(("nodes", "whole"), [(160, True), (240, False)])
-def test_a_correction_by_intensity_stands_in_the_record(outcome: Outcome, nodes: int, whole: bool) -> None:
+def test_a_correction_by_intensity_is_recorded(outcome: Outcome, nodes: int, whole: bool) -> None:
     """Where there is one; a long table like other large matrices."""
     assert "CA_Intensity.intensityCorrection" not in numbers(outcome)
     table = np.linspace(0.0, 1000.0, nodes + 1), np.linspace(-0.02, 0.03, nodes + 1)
@@ -341,8 +341,8 @@ def test_a_correction_by_intensity_stands_in_the_record(outcome: Outcome, nodes:
 
 
 @pytest.mark.parametrize("key", [row.key for row in ROWS])
-def test_what_people_tell_stands_in_its_class(outcome: Outcome, key: str) -> None:
-    """Whatever the attribute, over what the calibration says and instead of its being missing."""
+def test_facts_given_by_the_user_are_recorded_in_their_class(outcome: Outcome, key: str) -> None:
+    """User facts replace computed and missing values, whatever the attribute."""
     words: dict[str, Plain] = {
         "Integer": 7,
         "Length": 0.25,
@@ -355,7 +355,7 @@ def test_what_people_tell_stands_in_its_class(outcome: Outcome, key: str) -> Non
     assert key not in record.missing
 
 
-def test_gps_time_as_utc() -> None:
+def test_gps_time_is_written_as_utc() -> None:
     """GPS week 2000 began on 2018-05-06, 18 leap seconds ahead of UTC."""
     assert utc_text(2000 * 604_800 * 10**9) == "2018-05-05T23:59:42Z"
 
@@ -369,7 +369,7 @@ def test_gps_time_as_utc() -> None:
         ({"CA_AuxiliaryDevice.errorLeverarm": "4 mm"}, "metres"),
     ],
 )
-def test_what_is_told_wrongly(outcome: Outcome, told: dict[str, Any], message: str) -> None:
+def test_wrong_facts_are_refused_in_one_line(outcome: Outcome, told: dict[str, Any], message: str) -> None:
     with pytest.raises(RecordError, match=message) as caught:
         record_of(given(outcome, told=told))
     assert "\n" not in str(caught.value)
@@ -391,8 +391,8 @@ VALIDATED: dict[str, Plain] = {
 }
 
 
-def test_what_is_told_later_stands_where_it_would_have_stood(outcome: Outcome) -> None:
-    """A record read back and told more is that which would have been told at once, as JSON and as XML."""
+def test_facts_added_later_are_recorded_as_if_given_at_once(outcome: Outcome) -> None:
+    """A record that is read back and completed equals one with all facts from the start, in JSON and XML."""
     at_once = record_of(given(outcome, told=VALIDATED))
     written = read_document(record_json(record_of(given(outcome))), "left.record.json")
     later = with_told(written, {key: (value, "as told") for key, value in VALIDATED.items()})
@@ -415,7 +415,7 @@ def test_what_is_told_later_stands_where_it_would_have_stood(outcome: Outcome) -
         '{"version": 1, "id": "x", "note": "", "classes": [], "missing": [{"class": "CA_GNSS", "name": "unknown"}]}',
     ],
 )
-def test_what_is_no_record_is_said_in_a_line(text: str) -> None:
+def test_a_file_that_is_not_a_record_is_refused_in_one_line(text: str) -> None:
     with pytest.raises(RecordError, match=r"left\.record\.json: not a calibration record") as caught:
         read_document(text, "left.record.json")
     assert "\n" not in str(caught.value)

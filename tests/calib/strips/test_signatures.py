@@ -36,19 +36,19 @@ def made() -> Cast:
 
 
 def found_in(flight: Flight) -> dict[str, Signature]:
-    """By name."""
+    """Return the found parameters by name."""
     found = signatures(differences(flight, RULES).checks, SeenFrom.of(flight)).found
     assert tuple(one.effect.name for one in found) == NAMES
     return {one.effect.name: one for one in found}
 
 
 def wrong(made: Cast, **values: float) -> Flight:
-    """Placed with a calibration that is wrong by so much."""
+    """Place the flight with a calibration that is wrong by the given amounts."""
     return made.flight.placed({"left": made.truth.changed(**values)})
 
 
 def mounted(flight: Flight, rot_b_from_s: FloatArray, offset_rad: float) -> Flight:
-    """The same returns seen by a head that is mounted otherwise."""
+    """Return the same returns as seen by a head with another mounting."""
     turn = rot_b_from_s[1, 1] / abs(rot_b_from_s[1, 1])
     (head,) = flight.heads
     start = replace(head.start, installation_matrix=rot_b_from_s)
@@ -71,7 +71,7 @@ MOUNTINGS = {
 
 
 @pytest.mark.parametrize("mounting", MOUNTINGS)
-def test_columns_are_those_of_the_sensor_model(made: Cast, mounting: str) -> None:
+def test_columns_match_the_sensor_model(made: Cast, mounting: str) -> None:
     flight = mounted(made.flight, *MOUNTINGS[mounting])
     swath, head = flight.swaths[2], flight.heads[0]
     at = np.arange(100, len(swath), 5000)
@@ -91,7 +91,7 @@ def test_columns_are_those_of_the_sensor_model(made: Cast, mounting: str) -> Non
     assert errors[:, :3] == pytest.approx(np.broadcast_to(np.eye(3), errors[:, :3].shape))
 
 
-def test_a_trajectory_whose_file_says_no_velocities_shows_time_too(made: Cast) -> None:
+def test_a_trajectory_without_velocities_still_shows_a_time_offset(made: Cast) -> None:
     flight = made.flight
     whole = flight.trajectories[0]
     unsaid = replace(whole, velocity_e=np.full_like(whole.velocity_e, np.nan))
@@ -106,7 +106,7 @@ def test_a_trajectory_whose_file_says_no_velocities_shows_time_too(made: Cast) -
     np.testing.assert_allclose(found, expected, rtol=0, atol=0.5)  # of 50 m/s
 
 
-def test_a_true_calibration_shows_nothing(made: Cast) -> None:
+def test_a_true_calibration_shows_no_error(made: Cast) -> None:
     whole = signatures(differences(made.flight, RULES).checks, SeenFrom.of(made.flight))
     for one in whole.found:
         assert one.level in ("none", "not told")
@@ -117,7 +117,7 @@ def test_a_true_calibration_shows_nothing(made: Cast) -> None:
     assert whole.left_rms_m == pytest.approx(whole.rms_m, rel=0.01)
 
 
-def test_a_gimbal_turns_the_scan_too(made: Cast) -> None:
+def test_errors_are_found_with_a_gimbal(made: Cast) -> None:
     (head,) = made.flight.heads
     turned = replace(head, mount=Mount((Stage(np.array([0.0, 0.0, math.pi])),)))
     for rot_b_from_s in SeenFrom.of(replace(made.flight, heads=(turned,))).rot_b_from_s:
@@ -125,7 +125,7 @@ def test_a_gimbal_turns_the_scan_too(made: Cast) -> None:
 
 
 @pytest.mark.parametrize("mounting", MOUNTINGS)
-def test_torsion_is_told_from_roll_however_the_head_is_mounted(made: Cast, mounting: str) -> None:
+def test_torsion_is_separated_from_roll_however_the_head_is_mounted(made: Cast, mounting: str) -> None:
     flight = mounted(made.flight, *MOUNTINGS[mounting])
     start = flight.heads[0].start
     found = found_in(flight.placed({"left": start.changed(scan_angle_scale=1e-3)}))
@@ -144,7 +144,7 @@ def test_torsion_is_told_from_roll_however_the_head_is_mounted(made: Cast, mount
         ("time", "time_offset_s", 2.0e-3, "time_offset_us"),
     ],
 )
-def test_a_wrong_parameter_is_found_with_the_size_that_mends_it(
+def test_a_wrong_parameter_is_found_with_its_correction(
     made: Cast, name: str, parameter: str, error: float, key: str
 ) -> None:
     found = found_in(wrong(made, **{parameter: error}))
@@ -157,7 +157,7 @@ def test_a_wrong_parameter_is_found_with_the_size_that_mends_it(
         assert other is one or other.level in ("none", "not told", "small"), other.words
 
 
-def test_several_at_once_are_told_apart(made: Cast) -> None:
+def test_several_wrong_parameters_are_separated(made: Cast) -> None:
     errors = {"omega_rad": -2e-4, "phi_rad": 3e-4, "kappa_rad": 8e-4}
     flight = wrong(made, **errors)
     whole = signatures(differences(flight, RULES).checks, SeenFrom.of(flight))
@@ -167,7 +167,7 @@ def test_several_at_once_are_told_apart(made: Cast) -> None:
     assert whole.left_rms_m < 0.5 * whole.rms_m
 
 
-def test_the_scan_direction_is_found_where_the_encoder_tells_it(made: Cast) -> None:
+def test_scan_direction_is_found_if_the_encoder_determines_it(made: Cast) -> None:
     """A mirror to and fro: every other sweep backwards, points of a latency of 8 µs at ±3 rad/s."""
     rate = 3.0
     swaths = []
@@ -183,7 +183,7 @@ def test_the_scan_direction_is_found_where_the_encoder_tells_it(made: Cast) -> N
     assert abs(one.value) > 5.0 * one.sigma
 
 
-def test_errors_of_strips_alone_are_not_taken_for_a_calibration(made: Cast) -> None:
+def test_errors_of_single_strips_are_not_taken_for_a_calibration_error(made: Cast) -> None:
     """Strips shifted as their trajectory's 2 cm allow: within three sigmas of nothing."""
     shifts = np.random.default_rng(1).normal(0.0, 0.02, (4, 3))
     swaths = [
@@ -194,7 +194,7 @@ def test_errors_of_strips_alone_are_not_taken_for_a_calibration(made: Cast) -> N
     assert found["pitch"].sigma > math.radians(0.001)
 
 
-def test_an_error_that_all_strips_share_is_no_calibration_and_the_sigma_says_so(made: Cast) -> None:
+def test_the_sigma_covers_an_error_common_to_all_strips(made: Cast) -> None:
     """A roll of 0.003°, as the trajectory's sigma has it, is common to all strips: it looks like a boresight."""
     flight, roll_rad = made.flight, math.radians(0.003)
     leaning = wrong(made, omega_rad=roll_rad)
@@ -207,7 +207,7 @@ def test_an_error_that_all_strips_share_is_no_calibration_and_the_sigma_says_so(
     assert SeenFrom.of(flight).trajectories[0].attitude_sigma_rad[0, 0] == pytest.approx(roll_rad)
 
 
-def test_sigmas_hold_where_errors_are_those_of_the_covariance(made: Cast) -> None:
+def test_sigmas_hold_if_errors_follow_their_covariance(made: Cast) -> None:
     """Eight flights with errors drawn from it; Σ(value / σ)² of m values is within χ²'s 1e-4 bounds on either side."""
     flight = made.flight
     prior = gauss_markov(flight, Taus(lasting_tilt=0.4, lasting_heading=0.2), 2.0)
@@ -223,7 +223,7 @@ def test_sigmas_hold_where_errors_are_those_of_the_covariance(made: Cast) -> Non
     assert low < sum(squares) < high
 
 
-def test_strips_decimetres_apart_are_rough_and_get_no_numbers(made: Cast) -> None:
+def test_strips_decimetres_apart_are_reported_as_rough_without_numbers(made: Cast) -> None:
     flight = wrong(made, omega_rad=math.radians(0.3))
     whole = signatures(differences(flight, RULES).checks, SeenFrom.of(flight))
     assert whole.rough
@@ -233,7 +233,7 @@ def test_strips_decimetres_apart_are_rough_and_get_no_numbers(made: Cast) -> Non
     assert all(math.isnan(one.sigma) for one in whole.found)
 
 
-def test_parallel_lines_over_flat_ground_do_not_tell_pitch_and_heading() -> None:
+def test_parallel_lines_over_flat_ground_do_not_separate_pitch_and_heading() -> None:
     flat = "height_m = 450.0\nrelief_m = 0.0"
     lines = ((-200, 0, 200, 0, 850), (200, 40, -200, 40, 850))
     made = cast_flight(flat, lines, prf_hz=15_000.0, true={})
@@ -245,7 +245,7 @@ def test_parallel_lines_over_flat_ground_do_not_tell_pitch_and_heading() -> None
     assert math.isnan(found["heading"].value)
 
 
-def test_too_few_differences_tell_nothing_and_the_record_has_no_number(made: Cast) -> None:
+def test_too_few_differences_give_no_result_and_no_number_in_the_record(made: Cast) -> None:
     checks = differences(made.flight, RULES).checks.take(slice(0, 5))
     whole = signatures(checks, SeenFrom.of(made.flight))
     assert {one.level for one in whole.found} == {"not told"}
@@ -254,7 +254,7 @@ def test_too_few_differences_tell_nothing_and_the_record_has_no_number(made: Cas
     assert all(effect["value"] is None for effect in effects)
 
 
-def test_checks_in_a_gap_of_the_trajectory_are_left_out(made: Cast) -> None:
+def test_checks_in_a_trajectory_gap_are_dropped(made: Cast) -> None:
     checks = differences(made.flight, RULES).checks
     late = checks.point_ns.copy()
     late[::2] += 50_000_000_000

@@ -42,12 +42,12 @@ POINT = np.array([0.4, -0.7, -0.07])
 
 
 def level(east: FloatArray, north: FloatArray) -> FloatArray:
-    """Flat ground."""
+    """Return the heights of flat ground."""
     return np.zeros_like(east + north)
 
 
 def in_one_cell(first: FloatArray, second: FloatArray) -> Gathered:
-    """Two strips' returns in one cell."""
+    """Return the returns of two strips in one cell."""
     strip = np.repeat([0, 1], [len(first), len(second)])
     count = len(strip)
     times = np.arange(count, dtype=np.int64) * 1_000_000
@@ -56,27 +56,27 @@ def in_one_cell(first: FloatArray, second: FloatArray) -> Gathered:
 
 
 def patch_at(height_m: float, *, slope: float = 0.0, noise_m: float = 0.0, seed: int = 0) -> FloatArray:
-    """Twenty returns in a cell of 2 m."""
+    """Return twenty returns in a cell of 2 m."""
     draws = np.random.default_rng(seed)
     places = draws.uniform(-1.0, 1.0, (20, 2))
     return np.column_stack([places, height_m + slope * places[:, 0] + draws.normal(0.0, 1.0, 20) * noise_m])
 
 
 def compared(first: FloatArray, second: FloatArray, rules: StripRules = RULES) -> StripReport:
-    """Two patches."""
+    """Return the comparison of two patches."""
     return report_of(["a", "b"], in_one_cell(first, second), rules, 2.0)
 
 
 # ---------------------------------------------------------------------- the printed numbers
 
 
-def test_point_to_plane_gives_the_printed_numbers() -> None:
+def test_point_to_plane_distances_match_the_printed_numbers() -> None:
     plane = plane_through(PATCH)
     assert round(plane.distance_m(POINT), 4) == 0.1125
     assert round(plane.above_m(POINT), 4) == 0.1180
 
 
-def test_strips_give_the_printed_numbers_where_the_point_is_the_first_strips_return() -> None:
+def test_strip_differences_match_the_printed_numbers() -> None:
     near = POINT + 0.02 * np.array([[1, 0, -0.3], [0, 1, 0.1], [-1, 0, 0.3], [0, -1, -0.1], [1, 1, -0.2], [0, 0, 0]])
     wide = np.array([[2.0, 0, -0.6], [0, 2.0, 0.2], [-2.0, 0, 0.6], [0, -2.0, -0.2], [2.0, 2.0, -0.4]]) + POINT
     centre = PATCH.mean(axis=0)
@@ -95,7 +95,7 @@ def _width_m(points: FloatArray) -> float:
     return float(np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[1]) / math.sqrt(len(points))
 
 
-def test_every_check_is_what_slow_arithmetic_says() -> None:
+def test_every_check_matches_a_plain_computation() -> None:
     draws = np.random.default_rng(8)
     cells, strips, points = [], [], []
     for cell in range(30):
@@ -154,14 +154,14 @@ def test_every_check_is_what_slow_arithmetic_says() -> None:
         (patch_at(0.0) + np.array([5.0, 0.0, 0.0]), patch_at(0.0), "returns do not surround it"),
     ],
 )
-def test_what_is_no_planar_overlap_is_refused_by_reason(first: FloatArray, second: FloatArray, reason: str) -> None:
+def test_non_planar_overlap_is_refused_by_reason(first: FloatArray, second: FloatArray, reason: str) -> None:
     assert len(compared(patch_at(0.0), patch_at(0.0, seed=1)).checks) == 1
     report = compared(first, second)
     assert len(report.checks) == 0
     assert report.refused == {reason: 1}
 
 
-def test_the_second_strip_higher_is_a_negative_difference_with_all_its_numbers() -> None:
+def test_a_higher_second_strip_gives_a_negative_difference() -> None:
     report = differences(surface_flight([level, lambda e, n: level(e, n) + 0.07], noise_m=0.02), RULES)
     (pair,) = report.pairs
     assert (pair.first, pair.second) == ("01", "02")
@@ -174,7 +174,7 @@ def test_the_second_strip_higher_is_a_negative_difference_with_all_its_numbers()
     assert report.roughness_m["01"] == pytest.approx(0.02, rel=0.02)
 
 
-def test_differences_of_heights_are_those_of_gentle_slopes_only() -> None:
+def test_height_differences_use_gentle_slopes_only() -> None:
     def roof(east: FloatArray, north: FloatArray) -> FloatArray:
         return np.where(east > 0.0, 0.5 * east, 0.0) + 0.0 * north
 
@@ -187,7 +187,7 @@ def test_differences_of_heights_are_those_of_gentle_slopes_only() -> None:
     assert float(np.median(steep.distance_m)) == pytest.approx(0.1 / math.hypot(1.0, 0.5), abs=0.005)
 
 
-def test_pulses_with_several_returns_say_nothing() -> None:
+def test_pulses_with_several_returns_are_ignored() -> None:
     made = surface_flight([level, level])
     points = made.swaths[1].points_t + np.array([0.0, 0.0, 0.3])
     both = np.concatenate([made.swaths[1].points_t, points])
@@ -198,7 +198,7 @@ def test_pulses_with_several_returns_say_nothing() -> None:
     assert report.refused["too rough"] == 0
 
 
-def test_strips_that_do_not_meet_give_no_pair() -> None:
+def test_strips_that_do_not_overlap_give_no_pair() -> None:
     made = surface_flight([level, level], half_m=10.0)
     away = swath_of(made.swaths[1].points_t + np.array([500.0, 0.0, 0.0]), 2)
     report = differences(Flight(FRAME, (), (), (made.swaths[0], away)), RULES)
@@ -208,7 +208,7 @@ def test_strips_that_do_not_meet_give_no_pair() -> None:
     assert differences(Flight(FRAME, (), (), ()), RULES).pairs == ()
 
 
-def test_returns_without_a_place_are_left_out() -> None:
+def test_returns_without_coordinates_are_dropped() -> None:
     made = surface_flight([level, level], half_m=10.0)
     holed = made.swaths[1].points_t.copy()
     holed[::3] = np.nan
@@ -220,7 +220,7 @@ def test_returns_without_a_place_are_left_out() -> None:
 # ---------------------------------------------------------------------- cells
 
 
-def test_cells_have_numbers_of_their_own_on_all_sides_of_zero() -> None:
+def test_cells_have_distinct_numbers_on_all_sides_of_zero() -> None:
     east, north = np.meshgrid(np.arange(-5, 5), np.arange(-5, 5))
     places = np.column_stack([east.ravel() + 0.5, north.ravel() + 0.5])
     assert len(np.unique(numbers_of(places, 1.0))) == 100
@@ -228,7 +228,7 @@ def test_cells_have_numbers_of_their_own_on_all_sides_of_zero() -> None:
     assert len(np.unique(numbers_of(places * 0.5, 1.0))) == 36
 
 
-def test_cells_of_the_overlap_alone_are_taken_and_no_more_than_wanted() -> None:
+def test_at_most_the_requested_number_of_overlap_cells_is_taken() -> None:
     made = surface_flight([level, level], half_m=20.0)
     beside = swath_of(made.swaths[1].points_t + np.array([20.0, 0.0, 0.0]), 2)
     strips = [FlightStrip(made.swaths[0]), FlightStrip(beside)]
@@ -241,14 +241,14 @@ def test_cells_of_the_overlap_alone_are_taken_and_no_more_than_wanted() -> None:
     assert (few.numbers == thinned(cells, StripRules(cell_m=2.0, most_cells=50)).numbers).all()
 
 
-def test_the_side_of_cells_follows_the_thinnest_strip() -> None:
+def test_the_cell_size_follows_the_sparsest_strip() -> None:
     dense, thin = surface_flight([level], step_m=0.5), surface_flight([level], step_m=1.0)
     strips = [FlightStrip(dense.swaths[0]), FlightStrip(thin.swaths[0])]
     assert overlap_cells(strips, StripRules()).cell_m == pytest.approx(4.0, rel=0.1)  # 16 returns of one a square metre
     assert overlap_cells(strips[:1], StripRules()).cell_m == pytest.approx(2.0, rel=0.1)
 
 
-def test_no_cells_gather_nothing() -> None:
+def test_empty_cells_give_an_empty_report() -> None:
     report = report_of(["a"], in_one_cell(np.zeros((0, 3)), np.zeros((0, 3))), RULES, 2.0)
     assert len(report.checks) == 0
     assert Cells(1.0, np.zeros(0, np.int64)).cell_m == 1.0
@@ -269,7 +269,7 @@ def test_no_cells_gather_nothing() -> None:
         (9.0, 9.0, None, "333.3 cm"),
     ],
 )
-def test_a_level_is_kept_when_rms_and_largest_difference_are(
+def test_a_quality_level_is_met_if_rms_and_largest_difference_are_within_limits(
     rms_m: float, max_m: float, best: str | None, asprs: str
 ) -> None:
     judged = judge(overlap_rms_m=rms_m, overlap_max_m=max_m)
@@ -278,19 +278,19 @@ def test_a_level_is_kept_when_rms_and_largest_difference_are(
     assert [one.level for one in judged if one.standard == USGS] == ["QL0", "QL1", "QL2", "QL3"]
 
 
-def test_a_repeatability_says_nothing_of_a_limit_of_the_largest_difference() -> None:
+def test_repeatability_is_not_judged_by_the_limit_of_the_largest_difference() -> None:
     judged = judge(overlap_rms_m=0.02, overlap_max_m=0.05, within_rms_m=0.029)
     assert judged[-1].kept["within_m"] is None
     assert judged[0].kept["within_m"] is True
 
 
-def test_what_was_not_measured_is_neither_kept_nor_broken() -> None:
+def test_unmeasured_figures_are_neither_met_nor_missed() -> None:
     judged = judge(overlap_rms_m=None)
     assert best_of(judged) is None
     assert all(kept is None for one in judged for kept in one.kept.values())
 
 
-def test_density_is_kept_from_above_and_heights_from_below() -> None:
+def test_density_limits_are_minima_and_height_limits_are_maxima() -> None:
     judged = {one.level: one for one in judge(overlap_rms_m=0.01, pulses_m2=2.5, rmse_z_m=0.07, within_rms_m=0.02)}
     assert judged["QL1"].kept == {
         "pulses_m2": False,

@@ -76,7 +76,7 @@ def misses(flight: Flight, **true: float) -> tuple[FloatArray, FloatArray, Float
     return np.array(off), np.array(covariance), np.array(made)
 
 
-def test_shifts_are_those_a_wrong_boresight_makes_and_as_sure_as_they_say() -> None:
+def test_shifts_match_a_wrong_boresight_and_their_sigmas() -> None:
     true = {"omega_rad": 0.0013, "phi_rad": -0.0017}
     off, covariance, made = misses(flown(**true), **true)
     assert len(off) > 30
@@ -86,7 +86,7 @@ def test_shifts_are_those_a_wrong_boresight_makes_and_as_sure_as_they_say() -> N
     assert np.linalg.norm(off[:, :2], axis=1).max() < 0.1
 
 
-def test_heights_stand_on_each_swaths_own_plane() -> None:
+def test_heights_lie_on_the_plane_of_each_swath() -> None:
     """A wrong roll tilts the two swaths against each other: each sighting is on its own."""
     true = {"omega_rad": 0.0013, "phi_rad": -0.0017}
     flight = flown(**true)
@@ -117,7 +117,7 @@ def _bilinear(coarse: FloatArray, row: float, column: float) -> float:
 SIDE = 2 * round((SETTINGS.square_m / 2 + SETTINGS.search_m) / SETTINGS.cell_m) + 1
 
 
-def test_shift_of_images_to_the_east_and_north() -> None:
+def test_shifts_of_images_to_east_and_north_are_measured() -> None:
     large = pattern(SIDE + 20, 1)
     first, second = large[10:-10, 10:-10], large[7:-13, 14:-6]  # contents: 3 cells to the north, 4 to the west
     shift = shifted(Image(first, 0.4, True), Image(second, 0.4, True), SETTINGS)
@@ -143,12 +143,12 @@ def test_ambiguous_images_are_refused(first: FloatArray, second: FloatArray, why
     assert why in said or (why == "no single peak" and said in ("several places match equally well", "no single peak"))
 
 
-def test_holes_are_refused() -> None:
+def test_images_with_holes_are_refused() -> None:
     image = Image(pattern(SIDE, 1), 0.4, True)
     assert shifted(image, replace(image, whole=False), SETTINGS) == "the ground has holes"
 
 
-def test_what_does_not_become_a_tie_is_counted() -> None:
+def test_images_without_a_tie_are_counted() -> None:
     flight = flown(omega_rad=0.0013, phi_rad=-0.0017)
     even = replace(flight, swaths=tuple(replace(one, rows=_even(one.rows)) for one in flight.swaths))
     found = find_markings(even)

@@ -72,7 +72,7 @@ def by_kind(features: Features, kind: str) -> list[TiePoint]:
 SHIFTS = (np.zeros(3), np.array([0.30, -0.20, 0.10]), np.array([-0.1, 0.4, 0.0]))
 
 
-def test_corner_stands_where_the_faces_meet() -> None:
+def test_a_corner_lies_where_its_faces_meet() -> None:
     flight, planes = roof(1, SHIFTS)
     (corner,) = by_kind(find_ties(flight, planes), "corner")
     assert [sighting.swath for sighting in corner.sightings] == [0, 1, 2]
@@ -84,7 +84,7 @@ def test_corner_stands_where_the_faces_meet() -> None:
         assert sighting.at == np.argmin(distance)
 
 
-def test_ridge_is_known_across_and_not_along() -> None:
+def test_a_ridge_is_determined_across_and_not_along() -> None:
     flight, planes = roof(1, SHIFTS)
     ridges = {tie.name: tie for tie in by_kind(find_ties(flight, planes), "ridge")}
     assert set(ridges) == {"ridge p0/p1", "ridge p0/p2", "ridge p1/p2"}
@@ -99,7 +99,7 @@ def test_ridge_is_known_across_and_not_along() -> None:
         assert sighting.point_t[0] == pytest.approx(first.point_t[0], abs=0.01)  # a common place along it
 
 
-def test_covariance_of_corners_and_ridges_is_that_of_a_monte_carlo() -> None:
+def test_covariances_of_corners_and_ridges_match_a_monte_carlo_simulation() -> None:
     rng = np.random.default_rng(7)
     bare = [face(normal, 40, rng, 0.0) for normal in (NORTH, SOUTH, EAST)]
     line = np.array([1.0, 0.0, 0.0]), 0.0, 1e-12
@@ -125,7 +125,7 @@ def test_covariance_of_corners_and_ridges_is_that_of_a_monte_carlo() -> None:
     np.testing.assert_allclose(whitened @ got @ whitened.T, np.eye(2), atol=0.15)
 
 
-def test_far_from_the_patch_it_is_less_certain() -> None:
+def test_a_tie_far_from_its_patch_is_less_certain() -> None:
     rng = np.random.default_rng(3)
     fit = fit_patch(face(NORTH, 60, rng), np.arange(60), NORTH)
     on_plane = fit.centre_t + 10.0 * fit.axes[1]
@@ -142,7 +142,9 @@ def test_far_from_the_patch_it_is_less_certain() -> None:
         ({"least_length_m": 30.0}, "the swaths share too little of it"),
     ],
 )
-def test_what_is_no_ridge_is_counted(change: dict[str, Any], reason: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_patches_without_a_ridge_are_counted(
+    change: dict[str, Any], reason: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("swath.calib.ties.intersections.SPACINGS", 0.0)
     flight, planes = roof(1, SHIFTS)
     found = find_ties(flight, planes, replace(TieSettings(), **change))
@@ -150,7 +152,7 @@ def test_what_is_no_ridge_is_counted(change: dict[str, Any], reason: str, monkey
     assert not by_kind(found, "ridge")
 
 
-def test_faces_of_two_houses_are_no_ridge() -> None:
+def test_faces_of_two_houses_do_not_form_a_ridge() -> None:
     rng = np.random.default_rng(1)
     apart = np.array([0.0, 12.0, 0.0])
     swaths = [[face(NORTH, 60, rng), face(SOUTH, 60, rng) + apart] for _ in range(2)]
@@ -160,7 +162,7 @@ def test_faces_of_two_houses_are_no_ridge() -> None:
     assert found.refused["ridge: the planes do not intersect in two swaths"] == 1
 
 
-def test_one_swath_gives_nothing() -> None:
+def test_a_single_swath_gives_no_ties() -> None:
     flight, planes = roof(1, SHIFTS[:1])
     assert not find_ties(flight, planes).ties
     assert not find_ties(flight, Features()).ties
@@ -177,7 +179,7 @@ c,03,1.0,1.0,5.3,0.2
 """
 
 
-def test_file_of_picked_points() -> None:
+def test_a_file_of_picked_points_is_read() -> None:
     picked = read_picked(TEXT, "ties.csv")
     assert [(one.name, one.strip, one.sigma_m) for one in picked] == [
         ("a", "1", 0.05),
@@ -200,7 +202,7 @@ def test_file_of_picked_points() -> None:
     }
 
 
-def test_picked_points_go_with_their_returns() -> None:
+def test_picked_points_move_with_their_returns() -> None:
     flight, _ = roof(1, SHIFTS)
     picked = picked_ties(flight, read_picked(TEXT, "ties.csv"))
     away = np.array([3.0, -2.0, 0.5])
@@ -232,14 +234,14 @@ def test_sighting_far_from_the_others_is_counted() -> None:
         ("name,strip,x,y,z,sigma_m\na,1,2,3,4,0\n", "t.csv: line 2: sigma_m: got 0, want more than 0"),
     ],
 )
-def test_files_that_cannot_be_used(text: str, said: str) -> None:
+def test_unusable_files_of_picked_points_are_refused(text: str, said: str) -> None:
     with pytest.raises(PickedError) as caught:
         read_picked(text, "t.csv")
     assert str(caught.value).startswith(said)
     assert "\n" not in str(caught.value)
 
 
-def test_strip_the_flight_does_not_have() -> None:
+def test_a_strip_missing_from_the_flight_is_refused() -> None:
     flight, _ = roof(1, SHIFTS)
     (one,) = read_picked("name,strip,x,y,z,sigma_m\na,9,0,1,5.3,0.05\n", "t.csv")
     with pytest.raises(

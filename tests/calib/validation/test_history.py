@@ -50,7 +50,7 @@ def test_differences_are_tested_against_the_joint_sigma() -> None:
     assert row.words == "omega_deg +0.0030 ± 0.0014 (2.1 σ)"
 
 
-def test_correlation_counts() -> None:
+def test_correlation_is_taken_into_account() -> None:
     """Differences along the direction that is known worse are no surprise, across it they are."""
     along = compare(made(1, correlation=0.9), made(2, (0.253, -0.397, 0.6), correlation=0.9))
     across = compare(made(1, correlation=0.9), made(2, (0.253, -0.403, 0.6), correlation=0.9))
@@ -60,20 +60,20 @@ def test_correlation_counts() -> None:
     assert not along.moved
 
 
-def test_what_only_one_of_them_estimated_is_not_compared() -> None:
+def test_parameters_estimated_by_one_calibration_only_are_not_compared() -> None:
     held = made(2, sigmas=np.array([SIGMAS[0], 0.0, SIGMAS[2]]))
     assert [row.name for row in compare(made(1), held).rows] == ["omega_rad", "kappa_rad"]
     assert compare(made(1), made(2, sigmas=np.zeros(3))).freedom == 0
     assert not compare(made(1), made(2, sigmas=np.zeros(3))).moved
 
 
-def test_other_installation_matrices_cannot_be_compared() -> None:
+def test_calibrations_with_different_installations_cannot_be_compared() -> None:
     turned = replace(made(2), installation_matrix=np.diag([-1.0, -1.0, 1.0]))
     with pytest.raises(HistoryError, match="cal-1 and cal-2 have different installation matrices"):
         compare(made(1), turned)
 
 
-def test_a_jump_is_told_with_its_dates_and_size() -> None:
+def test_a_jump_is_reported_with_its_dates_and_size() -> None:
     (one,) = history([made(3, (0.25, -0.392, 0.6)), made(1), made(2)])
     assert [entry.id for entry in one.entries] == ["cal-1", "cal-2", "cal-3"]
     assert [step.moved for step in one.steps] == [False, True]
@@ -82,7 +82,7 @@ def test_a_jump_is_told_with_its_dates_and_size() -> None:
     assert "left: the boresight has moved between 2026-02-01 and 2026-03-01: phi_deg +0.0080 ± 0.0014" in text
 
 
-def test_a_slow_drift_is_found_by_the_line_though_no_step_shows_it() -> None:
+def test_a_slow_drift_is_found_by_a_line_without_any_step() -> None:
     entries = [made(number, (0.25, -0.4 + 0.0008 * number, 0.6)) for number in range(1, 11)]
     (one,) = history(entries)
     assert not any(step.moved for step in one.steps)
@@ -102,7 +102,7 @@ def test_a_slow_drift_is_found_by_the_line_though_no_step_shows_it() -> None:
     assert any("phi_deg drifts by +0.009" in line for line in one.sentences)
 
 
-def test_noise_is_no_move_at_the_rate_that_is_promised() -> None:
+def test_noise_is_reported_as_a_change_at_the_stated_rate() -> None:
     draws = np.random.default_rng(4)
     moved = 0
     for _ in range(400):
@@ -137,7 +137,7 @@ IBRC = np.array([200.0, 2000.0])
         ({"refraction": "ardc"}, "refraction is none and ardc"),
     ],
 )
-def test_what_was_held_otherwise_is_no_move(other: dict[str, Any], said: str) -> None:
+def test_a_parameter_held_at_another_value_is_not_a_change(other: dict[str, Any], said: str) -> None:
     """Neither a step nor a line through all; steps between others are judged."""
     values = {name: value for name, value in other.items() if name in INDEX}
     tables = {name: value for name, value in other.items() if name not in INDEX}
@@ -153,14 +153,14 @@ def test_what_was_held_otherwise_is_no_move(other: dict[str, Any], said: str) ->
     assert alone.sentences == one.sentences[1:]
 
 
-def test_what_was_held_nearly_alike_is_compared() -> None:
+def test_parameters_held_at_nearly_equal_values_are_compared() -> None:
     near = made(2, (0.25, -0.39, 0.6)).changed(lever_arm_x_m=0.002, range_offset_m=0.001, range_scale=2e-6)
     near = replace(near, ibrc=(IBRC, np.array([0.0, 0.002])), refraction="none")  # the other leaves it unsaid
     (one,) = history([made(1), near])
     assert one.moved
 
 
-def test_what_one_held_and_the_other_estimated_is_compared_where_values_agree() -> None:
+def test_a_held_and_an_estimated_parameter_are_compared_if_they_agree() -> None:
     tilt, sigmas = INDEX["scan_plane_tilt_rad"], made(2).sigmas.copy()
     sigmas[tilt] = np.radians(0.002)
     estimated = replace(made(2, (0.25, -0.39, 0.6)), sigmas=sigmas)
@@ -188,14 +188,14 @@ def test_each_installation_has_its_own_history() -> None:
         ({"installation": "a"}, "created is not a time"),
     ],
 )
-def test_what_is_no_history_is_one_line(header: dict[str, object], said: str) -> None:
+def test_files_that_form_no_history_are_refused_in_one_line(header: dict[str, object], said: str) -> None:
     with pytest.raises(HistoryError, match=said):
         history([replace(made(1), header=header)])
     with pytest.raises(HistoryError, match="is given twice"):
         history([made(1), made(1)])
 
 
-def test_the_record_and_the_picture_have_every_calibration() -> None:
+def test_record_and_picture_include_every_calibration() -> None:
     found = history([made(number) for number in range(1, 5)])
     record = found[0].record()
     assert [row["id"] for row in record["calibrations"]] == ["cal-1", "cal-2", "cal-3", "cal-4"]

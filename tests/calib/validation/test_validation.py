@@ -38,13 +38,13 @@ LINES = ((-200, 0, 200, 0, 850), (200, 60, -200, 60, 850), (0, 200, 0, -200, 850
 
 @pytest.fixture(scope="module")
 def made() -> Cast:
-    """Two opposite lines, a crossing one, and a crossing one higher up."""
+    """Return two opposite lines, a crossing one, and a crossing one at another height."""
     return cast_flight(lines=LINES, prf_hz=25_000.0, true={})
 
 
 @pytest.fixture(scope="module")
 def roofs(made: Cast) -> Features:
-    """Roofs by the scene's own word, every plane's returns where they truly lie."""
+    """Return the true roofs of the scene, with every plane's returns on it."""
     patches: dict[int, list[Patch]] = {}
     for number in range(len(made.flight.swaths)):
         at = np.flatnonzero(made.surface[number] == ROOF)
@@ -74,7 +74,7 @@ def control(made: Cast) -> list[ControlPoint]:
 def methods(
     made: Cast, roofs: Features, control: list[ControlPoint] | None = None, **wrong: float
 ) -> dict[str, Method]:
-    """Of a calibration that is wrong by so much and knows nothing of it."""
+    """Return by name the methods of a validation of a calibration that is wrong by so much and does not know it."""
     calibrations = {"left": made.truth.changed(**wrong)}
     found = validate(made.flight.placed(calibrations), roofs, calibrations, Asked(control))
     assert [method.name for method in found.methods] == list(CODES)
@@ -82,7 +82,7 @@ def methods(
 
 
 def with_sigmas(calibration: Calibration, **sigmas: float) -> Calibration:
-    """The same with sigmas of some parameters."""
+    """Return the calibration with sigmas of some parameters."""
     whole = calibration.sigmas.copy()
     for name, sigma in sigmas.items():
         whole[INDEX[name]] = sigma
@@ -92,7 +92,7 @@ def with_sigmas(calibration: Calibration, **sigmas: float) -> Calibration:
 # ---------------------------------------------------------------------- the methods
 
 
-def test_a_true_calibration_passes_all_that_the_flight_can_show(
+def test_a_true_calibration_passes_every_applicable_method(
     made: Cast, roofs: Features, control: list[ControlPoint]
 ) -> None:
     found = methods(made, roofs, control)
@@ -108,7 +108,7 @@ def test_a_true_calibration_passes_all_that_the_flight_can_show(
     assert found["measurementActualParameters"].passed is None
 
 
-def test_methods_take_the_pairs_they_are_named_after(made: Cast, roofs: Features) -> None:
+def test_each_method_uses_the_pairs_it_is_named_after(made: Cast, roofs: Features) -> None:
     found = methods(made, roofs)
     counts = {name: found[name].more.get("pairs") for name in ("crossStripFlight", "secondAltitude", "other")}
     assert counts == {"crossStripFlight": 4, "secondAltitude": 3, "other": 6}  # of two east-west, two north-south
@@ -130,7 +130,7 @@ def test_a_wrong_range_offset_fails_on_the_test_field_with_its_sign(
     assert method.numbers.mean_m == pytest.approx(0.11, abs=0.02)  # too short a range lifts the ground
 
 
-def test_what_the_calibration_does_not_claim_to_know_is_no_fault(made: Cast, roofs: Features) -> None:
+def test_parameters_that_the_calibration_declares_unknown_are_not_a_fault(made: Cast, roofs: Features) -> None:
     wrong = made.truth.changed(phi_rad=6e-4)
     sure, unsure = wrong, with_sigmas(wrong, phi_rad=6e-4)
     flight = made.flight.placed({"left": wrong})
@@ -138,7 +138,7 @@ def test_what_the_calibration_does_not_claim_to_know_is_no_fault(made: Cast, roo
     assert validate(flight, roofs, {"left": unsure}).passed is True
 
 
-def test_two_flights_are_a_method_of_their_own(made: Cast, roofs: Features) -> None:
+def test_two_flights_are_a_separate_method(made: Cast, roofs: Features) -> None:
     swaths = tuple(replace(swath, flown=number // 2) for number, swath in enumerate(made.flight.swaths))
     flight = replace(made.flight, trajectories=made.flight.trajectories * 2, swaths=swaths).placed({"left": made.truth})
     method = next(one for one in validate(flight, roofs, {"left": made.truth}).methods if one.name == "secondFlight")
@@ -146,7 +146,7 @@ def test_two_flights_are_a_method_of_their_own(made: Cast, roofs: Features) -> N
     assert method.more["pairs"] == 4
 
 
-def test_parameters_measured_anew_are_compared_with_their_joint_sigmas(made: Cast) -> None:
+def test_remeasured_parameters_are_compared_by_their_joint_sigmas(made: Cast) -> None:
     told = with_sigmas(made.truth, omega_rad=3e-5, phi_rad=4e-5)
     near, far = (with_sigmas(made.truth.changed(omega_rad=by), omega_rad=4e-5, phi_rad=3e-5) for by in (5e-5, 4e-4))
     for anew, passed in ((near, True), (far, False)):
@@ -159,14 +159,14 @@ def test_parameters_measured_anew_are_compared_with_their_joint_sigmas(made: Cas
         assert "omega_deg" in method.sentence
 
 
-def test_nothing_to_look_at_is_said(made: Cast) -> None:
+def test_a_validation_without_features_says_that_nothing_was_validated(made: Cast) -> None:
     validation = validate(made.flight, Features(), {"left": made.truth})
     assert validation.passed is None
     assert validation.sentence == "nothing could be validated"
     assert all("not applied: want" in method.sentence for method in validation.methods)
 
 
-def test_few_sights_of_control_are_too_few(made: Cast, roofs: Features, control: list[ControlPoint]) -> None:
+def test_few_control_sightings_are_too_few(made: Cast, roofs: Features, control: list[ControlPoint]) -> None:
     away = [ControlPoint("A", control[0].position_t + np.array([5000.0, 0.0, 0.0]), 0.01)]
     method = methods(made, roofs, away)["testfield"]
     assert method.passed is None
@@ -176,7 +176,7 @@ def test_few_sights_of_control_are_too_few(made: Cast, roofs: Features, control:
 # ---------------------------------------------------------------------- the tests themselves
 
 
-def test_the_tests_reject_as_often_as_they_promise() -> None:
+def test_the_tests_reject_at_their_stated_rate() -> None:
     draws = np.random.default_rng(9)
     shared = draws.normal(0.0, 0.02, (40, 12))
     noise = draws.uniform(0.005, 0.02, 40)
@@ -197,7 +197,7 @@ def test_the_tests_reject_as_often_as_they_promise() -> None:
 
 
 @pytest.mark.slow
-def test_planes_that_many_swaths_show_are_tested_as_often_as_promised(made: Cast, roofs: Features) -> None:
+def test_planes_seen_by_many_swaths_are_rejected_at_the_stated_rate(made: Cast, roofs: Features) -> None:
     """Each sight errs once, in all its distances, as returns and 3 mm of a distance say; so does a strip on a plane."""
     calibrations, flight = {"left": made.truth}, made.flight.placed({"left": made.truth})
     planes = tuple(plane for plane in roofs.planes if len(plane.patches) == 4)
@@ -241,7 +241,7 @@ def values_of(rows: Rows, prior: TrajectoryPrior, draws: np.random.Generator, fl
     return value
 
 
-def test_chi2_is_about_the_redundancy_where_planes_and_trajectory_are_as_they_say(made: Cast, roofs: Features) -> None:
+def test_chi2_equals_the_redundancy_if_planes_and_trajectory_match_their_sigmas(made: Cast, roofs: Features) -> None:
     """Erroneous trajectories, and all points placed along them: not the rows' own linear model."""
     prior, draws = gauss_markov(made.flight, Taus(5.0, 5.0, 5.0), 1.0), np.random.default_rng(3)
     ratios, redundancy = [], 0.0
@@ -256,7 +256,7 @@ def test_chi2_is_about_the_redundancy_where_planes_and_trajectory_are_as_they_sa
     assert np.mean(ratios) == pytest.approx(1.0, abs=3.0 * np.sqrt(2.0 / redundancy) + 0.05)
 
 
-def test_an_error_of_the_smallest_size_told_is_found_as_often_as_promised(
+def test_an_error_of_the_minimal_detectable_size_is_found_at_the_stated_rate(
     drawn: tuple[Rows, TrajectoryPrior],
 ) -> None:
     rows = drawn[0].take(np.arange(len(drawn[0])) % 3 == 0)
@@ -273,7 +273,7 @@ def test_an_error_of_the_smallest_size_told_is_found_as_often_as_promised(
         assert POWER - 3.3 * np.sqrt(POWER * (1.0 - POWER) / runs) < found / runs < 0.95
 
 
-def test_the_roughness_of_planes_is_what_the_flight_shows(drawn: tuple[Rows, TrajectoryPrior]) -> None:
+def test_the_roughness_of_planes_is_estimated_from_the_flight(drawn: tuple[Rows, TrajectoryPrior]) -> None:
     rows, prior = drawn
     draws = np.random.default_rng(6)
     found = {
@@ -285,7 +285,7 @@ def test_the_roughness_of_planes_is_what_the_flight_shows(drawn: tuple[Rows, Tra
     assert np.mean(found[0.02]) == pytest.approx(FLOOR_M, rel=0.01)  # more is no roughness of a natural plane
 
 
-def test_an_error_of_the_calibration_is_no_roughness(drawn: tuple[Rows, TrajectoryPrior]) -> None:
+def test_a_calibration_error_is_not_taken_for_roughness(drawn: tuple[Rows, TrajectoryPrior]) -> None:
     rows, prior = drawn
     sound = replace(rows, value_m=values_of(rows, prior, np.random.default_rng(7), 0.001))
     wrong = replace(sound, value_m=sound.value_m + rows.effects @ np.full(rows.effects.shape[1], 1e-4))
@@ -295,7 +295,7 @@ def test_an_error_of_the_calibration_is_no_roughness(drawn: tuple[Rows, Trajecto
 # ---------------------------------------------------------------------- what could have been seen, and was asked for
 
 
-def test_the_verdict_names_the_errors_that_would_not_have_been_seen(made: Cast, roofs: Features) -> None:
+def test_the_verdict_names_undetectable_errors(made: Cast, roofs: Features) -> None:
     calibrations = {"left": made.truth}
     validation = validate(made.at_truth(), roofs, calibrations)
     smallest = {one.parameter: one for one in validation.detectable}
@@ -307,7 +307,7 @@ def test_the_verdict_names_the_errors_that_would_not_have_been_seen(made: Cast, 
         assert validate(made.flight.placed(wrong), roofs, wrong).passed is False
 
 
-def test_errors_within_the_calibrations_own_sigmas_count_as_not_seen(made: Cast, roofs: Features) -> None:
+def test_errors_within_the_sigmas_of_the_calibration_are_undetectable(made: Cast, roofs: Features) -> None:
     size = {}
     for sigma in (0.0, 1e-3):
         calibrations = {"left": with_sigmas(made.truth, phi_rad=sigma)}
@@ -317,7 +317,7 @@ def test_errors_within_the_calibrations_own_sigmas_count_as_not_seen(made: Cast,
     assert size[1e-3] == pytest.approx(np.hypot(size[0.0], shift * 1e-3), rel=0.01)
 
 
-def test_a_test_without_power_says_so(made: Cast, roofs: Features) -> None:
+def test_a_test_without_power_is_reported(made: Cast, roofs: Features) -> None:
     """Sigmas of a trajectory far larger than its errors: χ² far below its redundancy, and nothing small can be seen."""
     trajectory = replace(
         made.flight.trajectories[0], attitude_sigma_rad=np.full((len(made.flight.trajectories[0]), 3), 0.01)
@@ -329,9 +329,7 @@ def test_a_test_without_power_says_so(made: Cast, roofs: Features) -> None:
     assert {one.parameter: one for one in validation.detectable}["omega_rad"].size > 0.01
 
 
-def test_control_that_was_asked_for_and_not_seen_is_no_holding(
-    made: Cast, roofs: Features, control: list[ControlPoint]
-) -> None:
+def test_control_that_was_not_seen_does_not_pass(made: Cast, roofs: Features, control: list[ControlPoint]) -> None:
     calibrations = {"left": made.truth}
     away = [ControlPoint("A", control[0].position_t + np.array([5000.0, 0.0, 0.0]), 0.01)]
     validation = validate(made.at_truth(), roofs, calibrations, Asked(away))
@@ -342,7 +340,7 @@ def test_control_that_was_asked_for_and_not_seen_is_no_holding(
     assert validate(made.at_truth(), roofs, calibrations).holds is True
 
 
-def test_parameters_anew_and_flights_that_could_not_be_compared_are_told(made: Cast, roofs: Features) -> None:
+def test_failed_remeasurements_and_comparisons_are_reported(made: Cast, roofs: Features) -> None:
     calibrations = {"left": made.truth}
     asked = Asked(anew={}, why_not_anew="the adjustment does not converge")
     validation = validate(made.at_truth(), roofs, calibrations, asked)
@@ -356,7 +354,7 @@ def test_parameters_anew_and_flights_that_could_not_be_compared_are_told(made: C
     assert line == "2 flights: two of them share fewer than 5 distances between planes"
 
 
-def test_a_scanner_whose_calibration_no_test_sees_is_told(made: Cast, roofs: Features) -> None:
+def test_a_scanner_that_no_test_covers_is_reported(made: Cast, roofs: Features) -> None:
     """A second head without a return on any plane."""
     head = replace(made.flight.heads[0], name="right")
     flight = replace(made.flight, heads=(*made.flight.heads, head)).placed({"left": made.truth, "right": made.truth})
@@ -367,7 +365,7 @@ def test_a_scanner_whose_calibration_no_test_sees_is_told(made: Cast, roofs: Fea
     assert validate(flight, roofs, calibrations, Asked(scanners=["left"])).holds is True
 
 
-def test_a_shift_of_all_is_seen_by_the_mean() -> None:
+def test_a_common_shift_is_found_by_the_mean() -> None:
     noise = np.full(30, 0.01)
     rows = Rows(noise * 0.8, np.zeros(30, int), np.ones(30, int), noise, np.zeros((30, 1)), ("a",) * 30)
     chi2, mean = distance_tests(rows)
@@ -377,7 +375,7 @@ def test_a_shift_of_all_is_seen_by_the_mean() -> None:
     assert not mean.passed
 
 
-def test_the_logs_of_the_calibration_itself_are_told(made: Cast) -> None:
+def test_logs_used_for_the_calibration_are_reported(made: Cast) -> None:
     header = {"logs": [{"name": "a.mcap", "sha256": "12ab"}]}
     calibration = replace(made.truth, header=header)
     (line,) = same_logs(calibration, [("b.mcap", "12ab"), ("a.mcap", "34cd")])
@@ -386,7 +384,7 @@ def test_the_logs_of_the_calibration_itself_are_told(made: Cast) -> None:
     assert same_logs(made.truth, [("b.mcap", "12ab")]) == ()
 
 
-def test_returns_without_a_place_are_no_part_of_a_sight(made: Cast, roofs: Features) -> None:
+def test_returns_without_coordinates_are_not_part_of_a_sighting(made: Cast, roofs: Features) -> None:
     """A calibration that moves stamps beyond the trajectory's end leaves some returns without a place."""
     flight = made.flight.placed({"left": made.truth})
     prior = gauss_markov(flight)
@@ -406,11 +404,11 @@ def test_returns_without_a_place_are_no_part_of_a_sight(made: Cast, roofs: Featu
 
 
 def patch_part(patch: Patch, every: int) -> NDArray[np.int64]:
-    """One in so many of its returns."""
+    """Return a fraction of the returns of a patch."""
     return patch.at[::every]
 
 
-def test_more_rows_than_can_be_tested_together_are_drawn_evenly(made: Cast) -> None:
+def test_rows_beyond_the_limit_are_sampled_evenly(made: Cast) -> None:
     count = 4000
     rows = Rows(
         np.arange(count, dtype=np.float64),

@@ -60,7 +60,7 @@ def loops() -> set[str]:
 
 @pytest.fixture(scope="module")
 def products(made: Made, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Of one run, and in ``new_loops`` what it needed that a warm-up does not make."""
+    """Return the products of one run, and in ``new_loops`` the loops that a warm-up does not compile."""
     folder = tmp_path_factory.mktemp("products")
     control = made.flown.folder / "control.csv"
     facts = folder / "facts.toml"
@@ -82,18 +82,18 @@ def products(made: Made, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_what_of_a_directory_is_no_log_is_passed_over_and_told(products: Path) -> None:
+def test_files_of_a_directory_that_are_not_logs_are_skipped_and_reported(products: Path) -> None:
     record = json.loads((products / "report" / "calibration.json").read_text())
     assert record["notes"][0] == f"passed over: {products / 'logs' / 'begun_0.mcap'}: is not an MCAP file"
 
 
-def test_the_file_says_where_the_trajectory_came_from(products: Path) -> None:
-    """By the summary beside it, as `swath trajectory` writes one."""
+def test_the_file_names_the_source_of_the_trajectory(products: Path) -> None:
+    """The summary of `swath trajectory` beside the file names the source."""
     assert read_calibration((products / "left.toml").read_text(), "left.toml").header["trajectory"] == "navigated"
 
 
 def refused(capsys: pytest.CaptureFixture[str], output: Path, given: list[str]) -> str:
-    """The one line of a command that made nothing."""
+    """Return the single error line of a command that wrote no file."""
     capsys.readouterr()
     assert run_app(given) in (1, 2, 3)
     line = capsys.readouterr().err
@@ -114,7 +114,7 @@ def test_the_truth_is_within_the_sigmas(made: Made, products: Path) -> None:
     assert (found.ranges, found.refraction) == ("corrected", "none")
 
 
-def test_a_calibration_is_refused_under_other_settings_than_its_own(
+def test_a_calibration_made_with_other_settings_is_refused(
     made: Made, products: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     text = (made.flown.folder / "swath.toml").read_text()
@@ -132,7 +132,7 @@ def list_of(name: str) -> int:
     return INDEX[name]
 
 
-def test_strips_agree_afterwards(products: Path) -> None:
+def test_strips_agree_after_calibration(products: Path) -> None:
     told = json.loads((products / "report" / "calibration.json").read_text())
     before, after = (told["strips"][when]["all"]["rms_m"] for when in ("before", "after"))
     assert before > 0.3
@@ -142,7 +142,7 @@ def test_strips_agree_afterwards(products: Path) -> None:
     assert "strips agree to" in told["verdict"]["sentence"]
 
 
-def test_report_and_record_stand_beside(products: Path) -> None:
+def test_report_and_record_are_written_beside_the_file(products: Path) -> None:
     page = (products / "report" / "report.html").read_text()
     assert "boresight" in page
     assert "src='http" not in page
@@ -150,7 +150,7 @@ def test_report_and_record_stand_beside(products: Path) -> None:
     assert (products / "report" / "report.pdf").read_bytes().startswith(b"%PDF")
 
 
-def test_the_record_has_what_was_told_and_its_matrices_beside_it(products: Path) -> None:
+def test_the_record_contains_the_given_facts_and_attaches_its_matrices(products: Path) -> None:
     record = json.loads((products / "report" / "left.record.json").read_text())
     attributes = {f"{owner['name']}.{one['name']}": one for owner in record["classes"] for one in owner["attributes"]}
     assert attributes["SD_Calibration.calibrationAgency"]["value"] == "Geo & Sons"
@@ -170,14 +170,14 @@ def test_the_record_has_what_was_told_and_its_matrices_beside_it(products: Path)
         assert arrays[design["array"]].shape == (told["lidarNObjectPoints"]["value"], 16)
 
 
-def test_a_warm_up_leaves_no_loop_to_be_compiled(products: Path) -> None:
+def test_after_a_warm_up_no_loop_is_compiled(products: Path) -> None:
     assert (products / "new_loops").read_text() == ""
 
 
-def test_a_navigated_flight_is_calibrated_on_all_the_ground_as_the_plan_says_beforehand(
+def test_calibration_of_a_navigated_flight_matches_the_sigmas_of_the_plan(
     made: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Once planes stay, as navigation says what the trajectory errs by; sigmas within a quarter of those predicted."""
+    """Sigmas of the calibration are within a quarter of those predicted by the plan."""
     output, control = tmp_path / "left.toml", str(made.flown.folder / "control.csv")
     searches: list[tuple[PlaneSettings, Features]] = []
 
@@ -204,9 +204,7 @@ def test_a_navigated_flight_is_calibrated_on_all_the_ground_as_the_plan_says_bef
         assert 0.75 < predicted / sigma < 1.25, name
 
 
-def test_control_that_lies_on_nothing_is_refused(
-    made: Made, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_control_outside_the_points_is_refused(made: Made, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Two points, too few to be doubted as a whole."""
     lines = (made.flown.folder / "control.csv").read_text().splitlines()
     points = [line.split(",") for line in lines[1:]]
@@ -258,7 +256,7 @@ def first_strips(made: Made, count: int, folder: Path) -> tuple[str, str]:
     return "--strips", str(strips)
 
 
-def test_a_calibration_on_a_trajectory_not_to_be_used_is_not_to_be_used(
+def test_an_unusable_trajectory_makes_the_calibration_unusable(
     made: Made, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Say it first, and in the file, from which whatever is made with the calibration has it."""
@@ -309,7 +307,7 @@ def by_intensity(tmp_path_factory: pytest.TempPathFactory) -> Made:
 
 
 def asked(made: Made, folder: Path, capsys: pytest.CaptureFixture[str], model: str) -> tuple[Any, Calibration]:
-    """What is told to scripts, and the file, of a run with a model's file."""
+    """Return the JSON output and the file of a run with a model file."""
     output, file, control = folder / "left.toml", folder / "model.toml", made.flown.folder / "control.csv"
     file.write_text(model)
     capsys.readouterr()
@@ -317,7 +315,7 @@ def asked(made: Made, folder: Path, capsys: pytest.CaptureFixture[str], model: s
     return json.loads(capsys.readouterr().out), read_calibration(output.read_text(), "left.toml")
 
 
-def test_a_model_s_file_asks_for_the_correction_by_intensity(
+def test_a_model_file_can_request_the_correction_by_intensity(
     by_intensity: Made, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     knots = [500.0, 1000.0, 1500.0, 2000.0]
@@ -343,10 +341,10 @@ def test_a_model_s_file_asks_for_the_correction_by_intensity(
     assert "model.toml" in [one["name"] for one in told["inputs"]]
 
 
-def test_what_the_flight_does_not_show_of_a_model_s_tables_is_held_and_said(
+def test_undetermined_tables_of_a_model_are_held_and_reported(
     by_intensity: Made, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """No return is so bright, and next to none is a second one; all are in one zone."""
+    """No return is so bright, almost none is a second one, and all are in one zone."""
     tables = "[ibrc]\nknots = [500, 1000, 2500, 60000]\n[range_offset]\nreturn_slots = [2]\nmta_zones = [0]\n"
     told, found = asked(by_intensity, tmp_path, capsys, f'model = "basic"\n{tables}')
     held = {one["name"]: one for one in told["held"] if one["why"] != "held by your choice"}
@@ -372,7 +370,7 @@ def test_what_the_flight_does_not_show_of_a_model_s_tables_is_held_and_said(
         (("--scanner", "right"), "right"),
     ],
 )
-def test_wrong_use(
+def test_wrong_usage_is_refused(
     made: Made, tmp_path: Path, capsys: pytest.CaptureFixture[str], more: tuple[str, ...], said: str
 ) -> None:
     output = tmp_path / "left.toml"
@@ -391,7 +389,7 @@ def test_wrong_use(
         ("[CA_GNSS\n", "facts.toml: not TOML: "),
     ],
 )
-def test_facts_that_no_record_holds_are_told_before_the_work(
+def test_facts_unknown_to_the_record_are_refused_before_processing(
     made: Made, tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, said: str
 ) -> None:
     output, facts = tmp_path / "left.toml", tmp_path / "facts.toml"
@@ -401,9 +399,7 @@ def test_facts_that_no_record_holds_are_told_before_the_work(
     assert "--report" in refused(capsys, output, arguments(made, output, "--facts", str(facts)))
 
 
-def test_a_line_of_control_that_is_none_is_named(
-    made: Made, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_error_names_a_wrong_line_of_control(made: Made, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     control = tmp_path / "control.csv"
     control.write_text("name,lat_deg,lon_deg,h_ellipsoidal_m,sigma_m\nGCP1,47.18,nine,450.0,0.01\n")
     output = tmp_path / "left.toml"
@@ -412,7 +408,7 @@ def test_a_line_of_control_that_is_none_is_named(
     assert "line 2" in line
 
 
-def test_where_strips_have_no_plane_in_common_it_says_why() -> None:
+def test_strips_without_common_planes_are_refused_with_the_reason() -> None:
     refuse_no_planes("log", Features((Plane("roof 1", np.zeros(3), np.array([0.0, 0.0, 1.0]), ()),)))
     with pytest.raises(UserError, match=r"log: no two strips see a common plane \(7 too rough, 2 curved\)"):
         refuse_no_planes("log", Features(refused=Counter({"curved": 2, "too rough": 7})))

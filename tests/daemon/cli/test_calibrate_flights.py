@@ -41,14 +41,14 @@ def read(path: Path) -> Calibration:
 
 
 def off_by(found: Calibration, truth: Calibration) -> dict[str, float]:
-    """Sigmas by name of what was estimated."""
+    """Return the errors of the estimated parameters in sigmas, by name."""
     errors = found.parameters - truth.parameters
     estimated = zip(PARAMETERS, errors.tolist(), found.sigmas.tolist(), strict=True)
     return {parameter.name: error / sigma for parameter, error, sigma in estimated if sigma > 0.0}
 
 
 @pytest.mark.parametrize("there", [True, False], ids=["there", "not there"])
-def test_more_parameters_are_found_where_they_are_and_only_there(tmp_path: Path, there: bool) -> None:
+def test_additional_parameters_are_found_only_where_they_are_wrong(tmp_path: Path, there: bool) -> None:
     made = village(tmp_path, prf_hz=20_000.0, lines=(0, 1, 2, 3, 4, 5), true=TRUE | MORE if there else TRUE)
     calibrated(made, tmp_path / "left.toml", "full")
     found = read(tmp_path / "left.toml")
@@ -60,7 +60,7 @@ def test_more_parameters_are_found_where_they_are_and_only_there(tmp_path: Path,
 
 
 def test_two_scanners_get_a_file_each(tmp_path: Path) -> None:
-    """Their range offsets go together by the trajectory's height: both are found all the same."""
+    """Both offsets are correlated through the height of the trajectory; both must be found."""
     made = village(tmp_path, lines=(0, 1, 2, 3, 4), plan_more=RIGHT)
     calibrated(made, tmp_path / "found", "basic")
     for name in ("left", "right"):

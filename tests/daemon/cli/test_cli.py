@@ -38,7 +38,7 @@ def swath(*arguments: str, **environment: str) -> subprocess.CompletedProcess[st
 
 
 def run_python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    """Run the command line with a command added to it."""
+    """Run the command line in a process with an additional statement."""
     head = "import sys; import swath.daemon.cli.main as cli\n"
     return subprocess.run(
         [sys.executable, "-c", head + code],
@@ -74,14 +74,14 @@ class TestHelp:
         ]
         assert codes == [*(int(code) for code in ExitCode), INTERRUPTED, PIPE_CLOSED]
 
-    def test_every_command_has_a_help_of_its_own(self) -> None:
+    def test_every_command_has_its_own_help(self) -> None:
         for listed in COMMANDS:
             result = CliRunner().invoke(make_app(None), [listed.name, "--help"])
             assert result.exit_code == 0, listed.name
             assert "Usage:" in result.output
 
     @pytest.mark.parametrize("name", ["georef", "live"])
-    def test_says_where_positions_come_from_without_an_ins(self, name: str) -> None:
+    def test_help_explains_where_positions_come_from_without_an_ins(self, name: str) -> None:
         text = CliRunner().invoke(make_app(None), [name, "--help"], env={"COLUMNS": "300"}).output
         assert "IMU and GNSS" in " ".join(text.split())
 
@@ -93,12 +93,12 @@ class TestHelp:
         )
         assert run.stdout.splitlines()[-1] == "loaded: []"
 
-    def test_without_arguments_says_how_it_is_used(self) -> None:
+    def test_without_arguments_the_usage_is_shown(self) -> None:
         run = swath()
         assert "Usage: swath" in run.stdout
         assert run.returncode == ExitCode.USAGE
 
-    def test_version(self) -> None:
+    def test_version_is_printed(self) -> None:
         run = swath("--version")
         assert run.returncode == 0
         assert run.stdout.startswith("swath 0.")
@@ -118,7 +118,7 @@ class TestErrors:
             (["check", "nowhere.toml"], "swath: nowhere.toml: No such file or directory; give the path"),
         ],
     )
-    def test_usage_is_one_line_and_2(self, arguments: list[str], line: str) -> None:
+    def test_a_usage_error_is_one_line_and_exit_code_2(self, arguments: list[str], line: str) -> None:
         run = swath(*arguments)
         assert run.returncode == ExitCode.USAGE
         assert run.stderr.startswith(line)
@@ -126,7 +126,7 @@ class TestErrors:
         assert run.stdout == ""
 
     @pytest.mark.parametrize("command", ["check", "run"])
-    def test_a_wrong_configuration_is_all_its_lines_and_2(self, command: str, tmp_path: Path) -> None:
+    def test_a_wrong_configuration_lists_every_mistake_and_exits_with_2(self, command: str, tmp_path: Path) -> None:
         bad = BAD / "unknown_key.toml"
         run = swath(command, str(bad))
         assert run.returncode == ExitCode.USAGE
@@ -136,7 +136,7 @@ class TestErrors:
             f"swath: {bad}: session.splt_minutes: unknown key; did you mean split_minutes?",
         ]
 
-    def test_an_internal_error_is_one_line_and_its_details_a_file(self, tmp_path: Path) -> None:
+    def test_an_internal_error_is_one_line_with_details_in_a_file(self, tmp_path: Path) -> None:
         run = run_python(
             "cli.make_app(None).command('boom')(lambda: 1 / 0)\nsys.exit(cli.run_app(['boom']))", TMPDIR=str(tmp_path)
         )
@@ -147,7 +147,7 @@ class TestErrors:
         assert line.endswith(f"{details})")
         assert "Traceback (most recent call last)" in details.read_text()
 
-    def test_a_service_keeps_the_details_in_its_state_directory(self, tmp_path: Path) -> None:
+    def test_a_service_writes_error_details_to_its_state_directory(self, tmp_path: Path) -> None:
         run = run_python(
             "cli.make_app(None).command('boom')(lambda: {}['x'])\nsys.exit(cli.run_app(['boom']))",
             STATE_DIRECTORY=str(tmp_path),
@@ -155,7 +155,7 @@ class TestErrors:
         assert run.returncode == ExitCode.PROBLEM
         assert len(list(tmp_path.glob("swath-error-*.txt"))) == 1
 
-    def test_output_that_cannot_be_written_is_an_io_error(self) -> None:
+    def test_unwritable_output_is_an_io_error(self) -> None:
         with Path("/dev/full").open("w") as full:
             run = subprocess.run(
                 [sys.executable, "-m", "swath.daemon.cli.main", "devices", "--json"],
@@ -170,7 +170,7 @@ class TestErrors:
         [line] = run.stderr.splitlines()
         assert line == "swath: output: No space left on device; free some space and run the command again"
 
-    def test_a_closed_pipe_ends_it_quietly(self) -> None:
+    def test_a_closed_pipe_ends_the_program_quietly(self) -> None:
         process = subprocess.Popen(
             [sys.executable, "-m", "swath.daemon.cli.main", "devices"],
             cwd=ROOT,
@@ -184,7 +184,7 @@ class TestErrors:
             assert process.stderr.read() == b""
             assert process.wait(timeout=HANGS_S) == PIPE_CLOSED
 
-    def test_ctrl_c_ends_it_quietly_and_at_once(self, tmp_path: Path) -> None:
+    def test_ctrl_c_ends_the_program_quietly_and_at_once(self, tmp_path: Path) -> None:
         config = tmp_path / "swath.toml"
         config.write_text(f'[session]\nname = "x"\ndirectory = "."\n[pps.main]\nsource = "fixed:{tmp_path}/edges"\n')
         os.mkfifo(tmp_path / "edges")
@@ -207,14 +207,14 @@ class TestErrors:
 
 
 def _has_open(pid: int, path: Path) -> bool:
-    """Whether a process has a file open: it has got as far as listening."""
+    """True if a process has opened the file."""
     folder = Path(f"/proc/{pid}/fd")
     links = [os.path.realpath(link) for link in folder.iterdir()] if folder.exists() else []
     return os.path.realpath(path) in links
 
 
 class TestDevices:
-    def test_json_lists_every_driver_with_what_it_needs(self) -> None:
+    def test_json_lists_every_driver_with_its_requirements(self) -> None:
         run = swath("devices", "--json")
         listed = {(row["kind"], row["protocol"]): row for row in json.loads(run.stdout)["devices"]}
         assert set(listed) == {(kind, protocol) for kind in KINDS for protocol in all_drivers(kind)}
@@ -243,7 +243,7 @@ class TestCheckOffline:
             == f"{AIRCRAFT}: valid; 5 sources: pps/main, gnss/rover, imu/main, scanner/left, corrections/base\n"
         )
 
-    def test_json(self) -> None:
+    def test_json_lists_the_sources(self) -> None:
         run = swath("check", "--offline", "--json", str(AIRCRAFT))
         assert json.loads(run.stdout)["sources"] == [
             "pps/main",

@@ -44,7 +44,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
     return made
 
 
-def test_points_lie_where_the_truth_does(flown: Flown, tmp_path: Path) -> None:
+def test_points_match_the_truth_with_apparent_ranges(flown: Flown, tmp_path: Path) -> None:
     truth = flown.truth
     first, last = (int(truth["left.gps_ns"][at]) for at in (0, -1))
     middle = (first + last) // 2

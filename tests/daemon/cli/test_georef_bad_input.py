@@ -58,7 +58,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
 
 
 def georef(flown: Flown, output: Path, *more: str, trajectory: Trajectory | None = None) -> tuple[int, dict[str, Any]]:
-    """Exit code and sidecar."""
+    """Run ``swath georef``; return exit code and sidecar."""
     arguments = flown.arguments(output, "--no-sigma", *more)
     if trajectory is not None:
         file = output.parent / "trajectory.csv"
@@ -70,13 +70,15 @@ def georef(flown: Flown, output: Path, *more: str, trajectory: Trajectory | None
 
 
 def without(trajectory: Trajectory, first_ns: int, last_ns: int) -> Trajectory:
-    """A trajectory with a gap."""
+    """Return the trajectory with a gap."""
     keep = (trajectory.time_ns <= first_ns) | (trajectory.time_ns >= last_ns)
     columns = ("time_ns", "position_e", "q_e_from_b", "velocity_e", "position_sigma_l", "attitude_sigma_rad")
     return replace(trajectory, **{column: getattr(trajectory, column)[keep] for column in columns})
 
 
-def test_damaged_datagrams_make_it_partial(flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_damaged_datagrams_make_the_result_partial(
+    flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     code, told = georef(flown, tmp_path / "out")
     assert (code, told["complete"]) == (1, False)
     unread = told["counts"]["left"]["messages_not_read"]
@@ -92,10 +94,10 @@ def test_damaged_datagrams_make_it_partial(flown: Flown, tmp_path: Path, capsys:
     assert missing > 1200  # a second of a laser of 1.5 kHz, and some
 
 
-def test_what_of_a_directory_is_no_log_is_passed_over(
+def test_files_of_a_directory_that_are_not_logs_are_skipped(
     flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """As a power cut leaves one at a part's beginning, and as somebody else's tool writes them."""
+    """Such files are remains of a power cut at the start of a part, or written by another tool."""
     _, alone = georef(flown, tmp_path / "alone")
     log = flown.copy_of_log(tmp_path / "logs")
     begun, foreign = log.with_name("begun_0.mcap"), log.with_name("foreign.mcap")
@@ -122,7 +124,7 @@ def refused_alone(flown: Flown) -> dict[str, int]:
     return dict(refused_by(parser))
 
 
-def test_where_the_trajectory_ends_the_rest_is_missing_not_a_turn(flown: Flown, tmp_path: Path) -> None:
+def test_returns_after_the_end_of_the_trajectory_are_missing_and_not_a_turn(flown: Flown, tmp_path: Path) -> None:
     first, last = (int(flown.truth["left.gps_ns"][at]) for at in (0, -1))
     short = flown.trajectory().between(first - 20 * S, (first + last) // 2)
     code, told = georef(flown, tmp_path / "out", trajectory=short)
@@ -135,7 +137,7 @@ def test_where_the_trajectory_ends_the_rest_is_missing_not_a_turn(flown: Flown, 
     )
 
 
-def test_a_gap_of_the_trajectory_is_no_turn_either(flown: Flown, tmp_path: Path) -> None:
+def test_a_gap_of_the_trajectory_is_not_a_turn(flown: Flown, tmp_path: Path) -> None:
     first = int(flown.truth["left.gps_ns"][0])
     code, told = georef(flown, tmp_path / "out", trajectory=without(flown.trajectory(), first + 2 * S, first + 5 * S))
     assert (code, told["complete"]) == (1, False)
@@ -143,7 +145,7 @@ def test_a_gap_of_the_trajectory_is_no_turn_either(flown: Flown, tmp_path: Path)
     assert set(told["counts"]["left"]["dropped"]) == {"trajectory_gap"}
 
 
-def test_where_nothing_can_be_placed_there_is_no_product(
+def test_without_any_georeferenced_return_no_product_is_written(
     flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     first, last = (int(flown.truth["left.gps_ns"][at]) for at in (0, -1))
@@ -157,7 +159,7 @@ def test_where_nothing_can_be_placed_there_is_no_product(
 
 @contextmanager
 def files_at_most(size: int) -> Iterator[None]:
-    """As on a disk that becomes full."""
+    """Limit the size of files, as a full disk does."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
     try:
@@ -166,7 +168,7 @@ def files_at_most(size: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
-def test_a_full_disk_is_one_line_and_leaves_nothing(
+def test_a_full_disk_is_reported_in_one_line_and_leaves_no_files(
     flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     capsys.readouterr()
@@ -187,7 +189,7 @@ def test_a_full_disk_is_one_line_and_leaves_nothing(
         (b"start_gps_ns,end_gps_ns\n1,2\n", 1, "none of its strips lies in the logs"),
     ],
 )
-def test_files_of_strips(
+def test_wrong_strip_files_are_refused(
     flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str], text: bytes | None, code: int, words: str
 ) -> None:
     file = tmp_path / "strips.csv"
@@ -201,7 +203,7 @@ def test_files_of_strips(
     assert not (tmp_path / "out").exists()
 
 
-def test_a_calibration_of_other_conventions_or_no_text(
+def test_a_calibration_of_other_conventions_or_of_binary_content_is_refused(
     flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     text = (flown.folder / "left.true.toml").read_text()
@@ -222,7 +224,7 @@ def test_a_calibration_of_other_conventions_or_no_text(
 
 
 @pytest.mark.parametrize("taken", ["here", "by another thread"])
-def test_an_interrupt_waits_till_the_processes_are_begun(taken: str) -> None:
+def test_an_interrupt_waits_until_the_processes_have_started(taken: str) -> None:
     steps = []
 
     def begin() -> None:

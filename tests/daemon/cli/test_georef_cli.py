@@ -41,13 +41,13 @@ def products(flown: Flown, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def record(output: Path) -> dict[str, Any]:
-    """The sidecar."""
+    """Return the sidecar."""
     read: dict[str, Any] = json.loads(next(output.glob("*.json")).read_text())
     return read
 
 
 def refused(capsys: pytest.CaptureFixture[str], output: Path, arguments: list[str]) -> str:
-    """The one line of a command that made nothing."""
+    """Return the single error line of a command that wrote no file."""
     capsys.readouterr()
     assert run_app(arguments) in (1, 2, 3)
     line = capsys.readouterr().err
@@ -59,7 +59,7 @@ def refused(capsys: pytest.CaptureFixture[str], output: Path, arguments: list[st
 
 
 class TestProducts:
-    def test_points_lie_where_the_truth_does(self, flown: Flown, products: Path) -> None:
+    def test_points_match_the_truth(self, flown: Flown, products: Path) -> None:
         las = laspy.read(next(products.glob("*_strip01.laz")))
         truth = flown.truth
         to_map = Transformer.from_crs("EPSG:4978", "EPSG:32632", always_xy=True)
@@ -78,7 +78,7 @@ class TestProducts:
         for name in ("sigma_easting", "sigma_northing", "sigma_height"):
             assert 0.02 <= np.median(las[name]) < 0.08, name
 
-    def test_the_sidecar_tells_what_they_are_made_of(self, flown: Flown, products: Path) -> None:
+    def test_the_sidecar_describes_the_inputs(self, flown: Flown, products: Path) -> None:
         told = record(products)
         assert (told["format"], told["complete"], told["holes"]) == ("swath.georef", True, [])
         digest = hashlib.sha256(flown.log.read_bytes()).hexdigest()
@@ -94,7 +94,7 @@ class TestProducts:
         assert strip["file"] == f"{flown.name}_strip01.laz"
         assert {path.name for path in products.iterdir()} == {strip["file"], *told["files"], f"{flown.name}.json"}
 
-    def test_the_calibration_stands_in_the_file(self, flown: Flown, products: Path) -> None:
+    def test_the_file_contains_the_calibration(self, flown: Flown, products: Path) -> None:
         with laspy.open(next(products.glob("*_strip01.laz"))) as reader:
             ours = next(vlr for vlr in reader.header.vlrs if vlr.user_id == "swath")
         assert json.loads(ours.record_data)["calibrations"] == {
@@ -108,8 +108,8 @@ class TestProducts:
         one, other = (laspy.read(next(path.glob("*_strip01.laz"))) for path in (products, tmp_path / "again"))
         assert np.abs(one.xyz - other.xyz).max() <= 0.001 + 1e-9
 
-    def test_an_attitude_from_the_plumb_line_is_turned_to_the_ellipsoid(self, flown: Flown, tmp_path: Path) -> None:
-        """By FORMULAS 1.8's matrix (headings are geodetic), about the true body."""
+    def test_an_attitude_about_the_plumb_line_is_converted_to_the_ellipsoid(self, flown: Flown, tmp_path: Path) -> None:
+        """Compare with the matrix of FORMULAS 1.8 (headings are geodetic) applied to the true body."""
         xi, eta = np.radians(np.array([100.0, -70.0]) / 3600)
         config = tmp_path / "plumb.toml"
         text = (flown.folder / "swath.toml").read_text()
@@ -146,7 +146,7 @@ class TestProducts:
         twice = laspy.read(next((tmp_path / "again").glob("*_strip01.laz")))
         assert np.abs(las.xyz - twice.xyz).max() <= 0.001 + 1e-9  # what is written refers to the plumb line again
 
-    def test_without_a_trajectory_the_imu_and_the_receiver_make_one(self, flown: Flown, tmp_path: Path) -> None:
+    def test_without_a_trajectory_imu_and_receiver_are_navigated(self, flown: Flown, tmp_path: Path) -> None:
         arguments = flown.arguments(tmp_path / "x", "--no-sigma")
         del arguments[arguments.index("--trajectory") : arguments.index("--trajectory") + 2]
         assert run_app(arguments) in (0, 1)  # so short a flight is not aligned at its very beginning: partial
@@ -154,7 +154,7 @@ class TestProducts:
         assert flight["trajectory"]["name"] == "navigation of the log's IMU and GNSS"
         assert flight["trajectory"]["epochs"] > 1000
 
-    def test_without_one_of_them_the_log_says_what_is_wanted(
+    def test_without_imu_or_receiver_the_error_names_the_missing_device(
         self, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
         text = re.sub(r"(?ms)^\[imu\..*?(?=^\[(?!imu))", "", (flown.folder / "swath.toml").read_text())
@@ -175,7 +175,7 @@ class TestStrips:
         path.write_text("\n".join(["start_gps_ns,end_gps_ns", *lines]))
         return path
 
-    def test_every_return_is_in_a_file_or_counted(self, flown: Flown, tmp_path: Path) -> None:
+    def test_every_return_is_written_or_counted(self, flown: Flown, tmp_path: Path) -> None:
         file = self.times(flown, tmp_path / "times.csv", (2.0, 16.0), (16.0, 29.5))
         assert run_app(flown.arguments(tmp_path / "out", "--strips", str(file), "--json")) == 0
         told = record(tmp_path / "out")
@@ -211,7 +211,7 @@ class TestStrips:
         assert told["counts"]["left"]["dropped"] == {"outside_trajectory": outside}
         assert told["holes"] == [f"strip 1: {outside:,} returns of left are outside the trajectory"]
 
-    def test_cloud_optimised_files_hold_the_same(self, flown: Flown, products: Path, tmp_path: Path) -> None:
+    def test_cloud_optimised_files_contain_the_same_points(self, flown: Flown, products: Path, tmp_path: Path) -> None:
         assert run_app(flown.arguments(tmp_path / "out", "--copc", "--no-sigma")) == 0
         with laspy.CopcReader.open(tmp_path / "out" / f"{flown.name}_strip01.copc.laz") as reader:
             found = reader.query()
@@ -222,7 +222,7 @@ class TestStrips:
 
 
 class TestPartial:
-    def test_a_damaged_chunk_is_named_and_the_rest_is_delivered(
+    def test_a_damaged_chunk_is_named_and_the_others_are_processed(
         self, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
         log = flown.copy_of_log(tmp_path / "bad")
@@ -241,7 +241,7 @@ class TestPartial:
         missing = len(flown.truth["left.gps_ns"]) - told["counts"]["left"]["written"]
         assert 0 < missing < 5_000
 
-    def test_a_log_that_was_cut_off_gives_what_it_has(self, flown: Flown, tmp_path: Path) -> None:
+    def test_a_truncated_log_is_processed_to_its_end(self, flown: Flown, tmp_path: Path) -> None:
         log = flown.copy_of_log(tmp_path / "cut")
         log.write_bytes(log.read_bytes()[: log.stat().st_size * 2 // 3])
         assert run_app(flown.arguments(tmp_path / "out", log=log)) == 1
@@ -250,7 +250,7 @@ class TestPartial:
         assert any("the file ends" in line or "unreadable" in line for line in told["holes"])
         assert told["counts"]["left"]["written"] > 20_000
 
-    def test_an_interrupted_run_leaves_nothing(
+    def test_an_interrupted_run_leaves_no_files(
         self, flown: Flown, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         def interrupted(*_: object) -> None:
@@ -272,7 +272,7 @@ class TestRefusals:
         assert {path.name: path.stat().st_mtime_ns for path in products.iterdir()} == before
 
     @pytest.mark.parametrize("command", ["georef", "calibrate", "validate", "strips"])
-    def test_no_trajectory_cannot_be_forced(
+    def test_force_trajectory_needs_a_trajectory_file(
         self, command: str, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
         arguments = [command, str(flown.log), "-o", str(tmp_path / "out"), "--force-trajectory"]
@@ -282,7 +282,7 @@ class TestRefusals:
         assert "--force-trajectory: needs --trajectory FILE, because it accepts that file" in capsys.readouterr().err
         assert list(tmp_path.iterdir()) == []
 
-    def test_a_trajectory_in_the_folder_is_not_replaced_unasked_and_never_where_it_is_read(
+    def test_a_trajectory_is_replaced_only_on_request_and_never_if_it_is_read(
         self, flown: Flown, products: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
         (made,) = products.glob("*_trajectory.csv")
@@ -301,14 +301,14 @@ class TestRefusals:
     def test_strips_of_a_run_of_several_sessions_are_kept(
         self, flown: Flown, products: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
-        """Whose sidecar has the name of the first session."""
+        """The sidecar of such a run has the name of the first session."""
         (made, *_) = products.glob("*_strip*.laz")
         shutil.copy(made, tmp_path)
         assert run_app(flown.arguments(tmp_path)) == 2
         assert f"{tmp_path / made.name}: exists from an earlier run" in capsys.readouterr().err
         assert [path.name for path in tmp_path.iterdir()] == [made.name]
 
-    def test_one_of_several_sessions_is_not_replaced_where_the_sidecar_is_of_all(
+    def test_a_single_session_is_not_replaced_if_the_sidecar_covers_several(
         self, flown: Flown, products: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
         (sidecar,) = products.glob("*.json")
@@ -330,7 +330,7 @@ class TestRefusals:
             (3 * 3600, "do not overlap; give the trajectory of this flight, or --week"),
         ],
     )
-    def test_a_trajectory_of_another_time_is_named(
+    def test_error_names_a_trajectory_of_another_time(
         self, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str], shift_s: int, words: str
     ) -> None:
         truth = flown.trajectory()
@@ -341,7 +341,7 @@ class TestRefusals:
         assert "late.csv" in line
         assert words in line
 
-    def test_seconds_of_the_day_are_named(
+    def test_error_names_times_in_seconds_of_day(
         self, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
         table = np.frombuffer(sbet_bytes(flown.trajectory()), "<f8").reshape(-1, 17).copy()
@@ -362,7 +362,7 @@ class TestRefusals:
             (("--calibration", "right=left.true.toml"), "left.true.toml"),
         ],
     )
-    def test_wrong_wishes(
+    def test_wrong_options_are_refused(
         self,
         flown: Flown,
         tmp_path: Path,
@@ -374,7 +374,7 @@ class TestRefusals:
         monkeypatch.setattr("swath.daemon.processing.points.workers.CONNECT_S", 1)
         assert words in refused(capsys, tmp_path / "out", flown.arguments(tmp_path / "out", *more))
 
-    def test_a_calibration_of_another_head_or_atmosphere(
+    def test_a_calibration_of_another_head_or_atmosphere_is_refused(
         self, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
         text = (flown.folder / "left.true.toml").read_text()
@@ -390,7 +390,7 @@ class TestRefusals:
             assert "other.toml" in line
             assert words in line
 
-    def test_a_clock_by_messages_alone_is_named_and_not_the_trajectory(
+    def test_error_names_the_clock_by_messages_and_not_the_trajectory(
         self, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
         lines = (flown.folder / "swath.toml").read_text().replace('[pps.main]\nsource = "/dev/pps0"\n', "").splitlines()
@@ -404,7 +404,7 @@ class TestRefusals:
         assert "record PPS edges and time messages throughout" in line
         assert not list(output.glob("*"))
 
-    def test_earth_centred_coordinates_are_no_map(
+    def test_earth_centred_coordinates_are_refused_as_a_map(
         self, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr("swath.daemon.processing.flights.read.read_clocks", None)  # before any work
@@ -413,7 +413,9 @@ class TestRefusals:
         line = refused(capsys, tmp_path / "out", arguments)
         assert line.startswith('swath: output.crs = "EPSG:4978" (WGS 84) is geocentric: ')
 
-    def test_two_recordings_of_one_time(self, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def test_two_recordings_of_one_time_are_refused(
+        self, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
         log = flown.copy_of_log(tmp_path / "second")
         renamed = log.read_bytes().replace(flown.name.encode(), flown.name[:-4].encode() + b"0000")
         log.write_bytes(renamed)
@@ -421,7 +423,7 @@ class TestRefusals:
         assert "the recordings overlap in time" in line
 
 
-def test_points_of_a_nominal_calibration_end_with_a_first_line_and_exit_code_1(
+def test_georef_with_a_nominal_calibration_prints_a_warning_and_exits_with_1(
     flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     arguments = flown.arguments(tmp_path / "points")

@@ -27,7 +27,7 @@ GATE_M = (310.0, 330.0)
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
-    """A flight whose configuration shuts out much, and whose trajectory ends before it does."""
+    """Return a flight with a narrow range gate, whose trajectory ends early."""
     made = fly(tmp_path_factory.mktemp("line"))
     config = made.folder / "swath.toml"
     text = config.read_text()
@@ -67,7 +67,9 @@ def listed(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def test_every_return_is_a_point_a_withheld_one_or_a_row(flown: Flown, asked: tuple[Path, dict[str, Any]]) -> None:
+def test_every_return_is_a_point_a_withheld_point_or_a_listed_row(
+    flown: Flown, asked: tuple[Path, dict[str, Any]]
+) -> None:
     output, told = asked
     dropped = told["counts"]["left"]["dropped"]
     assert set(dropped) == {"below_range_gate", "above_range_gate", "outside_trajectory"}
@@ -83,9 +85,7 @@ def test_every_return_is_a_point_a_withheld_one_or_a_row(flown: Flown, asked: tu
     assert told["options"]["write_dropped"]
 
 
-def test_withheld_points_are_those_beyond_the_gate_and_lie_where_the_truth_does(
-    flown: Flown, asked: tuple[Path, dict[str, Any]]
-) -> None:
+def test_withheld_points_exceed_the_gate_and_match_the_truth(flown: Flown, asked: tuple[Path, dict[str, Any]]) -> None:
     output, told = asked
     truth = flown.truth
     files = [laspy.read(output / strip["file"]) for strip in told["strips"]]
@@ -105,7 +105,7 @@ def test_withheld_points_are_those_beyond_the_gate_and_lie_where_the_truth_does(
     assert 0.99 < sure.mean()
 
 
-def test_rows_of_the_list_say_what_is_known(flown: Flown, asked: tuple[Path, dict[str, Any]]) -> None:
+def test_listed_rows_contain_the_known_values(flown: Flown, asked: tuple[Path, dict[str, Any]]) -> None:
     output, told = asked
     rows = listed(output / told["strips"][1]["dropped_file"])
     assert Counter(row["reason"] for row in rows) == {"outside_trajectory": len(rows)}
@@ -123,7 +123,9 @@ def test_two_processes_write_the_same_bytes(flown: Flown, asked: tuple[Path, dic
     assert digests(tmp_path) == digests(asked[0])
 
 
-def test_unasked_they_are_only_counted(flown: Flown, asked: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
+def test_discarded_returns_are_only_counted_by_default(
+    flown: Flown, asked: tuple[Path, dict[str, Any]], tmp_path: Path
+) -> None:
     told = made_of(flown, tmp_path)
     assert told["counts"] == asked[1]["counts"]
     assert not list(tmp_path.glob("*.csv.gz"))

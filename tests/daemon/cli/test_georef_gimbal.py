@@ -76,7 +76,9 @@ def test_points_lie_where_the_gimbal_points(tmp_path: Path) -> None:
     assert np.linalg.norm(las.xyz[mine] - rigid, axis=1).min() > 0.5
 
 
-def test_a_source_that_told_no_angles_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_source_without_gimbal_angles_is_refused_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     flown = fly(tmp_path, ins=False)
     capsys.readouterr()
     assert run_app(flown.arguments(tmp_path / "out", "--config", str(flown.folder / "swath.toml"))) == 1

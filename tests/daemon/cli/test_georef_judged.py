@@ -28,7 +28,7 @@ SAID = {"away": [ELSEWHERE], "other": ["give the trajectory of this flight", "it
 
 
 def plan(seed: int, half_m: float, norths_m: tuple[float, float]) -> str:
-    """Two lines with an antenna aside."""
+    """Return the plan of two lines with an antenna beside the body."""
     return two_lines(
         "judged",
         flight=f"seed = {seed}\nlead_s = 3.0",
@@ -59,12 +59,12 @@ class Judged:
         return self.flown.folder / f"{name}.csv"
 
     def georef(self, output: Path, *more: str, trajectory: str = "true") -> list[str]:
-        """The command, with a trajectory's file."""
+        """Return the arguments of ``swath georef`` with a trajectory file."""
         crs = () if "--crs" in more else ("--crs", "EPSG:32632")
         return ["georef", str(self.flown.log), "-o", str(output), *crs, *self.given(trajectory), "--no-sigma", *more]
 
     def navigated(self, output: Path, *more: str) -> list[str]:
-        """The command on what is navigated from the log's IMU and GNSS, the lever arm of the other sign."""
+        """Return the arguments of a command that navigates the log with the lever arm of opposite sign."""
         config = self.flown.changed("mirrored.toml", **{ARM: MIRRORED}).path
         more = ("--config", str(config), "--crs", "EPSG:32632", "--workers", "1", "--no-sigma", *more)
         return ["georef", str(self.flown.log), "-o", str(output), *self.calibration, *more]
@@ -102,10 +102,10 @@ def sidecar(output: Path) -> dict[str, Any]:
 # ---------------------------------------------------------------------- verdicts
 
 
-def test_points_on_a_trajectory_that_was_navigated_with_a_wrong_lever_arm_are_a_problem(
+def test_points_on_a_trajectory_with_a_wrong_lever_arm_exit_with_1(
     judged: Judged, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Say it first, and why; the points are there all the same."""
+    """The verdict comes first with its reason; the points are written nevertheless."""
     capsys.readouterr()
     assert run_app(judged.navigated(tmp_path)) == ExitCode.PROBLEM
     said = capsys.readouterr()
@@ -120,7 +120,7 @@ def test_points_on_a_trajectory_that_was_navigated_with_a_wrong_lever_arm_are_a_
     assert len(list(tmp_path.glob("*_strip*.laz"))) == 2
 
 
-def test_such_points_are_taken_at_the_user_s_word(
+def test_unusable_points_are_accepted_with_the_users_override(
     judged: Judged, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     capsys.readouterr()
@@ -140,7 +140,7 @@ def points(judged: Judged, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return output
 
 
-def test_points_that_are_not_to_be_used_are_a_problem_however_well_strips_agree(
+def test_unusable_points_exit_with_1_however_well_strips_agree(
     judged: Judged, points: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     capsys.readouterr()
@@ -150,7 +150,7 @@ def test_points_that_are_not_to_be_used_are_a_problem_however_well_strips_agree(
     assert said.err == f"swath: {line}; use --accept-verdict to accept it\n"  # and nothing of the strips
 
 
-def test_strips_of_such_points_are_compared_at_the_user_s_word(
+def test_strips_of_unusable_points_are_compared_with_the_users_override(
     points: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     capsys.readouterr()
@@ -166,7 +166,7 @@ def test_strips_of_such_points_are_compared_at_the_user_s_word(
 
 
 @pytest.mark.parametrize("name", list(SAID))
-def test_a_trajectory_of_something_else_makes_no_points_unless_forced(
+def test_a_trajectory_of_another_flight_needs_force(
     judged: Judged, name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     capsys.readouterr()
@@ -185,7 +185,7 @@ def test_a_trajectory_of_something_else_makes_no_points_unless_forced(
 
 
 @pytest.mark.parametrize("command", ["calibrate", "validate", "strips"])
-def test_no_command_takes_a_trajectory_of_another_place(
+def test_every_command_refuses_a_trajectory_of_another_place(
     judged: Judged, command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     capsys.readouterr()
@@ -199,10 +199,10 @@ def test_no_command_takes_a_trajectory_of_another_place(
 
 
 @pytest.mark.parametrize("command", ["validate", "strips"])
-def test_a_trajectory_of_another_place_is_warned_of_where_it_is_forced(
+def test_a_forced_trajectory_of_another_place_gives_a_warning(
     judged: Judged, command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """In its own place all strips are moved alike, so that nothing else says it."""
+    """All strips are moved alike there, so only this warning reveals it."""
     capsys.readouterr()
     assert run_app([*on_log(judged, command, tmp_path / "out", "away"), "--force-trajectory"]) == 0
     told = [line for line in capsys.readouterr().out.splitlines() if ELSEWHERE in line]
@@ -212,7 +212,7 @@ def test_a_trajectory_of_another_place_is_warned_of_where_it_is_forced(
 
 
 def on_log(judged: Judged, command: str, output: Path, trajectory: str) -> list[str]:
-    """A command on the log with a trajectory's file."""
+    """Return the arguments of a command on the log with a trajectory file."""
     log, out = str(judged.flown.log), ("-o", str(output))
     calibration, given = judged.calibration, judged.given(trajectory)
     if command == "strips":
@@ -231,7 +231,7 @@ def on_log(judged: Judged, command: str, output: Path, trajectory: str) -> list[
         ("EPSG:32633", "(WGS 84 / UTM zone 33N) is used from 12° to 18° E, 0° to 84° N, and 23"),
     ],
 )
-def test_a_map_of_elsewhere_is_refused_with_the_one_to_take_unless_forced(
+def test_a_map_of_another_place_is_refused_with_a_suggestion_unless_forced(
     judged: Judged, crs: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     capsys.readouterr()

@@ -23,7 +23,7 @@ CAPTURE = ROOT / "fixtures/novatel/propak6-basic-fix.gps.gz"
 ROVER = '[gnss.rover]\ntransport = "serial:{path}?baud=921600"\nprotocol = "novatel"\n'
 
 
-def test_numbers_of_a_recording_are_those_of_a_direct_parse(tmp_path: Path) -> None:
+def test_numbers_of_a_recording_match_a_direct_parse(tmp_path: Path) -> None:
     import numpy as np
 
     data = gzip.decompress(CAPTURE.read_bytes())[:200_000]
@@ -55,7 +55,7 @@ def test_numbers_of_a_recording_are_those_of_a_direct_parse(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("columns", [80, 120])
-def test_a_missing_part_is_named_and_lines_fit(tmp_path: Path, columns: int) -> None:
+def test_a_missing_part_is_named_and_lines_fit_the_screen(tmp_path: Path, columns: int) -> None:
     for part in (0, 2):
         write_part(tmp_path / f"{INFO.session_id}_{part}.mcap", part=part)
     result = swath("info", str(tmp_path), COLUMNS=str(columns))
@@ -65,7 +65,7 @@ def test_a_missing_part_is_named_and_lines_fit(tmp_path: Path, columns: int) -> 
     assert max(map(len, result.stdout.splitlines())) <= columns
 
 
-def test_damage_is_told_with_its_place(tmp_path: Path) -> None:
+def test_damage_is_reported_with_its_place(tmp_path: Path) -> None:
     path = tmp_path / f"{INFO.session_id}_0.mcap"
     write_part(path)
     data = bytearray(path.read_bytes())
@@ -79,7 +79,7 @@ def test_damage_is_told_with_its_place(tmp_path: Path) -> None:
     assert damage["offset"] <= len(data) // 2 < damage["offset"] + damage["length"]
 
 
-def test_the_same_log_twice_counts_once(tmp_path: Path) -> None:
+def test_the_same_log_given_twice_counts_once(tmp_path: Path) -> None:
     path = tmp_path / f"{INFO.session_id}_0.mcap"
     write_part(path)
     (session,) = json.loads(swath("info", "--json", str(path), str(tmp_path)).stdout)["sessions"]
@@ -87,7 +87,7 @@ def test_the_same_log_twice_counts_once(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("command", ["info", "replay"])
-def test_no_log_is_one_line(tmp_path: Path, command: str) -> None:
+def test_a_missing_log_is_reported_in_one_line(tmp_path: Path, command: str) -> None:
     (tmp_path / "text.mcap").write_text("no log")
     (tmp_path / "wire.toml").write_text(session_table(tmp_path))
     wire = ["--wire", str(tmp_path / "wire.toml")] if command == "replay" else []
@@ -100,7 +100,7 @@ def test_no_log_is_one_line(tmp_path: Path, command: str) -> None:
 
 @pytest.mark.parametrize("has_status", [True, False])
 @pytest.mark.parametrize(("origin", "told"), [("recording", "swath 1 on h\n"), ("import", "swath 1 on h (import)\n")])
-def test_a_long_name_and_a_wide_sigma_fit_and_what_is_not_known_is_not_told(
+def test_long_names_and_wide_sigmas_fit_and_unknown_values_are_omitted(
     origin: str, told: str, has_status: bool
 ) -> None:
     import io

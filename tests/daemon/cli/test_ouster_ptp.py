@@ -67,7 +67,9 @@ def test_points_have_the_time_and_place_of_their_pulses(
     assert np.abs(las.xyz - np.stack(expected, axis=1)).max() < 0.01
 
 
-def test_a_head_on_no_scale_is_named_and_gives_no_points(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_head_with_unknown_time_scale_is_named_and_gives_no_points(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Its clock was set by hand, or by a master that is wrong by 3 s."""
     flown = flown_by(tmp_path, OFF_S)
     capsys.readouterr()

@@ -109,7 +109,7 @@ def test_lines_over_a_village_determine_the_boresight(tmp_path: Path, capsys: py
     assert sigma["range_offset_m"] < 0.02
 
 
-def test_sigmas_go_by_what_is_expected_of_the_trajectory(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_sigmas_follow_the_expected_trajectory_accuracy(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """With half the trajectory's sigmas, hardly more than half."""
     plan, picture = plan_of(tmp_path, more=VILLAGE), tmp_path / "plan.png"
     found = []
@@ -131,7 +131,7 @@ def test_sigmas_go_by_what_is_expected_of_the_trajectory(tmp_path: Path, capsys:
         ("misalignment_mrad = 1.0", {"phi_deg": 1.5}),
     ],
 )
-def test_sigmas_go_by_the_noise_of_the_unit(
+def test_sigmas_follow_the_noise_of_the_imu(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], noise: str, worse: dict[str, float]
 ) -> None:
     """Not by its grade alone: single figures of the plan count, too."""
@@ -144,8 +144,10 @@ def test_sigmas_go_by_the_noise_of_the_unit(
         assert found[1][name] / found[0][name] > factor, (name, found)
 
 
-def test_a_model_s_file_is_predicted_as_far_as_paper_goes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A heading that is held may be a degree off, and blurs roll; tables are told as not predicted."""
+def test_parameters_of_a_model_file_are_predicted_and_its_tables_are_not(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A held heading may be wrong by a degree, which blurs roll; tables are reported as not predicted."""
     plan, picture, model = plan_of(tmp_path, more=VILLAGE), tmp_path / "plan.png", tmp_path / "model.toml"
     model.write_text(
         f'{KNOWN}kappa_deg = "fixed"\nphi_deg = {{ prior = 0.0001 }}\n'
@@ -167,7 +169,7 @@ def test_a_model_s_file_is_predicted_as_far_as_paper_goes(tmp_path: Path, capsys
     assert "not predicted: ibrc at 100, 1000" in capsys.readouterr().out
 
 
-def test_without_a_receiver_the_trajectory_goes_by_the_grade(
+def test_without_a_receiver_the_trajectory_follows_the_grade(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = Path(plan_of(tmp_path, more=VILLAGE))
@@ -199,13 +201,13 @@ def test_opposite_lines_over_flat_ground_determine_roll_alone(
         planned(plan, picture)
 
 
-def test_two_lines_leave_roll_to_a_poor_units_levelling(tmp_path: Path) -> None:
+def test_two_lines_do_not_separate_roll_from_the_levelling_of_a_poor_imu(tmp_path: Path) -> None:
     """An accelerometer's bias tilts both lines to the same side of the body, as the boresight's roll does."""
     with pytest.raises(UserError, match=r"does not determine roll \(ω\), pitch \(φ\)"):
         planned(plan_of(tmp_path, OPPOSITE), tmp_path / "plan.png")
 
 
-def test_a_poor_unit_is_said_before_the_flight(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_poor_imu_is_reported_before_the_flight(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The same lines with a MEMS unit: its attitude is too poor for these sigmas."""
     with pytest.raises(UserError, match="does not determine"):
         planned(plan_of(tmp_path, more=VILLAGE, grade="mems"), tmp_path / "plan.svg")
@@ -232,7 +234,7 @@ def test_a_poor_unit_is_said_before_the_flight(tmp_path: Path, capsys: pytest.Ca
         ({}, {"sigmas": "0.02,0,0.01"}, '--sigmas: got "0.02,0,0.01", want numbers above 0'),
     ],
 )
-def test_what_cannot_be_planned_is_one_line(
+def test_an_impossible_plan_is_refused_in_one_line(
     tmp_path: Path, made: dict[str, Any], options: dict[str, Any], words: str
 ) -> None:
     with pytest.raises(UserError) as ended:
@@ -242,7 +244,7 @@ def test_what_cannot_be_planned_is_one_line(
     assert ended.value.exit_code == ExitCode.USAGE
 
 
-def test_pictures_that_cannot_be_written_are_one_line(tmp_path: Path) -> None:
+def test_unwritable_pictures_are_reported_in_one_line(tmp_path: Path) -> None:
     plan = plan_of(tmp_path, OPPOSITE)
     with pytest.raises(UserError, match=r"plan.bmp: want a picture's name that ends in one of .pdf, .png, .svg"):
         planned(plan, tmp_path / "plan.bmp")

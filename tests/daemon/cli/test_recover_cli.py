@@ -42,14 +42,14 @@ def digest(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def test_a_whole_log_needs_nothing(logs: Path) -> None:
+def test_a_complete_log_needs_no_recovery(logs: Path) -> None:
     result = swath("recover", str(logs / WHOLE))
     assert (result.returncode, result.stderr) == (0, "")
     assert "whole" in result.stdout
     assert not list(logs.glob("*.recovered.mcap"))
 
 
-def test_a_directory_is_repaired_and_the_originals_stay(logs: Path) -> None:
+def test_a_directory_is_recovered_and_the_originals_are_kept(logs: Path) -> None:
     before = {path.name: digest(path) for path in logs.iterdir()}
     result = swath("recover", "--json", "--background", str(logs))
     assert result.returncode == 4, result.stderr
@@ -75,7 +75,7 @@ def test_a_flipped_bit_costs_its_chunk_only(logs: Path) -> None:
     assert saved["/gnss/rover/raw"] == 60
 
 
-def test_output_folder(logs: Path, tmp_path: Path) -> None:
+def test_recovered_copies_are_written_to_the_output_folder(logs: Path, tmp_path: Path) -> None:
     other = tmp_path / "other"
     other.mkdir()
     assert swath("recover", "--output", str(other), str(logs / CUT)).returncode == 4
@@ -83,7 +83,7 @@ def test_output_folder(logs: Path, tmp_path: Path) -> None:
     assert sorted(path.name for path in logs.iterdir()) == [WHOLE, CUT]
 
 
-def test_what_cannot_be_done_is_one_line(logs: Path, tmp_path: Path) -> None:
+def test_impossible_requests_are_refused_in_one_line(logs: Path, tmp_path: Path) -> None:
     (tmp_path / "text.mcap").write_text("no log")
     (tmp_path / "empty").mkdir()
     cases = [
@@ -133,7 +133,7 @@ def unfinished_copy(logs: Path) -> Path:
     return logs / LARGE.replace(".mcap", ".recovered.mcap.part")
 
 
-def test_a_log_that_another_process_recovers_is_left_to_it(logs: Path, recovering: subprocess.Popen[str]) -> None:
+def test_a_log_under_recovery_by_another_process_is_skipped(logs: Path, recovering: subprocess.Popen[str]) -> None:
     result = swath("recover", str(logs / LARGE))
     assert (result.returncode, result.stdout) == (3, "")
     assert result.stderr == f"swath: {logs / LARGE}: is being recovered by another process\n"
@@ -144,7 +144,7 @@ def test_a_log_that_another_process_recovers_is_left_to_it(logs: Path, recoverin
     assert not unfinished_copy(logs).exists()
 
 
-def test_what_a_killed_recovery_left_is_made_anew(logs: Path, recovering: subprocess.Popen[str]) -> None:
+def test_remains_of_a_killed_recovery_are_replaced(logs: Path, recovering: subprocess.Popen[str]) -> None:
     recovering.kill()
     recovering.wait()
     assert unfinished_copy(logs).exists()
@@ -153,7 +153,7 @@ def test_what_a_killed_recovery_left_is_made_anew(logs: Path, recovering: subpro
     assert not unfinished_copy(logs).exists()
 
 
-def test_of_many_that_begin_at_once_one_recovers(logs: Path) -> None:
+def test_of_many_simultaneous_recoveries_only_one_runs(logs: Path) -> None:
     """A claim is of an open file, so threads stand for processes; a copy that was left behind is in everybody's way."""
     copy = logs / CUT.replace(".mcap", ".recovered.mcap")
     for _ in range(20):
@@ -180,8 +180,8 @@ def test_of_many_that_begin_at_once_one_recovers(logs: Path) -> None:
 
 
 @pytest.mark.parametrize("mode", [0o640, 0o600, 0o664])
-def test_who_may_read_the_log_may_read_the_copy(logs: Path, mode: int) -> None:
-    """As after `sudo swath recover`; only root can give files away, for others the owner is their own."""
+def test_the_copy_has_the_owner_and_permissions_of_the_log(logs: Path, mode: int) -> None:
+    """This is the case after `sudo swath recover`; only root can change owners, so other users keep their own."""
     owner = (4711, 4712) if os.geteuid() == 0 else (os.geteuid(), os.getegid())
     os.chown(logs / CUT, *owner)
     (logs / CUT).chmod(mode)
@@ -191,18 +191,18 @@ def test_who_may_read_the_log_may_read_the_copy(logs: Path, mode: int) -> None:
 
 
 class Said(Events):
-    """What was reported."""
+    """Events that were reported."""
 
     def __init__(self) -> None:
         self.codes: list[str] = []
 
     def post(self, severity: Severity, source: str, code: str, text: str) -> Event:
-        """Note it."""
+        """Record an event."""
         self.codes.append(code)
         return Event(0, severity, source, code, text)
 
 
-async def test_the_services_repair_waits_for_a_recovery_by_hand(logs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_the_service_waits_for_a_manual_recovery(logs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(repair, "_LOOK_AGAIN_S", 0.05)
     temporary = logs / CUT.replace(".mcap", ".recovered.mcap.part")
     events = Said()

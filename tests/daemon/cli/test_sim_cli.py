@@ -95,8 +95,8 @@ def plan_with(folder: Path, before: str, after: str) -> str:
     return str(path)
 
 
-class TestIntoALog:
-    def test_the_log_and_all_that_belongs_to_it(self, flown: tuple[Path, str]) -> None:
+class TestFlyIntoALog:
+    def test_the_log_is_written_with_its_files(self, flown: tuple[Path, str]) -> None:
         folder, said = flown
         [log] = folder.glob("*.mcap")
         assert {path.name for path in folder.iterdir()} == BESIDE | {"truth.npz", log.name}
@@ -112,7 +112,7 @@ class TestIntoALog:
         units = sum(counts[f"/{source}"] + counts[f"/{source}/raw"] for source in SOURCES)
         assert f" {units:,} units, " in first
 
-    def test_its_configuration_is_whole_and_is_the_one_in_the_log(self, flown: tuple[Path, str]) -> None:
+    def test_the_written_configuration_is_complete_and_equals_the_one_in_the_log(self, flown: tuple[Path, str]) -> None:
         folder, _ = flown
         said = swath("check", "--offline", str(folder / "swath.toml")).stdout
         assert "valid; 4 sources: pps/main, gnss/rover, imu/main, scanner/left" in said
@@ -123,7 +123,7 @@ class TestIntoALog:
         assert attachments["dbc/main.dbc"] == (folder / "main.dbc").read_bytes()
         assert session.info.origin == "simulation"
 
-    def test_the_same_plan_gives_the_same_bytes_under_a_name_of_ones_own(
+    def test_the_same_plan_gives_the_same_bytes_under_another_file_name(
         self, plan: str, flown: tuple[Path, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
         log = tmp_path / "again.mcap"
@@ -134,7 +134,7 @@ class TestIntoALog:
         for name in BESIDE | {"truth.npz"}:
             assert (tmp_path / name).read_bytes() == (flown[0] / name).read_bytes(), name
 
-    def test_another_seed_and_no_truth(
+    def test_another_seed_changes_the_log_and_no_truth_is_written(
         self, plan: str, flown: tuple[Path, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
         words = ("fly", plan, "-o", str(tmp_path), "--seconds", "2", "--seed", "7", "--no-truth")
@@ -144,7 +144,7 @@ class TestIntoALog:
         assert read_log(log).data("imu/main") not in read_log(before).data("imu/main")
         assert {path.name for path in tmp_path.iterdir()} == BESIDE | {log.name}
 
-    def test_nothing_is_written_over(
+    def test_existing_files_are_not_overwritten(
         self, plan: str, flown: tuple[Path, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
         folder, _ = flown
@@ -160,7 +160,7 @@ class TestIntoALog:
         assert [path.name for path in tmp_path.iterdir()] == [log.name]
 
     @pytest.mark.slow
-    def test_interrupted_it_leaves_nothing(self, tmp_path: Path) -> None:
+    def test_an_interrupted_flight_leaves_no_files(self, tmp_path: Path) -> None:
         folder = tmp_path / "flight"
         command = [sys.executable, "-m", "swath.daemon.cli.main", "sim", "fly", "small", "-o", str(folder)]
         with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True) as flying:
@@ -173,7 +173,7 @@ class TestIntoALog:
         )
         assert list(tmp_path.iterdir()) == []
 
-    def test_a_full_disk_leaves_nothing(
+    def test_a_full_disk_leaves_no_files(
         self, plan: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
     ) -> None:
         def refuse_chunk(*_: object) -> None:
@@ -187,7 +187,7 @@ class TestIntoALog:
         assert in_process(capsys, *words) == (ExitCode.IO, line)
         assert list(tmp_path.iterdir()) == []
 
-    def test_two_flights_at_once_do_not_meet(self, tmp_path: Path) -> None:
+    def test_two_simultaneous_flights_do_not_interfere(self, tmp_path: Path) -> None:
         with FlightFolder(tmp_path / "logs") as folder:
             with pytest.raises(UserError, match="another flight runs there, or was killed there"):
                 FlightFolder(tmp_path / "logs")
@@ -215,7 +215,7 @@ class TestErrors:
             (("plan", "small", "-o", "x.gif"), "x.gif: want a picture's name that ends in one of"),
         ],
     )
-    def test_usage_is_one_line_and_2(
+    def test_a_usage_error_is_one_line_and_exit_code_2(
         self,
         tmp_path: Path,
         monkeypatch: pytest.MonkeyPatch,
@@ -242,7 +242,7 @@ class TestErrors:
             ),
         ],
     )
-    def test_a_plan_that_cannot_be_flown_names_its_key(
+    def test_error_for_a_plan_that_cannot_be_flown_names_its_key(
         self, tmp_path: Path, capsys: pytest.CaptureFixture[str], before: str, after: str, line: str
     ) -> None:
         path = plan_with(tmp_path, before, after)
@@ -252,7 +252,7 @@ class TestErrors:
         assert not (tmp_path / "logs").exists()
 
     @pytest.mark.parametrize("words", [("fly", "small", "-o", "x"), ("fly", "small", "--wire"), ("plan", "small")])
-    def test_without_the_extra_it_says_what_to_install(
+    def test_without_the_extra_the_error_names_the_packages(
         self,
         monkeypatch: pytest.MonkeyPatch,
         capsys: pytest.CaptureFixture[str],
@@ -267,16 +267,16 @@ class TestErrors:
         assert in_process(capsys, *words) == (ExitCode.USAGE, line)
         assert list(tmp_path.iterdir()) == []
 
-    def test_without_a_command_it_says_which_there_are(self) -> None:
+    def test_without_a_command_the_available_ones_are_listed(self) -> None:
         run = swath("sim")
         assert run.returncode == ExitCode.USAGE
         assert "Usage: swath sim" in run.stdout
 
-    def test_the_help_names_the_presets_there_are(self) -> None:
+    def test_the_help_lists_the_presets(self) -> None:
         assert PRESETS.split(", ") == list(REAL_PRESETS)
 
 
-def test_a_plan_is_drawn_and_told(plan: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_plan_is_drawn_and_summarised(plan: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     picture = tmp_path / "plan.png"
     assert cli.run_app(["sim", "plan", plan, "-o", str(picture), "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
@@ -291,7 +291,7 @@ def test_a_plan_is_drawn_and_told(plan: str, tmp_path: Path, capsys: pytest.Capt
 
 
 class Noted(Output):
-    """Takes everything; notes what came when, and that it was closed."""
+    """Output that accepts everything and records what arrived when, and that it was closed."""
 
     def __init__(self, notes: list[tuple[str, bytes, int]], name: str) -> None:
         self._notes, self._name = notes, name
@@ -306,7 +306,7 @@ class Noted(Output):
 
 @pytest.fixture
 def ahead() -> Iterator[Callable[..., Ahead]]:
-    """Makes flights in other processes, and ends them."""
+    """Make flights in other processes and end them."""
     made: list[Ahead] = []
 
     def make(function: Callable[..., tuple[Standin, dict[str, bytes]]], *arguments: object) -> Ahead:
@@ -318,10 +318,10 @@ def ahead() -> Iterator[Callable[..., Ahead]]:
         one.close()
 
 
-class TestAhead:
-    """A flight that another process makes."""
+class TestFlightInAnotherProcess:
+    """Flight computed by another process."""
 
-    def test_gives_the_same_units_in_the_same_order(self, ahead: Callable[..., Ahead]) -> None:
+    def test_the_same_units_arrive_in_the_same_order(self, ahead: Callable[..., Ahead]) -> None:
         one = ahead(make_standin, 5.0, ((1.0, 60.0),), (("gnss/rover", 2.0, 3.0),))
         facts = FlightFacts(5.0, SOURCES, ((1.0, 60.0),), (("gnss/rover", 2.0, 3.0),), {"README.md": b"none"})
         assert one.facts == facts
@@ -331,7 +331,7 @@ class TestAhead:
         ]
         assert list(one.units()) == want
 
-    def test_waits_when_it_is_far_enough_ahead(self, ahead: Callable[..., Ahead]) -> None:
+    def test_the_process_waits_when_it_is_far_enough_ahead(self, ahead: Callable[..., Ahead]) -> None:
         one = ahead(make_standin, 300.0)
         assert one.facts.duration_s == 300.0
         wait_until(lambda: one._words.full(), "a full queue")
@@ -340,7 +340,7 @@ class TestAhead:
         one.close()
         assert one._process.exitcode is not None
 
-    def test_what_goes_wrong_there_is_told_here(self, ahead: Callable[..., Ahead]) -> None:
+    def test_errors_of_the_process_are_reported(self, ahead: Callable[..., Ahead]) -> None:
         with pytest.raises(UserError, match="it cannot be flown"):
             assert ahead(refuse).facts
         with pytest.raises(RuntimeError, match="ZeroDivisionError"):
@@ -350,7 +350,7 @@ class TestAhead:
 
 
 class TestWires:
-    def test_own_wires_are_a_configuration_that_nothing_else_uses(self, tmp_path: Path) -> None:
+    def test_own_wires_use_addresses_that_nothing_else_uses(self, tmp_path: Path) -> None:
         wires = own_wires(tmp_path, SOURCES, {"gnss/rover": 460_800})
         assert wires["gnss/rover"] == f"serial:{tmp_path}/gnss-rover?baud=460800"
         assert wires["pps/main"] == f"fixed:{tmp_path}/pps-main"
@@ -370,7 +370,7 @@ class TestWires:
         for output in outputs.values():
             output.close()
 
-    def test_units_leave_in_time_and_plugs_are_pulled_between_them(
+    def test_units_leave_in_time_and_devices_are_unplugged_between_them(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         notes: list[tuple[str, bytes, int]] = []
@@ -401,7 +401,7 @@ class TestWires:
         assert edges[1] - edges[0] == pytest.approx(1e9 + 3600e9, abs=2)  # the second by the clock that was stepped
         assert [round(step_ns / 1e9) for step_ns in steps] == [0, 3600, -3600]
 
-    def test_a_wall_clock_that_may_not_be_set(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_a_wall_clock_without_permission_is_refused(self, monkeypatch: pytest.MonkeyPatch) -> None:
         def refuse_to(*_: object) -> None:
             raise PermissionError(1, "Operation not permitted")
 
@@ -410,7 +410,7 @@ class TestWires:
             WallClock()
 
     @pytest.mark.slow
-    def test_a_recorder_gets_from_the_wires_what_the_log_of_the_flight_holds(
+    def test_a_recorder_receives_the_units_of_the_simulated_log(
         self, plan: str, flown: tuple[Path, str], tmp_path: Path
     ) -> None:
         folder = tmp_path / "wires"
@@ -438,7 +438,7 @@ class TestWires:
         assert len(got.messages["/pps/main"]) == len(sent.messages["/pps/main"])
         assert load_config(folder / "swath.toml").session.directory == str(folder / "logs")
 
-    def test_a_folder_of_wires_is_not_made_twice(
+    def test_existing_wires_are_not_overwritten(
         self, plan: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr("swath.daemon.simulate.plans.make_flight_in_time", standin_for)
@@ -449,7 +449,7 @@ class TestWires:
         assert (code, said) == (ExitCode.IO, line)
         assert path.read_text() == ""
 
-    def test_wires_of_a_configuration_and_sources_that_do_not_meet(
+    def test_a_mismatch_between_wires_and_sources_is_refused(
         self, plan: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
     ) -> None:
         path = tmp_path / "swath.toml"
@@ -467,7 +467,7 @@ class TestWires:
         assert "pps/main: 0 units, 0 bytes, 1 rejected by a reader" in lines
         assert not (tmp_path / "pps").exists()
 
-    def test_stepping_the_clock_is_refused_before_anything_is_made(
+    def test_stepping_the_clock_is_refused_before_any_wire_is_made(
         self, plan: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr("swath.daemon.simulate.plans.make_flight_in_time", stepping_for)

@@ -39,14 +39,14 @@ FLAT = "height_m = 450.0\nrelief_m = 0.0"
 
 
 def run(*arguments: str) -> None:
-    """The command, in this process."""
+    """Run the command in this process."""
     app = typer.Typer()
     app.command()(strips.command)
     app(args=list(arguments), standalone_mode=False)
 
 
 def lifted(folder: Path, lift_m: float, south_m: float = 30.0) -> Path:
-    """Two strips over a slope, the second higher."""
+    """Return two strips over a slope, the second higher."""
     folder.mkdir()
     for number, (south, lift) in enumerate([(0.0, 0.0), (south_m, lift_m)], start=1):
         x, y = lattice(EAST_M, NORTH_M + south, 120.0, 50.0, 0.5)
@@ -56,7 +56,7 @@ def lifted(folder: Path, lift_m: float, south_m: float = 30.0) -> Path:
 
 @pytest.fixture(scope="module")
 def made() -> Cast:
-    """Two opposite lines over flat ground."""
+    """Return two opposite lines over flat ground."""
     return cast_flight(FLAT, LINES, prf_hz=40_000.0, true={})
 
 
@@ -110,7 +110,7 @@ def products(
     return folder
 
 
-def test_numbers_of_a_lifted_strip_in_the_record_and_the_table(
+def test_record_and_table_show_the_numbers_of_a_lifted_strip(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = lifted(tmp_path / "now", 0.07)
@@ -131,7 +131,7 @@ def test_numbers_of_a_lifted_strip_in_the_record_and_the_table(
     assert (tmp_path / "out" / "differences.png").read_bytes()[:4] == b"\x89PNG"
 
 
-def test_before_and_after_stand_beside_each_other(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_numbers_before_and_after_are_shown_side_by_side(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     now, then = lifted(tmp_path / "now", 0.01), lifted(tmp_path / "then", 0.20)
     run(str(now), "--before", str(then), "-o", str(tmp_path / "out"))
     told = capsys.readouterr().out
@@ -145,7 +145,7 @@ def test_before_and_after_stand_beside_each_other(tmp_path: Path, capsys: pytest
     ]
 
 
-def test_a_level_that_is_not_kept_is_a_problem(tmp_path: Path) -> None:
+def test_a_missed_quality_level_is_a_problem(tmp_path: Path) -> None:
     folder = lifted(tmp_path / "now", 0.12)
     run(str(folder), "--level", "QL3")
     with pytest.raises(UserError, match=r"strips do not meet QL2, because of its limit of 0\.08 m RMSDz") as caught:
@@ -171,7 +171,7 @@ def test_a_wrong_roll_is_named_and_is_a_problem(made: Cast, tmp_path: Path, caps
 
 
 @pytest.mark.slow
-def test_a_flight_gives_what_its_files_give(made: Cast, tmp_path: Path) -> None:
+def test_a_flight_and_its_files_give_the_same_differences(made: Cast, tmp_path: Path) -> None:
     """Both ways to the same differences: arrays in t, and LAZ in a projection."""
     of_flight = strips_of_flight("flight", made.flight, StripRules())
     of_files = strips_of_files([products(tmp_path / "p", made.flight)], StripRules(), lambda what, done, of: None)
@@ -184,7 +184,7 @@ def test_a_flight_gives_what_its_files_give(made: Cast, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_one_cloud_has_one_figure_and_one_level_wherever_it_is_told(
+def test_every_command_gives_the_same_figure_and_level_for_one_cloud(
     made: Cast, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """`calibrate`, the map of its report, `strips` and `view`; coordinates of files are rounded to 0.1 mm."""
@@ -219,8 +219,8 @@ def test_one_cloud_has_one_figure_and_one_level_wherever_it_is_told(
         {'datum = "EPSG:7912"\n': "", "datum_accuracy_m = 0.05": "datum_accuracy_m = 2.0"},
     ],
 )
-def test_the_datum_is_that_of_the_configuration(made: Cast, tmp_path: Path, said: dict[str, str]) -> None:
-    """Points and trajectory are in one place whoever said the datum and how good the way there must be."""
+def test_the_datum_is_taken_from_the_configuration(made: Cast, tmp_path: Path, said: dict[str, str]) -> None:
+    """Points and trajectory must agree, whatever source and accuracy of the datum was configured."""
     setup = Setup.of_config(aircraft_config(tmp_path / "c", said), Options(crs="EPSG:25832", uncertainty=False))
     assert setup.mapping is not None
     setup.mapping.settle(made.flight.trajectories[0].position_e[:1])
@@ -237,8 +237,8 @@ def test_the_datum_is_that_of_the_configuration(made: Cast, tmp_path: Path, said
 
 
 @pytest.mark.slow
-def test_equal_numbers_of_two_runs_are_strips_of_their_own(made: Cast, tmp_path: Path) -> None:
-    """Also of two aircraft at one time: each strip has its run's trajectory."""
+def test_strips_with_equal_numbers_of_two_runs_are_separate(made: Cast, tmp_path: Path) -> None:
+    """This includes two aircraft at one time: each strip has the trajectory of its run."""
     first = products(tmp_path / "p", made.flight)
     second = products(tmp_path / "q", made.flight, session="b", up_m=0.07)
     strips = strips_of_files([first, second], StripRules(), lambda what, done, of: None)
@@ -261,10 +261,10 @@ def test_strips_of_two_scanners_processed_apart_are_the_same_strips(made: Cast, 
 
 
 @pytest.mark.parametrize("of_week", [(2,), (1, 2)])
-def test_seconds_of_the_week_are_of_the_trajectory_beside_them(
+def test_seconds_of_the_week_belong_to_the_trajectory_beside_them(
     made: Cast, tmp_path: Path, of_week: tuple[int, ...]
 ) -> None:
-    """By the header of each file; files that mix both kinds are named."""
+    """The header of each file decides; files that mix both kinds are named."""
     folder = products(tmp_path / "p", made.flight, of_week=of_week)
     strips = strips_of_files([folder], StripRules(), lambda what, done, of: None)
     begin, end = made.flight.trajectories[0].span
@@ -276,7 +276,7 @@ def test_seconds_of_the_week_are_of_the_trajectory_beside_them(
     assert [note.startswith(mixed) for note in strips.notes] == [True] * (of_week == (2,))
 
 
-def test_points_of_another_time_than_their_trajectory_are_said_to_be(made: Cast, tmp_path: Path) -> None:
+def test_points_of_another_time_than_their_trajectory_are_reported(made: Cast, tmp_path: Path) -> None:
     folder = products(tmp_path / "p", made.flight, of_week=(1, 2))
     week = made.flight.trajectories[0].span[0] // WEEK_NS
     strips = strips_of_files([folder], StripRules(), lambda what, done, of: None, week - 1)
@@ -286,7 +286,7 @@ def test_points_of_another_time_than_their_trajectory_are_said_to_be(made: Cast,
         strips_of_files([folder], StripRules(), lambda what, done, of: None, 24233)
 
 
-def test_a_sidecar_that_says_no_datum_is_noted(made: Cast, tmp_path: Path) -> None:
+def test_a_sidecar_without_a_datum_is_reported(made: Cast, tmp_path: Path) -> None:
     folder = products(tmp_path / "p", made.flight)
     sidecar = json.loads((folder / "a.json").read_text())
     del sidecar["crs"]["datum_said"]
@@ -296,7 +296,7 @@ def test_a_sidecar_that_says_no_datum_is_noted(made: Cast, tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("what", ["one", "apart", "twice", "nothing", "absent", "level", "cell"])
-def test_what_cannot_be_compared_is_one_line(what: str, tmp_path: Path) -> None:
+def test_incomparable_files_are_refused_in_one_line(what: str, tmp_path: Path) -> None:
     folder = lifted(tmp_path / "now", 0.0, 500.0 if what == "apart" else 30.0)
     arguments, said = [str(folder)], ""
     if what == "one":

@@ -36,7 +36,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
 
 @pytest.fixture(scope="module")
 def made(flown: Flown, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Smoothed, with everything."""
+    """Return the folder of a smoothed trajectory with all products."""
     folder = tmp_path_factory.mktemp("made")
     arguments = [
         "trajectory",
@@ -63,7 +63,7 @@ def read(folder: Path, flown: Flown) -> Trajectory:
 
 
 class TestSmoothed:
-    def test_it_is_where_the_truth_is_within_its_own_sigmas(self, flown: Flown, made: Path) -> None:
+    def test_the_trajectory_matches_the_truth_within_its_sigmas(self, flown: Flown, made: Path) -> None:
         trajectory, truth = read(made, flown), flown.truth()
         inside = truth.fates(trajectory.time_ns) == 0
         position, attitude = errors(trajectory, truth)
@@ -77,7 +77,7 @@ class TestSmoothed:
         assert (spread < 3.0).all(), spread  # one flight: its errors are few independent ones
         assert np.sqrt((normalised**2).mean()) > 0.2  # nor are the sigmas large for fear of that
 
-    def test_the_summary_tells_what_it_is_made_of(self, flown: Flown, made: Path) -> None:
+    def test_the_summary_describes_the_inputs(self, flown: Flown, made: Path) -> None:
         told = summary(made)
         assert (told["format"], told["solution"], told["point"]) == ("swath.trajectory", "smoothed", "body")
         assert (told["complete"], told["holes"]) == (True, [])
@@ -94,14 +94,14 @@ class TestSmoothed:
         assert leg["verdict"]["level"] in {"good", "care"}
         assert leg["start"]["words"]
 
-    def test_its_page_says_the_same(self, made: Path) -> None:
+    def test_the_page_matches_the_summary(self, made: Path) -> None:
         page = (made / "a.html").read_text()
         session = summary(made)["sessions"][0]
         assert session["session"] in page
         assert session["imu"]["noise_by_grade"] == {}  # the virtual aircraft's configuration has every key
         assert "data:image/png" in page
 
-    def test_marks_are_where_the_aircraft_was(self, flown: Flown, made: Path) -> None:
+    def test_event_marks_match_the_position_of_the_aircraft(self, flown: Flown, made: Path) -> None:
         rows = list(csv.DictReader((made / "marks.csv").read_text().splitlines()))
         assert len(rows) >= SECONDS - 2
         assert summary(made)["events"] == {
@@ -117,15 +117,15 @@ class TestSmoothed:
             assert float(row["lat_deg"]) == pytest.approx(np.degrees(np.interp(0.0, since, lat)), abs=1e-6)
             assert float(row["height_m"]) == pytest.approx(np.interp(0.0, since, height), abs=0.1)
 
-    def test_the_function_for_georeferencing_gives_the_same(self, flown: Flown, made: Path) -> None:
+    def test_the_function_for_georeferencing_gives_the_same_trajectory(self, flown: Flown, made: Path) -> None:
         trajectory = read(made, flown)
         again = navigate_session(open_logs([flown.log])[0], NavigationOptions()).trajectory()
         assert np.abs(again.position_e - trajectory.position_e).max() < 1e-6
         assert np.abs(again.position_sigma_l - trajectory.position_sigma_l).max() < 1e-12
 
 
-class TestOtherwise:
-    def test_in_real_time_it_is_the_filters(
+class TestOptions:
+    def test_the_real_time_trajectory_is_that_of_the_filter(
         self, flown: Flown, made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
         output = tmp_path / "a.sbet"
@@ -141,7 +141,7 @@ class TestOtherwise:
         position, _ = errors(filtered, flown.truth())
         assert np.sqrt((position**2).mean(axis=0)).max() < 0.2
 
-    def test_a_csv_in_a_folder_that_is_not_there_yet_is_the_same_bit_for_bit(
+    def test_a_csv_in_a_new_folder_holds_the_same_trajectory_bit_for_bit(
         self, flown: Flown, made: Path, tmp_path: Path
     ) -> None:
         output = tmp_path / "new" / "t.csv"
@@ -150,9 +150,7 @@ class TestOtherwise:
         assert output.read_bytes() == (made / "a.csv").read_bytes()
 
     @pytest.mark.slow
-    def test_antennas_that_are_swapped_are_named(
-        self, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-    ) -> None:
+    def test_swapped_antennas_are_named(self, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         primary, secondary = "= [0.1, -0.05, -1.2]", "= [0.1, 1.15, -1.2]"
         flown.changed("swapped.toml", **{primary: "= [0, 0, 0]", secondary: primary, "= [0, 0, 0]": secondary})
         capsys.readouterr()
@@ -164,10 +162,10 @@ class TestOtherwise:
         assert all(line.startswith(f"swath: {flown.log}: ") for line in (why, *findings))
         assert not list(tmp_path.iterdir())
 
-    def test_an_imu_mounted_otherwise_is_not_to_be_used(
+    def test_an_imu_with_another_mounting_makes_the_trajectory_unusable(
         self, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
-        """Its position is right, for an attitude turned with it fits as well; only gravity and course tell."""
+        """A rotated attitude fits the rotated IMU, so positions are right; only gravity and course reveal the error."""
         turned = "rotation_b_imu = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]"
         alone = {"secondary_lever_arm_m": "# ", "lever_arm_m = [0.1, -0.05, -1.2]": "lever_arm_m = [0, 0, 0]"}
         plain = "rotation_b_imu = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]"
@@ -184,10 +182,10 @@ class TestOtherwise:
         assert all(reason["what"] in line for reason, line in zip(leg["verdict"]["reasons"][1:], reasons, strict=True))
 
     @pytest.mark.slow
-    def test_an_attitude_given_by_hand_starts_it(
+    def test_a_given_attitude_starts_the_navigation(
         self, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
-        """And a key of the noise that nobody set is named with its grade, on the page too."""
+        """A key of the noise that was not set is named with its grade, on the page too."""
         flown.changed("alone.toml", **{"secondary_lever_arm_m": "# ", "accel_scale_ppm": "# "})
         capsys.readouterr()
         arguments = ["-o", str(tmp_path / "a.sbet"), "--config", str(flown.folder / "alone.toml")]
@@ -211,7 +209,7 @@ class TestRefusals:
         assert "internal error" not in line
         return line
 
-    def test_what_is_there_is_kept(self, flown: Flown, made: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def test_existing_files_are_kept(self, flown: Flown, made: Path, capsys: pytest.CaptureFixture[str]) -> None:
         before = (made / "a.sbet").stat().st_mtime_ns
         assert "--overwrite" in self.refused(capsys, str(flown.log), "-o", str(made / "a.sbet"))
         assert (made / "a.sbet").stat().st_mtime_ns == before
@@ -226,25 +224,27 @@ class TestRefusals:
             (["--gnss", "nowhere.pos"], "--gnss nowhere.pos: cannot be read"),
         ],
     )
-    def test_mistakes_of_the_command_line(
+    def test_wrong_options_are_refused(
         self, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], said: str
     ) -> None:
         assert said in self.refused(capsys, str(flown.log), "-o", str(tmp_path / "a.sbet"), *arguments)
         assert not list(tmp_path.iterdir())
 
     @pytest.mark.parametrize(("output", "marks"), [("a.sbet", "a.csv"), ("a.csv", "a.csv"), ("a.sbet", "a.json")])
-    def test_marks_do_not_take_the_place_of_the_trajectory(
+    def test_event_marks_do_not_overwrite_the_trajectory(
         self, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str], output: str, marks: str
     ) -> None:
         arguments = ["-o", str(tmp_path / output), "--csv", "--events", str(tmp_path / "." / marks), "--overwrite"]
         assert "is a file of the trajectory itself" in self.refused(capsys, str(flown.log), *arguments)
         assert not list(tmp_path.iterdir())
 
-    def test_no_log(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def test_a_missing_log_is_refused(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         said = self.refused(capsys, str(tmp_path / "no.mcap"), "-o", str(tmp_path / "a.sbet"))
         assert "no such file or directory" in said
 
-    def test_a_damaged_log_is_partial(self, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def test_a_damaged_log_gives_a_partial_result(
+        self, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
         data = bytearray(flown.log.read_bytes())
         log = tmp_path / flown.log.name
         log.write_bytes(data[: len(data) * 9 // 10])
@@ -254,7 +254,7 @@ class TestRefusals:
         assert log.name in told["holes"][0]
         assert read(tmp_path, flown).span[1] > flown.truth().span[0] + 35 * S
 
-    def test_what_of_a_directory_is_no_log_is_passed_over(
+    def test_files_of_a_directory_that_are_not_logs_are_skipped(
         self, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
         logs = tmp_path / "logs"
@@ -268,16 +268,16 @@ class TestRefusals:
 
 
 @pytest.mark.parametrize("text", ["1,2", "1,2,x", "1,2,nan", "200,0,0", "0,91,0", "0,0,400", ""])
-def test_an_attitude_that_cannot_be_is_refused(text: str) -> None:
+def test_an_impossible_attitude_is_refused(text: str) -> None:
     with pytest.raises(Exception, match="want roll,pitch,heading in degrees"):
         attitude_of_text(text)
 
 
-def test_an_attitude_by_hand_is_in_degrees() -> None:
+def test_a_given_attitude_is_in_degrees() -> None:
     assert attitude_of_text("1.5, -2,270") == pytest.approx(np.radians([1.5, -2.0, 270.0]).tolist())
 
 
-def test_post_processed_positions_make_it_better(flown: Flown, made: Path, tmp_path: Path) -> None:
+def test_post_processed_positions_improve_the_trajectory(flown: Flown, made: Path, tmp_path: Path) -> None:
     """They replace the receiver's; errors shrink, the sigmas with them, and all are counted."""
     truth = flown.truth()
     file = tmp_path / "ppk.pos"
@@ -300,13 +300,13 @@ def test_post_processed_positions_make_it_better(flown: Flown, made: Path, tmp_p
     assert session["gnss"]["refused"]["fix_replaced_from_outside"] == pytest.approx(2 * SECONDS, abs=3)
 
 
-def test_sessions_of_a_host_whose_clock_was_set_back_follow_each_other(
+def test_sessions_are_ordered_by_trajectory_despite_a_clock_set_back(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Sessions are sorted by the host's clock; which came first the trajectories tell."""
+    """Sessions are sorted by the host's clock; the trajectories show which came first."""
 
     def begun_late(text: str, folder: Path) -> Plan:
-        """With a host's clock that is further off than a plan may say."""
+        """Return a plan whose host clock is further off than a plan may state."""
         plan = parse_plan(text, folder)
         host = plan.tables.host.model_copy(update={"utc_offset_s": -1200.0})
         return replace(plan, tables=plan.tables.model_copy(update={"host": host}))

@@ -104,19 +104,21 @@ def test_an_imu_without_a_receiver_is_timed_by_the_wall_clock_and_its_pulses(flo
     assert any("wall clock alone names the seconds" in line for line in told["warnings"])
 
 
-def test_a_lever_arm_that_nobody_says_is_estimated_and_told(flown: Flown) -> None:
+def test_an_absent_lever_arm_is_estimated_and_reported(flown: Flown) -> None:
     wish = InputOptions(positions=flown.folder / "ppk.pos", config=load_config(without_receiver(flown)))
     inputs = read_inputs(flown.session(), wish)
     assert inputs.setup.estimate_lever_arm == 2.0
     assert any("give --lever-arm X,Y,Z" in line for line in inputs.doubts)
 
 
-def test_without_a_file_raw_measurements_cannot_be_navigated(flown: Flown) -> None:
+def test_raw_measurements_need_a_position_file(flown: Flown) -> None:
     with pytest.raises(UserError, match=r"no position of gnss/rover.*--gnss FILE with post-processed positions"):
         read_inputs(flown.session(), InputOptions())
 
 
-def test_a_lever_arm_of_no_file_is_refused(flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_lever_arm_without_a_position_file_is_refused(
+    flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     arguments = [str(flown.log), "-o", str(tmp_path / "a.sbet"), "--lever-arm"]
     assert run_app(["trajectory", *arguments, "0,0,-1"]) == 2
     assert "--lever-arm needs --gnss FILE" in capsys.readouterr().err
@@ -127,7 +129,7 @@ def test_a_lever_arm_of_no_file_is_refused(flown: Flown, tmp_path: Path, capsys:
 # ---------------------------------------------------------------------- holes
 
 
-def test_stretches_without_time_are_told_with_begin_and_end() -> None:
+def test_stretches_without_time_are_reported_with_begin_and_end() -> None:
     """1000 samples at 100 Hz: the first 100, 60 in the middle and the last 2 s are not placed; 30 are too few."""
     host_ns = np.arange(1000) * S // 100 + 5 * S
     placed = np.ones(1000, np.bool_)
@@ -140,17 +142,17 @@ def test_stretches_without_time_are_told_with_begin_and_end() -> None:
     assert found[0].text.endswith("1.0 s: why")
 
 
-def test_nothing_placed_or_all_of_it_has_no_stretch() -> None:
+def test_all_or_none_of_the_samples_timed_gives_no_stretch() -> None:
     host_ns = np.arange(500) * S // 100
     assert stretches(host_ns, np.zeros(500, np.bool_), host_ns[:0], 100.0, "") == ()
     assert stretches(host_ns, np.ones(500, np.bool_), host_ns, 100.0, "") == ()
 
 
 @pytest.mark.slow
-def test_samples_without_a_time_are_a_hole_of_the_trajectory(
+def test_samples_without_time_are_a_gap_of_the_trajectory(
     flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The counter of 12 s in the middle reads nothing: their samples cannot be placed, and the whole says so."""
+    """The counter reads zero for 12 s in the middle: these samples have no time, and the whole log reports it."""
 
     def silent(rows: Any, *others: Any) -> Any:
         rows = rows.copy()

@@ -28,7 +28,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
 
 
 def validated(made: Made, folder: Path, omega_deg: float, *, sigmas: bool = True) -> tuple[int, Any]:
-    """Exit code, and the method's entry, of a calibration whose roll is off by so much."""
+    """Return exit code and entry of the method for a calibration whose roll is wrong by so much."""
     off = made.truth.changed(omega_rad=made.truth.value("omega_rad") + float(np.radians(omega_deg)))
     spread = np.zeros(len(INDEX))
     if sigmas:
@@ -45,7 +45,7 @@ def validated(made: Made, folder: Path, omega_deg: float, *, sigmas: bool = True
     return code, next(one for one in methods if one["method"] == METHOD)
 
 
-def test_a_true_calibration_is_measured_again(made: Made, tmp_path: Path) -> None:
+def test_a_true_calibration_is_confirmed_by_a_new_measurement(made: Made, tmp_path: Path) -> None:
     code, method = validated(made, tmp_path, 0.0)
     assert code == 1  # control is seen twice: too little for the test field that was asked for
     told = json.loads((tmp_path / "out" / "validation.json").read_text())["validation"]
@@ -59,7 +59,7 @@ def test_a_true_calibration_is_measured_again(made: Made, tmp_path: Path) -> Non
     assert found["omega_deg"]["sigma"] < 0.006
 
 
-def test_a_wrong_one_is_told_by_how_much(made: Made, tmp_path: Path) -> None:
+def test_the_error_of_a_wrong_calibration_is_reported(made: Made, tmp_path: Path) -> None:
     code, method = validated(made, tmp_path, 0.05)
     assert code == 1
     assert method["passed"] is False

@@ -33,7 +33,7 @@ PLACE = "HB-ABC/left"
 
 
 def run(*arguments: str) -> None:
-    """The command, in this process."""
+    """Run the command in this process."""
     app = typer.Typer()
     app.command()(validate.command)
     app(args=list(arguments), standalone_mode=False)
@@ -51,14 +51,14 @@ def file_of(
 
 
 def boresight(phi_deg: float, scanner: str = "left") -> Calibration:
-    """Of so much pitch."""
+    """Return a boresight with so much pitch."""
     return nominal(scanner, np.zeros(3), np.eye(3)).changed(phi_rad=float(np.radians(phi_deg)))
 
 
 # ---------------------------------------------------------------------- history
 
 
-def test_a_history_that_moved_is_told_drawn_and_a_problem(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_changed_history_is_reported_drawn_and_a_problem(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = tmp_path / "past"
     folder.mkdir()
     for month, phi in ((1, 0.10), (2, 0.1005), (3, 0.109)):
@@ -76,7 +76,7 @@ def test_a_history_that_moved_is_told_drawn_and_a_problem(tmp_path: Path, capsys
     assert (tmp_path / "out" / "history.png").read_bytes()[:4] == b"\x89PNG"
 
 
-def test_a_history_that_stayed_is_fine(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_unchanged_history_is_fine(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     files = [file_of(tmp_path / f"c{month}.toml", boresight(0.1 + 0.0003 * month), month) for month in (1, 2, 3)]
     run(str(files[2]), "--history", str(files[0]), "--history", str(files[1]))
     told = capsys.readouterr().out
@@ -84,7 +84,7 @@ def test_a_history_that_stayed_is_fine(tmp_path: Path, capsys: pytest.CaptureFix
     assert "0.1009 ± 0.0010" in told
 
 
-def test_a_history_in_which_nothing_can_be_tested_is_a_problem(tmp_path: Path) -> None:
+def test_a_history_without_testable_parameters_is_a_problem(tmp_path: Path) -> None:
     first = file_of(tmp_path / "c1.toml", boresight(0.1))
     with pytest.raises(
         UserError, match="drift cannot be tested, because fewer than two calibrations have sigmas"
@@ -103,7 +103,7 @@ def test_a_history_in_which_nothing_can_be_tested_is_a_problem(tmp_path: Path) -
 
 @pytest.fixture(scope="module")
 def made() -> Cast:
-    """Two opposite lines and one across, a village below."""
+    """Return two opposite lines and a crossing one over a village."""
     return cast_flight(lines=LINES, prf_hz=40_000.0, true={})
 
 
@@ -134,7 +134,7 @@ def log(made: Cast, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     return path
 
 
-def test_a_trajectory_that_is_not_to_be_used_is_the_first_line_and_a_problem(
+def test_an_unusable_trajectory_is_the_first_line_and_a_problem(
     log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     plain = cast(Any, validate_run).read_flight
@@ -152,7 +152,7 @@ def test_a_trajectory_that_is_not_to_be_used_is_the_first_line_and_a_problem(
     run(*arguments, "--accept-verdict")
 
 
-def test_a_true_calibration_holds(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_true_calibration_passes(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run(str(file_of(tmp_path / "good.toml", boresight(0.0))), str(log), "--json")
     record = json.loads(capsys.readouterr().out)["validation"]
     assert record["passed"] is True
@@ -164,13 +164,13 @@ def test_a_true_calibration_holds(log: Path, tmp_path: Path, capsys: pytest.Capt
     assert passed["secondAltitude"] is None
 
 
-def test_a_wrong_calibration_does_not(log: Path, tmp_path: Path) -> None:
+def test_a_wrong_calibration_fails(log: Path, tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"the calibration does not hold: .*other") as caught:
         run(str(file_of(tmp_path / "bad.toml", boresight(0.04))), str(log))
     assert caught.value.exit_code == ExitCode.PROBLEM
 
 
-def test_the_calibrations_own_log_is_no_independent_proof(
+def test_the_log_used_for_the_calibration_is_not_independent(
     log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from swath.daemon.processing.files import sha256_of
@@ -199,7 +199,7 @@ def attributes_of(path: Path) -> dict[str, dict[str, Any]]:
 
 
 @pytest.mark.parametrize("phi_deg", [0.0, 0.04], ids=["holds", "does not hold"])
-def test_the_record_beside_the_file_is_told_of_the_validation(log: Path, tmp_path: Path, phi_deg: float) -> None:
+def test_the_validation_is_added_to_the_record_beside_the_file(log: Path, tmp_path: Path, phi_deg: float) -> None:
     file = file_of(tmp_path / "c1.toml", boresight(phi_deg))
     old = record_beside(tmp_path / "left.record.json", "c1").read_bytes()
     try:
@@ -223,7 +223,7 @@ def test_the_record_beside_the_file_is_told_of_the_validation(log: Path, tmp_pat
     assert (tmp_path / "left.record.json").read_bytes() == old
 
 
-def test_a_record_elsewhere_is_named_and_one_of_another_calibration_left_alone(
+def test_another_record_can_be_named_and_that_of_another_calibration_is_unchanged(
     log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = file_of(tmp_path / "c1.toml", boresight(0.0))
@@ -250,7 +250,7 @@ def test_a_record_elsewhere_is_named_and_one_of_another_calibration_left_alone(
         ),
     ],
 )
-def test_a_record_that_cannot_be_told_is_one_line(
+def test_an_unusable_record_is_reported_in_one_line(
     log: Path, tmp_path: Path, what: str, said: str, code: ExitCode
 ) -> None:
     file = file_of(tmp_path / "c1.toml", boresight(0.0))
@@ -269,7 +269,7 @@ def test_a_record_that_cannot_be_told_is_one_line(
 
 
 def control_of(made: Cast, path: Path, lower_m: float = 0.0) -> int:
-    """Points on the true surface, or below it; how many."""
+    """Write a file of so many points on, or below, the true surface."""
     from swath.georef.geodesy.earth import geodetic_from_e
 
     places = made.true_t[0][20_000:180_000:8_000]
@@ -281,7 +281,7 @@ def control_of(made: Cast, path: Path, lower_m: float = 0.0) -> int:
     return len(places)
 
 
-def test_control_above_the_geoid_is_refused(log: Path, made: Cast, tmp_path: Path) -> None:
+def test_control_heights_above_the_geoid_are_refused(log: Path, made: Cast, tmp_path: Path) -> None:
     control = tmp_path / "control.csv"
     control_of(made, control, 48.0)
     with pytest.raises(UserError, match=r"control.csv: control lies 48\.0 m below the laser's ground everywhere"):
@@ -301,10 +301,10 @@ def test_check_points_are_counted_in_the_record(log: Path, made: Cast, tmp_path:
     assert 5 < told["CA_TestRange.numberCheckPoints"]["value"] == testfield["points"] <= given
 
 
-def test_control_of_which_too_little_is_seen_is_a_problem(
+def test_too_few_control_points_within_the_swath_are_a_problem(
     log: Path, made: Cast, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Of another site but for two points: what was asked for could not be done, and the verdict says so."""
+    """All but two points belong to another site, so the requested check is impossible and the verdict reports it."""
     control = tmp_path / "control.csv"
     control_of(made, control)
     header, *lines = control.read_text().splitlines()
@@ -320,7 +320,7 @@ def test_control_of_which_too_little_is_seen_is_a_problem(
     assert record["undone"][0].startswith("control: strips see control")
 
 
-def test_parameters_that_cannot_be_measured_anew_are_a_problem(
+def test_parameters_that_cannot_be_remeasured_are_a_problem(
     log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(validate_run, "adjust", lambda *rest, **more: SimpleNamespace(converged=False))
@@ -330,7 +330,7 @@ def test_parameters_that_cannot_be_measured_anew_are_a_problem(
     assert caught.value.exit_code == ExitCode.PROBLEM
 
 
-def test_a_history_that_says_nothing_is_a_problem_beside_logs_that_agree(log: Path, tmp_path: Path) -> None:
+def test_an_untestable_history_is_a_problem_even_if_logs_agree(log: Path, tmp_path: Path) -> None:
     good, other = file_of(tmp_path / "good.toml", boresight(0.0)), tmp_path / "other.toml"
     file_of(other, boresight(0.0), 2, place="elsewhere")
     with pytest.raises(
@@ -340,9 +340,7 @@ def test_a_history_that_says_nothing_is_a_problem_beside_logs_that_agree(log: Pa
     assert caught.value.exit_code == ExitCode.PROBLEM
 
 
-def test_the_verdict_says_what_would_not_have_been_seen(
-    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_verdict_names_undetectable_errors(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run(str(file_of(tmp_path / "good.toml", boresight(0.0))), str(log), "--json")
     record = json.loads(capsys.readouterr().out)["validation"]
     smallest = {one["parameter"]: one["smallest_error"] for one in record["smallest_errors"]}
@@ -350,7 +348,7 @@ def test_the_verdict_says_what_would_not_have_been_seen(
     assert "; errors below omega " in record["sentence"]
 
 
-def test_a_scanner_that_the_log_has_not_is_named(log: Path, tmp_path: Path) -> None:
+def test_a_scanner_missing_from_the_log_is_named(log: Path, tmp_path: Path) -> None:
     with pytest.raises(UserError, match="has no scanner right, to which calibration right belongs"):
         run(str(file_of(tmp_path / "right.toml", boresight(0.0, "right"))), str(log))
 
@@ -364,7 +362,7 @@ def test_a_scanner_that_the_log_has_not_is_named(log: Path, tmp_path: Path) -> N
         ("twice", "a calibration of this scanner was already given", ExitCode.USAGE),
     ],
 )
-def test_wrong_use_is_one_line(what: str, said: str, code: ExitCode, tmp_path: Path) -> None:
+def test_wrong_usage_is_refused_in_one_line(what: str, said: str, code: ExitCode, tmp_path: Path) -> None:
     good = str(file_of(tmp_path / "good.toml", boresight(0.0)))
     (tmp_path / "config.toml").write_text("[session]\nname = 'x'\n")
     arguments = {

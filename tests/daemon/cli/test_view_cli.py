@@ -89,7 +89,7 @@ def page(products: Path) -> Page:
     return Page((products / "view" / "index.html").read_text(encoding="utf-8"))
 
 
-def test_pictures_stand_beside_the_page_and_in_it(products: Path, page: Page) -> None:
+def test_pictures_are_written_beside_the_page_and_embedded(products: Path, page: Page) -> None:
     assert len(page.sources) == len(PICTURES)
     for name, source in zip(PICTURES, page.sources, strict=True):
         kind, data = source.split(",", 1)
@@ -109,7 +109,7 @@ def test_the_page_needs_no_network_and_is_well_formed(products: Path, page: Page
     assert "prefers-color-scheme: dark" in text
 
 
-def test_tables_say_what_was_put_in(page: Page) -> None:
+def test_tables_match_the_input(page: Page) -> None:
     rows = {row[0]: row for row in page.rows}
     assert rows["1 − 2"][2:7] == ["−7.0", "−7.0", "7.0", "7.0", "7.0"]
     assert rows["1"][1] == rows["1"][2] == "24\u202f000"
@@ -122,7 +122,7 @@ def test_tables_say_what_was_put_in(page: Page) -> None:
     assert "ETRS89 / UTM zone 32N (EPSG:25832)" in page.words
 
 
-def test_the_sidecar_speaks_on_the_page_and_its_markup_is_only_text(page: Page) -> None:
+def test_the_page_shows_the_sidecar_with_escaped_markup(page: Page) -> None:
     rows = {row[0]: row[1] for row in page.rows if len(row) == 2}
     assert rows["calibration"] == "left: cal-2026"
     assert rows["atmosphere"] == "ranges vacuum"
@@ -131,7 +131,7 @@ def test_the_sidecar_speaks_on_the_page_and_its_markup_is_only_text(page: Page) 
     assert "part 2 of the session is missing" in page.words
 
 
-def test_the_command_says_in_a_line_where_the_page_is(products: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_prints_the_path_of_the_page(products: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = products / "elsewhere"
     assert run_app(["view", str(products / "s1.laz"), "-o", str(folder)]) == 0
     assert capsys.readouterr().out == f"1 strip, 24,000 points: {folder / 'index.html'}\n"
@@ -160,7 +160,7 @@ def test_json_has_the_numbers(products: Path, tmp_path: Path, capsys: pytest.Cap
         (b"", ["--profile", "1,2,3"], 2, "--profile: got 1,2,3, want x1,y1,x2,y2"),
     ],
 )
-def test_what_is_wrong_is_one_line(
+def test_wrong_input_is_refused_in_one_line(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     content: bytes | None,
@@ -191,7 +191,7 @@ def test_files_without_points_and_folders_without_files_are_refused(
     assert "no points" in capsys.readouterr().err
 
 
-def test_a_cut_file_is_shown_in_part_and_ends_with_the_code_for_damage(
+def test_a_truncated_file_is_shown_in_part_and_exits_with_the_damage_code(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     x, y = lattice(EAST_M, NORTH_M, 100.0, 100.0, 0.5)
@@ -202,6 +202,6 @@ def test_a_cut_file_is_shown_in_part_and_ends_with_the_code_for_damage(
     assert "partial" in (tmp_path / "view" / "index.html").read_text(encoding="utf-8")
 
 
-def test_one_point_is_no_trouble(tmp_path: Path) -> None:
+def test_a_single_point_is_shown(tmp_path: Path) -> None:
     write(tmp_path / "one.las", np.array([EAST_M]), np.array([NORTH_M]), np.array([400.0]))
     assert run_app(["view", str(tmp_path)]) == 0

@@ -31,7 +31,7 @@ BAD = sorted((FIXTURES / "bad").glob("*.toml"))
 
 
 def expected_lines(path: Path) -> list[str]:
-    """What a bad file says of itself that must be said of it."""
+    """Return the lines that a bad file expects, from its comments."""
     words = {
         "here": str(path.parent),
         "gnss": ", ".join(sorted(all_drivers("gnss"))),
@@ -53,7 +53,7 @@ def with_session(text: str) -> str:
 
 
 class TestWholeFile:
-    def test_an_empty_gimbal_is_a_rigid_mount_and_a_byte_order_mark_no_part_of_the_text(self, tmp_path: Path) -> None:
+    def test_an_empty_gimbal_is_a_rigid_mount_and_a_byte_order_mark_is_ignored(self, tmp_path: Path) -> None:
         text = with_session(
             '[scanner.left]\ntransport = "udp:0.0.0.0:2368"\nprotocol = "srep"\nmirror_factor = 1.0\n'
             "[scanner.left.gimbal]\n"
@@ -73,7 +73,7 @@ class TestWholeFile:
         assert config.output.epoch == 2026.9
         assert config.text == AIRCRAFT.read_text()
 
-    def test_the_example_names_every_key_there_is(self) -> None:
+    def test_the_example_names_every_key(self) -> None:
         table = tomllib.loads(AIRCRAFT.read_text())
         assert set(_absent_keys(Tables, table, "")) == {  # each excludes something that stands there
             "gnss.*.setup.port",
@@ -107,12 +107,12 @@ class TestWholeFile:
         config = parse_config(with_session('directory = "logs"'), tmp_path / "a.toml")
         assert config.session.directory == str(tmp_path / "logs")
 
-    def test_whole_numbers_stand_for_numbers_but_text_does_not(self, tmp_path: Path) -> None:
+    def test_integers_are_accepted_as_numbers_and_text_is_not(self, tmp_path: Path) -> None:
         assert parse_config(with_session("fsync_s = 2"), tmp_path / "a.toml").session.fsync_s == 2.0
         with pytest.raises(ConfigError, match='fsync_s: got "2", want a number'):
             parse_config(with_session('fsync_s = "2"'), tmp_path / "a.toml")
 
-    def test_loading_stays_light(self) -> None:
+    def test_loading_a_configuration_imports_no_heavy_module(self) -> None:
         """No DBC configured: no cantools; and never what georeferencing needs."""
         code = (
             "import sys; from pathlib import Path; from swath.daemon.config import parse_config; "
@@ -126,7 +126,7 @@ class TestWholeFile:
 
 class TestBadFiles:
     @pytest.mark.parametrize("path", BAD, ids=[path.stem for path in BAD])
-    def test_each_finding_is_its_one_line(self, path: Path) -> None:
+    def test_each_finding_is_one_line(self, path: Path) -> None:
         expected = expected_lines(path)
         assert expected, f"{path} says nothing of what to expect"
         with pytest.raises(ConfigError) as caught:
@@ -135,27 +135,27 @@ class TestBadFiles:
         assert caught.value.exit_code is ExitCode.USAGE
         assert all("\n" not in line for line in caught.value.lines)
 
-    def test_a_key_of_a_table_below_is_pointed_to(self, tmp_path: Path) -> None:
+    def test_error_for_a_nested_key_gives_its_path(self, tmp_path: Path) -> None:
         text = with_session('[imu.main]\ntransport = "can:can0"\nprotocol = "dbc"\ndbc = "a.dbc"\ngrade = "mems"\n')
         with pytest.raises(ConfigError, match=r"imu\.main\.grade: unknown key; did you mean noise\.grade\?"):
             parse_config(text, tmp_path / "a.toml")
 
-    def test_no_such_file(self, tmp_path: Path) -> None:
+    def test_a_missing_file_is_refused(self, tmp_path: Path) -> None:
         with pytest.raises(UserError, match=r"nowhere\.toml: No such file or directory") as caught:
             load_config(tmp_path / "nowhere.toml")
         assert caught.value.exit_code is ExitCode.USAGE
 
-    def test_a_directory(self, tmp_path: Path) -> None:
+    def test_a_directory_is_refused(self, tmp_path: Path) -> None:
         with pytest.raises(UserError, match="Is a directory"):
             load_config(tmp_path)
 
-    def test_not_text(self, tmp_path: Path) -> None:
+    def test_a_file_that_is_not_utf_8_is_refused(self, tmp_path: Path) -> None:
         path = tmp_path / "a.toml"
         path.write_bytes(b"[session]\nname = \xff\xfe\n")
         with pytest.raises(ConfigError, match="line 2: not UTF-8"):
             load_config(path)
 
-    def test_a_log_given_by_mistake_is_not_read_whole(self, tmp_path: Path) -> None:
+    def test_a_log_given_by_mistake_is_not_read_completely(self, tmp_path: Path) -> None:
         path = tmp_path / "a.mcap"
         with path.open("wb") as stream:
             stream.truncate(MAX_CONFIG_BYTES * 1000)
@@ -204,12 +204,12 @@ class TestBadFiles:
         ("serial:/dev/null", "can:socketcan:can0", False),
     ],
 )
-def test_which_wires_are_one(one: str, other: str, same: bool) -> None:
+def test_addresses_of_the_same_wire_are_recognised(one: str, other: str, same: bool) -> None:
     assert same_wire(parse_transport(one), parse_transport(other)) is same
     assert same_wire(parse_transport(other), parse_transport(one)) is same
 
 
-def test_rotations_of_seven_digits_pass_and_others_do_not() -> None:
+def test_rotations_of_seven_digits_are_accepted_and_less_precise_ones_refused() -> None:
     assert rotation_problem([[0.7071068, -0.7071068, 0], [0.7071068, 0.7071068, 0], [0, 0, 1]]) is None
     assert rotation_problem([[0, 1, 0], [0, 0, 1], [1, 0, 0]]) is None
     assert "length" in str(rotation_problem([[0.70711, -0.70711, 0], [0.70711, 0.70711, 0], [0, 0, 1]]))
@@ -231,12 +231,12 @@ TOML_VALUES = st.recursive(
 )
 
 
-class TestAnything:
-    """Whatever stands in a file, it is valid or said in lines."""
+class TestArbitraryInput:
+    """Any content is valid or reported in single lines."""
 
     @settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.too_slow])
     @given(data=st.data())
-    def test_any_value_anywhere_is_valid_or_one_line_each(self, data: st.DataObject) -> None:
+    def test_any_value_is_valid_or_reported_in_one_line(self, data: st.DataObject) -> None:
         table = tomllib.loads(AIRCRAFT.read_text())
         for _ in range(data.draw(st.integers(1, 3))):
             place: dict[str, Any] = table
@@ -249,7 +249,7 @@ class TestAnything:
         lines = _findings(table)
         assert all(line.startswith(f"{AIRCRAFT}: ") and len(line.splitlines()) == 1 for line in lines)
 
-    def test_a_bottomless_file_is_refused(self, tmp_path: Path) -> None:
+    def test_an_endlessly_nested_file_is_refused(self, tmp_path: Path) -> None:
         with pytest.raises(ConfigError, match=r"a\.toml: not"):
             parse_config("a = " + "[" * 100_000, tmp_path / "a.toml")
 
@@ -259,7 +259,7 @@ class TestDevices:
     def config(self) -> Config:
         return load_config(AIRCRAFT)
 
-    def test_devices_carry_all_a_recorder_needs(self, config: Config) -> None:
+    def test_devices_have_all_settings_of_a_recorder(self, config: Config) -> None:
         devices = {device.source: device for device in config.devices()}
         assert list(devices) == ["gnss/rover", "imu/main", "scanner/left", "corrections/base"]
         imu, scanner = devices["imu/main"], devices["scanner/left"]
@@ -281,7 +281,7 @@ class TestDevices:
         devices = list(parse_config(text, tmp_path / "a.toml").devices())
         assert devices[1].transport.kind == "gnss"
 
-    def test_attachments_are_named_as_the_log_format_says(self, config: Config) -> None:
+    def test_attachments_are_named_as_in_the_log_format(self, config: Config) -> None:
         attachments = {name: data for name, _, data in config.attachments()}
         assert attachments == {
             "config.toml": AIRCRAFT.read_bytes(),
@@ -299,7 +299,7 @@ class TestDevices:
         assert ("geometry/left.json", "application/json", b"{}") in config.attachments()
         assert next(config.devices()).settings.files == {"geometry": b"{}"}
 
-    def test_a_parser_can_be_made_of_what_a_log_keeps(self, tmp_path: Path) -> None:
+    def test_a_parser_can_be_made_from_the_attachments_of_a_log(self, tmp_path: Path) -> None:
         """An Ouster head's metadata goes into every log."""
         metadata = (ROOT / "fixtures/ouster/crc_test.json").read_bytes()
         (tmp_path / "os0.json").write_bytes(metadata)
@@ -326,7 +326,7 @@ class TestPage:
     def test_every_key_stands_in_its_section_and_no_other(self) -> None:
         assert _page_keys(self.PAGE) == _model_keys()
 
-    def test_bounds_and_meanings_are_the_models(self) -> None:
+    def test_bounds_and_meanings_match_the_models(self) -> None:
         for section, model in _sections(Tables, "").items():
             for key, field in model.model_fields.items():
                 if _model_in(field.annotation) is not None and field.description is None:

@@ -46,7 +46,7 @@ def nmea(body: str) -> bytes:
 
 
 def epoch(second: int, valid: bool = True) -> bytes:
-    """What a receiver says once a second."""
+    """Return the messages of a receiver for one second."""
     status = "A" if valid else "V"
     clock = f"1015{second % 60:02}.00"
     return nmea(f"GPRMC,{clock},{status},4730.0000,N,00900.0000,E,0.0,0.0,211126,,,A") + nmea(
@@ -84,7 +84,7 @@ def pps_fifo(path: Path, spacing_ns: int = 1_000_000_000) -> Iterator[str]:
 
 
 def check(text: str, folder: Path, seconds: float = LISTEN_S) -> dict[str, Report]:
-    """Reports of a configuration, by source."""
+    """Return reports of a configuration by source."""
     config = parse_config(f'[session]\nname = "x"\ndirectory = "."\nreserve_mb = 1\n{text}', folder / "swath.toml")
     return {report.source: report for report in check_everything(config, seconds)}
 
@@ -98,8 +98,8 @@ def srep(port: int, more: str = "") -> str:
     return f'[scanner.left]\ntransport = "{transport}"\nprotocol = "srep"\nmirror_factor = 2\n{more}\n'
 
 
-class TestAllWell:
-    def test_every_device_answers_and_says_its_time(self, tmp_path: Path) -> None:
+class TestWorkingDevices:
+    def test_every_device_responds_and_gives_its_time(self, tmp_path: Path) -> None:
         port = free_udp_port()
         with pty(epoch) as path, pps_fifo(tmp_path / "edges") as edges, udp_sender(port, srep_datagram):
             pps = f'[pps.main]\nsource = "{edges}"\n'
@@ -140,7 +140,7 @@ class TestAllWell:
             (PPS_ABSENT, "A", "it reports that it is not locked to a pulse; wire the receiver's PPS to it"),
         ],
     )
-    def test_a_head_without_fix_or_pulse_is_said(self, tmp_path: Path, pps: int, status: str, said: str) -> None:
+    def test_a_head_without_fix_or_pulse_is_reported(self, tmp_path: Path, pps: int, status: str, said: str) -> None:
         data, position = free_udp_port(), free_udp_port()
         recorded = list(read_pcap(ROOT / "fixtures/velodyne/mrpt_vlp16_gps.pcap.gz"))
         packets = [unit.data for unit in recorded if len(unit.data) == 1206]
@@ -157,7 +157,7 @@ class TestAllWell:
             (note,) = check(text, tmp_path, 0.5)["scanner/roof"].notes
         assert note == said
 
-    def test_it_is_said_where_nothing_tells_whether_a_head_is_locked(self, tmp_path: Path) -> None:
+    def test_a_head_whose_lock_cannot_be_known_is_reported(self, tmp_path: Path) -> None:
         """The same head with its data port alone: auxiliary is named; a configured clock is named instead."""
         data = free_udp_port()
         recorded = list(read_pcap(ROOT / "fixtures/velodyne/mrpt_vlp16_gps.pcap.gz"))
@@ -195,7 +195,7 @@ class TestAllWell:
         assert reports["scanner/roof"].time == ""  # its packets do not say whether pulses come
         assert reports["scanner/roof"].records["ImuSamples"] == reports["scanner/roof/aux"].units > 0
 
-    def test_an_imu_inside_a_gnss_stream_reads_along(self, tmp_path: Path) -> None:
+    def test_an_imu_inside_a_gnss_stream_is_checked_on_the_same_wire(self, tmp_path: Path) -> None:
         """A NovAtel SPAN recording: one wire, two devices."""
         data = (ROOT / "fixtures/novatel/ins1.gps").read_bytes()
         imu = '[imu.main]\ntransport = "gnss:rover"\nprotocol = "novatel"\n'
@@ -206,7 +206,7 @@ class TestAllWell:
         assert reports["imu/main"].bytes == reports["gnss/rover"].bytes > 0
         assert reports["imu/main"].problems == []
 
-    def test_an_imu_on_a_serial_line(self, tmp_path: Path) -> None:
+    def test_an_imu_on_a_serial_line_is_checked(self, tmp_path: Path) -> None:
         data = gzip.decompress((ROOT / "fixtures/xsens/1_output.bin.gz").read_bytes())
         with pty(lambda number: data[number * 2000 % len(data) :][:2000]) as path:
             report = check(f'[imu.main]\ntransport = "serial:{path}"\nprotocol = "xsens-xbus"\n', tmp_path)["imu/main"]
@@ -223,30 +223,30 @@ class TestAllWell:
         assert reports["scanner/left/aux"].problems == []
 
 
-class TestAbsent:
-    def test_a_device_that_is_not_there(self, tmp_path: Path) -> None:
+class TestAbsentDevices:
+    def test_a_missing_device_is_reported(self, tmp_path: Path) -> None:
         report = check(gnss(str(tmp_path / "ttyNone")), tmp_path, 0.3)["gnss/rover"]
         assert not report.opens
         [problem] = report.problems
         assert "ttyNone" in problem
 
-    def test_a_pps_that_is_not_there(self, tmp_path: Path) -> None:
+    def test_a_missing_pps_is_reported(self, tmp_path: Path) -> None:
         report = check(f'[pps.main]\nsource = "{tmp_path}/pps9"\n', tmp_path, 0.3)["pps/main"]
         assert not report.opens
         assert "pps9" in report.problems[0]
 
-    def test_a_silent_device(self, tmp_path: Path) -> None:
+    def test_a_silent_device_is_reported(self, tmp_path: Path) -> None:
         with pty() as path:
             report = check(gnss(path), tmp_path, 0.3)["gnss/rover"]
         assert report.opens
         assert report.problems == ["opened, but sent nothing in 0.3 s; check its power, wiring and output port"]
 
-    def test_a_pps_without_edges(self, tmp_path: Path) -> None:
+    def test_a_pps_without_edges_is_reported(self, tmp_path: Path) -> None:
         os.mkfifo(tmp_path / "edges")
         report = check(f'[pps.main]\nsource = "fixed:{tmp_path}/edges"\n', tmp_path, 0.3)["pps/main"]
         assert report.problems[0].startswith("no assert edge in 0.3 s")
 
-    def test_a_port_that_another_program_has(self, tmp_path: Path) -> None:
+    def test_a_port_held_by_another_program_is_reported(self, tmp_path: Path) -> None:
         with socket(AF_INET, SOCK_DGRAM) as holder:
             holder.bind(("127.0.0.1", 0))
             port = holder.getsockname()[1]
@@ -255,7 +255,7 @@ class TestAbsent:
         assert f"port {port} is in use" in report.problems[0]
 
 
-class TestSomethingElse:
+class TestOtherProtocols:
     def test_a_receiver_of_another_protocol_is_named(self, tmp_path: Path) -> None:
         with pty(epoch) as path:
             report = check(gnss(path, "novatel"), tmp_path)["gnss/rover"]
@@ -300,7 +300,7 @@ class TestSomethingElse:
             report = check(srep(port), tmp_path, 0.5)["scanner/left"]
         assert report.problems == ["sends velodyne-vlp16, but srep is configured"]
 
-    def test_a_head_that_needs_its_metadata_is_named_by_the_form_of_its_packets(self, tmp_path: Path) -> None:
+    def test_a_head_that_needs_metadata_is_recognised_by_its_packet_format(self, tmp_path: Path) -> None:
         port = free_udp_port()
         recorded = [unit.data for unit in read_pcap(ROOT / "fixtures/ouster/crc_test.pcap.gz", port=7502)]
         with udp_sender(port, lambda number: recorded[number % len(recorded)]):
@@ -332,7 +332,7 @@ class TestSomethingElse:
             ("hesai/nebula_qt64.pcap.gz", "hesai-qt64"),
         ],
     )
-    def test_a_head_of_another_model_is_named_though_its_second_port_is_alike(
+    def test_a_head_of_another_model_is_named_despite_an_identical_second_port(
         self, recording: str, answers_as: str, tmp_path: Path
     ) -> None:
         """Velodyne's position packets are the same for all models: here they come while the data is another's."""
@@ -351,7 +351,7 @@ class TestSomethingElse:
             report = check(text, tmp_path, 0.5)["scanner/roof"]
         assert report.problems == [f"sends {answers_as}, but velodyne-vlp16 is configured"]
 
-    def test_garbage_is_no_protocol_and_asks_for_the_baud_rate(self, tmp_path: Path) -> None:
+    def test_garbage_matches_no_protocol_and_suggests_the_baud_rate(self, tmp_path: Path) -> None:
         noise = np.random.default_rng(7).integers(128, 255, 4000, dtype=np.uint8).tobytes()
         with pty(lambda _: noise) as path:
             report = check(gnss(path), tmp_path, 0.5)["gnss/rover"]
@@ -385,7 +385,7 @@ class TestCan:
             with repeating(send):
                 yield port
 
-    def test_answers(self, port: int, tmp_path: Path) -> None:
+    def test_a_real_recording_on_a_bus_is_checked(self, port: int, tmp_path: Path) -> None:
         text = f'[imu.main]\ntransport = "can:udp_multicast:{GROUP}?port={port}"\nprotocol = "canmod-gps"\n'
         report = check(text, tmp_path)["imu/main"]
         assert report.problems == []
@@ -393,7 +393,7 @@ class TestCan:
         assert report.bytes == 16 * report.units
 
     @pytest.mark.parametrize(("tick_hz", "rate"), [(1_000_000, None), (10_000, 100.0), (100_000_000, 0.01)])
-    def test_a_counter_read_in_the_wrong_unit_is_said(self, tick_hz: int, rate: float | None, tmp_path: Path) -> None:
+    def test_a_counter_in_the_wrong_unit_is_reported(self, tick_hz: int, rate: float | None, tmp_path: Path) -> None:
         """An MTi whose SampleTime is in microseconds; the maker's documents say two units."""
         port = free_udp_port()
         with can.Bus(interface="udp_multicast", channel=GROUP, port=port, ignore_config=True) as bus:
@@ -416,7 +416,7 @@ class TestCan:
             assert said
             assert float(said[1]) == pytest.approx(rate, rel=0.1)
 
-    def test_answers_as_something_else(self, port: int, tmp_path: Path) -> None:
+    def test_a_device_of_another_protocol_is_named(self, port: int, tmp_path: Path) -> None:
         (tmp_path / "imu.dbc").write_bytes((ROOT / "fixtures/config/imu.dbc").read_bytes())
         text = (
             f'[imu.main]\ntransport = "can:udp_multicast:{GROUP}?port={port}"\nprotocol = "dbc"\ndbc = "imu.dbc"\n'
@@ -428,14 +428,14 @@ class TestCan:
 
 
 class TestTime:
-    def test_a_receiver_without_valid_time(self, tmp_path: Path) -> None:
+    def test_a_receiver_without_valid_time_is_reported(self, tmp_path: Path) -> None:
         with pty(lambda number: epoch(number, valid=False)) as path:
             report = check(gnss(path), tmp_path)["gnss/rover"]
         assert report.problems == ["its time is not valid yet"]
         assert report.time == "not valid"
 
-    def test_a_receiver_that_says_local_time_is_told_and_not_refused(self, tmp_path: Path) -> None:
-        """Two hours east of UTC, beside a clock that nobody keeps but that is set."""
+    def test_a_receiver_in_local_time_is_reported_and_not_refused(self, tmp_path: Path) -> None:
+        """The receiver is two hours east of UTC, beside a clock that is set and not synchronised."""
 
         def local(_: int) -> bytes:
             now = dt.datetime.now(dt.UTC) + dt.timedelta(hours=2)
@@ -447,14 +447,14 @@ class TestTime:
         (note,) = report.notes
         assert note.startswith("its time is 2 h ahead of this computer's clock")
 
-    def test_a_scanner_that_sees_no_pps(self, tmp_path: Path) -> None:
+    def test_a_scanner_that_does_not_see_its_pps_is_reported(self, tmp_path: Path) -> None:
         port = free_udp_port()
         pps = '[pps.main]\nsource = "/dev/pps0"\n'
         with udp_sender(port, lambda number: srep_datagram(number, pps_count=0)):
             report = check(pps + srep(port, 'pps = "main"'), tmp_path, 0.5)["scanner/left"]
         assert report.problems == ["does not see its PPS (main)"]
 
-    def test_edges_of_another_pulse(self, tmp_path: Path) -> None:
+    def test_edges_of_another_pulse_are_reported(self, tmp_path: Path) -> None:
         with pps_fifo(tmp_path / "edges", spacing_ns=200_000_000) as edges:
             report = check(f'[pps.main]\nsource = "{edges}"\n', tmp_path)["pps/main"]
         assert report.problems == ["edges are 0.2000 s apart, want 1 s; check for noise or another signal"]
@@ -467,17 +467,17 @@ class TestTime:
             (TimeTag(TimeScale.UTC, 86_400_000_000_000), "24:00:00 UTC"),
         ],
     )
-    def test_a_time_is_said_as_far_as_it_is_known(self, tag: TimeTag, text: str) -> None:
+    def test_a_time_tag_is_described_as_far_as_it_is_known(self, tag: TimeTag, text: str) -> None:
         assert describe_tag(tag) == text
 
 
 class TestComputer:
-    def test_a_directory_that_is_full(self, tmp_path: Path) -> None:
+    def test_a_full_directory_is_reported(self, tmp_path: Path) -> None:
         config = parse_config('[session]\nname = "x"\ndirectory = "."\nreserve_mb = 10000000\n', tmp_path / "a.toml")
         [report] = check_everything(config, 0.1)
         assert "MB free, reserve_mb is 1e+07" in report.problems[0]
 
-    def test_a_can_interface_of_another_bitrate_is_named_with_the_command_that_mends_it(self) -> None:
+    def test_a_can_interface_of_another_bit_rate_is_reported_with_the_command(self) -> None:
         spec = parse_transport("can:socketcan:can0?bitrate=1000000")
         command = "ip link set can0 down && ip link set can0 up type can bitrate 1000000"
         assert bitrate_problems(spec, 250_000) == [
@@ -486,7 +486,7 @@ class TestComputer:
         assert bitrate_problems(spec, 1_000_000) == []
         assert bitrate_problems(spec, None) == []
 
-    def test_a_receive_buffer_that_is_not_granted(self, tmp_path: Path) -> None:
+    def test_a_receive_buffer_that_is_not_granted_is_reported(self, tmp_path: Path) -> None:
         """In a process without the right to force it, as the service is."""
         config = tmp_path / "swath.toml"
         port = free_udp_port()
@@ -504,7 +504,7 @@ class TestComputer:
         )
         assert problem.startswith(want)
 
-    def test_the_table_has_a_line_a_device_and_a_line_a_problem(self, tmp_path: Path) -> None:
+    def test_the_table_has_a_line_for_each_device_and_each_problem(self, tmp_path: Path) -> None:
         config = tmp_path / "swath.toml"
         port = free_udp_port()
         config.write_text(

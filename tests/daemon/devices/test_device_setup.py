@@ -48,7 +48,7 @@ def apply(
     present_baud: int | None = None,
     timeout_s: float = TIMEOUT_S,
 ) -> dict[str, DeviceSetup]:
-    """Plan and send; the devices by source."""
+    """Plan and send the messages; return the devices by source."""
     config = parse_config(session_table(folder) + text, folder / "swath.toml")
     wires = plan_setup(config, only, save=save, present_baud=present_baud)
     for wire in wires:
@@ -67,7 +67,7 @@ def outcome_of(device: DeviceSetup, part: str) -> tuple[str, str]:
 
 
 class TestUbx:
-    def test_all_is_accepted_amid_ordinary_data(self, tmp_path: Path) -> None:
+    def test_all_messages_are_accepted_amid_ordinary_data(self, tmp_path: Path) -> None:
         with receiver(split_ubx, ubx_acknowledges(), UBX_DATA) as device:
             found = apply(gnss(device.path, "ubx"), tmp_path)["gnss/rover"]
         assert set(outcomes(found)) == {Outcome.ACCEPTED}
@@ -77,7 +77,7 @@ class TestUbx:
         wanted = "NAV_PVT NAV_HPPOSLLH NAV_COV NAV_TIMEGPS NAV_TIMELS TIM_TP TIM_TM2 RXM_RAWX RXM_SFRBX"
         assert {f"CFG_MSGOUT_UBX_{name}_UART1" for name in wanted.split()} <= set_keys
 
-    def test_a_refusal_hinders_nothing_else(self, tmp_path: Path) -> None:
+    def test_a_refusal_does_not_stop_the_other_messages(self, tmp_path: Path) -> None:
         with receiver(split_ubx, ubx_acknowledges(refuses="TIM_TM2"), UBX_DATA) as device:
             found = apply(gnss(device.path, "ubx"), tmp_path)["gnss/rover"]
         assert outcome_of(found, "TIM_TM2") == (Outcome.REFUSED, "UBX-ACK-NAK")
@@ -86,7 +86,7 @@ class TestUbx:
 
     @pytest.mark.slow
     @pytest.mark.parametrize("chatter", [b"", UBX_DATA])
-    def test_without_an_answer_nothing_more_is_sent(self, tmp_path: Path, chatter: bytes) -> None:
+    def test_without_a_response_no_more_messages_are_sent(self, tmp_path: Path, chatter: bytes) -> None:
         with receiver(split_ubx, ubx_acknowledges(silent="RATE_MEAS"), chatter) as device:
             found = apply(gnss(device.path, "ubx"), tmp_path, timeout_s=SILENT_S)["gnss/rover"]
         assert outcome_of(found, "CFG-RATE-MEAS")[0] == Outcome.NO_ANSWER
@@ -94,7 +94,7 @@ class TestUbx:
         assert len(device.commands) == 2
 
     @pytest.mark.slow
-    def test_an_answer_said_twice_is_not_that_of_the_next_message(self, tmp_path: Path) -> None:
+    def test_a_repeated_response_is_not_taken_for_the_next_message(self, tmp_path: Path) -> None:
         acknowledge = ubx_acknowledges(silent="RATE_MEAS")
         with receiver(split_ubx, lambda command: 2 * acknowledge(command)) as device:
             found = apply(gnss(device.path, "ubx"), tmp_path, timeout_s=SILENT_S)["gnss/rover"]
@@ -119,14 +119,14 @@ class TestUbx:
         assert outcome_of(found, "CFG-UART1-BAUDRATE = 460800")[0] == Outcome.ACCEPTED
 
     @pytest.mark.slow
-    def test_a_device_that_has_the_configured_rate_already(self, tmp_path: Path) -> None:
+    def test_a_device_already_at_the_configured_rate_is_accepted(self, tmp_path: Path) -> None:
         with receiver(split_ubx, ubx_acknowledges(), UBX_DATA, termios.B460800) as device:
             text = gnss(device.path, "ubx", "?baud=460800")
             found = apply(text, tmp_path, present_baud=38400, timeout_s=SILENT_S)["gnss/rover"]
         assert set(outcomes(found)) == {Outcome.ACCEPTED}
 
     @pytest.mark.slow
-    def test_a_device_at_another_rate_gives_no_answer(self, tmp_path: Path) -> None:
+    def test_a_device_at_another_rate_gives_no_response(self, tmp_path: Path) -> None:
         with receiver(split_ubx, ubx_acknowledges(), UBX_DATA, termios.B9600) as device:
             found = apply(gnss(device.path, "ubx", "?baud=460800"), tmp_path, timeout_s=SILENT_S)["gnss/rover"]
         assert outcomes(found)[0] == Outcome.NO_ANSWER
@@ -134,9 +134,7 @@ class TestUbx:
 
 
 class TestNovatel:
-    def test_the_imu_inside_the_stream_is_asked_by_the_receivers_wire_and_saving_comes_last(
-        self, tmp_path: Path
-    ) -> None:
+    def test_the_imu_inside_the_stream_uses_the_receivers_wire_and_saving_comes_last(self, tmp_path: Path) -> None:
         imu = '[imu.main]\ntransport = "gnss:rover"\nprotocol = "novatel"\n'
         with receiver(split_lines, novatel_replies(), NOVATEL_DATA) as device:
             found = apply(gnss(device.path, "novatel") + imu, tmp_path, save=True)
@@ -146,7 +144,7 @@ class TestNovatel:
         assert device.commands.count(b"SAVECONFIG") == 1
         assert device.commands[-1] == b"SAVECONFIG"
 
-    def test_what_was_not_all_accepted_is_not_kept(self, tmp_path: Path) -> None:
+    def test_settings_are_not_saved_unless_all_were_accepted(self, tmp_path: Path) -> None:
         with receiver(split_lines, novatel_replies(refuses=b"MARK2TIME"), NOVATEL_DATA) as device:
             found = apply(gnss(device.path, "novatel"), tmp_path, save=True)["gnss/rover"]
         assert outcome_of(found, "MARK2TIME") == (Outcome.REFUSED, "Invalid Message ID")
@@ -154,7 +152,7 @@ class TestNovatel:
         assert outcomes(found).count(Outcome.ACCEPTED) == len(found.steps) - 2
         assert b"SAVECONFIG" not in device.commands
 
-    def test_by_udp(self, tmp_path: Path) -> None:
+    def test_messages_are_sent_by_udp(self, tmp_path: Path) -> None:
         port = free_udp_port()
         text = f'[gnss.rover]\ntransport = "udp:127.0.0.1:{port}?source=127.0.0.2&buffer_mb=1"\nprotocol = "novatel"\n'
         with udp_receiver(port, novatel_replies()) as commands:
@@ -163,7 +161,7 @@ class TestNovatel:
         assert commands == [step.message.data.strip() for step in found.steps]
 
     @pytest.mark.parametrize("options", ["", "?source=127.0.0.2&group=239.74.163.9"])
-    def test_a_device_without_an_address_of_its_own_cannot_be_sent_to(self, tmp_path: Path, options: str) -> None:
+    def test_a_device_without_an_address_cannot_be_configured(self, tmp_path: Path, options: str) -> None:
         text = f'[gnss.rover]\ntransport = "udp:127.0.0.1:{free_udp_port()}{options}"\nprotocol = "novatel"\n'
         found = apply(text, tmp_path)["gnss/rover"]
         assert found.problem.endswith("add ?source=<its address> and remove group")
@@ -171,7 +169,7 @@ class TestNovatel:
 
 
 class TestSbf:
-    def test_all_is_accepted_and_the_ins_uses_the_receivers_port(self, tmp_path: Path) -> None:
+    def test_all_messages_are_accepted_and_the_ins_uses_the_receivers_port(self, tmp_path: Path) -> None:
         more = (
             '[gnss.rover.setup]\nport = "COM2"\nrate_hz = 10\n[imu.main]\ntransport = "gnss:rover"\nprotocol = "sbf"\n'
         )
@@ -185,7 +183,7 @@ class TestSbf:
         assert b"setSBFOutput, Stream5, COM2, INSNavGeod, msec20" in device.commands
         assert device.commands[-1] == b"exeCopyConfigFile, Current, Boot"
 
-    def test_a_refusal_says_why(self, tmp_path: Path) -> None:
+    def test_a_refusal_gives_its_reason(self, tmp_path: Path) -> None:
         with receiver(split_lines, septentrio_replies(refuses=b"Stream3"), SBF_DATA) as device:
             found = apply(gnss(device.path, "sbf"), tmp_path)["gnss/rover"]
         assert outcome_of(found, "Stream3") == (Outcome.REFUSED, "setSBFOutput: Argument 'Stream' is invalid!")
@@ -193,7 +191,7 @@ class TestSbf:
 
 
 class TestPlan:
-    def test_a_device_without_start_up_messages_is_said_to_have_none(self, tmp_path: Path) -> None:
+    def test_a_device_without_start_up_messages_is_reported(self, tmp_path: Path) -> None:
         found = apply(gnss("/dev/ttyS99", "nmea"), tmp_path)["gnss/rover"]
         assert (found.steps, found.problem, found.ok) == ([], "", True)
 
@@ -202,18 +200,18 @@ class TestPlan:
         assert "does not exist" in found.problem
         assert set(outcomes(found)) == {Outcome.NOT_SENT}
 
-    def test_one_device_of_several(self, tmp_path: Path) -> None:
+    def test_one_device_of_several_can_be_chosen(self, tmp_path: Path) -> None:
         other = '[gnss.base]\ntransport = "serial:/dev/ttyS98"\nprotocol = "novatel"\n'
         with receiver(split_ubx, ubx_acknowledges()) as device:
             found = apply(gnss(device.path, "ubx") + other, tmp_path, "gnss/rover")
         assert list(found) == ["gnss/rover"]
 
-    def test_a_device_that_there_is_not(self, tmp_path: Path) -> None:
+    def test_an_unknown_device_is_refused(self, tmp_path: Path) -> None:
         with pytest.raises(UserError, match="no device gnss/base; there are: gnss/rover") as error:
             apply(gnss("/dev/ttyS99", "ubx"), tmp_path, "gnss/base")
         assert error.value.exit_code == ExitCode.USAGE
 
-    def test_a_present_rate_is_for_one_device_whose_rate_is_configured(self, tmp_path: Path) -> None:
+    def test_a_present_rate_needs_one_device_with_a_configured_rate(self, tmp_path: Path) -> None:
         with pytest.raises(UserError, match=r"one serial device with \?baud=…; no device has a baud rate"):
             apply(gnss("/dev/ttyS99", "ubx"), tmp_path, present_baud=9600)
         both = gnss("/dev/ttyS99", "ubx", "?baud=460800")
@@ -228,7 +226,7 @@ class TestCommand:
         path.write_text(session_table(folder) + text)
         return str(path)
 
-    def test_shows_what_would_be_sent_and_opens_nothing(self, tmp_path: Path) -> None:
+    def test_setup_shows_the_messages_and_opens_nothing(self, tmp_path: Path) -> None:
         run = swath("setup", self.write(tmp_path, gnss("/dev/ttyS99", "ubx", "?baud=460800")))
         assert run.returncode == ExitCode.OK
         lines = [line.strip() for line in run.stdout.splitlines()]
@@ -239,7 +237,7 @@ class TestCommand:
     def test_the_present_rate_has_the_bound_of_the_configured_one(self) -> None:
         assert setup.MAX_BAUD == uri.MAX_BAUD
 
-    def test_says_of_each_message_what_became_of_it(self, tmp_path: Path) -> None:
+    def test_setup_reports_the_outcome_of_each_message(self, tmp_path: Path) -> None:
         with receiver(split_lines, novatel_replies(refuses=b"RANGEB"), NOVATEL_DATA) as device:
             run = swath("setup", self.write(tmp_path, gnss(device.path, "novatel")), "--apply")
         assert run.returncode == ExitCode.PROBLEM
@@ -247,7 +245,7 @@ class TestCommand:
         assert "  refused    LOG RANGEB ONTIME 1 (Invalid Message ID)\n" in run.stdout
         assert run.stderr == ""
 
-    def test_json(self, tmp_path: Path) -> None:
+    def test_json_lists_the_outcomes(self, tmp_path: Path) -> None:
         with receiver(split_ubx, ubx_acknowledges(), UBX_DATA) as device:
             run = swath("setup", self.write(tmp_path, gnss(device.path, "ubx")), "--apply", "--save", "--json")
         assert run.returncode == ExitCode.OK
@@ -273,7 +271,7 @@ class TestCommand:
         assert line.strip().startswith(f"serial:{device.path}: {device.path} is in use by ")
         assert device.commands == []
 
-    def test_a_wrong_port_is_a_wrong_configuration(self, tmp_path: Path) -> None:
+    def test_a_wrong_port_is_a_configuration_error(self, tmp_path: Path) -> None:
         text = gnss("/dev/ttyS99", "ubx", more='[gnss.rover.setup]\nport = "COM1"\n')
         run = swath("check", "--offline", self.write(tmp_path, text))
         assert run.returncode == ExitCode.USAGE

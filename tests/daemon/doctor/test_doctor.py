@@ -72,7 +72,7 @@ NOW_S = 1_800_000_000.9
 
 @pytest.fixture
 def tree(tmp_path: Path) -> Tree:
-    """A computer without fault."""
+    """Return a computer without fault."""
     if os.geteuid() != 0:
         pytest.fail("this test gives files to other users: run it as root")
     made = Tree(tmp_path / "computer")
@@ -121,7 +121,7 @@ LOADED_LATER = {"can_raw"}
 
 
 def worst(findings: Iterable[Finding]) -> Finding | None:
-    """The first wrong one, else the first note."""
+    """Return the first wrong finding, or else the first note."""
     found = sorted(findings, key=lambda one: list(Verdict).index(one.verdict), reverse=True)
     return found[0] if found and found[0].verdict is not Verdict.OK else None
 
@@ -138,7 +138,7 @@ def test_a_kernel_is_named_as_debian_names_it(
 
 
 @pytest.mark.parametrize("question", [name for name in QUESTIONS if name not in LOADED_LATER])
-def test_nothing_is_wrong_with_a_good_computer(tree: Tree, question: str) -> None:
+def test_a_good_computer_has_no_findings(tree: Tree, question: str) -> None:
     assert worst(QUESTIONS[question](tree)) is None
 
 
@@ -204,7 +204,7 @@ def test_nothing_is_wrong_with_a_good_computer(tree: Tree, question: str) -> Non
         ("network", "/sys/class/net/eth1/operstate", "down", "wrong", "no link", "ip link set eth1 up"),
     ],
 )
-def test_what_is_spoilt_is_found_with_what_mends_it(
+def test_each_fault_is_found_with_its_remedy(
     tree: Tree, question: str, path: str, text: str, verdict: str, said: str, mend: str
 ) -> None:
     write(tree, path, text)
@@ -215,14 +215,14 @@ def test_what_is_spoilt_is_found_with_what_mends_it(
     assert mend in found.mend
 
 
-def test_powersave_of_a_driver_that_follows_the_load_is_no_fault(tree: Tree) -> None:
+def test_powersave_of_a_load_following_driver_is_not_a_fault(tree: Tree) -> None:
     write(tree, f"{CPU}/cpufreq/scaling_governor", "powersave")
     write(tree, f"{CPU}/cpufreq/scaling_driver", "intel_pstate")
     (found,) = host.governor(tree)
     assert found.verdict is Verdict.NOTE
 
 
-def test_a_driver_that_can_be_loaded_is_loaded_by_modprobe(tree: Tree) -> None:
+def test_a_loadable_driver_is_loaded_by_modprobe(tree: Tree) -> None:
     (found,) = QUESTIONS["can_raw"](tree)
     assert (found.verdict, found.text) == (Verdict.WRONG, "can_raw is not loaded")
     assert found.mend.startswith("sudo modprobe can_raw")
@@ -242,7 +242,7 @@ def test_a_driver_that_can_be_loaded_is_loaded_by_modprobe(tree: Tree) -> None:
         (0o066, 990, 20, "wrong"),  # the owner's bits hold for the owner, whatever the others have
     ],
 )
-def test_rights_are_reckoned_as_the_kernel_does(tree: Tree, mode: int, uid: int, gid: int, verdict: str) -> None:
+def test_permissions_are_judged_as_by_the_kernel(tree: Tree, mode: int, uid: int, gid: int, verdict: str) -> None:
     path = tree.at("/dev/ttyUSB0")
     path.chmod(mode)
     os.chown(path, uid, gid)
@@ -253,7 +253,7 @@ def test_rights_are_reckoned_as_the_kernel_does(tree: Tree, mode: int, uid: int,
 
 
 def _kernel_lets(path: Path, user: devices.User) -> bool:
-    """Whether a process of that user can open the file: asked in one that has become him."""
+    """True if a process of that user can open the file."""
     folder = os.open(path.parent, os.O_PATH)
     words = [sys.executable, "-c", OPEN_AS, str(folder), path.name, str(user.uid), *map(str, sorted(user.gids))]
     try:
@@ -262,7 +262,7 @@ def _kernel_lets(path: Path, user: devices.User) -> bool:
         os.close(folder)
 
 
-def test_what_is_not_there_is_said(tree: Tree) -> None:
+def test_missing_devices_are_reported(tree: Tree) -> None:
     (device,) = devices.device_file(tree, "/dev/ttyUSB7", SWATH)
     (pps,) = devices.pps_device(tree, "/dev/pps7", "assert", NOW_S)
     (can,) = devices.can_interface(tree, "can7", None, bitrate)
@@ -272,14 +272,14 @@ def test_what_is_not_there_is_said(tree: Tree) -> None:
     assert pps.mend.startswith("sudo systemctl start swath-pps@ttyS0 ")
 
 
-def test_another_bit_rate_is_mended_by_ip_link(tree: Tree) -> None:
+def test_a_different_bit_rate_is_corrected_by_ip_link(tree: Tree) -> None:
     found = worst(devices.can_interface(tree, "can0", 500_000, bitrate))
     assert found is not None
     assert found.text == "can0 runs at 1000000 bit/s, but 500000 is configured: no frame can be received"
     assert found.mend == "sudo ip link set can0 down && sudo ip link set can0 up type can bitrate 500000 restart-ms 100"
 
 
-def test_a_clock_that_nobody_keeps(tree: Tree) -> None:
+def test_an_unsynchronised_clock_is_noted(tree: Tree) -> None:
     tree.at("/proc/300/comm").unlink()
     (found,) = clock.keepers(tree, FREE_RUNNING)
     assert found.verdict is Verdict.NOTE
@@ -292,7 +292,7 @@ def test_a_clock_that_nobody_keeps(tree: Tree) -> None:
     ("step_ns", "slew_ppm", "verdict"),
     [(0, 12.0, "ok"), (-30_000, 0.0, "ok"), (1_000_000, 0.0, "wrong"), (-1_000_000, 0.0, "wrong"), (0, 500.0, "note")],
 )
-def test_steps_and_slews(step_ns: int, slew_ppm: float, verdict: str) -> None:
+def test_steps_and_slews_are_judged(step_ns: int, slew_ppm: float, verdict: str) -> None:
     (found,) = clock.movement(step_ns, slew_ppm)
     assert found.verdict == verdict
 
@@ -309,7 +309,7 @@ def test_the_clocks_of_this_computer_are_watched() -> None:
     ("free", "rate", "verdict", "told"),
     [(1e12, 25e6, "ok", "11 h 06 min"), (50e9, 25e6, "wrong", "32 min"), (0.4e9, 0.2e6, "wrong", "0 s")],
 )
-def test_room_is_told_in_hours(free: float, rate: float, verdict: str, told: str) -> None:
+def test_free_space_is_given_in_hours(free: float, rate: float, verdict: str, told: str) -> None:
     (found,) = disk.room(free, 512e6, rate)
     assert found.verdict == verdict
     assert told in found.text
@@ -319,19 +319,19 @@ def test_room_is_told_in_hours(free: float, rate: float, verdict: str, told: str
     ("rate", "sync_s", "verdict"),
     [(200e6, 0.03, "ok"), (200e6, 0.8, "note"), (200e6, 2.5, "wrong"), (30e6, 0.03, "wrong")],
 )
-def test_a_slow_disk(rate: float, sync_s: float, verdict: str) -> None:
+def test_a_slow_disk_is_reported(rate: float, sync_s: float, verdict: str) -> None:
     (found,) = disk.speed(rate, sync_s, 25.2e6)
     assert found.verdict == verdict
 
 
-def test_measuring_a_disk_leaves_nothing(tmp_path: Path) -> None:
+def test_measuring_a_disk_leaves_no_files(tmp_path: Path) -> None:
     rate, longest_s = disk.measure(tmp_path, 4 << 20)
     assert rate > 0
     assert 0 < longest_s < 60
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_directory_is_judged_by_the_folder_that_is_there(tree: Tree) -> None:
+def test_a_missing_directory_is_judged_by_its_nearest_existing_folder(tree: Tree) -> None:
     (found,) = disk.writable(tree, Path("/var/lib/swath/a/b"), SWATH)
     assert found.text == "swath may write to /var/lib/swath"
     os.chown(tree.at("/var/lib/swath"), 0, 0)
@@ -339,25 +339,25 @@ def test_a_directory_is_judged_by_the_folder_that_is_there(tree: Tree) -> None:
     assert found.mend == "sudo install -d -o swath -g swath -m 0750 /var/lib/swath"
 
 
-def test_a_directory_that_its_user_may_not_get_to(tree: Tree) -> None:
+def test_a_directory_inaccessible_to_its_user_is_reported(tree: Tree) -> None:
     tree.at("/var/lib").chmod(0o750)
     (found,) = disk.writable(tree, Path("/var/lib/swath"), SWATH)
     assert (found.verdict, found.text) == (Verdict.WRONG, "swath may not enter /var/lib, which holds /var/lib/swath")
     assert found.mend.startswith("sudo chmod o+x /var/lib ")
 
 
-def test_the_mount_of_a_directory_is_the_longest_that_holds_it(tree: Tree) -> None:
+def test_the_mount_of_a_directory_is_the_longest_containing_it(tree: Tree) -> None:
     points = [disk.mount_of(tree, Path(path)) for path in ("/var/lib/swath/x", "/var/lib/swathy", "/home")]
     assert [point.point if point else None for point in points] == ["/var/lib/swath", "/", "/"]
 
 
-def test_what_a_configuration_needs_of_the_kernel(tmp_path: Path) -> None:
+def test_kernel_modules_needed_by_a_configuration_are_listed(tmp_path: Path) -> None:
     config = parse_config((ROOT / "fixtures/config/aircraft.toml").read_text(), ROOT / "fixtures/config/aircraft.toml")
     assert set(needed_modules(config, _specs(config))) <= {"can_raw", "usbserial", "cdc_acm", "pps_core"}
     assert "pps_core" in needed_modules(config, _specs(config))
 
 
-def test_this_computer_is_judged_by_what_it_says_itself(tmp_path: Path) -> None:
+def test_this_computer_is_judged_by_its_own_files(tmp_path: Path) -> None:
     """The command itself, on the real files: each wrong finding can be mended, its verdict is the files' own."""
     config = tmp_path / "swath.toml"
     config.write_text(

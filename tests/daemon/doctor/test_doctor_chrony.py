@@ -30,7 +30,7 @@ ALWAYS = "makestep 0.1 -1\n"
 
 @pytest.fixture
 def tree(tmp_path: Path) -> Tree:
-    """chrony as Debian has it, with the installed drop-in."""
+    """Return chrony's files as installed by Debian, with our drop-in."""
     made = Tree(tmp_path)
     write(made, MAIN, DEBIAN_CHRONY)
     write(made, DROP_IN, (SYSTEMD / "chrony/swath.conf").read_text())
@@ -53,7 +53,7 @@ def write(tree: Tree, path: str, text: str) -> None:
         {MAIN: f"include {MAIN}\n! makestep 1 -1\n#makestep 1 -1\nmakestep 1\nconfdir\ninclude\n"},
     ],
 )
-def test_what_is_not_read_last_does_not_hold(tree: Tree, files: dict[str, str]) -> None:
+def test_a_directive_overridden_later_has_no_effect(tree: Tree, files: dict[str, str]) -> None:
     """chrony.conf(5): of a directive that stands there twice the last is effective."""
     for path, text in files.items():
         write(tree, path, text)
@@ -70,7 +70,7 @@ def test_what_is_not_read_last_does_not_hold(tree: Tree, files: dict[str, str]) 
         ({MAIN: "include /m/*.inc\n", "/m/a.inc": "makestep 1 3\n", "/m/b c.inc": ALWAYS}, "/m/b c.inc"),
     ],
 )
-def test_the_file_that_holds_is_named_and_its_mend_loses_nothing(
+def test_the_effective_file_is_named_and_its_remedy_loses_nothing(
     tree: Tree, files: dict[str, str], winner: str
 ) -> None:
     for path, text in files.items():

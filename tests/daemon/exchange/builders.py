@@ -46,7 +46,7 @@ Content = dict[str, list[tuple[int, bytes, tuple[tuple[str, str], ...]]]]
 
 
 def write_config(folder: Path, text: str = CONFIG) -> Config:
-    """A configuration as a file, loaded."""
+    """Write a configuration file and load it."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "swath.toml"
     path.write_text(text)

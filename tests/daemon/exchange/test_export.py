@@ -42,7 +42,7 @@ EDGE = b'{"edge_time_ns":1800000000000000123,"sequence":7,"edge":"assert","realt
 
 
 def export(log: Path, folder: Path) -> ExportReport:
-    """The only session of a log."""
+    """Export the only session of a log."""
     [session] = open_logs([log])
     return export_session(session, folder)
 
@@ -67,7 +67,7 @@ def exported(tmp_path: Path) -> ExportReport:
 
 
 class TestFiles:
-    def test_dpkt_reads_the_datagrams_of_a_head_with_both_its_ports(self, exported: ExportReport) -> None:
+    def test_dpkt_reads_the_datagrams_of_a_head_with_two_ports(self, exported: ExportReport) -> None:
         found = []
         with (exported.folder / "scanner-top.pcap").open("rb") as stream:
             for seconds, frame in dpkt.pcap.Reader(stream):
@@ -80,7 +80,7 @@ class TestFiles:
             (START_NS // 10**9, HEAD[0], HEAD[1], 2368, b"\2" * 1206),
         ]
 
-    def test_a_heads_two_ports_are_merged_by_their_stamps_and_keep_their_own_order(self, tmp_path: Path) -> None:
+    def test_datagrams_of_two_ports_are_merged_by_time_and_keep_their_own_order(self, tmp_path: Path) -> None:
         """A log has them block by block. The stamps of a port that step back stay where they are."""
         main, aux, second = "scanner/top", "scanner/top/aux", 10**9
         stamps = [(main, n * 10) for n in range(40)] + [(aux, n * 45 + 5) for n in range(8)]
@@ -102,7 +102,7 @@ class TestFiles:
         del found[stepped]
         assert [at for _, at in found] == sorted(at for _, at in found)
 
-    def test_stamps_of_a_pcap_are_in_nanoseconds(self, exported: ExportReport) -> None:
+    def test_timestamps_of_a_pcap_are_in_nanoseconds(self, exported: ExportReport) -> None:
         data = (exported.folder / "scanner-top.pcap").read_bytes()
         assert struct.unpack_from("<I", data) == (0xA1B23C4D,)
         assert struct.unpack_from("<II", data, 24) == divmod(START_NS + 1, 10**9)
@@ -114,7 +114,7 @@ class TestFiles:
         assert (second.arbitration_id, second.is_extended_id, second.is_fd) == (0x1234567, True, True)
         assert first.timestamp == pytest.approx(START_NS // 1000 / 1e6, abs=1e-6)
 
-    def test_serial_bytes_are_one_stream_with_a_tag_a_read(self, exported: ExportReport) -> None:
+    def test_serial_bytes_are_one_stream_with_a_tag_for_each_read(self, exported: ExportReport) -> None:
         """The tag's layout is written down in drivers/transports/rtklib_tag.py from RTKLIB's source."""
         assert (exported.folder / "gnss-rover.gps").read_bytes() == b"\xaa\x44\x12rest"
         tags = (exported.folder / "gnss-rover.gps.tag").read_bytes()
@@ -134,7 +134,7 @@ class TestFiles:
         assert exported.units == Counter(source for source, *_ in UNITS)
         assert not (exported.folder / f"scanner-top.pcap{SUFFIX}").exists()  # a pcap holds all of it
 
-    def test_the_configuration_can_be_loaded_where_it_lies(self, tmp_path: Path) -> None:
+    def test_the_exported_configuration_can_be_loaded_in_place(self, tmp_path: Path) -> None:
         shutil.copytree(ROOT / "fixtures/config", tmp_path / "config", ignore=shutil.ignore_patterns("bad"))
         config = load_config(tmp_path / "config/aircraft.toml")
         report = export(write_log(tmp_path / "log", config, [("gnss/rover", START_NS, b"$", None)]), tmp_path / "out")
@@ -195,20 +195,20 @@ def there_and_back(folder: Path, config: Config, units: list[Unit]) -> None:
 @pytest.mark.slow
 @settings(max_examples=50, deadline=None)
 @given(st.lists(ANY_UNIT, min_size=1, max_size=25))
-def test_any_log_comes_back_exactly(units: list[Unit]) -> None:
-    """Stamps that step back or lie beyond 2106, empty reads, frames no line can hold, senders nobody named."""
+def test_any_log_is_restored_exactly(units: list[Unit]) -> None:
+    """Log timestamps that step back or exceed 2106, empty reads, frames without a candump line and unnamed senders."""
     with tempfile.TemporaryDirectory() as folder:
         there_and_back(Path(folder), write_config(Path(folder)), units)
 
 
-def test_a_datagram_longer_than_ip_can_carry_comes_back(tmp_path: Path) -> None:
+def test_a_datagram_longer_than_ip_can_carry_is_restored(tmp_path: Path) -> None:
     units: list[Unit] = [
         ("scanner/top", START_NS, bytes(n), peer) for n in (65_507, 65_508, 70_000) for peer in (HEAD, None)
     ]
     there_and_back(tmp_path, write_config(tmp_path), units)
 
 
-def test_two_heads_on_one_port_number_are_told_by_their_groups(tmp_path: Path) -> None:
+def test_two_heads_on_one_port_are_distinguished_by_their_groups(tmp_path: Path) -> None:
     head = 'protocol = "velodyne-vlp16"\ninstallation = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\n'
     text = session_table(tmp_path / "logs")
     for name, where in (("left", "udp:0.0.0.0:2368?group=239.1.2.3"), ("right", "udp:0.0.0.0:2368?group=239.1.2.4")):
@@ -220,7 +220,7 @@ def test_two_heads_on_one_port_number_are_told_by_their_groups(tmp_path: Path) -
 
 
 def frame_of(number: int) -> can.Message:
-    """Frames of every kind in turn."""
+    """Return frames of every kind in turn."""
     kinds = [
         can.Message(arbitration_id=0x100 + number, data=bytes([number]) * (number % 9), is_extended_id=False),
         can.Message(arbitration_id=0x1000000 + number, data=bytes(8), is_extended_id=True),
@@ -231,13 +231,13 @@ def frame_of(number: int) -> can.Message:
 
 
 def parts_of(message: can.Message) -> tuple[int, bytes, bool, bool, bool]:
-    """What of a frame was on the bus."""
+    """Return the parts of a frame that were on the bus."""
     data = bytes(message.data)
     return message.arbitration_id, data, message.is_extended_id, message.is_fd, message.is_remote_frame
 
 
 @pytest.mark.slow
-def test_what_was_on_the_wire_is_in_the_files_and_comes_back(tmp_path: Path) -> None:
+def test_units_on_the_wire_are_exported_and_restored(tmp_path: Path) -> None:
     """A real recorder: sentences on a pty, datagrams, frames, edges; its log exported, imported, and all compared."""
     port, link, fifo = free_udp_port(), tmp_path / "rover", tmp_path / "pps"
     os.mkfifo(fifo)
@@ -295,7 +295,7 @@ def test_what_was_on_the_wire_is_in_the_files_and_comes_back(tmp_path: Path) -> 
 
 
 class TestCommand:
-    def test_several_logs_and_a_directory(self, tmp_path: Path) -> None:
+    def test_several_logs_and_a_directory_are_exported(self, tmp_path: Path) -> None:
         config = write_config(tmp_path)
         one = write_log(tmp_path / "a", config, UNITS, "one-20261121T101500Z-ab12")
         write_log(tmp_path / "b", config, UNITS[:3], "two-20261121T101500Z-ab12")
@@ -311,7 +311,7 @@ class TestCommand:
         assert result.returncode == 0, result.stderr
         assert content_of(tmp_path / "back") == content_of(one)
 
-    def test_an_export_that_is_there_is_never_written_over(self, tmp_path: Path) -> None:
+    def test_an_existing_export_is_never_overwritten(self, tmp_path: Path) -> None:
         log = write_log(tmp_path / "log", write_config(tmp_path), UNITS)
         assert swath("export", str(log), str(tmp_path / "out")).returncode == 0
         before = {path: path.stat().st_mtime_ns for path in (tmp_path / "out").rglob("*")}
@@ -321,7 +321,7 @@ class TestCommand:
         assert result.stderr.count("\n") == 1
         assert {path: path.stat().st_mtime_ns for path in (tmp_path / "out").rglob("*")} == before
 
-    def test_of_a_damaged_log_what_is_whole_is_written(self, tmp_path: Path) -> None:
+    def test_the_intact_part_of_a_damaged_log_is_exported(self, tmp_path: Path) -> None:
         log = write_log(tmp_path / "log", write_config(tmp_path), UNITS)
         data = bytearray(log.read_bytes())
         data[data.index(bytes(1206)) + 5] ^= 1
@@ -341,7 +341,9 @@ class TestCommand:
             (["only-one"], 2, "Missing argument"),
         ],
     )
-    def test_what_is_no_log_is_one_line(self, tmp_path: Path, arguments: list[str], code: int, line: str) -> None:
+    def test_a_file_that_is_not_a_log_is_refused_in_one_line(
+        self, tmp_path: Path, arguments: list[str], code: int, line: str
+    ) -> None:
         result = swath("export", *(str(tmp_path / one) if one == "out" else one for one in arguments))
         assert result.returncode == code
         assert line in result.stderr
@@ -363,7 +365,7 @@ class TestCommand:
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_memory_stays_flat(tmp_path: Path) -> None:
+def test_memory_does_not_grow_with_the_log(tmp_path: Path) -> None:
     """Files are read and written in a stream: four times the datagrams need no more memory."""
     config = write_config(tmp_path)
     payloads = np.random.default_rng(1).integers(0, 256, (500, 1206), dtype=np.uint8)
@@ -382,7 +384,7 @@ def test_memory_stays_flat(tmp_path: Path) -> None:
 
 
 def peak_kib(*arguments: object) -> int:
-    """What a command needed of memory at most."""
+    """Return the peak memory of a command in KiB."""
     code = (
         "import resource, sys; from swath.daemon.cli.main import run_app; assert run_app(sys.argv[1:]) == 0; "
         "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)"

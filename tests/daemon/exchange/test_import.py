@@ -67,7 +67,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class TestRealCaptures:
-    def test_every_unit_is_there_with_its_stamp(self, made: Path) -> None:
+    def test_every_unit_is_imported_with_its_timestamp(self, made: Path) -> None:
         content = content_of(made)
         datagrams = list(read_pcap(VELODYNE))
         for topic, port in (("/scanner/top/raw", 2368), ("/scanner/top/aux/raw", 8308)):
@@ -83,7 +83,7 @@ class TestRealCaptures:
         }  # fmt: skip
         assert dict(content["/imu/main/raw"][0][2])["protocol"] == "canmod-gps"
 
-    def test_info_decodes_it_and_every_unit_is_accounted_for(self, made: Path) -> None:
+    def test_info_decodes_it_and_accounts_for_every_unit(self, made: Path) -> None:
         result = swath("info", "--json", str(made))
         assert result.returncode == 0, result.stdout
         [session] = json.loads(result.stdout)["sessions"]
@@ -106,20 +106,20 @@ class TestRealCaptures:
         assert swath("recover", str(made)).returncode == 0
         assert not (made / "recording.json").exists()
 
-    def test_replay_plays_it_in_the_order_of_time(self, made: Path) -> None:
+    def test_replay_plays_it_in_time_order(self, made: Path) -> None:
         [session] = open_logs([made])
         times = [unit.time_ns for unit in timed_units(session, with_pps=True)]
         assert len(times) == 10_051 + 221 + 293 + 57
         assert times == sorted(times)
 
-    def test_parts_tell_of_each_other_and_of_the_captures(self, made: Path) -> None:
+    def test_parts_refer_to_each_other_and_to_the_captures(self, made: Path) -> None:
         content = read_log(made)
         names = [one["text"] for one in content.events("part_closed")]
         assert names == sorted(path.name for path in made.glob("*.mcap"))[1:]
         told = [one["text"] for one in content.events("capture_imported")]
         assert f"{VELODYNE.name}: 293 units of scanner/top, 57 units of scanner/top/aux" in told
 
-    def test_the_same_captures_again_write_nothing_over(self, made: Path) -> None:
+    def test_importing_the_same_captures_again_overwrites_nothing(self, made: Path) -> None:
         before = {path.name: path.stat().st_mtime_ns for path in made.glob("*.mcap")}
         named = f"gnss/rover={NOVATEL}"
         result = swath("import", str(made.parent / "swath.toml"), "--source", named, "-o", str(made))
@@ -128,10 +128,10 @@ class TestRealCaptures:
         assert {path.name: path.stat().st_mtime_ns for path in made.glob("*.mcap")} == before
 
 
-class TestWhose:
-    """Which device a unit belongs to."""
+class TestDeviceAssignment:
+    """Assignment of units to devices."""
 
-    def test_by_port_sender_interface_or_name(self, tmp_path: Path) -> None:
+    def test_units_are_assigned_by_port_sender_interface_or_name(self, tmp_path: Path) -> None:
         text = CONFIG.replace("udp:0.0.0.0:2368", "udp:0.0.0.0:2368?source=192.168.1.201")
         config = write_config(tmp_path, text)
         path = write_pcap(tmp_path / "one.pcap", [b"a", b"b"])
@@ -145,7 +145,7 @@ class TestWhose:
         _, [capture] = run_import(config, [path], tmp_path / "logs")
         assert (capture.units, capture.passed) == ({"scanner/top": 2}, {"port 2368": 1})
 
-    def test_source_with_a_port_or_an_interface_takes_those_only(self, tmp_path: Path) -> None:
+    def test_a_source_with_a_port_or_an_interface_takes_only_those(self, tmp_path: Path) -> None:
         config = write_config(tmp_path)
         both = tmp_path / "both.pcap"
         one, two = write_pcap(tmp_path / "1.pcap", [b"a"], 7000), write_pcap(tmp_path / "2.pcap", [b"b"], 7001)
@@ -157,7 +157,7 @@ class TestWhose:
         report, _ = run_import(config, [], tmp_path / "all", ImportOptions([f"imu/main={CANDUMP}"]))
         assert report.units == {"imu/main": 5588}
 
-    def test_a_name_that_two_buses_have_is_nobodys(self, tmp_path: Path) -> None:
+    def test_a_name_shared_by_two_buses_is_assigned_to_neither(self, tmp_path: Path) -> None:
         text = CONFIG.replace("can:socketcan:can1?bitrate=500000", "can:udp_multicast:239.74.163.2?port=1")
         text += '[imu.other]\ntransport = "can:udp_multicast:239.74.163.2?port=2"\nprotocol = "canmod-gps"\n'
         config, path = write_config(tmp_path, text), tmp_path / "bus.log"
@@ -167,8 +167,8 @@ class TestWhose:
         report, _ = run_import(config, [], tmp_path / "logs", ImportOptions([f"imu/other={path}"]))
         assert report.units == {"imu/other": 1}
 
-    def test_senders_have_channels_of_their_own(self, tmp_path: Path) -> None:
-        """And those beyond 256 one together, as the recorder has it."""
+    def test_each_sender_has_its_own_channel(self, tmp_path: Path) -> None:
+        """Senders beyond 256 share one channel, as in the recorder."""
         data = FILE_HEADER
         for number in range(300):
             peer = (f"10.1.{number // 256}.{number % 256}", 2368)
@@ -181,7 +181,7 @@ class TestWhose:
         assert len({metadata for _, _, metadata in units}) == 257
         assert "source_address" not in dict(units[-1][2])
 
-    def test_two_heads_of_a_real_capture_are_told_by_their_senders(self, tmp_path: Path) -> None:
+    def test_two_heads_of_a_real_capture_are_distinguished_by_their_senders(self, tmp_path: Path) -> None:
         """Both send to port 7502, in fragments; exported and imported again they are the same."""
         capture = FIXTURES / "captures" / "same_ports.pcap.gz"
         text = CONFIG.replace("udp:0.0.0.0:2368", "udp:0.0.0.0:7502")
@@ -197,7 +197,7 @@ class TestWhose:
         run_import(config, [folder], tmp_path / "back")
         assert content_of(tmp_path / "back") == content_of(tmp_path / "logs")
 
-    def test_more_files_than_a_process_may_open_at_first(self, tmp_path: Path) -> None:
+    def test_more_files_than_the_initial_limit_can_be_opened(self, tmp_path: Path) -> None:
         files = [write_pcap(tmp_path / f"{n:03}.pcap", [bytes([n])], first_ns=START_NS + n) for n in range(100)]
         write_config(tmp_path)
         words = ["import", str(tmp_path / "swath.toml"), *map(str, files), "-o", str(tmp_path / "logs")]
@@ -207,7 +207,7 @@ class TestWhose:
         units = content_of(tmp_path / "logs")["/scanner/top/raw"]
         assert [data for _, data, _ in units] == [bytes([n]) for n in range(100)]
 
-    def test_rotated_captures_come_in_the_order_of_time(self, tmp_path: Path) -> None:
+    def test_rotated_captures_are_imported_in_time_order(self, tmp_path: Path) -> None:
         config = write_config(tmp_path)
         late = write_pcap(tmp_path / "a.pcap", [b"3", b"4"], first_ns=START_NS + 10**9)
         early = write_pcap(tmp_path / "b.pcap", [b"1", b"2"])
@@ -216,11 +216,11 @@ class TestWhose:
         assert [data for _, data, _ in units] == [b"1", b"2", b"3", b"4"]
 
 
-class TestStamps:
-    """Whatever a capture's clock did, every unit is in the log, and parts and statuses stay few."""
+class TestTimestamps:
+    """With any timestamps every unit is imported, and parts and statuses stay few."""
 
-    def test_two_clocks_years_apart_in_turn(self, tmp_path: Path) -> None:
-        """As two interfaces of one pcapng may have them; a part and a status a unit would be absurd."""
+    def test_two_alternating_clocks_years_apart_give_few_parts_and_statuses(self, tmp_path: Path) -> None:
+        """Two interfaces of one pcapng may have such clocks; a part and a status for each unit would be absurd."""
         data, row = FILE_HEADER, np.zeros((1, 3), np.uint8)
         times = [START_NS // (1 + n % 2) + n * 10**6 for n in range(3000)]
         for n, time_ns in enumerate(times):
@@ -232,7 +232,7 @@ class TestStamps:
         assert [time_ns for time_ns, _ in content.units["scanner/top"]] == times
         assert len(content.messages["/status/scanner/top"]) < 10
 
-    def test_after_one_absurd_stamp_statuses_go_on(self, tmp_path: Path) -> None:
+    def test_statuses_continue_after_an_absurd_timestamp(self, tmp_path: Path) -> None:
         times = [START_NS + n * 10**7 for n in range(3000)]
         times[10] = 4_000_000_000 * 10**9
         data, row = FILE_HEADER, np.zeros((1, 3), np.uint8)
@@ -244,7 +244,7 @@ class TestStamps:
         assert [time_ns for time_ns, _ in content.units["scanner/top"]] == times
         assert len(content.messages["/status/scanner/top"]) >= 19  # the second after the jump, then one a second
 
-    def test_no_stamp_before_1970_or_after_2262(self, tmp_path: Path) -> None:
+    def test_timestamps_before_1970_and_after_2262_are_damage(self, tmp_path: Path) -> None:
         path = tmp_path / "rover.bin"
         path.write_bytes(b"abcdef")
         rows = ["-5.5,0,2", "1.5,2,2", "9999999999.0,4,2"]
@@ -262,7 +262,7 @@ class TestStamps:
 class TestSerialTimes:
     """A serial stream says its times by a table, by RTKLIB's tags, or the user does."""
 
-    def test_tags_of_rtklib(self, tmp_path: Path) -> None:
+    def test_times_are_taken_from_rtklib_tags(self, tmp_path: Path) -> None:
         data = gzip.decompress(UBX.read_bytes())
         path = tmp_path / "rover.ubx"
         path.write_bytes(data)
@@ -278,7 +278,7 @@ class TestSerialTimes:
             START_NS + 500_000_000 + 20_000_000 * n for n in range(len(ends))
         ]
 
-    def test_a_capture_of_rtklib(self, tmp_path: Path) -> None:
+    def test_a_capture_of_rtklib_is_imported(self, tmp_path: Path) -> None:
         """Nine minutes of an IMU on a serial line; CR, which upstream lost, is put back before each LF."""
         data = gzip.decompress((RTKLIB / "imu_1934.csv.gz").read_bytes()).replace(b"\n", b"\r\n")
         (tmp_path / "imu_1934.csv").write_bytes(data)
@@ -305,7 +305,9 @@ class TestSerialTimes:
             (["--start", "1800000000.000000007", "--baud", "gnss/rover=0"], 7),
         ],
     )
-    def test_a_start_and_a_rate(self, tmp_path: Path, options: list[str], first_after_ns: int) -> None:
+    def test_times_follow_from_a_start_and_a_rate(
+        self, tmp_path: Path, options: list[str], first_after_ns: int
+    ) -> None:
         path = tmp_path / "rover.bin"
         path.write_bytes(bytes(1200))
         write_config(tmp_path)
@@ -321,7 +323,7 @@ class TestSerialTimes:
         [["--start", "yesterday"], ["--start", "2027-01-15T08:00:00"], ["--start", "1969-01-01T00:00:00Z"],
          ["--start", "imu/nobody=1800000000"], ["--baud", "fast"], ["--baud", "-3"], ["--baud", "nan"], []],
     )  # fmt: skip
-    def test_what_is_no_time_is_one_line(self, tmp_path: Path, option: list[str]) -> None:
+    def test_missing_times_are_refused_in_one_line(self, tmp_path: Path, option: list[str]) -> None:
         path = tmp_path / "rover.bin"
         path.write_bytes(b"bytes")
         write_config(tmp_path)
@@ -334,8 +336,8 @@ class TestSerialTimes:
         assert not list((tmp_path / "logs").glob("*.mcap"))
 
 
-class TestWrong:
-    """One clear line, and the exit code that the page promises."""
+class TestRefusals:
+    """Refusals of wrong input in one line with the documented exit code."""
 
     def run(self, folder: Path, *arguments: str, text: str = CONFIG) -> tuple[int, str, dict[str, Any]]:
         """Exit code, stderr and the JSON object of an import into ``logs``."""
@@ -345,8 +347,8 @@ class TestWrong:
         assert all(line.startswith("swath: ") for line in result.stderr.splitlines())
         return result.returncode, result.stderr, json.loads(result.stdout) if result.stdout else {}
 
-    def test_what_cannot_be_read_is_3_and_beside_wrong_use_2(self, tmp_path: Path) -> None:
-        """As docs/commands.md has it: no such file."""
+    def test_unreadable_input_exits_with_3_and_with_2_beside_wrong_usage(self, tmp_path: Path) -> None:
+        """docs/commands.md documents these exit codes."""
         nowhere, folder = str(tmp_path / "nowhere.pcap"), f"gnss/rover={tmp_path}"
         (tmp_path / "cut.gz").write_bytes(gzip.compress(bytes(100))[:15])
         code, error, _ = self.run(tmp_path, str(tmp_path / "cut.gz"))
@@ -357,8 +359,8 @@ class TestWrong:
         assert not (tmp_path / "logs").exists()
         assert self.run(tmp_path, nowhere, "--source", f"gnss/nobody={nowhere}")[0] == 2
 
-    def test_a_short_packed_capture_that_is_cut_gives_what_stands_before(self, tmp_path: Path) -> None:
-        """As larger ones do: less than is looked at to know what it is."""
+    def test_a_short_truncated_gzip_capture_is_read_to_its_end(self, tmp_path: Path) -> None:
+        """A larger truncated capture is read in part; this one is shorter than the bytes that detect its format."""
         frames = [
             f"({1_700_000_000 + i}.{i * 7919 % 10**6:06}) can1 {i * 37 % 2048:03X}#{i * i:08X}" for i in range(200)
         ]
@@ -376,7 +378,7 @@ class TestWrong:
             " (2026-11-21 10:15:00.000123)  can0  RX - -  18FF50E5  [02]  01 02",
         ],
     )
-    def test_what_candump_shows_people_is_named(self, tmp_path: Path, line: str) -> None:
+    def test_human_readable_candump_output_is_named(self, tmp_path: Path, line: str) -> None:
         (tmp_path / "shown.log").write_text(f"{line}\n{line}\n")
         want = "shown.log: is candump's format for people; want the output of candump -L (or -l)"
         code, error, _ = self.run(tmp_path, str(tmp_path / "shown.log"))
@@ -391,14 +393,14 @@ class TestWrong:
             (b"LOGG\x90\0\0\0", "a BLF file of Vector"),
         ],
     )
-    def test_a_container_of_others_is_named(self, tmp_path: Path, begins: bytes, what: str) -> None:
-        """By the first bytes that SQLite, rosbag, MCAP and python-can's BLF reader give."""
+    def test_a_container_of_another_format_is_named(self, tmp_path: Path, begins: bytes, what: str) -> None:
+        """Formats are recognised by the first bytes written by SQLite, rosbag, MCAP and python-can's BLF reader."""
         (tmp_path / "flight.bag").write_bytes(begins + bytes(100))
         code, error, _ = self.run(tmp_path, str(tmp_path / "flight.bag"))
         want = f"swath: {tmp_path}/flight.bag: is {what}; want pcap, candump -L or the bytes of a device\n"
         assert (code, error) == (2, want)
 
-    def test_a_capture_of_other_ports(self, tmp_path: Path) -> None:
+    def test_a_capture_of_other_ports_is_reported(self, tmp_path: Path) -> None:
         path = write_pcap(tmp_path / "other.pcap", [b"x"] * 3, 5000)
         code, error, found = self.run(tmp_path, str(path))
         want = f"{path}: holds port 5000 (3), but the configuration has 2368 (scanner/top), 8308 (scanner/top/aux); "
@@ -406,7 +408,7 @@ class TestWrong:
         assert (code, error, found["log"]) == (1, f"swath: {want}\n", [])
         assert found["captures"][0]["of_no_device"] == {"port 5000": 3}
 
-    def test_one_of_two_captures_is_cut_off(self, tmp_path: Path) -> None:
+    def test_of_two_captures_the_truncated_one_is_reported(self, tmp_path: Path) -> None:
         good = write_pcap(tmp_path / "good.pcap", [b"good"])
         cut = write_pcap(tmp_path / "cut.pcap", [b"one", b"two"])
         cut.write_bytes(cut.read_bytes()[:-1])
@@ -439,7 +441,7 @@ class TestWrong:
             (["--source", "gnss/rover={}/port.bin"], "has no times"),
         ],
     )
-    def test_what_cannot_be_imported(self, tmp_path: Path, arguments: list[str], line: str) -> None:
+    def test_unusable_files_are_refused(self, tmp_path: Path, arguments: list[str], line: str) -> None:
         (tmp_path / "port.bin").write_bytes(b"$GPGGA,")
         write_pcap(tmp_path / "a.pcap", [b"x"])
         code, error, _ = self.run(tmp_path, *(one.replace("{}", str(tmp_path)) for one in arguments))
@@ -447,7 +449,7 @@ class TestWrong:
         assert line in error
         assert not (tmp_path / "logs").exists()
 
-    def test_no_port_and_no_bus_for_a_capture(self, tmp_path: Path) -> None:
+    def test_a_configuration_without_port_or_bus_for_a_capture_is_refused(self, tmp_path: Path) -> None:
         path = write_pcap(tmp_path / "a.pcap", [b"x"])
         text = '[session]\nname = "none"\ndirectory = "logs"\n'
         code, error, _ = self.run(tmp_path, str(path), str(CANDUMP), text=text)
@@ -464,7 +466,7 @@ class TestWrong:
         assert (code, lock > 0) == (3, True)
         assert "another recorder is running there" in error
 
-    def test_a_full_disk_leaves_nothing(self, tmp_path: Path) -> None:
+    def test_a_full_disk_leaves_no_files(self, tmp_path: Path) -> None:
         path = write_pcap(tmp_path / "a.pcap", [bytes(60_000)] * 100)
         write_config(tmp_path)
         words = ["import", str(tmp_path / "swath.toml"), str(path), "-o", str(tmp_path / "logs")]
@@ -476,7 +478,7 @@ class TestWrong:
         assert "the incomplete log was removed" in done.stderr
         assert not list((tmp_path / "logs").glob("*.mcap"))
 
-    def test_an_export_that_was_changed_is_told(self, tmp_path: Path) -> None:
+    def test_a_modified_export_is_reported(self, tmp_path: Path) -> None:
         config = write_config(tmp_path)
         log = write_log(
             tmp_path / "log", config, [("gnss/rover", START_NS + n, bytes([n]) * 10, None) for n in range(9)]
@@ -505,8 +507,8 @@ class TestWrong:
 
 
 @pytest.mark.parametrize("row", ["0,5,3,2,010203", "0,5,3,?,", "0,5,3,0,", "1,5,2,0,010203"])
-def test_a_row_of_a_sidecar_that_cannot_be_is_told(tmp_path: Path, row: str) -> None:
-    """An entry that is neither there nor not; one that is not there and lacks its bytes, or has others than it says."""
+def test_an_impossible_row_of_a_sidecar_is_reported(tmp_path: Path, row: str) -> None:
+    """The row marks an entry as neither native nor not, or has bytes that contradict its length."""
     with gzip.open(sidecar_of(tmp_path / "a.log"), "wt") as stream:
         stream.write(f"unit,time_ns,length,native,data\n{row}\n")
     with pytest.raises(CaptureDamageError, match="line 2: want unit,time_ns,length,native,data"):
@@ -515,7 +517,7 @@ def test_a_row_of_a_sidecar_that_cannot_be_is_told(tmp_path: Path, row: str) -> 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["pcap", "candump", "rtklib", "table", "bytes", "sidecar"])
-def test_captures_cut_and_damaged_anywhere_never_break_an_import(tmp_path: Path, kind: str) -> None:
+def test_truncated_and_damaged_captures_never_break_an_import(tmp_path: Path, kind: str) -> None:
     """Whatever is wrong, it is counted or refused in a line, and the log that is made is whole."""
     config = write_config(tmp_path)
     rng = np.random.default_rng(5)

@@ -45,7 +45,7 @@ def names(folder: Path) -> list[str]:
 
 
 def state(folder: Path) -> dict[str, tuple[int, str]]:
-    """Every file, to the byte and the nanosecond."""
+    """Return the content and modification time of every file."""
     files = [path for path in folder.iterdir() if path.is_file()]
     return {path.name: (path.stat().st_mtime_ns, hashlib.sha256(path.read_bytes()).hexdigest()) for path in files}
 
@@ -127,7 +127,7 @@ def test_a_killed_run_is_resumed(logs: Path, disk: Path) -> None:
     assert coreutils_agree(disk) == 1
 
 
-def test_ctrl_c_ends_it_quietly_and_leaves_the_partial_copy(logs: Path, disk: Path) -> None:
+def test_ctrl_c_ends_the_run_quietly_and_leaves_the_partial_copy(logs: Path, disk: Path) -> None:
     path = big_log(logs)
     partial = disk / (path.name + ".partial")
     command = [sys.executable, "-m", "swath.daemon.cli.main", "offload", "--same-disk", str(logs), str(disk)]
@@ -139,8 +139,8 @@ def test_ctrl_c_ends_it_quietly_and_leaves_the_partial_copy(logs: Path, disk: Pa
     assert names(disk) == [partial.name]
 
 
-def test_what_an_interruption_left_wrong_is_copied_anew(logs: Path, disk: Path) -> None:
-    """As after a power cut of the disk: the partial copy is long enough, its content is not the log's."""
+def test_a_corrupt_partial_copy_is_copied_again(logs: Path, disk: Path) -> None:
+    """A power cut of the disk leaves a partial copy of sufficient length with wrong content."""
     path = big_log(logs)
     partial = disk / (path.name + ".partial")
     partial.write_bytes(bytes(10 * BLOCK_BYTES + 1))
@@ -150,7 +150,7 @@ def test_what_an_interruption_left_wrong_is_copied_anew(logs: Path, disk: Path) 
     assert not partial.exists()
 
 
-def test_a_partial_copy_longer_than_the_log_is_cut(logs: Path, disk: Path) -> None:
+def test_a_partial_copy_longer_than_the_log_is_truncated(logs: Path, disk: Path) -> None:
     path = logs / "flight_0.mcap"
     write_part(path)
     (disk / (path.name + ".partial")).write_bytes(path.read_bytes() + b"more")
@@ -158,7 +158,7 @@ def test_a_partial_copy_longer_than_the_log_is_cut(logs: Path, disk: Path) -> No
     assert coreutils_agree(disk) == 1
 
 
-def test_a_disk_that_gives_back_something_else_is_told(logs: Path, disk: Path) -> None:
+def test_a_disk_that_returns_other_data_is_reported(logs: Path, disk: Path) -> None:
     """A bit of the copy changes between writing and reading back: no copy, nothing to delete, nothing in the list."""
     path = logs / "flight_0.mcap"
     write_part(path)
@@ -178,7 +178,7 @@ def test_a_disk_that_gives_back_something_else_is_told(logs: Path, disk: Path) -
     assert names(disk) == []
 
 
-def test_a_file_that_is_there_and_differs_is_not_overwritten(logs: Path, disk: Path) -> None:
+def test_an_existing_file_with_other_content_is_not_overwritten(logs: Path, disk: Path) -> None:
     path, other = logs / "flight_0.mcap", logs / "flight_1.mcap"
     write_part(path)
     write_part(other, part=1)
@@ -199,7 +199,7 @@ def test_a_copy_that_was_made_otherwise_is_compared_and_listed(logs: Path, disk:
     assert coreutils_agree(disk) == 1
 
 
-def test_verify_reads_again_and_finds_what_changed(logs: Path, disk: Path) -> None:
+def test_verify_reads_again_and_finds_changes(logs: Path, disk: Path) -> None:
     path = logs / "flight_0.mcap"
     write_part(path)
     run_all(logs, disk)
@@ -213,10 +213,8 @@ def test_verify_reads_again_and_finds_what_changed(logs: Path, disk: Path) -> No
     assert (code, report["may_be_deleted"]) == (4, [])
 
 
-def test_another_log_of_the_same_name_and_size_is_not_taken_for_the_one_that_was_copied(
-    logs: Path, disk: Path, tmp_path: Path
-) -> None:
-    """An import made anew has the name of the one before, and may be as long."""
+def test_another_log_of_the_same_name_and_size_is_copied(logs: Path, disk: Path, tmp_path: Path) -> None:
+    """A repeated import has the name of the previous one and may have its length."""
     path = logs / "flight_0.mcap"
     write_part(path)
     run_all(logs, disk)
@@ -235,7 +233,7 @@ def test_another_log_of_the_same_name_and_size_is_not_taken_for_the_one_that_was
     assert offload_json(logs, disk)[1]["may_be_deleted"] == [str(path)]
 
 
-def test_a_log_that_a_crash_left_open_is_copied_and_said(logs: Path, disk: Path) -> None:
+def test_a_log_left_open_by_a_crash_is_copied_and_reported(logs: Path, disk: Path) -> None:
     path = logs / f"{INFO.session_id}_0.mcap"
     write_part(path, finish=False)
     run = swath("offload", str(logs), str(disk), "--same-disk")
@@ -251,7 +249,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
         yield folder
 
 
-def test_a_full_disk_is_one_line_and_the_same_command_goes_on(logs: Path, small_disk: Path) -> None:
+def test_after_a_full_disk_the_same_command_continues(logs: Path, small_disk: Path) -> None:
     for part in range(4):
         write_part(logs / f"flight_{part}.mcap", part=part, blocks=100)
     filler = small_disk / "filler"
@@ -269,7 +267,7 @@ def test_a_full_disk_is_one_line_and_the_same_command_goes_on(logs: Path, small_
     assert coreutils_agree(small_disk) == 3
 
 
-def test_a_disk_that_fills_up_while_it_is_written(logs: Path, small_disk: Path) -> None:
+def test_a_disk_that_fills_up_during_writing_is_reported(logs: Path, small_disk: Path) -> None:
     write_part(logs / "flight_0.mcap", blocks=240)
 
     def fill(name: str, done: int, total: int) -> None:
@@ -285,7 +283,9 @@ def test_a_disk_that_fills_up_while_it_is_written(logs: Path, small_disk: Path) 
     assert coreutils_agree(small_disk) == 1
 
 
-def test_what_is_neither_a_directory_nor_a_configuration_is_one_line(disk: Path, tmp_path: Path) -> None:
+def test_a_source_that_is_neither_directory_nor_configuration_is_refused_in_one_line(
+    disk: Path, tmp_path: Path
+) -> None:
     text = tmp_path / "text.txt"
     text.write_text("line 4: start\n")
     for where, said in ((tmp_path / "nowhere", "no such file or directory"), (text, "not TOML: ")):
@@ -296,7 +296,7 @@ def test_what_is_neither_a_directory_nor_a_configuration_is_one_line(disk: Path,
         assert done.stderr.count("\n") == 1
 
 
-def test_what_cannot_be_a_destination_is_one_line(logs: Path, disk: Path, tmp_path: Path) -> None:
+def test_an_impossible_destination_is_refused_in_one_line(logs: Path, disk: Path, tmp_path: Path) -> None:
     write_part(logs / "flight_0.mcap")
     for where, to, code, said in (
         (logs, tmp_path / "not mounted", 3, "no such directory; check that the disk is mounted"),
@@ -308,7 +308,7 @@ def test_what_cannot_be_a_destination_is_one_line(logs: Path, disk: Path, tmp_pa
         assert said in run.stderr
 
 
-def test_a_list_of_sums_that_cannot_be_read_is_one_line(logs: Path, disk: Path) -> None:
+def test_an_unreadable_list_of_checksums_is_refused_in_one_line(logs: Path, disk: Path) -> None:
     write_part(logs / "flight_0.mcap")
     (disk / "SHA256SUMS").mkdir()
     run = swath("offload", "--same-disk", str(logs), str(disk))
@@ -317,9 +317,7 @@ def test_a_list_of_sums_that_cannot_be_read_is_one_line(logs: Path, disk: Path) 
     assert names(disk) == ["SHA256SUMS"]
 
 
-def test_the_folder_of_a_disk_that_is_not_mounted_is_not_taken_for_it(
-    logs: Path, small_disk: Path, tmp_path: Path
-) -> None:
+def test_the_mount_point_of_an_unmounted_disk_is_refused(logs: Path, small_disk: Path, tmp_path: Path) -> None:
     write_part(logs / "flight_0.mcap")
     usb = tmp_path / "usb"
     usb.mkdir()
@@ -333,7 +331,7 @@ def test_the_folder_of_a_disk_that_is_not_mounted_is_not_taken_for_it(
     assert (run.returncode, names(small_disk)) == (0, ["SHA256SUMS", "flight_0.mcap"])
 
 
-def test_a_log_that_is_moved_away_meanwhile_hinders_no_other(logs: Path, disk: Path) -> None:
+def test_a_log_moved_away_during_the_run_does_not_affect_the_others(logs: Path, disk: Path) -> None:
     for part in range(2):
         write_part(logs / f"flight_{part}.mcap", part=part)
     run_all(logs, disk)
@@ -347,7 +345,7 @@ def test_a_log_that_is_moved_away_meanwhile_hinders_no_other(logs: Path, disk: P
     assert report.deletable == [logs / "flight_1.mcap"]
 
 
-def test_a_log_that_is_moved_away_when_it_may_be_deleted_is_not_listed(
+def test_a_log_moved_away_before_deletion_is_not_listed(
     logs: Path, disk: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for part in range(2):
@@ -358,7 +356,7 @@ def test_a_log_that_is_moved_away_when_it_may_be_deleted_is_not_listed(
     assert [line for line in capsys.readouterr().out.splitlines() if "rm " in line] == [f"  rm {logs}/flight_1.mcap"]
 
 
-def test_a_disk_mounted_read_only_is_one_line(logs: Path, small_disk: Path) -> None:
+def test_a_read_only_disk_is_reported_in_one_line(logs: Path, small_disk: Path) -> None:
     for part in range(2):
         write_part(logs / f"flight_{part}.mcap", part=part)
     subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=True)
@@ -383,7 +381,7 @@ def test_one_run_at_a_time(logs: Path, disk: Path) -> None:
     assert swath("offload", str(logs), str(disk), "--same-disk").returncode == 0
 
 
-def test_the_list_keeps_other_lines_and_writes_odd_names_as_coreutils_do(disk: Path) -> None:
+def test_the_list_keeps_other_lines_and_escapes_names_as_coreutils_do(disk: Path) -> None:
     odd = ["with space.mcap", "back\\slash.mcap", "new\nline.mcap", "return\r.mcap"]
     for name in odd:
         (disk / name).write_bytes(name.encode())

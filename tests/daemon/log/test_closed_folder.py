@@ -55,7 +55,7 @@ def closed() -> Iterator[Path]:
 
 
 @pytest.mark.parametrize("directory", ["logs", "logs/absent", "absent"])
-def test_check_and_doctor_say_which_folder_is_closed(closed: Path, directory: str) -> None:
+def test_check_and_doctor_name_the_inaccessible_folder(closed: Path, directory: str) -> None:
     words = [sys.executable, "-c", AS_NOBODY, session_table(closed / directory)]
     done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=HANGS_S, check=False)
     assert done.returncode == 0, done.stderr
@@ -76,7 +76,7 @@ def test_check_and_doctor_say_which_folder_is_closed(closed: Path, directory: st
     ]
 
 
-def test_the_nearest_folder_that_is_there(tmp_path: Path) -> None:
+def test_the_nearest_existing_folder_is_found(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     assert nearest_there(tmp_path) == (tmp_path, True)
     assert nearest_there(tmp_path / "a/b") == (tmp_path, True)

@@ -40,14 +40,14 @@ def converter(monkeypatch: pytest.MonkeyPatch) -> StampConverter:
     return StampConverter(HostClock(pair(0)))
 
 
-def test_stamps_without_a_step_are_host_time(converter: StampConverter) -> None:
+def test_timestamps_without_a_step_are_host_time(converter: StampConverter) -> None:
     stamps = np.array([host(0.9), host(0.95)], dtype=np.int64)
     assert converter.convert_at(stamps, 2, pair(1.0)).tolist() == [host(0.9), host(0.95)]
     assert converter.ambiguous == 0
 
 
 @pytest.mark.parametrize("step_ns", [HOUR, -HOUR, 60_000, -60_000])
-def test_batch_across_a_step_takes_old_and_new(converter: StampConverter, step_ns: int) -> None:
+def test_a_batch_across_a_step_uses_both_offsets(converter: StampConverter, step_ns: int) -> None:
     converter.convert_at(None, 1, pair(1.0))
     before = np.array([host(1.2)], dtype=np.int64)  # stamped before the step, read after it
     after = np.array([host(1.4) + step_ns], dtype=np.int64)
@@ -63,7 +63,7 @@ def test_batch_across_a_step_takes_old_and_new(converter: StampConverter, step_n
     assert converter.convert_at(later, 1, pair(1.8, step_ns)).tolist() == [host(1.7)]
 
 
-def test_stamp_that_fits_neither_step_takes_the_read_time(converter: StampConverter) -> None:
+def test_a_timestamp_that_fits_neither_offset_uses_the_read_time(converter: StampConverter) -> None:
     converter.convert_at(None, 1, pair(1.0))
     stale = np.array([host(-600)], dtype=np.int64)
     assert converter.convert_at(stale, 1, pair(1.5, HOUR)).tolist() == [host(1.5)]
@@ -71,7 +71,7 @@ def test_stamp_that_fits_neither_step_takes_the_read_time(converter: StampConver
 
 
 @pytest.mark.parametrize("step_ns", [HOUR, -HOUR, SECOND, -SECOND])
-def test_unit_that_came_before_the_reading_after_the_previous_batch(converter: StampConverter, step_ns: int) -> None:
+def test_a_unit_between_a_reading_and_the_previous_batch_is_timed(converter: StampConverter, step_ns: int) -> None:
     converter.convert_at(None, 1, pair(1.0))
     came = np.array([host(0.98)], dtype=np.int64)  # the thread was kept waiting between its read and the clocks'
     assert converter.convert_at(came, 1, pair(1.5, step_ns)).tolist() == [host(0.98)]
@@ -85,7 +85,7 @@ def test_a_wide_bracket_is_not_taken_for_a_step(converter: StampConverter) -> No
     assert converter.ambiguous == 0
 
 
-def test_a_stamp_by_a_clock_that_was_stepped_on_and_back_takes_the_read_time(converter: StampConverter) -> None:
+def test_a_timestamp_of_a_clock_stepped_on_and_back_uses_the_read_time(converter: StampConverter) -> None:
     """Between two readings: no step is seen, and no unit comes an hour after it was read."""
     stamps = np.array([host(0.9), host(0.95) + HOUR], dtype=np.int64)
     assert converter.convert_at(stamps, 2, pair(1.0)).tolist() == [host(0.9), host(1.0)]
@@ -121,7 +121,7 @@ def test_clock_sample_has_the_three_clocks() -> None:
     assert -500 <= sample["frequency_ppm"] <= 500
 
 
-def test_a_clock_sample_says_the_greatest_error_of_a_wall_clock_that_is_kept() -> None:
+def test_a_clock_sample_gives_the_maximum_error_of_a_synchronised_wall_clock() -> None:
     assert read_clock_sample(ClockDiscipline(0.0, 0, 0.01))["max_error_s"] == 0.01
     assert "max_error_s" not in read_clock_sample(ClockDiscipline(0.0, STA_UNSYNC, 0.01))
 

@@ -45,12 +45,12 @@ def said_to_nobody(folder: Path) -> str:
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=HANGS_S, check=True).stdout
 
 
-def test_the_owner_of_a_directory_records_where_root_did(logs: Path) -> None:
+def test_the_owner_of_a_directory_records_after_root_did(logs: Path) -> None:
     os.close(take_directory(logs))
     assert said_to_nobody(logs) == ""
 
 
-def test_a_lock_that_is_not_his_is_named(logs: Path) -> None:
+def test_a_lock_of_another_user_is_named(logs: Path) -> None:
     (logs / LOCK).touch(0o600)
     assert said_to_nobody(logs) == (
         f"session.directory .: {LOCK}: Permission denied; a recording of another user left it; "
@@ -59,7 +59,7 @@ def test_a_lock_that_is_not_his_is_named(logs: Path) -> None:
 
 
 @pytest.mark.parametrize("symbolic", [True, False])
-def test_no_other_file_is_given_away(logs: Path, tmp_path: Path, symbolic: bool) -> None:
+def test_no_other_file_changes_its_owner(logs: Path, tmp_path: Path, symbolic: bool) -> None:
     other = tmp_path / "roots"
     other.touch(0o600)
     if symbolic:

@@ -125,7 +125,7 @@ def test_official_readers_and_ours_agree(tmp_path: Path, compression: str) -> No
     assert kinds == ({"", "lz4"} if compression == "auto" else {compression.replace("none", "")})
 
 
-def test_session_metadata_and_attachment_for_others(whole: tuple[Path, Content]) -> None:
+def test_session_metadata_and_attachments_are_readable_by_others(whole: tuple[Path, Content]) -> None:
     with whole[0].open("rb") as file:
         reader = make_reader(file)
         (metadata,) = reader.iter_metadata()
@@ -141,7 +141,7 @@ def test_a_part_is_never_overwritten(whole: tuple[Path, Content]) -> None:
     assert whole[0].read_bytes() == before
 
 
-def test_by_time_merges_the_chunk_classes(whole: tuple[Path, Content]) -> None:
+def test_messages_are_merged_by_time_across_chunk_classes(whole: tuple[Path, Content]) -> None:
     (session,) = open_logs([whole[0]])
     times: list[int] = []
     found: Content = {}
@@ -166,7 +166,9 @@ def is_prefix(found: Content, content: Content) -> bool:
     return all(found[topic] == content[topic][: len(found[topic])] for topic in found)
 
 
-def test_cut_anywhere_gives_every_whole_chunk_and_recovers(tmp_path: Path, whole: tuple[Path, Content]) -> None:
+def test_a_truncated_log_gives_every_whole_chunk_and_can_be_recovered(
+    tmp_path: Path, whole: tuple[Path, Content]
+) -> None:
     data = whole[0].read_bytes()
     boundaries = []
     for found in scan(io.BytesIO(data), len(data)):
@@ -191,7 +193,9 @@ def test_cut_anywhere_gives_every_whole_chunk_and_recovers(tmp_path: Path, whole
     assert counts[-1] == sum(map(len, whole[1].values()))
 
 
-def test_recovered_file_is_good_for_the_doctor_and_supersedes(tmp_path: Path, whole: tuple[Path, Content]) -> None:
+def test_a_recovered_file_is_accepted_by_the_doctor_and_supersedes_the_original(
+    tmp_path: Path, whole: tuple[Path, Content]
+) -> None:
     path = tmp_path / whole[0].name
     path.write_bytes(whole[0].read_bytes()[:900_000])
     before = path.read_bytes()
@@ -208,7 +212,7 @@ def test_recovered_file_is_good_for_the_doctor_and_supersedes(tmp_path: Path, wh
     assert recover(report.recovered).whole
 
 
-def test_tail_of_zeros(tmp_path: Path, whole: tuple[Path, Content]) -> None:
+def test_a_tail_of_zeros_is_ignored(tmp_path: Path, whole: tuple[Path, Content]) -> None:
     """What ext4 leaves after a power cut: the length is there, the bytes are not."""
     data = whole[0].read_bytes()
     path = tmp_path / "zeros.mcap"
@@ -247,7 +251,7 @@ DAMAGE = st.lists(
 
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(DAMAGE)
-def test_any_damage_is_told_and_nothing_false_is_given(
+def test_any_damage_is_reported_and_no_false_data_is_given(
     tmp_path: Path, whole: tuple[Path, Content], damage: list[tuple[float, bytes, bool]]
 ) -> None:
     content = bytearray(whole[0].read_bytes())
@@ -273,7 +277,7 @@ def test_any_damage_is_told_and_nothing_false_is_given(
 # ------------------------------------------------------------------ strangers
 
 
-def test_absurd_lengths_and_bombs_are_refused(tmp_path: Path) -> None:
+def test_absurd_lengths_and_decompression_bombs_are_refused(tmp_path: Path) -> None:
     bomb = struct.pack("<QQQII", 0, 1, 1 << 40, 0, 3) + b"lz4" + struct.pack("<Q", 4) + b"\0" * 4
     with pytest.raises(LogError, match="claims"):
         unpack_chunk(bomb)
@@ -291,7 +295,7 @@ def test_attachment_names_that_are_paths_are_refused(tmp_path: Path, name: str) 
     assert safe_attachment_path(tmp_path, "dbc/imu.dbc") == tmp_path / "dbc" / "imu.dbc"
 
 
-def test_files_that_are_no_logs_are_refused_in_a_line(tmp_path: Path) -> None:
+def test_files_that_are_not_logs_are_refused_in_one_line(tmp_path: Path) -> None:
     for name, data in (("text.mcap", b"hello"), ("empty.mcap", b""), ("magic.mcap", b"\x89MCAP0\r\n")):
         path = tmp_path / name
         path.write_bytes(data)
@@ -314,7 +318,7 @@ def test_files_that_are_no_logs_are_refused_in_a_line(tmp_path: Path) -> None:
         open_logs([empty])
 
 
-def test_a_strangers_chunk_with_a_malformed_channel_costs_that_chunk_only(
+def test_a_foreign_chunk_with_a_malformed_channel_costs_only_that_chunk(
     tmp_path: Path, whole: tuple[Path, Content]
 ) -> None:
     records = struct.pack("<BQ", 4, 3) + b"abc"  # a channel record is longer; the chunk's CRC is right
@@ -357,7 +361,7 @@ def test_parts_are_ordered_and_a_missing_one_is_named(tmp_path: Path) -> None:
         open_logs([tmp_path])
 
 
-def test_what_a_writer_lays_at_once_after_a_stall_is_read_in_order_of_time(tmp_path: Path) -> None:
+def test_chunks_written_at_once_after_a_stall_are_read_in_time_order(tmp_path: Path) -> None:
     writer = PartWriter(tmp_path / "stalled.mcap", INFO, 0)
     writer.add_channel(1, SCANNER)
     writer.add_channel(2, ROVER)
@@ -373,7 +377,7 @@ def test_what_a_writer_lays_at_once_after_a_stall_is_read_in_order_of_time(tmp_p
     assert (np.diff(times) >= 0).all()
 
 
-def test_of_a_directory_without_a_log_it_is_said_why(tmp_path: Path) -> None:
+def test_error_for_a_directory_without_logs_gives_the_reason(tmp_path: Path) -> None:
     for name in ("a", "b"):
         (tmp_path / f"{name}.mcap").touch()
     with pytest.raises(LogError) as error:
@@ -384,7 +388,7 @@ def test_of_a_directory_without_a_log_it_is_said_why(tmp_path: Path) -> None:
 # ------------------------------------------------------------------ a disk that refuses
 
 
-def test_refused_chunk_is_counted_cut_back_and_the_writer_goes_on(tmp_path: Path) -> None:
+def test_a_refused_chunk_is_counted_and_removed_and_the_writer_continues(tmp_path: Path) -> None:
     path = tmp_path / "limited.mcap"
     writer = PartWriter(path, INFO, 0)
     writer.add_channel(1, SCANNER)
@@ -417,7 +421,7 @@ def test_refused_chunk_is_counted_cut_back_and_the_writer_goes_on(tmp_path: Path
     assert doctor(path).returncode == 0
 
 
-def test_a_claim_is_got_although_somebody_asks_at_this_moment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_claim_succeeds_during_a_query_by_another_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "x.mcap"
     path.write_bytes(b"")
     with path.open("rb") as asking, path.open("ab") as writing:

@@ -20,7 +20,7 @@ COUNTS = [1, 1, 2, 3, 14, ONE_BY_ONE - 1, ONE_BY_ONE, ONE_BY_ONE + 1, 3 * ONE_BY
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_runs_are_whole_and_nothing_is_missing(seed: int) -> None:
+def test_runs_are_complete_and_contiguous(seed: int) -> None:
     chance = random.Random(seed)
     written: list[tuple[int, int, bytes]] = []  # channel, time, data
     data = b""

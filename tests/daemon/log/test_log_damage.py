@@ -44,7 +44,7 @@ CHUNK, INDEX, DATA_END = 6, 7, 15
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> bytes:
-    """A finished part."""
+    """Return a finished part."""
     path = tmp_path_factory.mktemp("log") / "whole.mcap"
     write_part(path)
     return path.read_bytes()
@@ -57,7 +57,7 @@ def records_of(data: bytes) -> list[Record]:
 
 
 def scanned(data: bytes) -> tuple[int, list[Damage]]:
-    """Good chunks and damage."""
+    """Return intact chunks and damage."""
     found = list(scan(io.BytesIO(data), len(data)))
     chunks = sum(isinstance(one, Record) and one.opcode == CHUNK for one in found)
     return chunks, [one for one in found if isinstance(one, Damage)]
@@ -66,7 +66,7 @@ def scanned(data: bytes) -> tuple[int, list[Damage]]:
 # ------------------------------------------------------------------ the end
 
 
-def test_every_cut_of_the_end_is_told_and_mended(tmp_path: Path, data: bytes) -> None:
+def test_every_truncation_of_the_end_is_reported_and_repaired(tmp_path: Path, data: bytes) -> None:
     """Nothing of the data is lost, but no other reader opens such a file by its index."""
     end = records_of(data)[-1]
     assert end.opcode == DATA_END
@@ -82,7 +82,7 @@ def test_every_cut_of_the_end_is_told_and_mended(tmp_path: Path, data: bytes) ->
         report.recovered.unlink()
 
 
-def test_every_byte_of_the_end_that_is_wrong_is_told(data: bytes) -> None:
+def test_every_wrong_byte_of_the_end_is_reported(data: bytes) -> None:
     end = records_of(data)[-1]
     chunks, _ = scanned(data)
     for at in range(end.offset, len(data)):
@@ -95,7 +95,7 @@ def test_every_byte_of_the_end_that_is_wrong_is_told(data: bytes) -> None:
         assert found == chunks
 
 
-def test_padding_behind_the_end_is_told(data: bytes) -> None:
+def test_padding_after_the_end_is_reported(data: bytes) -> None:
     _, damage = scanned(data + bytes(4096))
     assert [one.what for one in damage] == ["index and footer are missing, cut off or wrong"]
 
@@ -103,8 +103,8 @@ def test_padding_behind_the_end_is_told(data: bytes) -> None:
 # ------------------------------------------------------------------ between chunks
 
 
-def test_a_wrong_head_outside_chunks_leads_past_no_chunk(data: bytes) -> None:
-    """Every bit of every head between chunks: all chunks are still read, and what is unreadable is told."""
+def test_a_wrong_record_head_between_chunks_hides_no_chunk(data: bytes) -> None:
+    """Flip every bit of every record head between chunks: all chunks are read, and unreadable bytes are reported."""
     chunks, _ = scanned(data)
     outside = [one for one in records_of(data) if one.opcode not in (CHUNK, DATA_END)]
     for record in outside:
@@ -130,8 +130,8 @@ def test_a_damaged_chunk_head_costs_that_chunk_only(data: bytes) -> None:
         assert damage
 
 
-def test_records_of_others_are_passed_over(tmp_path: Path, data: bytes) -> None:
-    """An opcode we do not know is none of our business; official readers pass over it as well."""
+def test_unknown_records_are_skipped(tmp_path: Path, data: bytes) -> None:
+    """Official readers skip unknown opcodes as well."""
     chunk = next(one for one in records_of(data) if one.opcode == CHUNK)
     private = struct.pack("<BQ", 0x93, 5000) + bytes(range(250)) * 20
     path = tmp_path / "private.mcap"
@@ -141,7 +141,7 @@ def test_records_of_others_are_passed_over(tmp_path: Path, data: bytes) -> None:
     assert [one.what for one in damage] == ["index and footer are missing, cut off or wrong"]  # it points elsewhere now
 
 
-def test_messages_that_no_crc_covers_are_not_used(tmp_path: Path, data: bytes) -> None:
+def test_messages_not_covered_by_a_crc_are_not_used(tmp_path: Path, data: bytes) -> None:
     chunk = next(one for one in records_of(data) if one.opcode == CHUNK)
     loose = struct.pack("<BQHIQQ", 5, 22 + 4, 1, 0, 1, 1) + b"evil"
     content = data[: chunk.offset] + loose * 1000 + data[chunk.offset :]
@@ -161,9 +161,7 @@ def test_a_chunk_without_crc_is_not_used() -> None:
 
 @settings(max_examples=100, deadline=None)
 @given(st.integers(0, 2**32), st.integers(1, 70_000), st.booleans())
-def test_bytes_overwritten_anywhere_cost_what_they_touch_and_no_more(
-    data: bytes, seed: int, n: int, zero: bool
-) -> None:
+def test_overwritten_bytes_cost_only_the_chunks_they_touch(data: bytes, seed: int, n: int, zero: bool) -> None:
     rng = np.random.default_rng(seed)
     at = int(rng.integers(8, len(data) - n))
     content = bytearray(data)
@@ -178,8 +176,8 @@ def test_bytes_overwritten_anywhere_cost_what_they_touch_and_no_more(
     assert same or damage or not touched
 
 
-def test_a_field_of_false_chunk_heads_is_searched_fast(data: bytes) -> None:
-    """Garbage full of what looks like a chunk of 16 MB: each is weighed by its head, none is read."""
+def test_false_chunk_heads_are_searched_quickly(data: bytes) -> None:
+    """Search garbage full of heads of 16 MB chunks: each is rejected by its head, and none is read."""
     false_head = struct.pack("<BQ", CHUNK, 16 << 20)
     chunk = next(one for one in records_of(data) if one.opcode == CHUNK)
 
@@ -210,7 +208,7 @@ def by_small_mcap(path: Path) -> Content:
 
 
 @pytest.mark.parametrize("compression", ["auto", "none", "lz4", "zstd"])
-def test_finished_and_recovered_files_for_every_reader(tmp_path: Path, compression: str) -> None:
+def test_finished_and_recovered_files_are_readable_by_every_reader(tmp_path: Path, compression: str) -> None:
     path = tmp_path / "whole.mcap"
     content = write_part(path, compression=compression)
     assert {topic: sorted(rows) for topic, rows in by_small_mcap(path).items()} == content
@@ -236,7 +234,7 @@ def test_finished_and_recovered_files_for_every_reader(tmp_path: Path, compressi
 # ------------------------------------------------------------------ what stands in a directory
 
 
-def test_what_was_lost_is_known_to_the_message_where_the_end_is_whole(tmp_path: Path, data: bytes) -> None:
+def test_lost_messages_are_counted_exactly_if_the_end_is_intact(tmp_path: Path, data: bytes) -> None:
     content = bytearray(data)
     content[700_000:765_536] = bytes(65_536)
     path = tmp_path / "middle.mcap"
@@ -248,7 +246,7 @@ def test_what_was_lost_is_known_to_the_message_where_the_end_is_whole(tmp_path: 
     assert examine(path).messages_lost is None
 
 
-def test_a_log_that_is_being_recorded_is_read_without_blame_and_not_recovered(tmp_path: Path) -> None:
+def test_a_log_being_recorded_is_read_without_complaint_and_not_recovered(tmp_path: Path) -> None:
     """A copy of what is there so far would stand for the log when it is finished."""
     path = tmp_path / f"{INFO.session_id}_0.mcap"
     writer = PartWriter(path, INFO, 0)
@@ -274,7 +272,7 @@ def test_a_log_that_is_being_recorded_is_read_without_blame_and_not_recovered(tm
     assert recover(path).recovered is not None
 
 
-def test_a_part_that_a_crash_left_empty_hinders_no_other(tmp_path: Path) -> None:
+def test_a_part_left_empty_by_a_crash_does_not_affect_the_others(tmp_path: Path) -> None:
     good, cut = tmp_path / "a.mcap", tmp_path / "c.mcap"
     write_part(good)
     write_part(cut, part=1, finish=False)
@@ -300,8 +298,8 @@ def test_a_part_that_a_crash_left_empty_hinders_no_other(tmp_path: Path) -> None
         open_logs([tmp_path])
 
 
-def test_what_a_strangers_log_says_is_not_believed_and_is_no_markup(tmp_path: Path) -> None:
-    """JSON that is none, numbers that are none, console markup and control characters."""
+def test_text_of_a_foreign_log_is_validated_and_escaped(tmp_path: Path) -> None:
+    """Try invalid JSON, invalid numbers, console markup and control characters."""
     path = tmp_path / "stranger.mcap"
     writer = PartWriter(path, INFO, 0)
     writer.add_channel(1, EVENTS)
@@ -323,7 +321,7 @@ def test_what_a_strangers_log_says_is_not_believed_and_is_no_markup(tmp_path: Pa
     assert examine(path).whole
 
 
-def test_messages_whose_channel_was_lost_are_told(tmp_path: Path) -> None:
+def test_messages_whose_channel_was_lost_are_reported(tmp_path: Path) -> None:
     """In a log of another writer the channel's record stands once, in the first chunk that uses it."""
     path = tmp_path / "other.mcap"
     with path.open("wb") as file:
@@ -347,7 +345,7 @@ def test_messages_whose_channel_was_lost_are_told(tmp_path: Path) -> None:
     assert examine(path).messages_lost == 100
 
 
-def test_stamps_that_step_back_within_a_batch_are_merged_in_order(tmp_path: Path) -> None:
+def test_timestamps_that_step_back_within_a_batch_are_merged_in_order(tmp_path: Path) -> None:
     path = tmp_path / "steps.mcap"
     writer = PartWriter(path, INFO, 0)
     writer.add_channel(1, SCANNER)
@@ -365,7 +363,7 @@ def test_stamps_that_step_back_within_a_batch_are_merged_in_order(tmp_path: Path
     assert (np.diff(times) >= 0).all()
 
 
-def test_where_the_last_chunk_finds_no_room_the_end_still_may(tmp_path: Path) -> None:
+def test_the_end_may_be_written_even_if_the_last_chunk_does_not_fit(tmp_path: Path) -> None:
     path = tmp_path / "full.mcap"
     writer = PartWriter(path, INFO, 0)
     writer.add_channel(1, SCANNER)
@@ -386,7 +384,7 @@ def test_where_the_last_chunk_finds_no_room_the_end_still_may(tmp_path: Path) ->
     assert len(official(path)[SCANNER.topic]) == 400
 
 
-def test_units_without_bytes_and_blocks_without_units(tmp_path: Path) -> None:
+def test_empty_units_and_empty_blocks_are_logged(tmp_path: Path) -> None:
     """A datagram may be empty."""
     path = tmp_path / "empty.mcap"
     writer = PartWriter(path, INFO, 0)

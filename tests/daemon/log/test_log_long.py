@@ -18,7 +18,7 @@ PACKAGES = ("@mcap/core", "@mcap/support", "@mcap/nodejs")
 
 @pytest.fixture(scope="module")
 def reader(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The script beside the packages it needs."""
+    """Return the script beside its packages."""
     if shutil.which("npm") is None:
         pytest.fail("npm is not installed: apt-get install nodejs npm")
     folder = tmp_path_factory.mktemp("npm")
@@ -43,7 +43,9 @@ def counts(reader: Path, path: Path) -> dict[str, dict[str, int]]:
 
 @pytest.mark.long
 @pytest.mark.parametrize("compression", ["auto", "none", "lz4", "zstd"])
-def test_finished_and_recovered_files(reader: Path, tmp_path: Path, compression: str) -> None:
+def test_long_finished_and_recovered_files_are_readable_by_every_reader(
+    reader: Path, tmp_path: Path, compression: str
+) -> None:
     whole = tmp_path / "whole.mcap"
     content = write_part(whole, compression=compression)
     expected = {topic: len(rows) for topic, rows in content.items()}

@@ -130,7 +130,7 @@ def zstd_bomb() -> bytes:
 
 
 def claiming(name: bytes, stored: bytes, size: int) -> bytes:
-    """A chunk of those bytes that says it unfolds to so many."""
+    """Return a chunk of those bytes that states the given uncompressed size."""
     body = struct.pack("<QQQII", 0, 1, size, 1, len(name)) + name + struct.pack("<Q", len(stored)) + stored
     return mcap.record(mcap.CHUNK, body)
 
@@ -179,7 +179,7 @@ def schemas_not_ours() -> bytes:
 
 
 def channels_of_one_number() -> bytes:
-    """Number 1 is two channels; number 7 is none."""
+    """Return a file in which number 1 denotes two channels and number 7 none."""
     again = channel(1, "/imu/main/raw")
     return log_of(
         GOOD, chunk(again, message(1, START_NS)), again, chunk(message(7, START_NS), ROVER, message(1, START_NS))
@@ -187,7 +187,7 @@ def channels_of_one_number() -> bytes:
 
 
 def many_channels() -> bytes:
-    """Fifteen thousand, with long names."""
+    """Return a file with fifteen thousand channels with long names."""
     return log_of(
         *(
             chunk(*(channel(at, f"/{at}{'x' * 4000}/raw") for at in range(first, first + 3000)), compression=b"zstd")
@@ -223,7 +223,7 @@ COMMANDS = ("info", "recover", "replay", "export")
 
 @pytest.fixture(scope="module")
 def told(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str], dict[str, Any]]:
-    """What every command said of every file, and what it left behind."""
+    """Run every command on every file; return the output and the files left behind."""
     folder = tmp_path_factory.mktemp("stranger")
     (folder / "wire.toml").write_text(
         session_table(folder / "logs")
@@ -270,7 +270,7 @@ def _files(folder: Path) -> set[Path]:
 
 @pytest.mark.parametrize("command", COMMANDS)
 @pytest.mark.parametrize("name", FILES)
-def test_it_is_read_or_refused_in_few_words_and_little_memory(
+def test_a_foreign_log_is_read_or_refused_in_few_words_and_little_memory(
     told: dict[tuple[str, str], dict[str, Any]], name: str, command: str
 ) -> None:
     said = told[name, command]
@@ -289,7 +289,7 @@ def write(tmp_path: Path, data: bytes) -> Path:
     return path
 
 
-def test_a_schema_that_is_not_ours_is_recovered_with_its_messages(tmp_path: Path) -> None:
+def test_a_foreign_schema_is_recovered_with_its_messages(tmp_path: Path) -> None:
     """The official reader finds the stranger's schema, by its name and text, with the copy's messages."""
     report = recover(write(tmp_path, schemas_not_ours()))
     assert report.messages == {"/stranger/things": 1, "/gnss/rover/raw": 1, "/x/y": 1}
@@ -304,7 +304,7 @@ def test_a_schema_that_is_not_ours_is_recovered_with_its_messages(tmp_path: Path
     assert found["/gnss/rover/raw"] is None
 
 
-def test_times_that_cannot_be_are_counted_and_the_others_kept(tmp_path: Path) -> None:
+def test_impossible_times_are_counted_and_the_other_messages_kept(tmp_path: Path) -> None:
     """Two messages of each order of times have the sign bit; what is left is copied with the stamps it has."""
     path = write(tmp_path, times_beyond_reason())
     report = recover(path)
@@ -318,7 +318,7 @@ def test_times_that_cannot_be_are_counted_and_the_others_kept(tmp_path: Path) ->
     assert sorted(times.tolist()) == kept
 
 
-def test_a_channel_that_becomes_another_is_refused(tmp_path: Path) -> None:
+def test_a_channel_that_changes_its_topic_is_refused(tmp_path: Path) -> None:
     """Its later messages are not put under the topic of the earlier ones, nor the other way round."""
     report = examine(write(tmp_path, channels_of_one_number()))
     assert report.messages == {"/gnss/rover/raw": 2}
@@ -327,7 +327,7 @@ def test_a_channel_that_becomes_another_is_refused(tmp_path: Path) -> None:
     assert report.damage[2].what == "messages of channel 7, whose record is lost"
 
 
-def test_a_thousand_places_of_damage_are_listed(tmp_path: Path) -> None:
+def test_a_thousand_damaged_places_are_listed(tmp_path: Path) -> None:
     path = write(tmp_path, damage_without_end())
     report = examine(path)
     assert len(report.damage) == 1000
@@ -337,7 +337,7 @@ def test_a_thousand_places_of_damage_are_listed(tmp_path: Path) -> None:
     assert len(session.damage) == 1001
 
 
-def test_a_number_of_a_part_beyond_reason_is_no_log(tmp_path: Path) -> None:
+def test_a_file_with_an_absurd_part_number_is_refused(tmp_path: Path) -> None:
     with pytest.raises(LogError, match="is none, want 0 to"):
         open_logs([write(tmp_path, parts_beyond_reason())])
     (session,) = open_logs([write(tmp_path, session_that_leads_elsewhere())])

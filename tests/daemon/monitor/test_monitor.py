@@ -112,7 +112,7 @@ def comes_as_sent(found: dict[str, Any]) -> bool:
 
 
 @pytest.mark.slow
-def test_says_what_comes_and_that_all_is_well(tmp_path: Path, logs: Path) -> None:
+def test_monitor_shows_the_sources_and_that_all_is_well(tmp_path: Path, logs: Path) -> None:
     port = free_udp_port()
     with Recorder(tmp_path, session_table(logs) + scanner(port)) as recorder, srep_sender(port, 200.0):
         recorder.wait_said("device_opened")
@@ -136,8 +136,8 @@ def test_says_what_comes_and_that_all_is_well(tmp_path: Path, logs: Path) -> Non
     assert line.stdout.count("\n") == 1
 
 
-def test_gaps_in_a_sequence_and_damaged_messages_degrade(tmp_path: Path, logs: Path) -> None:
-    """Of every hundred datagrams three are never sent; of every two sentences one has a wrong checksum."""
+def test_sequence_gaps_and_damaged_messages_degrade_the_verdict(tmp_path: Path, logs: Path) -> None:
+    """Three of every hundred datagrams are omitted; one of two sentences has a wrong checksum."""
     port = free_udp_port()
     good = nmea("GPZDA,101500.00,21,11,2026,00,00")
     bad = good.replace(b"ZDA", b"ZDB")
@@ -193,7 +193,7 @@ def test_a_device_inside_a_stream_is_decoded_from_it(tmp_path: Path, logs: Path)
 
 
 @pytest.mark.slow
-def test_a_silent_source_degrades_and_an_absent_one(tmp_path: Path, logs: Path) -> None:
+def test_silent_and_absent_sources_degrade_the_verdict(tmp_path: Path, logs: Path) -> None:
     config = session_table(logs) + scanner(free_udp_port()) + ROVER.format(path=tmp_path / "nothing")
     with Recorder(tmp_path, config) as recorder:
         recorder.wait_said("scanner/left silent")
@@ -209,7 +209,7 @@ def test_a_silent_source_degrades_and_an_absent_one(tmp_path: Path, logs: Path) 
     assert said[-1].stdout.startswith("DEGRADED: recording ")
 
 
-def test_nothing_recorded_is_2_and_says_why(tmp_path: Path, logs: Path) -> None:
+def test_without_a_recording_monitor_exits_with_2_and_gives_the_reason(tmp_path: Path, logs: Path) -> None:
     logs.mkdir()
     run = swath("monitor", "--once", str(logs))
     assert (run.returncode, run.stdout) == (2, f"NOT RECORDING: no recording in {logs}\n")
@@ -227,7 +227,7 @@ def test_nothing_recorded_is_2_and_says_why(tmp_path: Path, logs: Path) -> None:
 
 
 @pytest.mark.slow
-def test_stopped_at_the_reserve_is_not_recording(tmp_path: Path) -> None:
+def test_a_recorder_stopped_at_the_reserve_is_not_recording(tmp_path: Path) -> None:
     """A note waits for room, a new part is refused."""
     logs = tmp_path / "disk/logs"
     with (
@@ -253,7 +253,7 @@ def test_stopped_at_the_reserve_is_not_recording(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_writer_that_stands_still_is_not_recording(tmp_path: Path, logs: Path) -> None:
+def test_a_stuck_writer_is_not_recording(tmp_path: Path, logs: Path) -> None:
     with Recorder(tmp_path, session_table(logs)) as recorder:
         time.sleep(1.5)
         recorder.process.send_signal(signal.SIGSTOP)
@@ -269,7 +269,7 @@ def test_a_writer_that_stands_still_is_not_recording(tmp_path: Path, logs: Path)
 def test_the_log_of_another_computer_is_judged_by_its_growth(
     tmp_path: Path, logs: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As over a network: its clocks are others, its locks are not seen."""
+    """This is the case over a network: clocks differ, and locks are not visible."""
     monkeypatch.setenv("SWATH_BOOT_ID", str(uuid.UUID(int=7)))
     port = free_udp_port()
     with Recorder(tmp_path, session_table(logs) + scanner(port)) as recorder, srep_sender(port, 100.0):
@@ -296,7 +296,7 @@ def test_the_log_of_another_computer_is_judged_by_its_growth(
 
 
 @pytest.mark.slow
-def test_the_log_of_a_power_cut_is_not_called_recording_after_the_restart(tmp_path: Path, logs: Path) -> None:
+def test_after_a_power_cut_and_restart_the_old_log_is_not_recording(tmp_path: Path, logs: Path) -> None:
     """The sign of what is recorded outlives the recorder; the recorder of another boot has no lock to be seen."""
     with Recorder(tmp_path, session_table(logs)) as recorder:
         recorder.wait_said("session_started")
@@ -335,7 +335,7 @@ def units_of(follower: LogFollower) -> list[int]:
 
 
 @pytest.mark.slow
-def test_follows_over_parts_a_kill_and_a_restart(tmp_path: Path, logs: Path) -> None:
+def test_monitor_follows_parts_a_kill_and_a_restart(tmp_path: Path, logs: Path) -> None:
     """What is followed is what is in the files, each unit once, in order."""
     numbers = Numbers(free_udp_port())
     config = session_table(logs) + scanner(numbers.port)
@@ -379,7 +379,7 @@ def test_follows_over_parts_a_kill_and_a_restart(tmp_path: Path, logs: Path) -> 
     assert len(seen) == numbers.sent == 700
 
 
-def test_a_chunk_is_taken_once_it_is_whole(tmp_path: Path) -> None:
+def test_a_chunk_is_read_once_it_is_complete(tmp_path: Path) -> None:
     """A log that grows by odd pieces gives what it gives when it is read at once."""
     whole, growing = tmp_path / f"{INFO.session_id}_0.mcap", tmp_path / "growing.mcap"
     write_part(whole)
@@ -416,7 +416,7 @@ def test_a_damaged_chunk_is_counted_and_the_next_one_read(tmp_path: Path) -> Non
     assert 0 < found < expected
 
 
-def test_a_damaged_chunk_of_the_growing_log_degrades(tmp_path: Path) -> None:
+def test_a_damaged_chunk_of_the_growing_log_degrades_the_verdict(tmp_path: Path) -> None:
     """What the disk made of the log since is lost as well; the next session begins without."""
     path = tmp_path / f"{INFO.session_id}_0.mcap"
     write_part(path, finish=False)
@@ -460,7 +460,7 @@ class Costly(PacketParser):
         return []
 
 
-def test_a_costly_parser_is_given_a_share_only(tmp_path: Path) -> None:
+def test_an_expensive_parser_gets_only_a_share_of_the_time(tmp_path: Path) -> None:
     path = tmp_path / f"{INFO.session_id}_0.mcap"
     write_part(path)
     (session,) = open_logs([path])
@@ -477,7 +477,7 @@ def test_a_costly_parser_is_given_a_share_only(tmp_path: Path) -> None:
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_memory_is_bounded_and_processor_little(tmp_path: Path, logs: Path) -> None:
+def test_memory_is_bounded_and_processor_load_is_low(tmp_path: Path, logs: Path) -> None:
     """Over some 100 MB its memory stands still; it costs less than the recorder it looks at would notice."""
     port = free_udp_port()
     with Recorder(tmp_path, session_table(logs, split_size_mb=16) + scanner(port)) as recorder:
@@ -515,7 +515,7 @@ def _processor_s(pid: int) -> float:
 
 
 @pytest.mark.slow
-def test_on_a_terminal_it_is_a_page_until_ctrl_c(tmp_path: Path, logs: Path) -> None:
+def test_on_a_terminal_a_page_is_shown_until_ctrl_c(tmp_path: Path, logs: Path) -> None:
     port = free_udp_port()
     main, secondary = pty.openpty()
     environment = os.environ | {"TERM": "xterm", "COLUMNS": "100", "LINES": "30"}
@@ -562,7 +562,7 @@ def test_the_page_fits_and_hides_no_number(tmp_path: Path, columns: int) -> None
     assert "…" not in text
 
 
-def test_sigma_is_told_in_its_unit() -> None:
+def test_sigma_is_shown_in_its_unit() -> None:
     assert time_text({"time_state": "LOCKED", "time_sigma_ns": 312.0}) == "LOCKED ±0.3 µs"
     assert time_text({"time_state": "COARSE", "time_sigma_ns": 289e6}) == "COARSE ±289 ms"
     assert time_text({"time_state": "NO_TIME", "time_sigma_ns": None}) == "NO_TIME"

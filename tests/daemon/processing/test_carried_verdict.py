@@ -57,7 +57,7 @@ def said_of(one: Calibration, source: str = "navigated", installation: str = "HB
     return list(calibration_verdicts(setup, source))
 
 
-def test_a_nominal_calibration_is_not_to_be_used_and_says_by_how_much_points_may_lie_off() -> None:
+def test_a_nominal_calibration_is_unusable_and_states_the_possible_point_error() -> None:
     """One degree about two axes: 100 m · √2 · π/180 = 2.47 m."""
     for one in (nominal("left", [0.0, 0.0, 0.0], np.eye(3)), calibration(method="nominal")):
         (said,) = said_of(one)
@@ -75,14 +75,14 @@ def test_points_of_a_nominal_calibration_have_its_plausible_sigmas() -> None:
         assert other.with_plausible_sigmas() is other
 
 
-def test_a_calibration_s_own_verdict_is_told_with_its_reason() -> None:
+def test_the_verdict_of_a_calibration_is_passed_on_with_its_reason() -> None:
     (said,) = said_of(calibration('verdict = "not to be used"\nverdict_reasons = ["kappa is held", "more"]'))
     assert said.line == "not to be used: calibration c1 of left: kappa is held"
     (said,) = said_of(calibration('verdict = "usable with care"'))
     assert said.level is Level.CARE
 
 
-def test_another_mounting_is_refused_and_another_source_of_the_trajectory_warned_of() -> None:
+def test_another_mounting_is_refused_and_another_trajectory_source_gives_a_warning() -> None:
     (said,) = said_of(calibration('installation = "HB-ABC/2"'))
     assert said.level is Level.UNUSABLE
     assert 'belongs to installation "HB-ABC/2", the log to "HB-ABC/1"' in said.sentence
@@ -100,7 +100,7 @@ def leg(first_ns: int, last_ns: int, level: str) -> dict[str, Any]:
     return {"first_gps_ns": first_ns, "last_gps_ns": last_ns, "verdict": verdict}
 
 
-def test_the_summary_beside_a_trajectory_is_read_for_the_time_of_the_log(tmp_path: Path) -> None:
+def test_the_summary_beside_a_trajectory_applies_to_the_time_of_the_log(tmp_path: Path) -> None:
     file = tmp_path / "flight.sbet"
     legs = [leg(0, 100, "unusable"), leg(200, 300, "good")]
     summary = {"format": "swath.trajectory", "solution": "smoothed", "sessions": [{"legs": legs}]}
@@ -114,7 +114,7 @@ def test_the_summary_beside_a_trajectory_is_read_for_the_time_of_the_log(tmp_pat
     assert file_verdicts(file, (250, 260)) == ([], "ins")
 
 
-def test_the_sidecar_of_points_says_it_of_the_trajectory_beside_them(tmp_path: Path) -> None:
+def test_the_sidecar_of_points_carries_the_verdict_of_its_trajectory(tmp_path: Path) -> None:
     told = {"level": "not to be used", "what": "navigated trajectory of s: lever arm"}
     trajectory = {"source": "navigated", "first_gps_ns": 0, "last_gps_ns": 100, "verdict": [told]}
     (tmp_path / "s.json").write_text(json.dumps({"format": "swath.georef", "flights": [{"trajectory": trajectory}]}))
@@ -122,7 +122,7 @@ def test_the_sidecar_of_points_says_it_of_the_trajectory_beside_them(tmp_path: P
     assert (said.level, source) == (Level.UNUSABLE, "navigated")
 
 
-def test_the_record_of_a_strip_adjustment_says_it_of_the_trajectories_it_has_corrected(tmp_path: Path) -> None:
+def test_the_record_of_a_strip_adjustment_carries_the_verdict_of_its_trajectories(tmp_path: Path) -> None:
     first = int(flown().time_ns[0])
     entry = trajectory_entry(flown(), "file", [Carried(Level.UNUSABLE, "trajectory a.sbet: lever arm")])
     record = {"format": "swath.strip-adjustment", "flights": [{"session": "s", "trajectory": entry}]}
@@ -132,7 +132,7 @@ def test_the_record_of_a_strip_adjustment_says_it_of_the_trajectories_it_has_cor
     assert said.sentence.endswith("s_trajectory.sbet: trajectory a.sbet: lever arm")
 
 
-def test_what_cannot_be_done_with_something_bad_says_first_that_it_is_bad() -> None:
+def test_a_failure_with_unusable_input_reports_the_input_first() -> None:
     care, bad = Carried(Level.CARE, "a"), Carried(Level.UNUSABLE, "lever arm")
     told = r"^not to be used: lever arm; therefore: does not come to rest$"
     for error in (UserError("does not come to rest"), PrealignError("does not come to rest")):
@@ -145,13 +145,13 @@ def test_what_cannot_be_done_with_something_bad_says_first_that_it_is_bad() -> N
 
 
 @pytest.mark.parametrize("text", ["", "[]", "no json", '{"format": "of others", "sessions": 3}'])
-def test_a_file_without_a_word_beside_it_is_a_file(tmp_path: Path, text: str) -> None:
+def test_a_file_without_a_readable_summary_has_no_verdict(tmp_path: Path, text: str) -> None:
     assert file_verdicts(tmp_path / "x.out", (0, 1)) == ([], "file")
     (tmp_path / "x.json").write_text(text)
     assert file_verdicts(tmp_path / "x.out", (0, 1)) == ([], "file")
 
 
-def test_the_worst_comes_first_and_only_what_is_not_to_be_used_is_a_problem() -> None:
+def test_the_worst_verdict_comes_first_and_only_an_unusable_one_is_a_problem() -> None:
     care, bad = Carried(Level.CARE, "a"), Carried(Level.UNUSABLE, "b")
     entry = verdict_entry([care, bad], accepted=False)
     assert first_lines(entry) == ["not to be used: b", "usable with care: a"]
@@ -162,7 +162,7 @@ def test_the_worst_comes_first_and_only_what_is_not_to_be_used_is_a_problem() ->
     assert refusal({}) == ""
 
 
-def test_points_carry_what_their_sidecar_says() -> None:
+def test_points_carry_the_verdict_of_their_sidecar() -> None:
     entry = verdict_entry([Carried(Level.UNUSABLE, "b")], accepted=True)
     sidecars: list[dict[str, Any]] = [{"format": "swath.georef", "verdict": entry}, {}, {"verdict": 3}]
     assert points_verdicts([*sidecars, *sidecars]) == [Carried(Level.UNUSABLE, "b")]

@@ -25,7 +25,7 @@ def compile_in_worker(flag: Any) -> None:
     numba.njit(lambda x: 5 * x)(2)
 
 
-def test_what_is_compiled_is_noticed() -> None:
+def test_compilation_is_detected() -> None:
     def twice(x: int) -> int:
         return 2 * x
 

@@ -49,14 +49,14 @@ class Log:
     truth: Trajectory
 
     def judged(self, trajectory: Trajectory, at: str = "body", *, datum_is_said: bool = False) -> Belonging:
-        """What is said of a trajectory, given as one of a point."""
+        """Judge a trajectory given for one of the points."""
         points = points_of(self.setup)
         moved = trajectory if at == "body" else trajectory.at_body(points[at])
         given = Given("x.out", moved, points[at], points, datum_is_said)
         return judge_given(given, self.setup, self.clocks, self.flown.log)
 
     def refused(self, trajectory: Trajectory, at: str = "body") -> str:
-        """The one line by which it is refused."""
+        """Return the single line with which a trajectory is refused."""
         (line,) = self.judged(trajectory, at).refused
         assert "\n" not in line
         assert line.startswith("x.out: ")
@@ -84,7 +84,7 @@ def single(tmp_path_factory: pytest.TempPathFactory) -> Log:
 
 
 def raised(trajectory: Trajectory, change: Any) -> Trajectory:
-    """With another latitude, longitude and height."""
+    """Return the trajectory with another latitude, longitude and height."""
     return placed(trajectory, *change(*trajectory.geodetic()))
 
 
@@ -95,18 +95,18 @@ def placed(trajectory: Trajectory, lat: Any, lon: Any, height: Any, angles: Angl
 
 
 def turned(trajectory: Trajectory, change: Any) -> Trajectory:
-    """With other angles."""
+    """Return the trajectory with other angles."""
     return placed(trajectory, *trajectory.geodetic(), angles=change(*trajectory.attitude()))
 
 
-def test_the_right_trajectory_is_taken_without_a_word(log: Log, single: Log) -> None:
+def test_a_correct_trajectory_is_accepted_without_warnings(log: Log, single: Log) -> None:
     for one in (log, single):
         found = one.judged(one.truth)
         assert found.refused == []
         assert found.warnings == []
 
 
-def test_metres_that_single_fixes_are_wrong_by_are_no_reason_to_refuse(single: Log) -> None:
+def test_errors_of_metres_in_single_fixes_do_not_refuse_a_trajectory(single: Log) -> None:
     found = single.judged(raised(single.truth, lambda lat, lon, height: (lat + 1.5 / 6.4e6, lon, height - 4.0)))
     assert found.refused == []
 
@@ -147,7 +147,9 @@ def up_by(one: Log, own_m: float, *, metres: float | None = None, sigmas: float 
         (2.0, {"metres": 3.01}, False, True),  # 1.5 sigmas, but 60 of the fixes alone
     ],
 )
-def test_limits(log: Log, own_m: float, limit: dict[str, float], warned: bool, refused: bool) -> None:
+def test_warnings_and_refusals_begin_at_their_limits(
+    log: Log, own_m: float, limit: dict[str, float], warned: bool, refused: bool
+) -> None:
     """Refused from 3 m or 20 sigmas on, warned of from 5 sigmas on, and not a word below."""
     found = log.judged(up_by(log, own_m, **limit))
     assert (len(found.warnings), len(found.refused)) == (int(warned), int(refused))
@@ -156,7 +158,9 @@ def test_limits(log: Log, own_m: float, limit: dict[str, float], warned: bool, r
 
 
 @pytest.mark.parametrize(("metres", "warned"), [(2.99, False), (3.01, True), (5.0, True), (8.0, True)])
-def test_metres_off_fixes_that_are_no_better_are_a_doubt_of_both(single: Log, metres: float, warned: bool) -> None:
+def test_a_trajectory_metres_from_poor_fixes_gives_a_warning_about_both(
+    single: Log, metres: float, warned: bool
+) -> None:
     """Not called the time's or a datum's fault, which such fixes cannot exclude and nothing speaks for."""
     found = single.judged(up_by(single, 0.1, metres=metres))
     assert found.refused == []
@@ -167,14 +171,14 @@ def test_metres_off_fixes_that_are_no_better_are_a_doubt_of_both(single: Log, me
     )
 
 
-def test_a_trajectory_48_m_low_is_above_the_geoid(log: Log, single: Log) -> None:
+def test_a_trajectory_48_m_low_is_recognised_as_above_the_geoid(log: Log, single: Log) -> None:
     for one in (log, single):
         line = one.refused(raised(one.truth, lambda lat, lon, height: (lat, lon, height - UNDULATION_M)))
         assert "its heights are above the geoid, which lies +48.0 m from the ellipsoid at this place" in line
     assert "up -48.0" in log.refused(raised(log.truth, lambda lat, lon, height: (lat, lon, height - UNDULATION_M)))
 
 
-def test_a_trajectory_7_km_east_is_of_another_place(log: Log) -> None:
+def test_a_trajectory_7_km_east_is_recognised_as_of_another_place(log: Log) -> None:
     line = log.refused(raised(log.truth, lambda lat, lon, height: (lat, lon + np.radians(0.1), height)))
     assert "lies 7.5 km off the fixes of gnss/rover" in line
     assert "in another place" in line
@@ -183,8 +187,8 @@ def test_a_trajectory_7_km_east_is_of_another_place(log: Log) -> None:
     )
 
 
-def test_on_a_straight_line_a_place_far_ahead_is_no_matter_of_time(log: Log) -> None:
-    """The line is flown east at 50 m/s: 7.5 km further on would be 151 s, which nobody saw the way of."""
+def test_a_distant_place_along_a_straight_line_is_not_a_time_offset(log: Log) -> None:
+    """The line is flown east at 50 m/s, so 7.5 km would be 151 s, outside the recorded time."""
     fixes = {source: rows[: len(rows) // 5] for source, rows in log.clocks.fixes.items()}
     clocks = replace(log.clocks, fixes=fixes)
     east = raised(log.truth, lambda lat, lon, height: (lat, lon + np.radians(0.1), height))
@@ -193,7 +197,7 @@ def test_on_a_straight_line_a_place_far_ahead_is_no_matter_of_time(log: Log) -> 
     assert "in another place" in line
 
 
-def test_heights_in_feet_are_named(log: Log) -> None:
+def test_heights_in_feet_are_recognised(log: Log) -> None:
     line = log.refused(raised(log.truth, lambda lat, lon, height: (lat, lon, height / 0.3048)))
     assert "its heights are in feet" in line
     line = log.refused(raised(log.truth, lambda lat, lon, height: (lat, lon, (height - UNDULATION_M) / 0.3048)))
@@ -201,7 +205,7 @@ def test_heights_in_feet_are_named(log: Log) -> None:
 
 
 @pytest.mark.parametrize(("code", "words"), [("EPSG:4230", "ED50"), ("EPSG:4312", "MGI")])
-def test_another_datum_is_named(log: Log, code: str, words: str) -> None:
+def test_another_datum_is_recognised(log: Log, code: str, words: str) -> None:
     """Tens of metres to hundreds: an old national datum. PROJ's transformation makes the case, at another place."""
     there = Transformer.from_crs("EPSG:4979", code, always_xy=True)
 
@@ -214,7 +218,7 @@ def test_another_datum_is_named(log: Log, code: str, words: str) -> None:
     assert words in line
 
 
-def test_the_frame_of_a_continent_is_told_from_that_of_the_world(log: Log) -> None:
+def test_a_continental_frame_is_distinguished_from_a_global_one(log: Log) -> None:
     """ETRS89 lies 0.8 m from ITRF there: more than 20 sigmas of an RTK fix and of the trajectory."""
     there = Transformer.from_crs("EPSG:7789", "EPSG:4936", always_xy=True)
     epoch = np.full(len(log.truth), 2026.5)
@@ -231,7 +235,7 @@ def test_the_frame_of_a_continent_is_told_from_that_of_the_world(log: Log) -> No
     assert "its datum differs" in found.warnings[0]
 
 
-def test_another_point_than_said_is_named(log: Log) -> None:
+def test_a_reference_point_other_than_stated_is_recognised(log: Log) -> None:
     sure = replace(log.truth, position_sigma_l=np.full((len(log.truth), 3), 0.01))
     of_antenna = sure.at_body([-0.4, 0.25, 1.2])
     assert "use --trajectory-at antenna" in log.refused(of_antenna)
@@ -241,7 +245,7 @@ def test_another_point_than_said_is_named(log: Log) -> None:
     assert "lever arm has the opposite sign" in log.refused(mirrored)
 
 
-def test_an_antenna_whose_place_nobody_said_is_no_reason_to_refuse(log: Log) -> None:
+def test_an_antenna_without_a_lever_arm_gives_only_a_warning(log: Log) -> None:
     """1.2 m apart, at 20 sigmas and more, because lever_arm_m is not in the configuration: a warning that names it."""
     table = log.setup.config.gnss["rover"]
     unsaid = GnssConfig(transport=table.transport, protocol=table.protocol, pps=table.pps)
@@ -255,7 +259,7 @@ def test_an_antenna_whose_place_nobody_said_is_no_reason_to_refuse(log: Log) -> 
     assert "gnss.rover.lever_arm_m is not configured" in line
 
 
-def test_time_that_is_off_is_named_by_the_way_flown(log: Log) -> None:
+def test_a_time_offset_is_recognised_by_the_distance_flown(log: Log) -> None:
     line = log.refused(replace(log.truth, time_ns=log.truth.time_ns - 2_000_000_000))
     assert "as if its time were 2.00 s early" in line
     found = log.judged(replace(log.truth, time_ns=log.truth.time_ns - 18_000_000_000))
@@ -276,20 +280,20 @@ FLIPS = {
 
 
 @pytest.mark.parametrize("words", list(FLIPS))
-def test_angles_of_another_convention_are_seen_and_named(log: Log, words: str) -> None:
+def test_angles_of_another_convention_are_recognised(log: Log, words: str) -> None:
     found = log.judged(turned(log.truth, FLIPS[words]))
     assert words in found.refused[0]
     assert "turns like the IMU" in found.refused[0]
 
 
 @pytest.mark.parametrize("words", list(FLIPS)[:3])
-def test_one_straight_line_of_20_seconds_is_enough_for_that(log: Log, words: str) -> None:
+def test_one_straight_line_of_20_seconds_suffices_to_recognise_other_angles(log: Log, words: str) -> None:
     begin = log.truth.time_ns[0] + 4_000_000_000
     line = turned(log.truth.between(int(begin), int(begin) + 20_000_000_000), FLIPS[words])
     assert words in log.judged(line).refused[0]
 
 
-def test_headings_from_grid_north_are_named(log: Log) -> None:
+def test_headings_from_grid_north_are_recognised(log: Log) -> None:
     """Convergence of UTM zone 32 there: (11.4° − 9°) sin 47.48° = 1.77°."""
     grid_rad = np.radians(2.4 * np.sin(np.radians(47.48)))
     line = log.refused(turned(log.truth, lambda roll, pitch, heading: (roll, pitch, heading - grid_rad)))
@@ -298,7 +302,7 @@ def test_headings_from_grid_north_are_named(log: Log) -> None:
     assert "heading is +3.0" in off.refused[0]
 
 
-def test_a_trajectory_of_another_flight_is_refused_by_how_it_turns(log: Log) -> None:
+def test_a_trajectory_of_another_flight_is_refused_by_its_turns(log: Log) -> None:
     """It lies where it should: the same way with another motion about it."""
     random = np.random.default_rng(5)
     count = len(log.truth)
@@ -323,8 +327,8 @@ def rough(tmp_path_factory: pytest.TempPathFactory) -> list[Log]:
     return flights
 
 
-def test_another_flight_over_the_same_lines_is_refused_by_what_gusts_do(rough: list[Log]) -> None:
-    """It turns where this one does (correlation 0.9), and lies a decimetre from it, which the fixes cannot tell."""
+def test_another_flight_over_the_same_lines_is_refused_by_its_gusts(rough: list[Log]) -> None:
+    """The flights turn alike (correlation 0.9) and lie a decimetre apart, which the fixes cannot separate."""
     for one, other in (rough, rough[::-1]):
         assert one.judged(one.truth).refused == []
         line = one.refused(other.truth)
@@ -333,8 +337,8 @@ def test_another_flight_over_the_same_lines_is_refused_by_what_gusts_do(rough: l
 
 
 @pytest.mark.parametrize(("every", "digits"), [(10, 2), (4, 3), (1, 2)])
-def test_attitudes_in_few_digits_and_at_20_hz_are_still_this_flights(rough: list[Log], every: int, digits: int) -> None:
-    """Also late, which is told elsewhere."""
+def test_rounded_attitudes_at_20_hz_are_accepted(rough: list[Log], every: int, digits: int) -> None:
+    """Attitudes may also be late, which is reported elsewhere."""
     truth = rough[0].truth
     angles = [np.radians(np.round(np.degrees(angle), digits)) for angle in truth.attitude()]
     columns = [column[::every] for column in (*truth.geodetic(), truth.velocity_l(), *angles)]
@@ -343,14 +347,14 @@ def test_attitudes_in_few_digits_and_at_20_hz_are_still_this_flights(rough: list
         assert not any("gusts" in line for line in rough[0].judged(given).refused)
 
 
-def test_noise_is_no_gust(log: Log) -> None:
+def test_noise_is_not_taken_for_gusts(log: Log) -> None:
     """Calm air: angles noisy by 0.02° say nothing of gusts, and the flight is this one."""
     noise = np.radians(0.02) * np.random.default_rng(7).standard_normal((3, len(log.truth)))
     given = turned(log.truth, lambda *angles: tuple(np.stack(angles) + noise))
     assert not any("gusts" in line for line in log.judged(given).refused)
 
 
-def test_height_of_the_truth_is_the_ellipsoids(log: Log) -> None:
+def test_the_truth_matches_the_ellipsoidal_height_of_the_fixes(log: Log) -> None:
     """The fixes that all is held against are the receiver's, brought to the ellipsoid by its undulation."""
     fixes = [fix for fix in log.clocks.fixes["gnss/rover"] if fix.height_m is not None]
     height = float(np.median(geodetic_from_e(log.truth.position_e)[2]))

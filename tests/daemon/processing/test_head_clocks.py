@@ -111,7 +111,7 @@ def hesai(scale_s: int) -> Units:
 
 
 def found(folder: Path, text: str, units: Iterable[tuple[str, int, bytes]]) -> tuple[Setup, FrozenClocks]:
-    """A log of the units, and its clocks."""
+    """Write a log of the units; return it with its clocks."""
     config: Config = parse_config(f'[session]\nname = "heads"\ndirectory = "."\n{text}', folder / "swath.toml")
     wires = Routes.of(config).ports
     log: ImportLog | None = None
@@ -147,7 +147,7 @@ WITH_AUX = VLP16 + 'auxiliary = "udp:0.0.0.0:8308"\n'
 XT32 = f'[scanner.top]\n{HEAD}protocol = "hesai-xt32"\n'
 
 
-def test_a_locked_head_without_position_packets_is_found_by_its_stamps(tmp_path: Path) -> None:
+def test_a_locked_head_without_position_packets_is_recognised_by_its_timestamps(tmp_path: Path) -> None:
     _, clocks = found(tmp_path, RECEIVER + VLP16 + 'pps = "main"\n', [*receiver(), *velodyne()])
     assert clocks.stamps["scanner/top"].scale is StampScale.HOUR
     error, sigma_ns = errors_ns(clocks, HOURS, -1)
@@ -158,7 +158,7 @@ def test_a_locked_head_without_position_packets_is_found_by_its_stamps(tmp_path:
 
 
 @pytest.mark.parametrize("off_us", [1_000_000, 300_000, 1_234_567_890])
-def test_a_head_that_is_not_locked_runs_free(tmp_path: Path, off_us: int) -> None:
+def test_an_unlocked_head_runs_free(tmp_path: Path, off_us: int) -> None:
     _, clocks = found(tmp_path, RECEIVER + VLP16 + 'pps = "main"\n', [*receiver(), *velodyne(off_us)])
     assert clocks.stamps["scanner/top"].scale is StampScale.FREE
     assert stamp_lines(clocks) == []
@@ -166,7 +166,7 @@ def test_a_head_that_is_not_locked_runs_free(tmp_path: Path, off_us: int) -> Non
     assert sigma_ns > 1e6
 
 
-def test_position_packets_are_the_clock_where_no_receiver_is_in_the_log(tmp_path: Path) -> None:
+def test_position_packets_are_the_clock_in_a_log_without_a_receiver(tmp_path: Path) -> None:
     """The recording computer is 0.3 s wrong: the head's own seconds count, not the computer's."""
     setup, clocks = found(tmp_path, WITH_AUX, [*velodyne(), *positions()])
     plan = clocks.host.plan.devices["scanner/top"]
@@ -181,10 +181,8 @@ def test_position_packets_are_the_clock_where_no_receiver_is_in_the_log(tmp_path
 
 
 @pytest.mark.parametrize("receives", [False, True])
-def test_stamps_just_before_the_first_position_packet_are_judged_by_what_follows(
-    tmp_path: Path, receives: bool
-) -> None:
-    """The first position packet comes 0.75 s after the first returns and says that the head is locked."""
+def test_timestamps_before_the_first_position_packet_are_judged_by_later_ones(tmp_path: Path, receives: bool) -> None:
+    """The first position packet, 0.75 s after the first returns, reports that the head is locked."""
     units = [*velodyne(), *positions(), *(receiver() if receives else ())]
     text = RECEIVER + WITH_AUX + 'pps = "main"\n' if receives else WITH_AUX
     _, clocks = found(tmp_path, text, units)
@@ -195,7 +193,7 @@ def test_stamps_just_before_the_first_position_packet_are_judged_by_what_follows
 
 
 @pytest.mark.parametrize("off_us", [300_000, -40_000])
-def test_stamps_that_jump_where_the_head_says_that_it_is_locked_are_not_taken(tmp_path: Path, off_us: int) -> None:
+def test_timestamps_before_a_jump_to_lock_are_refused(tmp_path: Path, off_us: int) -> None:
     """A counter before the pulse set it, 0.3 s or, by chance, 40 ms beside the hour."""
     first_said_ns = min(at_ns for _, at_ns, _ in positions())
     early = [unit for unit in velodyne(off_us) if unit[1] < first_said_ns]
@@ -207,7 +205,7 @@ def test_stamps_that_jump_where_the_head_says_that_it_is_locked_are_not_taken(tm
     assert "scanner/top" not in clocks.stamps or clocks.stamps["scanner/top"].scale is StampScale.FREE
 
 
-def test_a_roll_over_of_the_heads_receiver_is_moved_as_one_of_a_receivers_own(tmp_path: Path) -> None:
+def test_a_rollover_of_the_heads_receiver_is_corrected(tmp_path: Path) -> None:
     """Sentences 1024 weeks old: 2006 has another count of leap seconds, so that points lay 4 s off within the week."""
     _, clocks = found(tmp_path, WITH_AUX, [*velodyne(), *positions(off=-ROLLOVER)])
     error, _ = errors_ns(clocks, HOURS, 1)
@@ -218,7 +216,7 @@ def test_a_roll_over_of_the_heads_receiver_is_moved_as_one_of_a_receivers_own(tm
     )
 
 
-def test_a_heads_date_that_nobody_believes_is_refused_and_named(tmp_path: Path) -> None:
+def test_an_implausible_date_of_a_head_is_refused_and_named(tmp_path: Path) -> None:
     setup, clocks = found(tmp_path, WITH_AUX, [*velodyne(), *positions(off=-ROLLOVER - dt.timedelta(days=9))])
     (line,) = clocks.remarks
     assert line.startswith(
@@ -230,7 +228,7 @@ def test_a_heads_date_that_nobody_believes_is_refused_and_named(tmp_path: Path) 
         refuse_no_time(tmp_path, "scanner/top", status, setup.config, clocks.remarks, clocks.trouble("scanner/top"))
 
 
-def test_a_head_that_was_given_local_time_is_told(tmp_path: Path) -> None:
+def test_a_head_in_local_time_is_reported(tmp_path: Path) -> None:
     _, clocks = found(tmp_path, WITH_AUX, [*velodyne(), *positions(off=dt.timedelta(hours=2))])
     (line,) = clocks.remarks
     assert line.startswith(
@@ -238,7 +236,7 @@ def test_a_head_that_was_given_local_time_is_told(tmp_path: Path) -> None:
     )
 
 
-def test_counters_that_go_on_beyond_the_hour_are_modulo_the_hour_in_both_packets(tmp_path: Path) -> None:
+def test_counters_beyond_the_hour_are_modulo_the_hour_in_both_packets(tmp_path: Path) -> None:
     units = [*velodyne(goes_on=True), *positions(goes_on=True)]
     _, clocks = found(tmp_path, WITH_AUX, units)
     error, sigma_ns = errors_ns(clocks, HOURS, 1)
@@ -268,7 +266,7 @@ def test_a_configured_hour_needs_neither_receiver_nor_position_packets(tmp_path:
         (PPS_SYNCHRONIZING, None, r"reports that it is not locked to its pulse \(synchronizing\); wire a steady PPS"),
     ],
 )
-def test_a_head_without_fix_or_pulse_is_refused_by_that(
+def test_a_head_without_fix_or_pulse_is_refused_with_that_reason(
     tmp_path: Path, pps: int, status: str | None, words: str
 ) -> None:
     setup, clocks = found(tmp_path, WITH_AUX, [*velodyne(), *positions(pps=pps, status=status)])
@@ -279,7 +277,7 @@ def test_a_head_without_fix_or_pulse_is_refused_by_that(
     assert "configuration" not in refused.value.message
 
 
-def test_a_head_that_says_only_that_it_is_not_locked_is_not_said_to_have_no_pulse(tmp_path: Path) -> None:
+def test_an_unlocked_head_without_a_reason_is_not_reported_as_without_pulse(tmp_path: Path) -> None:
     """Hesai's packets have a flag, and no reason."""
     text = RECEIVER + XT32 + 'auxiliary = "udp:0.0.0.0:10110"\npps = "main"\n'
     seconds = [(START_UNIX_NS + k * NS + LATENCY_NS, START + dt.timedelta(seconds=k)) for k in range(SECONDS)]
@@ -289,7 +287,7 @@ def test_a_head_that_says_only_that_it_is_not_locked_is_not_said_to_have_no_puls
 
 
 @pytest.mark.parametrize("status", ["A", "V"])
-def test_a_head_without_pulse_beside_a_receiver_is_told_by_that(tmp_path: Path, status: str) -> None:
+def test_a_head_without_pulse_beside_a_receiver_is_reported_as_such(tmp_path: Path, status: str) -> None:
     """What the head's own sentences say does not matter then."""
     units = [*receiver(), *velodyne(12_345_678), *positions(pps=PPS_ABSENT, status=status)]
     _, clocks = found(tmp_path, RECEIVER + WITH_AUX + 'pps = "main"\n', units)
@@ -299,12 +297,12 @@ def test_a_head_without_pulse_beside_a_receiver_is_told_by_that(tmp_path: Path, 
     assert line.endswith("the head reports that no pulse reaches it; wire the receiver's PPS to it")
 
 
-def test_a_head_with_fix_and_pulse_is_in_no_trouble(tmp_path: Path) -> None:
+def test_a_head_with_fix_and_pulse_gives_no_warning(tmp_path: Path) -> None:
     _, clocks = found(tmp_path, WITH_AUX, [*velodyne(), *positions()])
     assert clocks.trouble("scanner/top") == ""
 
 
-def test_a_head_that_says_nothing_and_no_receiver_is_refused_with_what_would_do(tmp_path: Path) -> None:
+def test_a_head_without_status_and_receiver_is_refused_with_the_remedy(tmp_path: Path) -> None:
     setup, clocks = found(tmp_path, VLP16, velodyne())
     plan = clocks.host.plan.devices["scanner/top"]
     status = clocks.host.status(plan.clock, START_UNIX_NS + 20 * NS)
@@ -314,7 +312,7 @@ def test_a_head_that_says_nothing_and_no_receiver_is_refused_with_what_would_do(
 
 @pytest.mark.parametrize(("beside_utc_s", "scale"), [(0, StampScale.UTC), (37, StampScale.TAI)])
 @pytest.mark.parametrize("configured", [False, True])
-def test_ptp_stamps_keep_their_fraction_on_either_scale(
+def test_ptp_timestamps_keep_their_fraction_on_either_scale(
     tmp_path: Path, beside_utc_s: int, scale: StampScale, configured: bool
 ) -> None:
     """Found by a receiver's time; configured they are complete without one."""

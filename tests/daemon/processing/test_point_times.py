@@ -25,7 +25,7 @@ def tile(folder: Path, name: str, first_s: float, *, adjusted: bool, west_m: flo
     return point_times_of(write(folder / name, x, y, 0.0 * x + 400.0, gps_time=times, adjusted=adjusted))
 
 
-def test_the_header_decides(tmp_path: Path) -> None:
+def test_the_header_determines_the_kind_of_time(tmp_path: Path) -> None:
     of_week = tile(tmp_path, "week.laz", 345_600.0, adjusted=False)
     adjusted = tile(tmp_path, "adjusted.laz", ADJUSTED_S, adjusted=True)
     assert (of_week.kind, of_week.doubt) == (TimeKind.OF_WEEK, "")
@@ -54,7 +54,7 @@ def as_las_15(path: Path, offset: int) -> PointTimes:
 
 
 @pytest.mark.parametrize("offset", [1000, 1250, 1500])
-def test_times_of_las_15_count_from_where_the_header_says(tmp_path: Path, offset: int) -> None:
+def test_times_of_las_15_use_the_offset_of_the_header(tmp_path: Path, offset: int) -> None:
     """1500 is the LAS working group's recommendation for 2023 to 2031: times of now are below 0."""
     first_s = FLIGHT_NS / 1e9 - offset * 1e6
     tile(tmp_path, "a.las", first_s, adjusted=True)
@@ -66,7 +66,7 @@ def test_times_of_las_15_count_from_where_the_header_says(tmp_path: Path, offset
     assert clock.time_ns(of_week.path, np.array([345_600.5])).tolist() == [FLIGHT_NS + 500_000_000]
 
 
-def test_files_that_mix_times_are_named_by_the_quick_look_too(tmp_path: Path) -> None:
+def test_the_quick_look_names_files_that_mix_kinds_of_time(tmp_path: Path) -> None:
     tile(tmp_path, "a.laz", 345_600.0, adjusted=False)
     for number in range(5):
         tile(tmp_path, f"b{number}.laz", ADJUSTED_S, adjusted=True, west_m=20.0)
@@ -77,7 +77,7 @@ def test_files_that_mix_times_are_named_by_the_quick_look_too(tmp_path: Path) ->
     )
 
 
-def test_times_that_contradict_their_header_are_told(tmp_path: Path) -> None:
+def test_times_that_contradict_their_header_are_reported(tmp_path: Path) -> None:
     """Adjusted times without the bit are common; small numbers with it would be of September 2011."""
     unset = tile(tmp_path, "unset.laz", ADJUSTED_S, adjusted=False)
     assert unset.kind is TimeKind.ADJUSTED
@@ -103,7 +103,7 @@ def test_times_that_contradict_their_header_are_told(tmp_path: Path) -> None:
         (3_900_000_000.0, "belong to 2135-"),
     ],
 )
-def test_times_of_the_future_are_told_with_what_they_look_like(
+def test_times_in_the_future_are_reported_with_their_probable_kind(
     tmp_path: Path, first_s: float, told: str, adjusted: bool
 ) -> None:
     """2017-03-30 07:18:38 UTC as GPS seconds and as Unix seconds, under either bit (LAStools' list, 2017-08-27)."""
@@ -114,7 +114,7 @@ def test_times_of_the_future_are_told_with_what_they_look_like(
 
 
 @pytest.mark.parametrize("after_s", [0.0, 604_800.0], ids=["begins anew", "counts on"])
-def test_a_flight_from_saturday_into_sunday_is_of_two_weeks(tmp_path: Path, after_s: float) -> None:
+def test_a_flight_from_saturday_into_sunday_spans_two_weeks(tmp_path: Path, after_s: float) -> None:
     before = tile(tmp_path, "saturday.laz", 604_700.0, adjusted=False)
     after = tile(tmp_path, "sunday.laz", after_s + 50.0, adjusted=False)
     clock = PointClock([after, before], week=WEEK)
@@ -122,7 +122,7 @@ def test_a_flight_from_saturday_into_sunday_is_of_two_weeks(tmp_path: Path, afte
         assert clock.time_ns(one.path, np.array([second])).tolist() == [WEEK * WEEK_NS + since_s * 1_000_000_000]
 
 
-def test_seconds_of_no_week_count_among_themselves_and_say_so(tmp_path: Path) -> None:
+def test_seconds_of_an_unknown_week_are_comparable_and_reported(tmp_path: Path) -> None:
     one = tile(tmp_path, "a.laz", 345_600.0, adjusted=False)
     clock = PointClock([one])
     assert clock.notes == [

@@ -56,7 +56,7 @@ def flown(pulses_m2: float, seed: int = 3) -> Cloud:
 
 
 def tiles(folder: Path, cloud: Cloud, order: Array, side_m: float = 70.0) -> Path:
-    """Cut into square tiles as delivered, in this order."""
+    """Write the points as square tiles in this order."""
     folder.mkdir()
     cloud = {key: values[order] for key, values in cloud.items()}
     across, up = ((cloud[axis] - at) // side_m for axis, at in (("x", EAST_M), ("y", NORTH_M)))
@@ -77,14 +77,14 @@ def places_of(look: Look) -> set[tuple[float, float]]:
 
 
 def row_of(look: Look) -> dict[str, Any]:
-    """The pair, strip 1 minus strip 2 whichever was read first."""
+    """Return the row of the pair as strip 1 minus strip 2."""
     (row,) = look.overlap.rows
     sign = 1.0 if look.names[row["first"]] == "1" else -1.0
     return row | {key: sign * row[key] for key in ("mean_m", "median_m")}
 
 
 def run(command: Any, *arguments: str) -> None:
-    """A command, in this process."""
+    """Run a command in this process."""
     app = typer.Typer()
     app.command()(command)
     app(args=list(arguments), standalone_mode=False)
@@ -108,7 +108,9 @@ def test_tiles_in_any_order_give_the_same_cells_and_differences(tmp_path: Path) 
 
 
 @pytest.mark.parametrize(("pulses_m2", "cell_m"), [(1.2, 4.0), (5.0, 2.0), (10.0, 1.0)])
-def test_cells_hold_returns_enough_of_any_density_and_thinning(tmp_path: Path, pulses_m2: float, cell_m: float) -> None:
+def test_cells_contain_enough_returns_at_any_density_and_thinning(
+    tmp_path: Path, pulses_m2: float, cell_m: float
+) -> None:
     """A plane through n returns is as good as 2 cm / √n: of all cells the mean is known to 0.3 mm."""
     cloud = flown(pulses_m2)
     order = ORDERS["shuffled"](cloud, np.random.default_rng(2))
@@ -126,7 +128,7 @@ def test_the_density_is_that_of_single_returns_of_each_strip_on_open_ground(tmp_
     assert look.density == pytest.approx(6.0 * 2 * 100.0 / 120.0, rel=0.05)  # pulses of both strips
 
 
-def test_cells_that_the_user_asks_for_are_taken(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_cell_size_given_by_the_user_is_used(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cloud = flown(5.0)
     folder = tiles(tmp_path / "t", cloud, np.arange(len(cloud["x"])))
     run(strips.command, str(folder), "--cell", "4", "--json")
@@ -140,7 +142,7 @@ def test_cells_that_the_user_asks_for_are_taken(tmp_path: Path, capsys: pytest.C
     assert caught.value.exit_code == ExitCode.USAGE
 
 
-def test_few_cells_give_no_verdict_and_say_what_to_do(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_few_cells_give_no_verdict_but_advice(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A meadow of 14 m × 80 m: hundreds of square metres, dozens of cells."""
     cloud = flown(5.0)
     near = cloud["x"] < EAST_M + 14.0
@@ -172,7 +174,7 @@ def test_cells_of_one_patch_are_one_place() -> None:
 
 
 @pytest.mark.parametrize("noise_m", [0.02, 0.08])
-def test_repeatability_is_the_noise_also_beyond_what_is_compared(noise_m: float) -> None:
+def test_repeatability_equals_the_noise_beyond_the_compared_cells(noise_m: float) -> None:
     """Of 3600 planes through 16 returns the quartile of variances is known to 1 %, its root to half of that."""
     count = np.full(3600, 16.0)
     variance = noise_m**2 * np.random.default_rng(4).chisquare(13, 3600) / 13.0

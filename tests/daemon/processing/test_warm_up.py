@@ -75,7 +75,7 @@ def run_python(text: str, *arguments: object, **environment: str) -> subprocess.
 
 
 @pytest.mark.slow
-def test_after_a_warm_up_a_flight_needs_no_loop_that_is_not_there(tmp_path: Path) -> None:
+def test_after_a_warm_up_a_flight_compiles_nothing(tmp_path: Path) -> None:
     """The first pulse costs what the thousandth does: neither compiling nor reading what was compiled before."""
     done = run_python(FLY, tmp_path)
     assert done.returncode == 0, done.stderr
@@ -90,7 +90,7 @@ def test_after_a_warm_up_a_flight_needs_no_loop_that_is_not_there(tmp_path: Path
 @pytest.mark.parametrize(
     ("signum", "code"), [(signal.SIGTERM, -signal.SIGTERM), (signal.SIGINT, INTERRUPTED)], ids=lambda one: str(one)
 )
-def test_live_says_that_it_compiles_and_can_be_ended_then(tmp_path: Path, signum: int, code: int) -> None:
+def test_live_announces_compilation_and_can_be_interrupted(tmp_path: Path, signum: int, code: int) -> None:
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
     command = [sys.executable, "-m", "swath.daemon.cli.main", "live", str(tmp_path)]
     with subprocess.Popen(command, cwd=ROOT, env=environment, stderr=subprocess.PIPE, text=True) as live:
@@ -112,14 +112,14 @@ def test_live_says_that_it_compiles_and_can_be_ended_then(tmp_path: Path, signum
 @pytest.mark.skipif(
     tuple(int(part) for part in numba.__version__.split(".")[:2]) < (0, 62), reason="its caches cannot be taken away"
 )
-def test_without_a_place_to_keep_them_loops_are_compiled_in_memory(tmp_path: Path) -> None:
+def test_without_a_cache_folder_loops_are_compiled_in_memory(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     nowhere = str(tmp_path / "file/cache")
     done = run_python(NO_CACHE, NUMBA_CACHE_DIR=nowhere, NUMBA_CACHE_LOCATOR_CLASSES="_UserProvidedCacheLocator")
     assert done.stdout.split() == ["None", "3", "True"], done.stderr
 
 
-def test_says_where_the_cache_is_or_that_there_is_none(tmp_path: Path) -> None:
+def test_warm_up_reports_the_cache_folder_or_its_absence(tmp_path: Path) -> None:
     folder = cache_folder()
     assert folder is not None
     assert folder.is_dir()
@@ -128,7 +128,7 @@ def test_says_where_the_cache_is_or_that_there_is_none(tmp_path: Path) -> None:
     assert "compiles in memory; set NUMBA_CACHE_DIR" in WarmUp(12, 3.25, None).text()
 
 
-def test_a_wrong_configuration_is_a_line(tmp_path: Path) -> None:
+def test_a_wrong_configuration_is_refused_in_one_line(tmp_path: Path) -> None:
     config = tmp_path / "swath.toml"
     config.write_text('[session]\nname = "a"\nspeed = 3\n')
     done = swath("warm-up", str(config))

@@ -26,7 +26,7 @@ Synced = set[int]  # inodes
 
 @pytest.fixture
 def synced(monkeypatch: pytest.MonkeyPatch) -> Synced:
-    """What has been brought to the disk."""
+    """Return the list of paths synced to the disk."""
     found: Synced = set()
     sync = os.fsync
 
@@ -44,20 +44,20 @@ def missing(synced: Synced, folder: Path) -> list[str]:
     return [str(path.relative_to(folder.parent)) for path in there if path.stat().st_ino not in synced]
 
 
-def test_of_a_calibration(tmp_path: Path, synced: Synced) -> None:
+def test_calibration_files_are_synced_to_the_disk(tmp_path: Path, synced: Synced) -> None:
     folder = tmp_path / "out"
     calibrate_products._write({folder / "left.toml": b"a", folder / "report" / "report.html": b"b"})
     assert missing(synced, folder) == []
     assert sorted(path.name for path in folder.rglob("*")) == ["left.toml", "report", "report.html"]
 
 
-def test_of_a_sidecar(tmp_path: Path, synced: Synced) -> None:
+def test_a_sidecar_is_synced_to_the_disk(tmp_path: Path, synced: Synced) -> None:
     write_sidecar(tmp_path / "a.json", {"name": "Zürich"})
     assert missing(synced, tmp_path) == []
     assert (tmp_path / "a.json").read_text(encoding="utf-8") == '{\n  "name": "Zürich"\n}\n'
 
 
-def test_of_an_export(tmp_path: Path, synced: Synced) -> None:
+def test_an_export_is_synced_to_the_disk(tmp_path: Path, synced: Synced) -> None:
     log = tmp_path / f"{INFO.session_id}_0.mcap"
     write_part(log)
     synced.clear()
@@ -66,7 +66,7 @@ def test_of_an_export(tmp_path: Path, synced: Synced) -> None:
     assert len(list((tmp_path / "out").rglob("*"))) > 4
 
 
-def test_of_points(tmp_path: Path, synced: Synced) -> None:
+def test_points_are_synced_to_the_disk(tmp_path: Path, synced: Synced) -> None:
     flown = fly(tmp_path)
     synced.clear()
     assert run_app(flown.arguments(tmp_path / "out")) == 0
@@ -74,7 +74,7 @@ def test_of_points(tmp_path: Path, synced: Synced) -> None:
     assert len(list((tmp_path / "out").iterdir())) >= 5  # strips, three files of the trajectory, the sidecar
 
 
-def test_an_interruption_while_it_is_written(tmp_path: Path) -> None:
+def test_an_interruption_during_writing_leaves_no_file(tmp_path: Path) -> None:
     def interrupted(stream: IO[bytes]) -> None:
         stream.write(b"half")
         raise KeyboardInterrupt
@@ -84,7 +84,7 @@ def test_an_interruption_while_it_is_written(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_interruption_between_two_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interruption_between_two_files_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     aside: list[Path] = []
 
     def second_is_interrupted(path: Path, write: Callable[[IO[bytes]], None]) -> Path:
@@ -99,7 +99,9 @@ def test_an_interruption_between_two_files(tmp_path: Path, monkeypatch: pytest.M
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_interruption_while_they_are_put_in_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interruption_during_renaming_leaves_no_temporary_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     written = [(write_aside(tmp_path / name, lambda stream: None), tmp_path / name) for name in ("a", "b", "c")]
     replace = Path.replace
 

@@ -36,14 +36,14 @@ def the_line(done: subprocess.CompletedProcess[str], exit_code: int) -> str:
     return line
 
 
-def test_two_sources_on_one_port(tmp_path: Path) -> None:
+def test_two_sources_on_one_port_are_refused(tmp_path: Path) -> None:
     tables = SCANNER.format(name="left", port=2368) + SCANNER.format(name="right", port=2368)
     line = the_line(run_once(tmp_path, tables), 2)
     assert "scanner.left.transport and scanner.right.transport: both use UDP port 2368" in line
     assert not (tmp_path / "logs").exists()
 
 
-def test_dbc_without_the_named_signals(tmp_path: Path) -> None:
+def test_a_dbc_without_the_named_signals_is_refused(tmp_path: Path) -> None:
     shutil.copy(ROOT / "fixtures" / "config" / "imu.dbc", tmp_path / "imu.dbc")
     tables = (
         '[imu.main]\ntransport = "can:virtual:test"\nprotocol = "dbc"\ndbc = "imu.dbc"\nrate_hz = 200\n'
@@ -56,15 +56,15 @@ def test_dbc_without_the_named_signals(tmp_path: Path) -> None:
     assert "message ACC has: acc_x, acc_y, acc_z" in line
 
 
-def test_no_such_configuration(tmp_path: Path) -> None:
+def test_a_missing_configuration_is_refused(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "swath.daemon.cli.main", "run", str(tmp_path / "nothing.toml")]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=HANGS_S, check=False)
     assert "nothing.toml" in the_line(done, 2)
 
 
 @pytest.mark.parametrize("command", ["mark", "monitor"])
-def test_a_note_in_the_place_of_a_directory(command: str) -> None:
-    """Longer than a name may be: one line all the same."""
+def test_a_note_given_as_a_directory_is_refused_in_one_line(command: str) -> None:
+    """The text is longer than a file name may be, and the error is still one line."""
     note = "line 4, clouds below us and turbulence, " * 8
     done = swath(*((command, "logs", note) if command == "mark" else (command, "--once", note)))
     assert done.returncode == 2
@@ -74,7 +74,7 @@ def test_a_note_in_the_place_of_a_directory(command: str) -> None:
 
 
 @pytest.mark.slow
-def test_configuration_of_another_aircraft(tmp_path: Path) -> None:
+def test_a_configuration_of_another_aircraft_is_reported_device_by_device(tmp_path: Path) -> None:
     """Each device that speaks something else is named, the one that is right is not, and every byte is recorded."""
     ubx = recording("ubx", "ublox-zed-f9p-hp.log")
     srep = scan_lines()
@@ -99,7 +99,7 @@ def test_configuration_of_another_aircraft(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("what", ["absent", "no PPS device"])
-def test_pps_that_cannot_be_used_is_said_and_the_others_are_recorded(tmp_path: Path, what: str) -> None:
+def test_an_unusable_pps_is_reported_and_the_others_are_recorded(tmp_path: Path, what: str) -> None:
     path = tmp_path / "pps0"
     if what != "absent":
         path.write_text("")
@@ -114,7 +114,7 @@ def test_pps_that_cannot_be_used_is_said_and_the_others_are_recorded(tmp_path: P
     assert "\n" not in event["text"]
 
 
-def test_receive_buffer_that_was_not_granted_is_said_with_the_command_that_mends_it(tmp_path: Path) -> None:
+def test_a_receive_buffer_that_is_not_granted_is_reported_with_the_command(tmp_path: Path) -> None:
     setpriv = shutil.which("setpriv")
     assert setpriv is not None, "setpriv (util-linux) is needed to run without CAP_NET_ADMIN"
     assert int(Path("/proc/sys/net/core/rmem_max").read_text()) < 32 << 20, "this machine grants 32 MiB to everybody"

@@ -59,7 +59,7 @@ def whole(lines: list[str]) -> Iterator[bool]:
         yield len(sample) == len(SAMPLE) == len(set(sample))
 
 
-def test_samples_that_lack_a_frame_are_counted_and_left_out(
+def test_samples_with_a_missing_frame_are_counted_and_dropped(
     lossy: tuple[Path, int], capsys: pytest.CaptureFixture[str]
 ) -> None:
     logs, samples = lossy
@@ -72,7 +72,7 @@ def test_samples_that_lack_a_frame_are_counted_and_left_out(
     assert unit["errors"]["packet_gap"] > 100
 
 
-def test_what_is_left_is_navigated_and_what_is_missing_is_said(
+def test_remaining_samples_are_navigated_and_missing_ones_reported(
     flown: Flown, lossy: tuple[Path, int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Single samples are bridged; three seconds are a hole, and the rest lies within its sigmas."""

@@ -78,7 +78,7 @@ def connect(place: Path) -> socket.socket:
 
 
 def say(place: Path, line: bytes) -> dict[str, object]:
-    """A line to a control socket and its answer."""
+    """Send a line to a control socket and return its response."""
     with connect(place) as sock, sock.makefile("rb") as answer:
         sock.sendall(line)
         said = json.loads(answer.readline())
@@ -86,7 +86,7 @@ def say(place: Path, line: bytes) -> dict[str, object]:
         return said
 
 
-def test_a_note_is_in_the_log_with_its_time(tmp_path: Path, logs: Path) -> None:
+def test_a_note_is_logged_with_its_time(tmp_path: Path, logs: Path) -> None:
     with Recorder(tmp_path, session_table(logs)) as recorder:
         before_ns = time.time_ns()
         told = swath("mark", "line 4 start\tσ", str(recorder.config))
@@ -108,7 +108,7 @@ def test_a_note_is_in_the_log_with_its_time(tmp_path: Path, logs: Path) -> None:
     assert re.search(r"^  \d\d:\d\d:\d\d mark: line 4 start σ\n  \d\d:\d\d:\d\d mark: line 4 end$", shown, re.MULTILINE)
 
 
-def test_split_begins_a_part_and_loses_nothing(tmp_path: Path, logs: Path) -> None:
+def test_split_begins_a_part_and_loses_no_data(tmp_path: Path, logs: Path) -> None:
     with (
         contextlib.closing(Numbers(free_udp_port())) as numbers,
         Recorder(tmp_path, session_table(logs) + scanner(numbers.port)) as recorder,
@@ -131,7 +131,7 @@ def test_split_begins_a_part_and_loses_nothing(tmp_path: Path, logs: Path) -> No
 
 
 @pytest.mark.parametrize("command", [("mark", "x"), ("split",)])
-def test_without_a_recorder_it_is_one_line(tmp_path: Path, logs: Path, command: tuple[str, ...]) -> None:
+def test_without_a_recorder_the_error_is_one_line(tmp_path: Path, logs: Path, command: tuple[str, ...]) -> None:
     logs.mkdir()
     run = swath(*command, str(logs))
     assert (run.returncode, run.stdout) == (3, "")
@@ -148,14 +148,14 @@ def test_without_a_recorder_it_is_one_line(tmp_path: Path, logs: Path, command: 
 
 
 @pytest.mark.parametrize("text", ["", "  ", "x" * (NOTE_CHARACTERS + 1)])
-def test_what_is_no_note_is_said_before_it_is_sent(logs: Path, text: str) -> None:
+def test_an_invalid_note_is_refused_before_it_is_sent(logs: Path, text: str) -> None:
     logs.mkdir()
     run = swath("mark", text, str(logs))
     assert run.returncode == 2
     assert run.stderr == f"swath: TEXT has {len(text)} characters; want 1 to {NOTE_CHARACTERS}, not only spaces\n"
 
 
-def test_only_its_owner_can_connect(tmp_path: Path, open_folder: Path) -> None:
+def test_only_the_owner_of_the_recorder_can_connect(tmp_path: Path, open_folder: Path) -> None:
     """Root connects for the recorder's own user; another user is refused by the kernel."""
     if os.geteuid() != 0:
         pytest.fail("this test becomes another user: run it as root")
@@ -178,7 +178,7 @@ def test_only_its_owner_can_connect(tmp_path: Path, open_folder: Path) -> None:
 
 
 @pytest.mark.parametrize("words", [("mark", "x"), ("split",), ("monitor", "--once"), ("offload",)])
-def test_who_may_not_look_is_told_so(tmp_path: Path, open_folder: Path, words: tuple[str, ...]) -> None:
+def test_status_without_permission_is_refused(tmp_path: Path, open_folder: Path, words: tuple[str, ...]) -> None:
     """Not that nothing is recorded there."""
     logs = open_folder / "logs"
     logs.mkdir(mode=0o750)
@@ -190,7 +190,7 @@ def test_who_may_not_look_is_told_so(tmp_path: Path, open_folder: Path, words: t
     assert done.stderr.count("\n") == 1
 
 
-def test_the_unit_names_the_runtime_directory_and_the_log_directory_leads_there(
+def test_the_socket_is_in_the_runtime_directory_and_linked_from_the_log_directory(
     tmp_path: Path, logs: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     runtime = tmp_path / "run"
@@ -216,7 +216,7 @@ def test_a_stale_socket_is_replaced(tmp_path: Path, logs: Path) -> None:
         assert recorder.stop() == 0
 
 
-def test_a_living_socket_is_left_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_socket_in_use_is_left_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     runtime = tmp_path / "run"
     runtime.mkdir()
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(runtime))
@@ -232,7 +232,7 @@ def test_a_living_socket_is_left_alone(tmp_path: Path, monkeypatch: pytest.Monke
     assert read_log(second).events("control_absent")
 
 
-def test_what_is_no_socket_is_not_touched(tmp_path: Path, logs: Path) -> None:
+def test_a_file_that_is_not_a_socket_is_not_touched(tmp_path: Path, logs: Path) -> None:
     logs.mkdir()
     (logs / ".swath.control").write_text("a file of somebody's")
     with Recorder(tmp_path, session_table(logs)) as recorder:
@@ -241,7 +241,7 @@ def test_what_is_no_socket_is_not_touched(tmp_path: Path, logs: Path) -> None:
     assert (logs / ".swath.control").read_text() == "a file of somebody's"
 
 
-def test_after_a_defect_nobody_waits_for_an_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_after_a_defect_no_request_waits_for_a_response(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     said: list[str] = []
     events: Any = SimpleNamespace(post=lambda severity, source, code, text: said.append(code))
     recording: Any = SimpleNamespace(parts=SimpleNamespace(directory=tmp_path))
@@ -255,7 +255,7 @@ def test_after_a_defect_nobody_waits_for_an_answer(tmp_path: Path, monkeypatch: 
     assert not list(tmp_path.iterdir())
 
 
-def test_a_path_longer_than_addresses_are(tmp_path: Path) -> None:
+def test_a_path_longer_than_a_socket_address_works(tmp_path: Path) -> None:
     logs = tmp_path / ("d" * 100) / ("e" * 100)
     with Recorder(tmp_path, session_table(logs)) as recorder:
         assert swath("mark", "far", str(logs)).returncode == 0
@@ -277,7 +277,7 @@ def test_a_path_longer_than_addresses_are(tmp_path: Path) -> None:
         (b'{"command": "mark", "text": 7}\n', "1 to 500 characters"),
     ],
 )
-def test_what_is_no_request_is_refused_in_a_line(running: Path, line: bytes, error: str) -> None:
+def test_an_invalid_request_is_refused_in_one_line(running: Path, line: bytes, error: str) -> None:
     answer = say(running / ".swath.control", line)
     assert answer["ok"] is False
     assert error in str(answer["error"])
@@ -286,14 +286,14 @@ def test_what_is_no_request_is_refused_in_a_line(running: Path, line: bytes, err
 
 @pytest.fixture(scope="module")
 def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """The log directory of a recorder that goes on."""
+    """Return the log directory of a running recorder."""
     folder = tmp_path_factory.mktemp("running")
     with Recorder(folder, session_table(folder / "logs")) as recorder:
         yield folder / "logs"
         assert recorder.stop() == 0
 
 
-def test_new_parts_without_end_are_refused(running: Path) -> None:
+def test_endless_part_requests_are_refused(running: Path) -> None:
     answers = [say(running / ".swath.control", b'{"command": "split"}\n') for _ in range(SPLITS_AT_ONCE + 2)]
     assert [answer["ok"] for answer in answers[:SPLITS_AT_ONCE]] == [True] * SPLITS_AT_ONCE
     assert answers[-1] == {"ok": False, "error": "too many new parts; at most 1 per second is begun"}
@@ -349,7 +349,7 @@ class Nuisance:
 
 
 @pytest.mark.slow
-def test_a_flood_and_peers_that_hang_cost_not_a_byte(tmp_path: Path, logs: Path) -> None:
+def test_floods_and_hanging_peers_cost_no_data(tmp_path: Path, logs: Path) -> None:
     with (
         contextlib.closing(Numbers(free_udp_port())) as numbers,
         Recorder(tmp_path, session_table(logs) + scanner(numbers.port)) as recorder,

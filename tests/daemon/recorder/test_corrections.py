@@ -43,7 +43,7 @@ SERIAL = '[corrections.base]\ntransport = "serial:{path}?baud=115200"\n'
 
 @contextmanager
 def reader(descriptor: int) -> Iterator[bytearray]:
-    """What a device at the other end of a port gets."""
+    """Collect the bytes that arrive at the other end of a port."""
     got, ended = bytearray(), threading.Event()
 
     def read() -> None:
@@ -61,7 +61,7 @@ def reader(descriptor: int) -> Iterator[bytearray]:
 
 
 @pytest.mark.slow
-def test_a_caster_s_bytes_are_logged_and_reach_the_receiver(tmp_path: Path) -> None:
+def test_data_of_a_caster_are_logged_and_reach_the_receiver(tmp_path: Path) -> None:
     """The caster hangs up in the middle; the second connection gives the rest."""
     logs, half = tmp_path / "logs", len(DATA) // 2
     all_sent, ready = threading.Event(), threading.Event()
@@ -123,7 +123,7 @@ def test_a_serial_base_is_logged_without_a_receiver(tmp_path: Path) -> None:
     assert "forwarded_bytes" not in status
 
 
-def test_a_receiver_that_is_away_does_not_stop_the_recording(tmp_path: Path) -> None:
+def test_an_absent_receiver_does_not_stop_the_recording(tmp_path: Path) -> None:
     logs = tmp_path / "logs"
     sent = threading.Event()
 
@@ -145,7 +145,7 @@ def test_a_receiver_that_is_away_does_not_stop_the_recording(tmp_path: Path) -> 
     assert len(content.events("forwarding_failed")) == 1
 
 
-def test_an_end_does_not_wait_for_a_caster_that_says_nothing(tmp_path: Path) -> None:
+def test_stopping_does_not_wait_for_a_silent_caster(tmp_path: Path) -> None:
     hold = threading.Event()
 
     def script(sock: socket.socket, number: int) -> None:
@@ -185,7 +185,7 @@ def test_a_relay_never_waits_for_its_port(caplog: pytest.LogCaptureFixture) -> N
     assert not relay.is_alive()
 
 
-def test_check_says_what_answers(tmp_path: Path) -> None:
+def test_check_reports_the_caster_response(tmp_path: Path) -> None:
     ended = threading.Event()
 
     def script(sock: socket.socket, number: int) -> None:
@@ -233,7 +233,7 @@ def test_check_says_what_answers(tmp_path: Path) -> None:
         ({"transport": "ntrip:a:1/B", "pps": "main"}, "corrections.base.pps: unknown key"),
     ],
 )
-def test_what_cannot_be_is_one_line(tmp_path: Path, table: dict[str, str], said: str) -> None:
+def test_impossible_settings_are_refused_in_one_line(tmp_path: Path, table: dict[str, str], said: str) -> None:
     whole = {
         "session": {"name": "x"},
         "gnss": {
@@ -247,7 +247,7 @@ def test_what_cannot_be_is_one_line(tmp_path: Path, table: dict[str, str], said:
     assert [line for line in caught.value.lines if said in line], caught.value.lines
 
 
-def test_two_of_one_mountpoint(tmp_path: Path) -> None:
+def test_two_sources_of_one_mountpoint_are_refused(tmp_path: Path) -> None:
     whole = {
         "session": {"name": "x"},
         "corrections": {"a": {"transport": "ntrip:c:2101/M"}, "b": {"transport": "ntrip:c:2101/M?user=x"}},

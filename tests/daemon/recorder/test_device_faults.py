@@ -41,7 +41,7 @@ def logs(tmp_path: Path) -> Path:
 
 
 def info(logs: Path) -> dict[str, Any]:
-    """What ``swath info`` says of the one session in a directory; nothing unaccounted, nothing damaged."""
+    """Return the JSON of ``swath info`` for the only session; fail if it reports any loss or damage."""
     command = [sys.executable, "-m", "swath.daemon.cli.main", "info", "--json", str(logs)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=HANGS_S, check=True)
     (session,) = json.loads(done.stdout)["sessions"]
@@ -88,7 +88,7 @@ def faulty(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[FaultyCa
     bus.close()
 
 
-def test_bus_off_and_error_frames_are_told_and_the_bus_comes_back(
+def test_bus_off_and_error_frames_are_reported_and_the_bus_is_reopened(
     tmp_path: Path, logs: Path, faulty: FaultyCan
 ) -> None:
     """Error frames of 3 classes, bus-off with restart, then an adapter that fails and cannot be opened for a while."""
@@ -129,7 +129,7 @@ def test_bus_off_and_error_frames_are_told_and_the_bus_comes_back(
 
 
 class Wire:
-    """One end of a wire; `sent` is what the log must hold, unit by unit or joined."""
+    """One end of a wire; `sent` is the content that the log must have, unit by unit or joined."""
 
     def __init__(self, source: str, table: str, send: Callable[[bytes], object], close: Callable[[], object]) -> None:
         self.source, self.table = source, f"[{source.replace('/', '.')}]\n{table}\n"
@@ -187,7 +187,7 @@ def zda(number: int) -> bytes:
 
 
 def account_of(content: Any, wire: Wire) -> dict[str, Any]:
-    """The last status of a source, which must say that all of it is in the log, and so it must be."""
+    """Return the last status of a source; fail unless all its units are in the log."""
     status: dict[str, Any] = content.messages[f"/status/{wire.source}"][-1][1]
     assert status["lost_kernel"] == status["lost_queue"] == status["lost_write"] == 0, wire.source
     assert status["bytes"] == sum(map(len, wire.sent)), wire.source
@@ -201,7 +201,7 @@ def account_of(content: Any, wire: Wire) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def recording(tmp_path: Path, logs: Path, wires: list[Wire]) -> Iterator[Recorder]:
-    """A recorder of some wires, all open; it must end well."""
+    """Run a recorder with some wires, all open; it must end without error."""
     config = session_table(logs) + "".join(wire.table for wire in wires)
     try:
         with Recorder(tmp_path, config) as recorder:
@@ -217,8 +217,8 @@ def recording(tmp_path: Path, logs: Path, wires: list[Wire]) -> Iterator[Recorde
 
 
 @pytest.mark.slow
-def test_two_of_each_kind_at_once_and_one_receiver_changes_its_messages(tmp_path: Path, logs: Path) -> None:
-    """Each source has exactly its own units; the receiver that gives no time any more is told, the other is not."""
+def test_two_devices_of_each_kind_are_recorded_and_a_changed_receiver_is_reported(tmp_path: Path, logs: Path) -> None:
+    """Each source has exactly its own units; only the receiver that gives no time any more is reported."""
     scanners = [udp_wire("scanner/left"), udp_wire("scanner/right")]
     rover, base = serial_wire("gnss/rover"), serial_wire("gnss/base")
     imus = [can_wire("imu/main"), can_wire("imu/spare")]
@@ -286,7 +286,7 @@ def heard_at(data: bytes, sent_baud: int, heard_baud: int) -> bytes:
 
 
 @pytest.mark.slow
-def test_a_receiver_that_changes_its_baud_rate_is_told_and_recorded_as_it_came(tmp_path: Path, logs: Path) -> None:
+def test_a_receiver_that_changes_its_baud_rate_is_reported_and_recorded_unchanged(tmp_path: Path, logs: Path) -> None:
     rover = serial_wire("gnss/rover")
     assert heard_at(zda(1), 9600, 9600) == zda(1)
     with recording(tmp_path, logs, [rover]) as recorder:
@@ -350,8 +350,8 @@ def segments(logs: Path, source: str) -> int:
     return clock.status().segments
 
 
-def test_restarts_doubled_and_shuffled_datagrams(tmp_path: Path, logs: Path) -> None:
-    """Recorded as they came; told by what they are, never as gaps that there are not; a restart is a new segment."""
+def test_restarts_and_repeated_or_reordered_datagrams_are_reported_as_such(tmp_path: Path, logs: Path) -> None:
+    """Units are recorded unchanged and reported by their kind, never as gaps; a restart is a new segment."""
     dbc = Path(__file__).resolve().parents[3] / "fixtures" / "config" / "imu.dbc"
     restarting, shuffled = udp_wire("scanner/left"), udp_wire("scanner/right")
     imu = can_wire("imu/main", IMU_TABLE.format(dbc=dbc, table="imu.main"))
@@ -397,22 +397,22 @@ SYNCS = (
 
 
 def thread_cpu_s(recorder: Recorder, name: str) -> float:
-    """User and system seconds of one thread so far."""
+    """Return user plus system seconds of one thread."""
     stat = Path(f"/proc/{recorder.process.pid}/task/{recorder.thread(name)}/stat").read_text()
     fields = stat.rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def memory_mb(recorder: Recorder) -> float:
-    """What of the recorder's memory is its own."""
+    """Return the private memory of the recorder, MB."""
     status = Path(f"/proc/{recorder.process.pid}/status").read_text()
     return next(int(row.split()[1]) for row in status.splitlines() if row.startswith("RssAnon")) / 1e3
 
 
 @pytest.mark.slow
 @pytest.mark.alone
-def test_garbage_at_full_rate_costs_the_others_nothing(tmp_path: Path, logs: Path) -> None:
-    """A line full of beginnings of messages that never end, and 20 000 datagrams a second that are none."""
+def test_garbage_at_full_rate_does_not_affect_other_sources(tmp_path: Path, logs: Path) -> None:
+    """Send beginnings of messages that never end, and 20 000 invalid datagrams a second."""
     good, noisy = udp_wire("scanner/left"), udp_wire("scanner/right")
     rover, babbling = serial_wire("gnss/rover", "ubx"), serial_wire("gnss/base", "ubx")
     generator = random.Random(1)
@@ -448,14 +448,14 @@ def test_garbage_at_full_rate_costs_the_others_nothing(tmp_path: Path, logs: Pat
 
 
 def babble(wire: Wire, data: bytes) -> None:
-    """Send as a line of 921600 baud does."""
+    """Send garbage at the rate of a line of 921600 baud."""
     start_s = time.monotonic()
     for at in range(0, len(data), 460):
         time.sleep(max(0.0, start_s + at / 92_160 - time.monotonic()))
         wire.send(data[at : at + 460])
 
 
-def test_a_device_that_is_still_being_opened_at_the_end_has_lost_nothing(tmp_path: Path) -> None:
+def test_a_device_still_opening_at_the_end_has_lost_no_data(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as mute:  # a gateway that takes connections and says nothing
         transport = f"can:socketcand:can0?host=127.0.0.1&port={mute.getsockname()[1]}"
         config = f'{session_table(tmp_path / "logs")}[imu.main]\ntransport = "{transport}"\nprotocol = "canmod-gps"\n'

@@ -62,7 +62,9 @@ class Flood:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("reserve_mb", "said"), [(8, "disk_reserve"), (1, "write_failed")])
-def test_stops_when_full_and_resumes_when_there_is_room(small_disk: Path, reserve_mb: int, said: str) -> None:
+def test_recording_stops_when_the_disk_is_full_and_resumes_with_space(
+    small_disk: Path, reserve_mb: int, said: str
+) -> None:
     """Looked at once a second, the reserve stops 5 MB/s in time; 20 MB/s run past 1 MB into the disk's own error."""
     port = free_udp_port()
     filler = small_disk / "filler"
@@ -132,7 +134,7 @@ def keep_parts(logs: Path, kept: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.alone  # asserts how soon
-def test_file_system_that_goes_read_only_is_told_at_once_and_another_is_written_to(
+def test_a_read_only_file_system_is_reported_at_once_and_replaced_by_another(
     failing_disk: tuple[Path, Path], tmp_path: Path
 ) -> None:
     """The kernel's own remedy for a broken disk; remounting it by hand is refused while the log is open (EBUSY)."""
@@ -171,7 +173,7 @@ def test_file_system_that_goes_read_only_is_told_at_once_and_another_is_written_
 
 
 @pytest.mark.slow
-def test_full_from_the_start_is_ready_and_waits(small_disk: Path) -> None:
+def test_a_recorder_on_a_full_disk_is_ready_and_waits(small_disk: Path) -> None:
     (small_disk / "filler").write_bytes(bytes(20 << 20))
     port = free_udp_port()
     logs = small_disk / "logs"
@@ -187,7 +189,7 @@ def test_full_from_the_start_is_ready_and_waits(small_disk: Path) -> None:
     assert len(read_log(logs).events("disk_reserve")) == 1
 
 
-def test_directory_that_cannot_be_written(tmp_path: Path) -> None:
+def test_an_unwritable_directory_is_refused(tmp_path: Path) -> None:
     blocked = tmp_path / "file"
     blocked.write_text("")
     recorder = Recorder(tmp_path / "rig", config_of(blocked / "logs", free_udp_port(), 1))

@@ -19,7 +19,7 @@ ANSWER = {"ok": True, "session_id": "a", "part": 3, "recording": True, "reason":
 SIGN = {"session_id": "a-20261121T100000Z-ab12", "part": 1, "path": "a_1.mcap", "boot_id": "b"}
 
 
-def test_a_line_from_anywhere_can_be_written_anywhere() -> None:
+def test_foreign_text_becomes_one_encodable_line() -> None:
     assert one_line("a\nb\x1b[2J\u2028σ") == "a b [2J σ"
     assert one_line("/mnt/\udcff.mcap").encode() == rb"/mnt/\udcff.mcap"
 
@@ -36,21 +36,21 @@ def test_a_line_from_anywhere_can_be_written_anywhere() -> None:
         {"ok": False},
     ],
 )
-def test_what_is_no_answer_of_a_recorder_is_told(answer: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_invalid_response_of_a_recorder_is_refused(answer: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(control_client, "_exchange", lambda *_: json.dumps(answer).encode())
     with pytest.raises(UserError, match="no recorder of this version; start it anew after an update") as refused:
         ask(Path("/logs"), {"command": "mark", "text": "x"})
     assert refused.value.exit_code == ExitCode.IO
 
 
-def test_an_answer_has_what_was_asked_for_in_texts_of_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_response_contains_the_requested_fields_as_single_lines(monkeypatch: pytest.MonkeyPatch) -> None:
     said = json.dumps({**ANSWER, "text": "a\x1b\nb", "more": 1}).encode()
     monkeypatch.setattr(control_client, "_exchange", lambda *_: said)
     assert ask(Path("/logs"), {"command": "mark"}) == {**ANSWER, "text": "a b"}
     assert "time_ns" not in ask(Path("/logs"), {"command": "split"})
 
 
-def test_a_connection_that_ends_without_a_word_is_no_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_empty_response_is_not_a_recorders_response(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(control_client, "_exchange", lambda *_: b"")
     with pytest.raises(UserError, match="the recorder there does not answer"):
         ask(Path("/logs"), {"command": "split"})
@@ -64,14 +64,14 @@ def test_a_connection_that_ends_without_a_word_is_no_answer(monkeypatch: pytest.
         *({"session_id": value} for value in ("../a", "a/b", "", "a\0", 5, "a" * 300)),
     ],
 )
-def test_a_sign_that_no_recorder_made_is_none(changes: dict[str, Any], tmp_path: Path) -> None:
+def test_an_invalid_recording_sign_is_ignored(changes: dict[str, Any], tmp_path: Path) -> None:
     (tmp_path / RECORDING_SIGN).write_text(json.dumps(SIGN))
     assert read_sign(tmp_path) is not None
     (tmp_path / RECORDING_SIGN).write_text(json.dumps(SIGN | changes))
     assert read_sign(tmp_path) is None
 
 
-def test_parts_before_are_those_that_are_there(tmp_path: Path) -> None:
+def test_previous_parts_are_the_existing_files_only(tmp_path: Path) -> None:
     """However high a number the sign names, each file is looked at once."""
     (tmp_path / RECORDING_SIGN).write_text(json.dumps(SIGN | {"part": 999_999}))
     sign = read_sign(tmp_path)
@@ -82,7 +82,7 @@ def test_parts_before_are_those_that_are_there(tmp_path: Path) -> None:
     assert [path.name for path in _parts_before(tmp_path, sign)] == names[:3]
 
 
-def test_of_a_status_stays_what_can_be_shown() -> None:
+def test_only_displayable_values_of_a_status_are_kept() -> None:
     good = {"units": 5, "bytes": 7, "lost_kernel": 1, "lost_queue": 0, "lost_write": 0, "state": "receiving"}
     assert usable_status({**good, "time_sigma_ns": 5.5}) == {**good, "last_unit_age_s": None, "time_sigma_ns": 5.5}
     strange = usable_status(

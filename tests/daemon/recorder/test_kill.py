@@ -60,7 +60,7 @@ class Bystander:
         self._process.wait(HANGS_S)
 
     def since(self, until: float, running_s: float) -> float:
-        """The moment (monotonic s) from which the machine ran `running_s` in all until `until`."""
+        """Return the time (monotonic s) from which the machine ran `running_s` seconds in total until `until`."""
         moment = until
         for line in reversed(self._waits.read_text().splitlines()):
             begin, end = (float(word) for word in line.split())
@@ -72,7 +72,7 @@ class Bystander:
 
 
 class ForkServer:
-    """Recorders on demand."""
+    """Process that forks recorders on demand."""
 
     def __init__(self) -> None:
         command = [sys.executable, "-m", "tests.daemon.fork_server"]
@@ -134,7 +134,7 @@ def send_until(stop: threading.Event, port: int, master: int, fifo: int, sent: S
 
 
 def record_and_kill(server: ForkServer, bystander: Bystander, folder: Path, after_s: float) -> None:
-    """One recorder, killed in the middle; then what must be true of what it left."""
+    """Run one recorder, kill it, and check its log."""
     folder.mkdir()
     port, link, fifo_path, logs = free_udp_port(), folder / "rover", folder / "pps", folder / "logs"
     master, slave = os.openpty()
@@ -207,7 +207,9 @@ def numbers_in(path: Path) -> dict[str, list[int]]:
 
 @pytest.mark.slow
 @pytest.mark.alone
-def test_killed_at_a_hundred_random_moments(server: ForkServer, bystander: Bystander, tmp_path: Path) -> None:
+def test_a_recorder_killed_at_random_moments_loses_only_open_chunks(
+    server: ForkServer, bystander: Bystander, tmp_path: Path
+) -> None:
     rng = random.Random(20261121)
     moments = [rng.uniform(0.05, 2.0) for _ in range(KILLS)]
     with ThreadPoolExecutor(AT_ONCE) as pool:

@@ -78,7 +78,7 @@ def last_status(content: LogContent, source: str = "scanner/left") -> dict[str, 
 
 
 @pytest.mark.slow
-def test_full_queue_is_counted_told_and_survived(tmp_path: Path, logs: Path, numbers: Numbers) -> None:
+def test_a_full_queue_is_counted_reported_and_survived(tmp_path: Path, logs: Path, numbers: Numbers) -> None:
     config = session_table(logs) + scanner(numbers.port)
     with Recorder(tmp_path, config, module=(SPECIAL, "small-queue")) as recorder:
         recorder.wait_said("device_opened")
@@ -106,7 +106,7 @@ def test_full_queue_is_counted_told_and_survived(tmp_path: Path, logs: Path, num
     assert not content.events("account_mismatch")
 
 
-def test_kernel_drops_are_counted_to_the_unit(tmp_path: Path, logs: Path, numbers: Numbers) -> None:
+def test_kernel_drops_are_counted_exactly(tmp_path: Path, logs: Path, numbers: Numbers) -> None:
     config = session_table(logs) + scanner(numbers.port, "?buffer_mb=1")
     with Recorder(tmp_path, config) as recorder:
         recorder.wait_said("device_opened")
@@ -126,7 +126,7 @@ def test_kernel_drops_are_counted_to_the_unit(tmp_path: Path, logs: Path, number
     assert found(content)[-100:] == list(range(numbers.sent - 100, numbers.sent))
 
 
-def test_a_stall_within_the_buffer_loses_nothing(tmp_path: Path, logs: Path, numbers: Numbers) -> None:
+def test_a_stall_within_the_buffer_loses_no_data(tmp_path: Path, logs: Path, numbers: Numbers) -> None:
     """Half of what the granted buffer holds: the kernel charges 2304 bytes for a datagram of 1206."""
     config = session_table(logs) + scanner(numbers.port)
     with Recorder(tmp_path, config) as recorder:
@@ -142,7 +142,7 @@ def test_a_stall_within_the_buffer_loses_nothing(tmp_path: Path, logs: Path, num
     assert last_status(content)["lost_kernel"] == 0
 
 
-def test_what_the_kernel_holds_at_the_end_is_recorded(tmp_path: Path, logs: Path, numbers: Numbers) -> None:
+def test_data_in_the_kernel_at_the_end_are_recorded(tmp_path: Path, logs: Path, numbers: Numbers) -> None:
     with Recorder(tmp_path, session_table(logs) + scanner(numbers.port)) as recorder:
         recorder.wait_said("device_opened")
         recorder.process.send_signal(signal.SIGSTOP)
@@ -155,7 +155,7 @@ def test_what_the_kernel_holds_at_the_end_is_recorded(tmp_path: Path, logs: Path
     assert last_status(content)["units"] == 10_000
 
 
-def test_parts_under_load_lose_and_reorder_nothing(tmp_path: Path, logs: Path, numbers: Numbers) -> None:
+def test_part_changes_under_load_lose_and_reorder_no_data(tmp_path: Path, logs: Path, numbers: Numbers) -> None:
     config = session_table(logs, split_size_mb=1) + scanner(numbers.port)
     with Recorder(tmp_path, config) as recorder:
         recorder.wait_said("device_opened")
@@ -177,7 +177,7 @@ def test_parts_under_load_lose_and_reorder_nothing(tmp_path: Path, logs: Path, n
 
 
 def read_events(path: Path) -> list[dict[str, Any]]:
-    """Events of one part alone."""
+    """Return the events of one part."""
     content = LogContent()
     for session in open_logs([path]):
         for batch in session.batches():
@@ -186,7 +186,7 @@ def read_events(path: Path) -> list[dict[str, Any]]:
     return [value for _, value in content.messages["/events"]]
 
 
-def test_directory_removed_while_recording(tmp_path: Path, logs: Path, numbers: Numbers) -> None:
+def test_a_directory_removed_during_recording_is_made_again(tmp_path: Path, logs: Path, numbers: Numbers) -> None:
     with Recorder(tmp_path, session_table(logs) + scanner(numbers.port)) as recorder:
         recorder.wait_said("device_opened")
         numbers.send(100)
@@ -208,7 +208,7 @@ def test_directory_removed_while_recording(tmp_path: Path, logs: Path, numbers: 
     assert read_events(path)[0]["code"] in ("log_gone", "part_opened")
 
 
-def test_logs_that_vanish_while_they_are_looked_for_hinder_no_repair(tmp_path: Path) -> None:
+def test_logs_that_vanish_during_the_search_do_not_affect_the_recovery(tmp_path: Path) -> None:
     assert unfinished_logs(tmp_path / "gone") == []
     (tmp_path / "moved_0.mcap").symlink_to(tmp_path / "elsewhere.mcap")  # listed, and not there when it is opened
     write_part(tmp_path / "left_0.mcap", finish=False)
@@ -216,7 +216,7 @@ def test_logs_that_vanish_while_they_are_looked_for_hinder_no_repair(tmp_path: P
     assert unfinished_logs(tmp_path) == [tmp_path / "left_0.mcap"]
 
 
-def test_what_a_power_cut_leaves_of_a_parts_beginning_is_not_repaired_at_every_start(tmp_path: Path) -> None:
+def test_the_remains_of_a_part_after_a_power_cut_are_not_recovered_at_every_start(tmp_path: Path) -> None:
     whole = tmp_path / "left_0.mcap"
     write_part(whole, finish=False, blocks=0)
     head = whole.read_bytes()
@@ -226,7 +226,7 @@ def test_what_a_power_cut_leaves_of_a_parts_beginning_is_not_repaired_at_every_s
     assert unfinished_logs(tmp_path) == [whole]
 
 
-def test_lock_and_control_socket_come_back_with_the_directory(tmp_path: Path, logs: Path) -> None:
+def test_lock_and_control_socket_are_restored_with_the_directory(tmp_path: Path, logs: Path) -> None:
     config = session_table(logs)
     with Recorder(tmp_path / "one", config) as recorder:
         recorder.wait_said("session_started")
@@ -243,9 +243,7 @@ def test_lock_and_control_socket_come_back_with_the_directory(tmp_path: Path, lo
     assert "mark" in [event["code"] for event in read_events(path)]
 
 
-def test_another_recorder_that_takes_the_directory_made_anew_is_told_and_not_disturbed(
-    tmp_path: Path, logs: Path
-) -> None:
+def test_another_recorder_in_the_new_directory_is_reported_and_not_disturbed(tmp_path: Path, logs: Path) -> None:
     with Recorder(tmp_path, session_table(logs)) as recorder:
         recorder.wait_said("session_started")
         new = tmp_path / "new"
@@ -264,7 +262,9 @@ def test_another_recorder_that_takes_the_directory_made_anew_is_told_and_not_dis
 
 
 @pytest.mark.slow
-def test_directory_that_cannot_come_back_is_not_called_alive(tmp_path: Path, logs: Path, numbers: Numbers) -> None:
+def test_a_recorder_without_its_directory_does_not_notify_the_watchdog(
+    tmp_path: Path, logs: Path, numbers: Numbers
+) -> None:
     config = session_table(logs) + scanner(numbers.port)
     with Recorder(tmp_path, config, watchdog_s=1.0) as recorder:
         recorder.wait_said("device_opened")
@@ -284,7 +284,7 @@ def test_directory_that_cannot_come_back_is_not_called_alive(tmp_path: Path, log
     assert official_counts(path)["/scanner/left/raw"] == 10
 
 
-def test_strangers_on_the_port_share_one_channel(tmp_path: Path, logs: Path, numbers: Numbers) -> None:
+def test_unknown_senders_on_the_port_share_one_channel(tmp_path: Path, logs: Path, numbers: Numbers) -> None:
     senders = MAX_SENDERS + 40
     with Recorder(tmp_path, session_table(logs) + scanner(numbers.port)) as recorder:
         recorder.wait_said("device_opened")
@@ -311,7 +311,7 @@ def test_strangers_on_the_port_share_one_channel(tmp_path: Path, logs: Path, num
 
 
 @pytest.mark.slow
-def test_account_goes_on_when_a_device_comes_back(tmp_path: Path, logs: Path) -> None:
+def test_counters_continue_when_a_device_returns(tmp_path: Path, logs: Path) -> None:
     link = tmp_path / "rover"
     config = session_table(logs) + f'[gnss.rover]\ntransport = "serial:{link}"\nprotocol = "nmea"\n'
     sent = 0
@@ -336,7 +336,7 @@ def test_account_goes_on_when_a_device_comes_back(tmp_path: Path, logs: Path) ->
     assert status["units"] == status["written"] == len(content.units["gnss/rover"])
 
 
-def test_begins_at_once_whatever_lies_in_the_directory(tmp_path: Path, logs: Path, numbers: Numbers) -> None:
+def test_recording_begins_at_once_whatever_the_directory_contains(tmp_path: Path, logs: Path, numbers: Numbers) -> None:
     logs.mkdir()
     for number in range(5000):
         (logs / f"old-{number}.mcap").write_bytes(b"")
@@ -354,7 +354,7 @@ def test_begins_at_once_whatever_lies_in_the_directory(tmp_path: Path, logs: Pat
     assert found(read_log(path)) == list(range(500))
 
 
-def test_ended_while_it_starts_leaves_nothing_unfinished(tmp_path: Path, logs: Path, numbers: Numbers) -> None:
+def test_stopping_during_the_start_leaves_no_unfinished_file(tmp_path: Path, logs: Path, numbers: Numbers) -> None:
     recorder = Recorder(tmp_path, session_table(logs) + scanner(numbers.port))
     wait_until(lambda: list(logs.glob("*.mcap")), "the first part")
     assert recorder.stop() == 0, recorder.stderr()
@@ -365,7 +365,7 @@ def test_ended_while_it_starts_leaves_nothing_unfinished(tmp_path: Path, logs: P
     assert not (logs / "recording.json").exists()
 
 
-def test_started_again_within_the_second_takes_another_name(tmp_path: Path, logs: Path, numbers: Numbers) -> None:
+def test_a_restart_within_the_same_second_takes_another_name(tmp_path: Path, logs: Path, numbers: Numbers) -> None:
     config = session_table(logs) + scanner(numbers.port)
     for turn in range(2):
         with Recorder(tmp_path / str(turn), config) as recorder:
@@ -375,7 +375,7 @@ def test_started_again_within_the_second_takes_another_name(tmp_path: Path, logs
     assert len({path.stem.rsplit("_", 1)[0] for path in logs.glob("test*_0.mcap")}) == 3
 
 
-def test_death_of_the_writer_ends_the_process(tmp_path: Path, logs: Path, numbers: Numbers) -> None:
+def test_a_failing_writer_ends_the_process(tmp_path: Path, logs: Path, numbers: Numbers) -> None:
     config = session_table(logs) + scanner(numbers.port)
     with Recorder(tmp_path, config, module=(SPECIAL, "broken-writer")) as recorder:
         assert recorder.process.wait(HANGS_S) == 1
@@ -384,7 +384,9 @@ def test_death_of_the_writer_ends_the_process(tmp_path: Path, logs: Path, number
 
 @pytest.mark.slow
 @pytest.mark.parametrize("watchdog_s", [None, 2.0])
-def test_death_of_a_receiver(tmp_path: Path, logs: Path, numbers: Numbers, watchdog_s: float | None) -> None:
+def test_a_failing_receiver_ends_the_service_or_leaves_the_others_recording(
+    tmp_path: Path, logs: Path, numbers: Numbers, watchdog_s: float | None
+) -> None:
     """Under a service manager a new process begins at once; by hand the others are recorded on."""
     config = session_table(logs) + scanner(numbers.port)
     with Recorder(tmp_path, config, watchdog_s=watchdog_s, module=(SPECIAL, "broken-receiver")) as recorder:
@@ -409,7 +411,7 @@ def test_death_of_a_receiver(tmp_path: Path, logs: Path, numbers: Numbers, watch
 
 
 @pytest.mark.slow
-def test_losses_are_exact_while_everything_happens_at_once(tmp_path: Path, logs: Path, numbers: Numbers) -> None:
+def test_loss_counters_are_exact_under_simultaneous_faults(tmp_path: Path, logs: Path, numbers: Numbers) -> None:
     """Parts, stalls and a flood together: every status of every part keeps the equation (checked while reading)."""
     config = session_table(logs) + scanner(numbers.port, "?buffer_mb=1")
     with Recorder(tmp_path, config, module=(SPECIAL, "small-queue")) as recorder:

@@ -61,7 +61,7 @@ def played() -> list[TimedUnit]:
 
 
 def gps_of(assembly: Assembly, host_ns: int) -> int:
-    """GPS time of a host time, nanoseconds."""
+    """Return GPS time of a host time, ns."""
     clock: PpsClock = assembly.timekeeper._clocks["pps/main"]
     raw_ns = assembly.timekeeper._timeline.raw_at(host_ns)
     return int(clock.gps_from_host(np.array([raw_ns], dtype=np.int64))[0][0])
@@ -80,7 +80,7 @@ def test_recording_and_its_edges_are_locked(tmp_path: Path) -> None:
     assert abs(whole_s - round(whole_s)) < 1e-6
 
 
-def test_a_receiver_far_from_a_clock_that_is_kept_is_told_once(
+def test_a_receiver_far_from_a_synchronised_clock_is_reported_once(
     caplog: pytest.LogCaptureFixture, tmp_path: Path
 ) -> None:
     caplog.set_level("INFO", "swath")
@@ -90,7 +90,7 @@ def test_a_receiver_far_from_a_clock_that_is_kept_is_told_once(
     assert "days behind this computer's clock (kept by" in event.text
 
 
-def test_delay_and_named_edge_of_the_configuration_are_honoured(tmp_path: Path) -> None:
+def test_delay_and_named_edge_of_the_configuration_are_used(tmp_path: Path) -> None:
     seconds = {}
     for name, keys in {
         "plain": {},
@@ -138,7 +138,7 @@ def told_of(caplog: pytest.LogCaptureFixture, *codes: str) -> list[str]:
     return [event.code for event in journal_of(caplog) if event.code in codes]
 
 
-def test_a_receiver_that_changes_its_messages_is_told_and_edges_carry_the_second_on(
+def test_a_receiver_that_changes_its_messages_is_reported_and_edges_keep_the_second(
     caplog: pytest.LogCaptureFixture, tmp_path: Path
 ) -> None:
     caplog.set_level("INFO", "swath")
@@ -165,7 +165,7 @@ def test_time_without_pps_is_coarse_and_lost_a_minute_after_its_last_message(
     assert told_of(caplog, "time_messages_stopped") == ["time_messages_stopped"]  # at the end no data comes at all
 
 
-def test_pps_without_time_says_no_second(caplog: pytest.LogCaptureFixture, tmp_path: Path) -> None:
+def test_a_pps_without_time_messages_gives_no_second(caplog: pytest.LogCaptureFixture, tmp_path: Path) -> None:
     caplog.set_level("INFO", "swath")
     assembly = assembled(tmp_path / "x")
     states = play_changing(assembly, edges=True, messages=False)
@@ -174,7 +174,7 @@ def test_pps_without_time_says_no_second(caplog: pytest.LogCaptureFixture, tmp_p
 
 
 @pytest.mark.parametrize("broken", ["parser", "clock"])
-def test_a_defect_in_time_keeping_is_told_once_and_never_reaches_the_recording(
+def test_a_defect_in_time_keeping_is_reported_once_and_never_affects_the_recording(
     caplog: pytest.LogCaptureFixture, tmp_path: Path, broken: str
 ) -> None:
     caplog.set_level("INFO", "swath")

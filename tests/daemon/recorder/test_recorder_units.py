@@ -45,7 +45,7 @@ def block_of(channel_id: int, count: int, length: int = 100) -> EncodedBlock:
 
 
 @pytest.mark.parametrize("count", [1, 2, 300])
-def test_messages_written_around_units_where_they_lie_are_those_that_copy_them(count: int) -> None:
+def test_messages_written_around_units_in_place_equal_copied_ones(count: int) -> None:
     units = np.random.default_rng(1).integers(0, 256, (count, 40), dtype=np.uint8)
     rows = np.full((count, MESSAGE_HEADER_BYTES + 40), 0xEE, np.uint8)
     rows[:, MESSAGE_HEADER_BYTES:] = units
@@ -57,7 +57,7 @@ def test_messages_written_around_units_where_they_lie_are_those_that_copy_them(c
     assert len(in_place.data) == len(copied.data) == count * (MESSAGE_HEADER_BYTES + 40)
 
 
-def test_queue_is_bounded_for_data_and_open_for_events_and_accounts() -> None:
+def test_the_queue_is_bounded_for_data_and_not_for_events_and_counters() -> None:
     block = block_of(1, 10)
     queue = BlockQueue(int(2.5 * len(block.data)))
     assert [queue.put(QueueItem(SOURCE, block)) for _ in range(4)] == [True, True, False, False]
@@ -74,7 +74,7 @@ def test_queue_is_bounded_for_data_and_open_for_events_and_accounts() -> None:
 
 @dataclass
 class Bench:
-    """A recorder that is turned by hand, and what it works with."""
+    """Recorder without threads whose turns the test runs by hand."""
 
     logs: Path
     queue: BlockQueue
@@ -114,7 +114,9 @@ def bench(tmp_path: Path) -> Iterator[Bench]:
         parts.current.close()
 
 
-def test_a_failed_opening_leaves_nothing_and_recording_goes_on(bench: Bench, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_failed_opening_leaves_no_file_and_recording_continues(
+    bench: Bench, caplog: pytest.LogCaptureFixture
+) -> None:
     sign = bench.logs / "recording.json"
     sign.unlink()
     (sign / "in the way").mkdir(parents=True)
@@ -137,7 +139,7 @@ def test_a_failed_opening_leaves_nothing_and_recording_goes_on(bench: Bench, cap
     assert [official_counts(bench.logs / f"unit_{part}.mcap")["/gnss/rover/raw"] for part in (0, 1)] == [10, 5]
 
 
-def test_a_name_that_is_taken_is_never_written_to(bench: Bench) -> None:
+def test_an_existing_file_is_never_written_to(bench: Bench) -> None:
     (bench.logs / "unit_1.mcap").write_bytes(b"somebody's")
     bench.recorder.new_part.set()
     bench.turn()
@@ -155,7 +157,7 @@ def test_a_part_without_any_event_still_ends_with_part_closed(bench: Bench) -> N
     assert [value["code"] for _, value in read_log(bench.logs / "unit_0.mcap").messages["/events"]] == ["part_closed"]
 
 
-def test_refused_chunk_is_counted_and_its_events_come_into_the_next_part(bench: Bench) -> None:
+def test_a_refused_chunk_is_counted_and_its_events_go_to_the_next_part(bench: Bench) -> None:
     bench.receive(10)
     bench.turn(second=True)
     bench.events.post(Severity.WARNING, SOURCE, "silent", "told while the disk fails")
@@ -190,7 +192,7 @@ def test_refused_chunk_is_counted_and_its_events_come_into_the_next_part(bench: 
     assert codes == ["silent", "part_unfinished", "write_failed", "recording_resumed"]
 
 
-def test_one_status_after_a_stall_and_its_maxima_are_those_since_the_one_before(bench: Bench) -> None:
+def test_after_a_stall_one_status_holds_the_maxima_since_the_previous_one(bench: Bench) -> None:
     bench.recorder._status_due_s = time.monotonic() - 30.0
     bench.receive(5)
     bench.turn()
@@ -206,7 +208,7 @@ def test_one_status_after_a_stall_and_its_maxima_are_those_since_the_one_before(
     assert statuses[0]["queue_high_water"] > 500 > statuses[1]["queue_high_water"]
 
 
-def test_a_part_is_abandoned_only_where_it_stands(tmp_path: Path) -> None:
+def test_an_abandoned_part_does_not_delete_a_file_that_replaced_it(tmp_path: Path) -> None:
     info = SessionInfo("unit", "swath", "host", "boot", 1, 1)
     writer = PartWriter(tmp_path / "a.mcap", info, 0)
     (tmp_path / "a.mcap").rename(tmp_path / "b.mcap")
@@ -227,7 +229,7 @@ class ScriptedPps(PpsSource):
         self._sequences = sequences
 
     def open(self) -> None:
-        """Nothing to open."""
+        """Do nothing."""
 
     def receive(self, timeout_s: float) -> list[RawEdge]:
         """All edges, once."""
@@ -235,11 +237,11 @@ class ScriptedPps(PpsSource):
         return [RawEdge(time.time_ns(), sequence, "assert") for sequence in sequences]
 
     def close(self) -> None:
-        """Nothing to close."""
+        """Do nothing."""
 
 
 @pytest.mark.parametrize(("overwrites", "lost"), [(True, 4), (False, 0)])
-def test_edges_overwritten_in_the_kernel_are_units_lost(overwrites: bool, lost: int) -> None:
+def test_edges_overwritten_in_the_kernel_are_counted_as_lost_units(overwrites: bool, lost: int) -> None:
     clock, channels, queue = HostClock(), ChannelTable(), BlockQueue(1 << 20)
     shared = Shared(clock, queue, channels, Events(clock, queue, channels))
     openings = [ScriptedPps([7, 8, 11, 12, 15]), ScriptedPps([2, 3])]
@@ -260,7 +262,7 @@ def test_edges_overwritten_in_the_kernel_are_units_lost(overwrites: bool, lost: 
 # --- a wire's own trouble --------------------------------------------------------------------------------------------
 
 
-def test_trouble_is_told_at_once_and_while_it_goes_on_every_half_minute(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_problem_is_reported_at_once_and_then_every_half_minute(caplog: pytest.LogCaptureFixture) -> None:
     clock, channels, queue = HostClock(), ChannelTable(), BlockQueue(1 << 20)
     events = Events(clock, queue, channels)
     now_s = 1000.0
@@ -289,7 +291,7 @@ def health_of(**states: dict[str, object]) -> WriterHealth:
     return WriterHealth(free_bytes=100_000_000_000, bytes_per_s=10_000_000.0, statuses=statuses)
 
 
-def test_sentence_says_what_an_operator_must_know() -> None:
+def test_the_sentence_contains_what_an_operator_needs() -> None:
     assert sentence("s", 2, health_of(gnss_rover={}, scanner_left={})) == (
         "recording s part 2: all 2 sources deliver data; 100.0 GB free (2 h 46 min)"
     )
@@ -310,7 +312,7 @@ def test_sentence_says_what_an_operator_must_know() -> None:
     assert "starting" in sentence("s", 0, WriterHealth())
 
 
-def test_the_time_left_is_that_until_the_reserve_where_recording_stops(bench: Bench) -> None:
+def test_the_remaining_time_ends_at_the_reserve(bench: Bench) -> None:
     settings = RecorderSettings(1 << 30, 1800.0, 1.0, 1000)
     channels, clock = ChannelTable(), HostClock()
     recorder = Recorder(bench.parts, settings, bench.queue, channels, bench.events, clock, lambda source: {})
@@ -322,7 +324,7 @@ def test_the_time_left_is_that_until_the_reserve_where_recording_stops(bench: Be
     assert sentence("s", 0, health).endswith("100.0 GB free (0 s)")
 
 
-def test_a_device_that_is_long_in_opening_is_told_and_restarts_nothing() -> None:
+def test_a_device_that_opens_slowly_is_reported_and_causes_no_restart() -> None:
     """A caster's name that is looked up for a minute must not cost the scanner's data."""
     now_ns = 100_000_000_000
     opening = SimpleNamespace(source="corrections/base", opening=True, came_back_ns=now_ns - 60_000_000_000)
@@ -346,7 +348,7 @@ def test_a_writer_without_a_recent_status_is_stuck() -> None:
 
 
 @pytest.mark.parametrize("abstract", [False, True])
-def test_service_manager_is_told_on_a_path_and_on_an_abstract_socket(tmp_path: Path, abstract: bool) -> None:
+def test_the_service_manager_is_notified_on_a_path_and_on_an_abstract_socket(tmp_path: Path, abstract: bool) -> None:
     name = f"@swath-{os.getpid()}" if abstract else str(tmp_path / "notify")
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind("\0" + name[1:] if abstract else name)
@@ -362,7 +364,7 @@ def test_service_manager_is_told_on_a_path_and_on_an_abstract_socket(tmp_path: P
     service.notify(WATCHDOG="1")  # and one that has gone is no reason to stop
 
 
-def test_watchdog_of_another_process_is_not_ours() -> None:
+def test_the_watchdog_of_another_process_is_ignored() -> None:
     environment = {"WATCHDOG_USEC": "2000000", "WATCHDOG_PID": "1"}
     assert ServiceManager(environment).watchdog_s is None
     assert ServiceManager({}).watchdog_s is None

@@ -71,7 +71,7 @@ def nmea_zda(second: int) -> bytes:
     return f"${body}*{checksum:02X}\r\n".encode()
 
 
-def test_every_byte_of_every_wire_is_in_the_log(tmp_path: Path, logs: Path, sender: socket.socket) -> None:
+def test_every_byte_of_every_wire_is_logged(tmp_path: Path, logs: Path, sender: socket.socket) -> None:
     port, link, fifo = free_udp_port(), tmp_path / "rover", tmp_path / "pps"
     os.mkfifo(fifo)
     pty = Pty(link)
@@ -106,7 +106,7 @@ def test_every_byte_of_every_wire_is_in_the_log(tmp_path: Path, logs: Path, send
     assert not (logs / "recording.json").exists()
 
 
-def test_kernel_stamps_are_the_units_times(tmp_path: Path, logs: Path, sender: socket.socket) -> None:
+def test_units_have_the_kernel_timestamps(tmp_path: Path, logs: Path, sender: socket.socket) -> None:
     port = free_udp_port()
     with Recorder(tmp_path, session_table(logs) + SREP.format(port=port)) as recorder:
         recorder.wait_said("device_opened")
@@ -143,7 +143,7 @@ def test_absent_sensors_are_waited_for_and_never_restart_the_service(tmp_path: P
 
 
 @pytest.mark.slow
-def test_blocked_writer_is_not_called_alive(tmp_path: Path, logs: Path) -> None:
+def test_a_blocked_writer_does_not_notify_the_watchdog(tmp_path: Path, logs: Path) -> None:
     config = session_table(logs) + SREP.format(port=free_udp_port())
     with Recorder(tmp_path, config, watchdog_s=1.0) as recorder:
         wait_until(lambda: recorder.notify.count("WATCHDOG") >= 3, "watchdog fed while all is well")
@@ -166,7 +166,7 @@ def test_blocked_writer_is_not_called_alive(tmp_path: Path, logs: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_journal_that_nobody_reads_holds_up_nothing(tmp_path: Path, logs: Path) -> None:
+def test_an_unread_journal_blocks_nothing(tmp_path: Path, logs: Path) -> None:
     """stderr is a full pipe from the start, so that not one line of the recorder's is taken."""
     unread, full = os.pipe()
     os.set_blocking(full, False)
@@ -193,7 +193,7 @@ def test_a_journal_that_nobody_reads_holds_up_nothing(tmp_path: Path, logs: Path
     assert {event["source"] for event in content.events("device_absent")} == {"gnss/rover", "pps/main"}
 
 
-def test_serial_port_unplugged_and_plugged_in_again(tmp_path: Path, logs: Path) -> None:
+def test_a_serial_port_unplugged_and_plugged_in_again_is_reopened(tmp_path: Path, logs: Path) -> None:
     link, fifo = tmp_path / "rover", tmp_path / "pps"
     os.mkfifo(fifo)
     config = session_table(logs) + ROVER.format(path=link, fifo=fifo)
@@ -225,7 +225,7 @@ def _waiting_to_be_read(pty: Pty) -> int:
 
 
 @pytest.mark.slow
-def test_udp_silence_and_resume_are_told(tmp_path: Path, logs: Path, sender: socket.socket) -> None:
+def test_udp_silence_and_its_end_are_reported(tmp_path: Path, logs: Path, sender: socket.socket) -> None:
     port = free_udp_port()
     with Recorder(tmp_path, session_table(logs) + SREP.format(port=port)) as recorder:
         recorder.wait_said("device_opened")
@@ -267,7 +267,7 @@ def test_sighup_starts_a_new_part(tmp_path: Path, logs: Path, sender: socket.soc
         assert official_counts(path)["/scanner/left/raw"] > 0
 
 
-def test_two_recorders_in_one_directory(tmp_path: Path, logs: Path) -> None:
+def test_a_second_recorder_in_one_directory_is_refused(tmp_path: Path, logs: Path) -> None:
     config = session_table(logs) + SREP.format(port=free_udp_port())
     with Recorder(tmp_path, config):
         second = Recorder(tmp_path / "second", session_table(logs) + SREP.format(port=free_udp_port()))
@@ -277,7 +277,7 @@ def test_two_recorders_in_one_directory(tmp_path: Path, logs: Path) -> None:
         second.notify.close()
 
 
-def test_running_recorder_has_not_imported_what_processing_needs(
+def test_a_running_recorder_has_not_imported_processing_modules(
     tmp_path: Path, logs: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PYTHONPROFILEIMPORTTIME", "1")  # the running process lists every module it imports

@@ -13,7 +13,7 @@ from benchmarks.soak_sensors import Pulse, Receiver
 
 @pytest.fixture
 def good(tmp_path: Path) -> Iterator[Soak]:
-    """A run that found everything as it should be."""
+    """Return a run without problems."""
     soak = Soak(tmp_path, 10.0, 0.1, keep=False)
     soak.exit_status = 0
     for number, sensor in enumerate(soak.sensors, start=1000):
@@ -30,7 +30,7 @@ def good(tmp_path: Path) -> Iterator[Soak]:
             sensor.unplug()
 
 
-def test_nothing_is_wrong_with_a_good_run(good: Soak) -> None:
+def test_a_good_run_has_no_problems(good: Soak) -> None:
     assert problems(good) == []
 
 

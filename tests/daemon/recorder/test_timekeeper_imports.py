@@ -25,6 +25,6 @@ print(clock.status(edge_ns + 300_000_000).state.name, sorted(set(sys.modules) - 
 """
 
 
-def test_the_first_lock_loads_nothing() -> None:
+def test_the_first_lock_imports_no_module() -> None:
     found = subprocess.run([sys.executable, "-c", LOCK], cwd=ROOT, capture_output=True, text=True, check=False)
     assert found.stdout == "LOCKED []\n", found.stdout + found.stderr

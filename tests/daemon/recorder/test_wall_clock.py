@@ -29,7 +29,7 @@ def restored_clock() -> Iterator[int]:
 
 @pytest.mark.alone
 @pytest.mark.parametrize("step_ns", [HOUR_NS, -HOUR_NS])
-def test_wall_clock_stepped_by_an_hour(tmp_path: Path, step_ns: int) -> None:
+def test_a_wall_clock_step_of_an_hour_does_not_affect_the_recording(tmp_path: Path, step_ns: int) -> None:
     port, logs = free_udp_port(), tmp_path / "logs"
     table = f'[scanner.left]\ntransport = "udp:127.0.0.1:{port}"\nprotocol = "srep"\nmirror_factor = 1.0\n'
     sent_ns: list[tuple[int, int]] = []  # before and after the call

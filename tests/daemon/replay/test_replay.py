@@ -151,7 +151,7 @@ def arrival_after_edge(content: LogContent) -> list[float]:
     return [min(arrival - edge for arrival in arrivals if arrival > edge) * 1e-9 for edge in edges]
 
 
-def test_at_another_pace_there_are_no_edges_and_no_time(tmp_path: Path, first: tuple[Path, LogContent]) -> None:
+def test_at_another_speed_no_edges_and_no_times_are_replayed(tmp_path: Path, first: tuple[Path, LogContent]) -> None:
     logs, before = first
     after, _ = replay_into_a_recorder(tmp_path, logs, "2")
     same_bytes(before, after)
@@ -159,7 +159,7 @@ def test_at_another_pace_there_are_no_edges_and_no_time(tmp_path: Path, first: t
     assert set(time_states(after)) == {"NO_TIME"}
 
 
-def test_info_of_a_session_whose_first_part_is_missing_names_it_and_blames_no_count(
+def test_info_names_a_missing_first_part_and_reports_no_wrong_count(
     tmp_path: Path, first: tuple[Path, LogContent]
 ) -> None:
     second = sorted(first[0].glob("*.mcap"))[1]
@@ -172,7 +172,7 @@ def test_info_of_a_session_whose_first_part_is_missing_names_it_and_blames_no_co
     assert {source["account_errors"] for source in session["sources"].values()} == {0}
 
 
-def test_a_port_that_nobody_reads_does_not_hold_up_the_rest(tmp_path: Path) -> None:
+def test_an_unread_port_does_not_delay_the_others(tmp_path: Path) -> None:
     output = PtyOutput(tmp_path / "port")
     started = time.monotonic()
     refused = sum(not output.send(b"x" * 4096, 0) for _ in range(200))
@@ -182,7 +182,7 @@ def test_a_port_that_nobody_reads_does_not_hold_up_the_rest(tmp_path: Path) -> N
     assert not (tmp_path / "port").is_symlink()
 
 
-def test_a_link_to_a_device_is_left_alone_and_one_that_a_killed_replay_left_is_replaced(tmp_path: Path) -> None:
+def test_a_device_link_is_kept_and_one_left_by_a_killed_replay_is_replaced(tmp_path: Path) -> None:
     """Played with the aircraft's own configuration, udev's name of the receiver must not be lost."""
     link = tmp_path / "rover"
     link.symlink_to("/dev/null")
@@ -200,7 +200,7 @@ def test_a_link_to_a_device_is_left_alone_and_one_that_a_killed_replay_left_is_r
 
 
 class Dues(Output):
-    """Takes everything and remembers when it was due."""
+    """Output that accepts everything and records when each unit was due."""
 
     def __init__(self) -> None:
         self.realtime_ns: list[int] = []
@@ -213,7 +213,7 @@ class Dues(Output):
         return None
 
 
-def test_time_begins_with_the_first_unit_however_long_reading_up_to_it_takes() -> None:
+def test_time_begins_with_the_first_unit_however_long_reading_takes() -> None:
     """Else the first units of every source are late, and the ones after them are not."""
     output, read_ns = Dues(), []
 

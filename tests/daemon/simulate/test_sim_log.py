@@ -50,7 +50,7 @@ def told(content: LogContent, source: str) -> list[tuple[str, str, str]]:
 
 
 class TestUnits:
-    def test_every_unit_is_there_with_its_stamp_in_its_order(self, made: tuple[SimReport, Path]) -> None:
+    def test_every_unit_is_logged_with_its_timestamp_in_order(self, made: tuple[SimReport, Path]) -> None:
         report, logs = made
         content, clock = read_log(logs), Clock()
         sent: dict[str, list[Unit]] = {source: [] for source in SOURCES}
@@ -61,7 +61,7 @@ class TestUnits:
         assert report.units == {source: len(units) for source, units in sent.items()}
         assert report.returns == 40 * len(sent["scanner/left"])
 
-    def test_edges_are_those_of_the_flight(self, made: tuple[SimReport, Path]) -> None:
+    def test_edges_match_the_flight(self, made: tuple[SimReport, Path]) -> None:
         content, clock = read_log(made[1]), Clock()
         assert content.messages["/pps/main"] == [
             (
@@ -76,7 +76,7 @@ class TestUnits:
             for second in range(int(SECONDS))
         ]
 
-    def test_channels_say_what_a_recorder_says_of_them(self, made: tuple[SimReport, Path], tmp_path: Path) -> None:
+    def test_channels_have_the_metadata_of_a_recorder(self, made: tuple[SimReport, Path], tmp_path: Path) -> None:
         config = aircraft_config(tmp_path)
         with made[0].paths[0].open("rb") as file:
             summary = make_reader(file).get_summary()
@@ -93,7 +93,7 @@ class TestUnits:
                 assert channel.metadata == wire.metadata | (sender if spec.kind == "udp" else {})
         assert channels["/imu/main/raw"].metadata["dbc"] == "dbc/imu.dbc"
 
-    def test_replay_plays_all_of_it_in_the_order_of_time(self, made: tuple[SimReport, Path]) -> None:
+    def test_replay_plays_all_of_it_in_time_order(self, made: tuple[SimReport, Path]) -> None:
         [session] = open_logs([made[1]])
         played = list(timed_units(session, with_pps=True))
         assert Counter(unit.source for unit in played) == made[0].units
@@ -113,7 +113,7 @@ class TestRecorder:
         assert (info.host, info.boot_id, info.origin) == ("virtual", boot_id, "simulation")
         assert (info.realtime_ns, info.monotonic_ns) == (START_NS + 20_000_000, 20_000_000)
 
-    def test_attachments_have_the_recorders_names(self, made: tuple[SimReport, Path]) -> None:
+    def test_attachments_have_the_names_used_by_a_recorder(self, made: tuple[SimReport, Path]) -> None:
         [session] = open_logs([made[1]])
         attachments = session.attachments()
         assert sorted(attachments) == ["calibration/left.toml", "config.toml", "dbc/imu.dbc"]
@@ -130,7 +130,7 @@ class TestRecorder:
             assert one["monotonic_ns"] == one["monotonic_raw_ns"] == time_ns - START_NS
             assert (one["frequency_ppm"], one["status"]) == (0.0, 0x40)
 
-    def test_statuses_come_each_second_and_account_for_all(self, made: tuple[SimReport, Path]) -> None:
+    def test_statuses_come_each_second_and_account_for_all_units(self, made: tuple[SimReport, Path]) -> None:
         content = read_log(made[1])  # `read_log` compares each with what stands before it
         for source in SOURCES:
             statuses = content.messages[f"/status/{source}"]
@@ -151,7 +151,7 @@ class TestRecorder:
             assert content.messages[f"/status/{source}"][-1][1]["time_sigma_ns"] < 2000
         assert "time_state" not in content.messages["/status/imu/main"][-1][1]
 
-    def test_events_are_a_recorders(self, made: tuple[SimReport, Path]) -> None:
+    def test_events_match_those_of_a_recorder(self, made: tuple[SimReport, Path]) -> None:
         content = read_log(made[1])
         codes = [(event["source"], event["code"]) for _, event in content.messages["/events"]]
         opened = ["pps/main", "gnss/rover", "imu/main", "scanner/left", "scanner/left/aux"]
@@ -159,7 +159,7 @@ class TestRecorder:
         assert codes[1:6] == [(source, "device_opened") for source in opened]
         assert codes[6:] == [("gnss/rover", "second_known"), ("recorder", "session_ended")]
 
-    def test_info_recover_and_the_official_reader_find_nothing_wrong(self, made: tuple[SimReport, Path]) -> None:
+    def test_info_recover_and_the_official_reader_find_no_fault(self, made: tuple[SimReport, Path]) -> None:
         report, logs = made
         result = swath("info", "--json", str(logs))
         assert result.returncode == 0, result.stderr
@@ -182,7 +182,7 @@ class TestRecorder:
 class TestFaults:
     """What befalls the wires and the wall clock is told as a recorder tells it."""
 
-    def test_a_step_of_the_wall_clock_moves_no_log_time(self, tmp_path: Path) -> None:
+    def test_a_step_of_the_wall_clock_does_not_change_log_times(self, tmp_path: Path) -> None:
         content = fly(tmp_path, Standin(9.0, wall_steps=((4.05, 3600.0),)))
         [event] = content.events("wall_clock_stepped")
         assert event["text"] == "the wall clock was stepped by +3600.000000 s; log times are not affected"
@@ -193,7 +193,7 @@ class TestFaults:
         assert [edge["realtime_ns"] - edge["edge_time_ns"] for edge in edges] == [0] * 5 + [3600 * 10**9] * 4
         assert content.messages["/status/pps/main"][-1][1]["time_state"] == "LOCKED"
 
-    def test_a_plug_that_is_pulled(self, tmp_path: Path) -> None:
+    def test_an_unplugged_device_is_reported(self, tmp_path: Path) -> None:
         content = fly(tmp_path, Standin(12.0, pulled=(("gnss/rover", 5.5, 8.5),)))
         assert told(content, "gnss/rover") == [
             ("info", "device_opened", "opened"),
@@ -204,7 +204,7 @@ class TestFaults:
         assert states(content, "gnss/rover")[4:9] == ["receiving", "absent", "absent", "absent", "receiving"]
         assert set(states(content, "imu/main")) == {"receiving"}
 
-    def test_a_source_that_falls_silent_and_speaks_again(self, tmp_path: Path) -> None:
+    def test_a_source_that_falls_silent_and_resumes_is_reported(self, tmp_path: Path) -> None:
         content = fly(tmp_path, Standin(9.0, silent=(("scanner/left", 2.2, 7.2),)))
         assert told(content, "scanner/left") == [
             ("info", "device_opened", "opened"),
@@ -215,7 +215,7 @@ class TestFaults:
         ages = [value["last_unit_age_s"] for _, value in content.messages["/status/scanner/left"]]
         assert ages[:8] == pytest.approx([0.0, 0.0, 0.8, 1.8, 2.8, 3.8, 4.8, 0.0], abs=0.03)
 
-    def test_a_source_that_never_speaks_has_its_status_all_the_same(self, tmp_path: Path) -> None:
+    def test_a_source_without_units_has_its_status(self, tmp_path: Path) -> None:
         content = fly(tmp_path, Standin(5.0, silent=(("imu/main", 0.0, 9.0),)))
         assert states(content, "imu/main") == ["receiving"] * 2 + ["silent"] * 3
         assert {value["last_unit_age_s"] for _, value in content.messages["/status/imu/main"]} == {None}
@@ -241,7 +241,7 @@ class TestParts:
         [session] = open_logs([tmp_path])
         assert session.missing_parts == []
 
-    def test_a_log_of_this_session_is_never_written_to(self, made: tuple[SimReport, Path]) -> None:
+    def test_an_existing_log_of_the_session_is_never_written_to(self, made: tuple[SimReport, Path]) -> None:
         report, logs = made
         before = report.paths[0].read_bytes()
         config = aircraft_config(logs.parent)
@@ -260,7 +260,7 @@ class TestParts:
             fly_into_log(aircraft_config(tmp_path), tmp_path / "logs", Broken(5.0), SEED)
         assert list((tmp_path / "logs").iterdir()) == []
 
-    def test_progress_is_told_and_ends_at_the_end(self, tmp_path: Path) -> None:
+    def test_progress_is_reported_and_ends_at_the_end(self, tmp_path: Path) -> None:
         words: list[tuple[float, int, int, int]] = []
         report = fly_into_log(
             aircraft_config(tmp_path), tmp_path / "logs", Standin(9.0), SEED, lambda *word: words.append(word)

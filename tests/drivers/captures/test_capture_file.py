@@ -38,7 +38,7 @@ SPAN = FIXTURES / "novatel" / "propak6-basic-fix.gps.gz"
 # --- pcap -----------------------------------------------------------------------------------------------------------
 
 
-def test_real_pcap_gives_every_datagram() -> None:
+def test_every_datagram_of_a_real_pcap_is_read() -> None:
     units = list(read_pcap(VELODYNE))
     ports = Counter((unit.destination[1] if unit.destination else 0, len(unit.data)) for unit in units)
     assert ports == {(2368, 1206): 293, (8308, 512): 57}
@@ -47,7 +47,7 @@ def test_real_pcap_gives_every_datagram() -> None:
     assert len(list(read_pcap(VELODYNE, port=8308))) == 57
 
 
-def test_payloads_and_times_are_those_dpkt_reads() -> None:
+def test_payloads_and_times_match_dpkt() -> None:
     units = list(read_pcap(VELODYNE))
     with gzip.open(VELODYNE) as stream:
         theirs = [
@@ -57,7 +57,7 @@ def test_payloads_and_times_are_those_dpkt_reads() -> None:
     assert [(unit.time_ns, unit.data) for unit in units] == theirs
 
 
-def test_real_fragments_are_put_together_as_dpkt_reads_them() -> None:
+def test_reassembled_fragments_of_a_real_capture_match_dpkt() -> None:
     """Two heads on one port, datagrams in up to a dozen pieces; the oracle joins dpkt's fragments by their offsets."""
     pieces: dict[tuple[bytes, int], dict[int, bytes]] = {}
     with gzip.open(FIXTURES / "captures" / "same_ports.pcap.gz") as stream:
@@ -115,24 +115,24 @@ LINKS = [
 
 @pytest.mark.parametrize(("link", "head"), LINKS, ids=str)
 @pytest.mark.parametrize("order", ["<", ">"])
-def test_link_layers_and_byte_orders(tmp_path: Path, link: int, head: bytes, order: str) -> None:
+def test_each_link_layer_and_byte_order_is_read(tmp_path: Path, link: int, head: bytes, order: str) -> None:
     frame = head + udp_packet(b"scan") + b"padding"
     [unit] = read_pcap(write_pcap(tmp_path / "one.pcap", [frame], link, order))
     assert unit == CapturedUnit(1_700_000_000_123_456_000, b"scan", "udp", ("10.0.0.1", 4000), ("10.0.0.2", 2368))
 
 
-def test_bits_of_the_frame_check_sequence_are_no_link_type(tmp_path: Path) -> None:
-    """As draft-ietf-opsawg-pcap has it: link type in the low 16 bits; FCS length 2 words and its flag above."""
+def test_frame_check_sequence_bits_are_not_part_of_the_link_type(tmp_path: Path) -> None:
+    """draft-ietf-opsawg-pcap: the link type is in the low 16 bits, FCS length 2 and its flag above."""
     [unit] = read_pcap(write_pcap(tmp_path / "fcs.pcap", [ETHERNET + udp_packet(b"scan") + bytes(4)], 0x2400_0001))
     assert unit.data == b"scan"
 
 
-def test_nanosecond_times_are_exact(tmp_path: Path) -> None:
+def test_nanosecond_timestamps_are_read_exactly(tmp_path: Path) -> None:
     [unit] = read_pcap(write_pcap(tmp_path / "one.pcap", [ETHERNET + udp_packet(b"")], nano=True))
     assert unit.time_ns == 1_700_000_000_000_123_456
 
 
-def test_ipv6_datagrams(tmp_path: Path) -> None:
+def test_ipv6_datagrams_are_read(tmp_path: Path) -> None:
     segment = struct.pack(">HHHH", 1, 2368, 12, 0) + b"scan"
     packet = struct.pack(">IHBB", 6 << 28, len(segment), 17, 64) + bytes(15) + b"\1" + bytes(15) + b"\2" + segment
     [unit] = read_pcap(write_pcap(tmp_path / "six.pcap", [bytes(12) + b"\x86\xdd" + packet]))
@@ -146,7 +146,7 @@ def ipv6_with_options(following: int, rest: bytes, cut: int = 0) -> bytes:
     return (head + options + rest)[: cut or None]
 
 
-def test_ipv6_datagrams_behind_options() -> None:
+def test_ipv6_datagrams_after_extension_headers_are_read() -> None:
     segment = struct.pack(">HHHH", 1, 2368, 12, 0) + b"scan"
     packet = ipv6_with_options(17, segment)
     assert dpkt.ip6.IP6(packet).data.data == b"scan"
@@ -186,7 +186,7 @@ def ipv6_fragments(segment: bytes, size: int) -> list[bytes]:
     return pieces
 
 
-def test_ipv6_fragments_are_put_together(tmp_path: Path) -> None:
+def test_ipv6_fragments_are_reassembled(tmp_path: Path) -> None:
     payload = np.random.default_rng(2).bytes(5000)
     segment = struct.pack(">HHHH", 1, 2368, 8 + len(payload), 0) + payload
     pieces = ipv6_fragments(segment, 1448)
@@ -195,8 +195,8 @@ def test_ipv6_fragments_are_put_together(tmp_path: Path) -> None:
     assert unit.data == payload
 
 
-def test_a_frame_captured_on_two_interfaces_counts_once_where_that_is_sure(tmp_path: Path) -> None:
-    """The same identification and bytes again; without an identification nobody can tell."""
+def test_a_frame_captured_on_two_interfaces_counts_once_if_it_has_an_identification(tmp_path: Path) -> None:
+    """Repeat the same identification and bytes; without an identification copies cannot be recognised."""
     big = fragments(udp_packet(bytes(3000)), 1480)
     anonymous = udp_packet(b"none")[:4] + b"\0\0" + udp_packet(b"none")[6:]
     frames = [ETHERNET + packet for packet in (udp_packet(b"a"), udp_packet(b"a"), anonymous, anonymous, *big, *big)]
@@ -227,7 +227,7 @@ def test_a_frame_captured_on_two_interfaces_counts_once_where_that_is_sure(tmp_p
         st.tuples(st.sampled_from([b"", b"\x45", b"\x40", b"\x4f", b"\x60"]), st.binary(max_size=90)), max_size=20
     ),
 )
-def test_whatever_is_in_a_packet_is_a_datagram_or_counted(link: int, parts: list[tuple[bytes, bytes]]) -> None:
+def test_every_packet_is_a_datagram_or_is_counted(link: int, parts: list[tuple[bytes, bytes]]) -> None:
     packets = IpPackets(drop_copies=True)
     heads = {0: bytes(4), 1: ETHERNET, 108: bytes(4), 113: SLL, 276: SLL2}
     found = 0
@@ -240,7 +240,7 @@ def test_whatever_is_in_a_packet_is_a_datagram_or_counted(link: int, parts: list
     assert found + packets.others + packets.cut + packets.copies <= len(parts)
 
 
-def test_other_packets_are_passed_over(tmp_path: Path) -> None:
+def test_packets_of_other_protocols_are_ignored(tmp_path: Path) -> None:
     arp = bytes(12) + b"\x08\x06" + bytes(28)
     tcp = bytearray(udp_packet(b"no"))
     tcp[9] = 6
@@ -248,7 +248,7 @@ def test_other_packets_are_passed_over(tmp_path: Path) -> None:
     assert [unit.data for unit in read_pcap(write_pcap(tmp_path / "mixed.pcap", frames))] == [b"yes"]
 
 
-def test_pcapng(tmp_path: Path) -> None:
+def test_pcapng_is_read_and_a_truncated_file_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "one.pcapng"
     with path.open("wb") as stream:
         writer = dpkt.pcapng.Writer(stream)
@@ -291,7 +291,7 @@ def pcapng_section(order: str, resolution: bytes, offset_s: int, counts: list[in
         (b"\x00", 0, 1_700_000_000, 1_700_000_000_000_000_000),
     ],
 )
-def test_pcapng_stamps_are_exact(
+def test_pcapng_timestamps_are_read_exactly(
     tmp_path: Path, order: str, resolution: bytes, offset_s: int, count: int, time_ns: int
 ) -> None:
     path = tmp_path / "one.pcapng"
@@ -299,7 +299,7 @@ def test_pcapng_stamps_are_exact(
     assert [unit.time_ns for unit in read_pcap(path)] == [time_ns] * 4
 
 
-def test_pcapng_is_cut_and_damaged_without_a_traceback(tmp_path: Path) -> None:
+def test_truncated_and_damaged_pcapng_raise_only_transport_errors(tmp_path: Path) -> None:
     whole = pcapng_section("<", b"\x09", 0, [1, 2, 3])
     path = tmp_path / "cut.pcapng"
     rng = np.random.default_rng(3)
@@ -317,7 +317,7 @@ def test_pcapng_is_cut_and_damaged_without_a_traceback(tmp_path: Path) -> None:
         assert len(list(read_pcap(path, tally=CaptureTally()))) <= 3
 
 
-def test_a_reader_with_a_tally_goes_on_where_it_can(tmp_path: Path) -> None:
+def test_a_reader_with_a_tally_continues_after_damage(tmp_path: Path) -> None:
     whole, cut = ETHERNET + udp_packet(b"scan"), (ETHERNET + udp_packet(b"scan"))[:-2]
     lost = ETHERNET + fragments(udp_packet(bytes(3000)), 1480)[0]
     path = write_pcap(tmp_path / "some.pcap", [whole, cut, bytes(12) + b"\x08\x06", lost, whole])
@@ -329,7 +329,7 @@ def test_a_reader_with_a_tally_goes_on_where_it_can(tmp_path: Path) -> None:
     assert tally.passed["packets without UDP"] == 1
 
 
-def test_bad_pcaps_are_one_line(tmp_path: Path) -> None:
+def test_bad_pcap_files_are_refused_in_one_line(tmp_path: Path) -> None:
     good = write_pcap(tmp_path / "good.pcap", [ETHERNET + udp_packet(b"scan")] * 2)
     data = good.read_bytes()
     cases = {
@@ -361,7 +361,7 @@ def test_bad_pcaps_are_one_line(tmp_path: Path) -> None:
 # --- candump --------------------------------------------------------------------------------------------------------
 
 
-def test_real_candump_is_what_python_can_reads(tmp_path: Path) -> None:
+def test_real_candump_log_matches_python_can(tmp_path: Path) -> None:
     units = list(read_candump(CANDUMP))
     assert len(units) == 5588
     text = tmp_path / "frames.log"
@@ -392,7 +392,7 @@ def test_real_candump_is_what_python_can_reads(tmp_path: Path) -> None:
         ("123##0" + 64 * "5A", "23010000" "40040000" + 64 * "5a"),
     ],
 )  # fmt: skip
-def test_kinds_of_frames(tmp_path: Path, text: str, frame: str) -> None:
+def test_every_kind_of_candump_frame_is_read(tmp_path: Path, text: str, frame: str) -> None:
     path = tmp_path / "one.log"
     path.write_text(f"\n(1469439874.299591) vcan0 {text}\n(1469439874.299592) vcan0 {text} R\r\n")
     units = list(read_candump(path))
@@ -414,7 +414,7 @@ def test_kinds_of_frames(tmp_path: Path, text: str, frame: str) -> None:
         " vcan0  123   [2]  00 11",
     ],
 )
-def test_lines_that_are_no_frame_are_named(tmp_path: Path, line: str) -> None:
+def test_candump_lines_without_a_frame_are_refused_with_their_line_number(tmp_path: Path, line: str) -> None:
     path = tmp_path / "bad.log"
     path.write_text(f"(1.0) vcan0 123#00\n{line}\n")
     reader = read_candump(path)
@@ -447,7 +447,7 @@ def test_bad_lines_are_counted_and_the_rest_is_read(tmp_path: Path) -> None:
     assert "cannot be read further" in tally.first_damage
 
 
-def test_real_frames_are_written_as_they_were_read(tmp_path: Path) -> None:
+def test_real_candump_frames_are_written_back_byte_for_byte(tmp_path: Path) -> None:
     """The lines of a recording by candump's makers' own rules, byte for byte."""
     lines = gzip.decompress(CANDUMP.read_bytes()).decode().splitlines()
     ours = [candump_line(unit.time_ns, unit.channel, unit.data) for unit in read_candump(CANDUMP)]
@@ -459,7 +459,7 @@ def test_real_frames_are_written_as_they_were_read(tmp_path: Path) -> None:
     ["123#", "7FF#DEADBEEF", "00000123#01", "123#R", "123#R8", "20000004#0001000000000000", "123#1122334455667788_F",
      "123##1AABB", "123##0" + 64 * "5A", "123##5" + 12 * "00"],
 )  # fmt: skip
-def test_kinds_of_frames_are_written_as_they_were_read(tmp_path: Path, text: str) -> None:
+def test_every_kind_of_candump_frame_is_written_back_unchanged(tmp_path: Path, text: str) -> None:
     path = tmp_path / "one.log"
     path.write_text(f"(1469439874.299591) vcan0 {text}\n")
     [unit] = read_candump(path)
@@ -471,7 +471,7 @@ def test_kinds_of_frames_are_written_as_they_were_read(tmp_path: Path, text: str
 
 
 @given(st.binary(min_size=16, max_size=16) | st.binary(min_size=72, max_size=72) | st.binary(max_size=20))
-def test_a_line_that_is_said_to_hold_a_frame_does(frame: bytes) -> None:
+def test_a_line_recognised_as_a_candump_frame_can_be_read(frame: bytes) -> None:
     line = candump_line(1_000, "can0", frame)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "one.log"
@@ -484,7 +484,7 @@ def test_a_line_that_is_said_to_hold_a_frame_does(frame: bytes) -> None:
 # --- serial ---------------------------------------------------------------------------------------------------------
 
 
-def test_real_serial_recording_is_given_whole() -> None:
+def test_real_serial_recording_is_read_completely() -> None:
     units = list(read_serial(SPAN))
     assert len(units) == 10051
     assert b"".join(unit.data for unit in units) == gzip.decompress(SPAN.read_bytes())
@@ -503,14 +503,14 @@ def test_real_serial_recording_is_given_whole() -> None:
         ("time,offset,length\n1.5,0,1\n", "line 2: want arrival_unix_s"),
     ],
 )
-def test_bad_tables_are_one_line(tmp_path: Path, table: str, text: str) -> None:
+def test_bad_tables_are_refused_in_one_line(tmp_path: Path, table: str, text: str) -> None:
     (tmp_path / "port.bin").write_bytes(b"bytes")
     (tmp_path / "port.chunks.csv").write_text(table)
     with pytest.raises(TransportError, match=text):
         list(read_serial(tmp_path / "port.bin"))
 
 
-def test_a_missing_table_is_named(tmp_path: Path) -> None:
+def test_error_names_a_missing_table(tmp_path: Path) -> None:
     (tmp_path / "port.bin").write_bytes(b"bytes")
     with pytest.raises(TransportError, match=r"port\.chunks\.csv\[\.gz\] beside it"):
         list(read_serial(tmp_path / "port.bin"))
@@ -520,7 +520,7 @@ def test_a_missing_table_is_named(tmp_path: Path) -> None:
     assert [(unit.time_ns, unit.data) for unit in units] == [(1_250_000_000, b"by"), (1_500_000_000, b"tes")]
 
 
-def test_bytes_without_times_come_as_fast_as_they_are_said_to(tmp_path: Path) -> None:
+def test_bytes_without_times_are_delivered_at_the_given_rate(tmp_path: Path) -> None:
     (tmp_path / "port.bin").write_bytes(bytes(1000))
     units = list(read_bare(tmp_path / "port.bin", BareTime(10**18, 115_200, 10)))
     assert [len(unit.data) for unit in units] == [512, 488]
@@ -531,7 +531,7 @@ def test_bytes_without_times_come_as_fast_as_they_are_said_to(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("length", ["99999999999999", "-3", "6"])
-def test_a_table_with_an_absurd_length_reads_nothing_into_memory(tmp_path: Path, length: str) -> None:
+def test_a_table_with_an_absurd_length_allocates_no_memory(tmp_path: Path, length: str) -> None:
     (tmp_path / "port.bin").write_bytes(b"bytes")
     (tmp_path / "port.chunks.csv").write_text(f"arrival_unix_s,offset,length\n1.5,0,2\n1.5,2,{length}\n")
     tally = CaptureTally()

@@ -47,14 +47,14 @@ def gps_ns(message: Message) -> int:
         ("time", {"time": "TIME"}),
     ],
 )
-def test_the_ros_driver_saw_as_many_logs(name: str, published: dict[str, str]) -> None:
+def test_log_counts_match_the_ros_driver(name: str, published: dict[str, str]) -> None:
     topics = Counter(topic.removeprefix("/novatel/oem7/") for topic, _ in read_bag(recording(f"{name}.bag")))
     assert {topic: topics[topic] for topic in published} == {
         topic: COUNTS[f"{name}.gps"][log] for topic, log in published.items()
     }
 
 
-def test_positions_and_velocities_are_the_ros_drivers() -> None:
+def test_positions_and_velocities_match_the_ros_driver() -> None:
     records = parse(recording("bestpos.gps"))
     for fix, theirs in zip(of_type(records, GnssFix, "BESTPOS"), ros_messages("bestpos", "bestpos"), strict=True):
         assert (fix.time.week or 0) * WEEK_NS + fix.time.time_ns == gps_ns(theirs)
@@ -72,7 +72,7 @@ def test_positions_and_velocities_are_the_ros_drivers() -> None:
         np.testing.assert_allclose(fix.velocity_l, [*horizontal, -theirs["ver_speed"]], rtol=1e-12)
 
 
-def test_solutions_are_the_ros_drivers() -> None:
+def test_solutions_match_the_ros_driver() -> None:
     rows = rows_of(parse(recording("bestpos.gps")), InsSolution)
     rows = rows[np.isnan(rows["position_sigma_l"][:, 0])]  # without INSPVAX, which the driver made no INSPVA of
     for row, theirs in zip(rows, ros_messages("bestpos", "inspva"), strict=True):
@@ -86,7 +86,7 @@ def test_solutions_are_the_ros_drivers() -> None:
         assert row["status"] == theirs["status"]["status"]
 
 
-def test_headings_are_the_ros_drivers() -> None:
+def test_headings_match_the_ros_driver() -> None:
     headings = of_type(parse(recording("align.gps")), GnssHeading)
     for heading, theirs in zip(headings, ros_messages("align", "heading2"), strict=True):
         assert heading.time is not None
@@ -95,7 +95,7 @@ def test_headings_are_the_ros_drivers() -> None:
         assert ours == [math.radians(theirs[name]) for name in ("heading", "pitch", "heading_stdev")]
 
 
-def test_increments_are_the_ros_drivers() -> None:
+def test_increments_match_the_ros_driver() -> None:
     status = of_type(parse(recording("ins1.gps")), DeviceStatus, "CORRIMUS")
     for record, theirs in zip(status, ros_messages("ins1", "corrimu"), strict=True):
         values = record.values
@@ -106,7 +106,7 @@ def test_increments_are_the_ros_drivers() -> None:
         assert values["imu_samples"] == theirs["imu_data_count"]
 
 
-def test_times_are_the_ros_drivers() -> None:
+def test_times_match_the_ros_driver() -> None:
     times = of_type(parse(recording("time.gps")), TimeMessage)
     for time, theirs in zip(times, ros_messages("time", "time"), strict=True):
         assert (time.time.week or 0) * WEEK_NS + time.time.time_ns == gps_ns(theirs)
@@ -121,7 +121,7 @@ def test_times_are_the_ros_drivers() -> None:
 # --- the maker's converter
 
 
-def test_a_log_whose_bytes_were_changed_is_not_believed() -> None:
+def test_a_log_with_altered_bytes_is_refused() -> None:
     """A text filter put CR before each LF, in the binary log too: the log is refused until that is undone."""
     data, parser = recording(UTM), make()
     assert parse(data, parser) == []
@@ -134,7 +134,7 @@ def test_a_log_whose_bytes_were_changed_is_not_believed() -> None:
 
 
 @pytest.mark.parametrize("form", ["BINARY", "FLATTENED_BINARY"])
-def test_binary_of_the_converter_is_framed(form: str) -> None:
+def test_binary_output_of_the_converter_is_framed(form: str) -> None:
     """The same two logs as in its JSON, also with arrays filled up to their greatest length."""
     data, parser = recording(f"{UTM}.{form}"), make()
     parse(data, parser)
@@ -153,14 +153,14 @@ def test_binary_of_the_converter_is_framed(form: str) -> None:
 
 
 @pytest.mark.parametrize("form", ["ASCII", "ABBREV_ASCII", "JSON"])
-def test_text_of_the_converter_holds_no_binary_log(form: str) -> None:
+def test_text_output_of_the_converter_contains_no_binary_log(form: str) -> None:
     data, parser = recording(f"{UTM}.{form}"), make()
     assert parse(data, parser) == []
     assert not +parser.counters.messages
     assert parser.counters.bytes_skipped == len(data)
 
 
-def test_the_checksum_is_that_of_the_makers_ascii() -> None:
+def test_checksum_matches_the_ascii_examples_of_the_manual() -> None:
     """OEM7 manual, "32-bit CRC": the same over the characters between # and * as over a binary log."""
     lines = recording(f"{UTM}.edie.ascii").splitlines()
     assert lines == recording(f"{UTM}.ASCII").splitlines()
@@ -173,7 +173,7 @@ def test_the_checksum_is_that_of_the_makers_ascii() -> None:
 # --- the packets of the TCP stream
 
 
-def test_the_stream_is_what_the_packets_carried() -> None:
+def test_stream_joins_tcp_payloads_in_sequence_order() -> None:
     """Bytes to the host in the order of their sequence numbers, each chunk at the time of its packet."""
     chunks: list[tuple[str, int, int]] = []
     stream = b""

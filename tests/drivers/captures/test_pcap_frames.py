@@ -23,14 +23,14 @@ TIME_NS = 1_700_000_000_123_456_789
 
 
 def frames(source: Address, destination: Address, payloads: list[bytes]) -> bytes:
-    """A whole file of payloads of one length, a nanosecond apart."""
+    """Return a complete file of payloads of one length, a nanosecond apart."""
     rows = np.array([list(payload) for payload in payloads], np.uint8).reshape(len(payloads), -1)
     times = TIME_NS + np.arange(len(payloads), dtype=np.int64)
     return FILE_HEADER + pcap_frames(times, 65_530, source, destination, rows).tobytes()
 
 
 @given(st.lists(st.binary(min_size=7, max_size=7), min_size=1, max_size=20))
-def test_dpkt_reads_ipv4_frames_with_right_checksums(payloads: list[bytes]) -> None:
+def test_dpkt_reads_our_ipv4_frames_with_valid_checksums(payloads: list[bytes]) -> None:
     reader = dpkt.pcap.Reader(io.BytesIO(frames(SCANNER, COMPUTER, payloads)))
     assert reader.datalink() == dpkt.pcap.DLT_EN10MB
     identifications = []
@@ -46,7 +46,7 @@ def test_dpkt_reads_ipv4_frames_with_right_checksums(payloads: list[bytes]) -> N
 
 
 @given(st.binary(max_size=64))
-def test_dpkt_agrees_on_the_checksum_of_ipv6(payload: bytes) -> None:
+def test_ipv6_checksum_matches_dpkt(payload: bytes) -> None:
     [(_, frame)] = dpkt.pcap.Reader(io.BytesIO(frames(HEAD, ("fe80::2", 7000), [payload])))
     ip6 = dpkt.ethernet.Ethernet(frame).data
     ours = ip6.data.sum
@@ -59,7 +59,9 @@ def test_dpkt_agrees_on_the_checksum_of_ipv6(payload: bytes) -> None:
 @pytest.mark.parametrize(
     ("source", "destination"), [(SCANNER, COMPUTER), (HEAD, ("fe80::2", 7000)), (HEAD, ("239.1.2.3", 7000))]
 )
-def test_our_reader_gives_them_back_to_the_largest(tmp_path: Path, source: Address, destination: Address) -> None:
+def test_our_reader_returns_written_datagrams_up_to_the_largest_size(
+    tmp_path: Path, source: Address, destination: Address
+) -> None:
     payloads = [bytes([n]) * largest_payload(source, destination) for n in range(3)]
     path = tmp_path / "big.pcap"
     path.write_bytes(frames(source, destination, payloads))
@@ -69,7 +71,7 @@ def test_our_reader_gives_them_back_to_the_largest(tmp_path: Path, source: Addre
     ]
 
 
-def test_stamps_reach_from_1970_to_2106(tmp_path: Path) -> None:
+def test_timestamps_reach_from_1970_to_2106(tmp_path: Path) -> None:
     times = np.array([0, 1, LATEST_PCAP_NS], np.int64)
     path = tmp_path / "ends.pcap"
     path.write_bytes(FILE_HEADER + pcap_frames(times, 0, SCANNER, COMPUTER, np.zeros((3, 0), np.uint8)).tobytes())

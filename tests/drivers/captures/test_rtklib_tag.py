@@ -35,14 +35,14 @@ def tag_file(
 
 
 def expected(writes: list[tuple[int, int]] = WRITES) -> list[tuple[int, int]]:
-    """Times and sizes that the file means."""
+    """Return the times and sizes stored in the file."""
     return [((OPENED_UTC_S * 1000 + 250 + tick) * 1_000_000, size) for tick, size in writes]
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 4, 400])
 @pytest.mark.parametrize("layout", LAYOUTS)
 @pytest.mark.parametrize("fraction", [0.25, 0.123, 0.999999, 1e-6])
-def test_every_layout_is_told_by_its_numbers(layout: str, count: int, fraction: float) -> None:
+def test_every_tag_layout_is_recognised_by_its_field_sizes(layout: str, count: int, fraction: float) -> None:
     writes = (WRITES + [(3000 + n, 500 + n * 100) for n in range(count)])[:count]
     seconds, size = LAYOUTS[layout]
     found = list(read_tags(io.BytesIO(tag_file(seconds, size, writes, fraction))))
@@ -50,7 +50,7 @@ def test_every_layout_is_told_by_its_numbers(layout: str, count: int, fraction: 
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_an_entry_that_was_cut_is_left_out(layout: str) -> None:
+def test_a_truncated_entry_is_ignored(layout: str) -> None:
     data = tag_file(*LAYOUTS[layout], [*WRITES, (5000, 450)])
     assert list(read_tags(io.BytesIO(data[:-3]))) == expected()
 
@@ -68,7 +68,7 @@ def test_sizes_and_ticks_of_32_bits_wrap() -> None:
     [b"", b"TIMETAG", b"x" * 200, HEAD, HEAD + b"\xff" * 200, HEAD + bytes(100)],
     ids=["empty", "short", "other", "head", "ones", "zeros"],
 )
-def test_what_is_no_tag_file_is_one_line(tmp_path: Path, data: bytes) -> None:
+def test_a_file_that_is_not_a_tag_file_is_refused_in_one_line(tmp_path: Path, data: bytes) -> None:
     (tmp_path / "rover.ubx").write_bytes(b"bytes")
     (tmp_path / "rover.ubx.tag").write_bytes(data)
     with pytest.raises(TransportError, match=r"rover.ubx.tag: .*want the time tags of RTKLIB's str2str") as error:
@@ -77,12 +77,12 @@ def test_what_is_no_tag_file_is_one_line(tmp_path: Path, data: bytes) -> None:
 
 
 @given(st.binary(max_size=400))
-def test_garbage_never_breaks_the_reader(data: bytes) -> None:
+def test_garbage_raises_only_transport_errors(data: bytes) -> None:
     with contextlib.suppress(ValueError):
         assert all(0 <= size for _, size in read_tags(io.BytesIO(HEAD + data)))
 
 
-def test_bytes_come_with_the_time_of_their_write(tmp_path: Path) -> None:
+def test_bytes_carry_the_time_at_which_they_were_written(tmp_path: Path) -> None:
     stream = bytes(range(200)) + bytes(200)
     path, tags = tmp_path / "rover.ubx.gz", tmp_path / "rover.ubx.tag"
     path.write_bytes(gzip.compress(stream + b"rest"))
@@ -93,8 +93,8 @@ def test_bytes_come_with_the_time_of_their_write(tmp_path: Path) -> None:
     assert [len(unit.data) for unit in units] == [100, 200, 1, 99, 4]
 
 
-def test_tags_of_a_receiver_are_right_behind_the_epochs_of_its_solution() -> None:
-    """RTKLIB's own solution of the same bytes says its epochs in GPS time; each was written within milliseconds."""
+def test_receiver_tags_follow_the_epochs_of_its_solution_within_milliseconds() -> None:
+    """The epochs of RTKLIB's own solution are in GPS time; each byte was written within milliseconds of them."""
     text = gzip.decompress((FIXTURES / "gnss_1934_sf.pos.gz").read_bytes()).decode()
     epochs = [line[:23].replace("/", "-").replace(" ", "T") for line in text.splitlines()[1:]]
     epoch_ms = np.array(epochs, "datetime64[ms]").astype(np.int64) - 18_000  # GPS − UTC
@@ -107,7 +107,7 @@ def test_tags_of_a_receiver_are_right_behind_the_epochs_of_its_solution() -> Non
     assert np.percentile(behind_ms, 98) < 50
 
 
-def test_tags_of_an_imu_follow_its_own_clock(tmp_path: Path) -> None:
+def test_imu_tags_follow_the_clock_of_the_imu(tmp_path: Path) -> None:
     """Its lines carry its milliseconds; the time at which each was written stays within 30 ms of them for 9 minutes."""
     data = gzip.decompress((FIXTURES / "imu_1934.csv.gz").read_bytes()).replace(b"\n", b"\r\n")
     (tmp_path / "imu.csv").write_bytes(data)
@@ -125,7 +125,7 @@ def test_tags_of_an_imu_follow_its_own_clock(tmp_path: Path) -> None:
     assert np.abs(apart_ms - np.median(apart_ms)).mean() < 5
 
 
-def test_a_stream_whose_line_ends_were_changed_does_not_fit_its_tags() -> None:
+def test_a_stream_with_altered_line_ends_does_not_fit_its_tags() -> None:
     tally = CaptureTally()
     for _ in read_tagged(FIXTURES / "imu_1934.csv.gz", FIXTURES / "imu_1934.csv.tag.gz", tally):
         pass
@@ -134,7 +134,7 @@ def test_a_stream_whose_line_ends_were_changed_does_not_fit_its_tags() -> None:
     assert "bytes more than imu_1934.csv.gz holds" in tally.first_damage
 
 
-def test_tags_that_do_not_fit_are_told_after_the_good_bytes(tmp_path: Path) -> None:
+def test_mismatched_tags_raise_an_error_after_the_good_bytes(tmp_path: Path) -> None:
     path, tags = tmp_path / "rover.ubx", tmp_path / "rover.ubx.tag"
     path.write_bytes(bytes(350))
     tags.write_bytes(tag_file())
@@ -149,7 +149,7 @@ def test_tags_that_do_not_fit_are_told_after_the_good_bytes(tmp_path: Path) -> N
     st.lists(st.tuples(st.integers(0, 10**12), st.integers(1, 1 << 20)), min_size=1, max_size=30),
     st.integers(1_200_000_000 * 10**9, 2**32 * 10**9 - 10**14),
 )
-def test_what_is_written_reads_back_to_the_millisecond(steps: list[tuple[int, int]], first_ns: int) -> None:
+def test_written_tags_are_read_back_to_the_millisecond(steps: list[tuple[int, int]], first_ns: int) -> None:
     times = first_ns + np.cumsum([0, *(step for step, _ in steps[:-1])])
     sizes = np.cumsum([size for _, size in steps])
     stream = io.BytesIO()
@@ -164,7 +164,7 @@ def test_what_is_written_reads_back_to_the_millisecond(steps: list[tuple[int, in
     assert [time_ns for time_ns, _ in found] == (times // 10**6 * 10**6).tolist()
 
 
-def test_rtklib_never_sees_time_step_back() -> None:
+def test_tags_written_for_rtklib_never_step_back_in_time() -> None:
     stream = io.BytesIO()
     TagWriter(stream, 10**18).add(np.array([10**18, 10**18 - 10**9, 10**18 + 10**9]), np.array([1, 2, 3]))
     ticks = np.frombuffer(stream.getvalue()[76:], "<u4").reshape(-1, 2)[:, 0]

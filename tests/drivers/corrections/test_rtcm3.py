@@ -37,7 +37,7 @@ def parsed(data: bytes) -> tuple[Rtcm3Parser, list[DeviceStatus]]:
 
 
 @pytest.mark.parametrize("name", STREAMS)
-def test_counts_are_those_of_another_decoder(name: str) -> None:
+def test_message_counts_match_another_decoder(name: str) -> None:
     parser, _ = parsed(recording("rtcm3", name))
     entry = expected("rtcm3")[name]
     assert parser.counters.messages.total() == entry["frame_scan_own"]["rtcm3_crc_ok"]
@@ -50,7 +50,7 @@ def test_counts_are_those_of_another_decoder(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", STREAMS)
-def test_stations_are_those_of_pyrtcm(name: str) -> None:
+def test_station_positions_match_pyrtcm(name: str) -> None:
     data = recording("rtcm3", name)
     wanted = []
     for _, message in UBXReader(io.BytesIO(data), protfilter=RTCM3_PROTOCOL, quitonerror=ERR_IGNORE):
@@ -65,7 +65,7 @@ def test_stations_are_those_of_pyrtcm(name: str) -> None:
         assert one[2:] == pytest.approx(other[2:], abs=1e-6)
 
 
-def test_some_recording_has_a_station() -> None:
+def test_recordings_contain_stations_of_both_message_types() -> None:
     stations = [station for name in STREAMS for station in parsed(recording("rtcm3", name))[1]]
     assert {station.message for station in stations} == {"RTCM1005", "RTCM1006"}
     assert all(
@@ -74,13 +74,13 @@ def test_some_recording_has_a_station() -> None:
 
 
 @pytest.mark.parametrize("name", ["pygpsdata-RTCM3.log", "rtcm3.bndm.log"])
-def test_any_cut_gives_the_same(name: str) -> None:
+def test_messages_do_not_depend_on_how_the_stream_is_cut(name: str) -> None:
     data = recording("rtcm3", name)
     check_stream(make, data)
     check_damage(make, data)
 
 
-def test_a_station_message_that_is_too_short_is_counted() -> None:
+def test_a_truncated_station_message_is_counted() -> None:
     body = bytes([0xD3, 0, 4, 0x3E, 0xD0, 1, 2])  # number 1005
     parser, stations = parsed(body + crc24q(body).to_bytes(3, "big"))
     assert (parser.counters.bad_messages, stations) == (1, [])

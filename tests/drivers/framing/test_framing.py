@@ -71,7 +71,7 @@ class FramingParser(StreamParser):
 
 
 def count_frames() -> FramingParser:
-    """For long runs, that copy the parser."""
+    """Return a parser for long runs, which copy it."""
     return FramingParser(keep=False)
 
 
@@ -97,13 +97,13 @@ def test_checksums_equal_other_implementations(data: bytes) -> None:
 
 
 @pytest.mark.parametrize("length", [CRC24Q_STEP_BYTES - 1, CRC24Q_STEP_BYTES, CRC24Q_STEP_BYTES + 1, 1030, 1031, 5000])
-def test_crc24q_of_long_data_joins_its_steps(length: int) -> None:
+def test_crc24q_of_long_data_equals_the_crc_of_its_joined_parts(length: int) -> None:
     data = random.Random(length).randbytes(length)
     assert crc24q(data) == crc24q_reference(data)
 
 
 @pytest.mark.parametrize("begin", [0, 1, 700, CRC24Q_MARKED_BYTES - 150])
-def test_crc24q_marks_are_equal_where_a_good_frame_begins_and_ends_and_nowhere_else(begin: int) -> None:
+def test_crc24q_marks_are_equal_only_at_the_ends_of_a_valid_frame(begin: int) -> None:
     content = b"\xd3\x00\x04abcd"
     frame = content + crc24q_reference(content).to_bytes(3, "big")
     noise = random.Random(begin)
@@ -117,12 +117,12 @@ def test_crc24q_marks_are_equal_where_a_good_frame_begins_and_ends_and_nowhere_e
 
 
 @pytest.mark.parametrize("length", [FLETCHER_STEP_BYTES - 1, FLETCHER_STEP_BYTES, FLETCHER_STEP_BYTES + 1, 30_000])
-def test_fletcher_of_long_data_joins_its_steps(length: int) -> None:
+def test_fletcher_of_long_data_equals_the_checksum_of_its_joined_parts(length: int) -> None:
     data = random.Random(length).randbytes(length)
     assert bytes(ubx_fletcher(data)) == fletcher_reference(data)
 
 
-def test_crc32_novatel_is_the_manuals_bitwise_rule() -> None:
+def test_crc32_novatel_follows_the_bitwise_rule_of_the_manual() -> None:
     """OEM7 manual, "32-bit CRC": register 0, polynomial 0xEDB88320, low bit first, no inversion."""
     data = random.Random(3).randbytes(500)
     register = 0
@@ -150,7 +150,7 @@ NAMED_BY_NUMBER = ("CFG-", "MGA-", "MON-0a32", "MON-BATCH", "PFEC")
 
 
 def name_here(theirs: str) -> str:
-    """Our name of a message in expected.json."""
+    """Return our name of a message in expected.json."""
     protocol, _, name = theirs.partition(":")
     if protocol == "RTCM3":
         return "RTCM" + name.split("_")[0]
@@ -158,12 +158,12 @@ def name_here(theirs: str) -> str:
 
 
 def comparable(messages: Mapping[str, int]) -> dict[str, int]:
-    """Messages that have the same name here as elsewhere."""
+    """Return the messages that have the same name in both decoders."""
     return {name: count for name, count in messages.items() if count and not name.startswith(NAMED_BY_NUMBER)}
 
 
 def others_messages(name: str, entry: Mapping[str, Any]) -> dict[str, int]:
-    """What others found in a recording, under our names, with what they do not count."""
+    """Return the messages that another decoder found, under our names."""
     theirs: Counter[str] = Counter(UNCOUNTED_BY_OTHERS.get(name, {}))
     for message, count in entry["messages"].items():
         theirs[name_here(message)] += count
@@ -171,7 +171,7 @@ def others_messages(name: str, entry: Mapping[str, Any]) -> dict[str, int]:
 
 
 @pytest.mark.parametrize(("family", "name"), every_recording())
-def test_every_recording_has_the_frames_others_found(family: str, name: str) -> None:
+def test_frame_counts_of_every_recording_match_other_decoders(family: str, name: str) -> None:
     data, entry = recording(family, name), expected(family)[name]
     parser = frames_of(data)
     counters, scan = parser.counters, entry["frame_scan_own"]
@@ -184,7 +184,7 @@ def test_every_recording_has_the_frames_others_found(family: str, name: str) -> 
 
 
 @pytest.mark.parametrize("name", sorted(expected("sbf")))
-def test_every_sbf_recording_has_the_frames_others_found(name: str) -> None:
+def test_frame_counts_of_every_sbf_recording_match_other_decoders(name: str) -> None:
     data, entry = recording("sbf", name), expected("sbf")[name]
     parser = frames_of(data)
     numbers = Counter(frame.data[4] | (frame.data[5] & 0x1F) << 8 for frame in parser.frames if frame.kind == "sbf")
@@ -205,7 +205,7 @@ WITH_SENTENCES = sorted(name for name, entry in expected("nmea").items() if entr
 
 
 @pytest.mark.parametrize("name", WITH_SENTENCES)
-def test_every_sentence_is_gpsds(name: str) -> None:
+def test_nmea_sentences_match_gpsd(name: str) -> None:
     """gpsd repeats each sentence it framed, so its output is a list of them."""
     ours = [frame.data.strip().replace(b"|", b"") for frame in frames_of(recording("nmea", name)).frames]
     theirs = [line.strip() for line in gpsd_lines("nmea", name) if line[:1] in (b"$", b"!")]
@@ -224,7 +224,7 @@ def test_every_sentence_is_gpsds(name: str) -> None:
         ("ubx", "ublox-zed-f9t-rtcm3.log", 182),
     ],
 )
-def test_every_rtcm3_message_has_the_type_and_length_gpsd_says(family: str, name: str, count: int) -> None:
+def test_types_and_lengths_of_rtcm3_messages_match_gpsd(family: str, name: str, count: int) -> None:
     frames = [frame.data for frame in frames_of(recording(family, name)).frames if frame.kind == "rtcm3"]
     ours = [(int.from_bytes(data[3:5], "big") >> 4, len(data) - 6) for data in frames]
     assert ours == [(report["type"], report["length"]) for report in gpsd_output(family, name, "RTCM3")]
@@ -267,14 +267,14 @@ BROKEN = {
 }
 
 
-def test_every_broken_file_is_in_the_table() -> None:
+def test_every_broken_recording_is_listed_in_the_table() -> None:
     for family, files in BROKEN.items():
         names = {name for name, entry in expected(family).items() if entry["errors"] or "bad" in name.lower()}
         assert names == set(files), family
 
 
 @pytest.mark.parametrize(("family", "name"), [(family, name) for family in BROKEN for name in BROKEN[family]])
-def test_skipped_bytes_of_broken_files_are_those_that_belong_to_no_frame(family: str, name: str) -> None:
+def test_skipped_bytes_of_broken_files_belong_to_no_frame(family: str, name: str) -> None:
     counters = frames_of(recording(family, name)).counters
     assert (counters.bytes_skipped, counters.bad_checksums) == BROKEN[family][name]
 
@@ -310,7 +310,7 @@ FRAME = encode_frame(b"\x01\x22", bytes(20))
         b"*00\r\n",
     ],
 )
-def test_good_frames_inside_a_false_one_are_found(false_start: bytes) -> None:
+def test_valid_frames_inside_a_false_frame_are_found(false_start: bytes) -> None:
     parser = frames_of(false_start + FRAME + GOOD + FRAME)
     assert [frame.data for frame in parser.frames] == [FRAME, GOOD, FRAME]
     assert parser.counters.bytes_skipped == len(false_start)
@@ -318,7 +318,7 @@ def test_good_frames_inside_a_false_one_are_found(false_start: bytes) -> None:
 
 @pytest.mark.parametrize("read_bytes", [1, 64, 750, 100_000])
 @pytest.mark.parametrize("false", [b"\xd3\x03\xff", b"\xd3\x00", b"\xd3\x01\x50\x00"])
-def test_good_frames_among_overlapping_false_ones_are_found(false: bytes, read_bytes: int) -> None:
+def test_valid_frames_among_overlapping_false_frames_are_found(false: bytes, read_bytes: int) -> None:
     """Every false start is decided by a checksum of its own bytes, and each is counted."""
     [rtcm3] = frames_of(recording("rtcm3", "rtcm3.2.log")).frames[:1]
     one = false * 700 + rtcm3.data + false * 3 + rtcm3.data * 2 + GOOD + false
@@ -330,7 +330,7 @@ def test_good_frames_among_overlapping_false_ones_are_found(false: bytes, read_b
 
 
 @pytest.mark.parametrize("kind", ALL_KINDS, ids=lambda kind: kind.name)
-def test_a_false_sync_holds_back_no_more_than_its_bound(kind: FrameKind) -> None:
+def test_a_false_sync_delays_at_most_its_bound(kind: FrameKind) -> None:
     starts = {
         "nmea": b"$GPTXT,",
         "ubx": b"\xb5b\x01\x07" + UBX_MAX_PAYLOAD_BYTES.to_bytes(2, "little"),
@@ -350,7 +350,7 @@ def test_a_false_sync_holds_back_no_more_than_its_bound(kind: FrameKind) -> None
     assert fed >= kind.max_bytes - 64
 
 
-def test_lengths_beyond_the_bound_are_counted_and_not_waited_for() -> None:
+def test_frames_longer_than_the_bound_are_counted_and_not_waited_for() -> None:
     parser = FramingParser()
     parser.feed(Chunk("gnss/test", 0, b"\xb5b\x01\x07\x01\x20" + FRAME))
     assert [frame.data for frame in parser.frames] == [FRAME]
@@ -361,7 +361,7 @@ def test_lengths_beyond_the_bound_are_counted_and_not_waited_for() -> None:
     assert parser.counters.errors == {"sbf_length_over_bound": 1}
 
 
-def test_a_sentence_longer_than_the_bound_is_no_sentence() -> None:
+def test_a_sentence_longer_than_the_bound_is_rejected() -> None:
     longest = encode_sentence("PTEST," + "x" * (NMEA_MAX_BYTES - 12))
     assert len(longest) == NMEA_MAX_BYTES
     assert len(frames_of(longest).frames) == 1
@@ -386,7 +386,7 @@ def test_a_sentence_longer_than_the_bound_is_no_sentence() -> None:
         ("A bc,1", "A"),
     ],
 )
-def test_a_sentence_is_counted_by_its_name(body: str, name: str) -> None:
+def test_sentences_are_counted_by_name(body: str, name: str) -> None:
     assert frames_of(encode_sentence(body) * 2).counters.messages == {name: 2}
 
 
@@ -398,14 +398,14 @@ def test_a_sentence_ends_with_its_line_or_its_checksum(ending: bytes) -> None:
     assert [frame.data for frame in parser.frames] == [sentence + taken, FRAME]
 
 
-def test_a_frame_arrives_with_its_last_byte() -> None:
-    """Also one that was held back behind a false sync: it keeps the time at which it was there."""
+def test_a_frame_has_the_arrival_time_of_its_last_byte() -> None:
+    """A frame delayed by a false sync keeps the time of its own last byte."""
     false = b"\xb5b\x01\x07\x80\x00"
     parser = frames_of(b"x", FRAME[:5], FRAME[5:], false, FRAME, GOOD, bytes(200))
     assert [(frame.host_time_ns, frame.data) for frame in parser.frames] == [(2, FRAME), (4, FRAME), (5, GOOD)]
 
 
-def test_an_empty_stream_closes() -> None:
+def test_an_empty_stream_can_be_closed() -> None:
     parser = frames_of(b"")
     assert (parser.counters.bytes, parser.frames) == (0, [])
 
@@ -414,20 +414,20 @@ def test_an_empty_stream_closes() -> None:
 
 
 @pytest.mark.parametrize("name", ["rtcm3.2.log", "pygpsdata-NTRIP-4076.log", "pygpsdata-MIXED-RTCM3.log"])
-def test_rtcm3_however_it_is_cut(name: str) -> None:
+def test_rtcm3_frames_do_not_depend_on_how_the_stream_is_cut(name: str) -> None:
     outcome = check_stream(count_frames, recording("rtcm3", name))
     assert sum(outcome.counters["messages"].values()) == sum(expected("rtcm3")[name]["messages"].values())
 
 
-def test_rtcm3_damaged() -> None:
+def test_damaged_rtcm3_stream_never_raises() -> None:
     check_damage(count_frames, recording("rtcm3", "rtcm3.2.log"))
 
 
-def test_garbage_alone() -> None:
+def test_garbage_never_raises() -> None:
     check_garbage(count_frames)
 
 
-def test_sbf_between_nmea_and_rtcm3_however_it_is_cut() -> None:
+def test_sbf_mixed_with_nmea_and_rtcm3_does_not_depend_on_how_it_is_cut() -> None:
     """Block, sentence, block, RTCM3 and the replies of the command line between them, all on one port."""
     mixed = recording("sbf", "pygpsdata_mixed.log")
     blocks = recording("sbf", "pygpsdata_x5_status.log")
@@ -438,5 +438,5 @@ def test_sbf_between_nmea_and_rtcm3_however_it_is_cut() -> None:
     assert outcome.counters["bytes_skipped"] == 2 * len(reply)
 
 
-def test_sbf_damaged() -> None:
+def test_damaged_sbf_stream_never_raises() -> None:
     check_damage(count_frames, recording("sbf", "sbfdata.log"))

@@ -69,18 +69,18 @@ def candump_units(name: str, tmp_path: Path) -> list[bytes]:
 
 
 def decoded(name: str) -> list[tuple[str, dict[str, float]]]:
-    """cantools' decoding, in order."""
+    """Return cantools' decoding in order."""
     with gzip.open(FIXTURES / f"{name}.decoded.csv.gz", "rt", newline="") as file:
         return [(row["message"], json.loads(row["signals_json"])) for row in csv.DictReader(file)]
 
 
 def parse(units: list[bytes], parser: CanmodGpsParser) -> list[Record]:
-    """Everything as one run of batches."""
+    """Parse everything as one run of batches."""
     return [record for batch in packet_batches(units, lambda: len(units)) for record in parser.feed_batch(batch)]
 
 
 @pytest.mark.parametrize("expected", RECORDINGS, ids=lambda expected: expected.name)
-def test_imu_samples_are_cantools(expected: Expected, tmp_path: Path) -> None:
+def test_imu_samples_match_cantools(expected: Expected, tmp_path: Path) -> None:
     units = candump_units(expected.name, tmp_path)
     assert len(units) == expected.frames
     parser = CanmodGpsParser(SETTINGS)
@@ -99,7 +99,7 @@ def test_imu_samples_are_cantools(expected: Expected, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("expected", RECORDINGS, ids=lambda expected: expected.name)
-def test_gnss_records_are_cantools(expected: Expected, tmp_path: Path) -> None:
+def test_gnss_records_match_cantools(expected: Expected, tmp_path: Path) -> None:
     records = parse(candump_units(expected.name, tmp_path), CanmodGpsParser(SETTINGS))
     theirs = decoded(expected.name)
     times = [record for record in records if isinstance(record, TimeMessage)]
@@ -125,7 +125,7 @@ def test_gnss_records_are_cantools(expected: Expected, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("expected", RECORDINGS, ids=lambda expected: expected.name)
-def test_attitude_distance_and_fences_are_cantools(expected: Expected, tmp_path: Path) -> None:
+def test_attitude_distance_and_fences_match_cantools(expected: Expected, tmp_path: Path) -> None:
     records = parse(candump_units(expected.name, tmp_path), CanmodGpsParser(SETTINGS))
     theirs = decoded(expected.name)
     for message, valid, names in (
@@ -146,7 +146,7 @@ def test_attitude_distance_and_fences_are_cantools(expected: Expected, tmp_path:
                 assert values[f"{key}_accuracy_rad"] == pytest.approx(np.radians(said[f"{signal}Accuracy"]), abs=1e-12)
 
 
-def test_batches_do_not_matter(tmp_path: Path) -> None:
+def test_records_do_not_depend_on_batches(tmp_path: Path) -> None:
     units = candump_units(RECORDINGS[0].name, tmp_path)[500:2500]
     whole = check_packets(lambda: CanmodGpsParser(SETTINGS), units)
     assert whole.counters["messages"]["gnss_time"] > 5
@@ -176,7 +176,7 @@ def test_the_recorder_gets_time_messages_only(tmp_path: Path) -> None:
     assert driver.make_time_parser is make_time_parser
 
 
-def test_a_cut_millisecond_is_the_whole_second() -> None:
+def test_a_truncated_millisecond_is_rounded_to_the_whole_second() -> None:
     for unix_s in (1641469624.999, 1641469625.0):
         tag = utc_tag(unix_s)
         assert (str(tag.date), tag.time_ns) == ("2022-01-06", (11 * 3600 + 47 * 60 + 5) * 1_000_000_000)

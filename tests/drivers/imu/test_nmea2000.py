@@ -76,7 +76,7 @@ def bus(name: str) -> tuple[bytes, ...]:
 
 
 def decoded(name: str) -> list[dict[str, Any]]:
-    """The other decoder's messages, in order."""
+    """Return the other decoder's messages in order."""
     with gzip.open(FIXTURES / name, "rt") as file:
         return [json.loads(line) for line in file]
 
@@ -87,13 +87,13 @@ def parser_of(source_address: int | None = None) -> Nmea2000Parser:
 
 
 def parse(units: list[bytes] | tuple[bytes, ...], parser: Nmea2000Parser) -> list[Record]:
-    """Everything as one batch, closed."""
+    """Parse everything as one batch to the end."""
     records = [record for batch in packet_batches(units, lambda: len(units)) for record in parser.feed_batch(batch)]
     return records + parser.close()
 
 
 def frame(pgn: int, data: bytes, source: int = 1, priority: int = 2) -> bytes:
-    """A frame of a broadcast PGN."""
+    """Return a frame of a broadcast PGN."""
     return encode_can_frame(priority << 26 | pgn << 8 | source, data, extended=True)
 
 
@@ -115,18 +115,18 @@ def position(lat_deg: float, *, method: int = 1, days: int = 19326, time: int = 
 
 
 @pytest.mark.parametrize("name", COUNTS)
-def test_messages_are_counted_as_the_other_decoder_does(name: str) -> None:
+def test_message_counts_match_another_decoder(name: str) -> None:
     parser = parser_of()
     parse(bus(name), parser)
     assert dict(parser.counters.messages) == COUNTS[name]
     assert parser.counters.bad_messages == 0
 
 
-def test_the_whole_bus_is_read() -> None:
+def test_every_frame_of_the_bus_is_read() -> None:
     assert len(bus("can0-2_candump.log.gz")) == 47_166
 
 
-def test_values_of_every_source_in_order() -> None:
+def test_values_of_every_source_are_decoded_in_order() -> None:
     units = bus("can0-2_candump.log.gz")
     theirs = decoded("can0-2.nmea2000_decoded.jsonl.gz")
     compared = 0
@@ -154,7 +154,7 @@ def seconds_of_day(text: str) -> int:
     return hours * 3600 + minutes * 60 + seconds
 
 
-def test_fast_packets_of_every_source_in_order() -> None:
+def test_fast_packets_of_every_source_are_decoded_in_order() -> None:
     units, theirs = bus("can0-2_candump.log.gz"), decoded("can0-2.129029_decoded.jsonl.gz")
     types = {"GNSS fix": FixType.SINGLE, "DGNSS fix": FixType.DIFFERENTIAL}
     for source in sorted({message["src"] for message in theirs}):
@@ -199,7 +199,7 @@ def r_message(record: Record) -> str:
     return getattr(record, "message", "")
 
 
-def test_batches_do_not_matter() -> None:
+def test_records_do_not_depend_on_batches() -> None:
     whole = check_packets(parser_of, bus("can0-2_candump.log.gz")[:3000])
     assert whole.counters["errors"]["other_source"] > 100
     assert whole.counters["messages"]["129029"] > 10
@@ -227,14 +227,14 @@ def test_random_data_never_raises_whatever_the_batches(frames: list[tuple[int, i
     assert run_packets(parser_of, units, lambda: size) == run_packets(parser_of, units, lambda: len(units))
 
 
-def test_identifier_to_pgn_and_source() -> None:
+def test_identifier_is_split_into_pgn_and_source() -> None:
     broadcast, addressed = 0x09F11217, 0x18EA2314  # 127250 from 23; ISO request 59904 to 0x23 from 20
     pgn, source = pgn_and_source(np.array([broadcast, addressed], np.uint32))
     assert pgn.tolist() == [127250, 59904]
     assert source.tolist() == [23, 20]
 
 
-def test_interleaved_sources_and_numbers_are_put_together() -> None:
+def test_interleaved_sources_and_sequences_are_reassembled() -> None:
     packets = [fast_frames(position(47.0 + n), n % 8, source=3) for n in range(2)]
     others = fast_frames(position(-30.0), 0, source=4)
     units = [unit for trio in zip(*packets, others, strict=True) for unit in trio]
@@ -254,7 +254,7 @@ def test_a_missing_frame_costs_its_message_and_is_counted_once(missing: int) -> 
     assert parser.counters.errors == {"fast_packet_incomplete": 1}
 
 
-def test_a_late_frame_belongs_to_no_message() -> None:
+def test_a_late_frame_is_assigned_to_no_message() -> None:
     units = fast_frames(position(1.0), 0)
     parser = parser_of()
     host = STREAM_HOST_NS + np.where(np.arange(len(units)) < 3, 0, 1_000_000_000)
@@ -263,7 +263,7 @@ def test_a_late_frame_belongs_to_no_message() -> None:
     assert parser.counters.errors == {"fast_packet_incomplete": 1}
 
 
-def test_memory_is_bounded_by_sources_and_numbers() -> None:
+def test_memory_is_bounded_by_sources_and_sequences() -> None:
     parser = parser_of()
     units = [frame(129029, bytes([n << 5, 223]) + bytes(6), source) for source in range(256) for n in range(8)]
     parse(units * 3, parser)
@@ -271,7 +271,7 @@ def test_memory_is_bounded_by_sources_and_numbers() -> None:
     assert parser.counters.messages.total() == 0
 
 
-def test_what_is_not_available_is_left_out() -> None:
+def test_values_marked_not_available_are_omitted() -> None:
     units = [
         frame(127257, bytes.fromhex("00FF7F1F02FE7FFF")),
         frame(129025, bytes.fromhex("FFFFFF7FFFFFFF7F")),
@@ -284,7 +284,7 @@ def test_what_is_not_available_is_left_out() -> None:
     assert parser.counters.errors == {"time_not_available": 1}
 
 
-def test_headings_are_true_or_none() -> None:
+def test_headings_are_true_or_omitted() -> None:
     def heading(reference: int, deviation: int, variation: int) -> bytes:
         return frame(127250, struct.pack("<BHhhB", 0, 60000, deviation, variation, 0xFC | reference))
 
@@ -295,7 +295,7 @@ def test_headings_are_true_or_none() -> None:
     assert len(records) == 7
 
 
-def test_times_of_local_clocks_are_not_valid() -> None:
+def test_times_of_local_clocks_are_invalid() -> None:
     units = [frame(126992, struct.pack("<BBHI", 0, 0xF0 | source, 19326, 432_890_000)) for source in (0, 1, 2, 5)]
     units.append(frame(126992, struct.pack("<BBHI", 0, 0xF0, 19326, 900_000_000)))
     parser = parser_of()
@@ -305,7 +305,7 @@ def test_times_of_local_clocks_are_not_valid() -> None:
     assert parser.counters.errors == {"bad_value": 1}
 
 
-def test_impossible_positions_are_no_fixes() -> None:
+def test_impossible_positions_give_no_fix() -> None:
     parser = parser_of()
     units = fast_frames(position(91.0), 0) + fast_frames(position(45.0, method=0), 1) + fast_frames(bytes(20), 2)
     fixes = [record for record in parse(units, parser) if isinstance(record, GnssFix)]

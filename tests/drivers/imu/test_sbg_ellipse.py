@@ -53,7 +53,7 @@ def cycles(count: int, first_us: int = 0) -> tuple[list[bytes], np.ndarray[Any, 
     return frames, values
 
 
-def test_the_dbc_beside_the_driver_is_the_makers() -> None:
+def test_the_bundled_dbc_equals_the_manufacturers_file() -> None:
     ours: Any = cantools.database.load_file(DBC_PATH, encoding="utf-8", strict=False)
     theirs = {message.name: message for message in MAKERS.messages}
     assert {message.name for message in ours.messages} == set(theirs)
@@ -78,7 +78,7 @@ def test_the_dbc_beside_the_driver_is_the_makers() -> None:
             )
 
 
-def test_samples_are_what_cantools_encoded_by_the_makers_dbc() -> None:
+def test_samples_match_frames_encoded_by_cantools_with_the_manufacturers_dbc() -> None:
     first_us = 2**32 - 100 * STEP_US
     frames, values = cycles(300, first_us)
     parser = parser_of()
@@ -95,14 +95,14 @@ def test_samples_are_what_cantools_encoded_by_the_makers_dbc() -> None:
     assert not +parser.counters.errors
 
 
-def test_batches_do_not_matter_and_damage_never_raises() -> None:
+def test_samples_do_not_depend_on_batches_and_damage_never_raises() -> None:
     frames, _ = cycles(40)
     whole = check_packets(parser_of, frames)
     assert len(whole.rows["ImuSamples"]) == 40
     check_packet_damage(parser_of, frames)
 
 
-def test_a_lost_frame_costs_its_sample_only() -> None:
+def test_a_lost_frame_drops_only_its_sample() -> None:
     frames, values = cycles(10)
     parser = parser_of()
     rows = imu_rows([*feed(parser, frames[:10] + frames[11:]), *parser.close()])  # the ACCEL of the fourth
@@ -111,7 +111,7 @@ def test_a_lost_frame_costs_its_sample_only() -> None:
 
 
 @pytest.mark.parametrize("extended", [False, True])
-def test_identifiers_are_the_users(extended: bool) -> None:
+def test_identifiers_can_be_configured(extended: bool) -> None:
     ids = {"IMU_INFO": 0x320, "IMU_ACCEL": 0x10, "IMU_GYRO": 0x7FF}
     parser = parser_of(ids=ids, extended_ids=extended)
     info = {"TIME_STAMP": 1000, "STATUS": 0, "TEMPERATURE": 20.0}
@@ -132,7 +132,7 @@ def test_identifiers_are_the_users(extended: bool) -> None:
     assert not +parser.counters.errors
 
 
-def test_the_deprecated_messages_are_the_same_under_other_identifiers() -> None:
+def test_the_deprecated_messages_decode_like_the_current_ones() -> None:
     """canProtocol.md: IMU_DELTA_VEL and IMU_DELTA_ANGLE are the same as IMU_ACCEL and IMU_GYRO."""
     parser = parser_of(ids={"IMU_ACCEL": 0x123, "IMU_GYRO": 0x124})
     frames = [
@@ -146,7 +146,7 @@ def test_the_deprecated_messages_are_the_same_under_other_identifiers() -> None:
 
 
 @pytest.mark.parametrize("event", "ABCDE")
-def test_pps_on_a_sync_in_latches_the_counter(event: str) -> None:
+def test_a_pps_on_sync_in_latches_the_counter(event: str) -> None:
     """6 bytes by the document, 8 by the DBC: the time stamp is in both."""
     frames, _ = cycles(4)
     stamp = {"TIME_STAMP": 7500.0, "STATUS": 0.0}
@@ -175,13 +175,13 @@ def test_pps_on_a_sync_in_latches_the_counter(event: str) -> None:
         ({"pps_event": "F"}, "no message SBG_ECAN_MSG_EVENT_INFO_F in sbg-ellipse.dbc"),
     ],
 )
-def test_wrong_settings_are_one_line_that_names_them(config: dict[str, Any], text: str) -> None:
+def test_wrong_settings_are_refused_in_one_line_that_names_them(config: dict[str, Any], text: str) -> None:
     with pytest.raises(DriverSettingsError, match=text) as caught:
         parser_of(**config)
     assert "\n" not in str(caught.value)
 
 
-def test_the_driver_is_found() -> None:
+def test_the_driver_is_registered() -> None:
     driver = find_driver("imu", "sbg-ellipse")
     assert driver.transports == ("can",)
     assert driver.make_time_parser is make_clock_parser

@@ -40,7 +40,7 @@ def temperature(raw: int, mark: str = ">") -> bytes:
 
 
 @pytest.mark.parametrize("order", ["big", "little"])
-def test_values_are_those_of_the_layout(order: str) -> None:
+def test_values_follow_the_documented_layout(order: str) -> None:
     mark = MARKS[order]
     parser = parser_of(byte_order=order)
     frames = [temperature(0x1580, mark), *group(1, mark), *group(2, mark)]
@@ -53,26 +53,26 @@ def test_values_are_those_of_the_layout(order: str) -> None:
     assert not +parser.counters.errors
 
 
-def test_the_tick_is_what_the_user_said() -> None:
+def test_the_tick_is_taken_from_the_configuration() -> None:
     parser = parser_of(tick_hz=1_000_000)
     rows = imu_rows([*feed(parser, [*group(1), *group(2)]), *parser.close()])
     assert rows["device_time_ns"].tolist() == [100_000, 200_000]
 
 
-def test_big_is_the_default_byte_order() -> None:
+def test_byte_order_defaults_to_big_endian() -> None:
     frames = [*group(1), *group(2)]
     expected = imu_rows(feed(parser_of(byte_order="big"), frames))
     assert imu_rows(feed(parser_of(), frames)).tobytes() == expected.tobytes()
 
 
-def test_the_counter_runs_on_through_its_wrap() -> None:
+def test_the_counter_continues_through_its_wrap() -> None:
     parser = parser_of()
     frames = [*group(1, ticks=2**32 - 100), *group(2, ticks=0), *group(3, ticks=100)]
     rows = imu_rows([*feed(parser, frames), *parser.close()])
     assert np.diff(rows["device_time_ns"]).tolist() == [10_000_000, 10_000_000]
 
 
-def test_groups_that_are_missing_are_counted_by_the_counter() -> None:
+def test_missing_groups_are_counted_by_the_group_counter() -> None:
     parser = parser_of()
     numbers = [65533, 65534, 65537, 65538, 65538, 65540]  # two missing across the wrap, one repeated, one missing
     rows = imu_rows([*feed(parser, [frame for number in numbers for frame in group(number)]), *parser.close()])
@@ -80,13 +80,13 @@ def test_groups_that_are_missing_are_counted_by_the_counter() -> None:
     assert parser.counters.errors == {"packet_gap": 3}
 
 
-def test_a_counter_that_goes_back_is_no_gap() -> None:
+def test_a_counter_that_steps_back_is_not_a_gap() -> None:
     parser = parser_of()
     feed(parser, [*group(30_000), *group(0), *group(1)])
     assert parser.counters.errors["packet_gap"] == 0
 
 
-def test_batches_do_not_matter_and_damage_never_raises() -> None:
+def test_samples_do_not_depend_on_batches_and_damage_never_raises() -> None:
     frames = [frame for number in range(30) if number != 7 for frame in group(number)]
     whole = check_packets(parser_of, frames)
     assert len(whole.rows["ImuSamples"]) == 29
@@ -94,7 +94,7 @@ def test_batches_do_not_matter_and_damage_never_raises() -> None:
     check_packet_damage(parser_of, frames)
 
 
-def test_identifiers_are_the_users() -> None:
+def test_identifiers_can_be_configured() -> None:
     parser = parser_of(ids={"Acceleration": 0x18FF0034, "SampleTime": 0x18FF0005}, extended_ids=True)
     frames = [
         encode_can_frame(0x18FF0005, struct.pack(">I", 100), extended=True),
@@ -106,7 +106,7 @@ def test_identifiers_are_the_users() -> None:
     assert rows["specific_force_b"].tolist() == [[1.0, 0.0, 0.0]]
 
 
-def test_the_layout_is_a_dbc_whose_frames_have_the_documented_lengths() -> None:
+def test_the_layout_is_a_dbc_with_frames_of_the_documented_lengths() -> None:
     """Lengths of MT1604P section 6: SampleTime 4, GroupCounter 2, StatusWord 4, vectors 6, Temperature 2."""
     for order in MARKS:
         database: Any = cantools.database.load_string(dbc_text(order), database_format="dbc")
@@ -128,10 +128,10 @@ def test_the_layout_is_a_dbc_whose_frames_have_the_documented_lengths() -> None:
         ({"sample": "increment"}, 'sample: got "increment"'),
     ],
 )
-def test_wrong_settings_are_one_line_that_names_them(config: dict[str, Any], text: str) -> None:
+def test_wrong_settings_are_refused_in_one_line_that_names_them(config: dict[str, Any], text: str) -> None:
     with pytest.raises(DriverSettingsError, match=text):
         parser_of(**config)
 
 
-def test_the_driver_asks_for_the_tick() -> None:
+def test_the_driver_requires_the_tick() -> None:
     assert find_driver("imu", "xsens-mti").needs == ("tick_hz",)

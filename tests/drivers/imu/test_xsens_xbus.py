@@ -71,7 +71,7 @@ def make(**config: Any) -> XbusParser:
 
 
 def parse(*pieces: bytes, **config: Any) -> tuple[list[Record], XbusParser]:
-    """Records of the pieces, closed, and the parser."""
+    """Parse the pieces to the end; return records and parser."""
     parser = make(**config)
     return feed_pieces(parser, pieces), parser
 
@@ -84,7 +84,7 @@ def times(records: list[Record]) -> list[TimeMessage]:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_samples_are_what_the_other_library_decoded(name: str) -> None:
+def test_samples_match_the_reference_library(name: str) -> None:
     records, parser = parse(recording(name))
     rows = imu_rows(records)
     theirs = [block for block in decoded(name) if "Acceleration" in block]
@@ -103,7 +103,7 @@ def test_samples_are_what_the_other_library_decoded(name: str) -> None:
 
 
 @pytest.mark.parametrize("number", "12")
-def test_messages_end_where_the_other_library_ends_them(number: str) -> None:
+def test_message_boundaries_match_the_reference_library(number: str) -> None:
     text = gzip.decompress((FIXTURES / f"xsens/{number}_messages.golden.gz").read_bytes())
     theirs = [bytes.fromhex(line.decode()) for line in text.split()]
     assert len(theirs) == 100
@@ -128,7 +128,7 @@ FORMAT_NAMES = {"Float32": xbus.FLOAT32, "FP1220": xbus.FP1220}
 
 
 @pytest.mark.parametrize("number", "12")
-def test_identifiers_are_those_of_the_devices_own_output_configuration(number: str) -> None:
+def test_identifiers_match_the_output_configuration_of_the_device(number: str) -> None:
     """Identifier and rate of each item that the device was told to send, beside the other library's names for them."""
     data = (FIXTURES / f"xsens/{number}_outputconfig.bin").read_bytes()
     text = (FIXTURES / f"xsens/{number}_outputconfig.golden").read_text()
@@ -149,7 +149,7 @@ def test_identifiers_are_those_of_the_devices_own_output_configuration(number: s
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_every_item_that_is_read_is_what_the_other_library_decoded(name: str) -> None:
+def test_every_decoded_item_matches_the_reference_library(name: str) -> None:
     """Delta V, delta Q, the counter and UTC too, from the items themselves."""
     data, position = recording(name), 0
     for block in decoded(name):
@@ -177,7 +177,7 @@ def test_increments_are_divided_by_the_interval(name: str) -> None:
     np.testing.assert_allclose(rows["angular_rate_b"], 100.0 * Rotation.from_quat(quaternions).as_rotvec(), rtol=1e-6)
 
 
-def test_the_devices_rate_is_its_increment_over_the_interval() -> None:
+def test_rate_of_turn_equals_its_increment_divided_by_the_interval() -> None:
     """In float32; 12.20 resolves 2e-4 rad/s of an increment."""
     rates = imu_rows(parse(recording("1_output"))[0])
     increments = imu_rows(parse(recording("1_output"), sample="increment", rate_hz=100)[0])
@@ -202,13 +202,13 @@ def test_each_second_gives_one_time_message(name: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
-def test_recordings_however_they_are_cut(name: str) -> None:
+def test_records_do_not_depend_on_how_recordings_are_cut(name: str) -> None:
     outcome = check_stream(make, recording(name))
     assert len(outcome.rows["ImuSamples"]) == 96
 
 
 @pytest.mark.parametrize("size", [1, 64, 143, 1024])
-def test_a_batch_of_reads_is_what_its_reads_are(size: int) -> None:
+def test_a_batch_of_reads_gives_the_records_of_its_single_reads(size: int) -> None:
     data = recording("1_output")[: len(recording("1_output")) // size * size]
     units = np.frombuffer(data, np.uint8).reshape(-1, size)
     parser = make()
@@ -217,7 +217,7 @@ def test_a_batch_of_reads_is_what_its_reads_are(size: int) -> None:
     assert outcome(records, parser) == run_stream(make, (unit.tobytes() for unit in units))
 
 
-def test_damaged_recordings() -> None:
+def test_damaged_recordings_never_raise() -> None:
     check_damage(make, recording("1_output"), starts=STARTS)
     check_garbage(make, starts=STARTS)
 
@@ -237,7 +237,7 @@ def test_damaged_recordings() -> None:
         (xbus.FLOAT64, -1.5, "bff8000000000000"),
     ],
 )
-def test_numbers_on_the_wire(number_format: int, value: float, wire: str) -> None:
+def test_number_formats_are_decoded(number_format: int, value: float, wire: str) -> None:
     assert xbus.decode_numbers(bytes.fromhex(wire), number_format) == (value,)
     assert xbus.encode_numbers([value], number_format).hex() == wire
 
@@ -260,7 +260,7 @@ def test_a_message_of_every_number_format_is_read_back(number_format: int) -> No
     assert parser.counters.bytes_framed == len(message)
 
 
-def test_orientations_turned_by_the_identifier_do_not_turn_the_sample() -> None:
+def test_orientation_bits_of_an_identifier_do_not_rotate_the_sample() -> None:
     """Bits 2 and 3 of an identifier choose the frame of orientations; inertial items stay in the housing's axes."""
     for turned in (0x0, 0x4, 0x8):
         message = xbus.encode_mtdata2(
@@ -270,7 +270,7 @@ def test_orientations_turned_by_the_identifier_do_not_turn_the_sample() -> None:
         assert imu_rows(parse(message)[0])["specific_force_b"].tolist() == [[1.0, 2.0, 3.0]]
 
 
-def test_rotation_vectors_are_scipys() -> None:
+def test_rotation_vectors_match_scipy() -> None:
     rng = np.random.default_rng(5)
     quaternions = rng.normal(size=(200, 4))
     quaternions[:100, 1:] *= 10.0 ** rng.uniform(-9, 0, (100, 1))  # small angles, as of one sample
@@ -300,7 +300,7 @@ def test_a_long_message_has_an_extended_length() -> None:
         xbus.encode_message(0x36, bytes(2049))
 
 
-def test_lengths_at_the_border_of_the_extended_one() -> None:
+def test_both_length_encodings_are_read_at_the_border_between_them() -> None:
     for size in (0, 1, 253, 254, 255, 256):
         message = xbus.encode_message(0x3F, bytes(size))
         assert (len(message), sum(message[1:]) & 0xFF) == (size + (5 if size < 255 else 7), 0)
@@ -316,7 +316,7 @@ def test_a_length_beyond_the_bound_is_counted_and_not_waited_for() -> None:
     assert parser.counters.errors == {"xbus_length_over_bound": 1}
 
 
-def test_commands_of_a_host_are_no_frames() -> None:
+def test_host_commands_are_not_decoded() -> None:
     """A device answers with odd identifiers; GoToConfig (30) on the line is an echo."""
     _, parser = parse(xbus.encode_message(0x30, b"") + xbus.encode_message(0x31, b""))
     assert parser.counters.messages == {"XBUS-31": 1}
@@ -351,13 +351,13 @@ def sample(number: int, ticks: int | None = None) -> bytes:
     )
 
 
-def test_packets_that_are_missing_are_counted_through_the_wrap() -> None:
+def test_missing_packets_are_counted_through_the_counter_wrap() -> None:
     records, parser = parse(*(sample(number) for number in (65534, 65535, 65536, 65539, 65540)))
     assert len(imu_rows(records)) == 5
     assert parser.counters.errors == {"packet_gap": 2}
 
 
-def test_the_tick_counter_runs_on_through_its_wrap_and_shows_a_restart() -> None:
+def test_the_tick_counter_continues_through_its_wrap_and_shows_a_restart() -> None:
     parser = make()
     records: list[Record] = []
     for second, ticks in enumerate([2**32 - 10_000, 0, 10_000, 5_000, 15_000]):
@@ -383,7 +383,7 @@ def test_a_message_with_half_a_sample_or_the_other_kind_is_counted() -> None:
         assert parser.counters.errors == {code: 1}
 
 
-def test_what_is_no_number_is_no_sample() -> None:
+def test_a_non_finite_value_gives_no_sample() -> None:
     nan = xbus.encode_item(xbus.ACCELERATION, (0.0, float("nan"), 0.0))
     records, parser = parse(xbus.encode_mtdata2(nan, xbus.encode_item(xbus.RATE_OF_TURN, (0.0, 0.0, 0.0))))
     assert records == []
@@ -402,7 +402,7 @@ def test_a_sample_without_a_counter_has_no_device_time() -> None:
     ("fields", "valid"),
     [((0, 2026, 11, 21, 12, 0, 0, 0x07), True), ((0, 2026, 11, 21, 12, 0, 0, 0x03), False)],
 )
-def test_a_time_counts_while_the_device_vouches_for_it(fields: tuple[int, ...], valid: bool) -> None:
+def test_a_time_is_valid_only_while_the_device_declares_it_valid(fields: tuple[int, ...], valid: bool) -> None:
     records, _ = parse(xbus.encode_mtdata2(xbus.encode_item(xbus.UTC_TIME, fields)))
     assert [message.valid for message in times(records)] == [valid]
 
@@ -410,7 +410,7 @@ def test_a_time_counts_while_the_device_vouches_for_it(fields: tuple[int, ...], 
 @pytest.mark.parametrize(
     "fields", [(0, 2026, 0, 1, 0, 0, 0, 7), (0, 2026, 1, 1, 24, 0, 0, 7), (0, 0, 0, 0, 0, 0, 0, 0)]
 )
-def test_a_time_that_cannot_be_is_counted(fields: tuple[int, ...]) -> None:
+def test_an_impossible_time_is_counted(fields: tuple[int, ...]) -> None:
     records, parser = parse(xbus.encode_mtdata2(xbus.encode_item(xbus.UTC_TIME, fields)))
     assert records == []
     assert parser.counters.errors == {"bad_value": 1}
@@ -421,7 +421,7 @@ def test_increments_need_the_rate() -> None:
         make(sample="increment", rate_hz=None)
 
 
-def test_the_driver_is_found() -> None:
+def test_the_driver_is_registered() -> None:
     driver = find_driver("imu", "xsens-xbus")
     assert driver.transports == ("serial",)
     assert driver.make_time_parser is make_time_parser

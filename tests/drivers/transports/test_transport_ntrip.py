@@ -33,7 +33,7 @@ def transport(found: Caster, options: str = "", mountpoint: str = "ZIMM0") -> Tr
 
 
 def received(one: Transport, count: int) -> bytes:
-    """So many bytes, or what came in 20 s."""
+    """Return so many bytes, or those that arrived in 20 s."""
     data, deadline_s = b"", time.monotonic() + 20.0
     while len(data) < count and time.monotonic() < deadline_s:
         for block in one.receive(0.2):
@@ -71,7 +71,7 @@ def chunks(data: bytes, size: int) -> bytes:
     ],
     ids=["v1", "v1 without empty line", "v1 in pieces", "v2", "v2 in pieces", "chunked", "chunked in pieces"],
 )
-def test_data_comes_whole(parts: tuple[bytes, ...]) -> None:
+def test_data_arrive_completely(parts: tuple[bytes, ...]) -> None:
     hold = threading.Event()
     with caster(saying(*parts, hold=hold)) as found:
         one = transport(found)
@@ -84,7 +84,7 @@ def test_data_comes_whole(parts: tuple[bytes, ...]) -> None:
         one.close()
 
 
-def test_the_request_of_version_2(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_request_follows_ntrip_version_2(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CASTER_PASSWORD", "geheim:ü")
     with caster(saying(V2)) as found:
         one = transport(found, "?user=anna&password_env=CASTER_PASSWORD")
@@ -99,7 +99,7 @@ def test_the_request_of_version_2(monkeypatch: pytest.MonkeyPatch) -> None:
     assert base64.b64decode(secret).decode() == "anna:geheim:ü"
 
 
-def test_the_request_of_version_1_names_no_other() -> None:
+def test_the_version_1_request_names_no_other_version() -> None:
     with caster(saying(ICY)) as found:
         one = transport(found, "?version=1")
         one.open()
@@ -127,7 +127,7 @@ def test_the_request_of_version_1_names_no_other() -> None:
         (b"", "closed the connection without an answer"),
     ],
 )
-def test_refusals_are_one_line(answer: bytes, said: str) -> None:
+def test_refusals_are_reported_in_one_line(answer: bytes, said: str) -> None:
     with caster(saying(answer)) as found:
         with pytest.raises(TransportError) as caught:
             transport(found, mountpoint="FAR").open()
@@ -137,13 +137,13 @@ def test_refusals_are_one_line(answer: bytes, said: str) -> None:
     assert text.isprintable()
 
 
-def test_a_mountpoint_of_the_table_that_is_not_given() -> None:
+def test_a_listed_mountpoint_that_is_refused_is_explained() -> None:
     with caster(saying(b"SOURCETABLE 200 OK\r\n\r\n" + TABLE)) as found:
         with pytest.raises(TransportError, match="check that this user may read it"):
             transport(found).open()
 
 
-def test_nobody_listens_and_no_such_name() -> None:
+def test_a_closed_port_and_an_unknown_host_raise_transport_errors() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
     with pytest.raises(TransportError, match=f"refuses port {port}"):
@@ -152,14 +152,14 @@ def test_nobody_listens_and_no_such_name() -> None:
         open_transport(parse_transport("ntrip:caster.invalid:2101/A")).open()
 
 
-def test_a_name_that_cannot_be_encoded_is_one_line() -> None:
+def test_a_host_name_that_cannot_be_encoded_is_refused_in_one_line() -> None:
     one = NtripTransport(TransportSpec("ntrip", "a..b:2101/ZIMM0"))
     with pytest.raises(TransportError, match=r"ntrip:a\.\.b:2101/ZIMM0: a\.\.b is not a valid host name"):
         one.open()
     one.close()
 
 
-def test_a_password_that_is_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_password_variable_is_reported_before_connecting(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("NO_SUCH", raising=False)
     with caster(saying(V2)) as found:
         with pytest.raises(TransportError, match="this environment variable is not set"):
@@ -167,7 +167,7 @@ def test_a_password_that_is_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
         assert found.requests == []
 
 
-def test_a_caster_that_says_nothing_holds_nobody_up() -> None:
+def test_a_silent_caster_does_not_block_the_caller() -> None:
     hold = threading.Event()
     stopped = threading.Event()
     with caster(saying(hold=hold)) as found:
@@ -180,7 +180,7 @@ def test_a_caster_that_says_nothing_holds_nobody_up() -> None:
         hold.set()
 
 
-def test_an_opening_has_an_end_however_long_the_network_takes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_opening_ends_by_its_deadline_however_slow_the_network_is(monkeypatch: pytest.MonkeyPatch) -> None:
     """Name servers that do not answer: given up before the recorder's watchdog would take it for stuck."""
     monkeypatch.setattr(ntrip_client, "OPEN_S", 0.3)
     hold = threading.Event()
@@ -199,7 +199,7 @@ def test_an_opening_has_an_end_however_long_the_network_takes(monkeypatch: pytes
     hold.set()
 
 
-def test_a_bad_chunk_is_told() -> None:
+def test_a_bad_chunk_raises_a_transport_error() -> None:
     with caster(saying(CHUNKED + b"5\r\nabcde\r\nzz\r\n")) as found:
         one = transport(found)
         one.open()
@@ -208,7 +208,7 @@ def test_a_bad_chunk_is_told() -> None:
         one.close()
 
 
-def test_a_position_is_told_upstream() -> None:
+def test_a_position_is_sent_to_the_caster() -> None:
     def script(sock: socket.socket, number: int) -> None:
         sock.sendall(V2)
         listen(found, sock, 5.0)
@@ -226,7 +226,7 @@ def test_a_position_is_told_upstream() -> None:
 
 
 @pytest.mark.parametrize("lat", [0.0, -0.99999999, 59.999999999, 89.9999999, -33.123456])
-def test_gga_against_pynmea2(lat: float) -> None:
+def test_gga_sentence_matches_pynmea2(lat: float) -> None:
     now = dt.datetime(2026, 11, 21, 10, 15, 3, tzinfo=dt.UTC)
     message = pynmea2.parse(gga_sentence(lat, -179.999999999, 8848.0, now).decode().strip(), check=True)
     assert message.latitude == pytest.approx(lat, abs=0.00005 / 60 + 1e-9)
@@ -251,12 +251,12 @@ def test_gga_against_pynmea2(lat: float) -> None:
         ("ntrip:caster:2101/A?version=3", "should be 1 or 2"),
     ],
 )
-def test_wrong_texts(text: str, said: str) -> None:
+def test_wrong_ntrip_texts_are_refused(text: str, said: str) -> None:
     with pytest.raises(ValueError) as caught:
         parse_transport(text)
     assert said in str(caught.value)
 
 
-def test_an_address_of_version_six() -> None:
+def test_an_ipv6_address_is_accepted() -> None:
     spec = parse_transport("ntrip:[::1]:2101/A/B")
     assert (spec.ntrip_host, spec.ntrip_port, spec.mountpoint) == ("::1", 2101, "A/B")

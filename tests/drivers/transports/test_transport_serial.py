@@ -66,7 +66,7 @@ def content(blocks: list[UnitBlock]) -> bytes:
     return b"".join(block.units.tobytes() for block in blocks)
 
 
-def test_every_byte_value_comes_as_sent(device: Device) -> None:
+def test_every_byte_value_arrives_unchanged(device: Device) -> None:
     """No line discipline may touch the stream: not XON, not CR, not the interrupt character."""
     sent = bytes(range(256)) * 40 + random.Random(3).randbytes(200_000)
     serial = port(device.path)
@@ -79,7 +79,7 @@ def test_every_byte_value_comes_as_sent(device: Device) -> None:
     serial.close()
 
 
-def test_a_unit_is_one_read_without_a_stamp(device: Device) -> None:
+def test_each_read_gives_one_unit_without_a_timestamp(device: Device) -> None:
     serial = port(device.path)
     serial.open()
     device.write(b"$GPZDA")
@@ -91,7 +91,7 @@ def test_a_unit_is_one_read_without_a_stamp(device: Device) -> None:
     serial.close()
 
 
-def test_send(device: Device) -> None:
+def test_sent_bytes_reach_the_device(device: Device) -> None:
     serial = port(device.path)
     serial.open()
     serial.send(b"\x13\x11\r\n\x03")
@@ -99,7 +99,7 @@ def test_send(device: Device) -> None:
     serial.close()
 
 
-def test_send_to_a_line_that_takes_nothing(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_send_to_a_blocked_line_raises_a_transport_error(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("swath.drivers.transports.serial_port.SEND_TIMEOUT_S", 0.1)
     serial = port(device.path)
     serial.open()
@@ -108,7 +108,7 @@ def test_send_to_a_line_that_takes_nothing(device: Device, monkeypatch: pytest.M
     serial.close()
 
 
-def test_unplugged_while_waiting(device: Device) -> None:
+def test_unplugging_while_waiting_raises_a_transport_error(device: Device) -> None:
     serial = port(device.path)
     serial.open()
     unplug = threading.Timer(0.1, device.unplug)
@@ -121,7 +121,7 @@ def test_unplugged_while_waiting(device: Device) -> None:
     serial.close()
 
 
-def test_replugged_under_its_stable_name(device: Device, tmp_path: Path) -> None:
+def test_a_replugged_device_is_reopened_under_its_stable_name(device: Device, tmp_path: Path) -> None:
     """The name is a link, as udev makes it; the session opens what it points to now."""
     link = tmp_path / "gnss"
     link.symlink_to(device.path)
@@ -152,7 +152,7 @@ def test_replugged_under_its_stable_name(device: Device, tmp_path: Path) -> None
     again.unplug()
 
 
-def test_second_source_of_this_program(device: Device) -> None:
+def test_a_port_already_open_in_this_program_is_refused(device: Device) -> None:
     first, second = port(device.path), port(device.path)
     first.open()
     with pytest.raises(TransportError, match=f"{device.path} is in use by this program itself"):
@@ -162,7 +162,7 @@ def test_second_source_of_this_program(device: Device) -> None:
     second.close()
 
 
-def test_another_process_holds_the_port(device: Device) -> None:
+def test_a_port_held_by_another_process_is_refused(device: Device) -> None:
     code = (
         "import sys\n"
         "from swath.drivers.transports.serial_port import SerialTransport\n"
@@ -189,7 +189,7 @@ def test_another_process_holds_the_port(device: Device) -> None:
         ("/tmp", "cannot open /tmp as a serial port: Is a directory"),
     ],
 )
-def test_what_cannot_be_opened_says_why(path: str, says: str) -> None:
+def test_error_on_opening_gives_the_reason(path: str, says: str) -> None:
     serial = port(path)
     with pytest.raises(TransportError, match=says) as caught:
         serial.open()
@@ -197,15 +197,15 @@ def test_what_cannot_be_opened_says_why(path: str, says: str) -> None:
     serial.close()
 
 
-def test_a_rate_that_the_kernel_has_no_number_for(device: Device) -> None:
-    """Nothing hands one over that was not checked; a port must not end its thread all the same."""
+def test_a_baud_rate_unknown_to_the_kernel_raises_a_transport_error(device: Device) -> None:
+    """Settings are checked earlier; an unchecked rate must still not end the thread of its port."""
     serial = SerialTransport(TransportSpec("serial", device.path, {"baud": str(1 << 32)}))
     with pytest.raises(TransportError, match="cannot open"):
         serial.open()
     serial.close()
 
 
-def test_port_that_is_not_permitted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_error_for_a_port_without_permission_names_the_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     """root may open anything, so the refusal itself is stood in for; the wording is what is tested."""
 
     def refuse(*_: object, **__: object) -> None:

@@ -55,7 +55,7 @@ def sender() -> Iterator[socket.socket]:
 
 
 def collect(udp: UdpTransport, units: int) -> list[UnitBlock]:
-    """Blocks until ``units`` came or 5 s were silent."""
+    """Return blocks until ``units`` have arrived or 5 s of silence."""
     blocks: list[UnitBlock] = []
     while sum(len(block.units) for block in blocks) < units:
         more = udp.receive(5.0)
@@ -69,7 +69,7 @@ def payloads(blocks: list[UnitBlock]) -> list[bytes]:
     return [row.tobytes() for block in blocks for row in block.units]
 
 
-def test_burst_of_mixed_lengths_comes_whole_and_in_order(sender: socket.socket) -> None:
+def test_a_burst_of_mixed_lengths_arrives_completely_and_in_order(sender: socket.socket) -> None:
     rng = random.Random(1)
     sent = [rng.randbytes(rng.choice([1, 512, 512, 1206, 1206, 1206, 8448])) for _ in range(3000)]
     udp = transport()
@@ -85,7 +85,7 @@ def test_burst_of_mixed_lengths_comes_whole_and_in_order(sender: socket.socket) 
     udp.close()
 
 
-def test_empty_and_largest_datagrams_are_units_like_others(sender: socket.socket) -> None:
+def test_empty_and_largest_datagrams_are_delivered(sender: socket.socket) -> None:
     udp = transport()
     udp.open()
     sent = [b"", b"\xa5" * 65507, b"", b"", b"\x5a" * 65507]
@@ -108,7 +108,7 @@ def test_runs_of_equal_length_are_one_block(sender: socket.socket) -> None:
     udp.close()
 
 
-def test_blocks_stay_as_they_are_when_more_is_read(sender: socket.socket) -> None:
+def test_blocks_are_not_changed_by_later_reads(sender: socket.socket) -> None:
     udp = transport()
     udp.open()
     sender.sendto(b"first", ("127.0.0.1", port_of(udp)))
@@ -119,7 +119,7 @@ def test_blocks_stay_as_they_are_when_more_is_read(sender: socket.socket) -> Non
     udp.close()
 
 
-def test_writing_into_the_room_before_units_harms_no_unit(sender: socket.socket) -> None:
+def test_writing_into_the_spare_bytes_before_units_changes_no_unit(sender: socket.socket) -> None:
     """Over several of the reader's memories, with lengths that change now and then."""
     rng = random.Random(2)
     sent, length = [], 1206
@@ -142,7 +142,7 @@ def test_writing_into_the_room_before_units_harms_no_unit(sender: socket.socket)
     udp.close()
 
 
-def test_stamps_are_the_kernels_and_ordered(sender: socket.socket) -> None:
+def test_timestamps_come_from_the_kernel_and_are_ordered(sender: socket.socket) -> None:
     udp = transport()
     udp.open()
     before = time.time_ns()
@@ -159,8 +159,8 @@ def test_stamps_are_the_kernels_and_ordered(sender: socket.socket) -> None:
     udp.close()
 
 
-def test_the_first_after_opening_has_the_stamp_of_its_coming(sender: socket.socket) -> None:
-    """Also where nothing else on this machine had asked for stamps; the kernel takes a while to begin with them."""
+def test_the_first_datagram_after_opening_has_its_arrival_timestamp(sender: socket.socket) -> None:
+    """This holds even if no other program requested timestamps; the kernel enables them with a delay."""
     for _ in range(20):
         udp = transport()
         udp.open()
@@ -174,7 +174,7 @@ def test_the_first_after_opening_has_the_stamp_of_its_coming(sender: socket.sock
         time.sleep(0.02)  # the kernel stops stamping, if nobody else wants it
 
 
-def test_two_senders_are_told_apart(sender: socket.socket) -> None:
+def test_datagrams_of_two_senders_keep_their_peer(sender: socket.socket) -> None:
     udp = transport(host="0.0.0.0")
     udp.open()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
@@ -190,7 +190,7 @@ def test_two_senders_are_told_apart(sender: socket.socket) -> None:
 
 
 @pytest.mark.parametrize("length", [200, 1206, 8448])
-def test_received_and_lost_are_exactly_what_was_sent(sender: socket.socket, length: int) -> None:
+def test_received_and_lost_counts_equal_the_datagrams_sent(sender: socket.socket, length: int) -> None:
     udp = transport("?buffer_mb=1")
     udp.open()
     sent = 6000
@@ -213,7 +213,7 @@ def iter_until_silent(udp: UdpTransport) -> Iterator[UnitBlock]:
         yield from blocks
 
 
-def test_reopened_counts_from_nothing(sender: socket.socket) -> None:
+def test_counters_restart_when_reopened(sender: socket.socket) -> None:
     udp = transport("?buffer_mb=1")
     udp.open()
     for _ in range(3000):
@@ -225,7 +225,7 @@ def test_reopened_counts_from_nothing(sender: socket.socket) -> None:
     udp.close()
 
 
-def test_source_filter_lets_one_sender_through_and_counts_the_rest(sender: socket.socket) -> None:
+def test_source_filter_passes_one_sender_and_counts_the_others(sender: socket.socket) -> None:
     udp = transport("?source=127.0.0.2", host="0.0.0.0")
     udp.open()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as scanner:
@@ -246,7 +246,7 @@ def multicast_sender(address: str) -> socket.socket:
 
 
 @pytest.mark.parametrize("where", ["?group={}&interface=lo", "?group={}"])
-def test_multicast_group_and_nothing_else(sender: socket.socket, where: str) -> None:
+def test_only_datagrams_of_the_multicast_group_are_received(sender: socket.socket, where: str) -> None:
     udp = transport(where.format(GROUP))  # without an interface the local address, 127.0.0.1, names it
     udp.open()
     with multicast_sender("127.0.0.1") as scanner:
@@ -259,8 +259,8 @@ def test_multicast_group_and_nothing_else(sender: socket.socket, where: str) -> 
 
 
 @pytest.mark.parametrize("index", [99, None])
-def test_an_interface_that_is_another_one_now_is_gone(monkeypatch: pytest.MonkeyPatch, index: int | None) -> None:
-    """As an adapter that fell off its bus and came back: the socket would stay silent for ever and say nothing."""
+def test_a_replaced_interface_raises_a_transport_error(monkeypatch: pytest.MonkeyPatch, index: int | None) -> None:
+    """An adapter that fell off its bus and came back would leave the socket silent without an error."""
     udp = transport("?interface=lo")
     udp.open()
     assert udp.receive(0.05) == []
@@ -278,7 +278,7 @@ def test_an_interface_that_is_another_one_now_is_gone(monkeypatch: pytest.Monkey
     udp.close()
 
 
-def test_a_group_is_still_heard_after_a_silence() -> None:
+def test_a_multicast_group_is_still_received_after_a_silence() -> None:
     udp = transport(f"?group={GROUP}")
     udp.open()
     udp._looked_s = 0.0
@@ -289,7 +289,7 @@ def test_a_group_is_still_heard_after_a_silence() -> None:
     udp.close()
 
 
-def test_multicast_source_filter() -> None:
+def test_source_filter_applies_to_multicast() -> None:
     udp = transport(f"?group={GROUP}&source=127.0.0.3")
     udp.open()
     with multicast_sender("127.0.0.2") as stranger, multicast_sender("127.0.0.3") as scanner:
@@ -300,7 +300,7 @@ def test_multicast_source_filter() -> None:
     udp.close()
 
 
-def test_two_may_listen_to_a_group() -> None:
+def test_two_receivers_can_join_a_group() -> None:
     first = transport(f"?group={GROUP}")
     second = transport(f"?group={GROUP}", port=port_of(first))
     first.open()
@@ -312,8 +312,8 @@ def test_two_may_listen_to_a_group() -> None:
     second.close()
 
 
-def test_port_in_use_without_a_table_of_ports(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """As under a service whose /proc holds processes only: the device is waited for, not failed on."""
+def test_a_port_in_use_is_waited_for_without_a_table_of_ports(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """In a service whose /proc shows processes only, the device must be waited for."""
     monkeypatch.setattr(holders, "_UDP_TABLE", tmp_path / "absent")
     first = transport()
     first.open()
@@ -322,7 +322,7 @@ def test_port_in_use_without_a_table_of_ports(monkeypatch: pytest.MonkeyPatch, t
     first.close()
 
 
-def test_port_in_use_names_the_holder() -> None:
+def test_error_for_a_port_in_use_names_the_holder() -> None:
     first = transport()
     first.open()
     second = transport(port=port_of(first))
@@ -341,7 +341,7 @@ def test_port_in_use_names_the_holder() -> None:
         (f"?group={GROUP}&interface=nosuch0", "0.0.0.0", "no network interface nosuch0"),
     ],
 )
-def test_what_cannot_be_opened_says_why(options: str, host: str, says: str) -> None:
+def test_error_on_opening_gives_the_reason(options: str, host: str, says: str) -> None:
     udp = transport(options, host=host)
     with pytest.raises(TransportError, match=says):
         udp.open()
@@ -350,7 +350,7 @@ def test_what_cannot_be_opened_says_why(options: str, host: str, says: str) -> N
     udp.close()
 
 
-def test_granted_buffer_is_read_back_in_the_unit_it_was_asked_in() -> None:
+def test_a_granted_buffer_is_reported_in_the_requested_unit() -> None:
     udp = transport("?buffer_mb=1")
     udp.open()
     assert udp.counters.receive_buffer_asked_bytes == 1 << 20
@@ -382,7 +382,7 @@ def drop_capabilities() -> None:
     assert libc.capset(header, empty) == 0, ctypes.get_errno()
 
 
-def test_silence_is_an_empty_list_after_the_time_given() -> None:
+def test_silence_gives_an_empty_list_after_the_timeout() -> None:
     udp = transport()
     udp.open()
     started = time.monotonic()
@@ -407,7 +407,7 @@ def test_close_from_another_thread_ends_a_blocked_receive() -> None:
         udp.receive(1.0)
 
 
-def test_send_reaches_the_sender_filtered_for() -> None:
+def test_send_reaches_the_sender_of_the_source_filter() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as device:
         device.bind(("127.0.0.2", 0))
         udp = transport("?source=127.0.0.2", port=device.getsockname()[1])
@@ -418,7 +418,7 @@ def test_send_reaches_the_sender_filtered_for() -> None:
         udp.close()
 
 
-def test_send_without_anyone_to_send_to() -> None:
+def test_send_without_a_known_peer_is_refused() -> None:
     udp = transport()
     udp.open()
     with pytest.raises(TransportError, match="has no address to send to"):
@@ -426,7 +426,7 @@ def test_send_without_anyone_to_send_to() -> None:
     udp.close()
 
 
-def test_reader_survives_many_senders(sender: socket.socket) -> None:
+def test_the_reader_handles_many_senders(sender: socket.socket) -> None:
     """A device that takes a new port for every datagram keeps its order, and its ports are right."""
     udp = transport()
     udp.open()

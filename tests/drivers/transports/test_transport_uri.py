@@ -17,7 +17,7 @@ from swath.drivers.transports.spec import parse_pps, parse_transport
 from swath.drivers.transports.udp_socket import UdpTransport
 
 
-def test_udp_with_every_option() -> None:
+def test_udp_address_with_every_option_is_parsed() -> None:
     text = "udp:0.0.0.0:2368?group=239.1.2.3&source=192.168.1.201&interface=eth1&buffer_mb=8"
     spec = parse_transport(text)
     assert (spec.kind, spec.host, spec.port, spec.text) == ("udp", "0.0.0.0", 2368, text)
@@ -30,7 +30,7 @@ def test_udp_with_every_option() -> None:
     assert isinstance(open_transport(spec), UdpTransport)
 
 
-def test_serial_path_and_flags() -> None:
+def test_serial_path_and_flags_are_parsed() -> None:
     spec = parse_transport("serial:/dev/serial/by-id/usb-u-blox:00?baud=921600&parity=E&rtscts=yes&xonxoff=0")
     assert (spec.kind, spec.address) == ("serial", "/dev/serial/by-id/usb-u-blox:00")
     assert spec.flag("rtscts")
@@ -47,13 +47,13 @@ def test_serial_path_and_flags() -> None:
         ("can:slcan:/dev/ttyUSB0?bitrate=500000", "slcan", "/dev/ttyUSB0", PythonCanTransport),
     ],
 )
-def test_can(text: str, interface: str, channel: str, transport: type) -> None:
+def test_can_addresses_are_parsed(text: str, interface: str, channel: str, transport: type) -> None:
     spec = parse_transport(text)
     assert (spec.interface, spec.channel) == (interface, channel)
     assert isinstance(open_transport(spec), transport)
 
 
-def test_inside_a_gnss_stream_is_nothing_to_open() -> None:
+def test_an_address_inside_a_gnss_stream_cannot_be_opened() -> None:
     spec = parse_transport("gnss:rover")
     assert (spec.kind, spec.address) == ("gnss", "rover")
     with pytest.raises(ValueError, match="cannot be opened itself"):
@@ -99,7 +99,7 @@ def test_inside_a_gnss_stream_is_nothing_to_open() -> None:
         ("gnss:rover?baud=5", "want gnss:<name>"),
     ],
 )
-def test_wrong_text_says_what_would_be_right(text: str, says: str) -> None:
+def test_error_for_a_wrong_address_shows_a_valid_one(text: str, says: str) -> None:
     with pytest.raises(ValueError) as caught:
         parse_transport(text)
     assert says in str(caught.value)
@@ -107,7 +107,7 @@ def test_wrong_text_says_what_would_be_right(text: str, says: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_two_texts_for_one_device_are_the_same_device(tmp_path: Path) -> None:
+def test_two_spellings_of_one_device_are_the_same_device(tmp_path: Path) -> None:
     link = tmp_path / "gnss"
     link.symlink_to("/dev/null")
     assert parse_transport(f"serial:{link}").device == parse_transport("serial:/dev/null?baud=9600").device
@@ -116,25 +116,25 @@ def test_two_texts_for_one_device_are_the_same_device(tmp_path: Path) -> None:
     assert first == parse_transport("udp:192.168.1.1:2368?group=239.1.2.3&buffer_mb=3").device
 
 
-def test_pps_sources() -> None:
+def test_pps_addresses_are_parsed() -> None:
     assert isinstance(open_pps(parse_pps("/dev/pps0")), KernelPps)
     assert isinstance(open_pps(parse_pps("serial-dcd:/dev/ttyS0", edge="clear")), SerialDcdPps)
     assert isinstance(open_pps(parse_pps("fixed:edges.txt")), FixedPps)
 
 
 @pytest.mark.parametrize("text", ["", "pps0", "fixed:", "serial-dcd:ttyS0", "gpio:4"])
-def test_wrong_pps_text_says_what_would_be_right(text: str) -> None:
+def test_error_for_a_wrong_pps_address_shows_a_valid_one(text: str) -> None:
     with pytest.raises(ValueError, match="want /dev/pps0, serial-dcd:/dev/ttyS0 or fixed:<path>"):
         parse_pps(text)
 
 
 @pytest.mark.parametrize("text", ["fixed:x\0y", "/dev/pps\0", "serial-dcd:/dev/tty\x1bS0"])
-def test_a_pps_text_with_a_control_character_is_refused(text: str) -> None:
+def test_a_pps_address_with_a_control_character_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match="contains an unprintable character"):
         parse_pps(text)
 
 
-def test_wrong_pps_edge() -> None:
+def test_a_wrong_pps_edge_is_refused() -> None:
     with pytest.raises(ValueError, match="want assert or clear"):
         parse_pps("/dev/pps0", edge="rising")
 
@@ -143,7 +143,7 @@ def test_wrong_pps_edge() -> None:
     ("text", "value"),
     [("500000", 500000), ("0x10", 16), ("0.5", 0.5), ("true", True), ("No", False), ("/dev/ttyUSB0", "/dev/ttyUSB0")],
 )
-def test_options_become_what_python_can_expects(text: str, value: object) -> None:
+def test_options_are_converted_to_the_types_of_python_can(text: str, value: object) -> None:
     got = keyword_value(text)
     assert got == value
     assert type(got) is type(value)

@@ -40,7 +40,7 @@ MEASURED: dict[str, Any] = {"model": "measured", "temperature_c": 24.0, "pressur
 def beams(
     n: int, *, height_m: tuple[float, float] = (300.0, 6000.0), nadir_deg: float = 60.0, up_to_m: float = 4000.0
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Origins and points (n, 3) in e all over the earth, and the verticals (down) there, by PROJ."""
+    """Return beams (n, 3) in e all over the earth, and the verticals (down) there from PROJ."""
     rng = np.random.default_rng(11)
     lon, lat, sensor_m = rng.uniform(-180, 180, n), rng.uniform(-90, 90, n), rng.uniform(height_m[0], height_m[1], n)
     origin = np.stack(TO_E.transform(lon, lat, sensor_m), axis=1)
@@ -70,22 +70,22 @@ def lengths(vectors: FloatArray) -> FloatArray:
 @pytest.mark.parametrize(
     ("wavelength_nm", "sheet_ppm"), [(532, 289.4238), (905, 278.0041), (1064, 276.3942), (1550, 274.1915)]
 )
-def test_group_refractivity_is_the_sheets(wavelength_nm: float, sheet_ppm: float) -> None:
+def test_group_refractivity_matches_the_formula_sheet(wavelength_nm: float, sheet_ppm: float) -> None:
     assert float(group_refractivity_ppm(wavelength_nm, 288.15, 1013.25, 10.0)) == pytest.approx(sheet_ppm, abs=5e-5)
 
 
-def test_cold_thin_air_is_the_sheets() -> None:
+def test_cold_thin_air_matches_the_formula_sheet() -> None:
     assert float(group_refractivity_ppm(1064.0, 263.15, 850.0, 2.0)) == pytest.approx(254.16416, abs=5e-6)
 
 
 @pytest.mark.parametrize(
     ("wavelength_nm", "sheet_ppm"), [(532, 305.730085), (905, 293.683234), (1064, 291.984975), (1550, 289.661246)]
 )
-def test_standard_refractivity_is_the_sheets(wavelength_nm: float, sheet_ppm: float) -> None:
+def test_standard_refractivity_matches_the_formula_sheet(wavelength_nm: float, sheet_ppm: float) -> None:
     assert float(group_refractivity_ppm(wavelength_nm, 273.15, 1013.25, 0.0)) == pytest.approx(sheet_ppm, abs=5e-7)
 
 
-def test_sensitivities_are_the_sheets() -> None:
+def test_sensitivities_match_the_formula_sheet() -> None:
     def at(temperature_c: float = 15.0, pressure_hpa: float = 1013.25, vapour_hpa: float = 10.0) -> float:
         return float(group_refractivity_ppm(1064.0, temperature_c + 273.15, pressure_hpa, vapour_hpa))
 
@@ -95,11 +95,11 @@ def test_sensitivities_are_the_sheets() -> None:
     assert at(vapour_hpa=10.5) - at(vapour_hpa=9.5) == pytest.approx(-0.03911, abs=5e-6)
 
 
-def test_vapour_is_the_sheets() -> None:
+def test_vapour_pressure_matches_the_formula_sheet() -> None:
     assert float(saturated_hpa(20.0)) == pytest.approx(23.32596, abs=5e-6)
 
 
-def test_standard_atmosphere_is_the_standards() -> None:
+def test_standard_atmosphere_matches_the_standard() -> None:
     # ISO 2533, table 5: geopotential heights; two of them above the tropopause
     temperature_k, pressure_hpa = standard_air([-500.0, 2000.0, 11_000.0, 15_000.0, 20_000.0])
     np.testing.assert_allclose(temperature_k, [291.4, 275.15, 216.65, 216.65, 216.65], rtol=0, atol=1e-9)
@@ -107,14 +107,14 @@ def test_standard_atmosphere_is_the_standards() -> None:
 
 
 @pytest.mark.parametrize("known_m", [-200.0, 480.0, 11_500.0])
-def test_air_through_a_measurement_keeps_to_it(known_m: float) -> None:
+def test_air_through_a_measurement_reproduces_it(known_m: float) -> None:
     temperature_k, pressure_hpa = standard_air(known_m, known_m, 240.0, 321.0)
     assert (float(temperature_k), float(pressure_hpa)) == pytest.approx((240.0, 321.0), rel=1e-14)
     below, above = standard_air([known_m - 1.0, known_m + 1.0], known_m, 240.0, 321.0)[1]
     assert (above - below) / 2.0 == pytest.approx(-0.0341632 * 321.0 / 240.0, rel=1e-4)
 
 
-def test_path_means_are_the_sheets() -> None:
+def test_path_means_match_the_formula_sheet() -> None:
     # the sheet's air is that of NGA Eq. 10 and 11
     table = _table(lambda height_m: 1e-6 * group_refractivity_ppm(1064.0, *layer_air(height_m), 0.0))
     out = np.empty(4)
@@ -143,7 +143,7 @@ def test_path_means_are_exact(keys: dict[str, Any], from_m: float, to_m: float) 
 
 @pytest.mark.parametrize("wavelength_nm", [905.0, 1064.0, 1550.0])
 @pytest.mark.parametrize("keys", [{}, MEASURED])
-def test_means_agree_with_ciddors_of_the_virtual_aircraft(keys: dict[str, Any], wavelength_nm: float) -> None:
+def test_path_means_match_ciddor_of_the_simulator(keys: dict[str, Any], wavelength_nm: float) -> None:
     high, low = np.array([900.0, 3000.0, 5000.0]), np.array([400.0, 150.0, 2000.0])
     simulated = SimulatedAir(AtmosphereTable(**keys), wavelength_nm).group_refractivity_ppm(high, low)
     mean = 1e6 * Air(wavelength_nm=wavelength_nm, **keys).mean_refractivity(high, low)
@@ -154,7 +154,7 @@ def test_means_agree_with_ciddors_of_the_virtual_aircraft(keys: dict[str, Any], 
 
 
 @pytest.mark.parametrize("keys", [{}, MEASURED])
-def test_ranges_of_vacuum_are_those_of_the_path(keys: dict[str, Any]) -> None:
+def test_vacuum_ranges_are_corrected_to_the_path_of_the_simulator(keys: dict[str, Any]) -> None:
     origin, true_points, _ = beams(3 * BLOCK + 7, up_to_m=6000.0)
     air = Air(ranges="vacuum", **keys)
     index = 1.0 + air.mean_refractivity(heights(origin), heights(true_points))
@@ -165,7 +165,7 @@ def test_ranges_of_vacuum_are_those_of_the_path(keys: dict[str, Any]) -> None:
     np.testing.assert_allclose(points, true_points, rtol=0, atol=6e-6)
 
 
-def test_the_correction_at_a_kilometre_is_the_sheets() -> None:
+def test_the_correction_at_one_kilometre_matches_the_formula_sheet() -> None:
     # 15 °C, 1013.25 hPa, 10 hPa of vapour along a level path: −0.27632 m of 1000 m in real air
     humidity = 100.0 * 10.0 / float(saturated_hpa(15.0))
     air = Air("vacuum", "measured", 15.0, 1013.25, humidity, 0.0)
@@ -175,7 +175,7 @@ def test_the_correction_at_a_kilometre_is_the_sheets() -> None:
     assert float(points[0, 1]) - 1000.0 == pytest.approx(-0.276317853, abs=2e-5)  # at the far end 0.08 m higher
 
 
-def test_an_instrument_with_an_index_of_its_own() -> None:
+def test_the_index_assumed_by_an_instrument_is_removed() -> None:
     origin, points, _ = beams(40)
     plain, other = points.copy(), points.copy()
     Air(ranges="vacuum").apply(origin, plain)
@@ -184,7 +184,7 @@ def test_an_instrument_with_an_index_of_its_own() -> None:
     np.testing.assert_allclose(ratio, 1.000_274, rtol=0, atol=3e-8)  # it ends a metre lower, in denser air
 
 
-def test_only_what_travelled_is_corrected() -> None:
+def test_only_the_measured_path_is_corrected() -> None:
     origin, points, _ = beams(40)
     travelled = lengths(points - origin) - 7.0
     part = points.copy()
@@ -223,7 +223,7 @@ def turned_towards(direction: FloatArray, down: FloatArray, bent_rad: FloatArray
     return turned
 
 
-def test_ardc_bends_points_as_the_sheet_says() -> None:
+def test_ardc_bending_matches_the_formula_sheet() -> None:
     """20° from nadir, 3 km to 200 m: 10.872107 µrad, 34.47 mm on the ground."""
     top, foot = 6_378_137.0 + 3000.0, 6_378_137.0 + 200.0
     nadir = np.radians(20.0)
@@ -238,7 +238,7 @@ def test_ardc_bends_points_as_the_sheet_says() -> None:
     assert (points[0, 1] - moved[0, 1] * (origin - points)[0, 0] / down_m) == pytest.approx(0.0344745, abs=5e-5)
 
 
-def test_ardc_bends_by_its_formula() -> None:
+def test_ardc_bending_follows_its_formula() -> None:
     origin, points, down = beams(300, up_to_m=4000.0)
     ground_m = heights(points)
     keep = (ground_m > 0.0) & (lengths(points - origin) > 1000.0)  # nearer, a rounding is more than 1e-9 rad
@@ -254,7 +254,7 @@ def test_ardc_bends_by_its_formula() -> None:
 
 
 @pytest.mark.parametrize(("sensor_m", "ground_m"), [(400.0, 0.0), (3000.0, 200.0), (6000.0, -100.0), (10_000.0, 500.0)])
-def test_layers_along_the_path_are_the_exact_integral(sensor_m: float, ground_m: float) -> None:
+def test_layer_bending_equals_the_exact_integral(sensor_m: float, ground_m: float) -> None:
     # where the beam lands is told by Eq. 6 to 8, how far that is by the triangle with the earth's centre
     constant = layer_constant_ppm(1064.0)
     nadir = np.radians([0.5, 10.0, 30.0, 45.0, 60.0, 70.0, 75.0 if sensor_m < 9000.0 else 70.0])
@@ -272,7 +272,7 @@ def test_layers_along_the_path_are_the_exact_integral(sensor_m: float, ground_m:
     np.testing.assert_allclose(got, wanted, rtol=0, atol=1e-9 + 4e-9 / range_m.min())
 
 
-def test_ardc_knows_no_air_below_the_sea() -> None:
+def test_ardc_refuses_points_below_sea_level() -> None:
     origin = np.array([[6_378_137.0 + 2000.0, 0.0, 0.0], [6_378_137.0 - 100.0, 0.0, 0.0]])
     direction = np.array([-np.cos(0.5), np.sin(0.5), 0.0])
     points = origin + np.array([[2400.0 / np.cos(0.5)], [300.0]]) * direction  # to 400 m below; all below
@@ -291,7 +291,7 @@ def test_layers_bend_level_and_rising_beams_downward() -> None:
     np.testing.assert_allclose(got, 0.5 * 2000.0 * gradient, rtol=0.01)
 
 
-def test_bends_like_the_virtual_aircraft() -> None:
+def test_bending_matches_the_simulator() -> None:
     origin, points, down = beams(400, nadir_deg=75.0, up_to_m=6000.0)
     for refraction in ("ardc", "spherical"):
         along = (points - origin) / lengths(points - origin)[:, np.newaxis]
@@ -305,7 +305,7 @@ def test_bends_like_the_virtual_aircraft() -> None:
     assert lengths(points - moved).max() > 0.1
 
 
-def test_slows_and_bends_at_once() -> None:
+def test_slowing_and_bending_act_together() -> None:
     origin, true_points, down = beams(200, nadir_deg=50.0)
     air = Air(ranges="vacuum", refraction="spherical")
     chord = (true_points - origin) / lengths(true_points - origin)[:, np.newaxis]
@@ -343,7 +343,7 @@ def test_a_point_depends_on_itself_alone() -> None:
         assert part.tobytes() == whole[start:stop].tobytes()
 
 
-def test_rows_that_are_no_points_do_no_harm() -> None:
+def test_rows_without_points_are_harmless() -> None:
     origin, points, _ = beams(6)
     lonely = points[1:2].copy()
     origin[0], points[2] = np.nan, np.nan
@@ -355,7 +355,7 @@ def test_rows_that_are_no_points_do_no_harm() -> None:
     np.testing.assert_array_equal(points[3], origin[3])
 
 
-def test_straight_down_and_at_the_poles_nothing_turns() -> None:
+def test_vertical_beams_and_beams_at_the_poles_are_not_bent() -> None:
     origin = np.array([[0.0, 0.0, 6_356_752.3 + 2000.0], [0.0, 0.0, -6_356_752.3 - 2000.0], [6_380_137.0, 0.0, 0.0]])
     points = origin * (1.0 - 1900.0 / 6_378_000.0)
     for refraction in ("ardc", "spherical"):
@@ -364,7 +364,7 @@ def test_straight_down_and_at_the_poles_nothing_turns() -> None:
         np.testing.assert_allclose(moved, points, rtol=0, atol=2e-9)
 
 
-def test_what_it_amounts_to_at_the_edge() -> None:
+def test_effects_at_the_swath_edge_match_the_exact_integrals() -> None:
     half_rad = np.radians(30.0)
     ground_m, above_m = 200.0, 2800.0
     described: list[dict[str, Any]] = [{"refraction": "ardc"}, {"refraction": "spherical", "ranges": "vacuum"}, {}]
@@ -396,12 +396,12 @@ def test_what_it_amounts_to_at_the_edge() -> None:
         ({"reference_index": 0.99}, "reference_index: got 0.99, want"),
     ],
 )
-def test_refuses_what_no_air_is(keys: dict[str, Any], says: str) -> None:
+def test_impossible_air_is_refused(keys: dict[str, Any], says: str) -> None:
     with pytest.raises(AtmosphereError, match=says):
         Air(**keys)
 
 
-def test_goes_to_other_processes() -> None:
+def test_a_pickled_air_gives_the_same_points() -> None:
     origin, points, _ = beams(10)
     air = Air(ranges="vacuum", refraction="ardc", wavelength_nm=1550.0, **MEASURED)
     other = points.copy()

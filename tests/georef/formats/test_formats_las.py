@@ -62,11 +62,11 @@ def written(points: Points, settings: LasSettings = SETTINGS, *, cuts: tuple[int
 
 
 def read(data: bytes) -> laspy.LasData:
-    """By laspy."""
+    """Read the file with laspy."""
     return laspy.read(io.BytesIO(data))
 
 
-def test_every_field_comes_back() -> None:
+def test_every_field_is_read_back() -> None:
     points = made(70_000)  # more than two blocks and a chunk
     las = read(written(points)[0])
     assert (las.header.point_format.id, str(las.header.version)) == (6, "1.4")
@@ -87,7 +87,7 @@ def test_every_field_comes_back() -> None:
         assert np.abs(las[name] - points.sigma_map[:, axis]).max() <= 0.00005 + 1e-8
 
 
-def test_the_header_says_what_the_points_are() -> None:
+def test_the_header_describes_the_points() -> None:
     points = made(5_000)
     header = read(written(points)[0]).header
     assert header.global_encoding.gps_time_type == laspy.header.GpsTimeType.STANDARD
@@ -105,7 +105,7 @@ def test_the_header_says_what_the_points_are() -> None:
     assert ours.record_data.decode() == '{"calibration": "ä"}'
 
 
-def test_the_layout_is_the_standards() -> None:
+def test_the_header_layout_matches_the_standard() -> None:
     """Offsets of the header's fields as LAS 1.4-R15 table 3 has them."""
     data = written(made(100))[0]
     assert data[:4] == b"LASF"
@@ -117,26 +117,26 @@ def test_the_layout_is_the_standards() -> None:
     assert struct.unpack_from("<Q", data, 247) == (100,)
 
 
-def test_the_check_of_the_time_formula() -> None:
+def test_adjusted_time_matches_the_formula_sheet() -> None:
     """FORMULAS 12: 2026-11-21T12:00:00Z is 479297618 in a LAS file."""
     assert read(written(made(1))[0]).gps_time[0] == 479_297_618.0
 
 
-def test_bytes_do_not_depend_on_the_pieces() -> None:
+def test_bytes_do_not_depend_on_how_points_are_divided() -> None:
     points = made(2 * BLOCK + 500)
     whole = written(points)[0]
     assert written(points, cuts=(1, 17, BLOCK, BLOCK + 40_000))[0] == whole
     assert written(points)[0] == whole
 
 
-def test_without_sigmas_there_are_no_extra_bytes() -> None:
+def test_a_file_without_sigmas_has_no_extra_bytes() -> None:
     las = read(written(made(100, sigmas=False), replace(SETTINGS, sigmas=False))[0])
     assert list(las.point_format.extra_dimension_names) == []
     with pytest.raises(LasError, match="have no sigmas"):
         written(made(10, sigmas=False))
 
 
-def test_what_does_not_fit_is_clipped_and_counted() -> None:
+def test_values_that_do_not_fit_are_clipped_and_counted() -> None:
     points = made(6)
     points.sigma_map = np.full((6, 3), 0.01, np.float32)
     points.sigma_map[1, 0], points.sigma_map[2, 2], points.sigma_map[3] = 6.6, 1e9, np.nan
@@ -151,13 +151,13 @@ def test_what_does_not_fit_is_clipped_and_counted() -> None:
     assert np.asarray(las.intensity)[:3].tolist() == [65_535, 0, 65_535]
 
 
-def test_azimuths_are_angles_either_side_of_the_first() -> None:
+def test_azimuths_are_written_as_angles_relative_to_the_first() -> None:
     points = made(4)
     points.scan_angle_rad = np.radians([0.0, 90.0, 270.0, 359.0]).astype(np.float32)
     assert np.asarray(read(written(points)[0]).scan_angle).tolist() == [0, 15_000, -15_000, -167]
 
 
-def test_more_returns_or_channels_than_a_field_holds() -> None:
+def test_more_returns_or_channels_than_a_field_holds_are_clipped() -> None:
     points = made(2)
     points.return_number[:], points.number_of_returns[:], points.channel[:] = 16, 20, 300
     las = read(written(points)[0])
@@ -174,7 +174,7 @@ def test_coordinates_beyond_the_scale_are_refused(axis: int, value: float, name:
         written(points)
 
 
-def test_the_largest_coordinate_that_fits() -> None:
+def test_the_largest_coordinate_that_fits_is_written() -> None:
     points = made(2)
     points.points_map[1, 0] = 500_000.0 + 2_147_483.647
     assert read(written(points)[0]).X[1] == 2_147_483_647
@@ -183,7 +183,7 @@ def test_the_largest_coordinate_that_fits() -> None:
     assert abs(read(written(points, finer)[0]).x[1] - 700_000.12345) <= 0.00005 + 1e-9
 
 
-def test_points_not_to_be_used_are_withheld_and_intensities_scaled() -> None:
+def test_unusable_points_are_withheld_and_intensities_are_scaled() -> None:
     stream = io.BytesIO()
     writer = LasWriter(stream, SETTINGS, 1)
     points = made(10)
@@ -196,7 +196,7 @@ def test_points_not_to_be_used_are_withheld_and_intensities_scaled() -> None:
     assert set(np.asarray(las.scanner_channel)) == {3}
 
 
-def test_a_file_without_points_is_one() -> None:
+def test_a_file_without_points_is_valid() -> None:
     las = read(written(made(0))[0])
     assert len(las) == 0
     assert las.header.mins.tolist() == [0.0, 0.0, 0.0]
@@ -233,7 +233,7 @@ def test_copc_holds_the_same_points(tree: tuple[Points, bytes]) -> None:
         assert np.array_equal(np.asarray(found[name])[order], np.asarray(plain[name])), name
 
 
-def test_copc_gives_a_part_without_the_rest(tree: tuple[Points, bytes]) -> None:
+def test_a_part_of_a_copc_file_can_be_read_alone(tree: tuple[Points, bytes]) -> None:
     points, data = tree
     with laspy.CopcReader(io.BytesIO(data)) as reader:
         coarse = reader.query(level=0)
@@ -249,7 +249,9 @@ def test_copc_gives_a_part_without_the_rest(tree: tuple[Points, bytes]) -> None:
 
 
 @pytest.mark.skipif(sys.version_info >= (3, 14), reason="copclib has no wheel for this Python")
-def test_copc_is_read_by_others_and_repeats(tree: tuple[Points, bytes], tmp_path: object) -> None:
+def test_a_copc_file_is_read_by_other_software_and_is_reproducible(
+    tree: tuple[Points, bytes], tmp_path: object
+) -> None:
     import copclib
 
     points, data = tree
@@ -265,7 +267,7 @@ def test_copc_is_read_by_others_and_repeats(tree: tuple[Points, bytes], tmp_path
     assert copc(points) == data
 
 
-def test_copc_of_few_points_and_of_none() -> None:
+def test_a_copc_file_of_few_or_no_points_is_valid() -> None:
     with laspy.CopcReader(io.BytesIO(copc(made(10)))) as reader:
         assert len(reader.query()) == 10
     assert len(read(copc(made(0)))) == 0

@@ -80,7 +80,7 @@ def same(one: Trajectory, other: Trajectory) -> None:
 # ------------------------------------------------------------------------------------------------ reading
 
 
-def test_pdals_file_has_the_values_of_its_tests() -> None:
+def test_pdals_file_has_the_values_of_pdals_tests() -> None:
     """SbetReaderTest.cpp: 151631.003 s, 0.5680211852972264, −2.04165439230394, 107.71529532965604, …"""
     trajectory = read_trajectory(struct.pack("<34d", *PDAL[0], *PDAL[1]), "2-points.sbet", week=1700)
     assert trajectory.time_ns[0] == 1700 * 604_800_000_000_000 + 151_631_002_836_071
@@ -104,7 +104,7 @@ def test_truncated_file_is_refused() -> None:
         read_trajectory(struct.pack("<34d", *PDAL[0], *PDAL[1])[:271], "bad", week=1700)
 
 
-def test_what_is_written_is_read() -> None:
+def test_a_written_trajectory_is_read_back() -> None:
     trajectory = flown()
     back = read_trajectory(sbet_bytes(trajectory), "sbet.out", span_ns=SPAN, smrmsg=smrmsg_bytes(trajectory))
     same(back, trajectory)
@@ -120,7 +120,7 @@ def test_what_is_written_is_read() -> None:
 
 @pytest.mark.parametrize("wander_deg", [-100.0, -1.3, 0.0, 25.0, 170.0])
 @pytest.mark.parametrize("pospac", [True, False])
-def test_wander_angle_turns_heading_and_velocities(wander_deg: float, pospac: bool) -> None:
+def test_wander_angle_rotates_heading_and_velocities(wander_deg: float, pospac: bool) -> None:
     """Platform x is α west of north; y is left and z up with POSPac, right and down with others."""
     trajectory = flown()
     table = table_of(trajectory)
@@ -135,7 +135,7 @@ def test_wander_angle_turns_heading_and_velocities(wander_deg: float, pospac: bo
 
 
 @pytest.mark.parametrize("pospac", [True, False])
-def test_a_record_without_velocity_leaves_the_others_turned(pospac: bool) -> None:
+def test_a_record_without_velocity_leaves_the_other_records_rotated(pospac: bool) -> None:
     trajectory = flown()
     table = table_of(trajectory)
     wander = np.radians(25.0)
@@ -150,7 +150,7 @@ def test_a_record_without_velocity_leaves_the_others_turned(pospac: bool) -> Non
     np.testing.assert_allclose(back.velocity_e[7], trajectory.velocity_e[7], atol=0.1)  # by the positions beside it
 
 
-def test_a_record_without_velocity_hides_no_wrong_ones_behind_it() -> None:
+def test_a_record_without_velocity_does_not_hide_later_wrong_velocities() -> None:
     table = table_of(flown())
     north, east = table[:, 4].copy(), table[:, 5].copy()
     cos, sin = np.cos(np.radians(40.0)), np.sin(np.radians(40.0))
@@ -160,14 +160,14 @@ def test_a_record_without_velocity_hides_no_wrong_ones_behind_it() -> None:
         read(table)
 
 
-def test_unsaid_sigmas_stay_unsaid() -> None:
+def test_absent_sigmas_stay_absent() -> None:
     trajectory = flown(position_sigma_l=None)
     back = read_trajectory(sbet_bytes(trajectory), "sbet.out", span_ns=SPAN, smrmsg=smrmsg_bytes(trajectory))
     assert np.isnan(back.position_sigma_l).all()
     np.testing.assert_allclose(back.attitude_sigma_rad, trajectory.attitude_sigma_rad, rtol=1e-12)
 
 
-def test_sigmas_once_a_second_hold_for_all_epochs_between() -> None:
+def test_sigmas_given_once_a_second_apply_to_all_epochs_between() -> None:
     trajectory = flown()
     rows = np.frombuffer(smrmsg_bytes(trajectory), "<f8").reshape(-1, 10)
     assert rows[0, 9] == pytest.approx(0.02 * 60)  # arc minutes
@@ -181,7 +181,7 @@ def test_sigmas_once_a_second_hold_for_all_epochs_between() -> None:
 # -------------------------------------------------------------------------------------------------- weeks
 
 
-def test_week_is_the_one_that_overlaps_the_log() -> None:
+def test_the_week_is_chosen_to_overlap_the_log() -> None:
     trajectory = flown()
     for span in ((START_NS - 10**12, START_NS + 1), (START_NS + 29 * 10**9, START_NS + 10**13)):
         assert read(table_of(trajectory), span_ns=span).span == trajectory.span
@@ -191,7 +191,7 @@ def test_week_is_the_one_that_overlaps_the_log() -> None:
 
 
 @pytest.mark.parametrize("week", [-1, 24_233, 10**6, 10**20])
-def test_a_week_that_is_none(week: int) -> None:
+def test_an_impossible_week_is_refused(week: int) -> None:
     """24233 is the third day of week 2423, as names of orbit files have it: beyond 64 bits of nanoseconds."""
     with pytest.raises(TrajectoryError, match=rf"--week {week} is not a GPS week; give whole weeks since 1980"):
         read_trajectory(sbet_bytes(flown()), "s", week=week)
@@ -199,8 +199,8 @@ def test_a_week_that_is_none(week: int) -> None:
 
 @pytest.mark.parametrize("begins_anew", [True, False])
 @pytest.mark.parametrize("log_begins_s", [-20.0, 10.0])
-def test_week_ends_on_the_way(begins_anew: bool, log_begins_s: float) -> None:
-    """Either way to count, and a log on either side of the week's end."""
+def test_a_trajectory_across_the_end_of_a_week_is_read(begins_anew: bool, log_begins_s: float) -> None:
+    """Count the week in both ways, with a log on either side of the end of the week."""
     end_ns = (WEEK + 1) * WEEK_S * 10**9
     trajectory = flown(start_ns=end_ns - 15 * 10**9)
     table = table_of(trajectory)
@@ -211,7 +211,7 @@ def test_week_ends_on_the_way(begins_anew: bool, log_begins_s: float) -> None:
     np.testing.assert_array_equal(read(table, span_ns=(begin_ns, begin_ns + 20 * 10**9)).time_ns, trajectory.time_ns)
 
 
-def test_sigmas_that_begin_after_the_weeks_end() -> None:
+def test_sigmas_that_begin_after_the_end_of_the_week_are_read() -> None:
     end_ns = (WEEK + 1) * WEEK_S * 10**9
     trajectory = flown(start_ns=end_ns - 15 * 10**9)
     rows = np.frombuffer(smrmsg_bytes(trajectory), "<f8").reshape(-1, 10)[400:].copy()
@@ -224,8 +224,8 @@ def test_sigmas_that_begin_after_the_weeks_end() -> None:
         read_trajectory(sbet_bytes(trajectory), "s", week=WEEK, smrmsg=rows.tobytes())
 
 
-def test_epochs_left_out_between_saturday_and_sunday_cross_the_week() -> None:
-    """As where only the lines of a flight were exported, or at epochs of some seconds."""
+def test_epochs_with_gaps_across_the_end_of_a_week_are_read() -> None:
+    """Such gaps occur if only the lines of a flight were exported, or with epochs of some seconds."""
     end_ns = (WEEK + 1) * WEEK_S * 10**9
     trajectory = flown(start_ns=end_ns - 10 * 10**9)
     table = table_of(trajectory)
@@ -239,7 +239,7 @@ def test_epochs_left_out_between_saturday_and_sunday_cross_the_week() -> None:
         read(early, week=WEEK)
 
 
-def test_another_flight_is_told_with_both_spans() -> None:
+def test_error_for_another_flight_gives_both_time_spans() -> None:
     with pytest.raises(
         TrajectoryError,
         match=r"561618\.0 to 561647\.9 s of the week does not overlap the log, 61618.0 to 61638.0 s of GPS week 2445",
@@ -247,7 +247,7 @@ def test_another_flight_is_told_with_both_spans() -> None:
         read(table_of(flown()), span_ns=(START_NS - 500_000 * 10**9, START_NS - 499_980 * 10**9))
 
 
-def test_seconds_of_day_are_named() -> None:
+def test_error_names_times_in_seconds_of_day() -> None:
     table = table_of(flown())
     table[:, 0] -= 6 * 86_400
     with pytest.raises(TrajectoryError, match="look like seconds of the day; add 518400 s"):
@@ -295,14 +295,14 @@ def test_wrong_file_is_refused_in_one_line(changes: dict[str, Any], message: str
 
 
 @pytest.mark.parametrize("course_deg", [10.0, 100.0, 160.0, 250.0, 340.0])
-def test_swapped_positions_are_named_on_every_course(course_deg: float) -> None:
+def test_swapped_coordinates_are_reported_on_every_course(course_deg: float) -> None:
     table = table_of(flown(course_deg=course_deg))
     table[:, 1:3] = table[:, 2:0:-1]
     with pytest.raises(TrajectoryError, match="latitude and longitude are swapped"):
         read(table)
 
 
-def test_slow_crabbing_is_no_wrong_course() -> None:
+def test_slow_crabbing_is_not_reported_as_a_wrong_course() -> None:
     """Below 20 m/s the course of positions is not held against that of the velocities."""
     n = 600
     slow = flown(n, velocity_l=np.tile([15.0, 0, 0], (n, 1)))
@@ -314,19 +314,19 @@ def test_slow_crabbing_is_no_wrong_course() -> None:
     assert len(read(table_of(drifting))) == n
 
 
-def test_sigmas_given_for_the_trajectory_are_named() -> None:
+def test_error_names_sigmas_given_in_place_of_the_trajectory() -> None:
     rows = smrmsg_bytes(flown(601))
     with pytest.raises(TrajectoryError, match=r"is an smrmsg, which has the sigmas of a trajectory; give the SBET"):
         read_trajectory(rows, "smrmsg.out", span_ns=SPAN)
 
 
 @pytest.mark.parametrize("data", [b"", struct.pack("<17d", *([1.0] * 17))])
-def test_no_epochs_are_no_trajectory(data: bytes) -> None:
+def test_a_trajectory_without_epochs_is_refused(data: bytes) -> None:
     with pytest.raises(TrajectoryError, match=r"truncated or of another kind|has 1 epochs; a trajectory needs two"):
         read_trajectory(data, "short", week=WEEK)
 
 
-def test_smrmsg_that_is_none_is_refused() -> None:
+def test_a_file_that_is_not_smrmsg_is_refused() -> None:
     rows = np.frombuffer(smrmsg_bytes(flown()), "<f8").reshape(-1, 10).copy()
     rows[2, 4] = -1
     with pytest.raises(TrajectoryError, match="smrmsg of s: a sigma at record 3 is negative; smrmsg is expected"):

@@ -27,7 +27,7 @@ NOISE = replace(GRADES["tactical"], bias_correlation_s=1e9, misalignment=0.0)
 ARM = np.array([0.35, -0.12, -1.1])
 
 
-def test_the_filters_agree() -> None:
+def test_filter_results_match_pyins() -> None:
     """Half a minute with a turn: positions to a fifth of their sigma, sigmas to 3 %; biases and scales in both.
 
     Biases are constant in both: theirs cannot be Gauss–Markov.

@@ -22,7 +22,7 @@ LAT, LON, HEIGHT = np.radians(47.1234567), np.radians(8.7), 512.3
 TO_ECEF = Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
 
 
-def test_the_formula_sheets_point() -> None:
+def test_positions_match_the_formula_sheet() -> None:
     expected = (4297959.983892308, 657680.2964883694, 4651489.774063125)  # FORMULAS 1.2
     np.testing.assert_allclose(e_from_geodetic(LAT, LON, HEIGHT), expected, atol=1e-8)
     assert float(prime_vertical_radius_m(LAT)) == pytest.approx(6389632.9154552, abs=1e-6)
@@ -50,7 +50,7 @@ def test_positions_agree_with_proj_everywhere() -> None:
     assert np.abs(apart[:5000]).max() < 5e-9
 
 
-def test_local_axes_are_what_a_step_along_the_ellipsoid_gives() -> None:
+def test_local_axes_match_steps_along_the_ellipsoid() -> None:
     here = e_from_geodetic(LAT, LON, HEIGHT)
     geod = Geod(a=A_M, b=B_M)
     rotation = rot_e_from_l(LAT, LON)
@@ -62,7 +62,7 @@ def test_local_axes_are_what_a_step_along_the_ellipsoid_gives() -> None:
     np.testing.assert_allclose(down / 1000.0, rotation[:, 2], atol=1e-11)
 
 
-def test_shapes_are_kept() -> None:
+def test_array_shapes_are_preserved() -> None:
     position = e_from_geodetic(np.zeros((2, 3)), 0.5, 100.0)
     assert position.shape == (2, 3, 3)
     lat, lon, height = geodetic_from_e(position)

@@ -17,19 +17,19 @@ HEIGHT = np.array([0.0, 450.0, 6000.0, 3000.0, 0.0, 120.0, -50.0])
 PLACES = e_from_geodetic(LAT, LON, HEIGHT)
 
 
-def test_gravity_at_the_equator_and_the_poles_is_the_published_one() -> None:
+def test_gravity_at_the_equator_and_the_poles_matches_the_published_values() -> None:
     """NIMA TR8350.2, table 3.4."""
     there = gravity_e(np.array([[6_378_137.0, 0.0, 0.0], [0.0, 0.0, 6_356_752.314245], [0.0, 0.0, -6_356_752.314245]]))
     published = [[-9.7803253359, 0, 0], [0, 0, -9.8321849378], [0, 0, 9.8321849378]]
     np.testing.assert_allclose(there, published, rtol=0, atol=2e-10)
 
 
-def test_gravity_anywhere_is_the_simulators() -> None:
-    """Which finds the normal by PROJ."""
+def test_gravity_anywhere_matches_the_simulator() -> None:
+    """The simulator finds the normal by PROJ."""
     np.testing.assert_allclose(gravity_e(PLACES), simulated(PLACES), rtol=0, atol=1e-11)
 
 
-def test_the_gradient_is_the_difference_quotient() -> None:
+def test_the_gravity_gradient_matches_difference_quotients() -> None:
     step = 50.0
     forth = np.stack([gravity_e(PLACES + step * axis) for axis in np.eye(3)], axis=-1)
     back = np.stack([gravity_e(PLACES - step * axis) for axis in np.eye(3)], axis=-1)

@@ -19,14 +19,14 @@ def as_rotation(q: FloatArray) -> Rotation:
     return Rotation.from_quat(np.roll(q, -1, axis=-1))
 
 
-def test_turns_about_axes_are_right_handed() -> None:
+def test_rotations_about_axes_are_right_handed() -> None:
     for axis, letter in enumerate("xyz"):
         angles = np.linspace(-7, 7, 50)
         expected = Rotation.from_euler(letter, angles[:, np.newaxis])
         assert (as_rotation(about(axis, angles)) * expected.inv()).magnitude().max() < 1e-14
 
 
-def test_product_is_that_of_the_turns() -> None:
+def test_a_product_is_the_composition_of_the_rotations() -> None:
     a, b = some(1), some(2)
     expected = as_rotation(a) * as_rotation(b)
     assert (as_rotation(product(a, b)) * expected.inv()).magnitude().max() < 1e-14
@@ -34,12 +34,12 @@ def test_product_is_that_of_the_turns() -> None:
     np.testing.assert_allclose(product(a, conjugate(a)), np.tile([1.0, 0, 0, 0], (500, 1)), atol=1e-15)
 
 
-def test_vectors_turn_as_scipys_do() -> None:
+def test_vectors_are_rotated_as_in_scipy() -> None:
     q, vectors = some(3), np.random.default_rng(4).normal(size=(500, 3))
     np.testing.assert_allclose(rotated(q, vectors), as_rotation(q).apply(vectors), atol=1e-14)
 
 
-def test_rotation_vector_is_the_shorter_way() -> None:
+def test_the_rotation_vector_takes_the_shorter_way() -> None:
     q = np.concatenate([some(5), about(1, np.array([0.0, 1e-300, 1e-9, np.pi, 4.0]))])
     for sign in (1.0, -1.0):
         np.testing.assert_allclose(rotation_vector(sign * q)[:-2], as_rotation(q).as_rotvec()[:-2], atol=1e-14)

@@ -16,7 +16,7 @@ from swath.georef.geodesy.rotations import (
 )
 
 
-def test_the_formula_sheets_matrices() -> None:
+def test_matrices_match_the_formula_sheet() -> None:
     attitude = rot_l_from_b(*np.radians([3.0, -2.0, 75.0]))  # FORMULAS 1.4
     expected = [
         [0.2586613795, -0.9650747911, 0.0415323763],
@@ -28,7 +28,7 @@ def test_the_formula_sheets_matrices() -> None:
     np.testing.assert_allclose(first_row, [0.999979149037, -0.00209435449453, -0.00610861439068], atol=1e-12)
 
 
-def test_signs_of_attitude() -> None:
+def test_attitude_angles_have_the_documented_signs() -> None:
     nose, right = np.array([1.0, 0, 0]), np.array([0, 1.0, 0])
     assert (rot_l_from_b(0, 0, np.radians(90)) @ nose)[1] > 0.999  # heading east: the nose is east
     assert (rot_l_from_b(0, np.radians(10), 0) @ nose)[2] < -0.17  # nose up
@@ -58,7 +58,7 @@ def test_half_turns_have_a_quaternion() -> None:
         np.testing.assert_allclose(rot_from_quaternion(quaternion_from_rot(half_turn)), half_turn, atol=1e-14)
 
 
-def test_plumb_down_leans_by_the_deflection() -> None:
+def test_the_plumb_line_is_tilted_by_the_deflection() -> None:
     lat, second = np.radians(47.1234567), np.radians(1 / 3600)
     rotation = rot_l_from_plumb(lat, 8 * second, -5 * second)  # FORMULAS 1.8
     np.testing.assert_allclose(1000.0 * rotation[:, 2], [-0.0388, 0.0242, 1000.0], atol=5e-5)
@@ -66,6 +66,6 @@ def test_plumb_down_leans_by_the_deflection() -> None:
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-15)
 
 
-def test_skew_is_a_cross_product() -> None:
+def test_the_skew_matrix_gives_the_cross_product() -> None:
     one, other = np.random.default_rng(3).normal(size=(2, 5, 3))
     np.testing.assert_allclose((skew(one) @ other[..., None])[..., 0], np.cross(one, other), atol=1e-14)

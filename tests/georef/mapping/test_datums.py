@@ -19,7 +19,7 @@ pytestmark = pytest.mark.xdist_group("kernels")
 
 
 def proj(source: str, target: str) -> pyproj.Transformer:
-    """PROJ's own best, in traditional order."""
+    """Transform with the best operation of PROJ, in traditional axis order."""
     return pyproj.Transformer.from_crs(source, target, always_xy=True)
 
 
@@ -29,7 +29,7 @@ def at(lat_deg: float, lon_deg: float, height_m: float = 500.0) -> FloatArray:
 
 
 def refusal(crs: str, **settings: Any) -> str:
-    """The one line that a mapping frame is refused with."""
+    """Return the single line with which a mapping frame is refused."""
     with pytest.raises(MappingError) as caught:
         Mapping(crs, **settings)
     line = str(caught.value)
@@ -58,7 +58,7 @@ def test_wgs_84_of_unknown_realisation_is_not_etrs89() -> None:
     assert refusal("EPSG:25832", datum="EPSG:4979").count("accurate to 1 m only") == 1
 
 
-def test_an_operation_that_moves_needs_its_epoch() -> None:
+def test_a_time_dependent_operation_needs_its_epoch() -> None:
     assert "output.epoch = 2026.9" in refusal("EPSG:25832", datum="EPSG:7912")
     assert "26.47 is not a decimal year" in refusal("EPSG:25832", datum="EPSG:7912", epoch=26.47)
     assert "nan is not a decimal year" in refusal("EPSG:32632", epoch=float("nan"))
@@ -83,7 +83,7 @@ def test_itrf_to_utm_on_wgs_84_names_the_realisation() -> None:
     assert mapping.description()["accuracy_m"] == pytest.approx(0.01)
 
 
-def test_same_is_the_users_word() -> None:
+def test_datum_same_is_accepted_on_the_users_word() -> None:
     mapping = Mapping("EPSG:25832", datum="same")
     expected = proj("EPSG:4937", "EPSG:25832").transform(9.1, 47.5, 500.0)
     etrs = np.array(proj("EPSG:4937", "EPSG:4936").transform(9.1, 47.5, 500.0))[None]
@@ -109,13 +109,13 @@ def test_a_datum_on_another_ellipsoid_is_refused(crs: str, datum: str, ellipsoid
     assert f"is on the ellipsoid {ellipsoid}, but positions are read on that of WGS 84 and GRS 1980" in line
 
 
-def test_same_is_no_advice_where_it_would_be_refused() -> None:
+def test_datum_same_is_not_suggested_if_it_would_be_refused() -> None:
     assert '"same"' not in refusal("EPSG:2056")
     assert '"same"' not in refusal("EPSG:2056", datum="EPSG:4932")
     assert '"same"' in refusal("EPSG:25832")
 
 
-def test_an_accuracy_of_a_decimetre_is_taken_when_the_user_allows_it() -> None:
+def test_an_accuracy_of_a_decimetre_is_accepted_if_the_user_allows_it() -> None:
     """EPSG gives CHTRS95 → CH1903+ as good to 0.1 m; heights stay on the ellipsoid of the positions, as in PROJ."""
     line = refusal("EPSG:2056", datum="EPSG:4932")
     assert "good to 0.1 m only" in line
@@ -128,7 +128,7 @@ def test_an_accuracy_of_a_decimetre_is_taken_when_the_user_allows_it() -> None:
     assert mapping.description()["heights"] == "ellipsoidal (GRS 1980)"
 
 
-def test_an_operation_of_a_single_step_is_judged_too() -> None:
+def test_an_operation_of_a_single_step_is_checked() -> None:
     """To geocentric frames PROJ's operation is one transformation, without conversions around it."""
     assert "accurate to 1 m only" in refusal("EPSG:4936")
     stated = Mapping("EPSG:7789", datum="EPSG:9988", epoch=2020.0).description()
@@ -136,7 +136,7 @@ def test_an_operation_of_a_single_step_is_judged_too() -> None:
     assert stated["accuracy_m"] == pytest.approx(0.001)
 
 
-def test_a_guess_is_refused() -> None:
+def test_a_ballpark_transformation_is_refused() -> None:
     assert "would guess" in refusal("EPSG:2056", datum="EPSG:7912")
     assert "would guess" in refusal("EPSG:2056", datum="EPSG:7912", accuracy_m=1000.0)
 
@@ -151,7 +151,7 @@ def test_a_guess_is_refused() -> None:
         ("EPSG:27700", "EPSG:4937", "uk_os_OSTN15_NTv2_OSGBtoETRS.tif"),
     ],
 )
-def test_a_missing_grid_is_named_with_the_way_to_get_it(crs: str, datum: str | None, grid: str) -> None:
+def test_error_for_a_missing_grid_shows_how_to_get_it(crs: str, datum: str | None, grid: str) -> None:
     line = refusal(crs, datum=datum)
     assert f"`projsync --file {grid}" in line
     assert f"copy it to {get_user_data_dir()}" in line
@@ -175,18 +175,18 @@ def test_a_vertical_frame_without_any_model_is_refused() -> None:
         ("UTM 32", "is unknown to PROJ"),
     ],
 )
-def test_what_is_no_mapping_frame(crs: str, said: str) -> None:
+def test_an_unusable_mapping_frame_is_refused(crs: str, said: str) -> None:
     line = refusal(crs)
     assert line.startswith(f'output.crs = "{crs}"')
     assert said in line
 
 
-def test_what_is_no_datum() -> None:
+def test_an_unusable_datum_is_refused() -> None:
     assert 'name its geodetic CRS, "EPSG:4258"' in refusal("EPSG:25832", datum="EPSG:25832")
     assert 'datum = "ITRF14" is unknown to PROJ' in refusal("EPSG:25832", datum="ITRF14")
 
 
-def test_the_first_point_chooses_where_several_operations_do() -> None:
+def test_the_first_point_chooses_among_several_operations() -> None:
     """Around the Baltic PROJ's best operation to ETRS89 takes a grid of velocities, in Germany none."""
     mapping = Mapping("EPSG:25832", datum="EPSG:7912", epoch=2026.0)
     assert mapping.description()["operation"] is None
@@ -203,7 +203,7 @@ def test_the_first_point_chooses_where_several_operations_do() -> None:
         norway.map_from_e(at(60.5, 9.0))
 
 
-def test_nothing_is_downloaded() -> None:
+def test_no_grid_is_downloaded() -> None:
     before = is_network_enabled()
     set_network_enabled(True)
     try:

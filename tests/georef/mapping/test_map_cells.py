@@ -16,7 +16,7 @@ HERE = np.array([4_260_000.0, 670_000.0, 4_680_000.0])
 
 
 def quadratic(points: FloatArray) -> FloatArray:
-    """A map that an expansion of second order repeats."""
+    """Map that a second-order expansion reproduces exactly."""
     x, y, z = ((points - HERE) / 1000.0).T
     return np.stack([1e5 + x - 2 * y + 3 * x * y, 2e5 + x * x - z * z + y * z, z + 0.5 * y * y + x * z], axis=-1)
 
@@ -51,7 +51,7 @@ def cloud(n: int, spread_m: float, seed: int = 3) -> FloatArray:
     return HERE + np.random.default_rng(seed).uniform(-spread_m, spread_m, (n, 3))
 
 
-def test_values_and_derivatives_of_a_quadratic_map() -> None:
+def test_values_and_derivatives_of_a_quadratic_map_are_exact() -> None:
     """Closed form of the derivatives; the factor ½ of the squares is in the row."""
     rows, error = expand_cells(quadratic, HERE[None], np.array([512.0]), METRES)
     first = np.array([[1, -2, 0], [0, 0, 0], [0, 0, 1]]) / 1e3
@@ -71,7 +71,7 @@ def test_the_check_finds_the_neglected_third_order_at_the_corners() -> None:
     assert in_feet[0] == pytest.approx(0.3048 * error[0])
 
 
-def test_a_cube_without_values_is_infinitely_wrong() -> None:
+def test_a_cube_without_values_has_infinite_error() -> None:
     _, error = expand_cells(lambda points: np.full_like(points, np.inf), HERE[None], np.array([8.0]), METRES)
     assert error[0] == np.inf
 
@@ -88,7 +88,7 @@ def test_no_point_is_wrong_by_a_tenth_of_a_millimetre(exact: map_cells.Exact) ->
         assert np.abs(made.map(points) - exact(points)).max() < APPROXIMATION_M
 
 
-def test_cubes_are_halved_where_needed_and_no_further() -> None:
+def test_cubes_are_halved_only_where_needed() -> None:
     smooth, curved, broken = cells(quadratic), cells(cubic), cells(torn)
     points = cloud(2_000, 200.0)
     levels = []
@@ -112,7 +112,7 @@ def test_a_result_depends_on_its_point_alone() -> None:
     assert (np.concatenate([cells(creased).map(part) for part in np.array_split(points, 7)]) == whole).all()
 
 
-def test_faces_belong_to_one_cube() -> None:
+def test_each_face_belongs_to_one_cube() -> None:
     """A point less than a rounding below a face is the lower cube's, whoever was asked before."""
     below, above = np.array([-1e-300, 5.0, 5.0]), np.array([0.0, 5.0, 5.0])
     made = cells(cubic)
@@ -121,7 +121,7 @@ def test_faces_belong_to_one_cube() -> None:
     assert nodes == [nodes[0], nodes[0][::-1], nodes[0][1:]]
 
 
-def test_memory_is_bounded_and_results_stay(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_memory_is_bounded_and_recomputed_cubes_give_the_same_results(monkeypatch: pytest.MonkeyPatch) -> None:
     """Dropped cubes come back the same."""
     monkeypatch.setattr(map_cells, "CELLS_KEPT", 50)
     points = HERE + np.arange(3_000)[:, None] * [700.0, 30.0, 10.0]
@@ -146,7 +146,7 @@ def test_a_cube_is_made_once() -> None:
     assert asked == [91]
 
 
-def test_points_that_are_nowhere_come_back_from_the_map_itself() -> None:
+def test_points_outside_any_cube_are_computed_by_the_exact_map() -> None:
     """Not a number, and farther than any cube reaches."""
     points = np.array([[np.nan, 0.0, 0.0], [2e7, 0.0, 0.0], HERE])
     made = cells(quadratic)
@@ -155,7 +155,7 @@ def test_points_that_are_nowhere_come_back_from_the_map_itself() -> None:
     assert np.isnan(made.map_with_sigmas(points, covariance)[1]).all(axis=1).tolist() == [True, True, False]
 
 
-def test_sigmas_by_the_law_of_propagation() -> None:
+def test_sigmas_follow_the_law_of_propagation() -> None:
     """Against J Σ Jᵀ written with matrices, in units of half a metre."""
     random = np.random.default_rng(5)
     root = random.normal(size=(50, 3, 3)) * 0.02
@@ -168,7 +168,7 @@ def test_sigmas_by_the_law_of_propagation() -> None:
     np.testing.assert_allclose(made.map_with_sigmas(points, packed)[1], expected, rtol=1e-6)
 
 
-def test_who_admits_cubes_is_asked_for_each_root_once() -> None:
+def test_the_admission_callback_is_called_once_for_each_root_cube() -> None:
     seen: list[list[float]] = []
     made = MapCells(creased, METRES, lambda centres: seen.extend(centres.tolist()))
     made.map(cloud(500, 100.0))

@@ -65,13 +65,13 @@ def at(lat_deg: float, lon_deg: float, height_m: float = 0.0) -> FloatArray:
 
 
 def sigmas_of(frame: Mapping, points_e: FloatArray, covariance_e: FloatArray) -> NDArray[np.float32]:
-    """(n, 3)."""
+    """Return sigmas (n, 3)."""
     _, sigmas = frame.map_with_sigmas(points_e, covariance_e)
     assert sigmas is not None
     return sigmas
 
 
-def test_numbers_of_the_formula_sheet() -> None:
+def test_coordinates_match_the_formula_sheet() -> None:
     """FORMULAS 1.9: UTM 32 of lat 47.1234567°, lon 8.7°; meridian convergence and scale at the ellipsoid."""
     utm = Mapping("EPSG:32632")
     coordinates = utm.map_from_e(at(47.1234567, 8.7, 512.3))[0]
@@ -86,7 +86,7 @@ def test_numbers_of_the_formula_sheet() -> None:
 
 
 @pytest.mark.parametrize(("crs", "datum", "steps", "box"), FRAMES)
-def test_within_a_tenth_of_a_millimetre_of_proj(
+def test_coordinates_match_proj_within_a_tenth_of_a_millimetre(
     crs: str, datum: str | None, steps: tuple[str, ...], box: tuple[float, float, float, float]
 ) -> None:
     """1e5 points in some 1500 cubes, easting first whatever the CRS lists first; 0.007 mm is what is found."""
@@ -98,7 +98,7 @@ def test_within_a_tenth_of_a_millimetre_of_proj(
     assert np.abs(frame.map_from_e(points) - expected).max() < 2e-5
 
 
-def test_both_sides_of_the_antimeridian_and_of_the_pole_lie_side_by_side() -> None:
+def test_coordinates_are_continuous_across_the_antimeridian_and_the_pole() -> None:
     utm, ups = Mapping("EPSG:32601"), Mapping("EPSG:32661")
     west, east = utm.map_from_e(np.vstack([at(65.0, 179.9999), at(65.0, -179.9999)]))
     assert 0.0 < east[0] - west[0] < 20.0
@@ -107,7 +107,7 @@ def test_both_sides_of_the_antimeridian_and_of_the_pole_lie_side_by_side() -> No
     assert here[1] < 2e6 < there[1]  # UPS north: grid north is along 180°
 
 
-def test_a_point_alone_and_in_any_company() -> None:
+def test_a_point_maps_the_same_alone_and_among_others() -> None:
     """Bit for bit, in another process's copy too."""
     frame = Mapping("EPSG:25832", datum="EPSG:7912", epoch=2026.47)
     points = places(20_000, (8.0, 47.0, 8.3, 47.2))
@@ -121,8 +121,8 @@ def test_a_point_alone_and_in_any_company() -> None:
     assert (unsettled.map_from_e(points[::2][::-1]) == whole[::2][::-1]).all()
 
 
-def test_back_to_e() -> None:
-    """To what is left of PROJ's one step of Bowring's, 1 µm at 8 km."""
+def test_map_coordinates_are_converted_back_to_earth_centred_ones() -> None:
+    """The remaining error of PROJ's single step of Bowring's method is 1 µm at 8 km."""
     frame = Mapping("EPSG:32733")
     points = places(1000, (12, -60, 18, -1))
     assert np.abs(frame.e_from_map(frame.exact(points)) - points).max() < 2e-6
@@ -133,7 +133,7 @@ def test_back_to_e() -> None:
         frame.e_from_map(np.array([[np.inf, 0.0, 0.0]]))
 
 
-def test_sigmas_are_those_of_the_coordinates() -> None:
+def test_sigmas_are_those_of_the_map_coordinates() -> None:
     """Against sampled differences of PROJ; the scale of UTM (0.9996 on the central meridian) is left in."""
     frame = Mapping("EPSG:32632")
     point = at(47.5, 10.5, 400.0)
@@ -149,7 +149,7 @@ def test_sigmas_are_those_of_the_coordinates() -> None:
     assert sigmas_of(frame, point, packed).dtype == np.float32
 
 
-def test_feet_are_proj_s_and_stated() -> None:
+def test_coordinates_in_feet_match_proj_and_are_declared() -> None:
     """EPSG:2263 is in US survey feet; heights of a two-dimensional CRS are metres; sigmas are metres."""
     frame = Mapping("EPSG:2263", datum="same")
     point = at(40.7, -74.0, 100.0)
@@ -167,7 +167,7 @@ def test_feet_are_proj_s_and_stated() -> None:
     np.testing.assert_allclose(sigmas, 0.01, rtol=1e-3)
 
 
-def test_earth_centred_output() -> None:
+def test_earth_centred_output_is_supported() -> None:
     frame = Mapping("EPSG:4978")
     points = places(1000, (0, 0, 10, 50))
     assert np.abs(frame.map_from_e(points) - points).max() < 1e-8
@@ -178,13 +178,13 @@ def test_earth_centred_output() -> None:
     ("crs", "datum", "begins"),
     [("EPSG:32632", "same", "PROJCS["), ("EPSG:2056", "EPSG:4932", "PROJCS["), ("EPSG:4978", "same", "GEOCCS[")],
 )
-def test_wkt_for_files(crs: str, datum: str, begins: str) -> None:
+def test_wkt_for_files_is_given(crs: str, datum: str, begins: str) -> None:
     frame = Mapping(crs, datum=datum, accuracy_m=0.1)
     assert frame.wkt.startswith(begins)
     assert CRS.from_wkt(frame.wkt) == CRS(crs)
 
 
-def test_a_three_dimensional_frame_given_as_text() -> None:
+def test_a_three_dimensional_frame_may_be_given_as_text() -> None:
     """Its heights are on its own ellipsoid, its WKT is that of the plane."""
     frame = Mapping(CRS("EPSG:2056").to_3d().to_wkt(), datum="EPSG:4932", accuracy_m=0.1)
     expected = pipeline(TO_CH1903, BESSEL, LV95).transform(*at(47.1, 8.5, 480.0).T)
@@ -207,7 +207,7 @@ def test_places_without_coordinates_are_refused() -> None:
     assert len(frame.map_from_e(np.empty((0, 3)))) == 0
 
 
-def test_the_area_of_positions() -> None:
+def test_the_area_of_positions_is_found_across_the_antimeridian_and_the_pole() -> None:
     """Across the antimeridian by the shorter way, around the pole all longitudes."""
     west, south, east, north = module._area_of(np.vstack([at(65.0, 179.0), at(66.0, -179.0)]))
     assert (round(south, 3), round(north, 3)) == (64.5, 66.5)
@@ -217,7 +217,7 @@ def test_the_area_of_positions() -> None:
 
 
 def undulation(lat_deg: Any, lon_deg: Any) -> FloatArray:
-    """As rough as under the highest mountains."""
+    """Return an undulation as rough as below the highest mountains."""
     x, y = 75.0 * (lon_deg - 8.0), 111.0 * (lat_deg - 47.0)
     value: FloatArray = 48.0 + 0.05 * y + np.sin(x / 7.0) * np.cos(y / 9.0) + 0.05 * np.sin(x / 1.7 + y / 2.1)
     return value
@@ -232,7 +232,7 @@ def write_gtx(path: Path, south: float, west: float, step: float, shape: tuple[i
 
 
 def bilinear(nodes: NDArray[np.float32], south: float, west: float, step: float, lat: Any, lon: Any) -> FloatArray:
-    """Interpolate as geoid grids are meant to be."""
+    """Interpolate bilinearly, as geoid grids prescribe."""
     row, column = (lat - south) / step, (lon - west) / step
     i, j = np.floor(row).astype(int), np.floor(column).astype(int)
     v, u, grid = row - i, column - j, nodes.astype(np.float64)
@@ -241,7 +241,7 @@ def bilinear(nodes: NDArray[np.float32], south: float, west: float, step: float,
     return value
 
 
-def test_heights_above_a_grid_keep_to_its_own_bilinear_values(tmp_path: Path) -> None:
+def test_heights_above_a_grid_follow_its_bilinear_values(tmp_path: Path) -> None:
     """A 1′ grid: points of a small area with its creases, and lines along and across them."""
     step = 1.0 / 60.0
     nodes = write_gtx(tmp_path / "made.gtx", 46.5, 8.0, step, (61, 61))
@@ -263,7 +263,7 @@ def test_heights_above_a_grid_keep_to_its_own_bilinear_values(tmp_path: Path) ->
         frame.map_from_e(at(45.0, 8.5))
 
 
-def test_a_grid_that_is_installed_gives_orthometric_heights(tmp_path: Path) -> None:
+def test_an_installed_grid_gives_orthometric_heights(tmp_path: Path) -> None:
     """EPSG:32632+5773 with a file in the user's folder under the name that Debian's proj-data gives EGM96."""
     nodes = write_gtx(tmp_path / "egm96_15.gtx", -90.0, -180.0, 0.25, (721, 1440))
     script = (
@@ -296,7 +296,7 @@ def test_a_grid_that_is_installed_gives_orthometric_heights(tmp_path: Path) -> N
         ("EPSG:3857", -33.0, 151.0, ('"EPSG:32756"',)),
     ],
 )
-def test_a_frame_of_another_place_or_scale_names_the_zone_there(
+def test_error_for_a_frame_of_another_place_or_scale_names_the_local_zone(
     crs: str, lat_deg: float, lon_deg: float, words: tuple[str, ...]
 ) -> None:
     said = Mapping(crs, datum="same").misfit(at(lat_deg, lon_deg))
@@ -319,12 +319,12 @@ def test_a_frame_that_suits_the_place_is_taken(crs: str, lat_deg: float, lon_deg
     assert Mapping(crs, datum="same").misfit(at(lat_deg, lon_deg)) == ""
 
 
-def test_one_place_beyond_the_overlap_is_enough() -> None:
+def test_a_single_place_beyond_the_overlap_is_refused() -> None:
     assert Mapping("EPSG:32632").misfit(np.vstack([at(47.5, 11.9), at(47.5, 12.6)]))
 
 
-def test_convergence_is_that_of_the_formula_sheet() -> None:
-    """Of a transverse Mercator, to first order: Δλ sin φ."""
+def test_meridian_convergence_matches_the_formula_sheet() -> None:
+    """To first order the convergence of a transverse Mercator projection is Δλ sin φ."""
     (position,) = at(47.5, 11.4)
     assert Mapping("EPSG:32632").convergence_rad(position) == pytest.approx(
         np.radians(2.4) * np.sin(np.radians(47.5)), rel=2e-3

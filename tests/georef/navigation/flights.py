@@ -177,7 +177,7 @@ def drawn_start(
     truth: Truth, seed: int, *, position_m: float = 0.05, velocity_mps: float = 0.05,
     attitude_rad: tuple[float, float, float] = (1e-3, 1e-3, 5e-3), at_s: float = 0.0,
 ) -> Start:  # fmt: skip
-    """A start that is wrong by as much as it says."""
+    """Return a filter start with errors drawn from its sigmas."""
     rng = np.random.default_rng(seed + 1_000_000)
     at = truth.flight.motion(np.array([at_s]))
     rot = rot_e_from_l(*(angle[0] for angle in geodetic_from_e(at.position_e)[:2]))

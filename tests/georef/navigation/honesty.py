@@ -22,7 +22,7 @@ PARTS = {"position": slice(0, 3), "velocity": slice(3, 6), "attitude": slice(6, 
 
 @dataclass(frozen=True)
 class Honesty:
-    """Of one part of the state.
+    """Consistency of one part of the state.
 
     Attributes:
         mean: NEES of three components over 3; 1 where sigmas are right.
@@ -37,7 +37,7 @@ class Honesty:
 
     @property
     def holds(self) -> bool:
-        """Whether the mean lies within."""
+        """True if the mean lies within its bounds."""
         return self.low <= self.mean <= self.high
 
 

@@ -36,7 +36,7 @@ class Receiver:
     velocity_mps: tuple[float, float, float] | None = None
 
     def told(self, rows: StructArray, optimism: float) -> StructArray:
-        """Return its observations with the sigmas that are assumed of it: its own ones too small by a factor.
+        """Return its observations with the stated sigmas divided by a factor.
 
         Of positions that have no sigma by itself, the true errors are as much larger than is usually assumed.
         """

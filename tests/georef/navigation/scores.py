@@ -31,20 +31,20 @@ OUTAGES_M = {"tactical": (1.81, 0.090), "mems": (8.4, 0.31)}
 
 @cache
 def truth(name: str) -> FloatArray:
-    """The truth's rows."""
+    """Return the rows of the truth."""
     rows: FloatArray = flight_arrays(name)["truth"]
     return rows
 
 
 @cache
 def outages(name: str) -> FloatArray:
-    """(10, 2) s."""
+    """Return the outages (10, 2) in s."""
     spans: FloatArray = flight_arrays(name)["outages"]
     return spans
 
 
 def without(rows: StructArray, spans_s: FloatArray) -> StructArray:
-    """Observations outside spans of time."""
+    """Return the observations outside spans of time."""
     t = (rows["time_ns"] - BEGIN_NS) / 1e9
     kept: StructArray = rows[~((t[:, None] >= spans_s[:, 0]) & (t[:, None] < spans_s[:, 1])).any(axis=1)]
     return kept
@@ -90,7 +90,7 @@ def _angles(rot: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def rms(errors: FloatArray) -> FloatArray:
-    """By column."""
+    """Return the RMS by column."""
     mean: FloatArray = np.sqrt((errors**2).mean(axis=0))
     return mean
 

@@ -51,8 +51,8 @@ def shaken(axis: int, seed: int) -> Inertial:
 
 
 @pytest.mark.parametrize("run", [1, 2, 3, 10])
-def test_the_variance_is_that_of_the_samples_that_were_lost(run: int) -> None:
-    """By axis, quiet and shaken: squares over predicted ones are 1 within five sigmas of so many runs."""
+def test_variance_of_bridged_samples_matches_that_of_the_lost_samples(run: int) -> None:
+    """For each axis, quiet and shaken, squared errors over predicted ones are 1 within five sigmas."""
     whole = shaken(1, 3)
     gone = lost(len(whole), 0.02 * np.sqrt(run), run, 5)
     bridged = lossy(whole, gone)
@@ -79,13 +79,13 @@ def test_a_shaken_axis_has_a_larger_variance_than_a_quiet_one() -> None:
     assert variance[late, 1].min() > 30.0 * variance[late, 0].max()
 
 
-def test_before_anything_is_known_the_variance_is_a_cautious_one() -> None:
+def test_without_history_the_variance_is_cautious() -> None:
     bridged = lossy(shaken(1, 3), np.isin(np.arange(round(SECONDS * RATE_HZ)), [5, 6]))
     variance = made_up_variance(samples_of(bridged), new_bridges())
     assert np.sqrt(variance[:10, 0].sum()) == pytest.approx(UNKNOWN_RATE_RADPS * 2 / RATE_HZ)
 
 
-def test_how_samples_are_cut_changes_nothing() -> None:
+def test_results_do_not_depend_on_how_samples_are_cut() -> None:
     bridged = lossy(shaken(1, 3), lost(round(SECONDS * RATE_HZ), 0.05, 3, 5))
     samples, pieces = samples_of(bridged), new_bridges()
     cuts = [0, *np.sort(np.random.default_rng(1).integers(0, len(bridged), 60)).tolist(), len(bridged)]
@@ -97,7 +97,7 @@ def test_how_samples_are_cut_changes_nothing() -> None:
 
 
 @pytest.mark.parametrize("run", [1, 10])
-def test_one_sample_in_a_hundred_lost_makes_nothing_much_worse(run: int) -> None:
+def test_losing_one_sample_in_a_hundred_does_little_harm(run: int) -> None:
     """Three flights with a tactical unit, lost singly and ten on end: errors at most 1.3 times those without loss."""
     truth = fly(survey(), SECONDS, RATE_HZ)
     squares = np.zeros((2, 9))

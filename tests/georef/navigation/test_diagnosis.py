@@ -47,7 +47,7 @@ def test_sound_data_have_no_findings(recording: Callable[[], Recording], kinds: 
     assert diagnose(sound.inertial, sound.only(*kinds), sound.setup) == []
 
 
-def test_what_stands_still_has_no_findings() -> None:
+def test_a_vehicle_at_rest_gives_no_findings() -> None:
     parked = reference("mems").cut(100_010, 100_100)
     assert diagnose(parked.inertial, parked.rows, parked.setup) == []
 
@@ -62,7 +62,7 @@ def moved(seconds: float) -> Callable[[Parts], Parts]:
 
 
 def sensed(angle: Any = 1.0, velocity: Any = 1.0) -> Callable[[Parts], Parts]:
-    """Values multiplied by matrices, or numbers."""
+    """Return samples with values multiplied by matrices or numbers."""
 
     def turned(values: FloatArray, by: Any) -> FloatArray:
         changed: FloatArray = values @ np.asarray(by).T if np.ndim(by) == 2 else values * by
@@ -89,7 +89,7 @@ def arms(signs: Any) -> Callable[[Parts], Parts]:
 
 
 def seen(kind: Kind, change: Callable[[StructArray], None]) -> Callable[[Parts], Parts]:
-    """Observations of a kind changed in place."""
+    """Change the observations of a kind in place."""
 
     def fault(parts: Parts) -> Parts:
         rows = parts[1].copy()
@@ -231,7 +231,7 @@ def test_a_fault_is_found_and_named(fault: Callable[[Parts], Parts], code: str, 
     assert "\n" not in findings[0].text
 
 
-def test_two_antennas_that_are_right_have_no_findings() -> None:
+def test_two_correctly_mounted_antennas_give_no_findings() -> None:
     sound = survey()
     assert codes(dual(RIGHT, RIGHT)((sound.inertial, sound.rows, sound.setup))) == []
 
@@ -244,7 +244,7 @@ def test_two_antennas_that_are_right_have_no_findings() -> None:
         (np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]), r"body y reads \+1\.0"),
     ],
 )
-def test_gravity_in_the_wrong_axis_shows_at_rest_and_its_cure_is_right(matrix: FloatArray, reading: str) -> None:
+def test_gravity_in_the_wrong_axis_is_found_at_rest_with_the_right_remedy(matrix: FloatArray, reading: str) -> None:
     parked = reference("mems").cut(100_010, 100_100)
     parts = installed(matrix)((parked.inertial, parked.rows, parked.setup))
     (finding,) = diagnose(*parts)
@@ -256,7 +256,7 @@ def test_gravity_in_the_wrong_axis_shows_at_rest_and_its_cure_is_right(matrix: F
     assert codes(installed(cure)(parts)) == []
 
 
-def test_a_cure_of_turned_axes_is_right() -> None:
+def test_remedy_for_rotated_axes_is_right() -> None:
     sound = survey()
     parts = installed([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])((sound.inertial, sound.rows, sound.setup))
     (finding,) = diagnose(*parts)
@@ -278,7 +278,7 @@ def test_time_offsets_are_measured(recording: Callable[[], Recording], seconds: 
     assert abs(shifted.seconds - as_it_is.seconds - seconds) < 0.01
 
 
-def test_no_data_are_said() -> None:
+def test_missing_data_are_reported() -> None:
     sound = survey()
     assert codes((sound.inertial.between(0, 0), sound.rows, sound.setup)) == ["no_data"]
     assert codes((sound.inertial, sound.only(Kind.VELOCITY), sound.setup)) == ["no_data"]
@@ -308,7 +308,7 @@ def velocity_innovations(rows: StructArray, size_mps: float) -> StructArray:
 
 
 @pytest.mark.parametrize(("size_mps", "told"), [(0.02, False), (2.0, True)])
-def test_a_filter_that_goes_with_gnss_denies_an_offset(size_mps: float, told: bool) -> None:
+def test_a_filter_that_follows_gnss_rules_out_a_time_offset(size_mps: float, told: bool) -> None:
     """0.3 s would show in the velocities of the turns as more than a metre a second."""
     sound = survey()
     parts = moved(0.3)((sound.inertial, sound.rows, sound.setup))
@@ -317,7 +317,7 @@ def test_a_filter_that_goes_with_gnss_denies_an_offset(size_mps: float, told: bo
 
 
 @pytest.mark.parametrize(("taken_out_s", "told"), [(-0.3, []), (0.0, ["time_offset"])])
-def test_an_offset_that_the_filter_has_taken_out_is_not_told_again(taken_out_s: float, told: list[str]) -> None:
+def test_an_offset_already_removed_by_the_filter_is_not_reported_again(taken_out_s: float, told: list[str]) -> None:
     sound = survey()
     inertial, rows, setup = moved(0.3)((sound.inertial, sound.rows, sound.setup))
     timed = Timed(velocity_innovations(rows, 2.0), np.array([taken_out_s]))
@@ -325,8 +325,8 @@ def test_an_offset_that_the_filter_has_taken_out_is_not_told_again(taken_out_s: 
     assert [finding.code for finding in found] == told
 
 
-def test_comparisons_that_contradict_each_other_claim_nothing() -> None:
-    """As on a car's recording: 0.757 said −340 ± 13 ms, and 0.987 said −10 ms."""
+def test_contradicting_comparisons_give_no_offset() -> None:
+    """On a car's recording a correlation of 0.757 gave −340 ± 13 ms, and one of 0.987 gave −10 ms."""
     lone = TimeOffset(-0.34, 0.05, 0.757, 0.70, "force")
     assert lone.is_wrong
     assert not replace(lone, contradiction="by the turn -10 ± 50 ms").is_wrong
@@ -358,7 +358,7 @@ def component_late(rows: StructArray, component: str, late_s: float) -> StructAr
     ids=["course late", "course early", "down late"],
 )
 @pytest.mark.slow
-def test_motion_that_is_late_in_part_is_no_offset_but_unclear(
+def test_motion_late_in_one_signal_only_is_reported_as_unclear(
     recording: Callable[[], Recording], component: str, late_s: float, compared: str
 ) -> None:
     """What is compared with that part says so, the speed denies it; late as a whole, all of them say so."""
@@ -392,7 +392,7 @@ def test_noise_of_dense_positions_does_not_hide_an_offset(late_s: float) -> None
     assert late.code == "time_offset"
 
 
-def test_the_sigma_of_an_offset_is_honest() -> None:
+def test_the_sigma_of_a_time_offset_is_honest() -> None:
     """Of stretches of 250 s the offsets scatter no more than their sigmas say; the worst is within four."""
     whole = reference("mems")
     begin = float(whole.inertial.time_ns[0] - BEGIN_NS) / 1e9
@@ -401,7 +401,7 @@ def test_the_sigma_of_an_offset_is_honest() -> None:
     assert all(each is not None and abs(each.seconds) < 4.0 * each.sigma for each in found), found
 
 
-def test_what_the_filter_refused_is_said() -> None:
+def test_observations_refused_by_the_filter_are_reported() -> None:
     sound = survey()
     rows = np.zeros(100, INNOVATION_DTYPE)
     rows["kind"] = Kind.POSITION
@@ -413,7 +413,7 @@ def test_what_the_filter_refused_is_said() -> None:
     assert diagnose(sound.inertial, sound.rows, sound.setup, Solved(Innovations(rows))) == []
 
 
-def test_errors_come_before_warnings() -> None:
+def test_errors_are_listed_before_warnings() -> None:
     sound = survey()
     parts = arms(-1.0)(lost((sound.inertial, sound.rows, sound.setup)))
     assert [finding.severity for finding in diagnose(*parts)] == ["error", "warning"]

@@ -35,7 +35,7 @@ def flight(seconds: float) -> Truth:
 
 
 def knowing(receiver: Receiver, grade: str) -> Setup:
-    """A setup that is told the truth."""
+    """Return a setup with the true noise."""
     fixes = receiver.fixes
     return Setup(
         GRADES[grade],
@@ -61,14 +61,14 @@ def found_of(receiver: Receiver, seconds: float, seed: int, *, doubted: bool = F
     return assumed, find_heading_noise(nothing, stretch(assumed), stretch)
 
 
-def test_white_headings_are_found_to_be_white() -> None:
+def test_white_headings_are_recognised_as_white() -> None:
     _, found = found_of(DUAL_ANTENNAS["white"], 180.0, 3)
     assert found.setup.gnss_heading_share == 0.0
     assert found.setup.gnss_heading_scale == pytest.approx(1.0, abs=0.06)
     assert found.heading_evidence > EVIDENCE
 
 
-def test_headings_whose_errors_last_for_seconds_are_found() -> None:
+def test_heading_errors_correlated_over_seconds_are_found() -> None:
     """Half of the variance for 10 s: white and lasting sigma to a tenth and a fifth, the time to a factor."""
     _, found = found_of(DUAL_ANTENNAS["half lasting 10 s"], 240.0, 3)
     scale, share = found.setup.gnss_heading_scale, found.setup.gnss_heading_share
@@ -79,7 +79,7 @@ def test_headings_whose_errors_last_for_seconds_are_found() -> None:
 
 
 @pytest.mark.parametrize("doubted", [False, True], ids=["few", "doubted"])
-def test_headings_keep_what_is_assumed_where_nothing_may_be_found(doubted: bool) -> None:
+def test_headings_keep_their_assumed_noise_if_it_cannot_be_estimated(doubted: bool) -> None:
     """Fewer than sixty, whatever they are; and where positions are too far off to be noise."""
     seconds = 180.0 if doubted else 11.0
     assumed, found = found_of(DUAL_ANTENNAS["white"], seconds, 3, doubted=doubted)
@@ -87,8 +87,8 @@ def test_headings_keep_what_is_assumed_where_nothing_may_be_found(doubted: bool)
     assert found.heading_evidence == 0.0
 
 
-def test_errors_with_headings_that_last_are_as_large_as_their_sigmas() -> None:
-    """12 flights, told the truth of headings: NEES of attitude within 99.8 % of what chance allows."""
+def test_errors_with_correlated_headings_are_as_large_as_their_sigmas() -> None:
+    """Fly 12 times with the true heading noise: NEES of attitude must lie within 99.8 % of chance."""
     receiver = DUAL_ANTENNAS["half lasting 10 s"]
     flights = []
     for seed in range(12):
@@ -102,7 +102,7 @@ def test_errors_with_headings_that_last_are_as_large_as_their_sigmas() -> None:
         assert honesty.holds, (part, honesty)
 
 
-def test_alignment_takes_headings_so_far_apart_that_they_tell_something_new() -> None:
+def test_alignment_takes_headings_far_enough_apart_to_be_independent() -> None:
     """The mean of many has the variance that lasting errors leave it; white headings are all taken."""
     t = np.arange(0.0, 200.0, 0.2)
     rows = observed(Kind.HEADING, t, np.zeros(3), np.full(3, 0.01), FixType.RTK_FIXED)
@@ -140,6 +140,6 @@ def test_a_flight_with_two_antennas_is_navigated_as_if_its_noise_were_known(grad
 
 
 @pytest.mark.slow
-def test_positions_share_is_found_beside_headings_as_without_them() -> None:
+def test_correlated_share_of_positions_is_found_with_and_without_headings() -> None:
     (one,) = compared(flight(600.0), DUAL_ANTENNAS["half lasting 10 s"], "tactical", 7, (1.0,))
     assert abs(one.solved.report.setup.gnss_correlated_share - SHARE) < 0.2

@@ -48,7 +48,7 @@ def test_errors_are_as_large_as_their_sigmas(grade: str, share: float) -> None:
     assert 0.95 < np.mean(moments) < 1.05
 
 
-def test_errors_with_a_consumer_unit_are_as_large_as_their_sigmas() -> None:
+def test_errors_with_a_consumer_imu_are_as_large_as_their_sigmas() -> None:
     """Biases of 0.4 °/s and of 80 mg, axes that lean by 10 mrad: 8 flights, filtered and smoothed."""
     squared: dict[str, list[FloatArray]] = {"filtered": [], "smoothed": []}
     for seed in range(8):
@@ -66,7 +66,7 @@ def test_errors_with_a_consumer_unit_are_as_large_as_their_sigmas() -> None:
             assert honesty.holds, (what, name, honesty)
 
 
-def test_errors_of_a_quick_receiver_that_last_for_seconds_are_as_large_as_their_sigmas() -> None:
+def test_errors_with_correlated_fast_gnss_positions_are_as_large_as_their_sigmas() -> None:
     """Half of the positions' variance for 10 s, told of it: estimates of such errors have to die away as they do."""
     fixes = Fixes((0.014, 0.014, 0.02), 0.5, 10.0, 5.0, 0.03)
     setup = replace(setup_for(GRADES["tactical"], ARM), gnss_correlated_share=0.5, gnss_correlation_s=10.0)

@@ -80,33 +80,33 @@ def check(sensor: str, matrix: FloatArray) -> None:
 @pytest.mark.parametrize(
     ("sensor", "number"), [("gyro", 13), ("accel", 2), ("both", 0), ("both", 7), ("both", 30), ("gyro", 46)]
 )
-def test_some_ways_of_taking_the_axes_are_found(sensor: str, number: int) -> None:
+def test_common_wrong_axis_assignments_are_found(sensor: str, number: int) -> None:
     check(sensor, ways()[number])
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", range(48))
 @pytest.mark.parametrize("sensor", SENSORS)
-def test_each_of_the_48_ways_of_taking_the_axes_is_found(sensor: str, number: int) -> None:
+def test_each_of_the_48_axis_assignments_is_found(sensor: str, number: int) -> None:
     check(sensor, ways()[number])
 
 
-def test_degrees_for_radians_are_found_by_the_gain() -> None:
+def test_degrees_given_as_radians_are_found_by_the_gain() -> None:
     (finding,) = diagnose(*mounted("gyro", np.eye(3), unit=180.0 / np.pi))
     assert finding.code == "gyro_unit"
     assert "degrees are read as radians" in finding.text
 
 
 @pytest.mark.parametrize("unit", [0.6, 1.7, 20.0])
-def test_another_gain_is_no_unit(unit: float) -> None:
-    """A gain that is no unit's is told as what does not fit, and not as a wrong unit."""
+def test_a_gain_that_fits_no_unit_is_not_reported_as_a_wrong_unit(unit: float) -> None:
+    """A gain that fits no unit is reported as a mismatch, not as a wrong unit."""
     assert all("unit: " not in finding.text for finding in diagnose(*mounted("gyro", np.eye(3), unit=unit)))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("recording", [car, uav], ids=["car", "uav"])
-def test_real_recordings_cut_and_turned_give_no_offset_and_no_unit(recording: object) -> None:
-    """Minutes of them, also with turned axes: what is said is the axes, never a time or a unit."""
+def test_real_recordings_with_rotated_axes_give_no_time_offset_and_no_unit(recording: object) -> None:
+    """Use minutes of them, also with rotated axes: only the axes may be reported, never a time or a unit."""
     assert callable(recording)
     whole = recording()
     begin, end = (float(edge) for edge in (whole.inertial.time_ns[[0, -1]] - 2300 * 604_800 * 10**9) / 1e9)

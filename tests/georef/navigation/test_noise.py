@@ -55,7 +55,7 @@ def test_sigmas_are_scaled_up_and_down_by_kind_fix_type_and_axis() -> None:
     assert min(won.values()) > EVIDENCE
 
 
-def test_what_chance_may_give_scales_nothing() -> None:
+def test_innovations_within_chance_scale_nothing() -> None:
     """Innovations as large as predicted; and fewer than sixty, whatever they are."""
     setup = Setup(GRADES["tactical"])
     few = innovations(Kind.VELOCITY, FIXED, (3.0, 3.0, 3.0), count=59)
@@ -63,7 +63,7 @@ def test_what_chance_may_give_scales_nothing() -> None:
     assert rescaled(setup, rows) == (setup, {})
 
 
-def test_an_outlier_says_nothing_of_the_others() -> None:
+def test_an_outlier_does_not_affect_the_other_scales() -> None:
     rows = innovations(Kind.POSITION, FIXED, (1.0, 1.0, 1.0))
     rows["normalised"][100], rows["chi2"][100] = 60.0, 3 * 3600.0
     assert second_moments(rows)[0][int(Kind.POSITION), FIXED, False] == pytest.approx(1.0, abs=0.1)
@@ -101,7 +101,7 @@ def test_a_flight_is_navigated_as_if_its_noise_were_known(name: str, optimism: f
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", RECEIVERS)
-def test_sigmas_are_what_errors_are_whatever_the_receiver_says(name: str) -> None:
+def test_sigmas_equal_the_errors_whatever_the_receiver_states(name: str) -> None:
     """18 flights of 240 s, sigmas true, too small by 3, too large by 3 in turn: NEES of position, velocity and attitude
     within 99.8 % of what chance allows; positions and velocities err, RMS, at most 1.05 times as the best smoother's.
 
@@ -123,14 +123,14 @@ def test_sigmas_are_what_errors_are_whatever_the_receiver_says(name: str) -> Non
 
 
 def filtered(share: float, tau_s: float) -> Receiver:
-    """A receiver that filters its velocities."""
+    """Return a receiver that filters its velocities."""
     receiver = RECEIVERS["UBX"]
     return replace(receiver, fixes=replace(receiver.fixes, velocity_share=share, velocity_tau_s=tau_s))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("grade", ["tactical", "mems"])
-def test_velocities_whose_errors_last_for_seconds_are_found(grade: str) -> None:
+def test_velocity_errors_correlated_over_seconds_are_found(grade: str) -> None:
     """Half of their variance for 2 s: as with the smoother that knows, within a quarter of a sigma, and sigmas alike.
 
     How long they last and how much of them is not told apart well: neither is asked for here.
@@ -147,7 +147,7 @@ def test_velocities_whose_errors_last_for_seconds_are_found(grade: str) -> None:
 
 
 @pytest.mark.slow
-def test_velocities_that_are_white_are_not_said_to_last() -> None:
+def test_white_velocities_are_not_reported_as_correlated() -> None:
     """Not even where those that filter were looked for: the flight is navigated as if nobody had."""
     (one,) = compared(flight(), RECEIVERS["UBX"], "tactical", 7, (1.0,))
     assert one.solved.report.noise is not None

@@ -70,7 +70,7 @@ def test_means_become_increments_over_the_true_intervals() -> None:
     assert got.interval_s[0] == 0.005
 
 
-def test_jitter_of_stamps_does_not_become_jitter_of_what_the_sensor_felt() -> None:
+def test_jitter_of_timestamps_does_not_reach_the_increments() -> None:
     rng = np.random.default_rng(2)
     edges = np.arange(20001) / RATE_HZ
     stamps = edges[1:] + rng.uniform(-0.002, 0.002, 20000)  # sampled evenly, stamped badly
@@ -84,14 +84,14 @@ def test_jitter_of_stamps_does_not_become_jitter_of_what_the_sensor_felt() -> No
     assert np.abs(turned - turned.mean(axis=0)).max() < 1.5e-3  # rad, no more than a stamp's error times the rate
 
 
-def test_increments_are_the_devices_own_whatever_its_stamps_do() -> None:
+def test_increments_are_those_of_the_device_whatever_its_timestamps() -> None:
     rng = np.random.default_rng(3)
     edges = np.arange(2001) / RATE_HZ
     got = Sampler(RATE_HZ, sample="increment").feed(means(edges), ns(edges[1:] + rng.uniform(-0.002, 0.002, 2000)))
     np.testing.assert_allclose(got.angle_b, np.diff(rate_integral(edges), axis=0), atol=1e-15)
 
 
-def test_instants_are_averaged_over_the_interval_between_them() -> None:
+def test_instantaneous_samples_are_averaged_over_the_interval_between_them() -> None:
     t = np.arange(1, 2001) / RATE_HZ
     got = Sampler(RATE_HZ, sample="instant", stamp="middle").feed(
         rows_of(np.broadcast_to(FORCE, (2000, 3)), rate(t)), ns(t)
@@ -102,13 +102,13 @@ def test_instants_are_averaged_over_the_interval_between_them() -> None:
 
 
 @pytest.mark.parametrize(("stamp", "late"), [("end", 0.0), ("middle", 0.0025), ("start", 0.005)])
-def test_stamps_in_the_interval(stamp: StampRule, late: float) -> None:
+def test_the_timestamp_rule_places_the_interval(stamp: StampRule, late: float) -> None:
     edges = np.arange(101) / RATE_HZ
     got = Sampler(RATE_HZ, stamp=stamp).feed(means(edges), ns(edges[1:] - late))
     assert np.array_equal(got.time_ns, ns(edges[1:]))
 
 
-def test_rotation_takes_the_units_axes_to_the_bodys() -> None:
+def test_rotation_converts_imu_axes_to_body_axes() -> None:
     rotation = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
     got = Sampler(RATE_HZ, rot_b_from_imu=rotation).feed(
         rows_of(np.tile([1.0, 2.0, 3.0], (3, 1)), np.tile([4.0, 5.0, 6.0], (3, 1))), ns(np.arange(3) / RATE_HZ)
@@ -140,7 +140,7 @@ def test_short_gaps_are_bridged_and_marked(sample: SampleRule) -> None:
     np.testing.assert_allclose(got.angle_b, whole.angle_b, atol=0.5 * 0.005 * 9 * 0.05**2 / 8 * 1.1)
 
 
-def test_long_gaps_end_the_piece_and_are_told() -> None:
+def test_long_gaps_end_the_piece_and_are_reported() -> None:
     edges = np.arange(401) / RATE_HZ
     rows, stamps = np.delete(means(edges), np.s_[100:220]), np.delete(ns(edges[1:]), np.s_[100:220])
     sampler = Sampler(RATE_HZ)
@@ -151,7 +151,7 @@ def test_long_gaps_end_the_piece_and_are_told() -> None:
     assert not got.bridged.any()
 
 
-def test_spoilt_rows_are_counted_by_reason() -> None:
+def test_unusable_rows_are_counted_by_reason() -> None:
     edges = np.arange(1001) / RATE_HZ
     rows, stamps = means(edges), ns(edges[1:])
     rows["angular_rate_b"][50, 1] = np.nan
@@ -176,7 +176,7 @@ def test_spoilt_rows_are_counted_by_reason() -> None:
     assert sampler.gaps == []
 
 
-def test_time_that_jumps_for_good_is_followed_forwards() -> None:
+def test_a_permanent_time_jump_is_followed_forwards() -> None:
     edges = np.arange(201) / RATE_HZ
     stamps = ns(edges[1:])
     stamps[100:] += 604_800_000_000_000
@@ -186,7 +186,7 @@ def test_time_that_jumps_for_good_is_followed_forwards() -> None:
 
 
 @pytest.mark.parametrize("sample", ["mean", "instant", "increment"])
-def test_how_rows_are_cut_changes_nothing(sample: SampleRule) -> None:
+def test_results_do_not_depend_on_how_rows_are_cut(sample: SampleRule) -> None:
     rng = np.random.default_rng(4)
     edges = np.arange(3001) / RATE_HZ
     rows, stamps = means(edges), ns(edges[1:] + rng.uniform(-0.002, 0.002, 3000))
@@ -222,6 +222,6 @@ def test_how_rows_are_cut_changes_nothing(sample: SampleRule) -> None:
         ({"rate_hz": 100.0, "rot_b_from_imu": 2 * np.eye(3)}, "rotation_b_imu: the rows are not a rotation"),
     ],
 )
-def test_what_a_user_did_wrong_is_said(options: dict[str, Any], words: str) -> None:
+def test_wrong_options_are_refused_with_their_reason(options: dict[str, Any], words: str) -> None:
     with pytest.raises(NavigationError, match=words):
         Sampler(**options)

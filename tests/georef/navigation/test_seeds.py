@@ -57,7 +57,7 @@ def flown(lean: float, told: float, seed: int) -> tuple[Solution, Solution]:
 
 
 @pytest.mark.parametrize("lean", [0.0, MISALIGNMENT], ids=["true axes", "leaning axes"])
-def test_errors_on_the_lines_are_as_predicted(lean: float) -> None:
+def test_errors_on_the_lines_match_their_prediction(lean: float) -> None:
     """Over the seeds: filtered and smoothed RMS within the 99 % interval of the prediction, position and attitude."""
     solutions = [flown(lean, lean, seed) for seed in range(SEEDS)]
     for column in zip(*solutions, strict=True):
@@ -65,7 +65,7 @@ def test_errors_on_the_lines_are_as_predicted(lean: float) -> None:
         assert found.holds.all(), found
 
 
-def test_axes_that_lean_are_found() -> None:
+def test_axis_misalignments_are_estimated() -> None:
     """By the pairs of axes that the simulator drew, within their sigmas; turns show those of the gyroscopes."""
     off, sigmas = [], []
     for seed in range(SEEDS):
@@ -80,7 +80,7 @@ def test_axes_that_lean_are_found() -> None:
     assert np.mean(sigmas, axis=0)[0].min() < 0.3 * MISALIGNMENT
 
 
-def test_a_filter_that_does_not_know_of_it_is_told_from_one_that_does() -> None:
+def test_a_filter_without_misalignment_states_is_recognised() -> None:
     """The interval is narrow enough to refuse what leaves misalignment out."""
     found = seeds_of([on_lines(craft(), flown(MISALIGNMENT, 0.0, seed)[1]) for seed in range(4)])
     assert (found.measured > found.high)[3:].any(), found

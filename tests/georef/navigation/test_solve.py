@@ -24,7 +24,7 @@ pytestmark = pytest.mark.xdist_group("kernels")
 ARM = np.array([0.35, -0.12, -1.1])
 
 
-def test_a_flight_that_begins_in_the_air_is_as_good_at_its_begin() -> None:
+def test_a_flight_that_begins_in_the_air_is_as_accurate_at_its_start() -> None:
     """On a line, the heading wrong by 8° and known to 10°: the first minute is as good as the last."""
     flown = reference("tactical").cut(100_640.0, 101_550.0)
     assert flown.truth is not None
@@ -43,7 +43,7 @@ def test_a_flight_that_begins_in_the_air_is_as_good_at_its_begin() -> None:
     assert (rms(first[:, 3:]) < 1.5 * np.maximum(rms(last[:, 3:]), [0.003, 0.003, 0.008])).all()
 
 
-def test_a_further_pass_knows_no_more_than_the_first() -> None:
+def test_a_further_pass_claims_no_more_knowledge_than_the_first() -> None:
     """A MEMS unit whose start is known nearly as well as the flight tells it: a pass begun from the smoothed attitude
     lies within a tenth of a sigma of the first; what was known of the start counts once.
     """
@@ -69,7 +69,7 @@ def ticking(inertial: Inertial) -> Inertial:
     return replace(inertial, time_ns=time_ns, interval_s=interval_s)
 
 
-def test_the_cars_logging_delay_is_found() -> None:
+def test_the_logging_delay_of_the_car_is_found() -> None:
     """0.125 s by its makers' configuration, within 10 ms; positions only, for its velocities are means over 0.25 s."""
     drive, start = car(), start_of("gnss_imu_drive", "meta")
     setup = replace(drive.setup, estimate_time_offset_s=0.3)
@@ -82,7 +82,7 @@ def test_the_cars_logging_delay_is_found() -> None:
 
 
 @pytest.mark.slow
-def test_with_a_unit_that_is_late_the_trajectory_is_where_gnss_says_and_when() -> None:
+def test_the_trajectory_of_a_late_imu_is_given_at_gnss_times() -> None:
     """Stamps 8 ms late, half a metre of way, in eight flights: poses at GNSS's times, as sure as they say.
 
     The filter is better than a fix, the smoother than half of one. Squares over predicted ones scatter by 0.3 from
@@ -113,7 +113,9 @@ def test_with_a_unit_that_is_late_the_trajectory_is_where_gnss_says_and_when() -
 
 
 @pytest.mark.parametrize(("raw", "filtered_m", "smoothed_m"), [(False, 11.5, 0.53), (True, 11.5, 0.53)])
-def test_the_cars_outages_are_bridged_as_by_others(raw: bool, filtered_m: float, smoothed_m: float) -> None:
+def test_the_outages_of_the_car_are_bridged_as_accurately_as_published(
+    raw: bool, filtered_m: float, smoothed_m: float
+) -> None:
     """Thirteen of 15 s, horizontal, RMS of the largest errors; by the unit's own clock a third better.
 
     The published times stretch, which looks like positions that err twenty times as much as they are said to: no noise.
@@ -135,7 +137,7 @@ FLIGHT_S = 600.0
 
 
 @pytest.mark.parametrize(("scale", "share"), [(1.0, 0.0), (2.5, 0.0), (1.0, 0.8)])
-def test_noise_that_is_not_as_said_is_found(scale: float, share: float) -> None:
+def test_noise_different_from_the_stated_sigmas_is_found(scale: float, share: float) -> None:
     """Fixes as said, worse by 2.5, and with errors that last a minute: what they are is found, and used."""
     truth = fly(survey(), FLIGHT_S, 50.0)
     inertial, rows = noised(truth, GRADES["tactical"], Fixes(share=share, rate_hz=5.0), ARM, 11)
@@ -167,7 +169,7 @@ def test_seconds_of_blunders_do_not_hide_the_noise_of_the_flight(fault: str) -> 
 
 
 @pytest.mark.parametrize("velocity_mps", [0.02, 0.0], ids=["velocities", "positions alone"])
-def test_a_wrong_fix_moves_nothing(velocity_mps: float) -> None:
+def test_a_wrong_fix_does_not_move_the_trajectory(velocity_mps: float) -> None:
     """1.6 m from one epoch to the next, for 20 s: refused to its end, and errors stay within their sigmas."""
     truth = fly(survey(), FLIGHT_S, 50.0)
     inertial, rows = noised(truth, GRADES["tactical"], Fixes(rate_hz=5.0, velocity_mps=velocity_mps), ARM, 11)
@@ -184,8 +186,8 @@ def test_a_wrong_fix_moves_nothing(velocity_mps: float) -> None:
     assert np.abs(off[:, 3:6] / found.velocity_sigma_l[near]).max() < 5.0
 
 
-def test_what_a_flight_says_nothing_of_is_told() -> None:
-    """Straight and level, a lever arm sought: along the flight it moves like the start, the flight cannot tell."""
+def test_a_parameter_that_the_flight_cannot_determine_is_reported() -> None:
+    """Estimate a lever arm in straight and level flight, where it is inseparable from the start."""
     truth = fly(survey(line_s=1000.0), 60.0, 50.0)
     inertial, rows = noised(truth, GRADES["tactical"], Fixes(), ARM, 12)
     setup = replace(setup_for(GRADES["tactical"], ARM), estimate_lever_arm=0.05)

@@ -17,7 +17,7 @@ RATE_HZ = 100
 
 
 def unit(seconds: int, force: NDArray[np.float64], turn: NDArray[np.float64]) -> Inertial:
-    """Mean force and turn by second."""
+    """Return mean force and angular rate by second."""
     n = seconds * RATE_HZ
     time_ns = EPOCH_NS + np.arange(1, n + 1) * (SECOND_NS // RATE_HZ)
     each = np.repeat(np.arange(seconds), RATE_HZ)
@@ -43,7 +43,9 @@ def calm() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return np.tile([0.0, 0.0, -9.81], (40, 1)), np.zeros((40, 3))
 
 
-def test_a_vehicle_that_stands_is_seen_but_for_the_ends(calm: tuple[NDArray[np.float64], NDArray[np.float64]]) -> None:
+def test_a_stationary_vehicle_is_detected_except_at_the_ends(
+    calm: tuple[NDArray[np.float64], NDArray[np.float64]],
+) -> None:
     rows = still_seconds(unit(40, *calm), velocities(np.zeros(40), 0.02))
     assert seconds_of(rows) == list(range(3, 38))
     assert (rows["sigma"] == SIGMA_MPS).all()
@@ -52,7 +54,7 @@ def test_a_vehicle_that_stands_is_seen_but_for_the_ends(calm: tuple[NDArray[np.f
 
 @pytest.mark.parametrize("rate_hz", [1, 20])
 @pytest.mark.parametrize(("speed_mps", "stands"), [(0.0, True), (0.3, False), (1.5, False)])
-def test_positions_alone_tell_a_slow_flight_from_standing_however_often_they_come(
+def test_positions_alone_tell_slow_flight_from_standing_at_any_rate(
     calm: tuple[NDArray[np.float64], NDArray[np.float64]], rate_hz: int, speed_mps: float, stands: bool
 ) -> None:
     rows = np.zeros(40 * rate_hz, OBSERVATION_DTYPE)
@@ -63,7 +65,7 @@ def test_positions_alone_tell_a_slow_flight_from_standing_however_often_they_com
     assert bool(len(still_seconds(unit(40, *calm), rows))) == stands
 
 
-def test_even_straight_flight_feels_like_standing_and_is_not(
+def test_smooth_straight_flight_is_not_taken_for_standing(
     calm: tuple[NDArray[np.float64], NDArray[np.float64]],
 ) -> None:
     assert not len(still_seconds(unit(40, *calm), velocities(np.full(40, 60.0), 0.02)))
@@ -72,7 +74,7 @@ def test_even_straight_flight_feels_like_standing_and_is_not(
 
 
 @pytest.mark.parametrize("sensor", ["force", "turn"])
-def test_a_second_that_is_felt_and_its_neighbours_are_left_out(
+def test_a_second_with_motion_and_its_neighbours_are_excluded(
     sensor: str, calm: tuple[NDArray[np.float64], NDArray[np.float64]]
 ) -> None:
     force, turn = calm
@@ -81,7 +83,7 @@ def test_a_second_that_is_felt_and_its_neighbours_are_left_out(
     assert {18, 19, 20, 21, 22} <= missing <= set(range(18, 24))
 
 
-def test_positions_tell_it_where_no_velocity_is_said(calm: tuple[NDArray[np.float64], NDArray[np.float64]]) -> None:
+def test_positions_detect_motion_without_velocities(calm: tuple[NDArray[np.float64], NDArray[np.float64]]) -> None:
     for speed, expected in ((0.0, 35), (0.5, 0)):
         rows = velocities(np.zeros(40), 0.05)
         rows["kind"] = Kind.POSITION

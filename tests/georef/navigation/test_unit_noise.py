@@ -30,7 +30,7 @@ def flown(unit: ImuNoise, told: ImuNoise) -> tuple[Run, Setup]:
     return stretch_of(inertial, rows, drawn_start(flight(), 7)), Setup(told, ARM[None])
 
 
-def test_the_consumer_grade_is_its_data_sheets() -> None:
+def test_the_consumer_grade_matches_its_data_sheet() -> None:
     """InvenSense PS-MPU-6000A 3.4, 6.1 and 6.2: 0.005 °/s/√Hz, 400 µg/√Hz, ±80 mg, and within ±3 % and ±2 %."""
     noise = GRADES["consumer"]
     assert noise.velocity_random_walk == pytest.approx(400e-6 * 9.80665, rel=0.03)
@@ -54,15 +54,15 @@ def test_a_flight_fits_its_own_grade(unit: str, told: str) -> None:
     assert f'set imu.main.noise.grade = "{unit}"' in finding.text
 
 
-def test_a_flight_of_the_grade_that_was_named_asks_for_nothing() -> None:
+def test_a_flight_of_the_configured_grade_gives_no_advice() -> None:
     run, setup = flown(GRADES["tactical"], GRADES["tactical"])
     assert better_grade(run, setup, GRADES) is None
     assert contradicted(run, setup) == []
 
 
 @pytest.mark.parametrize(("field", "told"), [("gyro_scale", 1e-5), ("misalignment", 0.0)])
-def test_a_scale_factor_or_a_misalignment_that_cannot_be_is_named(field: str, told: float) -> None:
-    """The unit's is 5 mrad or 0.5 %, the configuration says (next to) none."""
+def test_an_implausible_scale_factor_or_misalignment_is_reported(field: str, told: float) -> None:
+    """The unit has 5 mrad or 0.5 %, and the configuration states almost zero."""
     noise = replace(GRADES["tactical"], **{field: told})
     run, setup = flown(replace(noise, **{field: 5e-3}), noise)
     assert contradicted(run, setup)[0].name == field

@@ -64,14 +64,14 @@ class Recording:
     truth: Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]] | None = None
 
     def cut(self, begin: float, end: float) -> Recording:
-        """The same between two times."""
+        """Return the part between two times."""
         edges = ns(np.array([begin, end]))
         first, last = np.searchsorted(self.inertial.time_ns, edges).tolist()
         rows = self.rows[(self.rows["time_ns"] >= edges[0]) & (self.rows["time_ns"] < edges[1])]
         return Recording(self.inertial.between(first, last), rows, self.setup, self.truth)
 
     def only(self, *kinds: Kind) -> StructArray:
-        """Observations of some kinds."""
+        """Keep the observations of some kinds."""
         kept: StructArray = self.rows[np.isin(self.rows["kind"], kinds)]
         return kept
 

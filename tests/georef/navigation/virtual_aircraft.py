@@ -76,7 +76,7 @@ class Aircraft:
 
     @property
     def end_s(self) -> float:
-        """Of the flight."""
+        """Return the end of the flight in s."""
         return float(self.truth.edges[-1])
 
 
@@ -182,7 +182,7 @@ class Seeds:
 
     @property
     def holds(self) -> NDArray[np.bool_]:
-        """(6,) whether the measured one lies within."""
+        """Return (6,) whether the measured values lie within their bounds."""
         return (self.low <= self.measured) & (self.measured <= self.high)
 
 

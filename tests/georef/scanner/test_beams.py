@@ -53,7 +53,7 @@ def tilted(geometry: Geometry, theta: float, tilt: float) -> float:
     return float(points_s(geometry, theta, calibration=calibration)[0, 0] / tilt)
 
 
-def test_line_beam_and_its_cone() -> None:
+def test_line_beam_follows_its_cone() -> None:
     theta, eta = np.radians(15.0), np.radians(0.5)
     flat = points_s(LineGeometry(), theta)[0]
     assert np.degrees(np.arctan2(flat[1], flat[2])) == pytest.approx(15.0, abs=1e-12)  # galvo at 7.5°
@@ -63,7 +63,7 @@ def test_line_beam_and_its_cone() -> None:
 
 
 @pytest.mark.parametrize(("shaft_deg", "printed"), [(0.0, 1.4142136), (7.5, 1.5867067), (-15.0, 0.99999999)])
-def test_facet_tilt_is_twice_the_cosine_of_incidence(shaft_deg: float, printed: float) -> None:
+def test_facet_tilt_turns_the_beam_by_twice_the_cosine_of_incidence(shaft_deg: float, printed: float) -> None:
     assert tilted(LineGeometry(4), 2 * np.radians(shaft_deg), 1e-4) == pytest.approx(printed, abs=1e-7)
 
 
@@ -74,7 +74,7 @@ def test_mirror_tilt_is_a_pitch_and_a_pitch_slope() -> None:
     assert slope == pytest.approx(0.707106781, abs=1e-8)
 
 
-def test_facets_have_each_their_own_tilt() -> None:
+def test_each_facet_has_its_own_tilt() -> None:
     tilts = {0: 0.001, 2: -0.002}
     points = points_s(
         LineGeometry(3), np.zeros(3), calibration=replace(NOMINAL, facet_tilt_rad=tilts), channel=[0, 1, 2]
@@ -82,7 +82,7 @@ def test_facets_have_each_their_own_tilt() -> None:
     assert points[:, 0] == pytest.approx(np.sqrt(2) * np.array([0.001, 0.0, -0.002]), rel=1e-5, abs=1e-12)
 
 
-def test_palmer_scan() -> None:
+def test_palmer_scan_follows_its_formula() -> None:
     points = points_s(NutatingGeometry(np.radians(3.5)), np.radians([0.0, 90.0, 180.0, 270.0]))
     x, y = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]
     assert x[[0, 2]] == pytest.approx([0.1227845609, -0.1227845609], abs=1e-10)  # tan 2ψ, forward first
@@ -90,13 +90,13 @@ def test_palmer_scan() -> None:
     assert x[1] == pytest.approx(0.003740866104, abs=1e-12)
 
 
-def test_palmer_shaft_at_another_angle() -> None:
+def test_palmer_scan_with_another_shaft_angle_follows_its_formula() -> None:
     """Middle of the scan: the laser's beam turned by π − 2β."""
     points = points_s(NutatingGeometry(1e-12, np.radians(40.0)), 0.0)
     assert points[0] == pytest.approx([-np.cos(np.radians(80.0)), 0.0, np.sin(np.radians(80.0))], abs=1e-11)
 
 
-def test_risley_pair() -> None:
+def test_risley_pair_follows_its_formula() -> None:
     wedge = np.radians(10.0)
     single = points_s(RisleyGeometry((wedge, 1e-12), 1.51), 0.0)[0]
     assert np.degrees(np.arctan2(-single[0], single[2])) == pytest.approx(5.201161908, abs=1e-8)  # to the thick end
@@ -113,13 +113,13 @@ def test_risley_counts_whole_turns() -> None:
     assert np.linalg.norm(points[1] - points[0]) > 0.05
 
 
-def test_risley_that_lets_no_light_through() -> None:
+def test_risley_wedges_with_total_reflection_are_refused() -> None:
     with pytest.raises(GeometryError, match=r"geometry.wedge_deg: got \[30, 30\], want smaller angles"):
         RisleyGeometry((np.radians(30.0), np.radians(30.0)), 1.51)
     RisleyGeometry((np.radians(20.0), np.radians(20.0)), 1.51)
 
 
-def test_velodyne_formulas() -> None:
+def test_velodyne_beams_follow_the_formulas() -> None:
     azimuth = np.radians(123.0)
     plain = points_s(spinning(elevation_deg=-9.0), azimuth, 50.0)[0]
     assert plain == pytest.approx([41.417257078, -26.8966812359, -7.82172325201], abs=1e-9)
@@ -135,7 +135,7 @@ def test_velodyne_formulas() -> None:
     assert points_s(table, azimuth, 50.0)[0] == pytest.approx([42.053718, -26.043818, -7.632007], abs=1e-6)
 
 
-def test_head_of_a_driver() -> None:
+def test_beams_of_a_driver_are_used() -> None:
     table, rng = VLP16.beams, np.random.default_rng(2)
     geometry = SpinningGeometry(**vars(table))
     angle, ranges, channel = rng.uniform(0, 2 * np.pi, 200), rng.uniform(1, 100, 200), rng.integers(0, 16, 200)
@@ -143,7 +143,7 @@ def test_head_of_a_driver() -> None:
     assert points_s(geometry, angle, ranges, channel=channel) == pytest.approx(beam_points(rows, table), abs=1e-12)
 
 
-def test_ouster_formula() -> None:
+def test_ouster_beams_follow_the_formula() -> None:
     geometry = OusterGeometry(np.radians([-9.0]), np.radians([3.2]), (0.015806, 0.0), np.eye(4))
     encoder = 2 * np.pi * (1 - 22528 / 90112)
     printed = [-2.75584102986, -49.3076340178, -7.81925064886]
@@ -155,7 +155,7 @@ def test_ouster_formula() -> None:
     assert points_s(turned, encoder, 50.0)[0] == pytest.approx(want, abs=1e-9)
 
 
-def test_fibres_by_the_mirror_that_lights_them() -> None:
+def test_fibres_follow_the_mirror_that_lights_them() -> None:
     geometry = read_fibres("across_deg,along_deg\n-10, 0\n0, 0.5\n\n10, 0\n20, -1\n", "fibres.csv")
     assert isinstance(geometry, FibreGeometry)
     points = points_s(geometry, 2 * np.pi / 4 * np.array([0.1, 1.0, 1.9, 2.9, 4.4, -1.0]))
@@ -175,7 +175,7 @@ def test_fibres_by_the_mirror_that_lights_them() -> None:
         ("across_deg,along_deg\n1,nan\n", "fibres.csv: needs the two angles of at least one fibre, all finite"),
     ],
 )
-def test_tables_of_fibres_that_cannot_be(text: str, wrong: str) -> None:
+def test_impossible_fibre_tables_are_refused(text: str, wrong: str) -> None:
     with pytest.raises(GeometryError, match=wrong):
         read_fibres(text, "fibres.csv")
 
@@ -193,7 +193,7 @@ ONE_BEAM = spinning()
         (LineGeometry(), {"installation_matrix": 2.0 * np.eye(3)}, "installation matrix: is not a rotation"),
     ],
 )
-def test_tables_that_belong_to_another_scanner(geometry: Geometry, changes: dict[str, object], wrong: str) -> None:
+def test_tables_of_another_scanner_are_refused(geometry: Geometry, changes: dict[str, object], wrong: str) -> None:
     with pytest.raises(GeometryError, match=f"calibration of left: {wrong}"):
         SensorModel(replace(NOMINAL, **changes), geometry)  # type: ignore[arg-type]
 
@@ -210,14 +210,14 @@ ROUND = ("scan_plane_tilt_rad", "pitch_slope")
         (read_fibres("across_deg,along_deg\n1,2\n", ""), ("encoder_latency_s", "torsion_s2")),
     ],
 )
-def test_errors_that_a_scanner_does_not_have(geometry: Geometry, refused: tuple[str, ...]) -> None:
+def test_error_parameters_that_a_scanner_lacks_are_refused(geometry: Geometry, refused: tuple[str, ...]) -> None:
     assert set(geometry.without) == set(refused)
     for name in refused:
         with pytest.raises(GeometryError, match=f"calibration of left: {name} is 1e-05, want 0"):
             SensorModel(NOMINAL.changed(**{name: 1e-5}), geometry)
 
 
-def test_scanners_as_configurations_declare_them() -> None:
+def test_scanner_geometries_are_made_from_configurations() -> None:
     assert line_scanner("monogon") == line_scanner("oscillating") == line_scanner(None) == LineGeometry()
     assert line_scanner("polygon", facets=8) == LineGeometry(8)
     nutating = line_scanner("nutating", nutation_deg=7.0, shaft_angle_deg=45.0)

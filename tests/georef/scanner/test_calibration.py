@@ -101,7 +101,7 @@ lever_arm_z_m = 0
 """
 
 
-def test_every_parameter_in_si_units() -> None:
+def test_every_parameter_is_converted_to_si_units() -> None:
     calibration = read_calibration(WHOLE, "left.toml")
     degree = math.pi / 180
     want = [0.25 * degree, -0.5 * degree, 0.75 * degree, 0.35, 4e-5, 0.125 * degree, 3e-4, 0.0625 * degree]
@@ -114,7 +114,7 @@ def test_every_parameter_in_si_units() -> None:
     assert calibration.lever_arm_b.tolist() == [0.12, -0.03, 0.28]
 
 
-def test_header_and_tables() -> None:
+def test_header_and_tables_are_read() -> None:
     calibration = read_calibration(WHOLE, "left.toml")
     assert (calibration.id, calibration.scanner, calibration.method) == ("2026-11-21T10:15:00Z-ab12", "left", "planes")
     assert (calibration.ranges, calibration.refraction, calibration.mirror_factor) == ("vacuum", "ardc", 2.0)
@@ -130,7 +130,7 @@ def test_header_and_tables() -> None:
     assert calibration.beams == {3: BeamCorrection(azimuth_rad=math.radians(0.5), range_m=0.04)}
 
 
-def test_covariance() -> None:
+def test_covariance_is_read() -> None:
     covariance = read_calibration(WHOLE, "left.toml").covariance()
     omega, offset, time = (INDEX[name] for name in ("omega_rad", "range_offset_m", "time_offset_s"))
     sigma_omega, sigma_time = math.radians(0.001), 2e-6
@@ -140,7 +140,7 @@ def test_covariance() -> None:
     assert np.count_nonzero(covariance) == 5  # what was held fixed has none
 
 
-def test_shortest_file() -> None:
+def test_the_shortest_valid_file_is_read() -> None:
     calibration = read_calibration(SHORTEST, "left.toml")
     assert calibration.parameters.tolist() == nominal("left", [1, 0, 0], np.eye(3)).parameters.tolist()
     assert not calibration.covariance().any()
@@ -148,7 +148,7 @@ def test_shortest_file() -> None:
     assert calibration.range_offsets == ()
 
 
-def test_files_of_the_virtual_aircraft(tmp_path) -> None:  # type: ignore[no-untyped-def]
+def test_files_of_the_simulator_match_their_plan(tmp_path) -> None:  # type: ignore[no-untyped-def]
     """A file written by other means says what its plan says."""
     plan = parse_plan(
         '[flight]\nname = "x"\n[[line]]\nname = "1"\nfrom_m = [0, 0]\nto_m = [500, 0]\nheight_m = 900\n'
@@ -162,7 +162,7 @@ def test_files_of_the_virtual_aircraft(tmp_path) -> None:  # type: ignore[no-unt
     assert calibration.facet_tilt_rad == {2: math.radians(0.1)}
 
 
-def test_changed_leaves_the_old_one() -> None:
+def test_changing_a_calibration_leaves_the_original_unchanged() -> None:
     old = nominal("left", [0, 0, 0], np.eye(3))
     assert old.changed(phi_rad=0.1).value("phi_rad") == 0.1
     assert old.value("phi_rad") == 0.0
@@ -192,7 +192,7 @@ def test_changed_leaves_the_old_one() -> None:
         ("[parameters]", "mirror_factor = 'two'\n[parameters]", "calibration.mirror_factor: got 'two', want a number"),
     ],
 )
-def test_mistakes_of_header_and_parameters(old: str, new: str, wrong: str) -> None:
+def test_wrong_headers_and_parameters_are_refused(old: str, new: str, wrong: str) -> None:
     assert old in SHORTEST
     with pytest.raises(CalibrationError) as caught:
         read_calibration(SHORTEST.replace(old, new, 1), "left.toml")
@@ -239,7 +239,7 @@ def test_mistakes_of_header_and_parameters(old: str, new: str, wrong: str) -> No
         ("[correlation]\nnames = [['a']]\nmatrix = [[1]]", "correlation.names: must be a list of keys of [sigma]"),
     ],
 )
-def test_mistakes_of_tables(added: str, wrong: str) -> None:
+def test_wrong_tables_are_refused(added: str, wrong: str) -> None:
     text = f"{added}\n{SHORTEST}" if added.startswith("sigma =") else f"{SHORTEST}\n{added}\n"
     with pytest.raises(CalibrationError) as caught:
         read_calibration(text, "left.toml")
@@ -247,7 +247,7 @@ def test_mistakes_of_tables(added: str, wrong: str) -> None:
     assert line.startswith(f"left.toml: {wrong}")
 
 
-def test_a_line_each() -> None:
+def test_each_mistake_is_reported_in_one_line() -> None:
     text = SHORTEST.replace("phi_deg = 0", "").replace("kappa_deg = 0", "kappa_deg = 'x'")
     with pytest.raises(CalibrationError) as caught:
         read_calibration(text, "left.toml")
@@ -264,7 +264,7 @@ def test_a_line_each() -> None:
         ("", "left.toml: calibration: missing; add [calibration]\nleft.toml: parameters: missing; add [parameters]"),
     ],
 )
-def test_what_is_no_calibration_file(text: str, wrong: str) -> None:
+def test_a_file_that_is_not_a_calibration_is_refused(text: str, wrong: str) -> None:
     with pytest.raises(CalibrationError) as caught:
         read_calibration(text, "left.toml")
     assert str(caught.value).startswith(wrong)

@@ -46,7 +46,7 @@ def run(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("prf_hz", [30_000.0, 150_000.0, 800_000.0])
-def test_a_microsecond_costs_less_than_a_tenth_of_a_count(prf_hz: float) -> None:
+def test_a_latency_of_a_microsecond_costs_less_than_a_tenth_of_a_count(prf_hz: float) -> None:
     rows, time_ns, rate_rps, acceleration_rps2 = read(sine(np.radians(30.0), 50.0), prf_hz, 0.06, BITS_17)
     _, rate, acceleration = run(rows, time_ns)
     off = np.abs(rate - rate_rps)
@@ -56,7 +56,7 @@ def test_a_microsecond_costs_less_than_a_tenth_of_a_count(prf_hz: float) -> None
     assert np.abs(acceleration_rps2).max() > 5e4
 
 
-def test_fine_encoders_are_taken_at_their_word() -> None:
+def test_fine_encoder_readings_are_used_unsmoothed() -> None:
     for motion, limit in ((sine(np.radians(30.0), 50.0), 0.05), (triangle(np.radians(30.0), 50.0), 0.5)):
         rows, time_ns, rate_rps, _ = read(motion, 200_000.0, 0.06, 2 * np.pi / 2**24)
         _, rate, _ = run(rows, time_ns)
@@ -64,7 +64,7 @@ def test_fine_encoders_are_taken_at_their_word() -> None:
         assert np.abs(rate - rate_rps)[inner].max() < limit
 
 
-def test_pulses_without_returns_and_pulses_with_several() -> None:
+def test_pulses_without_returns_and_with_several_give_the_same_motion() -> None:
     rows, time_ns, rate_rps, acceleration_rps2 = read(sine(np.radians(30.0), 50.0), 100_000.0, 0.1, BITS_17)
     rng = np.random.default_rng(8)
     repeats = rng.integers(0, 4, len(rows))
@@ -81,7 +81,7 @@ def test_pulses_without_returns_and_pulses_with_several() -> None:
 
 
 @pytest.mark.parametrize(("facets", "turns_hz"), [(4, 150.0), (40, 30.0)])
-def test_facets_jump_and_windows_do_not(facets: int, turns_hz: float) -> None:
+def test_rate_of_a_polygon_is_estimated_across_its_facets(facets: int, turns_hz: float) -> None:
     rows, time_ns, rate_rps, _ = read(polygon(turns_hz, facets), 300_000.0, 0.05, BITS_17)
     assert len(np.unique(rows["channel"])) == facets
     _, rate, acceleration = run(rows, time_ns, steady=True, facets=True)
@@ -93,7 +93,7 @@ def test_facets_jump_and_windows_do_not(facets: int, turns_hz: float) -> None:
 
 
 @pytest.mark.parametrize("turns_hz", [80.0, -80.0])
-def test_shafts_that_turn_on_through_zero(turns_hz: float) -> None:
+def test_a_shaft_turns_on_through_zero(turns_hz: float) -> None:
     rows, time_ns, rate_rps, _ = read(turning(turns_hz), 100_000.0, 0.05, BITS_17)
     _, rate, _ = run(rows, time_ns, steady=True)
     assert np.abs(np.diff(rows["encoder_rad"])).max() > 6.0  # it went through zero
@@ -101,7 +101,7 @@ def test_shafts_that_turn_on_through_zero(turns_hz: float) -> None:
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_cuts_change_nothing(seed: int) -> None:
+def test_results_do_not_depend_on_how_rows_are_cut(seed: int) -> None:
     rng = np.random.default_rng(seed)
     motion, keys = (sine(0.5, 50.0), {}) if seed == 1 else (polygon(100.0, 8), {"steady": True, "facets": True})
     rows, time_ns, _, _ = read(motion, 60_000.0, 0.04, BITS_17)
@@ -116,7 +116,7 @@ def test_cuts_change_nothing(seed: int) -> None:
         assert bend.tobytes() == acceleration.tobytes()
 
 
-def test_holds_back_little_and_keeps_little() -> None:
+def test_few_rows_are_delayed_and_stored() -> None:
     rows, time_ns, _, _ = read(sine(0.5, 50.0), 100_000.0, 0.1, BITS_17)
     motion = EncoderMotion()
     for part in np.split(np.arange(len(rows)), 40):

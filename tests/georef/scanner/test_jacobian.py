@@ -57,11 +57,11 @@ class Shots:
         self.motion = rng.uniform(-50.0, 50.0, 20), rng.uniform(-1e4, 1e4, 20)
 
     def model(self, calibration: Calibration) -> SensorModel:
-        """With these parameters."""
+        """Return the model with these parameters."""
         return SensorModel(calibration, self.case.geometry, mount=self.mount)
 
     def rays(self, calibration: Calibration, *, with_axes: bool = False) -> Rays:
-        """By the model."""
+        """Return the rays of the model."""
         rate, acceleration = self.motion
         rays = self.model(calibration).rays(
             self.rows,
@@ -83,7 +83,7 @@ def slope_of(points: list[FloatArray], step: float) -> FloatArray:
 
 @pytest.mark.parametrize("mount", [Mount(), ROLLING], ids=["rigid", "gimbal"])
 @pytest.mark.parametrize("kind", CASES)
-def test_parameters_against_central_differences(kind: str, mount: Mount) -> None:
+def test_parameter_derivatives_match_central_differences(kind: str, mount: Mount) -> None:
     case = CASES[kind]
     shots, calibration = Shots(case, mount), case.calibration()
     columns = parameter_columns_e(shots.rays(calibration, with_axes=True), shots.model(calibration), shots.trajectory)
@@ -104,7 +104,7 @@ def test_parameters_against_central_differences(kind: str, mount: Mount) -> None
         assert size > 0.0, name
 
 
-def test_observations_against_central_differences() -> None:
+def test_observation_derivatives_match_central_differences() -> None:
     case = CASES["polygon"]
     rows, time_ns = rows_of([-0.6, 0.1, 0.9], [900.0, 1500.0, 800.0], channel=[0, 1, 3]), np.full(3, 5_000_000)
     place = {"lat_rad": 0.82, "lon_rad": 0.15, "height_m": 1500.0}
@@ -173,7 +173,7 @@ def published_flight() -> Trajectory:
     return Trajectory(np.array([0, 1_000_000]), position, quaternions, unsaid, unsaid, unsaid)
 
 
-def test_printed_columns() -> None:
+def test_columns_match_the_formula_sheet() -> None:
     """By FORMULAS' header: its Δρ stands inside the scale, its Δθ has the other sign."""
     errors = dict(zip(("omega_rad", "phi_rad", "kappa_rad"), np.radians([0.05, -0.08, 0.03]), strict=True))
     errors |= {"range_offset_m": (1 + RANGE_SCALE) * OFFSET_M, "range_scale": RANGE_SCALE}
@@ -201,7 +201,7 @@ def test_printed_columns() -> None:
         assert ours[name] == pytest.approx(printed, rel=1e-8, abs=1e-6 if name != "encoder_latency_s" else 1e-4), name
 
 
-def test_first_order_effects_on_flat_ground() -> None:
+def test_first_order_effects_on_flat_ground_match_the_formula_sheet() -> None:
     """FORMULAS 5.3: level flight, H = 1000 m, θ = 20°; forward, right, down."""
     theta = np.radians(20.0)
     model = SensorModel(nominal("left", [0, 0, 0], np.eye(3)), LineGeometry())

@@ -24,18 +24,18 @@ ERRORS = {"omega_rad": 0.02, "phi_rad": -0.03, "kappa_rad": 0.05, "pitch_slope":
 
 
 def turned(angles_rad: np.ndarray) -> Rotation:
-    """Roll, pitch, yaw as an attitude."""
+    """Return roll, pitch and yaw as an attitude."""
     return Rotation.from_euler("ZYX", np.asarray(angles_rad)[..., ::-1])
 
 
-def test_rigid_mount() -> None:
+def test_rigid_mount_matches_its_matrix() -> None:
     rotation, shift, known = Mount().poses(np.arange(5))
     assert (rotation.shape, shift.shape, known.tolist()) == ((1, 3, 3), (1, 3), [1])
     assert np.array_equal(rotation[0], np.eye(3))
     assert not shift.any()
 
 
-def test_two_stages_outermost_first() -> None:
+def test_two_stages_are_applied_outermost_first() -> None:
     outer, inner = np.array([0.3, -0.2, 1.0]), np.array([-0.1, 0.4, 0.2])
     first, second = np.array([1.0, 0.2, -0.3]), np.array([0.1, -0.5, 0.4])
     mount = Mount((Stage(outer, first), Stage(inner, second)))
@@ -45,7 +45,7 @@ def test_two_stages_outermost_first() -> None:
     assert rotation[0] @ point + shift[0] == pytest.approx(want, abs=1e-14)
 
 
-def test_chain_of_a_moving_gimbal() -> None:
+def test_chain_of_a_moving_gimbal_uses_the_angles_of_each_pulse() -> None:
     """Boresight outside, installation inside, the head's own frame innermost; each pulse with its own angles."""
     rng = np.random.default_rng(4)
     series = AngleSeries(np.array([0, 40, 80]) * MS, np.array([[0.0, 0.1, 3.1], [0.2, -0.1, -3.1], [0.1, 0.0, -3.0]]))
@@ -73,7 +73,7 @@ def test_chain_of_a_moving_gimbal() -> None:
     assert np.abs(rays.arm_b - want).max() < 1e-10
 
 
-def test_head_with_axes_of_its_own_inside_a_gimbal() -> None:
+def test_a_head_with_its_own_axes_works_inside_a_gimbal() -> None:
     lidar = np.eye(4)
     lidar[:3, :3], lidar[:3, 3] = np.diag([-1.0, -1.0, 1.0]), (0.0, 0.0, 0.5)
     head = OusterGeometry(np.zeros(1), np.zeros(1), (0.0, 0.0), lidar)
@@ -94,15 +94,15 @@ def test_pulses_without_gimbal_angles_give_no_point() -> None:
     assert set(fates[[0, 3, 6]].tolist()) == {Fate.OUTSIDE_TRAJECTORY}
 
 
-def test_series_that_cannot_be() -> None:
+def test_impossible_angle_series_are_refused() -> None:
     with pytest.raises(MountError, match="gimbal angles: at least two epochs of roll, pitch and yaw are needed"):
         AngleSeries(np.array([1]), np.zeros((1, 3)))
     with pytest.raises(MountError, match="gimbal angles: time does not increase"):
         AngleSeries(np.array([1, 1]), np.zeros((2, 3)))
 
 
-def test_angles_a_device_tells_are_the_stages_own() -> None:
-    """Twice told, late, without a heading or a time: left out."""
+def test_angles_reported_by_a_device_are_those_of_the_stage() -> None:
+    """Angles that are repeated, late, or without heading or time are dropped."""
     rows = np.zeros(7, INS_DTYPE)
     rows["gps_ns"] = np.array([10, 20, 20, 15, 30, -1, 40]) * MS
     rows["gps_ns"][5] = -1
@@ -120,7 +120,7 @@ def test_angles_a_device_tells_are_the_stages_own() -> None:
         AngleSeries.of_solutions(rows[:1])
 
 
-def test_angles_of_two_recordings_are_of_the_time_of_both() -> None:
+def test_angles_of_two_recordings_cover_the_time_of_both() -> None:
     """Whatever was recorded first; nothing is known between them."""
     early = AngleSeries(np.array([0, 10]) * MS, np.full((2, 3), 0.1), max_gap_ns=20 * MS)
     late = AngleSeries(np.array([100, 110]) * MS, np.full((2, 3), 0.2), max_gap_ns=20 * MS)

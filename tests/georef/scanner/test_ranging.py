@@ -46,8 +46,8 @@ def longer_m(ticks: int, tick_hz: int, group_index: float, about_m: float) -> fl
         (10.00968871, 1.000276394225, 1500.0, 1e-6),  # and closes
     ],
 )
-def test_ranges_are_the_sheets(flight_us: float, group_index: float, range_m: float, within_m: float) -> None:
-    """By whole nanoseconds, of which the range is a share."""
+def test_ranges_match_the_formula_sheet(flight_us: float, group_index: float, range_m: float, within_m: float) -> None:
+    """Ranges follow from whole nanoseconds and the fraction of the range."""
     ticks = round(1e3 * flight_us)
     wanted_m = range_m * ticks / (1e3 * flight_us)
     assert longer_m(ticks, 10**9, group_index, range_m) == pytest.approx(wanted_m, abs=within_m)
@@ -56,12 +56,12 @@ def test_ranges_are_the_sheets(flight_us: float, group_index: float, range_m: fl
 @pytest.mark.parametrize(
     ("prf_hz", "range_m"), [(66_700, 2247.319775), (100_000, 1498.96229), (150_000, 999.3081933), (500_000, 299.792458)]
 )
-def test_zones_are_as_long_as_the_sheets(prf_hz: int, range_m: float) -> None:
+def test_zone_lengths_match_the_formula_sheet(prf_hz: int, range_m: float) -> None:
     assert longer_m(1000, 1000 * prf_hz, 1.0, range_m) == pytest.approx(range_m, abs=5e-7)
     assert longer_m(1000, 1000 * prf_hz, 1.0003, range_m) * 1.0003 == pytest.approx(range_m, abs=5e-7)
 
 
-def test_the_zone_of_a_range_is_the_sheets() -> None:
+def test_the_zone_of_a_range_matches_the_formula_sheet() -> None:
     ticks = 10**11 + 1000 * np.arange(20)  # 150 kHz by a counter of 150 MHz
     rows = np.zeros(20, RETURN_DTYPE)
     rows["device_time_ns"] = [int(tick) * 10**9 // 150_000_000 for tick in ticks]
@@ -73,7 +73,7 @@ def test_the_zone_of_a_range_is_the_sheets() -> None:
 
 
 @pytest.mark.parametrize(("range_m", "zone"), [(0.01, 0), (299.79, 0), (299.80, 1), (1000.0, 3)])
-def test_zones_at_500_khz_are_the_sheets(range_m: float, zone: int) -> None:
+def test_zones_at_500_khz_match_the_formula_sheet(range_m: float, zone: int) -> None:
     rows, true = train(lambda pulse, angle: [range_m], 50)
     found = fed(ZoneResolver(2000.0, range_m, slanted=False), rows)
     assert_true(found, true)
@@ -139,7 +139,7 @@ def assert_true(found: StructArray, true: StructArray) -> None:
     np.testing.assert_allclose(found["encoder_rad"], wanted["encoder_rad"], rtol=0, atol=1e-6)
 
 
-def test_continuity_finds_every_pulse() -> None:
+def test_continuity_assigns_every_pulse_its_zone() -> None:
     rows, true = train(flat(), 2500)
     resolver = ZoneResolver(2000.0, 960.0)
     found = fed(resolver, rows)
@@ -162,7 +162,7 @@ def test_the_zone_changes_with_the_scan_angle_and_the_ground() -> None:
     assert sum(resolver.counts.values()) < 12  # an echo may come with an emission, too far from anything
 
 
-def test_returns_of_a_pulse_come_together() -> None:
+def test_returns_of_one_pulse_get_the_same_zone() -> None:
     def forest(pulse: int, angle: float) -> list[float]:
         ground = 890.0 + 0.004 * pulse  # around the edge of the third zone, 899.4 m
         return [ground - above for above in (0.0, 2.5, 14.0)[: 1 + pulse % 3]]
@@ -175,7 +175,7 @@ def test_returns_of_a_pulse_come_together() -> None:
     assert len(found) == len(rows) - 3
 
 
-def test_jitter_counts_every_emission_from_its_own_time() -> None:
+def test_jitter_is_handled_by_each_emission_time() -> None:
     steps = np.random.default_rng(3).integers(1900, 2100, 2500)
     rows, true = train(flat(1234.5), 2500, steps, every_pulse=True)
     resolver = ZoneResolver(2500.0, 1200.0)
@@ -185,7 +185,7 @@ def test_jitter_counts_every_emission_from_its_own_time() -> None:
     assert not resolver.counts
 
 
-def test_missing_pulses_are_told_by_their_neighbours_only_where_these_know() -> None:
+def test_missing_pulses_are_inferred_only_from_neighbours_that_determine_them() -> None:
     def sparse(pulse: int, angle: float) -> list[float]:
         return [] if pulse % 23 in (5, 6) else [1000.0 / math.cos(angle)]
 
@@ -208,7 +208,7 @@ def test_missing_pulses_are_told_by_their_neighbours_only_where_these_know() -> 
     assert not resolver.counts
 
 
-def test_between_pulses_of_eleven_and_a_bit_ticks_nothing_is_guessed() -> None:
+def test_an_ambiguous_pulse_between_uneven_tick_steps_is_counted_as_a_gap() -> None:
     def sparse(pulse: int, angle: float) -> list[float]:
         return [] if pulse % 23 == 5 else [1000.0]
 
@@ -219,7 +219,7 @@ def test_between_pulses_of_eleven_and_a_bit_ticks_nothing_is_guessed() -> None:
     assert 6 < resolver.counts["mta_gap"] < 60  # where two steps are 23 ticks the middle one is not known
 
 
-def test_a_lost_datagram_costs_what_was_sent_before_it() -> None:
+def test_a_lost_datagram_costs_only_earlier_pulses() -> None:
     rows, true = train(flat(), 3000)
     datagram = rows["pulse_id"] >> 16
     resolver = ZoneResolver(2000.0, 1000.0)
@@ -229,7 +229,7 @@ def test_a_lost_datagram_costs_what_was_sent_before_it() -> None:
     assert len(found) == len(rows) - np.count_nonzero(datagram == 20) - 6
 
 
-def test_a_late_datagram_breaks_the_train_and_nothing_else() -> None:
+def test_a_late_datagram_only_breaks_the_pulse_train() -> None:
     rows, true = train(flat(), 3000)
     datagram = (rows["pulse_id"] >> 16).astype(int)
     order = np.argsort(np.where(datagram == 20, 21.5, datagram), kind="stable")
@@ -240,7 +240,7 @@ def test_a_late_datagram_breaks_the_train_and_nothing_else() -> None:
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_cuts_change_nothing(seed: int) -> None:
+def test_results_do_not_depend_on_how_rows_are_cut(seed: int) -> None:
     rng = np.random.default_rng(seed)
 
     def forest(pulse: int, angle: float) -> list[float]:
@@ -256,14 +256,14 @@ def test_cuts_change_nothing(seed: int) -> None:
         np.testing.assert_array_equal(again, whole)
 
 
-def test_whole_ranges_pass_as_they_are() -> None:
+def test_unambiguous_ranges_pass_unchanged() -> None:
     _, true = train(flat(), 500)
     resolver = ZoneResolver(2000.0)
     assert resolver.feed(true) is true
     assert not len(resolver.flush())
 
 
-def test_terrain_goes_before_continuity() -> None:
+def test_terrain_has_precedence_over_continuity() -> None:
     def cliff(pulse: int, angle: float) -> list[float]:
         return [(1000.0 if pulse // 500 % 2 else 870.0) / math.cos(angle)]
 
@@ -279,7 +279,7 @@ def test_terrain_goes_before_continuity() -> None:
     assert alone.counts["mta_ambiguous"] > 0.4 * len(rows)
 
 
-def test_between_zones_nothing_is_taken() -> None:
+def test_ranges_between_zones_are_dropped() -> None:
     zone_m = 299.792458  # 500 kHz
     rows, true = train(lambda pulse, angle: [1000.0], 500, every_pulse=True)
     for off, accepted in ((0.38, True), (-0.38, True), (0.42, False), (-0.42, False)):
@@ -292,7 +292,7 @@ def test_between_zones_nothing_is_taken() -> None:
     assert nothing.counts == {"mta_ambiguous": len(true)}
 
 
-def test_echoes_in_the_flash_of_a_later_pulse() -> None:
+def test_echoes_in_the_flash_of_a_later_pulse_are_resolved() -> None:
     zone_m = 299.792458  # 500 kHz
     rows, true = train(lambda pulse, angle: [3 * zone_m + (2.0 if pulse % 10 == 5 else 20.0)], 1000)
     resolver = ZoneResolver(2500.0, 3 * zone_m, slanted=False, blind_m=5.0)
@@ -302,7 +302,7 @@ def test_echoes_in_the_flash_of_a_later_pulse() -> None:
     assert (found["range_m"] > 3 * zone_m + 5.0).all()
 
 
-def test_ticks_that_are_no_whole_nanoseconds() -> None:
+def test_fractional_nanosecond_ticks_are_supported() -> None:
     # 70 MHz: a tick is 14.29 ns; the floor of nanoseconds would cost up to 15 cm
     ticks = 10**11 + 150 * np.arange(2000)
     rows = np.zeros(2000, RETURN_DTYPE)
@@ -318,7 +318,7 @@ def test_ticks_that_are_no_whole_nanoseconds() -> None:
     assert np.abs(floored["range_m"] - 1000.0).max() > 0.05
 
 
-def test_a_laser_that_rests_between_datagrams_leaves_no_gap_where_every_pulse_is_told() -> None:
+def test_a_laser_pause_leaves_no_gap_if_every_pulse_is_recorded() -> None:
     steps = np.full(1000, 2000)
     steps[500] = 2000 * 3 + 900  # 3.45 periods, between two datagrams
     rows, true = train(flat(1234.5), 1000, steps, every_pulse=True)
@@ -332,7 +332,7 @@ def test_a_laser_that_rests_between_datagrams_leaves_no_gap_where_every_pulse_is
     assert set(unsure.counts) == {"mta_gap"}  # how many pulses were between, the time does not say
 
 
-def test_rows_that_stand_there_for_their_neighbours_are_not_counted() -> None:
+def test_context_rows_are_not_counted() -> None:
     rows, _ = train(flat(), 300)
     resolver = ZoneResolver(2000.0, 1000.0)
     rows["flags"][:2] = 128
@@ -344,7 +344,7 @@ def test_rows_that_stand_there_for_their_neighbours_are_not_counted() -> None:
 
 
 @pytest.mark.parametrize("cuts", [(), (1, 399, 400, 401, 700)])
-def test_the_tick_rate_is_the_headers_from_a_pulse_on(cuts: tuple[int, ...]) -> None:
+def test_the_tick_rate_follows_the_header(cuts: tuple[int, ...]) -> None:
     """70 MHz, then, of another device, 150: its counter begins anew."""
     rows, zones_m = np.zeros(800, RETURN_DTYPE), []
     for part, hz in ((slice(0, 400), 70_000_000), (slice(400, 800), 150_000_000)):
@@ -364,7 +364,7 @@ def test_the_tick_rate_is_the_headers_from_a_pulse_on(cuts: tuple[int, ...]) -> 
     np.testing.assert_array_equal(found["device_time_ns"], wanted)
 
 
-def test_ticks_finer_than_device_times_are_gaps() -> None:
+def test_ticks_finer_than_device_times_give_gaps() -> None:
     rows, _ = train(flat(), 300, every_pulse=True)
     rates = PulseRates()
     rates.note(0, 0.0, 2_000_000_000)
@@ -377,7 +377,7 @@ def test_ticks_finer_than_device_times_are_gaps() -> None:
 
 
 @pytest.mark.parametrize("prf_hz", [250_000.0, 800_000.0])
-def test_apparent_ranges_on_the_wire_lead_back_to_their_pulse(prf_hz: float) -> None:
+def test_apparent_ranges_of_a_recording_are_assigned_to_their_pulse(prf_hz: float) -> None:
     table = scanner(zone="apparent", prf_hz=prf_hz, return_slots=3)
     zone_m = C_MPS / (2 * prf_hz)
     spoken: Spoken = speak(table, (2.0, 2.0 + 3000 / prf_hz), ranges_m=(1000.0, 1000.0 + 0.5 * zone_m))
@@ -406,6 +406,6 @@ def test_apparent_ranges_on_the_wire_lead_back_to_their_pulse(prf_hz: float) -> 
         ({"range_max_m": math.inf}, "range_max_m: got inf"),
     ],
 )
-def test_refuses_numbers_that_cannot_be(keys: dict[str, Any], says: str) -> None:
+def test_impossible_range_limits_are_refused(keys: dict[str, Any], says: str) -> None:
     with pytest.raises(RangingError, match=says):
         ZoneResolver(**({"range_max_m": 2000.0} | keys))

@@ -61,7 +61,7 @@ class Flights:
         return cls(time_ns.ravel(), lat, lon, height, np.stack([attitude, turned], axis=1).reshape(-1, 3))
 
     def trajectory(self) -> Trajectory:
-        """For the model."""
+        """Return the trajectory for the model."""
         still = np.zeros((len(self.time_ns), 3))
         return Trajectory.from_geodetic(
             self.time_ns, self.lat_rad, self.lon_rad, self.height_m, still, *self.attitude_rad.T, max_gap_ns=STEP_NS
@@ -103,7 +103,7 @@ class Shots:
         return cls(rows, time_ns, rng.uniform(-80.0, 80.0, count), rng.uniform(-2e4, 2e4, count))
 
     def rays(self, model: SensorModel, trajectory: Trajectory, *, with_axes: bool = False) -> Rays:
-        """By the model."""
+        """Return the rays of the model."""
         return model.rays(
             self.rows,
             self.time_ns,
@@ -143,7 +143,7 @@ def expected(case: Case, calibration: Calibration, flights: Flights, shots: Shot
 
 
 @pytest.mark.parametrize("kind", CASES)
-def test_everywhere_on_earth_with_every_error(kind: str) -> None:
+def test_the_model_is_exact_everywhere_on_earth_with_every_error(kind: str) -> None:
     case, rng = CASES[kind], np.random.default_rng(5)
     flights = Flights.all_over_the_earth(rng)
     shots = Shots.of(case, flights, rng)
@@ -156,7 +156,7 @@ def test_everywhere_on_earth_with_every_error(kind: str) -> None:
     assert (rays.time_ns == shots.time_ns + 1_300_000).all()
 
 
-def test_axes_belong_to_the_points() -> None:
+def test_axes_reproduce_the_points() -> None:
     """The arm in b, turned by the attitude that was taken, and put where the body was, is the point."""
     case, rng = CASES["spinning"], np.random.default_rng(6)
     flights = Flights.all_over_the_earth(rng)
@@ -252,13 +252,13 @@ def form_nga() -> FloatArray:
 
 
 @pytest.mark.parametrize("form", [form_9, form_10, form_11, form_nga])
-def test_four_forms_and_the_model_are_one(form: Callable[[], FloatArray]) -> None:
+def test_four_forms_of_the_equation_match_the_model(form: Callable[[], FloatArray]) -> None:
     rays = published_model().rays(rows_of(THETA, RANGE_M), np.array([4_000_000]), hovering())
     assert np.abs(form() - GROUND_E).max() < 1e-8 + 1e-8  # as printed
     assert np.abs(rays.points_e[0] - form()).max() < 1e-8 + 1e-8
 
 
-def test_sizes_of_the_misprints() -> None:
+def test_published_misprints_have_the_expected_size() -> None:
     truth = form_10()
     body_e, rot_e_l, rot_l_b, rot_b_s = matrices()
     beam_s = RANGE_M * beam()
@@ -269,7 +269,7 @@ def test_sizes_of_the_misprints() -> None:
     assert np.linalg.norm(transposed - truth) == pytest.approx(629.68402, abs=1e-5)
 
 
-def test_model_with_the_gimbal_of_nga_is_the_rigid_one() -> None:
+def test_the_model_with_a_fixed_gimbal_equals_the_rigid_model() -> None:
     """A stage that stands still with r_GIM, one that is the installation."""
     lever_gimbal = boresight(*BORESIGHT_RAD).T @ (0.4 * LEVER_ARM_B)
     mount = Mount((Stage(lever_arm=lever_gimbal), Stage(angles_rad=np.array([0.0, 0.0, np.pi]))))
@@ -281,7 +281,7 @@ def test_model_with_the_gimbal_of_nga_is_the_rigid_one() -> None:
     assert np.abs(rays.points_e[0] - GROUND_E).max() < 2e-8
 
 
-def test_small_corrections_have_their_sizes() -> None:
+def test_small_corrections_have_the_sizes_of_the_formula_sheet() -> None:
     """FORMULAS 9: encoder latency and IMU latency on the ground, H = 1000 m."""
     rows, time_ns = rows_of(0.0, 1000.0), np.array([4_000_000])
     model = SensorModel(UNIT.changed(encoder_latency_s=1e-6), LineGeometry())
@@ -349,8 +349,8 @@ def test_every_return_has_one_fate() -> None:
     ]
 
 
-def test_latencies_count_for_the_coverage() -> None:
-    """The attitude of a late IMU is asked after the pulse: at the trajectory's end there is none."""
+def test_latencies_count_for_the_trajectory_coverage() -> None:
+    """The attitude of a late IMU is needed after the pulse, where the trajectory may have ended."""
     ns = still_trajectory().time_ns[-1]
     base = UNIT
     rows = rows_of(np.zeros(3), np.full(3, 500.0))
@@ -372,14 +372,14 @@ def test_result_does_not_depend_on_the_batch() -> None:
         assert np.array_equal(piece.rays(model, trajectory).points_e, whole[part])
 
 
-def test_nothing_comes_of_nothing() -> None:
+def test_empty_input_gives_no_rays() -> None:
     model = SensorModel(UNIT, LineGeometry())
     assert len(model.rays(rows_of([], []), np.zeros(0, np.int64), still_trajectory(), with_axes=True).points_e) == 0
     rays = model.rays(rows_of(0.0, 10.0), np.array([5]), still_trajectory().between(-2, -1))
     assert rays.fate.tolist() == [Fate.OUTSIDE_TRAJECTORY]
 
 
-def test_range_offset_by_pulse_rate() -> None:
+def test_range_offset_is_applied_by_pulse_rate() -> None:
     calibration = replace(UNIT, range_offsets=(RangeOffset(0.5, prf_hz=1e5),))
     model = SensorModel(calibration, LineGeometry())
     rows, time_ns = rows_of(0.0, 100.0), np.array([5])
@@ -387,7 +387,7 @@ def test_range_offset_by_pulse_rate() -> None:
     assert ranges == [100.0, 100.5, 100.0]
 
 
-def test_encoder_motion_is_asked_for() -> None:
+def test_encoder_motion_is_required_with_an_encoder_latency() -> None:
     model = SensorModel(UNIT.changed(torsion_s2=1e-9), LineGeometry())
     assert model.needs_encoder_motion
     with pytest.raises(ValueError, match="calibration of left: encoder latency and torsion need the encoder's motion"):

@@ -75,7 +75,7 @@ class Geometry:
 
     @property
     def rot_e_from_l(self) -> FloatArray:
-        """(3, 3)."""
+        """Return the rotation (3, 3) from l to e."""
         columns: FloatArray = Rotation.from_euler("ZY", [self.lon_deg, -self.lat_deg - 90.0], degrees=True).as_matrix()
         return columns
 
@@ -97,7 +97,7 @@ class Geometry:
         )
 
     def covariance_e(self, noise: Noise, incidence_rad: FloatArray | None = None) -> FloatArray:
-        """(6,) of the point, 1.5 ms after the first epoch."""
+        """Return the covariance (6,) of the point, 1.5 ms after the first epoch."""
         rows = np.zeros(1, RETURN_DTYPE)
         rows["range_m"], rows["encoder_rad"] = self.range_m, self.encoder_rad
         rows["return_number"] = rows["number_of_returns"] = 1
@@ -168,7 +168,7 @@ def drawn_points_e(geometry: Geometry, rng: np.random.Generator, draws: int) -> 
 
 
 def as_matrix(six: FloatArray) -> FloatArray:
-    """(3, 3) of xx xy xz yy yz zz."""
+    """Return the (3, 3) matrix of xx xy xz yy yz zz."""
     xx, xy, xz, yy, yz, zz = six
     return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
@@ -183,7 +183,7 @@ def random_correlation(rng: np.random.Generator) -> FloatArray:
 
 
 @pytest.mark.slow
-def test_every_element_agrees_with_draws_of_all_inputs() -> None:
+def test_every_covariance_element_matches_sampled_inputs() -> None:
     rng = np.random.default_rng(5)
     worst = 0.0
     for k in range(GEOMETRIES):
@@ -201,7 +201,7 @@ def test_every_element_agrees_with_draws_of_all_inputs() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("stages", [0, 1])
-def test_covariances_and_axes_asked_together_are_those_asked_alone(stages: int) -> None:
+def test_covariances_and_axes_requested_together_equal_those_requested_alone(stages: int) -> None:
     rng = np.random.default_rng(5)
     geometry = random_geometry(rng, random_correlation(rng))
     count = 300  # more than a block of the kernel
@@ -246,19 +246,19 @@ def level(calibration: Calibration) -> Geometry:
 
 
 def sigmas_enu(geometry: Geometry, noise: Noise, incidence_rad: float | None = None) -> FloatArray:
-    """One sigma east, north, up."""
+    """Return one sigma east, north, up."""
     given = None if incidence_rad is None else np.array([incidence_rad])
     local = geometry.rot_e_from_l.T @ as_matrix(geometry.covariance_e(noise, given)) @ geometry.rot_e_from_l
     sigmas: FloatArray = np.sqrt(np.diag(local))[[1, 0, 2]]
     return sigmas
 
 
-def test_the_formula_sheets_sigmas() -> None:
+def test_sigmas_match_the_formula_sheet() -> None:
     noise = Noise(range_m=0.02, angle_rad=0.0, time_s=0.0)
     np.testing.assert_allclose(sigmas_enu(level(NOMINAL), noise), [0.0741, 0.0618, 0.0567], atol=5e-5)
 
 
-def test_a_slope_smears_the_range_by_the_footprint() -> None:
+def test_a_slope_widens_the_range_sigma_by_the_footprint() -> None:
     geometry = level(NOMINAL)
     noise = Noise(range_m=0.02, angle_rad=0.0, time_s=0.0, divergence_rad=5e-4)
     plain, smeared = sigmas_enu(geometry, noise), sigmas_enu(geometry, noise, np.radians(50.0))
@@ -267,12 +267,12 @@ def test_a_slope_smears_the_range_by_the_footprint() -> None:
     np.testing.assert_array_equal(sigmas_enu(geometry, noise, 0.0), plain)
 
 
-def test_a_trajectory_without_sigmas_gives_none() -> None:
+def test_a_trajectory_without_sigmas_gives_no_sigmas() -> None:
     geometry = replace(level(NOMINAL), attitude_sigma_rad=np.full(3, np.nan))
     assert np.isnan(geometry.covariance_e(NOISE)).all()
 
 
-def test_a_correlation_that_is_none_is_refused() -> None:
+def test_an_invalid_correlation_matrix_is_refused() -> None:
     wrong = np.eye(len(NAMES))
     wrong[0, 1] = wrong[1, 0] = 1.5
     calibration = replace(NOMINAL, sigmas=np.ones(len(NAMES)), correlation=wrong)
@@ -280,7 +280,7 @@ def test_a_correlation_that_is_none_is_refused() -> None:
         Uncertainty(calibration, NOISE)
 
 
-def test_an_encoder_latency_of_none_has_a_sigma_all_the_same() -> None:
+def test_a_zero_encoder_latency_with_a_sigma_still_contributes() -> None:
     sigmas = np.where(np.array(NAMES) == "encoder_latency_s", 1e-6, 0.0)
     geometry = replace(level(replace(NOMINAL, sigmas=sigmas)), encoder_rate=60.0)
     plain = replace(geometry, calibration=NOMINAL)
@@ -290,7 +290,7 @@ def test_an_encoder_latency_of_none_has_a_sigma_all_the_same() -> None:
     assert not SensorModel(NOMINAL, LineGeometry()).needs_encoder_motion
 
 
-def test_a_held_parameter_counts_in_points_and_cancels_with_what_was_estimated() -> None:
+def test_a_fixed_parameter_adds_to_sigmas_and_cancels_with_correlated_estimates() -> None:
     """A range offset held to 5 cm makes points 5 cm uncertain; a lever arm estimated beside it takes that back."""
     none, arm, offset = np.zeros(len(NAMES)), NAMES.index("lever_arm_z_m"), NAMES.index("range_offset_m")
     held, sigmas, correlation = none.copy(), none.copy(), np.eye(len(NAMES))

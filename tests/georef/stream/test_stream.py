@@ -60,7 +60,7 @@ def device_ns(seconds: float | np.ndarray[Any, Any]) -> Any:
 
 @dataclass
 class Echo:
-    """Takes time for easting, so that what came out shows what went in; counts how it was asked."""
+    """Model that writes time to easting so that the output shows its input, and counts its calls."""
 
     asked: list[int] = field(default_factory=list)
 
@@ -178,13 +178,13 @@ def ins_rows(times_s: np.ndarray[Any, Any]) -> StructArray:
 
 
 def errors_s(rig: Rig) -> np.ndarray[Any, Any]:
-    """Of the times given to returns."""
+    """Return errors of the times given to returns, s."""
     columns = np.concatenate([points.points_map[:, :2] for _, points in rig.placed])
     errors: np.ndarray[Any, Any] = np.abs(columns[:, 0] - columns[:, 1])
     return errors
 
 
-def test_returns_before_the_lock_are_held_and_then_placed() -> None:
+def test_returns_before_the_lock_wait_and_are_then_timed() -> None:
     rig = Rig().run(20.0)
     first_tick, first = rig.placed[0]
     assert 4.0 <= first_tick <= 5.2  # five edges make a train
@@ -222,7 +222,7 @@ def test_a_scanner_without_latch_runs_free_and_is_refused() -> None:
     assert sum(len(points) for _, points in worse.placed) > 900
 
 
-def test_a_lost_pulse_ends_the_points_when_its_sigma_has_grown() -> None:
+def test_after_a_lost_pulse_points_end_when_the_sigma_has_grown() -> None:
     """A device that is no more latched wanders by some 30 ns/s per √s: half a microsecond is soon passed."""
     tight = StreamSettings(max_time_sigma_ns=500.0)
     rig = Rig(tight, latch_s=(0.0, 10.0)).run(26.0)
@@ -234,8 +234,8 @@ def test_a_lost_pulse_ends_the_points_when_its_sigma_has_grown() -> None:
     assert errors_s(rig).max() < 3 * 0.5e-6
 
 
-def test_a_head_on_another_hour_is_not_believed() -> None:
-    """A Velodyne that is locked stamps past the UTC hour; one whose hour contradicts the host's is none."""
+def test_a_head_on_another_hour_is_refused() -> None:
+    """A locked Velodyne has timestamps past the UTC hour; one that contradicts the host's hour is refused."""
     for lag_s, placed in ((0.0, True), (700.0, False)):
         rig = Rig(name="top")
         past_hour_ns = (GPS_0 - 18 * SECOND_NS - round(lag_s * 1e9)) % (3600 * SECOND_NS)
@@ -256,7 +256,7 @@ def test_a_head_on_another_hour_is_not_believed() -> None:
             assert rig.fates() == {Fate.NO_TIME: 1200}
 
 
-def test_returns_wait_for_the_trajectory_and_no_longer_than_told() -> None:
+def test_returns_wait_for_the_trajectory_at_most_the_given_time() -> None:
     rig = Rig(ins_s=(0.0, 10.0)).run(10.0)
     before = rig.fates()[Fate.GEOREFERENCED]
     rig.run(11.9, since_s=10.0)
@@ -266,7 +266,7 @@ def test_returns_wait_for_the_trajectory_and_no_longer_than_told() -> None:
     assert rig.fates()[Fate.OUTSIDE_TRAJECTORY] == pytest.approx(200, abs=25)
 
 
-def test_a_gap_in_the_trajectory_is_counted_as_one() -> None:
+def test_a_gap_in_the_trajectory_is_counted_as_a_gap() -> None:
     rig = Rig(ins_s=(0.0, 8.0)).run(8.0)
     rig.ins_s = (8.5, 1e9)
     rig.run(15.0, since_s=8.0)
@@ -275,7 +275,7 @@ def test_a_gap_in_the_trajectory_is_counted_as_one() -> None:
     assert Fate.OUTSIDE_TRAJECTORY not in fates
 
 
-def test_queues_are_bounded_and_what_is_given_up_is_counted() -> None:
+def test_queues_are_bounded_and_dropped_returns_are_counted() -> None:
     rig = Rig(StreamSettings(max_rows=150), pps_s=(1e9, 1e9)).run(4.0)
     assert rig.stream.waiting("left") <= 150
     assert rig.fates() == {Fate.NO_TIME: rig.given - rig.stream.waiting("left")}
@@ -284,7 +284,7 @@ def test_queues_are_bounded_and_what_is_given_up_is_counted() -> None:
     assert rig.fates()[Fate.OUTSIDE_TRAJECTORY] > 1000
 
 
-def test_context_gives_no_points_and_is_counted_nowhere() -> None:
+def test_context_rows_give_no_points_and_are_not_counted() -> None:
     rig = Rig().run(8.0)
     rig.stream.advance(HOST_0 + 81 * TICK)
     before, waiting = rig.fates(), rig.stream.waiting("left")
@@ -295,8 +295,8 @@ def test_context_gives_no_points_and_is_counted_nowhere() -> None:
     assert sum(rig.fates().values()) == sum(before.values()) + waiting
 
 
-def test_what_is_left_out_is_handed_over_with_its_fate_and_what_is_known_of_its_time() -> None:
-    """Pulses without a return are none, and the margin's are not this piece's."""
+def test_discarded_returns_are_passed_on_with_their_fate_and_known_time() -> None:
+    """Pulses without a return and rows of the margin are not discarded returns."""
     rig = Rig(pps_s=(3.0, 1e9), ins_s=(4.0, 12.0))
     taken: list[tuple[StructArray, Int64Array, ByteArray]] = []
     rig.stream.chain("left").left_out = lambda rows, time_ns, fates, _: taken.append((rows, time_ns, fates))
@@ -331,7 +331,7 @@ def test_the_order_in_which_a_tick_is_fed_does_not_matter() -> None:
     assert len(digests[0]) > 30
 
 
-def test_complete_clocks_place_what_came_before_the_lock_and_do_not_depend_on_where_a_piece_begins() -> None:
+def test_complete_clocks_time_earlier_returns_whatever_the_start_of_the_piece() -> None:
     host = HostClocks(PLAN, keep_history=True)
     for second in range(30):
         edge, message = second_of(second)
@@ -362,7 +362,7 @@ def test_complete_clocks_place_what_came_before_the_lock_and_do_not_depend_on_wh
 
 @dataclass
 class Turning(Echo):
-    """Takes the encoder's rate for the height."""
+    """Model that writes the encoder's rate to the height."""
 
     given: GivenMotion = field(default_factory=GivenMotion)
 
@@ -372,7 +372,7 @@ class Turning(Echo):
         return points, fates
 
 
-def test_the_encoders_motion_is_that_of_the_row() -> None:
+def test_encoder_motion_belongs_to_its_row() -> None:
     """A shaft that turns evenly at 3 rad/s; what is there for its neighbours only tells, and gives no point."""
     rig, echo = Rig(), Turning()
     motion = EncoderMotion(steady=True)
@@ -396,7 +396,7 @@ def test_the_encoders_motion_is_that_of_the_row() -> None:
 
 @dataclass
 class PulsesInAir:
-    """Holds three returns back, and drops every tenth."""
+    """Resolver that delays three returns and drops every tenth."""
 
     counts: Counter[str] = field(default_factory=Counter)
     held: StructArray = field(default_factory=lambda: np.zeros(0, RETURN_DTYPE))
@@ -442,7 +442,7 @@ def test_returns_of_unknown_zone_get_the_time_of_their_emission() -> None:
     assert columns[:, 0] - columns[:, 1] == pytest.approx(-1e-5, abs=3e-6)
 
 
-def test_times_by_cells_are_those_of_the_device_clock() -> None:
+def test_interpolated_times_match_the_device_clock() -> None:
     """The quick way is within 2 ns of every row asked by itself; across a restart every row is asked."""
     rig = Rig().run(12.0)
     clocks, rows = rig.stream.clocks, return_rows(np.arange(9.0, 12.0, 0.0007))

@@ -35,8 +35,8 @@ def told(clocks: HostClocks, delay_ns: int, max_error_s: float, *, seconds: int,
 
 @pytest.mark.parametrize("ticks_s", [0, 1, 7])
 @pytest.mark.parametrize("delay_ms", [100, 800, 1200])
-def test_a_wall_clock_that_is_kept_decides_the_second_of_late_messages(delay_ms: int, ticks_s: int) -> None:
-    """As while recording: NMEA 0.8 s late is uncertain, 1.2 s late looks 0.2 s late, and chrony knows better."""
+def test_a_synchronised_wall_clock_decides_the_second_of_late_messages(delay_ms: int, ticks_s: int) -> None:
+    """As in recording: NMEA late by 0.8 s is uncertain, by 1.2 s looks 0.2 s late, and chrony decides."""
     plan = ClockPlan(OFFSET_NS, pps={"pps/main": PpsPlan(18)}, gnss={"gnss/rover": GnssPlan("pps/main")})
     clocks = HostClocks(plan, keep_history=True)
     told(clocks, delay_ms * 1_000_000, 0.01, seconds=400, ticks_s=ticks_s)
@@ -46,22 +46,22 @@ def test_a_wall_clock_that_is_kept_decides_the_second_of_late_messages(delay_ms:
     assert abs(HOST_NS - OFFSET_NS + status.offset_ns - START_NS) < 1_000_000
 
 
-def test_a_wall_clock_that_nobody_keeps_decides_nothing() -> None:
+def test_an_unsynchronised_wall_clock_decides_no_second() -> None:
     plan = ClockPlan(OFFSET_NS, pps={"pps/main": PpsPlan(18)}, gnss={"gnss/rover": GnssPlan("pps/main")})
     clocks = HostClocks(plan, keep_history=True)
     told(clocks, 800_000_000, math.inf, seconds=60, ticks_s=0)
     assert clocks.status("pps/main", HOST_NS + 60 * SECOND_NS).state is TimeState.COARSE
 
 
-def test_a_wall_clock_is_no_time_where_no_receiver_speaks() -> None:
-    """Its drift between readings is in no sigma, and what is missing could no longer be said."""
+def test_a_wall_clock_alone_gives_no_time() -> None:
+    """Its drift between readings is in no sigma, and a missing receiver could not be reported."""
     plan = ClockPlan(OFFSET_NS, pps={"pps/main": PpsPlan(18)}, gnss={"gnss/rover": GnssPlan(None)})
     clocks = HostClocks(plan, keep_history=True)
     told(clocks, 100_000_000, 0.01, seconds=60, ticks_s=1)
     assert clocks.status("pps/main", HOST_NS + 60 * SECOND_NS).state is TimeState.NO_TIME
 
 
-def test_a_receiver_in_local_time_is_said_beside_the_clock_that_recorded_it() -> None:
+def test_a_receiver_in_local_time_is_reported_beside_the_recording_clock() -> None:
     plan = ClockPlan(OFFSET_NS - 7200 * SECOND_NS, pps={"pps/main": PpsPlan(18)}, gnss={"gnss/rover": GnssPlan(None)})
     clocks = HostClocks(plan, keep_history=True)
     for second in range(30):

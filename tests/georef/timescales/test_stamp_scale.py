@@ -53,10 +53,10 @@ def absolute(gps: Int64Array, beside_gps_s: int) -> Int64Array:
 
 @pytest.mark.parametrize(("beside_s", "scale"), [(19, StampScale.TAI), (-LEAP, StampScale.UTC)])
 @pytest.mark.parametrize(("sigma_ns", "off_ns"), [(2e3, 0), (3e8, 250_000_000), (3e8, -250_000_000)])
-def test_ptp_stamps_are_found_and_keep_their_fraction(
+def test_ptp_timestamps_are_recognised_and_keep_their_fraction(
     beside_s: int, scale: StampScale, sigma_ns: float, off_ns: int
 ) -> None:
-    """Also by a host's clock that is good to some tenths of a second only."""
+    """This works with a host clock that is accurate to some tenths of a second only."""
     gps = truth_ns()
     stamps = absolute(gps, beside_s)
     found = judged(stamps, gps, sigma_ns=sigma_ns, off_ns=off_ns)
@@ -71,8 +71,8 @@ def test_a_capture_of_two_seconds_is_enough() -> None:
     assert judged(hour_stamps(gps), gps, past_hour=True).scale is StampScale.HOUR
 
 
-def test_absolute_stamps_of_no_known_scale_run_free_until_they_are_configured() -> None:
-    """A PTP master whose seconds are right and whose date is a second off: whole seconds by arrival, once so said."""
+def test_absolute_timestamps_of_unknown_scale_run_free_until_configured() -> None:
+    """A PTP master has right fractions and a date a second off, so arrivals decide once configured."""
     gps = truth_ns()
     stamps = absolute(gps, 20)
     found = judged(stamps, gps)
@@ -90,13 +90,13 @@ def test_a_counter_since_power_on_runs_free() -> None:
 
 
 def hour_stamps(gps: Int64Array, off_ns: int = 0, drift_ppm: float = 0.0) -> Int64Array:
-    """Time past the UTC hour."""
+    """Return time past the UTC hour, µs."""
     drifted = np.rint((gps - gps[0]) * drift_ppm * 1e-6).astype(np.int64)
     past: Int64Array = (gps - LEAP * NS + off_ns + drifted) % HOUR
     return past
 
 
-def test_stamps_of_a_locked_head_are_found_to_be_the_hours_of_utc() -> None:
+def test_timestamps_of_a_locked_head_are_recognised_as_hours_of_utc() -> None:
     """Across the turn of the hour, too."""
     gps = truth_ns() + 3570 * NS
     found = judged(hour_stamps(gps), gps, past_hour=True)
@@ -105,14 +105,14 @@ def test_stamps_of_a_locked_head_are_found_to_be_the_hours_of_utc() -> None:
 
 
 @pytest.mark.parametrize(("off_s", "drift_ppm"), [(1.0, 0.0), (-1.0, 0.0), (0.3, 0.0), (777.7, 12.0), (0.0, 30.0)])
-def test_stamps_that_stand_or_run_elsewhere_are_free(off_s: float, drift_ppm: float) -> None:
+def test_timestamps_that_do_not_follow_the_hour_run_free(off_s: float, drift_ppm: float) -> None:
     """A second off, anywhere in the hour, and once right but without a pulse: 30 ppm are 9 ms in five minutes."""
     gps = truth_ns(310, 0.1)
     found = judged(hour_stamps(gps, round(off_s * NS), drift_ppm), gps, past_hour=True)
     assert found.scale is StampScale.FREE
 
 
-def test_a_drift_within_the_limit_is_in_the_sigma() -> None:
+def test_a_drift_within_the_limit_is_included_in_the_sigma() -> None:
     """3 ppm over five minutes, 0.9 ms: the stamps are not as good as those of a head known to be locked."""
     gps = truth_ns(310, 0.1)
     stamps = hour_stamps(gps, 0, 3.0)
@@ -122,7 +122,7 @@ def test_a_drift_within_the_limit_is_in_the_sigma() -> None:
     assert found.sigma_ns >= worst_ns / 3
 
 
-def test_free_counters_are_hardly_ever_taken_for_the_hour() -> None:
+def test_free_counters_are_rarely_taken_for_the_hour() -> None:
     """600 starts, evenly over the hour: of them 0.1 s in 3600 s stand there by chance."""
     gps = truth_ns(20, 0.1)
     off = np.linspace(0, 3600, 600, endpoint=False) + 0.6
@@ -131,14 +131,14 @@ def test_free_counters_are_hardly_ever_taken_for_the_hour() -> None:
 
 
 @pytest.mark.parametrize("wanted", [StampScale.HOUR, StampScale.FREE])
-def test_the_configuration_decides(wanted: StampScale) -> None:
+def test_the_configured_scale_has_precedence(wanted: StampScale) -> None:
     gps = truth_ns()
     found = judged(hour_stamps(gps), gps, past_hour=True, wanted=wanted)
     assert found.scale is wanted
     assert found.text.startswith("as configured")
 
 
-def test_too_little_or_no_time_beside_is_no_judgement() -> None:
+def test_without_enough_data_or_a_time_no_scale_is_found() -> None:
     gps = truth_ns(10.9)
     sigma = np.full(len(gps), 2e3)
     assert judge(absolute(gps, 19), gps, sigma, LEAP, past_hour=False) is None
@@ -165,7 +165,7 @@ def errors(clock: DeviceClock, rows: StructArray, gps: Int64Array) -> tuple[NDAr
 
 
 @pytest.mark.parametrize("hour", [False, True])
-def test_a_clock_that_grows_finds_the_scale_after_some_seconds(hour: bool) -> None:
+def test_a_growing_clock_finds_the_scale_after_some_seconds(hour: bool) -> None:
     """Before it, the arrivals' 2 ms; from then on the stamps' own; the same however the rows are cut."""
     gps = truth_ns(60)
     stamps = hour_stamps(gps) if hour else absolute(gps, 19)
@@ -183,7 +183,7 @@ def test_a_clock_that_grows_finds_the_scale_after_some_seconds(hour: bool) -> No
     assert clock.stamps.scale is (StampScale.HOUR if hour else StampScale.TAI)
 
 
-def test_a_head_that_says_it_is_not_locked_is_not_judged() -> None:
+def test_a_head_that_reports_no_lock_is_not_judged() -> None:
     gps = truth_ns(60)
     rows = rows_of(hour_stamps(gps), gps, locked=0)
     clock = DeviceClock(host_clock(70), past_utc_hour=True, wanted=StampScale.AUTO)
@@ -192,7 +192,7 @@ def test_a_head_that_says_it_is_not_locked_is_not_judged() -> None:
     assert errors(clock, rows, gps)[1].min() > 1e6
 
 
-def test_stamps_that_jump_away_from_their_arrival_are_refused() -> None:
+def test_timestamps_that_jump_away_from_their_arrival_are_refused() -> None:
     """A PTP master whose date changes in flight: those stamps are counted, and have no time good enough."""
     gps = truth_ns(60)
     stamps = absolute(gps, 19)
@@ -208,7 +208,7 @@ def test_stamps_that_jump_away_from_their_arrival_are_refused() -> None:
     assert clock.status().refused["stamp_jump"] == len(gps) - half
 
 
-def test_a_head_that_is_set_by_ptp_after_its_start_has_the_time_from_then_on() -> None:
+def test_a_head_set_by_ptp_after_its_start_has_time_from_then_on() -> None:
     gps = truth_ns()
     stamps = absolute(gps, 19)
     begun = len(gps) // 3
@@ -221,7 +221,7 @@ def test_a_head_that_is_set_by_ptp_after_its_start_has_the_time_from_then_on() -
     assert judged(stamps, gps).scale is StampScale.FREE
 
 
-def test_stamps_that_change_their_scale_on_the_way_are_none() -> None:
+def test_timestamps_that_change_their_scale_are_refused() -> None:
     gps = truth_ns()
     stamps = np.where(np.arange(len(gps)) < len(gps) // 2, absolute(gps, 19), absolute(gps, -LEAP))
     found = judged(stamps, gps)
@@ -231,8 +231,8 @@ def test_stamps_that_change_their_scale_on_the_way_are_none() -> None:
 
 
 @pytest.mark.parametrize("later", [0, 1])
-def test_what_a_head_says_late_of_its_lock_leaves_the_stamps_before_to_their_own_judgement(later: int) -> None:
-    """Position packets that begin in the middle: the hour's stamps before them hold, whatever is said afterwards."""
+def test_a_late_lock_report_does_not_change_the_judgement_of_earlier_timestamps(later: int) -> None:
+    """Hour timestamps before the first position packet hold, whatever the packets report later."""
     gps = truth_ns(60)
     rows, half = rows_of(hour_stamps(gps), gps), len(gps) // 2
     rows["locked"][half:] = later

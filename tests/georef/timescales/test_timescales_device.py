@@ -46,7 +46,7 @@ def host_clock(seconds: int, *, message_s: float = 0.1, keep_history: bool = Tru
     return clock
 
 
-def test_an_edge_stamped_in_the_future_stops_no_clock() -> None:
+def test_an_edge_stamped_in_the_future_does_not_stop_the_clock() -> None:
     """One wrong line of a FIFO, an hour ahead: refused, and the edges that come then are taken."""
     clock = host_clock(30)
     before = dict(clock.edges_refused)
@@ -78,13 +78,13 @@ def rows_of(
 def errors_ns(
     clock: DeviceClock, true_s: NDArray[np.float64], host: NDArray[np.int64] | None = None
 ) -> NDArray[np.float64]:
-    """Error of device times of true seconds."""
+    """Return errors of device times of true seconds."""
     gps, sigma = clock.gps_from_device(device_ns(true_s), host)
     assert np.all(np.isfinite(sigma))
     return np.asarray((gps - START_S * NS) - np.rint(true_s * NS), dtype=np.float64)
 
 
-def test_latched_device_is_good_to_its_ticks() -> None:
+def test_a_latched_device_is_accurate_to_its_ticks() -> None:
     """100 ns ticks: between and after edges within 0.3 µs, whatever the datagrams' latency (up to 0.25 s)."""
     random = np.random.default_rng(1)
     clock = DeviceClock(host_clock(120))
@@ -98,7 +98,7 @@ def test_latched_device_is_good_to_its_ticks() -> None:
     assert (status.edges_used, status.segments) == (90, 1)
 
 
-def test_batches_give_what_one_gives() -> None:
+def test_batches_of_any_size_give_the_same_clock() -> None:
     """Rows in batches of any size make the same clock."""
     host = host_clock(60)
     times = np.arange(20.003, 50.0, 0.02)
@@ -120,7 +120,7 @@ def test_stalled_datagrams_do_not_shift_the_second() -> None:
     assert np.max(np.abs(errors_ns(clock, np.arange(21.0, 59.0, 0.1)))) < 300
 
 
-def test_refused_beyond_three_tenths() -> None:
+def test_latches_more_than_three_tenths_of_a_second_off_are_not_paired() -> None:
     """Latched edges the host saw 0.4 s off are not paired: arrivals are used instead, with a sigma that says so."""
     times = np.arange(20.003, 60.0, 0.02)
     clock = DeviceClock(host_clock(120))
@@ -129,7 +129,7 @@ def test_refused_beyond_three_tenths() -> None:
     assert sigma[0] > 1e6
 
 
-def test_missing_and_spurious_latches() -> None:
+def test_missing_latches_are_bridged_and_spurious_ones_refused() -> None:
     """A latch that stays away for 20 s is bridged; one between two seconds is refused and counted."""
     times = np.arange(20.003, 90.0, 0.02)
     rows = rows_of(times)
@@ -143,8 +143,8 @@ def test_missing_and_spurious_latches() -> None:
     assert np.max(np.abs(errors_ns(clock, np.arange(21.0, 89.0, 0.0371)))) < 300
 
 
-def test_a_first_latch_that_was_none() -> None:
-    """A spurious first latch makes all others look wrong: the chain begins anew and the time is right."""
+def test_a_spurious_first_latch_is_discarded() -> None:
+    """A spurious first latch makes all later ones look wrong: the chain restarts and the time is right."""
     times = np.arange(20.503, 60.0, 0.02)
     rows = rows_of(times)
     rows["pps_time_ns"][times < 21] = device_ns(20.2)
@@ -154,7 +154,7 @@ def test_a_first_latch_that_was_none() -> None:
 
 
 @pytest.mark.parametrize("pulses_from_s", [40.0, math.inf])
-def test_a_register_that_reads_zero_before_the_first_pulse_is_no_edge(pulses_from_s: float) -> None:
+def test_a_latch_register_of_zero_before_the_first_pulse_is_not_an_edge(pulses_from_s: float) -> None:
     """The device was switched on 0.2 s after a whole second; its latch reads 0 until a pulse comes, if one does."""
     times = np.arange(20.003, 60.0, 0.02)
     rows = rows_of(times)
@@ -172,7 +172,7 @@ def test_a_register_that_reads_zero_before_the_first_pulse_is_no_edge(pulses_fro
     assert np.all(sigma[times > pulses_from_s + 5.0] < 1e4)
 
 
-def test_restart_is_a_new_segment() -> None:
+def test_a_counter_restart_begins_a_new_segment() -> None:
     """The counter starts again from little: the host time chooses the segment; both are right."""
     times = np.arange(20.003, 60.0, 0.02)
     before, after = rows_of(times), rows_of(times + 50.0)
@@ -190,7 +190,7 @@ def test_restart_is_a_new_segment() -> None:
 
 
 def fed_whole_and_in_pieces(rows: StructArray, seconds: int) -> Iterator[DeviceClock]:
-    """As a log is read, and as it is followed."""
+    """Return a clock fed at once as a log is read, and one fed in pieces as it is followed."""
     for step in (len(rows), 37):
         clock = DeviceClock(host_clock(seconds), keep_history=True)
         for start in range(0, len(rows), step):
@@ -209,7 +209,7 @@ def head_rows(times: NDArray[np.float64], free: NDArray[np.bool_], free_s: NDArr
 
 @pytest.mark.parametrize("latched", [False, True])
 @pytest.mark.parametrize(("silent_s", "ahead_s"), [(0.02, 20.123), (0.02, 1.7e9), (60.0, -20.123)])
-def test_device_time_that_jumps_is_a_new_segment(silent_s: float, ahead_s: float, latched: bool) -> None:
+def test_a_jump_of_device_time_begins_a_new_segment(silent_s: float, ahead_s: float, latched: bool) -> None:
     """Set to another scale, or restarted while nothing came and further on by now: what host time contradicts."""
     times = np.arange(20.003, 60.0, 0.02)
     after = np.arange(times[-1] + silent_s, times[-1] + silent_s + 60.0, 0.02)
@@ -225,7 +225,7 @@ def test_device_time_that_jumps_is_a_new_segment(silent_s: float, ahead_s: float
         assert clock.status().segments == 2
 
 
-def test_label_that_comes_late_reaches_the_past() -> None:
+def test_a_late_label_applies_to_earlier_edges() -> None:
     """Edges latched before the host knew its second are labelled once it does."""
     host = PpsClock(18, keep_history=True)
     clock = DeviceClock(host)
@@ -243,7 +243,7 @@ def test_label_that_comes_late_reaches_the_past() -> None:
     assert np.max(np.abs(errors_ns(clock, times[60:]))) < 300
 
 
-def test_without_latch_the_least_delayed_count() -> None:
+def test_without_latch_the_least_delayed_arrivals_count() -> None:
     """Latency 1 ms plus an exponential tail of 5 ms mean: within the stated sigma, and never silently as if latched."""
     random = np.random.default_rng(2)
     clock = DeviceClock(host_clock(400))
@@ -258,7 +258,7 @@ def test_without_latch_the_least_delayed_count() -> None:
     assert np.max(np.abs(error)) < 3e6
 
 
-def test_hour_stamps_while_locked_only() -> None:
+def test_hour_timestamps_are_used_only_while_locked() -> None:
     """Velodyne: µs past the UTC hour, over its turn, while locked; before that from power-on, which is not UTC."""
     host = host_clock(7300, message_s=0.05)
     times = np.arange(100.0, 7200.0, 0.5)
@@ -277,7 +277,7 @@ def test_hour_stamps_while_locked_only() -> None:
     assert np.all(sigma[~locked] > 1e6)
 
 
-def test_a_head_that_loses_its_pulse_is_not_called_latched_meanwhile() -> None:
+def test_a_head_that_loses_its_pulse_is_not_treated_as_latched() -> None:
     """A head whose second is the edge while locked drifts by 20 ppm for a minute, then is set right again: 1.2 ms."""
     times = np.arange(20.003, 160.0, 0.02)
     free = (times >= 60.0) & (times < 120.0)
@@ -290,7 +290,7 @@ def test_a_head_that_loses_its_pulse_is_not_called_latched_meanwhile() -> None:
         assert np.max(error[~free]) < 300
 
 
-def test_a_pulse_that_is_missed_costs_no_returns() -> None:
+def test_a_missed_pulse_costs_no_returns() -> None:
     """Unlocked for one second in five, 20 ppm off then: 20 µs, and not the 2 ms of arrivals, no time for returns."""
     times = np.arange(21.003, 160.0, 0.02)
     free = times // 1.0 % 5 == 0
@@ -304,8 +304,8 @@ def test_a_pulse_that_is_missed_costs_no_returns() -> None:
 
 
 @pytest.mark.parametrize("off_s", [5.0, 1.0, -1.0])
-def test_hour_stamps_that_contradict_the_clock_are_refused(off_s: float) -> None:
-    """A head that says locked but is seconds off (by its receiver's old leap count) is not believed, but counted."""
+def test_hour_timestamps_that_contradict_the_clock_are_refused(off_s: float) -> None:
+    """A head reports lock but is seconds off because of its receiver's old leap count."""
     times = np.arange(100.0, 200.0, 0.5)
     rows = rows_of(times, latched=False, locked=1)
     rows["device_time_ns"] = np.rint((times + off_s) * 1e6).astype(np.int64) * 1000
@@ -316,7 +316,7 @@ def test_hour_stamps_that_contradict_the_clock_are_refused(off_s: float) -> None
     assert clock.status().refused["past_hour"] == len(rows)
 
 
-def test_nothing_known_is_said() -> None:
+def test_without_data_or_host_time_the_sigma_is_infinite() -> None:
     """No rows, or a host without time: sigma is inf, nothing raises."""
     empty = DeviceClock(PpsClock(18))
     assert math.isinf(empty.gps_from_device(np.array([5]))[1][0])

@@ -36,7 +36,7 @@ NOON = dt.date(2026, 11, 21)
 gps_times = st.integers(0, 4 * 10**9 * SECOND_NS)
 
 
-def test_formulas_12_check() -> None:
+def test_gps_time_matches_the_check_of_formulas_12() -> None:
     """2026-11-21T12:00:00Z with 18 leap seconds: the figures of FORMULAS 12."""
     gps = gps_ns_from_utc(NOON, 12 * HOUR_NS, 18)
     assert gps == CHECK_S * SECOND_NS
@@ -46,7 +46,7 @@ def test_formulas_12_check() -> None:
     assert las_adjusted_s(gps) == 479_297_618.0
 
 
-def test_las_zero() -> None:
+def test_las_time_zero_is_in_september_2011() -> None:
     """LAS adjusted time 0 is 2011-09-14 01:46:25 UTC (leap seconds 15)."""
     gps = gps_ns_from_utc(dt.date(2011, 9, 14), (1 * 3600 + 46 * 60 + 25) * SECOND_NS, 15)
     assert las_adjusted_s(gps) == 0.0
@@ -55,7 +55,7 @@ def test_las_zero() -> None:
 @pytest.mark.parametrize(
     ("day", "week"), [(dt.date(1999, 8, 22), 1024), (dt.date(2019, 4, 7), 2048), (dt.date(2038, 11, 21), 3072)]
 )
-def test_rollovers(day: dt.date, week: int) -> None:
+def test_week_rollovers_are_resolved_from_any_near_reference(day: dt.date, week: int) -> None:
     """The 10-bit week is 0 again on these days; the full one is found from any reference within 511 weeks."""
     found, of_week = week_from_gps(gps_ns_from_utc(day, 0, 0))
     assert (found, of_week) == (week, 0)
@@ -75,7 +75,7 @@ def test_leap_second_is_one_second_long() -> None:
     assert np.diff(times).tolist() == [SECOND_NS, SECOND_NS]
 
 
-def test_leap_table() -> None:
+def test_leap_second_table_grows_by_one_and_knows_its_end() -> None:
     """One more at each row; the table knows how far it reaches."""
     counts = [count for _, count in LEAP_SECOND_TABLE]
     assert counts == list(range(19))
@@ -85,7 +85,7 @@ def test_leap_table() -> None:
 
 
 @given(gps_times, st.integers(0, 30))
-def test_utc_and_unix_go_back_and_forth(gps: int, leap: int) -> None:
+def test_utc_and_unix_conversions_are_invertible(gps: int, leap: int) -> None:
     """GPS to UTC (or POSIX) and back is the identity; the date is the calendar's."""
     date, of_day = utc_from_gps(gps, leap)
     assert gps_ns_from_utc(date, of_day, leap) == gps
@@ -95,7 +95,7 @@ def test_utc_and_unix_go_back_and_forth(gps: int, leap: int) -> None:
 
 
 @given(st.integers(-3 * WEEK_NS, 3 * WEEK_NS))
-def test_week_difference_is_folded(difference: int) -> None:
+def test_week_differences_are_folded(difference: int) -> None:
     """Within half a week, and the same modulo a week."""
     folded = week_difference_ns(difference)
     assert -WEEK_NS // 2 <= folded < WEEK_NS // 2
@@ -103,7 +103,7 @@ def test_week_difference_is_folded(difference: int) -> None:
 
 
 @given(gps_times, st.integers(-300, 9_000), st.integers(-2, 2))
-def test_complete_time_repairs_the_week(gps: int, age_ms: int, weeks_off: int) -> None:
+def test_complete_time_corrects_the_week(gps: int, age_ms: int, weeks_off: int) -> None:
     """A wrong or missing week number beside a right time of week gives the right time, given the arrival's."""
     week, of_week = week_from_gps(gps + 3 * WEEK_NS)
     truth = gps_ns_from_week(week, of_week)
@@ -122,7 +122,7 @@ def test_complete_time_finds_the_day(gps: int) -> None:
     assert nearest_gps_ns(tag, gps + 11 * HOUR_NS, 18) == gps
 
 
-def test_complete_time_refuses_what_cannot_be() -> None:
+def test_complete_time_refuses_impossible_tags() -> None:
     """Tags far from the arrival, or that say too little, are not placed."""
     arrival = CHECK_S * SECOND_NS
     of_week = 561_618 * SECOND_NS
@@ -138,7 +138,7 @@ def test_complete_time_refuses_what_cannot_be() -> None:
 
 
 @given(gps_times, st.integers(-450, 900))
-def test_hour_stamps_find_their_hour(gps: int, off_ms: int) -> None:
+def test_hour_timestamps_find_their_hour(gps: int, off_ms: int) -> None:
     """Stamps past the UTC hour, across the hour's turn: placed within ± 30 min, believed up to 1 s old, 0.5 s ahead."""
     gps += WEEK_NS
     past = np.array([(gps - 18 * SECOND_NS) % HOUR_NS])
@@ -147,7 +147,7 @@ def test_hour_stamps_find_their_hour(gps: int, off_ms: int) -> None:
     assert believed[0]
 
 
-def test_hour_stamps_from_power_on_are_refused() -> None:
+def test_hour_timestamps_counted_from_power_on_are_refused() -> None:
     """A head without lock counts from power-on: its stamps are not near any clock's time and are not believed."""
     near = np.full(3, CHECK_S * SECOND_NS)
     past = np.array([5, 1500, 3599]) * SECOND_NS + SECOND_NS // 2

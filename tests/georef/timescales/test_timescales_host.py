@@ -34,7 +34,7 @@ def timeline(*, step_s: float = 0.0, keep_history: bool = True) -> HostTimeline:
     return line
 
 
-def test_raw_is_found_between_and_after_readings() -> None:
+def test_raw_clock_is_interpolated_between_and_extrapolated_after_readings() -> None:
     """Within 2 µs between readings and 10 µs where the slew changed."""
     line = timeline()
     raw = np.arange(0.05, 310.0, 0.037)
@@ -72,7 +72,7 @@ def test_torn_reading_is_refused() -> None:
     assert line.refused == 4
 
 
-def test_without_readings_raw_is_monotonic() -> None:
+def test_without_readings_raw_equals_monotonic() -> None:
     """No /clock channel: MONOTONIC is the best there is."""
     line = HostTimeline(CONSTANT)
     host = np.array([CONSTANT + 5, CONSTANT + 10 * NS])
@@ -80,7 +80,7 @@ def test_without_readings_raw_is_monotonic() -> None:
     assert line.raw_at(CONSTANT + 7) == 7
 
 
-def test_the_real_clocks_of_this_machine() -> None:
+def test_real_clocks_of_this_machine_are_mapped_within_a_millisecond() -> None:
     """Fed by this machine's clocks for 0.3 s: RAW read now is found within 1 ms."""
     line = HostTimeline(0)
     for _ in range(30):
@@ -105,7 +105,7 @@ def test_the_real_clocks_of_this_machine() -> None:
     st.sampled_from([50.0, 1500.0, 15e3, 300e3]),
     st.floats(-90.0, 90.0),
 )
-def test_never_a_wrong_second(
+def test_the_second_is_never_wrong(
     seed: int,
     delay_s: float,
     jitter_s: float,
@@ -130,7 +130,7 @@ def test_never_a_wrong_second(
 
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 40 * NS), st.integers(0, 3), st.integers(-3, 3)), max_size=60))
-def test_anything_may_come_in(items: list[tuple[int, int, int]]) -> None:
+def test_arbitrary_input_never_raises_or_gives_a_wrong_claim(items: list[tuple[int, int, int]]) -> None:
     """Edges and messages in any order, at any time, with any second: nothing raises, nothing is claimed falsely."""
     clock = PpsClock(18)
     for host, kind, off in items:
@@ -160,7 +160,7 @@ def test_time_is_monotone_and_continuous_across_a_relock() -> None:
     assert np.max(np.abs(np.diff(gps) / np.diff(hosts) - 1.0)) < 0.03
 
 
-def test_edges_that_move_a_little_spoil_no_second_before_them() -> None:
+def test_a_small_move_of_the_edges_spoils_no_earlier_second() -> None:
     """The receiver sets its pulse by 0.5 ms: near enough to what was that a chain could run through both."""
     clock = PpsClock(18, keep_history=True)
     true = np.arange(200) * NS

@@ -81,8 +81,8 @@ def test_all_messages_name_the_same_second(name: str, protocol: str, kinds: set[
 
 
 @pytest.mark.parametrize(("year", "leap"), [(2014, 16), (2016, 17), (2026, 18)])
-def test_a_leap_count_said_without_a_date_is_compared_with_that_of_the_recordings_day(year: int, leap: int) -> None:
-    """RMC labels the edges by the table; NAV-TIMELS, which has no date, then says the same count: nothing moves."""
+def test_a_leap_count_without_a_date_is_compared_with_that_of_the_recording_day(year: int, leap: int) -> None:
+    """RMC labels the edges by the table; NAV-TIMELS, without a date, then reports the same count."""
     date = dt.date(year, 5, 10)
     start_ns = gps_ns_from_utc(date, 12 * HOUR_NS, leap)
     clock = PpsClock()
@@ -123,8 +123,8 @@ def labelled(
 
 
 @pytest.mark.parametrize("stale", [13, 16, 17])
-def test_a_stale_count_holds_for_its_own_messages_and_moves_nobody_elses(stale: int) -> None:
-    """One receiver's UTC goes by a count of years ago, which it says; the other says none and is right."""
+def test_a_stale_leap_count_applies_only_to_its_own_receiver(stale: int) -> None:
+    """One receiver states a leap count of years ago for its UTC; the other states none and is right."""
     clock = PpsClock()
     errors = {"gnss/base": 0, "gnss/rover": 18 - stale}
     error_ns, sigma_ns = labelled(clock, dt.date(2026, 3, 10), errors, 18, {"gnss/rover": stale})
@@ -138,7 +138,7 @@ def test_a_stale_count_holds_for_its_own_messages_and_moves_nobody_elses(stale: 
 
 
 @pytest.mark.parametrize(("year", "leap"), [(2010, 15), (2014, 16), (2016, 17), (2018, 18)])
-def test_without_a_configured_count_the_table_of_the_date_is_taken(year: int, leap: int) -> None:
+def test_without_a_configured_leap_count_the_table_is_used(year: int, leap: int) -> None:
     clock = PpsClock()
     error_ns, _ = labelled(clock, dt.date(year, 5, 1), {"gnss/rover": 0}, leap, {})
     status = clock.status(HOST_0 + 60 * SECOND_NS)
@@ -154,7 +154,7 @@ def test_without_a_configured_count_the_table_of_the_date_is_taken(year: int, le
         (None, dt.date(2033, 5, 1), 20, "the built-in leap seconds end at 2026-06-28, and this is 2033-05-01"),
     ],
 )
-def test_a_guessed_count_is_never_locked_and_its_sigma_holds_the_error(
+def test_a_guessed_leap_count_never_locks_and_its_sigma_contains_the_error(
     assumed: int | None, date: dt.date, truth: int, doubt: str
 ) -> None:
     clock = PpsClock(assumed)

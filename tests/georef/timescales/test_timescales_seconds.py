@@ -70,7 +70,7 @@ class Case:
     wall: Callable[[int, int], tuple[int, bool]] | None = None  # second, true GPS ns: realtime ns, disciplined
 
     def run(self) -> tuple[Simulation, Outcome]:
-        """The simulation and what the clock made of it."""
+        """Return the simulation and the clock's outcome."""
         oscillator = Oscillator(SECONDS, seed=len(self.name), ramps=self.ramps)
         simulation = Simulation(self.start, oscillator, self.edges, self.senders, seed=len(self.name) + 7)
         clock = PpsClock(self.assumed_leap)
@@ -185,13 +185,13 @@ CASES = [
 
 
 def expected_events(case: Case) -> tuple[str, ...]:
-    """Those named, and for COARSE by delay the one that says why."""
+    """Return the named events, and for COARSE by delay its reason."""
     return ("second_ambiguous",) if case.steady is COARSE and case.events == ("second_known",) else case.events
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
-def test_no_wrong_second(case: Case) -> None:
-    """0 wrong seconds; the steady state is the one expected; the log says why."""
+def test_no_second_is_wrong(case: Case) -> None:
+    """No second is wrong, the steady state is as expected, and the log gives the reason."""
     _, outcome = case.run()
     assert outcome.wrong_seconds == 0
     late = outcome.counts(720 if case.name.startswith(("cold", "assumed")) else 30)
@@ -210,12 +210,12 @@ def test_the_simulated_time_is_long_enough() -> None:
 def simulate(
     senders: list[Sender], edges: Edges | None = None, clock: PpsClock | None = None, seconds: int = 2500
 ) -> tuple[Simulation, Outcome]:
-    """One run on its own."""
+    """Run one simulation."""
     simulation = Simulation(START, Oscillator(seconds, seed=5), edges or Edges(), senders, seed=11)
     return simulation, run(simulation, clock or PpsClock(18))
 
 
-def test_edges_stop_and_come_back() -> None:
+def test_holdover_follows_when_edges_stop_and_lock_returns_with_them() -> None:
     """HOLDOVER with a growing sigma; LOCKED at once when they are back; nothing relabelled."""
     _, outcome = simulate(nmea(), Edges(silent=lambda s: 1000 <= s < 1900))
     assert outcome.wrong_seconds == 0
@@ -226,7 +226,7 @@ def test_edges_stop_and_come_back() -> None:
     assert outcome.codes == ["second_known"]
 
 
-def test_lost_when_sigma_says_so() -> None:
+def test_holdover_ends_in_lost_when_the_sigma_passes_its_limit() -> None:
     """HOLDOVER ends in LOST where the sigma passes the limit; time is still given, with that sigma."""
     clock = PpsClock(18, lost_sigma_ns=20_000.0)
     _, outcome = simulate(nmea(), Edges(silent=lambda s: s >= 1000), clock)
@@ -236,7 +236,7 @@ def test_lost_when_sigma_says_so() -> None:
     assert max(outcome.sigmas_ns) <= 20_000.0
 
 
-def test_receiver_restart_off_phase() -> None:
+def test_a_receiver_restart_with_pulses_off_phase_gives_holdover() -> None:
     """A restarting receiver pulses at any phase and says its time is invalid: HOLDOVER meanwhile, then on as before."""
     edges = Edges(late_s=lambda s: 0.37 if 1000 <= s < 1100 else 0.0)
     _, outcome = simulate(nmea(valid=lambda s: not 1000 <= s < 1110), edges)
@@ -249,7 +249,7 @@ def test_receiver_restart_off_phase() -> None:
 @pytest.mark.parametrize("sender", ["bound to the edge before", "bound to the next edge", "NMEA"])
 @pytest.mark.parametrize("phase_s", [0.2, 0.45, 0.55, 0.8])
 @pytest.mark.parametrize("found_s", [5, 7, 12, 40])
-def test_a_receiver_that_pulses_before_it_knows_the_time(sender: str, phase_s: float, found_s: int) -> None:
+def test_pulses_before_a_receiver_has_time_name_no_second(sender: str, phase_s: float, found_s: int) -> None:
     """At any phase until it has the time, its messages invalid; then on the second: none is named by former pulses."""
     known: dict[str, Any] = {"valid": lambda s: s >= found_s}
     senders = {
@@ -272,8 +272,8 @@ def contradicted(free_s: int, seconds: int) -> Outcome:
     return simulate([Sender("TIME", week_tag(), bound=True, delay_s=0.1)], edges, seconds=seconds)[1]
 
 
-def test_edges_that_have_ended_are_held_against_new_ones_for_as_long_as_they_said_more() -> None:
-    """Told once, not with every edge; the new ones take over, aloud, when they have been there for twice as long."""
+def test_new_edges_replace_ended_ones_after_twice_their_duration() -> None:
+    """The contradiction is reported once; new edges take over, with an event, after twice the duration."""
     outcome = contradicted(100, 600)
     assert outcome.codes == ["second_known", "second_ambiguous", "relabelled"]
     (_, at), (taken_over_s, text) = [(s, text) for s, code, text in outcome.events if code != "second_known"]
@@ -286,14 +286,14 @@ def test_edges_that_have_ended_are_held_against_new_ones_for_as_long_as_they_sai
     assert np.abs(np.array(outcome.errors_ns)[late]).max() < 1e5
 
 
-def test_what_was_labelled_by_edges_that_were_given_up_is_doubtful_in_post_processing() -> None:
+def test_labels_from_rejected_edges_are_doubtful_in_post_processing() -> None:
     outcome = contradicted(100, 600)
     host_ns = np.array([HOST_START_NS + 50 * NS, HOST_START_NS + 500 * NS])
     _, sigma_ns = outcome.clock.gps_from_host(host_ns)
     assert sigma_ns[0] >= 1e9 > 1e5 > sigma_ns[1]
 
 
-def test_edges_at_a_new_phase_with_time() -> None:
+def test_edges_at_a_new_phase_are_relocked_and_logged() -> None:
     """Edges that move by 0.1 s (polarity swapped) and stay: relocked, and the log says by how much."""
     _, outcome = simulate(nmea(0.3), Edges(late_s=lambda s: 0.1 if s >= 1000 else 0.0))
     assert outcome.wrong_seconds == 0
@@ -302,7 +302,7 @@ def test_edges_at_a_new_phase_with_time() -> None:
     assert outcome.counts(1100)[LOCKED] == len(outcome.states) - 1100
 
 
-def test_receiver_restart_with_wrong_time_it_vouches_for() -> None:
+def test_a_restarted_receiver_with_a_wrong_valid_time_makes_the_state_coarse() -> None:
     """Valid but one second off for a while: the label is held, the state COARSE until they agree again."""
     _, outcome = simulate(nmea(error_s=lambda s: -1 if 1000 <= s < 1100 else 0))
     assert outcome.wrong_seconds == 0
@@ -326,7 +326,7 @@ def default_leap_count(seconds_ahead: int, wall: Callable[[int], int] | None) ->
 
 
 @pytest.mark.parametrize("seconds_ahead", [1, 2, 18])
-def test_a_disciplined_wall_clock_unmasks_a_default_leap_count(seconds_ahead: int) -> None:
+def test_a_synchronised_wall_clock_reveals_a_default_leap_count(seconds_ahead: int) -> None:
     """COARSE with the reason until the receiver knows; LOCKED from then on, never on a wrong second."""
     outcome = default_leap_count(seconds_ahead, lambda gps_ns: gps_ns)
     assert outcome.wrong_seconds == 0
@@ -336,7 +336,7 @@ def test_a_disciplined_wall_clock_unmasks_a_default_leap_count(seconds_ahead: in
     assert f"{seconds_ahead:+d} s against the disciplined wall clock: its leap seconds?" in outcome.events[0][2]
 
 
-def test_a_default_leap_count_nobody_contradicts_is_believed_until_it_has_changed_for_longer() -> None:
+def test_an_uncontradicted_default_leap_count_is_used_until_a_new_one_outlasts_it() -> None:
     """What no software can see (docs/time.md); once it changes, COARSE until the new one has lasted longer, aloud."""
     outcome = default_leap_count(2, None)
     assert outcome.counts(30, 700) == {LOCKED: 670}
@@ -350,13 +350,13 @@ def test_a_default_leap_count_nobody_contradicts_is_believed_until_it_has_change
     assert np.abs(np.array(outcome.errors_ns)[late]).max() < 1e5
 
 
-def test_a_wall_clock_of_another_hour_shakes_nothing() -> None:
+def test_a_wall_clock_of_another_hour_changes_nothing() -> None:
     outcome = default_leap_count(0, lambda gps_ns: gps_ns - 3600 * NS)
     assert outcome.wrong_seconds == 0
     assert outcome.counts(30)[LOCKED] == len(outcome.states) - 30
 
 
-def test_leap_count_said_relabels_in_one_logged_step() -> None:
+def test_a_reported_leap_count_relabels_all_seconds_in_one_logged_step() -> None:
     """Assumed 19, said 18: two events, all seconds since lock move together, history included."""
     senders = [Sender("RMC", UTC), time_gps(silent=lambda s: s < 500)]
     clock = PpsClock(19, keep_history=True)
@@ -370,7 +370,7 @@ def test_leap_count_said_relabels_in_one_logged_step() -> None:
     assert (status.leap_seconds, status.leap_origin) == (18, "receiver")
 
 
-def test_bound_message_corrects_a_label_aloud() -> None:
+def test_a_bound_message_corrects_a_label_and_is_logged() -> None:
     """Messages 1.2 s late look 0.2 s late: undetectable alone, and the label moves, logged, when TIM-TP comes."""
     senders = [*nmea(1.2), tim_tp()]
     senders[-1].silent = lambda s: s < 500
@@ -381,7 +381,7 @@ def test_bound_message_corrects_a_label_aloud() -> None:
     assert outcome.counts(520)[LOCKED] == len(outcome.states) - 520
 
 
-def test_messages_that_become_late_do_not_shake_a_held_label() -> None:
+def test_messages_that_become_late_do_not_change_a_held_label() -> None:
     """Edges carry the label on: a delay that grows from 0.3 s to 0.85 s is a warning, and the seconds stay right."""
     early = [Sender("RMC", UTC, delay_s=0.3, silent=lambda s: s >= 500)]
     late = [Sender("RMC", UTC, delay_s=0.85, silent=lambda s: s < 500)]
@@ -391,7 +391,7 @@ def test_messages_that_become_late_do_not_shake_a_held_label() -> None:
     assert outcome.counts(20) == {LOCKED: len(outcome.states) - 20}
 
 
-def test_table_is_enough_where_it_reaches() -> None:
+def test_the_leap_second_table_suffices_where_it_reaches() -> None:
     """UTC of 2019, nothing configured: the built-in table knows. Configured against it is a guess."""
     start = gps_second(dt.datetime(2019, 5, 1, tzinfo=dt.UTC), 18)
 
@@ -406,7 +406,7 @@ def test_table_is_enough_where_it_reaches() -> None:
     assert last(16) == (COARSE, "guess")
 
 
-def test_edges_may_be_told_after_their_messages() -> None:
+def test_edges_may_arrive_after_their_messages() -> None:
     """The PPS thread wakes 80 ms late, so messages 15 ms after an edge are told before it: the same seconds, LOCKED."""
     simulation = Simulation(START, Oscillator(300, seed=5), Edges(), nmea(0.015, 0.001), seed=11)
     told = sorted(simulation, key=lambda event: event[0] + (NS * 80 // 1000 if event[1] == "edge" else 0))
@@ -425,8 +425,8 @@ def test_edges_may_be_told_after_their_messages() -> None:
     assert [event.code for event in clock.drain_events()] == ["second_known"]
 
 
-def test_names_edge_can_be_overridden() -> None:
-    """A receiver whose sentence names the edge to come, told so by the configuration: the second is right."""
+def test_the_named_edge_can_be_configured() -> None:
+    """The sentence of this receiver names the next edge, as configured, and the second is right."""
     senders = [Sender("ZDA", UTC, delay_s=0.3, error_s=lambda s: 1)]
     simulation = Simulation(START, Oscillator(100, seed=5), Edges(), senders, seed=11)
     outcome = run(simulation, PpsClock(18, names_edge=NamesEdge.NEXT))
@@ -444,7 +444,7 @@ def test_delay_is_subtracted() -> None:
     assert np.mean(right.errors_ns[100:]) == pytest.approx(0, abs=100)
 
 
-def test_coarse_time_is_good_to_half_a_second() -> None:
+def test_coarse_time_is_accurate_to_half_a_second() -> None:
     """Without PPS the time is within its ± 0.5 s for any delay up to 0.7 s."""
     for delay in (0.01, 0.2, 0.5, 0.7):
         simulation, outcome = simulate([Sender("RMC", UTC, delay_s=delay)], Edges(silent=lambda s: True), seconds=200)
@@ -455,7 +455,7 @@ def test_coarse_time_is_good_to_half_a_second() -> None:
         assert status.sigma_ns == pytest.approx(0.3 * NS)
 
 
-def test_quantisation_of_the_edge_is_taken_off() -> None:
+def test_quantisation_of_the_edge_is_subtracted() -> None:
     """TIM-TP's qErr belongs to the edge it names: with it the edges fit several times better than without."""
     errors = np.rint(np.random.default_rng(3).uniform(-100.0, 100.0, 602))
 
@@ -477,7 +477,7 @@ def test_quantisation_of_the_edge_is_taken_off() -> None:
     assert noise(told=True) < 10.0
 
 
-def test_quantisation_told_after_the_edge() -> None:
+def test_quantisation_received_after_the_edge_corrects_it() -> None:
     """A message that names the previous edge corrects it afterwards, as if it had been known before."""
     errors = np.rint(np.random.default_rng(4).uniform(-100.0, 100.0, 602))
     clock = PpsClock(18)

@@ -35,7 +35,7 @@ def errors_s(simulation: Simulation, clock: PpsClock, from_s: int = 8, to_s: int
 
 @pytest.mark.parametrize("error_s", [1, 20, -1, 3600])
 @pytest.mark.parametrize("wrong_s", [20, 60, 140])
-def test_wrong_seconds_at_the_start_cost_nothing_after_the_flight(error_s: int, wrong_s: int) -> None:
+def test_wrong_seconds_at_the_start_are_corrected_after_the_flight(error_s: int, wrong_s: int) -> None:
     simulation, _, clock = flown(nmea(error_s=lambda s: error_s if s < wrong_s else 0))
     (line,) = clock.settle()
     wrong, sigma = errors_s(simulation, clock)
@@ -50,7 +50,7 @@ def test_wrong_seconds_at_the_start_cost_nothing_after_the_flight(error_s: int, 
 
 
 @pytest.mark.parametrize("error_s", [1, -1, 20])
-def test_tags_of_the_wrong_stretch_are_set_right_and_no_others(error_s: int) -> None:
+def test_only_the_tags_of_the_wrong_stretch_are_corrected(error_s: int) -> None:
     """By the arrival of each tag; messages that were stalled for more than a second are right all the same."""
     simulation, _, clock = flown(nmea(error_s=lambda s: error_s if s < 60 else 0, stalls=0.05))
     clock.settle()
@@ -62,7 +62,7 @@ def test_tags_of_the_wrong_stretch_are_set_right_and_no_others(error_s: int) -> 
     assert clock.tag_error_s("gnss/other", hosts, utc=True).tolist() == [0] * len(hosts)
 
 
-def test_a_wrong_stretch_in_flight_leaves_no_doubt_behind() -> None:
+def test_a_wrong_stretch_in_flight_is_not_doubtful_after_settling() -> None:
     simulation, outcome, clock = flown(nmea(error_s=lambda s: 1 if 100 <= s < 150 else 0))
     assert "second_ambiguous" in outcome.codes
     _, before = errors_s(simulation, clock)
@@ -73,7 +73,7 @@ def test_a_wrong_stretch_in_flight_leaves_no_doubt_behind() -> None:
     assert sigma.max() < 1e-3
 
 
-def test_a_flight_without_contradiction_is_not_changed_and_nothing_is_said() -> None:
+def test_a_flight_without_contradictions_is_unchanged_and_gives_no_event() -> None:
     simulation, _, clock = flown(nmea(stalls=0.1))
     before = errors_s(simulation, clock)
     assert clock.settle() == []
@@ -82,7 +82,7 @@ def test_a_flight_without_contradiction_is_not_changed_and_nothing_is_said() -> 
     assert np.array_equal(before[1], after[1])
 
 
-def test_receivers_that_contradict_each_other_all_along_are_not_outvoted() -> None:
+def test_receivers_that_always_contradict_each_other_are_not_outvoted() -> None:
     """Two kinds of messages of one receiver against one of another decide nothing; a refusal can name both."""
     senders = [*nmea(), Sender("RMC", UTC, source="gnss/base", error_s=lambda s: 1)]
     simulation, _, clock = flown(senders)
@@ -92,8 +92,8 @@ def test_receivers_that_contradict_each_other_all_along_are_not_outvoted() -> No
     assert clock.status(simulation.host_ns(SECONDS - 2)).state is TimeState.COARSE
 
 
-def test_receivers_that_contradict_each_other_one_after_the_other_are_refused() -> None:
-    """The second comes when the first has been silent for minutes, and names another second: nobody knows which."""
+def test_receivers_that_contradict_each_other_in_succession_are_refused() -> None:
+    """The second receiver begins minutes after the first and names another second, so neither can be trusted."""
     senders = [
         *nmea(silent=lambda s: s >= 100),
         Sender("RMC", UTC, source="gnss/base", error_s=lambda s: 1, silent=lambda s: s < 180),
@@ -114,7 +114,7 @@ def test_messages_bound_to_their_edges_outvote_any_number_of_others() -> None:
     assert np.abs(errors_s(simulation, clock)[0]).max() < 1e-4
 
 
-def test_seconds_of_edges_that_began_anew_are_settled_with_those_before() -> None:
+def test_seconds_of_restarted_edges_are_settled_with_earlier_ones_of_the_same_phase() -> None:
     """The edges pause and come back at the same phase: the wrong start is that of the former ones alone."""
     edges = Edges(late_s=lambda s: 0.1 if 40 <= s < 60 else 0.0)
     simulation, _, clock = flown(nmea(0.3, error_s=lambda s: 1 if s < 30 else 0), edges=edges)
@@ -123,7 +123,7 @@ def test_seconds_of_edges_that_began_anew_are_settled_with_those_before() -> Non
     assert np.abs(wrong).max() < 1e-4
 
 
-def test_in_flight_a_label_moves_when_its_source_contradicts_it_for_longer_than_it_supported_it() -> None:
+def test_a_label_moves_in_flight_when_contradiction_outlasts_support() -> None:
     simulation, outcome, clock = flown(nmea(error_s=lambda s: 20 if s < 60 else 0))
     assert outcome.codes == ["second_known", "second_ambiguous", "relabelled", "second_confirmed"]
     at_s, text = next((second, text) for second, code, text in outcome.events if code == "relabelled")

@@ -44,7 +44,7 @@ def errors(noise_ns: float, ramps: bool, ahead_s: float = 60.0) -> tuple[np.ndar
 @pytest.mark.slow
 @pytest.mark.parametrize("noise_ns", [KERNEL_NS, USER_NS])
 @pytest.mark.parametrize("ramps", [False, True])
-def test_sigma_is_honest(noise_ns: float, ramps: bool) -> None:
+def test_clock_errors_are_as_large_as_their_sigma(noise_ns: float, ramps: bool) -> None:
     """Normalised RMS within 0.8 … 1.25, locked and 60 s into holdover."""
     locked, locked_sigma, ahead, ahead_sigma = errors(noise_ns, ramps)
     figures = rms(locked / locked_sigma), rms(ahead / ahead_sigma)
@@ -52,28 +52,28 @@ def test_sigma_is_honest(noise_ns: float, ramps: bool) -> None:
     assert 0.8 <= figures[1] <= 1.25, figures
 
 
-def test_kernel_stamps_are_good_to_a_microsecond() -> None:
+def test_kernel_timestamps_are_accurate_to_a_microsecond() -> None:
     """Without ramps, 1.5 µs stamps: better than 1 µs rms locked and 5 µs after 60 s of holdover."""
     locked, _, ahead, _ = errors(KERNEL_NS, False)
     assert rms(locked) < 1_000.0
     assert rms(ahead) < 5_000.0
 
 
-def test_user_space_stamps_profit_from_a_longer_memory() -> None:
+def test_user_space_timestamps_profit_from_a_longer_memory() -> None:
     """300 µs stamps without ramps: better than a fixed 64 s window can be (60 µs, ACQUISITION 5.3)."""
     locked, _, _, _ = errors(USER_NS, False)
     assert rms(locked) < 60_000.0
 
 
-def test_no_error_is_beyond_all_sigma() -> None:
+def test_no_locked_error_exceeds_six_sigmas() -> None:
     """Once settled, no locked error is beyond 6 sigma without ramps: outliers and spurious edges are kept out."""
     for noise_ns in (KERNEL_NS, USER_NS):
         locked, sigma, _, _ = errors(noise_ns, False)
         assert float(np.max(np.abs(locked / sigma))) < 6.0
 
 
-def test_stamp_noise_is_told() -> None:
-    """The status says the noise of the stamps as it is, within 25 %."""
+def test_timestamp_noise_is_reported() -> None:
+    """The status reports the noise of the timestamps within 25 %."""
     for noise_ns in (50.0, KERNEL_NS, 15e3, USER_NS):
         simulation = Simulation(START, Oscillator(900, seed=2), Edges(noise_ns=noise_ns), [], seed=2)
         outcome = run(simulation, PpsClock(18))
@@ -101,7 +101,7 @@ def test_history_interpolates_gaps_from_both_sides() -> None:
     assert outcome.states[1700] is TimeState.HOLDOVER
 
 
-def test_history_before_the_first_label() -> None:
+def test_history_labels_edges_before_the_first_label() -> None:
     """Edges seen before their second was known are labelled afterwards."""
     simulation = Simulation(
         START, Oscillator(200, seed=9), Edges(), [Sender("TIME", week_tag(), silent=lambda s: s < 100)], seed=9
@@ -125,7 +125,7 @@ def test_live_memory_is_bounded() -> None:
     assert len(train._numbers) == 10 * len(train._whole)
 
 
-def test_a_chain_whose_edges_lie_nowhere_near_its_line_says_its_own_noise() -> None:
-    """As one made of stray edges by chance: 5 ms to either side, of which the tolerance of 2 ms sees none."""
+def test_a_chain_with_scattered_edges_reports_its_own_noise() -> None:
+    """Stray edges may form such a chain: 5 ms to either side, while only those within 2 ms fit."""
     chain = [(second, 1_000_000_000 * second + 10_000_000 * (second % 2)) for second in range(10)]
     assert _chain_noise_ns(chain, [host for _, host in chain]) > 5_000_000

@@ -45,7 +45,7 @@ def same(one: Trajectory, other: Trajectory, metres: float, radians: float) -> N
 # -------------------------------------------------------------------------------------------------- CSV
 
 
-def test_csv_written_is_read() -> None:
+def test_a_written_csv_is_read_back() -> None:
     trajectory = flown(100)
     back = read(csv_text(trajectory))
     same(back, trajectory, 2e-5, 1e-9)
@@ -53,7 +53,7 @@ def test_csv_written_is_read() -> None:
     np.testing.assert_allclose(back.attitude_sigma_rad, trajectory.attitude_sigma_rad, atol=2e-9)
 
 
-def test_csv_by_hand() -> None:
+def test_a_csv_written_by_hand_is_read() -> None:
     """Times to the nanosecond, sigmas absent or in another order."""
     rows = [
         "1479297618000000001,47.5,8.9,900,60,0,-1,1.5,-2,359.5",
@@ -79,7 +79,7 @@ def degrees_as_radians(text: str) -> str:
     return "\n".join([lines[0], *(",".join(row) for row in rows)])
 
 
-def test_csv_that_is_wrong_is_refused() -> None:
+def test_a_wrong_csv_is_refused() -> None:
     good = csv_text(flown(100))
     lines = good.splitlines()
     swapped = good.replace("lat_deg,lon_deg", "lon_deg,lat_deg")
@@ -109,7 +109,7 @@ def test_a_gap_takes_no_memory() -> None:
     assert most < 2_000_000
 
 
-def test_a_trajectory_that_is_all_gaps_is_refused() -> None:
+def test_a_trajectory_with_gaps_only_is_refused() -> None:
     lines = csv_text(flown(100)).splitlines()
     line = refusal("\n".join([lines[0], *lines[1::4]]))
     assert "its epochs are 0.200 s apart, and epochs more than 0.150 s apart count as a gap: export it at 10 Hz" in line
@@ -238,7 +238,7 @@ def separated(mark: str, comma: bool, dms_cells: bool = False) -> str:
         ("  ", True, False),
     ],
 )
-def test_waypoint_columns_may_stand_apart_by_marks(mark: str, comma: bool, dms_cells: bool) -> None:
+def test_waypoint_columns_may_be_separated_by_delimiters(mark: str, comma: bool, dms_cells: bool) -> None:
     text = separated(mark, comma, dms_cells)
     trajectory = read(f"{text.rstrip()} 1" if mark == "  " else text)  # an empty cell is none between blanks
     assert trajectory.span == (START_NS, START_NS + 300_000_000)
@@ -248,19 +248,19 @@ def test_waypoint_columns_may_stand_apart_by_marks(mark: str, comma: bool, dms_c
     assert np.degrees([angle[3] for angle in trajectory.attitude()]) == pytest.approx([1.5, -2.5, 359.0])
 
 
-def test_waypoint_decimal_commas_between_commas_name_what_to_export() -> None:
+def test_error_for_waypoint_decimal_commas_names_the_export_setting() -> None:
     told = refusal(separated(",", True))
     assert "decimal commas cannot be distinguished from commas between columns; export it with decimal points" in told
 
 
-def test_waypoint_sigmas_are_scaled_back_to_one() -> None:
+def test_waypoint_sigmas_are_scaled_back_to_one_sigma() -> None:
     trajectory = flown(100)
     twice = HEAD.replace("Position: 1.0000", "Position: 2.0000")
     back = read(export(trajectory, weeks(trajectory), *WEEKS, head=twice))
     np.testing.assert_allclose(back.position_sigma_l, trajectory.position_sigma_l / 2, atol=1e-6)
 
 
-def test_waypoint_degrees_with_decimals_and_units_without_brackets() -> None:
+def test_waypoint_decimal_degrees_and_units_without_brackets_are_read() -> None:
     rows = [f"{WEEK} {SECOND}.{i}00 {SECOND - 18}.{i}00 121.0000{i} 31.0 10.5 359.0 1.0 -2.0" for i in range(4)]
     titles = "Week     GPSTime     UTCTime       Longitude       Latitude     H-Ell     Heading      Pitch      Roll"
     units = "week       (sec)       (sec)           (deg)          (deg)       (m)       (deg)      (deg)     (deg)"
@@ -290,7 +290,7 @@ def dates(trajectory: Trajectory, form: str, leap_s: int = 0) -> list[str]:
         ("Date UTCTime", "(YMD) (HMS)", "%Y/%m/%d %H:%M:%S.%f", {"leap_seconds": 18}),
     ],
 )
-def test_waypoint_times(titles: str, units: str, form: str | None, settings: dict[str, Any]) -> None:
+def test_waypoint_times_are_read(titles: str, units: str, form: str | None, settings: dict[str, Any]) -> None:
     trajectory = flown(100)
     seconds = [time.split()[1] for time in weeks(trajectory)]
     times = seconds if form is None else dates(trajectory, form, 18 if "UTC" in titles else 0)
@@ -325,7 +325,7 @@ def test_waypoint_utc_takes_the_offset_of_its_header() -> None:
     assert "this program knows leap seconds only until 2026-06-28; export it in GPS time" in refusal(unsure)
 
 
-def test_waypoint_that_is_wrong_is_refused() -> None:
+def test_a_wrong_waypoint_export_is_refused() -> None:
     trajectory = flown(100)
     good = export(trajectory, weeks(trajectory), *WEEKS)
     lines = good.splitlines()
@@ -352,15 +352,15 @@ def test_waypoint_that_is_wrong_is_refused() -> None:
         ("(m)    (deg)", "(m)   (amin)", "its sigma roll is in (amin); export it in (deg) or (rad)"),
     ],
 )
-def test_waypoint_in_other_units_is_refused(units: str, others: str, says: str) -> None:
-    """900 ft are not 900 m, and nothing else in the file would tell."""
+def test_waypoint_export_in_other_units_is_refused(units: str, others: str, says: str) -> None:
+    """Heights of 900 ft would otherwise be read as 900 m without any other sign."""
     trajectory = flown(100)
     text = export(trajectory, weeks(trajectory), *WEEKS)
     assert text.count(units) == 1
     assert says in refusal(text.replace(units, others))
 
 
-def test_waypoint_yaw_is_no_heading() -> None:
+def test_waypoint_yaw_is_not_taken_for_heading() -> None:
     """It counts from north to west: 350° of it is a heading of 10°."""
     trajectory = flown(100)
     text = export(trajectory, weeks(trajectory), *WEEKS)
@@ -396,7 +396,7 @@ def positions(text: str, **settings: Any) -> Trajectory:
     return read(text, needs_attitude=False, **settings)
 
 
-def test_rtklib_positions_of_a_drive() -> None:
+def test_rtklib_positions_of_a_drive_are_read() -> None:
     """243 258.499 s of week 2374 by the data set's own notes; sigmas and velocities as printed."""
     drive = positions(DRIVE)
     assert drive.time_ns.tolist() == [2374 * 604_800 * 10**9 + ms * 10**6 for ms in (243_258_499, 243_258_749)]
@@ -409,7 +409,7 @@ def test_rtklib_positions_of_a_drive() -> None:
     assert "has positions but no attitude; georeferencing needs roll, pitch and heading" in refusal(DRIVE)
 
 
-def test_rtklib_week_and_seconds_utc_degrees_minutes_and_separators() -> None:
+def test_rtklib_weeks_utc_degrees_minutes_and_separators_are_read() -> None:
     gpst = positions(DRIVE)
     by_week = DRIVE.replace("2025/07/08 19:34:18.499", "2374 243258.499").replace(
         "2025/07/08 19:34:18.749", "2374 243258.749"
@@ -430,7 +430,7 @@ def test_rtklib_week_and_seconds_utc_degrees_minutes_and_separators() -> None:
     np.testing.assert_array_equal(positions(commas).position_e, gpst.position_e)
 
 
-def test_rtklib_earth_centred_positions_and_their_sigmas() -> None:
+def test_rtklib_earth_centred_positions_and_their_sigmas_are_read() -> None:
     """The covariance of north, east, down 1, 2, 3 cm, turned to ECEF by differences of PROJ, comes back."""
     place = np.array([-60.0, 47.5, 600.0])
     to_e = np.stack(
@@ -456,7 +456,7 @@ def test_rtklib_earth_centred_positions_and_their_sigmas() -> None:
     assert found.position_e[0] == pytest.approx([x, y, z], abs=1e-4)
 
 
-def test_rtklib_that_is_wrong_is_refused() -> None:
+def test_a_wrong_rtklib_file_is_refused() -> None:
     assert "heights are above the geoid; export ellipsoidal heights" in refusal(
         ELLIPSOIDAL.replace("ellipsoidal", "geodetic") + DRIVE
     )
@@ -473,5 +473,5 @@ def test_rtklib_that_is_wrong_is_refused() -> None:
 
 
 @pytest.mark.parametrize("text", ["<kml></kml>", "time lat lon\n1 2 3\n", "% a comment\n1 2 3\n", " \n"])
-def test_other_texts_are_no_trajectory(text: str) -> None:
+def test_other_text_files_are_refused_as_trajectories(text: str) -> None:
     assert "is not a trajectory; give SBET, Waypoint text, RTKLIB .pos or trajectory CSV" in refusal(text)

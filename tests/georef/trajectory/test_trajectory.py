@@ -58,7 +58,7 @@ def attitude_by_scipy(lat_rad: Any, lon_rad: Any, roll_rad: Any, pitch_rad: Any,
 # ------------------------------------------------------------------------------------------- interpolation
 
 
-def test_attitude_between_epochs_is_scipys_slerp() -> None:
+def test_attitude_between_epochs_matches_scipys_slerp() -> None:
     trajectory = wild()
     at = inside(trajectory)
     seconds = (trajectory.time_ns - START_NS) / 1e9
@@ -67,7 +67,7 @@ def test_attitude_between_epochs_is_scipys_slerp() -> None:
     assert difference.max() < 1e-12  # 1e-9 m at a kilometre; the turns are up to π
 
 
-def test_small_turns_are_scipys_slerp_too() -> None:
+def test_small_rotations_match_scipys_slerp() -> None:
     n = 200
     wobble = np.radians(15.0) * np.sin(np.arange(n) / 9.0)
     trajectory = wild(n, roll_rad=wobble, pitch_rad=wobble[::-1], heading_rad=np.radians(355) + wobble)
@@ -91,7 +91,7 @@ def test_position_velocity_and_sigmas_are_linear_in_time() -> None:
         np.testing.assert_allclose(getattr(poses, name), expected, rtol=0, atol=3e-9, err_msg=name)
 
 
-def test_height_goes_the_right_way_in_a_climb() -> None:
+def test_height_follows_a_climb_between_epochs() -> None:
     """A quarter of the way up is a quarter of the climb: PDAL's filters.georeference weighs the two ends swapped."""
     two: dict[str, Any] = {"lat_rad": [0.8, 0.8], "lon_rad": [0.1, 0.1], "height_m": [500.0, 500.02]}
     trajectory = wild(2, time_ns=START_NS + np.array([0, 20 * MS]), **two)
@@ -100,7 +100,7 @@ def test_height_goes_the_right_way_in_a_climb() -> None:
     assert height == pytest.approx(500.005, abs=1e-8)
 
 
-def test_turn_rate_is_that_of_a_steady_turn() -> None:
+def test_turn_rate_matches_a_steady_turn() -> None:
     """0.3 rad/s of roll at 200 Hz, over ground that stands still."""
     n, rate = 100, 0.3
     times = START_NS + 5 * MS * np.arange(n)
@@ -112,7 +112,7 @@ def test_turn_rate_is_that_of_a_steady_turn() -> None:
     np.testing.assert_allclose(trajectory.turn_rates_b("l"), np.tile([rate, 0, 0], (n - 1, 1)), atol=1e-11)
 
 
-def test_relative_to_inertial_space_the_earth_turns_too() -> None:
+def test_inertial_turn_rate_includes_earth_rotation() -> None:
     """Level and north at the equator and at rest, the earth's rate is all about x; at the pole all about −z."""
     n = 4
     rest: dict[str, Any] = {key: np.zeros(n) for key in ("roll_rad", "pitch_rad", "heading_rad", "lon_rad")}
@@ -121,7 +121,7 @@ def test_relative_to_inertial_space_the_earth_turns_too() -> None:
         np.testing.assert_allclose(still.turn_rates_b("i"), np.tile(expected, (n - 1, 1)), atol=1e-13)
 
 
-def test_relative_to_l_the_transport_rate_is_not_a_turn() -> None:
+def test_turn_rate_in_l_excludes_the_transport_rate() -> None:
     """Level flight north at 100 m/s: l itself pitches down at v / M."""
     n, step_s = 50, 0.005
     lat = 0.8 + 100 / 6_367_000 * step_s * np.arange(n)
@@ -135,7 +135,7 @@ def test_relative_to_l_the_transport_rate_is_not_a_turn() -> None:
 # ------------------------------------------------------------------------------- from and to geodetic
 
 
-def test_from_geodetic_is_proj_and_scipy_everywhere() -> None:
+def test_from_geodetic_matches_proj_and_scipy_everywhere() -> None:
     rng = np.random.default_rng(11)
     n = 1000
     lat, lon = np.arcsin(rng.uniform(-1, 1, n)), rng.uniform(-np.pi, np.pi, n)
@@ -161,7 +161,7 @@ def test_from_geodetic_is_proj_and_scipy_everywhere() -> None:
     assert np.isnan(trajectory.position_sigma_l).all()
 
 
-def test_quaternions_of_neighbours_have_one_sign() -> None:
+def test_neighbouring_quaternions_have_the_same_sign() -> None:
     n = 720
     turning = wild(n, roll_rad=np.zeros(n), pitch_rad=np.zeros(n), heading_rad=np.linspace(0, 8 * np.pi, n))
     q = turning.q_e_from_b
@@ -182,7 +182,7 @@ def eastwards(times_ns: NDArray[np.int64], said: FloatArray | None = None) -> Tr
     return wild(len(times_ns), time_ns=times_ns, lon_rad=lon, velocity_l=velocity_l, **flat)
 
 
-def test_velocities_that_are_unsaid_are_those_of_the_way() -> None:
+def test_absent_velocities_are_derived_from_positions() -> None:
     times = START_NS + 50 * MS * np.arange(40)
     found = eastwards(times).with_velocities().velocity_l()
     expected = 60.0 + 2.0 * (times - START_NS) / 1e9
@@ -191,7 +191,7 @@ def test_velocities_that_are_unsaid_are_those_of_the_way() -> None:
     np.testing.assert_allclose(found[:, [0, 2]], 0.0, atol=1e-3)  # down: the chord of 6 m of the earth
 
 
-def test_velocities_are_taken_over_no_gap_and_an_epoch_alone_has_none() -> None:
+def test_velocities_are_not_derived_across_gaps_or_for_a_single_epoch() -> None:
     times = START_NS + 10 * MS * np.r_[np.arange(10), 60, np.arange(160, 170)]
     trajectory = eastwards(times).with_velocities()
     found = trajectory.velocity_l()[:, 1]
@@ -205,7 +205,7 @@ def test_velocities_are_taken_over_no_gap_and_an_epoch_alone_has_none() -> None:
     assert np.isfinite(poses.velocity_e).all()
 
 
-def test_velocities_that_are_said_stay() -> None:
+def test_given_velocities_are_kept() -> None:
     times = START_NS + 10 * MS * np.arange(20)
     said = np.tile([1.0, 2.0, 3.0], (20, 1))
     whole = eastwards(times, said)
@@ -225,7 +225,7 @@ def gapped() -> Trajectory:
     return wild(40, time_ns=times)
 
 
-def test_gap_is_refused_by_name_and_by_fate() -> None:
+def test_a_gap_raises_an_error_or_gives_a_fate() -> None:
     trajectory = gapped()
     before, after = trajectory.time_ns[19], trajectory.time_ns[20]
     at = np.array([before - 1, before + 1, after - 1, after])
@@ -238,7 +238,7 @@ def test_gap_is_refused_by_name_and_by_fate() -> None:
     assert trajectory.gaps().tolist() == [[before, after]]
 
 
-def test_interval_just_as_long_as_allowed_is_no_gap() -> None:
+def test_an_interval_as_long_as_allowed_is_not_a_gap() -> None:
     trajectory = wild(2, time_ns=START_NS + np.array([0, 150 * MS]))
     assert not trajectory.fates([START_NS + 75 * MS]).any()
     trajectory = wild(2, time_ns=START_NS + np.array([0, 150 * MS + 1]))
@@ -283,7 +283,7 @@ def test_part_of_a_trajectory_gives_the_same_poses() -> None:
         np.testing.assert_array_equal(getattr(part.poses(at), name), getattr(trajectory.poses(at), name))
 
 
-def test_time_that_does_not_rise_is_refused() -> None:
+def test_times_that_do_not_increase_are_refused() -> None:
     times = START_NS + 10 * MS * np.arange(5)
     times[3] = times[2]
     with pytest.raises(TrajectoryError, match=r"wild: time does not increase at GPS week 2445, 561618\.020 s"):
@@ -293,7 +293,7 @@ def test_time_that_does_not_rise_is_refused() -> None:
 # ------------------------------------------------------------------------------- reference point, deflection
 
 
-def test_body_is_found_from_its_antenna() -> None:
+def test_body_position_is_derived_from_the_antenna() -> None:
     trajectory = wild(300, seed=8)
     arm_b = np.array([0.4, -0.2, -1.3])
     turn = as_rotation(trajectory.q_e_from_b)
@@ -304,7 +304,7 @@ def test_body_is_found_from_its_antenna() -> None:
     np.testing.assert_allclose(of_antenna.at_body(arm_b).position_e, trajectory.position_e, atol=3e-9)
 
 
-def test_velocity_of_the_body_is_not_the_antennas_in_a_turn() -> None:
+def test_body_velocity_differs_from_the_antenna_velocity_in_a_turn() -> None:
     """Turning right at 0.1 rad/s over one spot: an antenna 2 m ahead moves to the right, east when heading north."""
     n = 201
     times = START_NS + 5 * MS * np.arange(n)
@@ -329,7 +329,7 @@ def test_velocity_of_the_body_is_not_the_antennas_in_a_turn() -> None:
     np.testing.assert_allclose(turned, 0.2, atol=1e-6)
 
 
-def test_deflection_tilts_the_attitude_as_the_formula_sheet_says() -> None:
+def test_deflection_tilts_the_attitude_as_in_the_formula_sheet() -> None:
     """ξ +8″, η −5″: 1000 m along the plumb line end 38.8 mm south and 24.2 mm east of the normal's foot."""
     level: dict[str, Any] = {key: np.zeros(3) for key in ("roll_rad", "pitch_rad", "heading_rad")}
     trajectory = wild(3, lat_rad=np.full(3, np.radians(47.1234567)), lon_rad=np.full(3, np.radians(8.7)), **level)
@@ -340,7 +340,7 @@ def test_deflection_tilts_the_attitude_as_the_formula_sheet_says() -> None:
     assert abs(np.sin(tilted.attitude()[2])).max() < 1e-9  # heading stays geodetic
 
 
-def test_positions_without_attitude_are_no_georeferencing_trajectory() -> None:
+def test_positions_without_attitude_cannot_be_used_for_georeferencing() -> None:
     bare = wild(5, roll_rad=np.full(5, np.nan))
     assert not bare.has_attitude
     with pytest.raises(TrajectoryError, match="positions but no attitude; georeferencing needs roll, pitch"):

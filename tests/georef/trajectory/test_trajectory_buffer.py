@@ -48,7 +48,7 @@ def same(one: Trajectory, other: Trajectory) -> None:
         np.testing.assert_array_equal(getattr(one, column), getattr(other, column), err_msg=column)
 
 
-def test_it_is_the_trajectory_of_all_rows() -> None:
+def test_the_buffer_equals_the_trajectory_of_all_rows() -> None:
     rows = solutions(9000)
     snapshot = filled(rows).snapshot()
     expected = Trajectory.from_geodetic(
@@ -64,7 +64,7 @@ def test_it_is_the_trajectory_of_all_rows() -> None:
     same(snapshot, expected)
 
 
-def test_it_does_not_matter_how_rows_were_cut() -> None:
+def test_the_buffer_does_not_depend_on_how_rows_are_cut() -> None:
     rows = np.concatenate([solutions(4000), with_sigmas(solutions(1, 3999), 0.02), solutions(5000, 4000)])
     rows = np.concatenate([rows[:100], with_sigmas(rows[99:100], 0.01), rows[100:]])
     cuts = np.sort(np.random.default_rng(2).integers(0, len(rows), 700))
@@ -81,7 +81,7 @@ def test_it_does_not_matter_how_rows_were_cut() -> None:
     )
 
 
-def test_rows_late_or_twice_are_counted_and_left_out() -> None:
+def test_late_and_repeated_rows_are_counted_and_dropped() -> None:
     rows = solutions(100)
     disturbed = np.concatenate([rows[:50], rows[30:40], rows[49:50], rows[49:]])
     buffer = filled(disturbed)
@@ -94,7 +94,7 @@ def test_rows_late_or_twice_are_counted_and_left_out() -> None:
     ("protocol", "bad", "taken"),
     [("novatel", 1, 90), ("novatel", 2, 100), ("sbf", 5 << 16, 90), ("sbf", 0x0FFF, 100), ("", 1, 100)],
 )
-def test_rows_that_are_no_solution_are_refused_by_their_status(protocol: str, bad: int, taken: int) -> None:
+def test_rows_without_a_solution_are_refused_by_their_status(protocol: str, bad: int, taken: int) -> None:
     rows = solutions(100)
     rows["status"] = 3  # GOOD, or some info of INSNavGeod without error
     rows["status"][40:50] = bad
@@ -113,8 +113,8 @@ def test_rows_without_position_or_attitude_are_refused() -> None:
     assert len(buffer.snapshot()) == 8
 
 
-def test_sigmas_come_once_a_second_and_hold() -> None:
-    """INSPVAS at 100 Hz has none, INSPVAX of the same epoch says them once a second."""
+def test_sigmas_given_once_a_second_are_held() -> None:
+    """INSPVAS at 100 Hz has no sigmas; INSPVAX of the same epoch has them once a second."""
     buffer = filled(solutions(100), with_sigmas(solutions(1, 99), 0.02), solutions(100, 100))
     buffer.append(with_sigmas(solutions(1, 199), 0.05))
     buffer.append(solutions(400, 200))
@@ -127,13 +127,13 @@ def test_sigmas_come_once_a_second_and_hold() -> None:
     assert buffer.counts["sigmas"] == 2
 
 
-def test_sigmas_an_epoch_said_itself_stay() -> None:
+def test_sigmas_given_with_an_epoch_are_kept() -> None:
     buffer = filled(with_sigmas(solutions(10), 0.02), with_sigmas(solutions(1, 9), 0.05))
     np.testing.assert_allclose(buffer.snapshot().position_sigma_l, 0.02, rtol=1e-6)
     assert buffer.counts["repeated"] == 1
 
 
-def test_covered_until_the_newest_epoch() -> None:
+def test_the_buffer_covers_time_up_to_the_newest_epoch() -> None:
     buffer = filled()
     assert buffer.covered_until_ns is None
     assert len(buffer.snapshot()) == 0
@@ -152,7 +152,7 @@ def test_a_snapshot_does_not_change() -> None:
         np.testing.assert_array_equal(getattr(before, column), kept[column], err_msg=column)
 
 
-def test_what_is_forgotten_takes_no_memory_and_changes_no_pose() -> None:
+def test_discarded_epochs_use_no_memory_and_change_no_pose() -> None:
     rows, buffer = solutions(60_000), filled()
     for first in range(0, 60_000, 50):
         buffer.append(rows[first : first + 50])

@@ -62,7 +62,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
 
 
 def late(trajectory: Trajectory, seconds: float) -> Trajectory:
-    """Stamps that are too small by so much."""
+    """Return the trajectory with timestamps that are too small by so much."""
     return replace(trajectory, time_ns=trajectory.time_ns - round(seconds * 1e9))
 
 
@@ -70,7 +70,7 @@ def shift_of(flight: Flight, seconds: float) -> TimeShift:
     return correlate_turn_rates(late(flight.trajectory, seconds), *flight.felt)
 
 
-def test_right_time_is_called_right(flight: Flight) -> None:
+def test_a_correct_time_is_confirmed(flight: Flight) -> None:
     shift = shift_of(flight, 0.0)
     assert shift.correlation > 0.9
     assert abs(shift.seconds) < 0.005
@@ -100,14 +100,14 @@ def test_wrong_time_is_named(flight: Flight, seconds: float, what: str) -> None:
     assert re.search(what, shift.what), shift.what
 
 
-def test_before_leap_seconds_utc_is_no_wrong_time(flight: Flight) -> None:
+def test_before_leap_seconds_utc_is_not_a_wrong_time(flight: Flight) -> None:
     early_ns = START_NS - 10**9 * 604_800 * 10
     trajectory = replace(flight.trajectory, time_ns=flight.trajectory.time_ns - early_ns)
     shift = correlate_turn_rates(late(trajectory, 7.0 * DAY_S), flight.felt.time_ns - early_ns, flight.felt.rate_b)
     assert shift.what == "its week is wrong: add +1"
 
 
-def test_sigma_is_honest(flight: Flight) -> None:
+def test_the_sigma_of_the_time_shift_is_realistic(flight: Flight) -> None:
     """The shift found differs from the true one by a few of its sigmas, over parts of the flight."""
     errors = []
     for begin in range(0, 16_000, 2_000):
@@ -117,21 +117,21 @@ def test_sigma_is_honest(flight: Flight) -> None:
     assert 0.1 < float(np.sqrt(np.mean(np.square(errors)))) < 4.0
 
 
-def test_another_flight_is_nothing_certain(flight: Flight) -> None:
+def test_another_flight_gives_no_certain_result(flight: Flight) -> None:
     other = flown(12_000, step_s=0.02, start_ns=int(flight.felt.time_ns[0]) - 30 * 10**9)
     shift = correlate_turn_rates(other, *flight.felt)
     assert not shift.is_certain
     assert shift.what == ""
 
 
-def test_too_little_in_common_is_nothing_certain(flight: Flight) -> None:
+def test_too_little_overlap_gives_no_certain_result(flight: Flight) -> None:
     felt = Felt(flight.felt.time_ns[:1000], flight.felt.rate_b[:1000])
     shift = correlate_turn_rates(flight.trajectory, *felt)
     assert np.isnan(shift.correlation)
     assert not shift.is_wrong
 
 
-def test_gaps_do_not_count(flight: Flight) -> None:
+def test_gaps_are_ignored(flight: Flight) -> None:
     keep = np.ones(len(flight.trajectory), np.bool_)
     keep[3000:4500] = False
     columns = {
@@ -144,7 +144,7 @@ def test_gaps_do_not_count(flight: Flight) -> None:
     assert shift.correlation > 0.9
 
 
-def test_samples_that_are_no_numbers_do_not_count(flight: Flight) -> None:
+def test_non_finite_samples_are_ignored(flight: Flight) -> None:
     rate_b = flight.felt.rate_b.copy()
     rate_b[[0, 777, 9000], [0, 1, 2]] = np.nan
     shift = correlate_turn_rates(late(flight.trajectory, 2.0), flight.felt.time_ns, rate_b)
@@ -152,7 +152,7 @@ def test_samples_that_are_no_numbers_do_not_count(flight: Flight) -> None:
     assert shift.correlation > 0.9
 
 
-def test_an_epoch_days_before_takes_no_memory(flight: Flight) -> None:
+def test_a_single_epoch_days_earlier_uses_no_memory_and_hides_no_wrong_time(flight: Flight) -> None:
     """17 million steps of 50 ms, of which 6000 matter; and it hides no wrong time."""
     time_ns = flight.trajectory.time_ns.copy()
     time_ns[0] -= 10 * DAY_S * 10**9
@@ -165,7 +165,7 @@ def test_an_epoch_days_before_takes_no_memory(flight: Flight) -> None:
     assert most < 50_000_000
 
 
-def test_positions_alone_do_not_turn(flight: Flight) -> None:
+def test_positions_without_attitude_give_no_turn_rates(flight: Flight) -> None:
     bare = replace(flight.trajectory, q_e_from_b=np.full_like(flight.trajectory.q_e_from_b, np.nan))
     with pytest.raises(TrajectoryError, match="no attitude"):
         correlate_turn_rates(bare, *flight.felt)

@@ -150,7 +150,7 @@ def test_lines_are_straight_level_and_at_constant_speed(changes: dict[str, Any])
         np.testing.assert_allclose(places[:, 2], table.height_m, atol=1e-8)
 
 
-def test_leads_stand_around_lines(quiet: Trajectory) -> None:
+def test_lines_have_leads_before_and_after(quiet: Trajectory) -> None:
     first, last = quiet.lines[0], quiet.lines[-1]
     assert quiet.end_s == pytest.approx(last.end_s + 4.0)
     assert 12.0 <= first.start_s <= 14.0
@@ -174,7 +174,7 @@ def test_one_line_needs_no_lead() -> None:
     assert plane(trajectory, np.array([trajectory.end_s]))[0] == pytest.approx([0.0, 300.0, 700.0], abs=1e-5)
 
 
-def test_the_trajectory_is_known_a_little_beyond_its_ends_and_no_farther(quiet: Trajectory) -> None:
+def test_the_trajectory_extends_only_a_little_beyond_its_ends(quiet: Trajectory) -> None:
     end_s = quiet.end_s
     known = quiet.poses(np.array([-5.0, end_s + 5.0]))
     assert np.isfinite(known.position_e).all()
@@ -186,7 +186,7 @@ def test_the_trajectory_is_known_a_little_beyond_its_ends_and_no_farther(quiet: 
 
 
 @pytest.mark.parametrize("which", ["quiet", "rough", "from_ground"])
-def test_derivatives_are_those_of_positions_and_rotations(which: str, request: pytest.FixtureRequest) -> None:
+def test_derivatives_match_those_of_positions_and_rotations(which: str, request: pytest.FixtureRequest) -> None:
     trajectory: Trajectory = request.getfixturevalue(which)
     knots = STEP_S * np.arange(1, int(trajectory.end_s / STEP_S))
     time_s, half_s = np.sort(np.concatenate([knots[::3], knots[::7] + 0.3 * STEP_S])), 1e-3
@@ -198,7 +198,7 @@ def test_derivatives_are_those_of_positions_and_rotations(which: str, request: p
     np.testing.assert_allclose(turned.as_rotvec() / (2 * half_s), now.rate_eb_b, atol=2e-6)
 
 
-def test_poses_and_motion_agree_and_rotations_are_rotations(rough: Trajectory) -> None:
+def test_poses_and_motion_agree_and_rotations_are_orthonormal(rough: Trajectory) -> None:
     time_s = times(rough)
     poses, motion = rough.poses(time_s), rough.motion(time_s)
     np.testing.assert_array_equal(poses.position_e, motion.position_e)
@@ -228,7 +228,7 @@ def test_four_derivatives_are_continuous_at_knots(which: str, request: pytest.Fi
         np.testing.assert_allclose(ahead, behind, atol=1e-8 / step_s ** (order - 1))
 
 
-def test_the_reports_are_those_of_the_poses(rough: Trajectory) -> None:
+def test_reported_states_match_the_poses(rough: Trajectory) -> None:
     time_s = times(rough, 0.5)
     poses = rough.poses(time_s)
     lat, lon, height = rough.geodetic(time_s)
@@ -254,7 +254,7 @@ def test_the_spline_goes_through_its_values() -> None:
 
 
 @pytest.mark.parametrize("half", [0, 3, 16, 77, 200])
-def test_the_kernel_keeps_straights_and_rises_no_faster_than_it_says(half: int) -> None:
+def test_the_kernel_preserves_straight_lines_and_limits_its_peak(half: int) -> None:
     weights = kernel(half)
     assert len(weights) == 2 * half + 1
     np.testing.assert_array_equal(weights, weights[::-1])
@@ -269,7 +269,7 @@ def test_the_kernel_keeps_straights_and_rises_no_faster_than_it_says(half: int) 
 
 
 @pytest.mark.parametrize("wind_mps", [[0.0, 0.0], [10.0, -15.0]])
-def test_nothing_pulls_sideways_in_flight(wind_mps: list[float]) -> None:
+def test_no_sideways_force_acts_in_flight(wind_mps: list[float]) -> None:
     trajectory = flown({"flight": {"wind_mps": wind_mps}})
     force_b = specific_force_b(trajectory, times(trajectory))
     assert np.abs(force_b[:, 1]).max() < 2e-5
@@ -308,7 +308,7 @@ def test_limits_of_the_plan_hold() -> None:
     assert speed.max() < 60.1
 
 
-def test_a_climb_that_a_turn_is_too_short_for_makes_the_way_longer() -> None:
+def test_a_climb_that_is_too_long_for_a_turn_lengthens_the_path() -> None:
     lines = plan_with().tables.model_dump()["line"]
     lines[1]["height_m"] = 1500.0
     short, long = flown(), flown({"line": lines, "flight": {"climb_max_mps": 3.0}})
@@ -320,7 +320,7 @@ def test_a_climb_that_a_turn_is_too_short_for_makes_the_way_longer() -> None:
     assert math.degrees(np.abs(long.attitude(time_s)[0]).max()) <= 25.0
 
 
-def test_signs_of_attitude(quiet: Trajectory) -> None:
+def test_attitude_angles_have_the_documented_signs(quiet: Trajectory) -> None:
     east, south, west = ((line.start_s + line.end_s) / 2 for line in quiet.lines)
     roll, pitch, heading = (np.degrees(angle) for angle in quiet.attitude(np.array([east, south, west])))
     assert np.abs(roll).max() < 0.07  # 2 Ω v / g
@@ -365,7 +365,7 @@ LONG = [{"name": "a", "from_m": [-40000.0, 0.0], "to_m": [40000.0, 0.0], "height
 
 
 @pytest.mark.parametrize(("turbulence", "factor"), [("light", 1.0), ("moderate", 2.5), ("severe", 5.0)])
-def test_turbulence_has_the_size_of_its_name(turbulence: str, factor: float) -> None:
+def test_turbulence_has_the_magnitude_of_its_name(turbulence: str, factor: float) -> None:
     changes = {"line": LONG, "flight": {"turbulence": turbulence, "seed": 5}}
     still, trajectory = flown({"line": LONG}), flown(changes)
     time_s = times(trajectory, 0.25)
@@ -378,7 +378,7 @@ def test_turbulence_has_the_size_of_its_name(turbulence: str, factor: float) -> 
     assert drift_m.max() < 3.0 * factor
 
 
-def test_same_seed_same_bytes() -> None:
+def test_the_same_seed_gives_the_same_bytes() -> None:
     rough = {"flight": {"turbulence": "moderate", "seed": 3}}
     time_s = np.linspace(0.0, 200.0, 777)
     first, again = flown(rough).motion(time_s), flown(rough).motion(time_s)
@@ -388,7 +388,7 @@ def test_same_seed_same_bytes() -> None:
         assert not np.array_equal(getattr(first, name), getattr(other, name))
 
 
-def test_how_times_are_asked_for_makes_no_difference(rough: Trajectory) -> None:
+def test_results_do_not_depend_on_how_times_are_requested(rough: Trajectory) -> None:
     time_s = times(rough)
     whole = rough.poses(time_s)
     for part in np.array_split(np.arange(len(time_s)), 7):
@@ -399,7 +399,7 @@ def test_how_times_are_asked_for_makes_no_difference(rough: Trajectory) -> None:
 # ---------------------------------------------------------------------------------------------- from the ground
 
 
-def test_it_stands_still_to_the_last_bit(from_ground: Trajectory) -> None:
+def test_a_parked_aircraft_stands_exactly_still(from_ground: Trajectory) -> None:
     time_s = np.linspace(0.0, 30.0, 5001)
     motion = from_ground.motion(time_s)
     assert not motion.velocity_e.any()
@@ -416,7 +416,7 @@ def test_it_stands_still_to_the_last_bit(from_ground: Trajectory) -> None:
     assert heading == pytest.approx(np.full(5001, 60.0 + convergence), abs=1e-3)
 
 
-def test_it_taxies_runs_and_climbs_out(from_ground: Trajectory) -> None:
+def test_a_start_taxies_runs_and_climbs_out(from_ground: Trajectory) -> None:
     time_s = np.arange(30.0, from_ground.lines[0].start_s, 0.1)
     places, (roll, pitch, _) = plane(from_ground, time_s), from_ground.attitude(time_s)
     velocity = velocity_l(from_ground, time_s)
@@ -520,7 +520,7 @@ MISTAKES = {
 
 
 @pytest.mark.parametrize("key", MISTAKES)
-def test_a_plan_that_cannot_be_flown_names_its_key(key: str) -> None:
+def test_error_for_a_plan_that_cannot_be_flown_names_its_key(key: str) -> None:
     changes, text = MISTAKES[key]
     with pytest.raises(PlanError) as caught:
         flown(changes)
@@ -528,7 +528,7 @@ def test_a_plan_that_cannot_be_flown_names_its_key(key: str) -> None:
     assert caught.value.key == key
 
 
-def test_a_line_below_a_hill_says_where() -> None:
+def test_error_for_a_line_below_a_hill_gives_the_place() -> None:
     plan = plan_with()
 
     def hill(east_m: FloatArray, north_m: FloatArray) -> FloatArray:

@@ -52,7 +52,7 @@ KNOWN = {
 
 
 @pytest.mark.parametrize("word", KNOWN)
-def test_lengths_of_the_words_that_have_a_closed_form(word: str) -> None:
+def test_path_lengths_match_their_closed_forms(word: str) -> None:
     start, end, want_m = KNOWN[word]
     way = shortest_way(start, end, FREE)
     assert length_m(way) == pytest.approx(want_m, abs=1e-6)
@@ -63,14 +63,14 @@ def test_lengths_of_the_words_that_have_a_closed_form(word: str) -> None:
     assert_joins(way, start, end)
 
 
-def test_of_two_opposite_poses_at_one_place_the_nearer_side_is_turned_to() -> None:
+def test_between_opposite_poses_the_path_turns_to_the_nearer_side() -> None:
     right = shortest_way(Pose(0, 0, NORTH), Pose(0.5 * R, 0, SOUTH), FREE)
     left = shortest_way(Pose(0, 0, NORTH), Pose(-0.5 * R, 0, SOUTH), FREE)
     assert (sides(right), sides(left)) == ("LRL", "RLR")
     assert length_m(right) == pytest.approx(length_m(left))
 
 
-def test_no_way_is_shorter_by_a_place_between() -> None:
+def test_no_path_is_shortened_by_a_waypoint() -> None:
     poses = random_poses(1, 240)
     words = set()
     for start, between, end in zip(poses[::3], poses[1::3], poses[2::3], strict=True):
@@ -87,18 +87,18 @@ def turned(pose: Pose) -> Pose:
     return Pose(pose.east_m, pose.north_m, pose.course_rad + math.pi)
 
 
-def test_the_way_back_is_as_long() -> None:
+def test_the_reverse_path_has_the_same_length() -> None:
     poses = random_poses(2, 100)
     for start, end in zip(poses[::2], poses[1::2], strict=True):
         there_m = length_m(shortest_way(start, end, FREE))
         assert length_m(shortest_way(turned(end), turned(start), FREE)) == pytest.approx(there_m)
 
 
-def test_where_there_is_nowhere_to_go_there_is_no_way() -> None:
+def test_equal_poses_give_an_empty_path() -> None:
     assert shortest_way(Pose(3, 4, 1.0), Pose(3, 4, 1.0), FREE) == ()
 
 
-def test_straight_on_is_no_whole_turn_by_rounding() -> None:
+def test_rounding_does_not_turn_straight_flight_into_a_full_circle() -> None:
     for course in np.linspace(0.1, 6.2, 300).tolist():
         start = Pose(10.0, -20.0, course)
         for distance_m in (30.0, 100.0, 500.0, 987.6):
@@ -106,7 +106,7 @@ def test_straight_on_is_no_whole_turn_by_rounding() -> None:
             assert length_m(way) == pytest.approx(distance_m)
 
 
-def test_turns_to_opposite_sides_are_wider_unless_a_straight_parts_them() -> None:
+def test_opposite_turns_are_wider_unless_a_straight_separates_them() -> None:
     turning = Turning(R, 1.5 * R, 4.0 * R)
     start = Pose(0, 0, NORTH)
     near = shortest_way(start, Pose(2 * R, 4 * R, NORTH), turning)
@@ -122,7 +122,7 @@ def test_turns_to_opposite_sides_are_wider_unless_a_straight_parts_them() -> Non
 
 
 @pytest.mark.parametrize("factor", [0.5, 1.001, 1.3, 2.5, 7.0])
-def test_a_longer_way_is_no_more_than_a_circle_longer(factor: float) -> None:
+def test_a_lengthened_path_is_at_most_a_circle_longer(factor: float) -> None:
     for start, end in zip(random_poses(4, 20), random_poses(5, 20), strict=True):
         shortest_m = length_m(shortest_way(start, end, FREE))
         way = way_of_length(start, end, FREE, factor * shortest_m)
@@ -132,7 +132,7 @@ def test_a_longer_way_is_no_more_than_a_circle_longer(factor: float) -> None:
         assert all(abs(arc.curvature_per_m) in (0.0, 1.0 / R) for arc in way)
 
 
-def test_between_opposite_lines_the_longer_way_flies_on_before_it_turns() -> None:
+def test_a_lengthened_path_between_opposite_lines_flies_on_before_turning() -> None:
     way = way_of_length(Pose(0, 0, NORTH), Pose(2 * R, 0, SOUTH), FREE, math.pi * R + 400.0)
     assert sides(way) == "SRS"
     assert length_m(way) == pytest.approx(math.pi * R + 400.0, abs=0.011 * math.pi * R)

@@ -79,7 +79,7 @@ class Flight:
     pulse: PulsePerSecond
 
     def units(self, stop_s: float) -> list[WireUnit]:
-        """From the start."""
+        """Return the units from the start."""
         return self.wire.units(0.0, stop_s)
 
     def records(self, stop_s: float) -> list[Record]:
@@ -95,7 +95,7 @@ class Flight:
 
 
 def start_gps_ns(plan: Plan) -> int:
-    """Of the plan's start by the calendar alone."""
+    """Return the GPS time of the plan's start computed from the calendar alone."""
     since = plan.tables.flight.start - dt.datetime(1980, 1, 6, tzinfo=dt.UTC)
     return (round(since.total_seconds()) + LEAP_S) * 1_000_000_000
 
@@ -112,7 +112,7 @@ def flight(*, level: bool = False, start: str = "", noise: bool = False, end_s: 
 
 
 def parsed(plan: Plan, units: list[WireUnit]) -> list[Record]:
-    """Unit by unit, as the recorder would."""
+    """Parse unit by unit, as the recorder does."""
     parser = find_driver("gnss", plan.tables.gnss["rover"].protocol).make_parser(DeviceSettings("gnss/rover", {}))
     records = [r for unit in units for r in parser.feed(Chunk(unit.source, round(unit.time_s * 1e9), unit.data))]
     records += parser.close()
@@ -122,22 +122,22 @@ def parsed(plan: Plan, units: list[WireUnit]) -> list[Record]:
 
 
 def of(kind: type[Any], records: list[Record]) -> list[Any]:
-    """The records of a type."""
+    """Return the records of a type."""
     return [record for record in records if isinstance(record, kind)]
 
 
 def stream(units: list[WireUnit]) -> bytes:
-    """All bytes."""
+    """Return all bytes."""
     return b"".join(unit.data for unit in units)
 
 
 def true_geodetic(at: Flight, time_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Of the antenna."""
+    """Return the true position of the antenna."""
     return geodetic(at.aircraft.point_e(LEVER_ARM, time_s))
 
 
 def ground_m(lat: FloatArray, lon: FloatArray, true_lat: FloatArray, true_lon: FloatArray) -> FloatArray:
-    """The larger of north and east differences, about."""
+    """Return approximately the larger of the north and east differences, m."""
     return np.maximum(np.abs(lat - true_lat), np.abs(lon - true_lon)) * EARTH_M
 
 
@@ -145,7 +145,7 @@ def ground_m(lat: FloatArray, lon: FloatArray, true_lat: FloatArray, true_lon: F
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_positions_are_the_antennas(protocol: str) -> None:
+def test_positions_match_the_antenna(protocol: str) -> None:
     at = flight(protocol=protocol, rate_hz=10, undulation_m=47.3)
     fixes = [fix for fix in of(GnssFix, at.records(8.0)) if fix.lat_rad is not None]
     time_s = np.array([at.time_s(fix) for fix in fixes])
@@ -161,7 +161,7 @@ def test_positions_are_the_antennas(protocol: str) -> None:
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_velocities_are_the_antennas_at_the_time_they_say(protocol: str) -> None:
+def test_velocities_match_the_antenna_at_their_stated_time(protocol: str) -> None:
     at = flight(protocol=protocol, rate_hz=20)
     fixes = [fix for fix in of(GnssFix, at.records(8.0)) if fix.velocity_l is not None]
     time_s = np.array([at.time_s(fix) for fix in fixes])
@@ -175,7 +175,7 @@ def test_velocities_are_the_antennas_at_the_time_they_say(protocol: str) -> None
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 @pytest.mark.parametrize(("grade", "sigma"), [("rtk", [0.0108, 0.0108, 0.0208]), ("spp", [1.2166, 1.2166, 2.01])])
-def test_sigmas_and_types_are_those_of_the_grade(protocol: str, grade: str, sigma: list[float]) -> None:
+def test_sigmas_and_fix_types_match_the_grade(protocol: str, grade: str, sigma: list[float]) -> None:
     at = flight(protocol=protocol, grade=grade)
     fix = next(fix for fix in of(GnssFix, at.records(3.0)) if fix.lat_rad is not None)
     assert fix.fix_type is (FixType.RTK_FIXED if grade == "rtk" else FixType.SINGLE)
@@ -184,7 +184,7 @@ def test_sigmas_and_types_are_those_of_the_grade(protocol: str, grade: str, sigm
     np.testing.assert_allclose(reported, 0.8 * np.array(sigma), rtol=0.005)
 
 
-def test_ubx_epoch_carries_its_covariance_of_velocity() -> None:
+def test_ubx_epoch_carries_its_velocity_covariance() -> None:
     fix = of(GnssFix, flight(protocol="ubx").records(3.0))[0]
     np.testing.assert_allclose(np.sqrt(np.diag(fix.velocity_cov_l)), 0.8 * np.array([0.01, 0.01, 0.02]), rtol=1e-6)
 
@@ -239,7 +239,7 @@ def test_novatel_ins_gives_the_body_a_hundred_times_a_second() -> None:
 # ------------------------------------------------------------------------------------- other people's decoders
 
 
-def test_ubx_by_pyubx2() -> None:
+def test_pyubx2_reads_the_ubx_messages() -> None:
     at = flight(protocol="ubx", rate_hz=5, undulation_m=47.3)
     reader = UBXReader(io.BytesIO(stream(at.units(5.0))), quitonerror=2)
     messages = [message for _, message in reader]
@@ -278,7 +278,7 @@ def test_ubx_by_pyubx2() -> None:
     ]
 
 
-def test_nmea_by_pynmea2() -> None:
+def test_pynmea2_reads_the_nmea_sentences() -> None:
     at = flight(protocol="nmea", rate_hz=5, undulation_m=47.3, secondary_lever_arm_m=SECOND_ARM)
     lines = stream(at.units(5.0)).decode("ascii").split("\r\n")[:-1]
     sentences = [pynmea2.parse(line, check=True) for line in lines]
@@ -307,7 +307,7 @@ def test_nmea_by_pynmea2() -> None:
             assert abs((float(found) - course + 180) % 360 - 180) < 1e-4
 
 
-def test_novatel_position_by_the_manuals_offsets() -> None:
+def test_novatel_position_follows_the_offsets_of_the_manual() -> None:
     """BESTPOS: header of 28 bytes, fields H, H+4, H+8, H+16, H+24, H+32, H+40 … (OEM7, table BESTPOS)."""
     at = flight(protocol="novatel", undulation_m=47.3, start="2026-11-21T12:00:00Z")
     data = stream(at.units(2.0))
@@ -340,7 +340,7 @@ def test_novatel_position_by_the_manuals_offsets() -> None:
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_whole_seconds_are_named_just_after_their_edge_or_before_it(protocol: str) -> None:
+def test_whole_seconds_are_named_just_after_or_just_before_their_edge(protocol: str) -> None:
     at = flight(protocol=protocol, rate_hz=2, noise=True)
     messages = [m for m in of(TimeMessage, at.records(10.0)) if m.time.week is not None or m.time.date is not None]
     seen = set()
@@ -365,7 +365,7 @@ def test_whole_seconds_are_named_just_after_their_edge_or_before_it(protocol: st
 
 
 @pytest.mark.parametrize(("protocol", "name", "resolution_ns"), [("novatel", "TIME", 1e-6), ("ubx", "TIM-TP", 5e-4)])
-def test_the_bound_message_tells_its_edges_own_error(protocol: str, name: str, resolution_ns: float) -> None:
+def test_the_bound_message_gives_the_error_of_its_edge(protocol: str, name: str, resolution_ns: float) -> None:
     at = flight(protocol=protocol, rate_hz=1, noise=True)
     bound = [message for message in of(TimeMessage, at.records(60.0)) if message.message == name]
     seconds = np.array([round(at.time_s(message)) for message in bound])
@@ -379,7 +379,7 @@ def test_the_bound_message_tells_its_edges_own_error(protocol: str, name: str, r
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_week_and_day_turn_inside_the_flight(protocol: str) -> None:
+def test_week_and_day_change_during_the_flight(protocol: str) -> None:
     """Saturday night: the GPS week turns at 23:59:42 UTC, the day 18 s later."""
     at = flight(protocol=protocol, rate_hz=2, start="2026-06-13T23:59:40Z", ins=protocol == "novatel")
     records = at.records(24.0)
@@ -401,7 +401,7 @@ def test_week_and_day_turn_inside_the_flight(protocol: str) -> None:
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_an_outage_has_no_solutions_but_time_goes_on(protocol: str) -> None:
+def test_an_outage_has_no_solutions_but_keeps_time(protocol: str) -> None:
     second: dict[str, Any] = {} if protocol == "ubx" else {"secondary_lever_arm_m": SECOND_ARM}
     at = flight(protocol=protocol, outage=[{"at_s": 5.0, "for_s": 4.0}], **second)
     records = at.records(25.0)
@@ -426,7 +426,7 @@ def test_an_outage_has_no_solutions_but_time_goes_on(protocol: str) -> None:
         assert named[float(number)] == (protocol != "nmea" or not 5 <= number < 9)
 
 
-def test_a_jump_moves_what_is_sent() -> None:
+def test_a_jump_moves_the_sent_positions() -> None:
     at = flight(protocol="ubx", jump=[{"at_s": 2.0, "for_s": 1.0, "offset_l_m": [0.0, 0.0, -2.5]}])
     fixes = of(GnssFix, at.records(5.0))
     time_s = np.array([at.time_s(fix) for fix in fixes])
@@ -440,7 +440,7 @@ def test_a_jump_moves_what_is_sent() -> None:
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_the_same_units_however_time_is_cut(protocol: str) -> None:
+def test_units_do_not_depend_on_how_time_is_cut(protocol: str) -> None:
     keys: dict[str, Any] = {"protocol": protocol, "noise": True, "rate_hz": 20, "baud": 115_200}
     keys |= {"ins": True, "secondary_lever_arm_m": SECOND_ARM, "baud": 460_800} if protocol == "novatel" else {}
     whole = flight(**keys).units(6.0)
@@ -464,7 +464,7 @@ def test_units_must_go_on_where_they_ended() -> None:
         at.wire.units(2.0, 3.0)
 
 
-def test_bytes_arrive_one_after_another_and_are_read_now_and_then() -> None:
+def test_bytes_arrive_in_succession_and_are_read_in_intervals() -> None:
     """Noiseless: a burst leaves 80 ms after its epoch, each byte takes ten bits, a read takes what is there."""
     baud, latency_s = 19_200, 0.080
     at = flight(protocol="nmea", rate_hz=1, baud=baud, latency_ms=80.0)
@@ -502,7 +502,7 @@ def test_latency_varies_by_some_milliseconds() -> None:
     assert abs(delay_ms.mean() - 60.0 - 2 * math.sqrt(2 / math.pi) - 0.025) < 4.5 * 1.21 / math.sqrt(300)
 
 
-def test_after_the_flight_only_what_is_on_the_way_comes() -> None:
+def test_after_the_flight_only_units_under_way_arrive() -> None:
     at = flight(protocol="nmea", rate_hz=1, latency_ms=500.0, end_s=3.2)
     assert stream(at.wire.units(0.0, 3.2)).count(b"GGA") == 3
     tail = at.wire.units(3.2, 6.0)
@@ -533,14 +533,14 @@ def test_after_the_flight_only_what_is_on_the_way_comes() -> None:
         ),
     ],
 )
-def test_what_the_line_cannot_carry_is_refused(keys: dict[str, Any], error: str) -> None:
+def test_a_rate_beyond_the_line_capacity_is_refused(keys: dict[str, Any], error: str) -> None:
     with pytest.raises(PlanError, match=f"^{error}") as caught:
         flight(**keys)
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_what_the_refusal_says_would_do_does(protocol: str) -> None:
+def test_the_baud_rate_suggested_by_the_refusal_is_sufficient(protocol: str) -> None:
     with pytest.raises(PlanError) as caught:
         flight(protocol=protocol, baud=4800, rate_hz=20)
     baud = int(str(caught.value).split("want ")[1].split()[0])
@@ -558,7 +558,7 @@ def test_satellites_out_of_sight_do_not_hide_a_slow_line() -> None:
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_its_configuration_is_one(protocol: str) -> None:
+def test_its_configuration_is_valid(protocol: str) -> None:
     second: dict[str, Any] = {} if protocol == "ubx" else {"secondary_lever_arm_m": SECOND_ARM}
     table = flight(protocol=protocol, **second).plan.tables.gnss["rover"]
     config = GnssConfig.model_validate(config_table(table, "rover", "serial:/dev/ttyUSB0?baud=460800", LEAP_S))
@@ -570,7 +570,7 @@ def test_its_configuration_is_one(protocol: str) -> None:
     assert "pps" not in config_table(unwired, "rover", "serial:/dev/ttyUSB0")
 
 
-def test_without_a_wired_pulse_none_is_announced() -> None:
+def test_without_a_wired_pulse_no_pulse_is_announced() -> None:
     at = flight(protocol="ubx")
     receiver = Receiver(at.plan.tables.gnss["rover"], at.aircraft, seed=1, name="rover", noise=False)
     records = parsed(at.plan, GnssWire(at.plan, "rover", receiver, None).units(0.0, 5.0))

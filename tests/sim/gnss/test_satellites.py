@@ -28,19 +28,19 @@ LIMIT = 4.5  # sigmas of an estimate
 
 
 def receiver(trajectory: Circling | None = None, *, noise: bool = True, **keys: Any) -> Receiver:
-    """A receiver on the circling body."""
+    """Return a receiver on the circling body."""
     seed, name = keys.pop("seed", 7), keys.pop("name", "rover")
     table = GnssTable.model_validate({"lever_arm_m": LEVER_ARM} | keys)
     return Receiver(table, trajectory or Circling(), seed=seed, name=name, noise=noise)
 
 
 def ecef(epochs: Epochs | InsEpochs) -> FloatArray:
-    """(n, 3) by PROJ."""
+    """Return (n, 3) ECEF coordinates from PROJ."""
     return np.stack(TO_E.transform(np.degrees(epochs.lon_rad), np.degrees(epochs.lat_rad), epochs.height_m), axis=-1)
 
 
 def autocovariance(rows: FloatArray, lag: int) -> FloatArray:
-    """(m,) of zero-mean rows (n, m)."""
+    """Return the autocovariance (m,) of zero-mean rows (n, m)."""
     n = len(rows) - lag
     return np.asarray((rows[:n] * rows[lag:]).sum(axis=0) / n)
 
@@ -53,7 +53,7 @@ def estimate_sigma(model: FloatArray, lag: int, count: int) -> float:
     return float(np.sqrt(((far**2).sum() + moved.sum()) / (count - lag)))
 
 
-def test_noiseless_solution_is_the_antennas_place_and_velocity() -> None:
+def test_the_noiseless_solution_equals_place_and_velocity_of_the_antenna() -> None:
     aircraft = Circling()
     epochs = receiver(aircraft, noise=False, rate_hz=10, protocol="ubx").epochs(3, 200)
     time_s = np.arange(3, 203) / 10
@@ -67,7 +67,7 @@ def test_noiseless_solution_is_the_antennas_place_and_velocity() -> None:
     assert (epochs.position_sigma_l > 0).all()
 
 
-def test_novatel_velocity_is_older_than_the_position_by_what_it_says() -> None:
+def test_novatel_velocity_lags_the_position_by_its_stated_latency() -> None:
     aircraft = Circling()
     epochs = receiver(aircraft, noise=False, rate_hz=20, protocol="novatel").epochs(0, 100)
     assert epochs.velocity_age_s[0] == 0.0  # nothing was before the start
@@ -77,7 +77,7 @@ def test_novatel_velocity_is_older_than_the_position_by_what_it_says() -> None:
     assert np.abs(epochs.velocity_l - aircraft.velocity_of(LEVER_ARM, epochs.time_s)).max() > 0.1
 
 
-def test_errors_are_told_as_they_are() -> None:
+def test_reported_errors_match_the_actual_ones() -> None:
     aircraft = Circling()
     noisy = receiver(aircraft, grade="spp", protocol="ubx", jump=[{"at_s": 20, "for_s": 5, "offset_l_m": [3, -2, 7]}])
     epochs = noisy.epochs(0, 300)
@@ -143,7 +143,7 @@ def test_reported_sigmas_are_a_little_optimistic_and_follow_the_satellites() -> 
 
 
 @pytest.mark.parametrize("length_m", [0.5, 2.0])
-def test_direction_of_the_baseline_is_as_good_as_it_is_long(length_m: float) -> None:
+def test_the_sigma_of_a_baseline_direction_follows_its_length(length_m: float) -> None:
     count = 100_000
     second = [LEVER_ARM[0], LEVER_ARM[1] + length_m, LEVER_ARM[2]]
     epochs = receiver(Standing(), secondary_lever_arm_m=second, rate_hz=1).epochs(0, count)
@@ -191,7 +191,7 @@ def test_without_a_second_antenna_there_is_no_direction() -> None:
 
 
 @pytest.mark.parametrize(("grade", "float_s", "usual"), [("rtk", 10, 4), ("ppk", 3, 4), ("spp", 0, 1)])
-def test_outage_then_float_then_the_usual_fix(grade: str, float_s: int, usual: int) -> None:
+def test_an_outage_is_followed_by_float_and_then_the_usual_fix(grade: str, float_s: int, usual: int) -> None:
     epochs = receiver(grade=grade, rate_hz=2, outage=[{"at_s": 10, "for_s": 4.0}]).epochs(0, 100)
     want = np.full(100, usual)
     want[20:28] = 0
@@ -201,7 +201,7 @@ def test_outage_then_float_then_the_usual_fix(grade: str, float_s: int, usual: i
     assert epochs.satellites[28:].all()
 
 
-def test_float_solutions_are_worse_and_say_so() -> None:
+def test_float_solutions_are_worse_and_report_it() -> None:
     outages = [{"at_s": 30.0 * k, "for_s": 1.0} for k in range(3000)]
     epochs = receiver(Standing(), rate_hz=1, outage=outages).epochs(0, 90_000)
     floating = epochs.fix == FixType.RTK_FLOAT
@@ -225,7 +225,7 @@ def test_a_jump_moves_the_solution_and_not_its_sigma() -> None:
     np.testing.assert_array_equal(before.fix, after.fix)
 
 
-def test_the_same_epochs_however_they_are_asked_for() -> None:
+def test_epochs_do_not_depend_on_how_they_are_requested() -> None:
     outages = [{"at_s": 20, "for_s": 5}]
     keys: dict[str, Any] = {"rate_hz": 20, "outage": outages, "secondary_lever_arm_m": [0.8, 0.6, -1.9], "ins": True}
     whole, pieces, backwards = receiver(**keys), receiver(**keys), receiver(**keys)
@@ -245,7 +245,7 @@ def test_the_same_epochs_however_they_are_asked_for() -> None:
                     np.testing.assert_allclose(found, want, rtol=0, atol=1e-9)
 
 
-def test_seeds_and_names_have_errors_of_their_own() -> None:
+def test_seeds_and_names_have_independent_errors() -> None:
     first = receiver(seed=1).epochs(0, 50).position_error_l
     np.testing.assert_array_equal(first, receiver(seed=1).epochs(0, 50).position_error_l)
     assert (first != receiver(seed=2).epochs(0, 50).position_error_l).all()
@@ -261,7 +261,7 @@ def test_ins_gives_the_bodys_origin_and_attitude() -> None:
     assert np.abs(ins.attitude_rad - np.stack(aircraft.attitude(time_s), -1)).max() < 1e-12
 
 
-def test_ins_errors_are_smooth_and_as_large_as_told() -> None:
+def test_ins_errors_are_smooth_and_as_large_as_stated() -> None:
     count = 500_000  # 5000 s
     ins = receiver(Standing(), ins=True).ins_epochs(0, count)
     step_s = 0.01
@@ -297,6 +297,6 @@ def test_ins_drifts_without_satellites_and_comes_back() -> None:
     assert np.abs(np.diff(coasting.position_error_l, axis=0)).max() < 0.005  # no step
 
 
-def test_second_antenna_where_the_first_is() -> None:
+def test_a_second_antenna_at_the_place_of_the_first_is_refused() -> None:
     with pytest.raises(PlanError, match=r"^gnss\.rover\.secondary_lever_arm_m: equals lever_arm_m; give"):
         receiver(secondary_lever_arm_m=LEVER_ARM)

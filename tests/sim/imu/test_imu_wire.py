@@ -81,7 +81,7 @@ def gps_times_s(rows: StructArray) -> FloatArray:
     ],
     ids=lambda keys: " ".join(map(str, keys.values())) or "plain",
 )
-def test_the_parser_reads_what_the_unit_measured(keys: dict[str, Any]) -> None:
+def test_the_parser_reads_the_measurements_of_the_unit(keys: dict[str, Any]) -> None:
     unit = made(**keys)
     rows, clock = decoded(wired(unit).units(0.0, SECONDS + 1.0), unit.table)
     end_s, force, rate = unit.samples(1, unit.last)
@@ -99,7 +99,7 @@ def test_the_parser_reads_what_the_unit_measured(keys: dict[str, Any]) -> None:
     np.testing.assert_allclose(gps_times_s(rows), end_s, rtol=0, atol=3.0 / unit.table.tick_hz + 1e-8)
 
 
-def test_samples_say_the_latest_edge_that_was_told() -> None:
+def test_samples_carry_the_latest_transmitted_edge() -> None:
     """Its frame is out within a millisecond of the edge: from then on every sample carries it."""
     unit = made(noise=False)
     units = wired(unit).units(0.0, SECONDS)
@@ -125,7 +125,7 @@ def test_the_counter_wraps_in_flight() -> None:
 
 
 @pytest.mark.parametrize("latency_us", [0.0, 1500.0, 40_000.0, -3000.0])
-def test_stamps_are_late_by_the_latency_and_frames_follow_them(latency_us: float) -> None:
+def test_timestamps_are_late_by_the_latency_and_frames_follow_them(latency_us: float) -> None:
     unit = made(noise=False, latency_us=latency_us, oscillator=OscillatorTable())
     units = wired(unit).units(0.0, SECONDS)
     rows, _ = decoded(units, unit.table)
@@ -136,7 +136,7 @@ def test_stamps_are_late_by_the_latency_and_frames_follow_them(latency_us: float
     np.testing.assert_allclose(behind_s, 50e-6 + 4 * 120e-6, rtol=0, atol=2e-9)
 
 
-def test_the_hosts_stamps_lag_by_the_jitter_and_keep_their_order() -> None:
+def test_host_timestamps_lag_by_the_jitter_and_keep_their_order() -> None:
     quiet, rough = (wired(made(), jitter_us).units(0.0, SECONDS) for jitter_us in (0.0, 60.0))
     assert [one.data for one in quiet] == [one.data for one in rough]
     stamps = np.array([one.time_s for one in rough])
@@ -148,7 +148,7 @@ def test_the_hosts_stamps_lag_by_the_jitter_and_keep_their_order() -> None:
 
 
 @pytest.mark.parametrize("keys", [{}, {"latency_us": 7000.0, "rate_hz": 1000}])
-def test_the_same_frames_however_time_is_cut(keys: dict[str, Any]) -> None:
+def test_frames_do_not_depend_on_how_time_is_cut(keys: dict[str, Any]) -> None:
     whole = wired(made(**keys), jitter_ns=20.0).units(0.0, SECONDS + 1.0)
     wire = wired(made(**keys), jitter_ns=20.0)
     cuts = [0.0, 0.25, 0.2503, 0.5, 1.0003, 1.00031, 1.7, 2.0, 3.141592, 5.9999, 6.0004, 6.1, 7.0]
@@ -182,7 +182,7 @@ def decoded_without_clock(units: list[WireUnit], table: ImuTable) -> StructArray
     return record.rows
 
 
-def test_values_beyond_the_frames_range_are_held_at_its_end() -> None:
+def test_values_beyond_the_range_of_a_frame_are_clipped() -> None:
     table = ImuTable(grade="perfect", rate_hz=50)
     unit = InertialUnit(table, circling_the_pole(1.0, 50.0, 12.0, 6357500.0), 1, "main", noise=False)
     rows, _ = decoded(wired(unit).units(0.0, 1.5), table)
@@ -192,7 +192,7 @@ def test_values_beyond_the_frames_range_are_held_at_its_end() -> None:
 
 @pytest.mark.parametrize("grade", ["navigation", "tactical", "mems", "perfect"])
 @pytest.mark.parametrize("pps", ["main", None])
-def test_the_configuration_is_one_the_recorder_takes(grade: Any, pps: str | None) -> None:
+def test_the_configuration_is_valid_for_the_recorder(grade: Any, pps: str | None) -> None:
     table = ImuTable(grade=grade, pps=pps, rate_hz=400, tick_hz=10_000_000)
     text = tomlkit.dumps({"imu": {"main": config_table(table, "main", "can:socketcan:can0?bitrate=1000000")}})
     read = ImuConfig.model_validate(tomllib.loads(text)["imu"]["main"])

@@ -39,7 +39,7 @@ def unit(trajectory: Any, seed: int = 1, *, noisy: bool = True, **keys: Any) -> 
 # -- gravity
 
 
-def test_gravity_on_the_ellipsoid_is_the_published_one() -> None:
+def test_gravity_on_the_ellipsoid_matches_the_published_values() -> None:
     """NIMA TR8350.2, table 3.4: at the equator, at a pole, mean over the ellipsoid."""
     equator, pole = normal_gravity(np.array([0.0, 1.0]), np.zeros(2))
     np.testing.assert_allclose([equator, pole], [9.7803253359, 9.8321849378], rtol=0, atol=1.5e-10)
@@ -49,7 +49,7 @@ def test_gravity_on_the_ellipsoid_is_the_published_one() -> None:
     assert np.average(normal_gravity(sine, 0 * sine), weights=area) == pytest.approx(9.7976432222, abs=1.5e-10)
 
 
-def test_gravity_at_45_degrees_and_its_gradient() -> None:
+def test_gravity_and_its_gradient_at_45_degrees_match_grs_80() -> None:
     """GRS 80 says 9.806199203 (Moritz 2000); WGS 84's GM is smaller, its shape and the centrifugal part the same."""
     sine = np.full(2, np.sqrt(0.5))
     ground, above = normal_gravity(sine, np.array([0.0, 1.0]))
@@ -79,7 +79,7 @@ def normal_potential(point: FloatArray) -> float:
 
 @pytest.mark.parametrize("lat_deg", [0.0, 30.0, 47.5, 75.0])
 @pytest.mark.parametrize("height_m", [0.0, 500.0, 3000.0])
-def test_gravity_above_the_ellipsoid_is_the_potentials_slope(lat_deg: float, height_m: float) -> None:
+def test_gravity_above_the_ellipsoid_is_the_gradient_of_the_potential(lat_deg: float, height_m: float) -> None:
     """The series has flattening to first order, 2γ/a · 3f² = 1e-10 m/s² a metre, and stops at h², 5e-9 m/s² at 3 km."""
     lat = np.radians(lat_deg)
     up, step = np.array([np.cos(lat), np.sin(lat)]), 50.0
@@ -89,7 +89,7 @@ def test_gravity_above_the_ellipsoid_is_the_potentials_slope(lat_deg: float, hei
     assert normal_gravity(np.array([np.sin(lat)]), np.array([height_m]))[0] == pytest.approx(-slope, abs=limit)
 
 
-def test_gravity_points_down_the_normal_by_proj_and_compiled() -> None:
+def test_gravity_points_down_the_normal_in_proj_and_compiled_code() -> None:
     rng = np.random.default_rng(5)
     lat, lon, height = rng.uniform(-1.57, 1.57, 100), rng.uniform(-3.1, 3.1, 100), rng.uniform(-400, 9000, 100)
     points_e = e_from_geodetic(lat, lon, height)
@@ -103,7 +103,7 @@ def test_gravity_points_down_the_normal_by_proj_and_compiled() -> None:
 # -- what perfect sensors measure
 
 
-def test_at_rest_it_measures_gravity_up_and_the_earths_rate() -> None:
+def test_an_imu_at_rest_measures_gravity_upwards_and_the_earth_rate() -> None:
     lat, heading, height_m = np.radians(47.5), np.radians(35.0), 470.0
     still = unit(standing(3.0, 47.5, height_m, attitude_deg=(35, 0, 0)), grade="perfect", rate_hz=100)
     _, force, rate = still.samples(1, 300)
@@ -114,14 +114,14 @@ def test_at_rest_it_measures_gravity_up_and_the_earths_rate() -> None:
     np.testing.assert_allclose(rate, np.tile([forward, right, down], (300, 1)), rtol=0, atol=1e-14)
 
 
-def test_nose_up_it_is_pushed_forward_and_right_wing_down_to_the_left() -> None:
+def test_pitch_up_gives_forward_force_and_roll_right_gives_leftward_force() -> None:
     _, force, _ = unit(standing(1.0, attitude_deg=(0, 10, 0)), grade="perfect").samples(1, 1)
     assert force[0, 0] / np.linalg.norm(force[0]) == pytest.approx(np.sin(np.radians(10.0)), abs=1e-9)
     _, force, _ = unit(standing(1.0, attitude_deg=(0, 0, 10)), grade="perfect").samples(1, 1)
     assert force[0, 1] / np.linalg.norm(force[0]) == pytest.approx(-np.sin(np.radians(10.0)), abs=1e-9)
 
 
-def test_in_a_steady_turn_it_measures_the_centripetal_force_of_inertial_space() -> None:
+def test_a_steady_turn_gives_the_centripetal_force_of_inertial_space() -> None:
     """Around the pole the turn and the earth's add: ρ (ω + Ω)² towards the axis, less what attraction gives."""
     radius_m, turn, z_m = 800.0, 0.075, 6357500.0
     circle = circling_the_pole(4.0, radius_m, turn, z_m)
@@ -136,7 +136,7 @@ def test_in_a_steady_turn_it_measures_the_centripetal_force_of_inertial_space() 
     assert radius_m * turn**2 == pytest.approx(-outward[0], rel=5e-3)
 
 
-def test_a_lever_arm_moves_the_steady_turns_radius() -> None:
+def test_a_lever_arm_changes_the_radius_of_a_steady_turn() -> None:
     shorter = circling_the_pole(1.0, 798.0, 0.075, 6357499.5)
     edges_s = np.arange(0.0, 1.0, 0.01)
     there = true_increments(circling_the_pole(1.0, 800.0, 0.075, 6357500.0), edges_s, np.array([0.0, -2.0, 0.5]))
@@ -144,7 +144,7 @@ def test_a_lever_arm_moves_the_steady_turns_radius() -> None:
 
 
 @pytest.mark.parametrize("rate_hz", [10, 100, 200, 1000])
-def test_increments_are_those_of_a_fine_quadrature(rate_hz: int, tmp_path: Path) -> None:
+def test_increments_match_a_fine_quadrature(rate_hz: int, tmp_path: Path) -> None:
     flight = rough_flight(tmp_path)
     edges_s = 31.0 + np.arange(41) / rate_hz
     fine = int(np.ceil(2000 / rate_hz)) * 2
@@ -161,7 +161,7 @@ def test_increments_are_those_of_a_fine_quadrature(rate_hz: int, tmp_path: Path)
     np.testing.assert_allclose(specific_force(motion), force_b.reshape(-1, 3), rtol=0, atol=1e-9)
 
 
-def test_the_units_own_axes_and_clock() -> None:
+def test_increments_use_the_axes_and_clock_of_the_unit() -> None:
     """Mounted with x to the right and y backward; its clock 100 ppm fast: intervals shorter, means smaller by that."""
     mounted = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
     still = standing(3.0, attitude_deg=(20, 4, 2))
@@ -207,7 +207,7 @@ def expected_allan(white: float, drift: float, constants_s: FloatArray, tau_s: f
 
 
 @pytest.mark.parametrize("grade", ["navigation", "tactical", "mems"])
-def test_the_random_walk_at_a_second_is_the_grades(grade: Any) -> None:
+def test_random_walk_at_one_second_matches_the_grade(grade: Any) -> None:
     """600 s of six sensors at rest: three sigmas are 6 % at a second, where there is little but white noise."""
     rate_hz, seconds = 20, 600
     _, force, rate = unit(standing(seconds + 1.0), grade=grade, rate_hz=rate_hz).samples(1, seconds * rate_hz)
@@ -222,7 +222,7 @@ def test_the_random_walk_at_a_second_is_the_grades(grade: Any) -> None:
                 assert 1.0 <= expected / sensor.random_walk < 1.05
 
 
-def test_the_drifts_level_is_the_instability_asked_for() -> None:
+def test_drift_level_matches_the_requested_instability() -> None:
     """A drift of short constants, far above the white noise: its curve by closed forms, its top the instability."""
     keys = {"gyro_bias_instability_deg_per_h": 30.0, "accel_bias_instability_mg": 0.5, "bias_correlation_h": 80 / 3600}
     table = ImuTable(grade="navigation", rate_hz=10, noise=ImuNoiseTable(**keys))
@@ -249,7 +249,7 @@ def test_default_drift_is_level_over_two_decades() -> None:
     assert max(curve) <= 1.0
 
 
-def test_turn_on_errors_have_the_grades_spread() -> None:
+def test_turn_on_errors_have_the_spread_of_the_grade() -> None:
     """Variances of 900 draws each: one sigma of them is √(2/900), three are 14 %."""
     table = ImuTable(grade="mems")
     noise, limit = noise_of(table), 3 * np.sqrt(2 / 900)
@@ -267,7 +267,7 @@ def test_turn_on_errors_have_the_grades_spread() -> None:
         np.testing.assert_array_equal(one.matrices, one.matrices.transpose(0, 2, 1))
 
 
-def test_outputs_are_the_truth_with_what_was_drawn() -> None:
+def test_outputs_are_the_truth_with_the_drawn_errors() -> None:
     still = standing(2.0, attitude_deg=(30, 20, -15))
     quiet = {"angle_random_walk_deg_per_sqrt_h": 0.0, "velocity_random_walk_m_per_s_per_sqrt_h": 0.0}
     quiet |= {"gyro_bias_instability_deg_per_h": 0.0, "accel_bias_instability_mg": 0.0}
@@ -283,7 +283,7 @@ def test_outputs_are_the_truth_with_what_was_drawn() -> None:
     assert np.abs(force - true_force).max() > 1e-3
 
 
-def test_a_flight_without_noise_is_perfect_whatever_the_grade() -> None:
+def test_a_flight_without_noise_is_perfect_with_any_grade() -> None:
     still = standing(1.0)
     without = unit(still, grade="mems", noisy=False)
     for got, expected in zip(without.samples(1, 50), unit(still, grade="perfect").samples(1, 50), strict=True):
@@ -295,7 +295,7 @@ def unit_of(flight: Any, seed: int, grade: str = "tactical") -> FloatArray:
     return np.concatenate([parts[0][:, None], *parts[1:]], axis=1)
 
 
-def test_same_seed_same_values_however_they_are_asked_for(tmp_path: Path) -> None:
+def test_values_depend_only_on_the_seed(tmp_path: Path) -> None:
     flight = rough_flight(tmp_path)
     whole = unit_of(flight, 1)
     piecewise = unit(flight, 1)
@@ -306,7 +306,7 @@ def test_same_seed_same_values_however_they_are_asked_for(tmp_path: Path) -> Non
     assert not np.array_equal(unit_of(flight, 2), whole)
 
 
-def test_samples_begin_with_the_flight_and_end_with_it() -> None:
+def test_samples_begin_and_end_with_the_flight() -> None:
     slow = unit(standing(10.0), oscillator=OscillatorTable(offset_ppm=-1000.0), rate_hz=100)
     assert slow.last == 999
     assert slow.samples(999, 1)[0] <= 10.0
@@ -318,7 +318,7 @@ def test_samples_begin_with_the_flight_and_end_with_it() -> None:
             slow.samples(first, count)
 
 
-def test_grades_get_worse_and_single_keys_override_them() -> None:
+def test_grades_are_ordered_and_single_keys_override_them() -> None:
     order = ["perfect", "navigation", "tactical", "mems", "consumer"]
     for key in set(ImuNoiseTable.model_fields) - {"bias_correlation_h"}:
         values = [getattr(GRADES[grade], key) for grade in order]
@@ -345,6 +345,6 @@ def test_a_plan_with_an_unknown_grade_is_refused(text: str, message: str, tmp_pa
 
 
 @pytest.mark.parametrize("row", [[0.0, 0.0, -1.0], [0.0, 0.1, 1.0]])
-def test_what_is_no_rotation_is_refused(row: list[float]) -> None:
+def test_a_matrix_that_is_not_a_rotation_is_refused(row: list[float]) -> None:
     with pytest.raises(PlanError, match=r"^imu\.main\.rotation_b_imu: not a rotation"):
         unit(standing(1.0), rotation_b_imu=[[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], row])

@@ -30,7 +30,7 @@ def edges_s(seconds: float) -> FloatArray:
 
 
 def navigated(flight: Trajectory, seconds: float, lever_arm_b: FloatArray | None = None) -> States:
-    """From the truth at the start by increments alone, made five seconds at a time."""
+    """Navigate from the true start with increments alone, made five seconds at a time."""
     edges = edges_s(seconds)
     cuts = range(0, len(edges) - 1, 5 * RATE_HZ)
     blocks: list[Increments] = [true_increments(flight, edges[k : k + 5 * RATE_HZ + 1], lever_arm_b) for k in cuts]
@@ -45,7 +45,7 @@ def navigated(flight: Trajectory, seconds: float, lever_arm_b: FloatArray | None
 
 
 def distances_m(states: States, flight: Trajectory, seconds: float, lever_arm_b: FloatArray) -> FloatArray:
-    """From the truth, ten times a second and at the end."""
+    """Return distances from the truth, ten times a second and at the end."""
     step = RATE_HZ // 10
     truth = flight.poses(edges_s(seconds)[step::step])
     points_e = truth.position_e + truth.rot_e_from_b @ lever_arm_b
@@ -53,7 +53,7 @@ def distances_m(states: States, flight: Trajectory, seconds: float, lever_arm_b:
     return distances
 
 
-def test_ten_rough_minutes_end_within_a_centimetre(flight: Trajectory) -> None:
+def test_ten_turbulent_minutes_are_integrated_to_a_centimetre(flight: Trajectory) -> None:
     seconds = 60.0 * MINUTES
     assert flight.end_s > seconds
     roll_rad, _, heading_rad = flight.attitude(edges_s(seconds)[::RATE_HZ])
@@ -68,13 +68,13 @@ def test_ten_rough_minutes_end_within_a_centimetre(flight: Trajectory) -> None:
     np.testing.assert_allclose(states.velocity_e[-1], truth.velocity_e[0], rtol=0, atol=1e-4)
 
 
-def test_off_the_bodys_origin_too(flight: Trajectory) -> None:
+def test_integration_off_the_body_origin_is_accurate_to_a_centimetre(flight: Trajectory) -> None:
     seconds, lever_arm_b = 120.0, np.array([1.5, -0.8, 0.6])
     states = navigated(flight, seconds, lever_arm_b)
     assert distances_m(states, flight, seconds, lever_arm_b).max() < LIMIT_M
 
 
-def test_the_centimetre_is_not_there_by_chance(flight: Trajectory) -> None:
+def test_small_rate_and_gravity_errors_break_the_centimetre(flight: Trajectory) -> None:
     """A hundredth of the earth's rate, or a tenth of a milligal, break it: the limit tests what it should."""
     seconds = 300.0
     edges = edges_s(seconds)

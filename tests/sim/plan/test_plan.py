@@ -53,7 +53,7 @@ def refused(text: str) -> PlanError:
 
 
 class TestLoading:
-    def test_a_line_is_enough_and_the_rest_is_the_documented_default(self) -> None:
+    def test_a_plan_with_one_line_gets_the_documented_defaults(self) -> None:
         plan = parse_plan(text_of(), Path("/somewhere"))
         assert plan.folder == Path("/somewhere")
         assert plan.tables.ground is None
@@ -62,25 +62,27 @@ class TestLoading:
         assert plan.tables.scanner["left"].kind == "oscillating"
         assert plan.tables.scanner["left"].nominal.range_offset_m == 0.0
 
-    def test_the_start_is_gps_time_by_the_leap_seconds_of_its_day(self) -> None:
+    def test_the_start_is_gps_time_with_the_leap_seconds_of_its_day(self) -> None:
         """GPS week 1903 began on 2016-06-26; five days and 18 s later it was 2016-07-01T00:00:01 by 17 leap seconds."""
         plan = parse_plan(text_of(flight="start = 2016-07-01T02:00:01+02:00"), Path())
         assert plan.leap_seconds == 17
         assert plan.start_gps_ns == (1903 * 604_800 + 5 * 86_400 + 18) * 1_000_000_000
 
-    def test_a_file_and_its_folder(self, tmp_path: Path) -> None:
+    def test_a_file_is_loaded_with_its_folder(self, tmp_path: Path) -> None:
         (tmp_path / "mine.toml").write_text(text_of())
         plan = load_plan(tmp_path / "mine.toml")
         assert plan.folder == tmp_path
         assert plan.text == text_of()
 
-    def test_a_file_named_as_a_preset_goes_before_it(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_a_file_with_the_name_of_a_preset_has_precedence(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
         monkeypatch.chdir(tmp_path)
         assert load_plan("small").tables.flight.name == "small"
         Path("small").write_text(text_of())
         assert load_plan("small").tables.flight.name == "short"
 
-    def test_no_null_in_toml_so_empty_text_unwires_a_pps(self) -> None:
+    def test_an_empty_text_disconnects_a_pps(self) -> None:
         plan = parse_plan(text_of(more='[gnss.rover]\npps = ""'), Path())
         assert plan.tables.gnss["rover"].pps is None
         other = plan.with_seed(5)
@@ -127,21 +129,21 @@ class TestRefusals:
             ("[flight\n", "plan", "not TOML: "),
         ],
     )
-    def test_one_line_that_names_the_key(self, text: str, key: str, words: str) -> None:
+    def test_each_mistake_is_one_line_that_names_the_key(self, text: str, key: str, words: str) -> None:
         error = refused(text)
         assert error.key == key
         assert words in str(error)
 
-    def test_no_such_file_says_which_presets_there_are(self, tmp_path: Path) -> None:
+    def test_error_for_a_missing_file_lists_the_presets(self, tmp_path: Path) -> None:
         with pytest.raises(PlanError, match=r"nowhere\.toml: No such file or directory; want .* small, calibration"):
             load_plan(tmp_path / "nowhere.toml")
 
-    def test_not_text(self, tmp_path: Path) -> None:
+    def test_a_file_that_is_not_utf_8_is_refused(self, tmp_path: Path) -> None:
         (tmp_path / "plan.toml").write_bytes(b"\xfd[flight]")
         with pytest.raises(PlanError, match="is not UTF-8"):
             load_plan(tmp_path / "plan.toml")
 
-    def test_a_folder(self, tmp_path: Path) -> None:
+    def test_a_folder_is_refused(self, tmp_path: Path) -> None:
         with pytest.raises(PlanError, match="Is a directory"):
             load_plan(tmp_path)
 
@@ -151,7 +153,7 @@ class TestChanges:
         more = "[scanner.left]\nprf_hz = 50_000.0\n[scanner.left.true]\nomega_deg = 0.3"
         return parse_plan(text_of(more=more), Path())
 
-    def test_another_seed_and_nothing_else(self) -> None:
+    def test_another_seed_changes_only_the_seed(self) -> None:
         plan = self.plan()
         other = plan.with_seed(99)
         assert other.tables.flight.seed == 99
@@ -174,7 +176,7 @@ class TestChanges:
         again = parse_plan(changed.text, Path())
         assert (again.tables, again.start_gps_ns) == (changed.tables, changed.start_gps_ns)
 
-    def test_a_change_is_validated_as_a_file_is(self) -> None:
+    def test_a_change_is_validated_like_a_file(self) -> None:
         with pytest.raises(PlanError, match=r"^flight\.speed_mps: got 5\.0, want greater than or equal to 10$"):
             self.plan().changed({"flight": {"speed_mps": 5.0}})
 
@@ -232,7 +234,7 @@ def model_in(annotation: Any) -> type[BaseModel] | None:
 
 
 def row_of(key: str, field: FieldInfo) -> str:
-    """A key's row on the page."""
+    """Return the row of a key on the page."""
     unit = next((unit for ending, unit in UNITS.items() if key.endswith(ending)), "")
     meaning = (field.description or "").replace("|", "\\|")
     return f"| `{key}` | {type_of(field)} | {unit} | {default_of(field)} | {meaning} |"
@@ -249,7 +251,7 @@ def type_of(field: FieldInfo) -> str:
 
 
 def words(annotation: Any, metadata: Sequence[Any] = ()) -> str:
-    """A type in words."""
+    """Describe a type in words."""
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     if origin is typing.Annotated:
         return words(arguments[0], [inner for outer in arguments[1:] for inner in getattr(outer, "metadata", [outer])])
@@ -268,7 +270,7 @@ def words(annotation: Any, metadata: Sequence[Any] = ()) -> str:
 
 
 def default_of(field: FieldInfo) -> str:
-    """A key's default as TOML."""
+    """Return a key's default as TOML."""
     value = field.get_default(call_default_factory=True)
     if value is PydanticUndefined:
         return "**needed**"
@@ -298,11 +300,11 @@ def tables_of_page() -> dict[str, str]:
 class TestPage:
     """docs/simulation.md and the tables say the same."""
 
-    def test_every_table_has_its_heading_and_no_other_has(self) -> None:
+    def test_every_table_has_a_heading_and_every_heading_a_table(self) -> None:
         assert set(tables_of_page()) == set(sections())
 
     @pytest.mark.parametrize("heading", list(sections()))
-    def test_rows_are_the_tables_keys(self, heading: str) -> None:
+    def test_rows_match_the_keys_of_the_table(self, heading: str) -> None:
         _, _, table = tables_of_page()[heading].partition("| key | type and bounds | unit | default | meaning |\n")
         rows = re.findall(r"^\| `\w+` \|.*$", table, flags=re.MULTILINE)
         fields = sections()[heading].model_fields
@@ -325,7 +327,7 @@ class TestPage:
         for surface in SURFACES:
             assert surface in truth, surface
 
-    def test_examples_are_plans(self) -> None:
+    def test_examples_are_valid_plans(self) -> None:
         blocks = re.findall(r"^```toml\n(.*?)^```$", PAGE, flags=re.MULTILINE | re.DOTALL)
         whole = [block for block in blocks if "[flight]" in block]
         assert whole

@@ -36,7 +36,7 @@ def headings_deg(preset: str) -> list[float]:
 
 class TestEveryPreset:
     @pytest.mark.parametrize("preset", PRESETS)
-    def test_is_flown_within_its_scanners_range(self, preset: str) -> None:
+    def test_every_preset_stays_within_the_range_of_its_scanner(self, preset: str) -> None:
         """What is below, from the middle of a swath to its edges, is measured."""
         flown = survey(preset)
         assert flown.plan.tables.flight.name == preset
@@ -49,7 +49,7 @@ class TestEveryPreset:
             assert slant_m.max() < 0.8 * scanner.range_max_m
 
     @pytest.mark.parametrize("preset", PRESETS)
-    def test_lines_are_flown_as_they_stand(self, preset: str) -> None:
+    def test_lines_are_flown_in_their_listed_order(self, preset: str) -> None:
         flown, tables = survey(preset), survey(preset).plan.tables
         assert [line.name for line in flown.trajectory.lines] == [line.name for line in tables.line]
         for strip, line in zip(flown.strips, tables.line, strict=True):
@@ -58,14 +58,14 @@ class TestEveryPreset:
             assert strip.end_s - strip.start_s == pytest.approx(length_m / speed_mps, rel=1e-3)
 
     @pytest.mark.parametrize("preset", PRESETS)
-    def test_the_log_is_as_large_as_the_page_says(self, preset: str) -> None:
+    def test_the_log_size_matches_the_page(self, preset: str) -> None:
         told = re.search(rf"^\| `{preset}` \|.*?([\d.]+) GB", PAGE, re.MULTILINE)
         log_gb = rows(preset)[-1]["log_bytes"] / 1e9
         assert log_gb < 2.0 if told is None else log_gb == pytest.approx(float(told[1]), rel=0.1)
 
 
-class TestSmall:
-    def test_it_is_short_and_has_of_everything(self) -> None:
+class TestSmallPreset:
+    def test_preset_is_short_and_contains_every_kind_of_object(self) -> None:
         flown = survey("small")
         total, scene = rows("small")[-1], flown.scene
         assert len(flown.strips) == 3
@@ -83,13 +83,13 @@ class TestSmall:
         assert south["overlap_percent"] == 0.0
 
 
-class TestCalibration:
-    def test_eleven_minutes_and_twenty_million(self) -> None:
+class TestCalibrationPreset:
+    def test_preset_takes_eleven_minutes_and_twenty_million_pulses(self) -> None:
         total = rows("calibration")[-1]
         assert total["seconds"] == pytest.approx(660.0, abs=20.0)
         assert total["pulses"] == pytest.approx(20e6, rel=0.05)
 
-    def test_turns_to_either_side(self) -> None:
+    def test_flight_turns_to_both_sides(self) -> None:
         """Between neighbouring lines: else what gyroscopes' axes lean by passes for the accelerometers' biases."""
         flown = survey("calibration")
         turned_deg = []
@@ -100,7 +100,7 @@ class TestCalibration:
         assert sum(angle > 90.0 for angle in turned_deg) >= 5
         assert sum(angle < -90.0 for angle in turned_deg) >= 5
 
-    def test_two_heights_two_speeds(self) -> None:
+    def test_flight_has_two_heights_and_two_speeds(self) -> None:
         lines = rows("calibration")[:-1]
         low = [row["height_mean_m"] for row in lines if row["name"].startswith("low")]
         high = [row["height_mean_m"] for row in lines if row["name"].startswith("high")]
@@ -108,7 +108,7 @@ class TestCalibration:
         assert min(high) / max(low) >= 1.7
         assert len({strip.speed_mps for strip in survey("calibration").strips}) == 2
 
-    def test_opposite_crossing_and_parallel_in_each_height(self) -> None:
+    def test_each_height_has_opposite_crossing_and_parallel_lines(self) -> None:
         strips, headings = survey("calibration").strips, headings_deg("calibration")
         for height_m in {strip.height_m for strip in strips}:
             level = [
@@ -124,7 +124,7 @@ class TestCalibration:
             assert min(apart) < 1.0
             assert max(apart) > 100.0
 
-    def test_papers_say_zero_and_are_wrong(self) -> None:
+    def test_nominal_calibration_is_zero_and_wrong(self) -> None:
         scanner = survey("calibration").plan.tables.scanner["left"]
         nominal, true = scanner.nominal.model_dump(), scanner.true.model_dump()
         assert all(value == 0.0 for key, value in nominal.items() if not key.startswith("lever_arm"))
@@ -134,7 +134,7 @@ class TestCalibration:
         for key in ("scan_angle_scale_ppm", "scan_plane_tilt_deg", "time_offset_us"):
             assert true[key] != 0.0
 
-    def test_roofs_of_every_aspect(self) -> None:
+    def test_roofs_face_every_direction(self) -> None:
         """Ridges of at least 150 houses, some in every sixth of the half circle."""
         corners = survey("calibration").scene.buildings
         assert len(corners) >= 150
@@ -151,7 +151,7 @@ class TestCalibration:
         assert np.median(seen) >= 6
 
 
-class TestOthers:
+class TestOtherPresets:
     def test_corridor_follows_its_wire_both_ways(self) -> None:
         """Every mast is seen; most from a line out, most from a line back: both leave out where they turn."""
         flown = survey("corridor")
@@ -185,7 +185,7 @@ class TestOthers:
 
 class TestPage:
     @pytest.mark.parametrize("text", EXAMPLES, ids=["first", "drone"])
-    def test_its_plans_fly(self, text: str) -> None:
+    def test_example_plans_can_be_flown(self, text: str) -> None:
         plan = parse_plan(text, Path())
         summary = summary_of(Survey(plan))
         assert len(summary) == len(plan.tables.line) + 1

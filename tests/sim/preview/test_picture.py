@@ -59,7 +59,7 @@ def strip(plan: Plan, index: int = 0) -> Strip:
 
 
 class TestSummary:
-    def test_by_hand(self) -> None:
+    def test_summary_matches_a_calculation_by_hand(self) -> None:
         """H = 400 m, ±30°: swath 800/√3 m; 1000 m at 50 m/s; lines 230.94 m apart overlap by half."""
         apart = 400.0 / math.sqrt(3.0)
         plan = flat_plan(
@@ -84,13 +84,13 @@ class TestSummary:
         assert total["pulses"] == pytest.approx(6_000_000, abs=1)
         assert total["seconds"] > 60.0
 
-    def test_the_log_is_datagrams_above_all(self) -> None:
+    def test_datagrams_dominate_the_size_of_the_log(self) -> None:
         """SREP/1: 48 + 100 · (8 + 8 · 3) + 4 bytes for 100 pulses."""
         plan = flat_plan(line("a", "-500.0, 0.0", "500.0, 0.0"))
         datagrams = 20_000 * (48 + 100 * 32 + 4)
         assert datagrams < plan_summary(plan)[-1]["log_bytes"] < 1.15 * datagrams
 
-    def test_a_slope_is_seen_from_less_high(self) -> None:
+    def test_a_slope_reduces_the_height_above_ground(self) -> None:
         """10 %, falling to the west along the line: ±50 m over 500 m, the mean as at the origin."""
         more = "slope_percent = 10.0\nslope_towards_deg = 270.0\n[control]\npoints = 0\n"
         text = FLAT.replace("[control]\npoints = 3\n", more)
@@ -98,7 +98,7 @@ class TestSummary:
         assert row["height_min_m"] == pytest.approx(350.0, abs=0.1)
         assert row["height_mean_m"] == pytest.approx(400.0, abs=0.1)
 
-    def test_a_spinning_head_sees_as_far_as_it_can_measure(self) -> None:
+    def test_swath_of_a_spinning_head_is_limited_by_its_range(self) -> None:
         """60 m up, to 100 m: 80 m to either side; acos 0.6 of half a turn of the pulses reach the ground."""
         head = f'[scanner.belly]\nkind = "vlp16"\nscan_hz = 10.0\nrange_max_m = 100.0\ninstallation = {ACROSS}\n'
         text = FLAT.partition("[scanner.left]")[0] + head + line("a", "-500.0, 0.0", "500.0, 0.0", 460.0)
@@ -151,20 +151,20 @@ class TestFans:
         return angles
 
     @pytest.mark.parametrize("kind", KINDS)
-    def test_rate_and_width(self, kind: str) -> None:
+    def test_rate_and_half_angle_match_the_pulses(self, kind: str) -> None:
         angles, fan = self.angles(KINDS[kind]), fan_of(KINDS[kind])
         assert len(angles) == pytest.approx(SPAN_S * pulse_rate_hz(KINDS[kind]), rel=2e-3)
         assert np.abs(angles).max() == pytest.approx(fan.half_angle_rad, rel=5e-3)
 
     @pytest.mark.parametrize("kind", ["sine", "polygon", "monogon", "nutating", "vlp16", "os1"])
-    def test_shares(self, kind: str) -> None:
+    def test_shares_of_pulses_below_each_angle_match(self, kind: str) -> None:
         """Share of the pulses below each angle; spinning heads' beams lean, so that they differ a little from turns."""
         angles, fan = self.angles(KINDS[kind]), fan_of(KINDS[kind])
         at = np.linspace(-0.95, 0.95, 39) * fan.half_angle_rad
         below = np.searchsorted(np.sort(angles), at) / len(angles)
         assert np.abs(below - fan.share(at)).max() < 0.01
 
-    def test_a_scanner_that_looks_to_the_right(self) -> None:
+    def test_a_scanner_mounted_with_roll_looks_sideways(self) -> None:
         """Mounted rolled by 20° to the left of the aircraft's axis: the beam at 0 goes to the right."""
         roll = math.radians(-20.0)
         turned = [[1.0, 0.0, 0.0], [0.0, math.cos(roll), -math.sin(roll)], [0.0, math.sin(roll), math.cos(roll)]]
@@ -176,7 +176,7 @@ class TestFans:
 
 
 class TestStrips:
-    def test_sides_and_ends(self) -> None:
+    def test_strip_has_its_sides_and_ends(self) -> None:
         """A line to the north-east: right of it is south-east."""
         one = strip(flat_plan(line("a", "100.0, 200.0", "400.0, 600.0")))
         east, north = np.array([220.0, 180.0, 100.0, 400.0]), np.array([360.0, 390.0, 200.0, 600.0])
@@ -185,15 +185,15 @@ class TestStrips:
         assert right == pytest.approx([0.0, -50.0, 0.0, 0.0])
         assert np.stack(one.point(along, right)) == pytest.approx(np.stack([east, north]))
 
-    def test_covered_is_what_the_beam_reaches(self) -> None:
-        """±30° from 400 m: 230.9 m on the level; on ground 100 m higher 173.2 m, and none behind the end."""
+    def test_covered_ground_is_what_the_beam_reaches(self) -> None:
+        """±30° from 400 m cover 230.9 m on level ground and 173.2 m on ground 100 m higher."""
         one = strip(flat_plan(line("a", "0.0, 0.0", "500.0, 0.0")))
         east = np.array([100.0, 100.0, 100.0, 100.0, 501.0, 499.0])
         north = np.array([230.0, -232.0, 180.0, -170.0, 0.0, 0.0])
         ground = np.array([400.0, 400.0, 500.0, 500.0, 400.0, 400.0])
         assert one.covers(east, north, ground).tolist() == [True, False, False, True, False, True]
 
-    def test_the_map_holds_every_pulse(self) -> None:
+    def test_the_map_contains_every_pulse(self) -> None:
         survey = Survey(flat_plan(line("a", "-500.0, 0.0", "500.0, 0.0"), line("b", "0.0, 500.0", "0.0, -500.0")))
         grid = grid_of(survey)
         assert grid.density.sum() * grid.cell_m**2 == pytest.approx(100_000.0 * 40.0, rel=0.01)
@@ -213,7 +213,7 @@ class TestStrips:
         sine = 100_000.0 / (50.0 * math.pi * np.sqrt(math.radians(30.0) ** 2 - angle**2)) * np.cos(angle) ** 2 / 400.0
         assert strip(plan).density(east, north, ground, 0.1) == pytest.approx(sine, rel=1e-4)
 
-    def test_ground_is_asked_for_where_it_is_seen(self) -> None:
+    def test_ground_heights_are_requested_only_inside_the_swath(self) -> None:
         plan = flat_plan(line("a", "-500.0, 0.0", "500.0, 0.0"))
         found = corners(plan)
         swath = 800.0 / math.sqrt(3.0)
@@ -240,14 +240,14 @@ class TestFrames:
         assert high == pytest.approx([2500.0, 2000.0])
         assert stretch == 1.0
 
-    def test_what_is_long_and_thin_is_stretched(self) -> None:
+    def test_a_long_narrow_map_is_stretched(self) -> None:
         low, high, stretch = _framed(np.array([0.0, 0.0]), np.array([500.0, 40_000.0]), self.BOX)
         assert [*low, *high] == pytest.approx([0.0, 0.0, 500.0, 40_000.0])
         assert stretch == pytest.approx((500.0 / 8.0) / (40_000.0 / 4.0))
 
 
 class TestDrawing:
-    def test_a_page(self, tmp_path: Path) -> None:
+    def test_a_page_is_drawn(self, tmp_path: Path) -> None:
         things = (
             "[[terrain.village]]\ncenter_m = [0.0, 0.0]\nsize_m = [200.0, 200.0]\nhouses = 10\n"
             "[[terrain.water]]\ncenter_m = [-300.0, 100.0]\nradius_m = 50.0\n"
@@ -270,7 +270,7 @@ class TestDrawing:
         assert data[:5] == b"%PDF-"
         assert b"/MediaBox [ 0 0 1224 820.8 ]" in data
 
-    def test_another_ending_is_refused_before_anything_is_flown(self, tmp_path: Path) -> None:
+    def test_another_file_extension_is_refused_before_flying(self, tmp_path: Path) -> None:
         plan = flat_plan(line("a", "-500.0, 0.0", "500.0, 0.0", 300.0))  # below the ground
         with pytest.raises(PlanError, match=r"plan\.docx: want a picture's name that ends in one of \.pdf, \.png, "):
             draw_plan(plan, tmp_path / "plan.docx")
@@ -278,6 +278,6 @@ class TestDrawing:
             draw_plan(plan, tmp_path / "plan.png")
         assert not list(tmp_path.iterdir())
 
-    def test_no_such_folder(self, tmp_path: Path) -> None:
+    def test_a_missing_folder_is_refused(self, tmp_path: Path) -> None:
         with pytest.raises(FileNotFoundError):
             draw_plan(flat_plan(line("a", "-500.0, 0.0", "500.0, 0.0")), tmp_path / "nowhere" / "plan.png")

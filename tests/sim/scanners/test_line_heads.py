@@ -45,13 +45,13 @@ def unit(*components: float | FloatArray) -> FloatArray:
 # ---------------------------------------------------------------------------------------------- optics
 
 
-def test_a_mirror_turns_the_beam_twice_its_own_turn() -> None:
+def test_a_mirror_turns_the_beam_by_twice_its_rotation() -> None:
     beam = mirrors.swung_mirror(2 * np.radians([7.5]), 0.0, 0.0)
     assert np.degrees(np.arctan2(beam[0, 1], beam[0, 2])) == pytest.approx(15.0, abs=1e-12)
 
 
 @pytest.mark.parametrize(("shaft_deg", "x_over_tilt"), [(0.0, 1.4142136), (7.5, 1.5867067), (-15.0, 0.99999999)])
-def test_a_tilted_facet_by_the_sheet(shaft_deg: float, x_over_tilt: float) -> None:
+def test_a_tilted_facet_follows_the_formula_sheet(shaft_deg: float, x_over_tilt: float) -> None:
     beam = mirrors.swung_mirror(2 * np.radians([shaft_deg]), 1e-4, 0.0)
     assert beam[0, 0] / 1e-4 == pytest.approx(x_over_tilt, abs=6e-8)  # printed with eight digits
 
@@ -70,12 +70,12 @@ def test_a_tilted_scan_plane_is_the_cone_of_iso_14(optics: Any) -> None:
     np.testing.assert_allclose(optics(theta, tilt), expected, atol=1e-15)
 
 
-def test_a_monogon_tilted_by_the_sheet() -> None:
+def test_a_tilted_monogon_follows_the_formula_sheet() -> None:
     beam = mirrors.monogon(np.radians([20.0]), 2e-4)
     assert beam[0, 0] / 1e-4 == pytest.approx(-1.999999987, abs=1e-9)
 
 
-def test_palmer_by_the_sheet() -> None:
+def test_palmer_scan_follows_the_formula_sheet() -> None:
     beam = mirrors.nutating(np.radians([0.0, 90.0, 180.0, 270.0]), np.radians(3.5))
     along, across = beam[:, 0] / beam[:, 2], beam[:, 1] / beam[:, 2]
     np.testing.assert_allclose(along[[0, 2]], [0.1227845609, -0.1227845609], atol=1e-10)
@@ -83,7 +83,7 @@ def test_palmer_by_the_sheet() -> None:
     assert along[1] == pytest.approx(0.003740866104, abs=1e-12)
 
 
-def test_risley_by_the_sheet() -> None:
+def test_risley_pair_follows_the_formula_sheet() -> None:
     wedge = np.radians(10.0)
     one = mirrors.risley(np.zeros(1), np.zeros(1), (wedge, 0.0), 1.51)
     assert np.degrees(np.arctan2(-one[0, 0], one[0, 2])) == pytest.approx(5.201161908, abs=1e-9)
@@ -105,7 +105,7 @@ def test_risley_by_the_sheet() -> None:
         motions.polygon(40.0, 6),
     ],
 )
-def test_rates_and_accelerations_are_the_angles_derivatives(motion: motions.Motion) -> None:
+def test_rates_and_accelerations_are_derivatives_of_the_angle(motion: motions.Motion) -> None:
     time_s, step_s = 3.0 + np.linspace(0.0, 0.05, 2001)[:-1] + 1.234e-5, 1e-7
     before, at, after = (motion(time_s + shift) for shift in (-step_s, 0.0, step_s))
     smooth = np.abs(after.angle_rad - before.angle_rad) < 1e-3  # where no facet or turn ends
@@ -116,13 +116,13 @@ def test_rates_and_accelerations_are_the_angles_derivatives(motion: motions.Moti
     np.testing.assert_allclose(acceleration[smooth], at.acceleration_rps2[smooth], atol=20.0, rtol=1e-5)
 
 
-def test_a_sine_is_one() -> None:
+def test_sine_motion_is_a_sine() -> None:
     time_s = np.linspace(0.0, 1.0, 5001)
     swing = motions.sine(0.5, 7.0)(time_s)
     np.testing.assert_allclose(swing.angle_rad, 0.5 * np.sin(2 * np.pi * 7.0 * time_s), atol=1e-13)
 
 
-def test_a_triangle_is_even_but_where_it_turns() -> None:
+def test_triangle_motion_is_uniform_except_at_its_turns() -> None:
     half_angle = np.radians(30.0)
     time_s = np.linspace(0.0, 0.1, 100_001)
     swing = motions.triangle(half_angle, 10.0)(time_s)
@@ -139,7 +139,7 @@ def test_a_triangle_is_even_but_where_it_turns() -> None:
 # ---------------------------------------------------------------------------------------------- emission
 
 
-def test_pulses_leave_at_their_ticks_and_later_by_the_time_offset() -> None:
+def test_pulses_leave_at_their_ticks_plus_the_time_offset() -> None:
     table = scanner(
         "oscillating", prf_hz=333_333.3, tick_hz=20_000_000, oscillator=OSCILLATOR, true={"time_offset_us": 250.0}
     )
@@ -157,7 +157,7 @@ def test_pulses_leave_at_their_ticks_and_later_by_the_time_offset() -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_time_may_be_cut_anywhere(kind: str) -> None:
+def test_pulses_do_not_depend_on_how_time_is_cut(kind: str) -> None:
     table = scanner(kind, prf_hz=50_000.0, true={"time_offset_us": -80.0}, oscillator=OSCILLATOR)
     whole = LineHead(table, "left").pulses(0.0, 0.5)
     cuts = [0.0, 0.1, 0.1, 0.1000001, 0.23456789, float(whole.time_s[3000]), 0.49999, 0.5]
@@ -254,7 +254,7 @@ def miss_rad(table: ScannerTable, pulses: Pulses) -> FloatArray:
 
 @pytest.mark.parametrize("error", ["none", *ERRORS, "all"])
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_readings_give_the_light_back_to_less_than_a_count(kind: str, error: str) -> None:
+def test_the_readings_reproduce_the_beams_to_less_than_a_count(kind: str, error: str) -> None:
     true = ERRORS if error == "all" else {error: ERRORS[error]} if error != "none" else {}
     if kind in ("nutating", "risley"):
         true = {key: value for key, value in true.items() if key not in LINE_ONLY}
@@ -268,7 +268,7 @@ def test_the_readings_give_the_light_back_to_less_than_a_count(kind: str, error:
 
 
 @pytest.mark.parametrize("key", ["scan_angle_offset_deg", "scan_angle_scale_ppm", "encoder_latency_us", "torsion_us2"])
-def test_an_error_forgotten_shows(key: str) -> None:
+def test_an_omitted_error_changes_the_beam_by_many_counts(key: str) -> None:
     """Each of the errors above turns the beam by many counts: the test before could fail."""
     table = scanner("oscillating", prf_hz=1_000_000.0, true={key: ERRORS[key]})
     pulses = LineHead(table, "left").pulses(5.0, 5.03)
@@ -276,7 +276,7 @@ def test_an_error_forgotten_shows(key: str) -> None:
     assert miss_rad(blind, pulses).max() > 15 * 4 * np.pi / table.encoder_counts
 
 
-def test_signs_of_the_errors_by_what_they_mean() -> None:
+def test_errors_have_their_documented_signs() -> None:
     """The reading at the centre is the offset, it is old by the latency, and the mirror lags it by the torsion."""
 
     def readings(**true: float) -> FloatArray:
@@ -308,7 +308,7 @@ def test_each_facet_of_a_polygon_has_its_own_tilt() -> None:
         assert (expected != 0.0).all() == (index in tilts)
 
 
-def test_a_risley_pairs_reading_counts_whole_turns() -> None:
+def test_the_reading_of_a_risley_pair_counts_whole_turns() -> None:
     """From the reading alone both prisms are known, over as many turns as it takes the second to be back."""
     table = scanner("risley", prism_ratio=-0.75, prf_hz=100_000.0, scan_hz=100.0, encoder_counts=100_000)
     pulses = LineHead(table, "left").pulses(0.0, 0.1)
@@ -323,7 +323,7 @@ def test_a_risley_pairs_reading_counts_whole_turns() -> None:
 
 
 @pytest.mark.parametrize("kind", ["oscillating", "polygon", "monogon", "nutating", "risley"])
-def test_the_configuration_takes_the_geometry(kind: str) -> None:
+def test_the_geometry_is_valid_in_a_configuration(kind: str) -> None:
     geometry = config_geometry(scanner(kind))
     said = GeometryConfig.model_validate(geometry).model_dump(exclude_none=True)
     assert said == geometry
@@ -361,12 +361,12 @@ def test_the_configuration_takes_the_geometry(kind: str) -> None:
         ({"true": {"scan_angle_offset_deg": 11.0}}, r"true\.scan_angle_offset_deg: turns the beam by 11°"),
     ],
 )
-def test_what_cannot_be_is_refused_by_its_key(keys: dict[str, Any], error: str) -> None:
+def test_impossible_values_are_refused_by_their_key(keys: dict[str, Any], error: str) -> None:
     with pytest.raises(PlanError, match=r"^scanner\.left\." + error):
         LineHead(ScannerTable.model_validate(keys), "left")
 
 
-def test_a_polygon_at_its_limit_stays_in_its_facets() -> None:
+def test_a_polygon_at_its_limit_stays_within_its_facets() -> None:
     true = {"scan_angle_offset_deg": -0.5}
     table = scanner("polygon", facets=6, half_angle_deg=59.492, prf_hz=1_000_000.0, true=true, encoder_counts=100_000)
     pulses = LineHead(table, "left").pulses(0.0, 0.05)

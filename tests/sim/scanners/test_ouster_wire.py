@@ -70,7 +70,7 @@ def expected_returns(shot: Shots, most: int) -> list[tuple[int, int, int, float]
 
 
 @pytest.mark.parametrize("dual", [False, True])
-def test_returns_come_back_in_the_order_of_the_truth(dual: bool) -> None:
+def test_returns_are_parsed_in_the_order_of_the_truth(dual: bool) -> None:
     plan = plan_of("os1", dual_return=dual)
     units, truth, (shot,) = sent(plan, [0.0, 0.03])
     rows, _ = read_back(plan, units)
@@ -87,7 +87,7 @@ def test_returns_come_back_in_the_order_of_the_truth(dual: bool) -> None:
     assert ((rows["return_number"] == 2).sum() > 4000) == dual
 
 
-def test_two_returns_of_one_range_come_the_stronger_first() -> None:
+def test_of_two_returns_at_one_range_the_stronger_comes_first() -> None:
     plan = plan_of("os1", dual_return=True)
     units, truth, (shot,) = sent(plan, [0.0, 0.02])
     rows, _ = read_back(plan, units)
@@ -102,7 +102,7 @@ def test_two_returns_of_one_range_come_the_stronger_first() -> None:
     assert ((rows["flags"][second] & RETURN_FLAG_LAST) > 0).all()
 
 
-def test_what_a_packet_cannot_say_is_no_return() -> None:
+def test_values_that_a_packet_cannot_express_give_no_return() -> None:
     plan = plan_of("os1")
     pulses = Os1Head(plan.tables.scanner["left"], "left").pulses(0.0, 0.01)
     shot = measured_of(pulses)
@@ -115,7 +115,7 @@ def test_what_a_packet_cannot_say_is_no_return() -> None:
     np.testing.assert_allclose(rows["range_m"], 524.287, rtol=0, atol=1e-9)
 
 
-def test_drivers_points_are_the_true_ones_within_quanta() -> None:
+def test_points_of_the_driver_match_the_truth_within_quanta() -> None:
     plan = plan_of("os1")
     units, truth, (shot,) = sent(plan, [0.0, 0.06])
     rows, _ = read_back(plan, units)
@@ -125,7 +125,7 @@ def test_drivers_points_are_the_true_ones_within_quanta() -> None:
     assert np.linalg.norm(points - true, axis=1).max() <= 0.0005 + 1e-9
 
 
-def test_turns_are_frames() -> None:
+def test_each_turn_is_a_frame() -> None:
     plan = plan_of("os1", scan_hz=20.0)
     units, truth, _ = sent(plan, [0.045, 0.06])
     rows, _ = read_back(plan, units)
@@ -138,7 +138,7 @@ def test_turns_are_frames() -> None:
     assert set(frames) == {0, 1}
 
 
-def test_cutting_time_differently_gives_the_same_bytes() -> None:
+def test_bytes_do_not_depend_on_how_time_is_cut() -> None:
     plan = plan_of("os1", noise=True, dual_return=True)
     one, truth, _ = sent(plan, [0.0, 0.05])
     other, other_truth, _ = sent(plan, [0.0, 0.0001, 0.0001, 0.0201, 0.021, 0.049, 0.05])
@@ -150,7 +150,7 @@ def test_cutting_time_differently_gives_the_same_bytes() -> None:
 # --- time -----------------------------------------------------------------------------------------------------------
 
 
-def test_stamps_count_the_seconds_since_power_on() -> None:
+def test_timestamps_count_the_seconds_since_power_on() -> None:
     plan = plan_of("os1", true={"time_offset_us": -120.0}, oscillator={"offset_ppm": 30.0, "ticks_at_start": 5 * 10**9})
     units, truth, _ = sent(plan, [2.98, 3.03])
     rows, clock = read_back(plan, units)
@@ -174,7 +174,7 @@ def ahead_us(plan: Plan, lost: list[tuple[float, float]], times_s: list[float], 
     return np.array(found)
 
 
-def test_without_pulses_the_head_goes_on_by_its_oscillator() -> None:
+def test_after_lost_pulses_the_head_continues_by_its_oscillator() -> None:
     plan = plan_of("os1", oscillator={"offset_ppm": -80.0})
     times_s = [0.9, 1.9, 2.5, 3.95, 4.9, 5.02, 6.0]
     drift = ahead_us(plan, [(1.5, 3.5)], times_s)
@@ -200,7 +200,7 @@ def test_a_head_without_pulses_counts_by_its_oscillator() -> None:
 @pytest.mark.parametrize(
     ("dual", "profile"), [(False, "RNG19_RFL8_SIG16_NIR16"), (True, "RNG19_RFL8_SIG16_NIR16_DUAL")]
 )
-def test_the_metadata_says_what_the_packets_are(dual: bool, profile: str) -> None:
+def test_the_metadata_describes_the_packets(dual: bool, profile: str) -> None:
     head = read_head(os1_metadata(plan_of("os1", dual_return=dual, serial="992200").tables.scanner["left"]))
     assert (head.profile, head.serial, head.return_order) == (profile, 992_200, "STRONGEST_TO_WEAKEST")
     assert head.header == "standard"
@@ -214,7 +214,7 @@ def test_serial_numbers_that_packets_cannot_carry_are_refused(serial: str) -> No
 
 
 @pytest.mark.parametrize("serial", ["1", str(2**40 - 1), "SIM-7", ""])
-def test_other_serials_are_recorded(serial: str) -> None:
+def test_other_serial_numbers_are_recorded(serial: str) -> None:
     plan = plan_of("os1", serial=serial)
     units, truth, _ = sent(plan, [0.0, 0.005])
     rows, _ = read_back(plan, units)

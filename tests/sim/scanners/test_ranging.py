@@ -65,7 +65,7 @@ def measure(
         {"true": {"range_offset_m": 0.35, "range_scale_ppm": 40.0}, "ibrc": IBRC},
     ],
 )
-def test_conventions_give_the_true_range_back(errors: dict[str, Any], ranges: str) -> None:
+def test_the_conventions_recover_the_true_range(errors: dict[str, Any], ranges: str) -> None:
     table = scanner(**errors)
     air = Air(AtmosphereTable.model_validate({"ranges": ranges, "visibility_km": 1e9}), 1064.0)
     measured = measure(table, echoes_of(SHOTS_M), air=air)
@@ -83,7 +83,7 @@ def test_conventions_give_the_true_range_back(errors: dict[str, Any], ranges: st
     assert (measured.range_m[~there] == 0.0).all()
 
 
-def test_intensities_of_the_table_meet_the_middle_its_ends_and_beyond() -> None:
+def test_intensity_corrections_hold_at_the_middle_the_ends_and_beyond() -> None:
     """A brighter echo than the table's last is corrected as that one, a darker one as the first."""
     table = scanner(ibrc={"intensity": [400.0, 2000.0], "correction_m": [0.04, -0.04]})
     range_m = np.full((4, 1), 1000.0)
@@ -100,7 +100,7 @@ def test_a_correction_that_is_subtracted_belongs_to_a_range_that_is_too_long() -
     assert dark == pytest.approx(1000.098, abs=1e-9)
 
 
-def test_beams_of_a_spinning_head_have_corrections_of_their_own() -> None:
+def test_each_beam_of_a_spinning_head_has_its_own_correction() -> None:
     beam = [{"channel": 3, "range_m": 0.05}, {"channel": 5, "range_m": -0.02}]
     table = scanner(kind="vlp16", beam=beam, reference_range_m=50.0, true={"range_offset_m": 0.1})
     pulses = pulses_of(np.arange(4), [3, 4, 5, 15])
@@ -112,7 +112,7 @@ def test_beams_of_a_spinning_head_have_corrections_of_their_own() -> None:
 # ---------------------------------------------------------------------------------------------- what is seen
 
 
-def test_intensity_by_reflectance_distance_and_air() -> None:
+def test_intensity_follows_reflectance_distance_and_air() -> None:
     """Twice as far: a quarter. Beer and Lambert: half the light after ln 2 of extinction, there and back."""
     range_m = np.array([[1000.0], [2000.0], [500.0], [10.0]])
     measured = measure(scanner(), echoes_of(range_m, np.array([[1.0], [1.0], [0.25], [1.0]])))
@@ -124,14 +124,14 @@ def test_intensity_by_reflectance_distance_and_air() -> None:
     assert hazy.intensity[0, 0] < 0.8 * 4000
 
 
-def test_a_receiver_may_have_another_scale() -> None:
+def test_a_receiver_may_use_another_intensity_scale() -> None:
     measured = measure(
         scanner(), echoes_of(np.full((2, 1), 1000.0), np.array([[0.5], [5.0]])), intensity=IntensityScale(200.0, 255.0)
     )
     assert measured.intensity[:, 0].tolist() == [100.0, 255.0]
 
 
-def test_too_weak_too_near_and_too_far_is_no_return_and_slots_keep_their_places() -> None:
+def test_echoes_out_of_limits_give_no_return_and_slots_keep_their_places() -> None:
     table = scanner(range_min_m=100.0, range_max_m=2000.0)
     range_m = np.array([[99.0, 500.0, 1999.0], [100.5, 1000.0, 1500.0], [300.0, 400.0, 2001.0]])
     reflectance = np.array([[0.4, 0.4, 0.4], [0.4, 0.004, 0.4], [1e-9, 0.4, 0.4]])
@@ -142,7 +142,7 @@ def test_too_weak_too_near_and_too_far_is_no_return_and_slots_keep_their_places(
     np.testing.assert_array_equal(measured.pulse_width_ns > 0, seen)
 
 
-def test_packed_slots_take_their_truth_along() -> None:
+def test_packed_slots_keep_their_truth() -> None:
     range_m = np.array([[0.0, 500.0, 700.0], [100.0, 0.0, 150.0], [9.0, 8.0, 0.0], [1.0, 2.0, 3.0], [0.0, 0.0, 0.0]])
     measured = Measured(range_m, range_m * 2, range_m * 3)
     truth = np.zeros(range_m.shape, RETURN_TRUTH_DTYPE)
@@ -157,7 +157,7 @@ def test_packed_slots_take_their_truth_along() -> None:
     assert measured.range_m[0, 0] == 0.0  # what was handed in stays
 
 
-def test_a_footprint_on_a_slope_makes_the_echo_long() -> None:
+def test_a_footprint_on_a_slope_lengthens_the_echo() -> None:
     """1000 m, 0.5 mrad, 45°: 0.5 m deep, 2 · 0.5 m / c = 3.336 ns more."""
     table = scanner(pulse_ns=4.0, divergence_mrad=0.5)
     measured = measure(table, echoes_of(np.full((2, 1), 1000.0), 1.0, np.array([[0.0], [45.0]])))
@@ -185,7 +185,7 @@ def noise_of(reflectance: float, incidence_deg: float, n: int, **keys: Any) -> F
         (0.4, 60.0, np.hypot(0.01, 0.3 * 0.4 * np.tan(np.pi / 3))),
     ],
 )
-def test_noise_is_normal_and_as_wide_as_intensity_and_incidence_make_it(
+def test_range_noise_is_normal_and_depends_on_intensity_and_incidence(
     reflectance: float, incidence_deg: float, sigma_m: float
 ) -> None:
     n = 50_000
@@ -196,7 +196,7 @@ def test_noise_is_normal_and_as_wide_as_intensity_and_incidence_make_it(
         assert stats.kstest(column / sigma_m, "norm").pvalue > 1e-3
 
 
-def test_noise_of_one_return_says_nothing_of_the_next() -> None:
+def test_noise_of_successive_returns_is_uncorrelated() -> None:
     n = 50_000
     drawn = noise_of(0.1, 0.0, n)
     assert abs(np.corrcoef(drawn[:, 0], drawn[:, 1])[0, 1]) < 4 / np.sqrt(n)
@@ -205,7 +205,7 @@ def test_noise_of_one_return_says_nothing_of_the_next() -> None:
     assert len(np.unique(drawn)) == drawn.size
 
 
-def test_noise_belongs_to_the_pulse_however_pulses_are_batched() -> None:
+def test_noise_does_not_depend_on_how_pulses_are_batched() -> None:
     echoes = echoes_of(np.full((1000, 3), 800.0), 0.2)
     table = scanner()
 
@@ -221,7 +221,7 @@ def test_noise_belongs_to_the_pulse_however_pulses_are_batched() -> None:
         assert abs(np.corrcoef(whole.ravel() - 800, other.ravel() - 800)[0, 1]) < 4 / np.sqrt(3000)
 
 
-def test_without_noise_there_is_none() -> None:
+def test_without_noise_ranges_are_exact() -> None:
     measured = measure(scanner(range_noise={"sigma_m": 5.0}), echoes_of(SHOTS_M))
     there = np.isfinite(SHOTS_M)
     np.testing.assert_array_equal(measured.range_m[there], SHOTS_M[there])
@@ -245,6 +245,6 @@ def test_without_noise_there_is_none() -> None:
         ({"true": {"range_scale_ppm": -1e6}}, r"true\.range_scale_ppm: got -1e\+06, want -100000 to 100000"),
     ],
 )
-def test_what_cannot_be_is_refused_by_its_key(keys: dict[str, Any], error: str) -> None:
+def test_impossible_values_are_refused_by_their_key(keys: dict[str, Any], error: str) -> None:
     with pytest.raises(PlanError, match=r"^scanner\.left\." + error):
         Ranging(scanner(**keys), Air(CLEAR, 1064.0), 1, "left", False)

@@ -46,7 +46,7 @@ def turned_deg(one: FloatArray, other: FloatArray) -> FloatArray:
 # --- when -----------------------------------------------------------------------------------------------------------
 
 
-def test_lasers_of_a_vlp16_fire_as_the_manual_has_it() -> None:
+def test_lasers_of_a_vlp16_fire_as_the_manual_states() -> None:
     # 9.4: 24 firing sequences of 55.296 µs a packet, 2.304 µs from laser to laser
     pulses = head_of("vlp16").pulses(0.0, 0.25)
     np.testing.assert_array_equal(pulses.number, np.arange(len(pulses)))
@@ -58,7 +58,7 @@ def test_lasers_of_a_vlp16_fire_as_the_manual_has_it() -> None:
 
 
 @pytest.mark.parametrize("scan_hz", [10.0, 20.0])
-def test_columns_of_an_os1_are_1024_a_turn(scan_hz: float) -> None:
+def test_an_os1_has_1024_columns_a_turn(scan_hz: float) -> None:
     pulses = head_of("os1", scan_hz=scan_hz).pulses(0.0, 0.15)
     np.testing.assert_array_equal(pulses.number, np.arange(len(pulses)))
     np.testing.assert_array_equal(pulses.channel, pulses.number % 64)
@@ -68,7 +68,7 @@ def test_columns_of_an_os1_are_1024_a_turn(scan_hz: float) -> None:
 
 
 @pytest.mark.parametrize("kind", ["vlp16", "os1"])
-def test_time_can_be_cut_anywhere(kind: str) -> None:
+def test_pulses_do_not_depend_on_how_time_is_cut(kind: str) -> None:
     oscillator = {"offset_ppm": 40.0, "drift_ppm_per_h": 5.0, "wander_ppm": 0.5}
     head = head_of(kind, oscillator=oscillator, true={"encoder_latency_us": 3.0})
     whole = joined([head.pulses(12.0, 12.2)])
@@ -85,7 +85,7 @@ def test_time_can_be_cut_anywhere(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", ["vlp16", "os1"])
-def test_the_heads_oscillator_makes_it_fire_and_turn_faster(kind: str) -> None:
+def test_a_fast_oscillator_makes_the_head_fire_and_turn_faster(kind: str) -> None:
     steady, fast = head_of(kind), head_of(kind, oscillator={"offset_ppm": 200.0})
     at_s = 100.0
     before = steady.pulses(at_s * (1 + 200e-6), at_s * (1 + 200e-6) + 1e-3)
@@ -98,7 +98,7 @@ def test_the_heads_oscillator_makes_it_fire_and_turn_faster(kind: str) -> None:
 # --- where to -------------------------------------------------------------------------------------------------------
 
 
-def test_a_vlp16s_point_is_the_formula_sheets() -> None:
+def test_vlp16_point_matches_the_formula_sheet() -> None:
     # FORMULAS 2.2: 50 m, α 123°, ω −9°; laser 6 has −9° and starts 6.6 mm above the centre
     reading_deg = 360.0 * 10.0 * 6 * 2.304e-6
     pulses = head_of("vlp16", true={"scan_angle_offset_deg": reading_deg - 123.0}).pulses(0.0, 20e-6)
@@ -106,7 +106,7 @@ def test_a_vlp16s_point_is_the_formula_sheets() -> None:
     np.testing.assert_allclose(points_at(pulses, 50.0)[6] - [0, 0, 0.0066], sheet, rtol=0, atol=6e-7)
 
 
-def test_an_os1s_point_is_the_formula_sheets() -> None:
+def test_os1_point_matches_the_formula_sheet() -> None:
     # FORMULAS 2.2: 50 m, tick 22528, azimuth 3.2°, altitude −9°, n 15.806 mm, in the lidar frame
     altitude_deg = json_head().altitude_rad[48] * 180 / np.pi
     beam = {"channel": 48, "azimuth_deg": 3.2 - 4.23, "elevation_deg": -9.0 - altitude_deg}
@@ -121,7 +121,7 @@ def json_head() -> Any:
     return read_head(os1_metadata(table_of("os1")))
 
 
-def test_an_os1_64_looks_like_one() -> None:
+def test_metadata_of_an_os1_64_has_its_figures() -> None:
     head = json_head()
     assert (head.beams, head.columns_per_frame, head.model) == (64, 1024, "OS-1-64")
     np.testing.assert_allclose(np.degrees(head.altitude_rad[[0, -1]]), [16.6, -16.6], atol=1e-9)
@@ -130,7 +130,7 @@ def test_an_os1_64_looks_like_one() -> None:
     assert head.beam_origin_m == (0.015806, 0.0)
 
 
-def test_vlp16_points_are_the_drivers_with_the_true_azimuth() -> None:
+def test_vlp16_points_match_the_driver_at_the_true_azimuth() -> None:
     pulses = head_of("vlp16", scan_hz=17.3).pulses(0.0, 0.06)
     rows = np.zeros(len(pulses), RETURN_DTYPE)
     rows["range_m"] = np.random.default_rng(1).uniform(1, 130, len(rows))
@@ -141,7 +141,7 @@ def test_vlp16_points_are_the_drivers_with_the_true_azimuth() -> None:
     np.testing.assert_allclose(np.linalg.norm(pulses.direction_s, axis=1), 1.0, rtol=0, atol=1e-14)
 
 
-def test_os1_points_are_the_drivers() -> None:
+def test_os1_points_match_the_driver() -> None:
     # the range the head says is the distance from the pulse's origin: nothing is left to be added
     pulses = head_of("os1").pulses(0.0, 0.1)
     rows = np.zeros(len(pulses), RETURN_DTYPE)
@@ -152,7 +152,7 @@ def test_os1_points_are_the_drivers() -> None:
 
 
 @pytest.mark.parametrize("scan_hz", [5.0, 10.0, 20.0])
-def test_a_vlp16_says_the_azimuth_of_each_groups_first_firing(scan_hz: float) -> None:
+def test_a_vlp16_reports_the_azimuth_of_the_first_firing_of_each_group(scan_hz: float) -> None:
     pulses = head_of("vlp16", scan_hz=scan_hz).pulses(0.0, 0.4)
     whole = len(pulses) // 32 * 32
     said = pulses.encoder[:whole].reshape(-1, 32)
@@ -171,7 +171,7 @@ def test_a_vlp16_says_the_azimuth_of_each_groups_first_firing(scan_hz: float) ->
 # --- errors ---------------------------------------------------------------------------------------------------------
 
 
-def test_encoder_errors_of_a_vlp16_turn_the_beam_as_conventions_says() -> None:
+def test_encoder_errors_of_a_vlp16_turn_the_beam_as_the_conventions_state() -> None:
     # θ = θ_encoder − offset + latency · dθ/dt, azimuth growing at 3600°/s
     plain = head_of("vlp16").pulses(0.0, 0.1)
     off = head_of("vlp16", true={"scan_angle_offset_deg": 0.3, "encoder_latency_us": 50.0}).pulses(0.0, 0.1)
@@ -179,7 +179,7 @@ def test_encoder_errors_of_a_vlp16_turn_the_beam_as_conventions_says() -> None:
     np.testing.assert_allclose(turned_deg(plain.direction_s, off.direction_s), -0.3 + 0.18, rtol=0, atol=1e-9)
 
 
-def test_encoder_errors_of_an_os1_turn_the_beam_as_conventions_says() -> None:
+def test_encoder_errors_of_an_os1_turn_the_beam_as_the_conventions_state() -> None:
     # its angle falls at 3600°/s, and grows from x to y
     plain = head_of("os1").pulses(0.0, 0.1)
     off = head_of("os1", true={"scan_angle_offset_deg": 0.3, "encoder_latency_us": 50.0}).pulses(0.0, 0.1)
@@ -189,7 +189,7 @@ def test_encoder_errors_of_an_os1_turn_the_beam_as_conventions_says() -> None:
 
 
 @pytest.mark.parametrize("kind", ["vlp16", "os1"])
-def test_beams_are_where_table_and_correction_say(kind: str) -> None:
+def test_beams_follow_their_table_and_corrections(kind: str) -> None:
     beam = {"channel": 5, "azimuth_deg": 0.2, "elevation_deg": -0.1, "range_m": 0.5}
     plain, off = head_of(kind).pulses(0.0, 0.05), head_of(kind, beam=[beam]).pulses(0.0, 0.05)
     hit = plain.channel == 5
@@ -215,7 +215,7 @@ def test_beams_are_where_table_and_correction_say(kind: str) -> None:
         ("os1", {"installation": [[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]]}, "installation"),
     ],
 )
-def test_what_no_such_head_has_is_refused(kind: str, keys: dict[str, Any], named: str) -> None:
+def test_settings_that_no_such_head_has_are_refused(kind: str, keys: dict[str, Any], named: str) -> None:
     with pytest.raises(PlanError) as caught:
         head_of(kind, **keys)
     assert caught.value.key == f"scanner.left.{named}"

@@ -68,7 +68,7 @@ def test_every_return_is_parsed_in_the_order_of_its_row(kind: str, slots: int) -
     np.testing.assert_allclose(rows["pulse_width_ns"], 3.0 + (truth["range_m"] - 900.0) / 200.0, atol=0.006)
 
 
-def test_a_header_says_what_the_page_asks_for() -> None:
+def test_a_header_has_the_fields_of_the_protocol_page() -> None:
     ticks_at_start = 2**63 - 5
     oscillator = {"ticks_at_start": ticks_at_start}
     table = scanner(oscillator=oscillator, prf_hz=150_000.0, tick_hz=20_000_000, return_slots=2, encoder_counts=100_000)
@@ -90,7 +90,7 @@ def test_a_header_says_what_the_page_asks_for() -> None:
     np.testing.assert_array_equal(np.diff(clocks["device_time_ns"]), np.diff(last))
 
 
-def test_datagrams_share_a_zone_and_the_zone_is_the_number_of_emissions_in_between() -> None:
+def test_datagrams_share_a_zone_that_counts_the_emissions_in_between() -> None:
     table = scanner(prf_hz=400_000.0, return_slots=1)
     spoken = speak(table, (1.0, 1.01), ranges_m=(300.0, 2300.0))
     rows, _ = spoken.parsed()
@@ -103,7 +103,7 @@ def test_datagrams_share_a_zone_and_the_zone_is_the_number_of_emissions_in_betwe
     assert (headers["mta_zone"][1:] != headers["mta_zone"][:-1]).all()  # cut for no other reason
 
 
-def test_a_pulse_without_return_stays_in_the_zone_at_hand() -> None:
+def test_a_pulse_without_return_stays_in_the_current_zone() -> None:
     table = scanner(prf_hz=150_000.0, return_slots=2)
     pulses = LineHead(table, "left").pulses(0.0, 11.5 / 150_000)
     range_m = np.zeros((len(pulses), 2))
@@ -121,7 +121,7 @@ def test_a_pulse_without_return_stays_in_the_zone_at_hand() -> None:
     assert headers["pulses"].tolist() == [2, 4, 6]
 
 
-def test_empty_slots_in_between_are_closed_on_the_wire() -> None:
+def test_empty_slots_in_between_are_removed_on_the_wire() -> None:
     table = scanner(return_slots=3)
     pulses = LineHead(table, "left").pulses(0.0, 1.5 / table.prf_hz)
     range_m = np.array([[0.0, 500.0, 600.0], [400.0, 0.0, 450.0]])
@@ -141,7 +141,7 @@ def test_empty_slots_in_between_are_closed_on_the_wire() -> None:
 
 @pytest.mark.parametrize("zone", ["resolved", "apparent"])
 @pytest.mark.parametrize("kind", ["oscillating", "polygon"])
-def test_the_same_bytes_however_time_is_cut(kind: str, zone: str) -> None:
+def test_bytes_do_not_depend_on_how_time_is_cut(kind: str, zone: str) -> None:
     table = scanner(kind=kind, zone=zone, prf_hz=200_000.0)
     idle, ranges_m = [(10.02, 10.35)], (740.0, 1400.0)  # some in the zone before, which ends at 749.5 m
     one = speak(table, (10.0, 10.02, 10.35, 10.4), noise=True, idle=idle, ranges_m=ranges_m)
@@ -170,7 +170,7 @@ def test_a_pause_ends_a_datagram_and_is_filled_with_heartbeats() -> None:
     assert (np.diff(clocks["device_time_ns"]) > 0).all()
 
 
-def test_truth_of_what_was_sent_in_a_pause_comes_with_the_next_units() -> None:
+def test_truth_of_returns_sent_in_a_pause_comes_with_the_next_units() -> None:
     table = scanner(return_slots=1)
     wire, head = SrepWire(table, "left", None, HostTable(), 1, noise=False), LineHead(table, "left")
     pulses = head.pulses(0.0, 50 / table.prf_hz)
@@ -195,7 +195,7 @@ def test_a_long_gap_between_pulses_ends_a_datagram_too() -> None:
     assert spoken.headers()["pulses"].tolist() == [25, 25]
 
 
-def test_ticks_since_the_first_fit_their_field() -> None:
+def test_ticks_since_the_first_pulse_fit_their_field() -> None:
     """1 GHz and 100 pulses a second: 2³² ticks go by in 430 pulses."""
     oscillator = {"ticks_at_start": 12}
     table = scanner(tick_hz=1_000_000_000, prf_hz=100.0, pulses_per_datagram=1000, oscillator=oscillator)
@@ -225,7 +225,7 @@ def test_units_arrive_after_a_fixed_time_and_jitter_in_order() -> None:
 # ---------------------------------------------------------------------------------------------- the pulse per second
 
 
-def test_the_latch_is_as_of_the_sending_of_each_datagram() -> None:
+def test_the_latch_is_that_at_the_sending_of_each_datagram() -> None:
     table = scanner(true={"time_offset_us": 90.0})
     pps = pulse_per_second(500.0)
     spoken = speak(table, (0.0, 0.4, 2.3), pps=pps)
@@ -267,7 +267,7 @@ def test_a_lost_pps_keeps_the_count_and_loses_the_lock() -> None:
     np.testing.assert_array_equal(headers["pps_ticks"], ticks[count])
 
 
-def test_without_a_pps_nothing_is_ever_latched() -> None:
+def test_without_a_pps_nothing_is_latched() -> None:
     table = scanner()
     wire, head = SrepWire(table, "left", None, HostTable(), 1, noise=False), LineHead(table, "left")
     pulses = head.pulses(100.0, 100.01)
@@ -282,7 +282,7 @@ def test_without_a_pps_nothing_is_ever_latched() -> None:
 # ---------------------------------------------------------------------------------------------- encoder, configuration
 
 
-def test_many_datagrams_at_once_are_those_one_by_one() -> None:
+def test_many_datagrams_at_once_equal_those_sent_singly() -> None:
     rng = np.random.default_rng(1)
     m, n, slots = 5, 7, 3
     body = np.zeros((m, n), pulse_dtype(slots))
@@ -303,7 +303,7 @@ def test_many_datagrams_at_once_are_those_one_by_one() -> None:
 
 
 @pytest.mark.parametrize("kind", ["oscillating", "polygon", "monogon", "nutating", "risley"])
-def test_the_configuration_takes_its_table(kind: str) -> None:
+def test_its_table_is_valid_in_a_configuration(kind: str) -> None:
     table = scanner(
         kind=kind,
         model="VUX-SIM",
@@ -323,7 +323,7 @@ def test_the_configuration_takes_its_table(kind: str) -> None:
     assert "pps" not in config_table(scanner(pps=None), "left", TRANSPORT)
 
 
-def test_what_cannot_be_is_refused_by_its_key() -> None:
+def test_impossible_values_are_refused_by_their_key() -> None:
     def wire(**keys: Any) -> None:
         SrepWire(scanner(**keys), "left", None, HostTable(), 1, noise=False)
 

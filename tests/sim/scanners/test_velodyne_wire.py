@@ -91,7 +91,7 @@ def expected_pairs(shot: Shots) -> list[tuple[int, int, int, float]]:
 
 
 @pytest.mark.parametrize("dual", [False, True])
-def test_returns_come_back_in_the_order_of_the_truth(dual: bool) -> None:
+def test_returns_are_parsed_in_the_order_of_the_truth(dual: bool) -> None:
     plan = plan_of("vlp16", dual_return=dual)
     units, truth, (shot,) = sent(plan, wire_of(plan), [0.0, 0.08])
     records, parser = decode(units)
@@ -115,7 +115,7 @@ def test_returns_come_back_in_the_order_of_the_truth(dual: bool) -> None:
     assert (number[rows["return_number"] == 2].size > 2000) == dual
 
 
-def test_flags_of_dual_returns_are_what_the_echoes_were() -> None:
+def test_flags_of_dual_returns_describe_the_echoes() -> None:
     plan = plan_of("vlp16", dual_return=True)
     units, truth, (shot,) = sent(plan, wire_of(plan), [0.0, 0.05])
     rows = rows_of(decode(units)[0], ScannerReturns)
@@ -127,7 +127,7 @@ def test_flags_of_dual_returns_are_what_the_echoes_were() -> None:
     np.testing.assert_array_equal(np.rint(rows["range_m"] / 0.002) == np.rint(farthest / 0.002), last)
 
 
-def test_what_a_packet_cannot_say_is_no_return() -> None:
+def test_values_that_a_packet_cannot_express_give_no_return() -> None:
     plan = plan_of("vlp16")
     pulses = Vlp16Head(plan.tables.scanner["left"], "left").pulses(0.0, 0.01)
     shot = measured_of(pulses)
@@ -144,7 +144,7 @@ def test_what_a_packet_cannot_say_is_no_return() -> None:
 # --- time -----------------------------------------------------------------------------------------------------------
 
 
-def test_stamps_are_utc_past_the_hour_over_the_hours_end() -> None:
+def test_timestamps_are_utc_past_the_hour_across_the_end_of_the_hour() -> None:
     plan = plan_of("vlp16", true={"time_offset_us": 250.0}, oscillator={"offset_ppm": 20.0})
     wire = wire_of(plan)
     units, truth, _ = sent(plan, wire, [1.9, 2.1])
@@ -173,7 +173,7 @@ def test_azimuths_are_true_to_a_hundredth_of_a_degree() -> None:
     assert 0.005 < np.abs(error[last_group]).max() <= 0.015
 
 
-def test_drivers_points_are_the_true_ones_within_quanta() -> None:
+def test_points_of_the_driver_match_the_truth_within_quanta() -> None:
     plan = plan_of("vlp16")
     units, truth, (shot,) = sent(plan, wire_of(plan), [0.0, 0.1])
     rows = rows_of(decode(units)[0], ScannerReturns)
@@ -184,7 +184,7 @@ def test_drivers_points_are_the_true_ones_within_quanta() -> None:
     assert (missed <= 0.001 + truth["range_m"] * np.radians(quanta) + 1e-9).all()
 
 
-def test_cutting_time_differently_gives_the_same_bytes() -> None:
+def test_bytes_do_not_depend_on_how_time_is_cut() -> None:
     plan = plan_of("vlp16", noise=True, dual_return=True)
     one, truth, _ = sent(plan, wire_of(plan), [0.0, 0.3])
     other, other_truth, _ = sent(plan, wire_of(plan), [0.0, 0.0004, 0.1, 0.1, 0.10061, 0.2, 0.299, 0.3])
@@ -207,7 +207,7 @@ def test_a_pause_begins_a_new_packet() -> None:
     assert set(parser.counters.errors) == {"cadence_gap"}
 
 
-def test_the_host_stamps_behind_the_last_firing() -> None:
+def test_the_host_timestamp_follows_the_last_firing() -> None:
     quiet = plan_of("vlp16")
     units, _, (shot,) = sent(quiet, wire_of(quiet), [0.0, 0.2])
     last_s = shot.pulses.time_s[383::384]
@@ -224,7 +224,7 @@ def test_the_host_stamps_behind_the_last_firing() -> None:
 # --- PPS and sentences ----------------------------------------------------------------------------------------------
 
 
-def test_position_packets_name_the_second_the_head_is_in() -> None:
+def test_position_packets_name_the_current_second_of_the_head() -> None:
     plan = plan_of("vlp16")
     wire = wire_of(plan)
     units = wire.idle(0.0, 4.0)
@@ -245,7 +245,7 @@ def test_position_packets_name_the_second_the_head_is_in() -> None:
     assert b",97.1922,36.8699,150626," in units[10].data  # 50 m/s in knots, course
 
 
-def test_returns_say_that_the_pulse_is_locked() -> None:
+def test_returns_report_the_locked_pulse() -> None:
     plan = plan_of("vlp16")
     units, _, _ = sent(plan, wire_of(plan), [0.0, 0.06])
     flags = rows_of(decode(units)[0], ScannerReturns)["flags"]
@@ -266,7 +266,7 @@ def past_hour_s(plan: Plan, lost: list[tuple[float, float]], times_s: list[float
     return np.array(ahead)
 
 
-def test_without_pulses_the_head_goes_on_by_its_oscillator() -> None:
+def test_after_lost_pulses_the_head_continues_by_its_oscillator() -> None:
     # edges of seconds 2 and 3 are lost; two in a row lock again: at second 5
     plan = plan_of("vlp16", oscillator={"offset_ppm": 60.0}, true={"time_offset_us": 40.0})
     lost = [(1.5, 3.5)]
@@ -295,7 +295,7 @@ def test_a_head_without_pulses_counts_from_power_on() -> None:
     assert all(unit.data[206:] == bytes(306) for unit in units)
 
 
-def test_a_head_that_gets_its_first_pulse_in_flight_is_set_by_it() -> None:
+def test_a_first_pulse_in_flight_sets_the_head() -> None:
     plan = plan_of("vlp16")
     lost = [(0.0, 1.5)]
     ahead_s = past_hour_s(plan, lost, [0.2, 1.9, 2.95, 3.02])

@@ -26,7 +26,7 @@ SQUARE = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 # --- ground ---------------------------------------------------------------------------------------------------------
 
 
-def test_ground_is_as_high_as_the_plan_says_also_far_from_the_origin() -> None:
+def test_ground_has_the_height_of_the_plan_even_far_from_the_origin() -> None:
     """At its nodes: 20 km away the ellipsoid lies 31 m below the site's plane."""
     scene = scene_of(
         "height_m = 730\nslope_percent = 2\nslope_towards_deg = 250\ncell_m = 20", 300.0, (16_000.0, -12_000.0)
@@ -50,7 +50,7 @@ def test_ground_between_nodes_is_bilinear_and_ends_at_the_edge() -> None:
     assert there == beyond
 
 
-def test_hills_are_as_high_and_as_long_as_the_plan_says() -> None:
+def test_hills_have_the_height_and_length_of_the_plan() -> None:
     table = plan_of("height_m = 100\nrelief_m = 80\nwavelength_m = 500").tables.terrain
     axis = np.arange(-5000.0, 5000.0, 25.0)
     height = analytic_heights(table)(axis, axis)
@@ -62,7 +62,7 @@ def test_hills_are_as_high_and_as_long_as_the_plan_says() -> None:
     assert 1.0 / number == pytest.approx(500.0, rel=0.1)
 
 
-def test_another_terrain_seed_moves_the_hills_and_another_flight_seed_does_not() -> None:
+def test_hills_depend_on_the_terrain_seed_and_not_on_the_flight_seed() -> None:
     text = "relief_m = 80\nseed = {}"
     place = np.linspace(-100.0, 100.0, 7)
     one, other = (scene_of(text.format(seed)).ground_m(place, place) for seed in (1, 2))
@@ -72,7 +72,7 @@ def test_another_terrain_seed_moves_the_hills_and_another_flight_seed_does_not()
     np.testing.assert_array_equal(again.ground_m(place, place), one)
 
 
-def test_up_is_the_ellipsoid_s_normal() -> None:
+def test_up_is_the_normal_of_the_ellipsoid() -> None:
     site = Site.at(47.5, 8.9)
     points = np.array([[0.0, 0.0, 400.0], [9000.0, -4000.0, 1500.0]])
     lat, lon, _ = geodetic_from_e(site.e_from_site(points))
@@ -80,7 +80,7 @@ def test_up_is_the_ellipsoid_s_normal() -> None:
     np.testing.assert_allclose(ups(site, points), normal_e @ site.rot_site_from_e.T, rtol=0, atol=1e-9)
 
 
-def test_too_fine_a_grid_names_the_cell_that_would_do() -> None:
+def test_error_for_too_fine_a_grid_suggests_a_cell_size() -> None:
     plan = plan_of("cell_m = 0.25")
     site = Site.at(*plan.tables.flight.origin_deg)
     with pytest.raises(
@@ -161,7 +161,7 @@ def test_roofs_face_every_side() -> None:
     assert counted.min() >= 10
 
 
-def test_more_houses_than_find_room_name_the_key_and_how_many_do() -> None:
+def test_error_for_too_many_houses_names_the_key_and_the_possible_number() -> None:
     text = "[[terrain.village]]\ncenter_m = [0, 0]\nsize_m = [100, 100]\nhouses = 500"
     with pytest.raises(
         PlanError, match=r"^terrain\.village\[0\]\.houses: 500 do not fit .* want at most (\d+)"
@@ -184,7 +184,7 @@ def test_streets_are_asphalt_with_paint() -> None:
 # --- what is left out -----------------------------------------------------------------------------------------------
 
 
-def test_what_lies_beyond_the_area_is_left_out() -> None:
+def test_objects_beyond_the_area_are_omitted() -> None:
     scene = scene_of(
         "[[terrain.building]]\ncenter_m = [5000, 0]\nsize_m = [10, 10]\n"
         "[[terrain.building]]\ncenter_m = [50, 0]\nsize_m = [10, 10]\n"
@@ -211,7 +211,7 @@ def test_trees_keep_off_houses_roads_and_water() -> None:
     assert (np.hypot(np.maximum(np.abs(x) - 10.0, 0.0), np.maximum(np.abs(y) - 15.0, 0.0)) >= radius).all()
 
 
-def test_forest_has_the_trees_the_plan_asks_for() -> None:
+def test_a_forest_has_the_number_of_trees_of_the_plan() -> None:
     scene = scene_of("[[terrain.forest]]\ncenter_m = [10, -20]\nsize_m = [200, 100]\ntrees_per_ha = 150\nheight_m = 18")
     assert len(scene.trees) == 300
     assert np.abs(scene.trees[:, 0] - 10.0).max() <= 100.0
@@ -226,7 +226,7 @@ def test_forest_has_the_trees_the_plan_asks_for() -> None:
 # --- control points -------------------------------------------------------------------------------------------------
 
 
-def test_control_points_lie_in_the_open_on_the_ground() -> None:
+def test_control_points_lie_on_open_ground() -> None:
     scene = scene_of(
         VILLAGE + "[[terrain.forest]]\ncenter_m = [-200, 200]\nsize_m = [150, 150]\n"
         "[[terrain.water]]\ncenter_m = [200, 200]\nradius_m = 50\n", 300.0,
@@ -246,7 +246,7 @@ def test_control_points_lie_in_the_open_on_the_ground() -> None:
     assert (scene.control_points(40, 8) != points).any()
 
 
-def test_control_points_keep_to_the_flatter_ground() -> None:
+def test_control_points_lie_on_flatter_ground() -> None:
     scene = scene_of("relief_m = 60\nwavelength_m = 200", 400.0)
     random = np.random.default_rng(1).uniform(-400.0, 400.0, (2000, 2))
     slope = scene.ground.slope(random[:, 0], random[:, 1])
@@ -254,7 +254,7 @@ def test_control_points_keep_to_the_flatter_ground() -> None:
     assert scene.ground.slope(points[:, 0], points[:, 1]).max() < 1.1 * np.median(slope)
 
 
-def test_no_room_for_control_points_names_the_key() -> None:
+def test_error_for_control_points_without_room_names_the_key() -> None:
     scene = scene_of("[[terrain.water]]\ncenter_m = [0, 0]\nradius_m = 290")
     with pytest.raises(PlanError, match=r"^control\.points: the open ground has no room for 10; set at most \d+$"):
         scene.control_points(10, 1)

@@ -22,7 +22,7 @@ ASKED, EVERY_S = 20, 2.0
 
 
 def feed_can(interface: str, port: int) -> None:
-    """Until the stream ends."""
+    """Forward frames until the stream ends."""
     bus = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
     bus.bind((interface,))
     with socket.create_server(("0.0.0.0", port)) as server:
@@ -49,7 +49,7 @@ def send(bus: socket.socket, frame: bytes) -> None:
 
 
 def asked(sock: socket.socket) -> tuple[int, int, int]:
-    """How long the answer took, this clock less the other, and the phase of the other's pulses; all in ns."""
+    """Return round-trip time, clock difference and phase of the other's pulses, all in ns."""
     sock.send(b"?")
     before = time.time_ns()
     try:
@@ -76,7 +76,7 @@ def follow(clock: str) -> None:
 
 
 def main() -> None:
-    """Until the power goes."""
+    """Run until the power is cut."""
     interface, port, clock = sys.argv[1:]
     threading.Thread(target=feed_can, args=(interface, int(port)), daemon=True).start()
     follow(clock)

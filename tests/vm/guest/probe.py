@@ -17,25 +17,25 @@ CLONE_NEWUSER = 0x10000000
 
 
 def libc(call: str, *arguments: object) -> None:
-    """A call of the C library; raises OSError."""
+    """Call a function of the C library; raise OSError on failure."""
     library = ctypes.CDLL(None, use_errno=True)
     if getattr(library, call)(*arguments) < 0:
         raise OSError(ctypes.get_errno(), call)
 
 
 def bound(family: int, kind: int, protocol: int, address: tuple[object, ...]) -> None:
-    """A socket of a family, bound."""
+    """Bind a socket of a family."""
     with socket.socket(family, kind, protocol) as sock:
         sock.bind(address)
 
 
 def opened(path: str, flags: int = os.O_RDWR) -> None:
-    """A file, opened."""
+    """Open a file."""
     os.close(os.open(path, flags | os.O_NOCTTY | os.O_NONBLOCK, 0o600))
 
 
 def synced(folder: str) -> None:
-    """A file in a folder, made and synced."""
+    """Create and sync a file in a folder."""
     fd = os.open(f"{folder}/probe", os.O_RDWR | os.O_CREAT)
     os.fsync(fd)
     os.close(fd)
@@ -43,12 +43,12 @@ def synced(folder: str) -> None:
 
 
 def stepped() -> None:
-    """The wall clock set to what it is."""
+    """Set the wall clock to its own value."""
     time.clock_settime(time.CLOCK_REALTIME, time.time())
 
 
 def real_time() -> None:
-    """The policy that the unit gave."""
+    """Raise unless this process has the real-time policy of its unit."""
     if os.sched_getscheduler(0) != os.SCHED_FIFO:
         raise OSError(errno.EPERM, "not real-time")
 

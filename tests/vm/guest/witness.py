@@ -31,18 +31,18 @@ def begin() -> int:
 
 
 def newest(logs: Path) -> Path | None:
-    """The log that was made last."""
+    """Return the newest log."""
     made = [path for path in logs.glob("*.mcap") if not path.name.endswith(".recovered.mcap")]
     return max(made, key=lambda path: path.stat().st_mtime_ns, default=None)
 
 
 def written(path: str) -> int:
-    """A file to be written to, empty."""
+    """Open an empty file for writing."""
     return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
 
 
 def main() -> None:
-    """Watch until the power goes."""
+    """Watch until the power is cut."""
     logs, told, begun = Path(sys.argv[1]), written(sys.argv[2]), written(sys.argv[2] + ".begun")
     pipe = begin()
     sizes: list[tuple[int, int, str]] = []

@@ -27,7 +27,7 @@ ROLL_RAD = math.radians(0.02)
 
 
 def quiet(what: str, done: int, total: int) -> None:
-    """Tell nobody how far it is."""
+    """Ignore progress."""
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,7 @@ def wish(made: Made, tmp_path_factory: pytest.TempPathFactory) -> CalibrationOpt
 
 @pytest.fixture(scope="module")
 def done(wish: CalibrationOptions, tmp_path_factory: pytest.TempPathFactory) -> Calibrated:
-    """The outcome before it is written; nothing is wrong with it."""
+    """Return an outcome without faults before it is written."""
     return calibrate(wish, tmp_path_factory.mktemp("returns"), quiet)
 
 
@@ -63,12 +63,12 @@ def wrong(done: Calibrated, sigma_rad: float = 1e-5, **by: float) -> Calibrated:
     return replace(done, adjusted=adjusted, flight=done.flight.placed(calibrations))
 
 
-def test_nothing_speaks_against_what_was_found(done: Calibrated) -> None:
+def test_a_correct_calibration_is_not_contradicted(done: Calibrated) -> None:
     assert strips_say(done, CELL_M) == []
     assert validation_says(done) == []
 
 
-def test_strips_speak_against_a_roll_that_is_off(done: Calibrated) -> None:
+def test_strips_contradict_a_wrong_roll(done: Calibrated) -> None:
     (said,) = strips_say(wrong(done, omega_rad=ROLL_RAD), CELL_M)
     assert said.what.startswith("strips still show this effect: roll: ")
     assert "to omega_deg" in said.what
@@ -77,13 +77,13 @@ def test_strips_speak_against_a_roll_that_is_off(done: Calibrated) -> None:
     assert not said.unusable
 
 
-def test_an_effect_that_the_calibration_does_not_claim_to_know_better_speaks_against_nothing(done: Calibrated) -> None:
+def test_an_effect_within_the_joint_sigma_is_not_a_contradiction(done: Calibrated) -> None:
     """Three sigmas of both together."""
     assert strips_say(wrong(done, ROLL_RAD / 2.0, omega_rad=ROLL_RAD), CELL_M) == []
     assert strips_say(wrong(done, ROLL_RAD / 4.0, omega_rad=ROLL_RAD), CELL_M) != []
 
 
-def test_a_validation_speaks_against_a_roll_that_is_off(done: Calibrated) -> None:
+def test_a_validation_contradicts_a_wrong_roll(done: Calibrated) -> None:
     """Both of its methods that compare strips: all that such a flight has."""
     said = validation_says(wrong(done, omega_rad=ROLL_RAD))
     assert [one.what.split(": ")[1] for one in said] == ["crossStripFlight (002)", "other (006)"]
@@ -94,7 +94,9 @@ def test_a_validation_speaks_against_a_roll_that_is_off(done: Calibrated) -> Non
         assert not one.unusable
 
 
-def test_all_three_are_told_in_the_verdict_of_a_calibration(done: Calibrated, wish: CalibrationOptions) -> None:
+def test_all_three_contradictions_are_in_the_verdict_of_a_calibration(
+    done: Calibrated, wish: CalibrationOptions
+) -> None:
     """Eight pairs of one sign, three sigmas off together: on the terminal, in the record and in the file."""
     sigma = 2.0**-16
     comparison = Comparison("left", "phi_rad", 8, -3.0 * sigma, sigma, 0.0, sigma, sigma)
@@ -119,10 +121,8 @@ def test_all_three_are_told_in_the_verdict_of_a_calibration(done: Calibrated, wi
         assert not any(one["what"].startswith(word) for one in sound.record["verdict"]["reasons"])
 
 
-def test_a_trajectory_of_another_place_is_noted_where_it_is_forced(
-    made: Made, wish: CalibrationOptions, tmp_path: Path
-) -> None:
-    """All strips are moved alike, so that nothing else says it."""
+def test_a_forced_trajectory_of_another_place_is_noted(made: Made, wish: CalibrationOptions, tmp_path: Path) -> None:
+    """All strips are moved alike, so only this note reveals it."""
     true, file = made.trajectory, tmp_path / "away.csv"
     lat, lon, height = true.geodetic()
     away = Trajectory.from_geodetic(

@@ -54,7 +54,7 @@ def test_a_scanner_without_noise_is_refused() -> None:
     assert "\n" not in str(raised.value)
 
 
-def test_polygons() -> None:
+def test_polygons_are_read() -> None:
     found = read_polygons(GOOD, "p.csv")
     np.testing.assert_array_equal(found["roof 1"], [[10, 0], [20, 0], [20, 8], [10, 8]])
     np.testing.assert_array_equal(found["roof 2"], [[0, 0], [4, 0], [2, 3]])
@@ -75,7 +75,7 @@ def test_polygons() -> None:
         (GOOD + '"POLYGON ((0 0, 1 0, 1 1))",roof 2\n', "line 4: name: roof 2 is given twice"),
     ],
 )
-def test_polygons_that_are_none(text: str, said: str) -> None:
+def test_invalid_polygons_are_refused(text: str, said: str) -> None:
     with pytest.raises(PolygonError) as raised:
         read_polygons(text, "p.csv")
     assert said in str(raised.value)
@@ -83,7 +83,7 @@ def test_polygons_that_are_none(text: str, said: str) -> None:
     assert "\n" not in str(raised.value)
 
 
-def test_polygons_stand_where_the_points_do(read: Any, tmp_path: Path) -> None:
+def test_polygons_are_in_the_coordinates_of_the_points(read: Any, tmp_path: Path) -> None:
     corners_t = np.array([[-20.0, -30.0, 0.0], [15.0, -30.0, 0.0], [15.0, 25.0, 0.0]])
     words = ", ".join(f"{x:.4f} {y:.4f}" for x, y, _ in on_map(read, corners_t))
     path = tmp_path / "p.csv"

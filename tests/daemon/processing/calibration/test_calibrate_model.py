@@ -59,7 +59,7 @@ def refused(*given: Any) -> str:
     return ended.value.message
 
 
-def test_a_file_reaches_all_that_can_be_asked_for(tmp_path: Path) -> None:
+def test_a_file_can_set_every_option(tmp_path: Path) -> None:
     assert model_of(file(tmp_path, WHOLE)) == ParameterOptions(
         "full",
         fix=frozenset(["time_offset_s", "right.omega_rad"]),
@@ -80,7 +80,7 @@ def test_a_file_reaches_all_that_can_be_asked_for(tmp_path: Path) -> None:
     )
 
 
-def test_the_example_of_the_page_is_such_a_file(tmp_path: Path) -> None:
+def test_the_example_of_the_page_is_valid(tmp_path: Path) -> None:
     (example,) = re.findall(r"^```toml\n(.*?)^```$", PAGE.read_text(), re.M | re.S)
     wish = model_of(file(tmp_path, example))
     assert wish.priors == {"left.kappa_rad": 0.02 * DEG, "range_offset_slot.2": 0.03}
@@ -90,7 +90,7 @@ def test_the_example_of_the_page_is_such_a_file(tmp_path: Path) -> None:
     assert len(wish.beams) == 3
 
 
-def test_an_empty_file_is_the_model_that_there_is_without_one(tmp_path: Path) -> None:
+def test_an_empty_file_gives_the_default_model(tmp_path: Path) -> None:
     assert model_of(file(tmp_path, "")) == ParameterOptions("scanner") == model_of("scanner")
     assert model_of(file(tmp_path, "[ibrc]\nknots = [1, 2]")) == ParameterOptions("scanner", ibrc_knots=(1.0, 2.0))
     assert (file_of("scanner"), file_of("model.TOML")) == (None, Path("model.TOML"))
@@ -108,10 +108,10 @@ def test_an_empty_file_is_the_model_that_there_is_without_one(tmp_path: Path) ->
         ),
     ],
 )
-def test_options_stand_above_the_file(
+def test_options_override_the_file(
     tmp_path: Path, options: tuple[str, str, list[str]], wish: dict[str, object]
 ) -> None:
-    """One of a parameter of all scanners also above what the file says of that of one."""
+    """An option for all scanners also overrides the file's setting of a single one."""
     found = model_of(file(tmp_path, BOTH), *options)
     assert {"fix": found.fix, "free": found.free} == {"fix": set(), "free": set()} | {
         word: set(names) for word, names in wish.items() if isinstance(names, list)
@@ -181,7 +181,7 @@ def test_options_stand_above_the_file(
         ("[beam]\nestimate = []", "beam.estimate: got [], want at least one"),
     ],
 )
-def test_mistakes_in_a_file_are_a_line_each(tmp_path: Path, text: str, said: str) -> None:
+def test_each_mistake_in_a_file_is_reported_in_one_line(tmp_path: Path, text: str, said: str) -> None:
     assert said in refused(file(tmp_path, text))
 
 
@@ -197,28 +197,28 @@ def test_mistakes_in_a_file_are_a_line_each(tmp_path: Path, text: str, said: str
         (("basic", "", "", ["ibrc.1=1"]), "--prior ibrc.1: unknown parameter"),
     ],
 )
-def test_mistakes_in_options_are_a_line_each(given: tuple[object, ...], said: str) -> None:
+def test_each_mistake_in_options_is_reported_in_one_line(given: tuple[object, ...], said: str) -> None:
     assert said in refused(*given)
 
 
-def test_all_that_is_wrong_with_a_file_is_said_at_once(tmp_path: Path) -> None:
+def test_all_mistakes_of_a_file_are_reported_at_once(tmp_path: Path) -> None:
     with pytest.raises(UserError) as ended:
         model_of(file(tmp_path, 'model = "all"\n[ibrc]\nknots = [2]\n'))
     assert len(ended.value.message.splitlines()) == 2
     assert ended.value.exit_code == ExitCode.USAGE
 
 
-def test_a_file_of_nested_tables_is_a_line(tmp_path: Path) -> None:
+def test_nested_tables_are_refused_in_one_line(tmp_path: Path) -> None:
     deep = "[parameters]\n" + 2000 * "a." + "b = 'free'"
     assert "nested too deeply; nest tables at most 32 deep" in refused(file(tmp_path, deep))
 
 
-def test_no_text_is_a_line(tmp_path: Path) -> None:
+def test_a_file_that_is_not_text_is_refused_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "model.toml").write_bytes(b"\xff\xfe\x00")
     assert "model.toml: cannot be read: not text; want a TOML file" in refused(str(tmp_path / "model.toml"))
 
 
-def test_what_is_asked_for_is_told_in_keys_of_files(tmp_path: Path) -> None:
+def test_options_are_described_by_the_keys_of_files(tmp_path: Path) -> None:
     wish = model_of(file(tmp_path, WHOLE))
     told = in_words(wish)
     assert told.startswith("full; fixed right.omega_deg, time_offset_us; free phi_deg; prior beam.azimuth_deg 0.05, ")

@@ -30,7 +30,7 @@ NOBODY: frozenset[str] = frozenset()
 
 
 def through_a_file(calibration: Calibration) -> Calibration:
-    """As a calibration file hands it on."""
+    """Return the calibration after writing it to a file and reading it back."""
     header = Header("2026-11-21T10:15:00Z-ab12", dt.datetime(2026, 11, 21, 10, 15, tzinfo=dt.UTC))
     return read_calibration(calibration_text(calibration, header), "left.toml")
 
@@ -69,7 +69,7 @@ def held_heading(flight: Flight) -> tuple[dict[str, float], Considered, tuple[Fi
     return away, heading, prealigned_otherwise(away, found)
 
 
-def test_a_held_heading_that_houses_contradict_is_told_and_makes_the_calibration_unusable(cast: Cast) -> None:
+def test_a_held_heading_contradicted_by_houses_makes_the_calibration_unusable(cast: Cast) -> None:
     away, heading, findings = held_heading(begun(cast, -0.6))
     assert set(away) == {"left.kappa_rad"}
     assert math.degrees(away["left.kappa_rad"]) == pytest.approx(0.6, abs=0.05)
@@ -86,8 +86,8 @@ def test_a_held_heading_that_is_right_is_not_contradicted(cast: Cast) -> None:
     assert heading.sigma < 0.5 * math.radians(0.6)
 
 
-def test_an_angle_that_is_fixed_keeps_its_start_and_leaves_the_others_to_be_found(cast: Cast) -> None:
-    """Neither is it contradicted here: of what is held at the user's word the adjustment tells."""
+def test_a_fixed_angle_keeps_its_start_while_the_others_are_found(cast: Cast) -> None:
+    """The contradiction is not reported here, because the adjustment reports it for angles fixed by the user."""
     flight = begun(cast, -0.6)
     first, away = _aligned(flight, frozenset({"left.kappa_rad"}))
     start = flight.heads[0].start

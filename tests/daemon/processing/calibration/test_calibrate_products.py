@@ -28,7 +28,7 @@ def session(installation: str, **serials: str) -> Any:
     return SimpleNamespace(setup=SimpleNamespace(config=config, scanners=sorted(scanner)))
 
 
-def test_a_scanner_that_the_first_session_lacks_has_the_head_of_its_own() -> None:
+def test_a_scanner_missing_from_the_first_session_uses_its_own_head() -> None:
     found = SimpleNamespace(parameters=np.zeros(3))
     adjusted = SimpleNamespace(calibrations={"left": found, "right": found}, variance_factor=1.0, redundancy=9)
     kept = SimpleNamespace(logged=[session("D-ABCD", left="L1"), session("D-ABCD", left="L1", right="R1")])
@@ -37,20 +37,20 @@ def test_a_scanner_that_the_first_session_lacks_has_the_head_of_its_own() -> Non
     assert [_header(done, name, []).scanner_serial for name in ("left", "right")] == ["L1", "R1"]
 
 
-def test_what_was_judged_of_the_trajectory_speaks_against_the_calibration_before_all_else() -> None:
+def test_the_verdict_on_the_trajectory_comes_first_against_the_calibration() -> None:
     bad, care = trajectory_says([Carried(Level.UNUSABLE, "lever arm"), Carried(Level.CARE, "few fixes")])
     assert (bad.what, bad.unusable, bad.excess) == ("lever arm", True, np.inf)
     assert (care.what, care.unusable) == ("few fixes", False)
 
 
 def wanted(text: str) -> dict[str, float]:
-    """By a configuration, as a run of `swath calibrate` takes it."""
+    """Return the requirements of a configuration as used by `swath calibrate`."""
     config = parse_config(f'[session]\nname = "x"\n{text}', Path("swath.toml"))
     kept = SimpleNamespace(logged=[SimpleNamespace(setup=SimpleNamespace(config=config))])
     return _wanted(cast(Calibrated, SimpleNamespace(kept=kept)))
 
 
-def test_what_a_configuration_wants_is_what_the_verdict_goes_by() -> None:
+def test_requirements_of_the_configuration_determine_the_verdict() -> None:
     """From TOML in the units of people, through what points need, to the words and the level."""
     table = "[calibration.wanted]\npoint_m = {point_m}\nkappa_deg = {kappa_deg}\nrange_scale_ppm = 7.5\n"
     outcome = made_outcome()

@@ -22,7 +22,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
     return village(tmp_path_factory.mktemp("village"), prf_hz=2_000.0, lines=(0, 1))
 
 
-def test_a_navigated_flight_tells_its_instruments(made: Made, tmp_path: Path) -> None:
+def test_a_navigated_flight_names_its_instruments(made: Made, tmp_path: Path) -> None:
     options = Options(datum="same", uncertainty=False)
     kept = read_flight(
         GeorefOptions([made.flown.log], tmp_path, TrajectoryOptions(navigate=True), options), tmp_path, lambda *_: None
@@ -41,7 +41,7 @@ def test_a_navigated_flight_tells_its_instruments(made: Made, tmp_path: Path) ->
         told_value(key, value.content)  # each is an attribute, and such as it takes
 
 
-def test_a_trajectory_from_elsewhere_tells_none(made: Made, tmp_path: Path) -> None:
+def test_a_supplied_trajectory_names_no_instruments(made: Made, tmp_path: Path) -> None:
     options = Options(datum="same", uncertainty=False)
     trajectory = TrajectoryOptions(made.flown.folder / "true_trajectory.csv")
     assert (

@@ -32,7 +32,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
 
 
 def kept_with(made: Made, folder: Path, more: str) -> Flight:
-    """As read with the true calibration and these lines behind it."""
+    """Return the flight as read with the true calibration and additional lines."""
     text = (made.flown.folder / "left.true.toml").read_text() + more
     options = Options(datum="same", uncertainty=False, calibrations={"left": (text, "start.toml")})
     trajectory = TrajectoryOptions(made.flown.folder / "true_trajectory.csv")
@@ -41,7 +41,9 @@ def kept_with(made: Made, folder: Path, more: str) -> Flight:
 
 
 @pytest.mark.parametrize(("rate_hz", "added_m"), [(PRF_HZ, OFFSET_M), (2 * PRF_HZ, 0.0)])
-def test_a_range_offset_by_pulse_rate_counts_once(made: Made, tmp_path: Path, rate_hz: float, added_m: float) -> None:
+def test_a_range_offset_by_pulse_rate_is_applied_once(
+    made: Made, tmp_path: Path, rate_hz: float, added_m: float
+) -> None:
     plain = kept_with(made, tmp_path / "plain", "")
     row = f"\n[[range_offset]]\nprf_hz = {rate_hz}\noffset_m = {OFFSET_M}\n"
     flight = kept_with(made, tmp_path / "offset", row)
@@ -62,7 +64,7 @@ def test_a_range_offset_by_pulse_rate_counts_once(made: Made, tmp_path: Path, ra
 
 
 @pytest.mark.parametrize("option", [("--fix", "right.phi_deg"), ("--prior", "right.kappa_deg=0.1")])
-def test_parameters_of_no_scanner_of_the_log_are_refused_before_it_is_read(
+def test_parameters_of_an_unknown_scanner_are_refused_before_the_log_is_read(
     made: Made,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -96,7 +98,7 @@ def test_returns_without_time_are_noted(made: Made, tmp_path: Path, monkeypatch:
     assert 2 * lost == of >= total
 
 
-def test_a_navigated_trajectory_is_the_bodys_whatever_is_said(made: Made, tmp_path: Path) -> None:
+def test_a_navigated_trajectory_is_always_that_of_the_body(made: Made, tmp_path: Path) -> None:
     found = []
     for at in ("body", "antenna"):
         (tmp_path / at).mkdir()
@@ -112,7 +114,7 @@ def test_a_navigated_trajectory_is_the_bodys_whatever_is_said(made: Made, tmp_pa
     ]
 
 
-def test_the_scanners_point_is_its_calibrations(made: Made) -> None:
+def test_the_point_of_the_scanner_is_that_of_its_calibration(made: Made) -> None:
     text = (made.flown.folder / "left.true.toml").read_text()
     moved = re.sub(r"lever_arm_y_m = .*", "lever_arm_y_m = 0.75", text, count=1)
     assert moved != text

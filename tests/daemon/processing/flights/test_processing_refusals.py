@@ -54,13 +54,13 @@ def config(arm: str = "[0.1, 0.0, -1.2]", crs: str = "EPSG:25832", epoch: float 
 
 
 def line(refused: Any) -> str:
-    """One, with both files."""
+    """Return the error's text, which must be one line."""
     text = str(refused.value)
     assert "\n" not in text
     return text
 
 
-def test_logs_with_different_frames() -> None:
+def test_logs_with_different_frames_are_refused() -> None:
     configs = {A: config(), B: config(crs="EPSG:2056")}
     with pytest.raises(UserError) as refused:
         refuse_different_settings(configs, None)
@@ -71,14 +71,14 @@ def test_logs_with_different_frames() -> None:
     refuse_different_settings({A: config(), B: config()}, None)
 
 
-def test_an_epoch_that_is_said_settles_different_ones_and_a_frame_does_not() -> None:
+def test_a_given_epoch_overrides_different_ones_and_a_frame_does_not() -> None:
     configs = {A: config(), B: config(epoch=2020.0)}
     refuse_different_settings(configs, None, epoch=2026.5)
     with pytest.raises(UserError, match=r"output\.epoch is 2020\.0, .* set one with --epoch"):
         refuse_different_settings(configs, "EPSG:25832")
 
 
-def test_sessions_with_positions_in_different_datums() -> None:
+def test_sessions_with_positions_in_different_datums_are_refused() -> None:
     other = parse_config(
         TEXT.format(arm="[0.1, 0.0, -1.2]", crs="EPSG:25832", epoch=2026.5).replace(
             'protocol = "novatel"', 'protocol = "novatel"\ndatum = "EPSG:7912"'
@@ -94,26 +94,26 @@ def test_sessions_with_positions_in_different_datums() -> None:
 
 
 @pytest.mark.parametrize("name", ["../x", "/tmp/x", "a/b", "", ".", "..", "a\0b", "a\nb", "x" * 300])
-def test_a_session_whose_name_leads_elsewhere(name: str) -> None:
+def test_a_session_name_that_is_a_path_is_refused(name: str) -> None:
     with pytest.raises(UserError, match="is not a valid file name"):
         refuse_no_name(name, A)
     refuse_no_name("flight-20261125T101500Z-ab12", A)
 
 
-def test_sessions_with_different_antennas() -> None:
+def test_sessions_with_different_antennas_are_refused() -> None:
     with pytest.raises(UserError) as refused:
         refuse_different_settings({A: config(), B: config(arm="[0.1, 0.0, -1.3]")}, None)
     assert all(word in line(refused) for word in ("gnss.rover.lever_arm_m", "-1.3", "-1.2", "the antennas differ"))
 
 
-def test_logs_of_one_time() -> None:
+def test_overlapping_logs_are_refused() -> None:
     refuse_overlap({B: (200, 300), A: (0, 200)})
     with pytest.raises(UserError) as refused:
         refuse_overlap({B: (199, 300), A: (0, 200)})
     assert all(word in line(refused) for word in ("a.mcap", "b.mcap", "the recordings overlap in time"))
 
 
-def test_a_second_that_is_not_certain_and_no_time() -> None:
+def test_an_uncertain_second_and_a_missing_time_are_refused() -> None:
     good = ClockStatus(TimeState.LOCKED, 100.0)
     settings = config()
     refuse_no_time(A, "pps/main", good, settings)
@@ -126,7 +126,7 @@ def test_a_second_that_is_not_certain_and_no_time() -> None:
         refuse_no_time(A, None, None, settings)
 
 
-def test_edges_that_no_receiver_names() -> None:
+def test_edges_without_a_receiver_that_names_them_are_refused() -> None:
     silent = ClockStatus(TimeState.NO_TIME, float("inf"))
     with pytest.raises(UserError, match=r"no gnss.….pps is set") as refused:
         refuse_no_time(A, "pps/main", silent, config())
@@ -148,7 +148,7 @@ def test_edges_that_no_receiver_names() -> None:
         ({}, TimeState.COARSE, "the host's clock is coarse"),
     ],
 )
-def test_why_returns_have_no_time(refused: dict[str, int], state: TimeState, words: str) -> None:
+def test_the_reason_for_returns_without_time_is_given(refused: dict[str, int], state: TimeState, words: str) -> None:
     fates = {"no_time": 500, "georeferenced": 500}
     told = time_trouble("left", fates, refused, ClockStatus(state, 1.0))
     assert words in told
@@ -170,7 +170,7 @@ def turning(time_ns: np.ndarray[Any, np.dtype[np.int64]], seed: int = 1) -> Traj
     return Trajectory.from_geodetic(time_ns, lat, lon, height, np.zeros((n, 3)), roll, level, level)
 
 
-def test_a_trajectory_that_turns_at_another_time_is_doubted_or_refused() -> None:
+def test_a_trajectory_that_turns_at_another_time_is_warned_about_or_refused() -> None:
     time_ns = 1_465_549_218_000_000_000 + np.arange(0, 240 * S, S // 20)
     flown = turning(time_ns)
     clocks = LogClocks(
@@ -186,13 +186,13 @@ def test_a_trajectory_that_turns_at_another_time_is_doubted_or_refused() -> None
 
 @dataclass
 class Flew:
-    """What of a flight a file of strips is held against."""
+    """Stand-in for a flight to which a file of strips is compared."""
 
     span: tuple[int, int]
     holes: list[str] = field(default_factory=list)
 
 
-def test_strips_of_a_file_that_lie_in_no_log() -> None:
+def test_strip_times_outside_every_log_are_refused() -> None:
     flights: list[Any] = [Flew((0, 100)), Flew((200, 300))]
     note_strips_elsewhere("s.csv", [(50, 120), (250, 260)], flights)
     assert flights[0].holes == []
@@ -203,14 +203,14 @@ def test_strips_of_a_file_that_lie_in_no_log() -> None:
         note_strips_elsewhere("s.csv", [(120, 200), (300, 310)], flights)
 
 
-def test_the_log_is_named_where_its_own_configuration_is_wrong() -> None:
+def test_error_in_the_configuration_of_a_log_names_the_log() -> None:
     lines = ["imu.main: dbc: missing", "left.toml: calibration.scanner: is of another", 'output.crs = "x" is none']
     given = Options(crs="x", calibrations={"left": ("", "left.toml")})
     assert of_log(A, lines, given) == ["a.mcap: imu.main: dbc: missing", *lines[1:]]
     assert of_log(A, lines, Options()) == [f"a.mcap: {said}" for said in lines]
 
 
-def test_messages_that_were_not_read() -> None:
+def test_undecoded_messages_are_reported() -> None:
     counts = {"left": {"bad_version": 3, "sequence_gap": 3, "bad_magic": 2}, "right": {"sequence_gap": 7}}
     holes, warnings = unread_lines("a.mcap", counts)
     assert holes == [
@@ -222,7 +222,7 @@ def test_messages_that_were_not_read() -> None:
     ]
 
 
-def test_only_the_own_messages_of_a_piece_count() -> None:
+def test_only_the_messages_of_the_piece_itself_count() -> None:
     parser = cast(Parser, SimpleNamespace(counters=ParserCounters()))
     unread = Unread({"left": parser})
     for own in (False, True, True, False):
@@ -234,7 +234,7 @@ def test_only_the_own_messages_of_a_piece_count() -> None:
 
 
 @pytest.mark.parametrize(("crs", "doubts"), [("EPSG:32632", 0), ("EPSG:6529", 1)])
-def test_heights_in_another_unit_than_the_plane_are_warned_of(crs: str, doubts: int) -> None:
+def test_a_height_unit_other_than_the_horizontal_unit_gives_a_warning(crs: str, doubts: int) -> None:
     flight = SimpleNamespace(setup=SimpleNamespace(mapping=Mapping(crs, datum="same")))
     lines = unit_doubts(cast(Any, flight))
     assert len(lines) == doubts
@@ -267,7 +267,7 @@ def level_flight(
         (level_flight(1.0, 0.0, seconds=0), []),
     ],
 )
-def test_an_attitude_of_other_axes_is_doubted(flown: Trajectory, words: list[str]) -> None:
+def test_an_attitude_about_other_axes_gives_a_warning(flown: Trajectory, words: list[str]) -> None:
     lines = attitude_doubts(flown, "x.out")
     assert len(lines) == len(words)
     for line, word in zip(lines, words, strict=True):

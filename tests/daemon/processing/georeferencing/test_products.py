@@ -12,6 +12,6 @@ def session(*scanners: str) -> Any:
     return SimpleNamespace(setup=SimpleNamespace(scanners=list(scanners)))
 
 
-def test_a_scanner_has_one_number_also_where_a_session_lacks_another() -> None:
+def test_a_scanner_keeps_its_number_in_sessions_that_lack_another() -> None:
     """Strips of a run are one product: channel 0 of one must not be channel 1 of the next."""
     assert _numbers([session("right"), session("left", "right")]) == {"left": 0, "right": 1}

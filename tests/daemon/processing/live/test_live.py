@@ -169,7 +169,7 @@ class TestPoints:
         assert (found["trouble"], found["damaged_chunks"]) == ("", 0)
 
     @pytest.mark.parametrize("seed", [1, 2])
-    def test_followed_while_it_grows_over_parts_gives_the_bytes_of_its_replay(
+    def test_a_growing_log_over_parts_gives_the_bytes_of_its_replay(
         self, flown: Flown, replayed: tuple[Path, Told], tmp_path: Path, seed: int, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         told = follow_growing(flown, tmp_path, seed, monkeypatch)
@@ -179,7 +179,9 @@ class TestPoints:
         assert json.loads((tmp_path / "live/live.json").read_text()) == told[-1]
         assert sorted({int(one["part"]) for one in told if "part" in one}) == list(range(len(flown.paths)))
 
-    def test_cut_otherwise_the_same_bytes(self, flown: Flown, replayed: tuple[Path, Told], tmp_path: Path) -> None:
+    def test_bytes_do_not_depend_on_how_the_log_is_cut(
+        self, flown: Flown, replayed: tuple[Path, Told], tmp_path: Path
+    ) -> None:
         def cut() -> Iterator[LogBatch]:
             lengths = random.Random(3)
             for batch in flown.session().batches():
@@ -193,7 +195,7 @@ class TestPoints:
         for name in ("points.npy", "coverage.png"):
             assert (tmp_path / name).read_bytes() == (replayed[0] / name).read_bytes(), name
 
-    def test_after_what_was_skipped_points_lie_where_they_lay(
+    def test_points_after_skipped_chunks_are_unchanged(
         self, flown: Flown, replayed: tuple[Path, Told], tmp_path: Path
     ) -> None:
         """Chunks of scanners of 1.5 s are left out, as by somebody who is behind."""
@@ -216,9 +218,7 @@ class TestPoints:
         np.testing.assert_allclose(late["time_ns"], theirs["time_ns"], rtol=0, atol=100)
         np.testing.assert_allclose(late["points_map"], theirs["points_map"], rtol=0, atol=1e-4)
 
-    def test_without_a_solution_of_the_device_and_an_imu_nothing_can_be_made(
-        self, flown: Flown, tmp_path: Path
-    ) -> None:
+    def test_without_a_device_solution_and_an_imu_live_is_refused(self, flown: Flown, tmp_path: Path) -> None:
         attachments = flown.session().attachments()
         text = attachments["config.toml"].replace(b'"novatel"', b'"nmea"')
         attachments["config.toml"] = re.sub(rb"(?ms)^\[imu\..*?(?=^\[(?!imu))", b"", text)
@@ -228,7 +228,7 @@ class TestPoints:
 
 
 class TestStatus:
-    def test_says_rates_latencies_time_and_density(self, replayed: tuple[Path, Told]) -> None:
+    def test_status_gives_rates_latencies_time_and_density(self, replayed: tuple[Path, Told]) -> None:
         folder, found = replayed
         assert json.loads((folder / "live.json").read_text()) == found
         for name in ("left", "right"):
@@ -241,7 +241,7 @@ class TestStatus:
         # two scanners of 8000 pulses a second in all, at 50 m/s: pulses over the area that they fall into
         assert 0.5 < coverage["density_per_m2"]["mean"] < 20.0
 
-    def test_a_sentence_names_what_is_wrong(self, replayed: tuple[Path, Told]) -> None:
+    def test_one_sentence_names_the_problem(self, replayed: tuple[Path, Told]) -> None:
         found = dict(replayed[1])
         assert "SKIPPED" not in sentence(found)
         found["live_skipped_s"] = 7.25
@@ -255,7 +255,7 @@ class TestStatus:
         assert "its stamps run free" in told
         assert sentence(found | {"points_file": "p.npy ends"}).endswith("; free space is down; p.npy ends")
 
-    def test_only_what_is_well_is_green(self, replayed: tuple[Path, Told]) -> None:
+    def test_status_is_green_only_if_all_is_well(self, replayed: tuple[Path, Told]) -> None:
         """At a glance: points of every scanner, on time, every clock locked, nothing damaged or passed over."""
         found = copy.deepcopy(replayed[1])
         found |= {"trouble": "", "live_skipped_s": 0.0, "damaged_chunks": 0, "state": "following", "without_time": []}
@@ -280,8 +280,8 @@ class TestStatus:
         assert styles == ["bold green", *["bold yellow"] * (len(wrong) - 1)]
         assert "2 chunks of the log DAMAGED" in sentence(found | {"damaged_chunks": 2})
 
-    def test_a_latency_is_by_the_scanners_clock_as_it_is_now(self) -> None:
-        """Which is asked once a second, and says something else each time here."""
+    def test_latency_uses_the_current_clock_of_the_scanner(self) -> None:
+        """The clock is asked once a second and answers differently each time here."""
         asked: list[int] = []
 
         def gps_from_host(clock: str, host_ns: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
@@ -303,7 +303,7 @@ class TestStatus:
         assert found == [None, 0.2, 0.2, 0.2, 0.3, 0.3]
         assert len(asked) == 3
 
-    def test_returns_without_time_are_told_with_the_reason_while_they_come(self) -> None:
+    def test_returns_without_time_are_reported_with_the_reason_while_they_come(self) -> None:
         """Those since the last time: at its beginning nothing has time, which passes."""
         counts: dict[Fate, int] = {}
         refused: dict[str, int] = {}
@@ -335,8 +335,8 @@ class TestStatus:
         assert said[2][0].startswith("scanner/left: 100 of 1,000 returns have no time: its stamps run free")
         assert said[3][0].startswith("scanner/left: 300 of 300 returns have no time: its stamps contradict the host's")
 
-    def test_what_was_navigated_is_not_called_the_devices_own(self) -> None:
-        """A receiver whose protocol could tell an INS solution, and that has none."""
+    def test_a_navigated_trajectory_is_not_called_a_device_solution(self) -> None:
+        """The receiver's protocol has INS solutions, and this receiver sends none."""
         host = SimpleNamespace(by_source={})
         stream: Any = SimpleNamespace(
             scanners=[], clocks=SimpleNamespace(host=host), path=SimpleNamespace(covered_until_ns=7)
@@ -351,7 +351,7 @@ class TestStatus:
         assert status.plain(None, 0)["trajectory"]["source"] == "navigated"
 
     @pytest.mark.parametrize(("made_with", "other"), [("navigated", True), ("ins", False), ("file", False)])
-    def test_a_calibration_made_with_another_kind_of_trajectory_is_told(
+    def test_a_calibration_made_with_another_trajectory_source_is_reported(
         self, flown: Flown, tmp_path: Path, made_with: str, other: bool
     ) -> None:
         """The receiver's own INS is what points come from here."""
@@ -364,7 +364,7 @@ class TestStatus:
         assert len(told) == (len(setup.calibrations) if other else 0)
         assert all("this run uses the device's own INS, whose alignment differs" in one for one in told)
 
-    def test_the_folder_cannot_be_written_to(self, flown: Flown, tmp_path: Path) -> None:
+    def test_an_unwritable_folder_is_refused(self, flown: Flown, tmp_path: Path) -> None:
         (tmp_path / "file").touch()
         with pytest.raises(UserError, match=r"Not a directory|File exists"):
             replay(flown.session(), flown.setup(), tmp_path / "file", LiveConfig(), None)
@@ -372,7 +372,7 @@ class TestStatus:
 
 class TestCommand:
     @pytest.mark.slow
-    def test_replays_with_a_configuration_of_its_own(self, flown: Flown, tmp_path: Path) -> None:
+    def test_live_replays_with_another_configuration(self, flown: Flown, tmp_path: Path) -> None:
         config = flown.config.path.with_name("other.toml")
         config.write_text(flown.config.text + "\n[live]\npoints_per_s = 100\ncell_m = 5.0\n")
         logs = tmp_path / "logs"
@@ -401,13 +401,13 @@ class TestCommand:
             (["a", "b"], "too many arguments; give one CONFIG or DIR"),
         ],
     )
-    def test_wrong_use_is_a_line(self, arguments: list[str], told: str) -> None:
+    def test_wrong_usage_is_refused_in_one_line(self, arguments: list[str], told: str) -> None:
         done = swath("live", *arguments)
         assert (done.returncode, done.stdout) == (2, "")
         assert told in done.stderr
         assert done.stderr.count("\n") == 1
 
-    def test_says_where_nothing_compiled_can_be_kept(
+    def test_an_unwritable_compilation_cache_is_reported(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
     ) -> None:
         """A service's journal has what stands on standard error."""
@@ -428,7 +428,7 @@ class TestCommand:
         assert told.err == WarmUp(12, 3.25, None).text() + "\n"
 
 
-def test_the_pages_say_how_often_is_decided() -> None:
+def test_the_pages_state_the_decision_interval() -> None:
     tick = f"{TICK_NS // 1_000_000} ms"
     assert f"decisions fall every {tick}" in (ROOT / "docs/live.md").read_text()
     decision = (ROOT / "docs/decisions/0012-ticks-make-live-equal-replay.md").read_text()

@@ -99,7 +99,7 @@ def units_of(items: Iterator[LogBatch | Skipped]) -> list[Unit]:
 
 
 class TestFollowing:
-    def test_every_unit_once_in_order_over_parts_until_the_end(self, recording: Recording, follow: Follow) -> None:
+    def test_every_unit_is_given_once_in_order_over_all_parts(self, recording: Recording, follow: Follow) -> None:
         follower = follow()
         seen = []
         for _ in range(3):
@@ -115,7 +115,7 @@ class TestFollowing:
         assert follower.ended == "the recording has ended"
         assert (follower.skipped_ns, follower.damaged) == (0, 0)
 
-    def test_a_part_that_is_still_being_finished_is_read_to_its_end(self, recording: Recording, follow: Follow) -> None:
+    def test_a_part_being_finished_is_read_to_its_end(self, recording: Recording, follow: Follow) -> None:
         """The next one is there already, and the last chunks of this one are not."""
         follower = follow()
         recording.go_on(1.0)
@@ -139,7 +139,7 @@ class TestFollowing:
         recording.go_on(1.0)
         assert units_of(follower.poll()) == recording.units
 
-    def test_a_recorder_that_was_killed_is_no_end_like_another(
+    def test_a_killed_recorder_is_distinguished_from_a_finished_one(
         self, recording: Recording, follow: Follow, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr(live_follow, "GONE_S", 0.0)
@@ -155,8 +155,8 @@ class TestFollowing:
         assert follower.ended == "the recorder stopped without closing its log"
 
 
-class TestPassingOver:
-    def test_more_than_five_seconds_behind_goes_to_the_end_of_scanners(
+class TestSkipping:
+    def test_more_than_five_seconds_behind_scanner_data_is_skipped_to_the_end(
         self, recording: Recording, follow: Follow
     ) -> None:
         follower = follow()
@@ -171,7 +171,7 @@ class TestPassingOver:
         recording.go_on(1.0)
         assert units_of(follower.poll()) == recording.units[-8:]
 
-    def test_five_seconds_are_caught_up_with(self, recording: Recording, follow: Follow) -> None:
+    def test_a_delay_of_five_seconds_is_caught_up(self, recording: Recording, follow: Follow) -> None:
         follower = follow()
         recording.go_on(0.5)
         seen = units_of(follower.poll())
@@ -179,7 +179,7 @@ class TestPassingOver:
         assert seen + units_of(follower.poll()) == recording.units
         assert follower.skipped_ns == 0
 
-    def test_a_late_start_takes_the_last_minutes_without_scanners(self, recording: Recording, follow: Follow) -> None:
+    def test_a_late_start_reads_the_last_minutes_without_scanners(self, recording: Recording, follow: Follow) -> None:
         recording.go_on(100.0)
         recording.split()
         recording.go_on(60.0)
@@ -190,13 +190,13 @@ class TestPassingOver:
         recording.go_on(1.0)
         assert units_of(follower.poll()) == recording.units[-8:]
 
-    def test_of_a_long_log_the_last_two_minutes_only(self, recording: Recording, follow: Follow) -> None:
+    def test_only_the_last_two_minutes_of_a_long_log_are_read(self, recording: Recording, follow: Follow) -> None:
         recording.go_on(200.0)
         follower = follow()
         seen = units_of(follower.poll())
         assert seen == recording.of("/gnss/rover/raw", 200.0 - STEP_NS / SECOND_NS - live_follow.WARM_NS / SECOND_NS)
 
-    def test_from_start_everything_is_read_however_old(self, recording: Recording, follow: Follow) -> None:
+    def test_from_start_reads_everything(self, recording: Recording, follow: Follow) -> None:
         recording.go_on(40.0)
         recording.split()
         recording.go_on(30.0)
@@ -205,7 +205,7 @@ class TestPassingOver:
         recording.go_on(8.0)
         assert [unit for unit in units_of(follower.poll()) if unit[0] == SCANNER.topic] == [], "caught up by then"
 
-    def test_what_lies_cold_on_the_disk_is_not_read(
+    def test_data_outside_the_page_cache_are_not_read(
         self, recording: Recording, follow: Follow, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         recording.go_on(1.0)
@@ -225,7 +225,7 @@ class TestPassingOver:
 
 
 class TestPageCache:
-    def test_written_is_cached_and_dropped_is_not(self, tmp_path: Path) -> None:
+    def test_written_data_are_cached_and_dropped_data_are_not(self, tmp_path: Path) -> None:
         path = tmp_path / "file"
         path.write_bytes(os.urandom(20 << 20))
         with path.open("rb") as file:
@@ -240,5 +240,5 @@ class TestPageCache:
             assert cached_from(fd, 20 << 20) == 12 << 20
             assert not is_cached(fd, 0, 20 << 20)
 
-    def test_what_cannot_be_known_is_not_cached(self, tmp_path: Path) -> None:
+    def test_an_unknown_file_counts_as_not_cached(self, tmp_path: Path) -> None:
         assert not is_cached(-1, 0, 10)

@@ -35,7 +35,7 @@ class TestFrame:
         nose = Rotation.from_quat(np.roll(q, -1)).apply([1, 0, 0])
         np.testing.assert_allclose(nose, [np.sqrt(0.5), np.sqrt(0.5), 0], atol=1e-9)
 
-    def test_a_frame_of_feet_is_told_in_metres(self, tmp_path: Path) -> None:
+    def test_a_frame_in_feet_is_converted_to_metres(self, tmp_path: Path) -> None:
         """The same points in UTM metres and in UTM feet: the same cells, clouds and poses."""
         trajectory = flight()
         told: list[tuple[Any, ...]] = []
@@ -62,7 +62,7 @@ class TestFrame:
         np.testing.assert_allclose(told[1][2], told[0][2], rtol=0, atol=1e-6)
         assert [one[3] for one in told] == [[1.0, 1.0, 1.0], [FOOT_M, FOOT_M, 1.0]]
 
-    def test_an_earth_centred_output_is_level_too(self) -> None:
+    def test_an_earth_centred_output_gets_a_level_frame(self) -> None:
         trajectory = flight()
         plain = LocalFrame(trajectory.position_e[0], None)
         frame = LocalFrame(trajectory.position_e[0], Utm("EPSG:4978"))
@@ -80,7 +80,7 @@ class TestFrame:
         ):
             np.testing.assert_allclose(one, other, atol=1e-8)
 
-    def test_attitudes_are_those_of_scipy(self) -> None:
+    def test_attitudes_match_scipy(self) -> None:
         """Where a map stretches east and north by two and more, the rotation is the one nearest to its steps."""
         rng = np.random.default_rng(9)
         position_e = flight().position_e[0]
@@ -108,7 +108,7 @@ class TestPointsFile:
         np.testing.assert_array_equal(rows["scanner"], [1] * 4 + [0] * 6)
         assert len(rows) == file.count == 10
 
-    def test_points_file_ends_where_the_recorder_wants_the_room(self, tmp_path: Path) -> None:
+    def test_points_file_ends_when_the_recorder_needs_the_space(self, tmp_path: Path) -> None:
         points = points_at(np.random.default_rng(7).random((10, 3)))
         room = Room(tmp_path, 0)
         file = PointsFile(tmp_path / "p.npy", ["left"], room)
@@ -125,7 +125,7 @@ class TestPointsFile:
         assert file.trouble.startswith("p.npy ends after 10 points: free space is down to ")
         np.testing.assert_array_equal(np.load(tmp_path / "p.npy")["points_map"], points.points_map)
 
-    def test_a_disk_without_space_ends_points_beside_a_recorder_and_stops_a_replay(self, tmp_path: Path) -> None:
+    def test_a_full_disk_ends_points_beside_a_recorder_and_stops_a_replay(self, tmp_path: Path) -> None:
         points = points_at(np.zeros((10_000, 3)))
         file = PointsFile(Path("/dev/full"), ["left"], Room(tmp_path, 0))
         file.add("left", points)
@@ -139,7 +139,7 @@ class TestPointsFile:
         with pytest.raises(OSError, match="No space left"):
             strict.close()
 
-    def test_a_folder_that_is_taken_away_stops_no_flight(self, tmp_path: Path) -> None:
+    def test_a_removed_folder_does_not_stop_a_flight(self, tmp_path: Path) -> None:
         (folder := tmp_path / "live").mkdir()
         products = LiveProducts(folder, LiveConfig(), Utm(), 0, "EPSG:32632")
         file = PointsFile(tmp_path / "p.npy", ["left"], Room(folder, 0))

@@ -51,8 +51,8 @@ def config_of(wires: Path, folder: Path) -> str:
     return text.replace(text[: text.index("[pps.main]")], head)
 
 
-def test_points_made_while_it_is_recorded_are_those_of_the_replay(tmp_path: Path) -> None:
-    """Over part changes, to the last byte; nothing is skipped, and it says how far it is behind."""
+def test_points_made_during_recording_equal_those_of_the_replay(tmp_path: Path) -> None:
+    """The bytes are equal over part changes; nothing is skipped, and the delay is reported."""
     warm_up([])  # else the command compiles before it follows anything, and says so
     logs, points, said, plan = (tmp_path / name for name in ("logs", "points.npy", "said", "plan.toml"))
     logs.mkdir()

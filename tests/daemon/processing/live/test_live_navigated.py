@@ -110,14 +110,14 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
 
 
 def judged(missed: FloatArray, sigma: FloatArray) -> None:
-    """Errors of one flight are few independent ones: RMS of each axis at most twice the predicted."""
+    """Assert that the RMS of each axis is at most twice the predicted one."""
     spread = np.sqrt((missed**2).mean(axis=0) / (sigma**2).mean(axis=0))
     assert (spread < 2.0).all(), spread
     assert np.sqrt(((missed / sigma) ** 2).mean()) > 0.1
     assert (np.abs(missed) < 5.0 * sigma).mean() > 0.999
 
 
-def test_points_in_flight_lie_where_the_light_went_within_their_sigmas(recorded: Recorded) -> None:
+def test_points_in_flight_match_the_truth_within_their_sigmas(recorded: Recorded) -> None:
     """Those that ``swath live`` wrote are those of the replay, which has the sigmas too."""
     session = recorded.session()
     setup = Setup.of_log(session.attachments(), Options())
@@ -136,7 +136,9 @@ def test_points_in_flight_lie_where_the_light_went_within_their_sigmas(recorded:
     judged(missed, placed.sigma_map[settled].astype(np.float64))
 
 
-def test_points_of_the_same_log_smoothed_lie_within_theirs(recorded: Recorded, tmp_path: Path) -> None:
+def test_smoothed_points_of_the_same_log_match_the_truth_within_their_sigmas(
+    recorded: Recorded, tmp_path: Path
+) -> None:
     """``swath georef`` without a trajectory."""
     arguments = ["georef", str(recorded.logs), "-o", str(tmp_path), "--strips", "whole"]
     assert run_app(arguments) in (0, 1)  # partial: returns before the first or after the last sample have no pose

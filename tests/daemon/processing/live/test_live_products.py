@@ -44,7 +44,7 @@ class Utm:
 
 
 def flight(epochs: int = 11) -> Trajectory:
-    """Level, north-east at 60 m/s."""
+    """Return a level flight to the north-east at 60 m/s."""
     t = np.arange(epochs) * 0.1
     lat = np.radians(LAT_DEG) + 60.0 * np.sqrt(0.5) * t / 6_366_000
     zero = np.zeros(epochs)
@@ -214,7 +214,7 @@ class TestMcap:
             [metadata] = make_reader(file).iter_metadata()
         assert json.loads(metadata.metadata["origin"]) == products.frame.origin.tolist()
 
-    def test_the_quota_holds_and_the_run_before_gives_way_first(self, tmp_path: Path) -> None:
+    def test_the_quota_is_kept_by_deleting_the_previous_run_first(self, tmp_path: Path) -> None:
         cloud = np.zeros(2000, CLOUD_DTYPE)
         cloud["x"] = np.random.default_rng(2).random(2000)
         quota = 1_000_000
@@ -235,7 +235,7 @@ class TestMcap:
         assert len(read_back(tmp_path / NAME)["/points/left"]) == added < 200
         assert quota > 2 * END_BYTES
 
-    def test_what_is_not_written_is_counted(self, tmp_path: Path) -> None:
+    def test_messages_that_are_not_written_are_counted(self, tmp_path: Path) -> None:
         products = LiveProducts(tmp_path, LiveConfig(), Utm(), 1 << 60, "EPSG:32632")
         trajectory = flight()
         products.look_for_room()
@@ -248,7 +248,7 @@ class TestMcap:
         assert products.unwritten == 1
         assert list(tmp_path.iterdir()) == []
 
-    def test_room_comes_back_a_little_above_where_it_went(self, tmp_path: Path) -> None:
+    def test_writing_resumes_slightly_above_the_limit_at_which_it_stopped(self, tmp_path: Path) -> None:
         room = Room(tmp_path, 0)
         assert room.look()
         free = room.free_bytes
@@ -261,7 +261,7 @@ class TestMcap:
 
 
 class TestThinning:
-    def test_at_most_so_many_a_second_spread_over_it(self) -> None:
+    def test_at_most_the_given_number_a_second_is_kept_evenly(self) -> None:
         rng = np.random.default_rng(3)
         times = np.sort(GPS_NS + rng.integers(0, 5 * SECOND_NS, 40_000))
         keep = Thinning(1000).keep(times)
@@ -272,7 +272,7 @@ class TestThinning:
         middle = times[keep][seconds == 2]
         assert np.diff(middle).max() < 10_000_000, "no hole in a second"
 
-    def test_the_rule_knows_no_blocks(self) -> None:
+    def test_thinning_does_not_depend_on_blocks(self) -> None:
         rng = np.random.default_rng(4)
         times = GPS_NS + np.cumsum(rng.integers(0, 300_000, 30_000))
         whole = Thinning(500).keep(times)
@@ -283,13 +283,13 @@ class TestThinning:
             first += step
         np.testing.assert_array_equal(np.concatenate(pieces), whole)
 
-    def test_few_are_all_kept(self) -> None:
+    def test_few_points_are_all_kept(self) -> None:
         times = GPS_NS + np.arange(3000, dtype=np.int64) * 1_000_000
         assert Thinning(2000).keep(times).tolist()[-2000:] == list(range(1000, 3000))
 
 
 class TestGrid:
-    def test_counts_are_those_of_numpy(self) -> None:
+    def test_counts_match_numpy(self) -> None:
         rng = np.random.default_rng(5)
         points = rng.uniform(-700, 900, (50_000, 3))
         grid = CountGrid(2.5)
@@ -326,8 +326,8 @@ class TestGrid:
             assert max(ours[0].shape) <= max(limit, 2 * TILE)
             assert ours[0].sum() == len(points)
 
-    def test_one_point_far_away_makes_no_larger_image(self) -> None:
-        """As a first position that was wrong: 137 million cells would be drawn for 6 s, every 10 s."""
+    def test_a_single_distant_point_does_not_enlarge_the_image(self) -> None:
+        """A wrong first position would otherwise draw 137 million cells for 6 s, every 10 s."""
         grid = CountGrid(1.0)
         grid.add(np.array([[0.5, 0.5, 0.0], [5.5, 5.5, 0.0], [3e6 + 0.5, -3e6 + 0.5, 0.0]]))
         image, west, north, cell = grid.image(IMAGE_CELLS)
@@ -336,7 +336,7 @@ class TestGrid:
         for east_m, north_m, count in ((1.0, 1.0, 2), (3e6, -3e6 + 1.0, 1)):
             assert image[int((north - north_m) // cell), int((east_m - west) // cell)] == count
 
-    def test_what_is_nowhere_is_refused(self) -> None:
+    def test_non_finite_points_are_refused(self) -> None:
         grid = CountGrid(1.0)
         grid.add(np.array([[np.nan, 0, 0], [np.inf, 0, 0], [1e30, 0, 0], [0, 0, np.nan], [-0.5, -0.5, 0]]))
         assert (grid.points, grid.refused) == (5, 3)
@@ -344,7 +344,7 @@ class TestGrid:
         assert CountGrid(1.0).image(100)[0].size == 0
 
 
-class TestOthers:
+class TestPicture:
     def test_picture_is_a_png_with_the_colours_of_densities(self) -> None:
         counts = np.array([[0, 2, 4], [15, 400, 0]], dtype=np.uint64)
         image = Image.open(io.BytesIO(picture(counts, 2.0)))

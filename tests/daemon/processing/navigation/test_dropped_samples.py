@@ -65,7 +65,7 @@ def lone(rows: NDArray[np.void], stamps_ns: Int64Array, at: slice) -> None:
         (lone, 3.99, "samples whose time stands alone"),
     ],
 )
-def test_samples_left_out_for_longer_than_may_be_bridged_are_one_hole(spoil: Spoil, begin_s: float, why: str) -> None:
+def test_a_long_run_of_dropped_samples_is_reported_as_one_gap(spoil: Spoil, begin_s: float, why: str) -> None:
     """Told once, with the reason, as long as the samples last: 0.7 s."""
     (hole,) = holes(spoil, 70)
     assert hole.why == why
@@ -74,7 +74,7 @@ def test_samples_left_out_for_longer_than_may_be_bridged_are_one_hole(spoil: Spo
     assert holes(spoil, 40) == []
 
 
-def test_a_gap_that_samples_left_out_explain_a_small_part_of_is_told_beside_them() -> None:
+def test_a_gap_that_dropped_samples_explain_only_in_part_is_reported_separately() -> None:
     def stuck_then_silent(rows: NDArray[np.void], stamps_ns: Int64Array, at: slice) -> None:
         stuck(rows, stamps_ns, at)
         stamps_ns[at.stop :] += 5 * S

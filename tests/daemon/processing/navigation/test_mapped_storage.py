@@ -23,12 +23,12 @@ COLUMNS = ("time_ns", "position_e", "velocity_e", "q_e_from_b", "position_sigma_
 
 
 def resident_kb() -> int:
-    """Of this process, mapped files included."""
+    """Return the resident memory of this process in kB, mapped files included."""
     lines = Path("/proc/self/status").read_text().splitlines()
     return int(next(line.split()[1] for line in lines if line.startswith("VmRSS")))
 
 
-def test_a_flight_in_files_is_the_flight_in_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_flight_in_files_equals_the_flight_in_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     """Filtered and smoothed in pieces, with files for all arrays, however small: every byte."""
     truth = fly(survey(), 60.0, 50.0)
     inertial, rows = noised(truth, GRADES["tactical"], Fixes(), ARM, 3)
@@ -47,7 +47,7 @@ def test_a_flight_in_files_is_the_flight_in_memory(monkeypatch: pytest.MonkeyPat
         assert not second.position_e.flags.owndata
 
 
-def test_memory_is_given_back_and_nothing_is_lost(tmp_path: Path) -> None:
+def test_memory_is_released_and_no_data_are_lost(tmp_path: Path) -> None:
     storage = MappedStorage(tmp_path)
     before_kb = resident_kb()
     array = storage.empty((8 << 20,), np.float64)  # 64 MB
@@ -59,7 +59,7 @@ def test_memory_is_given_back_and_nothing_is_lost(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_where_no_file_can_be_had_it_is_memory(tmp_path: Path) -> None:
+def test_without_a_file_memory_is_used(tmp_path: Path) -> None:
     array = MappedStorage(tmp_path / "absent").empty((1 << 18,), np.float64)
     assert array.flags.owndata
     assert array.shape == (1 << 18,)

@@ -18,8 +18,8 @@ pytestmark = [pytest.mark.xdist_group("kernels"), pytest.mark.slow]
 SPEED_MPS = 50.0
 
 
-def test_samples_timed_by_their_arrival_lead_nobody_along_the_track(tmp_path: Path) -> None:
-    """Three frames of CAN at 1 Mbit/s take 0.4 ms: 2 cm of way, at sigmas of 1 cm, if nobody took it out."""
+def test_samples_timed_by_arrival_cause_no_error_along_the_track(tmp_path: Path) -> None:
+    """Three CAN frames at 1 Mbit/s take 0.4 ms, which would shift positions of 1 cm sigma by 2 cm."""
     text = HEADER.format(seed=4, prf_hz=500.0, true="omega_deg = 0.0")
     for name, (x0, y0), (x1, y1), height in LINES[:3]:
         text += LINE.format(name=name, x0=x0, y0=y0, x1=x1, y1=y1, height=height)

@@ -99,7 +99,7 @@ def one_by_one(batches: Iterable[LogBatch]) -> Iterator[LogBatch]:
             yield from (batch.between(at, min(at + step, count)) for at in range(0, count, step))
 
 
-def test_poses_are_the_truth_within_their_sigmas(followed: Told, flown: Flown) -> None:
+def test_poses_match_the_truth_within_their_sigmas(followed: Told, flown: Flown) -> None:
     rows, truth = followed[0], flown.truth()
     assert (np.diff(rows["gps_ns"]) > 0).all()
     rows = rows[rows["gps_ns"] > rows["gps_ns"][0] + CONVERGED_NS]
@@ -120,7 +120,7 @@ def test_poses_are_the_truth_within_their_sigmas(followed: Told, flown: Flown) -
         assert np.degrees(wrong.max()) < (0.6 if name == "heading_rad" else 0.25), name
 
 
-def test_points_come_of_it(followed: Told) -> None:
+def test_points_are_georeferenced_with_the_poses(followed: Told) -> None:
     _, placed, feed = followed
     points = sum(len(points) for _, points in placed)
     fates = feed.stream.fates("left")
@@ -131,12 +131,12 @@ def test_points_come_of_it(followed: Told) -> None:
 
 
 @pytest.mark.slow
-def test_the_same_poses_however_its_messages_come(followed: Told, setup: Setup, flown: Flown) -> None:
+def test_poses_do_not_depend_on_how_messages_arrive(followed: Told, setup: Setup, flown: Flown) -> None:
     again, _, _ = told(setup, flown, one_by_one(flown.session().batches()))
     assert again.tobytes() == followed[0].tobytes()
 
 
-def test_an_epoch_whose_messages_come_in_two_ticks_is_taken_once(setup: Setup, flown: Flown) -> None:
+def test_an_epoch_whose_messages_come_in_two_ticks_is_used_once(setup: Setup, flown: Flown) -> None:
     """BESTPOS before a tick and BESTGNSSPOS behind it are one position: their errors are the same."""
     navigator = LogFeed(setup, setup.live_stream(flown.session().info)).navigator
     assert navigator is not None
@@ -149,7 +149,7 @@ def test_an_epoch_whose_messages_come_in_two_ticks_is_taken_once(setup: Setup, f
     assert len(navigator._fresh(rows)) == 3
 
 
-def test_a_device_s_own_solution_is_taken_as_soon_as_there_is_one(tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_a_device_solution_is_used_as_soon_as_it_exists(tmp_path_factory: pytest.TempPathFactory) -> None:
     flown = fly_short(tmp_path_factory.mktemp("ins"), PLAN.format(ins="ins = true"), 4.0)
     setup = Setup.of_log(flown.session().attachments(), Options(datum="same", uncertainty=False))
     feed = LogFeed(setup, setup.live_stream(flown.session().info))

@@ -102,13 +102,13 @@ def inputs(flown: Flown) -> NavigationInputs:
 
 
 def turned(poses: Poses, vector_b: FloatArray) -> FloatArray:
-    """To e, by another library's rotations."""
+    """Rotate vectors to e with another library."""
     vector_e: FloatArray = Rotation.from_quat(poses.q_e_from_b[:, [1, 2, 3, 0]]).apply(vector_b)
     return vector_e
 
 
-class TestOfALog:
-    def test_positions_are_the_antennas_at_their_time(self, flown: Flown, inputs: NavigationInputs) -> None:
+class TestInputsOfALog:
+    def test_positions_match_the_antenna_at_their_time(self, flown: Flown, inputs: NavigationInputs) -> None:
         rows = inputs.legs[0].observations
         rows, truth = rows[rows["kind"] == Kind.POSITION], flown.truth()
         rows = rows[truth.fates(rows["time_ns"]) == 0]
@@ -120,9 +120,7 @@ class TestOfALog:
         assert rows["satellites"].min() >= 5
         assert ((rows["sigma"] > 0.001) & (rows["sigma"] < 0.1)).all()
 
-    def test_velocities_are_of_the_moment_that_their_latency_tells(
-        self, flown: Flown, inputs: NavigationInputs
-    ) -> None:
+    def test_velocities_refer_to_the_time_given_by_their_latency(self, flown: Flown, inputs: NavigationInputs) -> None:
         rows = inputs.legs[0].observations
         rows, truth = rows[rows["kind"] == Kind.VELOCITY][3:], flown.truth()
         rows = rows[truth.fates(rows["time_ns"]) == 0]
@@ -136,7 +134,7 @@ class TestOfALog:
         assert (np.abs(rows["time_ns"] % 200_000_000 - 150_000_000) <= 1).all()  # 50 ms before each epoch
         assert inputs.assumed["velocity"] == (inputs.legs[0].observations["kind"] == Kind.VELOCITY).sum()
 
-    def test_headings_are_those_of_the_baseline(self, flown: Flown, inputs: NavigationInputs) -> None:
+    def test_headings_match_the_baseline(self, flown: Flown, inputs: NavigationInputs) -> None:
         rows = inputs.legs[0].observations
         rows, truth = rows[rows["kind"] == Kind.HEADING], flown.truth()
         rows = rows[truth.fates(rows["time_ns"]) == 0]
@@ -148,7 +146,7 @@ class TestOfALog:
         off = (rows["value"][:, 0] - of_baseline + np.pi) % (2 * np.pi) - np.pi
         assert np.abs(off).max() < radians(0.6)  # roll and pitch of some degrees turn the baseline's horizontal part
 
-    def test_increments_turn_and_push_as_the_flight_does(self, flown: Flown, inputs: NavigationInputs) -> None:
+    def test_increments_match_the_motion_of_the_flight(self, flown: Flown, inputs: NavigationInputs) -> None:
         """Axes of b, though the IMU's own are others; each at the time of its interval."""
         truth, (leg,) = flown.truth(), inputs.legs
         sample = leg.inertial
@@ -167,18 +165,18 @@ class TestOfALog:
         assert inputs.imu_time[0] == "latch"
         assert inputs.imu_time[1] < 1e-6
 
-    def test_marks_have_the_time_that_the_receiver_stamped(self, inputs: NavigationInputs) -> None:
+    def test_event_marks_have_the_time_of_the_receiver(self, inputs: NavigationInputs) -> None:
         assert len(inputs.marks) > 10
         for mark in inputs.marks:
             assert mark.gps_ns is not None
             assert abs(mark.gps_ns % S - MARK_AFTER_NS) <= 200  # a double of seconds of the week
             assert mark.event.sigma_s == pytest.approx(CLOCK_SIGMA_S)
 
-    def test_nothing_is_doubted_and_nothing_missing(self, inputs: NavigationInputs) -> None:
+    def test_a_sound_log_has_no_warnings_and_no_gaps(self, inputs: NavigationInputs) -> None:
         assert (inputs.doubts, inputs.holes) == ([], [])
         assert inputs.refused == {}
 
-    def test_the_logs_own_configuration_needs_no_file_beside_it(
+    def test_the_configuration_in_the_log_suffices(
         self, flown: Flown, inputs: NavigationInputs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.chdir(tmp_path)
@@ -186,7 +184,7 @@ class TestOfALog:
         again = read_inputs(flown.session(), InputOptions(config=config))
         assert again.samples == inputs.samples
 
-    def test_the_same_log_gives_the_same(self, flown: Flown, inputs: NavigationInputs) -> None:
+    def test_the_same_log_gives_the_same_inputs(self, flown: Flown, inputs: NavigationInputs) -> None:
         again = read_inputs(flown.session(), InputOptions())
         assert np.array_equal(again.legs[0].inertial.velocity_b, inputs.legs[0].inertial.velocity_b)
         assert again.legs[0].observations.tobytes() == inputs.legs[0].observations.tobytes()
@@ -199,41 +197,41 @@ class TestRefusals:
         assert "\n" not in caught.value.message
         return caught.value.message
 
-    def test_names_that_are_not_there(self, flown: Flown) -> None:
+    def test_unknown_device_names_are_refused(self, flown: Flown) -> None:
         assert self.refused(flown, InputOptions(imu="other")).endswith(
             "--imu: the configuration has no [imu.other]; it has: main"
         )
         assert "--gnss-name" in self.refused(flown, InputOptions(gnss="base"))
 
-    def test_an_imu_that_says_nothing(self, flown: Flown) -> None:
+    def test_an_imu_without_data_is_refused(self, flown: Flown) -> None:
         config = flown.changed("other_wire.toml", **{"[imu.main": "[imu.second"})
         said = self.refused(flown, InputOptions(config=config))
         assert said.endswith("no samples of imu/second: the log has no byte of it; check that its wire is recorded")
 
-    def test_a_receiver_that_speaks_otherwise(self, flown: Flown) -> None:
+    def test_a_receiver_of_another_protocol_is_refused(self, flown: Flown) -> None:
         config = flown.changed("nmea.toml", **{'protocol = "novatel"': 'protocol = "nmea"'})
         said = self.refused(flown, InputOptions(config=config))
         assert "no position of gnss/rover" in said
         assert "in no known message; set another protocol, or let the device send other messages" in said
 
-    def test_a_log_without_a_configured_receiver(self, flown: Flown) -> None:
+    def test_a_log_without_its_configured_receiver_is_refused(self, flown: Flown) -> None:
         config = flown.changed("other_receiver.toml", **{"[gnss.rover]": "[gnss.away]"})
         assert "no position of gnss/away, and an IMU alone gives no trajectory: the log has no byte" in self.refused(
             flown, InputOptions(config=config)
         )
 
-    def test_positions_of_another_day(self, flown: Flown, tmp_path: Path) -> None:
+    def test_positions_of_another_day_are_refused(self, flown: Flown, tmp_path: Path) -> None:
         file = tmp_path / "ppk.pos"
         file.write_text(POS.format("2026/11/01"))
         assert "belongs to another flight" in self.refused(flown, InputOptions(positions=file))
 
-    def test_a_finished_trajectory_is_no_antenna(self, flown: Flown, tmp_path: Path) -> None:
+    def test_a_finished_trajectory_is_refused_as_antenna_positions(self, flown: Flown, tmp_path: Path) -> None:
         file = tmp_path / "done.csv"
         file.write_text("gps_ns,lat_deg,lon_deg\n")
         assert "finished trajectory" in self.refused(flown, InputOptions(positions=file))
         assert "cannot be read" in self.refused(flown, InputOptions(positions=tmp_path / "none.pos"))
 
-    def test_antennas_in_one_place(self, flown: Flown) -> None:
+    def test_antennas_at_one_place_are_refused(self, flown: Flown) -> None:
         said = r"secondary_lever_arm_m: is 0\.00 m from lever_arm_m"
         with pytest.raises(ConfigError, match=said):
             flown.changed("one.toml", **{"[0.9, 0.6, -1.2]": "[0.1, -0.05, -1.2]"})
@@ -243,21 +241,21 @@ class TestRefusals:
         assert "secondary_lever_arm_m: is 0.00 m from lever_arm_m" in self.refused(flown, InputOptions(config=config))
 
 
-class TestDoubts:
-    def test_a_baseline_that_is_not_the_configured_one(self, flown: Flown) -> None:
+class TestWarnings:
+    def test_a_baseline_that_differs_from_the_configured_one_gives_a_warning(self, flown: Flown) -> None:
         config = flown.changed("long.toml", **{"[0.9, 0.6, -1.2]": "[0.9, 1.6, -1.2]"})
         (line,) = read_inputs(flown.session(), InputOptions(config=config)).doubts
         assert "measures 1.03 m between its antennas" in line
         assert "are 1.83 m apart" in line
 
-    def test_headings_without_a_second_antenna(self, flown: Flown) -> None:
+    def test_headings_without_a_second_antenna_give_a_warning(self, flown: Flown) -> None:
         config = flown.changed("single.toml", **{"secondary_lever_arm_m": "# "})
         inputs = read_inputs(flown.session(), InputOptions(config=config))
         assert inputs.observed["heading"] == 0
         assert inputs.refused["heading_no_secondary_lever_arm"] > 60
         assert "set gnss.rover.secondary_lever_arm_m" in inputs.doubts[0]
 
-    def test_a_second_antenna_that_tells_nothing(self, tmp_path: Path) -> None:
+    def test_a_second_antenna_without_headings_gives_a_warning(self, tmp_path: Path) -> None:
         one = PLAN.replace("secondary_lever_arm_m = [0.9, 0.6, -1.2]", "")
         flown = fly_short(tmp_path, one, 10.0)
         assert not read_inputs(flown.session(), InputOptions()).doubts
@@ -266,7 +264,7 @@ class TestDoubts:
         (line,) = read_inputs(flown.session(), InputOptions(config=config)).doubts
         assert "gnss/rover sent no heading that this program reads, although secondary_lever_arm_m" in line
 
-    def test_an_imu_timed_by_its_arrival(self, flown: Flown) -> None:
+    def test_an_imu_timed_by_arrival_gives_a_warning(self, flown: Flown) -> None:
         config = flown.changed("untimed.toml", **{"sample_ticks": "# ", "pps_ticks": "# ", 'group = "last"': ""})
         inputs = read_inputs(flown.session(), InputOptions(config=config))
         assert inputs.imu_time[0] == "arrival"
@@ -286,7 +284,7 @@ POS = """% program   : RTKLIB
 """
 
 
-def test_positions_from_outside_replace_those_of_the_receiver(flown: Flown, tmp_path: Path) -> None:
+def test_positions_from_a_file_replace_those_of_the_receiver(flown: Flown, tmp_path: Path) -> None:
     file = tmp_path / "ppk.pos"
     file.write_text(POS.format("2026/06/15"))
     first = flown.truth().time_ns[0]
@@ -318,7 +316,7 @@ def fix(**changes: Any) -> GnssFix:
 
 
 class TestFixes:
-    def test_messages_of_one_epoch_are_one_position_and_one_velocity(self) -> None:
+    def test_messages_of_one_epoch_give_one_position_and_one_velocity(self) -> None:
         moving = {"lat_rad": None, "lon_rad": None, "height_m": None, "velocity_l": (1.0, 2.0, 3.0)}
         fixes = [fix(), fix(message="BESTVEL", **moving), fix(height_m=501.0), fix(fix_type=FixType.SINGLE)]
         found = fix_observations(fixes, [5, 5, 5, 5], 1)
@@ -327,7 +325,7 @@ class TestFixes:
         assert found.rows["value"][1].tolist() == [1.0, 2.0, 3.0]
         assert found.refused == {"repeated_in_epoch": 2}
 
-    def test_the_better_fix_of_an_epoch_is_taken_whatever_came_first(self) -> None:
+    def test_the_better_fix_of_an_epoch_is_used_in_any_order(self) -> None:
         fixes = [fix(fix_type=FixType.SINGLE), fix(fix_type=FixType.RTK_FLOAT), fix(fix_type=FixType.DIFFERENTIAL)]
         found = fix_observations(fixes, [5, 5, 5], 1)
         assert found.rows["fix_type"].tolist() == [FixType.RTK_FLOAT]
@@ -345,24 +343,26 @@ class TestFixes:
             ({"height_m": float("nan")}, 5, "not_finite"),
         ],
     )
-    def test_what_is_no_observation_is_counted(self, changes: dict[str, Any], at_ns: int | None, why: str) -> None:
+    def test_messages_that_are_not_observations_are_counted(
+        self, changes: dict[str, Any], at_ns: int | None, why: str
+    ) -> None:
         found = fix_observations([fix(**changes)], [at_ns], 1)
         assert (len(found.rows), dict(found.refused)) == (0, {why: 1})
 
-    def test_positions_that_the_receivers_ins_made_give_way_to_those_of_satellites(self) -> None:
+    def test_satellite_positions_have_precedence_over_those_of_the_receivers_ins(self) -> None:
         found = fix_observations([fix(), fix(message="BESTGNSSPOS"), fix()], [5, 5, 6], 1)
         assert found.rows["time_ns"].tolist() == [5]
         assert found.refused == {"blended_by_ins": 2}
 
     @pytest.mark.parametrize("kind", sorted(DEFAULT_SIGMAS))
-    def test_sigmas_that_are_not_said_are_the_defaults_of_the_fix(self, kind: FixType) -> None:
+    def test_absent_sigmas_default_to_those_of_the_fix_type(self, kind: FixType) -> None:
         given = np.diag([0.5**2, np.nan, 0.0])
         found = fix_observations([fix(fix_type=kind, position_cov_l=given)], [5], 1)
         (horizontal, vertical), _ = DEFAULT_SIGMAS[kind]
         assert found.rows["sigma"][0].tolist() == [0.5, horizontal, vertical]
         assert found.assumed == {"position": 1}
 
-    def test_a_covariance_is_sigmas_and_correlations(self) -> None:
+    def test_a_covariance_is_converted_to_sigmas_and_correlations(self) -> None:
         given = np.array([[4.0, 1.2, -0.4], [1.2, 9.0, 0.6], [-0.4, 0.6, 16.0]])
         found = fix_observations([fix(position_cov_l=given)], [5], 1)
         assert found.rows["sigma"][0].tolist() == [2.0, 3.0, 4.0]
@@ -374,14 +374,14 @@ class TestHeadings:
     def heading(self, **changes: Any) -> GnssHeading:
         return replace(GnssHeading(100, TimeTag(TimeScale.GPS, 0), 1.0), **changes)
 
-    def test_sigma_of_a_baseline_follows_its_length(self) -> None:
+    def test_sigma_of_a_baseline_heading_follows_its_length(self) -> None:
         short, long = (heading_observations([self.heading()], [5], length).rows["sigma"][0, 0] for length in (0.5, 5.0))
         assert short / long == pytest.approx(10.0, rel=1e-3)
         said = heading_observations([self.heading(heading_sigma_rad=0.1)], [5], 1.0)
         assert said.rows["sigma"][0, 0] == 0.1
         assert np.isnan(said.rows["value"][0, 1])
 
-    def test_one_without_time_is_of_the_fix_that_came_with_it(self) -> None:
+    def test_a_heading_without_time_gets_that_of_the_fix_it_came_with(self) -> None:
         fixes = [fix(host_time_ns=at) for at in (0, S, 2 * S)]
         headings = [self.heading(time=None, host_time_ns=at) for at in (S + 100_000_000, 2 * S + 700_000_000)]
         assert heading_times(headings, [None, None], fixes, [10, 20, 30]) == [20, None]
@@ -391,7 +391,7 @@ class TestHeadings:
 def test_correlated_errors_average_as_slowly_as_white_ones_with_their_factor(
     step_s: float, share: float, tau_s: float
 ) -> None:
-    """By the covariance of the errors themselves: the variance of the mean of many."""
+    """Compare the variance of a mean of many with that from the covariance of the errors themselves."""
     n = 4000
     apart = step_s * np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
     covariance = share**2 * np.exp(-apart / tau_s) + (1 - share**2) * np.eye(n)
@@ -408,7 +408,7 @@ def test_each_heading_is_taken_once() -> None:
     assert found.refused == {"repeated_in_epoch": 1}
 
 
-def test_attitudes_of_an_ins_are_few_and_only_of_solutions() -> None:
+def test_attitudes_of_an_ins_are_few_and_only_of_valid_solutions() -> None:
     rows = np.zeros(250, INS_DTYPE)
     rows["gps_ns"] = 1000 * S + np.arange(250) * 200_000_000
     rows["heading_rad"], rows["attitude_sigma_rad"], rows["status"] = 1.5, np.nan, 3
@@ -435,7 +435,7 @@ def test_arrivals_in_bunches_are_spread_evenly() -> None:
     assert np.diff(found)[:900].std() < 1.0
 
 
-def test_samples_with_gps_time_of_their_own_need_no_clock() -> None:
+def test_samples_with_gps_time_need_no_clock() -> None:
     rows = np.zeros(3, IMU_DTYPE)
     rows["gps_week"], rows["device_time_ns"] = [2423, 2423, -1], [5, 7, 9]
     found = imu_times(rows, HostClocks(ClockPlan(0)), None, 100.0)
@@ -460,7 +460,7 @@ def test_samples_before_any_time_are_counted() -> None:
     assert np.abs(found.gps_ns - 2423 * 604_800 * S - 100 * S - rows["host_time_ns"]).max() < 5_000_000
 
 
-def test_noise_is_the_grades_where_the_configuration_says_nothing(flown: Flown) -> None:
+def test_noise_defaults_to_that_of_the_grade(flown: Flown) -> None:
     table = flown.config.imu["main"].noise.model_copy(
         update={"grade": "mems", "gyro_bias_deg_per_h": 3600.0, "accel_scale_ppm": 7.0}
         | dict.fromkeys(("angle_random_walk_deg_per_sqrt_h", "accel_bias_mg", "bias_correlation_h", "gyro_scale_ppm"))
@@ -475,8 +475,8 @@ def test_noise_is_the_grades_where_the_configuration_says_nothing(flown: Flown) 
         assert getattr(noise, name) == getattr(GRADES["mems"], name)
 
 
-def test_keys_of_the_noise_that_a_grade_gives_are_named(flown: Flown) -> None:
-    """By their own units; none where all are set; and it is said where nobody chose the grade."""
+def test_noise_keys_taken_from_a_grade_are_named(flown: Flown) -> None:
+    """The keys have their own units; none is named if all are set, and a default grade is reported."""
     sources = NavigationSources(flown.config, {})
     keys = set(NoiseConfig.model_fields) - {"grade"}
     table = {"imu": {"main": sources.imu.model_copy(update={"noise": NoiseConfig(gyro_bias_deg_per_h=2.0)})}}
@@ -503,7 +503,7 @@ Program:     GrafNav
 """
 
 
-def test_waypoint_text_says_its_quality_too() -> None:
+def test_waypoint_text_gives_its_quality() -> None:
     columns = read_antenna_positions(WAYPOINT.encode(), "rover.txt")
     assert columns.fix_type is not None
     assert columns.fix_type.tolist() == [FixType.RTK_FIXED, FixType.RTK_FLOAT, FixType.SINGLE]
@@ -513,7 +513,7 @@ def test_waypoint_text_says_its_quality_too() -> None:
     assert np.degrees(columns.lat_rad[0]) == pytest.approx(47.482, abs=1e-9)
 
 
-def test_positions_that_say_no_quality_are_as_good_as_their_sigmas(tmp_path: Path) -> None:
+def test_positions_without_quality_are_as_accurate_as_their_sigmas(tmp_path: Path) -> None:
     """A floor for single receivers would make centimetres of post-processing half a metre."""
     lines = [line[:65] + line[68:] for line in WAYPOINT.splitlines()]
     assert " Q " in WAYPOINT
@@ -551,7 +551,7 @@ def findings_of(fixes: list[GnssFix]) -> list[Finding]:
     return height_findings(found, sources)
 
 
-def test_a_geoid_separation_of_zero_in_every_gga_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_geoid_separation_of_zero_in_every_gga_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     fixes = gga_fixes([0.0] * 20)
     assert {fix.undulation_m for fix in fixes} == {0.0}
     for known, size in ((None, "up to 107 m"), ((48.2, "EGM2008"), "48.2 m (EGM2008)")):
@@ -564,13 +564,13 @@ def test_a_geoid_separation_of_zero_in_every_gga_is_none(monkeypatch: pytest.Mon
         )
 
 
-def test_a_geoid_separation_that_is_said_or_once_zero_is_no_finding() -> None:
+def test_a_real_geoid_separation_is_not_reported() -> None:
     assert not findings_of(gga_fixes([48.0] * 20))
     assert not findings_of(gga_fixes([0.1, 0.0, -0.1] * 8))
     assert not findings_of(gga_fixes([0.0] * 20)[:5])  # too few to say
 
 
-def test_a_log_whose_receiver_says_no_geoid_has_the_finding(tmp_path: Path) -> None:
+def test_a_log_whose_receiver_lacks_a_geoid_has_the_finding(tmp_path: Path) -> None:
     plan = PLAN.replace("[gnss.rover]\nrate_hz = 5\nsecondary_lever_arm_m = [0.9, 0.6, -1.2]", NMEA)
     assert NMEA in plan
     inputs = read_inputs(fly_short(tmp_path, plan, 10.0).session(), InputOptions())
@@ -591,14 +591,16 @@ def flown_rows(later_s: float = 0.0, north_m: float = 0.0) -> StructArray:
 
 
 @pytest.mark.parametrize(("later_s", "words"), [(2.0, "2 s later"), (-18.0, "18 s earlier"), (37.0, "37 s later")])
-def test_positions_written_with_other_leap_seconds_are_named(later_s: float, words: str) -> None:
+def test_positions_written_with_other_leap_seconds_are_reported(later_s: float, words: str) -> None:
     outside = OutsidePositions(Path("a.pos"), Observed(flown_rows(later_s), Counter(), Counter()))
     with pytest.raises(UserError, match=f"a.pos: its positions are those of the log's receiver {words} .*leap seconds"):
         refuse_shifted(outside, flown_rows())
 
 
 @pytest.mark.parametrize(("later_s", "north_m"), [(0.0, 0.0), (0.02, 0.0), (0.0, 3.0), (0.0, 300.0)])
-def test_positions_of_the_same_time_or_of_another_place_are_not_called_shifted(later_s: float, north_m: float) -> None:
+def test_positions_of_the_same_time_or_another_place_are_not_reported_as_shifted(
+    later_s: float, north_m: float
+) -> None:
     outside = OutsidePositions(Path("a.pos"), Observed(flown_rows(later_s, north_m), Counter(), Counter()))
     refuse_shifted(outside, flown_rows())
     refuse_shifted(outside, flown_rows()[:3])

@@ -37,28 +37,28 @@ def turning(n: int = 600) -> Trajectory:
     )
 
 
-def test_the_offset_is_that_of_the_point() -> None:
+def test_the_offset_is_that_of_the_reference_point() -> None:
     body = turning()
     found = offset_in_b(body.at_body(-ARM), body)
     assert found is not None
     assert found[0] == pytest.approx(ARM, abs=1e-6)
 
 
-def test_the_antenna_is_named() -> None:
+def test_the_antenna_is_recognised_as_reference_point() -> None:
     body = turning()
     (line,) = point_doubts(body.at_body(-ARM - [0.02, 0.0, 0.05]), body, [ARM], "gnss/rover")
     assert line.startswith("gnss/rover: its own INS gives the trajectory of its antenna, 1.")
     assert "use --trajectory-at antenna" in line
 
 
-def test_another_point_is_told_by_its_place() -> None:
+def test_another_reference_point_is_described_by_its_place() -> None:
     body = turning()
     (line,) = point_doubts(body.at_body([-1.0, 0.0, 0.0]), body, [ARM], "gnss/rover")
     assert "another point than the IMU, 1.00 m" in line
     assert "--trajectory-at 1.00," in line
 
 
-def test_the_body_itself_and_a_bad_solution_say_nothing() -> None:
+def test_the_body_itself_and_a_bad_solution_give_no_finding() -> None:
     body, generator = turning(), np.random.default_rng(1)
     noise = generator.normal(0.0, 0.02, (600, 3))
     near = body._with(position_e=body.position_e + noise)
@@ -68,7 +68,7 @@ def test_the_body_itself_and_a_bad_solution_say_nothing() -> None:
     assert point_doubts(turning(15), body, [ARM], "x") == []
 
 
-def test_an_ins_that_says_no_velocities_has_those_of_its_way() -> None:
+def test_absent_ins_velocities_are_derived_from_positions() -> None:
     body = turning()
     rows = np.zeros(len(body), INS_DTYPE)
     rows["gps_ns"], rows["velocity_l"] = body.time_ns, np.nan

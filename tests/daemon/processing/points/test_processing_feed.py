@@ -97,7 +97,7 @@ class Flown:
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
-    """The flight, in parts of some seconds."""
+    """Return the flight in parts of some seconds."""
     folder = tmp_path_factory.mktemp("cut")
     plan = parse_plan(PLAN, Path())
     flight = VirtualFlight(plan, None, SECONDS)
@@ -117,7 +117,7 @@ def setup(flown: Flown) -> Setup:
 
 
 def placed_of(setup: Setup, session: Session, batches: Iterable[LogBatch]) -> tuple[Placed, LogFeed]:
-    """All points of a log by its own INS, tick by tick."""
+    """Return all points of a log made with its own INS, tick by tick."""
     feed = LogFeed(setup, setup.live_stream(session.info, ENOUGH))
     placed: Placed = []
     for batch in batches:
@@ -126,7 +126,7 @@ def placed_of(setup: Setup, session: Session, batches: Iterable[LogBatch]) -> tu
 
 
 def digest(placed: Placed) -> str:
-    """Of every column of every piece, and of the order and sizes of the pieces."""
+    """Return a digest of every column of every piece and of the order and sizes of the pieces."""
     found = hashlib.sha256()
     for name, points in placed:
         found.update(f"{name} {len(points)} ".encode())
@@ -138,12 +138,12 @@ def digest(placed: Placed) -> str:
 
 @pytest.fixture(scope="module")
 def whole(setup: Setup, flown: Flown) -> tuple[Placed, LogFeed]:
-    """The log as its chunks come."""
+    """Return the log in its own chunks."""
     return placed_of(setup, flown.session(), flown.session().batches())
 
 
 def cut(batches: Iterable[LogBatch], longest: int, seed: int) -> Iterator[LogBatch]:
-    """The same messages in runs of random lengths."""
+    """Return the same messages in runs of random lengths."""
     lengths = random.Random(seed)
     for batch in batches:
         first = 0
@@ -166,7 +166,7 @@ def test_every_return_has_a_fate_and_most_are_points(whole: tuple[Placed, LogFee
 
 
 def test_points_lie_on_the_ground(whole: tuple[Placed, LogFeed], flown: Flown) -> None:
-    """Flat terrain: heights tell of every error of time, attitude and sign that there could be."""
+    """Heights of flat terrain reveal every error of time, attitude and sign."""
     for name in ("left", "top"):
         heights = np.concatenate([points.points_map[:, 2] for scanner, points in whole[0] if scanner == name])
         assert np.median(np.abs(heights - np.median(heights))) < 0.5
@@ -188,10 +188,10 @@ def test_message_by_message_gives_the_same_bytes(whole: tuple[Placed, LogFeed], 
     assert digest(placed) == digest(whole[0])
 
 
-def test_a_log_that_is_followed_while_it_grows_gives_the_same_bytes(
+def test_a_growing_log_gives_the_same_bytes(
     whole: tuple[Placed, LogFeed], setup: Setup, flown: Flown, tmp_path: Path
 ) -> None:
-    """Each part is written in pieces of any length, and read as far as it goes after each."""
+    """Each part is written in pieces of any length and read as far as possible after each."""
 
     def growing() -> Iterator[LogBatch]:
         lengths = random.Random(4)
@@ -216,7 +216,7 @@ def test_a_log_that_is_followed_while_it_grows_gives_the_same_bytes(
 
 
 def opened(path: Path) -> PartFollower | None:
-    """None: what stands before its first chunk is not all there yet."""
+    """Return the log, or None while its first chunk is incomplete."""
     try:
         return PartFollower(path)
     except LogError:
@@ -228,7 +228,7 @@ def known(setup: Setup, flown: Flown) -> LogClocks:
     return read_clocks(flown.session(), setup)
 
 
-def test_the_first_pass_passes_over_what_scanners_say(
+def test_the_first_pass_skips_scanner_data(
     setup: Setup, flown: Flown, known: LogClocks, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     unpacked: list[int] = []
@@ -271,7 +271,7 @@ def by_time(placed: Placed, name: str) -> dict[tuple[int, int, int], bytes]:
     return found
 
 
-def test_pieces_of_a_log_give_together_what_the_whole_gives(setup: Setup, flown: Flown, known: LogClocks) -> None:
+def test_pieces_of_a_log_together_give_the_whole(setup: Setup, flown: Flown, known: LogClocks) -> None:
     """With complete clocks, which pickle, each return stands in the piece where its message does, and alike."""
     session = flown.session()
     known = pickle.loads(pickle.dumps(known))
@@ -292,7 +292,7 @@ def test_pieces_of_a_log_give_together_what_the_whole_gives(setup: Setup, flown:
         assert Fate.NO_TIME not in stream.fates("left")
 
 
-def test_what_is_no_reading_and_no_edge_is_left_out(setup: Setup, flown: Flown) -> None:
+def test_invalid_readings_and_edges_are_dropped(setup: Setup, flown: Flown) -> None:
     session = flown.session()
     pps = next(batch for batch in session.batches() if batch.channel.topic == "/pps/main")
     feed = LogFeed(setup, setup.live_stream(session.info))
@@ -302,7 +302,7 @@ def test_what_is_no_reading_and_no_edge_is_left_out(setup: Setup, flown: Flown) 
     assert feed.counts["pps/main"] == {"refused": 3}
 
 
-def test_a_scanners_units_of_any_lengths_are_decoded_together(
+def test_scanner_units_of_any_length_are_decoded_in_batches(
     setup: Setup, flown: Flown, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Until they are enough, come by another wire, or a tick comes."""
@@ -340,7 +340,7 @@ def test_a_scanners_units_of_any_lengths_are_decoded_together(
     assert seen[4:] == [[(4, 60)]]
 
 
-def test_a_log_whose_time_stands_still_is_decided_on_by_its_bytes(
+def test_decisions_on_a_log_without_advancing_time_follow_its_bytes(
     setup: Setup, flown: Flown, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(feed_module, "TICK_BYTES", 1 << 20)
@@ -356,9 +356,7 @@ def test_a_log_whose_time_stands_still_is_decided_on_by_its_bytes(
     assert set(ticks) == {10**18}
 
 
-def test_a_batch_is_split_at_every_tick_that_it_passes(
-    setup: Setup, flown: Flown, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_batch_is_split_at_every_tick(setup: Setup, flown: Flown, monkeypatch: pytest.MonkeyPatch) -> None:
     session = flown.session()
     clock = next(batch for batch in session.batches() if batch.channel.topic == "/clock")
     stream = setup.live_stream(session.info)
@@ -373,7 +371,7 @@ def test_a_batch_is_split_at_every_tick_that_it_passes(
     assert [before for _, before in seen] == [3, 7, 10]
 
 
-def test_a_terrain_model_expects_what_was_measured(
+def test_a_terrain_model_predicts_the_measured_range(
     setup: Setup, flown: Flown, known: LogClocks, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Flat ground, heights of which a grid around the site knows; so the range expected is the range."""

@@ -36,7 +36,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
 
 
 def halves(flown: Flown, path: Path) -> str:
-    """A file of two strips."""
+    """Write a file of two strips."""
     first, last = (int(flown.truth["left.gps_ns"][at]) for at in (0, -1))
     middle = (first + last) // 2
     path.write_text(f"start_gps_ns,end_gps_ns\n{first},{middle}\n{middle},{last}\n")
@@ -44,7 +44,7 @@ def halves(flown: Flown, path: Path) -> str:
 
 
 def digests(output: Path) -> dict[str, str]:
-    """Of all files but the sidecar, which names the output's strips."""
+    """Return digests of all files except the sidecar, which names the output's strips."""
     return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(output.iterdir())}
 
 
@@ -58,13 +58,17 @@ def alone(flown: Flown, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path,
 
 
 class TestSameBytes:
-    def test_in_two_processes(self, flown: Flown, alone: tuple[Path, dict[str, str]], tmp_path: Path) -> None:
+    def test_two_processes_give_the_same_bytes(
+        self, flown: Flown, alone: tuple[Path, dict[str, str]], tmp_path: Path
+    ) -> None:
         strips, expected = alone
         assert run_app(flown.arguments(tmp_path, "--strips", str(strips), "--workers", "2")) == 0
         assert digests(tmp_path) == expected
         assert len(expected) == 6  # two strips, three files of the trajectory, the sidecar
 
-    def test_on_a_cluster_of_two(self, flown: Flown, alone: tuple[Path, dict[str, str]], tmp_path: Path) -> None:
+    def test_a_cluster_of_two_gives_the_same_bytes(
+        self, flown: Flown, alone: tuple[Path, dict[str, str]], tmp_path: Path
+    ) -> None:
         distributed: Any = importlib.import_module("distributed")
         strips, expected = alone
         with distributed.LocalCluster(
@@ -90,7 +94,7 @@ class TestIndex:
         assert cut.chunks == whole.chunks
         assert whole.damage == []
 
-    def test_a_bit_of_the_summary_moves_no_chunk(self, flown: Flown, tmp_path: Path) -> None:
+    def test_a_wrong_bit_in_the_summary_does_not_change_the_chunks(self, flown: Flown, tmp_path: Path) -> None:
         whole = index_log(open_logs([flown.log])[0])
         log = flown.copy_of_log(tmp_path)
         data = bytearray(log.read_bytes())
@@ -103,21 +107,21 @@ class TestIndex:
         assert index.chunks == whole.chunks
         assert [one.damage.what for one in index.damage] == ["index and footer are missing, cut off or wrong"]
 
-    def test_chunks_give_what_the_session_gives(self, flown: Flown) -> None:
+    def test_indexed_chunks_equal_those_of_the_session(self, flown: Flown) -> None:
         session = open_logs([flown.log])[0]
         index = index_log(session)
         wanted = [batch.units.tobytes() for batch in session.batches(lambda topic: topic.startswith("/scanner/"))]
         found = read_chunks(index, index.scanner_chunks(), lambda topic: topic.startswith("/scanner/"), [])
         assert [batch.units.tobytes() for batch in found] == wanted
 
-    def test_between_gives_all_chunks_with_a_message_of_the_span_and_no_other(self, flown: Flown) -> None:
+    def test_between_gives_exactly_the_chunks_with_messages_of_the_span(self, flown: Flown) -> None:
         index = index_log(open_logs([flown.log])[0])
         chunks = index.scanner_chunks()
         start, end = chunks[3].start_ns + 1, chunks[6].start_ns
         assert index.between(start, end) == chunks[3:6]
         assert index.between(start, end + 1) == chunks[3:7]
 
-    def test_a_file_that_became_another_is_damage(self, flown: Flown, tmp_path: Path) -> None:
+    def test_a_replaced_file_is_damage(self, flown: Flown, tmp_path: Path) -> None:
         log = flown.copy_of_log(tmp_path)
         index = index_log(open_logs([log])[0])
         log.write_bytes(log.read_bytes()[: index.chunks[4].offset + 7])
@@ -128,14 +132,14 @@ class TestIndex:
 
 
 def counts(plan: SessionPlan, job: Job, tell: Tell) -> JobResult:
-    """One that does nothing."""
+    """Return the result of a job that does nothing."""
     tell(5)
     return JobResult(job.session, job.segment.strip, 0, 0)
 
 
 class TestWorkers:
     def jobs(self, count: int) -> list[Job]:
-        """Of no size."""
+        """Return jobs without data."""
         return [Job(0, Segment(number, 0, 1), []) for number in range(count)]
 
     def test_results_come_in_the_order_of_the_jobs(self) -> None:
@@ -144,14 +148,14 @@ class TestWorkers:
         assert [result.strip for result in results] == [0, 1, 2, 3]
         assert told == [5, 10, 15, 20]
 
-    def test_a_process_that_dies_is_a_strip_that_failed(self) -> None:
+    def test_a_killed_process_gives_a_failed_strip(self) -> None:
         results = workers.run_jobs([None], self.jobs(2), workers=2, scheduler=None, progress=lambda done: None, do=dies)
         assert [bool(result.failed) for result in results] == [True, True]
         assert "memory" in results[0].failed
 
     @pytest.mark.parametrize("guarded", [False, True])
-    def test_a_script_that_its_own_processes_would_run_again_is_told_so(self, tmp_path: Path, guarded: bool) -> None:
-        """Processes that are begun anew import the script: unguarded it would begin others."""
+    def test_a_script_without_a_main_guard_is_refused(self, tmp_path: Path, guarded: bool) -> None:
+        """Spawned processes import the script again, which would start further ones."""
         script = tmp_path / "script.py"
         call = "run_jobs([None], jobs, workers=2, scheduler=None, progress=lambda done: None, do=counts)"
         script.write_text(

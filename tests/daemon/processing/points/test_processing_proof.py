@@ -80,14 +80,14 @@ LOW_HEAD = {
 
 
 def fly(folder: Path, case: Case, atmosphere: dict[str, str]) -> Flown:
-    """The flight of a case through some air."""
+    """Fly the case through some air."""
     changes: dict[str, Any] = {"scanner": {"left": case.scanner | (LOW_HEAD if case.low else {})}}
     changes |= {"atmosphere": atmosphere} | (LOW_AND_SLOW if case.low else {})
     return fly_and_decode(folder, changes, case.stop_s)
 
 
 def true_trajectory(flown: Flown) -> Trajectory:
-    """Of the body, by SciPy's splines through the truth, at small steps."""
+    """Return the true trajectory of the body, from SciPy's splines at small steps."""
     track = flown.track()
     time_s = np.linspace(track.time_s[0], track.time_s[-1], round((track.time_s[-1] - track.time_s[0]) / STEP_S) + 1)
     position_e, rotation = track.poses(time_s)
@@ -100,7 +100,7 @@ def true_trajectory(flown: Flown) -> Trajectory:
 
 
 def georeferenced(flown: Flown, folder: Path) -> tuple[Points, NDArray[np.uint8]]:
-    """By the configuration that the flight leaves, and the true calibration."""
+    """Georeference with the configuration of the flight and the true calibration."""
     for name, data in flown.files.items():
         (folder / name).write_bytes(data)
     text = config_text(flown.plan, default_wires(flown.plan), ".").partition("[output]")[0]  # points stay in e
@@ -125,7 +125,7 @@ def georeferenced(flown: Flown, folder: Path) -> tuple[Points, NDArray[np.uint8]
 
 
 def limits_of(case: Case, flown: Flown) -> FloatArray:
-    """1 mm and half of each quantum carried to the ground."""
+    """Return 1 mm plus half of each quantum projected to the ground."""
     kind = case.scanner.get("kind")
     if kind == "vlp16":
         groups = 6 if case.scanner["dual_return"] else 12
@@ -138,7 +138,7 @@ def limits_of(case: Case, flown: Flown) -> FloatArray:
 
 @pytest.mark.parametrize("air", ["off", "on"])
 @pytest.mark.parametrize("name", CASES)
-def test_every_return_is_where_the_light_went(tmp_path: Path, name: str, air: str) -> None:
+def test_every_return_is_placed_where_the_simulated_beam_hit(tmp_path: Path, name: str, air: str) -> None:
     case = CASES[name]
     flown = fly(tmp_path, case, AIR if air == "on" else {})
     points, fate = georeferenced(flown, tmp_path)

@@ -52,7 +52,7 @@ def standing() -> Trajectory:
 
 
 def back_in_body(points_e: FloatArray) -> FloatArray:
-    """From e to the body by other means than georef's."""
+    """Convert from e to the body without georef."""
     to_e = Transformer.from_crs(4979, 4978, always_xy=True)
     origin_e = np.array(to_e.transform(LON_DEG, LAT_DEG, HEIGHT_M))
     rot_e_from_l = Rotation.from_euler("ZY", [LON_DEG, -LAT_DEG - 90.0], degrees=True)
@@ -62,26 +62,26 @@ def back_in_body(points_e: FloatArray) -> FloatArray:
 
 
 def model_of(protocol: str, parser: PacketParser) -> SensorModel:
-    """Without a calibration: the head is the body."""
+    """Return the model of a head at the body's origin, without a calibration."""
     table = ScannerConfig.model_validate({"transport": "udp:0.0.0.0:2368", "protocol": protocol})
     return SensorModel(nominal("left", np.zeros(3), np.eye(3)), geometry_of(table, parser))
 
 
 def points_s(model: SensorModel, rows: StructArray) -> FloatArray:
-    """(n, 3) in the head's frame, of returns all at one time."""
+    """Return (n, 3) points in the head's frame of returns at one time."""
     rays = model.rays(rows, np.full(len(rows), 500_000_000, np.int64), standing())
     assert not rays.fate.any()
     return back_in_body(rays.points_e)
 
 
 def as_ros(points: FloatArray) -> FloatArray:
-    """x forward, y left, as ROS decoders publish."""
+    """Convert to the axes of ROS decoders: x forward, y left."""
     x, y, z = points.T
     return np.stack([y, -x, z], axis=1)
 
 
 def apart_deg(one: FloatArray, other: FloatArray) -> FloatArray:
-    """(n,) between two points, about the spin axis."""
+    """Return (n,) angles about the spin axis between two sets of points, degrees."""
     azimuth = np.arctan2(one[:, 1], one[:, 0]) - np.arctan2(other[:, 1], other[:, 0])
     apart: FloatArray = np.degrees(np.abs(np.angle(np.exp(1j * azimuth))))
     return apart
@@ -126,7 +126,7 @@ class Velodyne:
     ],
     ids=lambda recording: recording.capture,
 )
-def test_velodyne_points_are_velodyne_decoders(recording: Velodyne) -> None:
+def test_velodyne_points_match_velodyne_decoder(recording: Velodyne) -> None:
     parser = recording.parser()
     theirs = recording.decoder_cloud()
     rows = recording.in_that_order(returns_of(feed(parser, recording.units()))[: len(theirs)])
@@ -142,7 +142,7 @@ def test_velodyne_points_are_velodyne_decoders(recording: Velodyne) -> None:
     assert apart_deg(ours, wanted)[sure].max() < 0.025
 
 
-def test_vlp16_points_are_nebulas() -> None:
+def test_vlp16_points_match_nebula() -> None:
     """Its own regression cloud: 3 cm, as it has no vertical corrections (11 mm) and turns azimuths on otherwise."""
     fields = [("x", "f4"), ("y", "f4"), ("z", "f4"), ("intensity", "u1"), ("return_type", "u1"), ("channel", "u2")]
     kind = np.dtype([*fields, ("azimuth", "f4"), ("elevation", "f4"), ("distance", "f4"), ("time_stamp", "u4")])
@@ -163,7 +163,7 @@ def nearest_m(points: FloatArray, others: FloatArray) -> FloatArray:
     return distance
 
 
-def test_vlp32c_points_are_nebulas() -> None:
+def test_vlp32c_points_match_nebula() -> None:
     """Laser by elevation and raw distance of each point are ours, and so is its azimuth as nebula turns it on.
 
     It lets every laser fire 2.304 µs after the one before (the manual: every pair), and some blocks it does not turn.
@@ -195,7 +195,7 @@ def by_laser(points: FloatArray) -> FloatArray:
 # ------------------------------------------------------------------------------------------------------------- Hesai
 
 
-def test_xt32_points_are_nebulas() -> None:
+def test_xt32_points_match_nebula() -> None:
     """Every point of its cloud within 0.1 mm, once its leaving out the turn up to the firing is done here too."""
     angles = (FIXTURES / "hesai" / "calib_PandarXT32.csv").read_bytes()
     parser = find_driver("scanner", "hesai-xt32").make_parser(DeviceSettings("scanner/left", {}, {"geometry": angles}))
@@ -219,7 +219,7 @@ LIDAR = (
 
 
 @pytest.mark.parametrize("capture", LIDAR)
-def test_ouster_points_are_the_makers(capture: str) -> None:
+def test_ouster_points_match_the_manufacturers_decoder(capture: str) -> None:
     parser = ouster_cases.recorded(capture)
     rows = returns_of(ouster_cases.feed(parser, ouster_cases.payloads(capture)))
     with np.load(FIXTURES / "ouster" / f"{capture}.ouster_sdk.npz") as archive:

@@ -28,7 +28,7 @@ EAST_M, NORTH_M = 500_000.0, 5_200_000.0
 
 
 def plane(x: Array, y: Array) -> Array:
-    """A slope of 8 degrees or so."""
+    """Return heights of a slope of about 8 degrees."""
     return np.asarray(400.0 + 0.12 * (x - EAST_M) - 0.07 * (y - NORTH_M))
 
 
@@ -104,7 +104,7 @@ def test_a_shift_between_strips_is_found_on_a_slope_to_a_tenth_of_a_millimetre(s
     assert (together["median_m"], together["p95_m"]) == (-0.07, 0.07)
 
 
-def test_density_area_and_length_are_those_of_the_lattice(shifted: Look) -> None:
+def test_density_area_and_length_match_the_lattice(shifted: Look) -> None:
     for strip in shifted.strips:
         assert strip.points == strip.pulses == 600 * 200
         assert strip.density == pytest.approx(4.0, rel=0.01)
@@ -115,7 +115,7 @@ def test_density_area_and_length_are_those_of_the_lattice(shifted: Look) -> None
     assert shifted.area_m2 == pytest.approx(300.0 * 160.0, rel=0.05)
 
 
-def test_the_profile_lies_across_the_overlap_and_shows_half_the_shift_on_either_side(shifted: Look) -> None:
+def test_the_profile_crosses_the_overlap_and_shows_half_the_shift_on_each_side(shifted: Look) -> None:
     assert shifted.profile is not None
     line = shifted.profile.line
     assert abs(line.ahead[1]) == pytest.approx(1.0, abs=0.01)  # strips run east
@@ -148,7 +148,7 @@ def test_rough_and_steep_ground_is_not_compared(tmp_path: Path) -> None:
     assert row["median_m"] == pytest.approx(-0.02, abs=2e-4)
 
 
-def test_only_single_returns_are_compared_and_first_ones_counted(tmp_path: Path) -> None:
+def test_only_single_returns_are_compared_and_first_returns_counted(tmp_path: Path) -> None:
     """Second returns lie a metre below and would spoil both."""
     paths = []
     for number in (1, 2):
@@ -168,7 +168,7 @@ def test_only_single_returns_are_compared_and_first_ones_counted(tmp_path: Path)
     assert look.strips[0].points == 2 * look.strips[0].pulses
 
 
-def test_sigmas_are_root_mean_squares_and_those_unknown_are_counted(tmp_path: Path) -> None:
+def test_sigmas_are_root_mean_squares_and_unknown_ones_are_counted(tmp_path: Path) -> None:
     x, y = lattice(EAST_M, NORTH_M, 40.0, 40.0, 0.5)
     height = np.where(np.arange(len(x)) % 2, 0.03, 0.05)
     height[:100] = 6.5535
@@ -186,7 +186,7 @@ def test_sigmas_are_root_mean_squares_and_those_unknown_are_counted(tmp_path: Pa
     assert float(np.nanmax(look.surface.mean(5))) <= 0.0500001
 
 
-def test_means_of_cells_are_those_of_their_points(tmp_path: Path) -> None:
+def test_means_of_cells_match_those_of_their_points(tmp_path: Path) -> None:
     x, y = lattice(EAST_M, NORTH_M, 30.0, 30.0, 0.5)
     intensity = (x - EAST_M).astype(int)
     look = look_at([write(tmp_path / "s.las", x, y, plane(x, y), intensity=intensity)], cell_m=5.0)
@@ -210,7 +210,7 @@ def test_quality_levels_follow_density_and_rmsdz(tmp_path: Path, dz_m: float, be
     assert within == [dz_m < limit for limit in (0.08, 0.16, 0.16, 0.32)]
 
 
-def test_feet_become_metres(tmp_path: Path) -> None:
+def test_feet_are_converted_to_metres(tmp_path: Path) -> None:
     """EPSG:2994 counts in feet; a lattice of a foot has 1 / 0.3048² points a square metre."""
     x, y = lattice(600_000.0, 800_000.0, 300.0, 300.0, 1.0)
     paths = [
@@ -225,14 +225,14 @@ def test_feet_become_metres(tmp_path: Path) -> None:
     assert look.notes == ["no vertical CRS: heights are assumed to be in foot"]
 
 
-def test_degrees_become_metres(tmp_path: Path) -> None:
+def test_degrees_are_converted_to_metres(tmp_path: Path) -> None:
     x, y = lattice(9.0, 47.0, 2e-4, 2e-4, 2e-6)
     look = look_at([write(tmp_path / "d.las", x, y, 0.0 * x, crs=CRS.from_epsg(4326), scale=1e-8)])
     truth = 1.0 / (2e-6 * 111_320.0) ** 2 / math.cos(math.radians(47.0))
     assert look.strips[0].density == pytest.approx(truth, rel=0.03)
 
 
-def test_files_without_point_source_ids_are_strips_of_their_own(tmp_path: Path) -> None:
+def test_files_without_point_source_ids_are_separate_strips(tmp_path: Path) -> None:
     for name, lift_m in (("north", 0.0), ("south", 0.05)):
         x, y = lattice(EAST_M, NORTH_M, 40.0, 40.0, 0.5)
         write(tmp_path / f"{name}.las", x, y, plane(x, y) + lift_m, 0, point_format=0)  # no GPS time, no CRS
@@ -263,7 +263,7 @@ def test_noise_and_withheld_points_are_left_out_and_counted(tmp_path: Path) -> N
     assert any(note.startswith("30 points left out") for note in look.notes)
 
 
-def test_a_header_that_lies_about_the_extent_costs_no_point(tmp_path: Path) -> None:
+def test_a_wrong_extent_in_the_header_loses_no_point(tmp_path: Path) -> None:
     x, y = lattice(EAST_M, NORTH_M, 40.0, 40.0, 0.5)
     path = write(tmp_path / "l.las", x, y, plane(x, y))
     raw = bytearray(path.read_bytes())
@@ -275,7 +275,7 @@ def test_a_header_that_lies_about_the_extent_costs_no_point(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("suffix", ["las", "laz"])
-def test_what_a_cut_file_still_holds_is_shown_and_said(tmp_path: Path, suffix: str) -> None:
+def test_the_readable_part_of_a_truncated_file_is_shown_and_reported(tmp_path: Path, suffix: str) -> None:
     x, y = lattice(EAST_M, NORTH_M, 500.0, 400.0, 0.5)
     path = write(tmp_path / f"c.{suffix}", x, y, plane(x, y))
     assert len(x) > BLOCK_POINTS
@@ -305,7 +305,7 @@ def test_geocentric_files_are_refused(tmp_path: Path) -> None:
         look_at([path])
 
 
-def test_a_profile_that_is_asked_for_lies_where_it_was_asked_for(tmp_path: Path) -> None:
+def test_a_requested_profile_lies_at_its_requested_place(tmp_path: Path) -> None:
     x, y = lattice(EAST_M, NORTH_M, 60.0, 40.0, 0.5)
     path = write(tmp_path / "s.laz", x, y, plane(x, y))
     ends = (EAST_M + 5.0, NORTH_M + 20.0, EAST_M + 45.0, NORTH_M + 20.0)
@@ -320,7 +320,9 @@ def test_a_profile_that_is_asked_for_lies_where_it_was_asked_for(tmp_path: Path)
         look_at([path], ends=(0.0, 0.0, 1.0, 1.0))
 
 
-def test_cells_made_twice_as_large_say_the_same(shifted: Look, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_enlarged_cells_give_the_results_of_larger_cells(
+    shifted: Look, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     """With room for few tiles the cells grow; the moments are the ones of larger cells from the beginning."""
     monkeypatch.setattr("swath.daemon.processing.quicklook.strips.MOST_TILES", 30)
     look = two_strips(tmp_path, 0.07)
@@ -346,13 +348,13 @@ def test_moments_move_with_their_cells() -> None:
     np.testing.assert_allclose(_halved(fine.reshape(-1, MOMENTS), 1.0), coarse, atol=1e-9)
 
 
-def test_tiles_are_kept_where_there_are_points_only() -> None:
+def test_tiles_are_stored_only_where_there_are_points() -> None:
     cells = StripCells(Frame(0.0, 0.0, 1.0, 1600, 1600), 0.0)
     assert cells.tiles.shape == (1, 100, 100)
     assert cells.used == 0
 
 
-def test_cells_beyond_all_numbers_are_too_many_as_well() -> None:
+def test_an_overflowing_number_of_cells_is_too_many() -> None:
     """`--cell 1e-9`: their product is no 64 bit integer."""
     frame = frame_of(np.array([0.0, 0.0]), np.array([1e4, 1e4]), 1e-9)
     assert 1_000_000 < frame.rows * frame.columns <= 2_000_000
@@ -373,7 +375,7 @@ def test_inner_cells_have_all_their_neighbours() -> None:
     np.testing.assert_array_equal(inner(there), expected)
 
 
-def test_numbers_are_json(shifted: Look) -> None:
+def test_numbers_can_be_written_as_json(shifted: Look) -> None:
     numbers = json.loads(json.dumps(numbers_of(shifted), allow_nan=False))
     assert numbers["points"] == 240_000
     assert numbers["pairs"][0]["first"] == "1"

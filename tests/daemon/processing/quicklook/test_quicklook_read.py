@@ -26,7 +26,7 @@ FOOT_M = 1200.0 / 3937.0  # US survey foot, by its definition
 
 
 def as_copc(laz: Path, path: Path) -> Path:
-    """The same points as COPC."""
+    """Write the same points as COPC."""
     las = laspy.read(laz)
     places = np.stack([las.x, las.y, las.z], axis=-1)
     n, byte = len(places), np.ones(len(places), np.uint8)
@@ -55,7 +55,7 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Look, Path]:
     return look, copc
 
 
-def test_points_of_copc_are_themselves_from_any_place_on(both: tuple[Look, Path]) -> None:
+def test_points_of_copc_are_read_from_any_offset(both: tuple[Look, Path]) -> None:
     path = both[1] / "s1.copc.laz"
     everything = np.asarray(laspy.read(path).x)
     with PointReader(path, Selection.all()) as reader:
@@ -66,7 +66,7 @@ def test_points_of_copc_are_themselves_from_any_place_on(both: tuple[Look, Path]
         reader.go_to(120_001)
 
 
-def test_copc_looks_like_the_laz_of_its_points(both: tuple[Look, Path]) -> None:
+def test_a_copc_file_looks_like_the_laz_file_of_its_points(both: tuple[Look, Path]) -> None:
     laz, copc = both[0], look_at([both[1]])
     assert copc.surface.points == laz.surface.points == 240_000
     assert copc.cells.frame.cell_m == pytest.approx(laz.cells.frame.cell_m, rel=0.5)
@@ -75,7 +75,9 @@ def test_copc_looks_like_the_laz_of_its_points(both: tuple[Look, Path]) -> None:
     assert row["median_m"] == pytest.approx(same["median_m"], abs=2e-4)
 
 
-def test_a_profile_through_copc_has_the_points_of_laz(both: tuple[Look, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_profile_through_copc_contains_the_points_of_laz(
+    both: tuple[Look, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """At the far end, where only some of the blocks are wanted."""
     monkeypatch.setattr("swath.daemon.processing.quicklook.read.BLOCK_POINTS", 5_000)
     ends = (EAST_M + 290.0, NORTH_M + 5.0, EAST_M + 290.0, NORTH_M + 155.0)
@@ -89,7 +91,9 @@ def test_a_profile_through_copc_has_the_points_of_laz(both: tuple[Look, Path], m
 
 
 @pytest.mark.parametrize("size", [5_000, 100_000])
-def test_density_is_found_in_any_order(both: tuple[Look, Path], monkeypatch: pytest.MonkeyPatch, size: int) -> None:
+def test_density_does_not_depend_on_the_point_order(
+    both: tuple[Look, Path], monkeypatch: pytest.MonkeyPatch, size: int
+) -> None:
     """COPC's is that of a tree: a piece of it is less dense than the whole."""
     monkeypatch.setattr("swath.daemon.processing.quicklook.read.SAMPLE_POINTS", size)
     assert density_near(open_source(both[1] / "s1.copc.laz"), Units()) == pytest.approx(4.0, rel=0.3)
@@ -108,8 +112,8 @@ def feet(folder: Path, name: str, crs: CRS, height: float, sidecar: dict[str, An
     return look_at([inside])
 
 
-def test_heights_are_in_the_unit_that_crs_or_sidecar_says(tmp_path: Path) -> None:
-    """Where a CRS of feet says nothing of heights, `swath georef` writes metres, and its sidecar says so."""
+def test_the_height_unit_is_taken_from_crs_or_sidecar(tmp_path: Path) -> None:
+    """If a CRS in feet does not define heights, `swath georef` writes metres, and its sidecar declares them."""
     said = {"crs": {"crs": "EPSG:2230", "units": {"metres": [FOOT_M, FOOT_M, 1.0]}}}
     without, vertical = CRS.from_epsg(2230), CRS.from_user_input("EPSG:2230+6360")
     metres = feet(tmp_path, "sidecar", without, 100.0, said)
@@ -124,19 +128,19 @@ def test_heights_are_in_the_unit_that_crs_or_sidecar_says(tmp_path: Path) -> Non
     assert nothing.notes == ["no vertical CRS: heights are assumed to be in US survey foot"]
 
 
-def test_sigmas_are_metres_in_feet_too(tmp_path: Path) -> None:
+def test_sigmas_are_in_metres_with_coordinates_in_feet(tmp_path: Path) -> None:
     look = feet(tmp_path, "feet", CRS.from_epsg(2230), 100.0)
     assert look.strips[0].sigma_m is not None
     np.testing.assert_allclose(look.strips[0].sigma_m, 0.03, atol=1e-6)
 
 
 @pytest.mark.parametrize("units", [None, [], {"metres": 1.0}, {"metres": [1, 1, "m"]}, {"metres": [1.0, 1.0, 0.0]}])
-def test_a_sidecar_that_says_no_unit_changes_nothing(tmp_path: Path, units: Any) -> None:
+def test_a_sidecar_without_a_unit_changes_nothing(tmp_path: Path, units: Any) -> None:
     look = feet(tmp_path, "odd", CRS.from_epsg(2230), 100.0, {"crs": {"units": units}})
     assert look.units.up_m == pytest.approx(FOOT_M)
 
 
-def test_differences_of_metres_are_told_in_metres(tmp_path: Path) -> None:
+def test_differences_of_metres_are_shown_in_metres(tmp_path: Path) -> None:
     """An aircraft that was never calibrated: nothing is cut off at a metre."""
     for number in (1, 2):
         x, y = lattice(EAST_M, NORTH_M, 60.0, 60.0, 0.5)
@@ -146,7 +150,7 @@ def test_differences_of_metres_are_told_in_metres(tmp_path: Path) -> None:
     assert (numbers["median_m"], numbers["p95_m"]) == (pytest.approx(-2.5), pytest.approx(2.5))
 
 
-def test_lengths_on_a_map_far_from_true_to_scale_are_those_on_the_ground(tmp_path: Path) -> None:
+def test_lengths_on_a_distorted_map_are_ground_lengths(tmp_path: Path) -> None:
     """At 47.5° N web Mercator has 1.48 m for one on the ground, and so 2.19 times fewer pulses a square metre."""
     x, y = lattice(990_000.0, 6_024_000.0, 300.0, 100.0, 0.5)  # four a square metre of the map
     write(tmp_path / "s.laz", x, y, 0.0 * x + 400.0, crs=CRS.from_epsg(3857))
@@ -159,7 +163,7 @@ def test_lengths_on_a_map_far_from_true_to_scale_are_those_on_the_ground(tmp_pat
     assert '"EPSG:32632"' in note
 
 
-def test_points_outside_the_area_of_use_of_their_crs_are_said_to_be(tmp_path: Path) -> None:
+def test_points_outside_the_area_of_use_of_their_crs_are_reported(tmp_path: Path) -> None:
     """Points of 9° E in zone 33, which begins at 12° E."""
     x, y = lattice(47_000.0, 5_275_000.0, 50.0, 50.0, 0.5)
     write(tmp_path / "s.laz", x, y, 0.0 * x + 400.0, crs=CRS.from_epsg(32633))
@@ -167,7 +171,7 @@ def test_points_outside_the_area_of_use_of_their_crs_are_said_to_be(tmp_path: Pa
     assert "WGS 84 / UTM zone 33N is used from 12° to 18° E" in note
 
 
-def test_points_where_they_belong_have_no_such_note(tmp_path: Path) -> None:
+def test_points_inside_the_area_of_use_give_no_such_note(tmp_path: Path) -> None:
     x, y = lattice(500_000.0, 5_275_000.0, 50.0, 50.0, 0.5)
     write(tmp_path / "s.laz", x, y, 0.0 * x + 400.0, crs=CRS.from_epsg(25832))
     assert look_at([tmp_path]).notes == []

@@ -47,8 +47,8 @@ STAGES = {
 }
 
 
-def test_a_scanner_that_says_nothing_of_its_beams_is_not_taken_for_a_line_scanner() -> None:
-    """Of srep's parser, which has no table of beams, under the name of a head that has one."""
+def test_a_scanner_without_declared_beams_is_not_taken_for_a_line_scanner() -> None:
+    """Use srep's parser, which has no table of beams, under the name of a head that has one."""
     table = ScannerConfig.model_validate({"transport": "udp:0.0.0.0:2368", "protocol": "velodyne-vlp16"})
     with pytest.raises(
         ValueError, match="protocol velodyne-vlp16: its parser has no beam table and it is not a line scanner"
@@ -56,7 +56,7 @@ def test_a_scanner_that_says_nothing_of_its_beams_is_not_taken_for_a_line_scanne
         geometry_of(table, SrepParser(DeviceSettings("scanner/left", {"mirror_factor": 2.0})))
 
 
-def test_logged_angles_are_added_to_the_stages_fixed_ones() -> None:
+def test_logged_angles_are_added_to_the_fixed_ones_of_the_stage() -> None:
     series = AngleSeries(np.array([0, 100]) * MS, np.array([[0.0, 0.1, 3.0], [0.2, 0.1, 3.2]]))
     mount = mount_of(GimbalConfig.model_validate(STAGES), {"imu/gimbal": series})
     rows, time_ns = rows_of(np.array([0.3, -0.2]), 800.0), np.array([25, 75]) * MS
@@ -70,7 +70,7 @@ def test_logged_angles_are_added_to_the_stages_fixed_ones() -> None:
         assert point == pytest.approx(wanted, abs=1e-9)
 
 
-def test_returns_have_no_place_until_the_angles_are_known() -> None:
+def test_returns_wait_until_the_angles_are_known() -> None:
     mount = mount_of(GimbalConfig.model_validate(STAGES))
     assert mount.moves
     model = SensorModel(nominal("left", np.zeros(3), np.eye(3)), LineGeometry(), mount=mount)
@@ -78,7 +78,7 @@ def test_returns_have_no_place_until_the_angles_are_known() -> None:
     assert set(rays.fate.tolist()) == {Fate.OUTSIDE_TRAJECTORY}
 
 
-def test_a_source_that_told_nothing_is_one_line() -> None:
+def test_a_source_without_angles_is_refused_in_one_line() -> None:
     with pytest.raises(ValueError, match=r'^gimbal\.stages\[0\]\.source: "imu/gimbal" sent no angles$'):
         mount_of(GimbalConfig.model_validate(STAGES), {})
 
@@ -91,7 +91,7 @@ def logged(folder: Path, source: str) -> Config:
     return aircraft_config(folder, {FIXED: f'source = "{source}", angles_deg = [0, 0, 0]'})
 
 
-def test_sources_of_gimbals(tmp_path: Path) -> None:
+def test_sources_of_gimbal_angles_are_found(tmp_path: Path) -> None:
     assert list(gimbal_sources(aircraft_config(tmp_path / "fixed", {}), "left")) == []
     assert list(gimbal_sources(logged(tmp_path / "logged", "gnss/rover"), "left")) == [(0, "gnss/rover")]
 
@@ -108,7 +108,7 @@ def test_a_source_that_is_not_configured_is_refused_before_the_flight(tmp_path: 
         logged(tmp_path, source)
 
 
-def test_who_cannot_wait_for_logged_angles_says_so(tmp_path: Path) -> None:
+def test_logged_angles_are_refused_where_waiting_is_impossible(tmp_path: Path) -> None:
     refuse_logged_gimbals(aircraft_config(tmp_path / "fixed", {}), ["left"])
     config = logged(tmp_path / "logged", "gnss/rover")
     refuse_logged_gimbals(config, [])
@@ -128,7 +128,7 @@ def georeferencer(config: Config, protocol: str, **keys: Any) -> Georeferencer:
     return make_georeferencer(config, "left", calibration, parser, None, None, uncertainty=False, **keys)
 
 
-def test_an_offset_by_a_pulse_rate_that_nobody_tells_is_one_line(tmp_path: Path) -> None:
+def test_an_offset_by_an_unreported_pulse_rate_is_refused_in_one_line(tmp_path: Path) -> None:
     config = aircraft_config(tmp_path, {})
     assert georeferencer(config, "srep").rates is None
     with pytest.raises(ValueError, match=r"range_offset\.prf_hz: velodyne-vlp16 sends no pulse rate; use") as caught:
@@ -136,7 +136,7 @@ def test_an_offset_by_a_pulse_rate_that_nobody_tells_is_one_line(tmp_path: Path)
     assert "\n" not in str(caught.value)
 
 
-def test_a_chain_hears_what_its_parser_tells() -> None:
+def test_a_chain_receives_the_emissions_and_rates_of_its_parser() -> None:
     keys = {"transport": "udp:0.0.0.0:2368", "protocol": "srep", "mirror_factor": 2.0}
     table = ScannerConfig.model_validate(keys)
     made = Georeferencer(SensorModel(nominal("left", np.zeros(3), np.eye(3)), LineGeometry()))

@@ -190,7 +190,7 @@ class SteadyClocks:
     """Stand-in: the scanner's counter runs as GPS does."""
 
     def update(self) -> None:
-        """Nothing changes."""
+        """Do nothing."""
 
     def place(self, source: str, rows: StructArray, worst_ns: float) -> tuple[NDArray[np.bool_], Int64Array]:
         del source, worst_ns
@@ -245,7 +245,7 @@ def echoes_of(points: Points) -> NDArray[np.intp]:
 
 
 @pytest.mark.parametrize("terrain", [True, False], ids=["terrain", "continuity"])
-def test_echoes_come_back_to_their_pulse(terrain: bool) -> None:
+def test_echoes_are_assigned_to_their_pulse(terrain: bool) -> None:
     true, made = flight(), made_of(terrain=terrain)
     assert set(np.unique(true.zone[true.known]).tolist()) == {2, 3, 4}
     empty = 1.0 - len(np.unique(true.record)) / PULSES
@@ -278,19 +278,19 @@ def test_returns_of_a_pulse_are_numbered_across_records() -> None:
     np.testing.assert_array_equal(points.time_ns, floors + GPS_MINUS_DEVICE_NS)
 
 
-def test_cuts_change_nothing() -> None:
+def test_results_do_not_depend_on_how_the_log_is_cut() -> None:
     one, other = made_of(terrain=False), made_of(terrain=False, at_once=600)
     np.testing.assert_array_equal(one.points.points_map, other.points.points_map)
     assert one.fates == other.fates
 
 
-def test_without_the_other_pulses_most_is_lost() -> None:
+def test_without_pulses_that_gave_no_return_most_points_are_lost() -> None:
     """What the rows of pulses without a return are for."""
     alone = made_of(terrain=True, emissions=False)
     assert alone.fates[Fate.MTA_GAP] > 0.3 * flight().came.sum()
 
 
-def test_an_offset_by_pulse_rate_meets_the_rate_of_the_header() -> None:
+def test_an_offset_by_pulse_rate_uses_the_rate_of_the_header() -> None:
     plain = made_of(terrain=True)
     for prf_hz, offset_m in ((350_000.0, 0.25), (300_000.0, 0.0)):
         shifted = made_of(terrain=True, offsets=(RangeOffset(0.25, prf_hz=prf_hz),))

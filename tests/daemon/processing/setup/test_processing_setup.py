@@ -40,7 +40,7 @@ def config(folder: Path, **changes: str) -> Config:
 
 
 def inside_the_receiver() -> dict[str, str]:
-    """Its INS, with axes of its own, instead of the IMU on CAN."""
+    """Return the configuration with the receiver's INS in place of the IMU on CAN."""
     text = AIRCRAFT.read_text()
     imu = text[text.index("[imu.main]") : text.index("[imu.main.noise]")]
     rows = "[[0, 1, 0], [-1, 0, 0], [0, 0, 1]]"
@@ -70,7 +70,7 @@ def test_each_scanner_has_its_geometry_calibration_and_gate(setup: Setup) -> Non
     assert setup.calibrations["top"].installation_matrix[0] == pytest.approx([0, 0, 1])
 
 
-def test_clocks_are_those_of_the_recorder(setup: Setup) -> None:
+def test_clocks_equal_those_of_the_recorder(setup: Setup) -> None:
     plan = setup.sources.clock_plan(INFO)
     assert plan.host_minus_monotonic_ns == 3_000
     assert plan.pps == {"pps/main": PpsPlan(18, 0)}
@@ -82,14 +82,14 @@ def test_clocks_are_those_of_the_recorder(setup: Setup) -> None:
     }
 
 
-def test_an_edge_named_by_hand_and_a_delay_reach_the_clocks(tmp_path: Path) -> None:
+def test_a_configured_edge_and_delay_reach_the_clocks(tmp_path: Path) -> None:
     changed = config(tmp_path, **{'names_edge = "auto"': 'names_edge = "next"', "delay_ns = 0": "delay_ns = 70"})
     plan = setup_of(changed).sources.clock_plan(INFO)
     assert plan.gnss["gnss/rover"].names_edge is NamesEdge.NEXT
     assert plan.pps["pps/main"].delay_ns == 70
 
 
-def test_sources_and_what_stands_inside_them(tmp_path: Path, setup: Setup) -> None:
+def test_sources_and_the_devices_inside_them_are_found(tmp_path: Path, setup: Setup) -> None:
     assert setup.sources.ins_source == "gnss/rover"
     assert setup.sources.ins_protocol == "novatel"
     assert setup.sources.inside("gnss/rover") == ["gnss/rover"]
@@ -106,7 +106,7 @@ def test_sources_and_what_stands_inside_them(tmp_path: Path, setup: Setup) -> No
     assert list(span.ins_parser()) == ["imu/main"]
 
 
-def test_the_attitude_of_an_ins_is_that_of_the_body(tmp_path: Path) -> None:
+def test_the_attitude_of_an_ins_is_converted_to_the_body(tmp_path: Path) -> None:
     setup = setup_of(config(tmp_path, **inside_the_receiver()))
     row = np.zeros(1, INS_DTYPE)
     row["roll_rad"], row["pitch_rad"], row["heading_rad"] = 0.1, -0.2, 1.0
@@ -127,7 +127,7 @@ def test_deflection_of_the_vertical_is_in_radians(tmp_path: Path, setup: Setup) 
     assert turned.deflection_rad == pytest.approx((math.radians(10 / 3600), math.radians(-5 / 3600)))
 
 
-def test_a_setup_pickles(setup: Setup) -> None:
+def test_a_setup_can_be_pickled(setup: Setup) -> None:
     again = pickle.loads(pickle.dumps(setup))
     assert again.mapping is not None
     assert setup.mapping is not None
@@ -135,7 +135,7 @@ def test_a_setup_pickles(setup: Setup) -> None:
     assert again.live_stream(INFO).scanners == ["left", "top"]
 
 
-def test_only_the_scanners_that_are_asked_for(tmp_path: Path) -> None:
+def test_only_the_requested_scanners_are_set_up(tmp_path: Path) -> None:
     setup = setup_of(config(tmp_path), scanners=("top",))
     assert setup.scanners == ["top"]
     assert list(setup.sources.parsers(("scanner",))) == ["scanner/top"]
@@ -156,7 +156,7 @@ def test_only_the_scanners_that_are_asked_for(tmp_path: Path) -> None:
         ('method = "guessed"', "guessed"),
     ],
 )
-def test_a_calibration_that_is_none_of_this_flights_is_refused(tmp_path: Path, header: str, said: str) -> None:
+def test_a_calibration_of_another_flight_is_refused(tmp_path: Path, header: str, said: str) -> None:
     key = header.split(" = ")[0]
     lines = (AIRCRAFT.parent / "left.toml").read_text().splitlines()
     lines = [line for line in lines if not line.startswith(f"{key} =")]
@@ -180,7 +180,7 @@ def test_a_calibration_that_is_none_of_this_flights_is_refused(tmp_path: Path, h
         ),
     ],
 )
-def test_what_cannot_be_meant_is_one_line(
+def test_impossible_settings_are_refused_in_one_line(
     tmp_path: Path, changes: dict[str, str], options: dict[str, Any], said: str
 ) -> None:
     with pytest.raises(ConfigError) as caught:
@@ -189,12 +189,12 @@ def test_what_cannot_be_meant_is_one_line(
     assert said in caught.value.lines[0]
 
 
-def test_a_log_without_configuration_is_told_what_to_do() -> None:
+def test_error_for_a_log_without_configuration_gives_the_remedy() -> None:
     with pytest.raises(UserError, match="--config"):
         Setup.of_log({})
 
 
-def test_a_log_that_lacks_the_calibration_its_configuration_names_says_so(tmp_path: Path) -> None:
+def test_error_names_a_calibration_missing_from_the_log(tmp_path: Path) -> None:
     files = {name: data for name, _, data in config(tmp_path).attachments()}
     assert Setup.of_log(files, Options(datum="same")).calibrations["left"].id
     del files["calibration/left.toml"]

@@ -47,7 +47,7 @@ SIGMAS = {
 
 
 def wrong(trajectory: Trajectory, rng: np.random.Generator) -> Trajectory:
-    """The trajectory with errors drawn from the sigmas that it then says."""
+    """Return the trajectory with errors drawn from the sigmas that it states."""
     lat, lon, height = trajectory.geodetic()
     errors = ATTITUDE_SIGMA_RAD * rng.normal(size=3)
     roll, pitch, heading = (angle + error for angle, error in zip(trajectory.attitude(), errors, strict=True))
@@ -68,7 +68,7 @@ def wrong(trajectory: Trajectory, rng: np.random.Generator) -> Trajectory:
 
 
 def normalised_errors(flown: Flown, seed: int) -> FloatArray:
-    """(DRAWS,) eᵀ C⁻¹ e."""
+    """Return (DRAWS,) eᵀ C⁻¹ e."""
     rng = np.random.default_rng(seed)
     names = [parameter.name for parameter in PARAMETERS]
     sigmas = np.array([SIGMAS.get(name, 0.0) for name in names])
@@ -104,11 +104,11 @@ def normalised_errors(flown: Flown, seed: int) -> FloatArray:
 
 
 def flown_config() -> ScannerConfig:
-    """What the configuration says of the head."""
+    """Return the configuration of the head."""
     return ScannerConfig(transport="udp:0.0.0.0:2368", protocol="srep", mirror_factor=2.0)
 
 
-def test_normalised_errors_are_as_they_should_be(tmp_path: Path) -> None:
+def test_normalised_errors_have_unit_variance(tmp_path: Path) -> None:
     found = []
     for seed in (1, 2):
         scanner = {"motion": "sine", "true": EVERY_ERROR, "installation": TURNED, "ibrc": IBRC}

@@ -37,7 +37,7 @@ def write(path: Path, **others: Any) -> None:
         file.write(values, 1)
 
 
-def test_heights_and_ranges_are_the_planes_own(tmp_path: Path) -> None:
+def test_heights_and_ranges_match_the_plane(tmp_path: Path) -> None:
     write(tmp_path / "dem.tif")
     terrain = pickle.loads(pickle.dumps(read_terrain(tmp_path / "dem.tif")))
     to_geodetic = Transformer.from_crs("EPSG:32632", "EPSG:4326", always_xy=True)
@@ -48,14 +48,14 @@ def test_heights_and_ranges_are_the_planes_own(tmp_path: Path) -> None:
     np.testing.assert_allclose(terrain.predicted_m(origin_e, straight_down), 1000.0, atol=1.0)
 
 
-def test_outside_and_where_there_is_no_data_nothing_is_known(tmp_path: Path) -> None:
+def test_heights_outside_and_in_holes_are_unknown(tmp_path: Path) -> None:
     write(tmp_path / "dem.tif", nodata=plane_m(15.0, 15.0))
     terrain = read_terrain(tmp_path / "dem.tif")
     assert np.isnan(terrain.height_at(np.array([LAT, np.radians(48.5)]), np.array([LON, LON]))).all()
 
 
 @pytest.mark.parametrize("west_deg", [179.95, 359.95, -0.05])  # across 180° or Greenwich
-def test_a_grid_in_degrees_goes_on_where_longitudes_begin_anew(tmp_path: Path, west_deg: float) -> None:
+def test_a_grid_in_degrees_continues_across_the_antimeridian(tmp_path: Path, west_deg: float) -> None:
     write(tmp_path / "dem.tif", crs="EPSG:4326", transform=Affine(0.001, 0.0, west_deg, 0.0, -0.001, 47.6))
     terrain = pickle.loads(pickle.dumps(read_terrain(tmp_path / "dem.tif")))
     north_m = 1500.0 - 30.0 * (47.6 - np.degrees(LAT + 0.001)) / 0.001
@@ -74,18 +74,18 @@ def test_a_grid_in_degrees_goes_on_where_longitudes_begin_anew(tmp_path: Path, w
         ({"transform": Affine(1e300, 0.0, 0.0, 0.0, -1.0, 0.0)}, r"has pixels of 1e\+300 × -1 from 0, 0 on"),
     ],
 )
-def test_what_is_no_terrain_is_refused(tmp_path: Path, others: dict[str, Any], words: str) -> None:
+def test_unusable_terrain_is_refused(tmp_path: Path, others: dict[str, Any], words: str) -> None:
     write(tmp_path / "dem.tif", **others)
     with pytest.raises(ConfigError, match=words):
         read_terrain(tmp_path / "dem.tif")
 
 
-def test_a_raster_that_lies_nowhere_is_refused() -> None:
+def test_a_raster_without_a_location_is_refused() -> None:
     with pytest.raises(ConfigError, match="has no georeference; use a georeferenced GeoTIFF"):
         read_terrain(Path(__file__).parents[3] / "fuzz/seeds/terrain/nowhere")
 
 
-def test_bands_that_share_blocks_too_large_to_read_are_refused(tmp_path: Path) -> None:
+def test_rasters_with_blocks_too_large_to_read_are_refused(tmp_path: Path) -> None:
     profile = {"crs": "EPSG:32632", "transform": Affine(30.0, 0.0, EAST_M, 0.0, -30.0, NORTH_M), "SPARSE_OK": True}
     blocks = {"tiled": True, "blockxsize": 512, "blockysize": 512, "interleave": "pixel"}
     with rasterio.open(
@@ -98,7 +98,7 @@ def test_bands_that_share_blocks_too_large_to_read_are_refused(tmp_path: Path) -
         read_terrain(tmp_path / "dem.tif")
 
 
-def test_what_is_no_raster_is_one_line(tmp_path: Path) -> None:
+def test_a_file_that_is_not_a_raster_is_refused_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "dem.tif").write_text("no raster")
     with pytest.raises(ConfigError, match=r"^mta\.terrain: .*dem\.tif cannot be read: ") as refused:
         read_terrain(tmp_path / "dem.tif")

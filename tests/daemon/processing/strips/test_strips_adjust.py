@@ -54,7 +54,7 @@ def raised(made: Made, up_m: float, swaths: tuple[int, ...]) -> Trajectory:
 
 @pytest.fixture(scope="module")
 def lifted(made: Made, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A trajectory's file, 12 cm too high along one strip."""
+    """Write a trajectory file that is 12 cm too high along one strip."""
     path = tmp_path_factory.mktemp("lifted") / "lifted.csv"
     path.write_text(csv_text(raised(made, UP_M, (LIFTED,))))
     return path
@@ -68,7 +68,7 @@ def arguments(made: Made, trajectory: Path, output: Path, *more: str) -> list[st
 
 @pytest.fixture(scope="module")
 def adjusted(made: Made, lifted: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder that the command leaves."""
+    """Return the folder written by the command."""
     folder = tmp_path_factory.mktemp("adjusted") / "new" / "folder"
     assert run_app(arguments(made, lifted, folder)) == 0
     return folder
@@ -83,7 +83,7 @@ def trajectory_of(folder: Path, suffix: str) -> Path:
     return path
 
 
-def test_what_a_strip_lacks_is_found_within_its_sigma(made: Made, adjusted: Path) -> None:
+def test_strip_errors_are_found_within_their_sigma(made: Made, adjusted: Path) -> None:
     strips = record_of(adjusted)["strips"]
     numbers = [swath.strip for swath in made.flight.swaths]
     assert [strip["strip"] for strip in strips] == numbers
@@ -99,7 +99,7 @@ def test_what_a_strip_lacks_is_found_within_its_sigma(made: Made, adjusted: Path
     assert found["knots"][0]["gps_ns"] <= times[0] < times[-1] <= found["knots"][-1]["gps_ns"]
 
 
-def test_strips_agree_afterwards(adjusted: Path) -> None:
+def test_strips_agree_after_adjustment(adjusted: Path) -> None:
     record = record_of(adjusted)
     before, after = (record["differences"][when]["all"]["rms_m"] for when in ("before", "after"))
     assert before > 0.08
@@ -110,7 +110,7 @@ def test_strips_agree_afterwards(adjusted: Path) -> None:
     assert record["variance"]["after"] < 1.0 < 2.0 < record["variance"]["before"]
 
 
-def test_nothing_is_a_calibration(made: Made, adjusted: Path) -> None:
+def test_no_calibration_is_written(made: Made, adjusted: Path) -> None:
     record = record_of(adjusted)
     assert record["what"].startswith("Correction of the trajectory by strips")
     assert "No calibration" in record["what"]
@@ -121,7 +121,7 @@ def test_nothing_is_a_calibration(made: Made, adjusted: Path) -> None:
     assert any("the datum is not determined" in note for note in record["notes"])
 
 
-def test_the_calibration_file_stays_and_the_table_says_what_was_done(
+def test_the_calibration_is_unchanged_and_the_table_lists_the_corrections(
     made: Made, lifted: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = made.flown.folder / "left.true.toml"
@@ -139,7 +139,7 @@ def test_the_calibration_file_stays_and_the_table_says_what_was_done(
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".sbet"])
-def test_the_corrected_trajectory_reads_as_one_and_wants_no_correction(
+def test_the_corrected_trajectory_is_readable_and_needs_no_correction(
     made: Made, adjusted: Path, tmp_path: Path, suffix: str
 ) -> None:
     path = trajectory_of(adjusted, suffix)
@@ -153,7 +153,7 @@ def test_the_corrected_trajectory_reads_as_one_and_wants_no_correction(
     assert {strip["model"] for strip in record_of(tmp_path / "again")["strips"]} == {"none"}
 
 
-def test_a_trajectory_not_to_be_used_is_said_to_be_first_and_stays_so(
+def test_an_unusable_trajectory_is_reported_first_and_stays_unusable(
     made: Made, lifted: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Exit code 1, the files written, and the same word on what is made with them."""
@@ -206,7 +206,7 @@ def refused(capsys: pytest.CaptureFixture[str], given: list[str]) -> tuple[int, 
     return code, line
 
 
-def test_mistakes_are_one_line_and_leave_nothing(
+def test_mistakes_are_reported_in_one_line_and_leave_no_files(
     made: Made, lifted: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     output = tmp_path / "out"
@@ -236,7 +236,7 @@ def test_mistakes_are_one_line_and_leave_nothing(
     assert not output.exists()
 
 
-def test_files_that_are_there_stay(
+def test_existing_files_are_kept(
     made: Made, lifted: Path, adjusted: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     was = {path: path.read_bytes() for path in adjusted.iterdir()}
@@ -254,7 +254,7 @@ def test_files_that_are_there_stay(
 
 @pytest.fixture(scope="module")
 def done(made: Made, lifted: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[AdjustOptions, StripsCorrected]:
-    """The outcome before it is written."""
+    """Return the outcome before it is written."""
     folder = tmp_path_factory.mktemp("returns")
     text = (made.flown.folder / "left.true.toml").read_text()
     options = Options(datum="same", calibrations={"left": (text, str(made.flown.folder / "left.true.toml"))})
@@ -264,7 +264,7 @@ def done(made: Made, lifted: Path, tmp_path_factory: pytest.TempPathFactory) -> 
 
 
 @pytest.mark.parametrize("there", [True, False], ids=["folder there", "folder not there"])
-def test_a_full_disk_leaves_nothing_behind(
+def test_a_full_disk_leaves_no_files(
     done: tuple[AdjustOptions, StripsCorrected], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, there: bool
 ) -> None:
     def full(record: Any, stream: Any) -> None:
@@ -282,7 +282,7 @@ def test_a_full_disk_leaves_nothing_behind(
     assert list(tmp_path.rglob("*")) == [output] * there
 
 
-def test_a_trajectory_is_given_back_by_the_plumb_line_it_was_read_by(
+def test_a_trajectory_is_written_back_about_the_plumb_line_of_its_input(
     made: Made, done: tuple[AdjustOptions, StripsCorrected], tmp_path: Path
 ) -> None:
     """Otherwise the deflection of the vertical would be taken off twice."""

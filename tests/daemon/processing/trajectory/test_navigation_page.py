@@ -42,7 +42,7 @@ OUTAGE_S = 600, 640
 
 @pytest.fixture(scope="module")
 def flight() -> Flight:
-    """With an outage, rejected positions, several fix types, a spike, samples made up, and everything estimated."""
+    """Return a flight with an outage, rejected positions, several fix types, a spike and bridged samples."""
     sound = sound_flight(every=EVERY)
     rows = sound.forward.innovations.copy()
     at_s = (rows["time_ns"] - rows["time_ns"][0]) / SECOND_NS
@@ -84,7 +84,7 @@ def image_of(source: str) -> Image.Image:
     return Image.open(io.BytesIO(base64.b64decode(data)))
 
 
-def test_the_page_is_whole(flight: Flight, tmp_path: Path) -> None:
+def test_the_page_is_complete(flight: Flight, tmp_path: Path) -> None:
     path = tmp_path / "sub" / "page.html"
     verdict, _ = write_page(path, flight)
     text = path.read_text(encoding="utf-8")
@@ -108,7 +108,7 @@ def test_the_page_is_whole(flight: Flight, tmp_path: Path) -> None:
     assert {width for width, _ in narrow} == {int(NARROW.width_in * NARROW.dpi + 1e-6)}
 
 
-def test_almost_nothing_makes_a_page(flight: Flight, tmp_path: Path) -> None:
+def test_a_minimal_solution_gives_a_page(flight: Flight, tmp_path: Path) -> None:
     """Three epochs, no observation, no node, not smoothed."""
     first: dict[str, Any] = {}
     for name in Solution.__dataclass_fields__:
@@ -123,7 +123,7 @@ def test_almost_nothing_makes_a_page(flight: Flight, tmp_path: Path) -> None:
     assert "Filter − smoother" not in path.read_text(encoding="utf-8")
 
 
-def test_a_spike_of_one_epoch_stays(flight: Flight) -> None:
+def test_a_spike_of_one_epoch_is_drawn(flight: Flight) -> None:
     time_ns = 1_000_000_000_000 + np.arange(3_600_000, dtype=np.int64) * 5_000_000
     values = np.zeros(len(time_ns))
     values[1_234_567], values[2_345_678] = 7.0, -5.0
@@ -135,7 +135,7 @@ def test_a_spike_of_one_epoch_stays(flight: Flight) -> None:
     assert not np.isnan(line).any()
 
 
-def test_few_samples_are_drawn_as_they_are() -> None:
+def test_few_samples_are_drawn_unreduced() -> None:
     time_ns = np.array([0, 1, 2, 3, 10, 11, 12], np.int64) * SECOND_NS
     pixels = Pixels(time_ns, 0)
     at_s, line = pixels.line(pixels.band(np.arange(7.0)))
@@ -151,7 +151,7 @@ def test_blocks_cover_every_sample_once(flight: Flight) -> None:
     assert np.array_equal(np.concatenate([np.arange(c.start, c.stop) for c, _ in blocks]), np.arange(len(pixels)))
 
 
-def test_course_against_the_flight_s_truth() -> None:
+def test_drawn_errors_match_the_truth_of_the_flight() -> None:
     """Errors of the stand-in are 5 mm, 5 mm/s, 0.004°; bands hold the truth but for six sigmas of these."""
     flight = sound_flight(every=1)  # 20 Hz: epochs are close enough to share verticals
     truth = reference_truth()
@@ -181,7 +181,7 @@ def test_course_against_the_flight_s_truth() -> None:
 
 
 @pytest.mark.parametrize("every", [1, 40])
-def test_shared_verticals_show_no_difference(every: int) -> None:
+def test_shared_verticals_make_no_difference(every: int) -> None:
     """At 20 Hz sixteen epochs share a vertical, at 0.5 Hz each has its own."""
     flight = sound_flight(every=every)
     course, trajectory = course_of(flight), flight.best.trajectory()
@@ -195,7 +195,7 @@ def test_shared_verticals_show_no_difference(every: int) -> None:
         assert band == pytest.approx(course.pixels.band(values), abs=within)
 
 
-def test_outages_bridges_and_fix_types(flight: Flight) -> None:
+def test_outages_bridges_and_fix_types_are_found(flight: Flight) -> None:
     zero_ns = int(flight.forward.innovations["time_ns"][0])
     (outage_ns,) = outages_of(flight)
     assert tuple((outage_ns - zero_ns) / SECOND_NS) == pytest.approx((OUTAGE_S[0], OUTAGE_S[1]), abs=1e-9)
@@ -235,7 +235,7 @@ def pixels_near(png: bytes, colour: str) -> int:
     return int((np.abs(image - wanted).max(axis=2) < 24).sum())
 
 
-def test_pictures_show_what_happened(flight: Flight) -> None:
+def test_pictures_show_rejections_and_fix_types(flight: Flight) -> None:
     sound = sound_flight(every=40)
     clean = Drawn(sound, course_of(sound), None)
     drawn = Drawn(flight, course_of(flight), None)
@@ -251,7 +251,7 @@ def test_pictures_show_what_happened(flight: Flight) -> None:
     assert seen["none rejected"] == seen["no float"] == 0
 
 
-def test_positions_alone_are_in_the_observations(flight: Flight) -> None:
+def test_a_flight_with_positions_only_is_drawn(flight: Flight) -> None:
     rows = flight.forward.innovations
     assert set(np.unique(rows["kind"])) == {Kind.POSITION, Kind.VELOCITY}
     assert outages_of(with_rows(flight, rows[rows["kind"] == Kind.VELOCITY])).shape == (1, 2)

@@ -40,7 +40,7 @@ def figures(sound: Flight) -> Figures:
 
 
 def told(flight: Flight) -> dict[str, str]:
-    """Names and words of the reasons."""
+    """Return names and sentences of the reasons."""
     verdict = judge(figures_of(flight, separation_of(flight)))
     return {reason.name: reason.what for reason in verdict.reasons}
 
@@ -59,7 +59,7 @@ def test_a_sound_flight_is_good(figures: Figures) -> None:
     )
 
 
-def test_figures_of_errors_put_in(figures: Figures) -> None:
+def test_figures_match_the_simulated_errors(figures: Figures) -> None:
     assert figures["sigma_rms"]["down_m"] == pytest.approx(SMOOTHER_SIGMA[0][2])
     assert figures["sigma_p95"]["heading_deg"] == pytest.approx(np.degrees(SMOOTHER_SIGMA[2][2]))
     assert figures["rate_hz"] == pytest.approx(5.0)
@@ -70,11 +70,11 @@ def test_figures_of_errors_put_in(figures: Figures) -> None:
         assert abs(row["correlation"]) < 3 / np.sqrt(3 * 1825)
 
 
-def test_median_of_chi2() -> None:
+def test_the_median_of_chi2_matches_scipy() -> None:
     assert CHI2_MEDIAN[1:] == pytest.approx([chi2.median(n) for n in (1, 2, 3)], abs=1e-4)
 
 
-def test_summary_is_json(sound: Flight) -> None:
+def test_summary_can_be_written_as_json(sound: Flight) -> None:
     summary = json.loads(json.dumps(summary_of(sound), allow_nan=False))
     assert summary["verdict"]["level"] == "good"
     assert summary["figures"]["positions"]["fix_types"] == {"rtk_fixed": 1826}
@@ -117,8 +117,8 @@ PLACES: dict[str, Callable[[Figures, float], Any]] = {
 
 
 @pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.name)
-def test_limits(figures: Figures, rule: Any) -> None:
-    """At a limit nothing is said; beyond it one reason of that level and no other."""
+def test_each_limit_gives_one_reason_only_when_exceeded(figures: Figures, rule: Any) -> None:
+    """At a limit no reason is given; beyond it exactly one reason of that level."""
     for limit, level in ((rule.care, Level.CARE), (rule.unusable, Level.UNUSABLE)):
         if limit is None:
             continue
@@ -136,7 +136,7 @@ def test_limits(figures: Figures, rule: Any) -> None:
         assert all(reason.level < worst for reason in judge(within).reasons)
 
 
-def test_the_documentation_has_the_table() -> None:
+def test_the_documentation_has_the_table_of_limits() -> None:
     rows = re.findall(r"^\| ([a-z ]+) \| [^|]* \| ([^|]+) \| ([^|]+) \|", DOC.read_text(encoding="utf-8"), re.MULTILINE)
 
     def limit(value: float | None) -> str:
@@ -147,7 +147,7 @@ def test_the_documentation_has_the_table() -> None:
     assert {rule.name: (limit(rule.care), limit(rule.unusable)) for rule in RULES} == documented
 
 
-def test_rejected_and_inflated(sound: Flight) -> None:
+def test_rejected_and_inflated_observations_are_a_reason(sound: Flight) -> None:
     rows = sound.forward.innovations.copy()
     positions = np.flatnonzero(rows["kind"] == Kind.POSITION)
     rows["fate"][positions[::10]] = Fate.REJECTED
@@ -157,7 +157,7 @@ def test_rejected_and_inflated(sound: Flight) -> None:
     assert found["inflated"].startswith("10.0% of the position")
 
 
-def test_rows_outside_the_run_are_no_share_of_it(sound: Flight) -> None:
+def test_rows_outside_the_run_are_ignored(sound: Flight) -> None:
     rows = sound.forward.innovations.copy()
     rows["fate"][: len(rows) // 2] = Fate.OUTSIDE
     rows["fate"][-40::2] = Fate.REJECTED
@@ -165,7 +165,7 @@ def test_rows_outside_the_run_are_no_share_of_it(sound: Flight) -> None:
     assert (found["outside"], found["seen"], found["rejected"]) == (913, 913, 20)
 
 
-def test_an_outage_is_told_with_its_length(sound: Flight) -> None:
+def test_an_outage_is_reported_with_its_duration(sound: Flight) -> None:
     at_s = seconds_of(sound)
     gone = with_rows(sound, sound.forward.innovations[(at_s <= 600) | (at_s >= 645)])
     assert told(gone) == {"outage": "45 s passed without a usable position"}
@@ -174,7 +174,7 @@ def test_an_outage_is_told_with_its_length(sound: Flight) -> None:
     assert told(with_rows(sound, rejected))["outage"] == told(gone)["outage"]
 
 
-def test_larger_innovations_are_found_among_outliers(sound: Flight) -> None:
+def test_enlarged_innovations_are_found_among_outliers(sound: Flight) -> None:
     rows = sound.forward.innovations.copy()
     rows["normalised"] *= 2.0
     rows["chi2"] *= 4.0
@@ -184,7 +184,7 @@ def test_larger_innovations_are_found_among_outliers(sound: Flight) -> None:
     assert found["sigma_factor"] == pytest.approx(2.0, abs=0.15)
 
 
-def test_correlated_innovations(sound: Flight) -> None:
+def test_correlated_innovations_are_a_reason(sound: Flight) -> None:
     rows = sound.forward.innovations.copy()
     for kind, memory in ((Kind.POSITION, 0.8), (Kind.VELOCITY, 0.2)):
         mine = np.flatnonzero(rows["kind"] == kind)
@@ -198,12 +198,12 @@ def test_correlated_innovations(sound: Flight) -> None:
     assert set(told(with_rows(sound, rows))) == {"innovations correlated"}
 
 
-def test_a_separation_too_large(sound: Flight) -> None:
+def test_too_large_a_separation_is_a_reason(sound: Flight) -> None:
     small = replace(sound.forward, position_sigma_l=sound.forward.position_sigma_l / 2)
     assert "separation" in told(replace(sound, forward=small))
 
 
-def test_seconds_of_a_wrong_fix_are_told_with_their_time_however_long_the_flight(sound: Flight) -> None:
+def test_seconds_of_a_wrong_fix_are_reported_with_their_time_in_any_flight(sound: Flight) -> None:
     at_s = (sound.forward.time_ns - sound.start_ns) / SECOND_NS
     moved = sound.forward.position_e.copy()
     during = (at_s > 700.0) & (at_s < 712.0)
@@ -217,7 +217,7 @@ def test_seconds_of_a_wrong_fix_are_told_with_their_time_however_long_the_flight
     assert "separation" not in told(wrong)
 
 
-def test_made_up_samples(sound: Flight) -> None:
+def test_a_long_bridge_of_samples_is_a_reason(sound: Flight) -> None:
     assert sound.smoothed is not None
     bridged = np.zeros(len(sound.smoothed), bool)
     bridged[1000:1008] = True  # 1.6 s
@@ -225,7 +225,7 @@ def test_made_up_samples(sound: Flight) -> None:
     assert found == {"bridged run": "inertial samples are missing for 1.6 s without a break"}
 
 
-def test_lever_arm_and_time_offset(sound: Flight) -> None:
+def test_lever_arm_and_time_offset_are_reasons(sound: Flight) -> None:
     assert sound.smoothed is not None
     count = len(sound.smoothed.node_time_ns)
     best = replace(
@@ -244,7 +244,7 @@ def test_lever_arm_and_time_offset(sound: Flight) -> None:
     assert found["time offset"].startswith("GNSS stamps are 125.0 ms early")
 
 
-def test_no_position_at_all(sound: Flight) -> None:
+def test_a_flight_without_positions_is_unusable(sound: Flight) -> None:
     none = with_rows(sound, sound.forward.innovations[:0])
     verdict = judge(figures_of(none, separation_of(none)))
     assert verdict.level is Level.UNUSABLE

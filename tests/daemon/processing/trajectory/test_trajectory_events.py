@@ -55,7 +55,7 @@ def mark(after_s: float | None, **changes: Any) -> Mark:
     return Mark("gnss/rover", replace(EVENT, **changes), at)
 
 
-def test_a_mark_has_the_pose_of_its_time(trajectory: Trajectory) -> None:
+def test_an_event_mark_has_the_pose_at_its_time(trajectory: Trajectory) -> None:
     (row,) = rows([mark(2.345)], trajectory)
     assert row["fate"] == PLACED
     assert (row["source"], row["channel"], row["edge"], row["count"]) == ("gnss/rover", "MARK2", "rising", "7")
@@ -68,7 +68,7 @@ def test_a_mark_has_the_pose_of_its_time(trajectory: Trajectory) -> None:
     assert float(row["sigma_heading_deg"]) == pytest.approx(np.degrees(3e-4), abs=1e-6)
 
 
-def test_the_sigma_of_its_time_is_one_along_the_way(trajectory: Trajectory) -> None:
+def test_the_time_sigma_of_a_mark_becomes_a_sigma_along_the_track(trajectory: Trajectory) -> None:
     late, sharp = rows([mark(1.0), mark(1.0, sigma_s=None)], trajectory)
     assert float(late["sigma_n_m"]) == pytest.approx(np.hypot(0.03, 60.0 * 1e-3), abs=1e-4)
     assert float(late["sigma_e_m"]) == pytest.approx(0.04, abs=1e-4)
@@ -77,7 +77,7 @@ def test_the_sigma_of_its_time_is_one_along_the_way(trajectory: Trajectory) -> N
     assert sharp["sigma_time_s"] == ""
 
 
-def test_what_has_no_pose_says_why_and_keeps_its_place(trajectory: Trajectory) -> None:
+def test_a_mark_without_a_pose_keeps_its_row_and_gives_the_reason(trajectory: Trajectory) -> None:
     marks = [mark(-1.0), mark(1.0), mark(5.0), mark(None), mark(None, valid=False), mark(10.5), mark(1.0, rising=False)]
     found = rows(marks, trajectory)
     assert [row["fate"] for row in found] == [
@@ -96,5 +96,5 @@ def test_what_has_no_pose_says_why_and_keeps_its_place(trajectory: Trajectory) -
     assert rows([mark(1.0, rising=None)], trajectory)[0]["edge"] == ""
 
 
-def test_no_marks_are_a_header(trajectory: Trajectory) -> None:
+def test_without_event_marks_only_the_header_is_written(trajectory: Trajectory) -> None:
     assert event_table([], trajectory).text == HEADER + "\n"

@@ -52,9 +52,7 @@ def written(files: TrajectoryFiles, trajectory: Trajectory) -> None:
 
 
 @pytest.mark.parametrize("name", ["f1.sbet", "F1.SBET", "f1.out", "sbet_f1.out", "sbet_f1.OUT", "sbet_f1.sbet"])
-def test_the_sigmas_of_an_sbet_are_found_where_they_were_written(
-    trajectory: Trajectory, tmp_path: Path, name: str
-) -> None:
+def test_the_sigmas_of_an_sbet_are_found_beside_it(trajectory: Trajectory, tmp_path: Path, name: str) -> None:
     files = TrajectoryFiles.of_output(tmp_path / name, "x", csv=False)
     assert files.sbet is not None
     assert smrmsg_beside(files.sbet) is None
@@ -62,14 +60,14 @@ def test_the_sigmas_of_an_sbet_are_found_where_they_were_written(
     assert smrmsg_beside(files.sbet) == files.smrmsg
 
 
-def test_sigmas_as_applanix_names_them_are_found(tmp_path: Path) -> None:
+def test_sigmas_named_as_by_applanix_are_found(tmp_path: Path) -> None:
     (tmp_path / "smrmsg_f1.sbet").touch()
     assert smrmsg_beside(tmp_path / "sbet_f1.sbet") == tmp_path / "smrmsg_f1.sbet"
     assert smrmsg_beside(tmp_path / "f1.csv") is None
 
 
 @pytest.mark.parametrize("block", [7, 49, 50, 1000])
-def test_blocks_do_not_show_in_the_files(
+def test_files_do_not_depend_on_the_block_size(
     trajectory: Trajectory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, block: int
 ) -> None:
     monkeypatch.setattr(trajectory_files, "BLOCK", block)
@@ -84,7 +82,7 @@ def test_blocks_do_not_show_in_the_files(
     assert files.csv.read_text() == csv_text(trajectory)
 
 
-def test_what_is_written_is_read_again(trajectory: Trajectory, tmp_path: Path) -> None:
+def test_a_written_trajectory_is_read_back(trajectory: Trajectory, tmp_path: Path) -> None:
     files = TrajectoryFiles.of_output(tmp_path / "a.sbet", "x", csv=False)
     written(files, trajectory)
     assert files.sbet is not None
@@ -101,27 +99,27 @@ def test_what_is_written_is_read_again(trajectory: Trajectory, tmp_path: Path) -
 
 
 class TestNames:
-    def test_a_folder_holds_files_with_the_sessions_name(self, tmp_path: Path) -> None:
+    def test_a_folder_holds_files_with_the_name_of_the_session(self, tmp_path: Path) -> None:
         files = TrajectoryFiles.of_output(tmp_path, "flight-1", csv=True)
         names = {path.name for path in files.all()}
         assert names == {f"flight-1_trajectory{end}" for end in (".sbet", ".smrmsg", ".csv", ".json", ".html")}
 
-    def test_sigmas_stand_where_georeferencing_looks_for_them(self, tmp_path: Path) -> None:
+    def test_sigmas_are_written_where_georeferencing_looks_for_them(self, tmp_path: Path) -> None:
         applanix = TrajectoryFiles.of_output(tmp_path / "sbet_f1.out", "x", csv=False)
         assert applanix.smrmsg == tmp_path / "smrmsg_f1.out"
         plain = TrajectoryFiles.of_output(tmp_path / "f1.sbet", "x", csv=False)
         assert plain.smrmsg == tmp_path / "f1.smrmsg"
         assert plain.csv is None
 
-    def test_a_csv_alone(self, tmp_path: Path) -> None:
+    def test_a_csv_output_is_written_alone(self, tmp_path: Path) -> None:
         files = TrajectoryFiles.of_output(tmp_path / "f1.csv", "x", csv=False)
         assert (files.sbet, files.smrmsg, files.csv) == (None, None, tmp_path / "f1.csv")
 
-    def test_another_ending_is_refused(self, tmp_path: Path) -> None:
+    def test_another_file_extension_is_refused(self, tmp_path: Path) -> None:
         with pytest.raises(UserError, match=r"the name must end in \.sbet, \.out or \.csv, or be a folder"):
             TrajectoryFiles.of_output(tmp_path / "f1.txt", "x", csv=False)
 
-    def test_what_is_there_is_named(self, tmp_path: Path) -> None:
+    def test_existing_files_are_named(self, tmp_path: Path) -> None:
         files = TrajectoryFiles.of_output(tmp_path / "f1.sbet", "x", csv=False)
         files.refuse_existing(tmp_path / "events.csv")
         (tmp_path / "events.csv").touch()
@@ -129,9 +127,7 @@ class TestNames:
             files.refuse_existing(tmp_path / "events.csv")
 
 
-def test_a_disk_that_refuses_leaves_nothing(
-    trajectory: Trajectory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_write_error_leaves_no_files(trajectory: Trajectory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     files = TrajectoryFiles.of_output(tmp_path / "a.sbet", "x", csv=False)
 
     def full(descriptor: int) -> None:

@@ -34,7 +34,7 @@ def make() -> NmeaParser:
 
 
 def parse(*sentences: bytes, config: dict[str, object] | None = None) -> tuple[list[Record], NmeaParser]:
-    """Records of the sentences, closed, and the parser."""
+    """Parse the sentences to the end; return records and parser."""
     parser = NmeaParser(DeviceSettings("gnss/test", config or {}))
     return feed_pieces(parser, sentences), parser
 
@@ -72,7 +72,7 @@ WITH_POSITIONS = [
 
 
 @pytest.mark.parametrize("name", WITH_POSITIONS)
-def test_fixes_are_gpsds(name: str) -> None:
+def test_fixes_match_gpsd(name: str) -> None:
     """Each fix with a position has a report of gpsd at its time with the same coordinates, height and date."""
     reports: dict[int, list[dict[str, object]]] = {}
     for report in gpsd_reports("nmea", name):
@@ -95,7 +95,7 @@ def test_fixes_are_gpsds(name: str) -> None:
     assert compared >= min(5, len(reports))
 
 
-def test_every_recording_is_read_without_a_bad_message_but_the_broken_ones() -> None:
+def test_only_the_broken_recordings_have_bad_messages() -> None:
     """april6_2019 says the date 2208-1, tcp-torture and nmeafoo2 have fields overwritten."""
     bad = {}
     for name in expected("nmea"):
@@ -106,7 +106,7 @@ def test_every_recording_is_read_without_a_bad_message_but_the_broken_ones() -> 
     assert bad == {"april6_2019.log": 1, "tcp-torture.log": 1, "pygpsdata-nmeafoo2.log": 1}
 
 
-def test_a_receiver_one_rollover_behind_is_not_believed_and_counted() -> None:
+def test_a_date_one_rollover_behind_is_invalid_and_counted() -> None:
     """april6_2019.log: after the roll-over of 2019-04-06 this receiver says 1999."""
     parser = make()
     records = feed_pieces(parser, [recording("nmea", "april6_2019.log")])
@@ -115,7 +115,7 @@ def test_a_receiver_one_rollover_behind_is_not_believed_and_counted() -> None:
     assert [fix.time.date for fix in fixes(records)] == [None]
 
 
-def test_a_receiver_one_rollover_behind_is_set_right_by_the_hosts_day() -> None:
+def test_a_date_one_rollover_behind_is_corrected_by_the_host_date() -> None:
     """The same on a computer whose clock is right: the date is the one that gpsd has for the sentence."""
     (report,) = [report for report in gpsd_reports("nmea", "april6_2019.log") if "time" in report]
     at = dt.datetime.fromisoformat(str(report["time"]))
@@ -134,8 +134,8 @@ def test_a_receiver_one_rollover_behind_is_set_right_by_the_hosts_day() -> None:
 
 @pytest.mark.parametrize("weeks", [1024, 2048])
 @pytest.mark.parametrize("name", ["RMC", "ZDA"])
-def test_dates_roll_overs_behind_are_set_right(weeks: int, name: str) -> None:
-    """RMC says the year in two digits: 1987 and 2007 before 2026."""
+def test_dates_several_rollovers_behind_are_corrected(weeks: int, name: str) -> None:
+    """RMC has a year of two digits, so 1987 and 2007 lie before 2026."""
     said, time = DAY - dt.timedelta(weeks=weeks), 12 * 3600 * S
     sentences = {"RMC": nmea.encode_rmc(time, said, *POSITION, 1.0, 0.0), "ZDA": nmea.encode_zda(time, said)}
     host_ns = int(dt.datetime(DAY.year, DAY.month, DAY.day, 12, tzinfo=dt.UTC).timestamp()) * S
@@ -148,27 +148,27 @@ def test_dates_roll_overs_behind_are_set_right(weeks: int, name: str) -> None:
     assert f"sends the date {said}, {behind} 1024 weeks behind; corrected to 2026-11-21" in line
 
 
-def test_however_it_is_cut() -> None:
+def test_records_do_not_depend_on_how_the_stream_is_cut() -> None:
     outcome = check_stream(make, recording("nmea", "ublox-8.log"))
     assert outcome.counters["bad_checksums"] == outcome.counters["bad_messages"] == 0
 
 
 @pytest.mark.parametrize("name", ["nmea-rtk.log", "polarx2.log", "hemi.log", "isync.log"])
-def test_in_random_reads_and_byte_by_byte(name: str) -> None:
+def test_random_and_byte_by_byte_reads_give_the_same_records(name: str) -> None:
     check_random_reads(make, recording("nmea", name))
     check_bytewise(make, recording("nmea", name))
 
 
-def test_damaged() -> None:
+def test_damaged_stream_never_raises() -> None:
     check_damage(make, recording("nmea", "ublox-8.log"))
 
 
-def test_garbage() -> None:
+def test_garbage_never_raises() -> None:
     check_garbage(make)
 
 
 @pytest.mark.parametrize("name", [*WITH_POSITIONS, "pygpsdata-nmea4.log"])
-def test_the_time_parser_says_the_same_times_and_nothing_else(name: str) -> None:
+def test_time_parser_gives_the_same_times_and_no_other_records(name: str) -> None:
     driver = DRIVERS[0]
     assert driver.make_time_parser is not None
     data = recording("nmea", name)
@@ -179,7 +179,7 @@ def test_the_time_parser_says_the_same_times_and_nothing_else(name: str) -> None
 # --- values ---
 
 
-def test_what_is_encoded_is_read_back() -> None:
+def test_encoded_sentences_are_read_back() -> None:
     time = 45_296 * S + 250_000_000
     records, parser = parse(
         nmea.encode_gga(time, *POSITION, 412.5, 47.25, quality=4, satellites=17),
@@ -219,7 +219,7 @@ def test_times_name_the_previous_edge_in_utc() -> None:
         assert message.time.leap_seconds is None
 
 
-def test_second_60_is_a_second() -> None:
+def test_second_60_is_read_as_a_leap_second() -> None:
     eve = dt.date(2016, 12, 31)
     records, parser = parse(nmea.encode_zda(86_400 * S, eve), nmea.encode_rmc(86_400 * S, eve, *POSITION, 1.0, 0.0))
     assert [(message.time.time_ns, message.time.date, message.valid) for message in times(records)] == [
@@ -232,7 +232,7 @@ def test_second_60_is_a_second() -> None:
 @pytest.mark.parametrize(
     "time", ["240000.00", "126000.00", "120060.00", "125960.00", "12000", "1200x0.00", "-10000.00", "120000.0.0"]
 )
-def test_times_that_cannot_be_are_bad_messages(time: str) -> None:
+def test_impossible_times_are_counted_as_bad_messages(time: str) -> None:
     records, parser = parse(nmea.encode_sentence(f"GPZDA,{time},21,11,2026,00,00"))
     assert (records, parser.counters.bad_messages, parser.counters.messages["ZDA"]) == ([], 1, 1)
 
@@ -251,7 +251,7 @@ def test_times_that_cannot_be_are_bad_messages(time: str) -> None:
         "GPGST,120000.00,,,,,1e999,1.0,1.0",
     ],
 )
-def test_fields_that_cannot_be_are_bad_messages(body: str) -> None:
+def test_impossible_fields_are_counted_as_bad_messages(body: str) -> None:
     records, parser = parse(nmea.encode_sentence(body))
     assert (of_type(records, GnssFix), parser.counters.bad_messages) == ([], 1)
 
@@ -265,7 +265,7 @@ def test_fields_that_cannot_be_are_bad_messages(body: str) -> None:
         ("9000.0", "18000.0", (90.0, 180.0)),
     ],
 )
-def test_digits_behind_the_point_may_be_missing(latitude: str, longitude: str, degrees: tuple[float, float]) -> None:
+def test_decimals_may_be_missing(latitude: str, longitude: str, degrees: tuple[float, float]) -> None:
     body = f"GPGGA,120000.00,{latitude},S,{longitude},W,1,08,1.0,500.0,M,48.0,M,,"
     (fix,) = fixes(parse(nmea.encode_sentence(body))[0])
     assert fix.lat_rad is not None
@@ -273,7 +273,7 @@ def test_digits_behind_the_point_may_be_missing(latitude: str, longitude: str, d
     assert (-np.degrees(fix.lat_rad), -np.degrees(fix.lon_rad)) == pytest.approx(degrees, abs=1e-8)
 
 
-def test_no_fix_is_normal() -> None:
+def test_a_sentence_without_a_fix_is_not_an_error() -> None:
     records, parser = parse(
         b"$GPHDT,,T*1B\r\n$GPGGA,,,,,,0,,,,M,,M,,*66\r\n$GPVTG,,T,,M,,N,,K,N*2C\r\n$GPZDA,,,,,,*48\r\n",
         b"$GPRMC,,V,,,,,,,,,,N*53\r\n",
@@ -285,14 +285,14 @@ def test_no_fix_is_normal() -> None:
     assert (parser.counters.bad_messages, parser.counters.errors) == (0, {})
 
 
-def test_a_height_without_separation_is_not_said() -> None:
+def test_a_height_without_geoid_separation_is_ignored() -> None:
     records, _ = parse(nmea.encode_sentence("GPGGA,120000.00,4700.0,N,00830.0,E,1,08,1.0,400.0,M,,M,,"))
     (fix,) = fixes(records)
     assert fix.height_m is None
     assert fix.valid
 
 
-def test_gns_is_a_position_as_gga_is() -> None:
+def test_gns_position_matches_gga() -> None:
     """A receiver's own (fixtures/nmea/pygpsdata-nmea4.log): 56.0 m above a geoid that is 48.5 m above the ellipsoid."""
     records, parser = parse(b"$GNGNS,103607.00,5327.03942,N,00214.42462,W,AANN,06,5.88,56.0,48.5,,,V*34\r\n")
     (fix,) = fixes(records)
@@ -319,12 +319,12 @@ def gns(modes: str) -> bytes:
         ("NNNN", FixType.NONE),
     ],
 )
-def test_the_best_mode_of_gns_is_the_fixs(modes: str, fix_type: FixType) -> None:
+def test_fix_type_follows_the_best_mode_of_gns(modes: str, fix_type: FixType) -> None:
     (fix,) = fixes(parse(gns(modes))[0])
     assert fix.fix_type is fix_type
 
 
-def test_gga_goes_before_gns_and_gns_of_one_constellation_says_no_position() -> None:
+def test_gga_has_precedence_over_gns_and_single_constellation_gns_gives_no_position() -> None:
     satellites_only = nmea.encode_sentence("GLGNS,000001.00,,,,,,7,,,,,")
     gga = nmea.encode_gga(S, *POSITION, 401.0, 47.0, quality=4)
     records, parser = parse(gns("AANN"), satellites_only, gga, nmea.encode_zda(S, DAY))
@@ -334,7 +334,7 @@ def test_gga_goes_before_gns_and_gns_of_one_constellation_says_no_position() -> 
     assert parser.counters.errors == {}
 
 
-def test_zda_is_believed_only_while_the_receiver_has_a_fix() -> None:
+def test_zda_is_valid_only_while_the_receiver_has_a_fix() -> None:
     no_fix = nmea.encode_sentence("GPGGA,120000.00,,,,,0,00,99.99,,,,,,")
     records, _ = parse(
         nmea.encode_zda(0, DAY),  # alone so far: believed
@@ -346,7 +346,7 @@ def test_zda_is_believed_only_while_the_receiver_has_a_fix() -> None:
     assert [message.valid for message in times(records)] == [True, False, True]
 
 
-def test_status_v_is_not_believed() -> None:
+def test_status_v_makes_the_time_invalid() -> None:
     records, _ = parse(nmea.encode_rmc(S, DAY, *POSITION, 1.0, 0.0, valid=False))
     assert [message.valid for message in times(records)] == [False]
     assert [fix.valid for fix in fixes(records)] == [False]
@@ -367,7 +367,7 @@ def epoch(second: int, order: str) -> list[bytes]:
 
 
 @pytest.mark.parametrize("order", ["GRS", "RGS", "SGR", "GSR", "RVGSZ", "GVSZ", "ZGVS"])
-def test_one_fix_an_epoch_whatever_the_order(order: str) -> None:
+def test_each_epoch_gives_one_fix_in_any_sentence_order(order: str) -> None:
     records, parser = parse(*(sentence for second in range(5) for sentence in epoch(second, order)))
     found = fixes(records)
     assert [fix.time.time_ns for fix in found] == [second * S for second in range(5)]
@@ -381,7 +381,7 @@ def test_one_fix_an_epoch_whatever_the_order(order: str) -> None:
     assert parser.counters.errors == {}
 
 
-def test_a_fix_comes_with_the_last_sentence_of_its_epoch_once_the_order_is_known() -> None:
+def test_a_fix_is_given_with_the_last_sentence_of_its_epoch_once_the_order_is_known() -> None:
     parser = make()
     when: list[tuple[int, int]] = []
     for second in range(4):
@@ -390,7 +390,7 @@ def test_a_fix_comes_with_the_last_sentence_of_its_epoch_once_the_order_is_known
     assert when == [(1, 0), (1, 1), (2, 2), (3, 3)]
 
 
-def test_sigmas_sent_now_and_then_are_not_lost() -> None:
+def test_sigmas_sent_every_third_epoch_are_not_lost() -> None:
     """Every third epoch has a GST at its end: the others wait for the next epoch rather than lose it."""
     records, parser = parse(
         *(sentence for second in range(12) for sentence in epoch(second, "GRS" if second % 3 == 0 else "GR"))
@@ -415,7 +415,7 @@ def test_ubx_and_rtcm3_on_the_same_port_are_counted() -> None:
 # --- settings ---
 
 
-def test_the_floor_can_be_moved() -> None:
+def test_date_floor_can_be_lowered_by_the_configuration() -> None:
     old = nmea.encode_zda(S, dt.date(2007, 5, 1))
     assert [message.valid for message in times(parse(old)[0])] == [False]
     assert [message.valid for message in times(parse(old, config={"date_floor": "2000-01-01"})[0])] == [True]
@@ -423,7 +423,7 @@ def test_the_floor_can_be_moved() -> None:
 
 
 @pytest.mark.parametrize("value", ["yesterday", 2009])
-def test_a_floor_that_is_no_date_is_refused(value: object) -> None:
+def test_an_invalid_date_floor_is_refused(value: object) -> None:
     with pytest.raises(DriverSettingsError, match="date_floor"):
         NmeaParser(DeviceSettings("gnss/test", {"date_floor": value}))
 

@@ -107,28 +107,28 @@ INS_STATUS = {
 
 
 def make() -> NovatelParser:
-    """A parser of everything."""
+    """Return a parser of every message."""
     return NovatelParser(DeviceSettings("gnss/rover"))
 
 
 def parse(data: bytes, parser: NovatelParser | None = None) -> list[Record]:
-    """All records of a recording."""
+    """Return all records of a recording."""
     parser = parser or make()
     return [*parser.feed(Chunk("gnss/rover", HOST_NS, data)), *parser.close()]
 
 
 def of_type(records: list[Record], kind: type[RecordT], message: str = "") -> list[RecordT]:
-    """Records of one type, of one message if said."""
+    """Return the records of one type, optionally of one message."""
     return [r for r in records if isinstance(r, kind) and (not message or getattr(r, "message", "") == message)]
 
 
 def rows_of(records: list[Record], kind: type[InsSolution] | type[ImuSamples]) -> StructArray:
-    """All rows of one kind."""
+    """Return all rows of one type."""
     return np.concatenate([record.rows for record in records if isinstance(record, kind)])
 
 
 @pytest.mark.parametrize("name", COUNTS)
-def test_messages_are_those_of_the_existing_decoder(name: str) -> None:
+def test_messages_match_the_reference_decoder(name: str) -> None:
     parser = make()
     parse(recording(name), parser)
     assert +parser.counters.messages == Counter(COUNTS[name])
@@ -137,7 +137,7 @@ def test_messages_are_those_of_the_existing_decoder(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", NO_MESSAGES)
-def test_there_are_no_messages_where_there_are_none(name: str) -> None:
+def test_recordings_without_novatel_logs_give_no_messages(name: str) -> None:
     parser = make()
     data = recording(name)
     assert parse(data, parser) == []
@@ -165,13 +165,13 @@ def test_a_prompt_between_logs_is_skipped() -> None:
     "name",
     ["bestpos.gps", "ins1.gps", "align.gps", "time.gps", "unit_test_vectors.bin"],
 )
-def test_a_recording_gives_the_same_however_it_is_cut(name: str) -> None:
+def test_records_do_not_depend_on_how_a_recording_is_cut(name: str) -> None:
     whole = check_stream(make, recording(name))
     assert whole.counters["messages"] == COUNTS[name]
 
 
 @pytest.mark.slow
-def test_the_large_recordings_give_the_same_however_they_are_cut() -> None:
+def test_records_do_not_depend_on_how_a_large_recording_is_cut() -> None:
     check_stream(make, recording(SPAN)[: 160 * 1024])
     check_stream(make, recording("oemv_200911218.gps")[: 48 * 1024])
     prompts = recording("bestpos-bestvel-psrdop2-sync.gps")
@@ -181,7 +181,7 @@ def test_the_large_recordings_give_the_same_however_they_are_cut() -> None:
 
 
 @pytest.mark.parametrize("name", ["bestpos.gps", "unit_test_vectors.bin", SPAN])
-def test_damage_costs_only_what_it_touched(name: str) -> None:
+def test_damage_affects_only_the_logs_it_hits(name: str) -> None:
     check_damage(make, recording(name), examples=30, window=4096)
 
 
@@ -195,7 +195,7 @@ def test_garbage_never_raises() -> None:
 @pytest.mark.parametrize(
     "name", [SPAN, "bestpos.gps", "bestpos-bestvel-psrdop2-sync.gps", "oemv_200911218.gps", "unit_test_vectors.bin"]
 )
-def test_bestpos_is_edies(name: str) -> None:
+def test_bestpos_matches_edie(name: str) -> None:
     fixes = of_type(parse(recording(name)), GnssFix, "BESTPOS")
     expected = ascii_logs(name, "BESTPOS")
     assert len(fixes) == len(expected) == COUNTS[name]["BESTPOS"]
@@ -204,7 +204,7 @@ def test_bestpos_is_edies(name: str) -> None:
 
 
 def assert_position(fix: GnssFix, log: AsciiLog) -> None:
-    """A fix is the ASCII log's: place, sigmas, type, satellites, time."""
+    """Assert that a fix equals the ASCII log in place, sigmas, type, satellites and time."""
     assert fix.time.time_ns == log.time_ns
     assert fix.time.week == (log.week or None)
     position_type = POSITION_TYPES[log.fields[1]]
@@ -225,7 +225,7 @@ def assert_position(fix: GnssFix, log: AsciiLog) -> None:
 
 
 @pytest.mark.parametrize("name", ["bestpos.gps", "bestpos-bestvel-psrdop2-sync.gps"])
-def test_bestvel_is_edies_with_its_latency_off_the_time(name: str) -> None:
+def test_bestvel_matches_edie_with_the_latency_subtracted_from_its_time(name: str) -> None:
     fixes = of_type(parse(recording(name)), GnssFix, "BESTVEL")
     expected = ascii_logs(name, "BESTVEL")
     assert len(fixes) == len(expected) > 0
@@ -240,7 +240,7 @@ def test_bestvel_is_edies_with_its_latency_off_the_time(name: str) -> None:
         assert (fix.lat_rad, fix.height_m) == (None, None)
 
 
-def test_time_is_edies() -> None:
+def test_time_matches_edie() -> None:
     times = of_type(parse(recording("time.gps")), TimeMessage)
     expected = ascii_logs("time.gps", "TIME")
     assert len(times) == len(expected) == 6
@@ -252,7 +252,7 @@ def test_time_is_edies() -> None:
         assert time.host_time_ns == HOST_NS
 
 
-def test_solutions_on_the_second_name_it_once_and_only_with_a_valid_time() -> None:
+def test_solutions_on_a_whole_second_name_it_once_and_only_with_a_valid_time() -> None:
     times = of_type(parse(recording(SPAN), make_time_parser(DeviceSettings("gnss/rover"))), TimeMessage)
     seconds = [time.time.time_ns // 1_000_000_000 for time in times]
     assert seconds == sorted(set(seconds))
@@ -264,7 +264,7 @@ def test_solutions_on_the_second_name_it_once_and_only_with_a_valid_time() -> No
 
 
 @pytest.mark.parametrize(("name", "log"), [("bestpos.gps", "INSPVAS"), ("ins1.gps", "INSPVAS")])
-def test_inspvas_is_edies(name: str, log: str) -> None:
+def test_inspvas_matches_edie(name: str, log: str) -> None:
     parser = NovatelParser(DeviceSettings("gnss/rover"), wanted=(InsSolution,))
     rows = rows_of(parse(recording(name), parser), InsSolution)
     if name == "bestpos.gps":
@@ -279,7 +279,7 @@ def test_inspvas_is_edies(name: str, log: str) -> None:
 
 
 @pytest.mark.parametrize("name", [SPAN, "bestpos.gps"])
-def test_inspvax_is_edies(name: str) -> None:
+def test_inspvax_matches_edie(name: str) -> None:
     rows = rows_of(parse(recording(name)), InsSolution)
     rows = rows[~np.isnan(rows["position_sigma_l"][:, 0])]
     expected = ascii_logs(name, "INSPVAX")
@@ -295,7 +295,7 @@ def test_inspvax_is_edies(name: str) -> None:
 
 
 def assert_solution(row: np.void, numbers: list[float], undulation: float) -> None:
-    """Latitude, longitude, height, velocities north east up, roll, pitch, azimuth."""
+    """Assert that a solution equals the ASCII log in position, velocity and attitude."""
     assert np.degrees(row["lat_rad"]) == pytest.approx(numbers[0], abs=6e-12)
     assert np.degrees(row["lon_rad"]) == pytest.approx(numbers[1], abs=6e-12)
     assert row["height_m"] == pytest.approx(numbers[2] + undulation, abs=1.1e-4)
@@ -312,7 +312,7 @@ def test_heights_of_ins_and_position_agree_on_the_ellipsoid() -> None:
     assert all(abs(height - rows["height_m"].mean()) < 1.0 for height in heights if height is not None)
 
 
-def test_heading2_is_edies() -> None:
+def test_heading2_matches_edie() -> None:
     headings = of_type(parse(recording("align.gps")), GnssHeading)
     expected = ascii_logs("align.gps", "HEADING2")
     assert len(headings) == len(expected) == 12
@@ -328,7 +328,7 @@ def test_heading2_is_edies() -> None:
         assert heading.valid
 
 
-def test_rawimusx_is_edies_and_weighs_one_g() -> None:
+def test_rawimusx_matches_edie_and_measures_one_g() -> None:
     rows = rows_of(parse(recording("unit_test_vectors.bin")), ImuSamples)
     expected = ascii_logs("unit_test_vectors.bin", "RAWIMUSX")
     assert len(rows) == len(expected) == 4
@@ -351,10 +351,10 @@ def test_rawimusx_is_edies_and_weighs_one_g() -> None:
     ("name", "rows", "kind"),
     [("unit_test_vectors.bin", 4, ImuSamples), (SPAN, 1988, InsSolution), ("ins1.gps", 243, InsSolution)],
 )
-def test_the_imu_inside_the_stream_gives_what_the_receiver_gives(
+def test_imu_parser_of_the_gnss_stream_gives_the_samples_of_the_gnss_parser(
     name: str, rows: int, kind: type[InsSolution] | type[ImuSamples]
 ) -> None:
-    """By ``transport = "gnss:rover"`` the same bytes; the recording of SPAN has no RAWIMU, only CORRIMUDATA."""
+    """The parser of ``transport = "gnss:rover"`` reads the same bytes; the SPAN recording has CORRIMUDATA only."""
     parser = find_driver("imu", "novatel").make_parser(DeviceSettings("imu/main"))
     records = [*parser.feed(Chunk("imu/main", HOST_NS, recording(name))), *parser.close()]
     assert {type(record) for record in records} <= {ImuSamples, InsSolution}
@@ -365,7 +365,7 @@ def test_the_imu_inside_the_stream_gives_what_the_receiver_gives(
 
 
 @pytest.mark.parametrize(("name", "message", "first"), [("ins1.gps", "CORRIMUS", 1), (SPAN, "CORRIMUDATA", 2)])
-def test_corrected_increments_are_edies(name: str, message: str, first: int) -> None:
+def test_corrected_increments_match_edie(name: str, message: str, first: int) -> None:
     status = of_type(parse(recording(name)), DeviceStatus, message)
     expected = ascii_logs(name, message)
     assert len(status) == len(expected) > 0

@@ -51,18 +51,18 @@ MARK = nov.MarkTime(WEEK, 604_799.9999999, -2e-7, 1e-8, -18.0, 0)
 
 
 def parse(data: bytes, **config: Any) -> tuple[list[Record], NovatelParser]:
-    """Records of a stream, and the parser for its counters."""
+    """Parse a stream; return records and parser."""
     parser = NovatelParser(DeviceSettings("gnss/rover", config))
     return [*parser.feed(Chunk("gnss/rover", HOST_NS, data)), *parser.close()], parser
 
 
 def one(data: bytes, kind: type[Any], **config: Any) -> Any:
-    """The only record of a type."""
+    """Return the only record of a type."""
     (record,) = [record for record in parse(data, **config)[0] if isinstance(record, kind)]
     return record
 
 
-def test_real_logs_come_out_of_the_encoder_byte_for_byte() -> None:
+def test_real_logs_are_encoded_byte_for_byte() -> None:
     data = recording("time.gps")[:76]
     time = nov.Time._make(nov.LAYOUTS[101].wire.unpack(data[28:72]))
     ours = encode_log("TIME", time, 2070, 241_084_000)
@@ -79,7 +79,7 @@ def test_real_logs_come_out_of_the_encoder_byte_for_byte() -> None:
 @pytest.mark.parametrize(
     ("status", "valid"), [(180, True), (160, True), (170, True), (130, False), (100, False), (60, False), (20, False)]
 )
-def test_time_is_vouched_for_only_when_steered(status: int, valid: bool) -> None:
+def test_time_is_valid_only_while_the_clock_is_steered(status: int, valid: bool) -> None:
     time = one(encode_log("TIME", TIME, WEEK, MS, time_status=status), TimeMessage)
     assert time.valid is valid
     assert time.bound
@@ -92,13 +92,13 @@ def test_leap_seconds_are_taken_only_when_valid(utc_status: int, leap: int | Non
     assert time.names_edge is NamesEdge.PREVIOUS
 
 
-def test_an_unset_clock_model_is_not_valid() -> None:
+def test_an_unset_clock_model_makes_the_time_invalid() -> None:
     time = one(encode_log("TIME", TIME._replace(clock_status=3, clock_offset_s=0.5), WEEK, MS), TimeMessage)
     assert not time.valid
     assert time.quantisation_ns == 0.0
 
 
-def test_no_week_no_time() -> None:
+def test_a_log_without_a_week_gives_no_time() -> None:
     records, _ = parse(encode_log("TIME", TIME, 0, 5000, time_status=TIME_STATUS_UNKNOWN))
     assert records == []
 
@@ -128,7 +128,7 @@ def early_logs() -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("name", early_logs())
-def test_a_week_one_roll_over_behind_is_not_believed(name: str) -> None:
+def test_a_week_one_rollover_behind_is_invalid(name: str) -> None:
     records, parser = parse(early_logs()[name])
     for record in records:
         assert isinstance(record, GnssFix | GnssHeading | EventMark)
@@ -149,17 +149,17 @@ def test_the_recorder_takes_no_time_from_a_week_before_the_floor() -> None:
         assert {message.valid for message in records if isinstance(message, TimeMessage)} == expected
 
 
-def test_a_raw_imus_week_before_the_floor_is_none() -> None:
+def test_a_raw_imu_week_before_the_date_floor_is_dropped() -> None:
     data = encode_log("RAWIMU", RAW_IMU._replace(week=WEEK - 1024), WEEK - 1024, MS)
     assert one(data, ImuSamples, imu_type="HG1900_CA50").rows["gps_week"] == [-1]
 
 
-def test_a_date_floor_that_is_no_date_is_refused() -> None:
+def test_an_invalid_date_floor_is_refused() -> None:
     with pytest.raises(DriverSettingsError, match="date_floor"):
         parse(b"", date_floor="soon")
 
 
-def test_position_and_velocity() -> None:
+def test_position_and_velocity_are_decoded() -> None:
     fix = one(encode_log("PPPPOS", BEST_POS, WEEK, MS + 5, time_status=TIME_STATUS_FINE), GnssFix)
     assert (fix.height_m, fix.fix_type, fix.satellites, fix.message) == (448.5, FixType.RTK_FIXED, 24, "PPPPOS")
     velocity = one(encode_log("BESTVEL", BEST_VEL, WEEK, 100), GnssFix)
@@ -168,7 +168,7 @@ def test_position_and_velocity() -> None:
     assert velocity.time.time_ns == pytest.approx(WEEK_NS - 50_000_000, abs=10)
 
 
-def test_the_secondary_antenna_is_named() -> None:
+def test_antenna_is_named_primary_or_secondary() -> None:
     body = nov.LAYOUTS[42].wire.pack(*BEST_POS)
     assert one(encode_frame(42, body, WEEK, MS, message_type=1), GnssFix).antenna == "secondary"
     assert one(encode_frame(42, body, WEEK, MS, message_type=2), GnssFix).antenna == "primary"
@@ -188,14 +188,14 @@ def test_a_short_body_is_counted() -> None:
     assert parser.counters.bad_messages == 1
 
 
-def test_answers_to_commands_are_no_logs() -> None:
+def test_command_responses_are_not_decoded_as_logs() -> None:
     body = nov.LAYOUTS[42].wire.pack(*BEST_POS)
     records, parser = parse(encode_frame(42, body, WEEK, MS, message_type=nov.RESPONSE_BIT))
     assert records == []
     assert +parser.counters.messages == {"BESTPOS-response": 1}
 
 
-def test_ins_solutions() -> None:
+def test_ins_solutions_are_decoded() -> None:
     attitude = nov.InsAtt(WEEK, 345_600.02, 1.0, 2.0, 90.0, 3)
     attitude_x = nov.InsAttx(3, 56, 1.0, 2.0, 90.0, 0.25, 0.5, 0.75, 0, 0)
     logs: list[tuple[str, nov.Body]] = [
@@ -224,7 +224,7 @@ def test_a_solution_without_week_is_dropped_and_counted() -> None:
     assert parser.counters.errors == {"time_unknown": 1}
 
 
-def test_raw_counts_need_the_imus_type() -> None:
+def test_raw_counts_need_the_imu_type() -> None:
     stream = encode_log("RAWIMUS", RAW_IMU, WEEK, MS)
     records, parser = parse(stream)
     assert records == []
@@ -238,7 +238,7 @@ def test_raw_counts_need_the_imus_type() -> None:
     assert (rows["gps_week"][0], rows["status"][0]) == (WEEK, 7)
 
 
-def test_an_unknown_imu_type_is_refused_with_those_there_are() -> None:
+def test_an_unknown_imu_type_is_refused_with_a_list_of_known_ones() -> None:
     with pytest.raises(DriverSettingsError, match="imu_type: got 'HG9999', want one of: ADIS16488, EPSON_G320"):
         parse(b"", imu_type="HG9999")
     assert parse(b"", imu_type="hg1700-ag58")[0] == []
@@ -250,14 +250,14 @@ def test_an_imu_error_is_counted() -> None:
     assert parser.counters.errors == {"imu_error": 1}
 
 
-def test_encrypted_counts_are_no_samples() -> None:
+def test_encrypted_counts_give_no_samples() -> None:
     """RAWIMUX, IMU info bit 1: "the IMU data is encrypted and should not be used"."""
     records, parser = parse(encode_log("RAWIMUSX", nov.RawImux(2, 8, *RAW_IMU), WEEK, MS))
     assert records == []
     assert parser.counters.errors == {"imu_encrypted": 1}
 
 
-def test_heading_and_marks() -> None:
+def test_headings_and_event_marks_are_decoded() -> None:
     heading = one(encode_log("HEADING2", HEADING, WEEK, MS), GnssHeading)
     assert math.degrees(heading.heading_rad) == pytest.approx(359.5)
     assert (heading.baseline_m, heading.valid) == (2.0, True)
@@ -271,14 +271,14 @@ def test_heading_and_marks() -> None:
     ] * 2
 
 
-def test_the_encoder_refuses_another_logs_body() -> None:
+def test_encoder_refuses_the_body_of_another_log() -> None:
     with pytest.raises(TypeError, match="TIME takes a Time, not a BestVel"):
         encode_log("TIME", BEST_VEL, WEEK, MS)
 
 
 @settings(max_examples=300, deadline=None, derandomize=True)
 @given(number=st.sampled_from(sorted(nov.LAYOUTS)), data=st.data())
-def test_no_content_of_an_intact_log_raises(number: int, data: st.DataObject) -> None:
+def test_an_intact_log_never_raises_whatever_its_content(number: int, data: st.DataObject) -> None:
     layout = nov.LAYOUTS[number]
     size = layout.wire.size
     body = data.draw(

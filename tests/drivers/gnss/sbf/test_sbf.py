@@ -31,7 +31,7 @@ def make() -> SbfParser:
 
 
 def parse(*pieces: bytes) -> tuple[list[Record], SbfParser]:
-    """Records of the pieces, closed, and the parser."""
+    """Parse the pieces to the end; return records and parser."""
     parser = make()
     return feed_pieces(parser, pieces), parser
 
@@ -51,14 +51,14 @@ def blocks_of(name: str, block: str = "") -> Iterator[tuple[bytes, Any]]:
 # --- frames ---
 
 
-def test_the_blocks_have_the_names_that_pysbf2_gives_them() -> None:
+def test_block_names_match_pysbf2() -> None:
     theirs = {number: name for number, (name, _) in SBF_MSGIDS.items()}
     assert {number: NAMES[number] for number in theirs} == theirs
     assert len(set(NAMES.values())) == len(NAMES)
 
 
 @pytest.mark.parametrize("name", RECORDINGS)
-def test_every_recording_has_the_messages_that_pysbf2_found(name: str) -> None:
+def test_messages_of_every_recording_match_pysbf2(name: str) -> None:
     data = recording("sbf", name)
     records, parser = parse(data)
     theirs: Counter[str] = Counter()
@@ -72,7 +72,7 @@ def test_every_recording_has_the_messages_that_pysbf2_found(name: str) -> None:
     assert list(map(canonical, times)) == list(map(canonical, of_type(records, TimeMessage)))
 
 
-def test_a_receiver_that_speaks_nmea_only_is_framed() -> None:
+def test_nmea_from_a_septentrio_receiver_is_framed() -> None:
     """PolaRx2 of gpsd's suite."""
     records, parser = parse(recording("nmea", "polarx2.log"))
     assert records == []
@@ -80,13 +80,13 @@ def test_a_receiver_that_speaks_nmea_only_is_framed() -> None:
     assert parser.counters.bytes_skipped == 0
 
 
-def test_another_receivers_binary_is_skipped() -> None:
+def test_binary_data_of_another_receiver_is_skipped() -> None:
     records, parser = parse(recording("sbf", "pygpsdata_ubx.log"))
     assert records == []
     assert parser.counters.bytes_skipped == expected("sbf")["pygpsdata_ubx.log"]["bytes"]
 
 
-def test_a_recording_that_ends_within_a_block_loses_that_block_only() -> None:
+def test_a_recording_truncated_within_a_block_loses_only_that_block() -> None:
     records, parser = parse(recording("sbf", "pygpsdata_x5_pvttruncated.log"))
     assert parser.counters.bytes_skipped == 222 - 96 - 2 * 56
     [fix] = of_type(records, GnssFix)
@@ -96,16 +96,16 @@ def test_a_recording_that_ends_within_a_block_loses_that_block_only() -> None:
 # --- cut and damaged ---
 
 
-def test_the_longest_recording_gives_the_same_however_it_is_cut() -> None:
+def test_records_do_not_depend_on_how_the_longest_recording_is_cut() -> None:
     check_stream(make, recording("sbf", "sbfdata.log"))
 
 
-def test_the_others_behind_each_other_give_the_same_however_they_are_cut() -> None:
+def test_records_of_concatenated_recordings_do_not_depend_on_how_they_are_cut() -> None:
     check_stream(make, b"".join(recording("sbf", name) for name in RECORDINGS if name != "sbfdata.log"))
 
 
 @pytest.mark.parametrize("name", ["sbfdata.log", "pygpsdata_x5_constellations.log"])
-def test_damage_costs_only_what_it_touched(name: str) -> None:
+def test_damage_affects_only_the_blocks_it_hits(name: str) -> None:
     check_damage(make, recording("sbf", name), examples=40)
 
 
@@ -218,7 +218,7 @@ FIELDS: dict[str, tuple[str, Layout[Any], dict[str, tuple[str, float]]]] = {
 
 
 @pytest.mark.parametrize("block", FIELDS)
-def test_fields_are_those_of_pysbf2(block: str) -> None:
+def test_fields_match_pysbf2(block: str) -> None:
     name, layout, fields = FIELDS[block]
     decoded = list(blocks_of(name, block))
     assert len(decoded) == expected("sbf")[name]["messages"][f"SBF:{block}"]
@@ -232,7 +232,7 @@ def test_fields_are_those_of_pysbf2(block: str) -> None:
 
 
 @pytest.mark.parametrize("block", [block for block in FIELDS if block != "PVTCartesian"])
-def test_real_blocks_come_out_of_the_encoder_byte_for_byte(block: str) -> None:
+def test_real_blocks_are_encoded_byte_for_byte(block: str) -> None:
     name, layout, _ = FIELDS[block]
     for raw, _ in blocks_of(name, block):
         header = read_header(raw)
@@ -241,7 +241,7 @@ def test_real_blocks_come_out_of_the_encoder_byte_for_byte(block: str) -> None:
         assert len(ours) == len(raw)
 
 
-def test_the_fix_is_that_of_pysbf2() -> None:
+def test_fixes_match_pysbf2() -> None:
     decoded = {message.identity: message for _, message in blocks_of("pygpsdata_x5_pvtgeod.log")}
     pvt, position, velocity = (decoded[name] for name in ("PVTGeodetic", "PosCovGeodetic", "VelCovGeodetic"))
     [fix] = of_type(parse(recording("sbf", "pygpsdata_x5_pvtgeod.log"))[0], GnssFix)
@@ -263,7 +263,7 @@ def test_the_fix_is_that_of_pysbf2() -> None:
     np.testing.assert_allclose(down, [-velocity.Cov_VnVu, -velocity.Cov_VeVu, velocity.Cov_VuVu])
 
 
-def test_accuracies_say_what_the_covariance_says_where_it_is_absent() -> None:
+def test_accuracies_replace_a_missing_covariance() -> None:
     """The same epoch with and without PosCovGeodetic: centimetres are all that PVTGeodetic carries."""
     data = recording("sbf", "pygpsdata_x5_pvtgeod.log")
     [alone], [whole] = (of_type(parse(piece)[0], GnssFix) for piece in (data[:96], data))
@@ -286,7 +286,7 @@ def test_every_second_of_a_recording_is_named_once() -> None:
     }
 
 
-def test_the_pulse_and_the_receivers_time() -> None:
+def test_pulse_and_receiver_time_are_decoded_from_a_recording() -> None:
     decoded = {message.identity: message for _, message in blocks_of("pygpsdata_x5_time.log")}
     pulse, time = of_type(parse(recording("sbf", "pygpsdata_x5_time.log"))[0], TimeMessage)
     assert (pulse.message, pulse.bound, pulse.valid, pulse.names_edge) == ("xPPSOffset", True, True, NamesEdge.PREVIOUS)

@@ -69,26 +69,26 @@ FORCE, RATE = sensor(sbf.SENSOR_ACCELERATION, 0.5, -0.25, 9.75), sensor(sbf.SENS
 
 
 def parse(data: bytes, **config: Any) -> tuple[list[Record], SbfParser]:
-    """Records of a stream, closed, and the parser for its counters."""
+    """Parse a stream to the end; return records and parser."""
     parser = SbfParser(DeviceSettings("gnss/rover", config))
     return feed_pieces(parser, [data]), parser
 
 
 def one(data: bytes, kind: type[Any]) -> Any:
-    """The only record of a type."""
+    """Return the only record of a type."""
     (record,) = [record for record in parse(data)[0] if isinstance(record, kind)]
     return record
 
 
 def none_of(data: bytes, *kinds: type[Any]) -> SbfParser:
-    """The parser, after no record of these types came."""
+    """Return the parser after asserting that no record of these types came."""
     records, parser = parse(data)
     assert not [record for record in records if isinstance(record, kinds)]
     return parser
 
 
 def rows_of(data: bytes, kind: type[ImuSamples] | type[InsSolution]) -> StructArray:
-    """All rows of one kind."""
+    """Return all rows of one type."""
     return np.concatenate([record.rows for record in parse(data)[0] if isinstance(record, kind)])
 
 
@@ -103,7 +103,7 @@ def imu(*sets: sbf.SensorSet, tow_ms: int | None = TOW_MS, week: int | None = WE
 # --- the encoder ---
 
 
-def test_pysbf2_reads_what_the_encoder_writes() -> None:
+def test_pysbf2_reads_encoded_blocks() -> None:
     data = (
         pvt()
         + sbf.EXT_EVENT.encode(EVENT, TOW_MS + 3, WEEK)
@@ -140,7 +140,7 @@ def stream() -> bytes:
 
 
 @pytest.mark.slow
-def test_a_whole_stream_gives_the_same_however_it_is_cut() -> None:
+def test_records_do_not_depend_on_how_a_whole_stream_is_cut() -> None:
     whole = check_stream(lambda: SbfParser(DeviceSettings("gnss/rover")), stream())
     assert {name: len(rows) for name, rows in whole.rows.items()} == {"ImuSamples": 15, "InsSolution": 15}
     kinds = [event[0] for event in whole.events]
@@ -149,7 +149,7 @@ def test_a_whole_stream_gives_the_same_however_it_is_cut() -> None:
     assert whole.counters["errors"] == {"clock_bias_unknown": 2}, "IMU and INS before the first position"
 
 
-def test_damage_to_a_whole_stream_costs_only_what_it_touched() -> None:
+def test_damage_to_a_whole_stream_affects_only_the_blocks_it_hits() -> None:
     check_damage(lambda: SbfParser(DeviceSettings("gnss/rover")), stream(), examples=30)
 
 
@@ -171,13 +171,13 @@ def test_damage_to_a_whole_stream_costs_only_what_it_touched() -> None:
         (0, 1, FixType.NONE, False),
     ],
 )
-def test_the_mode_says_the_type_of_the_fix(mode: int, error: int, fix_type: FixType, valid: bool) -> None:
+def test_fix_type_follows_the_mode(mode: int, error: int, fix_type: FixType, valid: bool) -> None:
     fix = one(pvt(mode=mode, error=error), GnssFix)
     assert (fix.fix_type, fix.valid) == (fix_type, valid)
     assert one(pvt(mode=mode, error=error), TimeMessage).valid == valid
 
 
-def test_values_not_to_be_used_are_none_or_nan() -> None:
+def test_do_not_use_values_become_none_or_nan() -> None:
     fields = ("lat_rad", "lon_rad", "height_m", "north_mps", "east_mps", "up_mps")
     nothing: dict[str, Any] = dict.fromkeys(fields, UNSET)
     fix = one(pvt(mode=0, error=1, satellites=255, clock_bias_ms=UNSET, **nothing), GnssFix)
@@ -206,7 +206,7 @@ def test_a_fix_is_complete_at_the_end_of_its_epoch() -> None:
     assert [type(r) for r in feed_pieces(parser, [end], close=False)] == [GnssFix]
 
 
-def test_the_clocks_bias_crosses_the_weeks_end() -> None:
+def test_a_clock_bias_across_the_end_of_the_week_changes_the_week() -> None:
     early = one(pvt(0, WEEK, clock_bias_ms=0.1), GnssFix).time
     late = one(pvt(604_799_999, WEEK, clock_bias_ms=-1.5), GnssFix).time
     assert (early.week, early.time_ns) == (WEEK - 1, WEEK_NS - 100_000)
@@ -216,7 +216,7 @@ def test_the_clocks_bias_crosses_the_weeks_end() -> None:
 # --- time ---
 
 
-def test_the_second_is_named_once_an_epoch_and_only_on_the_second() -> None:
+def test_the_second_is_named_once_an_epoch_and_only_on_the_whole_second() -> None:
     ins = sbf.encode_ins_nav_geod(INS, TRIPLES, TOW_MS, WEEK)
     assert one(pvt() + ins, TimeMessage).message == "PVTGeodetic"
     assert one(ins + pvt(), TimeMessage).message == "INSNavGeod"
@@ -231,7 +231,7 @@ def test_time_is_valid_at_full_synchronisation_only(level: int, valid: bool) -> 
     assert [r.valid for r in records if isinstance(r, TimeMessage)] == [valid] * 3
 
 
-def test_leap_seconds_only_where_the_receiver_knows_them() -> None:
+def test_leap_seconds_are_given_only_when_the_receiver_knows_them() -> None:
     unknown = FULL_TIME._replace(leap_seconds=-128, year=-128)
     message = one(sbf.RECEIVER_TIME.encode(unknown, TOW_MS, WEEK), TimeMessage)
     assert (message.valid, message.time.leap_seconds) == (True, None)
@@ -248,11 +248,11 @@ def test_a_pulse_on_the_receivers_own_clock_names_no_second(scale: int, valid: b
 
 
 @pytest.mark.parametrize("offset", [UNSET, math.nan, math.inf, 2e6])
-def test_an_offset_that_is_none_is_not_taken_off(offset: float) -> None:
+def test_an_absent_pps_offset_is_not_subtracted(offset: float) -> None:
     assert one(sbf.XPPS_OFFSET.encode(sbf.XppsOffset(0, 1, offset), TOW_MS, WEEK), TimeMessage).quantisation_ns == 0.0
 
 
-def test_without_a_week_no_second_is_named_and_without_a_time_nothing_is() -> None:
+def test_without_week_no_second_is_named_and_without_time_nothing_is_given() -> None:
     message = one(pvt(week=None), TimeMessage)
     assert (message.valid, message.time.week, message.time.time_ns) == (False, None, TOW_MS * 10**6)
     fix = one(pvt(week=None), GnssFix)
@@ -271,7 +271,7 @@ def test_without_a_week_no_second_is_named_and_without_a_time_nothing_is() -> No
     assert parser.counters.bad_messages == 0
 
 
-def test_a_week_one_roll_over_behind_is_not_believed() -> None:
+def test_a_week_one_rollover_behind_is_invalid() -> None:
     message = one(pvt(week=WEEK - 1024), TimeMessage)
     assert (message.valid, message.time.week) == (False, None)
     assert parse(pvt(week=WEEK - 1024))[1].counters.errors == {"date_before_floor": 1}
@@ -282,14 +282,14 @@ def test_a_week_one_roll_over_behind_is_not_believed() -> None:
 
 
 @pytest.mark.parametrize(("tow_ms", "week"), [(604_800_000, WEEK), (0xFFFF_FFFE, WEEK), (0, 8192), (0, 0xFFFE)])
-def test_times_that_cannot_be_are_counted(tow_ms: int, week: int) -> None:
+def test_impossible_times_are_counted(tow_ms: int, week: int) -> None:
     parser = none_of(pvt(tow_ms, week) + imu(FORCE, RATE, tow_ms=tow_ms, week=week), object)
     assert (parser.counters.bad_messages, parser.counters.errors["bad_time_stamp"]) == (2, 2)
 
 
 @pytest.mark.parametrize(("told", "least_ns", "greatest_ns"), [(True, 0.0, 5.0), (False, 20.0, 300.0)])
-def test_pulses_are_labelled_and_their_errors_taken_off(told: bool, least_ns: float, greatest_ns: float) -> None:
-    """Edges up to 300 ns off, each told by its xPPSOffset 5 ms later; ReceiverTime comes half a second late."""
+def test_pulses_are_labelled_and_their_offsets_subtracted(told: bool, least_ns: float, greatest_ns: float) -> None:
+    """Edges are up to 300 ns off; xPPSOffset comes 5 ms after each, ReceiverTime half a second late."""
     clock, parser = PpsClock(assumed_leap_seconds=17), SbfParser(DeviceSettings("gnss/rover"))
     errors = np.random.default_rng(5).uniform(-300.0, 300.0, 600).round()
     found: list[float] = []
@@ -326,12 +326,12 @@ def test_an_event_is_in_gnss_time() -> None:
 
 
 @pytest.mark.parametrize("change", [{"clock_bias_s": UNSET}, {"offset_s": UNSET}, {"offset_s": 1e30}])
-def test_an_event_without_its_bias_is_not_valid(change: dict[str, Any]) -> None:
+def test_an_event_without_clock_bias_is_invalid(change: dict[str, Any]) -> None:
     mark = one(sbf.EXT_EVENT.encode(EVENT._replace(**change), TOW_MS, WEEK), EventMark)
     assert (mark.valid, mark.time.time_ns) == (False, TOW_MS * 10**6)
 
 
-def test_a_heading_has_the_sigmas_of_its_covariances_and_the_clock_of_the_position() -> None:
+def test_a_heading_uses_the_sigmas_of_its_covariances_and_the_clock_of_the_position() -> None:
     cov = sbf.ATT_COV_EULER.encode(ATTITUDE_COV, TOW_MS, WEEK)
     heading = one(pvt() + sbf.ATT_EULER.encode(ATTITUDE, TOW_MS, WEEK) + cov, GnssHeading)
     assert math.degrees(heading.heading_rad) == pytest.approx(271.5)
@@ -344,14 +344,14 @@ def test_a_heading_has_the_sigmas_of_its_covariances_and_the_clock_of_the_positi
     assert (alone.valid, alone.heading_sigma_rad) == (False, None)
 
 
-def test_one_antenna_gives_no_heading() -> None:
+def test_a_single_antenna_gives_no_heading() -> None:
     none_of(recording("sbf", "pygpsdata_x5_attitude.log"), GnssHeading)
 
 
 # --- INS and IMU: bytes by hand, in the order of Septentrio's ROS driver ---
 
 
-def test_an_ins_solution_by_hand() -> None:
+def test_an_ins_solution_written_by_hand_is_decoded() -> None:
     fixed = struct.pack("<BBHHdddfHHBxH", 0x24, 0, 0x48, 10, 0.82, 0.16, 500.0, 48.0, 2, 55, 0, 0b11111)
     sigmas = struct.pack("<3f", 0.25, 0.5, 0.75)  # latitude, longitude, height
     attitude = struct.pack("<6f", 90.0, 2.0, -1.0, 0.3, 0.2, 0.1)  # heading, pitch, roll, and their sigmas
@@ -372,7 +372,7 @@ def test_an_ins_solution_by_hand() -> None:
 @pytest.mark.parametrize(
     "kept", [(), (sbf.INS_ATTITUDE,), (sbf.INS_VELOCITY,), (sbf.INS_POSITION_SIGMA, sbf.INS_VELOCITY)]
 )
-def test_sub_blocks_that_are_absent_are_nan(kept: tuple[int, ...]) -> None:
+def test_absent_sub_blocks_give_nan(kept: tuple[int, ...]) -> None:
     triples = {bit: TRIPLES[bit] for bit in kept}
     [row] = rows_of(sbf.encode_ins_nav_geod(INS._replace(error=31), triples, TOW_MS, WEEK), InsSolution)
     assert np.isnan(row["heading_rad"]) == (sbf.INS_ATTITUDE not in kept)
@@ -381,7 +381,7 @@ def test_sub_blocks_that_are_absent_are_nan(kept: tuple[int, ...]) -> None:
     assert row["status"] == 31 << 16 | 0x48
 
 
-def test_an_ins_that_has_no_solution_yet_gives_no_row() -> None:
+def test_an_ins_without_a_solution_gives_no_row() -> None:
     aligning = INS._replace(error=23, lat_rad=UNSET, lon_rad=UNSET, height_m=UNSET)
     unset = {sbf.INS_ATTITUDE: (UNSET, UNSET, UNSET)}
     parser = none_of(sbf.encode_ins_nav_geod(aligning, unset, TOW_MS, WEEK), InsSolution)
@@ -389,7 +389,7 @@ def test_an_ins_that_has_no_solution_yet_gives_no_row() -> None:
     assert parser.counters.bad_messages == 0
 
 
-def test_a_block_shorter_than_it_says_is_counted() -> None:
+def test_a_block_shorter_than_its_stated_length_is_counted() -> None:
     ins = sbf.INS_NAV_GEOD.encode(INS._replace(sub_blocks=0b11111), TOW_MS, WEEK, behind=bytes(12))
     sensors = sbf.EXT_SENSOR_MEAS.encode(sbf.ExtSensorMeas(2, 28), TOW_MS, WEEK, behind=bytes(28))
     narrow = sbf.EXT_SENSOR_MEAS.encode(sbf.ExtSensorMeas(1, 20), TOW_MS, WEEK, behind=bytes(28))
@@ -398,7 +398,7 @@ def test_a_block_shorter_than_it_says_is_counted() -> None:
     assert (parser.counters.bad_messages, parser.counters.errors["bad_length"]) == (4, 4)
 
 
-def test_inertial_samples_by_hand() -> None:
+def test_inertial_samples_written_by_hand_are_decoded() -> None:
     sets = struct.pack("<BBBB3d", 32, 10, 0, 1, 0.5, -0.25, 9.75)
     sets += struct.pack("<BBBB3d", 32, 10, 1, 2, 1.0, -2.0, 180.0)
     sets += struct.pack("<BBBBh22x", 32, 10, 3, 0, 3125)
@@ -413,13 +413,13 @@ def test_inertial_samples_by_hand() -> None:
     assert (first["status"], second["status"]) == (0x0201, 0x0201)
 
 
-def test_longer_sets_and_other_kinds_of_measurement_are_passed_over() -> None:
+def test_longer_sets_and_other_measurement_types_are_skipped() -> None:
     sets = [struct.pack("<BBBB24s", *one) + bytes(4) for one in (FORCE, FORCE._replace(kind=4), RATE)]
     data = sbf.EXT_SENSOR_MEAS.encode(sbf.ExtSensorMeas(3, 32), TOW_MS, WEEK, behind=b"".join(sets))
     assert len(rows_of(data, ImuSamples)) == 1
 
 
-def test_halves_in_two_blocks_are_one_sample_only_at_one_time() -> None:
+def test_halves_in_two_blocks_join_only_at_the_same_time() -> None:
     [row] = rows_of(imu(FORCE) + imu(RATE), ImuSamples)
     assert row["specific_force_b"].tolist() == [0.5, -0.25, 9.75]
     parser = none_of(imu(FORCE) + imu(RATE, tow_ms=TOW_MS + 20), ImuSamples)
@@ -429,19 +429,19 @@ def test_halves_in_two_blocks_are_one_sample_only_at_one_time() -> None:
     none_of(imu(other, RATE), ImuSamples)
 
 
-def test_a_sample_with_a_value_not_to_be_used_is_left_out() -> None:
+def test_a_sample_with_a_do_not_use_value_is_dropped() -> None:
     bad = sensor(sbf.SENSOR_ACCELERATION, 0.5, UNSET, 9.75)
     parser = none_of(imu(bad, RATE), ImuSamples)
     assert parser.counters.errors["imu_value_unset"] == 1
 
 
-def test_samples_before_the_receiver_knows_the_time() -> None:
+def test_samples_before_the_receiver_has_time_are_decoded() -> None:
     timeless, weekless = rows_of(imu(FORCE, RATE, tow_ms=None, week=None) + imu(FORCE, RATE, week=None), ImuSamples)
     assert (timeless["device_time_ns"], timeless["gps_week"]) == (-1, -1)
     assert (weekless["device_time_ns"], weekless["gps_week"]) == (TOW_MS * 10**6, -1)
 
 
-def test_the_imu_inside_the_stream_gives_what_is_inertial() -> None:
+def test_imu_parser_of_the_gnss_stream_gives_only_inertial_records() -> None:
     driver = find_driver("imu", "sbf")
     assert driver.transports == ("gnss",)
     parser = driver.make_parser(DeviceSettings("imu/main"))

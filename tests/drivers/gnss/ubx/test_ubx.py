@@ -40,7 +40,7 @@ def make() -> UbxParser:
 
 
 def parse(*frames: bytes) -> tuple[list[Record], UbxParser]:
-    """Records of the frames, closed, and the parser."""
+    """Parse the frames to the end; return records and parser."""
     parser = make()
     return feed_pieces(parser, frames), parser
 
@@ -54,7 +54,7 @@ def times(records: list[Record]) -> list[TimeMessage]:
 
 
 def decoded_by_pyubx2(name: str, identity: str) -> Iterator[tuple[bytes, Any]]:
-    """Frames and messages of one kind."""
+    """Return frames and messages of one type, decoded by pyubx2."""
     reader = UBXReader(io.BytesIO(recording("ubx", name)), protfilter=UBX_PROTOCOL, quitonerror=ERR_IGNORE)
     for raw, message in reader:
         if message is not None and message.identity == identity:
@@ -95,7 +95,7 @@ FIELDS: dict[str, tuple[ubx.Layout[Any], dict[str, tuple[str, float]]]] = {
 
 
 @pytest.mark.parametrize("identity", FIELDS)
-def test_fields_are_pyubx2s(identity: str) -> None:
+def test_fields_match_pyubx2(identity: str) -> None:
     layout, fields = FIELDS[identity]
     compared = 0
     for name in RECORDINGS:
@@ -119,7 +119,7 @@ def tow_ms(utc: str) -> int:
 
 
 @pytest.mark.parametrize("name", ["ublox-zed-f9p-hp.log", "ublox-zed-f9p-sfrbx.log", "ublox-zed-f9t-rtcm3.log"])
-def test_fixes_are_gpsds(name: str) -> None:
+def test_fixes_match_gpsd(name: str) -> None:
     """gpsd's reports are of NAV-PVT alone: a refined position differs by less than its last digit and its height's."""
     reports = {tow_ms(report["time"]): report for report in gpsd_reports("ubx", name)}
     found = fixes(feed_pieces(make(), [recording("ubx", name)]))
@@ -140,7 +140,7 @@ def test_fixes_are_gpsds(name: str) -> None:
     assert compared >= len(found) - 2
 
 
-def test_week_and_time_of_week_are_gpsds_seconds() -> None:
+def test_week_and_time_of_week_match_gpsd() -> None:
     """NAV-TIMEGPS of an M8 in time mode beside the UTC that gpsd made of it."""
     reports = {report["time"] for report in gpsd_reports("ubx", "ublox-8-time.log")}
     messages = [
@@ -165,7 +165,7 @@ def test_no_recording_has_a_bad_message() -> None:
         assert parser.counters.bad_messages == 0, name
 
 
-def test_pulses_of_an_old_receiver() -> None:
+def test_tim_tp_pulses_of_an_old_receiver_are_decoded() -> None:
     """ublox-lea-4t.log: TIM-TP in UTC, with its quantisation; NAV-SOL two seconds of the same week."""
     messages = times(feed_pieces(make(), [recording("ubx", "ublox-lea-4t.log")]))
     pulses = [message for message in messages if message.message == "TIM-TP"]
@@ -186,7 +186,7 @@ def test_pulses_of_an_old_receiver() -> None:
         ("ublox-neo-m8t.log", "RXM-RAWX"),
     ],
 )
-def test_however_it_is_cut(name: str, message: str) -> None:
+def test_records_do_not_depend_on_how_the_stream_is_cut(name: str, message: str) -> None:
     """UBX and RTCM3 mixed; epochs of many messages; long raw measurements between."""
     outcome = check_stream(make, recording("ubx", name))
     assert outcome.counters["messages"][message] == expected("ubx")[name]["messages"][f"UBX:{message}"]
@@ -195,25 +195,25 @@ def test_however_it_is_cut(name: str, message: str) -> None:
 @pytest.mark.parametrize(
     "name", ["ublox-8-time.log", "ublox-aek-4t.log", "mon_span.ubx", "pygpsdata-NAV.log", "pygpsdata-MIXED3.log"]
 )
-def test_in_random_reads_and_byte_by_byte(name: str) -> None:
+def test_random_and_byte_by_byte_reads_give_the_same_records(name: str) -> None:
     check_random_reads(make, recording("ubx", name))
     check_bytewise(make, recording("ubx", name))
 
 
-def test_damaged() -> None:
+def test_damaged_stream_never_raises() -> None:
     check_damage(make, recording("ubx", "ublox-zed-f9p-hp.log"))
 
 
-def test_damaged_in_a_mixed_stream() -> None:
+def test_damaged_mixed_stream_never_raises() -> None:
     check_damage(make, recording("ubx", "ublox-zed-f9t-rtcm3.log"), examples=40)
 
 
-def test_garbage() -> None:
+def test_garbage_never_raises() -> None:
     check_garbage(make)
 
 
 @pytest.mark.parametrize("name", RECORDINGS)
-def test_the_time_parser_says_the_same_times_and_nothing_else(name: str) -> None:
+def test_time_parser_gives_the_same_times_and_no_other_records(name: str) -> None:
     driver = DRIVERS[0]
     assert driver.make_time_parser is not None
     data = recording("ubx", name)
@@ -248,7 +248,7 @@ def timegps(itow_ms: int, week: int = WEEK, valid: int = 7, ftow_ns: int = 0, le
 NOON_MS = MIDNIGHT_MS + 12 * 3_600_000
 
 
-def test_encoders_make_what_pyubx2_reads() -> None:
+def test_pyubx2_reads_encoded_messages() -> None:
     frames = [
         pvt(NOON_MS),
         timegps(NOON_MS),
@@ -266,7 +266,7 @@ def test_encoders_make_what_pyubx2_reads() -> None:
     ]  # fmt: skip
 
 
-def test_one_fix_of_all_messages_of_an_epoch() -> None:
+def test_all_messages_of_an_epoch_give_one_fix() -> None:
     covariance = (4e-4, 1e-5, 2e-5, 5e-4, 3e-5, 9e-4)
     records, parser = parse(
         pvt(NOON_MS),
@@ -290,13 +290,13 @@ def test_one_fix_of_all_messages_of_an_epoch() -> None:
     assert parser.counters.errors == {}
 
 
-def test_the_highest_bit_of_satellites_counts_none() -> None:
-    """M8P firmware says 0x88 of eight satellites; no receiver uses more than 127."""
+def test_the_highest_bit_of_the_satellite_count_is_ignored() -> None:
+    """M8P firmware reports 0x88 for eight satellites; no receiver uses more than 127."""
     (fix,) = fixes(parse(pvt(NOON_MS, satellites=0x88), ubx.encode_nav_eoe(ubx.NavEoe(NOON_MS)))[0])
     assert fix.satellites == 8
 
 
-def test_without_covariances_the_accuracies_stand_in() -> None:
+def test_accuracies_replace_missing_covariances() -> None:
     (fix,) = fixes(parse(pvt(NOON_MS))[0])
     assert fix.position_cov_l is not None
     assert fix.position_cov_l[0, 0] + fix.position_cov_l[1, 1] == pytest.approx(0.014**2)
@@ -318,7 +318,7 @@ def test_an_itow_is_never_joined_with_the_week_of_another_epoch() -> None:
     assert weeks == {(last, WEEK), (1000, WEEK + 1)}
 
 
-def test_a_fraction_before_the_week_belongs_to_the_week_before() -> None:
+def test_a_negative_fraction_at_the_start_of_a_week_belongs_to_the_previous_week() -> None:
     (fix,) = fixes(parse(pvt(0), timegps(0, WEEK + 1, ftow_ns=-300_000))[0])
     assert (fix.time.week, fix.time.time_ns) == (WEEK, WEEK_MS * MS - 300_000)
 
@@ -338,7 +338,7 @@ def test_time_of_nav_pvt_needs_all_validity_bits(missing: int) -> None:
     assert not any(message.valid for message in messages)
 
 
-def test_leap_seconds_come_from_valid_messages_only_and_of_nav_pvt_from_its_own_itow() -> None:
+def test_leap_seconds_come_from_valid_messages_and_nav_pvt_uses_its_own_itow() -> None:
     unknown = timegps(NOON_MS, valid=ubx.TIMEGPS_TOW | ubx.TIMEGPS_WEEK)
     timels = ubx.NavTimels(NOON_MS, 0, 2, 18, 0, 0, 0, 0, 0, ubx.TIMELS_CURRENT)
     invalid = timels._replace(valid=0)
@@ -351,14 +351,14 @@ def test_leap_seconds_come_from_valid_messages_only_and_of_nav_pvt_from_its_own_
     ]
 
 
-def test_a_count_of_leap_seconds_that_holds_vouches_for_no_time() -> None:
+def test_a_valid_leap_second_count_does_not_make_the_time_valid() -> None:
     timels = ubx.encode_nav_timels(ubx.NavTimels(NOON_MS, 0, 2, 18, 0, 0, 0, 0, 0, ubx.TIMELS_CURRENT))
     unsure = pvt(NOON_MS, valid=ALL_VALID & ~ubx.PVT_FULLY_RESOLVED)
     records, _ = parse(timels, unsure, timels, pvt(NOON_MS), timels)
     assert [message.valid for message in times(records)] == [True, False, False, True, True]
 
 
-def test_the_second_is_itows_whatever_leap_count_utc_goes_by() -> None:
+def test_the_second_follows_itow_whatever_leap_count_utc_uses() -> None:
     """The first NAV-PVT after an insertion comes before the first message with the new count; the second is right."""
     late = pvt(NOON_MS + 1000, itow_ms=NOON_MS + 2000)  # UTC one second behind what 18 s would give
     records, _ = parse(timegps(NOON_MS), pvt(NOON_MS), late, timegps(NOON_MS + 2000, leap=19), late)
@@ -370,7 +370,7 @@ def test_the_second_is_itows_whatever_leap_count_utc_goes_by() -> None:
 
 @pytest.mark.parametrize("leap", [13, 16, 17, 38, -2])
 @pytest.mark.parametrize("name", ["NAV-PVT", "NAV-TIMEUTC"])
-def test_utc_by_a_stale_leap_count_gives_the_second_of_its_own_itow(name: str, leap: int) -> None:
+def test_utc_with_a_stale_leap_count_gives_the_second_of_its_own_itow(name: str, leap: int) -> None:
     """A receiver whose firmware counts `leap` leap seconds where there are 18, fully resolved all the same."""
     utc = dt.datetime(2026, 11, 21, 12, tzinfo=dt.UTC) - dt.timedelta(seconds=leap)
     calendar = (utc.year, utc.month, utc.day, utc.hour, utc.minute, utc.second)
@@ -389,13 +389,13 @@ def test_utc_by_a_stale_leap_count_gives_the_second_of_its_own_itow(name: str, l
     assert whole_gps_ns(messages[1].time, None) == gps_ns_from_week(WEEK, NOON_MS * MS)
 
 
-def test_utc_that_is_minutes_off_its_itow_is_not_valid() -> None:
+def test_utc_minutes_away_from_its_itow_is_invalid() -> None:
     records, parser = parse(pvt(NOON_MS, itow_ms=NOON_MS - 300_000), pvt(NOON_MS, itow_ms=NOON_MS + 300))
     assert [message.valid for message in times(records)] == [False, False]
     assert parser.counters.errors["utc_contradicts_itow"] == 2
 
 
-def test_nav_timeutc_is_read_as_pyubx2_writes_it() -> None:
+def test_nav_timeutc_written_by_pyubx2_is_read() -> None:
     fields = {"iTOW": NOON_MS, "nano": -277_753, "year": 2026, "month": 11, "day": 21, "hour": 11, "min": 59, "sec": 42}
     frame = UBXMessage("NAV", "NAV-TIMEUTC", GET, **fields, validTOW=1, validWKN=1, validUTC=1).serialize()
     (message,) = times(parse(frame)[0])
@@ -404,7 +404,7 @@ def test_nav_timeutc_is_read_as_pyubx2_writes_it() -> None:
 
 
 @pytest.mark.parametrize(("said", "host"), [(1024, "set"), (0, "2026-11-21"), (0, "2026-11-22"), (0, "1970-01-01")])
-def test_weeks_one_roll_over_behind_are_moved_on_request_or_by_the_hosts_day(said: int, host: str) -> None:
+def test_weeks_one_rollover_behind_are_corrected_on_request_or_by_the_host_date(said: int, host: str) -> None:
     parser = UbxParser(DeviceSettings("gnss/rover", {"add_weeks": said}))
     day = 0 if host == "set" else (dt.date.fromisoformat(host) - dt.date(1970, 1, 1)).days
     frames = timegps(NOON_MS, week=WEEK - 1024) + pvt(NOON_MS, year=2007, month=4, day=7)
@@ -422,7 +422,7 @@ def test_weeks_one_roll_over_behind_are_moved_on_request_or_by_the_hosts_day(sai
     assert "1 roll-over of 1024 weeks behind; corrected to 2026-11-15" in line
 
 
-def test_second_60_is_a_second() -> None:
+def test_second_60_is_read_as_a_leap_second() -> None:
     """2016-12-31, a Saturday: 23:59:60 is 17 s behind GPS, whose new week began 17 s ago."""
     frame = pvt(NOON_MS, itow_ms=17_000, year=2016, month=12, day=31, hour=23, minute=59, second=60)
     records, parser = parse(ubx.encode_nav_timels(ubx.NavTimels(0, 0, 2, 17, 2, 1, 17, 1930, 1, 3)), frame)
@@ -431,7 +431,7 @@ def test_second_60_is_a_second() -> None:
     assert (message.time.leap_seconds, message.valid, parser.counters.bad_messages) == (17, True, 0)
 
 
-def test_a_time_just_before_midnight_is_of_the_day_before() -> None:
+def test_a_time_just_before_midnight_belongs_to_the_previous_day() -> None:
     frame = pvt(MIDNIGHT_MS + 18_000, nano_ns=-100 * MS, itow_ms=MIDNIGHT_MS + 17_900)
     (message,) = times(parse(frame)[0])
     assert (message.time.date, message.time.time_ns) == (dt.date(2026, 11, 20), (86_400_000 - 100) * MS)
@@ -455,20 +455,20 @@ def test_tim_tp_names_the_next_edge_and_is_bound() -> None:
         (ubx.TP_NOT_LOCKED, 0, False, -5.0),
     ],
 )
-def test_flags_of_tim_tp(flags: int, reference: int, valid: bool, quantisation_ns: float) -> None:
+def test_tim_tp_flags_are_decoded(flags: int, reference: int, valid: bool, quantisation_ns: float) -> None:
     records, parser = parse(ubx.encode_tim_tp(ubx.TimTp(NOON_MS, 0, 5_000, WEEK, flags, reference)))
     (message,) = times(records)
     assert (message.valid, message.quantisation_ns) == (valid, quantisation_ns)
     assert parser.counters.errors["tim_tp_time_base"] == (1 if reference == 1 else 0)
 
 
-def test_tim_tp_is_not_believed_while_the_receiver_does_not_know_the_time() -> None:
+def test_tim_tp_is_invalid_while_the_receiver_has_no_time() -> None:
     pulse = ubx.encode_tim_tp(ubx.TimTp(NOON_MS, 0, 0, WEEK, 0, 0))
     records, _ = parse(timegps(NOON_MS, valid=0), pulse, timegps(NOON_MS), pulse)
     assert [message.valid for message in times(records) if message.bound] == [False, True]
 
 
-def test_a_week_one_rollover_behind_is_not_believed_and_counted() -> None:
+def test_a_week_one_rollover_behind_is_invalid_and_counted() -> None:
     records, parser = parse(
         timegps(NOON_MS, WEEK - 1024),
         ubx.encode_tim_tp(ubx.TimTp(NOON_MS, 0, 0, WEEK - 1024, 0, 0)),
@@ -479,7 +479,7 @@ def test_a_week_one_rollover_behind_is_not_believed_and_counted() -> None:
     assert [fix.time.week for fix in fixes(records)] == [None]
 
 
-def test_marks_of_both_edges() -> None:
+def test_event_marks_of_both_edges_are_decoded() -> None:
     mark = ubx.TimTm2(1, 0xC4 | 1 << 3, 513, WEEK, WEEK + 1, NOON_MS, 250, 5, 750, 30)
     records, _ = parse(ubx.encode_tim_tm2(mark))
     rising, falling = (record for record in records if isinstance(record, EventMark))
@@ -490,7 +490,7 @@ def test_marks_of_both_edges() -> None:
     assert [r.valid for r in parse(ubx.encode_tim_tm2(receiver_time))[0] if isinstance(r, EventMark)] == [False, False]
 
 
-def test_no_fix_is_normal() -> None:
+def test_a_message_without_a_fix_is_not_an_error() -> None:
     records, parser = parse(pvt(NOON_MS, fix_type=0, flags=0, valid=0, year=0, month=0, day=0))
     (fix,) = fixes(records)
     assert (fix.lat_rad, fix.velocity_l, fix.fix_type, fix.valid) == (None, None, FixType.NONE, False)
@@ -511,7 +511,7 @@ def test_no_fix_is_normal() -> None:
         ubx.encode_nav_cov(ubx.NavCov(NOON_MS, 0, 1, 1, math.nan, *range(11))),
     ],
 )
-def test_content_that_cannot_be_is_a_bad_message(frame: bytes) -> None:
+def test_impossible_content_is_counted_as_a_bad_message(frame: bytes) -> None:
     records, parser = parse(frame)
     assert (records, parser.counters.bad_messages, parser.counters.bad_checksums) == ([], 1, 0)
 

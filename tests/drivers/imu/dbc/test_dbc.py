@@ -50,7 +50,7 @@ KINDS = {  # rule -> the parts of a sample, the signal map without what the rule
 
 
 def make(rule: str = "last", *drop: str, **config: Any) -> DbcParser:
-    """A parser with one of the grouping rules."""
+    """Return a parser with one of the grouping rules."""
     return DbcParser(settings(signals=without(*drop), group="first" if rule == "first" else "last", **config))
 
 
@@ -83,7 +83,7 @@ def reference_samples(kinds: str, rule: str) -> tuple[list[dict[str, int]], int,
 
 
 @pytest.mark.parametrize("rule", ["last", "first", "repeat"])
-def test_samples_are_those_of_the_stated_rule_however_batches_are_cut(rule: str) -> None:
+def test_samples_follow_the_stated_rule_whatever_the_batches(rule: str) -> None:
     parts, drop = KINDS[rule]
     fresh = Snapshot(make(rule, *drop)).again
 
@@ -135,7 +135,7 @@ def _stream(samples: int, *, with_latch: bool = True) -> list[bytes]:
 
 
 @pytest.mark.parametrize(("group", "good", "incomplete"), [("last", 298, 1), ("first", 297, 3)])
-def test_a_stream_gives_the_same_whatever_the_batches_are(group: str, good: int, incomplete: int) -> None:
+def test_samples_do_not_depend_on_how_a_stream_is_batched(group: str, good: int, incomplete: int) -> None:
     whole = check_packets(lambda: make(group), _stream(300))
     assert len(whole.rows["ImuSamples"]) == len(whole.rows["DeviceClockSamples"]) == good
     assert whole.counters["errors"] == {"sample_incomplete": incomplete, "sample_duplicate": 1}
@@ -145,7 +145,7 @@ def test_damaged_units_never_raise() -> None:
     check_packet_damage(make, _stream(12))
 
 
-def test_units_and_scale() -> None:
+def test_units_and_scale_are_converted_to_si() -> None:
     parser = make("last", "pps_ticks")
     rows = imu_rows(feed(parser, [acc_frame(100, -200, 981), gyr_frame(50, -50, 9000), sample_frame(1, -55)]))
     np.testing.assert_allclose(rows["specific_force_b"][0], [1.0, -2.0, 9.81], rtol=1e-14)
@@ -158,14 +158,14 @@ def test_units_and_scale() -> None:
 @pytest.mark.parametrize(
     ("unit", "factor"), [("g", 9.80665), ("G", 9.80665), ("m/s²", 1.0), ("m.s-2", 1.0), ("m/s2", 1.0)]
 )
-def test_units_of_specific_force(unit: str, factor: float) -> None:
+def test_units_of_specific_force_are_converted(unit: str, factor: float) -> None:
     parser = DbcParser(settings(IMU_DBC.replace("m/s^2", unit), without("pps_ticks")))
     rows = imu_rows(feed(parser, [acc_frame(100), gyr_frame(0), sample_frame(0)]))
     assert rows["specific_force_b"][0, 0] == pytest.approx(factor)
 
 
 @pytest.mark.parametrize(("unit", "expected"), [("rad/s", 1.0), ("°/s", np.pi / 180), ("deg/s", np.pi / 180)])
-def test_units_of_angular_rate(unit: str, expected: float) -> None:
+def test_units_of_angular_rate_are_converted(unit: str, expected: float) -> None:
     parser = DbcParser(settings(IMU_DBC.replace("deg/s", unit), without("pps_ticks")))
     rows = imu_rows(feed(parser, [acc_frame(0), gyr_frame(50), sample_frame(0)]))
     assert rows["angular_rate_b"][0, 0] == pytest.approx(expected)
@@ -189,28 +189,28 @@ def _run(parser: Parser, ticks: list[int], host_s: list[float]) -> StructArray:
     return imu_rows(feed(parser, frames, np.repeat(np.array(host_s) * 1e9, 3).astype(np.int64)))
 
 
-def test_a_counter_runs_on_through_its_wrap() -> None:
+def test_a_counter_continues_through_its_wrap() -> None:
     parser = make("last", "pps_ticks")
     rows = _run(parser, [2**32 - 5000, 0, 5000], [0.0, 0.005, 0.010])
     assert np.diff(rows["device_time_ns"]).tolist() == [5_000_000, 5_000_000]
     assert parser.counters.errors["restart"] == 0
 
 
-def test_wraps_inside_a_gap_are_counted_by_host_time() -> None:
+def test_wraps_during_a_gap_are_counted_from_host_time() -> None:
     parser = make("last", "pps_ticks")
     gap_s = 3 * 2**32 / 1e6 + 10.0
     rows = _run(parser, [1000, 1000 + 10_000_000], [0.0, gap_s - 0.3])
     assert np.diff(rows["device_time_ns"]).tolist() == [3 * 2**32 * 1000 + 10_000_000_000]
 
 
-def test_a_restart_is_counted_and_begins_a_new_count() -> None:
+def test_a_restart_is_counted_and_starts_a_new_count() -> None:
     parser = make("last", "pps_ticks")
     rows = _run(parser, [100_000_000, 100_005_000, 3000, 8000], [0.0, 0.005, 4.0, 4.005])
     assert rows["device_time_ns"].tolist() == [100_000_000_000, 100_005_000_000, 3_000_000, 8_000_000]
     assert parser.counters.errors["restart"] == 1
 
 
-def test_a_late_reader_is_no_restart() -> None:
+def test_a_late_reader_is_not_taken_for_a_restart() -> None:
     parser = make("last", "pps_ticks")
     _run(parser, [0, 5000, 10_000, 15_000], [0.0, 1.5, 1.5, 1.5])
     assert parser.counters.errors["restart"] == 0
@@ -229,7 +229,7 @@ def test_a_fast_counter_that_may_have_wrapped_unseen_begins_anew() -> None:
 
 
 @pytest.mark.parametrize("rule", ["last", "first"])
-def test_the_latched_counter_is_on_the_same_scale(rule: str) -> None:
+def test_the_latched_counter_has_the_scale_of_the_sample_counter(rule: str) -> None:
     parser = make(rule)
     base = 2**32 - 20_000
     frames: list[bytes] = []
@@ -246,7 +246,7 @@ def test_the_latched_counter_is_on_the_same_scale(rule: str) -> None:
     assert (rows["device_time_ns"][known] >= rows["pps_time_ns"][known] - 10_000_000).all()
 
 
-def test_a_latch_no_edge_renews_does_not_creep_with_the_wraps() -> None:
+def test_a_latch_without_new_edges_does_not_move_with_the_wraps() -> None:
     parser = make()
     records = feed(parser, [sync_frame(500), *_sample(1000)])
     for number in range(1, 6):
@@ -255,7 +255,7 @@ def test_a_latch_no_edge_renews_does_not_creep_with_the_wraps() -> None:
     assert set(imu_rows(records)["pps_time_ns"].tolist()) == {500_000}
 
 
-def test_after_a_restart_the_latch_is_unknown_until_renewed() -> None:
+def test_after_a_restart_the_latch_is_unknown_until_the_next_edge() -> None:
     parser = make()
     host = np.repeat(np.array([0, 10, 10.01]) * 1e9, [4, 3, 4]).astype(np.int64)
     frames = [sync_frame(90_000_000), *_sample(90_001_000), *_sample(5000), sync_frame(12_000), *_sample(15_000)]
@@ -272,7 +272,7 @@ def test_clock_samples_pair_host_device_and_edge() -> None:
     assert (row["host_time_ns"], row["pps_count"], row["locked"]) == (3_000_000, -1, -1)
 
 
-def test_a_temperature_in_a_message_of_its_own_holds() -> None:
+def test_a_temperature_from_its_own_message_is_kept_for_later_samples() -> None:
     signals = {**without("pps_ticks"), "temperature": "TEMP.celsius"}
     parser = DbcParser(settings(signals=signals))
     rows = imu_rows(feed(parser, [*_sample(0), temp_frame(215), *_sample(5000), *_sample(10_000)]))
@@ -293,14 +293,14 @@ def state_frame(word: int, count: int) -> bytes:
     return encode_can_frame(262, word.to_bytes(5, "little") + bytes([count & 0xFF, 0, 0]))
 
 
-def test_a_status_word_is_kept_with_each_sample_and_holds() -> None:
+def test_a_status_word_is_stored_with_each_sample_and_kept_for_later_ones() -> None:
     signals = {**without("pps_ticks"), "status": "STATE.word"}
     parser = DbcParser(settings(STATUS_DBC, signals=signals))
     rows = imu_rows(feed(parser, [*_sample(0), state_frame(0xAB_8000_0001, 0), *_sample(5000), *_sample(10_000)]))
     assert rows["status"].tolist() == [0, 0x8000_0001, 0x8000_0001], "its low 32 bits"
 
 
-def test_what_a_packet_counter_skips_is_counted_however_batches_are_cut() -> None:
+def test_samples_skipped_by_the_packet_counter_are_counted_whatever_the_batches() -> None:
     signals = {**without("pps_ticks"), "packet_counter": "STATE.count"}
     counts = [254, 255, 256, 256, 259, 260, 264, 200, 201]  # repeated, 2 and 3 missing, gone back by 64
     frames = [
@@ -314,7 +314,7 @@ def test_what_a_packet_counter_skips_is_counted_however_batches_are_cut() -> Non
 
 
 @pytest.mark.parametrize("key", ["status", "packet_counter"])
-def test_a_status_or_counter_that_is_a_float_is_refused(key: str) -> None:
+def test_a_floating_point_status_or_counter_is_refused(key: str) -> None:
     text = STATUS_DBC.replace("word : 0|40@1+", "word : 0|32@1-") + "\nSIG_VALTYPE_ 262 word : 1;\n"
     with pytest.raises(DriverSettingsError, match=f"signals.{key}: STATE.word is a float"):
         DbcParser(settings(text, signals={**without("pps_ticks"), key: "STATE.word"}))
@@ -344,7 +344,7 @@ def test_short_frames_and_odd_units_are_counted() -> None:
     assert parser.counters.bad_messages == 3
 
 
-def test_fd_frames_give_the_same_as_classic_ones_and_mix_with_them() -> None:
+def test_fd_frames_give_the_same_samples_as_classic_frames_and_can_be_mixed() -> None:
     def as_fd(frame: bytes) -> bytes:
         return frame + bytes(56)
 
@@ -355,7 +355,7 @@ def test_fd_frames_give_the_same_as_classic_ones_and_mix_with_them() -> None:
     assert packed_rows(imu_rows(records)) == packed_rows(expected)
 
 
-def test_a_sample_in_one_long_fd_frame() -> None:
+def test_one_long_fd_frame_carries_a_whole_sample() -> None:
     names = [f"{kind}{axis}" for kind in ("a", "w") for axis in "xyz"]
     lines = [
         f' SG_ {name} : {number * 64}|64@1- (1,0) [0|0] "{"m/s2" if name[0] == "a" else "rad/s"}" X'
@@ -396,7 +396,7 @@ def test_multiplexed_signals_are_read_from_their_own_frames() -> None:
     assert rows["angular_rate_b"].tolist() == [[2.0, 10.0, 20.0]]
 
 
-def test_a_signal_of_all_pages_beside_signals_of_two_is_refused() -> None:
+def test_a_signal_on_every_page_is_refused_beside_signals_of_two_pages() -> None:
     with pytest.raises(DriverSettingsError, match=r"M.count is in every frame of M"):
         DbcParser(settings(MULTIPLEXED, {**MULTIPLEXED_SIGNALS, "sample_ticks": "M.count"}))
 
@@ -424,18 +424,18 @@ def test_a_signal_of_all_pages_beside_signals_of_two_is_refused() -> None:
         ({"sample": "increment"}, "rate_hz: needed with sample"),
     ],
 )
-def test_wrong_settings_are_one_line_that_names_them(changes: dict[str, Any], text: str) -> None:
+def test_wrong_settings_are_refused_in_one_line_that_names_them(changes: dict[str, Any], text: str) -> None:
     with pytest.raises(DriverSettingsError, match=text) as caught:
         DbcParser(settings(**changes))
     assert "\n" not in str(caught.value)
 
 
-def test_the_tick_is_a_microsecond_unless_said() -> None:
+def test_the_tick_defaults_to_a_microsecond() -> None:
     parser = make("last", "pps_ticks", tick_hz=None)
     assert _run(parser, [1000, 6000], [0.0, 0.005])["device_time_ns"].tolist() == [1_000_000, 6_000_000]
 
 
-def test_the_driver_is_found_and_gives_the_recorder_its_clock() -> None:
+def test_the_driver_is_registered_and_gives_the_recorder_its_clock() -> None:
     driver: Driver = find_driver("imu", "dbc")
     assert driver.transports == ("can",)
     assert driver.make_time_parser is not None
@@ -443,7 +443,7 @@ def test_the_driver_is_found_and_gives_the_recorder_its_clock() -> None:
     assert len(clock_rows(records)) == 1
 
 
-def test_frames_round_trip_through_the_log_layout() -> None:
+def test_frames_are_unchanged_by_the_log_layout() -> None:
     unit = encode_can_frame(0x1ABCDEF, b"\x01\x02\x03", extended=True)
     assert unit == bytes.fromhex("efcdab81 03 000000 0102030000000000".replace(" ", ""))
     frames = decode_can_frames(units([unit]))
@@ -457,7 +457,7 @@ def test_frames_round_trip_through_the_log_layout() -> None:
         encode_can_frame(1, bytes(9), fd=True)
 
 
-def test_a_makers_own_dbc_with_the_counter_first() -> None:
+def test_a_manufacturers_dbc_with_the_counter_first_is_decoded() -> None:
     """SBG Ellipse: IMU_INFO with the time stamp opens a sample, ACCEL and GYRO follow (sbgECom, canProtocol.md)."""
     prefix = "SBG_ECAN_MSG_IMU_"
     signals = {
@@ -504,7 +504,9 @@ def _burst(order: str, pauses_ms: float, samples: int = 80) -> tuple[list[bytes]
 @pytest.mark.parametrize("order", ["AGT", "TAG", "ATG", "GTA"])
 @pytest.mark.parametrize("drop", [(), ("sample_ticks", "pps_ticks", "temperature")], ids=["ticks", "bare"])
 @pytest.mark.parametrize("batch", [1, 7, 1000])
-def test_an_unsaid_group_is_read_from_the_pauses_between_samples(order: str, drop: tuple[str, ...], batch: int) -> None:
+def test_an_unspecified_group_is_derived_from_the_pauses_between_samples(
+    order: str, drop: tuple[str, ...], batch: int
+) -> None:
     """Whichever frame comes last: force and rate are of one sample, though the log begins within one."""
     order = order.replace("T", "") if drop else order
     parser = DbcParser(settings(signals=without(*drop) if drop else None, group=None))
@@ -520,7 +522,7 @@ def test_an_unsaid_group_is_read_from_the_pauses_between_samples(order: str, dro
     assert parser.doubts == ()
 
 
-def test_frames_that_come_evenly_leave_the_group_in_doubt() -> None:
+def test_evenly_spaced_frames_leave_the_group_undecided() -> None:
     parser = DbcParser(settings(group=None))
     frames, _ = _burst("TAG", 0.0)
     rows = imu_rows(feed(parser, frames) + parser.close())

@@ -65,7 +65,7 @@ UNITS = units()
 
 
 def columns() -> dict[str, Any]:
-    """Values of N samples."""
+    """Return columns with values of N samples."""
     rng = np.random.default_rng(3)
     return {
         "ticks": 2**32 - 5000 + 100 * np.arange(N),
@@ -90,7 +90,7 @@ def decoded(text: str, frames: np.ndarray[Any, np.dtype[np.uint8]]) -> dict[str,
 
 
 @pytest.mark.parametrize("name", UNITS)
-def test_frames_say_to_cantools_what_went_in(name: str) -> None:
+def test_cantools_decodes_encoded_frames_to_the_input(name: str) -> None:
     signals, text, _ = UNITS[name]
     given = columns()
     theirs = decoded(text, encode_samples(signals, **given))
@@ -123,7 +123,7 @@ def test_the_parser_reads_back_every_sample(name: str) -> None:
         assert set(np.diff(rows["device_time_ns"]).tolist()) == {100 * 1_000_000_000 // int(signals.tick_hz)}
 
 
-def test_a_latched_edge_is_a_frame_of_its_own() -> None:
+def test_a_latched_edge_has_its_own_frame() -> None:
     made = DeviceSettings("imu/main", {"pps_event": "B", "ids": {"EVENT_INFO_B": 0x7A0}})
     signals = sbg_ellipse.signal_map(made)
     parser = sbg_ellipse.make_clock_parser(made)
@@ -137,7 +137,7 @@ def test_a_latched_edge_is_a_frame_of_its_own() -> None:
         encode_latch(UNITS["sbg-ellipse"][0], 1)
 
 
-def test_what_does_not_fit_is_refused() -> None:
+def test_values_that_do_not_fit_are_refused() -> None:
     signals = UNITS["sbg-ellipse"][0]
     with pytest.raises(ValueError, match=r"GYRO_Z holds 16 bits: 40.0 … 40.0 does not fit"):
         encode_samples(signals, np.array([0]), np.zeros((1, 3)), np.array([[0.0, 0.0, 40.0]]))
@@ -147,7 +147,7 @@ def test_what_does_not_fit_is_refused() -> None:
         encode_samples(beyond, np.array([0]), np.zeros((1, 3)), np.zeros((1, 3)))
 
 
-def test_the_makers_own_file_reads_the_same_in_them() -> None:
+def test_the_manufacturers_dbc_decodes_frames_like_the_encoders_own_dbc() -> None:
     shipped = Path(__file__).parents[4] / "fixtures/sbg-ellipse/sbgCan.dbc"
     theirs = decoded(shipped.read_text(encoding="cp1252"), encode_samples(UNITS["sbg-ellipse"][0], **columns()))
     assert theirs == decoded(UNITS["sbg-ellipse"][1], encode_samples(UNITS["sbg-ellipse"][0], **columns()))

@@ -85,7 +85,7 @@ def assert_like_cantools(message: Any, signal: Any, data: np.ndarray[Any, np.dty
 @example(DbcSignal(0, 64, False, True, True, 12.0, 0.0, 8), [bytes(6) + b"\xef\x7f" + bytes(56)])  # overflows
 @settings(max_examples=300, deadline=None)
 @given(dbc_signals(), st.lists(st.binary(min_size=64, max_size=64), min_size=1, max_size=4))
-def test_any_signal_reads_as_cantools_reads_it(signal: DbcSignal, payloads: list[bytes]) -> None:
+def test_any_signal_reads_as_in_cantools(signal: DbcSignal, payloads: list[bytes]) -> None:
     message = load_database(signal.text().encode()).messages[0]
     rows = np.array([np.frombuffer(payload, np.uint8) for payload in payloads])[:, : signal.message_bytes]
     assert assert_like_cantools(message, message.signals[0], rows) == len(payloads)
@@ -96,7 +96,7 @@ def test_the_fixtures_hold_dbc_files() -> None:
 
 
 @pytest.mark.parametrize("path", [*DBC_FILES, CANMOD_DBC], ids=lambda path: path.name)
-def test_every_signal_of_real_dbc_files_reads_as_cantools_reads_it(path: Path) -> None:
+def test_every_signal_of_real_dbc_files_reads_as_in_cantools(path: Path) -> None:
     generator = np.random.default_rng(7)
     compared = 0
     for message in load_database(path.read_bytes()).messages:
@@ -113,7 +113,7 @@ def test_every_signal_of_real_dbc_files_reads_as_cantools_reads_it(path: Path) -
     assert compared >= (0 if multiplexed_only else 10), "too little was compared"
 
 
-def test_a_missing_signal_is_named_with_what_there_is() -> None:
+def test_error_for_a_missing_signal_lists_the_available_ones() -> None:
     database = load_database(IMU_DBC.encode())
     with pytest.raises(
         DriverSettingsError, match=r"no signal ACC.acc_w in imu.dbc; did you mean .*; message ACC has: "
@@ -126,15 +126,15 @@ def test_a_missing_signal_is_named_with_what_there_is() -> None:
 
 
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
-def test_a_byte_order_mark_is_no_part_of_a_dbc(encoding: str) -> None:
-    """As Windows editors save it."""
+def test_a_byte_order_mark_in_a_dbc_is_ignored(encoding: str) -> None:
+    """Windows editors save such files."""
     marked = load_database(IMU_DBC.encode(encoding))
     assert [message.name for message in marked.messages] == [
         message.name for message in load_database(IMU_DBC.encode()).messages
     ]
 
 
-def test_what_is_no_dbc_is_refused_in_one_line() -> None:
+def test_a_file_that_is_not_a_dbc_is_refused_in_one_line() -> None:
     with pytest.raises(DriverSettingsError, match="not a DBC file"):
         load_database(b"\x7fELF not a DBC")
 
@@ -149,8 +149,8 @@ def test_nested_multiplexing_is_refused() -> None:
         find_signal(load_database(text.encode()), "M.C", "imu.dbc")
 
 
-def test_a_message_that_stands_twice_is_refused_where_it_is_needed(caplog: pytest.LogCaptureFixture) -> None:
-    """Which of the two a frame means nobody can say; of others nothing is said at all."""
+def test_a_duplicate_message_is_refused_only_if_it_is_used(caplog: pytest.LogCaptureFixture) -> None:
+    """The meaning of a frame with two definitions is unknown; unused duplicates are not reported."""
     message = IMU_DBC[IMU_DBC.index("BO_ ") :].split("\n\n")[0]
     name = message.split()[2].rstrip(":")
     database = load_database(f"{IMU_DBC}\n\n{message}\n".encode())

@@ -115,7 +115,7 @@ def test_points_agree_with_the_golden_cloud_of_nebula(model: Model) -> None:
 
 
 @MODELS
-def test_recording_is_whole_and_goes_on(model: Model) -> None:
+def test_every_packet_of_a_recording_is_decoded_without_gaps(model: Model) -> None:
     units = payloads(model.capture)
     parser = model.parser()
     records = feed(parser, units)
@@ -158,7 +158,7 @@ def test_dual_returns_are_numbered_by_range(model: Model) -> None:
 
 
 @MODELS
-def test_batches_may_be_cut_anywhere(model: Model) -> None:
+def test_returns_do_not_depend_on_how_batches_are_cut(model: Model) -> None:
     gps = [encode_gps_packet(NOON.replace(microsecond=40, second=second), locked=second > 1) for second in range(4)]
     units = payloads(model.capture)[:200]
     for at, unit in enumerate(gps):
@@ -182,7 +182,7 @@ def test_lost_and_repeated_packets_are_counted(model: Model) -> None:
 # --- the manuals' figures -------------------------------------------------------------------------------------------
 
 
-def test_firing_times_of_the_xt32_manual() -> None:
+def test_firing_times_follow_the_xt32_manual() -> None:
     """Appendix II, PandarXT: block N at t0 + 5.632 − 50 (8 − N) µs, channel n at 0.368 + 1.512 (n − 1) µs."""
     times = decode(packet())["device_time_ns"].reshape(8, 32) - NOON_NS
     for block, channel, want_us in ((8, 1, 6.0), (8, 32, 52.872), (1, 1, -344.0), (7, 2, -42.488)):
@@ -192,7 +192,7 @@ def test_firing_times_of_the_xt32_manual() -> None:
     assert times[0, 31] == -150_000 + 52_872  # blocks 1 and 2
 
 
-def test_firing_times_of_the_qt64_driver() -> None:
+def test_firing_times_follow_the_qt64_driver() -> None:
     """HesaiLidar_General_ROS: 25.71 µs + 166.67 µs a round + 10 µs + the channel's own."""
     times = decode(packet(QT64), QT64)["device_time_ns"].reshape(4, 64) - NOON_NS
     for block, channel, want_us in ((1, 1, 38.02), (4, 1, 538.02), (2, 64, 338.827), (3, 17, 405.653)):
@@ -201,7 +201,7 @@ def test_firing_times_of_the_qt64_driver() -> None:
     assert times[1, 0] == pytest.approx(25_710 + 166_667 + 12_310, abs=1)  # blocks 3 and 4
 
 
-def test_azimuth_is_turned_on_to_each_firing() -> None:
+def test_azimuth_is_advanced_to_each_firing() -> None:
     """10 rev/s are 3.6° in a millisecond; across 0° too."""
     azimuth = (35_990 + 18 * np.arange(8)) % 36_000
     unit = encode_point_packet(NOON, azimuth, np.full((8, 32), 100), 1, motor_rpm=600)
@@ -233,7 +233,7 @@ def test_single_return_modes_are_flagged(mode: int, flags: int) -> None:
         (MODE_LAST_STRONGEST, ((0, 0), (0, 0)), []),
     ],
 )
-def test_dual_return_modes_of_the_manual(
+def test_dual_return_modes_follow_the_manual(
     mode: int, pair: tuple[tuple[int, int], tuple[int, int]], want: list[tuple[int, int]]
 ) -> None:
     """PandarXT-16 User Manual 3.1.2, table of return modes."""
@@ -247,7 +247,7 @@ def test_dual_return_modes_of_the_manual(
     assert all((table["number_of_returns"] == len(want)).all() and (table["channel"] == 5).all() for table in rows)
 
 
-def test_design_angles_are_used_without_a_file() -> None:
+def test_design_angles_are_used_without_an_angle_file() -> None:
     parser = HesaiParser(DeviceSettings("scanner/left"), XT32)
     rows = returns_of(parser.feed(Chunk("scanner/left", 1, packet())))[:32].copy()
     rows["encoder_rad"], rows["range_m"] = np.radians(123.0), 50.0
@@ -270,7 +270,7 @@ def test_design_angles_are_used_without_a_file() -> None:
         (lambda _: "\0\xff" * 99, "0 channels"),
     ],
 )
-def test_angle_files_that_cannot_be_are_refused(change: object, says: str) -> None:
+def test_impossible_angle_files_are_refused(change: object, says: str) -> None:
     text = (FIXTURES / "hesai" / "calib_PandarXT32.csv").read_text()
     broken = DeviceSettings("scanner/left", {}, {"geometry": change(text).encode()})  # type: ignore[operator]
     with pytest.raises(DriverSettingsError, match=says):
@@ -279,7 +279,7 @@ def test_angle_files_that_cannot_be_are_refused(change: object, says: str) -> No
 
 @given(seed=st.integers(0, 2**32 - 1), mode=st.sampled_from(sorted(SINGLE_FLAGS)), qt=st.booleans())
 @settings(max_examples=40, deadline=None)
-def test_what_is_encoded_is_decoded(seed: int, mode: int, qt: bool) -> None:
+def test_encoded_packets_are_decoded_to_their_input(seed: int, mode: int, qt: bool) -> None:
     head, random = QT64 if qt else XT32, np.random.default_rng(seed)
     shape = (head.blocks, head.channels)
     ranges = random.integers(0, 2, shape) * random.integers(0, 65_536, shape)
@@ -296,13 +296,13 @@ def test_what_is_encoded_is_decoded(seed: int, mode: int, qt: bool) -> None:
 
 
 def utc_at(head: HesaiHead) -> int:
-    """Where in a packet the date begins."""
+    """Return the offset of the date in a packet."""
     fields = head.packet_dtype().fields
     assert fields is not None
     return int(fields["utc"][1])
 
 
-def test_a_date_counted_in_seconds() -> None:
+def test_a_date_in_seconds_since_1970_is_decoded() -> None:
     """HesaiLidar_SDK_2.0: a year of 0 is followed by seconds since 1970, the highest byte first."""
     unit = bytearray(packet())
     at = utc_at(XT32)
@@ -311,14 +311,14 @@ def test_a_date_counted_in_seconds() -> None:
 
 
 @pytest.mark.parametrize(("head", "year"), [(QT64, 26), (QT64, 126), (XT32, 126), (XT32, 226)])
-def test_a_year_of_either_century(head: HesaiHead, year: int) -> None:
+def test_a_year_of_either_century_is_decoded(head: HesaiHead, year: int) -> None:
     """HesaiLidar_SDK_2.0, udp_protocol_v3_1.h and v6_1.h, GetMicroLidarTimeU64: 2026 in all of these."""
     unit = bytearray(packet(head))
     unit[utc_at(head)] = year
     np.testing.assert_array_equal(decode(bytes(unit), head), decode(packet(head), head))
 
 
-def test_qt64_without_udp_sequence() -> None:
+def test_qt64_packets_without_udp_sequence_are_decoded() -> None:
     units = [packet(QT64, time=NOON.replace(microsecond=667 * at), sequence=None) for at in range(3)]
     assert {len(unit) for unit in units} == {1068}
     parser = HesaiParser(DeviceSettings("scanner/left"), QT64)
@@ -347,7 +347,7 @@ def test_qt64_without_udp_sequence() -> None:
         (1074, b"\x7f", "bad_time"),
     ],
 )
-def test_packets_that_cannot_be_are_counted(at: int, new: bytes, code: str) -> None:
+def test_impossible_packets_are_counted(at: int, new: bytes, code: str) -> None:
     good = [packet(time=NOON.replace(microsecond=400 * one), sequence=one) for one in range(3)]
     parser = HesaiParser(DeviceSettings("scanner/left"), XT32)
     rows = returns_of(feed(parser, [good[0], good[1][:at] + new + good[1][at + len(new) :], good[2]]))
@@ -357,7 +357,7 @@ def test_packets_that_cannot_be_are_counted(at: int, new: bytes, code: str) -> N
     np.testing.assert_array_equal(np.unique(rows["host_time_ns"]), [0, 2_000_000])
 
 
-def test_cut_packets_are_counted() -> None:
+def test_truncated_packets_are_counted() -> None:
     unit = packet()
     parser = HesaiParser(DeviceSettings("scanner/left"), XT32)
     for length in range(1080):
@@ -374,7 +374,7 @@ def run(*units: bytes) -> tuple[HesaiParser, list[Record]]:
     return parser, feed(parser, list(units))
 
 
-def test_the_manuals_example_of_a_gps_packet() -> None:
+def test_the_example_gps_packet_of_the_manual_is_decoded() -> None:
     """PandarXT-16 and PandarXT User Manual 3.2.3: 30 32 34 30 37 30 and 38 35 37 30 34 30 are 2020-04-07 04:07:58."""
     unit = encode_gps_packet(dt.datetime(2020, 4, 7, 4, 7, 58, 120, tzinfo=dt.UTC))
     assert unit[:14] == bytes.fromhex("ffee 303234303730 383537303430")
@@ -396,7 +396,7 @@ def test_the_manuals_example_of_a_gps_packet() -> None:
     assert parser.counters.messages == {"gps": 1}
 
 
-def test_lock_makes_the_second_a_latch() -> None:
+def test_a_locked_head_latches_the_whole_second() -> None:
     point = [packet(time=NOON.replace(microsecond=400 * at), sequence=at) for at in range(4)]
     locked = encode_gps_packet(NOON.replace(microsecond=30))
     lost = encode_gps_packet(NOON.replace(microsecond=30, second=1), locked=False)
@@ -409,7 +409,7 @@ def test_lock_makes_the_second_a_latch() -> None:
     np.testing.assert_array_equal(flagged, rows["host_time_ns"] == 2_000_000)
 
 
-def test_a_locked_head_is_placed_by_its_latches() -> None:
+def test_a_locked_head_is_timed_by_its_latches_and_an_unlocked_one_by_arrival() -> None:
     """Through `DeviceClock`: to its microseconds while locked, whatever the delay; by arrival while it is not."""
     parser = find_driver("scanner", "hesai-xt32").make_time_parser
     assert parser is not None
@@ -449,13 +449,15 @@ def test_a_locked_head_is_placed_by_its_latches() -> None:
         (b"9", True, True, "valid"),
     ],
 )
-def test_only_a_locked_head_with_a_position_is_believed(status: bytes, locked: bool, valid: bool, name: str) -> None:
+def test_time_is_valid_only_if_the_head_is_locked_and_has_a_position(
+    status: bytes, locked: bool, valid: bool, name: str
+) -> None:
     _, records = run(encode_gps_packet(NOON, status=status, locked=locked))
     assert [r.valid for r in records if isinstance(r, TimeMessage)] == [valid]
     assert [r.values["gps_status"] for r in records if isinstance(r, DeviceStatus)] == [name]
 
 
-def test_a_date_a_roll_over_behind_is_moved_in_the_time_message() -> None:
+def test_a_date_one_rollover_behind_is_corrected_in_the_time_message() -> None:
     """2006-11-06 is 1024 weeks before 2026-06-22. Device times stay as the head counts them."""
     parser = HesaiParser(DeviceSettings("scanner/left"), XT32)
     host_ns = int(dt.datetime(2026, 6, 22, 12, tzinfo=dt.UTC).timestamp()) * 10**9
@@ -481,7 +483,7 @@ def test_a_date_a_roll_over_behind_is_moved_in_the_time_message() -> None:
     ("at", "new"),
     [(0, b"\xfe"), (2, b"A"), (4, b"31"), (8, b"16"), (12, b"52"), (506, b"?"), (507, b"\x02")],
 )
-def test_gps_packets_that_cannot_be_are_counted(at: int, new: bytes) -> None:
+def test_impossible_gps_packets_are_counted(at: int, new: bytes) -> None:
     unit = encode_gps_packet(NOON)
     parser, records = run(unit, unit[:at] + new + unit[at + len(new) :])
     assert parser.counters.errors == {"bad_gps": 1}
@@ -490,7 +492,7 @@ def test_gps_packets_that_cannot_be_are_counted(at: int, new: bytes) -> None:
 
 
 @pytest.mark.parametrize("protocol", ["hesai-xt32", "hesai-qt64"])
-def test_driver_declares_what_it_gives(protocol: str) -> None:
+def test_the_driver_declares_its_records(protocol: str) -> None:
     driver = find_driver("scanner", protocol)
     assert driver.transports == ("udp",)
     assert driver.make_time_parser is not None

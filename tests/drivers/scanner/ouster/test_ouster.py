@@ -66,7 +66,7 @@ def md5(image: np.ndarray[Any, Any]) -> str:
 
 
 @pytest.mark.parametrize("capture", LIDAR)
-def test_every_field_of_every_frame_has_the_digest_of_the_makers_decoder(capture: str) -> None:
+def test_every_field_of_every_frame_matches_the_digest_of_the_manufacturers_decoder(capture: str) -> None:
     layout, packets = lidar_packets(capture)
     shape = (layout.head.beams, layout.head.columns_per_frame)
     scans = EXPECTED[f"{capture}.pcap"]["scans"]
@@ -84,7 +84,7 @@ def test_every_field_of_every_frame_has_the_digest_of_the_makers_decoder(capture
 
 
 @pytest.mark.parametrize("capture", LIDAR)
-def test_returns_make_the_images_of_the_makers_decoder(capture: str) -> None:
+def test_returns_rebuild_the_images_of_the_manufacturers_decoder(capture: str) -> None:
     """Ranges and intensities put back to their places, and nothing beside them."""
     parser = recorded(capture)
     rows = returns_of(feed(parser, payloads(capture)))
@@ -122,7 +122,7 @@ def test_returns_make_the_images_of_the_makers_decoder(capture: str) -> None:
 
 
 @pytest.mark.parametrize("capture", LIDAR)
-def test_points_agree_with_the_makers_decoder(capture: str) -> None:
+def test_points_match_the_manufacturers_decoder(capture: str) -> None:
     parser = recorded(capture)
     rows = returns_of(feed(parser, payloads(capture)))
     with np.load(FIXTURES / f"{capture}.ouster_sdk.npz") as archive:
@@ -156,7 +156,7 @@ def test_two_returns_are_numbered_by_range() -> None:
     assert (rows[~two]["flags"] == RETURN_FLAG_LAST | RETURN_FLAG_STRONGEST).all()
 
 
-def test_status_says_of_which_start_the_metadata_is() -> None:
+def test_status_reports_whether_the_metadata_belongs_to_this_start() -> None:
     (status,) = [one for one in feed(recorded("crc_test"), payloads("crc_test")) if isinstance(one, DeviceStatus)]
     assert status.values["timestamp_mode"] == "TIME_FROM_INTERNAL_OSC"
     assert status.values["profile"] == "RNG15_RFL8_NIR8"
@@ -167,21 +167,21 @@ def test_status_says_of_which_start_the_metadata_is() -> None:
 
 
 @pytest.mark.parametrize("capture", [DUAL, LEGACY, "crc_test", "windowed_frame1", "imu_zm_no_lidar"])
-def test_batches_may_be_cut_anywhere(capture: str) -> None:
+def test_returns_do_not_depend_on_how_batches_are_cut(capture: str) -> None:
     units = payloads(capture)
     check_packets(lambda: recorded(capture), units)
     check_packets(lambda: parser_of(metadata_of(capture), clock_only=True), units, seeds=(1,))
 
 
 @pytest.mark.parametrize("capture", [DUAL, LEGACY, "crc_test", "imu_zm_no_lidar"])
-def test_damaged_packets_raise_nothing(capture: str) -> None:
+def test_damaged_packets_never_raise(capture: str) -> None:
     check_packet_damage(lambda: recorded(capture), payloads(capture)[:6], examples=30)
 
 
 # --- IMU ------------------------------------------------------------------------------------------------------------
 
 
-def test_imu_samples_agree_with_the_makers_decoder() -> None:
+def test_imu_samples_match_the_manufacturers_decoder() -> None:
     parser = recorded("imu_zm_no_lidar")
     rows = samples_of(feed(parser, payloads("imu_zm_no_lidar")))
     assert parser.counters.messages == {"imu": 8, "zone": 1}
@@ -200,7 +200,7 @@ def test_imu_samples_agree_with_the_makers_decoder() -> None:
         np.testing.assert_array_equal(rows[column], table[name])
 
 
-def test_imu_of_older_firmware_is_in_g_and_degrees() -> None:
+def test_imu_of_older_firmware_is_converted_from_g_and_degrees() -> None:
     units = [unit for unit in payloads("crc_test") if len(unit) == 48]
     rows = samples_of(feed(recorded("crc_test"), units))
     for row, unit in zip(rows, units, strict=True):
@@ -216,7 +216,7 @@ def test_imu_of_older_firmware_is_in_g_and_degrees() -> None:
 
 
 @pytest.mark.parametrize("capture", ["crc_test", "imu_zm_no_lidar"])
-def test_imu_packets_are_encoded_as_they_are_decoded(capture: str) -> None:
+def test_encoded_imu_packets_are_decoded_to_their_input(capture: str) -> None:
     head = read_head(metadata_of(capture))
     count = head.imu_samples
     force, rate = np.linspace(-9.0, 9.0, 3 * count).reshape(-1, 3), np.linspace(1.0, -1.0, 3 * count).reshape(-1, 3)
@@ -229,7 +229,7 @@ def test_imu_packets_are_encoded_as_they_are_decoded(capture: str) -> None:
 
 
 @pytest.mark.parametrize("word", [0x7FC0_0000, 0x7FA0_0000, 0xFF80_0000], ids=["NaN", "signalling NaN", "-infinity"])
-def test_samples_that_are_no_numbers_are_left_out(word: int) -> None:
+def test_non_finite_imu_samples_are_dropped(word: int) -> None:
     parser = recorded("crc_test")
     assert feed(parser, [struct.pack("<3QI5f", 1, 2, 3, word, 0, 1, 0, 0, 0)]) == []
     assert parser.counters.errors == {"bad_sample": 1}
@@ -238,7 +238,7 @@ def test_samples_that_are_no_numbers_are_left_out(word: int) -> None:
 # --- the manual's figures -------------------------------------------------------------------------------------------
 
 
-def test_points_of_the_formula_sheet() -> None:
+def test_points_match_the_formula_sheet() -> None:
     """FORMULAS 2.2: 50 m at tick 22528, azimuth 3.2°, altitude −9°, n 15.806 mm, before the sensor's own frame."""
     head = read_head(metadata())
     head.azimuth_rad[2], head.altitude_rad[2] = np.radians([3.2, -9.0])
@@ -252,7 +252,7 @@ def test_points_of_the_formula_sheet() -> None:
 @pytest.mark.parametrize(("beams", "columns"), [(16, 512), (64, 2048)])
 @given(seed=st.integers(0, 2**32 - 1))
 @settings(max_examples=5, deadline=None)
-def test_what_is_encoded_is_decoded(profile: str, beams: int, columns: int, seed: int) -> None:
+def test_encoded_packets_are_decoded_to_their_input(profile: str, beams: int, columns: int, seed: int) -> None:
     parser = parser_of(metadata(profile, beams, columns))
     layout, random = parser.layout, np.random.default_rng(seed)
     fields, status = random_fields(layout, random), random.integers(0, 2, 16)
@@ -315,7 +315,7 @@ def test_two_returns_follow_the_return_order(profile: str, order: str) -> None:
         ("NEAREST_TO_FARTHEST", 0),
     ],
 )
-def test_a_single_return_is_what_the_return_order_makes_it(order: str, flag: int) -> None:
+def test_a_single_return_follows_the_return_order(order: str, flag: int) -> None:
     parser = parser_of(metadata(return_order=order))
     assert (returns_of(feed(parser, frames_of(parser.layout, 1)))["flags"] == flag).all()
 
@@ -376,7 +376,7 @@ def test_frame_numbers_wrap_without_a_gap() -> None:
 
 
 @pytest.mark.parametrize(("window", "places"), [((100, 400), range(6, 26)), ((480, 40), [0, 1, 2, 30, 31])])
-def test_a_window_is_no_gap(window: tuple[int, int], places: list[int]) -> None:
+def test_an_azimuth_window_is_not_a_gap(window: tuple[int, int], places: list[int]) -> None:
     parser = parser_of(metadata(columns=512, window=window))
     units = [
         parser.layout.encode(frame, 16 * at, 10**8 * frame + 10**5 * at + np.arange(16), {"RANGE": 5000})
@@ -392,7 +392,7 @@ def test_a_window_is_no_gap(window: tuple[int, int], places: list[int]) -> None:
     assert parser.counters.errors["sequence_gap"] >= 2
 
 
-def test_a_head_that_starts_anew_is_no_gap() -> None:
+def test_a_restarted_head_is_not_a_gap() -> None:
     parser = parser_of(metadata(columns=512))
     units = frames_of(parser.layout, 40)
     anew = [
@@ -409,8 +409,8 @@ def test_a_head_that_starts_anew_is_no_gap() -> None:
     assert first_of.min() == last_of.max() + 1
 
 
-def test_a_frame_number_that_begins_anew_is_no_gap() -> None:
-    """LEGACY says no start, and under PTP the stamps go on through it."""
+def test_a_restarted_frame_number_is_not_a_gap() -> None:
+    """LEGACY packets have no start identifier, and under PTP the timestamps continue."""
     parser = parser_of(metadata("LEGACY", columns=512, timestamp_mode="TIME_FROM_PTP_1588"))
     units = [
         parser.layout.encode(frame, 16 * at, 10**18 + 10**9 * turn + 10**6 * at + np.arange(16), {"RANGE": 5000})
@@ -421,7 +421,7 @@ def test_a_frame_number_that_begins_anew_is_no_gap() -> None:
     assert parser.counters.errors == {"restart": 1}
 
 
-def test_health_is_told_when_it_changes() -> None:
+def test_health_is_reported_only_when_it_changes() -> None:
     parser = parser_of(metadata())
     units = frames_of(parser.layout, 6)
     for at, seconds in ((2, 30), (3, 29), (4, 29)):
@@ -441,7 +441,7 @@ def test_health_is_told_when_it_changes() -> None:
         (39, b"\x80", "bad_timestamp"),
     ],
 )
-def test_packets_that_cannot_be_are_counted(at: int, new: bytes, code: str) -> None:
+def test_impossible_packets_are_counted(at: int, new: bytes, code: str) -> None:
     parser = parser_of(metadata())
     units = frames_of(parser.layout, 3)
     units[1] = with_crc(units[1][:at] + new + units[1][at + len(new) :])
@@ -474,7 +474,7 @@ def test_encoder_counts_of_another_mode_are_refused() -> None:
     assert parser.counters.errors == {"bad_column": 10}
 
 
-def test_every_flipped_bit_is_found_by_the_crc() -> None:
+def test_the_crc_detects_every_flipped_bit() -> None:
     units = [unit for unit in payloads("crc_test") if len(unit) > 48]
     random = np.random.default_rng(5)
     for _ in range(20):
@@ -488,7 +488,7 @@ def test_every_flipped_bit_is_found_by_the_crc() -> None:
         assert 3_000_000 not in rows["host_time_ns"]
 
 
-def test_a_place_for_a_crc_that_firmware_does_not_fill_is_no_bad_one() -> None:
+def test_a_crc_field_that_the_firmware_does_not_fill_is_accepted() -> None:
     assert {unit[-8:] for unit in payloads("windowed_frame1") if len(unit) > 48} == {bytes.fromhex("dec00000efbeadde")}
     assert {unit[-8:] for unit in payloads(DUAL) if len(unit) > 48} == {bytes(8)}
 
@@ -503,7 +503,7 @@ def test_packets_of_another_length_are_counted() -> None:
     assert parser.counters.bytes_skipped == 47 + 1 + 49 + 680 + 8447
 
 
-def test_driver_declares_what_it_gives() -> None:
+def test_the_driver_declares_its_records() -> None:
     driver = find_driver("scanner", "ouster")
     assert driver.transports == ("udp",)
     assert driver.make_time_parser is not None
@@ -515,7 +515,7 @@ def test_driver_declares_what_it_gives() -> None:
     assert everything == {DeviceClockSamples, DeviceStatus, ScannerReturns, ImuSamples} == set(driver.yields)
 
 
-def test_a_head_is_told_by_the_form_of_its_packets() -> None:
+def test_a_head_is_recognised_by_its_packet_format() -> None:
     driver = find_driver("scanner", "ouster")
     assert driver.make_probe is not None
     probe = driver.make_probe(DeviceSettings("scanner/left"))
@@ -535,7 +535,7 @@ def test_a_head_is_told_by_the_form_of_its_packets() -> None:
     assert not others.counters.messages
 
 
-def test_serial_numbers_are_those_of_the_metadata() -> None:
+def test_serial_numbers_match_the_metadata() -> None:
     for capture in (DUAL, LOW, "crc_test", "windowed_frame1"):
         layout, packets = lidar_packets(capture)
         assert set(layout.serial(packets).tolist()) == {layout.head.serial}

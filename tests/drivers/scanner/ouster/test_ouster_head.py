@@ -16,7 +16,7 @@ from swath.drivers.scanner.ouster.parser import OusterParser
 from tests.drivers.ouster_cases import SERIAL, metadata, metadata_of, parser_of
 
 
-def test_the_flat_form_of_older_firmware() -> None:
+def test_flat_metadata_of_older_firmware_is_read() -> None:
     head = read_head(metadata_of("OS-1-32-G_v2.1.1_1024x10"))
     assert (head.model, head.serial, head.init_id) == ("OS-1-32-G", 992_101_000_280, None)
     assert (head.profile, head.header, head.imu_profile) == ("LEGACY", "legacy", "LEGACY")
@@ -29,7 +29,7 @@ def test_the_flat_form_of_older_firmware() -> None:
     assert head.pixel_shift[:6].tolist() == [0, 0, 0, 0, 8, 16]
 
 
-def test_the_form_in_sections_of_newer_firmware() -> None:
+def test_sectioned_metadata_of_newer_firmware_is_read() -> None:
     head = read_head(metadata_of("windowed_frame1"))
     assert (head.model, head.serial, head.init_id) == ("OS-0-128", 992_108_000_265, 7_109_746)
     assert (head.profile, head.header) == ("RNG15_RFL8_NIR8", "standard")
@@ -42,7 +42,7 @@ def test_the_form_in_sections_of_newer_firmware() -> None:
 
 
 def changed(path: str, value: Any) -> bytes:
-    """Metadata with one value set anew; None: taken away."""
+    """Return the metadata with one value changed, or removed if it is None."""
     table = json.loads(metadata())
     *sections, key = path.split("/")
     inner = table
@@ -134,7 +134,7 @@ def changed(path: str, value: Any) -> bytes:
         ("config_params", [1], "config_params: got a list of 1, want a table"),
     ],
 )
-def test_what_cannot_be_is_refused_in_one_line(path: str, value: Any, line: str) -> None:
+def test_impossible_metadata_is_refused_in_one_line(path: str, value: Any, line: str) -> None:
     with pytest.raises(DriverSettingsError) as caught:
         parser_of(changed(path, value))
     said = str(caught.value)
@@ -155,18 +155,18 @@ def test_what_cannot_be_is_refused_in_one_line(path: str, value: Any, line: str)
         (b'{"data_format": ' + b"9" * 5000 + b"}", "not JSON"),
     ],
 )
-def test_what_is_no_metadata_is_refused(content: bytes, reason: str) -> None:
+def test_a_file_that_is_not_metadata_is_refused(content: bytes, reason: str) -> None:
     with pytest.raises(DriverSettingsError, match=reason) as caught:
         parser_of(content)
     assert "\n" not in str(caught.value)
 
 
-def test_without_metadata_there_is_no_parser() -> None:
+def test_a_parser_needs_metadata() -> None:
     with pytest.raises(DriverSettingsError, match=r"geometry\.file: missing; want the head's metadata"):
         OusterParser(DeviceSettings("scanner/left"))
 
 
-def test_metadata_of_another_head_than_the_configured_one_is_refused() -> None:
+def test_metadata_of_another_head_is_refused() -> None:
     assert parser_of(metadata(), serial="").head.serial == SERIAL
     assert parser_of(metadata(), serial=str(SERIAL)).head.serial == SERIAL
     with pytest.raises(DriverSettingsError, match=f"is of head {SERIAL}, but serial is 99; use the metadata"):
@@ -190,7 +190,7 @@ _values = st.recursive(
 
 @given(data=st.data())
 @settings(max_examples=300, deadline=None)
-def test_any_change_is_read_or_refused(data: st.DataObject) -> None:
+def test_altered_metadata_is_read_or_refused(data: st.DataObject) -> None:
     table = json.loads(metadata())
     table |= table.pop("beam_intrinsics") | {"data_format": table.pop("lidar_data_format")}
     section = data.draw(st.sampled_from([table, table["data_format"], table["config_params"], table["sensor_info"]]))

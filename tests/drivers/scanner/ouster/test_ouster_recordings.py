@@ -38,7 +38,7 @@ def lidar_packets(capture: str) -> tuple[LidarLayout, StructArray]:
 
 
 def column_values(layout: LidarLayout, columns: StructArray) -> Iterator[tuple[str, np.ndarray[Any, Any]]]:
-    """What the maker's decoder has once a column, under its names."""
+    """Return the values that the manufacturer's decoder gives once a column, by name."""
     yield "TIMESTAMP", columns["time_ns"]
     yield "MEASUREMENT_ID", columns["id"]
     has_encoder = "encoder" in (columns.dtype.names or ())
@@ -48,7 +48,7 @@ def column_values(layout: LidarLayout, columns: StructArray) -> Iterator[tuple[s
 
 
 @pytest.mark.parametrize("capture", DIGESTED)
-def test_packets_have_the_makers_digests(capture: str) -> None:
+def test_packet_fields_match_the_manufacturers_digests(capture: str) -> None:
     """Its digest of each field through all packets, each packet beam by beam."""
     digests = json.loads((FIXTURES / f"{capture}_digest.json").read_text())["packet_hash"]
     layout, packets = lidar_packets(capture)
@@ -63,8 +63,8 @@ def test_packets_have_the_makers_digests(capture: str) -> None:
 
 
 @pytest.mark.parametrize("capture", DIGESTED)
-def test_frames_have_the_makers_digests(capture: str) -> None:
-    """Of each field the image, its pixels staggered as they were sent, and what each column has."""
+def test_frame_fields_match_the_manufacturers_digests(capture: str) -> None:
+    """Compare the image of each field, its pixels staggered as sent, and the values of each column."""
     [digests] = json.loads((FIXTURES / f"{capture}_digest.json").read_text())["scans"]
     layout, packets = lidar_packets(capture)
     assert set(layout.frame_id(packets).tolist()) == {int(digests["FRAME_ID"])}
@@ -80,7 +80,7 @@ def test_frames_have_the_makers_digests(capture: str) -> None:
     assert set(digests) - set(compared) <= {"FRAME_ID", "ENCODER_COUNT"}
 
 
-def test_a_packet_alone_is_that_packet_of_the_frame() -> None:
+def test_a_single_packet_gives_its_part_of_the_frame() -> None:
     [packet] = payloads(SINGLE)
     assert packet in payloads(DIGESTED[0])
     with np.load(FIXTURES / f"{SINGLE}.ouster_sdk.npz") as archive:
@@ -91,7 +91,7 @@ def test_a_packet_alone_is_that_packet_of_the_frame() -> None:
     assert len(nearest_or_only) >= np.count_nonzero(ranges)
 
 
-def test_poses_of_the_maker_lay_the_frames_onto_each_other() -> None:
+def test_the_manufacturers_poses_align_successive_frames() -> None:
     """Its poses (rows of 3 × 4, in the sensor's frame) bring the second and the third frame nearer to the first."""
     parser = recorded(THREE)
     rows = returns_of(feed(parser, payloads(THREE)))
@@ -117,7 +117,7 @@ def test_poses_of_the_maker_lay_the_frames_onto_each_other() -> None:
 
 @pytest.mark.parametrize("capture", ["VLI-16-one-packet.pcap.gz", "empty_pcap.pcap"])
 @pytest.mark.parametrize("protocol", ["ouster", "velodyne-vlp16"])
-def test_a_foreign_datagram_is_counted_and_gives_nothing(capture: str, protocol: str) -> None:
+def test_a_foreign_datagram_is_counted_and_gives_no_returns(capture: str, protocol: str) -> None:
     """One of 1212 bytes to Velodyne's port, of a head that is like a VLP-16, and a capture of nothing."""
     units = [unit.data for unit in read_pcap(FIXTURES.parent / "captures" / capture)]
     assert [len(unit) for unit in units] == ([1212] if capture.startswith("VLI") else [])

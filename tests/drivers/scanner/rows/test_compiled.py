@@ -27,7 +27,7 @@ NAMED = [None, (True, True), (True, False), (False, True), (False, False)]
 
 
 def parser_of(driver: Driver, settings: DeviceSettings) -> PacketParser | None:
-    """None where the file belongs to another head."""
+    """Return the parser, or None if the file belongs to another head."""
     try:
         parser = driver.make_parser(settings)
     except DriverSettingsError:
@@ -41,7 +41,7 @@ def row_bytes(records: list[Record]) -> list[bytes]:
 
 
 @pytest.mark.parametrize("protocol", sorted(set(SCANNERS) - NO_RECORDING))
-def test_recordings_give_the_same_rows(protocol: str) -> None:
+def test_compiled_and_plain_code_give_the_same_rows_of_recordings(protocol: str) -> None:
     driver = SCANNERS[protocol]
     seen = 0
     for settings in settings_of(driver):
@@ -59,7 +59,7 @@ def test_recordings_give_the_same_rows(protocol: str) -> None:
 
 
 @pytest.mark.parametrize(("slots", "polygon"), list(product([1, 2, 3, 8], [False, True])))
-def test_datagrams_of_any_number_of_slots_give_the_same_rows(slots: int, polygon: bool) -> None:
+def test_compiled_and_plain_code_give_the_same_rows_for_any_number_of_slots(slots: int, polygon: bool) -> None:
     random = np.random.default_rng(slots)
     geometry = {"geometry": {"type": "polygon", "facets": 4}} if polygon else {}
     settings = DeviceSettings("scanner/left", {"mirror_factor": 2.0, **geometry})
@@ -76,7 +76,7 @@ def test_datagrams_of_any_number_of_slots_give_the_same_rows(slots: int, polygon
 
 
 def random_slots(slots: int, named: tuple[bool, bool] | None, seed: int) -> ReturnSlots:
-    """Slots of 40 · 30 pulses with what is the pulse's given in every shape there may be."""
+    """Return slots of 40 · 30 pulses with per-pulse values in every possible shape."""
     random = np.random.default_rng(seed)
     numbers = random.integers(0, 1 << 63, (1200, slots), dtype=np.uint64) * (random.random((1200, slots)) < 0.7)
     if slots == 2:
@@ -106,7 +106,7 @@ def strength_of(returns: StructArray) -> StructArray:
 
 
 @pytest.mark.parametrize(("named", "seed"), list(product(NAMED, [1, 2])))
-def test_any_pulses_give_the_same_rows(named: tuple[bool, bool] | None, seed: int) -> None:
+def test_compiled_and_plain_code_give_the_same_rows_for_any_pulses(named: tuple[bool, bool] | None, seed: int) -> None:
     for slots in (2,) if named else (1, 2, 5):
         made = random_slots(slots, named, seed)
         expected, table = returns_table(made.content.size), returns_table(made.content.size)
@@ -118,7 +118,7 @@ def test_any_pulses_give_the_same_rows(named: tuple[bool, bool] | None, seed: in
         assert set(table[count:].tobytes()) <= {0xA5}
 
 
-def test_without_numba_one_line_says_what_is_wanted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_numba_one_line_names_the_missing_package(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(sys.modules, "swath.drivers.scanner.rows.compiled")
     monkeypatch.setitem(sys.modules, "numba", None)
     with pytest.raises(DriverSettingsError, match=r"wants numba: pip install '\.\[process\]'"):

@@ -87,7 +87,7 @@ def assert_as_reference(rows: StructArray, datagrams: list[bytes], mirror_factor
     np.testing.assert_array_equal(rows["flags"] == 4, [one.locked for one in expected])
 
 
-def test_vector_is_read_as_the_page_says() -> None:
+def test_test_vector_is_decoded_as_the_protocol_page_states() -> None:
     """The sentence before the vector calls the id 42 and pps_count 3; the bytes, by the page's table, the reverse."""
     records = feed_all(make_parser(), [TEST_VECTOR])
     rows = returns_of(records)
@@ -111,14 +111,14 @@ def test_vector_is_read_as_the_page_says() -> None:
     }  # fmt: skip
 
 
-def test_vector_is_written_byte_for_byte() -> None:
+def test_test_vector_is_encoded_byte_for_byte() -> None:
     header = SrepHeader(7, 3, 5, 0, 42, 10_000_000, 1_000_000_000, 1_004_000_000, 524_288, 200_000_000)
     ranges = [[9_123_456, 9_250_000], [9_130_001, 0]]
     written = encode_datagram(header, [0, 50], [-1000, -990], ranges, [[800, 120], [810, 0]], [[450, 0], [0, 0]])
     assert written.hex() == TEST_VECTOR.hex()
 
 
-def test_fixtures_are_what_makes_them() -> None:
+def test_fixtures_equal_the_output_of_their_generator() -> None:
     assert (FIXTURES / "test_vector.bin").read_bytes() == TEST_VECTOR
     assert (FIXTURES / "scan_lines.bin").read_bytes() == b"".join(scan_lines())
 
@@ -141,7 +141,7 @@ def test_scan_lines_agree_with_the_reference() -> None:
 
 
 @pytest.mark.parametrize("sizes", [[1], [2, 3], [5, 1, 7], [1000]])
-def test_batches_may_be_cut_anywhere(sizes: list[int]) -> None:
+def test_returns_do_not_depend_on_how_batches_are_cut(sizes: list[int]) -> None:
     datagrams = scan_lines(40, 16)
     del datagrams[20:23]
     datagrams[30] = datagrams[30][:50] + b"\xff" + datagrams[30][51:]
@@ -155,7 +155,7 @@ def test_batches_may_be_cut_anywhere(sizes: list[int]) -> None:
     assert cut.counters.bad_checksums == 1
 
 
-def test_recording_through_the_harness() -> None:
+def test_a_recording_passes_the_common_driver_checks() -> None:
     check_packets(make_parser, scan_lines(60, 20))
     check_packets(lambda: make_parser(clock_only=True), scan_lines(60, 20))
     check_packet_damage(make_parser, scan_lines(12, 4))
@@ -232,7 +232,7 @@ def test_one_flipped_bit_gives_no_returns(datagram: bytes, data: st.DataObject) 
     assert parser.counters.bytes == parser.counters.bytes_skipped == len(broken)
 
 
-def test_cut_datagrams_are_counted() -> None:
+def test_truncated_datagrams_are_counted() -> None:
     parser = make_parser()
     assert feed_all(parser, [TEST_VECTOR[:length] for length in range(len(TEST_VECTOR))]) == []
     assert parser.counters.errors == {"bad_length": 100}
@@ -256,7 +256,7 @@ def with_bytes(at: int, new: bytes) -> bytes:
         (with_bytes(6, b"\x06\x00\x07\x00\x00\x00\x03\x00\x00"), "bad_header"),
     ],
 )
-def test_headers_that_cannot_be_are_counted(datagram: bytes, code: str) -> None:
+def test_impossible_headers_are_counted(datagram: bytes, code: str) -> None:
     parser = make_parser()
     assert feed_all(parser, [datagram]) == []
     assert parser.counters.errors == {code: 1}
@@ -276,7 +276,7 @@ def line(sequence: int, first_ticks: int, pps_count: int = 1, tick_hz: int = 10_
     return encode_datagram(header, [0], [0], [[10_000]])
 
 
-def test_gaps_late_and_repeated_datagrams_are_told_apart() -> None:
+def test_gaps_late_and_repeated_datagrams_are_distinguished() -> None:
     parser = make_parser()
     order = [0xFFFF_FFFE, 0xFFFF_FFFF, 2, 1, 3, 3, 4, 10]
     unwrapped = [number - 0xFFFF_FFFE if number > 100 else number + 2 for number in order]
@@ -287,7 +287,7 @@ def test_gaps_late_and_repeated_datagrams_are_told_apart() -> None:
 
 
 @pytest.mark.parametrize("cut", [1, 3, 100])
-def test_doubled_and_shuffled_datagrams_give_each_pulse_once_and_no_time_that_goes_back(cut: int) -> None:
+def test_repeated_and_reordered_datagrams_give_each_pulse_once_in_time_order(cut: int) -> None:
     """Neighbours swapped throughout, every fifth datagram again five places later; 70 ms apart."""
     order = [number ^ 1 for number in range(200)]
     for at in range(195, -1, -5):
@@ -317,9 +317,7 @@ def test_restart_begins_a_segment_without_a_gap(cut: int) -> None:
 
 @pytest.mark.parametrize("before", [1, 2, 40, 64, 66])
 @pytest.mark.parametrize("off_s", [1.5, 10.0])
-def test_a_scanner_that_is_switched_off_and_on_soon_after_its_start_is_no_network_that_repeats(
-    before: int, off_s: float
-) -> None:
+def test_an_early_scanner_restart_is_not_taken_for_repeated_datagrams(before: int, off_s: float) -> None:
     """Its second beginning has the numbers and the times of its first; only when they come is another."""
     datagrams = [*(line(at, 1000 * at + 10) for at in range(before)), *(line(at, 1000 * at) for at in range(100))]
     host_s = [*(at * 1e-4 for at in range(before)), *(off_s + at * 1e-4 for at in range(100))]
@@ -330,7 +328,7 @@ def test_a_scanner_that_is_switched_off_and_on_soon_after_its_start_is_no_networ
     assert (rows["pulse_id"] >> np.uint64(16)).tolist() == list(range(before + 100))
 
 
-def test_layouts_of_equal_length_in_one_batch() -> None:
+def test_datagrams_of_equal_length_and_different_layout_share_a_batch() -> None:
     """N = 2, R = 2 and N = 3, R = 1 are both 100 bytes; tick rates differ too."""
     other = encode_datagram(
         SrepHeader(8, tick_hz=3, first_ticks=1000, pps_count=3), [0, 1, 2], [1, 2, 3], [[5], [0], [7]]
@@ -357,7 +355,7 @@ def test_counters_of_64_bits_are_exact(tick_hz: int, first_ticks: int) -> None:
     assert clocks_of(records)["pps_count"].tolist() == [2**32 - 1]
 
 
-def test_polygon_facets() -> None:
+def test_polygon_facets_are_derived_from_the_shaft_angle() -> None:
     """Four facets of 90° shaft: beam angle 0 in a facet's middle, ±90° at its edges, facet by facet, both ways."""
     counts = 3600
     shaft_deg = np.array([45.0, 0.0, 89.9, 90.0, 135.0, 315.0, 359.9, 360.0, 405.0, -0.1, -45.0, -90.0])
@@ -371,12 +369,12 @@ def test_polygon_facets() -> None:
     np.testing.assert_allclose(np.degrees(rows["encoder_rad"]), want, atol=1e-9)
 
 
-def test_unknown_zone_is_handed_on() -> None:
+def test_an_unknown_zone_is_passed_on() -> None:
     datagram = encode_datagram(SrepHeader(mta_zone=255), [0], [0], [[123]])
     assert returns_of(feed_all(make_parser(), [datagram]))["mta_zone"].tolist() == [255]
 
 
-def test_heartbeat_gives_the_clock_only() -> None:
+def test_a_heartbeat_gives_only_the_clock() -> None:
     header = SrepHeader(pps_count=9, pps_ticks=50, first_ticks=70, tick_hz=1000, encoder_counts=0)
     records = feed_all(make_parser(), [encode_datagram(header, [], [], np.zeros((0, 1)))])
     assert not any(isinstance(record, ScannerReturns) for record in records)
@@ -395,7 +393,7 @@ def test_heartbeat_gives_the_clock_only() -> None:
         ({"mirror_factor": 2.0, "geometry": {"type": "polygon", "facets": 1}}, "geometry.facets"),
     ],
 )
-def test_wrong_settings_are_refused_at_once(config: dict[str, Any], key: str) -> None:
+def test_wrong_settings_are_refused_when_the_parser_is_made(config: dict[str, Any], key: str) -> None:
     driver = find_driver("scanner", "srep")
     assert driver.make_time_parser is not None
     for make in (driver.make_parser, driver.make_time_parser):

@@ -26,7 +26,7 @@ def parser(*, emissions: bool, compiled: bool = False, **config: object) -> Srep
 
 
 def datagrams(slots: int, zones: Sequence[int], seed: int = 5) -> list[bytes]:
-    """Of which four pulses in ten have no return, and one datagram has none at all."""
+    """Return datagrams in which four pulses in ten have no return, and one has no return."""
     random = np.random.default_rng(seed)
     made = []
     for number, zone in enumerate(zones):
@@ -56,7 +56,7 @@ def rows_of(reader: SrepParser, units: list[bytes], at_once: int) -> StructArray
 @pytest.mark.parametrize("compiled", [False, True])
 @pytest.mark.parametrize("slots", [1, 3])
 @pytest.mark.parametrize("at_once", [1, 4, 12])
-def test_every_pulse_is_a_row_where_ranges_are_apparent(slots: int, at_once: int, compiled: bool) -> None:
+def test_every_pulse_gives_a_row_if_ranges_are_apparent(slots: int, at_once: int, compiled: bool) -> None:
     zones = [255, 255, 2, 255, 255, 0, 0, 255, 255, 255, 255, 3]
     units = datagrams(slots, zones)
     plain = rows_of(parser(emissions=False), units, at_once)
@@ -84,13 +84,13 @@ def test_every_pulse_is_a_row_where_ranges_are_apparent(slots: int, at_once: int
     assert empty["host_time_ns"].tolist() == datagram[alone].tolist()
 
 
-def test_nobody_who_does_not_ask_gets_them() -> None:
+def test_pulses_without_return_are_omitted_unless_requested() -> None:
     units = datagrams(2, [255] * 5)
     assert rows_of(parser(emissions=False), units, 5)["number_of_returns"].all()
     assert parser(emissions=False).tell_rates is None
 
 
-def test_a_polygons_pulses_tell_their_facet() -> None:
+def test_pulses_of_a_polygon_carry_their_facet() -> None:
     rows = rows_of(
         parser(emissions=True, geometry={"type": "polygon", "facets": 512}), datagrams(1, [255] * 5), at_once=5
     )
@@ -100,11 +100,11 @@ def test_a_polygons_pulses_tell_their_facet() -> None:
     assert rows["channel"].max() == 3
 
 
-def test_the_flag_is_that_of_rows_that_give_no_point() -> None:
+def test_flag_of_rows_without_a_point_equals_the_context_flag() -> None:
     assert FLAG_NO_POINT == CONTEXT_FLAG
 
 
-def test_rates_are_told_when_they_change_and_before_their_returns() -> None:
+def test_pulse_rates_are_reported_on_change_before_their_returns() -> None:
     told: list[tuple[int, float, int]] = []
     rates = [(100_000_000, 10**7)] * 3 + [(100_050_000, 10**7), (120_000_000, 10**7)] * 2 + [(0, 10**7), (0, 7 * 10**7)]
     units = [

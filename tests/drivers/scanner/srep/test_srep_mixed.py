@@ -27,7 +27,7 @@ STEP_NS = 7_000_000  # between datagrams, of host time
 
 
 class Reader:
-    """A parser, and all that it gave."""
+    """Parser with everything that it gave."""
 
     def __init__(self, *, compiled: bool = False, emissions: bool = False, clock_only: bool = False) -> None:
         settings = DeviceSettings(SOURCE, {"mirror_factor": 2.0, "geometry": POLYGON}, compiled=compiled)
@@ -64,11 +64,11 @@ class Reader:
         return self
 
     def outcome(self) -> Outcome:
-        """All that it gave and counted."""
+        """Return all records and counters."""
         return outcome(self.records, self.parser)
 
     def state(self) -> dict[str, Any]:
-        """All that what comes next depends on, and what was told."""
+        """Return everything on which later output depends, and what was reported."""
         kept = {name: value for name, value in vars(self.parser).items() if not callable(value)}
         del kept["_scan_angle"]  # which never changes
         thinner, tracker = kept.pop("_thinner"), dict(vars(kept.pop("_tracker")))
@@ -83,7 +83,7 @@ def assert_alike(one: Reader, other: Reader) -> None:
 
 
 def datagram(chance: random.Random, header: SrepHeader, slots: int) -> bytes:
-    """Of few or many pulses or none, of which some have fewer returns than slots or none."""
+    """Return a datagram of few, many or no pulses, some with fewer returns than slots."""
     pulses = chance.choice([0, 1, 2, 9, 9, 9, 30, 60])
     numbers = np.random.default_rng(chance.getrandbits(32))
     ranges = numbers.integers(1, 1 << 32, (pulses, slots)) * (numbers.random((pulses, slots)) < 0.6)
@@ -93,7 +93,7 @@ def datagram(chance: random.Random, header: SrepHeader, slots: int) -> bytes:
 
 
 def damaged(chance: random.Random, good: bytes) -> bytes:
-    """Cut, made longer, a bit flipped; or a header that cannot be, under a CRC that is right."""
+    """Return the datagram truncated, extended, with a flipped bit, or with an impossible header and a right CRC."""
     kind = chance.randrange(8)
     if kind == 0:
         return good[: chance.choice([0, 1, 47, 51])]
@@ -110,7 +110,7 @@ def damaged(chance: random.Random, good: bytes) -> bytes:
 
 
 def mixed(seed: int, number: int = 400) -> list[bytes]:
-    """As they come of a scanner and a network at their worst: whatever the lengths, with gaps, late and repeated."""
+    """Return datagrams of any length with gaps, late and repeated ones."""
     chance = random.Random(seed)
     header, slots = SrepHeader(sequence=2**32 - 50, flags=5, pps_count=3, prf_mhz=2_000_000_000), 2
     units: list[bytes] = []
@@ -141,7 +141,7 @@ def mixed(seed: int, number: int = 400) -> list[bytes]:
 
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("longest", [7, 10_000])
-def test_any_mix_gives_what_its_datagrams_give_one_by_one(seed: int, longest: int) -> None:
+def test_any_mix_gives_the_rows_of_its_single_datagrams(seed: int, longest: int) -> None:
     units = mixed(seed)
     for emissions in (False, True):
         alone = Reader(emissions=emissions).one_by_one(units)
@@ -150,7 +150,7 @@ def test_any_mix_gives_what_its_datagrams_give_one_by_one(seed: int, longest: in
             assert_alike(some, alone)
 
 
-def test_a_mix_is_of_everything() -> None:
+def test_the_mix_contains_every_kind_of_error() -> None:
     """Else the test above would show little."""
     counters = Reader().one_by_one(mixed(0) + mixed(1)).parser.counters
     assert {"bad_length", "bad_magic", "bad_version", "bad_header"} < set(counters.errors)
@@ -162,7 +162,7 @@ def test_a_mix_is_of_everything() -> None:
 
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("longest", [7, 10_000])
-def test_clocks_alone_are_those_of_a_mix_one_by_one(seed: int, longest: int) -> None:
+def test_clock_records_of_a_mix_equal_those_of_its_single_datagrams(seed: int, longest: int) -> None:
     units = mixed(seed)
     some = Reader(clock_only=True).together(units, random.Random(seed), longest)
     assert_alike(some, Reader(clock_only=True).one_by_one(units))
@@ -170,9 +170,7 @@ def test_clocks_alone_are_those_of_a_mix_one_by_one(seed: int, longest: int) -> 
 
 
 @pytest.mark.parametrize("most", [1, 40, 300])
-def test_pieces_of_a_mix_are_of_no_more_slots_than_are_worked_on_at_once(
-    monkeypatch: pytest.MonkeyPatch, most: int
-) -> None:
+def test_pieces_of_a_mix_have_at_most_the_working_number_of_slots(monkeypatch: pytest.MonkeyPatch, most: int) -> None:
     units = mixed(9)
     alone = Reader().one_by_one(units)
     monkeypatch.setattr(srep, "BLOCK_SLOTS", most)
@@ -209,7 +207,7 @@ def test_a_mix_of_one_layout_is_one_piece() -> None:
     assert reader.parser.feed_batches([]) == []
 
 
-def test_batches_of_nothing_are_nothing() -> None:
+def test_empty_batches_give_no_rows() -> None:
     reader = Reader(clock_only=True)
     for length in (0, 20, 52):
         nothing = ChunkBatch(SOURCE, np.zeros(0, dtype=np.int64), np.zeros((0, length), dtype=np.uint8))

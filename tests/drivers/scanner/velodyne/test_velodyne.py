@@ -125,7 +125,7 @@ def test_dual_returns_are_numbered_by_range() -> None:
     assert len(np.unique(rows["pulse_id"])) == len(rows) - 708
 
 
-def test_gps_capture_gives_time_and_status() -> None:
+def test_position_packets_of_a_gps_capture_give_time_and_status() -> None:
     units = payloads("velodyne/mrpt_vlp16_gps.pcap.gz")
     parser = make_parser()
     records = feed(parser, units)
@@ -154,7 +154,7 @@ def test_gps_capture_gives_time_and_status() -> None:
     )
 
 
-def test_recording_without_gps() -> None:
+def test_a_recording_without_gps_gives_returns_but_no_time() -> None:
     units = recording()
     assert units[0] == (FIXTURES / "vlp16-go_packet.bin").read_bytes()
     parser = make_parser()
@@ -178,14 +178,14 @@ def test_recording_without_gps() -> None:
 
 
 @pytest.mark.parametrize("name", ["mrpt_vlp16_gps.pcap.gz", "nebula_vlp16.pcap.gz"])
-def test_batches_may_be_cut_anywhere(name: str) -> None:
+def test_returns_do_not_depend_on_how_batches_are_cut(name: str) -> None:
     units = payloads(f"velodyne/{name}")
     check_packets(make_parser, units)
     check_packet_damage(make_parser, units[:20])
     check_packets(lambda: VelodyneParser(SETTINGS, clock_only=True), units)
 
 
-def test_lost_packets_are_counted_by_the_stamps() -> None:
+def test_lost_packets_are_counted_by_their_timestamps() -> None:
     units = recording()[:200]
     parser = make_parser()
     feed(parser, units[:50] + units[53:120] + units[119:120] + units[160:])
@@ -198,7 +198,7 @@ def test_lost_packets_are_counted_by_the_stamps() -> None:
 
 
 @pytest.mark.parametrize("cut", [1, 7, 1000])
-def test_late_and_repeated_packets_are_no_jumps(cut: int) -> None:
+def test_late_and_repeated_packets_are_not_jumps(cut: int) -> None:
     """Neighbours swapped in one place, a packet four places late in another, copies three places later."""
     units = recording()[:200]
     units[20], units[21] = units[21], units[20]
@@ -213,7 +213,7 @@ def test_late_and_repeated_packets_are_no_jumps(cut: int) -> None:
     assert len(returns_of(records)) == len(returns_of(feed(make_parser(), recording()[:200])))
 
 
-def test_a_head_that_restarts_is_one_jump_and_no_gap() -> None:
+def test_a_restarted_head_is_one_jump_and_no_gap() -> None:
     parser = make_parser()
     feed(parser, [packet(900_000_000 + 1_327 * number) for number in range(20)])
     feed(parser, [packet(1_327 * number) for number in range(20)])
@@ -234,7 +234,7 @@ def decode(unit: bytes) -> StructArray:
     return returns_of(make_parser().feed(Chunk("scanner/left", 1, unit)))
 
 
-def test_firing_times_of_figure_9_9() -> None:
+def test_firing_times_follow_figure_9_9_of_the_manual() -> None:
     """Single return: block b, sequence s, laser k fires at 110.592 b + 55.296 s + 2.304 k µs."""
     times = decode(packet(stamp_us=2_000))["device_time_ns"].reshape(12, 2, 16) - 2_000_000
     for block, sequence, laser, want_us in [
@@ -246,14 +246,14 @@ def test_firing_times_of_figure_9_9() -> None:
         assert times[block, sequence, laser] == round(want_us * 1000)
 
 
-def test_dual_return_fires_half_as_long() -> None:
+def test_a_dual_return_block_advances_half_as_far() -> None:
     rows = decode(packet(mode=MODE_DUAL, azimuth=[100 + 20 * (block // 2) for block in range(12)]))
     assert len(rows) == 6 * 32
     assert rows["device_time_ns"].max() == 5 * 110_592 + 55_296 + 15 * 2_304
     assert len(np.unique(rows["pulse_id"])) == 6 * 32
 
 
-def test_azimuth_is_turned_on_to_each_firing() -> None:
+def test_azimuth_is_advanced_to_each_firing() -> None:
     """Section 9.5, across 0° and with the last block turned on as fast as the one before."""
     azimuth = [(35_900 + 20 * block) % 36_000 for block in range(12)]
     rows = decode(packet(azimuth=azimuth))
@@ -263,7 +263,7 @@ def test_azimuth_is_turned_on_to_each_firing() -> None:
     assert (rows["encoder_rad"] < 2 * np.pi).all()
 
 
-def test_a_full_circle_is_north() -> None:
+def test_an_azimuth_of_360_degrees_is_north() -> None:
     """PointCloudLibrary/pcl #20: "the rotation angle returned from the HDL might be 36000 (instead of 0)"."""
     azimuth = [(35_900 + 20 * block) % 36_000 for block in range(12)]
     full, zero = decode(packet(azimuth=[each or 36_000 for each in azimuth])), decode(packet(azimuth=azimuth))
@@ -271,7 +271,7 @@ def test_a_full_circle_is_north() -> None:
     np.testing.assert_allclose(full["encoder_rad"], zero["encoder_rad"], atol=1e-12)
 
 
-def test_a_step_of_the_field_of_view_is_not_rotation() -> None:
+def test_the_step_across_the_field_of_view_is_not_rotation() -> None:
     azimuth = [1000, 1020, 1040, 1060, 1080, 27_000, 27_020, 27_040, 27_060, 27_080, 27_100, 27_120]
     degrees = np.degrees(decode(packet(azimuth=azimuth))["encoder_rad"]).reshape(12, 32)
     assert degrees[4, -1] == pytest.approx(10.8 + 0.2 * 89.856 / 110.592, abs=1e-9)
@@ -287,7 +287,7 @@ def test_times_stay_within_the_hour() -> None:
     assert times[-1] == 1_306_368 - 500_000
 
 
-def test_the_hour_wrap_is_no_gap_and_a_clock_that_was_set_is_a_jump() -> None:
+def test_the_hour_wrap_is_not_a_gap_and_a_clock_step_is_a_jump() -> None:
     parser = make_parser()
     feed(parser, [packet(3_599_999_000), packet(327), packet(1_654)])
     assert not parser.counters.errors
@@ -295,7 +295,7 @@ def test_the_hour_wrap_is_no_gap_and_a_clock_that_was_set_is_a_jump() -> None:
     assert parser.counters.errors == {"stamp_jump": 1}
 
 
-def test_beam_points_of_the_formula_sheet() -> None:
+def test_beam_points_match_the_formula_sheet() -> None:
     """FORMULAS 2.2: 50 m at azimuth 123° and elevation −9° without the vertical correction of its laser (8.1 mm)."""
     rows = decode(packet())[:1].copy()
     rows["channel"], rows["encoder_rad"], rows["range_m"] = 6, np.radians(123.0), 50.0
@@ -311,7 +311,7 @@ def test_beam_points_of_the_formula_sheet() -> None:
     seed=st.integers(0, 2**32 - 1),
 )
 @settings(max_examples=60, deadline=None)
-def test_what_is_encoded_is_decoded(stamp_us: int, mode: int, seed: int) -> None:
+def test_encoded_packets_are_decoded_to_their_input(stamp_us: int, mode: int, seed: int) -> None:
     random = np.random.default_rng(seed)
     ranges = random.integers(0, 3, (12, 32)) * random.integers(0, 32_768, (12, 32))
     light = random.integers(0, 256, (12, 32))
@@ -363,7 +363,7 @@ def test_dual_pairs_follow_the_documented_rule(seed: int) -> None:
         (1205, b"\x28", "wrong_product"),
     ],
 )
-def test_packets_that_cannot_be_are_counted(at: int, new: bytes, code: str) -> None:
+def test_impossible_packets_are_counted(at: int, new: bytes, code: str) -> None:
     good = recording()[:3]
     broken = good[1][:at] + new + good[1][at + len(new) :]
     parser = make_parser()
@@ -374,7 +374,7 @@ def test_packets_that_cannot_be_are_counted(at: int, new: bytes, code: str) -> N
     np.testing.assert_array_equal(np.unique(rows["host_time_ns"]), [0, 2_000_000])
 
 
-def test_cut_packets_are_counted() -> None:
+def test_truncated_packets_are_counted() -> None:
     unit = recording()[0]
     parser = make_parser()
     for length in range(1206):
@@ -401,7 +401,7 @@ def positions(*said: tuple[int, int, str]) -> tuple[VelodyneParser, list[Record]
     return parser, feed(parser, [encode_position_packet(*one) for one in said])
 
 
-def test_a_repeated_sentence_names_no_second_twice() -> None:
+def test_a_repeated_sentence_does_not_name_the_second_again() -> None:
     """The packet after an edge still repeats the sentence before it: only a new sentence speaks."""
     parser, records = positions(
         (1_000_200_000, 2, rmc("081639.00")),  # stale: the clock stands in second 40
@@ -415,7 +415,7 @@ def test_a_repeated_sentence_names_no_second_twice() -> None:
     assert parser.counters.errors == {"nmea_second_mismatch": 1}
 
 
-def test_without_lock_only_a_new_sentence_counts() -> None:
+def test_without_lock_only_a_new_sentence_names_a_second() -> None:
     _, records = positions(
         (5_000_000, 0, rmc("081639.00")), (5_100_000, 0, rmc("081639.00")), (5_900_000, 1, rmc("081640.00"))
     )
@@ -425,13 +425,13 @@ def test_without_lock_only_a_new_sentence_counts() -> None:
     assert statuses == ["absent", "synchronizing"]
 
 
-def test_a_receiver_that_warns_is_not_believed() -> None:
+def test_a_receiver_with_status_void_gives_an_invalid_time() -> None:
     _, records = positions((1_000_200_000, 2, ""), (1_000_300_000, 2, rmc("081640.00", "V")))
     assert [r.valid for r in records if isinstance(r, TimeMessage)] == [False]
     assert [r.values["nmea_valid"] for r in records if isinstance(r, DeviceStatus)] == [False]
 
 
-def test_a_date_a_roll_over_behind_is_moved_and_an_older_one_is_not_valid() -> None:
+def test_a_date_one_rollover_behind_is_corrected_and_an_older_one_is_invalid() -> None:
     """What pucks said on 2019-04-07, when the 10-bit week had begun anew: 1999-08-22, 1024 weeks before."""
     parser, host_ns = make_parser(), int(dt.datetime(2019, 4, 7, tzinfo=dt.UTC).timestamp()) * 10**9
     said = [(1_000_200_000, rmc("081640.00", date="220899")), (1_001_200_000, rmc("081641.00", date="210898"))]
@@ -446,7 +446,7 @@ def test_a_date_a_roll_over_behind_is_moved_and_an_older_one_is_not_valid() -> N
     assert "sends the date 1998-08-21, before 2009-01-01" in second
 
 
-def test_a_date_without_a_fix_is_not_remarked_on() -> None:
+def test_a_date_without_a_fix_causes_no_warning() -> None:
     parser, _ = positions((1_000_200_000, 2, rmc("081640.00", "V", "060180")))
     assert parser.remarks() == []
     assert not parser.counters.errors
@@ -459,7 +459,7 @@ def test_damaged_sentences_are_counted_once() -> None:
     assert not any(isinstance(r, TimeMessage) for r in records)
 
 
-def test_a_counter_that_goes_on_beyond_the_hour_is_taken_modulo_the_hour() -> None:
+def test_a_counter_beyond_the_hour_is_taken_modulo_the_hour() -> None:
     """As the data packets' are: lock and sentence count, and the sentence is that of the second the clock stands in."""
     parser, records = positions((3_600_000_000 + 500_200_000, 2, rmc("080820.00")))
     assert not parser.counters.errors
@@ -470,7 +470,7 @@ def test_a_counter_that_goes_on_beyond_the_hour_is_taken_modulo_the_hour() -> No
     assert clock.rows["locked"].tolist() == [1]
 
 
-def test_position_packets_that_cannot_be_are_counted() -> None:
+def test_impossible_position_packets_are_counted() -> None:
     parser, records = positions((0, 4, ""), (0, 3, ""))
     assert parser.counters.errors == {"bad_position": 1}
     assert [r.values["pps_status"] for r in records if isinstance(r, DeviceStatus)] == ["error"]
@@ -484,7 +484,7 @@ def test_position_packets_that_cannot_be_are_counted() -> None:
         (rmc("081802.00") + "\r\n", 29_882),
     ],
 )
-def test_rmc_seconds(sentence: str, second: int) -> None:
+def test_seconds_of_rmc_sentences_are_read(sentence: str, second: int) -> None:
     named = rmc_time(sentence.encode())
     assert named is not None
     assert named[0].time_ns == second * 10**9
@@ -495,13 +495,13 @@ def test_rmc_seconds(sentence: str, second: int) -> None:
     ["", "$", "*", "$GPRMC*4B", "garbage", rmc("0818"), rmc("08180x.00"), rmc("081802,5"), rmc("241802.00"),
      rmc("081802.00", date="310216"), rmc("081802.00", date="3102"), rmc("081802.00")[:-1], rmc("081802.²")],
 )  # fmt: skip
-def test_what_is_no_rmc_names_nothing(sentence: str) -> None:
+def test_text_that_is_not_rmc_names_no_second(sentence: str) -> None:
     assert rmc_time(sentence.encode()) is None
 
 
 @given(text=st.binary(max_size=80))
 @settings(max_examples=200, deadline=None)
-def test_any_bytes_as_a_sentence_raise_nothing(text: bytes) -> None:
+def test_random_bytes_as_a_sentence_never_raise(text: bytes) -> None:
     packet = bytearray(encode_position_packet(0, 2, ""))
     packet[206 : 206 + len(text)] = text
     parser = make_parser()
@@ -509,7 +509,7 @@ def test_any_bytes_as_a_sentence_raise_nothing(text: bytes) -> None:
     assert parser.counters.messages == {"position": 1}
 
 
-def test_driver_declares_what_it_gives() -> None:
+def test_the_driver_declares_its_records() -> None:
     driver = find_driver("scanner", "velodyne-vlp16")
     assert driver.transports == ("udp",)
     assert driver.make_time_parser is not None

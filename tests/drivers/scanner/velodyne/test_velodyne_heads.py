@@ -48,7 +48,7 @@ def make_parser(head: SpinningHead, calibration: str | None = None) -> VelodyneP
 
 
 def azimuths(head: SpinningHead, dual: bool, first: int = 100, step: int = 20) -> list[int]:
-    """One azimuth a group, the same in all its blocks."""
+    """Return one azimuth for each group, the same in all its blocks."""
     group = len(head.block_flags) * (2 if dual else 1)
     return [(first + step * (block // group)) % 36_000 for block in range(BLOCKS)]
 
@@ -127,7 +127,7 @@ def test_vlp32c_agrees_with_the_golden_cloud_of_nebula() -> None:
     assert np.median(apart_deg) < 0.004
 
 
-def test_vlp32c_counts_what_the_recorder_left_out() -> None:
+def test_vlp32c_gaps_left_by_the_recorder_are_counted() -> None:
     """The bag holds three scans' beginnings 50 ms apart: packets of the other half turn were filtered out."""
     units = payloads(VLP32C_CAPTURE)
     parser = make_parser(VLP32C)
@@ -143,7 +143,7 @@ def test_vlp32c_counts_what_the_recorder_left_out() -> None:
 
 
 @pytest.mark.slow
-def test_vlp32c_batches_may_be_cut_anywhere() -> None:
+def test_vlp32c_returns_do_not_depend_on_how_batches_are_cut() -> None:
     units = payloads(VLP32C_CAPTURE)[:160]
     check_packets(lambda: make_parser(VLP32C), units)
     check_packet_damage(lambda: make_parser(VLP32C), units[:20])
@@ -152,7 +152,7 @@ def test_vlp32c_batches_may_be_cut_anywhere() -> None:
 # --- the manuals' figures -------------------------------------------------------------------------------------------
 
 
-def test_vlp32c_firing_times_of_the_manual() -> None:
+def test_vlp32c_firing_times_follow_the_manual() -> None:
     """VLP-32C manual 9.4: 55.296 µs · sequence + 2.304 µs · (laser / 2), in dual return a sequence in two blocks."""
     times = decode(packet(VLP32C), VLP32C)["device_time_ns"].reshape(12, 32) - 2_000_000
     for block, laser, want_us in ((0, 0, 0.0), (0, 1, 0.0), (0, 31, 34.56), (1, 0, 55.296), (11, 31, 642.816)):
@@ -161,7 +161,7 @@ def test_vlp32c_firing_times_of_the_manual() -> None:
     assert times[5, 31] == round(1000 * (5 * 55.296 + 34.56))
 
 
-def test_vlp32c_precision_azimuth_of_the_manual() -> None:
+def test_vlp32c_precision_azimuth_follows_the_manual() -> None:
     """VLP-32C manual 9.5: azimuth + gap · 2.304 µs · K / 55.296 µs, K one of 16 pairs, and the laser's offset."""
     rows = decode(packet(VLP32C, first=35_990), VLP32C)
     want = 359.9 + 0.2 * (np.arange(12)[:, np.newaxis] + np.arange(32) // 2 * 2.304 / 55.296)
@@ -173,7 +173,7 @@ def test_vlp32c_precision_azimuth_of_the_manual() -> None:
     np.testing.assert_allclose(point, [flat * np.sin(azimuth), flat * np.cos(azimuth), height], atol=1e-9)
 
 
-def test_vls128_firing_times_of_the_manual() -> None:
+def test_vls128_firing_times_follow_the_manual() -> None:
     """VLS-128 manual 9.4: groups of eight each 2.665 µs, one left out after the eighth, sequences 53.3 µs, −8.7 µs."""
     times = decode(packet(VLS128), VLS128)["device_time_ns"].reshape(3, 128) - 2_000_000
     for sequence, laser, want_us in (
@@ -195,7 +195,7 @@ def test_vls128_firing_times_of_the_manual() -> None:
     assert early[0] == 3_600_000_000_000 - 3_700
 
 
-def test_vls128_packet_as_the_manual_draws_it() -> None:
+def test_vls128_packet_layout_follows_the_manual() -> None:
     """Four blocks a sequence, a bank each; in dual return each bank's last and strongest, then four empty blocks."""
     single, dual = packet(VLS128), packet(VLS128, MODE_DUAL)
     assert [single[at : at + 2].hex() for at in range(0, 1200, 100)] == 3 * ["ffee", "ffdd", "ffcc", "ffbb"]
@@ -214,7 +214,7 @@ def test_vls128_packet_as_the_manual_draws_it() -> None:
         assert parser.counters.errors == {code: 1}
 
 
-def test_vls128_design_angles() -> None:
+def test_vls128_design_angles_follow_the_manual() -> None:
     """128 lasers from −25° to +15°, eight azimuth offsets (manual 9.3.1.2); laser 36 looks down most."""
     beams = VLS128.beams
     assert len(beams) == len(np.unique(beams.elevation_deg)) == 128
@@ -225,7 +225,7 @@ def test_vls128_design_angles() -> None:
     np.testing.assert_allclose(beams.up_m[36], 0.05863 * np.tan(np.radians(25.0)))
 
 
-def test_vls128_dual_return_turns_with_the_packet_before() -> None:
+def test_vls128_dual_return_uses_the_rotation_since_the_previous_packet() -> None:
     """A dual-return packet has one azimuth: the rotation is that since the last one, also past a lost packet."""
     number = np.array([0, 1, 2, 5, 6, 7, 8])
     azimuth = (35_970 + 20 * number) % 36_000
@@ -244,7 +244,7 @@ def test_vls128_dual_return_turns_with_the_packet_before() -> None:
     np.testing.assert_allclose(degrees[1:], want % 360, atol=1e-9)
 
 
-def test_hdl32e_firing_times_of_the_manual() -> None:
+def test_hdl32e_firing_times_follow_the_manual() -> None:
     """HDL-32E manual, appendix E: block · 46.08 µs + laser · 1.152 µs, 542.592 µs from the first firing to the last."""
     times = decode(packet(HDL32E), HDL32E)["device_time_ns"].reshape(12, 32) - 2_000_000
     for block, laser, want_us in ((0, 0, 0.0), (0, 1, 1.152), (0, 31, 35.712), (1, 0, 46.08), (11, 31, 542.592)):
@@ -253,7 +253,7 @@ def test_hdl32e_firing_times_of_the_manual() -> None:
     assert times[5, 31] == round(1000 * (5 * 46.08 + 35.712))
 
 
-def test_hdl32e_lasers_in_firing_order() -> None:
+def test_hdl32e_lasers_follow_the_firing_order() -> None:
     """HDL-32E manual, laser firing sequence: the lowest first, then both banks of 16 in turn, 4/3° apart."""
     elevation = HDL32E.beams.elevation_deg
     np.testing.assert_allclose(elevation[0::2], -92 / 3 + 4 / 3 * np.arange(16), atol=0.01)
@@ -264,7 +264,7 @@ def test_hdl32e_lasers_in_firing_order() -> None:
 
 
 @pytest.mark.slow
-def test_batches_of_every_head_may_be_cut_anywhere() -> None:
+def test_returns_of_every_head_do_not_depend_on_how_batches_are_cut() -> None:
     for head in HEADS.values():
         random = np.random.default_rng(1)
         units, stamp_us = [], 3_599_990_000.0
@@ -282,7 +282,7 @@ def test_batches_of_every_head_may_be_cut_anywhere() -> None:
 
 
 @EVERY_HEAD
-def test_modes_and_products(head: SpinningHead) -> None:
+def test_modes_and_products_are_recognised(head: SpinningHead) -> None:
     assert (decode(packet(head, MODE_LAST), head)["flags"] == RETURN_FLAG_LAST).all()
     assert (decode(packet(head), head)["flags"] == RETURN_FLAG_STRONGEST).all()
     assert (decode(packet(head, MODE_DUAL), head)["flags"] == RETURN_FLAG_STRONGEST | RETURN_FLAG_LAST).all()
@@ -298,7 +298,7 @@ def test_modes_and_products(head: SpinningHead) -> None:
 @EVERY_HEAD
 @given(seed=st.integers(0, 2**32 - 1), mode=st.sampled_from([MODE_STRONGEST, MODE_LAST]))
 @settings(max_examples=30, deadline=None)
-def test_what_is_encoded_is_decoded(head: SpinningHead, seed: int, mode: int) -> None:
+def test_encoded_packets_are_decoded_to_their_input(head: SpinningHead, seed: int, mode: int) -> None:
     random = np.random.default_rng(seed)
     ranges = random.integers(0, 2, (BLOCKS, PLACES)) * random.integers(0, 65_536, (BLOCKS, PLACES))
     light = random.integers(0, 256, (BLOCKS, PLACES))
@@ -334,7 +334,7 @@ def test_dual_returns_are_paired(head: SpinningHead, seed: int) -> None:
 
 
 @pytest.mark.parametrize("protocol", HEADS)
-def test_driver_declares_what_it_gives(protocol: str) -> None:
+def test_the_driver_declares_its_records(protocol: str) -> None:
     driver = find_driver("scanner", protocol)
     assert driver.transports == ("udp",)
     assert driver.make_time_parser is not None
@@ -354,7 +354,7 @@ def test_driver_declares_what_it_gives(protocol: str) -> None:
 # --- a head's own calibration ---------------------------------------------------------------------------------------
 
 
-def test_calibration_files_of_the_fixtures() -> None:
+def test_calibration_files_of_the_fixtures_are_read() -> None:
     for head, name in ((VLP32C, "calib_VLP32.yaml"), (VLP16, "calib_VLP16.yaml")):
         beams = make_parser(head, name).beams
         np.testing.assert_allclose(beams.elevation_deg, head.beams.elevation_deg, atol=1e-9)
@@ -379,7 +379,7 @@ def full_table(unit: str) -> bytes:
 
 
 @pytest.mark.parametrize("unit", ["yaml", "xml"])
-def test_full_table_of_the_formula_sheet(unit: str) -> None:
+def test_full_calibration_table_matches_the_formula_sheet(unit: str) -> None:
     """FORMULAS 2.2: 50 m at azimuth 123°, ω −9°, rot 1.2°, v 0.2 m, h 0.026 m, ΔR 0.05 m."""
     beams = read_calibration(full_table(unit), VLP16)
     rows = np.zeros(1, dtype=RETURN_DTYPE)
@@ -388,7 +388,7 @@ def test_full_table_of_the_formula_sheet(unit: str) -> None:
 
 
 def both(yaml: str, new_yaml: str, xml: str, new_xml: str) -> Callable[[bytes], bytes]:
-    """The same change of either file."""
+    """Apply the same change to both files."""
     return lambda data: data.replace(yaml.encode(), new_yaml.encode()).replace(xml.encode(), new_xml.encode())
 
 
@@ -412,7 +412,7 @@ def both(yaml: str, new_yaml: str, xml: str, new_xml: str) -> Callable[[bytes], 
         (both("-0.15707963267948966", ".nan", ">-9<", ">nan<"), "vert_correction of laser 0"),
     ],
 )  # fmt: skip
-def test_calibration_files_that_cannot_be_are_refused(unit: str, change: Callable[[bytes], bytes], says: str) -> None:
+def test_impossible_calibration_files_are_refused(unit: str, change: Callable[[bytes], bytes], says: str) -> None:
     files = {"geometry": change(full_table(unit))}
     with pytest.raises(DriverSettingsError, match=says):
         VelodyneParser(DeviceSettings("scanner/left", {}, files), VLP16)

@@ -56,7 +56,7 @@ def message(identifier: int, data: bytes, *, extended: bool = False) -> can.Mess
 # ---- frames
 
 
-def test_classic_frames_are_those_of_the_log() -> None:
+def test_classic_frames_match_the_log_layout() -> None:
     assert pack_frame(message(0x123, b"\x01\x02\x03")) == encode_can_frame(0x123, b"\x01\x02\x03")
     assert pack_frame(message(0x18FF1234, bytes(8), extended=True)) == encode_can_frame(
         0x18FF1234, bytes(8), extended=True
@@ -70,7 +70,7 @@ def test_remote_frame_carries_its_length_and_no_data() -> None:
     assert pack_frame(remote) == bytes.fromhex("10000040 08 000000 0000000000000000")
 
 
-def test_fd_frame() -> None:
+def test_an_fd_frame_matches_the_log_layout() -> None:
     fd = can.Message(arbitration_id=0x55, is_extended_id=False, is_fd=True, bitrate_switch=True, data=bytes(range(12)))
     frame = pack_frame(fd)
     assert len(frame) == 72
@@ -82,7 +82,7 @@ def test_fd_frame() -> None:
 @pytest.mark.parametrize(
     "flags", list(itertools.product((False, True), repeat=3)), ids=lambda flags: "".join("01"[flag] for flag in flags)
 )
-def test_frame_to_message_and_back(flags: tuple[bool, bool, bool]) -> None:
+def test_a_frame_converts_to_a_message_and_back(flags: tuple[bool, bool, bool]) -> None:
     extended, fd, special = flags
     sent = can.Message(
         arbitration_id=0x1234567 if extended else 0x345,
@@ -98,14 +98,14 @@ def test_frame_to_message_and_back(flags: tuple[bool, bool, bool]) -> None:
 
 
 @pytest.mark.parametrize("sent", [message(0x800, b""), message(-1, b""), message(1, bytes(8))])
-def test_what_fits_no_frame_is_refused(sent: can.Message) -> None:
+def test_a_message_that_fits_no_frame_is_refused(sent: can.Message) -> None:
     sent.data = bytearray(9) if sent.arbitration_id == 1 else sent.data
     with pytest.raises(ValueError, match="not a CAN frame"):
         pack_frame(sent)
 
 
 @pytest.mark.parametrize("frame", [b"", bytes(15), bytes(17), b"\0\0\0\0\x09".ljust(16, b"\0")])
-def test_what_is_no_frame_is_not_sent(frame: bytes) -> None:
+def test_bytes_that_are_not_a_frame_are_not_sent(frame: bytes) -> None:
     with pytest.raises(ValueError, match="CAN frame"):
         unpack_frame(frame)
 
@@ -142,7 +142,7 @@ def transport(port: int) -> Iterator[PythonCanTransport]:
     transport.close()
 
 
-def test_frames_come_in_order_with_the_kernels_stamps(transport: PythonCanTransport, bus: can.BusABC) -> None:
+def test_frames_arrive_in_order_with_kernel_timestamps(transport: PythonCanTransport, bus: can.BusABC) -> None:
     sent = [message(0x100 + n % 5, n.to_bytes(4, "big")) for n in range(500)]
     before_ns = time.time_ns()
     for item in sent:
@@ -158,7 +158,7 @@ def test_frames_come_in_order_with_the_kernels_stamps(transport: PythonCanTransp
     assert transport.poll_counters().lost_kernel == 0
 
 
-def test_classic_and_fd_frames_mixed(transport: PythonCanTransport, bus: can.BusABC) -> None:
+def test_classic_and_fd_frames_can_be_mixed(transport: PythonCanTransport, bus: can.BusABC) -> None:
     sent = [
         can.Message(arbitration_id=n, is_extended_id=False, is_fd=n in (3, 4), data=bytes([n])) for n in range(1, 7)
     ]
@@ -170,7 +170,7 @@ def test_classic_and_fd_frames_mixed(transport: PythonCanTransport, bus: can.Bus
     assert [block.units.shape for block in blocks] == [(2, 16), (2, 72), (2, 16)]
 
 
-def test_error_frames_and_bus_off_are_units_and_counted(transport: PythonCanTransport, bus: can.BusABC) -> None:
+def test_error_frames_and_bus_off_are_delivered_and_counted(transport: PythonCanTransport, bus: can.BusABC) -> None:
     for error_class in (0x04, 0x40):  # controller problems; bus off
         bus.send(can.Message(arbitration_id=error_class, is_extended_id=False, is_error_frame=True, data=bytes(8)))
     units = frames(collect(transport, 2))
@@ -191,7 +191,7 @@ def test_garbage_on_the_group_is_counted_and_skipped(
     assert transport.poll_counters().refused == 1
 
 
-def test_received_and_lost_are_exactly_what_was_sent(bus: can.BusABC, port: int) -> None:
+def test_received_and_lost_counts_equal_the_frames_sent(bus: can.BusABC, port: int) -> None:
     transport = PythonCanTransport(parse_transport(MULTICAST.format(port)))
     transport.open()
     assert transport._sock is not None
@@ -238,7 +238,7 @@ def adapter() -> Iterator[SlcanAdapter]:
     adapter.close()
 
 
-def test_slcan_frames(adapter: SlcanAdapter) -> None:
+def test_slcan_frames_are_received(adapter: SlcanAdapter) -> None:
     assert os.read(adapter.master, 100).endswith(b"O\r")  # the adapter is told to open its channel
     adapter.say(b"t1232AABB\rT18FF12340\r\rr0104\r" + b"t7FF81122334455667788\r" * 20)
     expected = [
@@ -252,14 +252,14 @@ def test_slcan_frames(adapter: SlcanAdapter) -> None:
     assert all(block.kernel_realtime_ns is None for block in blocks)  # stamped by python-can on reading
 
 
-def test_slcan_send(adapter: SlcanAdapter) -> None:
+def test_slcan_frames_are_sent(adapter: SlcanAdapter) -> None:
     os.read(adapter.master, 100)
     adapter.transport.send(encode_can_frame(0x321, b"\x01\x02"))
     assert os.read(adapter.master, 100) == b"t32120102\r"
 
 
 @pytest.mark.parametrize("garbage", [b"tXYZ2AABB\r", b"t1\r", b"\xff\xfe\r", b"t1239112233445566778899\r"])
-def test_slcan_garbage_is_counted_and_the_next_frames_come(adapter: SlcanAdapter, garbage: bytes) -> None:
+def test_slcan_garbage_is_counted_and_later_frames_arrive(adapter: SlcanAdapter, garbage: bytes) -> None:
     adapter.say(garbage)
     assert adapter.transport.receive(1.0) == []
     assert adapter.transport.counters.refused == 1
@@ -267,7 +267,7 @@ def test_slcan_garbage_is_counted_and_the_next_frames_come(adapter: SlcanAdapter
     assert frames(collect(adapter.transport, 1)) == [encode_can_frame(0x123, b"")]
 
 
-def test_slcan_unplugged(adapter: SlcanAdapter) -> None:
+def test_unplugging_an_slcan_adapter_raises_a_transport_error(adapter: SlcanAdapter) -> None:
     os.close(adapter.master)
     adapter.master = -1
     with pytest.raises(TransportError, match=r"the CAN (bus failed|adapter was disconnected)"):
@@ -282,9 +282,7 @@ def test_slcan_unplugged(adapter: SlcanAdapter) -> None:
         ("seeedstudio", "aac223", "aac2" + "2301" + "aabb" + "55"),
     ],
 )
-def test_a_binary_frame_that_is_cut_off_is_counted_and_the_next_one_comes(
-    interface: str, cut_off: str, whole: str
-) -> None:
+def test_a_truncated_binary_frame_is_counted_and_the_next_one_arrives(interface: str, cut_off: str, whole: str) -> None:
     """An adapter that resets, or a line that loses bytes, must not end the thread that reads it."""
     master, slave = os.openpty()
     tty.setraw(slave)
@@ -305,7 +303,7 @@ def test_a_binary_frame_that_is_cut_off_is_counted_and_the_next_one_comes(
 # ---- what every bus must do
 
 
-def test_virtual_bus_without_a_descriptor() -> None:
+def test_a_virtual_bus_without_a_file_descriptor_works() -> None:
     transport = PythonCanTransport(parse_transport("can:virtual:swath-test"))
     transport.open()
     with can.Bus(interface="virtual", channel="swath-test", ignore_config=True) as other:
@@ -337,7 +335,7 @@ def test_close_from_another_thread_ends_a_blocked_receive(kind: str) -> None:
         transport.receive(0.0)
 
 
-def test_a_bus_that_dies_is_a_transport_error(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failing_bus_raises_a_transport_error(monkeypatch: pytest.MonkeyPatch) -> None:
     transport = PythonCanTransport(parse_transport("can:virtual:swath-dying"))
     transport.open()
 
@@ -362,7 +360,7 @@ def test_a_bus_that_dies_is_a_transport_error(monkeypatch: pytest.MonkeyPatch) -
         ("can:socketcan:nosuch0", "network interface nosuch0 does not exist; see `ip link`"),
     ],
 )
-def test_what_cannot_be_opened_says_why(text: str, says: str) -> None:
+def test_error_on_opening_gives_the_reason(text: str, says: str) -> None:
     transport = open_transport(parse_transport(text))
     with pytest.raises(TransportError, match=says) as caught:
         transport.open()
@@ -381,7 +379,7 @@ def kernel_has_can() -> bool:
     return True
 
 
-def test_socketcan_on_what_is_no_can_interface() -> None:
+def test_socketcan_refuses_an_interface_that_is_not_can() -> None:
     transport = SocketCanTransport(parse_transport("can:socketcan:lo"))
     if kernel_has_can():
         says = "lo is gone or is no CAN interface"
@@ -401,7 +399,7 @@ def test_socketcan_counts_error_frames_and_bus_off() -> None:
     assert transport.counters.bus_off == 2
 
 
-def test_the_readers_slots_for_frames_keep_classic_and_fd_apart() -> None:
+def test_frame_slots_of_the_reader_keep_classic_and_fd_apart() -> None:
     """SocketCAN's reading is UDP's with slots of 72 bytes and no sender; a datagram pair stands in for the bus."""
     near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
     ask_stamps(near)
@@ -437,7 +435,7 @@ def can_info(bitrate: int) -> bytes:
     return attribute(1, b"can\0") + attribute(2 | 0x8000, state + timing)
 
 
-def test_bitrate_in_a_link_message() -> None:
+def test_bit_rate_is_read_from_a_link_message() -> None:
     assert bitrate_of_link(link_message(can_info(1_000_000))) == 1_000_000
     assert bitrate_of_link(link_message(attribute(1, b"vcan\0"))) is None
 
@@ -449,7 +447,7 @@ def test_a_damaged_link_message_never_raises(cut: Callable[[bytes, int], bytes])
         bitrate_of_link(cut(whole, at))
 
 
-def test_interfaces_without_a_bitrate() -> None:
+def test_interfaces_without_a_bit_rate_give_none() -> None:
     assert interface_bitrate("lo") is None
     assert interface_bitrate("nosuch0") is None
 
@@ -457,7 +455,7 @@ def test_interfaces_without_a_bitrate() -> None:
 # ---- socketcand on loopback
 
 
-def test_a_gateway_that_closes_is_noticed_and_comes_back() -> None:
+def test_a_closed_gateway_is_detected_and_reopened() -> None:
     with socket.create_server(("127.0.0.1", 0)) as gateway:
         gateway.settimeout(10.0)
 
@@ -486,7 +484,7 @@ def test_a_gateway_that_closes_is_noticed_and_comes_back() -> None:
             transport.close()
 
 
-def test_a_gateway_that_serves_one_client_has_no_other() -> None:
+def test_a_gateway_with_a_single_client_is_retried_until_it_is_free() -> None:
     """It may take a while to notice that a client has gone, and turns the next one away meanwhile."""
     with socket.create_server(("127.0.0.1", 0)) as gateway:
 
@@ -506,7 +504,7 @@ def test_a_gateway_that_serves_one_client_has_no_other() -> None:
         serving.join(5.0)
 
 
-def test_a_gateway_that_is_not_there_is_asked_once(caplog: pytest.LogCaptureFixture) -> None:
+def test_an_absent_gateway_is_contacted_once(caplog: pytest.LogCaptureFixture) -> None:
     with socket.socket() as nobody:
         nobody.bind(("127.0.0.1", 0))  # and does not listen
         port = nobody.getsockname()[1]

@@ -78,7 +78,7 @@ def test_file_is_read_and_followed(tmp_path: Path) -> None:
     pps.close()
 
 
-def test_stamps_keep_every_nanosecond(tmp_path: Path) -> None:
+def test_timestamps_keep_every_nanosecond(tmp_path: Path) -> None:
     path = tmp_path / "edges"
     path.write_text("1763704800123456789 4294967295\n")
     pps = FixedPps(str(path))
@@ -98,14 +98,14 @@ def test_fifo_outlives_its_writers(fifo: Path, source: FixedPps) -> None:
     assert source.garbage_lines == 0
 
 
-def test_fifo_without_a_writer_is_silence_not_load(source: FixedPps) -> None:
+def test_a_fifo_without_a_writer_is_silent_and_uses_no_cpu(source: FixedPps) -> None:
     started_s, load_s = time.monotonic(), time.process_time()
     assert source.receive(0.5) == []
     assert time.monotonic() - started_s >= 0.49
     assert time.process_time() - load_s < 0.25
 
 
-def test_lines_in_pieces(fifo: Path, source: FixedPps) -> None:
+def test_lines_written_in_pieces_are_joined(fifo: Path, source: FixedPps) -> None:
     with fifo.open("wb", buffering=0) as writer:
         for byte in line(7):
             writer.write(bytes([byte]))
@@ -114,7 +114,7 @@ def test_lines_in_pieces(fifo: Path, source: FixedPps) -> None:
         assert collect(source, 1) == [edge(7)]
 
 
-def test_what_a_writer_leaves_unfinished_does_not_join_the_next(fifo: Path, source: FixedPps) -> None:
+def test_an_unfinished_line_of_one_writer_is_not_joined_to_the_next(fifo: Path, source: FixedPps) -> None:
     with fifo.open("wb", buffering=0) as writer:
         writer.write(line(1) + line(2)[:12])
         assert collect(source, 1) == [edge(1)]
@@ -136,7 +136,7 @@ def test_garbage_is_counted_and_skipped(fifo: Path, source: FixedPps, garbage: b
     assert source.garbage_lines == 1
 
 
-def test_a_line_without_end_holds_nothing_back_and_counts_once(fifo: Path, source: FixedPps) -> None:
+def test_an_unterminated_line_delays_nothing_and_is_counted_once(fifo: Path, source: FixedPps) -> None:
     with fifo.open("wb", buffering=0) as writer:
         for _ in range(20):
             writer.write(b"9" * 4000)
@@ -147,7 +147,7 @@ def test_a_line_without_end_holds_nothing_back_and_counts_once(fifo: Path, sourc
     assert len(source._partial) == 0
 
 
-def test_replaced_fifo_is_opened_again_by_its_session(fifo: Path) -> None:
+def test_a_replaced_fifo_is_reopened_by_its_session(fifo: Path) -> None:
     session: Session[RawEdge] = Session(lambda: FixedPps(str(fifo)), pause=lambda _: None)
     session.receive(0.0)
     fifo.unlink()
@@ -163,7 +163,7 @@ def test_replaced_fifo_is_opened_again_by_its_session(fifo: Path) -> None:
     session.close()
 
 
-def test_file_cut_short_is_said(tmp_path: Path) -> None:
+def test_a_truncated_file_raises_a_transport_error(tmp_path: Path) -> None:
     path = tmp_path / "edges"
     path.write_bytes(line(0) + line(1))
     pps = FixedPps(str(path))
@@ -204,7 +204,7 @@ def test_close_from_another_thread_ends_a_blocked_receive(tmp_path: Path, name: 
         (SerialDcdPps("/dev/null"), "cannot wait for DCD"),
     ],
 )
-def test_what_cannot_be_opened_says_why(source: PpsSource, says: str) -> None:
+def test_error_on_opening_gives_the_reason(source: PpsSource, says: str) -> None:
     with pytest.raises(TransportError, match=says) as caught:
         source.open()
     assert "\n" not in str(caught.value)
@@ -213,7 +213,7 @@ def test_what_cannot_be_opened_says_why(source: PpsSource, says: str) -> None:
     source.close()
 
 
-def test_unreadable_device_names_the_rule(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_error_for_an_unreadable_device_names_the_udev_rule(monkeypatch: pytest.MonkeyPatch) -> None:
     """root may open anything, so the refusal itself is stood in for; the wording is what is tested."""
 
     def refuse(*_: object) -> int:
@@ -226,7 +226,7 @@ def test_unreadable_device_names_the_rule(monkeypatch: pytest.MonkeyPatch) -> No
     assert 'udev rule (KERNEL=="pps[0-9]*", GROUP="swath", MODE="0660")' in str(caught.value)
 
 
-def test_a_pty_has_no_dcd() -> None:
+def test_a_pty_without_dcd_is_refused() -> None:
     master, slave = os.openpty()
     with pytest.raises(TransportError, match="cannot wait for DCD"):
         SerialDcdPps(os.ttyname(slave)).open()
@@ -234,7 +234,9 @@ def test_a_pty_has_no_dcd() -> None:
     os.close(slave)
 
 
-def test_kernel_source_that_vanishes_or_is_another_one_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_kernel_source_that_vanishes_or_is_replaced_raises_a_transport_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     device = tmp_path / "pps0"
 
     def silent(fd: int, request: int, argument: bytes) -> bytes:
@@ -262,7 +264,7 @@ def test_kernel_source_that_vanishes_or_is_another_one_is_said(tmp_path: Path, m
         source.close()
 
 
-def test_ioctl_numbers_and_layouts_are_those_of_the_header() -> None:
+def test_ioctl_numbers_and_layouts_match_the_kernel_header() -> None:
     """<linux/pps.h> on a 64-bit machine, as printed by a C program that includes it."""
     assert struct.calcsize("@P") == 8
     assert (PPS_GETPARAMS, PPS_SETPARAMS, PPS_GETCAP, PPS_FETCH) == (0x800870A1, 0x400870A2, 0x800870A3, 0xC00870A4)
@@ -270,7 +272,7 @@ def test_ioctl_numbers_and_layouts_are_those_of_the_header() -> None:
     assert FETCH_DATA.size == 64
 
 
-def test_both_edges_are_found_in_what_the_kernel_hands_over() -> None:
+def test_both_edges_are_read_from_the_kernel_structure() -> None:
     """A struct pps_fdata laid out by hand, offset by offset."""
     answer = bytearray(64)
     struct.pack_into("<II", answer, 0, 17, 16)
@@ -290,7 +292,7 @@ def test_both_edges_are_found_in_what_the_kernel_hands_over() -> None:
         (10, 10, True, ("assert", 5)),  # a driver that counts later than it wakes
     ],
 )
-def test_dcd_edge_at_wake_up(before: int, changes: int, carrier: bool, expected: tuple[str, int]) -> None:
+def test_a_dcd_edge_is_timed_at_wake_up(before: int, changes: int, carrier: bool, expected: tuple[str, int]) -> None:
     assert edge_at_wake_up(before, changes, carrier) == expected
 
 
@@ -301,8 +303,8 @@ def test_dcd_sequence_shows_a_missed_pulse() -> None:
     assert [first[1], second[1], after_one_missed[1]] == [5, 6, 8]
 
 
-def test_lines_that_are_no_edge_are_counted_as_refused(tmp_path: Path) -> None:
-    """A writer that says seconds where nanoseconds are wanted is no silence."""
+def test_lines_that_are_not_an_edge_are_counted_as_refused(tmp_path: Path) -> None:
+    """A writer that sends seconds instead of nanoseconds must not look silent."""
     path = tmp_path / "edges"
     path.write_text("1700000000.5 1\n1700000001000000000 2\n1700000001.5 3\n")
     session: Session[RawEdge] = Session(lambda: FixedPps(str(path)))

@@ -75,7 +75,7 @@ def found(recording: Recording) -> AlignedStart:
 
 @pytest.mark.parametrize("name", ["tactical", "mems"])
 @pytest.mark.parametrize("kinds", [(Kind.POSITION, Kind.VELOCITY), (Kind.POSITION,)], ids=["both", "positions"])
-def test_starts_anywhere_in_a_flight_are_as_good_as_they_say(name: str, kinds: tuple[Kind, ...]) -> None:
+def test_starts_anywhere_in_a_flight_are_as_accurate_as_their_sigmas(name: str, kinds: tuple[Kind, ...]) -> None:
     flight = reference(name)
     errors = []
     for begin in range(100_150, 101_700, 75):
@@ -93,7 +93,7 @@ def test_starts_anywhere_in_a_flight_are_as_good_as_they_say(name: str, kinds: t
     assert np.abs(each).max() < 4.0
 
 
-def test_seeds_spread_as_the_sigmas_say() -> None:
+def test_seeds_scatter_as_their_sigmas_predict() -> None:
     errors = []
     for seed in range(24):
         recording = made(winding((0.8, 0.1, 400.0)), 14.0, GRADES["mems"], seed, lever_arm_b=ARM, rate_hz=50.0)
@@ -103,7 +103,7 @@ def test_seeds_spread_as_the_sigmas_say() -> None:
     assert (spread < 1.42).all()
 
 
-def test_gyroscopes_that_feel_the_earth_turn_find_north_standing_still() -> None:
+def test_gyroscopes_that_sense_earth_rotation_find_north_at_rest() -> None:
     noise, errors = GRADES["navigation"], []
     for seed in range(5):
         recording = made(parked(72.0 * seed), 32.0, noise, seed, lever_arm_b=ARM, rate_hz=50.0)
@@ -116,7 +116,7 @@ def test_gyroscopes_that_feel_the_earth_turn_find_north_standing_still() -> None
     assert 0.4 < np.sqrt(np.mean(np.array(errors)[:, :2] ** 2)) < 1.5
 
 
-def test_gyroscopes_that_do_not_wait_for_motion_and_say_so() -> None:
+def test_gyroscopes_that_cannot_sense_earth_rotation_wait_for_motion_and_report_it() -> None:
     recording = made(parked(200.0), 64.0, GRADES["mems"], 3, lever_arm_b=ARM)
     with pytest.raises(AlignmentError, match=r"roll/pitch 0\.\d+° yet: waits for first motion") as refused:
         found(recording)
@@ -125,7 +125,7 @@ def test_gyroscopes_that_do_not_wait_for_motion_and_say_so() -> None:
     assert int(said[1]) > 90  # a bias of 25 °/h against 10 °/h of the earth tells nothing
 
 
-def test_noise_that_turns_along_does_not_pass_for_knowledge() -> None:
+def test_correlated_noise_is_not_taken_for_knowledge() -> None:
     parked_one = reference("mems").cut(100_010, 100_074)
     blocks = Blocks()
     blocks.feed(parked_one.inertial)
@@ -138,7 +138,7 @@ def test_noise_that_turns_along_does_not_pass_for_knowledge() -> None:
     assert np.degrees(fitted.sigma(TILT)[2]) > 15.0  # 11° if the residuals' noise were taken for motion
 
 
-def test_gnss_that_drifts_is_no_motion() -> None:
+def test_drifting_gnss_positions_are_not_taken_for_motion() -> None:
     ground = uav()
     begin = (int(ground.inertial.time_ns[0]) - BEGIN_NS) / 1e9
     with pytest.raises(AlignmentError, match="waits for first motion"):
@@ -178,7 +178,7 @@ def test_a_second_antenna_gives_the_heading_at_once(heading_deg: float) -> None:
     assert 0.4 < np.sqrt(np.mean(np.array(errors)[:, :3] ** 2)) < 1.5
 
 
-def test_a_straight_flight_has_its_course_for_heading_with_the_sigma_of_crabbing() -> None:
+def test_heading_of_a_straight_flight_is_its_course_with_the_sigma_of_crabbing() -> None:
     off = []
     for seed, crab in enumerate([-12.0, 3.0, 9.0]):
         recording = made(straight(crab), 34.0, GRADES["mems"], seed, lever_arm_b=ARM)
@@ -200,7 +200,7 @@ def test_a_straight_flight_has_its_course_for_heading_with_the_sigma_of_crabbing
     ],
     ids=["north pole", "south pole", "antimeridian", "equator"],
 )
-def test_the_ends_of_the_earth(place: tuple[float, float, float]) -> None:
+def test_alignment_works_at_the_poles_and_the_antimeridian(place: tuple[float, float, float]) -> None:
     errors = []
     for seed in range(4):
         recording = made(winding(place), 20.0, GRADES["tactical"], seed, lever_arm_b=np.array([0.8, -6.0, -1.2]))
@@ -211,7 +211,7 @@ def test_the_ends_of_the_earth(place: tuple[float, float, float]) -> None:
     assert 0.6 < np.sqrt(np.mean(np.array(errors) ** 2)) < 1.4
 
 
-def test_a_vehicle_that_backs_is_not_turned_round() -> None:
+def test_a_reversing_vehicle_is_not_turned_round() -> None:
     motion = winding((0.8, 0.1, 400.0), 8.0, reverse=True)
     for seed, sigma in enumerate([0.5, 0.9]):
         recording = made(motion, 34.0, GRADES["mems"], seed, lever_arm_b=ARM, sigma=(sigma, sigma), rate_hz=50.0)
@@ -220,7 +220,7 @@ def test_a_vehicle_that_backs_is_not_turned_round() -> None:
         assert np.abs(normalised(recording, start)).max() < 3.7
 
 
-def test_an_attitude_that_is_given_is_taken_and_carried_on() -> None:
+def test_a_given_attitude_is_used_and_propagated() -> None:
     recording = made(winding((0.8, 0.1, 400.0)), 20.0, GRADES["mems"], 5, lever_arm_b=ARM)
     assert recording.truth is not None
     rot = recording.truth(np.array([0.0]))[0][0]
@@ -233,7 +233,7 @@ def test_an_attitude_that_is_given_is_taken_and_carried_on() -> None:
     assert np.degrees(start.attitude_sigma_rad[2]) < 0.6
 
 
-def test_a_car_of_the_real_world_points_where_it_drives() -> None:
+def test_heading_of_a_real_car_matches_its_direction_of_travel() -> None:
     drive, off = car(), []
     begin = (int(drive.inertial.time_ns[0]) - BEGIN_NS) / 1e9
     speed = drive.only(Kind.VELOCITY)
@@ -250,7 +250,7 @@ def test_a_car_of_the_real_world_points_where_it_drives() -> None:
     assert np.abs(off).max() < 3.0
 
 
-def test_a_small_aeroplane_of_the_real_world_agrees_with_its_own_filter() -> None:
+def test_attitude_of_a_real_light_aircraft_matches_its_own_filter() -> None:
     flight = uav()
     assert flight.truth is not None
     off = []
@@ -284,7 +284,7 @@ def equal(a: Start, b: Start) -> bool:
     return a.time_ns == b.time_ns and all(np.array_equal(getattr(a, name), getattr(b, name)) for name in names)
 
 
-def test_how_data_are_cut_changes_nothing() -> None:
+def test_results_do_not_depend_on_how_data_are_cut() -> None:
     part = reference("mems").cut(100_138, 100_170)
     whole = feed(part, [], [True]).start
     assert whole is not None
@@ -308,7 +308,7 @@ def test_how_data_are_cut_changes_nothing() -> None:
         assert equal(each.start, whole)
 
 
-def test_a_gap_of_samples_begins_the_window_anew() -> None:
+def test_a_gap_of_samples_restarts_the_window() -> None:
     part = reference("tactical").cut(100_400, 100_440)
     inertial = part.inertial
     keep = (inertial.time_ns < ns(100_405.0)) | (inertial.time_ns > ns(100_407.0))
@@ -324,7 +324,7 @@ def test_a_gap_of_samples_begins_the_window_anew() -> None:
     assert np.abs(normalised(part, start)).max() < 4.0
 
 
-def test_one_bad_fix_does_no_harm() -> None:
+def test_a_single_bad_fix_is_harmless() -> None:
     part = reference("tactical").cut(100_400, 100_440)
     rows = part.rows.copy()
     place = np.flatnonzero(rows["kind"] == Kind.POSITION)
@@ -338,7 +338,7 @@ def test_one_bad_fix_does_no_harm() -> None:
     assert np.abs(normalised(part, aligner.start)).max() < 4.0
 
 
-def test_antenna_and_origin_are_told_apart() -> None:
+def test_antenna_and_body_origin_are_distinguished() -> None:
     part = reference("tactical").cut(100_700, 100_730)
     start = found(part)
     other = align(part.inertial, part.rows, replace(part.setup, lever_arms_b=np.zeros((1, 3))))
@@ -368,13 +368,13 @@ def states() -> list[tuple[Inertial, StructArray, str]]:
 
 
 @pytest.mark.parametrize("number", range(6))
-def test_what_is_missing_is_said(number: int) -> None:
+def test_missing_data_are_reported(number: int) -> None:
     inertial, rows, words = states()[number]
     with pytest.raises(AlignmentError, match=words):
         align(inertial, rows, reference("tactical").setup)
 
 
-def test_sigmas_of_a_start_grow_with_the_units_noise() -> None:
+def test_sigmas_of_a_start_grow_with_the_noise_of_the_imu() -> None:
     part = reference("tactical").cut(100_400, 100_440)
     rough = replace(part.setup, noise=replace(part.setup.noise, accel_bias=0.05, gyro_bias=1e-4))
     fine, coarse = found(part), align(part.inertial, part.rows, rough)

@@ -46,7 +46,7 @@ def samples() -> Inertial:
 
 
 def l_from_e(position_e: FloatArray) -> FloatArray:
-    """(3, 3) by another library."""
+    """Return the rotation (3, 3) computed by another library."""
     lon, lat, _ = np.radians(Transformer.from_crs(4978, 4979, always_xy=True).transform(*position_e))
     up = np.array([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
     east = np.array([-np.sin(lon), np.cos(lon), 0.0])
@@ -78,7 +78,7 @@ def start_at(since_s: float) -> Start:
 
 
 @pytest.mark.parametrize("velocities", [True, False])
-def test_it_is_where_the_truth_was(velocities: bool) -> None:
+def test_the_earlier_start_matches_the_truth(velocities: bool) -> None:
     found = earlier_start(samples(), observations(velocities=velocities), SETUP, start_at(15.0))
     true = start_at(0.2)
     assert found.time_ns == true.time_ns
@@ -87,7 +87,7 @@ def test_it_is_where_the_truth_was(velocities: bool) -> None:
     assert (np.abs(found.velocity_l - true.velocity_l) <= (1e-5 if velocities else found.velocity_sigma_l)).all()
 
 
-def test_its_sigmas_are_those_of_gnss_and_of_what_the_gyroscopes_drift() -> None:
+def test_sigmas_of_the_earlier_start_combine_gnss_and_gyroscope_drift() -> None:
     found = earlier_start(samples(), observations(velocities=True), SETUP, start_at(15.0))
     assert found.position_sigma_l == pytest.approx([0.03, 0.06, 0.09])
     drift = drift_rad(SETUP.noise, 14.8)
@@ -95,13 +95,13 @@ def test_its_sigmas_are_those_of_gnss_and_of_what_the_gyroscopes_drift() -> None
     assert drift_rad(imu_noise(3.0, 0.1, 4.0, 1.0), 3600.0) == pytest.approx(np.radians(5.0))
 
 
-def test_gyroscopes_that_drift_too_far_reach_back_less() -> None:
+def test_strongly_drifting_gyroscopes_reach_back_less() -> None:
     poor = replace(SETUP, noise=replace(SETUP.noise, gyro_bias=np.radians(0.4)))
     found = earlier_start(samples(), observations(velocities=True), poor, start_at(15.0))
     assert (START_NS + 15 * S - found.time_ns) / S == pytest.approx(4.8)
 
 
-def test_without_anything_earlier_it_stays() -> None:
+def test_without_earlier_samples_the_start_is_unchanged() -> None:
     start = start_at(0.1)
     assert earlier_start(samples(), observations(velocities=True), SETUP, start) is start
     assert earlier_start(samples(), observations(velocities=True)[:0], SETUP, start_at(9.0)).time_ns == START_NS + 9 * S

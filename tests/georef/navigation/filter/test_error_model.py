@@ -93,7 +93,7 @@ def off_by(x: FloatArray, error: FloatArray) -> FloatArray:
 
 
 @pytest.mark.parametrize("place", PLACES.values(), ids=PLACES.keys())
-def test_the_transition_is_the_difference_quotient_of_strapdown(place: tuple[float, float]) -> None:
+def test_the_transition_matrix_matches_difference_quotients_of_the_strapdown(place: tuple[float, float]) -> None:
     """Over a step of 0.1 s in a steep turn: to 1e-3 of each block's largest element.
 
     Of what is second order in the step to a tenth: the force is taken for even within it.
@@ -147,8 +147,8 @@ REFERENCE_E = e_from_geodetic(0.82, 0.15, 1200.0)
 
 @pytest.mark.parametrize("antenna", [0, 1])
 @pytest.mark.parametrize("kind", OBSERVED, ids=lambda kind: kind.name)
-def test_each_observations_derivatives_are_difference_quotients(kind: Kind, antenna: int) -> None:
-    """Of all errors, installation's and receiver's too."""
+def test_derivatives_of_each_observation_match_difference_quotients(kind: Kind, antenna: int) -> None:
+    """Compare for all errors, including those of installation and receiver."""
     rng = np.random.default_rng(5)
     x = state_at(*PLACES["mid-latitude"], rng)
     angle, push = np.array([2e-3, -1e-3, 2.5e-3]), np.array([0.005, -0.01, -0.046])
@@ -176,7 +176,7 @@ def test_each_observations_derivatives_are_difference_quotients(kind: Kind, ante
 TURNING = 1e-4  # velocity by position: north and east turn with it; by attitude: the earth's turn of the lever arm
 
 
-def test_covariance_is_propagated_as_dense_matrices_would() -> None:
+def test_covariance_propagation_matches_dense_matrices() -> None:
     """Φ P Φᵀ, and two steps' Φ as their product."""
     rng = np.random.default_rng(1)
     n, core = LAYOUT.size, LAYOUT.core
@@ -201,7 +201,7 @@ def test_covariance_is_propagated_as_dense_matrices_would() -> None:
     np.testing.assert_allclose(np.diag(total_decay)[MOVED:, MOVED:], whole[MOVED:, MOVED:], rtol=1e-12)
 
 
-def test_noise_of_a_step_is_that_of_a_walk_drawn_many_times() -> None:
+def test_process_noise_matches_the_covariance_of_sampled_random_walks() -> None:
     """White rates and forces over 0.5 s of constant specific force: covariance of 20 000 draws, to 3 %."""
     rng = np.random.default_rng(8)
     sums = np.zeros(LAYOUT.sums_size)

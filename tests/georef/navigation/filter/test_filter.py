@@ -39,7 +39,7 @@ GOOD = Fixes(velocity_mps=0.03)
 
 
 @pytest.mark.parametrize("name", ["tactical", "mems"])
-def test_the_reference_flight_is_filtered_as_well_as_by_others(name: str) -> None:
+def test_the_reference_flight_is_filtered_as_accurately_as_published(name: str) -> None:
     """Positions only; each figure against the README's filter, to a tenth; the outages' too, to 15 %."""
     flown, start = reference(name), start_of("reference_flight", name)
     rows = flown.only(Kind.POSITION)
@@ -54,7 +54,7 @@ def test_the_reference_flight_is_filtered_as_well_as_by_others(name: str) -> Non
     assert of_maxima(t, np.linalg.norm(off[:, :3], axis=1), spans) < 1.15 * OUTAGES_M[name][0]
 
 
-def test_what_is_known_of_a_lasting_error_dies_away_as_the_error_does() -> None:
+def test_knowledge_of_a_correlated_error_decays_with_the_error() -> None:
     """Half a minute without observations: of the positions' error, and of the velocities', what decay leaves."""
     truth, noise = fly(survey(), 60.0, 50.0), GRADES["mems"]
     inertial, rows = noised(truth, noise, Fixes(share=0.5, tau_s=20.0, velocity_mps=0.03), ARM, 3)
@@ -69,7 +69,7 @@ def test_what_is_known_of_a_lasting_error_dies_away_as_the_error_does() -> None:
         np.testing.assert_allclose(end[first : first + 3], np.exp(-30.0 / tau_s) * there, rtol=1e-3)
 
 
-def test_however_the_input_is_cut_the_numbers_are_the_same() -> None:
+def test_results_do_not_depend_on_how_the_input_is_cut() -> None:
     """Sample by sample, with observations held back, or all at once: bit for bit."""
     truth = fly(survey(), 40.0, 100.0)
     inertial, rows = noised(truth, GRADES["tactical"], GOOD, ARM, 1)
@@ -95,7 +95,7 @@ def test_however_the_input_is_cut_the_numbers_are_the_same() -> None:
             np.testing.assert_array_equal(mine, theirs)
 
 
-def test_the_first_covariance_is_what_the_starts_sigmas_say() -> None:
+def test_the_first_covariance_equals_the_sigmas_of_the_start() -> None:
     """Nose up, banked, heading west, near a pole: by what each angle, and each step north, east, down, changes."""
     setup = setup_for(GRADES["tactical"], ARM)
     place, angles = e_from_geodetic(1.4, -2.0, 3000.0), np.array([0.4, 0.7, 4.5])
@@ -119,7 +119,7 @@ def test_the_first_covariance_is_what_the_starts_sigmas_say() -> None:
     np.testing.assert_allclose(np.diag(found)[9:], rest**2)
 
 
-def test_what_comes_too_late_is_told() -> None:
+def test_late_observations_are_counted() -> None:
     truth = fly(survey(), 20.0, 100.0)
     inertial, rows = noised(truth, GRADES["tactical"], GOOD, ARM, 2)
     live = NavigationFilter(setup_for(GRADES["tactical"], ARM), drawn_start(truth, 2), smoothed=False)
@@ -134,7 +134,7 @@ def test_what_comes_too_late_is_told() -> None:
 
 
 def bad_rows(rows: StructArray) -> StructArray:
-    """One of each kind of bad luck."""
+    """Return one observation of each kind of fault."""
     bad = rows[:7].copy()
     bad["value"][0, 1] = np.nan
     bad["sigma"][1] = np.nan
@@ -147,7 +147,7 @@ def bad_rows(rows: StructArray) -> StructArray:
 
 
 def test_every_observation_has_a_fate() -> None:
-    """What cannot be used is told so, a jump is refused, a larger error inflated; and the state is none the worse."""
+    """Unusable observations are reported, jumps refused, larger errors inflated; the state is unaffected."""
     truth = fly(survey(), 60.0, 100.0)
     inertial, rows = noised(truth, GRADES["tactical"], Fixes(), ARM, 3)
     rows["value"][30] += [3.0, -4.0, 1.0]
@@ -174,7 +174,7 @@ def test_every_observation_has_a_fate() -> None:
     assert np.isfinite(told["chi2"][told["fate"] < Fate.UNUSABLE]).all()
 
 
-def test_a_position_that_jumps_for_good_is_taken_in_the_end() -> None:
+def test_a_permanent_position_jump_is_accepted_after_half_a_minute() -> None:
     """A base station set wrong by 20 m: refused for half a minute, as long as a wrong fix may last, then taken."""
     truth = fly(survey(), 90.0, 100.0)
     inertial, rows = noised(truth, GRADES["tactical"], Fixes(), ARM, 4)
@@ -191,7 +191,7 @@ def test_a_position_that_jumps_for_good_is_taken_in_the_end() -> None:
     np.testing.assert_allclose(off, [10.0, 10.0, 14.0], atol=0.3)
 
 
-def test_a_receiver_whose_sigmas_are_too_small_is_not_shut_out() -> None:
+def test_a_receiver_with_too_small_sigmas_is_not_refused_for_long() -> None:
     """Sigmas a third of the errors: nothing is refused for long, and the result is what the errors allow."""
     truth = fly(survey(), 120.0, 100.0)
     inertial, rows = noised(truth, GRADES["tactical"], Fixes(sigma_m=(0.06, 0.06, 0.12)), ARM, 5)
@@ -204,8 +204,8 @@ def test_a_receiver_whose_sigmas_are_too_small_is_not_shut_out() -> None:
     assert (rms(off[3000:, :3]) < [0.05, 0.05, 0.08]).all()
 
 
-def test_missing_samples_are_seen_and_made_good_by_the_next() -> None:
-    """20 ms missing that nobody has bridged: counted, marked, and no fix suffers."""
+def test_missing_samples_are_counted_and_bridged_by_the_next() -> None:
+    """Lose 20 ms of samples that are not bridged: they are counted and marked, and no fix is refused."""
     truth = fly(survey(), 30.0, 100.0)
     inertial, rows = noised(truth, GRADES["tactical"], Fixes(), ARM, 6)
     kept = np.r_[0:1500, 1502:3000]
@@ -222,7 +222,7 @@ def test_missing_samples_are_seen_and_made_good_by_the_next() -> None:
     assert np.isin(run.innovations["fate"], [Fate.TAKEN, Fate.INFLATED]).all()
 
 
-def test_hours_of_perfect_fixes_leave_the_covariance_positive() -> None:
+def test_the_covariance_stays_positive_after_hours_of_perfect_fixes() -> None:
     """Standing still for three hours with a perfect unit and fixes of 0.1 mm: symmetric, and positive."""
     noise, seconds = ImuNoise(1e-9, 1e-9, 1e-10, 1e-9, 3600.0, 1e-8, 1e-8), 10_800
     lat, lon = np.radians(47.0), np.radians(8.0)
@@ -246,7 +246,7 @@ def test_hours_of_perfect_fixes_leave_the_covariance_positive() -> None:
     assert np.linalg.eigvalsh(p / np.outer(scale, scale)).min() > -1e-9
 
 
-def test_a_real_flight_with_metres_of_gps_runs_through() -> None:
+def test_a_real_flight_with_metre_level_gps_is_processed() -> None:
     """The UAV: what its GPS jumps by is counted, all else taken, and the filter's attitude is near the on-board one."""
     flown = uav()
     assert flown.truth is not None
@@ -269,7 +269,7 @@ def test_a_real_flight_with_metres_of_gps_runs_through() -> None:
     assert np.sqrt(np.mean(position["value"][:, :2] ** 2)) < 3.0
 
 
-def test_a_live_filter_does_not_keep_what_it_told() -> None:
+def test_a_live_filter_keeps_only_the_latest_innovations() -> None:
     """Only the latest innovations stay, and yet all are counted, as where they are kept."""
     truth = fly(survey(), 60.0, 100.0)
     inertial, rows = noised(truth, GRADES["tactical"], Fixes(rate_hz=100.0), ARM, 2)

@@ -34,7 +34,7 @@ ARM = np.array([0.35, -0.12, -1.1])
 
 
 @pytest.mark.parametrize("name", ["tactical", "mems"])
-def test_the_reference_flight_is_smoothed_as_well_as_can_be(name: str) -> None:
+def test_the_reference_flight_is_smoothed_as_accurately_as_published(name: str) -> None:
     """Positions only; each figure within a tenth of the README's smoother, in outages too."""
     flown, start = reference(name), start_of("reference_flight", name)
     rows = flown.only(Kind.POSITION)
@@ -94,7 +94,7 @@ def rauch_tung_striebel(run: FilterRun) -> tuple[FloatArray, FloatArray]:
     return out, variance
 
 
-def test_the_adjoint_form_is_the_smoother_of_rauch_tung_and_striebel() -> None:
+def test_the_adjoint_smoother_equals_rauch_tung_striebel() -> None:
     """With everything estimated, across an outage of 15 s: errors and sigmas of the formulas with inverses."""
     run = flown(1, estimate_lever_arm=0.1, estimate_time_offset_s=0.01, gnss_correlated_share=0.4)
     errors_there, variance = rauch_tung_striebel(run)
@@ -107,7 +107,7 @@ def test_the_adjoint_form_is_the_smoother_of_rauch_tung_and_striebel() -> None:
     np.testing.assert_allclose(learnt / size[:, 9:21], errors_there[:, 9:21] / size[:, 9:21], rtol=0, atol=1e-4)
 
 
-def test_a_start_off_its_mean_is_as_one_begun_there() -> None:
+def test_a_start_off_its_mean_equals_one_begun_there() -> None:
     """Begun 50 µrad off what was known before, and told: states to a hundredth of a sigma, sigmas to a thousandth."""
     keys: dict[str, Any] = {"estimate_time_offset_s": 0.01, "gnss_correlated_share": 0.4}
     there, off = flown(1, **keys), np.array([5e-5, -3e-5, 4e-5])
@@ -125,7 +125,7 @@ def test_a_start_off_its_mean_is_as_one_begun_there() -> None:
     np.testing.assert_allclose(found.separation[:, 6:], expected.separation[:, 6:], rtol=0, atol=1e-2 * least)
 
 
-def test_a_sensor_without_errors_does_no_harm() -> None:
+def test_a_sensor_without_errors_is_harmless() -> None:
     """Scale factors known perfectly: their covariance is singular, which a smoother with inverses could not bear."""
     truth = fly(survey(), 40.0, 50.0)
     noise = replace(GRADES["tactical"], gyro_scale=0.0, accel_scale=0.0)
@@ -137,7 +137,7 @@ def test_a_sensor_without_errors_does_no_harm() -> None:
     assert (rms(off[:, :3]) < 0.02).all()
 
 
-def test_between_nodes_the_path_is_smooth() -> None:
+def test_the_path_between_nodes_is_smooth() -> None:
     """No step at a node, where the filter jumps: what the position moves by in a sample is the velocity there."""
     run = flown(3)
 
@@ -149,7 +149,7 @@ def test_between_nodes_the_path_is_smooth() -> None:
     assert steps(smooth(run)) < 2e-4
 
 
-def test_parts_of_a_run_are_the_whole() -> None:
+def test_parts_of_a_run_equal_the_whole() -> None:
     """A long flight is written piece by piece."""
     run = flown(4)
     nodes = smooth_nodes(run)
@@ -161,7 +161,7 @@ def test_parts_of_a_run_are_the_whole() -> None:
         )
 
 
-def test_forward_and_smoothed_differ_by_as_much_as_they_say() -> None:
+def test_forward_and_smoothed_solutions_differ_as_their_sigmas_predict() -> None:
     """Separation over its own sigma, √(P forward − P smoothed), over the whole flight: near 1."""
     ratios = []
     for seed in range(8):

@@ -57,7 +57,7 @@ def at_rest(
     ("lat_deg", "lon_deg", "height_m"),
     [(90.0, 0.0, 30.0), (-90.0, 0.0, 2800.0), (89.9999999, 120.0, 0.0), (47.0, 180.0, 500.0), (-20.0, 8.0, 6000.0)],
 )
-def test_at_rest_it_stays(lat_deg: float, lon_deg: float, height_m: float) -> None:
+def test_a_unit_at_rest_stays_in_place(lat_deg: float, lon_deg: float, height_m: float) -> None:
     """Ten minutes: Bowring's step, 1e-11 of gravity, moves it by micrometres."""
     inertial, state = at_rest(lat_deg, lon_deg, height_m, 600.0, 50.0)
     end = navigate(inertial, state)[-1]
@@ -66,7 +66,7 @@ def test_at_rest_it_stays(lat_deg: float, lon_deg: float, height_m: float) -> No
     assert np.abs(end[6:] - state[6:10]).max() < 1e-11
 
 
-def test_around_the_pole_it_keeps_its_circle() -> None:
+def test_a_circle_around_the_pole_stays_a_circle() -> None:
     """A minute on a circle of 100 m around the pole: longitude runs through everything, position does not care."""
     path = circling_the_pole(60.0, 100.0, 0.2, 6_356_752.3)
     edges = np.arange(12_001) / 200.0
@@ -78,7 +78,7 @@ def test_around_the_pole_it_keeps_its_circle() -> None:
     assert np.abs(found[3:6] - end.velocity_e[0]).max() < 1e-4
 
 
-def test_a_flight_comes_out_as_flown() -> None:
+def test_a_flight_is_reproduced_from_its_increments() -> None:
     """Two minutes with turns and a shaking fuselage: what is left is of the two-sample algorithms' order."""
     truth = fly(survey(), 120.0, 200.0)
     start = drawn_start(truth, 0, position_m=0.0, velocity_mps=0.0, attitude_rad=(0.0, 0.0, 0.0))
@@ -89,7 +89,7 @@ def test_a_flight_comes_out_as_flown() -> None:
     assert np.abs(off[:, 6:]).max() < 1e-7
 
 
-def test_coning_is_made_good() -> None:
+def test_coning_is_compensated() -> None:
     """A cone of 1° at 5 Hz; with φ the cone's turn in a sample, Ω a²/2 (1 − sin φ / φ) is 4e-4 rad in 20 s.
 
     The body's z axis goes round a cone, which q(t) = (cos a/2, sin a/2 cos Ωt, sin a/2 sin Ωt, 0) describes
@@ -115,7 +115,7 @@ def test_coning_is_made_good() -> None:
 
 
 @pytest.mark.parametrize("what", ["accelerometer", "tilt", "gyroscope"])
-def test_an_hour_of_schuler_oscillation(what: str) -> None:
+def test_an_hour_shows_schuler_oscillation(what: str) -> None:
     """On the equator, northward, tilt θ (nose down) and heading ψ: dx = v, dv = g θ + b, dθ = ε − v / M + Ω ψ,
     dψ = −Ω (θ + x / M), solved by the matrix exponential; but for Ω it is b / ω² (1 − cos ωt) and its like."""
     lat, lon = np.zeros(1), np.array([3.0])
@@ -149,7 +149,7 @@ def test_an_hour_of_schuler_oscillation(what: str) -> None:
 
 
 @pytest.mark.filterwarnings("ignore:The copy keyword")
-def test_three_minutes_as_pyins_navigates_them() -> None:
+def test_three_minutes_match_pyins() -> None:
     """The same increments of the reference flight; its gravity is another above the ground, by 3e-6 m/s²."""
     flown = reference("tactical").cut(100_700.0, 100_880.0)
     true = reference("tactical").truth
