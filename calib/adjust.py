@@ -52,7 +52,7 @@ _NO_PRIOR = (
 def adjust(
     flight: Flight,
     features: Features,
-    wish: ParameterOptions,
+    options: ParameterOptions,
     prior: TrajectoryPrior | None = None,
     settings: Settings = AS_USUAL,
     start: Mapping[str, Calibration] | None = None,
@@ -66,7 +66,7 @@ def adjust(
     Args:
         flight: returns and trajectories.
         features: observed planes, tie points and control.
-        wish: which parameters to estimate.
+        options: which parameters to estimate.
         prior: prior of trajectory errors; None: the trajectory's sigmas count as noise of single returns, and a note
             reports that.
         settings: settings of the solver.
@@ -82,11 +82,11 @@ def adjust(
         where the global test rejects and that factor is above 1; they include the plausible errors of held parameters.
 
     Raises:
-        ParameterError: the wish cannot be met; NormalError: nothing can be solved.
+        ParameterError: the options cannot be met; NormalError: nothing can be solved.
     """
     if not features.planes and not features.ties:
         raise NormalError("the flight has neither planes nor tie points to adjust; use strips that overlap over roofs")
-    asked, placed_with = unknowns(flight, wish, start, first, doubted), None
+    asked, placed_with = unknowns(flight, options, start, first, doubted), None
     found: Solved | None = None
     for matching in range(1, settings.matchings + 1):
         before = found
@@ -107,7 +107,7 @@ def adjust(
 def predict(
     flight: Flight,
     features: Features,
-    wish: ParameterOptions,
+    options: ParameterOptions,
     prior: TrajectoryPrior | None = None,
     settings: Settings = AS_USUAL,
     start: Mapping[str, Calibration] | None = None,
@@ -120,7 +120,7 @@ def predict(
     Raises:
         ParameterError, NormalError: see `adjust`.
     """
-    block = determined(Block.of(flight, features, unknowns(flight, wish, start), prior, None), settings)
+    block = determined(Block.of(flight, features, unknowns(flight, options, start), prior, None), settings)
     state, weights, asked = block.start(), block.weights(), block.rows.unknowns
     equations = block.normals(state, weights)
     p, covariance = equations.parameters, equations.covariance()

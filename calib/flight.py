@@ -104,7 +104,7 @@ class Swath:
         name: for display, as ``03`` or ``left 03``.
         head: index in `Flight.heads`.
         strip: its number.
-        flown: index in `Flight.trajectories`.
+        trajectory_index: index in `Flight.trajectories`.
         rows: (n,) `RETURN_DTYPE`, in the order of their times.
         time_ns: (n,) GPS time of emission by the scanner's stamps.
         points_t: (n, 3) as placed by `Flight.place` with the calibrations in use.
@@ -114,7 +114,7 @@ class Swath:
     name: str
     head: int
     strip: int
-    flown: int
+    trajectory_index: int
     rows: StructArray
     time_ns: Int64Array
     points_t: FloatArray
@@ -144,7 +144,7 @@ class Flight:
 
     def rays(self, swath: Swath, calibration: Calibration, at: Rows = slice(None), *, with_axes: bool = True) -> Rays:
         """Compute rays of a swath's returns with a calibration (`swath.georef.scanner.sensor_model`) and air."""
-        head, trajectory = self.heads[swath.head], self.trajectories[swath.flown]
+        head, trajectory = self.heads[swath.head], self.trajectories[swath.trajectory_index]
         model = head.model(calibration)
         count = len(swath.time_ns[at])
         rate = np.zeros(count) if swath.encoder_rate is None else swath.encoder_rate[at]
@@ -183,6 +183,6 @@ class Flight:
 
 def sensor_t(flight: Flight, swath: Swath, at: Int64Array) -> FloatArray:
     """Return the scanner's approximate positions (n, 3) at returns: the body's origin at the next epoch."""
-    trajectory = flight.trajectories[swath.flown]
+    trajectory = flight.trajectories[swath.trajectory_index]
     epoch = np.minimum(np.searchsorted(trajectory.time_ns, swath.time_ns[at]), len(trajectory) - 1)
     return flight.frame.t_from_e(trajectory.position_e[epoch])

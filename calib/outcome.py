@@ -120,14 +120,14 @@ class TrajectoryFit:
     """Corrections of the trajectory, estimated along with the parameters (k knots).
 
     Attributes:
-        flown: (k,) index of the trajectory.
+        trajectory_index: (k,) index of the trajectory.
         time_ns: (k,).
         strip: (k,) number; 0: between strips.
         position_l: (k, 3) north, east, down, metres; attitude_rad: (k, 3) small turns about n, e, d.
         position_sigma_l, attitude_sigma_rad: (k, 3) after the adjustment; prior_…: before.
     """
 
-    flown: Int64Array
+    trajectory_index: Int64Array
     time_ns: Int64Array
     strip: Int64Array
     position_l: FloatArray

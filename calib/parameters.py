@@ -40,7 +40,7 @@ INSTALLED: Mapping[str, float] = {f"lever_arm_{axis}_m": 0.002 for axis in "xyz"
 
 
 class ParameterError(ValueError):
-    """A wish that cannot be met; the message is one line for the user."""
+    """Options of a parameter that cannot be met; the message is one line for the user."""
 
 
 @dataclass(frozen=True)
@@ -268,7 +268,7 @@ class Unknowns:
 
 def unknowns(
     flight: Flight,
-    wish: ParameterOptions,
+    options: ParameterOptions,
     start: Mapping[str, Calibration] | None = None,
     first: Mapping[str, Calibration] | None = None,
     doubted: Mapping[str, float] | None = None,
@@ -277,55 +277,55 @@ def unknowns(
 
     Args:
         flight: flight with the heads.
-        wish: which parameters to estimate.
+        options: which parameters to estimate.
         start: calibrations to start from, by scanner; None: the heads' own. Held parameters keep their values.
         first: by scanner, boresight angles from which iterations begin; None: from the start.
         doubted: by name, as ``left.kappa_rad``, least sigma (SI) of its start where it is held.
 
     Raises:
-        ParameterError: the wish names an unknown parameter, or one that such a scanner does not have.
+        ParameterError: the options name an unknown parameter, or one that such a scanner does not have.
     """
-    check_wish(flight, wish)
+    check_options(flight, options)
     bases, items, held, considered = [], [], [], []
     for index, head in enumerate(flight.heads):
         calibration = head.start if start is None else start[head.name]
-        base = _with_knots(replace(calibration, scanner=head.name), wish)
+        base = _with_knots(replace(calibration, scanner=head.name), options)
         bases.append(base)
         for parameter in PARAMETERS:
-            name, word = parameter.name, _word(head, parameter.name, wish)
+            name, word = parameter.name, _word(head, parameter.name, options)
             near = np.nan if first is None or name not in ANGLES else first[head.name].value(name)
-            plausible = max(_plausible(head, base, name, wish), (doubted or {}).get(f"{head.name}.{name}", 0.0))
+            plausible = max(_plausible(head, base, name, options), (doubted or {}).get(f"{head.name}.{name}", 0.0))
             known = Unknown(index, INDEX[name], 0, f"{head.name}.{name}", base.value(name), plausible=plausible)
             if word is None:
-                items.append(replace(known, prior_sigma=_prior(head, name, wish), first=near))
+                items.append(replace(known, prior_sigma=_prior(head, name, options), first=near))
                 continue
             if plausible > 0.0:
                 considered.append(known)
-            if name in MODELS[wish.model] or _asked(head, name, wish) == "fix":
+            if name in MODELS[options.model] or _asked(head, name, options) == "fix":
                 held.append(FixedParameter(head.name, name, word))
-        items += _extras(index, head, base, wish)
-    knots = np.array(wish.ibrc_knots, dtype=np.float64)
-    return Unknowns(tuple(bases), tuple(items), tuple(held), knots, wish.ibrc_smoothness_m, tuple(considered))
+        items += _extras(index, head, base, options)
+    knots = np.array(options.ibrc_knots, dtype=np.float64)
+    return Unknowns(tuple(bases), tuple(items), tuple(held), knots, options.ibrc_smoothness_m, tuple(considered))
 
 
-def _asked(head: Head, name: str, wish: ParameterOptions) -> str:
+def _asked(head: Head, name: str, options: ParameterOptions) -> str:
     """Return ``fix``, ``free``, ``prior`` or an empty string, the user's setting for this head or else for all."""
     for key in (f"{head.name}.{name}", name):
-        for word, names in (("fix", wish.fix), ("prior", wish.priors), ("free", wish.free)):
+        for word, names in (("fix", options.fix), ("prior", options.priors), ("free", options.free)):
             if key in names:
                 return word
     return ""
 
 
-def _prior(head: Head, name: str, wish: ParameterOptions) -> float:
-    if _asked(head, name, wish) == "free":
+def _prior(head: Head, name: str, options: ParameterOptions) -> float:
+    if _asked(head, name, options) == "free":
         return np.inf
-    return wish.priors.get(f"{head.name}.{name}", wish.priors.get(name, np.inf))
+    return options.priors.get(f"{head.name}.{name}", options.priors.get(name, np.inf))
 
 
-def _word(head: Head, name: str, wish: ParameterOptions) -> str | None:
+def _word(head: Head, name: str, options: ParameterOptions) -> str | None:
     """Return why a parameter is not estimated; None: it is estimated."""
-    asked = _asked(head, name, wish)
+    asked = _asked(head, name, options)
     if name in head.geometry.without:
         if asked in ("free", "prior"):
             raise ParameterError(f"{head.name}.{name}: cannot be estimated, because this scanner has no such parameter")
@@ -336,10 +336,10 @@ def _word(head: Head, name: str, wish: ParameterOptions) -> str | None:
         return None
     if name == _BY_CONVENTION:
         return "held by convention, because it cannot be separated from the boresight; free it by name to estimate it"
-    return None if name in MODELS[wish.model] else "not in the model"
+    return None if name in MODELS[options.model] else "not in the model"
 
 
-def _plausible(head: Head, base: Calibration, name: str, wish: ParameterOptions) -> float:
+def _plausible(head: Head, base: Calibration, name: str, options: ParameterOptions) -> float:
     """Return one sigma, SI, by which a parameter may be wrong while it is held; 0: the value is exact.
 
     The user's sigma counts first, then the one of an earlier calibration, then the plausible one. By convention the
@@ -348,7 +348,7 @@ def _plausible(head: Head, base: Calibration, name: str, wish: ParameterOptions)
     """
     if name in head.geometry.without:
         return 0.0
-    prior = wish.priors.get(f"{head.name}.{name}", wish.priors.get(name))
+    prior = options.priors.get(f"{head.name}.{name}", options.priors.get(name))
     if prior is not None:
         return prior
     if name == _BY_CONVENTION:
@@ -356,33 +356,33 @@ def _plausible(head: Head, base: Calibration, name: str, wish: ParameterOptions)
     stated = 0.0 if base.method == "nominal" else float(base.all_sigmas[INDEX[name]])
     if stated > 0.0:
         return stated
-    if name in _SCANNER or name in MODELS[wish.model] or _asked(head, name, wish):
+    if name in _SCANNER or name in MODELS[options.model] or _asked(head, name, options):
         return PARAMETERS[INDEX[name]].plausible
     return INSTALLED.get(name, 0.0)
 
 
-def _extras(index: int, head: Head, base: Calibration, wish: ParameterOptions) -> Iterator[Unknown]:
+def _extras(index: int, head: Head, base: Calibration, options: ParameterOptions) -> Iterator[Unknown]:
     for kind, word, numbers in (
-        (SLOT, "range_offset_slot", wish.range_offset_slots),
-        (ZONE, "range_offset_zone", wish.range_offset_zones),
+        (SLOT, "range_offset_slot", options.range_offset_slots),
+        (ZONE, "range_offset_zone", options.range_offset_zones),
     ):
         for number in numbers:
             name = f"{word}.{number}"
             value = sum(row.offset_m for row in base.range_offsets if _is_own(row, kind, number))
-            yield Unknown(index, kind, number, f"{head.name}.{name}", value, _prior(head, name, wish))
-    if wish.ibrc_knots and base.ibrc is not None:
+            yield Unknown(index, kind, number, f"{head.name}.{name}", value, _prior(head, name, options))
+    if options.ibrc_knots and base.ibrc is not None:
         for knot, value in enumerate(base.ibrc[1].tolist()):
-            if knot != _reference(wish):
+            if knot != _reference(options):
                 name = f"ibrc.{knot}"
-                yield Unknown(index, KNOT, knot, f"{head.name}.{name}", value, _prior(head, name, wish))
-    if wish.beams and _spins(head):
+                yield Unknown(index, KNOT, knot, f"{head.name}.{name}", value, _prior(head, name, options))
+    if options.beams and _spins(head):
         for channel in range(1, len(head.geometry.deflection(base).table)):
             for part, kind in BEAM_PARTS.items():
-                if part in wish.beams:
+                if part in options.beams:
                     name = f"beam.{channel}.{part}"
                     value = getattr(base.beams.get(channel, BeamCorrection()), part)
                     yield Unknown(
-                        index, kind, channel, f"{head.name}.{name}", value, _prior(head, f"beam.{part}", wish)
+                        index, kind, channel, f"{head.name}.{name}", value, _prior(head, f"beam.{part}", options)
                     )
 
 
@@ -401,36 +401,36 @@ def _put_offset(offsets: list[RangeOffset], item: Unknown, value: float) -> None
     offsets[:] = [row for row in offsets if not _is_own(row, item.kind, item.argument)] + [own]
 
 
-def _reference(wish: ParameterOptions) -> int:
+def _reference(options: ParameterOptions) -> int:
     """Return the index of the knot whose correction is 0."""
-    if wish.ibrc_reference is None:
-        return len(wish.ibrc_knots) // 2
-    return int(np.argmin(np.abs(np.array(wish.ibrc_knots) - wish.ibrc_reference)))
+    if options.ibrc_reference is None:
+        return len(options.ibrc_knots) // 2
+    return int(np.argmin(np.abs(np.array(options.ibrc_knots) - options.ibrc_reference)))
 
 
-def _with_knots(calibration: Calibration, wish: ParameterOptions) -> Calibration:
-    """Return a calibration whose correction by intensity is at the wish's knots and 0 at the reference.
+def _with_knots(calibration: Calibration, options: ParameterOptions) -> Calibration:
+    """Return a calibration whose correction by intensity is at the knots of the options and 0 at the reference.
 
     The correction at the reference moves to the range offset.
     """
-    if not wish.ibrc_knots:
+    if not options.ibrc_knots:
         return calibration
-    knots = np.array(wish.ibrc_knots, dtype=np.float64)
+    knots = np.array(options.ibrc_knots, dtype=np.float64)
     if calibration.ibrc is None:
         return replace(calibration, ibrc=(knots, np.zeros(len(knots))))
     values = np.interp(knots, *calibration.ibrc)
-    away = float(values[_reference(wish)])
+    away = float(values[_reference(options)])
     moved = calibration.changed(range_offset_m=calibration.value("range_offset_m") - away)
     return replace(moved, ibrc=(knots, values - away))
 
 
-def check_scanners(scanners: Sequence[str], wish: ParameterOptions) -> None:
-    """Refuse a wish that names a scanner that is not among these names.
+def check_scanners(scanners: Sequence[str], options: ParameterOptions) -> None:
+    """Refuse options that name a scanner that is not among these names.
 
     Raises:
         ParameterError: with the name and the scanners there are.
     """
-    for name in sorted({*wish.fix, *wish.free, *wish.priors}):
+    for name in sorted({*options.fix, *options.free, *options.priors}):
         scanner, dot, _ = name.partition(".")
         if dot and scanner not in scanners and not name.startswith(EXTRA):
             raise ParameterError(
@@ -438,29 +438,29 @@ def check_scanners(scanners: Sequence[str], wish: ParameterOptions) -> None:
             )
 
 
-def check_wish(flight: Flight, wish: ParameterOptions) -> None:
-    """Refuse a wish with unknown names or impossible values before any long computation starts.
+def check_options(flight: Flight, options: ParameterOptions) -> None:
+    """Refuse options with unknown names or impossible values before any long computation starts.
 
     Raises:
         ParameterError: with the name and the values that are possible.
     """
-    if wish.model not in MODELS:
-        raise ParameterError(f"model: got {wish.model!r}, want one of {', '.join(MODELS)}")
+    if options.model not in MODELS:
+        raise ParameterError(f"model: got {options.model!r}, want one of {', '.join(MODELS)}")
     heads = [head.name for head in flight.heads]
-    check_scanners(heads, wish)
+    check_scanners(heads, options)
     known = set(INDEX) | {f"{head}.{name}" for head in heads for name in INDEX}
-    for name in sorted({*wish.fix, *wish.free} - known):
+    for name in sorted({*options.fix, *options.free} - known):
         raise ParameterError(
             f"{name}: unknown parameter; use one of {', '.join(INDEX)}, or the same with {heads[0]}. before it"
         )
-    for name, sigma in wish.priors.items():
+    for name, sigma in options.priors.items():
         if name not in known and not name.split(".", 1)[-1].startswith(EXTRA) and not name.startswith(EXTRA):
             raise ParameterError(f"prior {name}: unknown parameter; use one of {', '.join(INDEX)}")
         if not sigma > 0.0:
             raise ParameterError(f"prior {name}: got {sigma:g}, want a sigma above 0")
-    if wish.ibrc_knots and (len(wish.ibrc_knots) < 2 or bool((np.diff(wish.ibrc_knots) <= 0.0).any())):
+    if options.ibrc_knots and (len(options.ibrc_knots) < 2 or bool((np.diff(options.ibrc_knots) <= 0.0).any())):
         raise ParameterError("ibrc_knots: needs at least two increasing intensities")
-    for part in sorted(wish.beams - BEAM_PARTS.keys()):
+    for part in sorted(options.beams - BEAM_PARTS.keys()):
         raise ParameterError(f"beams: got {part!r}, want some of {', '.join(BEAM_PARTS)}")
-    if wish.beams and not any(_spins(head) for head in flight.heads):
+    if options.beams and not any(_spins(head) for head in flight.heads):
         raise ParameterError("beams: this flight has no spinning head on a rigid mount; leave beams out")

@@ -70,7 +70,7 @@ class Line:
     """A flight line: its trajectory, its number, and its begin and end (GPS time)."""
 
     name: str
-    flown: int
+    trajectory_index: int
     strip: int
     begin_ns: int
     end_ns: int
@@ -165,7 +165,7 @@ def planned(
     several = len(heads) > 1
     for line in lines:
         for number, (head, scan) in enumerate(zip(heads, scans, strict=True)):
-            shots, expected = _shots(frame, head, scan, trajectories[line.flown], line, surfaces)
+            shots, expected = _shots(frame, head, scan, trajectories[line.trajectory_index], line, surfaces)
             if not len(shots.time_ns):
                 continue
             for surface in np.unique(shots.surface).tolist():
@@ -204,7 +204,7 @@ def search_cell_m(scan: Scan, per_m2: FloatArray, speed_mps: float) -> float:
 def predict(
     flight: Flight,
     features: Features,
-    wish: ParameterOptions,
+    options: ParameterOptions,
     prior: TrajectoryPrior | None,
     settings: Settings = AS_USUAL,
 ) -> Predicted:
@@ -212,14 +212,14 @@ def predict(
 
     Args:
         flight, features: planned or flown.
-        wish: which parameters to estimate.
+        options: which parameters to estimate.
         prior: prior of the trajectory's errors.
         settings: settings of the adjustment, with its rules for which parameters count as determined.
 
     Raises:
         ParameterError, NormalError: see `swath.calib.adjust.predict`.
     """
-    left, covariance = adjustment.predict(flight, features, wish, prior, settings)
+    left, covariance = adjustment.predict(flight, features, options, prior, settings)
     sigmas = np.sqrt(np.diag(covariance))
     planes = [plane for plane in features.planes if plane.points]
     returns = sum(plane.points for plane in planes)
@@ -370,4 +370,4 @@ def _swath(name: str, head: int, line: Line, calibration: Calibration, scan: Sca
     rows["encoder_rad"] = shots.angle_rad / (1.0 + value("scan_angle_scale")) + value("scan_angle_offset_rad")
     rows["return_number"] = rows["number_of_returns"] = 1
     rate, acceleration = scan.encoder_motion(shots.angle_rad)
-    return Swath(name, head, line.strip, line.flown, rows, shots.time_ns, shots.points_t, rate, acceleration)
+    return Swath(name, head, line.strip, line.trajectory_index, rows, shots.time_ns, shots.points_t, rate, acceleration)

@@ -111,10 +111,10 @@ class PacketParser(Parser):
     """Base of parsers for datagrams and CAN frames, whose units are whole; a subclass implements `parse_units`.
 
     Attributes:
-        doubts: facts that the units leave uncertain, one line for the user each.
+        warnings: facts that the units leave uncertain, one line for the user each.
     """
 
-    doubts: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
     def feed(self, chunk: Chunk) -> list[Record]:
         """Parse one unit as a batch of one row."""

@@ -41,7 +41,7 @@ def rays_of(flight: Flight, swath: Swath, model: SensorModel, rows: Any, at: Int
     rays = model.rays(
         rows,
         swath.time_ns[at],
-        flight.trajectories[swath.flown],
+        flight.trajectories[swath.trajectory_index],
         encoder_rate=still if swath.encoder_rate is None else swath.encoder_rate[at],
         encoder_acceleration=still if swath.encoder_acceleration is None else swath.encoder_acceleration[at],
         with_axes=True,

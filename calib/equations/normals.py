@@ -88,7 +88,7 @@ class TrajectoryWeight:
         if prior is None:
             return
         for knot in range(count):
-            trajectory = rows.flight.trajectories[int(prior.flown[knot])]
+            trajectory = rows.flight.trajectories[int(prior.trajectory_index[knot])]
             epoch = min(int(np.searchsorted(trajectory.time_ns, prior.time_ns[knot])), len(trajectory) - 1)
             lat, lon, _ = geodetic_from_e(trajectory.position_e[epoch])
             self.rot_e_from_l[knot] = rot_e_from_l(lat, lon)

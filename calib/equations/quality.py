@@ -96,7 +96,7 @@ def trajectory_fit(solution: Solution) -> TrajectoryFit | None:
     sigmas = np.sqrt(solution.trajectory.variances_l(solution.covariance[p:, p:])).reshape(-1, 2, 3)
     before = np.sqrt(np.diag(prior.covariance)).reshape(-1, 2, 3)
     columns = (states[:, 0], states[:, 1], sigmas[:, 0], sigmas[:, 1], before[:, 0], before[:, 1])
-    return TrajectoryFit(prior.flown, prior.time_ns, prior.strip, *columns)
+    return TrajectoryFit(prior.trajectory_index, prior.time_ns, prior.strip, *columns)
 
 
 def _on_planes(solution: Solution) -> tuple[Residuals, dict[str, float]]:

@@ -238,9 +238,9 @@ class Rows:
         if self.prior is None:
             none = np.full(len(time_ns), -1, dtype=np.int64)
             return none, none
-        mine = (self.prior.flown == swath.flown) & (self.prior.strip == swath.strip)
+        mine = (self.prior.trajectory_index == swath.trajectory_index) & (self.prior.strip == swath.strip)
         if not mine.any():
-            mine = self.prior.flown == swath.flown
+            mine = self.prior.trajectory_index == swath.trajectory_index
         knots = np.flatnonzero(mine)
         before = np.searchsorted(self.prior.time_ns[knots], time_ns, side="right") - 1
         late, early = before >= len(knots) - 1, before < 0
@@ -274,7 +274,7 @@ class Rows:
 
     def _task(self, state: State, batch: Batch, planes: PlaneTable, model: SensorModel) -> Task:
         swath = self.flight.swaths[batch.swath]
-        trajectory = self.flight.trajectories[swath.flown]
+        trajectory = self.flight.trajectories[swath.trajectory_index]
         at = np.concatenate([run.at for run in batch.runs])
         rows = swath.rows.take(at)  # many times faster than indexing
         beam = beam_table(rows, rays_of(self.flight, swath, model, rows, at))
@@ -282,7 +282,7 @@ class Rows:
         if self.prior is not None:
             walk = self.prior.walk_rad2 if len(self.prior.walk_rad2) else np.zeros(len(self.prior))
             knots = knots._replace(time_ns=contiguous(self.prior.time_ns), walk=walk)
-        sigmas = self._sigmas[swath.flown] if self.prior is None else _NO_SIGMAS
+        sigmas = self._sigmas[swath.trajectory_index] if self.prior is None else _NO_SIGMAS
         middle = trajectory.position_e[int(beam.epoch[len(at) // 2])]
         lat, lon, _ = geodetic_from_e(middle)
         rot_l_from_e = np.ascontiguousarray(rot_e_from_l(lat, lon).T)

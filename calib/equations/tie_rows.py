@@ -153,7 +153,7 @@ class Ties:
     def _flown(self, run: Run, arm_b: FloatArray) -> FloatArray:
         """Return the covariance (3, 3) due to a trajectory whose errors are not estimated; equal in all directions."""
         swath = self.rows.flight.swaths[run.swath]
-        trajectory = self.rows.flight.trajectories[swath.flown]
+        trajectory = self.rows.flight.trajectories[swath.trajectory_index]
         epoch = min(int(np.searchsorted(trajectory.time_ns, swath.time_ns[run.at[0]])), len(trajectory) - 1)
         shift = np.nan_to_num(trajectory.position_sigma_l[epoch]).max()
         turn = np.nan_to_num(trajectory.attitude_sigma_rad[epoch]).max()

@@ -68,14 +68,14 @@ class Knots:
     """The knots at which the trajectory's errors are estimated.
 
     Attributes:
-        flown: (k,) index in `Flight.trajectories`.
+        trajectory_index: (k,) index in `Flight.trajectories`.
         time_ns: (k,) GPS time, rising within a trajectory.
         strip: (k,) number of the strip.
         apart_s: greatest distance of neighbours in a strip.
         widened: whether that distance had to be larger than requested.
     """
 
-    flown: Int64Array
+    trajectory_index: Int64Array
     time_ns: Int64Array
     strip: Int64Array
     apart_s: float
@@ -91,7 +91,7 @@ class TrajectoryPrior:
     """The trajectory's errors before the adjustment: jointly normal, with zero mean.
 
     Attributes:
-        flown: (k,) index in `Flight.trajectories`.
+        trajectory_index: (k,) index in `Flight.trajectories`.
         time_ns: (k,) GPS time, rising within a trajectory.
         strip: (k,) number of the strip.
         covariance: (6k, 6k); a knot has north, east, down (m), then small turns of the body about n, e, d (rad).
@@ -100,7 +100,7 @@ class TrajectoryPrior:
             one moment share it. Empty: it is not known, and counts as zero.
     """
 
-    flown: Int64Array
+    trajectory_index: Int64Array
     time_ns: Int64Array
     strip: Int64Array
     covariance: FloatArray
@@ -116,12 +116,12 @@ class TrajectoryPrior:
         """Inverse (6k, 6k) of the covariance; raises LinAlgError if it has none."""
         return inverted(self.covariance)
 
-    def between(self, flown: int, time_ns: Int64Array) -> tuple[Int64Array, Int64Array, FloatArray]:
+    def between(self, trajectory_index: int, time_ns: Int64Array) -> tuple[Int64Array, Int64Array, FloatArray]:
         """Return the knots (n,) before and after moments (n,) of a trajectory, and the share (n,) of the later one.
 
         Outside the range of its knots only the nearest knot counts.
         """
-        mine = np.flatnonzero(self.flown == flown)
+        mine = np.flatnonzero(self.trajectory_index == trajectory_index)
         knots = self.time_ns[mine]
         after = np.clip(np.searchsorted(knots, time_ns), 1, max(len(knots) - 1, 1))
         before, after = after - 1, np.minimum(after, len(knots) - 1)
@@ -166,9 +166,9 @@ def knots_within(strips: Sequence[tuple[int, int, int, int]], knot_s: float, mos
     while _counts(lengths, apart_s).sum() > most and apart_s < lengths.max():
         apart_s *= 1.05
     columns: list[tuple[int, int, int]] = []
-    for (flown, strip, begin, end), count in zip(strips, _counts(lengths, apart_s).tolist(), strict=True):
+    for (trajectory_index, strip, begin, end), count in zip(strips, _counts(lengths, apart_s).tolist(), strict=True):
         times = np.rint(np.linspace(0.0, end - begin, count)).astype(np.int64) + begin
-        columns += [(flown, time, strip) for time in times.tolist()]
+        columns += [(trajectory_index, time, strip) for time in times.tolist()]
     flown_of, time_ns, strip_of = np.array(columns, dtype=np.int64).T
     return Knots(flown_of, time_ns, strip_of, apart_s, apart_s > knot_s)
 
@@ -182,21 +182,21 @@ def _strips(flight: Flight) -> list[tuple[int, int, int, int]]:
     spans: dict[tuple[int, int], tuple[int, int]] = {}
     for swath in flight.swaths:
         if len(swath):
-            key = (swath.flown, swath.strip)
+            key = (swath.trajectory_index, swath.strip)
             first, last = spans.get(key, (2**62, -(2**62)))
             spans[key] = (min(first, int(swath.time_ns[0])), max(last, int(swath.time_ns[-1])))
-    ordered = sorted((flown, *span, strip) for (flown, strip), span in spans.items())
+    ordered = sorted((trajectory_index, *span, strip) for (trajectory_index, strip), span in spans.items())
     found = []
-    for at, (flown, first, last, strip) in enumerate(ordered):
-        low, high = flight.trajectories[flown].span
-        before = ordered[at - 1][2] if at and ordered[at - 1][0] == flown else None
-        after = ordered[at + 1][1] if at + 1 < len(ordered) and ordered[at + 1][0] == flown else None
+    for at, (trajectory_index, first, last, strip) in enumerate(ordered):
+        low, high = flight.trajectories[trajectory_index].span
+        before = ordered[at - 1][2] if at and ordered[at - 1][0] == trajectory_index else None
+        after = ordered[at + 1][1] if at + 1 < len(ordered) and ordered[at + 1][0] == trajectory_index else None
         begin, end = max(first - MARGIN_NS, low), min(last + MARGIN_NS, high)
         if before is not None:
             begin = max(begin, (before + first) // 2 + 1)
         if after is not None:
             end = min(end, (last + after) // 2)
-        found.append((flown, strip, begin, max(end, begin + 1)))
+        found.append((trajectory_index, strip, begin, max(end, begin + 1)))
     return found
 
 
@@ -225,7 +225,7 @@ def gauss_markov_at(knots: Knots, trajectories: Sequence[Trajectory], taus: Taus
     """
     covariance = np.zeros((len(knots), ERRORS, len(knots), ERRORS))
     for number, trajectory in enumerate(trajectories):
-        at = np.flatnonzero(knots.flown == number)
+        at = np.flatnonzero(knots.trajectory_index == number)
         if not len(at):
             continue
         sigmas, turns = _told(trajectory, knots.time_ns[at])
@@ -289,18 +289,23 @@ def from_smoother(flight: Flight, chains: Sequence[ErrorChain], knot_s: float = 
             "needs its run"
         )
     knots = knots_of(flight, knot_s)
-    times, strips, flown, blocks = [], [], [], []
+    times, strips, trajectory_index, blocks = [], [], [], []
     for number, chain in enumerate(chains):
-        at = np.flatnonzero(knots.flown == number)
+        at = np.flatnonzero(knots.trajectory_index == number)
         part = chain.at(knots.time_ns[at]) if len(at) else chain
         if not len(at):
             continue
         nearest = _strip_at(part.time_ns, knots, at, flight.trajectories[number].name)
         times.append(part.time_ns)
         strips.append(nearest)
-        flown.append(np.full(len(part), number))
+        trajectory_index.append(np.full(len(part), number))
         blocks.append(part.covariance())
-    joined = replace(knots, flown=np.concatenate(flown), time_ns=np.concatenate(times), strip=np.concatenate(strips))
+    joined = replace(
+        knots,
+        trajectory_index=np.concatenate(trajectory_index),
+        time_ns=np.concatenate(times),
+        strip=np.concatenate(strips),
+    )
     covariance, begin = np.zeros((ERRORS * len(joined), ERRORS * len(joined))), 0
     for block in blocks:
         part_of = slice(begin, begin + len(block))
@@ -356,7 +361,7 @@ def _prior(knots: Knots, covariance: FloatArray, source: str) -> TrajectoryPrior
     notes = [f"{source}; {len(knots)} knots, {knots.apart_s:.3g} s apart"]
     if knots.widened:
         notes.append(f"the knots are {knots.apart_s:.3g} s apart, so that there are at most {MOST_KNOTS}")
-    return TrajectoryPrior(knots.flown, knots.time_ns, knots.strip, positive(square), tuple(notes))
+    return TrajectoryPrior(knots.trajectory_index, knots.time_ns, knots.strip, positive(square), tuple(notes))
 
 
 def positive(covariance: FloatArray) -> FloatArray:
@@ -395,20 +400,20 @@ def draw(prior: TrajectoryPrior, rng: np.random.Generator) -> FloatArray:
     return errors
 
 
-def apply(trajectory: Trajectory, flown: int, prior: TrajectoryPrior, errors: FloatArray) -> Trajectory:
+def apply(trajectory: Trajectory, trajectory_index: int, prior: TrajectoryPrior, errors: FloatArray) -> Trajectory:
     """Return a trajectory with errors added.
 
     Between knots, also between those of two strips, the errors are linear; before the first knot and after the last one
     they are constant, so the path has no steps. Velocity and sigmas stay.
 
     Args:
-        trajectory: index ``flown`` in the flight.
-        flown: selects the trajectory's own knots of the prior.
+        trajectory: index ``trajectory_index`` in the flight.
+        trajectory_index: selects the trajectory's own knots of the prior.
         prior: has the knots.
         errors: (k, 6) of all knots, as `draw` returns them; with reversed signs a true trajectory becomes an erroneous
             one.
     """
-    mine = prior.flown == flown
+    mine = prior.trajectory_index == trajectory_index
     if not mine.any():
         return trajectory
     knot_ns = prior.time_ns[mine]

@@ -56,7 +56,7 @@ def trajectory_sigmas(flight: Flight, swath: int, unsaid: tuple[float, float]) -
     Where the trajectory has no sigmas, those of ``unsaid`` count, with that of heading doubled.
     """
     one = flight.swaths[swath]
-    trajectory = flight.trajectories[one.flown]
+    trajectory = flight.trajectories[one.trajectory_index]
     part = trajectory.between(int(one.time_ns[0]), int(one.time_ns[-1]))
     columns = np.concatenate([part.position_sigma_l, part.attitude_sigma_rad], axis=1)
     known = np.isfinite(columns)

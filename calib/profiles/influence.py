@@ -61,7 +61,9 @@ def influence(
         pieces = _pieces(flight, flight.swaths[swath], profile, calibration, parameters)
         gain = -sign * profile.gain  # the correction is the negative error
         by_parameter += gain @ pieces.by_parameter
-        _to_knots(by_knot, prior, flight.swaths[swath].flown, pieces.time_ns, gain[:, np.newaxis] * pieces.by_state)
+        _to_knots(
+            by_knot, prior, flight.swaths[swath].trajectory_index, pieces.time_ns, gain[:, np.newaxis] * pieces.by_state
+        )
     targets = dict(zip(profile.targets, profile.gain.tolist(), strict=False))
     return Influence(dict(zip(parameters, by_parameter.tolist(), strict=True)), by_knot.ravel(), targets)
 
@@ -123,9 +125,9 @@ def _means(values: FloatArray, group: Int64Array, groups: int) -> FloatArray:
 
 
 def _to_knots(
-    by_knot: FloatArray, prior: TrajectoryPrior, flown: int, time_ns: Int64Array, effects: FloatArray
+    by_knot: FloatArray, prior: TrajectoryPrior, trajectory_index: int, time_ns: Int64Array, effects: FloatArray
 ) -> None:
     """Distribute effects (k, 6) at moments (k,) to the knots (knots, 6) before and after them."""
-    before, after, share = prior.between(flown, time_ns)
+    before, after, share = prior.between(trajectory_index, time_ns)
     np.add.at(by_knot, before, (1.0 - share[:, np.newaxis]) * effects)
     np.add.at(by_knot, after, share[:, np.newaxis] * effects)

@@ -178,7 +178,7 @@ def _rms(values: FloatArray) -> FloatArray:
 def _flown(flight: Flight) -> Found:
     found: Found = {
         "CA_PhotoFlight.numberOfPhotoFlights": Value(len(flight.trajectories), "", "sessions of recording"),
-        "CA_PhotoFlight.numberOfStrips": Value(len({(swath.flown, swath.strip) for swath in flight.swaths})),
+        "CA_PhotoFlight.numberOfStrips": Value(len({(swath.trajectory_index, swath.strip) for swath in flight.swaths})),
     }
     ground_m, above_m, flying_m = _heights(flight)
     if math.isfinite(ground_m):
@@ -195,7 +195,7 @@ def _heights(flight: Flight) -> tuple[float, float, float]:
     for swath in flight.swaths:
         points = np.asarray(swath.points_t[::share], np.float64)
         points = points[np.isfinite(points).all(axis=1)]
-        trajectory = flight.trajectories[swath.flown]
+        trajectory = flight.trajectories[swath.trajectory_index]
         at = np.searchsorted(trajectory.time_ns, swath.time_ns[::share])
         at = np.unique(np.clip(at, 0, len(trajectory.time_ns) - 1))
         if len(points) and len(at):
@@ -331,7 +331,7 @@ def _block(
     flight: Flight, features: Features, adjusted: Adjusted, observed: Observed, index: int, block: Int64Array
 ) -> Mapping[str, FloatArray]:
     swath = flight.swaths[index]
-    head, trajectory = flight.heads[swath.head], flight.trajectories[swath.flown]
+    head, trajectory = flight.heads[swath.head], flight.trajectories[swath.trajectory_index]
     calibration = adjusted.calibrations[head.name]
     model = head.model(calibration)
     rays = flight.rays(swath, calibration, observed.at[block])

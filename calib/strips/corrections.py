@@ -79,12 +79,12 @@ class StripChoice:
     """The model that one strip got.
 
     Attributes:
-        flown, strip: of the strip.
+        trajectory_index, strip: of the strip.
         model: of `MODELS`.
         gains: by model: criterion of this strip with it minus with the one chosen, the others as chosen; 0: chosen.
     """
 
-    flown: int
+    trajectory_index: int
     strip: int
     model: str
     gains: Mapping[str, float] = field(default_factory=dict)
@@ -141,9 +141,9 @@ def adjust_strips(
             "overlap over roofs or open ground"
         )
     knots = knots_of(flight, settings.knot_s)
-    free = TrajectoryPrior(knots.flown, knots.time_ns, knots.strip, np.eye(ERRORS * len(knots)))
+    free = TrajectoryPrior(knots.trajectory_index, knots.time_ns, knots.strip, np.eye(ERRORS * len(knots)))
     case = _Equations(flight, features, calibrations, free, settings, row_weight)
-    choice = _Choice(knots.flown, knots.strip, settings)
+    choice = _Choice(knots.trajectory_index, knots.strip, settings)
     state, before = case.start(), None
     for _ in range(settings.linearisations):
         quadratic = case.at(state)
@@ -176,7 +176,7 @@ def _check(settings: Settings) -> None:
 
 def _fit(free: TrajectoryPrior, along: FloatArray, sigma: FloatArray, prior: FloatArray) -> TrajectoryFit:
     return TrajectoryFit(
-        free.flown, free.time_ns, free.strip,
+        free.trajectory_index, free.time_ns, free.strip,
         along[:, :3], along[:, 3:], sigma[:, :3], sigma[:, 3:], prior[:, :3], prior[:, 3:],
     )  # fmt: skip
 
@@ -289,11 +289,11 @@ class _Choice:
     A model's parameters are the first ones of every richer model, so those of the richest are computed once.
     """
 
-    def __init__(self, flown: Int64Array, strip: Int64Array, settings: Settings) -> None:
+    def __init__(self, trajectory_index: Int64Array, strip: Int64Array, settings: Settings) -> None:
         self._settings = settings
-        firsts = np.unique(np.stack([flown, strip], axis=1), axis=0, return_index=True)[1]
-        self._keys = [(int(flown[at]), int(strip[at])) for at in sorted(firsts.tolist())]
-        self._at = [np.flatnonzero((flown == key[0]) & (strip == key[1])) for key in self._keys]
+        firsts = np.unique(np.stack([trajectory_index, strip], axis=1), axis=0, return_index=True)[1]
+        self._keys = [(int(trajectory_index[at]), int(strip[at])) for at in sorted(firsts.tolist())]
+        self._at = [np.flatnonzero((trajectory_index == key[0]) & (strip == key[1])) for key in self._keys]
         self.models = [settings.models[0]] * len(self._keys)
         self._columns: list[dict[str, Int64Array]] = []
         bases, begin = [], 0
@@ -301,7 +301,7 @@ class _Choice:
             own = {model: _basis(model, len(at), settings) for model in settings.models}
             self._columns.append({model: begin + np.arange(basis.shape[1]) for model, basis in own.items()})
             richest = max(own.values(), key=lambda basis: basis.shape[1])
-            bases.append(np.zeros((ERRORS * len(flown), richest.shape[1])))
+            bases.append(np.zeros((ERRORS * len(trajectory_index), richest.shape[1])))
             bases[-1][(ERRORS * at[:, np.newaxis] + np.arange(ERRORS)).ravel()] = richest
             begin += richest.shape[1]
         self._basis = np.concatenate(bases, axis=1)
@@ -351,11 +351,11 @@ class _Choice:
         of_all = quadratic.of(self._basis)
         singly = len(self._keys) <= MOST_CHOSEN_SINGLY
         told = []
-        for number, (flown, strip) in enumerate(self._keys):
+        for number, (trajectory_index, strip) in enumerate(self._keys):
             found = self._tried(of_all, number) if singly else {}
             chosen = found.get(self.models[number], 0.0)
             gains = {model: value - chosen for model, value in found.items()}
-            told.append(StripChoice(flown, strip, self.models[number], gains))
+            told.append(StripChoice(trajectory_index, strip, self.models[number], gains))
         return tuple(told)
 
     def notes(self) -> tuple[str, ...]:

@@ -91,14 +91,14 @@ class SeenFrom:
     Attributes:
         frame: the frame t.
         trajectories: of the body, one per session.
-        flown: of each strip, the index of its trajectory.
+        trajectory_index: of each strip, the index of its trajectory.
         scan_rate: of each strip, |θ̇| in rad/s, typical; 0: not known.
         rot_b_from_s: of each strip, (3, 3), mounting of its scanner; directions of the scan are about its x axis.
     """
 
     frame: Tangent
     trajectories: Sequence[Trajectory]
-    flown: Sequence[int]
+    trajectory_index: Sequence[int]
     scan_rate: Sequence[float]
     rot_b_from_s: Sequence[FloatArray]
 
@@ -110,7 +110,9 @@ class SeenFrom:
             for swath in flight.swaths
         ]
         mounted = [_rot_b_from_s(flight.heads[swath.head], swath) for swath in flight.swaths]
-        return cls(flight.frame, flight.trajectories, [swath.flown for swath in flight.swaths], rates, mounted)
+        return cls(
+            flight.frame, flight.trajectories, [swath.trajectory_index for swath in flight.swaths], rates, mounted
+        )
 
 
 def _rot_b_from_s(head: Head, swath: Swath) -> FloatArray:
@@ -139,7 +141,7 @@ class _Arms:
     @classmethod
     def of(cls, points_t: FloatArray, strip: int, time_ns: Int64Array, seen: SeenFrom) -> _Arms:
         """Compute the places for points (n, 3) at GPS times (n,)."""
-        poses = seen.trajectories[seen.flown[strip]].poses(time_ns)
+        poses = seen.trajectories[seen.trajectory_index[strip]].poses(time_ns)
         rot_t_from_b = seen.frame.rot_t_from_e @ rot_from_quaternion(poses.q_e_from_b)
         arm_t = points_t - seen.frame.t_from_e(poses.position_e)
         return cls(poses, rot_t_from_b, arm_t, np.einsum("nji,nj->ni", rot_t_from_b, arm_t))

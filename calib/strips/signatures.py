@@ -141,7 +141,7 @@ def _known(checks: Checks, seen: SeenFrom) -> NDArray[np.bool_]:
     for strip, time_ns in ((checks.first, checks.point_ns), (checks.second, checks.centre_ns)):
         for number in np.unique(strip):
             own = strip == number
-            known[own] &= seen.trajectories[seen.flown[number]].fates(time_ns[own]) == 0
+            known[own] &= seen.trajectories[seen.trajectory_index[number]].fates(time_ns[own]) == 0
     return known
 
 
@@ -167,16 +167,19 @@ def _spans(checks: Checks, seen: SeenFrom) -> list[tuple[int, int, int, int]]:
     strip = np.concatenate([checks.first, checks.second])
     time_ns = np.concatenate([checks.point_ns, checks.centre_ns])
     own = sorted(
-        (seen.flown[number], int(time_ns[strip == number].min()), int(time_ns[strip == number].max()))
+        (seen.trajectory_index[number], int(time_ns[strip == number].min()), int(time_ns[strip == number].max()))
         for number in np.unique(strip).tolist()
     )
     joined: list[tuple[int, int, int]] = []
-    for flown, begin, end in own:
-        if joined and joined[-1][0] == flown and begin <= joined[-1][2]:
-            joined[-1] = (flown, joined[-1][1], max(end, joined[-1][2]))
+    for trajectory_index, begin, end in own:
+        if joined and joined[-1][0] == trajectory_index and begin <= joined[-1][2]:
+            joined[-1] = (trajectory_index, joined[-1][1], max(end, joined[-1][2]))
         else:
-            joined.append((flown, begin, end))
-    return [(flown, number, begin, max(end, begin + 1)) for number, (flown, begin, end) in enumerate(joined)]
+            joined.append((trajectory_index, begin, end))
+    return [
+        (trajectory_index, number, begin, max(end, begin + 1))
+        for number, (trajectory_index, begin, end) in enumerate(joined)
+    ]
 
 
 def _with_sigmas(trajectory: Trajectory) -> Trajectory:
@@ -210,7 +213,7 @@ def _design(checks: Checks, seen: SeenFrom, prior: TrajectoryPrior) -> tuple[Flo
         design -= sign * np.einsum("nki,ni->nk", moved, checks.normal)
         edges = np.maximum(edges, np.percentile(np.linalg.norm(moved, axis=2), 95.0, axis=0))
         own = -sign * np.einsum("nki,ni->nk", error_columns(points_t, strip, time_ns, seen), checks.normal)
-        for knot, share in _shares(prior, np.asarray(seen.flown)[strip], time_ns):
+        for knot, share in _shares(prior, np.asarray(seen.trajectory_index)[strip], time_ns):
             values.append(share[:, np.newaxis] * own)
             rows.append(np.repeat(np.arange(count), ERRORS).reshape(count, ERRORS))
             columns.append(ERRORS * knot[:, np.newaxis] + np.arange(ERRORS))
@@ -219,12 +222,12 @@ def _design(checks: Checks, seen: SeenFrom, prior: TrajectoryPrior) -> tuple[Flo
 
 
 def _shares(
-    prior: TrajectoryPrior, flown: Int64Array, time_ns: Int64Array
+    prior: TrajectoryPrior, trajectory_index: Int64Array, time_ns: Int64Array
 ) -> tuple[tuple[Int64Array, FloatArray], tuple[Int64Array, FloatArray]]:
     """Return the knots (n,) before and after each moment, and each knot's share in the error at that moment."""
     before, after = np.zeros(len(time_ns), np.int64), np.zeros(len(time_ns), np.int64)
-    for number in np.unique(flown):
-        own, knots = flown == number, np.flatnonzero(prior.flown == number)
+    for number in np.unique(trajectory_index):
+        own, knots = trajectory_index == number, np.flatnonzero(prior.trajectory_index == number)
         if not len(knots):
             raise FlightError(f"trajectory errors: the covariance has no knot of trajectory {number + 1}")
         at = np.searchsorted(prior.time_ns[knots], time_ns[own])
@@ -304,8 +307,8 @@ def _worst_m(prior: TrajectoryPrior, seen: SeenFrom, edges: FloatArray) -> float
     The limit accounts for the attitude error that remains even in the best of flights.
     """
     row = np.zeros((len(prior), ERRORS))
-    for number in np.unique(prior.flown):
-        own = prior.flown == number
+    for number in np.unique(prior.trajectory_index):
+        own = prior.trajectory_index == number
         trajectory = seen.trajectories[number]
         at = np.clip(np.searchsorted(trajectory.time_ns, prior.time_ns[own]), 0, len(trajectory) - 1)
         right_e = rot_from_quaternion(trajectory.q_e_from_b[at])[:, :, 1]

@@ -385,11 +385,11 @@ def _by_knots(
 
     A place p seen from a body at x moves by n · (δx + δθ × (p − x)) along n.
     """
-    flown = np.array([flight.swaths[one].flown for one in strip], np.int64)
+    trajectory_index = np.array([flight.swaths[one].trajectory_index for one in strip], np.int64)
     moved, walk = np.zeros((len(places), ERRORS)), np.zeros(len(places))
     row, column, value = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], [np.zeros(0)]
-    for number in np.unique(flown).tolist():
-        own = np.flatnonzero(flown == number)
+    for number in np.unique(trajectory_index).tolist():
+        own = np.flatnonzero(trajectory_index == number)
         position_e = flight.trajectories[number].poses(times[own]).position_e
         lat, lon, _ = geodetic_from_e(position_e)
         rot_t_from_l = flight.frame.rot_t_from_e @ rot_e_from_l(lat, lon)

@@ -277,7 +277,7 @@ def validate(
 def _by_sigmas(flight: Flight) -> tuple[TrajectoryPrior, TrajectoryPrior]:
     """Return two priors from trajectories' sigmas: with independent strips and some wander, and with joint strips."""
     along = gauss_markov(flight, knot_s=KNOT_S)
-    strips = np.repeat(along.flown * (along.strip.max() + 1) + along.strip, ERRORS)
+    strips = np.repeat(along.trajectory_index * (along.strip.max() + 1) + along.strip, ERRORS)
     wander = gauss_markov(flight, WANDER_TAUS, KNOT_S).covariance
     covariance = along.covariance * (strips[:, np.newaxis] == strips) + WANDER**2 * wander
     return replace(along, covariance=covariance), along
@@ -339,10 +339,10 @@ def _classes(flight: Flight, rows: Rows) -> dict[str, NDArray[np.bool_]]:
         return dict.fromkeys(WORDS, none)
     apart = np.abs((headings[first] - headings[second] + 90.0) % 180.0 - 90.0)
     ratio = np.maximum(heights[first], heights[second]) / np.minimum(heights[first], heights[second])
-    flown = np.array([swath.flown for swath in flight.swaths])
+    trajectory_index = np.array([swath.trajectory_index for swath in flight.swaths])
     return {
         "crossStripFlight": apart >= CROSSING_DEG,
-        "secondFlight": flown[first] != flown[second],
+        "secondFlight": trajectory_index[first] != trajectory_index[second],
         "secondAltitude": ratio >= HEIGHTS_RATIO,
         "other": np.ones(len(rows), bool),
     }
@@ -354,7 +354,7 @@ def _flown_so(flight: Flight) -> tuple[FloatArray, FloatArray]:
     for number, swath in enumerate(flight.swaths):
         if not len(swath):
             continue
-        trajectory = flight.trajectories[swath.flown]
+        trajectory = flight.trajectories[swath.trajectory_index]
         within = trajectory.between(int(swath.time_ns[0]), int(swath.time_ns[-1]))
         way = within.velocity_l().mean(axis=0)
         headings[number] = math.degrees(math.atan2(way[1], way[0])) % 360.0

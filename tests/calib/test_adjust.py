@@ -86,9 +86,9 @@ NO_TIES = np.zeros(0, np.float32)
 
 
 def block(
-    flight: Flight, features: Features, wish: ParameterOptions, prior: TrajectoryPrior | None
+    flight: Flight, features: Features, options: ParameterOptions, prior: TrajectoryPrior | None
 ) -> tuple[Rows, Ties, TrajectoryWeight]:
-    rows = Rows(flight, features.planes, unknowns(flight, wish), prior)
+    rows = Rows(flight, features.planes, unknowns(flight, options), prior)
     return rows, Ties(rows, features.ties, None), TrajectoryWeight(rows)
 
 
@@ -486,8 +486,8 @@ def test_a_flight_that_contradicts_a_held_parameter_reports_it() -> None:
     """A scale declared known to 5 ppm is 250 ppm off: the flight reveals it, and its sigma is rejected."""
     built = made(truth=SCALED)
     prior, start = gauss_markov(built.flight, Taus(), 4.0), unknown_start(built)
-    wish = ParameterOptions(fix=frozenset(["scan_angle_scale"]), priors={"scan_angle_scale": 5e-6})
-    found = adjust(built.flight, built.features, wish, prior, PLAIN, start)
+    options = ParameterOptions(fix=frozenset(["scan_angle_scale"]), priors={"scan_angle_scale": 5e-6})
+    found = adjust(built.flight, built.features, options, prior, PLAIN, start)
     (one,) = (one for one in found.considered if one.contradicted)
     assert one.name == "scan_angle_scale"
     assert abs(one.told - 2.5e-4) < 4.0 * one.told_sigma
@@ -502,11 +502,11 @@ def test_a_fixed_parameter_is_reported_as_wrong_if_the_flight_contradicts_it(nam
     """However plausible its error is; its sigma stays what is plausible."""
     built = made(truth=SCALED)
     prior, start = gauss_markov(built.flight, Taus(), 4.0), {"left": replace(built.truth, method="nominal")}
-    wish, away = ParameterOptions(fix=frozenset([name])), {"kappa_rad": 3e-3, "scan_angle_scale": 2.5e-4}[name]
-    right = adjust(built.flight, built.features, wish, prior, PLAIN, start)
+    options, away = ParameterOptions(fix=frozenset([name])), {"kappa_rad": 3e-3, "scan_angle_scale": 2.5e-4}[name]
+    right = adjust(built.flight, built.features, options, prior, PLAIN, start)
     assert not any(one.contradicted for one in right.considered)
     off = {"left": start["left"].changed(**{name: built.truth.value(name) + away})}
-    found = adjust(built.flight, built.features, wish, prior, PLAIN, off)
+    found = adjust(built.flight, built.features, options, prior, PLAIN, off)
     (one,) = (one for one in found.considered if one.contradicted)
     assert one.name == name
     assert abs(one.told + away) < 4.0 * one.told_sigma < away
@@ -530,8 +530,8 @@ LOGARITHM = 0.3 * np.log((INTENSITY + 30.0) / (KNOTS[3] + 30.0))
 def by_intensity(correction_m: FloatArray, noise: float = 1.0) -> Adjusted:
     """Return the calibration of a scanner with this correction at `INTENSITY`."""
     built = made(ibrc=(INTENSITY, correction_m), points=24, noise=noise)
-    wish = ParameterOptions(ibrc_knots=tuple(KNOTS.tolist()), ibrc_reference=45.0, ibrc_smoothness_m=1.0)
-    return adjust(built.flight, built.features, wish, gauss_markov(built.flight, Taus(), 4.0))
+    options = ParameterOptions(ibrc_knots=tuple(KNOTS.tolist()), ibrc_reference=45.0, ibrc_smoothness_m=1.0)
+    return adjust(built.flight, built.features, options, gauss_markov(built.flight, Taus(), 4.0))
 
 
 @pytest.mark.parametrize("share", [1.0, 0.0], ids=["there", "none is invented"])

@@ -93,14 +93,14 @@ def extras() -> Unknowns:
         beams={2: BeamCorrection(0.01, 0.02, 0.03)},
     )
     made = replace(made, heads=(made.heads[0], replace(made.heads[1], start=old)))
-    wish = ParameterOptions(
+    options = ParameterOptions(
         ibrc_knots=(0.0, 50.0, 75.0, 100.0),
         ibrc_reference=50.0,
         beams=frozenset(["azimuth_rad", "range_m"]),
         range_offset_slots=(2,),
         range_offset_zones=(3,),
     )
-    return unknowns(made, wish)
+    return unknowns(made, options)
 
 
 def test_tables_start_from_the_existing_ones_and_are_returned() -> None:
@@ -134,8 +134,8 @@ def test_a_curve_is_returned_at_the_same_knots() -> None:
     done = asked.calibrations(asked.start + np.arange(1, len(asked) + 1) * 1e-3)
     made = flight()
     again = replace(made, heads=tuple(replace(head, start=done[head.name]) for head in made.heads))
-    wish = ParameterOptions(ibrc_knots=(0.0, 50.0, 75.0, 100.0), ibrc_reference=50.0)
-    asked = unknowns(again, wish)
+    options = ParameterOptions(ibrc_knots=(0.0, 50.0, 75.0, 100.0), ibrc_reference=50.0)
+    asked = unknowns(again, options)
     for name, found in asked.calibrations(asked.start).items():
         before = done[name].ibrc
         assert before is not None
@@ -176,10 +176,10 @@ def test_sigmas_and_correlations_are_returned_to_their_head() -> None:
     np.testing.assert_allclose(done.covariance()[at, arm], moved[4:, own] * 0.002)
 
 
-def held_sigma(name: str, wish: ParameterOptions, start: Calibration | None = None) -> float:
+def held_sigma(name: str, options: ParameterOptions, start: Calibration | None = None) -> float:
     """One sigma of a parameter of ``left`` that is not estimated; 0: it counts as exact."""
     starts = flight().starts()
-    asked = unknowns(flight(), wish, starts if start is None else {**starts, "left": start})
+    asked = unknowns(flight(), options, starts if start is None else {**starts, "left": start})
     assert f"left.{name}" not in asked.names
     return {one.name: one.plausible for one in asked.considered}.get(f"left.{name}", 0.0)
 
@@ -229,7 +229,7 @@ def test_held_parameters_keep_their_start_and_estimated_ones_begin_at_nominal_va
 
 
 @pytest.mark.parametrize(
-    ("wish", "text"),
+    ("options", "text"),
     [
         (ParameterOptions("everything"), "want one of basic, scanner, full"),
         (ParameterOptions(fix=frozenset(["omega"])), "omega: unknown parameter"),
@@ -244,9 +244,9 @@ def test_held_parameters_keep_their_start_and_estimated_ones_begin_at_nominal_va
         (ParameterOptions(beams=frozenset(["roll_rad"])), "beams: got 'roll_rad'"),
     ],
 )
-def test_impossible_options_are_refused(wish: ParameterOptions, text: str) -> None:
+def test_impossible_options_are_refused(options: ParameterOptions, text: str) -> None:
     with pytest.raises(ParameterError, match=text.replace(".", r"\.")) as refused:
-        unknowns(flight(), wish)
+        unknowns(flight(), options)
     assert "\n" not in str(refused.value)
 
 

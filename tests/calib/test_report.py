@@ -24,7 +24,7 @@ from swath.calib.need import Need
 from swath.calib.outcome import Adjusted, Considered, ControlFit, FixedParameter, GroupFit
 from swath.calib.profiles.check import Check, Comparison
 from swath.calib.summary import Finding, PairDifference, ReportInput
-from swath.calib.verdict import Level, held_words, judge
+from swath.calib.verdict import held_words, judge
 from swath.daemon.processing.calibration.products import pages
 from swath.daemon.processing.calibration.report.cuts import cuts_of
 from swath.daemon.processing.calibration.report.maps import plane_rms_cm
@@ -32,6 +32,7 @@ from swath.daemon.processing.calibration.report.page import html, paper_page, pd
 from swath.daemon.processing.calibration.report.residuals import residual_picture, seen_of
 from swath.daemon.processing.calibration.report.tables import entries_table, held_table, parameter_tables
 from swath.daemon.processing.pages.canvas import NARROW
+from swath.georef.verdicts import Level
 from tests.calib.made_outcome import RISE, Outcome, made_outcome, made_report
 from tests.same_bytes import numbers_of
 

@@ -34,7 +34,7 @@ def spoilt(flight: Flight, strip: int, along: FloatArray, knot_s: float = 1.0) -
     errors = np.zeros((len(knots), 6))
     places = np.linspace(0.0, 1.0, len(along))
     errors[at] = np.stack([np.interp(np.linspace(0, 1, len(at)), places, column) for column in along.T], axis=1)
-    prior = TrajectoryPrior(knots.flown, knots.time_ns, knots.strip, np.eye(6 * len(knots)))
+    prior = TrajectoryPrior(knots.trajectory_index, knots.time_ns, knots.strip, np.eye(6 * len(knots)))
     return replace(flight, trajectories=(apply(flight.trajectories[0], 0, prior, -errors),))
 
 

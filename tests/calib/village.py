@@ -145,8 +145,8 @@ def village(
     file.write_text(csv_text(trajectory))
     kept = folder / "kept"
     kept.mkdir()
-    wish = GeorefOptions([flown.log], kept, TrajectoryOptions(file), Options(datum="same", uncertainty=False))
-    read = read_flight(wish, kept, lambda what, done, total: None)
+    options = GeorefOptions([flown.log], kept, TrajectoryOptions(file), Options(datum="same", uncertainty=False))
+    read = read_flight(options, kept, lambda what, done, total: None)
     truth = read_calibration((folder / "left.true.toml").read_text(), "left.true.toml")
     flight = replace(read.flight, trajectories=(trajectory,))
     return Made(flight, truth, trajectory, flown, text)

@@ -72,8 +72,8 @@ class Starter:
         assert self._process.stdout is not None
         with tempfile.TemporaryDirectory() as folder:
             output, errors = Path(folder) / "stdout", Path(folder) / "stderr"
-            wish = {"arguments": arguments, "environment": environment, "says_to": [str(output), str(errors)]}
-            self._process.stdin.write(json.dumps(wish) + "\n")
+            request = {"arguments": arguments, "environment": environment, "says_to": [str(output), str(errors)]}
+            self._process.stdin.write(json.dumps(request) + "\n")
             self._process.stdin.flush()
             if not select.select([self._process.stdout], [], [], HANGS_S)[0]:
                 self.close()

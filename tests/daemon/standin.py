@@ -129,12 +129,12 @@ def make_standin(*arguments: object) -> tuple[Standin, dict[str, bytes]]:
     return Standin(*arguments), {"README.md": b"none"}  # type: ignore[arg-type]
 
 
-def standin_for(wish: object) -> tuple[Standin, dict[str, bytes]]:
+def standin_for(request: object) -> tuple[Standin, dict[str, bytes]]:
     """Replace `swath.daemon.simulate.plans.make_flight_in_time` by a stand-in of one second."""
     return Standin(1.0), {}
 
 
-def stepping_for(wish: object) -> tuple[Standin, dict[str, bytes]]:
+def stepping_for(request: object) -> tuple[Standin, dict[str, bytes]]:
     """Return the same stand-in with a wall clock step."""
     return Standin(1.0, ((1.0, 60.0),)), {}
 

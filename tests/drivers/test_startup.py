@@ -61,8 +61,8 @@ class TestUbx:
     @pytest.mark.parametrize("rate_hz", [1, 2, 5, 10, 20])
     @pytest.mark.parametrize("save", [False, True])
     def test_pyubx2_reads_back_the_displayed_keys_and_values(self, port: str, rate_hz: int, save: bool) -> None:
-        wish = StartupOptions(save=save, baud=460800)
-        for message in ubx_startup.startup_messages(settings(port=port, rate_hz=rate_hz), wish):
+        options = StartupOptions(save=save, baud=460800)
+        for message in ubx_startup.startup_messages(settings(port=port, rate_hz=rate_hz), options):
             parsed = UBXReader.parse(message.data, msgmode=SET)
             assert parsed.identity == "CFG-VALSET"
             assert (parsed.version, parsed.ram, parsed.bbr, parsed.flash) == (0, 1, 1, int(save))
@@ -134,10 +134,10 @@ class TestUbx:
 
 class TestNovatel:
     def test_requested_logs_are_known_to_the_driver(self) -> None:
-        wish = StartupOptions()
+        options = StartupOptions()
         config = {"secondary_lever_arm_m": [0, 1, 0], "setup": {"rate_hz": 10}}
-        messages = novatel_startup.startup_messages(DeviceSettings("gnss/rover", config), wish)
-        messages += novatel_startup.imu_startup_messages(settings(), wish)
+        messages = novatel_startup.startup_messages(DeviceSettings("gnss/rover", config), options)
+        messages += novatel_startup.imu_startup_messages(settings(), options)
         logs = re.findall(r"^LOG (\w+)B (?:ONNEW|ONCHANGED|ONTIME \d)", "\n".join(texts(messages)), re.MULTILINE)
         assert len(logs) == len(messages) - 1
         layouts = {layout.name for layout in novatel_layouts.LAYOUTS.values()}

@@ -187,8 +187,8 @@ def model_of(model: str, fix: str = "", free: str = "", priors: Sequence[str] = 
         UserError: there is no such model or file, a key is not a parameter, or a sigma is invalid.
     """
     tables = _tables(model)
-    wish = _of_tables(tables)
-    known = _PARAMETERS | _entries(wish)
+    request = _of_tables(tables)
+    known = _PARAMETERS | _entries(request)
     configured = _states(tables.parameters.items(), f"{model}: parameters.", known)
     own = _states(((key, FREE) for key in free.split(",") if key), "--free ", known)
     sigmas = _states(map(_prior, priors), "--prior ", known)
@@ -198,7 +198,7 @@ def model_of(model: str, fix: str = "", free: str = "", priors: Sequence[str] = 
     states = {f"{scanner}.{name}" if scanner else name: state for (scanner, name), state in (left | own).items()}
     held = {f"{scanner}.{name}" if scanner else name: sigma for (scanner, name), sigma in sigmas.items()}
     return replace(
-        wish,
+        request,
         fix=frozenset(name for name, state in states.items() if state == FIXED),
         free=frozenset(name for name, state in states.items() if state == FREE),
         priors={name: state for name, state in (states | held).items() if not isinstance(state, str)},
@@ -210,11 +210,11 @@ def file_of(model: str) -> Path | None:
     return Path(model) if model.lower().endswith(SUFFIX) else None
 
 
-def of_parameters(wish: ParameterOptions) -> ParameterOptions:
+def of_parameters(request: ParameterOptions) -> ParameterOptions:
     """Return the options without the entries of tables: with the parameters alone."""
-    entries = {name for name, _ in _entries(wish).values()}
-    priors = {name: sigma for name, sigma in wish.priors.items() if not {name, name.partition(".")[2]} & entries}
-    return ParameterOptions(wish.model, wish.fix, wish.free, priors)
+    entries = {name for name, _ in _entries(request).values()}
+    priors = {name: sigma for name, sigma in request.priors.items() if not {name, name.partition(".")[2]} & entries}
+    return ParameterOptions(request.model, request.fix, request.free, priors)
 
 
 def key_of(name: str, knots: Sequence[float] = ()) -> tuple[str, float]:
@@ -233,9 +233,9 @@ def key_of(name: str, knots: Sequence[float] = ()) -> tuple[str, float]:
     return name, 1.0
 
 
-def in_words(wish: ParameterOptions) -> str:
+def in_words(request: ParameterOptions) -> str:
     """Return the model and all options in words for reports, with a file's keys and units."""
-    back = {name: (key, factor) for key, (name, factor) in (_PARAMETERS | _entries(wish)).items()}
+    back = {name: (key, factor) for key, (name, factor) in (_PARAMETERS | _entries(request)).items()}
 
     def told(name: str, sigma: float | None = None) -> str:
         scanner, own = ("", name) if name in back else (name.partition(".")[0] + ".", name.partition(".")[2])
@@ -243,27 +243,31 @@ def in_words(wish: ParameterOptions) -> str:
         return f"{scanner}{key}" if sigma is None else f"{scanner}{key} {sigma / factor:g}"
 
     lists = {
-        FIXED: [told(name) for name in sorted(wish.fix)],
-        FREE: [told(name) for name in sorted(wish.free)],
-        "prior": [told(name, sigma) for name, sigma in sorted(wish.priors.items())],
+        FIXED: [told(name) for name in sorted(request.fix)],
+        FREE: [told(name) for name in sorted(request.free)],
+        "prior": [told(name, sigma) for name, sigma in sorted(request.priors.items())],
     }
     return "; ".join(
-        [wish.model, *(f"{word} {', '.join(names)}" for word, names in lists.items() if names), *tables_in_words(wish)]
+        [
+            request.model,
+            *(f"{word} {', '.join(names)}" for word, names in lists.items() if names),
+            *tables_in_words(request),
+        ]
     )
 
 
-def tables_in_words(wish: ParameterOptions) -> list[str]:
+def tables_in_words(request: ParameterOptions) -> list[str]:
     """Return in words which entries of tables are estimated."""
     words = []
-    if wish.ibrc_knots:
-        reference = "" if wish.ibrc_reference is None else f" (reference {wish.ibrc_reference:g})"
-        knots = ", ".join(f"{knot:g}" for knot in wish.ibrc_knots)
-        words.append(f"ibrc at {knots}{reference}, smooth to {wish.ibrc_smoothness_m:g} m")
-    for word, numbers in (("return slot", wish.range_offset_slots), ("zone", wish.range_offset_zones)):
+    if request.ibrc_knots:
+        reference = "" if request.ibrc_reference is None else f" (reference {request.ibrc_reference:g})"
+        knots = ", ".join(f"{knot:g}" for knot in request.ibrc_knots)
+        words.append(f"ibrc at {knots}{reference}, smooth to {request.ibrc_smoothness_m:g} m")
+    for word, numbers in (("return slot", request.range_offset_slots), ("zone", request.range_offset_zones)):
         if numbers:
             words.append(f"range offset of {word} {', '.join(map(str, numbers))}")
-    if wish.beams:
-        words.append(f"beam {', '.join(key for key, (name, _) in _BEAM_PARTS.items() if name in wish.beams)}")
+    if request.beams:
+        words.append(f"beam {', '.join(key for key, (name, _) in _BEAM_PARTS.items() if name in request.beams)}")
     return words
 
 
@@ -278,27 +282,27 @@ def _tables(model: str) -> ModelTables:
 
 def _of_tables(tables: ModelTables) -> ParameterOptions:
     """Return the options from all tables but the parameters."""
-    wish, ibrc, offsets, beam = ParameterOptions(tables.model), tables.ibrc, tables.range_offset, tables.beam
+    request, ibrc, offsets, beam = ParameterOptions(tables.model), tables.ibrc, tables.range_offset, tables.beam
     if ibrc is not None:
-        wish = replace(
-            wish, ibrc_knots=tuple(ibrc.knots), ibrc_reference=ibrc.reference, ibrc_smoothness_m=ibrc.smoothness_m
+        request = replace(
+            request, ibrc_knots=tuple(ibrc.knots), ibrc_reference=ibrc.reference, ibrc_smoothness_m=ibrc.smoothness_m
         )
     if offsets is not None:
         slots, zones = tuple(offsets.return_slots), tuple(offsets.mta_zones)
-        wish = replace(wish, range_offset_slots=slots, range_offset_zones=zones)
+        request = replace(request, range_offset_slots=slots, range_offset_zones=zones)
     if beam is not None:
-        wish = replace(wish, beams=frozenset(_BEAM_PARTS[part][0] for part in beam.estimate))
-    return wish
+        request = replace(request, beams=frozenset(_BEAM_PARTS[part][0] for part in beam.estimate))
+    return request
 
 
-def _entries(wish: ParameterOptions) -> dict[str, tuple[str, float]]:
+def _entries(request: ParameterOptions) -> dict[str, tuple[str, float]]:
     """Return the entries of the requested tables that may have priors, in the form of `_PARAMETERS`."""
-    names = [f"range_offset_slot.{slot}" for slot in wish.range_offset_slots]
-    names += [f"range_offset_zone.{zone}" for zone in wish.range_offset_zones]
-    middle, reference = len(wish.ibrc_knots) // 2, wish.ibrc_reference
-    zero = middle if reference is None else wish.ibrc_knots.index(reference)
-    names += [f"ibrc.{knot}" for knot in range(len(wish.ibrc_knots)) if knot != zero]
-    parts = {key: one for key, one in _BEAM_PARTS.items() if one[0] in wish.beams}
+    names = [f"range_offset_slot.{slot}" for slot in request.range_offset_slots]
+    names += [f"range_offset_zone.{zone}" for zone in request.range_offset_zones]
+    middle, reference = len(request.ibrc_knots) // 2, request.ibrc_reference
+    zero = middle if reference is None else request.ibrc_knots.index(reference)
+    names += [f"ibrc.{knot}" for knot in range(len(request.ibrc_knots)) if knot != zero]
+    parts = {key: one for key, one in _BEAM_PARTS.items() if one[0] in request.beams}
     beams = {f"beam.{key}": (f"beam.{name}", factor) for key, (name, factor) in parts.items()}
     return {name: (name, 1.0) for name in names} | beams
 

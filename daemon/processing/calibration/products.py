@@ -58,7 +58,7 @@ class Told:
     warnings: list[str] = field(default_factory=list)
 
 
-def write_products(wish: CalibrationOptions, done: Calibrated, tell: Steps) -> Told:
+def write_products(request: CalibrationOptions, done: Calibrated, tell: Steps) -> Told:
     """Write all outputs; files from an earlier run are replaced last.
 
     Raises:
@@ -66,7 +66,7 @@ def write_products(wish: CalibrationOptions, done: Calibrated, tell: Steps) -> T
     """
     tell("strips before and after", 0, 1)
     before, after = before_and_after(done.kept.flight, done.flight, done.kept.logged[0].setup.mapping)
-    inputs = _inputs(wish, done)
+    inputs = _inputs(request, done)
     headers = {name: _header(done, name, inputs) for name in done.adjusted.calibrations}
     tell("checks", 0, 1)
     carried = trajectory_verdicts_of(done.kept.logged)
@@ -76,7 +76,7 @@ def write_products(wish: CalibrationOptions, done: Calibrated, tell: Steps) -> T
         *strips_say(done, after.cells.frame.cell_m),
         *validation_says(done),
     )
-    report = replace(_report(wish, done, headers, before, after, inputs), findings=findings)
+    report = replace(_report(request, done, headers, before, after, inputs), findings=findings)
     verdict = judge(report)
     source = done.kept.logged[0].source
     headers = {
@@ -86,30 +86,30 @@ def write_products(wish: CalibrationOptions, done: Calibrated, tell: Steps) -> T
         texts = {name: calibration_text(_named(done, name, headers), header) for name, header in headers.items()}
     except CalibrationFileError as error:
         raise UserError(str(error)) from error
-    files: dict[Path, bytes] = {path: texts[name].encode() for name, path in paths_of(wish, headers).items()}
+    files: dict[Path, bytes] = {path: texts[name].encode() for name, path in paths_of(request, headers).items()}
     record = _record(done, headers, before, after, inputs) | {
-        "model": in_words(wish.model),
-        "ibrc_knots": list(wish.model.ibrc_knots),
+        "model": in_words(request.model),
+        "ibrc_knots": list(request.model.ibrc_knots),
         "verdict": _verdict_entry(verdict),
         "need": _need_entry(report.need),
-        "carried": verdict_entry(carried, accepted=wish.logs.accept_verdict),
+        "carried": verdict_entry(carried, accepted=request.logs.accept_verdict),
     }
     warnings: list[str] = []
-    if wish.report is not None:
+    if request.report is not None:
         tell("report", 0, 1)
-        files |= pages(wish.report, _with_profiles(report, done), warnings)
-        files |= _records(wish.report, done, report, wish.facts)
-        files[wish.report / OUTCOME] = (json.dumps(record, indent=2) + "\n").encode()
+        files |= pages(request.report, _with_profiles(report, done), warnings)
+        files |= _records(request.report, done, report, request.facts)
+        files[request.report / OUTCOME] = (json.dumps(record, indent=2) + "\n").encode()
     _write(files)
-    if wish.report is not None and wish.report / PRINTED not in files:
-        (wish.report / PRINTED).unlink(missing_ok=True)  # of an earlier run
+    if request.report is not None and request.report / PRINTED not in files:
+        (request.report / PRINTED).unlink(missing_ok=True)  # of an earlier run
     written = [str(path) for path in files]
     reasons = [f"also: {reason.what}" for reason in verdict.reasons[1:]]
     return Told(
         record | {"files": written},
         [
             *first_lines(record["carried"]),
-            *_lines(done, wish.model.ibrc_knots, before, after),
+            *_lines(done, request.model.ibrc_knots, before, after),
             *(verdict.sentence, *reasons, *written),
         ],
         warnings,
@@ -176,10 +176,10 @@ def _write(files: Mapping[Path, bytes]) -> None:
         raise UserError(f"{error.filename}: {error.strerror or error}", ExitCode.IO) from error
 
 
-def _inputs(wish: CalibrationOptions, done: Calibrated) -> list[tuple[str, str]]:
+def _inputs(request: CalibrationOptions, done: Calibrated) -> list[tuple[str, str]]:
     """Return name and SHA-256 of every input file, logs first."""
     paths = [part.path for flight in done.kept.logged for part in flight.session.parts]
-    given = (wish.logs.trajectory.file, wish.control, wish.ties, wish.polygons, wish.model_file)
+    given = (request.logs.trajectory.file, request.control, request.ties, request.polygons, request.model_file)
     paths += [path for path in given if path is not None]
     return [(path.name, sha256_of(path)) for path in paths]
 
@@ -318,7 +318,7 @@ def _verdict_entry(verdict: Verdict) -> dict[str, Any]:
 
 
 def _report(
-    wish: CalibrationOptions,
+    request: CalibrationOptions,
     done: Calibrated,
     headers: Mapping[str, Header],
     before: FlightStrips,
@@ -337,7 +337,7 @@ def _report(
         level=level_words(after),
         check=done.check,
         inputs=inputs,
-        settings=_settings(wish, done),
+        settings=_settings(request, done),
         need=need_of(done.flight, done.adjusted.calibrations, done.adjusted.trajectory, _wanted(done)),
         notes=[note for note in done.notes if note not in done.adjusted.notes],  # which the report has anyway
     )
@@ -404,12 +404,12 @@ def _npz(arrays: Mapping[str, Any]) -> bytes:
     return file.getvalue()
 
 
-def _settings(wish: CalibrationOptions, done: Calibrated) -> dict[str, str]:
+def _settings(request: CalibrationOptions, done: Calibrated) -> dict[str, str]:
     air = done.kept.logged[0].setup.config.atmosphere
     return {
         "Swath": __version__,
-        "model": in_words(wish.model),
-        "observed": ", ".join(wish.observe) + (", control" if done.control else ""),
+        "model": in_words(request.model),
+        "observed": ", ".join(request.observe) + (", control" if done.control else ""),
         "trajectory": "; ".join(trajectory.name for trajectory in done.flight.trajectories),
         "trajectory errors": "; ".join(done.prior.notes) or f"{len(done.prior)} knots",
         "atmosphere": f"ranges {air.ranges}, refraction {air.refraction}",

@@ -79,7 +79,7 @@ class KeptFlight:
     def notes(self) -> list[str]:
         """Holes in the data asked for, then doubts about the data read, one line each."""
         holes = [line for flight in self.logged for line in flight.holes]
-        return [*holes, *dict.fromkeys(line for flight in self.logged for line in flight.doubts)]
+        return [*holes, *dict.fromkeys(line for flight in self.logged for line in flight.warnings)]
 
 
 def refuse_without_noise(kept: KeptFlight) -> None:
@@ -101,17 +101,17 @@ def smoothed_prior(kept: KeptFlight) -> TrajectoryPrior | None:
         legs = [] if flight.navigated is None else flight.navigated.legs
         if len(legs) != 1:
             return None
-        chains.append(legs[0].solved.error_chain(knots.time_ns[knots.flown == number]))
+        chains.append(legs[0].solved.error_chain(knots.time_ns[knots.trajectory_index == number]))
     return from_smoother(kept.flight, chains, KNOT_S)
 
 
 def read_flight(
-    wish: GeorefOptions, folder: Path, tell: Steps, check: Callable[[list[str]], None] = lambda scanners: None
+    request: GeorefOptions, folder: Path, tell: Steps, check: Callable[[list[str]], None] = lambda scanners: None
 ) -> KeptFlight:
     """Read logs into a flight with all returns of its strips.
 
     Args:
-        wish: options as of `swath georef`; those about products are ignored.
+        request: options as of `swath georef`; those about products are ignored.
         folder: folder for the files, which take 104 bytes per return.
         tell: called with the progress.
         check: called as by `read_flights`.
@@ -119,7 +119,7 @@ def read_flight(
     Raises:
         UserError: for the reasons of `read_flights`; StripError, MappingError, LogError, OSError.
     """
-    logged = read_flights(wish, tell, check)
+    logged = read_flights(request, tell, check)
     frame = Tangent.at(_middle(logged[0]))
     plans = [KeepPlan(flight.index, flight.setup, flight.clocks.clocks, frame) for flight in logged]
     jobs = [job for number, flight in enumerate(logged) for job in _jobs(flight, number, folder)]
@@ -127,7 +127,7 @@ def read_flight(
     results = run_jobs(
         plans,
         jobs,
-        workers=wish.workers,
+        workers=request.workers,
         scheduler=None,
         progress=lambda done: tell("returns", done, total),
         do=keep_job,

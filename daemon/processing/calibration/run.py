@@ -26,7 +26,7 @@ from swath.calib.features import ControlPoint, Features
 from swath.calib.flight import Flight, FlightError
 from swath.calib.labels import number, unknown
 from swath.calib.outcome import Adjusted
-from swath.calib.parameters import ANGLES, ParameterError, check_scanners, check_wish
+from swath.calib.parameters import ANGLES, ParameterError, check_options, check_scanners
 from swath.calib.parameters import ParameterOptions as Model
 from swath.calib.planes.fit import PlaneError, PlaneSettings
 from swath.calib.planes.given import given_planes
@@ -145,11 +145,11 @@ class Calibrated:
     findings: tuple[Finding, ...] = ()
 
 
-def calibrate(wish: CalibrationOptions, folder: Path, tell: Steps) -> Calibrated:
+def calibrate(request: CalibrationOptions, folder: Path, tell: Steps) -> Calibrated:
     """Calibrate a flight's scanners.
 
     Args:
-        wish: options of the calibration.
+        request: options of the calibration.
         folder: temporary folder for the returns, some 150 bytes each.
         tell: called with the progress.
 
@@ -157,30 +157,30 @@ def calibrate(wish: CalibrationOptions, folder: Path, tell: Steps) -> Calibrated
         UserError: the flight cannot be calibrated; one line.
     """
     with as_user_error(folder, *REFUSED):
-        return _calibrate(wish, folder, tell)
+        return _calibrate(request, folder, tell)
 
 
-def _calibrate(wish: CalibrationOptions, folder: Path, tell: Steps) -> Calibrated:
-    _refuse_existing(wish, [] if wish.report is None else [wish.report / OUTCOME])
-    kept = read_flight(wish.logs, folder, tell, lambda scanners: check_scanners(scanners, wish.model))
-    _refuse_existing(wish, paths_of(wish, (head.name for head in kept.flight.heads)).values())
-    check_wish(kept.flight, wish.model)
+def _calibrate(request: CalibrationOptions, folder: Path, tell: Steps) -> Calibrated:
+    _refuse_existing(request, [] if request.report is None else [request.report / OUTCOME])
+    kept = read_flight(request.logs, folder, tell, lambda scanners: check_scanners(scanners, request.model))
+    _refuse_existing(request, paths_of(request, (head.name for head in kept.flight.heads)).values())
+    check_options(kept.flight, request.model)
     with told_before(trajectory_verdicts_of(kept.logged), *REFUSED):
-        return _calibrated(wish, kept, folder, tell)
+        return _calibrated(request, kept, folder, tell)
 
 
-def _calibrated(wish: CalibrationOptions, kept: KeptFlight, folder: Path, tell: Steps) -> Calibrated:
+def _calibrated(request: CalibrationOptions, kept: KeptFlight, folder: Path, tell: Steps) -> Calibrated:
     _refuse_one_strip(kept)
-    points = _control(wish, kept.flight)
-    workers = wish.logs.workers
+    points = _control(request, kept.flight)
+    workers = request.logs.workers
     tell("pre-alignment", 0, 1)
-    first, away = _aligned(kept.flight, wish.model.fix)
+    first, away = _aligned(kept.flight, request.model.fix)
     doubted = {name: abs(apart) for name, apart in away.items()}
     flight = replaced(kept.flight, first, folder, "aligned", workers)
     notes = _doubts(flight, points)
     tell("planes", 0, 1)
-    rings = None if wish.polygons is None else rings_of(wish.polygons, kept)
-    picked = Features() if wish.ties is None else ties_of(wish.ties, kept)
+    rings = None if request.polygons is None else rings_of(request.polygons, kept)
+    picked = Features() if request.ties is None else ties_of(request.ties, kept)
 
     def search(settings: PlaneSettings = PLANES) -> Features:
         if rings is not None:
@@ -193,10 +193,12 @@ def _calibrated(wish: CalibrationOptions, kept: KeptFlight, folder: Path, tell: 
             return rematch(flight, planes, PLANES, pool.map)
 
     def observed() -> Features:
-        return Features.joined([_features(wish, flight, planes, points), carried_points(picked, kept.flight, flight)])
+        return Features.joined(
+            [_features(request, flight, planes, points), carried_points(picked, kept.flight, flight)]
+        )
 
     planes, searched = search(), 1
-    refuse_no_planes(str(wish.logs.logs[0] if rings is None else wish.polygons), planes)
+    refuse_no_planes(str(request.logs.logs[0] if rings is None else request.polygons), planes)
     features = observed()
     prior = prior_of(kept)
 
@@ -212,7 +214,7 @@ def _calibrated(wish: CalibrationOptions, kept: KeptFlight, folder: Path, tell: 
 
     def everything(calibrations: Mapping[str, Calibration]) -> Features | None:
         nonlocal flight, planes, features
-        if not len(prior.walk_rad2) or "ties" in wish.observe:
+        if not len(prior.walk_rad2) or "ties" in request.observe:
             return None
         tell("all planes", 0, 1)
         flight = replaced(kept.flight, calibrations, folder, "entire", workers)
@@ -222,10 +224,10 @@ def _calibrated(wish: CalibrationOptions, kept: KeptFlight, folder: Path, tell: 
 
     tell("adjustment", 0, 1)
     adjusted = adjust(
-        flight, features, wish.model, prior, rematch=found_anew, first=first, doubted=doubted, entire=everything
+        flight, features, request.model, prior, rematch=found_anew, first=first, doubted=doubted, entire=everything
     )
-    _refuse_far(wish, kept.flight, adjusted)
-    refuse_lost_control(wish.control, features)
+    _refuse_far(request, kept.flight, adjusted)
+    refuse_lost_control(request.control, features)
     flight = replaced(kept.flight, adjusted.calibrations, folder, "calibrated", workers)
     tell("profiles", 0, 1)
     checked = check(flight, adjusted, prior, points)
@@ -270,23 +272,23 @@ def prealigned_otherwise(away: Mapping[str, float], adjusted: Adjusted) -> tuple
     return tuple(found)
 
 
-def _refuse_existing(wish: CalibrationOptions, files: Iterable[Path]) -> None:
+def _refuse_existing(request: CalibrationOptions, files: Iterable[Path]) -> None:
     """Refuse with `UserError` to replace files that exist, unless the user allows it."""
     for path in files:
-        if path.exists() and not wish.overwrite:
+        if path.exists() and not request.overwrite:
             raise UserError(f"{path}: already exists; choose another folder or use --overwrite", ExitCode.USAGE)
 
 
-def paths_of(wish: CalibrationOptions, scanners: Iterable[str]) -> dict[str, Path]:
+def paths_of(request: CalibrationOptions, scanners: Iterable[str]) -> dict[str, Path]:
     """Return the path of each scanner's calibration file."""
     names = list(scanners)
-    if len(names) == 1 and not wish.output.is_dir():
-        return dict.fromkeys(names, wish.output)
-    return {name: wish.output / f"{name}.toml" for name in names}
+    if len(names) == 1 and not request.output.is_dir():
+        return dict.fromkeys(names, request.output)
+    return {name: request.output / f"{name}.toml" for name in names}
 
 
 def _refuse_one_strip(kept: KeptFlight) -> None:
-    strips = {(swath.flown, swath.strip) for swath in kept.flight.swaths}
+    strips = {(swath.trajectory_index, swath.strip) for swath in kept.flight.swaths}
     log = kept.logged[0].log
     if not strips and (holes := [line for flight in kept.logged for line in flight.holes]):
         raise UserError("\n".join(holes))
@@ -321,10 +323,10 @@ def refuse_lost_control(control: Path | None, features: Features) -> None:
 # ---------------------------------------------------------------------- observations
 
 
-def _control(wish: CalibrationOptions, flight: Flight) -> tuple[ControlPoint, ...]:
-    if wish.control is None:
+def _control(request: CalibrationOptions, flight: Flight) -> tuple[ControlPoint, ...]:
+    if request.control is None:
         return ()
-    return in_t(read_control(text_of(wish.control), str(wish.control)), flight.frame)
+    return in_t(read_control(text_of(request.control), str(request.control)), flight.frame)
 
 
 def _doubts(flight: Flight, points: Sequence[ControlPoint]) -> tuple[str, ...]:
@@ -340,16 +342,18 @@ def _doubts(flight: Flight, points: Sequence[ControlPoint]) -> tuple[str, ...]:
     return tuple(doubt.text for doubt in found)
 
 
-def _features(wish: CalibrationOptions, flight: Flight, planes: Features, points: Sequence[ControlPoint]) -> Features:
+def _features(
+    request: CalibrationOptions, flight: Flight, planes: Features, points: Sequence[ControlPoint]
+) -> Features:
     """Return the observations of the adjustment: planes or their intersections, never both, as they share their
     returns.
     """
     found = [planes]
-    if "ties" in wish.observe:
+    if "ties" in request.observe:
         found = [find_ties(flight, planes)]
     if points:
         found.append(control_planes(flight, points))
-    if "markings" in wish.observe:
+    if "markings" in request.observe:
         found.append(find_markings(flight))
     return Features.joined(found)
 
@@ -362,25 +366,25 @@ def prior_of(kept: KeptFlight) -> TrajectoryPrior:
 # ---------------------------------------------------------------------- results
 
 
-def _refuse_far(wish: CalibrationOptions, flight: Flight, adjusted: Adjusted) -> None:
+def _refuse_far(request: CalibrationOptions, flight: Flight, adjusted: Adjusted) -> None:
     """Refuse with `UserError` an adjustment that did not converge or moved implausibly far, before
     any file is written.
     """
-    log = wish.logs.logs[0]
+    log = request.logs.logs[0]
     if not adjusted.converged:
         raise UserError(f"{log}: the adjustment does not converge; inspect the strips with swath view first")
     for head in flight.heads:
         found = adjusted.calibrations[head.name]
         for name in ANGLES:
             away_deg = math.degrees(found.value(name) - head.start.value(name))
-            if abs(away_deg) > wish.limit_deg:
+            if abs(away_deg) > request.limit_deg:
                 raise UserError(
                     f"{log}: {head.name}: {name.removesuffix('_rad')} would change by {away_deg:.2f}°, more than "
-                    f"--limit-deg {wish.limit_deg:g}; check the installation matrix"
+                    f"--limit-deg {request.limit_deg:g}; check the installation matrix"
                 )
         away_m = found.value("range_offset_m") - head.start.value("range_offset_m")
-        if abs(away_m) > wish.limit_m:
+        if abs(away_m) > request.limit_m:
             raise UserError(
                 f"{log}: {head.name}: the range offset would change by {away_m:.2f} m, more than --limit-m "
-                f"{wish.limit_m:g}; check that the control's heights are ellipsoidal and in this datum"
+                f"{request.limit_m:g}; check that the control's heights are ellipsoidal and in this datum"
             )

@@ -147,7 +147,7 @@ class Flight:
         return self.session.parts[0].path
 
     @property
-    def doubts(self) -> list[str]:
+    def warnings(self) -> list[str]:
         """Doubts about its data, time and trajectory, one line each."""
         lost = [f"{self.log}: the recorder lost {count:,} units of {source}" for source, count in self.lost.items()]
         return [*lost, *self.troubles]
@@ -179,12 +179,12 @@ class Flight:
 
 
 def read_flights(
-    wish: GeorefOptions, tell: Tell, check: Callable[[list[str]], None] = lambda scanners: None
+    request: GeorefOptions, tell: Tell, check: Callable[[list[str]], None] = lambda scanners: None
 ) -> list[Flight]:
     """Return the flights of the logs, with trajectories and strips; note files that are not logs as holes of the first.
 
     Args:
-        wish: which logs, and how.
+        request: which logs, and how.
         tell: called with the progress.
         check: called with the names of all scanners before any long work; its exceptions pass through.
 
@@ -195,37 +195,37 @@ def read_flights(
     """
     refuse_in_import()
     passed_over: list[str] = []
-    sessions = open_logs(wish.logs, passed_over)
-    setups = [_setup(wish, session) for session in sessions]
+    sessions = open_logs(request.logs, passed_over)
+    setups = [_setup(request, session) for session in sessions]
     logs = [session.parts[0].path for session in sessions]
     configs = dict(zip(logs, (setup.config for setup in setups), strict=True))
     for session in sessions:
         refuse_no_name(session.session_id, session.parts[0].path)
     check(list(dict.fromkeys(name for setup in setups for name in setup.scanners)))
-    refuse_different_settings(configs, wish.options.crs, wish.options.datum, wish.options.epoch)
+    refuse_different_settings(configs, request.options.crs, request.options.datum, request.options.epoch)
     flights: list[Flight] = []
     for number, (session, setup) in enumerate(zip(sessions, setups, strict=True)):
         tell("clocks and trajectory", number, len(sessions))
-        flights.append(_read(session, setup, positions=wish.trajectory.file is not None))
+        flights.append(_read(session, setup, positions=request.trajectory.file is not None))
     flights[0].holes += [f"skipped: {line}" for line in passed_over]
     refuse_overlap({flight.log: flight.span for flight in flights})
     flights.sort(key=lambda flight: flight.span)  # sessions come in host time, which may be wrong
     for flight in flights:
-        _choose(wish, flight)
-    _number_strips(wish, flights)
+        _choose(request, flight)
+    _number_strips(request, flights)
     return flights
 
 
-def _setup(wish: GeorefOptions, session: Session) -> Setup:
-    if wish.config is None:
+def _setup(request: GeorefOptions, session: Session) -> Setup:
+    if request.config is None:
         try:
-            setup = Setup.of_log(session.attachments(), wish.options)
+            setup = Setup.of_log(session.attachments(), request.options)
         except UserError as error:
-            lines = of_log(session.parts[0].path, error.message.splitlines(), wish.options)
+            lines = of_log(session.parts[0].path, error.message.splitlines(), request.options)
             raise UserError("\n".join(lines), error.exit_code) from error
     else:
-        setup = Setup.of_config(wish.config, wish.options)
-    crs = wish.options.crs or setup.config.output.crs
+        setup = Setup.of_config(request.config, request.options)
+    crs = request.options.crs or setup.config.output.crs
     if crs is None:
         raise UserError(f"{session.parts[0].path}: its configuration has no output.crs; give --crs", ExitCode.USAGE)
     refuse_geocentric(crs)
@@ -257,29 +257,31 @@ def _read(session: Session, setup: Setup, *, positions: bool) -> Flight:
     return flight
 
 
-def _choose(wish: GeorefOptions, flight: Flight) -> None:
+def _choose(request: GeorefOptions, flight: Flight) -> None:
     """Set the flight's trajectory, and settle the mapping for its area."""
     status = flight.status(flight.host_span[1])
     leap_seconds = status.leap_seconds if status is not None and status.leap_origin != "guess" else None
-    chosen = choose_trajectory(wish.trajectory, flight.setup, flight.session, flight.clocks, flight.span, leap_seconds)
+    chosen = choose_trajectory(
+        request.trajectory, flight.setup, flight.session, flight.clocks, flight.span, leap_seconds
+    )
     flight.trajectory, flight.solutions, flight.navigated = chosen.trajectory, chosen.solutions, chosen.navigated
-    flight.troubles += [doubt for doubt in chosen.doubts if doubt not in flight.troubles]
-    _judge(wish, flight)
+    flight.troubles += [doubt for doubt in chosen.warnings if doubt not in flight.troubles]
+    _judge(request, flight)
     assert flight.setup.mapping is not None
     within = flight.trajectory.between(*flight.span)
     places_e = within.position_e[:: max(1, len(within) // 100)]
     flight.setup.mapping.settle(places_e)
     misfit = flight.setup.mapping.misfit(places_e)
-    if misfit and not wish.options.force_crs:
-        lines = of_log(flight.log, [misfit], wish.options)
+    if misfit and not request.options.force_crs:
+        lines = of_log(flight.log, [misfit], request.options)
         raise UserError(f"{lines[0]}; use --force-crs to accept it", ExitCode.USAGE)
     flight.troubles += [misfit] if misfit else []
 
 
-def _judge(wish: GeorefOptions, flight: Flight) -> None:
+def _judge(request: GeorefOptions, flight: Flight) -> None:
     """Set the verdicts that products of the flight carry."""
-    if wish.trajectory.file is not None:
-        flight.trajectory_verdicts, flight.source = file_verdicts(wish.trajectory.file, flight.span)
+    if request.trajectory.file is not None:
+        flight.trajectory_verdicts, flight.source = file_verdicts(request.trajectory.file, flight.span)
     elif flight.navigated is not None:
         flight.trajectory_verdicts, flight.source = list(navigated_verdicts(flight.navigated)), "navigated"
     else:
@@ -297,23 +299,23 @@ def trajectory_verdicts_of(flights: Sequence[Flight]) -> list[Carried]:
     return list(dict.fromkeys(one for flight in flights for one in flight.trajectory_verdicts))
 
 
-def verdict_of(wish: GeorefOptions, flights: Sequence[Flight]) -> dict[str, Any]:
+def verdict_of(request: GeorefOptions, flights: Sequence[Flight]) -> dict[str, Any]:
     """Return the verdict entry of a run, each reason once."""
-    return verdict_entry(verdicts_of(flights), accepted=wish.accept_verdict)
+    return verdict_entry(verdicts_of(flights), accepted=request.accept_verdict)
 
 
-def _number_strips(wish: GeorefOptions, flights: Sequence[Flight]) -> None:
+def _number_strips(request: GeorefOptions, flights: Sequence[Flight]) -> None:
     """Set each flight's strips in log time, numbered throughout the run."""
-    given = None if wish.strips in ("auto", "whole") else _given_strips(wish.strips)
+    given = None if request.strips in ("auto", "whole") else _given_strips(request.strips)
     number = 1
     for flight in flights:
-        flight.strips, flight.first_number = _strips(wish, flight, given), number
+        flight.strips, flight.first_number = _strips(request, flight, given), number
         number += len(flight.strips)
     if given is not None:
-        note_strips_elsewhere(wish.strips, given, flights)
+        note_strips_elsewhere(request.strips, given, flights)
     if number == 1:
         raise UserError(
-            f"{flights[0].log}: has no strip: no straight flight with data lasts {wish.rules.min_strip_s:g} s; use "
+            f"{flights[0].log}: has no strip: no straight flight with data lasts {request.rules.min_strip_s:g} s; use "
             "--strips whole, or --strips FILE with the strips' times"
         )
 
@@ -341,19 +343,19 @@ def _given_strips(name: str) -> list[Span]:
     return read_strips(text_of(Path(name), "a CSV file with start_gps_ns,end_gps_ns"), name)
 
 
-def _strips(wish: GeorefOptions, flight: Flight, given: Sequence[Span] | None) -> list[Span]:
-    laser = laser_spans(*flight.index.spans(), wish.rules)
-    if wish.strips == "whole":
+def _strips(request: GeorefOptions, flight: Flight, given: Sequence[Span] | None) -> list[Span]:
+    laser = laser_spans(*flight.index.spans(), request.rules)
+    if request.strips == "whole":
         return laser
-    spans = _straight(wish, flight) if given is None else given
+    spans = _straight(request, flight) if given is None else given
     host = flight.host_from_gps([time_ns for span in spans for time_ns in span])
     here = list(zip(host[::2], host[1::2], strict=True))
     if given is None:
-        return cut(here, laser, wish.rules)
+        return cut(here, laser, request.rules)
     return [(start, end) for start, end in here if start < flight.host_span[1] and end > flight.host_span[0]]
 
 
-def _straight(wish: GeorefOptions, flight: Flight) -> list[Span]:
+def _straight(request: GeorefOptions, flight: Flight) -> list[Span]:
     """Return the spans of straight flight in GPS time, and spans without a trajectory.
 
     Before a device's own INS is aligned there is no solution: this is noted as trouble, not as a strip.
@@ -363,16 +365,16 @@ def _straight(wish: GeorefOptions, flight: Flight) -> list[Span]:
     (begin, end), (first, last) = flight.span, trajectory.span
     unknown = [(start, stop) for start, stop in trajectory.gaps().tolist()]
     outside = [(start, stop) for start, stop in ((begin, first), (last, end)) if start < stop]
-    if wish.trajectory.file is not None:
+    if request.trajectory.file is not None:
         unknown += outside
     else:
         flight.troubles += [
             f"{flight.log}: {(stop - start) / 1e9:.1f} s of the log have no INS solution and therefore no strips"
             for start, stop in outside
-            if stop - start >= wish.rules.min_strip_s * 1e9
+            if stop - start >= request.rules.min_strip_s * 1e9
         ]
     roll, _, heading = trajectory.attitude()
-    return straight_spans(trajectory.time_ns, heading, roll, wish.rules, unknown)
+    return straight_spans(trajectory.time_ns, heading, roll, request.rules, unknown)
 
 
 def refuse_different_settings(

@@ -73,19 +73,19 @@ class Chosen:
     Attributes:
         trajectory: the trajectory; its attitude refers to the ellipsoid's normal, whatever the source's did
             (``[attitude]``).
-        doubts: doubts about it, one line each.
+        warnings: doubts about it, one line each.
         solutions: number of the device's INS solutions by fate (`swath.georef.trajectory.buffer`); empty for a file.
         navigated: the navigation that it was smoothed in; None: it comes from elsewhere.
     """
 
     trajectory: Trajectory
-    doubts: list[str]
+    warnings: list[str]
     solutions: dict[str, int]
     navigated: Navigated | None = None
 
 
 def choose_trajectory(
-    wish: TrajectoryOptions,
+    request: TrajectoryOptions,
     setup: Setup,
     session: Session,
     clocks: LogClocks,
@@ -104,22 +104,22 @@ def choose_trajectory(
     solutions: dict[str, int] = {}
     navigated: Navigated | None = None
     both = setup.sources.imu_source is not None and bool(setup.config.gnss)
-    offset = offset_of(wish.at, setup)
+    offset = offset_of(request.at, setup)
     try:
-        if wish.file is None:
+        if request.file is None:
             trajectory, solutions = _from_device(setup, clocks)
-            if (wish.navigate and both) or len(trajectory) < SHORTEST_TRAJECTORY:
+            if (request.navigate and both) or len(trajectory) < SHORTEST_TRAJECTORY:
                 navigated = _navigated(setup, session, solutions)
                 trajectory = navigated.trajectory()
                 findings = [finding.text for leg in navigated.legs for finding in leg.findings]
-                warnings = [*navigated.doubts, *navigated.holes, *findings]
+                warnings = [*navigated.warnings, *navigated.holes, *findings]
         else:
-            trajectory = _from_file(wish, wish.file, span, leap_seconds)
-            warnings = refuse_other_motion(clocks, trajectory, str(wish.file), log)
-        refuse_no_overlap(trajectory, str(wish.file or trajectory.name), span, log)
+            trajectory = _from_file(request, request.file, span, leap_seconds)
+            warnings = refuse_other_motion(clocks, trajectory, str(request.file), log)
+        refuse_no_overlap(trajectory, str(request.file or trajectory.name), span, log)
         trajectory.require_attitude()
         if navigated is None:
-            warnings += attitude_doubts(trajectory, str(wish.file or f"{log}: {FROM_LOG}"))
+            warnings += attitude_doubts(trajectory, str(request.file or f"{log}: {FROM_LOG}"))
         if setup.deflection_rad is not None:
             trajectory = trajectory.with_deflection(*setup.deflection_rad)
         if offset is not None and navigated is not None:
@@ -128,8 +128,8 @@ def choose_trajectory(
             )
         elif offset is not None:
             trajectory = trajectory.at_body(offset)
-        if wish.file is not None:
-            warnings += _belonging(wish, wish.file, trajectory, setup, clocks, log)
+        if request.file is not None:
+            warnings += _belonging(request, request.file, trajectory, setup, clocks, log)
     except TrajectoryError as error:
         named = str(error) if str(log) in str(error) else f"{error} ({log})"
         raise UserError(named) from error
@@ -137,26 +137,26 @@ def choose_trajectory(
 
 
 def _belonging(
-    wish: TrajectoryOptions, file: Path, trajectory: Trajectory, setup: Setup, clocks: LogClocks, log: Path
+    request: TrajectoryOptions, file: Path, trajectory: Trajectory, setup: Setup, clocks: LogClocks, log: Path
 ) -> list[str]:
     """Return doubts about a file's trajectory against the log; refuse one that does not belong to
     it with `UserError`.
     """
-    offset = offset_of(wish.at, setup) or (0.0, 0.0, 0.0)
+    offset = offset_of(request.at, setup) or (0.0, 0.0, 0.0)
     given = Given(str(file), trajectory, offset, points_of(setup), setup.options.datum is not None)
     found = judge_given(given, setup, clocks, log)
-    if found.refused and not wish.force:
+    if found.refused and not request.force:
         raise UserError("\n".join(f"{line}; use --force-trajectory to accept it" for line in found.refused))
     return [*found.refused, *found.warnings]
 
 
-def _from_file(wish: TrajectoryOptions, file: Path, span: tuple[int, int], leap_seconds: int | None) -> Trajectory:
+def _from_file(request: TrajectoryOptions, file: Path, span: tuple[int, int], leap_seconds: int | None) -> Trajectory:
     smrmsg = smrmsg_beside(file)
     return read_trajectory(
         file.read_bytes(),
         str(file),
         span_ns=span,
-        week=wish.week,
+        week=request.week,
         leap_seconds=leap_seconds,
         smrmsg=None if smrmsg is None else smrmsg.read_bytes(),
     )

@@ -32,12 +32,12 @@ from swath.daemon.processing.flights.read import (
     read_flights,
     verdict_of,
 )
-from swath.daemon.processing.georeferencing.sidecar import count_unread, reasons_text, run_record, write_sidecar
+from swath.daemon.processing.georeferencing.sidecar import count_undecoded, reasons_text, run_record, write_sidecar
 from swath.daemon.processing.points.jobs import MARGIN_NS, Job, JobError, JobResult, SessionPlan
 from swath.daemon.processing.points.workers import run_jobs
 from swath.daemon.processing.quicklook.product_facts import read_sidecar, sessions_in
 from swath.daemon.processing.trajectory.files import TrajectoryFiles, write_trajectory
-from swath.daemon.processing.unread import unread_lines
+from swath.daemon.processing.undecoded import undecoded_lines
 from swath.daemon.processing.user_errors import as_user_error
 from swath.drivers.driver import find_driver
 from swath.georef.formats.las import LasSettings
@@ -60,28 +60,28 @@ class Report:
     sidecar: Path
 
 
-def georeference(wish: GeorefOptions, tell: Tell) -> Report:
+def georeference(request: GeorefOptions, tell: Tell) -> Report:
     """Make the products of a run.
 
     Raises:
         UserError: they cannot be made, one line; no file that looks like a product is left then.
     """
-    with as_user_error(wish.output, StripError, JobError, MappingError):
-        flights = read_flights(wish, tell)
+    with as_user_error(request.output, StripError, JobError, MappingError):
+        flights = read_flights(request, tell)
         names = [flight.session.session_id for flight in flights]
-        with _out_of_sight(wish, names) as (partial, into_place):
-            return _make(wish, flights, names[0], partial, into_place, tell)
+        with _out_of_sight(request, names) as (partial, into_place):
+            return _make(request, flights, names[0], partial, into_place, tell)
 
 
 # ---------------------------------------------------------------------- jobs
 
 
-def _jobs(wish: GeorefOptions, flight: Flight, number: int, partial: Path) -> list[Job]:
+def _jobs(request: GeorefOptions, flight: Flight, number: int, partial: Path) -> list[Job]:
     tiles = segments(flight.strips, *flight.host_span, first_number=flight.first_number)
-    return [_job(wish, flight, number, tile, partial) for tile in tiles]
+    return [_job(request, flight, number, tile, partial) for tile in tiles]
 
 
-def _job(wish: GeorefOptions, flight: Flight, number: int, tile: Segment, partial: Path) -> Job:
+def _job(request: GeorefOptions, flight: Flight, number: int, tile: Segment, partial: Path) -> Job:
     places = flight.index.between(tile.start_ns - MARGIN_NS, tile.end_ns + MARGIN_NS)
     if not tile.strip:
         return Job(number, tile, places)
@@ -90,8 +90,8 @@ def _job(wish: GeorefOptions, flight: Flight, number: int, tile: Segment, partia
     reach = MARGIN_NS + TRAJECTORY_MARGIN_NS
     trajectory = flight.trajectory.between(begin - reach, end + reach)
     name = f"{flight.session.session_id}_strip{tile.strip:02d}"
-    path = partial / (name + (".copc.laz" if wish.copc else ".laz"))
-    dropped_file = partial / f"{name}{DROPPED}" if wish.write_dropped else None
+    path = partial / (name + (".copc.laz" if request.copc else ".laz"))
+    dropped_file = partial / f"{name}{DROPPED}" if request.write_dropped else None
     return Job(number, tile, places, trajectory, path, dropped_file)
 
 
@@ -101,7 +101,7 @@ def _numbers(flights: Sequence[Flight]) -> dict[str, int]:
 
 
 def _plan(
-    wish: GeorefOptions, flight: Flight, origin: tuple[float, float, float], numbers: dict[str, int]
+    request: GeorefOptions, flight: Flight, origin: tuple[float, float, float], numbers: dict[str, int]
 ) -> SessionPlan:
     setup = flight.setup
     assert setup.mapping is not None
@@ -111,8 +111,8 @@ def _plan(
     las = LasSettings(
         wkt=setup.mapping.wkt,
         offset=origin,
-        scale=(wish.scale, wish.scale, wish.scale),
-        sigmas=wish.sigmas,
+        scale=(request.scale, request.scale, request.scale),
+        sigmas=request.sigmas,
         creation_date=day,
         software=f"swath {__version__}",
         system_identifier=" ".join(protocols.values()),
@@ -126,7 +126,7 @@ def _plan(
     )
     eight_bit = [name for name, protocol in protocols.items() if find_driver("scanner", protocol).eight_bit_intensity]
     factors = dict.fromkeys(eight_bit, INTENSITY_FACTOR)
-    return SessionPlan(flight.index, setup, flight.clocks.clocks, las, factors, numbers, wish.copc)
+    return SessionPlan(flight.index, setup, flight.clocks.clocks, las, factors, numbers, request.copc)
 
 
 def _origin(flights: Sequence[Flight]) -> tuple[float, float, float]:
@@ -144,15 +144,15 @@ def _origin(flights: Sequence[Flight]) -> tuple[float, float, float]:
 
 
 @contextmanager
-def _out_of_sight(wish: GeorefOptions, names: Sequence[str]) -> Iterator[tuple[Path, Callable[[list[Path]], None]]]:
+def _out_of_sight(request: GeorefOptions, names: Sequence[str]) -> Iterator[tuple[Path, Callable[[list[Path]], None]]]:
     """Provide a temporary folder and a function that moves files to their place; the folder is always removed.
 
     Args:
-        wish: options of the run.
+        request: options of the run.
         names: names of the sessions.
     """
-    output, name = wish.output, names[0]
-    _refuse_existing(wish, names)
+    output, name = request.output, names[0]
+    _refuse_existing(request, names)
     output.mkdir(parents=True, exist_ok=True)
     partial = output / f"{name}.partial"
     shutil.rmtree(partial, ignore_errors=True)
@@ -180,21 +180,21 @@ def _strips(folder: Path, name: str) -> list[Path]:
     return [file for file in sorted(folder.glob(f"{glob.escape(name)}_strip*")) if file.name.endswith(ENDINGS)]
 
 
-def _refuse_existing(wish: GeorefOptions, names: Sequence[str]) -> None:
+def _refuse_existing(request: GeorefOptions, names: Sequence[str]) -> None:
     """Refuse with `UserError` to replace the sessions' products, or a trajectory of theirs that is read."""
     for name in names:
-        files = TrajectoryFiles.in_folder(wish.output, name, csv=True)
+        files = TrajectoryFiles.in_folder(request.output, name, csv=True)
         trajectories = [path for path in (files.csv, files.sbet, files.smrmsg) if path is not None and path.exists()]
-        read = wish.trajectory.file
+        read = request.trajectory.file
         if read is not None and read.exists() and any(path.samefile(read) for path in trajectories):
             raise UserError(f"{read}: is an input and would be overwritten; choose another folder", ExitCode.USAGE)
-        there = [path for path in (wish.output / f"{name}.json", *_strips(wish.output, name)) if path.exists()]
-        if (there or trajectories) and not wish.overwrite:
+        there = [path for path in (request.output / f"{name}.json", *_strips(request.output, name)) if path.exists()]
+        if (there or trajectories) and not request.overwrite:
             first = [*there, *trajectories][0]
             raise UserError(
                 f"{first}: exists from an earlier run; choose another folder or use --overwrite", ExitCode.USAGE
             )
-    _refuse_parts(wish.output, names)
+    _refuse_parts(request.output, names)
 
 
 def _refuse_parts(folder: Path, names: Sequence[str]) -> None:
@@ -211,7 +211,7 @@ def _refuse_parts(folder: Path, names: Sequence[str]) -> None:
 
 
 def _make(
-    wish: GeorefOptions,
+    request: GeorefOptions,
     flights: Sequence[Flight],
     name: str,
     partial: Path,
@@ -220,8 +220,8 @@ def _make(
 ) -> Report:
     origin = _origin(flights)
     numbers = _numbers(flights)
-    plans = [_plan(wish, flight, origin, numbers) for flight in flights]
-    jobs = [job for number, flight in enumerate(flights) for job in _jobs(wish, flight, number, partial)]
+    plans = [_plan(request, flight, origin, numbers) for flight in flights]
+    jobs = [job for number, flight in enumerate(flights) for job in _jobs(request, flight, number, partial)]
     total = sum(job.size for job in jobs)
     given_up = Event()
     with ThreadPoolExecutor(1) as hasher:
@@ -231,8 +231,8 @@ def _make(
             results = run_jobs(
                 plans,
                 jobs,
-                workers=wish.workers,
-                scheduler=wish.scheduler,
+                workers=request.workers,
+                scheduler=request.scheduler,
                 progress=lambda done: tell("points", done, total),
             )
             logs = [{"name": path.name, "sha256": found.result()} for path, found in zip(paths, hashes, strict=True)]
@@ -244,10 +244,10 @@ def _make(
     done = [path for made in files.values() for path in made if path is not None]
     trajectories = [path for flight in flights for path in _write_trajectory(flight, partial)]
     record = run_record(flights, results, files)
-    record["verdict"] = verdict_of(wish, flights)
-    record |= {"logs": logs, "files": [path.name for path in trajectories], "options": wish.record()}
+    record["verdict"] = verdict_of(request, flights)
+    record |= {"logs": logs, "files": [path.name for path in trajectories], "options": request.record()}
     into_place([*done, *trajectories])
-    sidecar = wish.output / f"{name}.json"
+    sidecar = request.output / f"{name}.json"
     write_sidecar(sidecar, record)
     return Report(record, sidecar)
 
@@ -256,7 +256,7 @@ def _files(job: Job, result: JobResult) -> tuple[Path | None, Path | None]:
     """Return the files that a job made: points, and the list of returns without a place."""
     if result.failed:
         return None, None
-    return job.path if result.points or result.withheld else None, job.dropped if result.listed else None
+    return job.path if result.points or result.withheld else None, job.discarded if result.listed else None
 
 
 def _note_troubles(flights: Sequence[Flight], results: Sequence[JobResult]) -> None:
@@ -264,7 +264,7 @@ def _note_troubles(flights: Sequence[Flight], results: Sequence[JobResult]) -> N
     note_times(flights, results)
     if not any(result.points or result.failed for result in results):
         lines = [line for flight in flights for line in (*flight.troubles, *flight.holes)]
-        lines += [line for part in unread_lines(str(flights[0].log), count_unread(results)) for line in part]
+        lines += [line for part in undecoded_lines(str(flights[0].log), count_undecoded(results)) for line in part]
         became = reasons_text(fates for result in results for fates in result.fates.values())
         refuse_nothing(flights[0].log, lines, became)
 

@@ -13,7 +13,7 @@ from swath import __version__
 from swath.daemon.processing.carried_verdict import trajectory_entry
 from swath.daemon.processing.files import utc_text, write_whole
 from swath.daemon.processing.setup.models import air_of
-from swath.daemon.processing.unread import unread_lines
+from swath.daemon.processing.undecoded import undecoded_lines
 from swath.georef.points import Fate
 from swath.georef.scanner.calibration import PARAMETERS
 
@@ -57,18 +57,18 @@ def count_fates(results: Sequence[JobResult]) -> dict[str, dict[str, Any]]:
     for result in results:
         for scanner, fates in result.fates.items():
             total.setdefault(scanner, Counter()).update(fates)
-    undecoded = count_unread(results)
+    undecoded = count_undecoded(results)
     return {
         scanner: counts_entry(fates) | {"messages_not_read": dict(sorted(undecoded.get(scanner, {}).items()))}
         for scanner, fates in sorted(total.items())
     }
 
 
-def count_unread(results: Sequence[JobResult]) -> dict[str, Counter[str]]:
+def count_undecoded(results: Sequence[JobResult]) -> dict[str, Counter[str]]:
     """Return counts by scanner of messages that gave no returns, by reason."""
     total: dict[str, Counter[str]] = {}
     for result in results:
-        for scanner, counts in result.unread.items():
+        for scanner, counts in result.undecoded.items():
             total.setdefault(scanner, Counter()).update(counts)
     return total
 
@@ -202,8 +202,8 @@ def _warnings(flight: Flight, results: Sequence[JobResult]) -> list[str]:
         if (line := air_of(config, config.scanner[name]).warning(above_m, angle_rad, ground_m)) is not None
     ]
     lines += unit_doubts(flight)
-    lines += flight.doubts
-    lines += unread_lines(str(flight.log), count_unread(results))[1]
+    lines += flight.warnings
+    lines += undecoded_lines(str(flight.log), count_undecoded(results))[1]
     sigma, unknown, intensity = (
         sum(getattr(result.clipped, name) for result in results) for name in ("sigma", "sigma_unknown", "intensity")
     )
@@ -244,7 +244,7 @@ def _holes(flight: Flight, results: Sequence[JobResult]) -> list[str]:
         damage = part.damage
         lines.append(f"{part.path}: at byte {damage.offset}: {damage.length} bytes, {damage.what}")
     lines += flight.holes
-    lines += unread_lines(str(flight.log), count_unread(results))[0]
+    lines += undecoded_lines(str(flight.log), count_undecoded(results))[0]
     for result in results:
         if result.failed:
             lines.append(f"strip {result.strip}: {result.failed}" if result.strip else f"a turn: {result.failed}")

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from swath.daemon.errors import ExitCode, UserError
-from swath.daemon.processing.navigation.doubts import (
+from swath.daemon.processing.navigation.input_checks import (
     TIME_IS_KNOWN_S,
     height_findings,
     input_doubts,
@@ -93,7 +93,7 @@ class NavigationInputs:
         observed: number of observations by kind (lower case).
         refused: number of fixes, headings and solutions that gave no observation, by kind and reason.
         assumed: number of observations with default sigmas, by kind.
-        doubts: lines for the user; holes: missing data, one line each.
+        warnings: lines for the user; holes: missing data, one line each.
         missing: stretches of samples longer than `LEAST_HOLE_S` that no leg holds; each is a hole too.
         findings: errors that the receiver's messages themselves show, for the verdict.
     """
@@ -110,7 +110,7 @@ class NavigationInputs:
     refused: Counter[str]
     assumed: Counter[str]
     counts: dict[str, Counter[str]]
-    doubts: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
     holes: list[str] = field(default_factory=list)
     missing: list[Stretch] = field(default_factory=list)
     findings: list[Finding] = field(default_factory=list)
@@ -143,7 +143,7 @@ class InputOptions:
     ins: str = "ignore"
 
 
-def read_inputs(session: Session, wish: InputOptions, storage: Storage = IN_MEMORY) -> NavigationInputs:
+def read_inputs(session: Session, request: InputOptions, storage: Storage = IN_MEMORY) -> NavigationInputs:
     """Read a session's inputs of navigation; its samples are kept in the storage.
 
     Raises:
@@ -151,11 +151,11 @@ def read_inputs(session: Session, wish: InputOptions, storage: Storage = IN_MEMO
         LogError, OSError: the log cannot be read.
     """
     log = session.parts[0].path
-    if wish.positions is not None:
-        refuse_unreadable(wish.positions)
-    sources = _sources(session, wish)
+    if request.positions is not None:
+        refuse_unreadable(request.positions)
+    sources = _sources(session, request)
     found = read_navigation_log(session, sources)
-    refuse_nothing(found, sources, log, outside=wish.positions is not None)
+    refuse_nothing(found, sources, log, outside=request.positions is not None)
     times = imu_times(found.imu, found.host, sources.clock, sources.imu.rate_hz)
     if not len(times.gps_ns):
         raise UserError(no_time(found, sources, log))
@@ -164,10 +164,10 @@ def read_inputs(session: Session, wish: InputOptions, storage: Storage = IN_MEMO
         refuse_no_time(log, sources.clock, found.host.status(sources.clock, last_ns), sources.config)
     inertial, sampler = _sampled(times, sources, storage)
     placed = _Placed(found, sources)
-    outside = None if wish.positions is None else _outside(wish.positions, wish.week, inertial, placed)
-    parts = placed.observations(outside, use_ins=wish.ins == "observe")
+    outside = None if request.positions is None else _outside(request.positions, request.week, inertial, placed)
+    parts = placed.observations(outside, use_ins=request.ins == "observe")
     observations = joined(list(parts.values()))
-    refuse_elsewhere(inertial, observations, sources, wish.positions, log)
+    refuse_elsewhere(inertial, observations, sources, request.positions, log)
     legs, short = _legs(inertial, observations)
     warnings = input_doubts(found, sources, times, parts, log)
     missing = _missing(times, sampler, short, sources.imu.rate_hz)
@@ -189,21 +189,21 @@ def read_inputs(session: Session, wish: InputOptions, storage: Storage = IN_MEMO
         ),
         assumed=sum((part.assumed for part in parts.values()), Counter()),
         counts=found.counts,
-        doubts=warnings,
+        warnings=warnings,
         holes=holes,
         missing=missing,
         findings=height_findings(found, sources) if outside is None else [],
     )
 
 
-def _sources(session: Session, wish: InputOptions) -> NavigationSources:
+def _sources(session: Session, request: InputOptions) -> NavigationSources:
     log = session.parts[0].path
     try:
-        files = files_of(session, wish.config)
-        config, outside = wish.config or config_of_log(files), wish.positions is not None
-        return NavigationSources(config, files, wish.imu, wish.gnss, outside=outside, arm_b=wish.arm_b)
+        files = files_of(session, request.config)
+        config, outside = request.config or config_of_log(files), request.positions is not None
+        return NavigationSources(config, files, request.imu, request.gnss, outside=outside, arm_b=request.arm_b)
     except UserError as error:
-        prefix = "" if wish.config is not None or error.message.startswith("--") else f"{log}: "
+        prefix = "" if request.config is not None or error.message.startswith("--") else f"{log}: "
         lines = [f"{prefix}{line}" for line in error.message.splitlines()]
         raise UserError("\n".join(lines), error.exit_code) from error
 
@@ -236,7 +236,7 @@ def _missing(times: ImuTimes, sampler: Sampler, short: Sequence[Stretch], rate_h
     """Return the stretches of samples that no leg holds, by time; a gap left by unused samples is listed once."""
     rows = times.rows
     finite = np.isfinite(rows["specific_force_b"]).all(axis=1) & np.isfinite(rows["angular_rate_b"]).all(axis=1)
-    stretches_without = [*times.dropped]
+    stretches_without = [*times.discarded]
     stretches_without += stretches(
         rows["host_time_ns"], finite, times.gps_ns[finite], rate_hz, "samples that are not numbers"
     )

@@ -12,7 +12,7 @@ from swath.daemon.log.chunk_index import SCANNER, Listening
 from swath.daemon.log.format import source_of_topic
 from swath.daemon.log.host_messages import edges_of, readings_of
 from swath.daemon.log.reader import Session
-from swath.daemon.processing.unread import refused_by
+from swath.daemon.processing.undecoded import refused_by
 from swath.drivers.parser import PacketParser
 from swath.georef.records import (
     IMU_DTYPE,
@@ -48,7 +48,7 @@ class NavigationLog:
         refused: messages that gave no record, by source and reason.
         heard: by source: number of bytes, of bytes outside any message, and of messages by name.
         lost: number of units that the recorder lost, by source.
-        doubts: doubts about the sources' messages, one line each.
+        warnings: doubts about the sources' messages, one line each.
         remarks: parsers' lines for the user.
     """
 
@@ -63,7 +63,7 @@ class NavigationLog:
     refused: dict[str, Counter[str]] = field(default_factory=dict)
     heard: dict[str, tuple[int, int, Counter[str]]] = field(default_factory=dict)
     lost: dict[str, int] = field(default_factory=dict)
-    doubts: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
 
 
@@ -110,7 +110,7 @@ class _Reader:
             counters = parser.counters
             found.heard[name] = counters.bytes, counters.bytes_skipped, counters.messages
             if isinstance(parser, PacketParser):
-                found.doubts += [f"{name}: {doubt}" for doubt in parser.doubts]
+                found.warnings += [f"{name}: {doubt}" for doubt in parser.warnings]
         found.host.update()
         found.remarks += found.host.settle()
         if self._imu:

@@ -120,7 +120,7 @@ class Navigated:
     Attributes:
         legs: legs that could be navigated.
         holes: missing data, one line each, those of the inputs included.
-        doubts: lines for the user.
+        warnings: lines for the user.
         missing: stretches of samples without a trajectory, by time; each has a line in holes.
     """
 
@@ -128,7 +128,7 @@ class Navigated:
     smooth: bool
     legs: list[NavigatedLeg]
     holes: list[str]
-    doubts: list[str]
+    warnings: list[str]
     missing: list[Stretch] = field(default_factory=list)
 
     @property
@@ -155,7 +155,7 @@ class Navigated:
 
 
 def navigate_session(
-    session: Session, wish: NavigationOptions, tell: Tell = lambda what, done, total: None
+    session: Session, request: NavigationOptions, tell: Tell = lambda what, done, total: None
 ) -> Navigated:
     """Read a session and navigate it.
 
@@ -165,14 +165,14 @@ def navigate_session(
     """
     tell("clocks, IMU and GNSS", 0, 1)
     storage = MappedStorage()
-    inputs = read_inputs(session, wish.inputs, storage)
+    inputs = read_inputs(session, request.inputs, storage)
     storage.rest()
-    return navigate_inputs(inputs, wish, tell, storage)
+    return navigate_inputs(inputs, request, tell, storage)
 
 
 def navigate_inputs(
     inputs: NavigationInputs,
-    wish: NavigationOptions,
+    request: NavigationOptions,
     tell: Tell = lambda what, done, total: None,
     storage: Storage = IN_MEMORY,
 ) -> Navigated:
@@ -184,9 +184,9 @@ def navigate_inputs(
     legs: list[NavigatedLeg] = []
     holes, missing = list(inputs.holes), list(inputs.missing)
     for number, leg in enumerate(inputs.legs):
-        tell("filter and smoother" if wish.smooth else "filter", number, len(inputs.legs))
+        tell("filter and smoother" if request.smooth else "filter", number, len(inputs.legs))
         try:
-            legs.append(_navigated(inputs, leg, wish, storage))
+            legs.append(_navigated(inputs, leg, request, storage))
             storage.rest()
         except NavigationError as error:
             missing.append(Stretch(*leg.span, str(error)))
@@ -197,26 +197,28 @@ def navigate_inputs(
             f"{inputs.log}: {inputs.sources.imu_source}: no run of samples without a gap is long enough for navigation"
         ]
         raise UserError("\n".join(why))
-    warnings = list(inputs.doubts)
-    for part, has_fixes in _unreached(legs, smooth=wish.smooth):
-        if wish.smooth and has_fixes:
+    warnings = list(inputs.warnings)
+    for part, has_fixes in _unreached(legs, smooth=request.smooth):
+        if request.smooth and has_fixes:
             missing.append(part)
-        (holes if wish.smooth and has_fixes else warnings).append(f"{inputs.log}: {part.text}")
-    navigated = Navigated(inputs, wish.smooth, legs, holes, warnings, sorted(missing, key=lambda part: part.begin_ns))
-    navigated.doubts.extend(_ins_doubts(inputs, navigated.trajectory()))
+        (holes if request.smooth and has_fixes else warnings).append(f"{inputs.log}: {part.text}")
+    navigated = Navigated(
+        inputs, request.smooth, legs, holes, warnings, sorted(missing, key=lambda part: part.begin_ns)
+    )
+    navigated.warnings.extend(_ins_doubts(inputs, navigated.trajectory()))
     return navigated
 
 
-def _navigated(inputs: NavigationInputs, leg: Leg, wish: NavigationOptions, storage: Storage) -> NavigatedLeg:
-    rows = leg.observations if wish.attitude_rad is None else _with_attitude(leg, wish.attitude_rad)
+def _navigated(inputs: NavigationInputs, leg: Leg, request: NavigationOptions, storage: Storage) -> NavigatedLeg:
+    rows = leg.observations if request.attitude_rad is None else _with_attitude(leg, request.attitude_rad)
     start = align(leg.inertial, rows, inputs.setup)
-    if wish.smooth:
+    if request.smooth:
         start = earlier_start(leg.inertial, leg.observations, inputs.setup, start)
     setup, rows = inputs.setup, with_still_seconds(leg.inertial, leg.observations)
     solved = solve(leg.inertial, rows, setup, start, storage=storage)
     setup = solved.report.setup
     findings = diagnose(leg.inertial, leg.observations, setup, solved) + inputs.findings
-    if wish.compare_noise and not any(finding.severity == "error" for finding in findings):
+    if request.compare_noise and not any(finding.severity == "error" for finding in findings):
         table, name = inputs.sources.imu.noise, inputs.sources.imu_name
         grades = {grade: noise_of(table.model_copy(update={"grade": grade})) for grade in GRADES}
         run = stretch_of(leg.inertial, rows, start)

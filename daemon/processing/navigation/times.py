@@ -53,7 +53,7 @@ class ImuTimes:
         sigma_s: usual standard deviation of a time (median).
         by: source of the times: gps (the unit gives GPS time itself), latch (of the PPS), counter, arrival.
         refused: samples without a time, by reason.
-        dropped: stretches of such samples that are longer than `LEAST_HOLE_S`.
+        discarded: stretches of such samples that are longer than `LEAST_HOLE_S`.
     """
 
     rows: StructArray
@@ -61,7 +61,7 @@ class ImuTimes:
     sigma_s: float
     by: str
     refused: Counter[str]
-    dropped: tuple[Stretch, ...] = ()
+    discarded: tuple[Stretch, ...] = ()
 
 
 def imu_times(rows: StructArray, host: HostClocks, clock: str | None, rate_hz: float) -> ImuTimes:

@@ -24,10 +24,10 @@ from swath.daemon.log.chunk_index import SCANNER, ChunkPlace, LogIndex, read_chu
 from swath.daemon.log.format import source_of_topic
 from swath.daemon.log.mcap.chunks import LogBatch
 from swath.daemon.log.reader import PartDamage
-from swath.daemon.processing.points.dropped import Dropped
+from swath.daemon.processing.points.discarded import DiscardedPoints
 from swath.daemon.processing.points.feed import LogFeed
 from swath.daemon.processing.setup.setup import Setup
-from swath.daemon.processing.unread import Unread
+from swath.daemon.processing.undecoded import Undecoded
 from swath.georef.formats.copc import CopcWriter
 from swath.georef.formats.las import Clipped, LasError, LasSettings, LasWriter
 from swath.georef.geodesy.earth import geodetic_from_e
@@ -91,7 +91,7 @@ class Job:
         places: places of its chunks, and of those of the margin.
         trajectory: the part of the trajectory that it needs; None between strips, where returns are only counted.
         path: file to be written; None: no file.
-        dropped: file for the list of returns without a place; None: they are only counted.
+        discarded: file for the list of returns without a place; None: they are only counted.
     """
 
     session: int
@@ -99,7 +99,7 @@ class Job:
     places: list[ChunkPlace]
     trajectory: Trajectory | None = None
     path: Path | None = None
-    dropped: Path | None = None
+    discarded: Path | None = None
 
     @property
     def size(self) -> int:
@@ -114,7 +114,7 @@ class JobResult:
     Attributes:
         fates: by scanner, number of returns by fate.
         time_refused: by scanner, number of stamps that its clock rejected, by reason.
-        unread: by scanner, messages that its parser refused, by reason, and those missing from its own sequence.
+        undecoded: by scanner, messages that its parser refused, by reason, and those missing from its own sequence.
         first_gps_ns, last_gps_ns: times of the points; None: there are none.
         bounds: smallest and largest coordinates.
         edges: by scanner, for the sampled point seen farthest from nadir: the angle, rad, the height of the scanner
@@ -131,7 +131,7 @@ class JobResult:
     end_ns: int
     fates: dict[str, Counter[str]] = field(default_factory=dict)
     time_refused: dict[str, dict[str, int]] = field(default_factory=dict)
-    unread: dict[str, Counter[str]] = field(default_factory=dict)
+    undecoded: dict[str, Counter[str]] = field(default_factory=dict)
     clipped: Clipped = field(default_factory=Clipped)
     points: int = 0
     withheld: int = 0
@@ -213,8 +213,8 @@ def _write(
             _note_edge(result, name, points, setup, trajectory)
 
     dropped_file = None
-    if job.dropped is not None:
-        dropped_file = Dropped(job.dropped, georeferenced, partial(put, withheld=True))
+    if job.discarded is not None:
+        dropped_file = DiscardedPoints(job.discarded, georeferenced, partial(put, withheld=True))
         opened.callback(dropped_file.close)
     feed_job(plan, job, result, feed, write, tell)
     sink.close()
@@ -233,7 +233,7 @@ def feed_job(
 ) -> None:
     """Pass a job's messages through its own feed, close the feed, and count the fates of returns."""
     stream = feed.stream
-    undecoded = Unread({name: feed.parser(f"scanner/{name}") for name in stream.scanners})
+    undecoded = Undecoded({name: feed.parser(f"scanner/{name}") for name in stream.scanners})
     was_own = False
     for batch, own in _messages(plan, job, result, tell):
         if own is not was_own:
@@ -243,7 +243,7 @@ def feed_job(
         write(feed.take(batch, context=not own))
     write(feed.close())
     undecoded.note(own=was_own)
-    result.unread = undecoded.counts
+    result.undecoded = undecoded.counts
     for name in stream.scanners:
         fates = stream.fates(name)
         result.fates[name] = Counter({fate.name.lower(): count for fate, count in fates.items()})
@@ -305,14 +305,14 @@ def _count(plan: SessionPlan, job: Job, result: JobResult, tell: Tell) -> None:
                 host_ns = record.rows["host_time_ns"]
                 counts[source] += int(np.count_nonzero((host_ns >= start_ns) & (host_ns < end_ns)))
 
-    undecoded = Unread({source.removeprefix("scanner/"): parser for source, parser in parsers.items()})
+    undecoded = Undecoded({source.removeprefix("scanner/"): parser for source, parser in parsers.items()})
     for batch, own in _messages(plan, job, result, tell):
         wire = source_of_topic(batch.channel.topic) or ""
         source = wire.removesuffix("/aux")
         if source in parsers:
             count(source, parsers[source].feed_batch(ChunkBatch(wire, batch.log_time_ns, batch.units)))
         undecoded.note(own=own)
-    result.unread = undecoded.counts
+    result.undecoded = undecoded.counts
     for source, parser in parsers.items():
         count(source, parser.close())
         result.fates[source.removeprefix("scanner/")] = Counter({BETWEEN_STRIPS: counts[source]})

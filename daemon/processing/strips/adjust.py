@@ -112,70 +112,70 @@ class StripsCorrected:
     notes: tuple[str, ...]
 
 
-def _refuse_output(wish: AdjustOptions) -> None:
+def _refuse_output(request: AdjustOptions) -> None:
     """Refuse with `UserError` an unusable folder or one with an adjustment, before any long work."""
-    there, permitted = nearest_there(wish.output.absolute())
+    there, permitted = nearest_there(request.output.absolute())
     if permitted and not there.is_dir():
-        raise UserError(f"--adjust {wish.output}: {there} is a file; give a folder", ExitCode.USAGE)
+        raise UserError(f"--adjust {request.output}: {there} is a file; give a folder", ExitCode.USAGE)
     if not permitted or not os.access(there, os.W_OK | os.X_OK):
-        raise UserError(f"--adjust {wish.output}: {there} is not writable", ExitCode.IO)
-    if (wish.output / ADJUSTMENT).exists() and not wish.overwrite:
+        raise UserError(f"--adjust {request.output}: {there} is not writable", ExitCode.IO)
+    if (request.output / ADJUSTMENT).exists() and not request.overwrite:
         raise UserError(
-            f"{wish.output / ADJUSTMENT}: already exists; choose another folder or use --overwrite", ExitCode.USAGE
+            f"{request.output / ADJUSTMENT}: already exists; choose another folder or use --overwrite", ExitCode.USAGE
         )
 
 
-def files_of(wish: AdjustOptions, flight: LoggedFlight) -> TrajectoryFiles:
+def files_of(request: AdjustOptions, flight: LoggedFlight) -> TrajectoryFiles:
     """Return the paths of a session's files; refuse with `UserError` files that exist or that the trajectory was read
     from.
     """
-    files = TrajectoryFiles.in_folder(wish.output, flight.session.session_id, csv=True)
+    files = TrajectoryFiles.in_folder(request.output, flight.session.session_id, csv=True)
     paths = [path for path in (files.sbet, files.smrmsg, files.csv) if path is not None]
-    read = wish.logs.trajectory.file
+    read = request.logs.trajectory.file
     for path in paths:
         if path.exists() and read is not None and path.samefile(read):
             raise UserError(f"--adjust: {path} is the trajectory to correct; choose another folder", ExitCode.USAGE)
-        if path.exists() and not wish.overwrite:
+        if path.exists() and not request.overwrite:
             raise UserError(f"{path}: already exists; choose another folder or use --overwrite", ExitCode.USAGE)
     return files
 
 
-def correct_strips(wish: AdjustOptions, folder: Path, tell: Steps) -> StripsCorrected:
+def correct_strips(request: AdjustOptions, folder: Path, tell: Steps) -> StripsCorrected:
     """Estimate corrections of strips; write no files.
 
     Args:
-        wish: options of the adjustment.
+        request: options of the adjustment.
         folder: temporary folder for the returns, some 150 bytes each.
         tell: called with the progress.
 
     Raises:
         UserError: the strips cannot be corrected; one line.
     """
-    if wish.model not in CHOICES:
-        raise UserError(f'--strip-model: got "{wish.model}", want one of {", ".join(CHOICES)}', ExitCode.USAGE)
-    if not is_of_logs(wish.logs.logs):
+    if request.model not in CHOICES:
+        raise UserError(f'--strip-model: got "{request.model}", want one of {", ".join(CHOICES)}', ExitCode.USAGE)
+    if not is_of_logs(request.logs.logs):
         raise UserError(
-            f"--adjust: corrects the trajectory of logs, but {wish.logs.logs[0]} contains points; give the logs "
+            f"--adjust: corrects the trajectory of logs, but {request.logs.logs[0]} contains points; give the logs "
             "of these points",
             ExitCode.USAGE,
         )
-    _refuse_output(wish)
+    _refuse_output(request)
     with as_user_error(folder, *REFUSED):
-        return _corrected(wish, folder, tell)
+        return _corrected(request, folder, tell)
 
 
-def _corrected(wish: AdjustOptions, folder: Path, tell: Steps) -> StripsCorrected:
-    kept = read_flight(wish.logs, folder, tell)
+def _corrected(request: AdjustOptions, folder: Path, tell: Steps) -> StripsCorrected:
+    kept = read_flight(request.logs, folder, tell)
     with told_before(verdicts_of(kept.logged), *REFUSED):
-        return _of_flight(wish, kept, folder, tell)
+        return _of_flight(request, kept, folder, tell)
 
 
-def _of_flight(wish: AdjustOptions, kept: KeptFlight, folder: Path, tell: Steps) -> StripsCorrected:
-    _refuse(wish, kept)
+def _of_flight(request: AdjustOptions, kept: KeptFlight, folder: Path, tell: Steps) -> StripsCorrected:
+    _refuse(request, kept)
     for logged in kept.logged:
-        files_of(wish, logged)
-    flight, calibrations, workers = kept.flight, kept.flight.starts(), wish.logs.workers
-    points, notes = ((), []) if wish.control is None else control_of(wish.control, flight, ())
+        files_of(request, logged)
+    flight, calibrations, workers = kept.flight, kept.flight.starts(), request.logs.workers
+    points, notes = ((), []) if request.control is None else control_of(request.control, flight, ())
 
     def features_of(placed: Flight) -> Features:
         with ThreadPoolExecutor(workers) as pool:
@@ -189,21 +189,21 @@ def _of_flight(wish: AdjustOptions, kept: KeptFlight, folder: Path, tell: Steps)
     tell("planes", 0, 1)
     features = features_of(flight)
     tell("adjustment", 0, 1)
-    first = adjust_strips(flight, features, calibrations, replace(wish.settings, linearisations=1))
+    first = adjust_strips(flight, features, calibrations, replace(request.settings, linearisations=1))
     tell("planes again", 0, 1)  # strips that errors of the trajectory had kept apart overlap now
     features = features_of(moved(first, "matched"))
-    refuse_lost_control(wish.control, features)
+    refuse_lost_control(request.control, features)
     tell("adjustment", 0, 1)
-    adjusted = adjust_strips(flight, features, calibrations, wish.settings)
+    adjusted = adjust_strips(flight, features, calibrations, request.settings)
     tell("strips before and after", 0, 1)
     before, after = before_and_after(flight, moved(adjusted, "adjusted"), kept.logged[0].setup.mapping)
-    notes += [*kept.notes, *_notes(wish, kept, features, before.cells.frame.cell_m), *adjusted.notes]
+    notes += [*kept.notes, *_notes(request, kept, features, before.cells.frame.cell_m), *adjusted.notes]
     return StripsCorrected(kept, features, points, adjusted, before, after, tuple(notes))
 
 
-def _refuse(wish: AdjustOptions, kept: KeptFlight) -> None:
+def _refuse(request: AdjustOptions, kept: KeptFlight) -> None:
     log = kept.logged[0].log
-    strips = {(swath.flown, swath.strip) for swath in kept.flight.swaths}
+    strips = {(swath.trajectory_index, swath.strip) for swath in kept.flight.swaths}
     if len(strips) < 2:
         raise UserError(
             f"{log}: {len(strips) or 'no'} strip with returns; an adjustment compares strips: fly at least two that "
@@ -212,7 +212,7 @@ def _refuse(wish: AdjustOptions, kept: KeptFlight) -> None:
     refuse_installations(kept.logged)
     refuse_without_noise(kept)
     for head in kept.flight.heads:
-        if head.start.method == "nominal" and head.name not in wish.logs.options.calibrations:
+        if head.start.method == "nominal" and head.name not in request.logs.options.calibrations:
             raise UserError(
                 f"{log}: {head.name}: has only the nominal calibration, whose errors would distort the trajectory; "
                 "give --calibration FILE of swath calibrate",
@@ -220,10 +220,10 @@ def _refuse(wish: AdjustOptions, kept: KeptFlight) -> None:
             )
 
 
-def _notes(wish: AdjustOptions, kept: KeptFlight, features: Features, cell_m: float) -> list[str]:
+def _notes(request: AdjustOptions, kept: KeptFlight, features: Features, cell_m: float) -> list[str]:
     notes, flight = [], kept.flight
-    if not wish.control:
-        settings = wish.settings
+    if not request.control:
+        settings = request.settings
         notes.append(
             "no control: a shift or tilt common to all strips is held by its prior of "
             f"{100 * settings.position_m:.0f} cm and {_mdeg(settings.turn_rad):.0f} mdeg; the datum is not determined"

@@ -38,28 +38,28 @@ UNCORRECTED = "none"
 TOLD = 0.7  # share of its prior's sigma: here returns contribute as much as the prior
 
 
-def write_adjustment(wish: AdjustOptions, done: StripsCorrected, tell: Callable[[str, int, int], None]) -> Told:
+def write_adjustment(request: AdjustOptions, done: StripsCorrected, tell: Callable[[str, int, int], None]) -> Told:
     """Write all files, the record last: a folder with a record is complete.
 
     Raises:
         UserError: a file cannot be written; no file is left then.
     """
     tell("trajectories", 0, 1)
-    files = [files_of(wish, flight) for flight in done.kept.logged]
+    files = [files_of(request, flight) for flight in done.kept.logged]
     written: list[tuple[Path, Path]] = []
-    made = not wish.output.exists()
+    made = not request.output.exists()
     try:
         with gone_on_failure(written):
             for flight, own, trajectory in zip(done.kept.logged, files, done.adjusted.trajectories, strict=True):
                 written += write_trajectory(own, _as_given(flight, trajectory), None)
-            record = finite(_record(wish, done, written))
-            path = wish.output / ADJUSTMENT
+            record = finite(_record(request, done, written))
+            path = request.output / ADJUSTMENT
             written.append((write_aside(path, partial(write_json, record)), path))
         put_in_place(written)
     except OSError as error:
-        if made and wish.output.is_dir() and not any(wish.output.iterdir()):
-            wish.output.rmdir()
-        raise UserError(f"{error.filename or wish.output}: {error.strerror or error}", ExitCode.IO) from error
+        if made and request.output.is_dir() and not any(request.output.iterdir()):
+            request.output.rmdir()
+        raise UserError(f"{error.filename or request.output}: {error.strerror or error}", ExitCode.IO) from error
     paths = [str(path) for _, path in written]
     return Told(record | {"files": paths}, [*first_lines(record["verdict"]), *_lines(done), *paths])
 
@@ -107,24 +107,24 @@ def _strips(done: StripsCorrected) -> Iterator[_Strip]:
     sigmas = np.concatenate([fit.position_sigma_l, fit.attitude_sigma_rad], axis=1)
     priors = np.concatenate([fit.prior_position_sigma_l, fit.prior_attitude_sigma_rad], axis=1)
     for choice in done.adjusted.choices:
-        mine = (fit.flown == choice.flown) & (fit.strip == choice.strip)
+        mine = (fit.trajectory_index == choice.trajectory_index) & (fit.strip == choice.strip)
         names = {swath.name for swath in done.kept.flight.swaths if swath.strip == choice.strip}
         own = (fit.time_ns[mine], corrections[mine], sigmas[mine], priors[mine])
         yield _Strip(choice, *own, done.before.rms_of(names), done.after.rms_of(names))
 
 
-def _record(wish: AdjustOptions, done: StripsCorrected, written: list[tuple[Path, Path]]) -> dict[str, Any]:
-    adjusted, settings = done.adjusted, wish.settings
+def _record(request: AdjustOptions, done: StripsCorrected, written: list[tuple[Path, Path]]) -> dict[str, Any]:
+    adjusted, settings = done.adjusted, request.settings
     heads = done.kept.flight.heads
     inputs = [part.path for flight in done.kept.logged for part in flight.session.parts]
-    inputs += [path for path in (wish.logs.trajectory.file, wish.control) if path is not None]
-    inputs += [Path(file) for _, file in wish.logs.options.calibrations.values()]
+    inputs += [path for path in (request.logs.trajectory.file, request.control) if path is not None]
+    inputs += [Path(file) for _, file in request.logs.options.calibrations.values()]
     return {
         "format": "swath.strip-adjustment",
         "version": 1,
         "software": f"swath {__version__}",
         "what": f"{WHAT} {KEPT[0].upper()}{KEPT[1:]}.",
-        "verdict": verdict_of(wish.logs, done.kept.logged),
+        "verdict": verdict_of(request.logs, done.kept.logged),
         "flights": [
             {
                 "session": flight.session.session_id,
@@ -133,7 +133,7 @@ def _record(wish: AdjustOptions, done: StripsCorrected, written: list[tuple[Path
             for flight, trajectory in zip(done.kept.logged, done.adjusted.trajectories, strict=True)
         ],
         "calibrations_held": {head.name: head.start.id for head in heads},
-        "strip_model": wish.model,
+        "strip_model": request.model,
         "settings": asdict(settings),
         "strips": [_strip_entry(done, strip) for strip in _strips(done)],
         "planes": len(done.features.planes),
@@ -156,7 +156,7 @@ def _strip_entry(done: StripsCorrected, strip: _Strip) -> dict[str, Any]:
     means = (strip.corrections.mean(axis=0), strip.sigmas.mean(axis=0), strip.priors.mean(axis=0))
     return {
         "strip": strip.choice.strip,
-        "log": done.kept.logged[strip.choice.flown].log.name,
+        "log": done.kept.logged[strip.choice.trajectory_index].log.name,
         "model": strip.choice.model,
         "criterion_gains": dict(strip.choice.gains),
         "rms_dz_m": {"before": strip.before_m, "after": strip.after_m},

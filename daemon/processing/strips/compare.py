@@ -60,11 +60,11 @@ class Compared:
     problem: str
 
 
-def compare_strips(wish: StripsOptions, folder: Path, told: Told) -> Compared:
+def compare_strips(request: StripsOptions, folder: Path, told: Told) -> Compared:
     """Compare strips and write the results.
 
     Args:
-        wish: options of the comparison.
+        request: options of the comparison.
         folder: temporary folder for returns of logs.
         told: called with the progress.
 
@@ -72,17 +72,19 @@ def compare_strips(wish: StripsOptions, folder: Path, told: Told) -> Compared:
         UserError: the strips cannot be compared; one line.
     """
     with as_user_error(folder, FlightError, StripError, MappingError):
-        now = _judged(_read(wish.paths, wish, folder / "now", told), wish, told)
-        then = _judged(_read(wish.before, wish, folder / "before", told), wish, told) if wish.before else None
+        now = _judged(_read(request.paths, request, folder / "now", told), request, told)
+        then = (
+            _judged(_read(request.before, request, folder / "before", told), request, told) if request.before else None
+        )
     record = finite(now.record() | ({"before": then.record()} if then is not None else {}))
-    record["verdict"] = verdict_entry(now.strips.carried, accepted=wish.logs.accept_verdict)
-    pictures = _draw(wish, now, then)
-    if wish.output is not None:
+    record["verdict"] = verdict_entry(now.strips.carried, accepted=request.logs.accept_verdict)
+    pictures = _draw(request, now, then)
+    if request.output is not None:
         record["pictures"] = [str(path) for path in pictures]
-        path = wish.output / RECORD
+        path = request.output / RECORD
         path.write_text(json.dumps(record, indent=2, allow_nan=False) + "\n", encoding="utf-8")
     lines = [*first_lines(record["verdict"]), *now.lines(then), *map(str, pictures)]
-    return Compared(record, lines, "; ".join(filter(None, (refusal(record["verdict"]), now.problem(wish.level)))))
+    return Compared(record, lines, "; ".join(filter(None, (refusal(record["verdict"]), now.problem(request.level)))))
 
 
 def rules_of(most_cells: int, cell_m: float | None) -> StripRules:
@@ -114,18 +116,18 @@ def _kind(path: Path) -> str:
     return "points" if path.suffix.lower() in POINT_SUFFIXES else "logs"
 
 
-def _read(paths: Sequence[Path], wish: StripsOptions, folder: Path, told: Told) -> Strips:
+def _read(paths: Sequence[Path], request: StripsOptions, folder: Path, told: Told) -> Strips:
     if not is_of_logs(paths):
-        strips = strips_of_files(paths, wish.rules, told, wish.logs.trajectory.week)
+        strips = strips_of_files(paths, request.rules, told, request.logs.trajectory.week)
         strips.carried.extend(points_verdicts([source.sidecar for source in strips.look.sources]))
         return strips
     folder.mkdir(parents=True, exist_ok=True)
-    kept = read_flight(replace(wish.logs, logs=paths), folder, told)
+    kept = read_flight(replace(request.logs, logs=paths), folder, told)
     refuse_installations(kept.logged)
     mapping = kept.logged[0].setup.mapping
     carried = verdicts_of(kept.logged)
     with told_before(carried, FlightError):
-        strips = strips_of_flight(", ".join(map(str, paths)), kept.flight, wish.rules, mapping, smoothed_prior(kept))
+        strips = strips_of_flight(", ".join(map(str, paths)), kept.flight, request.rules, mapping, smoothed_prior(kept))
     strips.notes.extend(kept.notes)
     strips.carried.extend(carried)
     return strips
@@ -217,27 +219,27 @@ class Judgement:
         return lines + self.strips.notes
 
 
-def _judged(strips: Strips, wish: StripsOptions, told: Told) -> Judgement:
+def _judged(strips: Strips, request: StripsOptions, told: Told) -> Judgement:
     told(f"comparing {strips.what}", 0, 1)
-    report = report_of(strips.look.names, strips.gathered, wish.rules, strips.cell_m)
+    report = report_of(strips.look.names, strips.gathered, request.rules, strips.cell_m)
     found = None if strips.seen is None else signatures(report.checks, strips.seen, strips.prior)
     return Judgement(strips, report, found)
 
 
-def _draw(wish: StripsOptions, now: Judgement, then: Judgement | None) -> list[Path]:
-    if wish.output is None:
+def _draw(request: StripsOptions, now: Judgement, then: Judgement | None) -> list[Path]:
+    if request.output is None:
         return []
     from swath.daemon.processing.quicklook.maps import draw_differences
 
     made = []
     try:
-        wish.output.mkdir(parents=True, exist_ok=True)
+        request.output.mkdir(parents=True, exist_ok=True)
         for name, one in (("differences.png", now), ("differences_before.png", then)):
             if one is not None:
-                draw_differences(one.strips.look, wish.output / name)
-                made.append(wish.output / name)
+                draw_differences(one.strips.look, request.output / name)
+                made.append(request.output / name)
     except OSError as error:
-        raise UserError(f"{wish.output}: is not writable ({error.strerror or error})", ExitCode.IO) from error
+        raise UserError(f"{request.output}: is not writable ({error.strerror or error})", ExitCode.IO) from error
     return made
 
 

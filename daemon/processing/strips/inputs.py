@@ -217,7 +217,7 @@ def _middle_ns(seen: SeenFrom) -> int | None:
 def _times_apart(strips: Gathered, seen: SeenFrom) -> list[str]:
     """Return a line if most returns have times outside their strips' trajectories."""
     outside = 0
-    for number, trajectory_number in enumerate(seen.flown):
+    for number, trajectory_number in enumerate(seen.trajectory_index):
         begin, end = seen.trajectories[trajectory_number].span
         times = strips.time_ns[strips.strip == number]
         outside += int(((times < begin) | (times > end)).sum())

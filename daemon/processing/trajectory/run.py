@@ -47,41 +47,41 @@ class TrajectoryReport:
     files: list[Path]
 
 
-def make_trajectory(wish: TrajectoryRequest, tell: Tell) -> TrajectoryReport:
+def make_trajectory(request: TrajectoryRequest, tell: Tell) -> TrajectoryReport:
     """Make the trajectory of logs and write its files.
 
     Raises:
         UserError: there is no trajectory, one line per reason; no file is left then.
     """
-    with as_user_error(wish.output, TrajectoryError):
+    with as_user_error(request.output, TrajectoryError):
         passed_over: list[str] = []
-        sessions = open_logs(wish.logs, passed_over)
+        sessions = open_logs(request.logs, passed_over)
         for session in sessions:
             refuse_no_name(session.session_id, session.parts[0].path)
         holes = [f"skipped: {line}" for line in passed_over]
-        files = TrajectoryFiles.of_output(wish.output, sessions[0].session_id, csv=wish.csv)
-        _refuse_one_name(wish.events, files)
-        if not wish.overwrite:
-            files.refuse_existing(wish.events)
-        if wish.navigate.inputs.ins == AS_IS:
-            return _write_as_is(wish, files, sessions, holes)
-        flights = [navigate_session(session, wish.navigate, tell) for session in sessions]
+        files = TrajectoryFiles.of_output(request.output, sessions[0].session_id, csv=request.csv)
+        _refuse_one_name(request.events, files)
+        if not request.overwrite:
+            files.refuse_existing(request.events)
+        if request.navigate.inputs.ins == AS_IS:
+            return _write_as_is(request, files, sessions, holes)
+        flights = [navigate_session(session, request.navigate, tell) for session in sessions]
         flights.sort(key=lambda flight: int(flight.solutions()[0].time_ns[0]))  # the hosts' clocks may be wrong
         flights[0].holes.extend(holes)
-        return _write(wish, files, flights, tell)
+        return _write(request, files, flights, tell)
 
 
 def _write(
-    wish: TrajectoryRequest, files: TrajectoryFiles, flights: Sequence[Navigated], tell: Tell
+    request: TrajectoryRequest, files: TrajectoryFiles, flights: Sequence[Navigated], tell: Tell
 ) -> TrajectoryReport:
     tell("files", 0, 1)
     trajectory = _joined(flights)
     sigma = np.concatenate([flight.velocity_sigma_l() for flight in flights])
     written = write_trajectory(files, trajectory, sigma)
     try:
-        events = _write_events(wish, flights, trajectory, written)
-        verdicts, figures = _write_pages(wish, files, flights, written)
-        record = summary_of_run(wish, flights, verdicts, figures, events)
+        events = _write_events(request, flights, trajectory, written)
+        verdicts, figures = _write_pages(request, files, flights, written)
+        record = summary_of_run(request, flights, verdicts, figures, events)
         record["files"] = [path.name for _, path in written]
         written.append((write_aside(files.summary, partial(write_json, record)), files.summary))
     except BaseException:
@@ -93,19 +93,19 @@ def _write(
 
 
 def _write_as_is(
-    wish: TrajectoryRequest, files: TrajectoryFiles, sessions: Sequence[Session], holes: Sequence[str]
+    request: TrajectoryRequest, files: TrajectoryFiles, sessions: Sequence[Session], holes: Sequence[str]
 ) -> TrajectoryReport:
     """Write the solutions of the devices' own INS, without a page."""
-    if wish.events is not None:
+    if request.events is not None:
         raise UserError(
             "--events: only a navigated trajectory gives event marks their place; leave --ins as-is out", ExitCode.USAGE
         )
-    read = [(session, ins_as_is(session, wish.navigate.inputs.config)) for session in sessions]
+    read = [(session, ins_as_is(session, request.navigate.inputs.config)) for session in sessions]
     read.sort(key=lambda pair: pair[1].trajectory.span)  # the hosts' clocks may be wrong
     sessions, found = [session for session, _ in read], [one for _, one in read]
     _refuse_overlap([(session.parts[0].path, one.trajectory) for session, one in read])
     trajectory = joined_trajectory([one.trajectory for one in found], found[0].trajectory.name)
-    record = summary_head(wish, AS_IS, sessions, [*(line for one in found for line in one.holes), *holes], [])
+    record = summary_head(request, AS_IS, sessions, [*(line for one in found for line in one.holes), *holes], [])
     record["sessions"] = [
         {"session": session.session_id, "ins": one.source, "solutions": dict(sorted(one.solutions.items()))}
         for session, one in zip(sessions, found, strict=True)
@@ -145,10 +145,10 @@ def _refuse_one_name(events: Path | None, files: TrajectoryFiles) -> None:
 
 
 def _write_events(
-    wish: TrajectoryRequest, flights: Sequence[Navigated], trajectory: Trajectory, written: Written
+    request: TrajectoryRequest, flights: Sequence[Navigated], trajectory: Trajectory, written: Written
 ) -> EventTable | None:
     marks: list[Mark] = [mark for flight in flights for mark in flight.inputs.marks]
-    if wish.events is None:
+    if request.events is None:
         return event_table(marks, trajectory) if marks else None
     table = event_table(marks, trajectory)
     data = table.text.encode()
@@ -156,19 +156,19 @@ def _write_events(
     def write(stream: IO[bytes]) -> None:
         stream.write(data)
 
-    written.append((write_aside(wish.events, write), wish.events))
+    written.append((write_aside(request.events, write), request.events))
     return table
 
 
 def _write_pages(
-    wish: TrajectoryRequest, files: TrajectoryFiles, flights: Sequence[Navigated], written: Written
+    request: TrajectoryRequest, files: TrajectoryFiles, flights: Sequence[Navigated], written: Written
 ) -> tuple[list[Any], list[Any]]:
     """Write one page per leg; return verdicts and figures of all legs, in order."""
     verdicts: list[Any] = []
     figures: list[Any] = []
     for page in pages_of(flights):
         path = files.page if not verdicts else files.page.with_stem(f"{files.page.stem}_{len(verdicts) + 1}")
-        if wish.page:
+        if request.page:
             verdict, own, aside = page.write(path)
             written.append((aside, path))
         else:

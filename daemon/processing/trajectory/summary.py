@@ -62,7 +62,7 @@ def pages_of(flights: Sequence[Navigated]) -> Iterator[Page]:
     """Yield one page per leg, in order."""
     for flight in flights:
         noise = flight.inputs.sources.noise_words()
-        notes = (*((noise,) if noise else ()), *flight.doubts, *flight.holes)
+        notes = (*((noise,) if noise else ()), *flight.warnings, *flight.holes)
         for number, leg in enumerate(flight.legs, start=1):
             title = flight.session_id if len(flight.legs) == 1 else f"{flight.session_id}, leg {number}"
             smoothed = leg.solved.smoothed if flight.smooth else None
@@ -83,10 +83,14 @@ def start_words(start: Start) -> str:
 
 
 def summary_head(
-    wish: TrajectoryRequest, solution: str, sessions: Sequence[Session], holes: Sequence[str], warnings: Sequence[str]
+    request: TrajectoryRequest,
+    solution: str,
+    sessions: Sequence[Session],
+    holes: Sequence[str],
+    warnings: Sequence[str],
 ) -> dict[str, Any]:
     """Return the part that every summary has: software, inputs, missing data, options."""
-    wanted = wish.navigate.inputs
+    wanted = request.navigate.inputs
     outside = wanted.positions
     return {
         "format": FORMAT,
@@ -108,13 +112,15 @@ def summary_head(
             "week": wanted.week,
             "lever_arm_m": None if wanted.arm_b is None else list(wanted.arm_b),
             "config": None if wanted.config is None else wanted.config.path.name,
-            "start_deg": None if wish.navigate.attitude_rad is None else list(np.degrees(wish.navigate.attitude_rad)),
+            "start_deg": None
+            if request.navigate.attitude_rad is None
+            else list(np.degrees(request.navigate.attitude_rad)),
         },
     }
 
 
 def summary_of_run(
-    wish: TrajectoryRequest,
+    request: TrajectoryRequest,
     flights: Sequence[Navigated],
     verdicts: Sequence[Any],
     figures: Sequence[Any],
@@ -123,11 +129,11 @@ def summary_of_run(
     """Return the summary of a run, without the names of the files."""
     judged = iter(zip(verdicts, figures, strict=True))
     head = summary_head(
-        wish,
-        "smoothed" if wish.navigate.smooth else "realtime",
+        request,
+        "smoothed" if request.navigate.smooth else "realtime",
         [flight.inputs.session for flight in flights],
         [line for flight in flights for line in flight.holes],
-        [line for flight in flights for line in flight.doubts],
+        [line for flight in flights for line in flight.warnings],
     )
     return head | {
         "events": None if events is None else dict(sorted(events.fates.items())),

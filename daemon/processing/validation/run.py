@@ -102,11 +102,11 @@ class _Found:
     carried: list[Carried] = field(default_factory=list)
 
 
-def run_validation(wish: ValidationOptions, folder: Path, told: Told) -> Validated:
+def run_validation(request: ValidationOptions, folder: Path, told: Told) -> Validated:
     """Run a validation and write its results.
 
     Args:
-        wish: options of the validation.
+        request: options of the validation.
         folder: temporary folder for returns.
         told: called with the progress.
 
@@ -114,16 +114,16 @@ def run_validation(wish: ValidationOptions, folder: Path, told: Told) -> Validat
         UserError: the validation cannot be done; one line.
     """
     with as_user_error(folder, *REFUSED):
-        calibrations = [read_file(path) for path in wish.calibrations]
+        calibrations = [read_file(path) for path in request.calibrations]
         found = _Found({one.scanner: one for one in calibrations})
-        if wish.histories:
-            found.histories = _histories(wish.histories, calibrations)
-        if wish.logs.logs:
-            if wish.output is not None:
-                recorded = records_of(list(zip(wish.calibrations, calibrations, strict=True)), wish.record)
+        if request.histories:
+            found.histories = _histories(request.histories, calibrations)
+        if request.logs.logs:
+            if request.output is not None:
+                recorded = records_of(list(zip(request.calibrations, calibrations, strict=True)), request.record)
                 found.documents, found.notes = recorded.documents, list(recorded.notes)
-            _against_logs(wish, found, folder, told)
-    return _written(wish, found)
+            _against_logs(request, found, folder, told)
+    return _written(request, found)
 
 
 def read_file(path: Path) -> Calibration:
@@ -151,18 +151,18 @@ def _entry(path: Path, named: Sequence[Path]) -> Calibration | None:
     return None
 
 
-def _against_logs(wish: ValidationOptions, found: _Found, folder: Path, told: Told) -> None:
-    kept = read_flight(wish.logs, folder, told)
+def _against_logs(request: ValidationOptions, found: _Found, folder: Path, told: Told) -> None:
+    kept = read_flight(request.logs, folder, told)
     refuse_installations(kept.logged)
     found.carried += verdicts_of(kept.logged)
     with told_before(found.carried, *REFUSED):
-        _against_flight(wish, found, kept, folder, told)
+        _against_flight(request, found, kept, folder, told)
 
 
-def _against_flight(wish: ValidationOptions, found: _Found, kept: KeptFlight, folder: Path, told: Told) -> None:
-    _refuse_others(wish, found, kept)
+def _against_flight(request: ValidationOptions, found: _Found, kept: KeptFlight, folder: Path, told: Told) -> None:
+    _refuse_others(request, found, kept)
     flight = kept.flight
-    points, notes = (None, []) if wish.control is None else control_of(wish.control, flight, ["shift"])
+    points, notes = (None, []) if request.control is None else control_of(request.control, flight, ["shift"])
     named = sorted(found.calibrations)
     found.notes += _assumed(kept)
     _along(kept, found)
@@ -170,9 +170,9 @@ def _against_flight(wish: ValidationOptions, found: _Found, kept: KeptFlight, fo
     planes = find_planes(flight)
     if not planes.planes:
         raise UserError(
-            f"{wish.logs.logs[0]}: no two strips see a common plane; a validation needs strips that overlap"
+            f"{request.logs.logs[0]}: no two strips see a common plane; a validation needs strips that overlap"
         )
-    anew, why_not = _anew(wish, found, kept, points or (), folder, told) if wish.anew else (None, "")
+    anew, why_not = _anew(request, found, kept, points or (), folder, told) if request.anew else (None, "")
     told("tests", 0, 1)
     asked = Asked(points, anew, why_not, named)
     validation = validate(flight, planes, found.calibrations, asked, _prior(kept))
@@ -183,7 +183,7 @@ def _against_flight(wish: ValidationOptions, found: _Found, kept: KeptFlight, fo
     found.notes += [*kept.notes, *notes]
 
 
-def _refuse_others(wish: ValidationOptions, found: _Found, kept: KeptFlight) -> None:
+def _refuse_others(request: ValidationOptions, found: _Found, kept: KeptFlight) -> None:
     """Refuse with `UserError` logs without the calibrations' scanners or with one strip; note odd installations."""
     scanners = {head.name for head in kept.flight.heads}
     log = kept.logged[0].log
@@ -202,7 +202,7 @@ def _refuse_others(wish: ValidationOptions, found: _Found, kept: KeptFlight) -> 
                 f'{log}: was recorded with installation "{installation}", but calibration {calibration.id} '
                 f'belongs to "{made}"'
             )
-    if len({(swath.flown, swath.strip) for swath in kept.flight.swaths}) < 2:
+    if len({(swath.trajectory_index, swath.strip) for swath in kept.flight.swaths}) < 2:
         raise UserError(f"{log}: has one strip only; a validation needs at least two strips that overlap")
 
 
@@ -242,7 +242,12 @@ def _assumed(kept: KeptFlight) -> list[str]:
 
 
 def _anew(
-    wish: ValidationOptions, found: _Found, kept: KeptFlight, points: Sequence[ControlPoint], folder: Path, told: Told
+    request: ValidationOptions,
+    found: _Found,
+    kept: KeptFlight,
+    points: Sequence[ControlPoint],
+    folder: Path,
+    told: Told,
 ) -> tuple[Mapping[str, Calibration], str]:
     """Return parameters estimated from these logs and control alone, as by `swath calibrate`; or
     none and the reason.
@@ -253,7 +258,7 @@ def _anew(
         return Features.joined([find_planes(flight, PLANES), control_planes(flight, points)])
 
     def found_anew(calibrations: Mapping[str, Calibration]) -> Features:
-        return features(replaced(kept.flight, calibrations, folder, "anew", wish.logs.workers))
+        return features(replaced(kept.flight, calibrations, folder, "anew", request.logs.workers))
 
     start = found.calibrations
     try:
@@ -270,9 +275,9 @@ def _anew(
 # ---------------------------------------------------------------------- output
 
 
-def _written(wish: ValidationOptions, found: _Found) -> Validated:
+def _written(request: ValidationOptions, found: _Found) -> Validated:
     record: dict[str, Any] = {"calibrations": {name: one.id for name, one in found.calibrations.items()}}
-    record["verdict"] = verdict_entry(found.carried, accepted=wish.logs.accept_verdict)
+    record["verdict"] = verdict_entry(found.carried, accepted=request.logs.accept_verdict)
     lines: list[str] = first_lines(record["verdict"])
     wrong: list[str] = list(filter(None, [refusal(record["verdict"])]))
     if found.validation is not None:
@@ -287,8 +292,8 @@ def _written(wish: ValidationOptions, found: _Found) -> Validated:
             wrong += list(one.sentences) if one.moved or not one.steps else []  # without steps no test was made
     record["notes"] = found.notes
     record = finite(record)
-    if wish.output is not None:
-        lines += _write(wish.output, record, found)
+    if request.output is not None:
+        lines += _write(request.output, record, found)
     return Validated(record, [*lines, *found.notes], "; ".join(wrong))
 
 

@@ -127,7 +127,7 @@ class DbcParser(PacketParser):
             self._grouper = self._grouper_of("last", last)
         elif grouped.any():
             names = " and ".join(dict.fromkeys(part.message for part in self._map.parts[: self._map.grouped]))
-            self.doubts = (
+            self.warnings = (
                 f"the frames of {names} are evenly spaced, so it is uncertain which of them form one sample: specific "
                 'force and angular rate may be one sample apart; set group = "last" or "first"',
             )

@@ -122,8 +122,8 @@ def test_opposite_lines_side_by_side_do_not_separate_heading_from_pitch(prior: T
 def test_planes_and_profiles_agree_within_their_sigmas(flight: Flight, prior: TrajectoryPrior) -> None:
     moved = flown_wrong(flight, prior, draw(prior, np.random.default_rng(3)))
     known = {name: exactly_known(one) for name, one in moved.starts().items()}
-    wish = ParameterOptions("basic", fix=frozenset({"range_offset_m"}))
-    adjusted = adjust(moved, find_planes(moved), wish, prior, start=known)
+    options = ParameterOptions("basic", fix=frozenset({"range_offset_m"}))
+    adjusted = adjust(moved, find_planes(moved), options, prior, start=known)
     placed = moved.placed(adjusted.calibrations)
     checked = check(placed, adjusted, prior)
     assert {one.parameter for one in checked.comparisons} == {"omega_rad", "phi_rad", "kappa_rad"}

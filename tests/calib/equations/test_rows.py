@@ -158,13 +158,13 @@ def head_flight(geometry: Geometry) -> Flight:
 @pytest.mark.parametrize("geometry", [spinning(), ouster()])
 def test_columns_of_beams_slots_zones_and_intensities_match_differences_of_the_model(geometry: Geometry) -> None:
     flight = head_flight(geometry)
-    wish = ParameterOptions(
+    options = ParameterOptions(
         ibrc_knots=(0.0, 20.0, 50.0, 100.0),
         beams=frozenset(["azimuth_rad", "elevation_rad", "range_m"]),
         range_offset_slots=(2,),
         range_offset_zones=(1,),
     )
-    asked = unknowns(flight, wish)
+    asked = unknowns(flight, options)
     g = np.random.default_rng(3)
     planes = tuple(
         Plane(f"{index}", np.array([0.0, 0.0, 1150.0]), normal / np.linalg.norm(normal), (Patch(0, at),))
@@ -274,9 +274,9 @@ def test_attitude_error_between_knots_is_common_to_a_run() -> None:
     assert np.diag(free.normal)[3] > 1.2 * np.diag(found.normal)[3]
 
 
-def looks_of(flight: Flight, planes: tuple[Plane, ...], wish: ParameterOptions) -> tuple[FloatArray, FloatArray]:
+def looks_of(flight: Flight, planes: tuple[Plane, ...], options: ParameterOptions) -> tuple[FloatArray, FloatArray]:
     """Columns (n, u) of the parameters and of the plane's turns, and f (n,), of one swath's returns on one plane."""
-    seen = Rows(flight, planes, unknowns(flight, wish), None)
+    seen = Rows(flight, planes, unknowns(flight, options), None)
     ((batch, looks),) = seen.looks(seen.start())
     (run,) = batch.runs
     assert run.channel == -1

@@ -285,11 +285,11 @@ def test_trajectories_of_two_sessions_are_independent() -> None:
     second = level_path(60, BEGIN + 100 * SECOND)
     flight = made([(0, 1, 5, 20), (1, 1, 105, 120)], [level_path(60), second])
     prior = gauss_markov(flight)
-    cut = 6 * int((prior.flown == 0).sum())
+    cut = 6 * int((prior.trajectory_index == 0).sum())
     assert 0 < cut < len(prior.covariance)
     assert not prior.covariance[:cut, cut:].any()
     assert prior.covariance[:cut, :cut].all(axis=None) == np.False_
-    assert (np.diff(prior.time_ns[prior.flown == 1]) > 0).all()
+    assert (np.diff(prior.time_ns[prior.trajectory_index == 1]) > 0).all()
 
 
 def test_knots_are_widened_and_reported_if_there_would_be_too_many() -> None:

@@ -335,7 +335,10 @@ def test_a_pitch_found_for_one_scanner_does_not_apply_to_another() -> None:
     other = village((THERE, Line(145, 90, 270, 290, 300)), phi_rad=0.006)
     right = replace(other.heads[0], name="right", start=replace(other.heads[0].start, scanner="right"))
     flown = (*one.trajectories, *other.trajectories)
-    swaths = (*one.swaths, *(replace(swath, head=1, flown=len(LINES) + swath.flown) for swath in other.swaths))
+    swaths = (
+        *one.swaths,
+        *(replace(swath, head=1, trajectory_index=len(LINES) + swath.trajectory_index) for swath in other.swaths),
+    )
     flight = replace(one, heads=(*one.heads, right), trajectories=flown, swaths=swaths)
     result = stepwise(flight, settings=Settings(rounds=1))
     assert {"left.phi_rad", "left.kappa_rad"} <= set(result.sigmas)

@@ -139,7 +139,7 @@ def test_parameters_that_the_calibration_declares_unknown_are_not_a_fault(made: 
 
 
 def test_two_flights_are_a_separate_method(made: Cast, roofs: Features) -> None:
-    swaths = tuple(replace(swath, flown=number // 2) for number, swath in enumerate(made.flight.swaths))
+    swaths = tuple(replace(swath, trajectory_index=number // 2) for number, swath in enumerate(made.flight.swaths))
     flight = replace(made.flight, trajectories=made.flight.trajectories * 2, swaths=swaths).placed({"left": made.truth})
     method = next(one for one in validate(flight, roofs, {"left": made.truth}).methods if one.name == "secondFlight")
     assert method.passed is True
@@ -346,7 +346,7 @@ def test_failed_remeasurements_and_comparisons_are_reported(made: Cast, roofs: F
     validation = validate(made.at_truth(), roofs, calibrations, asked)
     assert validation.undone == ("parameters anew: the adjustment does not converge",)
     elsewhere = tuple(replace(plane, patches=plane.patches[:2]) for plane in roofs.planes)
-    swaths = tuple(replace(swath, flown=number // 2) for number, swath in enumerate(made.flight.swaths))
+    swaths = tuple(replace(swath, trajectory_index=number // 2) for number, swath in enumerate(made.flight.swaths))
     flight = replace(made.flight, trajectories=made.flight.trajectories * 2, swaths=swaths).placed(calibrations)
     alone = [plane for plane in elsewhere if {patch.swath // 2 for patch in plane.patches} == {0}]
     assert len(alone) > 5

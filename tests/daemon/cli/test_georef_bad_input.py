@@ -19,7 +19,7 @@ from swath.daemon.cli.main import run_app
 from swath.daemon.log.reader import open_logs
 from swath.daemon.processing.points.workers import _held_interrupts
 from swath.daemon.processing.setup.setup import Options, Setup
-from swath.daemon.processing.unread import refused_by
+from swath.daemon.processing.undecoded import refused_by
 from swath.georef.formats.sbet import sbet_bytes
 from swath.georef.formats.trajectory.csv import csv_text
 from swath.georef.records import ChunkBatch

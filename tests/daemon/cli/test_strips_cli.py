@@ -250,7 +250,7 @@ def test_strips_with_equal_numbers_of_two_runs_are_separate(made: Cast, tmp_path
         for number in (1, 2)
     ]
     assert strips.seen is not None
-    assert strips.seen.flown == [0, 0, 1, 1]
+    assert strips.seen.trajectory_index == [0, 0, 1, 1]
 
 
 @pytest.mark.slow

@@ -105,10 +105,10 @@ def test_an_imu_without_a_receiver_is_timed_by_the_wall_clock_and_its_pulses(flo
 
 
 def test_an_absent_lever_arm_is_estimated_and_reported(flown: Flown) -> None:
-    wish = InputOptions(positions=flown.folder / "ppk.pos", config=load_config(without_receiver(flown)))
-    inputs = read_inputs(flown.session(), wish)
+    request = InputOptions(positions=flown.folder / "ppk.pos", config=load_config(without_receiver(flown)))
+    inputs = read_inputs(flown.session(), request)
     assert inputs.setup.estimate_lever_arm == 2.0
-    assert any("give --lever-arm X,Y,Z" in line for line in inputs.doubts)
+    assert any("give --lever-arm X,Y,Z" in line for line in inputs.warnings)
 
 
 def test_raw_measurements_need_a_position_file(flown: Flown) -> None:

@@ -113,14 +113,14 @@ def log(made: Cast, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     path = tmp_path / "flight.mcap"
     path.write_bytes(b"bytes of a log")
 
-    def read(wish: Any, folder: Path, tell: Any) -> KeptFlight:
-        text, name = wish.options.calibrations.get("left", (None, ""))
+    def read(request: Any, folder: Path, tell: Any) -> KeptFlight:
+        text, name = request.options.calibrations.get("left", (None, ""))
         head = made.flight.heads[0]
         start = head.start if text is None else read_calibration(text, name)
         flight = replace(made.flight, heads=(replace(head, start=start),)).placed({"left": start})
         profile = SimpleNamespace(installation=PLACE)
         logged: Any = SimpleNamespace(
-            doubts=[],
+            warnings=[],
             holes=[],
             log=path,
             navigated=None,

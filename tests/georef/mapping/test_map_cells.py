@@ -122,7 +122,7 @@ def test_each_face_belongs_to_one_cube() -> None:
 
 
 def test_memory_is_bounded_and_recomputed_cubes_give_the_same_results(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Dropped cubes come back the same."""
+    """DiscardedPoints cubes come back the same."""
     monkeypatch.setattr(map_cells, "CELLS_KEPT", 50)
     points = HERE + np.arange(3_000)[:, None] * [700.0, 30.0, 10.0]
     made = cells(cubic)

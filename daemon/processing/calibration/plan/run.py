@@ -158,7 +158,7 @@ class PlannedCalibration:
         return f"This flight does not determine {words}."
 
 
-def plan_calibration(plan: Plan, wish: PlanOptions) -> PlannedCalibration:
+def plan_calibration(plan: Plan, request: PlanOptions) -> PlannedCalibration:
     """Predict a plan's calibration.
 
     Raises:
@@ -167,27 +167,27 @@ def plan_calibration(plan: Plan, wish: PlanOptions) -> PlannedCalibration:
     survey = Survey(plan)
     frame = Tangent.at(survey.site.origin_e)
     try:
-        navigation = navigated(survey, BEGIN_NS) if wish.sigmas is None else None
+        navigation = navigated(survey, BEGIN_NS) if request.sigmas is None else None
     except NavigationError as error:
         raise UserError(one_line(str(error)), ExitCode.USAGE) from error
-    sigmas = wish.sigmas or (_by_the_grade(plan) if navigation is None else navigation.sigmas)
+    sigmas = request.sigmas or (_by_the_grade(plan) if navigation is None else navigation.sigmas)
     heads, scans = _heads(plan)
     lines = [
         Line(strip.name, 0, number + 1, _gps(strip.start_s), _gps(strip.end_s))
         for number, strip in enumerate(survey.strips)
     ]
     surfaces = [*_roofs(survey, frame), *_ground(survey, frame)]
-    control = _control(survey, frame, wish.control_sigma_m) if wish.control else []
+    control = _control(survey, frame, request.control_sigma_m) if request.control else []
     try:
         most = (PLANES if navigation is None else EVERY).most_points
-        flown = [_trajectory(survey, sigmas)]
-        flight, features = planned(frame, heads, scans, flown, lines, [*surfaces, *control], most)
+        trajectories = [_trajectory(survey, sigmas)]
+        flight, features = planned(frame, heads, scans, trajectories, lines, [*surfaces, *control], most)
         prior = gauss_markov(flight) if navigation is None else navigation.prior(flight)
-        predicted = predict(flight, features, of_parameters(wish.model), prior)
+        predicted = predict(flight, features, of_parameters(request.model), prior)
     except (FlightError, ParameterError, NormalError) as error:
         raise UserError(one_line(str(error)), ExitCode.USAGE) from error
     used = sum(len(plane.control) for plane in features.planes)
-    unplanned = tuple(tables_in_words(wish.model))
+    unplanned = tuple(tables_in_words(request.model))
     return PlannedCalibration(survey, flight, features, predicted, _rows(predicted), sigmas, used, unplanned)
 
 

@@ -228,7 +228,7 @@ def _words(axes: Axes) -> None:
 
 def track_of(flight: Flight, swath: Swath) -> FloatArray:
     """Return the body's track (k, 2), east and north in t, while a swath was flown."""
-    trajectory = flight.trajectories[swath.flown]
+    trajectory = flight.trajectories[swath.trajectory_index]
     if not len(swath.time_ns):
         return np.zeros((0, 2))
     first, last = np.searchsorted(trajectory.time_ns, [swath.time_ns[0], swath.time_ns[-1]])

@@ -176,7 +176,7 @@ def trajectory_pictures(report: ReportInput) -> list[Picture]:
     fit = report.adjusted.trajectory
     if fit is None:
         return []
-    sessions = np.unique(fit.flown)
+    sessions = np.unique(fit.trajectory_index)
     return [_trajectory_picture(fit, int(number), several=len(sessions) > 1) for number in sessions]
 
 
@@ -184,8 +184,8 @@ TURNS = ("Turn about north (0.001°)", "Turn about east (0.001°)", "Turn about 
 SHIFTS = ("North (cm)", "East (cm)", "Down (cm)")
 
 
-def _trajectory_picture(fit: TrajectoryFit, flown: int, *, several: bool) -> Picture:
-    mine = np.flatnonzero(fit.flown == flown)
+def _trajectory_picture(fit: TrajectoryFit, trajectory_index: int, *, several: bool) -> Picture:
+    mine = np.flatnonzero(fit.trajectory_index == trajectory_index)
     mine = mine[np.argsort(fit.time_ns[mine], kind="stable")]
     minutes = (fit.time_ns[mine] - fit.time_ns[mine[0]]) / (60.0 * SECOND_NS)
     broken = _breaks(minutes)
@@ -221,7 +221,7 @@ def _trajectory_picture(fit: TrajectoryFit, flown: int, *, several: bool) -> Pic
             ]
         )
 
-    title = f"Corrections of the trajectory{f', session {flown + 1}' if several else ''}"
+    title = f"Corrections of the trajectory{f', session {trajectory_index + 1}' if several else ''}"
     words = "Corrections that are added to the trajectory, estimated together with the calibration."
     return Picture(title, words, lambda form: 0.3 + Panels.height_in(form, 6, panel_in), draw)
 

@@ -36,7 +36,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
 
 
 @pytest.fixture(scope="module")
-def wish(made: Made, tmp_path_factory: pytest.TempPathFactory) -> CalibrationOptions:
+def options(made: Made, tmp_path_factory: pytest.TempPathFactory) -> CalibrationOptions:
     folder = made.flown.folder
     true = folder / "left.true.toml"
     options = Options(datum="same", calibrations={"left": (true.read_text(), str(true))}, uncertainty=False)
@@ -46,9 +46,9 @@ def wish(made: Made, tmp_path_factory: pytest.TempPathFactory) -> CalibrationOpt
 
 
 @pytest.fixture(scope="module")
-def done(wish: CalibrationOptions, tmp_path_factory: pytest.TempPathFactory) -> Calibrated:
+def done(options: CalibrationOptions, tmp_path_factory: pytest.TempPathFactory) -> Calibrated:
     """Return an outcome without faults before it is written."""
-    return calibrate(wish, tmp_path_factory.mktemp("returns"), quiet)
+    return calibrate(options, tmp_path_factory.mktemp("returns"), quiet)
 
 
 def wrong(done: Calibrated, sigma_rad: float = 1e-5, **by: float) -> Calibrated:
@@ -95,7 +95,7 @@ def test_a_validation_contradicts_a_wrong_roll(done: Calibrated) -> None:
 
 
 def test_all_three_contradictions_are_in_the_verdict_of_a_calibration(
-    done: Calibrated, wish: CalibrationOptions
+    done: Calibrated, options: CalibrationOptions
 ) -> None:
     """Eight pairs of one sign, three sigmas off together: on the terminal, in the record and in the file."""
     sigma = 2.0**-16
@@ -107,21 +107,21 @@ def test_all_three_contradictions_are_in_the_verdict_of_a_calibration(
         "validation: crossStripFlight (002): ",
         "8 profiles put boresight φ (pitch) −0.0026° from the adjustment (−3.0 sigmas)",
     ]
-    told = write_products(wish, bad, quiet)
+    told = write_products(options, bad, quiet)
     assert told.record["verdict"]["level"] in ("care", "unusable")
     reasons = [one["what"] for one in told.record["verdict"]["reasons"]]
-    in_file = read_calibration(wish.output.read_text(), "left.toml").header["verdict_reasons"]
+    in_file = read_calibration(options.output.read_text(), "left.toml").header["verdict_reasons"]
     assert isinstance(in_file, list)
     for word in words:
         assert any(reason.startswith(word) for reason in reasons), reasons
         assert any(str(reason).startswith(word) for reason in in_file)
         assert any(word in line for line in told.lines)
-    sound = write_products(wish, replace(done, check=Check((), (replace(comparison, told=-2.75 * sigma),))), quiet)
+    sound = write_products(options, replace(done, check=Check((), (replace(comparison, told=-2.75 * sigma),))), quiet)
     for word in words:
         assert not any(one["what"].startswith(word) for one in sound.record["verdict"]["reasons"])
 
 
-def test_a_forced_trajectory_of_another_place_is_noted(made: Made, wish: CalibrationOptions, tmp_path: Path) -> None:
+def test_a_forced_trajectory_of_another_place_is_noted(made: Made, options: CalibrationOptions, tmp_path: Path) -> None:
     """All strips are moved alike, so only this note reveals it."""
     true, file = made.trajectory, tmp_path / "away.csv"
     lat, lon, height = true.geodetic()
@@ -130,9 +130,9 @@ def test_a_forced_trajectory_of_another_place_is_noted(made: Made, wish: Calibra
     )
     sigmas = {name: getattr(true, name) for name in ("position_sigma_l", "attitude_sigma_rad")}
     file.write_text(csv_text(replace(away, **sigmas)))
-    elsewhere = replace(wish.logs, trajectory=TrajectoryOptions(file, force=True))
+    elsewhere = replace(options.logs, trajectory=TrajectoryOptions(file, force=True))
     output = tmp_path / "left.toml"
-    forced = replace(wish, logs=elsewhere, output=output)
+    forced = replace(options, logs=elsewhere, output=output)
     told = write_products(forced, calibrate(forced, tmp_path, quiet), quiet)
     (note,) = (line for line in told.record["notes"] if line.startswith(f"{file}: "))
     assert "lies 7.6 km off the fixes of gnss/rover" in note

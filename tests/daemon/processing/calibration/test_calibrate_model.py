@@ -82,12 +82,12 @@ def test_a_file_can_set_every_option(tmp_path: Path) -> None:
 
 def test_the_example_of_the_page_is_valid(tmp_path: Path) -> None:
     (example,) = re.findall(r"^```toml\n(.*?)^```$", PAGE.read_text(), re.M | re.S)
-    wish = model_of(file(tmp_path, example))
-    assert wish.priors == {"left.kappa_rad": 0.02 * DEG, "range_offset_slot.2": 0.03}
-    assert wish.ibrc_reference in wish.ibrc_knots
-    assert wish.range_offset_slots
-    assert wish.range_offset_zones
-    assert len(wish.beams) == 3
+    request = model_of(file(tmp_path, example))
+    assert request.priors == {"left.kappa_rad": 0.02 * DEG, "range_offset_slot.2": 0.03}
+    assert request.ibrc_reference in request.ibrc_knots
+    assert request.range_offset_slots
+    assert request.range_offset_zones
+    assert len(request.beams) == 3
 
 
 def test_an_empty_file_gives_the_default_model(tmp_path: Path) -> None:
@@ -97,7 +97,7 @@ def test_an_empty_file_gives_the_default_model(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "wish"),
+    ("options", "expected"),
     [
         (("", "", []), {"fix": ["left.kappa_rad", "omega_rad"], "priors": {"phi_rad": 0.1}}),
         (("phi_deg", "", []), {"fix": ["left.kappa_rad", "omega_rad", "phi_rad"]}),
@@ -109,14 +109,14 @@ def test_an_empty_file_gives_the_default_model(tmp_path: Path) -> None:
     ],
 )
 def test_options_override_the_file(
-    tmp_path: Path, options: tuple[str, str, list[str]], wish: dict[str, object]
+    tmp_path: Path, options: tuple[str, str, list[str]], expected: dict[str, object]
 ) -> None:
     """An option for all scanners also overrides the file's setting of a single one."""
     found = model_of(file(tmp_path, BOTH), *options)
     assert {"fix": found.fix, "free": found.free} == {"fix": set(), "free": set()} | {
-        word: set(names) for word, names in wish.items() if isinstance(names, list)
+        word: set(names) for word, names in expected.items() if isinstance(names, list)
     }
-    assert {name: round(sigma / DEG, 9) for name, sigma in found.priors.items()} == wish.get("priors", {})
+    assert {name: round(sigma / DEG, 9) for name, sigma in found.priors.items()} == expected.get("priors", {})
     assert found.model == "basic"
 
 
@@ -219,8 +219,8 @@ def test_a_file_that_is_not_text_is_refused_in_one_line(tmp_path: Path) -> None:
 
 
 def test_options_are_described_by_the_keys_of_files(tmp_path: Path) -> None:
-    wish = model_of(file(tmp_path, WHOLE))
-    told = in_words(wish)
+    request = model_of(file(tmp_path, WHOLE))
+    told = in_words(request)
     assert told.startswith("full; fixed right.omega_deg, time_offset_us; free phi_deg; prior beam.azimuth_deg 0.05, ")
     assert "left.kappa_deg 0.02" in told
     assert "range_scale_ppm 20" in told
@@ -229,10 +229,10 @@ def test_options_are_described_by_the_keys_of_files(tmp_path: Path) -> None:
         "range offset of return slot 1, 2; range offset of zone 0, 3; beam azimuth_deg, elevation_deg, range_m"
     )
     assert in_words(ParameterOptions("basic")) == "basic"
-    alone = of_parameters(wish)
+    alone = of_parameters(request)
     assert tables_in_words(alone) == []
     assert set(alone.priors) == {"left.kappa_rad", "range_scale"}
-    assert (alone.model, alone.fix, alone.free) == (wish.model, wish.fix, wish.free)
+    assert (alone.model, alone.fix, alone.free) == (request.model, request.fix, request.free)
 
 
 def test_unknowns_are_named_as_in_files() -> None:

@@ -55,7 +55,7 @@ def test_a_range_offset_by_pulse_rate_is_applied_once(
         rays = head.model(head.start).rays(
             before.rows,
             before.time_ns,
-            flight.trajectories[swath.flown],
+            flight.trajectories[swath.trajectory_index],
             encoder_rate=before.encoder_rate,
             encoder_acceleration=before.encoder_acceleration,
             prf_hz=PRF_HZ,
@@ -89,8 +89,8 @@ def test_returns_without_time_are_noted(made: Made, tmp_path: Path, monkeypatch:
 
     monkeypatch.setattr(calibration_flight, "run_jobs", without_time)
     trajectory = TrajectoryOptions(made.flown.folder / "true_trajectory.csv")
-    wish = GeorefOptions([made.flown.log], tmp_path, trajectory, Options(datum="same", uncertainty=False))
-    kept = read_flight(wish, tmp_path, lambda *_: None)
+    request = GeorefOptions([made.flown.log], tmp_path, trajectory, Options(datum="same", uncertainty=False))
+    kept = read_flight(request, tmp_path, lambda *_: None)
     total = 2 * sum(len(swath) for swath in kept.flight.swaths)
     (line,) = (line for line in kept.notes if "have no time" in line)
     assert line.startswith(f"{made.flown.log}: scanner/left: ")
@@ -103,8 +103,8 @@ def test_a_navigated_trajectory_is_always_that_of_the_body(made: Made, tmp_path:
     for at in ("body", "antenna"):
         (tmp_path / at).mkdir()
         options = Options(datum="same", uncertainty=False)
-        wish = GeorefOptions([made.flown.log], tmp_path / at, TrajectoryOptions(navigate=True, at=at), options)
-        kept = read_flight(wish, tmp_path / at, lambda *_: None)
+        request = GeorefOptions([made.flown.log], tmp_path / at, TrajectoryOptions(navigate=True, at=at), options)
+        kept = read_flight(request, tmp_path / at, lambda *_: None)
         found.append((kept.flight.trajectories[0].position_e, kept.logged[0].troubles))
     (plain, before), (asked, told) = found
     assert made.flown.config.gnss["rover"].lever_arm_m != [0.0, 0.0, 0.0]

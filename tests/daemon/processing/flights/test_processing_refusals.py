@@ -26,7 +26,7 @@ from swath.daemon.processing.georeferencing.sidecar import unit_doubts
 from swath.daemon.processing.points.clocks import LogClocks
 from swath.daemon.processing.points.time_checks import refuse_no_time, time_trouble
 from swath.daemon.processing.setup.setup import Options
-from swath.daemon.processing.unread import Unread, unread_lines
+from swath.daemon.processing.undecoded import Undecoded, undecoded_lines
 from swath.drivers.parser import Parser, ParserCounters
 from swath.georef.mapping.frame import Mapping
 from swath.georef.records import INS_DTYPE
@@ -212,7 +212,7 @@ def test_error_in_the_configuration_of_a_log_names_the_log() -> None:
 
 def test_undecoded_messages_are_reported() -> None:
     counts = {"left": {"bad_version": 3, "sequence_gap": 3, "bad_magic": 2}, "right": {"sequence_gap": 7}}
-    holes, warnings = unread_lines("a.mcap", counts)
+    holes, warnings = undecoded_lines("a.mcap", counts)
     assert holes == [
         "a.mcap: 3 messages of scanner/left were not read: a version of the protocol that this program does not read"
     ]
@@ -224,7 +224,7 @@ def test_undecoded_messages_are_reported() -> None:
 
 def test_only_the_messages_of_the_piece_itself_count() -> None:
     parser = cast(Parser, SimpleNamespace(counters=ParserCounters()))
-    unread = Unread({"left": parser})
+    unread = Undecoded({"left": parser})
     for own in (False, True, True, False):
         parser.counters.bad_checksums += 1
         parser.counters.errors["bad_version"] += 10

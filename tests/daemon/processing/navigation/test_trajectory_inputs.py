@@ -18,8 +18,8 @@ from swath.daemon.config import Config
 from swath.daemon.config.tables import NoiseConfig
 from swath.daemon.errors import ConfigError, UserError
 from swath.daemon.log.parsers import stored_config
-from swath.daemon.processing.navigation import doubts as navigation_doubts
-from swath.daemon.processing.navigation.doubts import height_findings
+from swath.daemon.processing.navigation import input_checks
+from swath.daemon.processing.navigation.input_checks import height_findings
 from swath.daemon.processing.navigation.inputs import InputOptions, NavigationInputs, read_inputs
 from swath.daemon.processing.navigation.observations import (
     DEFAULT_SIGMAS,
@@ -173,7 +173,7 @@ class TestInputsOfALog:
             assert mark.event.sigma_s == pytest.approx(CLOCK_SIGMA_S)
 
     def test_a_sound_log_has_no_warnings_and_no_gaps(self, inputs: NavigationInputs) -> None:
-        assert (inputs.doubts, inputs.holes) == ([], [])
+        assert (inputs.warnings, inputs.holes) == ([], [])
         assert inputs.refused == {}
 
     def test_the_configuration_in_the_log_suffices(
@@ -191,9 +191,9 @@ class TestInputsOfALog:
 
 
 class TestRefusals:
-    def refused(self, flown: Flown, wish: InputOptions) -> str:
+    def refused(self, flown: Flown, request: InputOptions) -> str:
         with pytest.raises(UserError) as caught:
-            read_inputs(flown.session(), wish)
+            read_inputs(flown.session(), request)
         assert "\n" not in caught.value.message
         return caught.value.message
 
@@ -244,7 +244,7 @@ class TestRefusals:
 class TestWarnings:
     def test_a_baseline_that_differs_from_the_configured_one_gives_a_warning(self, flown: Flown) -> None:
         config = flown.changed("long.toml", **{"[0.9, 0.6, -1.2]": "[0.9, 1.6, -1.2]"})
-        (line,) = read_inputs(flown.session(), InputOptions(config=config)).doubts
+        (line,) = read_inputs(flown.session(), InputOptions(config=config)).warnings
         assert "measures 1.03 m between its antennas" in line
         assert "are 1.83 m apart" in line
 
@@ -253,22 +253,22 @@ class TestWarnings:
         inputs = read_inputs(flown.session(), InputOptions(config=config))
         assert inputs.observed["heading"] == 0
         assert inputs.refused["heading_no_secondary_lever_arm"] > 60
-        assert "set gnss.rover.secondary_lever_arm_m" in inputs.doubts[0]
+        assert "set gnss.rover.secondary_lever_arm_m" in inputs.warnings[0]
 
     def test_a_second_antenna_without_headings_gives_a_warning(self, tmp_path: Path) -> None:
         one = PLAN.replace("secondary_lever_arm_m = [0.9, 0.6, -1.2]", "")
         flown = fly_short(tmp_path, one, 10.0)
-        assert not read_inputs(flown.session(), InputOptions()).doubts
+        assert not read_inputs(flown.session(), InputOptions()).warnings
         arm = "lever_arm_m = [0.1, -0.05, -1.2]"
         config = flown.changed("two.toml", **{arm: f"{arm}\nsecondary_lever_arm_m = [0.9, 0.6, -1.2]"})
-        (line,) = read_inputs(flown.session(), InputOptions(config=config)).doubts
+        (line,) = read_inputs(flown.session(), InputOptions(config=config)).warnings
         assert "gnss/rover sent no heading that this program reads, although secondary_lever_arm_m" in line
 
     def test_an_imu_timed_by_arrival_gives_a_warning(self, flown: Flown) -> None:
         config = flown.changed("untimed.toml", **{"sample_ticks": "# ", "pps_ticks": "# ", 'group = "last"': ""})
         inputs = read_inputs(flown.session(), InputOptions(config=config))
         assert inputs.imu_time[0] == "arrival"
-        assert "timed by their arrival" in inputs.doubts[0]
+        assert "timed by their arrival" in inputs.warnings[0]
         assert inputs.setup.estimate_time_offset_s > 1e-3
         latched = read_inputs(flown.session(), InputOptions()).legs[0].inertial.time_ns
         off_ns = inputs.legs[0].inertial.time_ns[200:1200] - latched[200:1200]
@@ -555,7 +555,7 @@ def test_a_geoid_separation_of_zero_in_every_gga_is_reported(monkeypatch: pytest
     fixes = gga_fixes([0.0] * 20)
     assert {fix.undulation_m for fix in fixes} == {0.0}
     for known, size in ((None, "up to 107 m"), ((48.2, "EGM2008"), "48.2 m (EGM2008)")):
-        monkeypatch.setattr(navigation_doubts, "geoid_undulation", lambda place, known=known: known)
+        monkeypatch.setattr(input_checks, "geoid_undulation", lambda place, known=known: known)
         (finding,) = findings_of(fixes)
         assert finding.severity == "warning"
         assert (

@@ -259,8 +259,8 @@ def done(made: Made, lifted: Path, tmp_path_factory: pytest.TempPathFactory) -> 
     text = (made.flown.folder / "left.true.toml").read_text()
     options = Options(datum="same", calibrations={"left": (text, str(made.flown.folder / "left.true.toml"))})
     logs = GeorefOptions([made.flown.log], folder, TrajectoryOptions(lifted), replace(options, uncertainty=False))
-    wish = AdjustOptions(logs, folder / "none")
-    return wish, correct_strips(wish, folder, lambda what, done, total: None)
+    request = AdjustOptions(logs, folder / "none")
+    return request, correct_strips(request, folder, lambda what, done, total: None)
 
 
 @pytest.mark.parametrize("there", [True, False], ids=["folder there", "folder not there"])
@@ -287,7 +287,7 @@ def test_a_trajectory_is_written_back_about_the_plumb_line_of_its_input(
 ) -> None:
     """Otherwise the deflection of the vertical would be taken off twice."""
     xi_eta_rad = tuple(np.radians([12.0 / 3600.0, -7.0 / 3600.0]))
-    wish, outcome = replace(done[0], output=tmp_path / "out"), done[1]
+    request, outcome = replace(done[0], output=tmp_path / "out"), done[1]
     (logged,) = outcome.kept.logged
     plumbed: Any = SimpleNamespace(
         log=logged.log,
@@ -298,7 +298,7 @@ def test_a_trajectory_is_written_back_about_the_plumb_line_of_its_input(
         source=logged.source,
     )
     kept = replace(outcome.kept, logged=[plumbed])
-    write_adjustment(wish, replace(outcome, kept=kept), lambda what, done, total: None)
+    write_adjustment(request, replace(outcome, kept=kept), lambda what, done, total: None)
     path = trajectory_of(tmp_path / "out", ".csv")
     read = read_trajectory(path.read_bytes(), path.name)
     for turned, same in ((read, False), (read.with_deflection(*xi_eta_rad), True)):

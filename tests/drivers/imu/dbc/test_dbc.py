@@ -519,7 +519,7 @@ def test_an_unspecified_group_is_derived_from_the_pauses_between_samples(
     assert len(rows) >= 79
     force, rate = rows["specific_force_b"][:, 0], rows["angular_rate_b"][:, 0]  # as their samples' numbers
     assert np.allclose(force * rate[-1], rate * force[-1])
-    assert parser.doubts == ()
+    assert parser.warnings == ()
 
 
 def test_evenly_spaced_frames_leave_the_group_undecided() -> None:
@@ -527,6 +527,6 @@ def test_evenly_spaced_frames_leave_the_group_undecided() -> None:
     frames, _ = _burst("TAG", 0.0)
     rows = imu_rows(feed(parser, frames) + parser.close())
     assert len(rows) > 70
-    (doubt,) = parser.doubts
+    (doubt,) = parser.warnings
     assert 'set group = "last" or "first"' in doubt
-    assert DbcParser(settings()).doubts == ()
+    assert DbcParser(settings()).warnings == ()

@@ -19,7 +19,7 @@ WHY = {
 }
 
 
-class Unread:
+class Undecoded:
     """Counts the messages that parsers refused, but for those in the margin around a piece of a log.
 
     Attributes:
@@ -50,16 +50,16 @@ def refused_by(parser: Parser) -> Counter[str]:
     return +found
 
 
-def unread_lines(log: str, unread: Mapping[str, Mapping[str, int]]) -> tuple[list[str], list[str]]:
+def undecoded_lines(log: str, undecoded: Mapping[str, Mapping[str, int]]) -> tuple[list[str], list[str]]:
     """Return two lists of lines: what is missing from the products, and what is only a warning.
 
     Args:
         log: its name, for the lines.
-        unread: by scanner, counts of messages by reason.
+        undecoded: by scanner, counts of messages by reason.
     """
     holes: list[str] = []
     warnings: list[str] = []
-    for scanner, counts in sorted(unread.items()):
+    for scanner, counts in sorted(undecoded.items()):
         for reason, count in sorted(counts.items()):
             if reason == SEQUENCE_GAP:
                 if len(counts) == 1:  # what was refused is missing from the sequence too

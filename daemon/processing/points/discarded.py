@@ -30,7 +30,7 @@ HEAD = ",".join(["scanner", "reason", "gps_ns", *COLUMNS, "range_m", "encoder_de
 GATED = (Fate.BELOW_RANGE_GATE, Fate.ABOVE_RANGE_GATE)
 
 
-class Dropped:
+class DiscardedPoints:
     """Takes the returns that a stream leaves out, in the stream's own order.
 
     Args:

@@ -136,7 +136,7 @@ def input_doubts(
                 f"{log}: {' and '.join(blended)} of a receiver with an INS contain its IMU's data, so that IMU errors "
                 "count twice; use BESTGNSSPOS and BESTGNSSVEL"
             )
-    lines += [f"{log}: {doubt}" for doubt in found.doubts]
+    lines += [f"{log}: {doubt}" for doubt in found.warnings]
     without = parts["heading"].refused["no_secondary_lever_arm"]
     if without:
         lines.append(
