@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
+from tests.builders import SYSTEMD
 from tests.daemon.rig import HANGS_S
 
-SYSTEMD = Path(__file__).resolve().parent.parent / "systemd"
 UNIT = SYSTEMD / "swathd.service"
 LIVE = SYSTEMD / "swath-live.service"
 PPS = SYSTEMD / "swath-pps@.service"

@@ -5,10 +5,6 @@ The bound of each return is 1 mm and half the packet's own quanta carried to the
 
 from __future__ import annotations
 
-import tomllib
-from collections.abc import Iterator
-from dataclasses import dataclass
-from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -18,22 +14,27 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
-from swath.drivers.driver import find_driver
-from swath.drivers.parser import DeviceSettings
 from swath.drivers.scanner.beams import beam_points as velodyne_points
 from swath.drivers.scanner.ouster.head import beam_points as ouster_points
 from swath.drivers.scanner.ouster.head import read_head
 from swath.drivers.scanner.velodyne.heads import VLP16
 from swath.georef.arrays import FloatArray
-from swath.georef.records import ChunkBatch, DeviceClockSamples, ScannerReturns
-from swath.sim.companions import companion_files, config_text, default_wires
-from swath.sim.fly import VirtualFlight, open_truth
-from swath.sim.plan.plan import Plan, parse_plan
+from tests.builders import (
+    EVERY_ERROR,
+    LOW_AND_SLOW,
+    ROUND_ERRORS,
+    SIDEWAYS,
+    SPINNING_ERRORS,
+    SREP_24_BIT,
+    TURNED,
+    Flown,
+    bound,
+    fly_and_decode,
+    vlp16_quanta,
+)
 from tests.sim.direct import (
     TO_GEODETIC,
     Bending,
-    Calibration,
-    Track,
     ardc,
     beam_angle,
     corrected_range,
@@ -46,159 +47,11 @@ from tests.sim.direct import (
 pytestmark = pytest.mark.xdist_group("kernels")  # the loops that cast rays are compiled once, by one worker
 
 
-PLAN = """
-[flight]
-name = "proof"
-seed = 11
-noise = false
-turbulence = "moderate"
-speed_mps = 60.0
-
-[[line]]
-name = "1"
-from_m = [-200, -20]
-to_m = [200, 20]
-height_m = 1250
-
-[terrain]
-height_m = 450
-relief_m = 40
-wavelength_m = 400
-
-[[terrain.village]]
-center_m = [0, 0]
-size_m = [300, 300]
-houses = 12
-
-[[terrain.forest]]
-center_m = [100, 200]
-size_m = [150, 100]
-
-[host]
-clock_ppm = -12.0
-
-[imu.main]
-rate_hz = 200
-
-[scanner.left]
-prf_hz = 20000
-scan_hz = 40
-encoder_counts = 16777216
-oscillator = { offset_ppm = 3.0, drift_ppm_per_h = 2.0 }
-"""
-EVERY_ERROR = {
-    "omega_deg": 0.25,
-    "phi_deg": -0.4,
-    "kappa_deg": 0.6,
-    "range_offset_m": 0.35,
-    "range_scale_ppm": 40.0,
-    "scan_angle_offset_deg": 0.05,
-    "scan_angle_scale_ppm": 300.0,
-    "scan_plane_tilt_deg": 0.02,
-    "lever_arm_x_m": 0.15,
-    "lever_arm_y_m": -0.08,
-    "lever_arm_z_m": 0.42,
-    "time_offset_us": 150.0,
-    "encoder_latency_us": 1.0,
-    "torsion_us2": 2000.0,
-    "pitch_slope_ppm": 200.0,
-}
-TURNED = [[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]]  # cables to the rear, FORMULAS 1.5
-
-
-@dataclass
-class Flown:
-    """What a flight left: decoded returns, when their pulses were by the packets' own clock, and the truth."""
-
-    plan: Plan
-    rows: NDArray[np.void]
-    time_s: FloatArray
-    truth: dict[str, NDArray[Any]]
-    calibration: Calibration
-    files: dict[str, bytes]
-
-    def track(self) -> Track:
-        """The true trajectory at the IMU's rate."""
-        truth = self.truth
-        attitude = np.stack([truth[f"trajectory.{name}_rad"] for name in ("roll", "pitch", "heading")], axis=1)
-        time_s = 1e-9 * (truth["trajectory.gps_ns"] - self.plan.start_gps_ns)
-        lat, lon, height = (truth[f"trajectory.{name}"] for name in ("lat_rad", "lon_rad", "height_m"))
-        return Track(time_s, lat, lon, height, attitude)
-
-
-def fly_and_decode(folder: Path, changes: dict[str, Any], stop_s: float = 15.5) -> Flown:
-    """Fly the plan, feed the scanner's packets to its driver."""
-    plan = parse_plan(PLAN, folder).changed(changes)
-    path = folder / "truth.npz"
-    flight = VirtualFlight(plan, open_truth(plan, path), stop_s=stop_s)
-    files = companion_files(plan, flight.site, flight.scene)
-    config = tomllib.loads(config_text(plan, default_wires(plan), "."))["scanner"]["left"]
-    geometry = {"geometry": files["left.json"]} if "left.json" in files else {}
-    parser = find_driver("scanner", config["protocol"]).make_parser(DeviceSettings("scanner/left", config, geometry))
-    records = [record for batch in scanner_batches(flight) for record in parser.feed_batch(batch)] + parser.close()
-    flight.finish_truth()
-    assert parser.counters.bad_messages == parser.counters.bad_checksums == parser.counters.bytes_skipped == 0
-    rows = np.concatenate([record.rows for record in records if isinstance(record, ScannerReturns)])
-    clock = np.concatenate([record.rows for record in records if isinstance(record, DeviceClockSamples)])
-    with np.load(path) as truth:
-        loaded = dict(truth)
-    assert len(rows) == len(loaded["left.gps_ns"]) > 5000
-    time_s = pulse_times(flight, rows, clock)
-    return Flown(plan, rows, time_s, loaded, Calibration.read(files["left.true.toml"].decode()), files)
-
-
-def scanner_batches(flight: VirtualFlight) -> Iterator[ChunkBatch]:
-    """The scanner's packets; those of one length that follow each other together."""
-    units = (unit for unit in flight.units() if unit.source.startswith("scanner/left"))
-    for (source, length), alike in groupby(units, lambda unit: (unit.source, len(unit.data))):
-        together = list(alike)
-        host_ns = np.array([flight.host_clock.host_ns(unit.time_s) for unit in together], dtype=np.int64)
-        data = np.frombuffer(b"".join(unit.data for unit in together), dtype=np.uint8)
-        yield ChunkBatch(source, host_ns, data.reshape(len(together), length))
-
-
-def pulse_times(flight: VirtualFlight, rows: NDArray[np.void], clock: NDArray[np.void]) -> FloatArray:
-    """Seconds since the plan's start by what the packets say of their clock."""
-    if (clock["pps_time_ns"] < 0).all():  # disciplined: UTC past the hour, or GPS itself
-        return disciplined_times(flight, rows)
-    host_s = (clock["host_time_ns"] - flight.host_clock.host_ns(0.0)) * 1e-9
-    latched = clock["pps_time_ns"] >= 0
-    age_s = 1e-9 * (clock["device_time_ns"] - clock["pps_time_ns"])
-    seconds = np.rint(host_s - age_s)[latched]
-    edges, first = np.unique(clock["pps_time_ns"][latched], return_index=True)
-    seconds = seconds[first]
-    device = rows["device_time_ns"]
-    k = np.clip(np.searchsorted(edges, device, side="right") - 1, 0, len(edges) - 2)
-    share = (device - edges[k]) / (edges[k + 1] - edges[k])
-    times: FloatArray = seconds[k] + share * (seconds[k + 1] - seconds[k])
-    return times
-
-
-def disciplined_times(flight: VirtualFlight, rows: NDArray[np.void]) -> FloatArray:
-    """A head's stamps modulo the hour, beside the host's time of their packets."""
-    leap_ns = flight.plan.leap_seconds * 1_000_000_000
-    hour_ns = 3_600_000_000_000
-    expected = flight.plan.start_gps_ns - leap_ns + (rows["host_time_ns"] - flight.host_clock.host_ns(0.0))
-    behind = (expected - rows["device_time_ns"] + hour_ns // 2) // hour_ns
-    times: FloatArray = 1e-9 * (rows["device_time_ns"] + behind * hour_ns + leap_ns - flight.plan.start_gps_ns)
-    return times
-
-
 def misses(flown: Flown, points_e: FloatArray) -> FloatArray:
     """Return the distances from the truth."""
     assert np.isfinite(points_e).all()
     distances: FloatArray = np.linalg.norm(points_e - flown.truth["left.point_e"], axis=1)
     return distances
-
-
-def bound(
-    flown: Flown, *, range_quantum_m: float, angle_quantum_rad: float | FloatArray, time_quantum_s: float
-) -> FloatArray:
-    """1 mm and half of each quantum carried to the ground."""
-    fastest_mps = np.linalg.norm(flown.truth["trajectory.velocity_l"], axis=1).max()
-    carried = angle_quantum_rad * flown.truth["left.range_m"] + range_quantum_m + time_quantum_s * fastest_mps
-    limits: FloatArray = 1e-3 + 0.5 * carried
-    return limits
 
 
 def line_points(flown: Flown, theta: FloatArray, direction: FloatArray) -> FloatArray:
@@ -245,9 +98,6 @@ def pulse_angles(flown: Flown) -> FloatArray:
     time_s = flown.time_s[0] + step_s * np.arange(number[-1] + 1)
     angles: FloatArray = beam_angle(flown.calibration, time_s, steady)[number][back]
     return angles
-
-
-SREP_24_BIT = {"range_quantum_m": 1e-4, "angle_quantum_rad": 2 * 2 * np.pi / 2**24, "time_quantum_s": 1e-7}
 
 
 @pytest.mark.parametrize("motion", ["sine", "triangle"])
@@ -306,14 +156,6 @@ def test_points_of_a_monogon_are_recovered_with_every_error(tmp_path: Path) -> N
     assert (missed <= bound(flown, **SREP_24_BIT)).all(), missed.max()
 
 
-ROUND_ERRORS = EVERY_ERROR | {
-    "scan_plane_tilt_deg": 0.0,
-    "pitch_slope_ppm": 0.0,
-    "torsion_us2": 0.0,
-    "scan_angle_scale_ppm": 0.0,
-}
-
-
 def shaft_angle(flown: Flown, scan_hz: float) -> FloatArray:
     """γ of a shaft that turns evenly."""
     offset = flown.calibration.value("scan_angle_offset_deg")
@@ -367,21 +209,6 @@ def bent(ray: FloatArray, normal: FloatArray, ratio: float) -> FloatArray:
     return refracted
 
 
-LOW_AND_SLOW = {
-    "flight": {"speed_mps": 12.0},
-    "line": [{"name": "1", "from_m": [-60, -5], "to_m": [60, 5], "height_m": 540.0}],
-    "terrain": {"relief_m": 5.0},
-}
-SPINNING_ERRORS = EVERY_ERROR | {
-    "scan_angle_scale_ppm": 0.0,
-    "scan_plane_tilt_deg": 0.0,
-    "torsion_us2": 0.0,
-    "pitch_slope_ppm": 0.0,
-    "range_offset_m": 0.05,
-}
-SIDEWAYS = [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]  # spin axis forward, azimuth 0 down
-
-
 @pytest.mark.parametrize("dual", [False, True])
 def test_points_of_a_vlp16_are_recovered(tmp_path: Path, dual: bool) -> None:
     scanner = {"kind": "vlp16", "scan_hz": 10.0, "true": SPINNING_ERRORS, "installation": SIDEWAYS, "dual_return": dual}
@@ -390,18 +217,6 @@ def test_points_of_a_vlp16_are_recovered(tmp_path: Path, dual: bool) -> None:
     points_s = velodyne_points(corrected_rows(flown, 10.0), VLP16.beams)
     angle_quantum_rad = np.radians(0.01) * vlp16_quanta(flown.truth["left.pulse"], groups=6 if dual else 12)
     check_spinning(flown, points_s, range_quantum_m=0.002, angle_quantum_rad=angle_quantum_rad, time_quantum_s=1e-6)
-
-
-def vlp16_quanta(pulse: NDArray[np.int64], groups: int) -> FloatArray:
-    """How many quanta of azimuth a firing's azimuth is good to.
-
-    Between two groups of a packet it is interpolated: one. Behind the last group it goes on from the last two, a_n and
-    a_n + t (a_n − a_n−1) for the share t of the time from group to group: 1 + 2t.
-    """
-    place = pulse % 32
-    share = ((place // 16) * 55.296 + (place % 16) * 2.304) / 110.592  # VLP-16 manual, 9.4
-    last = pulse // 32 % groups == groups - 1
-    return np.where(last, 1.0 + 2.0 * share, 1.0)
 
 
 def test_points_of_an_os1_are_recovered(tmp_path: Path) -> None:

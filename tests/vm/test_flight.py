@@ -31,9 +31,8 @@ from swath.drivers.transports.spec import parse_transport
 from swath.sim.companions import companion_files, config_text
 from swath.sim.fly import VirtualFlight
 from swath.sim.plan.plan import parse_plan
+from tests.builders import Recorded, judged, running
 from tests.daemon.log_check import read_log
-from tests.daemon.processing.live.test_live_growing import running
-from tests.daemon.processing.live.test_live_navigated import Recorded, judged
 from tests.daemon.rig import HANGS_S, wait_until
 from tests.vm import aircraft, machine
 from tests.vm.installed import with_udev

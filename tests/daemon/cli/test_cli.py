@@ -16,9 +16,9 @@ from typer.testing import CliRunner
 from swath.daemon.cli.main import COMMANDS, make_app
 from swath.daemon.errors import ExitCode
 from swath.drivers.driver import KINDS, all_drivers
+from tests.builders import ROOT
 from tests.daemon.rig import HANGS_S
 
-ROOT = Path(__file__).parents[3]
 AIRCRAFT = ROOT / "fixtures/config/aircraft.toml"
 BAD = ROOT / "fixtures/config/bad"
 INTERRUPTED, PIPE_CLOSED = 130, 141

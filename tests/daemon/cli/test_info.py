@@ -14,7 +14,7 @@ import pytest
 from swath.drivers.driver import find_driver
 from swath.drivers.parser import DeviceSettings
 from swath.georef.records import ChunkBatch
-from tests.daemon.cli.test_cli import ROOT
+from tests.builders import ROOT
 from tests.daemon.commands import swath
 from tests.daemon.log.test_log import INFO, write_part
 from tests.daemon.rig import Recorder, session_table

@@ -16,10 +16,10 @@ from swath.daemon.config import parse_config
 from swath.daemon.doctor import _specs, clock, devices, disk, host, needed_modules
 from swath.daemon.doctor.finding import Finding, Tree, Verdict
 from swath.daemon.log.host_clock import STA_UNSYNC, ClockDiscipline
-from tests.daemon.cli.test_cli import ROOT, swath
+from tests.builders import ROOT, SYSTEMD
+from tests.daemon.cli.test_cli import swath
 from tests.daemon.doctor.test_doctor_chrony import DEBIAN_CHRONY
 from tests.daemon.rig import session_table
-from tests.test_systemd import SYSTEMD
 
 KEPT = ClockDiscipline(12.0, 0, 0.002)
 FREE_RUNNING = ClockDiscipline(0.0, STA_UNSYNC, 16.0)

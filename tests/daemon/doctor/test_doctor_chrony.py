@@ -10,7 +10,7 @@ import pytest
 
 from swath.daemon.doctor.clock import chrony_steps
 from swath.daemon.doctor.finding import Tree
-from tests.test_systemd import SYSTEMD
+from tests.builders import SYSTEMD
 
 # what Debian's and Ubuntu's chrony.conf says beside sources of time: conf.d comes before its own makestep
 DEBIAN_CHRONY = """# Include configuration files found in /etc/chrony/conf.d.

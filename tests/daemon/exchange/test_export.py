@@ -27,7 +27,7 @@ from swath.daemon.exchange.sidecar import SUFFIX
 from swath.daemon.log.reader import open_logs
 from swath.drivers.can_frames import encode_can_frame
 from swath.drivers.captures.pcap_writer import FILE_HEADER, pcap_frames
-from tests.daemon.cli.test_cli import ROOT
+from tests.builders import ROOT
 from tests.daemon.commands import swath
 from tests.daemon.exchange.builders import Unit, content_of, run_import, write_config, write_log
 from tests.daemon.log.test_log import doctor

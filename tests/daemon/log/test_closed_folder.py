@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from swath.daemon.log.directory import nearest_there
-from tests.daemon.cli.test_cli import ROOT
+from tests.builders import ROOT
 from tests.daemon.rig import HANGS_S, session_table
 
 # All is loaded before root becomes somebody else, who may not read where it lies.

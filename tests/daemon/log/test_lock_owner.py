@@ -11,7 +11,7 @@ import pytest
 
 from swath.daemon.errors import UserError
 from swath.daemon.log.directory import LOCK, take_directory
-from tests.daemon.cli.test_cli import ROOT
+from tests.builders import ROOT
 from tests.daemon.rig import HANGS_S
 
 NOBODY = 65534

@@ -23,7 +23,7 @@ from swath.daemon.log.mcap.scan import Damage, Record, scan, unpack_chunk
 from swath.daemon.log.mcap.writer import LogWriteError, PartWriter
 from swath.daemon.log.reader import open_logs
 from swath.daemon.log.recover import examine, recover
-from tests.daemon.cli.test_cli import ROOT
+from tests.builders import ROOT
 from tests.daemon.commands import swath
 from tests.daemon.log.test_log import (
     EVENTS,

@@ -35,7 +35,7 @@ from swath.daemon.monitor.source import Decoding
 from swath.drivers.parser import PacketParser
 from swath.drivers.scanner.srep.layout import SrepHeader, encode_datagram
 from swath.georef.records import ByteRows, Int64Array, Record
-from tests.daemon.cli.test_cli import ROOT
+from tests.builders import ROOT
 from tests.daemon.cli.test_info import CAPTURE
 from tests.daemon.commands import swath
 from tests.daemon.devices.test_check import nmea

@@ -29,7 +29,7 @@ from swath.daemon.recorder.control import (
     SPLITS_AT_ONCE,
     Control,
 )
-from tests.daemon.cli.test_cli import ROOT
+from tests.builders import ROOT
 from tests.daemon.commands import swath
 from tests.daemon.log_check import read_log
 from tests.daemon.recorder.test_recorder_faults import Numbers, scanner

@@ -20,7 +20,7 @@ import pytest
 
 from swath.daemon.replay.wire_player import Output, PtyOutput, TimedUnit, play
 from swath.drivers.transports.base import TransportError
-from tests.daemon.cli.test_cli import ROOT
+from tests.builders import ROOT
 from tests.daemon.log_check import LogContent, read_log
 from tests.daemon.recorder.test_recording import ROVER, SREP, Pty, nmea_zda
 from tests.daemon.rig import HANGS_S, Recorder, free_udp_port, one_processor, session_table

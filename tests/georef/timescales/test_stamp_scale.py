@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from swath.georef.records import DEVICE_CLOCK_DTYPE, Int64Array, StructArray
 from swath.georef.timescales import DeviceClock, Stamps, StampScale
 from swath.georef.timescales.stamp_scale import judge
-from tests.georef.timescales.test_timescales_device import NS, START_S, host_clock, host_ns
+from tests.builders import NS, START_S, host_clock, host_ns
 
 UNIX_MINUS_GPS_S = 315_964_800  # of UTC, but for the leap seconds
 LEAP = 18

@@ -11,39 +11,17 @@ from numpy.typing import NDArray
 
 from swath.georef.records import DEVICE_CLOCK_DTYPE, NamesEdge, StructArray, TimeMessage, TimeScale, TimeTag
 from swath.georef.timescales import DeviceClock, PpsClock, TimeState
+from tests.builders import NS, START_S, host_clock, host_ns
 from tests.georef.clock_run import rms
 
-NS = 1_000_000_000
-START_S = 1_479_297_618  # 2026-11-21T12:00:00Z: on the UTC hour with 18 leap seconds
-HOST_0 = 5_000_000_000_000
-HOST_RATE = 1.0 + 23e-6
 POWER_ON_NS = 77_000_000_000  # device time at START_S
 DEVICE_RATE = 1.0 - 41e-6
-
-
-def host_ns(true_s: NDArray[np.float64] | float) -> NDArray[np.int64]:
-    """Host time of true seconds since START_S."""
-    return HOST_0 + np.rint(np.asarray(true_s, dtype=np.float64) * HOST_RATE * NS).astype(np.int64)
 
 
 def device_ns(true_s: NDArray[np.float64] | float) -> NDArray[np.int64]:
     """Device time of true seconds since START_S, in whole 100 ns ticks."""
     ticks = np.rint((POWER_ON_NS + np.asarray(true_s, dtype=np.float64) * DEVICE_RATE * NS) / 100.0)
     return ticks.astype(np.int64) * 100
-
-
-def host_clock(seconds: int, *, message_s: float = 0.1, keep_history: bool = True) -> PpsClock:
-    """A host's clock with an edge and a message every second."""
-    clock = PpsClock(18, keep_history=keep_history)
-    for second in range(seconds):
-        edge = int(host_ns(second))
-        clock.add_edge(edge, second)
-        week, of_week = divmod(START_S + second, 604_800)
-        tag = TimeTag(TimeScale.GPS, of_week * NS, week)
-        arrival = edge + round(message_s * NS)
-        clock.add_message("gnss/rover", TimeMessage(arrival, tag, NamesEdge.PREVIOUS, message="TIME"))
-    assert clock.status(int(host_ns(seconds))).state is TimeState.LOCKED
-    return clock
 
 
 def test_an_edge_stamped_in_the_future_does_not_stop_the_clock() -> None:

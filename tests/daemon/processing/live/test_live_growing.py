@@ -3,13 +3,8 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import IO
 
 import numpy as np
 import pytest
@@ -19,7 +14,7 @@ from swath.daemon.log.reader import open_logs
 from swath.daemon.processing.live.session import Told, replay
 from swath.daemon.processing.setup.setup import Options, Setup
 from swath.daemon.processing.warm_up import warm_up
-from tests.daemon.cli.test_cli import ROOT
+from tests.builders import running
 from tests.daemon.processing.live.test_live import PLAN
 from tests.daemon.rig import HANGS_S, Recorder, session_table, wait_until
 
@@ -27,17 +22,6 @@ pytestmark = [pytest.mark.slow, pytest.mark.alone, pytest.mark.xdist_group("kern
 
 SECONDS = 6.5
 PART_MINUTES = 0.035  # two seconds
-
-
-@contextmanager
-def running(*words: str | Path, output: IO[str] | int = subprocess.DEVNULL) -> Iterator[subprocess.Popen[str]]:
-    """A command of ours; gone at the end, whatever happens."""
-    command = [sys.executable, "-m", "swath.daemon.cli.main", *map(str, words)]
-    with subprocess.Popen(command, cwd=ROOT, stdout=output, stderr=subprocess.PIPE, text=True) as process:
-        try:
-            yield process
-        finally:
-            process.kill()
 
 
 def config_of(wires: Path, folder: Path) -> str:

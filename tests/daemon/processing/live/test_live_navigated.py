@@ -3,24 +3,19 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import laspy
 import numpy as np
 import pytest
-from numpy.typing import NDArray
-from pyproj import Transformer
 
 from swath.daemon.cli.main import run_app
-from swath.daemon.log.reader import Session, open_logs
 from swath.daemon.processing.points.feed import LogFeed
 from swath.daemon.processing.setup.setup import Options, Setup
 from swath.daemon.processing.warm_up import warm_up
-from swath.georef.arrays import FloatArray
 from swath.georef.points import Points
-from tests.daemon.processing.live.test_live_growing import config_of, running
+from tests.builders import Recorded, judged, running
+from tests.daemon.processing.live.test_live_growing import config_of
 from tests.daemon.rig import HANGS_S, Recorder, wait_until
 
 pytestmark = [pytest.mark.slow, pytest.mark.alone, pytest.mark.xdist_group("kernels")]
@@ -51,34 +46,6 @@ on_lines_only = false
 """
 SECONDS = 22.0
 SETTLED_S = 8.0  # of the points: before, the filter has hardly begun
-TO_MAP = Transformer.from_crs("EPSG:4978", "EPSG:32632", always_xy=True)
-
-
-@dataclass(frozen=True)
-class Recorded:
-    """What is left of the flight: the log's folder, the points as they came in flight, and the truth of the returns."""
-
-    logs: Path
-    points: NDArray[np.void]
-    truth: Any
-
-    def session(self) -> Session:
-        (session,) = open_logs([self.logs])
-        return session
-
-    def missed(self, time_ns: NDArray[np.int64], number: NDArray[Any], points_map: FloatArray) -> FloatArray:
-        """(n, 3) easting, northing, height from where the light went; by the nearest return of that number."""
-        missed = np.empty((len(time_ns), 3))
-        for slot in np.unique(number).tolist():
-            of_slot = np.flatnonzero(self.truth["left.return_number"] == slot)
-            there_ns = self.truth["left.gps_ns"][of_slot]
-            mine = np.flatnonzero(number == slot)
-            after = np.clip(np.searchsorted(there_ns, time_ns[mine]), 1, len(there_ns) - 1)
-            nearest = after - (time_ns[mine] - there_ns[after - 1] < there_ns[after] - time_ns[mine])
-            assert np.abs(there_ns[nearest] - time_ns[mine]).max() < 50_000  # pulses are a millisecond apart
-            true = np.stack(TO_MAP.transform(*self.truth["left.point_e"][of_slot[nearest]].T), axis=1)
-            missed[mine] = points_map[mine] - true
-        return missed
 
 
 @pytest.fixture(scope="module")
@@ -107,14 +74,6 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
     again = folder / "again"  # the same flight into a log, for on wires the truth is not written
     assert run_app(["sim", "fly", str(plan), "-o", str(again), "--seconds", f"{SECONDS:g}"]) == 0
     return Recorded(logs, np.load(points), np.load(again / "truth.npz"))
-
-
-def judged(missed: FloatArray, sigma: FloatArray) -> None:
-    """Assert that the RMS of each axis is at most twice the predicted one."""
-    spread = np.sqrt((missed**2).mean(axis=0) / (sigma**2).mean(axis=0))
-    assert (spread < 2.0).all(), spread
-    assert np.sqrt(((missed / sigma) ** 2).mean()) > 0.1
-    assert (np.abs(missed) < 5.0 * sigma).mean() > 0.999
 
 
 def test_points_in_flight_match_the_truth_within_their_sigmas(recorded: Recorded) -> None:

@@ -22,7 +22,7 @@ from swath.georef.geodesy.rotations import quaternion_from_rot
 from swath.georef.points import Points
 from swath.georef.trajectory.trajectory import Trajectory
 from swath.sim.companions import config_text, default_wires
-from tests.sim.test_proof import (
+from tests.builders import (
     EVERY_ERROR,
     LOW_AND_SLOW,
     ROUND_ERRORS,
