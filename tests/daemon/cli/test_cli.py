@@ -17,38 +17,12 @@ from swath.daemon.cli.main import COMMANDS, make_app
 from swath.daemon.errors import ExitCode
 from swath.drivers.driver import KINDS, all_drivers
 from tests.builders import ROOT
+from tests.daemon.builders import run_python, swath
 from tests.daemon.rig import HANGS_S
 
 AIRCRAFT = ROOT / "fixtures/config/aircraft.toml"
 BAD = ROOT / "fixtures/config/bad"
 INTERRUPTED, PIPE_CLOSED = 130, 141
-
-
-def swath(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    """Run the command line as a process of its own."""
-    return subprocess.run(
-        [sys.executable, "-m", "swath.daemon.cli.main", *arguments],
-        cwd=ROOT,
-        env=os.environ | {"COLUMNS": "100", "NO_COLOR": "1"} | environment,
-        capture_output=True,
-        text=True,
-        timeout=HANGS_S,
-        check=False,
-    )
-
-
-def run_python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    """Run the command line in a process with an additional statement."""
-    head = "import sys; import swath.daemon.cli.main as cli\n"
-    return subprocess.run(
-        [sys.executable, "-c", head + code],
-        cwd=ROOT,
-        env=os.environ | environment,
-        capture_output=True,
-        text=True,
-        timeout=HANGS_S,
-        check=False,
-    )
 
 
 class TestHelp:

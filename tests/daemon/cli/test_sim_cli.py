@@ -26,7 +26,7 @@ from swath.daemon.simulate.on_wires import WallClock, fly_on_wires, open_wires, 
 from swath.drivers.extras import how_to_install
 from swath.sim.plan.plan import PRESETS as REAL_PRESETS
 from tests.builders import ROOT
-from tests.daemon.cli.test_cli import swath
+from tests.daemon.builders import swath
 from tests.daemon.log_check import official_counts, read_log
 from tests.daemon.rig import HANGS_S, Recorder, one_processor, session_table, wait_until
 from tests.daemon.standin import (

@@ -12,8 +12,6 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import reduce
-from operator import xor
 from pathlib import Path
 from socket import AF_INET, SOCK_DGRAM, socket
 
@@ -31,6 +29,7 @@ from swath.drivers.scanner.srep.layout import SrepHeader, encode_datagram
 from swath.drivers.scanner.velodyne.position import PPS_ABSENT, PPS_LOCKED, encode_position_packet
 from swath.drivers.transports.spec import parse_transport
 from swath.georef.records import ChunkBatch, TimeScale, TimeTag
+from tests.daemon.builders import nmea_sentence
 from tests.daemon.rig import HANGS_S, free_udp_port
 from tests.daemon.wires import pty, repeating, udp_sender
 
@@ -40,16 +39,11 @@ GROUP = "239.74.163.2"
 LISTEN_S = 1.2
 
 
-def nmea(body: str) -> bytes:
-    """A sentence with its checksum (NMEA 0183: exclusive or of what stands between $ and *)."""
-    return f"${body}*{reduce(xor, body.encode()):02X}\r\n".encode()
-
-
 def epoch(second: int, valid: bool = True) -> bytes:
     """Return the messages of a receiver for one second."""
     status = "A" if valid else "V"
     clock = f"1015{second % 60:02}.00"
-    return nmea(f"GPRMC,{clock},{status},4730.0000,N,00900.0000,E,0.0,0.0,211126,,,A") + nmea(
+    return nmea_sentence(f"GPRMC,{clock},{status},4730.0000,N,00900.0000,E,0.0,0.0,211126,,,A") + nmea_sentence(
         f"GPGGA,{clock},4730.0000,N,00900.0000,E,{int(valid)},12,0.8,500.0,M,47.0,M,,"
     )
 
@@ -150,7 +144,9 @@ class TestWorkingDevices:
         )
 
         def told(second: int) -> bytes:
-            sentence = nmea(f"GPRMC,1015{second % 60:02}.00,{status},4730.0,N,00900.0,E,0.0,0.0,211126,,,A").decode()
+            sentence = nmea_sentence(
+                f"GPRMC,1015{second % 60:02}.00,{status},4730.0,N,00900.0,E,0.0,0.0,211126,,,A"
+            ).decode()
             return encode_position_packet((15 * 60 + second % 60) * 1_000_000, pps, sentence.strip())
 
         with udp_sender(data, lambda n: packets[n % len(packets)]), udp_sender(position, told):
@@ -439,7 +435,7 @@ class TestTime:
 
         def local(_: int) -> bytes:
             now = dt.datetime.now(dt.UTC) + dt.timedelta(hours=2)
-            return nmea(f"GPRMC,{now:%H%M%S}.00,A,4730.0000,N,00900.0000,E,0.0,0.0,{now:%d%m%y},,,A")
+            return nmea_sentence(f"GPRMC,{now:%H%M%S}.00,A,4730.0000,N,00900.0000,E,0.0,0.0,{now:%d%m%y},,,A")
 
         with pty(local) as path:
             report = check(gnss(path), tmp_path)["gnss/rover"]

@@ -17,7 +17,7 @@ from swath.daemon.doctor import _specs, clock, devices, disk, host, needed_modul
 from swath.daemon.doctor.finding import Finding, Tree, Verdict
 from swath.daemon.log.host_clock import STA_UNSYNC, ClockDiscipline
 from tests.builders import ROOT, SYSTEMD
-from tests.daemon.cli.test_cli import swath
+from tests.daemon.builders import swath
 from tests.daemon.doctor.test_doctor_chrony import DEBIAN_CHRONY
 from tests.daemon.rig import session_table
 

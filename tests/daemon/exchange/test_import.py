@@ -25,7 +25,7 @@ from swath.drivers.captures.base import CaptureDamageError
 from swath.drivers.captures.opening import read_candump, read_pcap, read_serial
 from swath.drivers.captures.pcap_writer import FILE_HEADER, pcap_frames
 from tests.builders import ROOT
-from tests.daemon.cli.test_cli import run_python
+from tests.daemon.builders import run_python
 from tests.daemon.commands import swath
 from tests.daemon.exchange.builders import CONFIG, content_of, run_import, write_config, write_log
 from tests.daemon.log.test_log import doctor

@@ -36,9 +36,8 @@ from swath.drivers.parser import PacketParser
 from swath.drivers.scanner.srep.layout import SrepHeader, encode_datagram
 from swath.georef.records import ByteRows, Int64Array, Record
 from tests.builders import ROOT
-from tests.daemon.cli.test_info import CAPTURE
+from tests.daemon.builders import CAPTURE, nmea_sentence
 from tests.daemon.commands import swath
-from tests.daemon.devices.test_check import nmea
 from tests.daemon.log.test_log import INFO, SCANNER, START_NS, write_part
 from tests.daemon.log_check import read_log
 from tests.daemon.recorder.test_recorder_faults import Numbers, scanner
@@ -139,7 +138,7 @@ def test_monitor_shows_the_sources_and_that_all_is_well(tmp_path: Path, logs: Pa
 def test_sequence_gaps_and_damaged_messages_degrade_the_verdict(tmp_path: Path, logs: Path) -> None:
     """Three of every hundred datagrams are omitted; one of two sentences has a wrong checksum."""
     port = free_udp_port()
-    good = nmea("GPZDA,101500.00,21,11,2026,00,00")
+    good = nmea_sentence("GPZDA,101500.00,21,11,2026,00,00")
     bad = good.replace(b"ZDA", b"ZDB")
     with (
         serial_port(lambda number: good if number % 2 else bad) as path,

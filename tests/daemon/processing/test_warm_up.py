@@ -15,7 +15,7 @@ import pytest
 from swath.daemon.cli.main import INTERRUPTED
 from swath.daemon.processing.warm_up import WarmUp, cache_folder
 from tests.builders import ROOT
-from tests.daemon.cli.test_cli import swath
+from tests.daemon.builders import swath
 from tests.daemon.rig import HANGS_S
 
 pytestmark = pytest.mark.xdist_group("kernels")

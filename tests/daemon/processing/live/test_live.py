@@ -42,7 +42,7 @@ from swath.georef.timescales import ClockStatus, TimeState
 from swath.sim.companions import companion_files, config_text, default_wires
 from swath.sim.fly import VirtualFlight
 from swath.sim.plan.plan import parse_plan
-from tests.daemon.cli.test_cli import swath
+from tests.daemon.builders import swath
 from tests.daemon.commands import ROOT
 
 pytestmark = pytest.mark.xdist_group("kernels")
