@@ -7,7 +7,13 @@ import subprocess
 import sys
 from functools import reduce
 from operator import xor
+from pathlib import Path
 
+import numpy as np
+
+from swath.daemon.log.format import ChannelSpec, SessionInfo
+from swath.daemon.log.mcap.encode import encode_block, encode_json
+from swath.daemon.log.mcap.writer import PartWriter
 from tests.builders import ROOT
 from tests.daemon.rig import HANGS_S
 
@@ -44,3 +50,50 @@ def run_python(code: str, **environment: str) -> subprocess.CompletedProcess[str
 def nmea_sentence(body: str) -> bytes:
     """Return a sentence with its checksum (NMEA 0183: exclusive or of the bytes between $ and *)."""
     return f"${body}*{reduce(xor, body.encode()):02X}\r\n".encode()
+
+
+START_NS = 1_800_000_000_000_000_000
+INFO = SessionInfo("flight-20261121T100000Z-ab12", "swath test", "host", "boot", START_NS, 1000)
+SCANNER_CHANNEL = ChannelSpec("/scanner/left/raw", "x-swath-udp", {"protocol": "srep"}, None, "scanner")
+ROVER_CHANNEL = ChannelSpec("/gnss/rover/raw", "x-swath-serial", {"protocol": "nmea"}, None, "other")
+EVENTS_CHANNEL = ChannelSpec("/events", "json", {}, "swath.Event", "other")
+Content = dict[str, list[tuple[int, bytes]]]
+
+
+def write_part(
+    path: Path, *, part: int = 0, compression: str = "auto", blocks: int = 60, finish: bool = True
+) -> Content:
+    """Write a part with two chunk classes and return its content."""
+    rng = np.random.default_rng(part)
+    content: Content = {"/scanner/left/raw": [], "/gnss/rover/raw": [], "/events": []}
+    writer = PartWriter(path, INFO, part, compression=compression)
+    writer.add_attachment("config.toml", "application/toml", b"[session]\n", START_NS)
+    for channel_id, spec in enumerate((SCANNER_CHANNEL, ROVER_CHANNEL, EVENTS_CHANNEL), start=1):
+        writer.add_channel(channel_id, spec)
+    for number in range(blocks):
+        base = START_NS + (part * 1000 + number) * 4_000_000
+        units = rng.integers(0, 256, (20, 1206), dtype=np.uint8)
+        times = base + np.arange(20, dtype=np.int64) * 200_000
+        writer.add(encode_block(1, number * 20, times, units))
+        content["/scanner/left/raw"] += [(int(t), u.tobytes()) for t, u in zip(times, units, strict=True)]
+        read = rng.integers(0, 256, (1, 10 + number), dtype=np.uint8)
+        writer.add(encode_block(2, number, np.array([base + 1000], dtype=np.int64), read))
+        content["/gnss/rover/raw"].append((base + 1000, read.tobytes()))
+        if number % 10 == 9:
+            event = {"time_ns": base, "severity": "info", "source": "test", "code": "tick", "text": str(number)}
+            block = encode_json(3, number // 10, base + 2000, event)
+            writer.add(block)
+            content["/events"].append((base + 2000, bytes(block.data)[31:]))
+            writer.flush()
+    if finish:
+        writer.finish()
+    else:
+        writer.flush()
+        writer.close()
+    return content
+
+
+def mcap_doctor(path: Path) -> subprocess.CompletedProcess[str]:
+    """Check a file with `pymcap-cli doctor`."""
+    command = [str(Path(sys.executable).parent / "pymcap-cli"), "doctor", str(path)]
+    return subprocess.run(command, capture_output=True, text=True, check=False)

@@ -14,9 +14,8 @@ import pytest
 from swath.drivers.driver import find_driver
 from swath.drivers.parser import DeviceSettings
 from swath.georef.records import ChunkBatch
-from tests.daemon.builders import CAPTURE
+from tests.daemon.builders import CAPTURE, INFO, write_part
 from tests.daemon.commands import swath
-from tests.daemon.log.test_log import INFO, write_part
 from tests.daemon.rig import Recorder, session_table
 
 ROVER = '[gnss.rover]\ntransport = "serial:{path}?baud=921600"\nprotocol = "novatel"\n'

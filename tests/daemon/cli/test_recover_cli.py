@@ -21,8 +21,8 @@ from swath.daemon.log.events import Event, Events, Severity
 from swath.daemon.log.format import LogError
 from swath.daemon.log.recover import recover
 from swath.daemon.recorder import repair
+from tests.daemon.builders import INFO, write_part
 from tests.daemon.commands import ROOT, swath
-from tests.daemon.log.test_log import INFO, write_part
 from tests.daemon.log_check import official_counts
 from tests.daemon.rig import HANGS_S, wait_until
 

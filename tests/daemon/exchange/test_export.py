@@ -28,9 +28,9 @@ from swath.daemon.log.reader import open_logs
 from swath.drivers.can_frames import encode_can_frame
 from swath.drivers.captures.pcap_writer import FILE_HEADER, pcap_frames
 from tests.builders import ROOT
+from tests.daemon.builders import mcap_doctor
 from tests.daemon.commands import swath
 from tests.daemon.exchange.builders import Unit, content_of, run_import, write_config, write_log
-from tests.daemon.log.test_log import doctor
 from tests.daemon.log_check import official_counts, read_log
 from tests.daemon.recorder.test_recording import ROVER, SREP, Pty, nmea_zda
 from tests.daemon.rig import HANGS_S, Recorder, free_udp_port, one_processor, session_table
@@ -286,7 +286,7 @@ def test_units_on_the_wire_are_exported_and_restored(tmp_path: Path) -> None:
     assert back.returncode == 0, back.stderr
     assert content_of(tmp_path / "back") == content_of(tmp_path / "logs")
     for log in (tmp_path / "back").glob("*.mcap"):
-        assert doctor(log).returncode == 0
+        assert mcap_doctor(log).returncode == 0
         assert official_counts(log).total() > 120
     read_log(tmp_path / "back")
 

@@ -25,10 +25,9 @@ from swath.drivers.captures.base import CaptureDamageError
 from swath.drivers.captures.opening import read_candump, read_pcap, read_serial
 from swath.drivers.captures.pcap_writer import FILE_HEADER, pcap_frames
 from tests.builders import ROOT
-from tests.daemon.builders import run_python
+from tests.daemon.builders import mcap_doctor, run_python
 from tests.daemon.commands import swath
 from tests.daemon.exchange.builders import CONFIG, content_of, run_import, write_config, write_log
-from tests.daemon.log.test_log import doctor
 from tests.daemon.log_check import official_counts, read_log
 
 FIXTURES = ROOT / "fixtures"
@@ -101,7 +100,7 @@ class TestRealCaptures:
     @pytest.mark.slow
     def test_other_readers_accept_it(self, made: Path) -> None:
         for log in made.glob("*.mcap"):
-            assert doctor(log).returncode == 0
+            assert mcap_doctor(log).returncode == 0
             assert sum(count for topic, count in official_counts(log).items() if topic.endswith("/raw")) > 200
         assert read_log(made).damage == 0  # each status is compared with what stands before it
         assert swath("recover", str(made)).returncode == 0

@@ -19,8 +19,8 @@ import pytest
 from swath.daemon.cli.offload import _print as show
 from swath.daemon.exchange.offload import BLOCK_BYTES, ChecksumList, OffloadReport, offload
 from tests.builders import ROOT
+from tests.daemon.builders import INFO, write_part
 from tests.daemon.commands import swath
-from tests.daemon.log.test_log import INFO, write_part
 from tests.daemon.rig import HANGS_S, Recorder, disk_of, session_table, wait_until
 
 BIG_BYTES = 24 * BLOCK_BYTES + 12345

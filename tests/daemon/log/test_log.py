@@ -7,8 +7,6 @@ import io
 import resource
 import shutil
 import struct
-import subprocess
-import sys
 import time
 import zlib
 from collections import Counter
@@ -19,78 +17,18 @@ import pytest
 import zstandard
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from mcap.reader import NonSeekingReader, make_reader
+from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from swath.daemon.log.claim import claim, is_being_written
-from swath.daemon.log.format import ChannelSpec, LogError, SessionInfo, safe_attachment_path
-from swath.daemon.log.mcap.encode import encode_block, encode_json
+from swath.daemon.log.format import LogError, safe_attachment_path
+from swath.daemon.log.mcap.encode import encode_block
 from swath.daemon.log.mcap.scan import MAX_CHUNK_BYTES, Damage, scan, unpack_chunk
 from swath.daemon.log.mcap.writer import LogWriteError, PartWriter
-from swath.daemon.log.reader import Session, open_logs
+from swath.daemon.log.reader import open_logs
 from swath.daemon.log.recover import examine, recover
-
-START_NS = 1_800_000_000_000_000_000
-INFO = SessionInfo("flight-20261121T100000Z-ab12", "swath test", "host", "boot", START_NS, 1000)
-SCANNER = ChannelSpec("/scanner/left/raw", "x-swath-udp", {"protocol": "srep"}, None, "scanner")
-ROVER = ChannelSpec("/gnss/rover/raw", "x-swath-serial", {"protocol": "nmea"}, None, "other")
-EVENTS = ChannelSpec("/events", "json", {}, "swath.Event", "other")
-Content = dict[str, list[tuple[int, bytes]]]
-
-
-def write_part(
-    path: Path, *, part: int = 0, compression: str = "auto", blocks: int = 60, finish: bool = True
-) -> Content:
-    """A part with two chunk classes; returns what is in it."""
-    rng = np.random.default_rng(part)
-    content: Content = {"/scanner/left/raw": [], "/gnss/rover/raw": [], "/events": []}
-    writer = PartWriter(path, INFO, part, compression=compression)
-    writer.add_attachment("config.toml", "application/toml", b"[session]\n", START_NS)
-    for channel_id, spec in enumerate((SCANNER, ROVER, EVENTS), start=1):
-        writer.add_channel(channel_id, spec)
-    for number in range(blocks):
-        base = START_NS + (part * 1000 + number) * 4_000_000
-        units = rng.integers(0, 256, (20, 1206), dtype=np.uint8)
-        times = base + np.arange(20, dtype=np.int64) * 200_000
-        writer.add(encode_block(1, number * 20, times, units))
-        content["/scanner/left/raw"] += [(int(t), u.tobytes()) for t, u in zip(times, units, strict=True)]
-        read = rng.integers(0, 256, (1, 10 + number), dtype=np.uint8)
-        writer.add(encode_block(2, number, np.array([base + 1000], dtype=np.int64), read))
-        content["/gnss/rover/raw"].append((base + 1000, read.tobytes()))
-        if number % 10 == 9:
-            event = {"time_ns": base, "severity": "info", "source": "test", "code": "tick", "text": str(number)}
-            block = encode_json(3, number // 10, base + 2000, event)
-            writer.add(block)
-            content["/events"].append((base + 2000, bytes(block.data)[31:]))
-            writer.flush()
-    if finish:
-        writer.finish()
-    else:
-        writer.flush()
-        writer.close()
-    return content
-
-
-def read_all(session: Session) -> Content:
-    content: Content = {}
-    for batch in session.batches():
-        rows = content.setdefault(batch.channel.topic, [])
-        rows += [(t, u.tobytes()) for t, u in zip(batch.log_time_ns.tolist(), batch.units, strict=True)]
-    return content
-
-
-def official(path: Path, *, seeking: bool = True) -> Content:
-    content: Content = {}
-    with path.open("rb") as file:
-        reader = make_reader(file, validate_crcs=True) if seeking else NonSeekingReader(file, validate_crcs=True)
-        for _, channel, message in reader.iter_messages(log_time_order=False):
-            content.setdefault(channel.topic, []).append((message.log_time, message.data))
-    return content
-
-
-def doctor(path: Path) -> subprocess.CompletedProcess[str]:
-    command = [str(Path(sys.executable).parent / "pymcap-cli"), "doctor", str(path)]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
+from tests.daemon.builders import INFO, ROVER_CHANNEL, SCANNER_CHANNEL, START_NS, Content, mcap_doctor, write_part
+from tests.daemon.log.builders import official, read_all
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +46,7 @@ def test_official_readers_and_ours_agree(tmp_path: Path, compression: str) -> No
     (session,) = open_logs([path])
     assert read_all(session) == content
     assert session.damage == []
-    verdict = doctor(path)
+    verdict = mcap_doctor(path)
     assert verdict.returncode == 0, verdict.stdout
     assert "│ error" not in verdict.stdout, verdict.stdout
     with path.open("rb") as file:
@@ -202,7 +140,7 @@ def test_a_recovered_file_is_accepted_by_the_doctor_and_supersedes_the_original(
     report = recover(path)
     assert report.recovered is not None
     assert path.read_bytes() == before
-    verdict = doctor(report.recovered)
+    verdict = mcap_doctor(report.recovered)
     assert verdict.returncode == 0, verdict.stdout
     (session,) = open_logs([tmp_path])
     assert [part.path for part in session.parts] == [report.recovered]
@@ -363,8 +301,8 @@ def test_parts_are_ordered_and_a_missing_one_is_named(tmp_path: Path) -> None:
 
 def test_chunks_written_at_once_after_a_stall_are_read_in_time_order(tmp_path: Path) -> None:
     writer = PartWriter(tmp_path / "stalled.mcap", INFO, 0)
-    writer.add_channel(1, SCANNER)
-    writer.add_channel(2, ROVER)
+    writer.add_channel(1, SCANNER_CHANNEL)
+    writer.add_channel(2, ROVER_CHANNEL)
     units = np.zeros((100, 1206), np.uint8)
     for number in range(300):  # 3 s of log time
         base_ns = START_NS + number * 10_000_000
@@ -391,8 +329,8 @@ def test_error_for_a_directory_without_logs_gives_the_reason(tmp_path: Path) -> 
 def test_a_refused_chunk_is_counted_and_removed_and_the_writer_continues(tmp_path: Path) -> None:
     path = tmp_path / "limited.mcap"
     writer = PartWriter(path, INFO, 0)
-    writer.add_channel(1, SCANNER)
-    writer.add_channel(2, ROVER)
+    writer.add_channel(1, SCANNER_CHANNEL)
+    writer.add_channel(2, ROVER_CHANNEL)
     units = np.zeros((400, 1206), np.uint8)
     times = START_NS + np.arange(400, dtype=np.int64)
     kept: Counter[int] = Counter()
@@ -417,8 +355,11 @@ def test_a_refused_chunk_is_counted_and_removed_and_the_writer_continues(tmp_pat
     assert writer.written == kept
     assert writer.lost == Counter({1: 800})
     writer.finish()
-    assert {topic: len(rows) for topic, rows in official(path).items()} == {SCANNER.topic: 400, ROVER.topic: 3}
-    assert doctor(path).returncode == 0
+    assert {topic: len(rows) for topic, rows in official(path).items()} == {
+        SCANNER_CHANNEL.topic: 400,
+        ROVER_CHANNEL.topic: 3,
+    }
+    assert mcap_doctor(path).returncode == 0
 
 
 def test_a_claim_succeeds_during_a_query_by_another_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -24,19 +24,18 @@ from swath.daemon.log.mcap.writer import LogWriteError, PartWriter
 from swath.daemon.log.reader import open_logs
 from swath.daemon.log.recover import examine, recover
 from tests.builders import ROOT
-from tests.daemon.commands import swath
-from tests.daemon.log.test_log import (
-    EVENTS,
+from tests.daemon.builders import (
+    EVENTS_CHANNEL,
     INFO,
-    ROVER,
-    SCANNER,
+    ROVER_CHANNEL,
+    SCANNER_CHANNEL,
     START_NS,
     Content,
-    doctor,
-    official,
-    read_all,
+    mcap_doctor,
     write_part,
 )
+from tests.daemon.commands import swath
+from tests.daemon.log.builders import official, read_all
 from tests.daemon.rig import session_table
 
 CHUNK, INDEX, DATA_END = 6, 7, 15
@@ -221,7 +220,7 @@ def test_finished_and_recovered_files_are_readable_by_every_reader(tmp_path: Pat
     assert sum(map(len, expected.values())) > 500
     assert official(report.recovered) == official(report.recovered, seeking=False) == expected
     assert by_small_mcap(report.recovered) == expected
-    verdict = doctor(report.recovered)
+    verdict = mcap_doctor(report.recovered)
     assert verdict.returncode == 0, verdict.stdout
     with report.recovered.open("rb") as file:
         summary = get_summary(file)
@@ -250,12 +249,12 @@ def test_a_log_being_recorded_is_read_without_complaint_and_not_recovered(tmp_pa
     """A copy of what is there so far would stand for the log when it is finished."""
     path = tmp_path / f"{INFO.session_id}_0.mcap"
     writer = PartWriter(path, INFO, 0)
-    writer.add_channel(1, SCANNER)
+    writer.add_channel(1, SCANNER_CHANNEL)
     units = np.zeros((20, 1206), np.uint8)
     writer.add(encode_block(1, 0, START_NS + np.arange(20, dtype=np.int64), units))
     writer.flush()
     (session,) = open_logs([tmp_path])
-    assert len(read_all(session)[SCANNER.topic]) == 20
+    assert len(read_all(session)[SCANNER_CHANNEL.topic]) == 20
     assert (session.damage, session.growing) == ([], path)
     with pytest.raises(LogError, match="is being recorded"):
         recover(path)
@@ -302,7 +301,7 @@ def test_text_of_a_foreign_log_is_validated_and_escaped(tmp_path: Path) -> None:
     """Try invalid JSON, invalid numbers, console markup and control characters."""
     path = tmp_path / "stranger.mcap"
     writer = PartWriter(path, INFO, 0)
-    writer.add_channel(1, EVENTS)
+    writer.add_channel(1, EVENTS_CHANNEL)
     writer.add_channel(2, ChannelSpec("/status/gnss/rover", "json", {}, "swath.Status"))
     event = {"severity": "warning", "source": "x", "code": "[/nothing]", "text": "a\x1b[31mb [bold]c[/] \n d"}
     writer.add(encode_json(1, 0, START_NS, event))
@@ -348,8 +347,8 @@ def test_messages_whose_channel_was_lost_are_reported(tmp_path: Path) -> None:
 def test_timestamps_that_step_back_within_a_batch_are_merged_in_order(tmp_path: Path) -> None:
     path = tmp_path / "steps.mcap"
     writer = PartWriter(path, INFO, 0)
-    writer.add_channel(1, SCANNER)
-    writer.add_channel(2, ROVER)
+    writer.add_channel(1, SCANNER_CHANNEL)
+    writer.add_channel(2, ROVER_CHANNEL)
     rng = np.random.default_rng(5)
     for number in range(20):
         times = START_NS + number * 50_000_000 + rng.integers(0, 60_000_000, 50)
@@ -366,7 +365,7 @@ def test_timestamps_that_step_back_within_a_batch_are_merged_in_order(tmp_path: 
 def test_the_end_may_be_written_even_if_the_last_chunk_does_not_fit(tmp_path: Path) -> None:
     path = tmp_path / "full.mcap"
     writer = PartWriter(path, INFO, 0)
-    writer.add_channel(1, SCANNER)
+    writer.add_channel(1, SCANNER_CHANNEL)
     units = np.zeros((400, 1206), np.uint8)
     times = START_NS + np.arange(400, dtype=np.int64)
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -381,20 +380,20 @@ def test_the_end_may_be_written_even_if_the_last_chunk_does_not_fit(tmp_path: Pa
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert (writer.written[1], writer.lost[1]) == (400, 400)
     assert examine(path).whole
-    assert len(official(path)[SCANNER.topic]) == 400
+    assert len(official(path)[SCANNER_CHANNEL.topic]) == 400
 
 
 def test_empty_units_and_empty_blocks_are_logged(tmp_path: Path) -> None:
     """A datagram may be empty."""
     path = tmp_path / "empty.mcap"
     writer = PartWriter(path, INFO, 0)
-    writer.add_channel(1, SCANNER)
+    writer.add_channel(1, SCANNER_CHANNEL)
     none = np.array([], np.int64)
     writer.add(encode_block(1, 0, none, np.zeros((0, 5), np.uint8)))
     writer.add(encode_block(1, 0, START_NS + np.arange(3, dtype=np.int64), np.zeros((3, 0), np.uint8)))
     writer.finish()
     (session,) = open_logs([path])
-    assert read_all(session) == official(path) == {SCANNER.topic: [(START_NS + n, b"") for n in range(3)]}
+    assert read_all(session) == official(path) == {SCANNER_CHANNEL.topic: [(START_NS + n, b"") for n in range(3)]}
 
 
 PEAK = """
@@ -414,7 +413,7 @@ def test_a_log_of_any_length_is_read_and_recovered_in_little_memory(tmp_path: Pa
     """A second is held to merge by time, here 24 MB, and a chunk or two."""
     path = tmp_path / "long.mcap"
     writer = PartWriter(path, INFO, 0)
-    writer.add_channel(1, SCANNER)
+    writer.add_channel(1, SCANNER_CHANNEL)
     units = np.random.default_rng(0).integers(0, 256, (200, 1206), dtype=np.uint8)
     for number in range(500):
         times = START_NS + (number * 200 + np.arange(200, dtype=np.int64)) * 50_000

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from swath.daemon.log.recover import recover
-from tests.daemon.log.test_log import write_part
+from tests.daemon.builders import write_part
 
 SCRIPT = Path(__file__).with_name("read_with_official_typescript.mjs")
 PACKAGES = ("@mcap/core", "@mcap/support", "@mcap/nodejs")

@@ -23,7 +23,8 @@ from mcap.reader import make_reader
 from swath.daemon.log.format import LogError
 from swath.daemon.log.reader import open_logs
 from swath.daemon.log.recover import examine, recover
-from tests.daemon.log.test_log import INFO, START_NS, official
+from tests.daemon.builders import INFO, START_NS
+from tests.daemon.log.builders import official
 from tests.daemon.rig import HANGS_S, free_udp_port, session_table
 from tests.fuzz import mcap_parts as mcap
 

@@ -36,9 +36,8 @@ from swath.drivers.parser import PacketParser
 from swath.drivers.scanner.srep.layout import SrepHeader, encode_datagram
 from swath.georef.records import ByteRows, Int64Array, Record
 from tests.builders import ROOT
-from tests.daemon.builders import CAPTURE, nmea_sentence
+from tests.daemon.builders import CAPTURE, INFO, SCANNER_CHANNEL, START_NS, nmea_sentence, write_part
 from tests.daemon.commands import swath
-from tests.daemon.log.test_log import INFO, SCANNER, START_NS, write_part
 from tests.daemon.log_check import read_log
 from tests.daemon.recorder.test_recorder_faults import Numbers, scanner
 from tests.daemon.rig import HANGS_S, Recorder, disk_of, free_udp_port, session_table, wait_until
@@ -433,7 +432,7 @@ def test_a_damaged_chunk_of_the_growing_log_degrades_the_verdict(tmp_path: Path)
     assert "1 DAMAGED chunks in the log" in found["sentence"]
     other = replace(INFO, session_id="later-20261121T110000Z-ab12")
     later = PartWriter(tmp_path / f"{other.session_id}_0.mcap", other, 0)
-    later.add_channel(1, SCANNER)
+    later.add_channel(1, SCANNER_CHANNEL)
     later.add(encode_block(1, 0, np.array([START_NS + 10**9]), np.zeros((1, 9), np.uint8)))
     later.flush()
     sign |= {"session_id": other.session_id, "path": later.path.name}

@@ -16,7 +16,7 @@ from swath.daemon.processing import files as whole_files
 from swath.daemon.processing.calibration import products as calibrate_products
 from swath.daemon.processing.files import put_in_place, write_aside, write_whole
 from swath.daemon.processing.georeferencing.sidecar import write_sidecar
-from tests.daemon.log.test_log import INFO, write_part
+from tests.daemon.builders import INFO, write_part
 from tests.daemon.one_line import fly
 
 pytestmark = pytest.mark.xdist_group("kernels")

@@ -24,8 +24,8 @@ from swath.daemon.log.directory import take_directory
 from swath.daemon.log.reader import open_logs
 from swath.daemon.log.wires import MAX_SENDERS
 from swath.daemon.recorder.repair import MCAP_MAGIC, unfinished_logs
+from tests.daemon.builders import write_part
 from tests.daemon.commands import swath
-from tests.daemon.log.test_log import write_part
 from tests.daemon.log_check import LogContent, check_status, official_counts, read_log
 from tests.daemon.rig import HANGS_S, Recorder, free_udp_port, one_processor, session_table, wait_until
 

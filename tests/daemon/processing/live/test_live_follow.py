@@ -18,7 +18,7 @@ from swath.daemon.log.parts import RECORDING_SIGN
 from swath.daemon.processing.live import follow as live_follow
 from swath.daemon.processing.live.follow import LiveFollower, Skipped, cached_from, is_cached
 from swath.georef.timescales.gps_time import SECOND_NS
-from tests.daemon.log.test_log import INFO, ROVER, SCANNER, START_NS
+from tests.daemon.builders import INFO, ROVER_CHANNEL, SCANNER_CHANNEL, START_NS
 
 STEP_NS = 250_000_000  # a chunk of each class
 Unit = tuple[str, int]
@@ -36,7 +36,7 @@ class Recording:
     def _open(self) -> PartWriter:
         path = self.folder / f"{self.info.session_id}_{self.number}.mcap"
         writer = PartWriter(path, self.info, self.number)
-        for channel_id, spec in enumerate((SCANNER, ROVER), start=1):
+        for channel_id, spec in enumerate((SCANNER_CHANNEL, ROVER_CHANNEL), start=1):
             writer.add_channel(channel_id, spec)
         sign = {"session_id": self.info.session_id, "part": self.number, "path": path.name, "boot_id": "boot"}
         (self.folder / RECORDING_SIGN).write_text(json.dumps(sign))
@@ -45,7 +45,7 @@ class Recording:
     def go_on(self, seconds: float) -> None:
         for _ in range(round(seconds * 4)):
             time_ns = START_NS + self.steps * STEP_NS
-            for channel_id, spec in enumerate((SCANNER, ROVER), start=1):
+            for channel_id, spec in enumerate((SCANNER_CHANNEL, ROVER_CHANNEL), start=1):
                 unit = np.frombuffer(self.steps.to_bytes(8, "little"), np.uint8).reshape(1, 8)
                 self.writer.add(encode_block(channel_id, self.steps, np.array([time_ns], dtype=np.int64), unit))
                 self.units.append((spec.topic, self.steps))
@@ -203,7 +203,9 @@ class TestSkipping:
         follower = follow(from_start=True)
         assert units_of(follower.poll()) == recording.units
         recording.go_on(8.0)
-        assert [unit for unit in units_of(follower.poll()) if unit[0] == SCANNER.topic] == [], "caught up by then"
+        assert [unit for unit in units_of(follower.poll()) if unit[0] == SCANNER_CHANNEL.topic] == [], (
+            "caught up by then"
+        )
 
     def test_data_outside_the_page_cache_are_not_read(
         self, recording: Recording, follow: Follow, monkeypatch: pytest.MonkeyPatch
