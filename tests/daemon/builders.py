@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import os
+import socket
 import subprocess
 import sys
+import time
+import tty
 from functools import reduce
 from operator import xor
 from pathlib import Path
@@ -15,7 +18,7 @@ from swath.daemon.log.format import ChannelSpec, SessionInfo
 from swath.daemon.log.mcap.encode import encode_block, encode_json
 from swath.daemon.log.mcap.writer import PartWriter
 from tests.builders import ROOT
-from tests.daemon.rig import HANGS_S
+from tests.daemon.rig import HANGS_S, one_processor
 
 CAPTURE = ROOT / "fixtures/novatel/propak6-basic-fix.gps.gz"
 
@@ -97,3 +100,76 @@ def mcap_doctor(path: Path) -> subprocess.CompletedProcess[str]:
     """Check a file with `pymcap-cli doctor`."""
     command = [str(Path(sys.executable).parent / "pymcap-cli"), "doctor", str(path)]
     return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+def scanner(port: int, options: str = "") -> str:
+    """Return the configuration of a scanner that sends to a port of this host."""
+    return f'[scanner.left]\ntransport = "udp:127.0.0.1:{port}{options}"\nprotocol = "srep"\nmirror_factor = 1.0\n'
+
+
+class Numbers:
+    """Send numbered datagrams to one port, from one processor, so that their order is kept."""
+
+    def __init__(self, port: int) -> None:
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.port = port
+        self.sent = 0
+
+    def send(self, count: int, pause_s: float = 0.0) -> None:
+        """Send the next datagrams."""
+        with one_processor():
+            for _ in range(count):
+                self._socket.sendto(self.sent.to_bytes(8, "little") + bytes(1198), ("127.0.0.1", self.port))
+                self.sent += 1
+                if pause_s:
+                    time.sleep(pause_s)
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+
+
+SREP = """
+[scanner.left]
+transport = "udp:127.0.0.1:{port}"
+protocol = "srep"
+mirror_factor = 1.0
+"""
+ROVER_CONFIG = """
+[gnss.rover]
+transport = "serial:{path}?baud=921600"
+protocol = "nmea"
+pps = "main"
+[pps.main]
+source = "fixed:{fifo}"
+"""
+
+
+class Pty:
+    """Open a serial port whose other end the test holds; the link is the device's name under udev."""
+
+    def __init__(self, link: Path) -> None:
+        self.master, self.slave = os.openpty()
+        tty.setraw(self.slave)
+        self.link = link
+        link.unlink(missing_ok=True)
+        link.symlink_to(os.ttyname(self.slave))
+
+    def write(self, data: bytes) -> None:
+        """Send bytes from the device."""
+        os.write(self.master, data)
+
+    def unplug(self) -> None:
+        """Remove the device."""
+        self.link.unlink(missing_ok=True)
+        os.close(self.slave)
+        os.close(self.master)
+
+
+def nmea_zda(second: int) -> bytes:
+    """Return a ZDA sentence at a second of the day."""
+    body = f"GPZDA,{second // 3600:02d}{second // 60 % 60:02d}{second % 60:02d}.00,21,11,2026,00,00"
+    checksum = 0
+    for byte in body.encode():
+        checksum ^= byte
+    return f"${body}*{checksum:02X}\r\n".encode()

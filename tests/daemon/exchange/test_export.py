@@ -28,11 +28,10 @@ from swath.daemon.log.reader import open_logs
 from swath.drivers.can_frames import encode_can_frame
 from swath.drivers.captures.pcap_writer import FILE_HEADER, pcap_frames
 from tests.builders import ROOT
-from tests.daemon.builders import mcap_doctor
+from tests.daemon.builders import ROVER_CONFIG, SREP, Pty, mcap_doctor, nmea_zda
 from tests.daemon.commands import swath
 from tests.daemon.exchange.builders import Unit, content_of, run_import, write_config, write_log
 from tests.daemon.log_check import official_counts, read_log
-from tests.daemon.recorder.test_recording import ROVER, SREP, Pty, nmea_zda
 from tests.daemon.rig import HANGS_S, Recorder, free_udp_port, one_processor, session_table
 
 START_NS = 1_800_000_000_123_456_789
@@ -244,7 +243,12 @@ def test_units_on_the_wire_are_exported_and_restored(tmp_path: Path) -> None:
     pty = Pty(link)
     can_port = free_udp_port()
     bus_table = f'[imu.main]\ntransport = "can:udp_multicast:{BUS}?port={can_port}"\nprotocol = "canmod-gps"\n'
-    config = session_table(tmp_path / "logs") + SREP.format(port=port) + ROVER.format(path=link, fifo=fifo) + bus_table
+    config = (
+        session_table(tmp_path / "logs")
+        + SREP.format(port=port)
+        + ROVER_CONFIG.format(path=link, fifo=fifo)
+        + bus_table
+    )
     sent_bytes, sent, edges, frames = b"", [], [], []
     with (
         Recorder(tmp_path, config) as recorder,

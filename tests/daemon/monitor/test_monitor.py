@@ -36,10 +36,18 @@ from swath.drivers.parser import PacketParser
 from swath.drivers.scanner.srep.layout import SrepHeader, encode_datagram
 from swath.georef.records import ByteRows, Int64Array, Record
 from tests.builders import ROOT
-from tests.daemon.builders import CAPTURE, INFO, SCANNER_CHANNEL, START_NS, nmea_sentence, write_part
+from tests.daemon.builders import (
+    CAPTURE,
+    INFO,
+    SCANNER_CHANNEL,
+    START_NS,
+    Numbers,
+    nmea_sentence,
+    scanner,
+    write_part,
+)
 from tests.daemon.commands import swath
 from tests.daemon.log_check import read_log
-from tests.daemon.recorder.test_recorder_faults import Numbers, scanner
 from tests.daemon.rig import HANGS_S, Recorder, disk_of, free_udp_port, session_table, wait_until
 from tests.daemon.wires import pty as serial_port
 

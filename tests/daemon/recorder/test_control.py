@@ -30,9 +30,9 @@ from swath.daemon.recorder.control import (
     Control,
 )
 from tests.builders import ROOT
+from tests.daemon.builders import Numbers, scanner
 from tests.daemon.commands import swath
 from tests.daemon.log_check import read_log
-from tests.daemon.recorder.test_recorder_faults import Numbers, scanner
 from tests.daemon.rig import HANGS_S, Recorder, free_udp_port, session_table, wait_until
 
 NOBODY = 65534

@@ -23,10 +23,10 @@ from swath.daemon.log.channels import ChannelTable
 from swath.daemon.log.events import Events
 from swath.daemon.log.host_clock import HostClock
 from swath.daemon.recorder.corrections import MOST_WAITING, Relay
+from tests.daemon.builders import Pty
 from tests.daemon.commands import swath
 from tests.daemon.journal import journal_of
 from tests.daemon.log_check import official_counts, read_log
-from tests.daemon.recorder.test_recording import Pty
 from tests.daemon.rig import Recorder, session_table, wait_until
 from tests.drivers.caster import caster
 from tests.drivers.recordings import expected, recording

@@ -24,41 +24,17 @@ from swath.daemon.log.directory import take_directory
 from swath.daemon.log.reader import open_logs
 from swath.daemon.log.wires import MAX_SENDERS
 from swath.daemon.recorder.repair import MCAP_MAGIC, unfinished_logs
-from tests.daemon.builders import write_part
+from tests.daemon.builders import Numbers, scanner, write_part
 from tests.daemon.commands import swath
 from tests.daemon.log_check import LogContent, check_status, official_counts, read_log
-from tests.daemon.rig import HANGS_S, Recorder, free_udp_port, one_processor, session_table, wait_until
+from tests.daemon.rig import HANGS_S, Recorder, free_udp_port, session_table, wait_until
 
 SPECIAL = "tests.daemon.special_recorder"
-
-
-def scanner(port: int, options: str = "") -> str:
-    return f'[scanner.left]\ntransport = "udp:127.0.0.1:{port}{options}"\nprotocol = "srep"\nmirror_factor = 1.0\n'
 
 
 @pytest.fixture
 def logs(tmp_path: Path) -> Path:
     return tmp_path / "logs"
-
-
-class Numbers:
-    """Numbered datagrams to one port, from one processor, so that their order is kept."""
-
-    def __init__(self, port: int) -> None:
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self.port = port
-        self.sent = 0
-
-    def send(self, count: int, pause_s: float = 0.0) -> None:
-        with one_processor():
-            for _ in range(count):
-                self._socket.sendto(self.sent.to_bytes(8, "little") + bytes(1198), ("127.0.0.1", self.port))
-                self.sent += 1
-                if pause_s:
-                    time.sleep(pause_s)
-
-    def close(self) -> None:
-        self._socket.close()
 
 
 @pytest.fixture

@@ -7,49 +7,15 @@ import os
 import signal
 import socket
 import time
-import tty
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
 
+from tests.daemon.builders import ROVER_CONFIG, SREP, Pty, nmea_zda
 from tests.daemon.log_check import official_counts, read_log
 from tests.daemon.rig import HANGS_S, Recorder, free_udp_port, one_processor, session_table, wait_until
-
-SREP = """
-[scanner.left]
-transport = "udp:127.0.0.1:{port}"
-protocol = "srep"
-mirror_factor = 1.0
-"""
-ROVER = """
-[gnss.rover]
-transport = "serial:{path}?baud=921600"
-protocol = "nmea"
-pps = "main"
-[pps.main]
-source = "fixed:{fifo}"
-"""
-
-
-class Pty:
-    """A serial port whose other end the test holds; the link is the device's name under udev."""
-
-    def __init__(self, link: Path) -> None:
-        self.master, self.slave = os.openpty()
-        tty.setraw(self.slave)
-        self.link = link
-        link.unlink(missing_ok=True)
-        link.symlink_to(os.ttyname(self.slave))
-
-    def write(self, data: bytes) -> None:
-        os.write(self.master, data)
-
-    def unplug(self) -> None:
-        self.link.unlink(missing_ok=True)
-        os.close(self.slave)
-        os.close(self.master)
 
 
 @pytest.fixture
@@ -63,19 +29,11 @@ def sender() -> Iterator[socket.socket]:
         yield sock
 
 
-def nmea_zda(second: int) -> bytes:
-    body = f"GPZDA,{second // 3600:02d}{second // 60 % 60:02d}{second % 60:02d}.00,21,11,2026,00,00"
-    checksum = 0
-    for byte in body.encode():
-        checksum ^= byte
-    return f"${body}*{checksum:02X}\r\n".encode()
-
-
 def test_every_byte_of_every_wire_is_logged(tmp_path: Path, logs: Path, sender: socket.socket) -> None:
     port, link, fifo = free_udp_port(), tmp_path / "rover", tmp_path / "pps"
     os.mkfifo(fifo)
     pty = Pty(link)
-    config = session_table(logs) + SREP.format(port=port) + ROVER.format(path=link, fifo=fifo)
+    config = session_table(logs) + SREP.format(port=port) + ROVER_CONFIG.format(path=link, fifo=fifo)
     datagrams = [os.urandom(1206) for _ in range(500)] + [os.urandom(n) for n in (1, 7, 60000, 1206, 1206)]
     lines = []
     with Recorder(tmp_path, config) as recorder, fifo.open("w") as edges:
@@ -125,7 +83,7 @@ def test_units_have_the_kernel_timestamps(tmp_path: Path, logs: Path, sender: so
 
 @pytest.mark.slow
 def test_absent_sensors_are_waited_for_and_never_restart_the_service(tmp_path: Path, logs: Path) -> None:
-    config = session_table(logs) + ROVER.format(path=tmp_path / "nothing", fifo=tmp_path / "nofifo")
+    config = session_table(logs) + ROVER_CONFIG.format(path=tmp_path / "nothing", fifo=tmp_path / "nofifo")
     limit_s = 2.0  # of systemd's watchdog; a machine that is busy for a moment is within it
     with Recorder(tmp_path, config, watchdog_s=limit_s) as recorder:
         fed = recorder.notify.count("WATCHDOG")
@@ -175,7 +133,7 @@ def test_an_unread_journal_blocks_nothing(tmp_path: Path, logs: Path) -> None:
             os.write(full, b"x" * 4096)
     os.set_blocking(full, True)
     port, absent = free_udp_port(), tmp_path / "nothing"
-    config = session_table(logs) + SREP.format(port=port) + ROVER.format(path=absent, fifo=tmp_path / "nofifo")
+    config = session_table(logs) + SREP.format(port=port) + ROVER_CONFIG.format(path=absent, fifo=tmp_path / "nofifo")
     with (
         Recorder(tmp_path, config, watchdog_s=1.0, says_to=full) as recorder,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
@@ -196,7 +154,7 @@ def test_an_unread_journal_blocks_nothing(tmp_path: Path, logs: Path) -> None:
 def test_a_serial_port_unplugged_and_plugged_in_again_is_reopened(tmp_path: Path, logs: Path) -> None:
     link, fifo = tmp_path / "rover", tmp_path / "pps"
     os.mkfifo(fifo)
-    config = session_table(logs) + ROVER.format(path=link, fifo=fifo)
+    config = session_table(logs) + ROVER_CONFIG.format(path=link, fifo=fifo)
     with Recorder(tmp_path, config) as recorder:
         recorder.wait_said("gnss/rover device_absent")
         sent = []
@@ -282,7 +240,7 @@ def test_a_running_recorder_has_not_imported_processing_modules(
 ) -> None:
     monkeypatch.setenv("PYTHONPROFILEIMPORTTIME", "1")  # the running process lists every module it imports
     link, fifo = tmp_path / "rover", tmp_path / "pps"
-    config = session_table(logs) + SREP.format(port=free_udp_port()) + ROVER.format(path=link, fifo=fifo)
+    config = session_table(logs) + SREP.format(port=free_udp_port()) + ROVER_CONFIG.format(path=link, fifo=fifo)
     with Recorder(tmp_path, config) as recorder:
         assert recorder.stop() == 0
     lines = [line for line in recorder.stderr().splitlines() if line.startswith("import time:")]

@@ -21,13 +21,14 @@ import pytest
 from swath.daemon.replay.wire_player import Output, PtyOutput, TimedUnit, play
 from swath.drivers.transports.base import TransportError
 from tests.builders import ROOT
+from tests.daemon.builders import ROVER_CONFIG, SREP, Pty, nmea_zda
 from tests.daemon.log_check import LogContent, read_log
-from tests.daemon.recorder.test_recording import ROVER, SREP, Pty, nmea_zda
 from tests.daemon.rig import HANGS_S, Recorder, free_udp_port, one_processor, session_table
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("replay")]  # what is replayed is recorded once, by one worker
 SECONDS = 18
-TIMED = ROVER.replace('protocol = "nmea"', 'protocol = "nmea"\nleap_seconds = 18')  # LOCKED after the table's end, too
+# LOCKED after the table's end, too
+TIMED = ROVER_CONFIG.replace('protocol = "nmea"', 'protocol = "nmea"\nleap_seconds = 18')
 BUS = '[imu.main]\ntransport = "can:udp_multicast:239.74.163.2?port={port}"\nprotocol = "canmod-gps"\n'
 
 
