@@ -11,8 +11,12 @@ import tty
 from functools import reduce
 from operator import xor
 from pathlib import Path
+from typing import Any
 
+import laspy
 import numpy as np
+from numpy.typing import NDArray
+from pyproj import CRS
 
 from swath.daemon.log.format import ChannelSpec, SessionInfo
 from swath.daemon.log.mcap.encode import encode_block, encode_json
@@ -173,3 +177,59 @@ def nmea_zda(second: int) -> bytes:
     for byte in body.encode():
         checksum ^= byte
     return f"${body}*{checksum:02X}\r\n".encode()
+
+
+Array = NDArray[Any]
+SIGMAS = ("sigma_easting", "sigma_northing", "sigma_height")
+EAST_M, NORTH_M = 500_000.0, 5_200_000.0
+
+
+def plane(x: Array, y: Array) -> Array:
+    """Return heights of a slope of about 8 degrees."""
+    return np.asarray(400.0 + 0.12 * (x - EAST_M) - 0.07 * (y - NORTH_M))
+
+
+def lattice(west_m: float, south_m: float, width_m: float, height_m: float, spacing_m: float) -> tuple[Array, Array]:
+    """Return places in order, `1 / spacing²` a square metre; none lies on the edge of a cell."""
+    x, y = np.meshgrid(
+        np.arange(west_m + 0.51 * spacing_m, west_m + width_m, spacing_m),
+        np.arange(south_m + 0.49 * spacing_m, south_m + height_m, spacing_m),
+        indexing="ij",
+    )
+    return x.ravel(), y.ravel()
+
+
+def write_laz(
+    path: Path,
+    x: Array,
+    y: Array,
+    z: Array,
+    strip: int | Array = 1,
+    *,
+    crs: CRS | None = None,
+    sigma_m: tuple[Array | float, ...] | None = None,
+    point_format: int = 6,
+    scale: float = 0.0001,
+    adjusted: bool = True,
+    **columns: Array | int,
+) -> Path:
+    """Write a file of points; all are single returns unless the columns say otherwise.
+
+    Its header says that GPS times are adjusted standard ones, or else seconds of the week.
+    """
+    header = laspy.LasHeader(point_format=point_format, version="1.4" if point_format > 5 else "1.2")
+    header.global_encoding.gps_time_type = laspy.header.GpsTimeType(int(adjusted))
+    header.scales, header.offsets = np.full(3, scale), np.floor([x.min(), y.min(), 0.0])
+    if crs is not None:
+        header.add_crs(crs)
+    for name in SIGMAS if sigma_m else ():
+        header.add_extra_dim(laspy.ExtraBytesParams(name, "u2", scales=np.array([1e-4]), offsets=np.array([0.0])))
+    made = laspy.LasData(header)
+    made.x, made.y, made.z = x, y, z
+    made.point_source_id = np.broadcast_to(np.asarray(strip, np.uint16), x.shape)
+    for name, value in ({"return_number": 1, "number_of_returns": 1} | columns).items():
+        made[name] = np.broadcast_to(np.asarray(value), x.shape)
+    for name, sigma in zip(SIGMAS, sigma_m or (), strict=False):
+        made[name] = np.broadcast_to(np.asarray(sigma, float), x.shape)
+    made.write(path)
+    return path

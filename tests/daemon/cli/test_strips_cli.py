@@ -29,7 +29,7 @@ from swath.georef.formats.trajectory.csv import csv_text
 from swath.georef.mapping.frame import Mapping
 from swath.georef.timescales.gps_time import WEEK_NS
 from tests.calib.cast_flight import Cast, cast_flight
-from tests.daemon.processing.quicklook.test_quicklook import EAST_M, NORTH_M, lattice, plane, write
+from tests.daemon.builders import EAST_M, NORTH_M, lattice, plane, write_laz
 from tests.daemon.standin import aircraft_config
 
 pytestmark = pytest.mark.xdist_group("kernels")
@@ -50,7 +50,7 @@ def lifted(folder: Path, lift_m: float, south_m: float = 30.0) -> Path:
     folder.mkdir()
     for number, (south, lift) in enumerate([(0.0, 0.0), (south_m, lift_m)], start=1):
         x, y = lattice(EAST_M, NORTH_M + south, 120.0, 50.0, 0.5)
-        write(folder / f"s{number}.laz", x, y, plane(x, y) + lift, number, crs=CRS.from_epsg(25832))
+        write_laz(folder / f"s{number}.laz", x, y, plane(x, y) + lift, number, crs=CRS.from_epsg(25832))
     return folder
 
 
@@ -81,7 +81,7 @@ def products(
         if number in of_week:
             seconds = swath.time_ns % WEEK_NS / 1e9
         number_of = np.asarray(swath.rows["number_of_returns"])
-        write(
+        write_laz(
             folder / f"a_strip{number:02d}.laz",
             points[:, 0],
             points[:, 1],
@@ -306,7 +306,7 @@ def test_incomparable_files_are_refused_in_one_line(what: str, tmp_path: Path) -
         said = "now: no two of the 2 strips share smooth ground"
     elif what == "twice":
         x, y = lattice(EAST_M, NORTH_M, 120.0, 50.0, 0.5)
-        write(folder / "s2.laz", x, y, plane(x, y), 2, crs=CRS.from_epsg(25832))
+        write_laz(folder / "s2.laz", x, y, plane(x, y), 2, crs=CRS.from_epsg(25832))
         said = "strips 1 and 2 contain the same returns under two names"
     elif what == "nothing":
         (tmp_path / "empty").mkdir()

@@ -14,7 +14,7 @@ import pytest
 from pyproj import CRS
 
 from swath.daemon.cli.main import run_app
-from tests.daemon.processing.quicklook.test_quicklook import EAST_M, NORTH_M, lattice, plane, write
+from tests.daemon.builders import EAST_M, NORTH_M, lattice, plane, write_laz
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
@@ -64,7 +64,7 @@ def products(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for number, (south_m, lift_m) in enumerate([(0.0, 0.0), (30.0, 0.07)], start=1):
         x, y = lattice(EAST_M, NORTH_M + south_m, 120.0, 50.0, 0.5)
         z, sigma_m = plane(x, y) + lift_m, (0.031, 0.032, 0.0215)
-        write(folder / f"s{number}.laz", x, y, z, number, crs=CRS.from_epsg(25832), sigma_m=sigma_m)
+        write_laz(folder / f"s{number}.laz", x, y, z, number, crs=CRS.from_epsg(25832), sigma_m=sigma_m)
     sidecar = {
         "software": "swath 0.1.0",
         "complete": False,
@@ -183,7 +183,7 @@ def test_files_without_points_and_folders_without_files_are_refused(
     assert run_app(["view", str(tmp_path)]) == 3
     assert "has no LAS or LAZ file" in capsys.readouterr().err
     x, y = lattice(0.0, 0.0, 1.0, 1.0, 0.5)
-    path = write(tmp_path / "none.las", x, y, x)
+    path = write_laz(tmp_path / "none.las", x, y, x)
     raw = bytearray(path.read_bytes())[:375]
     raw[247:255] = bytes(8)
     path.write_bytes(raw)
@@ -195,7 +195,7 @@ def test_a_truncated_file_is_shown_in_part_and_exits_with_the_damage_code(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     x, y = lattice(EAST_M, NORTH_M, 100.0, 100.0, 0.5)
-    path = write(tmp_path / "cut.las", x, y, plane(x, y))
+    path = write_laz(tmp_path / "cut.las", x, y, plane(x, y))
     path.write_bytes(path.read_bytes()[:-100_000])
     assert run_app(["view", str(path)]) == 4
     assert "points could be read" in capsys.readouterr().err
@@ -203,5 +203,5 @@ def test_a_truncated_file_is_shown_in_part_and_exits_with_the_damage_code(
 
 
 def test_a_single_point_is_shown(tmp_path: Path) -> None:
-    write(tmp_path / "one.las", np.array([EAST_M]), np.array([NORTH_M]), np.array([400.0]))
+    write_laz(tmp_path / "one.las", np.array([EAST_M]), np.array([NORTH_M]), np.array([400.0]))
     assert run_app(["view", str(tmp_path)]) == 0

@@ -11,7 +11,7 @@ import pytest
 from swath.daemon.processing.point_times import PointClock, PointTimes, TimeKind, point_times_of, time_notes
 from swath.daemon.processing.quicklook.run import look_at
 from swath.georef.timescales.gps_time import WEEK_NS
-from tests.daemon.processing.quicklook.test_quicklook import lattice, write
+from tests.daemon.builders import lattice, write_laz
 
 WEEK = 2423
 FLIGHT_NS = WEEK * WEEK_NS + 345_600_000_000_000  # a Thursday
@@ -22,7 +22,7 @@ def tile(folder: Path, name: str, first_s: float, *, adjusted: bool, west_m: flo
     """Points of 20 s from a time on, as a header says, and what is read of them."""
     x, y = lattice(500_000.0 + west_m, 5_200_000.0, 20.0, 20.0, 1.0)
     times = first_s + np.linspace(0.0, 20.0, len(x))
-    return point_times_of(write(folder / name, x, y, 0.0 * x + 400.0, gps_time=times, adjusted=adjusted))
+    return point_times_of(write_laz(folder / name, x, y, 0.0 * x + 400.0, gps_time=times, adjusted=adjusted))
 
 
 def test_the_header_determines_the_kind_of_time(tmp_path: Path) -> None:
@@ -134,8 +134,8 @@ def test_seconds_of_an_unknown_week_are_comparable_and_reported(tmp_path: Path) 
 
 def test_points_without_times_have_none(tmp_path: Path) -> None:
     x, y = lattice(500_000.0, 5_200_000.0, 20.0, 20.0, 1.0)
-    none = point_times_of(write(tmp_path / "n.las", x, y, 0.0 * x, point_format=0))
-    zero = point_times_of(write(tmp_path / "z.las", x, y, 0.0 * x))
+    none = point_times_of(write_laz(tmp_path / "n.las", x, y, 0.0 * x, point_format=0))
+    zero = point_times_of(write_laz(tmp_path / "z.las", x, y, 0.0 * x))
     assert [one.kind for one in (none, zero)] == [TimeKind.NONE] * 2
     nowhere = np.array([np.nan, np.inf, 1e300, 1.0])
     assert PointClock([none]).time_ns(none.path, nowhere).tolist() == [0, 0, 0, 0]

@@ -18,7 +18,7 @@ from swath.daemon.cli import strips, view
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.processing.quicklook.run import Look, look_at
 from swath.daemon.processing.quicklook.strips import TILE, Overlap
-from tests.daemon.processing.quicklook.test_quicklook import EAST_M, NORTH_M, plane, write
+from tests.daemon.builders import EAST_M, NORTH_M, plane, write_laz
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
@@ -66,7 +66,7 @@ def tiles(folder: Path, cloud: Cloud, order: Array, side_m: float = 70.0) -> Pat
         name = folder / f"tile_{tile[0]:.0f}_{tile[1]:.0f}.laz"
         columns = {"return_number": part["number"], "number_of_returns": part["of"], "gps_time": part["time"]}
         crs = CRS.from_epsg(25832)
-        write(name, part["x"], part["y"], part["z"], part["strip"].astype(np.uint16), crs=crs, **columns)
+        write_laz(name, part["x"], part["y"], part["z"], part["strip"].astype(np.uint16), crs=crs, **columns)
     return folder
 
 

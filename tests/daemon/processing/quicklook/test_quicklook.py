@@ -4,14 +4,10 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
-import laspy
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from pyproj import CRS
 
 from swath.daemon.processing.quicklook.grids import Frame, frame_of, inner, round_up
@@ -19,71 +15,10 @@ from swath.daemon.processing.quicklook.profile import steps_of
 from swath.daemon.processing.quicklook.read import BLOCK_POINTS, QuickLookError
 from swath.daemon.processing.quicklook.run import Look, look_at, numbers_of
 from swath.daemon.processing.quicklook.strips import MOMENTS, TILE, StripCells, _halved
+from tests.daemon.builders import EAST_M, NORTH_M, Array, lattice, plane, write_laz
+from tests.daemon.processing.quicklook.builders import two_strips
 
 pytestmark = pytest.mark.xdist_group("kernels")
-
-Array = NDArray[Any]
-SIGMAS = ("sigma_easting", "sigma_northing", "sigma_height")
-EAST_M, NORTH_M = 500_000.0, 5_200_000.0
-
-
-def plane(x: Array, y: Array) -> Array:
-    """Return heights of a slope of about 8 degrees."""
-    return np.asarray(400.0 + 0.12 * (x - EAST_M) - 0.07 * (y - NORTH_M))
-
-
-def lattice(west_m: float, south_m: float, width_m: float, height_m: float, spacing_m: float) -> tuple[Array, Array]:
-    """Places in order, `1 / spacing²` a square metre, none on the edge of a cell."""
-    x, y = np.meshgrid(
-        np.arange(west_m + 0.51 * spacing_m, west_m + width_m, spacing_m),
-        np.arange(south_m + 0.49 * spacing_m, south_m + height_m, spacing_m),
-        indexing="ij",
-    )
-    return x.ravel(), y.ravel()
-
-
-def write(
-    path: Path,
-    x: Array,
-    y: Array,
-    z: Array,
-    strip: int | Array = 1,
-    *,
-    crs: CRS | None = None,
-    sigma_m: tuple[Array | float, ...] | None = None,
-    point_format: int = 6,
-    scale: float = 0.0001,
-    adjusted: bool = True,
-    **columns: Array | int,
-) -> Path:
-    """A file of points; all are single returns unless the columns say otherwise.
-
-    Its header says that GPS times are adjusted standard ones, or else seconds of the week.
-    """
-    header = laspy.LasHeader(point_format=point_format, version="1.4" if point_format > 5 else "1.2")
-    header.global_encoding.gps_time_type = laspy.header.GpsTimeType(int(adjusted))
-    header.scales, header.offsets = np.full(3, scale), np.floor([x.min(), y.min(), 0.0])
-    if crs is not None:
-        header.add_crs(crs)
-    for name in SIGMAS if sigma_m else ():
-        header.add_extra_dim(laspy.ExtraBytesParams(name, "u2", scales=np.array([1e-4]), offsets=np.array([0.0])))
-    made = laspy.LasData(header)
-    made.x, made.y, made.z = x, y, z
-    made.point_source_id = np.broadcast_to(np.asarray(strip, np.uint16), x.shape)
-    for name, value in ({"return_number": 1, "number_of_returns": 1} | columns).items():
-        made[name] = np.broadcast_to(np.asarray(value), x.shape)
-    for name, sigma in zip(SIGMAS, sigma_m or (), strict=False):
-        made[name] = np.broadcast_to(np.asarray(sigma, float), x.shape)
-    made.write(path)
-    return path
-
-
-def two_strips(folder: Path, dz_m: float, surface: Callable[[Array, Array], Array] = plane) -> Look:
-    """Strips 100 m wide and 300 m long that overlap by 40 m, the second so much higher; sampled differently."""
-    for number, (south_m, lift_m, shift_m) in enumerate([(0.0, 0.0, 0.0), (60.0, dz_m, 0.17)], start=1):
-        x, y = lattice(EAST_M + shift_m, NORTH_M + south_m, 300.0, 100.0, 0.5)
-        write(folder / f"s{number}.laz", x, y, surface(x, y) + lift_m, number, crs=CRS.from_epsg(25832))
-    return look_at([folder])
 
 
 @pytest.fixture(scope="module")
@@ -158,7 +93,7 @@ def test_only_single_returns_are_compared_and_first_returns_counted(tmp_path: Pa
         many = second | (np.arange(len(x)) % 2 == 0)
         z = plane(x, y) + np.where(second, -1.0, np.where(many, 0.5, 0.04 * number))
         columns = {"return_number": 1 + second, "number_of_returns": 1 + many}
-        paths.append(write(tmp_path / f"{number}.las", x, y, z, number, **columns))
+        paths.append(write_laz(tmp_path / f"{number}.las", x, y, z, number, **columns))
     look = look_at(paths)
     (row,) = look.overlap.rows
     assert row["median_m"] == pytest.approx(-0.04, abs=2e-4)
@@ -172,7 +107,7 @@ def test_sigmas_are_root_mean_squares_and_unknown_ones_are_counted(tmp_path: Pat
     x, y = lattice(EAST_M, NORTH_M, 40.0, 40.0, 0.5)
     height = np.where(np.arange(len(x)) % 2, 0.03, 0.05)
     height[:100] = 6.5535
-    path = write(tmp_path / "s.laz", x, y, plane(x, y), sigma_m=(0.011, 0.022, height))
+    path = write_laz(tmp_path / "s.laz", x, y, plane(x, y), sigma_m=(0.011, 0.022, height))
     look = look_at([path])
     (strip,) = look.strips
     assert strip.sigma_m is not None
@@ -189,7 +124,7 @@ def test_sigmas_are_root_mean_squares_and_unknown_ones_are_counted(tmp_path: Pat
 def test_means_of_cells_match_those_of_their_points(tmp_path: Path) -> None:
     x, y = lattice(EAST_M, NORTH_M, 30.0, 30.0, 0.5)
     intensity = (x - EAST_M).astype(int)
-    look = look_at([write(tmp_path / "s.las", x, y, plane(x, y), intensity=intensity)], cell_m=5.0)
+    look = look_at([write_laz(tmp_path / "s.las", x, y, plane(x, y), intensity=intensity)], cell_m=5.0)
     assert (look.surface.frame.rows, look.surface.frame.columns) == (6, 6)
     centres = EAST_M + 2.5 + 5.0 * np.arange(6)
     expected = plane(*np.meshgrid(centres, NORTH_M + 2.5 + 5.0 * np.arange(6)))
@@ -214,7 +149,7 @@ def test_feet_are_converted_to_metres(tmp_path: Path) -> None:
     """EPSG:2994 counts in feet; a lattice of a foot has 1 / 0.3048² points a square metre."""
     x, y = lattice(600_000.0, 800_000.0, 300.0, 300.0, 1.0)
     paths = [
-        write(tmp_path / f"{n}.laz", x, y, 1000.0 + 0.05 * x + 0.1 * n, n, crs=CRS.from_epsg(2994), scale=0.001)
+        write_laz(tmp_path / f"{n}.laz", x, y, 1000.0 + 0.05 * x + 0.1 * n, n, crs=CRS.from_epsg(2994), scale=0.001)
         for n in (1, 2)
     ]
     look = look_at(paths)
@@ -227,7 +162,7 @@ def test_feet_are_converted_to_metres(tmp_path: Path) -> None:
 
 def test_degrees_are_converted_to_metres(tmp_path: Path) -> None:
     x, y = lattice(9.0, 47.0, 2e-4, 2e-4, 2e-6)
-    look = look_at([write(tmp_path / "d.las", x, y, 0.0 * x, crs=CRS.from_epsg(4326), scale=1e-8)])
+    look = look_at([write_laz(tmp_path / "d.las", x, y, 0.0 * x, crs=CRS.from_epsg(4326), scale=1e-8)])
     truth = 1.0 / (2e-6 * 111_320.0) ** 2 / math.cos(math.radians(47.0))
     assert look.strips[0].density == pytest.approx(truth, rel=0.03)
 
@@ -235,7 +170,7 @@ def test_degrees_are_converted_to_metres(tmp_path: Path) -> None:
 def test_files_without_point_source_ids_are_separate_strips(tmp_path: Path) -> None:
     for name, lift_m in (("north", 0.0), ("south", 0.05)):
         x, y = lattice(EAST_M, NORTH_M, 40.0, 40.0, 0.5)
-        write(tmp_path / f"{name}.las", x, y, plane(x, y) + lift_m, 0, point_format=0)  # no GPS time, no CRS
+        write_laz(tmp_path / f"{name}.las", x, y, plane(x, y) + lift_m, 0, point_format=0)  # no GPS time, no CRS
     look = look_at([tmp_path])
     assert look.names == ["north", "south"]
     assert look.overlap.rows[0]["median_m"] == pytest.approx(-0.05, abs=2e-4)
@@ -245,7 +180,7 @@ def test_files_without_point_source_ids_are_separate_strips(tmp_path: Path) -> N
 def test_a_strip_in_two_files_is_one_strip(tmp_path: Path) -> None:
     for number in (0, 1):
         x, y = lattice(EAST_M + 50.0 * number, NORTH_M, 50.0, 40.0, 0.5)
-        write(tmp_path / f"tile{number}.laz", x, y, plane(x, y), 7)
+        write_laz(tmp_path / f"tile{number}.laz", x, y, plane(x, y), 7)
     (strip,) = look_at([tmp_path]).strips
     assert (strip.name, strip.points) == ("7", 2 * 100 * 80)
     assert strip.length_m == pytest.approx(100.0, rel=0.05)
@@ -256,7 +191,7 @@ def test_noise_and_withheld_points_are_left_out_and_counted(tmp_path: Path) -> N
     number = np.arange(len(x))
     z = plane(x, y) + np.where(number < 30, 500.0, 0.0)
     classes = np.where(number < 10, 7, np.where(number < 20, 18, 2))
-    path = write(tmp_path / "n.laz", x, y, z, classification=classes, withheld=(number >= 20) & (number < 30))
+    path = write_laz(tmp_path / "n.laz", x, y, z, classification=classes, withheld=(number >= 20) & (number < 30))
     look = look_at([path])
     assert (look.skipped, look.surface.points) == (30, len(x) - 30)
     assert look.surface.high_m[2] < 410.0
@@ -265,7 +200,7 @@ def test_noise_and_withheld_points_are_left_out_and_counted(tmp_path: Path) -> N
 
 def test_a_wrong_extent_in_the_header_loses_no_point(tmp_path: Path) -> None:
     x, y = lattice(EAST_M, NORTH_M, 40.0, 40.0, 0.5)
-    path = write(tmp_path / "l.las", x, y, plane(x, y))
+    path = write_laz(tmp_path / "l.las", x, y, plane(x, y))
     raw = bytearray(path.read_bytes())
     raw[179:227] = np.array([EAST_M + 1, EAST_M, NORTH_M + 1, NORTH_M, 401.0, 400.0]).tobytes()
     path.write_bytes(raw)
@@ -277,7 +212,7 @@ def test_a_wrong_extent_in_the_header_loses_no_point(tmp_path: Path) -> None:
 @pytest.mark.parametrize("suffix", ["las", "laz"])
 def test_the_readable_part_of_a_truncated_file_is_shown_and_reported(tmp_path: Path, suffix: str) -> None:
     x, y = lattice(EAST_M, NORTH_M, 500.0, 400.0, 0.5)
-    path = write(tmp_path / f"c.{suffix}", x, y, plane(x, y))
+    path = write_laz(tmp_path / f"c.{suffix}", x, y, plane(x, y))
     assert len(x) > BLOCK_POINTS
     path.write_bytes(path.read_bytes()[: int(path.stat().st_size * 0.9)])
     if suffix == "laz":  # its table of chunks stands at the end
@@ -293,21 +228,21 @@ def test_the_readable_part_of_a_truncated_file_is_shown_and_reported(tmp_path: P
 def test_two_crs_are_refused_naming_both_files(tmp_path: Path) -> None:
     x, y = lattice(EAST_M, NORTH_M, 10.0, 10.0, 0.5)
     for name, code in (("a", 25832), ("b", 25833)):
-        write(tmp_path / f"{name}.las", x, y, plane(x, y), crs=CRS.from_epsg(code))
+        write_laz(tmp_path / f"{name}.las", x, y, plane(x, y), crs=CRS.from_epsg(code))
     with pytest.raises(QuickLookError, match=r"b\.las is in ETRS89 / UTM zone 33N, .*a\.las in ETRS89 / UTM zone 32N"):
         look_at([tmp_path])
 
 
 def test_geocentric_files_are_refused(tmp_path: Path) -> None:
     x, y = lattice(4e6, 6e5, 10.0, 10.0, 0.5)
-    path = write(tmp_path / "e.las", x, y, 4.7e6 + 0 * x, crs=CRS.from_epsg(4978), scale=0.01)
+    path = write_laz(tmp_path / "e.las", x, y, 4.7e6 + 0 * x, crs=CRS.from_epsg(4978), scale=0.01)
     with pytest.raises(QuickLookError, match="geocentric"):
         look_at([path])
 
 
 def test_a_requested_profile_lies_at_its_requested_place(tmp_path: Path) -> None:
     x, y = lattice(EAST_M, NORTH_M, 60.0, 40.0, 0.5)
-    path = write(tmp_path / "s.laz", x, y, plane(x, y))
+    path = write_laz(tmp_path / "s.laz", x, y, plane(x, y))
     ends = (EAST_M + 5.0, NORTH_M + 20.0, EAST_M + 45.0, NORTH_M + 20.0)
     profile = look_at([path], ends=ends).profile
     assert profile is not None

@@ -18,7 +18,8 @@ from swath.daemon.processing.quicklook.run import Look, look_at
 from swath.georef.formats.copc import CopcWriter
 from swath.georef.formats.las import LasSettings
 from swath.georef.points import Points
-from tests.daemon.processing.quicklook.test_quicklook import EAST_M, NORTH_M, lattice, plane, two_strips, write
+from tests.daemon.builders import EAST_M, NORTH_M, lattice, plane, write_laz
+from tests.daemon.processing.quicklook.builders import two_strips
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
@@ -106,7 +107,7 @@ def feet(folder: Path, name: str, crs: CRS, height: float, sidecar: dict[str, An
     for number in (1, 2):
         x, y = lattice(6_300_000.0, 1_890_000.0, 150.0, 150.0, 2.0)
         z = height + number + 0.0 * x
-        write(inside / f"{number}.laz", x, y, z, number, crs=crs, sigma_m=(0.03, 0.03, 0.03), scale=0.001)
+        write_laz(inside / f"{number}.laz", x, y, z, number, crs=crs, sigma_m=(0.03, 0.03, 0.03), scale=0.001)
     if sidecar is not None:
         (inside / "flight.json").write_text(json.dumps(sidecar | {"strips": [{"file": "1.laz"}, {"file": "2.laz"}]}))
     return look_at([inside])
@@ -144,7 +145,7 @@ def test_differences_of_metres_are_shown_in_metres(tmp_path: Path) -> None:
     """An aircraft that was never calibrated: nothing is cut off at a metre."""
     for number in (1, 2):
         x, y = lattice(EAST_M, NORTH_M, 60.0, 60.0, 0.5)
-        write(tmp_path / f"{number}.laz", x, y, plane(x, y) + 2.5 * number, number)
+        write_laz(tmp_path / f"{number}.laz", x, y, plane(x, y) + 2.5 * number, number)
     numbers = look_at([tmp_path]).overlap.numbers()
     assert numbers is not None
     assert (numbers["median_m"], numbers["p95_m"]) == (pytest.approx(-2.5), pytest.approx(2.5))
@@ -153,7 +154,7 @@ def test_differences_of_metres_are_shown_in_metres(tmp_path: Path) -> None:
 def test_lengths_on_a_distorted_map_are_ground_lengths(tmp_path: Path) -> None:
     """At 47.5° N web Mercator has 1.48 m for one on the ground, and so 2.19 times fewer pulses a square metre."""
     x, y = lattice(990_000.0, 6_024_000.0, 300.0, 100.0, 0.5)  # four a square metre of the map
-    write(tmp_path / "s.laz", x, y, 0.0 * x + 400.0, crs=CRS.from_epsg(3857))
+    write_laz(tmp_path / "s.laz", x, y, 0.0 * x + 400.0, crs=CRS.from_epsg(3857))
     look = look_at([tmp_path])
     lat = 2.0 * np.arctan(np.exp(6_024_050.0 / 6_378_137.0)) - np.pi / 2
     assert look.density == pytest.approx(4.0 / np.cos(lat) ** 2, rel=0.02)
@@ -166,12 +167,12 @@ def test_lengths_on_a_distorted_map_are_ground_lengths(tmp_path: Path) -> None:
 def test_points_outside_the_area_of_use_of_their_crs_are_reported(tmp_path: Path) -> None:
     """Points of 9° E in zone 33, which begins at 12° E."""
     x, y = lattice(47_000.0, 5_275_000.0, 50.0, 50.0, 0.5)
-    write(tmp_path / "s.laz", x, y, 0.0 * x + 400.0, crs=CRS.from_epsg(32633))
+    write_laz(tmp_path / "s.laz", x, y, 0.0 * x + 400.0, crs=CRS.from_epsg(32633))
     (note,) = look_at([tmp_path]).notes
     assert "WGS 84 / UTM zone 33N is used from 12° to 18° E" in note
 
 
 def test_points_inside_the_area_of_use_give_no_such_note(tmp_path: Path) -> None:
     x, y = lattice(500_000.0, 5_275_000.0, 50.0, 50.0, 0.5)
-    write(tmp_path / "s.laz", x, y, 0.0 * x + 400.0, crs=CRS.from_epsg(25832))
+    write_laz(tmp_path / "s.laz", x, y, 0.0 * x + 400.0, crs=CRS.from_epsg(25832))
     assert look_at([tmp_path]).notes == []
