@@ -18,7 +18,7 @@ from swath.daemon.doctor.finding import Finding, Tree, Verdict
 from swath.daemon.log.host_clock import STA_UNSYNC, ClockDiscipline
 from tests.builders import ROOT, SYSTEMD
 from tests.daemon.builders import swath
-from tests.daemon.doctor.test_doctor_chrony import DEBIAN_CHRONY
+from tests.daemon.doctor.builders import DEBIAN_CHRONY, write
 from tests.daemon.rig import session_table
 
 KEPT = ClockDiscipline(12.0, 0, 0.002)
@@ -87,11 +87,6 @@ def tree(tmp_path: Path) -> Tree:
     os.chown(made.at("/var/lib/swath"), 990, 990)
     made.at("/var/lib/swath").chmod(0o750)
     return made
-
-
-def write(tree: Tree, path: str, text: str) -> None:
-    tree.at(path).parent.mkdir(parents=True, exist_ok=True)
-    tree.at(path).write_text(text)
 
 
 def bitrate(name: str) -> int | None:

@@ -11,19 +11,8 @@ import pytest
 from swath.daemon.doctor.clock import chrony_steps
 from swath.daemon.doctor.finding import Tree
 from tests.builders import SYSTEMD
+from tests.daemon.doctor.builders import DEBIAN_CHRONY, write
 
-# what Debian's and Ubuntu's chrony.conf says beside sources of time: conf.d comes before its own makestep
-DEBIAN_CHRONY = """# Include configuration files found in /etc/chrony/conf.d.
-confdir /etc/chrony/conf.d
-pool 2.debian.pool.ntp.org iburst
-sourcedir /run/chrony-dhcp
-sourcedir /etc/chrony/sources.d
-maxupdateskew 100.0
-rtcsync
-# Step the system clock instead of slewing it if the adjustment is larger than
-# one second, but only in the first three clock updates.
-makestep 1 3
-"""
 MAIN, DROP_IN = "/etc/chrony/chrony.conf", "/etc/chrony/conf.d/swath.conf"
 ALWAYS = "makestep 0.1 -1\n"
 
@@ -35,11 +24,6 @@ def tree(tmp_path: Path) -> Tree:
     write(made, MAIN, DEBIAN_CHRONY)
     write(made, DROP_IN, (SYSTEMD / "chrony/swath.conf").read_text())
     return made
-
-
-def write(tree: Tree, path: str, text: str) -> None:
-    tree.at(path).parent.mkdir(parents=True, exist_ok=True)
-    tree.at(path).write_text(text)
 
 
 @pytest.mark.parametrize(

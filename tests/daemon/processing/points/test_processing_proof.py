@@ -18,9 +18,7 @@ from swath.daemon.config import parse_config
 from swath.daemon.processing.setup.models import make_motion
 from swath.daemon.processing.setup.setup import Options, Setup
 from swath.georef.arrays import FloatArray
-from swath.georef.geodesy.rotations import quaternion_from_rot
 from swath.georef.points import Points
-from swath.georef.trajectory.trajectory import Trajectory
 from swath.sim.companions import config_text, default_wires
 from tests.builders import (
     EVERY_ERROR,
@@ -35,12 +33,11 @@ from tests.builders import (
     fly_and_decode,
     vlp16_quanta,
 )
+from tests.daemon.processing.builders import IBRC, true_trajectory
 
 pytestmark = pytest.mark.xdist_group("proof")
 
-STEP_S = 5e-4  # of the true trajectory: a slerp between its epochs is then exact to a micrometre
 FACETS = [{"index": 0, "tilt_deg": 0.03}, {"index": 1, "tilt_deg": -0.02}, {"index": 3, "tilt_deg": 0.01}]
-IBRC = {"intensity": [0.0, 500.0, 2000.0, 65535.0], "correction_m": [0.02, 0.01, -0.005, -0.03]}
 STEADY = EVERY_ERROR | {"torsion_us2": 0.0}
 NO_LATENCY = {"encoder_latency_us": 0.0, "torsion_us2": 0.0}
 AIR = {"ranges": "vacuum", "refraction": "spherical"}
@@ -84,19 +81,6 @@ def fly(folder: Path, case: Case, atmosphere: dict[str, str]) -> Flown:
     changes: dict[str, Any] = {"scanner": {"left": case.scanner | (LOW_HEAD if case.low else {})}}
     changes |= {"atmosphere": atmosphere} | (LOW_AND_SLOW if case.low else {})
     return fly_and_decode(folder, changes, case.stop_s)
-
-
-def true_trajectory(flown: Flown) -> Trajectory:
-    """Return the true trajectory of the body, from SciPy's splines at small steps."""
-    track = flown.track()
-    time_s = np.linspace(track.time_s[0], track.time_s[-1], round((track.time_s[-1] - track.time_s[0]) / STEP_S) + 1)
-    position_e, rotation = track.poses(time_s)
-    q_e_from_b = quaternion_from_rot(rotation)
-    turns = np.where((q_e_from_b[1:] * q_e_from_b[:-1]).sum(axis=1) < 0, -1.0, 1.0)
-    q_e_from_b[1:] *= np.cumprod(turns)[:, np.newaxis]
-    unsaid = np.full((len(time_s), 3), np.nan)
-    time_ns = flown.plan.start_gps_ns + np.rint(time_s * 1e9).astype(np.int64)
-    return Trajectory(time_ns, position_e, q_e_from_b, unsaid, unsaid, unsaid)
 
 
 def georeferenced(flown: Flown, folder: Path) -> tuple[Points, NDArray[np.uint8]]:

@@ -24,7 +24,7 @@ from swath.georef.scanner.sensor_model import SensorModel
 from swath.georef.scanner.uncertainty import Noise, Uncertainty
 from swath.georef.trajectory.trajectory import Trajectory
 from tests.builders import EVERY_ERROR, TURNED, Flown, fly_and_decode
-from tests.daemon.processing.points.test_processing_proof import IBRC, true_trajectory
+from tests.daemon.processing.builders import IBRC, true_trajectory
 
 pytestmark = pytest.mark.xdist_group("proof")
 
