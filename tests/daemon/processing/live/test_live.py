@@ -44,36 +44,12 @@ from swath.sim.fly import VirtualFlight
 from swath.sim.plan.plan import parse_plan
 from tests.daemon.builders import swath
 from tests.daemon.commands import ROOT
+from tests.daemon.processing.live.builders import PLAN
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
 # ---------------------------------------------------------------------------------------------- a flight
 
-PLAN = """
-[flight]
-name = "live"
-seed = 5
-speed_mps = 50.0
-[[line]]
-name = "1"
-from_m = [-150, 0]
-to_m = [150, 0]
-height_m = 520
-[[line]]
-name = "2"  # never reached: so that there is ground below the way to the first
-from_m = [-1000, 0]
-to_m = [-900, 0]
-height_m = 520
-[gnss.rover]
-ins = true
-rate_hz = 1
-[scanner.left]
-prf_hz = 5000
-on_lines_only = false
-[scanner.right]
-prf_hz = 3000
-on_lines_only = false
-"""
 SECONDS = 7.0
 
 

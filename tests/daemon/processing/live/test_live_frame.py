@@ -16,7 +16,7 @@ from swath.daemon.processing.live.mcap import NAME
 from swath.daemon.processing.live.points import PointsFile
 from swath.daemon.processing.live.products import LiveProducts, Room
 from swath.georef.timescales.gps_time import SECOND_NS
-from tests.daemon.processing.live.test_live_products import Utm, flight, points_at, read_back
+from tests.daemon.processing.live.builders import Utm, flight, points_at, read_back
 
 pytestmark = pytest.mark.xdist_group("kernels")
 

@@ -15,24 +15,12 @@ from swath.daemon.processing.live.session import Told, replay
 from swath.daemon.processing.setup.setup import Options, Setup
 from swath.daemon.processing.warm_up import warm_up
 from tests.builders import running
-from tests.daemon.processing.live.test_live import PLAN
-from tests.daemon.rig import HANGS_S, Recorder, session_table, wait_until
+from tests.daemon.processing.live.builders import PLAN, config_of
+from tests.daemon.rig import HANGS_S, Recorder, wait_until
 
 pytestmark = [pytest.mark.slow, pytest.mark.alone, pytest.mark.xdist_group("kernels")]
 
 SECONDS = 6.5
-PART_MINUTES = 0.035  # two seconds
-
-
-def config_of(wires: Path, folder: Path) -> str:
-    """The configuration that reads a flight's wires, and its files beside it."""
-    wait_until((wires / "pps-main").exists, "the last of the wires")
-    for path in [*wires.glob("*.true.toml"), wires / "main.dbc"]:
-        (folder / path.name).write_bytes(path.read_bytes())
-    text = (wires / "swath.toml").read_text().replace('"novatel"', '"novatel"\ndatum = "same"')
-    text = text.replace(".nominal.toml", ".true.toml")
-    head = session_table(folder / "logs", name='"growing"', split_minutes=PART_MINUTES)
-    return text.replace(text[: text.index("[pps.main]")], head)
 
 
 def test_points_made_during_recording_equal_those_of_the_replay(tmp_path: Path) -> None:

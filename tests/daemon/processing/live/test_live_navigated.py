@@ -15,7 +15,7 @@ from swath.daemon.processing.setup.setup import Options, Setup
 from swath.daemon.processing.warm_up import warm_up
 from swath.georef.points import Points
 from tests.builders import Recorded, judged, running
-from tests.daemon.processing.live.test_live_growing import config_of
+from tests.daemon.processing.live.builders import config_of
 from tests.daemon.rig import HANGS_S, Recorder, wait_until
 
 pytestmark = [pytest.mark.slow, pytest.mark.alone, pytest.mark.xdist_group("kernels")]
