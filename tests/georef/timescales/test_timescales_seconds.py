@@ -29,25 +29,11 @@ from tests.georef.clock_simulation import (
     utc_tag,
     week_tag,
 )
+from tests.georef.timescales.builders import START, UTC, nmea, tim_tp
 
-START = 1_479_297_618  # 2026-11-21T12:00:00Z
 SECONDS = 3000
-UTC = utc_tag(18)
 LEAP_AT = gps_second(dt.datetime(2028, 6, 30, 23, 59, 59, tzinfo=dt.UTC), 18) + 1
 LOCKED, HOLDOVER, COARSE, NO_TIME = TimeState.LOCKED, TimeState.HOLDOVER, TimeState.COARSE, TimeState.NO_TIME
-
-
-def nmea(delay_s: float = 0.2, jitter_s: float = 0.01, **more: Any) -> list[Sender]:
-    """RMC and ZDA of one receiver, one after the other."""
-    return [
-        Sender("RMC", UTC, delay_s=delay_s, jitter_s=jitter_s, **more),
-        Sender("ZDA", UTC, delay_s=delay_s + 0.02, jitter_s=jitter_s, **more),
-    ]
-
-
-def tim_tp() -> Sender:
-    """The bound message that names the next edge."""
-    return Sender("TIM-TP", week_tag(), names_edge=NamesEdge.NEXT, bound=True, delay_s=0.1)
 
 
 def time_gps(**more: Any) -> Sender:

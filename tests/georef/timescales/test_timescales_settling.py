@@ -10,7 +10,7 @@ import pytest
 from swath.georef.timescales import PpsClock, TimeState
 from tests.georef.clock_run import Outcome, run
 from tests.georef.clock_simulation import NS, Edges, Oscillator, Sender, Simulation, utc_tag, week_tag
-from tests.georef.timescales.test_timescales_seconds import START, nmea, tim_tp
+from tests.georef.timescales.builders import START, nmea, tim_tp
 
 SECONDS = 300
 UTC = utc_tag(18)
