@@ -35,7 +35,7 @@ from swath.calib.features import ControlPoint, Features
 from swath.calib.outcome import Adjusted
 from swath.calib.parameters import INSTALLED, MODELS, ParameterOptions, unknowns
 from swath.georef.scanner.calibration import INDEX, PARAMETERS, nominal
-from tests.calib.equations.test_rows import shifted
+from tests.calib.builders import shifted
 from tests.calib.roofs import LINES, Line, Made, made, roofs, trajectory
 
 LIMIT = 4.0  # sigmas

@@ -12,7 +12,7 @@ from scipy import stats
 
 from swath.calib.adjust import adjust, predict
 from swath.calib.equations.normals import NormalError, TrajectoryWeight, moved, normals
-from swath.calib.equations.rows import Rows, State
+from swath.calib.equations.rows import Rows
 from swath.calib.equations.solve import Settings
 from swath.calib.equations.tie_rows import Ties
 from swath.calib.equations.trajectory_prior import Taus, TrajectoryPrior, gauss_markov
@@ -24,7 +24,7 @@ from swath.calib.parameters import MODELS, ParameterOptions, unknowns
 from swath.georef.arrays import FloatArray
 from swath.georef.scanner.calibration import INDEX, PARAMETERS, Calibration, nominal
 from swath.georef.trajectory.trajectory import Trajectory
-from tests.calib.equations.test_rows import design
+from tests.calib.builders import controlled, design, in_planes
 from tests.calib.printed import TRUTH, Printed, printed
 from tests.calib.roofs import LINES, NOISE, Line, Made, made, roofs
 
@@ -107,19 +107,6 @@ def knots(flown: Trajectory, every_s: float = 6.0) -> TrajectoryPrior:
 @cache
 def small() -> Made:
     return made(lines=LINES[:3], points=6)
-
-
-def in_planes(rows: Rows, state: State) -> tuple[FloatArray, list[int]]:
-    """(r, 2) places of points, as adjusted, in their planes, and which plane each is of."""
-    places, planes = [], []
-    for batch, looks in rows.looks(state):
-        begin = 0
-        for run in batch.runs:
-            first = rows.expansion(run, state.normal_e[run.plane])[1].shape[1]
-            places.append(looks.design[begin : begin + len(run.at), first : first + 2])
-            planes += [run.plane] * len(run.at)
-            begin += len(run.at)
-    return np.concatenate(places), planes
 
 
 @pytest.mark.parametrize("weighted", [True, False])
@@ -238,18 +225,6 @@ def test_a_wrong_sighting_is_removed() -> None:
     (of_ties,) = (one for one in found.groups if one.group == "ties")
     assert (of_ties.observations, of_ties.rejected) == (len(residuals.weight), len(taken))  # rejected of all
     assert (np.abs(found.values - good.values) < 0.5 * good.sigmas).all()
-
-
-def controlled(built: Made, seed: int = 9) -> Features:
-    """Ten surveyed points at 1 cm on the flat planes, two a plane."""
-    g, planes = np.random.default_rng(seed), list(built.features.planes)
-    for index in range(0, 25, 5):
-        points = []
-        for number in range(2):
-            at = planes[index].centre_t + np.array([*g.uniform(-5, 5, 2), 0.01 * g.normal()])
-            points.append(ControlPoint(f"p{index}.{number}", at, 0.01))
-        planes[index] = replace(planes[index], control=tuple(points))
-    return Features(tuple(planes))
 
 
 def test_control_determines_the_range_offset_and_reports_each_point() -> None:

@@ -12,7 +12,7 @@ from swath.calib.equations.rows import Rows
 from swath.calib.equations.solve import Settings
 from swath.calib.equations.trajectory_prior import Taus, gauss_markov
 from swath.calib.parameters import ParameterOptions, unknowns
-from tests.calib.equations.test_rows import shifted
+from tests.calib.builders import shifted
 from tests.calib.roofs import LINES, made, trajectory
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("kernels")]

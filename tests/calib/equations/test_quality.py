@@ -18,10 +18,9 @@ from swath.calib.features import Features
 from swath.calib.parameters import ParameterOptions, unknowns
 from swath.georef.arrays import FloatArray
 from swath.georef.records import Int64Array
-from tests.calib.equations.test_rows import design
+from tests.calib.builders import controlled, design, in_planes
 from tests.calib.printed import printed
 from tests.calib.roofs import LINES, made
-from tests.calib.test_adjust import controlled, in_planes
 
 pytestmark = pytest.mark.xdist_group("kernels")
 PLAIN = Settings(huber=0.0, family=0.0)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from swath.calib.equations.rows import Rows, State
+from swath.calib.equations.rows import Rows
 from swath.calib.equations.trajectory_prior import TrajectoryPrior
 from swath.calib.features import Patch, Plane
 from swath.calib.flight import Flight, Head, Swath
@@ -19,7 +19,7 @@ from swath.georef.scanner.beams import Geometry, OusterGeometry, SpinningGeometr
 from swath.georef.scanner.calibration import INDEX, Calibration, nominal
 from swath.georef.scanner.jacobian import observation_columns_e, parameter_columns_e
 from swath.georef.scanner.uncertainty import Noise
-from swath.georef.trajectory.trajectory import Trajectory
+from tests.calib.builders import design, shifted
 from tests.calib.roofs import LINES, START_NS, frame, made, trajectory
 
 pytestmark = pytest.mark.xdist_group("kernels")
@@ -58,25 +58,6 @@ def line_flight() -> tuple[Flight, tuple[Plane, ...], Calibration]:
         for one in built.flight.swaths
     )
     return replace(built.flight, heads=(head,), swaths=swaths), built.features.planes[:5], start
-
-
-def design(rows: Rows, state: State) -> tuple[FloatArray, FloatArray, FloatArray, list[int]]:
-    """Columns of all unknowns but the planes' (n, u), f and M (n,), planes (n,)."""
-    columns, misclosures, variances, planes = [], [], [], []
-    for batch, looks in rows.looks(state):
-        begin = 0
-        for run in batch.runs:
-            mine = slice(begin, begin + len(run.at))
-            at, expanded = rows.expansion(run, state.normal_e[run.plane])
-            whole = np.zeros((len(run.at), rows.size))
-            for one, column in zip(at.tolist(), (looks.design[mine, : expanded.shape[1]] @ expanded.T).T, strict=True):
-                whole[:, one] += column
-            columns.append(whole)
-            planes += [run.plane] * len(run.at)
-            begin += len(run.at)
-        misclosures.append(looks.misclosure)
-        variances.append(looks.variance)
-    return np.concatenate(columns), np.concatenate(misclosures), np.concatenate(variances), planes
 
 
 def test_columns_match_georef() -> None:
@@ -197,14 +178,6 @@ def placed(flight: Flight, asked: Unknowns, values: FloatArray, column: int, ste
         moved.append(flight.place(flight.swaths[0], asked.calibrations(there)["left"]))
     difference: FloatArray = (moved[1] - moved[0]) / (2.0 * step)
     return difference
-
-
-def shifted(flown: Trajectory, prior: TrajectoryPrior, errors_e: FloatArray) -> Trajectory:
-    """With errors (k, 6) in e at the knots added, linear between them and level beyond them."""
-    seconds, knots = (flown.time_ns - START_NS) / 1e9, (prior.time_ns - START_NS) / 1e9
-    error = np.stack([np.interp(seconds, knots, column) for column in errors_e.T], axis=1)
-    turned = Rotation.from_rotvec(error[:, 3:]) * Rotation.from_quat(flown.q_e_from_b[:, [1, 2, 3, 0]])
-    return replace(flown, position_e=flown.position_e + error[:, :3], q_e_from_b=turned.as_quat()[:, [3, 0, 1, 2]])
 
 
 def test_columns_of_the_trajectory_match_differences_of_the_model() -> None:
