@@ -28,10 +28,8 @@ from swath.drivers.imu.nmea2000 import pgn_and_source
 from swath.drivers.parser import DeviceKind, DeviceSettings, Parser
 from swath.drivers.scanner.ouster.head import read_head
 from swath.georef.records import Chunk, ChunkBatch, Record, ScannerReturns, TimeMessage
-from tests.drivers.framing.test_framing import comparable, others_messages
+from tests.drivers.builders import NMEA2000_COUNTS, comparable, nmea2000_bus, others_messages
 from tests.drivers.harness import packet_batches
-from tests.drivers.imu.test_nmea2000 import COUNTS as NMEA2000_COUNTS
-from tests.drivers.imu.test_nmea2000 import bus
 from tests.drivers.imu_dbc import imu_rows
 from tests.drivers.ouster_cases import metadata_of
 from tests.drivers.recordings import FIXTURES, every_recording, expected, gpsd_lines
@@ -155,7 +153,7 @@ def check_canmod(copy: Path, entry: Entry) -> None:
 
 
 def check_nmea2000(copy: Path, entry: Entry) -> None:
-    frames = bus(copy.name)
+    frames = nmea2000_bus(copy.name)
     messages = entry.get("messages") or entry["messages_after_fast_packet_reassembly"]
     parser = find_driver("imu", "nmea2000").make_parser(DeviceSettings("imu/main"))
     for batch in packet_batches(frames, lambda: len(frames)):

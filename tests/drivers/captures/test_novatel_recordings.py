@@ -17,7 +17,7 @@ import pytest
 from swath.drivers.captures.opening import CaptureTally, read_pcap
 from swath.drivers.framing.checksums import crc32_novatel
 from swath.georef.records import DeviceStatus, GnssFix, GnssHeading, InsSolution, TimeMessage
-from tests.drivers.gnss.novatel.test_novatel import COUNTS, make, of_type, parse, rows_of
+from tests.drivers.builders import NOVATEL_COUNTS, make_novatel, of_type, parse_novatel, rows_of
 from tests.drivers.novatel_ascii import FIXTURES, WEEK_NS, recording
 from tests.drivers.ros_bag import Message, read_bag
 
@@ -50,12 +50,12 @@ def gps_ns(message: Message) -> int:
 def test_log_counts_match_the_ros_driver(name: str, published: dict[str, str]) -> None:
     topics = Counter(topic.removeprefix("/novatel/oem7/") for topic, _ in read_bag(recording(f"{name}.bag")))
     assert {topic: topics[topic] for topic in published} == {
-        topic: COUNTS[f"{name}.gps"][log] for topic, log in published.items()
+        topic: NOVATEL_COUNTS[f"{name}.gps"][log] for topic, log in published.items()
     }
 
 
 def test_positions_and_velocities_match_the_ros_driver() -> None:
-    records = parse(recording("bestpos.gps"))
+    records = parse_novatel(recording("bestpos.gps"))
     for fix, theirs in zip(of_type(records, GnssFix, "BESTPOS"), ros_messages("bestpos", "bestpos"), strict=True):
         assert (fix.time.week or 0) * WEEK_NS + fix.time.time_ns == gps_ns(theirs)
         assert (fix.lat_rad, fix.lon_rad) == (math.radians(theirs["lat"]), math.radians(theirs["lon"]))
@@ -73,7 +73,7 @@ def test_positions_and_velocities_match_the_ros_driver() -> None:
 
 
 def test_solutions_match_the_ros_driver() -> None:
-    rows = rows_of(parse(recording("bestpos.gps")), InsSolution)
+    rows = rows_of(parse_novatel(recording("bestpos.gps")), InsSolution)
     rows = rows[np.isnan(rows["position_sigma_l"][:, 0])]  # without INSPVAX, which the driver made no INSPVA of
     for row, theirs in zip(rows, ros_messages("bestpos", "inspva"), strict=True):
         assert row["gps_ns"] == gps_ns(theirs)
@@ -87,7 +87,7 @@ def test_solutions_match_the_ros_driver() -> None:
 
 
 def test_headings_match_the_ros_driver() -> None:
-    headings = of_type(parse(recording("align.gps")), GnssHeading)
+    headings = of_type(parse_novatel(recording("align.gps")), GnssHeading)
     for heading, theirs in zip(headings, ros_messages("align", "heading2"), strict=True):
         assert heading.time is not None
         assert (heading.time.week or 0) * WEEK_NS + heading.time.time_ns == gps_ns(theirs)
@@ -96,7 +96,7 @@ def test_headings_match_the_ros_driver() -> None:
 
 
 def test_increments_match_the_ros_driver() -> None:
-    status = of_type(parse(recording("ins1.gps")), DeviceStatus, "CORRIMUS")
+    status = of_type(parse_novatel(recording("ins1.gps")), DeviceStatus, "CORRIMUS")
     for record, theirs in zip(status, ros_messages("ins1", "corrimu"), strict=True):
         values = record.values
         turned = [values[f"delta_angle_{axis}_rad"] for axis in "xyz"]
@@ -107,7 +107,7 @@ def test_increments_match_the_ros_driver() -> None:
 
 
 def test_times_match_the_ros_driver() -> None:
-    times = of_type(parse(recording("time.gps")), TimeMessage)
+    times = of_type(parse_novatel(recording("time.gps")), TimeMessage)
     for time, theirs in zip(times, ros_messages("time", "time"), strict=True):
         assert (time.time.week or 0) * WEEK_NS + time.time.time_ns == gps_ns(theirs)
         assert time.time.leap_seconds == round(-theirs["utc_offset"])
@@ -123,12 +123,12 @@ def test_times_match_the_ros_driver() -> None:
 
 def test_a_log_with_altered_bytes_is_refused() -> None:
     """A text filter put CR before each LF, in the binary log too: the log is refused until that is undone."""
-    data, parser = recording(UTM), make()
-    assert parse(data, parser) == []
+    data, parser = recording(UTM), make_novatel()
+    assert parse_novatel(data, parser) == []
     assert not +parser.counters.messages
     assert (parser.counters.bad_checksums, parser.counters.bytes_skipped) == (1, len(data))
-    parser = make()
-    parse(data.replace(b"\r\n", b"\n"), parser)
+    parser = make_novatel()
+    parse_novatel(data.replace(b"\r\n", b"\n"), parser)
     assert parser.counters.messages == {"BESTUTM": 1}
     assert parser.counters.bad_checksums == 0
 
@@ -136,8 +136,8 @@ def test_a_log_with_altered_bytes_is_refused() -> None:
 @pytest.mark.parametrize("form", ["BINARY", "FLATTENED_BINARY"])
 def test_binary_output_of_the_converter_is_framed(form: str) -> None:
     """The same two logs as in its JSON, also with arrays filled up to their greatest length."""
-    data, parser = recording(f"{UTM}.{form}"), make()
-    parse(data, parser)
+    data, parser = recording(f"{UTM}.{form}"), make_novatel()
+    parse_novatel(data, parser)
     assert parser.counters.messages == {"BESTUTM": 1, "VERSION": 1}
     assert parser.counters.bytes_framed == len(data)
     decoder, text, at = json.JSONDecoder(), recording(f"{UTM}.JSON").decode(), 0
@@ -154,8 +154,8 @@ def test_binary_output_of_the_converter_is_framed(form: str) -> None:
 
 @pytest.mark.parametrize("form", ["ASCII", "ABBREV_ASCII", "JSON"])
 def test_text_output_of_the_converter_contains_no_binary_log(form: str) -> None:
-    data, parser = recording(f"{UTM}.{form}"), make()
-    assert parse(data, parser) == []
+    data, parser = recording(f"{UTM}.{form}"), make_novatel()
+    assert parse_novatel(data, parser) == []
     assert not +parser.counters.messages
     assert parser.counters.bytes_skipped == len(data)
 

@@ -7,8 +7,6 @@ import operator
 import random
 import zlib
 from collections import Counter
-from collections.abc import Mapping
-from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -42,6 +40,7 @@ from swath.drivers.gnss.nmea.sentences import encode_sentence
 from swath.drivers.gnss.ubx.messages import encode_frame
 from swath.drivers.parser import StreamParser
 from swath.georef.records import Chunk, Record
+from tests.drivers.builders import comparable, others_messages
 from tests.drivers.harness import check_damage, check_garbage, check_stream
 from tests.drivers.recordings import every_recording, expected, gpsd_lines, gpsd_output, recording
 
@@ -135,39 +134,6 @@ def test_crc32_novatel_follows_the_bitwise_rule_of_the_manual() -> None:
 
 
 # --- every recording ---
-
-# Where others count otherwise. pynmeagps joins some makers' first field to the address (PFEC,GPatt), refuses sentences
-# it does not know or whose fields it cannot type though their checksum is good (FOO, PTNTA cut into a GPGSV, RMC with
-# a wrong speed, polls without fields); UBX configuration and aiding messages are named by class and number here.
-UNCOUNTED_BY_OTHERS = {
-    "furuno_nmea.log": {"PFEC": 2},
-    "isync.log": {"PTNTA": 1},
-    "pygpsdata-nmeafoo1.log": {"FOO": 1},
-    "pygpsdata-nmeafoo2.log": {"FOO": 1, "RMC": 1},
-    "quectel_nmea_poll.log": {"PQTMCFGMSGRATE": 1, "PQTMSN": 1},
-}
-NAMED_BY_NUMBER = ("CFG-", "MGA-", "MON-0a32", "MON-BATCH", "PFEC")
-
-
-def name_here(theirs: str) -> str:
-    """Return our name of a message in expected.json."""
-    protocol, _, name = theirs.partition(":")
-    if protocol == "RTCM3":
-        return "RTCM" + name.split("_")[0]
-    return name[2:] if protocol == "NMEA" and not name.startswith("P") and len(name) == 5 else name
-
-
-def comparable(messages: Mapping[str, int]) -> dict[str, int]:
-    """Return the messages that have the same name in both decoders."""
-    return {name: count for name, count in messages.items() if count and not name.startswith(NAMED_BY_NUMBER)}
-
-
-def others_messages(name: str, entry: Mapping[str, Any]) -> dict[str, int]:
-    """Return the messages that another decoder found, under our names."""
-    theirs: Counter[str] = Counter(UNCOUNTED_BY_OTHERS.get(name, {}))
-    for message, count in entry["messages"].items():
-        theirs[name_here(message)] += count
-    return comparable(theirs)
 
 
 @pytest.mark.parametrize(("family", "name"), every_recording())

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import gzip
 import json
-import re
 import struct
-from functools import cache
 from math import degrees, pi, radians
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,32 +18,10 @@ from swath.drivers.driver import find_driver
 from swath.drivers.imu.nmea2000 import Nmea2000Parser, make_time_parser, pgn_and_source
 from swath.drivers.parser import DeviceSettings, DriverSettingsError
 from swath.georef.records import DeviceStatus, FixType, GnssFix, GnssHeading, NamesEdge, Record, TimeMessage
+from tests.drivers.builders import NMEA2000_COUNTS, NMEA2000_FIXTURES, nmea2000_bus
 from tests.drivers.harness import STREAM_HOST_NS, check_packet_damage, check_packets, packet_batches, run_packets
 
-FIXTURES = Path(__file__).parents[3] / "fixtures/nmea2000"
 SETTINGS = DeviceSettings("imu/main", {"protocol": "nmea2000"})
-COUNTS = {  # messages of all sources: nmea2000 2026.10.3 (PyPI)
-    "can0-2_candump.log.gz": {
-        "126992": 177,
-        "127250": 1786,
-        "127251": 2383,
-        "127252": 595,
-        "127257": 1906,
-        "129025": 1639,
-        "129026": 1390,
-        "129029": 356,
-    },
-    "candumpSample2.txt.gz": {
-        "129026": 46,
-        "129025": 46,
-        "127250": 46,
-        "127251": 46,
-        "129029": 5,
-        "126992": 5,
-        "127257": 5,
-    },
-    "candumpSample3.txt.gz": {"127250": 175, "127251": 175, "127257": 175, "129025": 165, "129026": 66},
-}
 NAMES = {  # the other decoder's field -> ours
     "heading": "heading_rad",
     "deviation": "deviation_rad",
@@ -61,23 +36,11 @@ NAMES = {  # the other decoder's field -> ours
     "cog": "course_rad",
     "sog": "speed_mps",
 }
-LINE = re.compile(r"([0-9A-F]{8})(?:#([0-9A-F]*)|\s+\[\d\]\s+([0-9A-F ]+))\s*$")
-
-
-@cache
-def bus(name: str) -> tuple[bytes, ...]:
-    """All frames with 29-bit identifiers of a recording, either format of candump."""
-    with gzip.open(FIXTURES / name, "rt") as file:
-        found = [match for line in file if (match := LINE.search(line))]
-    return tuple(
-        encode_can_frame(int(identifier, 16), bytes.fromhex(compact or spaced or ""), extended=True)
-        for identifier, compact, spaced in (match.groups() for match in found)
-    )
 
 
 def decoded(name: str) -> list[dict[str, Any]]:
     """Return the other decoder's messages in order."""
-    with gzip.open(FIXTURES / name, "rt") as file:
+    with gzip.open(NMEA2000_FIXTURES / name, "rt") as file:
         return [json.loads(line) for line in file]
 
 
@@ -114,20 +77,20 @@ def position(lat_deg: float, *, method: int = 1, days: int = 19326, time: int = 
     return counts + struct.pack("<BBBhhiB", method << 4, 0xFC, 9, 90, 0x7FFF, 4690, 0)
 
 
-@pytest.mark.parametrize("name", COUNTS)
+@pytest.mark.parametrize("name", NMEA2000_COUNTS)
 def test_message_counts_match_another_decoder(name: str) -> None:
     parser = parser_of()
-    parse(bus(name), parser)
-    assert dict(parser.counters.messages) == COUNTS[name]
+    parse(nmea2000_bus(name), parser)
+    assert dict(parser.counters.messages) == NMEA2000_COUNTS[name]
     assert parser.counters.bad_messages == 0
 
 
 def test_every_frame_of_the_bus_is_read() -> None:
-    assert len(bus("can0-2_candump.log.gz")) == 47_166
+    assert len(nmea2000_bus("can0-2_candump.log.gz")) == 47_166
 
 
 def test_values_of_every_source_are_decoded_in_order() -> None:
-    units = bus("can0-2_candump.log.gz")
+    units = nmea2000_bus("can0-2_candump.log.gz")
     theirs = decoded("can0-2.nmea2000_decoded.jsonl.gz")
     compared = 0
     for source in sorted({message["src"] for message in theirs}):
@@ -155,7 +118,7 @@ def seconds_of_day(text: str) -> int:
 
 
 def test_fast_packets_of_every_source_are_decoded_in_order() -> None:
-    units, theirs = bus("can0-2_candump.log.gz"), decoded("can0-2.129029_decoded.jsonl.gz")
+    units, theirs = nmea2000_bus("can0-2_candump.log.gz"), decoded("can0-2.129029_decoded.jsonl.gz")
     types = {"GNSS fix": FixType.SINGLE, "DGNSS fix": FixType.DIFFERENTIAL}
     for source in sorted({message["src"] for message in theirs}):
         records = parse(units, parser_of(source))
@@ -177,7 +140,7 @@ def test_fast_packets_of_every_source_are_decoded_in_order() -> None:
 
 
 def test_the_first_source_of_each_pgn_is_used_and_the_others_counted() -> None:
-    units, theirs = bus("can0-2_candump.log.gz"), decoded("can0-2.nmea2000_decoded.jsonl.gz")
+    units, theirs = nmea2000_bus("can0-2_candump.log.gz"), decoded("can0-2.nmea2000_decoded.jsonl.gz")
     first: dict[int, int] = {}
     for message in theirs:
         first.setdefault(message["pgn"], message["src"])
@@ -200,13 +163,13 @@ def r_message(record: Record) -> str:
 
 
 def test_records_do_not_depend_on_batches() -> None:
-    whole = check_packets(parser_of, bus("can0-2_candump.log.gz")[:3000])
+    whole = check_packets(parser_of, nmea2000_bus("can0-2_candump.log.gz")[:3000])
     assert whole.counters["errors"]["other_source"] > 100
     assert whole.counters["messages"]["129029"] > 10
 
 
 def test_damaged_frames_never_raise() -> None:
-    check_packet_damage(parser_of, bus("can0-2_candump.log.gz")[100:])
+    check_packet_damage(parser_of, nmea2000_bus("can0-2_candump.log.gz")[100:])
 
 
 @settings(max_examples=150, deadline=None, derandomize=True)
@@ -331,7 +294,7 @@ def test_a_wrong_source_address_is_refused(wrong: Any) -> None:
 
 
 def test_the_recorder_gets_time_messages_only() -> None:
-    records = parse(bus("can0-2_candump.log.gz"), make_time_parser(SETTINGS))
+    records = parse(nmea2000_bus("can0-2_candump.log.gz"), make_time_parser(SETTINGS))
     assert {type(record) for record in records} == {TimeMessage}
     assert len(records) == 60
     assert find_driver("imu", "nmea2000").make_time_parser is make_time_parser

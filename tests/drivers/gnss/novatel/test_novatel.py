@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from typing import TypeVar
 
 import numpy as np
 import pytest
@@ -22,10 +21,9 @@ from swath.georef.records import (
     ImuSamples,
     InsSolution,
     NamesEdge,
-    Record,
-    StructArray,
     TimeMessage,
 )
+from tests.drivers.builders import HOST_NS, NOVATEL_COUNTS, NOVATEL_SPAN, make_novatel, of_type, parse_novatel, rows_of
 from tests.drivers.harness import (
     check_damage,
     check_every_cut,
@@ -37,48 +35,6 @@ from tests.drivers.harness import (
 )
 from tests.drivers.novatel_ascii import WEEK_NS, AsciiLog, ascii_logs, recording
 
-HOST_NS = 1_700_000_000_000_000_000
-RecordT = TypeVar("RecordT")
-SPAN = "propak6-basic-fix.gps"
-COUNTS = {  # by an existing decoder and by checksum
-    "oemv_200911218.gps": {
-        "TRACKSTAT": 50,
-        "BESTPOS": 49,
-        "SATVIS": 49,
-        "RANGECMP": 46,
-        "NOVATEL-287": 90,
-        "RAWEPHEM": 25,
-        "GLOEPHEMERIS": 8,
-    },
-    "bestpos-bestvel-psrdop2-sync.gps": {"PSRDOP2": 33, "BESTPOS": 33, "BESTVEL": 33},
-    SPAN: {"CORRIMUDATA": 1988, "INSCOV": 1988, "INSPVAX": 1988, "BESTPOS": 2187, "BESTXYZ": 1988},
-    "align.gps": {"HEADING2": 12},
-    "bestpos.gps": {"INSPVAS": 10, "BESTPOS": 5, "BESTVEL": 5, "PSRDOP2": 2, "INSPVAX": 2, "BESTUTM": 2},
-    "ins1.gps": {"INSPVAS": 243, "INSSTDEV": 29, "CORRIMUS": 10, "INSCONFIG": 2},
-    "rxstatus.gps": {"RXSTATUS": 3},
-    "time.gps": {"TIME": 6},
-    "unit_test_vectors.bin": {
-        "BESTPOS": 8,
-        "RAWIMUSX": 4,
-        "LOGLIST": 3,
-        "SOURCETABLE": 1,
-        "VERSION": 2,
-        "PROFILEINFO": 1,
-        "PORTSTATS": 1,
-        "PSRDOP": 1,
-        "VALIDMODELS": 1,
-        "SETNAV-response": 2,
-        "UALCONTROL": 1,
-        "TRACKSTAT": 2,
-        "BESTSATS": 1,
-        "RAWGPSSUBFRAME": 1,
-        "BESTUTM": 1,
-        "INSPVA": 1,
-        "INSPVAS": 1,
-        "CONFIGCODE": 1,
-        "RXCONFIG": 2,
-    },
-}
 NO_MESSAGES = (
     "binary_sync_error.BIN",
     "short_ascii_sync_error.ASC",
@@ -106,54 +62,33 @@ INS_STATUS = {
 }
 
 
-def make() -> NovatelParser:
-    """Return a parser of every message."""
-    return NovatelParser(DeviceSettings("gnss/rover"))
-
-
-def parse(data: bytes, parser: NovatelParser | None = None) -> list[Record]:
-    """Return all records of a recording."""
-    parser = parser or make()
-    return [*parser.feed(Chunk("gnss/rover", HOST_NS, data)), *parser.close()]
-
-
-def of_type(records: list[Record], kind: type[RecordT], message: str = "") -> list[RecordT]:
-    """Return the records of one type, optionally of one message."""
-    return [r for r in records if isinstance(r, kind) and (not message or getattr(r, "message", "") == message)]
-
-
-def rows_of(records: list[Record], kind: type[InsSolution] | type[ImuSamples]) -> StructArray:
-    """Return all rows of one type."""
-    return np.concatenate([record.rows for record in records if isinstance(record, kind)])
-
-
-@pytest.mark.parametrize("name", COUNTS)
+@pytest.mark.parametrize("name", NOVATEL_COUNTS)
 def test_messages_match_the_reference_decoder(name: str) -> None:
-    parser = make()
-    parse(recording(name), parser)
-    assert +parser.counters.messages == Counter(COUNTS[name])
+    parser = make_novatel()
+    parse_novatel(recording(name), parser)
+    assert +parser.counters.messages == Counter(NOVATEL_COUNTS[name])
     assert parser.counters.bytes == parser.counters.bytes_framed + parser.counters.bytes_skipped
     assert parser.counters.bad_messages == 0
 
 
 @pytest.mark.parametrize("name", NO_MESSAGES)
 def test_recordings_without_novatel_logs_give_no_messages(name: str) -> None:
-    parser = make()
+    parser = make_novatel()
     data = recording(name)
-    assert parse(data, parser) == []
+    assert parse_novatel(data, parser) == []
     assert not +parser.counters.messages
     assert parser.counters.bytes_skipped == len(data)
 
 
 def test_a_prompt_between_logs_is_skipped() -> None:
     data = recording("bestpos-bestvel-psrdop2-sync.gps")
-    parser = make()
-    parse(data, parser)
+    parser = make_novatel()
+    parse_novatel(data, parser)
     assert data.startswith(b"[ICOM1]")
     assert parser.counters.bytes_skipped == len(b"[ICOM1]")
-    parser = make()
+    parser = make_novatel()
     log = recording("time.gps")[:76]
-    assert len(of_type(parse(b"[COM1]" + log + b"\r\n<OK\r\n[COM1]" + log, parser), TimeMessage)) == 2
+    assert len(of_type(parse_novatel(b"[COM1]" + log + b"\r\n<OK\r\n[COM1]" + log, parser), TimeMessage)) == 2
     assert parser.counters.bytes_skipped == 6 + 13
 
 
@@ -166,39 +101,40 @@ def test_a_prompt_between_logs_is_skipped() -> None:
     ["bestpos.gps", "ins1.gps", "align.gps", "time.gps", "unit_test_vectors.bin"],
 )
 def test_records_do_not_depend_on_how_a_recording_is_cut(name: str) -> None:
-    whole = check_stream(make, recording(name))
-    assert whole.counters["messages"] == COUNTS[name]
+    whole = check_stream(make_novatel, recording(name))
+    assert whole.counters["messages"] == NOVATEL_COUNTS[name]
 
 
 @pytest.mark.slow
 def test_records_do_not_depend_on_how_a_large_recording_is_cut() -> None:
-    check_stream(make, recording(SPAN)[: 160 * 1024])
-    check_stream(make, recording("oemv_200911218.gps")[: 48 * 1024])
+    check_stream(make_novatel, recording(NOVATEL_SPAN)[: 160 * 1024])
+    check_stream(make_novatel, recording("oemv_200911218.gps")[: 48 * 1024])
     prompts = recording("bestpos-bestvel-psrdop2-sync.gps")
-    check_random_reads(make, prompts)
-    check_every_cut(make, prompts, window=1024)
-    check_random_cuts(make, prompts)
+    check_random_reads(make_novatel, prompts)
+    check_every_cut(make_novatel, prompts, window=1024)
+    check_random_cuts(make_novatel, prompts)
 
 
-@pytest.mark.parametrize("name", ["bestpos.gps", "unit_test_vectors.bin", SPAN])
+@pytest.mark.parametrize("name", ["bestpos.gps", "unit_test_vectors.bin", NOVATEL_SPAN])
 def test_damage_affects_only_the_logs_it_hits(name: str) -> None:
-    check_damage(make, recording(name), examples=30, window=4096)
+    check_damage(make_novatel, recording(name), examples=30, window=4096)
 
 
 def test_garbage_never_raises() -> None:
-    check_garbage(make)
+    check_garbage(make_novatel)
 
 
 # --- values
 
 
 @pytest.mark.parametrize(
-    "name", [SPAN, "bestpos.gps", "bestpos-bestvel-psrdop2-sync.gps", "oemv_200911218.gps", "unit_test_vectors.bin"]
+    "name",
+    [NOVATEL_SPAN, "bestpos.gps", "bestpos-bestvel-psrdop2-sync.gps", "oemv_200911218.gps", "unit_test_vectors.bin"],
 )
 def test_bestpos_matches_edie(name: str) -> None:
-    fixes = of_type(parse(recording(name)), GnssFix, "BESTPOS")
+    fixes = of_type(parse_novatel(recording(name)), GnssFix, "BESTPOS")
     expected = ascii_logs(name, "BESTPOS")
-    assert len(fixes) == len(expected) == COUNTS[name]["BESTPOS"]
+    assert len(fixes) == len(expected) == NOVATEL_COUNTS[name]["BESTPOS"]
     for fix, log in zip(fixes, expected, strict=True):
         assert_position(fix, log)
 
@@ -226,7 +162,7 @@ def assert_position(fix: GnssFix, log: AsciiLog) -> None:
 
 @pytest.mark.parametrize("name", ["bestpos.gps", "bestpos-bestvel-psrdop2-sync.gps"])
 def test_bestvel_matches_edie_with_the_latency_subtracted_from_its_time(name: str) -> None:
-    fixes = of_type(parse(recording(name)), GnssFix, "BESTVEL")
+    fixes = of_type(parse_novatel(recording(name)), GnssFix, "BESTVEL")
     expected = ascii_logs(name, "BESTVEL")
     assert len(fixes) == len(expected) > 0
     for fix, log in zip(fixes, expected, strict=True):
@@ -241,7 +177,7 @@ def test_bestvel_matches_edie_with_the_latency_subtracted_from_its_time(name: st
 
 
 def test_time_matches_edie() -> None:
-    times = of_type(parse(recording("time.gps")), TimeMessage)
+    times = of_type(parse_novatel(recording("time.gps")), TimeMessage)
     expected = ascii_logs("time.gps", "TIME")
     assert len(times) == len(expected) == 6
     for time, log in zip(times, expected, strict=True):
@@ -253,12 +189,12 @@ def test_time_matches_edie() -> None:
 
 
 def test_solutions_on_a_whole_second_name_it_once_and_only_with_a_valid_time() -> None:
-    times = of_type(parse(recording(SPAN), make_time_parser(DeviceSettings("gnss/rover"))), TimeMessage)
+    times = of_type(parse_novatel(recording(NOVATEL_SPAN), make_time_parser(DeviceSettings("gnss/rover"))), TimeMessage)
     seconds = [time.time.time_ns // 1_000_000_000 for time in times]
     assert seconds == sorted(set(seconds))
     assert len(seconds) == 199
     assert not any(time.bound for time in times)
-    oemv = of_type(parse(recording("oemv_200911218.gps")), TimeMessage)
+    oemv = of_type(parse_novatel(recording("oemv_200911218.gps")), TimeMessage)
     assert {time.time.week for time in oemv} == {1562}
     assert len(oemv) == sum(log.status == "FINESTEERING" for log in ascii_logs("oemv_200911218.gps", "BESTPOS")) == 46
 
@@ -266,7 +202,7 @@ def test_solutions_on_a_whole_second_name_it_once_and_only_with_a_valid_time() -
 @pytest.mark.parametrize(("name", "log"), [("bestpos.gps", "INSPVAS"), ("ins1.gps", "INSPVAS")])
 def test_inspvas_matches_edie(name: str, log: str) -> None:
     parser = NovatelParser(DeviceSettings("gnss/rover"), wanted=(InsSolution,))
-    rows = rows_of(parse(recording(name), parser), InsSolution)
+    rows = rows_of(parse_novatel(recording(name), parser), InsSolution)
     if name == "bestpos.gps":
         rows = rows[np.isnan(rows["position_sigma_l"][:, 0])]  # INSPVAX says sigmas
     expected = ascii_logs(name, log)
@@ -278,9 +214,9 @@ def test_inspvas_matches_edie(name: str, log: str) -> None:
         assert row["status"] == INS_STATUS[line.fields[11]]
 
 
-@pytest.mark.parametrize("name", [SPAN, "bestpos.gps"])
+@pytest.mark.parametrize("name", [NOVATEL_SPAN, "bestpos.gps"])
 def test_inspvax_matches_edie(name: str) -> None:
-    rows = rows_of(parse(recording(name)), InsSolution)
+    rows = rows_of(parse_novatel(recording(name)), InsSolution)
     rows = rows[~np.isnan(rows["position_sigma_l"][:, 0])]
     expected = ascii_logs(name, "INSPVAX")
     assert len(rows) == len(expected) > 0
@@ -305,7 +241,7 @@ def assert_solution(row: np.void, numbers: list[float], undulation: float) -> No
 
 
 def test_heights_of_ins_and_position_agree_on_the_ellipsoid() -> None:
-    records = parse(recording("bestpos.gps"))
+    records = parse_novatel(recording("bestpos.gps"))
     heights = [fix.height_m for fix in of_type(records, GnssFix, "BESTPOS")]
     rows = rows_of(records, InsSolution)
     assert len(heights) == 5
@@ -313,7 +249,7 @@ def test_heights_of_ins_and_position_agree_on_the_ellipsoid() -> None:
 
 
 def test_heading2_matches_edie() -> None:
-    headings = of_type(parse(recording("align.gps")), GnssHeading)
+    headings = of_type(parse_novatel(recording("align.gps")), GnssHeading)
     expected = ascii_logs("align.gps", "HEADING2")
     assert len(headings) == len(expected) == 12
     for heading, log in zip(headings, expected, strict=True):
@@ -329,7 +265,7 @@ def test_heading2_matches_edie() -> None:
 
 
 def test_rawimusx_matches_edie_and_measures_one_g() -> None:
-    rows = rows_of(parse(recording("unit_test_vectors.bin")), ImuSamples)
+    rows = rows_of(parse_novatel(recording("unit_test_vectors.bin")), ImuSamples)
     expected = ascii_logs("unit_test_vectors.bin", "RAWIMUSX")
     assert len(rows) == len(expected) == 4
     scales = {  # type -> m/s², rad/s a count
@@ -349,7 +285,7 @@ def test_rawimusx_matches_edie_and_measures_one_g() -> None:
 
 @pytest.mark.parametrize(
     ("name", "rows", "kind"),
-    [("unit_test_vectors.bin", 4, ImuSamples), (SPAN, 1988, InsSolution), ("ins1.gps", 243, InsSolution)],
+    [("unit_test_vectors.bin", 4, ImuSamples), (NOVATEL_SPAN, 1988, InsSolution), ("ins1.gps", 243, InsSolution)],
 )
 def test_imu_parser_of_the_gnss_stream_gives_the_samples_of_the_gnss_parser(
     name: str, rows: int, kind: type[InsSolution] | type[ImuSamples]
@@ -360,13 +296,13 @@ def test_imu_parser_of_the_gnss_stream_gives_the_samples_of_the_gnss_parser(
     assert {type(record) for record in records} <= {ImuSamples, InsSolution}
     inside = rows_of(records, kind)
     assert len(inside) == rows
-    assert packed_rows(inside) == packed_rows(rows_of(parse(recording(name)), kind))
+    assert packed_rows(inside) == packed_rows(rows_of(parse_novatel(recording(name)), kind))
     assert (kind is ImuSamples) == any(isinstance(record, ImuSamples) for record in records)
 
 
-@pytest.mark.parametrize(("name", "message", "first"), [("ins1.gps", "CORRIMUS", 1), (SPAN, "CORRIMUDATA", 2)])
+@pytest.mark.parametrize(("name", "message", "first"), [("ins1.gps", "CORRIMUS", 1), (NOVATEL_SPAN, "CORRIMUDATA", 2)])
 def test_corrected_increments_match_edie(name: str, message: str, first: int) -> None:
-    status = of_type(parse(recording(name)), DeviceStatus, message)
+    status = of_type(parse_novatel(recording(name)), DeviceStatus, message)
     expected = ascii_logs(name, message)
     assert len(status) == len(expected) > 0
     for record, log in zip(status, expected, strict=True):
@@ -382,6 +318,6 @@ def test_corrected_increments_match_edie(name: str, message: str, first: int) ->
 
 
 def test_the_recorder_gets_time_messages_only() -> None:
-    for name in COUNTS:
-        records = parse(recording(name), make_time_parser(DeviceSettings("gnss/rover")))
+    for name in NOVATEL_COUNTS:
+        records = parse_novatel(recording(name), make_time_parser(DeviceSettings("gnss/rover")))
         assert {type(record) for record in records} <= {TimeMessage}
