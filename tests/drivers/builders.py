@@ -14,8 +14,17 @@ import numpy as np
 
 from swath.drivers.can_frames import encode_can_frame
 from swath.drivers.gnss.novatel.parser import NovatelParser
-from swath.drivers.parser import DeviceSettings
-from swath.georef.records import Chunk, ImuSamples, InsSolution, Record, StructArray
+from swath.drivers.parser import DeviceSettings, PacketParser
+from swath.georef.records import (
+    Chunk,
+    DeviceClockSamples,
+    ImuSamples,
+    InsSolution,
+    Record,
+    ScannerReturns,
+    StructArray,
+    TimeMessage,
+)
 
 # Where others count otherwise. pynmeagps joins some makers' first field to the address (PFEC,GPatt), refuses sentences
 # it does not know or whose fields it cannot type though their checksum is good (FOO, PTNTA cut into a GPGSV, RMC with
@@ -151,3 +160,32 @@ def nmea2000_bus(name: str) -> tuple[bytes, ...]:
         encode_can_frame(int(identifier, 16), bytes.fromhex(compact or spaced or ""), extended=True)
         for identifier, compact, spaced in (match.groups() for match in found)
     )
+
+
+def feed(parser: PacketParser, units: list[bytes]) -> list[Record]:
+    """Parse units, one millisecond apart; consecutive ones of equal length form a batch."""
+    records: list[Record] = []
+    at = 0
+    while at < len(units):
+        stop = at + 1
+        while stop < len(units) and len(units[stop]) == len(units[at]):
+            stop += 1
+        rows = np.frombuffer(b"".join(units[at:stop]), dtype=np.uint8).reshape(stop - at, -1)
+        records += parser.parse_units(np.arange(at, stop, dtype=np.int64) * 1_000_000, rows)
+        at = stop
+    return records
+
+
+def returns_of(records: list[Record]) -> StructArray:
+    """Return all returns, in order."""
+    return np.concatenate([record.rows for record in records if isinstance(record, ScannerReturns)])
+
+
+def clock_of(records: list[Record]) -> StructArray:
+    """Return all clock samples, in order."""
+    return np.concatenate([record.rows for record in records if isinstance(record, DeviceClockSamples)])
+
+
+def times(records: list[Record]) -> list[TimeMessage]:
+    """Return the time messages among records."""
+    return [record for record in records if isinstance(record, TimeMessage)]

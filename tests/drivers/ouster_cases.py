@@ -14,7 +14,7 @@ from swath.drivers.captures.opening import read_pcap
 from swath.drivers.parser import DeviceSettings
 from swath.drivers.scanner.ouster.layout import PROFILES, LidarLayout
 from swath.drivers.scanner.ouster.parser import OusterParser
-from swath.georef.records import ImuSamples, Record, ScannerReturns, StructArray
+from swath.georef.records import ImuSamples, Record, StructArray
 
 FIXTURES = Path(__file__).parents[2] / "fixtures" / "ouster"
 EXPECTED: dict[str, dict[str, Any]] = json.loads((FIXTURES / "expected.json").read_text())
@@ -38,24 +38,6 @@ def parser_of(metadata: bytes, *, clock_only: bool = False, **config: Any) -> Ou
 
 def recorded(capture: str) -> OusterParser:
     return parser_of(metadata_of(capture))
-
-
-def feed(parser: OusterParser, units: list[bytes]) -> list[Record]:
-    """Runs of equal length as one batch each, one millisecond a unit."""
-    records: list[Record] = []
-    at = 0
-    while at < len(units):
-        stop = at + 1
-        while stop < len(units) and len(units[stop]) == len(units[at]):
-            stop += 1
-        rows = np.frombuffer(b"".join(units[at:stop]), dtype=np.uint8).reshape(stop - at, -1)
-        records += parser.parse_units(np.arange(at, stop, dtype=np.int64) * 1_000_000, rows)
-        at = stop
-    return records
-
-
-def returns_of(records: list[Record]) -> StructArray:
-    return np.concatenate([record.rows for record in records if isinstance(record, ScannerReturns)])
 
 
 def samples_of(records: list[Record]) -> StructArray:

@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swath.drivers.captures.opening import read_pcap
-from swath.drivers.parser import PacketParser
 from swath.drivers.scanner.beams import BeamTable, beam_points
-from swath.georef.records import DeviceClockSamples, Record, ScannerReturns, StructArray
+from swath.georef.records import StructArray
 from tests.drivers.recordings import FIXTURES
 
 Points = NDArray[np.float64]
@@ -21,30 +20,6 @@ Points = NDArray[np.float64]
 def payloads(path: str) -> list[bytes]:
     """Datagrams of a capture in ``fixtures/``."""
     return [unit.data for unit in read_pcap(FIXTURES / path)]
-
-
-def feed(parser: PacketParser, units: list[bytes]) -> list[Record]:
-    """Runs of equal length as one batch each, one millisecond a unit."""
-    records: list[Record] = []
-    at = 0
-    while at < len(units):
-        stop = at + 1
-        while stop < len(units) and len(units[stop]) == len(units[at]):
-            stop += 1
-        rows = np.frombuffer(b"".join(units[at:stop]), dtype=np.uint8).reshape(stop - at, -1)
-        records += parser.parse_units(np.arange(at, stop, dtype=np.int64) * 1_000_000, rows)
-        at = stop
-    return records
-
-
-def returns_of(records: list[Record]) -> StructArray:
-    """All returns, in order."""
-    return np.concatenate([record.rows for record in records if isinstance(record, ScannerReturns)])
-
-
-def clock_of(records: list[Record]) -> StructArray:
-    """All clock samples, in order."""
-    return np.concatenate([record.rows for record in records if isinstance(record, DeviceClockSamples)])
 
 
 def ros_points(rows: StructArray, beams: BeamTable) -> Points:

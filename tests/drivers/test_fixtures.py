@@ -28,12 +28,19 @@ from swath.drivers.imu.nmea2000 import pgn_and_source
 from swath.drivers.parser import DeviceKind, DeviceSettings, Parser
 from swath.drivers.scanner.ouster.head import read_head
 from swath.georef.records import Chunk, ChunkBatch, Record, ScannerReturns, TimeMessage
-from tests.drivers.builders import NMEA2000_COUNTS, comparable, nmea2000_bus, others_messages
+from tests.drivers.builders import (
+    NMEA2000_COUNTS,
+    clock_of,
+    comparable,
+    feed,
+    nmea2000_bus,
+    others_messages,
+    returns_of,
+)
 from tests.drivers.harness import packet_batches
 from tests.drivers.imu_dbc import imu_rows
 from tests.drivers.ouster_cases import metadata_of
 from tests.drivers.recordings import FIXTURES, every_recording, expected, gpsd_lines
-from tests.drivers.spinning import clock_of, feed, returns_of
 
 Entry = dict[str, Any]
 Check = Callable[[Path, Entry], None]

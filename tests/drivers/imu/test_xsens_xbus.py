@@ -19,7 +19,8 @@ from swath.drivers.framing.kinds import XBUS, XBUS_MAX_DATA_BYTES
 from swath.drivers.imu import xsens_xbus as xbus
 from swath.drivers.imu.xsens_xbus import XbusParser, make_time_parser
 from swath.drivers.parser import DeviceSettings, DriverSettingsError, ParserCounters
-from swath.georef.records import Chunk, ChunkBatch, NamesEdge, Record, TimeMessage
+from swath.georef.records import Chunk, ChunkBatch, NamesEdge, Record
+from tests.drivers.builders import times
 from tests.drivers.harness import (
     STREAM_HOST_NS,
     check_damage,
@@ -74,10 +75,6 @@ def parse(*pieces: bytes, **config: Any) -> tuple[list[Record], XbusParser]:
     """Parse the pieces to the end; return records and parser."""
     parser = make(**config)
     return feed_pieces(parser, pieces), parser
-
-
-def times(records: list[Record]) -> list[TimeMessage]:
-    return [record for record in records if isinstance(record, TimeMessage)]
 
 
 # --- recordings ---

@@ -28,8 +28,9 @@ from swath.georef.scanner.calibration import nominal
 from swath.georef.scanner.sensor_model import SensorModel
 from swath.georef.trajectory.trajectory import Trajectory
 from tests.drivers import ouster_cases
+from tests.drivers.builders import feed, returns_of
 from tests.drivers.recordings import FIXTURES
-from tests.drivers.spinning import are_near, feed, payloads, read_pcd, returns_of, xyz
+from tests.drivers.spinning import are_near, payloads, read_pcd, xyz
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
@@ -221,7 +222,7 @@ LIDAR = (
 @pytest.mark.parametrize("capture", LIDAR)
 def test_ouster_points_match_the_manufacturers_decoder(capture: str) -> None:
     parser = ouster_cases.recorded(capture)
-    rows = returns_of(ouster_cases.feed(parser, ouster_cases.payloads(capture)))
+    rows = returns_of(feed(parser, ouster_cases.payloads(capture)))
     with np.load(FIXTURES / "ouster" / f"{capture}.ouster_sdk.npz") as archive:
         ranges, stamps, theirs = archive["RANGE"], archive["timestamp"], archive["xyz_first_200_columns"]
     column = ouster_cases.measurement_ids(rows, parser.head.columns_per_frame)

@@ -12,6 +12,8 @@ from swath.drivers.gnss.nmea import sentences as nmea
 from swath.drivers.gnss.nmea.parser import DRIVERS, NmeaParser
 from swath.drivers.parser import DeviceSettings, DriverSettingsError
 from swath.georef.records import Chunk, FixType, GnssFix, GnssHeading, NamesEdge, Record, TimeMessage, TimeScale
+from tests.drivers.builders import of_type, times
+from tests.drivers.gnss.builders import fixes
 from tests.drivers.harness import (
     canonical,
     check_bytewise,
@@ -37,18 +39,6 @@ def parse(*sentences: bytes, config: dict[str, object] | None = None) -> tuple[l
     """Parse the sentences to the end; return records and parser."""
     parser = NmeaParser(DeviceSettings("gnss/test", config or {}))
     return feed_pieces(parser, sentences), parser
-
-
-def of_type(records: list[Record], kind: type) -> list[Record]:
-    return [record for record in records if isinstance(record, kind)]
-
-
-def fixes(records: list[Record]) -> list[GnssFix]:
-    return [record for record in records if isinstance(record, GnssFix)]
-
-
-def times(records: list[Record]) -> list[TimeMessage]:
-    return [record for record in records if isinstance(record, TimeMessage)]
 
 
 # --- recordings ---

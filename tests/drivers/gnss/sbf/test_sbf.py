@@ -6,7 +6,7 @@ import io
 import math
 from collections import Counter
 from collections.abc import Iterator
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,13 +17,13 @@ from swath.drivers.gnss.sbf.frame import NAMES, Layout, number_of, read_header
 from swath.drivers.gnss.sbf.parser import SbfParser, make_time_parser
 from swath.drivers.parser import DeviceSettings
 from swath.georef.records import FixType, GnssFix, NamesEdge, Record, TimeMessage, TimeScale
+from tests.drivers.builders import of_type
 from tests.drivers.harness import canonical, check_damage, check_garbage, check_stream, feed_pieces
 from tests.drivers.recordings import expected, recording
 
 SETTINGS = DeviceSettings("gnss/test")
 WEEK = 2367
 RECORDINGS = sorted(expected("sbf"))
-RecordT = TypeVar("RecordT")
 
 
 def make() -> SbfParser:
@@ -34,10 +34,6 @@ def parse(*pieces: bytes) -> tuple[list[Record], SbfParser]:
     """Parse the pieces to the end; return records and parser."""
     parser = make()
     return feed_pieces(parser, pieces), parser
-
-
-def of_type(records: list[Record], kind: type[RecordT]) -> list[RecordT]:
-    return [record for record in records if isinstance(record, kind)]
 
 
 def blocks_of(name: str, block: str = "") -> Iterator[tuple[bytes, Any]]:

@@ -15,8 +15,10 @@ from pyubx2 import ERR_IGNORE, GET, UBX_PROTOCOL, UBXMessage, UBXReader
 from swath.drivers.gnss.ubx import messages as ubx
 from swath.drivers.gnss.ubx.parser import DRIVERS, UbxParser
 from swath.drivers.parser import DeviceSettings
-from swath.georef.records import Chunk, EventMark, FixType, GnssFix, NamesEdge, Record, TimeMessage, TimeScale
+from swath.georef.records import Chunk, EventMark, FixType, NamesEdge, Record, TimeMessage, TimeScale
 from swath.georef.timescales import gps_ns_from_week, whole_gps_ns
+from tests.drivers.builders import times
+from tests.drivers.gnss.builders import fixes
 from tests.drivers.harness import (
     canonical,
     check_bytewise,
@@ -43,14 +45,6 @@ def parse(*frames: bytes) -> tuple[list[Record], UbxParser]:
     """Parse the frames to the end; return records and parser."""
     parser = make()
     return feed_pieces(parser, frames), parser
-
-
-def fixes(records: list[Record]) -> list[GnssFix]:
-    return [record for record in records if isinstance(record, GnssFix)]
-
-
-def times(records: list[Record]) -> list[TimeMessage]:
-    return [record for record in records if isinstance(record, TimeMessage)]
 
 
 def decoded_by_pyubx2(name: str, identity: str) -> Iterator[tuple[bytes, Any]]:

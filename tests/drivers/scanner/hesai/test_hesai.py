@@ -43,9 +43,10 @@ from swath.georef.records import (
 )
 from swath.georef.timescales import DeviceClock
 from tests.builders import START_S, host_clock, host_ns
+from tests.drivers.builders import clock_of, feed, returns_of
 from tests.drivers.harness import check_packet_damage, check_packets
 from tests.drivers.recordings import FIXTURES
-from tests.drivers.spinning import are_near, clock_of, feed, payloads, read_pcd, returns_of
+from tests.drivers.spinning import are_near, payloads, read_pcd
 
 XYZ = np.dtype([("x", "f4"), ("y", "f4"), ("z", "f4")])
 NOON = dt.datetime(2026, 11, 21, 12, 0, 0, 250_000, tzinfo=dt.UTC)

@@ -15,7 +15,7 @@ from swath.drivers.driver import find_driver
 from swath.drivers.parser import DeviceSettings
 from swath.drivers.scanner.ouster.head import beam_points, read_head
 from swath.drivers.scanner.ouster.imu import SAMPLE_DTYPE, encode_imu_packet
-from swath.drivers.scanner.ouster.layout import PROFILES, LidarLayout, with_crc
+from swath.drivers.scanner.ouster.layout import PROFILES, with_crc
 from swath.drivers.scanner.ouster.parser import OusterParser
 from swath.georef.records import (
     RETURN_DTYPE,
@@ -26,14 +26,13 @@ from swath.georef.records import (
     DeviceStatus,
     ImuSamples,
     ScannerReturns,
-    StructArray,
 )
+from tests.drivers.builders import feed, returns_of
 from tests.drivers.harness import check_packet_damage, check_packets
 from tests.drivers.ouster_cases import (
     EXPECTED,
     FIXTURES,
     SERIAL,
-    feed,
     frames_of,
     measurement_ids,
     metadata,
@@ -42,20 +41,14 @@ from tests.drivers.ouster_cases import (
     payloads,
     random_fields,
     recorded,
-    returns_of,
     samples_of,
 )
+from tests.drivers.scanner.ouster.builders import lidar_packets
 
 DUAL, LEGACY, LOW = "OS-0-32-U1_v2.2.0_1024x10", "OS-1-32-G_v2.1.1_1024x10", "OS-1-128_v2.3.0_1024x10_lb_n3"
 SINGLE = f"{DUAL}-single-packet"
 LIDAR = (DUAL, SINGLE, LEGACY, LOW, "crc_test", "windowed_frame1")
 RETURNS = {DUAL: 21_803, SINGLE: 223, LEGACY: 27_310, LOW: 322_536, "crc_test": 29_692, "windowed_frame1": 9_246}
-
-
-def lidar_packets(capture: str) -> tuple[LidarLayout, StructArray]:
-    layout = LidarLayout(read_head(metadata_of(capture)))
-    units = b"".join(unit for unit in payloads(capture) if len(unit) == layout.packet_bytes)
-    return layout, np.frombuffer(units, dtype=layout.dtype)
 
 
 def md5(image: np.ndarray[Any, Any]) -> str:

@@ -14,10 +14,12 @@ from scipy.spatial import cKDTree
 from swath.drivers.captures.opening import read_pcap
 from swath.drivers.driver import find_driver
 from swath.drivers.parser import DeviceSettings
-from swath.drivers.scanner.ouster.head import beam_points, read_head
+from swath.drivers.scanner.ouster.head import beam_points
 from swath.drivers.scanner.ouster.layout import LidarLayout
 from swath.georef.records import Chunk, StructArray
-from tests.drivers.ouster_cases import EXPECTED, FIXTURES, feed, metadata_of, payloads, recorded, returns_of
+from tests.drivers.builders import feed, returns_of
+from tests.drivers.ouster_cases import EXPECTED, FIXTURES, metadata_of, payloads, recorded
+from tests.drivers.scanner.ouster.builders import lidar_packets
 
 DIGESTED = ("OS-0-32-U1_v2.2.0_1024x10", "OS-1-32-G_v2.1.1_1024x10")
 SINGLE = "OS-0-32-U1_v2.2.0_1024x10-single-packet"
@@ -29,12 +31,6 @@ DTYPES = {"RANGE": "u4", "RANGE2": "u4", "SIGNAL": "u2", "SIGNAL2": "u2", "NEAR_
 
 def md5(values: np.ndarray[Any, Any], dtype: str) -> str:
     return hashlib.md5(np.ascontiguousarray(values.astype(dtype)).tobytes()).hexdigest()
-
-
-def lidar_packets(capture: str) -> tuple[LidarLayout, StructArray]:
-    layout = LidarLayout(read_head(metadata_of(capture)))
-    units = b"".join(unit for unit in payloads(capture) if len(unit) == layout.packet_bytes)
-    return layout, np.frombuffer(units, dtype=layout.dtype)
 
 
 def column_values(layout: LidarLayout, columns: StructArray) -> Iterator[tuple[str, np.ndarray[Any, Any]]]:

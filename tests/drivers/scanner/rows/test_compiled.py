@@ -17,7 +17,7 @@ from swath.drivers.scanner.rows.slots import PairRule, ReturnSlots, common_words
 from swath.drivers.scanner.srep.layout import SrepHeader, encode_datagram
 from swath.drivers.scanner.srep.parser import SrepParser
 from swath.georef.records import Record, ScannerReturns, StructArray
-from tests.drivers.spinning import feed
+from tests.drivers.builders import feed
 from tests.fuzz.recordings import packets_of, settings_of
 
 SCANNERS = all_drivers("scanner")

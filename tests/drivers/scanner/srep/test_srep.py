@@ -26,6 +26,7 @@ from swath.georef.records import (
     ScannerReturns,
     StructArray,
 )
+from tests.drivers.builders import clock_of, returns_of
 from tests.drivers.harness import check_packet_damage, check_packets
 from tests.drivers.srep_cases import TEST_VECTOR, reference_decode, scan_lines, split_datagrams
 
@@ -57,14 +58,6 @@ def feed_batched(parser: SrepParser, datagrams: list[bytes], sizes: list[int]) -
         records += parser.feed_batch(ChunkBatch(SOURCE, host, units))
         at, turn = stop, (turn + 1) % len(sizes)
     return records
-
-
-def returns_of(records: list[Record]) -> StructArray:
-    return np.concatenate([record.rows for record in records if isinstance(record, ScannerReturns)])
-
-
-def clocks_of(records: list[Record]) -> StructArray:
-    return np.concatenate([record.rows for record in records if isinstance(record, DeviceClockSamples)])
 
 
 def assert_as_reference(rows: StructArray, datagrams: list[bytes], mirror_factor: float, facets: int = 0) -> None:
@@ -100,7 +93,7 @@ def test_test_vector_is_decoded_as_the_protocol_page_states() -> None:
     np.testing.assert_allclose(rows["encoder_rad"], np.array([-1000, -1000, -990]) * 2 * math.tau / 524288, atol=1e-15)
     assert (rows["flags"] == 4).all()
     assert (rows["mta_zone"] == 0).all()
-    clock = clocks_of(records)
+    clock = clock_of(records)
     assert clock["pps_count"].tolist() == [42]
     assert clock["pps_time_ns"].tolist() == [100_000_000_000]
     assert clock["device_time_ns"].tolist() == [100_400_005_000]
@@ -133,7 +126,7 @@ def test_scan_lines_agree_with_the_reference() -> None:
     assert parser.counters.messages["srep"] == 24
     assert parser.counters.bytes == parser.counters.bytes_framed == sum(map(len, datagrams))
     assert not parser.counters.errors  # the sequence wraps in the middle: no gap
-    assert clocks_of(records)["pps_time_ns"].tolist()[:4] == [-1, -1, -1, 99_999_000_000]
+    assert clock_of(records)["pps_time_ns"].tolist()[:4] == [-1, -1, -1, 99_999_000_000]
     assert [r.values["pps_locked"] for r in records if isinstance(r, DeviceStatus)] == [False, True]
     pulse = rows["pulse_id"]
     assert (np.diff(pulse.astype(np.int64)) >= 0).all()
@@ -148,7 +141,7 @@ def test_returns_do_not_depend_on_how_batches_are_cut(sizes: list[int]) -> None:
     whole, cut = make_parser(), make_parser()
     one, other = feed_all(whole, datagrams), feed_batched(cut, datagrams, sizes)
     np.testing.assert_array_equal(returns_of(one), returns_of(other))
-    np.testing.assert_array_equal(clocks_of(one), clocks_of(other))
+    np.testing.assert_array_equal(clock_of(one), clock_of(other))
     assert [r for r in one if isinstance(r, DeviceStatus)] == [r for r in other if isinstance(r, DeviceStatus)]
     assert whole.counters == cut.counters
     assert cut.counters.errors["sequence_gap"] == 4
@@ -351,8 +344,8 @@ def test_counters_of_64_bits_are_exact(tick_hz: int, first_ticks: int) -> None:
     base = seconds % 2**32 * 10**9
     want = [base + (rest + ticks) * 10**9 // tick_hz for ticks in (0, 1, 2**32 - 1)]
     assert returns_of(records)["device_time_ns"].tolist() == want
-    assert clocks_of(records)["pps_time_ns"].tolist() == [want[0]]
-    assert clocks_of(records)["pps_count"].tolist() == [2**32 - 1]
+    assert clock_of(records)["pps_time_ns"].tolist() == [want[0]]
+    assert clock_of(records)["pps_count"].tolist() == [2**32 - 1]
 
 
 def test_polygon_facets_are_derived_from_the_shaft_angle() -> None:
@@ -378,7 +371,7 @@ def test_a_heartbeat_gives_only_the_clock() -> None:
     header = SrepHeader(pps_count=9, pps_ticks=50, first_ticks=70, tick_hz=1000, encoder_counts=0)
     records = feed_all(make_parser(), [encode_datagram(header, [], [], np.zeros((0, 1)))])
     assert not any(isinstance(record, ScannerReturns) for record in records)
-    assert clocks_of(records)[["device_time_ns", "pps_time_ns"]].tolist() == [(70_000_000, 50_000_000)]
+    assert clock_of(records)[["device_time_ns", "pps_time_ns"]].tolist() == [(70_000_000, 50_000_000)]
 
 
 @pytest.mark.parametrize(
@@ -409,9 +402,9 @@ def test_time_parser_thins_out_but_counts_every_gap(sizes: list[int]) -> None:
     parser = make_parser(clock_only=True)
     records = feed_batched(parser, datagrams, sizes)
     assert not any(isinstance(record, ScannerReturns) for record in records)
-    clock = clocks_of(records)
+    clock = clock_of(records)
     assert len(clock) == 4  # 590 datagrams of 0.32 ms lie in 4 bins of 50 ms
-    whole = clocks_of(feed_all(make_parser(), datagrams))
+    whole = clock_of(feed_all(make_parser(), datagrams))
     np.testing.assert_array_equal(clock, whole[np.isin(whole["host_time_ns"], clock["host_time_ns"])])
     assert parser.counters.errors == {"sequence_gap": 10 + 1}
     assert parser.counters.bad_checksums == 1

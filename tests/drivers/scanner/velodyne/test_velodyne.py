@@ -36,8 +36,9 @@ from swath.georef.records import (
     StructArray,
     TimeMessage,
 )
+from tests.drivers.builders import feed, returns_of
 from tests.drivers.harness import check_packet_damage, check_packets
-from tests.drivers.spinning import feed, payloads, read_pcd, returns_of, ros_points, xyz
+from tests.drivers.spinning import payloads, read_pcd, ros_points, xyz
 
 FIXTURES = Path(__file__).parents[4] / "fixtures" / "velodyne"
 SETTINGS = DeviceSettings("scanner/left", {})

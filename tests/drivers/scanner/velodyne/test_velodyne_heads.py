@@ -32,9 +32,10 @@ from swath.georef.records import (
     ScannerReturns,
     StructArray,
 )
+from tests.drivers.builders import feed, returns_of
 from tests.drivers.harness import check_packet_damage, check_packets
 from tests.drivers.recordings import FIXTURES
-from tests.drivers.spinning import feed, payloads, read_pcd, returns_of, ros_points, xyz
+from tests.drivers.spinning import payloads, read_pcd, ros_points, xyz
 
 VLP32C_CAPTURE = "velodyne/nebula_vlp32.pcap.gz"
 XYZ = np.dtype([("x", "f4"), ("y", "f4"), ("z", "f4")])
