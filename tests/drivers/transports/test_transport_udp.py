@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import os
 import random
 import socket
 import struct
@@ -19,6 +18,8 @@ from swath.drivers.transports import holders
 from swath.drivers.transports.base import HEAD_ROOM_BYTES, TransportError, UnitBlock
 from swath.drivers.transports.spec import parse_transport
 from swath.drivers.transports.udp_socket import UdpTransport
+
+pytestmark = pytest.mark.usefixtures("one_processor")
 
 GROUP = "239.74.163.77"
 
@@ -36,15 +37,6 @@ def transport(options: str = "", host: str = "127.0.0.1", port: int | None = Non
 
 def port_of(udp: UdpTransport) -> int:
     return udp._spec.port
-
-
-@pytest.fixture(autouse=True)
-def one_processor() -> Iterator[None]:
-    """A sender that moves to another processor can overtake itself: loopback keeps the order of each one only."""
-    allowed = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, {max(allowed)})
-    yield
-    os.sched_setaffinity(0, allowed)
 
 
 @pytest.fixture

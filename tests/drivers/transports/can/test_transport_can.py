@@ -24,6 +24,8 @@ from swath.drivers.transports.datagrams import MessageReader, ask_stamps
 from swath.drivers.transports.opening import open_transport
 from swath.drivers.transports.spec import parse_transport
 
+pytestmark = pytest.mark.usefixtures("one_processor")
+
 MULTICAST = "can:udp_multicast:239.74.163.2?port={}"
 
 
@@ -111,15 +113,6 @@ def test_bytes_that_are_not_a_frame_are_not_sent(frame: bytes) -> None:
 
 
 # ---- udp_multicast
-
-
-@pytest.fixture(autouse=True)
-def one_processor() -> Iterator[None]:
-    """A sender that moves to another processor can overtake itself: loopback keeps the order of each one only."""
-    allowed = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, {max(allowed)})
-    yield
-    os.sched_setaffinity(0, allowed)
 
 
 @pytest.fixture
