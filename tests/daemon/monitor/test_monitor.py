@@ -55,11 +55,6 @@ ROVER = '[gnss.rover]\ntransport = "serial:{path}?baud=115200"\nprotocol = "nmea
 PULSES = 10
 
 
-@pytest.fixture
-def logs(tmp_path: Path) -> Path:
-    return tmp_path / "logs"
-
-
 def srep(sequence: int) -> bytes:
     header = SrepHeader(sequence=sequence, flags=1, pps_count=3, pps_ticks=1_000_000, first_ticks=1_500_000 + 20_000)
     return encode_datagram(header, np.arange(PULSES) * 50, np.arange(PULSES) * 100, np.full((PULSES, 1), 9_000_000))

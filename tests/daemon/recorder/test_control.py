@@ -51,11 +51,6 @@ sys.exit(swath.daemon.cli.main.run_app(sys.argv[2:]))
 """
 
 
-@pytest.fixture
-def logs(tmp_path: Path) -> Path:
-    return tmp_path / "logs"
-
-
 @pytest.fixture(autouse=True)
 def no_unit(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)

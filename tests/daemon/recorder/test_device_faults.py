@@ -35,11 +35,6 @@ from tests.daemon.rig import HANGS_S, Recorder, free_udp_port, one_processor, se
 ROOT = Path(__file__).resolve().parents[3]
 
 
-@pytest.fixture
-def logs(tmp_path: Path) -> Path:
-    return tmp_path / "logs"
-
-
 def info(logs: Path) -> dict[str, Any]:
     """Return the JSON of ``swath info`` for the only session; fail if it reports any loss or damage."""
     command = [sys.executable, "-m", "swath.daemon.cli.main", "info", "--json", str(logs)]

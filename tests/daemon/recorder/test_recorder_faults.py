@@ -33,11 +33,6 @@ SPECIAL = "tests.daemon.special_recorder"
 
 
 @pytest.fixture
-def logs(tmp_path: Path) -> Path:
-    return tmp_path / "logs"
-
-
-@pytest.fixture
 def numbers() -> Iterator[Numbers]:
     sender = Numbers(free_udp_port())
     yield sender

@@ -19,11 +19,6 @@ from tests.daemon.rig import HANGS_S, Recorder, free_udp_port, one_processor, se
 
 
 @pytest.fixture
-def logs(tmp_path: Path) -> Path:
-    return tmp_path / "logs"
-
-
-@pytest.fixture
 def sender() -> Iterator[socket.socket]:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         yield sock
