@@ -33,16 +33,10 @@ from swath.daemon.processing.calibration.report.residuals import residual_pictur
 from swath.daemon.processing.calibration.report.tables import entries_table, held_table, parameter_tables
 from swath.daemon.processing.pages.canvas import NARROW
 from swath.georef.verdicts import Level
-from tests.calib.made_outcome import RISE, Outcome, made_outcome, made_report
+from tests.calib.made_outcome import RISE, Outcome, made_report
 from tests.same_bytes import numbers_of
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("kernels")]
-
-
-@pytest.fixture(scope="module")
-def outcome() -> Outcome:
-    """Return an outcome with 40 000 returns a strip."""
-    return made_outcome(40_000)
 
 
 @pytest.fixture(scope="module")

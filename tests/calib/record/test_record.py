@@ -30,7 +30,7 @@ from swath.calib.record.values import Matrix, Plain, utc_text
 from swath.georef.scanner.beams import LineGeometry
 from swath.georef.scanner.calibration import INDEX
 from swath.georef.scanner.sensor_model import SensorModel
-from tests.calib.made_outcome import Outcome, made_outcome
+from tests.calib.made_outcome import Outcome
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
@@ -57,12 +57,6 @@ MANDATORY = {
     "SD_Calibration": "calibrationAgency calibrationDate",
 }
 KEYS = {f"{owner}.{name}" for owner, names in MANDATORY.items() for name in names.split()}
-
-
-@pytest.fixture(scope="module")
-def outcome() -> Outcome:
-    """Return a small outcome of a calibration."""
-    return made_outcome(40_000)
 
 
 def given(outcome: Outcome, **more: Any) -> RecordInput:
