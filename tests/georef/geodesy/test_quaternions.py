@@ -7,16 +7,13 @@ from scipy.spatial.transform import Rotation
 
 from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.quaternions import about, conjugate, product, rotated, rotation_vector
+from tests.georef.builders import as_rotation
 
 
 def some(seed: int, n: int = 500) -> FloatArray:
     q = np.random.default_rng(seed).normal(size=(n, 4))
     unit: FloatArray = q / np.linalg.norm(q, axis=1, keepdims=True)
     return unit
-
-
-def as_rotation(q: FloatArray) -> Rotation:
-    return Rotation.from_quat(np.roll(q, -1, axis=-1))
 
 
 def test_rotations_about_axes_are_right_handed() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
@@ -12,17 +11,13 @@ from swath.georef.arrays import FloatArray
 from swath.georef.navigation.filter.filter import run_filter
 from swath.georef.navigation.filter.smoother import forward, smooth
 from swath.georef.navigation.inputs import GRADES, Fate
-from tests.georef.navigation.flights import Fixes, Truth, drawn_start, fly, noised, setup_for, survey
+from tests.georef.navigation.builders import flight
+from tests.georef.navigation.flights import Fixes, drawn_start, noised, setup_for
 from tests.georef.navigation.honesty import judge, squares
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
 ARM = np.array([0.35, -0.12, -1.1])
-
-
-@cache
-def flight() -> Truth:
-    return fly(survey(), 240.0, 50.0)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.7], ids=["white", "lasting"])

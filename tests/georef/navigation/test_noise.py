@@ -6,7 +6,6 @@ Fifty flights of each kind are `python -m benchmarks.navigation_honesty --receiv
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
@@ -15,7 +14,7 @@ from swath.georef.geodesy.quaternions import conjugate, product, rotation_vector
 from swath.georef.navigation.inputs import GRADES, INNOVATION_DTYPE, Fate, Kind, Setup
 from swath.georef.navigation.noise import EVIDENCE, SIGNIFICANT, rescaled, second_moments
 from swath.georef.records import FixType, StructArray
-from tests.georef.navigation.flights import Truth, fly, survey
+from tests.georef.navigation.builders import flight
 from tests.georef.navigation.honesty import judge
 from tests.georef.navigation.honesty import squares as normalised_squares
 from tests.georef.navigation.receivers import RECEIVERS, SHARE, Receiver, compared
@@ -67,11 +66,6 @@ def test_an_outlier_does_not_affect_the_other_scales() -> None:
     rows = innovations(Kind.POSITION, FIXED, (1.0, 1.0, 1.0))
     rows["normalised"][100], rows["chi2"][100] = 60.0, 3 * 3600.0
     assert second_moments(rows)[0][int(Kind.POSITION), FIXED, False] == pytest.approx(1.0, abs=0.1)
-
-
-@cache
-def flight() -> Truth:
-    return fly(survey(), 240.0, 50.0)
 
 
 @pytest.mark.slow

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from swath.georef.arrays import FloatArray
 from swath.georef.points import Fate
 from swath.georef.trajectory.trajectory import Trajectory, TrajectoryError, TrajectoryGapError, locate_epoch
+from tests.georef.builders import as_rotation
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
@@ -44,10 +45,6 @@ def inside(trajectory: Trajectory, n: int = 5000) -> NDArray[np.int64]:
     """Times over the whole span, epochs themselves among them."""
     first_ns, last_ns = trajectory.span
     return np.sort(np.r_[np.random.default_rng(5).integers(first_ns, last_ns, n), trajectory.time_ns])
-
-
-def as_rotation(q: FloatArray) -> Rotation:
-    return Rotation.from_quat(np.roll(q, -1, axis=-1))
 
 
 def attitude_by_scipy(lat_rad: Any, lon_rad: Any, roll_rad: Any, pitch_rad: Any, heading_rad: Any) -> Rotation:
