@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import socket
 import subprocess
@@ -233,3 +234,8 @@ def write_laz(
         made[name] = np.broadcast_to(np.asarray(sigma, float), x.shape)
     made.write(path)
     return path
+
+
+def digests(output: Path) -> dict[str, str]:
+    """Return the SHA-256 of each file of a folder, by name."""
+    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(output.iterdir())}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import gzip
-import hashlib
 import json
 from collections import Counter
 from pathlib import Path
@@ -17,6 +16,7 @@ from pyproj import Transformer
 
 from swath.daemon.cli.main import run_app
 from swath.georef.formats.trajectory.csv import csv_text
+from tests.daemon.builders import digests
 from tests.daemon.one_line import Flown, fly
 
 pytestmark = [pytest.mark.xdist_group("kernels"), pytest.mark.slow]
@@ -50,10 +50,6 @@ def made_of(flown: Flown, output: Path, *more: str) -> dict[str, Any]:
     assert run_app(arguments) == 1
     told: dict[str, Any] = json.loads(next(output.glob("*.json")).read_text())
     return told
-
-
-def digests(output: Path) -> dict[str, str]:
-    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(output.iterdir())}
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import importlib
 import json
 import os
@@ -23,6 +22,7 @@ from swath.daemon.processing.georeferencing import run as products
 from swath.daemon.processing.points import workers
 from swath.daemon.processing.points.jobs import Job, JobResult, SessionPlan, Tell, run_job
 from swath.georef.strips import Segment
+from tests.daemon.builders import digests
 from tests.daemon.commands import ROOT
 from tests.daemon.one_line import Flown, fly
 from tests.daemon.rig import HANGS_S
@@ -41,11 +41,6 @@ def halves(flown: Flown, path: Path) -> str:
     middle = (first + last) // 2
     path.write_text(f"start_gps_ns,end_gps_ns\n{first},{middle}\n{middle},{last}\n")
     return str(path)
-
-
-def digests(output: Path) -> dict[str, str]:
-    """Return digests of all files except the sidecar, which names the output's strips."""
-    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(output.iterdir())}
 
 
 @pytest.fixture(scope="module")
