@@ -266,6 +266,27 @@ def test_the_index_names_every_page() -> None:
     assert {page for page in pages if f"]({page})" not in index} == set()
 
 
+def imported_tests(source: str) -> set[str]:
+    """Return what a file imports whose last part begins with ``test_``: modules, or names from a module."""
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            names |= {node.module or ""} | {alias.name for alias in node.names}
+    return {name for name in names if name.split(".")[-1].startswith("test_")}
+
+
+def test_no_test_imports_from_another_test() -> None:
+    """What several tests use lives in builders.py, fixtures in conftest.py, of the nearest common folder."""
+    files = [path for path in tracked() if path.is_relative_to(ROOT / "tests") and path.suffix == ".py"]
+    assert Path(__file__) in files
+    found = {str(path.relative_to(ROOT)): imported_tests(path.read_text()) for path in files}
+    assert {name: imported for name, imported in found.items() if imported} == {}
+    for statement in ("import tests.sim.test_proof", "from tests.sim.test_proof import bound", "from . import test_a"):
+        assert imported_tests(statement)
+
+
 def event_codes() -> set[str]:
     """The code of every event posted: third argument, second where it is said once only."""
     place = {"post": 2, "make": 2, "add": 2, "add_once": 1}
