@@ -25,7 +25,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -35,7 +34,7 @@ from swath.daemon.processing.calibration.run import prior_of
 from swath.daemon.processing.flights.read import GeorefOptions as Logs
 from swath.daemon.processing.flights.trajectory_choice import TrajectoryOptions
 from swath.daemon.processing.setup.setup import Options
-from swath.georef.arrays import FloatArray, IntArray
+from swath.georef.arrays import BoolArray, FloatArray, Int64Array
 from swath.georef.scanner.uncertainty import Noise
 from swath.sim.shots import GROUND, MARKING, ROAD, ROOF
 from swath.sim.site import e_from_geodetic, rot_e_from_ned
@@ -69,13 +68,13 @@ class Returns:
         place: (n, 3) two coordinates in the plane, metres, and 1.
     """
 
-    time_ns: IntArray
-    strip: IntArray
+    time_ns: Int64Array
+    strip: Int64Array
     design: FloatArray
     normal_l: FloatArray
     lever_l: FloatArray
     variance: FloatArray
-    face: IntArray
+    face: Int64Array
     place: FloatArray
 
 
@@ -113,7 +112,7 @@ def returns_of(folder: Path, head: str, noise: Noise, every: int) -> Returns:
     return Returns(time_ns[taken], strip[taken], design, normal, lever, variance, face, place)
 
 
-def planes_at(point_l: FloatArray, strip: IntArray, roof: NDArray[np.bool_], every: int) -> tuple[IntArray, FloatArray]:
+def planes_at(point_l: FloatArray, strip: Int64Array, roof: BoolArray, every: int) -> tuple[Int64Array, FloatArray]:
     """Return indexes (n,) of returns that lie on one plane with their neighbours, and upward normals (n, 3)."""
     taken, normals = [], []
     for number in np.unique(strip):
@@ -165,7 +164,7 @@ def equations(
     return design, (noise.range_m * cosine) ** 2 + aside**2
 
 
-def faces(point_l: FloatArray, normal: FloatArray, roof: NDArray[np.bool_]) -> tuple[IntArray, FloatArray]:
+def faces(point_l: FloatArray, normal: FloatArray, roof: BoolArray) -> tuple[Int64Array, FloatArray]:
     """Return numbers (n,) of planes, by direction, place and tile of 15 m, and places (n, 3) in them."""
     distance = (normal * point_l).sum(axis=1)
     tile = np.floor(point_l[:, :2] / TILE_M)
@@ -197,7 +196,9 @@ def bound(returns: Returns, prior: TrajectoryPrior, parameters: int, every: int,
     return sigmas
 
 
-def states(returns: Returns, rows: IntArray, prior: TrajectoryPrior, parameters: int) -> tuple[IntArray, FloatArray]:
+def states(
+    returns: Returns, rows: Int64Array, prior: TrajectoryPrior, parameters: int
+) -> tuple[Int64Array, FloatArray]:
     """Return the unknowns (m,) that affect returns of one plane, and their design matrix (n, m).
 
     The unknowns are the parameters, followed by the trajectory's errors at knots.

@@ -30,9 +30,8 @@ from swath.daemon.processing.calibration.returns import KNOT_S, read_flight, rep
 from swath.daemon.processing.flights.read import GeorefOptions as Logs
 from swath.daemon.processing.flights.trajectory_choice import TrajectoryOptions
 from swath.daemon.processing.setup.setup import Options
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.georef.navigation.cross_covariance import ErrorChain
-from swath.georef.records import Int64Array
 from swath.georef.scanner.calibration import Calibration, read_calibration
 
 MODEL = ParameterOptions("scanner")

@@ -21,15 +21,14 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.cpu_time import cpu_seconds
 from swath.daemon.system import keep_freed_memory
 from swath.georef.air.atmosphere import Air
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, Int64Array, StructArray
 from swath.georef.georeference import BLOCK_ROWS, Georeferencer
 from swath.georef.mapping.frame import Mapping
-from swath.georef.records import RETURN_DTYPE, StructArray
+from swath.georef.records import RETURN_DTYPE
 from swath.georef.scanner.beams import LineGeometry
 from swath.georef.scanner.calibration import PARAMETERS, Calibration, nominal
 from swath.georef.scanner.sensor_model import SensorModel
@@ -105,7 +104,7 @@ def trajectory() -> Trajectory:
     )
 
 
-def returns() -> tuple[StructArray, NDArray[np.int64], FloatArray, FloatArray]:
+def returns() -> tuple[StructArray, Int64Array, FloatArray, FloatArray]:
     """Make returns of a sine of 50 Hz over flat ground.
 
     Returns:
@@ -137,7 +136,7 @@ class KnownMotion:
     def __init__(self, rate: FloatArray, acceleration: FloatArray) -> None:
         self._rate, self._acceleration = rate, acceleration
 
-    def motion(self, rows: StructArray, time_ns: NDArray[np.int64]) -> tuple[FloatArray, FloatArray]:
+    def motion(self, rows: StructArray, time_ns: Int64Array) -> tuple[FloatArray, FloatArray]:
         """Return the encoder's rate and acceleration for consecutive pulses."""
         del time_ns
         first = int(rows["pulse_id"][0])

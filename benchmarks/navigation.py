@@ -25,12 +25,12 @@ from pyins import filters, inertial_sensor, measurements, strapdown
 from pyins.util import LLA_COLS, RPH_COLS, VEL_COLS
 
 from benchmarks.cpu_time import cpu_seconds
+from swath.georef.arrays import StructArray
 from swath.georef.geodesy.earth import geodetic_from_e
 from swath.georef.navigation.filter.filter import NavigationFilter, run_filter
 from swath.georef.navigation.filter.smoother import smooth
 from swath.georef.navigation.inputs import Inertial, Kind, Setup, Start
 from swath.georef.navigation.solve import solve
-from swath.georef.records import StructArray
 from tests.georef.navigation.scores import (
     FILTER,
     LINES_S,

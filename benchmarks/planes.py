@@ -25,7 +25,7 @@ from swath.calib.flight import Flight, Head, Swath, Tangent
 from swath.calib.planes.matching import rematch
 from swath.calib.planes.search import find_planes
 from swath.daemon.system import keep_freed_memory
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.georef.geodesy.earth import e_from_geodetic
 from swath.georef.records import RETURN_DTYPE
 from swath.georef.scanner.beams import LineGeometry
@@ -69,7 +69,7 @@ def mapped(folder: Path, name: str, array: NDArray[Any]) -> NDArray[Any]:
 
 def strip(
     number: int, count: int, folder: Path, frame: Tangent, draws: np.random.Generator
-) -> tuple[Swath, FloatArray, NDArray[np.int64]]:
+) -> tuple[Swath, FloatArray, Int64Array]:
     """Make a swath; return it with the positions (k, 3) of its aircraft in frame e and their times (ns)."""
     length_m = count / RETURNS_PER_M
     second = np.arange(count) / (SPEED_MPS * RETURNS_PER_M)

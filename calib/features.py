@@ -9,8 +9,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from swath.georef.arrays import FloatArray
-from swath.georef.records import Int64Array
+from swath.georef.arrays import FloatArray, Int64Array
 
 
 @dataclass(frozen=True, eq=False)

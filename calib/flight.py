@@ -14,10 +14,9 @@ from typing import Any
 import numpy as np
 
 from swath.georef.air.atmosphere import Air
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, Int64Array, StructArray
 from swath.georef.geodesy.earth import e_from_geodetic, geodetic_from_e, rot_e_from_l
 from swath.georef.points import Fate, Rays
-from swath.georef.records import Int64Array, StructArray
 from swath.georef.scanner.beams import Geometry
 from swath.georef.scanner.calibration import Calibration
 from swath.georef.scanner.mount import Mount

@@ -18,8 +18,7 @@ from swath.calib.flight import Flight, Swath
 from swath.calib.outcome import TrajectoryFit
 from swath.calib.parameters import ANGLES
 from swath.calib.strips.effects import SeenFrom, effect_columns
-from swath.georef.arrays import FloatArray
-from swath.georef.records import Int64Array
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.georef.scanner.calibration import PARAMETERS, Calibration
 
 POINT = "point"  # key of the user's accuracies: of a point, metres

@@ -16,8 +16,7 @@ import numpy as np
 from swath.calib.flight import Flight, Head
 from swath.calib.intensity_curve import at_knots, curve, nodes_of
 from swath.calib.outcome import FixedParameter
-from swath.georef.arrays import FloatArray
-from swath.georef.records import Int64Array
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.georef.scanner.beams import OusterGeometry, SpinningGeometry
 from swath.georef.scanner.calibration import INDEX, PARAMETERS, BeamCorrection, Calibration, RangeOffset
 

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.calib import adjust as adjustment
 from swath.calib.adjust import AS_USUAL
@@ -24,9 +23,9 @@ from swath.calib.parameters import ParameterOptions
 from swath.calib.planes.cells import CELL_SHORT_M, CELL_SIZES_M
 from swath.calib.planes.fit import PlaneSettings
 from swath.calib.planes.returns import RIM_M
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import BoolArray, FloatArray, Int64Array
 from swath.georef.geodesy.rotations import boresight, rot_from_quaternion
-from swath.georef.records import RETURN_DTYPE, Int64Array
+from swath.georef.records import RETURN_DTYPE
 from swath.georef.scanner.calibration import Calibration
 from swath.georef.timescales import SECOND_NS
 from swath.georef.trajectory.trajectory import Trajectory
@@ -236,7 +235,7 @@ class _Shots:
     angle_rad: FloatArray
     points_t: FloatArray
 
-    def at(self, chosen: NDArray[np.bool_] | Int64Array) -> _Shots:
+    def at(self, chosen: BoolArray | Int64Array) -> _Shots:
         """Select some of the returns."""
         return _Shots(
             self.surface[chosen],
@@ -272,7 +271,7 @@ def _shots(
 
 def _crossings(
     trajectory: Trajectory, calibration: Calibration, points_e: FloatArray, line: Line
-) -> tuple[Int64Array, NDArray[np.bool_]]:
+) -> tuple[Int64Array, BoolArray]:
     """Find the times at which points (n, 3) pass through the plane of the scan, and whether they do.
 
     The search uses a coarse grid, then false position (the Illinois rule, Dowell and Jarratt 1971).
@@ -344,7 +343,7 @@ def _density(scan: Scan, speed_mps: float, shots: _Shots) -> FloatArray:
 
 def _thinned(
     shots: _Shots, surface: Int64Array, surfaces: Sequence[Surface], per_m2: FloatArray, cell_m: float
-) -> tuple[NDArray[np.bool_], FloatArray]:
+) -> tuple[BoolArray, FloatArray]:
     """Return a mask of the shots to keep, and the expected number of real returns by surface.
 
     At most `MOST_MADE` shots of a surface are kept; surfaces that are hardly seen lose all their shots.

@@ -17,14 +17,12 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from scipy.spatial import cKDTree
 
 from swath.calib.flight import Flight, Swath
 from swath.calib.scale import Scale, area_spacing_m, scale_of
-from swath.georef.arrays import FloatArray
-from swath.georef.records import Int64Array
+from swath.georef.arrays import BoolArray, FloatArray, Int64Array
 from swath.georef.scanner.calibration import INDEX, Calibration
 
 SUPPORT = 0.9  # least support (share of a kernel that lies on cells with points), of the swath's typical one
@@ -228,7 +226,7 @@ def _samples(flight: Flight, found: Mapping[str, Calibration], count: int) -> tu
     return samples, Scale(scale.height_m, scale.width_m, max(spacings))
 
 
-def _shared(points: Sequence[FloatArray], cell_m: float) -> list[NDArray[np.bool_]]:
+def _shared(points: Sequence[FloatArray], cell_m: float) -> list[BoolArray]:
     """Return, by swath, a mask of its points (n, 3) with points of another swath in their or a neighbouring cell."""
     of_swath = []
     for place in points:
@@ -392,7 +390,7 @@ class Lattice:
         west, south = (float(np.floor(value / cell_m)) * cell_m for value in low)
         return cls(west, south, cell_m, int(north / cell_m) + 2, int(east / cell_m) + 2)
 
-    def cells(self, points: FloatArray) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    def cells(self, points: FloatArray) -> tuple[Int64Array, BoolArray]:
         """Return cells (n,) of points, and whether the points are on the lattice."""
         column = np.floor((points[:, 0] - self.west) / self.cell_m).astype(np.int64)
         row = np.floor((points[:, 1] - self.south) / self.cell_m).astype(np.int64)
@@ -410,7 +408,7 @@ class Surface:
         change: (c, p) of the height with each parameter.
     """
 
-    cells: NDArray[np.int64]
+    cells: Int64Array
     height_m: FloatArray
     change: FloatArray
 

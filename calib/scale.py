@@ -13,8 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from swath.calib.flight import Flight, Swath, sensor_t
-from swath.georef.arrays import FloatArray
-from swath.georef.records import Int64Array
+from swath.georef.arrays import FloatArray, Int64Array
 
 REFERENCE_HEIGHT_M = 800.0  # height at which constants in metres were tuned
 _SAMPLE = 20_000  # returns of a swath that are examined

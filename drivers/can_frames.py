@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from swath.georef.records import ByteRows, StructArray
+from swath.georef.arrays import StructArray
+from swath.georef.records import ByteRows
 
 CAN_EFF_FLAG = 0x8000_0000  # 29-bit identifier
 CAN_RTR_FLAG = 0x4000_0000  # remote request: carries no data

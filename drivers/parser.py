@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from swath.georef.records import ByteRows, Chunk, ChunkBatch, Int64Array, Record
+from swath.georef.arrays import Int64Array
+from swath.georef.records import ByteRows, Chunk, ChunkBatch, Record
 
 if TYPE_CHECKING:
     pass

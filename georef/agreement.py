@@ -15,13 +15,12 @@ from dataclasses import dataclass
 from itertools import product as combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import BoolArray, FloatArray, Int64Array, StructArray
 from swath.georef.geodesy.earth import geodetic_from_e
 from swath.georef.geodesy.gravity import gravity_e
 from swath.georef.geodesy.quaternions import about, conjugate, product, rotated
-from swath.georef.records import FixType, Int64Array, StructArray
+from swath.georef.records import FixType
 from swath.georef.timescales.gps_time import SECOND_NS
 from swath.georef.trajectory.trajectory import EARTH_RATE_RADPS, Trajectory
 from swath.georef.trajectory.turn_rates import REACH_STEPS, STEP_NS, Turning, turning
@@ -361,7 +360,7 @@ def _turned(
     return _centred(told.rate_b[known]), _centred(felt.rate_b[known]), ends
 
 
-def _known(turned: Turning) -> NDArray[np.bool_]:
+def _known(turned: Turning) -> BoolArray:
     return turned.known > 0.0
 
 
@@ -538,7 +537,7 @@ def _fitted(felt_l: FloatArray, flown_l: FloatArray, q_l_from_b: FloatArray) -> 
         unit[axis] = 1.0
         columns[:, :, 1 + axis] = rotated(q_l_from_b, np.broadcast_to(unit, (len(rest), 3)))
 
-    def solved(rows: NDArray[np.int64]) -> float:
+    def solved(rows: Int64Array) -> float:
         return float(np.linalg.lstsq(columns[rows].reshape(-1, 4), rest[rows].reshape(-1), rcond=None)[0][0])
 
     everything = np.arange(len(rest))

@@ -23,13 +23,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
-from swath.georef.arrays import ByteArray, FloatArray
+from swath.georef.arrays import ByteArray, FloatArray, Int64Array, SingleArray, StructArray
 from swath.georef.compiled import jit_cached
 from swath.georef.mapping.frame import Mapping, MappingError
 from swath.georef.points import Fate, Points, Rays, contiguous
-from swath.georef.records import Int64Array, StructArray
 from swath.georef.scanner.encoder_motion import TellsMotion
 from swath.georef.scanner.kernels.types import PointColumns
 from swath.georef.scanner.ranging import PulseRates
@@ -144,7 +142,7 @@ class Georeferencer:
             points.sigma_map[to] = sigma_map
         return len(points_map), failure
 
-    def _mapped_points(self, rays: Rays) -> tuple[NDArray[np.float64], NDArray[np.float32] | None]:
+    def _mapped_points(self, rays: Rays) -> tuple[FloatArray, SingleArray | None]:
         """Return coordinates (n, 3) and sigmas along the same axes (ISO Eq. 8, 13, 14).
 
         Raises:

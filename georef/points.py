@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.georef.arrays import ByteArray, FloatArray, SingleArray
-from swath.georef.records import Int64Array
+from swath.georef.arrays import BoolArray, ByteArray, FloatArray, Int64Array, SingleArray
 
 
 def contiguous(array: NDArray[Any]) -> NDArray[Any]:
@@ -149,7 +148,7 @@ class Rays:
     encoder_acceleration: FloatArray | None = None
     covariance_e: FloatArray | None = None
 
-    def take(self, which: NDArray[np.bool_]) -> Rays:
+    def take(self, which: BoolArray) -> Rays:
         """Return some of the rays; vectors stay stored as columns."""
         columns: dict[str, Any] = {}
         for field in fields(self):

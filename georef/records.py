@@ -14,9 +14,9 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-Int64Array: TypeAlias = NDArray[np.int64]
+from swath.georef.arrays import FloatArray, Int64Array, StructArray
+
 ByteRows: TypeAlias = NDArray[np.uint8]
-StructArray: TypeAlias = NDArray[np.void]
 
 
 class TimeScale(StrEnum):
@@ -155,8 +155,8 @@ class GnssFix:
     lon_rad: float | None
     height_m: float | None
     velocity_l: tuple[float, float, float] | None = None
-    position_cov_l: NDArray[np.float64] | None = None
-    velocity_cov_l: NDArray[np.float64] | None = None
+    position_cov_l: FloatArray | None = None
+    velocity_cov_l: FloatArray | None = None
     fix_type: FixType = FixType.NONE
     satellites: int | None = None
     antenna: str = "primary"

@@ -9,13 +9,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.georef.records import RETURN_DTYPE, Int64Array, StructArray
+from swath.georef.arrays import BoolArray, Int64Array, StructArray, UInt64Array
+from swath.georef.records import RETURN_DTYPE
 
 WORDS = RETURN_DTYPE.itemsize // 8
 _OFFSETS = {name: int(place[1]) for name, place in (RETURN_DTYPE.fields or {}).items()}
 
 
-def words(rows: StructArray) -> NDArray[np.uint64]:
+def words(rows: StructArray) -> UInt64Array:
     """Return rows as numbers (n, `WORDS`), whose copies are ten times as fast as those of a structure with gaps."""
     return np.ascontiguousarray(rows).view(np.uint64).reshape(-1, WORDS)
 
@@ -29,7 +30,7 @@ def any_has(rows: StructArray, name: str, bits: int) -> bool:
     return bool((rows[name] & bits == bits).any())
 
 
-def take(rows: StructArray, mask: NDArray[np.bool_]) -> StructArray:
+def take(rows: StructArray, mask: BoolArray) -> StructArray:
     """Return the rows of a mask."""
     return words(rows).take(np.flatnonzero(mask), axis=0).view(RETURN_DTYPE).reshape(-1)
 
@@ -64,7 +65,7 @@ class WaitingReturns:
     time_ns: Int64Array
 
 
-def split_at(held: WaitingReturns, mask: NDArray[np.bool_]) -> tuple[list[WaitingReturns], list[WaitingReturns]]:
+def split_at(held: WaitingReturns, mask: BoolArray) -> tuple[list[WaitingReturns], list[WaitingReturns]]:
     """Split into the rows of the mask and the others, each in order; contiguous parts are not copied."""
     count = int(np.count_nonzero(mask))
     if count == len(mask):

@@ -12,10 +12,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
-from swath.georef.arrays import FloatArray
-from swath.georef.records import Int64Array
+from swath.georef.arrays import BoolArray, FloatArray, Int64Array
 from swath.georef.timescales.gps_time import SECOND_NS
 
 LATEST_NS = 1 << 62  # of GPS time, in 2126: differences and sums of two stay within 64 bits
@@ -100,7 +98,7 @@ def _integral(seconds: FloatArray, values: FloatArray) -> FloatArray:
     return total
 
 
-def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
+def _runs(mask: BoolArray) -> list[tuple[int, int]]:
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
     return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
 

@@ -10,7 +10,7 @@ import zlib
 
 import numpy as np
 
-from swath.georef.arrays import FloatArray, IntArray
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.georef.timescales import unix_ns_from_gps
 from swath.georef.timescales.gps_time import SECOND_NS
 from swath.sim.plan.plan import Plan
@@ -43,7 +43,7 @@ class Oscillator:
         phase: FloatArray = self.tick_hz * (time_s + 1e-6 * gained)
         return phase
 
-    def ticks(self, time_s: FloatArray) -> IntArray:
+    def ticks(self, time_s: FloatArray) -> Int64Array:
         """Return (n,) the counter's reading in whole ticks, `OscillatorTable.ticks_at_start` at the plan's start."""
         return np.floor(self.phase(time_s)).astype(np.int64) + self._table.ticks_at_start
 
@@ -71,7 +71,7 @@ class PulsePerSecond:
         self._seed, self._name = seed, name
         self._jitter_s: FloatArray = np.zeros(0)
 
-    def edges(self, seconds: IntArray) -> FloatArray:
+    def edges(self, seconds: Int64Array) -> FloatArray:
         """Return (n,) true times of the edges of these seconds; second 0 is the plan's start."""
         seconds = np.asarray(seconds, np.int64)
         if len(seconds) and seconds.max() >= len(self._jitter_s):
@@ -79,7 +79,7 @@ class PulsePerSecond:
             self._jitter_s = self._sigma_s * draws
         return seconds + self._jitter_s[seconds]
 
-    def latest(self, time_s: FloatArray) -> IntArray:
+    def latest(self, time_s: FloatArray) -> Int64Array:
         """Return (n,) the second of the newest edge at or before each time; −1 before the first."""
         nearest = np.maximum(np.rint(time_s).astype(np.int64), 0)
         return np.where(self.edges(nearest) <= time_s, nearest, nearest - 1)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, StructArray
 from swath.sim.atmosphere import Air
 from swath.sim.clocks import HostClock, PulsePerSecond, generator
 from swath.sim.companions import control_points_e
@@ -29,7 +29,7 @@ from swath.sim.scanners.scan import Scanner
 from swath.sim.scene.scene import build_scene
 from swath.sim.shots import SURFACES, WireUnit
 from swath.sim.site import Site
-from swath.sim.truth import POSE_TRUTH_DTYPE, RETURN_TRUTH_DTYPE, StructArray, TruthWriter
+from swath.sim.truth import POSE_TRUTH_DTYPE, RETURN_TRUTH_DTYPE, TruthWriter
 
 BLOCK_S = 1.0
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.georef.arrays import FloatArray, IntArray
+from swath.georef.arrays import ByteArray, FloatArray, Int64Array
 
 SURFACES = ("none", "ground", "roof", "wall", "road", "marking", "water", "leaves", "wire", "car")
 NO_SURFACE, GROUND, ROOF, WALL, ROAD, MARKING, WATER, LEAVES, WIRE, CAR = range(len(SURFACES))
@@ -27,9 +27,9 @@ class Pulses:
         phi_extra_rad: (n,) amount that the pitch slope adds to φ.
     """
 
-    number: IntArray
+    number: Int64Array
     time_s: FloatArray
-    encoder: IntArray
+    encoder: Int64Array
     channel: NDArray[np.uint16]
     origin_s: FloatArray
     direction_s: FloatArray
@@ -54,7 +54,7 @@ class Echoes:
     range_m: FloatArray
     reflectance: FloatArray
     incidence_rad: FloatArray
-    surface: NDArray[np.uint8]
+    surface: ByteArray
 
 
 @dataclass(frozen=True, slots=True)

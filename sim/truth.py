@@ -12,7 +12,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-StructArray = NDArray[np.void]
+from swath.georef.arrays import StructArray
 
 RETURN_TRUTH_DTYPE = np.dtype(
     [

@@ -19,7 +19,7 @@ from pyproj import Transformer
 from swath.daemon.log.reader import Session, open_logs
 from swath.drivers.driver import find_driver
 from swath.drivers.parser import DeviceSettings
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, Int64Array, StructArray
 from swath.georef.records import (
     ChunkBatch,
     DeviceClockSamples,
@@ -58,7 +58,7 @@ class Recorded:
     """Hold a recorded flight: the log's folder, the points georeferenced in flight, and the truth of the returns."""
 
     logs: Path
-    points: NDArray[np.void]
+    points: StructArray
     truth: Any
 
     def session(self) -> Session:
@@ -66,7 +66,7 @@ class Recorded:
         (session,) = open_logs([self.logs])
         return session
 
-    def missed(self, time_ns: NDArray[np.int64], number: NDArray[Any], points_map: FloatArray) -> FloatArray:
+    def missed(self, time_ns: Int64Array, number: NDArray[Any], points_map: FloatArray) -> FloatArray:
         """Return errors of points (n, 3) in easting, northing and height, by the nearest true return of that number."""
         missed = np.empty((len(time_ns), 3))
         for slot in np.unique(number).tolist():
@@ -95,7 +95,7 @@ HOST_0 = 5_000_000_000_000
 HOST_RATE = 1.0 + 23e-6
 
 
-def host_ns(true_s: NDArray[np.float64] | float) -> NDArray[np.int64]:
+def host_ns(true_s: FloatArray | float) -> Int64Array:
     """Return the host's time at true seconds since START_S."""
     return HOST_0 + np.rint(np.asarray(true_s, dtype=np.float64) * HOST_RATE * NS).astype(np.int64)
 
@@ -179,7 +179,7 @@ class Flown:
     """Hold a flight's decoded returns, the times of their pulses by the packets' own clock, and the truth."""
 
     plan: Plan
-    rows: NDArray[np.void]
+    rows: StructArray
     time_s: FloatArray
     truth: dict[str, NDArray[Any]]
     calibration: Calibration
@@ -225,7 +225,7 @@ def scanner_batches(flight: VirtualFlight) -> Iterator[ChunkBatch]:
         yield ChunkBatch(source, host_ns, data.reshape(len(together), length))
 
 
-def pulse_times(flight: VirtualFlight, rows: NDArray[np.void], clock: NDArray[np.void]) -> FloatArray:
+def pulse_times(flight: VirtualFlight, rows: StructArray, clock: StructArray) -> FloatArray:
     """Return the times of pulses in seconds since the plan's start, by the clock in the packets."""
     if (clock["pps_time_ns"] < 0).all():  # disciplined: UTC past the hour, or GPS itself
         return disciplined_times(flight, rows)
@@ -242,7 +242,7 @@ def pulse_times(flight: VirtualFlight, rows: NDArray[np.void], clock: NDArray[np
     return times
 
 
-def disciplined_times(flight: VirtualFlight, rows: NDArray[np.void]) -> FloatArray:
+def disciplined_times(flight: VirtualFlight, rows: StructArray) -> FloatArray:
     """Return times of pulses from stamps modulo the hour, with the hour from the host's time of their packets."""
     leap_ns = flight.plan.leap_seconds * 1_000_000_000
     hour_ns = 3_600_000_000_000
@@ -284,7 +284,7 @@ SPINNING_ERRORS = EVERY_ERROR | {
 SIDEWAYS = [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]  # spin axis forward, azimuth 0 down
 
 
-def vlp16_quanta(pulse: NDArray[np.int64], groups: int) -> FloatArray:
+def vlp16_quanta(pulse: Int64Array, groups: int) -> FloatArray:
     """Return how many quanta of azimuth a firing's azimuth is good to.
 
     Between two groups of a packet it is interpolated: one. Behind the last group it goes on from the last two, a_n and

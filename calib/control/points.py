@@ -12,13 +12,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from swath.calib.features import ControlPoint, Features, Patch, Plane
 from swath.calib.flight import Flight, Swath, Tangent
 from swath.calib.planes.local import LocalPlane, PlaneRules, is_inside, robust_plane
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import BoolArray, FloatArray, Int64Array
 from swath.georef.geodesy.earth import e_from_geodetic
 
 COLUMNS = ("name", "lat_deg", "lon_deg", "h_ellipsoidal_m", "sigma_m")
@@ -81,7 +80,7 @@ class Ground:
 
     point: int
     swath: int
-    at: NDArray[np.int64]
+    at: Int64Array
     plane: LocalPlane
     above_m: float
 
@@ -243,7 +242,7 @@ class _Cells:
 
     corner: FloatArray
     cell_m: float
-    taken: NDArray[np.bool_]
+    taken: BoolArray
 
     @classmethod
     def around(cls, places: FloatArray, radius_m: float) -> _Cells:
@@ -258,7 +257,7 @@ class _Cells:
                 taken[at[:, 0] + column, at[:, 1] + row] = True
         return cls(corner, cell_m, taken)
 
-    def have(self, points: FloatArray) -> NDArray[np.int64]:
+    def have(self, points: FloatArray) -> Int64Array:
         """Return rising indexes of points (n, 2) in such cells; points with nan are left out."""
         column, row = ((points[:, axis] - self.corner[axis]) / self.cell_m for axis in (0, 1))
         columns, rows = self.taken.shape
@@ -267,15 +266,13 @@ class _Cells:
         return np.asarray(inside[taken], np.int64)
 
 
-def _returns_around(
-    swath: Swath, points: Sequence[ControlPoint], radius_m: float
-) -> list[tuple[int, NDArray[np.int64]]]:
+def _returns_around(swath: Swath, points: Sequence[ControlPoint], radius_m: float) -> list[tuple[int, Int64Array]]:
     """Return the indexes of the points that have returns within a radius, each with the indexes of these returns."""
     if not points:
         return []
     places = np.array([point.position_t[:2] for point in points])
     tree, cells = cKDTree(places), _Cells.around(places, radius_m)
-    near: list[NDArray[np.int64]] = []
+    near: list[Int64Array] = []
     for begin in range(0, len(swath), BLOCK):
         block = np.asarray(swath.points_t[begin : begin + BLOCK, :2])
         inside = cells.have(block)
@@ -288,7 +285,7 @@ def _returns_around(
     return [(number, at[np.array(one, dtype=np.int64)]) for number, one in enumerate(around) if len(one)]
 
 
-def _near(swath: Swath, place_t: FloatArray, at: NDArray[np.int64], rules: ControlRules) -> NDArray[np.int64]:
+def _near(swath: Swath, place_t: FloatArray, at: Int64Array, rules: ControlRules) -> Int64Array:
     """Return the returns within the radius around a point, or, if these are too few, twice as many as a plane needs."""
     away = np.hypot(*(swath.points_t[at, :2] - place_t[:2]).T)
     wanted = min(2 * rules.plane.fewest, len(at))
@@ -297,7 +294,7 @@ def _near(swath: Swath, place_t: FloatArray, at: NDArray[np.int64], rules: Contr
 
 
 def _ground(
-    swath: Swath, number: int, point: int, place_t: FloatArray, at: NDArray[np.int64], rules: ControlRules
+    swath: Swath, number: int, point: int, place_t: FloatArray, at: Int64Array, rules: ControlRules
 ) -> tuple[Ground | None, str]:
     returns_t = np.asarray(swath.points_t[at])
     plane, kept, reason = robust_plane(returns_t, rules.plane)

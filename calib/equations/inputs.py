@@ -11,10 +11,9 @@ from swath.calib.equations.tables import Beam, Head, RowDiagnostics, Sigmas
 from swath.calib.flight import Flight, Swath
 from swath.calib.intensity_curve import at_knots, curve_by_knots
 from swath.calib.parameters import Unknowns
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.georef.geodesy.rotations import rot_x, rot_y, rot_z
 from swath.georef.points import Rays, contiguous
-from swath.georef.records import Int64Array
 from swath.georef.scanner.beams import OusterGeometry
 from swath.georef.scanner.calibration import Calibration
 from swath.georef.scanner.kernels.types import Track

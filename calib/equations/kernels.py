@@ -13,10 +13,9 @@ from typing import Any
 import numpy as np
 
 from swath.calib.equations.tables import OF_PLANE, STATES, Beam, Head, Knots, Planes, Sigmas, Task
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.georef.compiled import jit_cached, jit_inline
 from swath.georef.geodesy.vectors import cross, dot, matrix_at, plus, rot_of, times, transposed_times, vector_at
-from swath.georef.records import Int64Array
 from swath.georef.scanner.calibration import INDEX
 from swath.georef.scanner.kernels.types import Three, Track
 from swath.georef.trajectory.trajectory import locate_epoch

@@ -20,9 +20,8 @@ from swath.calib.equations.inverse import inverted, scales
 from swath.calib.equations.rows import Rows, State, tangents
 from swath.calib.equations.tables import OF_PLANE
 from swath.calib.equations.tie_rows import Seen, Ties, covariance_t
-from swath.georef.arrays import FloatArray, SingleArray
+from swath.georef.arrays import FloatArray, Int64Array, SingleArray
 from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
-from swath.georef.records import Int64Array
 
 FLOOR = 1e-12  # of a plane's or tie point's normal matrix: smaller eigenvalues count as undetermined
 

@@ -15,11 +15,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.calib.labels import sized
 from swath.calib.outcome import FixedParameter
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import BoolArray, FloatArray
 from swath.georef.scanner.calibration import INDEX, PARAMETERS
 
 ALIKE = 0.8  # correlation above which two parameters absorb each other's errors
@@ -296,8 +295,8 @@ class _Case:
         np.fill_diagonal(rho, 0.0)
         return sigma, rho
 
-    def _determined(self, active: list[int], sigma: FloatArray) -> NDArray[np.bool_]:
-        found: NDArray[np.bool_] = self._given[active] | (sigma <= NOTHING_TOLD)
+    def _determined(self, active: list[int], sigma: FloatArray) -> BoolArray:
+        found: BoolArray = self._given[active] | (sigma <= NOTHING_TOLD)
         return found
 
     def _next(self, active: list[int], sigma: FloatArray, rho: FloatArray) -> tuple[int, int] | None:

@@ -27,10 +27,9 @@ from swath.calib.equations.trajectory_prior import TrajectoryPrior
 from swath.calib.features import Plane
 from swath.calib.flight import Flight, Swath
 from swath.calib.parameters import BEAM_PARTS, Unknowns
-from swath.georef.arrays import FloatArray, SingleArray
+from swath.georef.arrays import FloatArray, Int64Array, SingleArray
 from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
 from swath.georef.points import contiguous
-from swath.georef.records import Int64Array
 from swath.georef.scanner.calibration import Calibration
 from swath.georef.scanner.sensor_model import SensorModel
 

@@ -9,10 +9,9 @@ import numpy as np
 
 from swath.calib.equations.kernels import ALONG, AZIMUTH, COMMON, MISCLOSURE, ROWS, SPEED, VARIANCE, fill
 from swath.calib.equations.tables import OF_PLANE, STATES, Groups, Head, Knots, RowDiagnostics, Sums, Task
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.georef.compiled import jit_cached, jit_inline, whole
 from swath.georef.geodesy.vectors import vector_at
-from swath.georef.records import Int64Array
 from swath.georef.scanner.kernels.types import Three
 
 PIECE = 256  # returns processed at once

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from swath.georef.arrays import ByteArray, FloatArray
-from swath.georef.records import Int64Array, StructArray
+from swath.georef.arrays import ByteArray, FloatArray, Int64Array, StructArray
 from swath.georef.scanner.kernels.types import Track
 
 STATES, OF_PLANE = 8, 3  # columns of a row

@@ -18,8 +18,7 @@ from swath.calib.equations.rows import Batch, Rows, Run, State
 from swath.calib.equations.sums import MODE_GIVE, accumulate
 from swath.calib.equations.tables import Planes as PlaneTable
 from swath.calib.features import ControlPoint, Sighting, TiePoint
-from swath.georef.arrays import FloatArray
-from swath.georef.records import Int64Array
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.georef.scanner.calibration import Calibration
 
 AT_ONCE = 4096  # sightings per kernel call

@@ -18,12 +18,11 @@ import numpy as np
 
 from swath.calib.equations.inverse import inverted
 from swath.calib.flight import Flight, FlightError
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
 from swath.georef.geodesy.quaternions import product
 from swath.georef.geodesy.rotations import attitude_of, rot_from_quaternion
 from swath.georef.navigation.cross_covariance import ErrorChain
-from swath.georef.records import Int64Array
 from swath.georef.timescales import SECOND_NS
 from swath.georef.trajectory.trajectory import Trajectory, gps_text
 

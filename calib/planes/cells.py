@@ -30,9 +30,8 @@ from swath.calib.planes.kernels import (
     grow,
 )
 from swath.calib.scale import spacing_m
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import ByteArray, FloatArray, Int64Array
 from swath.georef.points import contiguous
-from swath.georef.records import Int64Array
 
 BLOCK = 1 << 18  # returns per kernel call; mapped ones are copied in blocks of this size
 PIECE = 4 << 20  # returns that one grid covers
@@ -101,9 +100,7 @@ def cell_middles(keys: Int64Array, cell_m: float) -> FloatArray:
     return (np.stack([keys - (rows << 32), rows], axis=1) + 0.5) * cell_m
 
 
-def blocks(
-    swath: Swath, start: int = 0, stop: int | None = None
-) -> Iterator[tuple[int, FloatArray, NDArray[np.uint8]]]:
+def blocks(swath: Swath, start: int = 0, stop: int | None = None) -> Iterator[tuple[int, FloatArray, ByteArray]]:
     """Yield a swath's returns in blocks: index of the first, points (n, 3), numbers of returns of their pulses (n,)."""
     stop = len(swath) if stop is None else stop
     for first in range(start, stop, BLOCK):
@@ -248,9 +245,7 @@ def _coarse_sigma(flight: Flight, swath: Swath, part: range, settings: PlaneSett
     return float(expected_sigma(noise, away, np.array([[0.0, 0.0, 1.0]]), settings)[0])
 
 
-def _count_refused(
-    what: NDArray[np.uint8], label: NDArray[np.int32], grid: _Grid, tile: int, refused: Counter[str]
-) -> None:
+def _count_refused(what: ByteArray, label: NDArray[np.int32], grid: _Grid, tile: int, refused: Counter[str]) -> None:
     """Count tiles in which no plane grew, by the kind of most of their cells."""
     at = np.flatnonzero(what != EMPTY)
     columns, rows = grid.places(at)

@@ -11,8 +11,7 @@ import numpy as np
 
 from swath.calib.flight import Flight, Swath, sensor_t
 from swath.calib.scale import Scale, scale_of
-from swath.georef.arrays import FloatArray
-from swath.georef.records import Int64Array
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.georef.scanner.uncertainty import Noise
 
 _CELLS_ACROSS, _CELL_LEAST_M = 50.0, 0.5  # fewest cells across a swath; smallest cell

@@ -6,15 +6,13 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.calib.features import Features, Plane
 from swath.calib.flight import Flight, Swath, sensor_t
 from swath.calib.planes.cells import cell_size, keys_of
 from swath.calib.planes.fit import GATE, PlaneError, PlaneSettings, expected_sigma, scaled_to
 from swath.calib.planes.returns import plane_of, returns_near, sights_of
-from swath.georef.arrays import FloatArray
-from swath.georef.records import Int64Array
+from swath.georef.arrays import BoolArray, FloatArray, Int64Array
 
 Rings = Mapping[str, FloatArray] | Sequence[tuple[str, FloatArray]]
 
@@ -110,7 +108,7 @@ def _cells(ring: FloatArray, cell_m: float) -> Int64Array:
     return keys_of(columns.ravel(), rows.ravel())
 
 
-def _in_ring(points: FloatArray, ring: FloatArray) -> NDArray[np.bool_]:
+def _in_ring(points: FloatArray, ring: FloatArray) -> BoolArray:
     """Return whether points lie inside (n,): a ray to the east then meets an odd number of sides."""
     x, y = points[:, 0], points[:, 1]
     odd = np.zeros(len(points), np.bool_)

@@ -11,9 +11,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.georef.arrays import ByteArray, FloatArray
+from swath.georef.arrays import ByteArray, FloatArray, Int64Array
 from swath.georef.compiled import jit_cached, jit_inline, whole
-from swath.georef.records import Int64Array
 
 Int32Array = NDArray[np.int32]
 

@@ -6,9 +6,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import BoolArray, FloatArray
 
 TRIPLES = 60  # of returns, each defining a candidate for the first plane
 INLIER_SIGMAS = 3.0
@@ -67,7 +66,7 @@ def plane_through(points_t: FloatArray) -> LocalPlane:
     return LocalPlane(centre, normal, math.sqrt(max(float(values[0]), 0.0)), len(points_t))
 
 
-def robust_plane(points_t: FloatArray, rules: PlaneRules) -> tuple[LocalPlane | None, NDArray[np.bool_], str]:
+def robust_plane(points_t: FloatArray, rules: PlaneRules) -> tuple[LocalPlane | None, BoolArray, str]:
     """Fit the plane on which most of points (n, 3) lie; return it, a mask of these points, and any reason of failure.
 
     The first plane is the one through three points that has the least median distance from the points (least median of

@@ -13,14 +13,13 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.calib.features import Features, Plane
 from swath.calib.flight import Flight
 from swath.calib.planes.cells import cell_size, keys_of
 from swath.calib.planes.fit import GATE, PlaneSettings, Sight, fit_sight, refusal, scaled_to
 from swath.calib.planes.returns import WIDE_M, cells_of, plane_of, pure, returns_near, thinned, well_inside
-from swath.georef.records import Int64Array
+from swath.georef.arrays import BoolArray, Int64Array
 
 LOST = "no longer fits"
 _DEFAULT = PlaneSettings()
@@ -88,10 +87,10 @@ def _agreeing(sights: Mapping[int, Sight], settings: PlaneSettings) -> dict[int,
     return {swath: sights[swath] for swath in sorted(np.array(swaths)[alike[best]].tolist())}
 
 
-def _in_sorted(at: Int64Array, others: Int64Array) -> NDArray[np.bool_]:
+def _in_sorted(at: Int64Array, others: Int64Array) -> BoolArray:
     """Return whether rising indexes (n,) are among other rising ones."""
     place = np.minimum(np.searchsorted(others, at), max(len(others) - 1, 0))
-    among: NDArray[np.bool_] = others[place] == at if len(others) else np.zeros(len(at), np.bool_)
+    among: BoolArray = others[place] == at if len(others) else np.zeros(len(at), np.bool_)
     return among
 
 

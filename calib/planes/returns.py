@@ -7,15 +7,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.calib.features import Features, Patch, Plane
 from swath.calib.flight import Flight, Swath
 from swath.calib.planes.cells import BLOCK, blocks, keys_of
 from swath.calib.planes.fit import PlaneSettings, Sight, fit_sight, refusal
 from swath.calib.planes.kernels import fill_table, gather
-from swath.georef.arrays import FloatArray
-from swath.georef.records import Int64Array
+from swath.georef.arrays import BoolArray, FloatArray, Int64Array
 
 WIDE_M = 0.5  # greatest distance of examined returns from a plane
 RIM_M = 0.5  # of a face: this far beyond a fold of 17° the other face is 0.15 m away, outside a gate of that size
@@ -62,7 +60,7 @@ def cells_of(points_t: FloatArray, cell_m: float) -> Int64Array:
     return numbers
 
 
-def well_inside(points_t: FloatArray, keys: Int64Array, cell_m: float) -> NDArray[np.bool_]:
+def well_inside(points_t: FloatArray, keys: Int64Array, cell_m: float) -> BoolArray:
     """Return which of points (n, 3) are at least `RIM_M`, or half of a small cell, inside the cells (c,) of a face.
 
     Beyond a ridge the other face stays within the gate for some decimetres, always below: returns from there would make
@@ -77,8 +75,8 @@ def well_inside(points_t: FloatArray, keys: Int64Array, cell_m: float) -> NDArra
 
 
 def pure(
-    points_t: FloatArray, plane: FloatArray, gate_m: float, cell: Int64Array, had: NDArray[np.bool_] | None = None
-) -> NDArray[np.bool_]:
+    points_t: FloatArray, plane: FloatArray, gate_m: float, cell: Int64Array, had: BoolArray | None = None
+) -> BoolArray:
     """Return which of points (n, 3) are within a gate of a plane (4,), in cells (n,) where nearly all points are.
 
     At a ridge both faces run through one cell: returns within the gate there belong to both. Former members (``had``)
@@ -86,10 +84,10 @@ def pure(
     """
     distance = np.abs(points_t @ plane[:3] - plane[3])
     share = np.bincount(cell, distance <= gate_m) / np.bincount(cell)
-    comes: NDArray[np.bool_] = (distance <= COMES * gate_m) & (share >= PURE)[cell]
+    comes: BoolArray = (distance <= COMES * gate_m) & (share >= PURE)[cell]
     if had is None:
         return comes
-    stays: NDArray[np.bool_] = (distance <= gate_m) & (share >= PURE_BEFORE)[cell]
+    stays: BoolArray = (distance <= gate_m) & (share >= PURE_BEFORE)[cell]
     return (stays & had) | comes
 
 

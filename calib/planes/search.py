@@ -23,8 +23,7 @@ from swath.calib.planes.cells import CELLS_LEAST, Segments, cell_middles, cell_s
 from swath.calib.planes.fit import GATE, PlaneError, PlaneSettings, expected_sigma, scaled_to
 from swath.calib.planes.given import given_planes
 from swath.calib.planes.returns import WIDE_M, cells_of, named, plane_of, pure, returns_near, sights_of, well_inside
-from swath.georef.arrays import BoolArray, FloatArray
-from swath.georef.records import Int64Array
+from swath.georef.arrays import BoolArray, FloatArray, Int64Array
 
 FIFTHS, THIRDS, OCTANTS = 5, 3, 8
 _ROOF_SHARE = 0.8  # of all planes, if there are too many

@@ -12,8 +12,7 @@ from swath.calib.flight import Flight, Swath
 from swath.calib.profiles.measure import PARAMETER, Ground
 from swath.calib.profiles.sections import Corridor
 from swath.calib.profiles.stepwise import Profile
-from swath.georef.arrays import FloatArray
-from swath.georef.records import Int64Array
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.georef.scanner.calibration import PARAMETERS, Calibration
 
 STEP = {"rad": 1e-5, "m": 1e-3, "s": 1e-6}  # steps of a parameter by its unit; otherwise the next one

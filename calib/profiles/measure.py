@@ -8,16 +8,14 @@ from dataclasses import dataclass, replace
 from itertools import chain
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.calib.flight import Flight, Swath
 from swath.calib.profiles.fit import TURNS, Fit, comparable, levers, solve, trajectory_sigmas
 from swath.calib.profiles.places import SAMPLES, Place, Track
 from swath.calib.profiles.sections import Corridor, Pieces, best_shift, fit_pieces, heights_by_bin
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.georef.scanner.calibration import Calibration
 
-IndexArray = NDArray[np.int64]
 Drawn = tuple[FloatArray, FloatArray]
 """Distances and heights (n,)."""
 FloatTriple = tuple[FloatArray, FloatArray, FloatArray]
@@ -143,7 +141,7 @@ class Ground:
         boxes = [np.concatenate([np.fmin.reduce(part), np.fmax.reduce(part)]) for part in parts]
         return cls(swath, np.array(boxes).reshape(-1, 4))
 
-    def rows_near(self, corridor: Corridor, longer_m: float = 0.0) -> IndexArray:
+    def rows_near(self, corridor: Corridor, longer_m: float = 0.0) -> Int64Array:
         """Return the indexes (k,) of its returns in a corridor that is extended by ``longer_m`` at either end."""
         pieces = [np.zeros(0, np.int64)]
         for chunk in np.flatnonzero(corridor.meets(self.boxes_t, longer_m)).tolist():
@@ -151,7 +149,7 @@ class Ground:
             pieces.append(chunk * CHUNK + np.flatnonzero(corridor.holds(points_t, longer_m)))
         return np.concatenate(pieces)
 
-    def taken(self, at: IndexArray) -> Swath:
+    def taken(self, at: Int64Array) -> Swath:
         """Select these returns (k,) of the swath."""
         swath = self.swath
         rate, acceleration = swath.encoder_rate, swath.encoder_acceleration

@@ -9,11 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from swath.georef.arrays import BoolArray, FloatArray
-
-IndexArray = NDArray[np.int64]
+from swath.georef.arrays import BoolArray, FloatArray, Int64Array
 
 ROUNDS = 3  # of a piece's plane: once from all its returns, then without distant ones
 FAR = 3.0  # a return is left out beyond this multiple of the median deviation (as a sigma)
@@ -98,10 +95,10 @@ class Pieces:
     side_slope: FloatArray
     sigma_m: FloatArray
     rms_m: FloatArray
-    count: IndexArray
+    count: Int64Array
 
 
-def grouped_median(values: FloatArray, group: IndexArray, groups: int) -> FloatArray:
+def grouped_median(values: FloatArray, group: Int64Array, groups: int) -> FloatArray:
     """Return the median (groups,) of the values (n,) of each group; nan for empty groups."""
     order = np.lexsort((values, group))
     count = np.bincount(group, minlength=groups)
@@ -136,7 +133,7 @@ def fit_pieces(
 
 
 def _planes(
-    group: IndexArray, columns: FloatArray, height: FloatArray, groups: int, least: int
+    group: Int64Array, columns: FloatArray, height: FloatArray, groups: int, least: int
 ) -> tuple[FloatArray, FloatArray]:
     """Return coefficients (groups, 3) and inverse normal matrices (groups, 3, 3) by least squares.
 

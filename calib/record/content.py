@@ -19,10 +19,9 @@ from swath.calib.flight import Flight
 from swath.calib.labels import unknown
 from swath.calib.outcome import Adjusted, Residuals, TrajectoryFit
 from swath.calib.record.values import Matrix, Value, utc_text
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.georef.geodesy.earth import geodetic_from_e, prime_vertical_radius_m, rot_e_from_l
 from swath.georef.geodesy.rotations import attitude_of, boresight, rot_from_quaternion
-from swath.georef.records import Int64Array
 from swath.georef.scanner.calibration import INDEX, Calibration
 from swath.georef.scanner.jacobian import observation_columns_e, parameter_columns_e
 

@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swath.calib.flight import Swath
-from swath.georef.arrays import FloatArray
-from swath.georef.records import Int64Array
+from swath.georef.arrays import BoolArray, FloatArray, Int64Array
 
 BLOCK = 1_000_000  # returns that are processed at a time
 RETURNS_A_CELL = 16.0
@@ -56,7 +55,7 @@ class StripBlock:
 
     points: FloatArray
     time_ns: Int64Array
-    single: NDArray[np.bool_]
+    single: BoolArray
     direction: NDArray[np.int8]
 
 

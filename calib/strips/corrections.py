@@ -31,8 +31,7 @@ from swath.calib.features import Features
 from swath.calib.flight import Flight
 from swath.calib.outcome import TrajectoryFit
 from swath.calib.parameters import ParameterOptions, unknowns
-from swath.georef.arrays import FloatArray, SingleArray
-from swath.georef.records import Int64Array
+from swath.georef.arrays import FloatArray, Int64Array, SingleArray
 from swath.georef.scanner.calibration import Calibration
 from swath.georef.trajectory.trajectory import Trajectory
 

@@ -14,12 +14,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.calib.flight import Flight
 from swath.calib.strips.cells import FlightStrip, Gathered, StripRules, blocks_of, gather, overlap_cells
-from swath.georef.arrays import FloatArray
-from swath.georef.records import Int64Array
+from swath.georef.arrays import BoolArray, FloatArray, Int64Array
 
 OVERLAP_SLOPE_DEG = 10.0  # USGS: overlap is judged on gentler slopes only
 GENTLE = math.cos(math.radians(OVERLAP_SLOPE_DEG))  # least vertical component of their normals
@@ -61,7 +59,7 @@ class Checks:
         return len(self.distance_m)
 
     @property
-    def gentle(self) -> NDArray[np.bool_]:
+    def gentle(self) -> BoolArray:
         """Mask (n,) of the slopes on which specifications judge heights."""
         return np.asarray(self.normal[:, 2] >= GENTLE)
 
@@ -298,7 +296,7 @@ def _nearest(gathered: Gathered, planes: _Planes, which: Int64Array, places: Flo
     return np.asarray(members[order][begins], np.int64)
 
 
-def _inside(gathered: Gathered, planes: _Planes, which: Int64Array, places: FloatArray) -> NDArray[np.bool_]:
+def _inside(gathered: Gathered, planes: _Planes, which: Int64Array, places: FloatArray) -> BoolArray:
     """Return whether places lie within the convex hulls of planes' returns.
 
     That is so if no half of the horizon around a place is free of returns.

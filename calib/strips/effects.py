@@ -9,10 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from swath.calib.flight import Flight, Head, Swath, Tangent
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
 from swath.georef.geodesy.rotations import rot_from_quaternion
-from swath.georef.records import Int64Array
 from swath.georef.scanner.beams import SpinningGeometry
 from swath.georef.scanner.calibration import INDEX, PARAMETERS
 from swath.georef.trajectory.trajectory import Poses, Trajectory

@@ -14,7 +14,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import csr_array
 
@@ -22,10 +21,9 @@ from swath.calib.equations.trajectory_prior import ERRORS, Taus, TrajectoryPrior
 from swath.calib.flight import FlightError
 from swath.calib.strips.differences import Checks
 from swath.calib.strips.effects import EFFECTS, NAMES, Effect, SeenFrom, effect_columns, error_columns
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import BoolArray, FloatArray, Int64Array
 from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
 from swath.georef.geodesy.rotations import rot_from_quaternion
-from swath.georef.records import Int64Array
 from swath.georef.trajectory.trajectory import Trajectory
 
 SIGNIFICANT = 3.29  # sigmas; one in a thousand by chance
@@ -135,7 +133,7 @@ def signatures(
     return Signatures(tuple(found), len(checks), rms_m, fit.left_rms_m, fit.variance_factor, prior.notes)
 
 
-def _known(checks: Checks, seen: SeenFrom) -> NDArray[np.bool_]:
+def _known(checks: Checks, seen: SeenFrom) -> BoolArray:
     """Return a mask of the rows for which both strips' trajectories are known."""
     known = np.ones(len(checks), bool)
     for strip, time_ns in ((checks.first, checks.point_ns), (checks.second, checks.centre_ns)):

@@ -18,8 +18,7 @@ from scipy.spatial import cKDTree
 
 from swath.calib.features import Features, Plane, Sighting, TiePoint
 from swath.calib.flight import Flight
-from swath.georef.arrays import FloatArray
-from swath.georef.records import Int64Array
+from swath.georef.arrays import FloatArray, Int64Array
 
 LEAST_RMS_M = 0.002  # lower limit of a patch's scatter
 SPACINGS = 2.5  # patches that end within this many point spacings of a line may still meet in it

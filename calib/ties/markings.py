@@ -15,15 +15,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, uniform_filter
 from scipy.signal import fftconvolve
 
 from swath.calib.features import Features, Sighting, TiePoint
 from swath.calib.flight import Flight, Swath
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, Int64Array
 
-IndexArray = NDArray[np.int64]
 CHUNK = 1_000_000
 LEAST_RMS_M = 0.002
 
@@ -128,7 +126,7 @@ def _tie(
     grid: Grid,
     number: int,
     seen: dict[int, Square],
-    returns: dict[int, NDArray[np.int64]],
+    returns: dict[int, Int64Array],
     settings: MarkingSettings,
     refused: Counter[str],
 ) -> TiePoint | None:
@@ -160,7 +158,7 @@ def _tie(
 def _sighting(
     swath: Swath,
     index: int,
-    at: NDArray[np.int64],
+    at: Int64Array,
     square: Square,
     place: FloatArray,
     covariance: FloatArray,
@@ -177,7 +175,7 @@ def _sighting(
 
 def _image(
     swath: Swath,
-    at: NDArray[np.int64],
+    at: Int64Array,
     square: Square,
     centre: FloatArray,
     smooth_m: float,
@@ -307,7 +305,7 @@ class Grid:
     columns: int
     rows: int
 
-    def number(self, points_t: FloatArray) -> IndexArray:
+    def number(self, points_t: FloatArray) -> Int64Array:
         """Return the numbers (n,) of the squares in which points (n, ≥ 2) lie; −1 for nan."""
         placed = np.isfinite(points_t[:, 0])
         away = np.where(placed[:, np.newaxis], points_t[:, :2], self.corner_t) - self.corner_t
@@ -425,7 +423,7 @@ def _square(number: int, grid: Grid, sums: FloatArray) -> Square | None:
     return Square(number, grid.centre(number), float(plane[0]), plane[1:], rms_m, sigma_m, n / grid.side_m**2, contrast)
 
 
-def near(swath: Swath, grid: Grid, numbers: Sequence[int]) -> dict[int, IndexArray]:
+def near(swath: Swath, grid: Grid, numbers: Sequence[int]) -> dict[int, Int64Array]:
     """Return, by square, the rising indexes of the returns in it and in its neighbours."""
     wanted = np.zeros(grid.columns * grid.rows, np.bool_)
     for number in numbers:

@@ -12,7 +12,6 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import optimize, sparse
 
 from swath.calib.control.points import ControlRules, Ground, grounds_at
@@ -21,9 +20,8 @@ from swath.calib.features import ControlPoint, Features, Plane
 from swath.calib.flight import Flight
 from swath.calib.planes.local import LocalPlane, plane_through
 from swath.calib.strips.effects import EFFECTS, SeenFrom, effect_columns
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import BoolArray, FloatArray, Int64Array
 from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
-from swath.georef.records import Int64Array
 from swath.georef.scanner.calibration import INDEX, Calibration
 
 FLOOR_M = 0.003  # of a distance, at most: variation of natural planes from one sight to another
@@ -95,7 +93,7 @@ class Rows:
             floor=floor,
         )
 
-    def independent(self, which: Any) -> NDArray[np.bool_]:
+    def independent(self, which: Any) -> BoolArray:
         """Return a mask (n,) of the chosen distances that are independent: k sights of a plane have k − 1.
 
         The distances with the most certain sights are kept; all others are sums and differences of them.

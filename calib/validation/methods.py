@@ -17,7 +17,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import optimize, stats
 
 from swath.calib.control.points import ControlRules
@@ -29,7 +28,7 @@ from swath.calib.strips.differences import Numbers
 from swath.calib.strips.effects import EFFECTS
 from swath.calib.validation.distances import Rows, control_rows, estimated_floor_m, plane_rows
 from swath.calib.validation.history import Compared, compare
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import BoolArray, FloatArray
 from swath.georef.geodesy.earth import geodetic_from_e
 from swath.georef.scanner.calibration import INDEX, PARAMETERS, Calibration
 
@@ -330,7 +329,7 @@ def same_logs(calibration: Calibration, logs: Sequence[tuple[str, str]]) -> tupl
 # ---------------------------------------------------------------------- planes
 
 
-def _classes(flight: Flight, rows: Rows) -> dict[str, NDArray[np.bool_]]:
+def _classes(flight: Flight, rows: Rows) -> dict[str, BoolArray]:
     """Return masks of the rows that belong to each method."""
     headings, heights = _flown_so(flight)
     first, second = rows.first, rows.second
@@ -363,7 +362,7 @@ def _flown_so(flight: Flight) -> tuple[FloatArray, FloatArray]:
     return headings, heights
 
 
-def _of_rows(name: str, every: Rows, which: NDArray[np.bool_]) -> Method:
+def _of_rows(name: str, every: Rows, which: BoolArray) -> Method:
     rows, tested = every.take(which), every.take(every.independent(which))
     if len(tested) < FEWEST:
         return Method(name, None, (), f"{name} ({CODES[name]}): not applied: {WANTS[name]}")

@@ -26,7 +26,7 @@ from swath.drivers.captures.pcap_writer import (
 )
 from swath.drivers.captures.serial import TagWriter
 from swath.drivers.transports.spec import TransportSpec, parse_transport
-from swath.georef.records import Int64Array
+from swath.georef.arrays import Int64Array
 
 # .ubx, .gps, .sbf: the names by which RTKLIB's convbin knows a format (app/convbin/convbin.c)
 _SERIAL_SUFFIX = {"ubx": ".ubx", "novatel": ".gps", "sbf": ".sbf", "nmea": ".nmea"}

@@ -38,7 +38,7 @@ from swath.daemon.log.mcap.scan import (
     unpack_chunk,
 )
 from swath.daemon.log.reader import PartDamage, Session
-from swath.georef.records import Int64Array
+from swath.georef.arrays import Int64Array
 
 OP_CHUNK_INDEX = 8
 _RECORD_HEAD_BYTES = 9

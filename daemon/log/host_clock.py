@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from swath.georef.records import Int64Array
+from swath.georef.arrays import Int64Array
 
 STEP_NOTICED_NS = 50_000  # a change of REALTIME − MONOTONIC beyond this is a step of the wall clock
 LATER_NS = 1_000_000_000  # a stamp later by more comes from a clock that was stepped forward and back meanwhile

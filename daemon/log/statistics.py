@@ -14,7 +14,8 @@ from swath.daemon.log.mcap.chunks import LogBatch, json_objects
 from swath.daemon.log.parsers import stored_parsers
 from swath.daemon.log.reader import Session
 from swath.drivers.parser import Parser
-from swath.georef.records import ChunkBatch, Int64Array
+from swath.georef.arrays import Int64Array
+from swath.georef.records import ChunkBatch
 
 USUAL_SHARE = 0.95  # intervals up to this quantile count as usual: those within bursts and the pauses between them
 GAP_MIN_NS = 1 << 27  # 0.134 s: a scanner whose laser is off still sends ten times a second

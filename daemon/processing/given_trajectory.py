@@ -19,10 +19,10 @@ from swath.georef.agreement import (
     heading_offset,
     time_that_explains,
 )
+from swath.georef.arrays import StructArray
 from swath.georef.geodesy.earth import e_from_geodetic, geodetic_from_e
 from swath.georef.mapping.datums import MappingError, between_datums, datum_that_explains, read_source, read_target
 from swath.georef.navigation.inputs import Kind
-from swath.georef.records import StructArray
 from swath.georef.timescales.gps_time import SECOND_NS, table_leap_seconds, utc_from_gps
 
 if TYPE_CHECKING:

@@ -12,20 +12,12 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.daemon.log.chunk_index import SCANNER, ChunkPlace, LogIndex, read_chunks
 from swath.daemon.log.format import source_of_topic
 from swath.daemon.log.reader import PartDamage
-from swath.georef.records import (
-    DEVICE_CLOCK_DTYPE,
-    ChunkBatch,
-    DeviceClockSamples,
-    DeviceStatus,
-    Record,
-    StructArray,
-    TimeMessage,
-)
+from swath.georef.arrays import BoolArray, StructArray
+from swath.georef.records import DEVICE_CLOCK_DTYPE, ChunkBatch, DeviceClockSamples, DeviceStatus, Record, TimeMessage
 from swath.georef.stream.clocks import DevicePlan, FrozenClocks, HeadTime, HostClocks
 from swath.georef.timescales import (
     SECOND_NS,
@@ -189,7 +181,7 @@ def _judged(plan: DevicePlan, rows: StructArray, host: HostClocks) -> Stamps | N
     return found if found is None else replace(found, brief=brief)
 
 
-def _before_it_says(rows: StructArray, says: NDArray[np.bool_]) -> tuple[StructArray, bool]:
+def _before_it_says(rows: StructArray, says: BoolArray) -> tuple[StructArray, bool]:
     """Return the rows before a head reports whether it is locked, and whether these rows are few.
 
     Few rows prove nothing by themselves. If the head is locked as soon as it reports and its stamps go on without a

@@ -18,8 +18,7 @@ import numpy as np
 from laspy.header import GpsTimeType
 
 from swath.daemon.processing.quicklook.point_files import UNREADABLE, PointReader, Selection, open_points
-from swath.georef.arrays import FloatArray
-from swath.georef.records import Int64Array
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.georef.timescales.gps_time import (
     GPS_EPOCH,
     GPS_EPOCH_UNIX_S,

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.calib.flight import Flight
 from swath.calib.strips.standards import ASPRS_2014, TO_CONFIRM, USGS, Judged, best_of, judge
@@ -28,7 +27,7 @@ from swath.daemon.processing.quicklook.strips import (
     compare,
     strip_frame,
 )
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, SingleArray
 from swath.georef.mapping.frame import Mapping
 
 BLOCK_POINTS = 500_000
@@ -308,7 +307,7 @@ def _words(strips: FlightStrips) -> str:
     return f"RMSDz {100.0 * strips.rms_m:.1f} cm" if math.isfinite(strips.rms_m) else "no comparison"
 
 
-def _largest(grid: NDArray[np.float32], times: int) -> FloatArray:
+def _largest(grid: SingleArray, times: int) -> FloatArray:
     """Return the value of largest size in each block of ``times`` by ``times`` cells; nan: the block has none."""
     rows, columns = (-(-size // times) * times for size in grid.shape)
     padded = np.full((rows, columns), np.nan)

@@ -22,7 +22,6 @@ from typing import Any
 
 import numpy as np
 import pyproj
-from numpy.typing import NDArray
 
 from swath.calib.adjust import adjust
 from swath.calib.equations.trajectory_prior import gauss_markov
@@ -46,6 +45,7 @@ from swath.drivers.scanner.hesai.parser import MODE_STRONGEST as HESAI_STRONGEST
 from swath.drivers.scanner.ouster.parser import OusterParser
 from swath.drivers.scanner.srep.layout import SrepHeader, encode_datagram
 from swath.drivers.scanner.velodyne.parser import MODE_DUAL, MODE_STRONGEST, encode_data_packet
+from swath.georef.arrays import FloatArray, Int64Array, StructArray
 from swath.georef.formats.las import LasSettings, LasWriter
 from swath.georef.geodesy.earth import e_from_geodetic, geodetic_from_e
 from swath.georef.geodesy.gravity import gravity_e
@@ -61,11 +61,9 @@ from swath.georef.records import (
     RETURN_DTYPE,
     ChunkBatch,
     FixType,
-    Int64Array,
     NamesEdge,
     PpsEdge,
     ScannerReturns,
-    StructArray,
     TimeMessage,
     TimeScale,
     TimeTag,
@@ -386,7 +384,7 @@ def _standing(gravity_mps2: float) -> Inertial:
     )
 
 
-def _seen(position_e: NDArray[np.float64]) -> StructArray:
+def _seen(position_e: FloatArray) -> StructArray:
     rows = np.zeros(2 * NAVIGATED_S, OBSERVATION_DTYPE)
     rows["time_ns"] = NAVIGATED_FROM_NS + np.repeat(np.arange(NAVIGATED_S), 2) * SECOND_NS
     rows["kind"] = np.tile([int(Kind.POSITION), int(Kind.VELOCITY)], NAVIGATED_S)

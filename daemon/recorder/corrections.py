@@ -15,7 +15,8 @@ from swath.daemon.log.events import Events, Severity
 from swath.daemon.system import name_thread
 from swath.drivers.parser import Parser
 from swath.drivers.transports.base import UnitBlock
-from swath.georef.records import Chunk, Int64Array
+from swath.georef.arrays import Int64Array
+from swath.georef.records import Chunk
 
 MOST_WAITING = 64  # reads that a receiver's port has not taken yet; older corrections are useless
 WAIT_S = 0.2

@@ -12,7 +12,8 @@ from swath.daemon.config import DeviceEntry
 from swath.daemon.devices.identify import Heard, not_understood
 from swath.drivers.driver import find_driver
 from swath.drivers.transports.base import UnitBlock
-from swath.georef.records import ChunkBatch, Int64Array
+from swath.georef.arrays import Int64Array
+from swath.georef.records import ChunkBatch
 
 JUDGED_BYTES = 64 * 1024  # several messages of every protocol
 JUDGED_AFTER_S = 10.0  # a slow device has sent several messages by then, and the start of the recording is over

@@ -27,7 +27,7 @@ from swath.daemon.log.wires import BLOCK_BYTES, MAX_SENDERS, SILENT_AFTER_S, Wir
 from swath.daemon.system import name_thread
 from swath.drivers.session import Session, SessionState
 from swath.drivers.transports.base import RawEdge, TransportCounters, UnitBlock
-from swath.georef.records import Int64Array
+from swath.georef.arrays import Int64Array
 
 REPORT_AGAIN_S = 30.0  # a continuing fault is reported at this interval, with the new counts
 

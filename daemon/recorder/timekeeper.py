@@ -15,7 +15,8 @@ from swath.daemon.log.events import Events, Severity
 from swath.daemon.log.host_clock import ClockDiscipline
 from swath.drivers.parser import Parser
 from swath.drivers.transports.base import UnitBlock
-from swath.georef.records import ChunkBatch, Int64Array, NamesEdge, Record, TimeMessage
+from swath.georef.arrays import Int64Array
+from swath.georef.records import ChunkBatch, NamesEdge, Record, TimeMessage
 from swath.georef.timescales import HostTimeline, PpsClock, WallComparison
 
 STOPPED_NS = 5_000_000_000  # data, but no time message for so long, and for three times the longest pause before …

@@ -9,10 +9,10 @@ import struct
 from ipaddress import IPv4Address, IPv6Address, ip_address
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.drivers.captures.base import Address
-from swath.georef.records import ByteRows, Int64Array
+from swath.georef.arrays import Int64Array
+from swath.georef.records import ByteRows
 
 NOBODY: Address = ("0.0.0.0", 0)  # stands for a sender that the log does not name
 FILE_HEADER = struct.pack("<IHHiIII", 0xA1B23C4D, 2, 4, 0, 0, 262_144, 1)  # stamps in nanoseconds, Ethernet
@@ -93,25 +93,25 @@ def _as_ipv6(host: str) -> bytes:
     return bytes(10) + b"\xff\xff" + address.packed if address.version == 4 else IPv6Address(address).packed
 
 
-def _put_u16(rows: ByteRows, at: int, values: NDArray[np.int64]) -> None:
+def _put_u16(rows: ByteRows, at: int, values: Int64Array) -> None:
     rows[:, at] = values >> 8
     rows[:, at + 1] = values & 0xFF
 
 
-def _sum16(rows: ByteRows) -> NDArray[np.int64]:
+def _sum16(rows: ByteRows) -> Int64Array:
     """Return the one's complement sums of rows, 16 bits at a time; an odd last byte is padded with 0."""
     high = rows[:, 0::2].sum(axis=1, dtype=np.int64)
-    total: NDArray[np.int64] = (high << 8) + rows[:, 1::2].sum(axis=1, dtype=np.int64)
+    total: Int64Array = (high << 8) + rows[:, 1::2].sum(axis=1, dtype=np.int64)
     for _ in range(3):
         total = (total & 0xFFFF) + (total >> 16)
     return total
 
 
-def _checksum(rows: ByteRows) -> NDArray[np.int64]:
+def _checksum(rows: ByteRows) -> Int64Array:
     return ~_sum16(rows) & 0xFFFF
 
 
-def _udp6_checksum(packets: ByteRows) -> NDArray[np.int64]:
+def _udp6_checksum(packets: ByteRows) -> Int64Array:
     """Compute the checksum over addresses, length, protocol and datagram (RFC 8200, 8.1); 0 is sent as FFFF."""
     length = packets.shape[1] - _IPV6_BYTES
     total = _sum16(packets[:, 8:]) + length + _UDP

@@ -38,7 +38,7 @@ from swath.drivers.captures.base import (
     until_damage,
 )
 from swath.drivers.transports.base import TransportError
-from swath.georef.records import Int64Array
+from swath.georef.arrays import Int64Array
 from swath.georef.timescales import SECOND_NS, table_leap_seconds
 
 MARK = b"TIMETAG RTKLIB"

@@ -14,6 +14,8 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from swath.georef.arrays import ByteArray
+
 Bytes: TypeAlias = bytes | bytearray | memoryview
 
 CRC24Q_POLYNOMIAL = 0x1864CFB  # RTCM 10403.3, 4.1.2 (Qualcomm's)
@@ -38,13 +40,13 @@ def nmea_xor(body: Bytes) -> int:
 
 
 @cache
-def _fletcher_weights() -> NDArray[np.uint8]:
+def _fletcher_weights() -> ByteArray:
     """Return the weights of the last n bytes in the second sum: n … 2, 1, modulo 256."""
     return np.arange(FLETCHER_STEP_BYTES, 0, -1).astype(np.uint8)
 
 
 @cache
-def _fletcher_ones() -> NDArray[np.uint8]:
+def _fletcher_ones() -> ByteArray:
     return np.ones(FLETCHER_STEP_BYTES, dtype=np.uint8)
 
 

@@ -19,16 +19,15 @@ from swath.drivers.driver import Driver
 from swath.drivers.imu.dbc.parser import DbcParser
 from swath.drivers.imu.dbc.signals import SignalLayout, find_signal, load_database
 from swath.drivers.parser import DeviceSettings
+from swath.georef.arrays import Int64Array, StructArray
 from swath.georef.records import (
     ByteRows,
     DeviceStatus,
     FixType,
     GnssFix,
     ImuSamples,
-    Int64Array,
     NamesEdge,
     Record,
-    StructArray,
     TimeMessage,
     TimeScale,
     TimeTag,

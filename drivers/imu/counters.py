@@ -5,9 +5,8 @@ from __future__ import annotations
 from fractions import Fraction
 
 import numpy as np
-from numpy.typing import NDArray
 
-from swath.georef.records import Int64Array
+from swath.georef.arrays import BoolArray, Int64Array, UInt64Array
 from swath.georef.timescales.gps_time import SECOND_NS
 
 RESTART_TOLERANCE_S = 2.0  # stalls may delay host stamps by this much
@@ -31,7 +30,7 @@ class CounterUnwrapper:
         self._last_host_ns = 0
         self._last = 0
 
-    def unwrap(self, raw: NDArray[np.uint64], host_time_ns: Int64Array) -> tuple[Int64Array, NDArray[np.bool_]]:
+    def unwrap(self, raw: UInt64Array, host_time_ns: Int64Array) -> tuple[Int64Array, BoolArray]:
         """Return continuous counts (n,) of raw values (n,) with their host times, and (n,) True where the device
         restarted.
         """
@@ -50,7 +49,7 @@ class CounterUnwrapper:
         restart[0] &= not first
         return counts, restart
 
-    def _steps(self, raw: NDArray[np.uint64], host_step_ns: Int64Array) -> tuple[Int64Array, NDArray[np.bool_]]:
+    def _steps(self, raw: UInt64Array, host_step_ns: Int64Array) -> tuple[Int64Array, BoolArray]:
         """Return steps between neighbours in ticks, whole wraps added by host time, and where the device restarted."""
         span_s = host_step_ns / SECOND_NS
         expected = span_s * self._tick_hz
@@ -66,7 +65,7 @@ class CounterUnwrapper:
         tolerance = (RESTART_TOLERANCE_S + RESTART_TOLERANCE_RATE * np.abs(span_s)) * self._tick_hz
         return steps, unsure | (steps < 0) | (np.abs(expected - steps) > tolerance)
 
-    def _accumulate(self, steps: Int64Array, restart: NDArray[np.bool_], raw: Int64Array) -> Int64Array:
+    def _accumulate(self, steps: Int64Array, restart: BoolArray, raw: Int64Array) -> Int64Array:
         """Return running counts; each restart begins at its own raw value."""
         sums = self._last + np.cumsum(np.where(restart, 0, steps))
         where = np.flatnonzero(restart)
@@ -84,7 +83,7 @@ class GapCounter:
         self._bits = bits
         self._last: np.uint64 | None = None
 
-    def missing(self, raw: NDArray[np.uint64]) -> int:
+    def missing(self, raw: UInt64Array) -> int:
         """Return how many values are missing between the raw ones (n,), starting after the last one of the previous
         call.
         """
@@ -110,9 +109,7 @@ class LatchTracker:
         self._last_known = False
         self._last_count = -1
 
-    def track(
-        self, raw: NDArray[np.uint64], known: NDArray[np.bool_], counts: Int64Array, restart: NDArray[np.bool_]
-    ) -> Int64Array:
+    def track(self, raw: UInt64Array, known: BoolArray, counts: Int64Array, restart: BoolArray) -> Int64Array:
         """Return continuous latched counts (n,), −1 where unknown.
 
         Args:
@@ -133,7 +130,7 @@ class LatchTracker:
         return latched
 
 
-def latched_before(raw: NDArray[np.uint64], bits: int, reference: Int64Array) -> Int64Array:
+def latched_before(raw: UInt64Array, bits: int, reference: Int64Array) -> Int64Array:
     """Return continuous counts of latched raw values: the nearest at or below the reference counts.
 
     A latch may be reported a moment before the sample that follows it, so a value ahead of its reference by less than

@@ -27,16 +27,15 @@ from numpy.typing import NDArray
 from swath.drivers.can_frames import CAN_EFF_FLAG, CAN_ERR_FLAG, CAN_RTR_FLAG, decode_can_frames
 from swath.drivers.driver import Driver
 from swath.drivers.parser import DeviceSettings, DriverSettingsError, PacketParser
+from swath.georef.arrays import Int64Array, StructArray
 from swath.georef.records import (
     ByteRows,
     DeviceStatus,
     FixType,
     GnssFix,
     GnssHeading,
-    Int64Array,
     NamesEdge,
     Record,
-    StructArray,
     TimeMessage,
     TimeScale,
     TimeTag,
@@ -168,7 +167,7 @@ class Nmea2000Parser(PacketParser):
 
     # -- frames
 
-    def _addresses(self, can_id: NDArray[np.uint32]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def _addresses(self, can_id: NDArray[np.uint32]) -> tuple[Int64Array, Int64Array]:
         """Return PGN (−1 unless it is a data frame with 29 bits) and source address of each frame."""
         flagged = can_id & np.uint32(CAN_ERR_FLAG | CAN_RTR_FLAG)
         errors = int(np.count_nonzero(flagged & np.uint32(CAN_ERR_FLAG)))
@@ -192,7 +191,7 @@ class Nmea2000Parser(PacketParser):
         pgn: int,
         layout: Layout,
         where: NDArray[np.intp],
-        source: NDArray[np.int64],
+        source: Int64Array,
         table: StructArray,
         host_time_ns: Int64Array,
     ) -> list[tuple[int, list[Record]]]:
@@ -215,7 +214,7 @@ class Nmea2000Parser(PacketParser):
         return found
 
     def _fast_frames(
-        self, where: NDArray[np.intp], source: NDArray[np.int64], table: StructArray, host_time_ns: Int64Array
+        self, where: NDArray[np.intp], source: Int64Array, table: StructArray, host_time_ns: Int64Array
     ) -> list[tuple[int, list[Record]]]:
         """Return row and records of each completed 129029, which make up few of a bus's frames."""
         found: list[tuple[int, list[Record]]] = []
@@ -316,7 +315,7 @@ class Nmea2000Parser(PacketParser):
         return [*records, fix]
 
 
-def pgn_and_source(can_id: NDArray[np.uint32]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def pgn_and_source(can_id: NDArray[np.uint32]) -> tuple[Int64Array, Int64Array]:
     """Return PGN and source address of (n,) 29-bit identifiers (SAE J1939-21).
 
     PDU format below 240 means that the next byte is a destination and no part of the PGN.

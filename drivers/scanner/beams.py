@@ -10,8 +10,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from swath.georef.arrays import FloatArray
-from swath.georef.records import StructArray
+from swath.georef.arrays import FloatArray, StructArray
 
 
 @dataclass(frozen=True)

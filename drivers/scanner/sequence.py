@@ -11,8 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.georef.arrays import BoolArray
-from swath.georef.records import Int64Array
+from swath.georef.arrays import BoolArray, Int64Array
 
 _U32 = 1 << 32
 LATE_DATAGRAMS = 64  # the network delays a datagram by at most so many places; a larger step back is a restart

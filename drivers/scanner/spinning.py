@@ -19,8 +19,7 @@ from swath.drivers.scanner.rows.slots import (
     in_order,
     returns_table,
 )
-from swath.georef.arrays import FloatArray
-from swath.georef.records import Int64Array, StructArray
+from swath.georef.arrays import ByteArray, FloatArray, Int64Array, StructArray
 
 # A return as one 32-bit number: range, reflectivity, and 1 for a pair's second. ``strength`` omits the range.
 _CONTENT = np.dtype(
@@ -84,9 +83,7 @@ class Firings:
         )
 
 
-def returns_of_packets(
-    mode: NDArray[np.uint8], most: int, firings_of: Callable[[slice], Firings], fill: Fill
-) -> StructArray:
+def returns_of_packets(mode: ByteArray, most: int, firings_of: Callable[[slice], Firings], fill: Fill) -> StructArray:
     """Decode the returns of all packets in order, in blocks of one return mode.
 
     Args:

@@ -12,7 +12,8 @@ import termios
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
-from swath.georef.records import ByteRows, Int64Array
+from swath.georef.arrays import Int64Array
+from swath.georef.records import ByteRows
 
 HEAD_ROOM_BYTES = 31  # size of a message's header in the log: opcode, length, channel, sequence, two times (MCAP)
 

@@ -19,10 +19,10 @@ from collections.abc import Iterator
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.drivers.transports.base import HEAD_ROOM_BYTES, UnitBlock
-from swath.georef.records import ByteRows, Int64Array
+from swath.georef.arrays import Int64Array, UInt64Array
+from swath.georef.records import ByteRows
 
 SO_TIMESTAMPNS = 35  # also SCM_TIMESTAMPNS, <asm-generic/socket.h>
 SO_RCVBUFFORCE = 33
@@ -75,7 +75,7 @@ class MessageReader:
         self._taken = 0  # bytes of it that blocks use
         self._expected = min(unit_bytes, FIRST_EXPECTED_BYTES)
         self._peers = np.zeros((slots, PEER_BYTES), np.uint8)
-        self._peer_keys: NDArray[np.uint64] = self._peers.view(np.uint64)[:, 0]  # family, port, address
+        self._peer_keys: UInt64Array = self._peers.view(np.uint64)[:, 0]  # family, port, address
         self._stamps = np.zeros(slots, _STAMP)
         self._headers = np.zeros(slots, _MMSGHDR)
         self._iovecs = np.zeros((slots, 2), _IOVEC)

@@ -14,14 +14,12 @@ from typing import Any, BinaryIO
 
 import lazrs
 import numpy as np
-from numpy.typing import NDArray
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, Int64Array, StructArray
 from swath.georef.compiled import jit_cached
 from swath.georef.formats.las import BLOCK, Clipped, LasSettings, PointPacker
 from swath.georef.formats.las_header import POINT_FORMAT, LasHeader, encode_copc_info, encode_evlr, encode_vlr
 from swath.georef.points import Points
-from swath.georef.records import Int64Array
 
 NODE_POINTS = 65_536
 ALL_OF = 1.5  # times that many: a node takes all remaining points, rather than leave a few to each of eight others
@@ -90,7 +88,7 @@ class CopcWriter:
         info = encode_copc_info(cube.low + cube.size / 2, cube.size / 2, cube.size / SPACINGS, hierarchy, span)
         return self.header.encode(self._laszip.record_data(), encode_vlr("copc", 1, info, "COPC info"), 1)
 
-    def _blocks(self) -> Iterator[tuple[int, NDArray[np.void]]]:
+    def _blocks(self) -> Iterator[tuple[int, StructArray]]:
         """Yield records in the order in which they came, with the number of the first one."""
         self._spool.seek(0)
         dtype = self.header.dtype
@@ -116,7 +114,7 @@ class CopcWriter:
                 self._sorted.write(ordered[start : start + length].tobytes())
                 at[place] += length
 
-    def _compress(self, nodes: Int64Array, counts: Int64Array) -> NDArray[np.void]:
+    def _compress(self, nodes: Int64Array, counts: Int64Array) -> StructArray:
         compressor: Any = lazrs.LasZipCompressor(self._stream, self._laszip)
         self._sorted.seek(0)
         for number, count in enumerate(counts.tolist()):
@@ -152,7 +150,7 @@ class _Cube:
         depth = math.ceil(math.log2(max(header.count / NODE_POINTS, 1.0)))  # enough where points lie along a line
         return cls(bounds[0] - header.scale, size, min(depth, MAX_DEPTH), header.scale, header.offset)
 
-    def cells(self, records: NDArray[np.void]) -> Int64Array:
+    def cells(self, records: StructArray) -> Int64Array:
         """Return (n,) the cell of the finest level that each record lies in."""
         cells = np.empty(len(records), np.int64)
         per_unit = (1 << self.depth) / self.size
@@ -174,7 +172,7 @@ class _Tree:
     left: FloatArray
 
     @classmethod
-    def over(cls, cube: _Cube, blocks: Iterator[tuple[int, NDArray[np.void]]]) -> _Tree:
+    def over(cls, cube: _Cube, blocks: Iterator[tuple[int, StructArray]]) -> _Tree:
         found = [np.unique(cube.cells(records), return_counts=True) for _, records in blocks]
         cells, counts = _summed(found)
         depth = cube.depth
@@ -190,7 +188,7 @@ class _Tree:
             left[:, level] = share
         return cls(cells, left)
 
-    def nodes(self, cube: _Cube, first: int, records: NDArray[np.void]) -> Int64Array:
+    def nodes(self, cube: _Cube, first: int, records: StructArray) -> Int64Array:
         """Return (n,) node of each record: level, x, y, z as bits of one number that rises in the order of the file."""
         nodes = np.empty(len(records), np.int64)
         _fill_nodes(cube.cells(records), first, self.cells, self.left, nodes)

@@ -15,11 +15,10 @@ import lazrs
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.georef.arrays import ByteArray, FloatArray, SingleArray
+from swath.georef.arrays import ByteArray, FloatArray, Int64Array, SingleArray, StructArray
 from swath.georef.compiled import jit_cached, jit_inline
 from swath.georef.formats.las_header import POINT_FORMAT, SIGMA_SCALE_M, LasHeader
 from swath.georef.points import Points
-from swath.georef.records import Int64Array
 
 ADJUSTED_GPS_EPOCH_S = 1_000_000_000
 SCAN_ANGLE_UNIT_RAD = math.radians(0.006)
@@ -111,7 +110,7 @@ class PointPacker:
 
     def pack(
         self, points: Points, first: int, *, scanner: int = 0, intensity_factor: float = 1.0, withheld: bool = False
-    ) -> NDArray[np.void]:
+    ) -> StructArray:
         """Return records of at most `BLOCK` points from ``first`` on; the next call overwrites them.
 
         Raises:
@@ -135,7 +134,7 @@ class PointPacker:
         head.count += len(records)
         return records
 
-    def _out_of_bounds(self, point: NDArray[np.float64]) -> str:
+    def _out_of_bounds(self, point: FloatArray) -> str:
         head = self.header
         inside = np.abs((point - head.offset) * self._per_unit) <= _LARGEST - 1
         axis = int(np.argmin(inside))

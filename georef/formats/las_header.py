@@ -7,7 +7,8 @@ import struct
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
+
+from swath.georef.arrays import FloatArray, Int64Array
 
 HEADER_BYTES = 375
 POINT_FORMAT = 6
@@ -58,8 +59,8 @@ class LasHeader:
         count, count_by_return, minimum, maximum: set when all points are written; the coordinates' integers.
     """
 
-    scale: NDArray[np.float64]
-    offset: NDArray[np.float64]
+    scale: FloatArray
+    offset: FloatArray
     sigmas: bool
     wkt: str
     creation_date: dt.date
@@ -68,9 +69,9 @@ class LasHeader:
     file_source_id: int = 0
     provenance: str = ""
     count: int = 0
-    count_by_return: NDArray[np.int64] = field(default_factory=lambda: np.zeros(RETURNS + 1, np.int64))
-    minimum: NDArray[np.float64] = field(default_factory=lambda: np.full(3, np.inf))
-    maximum: NDArray[np.float64] = field(default_factory=lambda: np.full(3, -np.inf))
+    count_by_return: Int64Array = field(default_factory=lambda: np.zeros(RETURNS + 1, np.int64))
+    minimum: FloatArray = field(default_factory=lambda: np.full(3, np.inf))
+    maximum: FloatArray = field(default_factory=lambda: np.full(3, -np.inf))
     evlr_start: int = 0
     evlr_count: int = 0
 
@@ -80,11 +81,11 @@ class LasHeader:
         return SIGMA_POINT_DTYPE if self.sigmas else POINT_DTYPE
 
     @property
-    def bounds(self) -> NDArray[np.float64]:
+    def bounds(self) -> FloatArray:
         """Least and largest coordinates (2, 3); zeros without points."""
         if not self.count:
             return np.zeros((2, 3))
-        bounds: NDArray[np.float64] = np.stack([self.minimum, self.maximum]) * self.scale + self.offset
+        bounds: FloatArray = np.stack([self.minimum, self.maximum]) * self.scale + self.offset
         return bounds
 
     def encode(self, laszip: bytes, first_vlrs: bytes = b"", first_count: int = 0) -> bytes:
@@ -151,7 +152,7 @@ def encode_evlr(user_id: str, record_id: int, data: bytes, description: str) -> 
 
 
 def encode_copc_info(
-    centre: NDArray[np.float64],
+    centre: FloatArray,
     half_size: float,
     spacing: float,
     hierarchy: tuple[int, int],

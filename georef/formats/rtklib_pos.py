@@ -9,13 +9,12 @@ from __future__ import annotations
 import re
 
 import numpy as np
-from numpy.typing import NDArray
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import ByteArray, FloatArray, Int64Array
 from swath.georef.formats.text_times import clock_ns, gps_days, gps_ns_of_day, leap_seconds_on, weeks_ns
 from swath.georef.formats.trajectory.columns import TrajectoryColumns, unsaid
 from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
-from swath.georef.records import FixType, Int64Array
+from swath.georef.records import FixType
 from swath.georef.timescales.gps_time import DAY_NS, SECOND_NS
 from swath.georef.trajectory.trajectory import TrajectoryError
 
@@ -102,14 +101,14 @@ def degrees_of(dms: FloatArray) -> FloatArray:
     return degrees
 
 
-def fix_types(quality: FloatArray | None, known: dict[int, FixType]) -> NDArray[np.uint8] | None:
+def fix_types(quality: FloatArray | None, known: dict[int, FixType]) -> ByteArray | None:
     """Return (n,) `FixType` of a column of quality numbers: NONE for an unknown number; None without the column."""
     if quality is None:
         return None
     return np.array([known.get(int(q) if np.isfinite(q) else 0, FixType.NONE) for q in quality], dtype=np.uint8)
 
 
-def byte_counts(said: FloatArray) -> NDArray[np.uint8]:
+def byte_counts(said: FloatArray) -> ByteArray:
     """Return (n,) whole numbers from 0 to 255; missing ones become 0."""
     return np.clip(np.nan_to_num(said, nan=0.0), 0, 255).astype(np.uint8)
 

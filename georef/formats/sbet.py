@@ -15,9 +15,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import BoolArray, FloatArray, Int64Array
 from swath.georef.formats.trajectory.columns import (
     Span,
     TrajectoryColumns,
@@ -29,7 +28,6 @@ from swath.georef.formats.trajectory.columns import (
     unsaid,
 )
 from swath.georef.geodesy.quaternions import conjugate, rotated
-from swath.georef.records import Int64Array
 from swath.georef.timescales.gps_time import SECOND_NS, WEEK_NS, WEEK_S, week_from_gps
 from swath.georef.trajectory.trajectory import Trajectory, TrajectoryError
 
@@ -82,7 +80,7 @@ def read_sbet(
         *(position, attitude),
         angles_in="radians",
     )
-    whole: NDArray[np.bool_] = np.logical_and.reduce(np.isfinite(table[:, 1:USED_DOUBLES]), axis=1)
+    whole: BoolArray = np.logical_and.reduce(np.isfinite(table[:, 1:USED_DOUBLES]), axis=1)
     columns.velocity_l = _velocity_l(columns, table[:, 10], whole)
     return columns
 
@@ -164,7 +162,7 @@ def _table(data: bytes, name: str, kind: str, doubles: int) -> FloatArray:
     return table
 
 
-def _velocity_l(columns: TrajectoryColumns, wander_rad: FloatArray, whole: NDArray[np.bool_]) -> FloatArray:
+def _velocity_l(columns: TrajectoryColumns, wander_rad: FloatArray, whole: BoolArray) -> FloatArray:
     """Return velocities north, east, down, by the platform axes with which they agree with the positions' motion.
 
     Only complete records, ``whole`` (n,), decide this.

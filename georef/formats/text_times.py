@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from swath.georef.records import Int64Array
+from swath.georef.arrays import Int64Array
 from swath.georef.timescales.gps_time import (
     DAY_NS,
     GPS_EPOCH,

@@ -19,11 +19,11 @@ from itertools import pairwise
 
 import numpy as np
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.georef.formats.rtklib_pos import byte_counts, degrees_of, fix_types
 from swath.georef.formats.text_times import clock_ns, gps_days, gps_ns_of_day, leap_seconds_on
 from swath.georef.formats.trajectory.columns import Span, TrajectoryColumns, continuous_of_week, placed_in_week
-from swath.georef.records import FixType, Int64Array
+from swath.georef.records import FixType
 from swath.georef.timescales.gps_time import DAY_NS, SECOND_NS, WEEK_NS, WEEK_S
 from swath.georef.trajectory.trajectory import TrajectoryError
 

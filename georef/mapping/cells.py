@@ -15,7 +15,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.georef.arrays import FloatArray, IntArray
+from swath.georef.arrays import FloatArray, Int64Array, SingleArray
 from swath.georef.compiled import jit_cached, jit_inline
 
 Exact = Callable[[FloatArray], FloatArray]
@@ -96,7 +96,7 @@ class MapCells:
             self._expand(points_e[block], mapped[block])
         return mapped
 
-    def map_with_sigmas(self, points_e: FloatArray, covariance_e: FloatArray) -> tuple[FloatArray, NDArray[np.float32]]:
+    def map_with_sigmas(self, points_e: FloatArray, covariance_e: FloatArray) -> tuple[FloatArray, SingleArray]:
         """Return `map`, and sigmas (n, 3) in metres along the map's axes.
 
         Covariances are (n, 6) in e, xx xy xz yy yz zz.
@@ -143,7 +143,7 @@ class MapCells:
             for start in range(0, len(keys), CELLS_AT_ONCE):
                 self._make(keys[start : start + CELLS_AT_ONCE])
 
-    def _make(self, keys: IntArray) -> None:
+    def _make(self, keys: Int64Array) -> None:
         """Make cubes and enter them in the tables."""
         level, corner = keys >> 60, np.stack([(keys >> shift & _MASK) - _OFFSET for shift in (40, 20, 0)], axis=-1)
         size = (ROOT_M / 2.0**level).astype(np.float64)
@@ -165,7 +165,7 @@ class MapCells:
         else:
             _enter(keys[roots], (first + roots).astype(np.int32), self._table_keys, self._table_nodes)
 
-    def _adopt(self, level: int, corner: IntArray, node: int) -> None:
+    def _adopt(self, level: int, corner: Int64Array, node: int) -> None:
         above, octant = corner >> 1, corner & 1
         parent = self._node_of[_packed(level - 1, *above.tolist())]
         self._children[parent, int(octant @ (1, 2, 4))] = node
@@ -249,7 +249,7 @@ def _slot_of(key: int, size: int) -> int:
 
 
 @jit_cached
-def _enter(keys: IntArray, nodes: NDArray[np.int32], table_keys: IntArray, table_nodes: NDArray[np.int32]) -> None:
+def _enter(keys: Int64Array, nodes: NDArray[np.int32], table_keys: Int64Array, table_nodes: NDArray[np.int32]) -> None:
     for i in range(len(keys)):
         slot = _slot_of(keys[i], len(table_keys))
         while table_nodes[slot] >= 0:
@@ -262,7 +262,7 @@ def _descend(
     x: float,
     y: float,
     z: float,
-    table_keys: IntArray,
+    table_keys: Int64Array,
     table_nodes: NDArray[np.int32],
     children: NDArray[np.int32],
     kinds: NDArray[np.int8],
@@ -288,8 +288,8 @@ def _descend(
 def _find(
     points: FloatArray,
     nodes: NDArray[np.int32],
-    wanted: IntArray,
-    table_keys: IntArray,
+    wanted: Int64Array,
+    table_keys: Int64Array,
     table_nodes: NDArray[np.int32],
     children: NDArray[np.int32],
     kinds: NDArray[np.int8],
@@ -322,7 +322,7 @@ def _find(
 
 
 @jit_inline
-def _second_order(row: NDArray[np.float64], j: int, x: float, y: float, z: float, squares: tuple[float, ...]) -> float:
+def _second_order(row: FloatArray, j: int, x: float, y: float, z: float, squares: tuple[float, ...]) -> float:
     """Return coordinate j of an expansion at x, y, z from its centre."""
     a, b = np.uint64(7 + 3 * j), np.uint64(16 + 6 * j)
     xx, xy, xz, yy, yz, zz = squares
@@ -355,7 +355,7 @@ def _expand(
 
 
 @jit_inline
-def _sigma(row: NDArray[np.float64], j: int, xx: float, xy: float, xz: float, yy: float, yz: float, zz: float) -> float:
+def _sigma(row: FloatArray, j: int, xx: float, xy: float, xz: float, yy: float, yz: float, zz: float) -> float:
     """Return √(g Σ gᵀ), g the first derivatives of coordinate j (law of propagation of variances)."""
     at = np.uint64(7 + 3 * j)
     a, b, c = row[at], row[at + np.uint64(1)], row[at + np.uint64(2)]
@@ -369,7 +369,7 @@ def _project(
     covariance: FloatArray,
     rows: FloatArray,
     unit_m: FloatArray,
-    sigmas: NDArray[np.float32],
+    sigmas: SingleArray,
 ) -> None:
     """Compute sigmas along the axes of the map; nan beyond the reach of cubes."""
     for i in range(len(nodes)):

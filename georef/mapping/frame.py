@@ -12,13 +12,13 @@ from typing import Any
 
 import numpy as np
 import pyproj
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pyproj import CRS
 from pyproj.database import get_database_metadata
 from pyproj.enums import TransformDirection
 from pyproj.exceptions import CRSError
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import BoolArray, FloatArray, SingleArray
 from swath.georef.geodesy.earth import geodetic_from_e
 from swath.georef.map_fit import degrees_text, misfit_of, outside_deg
 from swath.georef.mapping.cells import APPROXIMATION_M, ROOT_M, MapCells
@@ -145,7 +145,7 @@ class Mapping:
 
     def map_with_sigmas(
         self, points_e: FloatArray, covariance_e: FloatArray | None
-    ) -> tuple[FloatArray, NDArray[np.float32] | None]:
+    ) -> tuple[FloatArray, SingleArray | None]:
         """Return `map_from_e`, and sigmas (n, 3) along easting, northing and up, in metres, if covariances are given.
 
         Covariances are (n, 6) xx xy xz yy yz zz in e, m². The sigmas are those of the coordinates in the file: the
@@ -158,14 +158,14 @@ class Mapping:
         self._settle_by_first(points)
         return self._cells.map_with_sigmas(points, np.ascontiguousarray(covariance_e, dtype=np.float64))
 
-    def reaches(self, points_e: FloatArray) -> NDArray[np.bool_]:
+    def reaches(self, points_e: FloatArray) -> BoolArray:
         """Return whether `map_from_e` has coordinates for each of positions in e (n, 3), without raising for any.
 
         Raises:
             MappingError: no operation can be chosen.
         """
         points = np.ascontiguousarray(points_e, dtype=np.float64)
-        reached: NDArray[np.bool_] = np.logical_and.reduce(np.isfinite(points), axis=1)
+        reached: BoolArray = np.logical_and.reduce(np.isfinite(points), axis=1)
         points = points[reached]
         self._settle_by_first(points)
         centres, cube = np.unique(np.floor(points / ROOT_M), axis=0, return_inverse=True)

@@ -17,10 +17,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.georef.compiled import jit_cached, jit_inline
 from swath.georef.navigation.filter.strapdown import Samples
-from swath.georef.records import Int64Array
 
 UNKNOWN_RATE_RADPS, UNKNOWN_FORCE_MPS2 = 0.05, 1.0  # error of a made-up sample before any is known
 LEVELS = 7

@@ -19,14 +19,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
 from swath.georef.navigation.filter.error_model import E_ATTITUDE, E_POSITION, MOVED
 from swath.georef.navigation.filter.filter import FilterRun
 from swath.georef.navigation.filter.strapdown import VELOCITY
 from swath.georef.navigation.filter.types import Nodes
 from swath.georef.navigation.inputs import NavigationError
-from swath.georef.records import Int64Array
 
 ERRORS = 6  # per moment: position north, east, down, then small turns of the body about north, east, down
 

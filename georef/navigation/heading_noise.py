@@ -19,7 +19,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, StructArray
 from swath.georef.navigation.inputs import Kind, Setup
 from swath.georef.navigation.noise import (
     ENOUGH,
@@ -32,7 +32,6 @@ from swath.georef.navigation.noise import (
     Run,
     log_likelihoods,
 )
-from swath.georef.records import StructArray
 from swath.georef.timescales import SECOND_NS
 
 LONGEST_S = 1000.0  # an error beyond this cannot be told from a constant within ten minutes

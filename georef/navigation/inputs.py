@@ -11,8 +11,7 @@ from enum import IntEnum
 
 import numpy as np
 
-from swath.georef.arrays import BoolArray, FloatArray
-from swath.georef.records import Int64Array, StructArray
+from swath.georef.arrays import BoolArray, FloatArray, Int64Array, StructArray
 from swath.georef.trajectory.trajectory import DEFAULT_MAX_GAP_NS, Trajectory
 
 ARM_UNSAID_M = 2.0  # prior sigma of a lever arm that is not configured: it is estimated with the flight

@@ -27,9 +27,8 @@ from typing import Any
 
 import numpy as np
 
-from swath.georef.arrays import BoolArray, FloatArray
+from swath.georef.arrays import BoolArray, FloatArray, StructArray
 from swath.georef.navigation.inputs import Fate, Kind, Setup
-from swath.georef.records import StructArray
 
 Run = Callable[[Setup], StructArray]
 

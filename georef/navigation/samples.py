@@ -13,9 +13,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from swath.georef.arrays import BoolArray, FloatArray
+from swath.georef.arrays import BoolArray, FloatArray, Int64Array, StructArray
 from swath.georef.navigation.inputs import Inertial, NavigationError
-from swath.georef.records import Int64Array, StructArray
 from swath.georef.timescales.gps_time import SECOND_NS
 
 SampleRule = Literal["mean", "instant", "increment"]

@@ -12,9 +12,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import BoolArray, ByteArray, FloatArray, StructArray
 from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
 from swath.georef.geodesy.rotations import attitude_of, rot_from_quaternion
 from swath.georef.navigation.cross_covariance import ErrorChain, error_chain
@@ -26,7 +26,6 @@ from swath.georef.navigation.filter.strapdown import ATTITUDE, TIME_OFFSET
 from swath.georef.navigation.heading_noise import find_heading_noise
 from swath.georef.navigation.inputs import Inertial, Setup, Solution, Start
 from swath.georef.navigation.noise import OF_GNSS, NoiseFound, Run, find_noise, not_blunders, rescaled
-from swath.georef.records import StructArray
 from swath.georef.timescales import SECOND_NS
 
 MOST_PASSES = 3
@@ -168,7 +167,7 @@ def _bent(nodes: SmoothedNodes) -> bool:
     return bool(_change(nodes) ** 2 > LINEAR_SHARE * nodes.sigma[0, 6:].min())
 
 
-def _of_gnss(kinds: NDArray[np.uint8]) -> NDArray[np.bool_]:
+def _of_gnss(kinds: ByteArray) -> BoolArray:
     return np.isin(kinds, [int(kind) for kind in OF_GNSS])
 
 

@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from swath.georef.arrays import BoolArray
+from swath.georef.arrays import BoolArray, StructArray
 from swath.georef.geodesy.gravity import EARTH_RATE_RADPS
 from swath.georef.navigation.inputs import OBSERVATION_DTYPE, Inertial, Kind, sort_observations
-from swath.georef.records import StructArray
 from swath.georef.timescales import SECOND_NS
 
 TURN_RADPS = 4e-3  # mean of a second: above it the vehicle turns; biases of a good unit are smaller

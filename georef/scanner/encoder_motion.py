@@ -12,8 +12,8 @@ from typing import Protocol
 
 import numpy as np
 
-from swath.georef.arrays import FloatArray
-from swath.georef.records import RETURN_DTYPE, Int64Array, StructArray
+from swath.georef.arrays import FloatArray, Int64Array, StructArray
+from swath.georef.records import RETURN_DTYPE
 from swath.georef.return_rows import concatenate, words
 from swath.georef.scanner.kernels.motion import PLACE, REACH, TRAIN, cut, rates
 

@@ -15,11 +15,9 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import BoolArray, ByteArray, FloatArray, Int64Array, StructArray
 from swath.georef.geodesy.rotations import rot_l_from_b
-from swath.georef.records import Int64Array, StructArray
 
 DEFAULT_MAX_GAP_NS = 1_000_000_000
 
@@ -81,7 +79,7 @@ class AngleSeries:
     def _unwrapped(self) -> FloatArray:
         return np.unwrap(self.angles_rad, axis=0)
 
-    def at(self, time_ns: Int64Array) -> tuple[FloatArray, NDArray[np.bool_]]:
+    def at(self, time_ns: Int64Array) -> tuple[FloatArray, BoolArray]:
         """Return angles (n, 3) at GPS times (n,), and whether they are known."""
         last = len(self.time_ns) - 2
         epoch = np.clip(np.searchsorted(self.time_ns, time_ns, side="right") - 1, 0, last)
@@ -128,7 +126,7 @@ class Mount:
         """Return the same mount over the time of two recordings."""
         return Mount(tuple(one.joined(again) for one, again in zip(self.stages, other.stages, strict=True)))
 
-    def poses(self, time_ns: Int64Array) -> tuple[FloatArray, FloatArray, NDArray[np.uint8]]:
+    def poses(self, time_ns: Int64Array) -> tuple[FloatArray, FloatArray, ByteArray]:
         """Return poses of the innermost stage at GPS times (n,).
 
         They lead outward from the installed scanner's axes to those the boresight turns.

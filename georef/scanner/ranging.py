@@ -13,10 +13,9 @@ from collections import Counter
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
-from swath.georef.arrays import FloatArray
-from swath.georef.records import RETURN_DTYPE, Int64Array, StructArray
+from swath.georef.arrays import BoolArray, FloatArray, Int64Array, StructArray
+from swath.georef.records import RETURN_DTYPE
 from swath.georef.scanner.kernels.zones import (
     AMBIGUOUS,
     BRIDGED,
@@ -251,7 +250,7 @@ class ZoneResolver:
         self._held = np.concatenate([self._held, rows])
         self._held_key = np.concatenate([self._held_key, np.stack([ordinal, ticks], axis=1)])
 
-    def _released(self, which: NDArray[np.bool_]) -> StructArray:
+    def _released(self, which: BoolArray) -> StructArray:
         """Remove complete rows from those held and return them, by emission, then by range, renumbered."""
         index, rest = np.flatnonzero(which), np.flatnonzero(~which)
         if not len(index):

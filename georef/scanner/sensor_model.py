@@ -14,10 +14,9 @@ import math
 import numpy as np
 
 from swath.georef.air.atmosphere import Air
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, Int64Array, StructArray
 from swath.georef.geodesy.rotations import rot_x, rot_y, rot_z
 from swath.georef.points import Fate, Rays, contiguous
-from swath.georef.records import Int64Array, StructArray
 from swath.georef.scanner.beams import Geometry
 from swath.georef.scanner.calibration import INDEX, Calibration
 from swath.georef.scanner.kernels.beam import FIBRE_BY_CHANNEL, FIBRE_BY_ENCODER, FIXED_ANGLE, SPINNING

@@ -13,10 +13,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from swath.georef.arrays import BoolArray, FloatArray, Int64Array, StructArray
 from swath.georef.compiled import jit_cached
-from swath.georef.records import Int64Array, NamesEdge, PpsEdge, StructArray, TimeMessage
+from swath.georef.records import NamesEdge, PpsEdge, TimeMessage
 from swath.georef.timescales import (
     ClockEvent,
     ClockStatus,
@@ -34,9 +34,7 @@ MAX_RATE_OFF = 1e-3  # of device time against GPS time
 
 
 @jit_cached
-def _place(
-    device_ns: Int64Array, first_cell: int, gps_ns: Int64Array, rate: NDArray[np.float64], out: Int64Array
-) -> None:
+def _place(device_ns: Int64Array, first_cell: int, gps_ns: Int64Array, rate: FloatArray, out: Int64Array) -> None:
     for i in range(len(device_ns)):
         cell = (device_ns[i] >> CELL_BITS) - first_cell
         into = device_ns[i] - ((cell + first_cell) << CELL_BITS)
@@ -171,7 +169,7 @@ class HostClocks:
         for raw_ns, at_ns in zip(self.timeline.raw_from_host(host_ns).tolist(), gps_ns.tolist(), strict=True):
             self.by_source[source].add_coarse(raw_ns, at_ns)
 
-    def gps_from_host(self, source: str, host_ns: Int64Array) -> tuple[Int64Array, NDArray[np.float64]]:
+    def gps_from_host(self, source: str, host_ns: Int64Array) -> tuple[Int64Array, FloatArray]:
         """Return GPS ns (n,) and sigma ns (n,; inf without time) of host times (n,), by a source's clock."""
         return self.by_source[source].gps_from_host(self.timeline.raw_from_host(host_ns))
 
@@ -255,7 +253,7 @@ class StreamClocks:
                 self._devices[source].add(rows, self.host.timeline.raw_from_host(rows["host_time_ns"]))
                 pieces.clear()
 
-    def place(self, source: str, rows: StructArray, max_sigma_ns: float) -> tuple[NDArray[np.bool_], Int64Array]:
+    def place(self, source: str, rows: StructArray, max_sigma_ns: float) -> tuple[BoolArray, Int64Array]:
         """Return which rows (n,) have a sufficiently accurate time, and GPS ns (n,), by device time and host time."""
         if source not in self._devices or not len(rows):
             return np.zeros(len(rows), np.bool_), np.zeros(len(rows), np.int64)
@@ -265,9 +263,7 @@ class StreamClocks:
         gps_ns, sigma_ns = self.gps_from_device(source, rows["device_time_ns"], rows["host_time_ns"])
         return sigma_ns <= max_sigma_ns, gps_ns
 
-    def gps_from_device(
-        self, source: str, device_ns: Int64Array, host_ns: Int64Array
-    ) -> tuple[Int64Array, NDArray[np.float64]]:
+    def gps_from_device(self, source: str, device_ns: Int64Array, host_ns: Int64Array) -> tuple[Int64Array, FloatArray]:
         """Return GPS ns (n,) and sigma ns (n,; inf: unknown) of device times (n,) that arrived at host times (n,)."""
         return self._devices[source].gps_from_device(device_ns, self.host.timeline.raw_from_host(host_ns))
 

@@ -6,7 +6,7 @@ from typing import Protocol
 
 import numpy as np
 
-from swath.georef.records import StructArray
+from swath.georef.arrays import StructArray
 from swath.georef.timescales import SECOND_NS
 from swath.georef.trajectory.buffer import TrajectoryBuffer
 from swath.georef.trajectory.trajectory import Trajectory

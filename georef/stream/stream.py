@@ -13,11 +13,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from swath.georef.arrays import ByteArray
+from swath.georef.arrays import BoolArray, ByteArray, FloatArray, Int64Array, StructArray
 from swath.georef.points import FATE_NAMES, Fate, Points
-from swath.georef.records import RETURN_DTYPE, Int64Array, StructArray
+from swath.georef.records import RETURN_DTYPE
 from swath.georef.return_rows import WaitingReturns, after, any_has, compact, concatenate, split_at, take
 from swath.georef.stream.clocks import StreamClocks
 from swath.georef.stream.path import CompletePath, GrowingPath, Path
@@ -72,14 +71,14 @@ class Resolver(Protocol):
     def waiting(self) -> int:
         """The number of returns held back."""
 
-    def feed(self, rows: StructArray, predicted_m: NDArray[np.float64] | None = None) -> StructArray:
+    def feed(self, rows: StructArray, predicted_m: FloatArray | None = None) -> StructArray:
         """Take rows, and return those that are complete now, in the order of emission."""
 
     def flush(self) -> StructArray:
         """Return the rows held back, when no more will come."""
 
 
-Moving = tuple[StructArray, Int64Array, NDArray[np.float64], NDArray[np.float64]]
+Moving = tuple[StructArray, Int64Array, FloatArray, FloatArray]
 
 
 class Motion(Protocol):
@@ -98,17 +97,17 @@ class GivenMotion:
     def __init__(self) -> None:
         self.rate = self.acceleration = np.empty(0)
 
-    def motion(self, rows: StructArray, time_ns: Int64Array) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def motion(self, rows: StructArray, time_ns: Int64Array) -> tuple[FloatArray, FloatArray]:
         """Return the motion (n,), rad/s and rad/s², of the rows that are georeferenced now."""
         del rows, time_ns
         return self.rate, self.acceleration
 
-    def keep(self, which: NDArray[np.bool_]) -> None:
+    def keep(self, which: BoolArray) -> None:
         """Keep the motion of the masked rows, the only ones to be georeferenced next."""
         self.rate, self.acceleration = self.rate[which], self.acceleration[which]
 
 
-Predict = Callable[[StructArray, Int64Array, "Trajectory"], NDArray[np.float64]]
+Predict = Callable[[StructArray, Int64Array, "Trajectory"], FloatArray]
 LeftOut = Callable[[StructArray, Int64Array, ByteArray, "Trajectory | None"], None]
 
 
@@ -203,7 +202,7 @@ class _Lane:
         for held in after(self._timed, self._settings.max_rows):
             self._give_up(held.rows, Fate.OUTSIDE_TRAJECTORY, held.time_ns)
 
-    def _times(self, rows: StructArray, clocks: StreamClocks) -> tuple[NDArray[np.bool_], Int64Array]:
+    def _times(self, rows: StructArray, clocks: StreamClocks) -> tuple[BoolArray, Int64Array]:
         return clocks.place(f"scanner/{self.chain.name}", rows, self._settings.max_time_sigma_ns)
 
     def _was_asked(self, held: WaitingReturns, tick_ns: int) -> bool:

@@ -15,7 +15,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.georef.records import Int64Array, StructArray
+from swath.georef.arrays import BoolArray, FloatArray, Int64Array, StructArray
 from swath.georef.timescales.gps_time import HOUR_NS, SECOND_NS, gps_ns_past_hour
 from swath.georef.timescales.pps_clock import PpsClock
 from swath.georef.timescales.stamp_scale import Stamps, StampScale, judge
@@ -161,13 +161,13 @@ class _Segment:
         self.last_pps_ns = -1
 
 
-def _runs_free(rows: StructArray) -> NDArray[np.bool_]:
+def _runs_free(rows: StructArray) -> BoolArray:
     """Return (n,) whether a head whose clock the PPS sets, and which counts no edges, runs without it.
 
     Such a head drifts, and is set again; its seconds before and after do not belong to one clock, as a counter's
     latches do.
     """
-    free: NDArray[np.bool_] = (rows["locked"] == 0) & (rows["pps_time_ns"] < 0) & (rows["pps_count"] < 0)
+    free: BoolArray = (rows["locked"] == 0) & (rows["pps_time_ns"] < 0) & (rows["pps_count"] < 0)
     return free
 
 
@@ -337,7 +337,7 @@ class DeviceClock:
 
     def gps_from_device(
         self, device_time_ns: Int64Array, host_ns: Int64Array | None = None
-    ) -> tuple[Int64Array, NDArray[np.float64]]:
+    ) -> tuple[Int64Array, FloatArray]:
         """Return GPS ns (n,) and sigma ns (n,) of device times (n,).
 
         host_ns (n,), their arrival times, select among restarts; without it the time since the last restart is used.
@@ -362,7 +362,7 @@ class DeviceClock:
             self._place_absolute(device, host, gps, sigma)
         return gps, sigma
 
-    def _in_segment(self, segment: _Segment, device: Int64Array) -> tuple[Int64Array, NDArray[np.float64]]:
+    def _in_segment(self, segment: _Segment, device: Int64Array) -> tuple[Int64Array, FloatArray]:
         latched = self._by_latch(segment.latch, device)
         if latched is not None:
             return latched
@@ -374,14 +374,14 @@ class DeviceClock:
         better = held_sigma < sigma  # for about 20 s; within 10 s it is good enough for returns
         return np.where(better, held[0], gps), np.where(better, held_sigma, sigma)
 
-    def _by_arrivals(self, segment: _Segment, device: Int64Array) -> tuple[Int64Array, NDArray[np.float64]]:
+    def _by_arrivals(self, segment: _Segment, device: Int64Array) -> tuple[Int64Array, FloatArray]:
         if not segment.arrivals.bins:
             return np.zeros_like(device), np.full(device.shape, math.inf)
         host, scatter = segment.arrivals.host_at(device)
         gps, sigma = self._clock.gps_from_host(host)
         return gps, np.hypot(sigma, scatter)
 
-    def _by_latch(self, latch: _Latch, device: Int64Array) -> tuple[Int64Array, NDArray[np.float64]] | None:
+    def _by_latch(self, latch: _Latch, device: Int64Array) -> tuple[Int64Array, FloatArray] | None:
         """Return GPS ns and sigma, linear between latched edges, by the last rate beyond; None without a known second.
 
         A single edge is not used: it may be a register that reads 0 before the first pulse, or a glitch at power-on.
@@ -419,9 +419,7 @@ class DeviceClock:
         best = int(np.argmax(counts))
         return int(values[best]) if counts[best] >= LABEL_MAJORITY * len(offsets) else None
 
-    def _place_past_hour(
-        self, device: Int64Array, host: Int64Array, gps: Int64Array, sigma: NDArray[np.float64]
-    ) -> None:
+    def _place_past_hour(self, device: Int64Array, host: Int64Array, gps: Int64Array, sigma: FloatArray) -> None:
         """Overwrite times, in place, by a locked head's more accurate stamps past the UTC hour."""
         near, near_sigma = self._clock.gps_from_host(host)
         leap = self._clock.leap_seconds_at(int(near[-1]))
@@ -440,14 +438,12 @@ class DeviceClock:
         gps[good], sigma[good] = placed[good], sigma_ns
 
     @staticmethod
-    def _slack_ns(near_sigma: NDArray[np.float64]) -> Int64Array:
+    def _slack_ns(near_sigma: FloatArray) -> Int64Array:
         """Return the added tolerance (n,) between a stamp and its arrival; 0 if the host knows the second."""
         coarse = (near_sigma > LABEL_MAX_SIGMA_NS) & (near_sigma <= COARSE_MAX_SIGMA_NS)
         return np.where(coarse, 3.0 * near_sigma, 0.0).astype(np.int64)
 
-    def _place_absolute(
-        self, device: Int64Array, host: Int64Array, gps: Int64Array, sigma: NDArray[np.float64]
-    ) -> None:
+    def _place_absolute(self, device: Int64Array, host: Int64Array, gps: Int64Array, sigma: FloatArray) -> None:
         """Overwrite times, in place, by stamps that count from 1970, if these agree with their arrival."""
         assert self.stamps is not None
         near, near_sigma = self._clock.gps_from_host(host)

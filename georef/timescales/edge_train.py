@@ -8,9 +8,8 @@ from collections import deque
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-from swath.georef.records import Int64Array
+from swath.georef.arrays import BoolArray, FloatArray, Int64Array
 from swath.georef.timescales.gps_time import SECOND_NS
 from swath.georef.timescales.labelling import Labeller
 from swath.georef.timescales.line_fit import SHRINK_HORIZON, LineBank, excess_variances
@@ -212,21 +211,19 @@ def forget_later(edges: deque[int], train: EdgeTrain | None, host_ns: int) -> bo
 class KnotTable:
     """Knots as arrays; evaluates the line of knot k at host times."""
 
-    def __init__(
-        self, host_ns: Int64Array, index: Int64Array, doubt: NDArray[np.bool_], numbers: NDArray[np.float64]
-    ) -> None:
+    def __init__(self, host_ns: Int64Array, index: Int64Array, doubt: BoolArray, numbers: FloatArray) -> None:
         self.host_ns = host_ns
         self.index = index
         self.doubt = doubt
         self.numbers = numbers
 
-    def seconds_from(self, k: Int64Array, host_ns: Int64Array) -> NDArray[np.float64]:
+    def seconds_from(self, k: Int64Array, host_ns: Int64Array) -> FloatArray:
         """Return GPS seconds from knot k to the host times, by that knot's drift."""
         fraction, drift = self.numbers[k, 0], self.numbers[k, 1]
         since = (host_ns - self.host_ns[k]).astype(np.float64) - fraction
         return np.asarray(since / (SECOND_NS + drift), dtype=np.float64)
 
-    def variance(self, k: Int64Array, seconds: NDArray[np.float64]) -> NDArray[np.float64]:
+    def variance(self, k: Int64Array, seconds: FloatArray) -> FloatArray:
         """Return the variance (ns²) of the line of knot k, seconds away from it (sign as in `seconds_from`)."""
         xx, xy, yy, wander = self.numbers[k, 2], self.numbers[k, 3], self.numbers[k, 4], self.numbers[k, 5]
         away = np.abs(seconds)

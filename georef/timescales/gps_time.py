@@ -9,9 +9,9 @@ import datetime as dt
 from bisect import bisect_right
 
 import numpy as np
-from numpy.typing import NDArray
 
-from swath.georef.records import Int64Array, TimeScale, TimeTag
+from swath.georef.arrays import BoolArray, Int64Array
+from swath.georef.records import TimeScale, TimeTag
 
 SECOND_NS = 1_000_000_000
 MILLISECOND_NS = 1_000_000
@@ -161,7 +161,7 @@ def gps_ns_past_hour(
     *,
     max_age_ns: int = SECOND_NS,
     slack_ns: Int64Array | int = 0,
-) -> tuple[Int64Array, NDArray[np.bool_]]:
+) -> tuple[Int64Array, BoolArray]:
     """Place stamps that count from the UTC hour (Velodyne, locked): GPS ns (n,), and whether each is credible.
 
     The hour is the one nearest to the prediction, the GPS time of arrival (so within ± 30 min); a stamp is refused if

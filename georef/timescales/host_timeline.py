@@ -8,9 +8,8 @@ from __future__ import annotations
 from collections import deque
 
 import numpy as np
-from numpy.typing import NDArray
 
-from swath.georef.records import Int64Array
+from swath.georef.arrays import FloatArray, Int64Array
 
 MAX_SLEW = 1e-3  # of MONOTONIC against RAW: adjtimex allows 500 ppm on each side
 READ_TOLERANCE_NS = 5_000  # the two clocks are not read at one instant
@@ -36,7 +35,7 @@ class HostTimeline:
         self._offset: deque[int] = deque(maxlen=None if keep_history else 6000)  # RAW − host
         self._slope = 0.0
         self._slope_from: deque[tuple[int, int]] = deque()
-        self._arrays: tuple[Int64Array, NDArray[np.float64], int] | None = None
+        self._arrays: tuple[Int64Array, FloatArray, int] | None = None
 
     def add(self, realtime_ns: int, monotonic_ns: int, monotonic_raw_ns: int) -> None:
         """Take one reading of the three clocks; realtime_ns is ignored, so that a stepped wall clock has no effect."""

@@ -17,7 +17,8 @@ from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+
+from swath.georef.arrays import FloatArray
 
 # Documented priors. Wander of the frequency, ns/s per √s: 0.3e-9 (a good TCXO at rest) to 1e-7 (a crystal on a ramp of
 # 0.5 ppm/min looks like 3e-8 to 1e-7 over a minute), and how common each is.
@@ -100,7 +101,7 @@ def excess_variance(excess: tuple[float, ...], seconds: float) -> float:
     return near * (seconds / near_s) ** 3
 
 
-def excess_variances(excess: NDArray[np.float64], seconds: NDArray[np.float64]) -> NDArray[np.float64]:
+def excess_variances(excess: FloatArray, seconds: FloatArray) -> FloatArray:
     """Return `excess_variance` of rows (n, 3) at times (n,)."""
     cube = seconds**3
     near_s, near = 0.0, np.zeros_like(seconds)

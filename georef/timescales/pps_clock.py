@@ -13,9 +13,9 @@ from collections import deque
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-from swath.georef.records import Int64Array, NamesEdge, TimeMessage, TimeScale, TimeTag
+from swath.georef.arrays import BoolArray, FloatArray, Int64Array
+from swath.georef.records import NamesEdge, TimeMessage, TimeScale, TimeTag
 from swath.georef.timescales.clock_status import ClockEvent, ClockStatus, EventLog, Severity, TimeState
 from swath.georef.timescales.coarse import AMBIGUOUS_SIGMA_NS, COARSE_SIGMA_NS, CoarseClock, WallClock
 from swath.georef.timescales.edge_train import (
@@ -409,7 +409,7 @@ class PpsClock:
             return TimeState.NO_TIME, None, math.inf
         return TimeState.LOST, offset, sigma + 1e-4 * (host_ns - last)
 
-    def gps_from_host(self, host_ns: Int64Array) -> tuple[Int64Array, NDArray[np.float64]]:
+    def gps_from_host(self, host_ns: Int64Array) -> tuple[Int64Array, FloatArray]:
         """Return GPS ns (n,) and sigma ns (n,) of host times (n,), by the line forward, or between knots.
 
         Knots on both sides are used where later ones exist. Without time the sigma is inf and the GPS time 0.
@@ -438,7 +438,7 @@ class PpsClock:
         gps, sigma = self._by_trains(np.array([host_ns], dtype=np.int64))
         return int(gps[0]), float(sigma[0])
 
-    def _by_trains(self, host: Int64Array) -> tuple[Int64Array, NDArray[np.float64]]:
+    def _by_trains(self, host: Int64Array) -> tuple[Int64Array, FloatArray]:
         return gps_of_trains([train for train in self._trains() if train.labeller.label is not None], host)
 
     def drain_events(self) -> list[ClockEvent]:
@@ -451,7 +451,7 @@ def _gps_float(train: EdgeTrain, host_ns: int) -> float:
     return (train.labeller.label or 0) + train.index_at(host_ns)
 
 
-def gps_of_trains(trains: Sequence[EdgeTrain], host_ns: Int64Array) -> tuple[Int64Array, NDArray[np.float64]]:
+def gps_of_trains(trains: Sequence[EdgeTrain], host_ns: Int64Array) -> tuple[Int64Array, FloatArray]:
     """Return GPS ns (n,) and sigma ns (n,) at host times (n,) from labelled trains in order of time (at least one)."""
     low, high = int(host_ns.min()), int(host_ns.max())
     chosen = _overlapping(trains, low, high)
@@ -495,9 +495,9 @@ def _blend(
     knot_gps: Int64Array,
     host_ns: Int64Array,
     left: Int64Array,
-    inside: NDArray[np.bool_],
+    inside: BoolArray,
     gps: Int64Array,
-    sigma: NDArray[np.float64],
+    sigma: FloatArray,
 ) -> None:
     """Change over from the left knot's line to the right knot's between two knots, in place."""
     k, host = left[inside], host_ns[inside]

@@ -12,9 +12,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
-from swath.georef.records import Int64Array
+from swath.georef.arrays import BoolArray, FloatArray, Int64Array
 from swath.georef.timescales.edge_train import EdgeTrain
 from swath.georef.timescales.gps_time import SECOND_NS
 from swath.georef.timescales.labelling import LATE_AGE_S, MIN_VOTES, VOTES, LeapTrust, VoterKey
@@ -63,8 +62,8 @@ class _Named:
 
     host_ns: Int64Array
     offset: Int64Array
-    age_s: NDArray[np.float64]
-    guessed: NDArray[np.bool_]
+    age_s: FloatArray
+    guessed: BoolArray
 
     def majority(self) -> int | None:
         """Return the offset that most of the messages name; None without a majority that is punctual and certain.

@@ -13,9 +13,8 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
-from swath.georef.records import Int64Array
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.georef.timescales.gps_time import GPS_EPOCH_UNIX_S, HOUR_NS, SECOND_NS
 
 TAI_MINUS_GPS_S = 19  # since 1980, by definition
@@ -60,7 +59,7 @@ class Stamps:
 def judge(
     device_ns: Int64Array,
     near_gps_ns: Int64Array,
-    near_sigma_ns: NDArray[np.float64],
+    near_sigma_ns: FloatArray,
     leap_seconds: int,
     *,
     past_hour: bool,

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.georef.arrays import BoolArray, FloatArray
+from swath.georef.arrays import BoolArray, FloatArray, Int64Array, StructArray
 from swath.georef.geodesy.quaternions import rotations_between
-from swath.georef.records import INS_DTYPE, Int64Array, StructArray
+from swath.georef.records import INS_DTYPE
 from swath.georef.trajectory.trajectory import DEFAULT_MAX_GAP_NS, Trajectory
 
 SIGMA_HOLDS_NS = 2_500_000_000  # INSPVAX gives sigmas once a second beside INSPVAS, which has none

@@ -15,13 +15,12 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from swath.georef.arrays import ByteArray, FloatArray
+from swath.georef.arrays import ByteArray, FloatArray, Int64Array
 from swath.georef.compiled import jit_cached, jit_inline
 from swath.georef.geodesy.earth import e_from_geodetic, geodetic_from_e
 from swath.georef.geodesy.quaternions import about, conjugate, product, rotated, rotation_vector, rotations_between
 from swath.georef.geodesy.rotations import quaternion_from_rot, rot_l_from_plumb
 from swath.georef.points import Fate
-from swath.georef.records import Int64Array
 from swath.georef.timescales.gps_time import SECOND_NS, week_from_gps
 
 DEFAULT_MAX_GAP_NS = 150_000_000  # 10 Hz with jitter; a missing epoch of 10 Hz may hide 15 mm and 1 mrad

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from swath.georef.arrays import FloatArray
-from swath.georef.records import Int64Array
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.georef.timescales.gps_time import DAY_NS, SECOND_NS, table_leap_seconds, utc_from_gps
 from swath.georef.trajectory.trajectory import Trajectory, TrajectoryError
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 from scipy.spatial.transform import Rotation
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.sim.flight.envelope import Envelope, Ground, refuse_lines
 from swath.sim.flight.itinerary import route_of
 from swath.sim.flight.route import Route
@@ -166,7 +166,7 @@ def fly(plan: Plan, site: Site, ground_m: Ground) -> Trajectory:
     return Trajectory(spline_through(int(knots[4]), values), site.origin_e, lines, end_s)
 
 
-def _smooth_path(route: Route, envelope: Envelope, knots: NDArray[np.int64]) -> FloatArray:
+def _smooth_path(route: Route, envelope: Envelope, knots: Int64Array) -> FloatArray:
     """Return (n, 4) smooth east, north, height, airborne at knots (n,).
 
     Where the aircraft stands, values are equal to the last bit: they are taken relative to the first place, so that

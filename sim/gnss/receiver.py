@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from swath.georef.arrays import FloatArray, IntArray
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.georef.records import FixType
 from swath.sim.gnss import grades
 from swath.sim.gnss.noise import Noise
@@ -67,15 +67,15 @@ class Epochs:
         heading_error_rad, pitch_error_rad: (n,) solution minus truth.
     """
 
-    index: IntArray
+    index: Int64Array
     time_s: FloatArray
     lat_rad: FloatArray
     lon_rad: FloatArray
     height_m: FloatArray
     velocity_l: FloatArray
     velocity_age_s: FloatArray
-    fix: IntArray
-    satellites: IntArray
+    fix: Int64Array
+    satellites: Int64Array
     position_sigma_l: FloatArray
     velocity_sigma_l: FloatArray
     heading_rad: FloatArray
@@ -103,14 +103,14 @@ class InsEpochs:
         position_error_l, velocity_error_l, attitude_error_rad: (n, 3) solution minus truth.
     """
 
-    index: IntArray
+    index: Int64Array
     time_s: FloatArray
     lat_rad: FloatArray
     lon_rad: FloatArray
     height_m: FloatArray
     velocity_l: FloatArray
     attitude_rad: FloatArray
-    fix: IntArray
+    fix: Int64Array
     since_update_s: FloatArray
     position_sigma_l: FloatArray
     velocity_sigma_l: FloatArray
@@ -251,7 +251,7 @@ class Receiver:
 
     # --- events scripted in the plan ---
 
-    def _fix(self, time_s: FloatArray) -> IntArray:
+    def _fix(self, time_s: FloatArray) -> Int64Array:
         fix = np.full(len(time_s), int(self._grade.fix))
         for outage in self.table.outage:
             back_s = outage.at_s + outage.for_s

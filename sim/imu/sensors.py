@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.signal import lfilter
 
-from swath.georef.arrays import FloatArray, IntArray
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.sim.clocks import Oscillator, generator
 from swath.sim.gravity import EARTH_RATE_RADPS, RATE_IE_E, gravity_e
 from swath.sim.imu.grades import sensor_grades
@@ -218,7 +218,7 @@ class InertialUnit:
         self.last = self.count(trajectory.end_s)
         self._kept: dict[int, FloatArray] = {}  # values of the last two seconds: a request may span both
 
-    def ends_s(self, number: FloatArray | IntArray) -> FloatArray:
+    def ends_s(self, number: FloatArray | Int64Array) -> FloatArray:
         """Return (n,) true times at which samples (n,) end."""
         return self.oscillator.time_of(np.asarray(number, np.float64) * self.table.tick_hz / self.table.rate_hz)
 

@@ -15,7 +15,7 @@ import numpy as np
 from swath.drivers.imu.dbc.encoder import encode_latch, encode_samples
 from swath.drivers.imu.dbc.settings import map_signals
 from swath.drivers.parser import DeviceSettings
-from swath.georef.arrays import FloatArray, IntArray
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.sim.clocks import PulsePerSecond, generator
 from swath.sim.imu.grades import noise_of
 from swath.sim.imu.sensors import InertialUnit
@@ -206,12 +206,12 @@ class ImuWire:
         frames = [encode_latch(self._signals, int(ticks)) for ticks in self._ticks(edge_s[sent])]
         return sent_s[sent], delay_s[sent], frames
 
-    def _ticks(self, time_s: FloatArray) -> IntArray:
+    def _ticks(self, time_s: FloatArray) -> Int64Array:
         """Return (n,) the counter's readings, not wrapped."""
         phase = self._unit.oscillator.phase(time_s)
         return np.floor(phase + TICK_ROUNDING).astype(np.int64) + self._start_ticks
 
-    def _delays(self, number: IntArray) -> FloatArray:
+    def _delays(self, number: Int64Array) -> FloatArray:
         """Return (n, frames of a sample) delays of the host's stamps, drawn for whole seconds of samples."""
         rate_hz = self._unit.table.rate_hz
         delays_s = np.zeros((len(number), SAMPLE_FRAMES))

@@ -12,9 +12,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import BoolArray, FloatArray, Int64Array
 from swath.sim.flight.envelope import Ground
 from swath.sim.flight.trajectory import Trajectory, fly
 from swath.sim.flight.turbulence import ANGLE_RMS_DEG, INTENSITY
@@ -143,7 +142,7 @@ class Strip:
         east_m = self.from_m[0] + along_m * self.ahead[0] + right_m * self.ahead[1]
         return east_m, self.from_m[1] + along_m * self.ahead[1] - right_m * self.ahead[0]
 
-    def covers(self, east_m: FloatArray, north_m: FloatArray, ground_m: FloatArray) -> NDArray[np.bool_]:
+    def covers(self, east_m: FloatArray, north_m: FloatArray, ground_m: FloatArray) -> BoolArray:
         """Return (n,) True where ground at these heights is within the swath."""
         along_m, right_m = self.beside(east_m, north_m)
         above_m = self.height_m - ground_m
@@ -224,7 +223,7 @@ def control_points(plan: Plan, scene: Scene) -> FloatArray:
     """
     strips = [strip_of(plan, index, 0.0, 0.0) for index in range(len(plan.tables.line))]
 
-    def seen(east_m: FloatArray, north_m: FloatArray) -> NDArray[np.bool_]:
+    def seen(east_m: FloatArray, north_m: FloatArray) -> BoolArray:
         ground_m = scene.ground_m(east_m, north_m)
         covered = np.zeros(ground_m.shape, np.bool_)
         for strip in strips:
@@ -307,7 +306,7 @@ class Grid:
     north_m: FloatArray
     cell_m: float
     density: FloatArray
-    lines: NDArray[np.int64]
+    lines: Int64Array
 
 
 def grid_of(survey: Survey, cells: int = 90_000) -> Grid:

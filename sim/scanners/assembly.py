@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
+from swath.georef.arrays import StructArray
 from swath.sim.clocks import PulsePerSecond
 from swath.sim.faults import windows
 from swath.sim.flight.trajectory import Trajectory
@@ -14,7 +15,6 @@ from swath.sim.scanners.spinning_heads import Os1Head, Vlp16Head
 from swath.sim.scanners.srep_wire import SrepWire
 from swath.sim.scanners.velodyne_wire import VelodyneWire
 from swath.sim.shots import Measured, Pulses, WireUnit
-from swath.sim.truth import StructArray
 
 
 class Head(Protocol):

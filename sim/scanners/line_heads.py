@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from swath.georef.arrays import FloatArray, IntArray
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.sim.clocks import Oscillator
 from swath.sim.plan.errors import PlanError
 from swath.sim.plan.tables import ScannerTable
@@ -100,7 +100,7 @@ class LineHead:
             phi_extra_rad=1e-6 * self._table.true.pitch_slope_ppm * swing.angle_rad,
         )
 
-    def _fired(self, start_s: float, stop_s: float) -> tuple[IntArray, FloatArray]:
+    def _fired(self, start_s: float, stop_s: float) -> tuple[Int64Array, FloatArray]:
         """Return numbers and times of the pulses in this time, including those that leave no light."""
         edges = self._oscillator.phase(np.array([start_s, stop_s]) - self._time_offset_s)
         first, last = np.floor(edges * (self._table.prf_hz / self._table.tick_hz)).astype(np.int64)
@@ -109,7 +109,7 @@ class LineHead:
         there = (time_s >= start_s) & (time_s < stop_s)
         return number[there], time_s[there]
 
-    def _encoder(self, swing: Swing) -> IntArray:
+    def _encoder(self, swing: Swing) -> Int64Array:
         """Return (n,) readings: whole counts, signed, 0 at the encoder's index."""
         return np.rint(self._shaft_rad(swing) * (self._table.encoder_counts / (2 * np.pi))).astype(np.int64)
 
@@ -147,7 +147,7 @@ class LineHead:
             raise PlanError(f"{key}.half_angle_deg", text)
 
 
-def emission_ticks(table: ScannerTable, number: IntArray) -> IntArray:
+def emission_ticks(table: ScannerTable, number: Int64Array) -> Int64Array:
     """Return (n,) ticks from the plan's start at which the pulses with these numbers (n,) leave."""
     return np.rint(number * table.tick_hz / table.prf_hz).astype(np.int64)
 

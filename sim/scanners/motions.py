@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import BoolArray, FloatArray
 
 TURNING_SHARE = 0.2  # share of a triangle's time that its turning points take
 
@@ -33,7 +33,7 @@ class Swing:
     centre_rad: FloatArray
     facet: NDArray[np.uint16]
 
-    def chosen(self, which: NDArray[np.bool_]) -> Swing:
+    def chosen(self, which: BoolArray) -> Swing:
         """Return the positions at the chosen times."""
         return Swing(
             self.angle_rad[which],

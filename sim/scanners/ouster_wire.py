@@ -13,7 +13,7 @@ import numpy as np
 
 from swath.drivers.scanner.ouster.head import SYNC_PULSE, read_head
 from swath.drivers.scanner.ouster.layout import LidarLayout
-from swath.georef.arrays import FloatArray, IntArray
+from swath.georef.arrays import FloatArray, Int64Array, StructArray
 from swath.sim.clocks import PulsePerSecond
 from swath.sim.plan.errors import PlanError
 from swath.sim.plan.plan import Plan
@@ -29,7 +29,7 @@ from swath.sim.scanners.spinning_wire import (
     in_slot,
 )
 from swath.sim.shots import Measured, Pulses, WireUnit
-from swath.sim.truth import RETURN_TRUTH_DTYPE, StructArray
+from swath.sim.truth import RETURN_TRUTH_DTYPE
 
 COLUMNS = 1024  # of a turn
 COLUMNS_OF_PACKET = 16
@@ -125,7 +125,7 @@ class OusterWire:
         if len(number) == 0:
             return [], np.empty(0, RETURN_TRUTH_DTYPE)
         slots = _strongest(raw, light, 2 if self._dual else 1)
-        fields: dict[str, IntArray] = {}
+        fields: dict[str, Int64Array] = {}
         for slot, which in zip(slots, ("", "2"), strict=False):
             fields[f"RANGE{which}"] = in_slot(raw, slot)
             # the parser reads the signal as intensity: signal and reflectivity are both the receiver's intensity
@@ -140,7 +140,7 @@ class OusterWire:
         """Return no packets; a packet that is not full is not sent."""
         return [], np.empty(0, RETURN_TRUTH_DTYPE)
 
-    def _packets(self, number: IntArray, time_s: FloatArray, fields: dict[str, IntArray]) -> list[WireUnit]:
+    def _packets(self, number: Int64Array, time_s: FloatArray, fields: dict[str, Int64Array]) -> list[WireUnit]:
         """Return the packets of pulses (n,) with these fields (n,)."""
         shape = (-1, COLUMNS_OF_PACKET, BEAMS)
         shaped = {name: values.reshape(shape) for name, values in fields.items()}
@@ -157,7 +157,7 @@ class OusterWire:
         return units
 
 
-def _strongest(raw: IntArray, light: IntArray, count: int) -> list[IntArray]:
+def _strongest(raw: Int64Array, light: Int64Array, count: int) -> list[Int64Array]:
     """Return the slots (n,) of the strongest return, and of the second-strongest if ``count`` is 2."""
     rank = np.where(raw > 0, light, -1)
     slots = [best_slot(rank)]
@@ -167,7 +167,7 @@ def _strongest(raw: IntArray, light: IntArray, count: int) -> list[IntArray]:
     return slots
 
 
-def _truth(raw: IntArray, slots: list[IntArray], truth: StructArray) -> StructArray:
+def _truth(raw: Int64Array, slots: list[Int64Array], truth: StructArray) -> StructArray:
     """Return the truth of the returns in these slots, (n,) each, flattened pulse by pulse.
 
     Of two returns the nearer is first.

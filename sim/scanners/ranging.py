@@ -8,13 +8,12 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.georef.arrays import FloatArray, IntArray
+from swath.georef.arrays import FloatArray, Int64Array, StructArray, UInt64Array
 from swath.sim.atmosphere import Air
 from swath.sim.clocks import generator
 from swath.sim.plan.errors import PlanError
 from swath.sim.plan.tables import ScannerTable
 from swath.sim.shots import Echoes, Measured, Pulses
-from swath.sim.truth import StructArray
 
 LIGHT_MPS = 299_792_458.0
 THRESHOLD = 0.005  # share of full intensity below which echoes are not detected
@@ -176,7 +175,7 @@ def _beam_corrections(table: ScannerTable) -> FloatArray:
     return corrections
 
 
-def _gauss(key: np.uint64, number: IntArray, slot: IntArray) -> FloatArray:
+def _gauss(key: np.uint64, number: Int64Array, slot: Int64Array) -> FloatArray:
     """Return (k,) standard normal numbers, each a function of pulse number and slot (k,) alone.
 
     Counters go through SplitMix64's mixer (Steele, Lea, Flood 2014), pairs through the Box-Muller transform.
@@ -189,7 +188,7 @@ def _gauss(key: np.uint64, number: IntArray, slot: IntArray) -> FloatArray:
     return normal
 
 
-def _mixed(values: NDArray[np.uint64]) -> NDArray[np.uint64]:
+def _mixed(values: UInt64Array) -> UInt64Array:
     mixed = values + np.uint64(0x9E3779B97F4A7C15)
     mixed = (mixed ^ (mixed >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     mixed = (mixed ^ (mixed >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, StructArray
 from swath.sim.atmosphere import Air
 from swath.sim.flight.trajectory import Trajectory
 from swath.sim.plan.tables import ScannerTable
@@ -21,7 +21,7 @@ from swath.sim.scanners.ranging import Ranging
 from swath.sim.scene.scene import Scene
 from swath.sim.shots import Echoes, Pulses, WireUnit
 from swath.sim.site import Site
-from swath.sim.truth import RETURN_TRUTH_DTYPE, StructArray
+from swath.sim.truth import RETURN_TRUTH_DTYPE
 
 BLOCK_S = 0.25
 EARTH_RADIUS_M = 6_371_000.0

@@ -18,7 +18,7 @@ import numpy as np
 
 from swath.drivers.scanner.ouster.head import read_head
 from swath.drivers.scanner.velodyne.heads import PLACES, VLP16
-from swath.georef.arrays import FloatArray, IntArray
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.sim.clocks import Oscillator
 from swath.sim.plan.errors import PlanError
 from swath.sim.plan.tables import ScannerTable
@@ -87,12 +87,12 @@ class Vlp16Head:
             phi_extra_rad=np.zeros(len(number)),
         )
 
-    def _turn(self, head_ns: IntArray) -> FloatArray:
+    def _turn(self, head_ns: Int64Array) -> FloatArray:
         """Return the encoder's position, turns 0 … 1, at times of the head's oscillator."""
         turned: FloatArray = np.mod(self._turns_per_ns * head_ns, 1.0)
         return turned
 
-    def _directions(self, fired_ns: IntArray, laser: IntArray) -> FloatArray:
+    def _directions(self, fired_ns: Int64Array, laser: Int64Array) -> FloatArray:
         """Return (n, 3) directions x = cos ω sin α, y = cos ω cos α, z = sin ω (VLP-16 manual, 9.2)."""
         azimuth = 2 * np.pi * self._turn(fired_ns) + self._ahead_rad + self._azimuth_rad[laser]
         flat = np.cos(self._elevation_rad)[laser]
@@ -157,7 +157,7 @@ class Os1Head:
         return origin.reshape(-1, 3) @ rotation.T + shift, direction.reshape(-1, 3) @ rotation.T
 
 
-def _numbers(oscillator: Oscillator, spacing_ns: float, each: int, start_s: float, stop_s: float) -> IntArray:
+def _numbers(oscillator: Oscillator, spacing_ns: float, each: int, start_s: float, stop_s: float) -> Int64Array:
     """Return the numbers of all pulses that may leave in this time; ``each`` pulses leave together, a spacing apart."""
     first, last = np.floor(oscillator.phase(np.array([start_s, stop_s])) / spacing_ns).astype(np.int64)
     return np.arange(max(first - 1, 0) * each, max(last + 2, 0) * each)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.georef.arrays import FloatArray, IntArray
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.sim.clocks import Oscillator, PulsePerSecond, generator
 from swath.sim.plan.plan import Plan
 from swath.sim.plan.tables import OscillatorTable, ScannerTable
@@ -53,7 +53,7 @@ class HeadClock:
         self._status = np.zeros(0, np.int64)  # of second −1, 0, 1, …
         self._anchor = np.zeros(0, np.int64)  # latest second at which it was locked, −2 if it never was
 
-    def ticks(self, time_s: FloatArray) -> IntArray:
+    def ticks(self, time_s: FloatArray) -> Int64Array:
         """Return (n,) the clock's readings at true times (n,), in whole ticks."""
         time_s = np.asarray(time_s, np.float64)
         free = self._oscillator.ticks(time_s) + self._at_start
@@ -67,12 +67,12 @@ class HeadClock:
         whole = np.floor(shown).astype(np.int64) + self._second * self._hz
         return np.where(locked | (anchor > -2), whole, free)
 
-    def status(self, time_s: FloatArray) -> IntArray:
+    def status(self, time_s: FloatArray) -> Int64Array:
         """Return (n,) the pulse's status at true times (n,): `PPS_ABSENT`, `PPS_SYNCHRONIZING` or `PPS_LOCKED`."""
         time_s = np.asarray(time_s, np.float64)
         return np.full(time_s.shape, PPS_ABSENT) if self._pps is None else self._of(self._pps, time_s)[0]
 
-    def _of(self, pps: PulsePerSecond, time_s: FloatArray) -> tuple[IntArray, IntArray]:
+    def _of(self, pps: PulsePerSecond, time_s: FloatArray) -> tuple[Int64Array, Int64Array]:
         """Return status and anchor of the seconds in which times (n,) lie."""
         second = pps.latest(time_s)
         if len(second) and int(second.max()) + 2 > len(self._status):
@@ -139,7 +139,7 @@ class Arrivals:
         return times_s
 
 
-def counts(measured: Measured, unit_m: float, most: int) -> tuple[IntArray, IntArray]:
+def counts(measured: Measured, unit_m: float, most: int) -> tuple[Int64Array, Int64Array]:
     """Return ranges (n, R) in whole units and light 0 … 255.
 
     A range is 0 if there is no return or a packet cannot express it.
@@ -149,12 +149,12 @@ def counts(measured: Measured, unit_m: float, most: int) -> tuple[IntArray, IntA
     return raw.astype(np.int64), np.clip(np.rint(measured.intensity), 0, 255).astype(np.int64)
 
 
-def best_slot(rank: IntArray) -> IntArray:
+def best_slot(rank: Int64Array) -> Int64Array:
     """Return (n,) the slot of the greatest rank of each pulse, the first of equal ones; −1 if all ranks are −1."""
     return np.where(rank.max(axis=1) >= 0, rank.argmax(axis=1), -1)
 
 
-def in_slot(values: IntArray, slot: IntArray) -> IntArray:
+def in_slot(values: Int64Array, slot: Int64Array) -> Int64Array:
     """Return (n,) the values (n, R) in these slots (n,); 0 where the slot is −1."""
     return np.where(slot >= 0, values[np.arange(len(values)), slot], 0)
 

@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swath.drivers.scanner.srep.layout import PULSE_WIDTH_UNIT_NS, RANGE_UNIT_M, ZONE_UNKNOWN, pulse_dtype
-from swath.georef.arrays import FloatArray, IntArray
+from swath.georef.arrays import FloatArray, Int64Array, StructArray
 from swath.sim.plan.tables import ScannerTable
 from swath.sim.scanners.line_heads import emission_ticks
 from swath.sim.scanners.ranging import LIGHT_MPS, packed
 from swath.sim.shots import Measured, Pulses
-from swath.sim.truth import RETURN_TRUTH_DTYPE, StructArray
+from swath.sim.truth import RETURN_TRUTH_DTYPE
 
 _U16, _U32 = 2**16 - 1, 2**32 - 1
 
@@ -31,9 +31,9 @@ class Records:
         truth: (k,) of the returns in them, by record, then by slot.
     """
 
-    ticks: IntArray
+    ticks: Int64Array
     time_s: FloatArray
-    zone: IntArray
+    zone: Int64Array
     body: StructArray
     truth: StructArray
 
@@ -107,7 +107,7 @@ class WholeRanges:
         """Return an empty set; no records wait."""
         return no_records(self._table.return_slots)
 
-    def _zones(self, first_m: FloatArray) -> IntArray:
+    def _zones(self, first_m: FloatArray) -> Int64Array:
         zones = np.concatenate([[self._zone], np.floor(first_m / self._zone_m).astype(np.int64)])
         known = np.arange(len(zones))
         known[1:][first_m <= 0.0] = 0
@@ -164,7 +164,7 @@ class ApparentRanges:
         zones = np.full(n, ZONE_UNKNOWN)
         return Records(emissions.ticks[:n], emissions.time_s[:n], zones, body, flying.truth.take(echo))
 
-    def _slots(self, record: IntArray, apparent_m: FloatArray, n: int) -> tuple[IntArray, IntArray]:
+    def _slots(self, record: Int64Array, apparent_m: FloatArray, n: int) -> tuple[Int64Array, Int64Array]:
         """Return the echoes that find a slot in the first n records, and their slots, in order of arrival."""
         come = np.flatnonzero(record < n)
         seen = come[np.rint(apparent_m[come] / RANGE_UNIT_M) > 0.0]
@@ -177,9 +177,9 @@ class ApparentRanges:
 
 @dataclass(frozen=True, slots=True)
 class _Emissions:
-    ticks: IntArray
+    ticks: Int64Array
     time_s: FloatArray
-    encoder: IntArray
+    encoder: Int64Array
 
     def after(self, n: int) -> _Emissions:
         return _Emissions(self.ticks[n:], self.time_s[n:], self.encoder[n:])
@@ -196,7 +196,7 @@ class _Emissions:
 class _Flying:
     """Echoes on their way: ticks of their emission, (range, intensity, width) as rows of ``said``, truth."""
 
-    from_ticks: IntArray
+    from_ticks: Int64Array
     said: FloatArray
     truth: StructArray
 

@@ -18,7 +18,7 @@ from swath.drivers.scanner.srep.layout import (
     encode_datagrams,
     pulse_dtype,
 )
-from swath.georef.arrays import BoolArray, FloatArray, IntArray, UInt64Array
+from swath.georef.arrays import BoolArray, FloatArray, Int64Array, StructArray, UInt64Array
 from swath.sim.clocks import Oscillator, PulsePerSecond, generator
 from swath.sim.plan.errors import PlanError
 from swath.sim.plan.tables import HostTable, ScannerTable
@@ -27,7 +27,7 @@ from swath.sim.scanners.line_heads import config_geometry
 from swath.sim.scanners.ranging import LIGHT_MPS
 from swath.sim.scanners.srep_records import ApparentRanges, RecordMaker, Records, WholeRanges, no_records
 from swath.sim.shots import Measured, Pulses, WireUnit
-from swath.sim.truth import RETURN_TRUTH_DTYPE, StructArray
+from swath.sim.truth import RETURN_TRUTH_DTYPE
 
 PROCESSING_S = 250e-6  # from a datagram's last pulse to the wire; longer than light needs to 30 km and back
 HOLD_S = 0.1  # a datagram is sent unfilled after this long without a pulse
@@ -60,7 +60,7 @@ class PpsLatch:
         self._edge_s: FloatArray = np.zeros(0)
         self._ticks: UInt64Array = np.zeros(0, np.uint64)
 
-    def seen(self, time_s: FloatArray) -> tuple[IntArray, UInt64Array, BoolArray]:
+    def seen(self, time_s: FloatArray) -> tuple[Int64Array, UInt64Array, BoolArray]:
         """Return (n,) the edges latched so far, the counter at the latest one, and True if the device follows them."""
         self._reach(float(time_s.max(initial=0.0)))
         count = np.searchsorted(self._edge_s, time_s, side="right")
@@ -183,7 +183,7 @@ class SrepWire:
         header = self._headers(first_ticks, time_s, sent.zone[edges[:-1]], FLAG_LASER_ON)
         return self._arriving(time_s, _encoded(header, sent.body, edges)), sent.truth
 
-    def _headers(self, first_ticks: IntArray, time_s: FloatArray, zone: IntArray, laser: int) -> StructArray:
+    def _headers(self, first_ticks: Int64Array, time_s: FloatArray, zone: Int64Array, laser: int) -> StructArray:
         """Return (m,) headers of datagrams sent at these times."""
         table = self._table
         count, latched_ticks, locked = self._latch.seen(time_s)
@@ -242,7 +242,7 @@ def _check(table: ScannerTable, key: str) -> None:
         raise PlanError(f"{key}.range_max_m", text)
 
 
-def _datagram_edges(records: Records, pulses: int) -> IntArray:
+def _datagram_edges(records: Records, pulses: int) -> Int64Array:
     """Return (m + 1,) the records at which datagrams begin, and the end of the last one.
 
     A datagram ends when it is full, when zone or epoch changes, or before a long pause.
@@ -256,7 +256,7 @@ def _datagram_edges(records: Records, pulses: int) -> IntArray:
     return np.concatenate([*(np.arange(start, stop, pulses) for start, stop in runs), [len(records)]])
 
 
-def _encoded(header: StructArray, body: StructArray, edges: IntArray) -> list[bytes]:
+def _encoded(header: StructArray, body: StructArray, edges: Int64Array) -> list[bytes]:
     """Return the datagrams between edges (m + 1,).
 
     Datagrams of equal length are encoded at once, because alternating zones make many short ones.

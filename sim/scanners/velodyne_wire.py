@@ -17,7 +17,7 @@ from swath.drivers.gnss.nmea.sentences import encode_rmc
 from swath.drivers.scanner.velodyne.heads import BLOCKS, PLACES
 from swath.drivers.scanner.velodyne.parser import MODE_DUAL, MODE_STRONGEST, encode_data_packet
 from swath.drivers.scanner.velodyne.position import HOUR_US, encode_position_packet
-from swath.georef.arrays import FloatArray, IntArray
+from swath.georef.arrays import FloatArray, Int64Array, StructArray
 from swath.georef.timescales import SECOND_NS, utc_from_gps
 from swath.sim.clocks import PulsePerSecond
 from swath.sim.plan.plan import Plan
@@ -33,7 +33,7 @@ from swath.sim.scanners.spinning_wire import (
     in_slot,
 )
 from swath.sim.shots import Measured, Pulses, WireUnit
-from swath.sim.truth import RETURN_TRUTH_DTYPE, StructArray
+from swath.sim.truth import RETURN_TRUTH_DTYPE
 
 MICROSECOND_HZ = 1_000_000
 RANGE_UNIT_M = 0.002
@@ -124,7 +124,7 @@ class VelodyneWire:
         times_s = self._arrivals.times(np.array([packet.time_s for packet in sent]))
         return [WireUnit(at_s, packet.source, packet.data) for at_s, packet in zip(times_s, sent, strict=True)]
 
-    def _packets(self, time_s: FloatArray, encoder: IntArray, content: IntArray) -> list[_Sent]:
+    def _packets(self, time_s: FloatArray, encoder: Int64Array, content: Int64Array) -> list[_Sent]:
         """Return the data packets of pulses (n,), whose content is (returns, n, range and light)."""
         mode, returns = (MODE_DUAL, 2) if self._dual else (MODE_STRONGEST, 1)
         packets = len(time_s) // (self._groups * PLACES)
@@ -179,7 +179,7 @@ class _Positions:
         return sentence.decode("ascii").strip()
 
 
-def _strongest(raw: IntArray, light: IntArray, truth: StructArray) -> tuple[IntArray, StructArray]:
+def _strongest(raw: Int64Array, light: Int64Array, truth: StructArray) -> tuple[Int64Array, StructArray]:
     """Return the content (1, n, 2) of single returns (range and reflectivity of the strongest) and their truth."""
     slot = best_slot(np.where(raw > 0, light, -1))
     there = slot >= 0
@@ -188,7 +188,7 @@ def _strongest(raw: IntArray, light: IntArray, truth: StructArray) -> tuple[IntA
     return _content(raw, light, [slot]), rows
 
 
-def _pairs(raw: IntArray, light: IntArray, truth: StructArray) -> tuple[IntArray, StructArray]:
+def _pairs(raw: Int64Array, light: Int64Array, truth: StructArray) -> tuple[Int64Array, StructArray]:
     """Return the content (2, n, 2) of dual returns, and their truth, of which the nearer is first.
 
     The content has the last return first, then the strongest, or the second-strongest where the strongest is the last;
@@ -205,7 +205,7 @@ def _pairs(raw: IntArray, light: IntArray, truth: StructArray) -> tuple[IntArray
     return _content(raw, light, [last, other]), rows[np.stack([two, last >= 0], axis=1)]
 
 
-def _content(raw: IntArray, light: IntArray, slots: Sequence[IntArray]) -> IntArray:
+def _content(raw: Int64Array, light: Int64Array, slots: Sequence[Int64Array]) -> Int64Array:
     """Return (returns, n, 2) range and reflectivity in these slots (n,)."""
     return np.stack([np.stack([in_slot(raw, slot), in_slot(light, slot)], axis=1) for slot in slots])
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from swath.georef.arrays import FloatArray, IntArray
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.sim.compiled import jit_inline, whole
 from swath.sim.scene.rays import (
     NEVER,
@@ -87,8 +87,8 @@ class SceneArrays(NamedTuple):
     frame: Frame
     z: FloatArray
     top: FloatArray
-    first: IntArray
-    item: IntArray
+    first: Int64Array
+    item: Int64Array
     rows: FloatArray
     seed: int
 
@@ -117,7 +117,7 @@ def texture(x: float, y: float) -> float:
 
 
 @jit_inline
-def on_road(rows: FloatArray, item: IntArray, first: int, last: int, x: float, y: float) -> int:
+def on_road(rows: FloatArray, item: Int64Array, first: int, last: int, x: float, y: float) -> int:
     """Return the road surface at a place: `ROAD`, `MARKING` or `NO_SURFACE`; crossings have no paint."""
     found, nearest, crossing, surface = -1.0, NEVER, False, NO_SURFACE
     for k in range(first, last):
@@ -142,7 +142,7 @@ def on_road(rows: FloatArray, item: IntArray, first: int, last: int, x: float, y
 
 
 @jit_inline
-def on_water(rows: FloatArray, item: IntArray, first: int, last: int, ray: Ray, at: float, pulse: Pulse) -> Hit:
+def on_water(rows: FloatArray, item: Int64Array, first: int, last: int, ray: Ray, at: float, pulse: Pulse) -> Hit:
     """Return the hit on a lake that a ray meets above the ground, if any; most pulses do not return from water."""
     for k in range(first, last):
         if item[k] & 1 != LAKES:
@@ -168,7 +168,7 @@ def on_ground(
     frame: Frame,
     z: FloatArray,
     rows: FloatArray,
-    item: IntArray,
+    item: Int64Array,
     first: int,
     last: int,
     ray: Ray,
@@ -250,7 +250,7 @@ def meet(
     frame: Frame,
     z: FloatArray,
     rows: FloatArray,
-    item: IntArray,
+    item: Int64Array,
     first: int,
     last: int,
     ray: Ray,
@@ -291,8 +291,8 @@ def march(
     frame: Frame,
     z: FloatArray,
     top: FloatArray,
-    listed: IntArray,
-    item: IntArray,
+    listed: Int64Array,
+    item: Int64Array,
     rows: FloatArray,
     ray: Ray,
     spread: float,

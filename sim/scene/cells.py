@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from swath.georef.arrays import FloatArray, IntArray
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.sim.scene.terrain import Ground
 
 CELL_M = 20.0
@@ -27,8 +27,8 @@ class Cells(NamedTuple):
 
     size_m: float
     top: FloatArray
-    first: IntArray
-    item: IntArray
+    first: Int64Array
+    item: Int64Array
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Listed:
         top_z: (n,) site z that it does not exceed.
     """
 
-    item: IntArray
+    item: Int64Array
     box: FloatArray
     top_z: FloatArray
 
@@ -73,13 +73,13 @@ def _joined(listed: list[Listed]) -> Listed:
 def _ground_top(ground: Ground, size_m: float, rows: int, columns: int) -> FloatArray:
     """Return (rows, columns) the highest node of each cell and of the patches that it cuts."""
 
-    def spans(count: int, nodes: int) -> tuple[IntArray, IntArray]:
+    def spans(count: int, nodes: int) -> tuple[Int64Array, Int64Array]:
         edge = np.arange(count + 1) * size_m / ground.cell_m
         first = np.clip(np.floor(edge[:-1] - 1e-6).astype(np.int64), 0, nodes - 2)
         last = np.clip(np.ceil(edge[1:] + 1e-6).astype(np.int64), 1, nodes - 1)
         return first, last
 
-    def highest(z: FloatArray, first: IntArray, last: IntArray) -> FloatArray:
+    def highest(z: FloatArray, first: Int64Array, last: Int64Array) -> FloatArray:
         """Return the highest values over rows first … last of each span."""
         top = z[first]
         for step in range(1, int(np.max(last - first)) + 1):
@@ -92,7 +92,7 @@ def _ground_top(ground: Ground, size_m: float, rows: int, columns: int) -> Float
 
 def _spread(
     ground: Ground, size_m: float, listed: Listed, rows: int, columns: int
-) -> tuple[IntArray, IntArray, FloatArray]:
+) -> tuple[Int64Array, Int64Array, FloatArray]:
     """Return (cell, item, top_z) of every cell that each box touches; parts of boxes off the grid are left out."""
     origin = np.array([ground.west_m, ground.south_m])
     low = np.floor((listed.box[:, :2] - origin) / size_m).astype(np.int64)
@@ -106,7 +106,7 @@ def _spread(
     return row * columns + column, listed.item[which], listed.top_z[which]
 
 
-def _lists(cell: IntArray, item: IntArray, cells: int) -> tuple[IntArray, IntArray]:
+def _lists(cell: Int64Array, item: Int64Array, cells: int) -> tuple[Int64Array, Int64Array]:
     """Return the first item of each cell (cells + 1,), and the items, each once per cell."""
     width = int(np.max(item, initial=0)) + 1
     pairs = np.unique(cell * width + item)

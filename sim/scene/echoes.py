@@ -7,9 +7,8 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from swath.georef.arrays import FloatArray, IntArray
+from swath.georef.arrays import ByteArray, FloatArray, Int64Array
 from swath.sim import compiled, shots
 from swath.sim.compiled import borrowed, digest, jit_cached, jit_inline, whole
 from swath.sim.scene import casting, rays
@@ -120,8 +119,8 @@ def echoes_of(
     frame: Frame,
     z: FloatArray,
     top: FloatArray,
-    first: IntArray,
-    item: IntArray,
+    first: Int64Array,
+    item: Int64Array,
     rows: FloatArray,
     ray: Ray,
     spread: float,
@@ -163,13 +162,13 @@ def _cast_pulses(sources: int) -> Callable[..., None]:
         origin: FloatArray,
         direction: FloatArray,
         time_s: FloatArray,
-        number: IntArray,
+        number: Int64Array,
         spread: float,
         pulse_m: float,
         range_m: FloatArray,
         reflectance: FloatArray,
         incidence_rad: FloatArray,
-        surface: NDArray[np.uint8],
+        surface: ByteArray,
     ) -> None:
         """Write echoes of n pulses into tables (n, slots), which hold the values of empty slots beforehand."""
         slots = range_m.shape[1] if sources else 0

@@ -6,10 +6,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from swath.georef.arrays import BoolArray, FloatArray
+from swath.georef.arrays import BoolArray, FloatArray, Int64Array
 from swath.sim.clocks import generator
 from swath.sim.plan.terrain_tables import CarTable, ForestTable, RoadTable, WireTable
 from swath.sim.scene.rays import PLANE
@@ -45,7 +44,7 @@ class Things(NamedTuple):
     road: FloatArray
 
 
-def flat(things: Things) -> tuple[FloatArray, dict[str, NDArray[np.int64]]]:
+def flat(things: Things) -> tuple[FloatArray, dict[str, Int64Array]]:
     """Return all tables one behind the other, planes first, and the position at which each row of each begins."""
     starts, at = {}, 0
     for name, table in things._asdict().items():

@@ -9,12 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError, ProjError
 
 from swath.drivers.extras import how_to_install
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.sim.plan.errors import PlanError
 from swath.sim.plan.plan import Plan
 from swath.sim.site import Site, geodetic_from_e
@@ -119,7 +118,7 @@ class _Pixels:
     """
 
     values: FloatArray
-    first: NDArray[np.int64]
+    first: Int64Array
     edges: _Edges
 
     def at(self, easting: FloatArray, northing: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -187,7 +186,7 @@ def _read(plan: Plan, to_crs: _Projected, corners: FloatArray, height_m: float) 
         raise PlanError(KEY, f"{path} cannot be read: {reason}; use a GeoTIFF of heights") from None
 
 
-def _window(source: Any, first: NDArray[np.int64], size: NDArray[np.int64], path: Path) -> FloatArray:
+def _window(source: Any, first: Int64Array, size: Int64Array, path: Path) -> FloatArray:
     """Return (rows, columns) of the first band, nan where it has no data.
 
     Values beyond any height on Earth count as no data too: they are marks that the file does not declare.

@@ -6,10 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import Delaunay
 
-from swath.georef.arrays import FloatArray, IntArray
+from swath.georef.arrays import BoolArray, FloatArray, Int64Array
 from swath.sim.clocks import generator
 from swath.sim.plan.errors import PlanError
 from swath.sim.plan.plan import Plan
@@ -37,7 +36,7 @@ from swath.sim.scene.village import Houses, build_village
 from swath.sim.shots import Echoes
 from swath.sim.site import Site
 
-Seen = Callable[[FloatArray, FloatArray], NDArray[np.bool_]]
+Seen = Callable[[FloatArray, FloatArray], BoolArray]
 
 FOOTPRINT_M = (1.0, 20.0)  # limits of the beam radius for which neighbouring cells list objects too
 CONTROL_CLEAR_M = 4.0
@@ -88,7 +87,7 @@ class Scene:
         origin: FloatArray,
         direction: FloatArray,
         time_s: FloatArray,
-        number: IntArray,
+        number: Int64Array,
         divergence_rad: float,
         pulse_m: float,
         slots: int,
@@ -151,7 +150,7 @@ class Scene:
         chosen = _far_apart(places, count)
         return self.ground.points(chosen[:, 0], chosen[:, 1])
 
-    def _occupied(self, places: FloatArray, clear_m: float) -> NDArray[np.bool_]:
+    def _occupied(self, places: FloatArray, clear_m: float) -> BoolArray:
         """Return (n,) True where an object is nearer to places (n, 2) than this; roads do not count."""
         clear = np.full(len(places), clear_m)
         center = np.mean(self.buildings, axis=1)
@@ -249,7 +248,7 @@ def _settle(table: TerrainTable, ground: Ground, water: FloatArray) -> tuple[Hou
     return houses, roads
 
 
-def _on_grid(ground: Ground, houses: Houses) -> NDArray[np.bool_]:
+def _on_grid(ground: Ground, houses: Houses) -> BoolArray:
     radius = houses.radius_m[:, np.newaxis]
     low, high = houses.center_m - radius, houses.center_m + radius
     return ground.covers(low[:, 0], low[:, 1]) & ground.covers(high[:, 0], high[:, 1])
@@ -304,14 +303,14 @@ def _footprint_m(scanners: list[ScannerTable]) -> float:
 
 
 def _listed(
-    kinds: int, kind: int, start: IntArray, box: FloatArray, top_z: FloatArray, wider_m: FloatArray | float
+    kinds: int, kind: int, start: Int64Array, box: FloatArray, top_z: FloatArray, wider_m: FloatArray | float
 ) -> Listed:
     """Return the objects of a kind, in boxes widened on all sides."""
     wider = np.broadcast_to(wider_m, len(box))[:, np.newaxis]
     return Listed(kinds * start + kind, np.concatenate([box[:, :2] - wider, box[:, 2:] + wider], axis=1), top_z)
 
 
-def _pieces(lines: FloatArray) -> tuple[IntArray, FloatArray]:
+def _pieces(lines: FloatArray) -> tuple[Int64Array, FloatArray]:
     """Return straight lines (n, 4) cut into pieces about as long as a cell: the line of each, and its box (m, 4)."""
     length = np.linalg.norm(lines[:, 2:] - lines[:, :2], axis=1)
     count = np.maximum(np.ceil(length / CELL_M), 1).astype(np.int64)
@@ -324,7 +323,7 @@ def _pieces(lines: FloatArray) -> tuple[IntArray, FloatArray]:
     return row, np.concatenate([np.minimum(first, last), np.maximum(first, last)], axis=1)
 
 
-def _driven(ways: FloatArray, ground: Ground) -> tuple[IntArray, FloatArray, FloatArray]:
+def _driven(ways: FloatArray, ground: Ground) -> tuple[Int64Array, FloatArray, FloatArray]:
     """Return pieces of the cars' ways: the car of each, its box (m, 4), and the z limit of the car there (m,)."""
     row, box = _pieces(ways)
     across = np.linspace(0.0, 1.0, 2 + int(2 * CELL_M / ground.cell_m))

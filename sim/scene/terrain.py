@@ -6,10 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import RectBivariateSpline
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import BoolArray, FloatArray, Int64Array
 from swath.sim.clocks import generator
 from swath.sim.plan.errors import PlanError
 from swath.sim.plan.plan import Plan
@@ -55,7 +54,7 @@ class Ground:
         """Site y of the last row."""
         return float(self.south_m + (self.z.shape[0] - 1) * self.cell_m)
 
-    def covers(self, east_m: FloatArray, north_m: FloatArray) -> NDArray[np.bool_]:
+    def covers(self, east_m: FloatArray, north_m: FloatArray) -> BoolArray:
         """Return (n,) True where places lie on the grid."""
         across = (east_m >= self.west_m) & (east_m <= self.east_m)
         return across & (north_m >= self.south_m) & (north_m <= self.north_m)
@@ -151,7 +150,7 @@ def build_ground(plan: Plan, site: Site, corners: FloatArray) -> Ground:
     return Ground(site, float(east[0]), float(north[0]), cell_m, z)
 
 
-def _check_size(cells: NDArray[np.int64], cell_m: float) -> None:
+def _check_size(cells: Int64Array, cell_m: float) -> None:
     nodes = float(np.prod(cells + 1.0))
     if nodes > LARGEST_NODES:
         width, depth = cells * cell_m / 1000.0

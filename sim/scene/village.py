@@ -7,9 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from swath.georef.arrays import FloatArray, IntArray
+from swath.georef.arrays import BoolArray, FloatArray, Int64Array
 from swath.sim.clocks import generator
 from swath.sim.plan.errors import PlanError
 from swath.sim.plan.terrain_tables import BuildingTable, RoadTable, VillageTable
@@ -43,7 +42,7 @@ class Houses:
     size_m: FloatArray
     heading_rad: FloatArray
     eaves_m: FloatArray
-    roof: IntArray
+    roof: Int64Array
     pitch_rad: FloatArray
 
     @classmethod
@@ -67,7 +66,7 @@ class Houses:
         """(n,) radii of the circles around the buildings."""
         return 0.5 * np.hypot(self.size_m[:, 0], self.size_m[:, 1])
 
-    def only(self, wanted: NDArray[np.bool_]) -> Houses:
+    def only(self, wanted: BoolArray) -> Houses:
         """Return the buildings that are wanted."""
         return Houses(*(getattr(self, name)[wanted] for name in self.__dataclass_fields__))
 
@@ -138,7 +137,7 @@ def _lots_of_size(extent: FloatArray, size: FloatArray) -> _Lots:
     return _Lots(center, size, along, across - 0.5 * extent[0])
 
 
-def _houses(table: VillageTable, draws: np.random.Generator, lots: _Lots, placed: Placed, used: IntArray) -> Houses:
+def _houses(table: VillageTable, draws: np.random.Generator, lots: _Lots, placed: Placed, used: Int64Array) -> Houses:
     """Return one house on each used lot; it is turned a little, and all its corners stay within its lot."""
     count = len(used)
     turn = np.radians(np.clip(_TURN_DEG * draws.standard_normal(count), -10.0, 10.0))

@@ -6,11 +6,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from swath.calib.flight import Flight, Head, Swath, Tangent
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import BoolArray, FloatArray, Int64Array, StructArray
 from swath.georef.geodesy.earth import e_from_geodetic
 from swath.georef.records import RETURN_DTYPE
 from swath.georef.scanner.beams import LineGeometry
@@ -160,7 +159,7 @@ def _scan(
     rng: np.random.Generator,
     intensity: Surface | None,
     limits_m: tuple[float, float],
-) -> tuple[NDArray[np.void], NDArray[np.int64]]:
+) -> tuple[StructArray, Int64Array]:
     count = int(line.length_m / line.speed_mps * scanner.prf_hz)
     seconds = np.arange(count) / scanner.prf_hz
     phase = (seconds * scanner.scan_hz + rng.uniform()) % 1.0
@@ -210,7 +209,7 @@ def _met(from_t: FloatArray, beam_t: FloatArray, ground: Surface, limits_m: tupl
     return 0.5 * (near + far)
 
 
-def only(flight: Flight, keep: Callable[[FloatArray], NDArray[np.bool_]]) -> Flight:
+def only(flight: Flight, keep: Callable[[FloatArray], BoolArray]) -> Flight:
     """Keep only the returns whose points (n, 3) are wanted."""
     swaths = []
     for swath in flight.swaths:

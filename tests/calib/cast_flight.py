@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from swath.calib.flight import Flight, Head, Swath, Tangent
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import BoolArray, ByteArray, FloatArray, Int64Array, StructArray
 from swath.georef.records import RETURN_DTYPE
 from swath.georef.scanner.beams import LineGeometry
 from swath.georef.scanner.calibration import Calibration, nominal
@@ -64,7 +64,7 @@ class Cast:
     flight: Flight
     truth: Calibration
     scene: Scene
-    surface: tuple[NDArray[np.uint8], ...]
+    surface: tuple[ByteArray, ...]
     true_t: tuple[FloatArray, ...]
     planes: FloatArray
 
@@ -72,10 +72,10 @@ class Cast:
         """Return the flight with its points placed by the true calibration."""
         return self.flight.placed({"left": self.truth})
 
-    def faces(self, swath: int, at: NDArray[np.int64], within_m: float = 1e-3) -> NDArray[np.bool_]:
+    def faces(self, swath: int, at: Int64Array, within_m: float = 1e-3) -> BoolArray:
         """(k, planes) which of the scene's planes true points lie on."""
         distance = self.true_t[swath][at] @ self.planes[:, :3].T - self.planes[:, 3]
-        on: NDArray[np.bool_] = np.abs(distance) < within_m
+        on: BoolArray = np.abs(distance) < within_m
         return on
 
 
@@ -174,7 +174,7 @@ def _shoot(
     truth: Calibration,
     prf_hz: float,
     half_angle_rad: float,
-) -> tuple[NDArray[np.void], NDArray[np.int64], NDArray[np.uint8], FloatArray]:
+) -> tuple[StructArray, Int64Array, ByteArray, FloatArray]:
     """Rows, their times, surfaces, and points (n, 3) in e, of all pulses along a track: a polygon's even sweeps."""
     time_ns, position_e, q = track[0].astype(np.int64), track[1], track[2]
     span_s = 1e-9 * float(time_ns[-1] - time_ns[0])

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from swath.calib.features import Features, Patch, Plane
 from swath.calib.flight import Flight, Head, Swath
-from swath.georef.arrays import FloatArray
-from swath.georef.records import RETURN_DTYPE, Int64Array
+from swath.georef.arrays import FloatArray, Int64Array
+from swath.georef.records import RETURN_DTYPE
 from swath.georef.scanner.beams import LineGeometry
 from swath.georef.scanner.calibration import nominal
 from swath.georef.scanner.uncertainty import Noise

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.calib.flight import Flight, Swath, Tangent
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import ByteArray, FloatArray
 from swath.georef.geodesy.earth import e_from_geodetic
 from swath.georef.records import RETURN_DTYPE
 
@@ -25,7 +24,7 @@ def grid(half_m: float, step_m: float) -> tuple[FloatArray, FloatArray]:
     return east.ravel(), north.ravel()
 
 
-def swath_of(points_t: FloatArray, strip: int = 1, returns: NDArray[np.uint8] | None = None) -> Swath:
+def swath_of(points_t: FloatArray, strip: int = 1, returns: ByteArray | None = None) -> Swath:
     """Single returns at places."""
     rows = np.zeros(len(points_t), RETURN_DTYPE)
     rows["return_number"] = 1

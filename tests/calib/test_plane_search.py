@@ -16,7 +16,7 @@ from swath.calib.flight import Flight
 from swath.calib.planes.fit import fit_sight
 from swath.calib.planes.kernels import GOOD, MOMENTS, accumulate, fill_table, fit_cells, gather, grow
 from swath.calib.planes.search import PlaneError, PlaneSettings, find_planes, given_planes, plane_rows
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.sim.shots import CAR, GROUND, LEAVES, MARKING, ROAD, ROOF, WALL, WATER
 from tests.calib.cast_flight import Cast, Line, cast_flight
 
@@ -78,10 +78,10 @@ def of_kind(features: Features, kind: str) -> list[Plane]:
     return [plane for plane in features.planes if plane.kind == kind]
 
 
-def made_of(cast: Cast, plane: Plane) -> NDArray[np.int64]:
+def made_of(cast: Cast, plane: Plane) -> Int64Array:
     """Return (10,) numbers of returns by surface."""
     parts = [np.bincount(cast.surface[patch.swath][patch.at], minlength=10) for patch in plane.patches]
-    counts: NDArray[np.int64] = np.sum(parts, axis=0)
+    counts: Int64Array = np.sum(parts, axis=0)
     return counts
 
 

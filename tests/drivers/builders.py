@@ -15,6 +15,7 @@ import numpy as np
 from swath.drivers.can_frames import encode_can_frame
 from swath.drivers.gnss.novatel.parser import NovatelParser
 from swath.drivers.parser import DeviceSettings, PacketParser
+from swath.georef.arrays import StructArray
 from swath.georef.records import (
     Chunk,
     DeviceClockSamples,
@@ -22,7 +23,6 @@ from swath.georef.records import (
     InsSolution,
     Record,
     ScannerReturns,
-    StructArray,
     TimeMessage,
 )
 

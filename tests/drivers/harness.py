@@ -28,16 +28,8 @@ from hypothesis import strategies as st
 
 from swath.drivers.framing.framer import FrameKind
 from swath.drivers.parser import Parser, ParserCounters
-from swath.georef.records import (
-    Chunk,
-    ChunkBatch,
-    DeviceClockSamples,
-    ImuSamples,
-    InsSolution,
-    Record,
-    ScannerReturns,
-    StructArray,
-)
+from swath.georef.arrays import StructArray
+from swath.georef.records import Chunk, ChunkBatch, DeviceClockSamples, ImuSamples, InsSolution, Record, ScannerReturns
 
 Factory = Callable[[], Parser]
 SOURCE = "gnss/test"

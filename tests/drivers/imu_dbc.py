@@ -9,16 +9,8 @@ import numpy as np
 
 from swath.drivers.can_frames import encode_can_frame
 from swath.drivers.parser import DeviceSettings, Parser
-from swath.georef.records import (
-    IMU_DTYPE,
-    ByteRows,
-    ChunkBatch,
-    DeviceClockSamples,
-    ImuSamples,
-    Int64Array,
-    Record,
-    StructArray,
-)
+from swath.georef.arrays import Int64Array, StructArray
+from swath.georef.records import IMU_DTYPE, ByteRows, ChunkBatch, DeviceClockSamples, ImuSamples, Record
 
 ACC, GYR, SAMPLE, SYNC, TEMP = 0x101, 0x102, 0x103, 0x104, 0x105
 

@@ -14,7 +14,8 @@ from swath.drivers.captures.opening import read_pcap
 from swath.drivers.parser import DeviceSettings
 from swath.drivers.scanner.ouster.layout import PROFILES, LidarLayout
 from swath.drivers.scanner.ouster.parser import OusterParser
-from swath.georef.records import ImuSamples, Record, StructArray
+from swath.georef.arrays import StructArray
+from swath.georef.records import ImuSamples, Record
 
 FIXTURES = Path(__file__).parents[2] / "fixtures" / "ouster"
 EXPECTED: dict[str, dict[str, Any]] = json.loads((FIXTURES / "expected.json").read_text())

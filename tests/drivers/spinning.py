@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from swath.drivers.captures.opening import read_pcap
 from swath.drivers.scanner.beams import BeamTable, beam_points
-from swath.georef.records import StructArray
+from swath.georef.arrays import BoolArray, Int64Array, StructArray
 from tests.drivers.recordings import FIXTURES
 
 Points = NDArray[np.float64]
@@ -40,12 +40,12 @@ def read_pcd(path: Path, dtype: np.dtype[np.void]) -> StructArray:
     return np.frombuffer(data[start:], dtype=dtype)
 
 
-def are_near(points: Points, others: Points, cell_m: float) -> NDArray[np.bool_]:
+def are_near(points: Points, others: Points, cell_m: float) -> BoolArray:
     """(n,) whether a point has one of the others within 1.5 cells an axis; True where one is within half a cell."""
 
-    def keys(cells: Points) -> NDArray[np.int64]:
+    def keys(cells: Points) -> Int64Array:
         x, y, z = (cells.astype(np.int64) + (1 << 20)).T
-        keyed: NDArray[np.int64] = (x << 42) + (y << 21) + z
+        keyed: Int64Array = (x << 42) + (y << 21) + z
         return keyed
 
     there = keys(np.floor(others / cell_m))

@@ -18,8 +18,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray
 from swath.georef.records import NamesEdge, TimeMessage, TimeScale, TimeTag
 
 NS = 1_000_000_000
@@ -42,7 +42,7 @@ class Oscillator:
     wander: float = 2e-9
     ramps: bool = False
 
-    def host_seconds(self) -> NDArray[np.float64]:
+    def host_seconds(self) -> FloatArray:
         """(seconds + 1,) host ns since the start at true seconds 0, 1, …"""
         random = np.random.default_rng(self.seed)
         frequency = self.drift_ppm * 1e3 + np.cumsum(random.normal(0.0, self.wander * NS, self.seconds))
@@ -51,7 +51,7 @@ class Oscillator:
         phase = np.concatenate(([0.0], np.cumsum(frequency)))
         return np.asarray(phase + np.arange(self.seconds + 1) * float(NS), dtype=np.float64)
 
-    def _ramp_rates(self, random: np.random.Generator) -> NDArray[np.float64]:
+    def _ramp_rates(self, random: np.random.Generator) -> FloatArray:
         rates = np.zeros(self.seconds)
         at = 0
         while at < self.seconds:

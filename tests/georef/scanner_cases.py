@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from swath.drivers.scanner.beams import BeamTable, beam_table
 from swath.drivers.scanner.beams import beam_points as velodyne_points
-from swath.georef.arrays import FloatArray
-from swath.georef.records import RETURN_DTYPE, StructArray
+from swath.georef.arrays import FloatArray, StructArray
+from swath.georef.records import RETURN_DTYPE
 from swath.georef.scanner.beams import (
     FibreGeometry,
     Geometry,

@@ -10,12 +10,11 @@ from pyproj import Transformer
 
 from swath.georef import georeference
 from swath.georef.air.atmosphere import Air
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, Int64Array, StructArray
 from swath.georef.geodesy.vectors import angle_of
 from swath.georef.georeference import Georeferencer
 from swath.georef.mapping.frame import Mapping, MappingError
 from swath.georef.points import Fate, Points
-from swath.georef.records import Int64Array, StructArray
 from swath.georef.scanner.beams import Geometry, LineGeometry, SpinningGeometry
 from swath.georef.scanner.calibration import nominal
 from swath.georef.scanner.sensor_model import SensorModel

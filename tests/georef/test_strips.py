@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.georef.strips import (
     Segment,
     StripError,
@@ -20,7 +20,7 @@ from swath.georef.strips import (
 
 S = 1_000_000_000
 START = 1_479_297_618 * S
-Flown = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]
+Flown = tuple[Int64Array, FloatArray, FloatArray]
 
 
 def flown(*legs: tuple[float, float, float], rate_hz: float = 50.0, gusts_rad: float = 0.0) -> Flown:

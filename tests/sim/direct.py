@@ -13,13 +13,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pyproj import Transformer
 from scipy.interpolate import CubicSpline
 from scipy.signal import savgol_filter
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import BoolArray, FloatArray
 
 TO_ECEF = Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
 TO_GEODETIC = Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True)
@@ -76,7 +75,7 @@ class Track:
                 position[at], rotation[at] = self._piece(knots, time_s[at])
         return position, rotation
 
-    def _piece(self, knots: NDArray[np.bool_], time_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _piece(self, knots: BoolArray, time_s: FloatArray) -> tuple[FloatArray, FloatArray]:
         t, lat, lon = self.time_s[knots], self.lat_rad[knots], self.lon_rad[knots]
         xyz = np.stack(TO_ECEF.transform(np.degrees(lon), np.degrees(lat), self.height_m[knots]), axis=1)
         ned = Rotation.from_euler("ZY", np.stack([lon, -lat - np.pi / 2], axis=1))

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swath.drivers.parser import PacketParser
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, StructArray
 from swath.georef.records import DeviceClockSamples, Record, ScannerReturns
 from swath.sim.clocks import PulsePerSecond
 from swath.sim.plan.plan import Plan, parse_plan
 from swath.sim.shots import Measured, Pulses, WireUnit
-from swath.sim.truth import RETURN_TRUTH_DTYPE, StructArray
+from swath.sim.truth import RETURN_TRUTH_DTYPE
 
 TEXT = """
 [flight]

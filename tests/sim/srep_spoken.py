@@ -13,13 +13,14 @@ from numpy.typing import NDArray
 from swath.drivers.parser import DeviceSettings
 from swath.drivers.scanner.srep.layout import HEADER_DTYPE
 from swath.drivers.scanner.srep.parser import SrepParser
+from swath.georef.arrays import Int64Array, StructArray
 from swath.georef.records import Chunk, DeviceClockSamples, ScannerReturns
 from swath.sim.clocks import PulsePerSecond
 from swath.sim.plan.tables import HostTable, PpsTable, ScannerTable
 from swath.sim.scanners.line_heads import LineHead
 from swath.sim.scanners.srep_wire import SrepWire, config_table
 from swath.sim.shots import Measured, Pulses, WireUnit
-from swath.sim.truth import RETURN_TRUTH_DTYPE, StructArray
+from swath.sim.truth import RETURN_TRUTH_DTYPE
 
 C_MPS = 299_792_458.0
 OSCILLATOR = {"offset_ppm": 5.0, "drift_ppm_per_h": 10.0}
@@ -35,7 +36,7 @@ def pulse_per_second(jitter_ns: float = 20.0) -> PulsePerSecond:
     return PulsePerSecond(PpsTable(jitter_ns=jitter_ns), 5, "main", noise=True)
 
 
-def measured_count(number: NDArray[np.int64], slots: int) -> NDArray[np.int64]:
+def measured_count(number: Int64Array, slots: int) -> Int64Array:
     """How many returns a pulse of this number has."""
     return number * 48_271 % 2_147_483_647 % (slots + 1)
 

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
@@ -18,7 +17,7 @@ from swath.drivers.scanner.beams import beam_points as velodyne_points
 from swath.drivers.scanner.ouster.head import beam_points as ouster_points
 from swath.drivers.scanner.ouster.head import read_head
 from swath.drivers.scanner.velodyne.heads import VLP16
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, StructArray
 from tests.builders import (
     EVERY_ERROR,
     LOW_AND_SLOW,
@@ -227,7 +226,7 @@ def test_points_of_an_os1_are_recovered(tmp_path: Path) -> None:
     check_spinning(flown, points_s, range_quantum_m=0.001, angle_quantum_rad=0.0, time_quantum_s=1e-9)
 
 
-def corrected_rows(flown: Flown, scan_hz: float) -> NDArray[np.void]:
+def corrected_rows(flown: Flown, scan_hz: float) -> StructArray:
     """Rows with what CONVENTIONS adds to range and azimuth."""
     rows = flown.rows.copy()
     rows["range_m"] = corrected_range(flown.calibration, rows["range_m"], rows["intensity"])

@@ -14,7 +14,8 @@ from mcap import records
 
 from swath.daemon.log.format import ChannelSpec, ChunkClass, LogError
 from swath.daemon.log.mcap.scan import OP_CHANNEL, OP_MESSAGE, OP_SCHEMA, Damage, Record, parse_record
-from swath.georef.records import ByteRows, Int64Array
+from swath.georef.arrays import Int64Array
+from swath.georef.records import ByteRows
 
 TopicFilter = Callable[[str], bool]
 _MESSAGE_HEAD = 31

@@ -15,7 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from swath.georef.records import ByteRows, Int64Array
+from swath.georef.arrays import Int64Array
+from swath.georef.records import ByteRows
 
 MESSAGE_HEADER_BYTES = 31
 _OP_MESSAGE, _OP_MESSAGE_INDEX = 5, 7

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.calib.equations.trajectory_prior import TrajectoryPrior, from_smoother, knots_of
 from swath.calib.flight import Flight, Head, Swath, Tangent
@@ -27,10 +26,10 @@ from swath.daemon.processing.points.feed import LogFeed
 from swath.daemon.processing.points.jobs import MARGIN_NS, Job, JobPlan, JobResult, Tell, feed_job
 from swath.daemon.processing.points.workers import run_jobs
 from swath.daemon.processing.setup.models import motion_of
-from swath.georef.arrays import ByteArray
+from swath.georef.arrays import ByteArray, FloatArray, Int64Array, StructArray
 from swath.georef.georeference import Georeferencer
 from swath.georef.points import Fate, Points
-from swath.georef.records import RETURN_DTYPE, Int64Array, StructArray
+from swath.georef.records import RETURN_DTYPE
 from swath.georef.scanner.calibration import Calibration
 from swath.georef.scanner.uncertainty import Noise
 from swath.georef.stream.stream import GivenMotion
@@ -143,10 +142,10 @@ def read_flight(
     return KeptFlight(Flight(frame, heads, trajectories, tuple(swaths)), logged, results)
 
 
-def _middle(flight: LoggedFlight) -> NDArray[np.float64]:
+def _middle(flight: LoggedFlight) -> FloatArray:
     assert flight.trajectory is not None
     within = flight.trajectory.between(*flight.span)
-    middle: NDArray[np.float64] = within.position_e[len(within) // 2]
+    middle: FloatArray = within.position_e[len(within) // 2]
     return middle
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pyproj import CRS
 
 from swath.daemon.processing.live.mcap import CLOUD_DTYPE
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.georef.compiled import jit_cached
 from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
 from swath.georef.geodesy.vectors import rot_of
@@ -72,7 +72,7 @@ class LocalFrame:
         away: FloatArray = points - self.origin
         return away @ self._rot_points_from_enu if self.is_level else away * self.unit_m
 
-    def cloud_of(self, points: Points, keep: NDArray[np.int64]) -> NDArray[Any]:
+    def cloud_of(self, points: Points, keep: Int64Array) -> NDArray[Any]:
         """Return the points with the indexes ``keep`` as `CLOUD_DTYPE`."""
         cloud = np.empty((len(keep), 4), np.float32)
         if self.is_level:

@@ -6,8 +6,8 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray, UInt64Array
 from swath.georef.compiled import jit_cached
 
 TILE = 256  # cells along a side
@@ -37,7 +37,7 @@ class CountGrid:
         self._places = np.zeros((tiles, 2), dtype=np.int64)  # column and row of each tile held
         self._state = np.zeros(2, dtype=np.int64)  # tiles held, points refused
 
-    def add(self, points: NDArray[np.float64], east: float = 0.0, north: float = 0.0, unit_m: float = 1.0) -> None:
+    def add(self, points: FloatArray, east: float = 0.0, north: float = 0.0, unit_m: float = 1.0) -> None:
         """Count points (n, 3): east, north, up, of which up is ignored. Blocks may be cut anywhere.
 
         Args:
@@ -90,7 +90,7 @@ class CountGrid:
         east, north = (self._places[:held].max(axis=0) + 1).tolist()
         return west, south, east, north
 
-    def image(self, limit: int) -> tuple[NDArray[np.uint64], float, float, float]:
+    def image(self, limit: int) -> tuple[UInt64Array, float, float, float]:
         """Return counts with north up, at most ``limit`` cells along a side.
 
         Returns:

@@ -18,6 +18,7 @@ from foxglove import messages as fox
 from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray
 from swath.georef.timescales.gps_time import SECOND_NS
 
 FRAME, BODY = "local", "body"
@@ -44,9 +45,9 @@ class LivePose:
     lat_deg: float
     lon_deg: float
     height_m: float
-    position: NDArray[np.float64]
-    q_local_from_b: NDArray[np.float64]
-    sigma_l: NDArray[np.float64]
+    position: FloatArray
+    q_local_from_b: FloatArray
+    sigma_l: FloatArray
 
 
 class LiveMcap:

@@ -24,6 +24,7 @@ from swath.daemon.config.tables import LiveConfig
 from swath.daemon.processing.live.frame import LocalFrame, Maps
 from swath.daemon.processing.live.grid import CountGrid
 from swath.daemon.processing.live.mcap import NAME, LiveMcap, LivePose
+from swath.georef.arrays import ByteArray, Int64Array
 from swath.georef.compiled import jit_cached
 from swath.georef.geodesy.earth import geodetic_from_e
 from swath.georef.points import Points
@@ -51,7 +52,7 @@ class Thinning:
         self._limit = points_per_s
         self._state = np.array([np.iinfo(np.int64).min, 0, 0, FIRST_STRIDE, 0], dtype=np.int64)
 
-    def keep(self, time_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+    def keep(self, time_ns: Int64Array) -> Int64Array:
         """Return the indexes (k,) of the points to keep; points come in the order of their arrival."""
         kept_ones = np.empty(len(time_ns), dtype=np.int64)
         return kept_ones[: _thin(time_ns, self._limit, self._state, kept_ones)]
@@ -274,7 +275,7 @@ def picture(counts: NDArray[Any], cell_m: float) -> bytes:
     """Return a PNG (ISO/IEC 15948) of cells (rows, columns), one pixel each, coloured by density;
     empty ones are clear.
     """
-    index: NDArray[np.uint8] = np.zeros(counts.shape, dtype=np.uint8)
+    index: ByteArray = np.zeros(counts.shape, dtype=np.uint8)
     for density, _ in _COLOURS:
         index += counts >= max(1, math.ceil(density * cell_m**2))
     rows, columns = index.shape

@@ -25,7 +25,7 @@ from swath.daemon.processing.live.products import LiveProducts, Room
 from swath.daemon.processing.live.status import LiveStatus, sentence, write_status
 from swath.daemon.processing.points.feed import LogFeed, Placed
 from swath.daemon.processing.setup.setup import Options, Setup
-from swath.georef.records import StructArray
+from swath.georef.arrays import StructArray
 from swath.georef.trajectory.trajectory import Trajectory
 
 FOLDER = "live"  # in the log directory

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.daemon.log.format import source_of_topic
 from swath.daemon.log.mcap.chunks import LogBatch
@@ -20,6 +19,7 @@ from swath.daemon.processing.live.follow import BEHIND_NS, LiveFollower
 from swath.daemon.processing.live.products import LiveProducts, replace_file
 from swath.daemon.processing.points.time_checks import time_trouble
 from swath.daemon.processing.setup.setup import Setup
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.georef.points import FATE_NAMES
 from swath.georef.stream.stream import Stream
 
@@ -35,9 +35,9 @@ class Latencies:
     """Time differences in seconds of the last moments."""
 
     def __init__(self) -> None:
-        self._blocks: deque[tuple[float, NDArray[np.float64] | float]] = deque()
+        self._blocks: deque[tuple[float, FloatArray | float]] = deque()
 
-    def add(self, seconds: NDArray[np.float64] | float) -> None:
+    def add(self, seconds: FloatArray | float) -> None:
         """Add time differences of the present moment."""
         now_s = time.monotonic()
         self._blocks.append((now_s, seconds))
@@ -88,11 +88,11 @@ class LiveStatus:
         self._newest_ns[source] = max(self._newest_ns[source], newest_ns)
         self._log[source].add((now_ns - newest_ns) * 1e-9)
 
-    def note_points(self, name: str, time_ns: NDArray[np.int64], now_ns: int) -> None:
+    def note_points(self, name: str, time_ns: Int64Array, now_ns: int) -> None:
         """Note that points have come out, at a host time; time_ns (n,) are their pulses' times."""
         offset_ns = self._gps_minus_host_ns(name, now_ns)
         if offset_ns is not None:
-            latest: NDArray[np.float64] = (now_ns + offset_ns - time_ns[::EVERY]) / 1e9
+            latest: FloatArray = (now_ns + offset_ns - time_ns[::EVERY]) / 1e9
             self._pulse.setdefault(f"scanner/{name}", Latencies()).add(latest)
 
     def _gps_minus_host_ns(self, name: str, host_ns: int) -> int | None:

@@ -14,10 +14,10 @@ from swath.daemon.processing.navigation.log import NavigationLog
 from swath.daemon.processing.navigation.observations import Observed
 from swath.daemon.processing.navigation.sources import NavigationSources
 from swath.daemon.processing.navigation.times import ImuTimes
+from swath.georef.arrays import StructArray
 from swath.georef.geodesy.earth import e_from_geodetic
 from swath.georef.navigation.diagnosis.data import Finding
 from swath.georef.navigation.inputs import Inertial, Kind
-from swath.georef.records import StructArray
 from swath.georef.trajectory.trajectory import gps_text
 
 FEWEST_HEIGHTS = 10

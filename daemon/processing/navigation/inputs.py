@@ -39,11 +39,12 @@ from swath.daemon.processing.navigation.outside_positions import (
 from swath.daemon.processing.navigation.sources import NavigationSources, config_of_log, files_of
 from swath.daemon.processing.navigation.times import LEAST_HOLE_S, ImuTimes, Stretch, imu_times, stretches
 from swath.daemon.processing.points.time_checks import refuse_no_time
+from swath.georef.arrays import StructArray
 from swath.georef.navigation.diagnosis.data import Finding
 from swath.georef.navigation.filter.stores import IN_MEMORY, Storage
 from swath.georef.navigation.inputs import Inertial, Kind, NavigationError, Setup
 from swath.georef.navigation.samples import Sampler
-from swath.georef.records import EventMark, GnssFix, GnssHeading, StructArray, TimeTag
+from swath.georef.records import EventMark, GnssFix, GnssHeading, TimeTag
 from swath.georef.timescales import SECOND_NS
 from swath.georef.trajectory.buffer import SOLUTION_STATUS
 

@@ -11,7 +11,6 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.daemon.errors import UserError
 from swath.daemon.processing.navigation.observations import (
@@ -21,23 +20,14 @@ from swath.daemon.processing.navigation.observations import (
     heading_times,
 )
 from swath.daemon.processing.navigation.sources import NavigationSources
+from swath.georef.arrays import BoolArray, Int64Array, StructArray
 from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
 from swath.georef.geodesy.rotations import attitude_of, rot_from_quaternion
 from swath.georef.navigation.alignment.align import Aligner
 from swath.georef.navigation.filter.filter import NavigationFilter
 from swath.georef.navigation.inputs import OBSERVATION_DTYPE, Inertial, NavigationError, sort_observations
 from swath.georef.navigation.samples import Sampler
-from swath.georef.records import (
-    DEVICE_CLOCK_DTYPE,
-    IMU_DTYPE,
-    INS_DTYPE,
-    GnssFix,
-    GnssHeading,
-    ImuSamples,
-    Int64Array,
-    Record,
-    StructArray,
-)
+from swath.georef.records import DEVICE_CLOCK_DTYPE, IMU_DTYPE, INS_DTYPE, GnssFix, GnssHeading, ImuSamples, Record
 from swath.georef.timescales import SECOND_NS, WEEK_NS
 
 if TYPE_CHECKING:
@@ -165,7 +155,7 @@ class Navigator:
             self._imu = []
         return self._sampler.feed(rows, time_ns)
 
-    def _times(self, rows: StructArray) -> tuple[Int64Array, NDArray[np.bool_]]:
+    def _times(self, rows: StructArray) -> tuple[Int64Array, BoolArray]:
         """Return GPS ns (n,) of samples, and flags (n,) of those that are known."""
         source = self._sources.imu_source
         own = rows["gps_week"] >= 0

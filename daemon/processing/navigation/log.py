@@ -14,6 +14,7 @@ from swath.daemon.log.host_messages import edges_of, readings_of
 from swath.daemon.log.reader import Session
 from swath.daemon.processing.undecoded import refused_by
 from swath.drivers.parser import PacketParser
+from swath.georef.arrays import StructArray
 from swath.georef.records import (
     IMU_DTYPE,
     INS_DTYPE,
@@ -24,7 +25,6 @@ from swath.georef.records import (
     ImuSamples,
     InsSolution,
     Record,
-    StructArray,
     TimeMessage,
 )
 from swath.georef.stream.clocks import HostClocks

@@ -21,7 +21,7 @@ from swath.daemon.log.reader import Session
 from swath.daemon.processing.navigation.inputs import InputOptions, Leg, NavigationInputs, protocol_of, read_inputs
 from swath.daemon.processing.navigation.sources import noise_of
 from swath.daemon.processing.navigation.times import Stretch
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, StructArray
 from swath.georef.geodesy.quaternions import conjugate, rotated
 from swath.georef.navigation.alignment.align import align
 from swath.georef.navigation.alignment.earlier_start import earlier_start
@@ -39,7 +39,7 @@ from swath.georef.navigation.solve import solve, stretch_of
 from swath.georef.navigation.stillness import with_still_seconds
 from swath.georef.navigation.unit_noise import noise_findings
 from swath.georef.points import Fate
-from swath.georef.records import FixType, StructArray
+from swath.georef.records import FixType
 from swath.georef.trajectory.buffer import TrajectoryBuffer
 from swath.georef.trajectory.trajectory import DEFAULT_MAX_GAP_NS, Trajectory
 

@@ -15,11 +15,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import BoolArray, FloatArray, StructArray
 from swath.georef.geodesy.earth import e_from_geodetic
 from swath.georef.navigation.alignment.noise import white_factor
 from swath.georef.navigation.inputs import OBSERVATION_DTYPE, Kind, sort_observations
-from swath.georef.records import FixType, GnssFix, GnssHeading, StructArray, TimeScale, TimeTag
+from swath.georef.records import FixType, GnssFix, GnssHeading, TimeScale, TimeTag
 from swath.georef.stream.clocks import HostClocks
 from swath.georef.timescales import complete_time
 
@@ -230,9 +230,7 @@ def _angle_sigma(said: float | None, usual: float) -> float:
     return said if said is not None and 0.0 < said < math.pi else usual
 
 
-def ins_observations(
-    rows: StructArray, is_solution: Callable[[NDArray[np.uint32]], NDArray[np.bool_]] | None
-) -> Observed:
+def ins_observations(rows: StructArray, is_solution: Callable[[NDArray[np.uint32]], BoolArray] | None) -> Observed:
     """Return attitudes of a device's own INS at intervals; its positions rest on fixes that are already used."""
     usable = np.isfinite(rows["roll_rad"]) & np.isfinite(rows["pitch_rad"]) & np.isfinite(rows["heading_rad"])
     if is_solution is not None:

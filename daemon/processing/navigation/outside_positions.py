@@ -8,16 +8,16 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.processing.navigation.observations import DEFAULT_SIGMAS, Observed
+from swath.georef.arrays import BoolArray, ByteArray, FloatArray, StructArray
 from swath.georef.formats.antenna_positions import read_antenna_positions
 from swath.georef.formats.trajectory.columns import TrajectoryColumns
 from swath.georef.geodesy.earth import e_from_geodetic
 from swath.georef.navigation.filter.measurements import POSITION_FLOORS_M
 from swath.georef.navigation.inputs import OBSERVATION_DTYPE, Kind, sort_observations
-from swath.georef.records import FixType, StructArray
+from swath.georef.records import FixType
 from swath.georef.timescales import SECOND_NS
 from swath.georef.trajectory.trajectory import TrajectoryError, gps_text
 
@@ -133,7 +133,7 @@ def _observed(columns: TrajectoryColumns) -> Observed:
     return Observed(sort_observations(np.concatenate(parts)), +Counter(fix_type=int((~usable).sum())), +counts)
 
 
-def _fix_types(columns: TrajectoryColumns) -> NDArray[np.uint8]:
+def _fix_types(columns: TrajectoryColumns) -> ByteArray:
     """Return the types of fixes; in a file without them, the type whose quality fits the horizontal sigmas, else
     single.
     """
@@ -150,11 +150,11 @@ def _fix_types(columns: TrajectoryColumns) -> NDArray[np.uint8]:
 
 def _rows(
     columns: TrajectoryColumns,
-    fix: NDArray[np.uint8],
+    fix: ByteArray,
     kind: Kind,
-    value: NDArray[np.float64],
-    sigma: NDArray[np.float64] | None,
-) -> tuple[StructArray, NDArray[np.bool_]]:
+    value: FloatArray,
+    sigma: FloatArray | None,
+) -> tuple[StructArray, BoolArray]:
     """Return rows of a kind, and flags (n,) of those in which a default sigma is used."""
     n = len(columns.time_ns)
     default = np.ones((n, 3))

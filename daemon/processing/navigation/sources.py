@@ -7,7 +7,6 @@ from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.daemon.config.checks import check_antennas
 from swath.daemon.config.config import PARSER_FILES, Config, attachment_name, plain_table
@@ -19,7 +18,7 @@ from swath.daemon.processing.setup.models import gimbal_sources
 from swath.daemon.processing.setup.sources import Sources
 from swath.drivers.driver import UnknownProtocolError, find_driver
 from swath.drivers.parser import DeviceSettings, DriverSettingsError, Parser
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, StructArray
 from swath.georef.navigation.inputs import ARM_UNSAID_M, GRADES, ImuNoise, Setup, imu_noise
 from swath.georef.stream.clocks import ClockPlan, DevicePlan
 
@@ -177,7 +176,7 @@ class NavigationSources:
         """Rotation (3, 3) from the IMU's axes to b, by ``rotation_b_imu``."""
         return np.array(self.imu.rotation_b_imu, dtype=np.float64)
 
-    def ins_rows_in_b(self, rows: NDArray[np.void]) -> NDArray[np.void]:
+    def ins_rows_in_b(self, rows: StructArray) -> StructArray:
         """Return solutions of the device's INS with the attitude of b."""
         return self._devices.ins_rows(rows)
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
-from swath.georef.records import DEVICE_CLOCK_DTYPE, Int64Array, StructArray
+from swath.georef.arrays import BoolArray, FloatArray, Int64Array, StructArray
+from swath.georef.records import DEVICE_CLOCK_DTYPE
 from swath.georef.stream.clocks import HostClocks
 from swath.georef.timescales import SECOND_NS, WEEK_NS, DeviceClock
 from swath.georef.trajectory.trajectory import gps_text
@@ -99,7 +99,7 @@ def imu_times(rows: StructArray, host: HostClocks, clock: str | None, rate_hz: f
 
 
 def stretches(
-    host_ns: Int64Array, placed: NDArray[np.bool_], gps_ns: Int64Array, rate_hz: float, why: str
+    host_ns: Int64Array, placed: BoolArray, gps_ns: Int64Array, rate_hz: float, why: str
 ) -> tuple[Stretch, ...]:
     """Return the stretches of unused samples that are longer than `LEAST_HOLE_S`.
 
@@ -132,7 +132,7 @@ def stretches(
 
 def _by_device(
     rows: StructArray, device_ns: Int64Array, host: HostClocks, clock: str
-) -> tuple[Int64Array, NDArray[np.float64], bool]:
+) -> tuple[Int64Array, FloatArray, bool]:
     """Return GPS ns and sigma ns (n,) by a device's clock, and whether it latches the PPS."""
     said = np.zeros(len(rows), DEVICE_CLOCK_DTYPE)
     said["host_time_ns"], said["device_time_ns"], said["pps_time_ns"] = (

@@ -17,6 +17,7 @@ from swath.daemon.log.mcap.chunks import LogBatch
 from swath.daemon.log.reader import Session
 from swath.daemon.processing.points.runs import Run
 from swath.daemon.processing.setup.setup import Setup
+from swath.georef.arrays import StructArray
 from swath.georef.records import (
     IMU_DTYPE,
     INS_DTYPE,
@@ -25,7 +26,6 @@ from swath.georef.records import (
     ImuSamples,
     InsSolution,
     Record,
-    StructArray,
     TimeMessage,
 )
 from swath.georef.scanner.mount import AngleSeries, MountError

@@ -15,11 +15,10 @@ from typing import BinaryIO
 
 import numpy as np
 
-from swath.georef.arrays import BoolArray, ByteArray
+from swath.georef.arrays import BoolArray, ByteArray, Int64Array, StructArray
 from swath.georef.georeference import Georeferencer
 from swath.georef.mapping.frame import MappingError
 from swath.georef.points import FATE_NAMES, Fate, Points
-from swath.georef.records import Int64Array, StructArray
 from swath.georef.stream.stream import Stream
 from swath.georef.trajectory.trajectory import Trajectory
 

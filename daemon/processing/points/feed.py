@@ -22,16 +22,9 @@ from swath.daemon.processing.points.runs import Run
 from swath.daemon.processing.setup.models import connect
 from swath.daemon.processing.setup.setup import Setup
 from swath.drivers.parser import Parser
+from swath.georef.arrays import BoolArray, StructArray
 from swath.georef.points import Points
-from swath.georef.records import (
-    ChunkBatch,
-    DeviceClockSamples,
-    InsSolution,
-    Record,
-    ScannerReturns,
-    StructArray,
-    TimeMessage,
-)
+from swath.georef.records import ChunkBatch, DeviceClockSamples, InsSolution, Record, ScannerReturns, TimeMessage
 from swath.georef.stream.stream import CONTEXT_FLAG, Stream
 from swath.georef.trajectory.buffer import SOLUTION_STATUS
 
@@ -41,7 +34,7 @@ Placed = list[tuple[str, Points]]
 Tick = tuple[int, int, int | None]  # first message, the one after the last, and the tick that follows
 
 
-def _any_status(status: NDArray[np.uint32]) -> NDArray[np.bool_]:
+def _any_status(status: NDArray[np.uint32]) -> BoolArray:
     return np.ones(len(status), np.bool_)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swath.daemon.processing.quicklook.read import Block
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import BoolArray, FloatArray
 from swath.georef.compiled import jit_cached
 
 MOST_CELLS = 2_000_000
@@ -168,7 +168,7 @@ class Surface:
         return np.where(counts > 0, counts / cell_m**2, np.nan), cell_m
 
 
-def inner(there: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def inner(there: BoolArray) -> BoolArray:
     """Return the cells all of whose eight neighbours are covered: others may be covered only partly."""
     found = np.zeros_like(there)
     if min(there.shape) > 2:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from swath.daemon.processing.quicklook.read import Source, StripBook, Units, read_blocks
 from swath.daemon.processing.quicklook.strips import ROUGHEST_M, Overlap, Pair, StripCells
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import BoolArray, FloatArray, SingleArray
 
 MOST_POINTS = 2_000_000  # maximum points kept in the corridor
 MOST_BLOCKS = 15  # maximum blocks read again for an automatic line
@@ -61,11 +61,11 @@ class Profile:
     """
 
     line: Line
-    along_m: NDArray[np.float32]
-    aside_m: NDArray[np.float32]
+    along_m: SingleArray
+    aside_m: SingleArray
     height_m: FloatArray
     strip: NDArray[np.int32]
-    single: NDArray[np.bool_]
+    single: BoolArray
     complete: bool
 
 

@@ -26,7 +26,7 @@ from swath.daemon.processing.quicklook.point_files import (
     sample_of,
 )
 from swath.daemon.processing.quicklook.product_facts import height_unit_in, sessions_in, sidecar_of
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import BoolArray, FloatArray, SingleArray
 from swath.georef.map_fit import misfit_of, scales_at
 
 SUFFIXES = (".las", ".laz")
@@ -89,11 +89,11 @@ class Block:
     x_m: FloatArray
     y_m: FloatArray
     z_m: FloatArray
-    intensity: NDArray[np.float32]
+    intensity: SingleArray
     strip: NDArray[np.int32]
-    first: NDArray[np.bool_]
-    single: NDArray[np.bool_]
-    sigma_m: NDArray[np.float32]
+    first: BoolArray
+    single: BoolArray
+    sigma_m: SingleArray
     skipped: int
 
     def __len__(self) -> int:
@@ -411,7 +411,7 @@ def _box(block: Block) -> FloatArray:
     return np.array([block.x_m.min(), block.y_m.min(), block.x_m.max(), block.y_m.max()])
 
 
-def _sigma(points: Points, name: str) -> NDArray[np.float32]:
+def _sigma(points: Points, name: str) -> SingleArray:
     """Return sigmas (n,), metres, as in this software's files; the largest integer means larger or unknown, and gives
     nan.
     """

@@ -42,7 +42,7 @@ from swath.daemon.processing.quicklook.strips import (
     strip_frame,
 )
 from swath.daemon.processing.strip_agreement import Agreement
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import BoolArray, FloatArray, SingleArray
 
 RETURNS_A_CELL = 4  # of the pictures: a side of two point spacings
 SAMPLED_FILES = 5
@@ -70,7 +70,7 @@ class StripSums:
 
     sums: FloatArray = field(default_factory=lambda: np.zeros((0, 9)))
 
-    def add(self, strip: NDArray[np.int32], first: NDArray[np.bool_], sigma_m: NDArray[np.float32]) -> None:
+    def add(self, strip: NDArray[np.int32], first: BoolArray, sigma_m: SingleArray) -> None:
         """Count points and pulses; sum squares of sigmas, and keep the largest."""
         strips = int(strip.max(initial=-1)) + 1
         if strips > len(self.sums):

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from swath.calib.strips.differences import single_return_sigma_m
 from swath.daemon.processing.quicklook.grids import Frame, inner
 from swath.daemon.processing.quicklook.read import Block
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import BoolArray, FloatArray, Int64Array, SingleArray
 from swath.georef.compiled import jit_cached
 
 TILE = 16  # cells along a side; memory is allocated by tiles
@@ -116,8 +116,8 @@ class Pair:
     first: int
     second: int
     dz_m: FloatArray
-    row: NDArray[np.int64]
-    column: NDArray[np.int64]
+    row: Int64Array
+    column: Int64Array
     compared: int
     scatter: tuple[tuple[FloatArray, FloatArray], ...] = ()
 
@@ -143,7 +143,7 @@ class Coverage:
     pulses: FloatArray
 
     @property
-    def there(self) -> NDArray[np.bool_]:
+    def there(self) -> BoolArray:
         """Flags of cells with a pulse."""
         return np.asarray(self.pulses > 0)
 
@@ -323,8 +323,8 @@ class _Planes:
     z_m: FloatArray
     east: FloatArray
     north: FloatArray
-    level: NDArray[np.bool_]
-    smooth: NDArray[np.bool_]
+    level: BoolArray
+    smooth: BoolArray
     variance_m2: FloatArray
     count: FloatArray
 
@@ -422,8 +422,8 @@ class Overlap:
         counts: histogram of |dZ| in millimetres, with an open last bin.
     """
 
-    worst_m: NDArray[np.float32]
-    signed: NDArray[np.int64] = field(default_factory=lambda: np.zeros(2 * HISTOGRAM_HALF + 1, np.int64))
+    worst_m: SingleArray
+    signed: Int64Array = field(default_factory=lambda: np.zeros(2 * HISTOGRAM_HALF + 1, np.int64))
     cells: int = 0
     squares: float = 0.0
     largest_m: float = 0.0

@@ -16,12 +16,12 @@ from swath.drivers.scanner.beams import BeamTable
 from swath.drivers.scanner.ouster.head import OusterHead
 from swath.drivers.scanner.srep.parser import SrepParser
 from swath.georef.air.atmosphere import Air
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, Int64Array, StructArray
 from swath.georef.coarse_terrain import CoarseTerrain
 from swath.georef.georeference import Georeferencer
 from swath.georef.mapping.frame import Mapping
 from swath.georef.points import Fate
-from swath.georef.records import InsSolution, Int64Array, StructArray
+from swath.georef.records import InsSolution
 from swath.georef.scanner.beams import Geometry, OusterGeometry, SpinningGeometry, line_scanner, read_fibres
 from swath.georef.scanner.calibration import Calibration
 from swath.georef.scanner.encoder_motion import EncoderMotion

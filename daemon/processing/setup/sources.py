@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.daemon.config.config import PARSER_FILES, Config, DeviceTable, attachment_name, plain_table
 from swath.daemon.config.tables import GnssConfig, ImuConfig
@@ -17,8 +16,9 @@ from swath.daemon.log.format import SessionInfo
 from swath.daemon.processing.setup.models import gimbal_sources
 from swath.drivers.driver import Driver, UnknownProtocolError, find_driver
 from swath.drivers.parser import DeviceKind, DeviceSettings, DriverSettingsError, Parser
+from swath.georef.arrays import FloatArray, StructArray
 from swath.georef.geodesy.rotations import attitude_of, rot_l_from_b
-from swath.georef.records import InsSolution, NamesEdge, StructArray
+from swath.georef.records import InsSolution, NamesEdge
 from swath.georef.stream.clocks import ClockPlan, DevicePlan, GnssPlan, PpsPlan
 from swath.georef.timescales import StampScale
 
@@ -202,11 +202,11 @@ class Sources:
         turned["roll_rad"], turned["pitch_rad"], turned["heading_rad"] = attitude
         return turned
 
-    def in_b(self, measured: NDArray[np.float64]) -> NDArray[np.float64]:
+    def in_b(self, measured: FloatArray) -> FloatArray:
         """Return turn rates or specific forces (n, 3) of the IMU along the axes of b."""
-        turned: NDArray[np.float64] = measured @ self._rotation_b_imu(self.imu_source).T
+        turned: FloatArray = measured @ self._rotation_b_imu(self.imu_source).T
         return turned
 
-    def _rotation_b_imu(self, source: str | None) -> NDArray[np.float64]:
+    def _rotation_b_imu(self, source: str | None) -> FloatArray:
         imu = self.config.imu.get((source or "").removeprefix("imu/"))
         return np.eye(3) if imu is None else np.array(imu.rotation_b_imu, dtype=np.float64)

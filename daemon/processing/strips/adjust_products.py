@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath import __version__
 from swath.calib.strips.corrections import StripChoice
@@ -24,7 +23,7 @@ from swath.daemon.processing.strips.adjust import AdjustOptions, StripsCorrected
 from swath.daemon.processing.trajectory.files import write_trajectory
 from swath.daemon.processing.trajectory.summary import write_json
 from swath.daemon.processing.user_errors import finite
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import BoolArray, FloatArray, Int64Array
 from swath.georef.trajectory.trajectory import Trajectory
 
 WHAT = (
@@ -88,7 +87,7 @@ class _Strip:
     """
 
     choice: StripChoice
-    time_ns: NDArray[np.int64]
+    time_ns: Int64Array
     corrections: FloatArray
     sigmas: FloatArray
     priors: FloatArray
@@ -96,7 +95,7 @@ class _Strip:
     after_m: float
 
     @property
-    def told(self) -> NDArray[np.bool_]:
+    def told(self) -> BoolArray:
         """Flags (6,) of components that the returns determine better than the prior does."""
         return np.asarray(self.sigmas.mean(axis=0) < TOLD * self.priors.mean(axis=0))
 

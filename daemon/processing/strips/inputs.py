@@ -36,11 +36,10 @@ from swath.daemon.processing.quicklook.read import NOISE_CLASSES, QuickLookError
 from swath.daemon.processing.quicklook.run import Look, StripFacts, look_at
 from swath.daemon.processing.quicklook.strips import FEWEST_RETURNS, TILE
 from swath.daemon.processing.strip_agreement import compare_flight, corners_of
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.georef.formats.trajectory.columns import LATEST_NS
 from swath.georef.formats.trajectory.file import read_trajectory
 from swath.georef.mapping.frame import Mapping, MappingError
-from swath.georef.records import Int64Array
 from swath.georef.timescales.gps_time import WEEK_NS
 from swath.georef.trajectory.trajectory import Trajectory, TrajectoryError, gps_text
 

@@ -9,10 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.daemon.processing.navigation.inputs import Mark
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.georef.points import Fate
 from swath.georef.trajectory.trajectory import Trajectory
 
@@ -96,7 +95,7 @@ def _line(mark: Mark, row: FloatArray | None, fate: str) -> str:
     return ",".join(fields)
 
 
-def _poses(trajectory: Trajectory, time_ns: NDArray[np.int64]) -> FloatArray:
+def _poses(trajectory: Trajectory, time_ns: Int64Array) -> FloatArray:
     """Return (n, 15): latitude to sigma of heading as in the file, then velocity north, east, down, m/s."""
     if not len(time_ns):
         return np.empty((0, 15))

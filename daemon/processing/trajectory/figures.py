@@ -15,9 +15,9 @@ from swath.daemon.processing.trajectory.series import (
     outages_of,
     used_positions,
 )
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, StructArray
 from swath.georef.navigation.inputs import ARM_UNSAID_M, Fate, Kind, Setup, Solution
-from swath.georef.records import FixType, StructArray
+from swath.georef.records import FixType
 from swath.georef.timescales.gps_time import SECOND_NS
 
 Figures = dict[str, Any]

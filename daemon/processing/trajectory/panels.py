@@ -14,14 +14,12 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import NDArray
 from PIL import Image
 
 from swath.daemon.processing.pages.words import INK, MUTED
 from swath.daemon.processing.trajectory.series import Course, Flight, Pixels, Separation, bridged_spans, outages_of
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import BoolArray, FloatArray, Int64Array
 from swath.georef.navigation.inputs import Solution
-from swath.georef.records import Int64Array
 from swath.georef.timescales.gps_time import SECOND_NS
 
 COLOURS_OF_PICTURE = 128
@@ -136,9 +134,7 @@ class Sheet:
                     zorder=0.5,
                 )
 
-    def line(
-        self, axes: Axes, pixels: Pixels, band: FloatArray, colour: str, broken: NDArray[np.bool_] | None = None
-    ) -> None:
+    def line(self, axes: Axes, pixels: Pixels, band: FloatArray, colour: str, broken: BoolArray | None = None) -> None:
         """Draw a line through bands (2, m); ``broken`` (m − 1,) marks additional breaks."""
         at_s, values = pixels.line(band, broken)
         axes.plot(at_s / self.unit_s, values, color=colour, lw=0.9, solid_joinstyle="round")

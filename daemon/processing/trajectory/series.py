@@ -11,11 +11,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import BoolArray, FloatArray, Int64Array, StructArray
 from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
 from swath.georef.geodesy.quaternions import about, conjugate, product, rotated
 from swath.georef.navigation.inputs import Fate, Kind, Setup, Solution
-from swath.georef.records import Int64Array, StructArray
 from swath.georef.timescales.gps_time import SECOND_NS
 from swath.georef.trajectory.trajectory import Trajectory
 
@@ -111,7 +110,7 @@ class Pixels:
         """Return the smallest and largest (2, m, …) of values (n, …) in each column; nan only if all are."""
         return np.stack([np.fmin.reduceat(values, self.starts), np.fmax.reduceat(values, self.starts)])
 
-    def line(self, band: FloatArray, broken: NDArray[np.bool_] | None = None) -> tuple[FloatArray, FloatArray]:
+    def line(self, band: FloatArray, broken: BoolArray | None = None) -> tuple[FloatArray, FloatArray]:
         """Return times and values (k,) of a line through both ends of each column, broken at gaps."""
         where = np.flatnonzero(self.broken if broken is None else self.broken | broken) + 1
         at_s = np.insert(self.at_s, where, np.nan)

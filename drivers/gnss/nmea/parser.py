@@ -21,7 +21,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.drivers.driver import Driver
 from swath.drivers.framing.framer import Frame, Framer
@@ -30,6 +29,7 @@ from swath.drivers.gnss.date_floor import ReceiverDates
 from swath.drivers.gnss.epochs import EpochGatherer
 from swath.drivers.gnss.nmea.sentences import MPS_PER_KMPH, MPS_PER_KNOT, FieldError, Sentence, velocity_from_course
 from swath.drivers.parser import DeviceSettings, StreamParser
+from swath.georef.arrays import FloatArray
 from swath.georef.records import (
     Chunk,
     FixType,
@@ -86,7 +86,7 @@ class Part:
     height_m: float | None = None
     satellites: int | None = None
     velocity_l: tuple[float, float, float] | None = None
-    position_cov_l: NDArray[np.float64] | None = None
+    position_cov_l: FloatArray | None = None
     date: dt.date | None = None
     undulation_m: float | None = None
 

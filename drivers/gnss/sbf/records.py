@@ -12,11 +12,11 @@ from math import isfinite, nan, radians, sqrt
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.drivers.gnss.record_rows import Row
 from swath.drivers.gnss.sbf import blocks as sbf
 from swath.drivers.parser import ParserCounters
+from swath.georef.arrays import FloatArray
 from swath.georef.records import (
     EventMark,
     FixType,
@@ -155,7 +155,7 @@ def geodetic_fix(parts: dict[str, FixPart]) -> GnssFix | None:
     )
 
 
-def _position_cov(parts: dict[str, FixPart], pvt: sbf.PvtGeodetic) -> NDArray[np.float64] | None:
+def _position_cov(parts: dict[str, FixPart], pvt: sbf.PvtGeodetic) -> FloatArray | None:
     """Return the covariance of PosCovGeodetic, else one from the accuracies: h² = 4 (NN + EE), v² = 4 DD."""
     _, cov = parts.get("PosCovGeodetic", (None, None))
     if isinstance(cov, sbf.PosCovGeodetic):
@@ -166,14 +166,14 @@ def _position_cov(parts: dict[str, FixPart], pvt: sbf.PvtGeodetic) -> NDArray[np
     return np.diag([horizontal**2 / 8.0, horizontal**2 / 8.0, vertical**2 / 4.0])
 
 
-def _velocity_cov(parts: dict[str, FixPart]) -> NDArray[np.float64] | None:
+def _velocity_cov(parts: dict[str, FixPart]) -> FloatArray | None:
     _, cov = parts.get("VelCovGeodetic", (None, None))
     if not isinstance(cov, sbf.VelCovGeodetic):
         return None
     return _ned_cov(cov.north_north, cov.east_east, cov.up_up, cov.north_east, cov.north_up, cov.east_up)
 
 
-def _ned_cov(nn: float, ee: float, uu: float, ne: float, nu: float, eu: float) -> NDArray[np.float64] | None:
+def _ned_cov(nn: float, ee: float, uu: float, ne: float, nu: float, eu: float) -> FloatArray | None:
     """Convert a covariance of north, east, up to north, east, down; return None where any element is unset."""
     values = [usable(value) for value in (nn, ee, uu, ne, nu, eu)]
     if not all(map(isfinite, values)):

@@ -6,13 +6,13 @@ import math
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.drivers.gnss.ubx import messages as ubx
+from swath.georef.arrays import FloatArray
 from swath.georef.records import FixType, GnssFix, TimeScale, TimeTag
 
 NavMessage: TypeAlias = ubx.NavPvt | ubx.NavHpposllh | ubx.NavCov | ubx.NavTimegps
-Position: TypeAlias = tuple[float, float, float, NDArray[np.float64]]
+Position: TypeAlias = tuple[float, float, float, FloatArray]
 
 MS_NS = 1_000_000
 WEEK_NS = 604_800_000_000_000
@@ -100,16 +100,16 @@ def _undulation_m(pvt: ubx.NavPvt | None, high: ubx.NavHpposllh | None) -> float
     return None if best is None else (best.height_mm - best.height_msl_mm) / 1e3
 
 
-def _accuracy_cov(horizontal: float, vertical: float) -> NDArray[np.float64]:
+def _accuracy_cov(horizontal: float, vertical: float) -> FloatArray:
     """Return the covariance of accuracies, m or m/s; the horizontal one covers both axes together, hAcc² = NN + EE."""
     return np.diag([horizontal**2 / 2.0, horizontal**2 / 2.0, vertical**2])
 
 
-def _symmetric(nn: float, ne: float, nd: float, ee: float, ed: float, dd: float) -> NDArray[np.float64]:
+def _symmetric(nn: float, ne: float, nd: float, ee: float, ed: float, dd: float) -> FloatArray:
     return np.array([[nn, ne, nd], [ne, ee, ed], [nd, ed, dd]])
 
 
-def _position_cov(position: Position | None, cov: ubx.NavCov | None) -> NDArray[np.float64] | None:
+def _position_cov(position: Position | None, cov: ubx.NavCov | None) -> FloatArray | None:
     if cov is not None and cov.position_valid:
         return _symmetric(cov.pos_nn, cov.pos_ne, cov.pos_nd, cov.pos_ee, cov.pos_ed, cov.pos_dd)
     return position[3] if position is not None else None
@@ -121,7 +121,7 @@ def _velocity(pvt: ubx.NavPvt | None) -> tuple[float, float, float] | None:
     return pvt.vel_n_mmps / 1e3, pvt.vel_e_mmps / 1e3, pvt.vel_d_mmps / 1e3
 
 
-def _velocity_cov(pvt: ubx.NavPvt | None, cov: ubx.NavCov | None) -> NDArray[np.float64] | None:
+def _velocity_cov(pvt: ubx.NavPvt | None, cov: ubx.NavCov | None) -> FloatArray | None:
     """Return NAV-COV's covariance, else one from the speed accuracy: compared with NAV-COV, sAcc² is close to NN + EE
     and to DD.
     """

@@ -9,13 +9,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.drivers.can_frames import CAN_FRAME_BYTES, CAN_FRAME_DTYPE
 from swath.drivers.imu.dbc.settings import MappedSignal, SignalMap
 from swath.drivers.imu.dbc.signals import FLOAT_TYPES, SignalLayout
-from swath.georef.arrays import FloatArray
-from swath.georef.records import ByteRows, Int64Array
+from swath.georef.arrays import FloatArray, Int64Array, UInt64Array
+from swath.georef.records import ByteRows
 
 CLASSIC_BYTES = 8
 
@@ -88,14 +87,14 @@ def _order(signals: SignalMap, sent: set[int]) -> Iterator[int]:
     yield from [*others, key] if signals.rule == "last" else [key, *others]
 
 
-def _raw_of_scalar(signals: SignalMap, signal: MappedSignal, column: Int64Array | FloatArray) -> NDArray[np.uint64]:
+def _raw_of_scalar(signals: SignalMap, signal: MappedSignal, column: Int64Array | FloatArray) -> UInt64Array:
     """Return raw values: counters and status words unchanged, a temperature by its scale."""
     if signal is signals.temperature:
         return _raw_of_values(signal.layout, np.asarray(column, np.float64))
     return np.asarray(column, np.int64).astype(np.uint64)
 
 
-def _raw_of_values(layout: SignalLayout, values: FloatArray) -> NDArray[np.uint64]:
+def _raw_of_values(layout: SignalLayout, values: FloatArray) -> UInt64Array:
     """Return the bits of physical values, rounded to the signal's resolution."""
     scaled = (values - layout.offset) / layout.scale
     if layout.is_float:
@@ -108,7 +107,7 @@ def _raw_of_values(layout: SignalLayout, values: FloatArray) -> NDArray[np.uint6
     return raw.astype(np.int64).astype(np.uint64)
 
 
-def _placed(layout: SignalLayout, raw: NDArray[np.uint64]) -> NDArray[np.uint64]:
+def _placed(layout: SignalLayout, raw: UInt64Array) -> UInt64Array:
     """Return the signal's bits at their position, in the word whose little-endian bytes are the frame's data."""
     if layout.needs_bytes > CLASSIC_BYTES:
         raise ValueError(f"{layout.name} lies beyond the 8 bytes of a classic frame")
@@ -116,7 +115,7 @@ def _placed(layout: SignalLayout, raw: NDArray[np.uint64]) -> NDArray[np.uint64]
     return word.byteswap() if layout.big_endian else word
 
 
-def _frames(signals: SignalMap, part: int, words: NDArray[np.uint64]) -> ByteRows:
+def _frames(signals: SignalMap, part: int, words: UInt64Array) -> ByteRows:
     """Return (n, 16) frames of one message."""
     frames = np.zeros(len(words), CAN_FRAME_DTYPE)
     frames["can_id"] = signals.parts[part].can_id

@@ -20,7 +20,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.georef.records import ByteRows, Int64Array
+from swath.georef.arrays import BoolArray, Int64Array
+from swath.georef.records import ByteRows
 
 GroupRule = Literal["last", "first", "repeat"]
 EVIDENCE = 32  # frames of each part needed to find where a sample ends
@@ -201,7 +202,7 @@ def _next_start(part: NDArray[np.int8], parts: int) -> IndexArray:
     return np.searchsorted(np.maximum.accumulate(previous), np.arange(n), side="left")
 
 
-def _chain(following: IndexArray, regular: NDArray[np.bool_], parts: int) -> IndexArray:
+def _chain(following: IndexArray, regular: BoolArray, parts: int) -> IndexArray:
     """Follow the starts from frame 0; a run of groups of ``parts`` frames is one step."""
     n = len(following)
     rows = -(-n // parts)

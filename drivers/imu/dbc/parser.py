@@ -26,16 +26,8 @@ from swath.drivers.imu.dbc.groups import (
 )
 from swath.drivers.imu.dbc.settings import MappedSignal, Part, SignalMap, map_signals
 from swath.drivers.parser import DeviceSettings, PacketParser
-from swath.georef.records import (
-    DEVICE_CLOCK_DTYPE,
-    IMU_DTYPE,
-    ByteRows,
-    DeviceClockSamples,
-    ImuSamples,
-    Int64Array,
-    Record,
-    StructArray,
-)
+from swath.georef.arrays import BoolArray, Int64Array, StructArray, UInt64Array
+from swath.georef.records import DEVICE_CLOCK_DTYPE, IMU_DTYPE, ByteRows, DeviceClockSamples, ImuSamples, Record
 
 
 class SideSignal:
@@ -55,7 +47,7 @@ class SideSignal:
         self._where = np.flatnonzero(frames.part == self._signal.part)
         self._bits = self._signal.layout.bits(frames.data[self._where])
 
-    def before(self, position: NDArray[np.intp]) -> tuple[NDArray[np.uint64], NDArray[np.bool_]]:
+    def before(self, position: NDArray[np.intp]) -> tuple[UInt64Array, BoolArray]:
         """Return its bits as of positions (m,) among this call's frames, and whether a value existed by then."""
         place = np.searchsorted(self._where, position, side="left")
         bits = np.concatenate([[self._last], self._bits])[place]
@@ -251,7 +243,7 @@ class DbcParser(PacketParser):
 
     def _bits_of(
         self, signal: MappedSignal, data: list[ByteRows], position: NDArray[np.intp]
-    ) -> tuple[NDArray[np.uint64], NDArray[np.bool_]]:
+    ) -> tuple[UInt64Array, BoolArray]:
         """Return the bits of an optional signal for each sample, from its own frames or from the message beside
         them.
         """

@@ -19,12 +19,12 @@ import numpy as np
 
 from swath.drivers.gnss.date_floor import ReceiverDates
 from swath.drivers.parser import DeviceSettings, ParserCounters
+from swath.georef.arrays import Int64Array
 from swath.georef.records import (
     DEVICE_CLOCK_DTYPE,
     ByteRows,
     DeviceClockSamples,
     DeviceStatus,
-    Int64Array,
     NamesEdge,
     Record,
     TimeMessage,

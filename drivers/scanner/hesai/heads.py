@@ -14,7 +14,7 @@ import numpy as np
 
 from swath.drivers.parser import DriverSettingsError
 from swath.drivers.scanner.beams import BeamTable, beam_table, numbers
-from swath.georef.records import Int64Array
+from swath.georef.arrays import Int64Array
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from swath.drivers.scanner.rows.filler import filler
 from swath.drivers.scanner.rows.slots import Chosen
 from swath.drivers.scanner.sequence import SampleThinner, SequenceTracker
 from swath.drivers.scanner.spinning import Firings, returns_of_packets
-from swath.georef.arrays import BoolArray, FloatArray
+from swath.georef.arrays import BoolArray, ByteArray, FloatArray, Int64Array, StructArray
 from swath.georef.records import (
     DEVICE_CLOCK_DTYPE,
     RETURN_FLAG_LAST,
@@ -35,10 +35,8 @@ from swath.georef.records import (
     ByteRows,
     DeviceClockSamples,
     DeviceStatus,
-    Int64Array,
     Record,
     ScannerReturns,
-    StructArray,
     TimeMessage,
 )
 
@@ -218,7 +216,7 @@ class HesaiParser(PacketParser):
         return records
 
     def _clock_samples(
-        self, host_time_ns: Int64Array, stamp_ns: Int64Array, second_ns: Int64Array, mode: NDArray[np.uint8]
+        self, host_time_ns: Int64Array, stamp_ns: Int64Array, second_ns: Int64Array, mode: ByteArray
     ) -> StructArray:
         """Return one `DEVICE_CLOCK_DTYPE` row a packet: device time of its last firing, and the edge that began its
         second.
@@ -276,7 +274,7 @@ def _azimuths(
     return made_of
 
 
-def _within(value: NDArray[np.uint8], least: int, most: int) -> BoolArray:
+def _within(value: ByteArray, least: int, most: int) -> BoolArray:
     inside: BoolArray = (value >= least) & (value <= most)
     return inside
 

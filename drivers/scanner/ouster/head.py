@@ -14,11 +14,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.drivers.parser import DriverSettingsError
-from swath.georef.arrays import FloatArray
-from swath.georef.records import StructArray
+from swath.georef.arrays import FloatArray, Int64Array, StructArray
 
 FILE = "geometry.file"
 LARGEST_PACKET_BYTES = 65_507  # payload of a UDP datagram
@@ -75,7 +73,7 @@ class OusterHead:
     return_order: str
     altitude_rad: FloatArray
     azimuth_rad: FloatArray
-    pixel_shift: NDArray[np.int64]
+    pixel_shift: Int64Array
     beam_origin_m: tuple[float, float]
     sensor_from_lidar: FloatArray
     rot_sensor_from_imu: FloatArray

@@ -11,12 +11,12 @@ from __future__ import annotations
 from math import radians
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from swath.drivers.scanner.ouster.head import OusterHead
 from swath.drivers.scanner.ouster.layout import FOOTER_BYTES, HEADER_BYTES, IMU_PACKET, with_crc
-from swath.georef.arrays import FloatArray
-from swath.georef.records import IMU_DTYPE, ByteRows, Int64Array, StructArray
+from swath.georef.arrays import FloatArray, Int64Array, SingleArray, StructArray
+from swath.georef.records import IMU_DTYPE, ByteRows
 
 STANDARD_GRAVITY = 9.80665  # m/s², CGPM 1901
 NMEA_BYTES = 100
@@ -86,7 +86,7 @@ def imu_samples(host_time_ns: Int64Array, units: ByteRows, head: OusterHead) -> 
     return rows, len(good) - len(rows)
 
 
-def _doubles(values: NDArray[np.float32]) -> FloatArray:
+def _doubles(values: SingleArray) -> FloatArray:
     with np.errstate(invalid="ignore"):  # a signalling NaN on the wire is a NaN like any other
         return values.astype(np.float64)
 

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from swath.drivers.parser import DriverSettingsError
 from swath.drivers.scanner.ouster.head import FILE, FUSA_PROFILE, LARGEST_PACKET_BYTES, OusterHead
-from swath.georef.records import StructArray
+from swath.georef.arrays import BoolArray, ByteArray, Int64Array, StructArray
 
 HEADER_BYTES = FOOTER_BYTES = 32
 LIDAR_PACKET = 1  # packet type
@@ -208,7 +208,7 @@ class LidarLayout:
             word = word >> np.uint32(shift)
         return word & np.uint32((1 << bits.size) - 1) if shift + bits.size < 32 else word
 
-    def headers(self, units: NDArray[np.uint8]) -> StructArray:
+    def headers(self, units: ByteArray) -> StructArray:
         """Return (n,) headers of packets (n, length) other than lidar packets; LEGACY heads send those with a STANDARD
         header.
         """
@@ -216,20 +216,20 @@ class LidarLayout:
         content = np.ascontiguousarray(units[:, :HEADER_BYTES])
         return content.view(_table(_HEADERS[kind], HEADER_BYTES)).reshape(-1)
 
-    def valid(self, columns: StructArray) -> NDArray[np.bool_]:
+    def valid(self, columns: StructArray) -> BoolArray:
         """Return which columns contain a measurement: bit 0 of the status."""
-        found: NDArray[np.bool_] = (columns["status"] & 1).astype(np.bool_)
+        found: BoolArray = (columns["status"] & 1).astype(np.bool_)
         return found
 
-    def first_id(self, columns: StructArray) -> NDArray[np.int64]:
+    def first_id(self, columns: StructArray) -> Int64Array:
         """Return (n,) measurement id of the first column of packets' columns (n, columns), derived from the first valid
         one.
         """
         place = self.valid(columns).argmax(axis=1)
-        found: NDArray[np.int64] = columns["id"][np.arange(len(columns)), place].astype(np.int64) - place
+        found: Int64Array = columns["id"][np.arange(len(columns)), place].astype(np.int64) - place
         return found
 
-    def frame_id(self, packets: StructArray) -> NDArray[np.int64]:
+    def frame_id(self, packets: StructArray) -> Int64Array:
         """Return (n,) frame ids of packets (n,)."""
         found: NDArray[Any] = packets["columns"]["frame_id"][:, 0] if self.legacy else packets["frame_id"]
         return found.astype(np.int64)
@@ -239,7 +239,7 @@ class LidarLayout:
         """Number of frame ids before they wrap."""
         return 1 << (32 if self.head.header == "fusa" else 16)
 
-    def window_ranks(self) -> NDArray[np.int64]:
+    def window_ranks(self) -> Int64Array:
         """Return (packets of a full frame,) the rank of each place on the circle among a frame's packets, −1 outside
         the window.
 
@@ -252,13 +252,13 @@ class LidarLayout:
         sent = (place >= first) | (place <= last) if around else (place >= first) & (place <= last)
         return np.where(sent, np.cumsum(sent) - 1, -1).astype(np.int64)
 
-    def init_id(self, packets: StructArray) -> NDArray[np.int64]:
+    def init_id(self, packets: StructArray) -> Int64Array:
         """Return (n,) number of the head's start; 0 in LEGACY, which does not contain it."""
         if self.legacy:
             return np.zeros(len(packets), dtype=np.int64)
         return ((packets["init_word"] >> _INIT_SHIFT[self.head.header]) & 0xFF_FFFF).astype(np.int64)
 
-    def serial(self, packets: StructArray) -> NDArray[np.int64]:
+    def serial(self, packets: StructArray) -> Int64Array:
         """Return (n,) serial number of packets or headers; LEGACY's lidar packets have none."""
         return (packets["serial_word"] & np.uint64((1 << 40) - 1)).astype(np.int64)
 
@@ -309,10 +309,10 @@ def with_crc(packet: bytes) -> bytes:
     return packet[:-8] + crc64_xz(packet[:-8]).to_bytes(8, "little")
 
 
-def crc_holds(units: NDArray[np.uint8]) -> NDArray[np.bool_]:
+def crc_holds(units: ByteArray) -> BoolArray:
     """Return (n,) whether packets (n, length) have a correct CRC, or were sent without one."""
     stated = np.ascontiguousarray(units[:, -8:]).view("<u8")[:, 0]
-    holds: NDArray[np.bool_] = np.isin(stated, np.array(NO_CRC, dtype=np.uint64))
+    holds: BoolArray = np.isin(stated, np.array(NO_CRC, dtype=np.uint64))
     for row in np.flatnonzero(~holds).tolist():
         holds[row] = crc64_xz(units[row, :-8].data) == stated[row]
     return holds

@@ -37,7 +37,7 @@ from swath.drivers.scanner.ouster.layout import (
 from swath.drivers.scanner.rows.filler import filler
 from swath.drivers.scanner.rows.slots import BLOCK_SLOTS, PairRule, ReturnSlots, common_words, in_order, returns_table
 from swath.drivers.scanner.sequence import SampleThinner, SequenceTracker
-from swath.georef.arrays import BoolArray
+from swath.georef.arrays import BoolArray, Int64Array, StructArray, UInt64Array
 from swath.georef.records import (
     DEVICE_CLOCK_DTYPE,
     RETURN_FLAG_LAST,
@@ -46,10 +46,8 @@ from swath.georef.records import (
     DeviceClockSamples,
     DeviceStatus,
     ImuSamples,
-    Int64Array,
     Record,
     ScannerReturns,
-    StructArray,
 )
 from swath.georef.timescales.gps_time import SECOND_NS
 
@@ -347,7 +345,7 @@ class OusterParser(PacketParser):
             return first.view(_CONTENT).reshape(-1, 1)
         return in_order(first, self._as_numbers(pixels, "2") | np.uint64(1 << 16)).view(_CONTENT)
 
-    def _as_numbers(self, pixels: NDArray[np.uint32], which: str = "") -> NDArray[np.uint64]:
+    def _as_numbers(self, pixels: NDArray[np.uint32], which: str = "") -> UInt64Array:
         """Pack one of the returns of a block as `_CONTENT` into one number, (pulses,)."""
         number = self.layout.raw_field(pixels, f"RANGE{which}").astype(np.uint64).reshape(-1)
         number <<= np.uint64(32)

@@ -14,7 +14,8 @@ import numba
 import numpy as np
 
 from swath.drivers.scanner.rows.slots import ReturnSlots
-from swath.georef.records import RETURN_DTYPE, RETURN_FLAG_LAST, RETURN_FLAG_STRONGEST, StructArray
+from swath.georef.arrays import StructArray
+from swath.georef.records import RETURN_DTYPE, RETURN_FLAG_LAST, RETURN_FLAG_STRONGEST
 
 # A row's last word is written as one number, starting from `slots.common_words`.
 _WORDS = RETURN_DTYPE.itemsize // 8

@@ -12,7 +12,8 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from swath.georef.records import RETURN_DTYPE, RETURN_FLAG_LAST, RETURN_FLAG_STRONGEST, Int64Array, StructArray
+from swath.georef.arrays import ByteArray, Int64Array, StructArray, UInt64Array
+from swath.georef.records import RETURN_DTYPE, RETURN_FLAG_LAST, RETURN_FLAG_STRONGEST
 
 # Slots processed at once: few enough that columns stay in the second-level cache, many enough that NumPy's cost of
 # each call is negligible.
@@ -35,7 +36,7 @@ def _place(name: str) -> tuple[int, np.dtype[np.void]]:
     return at // 8, np.dtype({"names": [name], "formats": [kind], "offsets": [at % 8], "itemsize": 8})
 
 
-def _column(words: NDArray[np.uint64], name: str) -> NDArray[Any]:
+def _column(words: UInt64Array, name: str) -> NDArray[Any]:
     """Return a field of rows whose words are (words, rows)."""
     word, kind = _place(name)
     column: NDArray[Any] = words[word].view(kind)[name]
@@ -57,14 +58,14 @@ class PairRule:
     names_strongest: bool
     names_last: bool
 
-    def flags(self, returns: StructArray, number: NDArray[np.uint8], count: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    def flags(self, returns: StructArray, number: ByteArray, count: ByteArray) -> ByteArray:
         """Return (n,) flags of consecutive returns, from their numbers and the counts of their pulses."""
         strength = np.ascontiguousarray(self.strength(returns))
         # choices are multiplications by 0 or 1: np.where takes ten times as long on conditions that vary often
         second = (number[1:] == 2).view(np.uint8)
         near_strongest = (strength[:-1] > strength[1:]).view(np.uint8) * second
         strongest, last = np.uint8(RETURN_FLAG_STRONGEST * self.names_strongest), np.uint8(RETURN_FLAG_LAST)
-        flags: NDArray[np.uint8] = (count == 1) * np.uint8(RETURN_FLAG_STRONGEST | RETURN_FLAG_LAST)
+        flags: ByteArray = (count == 1) * np.uint8(RETURN_FLAG_STRONGEST | RETURN_FLAG_LAST)
         flags[:-1] += near_strongest * strongest
         flags[1:] += (second - near_strongest) * strongest + second * (last * np.uint8(self.names_last))
         return flags
@@ -93,7 +94,7 @@ class ReturnSlots:
 
     content: StructArray
     range_unit_m: float
-    common: NDArray[np.uint64]
+    common: UInt64Array
     shape: tuple[int, int]
     pulse_id: Int64Array
     per_pulse: Mapping[str, Callable[[Chosen], NDArray[Any]]]
@@ -126,14 +127,14 @@ class ReturnSlots:
         table[: len(index)].view(np.uint64).reshape(-1, _WORDS)[:] = words.T
         return len(index)
 
-    def _write_all_pulses(self, words: NDArray[np.uint64]) -> None:
+    def _write_all_pulses(self, words: UInt64Array) -> None:
         """Write the values common to all returns of a pulse, where every pulse has one return."""
         words[-1].reshape(self.shape)[:] = self.common
         _column(words, "pulse_id").reshape(self.shape)[:] = self.pulse_id[:, np.newaxis] + np.arange(self.shape[1])
         for name, made_of in self.per_pulse.items():
             _column(words, name).reshape(self.shape)[:] = made_of(lambda values: values)
 
-    def _write_pulses(self, words: NDArray[np.uint64], pulse: NDArray[np.intp]) -> None:
+    def _write_pulses(self, words: UInt64Array, pulse: NDArray[np.intp]) -> None:
         """Write the values common to all returns of a pulse for these pulses, in order."""
         m, n = self.shape
         # pulses of a row are neighbours: repeating its value takes half as long as gathering it, unless it has one only
@@ -153,9 +154,7 @@ class ReturnSlots:
         for name, made_of in self.per_pulse.items():
             _column(words, name)[:] = made_of(chosen)
 
-    def _write_numbers(
-        self, words: NDArray[np.uint64], returns: StructArray, number: NDArray[np.uint8], count: NDArray[np.uint8]
-    ) -> None:
+    def _write_numbers(self, words: UInt64Array, returns: StructArray, number: ByteArray, count: ByteArray) -> None:
         """Write the number of each return, the count of its pulse, and the flags that follow from them."""
         # the two bytes after the channel
         words[-1].view("<u2")[1::4] = number | count.astype(np.uint16) << 8
@@ -163,7 +162,7 @@ class ReturnSlots:
             flags = _column(words, "flags")
             flags |= self.pair.flags(returns, number, count)
 
-    def _write_returns(self, words: NDArray[np.uint64], returns: StructArray) -> None:
+    def _write_returns(self, words: UInt64Array, returns: StructArray) -> None:
         """Write the values of each single return."""
         np.multiply(returns["range"], self.range_unit_m, out=_column(words, "range_m"))
         _column(words, "intensity")[:] = returns["intensity"]
@@ -174,7 +173,7 @@ class ReturnSlots:
             np.multiply(returns["pulse_width"], self.pulse_width_unit_ns, out=width)
 
 
-def _numbers(pulse: NDArray[np.intp], slots: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+def _numbers(pulse: NDArray[np.intp], slots: int) -> tuple[ByteArray, ByteArray]:
     """Return return_number and number_of_returns of returns in the order of their pulses; ``slots`` is the maximum of a
     pulse.
     """
@@ -197,7 +196,7 @@ def in_order(one: NDArray[Any], other: NDArray[Any]) -> NDArray[Any]:
 
 def common_words(
     shape: tuple[int, int], channel: ArrayLike = 0, mta_zone: ArrayLike = 0, flags: ArrayLike = 0
-) -> NDArray[np.uint64]:
+) -> UInt64Array:
     """Return the last words of rows of pulses that have one return."""
     rows = np.zeros(shape, dtype=RETURN_DTYPE)
     rows["return_number"] = rows["number_of_returns"] = 1

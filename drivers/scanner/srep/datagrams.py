@@ -8,11 +8,10 @@ from itertools import chain
 
 import numpy as np
 from fastcrc.crc32 import iso_hdlc as crc32
-from numpy.typing import NDArray
 
 from swath.drivers.scanner.srep.layout import CRC, FLAG_PPS_LOCKED, HEADER_BYTES, HEADER_DTYPE, body_words, nanoseconds
-from swath.georef.arrays import BoolArray
-from swath.georef.records import DEVICE_CLOCK_DTYPE, ByteRows, Int64Array, StructArray
+from swath.georef.arrays import BoolArray, Int64Array, StructArray, UInt64Array
+from swath.georef.records import DEVICE_CLOCK_DTYPE, ByteRows
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +61,7 @@ class Datagrams:
         agree: BoolArray = np.fromiter(found, np.uint32, len(self)) == stated
         return agree
 
-    def bodies(self) -> NDArray[np.uint64]:
+    def bodies(self) -> UInt64Array:
         """Return pulse records of all datagrams, one behind the other, in words: `body_words` of each datagram."""
         bodies = [block[:, HEADER_BYTES : -CRC.size] for block in self.blocks]
         words = np.empty(sum(body.size for body in bodies) // 8, dtype="<u8")
@@ -74,7 +73,7 @@ class Datagrams:
         return words
 
 
-def clock_samples(host_time_ns: Int64Array, header: StructArray, words: NDArray[np.uint64]) -> StructArray:
+def clock_samples(host_time_ns: Int64Array, header: StructArray, words: UInt64Array) -> StructArray:
     """Return `DEVICE_CLOCK_DTYPE` rows (n,), one a datagram: the counter at its last pulse and the latched counter.
 
     Args:

@@ -14,8 +14,7 @@ import numpy as np
 from fastcrc.crc32 import iso_hdlc as crc32
 from numpy.typing import ArrayLike, NDArray
 
-from swath.georef.arrays import BoolArray
-from swath.georef.records import Int64Array, StructArray
+from swath.georef.arrays import BoolArray, Int64Array, StructArray, UInt64Array
 from swath.georef.timescales.gps_time import SECOND_NS
 
 MAGIC = 0x50455253  # "SREP" in memory order
@@ -131,7 +130,7 @@ def encode_datagrams(header: StructArray, body: StructArray) -> list[bytes]:
     return [data + CRC.pack(crc32(data)) for data in datagrams]
 
 
-def nanoseconds(ticks: NDArray[np.uint64], tick_hz: NDArray[np.uint32]) -> Int64Array:
+def nanoseconds(ticks: UInt64Array, tick_hz: NDArray[np.uint32]) -> Int64Array:
     """Convert the tick counter to device time, both (n,): floor(ticks · 10⁹ / tick_hz), seconds modulo 2³²."""
     hz = tick_hz.astype(np.uint64)
     seconds, rest = np.divmod(ticks, hz)

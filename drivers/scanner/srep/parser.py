@@ -40,17 +40,15 @@ from swath.drivers.scanner.srep.layout import (
     pulse_dtype,
     pulse_times,
 )
-from swath.georef.arrays import BoolArray
+from swath.georef.arrays import BoolArray, FloatArray, Int64Array, StructArray, UInt64Array
 from swath.georef.records import (
     RETURN_FLAG_PPS_LOCKED,
     ByteRows,
     ChunkBatch,
     DeviceClockSamples,
     DeviceStatus,
-    Int64Array,
     Record,
     ScannerReturns,
-    StructArray,
 )
 
 FLAG_NO_POINT = 128  # marks a row without a return, which only gives a pulse's time and encoder reading
@@ -85,9 +83,7 @@ class ScanAngle:
                 raise DriverSettingsError(f"geometry.facets: got {facets!r}, want the polygon's number of facets")
             self._facets = facets
 
-    def angles(
-        self, encoder: NDArray[np.int32], encoder_counts: int
-    ) -> tuple[NDArray[np.float64], NDArray[np.uint16] | None]:
+    def angles(self, encoder: NDArray[np.int32], encoder_counts: int) -> tuple[FloatArray, NDArray[np.uint16] | None]:
         """Return scan angles (n, N) in radians and, for a polygon, facets (n, N) of readings (n, N)."""
         turned = encoder.astype(np.float64)
         if not self._facets:
@@ -251,7 +247,7 @@ class SrepParser(PacketParser):
             self.tell_rates(int(unwrapped[row]) << 16, rates[0] / 1000, rates[1])
 
     def _returns(
-        self, host_time_ns: Int64Array, header: StructArray, words: NDArray[np.uint64], unwrapped: Int64Array
+        self, host_time_ns: Int64Array, header: StructArray, words: UInt64Array, unwrapped: Int64Array
     ) -> StructArray:
         """Decode the returns of all datagrams in order, in blocks of one layout; ``words`` are their
         `Datagrams.bodies`.
@@ -290,7 +286,7 @@ class SrepParser(PacketParser):
         return filled
 
     def _block(
-        self, host_time_ns: Int64Array, header: StructArray, words: NDArray[np.uint64], unwrapped: Int64Array
+        self, host_time_ns: Int64Array, header: StructArray, words: UInt64Array, unwrapped: Int64Array
     ) -> ReturnSlots:
         """Return the slots of datagrams of one layout; ``words`` are those of their pulses."""
         slots = int(header["return_slots"][0])

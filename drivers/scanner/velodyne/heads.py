@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swath.drivers.scanner.beams import BeamTable, beam_table, numbers
+from swath.georef.arrays import Int64Array
 
 BLOCKS = 12  # blocks of a data packet
 PLACES = 32  # places of a block
@@ -36,7 +37,7 @@ class SpinningHead:
     product_ids: tuple[int, ...]
     range_unit_m: float
     channel: NDArray[np.uint16]
-    offset_ns: NDArray[np.int64]
+    offset_ns: Int64Array
     group_ns: int
     beams: BeamTable
     stamp_ns: int = 0

@@ -28,7 +28,7 @@ from swath.drivers.scanner.spinning import Firings, returns_of_packets
 from swath.drivers.scanner.velodyne.calibration import read_calibration
 from swath.drivers.scanner.velodyne.heads import BLOCKS, HDL32E, PLACES, VLP16, VLP32C, VLS128, SpinningHead
 from swath.drivers.scanner.velodyne.position import HOUR_US, POSITION_BYTES, PositionReader
-from swath.georef.arrays import BoolArray, FloatArray
+from swath.georef.arrays import BoolArray, ByteArray, FloatArray, Int64Array, StructArray
 from swath.georef.records import (
     DEVICE_CLOCK_DTYPE,
     RETURN_FLAG_LAST,
@@ -37,10 +37,8 @@ from swath.georef.records import (
     ByteRows,
     DeviceClockSamples,
     DeviceStatus,
-    Int64Array,
     Record,
     ScannerReturns,
-    StructArray,
     TimeMessage,
 )
 
@@ -287,7 +285,7 @@ def _firing_azimuths(
 
 
 def _clock_samples(
-    host_time_ns: Int64Array, stamp_us: NDArray[np.uint32], mode: NDArray[np.uint8], head: SpinningHead
+    host_time_ns: Int64Array, stamp_us: NDArray[np.uint32], mode: ByteArray, head: SpinningHead
 ) -> StructArray:
     """Return one `DEVICE_CLOCK_DTYPE` row a packet: device time of its last firing; the packet has no latched edge."""
     groups = np.where(mode == MODE_DUAL, head.groups(dual=True), head.groups(dual=False))
@@ -348,7 +346,7 @@ class StampTracker:
         self._newest_us: int | None = None
         self._recent: deque[int] = deque(maxlen=LATE_PACKETS + 1)
 
-    def follow(self, stamp_us: Int64Array, nominal_us: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def follow(self, stamp_us: Int64Array, nominal_us: FloatArray) -> BoolArray:
         """Take packets (n,) and the time that each spans; return (n,) False for a packet that has come before."""
         if not len(stamp_us):
             return np.zeros(0, dtype=np.bool_)

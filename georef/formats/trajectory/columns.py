@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import BoolArray, ByteArray, FloatArray, Int64Array
 from swath.georef.geodesy.earth import e_from_geodetic
 from swath.georef.geodesy.quaternions import about, conjugate, product, rotated
-from swath.georef.records import Int64Array
 from swath.georef.timescales.gps_time import DAY_NS, SECOND_NS, WEEK_NS, WEEK_S, week_from_gps
 from swath.georef.trajectory.trajectory import Trajectory, TrajectoryError, gps_text
 
@@ -58,12 +57,12 @@ class TrajectoryColumns:
     row: str = "record"
     first_row: int = 1
     angles_in: str = "degrees"
-    fix_type: NDArray[np.uint8] | None = None
-    satellites: NDArray[np.uint8] | None = None
+    fix_type: ByteArray | None = None
+    satellites: ByteArray | None = None
     velocity_sigma_l: FloatArray | None = None
     position_correlation_l: FloatArray | None = None
 
-    def at(self, where: NDArray[np.bool_]) -> str:
+    def at(self, where: BoolArray) -> str:
         """Return the name of the first row for which a condition holds."""
         return f"{self.row} {int(np.argmax(where)) + self.first_row}"
 
@@ -152,7 +151,7 @@ def _no_overlap(first: int, last: int, name: str, span_ns: Span) -> str:
 
 def _check_finite(columns: TrajectoryColumns, name: str) -> None:
     for column in ("lat_rad", "lon_rad", "height_m"):
-        bad: NDArray[np.bool_] = ~np.isfinite(getattr(columns, column))
+        bad: BoolArray = ~np.isfinite(getattr(columns, column))
         if bad.any():
             raise TrajectoryError(f"{name}: no number for {column.split('_')[0]} at {columns.at(bad)}")
     attitude = np.stack([columns.roll_rad, columns.pitch_rad, columns.heading_rad], axis=1)
@@ -181,7 +180,7 @@ def _check_velocity(columns: TrajectoryColumns, name: str) -> None:
 
 
 def _check_position(columns: TrajectoryColumns, name: str) -> None:
-    beyond: NDArray[np.bool_] = np.abs(columns.lat_rad) > np.pi / 2
+    beyond: BoolArray = np.abs(columns.lat_rad) > np.pi / 2
     if beyond.any():
         value = columns.lat_rad[int(np.argmax(beyond))]
         shown = value if columns.angles_in == "radians" else np.degrees(value)
@@ -191,10 +190,10 @@ def _check_position(columns: TrajectoryColumns, name: str) -> None:
         elif (np.abs(columns.lon_rad) <= np.pi / 2).all():
             hint += "; latitude and longitude may be swapped"
         raise TrajectoryError(f"{name}: latitude {shown:.6g} at {columns.at(beyond)}: {hint}")
-    around: NDArray[np.bool_] = np.abs(columns.lon_rad) > 2 * np.pi
+    around: BoolArray = np.abs(columns.lon_rad) > 2 * np.pi
     if around.any():
         raise TrajectoryError(f"{name}: longitude at {columns.at(around)} exceeds a full turn")
-    high: NDArray[np.bool_] = (columns.height_m < LOWEST_M) | (columns.height_m > HIGHEST_M)
+    high: BoolArray = (columns.height_m < LOWEST_M) | (columns.height_m > HIGHEST_M)
     if high.any():
         height = columns.height_m[int(np.argmax(high))]
         raise TrajectoryError(
@@ -205,7 +204,7 @@ def _check_position(columns: TrajectoryColumns, name: str) -> None:
 def _check_attitude(columns: TrajectoryColumns, name: str) -> None:
     limits = (("roll", columns.roll_rad, np.pi), ("pitch", columns.pitch_rad, np.pi / 2))
     for what, angle, limit in (*limits, ("heading", columns.heading_rad, 2 * np.pi)):
-        beyond: NDArray[np.bool_] = np.abs(angle) > limit + 1e-6
+        beyond: BoolArray = np.abs(angle) > limit + 1e-6
         if beyond.any():
             value = angle[int(np.argmax(beyond))]
             shown = value if columns.angles_in == "radians" else np.degrees(value)

@@ -7,9 +7,8 @@ latitude and longitude); other columns are refused.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, StructArray
 from swath.georef.formats.trajectory.columns import TrajectoryColumns, unsaid
 from swath.georef.geodesy.earth import meridian_radius_m, prime_vertical_radius_m
 from swath.georef.trajectory.trajectory import Trajectory, TrajectoryError
@@ -81,7 +80,7 @@ def csv_text(trajectory: Trajectory) -> str:
     return "\n".join([",".join((*COLUMNS, *SIGMAS)), *(form.format(*row) for row in rows), ""])
 
 
-def _numbers(lines: list[str], header: list[str], name: str, first_line: int) -> NDArray[np.void]:
+def _numbers(lines: list[str], header: list[str], name: str, first_line: int) -> StructArray:
     dtype = [(column, "i8" if column == "gps_ns" else "f8") for column in header]
     if not any(line.strip() for line in lines):
         return np.empty(0, dtype)
@@ -99,7 +98,7 @@ def _numbers(lines: list[str], header: list[str], name: str, first_line: int) ->
         raise TrajectoryError(f"{name}: {error}") from None
 
 
-def _sigmas(table: NDArray[np.void], degrees: dict[str, FloatArray]) -> tuple[FloatArray, FloatArray]:
+def _sigmas(table: StructArray, degrees: dict[str, FloatArray]) -> tuple[FloatArray, FloatArray]:
     """Return sigmas (n, 3) of position in metres and of attitude in radians."""
     position, attitude = unsaid(len(table)), unsaid(len(table))
     for column in table.dtype.names or ():

@@ -13,9 +13,8 @@ from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import BoolArray, FloatArray, Int64Array, StructArray
 from swath.georef.geodesy.earth import geodetic_from_e
 from swath.georef.geodesy.gravity import EARTH_RATE_RADPS
 from swath.georef.geodesy.rotations import attitude_of, rot_z
@@ -31,7 +30,6 @@ from swath.georef.navigation.inputs import (
     Start,
     sort_observations,
 )
-from swath.georef.records import Int64Array, StructArray
 from swath.georef.timescales.gps_time import SECOND_NS
 
 WINDOW_NS = 60 * SECOND_NS
@@ -264,13 +262,13 @@ def align(
     raise AlignmentError(f"no alignment: {aligner.state}")
 
 
-def _sound(rows: StructArray, antennas: int) -> NDArray[np.bool_]:
+def _sound(rows: StructArray, antennas: int) -> BoolArray:
     """Return (n,) whether a row is usable: finite, with a sigma, of a known antenna."""
     needed = np.where(rows["kind"] == Kind.HEADING, 1, 3)
     component = np.arange(3) < needed[:, None]
     sound = np.isfinite(rows["value"]) & np.isfinite(rows["sigma"]) & (rows["sigma"] > 0.0)
     known = (rows["antenna"] < antennas) | ~np.isin(rows["kind"], (Kind.POSITION, Kind.VELOCITY))
-    usable: NDArray[np.bool_] = (sound | ~component).all(axis=1) & known
+    usable: BoolArray = (sound | ~component).all(axis=1) & known
     return usable | ~np.isin(rows["kind"], USED)
 
 

@@ -13,11 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.georef.geodesy import quaternions
 from swath.georef.geodesy.rotations import rot_from_quaternion, skew
 from swath.georef.navigation.inputs import Inertial
-from swath.georef.records import Int64Array
 from swath.georef.timescales.gps_time import SECOND_NS
 
 BLOCK_NS = 50_000_000  # rate and force are taken as constant within a block

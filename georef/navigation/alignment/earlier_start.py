@@ -12,12 +12,11 @@ from typing import TypeVar
 
 import numpy as np
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, StructArray
 from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
 from swath.georef.geodesy.quaternions import product
 from swath.georef.geodesy.rotations import attitude_of, rot_from_quaternion, rot_l_from_b, rot_z
 from swath.georef.navigation.inputs import ImuNoise, Inertial, Kind, Setup, Start
-from swath.georef.records import StructArray
 from swath.georef.timescales import SECOND_NS
 from swath.georef.trajectory.trajectory import EARTH_RATE_RADPS
 

@@ -17,10 +17,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import BoolArray, FloatArray, Int64Array, StructArray
 from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
 from swath.georef.geodesy.quaternions import rotation_vector
 from swath.georef.geodesy.rotations import quaternion_from_rot, rot_l_from_b, rot_z, skew
@@ -29,7 +28,6 @@ from swath.georef.navigation.alignment.frame import RATE_IE_E, Frame
 from swath.georef.navigation.alignment.noise import covariances as noise_covariances
 from swath.georef.navigation.alignment.noise import spaced_headings
 from swath.georef.navigation.inputs import Kind, Setup
-from swath.georef.records import Int64Array, StructArray
 
 TILT, VELOCITY, PLACE, GYRO, ACCEL, ARM = (
     slice(0, 3),
@@ -189,7 +187,7 @@ class Problem:
         residual, design = self._rows(rot, state, course)
         return self._fitted(rot, state, residual, design)
 
-    def _weigh(self, gone: NDArray[np.bool_]) -> None:
+    def _weigh(self, gone: BoolArray) -> None:
         """Compute the matrices that whiten residuals, with negligible weight for the rows in ``gone``."""
         self._whiteners, self._shares = [], []
         for total, own in self._noise:

@@ -6,12 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, Int64Array, StructArray
 from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
 from swath.georef.geodesy.gravity import EARTH_RATE_RADPS, gravity_e
 from swath.georef.geodesy.rotations import rot_z
 from swath.georef.navigation.alignment.blocks import Felt
-from swath.georef.records import Int64Array, StructArray
 from swath.georef.timescales.gps_time import SECOND_NS
 
 RATE_IE_E = np.array([0.0, 0.0, EARTH_RATE_RADPS])

@@ -10,10 +10,9 @@ import math
 
 import numpy as np
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, StructArray
 from swath.georef.navigation.alignment.blocks import FeltAt
 from swath.georef.navigation.inputs import Setup
-from swath.georef.records import StructArray
 
 G_MPS2 = 9.80665
 STILL_MPS = 0.003  # residual motion of a vehicle that stands still

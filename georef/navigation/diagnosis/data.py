@@ -8,8 +8,9 @@ from typing import Literal
 
 import numpy as np
 
+from swath.georef.arrays import StructArray
 from swath.georef.navigation.inputs import Inertial, Kind
-from swath.georef.records import FixType, StructArray
+from swath.georef.records import FixType
 from swath.georef.timescales.gps_time import SECOND_NS, week_from_gps
 
 G_MPS2 = 9.80665

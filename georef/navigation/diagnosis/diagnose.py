@@ -13,7 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, StructArray
 from swath.georef.navigation.diagnosis.data import MOSTLY, force, gaps, receiver, times
 from swath.georef.navigation.diagnosis.data import Finding as Finding
 from swath.georef.navigation.diagnosis.motion import (
@@ -31,7 +31,6 @@ from swath.georef.navigation.diagnosis.motion import (
 )
 from swath.georef.navigation.diagnosis.time import SIGMAS, TimeOffset, time_offset, velocities
 from swath.georef.navigation.inputs import Fate, Inertial, Kind, Setup, Solution
-from swath.georef.records import StructArray
 from swath.georef.timescales.gps_time import GPS_EPOCH, SECOND_NS, table_leap_seconds
 
 G_MPS2 = 9.80665

@@ -12,15 +12,13 @@ from dataclasses import dataclass, replace
 from itertools import permutations, product
 
 import numpy as np
-from numpy.typing import NDArray
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import BoolArray, FloatArray, Int64Array, StructArray
 from swath.georef.geodesy.rotations import rot_z
 from swath.georef.navigation.alignment.blocks import Blocks, Felt
 from swath.georef.navigation.alignment.fit import ARM, GYRO, TILT, Fitted, Problem
 from swath.georef.navigation.diagnosis.time import velocities
 from swath.georef.navigation.inputs import Inertial, Kind, Setup
-from swath.georef.records import Int64Array, StructArray
 from swath.georef.timescales.gps_time import SECOND_NS
 
 WINDOW_NS = 40 * SECOND_NS
@@ -328,7 +326,7 @@ def _eventfulness(inertial: Inertial, rows: StructArray, begin_ns: int) -> float
     return 1e-6 + changed + 5.0 * turned
 
 
-def _is_motion(rows: StructArray) -> NDArray[np.bool_]:
+def _is_motion(rows: StructArray) -> BoolArray:
     return np.asarray(np.isin(rows["kind"], (Kind.POSITION, Kind.VELOCITY)))
 
 

@@ -17,10 +17,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, Int64Array, StructArray
 from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
 from swath.georef.navigation.inputs import Inertial, Kind
-from swath.georef.records import Int64Array, StructArray
 from swath.georef.timescales.gps_time import SECOND_NS
 
 G_MPS2 = 9.80665

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, StructArray
 from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
 from swath.georef.geodesy.rotations import quaternion_from_rot, rot_l_from_b
 from swath.georef.navigation.bridging import Bridges, made_up_variance, new_bridges, primed_bridges
@@ -45,7 +45,6 @@ from swath.georef.navigation.filter.types import (
     Running,
 )
 from swath.georef.navigation.inputs import Fate, Inertial, Kind, Setup, Start
-from swath.georef.records import StructArray
 from swath.georef.timescales import SECOND_NS
 
 PIECE = 1 << 17  # samples, and rows of a path, between calls of the storage's `rest`

@@ -17,10 +17,9 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import ByteArray, FloatArray
 from swath.georef.compiled import jit_cached, jit_inline
 from swath.georef.geodesy.gravity import EARTH_RATE_RADPS, gravity_of, normal_of
 from swath.georef.geodesy.vectors import cross, dot, plus, rot_of, times, transposed_times
@@ -361,7 +360,7 @@ def _height(
 
 @jit_cached
 def predict(
-    x: FloatArray, sums: FloatArray, rules: Rules, layout: Layout, what: NDArray[np.uint8], figures: FloatArray,
+    x: FloatArray, sums: FloatArray, rules: Rules, layout: Layout, what: ByteArray, figures: FloatArray,
     nu: FloatArray, rows: FloatArray, noise: FloatArray,
 ) -> int:  # fmt: skip
     """Compute an innovation, its derivatives and the observation's covariance.

@@ -25,7 +25,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.georef.compiled import jit_cached, jit_inline
 from swath.georef.geodesy.vectors import dot, rot_of
 from swath.georef.navigation.filter.error_model import (
@@ -60,7 +60,6 @@ from swath.georef.navigation.filter.strapdown import (
 )
 from swath.georef.navigation.filter.types import Nodes, Path
 from swath.georef.navigation.inputs import Solution
-from swath.georef.records import Int64Array
 
 SECOND = 1e-9  # seconds in a nanosecond
 

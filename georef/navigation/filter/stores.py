@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from swath.georef.arrays import Int64Array, StructArray
 from swath.georef.navigation.filter.error_model import MOVED, Layout
 from swath.georef.navigation.filter.strapdown import STATE_SIZE
 from swath.georef.navigation.filter.types import (
@@ -24,7 +25,6 @@ from swath.georef.navigation.filter.types import (
     Told,
 )
 from swath.georef.navigation.inputs import INNOVATION_DTYPE, OBSERVATION_DTYPE, Fate
-from swath.georef.records import Int64Array, StructArray
 
 PATH_ROWS = 4096
 BLOCK_NODES = 1024

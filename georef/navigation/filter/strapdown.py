@@ -14,14 +14,12 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import BoolArray, FloatArray, Int64Array
 from swath.georef.compiled import jit_cached, jit_inline
 from swath.georef.geodesy.gravity import EARTH_RATE_RADPS, gravity_of
 from swath.georef.geodesy.vectors import cross, plus, rot_of, times
 from swath.georef.navigation.inputs import Inertial
-from swath.georef.records import Int64Array
 from swath.georef.scanner.kernels.types import Matrix, Three
 
 POSITION, VELOCITY, ATTITUDE = 0, 3, 6  # m, m/s relative to the earth in e; q_e_from_b, scalar first
@@ -50,7 +48,7 @@ class Samples(NamedTuple):
     interval_s: FloatArray
     angle_b: FloatArray
     velocity_b: FloatArray
-    bridged: NDArray[np.bool_]
+    bridged: BoolArray
     made_up: FloatArray
 
 

@@ -4,14 +4,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
-from swath.georef.arrays import ByteArray, FloatArray
+from swath.georef.arrays import BoolArray, ByteArray, FloatArray, Int64Array, SingleArray
 from swath.georef.navigation.filter.error_model import Drive, Layout
 from swath.georef.navigation.filter.measurements import Rules
 from swath.georef.navigation.inputs import Kind
-from swath.georef.records import Int64Array
 
 KINDS = len(Kind)
 
@@ -88,8 +84,8 @@ class Path(NamedTuple):
 
     time_ns: Int64Array
     states: FloatArray
-    sigma: NDArray[np.float32]
-    bridged: NDArray[np.bool_]
+    sigma: SingleArray
+    bridged: BoolArray
 
 
 class Nodes(NamedTuple):

@@ -13,11 +13,10 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple, TypeAlias
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.georef.compiled import jit_cached, jit_inline
 from swath.georef.geodesy.earth import down_of, geodetic_of
 from swath.georef.geodesy.vectors import cross, dot, plus, rot_at, transposed_times, vector_at
-from swath.georef.records import Int64Array
 from swath.georef.scanner.kernels.block import (
     ACCELERATION,
     ACROSS,

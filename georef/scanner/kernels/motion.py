@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from swath.georef.arrays import FloatArray, IntArray
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.georef.compiled import jit_cached, jit_inline
 
 Tile: TypeAlias = tuple[FloatArray, FloatArray]
@@ -35,12 +35,12 @@ FROM, TO, MIDDLE = range(3)
 @jit_cached
 def cut(
     rows: Any,
-    time_ns: IntArray,
+    time_ns: Int64Array,
     facets: bool,
-    pulses: IntArray,
-    pulse_ns: IntArray,
+    pulses: Int64Array,
+    pulse_ns: Int64Array,
     angle: FloatArray,
-    pieces: IntArray,
+    pieces: Int64Array,
 ) -> tuple[int, int]:
     """Divide rows into pulses, and pulses into pieces of time; neither a piece nor a window crosses a jump.
 
@@ -78,7 +78,7 @@ def cut(
 
 
 @jit_inline
-def window_of(pieces: IntArray, m: int, n: int, piece: int, reach: int) -> tuple[int, int]:
+def window_of(pieces: Int64Array, m: int, n: int, piece: int, reach: int) -> tuple[int, int]:
     """Return the range of pulses, from and to, of the pieces at most ``reach`` away in time and of the same train."""
     first, last = piece, piece
     train, place = pieces[piece, TRAIN], pieces[piece, PLACE]
@@ -117,7 +117,9 @@ def solve(normal: FloatArray, right: FloatArray, size: int) -> bool:
 
 
 @jit_inline
-def take(pulse_ns: IntArray, angle: FloatArray, windows: IntArray, scale: FloatArray, begin: int, tile: Tile) -> int:
+def take(
+    pulse_ns: Int64Array, angle: FloatArray, windows: Int64Array, scale: FloatArray, begin: int, tile: Tile
+) -> int:
     """Copy times and readings from pulse ``begin`` of each window on into the tile, a column each.
 
     Rows after a window's end are zero.
@@ -167,9 +169,9 @@ def add_up(tile: Tile, rows: int, sums: FloatArray) -> None:
 
 @jit_inline
 def sum_up(
-    pulse_ns: IntArray,
+    pulse_ns: Int64Array,
     angle: FloatArray,
-    windows: IntArray,
+    windows: Int64Array,
     scale: FloatArray,
     tile: Tile,
     sums: FloatArray,
@@ -197,7 +199,7 @@ def fit(sums: FloatArray, lane: int, size: int, work: FloatArray) -> bool:
 
 
 @jit_inline
-def choose(pulse_ns: IntArray, pieces: IntArray, piece: int, steady: bool) -> tuple[int, int, int, int]:
+def choose(pulse_ns: Int64Array, pieces: Int64Array, piece: int, steady: bool) -> tuple[int, int, int, int]:
     """Return the window of a piece and the number of coefficients; 0 if a fit is impossible.
 
     The window is from pulse, to pulse, and the number of pieces to either side.
@@ -217,7 +219,7 @@ def choose(pulse_ns: IntArray, pieces: IntArray, piece: int, steady: bool) -> tu
 
 
 @jit_inline
-def pulses_of(pieces: IntArray, piece: int, n: int) -> tuple[int, int]:
+def pulses_of(pieces: Int64Array, piece: int, n: int) -> tuple[int, int]:
     """Return the range of pulses, from and to, of a piece."""
     return pieces[piece, FIRST], pieces[piece + 1, FIRST] if piece + 1 < len(pieces) else n
 
@@ -236,7 +238,9 @@ def give(work: FloatArray, told: bool, pulse_ns: Any, middle_ns: int, unit_ns: f
 
 
 @jit_inline
-def spread(pulses: IntArray, first: int, last: int, slope: FloatArray, bend: FloatArray, rate: Any, more: Any) -> None:
+def spread(
+    pulses: Int64Array, first: int, last: int, slope: FloatArray, bend: FloatArray, rate: Any, more: Any
+) -> None:
     """Copy values of pulses first to last to their rows, of which a pulse may have several."""
     for i in range(first, last):
         for row in range(pulses[i], pulses[i + 1] if i + 1 < len(pulses) else len(rate)):
@@ -245,10 +249,10 @@ def spread(pulses: IntArray, first: int, last: int, slope: FloatArray, bend: Flo
 
 @jit_cached
 def rates(
-    pulses: IntArray,
-    pulse_ns: IntArray,
+    pulses: Int64Array,
+    pulse_ns: Int64Array,
     angle: FloatArray,
-    pieces: IntArray,
+    pieces: Int64Array,
     steady: bool,
     first_piece: int,
     last_piece: int,

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, Int64Array, StructArray
 from swath.georef.compiled import jit_cached, jit_inline, whole
 from swath.georef.geodesy.earth import E2
 from swath.georef.geodesy.vectors import (
@@ -28,7 +28,6 @@ from swath.georef.geodesy.vectors import (
     vector_at,
 )
 from swath.georef.points import Fate
-from swath.georef.records import Int64Array, StructArray
 from swath.georef.scanner.kernels.axes import fill_axes, fill_covariance, take_readings, through_mount, turn_axes
 from swath.georef.scanner.kernels.beam import FIBRE_BY_CHANNEL, FIBRE_BY_ENCODER, FIXED_ANGLE, ONE, RANGE, SPINNING
 from swath.georef.scanner.kernels.block import (

@@ -7,8 +7,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.georef.arrays import ByteArray, FloatArray, SingleArray
-from swath.georef.records import Int64Array
+from swath.georef.arrays import ByteArray, FloatArray, Int64Array, SingleArray
 
 Two: TypeAlias = tuple[float, float]
 Three: TypeAlias = tuple[float, float, float]

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from swath.georef.arrays import FloatArray, IntArray
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.georef.compiled import jit_cached, jit_inline
 
 LIGHT_MPS = 299_792_458.0
@@ -34,7 +34,7 @@ def ticks_of(time_ns: int, tick_hz: int) -> int:
 
 
 @jit_inline
-def note_step(state: IntArray, ticks: int) -> None:
+def note_step(state: Int64Array, ticks: int) -> None:
     """Record the time between two successive pulses: the extremes of the last few hundred."""
     state[PERIOD] = ticks
     state[LEAST], state[MOST] = min(state[LEAST], ticks), max(state[MOST], ticks)
@@ -45,7 +45,7 @@ def note_step(state: IntArray, ticks: int) -> None:
 
 
 @jit_inline
-def next_ordinal(state: IntArray, pulse_id: Any, ticks: int) -> int:
+def next_ordinal(state: Int64Array, pulse_id: Any, ticks: int) -> int:
     """Return the number of a pulse in the train; after a break it continues far ahead.
 
     Within a datagram the pulse_id counts. The datagram before ended with a pulse that may have had no return: the time
@@ -86,7 +86,7 @@ def median_of(sorted_m: FloatArray, count: int) -> float:
 
 
 @jit_inline
-def push(sorted_m: FloatArray, ring_m: FloatArray, counts: IntArray, value: float) -> None:
+def push(sorted_m: FloatArray, ring_m: FloatArray, counts: Int64Array, value: float) -> None:
     """Insert a value into the running median's window, removing the oldest.
 
     ``counts`` holds the number of values, the position in the ring, and the values still to skip.
@@ -110,7 +110,7 @@ def push(sorted_m: FloatArray, ring_m: FloatArray, counts: IntArray, value: floa
 
 
 @jit_inline
-def even(state: IntArray) -> bool:
+def even(state: Int64Array) -> bool:
     """Return whether pulses are evenly spaced: the times between two of them are then known to the tick."""
     widest = max(state[MOST], state[OLD_MOST])
     return bool(widest > 0 and widest - min(state[LEAST], state[OLD_LEAST]) <= 1)
@@ -118,7 +118,7 @@ def even(state: IntArray) -> bool:
 
 @jit_inline
 def add_pulse(
-    pulses: IntArray, angles_rad: FloatArray, known: int, state: IntArray, ordinal: int, ticks: int, row: Any
+    pulses: Int64Array, angles_rad: FloatArray, known: int, state: Int64Array, ordinal: int, ticks: int, row: Any
 ) -> int:
     """Append an emission, and before it known ones without a return; return the number of known emissions.
 
@@ -147,7 +147,7 @@ def add_pulse(
 
 @jit_inline
 def nearest_emission(
-    pulses: IntArray,
+    pulses: Int64Array,
     angles_rad: FloatArray,
     known: int,
     apparent_m: float,
@@ -193,16 +193,16 @@ def verdict(miss_m: float, period_m: float, margin: float, zone: int, apparent_m
 def resolve_zones(
     rows: Any,
     predicted_m: FloatArray,
-    pulses: IntArray,
+    pulses: Int64Array,
     angles_rad: FloatArray,
     known: int,
-    state: IntArray,
-    median: tuple[FloatArray, FloatArray, IntArray],
+    state: Int64Array,
+    median: tuple[FloatArray, FloatArray, Int64Array],
     tick_hz: int,
     scale: tuple[float, int],
     limits: tuple[float, float, float],
     slanted: bool,
-    found: IntArray,
+    found: Int64Array,
     whole_m: FloatArray,
     angle_rad: FloatArray,
 ) -> int:

@@ -7,11 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from swath.calib.equations.observability import RULES, Rules, decide, kind_of, spectrum
 from swath.calib.outcome import FixedParameter
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.georef.geodesy.earth import e_from_geodetic, rot_e_from_l
 from swath.georef.geodesy.rotations import quaternion_from_rot, rot_l_from_b
 from swath.georef.records import RETURN_DTYPE
@@ -56,7 +55,7 @@ def planes(roofs: bool) -> list[tuple[FloatArray, FloatArray]]:
 
 
 @cache
-def design(name: str, roofs: bool) -> tuple[FloatArray, FloatArray, NDArray[np.int64], FloatArray]:
+def design(name: str, roofs: bool) -> tuple[FloatArray, FloatArray, Int64Array, FloatArray]:
     """Rows of all returns that hit: normal · columns (n, 16), variance (n,), plane (n,), place on it (n, 3)."""
     rng = np.random.default_rng(3)
     targets, poses, normals, plane_of, places = [], [], [], [], []

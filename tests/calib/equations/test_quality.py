@@ -16,8 +16,7 @@ from swath.calib.equations.solve import Block, Settings, solved
 from swath.calib.equations.trajectory_prior import Taus, gauss_markov
 from swath.calib.features import Features
 from swath.calib.parameters import ParameterOptions, unknowns
-from swath.georef.arrays import FloatArray
-from swath.georef.records import Int64Array
+from swath.georef.arrays import FloatArray, Int64Array
 from tests.calib.builders import controlled, design, in_planes
 from tests.calib.printed import printed
 from tests.calib.roofs import LINES, made

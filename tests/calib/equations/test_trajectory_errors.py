@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from swath.calib.equations.trajectory_prior import (
@@ -21,7 +20,7 @@ from swath.calib.equations.trajectory_prior import (
     positive,
 )
 from swath.calib.flight import Flight, FlightError, Head, Swath, Tangent
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
 from swath.georef.geodesy.rotations import rot_from_quaternion
 from swath.georef.navigation.cross_covariance import ErrorChain, error_chain
@@ -143,7 +142,7 @@ def test_errors_of_navigated_flights_are_correlated_as_the_chain_states() -> Non
         assert (low < np.mean(found) < high) == right
 
 
-def off(truth: Truth, time_ns: NDArray[np.int64], state: FloatArray) -> FloatArray:
+def off(truth: Truth, time_ns: Int64Array, state: FloatArray) -> FloatArray:
     """Return (6k,) true − found positions in l, and rotations about north, east, down."""
     at = truth.flight.motion((time_ns - ns(0.0)) / SECOND)
     level = rot_e_from_l(*geodetic_from_e(at.position_e)[:2])

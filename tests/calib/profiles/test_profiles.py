@@ -10,7 +10,6 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from matplotlib.text import Text
-from numpy.typing import NDArray
 
 from swath.calib.features import ControlPoint
 from swath.calib.flight import Flight
@@ -29,7 +28,7 @@ from swath.calib.profiles.stepwise import (
     survey,
 )
 from swath.daemon.processing.calibration.report.profiles import draw, most_precise, svg
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import BoolArray, FloatArray
 from tests.calib.analytic_scene import Line, Scanner, fly, gables, only, retold, truth_of
 
 pytestmark = pytest.mark.xdist_group("kernels")
@@ -144,7 +143,7 @@ def test_trajectory_errors_move_the_result_within_its_sigma() -> None:
         assert profile.sigma > 5e-5 / math.sqrt(2.0)  # the turns of two lines, averaged
 
 
-def _between(low: FloatArray, high: FloatArray, points: FloatArray) -> NDArray[np.bool_]:
+def _between(low: FloatArray, high: FloatArray, points: FloatArray) -> BoolArray:
     return np.asarray(((points[:, :2] > low) & (points[:, :2] < high)).all(axis=1))
 
 

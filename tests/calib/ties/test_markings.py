@@ -7,12 +7,11 @@ from functools import cache
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.special import erf
 
 from swath.calib.flight import Flight
 from swath.calib.ties.markings import Image, MarkingSettings, Shift, find_markings, shifted
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, StructArray
 from tests.calib.analytic_scene import Line, Scanner, fly, truth_of
 
 pytestmark = pytest.mark.xdist_group("kernels")
@@ -161,7 +160,7 @@ def test_images_without_a_tie_are_counted() -> None:
     assert not find_markings(replace(flight, swaths=())).ties
 
 
-def _even(rows: NDArray[np.void]) -> NDArray[np.void]:
+def _even(rows: StructArray) -> StructArray:
     rows = rows.copy()
     rows["intensity"] = 50.0
     return rows

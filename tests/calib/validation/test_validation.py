@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.stats import norm
 
 from swath.calib.equations.trajectory_prior import Taus, TrajectoryPrior, apply, draw, gauss_markov
@@ -26,7 +25,7 @@ from swath.calib.validation.methods import (
     smallest_errors,
     validate,
 )
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.georef.scanner.calibration import INDEX, Calibration
 from swath.sim.shots import ROOF
 from tests.calib.cast_flight import Cast, cast_flight
@@ -403,7 +402,7 @@ def test_returns_without_coordinates_are_not_part_of_a_sighting(made: Cast, roof
     assert second.swath not in {*rows.first.tolist(), *rows.second.tolist()}
 
 
-def patch_part(patch: Patch, every: int) -> NDArray[np.int64]:
+def patch_part(patch: Patch, every: int) -> Int64Array:
     """Return a fraction of the returns of a patch."""
     return patch.at[::every]
 

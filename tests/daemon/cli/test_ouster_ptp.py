@@ -10,11 +10,11 @@ from unittest.mock import patch
 import laspy
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from pyproj import Transformer
 
 from swath.daemon.cli.main import run_app
 from swath.drivers.scanner.ouster.head import read_head
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.sim.scanners import ouster_wire
 from swath.sim.scanners.spinning_wire import HeadClock
 from tests.daemon import one_line
@@ -37,7 +37,7 @@ SHORT = (
 def flown_by(folder: Path, beside_utc_s: float) -> Flown:
     """A flight of 8 s whose head stamps nanoseconds since 1970 on a scale so many seconds beside UTC."""
 
-    def ticks(clock: HeadClock, time_s: NDArray[np.float64]) -> NDArray[np.int64]:
+    def ticks(clock: HeadClock, time_s: FloatArray) -> Int64Array:
         return UNIX_NS + np.floor((np.asarray(time_s) + beside_utc_s) * 1e9).astype(np.int64)
 
     with (

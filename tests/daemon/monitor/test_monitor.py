@@ -34,7 +34,8 @@ from swath.daemon.monitor.display import Monitor
 from swath.daemon.monitor.source import Decoding
 from swath.drivers.parser import PacketParser
 from swath.drivers.scanner.srep.layout import SrepHeader, encode_datagram
-from swath.georef.records import ByteRows, Int64Array, Record
+from swath.georef.arrays import Int64Array
+from swath.georef.records import ByteRows, Record
 from tests.builders import ROOT
 from tests.daemon.builders import (
     CAPTURE,

@@ -14,10 +14,9 @@ from typing import Any
 import numpy as np
 import pyproj
 import pytest
-from numpy.typing import NDArray
 from pyproj import CRS
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, SingleArray
 from swath.georef.geodesy.earth import e_from_geodetic, meridian_radius_m
 from swath.georef.mapping import frame as module
 from swath.georef.mapping.frame import Mapping, MappingError
@@ -64,7 +63,7 @@ def at(lat_deg: float, lon_deg: float, height_m: float = 0.0) -> FloatArray:
     return np.atleast_2d(e_from_geodetic(np.radians(lat_deg), np.radians(lon_deg), height_m))
 
 
-def sigmas_of(frame: Mapping, points_e: FloatArray, covariance_e: FloatArray) -> NDArray[np.float32]:
+def sigmas_of(frame: Mapping, points_e: FloatArray, covariance_e: FloatArray) -> SingleArray:
     """Return sigmas (n, 3)."""
     _, sigmas = frame.map_with_sigmas(points_e, covariance_e)
     assert sigmas is not None
@@ -223,7 +222,7 @@ def undulation(lat_deg: Any, lon_deg: Any) -> FloatArray:
     return value
 
 
-def write_gtx(path: Path, south: float, west: float, step: float, shape: tuple[int, int]) -> NDArray[np.float32]:
+def write_gtx(path: Path, south: float, west: float, step: float, shape: tuple[int, int]) -> SingleArray:
     """A grid in NOAA's GTX format: big-endian, rows from south to north."""
     lat, lon = south + step * np.arange(shape[0])[:, None], west + step * np.arange(shape[1])[None]
     nodes = undulation(lat, lon).astype(np.float32)
@@ -231,7 +230,7 @@ def write_gtx(path: Path, south: float, west: float, step: float, shape: tuple[i
     return nodes
 
 
-def bilinear(nodes: NDArray[np.float32], south: float, west: float, step: float, lat: Any, lon: Any) -> FloatArray:
+def bilinear(nodes: SingleArray, south: float, west: float, step: float, lat: Any, lon: Any) -> FloatArray:
     """Interpolate bilinearly, as geoid grids prescribe."""
     row, column = (lat - south) / step, (lon - west) / step
     i, j = np.floor(row).astype(int), np.floor(column).astype(int)

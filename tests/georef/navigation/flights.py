@@ -9,11 +9,11 @@ from scipy.interpolate import make_interp_spline
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, StructArray
 from swath.georef.geodesy.earth import e_from_geodetic, geodetic_from_e, rot_e_from_l
 from swath.georef.geodesy.rotations import attitude_of, rot_from_quaternion, rot_l_from_b
 from swath.georef.navigation.inputs import ImuNoise, Inertial, Kind, Setup, Start
-from swath.georef.records import FixType, StructArray
+from swath.georef.records import FixType
 from swath.sim.flight.trajectory import Trajectory
 from swath.sim.imu.sensors import error_matrix, true_increments
 from tests.georef.navigation.vehicles import Motion, ns, observed

@@ -8,12 +8,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, StructArray
 from swath.georef.navigation.filter.filter import run_filter
 from swath.georef.navigation.filter.smoother import smooth
 from swath.georef.navigation.inputs import GRADES, Kind, Setup, Solution
 from swath.georef.navigation.solve import Solved, solve
-from swath.georef.records import StructArray
 from tests.georef.navigation.flights import BASELINE_B, Fixes, Truth, drawn_start, errors, noised
 from tests.georef.navigation.vehicles import ns
 

@@ -7,12 +7,11 @@ from functools import cache
 
 import numpy as np
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, StructArray
 from swath.georef.geodesy.earth import e_from_geodetic, rot_e_from_l
 from swath.georef.geodesy.quaternions import rotated
 from swath.georef.geodesy.rotations import rot_l_from_b
 from swath.georef.navigation.inputs import Solution, Start
-from swath.georef.records import StructArray
 from tests.georef.navigation.vehicles import BEGIN_NS, NAVIGATION, flight_arrays, ns
 
 LINES_S = (100_600.0, 101_550.0)

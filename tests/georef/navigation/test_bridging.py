@@ -6,8 +6,8 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from swath.georef.arrays import BoolArray
 from swath.georef.navigation.bridging import UNKNOWN_RATE_RADPS, made_up_variance, new_bridges
 from swath.georef.navigation.filter.filter import run_filter
 from swath.georef.navigation.filter.smoother import smooth
@@ -25,7 +25,7 @@ RATE_HZ = 100.0
 SECONDS = 120.0
 
 
-def lossy(inertial: Inertial, gone: NDArray[np.bool_], rate_hz: float = RATE_HZ) -> Inertial:
+def lossy(inertial: Inertial, gone: BoolArray, rate_hz: float = RATE_HZ) -> Inertial:
     """The samples without some, put together and bridged as a log's are."""
     rows = np.zeros(len(inertial), IMU_DTYPE)
     rows["specific_force_b"] = inertial.velocity_b / inertial.interval_s[:, None]
@@ -33,7 +33,7 @@ def lossy(inertial: Inertial, gone: NDArray[np.bool_], rate_hz: float = RATE_HZ)
     return Sampler(rate_hz).feed(rows[~gone], inertial.time_ns[~gone])
 
 
-def lost(count: int, share: float, run: int, seed: int) -> NDArray[np.bool_]:
+def lost(count: int, share: float, run: int, seed: int) -> BoolArray:
     """(count,) which samples are gone: runs of so many on end."""
     gone = np.zeros(count, np.bool_)
     for first in np.random.default_rng(seed).integers(50, count - 50, round(count * share / run)).tolist():

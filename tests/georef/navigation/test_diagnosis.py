@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, StructArray
 from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
 from swath.georef.navigation.diagnosis.diagnose import Finding, diagnose
 from swath.georef.navigation.diagnosis.time import TimeOffset, time_offset
 from swath.georef.navigation.inputs import INNOVATION_DTYPE, Fate, Inertial, Kind, Setup, sort_observations
-from swath.georef.records import FixType, StructArray
+from swath.georef.records import FixType
 from tests.georef.navigation.vehicles import BEGIN_NS, Recording, car, observed, reference, uav
 
 pytestmark = pytest.mark.xdist_group("kernels")

@@ -10,10 +10,9 @@ from itertools import permutations, product
 import numpy as np
 import pytest
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, StructArray
 from swath.georef.navigation.diagnosis.diagnose import diagnose
 from swath.georef.navigation.inputs import GRADES, Inertial, Setup, sort_observations
-from swath.georef.records import StructArray
 from tests.georef.navigation.flights import Fixes, fly, noised, setup_for, survey
 from tests.georef.navigation.vehicles import car, uav
 

@@ -10,10 +10,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from swath.georef.arrays import StructArray
 from swath.georef.geodesy.quaternions import conjugate, product, rotation_vector
 from swath.georef.navigation.inputs import GRADES, INNOVATION_DTYPE, Fate, Kind, Setup
 from swath.georef.navigation.noise import EVIDENCE, SIGNIFICANT, rescaled, second_moments
-from swath.georef.records import FixType, StructArray
+from swath.georef.records import FixType
 from tests.georef.navigation.builders import flight
 from tests.georef.navigation.honesty import judge
 from tests.georef.navigation.honesty import squares as normalised_squares

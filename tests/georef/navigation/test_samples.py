@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, Int64Array, StructArray
 from swath.georef.navigation.inputs import Inertial, NavigationError
 from swath.georef.navigation.samples import Sampler, SampleRule, StampRule
 from swath.georef.records import IMU_DTYPE
@@ -28,19 +27,19 @@ def rate_integral(t: FloatArray) -> FloatArray:
     return TURN * (np.sin(3.0 * t) / 3.0)[:, None]
 
 
-def rows_of(force: FloatArray, turn: FloatArray) -> NDArray[np.void]:
+def rows_of(force: FloatArray, turn: FloatArray) -> StructArray:
     rows = np.zeros(len(turn), IMU_DTYPE)
     rows["specific_force_b"], rows["angular_rate_b"] = force, turn
     return rows
 
 
-def means(edges_s: FloatArray) -> NDArray[np.void]:
+def means(edges_s: FloatArray) -> StructArray:
     """What a perfect unit says of the intervals between edges."""
     turn = np.diff(rate_integral(edges_s), axis=0) / np.diff(edges_s)[:, None]
     return rows_of(np.broadcast_to(FORCE, turn.shape), turn)
 
 
-def ns(t: FloatArray) -> NDArray[np.int64]:
+def ns(t: FloatArray) -> Int64Array:
     return EPOCH_NS + np.rint(t * 1e9).astype(np.int64)
 
 
@@ -54,7 +53,7 @@ def same(a: Inertial, b: Inertial) -> bool:
     return all(np.array_equal(getattr(a, name), getattr(b, name)) for name in fields)
 
 
-def one_by_one(rows: NDArray[np.void], time_ns: NDArray[np.int64], **options: Any) -> tuple[Inertial, Sampler]:
+def one_by_one(rows: StructArray, time_ns: Int64Array, **options: Any) -> tuple[Inertial, Sampler]:
     sampler = Sampler(RATE_HZ, **options)
     return joined([sampler.feed(rows[k : k + 1], time_ns[k : k + 1]) for k in range(len(rows))]), sampler
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray, StructArray
 from swath.georef.geodesy.earth import e_from_geodetic
 from swath.georef.navigation.inputs import OBSERVATION_DTYPE, Inertial, Kind, sort_observations
 from swath.georef.navigation.stillness import SIGMA_MPS, still_seconds, with_still_seconds
@@ -16,7 +16,7 @@ EPOCH_NS = 1_447_000_000 * SECOND_NS
 RATE_HZ = 100
 
 
-def unit(seconds: int, force: NDArray[np.float64], turn: NDArray[np.float64]) -> Inertial:
+def unit(seconds: int, force: FloatArray, turn: FloatArray) -> Inertial:
     """Return mean force and angular rate by second."""
     n = seconds * RATE_HZ
     time_ns = EPOCH_NS + np.arange(1, n + 1) * (SECOND_NS // RATE_HZ)
@@ -27,24 +27,24 @@ def unit(seconds: int, force: NDArray[np.float64], turn: NDArray[np.float64]) ->
     )
 
 
-def velocities(speed: NDArray[np.float64], sigma: float) -> NDArray[np.void]:
+def velocities(speed: FloatArray, sigma: float) -> StructArray:
     rows = np.zeros(len(speed), OBSERVATION_DTYPE)
     rows["time_ns"] = EPOCH_NS + np.arange(len(speed)) * SECOND_NS
     rows["kind"], rows["sigma"], rows["value"][:, 0] = Kind.VELOCITY, sigma, speed
     return rows
 
 
-def seconds_of(rows: NDArray[np.void]) -> list[int]:
+def seconds_of(rows: StructArray) -> list[int]:
     return [int(number) for number in (rows["time_ns"] - EPOCH_NS) // SECOND_NS]
 
 
 @pytest.fixture
-def calm() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def calm() -> tuple[FloatArray, FloatArray]:
     return np.tile([0.0, 0.0, -9.81], (40, 1)), np.zeros((40, 3))
 
 
 def test_a_stationary_vehicle_is_detected_except_at_the_ends(
-    calm: tuple[NDArray[np.float64], NDArray[np.float64]],
+    calm: tuple[FloatArray, FloatArray],
 ) -> None:
     rows = still_seconds(unit(40, *calm), velocities(np.zeros(40), 0.02))
     assert seconds_of(rows) == list(range(3, 38))
@@ -55,7 +55,7 @@ def test_a_stationary_vehicle_is_detected_except_at_the_ends(
 @pytest.mark.parametrize("rate_hz", [1, 20])
 @pytest.mark.parametrize(("speed_mps", "stands"), [(0.0, True), (0.3, False), (1.5, False)])
 def test_positions_alone_tell_slow_flight_from_standing_at_any_rate(
-    calm: tuple[NDArray[np.float64], NDArray[np.float64]], rate_hz: int, speed_mps: float, stands: bool
+    calm: tuple[FloatArray, FloatArray], rate_hz: int, speed_mps: float, stands: bool
 ) -> None:
     rows = np.zeros(40 * rate_hz, OBSERVATION_DTYPE)
     t = np.arange(len(rows)) / rate_hz
@@ -66,7 +66,7 @@ def test_positions_alone_tell_slow_flight_from_standing_at_any_rate(
 
 
 def test_smooth_straight_flight_is_not_taken_for_standing(
-    calm: tuple[NDArray[np.float64], NDArray[np.float64]],
+    calm: tuple[FloatArray, FloatArray],
 ) -> None:
     assert not len(still_seconds(unit(40, *calm), velocities(np.full(40, 60.0), 0.02)))
     assert not len(still_seconds(unit(40, *calm), velocities(np.full(40, 0.4), 2.0))), "whatever the receiver's sigma"
@@ -74,16 +74,14 @@ def test_smooth_straight_flight_is_not_taken_for_standing(
 
 
 @pytest.mark.parametrize("sensor", ["force", "turn"])
-def test_a_second_with_motion_and_its_neighbours_are_excluded(
-    sensor: str, calm: tuple[NDArray[np.float64], NDArray[np.float64]]
-) -> None:
+def test_a_second_with_motion_and_its_neighbours_are_excluded(sensor: str, calm: tuple[FloatArray, FloatArray]) -> None:
     force, turn = calm
     (force if sensor == "force" else turn)[20, 1] = 0.2 if sensor == "force" else 0.01
     missing = set(range(3, 38)) - set(seconds_of(still_seconds(unit(40, force, turn), velocities(np.zeros(40), 0.02))))
     assert {18, 19, 20, 21, 22} <= missing <= set(range(18, 24))
 
 
-def test_positions_detect_motion_without_velocities(calm: tuple[NDArray[np.float64], NDArray[np.float64]]) -> None:
+def test_positions_detect_motion_without_velocities(calm: tuple[FloatArray, FloatArray]) -> None:
     for speed, expected in ((0.0, 35), (0.5, 0)):
         rows = velocities(np.zeros(40), 0.05)
         rows["kind"] = Kind.POSITION

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, Int64Array, StructArray
 from swath.georef.geodesy.earth import e_from_geodetic, geodetic_from_e, rot_e_from_l
 from swath.georef.geodesy.quaternions import rotation_vector
 from swath.georef.geodesy.rotations import quaternion_from_rot, rot_l_from_b
@@ -29,7 +29,7 @@ from swath.georef.navigation.inputs import (
     imu_noise,
     sort_observations,
 )
-from swath.georef.records import FixType, StructArray
+from swath.georef.records import FixType
 from swath.sim.flight.trajectory import Trajectory
 from swath.sim.imu.sensors import error_matrix, true_increments
 
@@ -38,7 +38,7 @@ NAVIGATION = FIXTURES / "navigation"
 BEGIN_NS = 2300 * 604_800 * 10**9
 
 
-def ns(t: FloatArray | float) -> NDArray[np.int64]:
+def ns(t: FloatArray | float) -> Int64Array:
     """GPS time of seconds of the recording's week."""
     return BEGIN_NS + np.rint(np.asarray(t) * 1e9).astype(np.int64)
 

@@ -10,12 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import t as student
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import BoolArray, FloatArray, StructArray
 from swath.georef.navigation.inputs import ImuNoise, Inertial, Kind, Solution, imu_noise
-from swath.georef.records import FixType, StructArray
+from swath.georef.records import FixType
 from swath.georef.timescales import SECOND_NS
 from swath.sim.flight.trajectory import fly
 from swath.sim.gnss.receiver import Receiver
@@ -72,7 +71,7 @@ class Aircraft:
     """
 
     truth: Truth
-    on_line: NDArray[np.bool_]
+    on_line: BoolArray
 
     @property
     def end_s(self) -> float:
@@ -181,7 +180,7 @@ class Seeds:
     high: FloatArray
 
     @property
-    def holds(self) -> NDArray[np.bool_]:
+    def holds(self) -> BoolArray:
         """Return (6,) whether the measured values lie within their bounds."""
         return (self.low <= self.measured) & (self.measured <= self.high)
 

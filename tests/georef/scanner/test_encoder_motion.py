@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from swath.georef.arrays import FloatArray
-from swath.georef.records import RETURN_DTYPE, Int64Array, StructArray
+from swath.georef.arrays import FloatArray, Int64Array, StructArray
+from swath.georef.records import RETURN_DTYPE
 from swath.georef.scanner.encoder_motion import EncoderMotion
 from swath.sim.scanners.motions import polygon, sine, triangle, turning
 

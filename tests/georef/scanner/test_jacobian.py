@@ -9,9 +9,8 @@ import pytest
 from pyproj import Transformer
 from scipy.spatial.transform import Rotation
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, StructArray
 from swath.georef.points import Rays
-from swath.georef.records import StructArray
 from swath.georef.scanner.beams import LineGeometry
 from swath.georef.scanner.calibration import INDEX, PARAMETERS, Calibration, nominal
 from swath.georef.scanner.jacobian import OBSERVATIONS, columns_l, observation_columns_e, parameter_columns_e

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from swath.georef.records import RETURN_DTYPE, StructArray
+from swath.georef.arrays import StructArray
+from swath.georef.records import RETURN_DTYPE
 from swath.georef.scanner.ranging import PulseRates, RangingError, ZoneResolver
 from tests.sim.srep_spoken import Spoken, joined, scanner, speak
 

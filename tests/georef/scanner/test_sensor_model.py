@@ -8,14 +8,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from pyproj import Transformer
 from scipy.spatial.transform import Rotation, Slerp
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, Int64Array, StructArray
 from swath.georef.geodesy.rotations import boresight, rot_x
 from swath.georef.points import Fate, Rays
-from swath.georef.records import StructArray
 from swath.georef.scanner.beams import LineGeometry
 from swath.georef.scanner.calibration import Calibration, RangeOffset, nominal
 from swath.georef.scanner.mount import Mount, Stage
@@ -37,7 +35,7 @@ UNIT = nominal("left", [0, 0, 0], np.eye(3))
 class Flights:
     """Many short flights all over the earth, one second after the other, two epochs each."""
 
-    time_ns: NDArray[np.int64]
+    time_ns: Int64Array
     lat_rad: FloatArray
     lon_rad: FloatArray
     height_m: FloatArray
@@ -84,7 +82,7 @@ class Shots:
     """One pulse a flight, and the encoder's motion."""
 
     rows: StructArray
-    time_ns: NDArray[np.int64]
+    time_ns: Int64Array
     rate: FloatArray
     acceleration: FloatArray
 

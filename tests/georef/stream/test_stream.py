@@ -9,16 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from swath.georef.arrays import ByteArray
+from swath.georef.arrays import ByteArray, Int64Array, StructArray
 from swath.georef.points import Fate, Points
 from swath.georef.records import (
     DEVICE_CLOCK_DTYPE,
     INS_DTYPE,
     RETURN_DTYPE,
-    Int64Array,
     NamesEdge,
     PpsEdge,
-    StructArray,
     TimeMessage,
     TimeScale,
     TimeTag,

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-from swath.georef.records import DEVICE_CLOCK_DTYPE, Int64Array, StructArray
+from swath.georef.arrays import FloatArray, Int64Array, StructArray
+from swath.georef.records import DEVICE_CLOCK_DTYPE
 from swath.georef.timescales import DeviceClock, Stamps, StampScale
 from swath.georef.timescales.stamp_scale import judge
 from tests.builders import NS, START_S, host_clock, host_ns
@@ -159,7 +159,7 @@ def rows_of(stamps: Int64Array, gps: Int64Array, locked: int = -1) -> StructArra
     return rows
 
 
-def errors(clock: DeviceClock, rows: StructArray, gps: Int64Array) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def errors(clock: DeviceClock, rows: StructArray, gps: Int64Array) -> tuple[FloatArray, FloatArray]:
     placed, sigma = clock.gps_from_device(rows["device_time_ns"], rows["host_time_ns"])
     return (placed - gps).astype(np.float64), sigma
 

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-from swath.georef.records import DEVICE_CLOCK_DTYPE, NamesEdge, StructArray, TimeMessage, TimeScale, TimeTag
+from swath.georef.arrays import BoolArray, FloatArray, Int64Array, StructArray
+from swath.georef.records import DEVICE_CLOCK_DTYPE, NamesEdge, TimeMessage, TimeScale, TimeTag
 from swath.georef.timescales import DeviceClock, PpsClock, TimeState
 from tests.builders import NS, START_S, host_clock, host_ns
 from tests.georef.clock_run import rms
@@ -18,7 +18,7 @@ POWER_ON_NS = 77_000_000_000  # device time at START_S
 DEVICE_RATE = 1.0 - 41e-6
 
 
-def device_ns(true_s: NDArray[np.float64] | float) -> NDArray[np.int64]:
+def device_ns(true_s: FloatArray | float) -> Int64Array:
     """Device time of true seconds since START_S, in whole 100 ns ticks."""
     ticks = np.rint((POWER_ON_NS + np.asarray(true_s, dtype=np.float64) * DEVICE_RATE * NS) / 100.0)
     return ticks.astype(np.int64) * 100
@@ -37,8 +37,8 @@ def test_an_edge_stamped_in_the_future_does_not_stop_the_clock() -> None:
 
 
 def rows_of(
-    true_s: NDArray[np.float64],
-    latency_s: NDArray[np.float64] | float = 0.0005,
+    true_s: FloatArray,
+    latency_s: FloatArray | float = 0.0005,
     *,
     latched: bool = True,
     locked: int = -1,
@@ -53,9 +53,7 @@ def rows_of(
     return rows
 
 
-def errors_ns(
-    clock: DeviceClock, true_s: NDArray[np.float64], host: NDArray[np.int64] | None = None
-) -> NDArray[np.float64]:
+def errors_ns(clock: DeviceClock, true_s: FloatArray, host: Int64Array | None = None) -> FloatArray:
     """Return errors of device times of true seconds."""
     gps, sigma = clock.gps_from_device(device_ns(true_s), host)
     assert np.all(np.isfinite(sigma))
@@ -176,7 +174,7 @@ def fed_whole_and_in_pieces(rows: StructArray, seconds: int) -> Iterator[DeviceC
         yield clock
 
 
-def head_rows(times: NDArray[np.float64], free: NDArray[np.bool_], free_s: NDArray[np.float64]) -> StructArray:
+def head_rows(times: FloatArray, free: BoolArray, free_s: FloatArray) -> StructArray:
     """Of a head whose second is the edge while it is locked; free for so long it is 20 ppm fast."""
     rows = rows_of(times, latched=False)
     rows["device_time_ns"] = np.rint((times + np.where(free, 20e-6 * free_s, 0.0)) * NS)

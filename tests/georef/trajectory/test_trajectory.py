@@ -6,11 +6,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from pyproj import Transformer
 from scipy.spatial.transform import Rotation, Slerp
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.georef.points import Fate
 from swath.georef.trajectory.trajectory import Trajectory, TrajectoryError, TrajectoryGapError, locate_epoch
 from tests.georef.builders import as_rotation
@@ -41,7 +40,7 @@ def wild(n: int = 400, seed: int = 3, **changes: Any) -> Trajectory:
     return Trajectory.from_geodetic(**(columns | changes))
 
 
-def inside(trajectory: Trajectory, n: int = 5000) -> NDArray[np.int64]:
+def inside(trajectory: Trajectory, n: int = 5000) -> Int64Array:
     """Times over the whole span, epochs themselves among them."""
     first_ns, last_ns = trajectory.span
     return np.sort(np.r_[np.random.default_rng(5).integers(first_ns, last_ns, n), trajectory.time_ns])
@@ -168,7 +167,7 @@ def test_neighbouring_quaternions_have_the_same_sign() -> None:
 # --------------------------------------------------------------------------------------------- velocities
 
 
-def eastwards(times_ns: NDArray[np.int64], said: FloatArray | None = None) -> Trajectory:
+def eastwards(times_ns: Int64Array, said: FloatArray | None = None) -> Trajectory:
     """Along the equator with a speed that grows by 2 m/s²."""
     seconds = (times_ns - START_NS) / 1e9
     lon = (60.0 * seconds + seconds**2) / 6_378_137.0

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from swath.georef.records import INS_DTYPE, StructArray
+from swath.georef.arrays import StructArray
+from swath.georef.records import INS_DTYPE
 from swath.georef.trajectory.buffer import TrajectoryBuffer
 from swath.georef.trajectory.trajectory import Trajectory
 

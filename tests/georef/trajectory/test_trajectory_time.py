@@ -10,10 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.georef.trajectory.trajectory import Trajectory, TrajectoryError
 from swath.georef.trajectory.turn_rates import TimeShift, correlate_turn_rates
 from swath.sim.imu.sensors import true_increments
@@ -27,7 +26,7 @@ FIRST_S, LAST_S, RATE_HZ = 60.0, 240.0, 100
 
 
 class Felt(NamedTuple):
-    time_ns: NDArray[np.int64]
+    time_ns: Int64Array
     rate_b: FloatArray
 
 

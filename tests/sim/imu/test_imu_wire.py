@@ -14,8 +14,8 @@ from swath.daemon.config.tables import ImuConfig
 from swath.drivers.can_frames import CAN_FRAME_DTYPE
 from swath.drivers.driver import find_driver
 from swath.drivers.parser import DeviceSettings
-from swath.georef.arrays import FloatArray
-from swath.georef.records import ChunkBatch, DeviceClockSamples, ImuSamples, StructArray
+from swath.georef.arrays import FloatArray, StructArray
+from swath.georef.records import ChunkBatch, DeviceClockSamples, ImuSamples
 from swath.sim.clocks import PulsePerSecond
 from swath.sim.imu.sensors import InertialUnit
 from swath.sim.imu.wire import FORCE_UNIT_MPS2, RATE_UNIT_RADPS, ImuWire, config_table, dbc_text

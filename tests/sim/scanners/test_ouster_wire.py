@@ -12,14 +12,13 @@ from swath.daemon.config.tables import ScannerConfig
 from swath.drivers.parser import DeviceSettings
 from swath.drivers.scanner.ouster.head import beam_points, read_head
 from swath.drivers.scanner.ouster.parser import OusterParser
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, StructArray
 from swath.georef.records import RETURN_FLAG_LAST, RETURN_FLAG_STRONGEST, DeviceClockSamples, ScannerReturns
 from swath.sim.plan.errors import PlanError
 from swath.sim.plan.plan import Plan
 from swath.sim.scanners.ouster_wire import OusterWire, config_table, os1_metadata
 from swath.sim.scanners.spinning_heads import Os1Head
 from swath.sim.shots import WireUnit
-from swath.sim.truth import StructArray
 from tests.sim.heads import Shots, feed, measured_of, plan_of, pulse, rows_of
 
 PER_PACKET = 16 * 64

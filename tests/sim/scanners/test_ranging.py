@@ -6,10 +6,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy import stats
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.sim.atmosphere import Air
 from swath.sim.plan.errors import PlanError
 from swath.sim.plan.tables import AtmosphereTable, ScannerTable
@@ -26,7 +25,7 @@ def scanner(**keys: Any) -> ScannerTable:
     return ScannerTable.model_validate({"range_min_m": 1.0, "range_max_m": 5000.0} | keys)
 
 
-def pulses_of(number: NDArray[np.int64], channel: Any = 0) -> Pulses:
+def pulses_of(number: Int64Array, channel: Any = 0) -> Pulses:
     n = len(number)
     channels = np.broadcast_to(np.asarray(channel, np.uint16), (n,))
     return Pulses(

@@ -7,11 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from swath.daemon.config.tables import ScannerConfig
 from swath.drivers.scanner.srep.layout import HEADER_DTYPE, SrepHeader, encode_datagram, encode_datagrams, pulse_dtype
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.sim.clocks import Oscillator, PulsePerSecond
 from swath.sim.plan.errors import PlanError
 from swath.sim.plan.tables import HostTable, PpsTable, ScannerTable
@@ -32,7 +31,7 @@ from tests.sim.srep_spoken import (
 )
 
 
-def expected_angle(table: ScannerTable, encoder: NDArray[np.int64]) -> FloatArray:
+def expected_angle(table: ScannerTable, encoder: Int64Array) -> FloatArray:
     """θ_encoder by PROTOCOLS' words."""
     shaft = 2 * np.pi * encoder / table.encoder_counts
     if table.kind == "polygon":

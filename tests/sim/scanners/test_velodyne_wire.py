@@ -13,7 +13,7 @@ from swath.drivers.parser import DeviceSettings
 from swath.drivers.scanner.beams import beam_points
 from swath.drivers.scanner.velodyne.heads import VLP16
 from swath.drivers.scanner.velodyne.parser import VelodyneParser
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, StructArray
 from swath.georef.records import (
     RETURN_FLAG_LAST,
     RETURN_FLAG_PPS_LOCKED,
@@ -30,7 +30,6 @@ from swath.sim.scanners.spinning_heads import Vlp16Head
 from swath.sim.scanners.spinning_wire import PPS_LOCKED, HeadClock
 from swath.sim.scanners.velodyne_wire import VelodyneWire, config_table
 from swath.sim.shots import WireUnit
-from swath.sim.truth import StructArray
 from tests.sim.heads import Shots, Still, feed, measured_of, plan_of, pulse, rows_of
 
 START_PAST_HOUR_S = 3598.0  # of the plans of tests.sim.heads

@@ -11,14 +11,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.calib.equations.trajectory_prior import TrajectoryPrior, from_smoother, knots_of
 from swath.calib.flight import Flight
 from swath.daemon.config.tables import NoiseConfig
 from swath.daemon.processing.navigation.observations import heading_observations
 from swath.daemon.processing.navigation.sources import filter_setup, noise_of
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import BoolArray, FloatArray, Int64Array, StructArray
 from swath.georef.geodesy.earth import e_from_geodetic
 from swath.georef.navigation.cross_covariance import error_chain
 from swath.georef.navigation.filter.filter import FilterRun
@@ -33,7 +32,7 @@ from swath.georef.navigation.inputs import (
     sort_observations,
 )
 from swath.georef.navigation.solve import solve
-from swath.georef.records import FixType, GnssHeading, Int64Array, StructArray
+from swath.georef.records import FixType, GnssHeading
 from swath.georef.timescales import SECOND_NS
 from swath.sim.gnss.receiver import Epochs, Receiver
 from swath.sim.imu.sensors import true_increments
@@ -141,7 +140,7 @@ def _observations(survey: Survey, name: str, table: GnssTable, setup: Setup, beg
     return sort_observations(np.concatenate(parts))
 
 
-def _headings(epochs: Epochs, there: NDArray[np.bool_]) -> list[GnssHeading]:
+def _headings(epochs: Epochs, there: BoolArray) -> list[GnssHeading]:
     columns = (epochs.heading_rad, epochs.pitch_rad, epochs.heading_sigma_rad, epochs.pitch_sigma_rad)
     return [
         GnssHeading(-1, None, heading, pitch, None, heading_sigma, pitch_sigma)

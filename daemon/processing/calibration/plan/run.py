@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.calib.equations.normals import NormalError
 from swath.calib.equations.observability import RULES_OF_ALL
@@ -24,7 +23,7 @@ from swath.daemon.errors import ExitCode, UserError, one_line
 from swath.daemon.processing.calibration.model import of_parameters, tables_in_words
 from swath.daemon.processing.calibration.plan.navigation import navigated
 from swath.daemon.processing.calibration.run import EVERY, PLANES
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import ByteArray, FloatArray
 from swath.georef.geodesy.rotations import quaternion_from_rot
 from swath.georef.navigation.inputs import NavigationError
 from swath.georef.scanner.beams import LineGeometry
@@ -269,7 +268,7 @@ def _trajectory(survey: Survey, sigmas: tuple[float, float, float]) -> Trajector
 # ---------------------------------------------------------------------- terrain
 
 
-def _fallen(survey: Survey, places: FloatArray) -> tuple[FloatArray, NDArray[np.uint8]]:
+def _fallen(survey: Survey, places: FloatArray) -> tuple[FloatArray, ByteArray]:
     """Return where rays that fall at places (…, 2) hit: site coordinates (…, 3) and the kind of surface (…)."""
     flat = places.reshape(-1, 2)
     top = survey.scene.site_z(flat[:, 0], flat[:, 1]) + ABOVE_M

@@ -14,8 +14,7 @@ from swath.calib.features import Plane
 from swath.calib.flight import Flight
 from swath.calib.summary import ReportInput
 from swath.daemon.processing.pages.canvas import INK, MOST_MARKS, MUTED, Canvas, Format, Panels, Picture, colour_of
-from swath.georef.arrays import FloatArray
-from swath.georef.records import Int64Array
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.georef.scanner.calibration import Calibration
 
 MOST_CUTS = 3

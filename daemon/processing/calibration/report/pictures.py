@@ -12,7 +12,6 @@ from matplotlib.colors import Normalize
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 from matplotlib.ticker import FuncFormatter, NullFormatter
-from numpy.typing import NDArray
 
 from swath.calib.labels import number, unknown
 from swath.calib.outcome import TrajectoryFit
@@ -31,7 +30,7 @@ from swath.daemon.processing.pages.canvas import (
     Picture,
     colour_of,
 )
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.georef.timescales.gps_time import SECOND_NS
 
 MOST_CELLS = 60  # maximum unknowns in the correlation matrix
@@ -226,7 +225,7 @@ def _trajectory_picture(fit: TrajectoryFit, trajectory_index: int, *, several: b
     return Picture(title, words, lambda form: 0.3 + Panels.height_in(form, 6, panel_in), draw)
 
 
-def _breaks(minutes: FloatArray) -> NDArray[np.int64]:
+def _breaks(minutes: FloatArray) -> Int64Array:
     """Return the indexes at which a line would join stretches flown long apart."""
     steps = np.diff(minutes)
     return np.flatnonzero(steps > 5.0 * np.median(steps)) + 1 if len(steps) else np.zeros(0, np.int64)

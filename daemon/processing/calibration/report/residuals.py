@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from swath.calib.outcome import Residuals
 from swath.calib.summary import ReportInput
 from swath.daemon.processing.pages.canvas import BAD, INK, MUTED, SERIES, Canvas, Format, Panels, Picture
-from swath.georef.arrays import FloatArray
-from swath.georef.records import Int64Array
+from swath.georef.arrays import FloatArray, Int64Array
 
 PANEL_IN, NORMAL_IN = 1.7, 2.0
 MOST_COLUMNS, MOST_ROWS, EACH = 40, 41, 400  # of the shaded panels; observations per column at least, about

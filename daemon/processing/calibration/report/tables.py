@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.calib.labels import (
     Unknown,
@@ -24,6 +23,7 @@ from swath.calib.summary import ReportInput
 from swath.calib.verdict import held_words
 from swath.daemon.processing.calibration.report.pictures import SUSPECT
 from swath.daemon.processing.pages.blocks import Table
+from swath.georef.arrays import BoolArray
 from swath.georef.scanner.calibration import INDEX, PARAMETERS
 
 MOST_ROWS = 25
@@ -221,7 +221,7 @@ def _feature(report: ReportInput, group: Residuals, index: int) -> str:
     return known[index].name if 0 <= index < len(known) else str(index)
 
 
-def _strips(report: ReportInput, group: Residuals, rows: NDArray[np.bool_]) -> str:
+def _strips(report: ReportInput, group: Residuals, rows: BoolArray) -> str:
     swaths = np.unique(group.swath[rows])
     return ", ".join(report.flight.swaths[index].name if index >= 0 else "control" for index in swaths.tolist())
 

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 from mcap.reader import make_reader
-from numpy.typing import NDArray
 from pyproj import CRS, Transformer
 
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.georef.points import Points
 from swath.georef.timescales.gps_time import SECOND_NS
 from swath.georef.trajectory.trajectory import Trajectory
@@ -68,7 +68,7 @@ class Utm:
         self.wkt = CRS.from_user_input(crs).to_wkt()
         self.unit_m = np.array(unit_m)
 
-    def map_from_e(self, points_e: NDArray[np.float64]) -> NDArray[np.float64]:
+    def map_from_e(self, points_e: FloatArray) -> FloatArray:
         """Return coordinates (n, 3) of the mapping frame for points (n, 3) in e."""
         return np.stack(self._transformer.transform(*points_e.T), axis=-1)
 
@@ -91,7 +91,7 @@ def flight(epochs: int = 11) -> Trajectory:
     )
 
 
-def points_at(points_map: NDArray[np.float64], time_ns: NDArray[np.int64] | None = None) -> Points:
+def points_at(points_map: FloatArray, time_ns: Int64Array | None = None) -> Points:
     """Return points at these coordinates, without sigmas, by default a nanosecond apart."""
     n = len(points_map)
     single, byte = np.zeros(n, np.float32), np.ones(n, np.uint8)

@@ -16,7 +16,6 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from rich.text import Text
 
 from swath.daemon.cli.live import page
@@ -36,6 +35,7 @@ from swath.daemon.processing.points.feed import TICK_BYTES, TICK_NS
 from swath.daemon.processing.setup.setup import Options, Setup
 from swath.daemon.processing.warm_up import WarmUp
 from swath.daemon.simulate.into_log import fly_into_log
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.georef.points import Fate
 from swath.georef.stream.clocks import DevicePlan
 from swath.georef.timescales import ClockStatus, TimeState
@@ -260,7 +260,7 @@ class TestStatus:
         """The clock is asked once a second and answers differently each time here."""
         asked: list[int] = []
 
-        def gps_from_host(clock: str, host_ns: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        def gps_from_host(clock: str, host_ns: Int64Array) -> tuple[Int64Array, FloatArray]:
             asked.append(int(host_ns[0]))
             return host_ns + 100_000_000 * len(asked), np.array([np.inf if len(asked) == 1 else 1.0])
 

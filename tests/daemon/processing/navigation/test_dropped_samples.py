@@ -7,18 +7,18 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from swath.daemon.processing.navigation.inputs import _missing
 from swath.daemon.processing.navigation.times import ImuTimes, Stretch
+from swath.georef.arrays import Int64Array, StructArray
 from swath.georef.navigation.samples import Sampler
-from swath.georef.records import IMU_DTYPE, Int64Array
+from swath.georef.records import IMU_DTYPE
 
 S = 1_000_000_000
 RATE_HZ = 100.0
 BEGIN_NS = 1_479_297_618 * S
 FIRST = 400  # sample from which they are spoilt
-Spoil = Callable[[NDArray[np.void], Int64Array, slice], None]
+Spoil = Callable[[StructArray, Int64Array, slice], None]
 
 
 def holes(spoil: Spoil, count: int) -> list[Stretch]:
@@ -33,24 +33,24 @@ def holes(spoil: Spoil, count: int) -> list[Stretch]:
     return _missing(ImuTimes(rows, stamps_ns, 0.0, "gps", Counter()), sampler, (), RATE_HZ)
 
 
-def no_numbers(rows: NDArray[np.void], stamps_ns: Int64Array, at: slice) -> None:
+def no_numbers(rows: StructArray, stamps_ns: Int64Array, at: slice) -> None:
     rows["angular_rate_b"][at, 1] = np.nan
 
 
-def far_back(rows: NDArray[np.void], stamps_ns: Int64Array, at: slice) -> None:
+def far_back(rows: StructArray, stamps_ns: Int64Array, at: slice) -> None:
     stamps_ns[at] -= 200 * S
 
 
-def again(rows: NDArray[np.void], stamps_ns: Int64Array, at: slice) -> None:
+def again(rows: StructArray, stamps_ns: Int64Array, at: slice) -> None:
     """A clock that is set back by as much as it takes: from there on the same times come twice."""
     stamps_ns[at.start :] -= (at.stop - at.start) * (S // 100)
 
 
-def stuck(rows: NDArray[np.void], stamps_ns: Int64Array, at: slice) -> None:
+def stuck(rows: StructArray, stamps_ns: Int64Array, at: slice) -> None:
     stamps_ns[at] = stamps_ns[at.start - 1]
 
 
-def lone(rows: NDArray[np.void], stamps_ns: Int64Array, at: slice) -> None:
+def lone(rows: StructArray, stamps_ns: Int64Array, at: slice) -> None:
     """Stamps that no other comes near to, each farther away than the one before."""
     stamps_ns[at] += np.arange(1, at.stop - at.start + 1) * 600 * S
 
@@ -75,7 +75,7 @@ def test_a_long_run_of_dropped_samples_is_reported_as_one_gap(spoil: Spoil, begi
 
 
 def test_a_gap_that_dropped_samples_explain_only_in_part_is_reported_separately() -> None:
-    def stuck_then_silent(rows: NDArray[np.void], stamps_ns: Int64Array, at: slice) -> None:
+    def stuck_then_silent(rows: StructArray, stamps_ns: Int64Array, at: slice) -> None:
         stuck(rows, stamps_ns, at)
         stamps_ns[at.stop :] += 5 * S
 

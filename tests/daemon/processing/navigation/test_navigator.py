@@ -7,11 +7,11 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from swath.daemon.log.mcap.chunks import LogBatch
 from swath.daemon.processing.points.feed import LogFeed
 from swath.daemon.processing.setup.setup import Options, Setup
+from swath.georef.arrays import StructArray
 from swath.georef.navigation.inputs import OBSERVATION_DTYPE
 from swath.georef.points import Fate, Points
 from swath.georef.timescales import SECOND_NS
@@ -60,7 +60,7 @@ def setup(flown: Flown) -> Setup:
     return Setup.of_log(flown.session().attachments(), Options(datum="same", uncertainty=False))
 
 
-Told = tuple[NDArray[np.void], list[tuple[str, Points]], LogFeed]
+Told = tuple[StructArray, list[tuple[str, Points]], LogFeed]
 
 
 def told(setup: Setup, flown: Flown, batches: Iterable[LogBatch]) -> Told:
@@ -68,11 +68,11 @@ def told(setup: Setup, flown: Flown, batches: Iterable[LogBatch]) -> Told:
     feed = LogFeed(setup, setup.live_stream(flown.session().info))
     navigator = feed.navigator
     assert navigator is not None
-    poses: list[NDArray[np.void]] = []
+    poses: list[StructArray] = []
     path = feed.stream.path
     add = path.add
 
-    def noted(rows: NDArray[np.void]) -> None:
+    def noted(rows: StructArray) -> None:
         poses.append(rows)
         add(rows)
 

@@ -35,7 +35,7 @@ from swath.daemon.processing.navigation.times import counted_arrivals, imu_times
 from swath.drivers.gnss.nmea.parser import NmeaParser
 from swath.drivers.gnss.nmea.sentences import encode_gga
 from swath.drivers.parser import DeviceSettings
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, StructArray
 from swath.georef.formats.antenna_positions import read_antenna_positions
 from swath.georef.navigation.alignment.noise import white_factor
 from swath.georef.navigation.diagnosis.data import Finding
@@ -48,7 +48,6 @@ from swath.georef.records import (
     GnssHeading,
     NamesEdge,
     PpsEdge,
-    StructArray,
     TimeMessage,
     TimeScale,
     TimeTag,

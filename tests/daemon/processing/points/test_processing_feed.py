@@ -29,9 +29,10 @@ from swath.daemon.processing.points.runs import JOINED_BYTES
 from swath.daemon.processing.setup.models import TerrainRanges
 from swath.daemon.processing.setup.setup import Options, Setup
 from swath.daemon.simulate.into_log import fly_into_log
+from swath.georef.arrays import Int64Array, StructArray
 from swath.georef.coarse_terrain import CoarseTerrain
 from swath.georef.points import Fate
-from swath.georef.records import ChunkBatch, Int64Array, Record, StructArray
+from swath.georef.records import ChunkBatch, Record
 from swath.georef.stream.stream import Stream, StreamSettings
 from swath.georef.trajectory.buffer import TrajectoryBuffer
 from swath.georef.trajectory.trajectory import Trajectory

@@ -12,12 +12,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from swath.daemon.config import parse_config
 from swath.daemon.processing.setup.models import make_motion
 from swath.daemon.processing.setup.setup import Options, Setup
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import ByteArray, FloatArray
 from swath.georef.points import Points
 from swath.sim.companions import config_text, default_wires
 from tests.builders import (
@@ -83,7 +82,7 @@ def fly(folder: Path, case: Case, atmosphere: dict[str, str]) -> Flown:
     return fly_and_decode(folder, changes, case.stop_s)
 
 
-def georeferenced(flown: Flown, folder: Path) -> tuple[Points, NDArray[np.uint8]]:
+def georeferenced(flown: Flown, folder: Path) -> tuple[Points, ByteArray]:
     """Georeference with the configuration of the flight and the true calibration."""
     for name, data in flown.files.items():
         (folder / name).write_bytes(data)

@@ -21,8 +21,7 @@ from swath.drivers.driver import find_driver
 from swath.drivers.parser import DeviceSettings, PacketParser
 from swath.drivers.scanner.hesai.heads import XT32
 from swath.drivers.scanner.velodyne.heads import VLP16, VLP32C, SpinningHead
-from swath.georef.arrays import FloatArray
-from swath.georef.records import StructArray
+from swath.georef.arrays import FloatArray, StructArray
 from swath.georef.scanner.beams import OusterGeometry, SpinningGeometry
 from swath.georef.scanner.calibration import nominal
 from swath.georef.scanner.sensor_model import SensorModel

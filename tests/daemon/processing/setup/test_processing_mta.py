@@ -21,11 +21,11 @@ from swath.daemon.processing.setup.models import TerrainRanges, connect, make_re
 from swath.drivers.parser import DeviceSettings
 from swath.drivers.scanner.srep.layout import SrepHeader, encode_datagram
 from swath.drivers.scanner.srep.parser import SrepParser
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import BoolArray, FloatArray, Int64Array, StructArray
 from swath.georef.coarse_terrain import CoarseTerrain
 from swath.georef.georeference import Georeferencer
 from swath.georef.points import Fate, Points
-from swath.georef.records import ChunkBatch, Int64Array, ScannerReturns, StructArray
+from swath.georef.records import ChunkBatch, ScannerReturns
 from swath.georef.scanner.beams import LineGeometry
 from swath.georef.scanner.calibration import RangeOffset, nominal
 from swath.georef.scanner.ranging import PulseRates
@@ -107,12 +107,12 @@ class Flight:
         return self.record - self.pulse
 
     @property
-    def came(self) -> NDArray[np.bool_]:
+    def came(self) -> BoolArray:
         """(k,) whose record was not lost."""
         return ~np.isin(self.record // PER_DATAGRAM, LOST)
 
     @property
-    def known(self) -> NDArray[np.bool_]:
+    def known(self) -> BoolArray:
         """(k,) whose emission was not lost either."""
         return self.came & ~np.isin(self.pulse // PER_DATAGRAM, LOST)
 
@@ -192,7 +192,7 @@ class SteadyClocks:
     def update(self) -> None:
         """Do nothing."""
 
-    def place(self, source: str, rows: StructArray, worst_ns: float) -> tuple[NDArray[np.bool_], Int64Array]:
+    def place(self, source: str, rows: StructArray, worst_ns: float) -> tuple[BoolArray, Int64Array]:
         del source, worst_ns
         return np.ones(len(rows), np.bool_), rows["device_time_ns"] + GPS_MINUS_DEVICE_NS
 

@@ -18,6 +18,7 @@ from swath.drivers.gnss.sbf import blocks as sbf
 from swath.drivers.gnss.sbf.frame import encode_frame
 from swath.drivers.gnss.sbf.parser import SbfParser
 from swath.drivers.parser import DeviceSettings, DriverSettingsError
+from swath.georef.arrays import StructArray
 from swath.georef.records import (
     Chunk,
     EventMark,
@@ -28,7 +29,6 @@ from swath.georef.records import (
     InsSolution,
     NamesEdge,
     Record,
-    StructArray,
     TimeMessage,
 )
 from swath.georef.timescales import PpsClock, TimeState

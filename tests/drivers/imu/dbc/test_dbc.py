@@ -24,7 +24,8 @@ from swath.drivers.driver import Driver, find_driver
 from swath.drivers.imu.counters import CounterUnwrapper
 from swath.drivers.imu.dbc.parser import DbcParser, make_clock_parser
 from swath.drivers.parser import DeviceSettings, DriverSettingsError, Parser
-from swath.georef.records import ChunkBatch, DeviceClockSamples, Int64Array, Record, StructArray
+from swath.georef.arrays import Int64Array, StructArray
+from swath.georef.records import ChunkBatch, DeviceClockSamples, Record
 from tests.drivers.harness import Snapshot, check_packet_damage, check_packets, packed_rows
 from tests.drivers.imu_dbc import (
     ACC,

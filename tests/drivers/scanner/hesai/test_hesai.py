@@ -28,6 +28,7 @@ from swath.drivers.scanner.hesai.parser import (
     HesaiParser,
     encode_point_packet,
 )
+from swath.georef.arrays import StructArray
 from swath.georef.records import (
     RETURN_FLAG_LAST,
     RETURN_FLAG_PPS_LOCKED,
@@ -38,7 +39,6 @@ from swath.georef.records import (
     NamesEdge,
     Record,
     ScannerReturns,
-    StructArray,
     TimeMessage,
 )
 from swath.georef.timescales import DeviceClock

@@ -6,7 +6,7 @@ import numpy as np
 
 from swath.drivers.scanner.ouster.head import read_head
 from swath.drivers.scanner.ouster.layout import LidarLayout
-from swath.georef.records import StructArray
+from swath.georef.arrays import StructArray
 from tests.drivers.ouster_cases import metadata_of, payloads
 
 

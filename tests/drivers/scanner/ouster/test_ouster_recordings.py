@@ -16,7 +16,8 @@ from swath.drivers.driver import find_driver
 from swath.drivers.parser import DeviceSettings
 from swath.drivers.scanner.ouster.head import beam_points
 from swath.drivers.scanner.ouster.layout import LidarLayout
-from swath.georef.records import Chunk, StructArray
+from swath.georef.arrays import StructArray
+from swath.georef.records import Chunk
 from tests.drivers.builders import feed, returns_of
 from tests.drivers.ouster_cases import EXPECTED, FIXTURES, metadata_of, payloads, recorded
 from tests.drivers.scanner.ouster.builders import lidar_packets

@@ -16,7 +16,8 @@ from swath.drivers.scanner.rows.filler import filler
 from swath.drivers.scanner.rows.slots import PairRule, ReturnSlots, common_words, in_order, returns_table
 from swath.drivers.scanner.srep.layout import SrepHeader, encode_datagram
 from swath.drivers.scanner.srep.parser import SrepParser
-from swath.georef.records import Record, ScannerReturns, StructArray
+from swath.georef.arrays import StructArray
+from swath.georef.records import Record, ScannerReturns
 from tests.drivers.builders import feed
 from tests.fuzz.recordings import packets_of, settings_of
 

@@ -17,15 +17,8 @@ from swath.drivers.driver import find_driver
 from swath.drivers.parser import DeviceSettings, DriverSettingsError
 from swath.drivers.scanner.srep.layout import SrepHeader, datagram_bytes, encode_datagram
 from swath.drivers.scanner.srep.parser import SrepParser
-from swath.georef.records import (
-    Chunk,
-    ChunkBatch,
-    DeviceClockSamples,
-    DeviceStatus,
-    Record,
-    ScannerReturns,
-    StructArray,
-)
+from swath.georef.arrays import StructArray
+from swath.georef.records import Chunk, ChunkBatch, DeviceClockSamples, DeviceStatus, Record, ScannerReturns
 from tests.drivers.builders import clock_of, returns_of
 from tests.drivers.harness import check_packet_damage, check_packets
 from tests.drivers.srep_cases import TEST_VECTOR, reference_decode, scan_lines, split_datagrams

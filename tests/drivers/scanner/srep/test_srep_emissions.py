@@ -11,7 +11,8 @@ import pytest
 from swath.drivers.parser import DeviceSettings
 from swath.drivers.scanner.srep.layout import SrepHeader, encode_datagram
 from swath.drivers.scanner.srep.parser import FLAG_NO_POINT, SrepParser
-from swath.georef.records import ChunkBatch, ScannerReturns, StructArray
+from swath.georef.arrays import StructArray
+from swath.georef.records import ChunkBatch, ScannerReturns
 from swath.georef.stream.stream import CONTEXT_FLAG
 
 pytestmark = pytest.mark.xdist_group("kernels")

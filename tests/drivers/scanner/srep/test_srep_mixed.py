@@ -16,7 +16,8 @@ from swath.drivers.scanner.sequence import LATE_DATAGRAMS
 from swath.drivers.scanner.srep import parser as srep
 from swath.drivers.scanner.srep.layout import CRC, SrepHeader, encode_datagram
 from swath.drivers.scanner.srep.parser import SrepParser
-from swath.georef.records import Chunk, ChunkBatch, Record, StructArray
+from swath.georef.arrays import StructArray
+from swath.georef.records import Chunk, ChunkBatch, Record
 from tests.drivers.harness import Outcome, outcome
 
 pytestmark = pytest.mark.xdist_group("kernels")

@@ -23,6 +23,7 @@ from swath.drivers.scanner.velodyne.parser import (
     encode_data_packet,
 )
 from swath.drivers.scanner.velodyne.position import encode_position_packet, rmc_time
+from swath.georef.arrays import StructArray
 from swath.georef.records import (
     RETURN_FLAG_LAST,
     RETURN_FLAG_PPS_LOCKED,
@@ -33,7 +34,6 @@ from swath.georef.records import (
     NamesEdge,
     Record,
     ScannerReturns,
-    StructArray,
     TimeMessage,
 )
 from tests.drivers.builders import feed, returns_of

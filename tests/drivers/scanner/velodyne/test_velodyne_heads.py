@@ -22,6 +22,7 @@ from swath.drivers.scanner.velodyne.parser import (
     encode_data_packet,
 )
 from swath.drivers.scanner.velodyne.position import encode_position_packet
+from swath.georef.arrays import StructArray
 from swath.georef.records import (
     RETURN_DTYPE,
     RETURN_FLAG_LAST,
@@ -30,7 +31,6 @@ from swath.georef.records import (
     DeviceClockSamples,
     DeviceStatus,
     ScannerReturns,
-    StructArray,
 )
 from tests.drivers.builders import feed, returns_of
 from tests.drivers.harness import check_packet_damage, check_packets

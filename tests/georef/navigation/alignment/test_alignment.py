@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, StructArray
 from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
 from swath.georef.geodesy.gravity import EARTH_RATE_RADPS
 from swath.georef.geodesy.quaternions import rotation_vector
@@ -17,7 +17,7 @@ from swath.georef.navigation.alignment.align import AlignedStart, Aligner, Align
 from swath.georef.navigation.alignment.blocks import Blocks
 from swath.georef.navigation.alignment.fit import TILT, Problem
 from swath.georef.navigation.inputs import GRADES, OBSERVATION_DTYPE, ImuNoise, Inertial, Kind, Start, sort_observations
-from swath.georef.records import FixType, StructArray
+from swath.georef.records import FixType
 from tests.georef.navigation.vehicles import (
     BEGIN_NS,
     Motion,

@@ -9,10 +9,9 @@ import pytest
 from pyproj import Transformer
 from scipy.spatial.transform import Rotation
 
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, StructArray
 from swath.georef.navigation.alignment.earlier_start import drift_rad, earlier_start
 from swath.georef.navigation.inputs import GRADES, OBSERVATION_DTYPE, Inertial, Kind, Setup, Start, imu_noise
-from swath.georef.records import StructArray
 
 S = 1_000_000_000
 START_NS = 1_465_549_218 * S

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from swath.georef.arrays import StructArray
 from swath.georef.geodesy.earth import e_from_geodetic, rot_e_from_l
 from swath.georef.geodesy.gravity import EARTH_RATE_RADPS, gravity_e
 from swath.georef.geodesy.rotations import attitude_of
@@ -17,7 +18,7 @@ from swath.georef.navigation.filter.smoother import difference, forward
 from swath.georef.navigation.filter.stores import LATEST_ROWS
 from swath.georef.navigation.filter.strapdown import SLOW, SLOW_VELOCITY
 from swath.georef.navigation.inputs import GRADES, Fate, ImuNoise, Inertial, Kind, Start
-from swath.georef.records import FixType, StructArray
+from swath.georef.records import FixType
 from tests.georef.navigation.flights import Fixes, drawn_start, errors, fly, noised, setup_for, survey
 from tests.georef.navigation.scores import (
     FILTER,
