@@ -166,8 +166,13 @@ def runs_with_georef(_: Path) -> None:
 def extra_is_there(_: Path) -> None:
     """pip would fetch it; that it brings all that a command wants is what the tests of processing run on."""
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
-    wanted = {"numba", "scipy", "pyproj", "laspy", "matplotlib", "tomlkit"}
+    wanted = {"numba", "scipy", "pyproj", "laspy", "matplotlib", "jinja2", "tomlkit", "weasyprint"}
     assert {re.split(r"[\[><=]", line)[0] for line in extras["process"]} == wanted
+
+
+def pango_is_installed(_: Path) -> None:
+    """apt would install for this computer; the tests of PDF reports run on the packages that `make test` installs."""
+    assert "libpango-1.0-0 libpangoft2-1.0-0" in (ROOT / "systemd/setup.sh").read_text()
 
 
 def live_unit_is_there(_: Path) -> None:
@@ -207,6 +212,7 @@ EXERCISED: dict[str, Callable[[Path], None]] = {
     "sudo usermod -aG swath $USER": group_may_read,
     "python3 -m venv office && office/bin/pip install '.[process]'": extra_is_there,
     ". office/bin/activate": extra_is_there,
+    "sudo apt-get install libpango-1.0-0 libpangoft2-1.0-0": pango_is_installed,
     "swath georef /mnt/usb -o thurgau-north --crs EPSG:32632": run_points,
     "swath view thurgau-north": runs_with_georef,
     "swath sim fly small -o small": runs_with_georef,

@@ -66,7 +66,7 @@ class FlightOptions:
 def _check_installed() -> None:
     missing = [name for name in NEEDS if importlib.util.find_spec(name) is None]
     if missing:
-        text = f"swath sim needs {', '.join(missing)}; install with: {how_to_install('sim')}"
+        text = f"swath sim needs {', '.join(missing)}, which are not installed: {how_to_install('sim')}"
         raise UserError(text, ExitCode.USAGE)
 
 

@@ -47,7 +47,7 @@ class Plan:
     def changed(self, changes: dict[str, Any]) -> Plan:
         """Return the plan with other values; nested tables are merged, lists are replaced whole."""
         document = _merged(self.tables.model_dump(exclude_unset=True), changes)
-        return replace(self, tables=_validated(document), text=tomlkit.dumps(document))
+        return replace(self, tables=_validated(document), text=tomlkit.dumps(_set_keys(document)))
 
 
 def load_plan(name: str | Path) -> Plan:
@@ -82,6 +82,13 @@ def parse_plan(text: str, folder: Path) -> Plan:
     leap_seconds, _ = table_leap_seconds(start.date())
     start_gps_ns = gps_ns_from_unix(round(start.timestamp()) * 1_000_000_000, leap_seconds)
     return Plan(tables, folder, text, leap_seconds, start_gps_ns)
+
+
+def _set_keys(value: Any) -> Any:
+    """Return a document without the keys whose value is None: TOML has no null, and such a key has its default."""
+    if isinstance(value, dict):
+        return {key: _set_keys(one) for key, one in value.items() if one is not None}
+    return [_set_keys(one) for one in value] if isinstance(value, list) else value
 
 
 def _validated(document: dict[str, Any]) -> Tables:

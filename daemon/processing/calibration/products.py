@@ -32,8 +32,6 @@ from swath.calib.verdict import DEG, held_words, judge
 from swath.daemon.errors import ExitCode, UserError, one_line
 from swath.daemon.processing.calibration.model import in_words, key_of
 from swath.daemon.processing.calibration.record import instruments_of
-from swath.daemon.processing.calibration.report.page import html, pdf
-from swath.daemon.processing.calibration.report.profiles import pictures
 from swath.daemon.processing.calibration.run import OUTCOME, Calibrated, CalibrationOptions, paths_of
 from swath.daemon.processing.carried_verdict import Carried, first_lines, verdict_entry
 from swath.daemon.processing.files import sha256_of, write_whole
@@ -367,12 +365,14 @@ def _wanted(done: Calibrated) -> dict[str, float]:
 
 
 def _with_profiles(report: ReportInput, done: Calibrated) -> ReportInput:
+    from swath.daemon.processing.calibration.report.profiles import pictures
 
     return replace(report, profiles=pictures(done.check, done.kept.flight, done.control))
 
 
 def pages(folder: Path, report: ReportInput, warnings: list[str]) -> dict[Path, bytes]:
     """Return the report as HTML and PDF; where this computer cannot make a PDF, add a warning instead."""
+    from swath.daemon.processing.calibration.report.page import html, pdf
     from swath.daemon.processing.pages.pdf import PdfUnavailableError
 
     files = {folder / PAGE: html(report).encode()}

@@ -151,7 +151,7 @@ def test_every_check_matches_a_plain_computation() -> None:
         (patch_at(0.0), patch_at(0.0, noise_m=0.2), "too rough"),
         (patch_at(0.0), patch_at(0.0, slope=1.2), "too steep"),
         (patch_at(0.0), patch_at(0.0) * [1.0, 0.02, 1.0], "returns in a line"),
-        (patch_at(0.0) + np.array([5.0, 0.0, 0.0]), patch_at(0.0), "returns do not surround it"),
+        (patch_at(0.0) + np.array([5.0, 0.0, 0.0]), patch_at(0.0), "not within the returns"),
     ],
 )
 def test_non_planar_overlap_is_refused_by_reason(first: FloatArray, second: FloatArray, reason: str) -> None:

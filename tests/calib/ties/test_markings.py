@@ -131,7 +131,11 @@ def test_shifts_of_images_to_east_and_north_are_measured() -> None:
         (pattern(SIDE, 1), pattern(SIDE, 2), "the strips have too little in common"),
         (pattern(SIDE, 1, lines_only=True), pattern(SIDE, 1, lines_only=True), "no single peak"),
         (np.ones((SIDE, SIDE)), pattern(SIDE, 1), "the ground has no pattern"),
-        (np.tile(pattern(8, 1), (20, 20))[:SIDE, :SIDE], np.tile(pattern(8, 1), (20, 20))[:SIDE, :SIDE], "alike"),
+        (
+            np.tile(pattern(8, 1), (20, 20))[:SIDE, :SIDE],
+            np.tile(pattern(8, 1), (20, 20))[:SIDE, :SIDE],
+            "equally well",
+        ),
     ],
 )
 def test_ambiguous_images_are_refused(first: FloatArray, second: FloatArray, why: str) -> None:

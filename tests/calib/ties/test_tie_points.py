@@ -227,7 +227,7 @@ def test_sighting_far_from_the_others_is_counted() -> None:
     [
         ("", "t.csv: line 1: has nothing; the columns must be name, strip, x, y, z, sigma_m"),
         ("name,x\n", "t.csv: line 1: has name, x; the columns must be"),
-        ("name,strip,x,y,z,sigma_m\n", "t.csv: no points"),
+        ("name,strip,x,y,z,sigma_m\n", "t.csv: has no points"),
         ("name,strip,x,y,z,sigma_m\na,1,2,3\n", "t.csv: line 2: z is missing"),
         ("name,strip,x,y,z,sigma_m\na,1,2,3,four,1\n", "t.csv: line 2: z: got 'four', want a number"),
         ("name,strip,x,y,z,sigma_m\na,1,2,3,nan,1\n", "t.csv: line 2: z: got 'nan', want a number"),

@@ -162,14 +162,14 @@ def test_a_validation_without_features_says_that_nothing_was_validated(made: Cas
     validation = validate(made.flight, Features(), {"left": made.truth})
     assert validation.passed is None
     assert validation.sentence == "nothing could be validated"
-    assert all("not applied: want" in method.sentence for method in validation.methods)
+    assert all("not applied: needs" in method.sentence for method in validation.methods)
 
 
 def test_few_control_sightings_are_too_few(made: Cast, roofs: Features, control: list[ControlPoint]) -> None:
     away = [ControlPoint("A", control[0].position_t + np.array([5000.0, 0.0, 0.0]), 0.01)]
     method = methods(made, roofs, away)["testfield"]
     assert method.passed is None
-    assert "control is seen 0 times only" in method.sentence
+    assert "strips see control 0 times only" in method.sentence
 
 
 # ---------------------------------------------------------------------- the tests themselves
@@ -343,7 +343,7 @@ def test_failed_remeasurements_and_comparisons_are_reported(made: Cast, roofs: F
     calibrations = {"left": made.truth}
     asked = Asked(anew={}, why_not_anew="the adjustment does not converge")
     validation = validate(made.at_truth(), roofs, calibrations, asked)
-    assert validation.undone == ("parameters anew: the adjustment does not converge",)
+    assert validation.undone == ("independently measured parameters: the adjustment does not converge",)
     elsewhere = tuple(replace(plane, patches=plane.patches[:2]) for plane in roofs.planes)
     swaths = tuple(replace(swath, trajectory_index=number // 2) for number, swath in enumerate(made.flight.swaths))
     flight = replace(made.flight, trajectories=made.flight.trajectories * 2, swaths=swaths).placed(calibrations)

@@ -263,8 +263,8 @@ class TestRefusals:
         begun = logs / "begun_0.mcap"
         begun.touch()
         said = self.refused(capsys, str(logs), "-o", str(tmp_path / "a.sbet"), "--no-page")
-        assert said.endswith(f"a.json: partial: passed over: {begun}: is not an MCAP file\n")
-        assert summary(tmp_path)["holes"] == [f"passed over: {begun}: is not an MCAP file"]
+        assert said.endswith(f"a.json: partial: skipped: {begun}: is not an MCAP file\n")
+        assert summary(tmp_path)["holes"] == [f"skipped: {begun}: is not an MCAP file"]
 
 
 @pytest.mark.parametrize("text", ["1,2", "1,2,x", "1,2,nan", "200,0,0", "0,91,0", "0,0,400", ""])

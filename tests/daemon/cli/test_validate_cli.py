@@ -146,7 +146,7 @@ def test_an_unusable_trajectory_is_the_first_line_and_a_problem(
 
     monkeypatch.setattr(validate_run, "read_flight", judged)
     arguments = (str(file_of(tmp_path / "good.toml", boresight(0.0))), str(log))
-    with pytest.raises(UserError, match=r"^not to be used: navigated trajectory: lever arm; --accept-verdict"):
+    with pytest.raises(UserError, match=r"^not to be used: navigated trajectory: lever arm; use --accept-verdict"):
         run(*arguments)
     assert capsys.readouterr().out.splitlines()[0] == "not to be used: navigated trajectory: lever arm"
     run(*arguments, "--accept-verdict")
@@ -325,7 +325,9 @@ def test_parameters_that_cannot_be_remeasured_are_a_problem(
 ) -> None:
     monkeypatch.setattr(validate_run, "adjust", lambda *rest, **more: SimpleNamespace(converged=False))
     monkeypatch.setattr(validate_run, "prior_of", lambda kept: None)
-    with pytest.raises(UserError, match="parameters anew: the adjustment does not converge") as caught:
+    with pytest.raises(
+        UserError, match="independently measured parameters: the adjustment does not converge"
+    ) as caught:
         run(str(file_of(tmp_path / "good.toml", boresight(0.0))), str(log), "--anew")
     assert caught.value.exit_code == ExitCode.PROBLEM
 

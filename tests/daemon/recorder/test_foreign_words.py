@@ -38,7 +38,9 @@ def test_foreign_text_becomes_one_encodable_line() -> None:
 )
 def test_an_invalid_response_of_a_recorder_is_refused(answer: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(control_client, "_exchange", lambda *_: json.dumps(answer).encode())
-    with pytest.raises(UserError, match="no recorder of this version; start it anew after an update") as refused:
+    with pytest.raises(
+        UserError, match="the recorder there is of another version; restart it after an update"
+    ) as refused:
         ask(Path("/logs"), {"command": "mark", "text": "x"})
     assert refused.value.exit_code == ExitCode.IO
 

@@ -118,7 +118,7 @@ def test_datum_same_is_not_suggested_if_it_would_be_refused() -> None:
 def test_an_accuracy_of_a_decimetre_is_accepted_if_the_user_allows_it() -> None:
     """EPSG gives CHTRS95 → CH1903+ as good to 0.1 m; heights stay on the ellipsoid of the positions, as in PROJ."""
     line = refusal("EPSG:2056", datum="EPSG:4932")
-    assert "good to 0.1 m only" in line
+    assert "accurate to 0.1 m only" in line
     assert line.endswith("output.datum_accuracy_m = 0.1")
     mapping = Mapping("EPSG:2056", datum="EPSG:4933", accuracy_m=0.1)
     swiss = np.array(proj("EPSG:4933", "EPSG:4932").transform(8.5, 47.1, 480.0))[None]

@@ -213,7 +213,7 @@ FAULTS: list[tuple[str, Callable[[Parts], Parts], str, str]] = [
     ),
     ("-l", arms(-1.0), "lever_arm_sign", r"the data fit -l better than .* \[-0.35, 0.12, 1.10\] m: \[0\.[34]\d, "),
     ("-z of l", arms([1.0, 1.0, -1.0]), "lever_arm_sign", "the sign of z is wrong in the given lever_arm_m"),
-    ("at the body", at_body, "position_at_body", "are of the body's origin, not of an antenna"),
+    ("at the body", at_body, "position_at_body", "are those of the body's origin, not of an antenna"),
     ("at the antenna", arms(0.0), "lever_arm", "check whether they are an INS solution at the antenna"),
     ("antennas", dual(RIGHT, -RIGHT), "antennas_swapped", "headings are 1(79|80)° off .* antennas are exchanged"),
     ("baseline", dual(RIGHT, np.array([1.0, 0.0, 0.0])), "heading_offset", r"\+(89|90)° off .*secondary_lever_arm_m"),
@@ -408,7 +408,7 @@ def test_observations_refused_by_the_filter_are_reported() -> None:
     rows["fate"][:60] = Fate.REJECTED
     findings = diagnose(sound.inertial, sound.rows, sound.setup, Solved(Innovations(rows)))
     assert findings == [Finding("gnss_rejected", "warning", findings[0].text)]
-    assert "refused 60 % of GNSS's positions" in findings[0].text
+    assert "rejected 60 % of GNSS's positions" in findings[0].text
     rows["fate"][:60] = Fate.TAKEN
     assert diagnose(sound.inertial, sound.rows, sound.setup, Solved(Innovations(rows))) == []
 

@@ -543,7 +543,7 @@ def test_a_rate_beyond_the_line_capacity_is_refused(keys: dict[str, Any], error:
 def test_the_baud_rate_suggested_by_the_refusal_is_sufficient(protocol: str) -> None:
     with pytest.raises(PlanError) as caught:
         flight(protocol=protocol, baud=4800, rate_hz=20)
-    baud = int(str(caught.value).split("want ")[1].split()[0])
+    baud = int(str(caught.value).split("; set ")[1].split()[0])
     at = flight(protocol=protocol, baud=baud, rate_hz=20)
     named = [m for m in of(TimeMessage, at.records(4.0)) if m.names_edge is NamesEdge.PREVIOUS and m.time.week]
     assert all(0.0 < m.host_time_ns / 1e9 - at.time_s(m) < 0.9 for m in named)

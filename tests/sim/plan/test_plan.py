@@ -135,7 +135,7 @@ class TestRefusals:
         assert words in str(error)
 
     def test_error_for_a_missing_file_lists_the_presets(self, tmp_path: Path) -> None:
-        with pytest.raises(PlanError, match=r"nowhere\.toml: No such file or directory; want .* small, calibration"):
+        with pytest.raises(PlanError, match=r"nowhere\.toml: No such file or directory; give .* small, calibration"):
             load_plan(tmp_path / "nowhere.toml")
 
     def test_a_file_that_is_not_utf_8_is_refused(self, tmp_path: Path) -> None:

@@ -84,7 +84,7 @@ def test_error_for_too_fine_a_grid_suggests_a_cell_size() -> None:
     plan = plan_of("cell_m = 0.25")
     site = Site.at(*plan.tables.flight.origin_deg)
     with pytest.raises(
-        PlanError, match=r"^terrain\.cell_m: 0\.25 m over 4\.2 × 4\.2 km .* want 0\.8 m or more$"
+        PlanError, match=r"^terrain\.cell_m: 0\.25 m over 4\.2 × 4\.2 km .* set 0\.8 m or more$"
     ) as error:
         build_scene(plan, site, 2000.0 * SQUARE)
     assert "\n" not in str(error.value)
@@ -164,7 +164,7 @@ def test_roofs_face_every_side() -> None:
 def test_error_for_too_many_houses_names_the_key_and_the_possible_number() -> None:
     text = "[[terrain.village]]\ncenter_m = [0, 0]\nsize_m = [100, 100]\nhouses = 500"
     with pytest.raises(
-        PlanError, match=r"^terrain\.village\[0\]\.houses: 500 do not fit .* want at most (\d+)"
+        PlanError, match=r"^terrain\.village\[0\]\.houses: 500 do not fit .* set at most (\d+)"
     ) as error:
         scene_of(text)
     most = re.search(r"at most (\d+)", str(error.value))

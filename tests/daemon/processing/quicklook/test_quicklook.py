@@ -117,7 +117,7 @@ def test_sigmas_are_root_mean_squares_and_unknown_ones_are_counted(tmp_path: Pat
     np.testing.assert_allclose(strip.largest_sigma_m, [0.011, 0.022, 0.05], atol=1e-7)
     assert look.surface.unknown_sigma == 100
     assert look.surface.with_sigma == len(x) - 100
-    assert any(note.startswith("100 points have sigmas that are not known") for note in look.notes)
+    assert any(note.startswith("100 points have sigmas that are unknown") for note in look.notes)
     assert float(np.nanmax(look.surface.mean(5))) <= 0.0500001
 
 

@@ -122,6 +122,6 @@ def test_compiled_and_plain_code_give_the_same_rows_for_any_pulses(named: tuple[
 def test_without_numba_one_line_names_the_missing_package(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(sys.modules, "swath.drivers.scanner.rows.compiled")
     monkeypatch.setitem(sys.modules, "numba", None)
-    with pytest.raises(DriverSettingsError, match=r"wants numba: pip install '\.\[process\]'"):
+    with pytest.raises(DriverSettingsError, match=r"needs numba; install with: pip install '\.\[process\]'"):
         filler(compiled=True)
     assert filler(compiled=False) is ReturnSlots.fill
