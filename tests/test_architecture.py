@@ -19,6 +19,7 @@ import pytest
 import swath
 
 ROOT = Path(__file__).resolve().parent.parent
+pytestmark = pytest.mark.xdist_group("architecture")  # one worker parses the files once
 MOST_LINES = 600
 SMALL_LINES = 80
 MOST_MODULES = 20
@@ -61,6 +62,12 @@ PROCESSING_ONLY = {"numba", "scipy", "pyproj", "laspy", "matplotlib", "jinja2", 
 def project() -> dict[str, Any]:
     """Return the content of pyproject.toml."""
     return tomllib.loads((ROOT / "pyproject.toml").read_text())
+
+
+@functools.cache
+def parsed(path: Path) -> ast.Module:
+    """Return the syntax tree of a file, which several tests look at."""
+    return ast.parse(path.read_text())
 
 
 def tracked() -> list[Path]:
@@ -107,7 +114,7 @@ def test_sim_may_import_only_the_shared_modules_of_georef() -> None:
 def georef_modules_imported(path: Path) -> set[str]:
     """What a file imports of georef, as ``swath.georef.<module>``."""
     found: set[str] = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(parsed(path)):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module == "swath.georef":
@@ -156,7 +163,7 @@ def imports() -> dict[str, set[str]]:
     known, found = modules(), {}
     for name, path in known.items():
         taken: set[str] = set()
-        for node in ast.walk(ast.parse(path.read_text())):
+        for node in ast.walk(parsed(path)):
             if isinstance(node, ast.Import):
                 taken |= {alias.name for alias in node.names}
             elif isinstance(node, ast.ImportFrom) and node.module:
@@ -177,7 +184,7 @@ def test_no_module_imports_itself_through_others() -> None:
 def imported_in_functions(path: Path) -> set[str]:
     """Modules that functions of a file import."""
     functions = (ast.FunctionDef, ast.AsyncFunctionDef)
-    bodies = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, functions)]
+    bodies = [node for node in ast.walk(parsed(path)) if isinstance(node, functions)]
     found: set[str] = set()
     for node in (node for body in bodies for node in ast.walk(body)):
         if isinstance(node, ast.ImportFrom):
@@ -292,7 +299,7 @@ def event_codes() -> set[str]:
     place = {"post": 2, "make": 2, "add": 2, "add_once": 1}
     codes = set()
     for path in [*(ROOT / "daemon").rglob("*.py"), *(ROOT / "georef").rglob("*.py")]:
-        for call in ast.walk(ast.parse(path.read_text())):
+        for call in ast.walk(parsed(path)):
             if not isinstance(call, ast.Call):
                 continue
             name = getattr(call.func, "attr", getattr(call.func, "id", ""))

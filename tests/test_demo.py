@@ -37,7 +37,7 @@ class Nowhere(Output):
 @pytest.fixture(scope="module")
 def played(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
     folder = tmp_path_factory.mktemp("demo")
-    command = [sys.executable, "-m", "demo", "--seconds", "20", "--flight-seconds", "20", "--keep", str(folder)]
+    command = [sys.executable, "-m", "demo", "--seconds", "20", "--flight-seconds", "24", "--keep", str(folder)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=HANGS_S, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout, folder

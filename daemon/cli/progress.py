@@ -32,8 +32,11 @@ def transfer_bar() -> Progress:
 @contextmanager
 def compiling_noticed(console: Console) -> Iterator[None]:
     """Write a line when loops have to be compiled within the block, as on a new installation."""
-    from swath.daemon.processing.compiling import before_compiling
-
+    try:
+        from swath.daemon.processing.compiling import before_compiling
+    except ImportError:  # nothing is compiled without numba; the command reports what it needs
+        yield
+        return
     with before_compiling(lambda: console.print(COMPILING, markup=False, highlight=False, soft_wrap=True)):
         yield
 

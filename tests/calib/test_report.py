@@ -172,7 +172,7 @@ def test_contradicting_profiles_are_a_reason(report: ReportInput, sigmas: float,
     told = f"{'−' if sigmas < 0.0 else '+'}{size} from the adjustment ({'−' if sigmas < 0.0 else '+'}{abs(sigmas):.1f}"
     words = f"8 profiles put boresight ω (roll) {told} sigmas)"
     assert [reason.what for reason in verdict.reasons] == ([words] if level else [])
-    assert level is Level.GOOD or verdict.sentence.startswith(f"{level.words}: {words}. Boresight to ")
+    assert level is Level.GOOD or verdict.sentence.startswith(f"{level.heading}: {words}. Boresight to ")
 
 
 def test_findings_are_reasons(report: ReportInput) -> None:

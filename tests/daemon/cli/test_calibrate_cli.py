@@ -84,7 +84,7 @@ def products(made: Made, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_files_of_a_directory_that_are_not_logs_are_skipped_and_reported(products: Path) -> None:
     record = json.loads((products / "report" / "calibration.json").read_text())
-    assert record["notes"][0] == f"passed over: {products / 'logs' / 'begun_0.mcap'}: is not an MCAP file"
+    assert record["notes"][0] == f"skipped: {products / 'logs' / 'begun_0.mcap'}: is not an MCAP file"
 
 
 def test_the_file_names_the_source_of_the_trajectory(products: Path) -> None:

@@ -106,9 +106,9 @@ def test_files_of_a_directory_that_are_not_logs_are_skipped(
     arguments = flown.arguments(tmp_path / "out", "--no-sigma", log=log.parent)
     capsys.readouterr()
     assert run_app(arguments) == 1
-    assert f"partial: passed over: {begun}: is not an MCAP file; " in capsys.readouterr().err
+    assert f"partial: skipped: {begun}: is not an MCAP file; " in capsys.readouterr().err
     told = json.loads(next((tmp_path / "out").glob("*.json")).read_text())
-    assert told["holes"][:2] == [f"passed over: {path}: is not an MCAP file" for path in (begun, foreign)]
+    assert told["holes"][:2] == [f"skipped: {path}: is not an MCAP file" for path in (begun, foreign)]
     assert told["holes"][2:] == [hole.replace(str(flown.log), str(log)) for hole in alone["holes"]]
     assert told["counts"] == alone["counts"]
     named = flown.arguments(tmp_path / "named", "--no-sigma", log=begun)

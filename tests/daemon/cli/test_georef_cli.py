@@ -411,7 +411,7 @@ class TestRefusals:
         arguments = flown.arguments(tmp_path / "out")
         arguments[arguments.index("--crs") + 1] = "EPSG:4978"
         line = refused(capsys, tmp_path / "out", arguments)
-        assert line.startswith('swath: output.crs = "EPSG:4978" (WGS 84) is geocentric: ')
+        assert line.startswith('swath: output.crs = "EPSG:4978" (WGS 84) is geocentric; ')
 
     def test_two_recordings_of_one_time_are_refused(
         self, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -339,7 +339,7 @@ def test_a_thousand_damaged_places_are_listed(tmp_path: Path) -> None:
 
 
 def test_a_file_with_an_absurd_part_number_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(LogError, match="is none, want 0 to"):
+    with pytest.raises(LogError, match="is not a part number, want 0 to"):
         open_logs([write(tmp_path, parts_beyond_reason())])
     (session,) = open_logs([write(tmp_path, session_that_leads_elsewhere())])
     assert len(session.missing_parts) == 1000

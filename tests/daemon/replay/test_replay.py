@@ -187,7 +187,7 @@ def test_a_device_link_is_kept_and_one_left_by_a_killed_replay_is_replaced(tmp_p
     """Played with the aircraft's own configuration, udev's name of the receiver must not be lost."""
     link = tmp_path / "rover"
     link.symlink_to("/dev/null")
-    with pytest.raises(TransportError, match="is no link to a pseudo-terminal"):
+    with pytest.raises(TransportError, match="is not a link to a pseudo-terminal"):
         PtyOutput(link)
     assert link.readlink() == Path("/dev/null")
     for left in ("/dev/pts/ptmx", "/dev/pts/999999"):
