@@ -9,6 +9,10 @@ from pathlib import Path
 from rich.console import Console
 
 CRS = "EPSG:32632"
+REMARK = (
+    "The sensors were not switched on and off at the same moment: returns before the first and after the last inertial "
+    "sample have no trajectory. `swath georef` counts them and calls the points partial."
+)
 SWATH = (sys.executable, "-m", "swath.daemon.cli.main")
 
 
@@ -34,6 +38,9 @@ def make_points(console: Console, folder: Path, compiling: subprocess.Popen[byte
     for command in commands:
         words = [str(word) for word in command]
         console.print(f"[bold]$ swath {' '.join(words)}[/]", soft_wrap=True, highlight=False)
-        if subprocess.run([*SWATH, *words], check=False).returncode != 0:
+        done = subprocess.run([*SWATH, *words], check=False)
+        if done.returncode not in (0, 1):  # 1: written, but in part
             return None
-    return view / "index.html"
+    console.print(REMARK)
+    page = view / "index.html"
+    return page if page.exists() else None
