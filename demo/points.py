@@ -10,7 +10,7 @@ from rich.console import Console
 
 CRS = "EPSG:32632"
 REMARK = (
-    "The sensors were not switched on and off at the same moment: returns before the first and after the last inertial "
+    "The sensors were not switched on and off at one moment: returns before the first and after the last inertial "
     "sample have no trajectory. `swath georef` counts them and calls the points partial."
 )
 SWATH = (sys.executable, "-m", "swath.daemon.cli.main")
