@@ -130,7 +130,7 @@ def _leap_of_fields(header: Header, time: nov.Time) -> int | None:
     """Return GPS − UTC as header and calendar fields of a TIME imply it; None where they do not."""
     try:
         date = dt.date(time.utc_year, time.utc_month, time.utc_day)
-    except ValueError:
+    except (ValueError, OverflowError):  # a year of 32 bits may exceed what a date's C integers hold
         return None
     of_day_ms = (time.utc_hour * 60 + time.utc_minute) * 60_000 + time.utc_ms
     return leap_seconds_of(date, of_day_ms, header.milliseconds)

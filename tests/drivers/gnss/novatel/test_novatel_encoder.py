@@ -289,6 +289,13 @@ def test_an_intact_log_never_raises_whatever_its_content(number: int, data: st.D
     assert parser.counters.messages[layout.name] == 1
 
 
+def test_a_time_log_with_a_year_that_no_date_holds_is_decoded() -> None:
+    body = bytearray(nov.LAYOUTS[101].wire.size)
+    body[28:32] = (1 << 31).to_bytes(4, "little")  # the year
+    _, parser = parse(encode_frame(101, bytes(body), 1512, 0, short=False), imu_type="LN200")
+    assert parser.counters.messages[nov.LAYOUTS[101].name] == 1
+
+
 def test_the_imu_of_a_span_system_is_found_inside_the_gnss_stream() -> None:
     driver = find_driver("imu", "novatel")
     assert driver.transports == ("gnss",)
