@@ -9,6 +9,7 @@ from pathlib import Path
 from rich.console import Console
 
 CRS = "EPSG:32632"
+PARTIAL = 1  # exit code of products that were written, but not of all returns
 REMARK = (
     "The sensors were not switched on and off at one moment: returns before the first and after the last inertial "
     "sample have no trajectory. `swath georef` counts them and calls the points partial."
@@ -31,16 +32,16 @@ def make_points(console: Console, folder: Path, compiling: subprocess.Popen[byte
         compiling.wait()
     points, view = folder / "points", folder / "view"
     calibration = f"left={folder / 'left.true.toml'}"
-    commands = (
-        ("georef", folder / "logs", "-o", points, "--crs", CRS, "--calibration", calibration),
-        ("view", points, "-o", view),
-    )
-    for command in commands:
-        words = [str(word) for word in command]
-        console.print(f"[bold]$ swath {' '.join(words)}[/]", soft_wrap=True, highlight=False)
-        done = subprocess.run([*SWATH, *words], check=False)
-        if done.returncode not in (0, 1):  # 1: written, but in part
-            return None
-    console.print(REMARK)
-    page = view / "index.html"
-    return page if page.exists() else None
+    georef = _run(console, "georef", folder / "logs", "-o", points, "--crs", CRS, "--calibration", calibration)
+    if georef == PARTIAL:
+        console.print(REMARK)
+    if georef not in (0, PARTIAL) or _run(console, "view", points, "-o", view) != 0:
+        return None
+    return view / "index.html"
+
+
+def _run(console: Console, *arguments: str | Path) -> int:
+    """Show a command of the program, run it, and return its exit code."""
+    words = [str(word) for word in arguments]
+    console.print(f"[bold]$ swath {' '.join(words)}[/]", soft_wrap=True, highlight=False)
+    return subprocess.run([*SWATH, *words], check=False).returncode
