@@ -84,7 +84,7 @@ bench: $(VENV)/.tests ## measure speed, and compare each figure with the limit o
 	$(BIN)/python -m benchmarks
 
 bench-calibration: $(VENV)/.tests ## calibrate five simulated flights and compare with the truth, about 40 min (SEEDS=)
-	$(BIN)/python -m benchmarks.calibration_accuracy --seeds $(SEEDS)
+	$(BIN)/python -m benchmarks.calibration.accuracy --seeds $(SEEDS)
 
 install: ## install the service (root; DESTDIR=, PREFIX=)
 	@DESTDIR="$(DESTDIR)" PREFIX="$(PREFIX)" sh systemd/install.sh install

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.calibration_designs import LIMIT, Case, flight_of, normalised, run
+from benchmarks.calibration.designs import LIMIT, Case, flight_of, normalised, run
 from swath.calib.adjust import adjust
 from swath.calib.equations.solve import Settings
 from swath.calib.equations.trajectory_prior import Taus, gauss_markov

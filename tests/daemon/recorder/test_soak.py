@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.soak import Sample, Soak, problems
-from benchmarks.soak_sensors import Pulse, Receiver
+from benchmarks.soak.__main__ import Sample, Soak, problems
+from benchmarks.soak.sensors import Pulse, Receiver
 
 
 @pytest.fixture

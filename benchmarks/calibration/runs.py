@@ -4,7 +4,7 @@ The flight is read and matched once. The ranges of its returns on planes are the
 on its plane exactly, with the true calibration and the smoothed trajectory; these two are the truth. A run adds what
 the sensors would add: trajectory errors drawn from the smoother's joint covariance at its own nodes, which are closer
 together than the knots of the adjustment; the gyroscopes' random walk between nodes; noise of range, scan angle and
-control. `benchmarks.calibration_accuracy` runs this and prints the figures.
+control. `benchmarks.calibration.accuracy` runs this and prints the figures.
 """
 
 from __future__ import annotations

@@ -1,16 +1,16 @@
 """Test the sigmas of a calibration against the virtual aircraft's truth, over many runs and over whole flights.
 
-python -m benchmarks.calibration_accuracy --runs 400 [--flight FOLDER] [--rows 200000] [--json FILE]
-python -m benchmarks.calibration_accuracy --seeds 5 [--json FILE]
+python -m benchmarks.calibration.accuracy --runs 400 [--flight FOLDER] [--rows 200000] [--json FILE]
+python -m benchmarks.calibration.accuracy --seeds 5 [--json FILE]
 
-`--runs`: every run draws new observations (`benchmarks.calibration_runs`), with the sensors' noise and the covariance
+`--runs`: every run draws new observations (`benchmarks.calibration.runs`), with the sensors' noise and the covariance
 of the smoothed trajectory, and adjusts them; it starts from the nominal installation. NEES is the mean square of a
 parameter's error divided by its sigma; coverage is how often the truth lies within 1.96 sigmas.
 
 `--seeds`: whole flights of the preset `calibration`, with new noise of every sensor, go through `swath sim fly` and
 `swath calibrate`, which gets nothing but the logs and the control points.
 
-All random numbers follow from the master seed in calibration_seed.toml. Exit status 1 if a limit is not met.
+All random numbers follow from the master seed in seed.toml. Exit status 1 if a limit is not met.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.calibration_runs import Outcome, Reference, read_reference, run
+from benchmarks.calibration.runs import Outcome, Reference, read_reference, run
 from swath.georef.arrays import FloatArray
 from swath.georef.scanner.calibration import PARAMETERS, read_calibration
 
-ROOT = Path(__file__).resolve().parent.parent
-SEED_FILE = Path(__file__).with_name("calibration_seed.toml")
+ROOT = Path(__file__).resolve().parents[2]
+SEED_FILE = Path(__file__).with_name("seed.toml")
 NEES, COVERAGE = (0.8, 1.25), (92.0, 98.0)
 EACH = {"omega_deg": 0.004, "phi_deg": 0.004, "kappa_deg": 0.008, "range_offset_m": 0.01}
 RMS = {"omega_deg": 0.002, "phi_deg": 0.002, "kappa_deg": 0.004}

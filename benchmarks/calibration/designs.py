@@ -1,6 +1,6 @@
 """Test the sigmas of a calibration on virtual flights of many designs, for estimated and for held parameters.
 
-    python -m benchmarks.calibration_designs --flights 200
+    python -m benchmarks.calibration.designs --flights 200
 
 Each flight draws:
 

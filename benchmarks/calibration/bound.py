@@ -1,6 +1,6 @@
 """Compute the least sigmas that a calibration of a flight can have, given its returns and its trajectory.
 
-python -m benchmarks.calibration_bound FOLDER [--every 5]
+python -m benchmarks.calibration.bound FOLDER [--every 5]
 
 FOLDER is a flight of `swath sim fly`, with truth. From the truth come the returns, their places and the exact planes on
 which they lie. From the log comes the joint covariance of the smoothed trajectory's errors, as `swath calibrate`

@@ -16,7 +16,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from benchmarks.soak_log import Found, is_finished
+from benchmarks.soak.log import Found, is_finished
 from swath.daemon.log.mcap.scan import OP_CHUNK
 from swath.daemon.log.parts import read_sign
 

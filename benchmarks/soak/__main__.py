@@ -27,11 +27,11 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.acquire import cpu_s, free_port
-from benchmarks.soak_log import Found
-from benchmarks.soak_sensors import InertialUnit, Pulse, Receiver, Scanner, Sensor
-from benchmarks.soak_watchers import Watcher, note_ages, read_parts
+from benchmarks.soak.log import Found
+from benchmarks.soak.sensors import InertialUnit, Pulse, Receiver, Scanner, Sensor
+from benchmarks.soak.watchers import Watcher, note_ages, read_parts
 
-DBC = Path(__file__).resolve().parent.parent / "fixtures" / "config" / "imu.dbc"
+DBC = Path(__file__).resolve().parents[2] / "fixtures" / "config" / "imu.dbc"
 EXPECTED_EVENTS = {
     "session_started",
     "session_ended",
