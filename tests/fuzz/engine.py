@@ -1,4 +1,4 @@
-"""What a target is and the rules that every input is held to; Hypothesis chooses inputs and minimises findings.
+"""Defines a target and the rules for each of its inputs; Hypothesis chooses the inputs and minimises findings.
 
 A path is a seed and a few mutations, of the seed or of what the mutation before made; every input on it is checked.
 Hypothesis draws the seed, how many mutations there are, and the key of their random generators; it shrinks a path that
@@ -36,7 +36,7 @@ SETTINGS = settings(
 
 
 class FindingError(AssertionError):
-    """What a target did that it must not."""
+    """A target broke a rule of time, memory or growth."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,11 +44,11 @@ class Target:
     """Something that reads bytes of others.
 
     Attributes:
-        name: of the command line and of the folder of its inputs.
+        name: name on the command line, and of the folder of its inputs.
         seeds: inputs to begin with.
-        mutate: another input from one.
-        run: reads an input; returns what was seen in it, in words. Raises whatever is wrong.
-        endure: takes many inputs in one life; raises `FindingError` where something grows. None: each input is a life.
+        mutate: makes another input from one.
+        run: reads an input and returns its contents in words; any exception is a finding.
+        endure: reads many inputs with one object; raises `FindingError` if something grows. None: not tested.
         peak_bytes: memory that one input of that many bytes may take while it is read.
     """
 
@@ -130,13 +130,13 @@ def fuzz(target: Target, paths: int, *, number: int | None = None, report: Repor
             found.executions += 1
             try:
                 found.seen |= check(target, data, memory=turn == MEASURED_OF_PATHS - 1)
-            except Exception as error:
+            except Exception as error:  # any exception of a target is a finding
                 _keep(found, data, error)
                 raise
 
     try:
         (run if number is None else hypothesis.seed(number)(run))()
-    except Exception:  # Hypothesis groups several
+    except Exception:  # the finding again, or a group of several; an error of the engine itself is raised
         if not found.findings:
             raise
     return found
@@ -153,7 +153,7 @@ def fuzz_for(target: Target, seconds: float, *, number: int) -> Report:
         cases = [target.mutate(rng, rng.choice(target.seeds)) for _ in range(INPUTS_OF_A_LIFE)]
         try:
             target.endure(cases)
-        except Exception as error:  # the last input stands for all where something grows
+        except Exception as error:  # any exception is a finding; the last input stands for all where something grows
             _keep(report, cases[-1], error)
     return report
 

@@ -14,7 +14,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -314,7 +314,7 @@ class Nuisance:
         for thread in self._threads:
             thread.join()
 
-    def _repeat(self, job) -> None:  # type: ignore[no-untyped-def]
+    def _repeat(self, job: Callable[[socket.socket], object]) -> None:
         while not self._stop.is_set():
             try:
                 with socket.socket(socket.AF_UNIX) as sock:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import tomllib
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -148,8 +149,7 @@ def test_the_shortest_valid_file_is_read() -> None:
     assert calibration.range_offsets == ()
 
 
-def test_files_of_the_simulator_match_their_plan(tmp_path) -> None:  # type: ignore[no-untyped-def]
-    """A file written by other means says what its plan says."""
+def test_files_of_the_simulator_match_their_plan(tmp_path: Path) -> None:
     plan = parse_plan(
         '[flight]\nname = "x"\n[[line]]\nname = "1"\nfrom_m = [0, 0]\nto_m = [500, 0]\nheight_m = 900\n'
         '[scanner.left]\nkind = "polygon"\n[scanner.left.true]\nomega_deg = 0.3\ntorsion_us2 = 50.0\n'

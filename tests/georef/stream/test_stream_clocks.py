@@ -36,7 +36,7 @@ def told(clocks: HostClocks, delay_ns: int, max_error_s: float, *, seconds: int,
 @pytest.mark.parametrize("ticks_s", [0, 1, 7])
 @pytest.mark.parametrize("delay_ms", [100, 800, 1200])
 def test_a_synchronised_wall_clock_decides_the_second_of_late_messages(delay_ms: int, ticks_s: int) -> None:
-    """As in recording: NMEA late by 0.8 s is uncertain, by 1.2 s looks 0.2 s late, and chrony decides."""
+    """NMEA late by 0.8 s is uncertain, late by 1.2 s looks 0.2 s late; chrony decides, as it does while recording."""
     plan = ClockPlan(OFFSET_NS, pps={"pps/main": PpsPlan(18)}, gnss={"gnss/rover": GnssPlan("pps/main")})
     clocks = HostClocks(plan, keep_history=True)
     told(clocks, delay_ms * 1_000_000, 0.01, seconds=400, ticks_s=ticks_s)
