@@ -40,7 +40,7 @@ class Section(BaseModel):
 class SessionConfig(Section):
     """``[session]``: name, directory and writing of the logs."""
 
-    name: Name = Field(description="first part of the name of every log")
+    name: Name = Field(description="a name, the first part of every log's name")
     directory: Text = Field("/var/lib/swath", description="folder for the logs; relative to this file")
     compression: Literal["auto", "lz4", "zstd", "none"] = Field(
         "auto", description="compression of chunks; auto: none for scanners, lz4 for the rest"
