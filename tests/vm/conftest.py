@@ -31,16 +31,22 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    """Beside a failure stands how much of this computer others had."""
+    """Report with a failure how much of this computer others had, and with any test the machines that stood still."""
     report = yield
     if report.failed:
         share = item.stash[_BEGAN].share_of_others()
         report.sections.append(("this computer", f"others had {share:.0%} of its processors meanwhile"))
+    if report.when == "call" and stood_still:
+        report.user_properties.append(("powered_on_again", len(stood_still)))
+        stood_still.clear()
     return report
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """What the proofs measured, below which of them passed."""
+    """Print the figures of the proofs, below the results.
+
+    `powered_on_again` counts machines that stood still before their first program and were powered on again.
+    """
     reports = [report for outcome in ("passed", "failed") for report in terminalreporter.getreports(outcome)]
     measured = [report for report in reports if report.when == "call" and report.user_properties]
     if measured:
@@ -48,9 +54,6 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     for report in measured:
         told = ", ".join(f"{name} {_short(value)}" for name, value in report.user_properties)
         terminalreporter.write_line(f"{report.nodeid.removeprefix('tests/vm/')}  {told}")
-    if stood_still:
-        count = len(stood_still)
-        terminalreporter.write_line(f"machines that stood still before their first program, powered on again: {count}")
 
 
 def _short(value: object) -> str:
