@@ -46,7 +46,11 @@ IMPORTED_LATE = {
     "swath.daemon.processing.pages.pdf": {"weasyprint"},
     "swath.daemon.processing.setup.terrain": {"rasterio"},
     "swath.daemon.processing.strips.compare": {"swath.daemon.processing.quicklook.maps"},  # matplotlib, with -o only
-    "swath.daemon.processing.trajectory.summary": {"swath.daemon.processing.trajectory.page"},  # matplotlib
+    # matplotlib
+    "swath.daemon.processing.trajectory.summary": {
+        "swath.daemon.processing.pages.pdf",
+        "swath.daemon.processing.trajectory.page",
+    },
     "swath.daemon.simulate.plans": {"swath.sim"},  # the one door to the virtual aircraft
     "swath.daemon.system": {"psutil"},
     "swath.drivers.imu.dbc.signals": {"cantools.database"},

@@ -26,8 +26,9 @@ print(swath.__file__)
 """
 RENDER = """
 from swath.daemon.processing.pages.blocks import Words
-from swath.daemon.processing.pages.render import render
-page = render("quicklook.html", heading="Points", crs="", cards=[], blocks=[Words("a line of words")])
+from swath.daemon.processing.pages.head import PageHead
+from swath.daemon.processing.pages.render import Page, html_of
+page = html_of(Page("Quick look", "Points", PageHead(), [Words("a line of words")]))
 print(page.count("a line of words"), page.count("@page"))
 """
 OTHER_DAEMON = """

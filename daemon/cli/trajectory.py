@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from swath.daemon.errors import ExitCode, UserError, one_line
-from swath.daemon.processing.requirements import PAGES, require_installed
+from swath.daemon.processing.requirements import PRINTED_PAGES, require_installed
 
 
 def command(
@@ -52,7 +53,7 @@ def command(
         typer.Option(metavar="R,P,H", help="Roll, pitch, heading at the start, in degrees; default: estimated."),
     ] = None,
     config: Annotated[Path | None, typer.Option(metavar="FILE", help="Configuration; default: the logs' own.")] = None,
-    no_page: Annotated[bool, typer.Option("--no-page", help="Do not write the page of plots.")] = False,
+    no_page: Annotated[bool, typer.Option("--no-page", help="Do not write the page of plots and its PDF.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON, for scripts.")] = False,
 ) -> None:
@@ -61,7 +62,7 @@ def command(
     Every fix is either used or counted with the reason for leaving it out. Exit code 1 when the trajectory is partial
     or not to be used: data damaged, parts missing, inputs that contradict each other; 2 or 3 when there is none.
     """
-    require_installed("swath trajectory", *(() if no_page else PAGES))
+    require_installed("swath trajectory", *(() if no_page else PRINTED_PAGES))
     from swath.daemon.cli.progress import progress_bar
     from swath.daemon.config import load_config
     from swath.daemon.processing.navigation.inputs import INS_USES, InputOptions
@@ -93,6 +94,8 @@ def command(
         print(json.dumps(report.record, indent=2))
     else:
         _print(report.record, report.files)
+    for line in report.warnings:
+        print(one_line(f"swath: {line}"), file=sys.stderr)
     unusable = [line for session in report.record["sessions"] for line in _unusable(session)]
     if unusable:
         raise UserError("\n".join(f"{report.summary}: {line}" for line in unusable))

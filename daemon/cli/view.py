@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from swath.daemon.errors import ExitCode, UserError, one_line
-from swath.daemon.processing.requirements import PAGES, require_installed
+from swath.daemon.processing.requirements import PRINTED_PAGES, require_installed
 
 
 def command(
@@ -38,7 +38,7 @@ def command(
 
     Exit code 4 when a file could be read only in part.
     """
-    require_installed("swath view", *PAGES)
+    require_installed("swath view", *PRINTED_PAGES)
     if cell is not None and not (math.isfinite(cell) and cell > 0.0):
         raise UserError(f"--cell: got {cell:g}, want metres above 0", ExitCode.USAGE)
     ends = _ends(profile)
@@ -70,6 +70,7 @@ def _make(
     from swath.daemon.processing.quicklook.run import look_at, numbers_of
     from swath.daemon.processing.user_errors import finite
 
+    warnings: list[str] = []
     console = Console(stderr=True, markup=False, highlight=False, soft_wrap=True)
     first = paths[0]
     folder = output or (first if first.is_dir() else first.parent) / "view"
@@ -83,10 +84,12 @@ def _make(
             raise UserError(one_line(str(error)), ExitCode.IO) from error
         status.update("drawing")
         try:
-            page = make_page(look, folder, title)
+            page = make_page(look, folder, title, warnings)
         except OSError as error:
             text = f"{folder}: cannot write there ({error.strerror or error}); choose another folder with --output"
             raise UserError(one_line(text), ExitCode.IO) from error
+    for line in warnings:
+        console.print(one_line(f"swath: {line}"))
     damaged = False
     for source in look.sources:
         if source.damage:

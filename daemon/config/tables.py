@@ -388,9 +388,10 @@ class MtaConfig(Section):
 
 
 class ProfileConfig(Section):
-    """``[profile]``: names of aircraft and installation for the records."""
+    """``[profile]``: names of aircraft, installation and operator for the records and pages."""
 
-    aircraft: str = Field("", description="the aircraft")
+    aircraft: str = Field("", description="name of the aircraft")
+    operator: str = Field("", description="who flies or delivers: the author that pages and PDF name")
     installation: str = Field("", description="identifier of this mounting")
 
 

@@ -289,9 +289,9 @@ def test_the_page_has_all_its_parts(page: str) -> None:
         "Outliers",
         "Control",
         "Corrections of the trajectory",
-        "How it was computed",
         "Fit by group of observations",
         "Smallest detectable errors",
+        "How it was computed",
         "Software and settings",
         "Inputs",
     ]

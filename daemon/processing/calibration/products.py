@@ -36,13 +36,14 @@ from swath.daemon.processing.calibration.run import OUTCOME, Calibrated, Calibra
 from swath.daemon.processing.carried_verdict import Carried, first_lines, verdict_entry
 from swath.daemon.processing.files import sha256_of, write_whole
 from swath.daemon.processing.flights.read import trajectory_verdicts_of
+from swath.daemon.processing.pages.head import NOTHING_KNOWN, PageHead, head_of_flights, headers_words
+from swath.daemon.processing.pages.names import PRINTED, REPORT
 from swath.daemon.processing.strip_agreement import FlightStrips, before_and_after, difference_map
 from swath.daemon.processing.user_errors import finite
 from swath.georef.scanner.calibration import INDEX, PARAMETERS
 from swath.georef.verdicts import Level, Verdict
 
 Steps = Callable[[str, int, int], None]  # arguments: the step, how much is done, of how much
-PAGE, PRINTED = "report.html", "report.pdf"
 MAP_CELLS = 400  # maximum cells across a map of differences
 BEYOND = 3.0  # sigmas, of strips and calibration together, above which strips contradict the calibration
 
@@ -95,12 +96,14 @@ def write_products(request: CalibrationOptions, done: Calibrated, tell: Steps) -
     warnings: list[str] = []
     if request.report is not None:
         tell("report", 0, 1)
-        files |= pages(request.report, _with_profiles(report, done), warnings)
+        head = head_of_flights(done.kept.logged, headers_words(headers, verdict.level.words))
+        files |= pages(request.report, _with_profiles(report, done), warnings, head)
         files |= _records(request.report, done, report, request.facts)
         files[request.report / OUTCOME] = (json.dumps(record, indent=2) + "\n").encode()
     _write(files)
-    if request.report is not None and request.report / PRINTED not in files:
-        (request.report / PRINTED).unlink(missing_ok=True)  # of an earlier run
+    printed = None if request.report is None else (request.report / REPORT).with_suffix(PRINTED)
+    if printed is not None and printed not in files:
+        printed.unlink(missing_ok=True)  # of an earlier run
     written = [str(path) for path in files]
     reasons = [f"also: {reason.what}" for reason in verdict.reasons[1:]]
     return Told(
@@ -370,17 +373,12 @@ def _with_profiles(report: ReportInput, done: Calibrated) -> ReportInput:
     return replace(report, profiles=pictures(done.check, done.kept.flight, done.control))
 
 
-def pages(folder: Path, report: ReportInput, warnings: list[str]) -> dict[Path, bytes]:
+def pages(folder: Path, report: ReportInput, warnings: list[str], head: PageHead = NOTHING_KNOWN) -> dict[Path, bytes]:
     """Return the report as HTML and PDF; where this computer cannot make a PDF, add a warning instead."""
-    from swath.daemon.processing.calibration.report.page import html, pdf
-    from swath.daemon.processing.pages.pdf import PdfUnavailableError
+    from swath.daemon.processing.calibration.report.page import html, paper_page
+    from swath.daemon.processing.pages.pdf import page_files
 
-    files = {folder / PAGE: html(report).encode()}
-    try:
-        files[folder / PRINTED] = pdf(report)
-    except PdfUnavailableError as error:
-        warnings.append(f"{folder / PRINTED}: not written, {error}; {PAGE} shows the same")
-    return files
+    return page_files(folder / REPORT, html(report, head), warnings, paper_page(report, head))
 
 
 def _records(folder: Path, done: Calibrated, report: ReportInput, facts: Mapping[str, Plain]) -> dict[Path, bytes]:

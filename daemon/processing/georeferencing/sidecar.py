@@ -34,7 +34,8 @@ def calibration_entry(calibration: Calibration) -> dict[str, Any]:
     """Return the entry of a calibration with all its parameters, in the units of its file."""
     parameters = {parameter.key: calibration.value(parameter.name) / parameter.factor for parameter in PARAMETERS}
     carried = {key: calibration.header[key] for key in CARRIED if key in calibration.header}
-    return {"id": calibration.id, "method": calibration.method, **carried, "parameters": parameters}
+    created = {"created": str(calibration.header["created"])} if "created" in calibration.header else {}
+    return {"id": calibration.id, "method": calibration.method, **created, **carried, "parameters": parameters}
 
 
 def settings_entry(setup: Setup) -> dict[str, Any]:
@@ -152,6 +153,8 @@ def _flight_entry(flight: Flight, results: Sequence[JobResult]) -> dict[str, Any
         "session": flight.session.session_id,
         "start": utc_text(flight.session.info.realtime_ns),
         "recorder": flight.session.info.software,
+        "aircraft": setup.config.profile.aircraft or None,
+        "operator": setup.config.profile.operator or None,
         "origin": flight.session.info.origin or "recording",
         "returns_gps_ns": list(flight.span),
         "trajectory": trajectory_entry(trajectory, flight.source, flight.trajectory_verdicts)

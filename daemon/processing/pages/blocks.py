@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, TypeAlias
 
 
@@ -35,6 +35,12 @@ class Judged:
 
 
 Cell: TypeAlias = str | Judged
+UNKNOWN = ("", "–")  # texts of cells that say nothing
+
+
+def text_of_cell(cell: Cell) -> str:
+    """Return the words of a cell."""
+    return cell if isinstance(cell, str) else cell.text
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +68,25 @@ class Table:
     pale: frozenset[int] = frozenset()
     stacked: bool = False
     omitted: int = 0
+
+    def known_columns(self) -> Table:
+        """Return the table without columns whose every cell is empty or a dash; the first column stays."""
+        if not self.rows:
+            return self
+        kept = [
+            column
+            for column in range(len(self.heads))
+            if column == 0 or any(text_of_cell(row[column]).strip() not in UNKNOWN for row in self.rows)
+        ]
+        if len(kept) == len(self.heads):
+            return self
+        return replace(
+            self,
+            heads=[self.heads[column] for column in kept],
+            rows=[[row[column] for column in kept] for row in self.rows],
+            left=tuple(kept.index(column) for column in self.left if column in kept),
+            hashes=tuple(kept.index(column) for column in self.hashes if column in kept),
+        )
 
 
 @dataclass(frozen=True, slots=True)

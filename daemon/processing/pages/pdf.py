@@ -12,6 +12,8 @@ from typing import Any
 
 from matplotlib.font_manager import FontProperties, findfont
 
+from swath.daemon.processing.pages.names import PRINTED
+
 FACES = (("DejaVu Sans", "normal"), ("DejaVu Sans", "bold"), ("DejaVu Sans Mono", "normal"))
 DATE = "SOURCE_DATE_EPOCH"
 NO_PANGO = "because Pango is missing: apt-get install libpango-1.0-0 libpangoft2-1.0-0"
@@ -19,6 +21,23 @@ NO_PANGO = "because Pango is missing: apt-get install libpango-1.0-0 libpangoft2
 
 class PdfUnavailableError(Exception):
     """This computer lacks a library that printing needs; the message says what to install."""
+
+
+def page_files(page: Path, html: str, warnings: list[str], paper: str = "") -> dict[Path, bytes]:
+    """Return a page and its PDF beside it, by path; where this computer cannot make a PDF, add a warning instead.
+
+    Args:
+        page: where the page goes.
+        html: its text.
+        warnings: gets the warning.
+        paper: text of the page that is printed; empty: the same.
+    """
+    files, printed = {page: html.encode()}, page.with_suffix(PRINTED)
+    try:
+        files[printed] = pdf_of(paper or html)
+    except PdfUnavailableError as error:
+        warnings.append(f"{printed}: not written, {error}; {page.name} shows the same")
+    return files
 
 
 def pdf_of(page: str) -> bytes:

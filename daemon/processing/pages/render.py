@@ -1,14 +1,47 @@
-"""Renders HTML pages from their templates: one file each, with its style sheet, that needs no network."""
+"""Renders HTML pages from their template: one file each, with its style sheet, that needs no network."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-STYLE_SHEET = "page.css"
+from swath.daemon.processing.pages.blocks import Block, Card, Table
+from swath.daemon.processing.pages.head import PageHead
+from swath.georef.verdicts import Verdict
+
+STYLE_SHEET, TEMPLATE = "page.css", "base.html"
+
+
+@dataclass(frozen=True, slots=True)
+class Page:
+    """The content of a page.
+
+    Attributes:
+        kind: what it is, as ``Quick look``; stands above the heading.
+        heading: name of what it is about.
+        head: flight, logs, aircraft, coordinate system, calibration, software.
+        blocks: all that stands below verdict and cards.
+        verdict: None: nothing is judged.
+        cards: the most important figures.
+        subtitle: a line under the heading; empty: none.
+        title: title of the document; empty: heading and kind.
+        appendix: what stands at the end: formulas, methods, complete lists.
+    """
+
+    kind: str
+    heading: str
+    head: PageHead
+    blocks: Sequence[Block]
+    verdict: Verdict | None = None
+    cards: Sequence[Card] = ()
+    subtitle: str = ""
+    title: str = ""
+    appendix: Sequence[Block] = ()
 
 
 @cache
@@ -35,3 +68,24 @@ def render(template: str, **values: Any) -> str:
         jinja2.UndefinedError: the template uses a value that is not given.
     """
     return environment().get_template(template).render(values)
+
+
+def html_of(page: Page) -> str:
+    """Return the HTML text of a page; the same content gives the same text."""
+    return render(
+        TEMPLATE,
+        kind=page.kind,
+        heading=page.heading,
+        head=page.head,
+        subtitle=page.subtitle,
+        title=page.title or f"{page.heading}: {page.kind.lower()}",
+        verdict=page.verdict,
+        cards=page.cards,
+        blocks=_shown(page.blocks),
+        appendix=_shown(page.appendix),
+    )
+
+
+def _shown(blocks: Iterable[Block]) -> list[Block]:
+    """Return the blocks without columns in which nothing is known."""
+    return [block.known_columns() if isinstance(block, Table) else block for block in blocks]

@@ -7,8 +7,12 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from swath.calib.strips.standards import ASPRS_OVERLAP, QUALITY_LEVELS, TO_CONFIRM, USGS
+from swath.daemon.processing.files import write_whole
 from swath.daemon.processing.pages.blocks import Block, Card, Cell, Image, Judged, Notes, Table, Words, data_uri
-from swath.daemon.processing.pages.render import render
+from swath.daemon.processing.pages.head import head_of_sidecars
+from swath.daemon.processing.pages.names import PRINTED, QUICK_LOOK
+from swath.daemon.processing.pages.pdf import page_files
+from swath.daemon.processing.pages.render import Page, html_of
 from swath.daemon.processing.pages.words import thousands
 from swath.daemon.processing.quicklook.maps import (
     draw_density,
@@ -22,7 +26,6 @@ from swath.daemon.processing.quicklook.profile_picture import draw_profile
 from swath.daemon.processing.quicklook.run import Look
 from swath.daemon.processing.quicklook.strips import FEWEST_RETURNS, ROUGHEST_M, STEEPEST_DEG
 
-PAGE_NAME = "index.html"
 MOST_ROWS = 300
 FEW_CELLS = 30
 PICTURES: tuple[tuple[str, str, Callable[[Look, Path], None], Callable[[Look], bool]], ...] = (
@@ -35,8 +38,10 @@ PICTURES: tuple[tuple[str, str, Callable[[Look, Path], None], Callable[[Look], b
 )
 
 
-def make_page(look: Look, folder: Path, title: str) -> Path:
-    """Draw all pictures into a folder and write the page beside them; return its path.
+def make_page(look: Look, folder: Path, title: str, warnings: list[str]) -> Path:
+    """Draw all pictures into a folder and write the page and its PDF beside them; return the page's path.
+
+    ``warnings`` gets a line if the PDF cannot be made.
 
     Raises:
         OSError: the folder cannot be written to.
@@ -49,30 +54,29 @@ def make_page(look: Look, folder: Path, title: str) -> Path:
         if wanted(look):
             draw(look, path)
             shown.append(Image(alt, data_uri(path.read_bytes(), "image/png")))
-    page = folder / PAGE_NAME
-    page.write_text(page_of(look, title, shown), encoding="utf-8")
+    page = folder / QUICK_LOOK
+    page.with_suffix(PRINTED).unlink(missing_ok=True)
+    write_whole(page_files(page, page_of(look, title, shown), warnings))
     return page
 
 
 def page_of(look: Look, title: str, pictures: Sequence[Image]) -> str:
     """Return the HTML text of the page."""
-    blocks: list[Block] = [
-        *_notes(look),
-        *pictures,
-        *_quality(look),
-        *_pairs(look),
-        _strips(look),
-        _files(look),
-        *_sidecars(look),
-        _method(look),
-    ]
-    return render("quicklook.html", heading=title, crs=_crs_words(look), cards=_cards(look), blocks=blocks)
+    page = Page(
+        "Quick look",
+        title,
+        head_of_sidecars((source.sidecar for source in look.sources), _crs_words(look)),
+        [*_notes(look), *pictures, *_quality(look), *_pairs(look), _strips(look), _files(look)],
+        cards=_cards(look),
+        appendix=[_method(look), *_sidecars(look)],
+    )
+    return html_of(page)
 
 
 def _crs_words(look: Look) -> str:
     crs = next((source.crs for source in look.sources if source.crs is not None), None)
     if crs is None:
-        return "Coordinate reference system unknown"
+        return "unknown"
     code = crs.to_authority(min_confidence=100)
     return f"{crs.name}{f' ({code[0]}:{code[1]})' if code else ''}"
 
@@ -123,8 +127,14 @@ def _table(title: str, heads: Sequence[str], rows: Sequence[Sequence[Cell]], und
     return Table(title, heads, rows[:MOST_ROWS], under, omitted=max(len(rows) - MOST_ROWS, 0))
 
 
-def _kept(kept: bool | None) -> Cell:
-    return "–" if kept is None else Judged("kept" if kept else "not kept", kept)
+def _sigma_cm(sigma_m: float) -> str:
+    """Return a sigma in centimetres with two digits."""
+    return f"{100 * sigma_m:.1f}" if sigma_m >= 0.00995 else f"{100 * sigma_m:.2f}"
+
+
+def _kept(limit: str, kept: bool | None) -> Cell:
+    """Return a limit, with whether it is kept if that is known."""
+    return limit if kept is None else Judged(f"{limit}{' kept' if kept else ' not kept'}", kept)
 
 
 def _quality(look: Look) -> list[Block]:
@@ -135,19 +145,21 @@ def _quality(look: Look) -> list[Block]:
     assert numbers is not None
     within_m = agreement.record()["within_m"]
     kept = {one.level: one.kept for one in agreement.judged if one.standard == USGS}
-    rows = []
-    for level in QUALITY_LEVELS:
-        row: list[Cell] = [level.name]
-        for limit, word in (
-            (f"≥ {level.pulses_m2:g}", "pulses_m2"),
-            (f"≤ {100 * level.overlap_m:g} cm", "overlap_m"),
-            (f"≤ {100 * level.overlap_max_m:g} cm", "overlap_max_m"),
-            (f"≤ {100 * level.within_m:g} cm", "within_m"),
-        ):
-            row += [limit, _kept(kept[level.name][word])]
-        rows.append(row)
-    heads = ["level", "pulses per m²", f"here {agreement.pulses_m2:.3g}", "RMSDz", f"here {_cm(numbers['rms_m'])}"]
-    heads += ("99 % of |dZ|", f"here {_cm(numbers['p99_m'])}", "within strips", f"here {_cm(within_m)}")
+    measures = (
+        ("pulses per m²", f"{agreement.pulses_m2:.3g}", "pulses_m2", "≥ {:g}", 1.0),
+        ("RMSDz", _cm(numbers["rms_m"]), "overlap_m", "≤ {:g} cm", 100.0),
+        ("99 % of |dZ|", _cm(numbers["p99_m"]), "overlap_max_m", "≤ {:g} cm", 100.0),
+        ("sigma within strips", _cm(within_m), "within_m", "≤ {:g} cm", 100.0),
+    )
+    rows: list[list[Cell]] = [
+        [
+            words,
+            measured,
+            *(_kept(limit.format(factor * getattr(level, name)), kept[level.name][name]) for level in QUALITY_LEVELS),
+        ]
+        for words, measured, name, limit, factor in measures
+    ]
+    heads = ["measure", "measured", *(level.name for level in QUALITY_LEVELS)]
     verdicts = " ".join(f"{line}." for line in agreement.verdicts() if line != TO_CONFIRM)
     words = (
         f"{agreement.measure}. Density: first returns per m² where cells are "
@@ -190,20 +202,20 @@ def _pairs(look: Look) -> list[Block]:
         ]
         for row in sorted(look.overlap.rows, key=lambda row: -row["rms_m"])
     ]
-    heads = ("strips", "smooth cells", "median dZ", "mean", "RMSDz", "95 % of |dZ|", "largest", "of cells smooth")
-    return [_table("Strips against each other", heads, rows, f"Centimetres. {look.agreement.measure}.")]
+    heads = ("strips", "smooth cells", "median dZ, cm", "mean, cm", "RMSDz, cm", "95 % of |dZ|, cm", "largest, cm")
+    return [_table("Strips against each other", (*heads, "share of smooth cells"), rows, f"{look.agreement.measure}.")]
 
 
 def _strips(look: Look) -> Table:
     sigmas = any(strip.sigma_m is not None for strip in look.strips)
-    heads = ["strip", "points", "pulses", "length m", "area", "pulses per m²"]
-    heads += ["σ east cm", "σ north cm", "σ height cm", "largest σ height"] if sigmas else []
+    heads = ["strip", "points", "pulses", "length, m", "area", "pulses per m²"]
+    heads += ["σ east, cm", "σ north, cm", "σ height, cm", "largest σ height, cm"] if sigmas else []
     rows = []
     for strip in look.strips:
         row = [strip.name, thousands(strip.points), thousands(strip.pulses), thousands(strip.length_m)]
         row += [_area(strip.area_m2), "–" if math.isnan(strip.density) else f"{strip.density:.3g}"]
         if strip.sigma_m is not None and strip.largest_sigma_m is not None:
-            row += [f"{100 * value:.2f}" for value in (*strip.sigma_m, strip.largest_sigma_m[2])]
+            row += [_sigma_cm(value) for value in (*strip.sigma_m, strip.largest_sigma_m[2])]
         elif sigmas:
             row += ["–"] * 4
         rows.append(row)

@@ -15,6 +15,7 @@ import numpy as np
 
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.processing.files import gone_on_failure, write_aside
+from swath.daemon.processing.pages.names import PRINTED
 from swath.georef.arrays import FloatArray
 from swath.georef.formats.sbet import SBET_DOUBLES, SMRMSG_DOUBLES, sbet_bytes, smrmsg_bytes
 from swath.georef.formats.trajectory.csv import csv_text
@@ -33,7 +34,7 @@ class TrajectoryFiles:
     Attributes:
         sbet, smrmsg, csv: None: not written.
         summary: path of the JSON, which is written last.
-        page: path of the plots.
+        page: path of the plots, with the PDF beside it.
     """
 
     sbet: Path | None
@@ -44,7 +45,7 @@ class TrajectoryFiles:
 
     def all(self) -> list[Path]:
         """Return the paths of all files that are written."""
-        named = (self.sbet, self.smrmsg, self.csv, self.page, self.summary)
+        named = (self.sbet, self.smrmsg, self.csv, self.page, self.page.with_suffix(PRINTED), self.summary)
         return [path for path in named if path is not None]
 
     @classmethod

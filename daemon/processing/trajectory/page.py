@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from pathlib import Path
 
 import numpy as np
 
 from swath.daemon.processing.pages.blocks import Block, Card, Image, Judged, Notes, Table, data_uri
-from swath.daemon.processing.pages.render import render
+from swath.daemon.processing.pages.head import NOTHING_KNOWN, PageHead
+from swath.daemon.processing.pages.render import Page, html_of
 from swath.daemon.processing.pages.words import thousands
 from swath.daemon.processing.trajectory.figures import ANGLES, AXES_B, AXES_L, Figures, figures_of
 from swath.daemon.processing.trajectory.panels import NARROW, WIDE, Drawn, Format
@@ -103,12 +103,10 @@ PICTURES: tuple[tuple[str, str, Callable[[Drawn, Format], bytes], Wanted], ...] 
 )
 
 
-def write_page(path: Path, flight: Flight, findings: Iterable[Found] = ()) -> tuple[Verdict, Figures]:
-    """Write the page of a flight; return its verdict and its figures, as `summary_of` puts them into JSON.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
+def make_page(
+    flight: Flight, findings: Iterable[Found] = (), head: PageHead = NOTHING_KNOWN
+) -> tuple[str, Verdict, Figures]:
+    """Return the HTML page of a flight, its verdict, and its figures as `summary_of` puts them into JSON."""
     separation = separation_of(flight)
     figures = figures_of(flight, separation)
     verdict = judge(figures, findings)
@@ -124,9 +122,7 @@ def write_page(path: Path, flight: Flight, findings: Iterable[Found] = ()) -> tu
         for title, words, draw, wanted in PICTURES
         if wanted(drawn)
     ]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(page_of(flight, figures, verdict, pictures), encoding="utf-8")
-    return verdict, figures
+    return page_of(flight, figures, verdict, pictures, head), verdict, figures
 
 
 def summary_of(flight: Flight, findings: Iterable[Found] = ()) -> dict[str, object]:
@@ -135,7 +131,9 @@ def summary_of(flight: Flight, findings: Iterable[Found] = ()) -> dict[str, obje
     return {"verdict": judge(figures, findings).as_dict(), "figures": figures}
 
 
-def page_of(flight: Flight, figures: Figures, verdict: Verdict, pictures: Sequence[Image]) -> str:
+def page_of(
+    flight: Flight, figures: Figures, verdict: Verdict, pictures: Sequence[Image], head: PageHead = NOTHING_KNOWN
+) -> str:
     """Return the HTML text of the page."""
     blocks: list[Block | None] = [
         _reasons(verdict),
@@ -144,16 +142,19 @@ def page_of(flight: Flight, figures: Figures, verdict: Verdict, pictures: Sequen
         _sigmas(figures),
         _observations(figures),
         _sensors(figures),
-        _run(figures),
     ]
-    return render(
-        "trajectory.html",
-        heading=flight.title,
-        span=_span_words(figures),
-        verdict=verdict,
-        cards=_cards(figures),
-        blocks=[block for block in blocks if block is not None],
+    shown = [block for block in blocks if block is not None]
+    page = Page(
+        "Trajectory",
+        flight.title,
+        head,
+        shown,
+        verdict,
+        _cards(figures),
+        subtitle=_span_words(figures),
+        appendix=[_run(figures)],
     )
+    return html_of(page)
 
 
 def _span_words(figures: Figures) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -40,11 +40,12 @@ AS_IS = "as-is"
 
 @dataclass(frozen=True)
 class TrajectoryReport:
-    """The outcome: the summary's content, its path, and all files."""
+    """The outcome: the summary's content, its path, all files, and warnings about files that could not be made."""
 
     record: dict[str, Any]
     summary: Path
     files: list[Path]
+    warnings: list[str] = field(default_factory=list)
 
 
 def make_trajectory(request: TrajectoryRequest, tell: Tell) -> TrajectoryReport:
@@ -78,9 +79,10 @@ def _write(
     trajectory = _joined(flights)
     sigma = np.concatenate([flight.velocity_sigma_l() for flight in flights])
     written = write_trajectory(files, trajectory, sigma)
+    warnings: list[str] = []
     try:
         events = _write_events(request, flights, trajectory, written)
-        verdicts, figures = _write_pages(request, files, flights, written)
+        verdicts, figures = _write_pages(request, files, flights, written, warnings)
         record = summary_of_run(request, flights, verdicts, figures, events)
         record["files"] = [path.name for _, path in written]
         written.append((write_aside(files.summary, partial(write_json, record)), files.summary))
@@ -89,7 +91,7 @@ def _write(
         raise
     put_in_place(written)
     tell("files", 1, 1)
-    return TrajectoryReport(record, files.summary, [path for _, path in written])
+    return TrajectoryReport(record, files.summary, [path for _, path in written], warnings)
 
 
 def _write_as_is(
@@ -161,16 +163,19 @@ def _write_events(
 
 
 def _write_pages(
-    request: TrajectoryRequest, files: TrajectoryFiles, flights: Sequence[Navigated], written: Written
+    request: TrajectoryRequest,
+    files: TrajectoryFiles,
+    flights: Sequence[Navigated],
+    written: Written,
+    warnings: list[str],
 ) -> tuple[list[Any], list[Any]]:
-    """Write one page per leg; return verdicts and figures of all legs, in order."""
+    """Write one page with its PDF per leg; return verdicts and figures of all legs, in order."""
     verdicts: list[Any] = []
     figures: list[Any] = []
     for page in pages_of(flights):
         path = files.page if not verdicts else files.page.with_stem(f"{files.page.stem}_{len(verdicts) + 1}")
         if request.page:
-            verdict, own, aside = page.write(path)
-            written.append((aside, path))
+            verdict, own = page.write(path, written, warnings)
         else:
             verdict, own = page.judge()
         verdicts.append(verdict)

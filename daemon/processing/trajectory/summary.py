@@ -7,14 +7,15 @@ import json
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
 from swath import __version__
-from swath.daemon.log.durable import sync_file
-from swath.daemon.processing.files import PARTIAL, gone_on_failure, sha256_of, utc_text
+from swath.daemon.processing.files import sha256_of, utc_text, write_aside
+from swath.daemon.processing.pages.head import PageHead, head_of_navigated
 from swath.daemon.processing.trajectory.figures import figures_of
 from swath.daemon.processing.trajectory.series import Flight, separation_of
 from swath.daemon.processing.trajectory.verdict import judge
@@ -37,20 +38,26 @@ class Page:
 
     flight: Flight
     findings: Sequence[Finding]
+    head: PageHead
 
-    def write(self, path: Path) -> tuple[Any, Any, Path]:
-        """Write the page to a temporary file; return verdict, figures, and the path of this file.
+    def write(self, path: Path, written: list[tuple[Path, Path]], warnings: list[str]) -> tuple[Any, Any]:
+        """Write the page and its PDF to temporary files; return verdict and figures.
+
+        Args:
+            path: place of the page.
+            written: gets the temporary files with their places.
+            warnings: gets a line if the PDF cannot be made.
 
         Raises:
-            OSError: the file cannot be written.
+            OSError: a file cannot be written.
         """
-        from swath.daemon.processing.trajectory.page import write_page  # matplotlib, which other functions do not need
+        from swath.daemon.processing.pages.pdf import page_files  # matplotlib, which other functions do not need
+        from swath.daemon.processing.trajectory.page import make_page
 
-        aside = path.with_name(path.name + PARTIAL)
-        with gone_on_failure([(aside, path)]):
-            verdict, figures = write_page(aside, self.flight, self.findings)
-            sync_file(aside)
-        return verdict, figures, aside
+        html, verdict, figures = make_page(self.flight, self.findings, self.head)
+        for place, data in page_files(path, html, warnings).items():
+            written.append((write_aside(place, partial(_put, data)), place))
+        return verdict, figures
 
     def judge(self) -> tuple[Any, Any]:
         """Return verdict and figures without writing the page."""
@@ -70,7 +77,12 @@ def pages_of(flights: Sequence[Navigated]) -> Iterator[Page]:
             page = Flight(
                 title, leg.solved.forward, smoothed, leg.setup, start, found, notes, missing_s=flight.missing_s
             )
-            yield Page(page, leg.findings)
+            times_ns = leg.solved.forward.time_ns
+            yield Page(page, leg.findings, head_of_navigated(flight, (int(times_ns[0]), int(times_ns[-1]))))
+
+
+def _put(data: bytes, stream: IO[bytes]) -> None:
+    stream.write(data)
 
 
 def start_words(start: Start) -> str:

@@ -100,6 +100,8 @@ class TestSmoothed:
         assert session["session"] in page
         assert session["imu"]["noise_by_grade"] == {}  # the virtual aircraft's configuration has every key
         assert "data:image/png" in page
+        assert "virtual" in page  # the aircraft
+        assert (made / "a.pdf").read_bytes().startswith(b"%PDF")
 
     def test_event_marks_match_the_position_of_the_aircraft(self, flown: Flown, made: Path) -> None:
         rows = list(csv.DictReader((made / "marks.csv").read_text().splitlines()))

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pypdf import PdfReader
 from pyproj import CRS
 
 from swath.daemon.cli.main import run_app
@@ -73,6 +74,9 @@ def products(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "strips": [{"file": "s1.laz"}, {"file": "s2.laz"}],
         "flights": [
             {
+                "session": "one-20260615",
+                "aircraft": "HB-ABC",
+                "operator": "Survey AG",
                 "calibrations": {"left": {"id": "cal-2026"}},
                 "settings": {"atmosphere": {"ranges": "vacuum"}, "scanners": {"left": {"calibration": "x.toml"}}},
             }
@@ -101,6 +105,16 @@ def test_pictures_are_written_beside_the_page_and_embedded(products: Path, page:
         assert height > 600
 
 
+def test_the_head_names_log_aircraft_crs_calibration_and_the_pdf_its_author(products: Path, page: Page) -> None:
+    for words in ("one-20260615", "HB-ABC", "ETRS89 / UTM zone 32N (EPSG:25832)", "cal-2026 of left"):
+        assert words in page.words
+    read = PdfReader(products / "view" / "index.pdf")
+    assert read.metadata is not None
+    assert (read.metadata.title, read.metadata.author) == (f"{products.name}: quick look", "Survey AG")
+    assert "HB-ABC" in read.pages[0].extract_text()
+    assert "Appendix" in read.pages[-1].extract_text()
+
+
 def test_the_page_needs_no_network_and_is_well_formed(products: Path, page: Page) -> None:
     text = (products / "view" / "index.html").read_text(encoding="utf-8")
     assert page.links == []
@@ -114,10 +128,11 @@ def test_tables_match_the_input(page: Page) -> None:
     assert rows["1 − 2"][2:7] == ["−7.0", "−7.0", "7.0", "7.0", "7.0"]
     assert rows["1"][1] == rows["1"][2] == "24\u202f000"
     assert rows["1"][5] == "4"
-    assert rows["1"][6:] == ["3.10", "3.20", "2.15", "2.15"]
+    assert rows["1"][6:] == ["3.1", "3.2", "2.2", "2.2"]
     assert rows["s1.laz"][1:] == ["24\u202f000", "1.4, 6", "ETRS89 / UTM zone 32N", "left: cal-2026", "whole"]
-    assert rows["QL0"][2:5] == ["not kept", "≤ 4 cm", "not kept"]
-    assert rows["QL2"][1:5] == ["≥ 2", "kept", "≤ 8 cm", "kept"]
+    assert rows["RMSDz"][1:4] == ["7.0 cm", "≤ 4 cm not kept", "≤ 8 cm kept"]
+    assert rows["pulses per m²"][2] == "≥ 8 not kept"
+    assert rows["pulses per m²"][4] == "≥ 2 kept"
     assert "strips meet the 10 cm class" in page.words
     assert "ETRS89 / UTM zone 32N (EPSG:25832)" in page.words
 

@@ -16,7 +16,7 @@ from swath.daemon.processing.calibration.report.pictures import (
     strips_picture,
     trajectory_pictures,
 )
-from swath.daemon.processing.calibration.report.profiles import comparison_table, profiles_table
+from swath.daemon.processing.calibration.report.profiles import comparison_table, formulas_table, profiles_table
 from swath.daemon.processing.calibration.report.residuals import normal_picture, residual_picture
 from swath.daemon.processing.calibration.report.tables import (
     control_table,
@@ -31,8 +31,9 @@ from swath.daemon.processing.calibration.report.tables import (
 )
 from swath.daemon.processing.pages.blocks import Block, Card, Image, Notes, Table, Words, data_uri
 from swath.daemon.processing.pages.canvas import NARROW, PAPER, WIDE, Format, Picture
+from swath.daemon.processing.pages.head import NOTHING_KNOWN, PageHead
 from swath.daemon.processing.pages.pdf import pdf_of
-from swath.daemon.processing.pages.render import render
+from swath.daemon.processing.pages.render import Page, html_of
 from swath.georef.verdicts import Verdict
 
 Content: TypeAlias = Words | Notes | Table | Picture | Profile
@@ -40,35 +41,40 @@ MOST_REASONS = 40
 SVG = "image/svg+xml"
 
 
-def html(report: ReportInput) -> str:
+def html(report: ReportInput, head: PageHead = NOTHING_KNOWN) -> str:
     """Return the report as an HTML page; the same input gives the same text."""
-    return _page(report, WIDE, NARROW)
+    return _page(report, head, WIDE, NARROW)
 
 
-def pdf(report: ReportInput) -> bytes:
+def pdf(report: ReportInput, head: PageHead = NOTHING_KNOWN) -> bytes:
     """Return the report on A4 pages as PDF; the same input gives the same bytes.
 
     Raises:
         PdfUnavailableError: this computer lacks the library that sets text.
     """
-    return pdf_of(paper_page(report))
+    return pdf_of(paper_page(report, head))
 
 
-def paper_page(report: ReportInput) -> str:
+def paper_page(report: ReportInput, head: PageHead = NOTHING_KNOWN) -> str:
     """Return the HTML page that is printed: pictures have the width of paper."""
-    return _page(report, PAPER)
+    return _page(report, head, PAPER)
 
 
-def _page(report: ReportInput, form: Format, narrow: Format | None = None) -> str:
+def _page(report: ReportInput, head: PageHead, form: Format, narrow: Format | None = None) -> str:
     """Return the page's text with pictures in one format, or in one for wide and one for narrow windows."""
     verdict = judge(report)
-    return render(
-        "report.html",
-        heading=report.heading,
-        verdict=verdict,
-        cards=cards_of(report),
-        blocks=[_block(content, form, narrow) for content in contents_of(report, verdict)],
+    shown, appendix = contents_of(report, verdict), appendix_of(report)
+    page = Page(
+        "Calibration report",
+        report.heading,
+        head,
+        [_block(content, form, narrow) for content in shown],
+        verdict,
+        cards_of(report),
+        title=report.heading,
+        appendix=[_block(content, form, narrow) for content in appendix],
     )
+    return html_of(page)
 
 
 def _block(content: Content, form: Format, narrow: Format | None) -> Block:
@@ -112,12 +118,16 @@ def contents_of(report: ReportInput, verdict: Verdict) -> list[Content]:
         control_picture(report),
         control_table(report),
         *trajectory_pictures(report),
-        *_method(report),
         groups_table(report),
         detectable_table(report),
-        _run(report),
-        *_inputs(report),
     ]
+    return [block for block in found if block is not None]
+
+
+def appendix_of(report: ReportInput) -> list[Content]:
+    """Return what stands at the end: how it was computed, formulas, settings and inputs."""
+    formulas = None if report.check is None else formulas_table(report.check)
+    found = [*_method(report), formulas, _run(report), *_inputs(report)]
     return [block for block in found if block is not None]
 
 

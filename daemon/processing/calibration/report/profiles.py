@@ -72,7 +72,7 @@ def _compared(one: Comparison, *, several: bool) -> list[str]:
 
 
 def profiles_table(checked: Check) -> Table | None:
-    """Return a table of every profile: separation, baseline, formula."""
+    """Return a table of every profile: strips, separation, baseline."""
     rows = [
         [
             profile.kind,
@@ -81,13 +81,20 @@ def profiles_table(checked: Check) -> Table | None:
             number(profile.separation_sigma_m, ".3f"),
             "–" if profile.kind == "range" else number(profile.baseline_m, ".1f"),
             str(profile.pieces),
-            profile.formula,
         ]
         for profile in checked.profiles
     ]
-    heads = ("kind", "strips", "separation, m", "sigma", "baseline, m", "pieces", "formula")
-    under = "Measured on the adjusted points: the separations are residual."
-    return Table("", heads, rows, under, left=(0, 1, 6)) if rows else None
+    heads = ("kind", "strips", "separation, m", "sigma, m", "baseline, m", "pieces")
+    under = "Measured on the adjusted points: the separations are residual. The appendix gives each one's formula."
+    return Table("", heads, rows, under, left=(0, 1)) if rows else None
+
+
+def formulas_table(checked: Check) -> Table | None:
+    """Return a table of the formula of every profile, with its numbers."""
+    rows = [
+        [profile.kind, f"{profile.names[0]} and {profile.names[1]}", profile.formula] for profile in checked.profiles
+    ]
+    return Table("Formulas of the profiles", ("kind", "strips", "formula"), rows, left=(0, 1, 2)) if rows else None
 
 
 def pictures(checked: Check, at_start: Flight, control: Sequence[ControlPoint] = ()) -> list[Picture]:

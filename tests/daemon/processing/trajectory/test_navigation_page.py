@@ -7,7 +7,6 @@ import io
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from html.parser import HTMLParser
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from swath.daemon.processing.trajectory.page import PICTURES, write_page
+from swath.daemon.processing.trajectory.page import PICTURES, make_page
 from swath.daemon.processing.trajectory.panels import NARROW, WIDE, Drawn
 from swath.daemon.processing.trajectory.pictures import FATE_LOOK, FIX_LOOK, draw_innovations, draw_map
 from swath.daemon.processing.trajectory.series import (
@@ -84,10 +83,8 @@ def image_of(source: str) -> Image.Image:
     return Image.open(io.BytesIO(base64.b64decode(data)))
 
 
-def test_the_page_is_complete(flight: Flight, tmp_path: Path) -> None:
-    path = tmp_path / "sub" / "page.html"
-    verdict, _ = write_page(path, flight)
-    text = path.read_text(encoding="utf-8")
+def test_the_page_is_complete(flight: Flight) -> None:
+    text, verdict, _ = make_page(flight)
     page = Page()
     page.feed(text)
     assert len(text.encode()) < 3_000_000
@@ -108,7 +105,7 @@ def test_the_page_is_complete(flight: Flight, tmp_path: Path) -> None:
     assert {width for width, _ in narrow} == {int(NARROW.width_in * NARROW.dpi + 1e-6)}
 
 
-def test_a_minimal_solution_gives_a_page(flight: Flight, tmp_path: Path) -> None:
+def test_a_minimal_solution_gives_a_page(flight: Flight) -> None:
     """Three epochs, no observation, no node, not smoothed."""
     first: dict[str, Any] = {}
     for name in Solution.__dataclass_fields__:
@@ -116,11 +113,10 @@ def test_a_minimal_solution_gives_a_page(flight: Flight, tmp_path: Path) -> None
         if isinstance(value, np.ndarray):
             first[name] = value[: 3 if len(value) == len(flight.forward) else 0]
     little = replace(flight, forward=replace(flight.forward, **first), smoothed=None)
-    path = tmp_path / "page.html"
-    verdict, figures = write_page(path, little)
+    text, verdict, figures = make_page(little)
     assert verdict.sentence.startswith("Not to be used: the filter used only 0 positions")
     assert figures["observations"] == {}
-    assert "Filter − smoother" not in path.read_text(encoding="utf-8")
+    assert "Filter − smoother" not in text
 
 
 def test_a_spike_of_one_epoch_is_drawn(flight: Flight) -> None:

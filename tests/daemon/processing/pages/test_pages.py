@@ -1,0 +1,144 @@
+"""What every page has: its head, tables without empty columns, an appendix; and its PDF."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pypdf import PdfReader
+
+from swath import __version__
+from swath.daemon.processing.pages import pdf
+from swath.daemon.processing.pages.blocks import Cell, Image, Judged, Table, Words
+from swath.daemon.processing.pages.head import (
+    PageHead,
+    calibration_words,
+    crs_words,
+    flown_words,
+    head_of_sidecars,
+)
+from swath.daemon.processing.pages.names import OF_COMMAND, PRINTED
+from swath.daemon.processing.pages.pdf import PdfUnavailableError, page_files, pdf_of
+from swath.daemon.processing.pages.render import Page, html_of
+
+NINE_NS = 1_465_549_218_000_000_000  # 2026-06-15 09:00:00 UTC and 18 leap seconds
+DAY_NS = 86_400_000_000_000
+DOT = "data:image/svg+xml;base64,PHN2ZyB4bWxucz0iaHR0cDovL3d3dy53My5vcmcvMjAwMC9zdmciIHdpZHRoPSI5IiBoZWlnaHQ9IjkiLz4="
+
+
+def flight_entry(**more: object) -> dict[str, object]:
+    """Return a flight of a sidecar."""
+    calibration = {"id": "c-1", "created": "2026-05-01T08:00:00+00:00", "verdict": "usable with care"}
+    return {
+        "session": "one",
+        "aircraft": "HB-ABC",
+        "operator": "Aero Survey",
+        "returns_gps_ns": [NINE_NS, NINE_NS + 120_000_000_000],
+        "calibrations": {"left": calibration},
+        **more,
+    }
+
+
+def test_the_head_gives_flight_logs_aircraft_crs_calibration_and_software() -> None:
+    crs = {"name": "ETRS89 / UTM zone 32N", "crs": "EPSG:25832", "heights": "ellipsoidal (GRS 1980)"}
+    sidecar = {"software": "swath 0.0.9", "crs": crs, "flights": [flight_entry(), flight_entry(session="two")]}
+    head = head_of_sidecars([sidecar, sidecar])
+    assert head.rows() == [
+        ("Flown", "2026-06-15, 09:00 to 09:02 UTC"),
+        ("Logs", "one, two"),
+        ("Aircraft", "HB-ABC"),
+        ("CRS", "ETRS89 / UTM zone 32N (EPSG:25832); heights ellipsoidal (GRS 1980)"),
+        ("Calibration", "c-1 of left, made 2026-05-01, usable with care"),
+        ("By", "Aero Survey"),
+        ("Software", f"Swath {__version__}; data by swath 0.0.9"),
+    ]
+
+
+def test_the_head_leaves_out_what_is_not_known() -> None:
+    assert PageHead().rows() == [("Software", f"Swath {__version__}")]
+    strange = {"flights": [3, {"returns_gps_ns": [1], "calibrations": 4, "session": None}], "crs": "EPSG:1"}
+    assert head_of_sidecars([{}, strange], "local").rows() == [("CRS", "local"), ("Software", f"Swath {__version__}")]
+
+
+def test_a_flight_over_midnight_has_both_dates() -> None:
+    assert flown_words([]) == ""
+    words = flown_words([(NINE_NS + DAY_NS, NINE_NS + DAY_NS + 60_000_000_000), (NINE_NS, NINE_NS + 1)])
+    assert words == "2026-06-15 09:00 to 2026-06-16 09:01 UTC"
+
+
+def test_a_calibration_without_a_verdict_is_called_nominal_only_if_it_is() -> None:
+    assert calibration_words("left", {"id": "a", "method": "nominal"}) == "a of left, nominal, never estimated"
+    assert calibration_words("left", {"id": "a", "method": "planes"}) == "a of left"
+    assert calibration_words("", {"id": "a", "method": "nominal", "verdict": "good"}) == "a, good"
+
+
+def test_a_long_definition_of_a_crs_is_not_repeated() -> None:
+    assert crs_words({"name": "Local", "crs": "PROJCRS[" + 80 * "x"}) == "Local"
+    assert crs_words({"name": "EPSG:4978", "crs": "EPSG:4978", "heights": "none: earth-centred"}) == "EPSG:4978"
+
+
+def test_columns_that_say_nothing_are_left_out() -> None:
+    rows: list[list[Cell]] = [["a", "–", "", "1", Judged("–", good=True), "x"], ["b", "–", "–", "–", "–", "y"]]
+    table = Table("T", ("name", "none", "empty", "some", "judged", "words"), rows, left=(0, 4, 5), hashes=(5,))
+    shown = table.known_columns()
+    assert list(shown.heads) == ["name", "some", "words"]
+    assert [list(row) for row in shown.rows] == [["a", "1", "x"], ["b", "–", "y"]]
+    assert (shown.left, shown.hashes) == ((0, 2), (2,))
+    full = Table("T", ("name", "some"), [["–", "1"]])
+    assert full.known_columns() is full
+
+
+def page_of(rows: int = 3) -> Page:
+    """Return a page with a picture, a table and an appendix."""
+    table = Table("Rows", ("name", "value, cm", "unknown"), [[f"row {n}", f"{n}", "–"] for n in range(rows)])
+    head = PageHead("2026-06-15", ["one"], "HB-ABC", author="Aero <Survey>")
+    return Page(
+        "Test page", "Title & more", head, [Image("A map", DOT), table], appendix=[Words("x = a + b", "Formulas")]
+    )
+
+
+def test_a_page_ends_with_its_appendix_and_shows_no_empty_column() -> None:
+    text = html_of(page_of())
+    assert text.index("HB-ABC") < text.index("row 2") < text.index("<h1>Appendix</h1>") < text.index("x = a + b")
+    assert "unknown" not in text
+    assert "<title>Title &amp; more: test page</title>" in text
+    assert '<meta name="author" content="Aero &lt;Survey&gt;">' in text
+    assert "Appendix" not in html_of(Page("Test page", "Title", PageHead(), []))
+
+
+def test_the_pdf_has_title_author_bookmarks_page_numbers_and_repeats_heads_of_tables() -> None:
+    read = PdfReader(io.BytesIO(pdf_of(html_of(page_of(rows=200)))))
+    assert read.metadata is not None
+    assert (read.metadata.title, read.metadata.author) == ("Title & more: test page", "Aero <Survey>")
+    assert read.metadata.creator == f"Swath {__version__}"
+    assert titles_of(read.outline) == ["Title & more", ["A map", "Rows"], "Appendix", ["Formulas"]]
+    pages = [page.extract_text() for page in read.pages]
+    assert len(pages) >= 5
+    for number, text in enumerate(pages, start=1):
+        assert f"{number} of {len(pages)}" in text
+        assert ("value, cm" in text) == ("row " in text)
+    assert "x = a + b" in pages[-1]
+    assert "row " not in pages[-1]
+
+
+def titles_of(outline: Any) -> list[Any]:
+    """Return the titles of bookmarks, those below one in a list after it."""
+    return [titles_of(one) if isinstance(one, list) else one.title for one in outline]
+
+
+def test_without_pango_the_page_is_written_alone_with_one_warning(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(page: str) -> bytes:
+        raise PdfUnavailableError(pdf.NO_PANGO)
+
+    monkeypatch.setattr(pdf, "pdf_of", fails)
+    warnings: list[str] = []
+    assert page_files(Path("out/strips.html"), "text", warnings) == {Path("out/strips.html"): b"text"}
+    assert warnings == [f"out/strips.pdf: not written, {pdf.NO_PANGO}; strips.html shows the same"]
+
+
+def test_every_page_has_its_pdf_among_the_names() -> None:
+    for names in OF_COMMAND.values():
+        (page,) = (name for name in names if name.endswith(".html"))
+        assert str(Path(page).with_suffix(PRINTED)) in names
