@@ -45,7 +45,6 @@ IMPORTED_LATE = {
     "swath.daemon.processing.flights.trajectory_choice": {"swath.georef.trajectory.turn_rates"},  # scipy.signal
     "swath.daemon.processing.pages.pdf": {"weasyprint"},
     "swath.daemon.processing.setup.terrain": {"rasterio"},
-    "swath.daemon.processing.strips.compare": {"swath.daemon.processing.quicklook.maps"},  # matplotlib, with -o only
     # matplotlib
     "swath.daemon.processing.trajectory.summary": {
         "swath.daemon.processing.pages.pdf",

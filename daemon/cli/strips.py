@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,7 +14,7 @@ import typer
 
 from swath.daemon.cli.options import AcceptVerdict, ForceTrajectory, TrajectoryDatum, TrajectoryPoint
 from swath.daemon.errors import ExitCode, UserError, one_line
-from swath.daemon.processing.requirements import require_installed
+from swath.daemon.processing.requirements import PRINTED_PAGES, require_installed
 
 if TYPE_CHECKING:
     from swath.daemon.processing.flights.read import GeorefOptions
@@ -32,7 +33,8 @@ def command(
         typer.Option(metavar="DIR|LOG", help="An earlier version of the same strips, to compare with; repeatable."),
     ] = None,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", metavar="DIR", help="Folder for difference maps and strips.json.")
+        Path | None,
+        typer.Option("--output", "-o", metavar="DIR", help="Folder for page, PDF, difference maps and strips.json."),
     ] = None,
     level: Annotated[
         str | None, typer.Option(help="Quality level that the strips must meet: QL0, QL1, QL2 or QL3.")
@@ -96,7 +98,7 @@ def command(
     Exit code 1 when the differences show a significant calibration error, when --level is not met, when strips are
     too far apart to find the cause, when there are too few cells for a verdict, or when no strips could be compared.
     """
-    require_installed("swath strips", *(["matplotlib"] if output else []))
+    require_installed("swath strips", *(PRINTED_PAGES if output else ()))
     from swath.daemon.cli.georef import calibrations_given
     from swath.daemon.config import load_config
     from swath.daemon.processing.flights.read import GeorefOptions
@@ -142,10 +144,20 @@ def _compare(
     from swath.daemon.cli.progress import progress_bar
     from swath.daemon.processing.strips.compare import StripsOptions, compare_strips, rules_of
 
-    request = StripsOptions(logs.logs, logs, before, rules_of(*cells), output, level)
+    request = StripsOptions(logs.logs, logs, before, rules_of(*cells), level)
+    warnings: list[str] = []
+    written: list[Path] = []
     with tempfile.TemporaryDirectory(prefix="swath-") as folder, progress_bar() as tell:
         done = compare_strips(request, Path(folder), tell)
-    print(json.dumps(done.record, indent=2) if as_json else "\n".join(map(one_line, done.lines)))
+        if output is not None:
+            from swath.daemon.processing.strips.page import write_comparison
+
+            tell("page", 0, 1)
+            written = write_comparison(done, output, level, warnings)
+    lines = [*done.lines, *map(str, written)]
+    print(json.dumps(done.record, indent=2) if as_json else "\n".join(map(one_line, lines)))
+    for line in warnings:
+        print(one_line(f"swath: {line}"), file=sys.stderr)
     if done.problem:
         raise UserError(done.problem)
 

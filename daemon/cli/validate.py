@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 import tempfile
 from pathlib import Path
 from typing import Annotated
@@ -12,7 +13,7 @@ import typer
 
 from swath.daemon.cli.options import AcceptVerdict, ForceTrajectory, TrajectoryDatum, TrajectoryPoint, TrajectoryWeek
 from swath.daemon.errors import ExitCode, UserError, one_line
-from swath.daemon.processing.requirements import require_installed
+from swath.daemon.processing.requirements import PRINTED_PAGES, require_installed
 from swath.daemon.text_files import text_of
 
 
@@ -55,7 +56,10 @@ def command(
     output: Annotated[
         Path | None,
         typer.Option(
-            "--output", "-o", metavar="DIR", help="Folder for validation.json, history.png and updated records."
+            "--output",
+            "-o",
+            metavar="DIR",
+            help="Folder for page, PDF, validation.json, history.png and updated records.",
         ),
     ] = None,
     record: Annotated[
@@ -72,7 +76,7 @@ def command(
     Exit code 1 when a test rejects the calibration, when the boresight has moved, or when a requested test, or any test
     at all, could not be made.
     """
-    require_installed("swath validate", *(["matplotlib"] if output else []))
+    require_installed("swath validate", *PRINTED_PAGES)
     from swath.daemon.cli.progress import progress_bar
     from swath.daemon.config import load_config
     from swath.daemon.processing.flights.read import GeorefOptions
@@ -114,5 +118,7 @@ def command(
     with tempfile.TemporaryDirectory(prefix="swath-") as folder, progress_bar() as tell:
         done = run_validation(request, Path(folder), tell)
     print(json.dumps(done.record, indent=2) if as_json else "\n".join(map(one_line, done.lines)))
+    for line in done.warnings:
+        print(one_line(f"swath: {line}"), file=sys.stderr)
     if done.problem:
         raise UserError(done.problem)

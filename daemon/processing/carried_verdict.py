@@ -15,7 +15,7 @@ from swath.daemon.processing.trajectory.figures import figures_of
 from swath.daemon.processing.trajectory.series import Flight, separation_of
 from swath.daemon.processing.trajectory.verdict import judge
 from swath.georef.scanner.calibration import INDEX
-from swath.georef.verdicts import Level
+from swath.georef.verdicts import Level, Reason
 
 if TYPE_CHECKING:
     from swath.daemon.processing.navigation.navigate import Navigated
@@ -48,6 +48,12 @@ class Carried:
     def line(self) -> str:
         """The sentence after its level, as the first line of an output."""
         return f"{self.level.words}: {self.sentence}"
+
+    @property
+    def reason(self) -> Reason:
+        """The sentence as the gravest reason of a verdict, with its remedy apart."""
+        what, _, change = self.sentence.partition("; ")
+        return Reason(self.level, "input", what, change, math.inf)
 
 
 def verdict_entry(carried: Sequence[Carried], *, accepted: bool) -> dict[str, Any]:

@@ -124,14 +124,16 @@ def head_of_flights(flights: Sequence[Flight], calibrations: Sequence[str] | Non
         flights: the flights that were read.
         calibrations: texts on the calibrations; None: those that the flights' points are made with.
     """
-    made_with = [text for flight in flights for text in calibrations_words(flight.setup.calibrations)]
+    if calibrations is None:
+        made_with = [text for flight in flights for text in calibrations_words(flight.setup.calibrations)]
+        calibrations = list(dict.fromkeys(made_with))
     mapping = flights[0].setup.mapping
     return PageHead(
         flown=flown_words(flight.span for flight in flights),
         logs=[flight.session.session_id for flight in flights],
         **_profile(flight.setup.config for flight in flights),
         crs="" if mapping is None else crs_words(mapping.description()),
-        calibrations=list(dict.fromkeys(made_with)) if calibrations is None else calibrations,
+        calibrations=calibrations,
     )
 
 

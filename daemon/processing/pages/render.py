@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -15,6 +16,7 @@ from swath.daemon.processing.pages.head import PageHead
 from swath.georef.verdicts import Verdict
 
 STYLE_SHEET, TEMPLATE = "page.css", "base.html"
+HYPHEN_AS_MINUS = re.compile(r"(?<![\w=.,/\-])-(?=\d)")  # not that of dates, names and definitions of CRS
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,10 +57,16 @@ def environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
         keep_trailing_newline=True,
+        finalize=_with_minus,
     )
     style, _, _ = loader.get_source(made, STYLE_SHEET)
     made.globals["style"] = Markup(style)
     return made
+
+
+def _with_minus(value: Any) -> Any:
+    """Return a text with real minus signs before numbers; texts of other programs and of scripts write hyphens."""
+    return HYPHEN_AS_MINUS.sub("−", value) if type(value) is str else value
 
 
 def render(template: str, **values: Any) -> str:

@@ -21,7 +21,7 @@ from swath.daemon.processing.quicklook.maps import (
     draw_intensity,
     draw_sigma,
 )
-from swath.daemon.processing.quicklook.product_facts import calibrations_in, rows_of, warnings_in
+from swath.daemon.processing.quicklook.product_facts import calibrations_in, crs_of, rows_of, warnings_in
 from swath.daemon.processing.quicklook.profile_picture import draw_profile
 from swath.daemon.processing.quicklook.run import Look
 from swath.daemon.processing.quicklook.strips import FEWEST_RETURNS, ROUGHEST_M, STEEPEST_DEG
@@ -65,20 +65,12 @@ def page_of(look: Look, title: str, pictures: Sequence[Image]) -> str:
     page = Page(
         "Quick look",
         title,
-        head_of_sidecars((source.sidecar for source in look.sources), _crs_words(look)),
+        head_of_sidecars((source.sidecar for source in look.sources), crs_of(source.crs for source in look.sources)),
         [*_notes(look), *pictures, *_quality(look), *_pairs(look), _strips(look), _files(look)],
         cards=_cards(look),
         appendix=[_method(look), *_sidecars(look)],
     )
     return html_of(page)
-
-
-def _crs_words(look: Look) -> str:
-    crs = next((source.crs for source in look.sources if source.crs is not None), None)
-    if crs is None:
-        return "unknown"
-    code = crs.to_authority(min_confidence=100)
-    return f"{crs.name}{f' ({code[0]}:{code[1]})' if code else ''}"
 
 
 def _cards(look: Look) -> list[Card]:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
+
+from pyproj import CRS
 
 Json = dict[str, Any]
 LARGEST_BYTES = 50_000_000
@@ -52,6 +54,15 @@ def find_key(tree: Any, name: str) -> Iterator[Any]:
     elif isinstance(tree, list):
         for value in tree:
             yield from find_key(value, name)
+
+
+def crs_of(systems: Iterable[CRS | None]) -> str:
+    """Return name and code of the files' coordinate system; empty if no file states one."""
+    crs = next((one for one in systems if one is not None), None)
+    if crs is None:
+        return ""
+    code = crs.to_authority(min_confidence=100)
+    return f"{crs.name}{f' ({code[0]}:{code[1]})' if code else ''}"
 
 
 def warnings_in(sidecar: Json) -> list[str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -12,16 +11,19 @@ from typing import Any
 from swath.calib.flight import FlightError
 from swath.calib.strips.cells import StripRules
 from swath.calib.strips.differences import Numbers, PairReport, StripReport, report_of
-from swath.calib.strips.signatures import Signatures, record_of, signatures
+from swath.calib.strips.signatures import MATTERS_M, Signatures, record_of, signatures
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.processing.calibration.returns import read_flight, refuse_installations, smoothed_prior
 from swath.daemon.processing.carried_verdict import first_lines, points_verdicts, refusal, told_before, verdict_entry
 from swath.daemon.processing.flights.read import GeorefOptions, verdicts_of
+from swath.daemon.processing.pages.head import head_of_flights, head_of_sidecars
+from swath.daemon.processing.quicklook.product_facts import crs_of
 from swath.daemon.processing.strip_agreement import Agreement, difference_of
 from swath.daemon.processing.strips.inputs import Strips, strips_of_files, strips_of_flight
 from swath.daemon.processing.user_errors import as_user_error, finite
 from swath.georef.mapping.frame import MappingError
 from swath.georef.strips import StripError
+from swath.georef.verdicts import Level, Reason, Verdict, worst_first
 
 Told = Callable[[str, int, int], None]
 
@@ -39,7 +41,6 @@ class StripsOptions:
         before: paths of the same strips at an earlier state; empty: no comparison with one.
         logs: how logs are read; its list of logs is ignored.
         rules: rules of the comparison.
-        output: folder for pictures and record; None: no files.
         level: a USGS level that must be kept; None: no level is required.
     """
 
@@ -47,21 +48,28 @@ class StripsOptions:
     logs: GeorefOptions
     before: Sequence[Path] = ()
     rules: StripRules = field(default_factory=StripRules)
-    output: Path | None = None
     level: str | None = None
 
 
 @dataclass(frozen=True)
 class Compared:
-    """The outcome: a record for scripts, lines for people, and the problem in a line (empty: no problem)."""
+    """The outcome of a comparison.
+
+    Attributes:
+        record: for scripts; lines: for people.
+        problem: in a line; empty: no problem.
+        now, before: strips with their differences; before: None if there is no earlier state.
+    """
 
     record: dict[str, Any]
     lines: list[str]
     problem: str
+    now: Judgement
+    before: Judgement | None = None
 
 
 def compare_strips(request: StripsOptions, folder: Path, told: Told) -> Compared:
-    """Compare strips and write the results.
+    """Compare strips.
 
     Args:
         request: options of the comparison.
@@ -78,13 +86,9 @@ def compare_strips(request: StripsOptions, folder: Path, told: Told) -> Compared
         )
     record = finite(now.record() | ({"before": then.record()} if then is not None else {}))
     record["verdict"] = verdict_entry(now.strips.carried, accepted=request.logs.accept_verdict)
-    pictures = _draw(request, now, then)
-    if request.output is not None:
-        record["pictures"] = [str(path) for path in pictures]
-        path = request.output / RECORD
-        path.write_text(json.dumps(record, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-    lines = [*first_lines(record["verdict"]), *now.lines(then), *map(str, pictures)]
-    return Compared(record, lines, "; ".join(filter(None, (refusal(record["verdict"]), now.problem(request.level)))))
+    lines = [*first_lines(record["verdict"]), *now.lines(then)]
+    problem = "; ".join(filter(None, (refusal(record["verdict"]), now.problem(request.level))))
+    return Compared(record, lines, problem, now, then)
 
 
 def rules_of(most_cells: int, cell_m: float | None) -> StripRules:
@@ -119,8 +123,9 @@ def _kind(path: Path) -> str:
 def _read(paths: Sequence[Path], request: StripsOptions, folder: Path, told: Told) -> Strips:
     if not is_of_logs(paths):
         strips = strips_of_files(paths, request.rules, told, request.logs.trajectory.week)
-        strips.carried.extend(points_verdicts([source.sidecar for source in strips.look.sources]))
-        return strips
+        sidecars = [source.sidecar for source in strips.look.sources]
+        strips.carried.extend(points_verdicts(sidecars))
+        return replace(strips, head=head_of_sidecars(sidecars, crs_of(source.crs for source in strips.look.sources)))
     folder.mkdir(parents=True, exist_ok=True)
     kept = read_flight(replace(request.logs, logs=paths), folder, told)
     refuse_installations(kept.logged)
@@ -130,7 +135,7 @@ def _read(paths: Sequence[Path], request: StripsOptions, folder: Path, told: Tol
         strips = strips_of_flight(", ".join(map(str, paths)), kept.flight, request.rules, mapping, smoothed_prior(kept))
     strips.notes.extend(kept.notes)
     strips.carried.extend(carried)
-    return strips
+    return replace(strips, head=head_of_flights(kept.logged))
 
 
 # ---------------------------------------------------------------------- results
@@ -153,6 +158,43 @@ class Judgement:
         """Return sentences on effects that matter, and on strips that are too far apart to tell an effect."""
         found = () if self.signatures is None else self.signatures.found
         return list(dict.fromkeys(one.words for one in found if one.level in ("significant", "rough")))
+
+    def verdict(self, level: str | None) -> Verdict:
+        """Return the verdict on the strips: what they are made with, effects that matter, and the level if it is asked.
+
+        Args:
+            level: quality level that they must meet; None: none is required.
+        """
+        reasons = [one.reason for one in self.strips.carried]
+        found = () if self.signatures is None else self.signatures.found
+        for one in {one.words: one for one in found if one.level in ("significant", "rough")}.values():
+            far = one.level == "rough"
+            remedy = "run swath calibrate" if far else "run swath calibrate; it estimates all parameters together"
+            words, level_of = one.words.partition("; run swath")[0], Level.UNUSABLE if far else Level.CARE
+            reasons.append(Reason(level_of, one.effect.name, words, remedy, 1.0 if far else one.edge_m / MATTERS_M))
+        if self.agreement.no_verdict:
+            what, _, remedy = self.agreement.no_verdict.partition(": add ")
+            reasons.append(Reason(Level.CARE, "cells", what, f"add {remedy}", 0.0))
+        elif level is not None and (broken := self.agreement.broken(level)):
+            what = f"strips do not meet {level}, because of its limit of {', '.join(broken)}"
+            reasons.append(Reason(Level.UNUSABLE, "level", what, "calibrate, or correct the trajectory (--adjust)"))
+        worst, ordered = worst_first(reasons)
+        return Verdict(worst, f"{worst.heading}: {self._agree(ordered)}.", ordered)
+
+    def _agree(self, reasons: Sequence[Reason]) -> str:
+        """Return the gravest reason, and how well the strips agree."""
+        numbers, words = self.agreement.numbers, [reasons[0].what] if reasons else []
+        if numbers is not None:
+            met = f", and meet {self.agreement.best}" if self.agreement.best else ", and meet no quality level"
+            met = met if self.agreement.judged else ""
+            words.append(f"strips agree to {100.0 * numbers['rms_m']:.1f} cm (RMSDz of {len(self.pairs())} pairs){met}")
+        return "; ".join(words)
+
+    def pairs(self) -> list[tuple[str, str, dict[str, Any] | None, PairReport | None]]:
+        """Return names, gridded numbers and point-to-plane numbers of every pair, the largest RMSDz first."""
+        heights, to_plane = self._rows(), {(pair.first, pair.second): pair for pair in self.report.pairs}
+        every = [(*pair, heights.get(pair), to_plane.get(pair)) for pair in {**heights, **to_plane}]
+        return sorted(every, key=lambda one: (-one[2]["rms_m"] if one[2] else 0.0, *self._place(one[:2])))
 
     def problem(self, level: str | None) -> str:
         """Return the problem in a line; empty if there is none."""
@@ -224,23 +266,6 @@ def _judged(strips: Strips, request: StripsOptions, told: Told) -> Judgement:
     report = report_of(strips.look.names, strips.gathered, request.rules, strips.cell_m)
     found = None if strips.seen is None else signatures(report.checks, strips.seen, strips.prior)
     return Judgement(strips, report, found)
-
-
-def _draw(request: StripsOptions, now: Judgement, then: Judgement | None) -> list[Path]:
-    if request.output is None:
-        return []
-    from swath.daemon.processing.quicklook.maps import draw_differences
-
-    made = []
-    try:
-        request.output.mkdir(parents=True, exist_ok=True)
-        for name, one in (("differences.png", now), ("differences_before.png", then)):
-            if one is not None:
-                draw_differences(one.strips.look, request.output / name)
-                made.append(request.output / name)
-    except OSError as error:
-        raise UserError(f"{request.output}: is not writable ({error.strerror or error})", ExitCode.IO) from error
-    return made
 
 
 def _row(name: str, *values: str) -> str:

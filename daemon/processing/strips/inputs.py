@@ -29,6 +29,7 @@ from swath.calib.strips.cells import (
 from swath.calib.strips.effects import SeenFrom
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.processing.carried_verdict import Carried
+from swath.daemon.processing.pages.head import NOTHING_KNOWN, PageHead
 from swath.daemon.processing.point_times import PointClock
 from swath.daemon.processing.quicklook.grids import Surface, cell_for, frame_of
 from swath.daemon.processing.quicklook.point_files import UNREADABLE, PointReader, Selection
@@ -64,6 +65,7 @@ class Strips:
         prior: joint covariance of the trajectory's errors; None: it is not known.
         notes: what the user should know.
         carried: verdicts on inputs of the points, other than good.
+        head: head of their page.
     """
 
     what: str
@@ -74,6 +76,7 @@ class Strips:
     prior: TrajectoryPrior | None = None
     notes: list[str] = field(default_factory=list)
     carried: list[Carried] = field(default_factory=list)
+    head: PageHead = NOTHING_KNOWN
 
 
 def strips_of_files(paths: Sequence[Path], rules: StripRules, told: Told, week: int | None = None) -> Strips:

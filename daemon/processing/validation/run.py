@@ -43,7 +43,11 @@ from swath.daemon.processing.calibration.run import PLANES, prior_of
 from swath.daemon.processing.carried_verdict import Carried, first_lines, refusal, told_before, verdict_entry
 from swath.daemon.processing.files import sha256_of, write_whole
 from swath.daemon.processing.flights.read import GeorefOptions, verdicts_of
+from swath.daemon.processing.pages.head import NOTHING_KNOWN, PageHead, calibrations_words, head_of_flights
+from swath.daemon.processing.pages.names import HISTORY_PICTURE, PRINTED, VALIDATION
+from swath.daemon.processing.pages.pdf import page_files
 from swath.daemon.processing.user_errors import as_user_error, finite
+from swath.daemon.processing.validation.page import validation_page
 from swath.daemon.processing.validation.record import record_files, records_of
 from swath.daemon.text_files import text_of
 from swath.georef.mapping.frame import MappingError
@@ -55,7 +59,7 @@ INK, MUTED, COLOURS = "#1d242b", "#5d6770", ("#0072b2", "#d55e00", "#009e73")
 DPI, DAY_S = 140, 86_400.0
 
 Told = Callable[[str, int, int], None]
-RECORD, PICTURE = "validation.json", "history.png"
+RECORD = "validation.json"
 REFUSED = (FlightError, PlaneError, HistoryError, StripError, MappingError, CalibrationError, ControlError)
 
 
@@ -84,11 +88,12 @@ class ValidationOptions:
 
 @dataclass(frozen=True)
 class Validated:
-    """The outcome: a record for scripts, lines for people, and the problem in a line (empty: no problem)."""
+    """The outcome: a record for scripts, lines for people, the problem in a line (empty: no problem), and warnings."""
 
     record: dict[str, Any]
     lines: list[str]
     problem: str
+    warnings: list[str] = field(default_factory=list)
 
 
 @dataclass
@@ -100,6 +105,8 @@ class _Found:
     documents: Mapping[str, Document] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     carried: list[Carried] = field(default_factory=list)
+    head: PageHead = NOTHING_KNOWN
+    warnings: list[str] = field(default_factory=list)
 
 
 def run_validation(request: ValidationOptions, folder: Path, told: Told) -> Validated:
@@ -116,6 +123,7 @@ def run_validation(request: ValidationOptions, folder: Path, told: Told) -> Vali
     with as_user_error(folder, *REFUSED):
         calibrations = [read_file(path) for path in request.calibrations]
         found = _Found({one.scanner: one for one in calibrations})
+        found.head = PageHead(calibrations=calibrations_words(found.calibrations))
         if request.histories:
             found.histories = _histories(request.histories, calibrations)
         if request.logs.logs:
@@ -155,6 +163,7 @@ def _against_logs(request: ValidationOptions, found: _Found, folder: Path, told:
     kept = read_flight(request.logs, folder, told)
     refuse_installations(kept.logged)
     found.carried += verdicts_of(kept.logged)
+    found.head = head_of_flights(kept.logged, calibrations_words(found.calibrations))
     with told_before(found.carried, *REFUSED):
         _against_flight(request, found, kept, folder, told)
 
@@ -293,8 +302,8 @@ def _written(request: ValidationOptions, found: _Found) -> Validated:
     record["notes"] = found.notes
     record = finite(record)
     if request.output is not None:
-        lines += _write(request.output, record, found)
-    return Validated(record, [*lines, *found.notes], "; ".join(wrong))
+        lines += _write(request, request.output, record, found)
+    return Validated(record, [*lines, *found.notes], "; ".join(wrong), found.warnings)
 
 
 def _record(validation: Validation) -> dict[str, Any]:
@@ -337,14 +346,19 @@ def _table(one: History) -> list[str]:
     return lines
 
 
-def _write(output: Path, record: dict[str, Any], found: _Found) -> list[str]:
-    files: dict[Path, bytes] = {}
+def _write(request: ValidationOptions, output: Path, record: dict[str, Any], found: _Found) -> list[str]:
+    page = output / VALIDATION
+    picture = history_png(found.histories) if found.histories else None
+    heading = "Validation of " + " and ".join(path.name for path in request.calibrations)
+    html = validation_page(heading, found.head, found.validation, found.histories, found.carried, found.notes, picture)
+    files = page_files(page, html, found.warnings)
     if found.validation is not None and found.validation.passed is not None:
         files |= record_files(output, found.documents, found.validation, found.logs)
-    if found.histories:
-        files[output / PICTURE] = history_png(found.histories)
+    if picture is not None:
+        files[output / HISTORY_PICTURE] = picture
     files[output / RECORD] = (json.dumps(record, indent=2, allow_nan=False) + "\n").encode()
     try:
+        page.with_suffix(PRINTED).unlink(missing_ok=True)  # of an earlier run
         write_whole(files)
     except OSError as error:
         raise UserError(f"{output}: is not writable ({error.strerror or error})", ExitCode.IO) from error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import typer
+from pypdf import PdfReader
 from pyproj import CRS
 
 from swath.calib.flight import Flight
@@ -129,6 +131,23 @@ def test_record_and_table_show_the_numbers_of_a_lifted_strip(
     assert any("no trajectory" in line or "no signatures" in line for line in record["notes"])
     assert json.loads((tmp_path / "out" / "strips.json").read_text()) == record
     assert (tmp_path / "out" / "differences.png").read_bytes()[:4] == b"\x89PNG"
+    assert record["page"] == str(tmp_path / "out" / "strips.html")
+
+
+def test_the_page_begins_with_the_verdict_and_shows_strips_pairs_and_the_map(tmp_path: Path) -> None:
+    folder = lifted(tmp_path / "now", 0.07)
+    with pytest.raises(UserError, match="do not meet QL1"):
+        run(str(folder), "-o", str(tmp_path / "out"), "--level", "QL1")
+    text = (tmp_path / "out" / "strips.html").read_text(encoding="utf-8")
+    sentence = "Not to be used: strips do not meet QL1, because of its limit of 8 pulses per m²; strips agree to 7.0 cm"
+    assert 0 < text.index(sentence) < text.index("<h2>Strips</h2>") < text.index("<h2>Pairs</h2>")
+    assert "data:image/png;base64" in text
+    for cell in ("<td>1</td><td>1</td>", "<td>−7.0</td><td>7.0</td>", "<td>+7.0</td><td>7.0</td>"):
+        assert cell in text, cell
+    assert not re.search(r"<th[^>]*></th>|(?<![\w-])-\d", re.sub(r"<style>.*?</style>", "", text, flags=re.DOTALL))
+    read = PdfReader(tmp_path / "out" / "strips.pdf")
+    assert read.metadata is not None
+    assert read.metadata.title == "now: comparison of strips"
 
 
 def test_numbers_before_and_after_are_shown_side_by_side(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -141,8 +160,13 @@ def test_numbers_before_and_after_are_shown_side_by_side(tmp_path: Path, capsys:
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
         "differences.png",
         "differences_before.png",
+        "strips.html",
         "strips.json",
+        "strips.pdf",
     ]
+    text = (tmp_path / "out" / "strips.html").read_text(encoding="utf-8")
+    assert "<td>before</td><td>−20.0</td><td>20.0</td>" in text
+    assert "overlapping strips, before" in text
 
 
 def test_a_missed_quality_level_is_a_problem(tmp_path: Path) -> None:

@@ -74,6 +74,9 @@ def test_a_changed_history_is_reported_drawn_and_a_problem(tmp_path: Path, capsy
     assert one["moved"] is True
     assert json.loads((tmp_path / "out" / "validation.json").read_text()) == record
     assert (tmp_path / "out" / "history.png").read_bytes()[:4] == b"\x89PNG"
+    page = (tmp_path / "out" / "validation.html").read_text(encoding="utf-8")
+    assert page.index("the boresight of left has moved") < page.index("<td>c3</td>") < page.index("image/png")
+    assert "c3 of left, made 2026-03-01" in page
 
 
 def test_an_unchanged_history_is_fine(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -118,15 +121,16 @@ def log(made: Cast, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
         head = made.flight.heads[0]
         start = head.start if text is None else read_calibration(text, name)
         flight = replace(made.flight, heads=(replace(head, start=start),)).placed({"left": start})
-        profile = SimpleNamespace(installation=PLACE)
+        profile = SimpleNamespace(installation=PLACE, aircraft="HB-ABC", operator="Survey AG")
         logged: Any = SimpleNamespace(
             warnings=[],
             holes=[],
             log=path,
             navigated=None,
-            setup=SimpleNamespace(config=SimpleNamespace(profile=profile)),
+            setup=SimpleNamespace(config=SimpleNamespace(profile=profile), mapping=None),
             verdicts=[],
-            session=SimpleNamespace(parts=[SimpleNamespace(path=path)]),
+            span=made.flight.trajectories[0].span,
+            session=SimpleNamespace(session_id="second-flight", parts=[SimpleNamespace(path=path)]),
         )
         return KeptFlight(flight, [logged], [])
 
@@ -230,7 +234,8 @@ def test_another_record_can_be_named_and_that_of_another_calibration_is_unchange
     record_beside(tmp_path / "left.record.json", "c0")
     run(str(file), str(log), "-o", str(tmp_path / "out"))
     assert "left.record.json: is the record of calibration c0" in capsys.readouterr().out
-    assert [path.name for path in (tmp_path / "out").iterdir()] == ["validation.json"]
+    written = {path.name for path in (tmp_path / "out").iterdir()}
+    assert written == {"validation.json", "validation.html", "validation.pdf"}
     (tmp_path / "report").mkdir()
     record_beside(tmp_path / "report" / "left.record.json", "c1")
     run(str(file), str(log), "-o", str(tmp_path / "out"), "--record", str(tmp_path / "report"))
@@ -298,6 +303,15 @@ def test_check_points_are_counted_in_the_record(log: Path, made: Cast, tmp_path:
     assert "testfield" in told["CA_GeometryValidation.validationMethod"]["value"]
     methods = json.loads((tmp_path / "out" / "validation.json").read_text())["validation"]["methods"]
     (testfield,) = [one for one in methods if one["method"] == "testfield"]
+    page = (tmp_path / "out" / "validation.html").read_text(encoding="utf-8")
+    figures = testfield["numbers"]
+    row = f"<td>001</td><td>{figures['count']}</td><td>{100 * figures['mean_m']:+.1f}</td>".replace("-", "−")
+    assert row in page
+    assert "not applied: needs the log of a second flight" in page
+    assert "second-flight" in page
+    assert "HB-ABC" in page
+    assert page.count(">passed</span>") >= 6  # two methods, and their tests in the appendix
+    assert "≤ " in page
     assert 5 < told["CA_TestRange.numberCheckPoints"]["value"] == testfield["points"] <= given
 
 

@@ -99,6 +99,13 @@ def page_of(rows: int = 3) -> Page:
     )
 
 
+def test_numbers_have_a_minus_and_names_keep_their_hyphens() -> None:
+    lines = ["add -0.5 to (-3) a-1", "2026-06-15", "+lat_0=-33", "x,-1.5"]
+    text = html_of(Page("Test page", "Title", PageHead(), [Words(line) for line in lines]))
+    for words in ("add −0.5 to (−3) a-1", "2026-06-15", "+lat_0=-33", "x,-1.5"):
+        assert words in text, words
+
+
 def test_a_page_ends_with_its_appendix_and_shows_no_empty_column() -> None:
     text = html_of(page_of())
     assert text.index("HB-ABC") < text.index("row 2") < text.index("<h1>Appendix</h1>") < text.index("x = a + b")

@@ -1,0 +1,213 @@
+"""Writes the page of a validation: verdict, each method with figures and limits, errors that would be missed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from scipy import stats
+
+from swath.calib.labels import decimals_of, number, thousands
+from swath.calib.validation.history import History
+from swath.calib.validation.methods import ALPHA, POWER, WANTS, WORDS, Detectable, Test, Validation
+from swath.daemon.processing.carried_verdict import Carried
+from swath.daemon.processing.pages.blocks import Block, Card, Cell, Image, Judged, Notes, Table, Words, data_uri
+from swath.daemon.processing.pages.head import PageHead
+from swath.daemon.processing.pages.render import Page, html_of
+from swath.georef.scanner.calibration import INDEX, PARAMETERS
+from swath.georef.verdicts import Level, Reason, Verdict, worst_first
+
+COMPARED = {
+    **WORDS,
+    "testfield": "laser above control points",
+    "measurementActualParameters": "parameters, measured anew",
+}
+TESTS = {
+    "chi2": "χ² of all distances",
+    "z": "size of their mean, in sigmas",
+    "effects": "χ² of the part that errors of the calibration explain",
+    "effect": "largest single error, in sigmas",
+}
+HOW = (
+    "Every distance is tested against its expected covariance: noise of the planes, errors of the trajectory with "
+    "their correlation along the strips, and the sigmas of the calibration itself. A test fails where chance alone "
+    f"gives a larger figure in less than {ALPHA:g} of all cases; the limit of p is therefore {ALPHA:g}."
+)
+
+
+def validation_page(
+    heading: str,
+    head: PageHead,
+    validation: Validation | None,
+    histories: Sequence[History],
+    carried: Sequence[Carried],
+    notes: Sequence[str],
+    picture: bytes | None,
+) -> str:
+    """Return the HTML text of the page.
+
+    Args:
+        heading: name of the calibrations.
+        head: flight and calibrations.
+        validation: result against logs; None: not made.
+        histories: earlier calibrations of the installations.
+        carried: verdicts on the inputs, other than good.
+        notes: for the reader, one sentence each.
+        picture: PNG of the histories; None: there are none.
+    """
+    verdict = verdict_of(validation, histories, carried)
+    reasons = [[reason.what, reason.change] for reason in verdict.reasons]
+    blocks: list[Block] = [
+        *([Table("Reasons", ("what", "remedy"), reasons, left=(0, 1), stacked=True)] if reasons else []),
+        *([Notes(notes)] if notes else []),
+        *([] if validation is None else [_methods(validation), *_detectable(validation)]),
+        *_histories(histories, picture),
+    ]
+    appendix: list[Block] = [] if validation is None else [*_tests(validation), Words(HOW, "How it was tested")]
+    cards = _cards(validation, histories)
+    return html_of(Page("Validation", heading, head, blocks, verdict, cards, title=heading, appendix=appendix))
+
+
+def verdict_of(validation: Validation | None, histories: Sequence[History], carried: Sequence[Carried]) -> Verdict:
+    """Return the verdict on calibrations by all tests that were made."""
+    reasons = [one.reason for one in carried]
+    words = []
+    if validation is not None:
+        words.append(validation.sentence)
+        failed = [method for method in validation.methods if method.passed is False]
+        remedy = "calibrate again; until then do not use the calibration"
+        reasons += [Reason(Level.UNUSABLE, one.name, one.sentence, remedy, 2.0) for one in failed]
+        reasons += [Reason(Level.CARE, "undone", f"not done as requested: {one}", "", 1.0) for one in validation.undone]
+        if validation.passed is None:
+            reasons.append(Reason(Level.CARE, "nothing", "no method could be applied", "give other logs, or control"))
+        reasons += [
+            Reason(Level.CARE, "logs", one, "validate with a flight of its own") for one in validation.dependent
+        ]
+    for one in histories:
+        words += one.sentences
+        if one.moved:
+            what = f"the boresight of {one.scanner} has moved"
+            reasons.append(Reason(Level.UNUSABLE, "moved", what, "fasten the scanner and calibrate again", 3.0))
+    worst, ordered = worst_first(reasons)
+    return Verdict(worst, f"{worst.heading}: {'; '.join(words)}.", ordered)
+
+
+def _cards(validation: Validation | None, histories: Sequence[History]) -> list[Card]:
+    cards: list[Card] = []
+    if validation is not None:
+        applied = [method for method in validation.methods if method.passed is not None]
+        passed = sum(method.passed is True for method in applied)
+        cards.append((f"{passed} of {len(applied)}", "methods passed, of those that could be applied"))
+        for method in applied:
+            if method.numbers is not None:
+                cards.append((f"{_cm(method.numbers.rms_m)} cm", f"RMS, {COMPARED[method.name]}"))
+    cards += [(str(len(one.entries)), f"calibrations of {one.scanner} compared") for one in histories]
+    return cards
+
+
+def _cm(metres: float, pattern: str = ".1f") -> str:
+    return number(100.0 * metres, pattern)
+
+
+def _methods(validation: Validation) -> Table:
+    """Return a table of the six methods, each with its deciding test: the first that fails, otherwise that of all."""
+    rows: list[list[Cell]] = []
+    for method in validation.methods:
+        if method.passed is None:
+            why = method.sentence.partition("not applied: ")[2] or WANTS[method.name]
+            rows.append([COMPARED[method.name], method.code, *["–"] * 8, f"not applied: {why}"])
+            continue
+        test = next((one for one in method.tests if not one.passed), method.tests[0])
+        numbers = method.numbers
+        sizes = ["–"] * 5
+        if numbers is not None:
+            sizes = [thousands(numbers.count), _cm(numbers.mean_m, "+.1f")]
+            sizes += [_cm(value) for value in (numbers.std_m, numbers.rms_m, numbers.max_m)]
+        verdict = Judged("passed" if method.passed else f"failed {test.words}".strip(), bool(method.passed))
+        rows.append([COMPARED[method.name], method.code, *sizes, *_figures(test), verdict])
+    heads = ("method", "code", "distances", "mean, cm", "std, cm", "RMS, cm", "largest, cm", "figure", "limit", "p")
+    under = (
+        "Codes: ISO/TS 19159-2, 6.8. Figure and limit are those of the test that failed, otherwise of "
+        f"{TESTS['chi2']}; the appendix has all tests."
+    )
+    return Table("Methods", (*heads, "verdict"), rows, under, left=(0, 10))
+
+
+def _figures(test: Test) -> list[str]:
+    """Return figure, limit and p of a test."""
+    digits = ".0f" if test.value >= 100.0 else ".1f"
+    limit = _limit(test)
+    return [
+        number(abs(test.value), digits),
+        "–" if limit is None else f"≤ {number(limit, digits)}",
+        number(test.p, ".2g"),
+    ]
+
+
+def _limit(test: Test) -> float | None:
+    """Return the value that a test may reach; None for a test whose p depends on the number of errors tried."""
+    if test.kind in ("chi2", "effects"):
+        return float(stats.chi2.isf(ALPHA, test.freedom))
+    return float(stats.norm.isf(ALPHA / 2.0)) if test.kind == "z" else None
+
+
+def _tests(validation: Validation) -> list[Block]:
+    """Return a table of all tests of all methods that were applied."""
+    rows: list[list[Cell]] = [
+        [
+            COMPARED[method.name],
+            TESTS[test.kind],
+            thousands(test.freedom) if test.kind in ("chi2", "effects") else "–",
+            *_figures(test),
+            Judged("passed" if test.passed else "failed", test.passed),
+        ]
+        for method in validation.methods
+        for test in method.tests
+    ]
+    heads = ("method", "test", "degrees of freedom", "figure", "limit", "p", "verdict")
+    return [Table("All tests", heads, rows, left=(0, 1, 6))] if rows else []
+
+
+def _detectable(validation: Validation) -> list[Block]:
+    """Return a table of the smallest errors that the tests would have detected."""
+    found = validation.detectable
+    several = len({one.scanner for one in found}) > 1
+    rows = [[f"{one.scanner} {one.name}" if several else one.name, *_size(one)] for one in found]
+    under = (
+        f"A single error of this size would have failed a test with a probability of {POWER:.0%}; smaller ones may "
+        "remain unseen."
+    )
+    heads = ("parameter", "smallest error that would be detected", "unit")
+    return [Table("What would have been seen", heads, rows, under, left=(0, 2))] if rows else []
+
+
+def _size(one: Detectable) -> tuple[str, str]:
+    parameter = PARAMETERS[INDEX[one.parameter]]
+    ending = parameter.key.rpartition("_")[2]
+    unit = {"deg": "°", "us": "µs", "us2": "µs²"}.get(ending, ending)
+    if not one.seen:
+        return "none would be", unit
+    size = one.size / parameter.factor
+    return number(size, f".{decimals_of(size)}f"), unit
+
+
+def _histories(histories: Iterable[History], picture: bytes | None) -> list[Block]:
+    """Return a table of the boresight in all calibrations of each installation, and the picture of all."""
+    blocks: list[Block] = []
+    keys = ("omega_deg", "phi_deg", "kappa_deg")
+    for one in histories:
+        rows = [
+            [row["id"], row["created"], *(_with_sigma(row[key], row[f"{key}_sigma"]) for key in keys)]
+            for row in one.table()
+        ]
+        heads = ("calibration", "made", "ω, °", "φ, °", "κ, °")
+        title = f"Calibrations of {one.scanner}" + (f", {one.installation}" if one.installation else "")
+        blocks += [Table(title, heads, rows, " ".join(f"{line[0].upper()}{line[1:]}." for line in one.sentences))]
+    return [*blocks, *([Image("Boresight over time", data_uri(picture, "image/png"))] if picture else [])]
+
+
+def _with_sigma(value: float, sigma: float | None) -> str:
+    """Return a value with its sigma; a value without one has four decimals."""
+    if not sigma:
+        return number(value, ".4f")
+    pattern = f".{decimals_of(sigma)}f"
+    return f"{number(value, pattern)} ± {number(sigma, pattern)}"
