@@ -69,7 +69,7 @@ class Compared:
 
 
 def compare_strips(request: StripsOptions, folder: Path, told: Told) -> Compared:
-    """Compare strips.
+    """Compare strips with each other, and with an earlier state of them.
 
     Args:
         request: options of the comparison.
