@@ -93,7 +93,8 @@ def decimals_of(sigma: float, most: int = 9) -> int:
     """Return how many decimals show two digits of a sigma."""
     if not math.isfinite(sigma) or sigma <= 0.0:
         return 4
-    return min(max(1 - math.floor(math.log10(sigma)), 0), most)
+    exponent = int(f"{sigma:.1e}".partition("e")[2])  # of the rounded sigma: 0.0996 shows as 0.10
+    return min(max(1 - exponent, 0), most)
 
 
 def number(value: float | None, pattern: str = ".3g") -> str:
@@ -102,6 +103,12 @@ def number(value: float | None, pattern: str = ".3g") -> str:
         return "–"
     text = format(value, pattern)
     return text.replace("-", MINUS) if float(text.replace(",", "")) else text.replace("-", "")
+
+
+def with_sigma(value: float, sigma: float, *, sign: bool = True) -> str:
+    """Format a value and its sigma as ``+12.0 ± 1.4``: the sigma with two digits, the value to the same place."""
+    pattern = f".{decimals_of(sigma)}f"
+    return f"{number(value, f'+{pattern}' if sign else pattern)} ± {number(sigma, pattern)}"
 
 
 def thousands(value: float, digits: int = 0) -> str:

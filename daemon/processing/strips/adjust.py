@@ -8,7 +8,6 @@ height differences of strips, before and after                 swath.calib.strip
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -95,6 +94,7 @@ class StripsCorrected:
     """The outcome of an adjustment of strips.
 
     Attributes:
+        settings: of the adjustment.
         kept: the flight as read, placed with the calibration that is held.
         features: planes and control that the corrections were estimated from.
         control: surveyed points; empty if there are none.
@@ -103,6 +103,7 @@ class StripsCorrected:
         notes: notes for people, one line each.
     """
 
+    settings: Settings
     kept: KeptFlight
     features: Features
     control: tuple[ControlPoint, ...]
@@ -198,7 +199,7 @@ def _of_flight(request: AdjustOptions, kept: KeptFlight, folder: Path, tell: Ste
     tell("strips before and after", 0, 1)
     before, after = before_and_after(flight, moved(adjusted, "adjusted"), kept.logged[0].setup.mapping)
     notes += [*kept.notes, *_notes(request, kept, features, before.cells.frame.cell_m), *adjusted.notes]
-    return StripsCorrected(kept, features, points, adjusted, before, after, tuple(notes))
+    return StripsCorrected(request.settings, kept, features, points, adjusted, before, after, tuple(notes))
 
 
 def _refuse(request: AdjustOptions, kept: KeptFlight) -> None:
@@ -223,14 +224,10 @@ def _refuse(request: AdjustOptions, kept: KeptFlight) -> None:
 def _notes(request: AdjustOptions, kept: KeptFlight, features: Features, cell_m: float) -> list[str]:
     notes, flight = [], kept.flight
     if not request.control:
-        settings = request.settings
-        notes.append(
-            "no control: a shift or tilt common to all strips is held by its prior of "
-            f"{100 * settings.position_m:.0f} cm and {_mdeg(settings.turn_rad):.0f} mdeg; the datum is not determined"
-        )
+        notes.append("no control: the datum is not determined; a shift or tilt common to all strips stays as it is")
     seen = {flight.swaths[patch.swath].strip for plane in features.planes for patch in plane.patches}
     for strip in sorted({swath.strip for swath in flight.swaths} - seen):
-        notes.append(f"strip {strip:02d}: no other strip sees one of its planes, so it is not corrected")
+        notes.append(f"strip {strip:02d}: no other strip sees one of its planes, so nothing of it is determined")
     found = signatures(
         differences(flight, StripRules(cell_m=cell_m)).checks, SeenFrom.of(flight), smoothed_prior(kept)
     ).found
@@ -241,7 +238,3 @@ def _notes(request: AdjustOptions, kept: KeptFlight, features: Features, cell_m:
         for words in effects
     ]
     return notes
-
-
-def _mdeg(turn_rad: float) -> float:
-    return 1e3 * math.degrees(turn_rad)

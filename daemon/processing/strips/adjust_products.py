@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from swath import __version__
-from swath.calib.strips.corrections import StripChoice
+from swath.calib.labels import number, with_sigma
+from swath.calib.strips.corrections import NONE, Settings, StripChoice
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.processing.calibration.products import Told, strips_entry
 from swath.daemon.processing.carried_verdict import ADJUSTMENT, first_lines, trajectory_entry
@@ -23,7 +24,7 @@ from swath.daemon.processing.strips.adjust import AdjustOptions, StripsCorrected
 from swath.daemon.processing.trajectory.files import write_trajectory
 from swath.daemon.processing.trajectory.summary import write_json
 from swath.daemon.processing.user_errors import finite
-from swath.georef.arrays import BoolArray, FloatArray, Int64Array
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.georef.trajectory.trajectory import Trajectory
 
 WHAT = (
@@ -33,8 +34,11 @@ WHAT = (
 )
 KEPT = "velocities and sigmas of the trajectories are unchanged"
 AXES = ("north", "east", "down")
-UNCORRECTED = "none"
-TOLD = 0.7  # share of its prior's sigma: here returns contribute as much as the prior
+COMPONENTS = ("along", "across", "down", "roll", "pitch", "heading")
+CM, MDEG = 100.0, 1e3 * math.degrees(1.0)
+FACTORS = (CM, CM, CM, MDEG, MDEG, MDEG)  # of the components' units on the console
+WIDTH = 16
+NOT_DETERMINED = "not determined"
 
 
 def write_adjustment(request: AdjustOptions, done: StripsCorrected, tell: Callable[[str, int, int], None]) -> Told:
@@ -81,6 +85,7 @@ class _Strip:
     """A strip's corrections, and its distance from other strips before and after.
 
     Attributes:
+        choice: its model, and the means of its corrections in its own axes.
         time_ns: (k,) times of its knots.
         corrections, sigmas, priors: (k, 6) north, east, down, metres, turns about these, rad; sigmas after and before.
         before_m, after_m: RMSDz; nan: no other strip overlaps it.
@@ -95,9 +100,31 @@ class _Strip:
     after_m: float
 
     @property
-    def told(self) -> BoolArray:
-        """Flags (6,) of components that the returns determine better than the prior does."""
-        return np.asarray(self.sigmas.mean(axis=0) < TOLD * self.priors.mean(axis=0))
+    def is_corrected(self) -> bool:
+        """True if the strip has a correction."""
+        return self.choice.model != NONE
+
+    def words(self, component: int) -> str:
+        """Return the correction of a component with its sigma, or why there is none."""
+        own, factor = self.choice.components, FACTORS[component]
+        if own.datum[component]:
+            return "datum"
+        if not own.determined[component]:
+            return NOT_DETERMINED
+        if not self.is_corrected:
+            return "0"
+        value, sigma = factor * float(own.mean[component]), factor * float(own.sigma[component])
+        return with_sigma(value, sigma)
+
+    def reason(self, component: int) -> str | None:
+        """Return why a component has no correction; None: it has one."""
+        own = self.choice.components
+        if own.datum[component]:
+            return "without control this strip holds the datum"
+        if not own.determined[component]:
+            share = 100.0 * (1.0 - math.sqrt(max(1.0 - float(own.redundancy[component]), 0.0)))
+            return f"{NOT_DETERMINED}: the returns reduce the prior sigma by {share:.0f} %, and 75 % are needed"
+        return None if self.is_corrected else "the strip agrees with the others without a correction"
 
 
 def _strips(done: StripsCorrected) -> Iterator[_Strip]:
@@ -150,7 +177,6 @@ def _record(request: AdjustOptions, done: StripsCorrected, written: list[tuple[P
 
 def _strip_entry(done: StripsCorrected, strip: _Strip) -> dict[str, Any]:
     """Return a strip's entry in the record; an uncorrected strip has no corrections and no sigmas."""
-    corrected = strip.choice.model != UNCORRECTED
     knots = zip(strip.time_ns.tolist(), strip.corrections, strip.sigmas, strip.priors, strict=True)
     means = (strip.corrections.mean(axis=0), strip.sigmas.mean(axis=0), strip.priors.mean(axis=0))
     return {
@@ -158,9 +184,27 @@ def _strip_entry(done: StripsCorrected, strip: _Strip) -> dict[str, Any]:
         "log": done.kept.logged[strip.choice.trajectory_index].log.name,
         "model": strip.choice.model,
         "criterion_gains": dict(strip.choice.gains),
+        "course_deg": math.degrees(strip.choice.course_rad) % 360.0,
+        "components": {name: _component_entry(done, strip, at) for at, name in enumerate(COMPONENTS)},
         "rms_dz_m": {"before": strip.before_m, "after": strip.after_m},
-        "mean": _named(*means) if corrected else None,
-        "knots": [{"gps_ns": time_ns} | _named(*values) for time_ns, *values in knots] if corrected else [],
+        "mean": _named(*means) if strip.is_corrected else None,
+        "knots": [{"gps_ns": time_ns} | _named(*values) for time_ns, *values in knots] if strip.is_corrected else [],
+    }
+
+
+def _component_entry(done: StripsCorrected, strip: _Strip, at: int) -> dict[str, Any]:
+    """Return the mean correction along the strip's own axes, m or degrees; null with the reason if there is none."""
+    own, reason = strip.choice.components, strip.reason(at)
+    settings, unit = done.settings, 1.0 if at < len(AXES) else math.degrees(1.0)
+    return {
+        "unit": "m" if at < len(AXES) else "deg",
+        "determined": bool(own.determined[at]),
+        "correction": None if reason else unit * float(own.mean[at]),
+        "sigma": unit * float(own.sigma[at]),
+        "prior_sigma": unit * (settings.position_m if at < len(AXES) else settings.turn_rad),
+        "redundancy": float(own.redundancy[at]),
+        "contains": [name for other, name in enumerate(COMPONENTS) if own.absorbs[at, other]],
+        "reason": reason,
     }
 
 
@@ -180,9 +224,9 @@ def _named(*sixes: FloatArray) -> dict[str, float]:
 def _lines(done: StripsCorrected) -> list[str]:
     adjusted, strips = done.adjusted, list(_strips(done))
     held = ", ".join(f"{head.name} {head.start.id}" for head in done.kept.flight.heads)
-    titles = [*(f"{axis} cm" for axis in AXES), *(f"turn {axis[0]} mdeg" for axis in AXES), "RMSDz cm"]
+    titles = [f"{name} {'cm' if at < len(AXES) else 'mdeg'}" for at, name in enumerate(COMPONENTS)]
     lines = [f"correction of the trajectory, no calibration; held: {held}"]
-    lines.append(f"{'strip':<7}{'model':<10}" + "".join(f"{title:>14}" for title in titles))
+    lines.append(f"{'strip':<7}{'model':<10}" + "".join(f"{title:>{WIDTH}}" for title in (*titles, "RMSDz cm")))
     lines += [_row(strip) for strip in strips]
     control = sum(len(plane.control) for plane in done.features.planes)
     lines.append(
@@ -191,21 +235,34 @@ def _lines(done: StripsCorrected) -> list[str]:
         + f"; misclosures {math.sqrt(adjusted.variance_before):.2f} → {math.sqrt(adjusted.variance_after):.2f} sigmas"
     )
     rms = [100.0 * strips.rms_m for strips in (done.before, done.after)]
-    lines.append(f"all strips: RMSDz {rms[0]:.1f} → {rms[1]:.1f} cm")
-    if any(not strip.told.all() for strip in strips if strip.choice.model != UNCORRECTED):
-        lines.append("undetermined: the planes of the strip do not determine the component, so it is unchanged")
-    return [*lines, *(f"note: {note}" for note in (*done.notes, KEPT))]
+    lines.append(f"all strips: RMSDz {number(rms[0], '.1f')} → {number(rms[1], '.1f')} cm")
+    return [*lines, *_legend(done.settings, strips), *(f"note: {note}" for note in (*done.notes, KEPT))]
+
+
+def _legend(settings: Settings, strips: Sequence[_Strip]) -> list[str]:
+    """Return what the words of the table mean, as far as it has them."""
+    shown = {strip.words(at) for strip in strips for at in range(len(COMPONENTS))}
+    lines = []
+    if NOT_DETERMINED in shown:
+        lines.append(
+            f"{NOT_DETERMINED}: the returns leave more than a quarter of the prior sigma of "
+            f"{CM * settings.position_m:.0f} cm or {MDEG * settings.turn_rad:.0f} mdeg; the component is not corrected"
+        )
+    if "0" in shown:
+        lines.append("0: the strip agrees with the others without a correction")
+    for strip in strips:
+        own = strip.choice.components
+        for at, name in enumerate(COMPONENTS):
+            if merged := [other for number, other in enumerate(COMPONENTS) if own.absorbs[at, number]]:
+                lines.append(
+                    f"strip {strip.choice.strip:02d}: {name} contains {' and '.join(merged)}, because the returns show "
+                    "only their sum"
+                )
+    return lines
 
 
 def _row(strip: _Strip) -> str:
-    """Return a line of means along the strip; uncorrected components have no sigma."""
-    factors = np.array([100.0] * 3 + [1e3 * 180.0 / np.pi] * 3)
-    means, sigmas = factors * strip.corrections.mean(axis=0), factors * strip.sigmas.mean(axis=0)
-    columns = [
-        f"{mean:+.1f} ± {sigma:.1f}" if determined else "undetermined"
-        for mean, sigma, determined in zip(means, sigmas, strip.told, strict=True)
-    ]
-    if strip.choice.model == UNCORRECTED:
-        columns = ["–"] * len(columns)
+    """Return a line of means along the strip, in its own axes."""
+    columns = [strip.words(at) for at in range(len(COMPONENTS))]
     columns.append(f"{100 * strip.before_m:.1f} → {100 * strip.after_m:.1f}" if math.isfinite(strip.after_m) else "–")
-    return f"{strip.choice.strip:02d}     {strip.choice.model:<10}" + "".join(f"{column:>14}" for column in columns)
+    return f"{strip.choice.strip:02d}     {strip.choice.model:<10}" + "".join(f"{one:>{WIDTH}}" for one in columns)

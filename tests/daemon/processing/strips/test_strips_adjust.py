@@ -133,7 +133,7 @@ def test_the_calibration_is_unchanged_and_the_table_lists_the_corrections(
     assert "model of all strips: constant; the calibration parameters were held" in told
     row = next(line for line in told.splitlines() if line.startswith(f"{made.flight.swaths[LIFTED].strip:02d} "))
     assert "constant" in row
-    assert "undetermined" in row  # its place in plan, over hardly anything but level ground
+    assert "not determined" in row  # its place in plan, over hardly anything but level ground
     assert "→" in row
     assert str(tmp_path / "out" / ADJUSTMENT) in told
 
