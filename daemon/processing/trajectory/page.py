@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
-from swath.daemon.processing.pages.blocks import Block, Card, Image, Judged, Notes, Table, data_uri
+from swath.daemon.processing.pages.blocks import Block, Card, Image, Judged, Notes, Table, Words, data_uri
 from swath.daemon.processing.pages.head import NOTHING_KNOWN, PageHead
 from swath.daemon.processing.pages.render import Page, html_of
 from swath.daemon.processing.pages.words import thousands
@@ -29,7 +29,7 @@ from swath.daemon.processing.trajectory.pictures import (
     draw_time_offset,
     draw_velocity_sigma,
 )
-from swath.daemon.processing.trajectory.series import Flight, course_of, separation_of
+from swath.daemon.processing.trajectory.series import Flight, course_of, determined_axes, separation_of
 from swath.daemon.processing.trajectory.verdict import Found, judge
 from swath.georef.trajectory.trajectory import gps_text
 from swath.georef.verdicts import Level, Verdict
@@ -55,38 +55,63 @@ def _estimated(drawn: Drawn) -> bool:
 
 
 def _scaled(drawn: Drawn) -> bool:
-    return _estimated(drawn) and max(drawn.flight.setup.noise.gyro_scale, drawn.flight.setup.noise.accel_scale) > 0.0
+    return _estimated(drawn) and _determines(drawn, "gyro_scale", "accel_scale")
 
 
 def _leaning(drawn: Drawn) -> bool:
-    return len(drawn.flight.best.gyro_misalignment) > 0
+    return _estimated(drawn) and _determines(drawn, "gyro_misalignment", "accel_misalignment")
+
+
+def _determines(drawn: Drawn, *names: str) -> bool:
+    return any(determined_axes(drawn.flight, name) for name in names)
 
 
 PICTURES: tuple[tuple[str, str, Callable[[Drawn, Format], bytes], Wanted], ...] = (
-    ("Map", "Positions used, by fix type; where none was used for long, grey.", draw_map, _always),
-    ("Height and speed", "Grey: no position was used. Red: inertial samples made up.", draw_height, _always),
+    (
+        "Map",
+        "Positions used, by fix type; where none was used for long, grey. Numbers: straight flight, of which swath "
+        "georef makes strips where the laser was on.",
+        draw_map,
+        _always,
+    ),
+    (
+        "Height and speed",
+        "Blue, numbered: straight flight. Grey: no position was used. Red: inertial samples made up.",
+        draw_height,
+        _always,
+    ),
     ("Attitude", "", draw_attitude, _always),
     ("Sigma of position", "One standard deviation, as predicted.", draw_position_sigma, _always),
     ("Sigma of attitude", "", draw_attitude_sigma, _always),
     ("Sigma of velocity", "", draw_velocity_sigma, _always),
     (
         "Innovations",
-        "Observed − computed, whitened: nine in ten of honest ones lie within ±1.6. Dashed: the gate. What lies beyond "
-        "the panel stands at its edge.",
+        "Observed − computed, divided by their sigmas: nine in ten lie within ±1.6 if these are right. Dashed: the "
+        "limit beyond which an observation is rejected. Values beyond the panel are drawn at its edge.",
         draw_innovations,
         _observed,
     ),
     (
         "Filter − smoother: position",
-        "The band is three times the sigma that the difference should have; beyond it, the noise or a sensor is not "
-        "what it was said to be.",
+        "The band is three times the sigma that the difference should have; where the line leaves it, the configured "
+        "noise or a sensor is wrong.",
         draw_position_separation,
         _smoothed,
     ),
     ("Filter − smoother: attitude", "", draw_attitude_separation, _smoothed),
     ("Sensor biases", "With bands of one sigma.", draw_biases, _estimated),
-    ("Scale factors", "With bands of one sigma.", draw_scales, _scaled),
-    ("Misalignments", "x: of axes y and z towards each other, and so on.", draw_misalignments, _leaning),
+    (
+        "Scale factors",
+        "With bands of one sigma; axes that the flight does not determine are left out.",
+        draw_scales,
+        _scaled,
+    ),
+    (
+        "Misalignments",
+        "x: of axes y and z towards each other, and so on; those that the flight does not determine are left out.",
+        draw_misalignments,
+        _leaning,
+    ),
     (
         "Lever arm",
         "Body to antenna, as estimated, with bands of one sigma.",
@@ -95,7 +120,7 @@ PICTURES: tuple[tuple[str, str, Callable[[Drawn, Format], bytes], Wanted], ...] 
     ),
     (
         "Time offset",
-        "Positive: what GNSS stamps name was observed so much earlier.",
+        "Positive: a GNSS observation was made this much before the time that its stamp gives.",
         draw_time_offset,
         lambda drawn: _estimated(drawn) and drawn.flight.setup.estimate_time_offset_s > 0.0,
     ),
@@ -152,7 +177,7 @@ def page_of(
         verdict,
         _cards(figures),
         subtitle=_span_words(figures),
-        appendix=[_run(figures)],
+        appendix=[*_facts(flight), _run(figures)],
     )
     return html_of(page)
 
@@ -209,8 +234,14 @@ def _reasons(verdict: Verdict) -> Table | None:
 
 
 def _notes(flight: Flight) -> Notes | None:
-    notes = [*((f"Start: {flight.start}",) if flight.start else ()), *flight.notes]
-    return Notes(notes) if notes else None
+    """Return what casts doubt on the trajectory; nothing else is set in amber."""
+    return Notes(flight.notes) if flight.notes else None
+
+
+def _facts(flight: Flight) -> list[Words]:
+    """Return how the flight began and with which noise: what the reader may want to know, without any doubt in it."""
+    lines = [*((f"Start: {flight.start}.",) if flight.start else ()), *(f"{line}." for line in flight.facts)]
+    return [Words(" ".join(lines), "Start and noise", muted=True)] if lines else []
 
 
 def _sigmas(figures: Figures) -> Table:

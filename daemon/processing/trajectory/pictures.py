@@ -11,14 +11,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.ticker import MaxNLocator, NullFormatter
+from matplotlib.ticker import NullFormatter
 from scipy.stats import chi2
 
+from swath.daemon.processing.pages.map_axes import HALO, coordinates, north_arrow, place_names, scale_bar
 from swath.daemon.processing.pages.words import INK, MUTED
-from swath.daemon.processing.quicklook.maps import round_down
 from swath.daemon.processing.trajectory.figures import AXES_B, AXES_L
 from swath.daemon.processing.trajectory.panels import NARROW, Drawn, Format, Sheet, dress, picture_of
-from swath.daemon.processing.trajectory.series import COLUMNS, Pixels, fix_types_at
+from swath.daemon.processing.trajectory.series import COLUMNS, Pixels, determined_axes, fix_types_at
 from swath.georef.arrays import FloatArray
 from swath.georef.navigation.inputs import Fate, Kind
 from swath.georef.records import FixType
@@ -48,43 +48,71 @@ FATE_LOOK: dict[Fate, tuple[str, str, float, str]] = {  # marker, colour, size, 
 
 
 def draw_map(drawn: Drawn, form: Format) -> bytes:
-    """Return the flight's map, coloured by the fix type of its positions."""
+    """Return the flight's map, coloured by the fix type of its positions, with the numbers of its strips."""
+    return picture_of(map_of(drawn, form), form)
+
+
+def map_of(drawn: Drawn, form: Format) -> Figure:
+    """Return the figure of the flight's map."""
     flight, course = drawn.flight, drawn.course
-    lon, lat = course.place
-    middle = math.radians(float(np.nanmean(lat)))
-    size = np.array([np.nanmax(lon) - np.nanmin(lon), np.nanmax(lat) - np.nanmin(lat)]) * [math.cos(middle), 1.0]
+    east, north = course.place
+    low, high = np.nanmin(course.place, axis=1), np.nanmax(course.place, axis=1)
+    size = np.maximum(high - low, 1.0)
     across = form.width_in - 1.05
-    up = float(np.clip(across * (size[1] + 1e-9) / (size[0] + 1e-9), 0.35 * across, min(across, 6.5)))
-    height = up + 1.0
-    figure = Figure(figsize=(form.width_in, height), facecolor="white")
+    up = float(np.clip(across * size[1] / size[0], 0.35 * across, min(across, 6.5)))
+    top_in = 0.72 if form is NARROW else 0.45
+    height = up + 0.5 + top_in
+    figure = Figure(figsize=(form.width_in, height), facecolor="white", dpi=form.dpi)
     axes = figure.add_axes((0.9 / form.width_in, 0.5 / height, across / form.width_in, up / height))
     dress(axes)
-    axes.set_aspect(1.0 / max(math.cos(middle), 1e-3), adjustable="datalim")
+    half = 0.55 * np.maximum(size, size[::-1] * [across / up, up / across])
+    middle = (low + high) / 2
+    axes.set_xlim(float(middle[0] - half[0]), float(middle[0] + half[0]))
+    axes.set_ylim(float(middle[1] - half[1]), float(middle[1] + half[1]))
     types = fix_types_at(flight, course.place_ns)
     handles = []
     for code, (colour, word) in FIX_LOOK.items():
         if (types == code).any():
             shown = (types == code) | np.append(False, types[:-1] == code)  # extends to the next type's first point
-            axes.plot(np.where(shown, lon, np.nan), np.where(shown, lat, np.nan), color=colour, lw=1.3)
+            axes.plot(np.where(shown, east, np.nan), np.where(shown, north, np.nan), color=colour, lw=1.3)
             handles.append(Line2D([], [], color=colour, lw=2.0, label=word))
     _map_marks(drawn, axes, handles)
-    axes.xaxis.set_major_locator(MaxNLocator(form.ticks - 1, steps=[1, 2, 5, 10]))
-    axes.yaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
-    axes.ticklabel_format(useOffset=False, style="plain")
-    axes.set_xlabel("Longitude (°)", fontsize=8.5, color=MUTED)
-    axes.set_ylabel("Latitude (°)", fontsize=8.5, color=MUTED)
-    _scale_bar(axes, middle, float(size[0]), lon, lat)
+    coordinates(axes, course.chart.unit, (form.ticks - 1, 6))
+    scale_bar(axes, 2.0 * float(half[0]) * course.chart.unit_m, _empty_corner(axes, course.place))
+    north_arrow(axes)
+    _strip_numbers(drawn, axes)
     figure.legend(
         handles=handles, loc="upper left", ncols=3 if form is NARROW else 8, frameon=False, fontsize=8, labelcolor=INK
     )
-    return picture_of(figure, form)
+    return figure
+
+
+def _strip_numbers(drawn: Drawn, axes: Axes) -> None:
+    """Write the numbers of the strips beside their tracks, as far as they have room."""
+    times_s, names = drawn.since_start_s(drawn.course.place_ns), []
+    for number, (begin_s, end_s) in enumerate(drawn.strips_s.tolist(), start=1):
+        share = np.array([0.5, 0.4, 0.6, 0.3, 0.7, 0.2, 0.8])
+        at_s = begin_s + share * (end_s - begin_s)
+        places = [np.interp(at_s, times_s, values) for values in drawn.course.place]
+        text = axes.text(0.0, 0.0, str(number), fontsize=8.5, weight="bold", color=INK, ha="center", va="center")
+        text.set(zorder=8, path_effects=HALO)
+        names.append((text, np.transpose(places).tolist()))
+    place_names(axes, names)
+
+
+def _empty_corner(axes: Axes, place: FloatArray) -> tuple[float, float]:
+    """Return the place of a scale bar in the lower corner that holds less of the flight."""
+    (west, east), (south, north) = axes.get_xlim(), axes.get_ylim()
+    across, up = (place[0] - west) / (east - west), (place[1] - south) / (north - south)
+    low = up < 0.2
+    return (0.025, 0.035) if (low & (across < 0.35)).sum() <= (low & (across > 0.65)).sum() else (0.775, 0.035)
 
 
 def _map_marks(drawn: Drawn, axes: Axes, handles: list[Line2D]) -> None:
-    flight, (lon, lat) = drawn.flight, drawn.course.place
+    flight, (east, north) = drawn.flight, drawn.course.place
     ends: dict[str, Any] = {"mec": "white", "mew": 0.8, "ls": "", "zorder": 5}
-    axes.plot(lon[:1], lat[:1], marker="o", ms=7, color=INK, **ends)
-    axes.plot(lon[-1:], lat[-1:], marker="s", ms=6.5, color=INK, **ends)
+    axes.plot(east[:1], north[:1], marker="o", ms=7, color=INK, **ends)
+    axes.plot(east[-1:], north[-1:], marker="s", ms=6.5, color=INK, **ends)
     handles.append(Line2D([], [], marker="o", ls="", ms=5, color=INK, label="start"))
     handles.append(Line2D([], [], marker="s", ls="", ms=5, color=INK, label="end"))
     rows = flight.forward.innovations
@@ -92,23 +120,9 @@ def _map_marks(drawn: Drawn, axes: Axes, handles: list[Line2D]) -> None:
     if len(bad_ns):
         times = drawn.course.place_ns
         marker, colour, size, word = FATE_LOOK[Fate.REJECTED]
-        place = np.interp(bad_ns, times, lon), np.interp(bad_ns, times, lat)
+        place = np.interp(bad_ns, times, east), np.interp(bad_ns, times, north)
         axes.plot(*place, marker, color=colour, ms=size + 0.5, mew=1.0, zorder=6)
         handles.append(Line2D([], [], marker=marker, ls="", ms=5, color=colour, label=word))
-
-
-def _scale_bar(axes: Axes, lat_rad: float, width_deg: float, lon: FloatArray, lat: FloatArray) -> None:
-    """Draw a scale bar in the lower corner that holds less of the flight."""
-    metre_deg = math.degrees(1.0 / 6_371_000.0)
-    length_m = round_down(max(0.25 * width_deg / metre_deg, 1.0))
-    (west, east), (south, north) = axes.get_xlim(), axes.get_ylim()
-    part = length_m * metre_deg / math.cos(lat_rad) / max(east - west, 1e-12)
-    low = lat < south + 0.2 * (north - south)
-    at_left, at_right = (low & (lon < west + 0.35 * (east - west))), (low & (lon > east - 0.35 * (east - west)))
-    left = 0.03 if at_left.sum() <= at_right.sum() else 0.97 - part
-    axes.plot([left, left + part], [0.05, 0.05], transform=axes.transAxes, color=INK, lw=2.2, zorder=7)
-    text = f"{length_m / 1000:g} km" if length_m >= 1000 else f"{length_m:g} m"
-    axes.text(left + part / 2, 0.065, text, transform=axes.transAxes, fontsize=8, color=INK, ha="center", zorder=7)
 
 
 def draw_height(drawn: Drawn, form: Format) -> bytes:
@@ -202,20 +216,30 @@ def draw_innovations(drawn: Drawn, form: Format) -> bytes:
     return sheet.picture()
 
 
-def _draw_sensors(names: Sequence[tuple[str, str, str, float]]) -> Callable[[Drawn, Format], bytes]:
-    """Return a function that draws estimates by axis, each with a band of one sigma."""
+def _draw_sensors(
+    names: Sequence[tuple[str, str, str, float]], *, determined: bool = False
+) -> Callable[[Drawn, Format], bytes]:
+    """Return a function that draws estimates by axis, each with a band of one sigma.
+
+    Args:
+        names: field of the solution, field of its sigma, title of the panel, and factor to the unit there.
+        determined: True to leave out axes, and panels, that the flight does not determine.
+    """
 
     def draw(drawn: Drawn, form: Format) -> bytes:
         best, pixels = drawn.flight.best, drawn.node_pixels
-        sheet = Sheet(drawn, form, [words for _, _, words, _ in names], panel=1.35)
-        for axes, (name, sigma, _, factor) in zip(sheet.panels, names, strict=True):
+        axes_of = {name: determined_axes(drawn.flight, name) for name, *_ in names} if determined else {}
+        shown = [one for one in names if axes_of.get(one[0], [0])]
+        sheet = Sheet(drawn, form, [words for _, _, words, _ in shown], panel=1.35)
+        for axes, (name, sigma, _, factor) in zip(sheet.panels, shown, strict=True):
             values, sigmas = (factor * getattr(best, key).reshape(len(pixels.time_ns), -1) for key in (name, sigma))
             band, low, high = pixels.band(values), pixels.band(values - sigmas)[0], pixels.band(values + sigmas)[1]
-            for i in range(values.shape[1]):
+            numbers = axes_of.get(name, range(values.shape[1]))
+            for i in numbers:
                 sheet.fill(axes, pixels, low[:, i], high[:, i], TRIPLE[i])
                 sheet.line(axes, pixels, band[..., i], TRIPLE[i])
-        if values.shape[1] > 1:
-            sheet.legend(sheet.panels[0], list(zip(TRIPLE, AXES_B, strict=True)))
+            if values.shape[1] > 1:
+                sheet.legend(axes, [(TRIPLE[i], AXES_B[i]) for i in numbers])
         return sheet.picture()
 
     return draw
@@ -287,13 +311,15 @@ draw_scales = _draw_sensors(
     (
         ("gyro_scale", "gyro_scale_sigma", "Gyro scale error (ppm)", 1e6),
         ("accel_scale", "accel_scale_sigma", "Accelerometer scale error (ppm)", 1e6),
-    )
+    ),
+    determined=True,
 )
 draw_misalignments = _draw_sensors(
     (
         ("gyro_misalignment", "gyro_misalignment_sigma", "Gyro axes towards each other (mrad)", 1e3),
         ("accel_misalignment", "accel_misalignment_sigma", "Accelerometer axes (mrad)", 1e3),
-    )
+    ),
+    determined=True,
 )
 draw_lever_arm = _draw_sensors((("lever_arm_b", "lever_arm_sigma", "Lever arm (m)", 1.0),))
 draw_time_offset = _draw_sensors((("time_offset_s", "time_offset_sigma_s", "Time offset of GNSS (ms)", 1e3),))

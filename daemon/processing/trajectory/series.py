@@ -14,7 +14,10 @@ from numpy.typing import NDArray
 from swath.georef.arrays import BoolArray, FloatArray, Int64Array, StructArray
 from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
 from swath.georef.geodesy.quaternions import about, conjugate, product, rotated
+from swath.georef.mapping.chart import Chart, chart_of
+from swath.georef.mapping.frame import Mapping
 from swath.georef.navigation.inputs import Fate, Kind, Setup, Solution
+from swath.georef.strips import cut, straight_spans
 from swath.georef.timescales.gps_time import SECOND_NS
 from swath.georef.trajectory.trajectory import Trajectory
 
@@ -23,6 +26,10 @@ BLOCK = 1 << 15  # epochs converted at once
 GROUP = 16  # epochs that share a vertical if they are close
 MOST_COMPARED = 200_000  # epochs of the separation, which steps at updates and is smooth between them
 GAP_INTERVALS = 3.0  # a line is broken after so many usual intervals without a sample
+STRAIGHT_HZ = 5.0  # rate of the epochs in which straight flight is looked for
+FLYING = 0.5  # of the speed that nine tenths of the epochs keep below: slower is not flown
+DETERMINED = 0.7  # of the sigma before; an error whose sigma stays larger is not determined by the flight
+PRIORS = {"gyro_misalignment": "misalignment", "accel_misalignment": "misalignment"}  # names in the noise's settings
 OUTAGE_S = 5.0  # minimum time without a position that counts as an outage
 USED = (int(Fate.TAKEN), int(Fate.INFLATED), int(Fate.REACQUIRED))
 SHORT = float(np.sqrt(0.02))  # sigma of a difference relative to the filter's, below which it is meaningless
@@ -39,8 +46,10 @@ class Flight:
         setup: installation and noise of the run.
         start: how the start was found, in words.
         noise_found: factors on sigmas that the innovations suggest, by kind of observation.
-        notes: lines for the user from the reading of the log.
+        notes: doubts and missing data, one line each.
         missing_s: total time of the log's samples without a trajectory.
+        mapping: mapping of the flight's products, for the map; None: the map is in the UTM zone.
+        facts: lines for the reader that are no doubts.
     """
 
     title: str
@@ -51,6 +60,8 @@ class Flight:
     noise_found: dict[str, float] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     missing_s: float = 0.0
+    mapping: Mapping | None = None
+    facts: tuple[str, ...] = ()
 
     @property
     def best(self) -> Solution:
@@ -123,13 +134,15 @@ class Course:
 
     Attributes:
         pixels: pixels of its epochs.
-        place: (2, p) longitude and latitude, degrees, at `place_ns`.
+        chart: coordinates of the map.
+        place: (2, p) easting and northing on the map at `place_ns`.
         place_ns: (p,) GPS times.
         height_m, speed_mps, climb_mps: (2, m) bands.
         attitude_deg: (2, m, 3) of roll, pitch, heading; heading may pass 0 or 360 by what a column spans.
     """
 
     pixels: Pixels
+    chart: Chart
     place: FloatArray
     place_ns: Int64Array
     height_m: FloatArray
@@ -161,9 +174,14 @@ def course_of(flight: Flight) -> Course:
     turns = np.floor(bands[..., 5].mean(axis=0) / 360.0)
     bands[..., 5] -= 360.0 * np.where(np.isfinite(turns), turns, 0.0)
     where = np.unique(np.linspace(0, len(solution) - 1, 4 * COLUMNS).astype(np.int64))
-    lat, lon, _ = _trajectory(solution, where).geodetic()
-    place = np.degrees([np.unwrap(lon), lat])
-    return Course(pixels, place, solution.time_ns[where], bands[..., 0], bands[..., 1], bands[..., 2], bands[..., 3:])
+    position_e = solution.position_e[where]
+    chart = chart_of(flight.mapping, position_e)
+    there = np.isfinite(position_e).all(axis=1)
+    place = np.full((2, len(where)), np.nan)
+    place[:, there] = chart.map_from_e(position_e[there]).T
+    return Course(
+        pixels, chart, place, solution.time_ns[where], bands[..., 0], bands[..., 1], bands[..., 2], bands[..., 3:]
+    )
 
 
 def _local_rows(solution: Solution, part: slice) -> FloatArray:
@@ -297,3 +315,33 @@ def bridged_spans(solution: Solution) -> Int64Array:
     change = np.diff(np.concatenate([[0], solution.bridged.astype(np.int8), [0]]))
     begin, end = np.flatnonzero(change == 1), np.flatnonzero(change == -1)
     return np.stack([solution.time_ns[np.maximum(begin - 1, 0)], solution.time_ns[end - 1]], axis=1)
+
+
+def straight_flight(flight: Flight) -> Int64Array:
+    """Return GPS times (k, 2) of straight flight, by the rules that cut strips; when the laser was on is not known."""
+    solution = flight.best
+    usual_s = float(np.median(np.diff(solution.time_ns[:10_000]))) / SECOND_NS if len(solution) > 1 else 1.0
+    thinned = _trajectory(solution, slice(None, None, max(1, round(1.0 / (STRAIGHT_HZ * usual_s)))))
+    if len(thinned) < 2:
+        return np.empty((0, 2), np.int64)
+    roll, _, heading = thinned.attitude()
+    straight = straight_spans(thinned.time_ns, np.nan_to_num(heading), np.nan_to_num(roll))
+    speed_mps = np.nan_to_num(np.linalg.norm(thinned.velocity_e, axis=1))
+    change = np.diff(np.concatenate([[0], (speed_mps > FLYING * np.percentile(speed_mps, 90.0)).astype(np.int8), [0]]))
+    begin, end = np.flatnonzero(change == 1), np.flatnonzero(change == -1) - 1
+    flying = list(zip(thinned.time_ns[begin].tolist(), (thinned.time_ns[end] + 1).tolist(), strict=True))
+    return np.array(cut(straight, flying), np.int64).reshape(-1, 2)
+
+
+def determined_axes(flight: Flight, name: str) -> list[int]:
+    """Return the axes on which the flight determines an error of the sensors: its sigma falls clearly below the first.
+
+    Args:
+        flight: with the solution's nodes.
+        name: field of `Solution`, such as ``gyro_scale``.
+    """
+    sigmas = getattr(flight.best, f"{name}_sigma")
+    prior = getattr(flight.setup.noise, PRIORS.get(name, name))
+    if not len(sigmas) or prior <= 0.0:
+        return []
+    return [axis for axis in range(sigmas.shape[1]) if float(np.nanmin(sigmas[:, axis])) < DETERMINED * prior]

@@ -19,6 +19,7 @@ from swath.daemon.processing.pages.head import PageHead, head_of_navigated
 from swath.daemon.processing.trajectory.figures import figures_of
 from swath.daemon.processing.trajectory.series import Flight, separation_of
 from swath.daemon.processing.trajectory.verdict import judge
+from swath.georef.mapping.frame import Mapping, MappingError
 
 if TYPE_CHECKING:
     from swath.daemon.log.reader import Session
@@ -69,13 +70,23 @@ def pages_of(flights: Sequence[Navigated]) -> Iterator[Page]:
     """Yield one page per leg, in order."""
     for flight in flights:
         noise = flight.inputs.sources.noise_words()
-        notes = (*((noise,) if noise else ()), *flight.warnings, *flight.holes)
+        notes, facts = (*flight.warnings, *flight.holes), ((noise,) if noise else ())
+        mapping = _mapping_of(flight)
         for number, leg in enumerate(flight.legs, start=1):
             title = flight.session_id if len(flight.legs) == 1 else f"{flight.session_id}, leg {number}"
             smoothed = leg.solved.smoothed if flight.smooth else None
             start, found = start_words(leg.start), leg.noise_found()
             page = Flight(
-                title, leg.solved.forward, smoothed, leg.setup, start, found, notes, missing_s=flight.missing_s
+                title,
+                leg.solved.forward,
+                smoothed,
+                leg.setup,
+                start,
+                found,
+                notes,
+                missing_s=flight.missing_s,
+                mapping=mapping,
+                facts=facts,
             )
             times_ns = leg.solved.forward.time_ns
             yield Page(page, leg.findings, head_of_navigated(flight, (int(times_ns[0]), int(times_ns[-1]))))
@@ -83,6 +94,20 @@ def pages_of(flights: Sequence[Navigated]) -> Iterator[Page]:
 
 def _put(data: bytes, stream: IO[bytes]) -> None:
     stream.write(data)
+
+
+def _mapping_of(flight: Navigated) -> Mapping | None:
+    """Return the mapping of the configured products, for the map; None if there is none, or it is refused."""
+    config = flight.inputs.sources.config
+    if config.output.crs is None:
+        return None
+    datum = next((gnss.datum for gnss in config.gnss.values() if gnss.datum), None)
+    try:
+        return Mapping(
+            config.output.crs, datum=datum, epoch=config.output.epoch, accuracy_m=config.output.datum_accuracy_m
+        )
+    except MappingError:
+        return None
 
 
 def start_words(start: Start) -> str:

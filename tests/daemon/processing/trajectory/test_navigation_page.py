@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from PIL import Image
+from pyproj import Transformer
 
 from swath.daemon.processing.trajectory.page import PICTURES, make_page
 from swath.daemon.processing.trajectory.panels import NARROW, WIDE, Drawn
@@ -171,7 +172,8 @@ def test_drawn_errors_match_the_truth_of_the_flight() -> None:
     assert (np.abs(turned) < turning + 0.03).all()
     assert (middle >= 0).all()
     assert (middle < 360).all()
-    lon, lat = course.place
+    back = Transformer.from_crs("EPSG:32632", "EPSG:4326", always_xy=True)
+    lon, lat = back.transform(*course.place)
     assert lon == pytest.approx(np.interp(course.place_ns, flight.best.time_ns, truth[:, 3]), abs=1e-6)
     assert lat == pytest.approx(np.interp(course.place_ns, flight.best.time_ns, truth[:, 2]), abs=1e-6)
 
