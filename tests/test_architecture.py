@@ -29,6 +29,7 @@ LARGEST_CHECKOUT_BYTES = 90_000_000
 SHARED_OF_GEOREF = {
     "swath.georef.arrays",
     "swath.georef.records",
+    "swath.georef.strip_colours",
     "swath.georef.text_encoding",
     "swath.georef.timescales",
     "swath.georef.toml_tables",

@@ -8,15 +8,17 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter
 
 from swath.daemon.processing.quicklook.read import Block
-from swath.georef.arrays import BoolArray, FloatArray
+from swath.georef.arrays import BoolArray, FloatArray, Int64Array
 from swath.georef.compiled import jit_cached
 
 MOST_CELLS = 2_000_000
 STEPS = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0)  # factors of a power of ten
 SMALLEST_CELL_M = 0.05
 PULSES_FOR_DENSITY = 25  # in a cell of the density map: its count is then accurate to 20 %
+WINDOWS = (1, 3, 5, 9, 15, 25)  # sides, in cells, of the squares that a smoothed value may be the mean of
 COUNT, FIRST, HEIGHT, INTENSITY, SIGMAS, SIGMA_HEIGHT = range(6)
 
 
@@ -198,3 +200,34 @@ def _around(values: FloatArray) -> FloatArray:
     padded = np.pad(values, 1)
     rows = padded[:-2] + padded[1:-1] + padded[2:]
     return np.asarray(rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:])
+
+
+def smoothed(
+    values: FloatArray, sigmas: FloatArray, row: Int64Array, column: Int64Array, wanted_sigma: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return means (n,) of cells' values over the smallest square around each that is precise enough, and their sigmas.
+
+    The mean is weighted by the cells' variances. Where even the largest of the squares is not precise enough, it is
+    that square's.
+
+    Args:
+        values, sigmas: (n,) of the cells, independent of each other.
+        row, column: (n,) of the cells; no two are the same.
+        wanted_sigma: sigma that a mean should have at most.
+    """
+    up, across = row - row.min(), column - column.min()
+    weight = np.zeros((int(up.max()) + 1, int(across.max()) + 1))
+    weight[up, across] = 1.0 / np.maximum(sigmas, 1e-6) ** 2
+    product = np.zeros_like(weight)
+    product[up, across] = weight[up, across] * values
+    mean, sigma = values.astype(np.float64), sigmas.astype(np.float64)
+    rough = sigma > wanted_sigma
+    for side in WINDOWS[1:]:
+        if not rough.any():
+            break
+        weights, products = (
+            uniform_filter(grid, side, mode="constant")[up, across][rough] * side**2 for grid in (weight, product)
+        )
+        mean[rough], sigma[rough] = products / weights, 1.0 / np.sqrt(weights)
+        rough &= sigma > wanted_sigma
+    return mean, sigma

@@ -12,12 +12,20 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import BoundaryNorm, LightSource, ListedColormap, Normalize, PowerNorm
 from matplotlib.figure import Figure
-from matplotlib.patches import Patch, Rectangle
-from matplotlib.patheffects import withStroke
+from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from swath.daemon.processing.pages.classes import (
+    DZ_LIMITS_M,
+    SHARE_INSIDE,
+    SIZE_COLOURS,
+    class_number,
+    limits_for,
+    size_words,
+)
+from swath.daemon.processing.pages.map_axes import HALO, along, coordinates, north_arrow, place_names, scale_bar
 from swath.daemon.processing.pages.words import DPI, EMPTY, INK, MUTED, shortened, thousands
 from swath.daemon.processing.quicklook.grids import COUNT, HEIGHT, INTENSITY, SIGMA_HEIGHT, Frame, filled, round_up
 from swath.daemon.processing.quicklook.profile import axis_of
@@ -28,18 +36,9 @@ from swath.georef.arrays import FloatArray
 LARGEST_MAP_IN, SMALLEST_MAP_IN = (10.0, 7.6), (3.0, 1.3)
 NARROW_SIDE_IN, WIDE_SIDE_IN = 1.55, 2.75
 LEFT_IN, TOP_IN, BOTTOM_IN, LOWEST_PAGE_IN = 1.0, 0.8, 0.62, 4.9
-HALO = [withStroke(linewidth=2.4, foreground="white")]
-STRIP_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#7a5c00", "#56b4e9", "#8b1a1a", "#5b4fc4", "#444444")
 MOST_OUTLINES = 60
-# Defaults of strip quality control in Leica HxMap: green to 3 cm, yellow to 5, red to 10
-DZ_LIMITS_M = (0.03, 0.05, 0.10)
-DZ_COLOURS = ("#2f9e4c", "#f4cc2a", "#e4572e", "#7d1d5a")
-DZ_WORDS = ("≤ 3 cm", "3–5 cm", "5–10 cm", "> 10 cm")
-
-
-def strip_colour(number: int) -> str:
-    """Return a strip's colour, the same in every picture."""
-    return STRIP_COLOURS[number % len(STRIP_COLOURS)]
+BARS_MM = (1, 2, 4, 5, 10, 20, 40, 80)  # widths of a histogram's bars, which divide the classes' limits
+NAME_SHARES = (0.06, 0.94, 0.15, 0.85, 0.25, 0.75, 0.35, 0.65, 0.5)  # places for a strip's name along it: ends first
 
 
 class MapPage:
@@ -51,7 +50,7 @@ class MapPage:
     """
 
     def __init__(self, look: Look, title: str, under: str, side_in: float = NARROW_SIDE_IN) -> None:
-        self.look = look
+        self.look, self.named = look, False
         low, high = look.surface.low_m[:2], look.surface.high_m[:2]
         border = np.maximum(0.03 * (high - low).max(), look.surface.frame.cell_m)
         self.low_m, self.high_m = low - border, high + border
@@ -105,38 +104,15 @@ class MapPage:
         axes.set_aspect(units.north_m / units.east_m, adjustable="box", anchor="NW")
         axes.set_xlim(self.low_m[0] / units.east_m, self.high_m[0] / units.east_m)
         axes.set_ylim(self.low_m[1] / units.north_m, self.high_m[1] / units.north_m)
-        metric = units.name != "°"
-        words = ("Easting", "Northing") if metric else ("Longitude", "Latitude")
-        for axis, word, limits in (
-            (axes.xaxis, words[0], axes.get_xlim()),
-            (axes.yaxis, words[1], axes.get_ylim()),
-        ):
-            step = (limits[1] - limits[0]) / 5
-            digits = max(0, -math.floor(math.log10(step))) if step < 1.0 else 0
-            axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
-            axis.set_major_formatter(FuncFormatter(lambda value, _, digits=digits: thousands(value, digits)))
-            axis.set_label_text(f"{word} ({units.name})", fontsize=8.5, color=MUTED)
-        for label in axes.get_yticklabels():
-            label.set(rotation=90, va="center")
+        coordinates(axes, units.name)
 
     def finish(self, path: Path) -> None:
         """Draw grid lines and scale bar, and save the file."""
         self.axes.grid(color="#7c858c", lw=0.4, alpha=0.35, zorder=2)
-        self._scale_bar()
+        scale_bar(self.axes, float((self.high_m - self.low_m)[0]))
+        north_arrow(self.axes)
+        self._names()
         self.figure.savefig(path, dpi=DPI)
-
-    def _scale_bar(self) -> None:
-        size_m = self.high_m - self.low_m
-        length_m = round_down(0.2 * float(size_m[0]))
-        part = length_m / float(size_m[0])
-        place = self.axes.transAxes
-        x, y = 0.025, 0.035
-        self.axes.add_patch(
-            Rectangle((x, y), part, 0.008, transform=place, fc=INK, ec="white", lw=1.6, zorder=9, clip_on=False)
-        )
-        text = f"{thousands(length_m / 1000, 1).rstrip('0').rstrip('.')} km" if length_m >= 1000 else f"{length_m:g} m"
-        style: dict[str, Any] = {"fontsize": 8.5, "color": INK, "path_effects": HALO, "zorder": 10}
-        self.axes.text(x + part / 2, y + 0.016, text, transform=place, ha="center", va="bottom", **style)
 
     def outlines(self, *, light: bool = False) -> None:
         """Draw the outlines of the strips with their names."""
@@ -150,30 +126,29 @@ class MapPage:
             frame = coverage.frame
             east_m = frame.west_m + (np.arange(there.shape[1]) - 2.5) * frame.cell_m
             north_m = frame.south_m + (np.arange(there.shape[0]) - 2.5) * frame.cell_m
-            colour = "white" if light else strip_colour(number)
+            colour = "white" if light else look.colours[number]
             shape = ndimage.gaussian_filter(there.astype(float), 0.7)
             self.axes.contour(
                 east_m / units.east_m, north_m / units.north_m, shape, [0.4], colors=[colour], linewidths=0.9, zorder=3
             )
-        self._names()
+        self.named = 1 < len(look.strips) <= MOST_OUTLINES
 
     def _names(self) -> None:
-        look = self.look
-        if not 1 < len(look.strips) <= MOST_OUTLINES:
-            return
-        for number, strip in enumerate(look.strips):
+        """Write the strips' names where they overlap nothing; a strip that has no such place stays unnamed."""
+        look, names = self.look, []
+        for number, strip in enumerate(look.strips if self.named else []):
             places_m = look.cells.coverage(number).centres()
             if not len(places_m):
                 continue
             middle, axis = axis_of(places_m)
-            along = (places_m - middle) @ axis
-            share = (0.5 + 0.13 * (number % 5 - 2)) * np.ptp(along) + along.min()  # keeps neighbours' names apart
-            place = middle + axis * share
-            self.axes.text(
-                place[0] / look.units.east_m,
-                place[1] / look.units.north_m,
+            distance_m = (places_m - middle) @ axis
+            ends = np.stack([middle + axis * distance_m.min(), middle + axis * distance_m.max()])
+            start, end = (ends / [look.units.east_m, look.units.north_m]).tolist()
+            places = along(start, end, NAME_SHARES)
+            text = self.axes.text(
+                *places[0],
                 shortened(strip.name, 24),
-                color=strip_colour(number),
+                color=look.colours[number],
                 fontsize=8.5,
                 weight="bold",
                 ha="center",
@@ -182,6 +157,8 @@ class MapPage:
                 zorder=8,
                 clip_on=True,
             )
+            names.append((text, places))
+        place_names(self.axes, names)
 
     def bar(self, image: Any, label: str, **style: Any) -> None:
         """Draw a colour bar in the right column."""
@@ -191,12 +168,6 @@ class MapPage:
         made.ax.tick_params(labelsize=8, colors=MUTED, length=3)
         made.outline.set_edgecolor("#b9bdb8")
         self.say(0.0, label, fontsize=8.5)
-
-
-def round_down(size: float) -> float:
-    """Return the largest of 1, 2, 5 × 10ⁿ that is not above a size."""
-    power = 10.0 ** math.floor(math.log10(size))
-    return max(step * power for step in (1.0, 2.0, 5.0) if step * power <= size * (1 + 1e-9))
 
 
 def _range_of(values: FloatArray, low: float = 2.0, high: float = 98.0) -> tuple[float, float]:
@@ -242,7 +213,7 @@ def draw_height(look: Look, path: Path) -> None:
     spread = f"{thousands(look.surface.low_m[2], 2)} to {thousands(look.surface.high_m[2], 2)} m"
     page = MapPage(look, "Height", f"mean of all returns, shaded from the north-west, {_cells_words(look)}; {spread}")
     page.image(image, frame, interpolation="antialiased")
-    page.bar(ScalarMappable(norm, land), "Height (m)", extend="both")
+    page.bar(ScalarMappable(norm, land), "Height (m)", extend="both", ticks=MaxNLocator(8, steps=[1, 2, 5, 10]))
     page.outlines()
     _mark_profile(page)
     page.finish(path)
@@ -294,6 +265,7 @@ def draw_sigma(look: Look, path: Path) -> None:
     """Draw the sigma of height from the files' points."""
     values = 100.0 * filled(look.surface.mean(SIGMA_HEIGHT))
     low, high = _range_of(values)
+    low = max(min(low, 0.8 * high), 0.0)  # so that colours do not show differences that do not matter
     under = f"one standard deviation, as stored in the files, mean of all returns, {_cells_words(look)}"
     page = MapPage(look, "Sigma of height", under)
     image = page.image(values, look.surface.frame, cmap="viridis", vmin=low, vmax=high, interpolation="antialiased")
@@ -303,39 +275,52 @@ def draw_sigma(look: Look, path: Path) -> None:
 
 
 def draw_differences(look: Look, path: Path) -> None:
-    """Draw differences of overlapping strips in smooth cells, by size, over the shaded ground."""
+    """Draw differences of overlapping strips in smooth cells, by size, over the shaded ground.
+
+    Each is the mean of so many cells around it that the map shows the pattern and not the noise.
+    """
     frame, overlap = look.cells.frame, look.overlap
     numbers = overlap.numbers()
     assert numbers is not None
-    under = (
-        f"smooth cells of {frame.cell_m:g} m; where more than two strips meet, the largest; "
-        f"{thousands(numbers['cells'])} comparisons"
-    )
-    page = MapPage(look, "Height difference of overlapping strips", under, WIDE_SIDE_IN)
+    page = MapPage(look, "Height difference of overlapping strips", _difference_words(look), WIDE_SIDE_IN)
     _pale_ground(page)
-    size = np.abs(overlap.worst_m).astype(float)
-    limits = np.array([0.0, *DZ_LIMITS_M, np.inf])
-    norm = BoundaryNorm(np.minimum(limits, 1e6), len(DZ_COLOURS))
+    size = np.abs(overlap.shown_m).astype(float)
+    limits = limits_for(float(np.nanquantile(size, SHARE_INSIDE)))
+    colours = SIZE_COLOURS[: len(limits) + 1]
+    norm = BoundaryNorm([0.0, *limits, 1e6], len(colours))
     cells = Frame(frame.west_m, frame.south_m, frame.cell_m, *size.shape)
-    image = page.image(size, cells, cmap=ListedColormap(list(DZ_COLOURS)), norm=norm, interpolation="nearest")
+    image = page.image(size, cells, cmap=ListedColormap(list(colours)), norm=norm, interpolation="nearest")
     image.set_zorder(2.5)
     page.outlines()
-    handles = [Patch(fc=colour, ec="none", label=word) for colour, word in zip(DZ_COLOURS, DZ_WORDS, strict=True)]
-    legend = page.side(0.0, 2.3, 1.25)
+    words = size_words(limits)
+    handles = [Patch(fc=colour, ec="none", label=word) for colour, word in zip(colours, words, strict=True)]
+    legend = page.side(0.0, 2.3, 0.25 + 0.21 * len(handles))
     legend.set_axis_off()
     made = legend.legend(
         handles=handles, loc="upper left", frameon=False, fontsize=8.5, borderaxespad=0, title="|dZ|", labelcolor=INK
     )
     made.get_title().set(fontsize=8.5, color=INK)
     made.set_alignment("left")
+    below = 0.5 + 0.21 * len(handles)
     figures = (
-        f"RMSDz {100 * numbers['rms_m']:.1f} cm (all pairs)\n95 % ≤ {100 * numbers['p95_m']:.1f} cm\n"
+        f"single cells, all pairs\nRMSDz {100 * numbers['rms_m']:.1f} cm\n95 % ≤ {100 * numbers['p95_m']:.1f} cm\n"
         f"largest {100 * numbers['max_m']:.1f} cm"
     )
-    page.say(1.2, figures)
-    page.say(1.95, _worst_pairs(look), color=MUTED, fontsize=8)
-    _dz_histogram(page)
+    page.say(below, figures)
+    page.say(below + 0.95, _worst_pairs(look), color=MUTED, fontsize=8)
+    _dz_histogram(page, below + 2.0)
     page.finish(path)
+
+
+def _difference_words(look: Look) -> str:
+    """Return what the map of differences shows."""
+    sigma_m = look.overlap.shown_sigma_m[np.isfinite(look.overlap.shown_sigma_m)]
+    parts = [
+        f"smooth cells of {look.cells.frame.cell_m:g} m, averaged with their neighbours to "
+        f"± {1000 * float(np.quantile(sigma_m, 0.95)):.1f} mm (one sigma)",
+        "where more than two strips meet, the largest" if len(look.strips) > 2 else "",
+    ]
+    return "; ".join(part for part in parts if part)
 
 
 def _worst_pairs(look: Look) -> str:
@@ -355,26 +340,26 @@ def _pale_ground(page: MapPage) -> None:
     page.image(np.clip(image, 0.0, 1.0), surface.frame, interpolation="antialiased")
 
 
-def _dz_histogram(page: MapPage) -> None:
-    """Draw a histogram of signed differences, coloured like the map."""
-    room = page.page_in[1] - TOP_IN - 3.0 - 0.5
+def _dz_histogram(page: MapPage, top: float) -> None:
+    """Draw a histogram of the single cells' signed differences, coloured like the map; bars end at class limits."""
+    room = page.page_in[1] - TOP_IN - top - 0.5
     if room < 0.6:
         return
-    axes = page.side(3.0, 2.2, float(min(room, 2.0)))
+    axes = page.side(top, 2.2, float(min(room, 2.0)))
     counts = page.look.overlap.signed
     share = np.cumsum(np.bincount(np.abs(np.arange(len(counts)) - HISTOGRAM_HALF), counts)) / counts.sum()
-    half_m = max(0.06, 1.1 * HISTOGRAM_STEP_M * float(np.searchsorted(share, 0.995)))
-    step = max(1, round(half_m / 0.025)) | 1  # odd, so that a bar is centred on zero
-    width_m = step * HISTOGRAM_STEP_M
-    bins = (np.arange(len(counts)) - HISTOGRAM_HALF + step // 2) // step
-    totals = np.bincount(bins - bins.min(), counts)
-    middles_m = (np.arange(len(totals)) + bins.min()) * width_m
-    which = np.searchsorted(DZ_LIMITS_M, np.abs(middles_m))
+    half_m = max(1.5 * DZ_LIMITS_M[1], 1.1 * HISTOGRAM_STEP_M * float(np.searchsorted(share, 0.995)))
+    step = next((size for size in BARS_MM if size >= half_m / 0.03), BARS_MM[-1])
+    low_mm = np.floor((np.arange(len(counts)) - HISTOGRAM_HALF) / step).astype(int) * step
+    lows_mm, which = np.unique(low_mm, return_inverse=True)
+    totals, middles_m = np.bincount(which, counts), (lows_mm + step / 2) * HISTOGRAM_STEP_M
     inside = np.abs(middles_m) <= half_m
-    colours = [DZ_COLOURS[number] for number in which[inside]]
-    axes.bar(100 * middles_m[inside], totals[inside], width=100 * width_m, color=colours)
+    limits = [limit for limit in DZ_LIMITS_M if limit < half_m]
+    colours = [SIZE_COLOURS[class_number(abs(middle), limits)] for middle in middles_m[inside].tolist()]
+    axes.bar(100 * middles_m[inside], totals[inside], width=0.1 * step, color=colours)
     axes.axvline(0.0, color=INK, lw=0.7)
     axes.set_xlim(-100 * half_m, 100 * half_m)
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: thousands(value, 0 if value % 1 == 0 else 1)))
     axes.set_yticks([])
     axes.spines[["left", "right", "top"]].set_visible(False)
-    axes.set_xlabel("dZ (cm), first strip − second", fontsize=8, color=MUTED)
+    axes.set_xlabel("dZ of single cells (cm),\nfirst strip − second", fontsize=8, color=MUTED)

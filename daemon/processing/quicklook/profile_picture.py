@@ -11,7 +11,6 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from swath.daemon.processing.pages.words import DPI, INK, MUTED, shortened, thousands
-from swath.daemon.processing.quicklook.maps import strip_colour
 from swath.daemon.processing.quicklook.profile import Profile, steps_of
 from swath.daemon.processing.quicklook.run import Look
 
@@ -37,7 +36,7 @@ def draw_profile(look: Look, path: Path) -> None:
     _points(upper, look, profile)
     if lower is not None:
         for strip, offset_m in steps.offset_m.items():
-            lower.plot(steps.along_m, 100 * offset_m, "o-", ms=3.2, lw=1.1, color=strip_colour(strip))
+            lower.plot(steps.along_m, 100 * offset_m, "o-", ms=3.2, lw=1.1, color=look.colours[strip])
         lower.axhline(0.0, color=INK, lw=0.6)
         lower.margins(y=0.15)
         lower.set_ylabel("strip − mean (cm)", fontsize=8.5, color=MUTED)
@@ -64,7 +63,7 @@ def _points(axes: Axes, look: Look, profile: Profile) -> None:
     for layer in range(7):
         for number in np.unique(strip):
             chosen = (strip == number) & (mixed == layer)
-            axes.scatter(along_m[chosen], height_m[chosen], s=size, color=strip_colour(int(number)), lw=0, alpha=0.75)
+            axes.scatter(along_m[chosen], height_m[chosen], s=size, color=look.colours[int(number)], lw=0, alpha=0.75)
     low, high = float(height_m.min()), float(height_m.max())
     border = max(LEAST_HEIGHT_M - (high - low), 0.08 * (high - low)) / 2
     axes.set_ylim(low - border, high + border)
@@ -77,7 +76,7 @@ def _legend(axes: Axes, look: Look, profile: Profile) -> None:
     numbers, counts = np.unique(profile.strip, return_counts=True)
     order = numbers[np.argsort(-counts, kind="stable")][:MOST_IN_LEGEND]
     handles = [
-        Line2D([], [], ls="", marker="o", ms=5, color=strip_colour(number), label=shortened(look.names[number], 16))
+        Line2D([], [], ls="", marker="o", ms=5, color=look.colours[number], label=shortened(look.names[number], 16))
         for number in sorted(int(number) for number in order)
     ]
     made = axes.legend(

@@ -43,6 +43,7 @@ from swath.daemon.processing.quicklook.strips import (
 )
 from swath.daemon.processing.strip_agreement import Agreement
 from swath.georef.arrays import BoolArray, FloatArray, SingleArray
+from swath.georef.strip_colours import PALETTE, colours_of, contact
 
 RETURNS_A_CELL = 4  # of the pictures: a side of two point spacings
 SAMPLED_FILES = 5
@@ -108,6 +109,7 @@ class Look:
         density: mean pulses per m² of fully covered cells; area_m2: of all covered ones.
         skipped: number of noise and withheld points.
         notes: notes for the reader of the page.
+        colours: by number of the strip, in every picture; strips side by side differ.
     """
 
     sources: list[Source]
@@ -124,6 +126,12 @@ class Look:
     skipped: int
     notes: list[str]
     origins: list[tuple[tuple[str, ...], int]] = field(default_factory=list)
+    colours: list[str] = field(init=False)
+
+    def __post_init__(self) -> None:
+        chosen = colours_of(contact(self.cells.tiles >= 0))
+        more = len(self.names) - len(chosen)  # strips beyond those that are compared
+        self.colours = chosen + [PALETTE[number % len(PALETTE)] for number in range(more)]
 
 
 def look_at(

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swath.calib.strips.differences import single_return_sigma_m
-from swath.daemon.processing.quicklook.grids import Frame, inner
+from swath.daemon.processing.quicklook.grids import Frame, inner, smoothed
 from swath.daemon.processing.quicklook.read import Block
 from swath.georef.arrays import BoolArray, FloatArray, Int64Array, SingleArray
 from swath.georef.compiled import jit_cached
@@ -47,6 +47,7 @@ COARSEST_CELL_M = 20.0
 PULSES_TO_COVER = 6.0
 NARROWEST = 0.125  # of a cell: the smallest spread (one sigma) of a strip's returns in it, in any direction
 HISTOGRAM_STEP_M, HISTOGRAM_HALF = 0.001, 10_000
+SHOWN_SIGMA_M = 0.0025  # sigma of a difference on maps: an eighth of their first class, 2 cm
 
 
 @jit_cached
@@ -107,6 +108,7 @@ class Pair:
     Attributes:
         first, second: numbers of the strips.
         dz_m: (n,) differences.
+        sigma_m: (n,) their sigmas, from the scatter of the returns about their planes.
         row, column: (n,) cells.
         compared: number of cells where both strips have enough single returns, smooth or not.
         scatter: for each strip, variances (m,) of its single returns about their planes, m², and the numbers (m,) of
@@ -116,6 +118,7 @@ class Pair:
     first: int
     second: int
     dz_m: FloatArray
+    sigma_m: FloatArray
     row: Int64Array
     column: Int64Array
     compared: int
@@ -305,9 +308,10 @@ class StripCells:
             return None
         x_m, y_m = (plane_a.x_m + plane_b.x_m) / 2, (plane_a.y_m + plane_b.y_m) / 2
         dz_m = plane_a.height(x_m, y_m) - plane_b.height(x_m, y_m)
+        sigma_m = np.sqrt(plane_a.height_variance(x_m, y_m) + plane_b.height_variance(x_m, y_m))
         row, column = ups[tile] * TILE + inside // TILE, acrosses[tile] * TILE + inside % TILE
         scatter = tuple((one.variance_m2[one.level], one.count[one.level]) for one in (plane_a, plane_b))
-        return Pair(first, second, dz_m[keep], row[keep], column[keep], len(tile), scatter)
+        return Pair(first, second, dz_m[keep], sigma_m[keep], row[keep], column[keep], len(tile), scatter)
 
 
 @dataclass(frozen=True, slots=True)
@@ -327,9 +331,18 @@ class _Planes:
     smooth: BoolArray
     variance_m2: FloatArray
     count: FloatArray
+    spread_m2: tuple[FloatArray, FloatArray, FloatArray]  # second moments about the centroid: xx, xy, yy
 
     def height(self, x_m: FloatArray, y_m: FloatArray) -> FloatArray:
         return self.z_m + self.east * (x_m - self.x_m) + self.north * (y_m - self.y_m)
+
+    def height_variance(self, x_m: FloatArray, y_m: FloatArray) -> FloatArray:
+        """Return variances of the planes' heights; a scatter that is small by chance counts as the typical one."""
+        x, y, (xx, xy, yy) = x_m - self.x_m, y_m - self.y_m, self.spread_m2
+        typical = float(np.median(self.variance_m2[self.smooth])) if self.smooth.any() else 0.0
+        determinant = np.where(self.level, xx * yy - xy * xy, 1.0)
+        lever = (x * x * yy - 2.0 * x * y * xy + y * y * xx) / determinant
+        return np.asarray(np.maximum(self.variance_m2, typical) * (1.0 + np.maximum(lever, 0.0)) / self.count)
 
 
 def _planes(moments: FloatArray, cell_m: float) -> _Planes:
@@ -344,7 +357,7 @@ def _planes(moments: FloatArray, cell_m: float) -> _Planes:
     variance = np.maximum(zz - east * xz - north * yz, 0.0) * n / (n - 3.0)
     gentle = np.hypot(east, north) <= math.tan(math.radians(STEEPEST_DEG))
     smooth = spread & gentle & (variance <= ROUGHEST_M**2)
-    return _Planes(x, y, z, east, north, spread & gentle, smooth, variance, n)
+    return _Planes(x, y, z, east, north, spread & gentle, smooth, variance, n, (xx, xy, yy))
 
 
 def _pooled(counts: NDArray[Any]) -> NDArray[Any]:
@@ -419,7 +432,9 @@ class Overlap:
 
     Attributes:
         worst_m: (rows, columns) f4 largest difference by size in each cell, nan if none was compared.
-        counts: histogram of |dZ| in millimetres, with an open last bin.
+        signed: histogram of dZ in millimetres, with open bins at both ends.
+        shown_m, shown_sigma_m: (rows, columns) f4 the same for maps: each pair's differences are smoothed to
+            `SHOWN_SIGMA_M` before the largest is taken; and its sigma.
     """
 
     worst_m: SingleArray
@@ -430,12 +445,21 @@ class Overlap:
     rows: list[dict[str, Any]] = field(default_factory=list)
     best: Pair | None = None
     scatter: dict[int, list[tuple[FloatArray, FloatArray]]] = field(default_factory=dict)
+    shown_m: SingleArray = field(init=False)
+    shown_sigma_m: SingleArray = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.shown_m, self.shown_sigma_m = (np.full_like(self.worst_m, np.nan) for _ in range(2))
 
     def add(self, pair: Pair) -> None:
         """Add a pair; the one with most cells is kept as the best."""
         before = self.worst_m[pair.row, pair.column]
         larger = ~(np.abs(before) >= np.abs(pair.dz_m))  # also if there was no value
         self.worst_m[pair.row[larger], pair.column[larger]] = pair.dz_m[larger]
+        mean_m, sigma_m = smoothed(pair.dz_m, pair.sigma_m, pair.row, pair.column, SHOWN_SIGMA_M)
+        larger = ~(np.abs(self.shown_m[pair.row, pair.column]) >= np.abs(mean_m))
+        self.shown_m[pair.row[larger], pair.column[larger]] = mean_m[larger]
+        self.shown_sigma_m[pair.row[larger], pair.column[larger]] = sigma_m[larger]
         steps = np.clip(np.rint(pair.dz_m / HISTOGRAM_STEP_M), -HISTOGRAM_HALF, HISTOGRAM_HALF).astype(int)
         self.signed += np.bincount(steps + HISTOGRAM_HALF, minlength=len(self.signed))
         self.cells += len(pair.dz_m)
