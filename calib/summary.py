@@ -13,6 +13,7 @@ from swath.calib.need import Need
 from swath.calib.outcome import Adjusted
 from swath.calib.profiles.check import Check
 from swath.georef.arrays import FloatArray
+from swath.georef.mapping.chart import Chart
 
 Pair = tuple[str, str]
 
@@ -49,13 +50,14 @@ class PairDifference:
 
 @dataclass(frozen=True, eq=False)
 class DifferenceMap:
-    """Height differences of overlapping strips on a grid in t.
+    """Height differences of overlapping strips on a grid.
 
     Attributes:
-        west_m, south_m: of the first cell's corner, in t.
+        west_m, south_m: of the first cell's corner, in metres of the map, or in t where the flight has no CRS.
         cell_m: its side.
-        before_m, after_m: (rows, columns) from south and west; nan: not compared. Where several pairs of strips meet,
-            it is the largest difference.
+        before_m, after_m: (rows, columns) from south and west, smoothed to a sigma that colours do not show; nan: not
+            compared. Where several pairs of strips meet, it is the largest difference.
+        in_t: True if the grid is one in t.
         before_words, after_words: overall difference of all pairs of strips, in the measure that the report states.
     """
 
@@ -66,6 +68,7 @@ class DifferenceMap:
     after_m: FloatArray
     before_words: str = ""
     after_words: str = ""
+    in_t: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,6 +122,7 @@ class ReportInput:
         title: of the whole; empty: made of installation and scanners.
         measure: what the height differences are, for display; empty: not stated.
         level: the quality level that strips keep, or why there is none; empty: not judged.
+        chart: coordinates of the maps; None: those of the UTM zone in which the flight lies.
     """
 
     flight: Flight
@@ -138,6 +142,7 @@ class ReportInput:
     title: str = ""
     measure: str = ""
     level: str = ""
+    chart: Chart | None = None
 
     @property
     def heading(self) -> str:

@@ -8,7 +8,7 @@ another measure, is named so, and gives no level.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -271,20 +271,18 @@ def before_and_after(
     return compare_flight(before, mapping, like=now.cells), now
 
 
-def difference_map(
-    before: FlightStrips, after: FlightStrips, origin: Sequence[float], most: int
-) -> DifferenceMap | None:
+def difference_map(before: FlightStrips, after: FlightStrips, most: int, *, in_t: bool = False) -> DifferenceMap | None:
     """Return the differences of all pairs on two grids of the same cells, the largest of each cell; None: there are
     none.
 
     Args:
         before, after: strips in the same cells, from `before_and_after`.
-        origin: east and north of the grid's origin.
         most: maximum number of cells along a side; more cells are merged.
+        in_t: True if the cells are in t, because the flight has no mapping.
     """
     if before.cells.frame != after.cells.frame:
         return None
-    grids = [one.overlap.worst_m for one in (before, after)]
+    grids = [one.overlap.shown_m for one in (before, after)]
     there = np.isfinite(grids[0]) | np.isfinite(grids[1])
     if not there.any():
         return None
@@ -293,13 +291,14 @@ def difference_map(
     times = max(1, -(-max(int(np.ptp(rows)) + 1, int(np.ptp(columns)) + 1) // most))
     shown = [_largest(grid[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1], times) for grid in grids]
     return DifferenceMap(
-        float(frame.west_m + columns[0] * frame.cell_m - origin[0]),
-        float(frame.south_m + rows[0] * frame.cell_m - origin[1]),
+        float(frame.west_m + columns[0] * frame.cell_m),
+        float(frame.south_m + rows[0] * frame.cell_m),
         times * frame.cell_m,
         shown[0],
         shown[1],
         _words(before),
         _words(after),
+        in_t,
     )
 
 

@@ -27,7 +27,7 @@ from swath.calib.summary import Finding, PairDifference, ReportInput
 from swath.calib.verdict import held_words, judge
 from swath.daemon.processing.calibration.products import pages
 from swath.daemon.processing.calibration.report.cuts import cuts_of
-from swath.daemon.processing.calibration.report.maps import plane_rms_cm
+from swath.daemon.processing.calibration.report.maps import plane_means_m
 from swath.daemon.processing.calibration.report.page import html, paper_page, pdf
 from swath.daemon.processing.calibration.report.residuals import residual_picture, seen_of
 from swath.daemon.processing.calibration.report.tables import entries_table, held_table, parameter_tables
@@ -349,12 +349,14 @@ def test_residuals_are_shown_by_possible_causes(report: ReportInput) -> None:
     assert (first["range_m"], first["intensity"]) == (seen.range_m[0], seen.intensity[0])
 
 
-def test_planes_are_coloured_by_their_own_residuals(report: ReportInput) -> None:
-    rms_cm = plane_rms_cm(report)
+def test_planes_are_coloured_by_the_means_of_their_strips(report: ReportInput) -> None:
+    """Single returns scatter by 2 cm; strip 3 lies 6 mm above the rest."""
+    means_m = plane_means_m(report)
     group = report.adjusted.residuals[0]
-    mine = group.misclosure_m[(group.feature == 7) & (group.weight > 0)]
-    assert rms_cm[7] == pytest.approx(100 * math.sqrt(float(np.mean(mine**2))))
-    assert rms_cm[7] < 4.0  # its outliers of 12 cm and more are out
+    mine = (group.feature == 7) & (group.weight > 0)
+    strips = [group.misclosure_m[mine & (group.swath == strip)] for strip in np.unique(group.swath[mine])]
+    assert means_m[7] == pytest.approx(max(abs(float(strip.mean())) for strip in strips))
+    assert float(np.nanmedian(means_m)) < 0.009 < float(np.std(group.misclosure_m[group.weight > 0]))
 
 
 def test_sections_show_one_roof_after_calibration(report: ReportInput) -> None:

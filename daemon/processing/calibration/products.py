@@ -16,6 +16,7 @@ import numpy as np
 
 from swath import __version__
 from swath.calib.calibration_file import CalibrationFileError, Header, calibration_text
+from swath.calib.flight import Flight
 from swath.calib.need import POINT, Need, need_of
 from swath.calib.outcome import Adjusted
 from swath.calib.parameters import ANGLES
@@ -40,6 +41,8 @@ from swath.daemon.processing.pages.head import NOTHING_KNOWN, PageHead, head_of_
 from swath.daemon.processing.pages.names import PRINTED, REPORT
 from swath.daemon.processing.strip_agreement import FlightStrips, before_and_after, difference_map
 from swath.daemon.processing.user_errors import finite
+from swath.georef.arrays import FloatArray
+from swath.georef.mapping.chart import chart_of
 from swath.georef.scanner.calibration import INDEX, PARAMETERS
 from swath.georef.verdicts import Level, Verdict
 
@@ -326,6 +329,7 @@ def _report(
     after: FlightStrips,
     inputs: list[tuple[str, str]],
 ) -> ReportInput:
+    mapping = done.kept.logged[0].setup.mapping
     return ReportInput(
         flight=done.flight,
         features=done.features,
@@ -333,9 +337,10 @@ def _report(
         headers=headers,
         before=before.pairs(),
         after=after.pairs(),
-        differences=difference_map(before, after, _middle_on_map(done), MAP_CELLS),
+        differences=difference_map(before, after, MAP_CELLS, in_t=mapping is None),
         measure=after.agreement.measure,
         level=level_words(after),
+        chart=chart_of(mapping, _positions_e(done.flight)),
         check=done.check,
         inputs=inputs,
         settings=_settings(request, done),
@@ -344,10 +349,9 @@ def _report(
     )
 
 
-def _middle_on_map(done: Calibrated) -> list[float]:
-    """Return east and north of the flight's middle, the origin of maps."""
-    mapping, frame = done.kept.logged[0].setup.mapping, done.flight.frame
-    return [0.0, 0.0] if mapping is None else mapping.map_from_e(frame.origin_e[np.newaxis])[0, :2].tolist()
+def _positions_e(flight: Flight) -> FloatArray:
+    """Return some positions of all trajectories."""
+    return np.concatenate([one.position_e[:: max(1, len(one.position_e) // 200)] for one in flight.trajectories])
 
 
 def level_words(strips: FlightStrips) -> str:

@@ -18,13 +18,12 @@ BEFORE, AFTER, GOOD, BAD = "#b8860b", "#0b5e8a", "#2f7d4f", "#b3261e"
 SERIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#7a5c00", "#56b4e9", "#8b1a1a", "#5b4fc4", "#444444")
 MOST_MARKS = 400  # that are drawn as lines; more become an image, because each takes a millisecond to print
 RASTER_DPI = 220
-LIMITS_CM = (2.0, 3.0, 5.0)
-CLASSES = ("#2f9e4c", "#f4cc2a", "#e4572e", "#7d1d5a")  # colours up to each of the limits, and above
 SETTINGS: Any = {
     "svg.hashsalt": "calibration",  # the same picture then gives the same text
     "font.family": "DejaVu Sans",
     "font.size": 8.5,
     "path.simplify": True,
+    "axes.unicode_minus": True,
 }
 
 
@@ -161,17 +160,5 @@ def dress(axes: Axes) -> None:
 
 
 def colour_of(index: int) -> str:
-    """Return a swath's colour, the same in every picture."""
+    """Return the colour of a series of values."""
     return SERIES[index % len(SERIES)]
-
-
-def class_of(value_cm: float) -> str:
-    """Return the colour of a residual's class."""
-    return CLASSES[sum(value_cm > limit for limit in LIMITS_CM)]
-
-
-def class_words() -> list[tuple[str, str]]:
-    """Return colour and words of each class."""
-    low, middle, high = (f"{limit:g}" for limit in LIMITS_CM)
-    words = (f"≤ {low} cm", f"{low}–{middle} cm", f"{middle}–{high} cm", f"> {high} cm")
-    return list(zip(CLASSES, words, strict=True))

@@ -221,7 +221,7 @@ def test_every_command_gives_the_same_figure_and_level_for_one_cloud(
     tilted = made.flight.placed({"left": made.truth.changed(omega_rad=1e-3)})
     before, after = before_and_after(tilted, made.flight, mapping)
     calibrated = strips_entry(after)
-    drawn = difference_map(before, after, (0.0, 0.0), 400)
+    drawn = difference_map(before, after, 400)
     assert drawn is not None
     assert drawn.after_words == f"RMSDz {100.0 * told['rmsdz_m']:.1f} cm"
     assert before.rms_m > 5.0 * after.rms_m

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +13,8 @@ from matplotlib.lines import Line2D
 from swath.calib.features import Plane
 from swath.calib.flight import Flight
 from swath.calib.summary import ReportInput
-from swath.daemon.processing.pages.canvas import INK, MOST_MARKS, MUTED, Canvas, Format, Panels, Picture, colour_of
+from swath.daemon.processing.calibration.report.maps import strip_colours
+from swath.daemon.processing.pages.canvas import INK, MOST_MARKS, MUTED, Canvas, Format, Panels, Picture
 from swath.georef.arrays import FloatArray, Int64Array
 from swath.georef.scanner.calibration import Calibration
 
@@ -90,7 +91,7 @@ def cut_picture(report: ReportInput) -> Picture | None:
     cuts = cuts_of(report)
     if not cuts:
         return None
-    names = [swath.name for swath in report.flight.swaths]
+    names, colours = [swath.name for swath in report.flight.swaths], strip_colours(report.flight)
     swaths = sorted({index for cut in cuts for index in cut.after})
     titles = [f"{cut.name}, {word}" for cut in cuts for word in ("before", "after")]
 
@@ -102,7 +103,7 @@ def cut_picture(report: ReportInput) -> Picture | None:
         for i, cut in enumerate(cuts):
             pair = panels.axes[2 * i : 2 * i + 2]
             for axes, points in zip(pair, (cut.before, cut.after), strict=True):
-                _points(axes, points)
+                _points(axes, points, colours)
             every = np.concatenate([*cut.before.values(), *cut.after.values()])[:, 1]
             low, high = np.percentile(every, [0.5, 99.5])
             for axes in pair:
@@ -112,7 +113,7 @@ def cut_picture(report: ReportInput) -> Picture | None:
             axes.set_ylabel("Height (m)", fontsize=8.5, color=MUTED)
         for axes in panels.axes[-canvas.form.columns :]:
             axes.set_xlabel("Down the roof (m)", fontsize=8.5, color=MUTED)
-        look = [Line2D([], [], marker="o", ls="", ms=4, color=colour_of(i), label=names[i]) for i in swaths]
+        look = [Line2D([], [], marker="o", ls="", ms=4, color=colours[i], label=names[i]) for i in swaths]
         canvas.legend(look, 4 if canvas.form.narrow else 10)
 
     words = (
@@ -123,11 +124,11 @@ def cut_picture(report: ReportInput) -> Picture | None:
     return Picture("Profiles", words, lambda form: top_in(form) + height(form, len(titles), PANEL_IN), draw)
 
 
-def _points(axes: Axes, points: Mapping[int, FloatArray]) -> None:
+def _points(axes: Axes, points: Mapping[int, FloatArray], colours: Sequence[str]) -> None:
     many = sum(map(len, points.values())) > MOST_MARKS
     for index, place in points.items():
         shown = place[:: max(1, len(place) // MOST_DRAWN)]
         size = float(np.clip(60.0 / math.sqrt(max(len(shown), 1)), 1.2, 3.0))
-        (line,) = axes.plot(shown[:, 0], shown[:, 1], "o", ms=size, color=colour_of(index), mew=0.0, alpha=0.8)
+        (line,) = axes.plot(shown[:, 0], shown[:, 1], "o", ms=size, color=colours[index], mew=0.0, alpha=0.8)
         line.set_rasterized(many)
     axes.axvline(0.0, color=INK, lw=0.4, alpha=0.4)
