@@ -73,13 +73,13 @@ def scale_bar(axes: Axes, width_m: float, corner: tuple[float, float] | None = N
     """
     length_m = round_down(0.2 * width_m)
     part, (x, y) = length_m / width_m, corner or (0.025, 0.035)
-    place = axes.transAxes
-    bar = Rectangle((x, y), part, BAR_IN / _size_in(axes)[1], transform=place, fc=INK, ec="white", lw=1.6, zorder=9, clip_on=False)
+    place, thick = axes.transAxes, BAR_IN / _size_in(axes)[1]
+    bar = Rectangle((x, y), part, thick, transform=place, fc=INK, ec="white", lw=1.6, zorder=9, clip_on=False)
     bar.set_gid("scale bar")
     axes.add_patch(bar)
     words = f"{length_m / 1000:g} km" if length_m >= 1000 else f"{length_m:g} m"
     style: dict[str, Any] = {"fontsize": 8.5, "color": INK, "path_effects": HALO, "zorder": 10}
-    axes.text(x + part / 2, y + 2.2 * BAR_IN / _size_in(axes)[1], words, transform=place, ha="center", va="bottom", **style)
+    axes.text(x + part / 2, y + 2.2 * thick, words, transform=place, ha="center", va="bottom", **style)
 
 
 def north_arrow(axes: Axes) -> None:
