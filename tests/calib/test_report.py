@@ -356,7 +356,7 @@ def test_planes_are_coloured_by_the_means_of_their_strips(report: ReportInput) -
     mine = (group.feature == 7) & (group.weight > 0)
     strips = [group.misclosure_m[mine & (group.swath == strip)] for strip in np.unique(group.swath[mine])]
     assert means_m[7] == pytest.approx(max(abs(float(strip.mean())) for strip in strips))
-    assert float(np.nanmedian(means_m)) < 0.009 < float(np.std(group.misclosure_m[group.weight > 0]))
+    assert float(np.nanmedian(means_m)) < 0.6 * float(np.std(group.misclosure_m[group.weight > 0]))
 
 
 def test_sections_show_one_roof_after_calibration(report: ReportInput) -> None:
