@@ -218,7 +218,7 @@ class Validation:
         below = [f"{one.scanner} {one.words}" if several else one.words for one in found if one.seen]
         blind = [f"{one.scanner} {one.name}" if several else one.name for one in found if not one.seen]
         words = (
-            f"; errors below {', '.join(below)} would not be detected ({POWER:.0%} of larger ones would)"
+            f"; errors below {', '.join(below)} would not be detected ({100 * POWER:.0f} % of larger ones would)"
             if below
             else ""
         )
@@ -476,7 +476,11 @@ def _testfield(
     numbers, tests = Numbers.of(rows.value_m), distance_tests(rows)
     what = f"laser above control: {numbers.count:,} distances at {len(set(rows.name))} points"
     sentence = _sentence("testfield", what, numbers, tests)
-    return Method("testfield", numbers, tests, sentence, {"points": len(set(rows.name))}, smallest_errors(rows))
+    residuals: dict[str, list[float]] = {}
+    for name, value in zip(rows.name, rows.value_m.tolist(), strict=True):
+        residuals.setdefault(name, []).append(value)
+    more = {"points": len(residuals), "residuals_m": residuals}
+    return Method("testfield", numbers, tests, sentence, more, smallest_errors(rows))
 
 
 def _anew(calibrations: Mapping[str, Calibration], anew: Mapping[str, Calibration] | None) -> Method:

@@ -5,12 +5,15 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from swath.daemon.errors import ExitCode, UserError, one_line
-from swath.daemon.processing.requirements import PRINTED_PAGES, require_installed
+from swath.daemon.processing.requirements import GIS, PRINTED_PAGES, require_installed
+
+if TYPE_CHECKING:
+    from swath.daemon.processing.quicklook.run import Look
 
 
 def command(
@@ -32,17 +35,20 @@ def command(
         str | None,
         typer.Option(metavar="X1,Y1,X2,Y2", help="Ends of the profile; default: across an overlap, or along a strip."),
     ] = None,
+    gis: Annotated[
+        bool, typer.Option("--gis", help="Also write maps as GeoTIFF, and lines, footprints, control as GeoPackage.")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object, for scripts.")] = False,
 ) -> None:
     """Make a page with maps of height, intensity, density, sigma and strip differences, and a profile.
 
     Exit code 4 when a file could be read only in part.
     """
-    require_installed("swath view", *PRINTED_PAGES)
+    require_installed("swath view", *PRINTED_PAGES, *(GIS if gis else ()))
     if cell is not None and not (math.isfinite(cell) and cell > 0.0):
         raise UserError(f"--cell: got {cell:g}, want metres above 0", ExitCode.USAGE)
     ends = _ends(profile)
-    damaged = _make(paths, output, cell, ends, as_json=as_json)
+    damaged = _make(paths, output, cell, ends, gis=gis, as_json=as_json)
     if damaged:
         raise typer.Exit(int(ExitCode.DAMAGE))
 
@@ -60,7 +66,7 @@ def _ends(text: str | None) -> list[float] | None:
 
 
 def _make(
-    paths: list[Path], output: Path | None, cell: float | None, ends: list[float] | None, *, as_json: bool
+    paths: list[Path], output: Path | None, cell: float | None, ends: list[float] | None, *, gis: bool, as_json: bool
 ) -> bool:
     """Read, draw, write and report; return True if a file could be read only in part."""
     from rich.console import Console
@@ -85,6 +91,7 @@ def _make(
         status.update("drawing")
         try:
             page = make_page(look, folder, title, warnings)
+            made = _gis(look, folder, paths, warnings) if gis else []
         except OSError as error:
             text = f"{folder}: cannot write there ({error.strerror or error}); choose another folder with --output"
             raise UserError(one_line(text), ExitCode.IO) from error
@@ -96,7 +103,19 @@ def _make(
             console.print(one_line(f"swath: {source.path}: {source.damage}; the page shows the readable part"))
             damaged = True
     if as_json:
-        print(json.dumps(finite(numbers_of(look)) | {"page": str(page)}, indent=2, allow_nan=False))
+        written = {"page": str(page)} | ({"gis": [str(path) for path in made]} if gis else {})
+        print(json.dumps(finite(numbers_of(look)) | written, indent=2, allow_nan=False))
     else:
         print(f"{len(look.strips)} strip{'s' * (len(look.strips) != 1)}, {look.surface.points:,} points: {page}")
+        for path in made:
+            print(one_line(str(path)))
     return damaged
+
+
+def _gis(look: Look, folder: Path, paths: list[Path], warnings: list[str]) -> list[Path]:
+    """Write maps and features for GIS; return their paths."""
+    from swath.daemon.processing.quicklook.gis import write_gis
+
+    done = write_gis(look, folder, paths)
+    warnings.extend(done.notes)
+    return done.paths

@@ -10,7 +10,12 @@ from swath.drivers.extras import how_to_install
 PROCESS = ("numba", "scipy", "pyproj", "laspy", "lazrs")
 PAGES = ("matplotlib", "jinja2")  # for HTML pages
 PRINTED_PAGES = (*PAGES, "weasyprint")  # for HTML pages that are written as PDF too
-EXTRA_OF = {"foxglove": "live"}  # package: the extra that installs it, if not process
+GIS = ("rasterio", "fudgeo")  # for maps and features that a GIS reads
+EXTRA_OF = {
+    "foxglove": "live",
+    "rasterio": "gis",
+    "fudgeo": "gis",
+}  # package: the extra that installs it, if not process
 
 
 def require_installed(command: str, *others: str) -> None:

@@ -10,9 +10,10 @@ import csv
 import io
 import math
 import re
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -25,6 +26,7 @@ from swath.daemon.errors import UserError
 from swath.daemon.processing.calibration.returns import KeptFlight
 from swath.daemon.text_files import text_of
 from swath.georef.arrays import FloatArray
+from swath.georef.mapping.frame import Mapping
 
 COLUMNS = ("WKT", "name")
 FARTHEST = 1e9  # largest coordinate accepted, in any unit of a map
@@ -54,6 +56,21 @@ def control_of(path: Path, flight: Flight, suffered: Collection[str]) -> tuple[t
     if refusing:
         raise UserError(refusing[0])
     return points, [f"{path}: {one.text}" for one in found]
+
+
+def control_places(
+    points: Sequence[ControlPoint], flight: Flight, mapping: Mapping | None
+) -> dict[str, dict[str, Any]]:
+    """Return place and coordinate system of control points by name, for records; empty without a mapping."""
+    if mapping is None or not points:
+        return {}
+    crs = mapping.description()["crs"]
+    places = mapping.map_from_e(flight.frame.e_from_t(np.stack([point.position_t for point in points])))
+    keys = ("easting", "northing", "height")
+    return {
+        point.name: dict(zip(keys, place, strict=True)) | {"crs": crs}
+        for point, place in zip(points, places.tolist(), strict=True)
+    }
 
 
 def ties_of(path: Path, kept: KeptFlight) -> Features:

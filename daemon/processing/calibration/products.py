@@ -31,6 +31,7 @@ from swath.calib.summary import Finding, ReportInput
 from swath.calib.validation.methods import Asked, validate
 from swath.calib.verdict import DEG, held_words, judge
 from swath.daemon.errors import ExitCode, UserError, one_line
+from swath.daemon.processing.calibration.inputs import control_places
 from swath.daemon.processing.calibration.model import in_words, key_of
 from swath.daemon.processing.calibration.record import instruments_of
 from swath.daemon.processing.calibration.run import OUTCOME, Calibrated, CalibrationOptions, paths_of
@@ -259,10 +260,21 @@ def _record(
         ],
         "strips": {"before": strips_entry(before), "after": strips_entry(after)},
         "profiles": profiles_entry(done.check),
+        "control": _control_entry(done),
         "refused": dict(done.features.refused),
         "notes": list(done.notes),
         "inputs": [{"name": name, "sha256": digest} for name, digest in inputs],
     }
+
+
+def _control_entry(done: Calibrated) -> list[dict[str, Any]]:
+    """Return place and residual of every control point that was used: how far the laser lies above it; SI."""
+    places = control_places(done.control, done.flight, done.kept.logged[0].setup.mapping)
+    return [
+        {"name": one.name, "laser_above_m": -one.misclosure_m, "sigma_m": one.sigma_m, "normalised": one.normalised}
+        | places.get(one.name, {})
+        for one in done.adjusted.control
+    ]
 
 
 def _considered_entry(adjusted: Adjusted, column: int) -> dict[str, Any]:

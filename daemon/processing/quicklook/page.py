@@ -10,7 +10,7 @@ from swath.calib.strips.standards import ASPRS_OVERLAP, QUALITY_LEVELS, TO_CONFI
 from swath.daemon.processing.files import write_whole
 from swath.daemon.processing.pages.blocks import Block, Card, Cell, Image, Judged, Notes, Table, Words, data_uri
 from swath.daemon.processing.pages.head import head_of_sidecars
-from swath.daemon.processing.pages.names import PRINTED, QUICK_LOOK
+from swath.daemon.processing.pages.names import PRINTED, QUICK_LOOK, QUICK_LOOK_FEATURES, QUICK_LOOK_MAPS
 from swath.daemon.processing.pages.pdf import page_files
 from swath.daemon.processing.pages.render import Page, html_of
 from swath.daemon.processing.pages.words import thousands
@@ -54,6 +54,8 @@ def make_page(look: Look, folder: Path, title: str, warnings: list[str]) -> Path
         if wanted(look):
             draw(look, path)
             shown.append(Image(alt, data_uri(path.read_bytes(), "image/png")))
+    for name in (*QUICK_LOOK_MAPS, QUICK_LOOK_FEATURES):
+        (folder / name).unlink(missing_ok=True)
     page = folder / QUICK_LOOK
     page.with_suffix(PRINTED).unlink(missing_ok=True)
     write_whole(page_files(page, page_of(look, title, shown), warnings))

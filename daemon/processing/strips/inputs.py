@@ -242,10 +242,11 @@ def _times_apart(strips: Gathered, seen: SeenFrom) -> list[str]:
 def _seen_from(look: Look) -> tuple[SeenFrom | None, Callable[[FloatArray], FloatArray]]:
     """Return the trajectories beside the points, and a function from the map's metres to t."""
     sidecars = [source.sidecar for source in look.sources]
-    trajectories, of_session = _trajectories(look)
+    trajectories = trajectories_beside(look)
+    of_session = [trajectory.name for trajectory in trajectories]
     if not trajectories or not all(sidecars):
         return None, lambda points: points
-    mapping = _mapping_of(sidecars[0]["crs"])
+    mapping = mapping_of(sidecars[0]["crs"])
     middle = trajectories[0].position_e[len(trajectories[0]) // 2]
     mapping.settle(middle[np.newaxis])
     frame = Tangent.at(middle)
@@ -260,7 +261,7 @@ def _seen_from(look: Look) -> tuple[SeenFrom | None, Callable[[FloatArray], Floa
     return SeenFrom(frame, trajectories, trajectory_numbers, [1.0] * len(look.names), mounted), place
 
 
-def _mapping_of(crs: dict[str, Any]) -> Mapping:
+def mapping_of(crs: dict[str, Any]) -> Mapping:
     """Return the mapping frame of a sidecar's points, with the datum given on the command line or
     in the configuration.
     """
@@ -269,14 +270,12 @@ def _mapping_of(crs: dict[str, Any]) -> Mapping:
     return Mapping(crs["crs"], datum=crs["datum_said"], epoch=crs.get("epoch"), accuracy_m=crs["accuracy_wanted_m"])
 
 
-def _trajectories(look: Look) -> tuple[list[Trajectory], list[str]]:
-    """Return the trajectories beside the points, and the session of each."""
+def trajectories_beside(look: Look) -> list[Trajectory]:
+    """Return the trajectories beside the points, named after their sessions."""
     folders = {source.path.parent for source in look.sources}
     files = sorted(file for folder in folders for file in folder.glob(f"*{TRAJECTORY}"))
-    return (
-        [read_trajectory(file.read_bytes(), str(file)) for file in files],
-        [file.name.removesuffix(TRAJECTORY) for file in files],
-    )
+    read = [(read_trajectory(file.read_bytes(), str(file)), file.name.removesuffix(TRAJECTORY)) for file in files]
+    return [replace(trajectory, name=session) for trajectory, session in read]
 
 
 def _flown(look: Look, number: int, trajectories: Sequence[Trajectory], of_session: Sequence[str]) -> int:

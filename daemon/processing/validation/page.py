@@ -6,9 +6,9 @@ from collections.abc import Iterable, Sequence
 
 from scipy import stats
 
-from swath.calib.labels import decimals_of, number, thousands
+from swath.calib.labels import decimals_of, number, thousands, words_of
 from swath.calib.validation.history import History
-from swath.calib.validation.methods import ALPHA, POWER, WANTS, WORDS, Detectable, Test, Validation
+from swath.calib.validation.methods import ALPHA, POWER, WANTS, WORDS, Detectable, Method, Test, Validation
 from swath.daemon.processing.carried_verdict import Carried
 from swath.daemon.processing.pages.blocks import Block, Card, Cell, Image, Judged, Notes, Table, Words, data_uri
 from swath.daemon.processing.pages.head import PageHead
@@ -27,6 +27,7 @@ TESTS = {
     "effects": "χ² of the part that errors of the calibration explain",
     "effect": "largest single error, in sigmas",
 }
+LEAST_P = 1e-6
 HOW = (
     "Every distance is tested against its expected covariance: noise of the planes, errors of the trajectory with "
     "their correlation along the strips, and the sigmas of the calibration itself. A test fails where chance alone "
@@ -58,8 +59,8 @@ def validation_page(
     reasons = [[reason.what, reason.change] for reason in verdict.reasons]
     blocks: list[Block] = [
         *([Table("Reasons", ("what", "remedy"), reasons, left=(0, 1), stacked=True)] if reasons else []),
-        *([Notes(notes)] if notes else []),
-        *([] if validation is None else [_methods(validation), *_detectable(validation)]),
+        *_notes(notes, validation),
+        *([] if validation is None else [*_methods(validation), *_detectable(validation)]),
         *_histories(histories, picture),
     ]
     appendix: list[Block] = [] if validation is None else [*_tests(validation), Words(HOW, "How it was tested")]
@@ -75,7 +76,7 @@ def verdict_of(validation: Validation | None, histories: Sequence[History], carr
         words.append(validation.sentence)
         failed = [method for method in validation.methods if method.passed is False]
         remedy = "calibrate again; until then do not use the calibration"
-        reasons += [Reason(Level.UNUSABLE, one.name, one.sentence, remedy, 2.0) for one in failed]
+        reasons += [Reason(Level.UNUSABLE, one.name, _failure(one), remedy, 2.0) for one in failed]
         reasons += [Reason(Level.CARE, "undone", f"not done as requested: {one}", "", 1.0) for one in validation.undone]
         if validation.passed is None:
             reasons.append(Reason(Level.CARE, "nothing", "no method could be applied", "give other logs, or control"))
@@ -89,6 +90,12 @@ def verdict_of(validation: Validation | None, histories: Sequence[History], carr
             reasons.append(Reason(Level.UNUSABLE, "moved", what, "fasten the scanner and calibrate again", 3.0))
     worst, ordered = worst_first(reasons)
     return Verdict(worst, f"{worst.heading}: {'; '.join(words)}.", ordered)
+
+
+def _notes(notes: Sequence[str], validation: Validation | None) -> list[Block]:
+    """Return the notes that are not among the reasons."""
+    shown = [note for note in notes if validation is None or note not in validation.dependent]
+    return [Notes(shown)] if shown else []
 
 
 def _cards(validation: Validation | None, histories: Sequence[History]) -> list[Card]:
@@ -108,13 +115,14 @@ def _cm(metres: float, pattern: str = ".1f") -> str:
     return number(100.0 * metres, pattern)
 
 
-def _methods(validation: Validation) -> Table:
-    """Return a table of the six methods, each with its deciding test: the first that fails, otherwise that of all."""
+def _methods(validation: Validation) -> list[Block]:
+    """Return a table of the methods with their deciding tests, the first that fails, and one of those not applied."""
     rows: list[list[Cell]] = []
+    missing: list[list[Cell]] = []
     for method in validation.methods:
         if method.passed is None:
             why = method.sentence.partition("not applied: ")[2] or WANTS[method.name]
-            rows.append([COMPARED[method.name], method.code, *["–"] * 8, f"not applied: {why}"])
+            missing.append([COMPARED[method.name], method.code, why])
             continue
         test = next((one for one in method.tests if not one.passed), method.tests[0])
         numbers = method.numbers
@@ -122,25 +130,32 @@ def _methods(validation: Validation) -> Table:
         if numbers is not None:
             sizes = [thousands(numbers.count), _cm(numbers.mean_m, "+.1f")]
             sizes += [_cm(value) for value in (numbers.std_m, numbers.rms_m, numbers.max_m)]
-        verdict = Judged("passed" if method.passed else f"failed {test.words}".strip(), bool(method.passed))
+        verdict = Judged("passed" if method.passed else "failed", bool(method.passed))
         rows.append([COMPARED[method.name], method.code, *sizes, *_figures(test), verdict])
     heads = ("method", "code", "distances", "mean, cm", "std, cm", "RMS, cm", "largest, cm", "figure", "limit", "p")
     under = (
         "Codes: ISO/TS 19159-2, 6.8. Figure and limit are those of the test that failed, otherwise of "
         f"{TESTS['chi2']}; the appendix has all tests."
     )
-    return Table("Methods", (*heads, "verdict"), rows, under, left=(0, 10))
+    tables: list[Block] = [Table("Methods", (*heads, "verdict"), rows, under, left=(0, 10))] if rows else []
+    if missing:
+        tables.append(Table("Methods not applied", ("method", "code", "why"), missing, left=(0, 2)))
+    return tables
+
+
+def _failure(method: Method) -> str:
+    """Return in words how a method failed."""
+    test = next(one for one in method.tests if not one.passed)
+    size = "" if method.numbers is None else f"RMS {_cm(method.numbers.rms_m)} cm, "
+    best = next((one.words for one in method.tests if one.words and not one.passed), "")
+    return f"{COMPARED[method.name]}: {size}{best or f'{TESTS[test.kind]} beyond the limit'}"
 
 
 def _figures(test: Test) -> list[str]:
     """Return figure, limit and p of a test."""
-    digits = ".0f" if test.value >= 100.0 else ".1f"
-    limit = _limit(test)
-    return [
-        number(abs(test.value), digits),
-        "–" if limit is None else f"≤ {number(limit, digits)}",
-        number(test.p, ".2g"),
-    ]
+    digits, limit = 0 if abs(test.value) >= 100.0 else 1, _limit(test)
+    most = "–" if limit is None else f"≤ {thousands(limit, digits)}"
+    return [thousands(abs(test.value), digits), most, f"< {LEAST_P:g}" if test.p < LEAST_P else number(test.p, ".2g")]
 
 
 def _limit(test: Test) -> float | None:
@@ -171,10 +186,10 @@ def _detectable(validation: Validation) -> list[Block]:
     """Return a table of the smallest errors that the tests would have detected."""
     found = validation.detectable
     several = len({one.scanner for one in found}) > 1
-    rows = [[f"{one.scanner} {one.name}" if several else one.name, *_size(one)] for one in found]
+    rows = [[words_of(one.scanner, one.parameter, several=several), *_size(one)] for one in found]
     under = (
-        f"A single error of this size would have failed a test with a probability of {POWER:.0%}; smaller ones may "
-        "remain unseen."
+        f"A single error of this size would have failed a test with a probability of {100 * POWER:.0f} %; "
+        "smaller ones may remain unseen."
     )
     heads = ("parameter", "smallest error that would be detected", "unit")
     return [Table("What would have been seen", heads, rows, under, left=(0, 2))] if rows else []

@@ -37,7 +37,7 @@ from swath.calib.validation.methods import (
     with_sigmas,
 )
 from swath.daemon.errors import ExitCode, UserError
-from swath.daemon.processing.calibration.inputs import control_of
+from swath.daemon.processing.calibration.inputs import control_of, control_places
 from swath.daemon.processing.calibration.returns import KeptFlight, read_flight, refuse_installations, replaced
 from swath.daemon.processing.calibration.run import PLANES, prior_of
 from swath.daemon.processing.carried_verdict import Carried, first_lines, refusal, told_before, verdict_entry
@@ -107,6 +107,7 @@ class _Found:
     carried: list[Carried] = field(default_factory=list)
     head: PageHead = NOTHING_KNOWN
     warnings: list[str] = field(default_factory=list)
+    control: list[dict[str, Any]] = field(default_factory=list)
 
 
 def run_validation(request: ValidationOptions, folder: Path, told: Told) -> Validated:
@@ -189,7 +190,17 @@ def _against_flight(request: ValidationOptions, found: _Found, kept: KeptFlight,
     found.logs = [(path.name, sha256_of(path)) for path in paths]
     dependent = tuple(line for one in found.calibrations.values() for line in same_logs(one, found.logs))
     found.validation = replace(validation, dependent=dependent)
+    found.control = _control_entry(validation, control_places(points or (), flight, kept.logged[0].setup.mapping))
     found.notes += [*kept.notes, *notes]
+
+
+def _control_entry(validation: Validation, places: dict[str, dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return place and residual of every control point: how far the laser lies above it, mean of its sights; SI."""
+    residuals = [found for one in validation.methods for found in one.more.get("residuals_m", {}).items()]
+    return [
+        {"name": name, "laser_above_m": sum(values) / len(values), "sights": len(values)} | places.get(name, {})
+        for name, values in residuals
+    ]
 
 
 def _refuse_others(request: ValidationOptions, found: _Found, kept: KeptFlight) -> None:
@@ -291,6 +302,7 @@ def _written(request: ValidationOptions, found: _Found) -> Validated:
     wrong: list[str] = list(filter(None, [refusal(record["verdict"])]))
     if found.validation is not None:
         record["validation"] = _record(found.validation)
+        record["control"] = found.control
         lines += [method.sentence for method in found.validation.methods] + [found.validation.sentence]
         wrong += [] if found.validation.holds else [found.validation.sentence]
         found.notes += found.validation.dependent

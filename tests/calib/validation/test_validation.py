@@ -299,7 +299,7 @@ def test_the_verdict_names_undetectable_errors(made: Cast, roofs: Features) -> N
     validation = validate(made.at_truth(), roofs, calibrations)
     smallest = {one.parameter: one for one in validation.detectable}
     assert f"errors below {smallest['omega_rad'].words}, {smallest['phi_rad'].words}, " in validation.sentence
-    assert "would not be detected (80% of larger ones would)" in validation.sentence
+    assert "would not be detected (80 % of larger ones would)" in validation.sentence
     assert 1e-5 < smallest["omega_rad"].size < 5e-4
     for name in ("omega_rad", "phi_rad"):
         wrong = {"left": made.truth.changed(**{name: 2.0 * smallest[name].size})}
