@@ -107,7 +107,7 @@ def _of_shape(frame: Frame, cell_m: float, values: FloatArray) -> Frame:
 
 def _cropped(values: FloatArray, frame: Frame) -> tuple[FloatArray, Frame]:
     """Return the smallest rectangle that has all values (bands, rows, columns), and its frame."""
-    known: BoolArray = np.isfinite(values).any(axis=0)
+    known: BoolArray = np.asarray(np.isfinite(values).any(axis=0))
     rows, columns = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
     part = values[:, rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
     west_m, south_m = frame.west_m + columns[0] * frame.cell_m, frame.south_m + rows[0] * frame.cell_m
