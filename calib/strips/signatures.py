@@ -19,6 +19,7 @@ from scipy.sparse import csr_array
 
 from swath.calib.equations.trajectory_prior import ERRORS, Taus, TrajectoryPrior, gauss_markov_at, knots_within
 from swath.calib.flight import FlightError
+from swath.calib.labels import with_sigma
 from swath.calib.strips.differences import Checks
 from swath.calib.strips.effects import EFFECTS, NAMES, Effect, SeenFrom, effect_columns, error_columns
 from swath.georef.arrays import BoolArray, FloatArray, Int64Array
@@ -342,9 +343,7 @@ def _not_told(effect: Effect, why: str) -> Signature:
 
 def _told(effect: Effect, value: float, sigma: float, edge: float) -> Signature:
     times, moves_m = abs(value) / sigma, abs(value) * edge
-    digits = max(0, 1 - math.floor(math.log10(effect.factor * sigma)))
-    size, spread = effect.factor * value, effect.factor * sigma
-    number = f"{size:+.{digits}f} ± {spread:.{digits}f} {effect.unit}".replace(" °", "°")
+    number = f"{with_sigma(effect.factor * value, effect.factor * sigma)} {effect.unit}".replace(" °", "°")
     if times < SIGNIFICANT:
         return Signature(effect, value, sigma, moves_m, "none", f"{effect.name}: not significant ({number})")
     size_words = f"{times:.0f} σ, {100.0 * moves_m:.1f} cm at the edge"

@@ -89,6 +89,7 @@ def command(
     workers: Annotated[int | None, typer.Option(help="Number of processes; default: one per processor.", min=1)] = None,
     force_trajectory: ForceTrajectory = False,
     accept_verdict: AcceptVerdict = False,
+    all_pairs: Annotated[bool, typer.Option("--all-pairs", help="List every pair, not only the ten worst.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object, for scripts.")] = False,
 ) -> None:
     """Compare overlapping strips, point to plane and gridded; find the pattern of the differences and judge them.
@@ -129,7 +130,7 @@ def command(
     if control or overwrite or strip_model != "auto":
         named = "--control" if control else "--overwrite" if overwrite else "--strip-model"
         raise UserError(f"{named} needs --adjust DIR, because only an adjustment uses it", ExitCode.USAGE)
-    _compare(logs, before or (), (cells, cell), output, level, as_json=as_json)
+    _compare(logs, before or (), (cells, cell), output, level, as_json=as_json, all_pairs=all_pairs)
 
 
 def _compare(
@@ -140,9 +141,11 @@ def _compare(
     level: str | None,
     *,
     as_json: bool,
+    all_pairs: bool,
 ) -> None:
     from swath.daemon.cli.progress import progress_bar
     from swath.daemon.processing.strips.compare import StripsOptions, compare_strips, rules_of
+    from swath.daemon.processing.strips.console import comparison_lines
 
     request = StripsOptions(logs.logs, logs, before, rules_of(*cells), level)
     warnings: list[str] = []
@@ -154,7 +157,7 @@ def _compare(
 
             tell("page", 0, 1)
             written = write_comparison(done, output, level, warnings)
-    lines = [*done.lines, *map(str, written)]
+    lines = [*comparison_lines(done, level, all_pairs=all_pairs), *map(str, written)]
     print(json.dumps(done.record, indent=2) if as_json else "\n".join(map(one_line, lines)))
     for line in warnings:
         print(one_line(f"swath: {line}"), file=sys.stderr)

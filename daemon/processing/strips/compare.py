@@ -14,7 +14,7 @@ from swath.calib.strips.differences import Numbers, PairReport, StripReport, rep
 from swath.calib.strips.signatures import MATTERS_M, Signatures, record_of, signatures
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.processing.calibration.returns import read_flight, refuse_installations, smoothed_prior
-from swath.daemon.processing.carried_verdict import first_lines, points_verdicts, refusal, told_before, verdict_entry
+from swath.daemon.processing.carried_verdict import points_verdicts, refusal, told_before, verdict_entry
 from swath.daemon.processing.flights.read import GeorefOptions, verdicts_of
 from swath.daemon.processing.pages.head import head_of_flights, head_of_sidecars
 from swath.daemon.processing.quicklook.product_facts import crs_of
@@ -28,6 +28,7 @@ from swath.georef.verdicts import Level, Reason, Verdict, worst_first
 Told = Callable[[str, int, int], None]
 
 RECORD = "strips.json"
+WORST_PAIRS = 10  # shown first
 LOG_SUFFIX = ".mcap"
 POINT_SUFFIXES = (".las", ".laz")
 
@@ -56,13 +57,12 @@ class Compared:
     """The outcome of a comparison.
 
     Attributes:
-        record: for scripts; lines: for people.
+        record: for scripts.
         problem: in a line; empty: no problem.
         now, before: strips with their differences; before: None if there is no earlier state.
     """
 
     record: dict[str, Any]
-    lines: list[str]
     problem: str
     now: Judgement
     before: Judgement | None = None
@@ -86,9 +86,8 @@ def compare_strips(request: StripsOptions, folder: Path, told: Told) -> Compared
         )
     record = finite(now.record() | ({"before": then.record()} if then is not None else {}))
     record["verdict"] = verdict_entry(now.strips.carried, accepted=request.logs.accept_verdict)
-    lines = [*first_lines(record["verdict"]), *now.lines(then)]
     problem = "; ".join(filter(None, (refusal(record["verdict"]), now.problem(request.level))))
-    return Compared(record, lines, problem, now, then)
+    return Compared(record, problem, now, then)
 
 
 def rules_of(most_cells: int, cell_m: float | None) -> StripRules:
@@ -141,6 +140,28 @@ def _read(paths: Sequence[Path], request: StripsOptions, folder: Path, told: Tol
 # ---------------------------------------------------------------------- results
 
 
+@dataclass(frozen=True, slots=True)
+class StripRow:
+    """A strip against all others.
+
+    Attributes:
+        name: of the strip.
+        neighbours: number of strips that it was compared with.
+        cells: number of smooth cells.
+        above_m, rms_m: its mean height above the others, and RMSDz; None: it was compared with none.
+        scatter_m: sigma of its single returns about their planes, on the smoothest quarter of gentle ground.
+        returns_m2: density of single returns on open ground.
+    """
+
+    name: str
+    neighbours: int
+    cells: int
+    above_m: float | None
+    rms_m: float | None
+    scatter_m: float | None
+    returns_m2: float | None
+
+
 @dataclass(frozen=True, eq=False)
 class Judgement:
     """Strips with their differences, the errors that these suggest, and their quality."""
@@ -189,6 +210,28 @@ class Judgement:
             met = met if self.agreement.judged else ""
             words.append(f"strips agree to {100.0 * numbers['rms_m']:.1f} cm (RMSDz of {len(self.pairs())} pairs){met}")
         return "; ".join(words)
+
+    def strip_rows(self) -> list[StripRow]:
+        """Return every strip against all others."""
+        look, rows = self.strips.look, []
+        densities = dict(zip(look.names, look.cells.single_densities(), strict=False))
+        for index, name in enumerate(look.names):
+            own = [row for row in look.overlap.rows if index in (row["first"], row["second"])]
+            cells = sum(row["cells"] for row in own)
+            above = sum((1.0 if row["first"] == index else -1.0) * row["cells"] * row["mean_m"] for row in own)
+            square = sum(row["cells"] * row["rms_m"] ** 2 for row in own)
+            rows.append(
+                StripRow(
+                    name,
+                    len(own),
+                    cells,
+                    above / cells if cells else None,
+                    math.sqrt(square / cells) if cells else None,
+                    self.agreement.repeatability_m.get(index),
+                    densities.get(name) or None,
+                )
+            )
+        return rows
 
     def pairs(self) -> list[tuple[str, str, dict[str, Any] | None, PairReport | None]]:
         """Return names, gridded numbers and point-to-plane numbers of every pair, the largest RMSDz first."""
@@ -244,45 +287,12 @@ class Judgement:
         names = self.strips.look.names
         return names.index(pair[0]), names.index(pair[1])
 
-    def lines(self, before: Judgement | None) -> list[str]:
-        """Return the comparison as lines for people."""
-        lines = [_row("strips", "cells", "mean", "RMSDz", "95 %", "max", "to plane", "RMS", "noise") + "  cm"]
-        heights, to_plane = self._rows(), {(pair.first, pair.second): pair for pair in self.report.pairs}
-        for pair in sorted({*heights, *to_plane}, key=self._place):
-            lines.append(_line(f"{pair[0]} − {pair[1]}", heights.get(pair), to_plane.get(pair)))
-        lines.append(_line("all", self.agreement.numbers, self.report.all))
-        lines.append(self.agreement.measure)
-        lines.append("to plane: single returns above the other strip's plane, RMS along its normal, all slopes to 45°")
-        lines += self.signatures.lines if self.signatures else []
-        lines += self.agreement.verdicts()
-        if before is not None and (was := before.agreement.numbers) and (now := self.agreement.numbers):
-            figures = [f"RMSDz {100 * one['rms_m']:.1f} cm, largest {100 * one['max_m']:.1f} cm" for one in (was, now)]
-            lines.append(f"before: {figures[0]}; now: {figures[1]}")
-        return lines + self.strips.notes
-
 
 def _judged(strips: Strips, request: StripsOptions, told: Told) -> Judgement:
     told(f"comparing {strips.what}", 0, 1)
     report = report_of(strips.look.names, strips.gathered, request.rules, strips.cell_m)
     found = None if strips.seen is None else signatures(report.checks, strips.seen, strips.prior)
     return Judgement(strips, report, found)
-
-
-def _row(name: str, *values: str) -> str:
-    return f"{name:<14}" + "".join(f"{value:>9}" for value in values)
-
-
-def _line(name: str, heights: dict[str, Any] | None, to_plane: PairReport | None) -> str:
-    """Return a row of the table, centimetres: first heights, then distances of returns from planes."""
-    values = ["–"] * 5
-    if heights is not None:
-        gridded = (heights["mean_m"], heights["rms_m"], heights["p95_m"], heights["max_m"])
-        values = [f"{heights['cells']:,}", *(f"{100.0 * value:.1f}" for value in gridded)]
-    if to_plane is None or not to_plane.distance.count:
-        return _row(name, *values, "–", "–", "–")
-    distance = to_plane.distance
-    more = (f"{100.0 * value:.1f}" for value in (distance.rms_m, to_plane.noise_m))
-    return _row(name, *values, f"{distance.count:,}", *more)
 
 
 def _to_plane(pair: PairReport | None) -> dict[str, Any]:

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from swath.calib.labels import decimals_of, number, thousands
 from swath.calib.strips.signatures import MATTERS_M, SIGNIFICANT, Signature
@@ -18,11 +17,10 @@ from swath.daemon.processing.pages.names import PRINTED, STRIPS, STRIPS_PICTURES
 from swath.daemon.processing.pages.pdf import page_files
 from swath.daemon.processing.pages.render import Page, html_of
 from swath.daemon.processing.quicklook.maps import draw_differences
-from swath.daemon.processing.strips.compare import RECORD, Compared, Judgement
+from swath.daemon.processing.strips.compare import RECORD, WORST_PAIRS, Compared, Judgement
 
 MAP_TITLE = "Height difference of overlapping strips"
 MAP_TITLES = (f"{MAP_TITLE}, now", f"{MAP_TITLE}, before")
-WORST_PAIRS = 10
 MOST_PAIRS = 300  # of the complete list
 LEVEL_WORDS = {"none": "not significant", "small": "too small to matter", "not told": "not determined"}
 TO_PLANE = (
@@ -138,33 +136,21 @@ def _change(now: Judgement, before: Judgement | None) -> list[Block]:
 
 def _strips(now: Judgement) -> Table:
     """Return a table of every strip against all others."""
-    look = now.strips.look
-    densities = dict(zip(look.names, look.cells.single_densities(), strict=False))
-    rows = []
-    for index, name in enumerate(look.names):
-        own = [(row, 1.0 if row["first"] == index else -1.0) for row in look.overlap.rows if index in _strips_of(row)]
-        cells = sum(row["cells"] for row, _ in own)
-        mean_m = sum(sign * row["cells"] * row["mean_m"] for row, sign in own) / cells if cells else None
-        rms_m = math.sqrt(sum(row["cells"] * row["rms_m"] ** 2 for row, _ in own) / cells) if cells else None
-        density = densities.get(name)
-        rows.append(
-            [
-                name,
-                str(len(own)),
-                thousands(cells),
-                _cm(mean_m, sign=True),
-                _cm(rms_m),
-                _cm(now.agreement.repeatability_m.get(index)),
-                f"{density:.1f}" if density else "–",
-            ]
-        )
+    rows = [
+        [
+            one.name,
+            str(one.neighbours),
+            thousands(one.cells),
+            _cm(one.above_m, sign=True),
+            _cm(one.rms_m),
+            _cm(one.scatter_m),
+            number(one.returns_m2, ".1f"),
+        ]
+        for one in now.strip_rows()
+    ]
     heads = ("strip", "neighbours", "smooth cells", "above the others, cm", "RMSDz, cm", "scatter within, cm")
     under = "Scatter within: sigma of single returns about their planes, on the smoothest quarter of gentle ground."
     return Table("Strips", (*heads, "single returns per m²"), rows, under)
-
-
-def _strips_of(row: Mapping[str, Any]) -> tuple[int, int]:
-    return row["first"], row["second"]
 
 
 def _pairs(now: Judgement, most: int) -> list[Block]:

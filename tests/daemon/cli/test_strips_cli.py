@@ -150,6 +150,47 @@ def test_the_page_begins_with_the_verdict_and_shows_strips_pairs_and_the_map(tmp
     assert read.metadata.title == "now: comparison of strips"
 
 
+def test_the_console_has_verdict_strips_and_the_ten_worst_pairs(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Six strips over one slope, each 1 cm above the one before: 15 pairs."""
+    folder = tmp_path / "six"
+    folder.mkdir()
+    x, y = lattice(EAST_M, NORTH_M, 120.0, 50.0, 0.5)
+    for number in range(1, 7):
+        z = plane(x, y) + 0.01 * number
+        write_laz(folder / f"s{number}.laz", x, y, z, number, crs=CRS.from_epsg(25832))
+    run(str(folder), "-o", str(tmp_path / "out"))
+    lines = capsys.readouterr().out.splitlines()
+    assert re.fullmatch(r"Good: strips agree to \d\.\d cm \(RMSDz of 15 pairs\), and meet QL0\.", lines[0])
+    assert lines[1].split()[:4] == ["strip", "pairs", "cells", "above"]
+    assert [line.split()[0] for line in lines[2:8]] == ["1", "2", "3", "4", "5", "6"]
+    assert [line.split()[3] for line in (lines[2], lines[7])] == ["−3.0", "+3.0"]
+    assert lines[8] == "the 10 worst of 15 pairs, cm (--all-pairs shows all)"
+    pairs = [line for line in lines if re.match(r"\d − \d ", line)]
+    assert len(pairs) == 10
+    assert pairs[0].startswith("1 − 6 ")
+    assert lines[20].startswith("all ")
+    assert len(set(lines)) == len(lines)
+    run(str(folder), "--all-pairs")
+    told = capsys.readouterr().out
+    assert len(re.findall(r"^\d − \d ", told, re.MULTILINE)) == 15
+    assert "--all-pairs" not in told
+    record = json.loads((tmp_path / "out" / "strips.json").read_text())
+    assert len(record["pairs"]) == 15
+
+
+@pytest.mark.slow
+def test_a_significant_effect_is_named_once(made: Cast, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bad = products(tmp_path / "bad", made.flight.placed({"left": made.truth.changed(omega_rad=4e-4)}))
+    with pytest.raises(UserError):
+        run(str(bad))
+    told = capsys.readouterr().out
+    assert told.splitlines()[0].startswith("Usable with care: roll: opposite strips tilt")
+    assert told.splitlines()[1] == "remedy: run swath calibrate; it estimates all parameters together"
+    assert told.count("roll:") == 1
+
+
 def test_numbers_before_and_after_are_shown_side_by_side(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     now, then = lifted(tmp_path / "now", 0.01), lifted(tmp_path / "then", 0.20)
     run(str(now), "--before", str(then), "-o", str(tmp_path / "out"))
