@@ -29,13 +29,14 @@ from swath.calib.equations.normals import NormalError
 from swath.calib.equations.observability import spectrum
 from swath.calib.equations.quality import Solution, trajectory_fit
 from swath.calib.equations.robust import global_test
-from swath.calib.equations.solve import Block, HeldEffects, Settings, Solved, determined, settled
+from swath.calib.equations.solve import Block, HeldEffects, Settings, Solved, counted, determined, settled
 from swath.calib.equations.trajectory_prior import TrajectoryPrior
 from swath.calib.features import Features
 from swath.calib.flight import Flight
 from swath.calib.outcome import Adjusted, Considered
 from swath.calib.parameters import ParameterOptions, Unknowns, unknowns
 from swath.georef.arrays import FloatArray
+from swath.georef.progress import Tell, silent
 from swath.georef.scanner.calibration import PARAMETERS, Calibration
 
 Rematch = Callable[[dict[str, Calibration]], Features | None]
@@ -60,6 +61,7 @@ def adjust(
     first: Mapping[str, Calibration] | None = None,
     doubted: Mapping[str, float] | None = None,
     entire: Rematch | None = None,
+    tell: Tell = silent,
 ) -> Adjusted:
     """Estimate all unknowns, finding correspondences anew until they no longer change the result.
 
@@ -76,6 +78,7 @@ def adjust(
         doubted: by name, as ``left.kappa_rad``, least sigma (SI) of its start where it is held.
         entire: returns all observations, once correspondences of a part of them are stable; None, or if it returns
             None: that part is everything.
+        tell: called with the progress; the number of iterations follows from the observations.
 
     Returns:
         The result. Sigmas are those that the observations' sigmas imply, multiplied by the root of the variance factor
@@ -90,7 +93,9 @@ def adjust(
     found: Solved | None = None
     for matching in range(1, settings.matchings + 1):
         before = found
-        found = settled(Block.of(flight, features, asked, prior, placed_with), settings, before)
+        what = f"adjustment {matching}"
+        tell(what, 0, 0, "iterations")
+        found = settled(Block.of(flight, features, asked, prior, placed_with), settings, before, counted(tell, what))
         placed_with = found.calibrations()
         last = rematch is None or matching == settings.matchings or (before is not None and _stable(before, found))
         again = None if last or rematch is None else rematch(placed_with)
@@ -98,7 +103,9 @@ def adjust(
             everything = None if entire is None else entire(placed_with)
             if everything is not None:
                 whole = Block.of(flight, everything, asked, prior, placed_with)
-                found = settled(whole, replace(settings, own_noise=True), found)
+                what = "adjustment, all planes"
+                found = settled(whole, replace(settings, own_noise=True), found, counted(tell, what))
+            tell("sigmas", 0, 0)
             return _adjusted(flight, found, settings, matching)
         features = again
     raise ValueError(f"matchings: got {settings.matchings}, want at least 1")

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import itertools
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -19,6 +20,7 @@ from swath.calib.flight import Flight
 from swath.calib.outcome import Residuals
 from swath.calib.parameters import Unknowns
 from swath.georef.arrays import FloatArray, SingleArray
+from swath.georef.progress import Tell
 from swath.georef.scanner.calibration import Calibration
 
 NOISE_TELLS = 1000.0  # redundancy above which residuals show how much a scanner's returns scatter
@@ -167,13 +169,22 @@ def determined(block: Block, settings: Settings) -> Block:
     return _without(block, part.normals(part.start(), weights), settings) or block
 
 
-def settled(block: Block, settings: Settings, before: Solved | None = None) -> Solved:
+def counted(tell: Tell, what: str) -> Callable[[], None]:
+    """Return a function that tells of one more iteration of a phase."""
+    numbers = itertools.count(1)
+    return lambda: tell(what, next(numbers), 0, "iterations")
+
+
+def settled(
+    block: Block, settings: Settings, before: Solved | None = None, stepped: Callable[[], None] = lambda: None
+) -> Solved:
     """Solve for the unknowns that are determined, both at the start and at the solution.
 
     Args:
         block: observations, and all unknowns that were requested.
         settings: settings of the adjustment.
         before: a solution with other correspondences, to start from.
+        stepped: called before each iteration.
 
     Raises:
         NormalError: an unknown is not determined after all.
@@ -182,19 +193,19 @@ def settled(block: Block, settings: Settings, before: Solved | None = None) -> S
     while less is not None:
         block = less
         state = block.start() if before is None else _carried(before.solution, block)
-        found = solved(block, settings, state)
+        found = solved(block, settings, state, stepped)
         less, before = _without(block, found.solution.normals, settings), found
     return found
 
 
-def solved(block: Block, settings: Settings, state: State) -> Solved:
+def solved(block: Block, settings: Settings, state: State, stepped: Callable[[], None] = lambda: None) -> Solved:
     """Iterate robustly until convergence, then without observations that the w-test rejects, until these stay the same.
 
     If there are many rows, the robust steps use a part of them.
     """
     part, taken = block.part(settings.thin_above)
     state, huber = moved(state, part.normals(state, taken).step()), settings.huber
-    state, equations, count, converged = _iterated(part, settings, state, taken, huber)
+    state, equations, count, converged = _iterated(part, settings, state, taken, huber, stepped)
     weights = block.weights()
     solution, quality = _examined(block, state, equations, weights)
     if settings.own_noise:
@@ -208,7 +219,7 @@ def solved(block: Block, settings: Settings, state: State) -> Solved:
             break
         weights, huber, part = chosen, 0.0, block
         del solution, quality  # frees memory before it is needed again: a third of a gigabyte for ten million rows
-        state, equations, more, converged = _iterated(block, settings, state, weights, 0.0)
+        state, equations, more, converged = _iterated(block, settings, state, weights, 0.0, stepped)
         solution, quality = _examined(block, state, equations, weights)
         count += more
     return Solved(solution, quality, count + 1, converged)
@@ -262,10 +273,16 @@ def _carried(before: Solution, block: Block) -> State:
 
 
 def _iterated(
-    block: Block, settings: Settings, state: State, weights: tuple[SingleArray, SingleArray], huber: float
+    block: Block,
+    settings: Settings,
+    state: State,
+    weights: tuple[SingleArray, SingleArray],
+    huber: float,
+    stepped: Callable[[], None],
 ) -> tuple[State, Normals, int, bool]:
     """Iterate until a step is less than the tolerance."""
     for count in range(1, settings.iterations + 1):
+        stepped()
         equations = block.normals(state, weights, huber)
         step = equations.step()
         state = moved(state, step)

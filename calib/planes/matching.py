@@ -20,6 +20,7 @@ from swath.calib.planes.cells import cell_size, keys_of
 from swath.calib.planes.fit import GATE, PlaneSettings, Sight, fit_sight, refusal, scaled_to
 from swath.calib.planes.returns import WIDE_M, cells_of, plane_of, pure, returns_near, thinned, well_inside
 from swath.georef.arrays import BoolArray, Int64Array
+from swath.georef.progress import Tell, silent
 
 LOST = "no longer fits"
 _DEFAULT = PlaneSettings()
@@ -29,14 +30,19 @@ _SIGMAS = 4.0
 
 
 def rematch(
-    flight: Flight, features: Features, settings: PlaneSettings = _DEFAULT, each: Callable[..., Any] = map
+    flight: Flight,
+    features: Features,
+    settings: PlaneSettings = _DEFAULT,
+    each: Callable[..., Any] = map,
+    tell: Tell = silent,
 ) -> Features:
     """Return the planes of features with the returns that lie on them now; other features are unchanged.
 
     The sets of returns stay the same if the points have not moved since the last call. A plane needs two swaths, or one
     and surveyed data; other planes are dropped and counted. Swaths are processed by `each`, which is called like `map`:
-    that of a pool processes several at a time, with the same result.
+    that of a pool processes several at a time, with the same result. ``tell`` is called with the progress.
     """
+    tell("planes, matching", 0, len(features.planes), "planes")
     refused = Counter(features.refused)
     settings = scaled_to(flight, settings)
     kept = [(plane, _agreeing(_sights(flight, plane, settings), settings)) for plane in features.planes]
@@ -45,7 +51,8 @@ def rematch(
     cell_m = cell_size(flight, settings)
     candidates = _candidates(flight, known, cell_m, settings, each)
     planes = []
-    for (plane, sights), near in zip(known, candidates, strict=True):
+    for number, ((plane, sights), near) in enumerate(zip(known, candidates, strict=True)):
+        tell("planes, matching", number, len(known), "planes")
         found = _agreeing(_settled(flight, plane, sights, near, cell_m, settings), settings)
         if len(found) < (1 if _surveyed(plane) else 2):
             refused[LOST] += 1

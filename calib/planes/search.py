@@ -24,6 +24,7 @@ from swath.calib.planes.fit import GATE, PlaneError, PlaneSettings, expected_sig
 from swath.calib.planes.given import given_planes
 from swath.calib.planes.returns import WIDE_M, cells_of, named, plane_of, pure, returns_near, sights_of, well_inside
 from swath.georef.arrays import BoolArray, FloatArray, Int64Array
+from swath.georef.progress import Tell, silent
 
 FIFTHS, THIRDS, OCTANTS = 5, 3, 8
 _ROOF_SHARE = 0.8  # of all planes, if there are too many
@@ -37,12 +38,14 @@ _DEFAULT = PlaneSettings()
 _ROUNDS = 4
 
 
-def find_planes(flight: Flight, settings: PlaneSettings = _DEFAULT, each: Callable[..., Any] = map) -> Features:
+def find_planes(
+    flight: Flight, settings: PlaneSettings = _DEFAULT, each: Callable[..., Any] = map, tell: Tell = silent
+) -> Features:
     """Find planes seen by at least two swaths, roofs first; the reasons why other places have none are counted.
 
     Only returns of pulses with a single return are used. Failures are counted as tiles of the ground where no plane
     grew, and as planes afterwards. Swaths are searched by `each`, which is called like `map`: that of a pool searches
-    several at a time, with the same result.
+    several at a time, with the same result. ``tell`` is called with the progress.
 
     Raises:
         PlaneError: no swath has points.
@@ -50,12 +53,13 @@ def find_planes(flight: Flight, settings: PlaneSettings = _DEFAULT, each: Callab
     refused: Counter[str] = Counter()
     settings = scaled_to(flight, settings)
     cell_m = cell_size(flight, settings)
-    segments = _grown(flight, cell_m, settings, refused, each)
+    segments = _grown(flight, cell_m, settings, refused, each, tell)
     face = same_faces(segments, settings, refused)
     pieces = cut(segments, face, cell_m, settings, refused)
     planes: dict[int, Plane] = {}
     tried: set[int] = set()
-    for _ in range(_ROUNDS):  # other pieces replace those that turn out to be no planes
+    for number in range(_ROUNDS):  # other pieces replace those that turn out to be no planes
+        tell("planes, single returns", number, _ROUNDS, "rounds")
         chosen = choose(flight, segments, pieces, settings, tried - planes.keys())
         fresh = np.array([piece for piece in chosen.tolist() if piece not in tried], np.int64)
         tried.update(fresh.tolist())
@@ -71,11 +75,15 @@ def find_planes(flight: Flight, settings: PlaneSettings = _DEFAULT, each: Callab
 
 
 def _grown(
-    flight: Flight, cell_m: float, settings: PlaneSettings, refused: Counter[str], each: Callable[..., Any]
+    flight: Flight, cell_m: float, settings: PlaneSettings, refused: Counter[str], each: Callable[..., Any], tell: Tell
 ) -> Segments:
     """Grow planes in all swaths; each swath has its own counter of refusals."""
     why: list[Counter[str]] = [Counter() for _ in flight.swaths]
-    found = list(each(lambda index: segments_of(flight, index, cell_m, settings, why[index]), range(len(why))))
+    found: list[list[Segments]] = []
+    tell("planes, grown", 0, len(why), "swaths")
+    for pieces in each(lambda index: segments_of(flight, index, cell_m, settings, why[index]), range(len(why))):
+        found.append(pieces)
+        tell("planes, grown", len(found), len(why), "swaths")
     for counted in why:
         refused.update(counted)
     return Segments.joined([one for pieces in found for one in pieces])

@@ -33,6 +33,7 @@ from swath.calib.profiles.influence import Influence, influence
 from swath.calib.profiles.measure import KINDS, PARAMETER, Settings
 from swath.calib.profiles.stepwise import MISSING, Profile, survey
 from swath.georef.arrays import FloatArray
+from swath.georef.progress import Tell, silent
 from swath.georef.scanner.calibration import INDEX, PARAMETERS
 
 CHECK = Settings(search_rad=1e-4, most_a_pair=2)  # the strips already coincide
@@ -88,6 +89,7 @@ def check(
     prior: TrajectoryPrior,
     control: Sequence[ControlPoint] = (),
     settings: Settings = CHECK,
+    tell: Tell = silent,
 ) -> Check:
     """Measure profiles where the procedure prescribes them, and compare them with the adjustment.
 
@@ -97,13 +99,16 @@ def check(
         prior: of the trajectories' errors, as used in the adjustment.
         control: for the range.
         settings: limits of the profiles.
+        tell: called with the progress.
     """
     refused: Counter[str] = Counter()
     profiles: list[Profile] = []
-    for kind in KINDS:
+    for number, kind in enumerate(KINDS):
+        tell("profiles", number, len(KINDS) + 1, "kinds")
         seen = survey(flight, kind, control, settings, adjusted.calibrations)
         refused.update({f"{kind}: {why}": count for why, count in seen.refused.items() if count})
         profiles += seen.profiles
+    tell("profiles", len(KINDS), len(KINDS) + 1, "kinds")
     comparisons = compare(flight, profiles, adjusted, prior, control, settings)
     compared = {(one.scanner, one.parameter) for one in comparisons}
     missing = {

@@ -42,6 +42,7 @@ from swath.calib.strips.determined import ALONG, DOWN, LEAST_KNOWN, ORDERS, PITC
 from swath.georef.arrays import BoolArray, FloatArray, Int64Array, SingleArray
 from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
 from swath.georef.geodesy.rotations import rot_z
+from swath.georef.progress import Tell, silent
 from swath.georef.scanner.calibration import Calibration
 from swath.georef.trajectory.trajectory import Trajectory
 
@@ -163,6 +164,7 @@ def adjust_strips(
     calibrations: Mapping[str, Calibration],
     settings: Settings = DEFAULTS,
     row_weight: SingleArray | None = None,
+    tell: Tell = silent,
 ) -> StripAdjusted:
     """Correct each strip's trajectory according to its features.
 
@@ -173,6 +175,7 @@ def adjust_strips(
         settings: of the strip adjustment.
         row_weight: (n,) of the rows on planes, in the order of `swath.calib.equations.rows`, from the calibration;
             None: 1.
+        tell: called with the progress.
 
     Raises:
         StripError: an unknown model or criterion, or no features; `FlightError`: there is no strip.
@@ -188,11 +191,13 @@ def adjust_strips(
     case = _Equations(flight, features, calibrations, free, settings, row_weight)
     choice = _Choice(knots.trajectory_index, knots.strip, _courses(flight, knots), settings)
     state, before = case.start(), None
-    for _ in range(settings.linearisations):
+    for number in range(settings.linearisations):
+        tell("corrections", number, settings.linearisations + 1, "linearisations")
         quadratic = case.at(state)
         before = quadratic if before is None else before
         choice.choose(quadratic)
         state = case.moved(choice.corrections(quadratic))
+    tell("corrections", settings.linearisations, settings.linearisations + 1, "linearisations")
     last = case.at(state)
     along, sigma, parameters = choice.solved(last)
     assert before is not None

@@ -39,11 +39,11 @@ def command(
 
 
 def _listen(config: Config, seconds: float) -> list[Report]:
-    from rich.console import Console
-
+    from swath.daemon.cli.progress import progress_bar
     from swath.daemon.devices.check import check_everything
 
-    with Console(stderr=True).status(f"listening for {seconds:g} s"):
+    with progress_bar() as tell:
+        tell(f"listening for {seconds:g} s", 0, 0)
         return check_everything(config, seconds)
 
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from swath.daemon.errors import ExitCode, UserError, one_line
+from swath.georef.progress import BYTES, Tell
 
 if TYPE_CHECKING:
     from swath.daemon.exchange.export import ExportReport
@@ -27,8 +29,7 @@ def command(
     What these formats cannot hold goes into a small file beside each; with it `swath import` makes the same log again.
         Exit code 4 when the log is damaged; everything readable is still written.
     """
-    from rich.console import Console
-
+    from swath.daemon.cli.progress import progress_bar
     from swath.daemon.exchange.export import export_session
     from swath.daemon.log.format import LogError
     from swath.daemon.log.reader import open_logs
@@ -36,8 +37,9 @@ def command(
     passed_over: list[str] = []
     done: list[tuple[Session, ExportReport]] = []
     try:
-        with Console(stderr=True).status("reading"):
+        with progress_bar() as tell:
             for session in open_logs(logs, passed_over):
+                session.progress = partial(_tell, tell, session.session_id)
                 done.append((session, export_session(session, directory)))
     except LogError as error:
         raise UserError(one_line(str(error)), ExitCode.IO) from error
@@ -55,6 +57,10 @@ def command(
         raise UserError("\n".join(map(one_line, lines)), ExitCode.DAMAGE)
     if any(session.missing_parts for session, _ in done):
         raise typer.Exit(int(ExitCode.PROBLEM))
+
+
+def _tell(tell: Tell, name: str, done: int, total: int) -> None:
+    tell(f"exporting {name}", done, total, BYTES)
 
 
 def _plain(session: Session, report: ExportReport) -> dict[str, object]:

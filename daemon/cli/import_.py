@@ -79,8 +79,7 @@ def command(
 
 
 def _import(config: Config, routes: Routes, captures: list[Capture], output: Path) -> ImportReport:
-    from rich.console import Console
-
+    from swath.daemon.cli.progress import progress_bar
     from swath.daemon.exchange.import_ import import_captures
     from swath.daemon.log.directory import take_directory
     from swath.drivers.transports.base import TransportError
@@ -89,9 +88,9 @@ def _import(config: Config, routes: Routes, captures: list[Capture], output: Pat
     resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))  # merging keeps all captures open at once
     lock = take_directory(output, "--output")
     try:
-        with Console(stderr=True).status("reading") as status:
+        with progress_bar() as tell:
             return import_captures(
-                config, routes, captures, output, lambda units: status.update(f"reading: {units} units")
+                config, routes, captures, output, lambda units: tell("reading captures", units, 0, "units")
             )
     except TransportError as error:
         raise UserError(one_line(str(error)), ExitCode.IO) from error

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from swath.daemon.errors import ExitCode, UserError, one_line
+from swath.georef.progress import BYTES, Tell
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -26,6 +28,7 @@ def command(
     """
     from rich.console import Console
 
+    from swath.daemon.cli.progress import progress_bar
     from swath.daemon.log.format import LogError
     from swath.daemon.log.reader import open_logs
     from swath.daemon.log.statistics import session_statistics
@@ -33,7 +36,9 @@ def command(
     passed_over: list[str] = []
     try:
         sessions = open_logs(logs, passed_over)
-        with Console(stderr=True).status("reading"):
+        with progress_bar() as tell:
+            for session in sessions:
+                session.progress = partial(_tell, tell, session.session_id)
             found = [session_statistics(session, decode=not quick) for session in sessions]
     except LogError as error:
         raise UserError(str(error), ExitCode.IO) from error
@@ -49,6 +54,10 @@ def command(
         raise typer.Exit(int(ExitCode.DAMAGE))
     if any(numbers["missing_parts"] or _unaccounted(numbers) for numbers in found):
         raise typer.Exit(int(ExitCode.PROBLEM))
+
+
+def _tell(tell: Tell, name: str, done: int, total: int) -> None:
+    tell(f"reading {name}", done, total, BYTES)
 
 
 def _plain(text: object) -> str:

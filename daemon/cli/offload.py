@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from swath.daemon.cli.progress import transfer_bar
+from swath.daemon.cli.progress import progress_bar
 from swath.daemon.errors import ExitCode, UserError, one_line
 from swath.daemon.log.directory import log_directory
+from swath.georef.progress import BYTES
 
 if TYPE_CHECKING:
     from swath.daemon.exchange.offload import OffloadReport
@@ -44,13 +45,12 @@ def command(
         give_way()
     report: OffloadReport | None = None
     printed = 0
-    with transfer_bar() as bar:
-        task = bar.add_task("", total=None)
+    with progress_bar() as tell:
 
-        def tell(name: str, done: int, total: int) -> None:
-            bar.update(task, description=one_line(name), completed=done, total=total)
+        def progress(name: str, done: int, total: int) -> None:
+            tell(name, done, total, BYTES)
 
-        for report in offload(directory, destination, verify=verify, same_disk=same_disk, progress=tell):
+        for report in offload(directory, destination, verify=verify, same_disk=same_disk, progress=progress):
             if not as_json and len(report.copied) > printed:
                 printed = len(report.copied)
                 copied = report.copied[-1]

@@ -54,7 +54,7 @@ def command(
     require_installed("swath plan-calibration", "matplotlib")
     from rich.console import Console
 
-    from swath.daemon.cli.progress import compiling_noticed
+    from swath.daemon.cli.progress import progress_bar
     from swath.daemon.processing.calibration.model import model_of
     from swath.daemon.processing.calibration.plan.page import draw_planned, require_picture
     from swath.daemon.processing.calibration.plan.run import PlanOptions, plan_calibration
@@ -64,9 +64,9 @@ def command(
     require_picture(picture)
     asked = PlanOptions(model_of(model), None if sigmas is None else _three(sigmas), not no_control, control_sigma)
     flight = FlightOptions(plan)
-    console = Console(stderr=True)
-    with console.status("computing"), compiling_noticed(console), flight.as_user_errors():
-        planned = plan_calibration(flight.load(), asked)
+    with progress_bar() as tell, flight.as_user_errors():
+        planned = plan_calibration(flight.load(), asked, tell)
+        tell("picture", 0, 0)
         try:
             draw_planned(planned, picture)
         except OSError as error:

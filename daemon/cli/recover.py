@@ -28,6 +28,7 @@ def command(
     The log itself stays unchanged. In a directory, logs that are being recorded or were already recovered are left
     out. Exit code 4 when damage was found, 3 when a log could not be recovered (the others still are).
     """
+    from swath.daemon.cli.progress import progress_bar
     from swath.daemon.log.format import LogError
     from swath.daemon.log.recover import recover
     from swath.daemon.system import give_way
@@ -36,17 +37,18 @@ def command(
         give_way()
     reports = []
     refused: list[str] = []
-    for path in _files(logs, output):
-        try:
-            report = recover(path, output, keep_free_bytes=round(keep_free_mb * 1e6))
-        except LogError as error:
-            refused.append(str(error))
-        except OSError as error:
-            refused.append(f"{error.filename or path}: {error.strerror or error}")
-        else:
-            reports.append(report)
-            if not as_json:
-                _print_report(report)
+    with progress_bar() as tell:
+        for path in _files(logs, output):
+            try:
+                report = recover(path, output, keep_free_bytes=round(keep_free_mb * 1e6), tell=tell)
+            except LogError as error:
+                refused.append(str(error))
+            except OSError as error:
+                refused.append(f"{error.filename or path}: {error.strerror or error}")
+            else:
+                reports.append(report)
+                if not as_json:
+                    _print_report(report)
     if as_json:
         print(json.dumps({"logs": [report.plain() for report in reports], "refused": refused}, indent=2))
     elif not reports and not refused:

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from swath.georef.progress import BYTES
+
 if TYPE_CHECKING:
     from rich.console import Console
 
@@ -49,7 +51,7 @@ def command(
         for session in sessions:
             if stop:
                 break
-            report = _play_session(session, outputs, pace, console, lambda: bool(stop))
+            report = _play_session(session, outputs, pace, lambda: bool(stop))
             _tell_report(report, session, outputs, wire, console)
     finally:
         close_outputs(outputs)
@@ -71,21 +73,15 @@ def _open_sessions(logs: list[Path], console: Console) -> list[Session]:
 
 
 def _play_session(
-    session: Session, outputs: Mapping[str, Output], pace: float, console: Console, stopped: Callable[[], bool]
+    session: Session, outputs: Mapping[str, Output], pace: float, stopped: Callable[[], bool]
 ) -> PlayReport:
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
+    from swath.daemon.cli.progress import progress_bar
     from swath.daemon.replay.units import timed_units
     from swath.daemon.replay.wire_player import play
 
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TextColumn("{task.fields[detail]}"))
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task(session.session_id, total=None, detail="")
-
-        def tell(seconds: float, report: PlayReport) -> None:
-            bar.update(task, detail=f"{seconds:.0f} s, {sum(report.units.values())} units")
-
-        return play(timed_units(session, with_pps=pace == 1.0), outputs, pace=pace, progress=tell, stopped=stopped)
+    with progress_bar() as tell:
+        session.progress = lambda done, total: tell(f"playing {session.session_id}", done, total, BYTES)
+        return play(timed_units(session, with_pps=pace == 1.0), outputs, pace=pace, stopped=stopped)
 
 
 def _tell_report(

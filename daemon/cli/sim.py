@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from swath.daemon.errors import ExitCode, UserError, one_line
+from swath.georef.progress import Tell
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from rich.console import Console
-    from rich.progress import Progress
 
     from swath.daemon.replay.wire_player import Output, PlayReport
     from swath.daemon.simulate.ahead import Ahead, FlightFacts
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 PRESETS = "small, calibration, corridor, block, bench"  # as in swath.sim.plan.plan
 CONFIG_NAME, TRUTH_NAME, LOGS_NAME = "swath.toml", "truth.npz", "logs"
 SETTLE_S = 1.0  # from the last reader at a port to the first unit; readers of UDP and CAN cannot be detected
+SECONDS = "s flown"
 LATE_S = 0.5  # a time message later than this after its edge may be taken as the next edge's
 INTERRUPTED = 130  # 128 + SIGINT
 
@@ -116,11 +117,13 @@ def plan_(
     """Draw a plan (lines, swaths, buildings, height profile, density, overlap) and print its figures as a table."""
     from rich.console import Console
 
+    from swath.daemon.cli.progress import progress_bar
     from swath.daemon.simulate.plans import FlightOptions, draw
 
     picture = output if output is not None else Path(f"{Path(plan).stem}.png")
     try:
-        with Console(stderr=True).status("drawing"):
+        with progress_bar() as tell:
+            tell("drawing", 0, 0)
             rows = draw(FlightOptions(plan), picture)
     except OSError as error:
         raise UserError(one_line(f"{picture}: {error.strerror or error}"), ExitCode.IO) from error
@@ -158,14 +161,14 @@ def _print_lines(console: Console, rows: list[dict[str, Any]]) -> None:
 
 
 def _fly_into_log(console: Console, options: FlightOptions, output: Path, *, with_truth: bool) -> None:
-    from swath.daemon.cli.progress import compiling_noticed
+    from swath.daemon.cli.progress import progress_bar
     from swath.daemon.simulate.folder import FlightFolder
 
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     started_s = time.monotonic()
     try:
-        with compiling_noticed(console), FlightFolder(output) as folder:
-            report, names = _make_log(console, options, folder, with_truth=with_truth)
+        with progress_bar() as tell, FlightFolder(output) as folder:
+            report, names = _make_log(tell, options, folder, with_truth=with_truth)
             logs = folder.keep(report.paths)
     except KeyboardInterrupt:
         console.print("interrupted: the incomplete files of this flight were removed")
@@ -181,7 +184,7 @@ def _fly_into_log(console: Console, options: FlightOptions, output: Path, *, wit
 
 
 def _make_log(
-    console: Console, options: FlightOptions, folder: FlightFolder, *, with_truth: bool
+    tell: Tell, options: FlightOptions, folder: FlightFolder, *, with_truth: bool
 ) -> tuple[SimReport, list[str]]:
     """Make all files of a flight in the hidden folder; return the report and the names of the files beside the log."""
     from swath.daemon.config import load_config
@@ -190,8 +193,8 @@ def _make_log(
 
     plan = options.load()
     folder.refuse_taken([CONFIG_NAME])  # before anything that takes long
-    with console.status("preparing the flight"):
-        flight, files = make_flight(options, folder.work / TRUTH_NAME if with_truth else None)
+    tell("preparing the flight", 0, 0)
+    flight, files = make_flight(options, folder.work / TRUTH_NAME if with_truth else None)
     files[CONFIG_NAME] = configuration(plan, None, ".")
     names = sorted([*files, *([TRUTH_NAME] if with_truth else [])])
     folder.refuse_taken(names)
@@ -199,26 +202,17 @@ def _make_log(
     config = load_config(folder.work / CONFIG_NAME)
     flight_seed = plan.tables.flight.seed
     folder.refuse_session(sim_session_info(config.session.name, flight.host_clock, flight_seed).session_id)
-    with _progress(console) as bar:
-        task = bar.add_task(config.session.name, total=flight.duration_s, detail="")
-        begun_s = time.monotonic()
-
-        def tell(flown_s: float, units: int, returns: int, size: int) -> None:
-            mb_per_s = size / 1e6 / max(time.monotonic() - begun_s, 1e-3)
-            detail = f"{flown_s:.0f} of {flight.duration_s:.0f} s flown, {units:,} units, {returns:,} returns"
-            bar.update(task, completed=flown_s, detail=f"{detail}, {mb_per_s:.1f} MB/s")
-
-        report = fly_into_log(config, folder.work, flight, flight_seed, tell)
-    with console.status("packing the truth"):
-        flight.finish_truth()
+    flown = f"flying {config.session.name}"
+    report = fly_into_log(
+        config,
+        folder.work,
+        flight,
+        flight_seed,
+        lambda flown_s, *_: tell(flown, round(flown_s), round(flight.duration_s), SECONDS),
+    )
+    tell("packing the truth", 0, 0)
+    flight.finish_truth()
     return report, names
-
-
-def _progress(console: Console) -> Progress:
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TextColumn("{task.fields[detail]}"))
-    return Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
 
 
 def _print_flown(report: SimReport, took_s: float, logs: list[Path], names: list[str]) -> None:
@@ -243,6 +237,7 @@ def _fly_on_wires(
     *,
     set_clock: bool,
 ) -> None:
+    from swath.daemon.cli.progress import progress_bar
     from swath.daemon.config import load_config
     from swath.daemon.replay.units import close_outputs
     from swath.daemon.simulate.ahead import Ahead
@@ -255,7 +250,8 @@ def _fly_on_wires(
     stop: list[int] = []
     before = {signum: signal.getsignal(signum) for signum in (signal.SIGINT, signal.SIGTERM)}
     try:
-        with console.status("preparing the flight"):
+        with progress_bar(compiling=False) as tell:
+            tell("preparing the flight", 0, 0)
             facts = ahead.facts
         check_steps(facts, set_clock=set_clock)
         if config_path is None or config is None:
@@ -266,7 +262,7 @@ def _fly_on_wires(
             signal.signal(signum, lambda number, frame: stop.append(number))
         try:
             _await_readers(console, outputs, wait_s, lambda: bool(stop))
-            report = _play(console, plan.tables.flight.name, ahead, outputs, others, lambda: bool(stop))
+            report = _play(plan.tables.flight.name, ahead, outputs, others, lambda: bool(stop))
         finally:
             close_outputs(outputs)
             close_outputs(others)
@@ -314,25 +310,22 @@ def _await_readers(console: Console, outputs: Mapping[str, Output], wait_s: floa
 
 
 def _play(
-    console: Console,
     name: str,
     ahead: Ahead,
     outputs: Mapping[str, Output],
     others: Mapping[str, Output],
     stopped: Callable[[], bool],
 ) -> PlayReport:
+    from swath.daemon.cli.progress import progress_bar
     from swath.daemon.simulate.on_wires import fly_on_wires
 
-    with _progress(console) as bar:
-        duration_s = ahead.facts.duration_s
-        task = bar.add_task(name, total=duration_s, detail="")
+    duration_s = ahead.facts.duration_s
+    with progress_bar(compiling=False) as tell:  # the other process has compiled
 
-        def tell(flown_s: float, report: PlayReport) -> None:
-            detail = f"{flown_s:.0f} of {duration_s:.0f} s flown, {report.units.total():,} units"
-            detail += f", {report.bytes.total() / 1e6:.1f} MB, delay up to {1e3 * report.latest_s:.0f} ms"
-            bar.update(task, completed=flown_s, detail=detail)
+        def flown(flown_s: float, report: PlayReport) -> None:
+            tell(f"flying {name}", round(flown_s), round(duration_s), SECONDS)
 
-        return fly_on_wires(ahead.units(), ahead.facts, outputs, others, progress=tell, stopped=stopped)
+        return fly_on_wires(ahead.units(), ahead.facts, outputs, others, progress=flown, stopped=stopped)
 
 
 def _tell_report(

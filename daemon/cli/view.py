@@ -71,6 +71,7 @@ def _make(
     """Read, draw, write and report; return True if a file could be read only in part."""
     from rich.console import Console
 
+    from swath.daemon.cli.progress import progress_bar
     from swath.daemon.processing.quicklook.page import make_page
     from swath.daemon.processing.quicklook.read import QuickLookError
     from swath.daemon.processing.quicklook.run import look_at, numbers_of
@@ -81,16 +82,15 @@ def _make(
     first = paths[0]
     folder = output or (first if first.is_dir() else first.parent) / "view"
     title = (first.resolve() if len(paths) == 1 else first.resolve().parent).name
-    with console.status("reading") as status:
+    with progress_bar() as tell:
         try:
-            look = look_at(
-                paths, cell, ends, lambda done, of: status.update(f"reading {100 * done / max(of, 1):.0f} %")
-            )
+            look = look_at(paths, cell, ends, tell)
         except QuickLookError as error:
             raise UserError(one_line(str(error)), ExitCode.IO) from error
-        status.update("drawing")
         try:
-            page = make_page(look, folder, title, warnings)
+            page = make_page(look, folder, title, warnings, tell)
+            if gis:
+                tell("GIS layers", 0, 0)
             made = _gis(look, folder, paths, warnings) if gis else []
         except OSError as error:
             text = f"{folder}: cannot write there ({error.strerror or error}); choose another folder with --output"

@@ -22,9 +22,12 @@ def command(
     the program or the computer changes.
     """
     require_installed("swath warm-up")
+    from swath.daemon.cli.progress import progress_bar
     from swath.daemon.config import load_config
     from swath.daemon.processing.setup.setup import Options, Setup
     from swath.daemon.processing.warm_up import warm_up
 
     setups = [] if config is None else [Setup.of_config(load_config(config), Options(uncertainty=False))]
-    print(warm_up(setups, calibration=True).text(), flush=True)
+    with progress_bar(compiling=False) as tell:
+        done = warm_up(setups, calibration=True, tell=tell)
+    print(done.text(), flush=True)

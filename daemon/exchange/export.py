@@ -12,7 +12,6 @@ import os
 import re
 import shutil
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -50,13 +49,12 @@ class ExportReport:
     notes: list[str] = field(default_factory=list)
 
 
-def export_session(session: Session, directory: Path, progress: Callable[[int], None] = lambda _: None) -> ExportReport:
+def export_session(session: Session, directory: Path) -> ExportReport:
     """Write a session into ``directory/<session_id>``; the folder appears when it is complete.
 
     Args:
         session: as `open_logs` gives it; read once, a chunk at a time.
         directory: created if necessary.
-        progress: called with the number of bytes of every batch.
 
     Raises:
         LogError: the log's name cannot be the name of a folder.
@@ -73,7 +71,7 @@ def export_session(session: Session, directory: Path, progress: Callable[[int], 
     directory.mkdir(parents=True, exist_ok=True)
     unfinished.mkdir()
     try:
-        report = _Export(session, unfinished).run(progress)
+        report = _Export(session, unfinished).run()
         sync_tree(unfinished)
         unfinished.rename(target)
     except BaseException:
@@ -94,7 +92,7 @@ class _Export:
         self._files: dict[str, NativeFile] = {}
         self._of_source: dict[tuple[str, str], NativeFile] = {}
 
-    def run(self, progress: Callable[[int], None]) -> ExportReport:
+    def run(self) -> ExportReport:
         """Write all files and return the report."""
         self._write_configuration()
         strange: Counter[str] = Counter()
@@ -107,7 +105,6 @@ class _Export:
                     self._report.units[source] += len(batch.units)
                 elif source is not None:
                     strange[f"{batch.channel.topic} ({batch.channel.message_encoding})"] += len(batch.units)
-                progress(batch.rows.size)
         finally:
             for file in self._files.values():
                 file.close()

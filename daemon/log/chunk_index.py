@@ -175,7 +175,7 @@ class Listening(Session):
     __slots__ = ("statuses",)
 
     def __init__(self, session: Session) -> None:
-        super().__init__(session.info, session.parts, session.damage)
+        super().__init__(session.info, session.parts, session.damage, progress=session.progress)
         self.statuses: dict[str, dict[str, Any]] = {}
 
     def batches(self, topics: TopicFilter | None = None, *, skim: bool = False) -> Iterator[LogBatch]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import heapq
 import struct
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import islice, pairwise
@@ -69,12 +69,14 @@ class Session:
     Attributes:
         damage: the stretches that could not be read.
         growing: the part that was being written during reading; its missing end is not damage.
+        progress: called during reading with the bytes of the parts that are read or skipped, and with all of them.
     """
 
     info: SessionInfo
     parts: list[Part]
     damage: list[PartDamage] = field(default_factory=list)
     growing: Path | None = None
+    progress: Callable[[int, int], None] = field(default=lambda done, total: None, repr=False, compare=False)
     _noted: set[PartDamage] = field(default_factory=set, repr=False)
 
     @property
@@ -162,9 +164,13 @@ class Session:
 
     def _records(self, part: Part, *, chunks: bool = True, wanted: ChannelFilter | None = None) -> Iterator[Record]:
         growing = is_being_written(part.path)
+        sizes = [one.path.stat().st_size for one in self.parts]
+        before, total = sum(sizes[: self.parts.index(part)]), sum(sizes)
         with part.path.open("rb") as file:
             size = part.path.stat().st_size
             for found in scan(file, size, chunks=chunks, wanted=wanted):
+                if chunks:
+                    self.progress(before + found.offset, total)
                 if isinstance(found, Record):
                     yield found
                 elif growing and found.offset + found.length == size:

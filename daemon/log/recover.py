@@ -10,7 +10,7 @@ import contextlib
 import os
 import shutil
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
@@ -98,23 +98,32 @@ class RecoveryReport:
         }
 
 
-def examine(path: Path) -> RecoveryReport:
+def examine(path: Path, progress: Callable[[int, int], None] = lambda done, total: None) -> RecoveryReport:
     """Read a log through and check every CRC; write nothing.
+
+    ``progress`` is called with the bytes read and with all bytes.
 
     Raises:
         LogError: it is not a log.
     """
     read_part_head(path)
-    return _pass(path, None)
+    return _pass(path, None, progress)
 
 
-def recover(path: Path, destination: Path | None = None, *, keep_free_bytes: int = 0) -> RecoveryReport:
+def recover(
+    path: Path,
+    destination: Path | None = None,
+    *,
+    keep_free_bytes: int = 0,
+    tell: Callable[[str, int, int, str], None] = lambda *_: None,
+) -> RecoveryReport:
     """Repair a log into ``<stem>.recovered.mcap`` beside it, or in the folder ``destination``.
 
     Args:
         path: the log; it is only read.
         destination: folder of the copy.
         keep_free_bytes: the recovery is refused if less space would stay free.
+        tell: called with the progress, as `swath.georef.progress.Tell`.
 
     Raises:
         LogError: it is not a log, another process is recording or recovering it, the copy exists already, or there is
@@ -125,7 +134,7 @@ def recover(path: Path, destination: Path | None = None, *, keep_free_bytes: int
     target = folder / (path.name.removesuffix(".mcap") + RECOVERED)
     if is_being_written(path):
         raise LogError(f"{path}: is being recorded; recover it after the recording has ended")
-    report = examine(path)
+    report = examine(path, lambda done, total: tell(f"checking {path.name}", done, total, "B"))
     if report.whole:
         return report
     _refuse_existing(target, path)
@@ -138,7 +147,8 @@ def recover(path: Path, destination: Path | None = None, *, keep_free_bytes: int
         _refuse_existing(target, path)  # another process may have made it meanwhile
         _give_to_owner_of(path, fd)
         head = read_part_head(path)
-        report = _pass(path, PartWriter(temporary, head.info, head.number, fd=os.dup(fd)))
+        writer = PartWriter(temporary, head.info, head.number, fd=os.dup(fd))
+        report = _pass(path, writer, lambda done, total: tell(f"repairing {path.name}", done, total, "B"))
         temporary.rename(target)
         sync_directory(folder)
     report.recovered = target
@@ -208,7 +218,9 @@ def _give_to_owner_of(path: Path, fd: int) -> None:
         os.fchmod(fd, original.st_mode & 0o777)
 
 
-def _pass(path: Path, writer: PartWriter | None) -> RecoveryReport:
+def _pass(
+    path: Path, writer: PartWriter | None, progress: Callable[[int, int], None] = lambda done, total: None
+) -> RecoveryReport:
     """Read the whole log; if a writer is given, write all good data to the copy and close it."""
     report = RecoveryReport(path)
     channels: dict[int, ChannelSpec] = {}
@@ -218,6 +230,7 @@ def _pass(path: Path, writer: PartWriter | None) -> RecoveryReport:
         with path.open("rb") as file:
             size = path.stat().st_size
             for found in scan(file, size):
+                progress(found.offset, size)
                 if isinstance(found, Damage):
                     report.add_damage(found)
                     end = None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -149,15 +148,12 @@ class EventNumbers:
             self.last.append(event)
 
 
-def session_statistics(
-    session: Session, *, decode: bool = True, progress: Callable[[int], None] | None = None
-) -> dict[str, Any]:
+def session_statistics(session: Session, *, decode: bool = True) -> dict[str, Any]:
     """Compute all numbers of a session, in one pass over its parts.
 
     Args:
         session: as `open_logs` gives it.
         decode: run the sources' parsers, for their messages, checksum errors and the devices' own sequence gaps.
-        progress: called with the number of bytes of every batch.
     """
     attachments = session.attachments()
     parsers, troubles = stored_parsers(attachments) if decode else ({}, [])
@@ -170,8 +166,6 @@ def session_statistics(
         first_ns = start if first_ns is None else min(first_ns, start)
         last_ns = max(last_ns, end)
         _take(batch, sources, events, parsers)
-        if progress is not None:
-            progress(batch.rows.size)
     for numbers in sources.values():
         if numbers.parser is not None:
             numbers.records.update(type(record).__name__ for record in numbers.parser.close())

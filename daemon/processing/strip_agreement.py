@@ -29,6 +29,7 @@ from swath.daemon.processing.quicklook.strips import (
 )
 from swath.georef.arrays import FloatArray, SingleArray
 from swath.georef.mapping.frame import Mapping
+from swath.georef.progress import Tell, silent
 
 BLOCK_POINTS = 500_000
 BORDER_M = 5.0  # around a flight's points in t, so that the map's corners hold them all
@@ -199,6 +200,7 @@ def compare_flight(
     corners: tuple[FloatArray, FloatArray] | None = None,
     like: StripCells | None = None,
     also: Callable[[Block], None] = lambda block: None,
+    tell: Tell = silent,
 ) -> FlightStrips:
     """Compare a flight's strips where its points are placed.
 
@@ -209,6 +211,7 @@ def compare_flight(
         corners: south-western and north-eastern corner (3,) of the cells; None: `corners_of`.
         like: cells to use again, whatever the other arguments are; None: new cells.
         also: called with every block of points.
+        tell: called with the progress.
     """
     if like is None:
         low_m, high_m = corners_of(flight, mapping) if corners is None else corners
@@ -216,9 +219,12 @@ def compare_flight(
         cells = StripCells(strip_frame(low_m, high_m, cell_m), reference_m, fixed=cell_m is not None)
     else:
         cells = StripCells(like.frame, like.reference_m, fixed=True)
+    done, total = 0, sum(map(len, flight.swaths))
     for block in _blocks(flight, mapping):
+        tell("height differences", done, total, "returns")
         cells.add(block)
         also(block)
+        done += len(block)
     overlap = compare(cells)
     return FlightStrips(tuple(swath.name for swath in flight.swaths), cells, overlap, Agreement.of(cells, overlap))
 
@@ -262,13 +268,16 @@ def _blocks(flight: Flight, mapping: Mapping | None) -> Iterator[Block]:
 
 
 def before_and_after(
-    before: Flight, after: Flight, mapping: Mapping | None = None
+    before: Flight, after: Flight, mapping: Mapping | None = None, tell: Tell = silent
 ) -> tuple[FlightStrips, FlightStrips]:
-    """Compare a flight's strips before and after a change, in the same cells: those chosen for the latter."""
+    """Compare a flight's strips before and after a change, in the same cells: those chosen for the latter.
+
+    ``tell`` is called with the progress.
+    """
     corners = [corners_of(flight, mapping) for flight in (before, after)]
     both = np.min([low for low, _ in corners], axis=0), np.max([high for _, high in corners], axis=0)
-    now = compare_flight(after, mapping, corners=both)
-    return compare_flight(before, mapping, like=now.cells), now
+    now = compare_flight(after, mapping, corners=both, tell=tell)
+    return compare_flight(before, mapping, like=now.cells, tell=tell), now
 
 
 def difference_map(before: FlightStrips, after: FlightStrips, most: int, *, in_t: bool = False) -> DifferenceMap | None:

@@ -55,6 +55,7 @@ from swath.georef.navigation.filter.smoother import forward, smooth
 from swath.georef.navigation.inputs import GRADES, OBSERVATION_DTYPE, Inertial, Kind, Start, sort_observations
 from swath.georef.navigation.inputs import Setup as NavigationSetup
 from swath.georef.points import Points
+from swath.georef.progress import Tell, silent
 from swath.georef.records import (
     DEVICE_CLOCK_DTYPE,
     INS_DTYPE,
@@ -152,17 +153,26 @@ def cache_folder() -> Path | None:
     return None if path is None else Path(path)
 
 
-def warm_up(setups: Iterable[Setup] = (), *, calibration: bool = False) -> WarmUp:
-    """Run every loop once: for all kinds of configurations and for those given; for calibration if asked."""
+def warm_up(setups: Iterable[Setup] = (), *, calibration: bool = False, tell: Tell = silent) -> WarmUp:
+    """Run every loop once: for all kinds of configurations and for those given; for calibration if asked.
+
+    ``tell`` is called with the progress.
+    """
     began_s = time.monotonic()
     with compilations() as names:
+        tell("decoding", 0, 0)
         _warm_parsers()
+        tell("navigation", 0, 0)
         warm_navigation()
-        for plan, uncertainty in product(PLANS, (False, True)):
+        plans = list(product(PLANS, (False, True)))
+        for number, (plan, uncertainty) in enumerate(plans):
+            tell("points", number, len(plans), "models")
             warm_setup(_setup(plan, uncertainty))
         for setup in setups:
+            tell("the configuration's points", 0, 0)
             warm_setup(setup)
         if calibration:
+            tell("calibration", 0, 0)
             warm_calibration()
     return WarmUp(len(names), time.monotonic() - began_s, cache_folder())
 

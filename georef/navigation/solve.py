@@ -26,6 +26,7 @@ from swath.georef.navigation.filter.strapdown import ATTITUDE, TIME_OFFSET
 from swath.georef.navigation.heading_noise import find_heading_noise
 from swath.georef.navigation.inputs import Inertial, Setup, Solution, Start
 from swath.georef.navigation.noise import OF_GNSS, NoiseFound, Run, find_noise, not_blunders, rescaled
+from swath.georef.progress import Tell, silent
 from swath.georef.timescales import SECOND_NS
 
 MOST_PASSES = 3
@@ -87,6 +88,7 @@ def solve(
     *,
     noise_from_flight: bool = True,
     storage: Storage = IN_MEMORY,
+    tell: Tell = silent,
 ) -> Solved:
     """Filter and smooth a whole flight.
 
@@ -96,24 +98,44 @@ def solve(
         noise_from_flight: whether to estimate and use GNSS's noise: factors on the sigmas of positions and velocities
             by fix type and of headings, and the lasting share of their errors; see `noise`, `heading_noise`.
         storage: where the runs and the solutions are kept.
+        tell: called with the progress; the number of runs follows from the flight.
     """
-    run = run_filter(inertial, observations, setup, start, storage=storage)
+    runs = 0
+
+    def filtered(rows: StructArray) -> FilterRun:
+        nonlocal runs
+        runs += 1
+        what, total = f"filter, run {runs}", len(inertial)
+        tell(what, 0, total, "samples")
+        return run_filter(
+            inertial,
+            rows,
+            setup,
+            start,
+            storage=storage,
+            passed=lambda samples: tell(what, samples, total, "samples"),
+        )
+
+    run = filtered(observations)
     found = None
     if noise_from_flight:
+        tell("noise of GNSS", 0, 0)
         found = _noise(inertial, observations, setup, start, run)
         for _ in range(1 + MOST_RESCALED):
             if setup is found.setup:
                 break
             setup = found.setup
-            run = run_filter(inertial, observations, setup, start, storage=storage)
+            run = filtered(observations)
             found = replace(found, setup=rescaled(setup, run.innovations[not_blunders(run.innovations)])[0])
         found = replace(found, setup=setup)
+    tell("smoother", 0, 0)
     flown, nodes = forward(run), smooth_nodes(run)
     changes, offset_s, asked = [_change(nodes)], 0.0, start
     while (_bent(nodes) or abs(nodes.state[0, TIME_OFFSET]) > OFFSET_LEFT_S) and len(changes) < MOST_PASSES:
         offset_s += float(nodes.state[0, TIME_OFFSET])
         start = replace(start, attitude_rad=_attitude(nodes))
-        run = run_filter(inertial, _shifted(observations, offset_s), setup, start, storage=storage)
+        run = filtered(_shifted(observations, offset_s))
+        tell("smoother", 0, 0)
         nodes = smooth_nodes(run, _mean(run, asked, offset_s))
         changes.append(_change(nodes))
     whole_s = offset_s + float(nodes.state[0, TIME_OFFSET])

@@ -146,7 +146,7 @@ def village(
     kept = folder / "kept"
     kept.mkdir()
     options = GeorefOptions([flown.log], kept, TrajectoryOptions(file), Options(datum="same", uncertainty=False))
-    read = read_flight(options, kept, lambda what, done, total: None)
+    read = read_flight(options, kept, lambda *_: None)
     truth = read_calibration((folder / "left.true.toml").read_text(), "left.true.toml")
     flight = replace(read.flight, trajectories=(trajectory,))
     return Made(flight, truth, trajectory, flown, text)

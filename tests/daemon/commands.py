@@ -9,6 +9,7 @@ import atexit
 import functools
 import importlib
 import json
+import math
 import os
 import select
 import signal
@@ -17,6 +18,7 @@ import sys
 import tempfile
 from pathlib import Path
 
+from swath.daemon.cli import progress
 from swath.daemon.cli.main import COMMANDS, main
 from swath.drivers.driver import KINDS, all_drivers
 from tests.daemon.rig import HANGS_S
@@ -106,7 +108,8 @@ def serve() -> None:
 
 
 def become(arguments: list[str], environment: dict[str, str], says_to: list[str]) -> None:
-    """Adopt the arguments, environment and outputs of a separately started process."""
+    """Adopt the arguments, environment and outputs of a separately started process; no line of progress is due."""
+    progress.AFTER_S = math.inf
     sys.argv[1:] = arguments
     os.environ.clear()
     os.environ.update(environment)

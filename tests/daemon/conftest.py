@@ -2,9 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import pytest
+
+from swath.daemon.cli import progress
+
+
+@pytest.fixture(autouse=True)
+def quick_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let no command write lines of progress because this computer is slow; the tests of progress set their own."""
+    monkeypatch.setattr(progress, "AFTER_S", math.inf)
 
 
 @pytest.fixture

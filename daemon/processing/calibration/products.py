@@ -7,7 +7,7 @@ import hashlib
 import io
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -44,10 +44,10 @@ from swath.daemon.processing.strip_agreement import FlightStrips, before_and_aft
 from swath.daemon.processing.user_errors import finite
 from swath.georef.arrays import FloatArray
 from swath.georef.mapping.chart import chart_of
+from swath.georef.progress import Tell
 from swath.georef.scanner.calibration import INDEX, PARAMETERS
 from swath.georef.verdicts import Level, Verdict
 
-Steps = Callable[[str, int, int], None]  # arguments: the step, how much is done, of how much
 MAP_CELLS = 400  # maximum cells across a map of differences
 BEYOND = 3.0  # sigmas, of strips and calibration together, above which strips contradict the calibration
 
@@ -61,17 +61,16 @@ class Told:
     warnings: list[str] = field(default_factory=list)
 
 
-def write_products(request: CalibrationOptions, done: Calibrated, tell: Steps) -> Told:
+def write_products(request: CalibrationOptions, done: Calibrated, tell: Tell) -> Told:
     """Write all outputs; files from an earlier run are replaced last.
 
     Raises:
         UserError: a file cannot be written.
     """
-    tell("strips before and after", 0, 1)
-    before, after = before_and_after(done.kept.flight, done.flight, done.kept.logged[0].setup.mapping)
+    before, after = before_and_after(done.kept.flight, done.flight, done.kept.logged[0].setup.mapping, tell)
     inputs = _inputs(request, done)
     headers = {name: _header(done, name, inputs) for name in done.adjusted.calibrations}
-    tell("checks", 0, 1)
+    tell("checks", 0, 0)
     carried = trajectory_verdicts_of(done.kept.logged)
     findings = (
         *trajectory_says(carried),
@@ -99,7 +98,7 @@ def write_products(request: CalibrationOptions, done: Calibrated, tell: Steps) -
     }
     warnings: list[str] = []
     if request.report is not None:
-        tell("report", 0, 1)
+        tell("report", 0, 0)
         head = head_of_flights(done.kept.logged, headers_words(headers, verdict.level.words))
         files |= pages(request.report, _with_profiles(report, done), warnings, head)
         files |= _records(request.report, done, report, request.facts)

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
+from threading import Lock
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
@@ -23,12 +24,13 @@ from swath.daemon.errors import UserError
 from swath.daemon.processing.flights.read import Flight as LoggedFlight
 from swath.daemon.processing.flights.read import GeorefOptions, note_times, read_flights
 from swath.daemon.processing.points.feed import LogFeed
-from swath.daemon.processing.points.jobs import MARGIN_NS, Job, JobPlan, JobResult, Tell, feed_job
+from swath.daemon.processing.points.jobs import MARGIN_NS, Job, JobPlan, JobResult, feed_job
 from swath.daemon.processing.points.workers import run_jobs
 from swath.daemon.processing.setup.models import motion_of
 from swath.georef.arrays import ByteArray, FloatArray, Int64Array, StructArray
 from swath.georef.georeference import Georeferencer
 from swath.georef.points import Fate, Points
+from swath.georef.progress import BYTES, Tell, silent
 from swath.georef.records import RETURN_DTYPE
 from swath.georef.scanner.calibration import Calibration
 from swath.georef.scanner.uncertainty import Noise
@@ -42,7 +44,6 @@ if TYPE_CHECKING:
 KNOT_S = 0.2  # time between knots of the trajectory's errors
 TRAJECTORY_MARGIN_NS = 2_000_000_000
 PLACED_ROWS = 1 << 18
-Steps = Callable[[str, int, int], None]  # arguments: the step, how much is done, of how much
 
 COLUMNS: dict[str, tuple[np.dtype[np.generic], tuple[int, ...]]] = {  # one file each
     "rows": (RETURN_DTYPE, ()),
@@ -105,7 +106,7 @@ def smoothed_prior(kept: KeptFlight) -> TrajectoryPrior | None:
 
 
 def read_flight(
-    request: GeorefOptions, folder: Path, tell: Steps, check: Callable[[list[str]], None] = lambda scanners: None
+    request: GeorefOptions, folder: Path, tell: Tell, check: Callable[[list[str]], None] = lambda scanners: None
 ) -> KeptFlight:
     """Read logs into a flight with all returns of its strips.
 
@@ -128,7 +129,7 @@ def read_flight(
         jobs,
         workers=request.workers,
         scheduler=None,
-        progress=lambda done: tell("returns", done, total),
+        progress=lambda done: tell("returns", done, total, BYTES),
         do=keep_job,
     )
     note_times(logged, results)
@@ -227,7 +228,12 @@ def _mapped(path: Path, dtype: np.dtype[np.generic], shape: tuple[int, ...]) -> 
 
 
 def replaced(
-    flight: Flight, calibrations: Mapping[str, Calibration], folder: Path, name: str, workers: int | None = None
+    flight: Flight,
+    calibrations: Mapping[str, Calibration],
+    folder: Path,
+    name: str,
+    workers: int | None = None,
+    tell: Tell = silent,
 ) -> Flight:
     """Return `Flight.placed` with the points in newly written, mapped files of this name.
 
@@ -235,7 +241,11 @@ def replaced(
     interpreter's lock.
     """
 
+    done, total, counting = 0, sum(map(len, flight.swaths)), Lock()
+    tell("placing returns", 0, total, "returns")
+
     def placed(number: int) -> Swath:
+        nonlocal done
         swath = flight.swaths[number]
         calibration = calibrations[flight.heads[swath.head].name]
         path = folder / f"{number:03d}.{name}.points_t"
@@ -244,6 +254,9 @@ def replaced(
             for start in range(0, len(swath), PLACED_ROWS):
                 points_t = flight.place(swath, calibration, slice(start, start + PLACED_ROWS))
                 file.write(np.ascontiguousarray(points_t).data)
+                with counting:
+                    done += len(points_t)
+                    tell("placing returns", done, total, "returns")
         return replace(swath, points_t=_mapped(path, *COLUMNS["points_t"]))
 
     with ThreadPoolExecutor(workers or os.cpu_count() or 1) as pool:
@@ -295,7 +308,7 @@ class _Keeper(Georeferencer):
         return rows
 
 
-def keep_job(plan: KeepPlan, job: Job, tell: Tell) -> JobResult:
+def keep_job(plan: KeepPlan, job: Job, tell: Callable[[int], None]) -> JobResult:
     """Keep a strip's returns in files of the job's folder.
 
     Raises:

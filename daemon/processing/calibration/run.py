@@ -12,7 +12,7 @@ All files are written aside and renamed at the end, so that any calibration file
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -56,11 +56,11 @@ from swath.daemon.processing.flights.read import GeorefOptions, trajectory_verdi
 from swath.daemon.processing.user_errors import as_user_error
 from swath.daemon.text_files import text_of
 from swath.georef.mapping.frame import MappingError
+from swath.georef.progress import Tell
 from swath.georef.scanner.calibration import Calibration
 from swath.georef.strips import StripError
 from swath.georef.trajectory.trajectory import TrajectoryError
 
-Steps = Callable[[str, int, int], None]  # arguments: the step, how much is done, of how much
 COARSE_RAD = math.radians(0.05)  # how well an angle can be found at best from heights of overlapping strips
 COARSE_SIGMAS = 3.0
 OUTCOME = "calibration.json"  # name of the outcome's file in a report's folder
@@ -145,7 +145,7 @@ class Calibrated:
     findings: tuple[Finding, ...] = ()
 
 
-def calibrate(request: CalibrationOptions, folder: Path, tell: Steps) -> Calibrated:
+def calibrate(request: CalibrationOptions, folder: Path, tell: Tell) -> Calibrated:
     """Calibrate a flight's scanners.
 
     Args:
@@ -160,7 +160,7 @@ def calibrate(request: CalibrationOptions, folder: Path, tell: Steps) -> Calibra
         return _calibrate(request, folder, tell)
 
 
-def _calibrate(request: CalibrationOptions, folder: Path, tell: Steps) -> Calibrated:
+def _calibrate(request: CalibrationOptions, folder: Path, tell: Tell) -> Calibrated:
     _refuse_existing(request, [] if request.report is None else [request.report / OUTCOME])
     kept = read_flight(request.logs, folder, tell, lambda scanners: check_scanners(scanners, request.model))
     _refuse_existing(request, paths_of(request, (head.name for head in kept.flight.heads)).values())
@@ -169,16 +169,15 @@ def _calibrate(request: CalibrationOptions, folder: Path, tell: Steps) -> Calibr
         return _calibrated(request, kept, folder, tell)
 
 
-def _calibrated(request: CalibrationOptions, kept: KeptFlight, folder: Path, tell: Steps) -> Calibrated:
+def _calibrated(request: CalibrationOptions, kept: KeptFlight, folder: Path, tell: Tell) -> Calibrated:
     _refuse_one_strip(kept)
     points = _control(request, kept.flight)
     workers = request.logs.workers
-    tell("pre-alignment", 0, 1)
+    tell("pre-alignment", 0, 0)
     first, away = _aligned(kept.flight, request.model.fix)
     doubted = {name: abs(apart) for name, apart in away.items()}
-    flight = replaced(kept.flight, first, folder, "aligned", workers)
+    flight = replaced(kept.flight, first, folder, "aligned", workers, tell)
     notes = _doubts(flight, points)
-    tell("planes", 0, 1)
     rings = None if request.polygons is None else rings_of(request.polygons, kept)
     picked = Features() if request.ties is None else ties_of(request.ties, kept)
 
@@ -186,11 +185,11 @@ def _calibrated(request: CalibrationOptions, kept: KeptFlight, folder: Path, tel
         if rings is not None:
             return given_planes(flight, rings, settings)
         with ThreadPoolExecutor(workers) as pool:
-            return find_planes(flight, settings, pool.map)
+            return find_planes(flight, settings, pool.map, tell)
 
     def match() -> Features:
         with ThreadPoolExecutor(workers) as pool:
-            return rematch(flight, planes, PLANES, pool.map)
+            return rematch(flight, planes, PLANES, pool.map, tell)
 
     def observed() -> Features:
         return Features.joined(
@@ -204,8 +203,7 @@ def _calibrated(request: CalibrationOptions, kept: KeptFlight, folder: Path, tel
 
     def found_anew(calibrations: Mapping[str, Calibration]) -> Features:
         nonlocal flight, planes, features, searched
-        tell("planes again", 0, 1)
-        flight = replaced(kept.flight, calibrations, folder, "matched", workers)
+        flight = replaced(kept.flight, calibrations, folder, "matched", workers, tell)
         # search once more: roofs at a swath's edges that the pre-alignment left apart overlap now
         again = searched == 1 or rings is not None
         planes, searched = search() if again else match(), searched + 1
@@ -216,21 +214,26 @@ def _calibrated(request: CalibrationOptions, kept: KeptFlight, folder: Path, tel
         nonlocal flight, planes, features
         if not len(prior.walk_rad2) or "ties" in request.observe:
             return None
-        tell("all planes", 0, 1)
-        flight = replaced(kept.flight, calibrations, folder, "entire", workers)
+        flight = replaced(kept.flight, calibrations, folder, "entire", workers, tell)
         planes = limited(search(EVERY), ROWS_MOST)
         features = observed()
         return features
 
-    tell("adjustment", 0, 1)
     adjusted = adjust(
-        flight, features, request.model, prior, rematch=found_anew, first=first, doubted=doubted, entire=everything
+        flight,
+        features,
+        request.model,
+        prior,
+        rematch=found_anew,
+        first=first,
+        doubted=doubted,
+        entire=everything,
+        tell=tell,
     )
     _refuse_far(request, kept.flight, adjusted)
     refuse_lost_control(request.control, features)
-    flight = replaced(kept.flight, adjusted.calibrations, folder, "calibrated", workers)
-    tell("profiles", 0, 1)
-    checked = check(flight, adjusted, prior, points)
+    flight = replaced(kept.flight, adjusted.calibrations, folder, "calibrated", workers, tell)
+    checked = check(flight, adjusted, prior, points, tell=tell)
     all_notes = (*kept.notes, *notes, *adjusted.notes)
     findings = prealigned_otherwise(away, adjusted)
     return Calibrated(kept, flight, features, prior, first, adjusted, points, checked, all_notes, findings)

@@ -30,6 +30,7 @@ from swath.daemon.processing.points.time_checks import refuse_no_time, time_trou
 from swath.daemon.processing.points.workers import refuse_in_import
 from swath.daemon.processing.setup.setup import Options, Setup
 from swath.daemon.text_files import text_of
+from swath.georef.progress import BYTES
 from swath.georef.strips import Span, StripRules, cut, laser_spans, read_strips, straight_spans
 from swath.georef.trajectory.trajectory import Trajectory, gps_text
 
@@ -39,10 +40,9 @@ if TYPE_CHECKING:
     from swath.daemon.config.config import Config
     from swath.daemon.processing.navigation.navigate import Navigated
     from swath.daemon.processing.points.jobs import JobResult
-    from swath.georef.timescales import ClockStatus
-
-    Tell = Callable[[str, int, int], None]  # arguments: the step, how much is done, of how much
     from swath.daemon.processing.setup.setup import Options
+    from swath.georef.progress import Tell
+    from swath.georef.timescales import ClockStatus
 
 
 UNSAID = "an unspecified datum"
@@ -204,14 +204,13 @@ def read_flights(
     check(list(dict.fromkeys(name for setup in setups for name in setup.scanners)))
     refuse_different_settings(configs, request.options.crs, request.options.datum, request.options.epoch)
     flights: list[Flight] = []
-    for number, (session, setup) in enumerate(zip(sessions, setups, strict=True)):
-        tell("clocks and trajectory", number, len(sessions))
-        flights.append(_read(session, setup, positions=request.trajectory.file is not None))
+    for session, setup in zip(sessions, setups, strict=True):
+        flights.append(_read(session, setup, tell, positions=request.trajectory.file is not None))
     flights[0].holes += [f"skipped: {line}" for line in passed_over]
     refuse_overlap({flight.log: flight.span for flight in flights})
     flights.sort(key=lambda flight: flight.span)  # sessions come in host time, which may be wrong
     for flight in flights:
-        _choose(request, flight)
+        _choose(request, flight, tell)
     _number_strips(request, flights)
     return flights
 
@@ -232,8 +231,9 @@ def _setup(request: GeorefOptions, session: Session) -> Setup:
     return setup
 
 
-def _read(session: Session, setup: Setup, *, positions: bool) -> Flight:
+def _read(session: Session, setup: Setup, tell: Tell, *, positions: bool) -> Flight:
     log = session.parts[0].path
+    session.progress = lambda done, total: tell("clocks", done, total, BYTES)
     listening = Listening(session)
     clocks = read_clocks(listening, setup, positions=positions)
     session.growing = listening.growing
@@ -257,12 +257,12 @@ def _read(session: Session, setup: Setup, *, positions: bool) -> Flight:
     return flight
 
 
-def _choose(request: GeorefOptions, flight: Flight) -> None:
+def _choose(request: GeorefOptions, flight: Flight, tell: Tell) -> None:
     """Set the flight's trajectory, and settle the mapping for its area."""
     status = flight.status(flight.host_span[1])
     leap_seconds = status.leap_seconds if status is not None and status.leap_origin != "guess" else None
     chosen = choose_trajectory(
-        request.trajectory, flight.setup, flight.session, flight.clocks, flight.span, leap_seconds
+        request.trajectory, flight.setup, flight.session, flight.clocks, flight.span, leap_seconds, tell
     )
     flight.trajectory, flight.solutions, flight.navigated = chosen.trajectory, chosen.solutions, chosen.navigated
     flight.troubles += [doubt for doubt in chosen.warnings if doubt not in flight.troubles]

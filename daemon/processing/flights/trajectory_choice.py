@@ -15,6 +15,7 @@ from swath.daemon.processing.navigation.inputs import InputOptions
 from swath.daemon.processing.navigation.navigate import NavigationOptions, navigate_session
 from swath.daemon.processing.trajectory.files import smrmsg_beside
 from swath.georef.formats.trajectory.file import read_trajectory
+from swath.georef.progress import Tell, silent
 from swath.georef.stream.path import SHORTEST_TRAJECTORY
 from swath.georef.strips import Span
 from swath.georef.trajectory.buffer import COLUMNS, TrajectoryBuffer
@@ -91,6 +92,7 @@ def choose_trajectory(
     clocks: LogClocks,
     span: tuple[int, int],
     leap_seconds: int | None,
+    tell: Tell = silent,
 ) -> Chosen:
     """Return the trajectory of a session whose returns lie in a span of GPS time.
 
@@ -109,7 +111,7 @@ def choose_trajectory(
         if request.file is None:
             trajectory, solutions = _from_device(setup, clocks)
             if (request.navigate and both) or len(trajectory) < SHORTEST_TRAJECTORY:
-                navigated = _navigated(setup, session, solutions)
+                navigated = _navigated(setup, session, solutions, tell)
                 trajectory = navigated.trajectory()
                 findings = [finding.text for leg in navigated.legs for finding in leg.findings]
                 warnings = [*navigated.warnings, *navigated.holes, *findings]
@@ -170,7 +172,7 @@ def _from_device(setup: Setup, clocks: LogClocks) -> tuple[Trajectory, dict[str,
     return solutions, {what: count for what, count in sorted(buffer.counts.items()) if count}
 
 
-def _navigated(setup: Setup, session: Session, solutions: dict[str, int]) -> Navigated:
+def _navigated(setup: Setup, session: Session, solutions: dict[str, int], tell: Tell) -> Navigated:
     """Return the session navigated and smoothed from IMU and GNSS."""
     log = session.parts[0].path
     if setup.sources.imu_source is None or not setup.config.gnss:
@@ -180,7 +182,7 @@ def _navigated(setup: Setup, session: Session, solutions: dict[str, int]) -> Nav
             f"{log}: {reason}, and {missing} to compute a trajectory; give --trajectory FILE", ExitCode.USAGE
         )
     try:
-        return navigate_session(session, NavigationOptions(InputOptions(config=setup.config)))
+        return navigate_session(session, NavigationOptions(InputOptions(config=setup.config)), tell)
     except UserError as error:
         hint = "; or give --trajectory FILE"
         raise UserError("\n".join(f"{line}{hint}" for line in error.message.splitlines()), error.exit_code) from error

@@ -42,6 +42,7 @@ from swath.daemon.processing.user_errors import as_user_error
 from swath.drivers.driver import find_driver
 from swath.georef.formats.las import LasSettings
 from swath.georef.mapping.frame import MappingError
+from swath.georef.progress import BYTES, Tell
 from swath.georef.strips import Segment, StripError, segments
 from swath.georef.timescales.gps_time import table_leap_seconds, utc_from_gps
 
@@ -49,7 +50,6 @@ DROPPED = ".dropped.csv.gz"
 ENDINGS = (".laz", DROPPED)  # endings of a strip's files
 OFFSET_STEP = 1000.0  # files' offsets are whole kilometres
 TRAJECTORY_MARGIN_NS = 2_000_000_000
-Tell = Callable[[str, int, int], None]  # arguments: the step, how much is done, of how much
 
 
 @dataclass(frozen=True)
@@ -233,7 +233,7 @@ def _make(
                 jobs,
                 workers=request.workers,
                 scheduler=request.scheduler,
-                progress=lambda done: tell("points", done, total),
+                progress=lambda done: tell("points", done, total, BYTES),
             )
             logs = [{"name": path.name, "sha256": found.result()} for path, found in zip(paths, hashes, strict=True)]
         except BaseException:  # an interrupt too: it must not wait for the hashes of large logs
@@ -242,6 +242,7 @@ def _make(
     _note_troubles(flights, results)
     files = {job.segment.strip: _files(job, result) for job, result in zip(jobs, results, strict=True)}
     done = [path for made in files.values() for path in made if path is not None]
+    tell("trajectory and sidecar", 0, 0)
     trajectories = [path for flight in flights for path in _write_trajectory(flight, partial)]
     record = run_record(flights, results, files)
     record["verdict"] = verdict_of(request, flights)

@@ -7,7 +7,7 @@ import mmap
 import os
 import tempfile
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from math import prod
 from pathlib import Path
@@ -39,6 +39,7 @@ from swath.georef.navigation.solve import solve, stretch_of
 from swath.georef.navigation.stillness import with_still_seconds
 from swath.georef.navigation.unit_noise import noise_findings
 from swath.georef.points import Fate
+from swath.georef.progress import BYTES, Tell, silent
 from swath.georef.records import FixType
 from swath.georef.trajectory.buffer import TrajectoryBuffer
 from swath.georef.trajectory.trajectory import DEFAULT_MAX_GAP_NS, Trajectory
@@ -56,7 +57,6 @@ NEAR = 0.3  # of the lever arm: within this distance the point is the antenna
 
 SMALLEST_BYTES = 1 << 20  # smaller arrays are kept in memory
 
-Tell = Callable[[str, int, int], None]  # arguments: the step, how much is done, of how much
 UNTIL_A_FIX_NS = 1_000_000_000  # a shorter wait for a position is due to the receiver's rate
 NAVIGATED = "navigation of the log's IMU and GNSS"
 GIVEN_SIGMA_RAD = tuple(map(math.radians, (1.0, 1.0, 3.0)))  # sigmas of an attitude that the user enters
@@ -154,16 +154,14 @@ class Navigated:
         return np.concatenate([solution.velocity_sigma_l for solution in self.solutions()])
 
 
-def navigate_session(
-    session: Session, request: NavigationOptions, tell: Tell = lambda what, done, total: None
-) -> Navigated:
+def navigate_session(session: Session, request: NavigationOptions, tell: Tell = silent) -> Navigated:
     """Read a session and navigate it.
 
     Raises:
         UserError: the session cannot be navigated; one line per reason.
         LogError, OSError: the log cannot be read.
     """
-    tell("clocks, IMU and GNSS", 0, 1)
+    session.progress = lambda done, total: tell("IMU and GNSS", done, total, BYTES)
     storage = MappedStorage()
     inputs = read_inputs(session, request.inputs, storage)
     storage.rest()
@@ -173,7 +171,7 @@ def navigate_session(
 def navigate_inputs(
     inputs: NavigationInputs,
     request: NavigationOptions,
-    tell: Tell = lambda what, done, total: None,
+    tell: Tell = silent,
     storage: Storage = IN_MEMORY,
 ) -> Navigated:
     """Navigate inputs that were read; runs and solutions are kept in the storage.
@@ -184,9 +182,9 @@ def navigate_inputs(
     legs: list[NavigatedLeg] = []
     holes, missing = list(inputs.holes), list(inputs.missing)
     for number, leg in enumerate(inputs.legs):
-        tell("filter and smoother" if request.smooth else "filter", number, len(inputs.legs))
+        tell("alignment" if len(inputs.legs) == 1 else f"alignment, leg {number + 1} of {len(inputs.legs)}", 0, 0)
         try:
-            legs.append(_navigated(inputs, leg, request, storage))
+            legs.append(_navigated(inputs, leg, request, storage, tell))
             storage.rest()
         except NavigationError as error:
             missing.append(Stretch(*leg.span, str(error)))
@@ -209,16 +207,20 @@ def navigate_inputs(
     return navigated
 
 
-def _navigated(inputs: NavigationInputs, leg: Leg, request: NavigationOptions, storage: Storage) -> NavigatedLeg:
+def _navigated(
+    inputs: NavigationInputs, leg: Leg, request: NavigationOptions, storage: Storage, tell: Tell
+) -> NavigatedLeg:
     rows = leg.observations if request.attitude_rad is None else _with_attitude(leg, request.attitude_rad)
     start = align(leg.inertial, rows, inputs.setup)
     if request.smooth:
         start = earlier_start(leg.inertial, leg.observations, inputs.setup, start)
     setup, rows = inputs.setup, with_still_seconds(leg.inertial, leg.observations)
-    solved = solve(leg.inertial, rows, setup, start, storage=storage)
+    solved = solve(leg.inertial, rows, setup, start, storage=storage, tell=tell)
     setup = solved.report.setup
+    tell("diagnosis", 0, 0)
     findings = diagnose(leg.inertial, leg.observations, setup, solved) + inputs.findings
     if request.compare_noise and not any(finding.severity == "error" for finding in findings):
+        tell("noise of the IMU", 0, 0)
         table, name = inputs.sources.imu.noise, inputs.sources.imu_name
         grades = {grade: noise_of(table.model_copy(update={"grade": grade})) for grade in GRADES}
         run = stretch_of(leg.inertial, rows, start)

@@ -14,7 +14,7 @@ from contextlib import contextmanager, suppress
 from typing import Any
 
 from swath.daemon.errors import ExitCode, UserError
-from swath.daemon.processing.compiling import mark_compiling, tell_of_worker
+from swath.daemon.processing.compiling import mark_compiling, tell_of_workers
 from swath.daemon.processing.points.jobs import Job, JobResult, run_job
 from swath.drivers.extras import how_to_install
 
@@ -145,7 +145,7 @@ def _in_processes(
     plans: Sequence[Any], jobs: Sequence[Job], order: list[int], workers: int, progress: Progress, do: Do
 ) -> dict[int, JobResult]:
     context = multiprocessing.get_context("spawn")
-    done, begun, compiling = context.Value("q", 0), context.Value("b", False), context.Value("b", False)
+    done, begun, compiling = context.Value("q", 0), context.Value("b", False), context.Value("d", 0.0)
     before = set(multiprocessing.active_children())
     pool = ProcessPoolExecutor(workers, context, _begin, (pickle.dumps(list(plans)), done, begun, compiling))
     results: dict[int, JobResult] = {}
@@ -167,7 +167,7 @@ def _in_processes(
                 except BrokenProcessPool:
                     results[number] = _failed(jobs[number], DIED)
             if compiling.value:
-                tell_of_worker()
+                tell_of_workers(compiling.value)
             progress(int(done.value))
         if futures and not begun.value:
             raise UserError(f"no worker process could start; {UNGUARDED}")

@@ -25,6 +25,7 @@ from swath.daemon.processing.quicklook.product_facts import calibrations_in, crs
 from swath.daemon.processing.quicklook.profile_picture import draw_profile
 from swath.daemon.processing.quicklook.run import Look
 from swath.daemon.processing.quicklook.strips import FEWEST_RETURNS, ROUGHEST_M, STEEPEST_DEG
+from swath.georef.progress import Tell, silent
 
 MOST_ROWS = 300
 FEW_CELLS = 30
@@ -38,17 +39,20 @@ PICTURES: tuple[tuple[str, str, Callable[[Look, Path], None], Callable[[Look], b
 )
 
 
-def make_page(look: Look, folder: Path, title: str, warnings: list[str]) -> Path:
+def make_page(look: Look, folder: Path, title: str, warnings: list[str], tell: Tell = silent) -> Path:
     """Draw all pictures into a folder and write the page and its PDF beside them; return the page's path.
 
     ``warnings`` gets a line if the PDF cannot be made.
+
+    ``tell`` is called with the progress.
 
     Raises:
         OSError: the folder cannot be written to.
     """
     folder.mkdir(parents=True, exist_ok=True)
     shown = []
-    for name, alt, draw, wanted in PICTURES:
+    for number, (name, alt, draw, wanted) in enumerate(PICTURES):
+        tell("pictures", number, len(PICTURES), "pictures")
         path = folder / f"{name}.png"
         path.unlink(missing_ok=True)  # left by an earlier run
         if wanted(look):

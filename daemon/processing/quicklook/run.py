@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -43,12 +43,12 @@ from swath.daemon.processing.quicklook.strips import (
 )
 from swath.daemon.processing.strip_agreement import Agreement
 from swath.georef.arrays import BoolArray, FloatArray, SingleArray
+from swath.georef.progress import Tell, silent
 from swath.georef.strip_colours import PALETTE, colours_of, contact
 
+READING = "reading points"
 RETURNS_A_CELL = 4  # of the pictures: a side of two point spacings
 SAMPLED_FILES = 5
-
-Told = Callable[[int, int], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,7 +138,7 @@ def look_at(
     paths: Sequence[Path],
     cell_m: float | None = None,
     ends: Sequence[float] | None = None,
-    told: Told = lambda done, of: None,
+    told: Tell = silent,
     strip_cell_m: float | None = None,
 ) -> Look:
     """Read files and folders into a quick look.
@@ -147,7 +147,7 @@ def look_at(
         paths: files and folders.
         cell_m: side of the pictures' cells; None: by the density of points.
         ends: x1, y1, x2, y2 of the profile in the files' coordinates; None: chosen automatically.
-        told: called with the number of points read, and of all points.
+        told: called with the progress.
         strip_cell_m: side of the cells in which strips are compared; None: by the strips' density, beginning with
             ``cell_m`` if it is given and not too fine.
 
@@ -217,7 +217,7 @@ class _Reading:
         corners: tuple[FloatArray, FloatArray],
         side_m: float,
         strip_side_m: tuple[float | None, bool],
-        told: Told,
+        told: Tell,
     ) -> None:
         self.sources, self.units, self.told = sources, units, told
         self.total = sum(source.point_count for source in sources)
@@ -240,10 +240,10 @@ class _Reading:
                 self.sums.add(block.strip, block.first, block.sigma_m)
                 self.skipped += block.skipped
                 done += len(block) + block.skipped
-                self.told(done, self.total)
+                self.told(READING, done, self.total, "points")
 
 
-def _read(sources: Sequence[Source], units: Units, given_m: tuple[float | None, float | None], told: Told) -> _Reading:
+def _read(sources: Sequence[Source], units: Units, given_m: tuple[float | None, float | None], told: Tell) -> _Reading:
     """Read all files; once more if points lie outside the headers' extent, which then follows from the points.
 
     ``given_m``: sides of the cells of the pictures and of the strips; None: automatic.

@@ -9,7 +9,6 @@ height differences of strips, before and after                 swath.calib.strip
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -45,10 +44,9 @@ from swath.daemon.processing.strips.compare import is_of_logs
 from swath.daemon.processing.trajectory.files import TrajectoryFiles
 from swath.daemon.processing.user_errors import as_user_error
 from swath.georef.mapping.frame import MappingError
+from swath.georef.progress import Tell
 from swath.georef.strips import StripError as StripTimesError
 from swath.georef.trajectory.trajectory import TrajectoryError
-
-Steps = Callable[[str, int, int], None]  # arguments: the step, how much is done, of how much
 
 AUTO = "auto"
 CHOICES = (*MODELS, AUTO)
@@ -141,7 +139,7 @@ def files_of(request: AdjustOptions, flight: LoggedFlight) -> TrajectoryFiles:
     return files
 
 
-def correct_strips(request: AdjustOptions, folder: Path, tell: Steps) -> StripsCorrected:
+def correct_strips(request: AdjustOptions, folder: Path, tell: Tell) -> StripsCorrected:
     """Estimate corrections of strips; write no files.
 
     Args:
@@ -165,13 +163,13 @@ def correct_strips(request: AdjustOptions, folder: Path, tell: Steps) -> StripsC
         return _corrected(request, folder, tell)
 
 
-def _corrected(request: AdjustOptions, folder: Path, tell: Steps) -> StripsCorrected:
+def _corrected(request: AdjustOptions, folder: Path, tell: Tell) -> StripsCorrected:
     kept = read_flight(request.logs, folder, tell)
     with told_before(verdicts_of(kept.logged), *REFUSED):
         return _of_flight(request, kept, folder, tell)
 
 
-def _of_flight(request: AdjustOptions, kept: KeptFlight, folder: Path, tell: Steps) -> StripsCorrected:
+def _of_flight(request: AdjustOptions, kept: KeptFlight, folder: Path, tell: Tell) -> StripsCorrected:
     _refuse(request, kept)
     for logged in kept.logged:
         files_of(request, logged)
@@ -180,24 +178,21 @@ def _of_flight(request: AdjustOptions, kept: KeptFlight, folder: Path, tell: Ste
 
     def features_of(placed: Flight) -> Features:
         with ThreadPoolExecutor(workers) as pool:
-            planes = find_planes(placed, PLANES, pool.map)
+            planes = find_planes(placed, PLANES, pool.map, tell)
         refuse_no_planes(str(kept.logged[0].log), planes)
         return Features.joined([planes, *([control_planes(placed, points)] if points else [])])
 
     def moved(adjusted: StripAdjusted, name: str) -> Flight:
-        return replaced(replace(flight, trajectories=adjusted.trajectories), calibrations, folder, name, workers)
+        return replaced(replace(flight, trajectories=adjusted.trajectories), calibrations, folder, name, workers, tell)
 
-    tell("planes", 0, 1)
     features = features_of(flight)
-    tell("adjustment", 0, 1)
-    first = adjust_strips(flight, features, calibrations, replace(request.settings, linearisations=1))
-    tell("planes again", 0, 1)  # strips that errors of the trajectory had kept apart overlap now
+    first = adjust_strips(flight, features, calibrations, replace(request.settings, linearisations=1), tell=tell)
+    # strips that errors of the trajectory had kept apart overlap now
     features = features_of(moved(first, "matched"))
     refuse_lost_control(request.control, features)
-    tell("adjustment", 0, 1)
-    adjusted = adjust_strips(flight, features, calibrations, request.settings)
-    tell("strips before and after", 0, 1)
-    before, after = before_and_after(flight, moved(adjusted, "adjusted"), kept.logged[0].setup.mapping)
+    adjusted = adjust_strips(flight, features, calibrations, request.settings, tell=tell)
+    before, after = before_and_after(flight, moved(adjusted, "adjusted"), kept.logged[0].setup.mapping, tell)
+    tell("checks", 0, 0)
     notes += [*kept.notes, *_notes(request, kept, features, before.cells.frame.cell_m), *adjusted.notes]
     return StripsCorrected(request.settings, kept, features, points, adjusted, before, after, tuple(notes))
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -25,6 +25,7 @@ from swath.daemon.processing.trajectory.files import write_trajectory
 from swath.daemon.processing.trajectory.summary import write_json
 from swath.daemon.processing.user_errors import finite
 from swath.georef.arrays import FloatArray, Int64Array
+from swath.georef.progress import Tell
 from swath.georef.trajectory.trajectory import Trajectory
 
 WHAT = (
@@ -41,13 +42,13 @@ WIDTH = 16
 NOT_DETERMINED = "not determined"
 
 
-def write_adjustment(request: AdjustOptions, done: StripsCorrected, tell: Callable[[str, int, int], None]) -> Told:
+def write_adjustment(request: AdjustOptions, done: StripsCorrected, tell: Tell) -> Told:
     """Write all files, the record last: a folder with a record is complete.
 
     Raises:
         UserError: a file cannot be written; no file is left then.
     """
-    tell("trajectories", 0, 1)
+    tell("trajectories", 0, 0)
     files = [files_of(request, flight) for flight in done.kept.logged]
     written: list[tuple[Path, Path]] = []
     made = not request.output.exists()

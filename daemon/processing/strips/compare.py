@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -22,10 +22,9 @@ from swath.daemon.processing.strip_agreement import Agreement, difference_of
 from swath.daemon.processing.strips.inputs import Strips, strips_of_files, strips_of_flight
 from swath.daemon.processing.user_errors import as_user_error, finite
 from swath.georef.mapping.frame import MappingError
+from swath.georef.progress import Tell
 from swath.georef.strips import StripError
 from swath.georef.verdicts import Level, Reason, Verdict, worst_first
-
-Told = Callable[[str, int, int], None]
 
 RECORD = "strips.json"
 WORST_PAIRS = 10  # shown first
@@ -68,7 +67,7 @@ class Compared:
     before: Judgement | None = None
 
 
-def compare_strips(request: StripsOptions, folder: Path, told: Told) -> Compared:
+def compare_strips(request: StripsOptions, folder: Path, told: Tell) -> Compared:
     """Compare strips with each other, and with an earlier state of them.
 
     Args:
@@ -119,7 +118,7 @@ def _kind(path: Path) -> str:
     return "points" if path.suffix.lower() in POINT_SUFFIXES else "logs"
 
 
-def _read(paths: Sequence[Path], request: StripsOptions, folder: Path, told: Told) -> Strips:
+def _read(paths: Sequence[Path], request: StripsOptions, folder: Path, told: Tell) -> Strips:
     if not is_of_logs(paths):
         strips = strips_of_files(paths, request.rules, told, request.logs.trajectory.week)
         sidecars = [source.sidecar for source in strips.look.sources]
@@ -131,7 +130,9 @@ def _read(paths: Sequence[Path], request: StripsOptions, folder: Path, told: Tol
     mapping = kept.logged[0].setup.mapping
     carried = verdicts_of(kept.logged)
     with told_before(carried, FlightError):
-        strips = strips_of_flight(", ".join(map(str, paths)), kept.flight, request.rules, mapping, smoothed_prior(kept))
+        strips = strips_of_flight(
+            ", ".join(map(str, paths)), kept.flight, request.rules, mapping, smoothed_prior(kept), told
+        )
     strips.notes.extend(kept.notes)
     strips.carried.extend(carried)
     return replace(strips, head=head_of_flights(kept.logged))
@@ -288,8 +289,8 @@ class Judgement:
         return names.index(pair[0]), names.index(pair[1])
 
 
-def _judged(strips: Strips, request: StripsOptions, told: Told) -> Judgement:
-    told(f"comparing {strips.what}", 0, 1)
+def _judged(strips: Strips, request: StripsOptions, told: Tell) -> Judgement:
+    told("differences", 0, 0)
     report = report_of(strips.look.names, strips.gathered, request.rules, strips.cell_m)
     found = None if strips.seen is None else signatures(report.checks, strips.seen, strips.prior)
     return Judgement(strips, report, found)

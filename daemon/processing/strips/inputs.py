@@ -41,10 +41,9 @@ from swath.georef.arrays import FloatArray, Int64Array
 from swath.georef.formats.trajectory.columns import LATEST_NS
 from swath.georef.formats.trajectory.file import read_trajectory
 from swath.georef.mapping.frame import Mapping, MappingError
+from swath.georef.progress import Tell, silent
 from swath.georef.timescales.gps_time import WEEK_NS
 from swath.georef.trajectory.trajectory import Trajectory, TrajectoryError, gps_text
-
-Told = Callable[[str, int, int], None]
 
 BLOCK_POINTS = 500_000
 TRAJECTORY = "_trajectory.csv"
@@ -79,7 +78,7 @@ class Strips:
     head: PageHead = NOTHING_KNOWN
 
 
-def strips_of_files(paths: Sequence[Path], rules: StripRules, told: Told, week: int | None = None) -> Strips:
+def strips_of_files(paths: Sequence[Path], rules: StripRules, told: Tell, week: int | None = None) -> Strips:
     """Return the strips in LAS or LAZ files and folders.
 
     Args:
@@ -95,7 +94,7 @@ def strips_of_files(paths: Sequence[Path], rules: StripRules, told: Told, week: 
     if week is not None and week > LATEST_NS // WEEK_NS:
         raise UserError(f"--week {week} is not a GPS week; give whole weeks since 1980, such as 2423", ExitCode.USAGE)
     try:
-        look = look_at(paths, strip_cell_m=rules.cell_m, told=lambda done, of: told(f"reading {what}", done, of))
+        look = look_at(paths, strip_cell_m=rules.cell_m, told=told)
     except QuickLookError as error:
         raise UserError(str(error), ExitCode.IO) from error
     notes = list(look.notes)
@@ -108,6 +107,7 @@ def strips_of_files(paths: Sequence[Path], rules: StripRules, told: Told, week: 
         trouble = str(error)
     clock = PointClock([source.times for source in look.sources], week, None if seen is None else _middle_ns(seen))
     notes += clock.notes
+    told("points of the cells", 0, 0)
     gathered = gather(_file_blocks(look, clock), cells)
     if seen is None or place is None:
         notes.append(f"{what}: no signatures: {trouble}")
@@ -122,6 +122,7 @@ def strips_of_flight(
     rules: StripRules,
     mapping: Mapping | None = None,
     prior: TrajectoryPrior | None = None,
+    told: Tell = silent,
 ) -> Strips:
     """Return the strips of a flight, as its points are placed.
 
@@ -131,12 +132,14 @@ def strips_of_flight(
         rules: rules of the comparison.
         mapping: settled mapping of the products: cells for heights are those of their files; None: cells lie in t.
         prior: joint covariance of the trajectory's errors; None: it is not known.
+        told: called with the progress.
 
     Raises:
         UserError: there is one strip only.
     """
-    look = look_of_flight(flight, rules, mapping)
+    look = look_of_flight(flight, rules, mapping, told)
     refuse_one(what, look)
+    told("points of the cells", 0, 0)
     strips = [FlightStrip(swath) for swath in flight.swaths]
     cells = overlap_cells(strips, replace(rules, cell_m=look.cells.frame.cell_m))
     return Strips(what, look, gather(blocks_of(strips), cells), cells.cell_m, SeenFrom.of(flight), prior)
@@ -297,13 +300,13 @@ def _flown(look: Look, number: int, trajectories: Sequence[Trajectory], of_sessi
 # ---------------------------------------------------------------------- a flight
 
 
-def look_of_flight(flight: Flight, rules: StripRules, mapping: Mapping | None = None) -> Look:
+def look_of_flight(flight: Flight, rules: StripRules, mapping: Mapping | None = None, told: Tell = silent) -> Look:
     """Return a quick look at a flight's points, on the map of its products or in t."""
     corners = low, high = corners_of(flight, mapping)
     area_m2 = max(float(np.prod((high - low)[:2])), 1.0)
     density = max((len(swath) for swath in flight.swaths), default=1) / area_m2
     surface = Surface(frame_of(low, high, float(np.clip(cell_for(density, 4), 0.25, 50.0))))
-    strips = compare_flight(flight, mapping, cell_m=rules.cell_m, corners=corners, also=surface.add)
+    strips = compare_flight(flight, mapping, cell_m=rules.cell_m, corners=corners, also=surface.add, tell=told)
     agreement, names = strips.agreement, list(strips.names)
     facts = [StripFacts(swath.name, len(swath), len(swath), 0.0, density, 0.0, None, None) for swath in flight.swaths]
     numbers = agreement.pulses_m2, agreement.area_m2

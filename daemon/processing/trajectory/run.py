@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import pairwise
@@ -26,6 +26,7 @@ from swath.daemon.processing.trajectory.files import TrajectoryFiles, write_traj
 from swath.daemon.processing.trajectory.request import TrajectoryRequest
 from swath.daemon.processing.trajectory.summary import pages_of, summary_head, summary_of_run, write_json
 from swath.daemon.processing.user_errors import as_user_error
+from swath.georef.progress import Tell
 from swath.georef.trajectory.buffer import TrajectoryBuffer
 from swath.georef.trajectory.trajectory import Trajectory, TrajectoryError, gps_text
 
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
     from swath.daemon.config.config import Config
     from swath.daemon.log.reader import Session
 
-Tell = Callable[[str, int, int], None]  # arguments: the step, how much is done, of how much
 Written = list[tuple[Path, Path]]
 AS_IS = "as-is"
 
@@ -75,13 +75,14 @@ def make_trajectory(request: TrajectoryRequest, tell: Tell) -> TrajectoryReport:
 def _write(
     request: TrajectoryRequest, files: TrajectoryFiles, flights: Sequence[Navigated], tell: Tell
 ) -> TrajectoryReport:
-    tell("files", 0, 1)
+    tell("files", 0, 0)
     trajectory = _joined(flights)
     sigma = np.concatenate([flight.velocity_sigma_l() for flight in flights])
     written = write_trajectory(files, trajectory, sigma)
     warnings: list[str] = []
     try:
         events = _write_events(request, flights, trajectory, written)
+        tell("page", 0, 0)
         verdicts, figures = _write_pages(request, files, flights, written, warnings)
         record = summary_of_run(request, flights, verdicts, figures, events)
         record["files"] = [path.name for _, path in written]
@@ -90,7 +91,6 @@ def _write(
         remove(written)
         raise
     put_in_place(written)
-    tell("files", 1, 1)
     return TrajectoryReport(record, files.summary, [path for _, path in written], warnings)
 
 

@@ -6,7 +6,7 @@ import datetime as dt
 import io
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -51,6 +51,7 @@ from swath.daemon.processing.validation.page import validation_page
 from swath.daemon.processing.validation.record import record_files, records_of
 from swath.daemon.text_files import text_of
 from swath.georef.mapping.frame import MappingError
+from swath.georef.progress import Tell
 from swath.georef.scanner.calibration import Calibration, CalibrationError, read_calibration
 from swath.georef.strips import StripError
 from swath.georef.text_encoding import decoded
@@ -58,7 +59,6 @@ from swath.georef.text_encoding import decoded
 INK, MUTED, COLOURS = "#1d242b", "#5d6770", ("#0072b2", "#d55e00", "#009e73")
 DPI, DAY_S = 140, 86_400.0
 
-Told = Callable[[str, int, int], None]
 RECORD = "validation.json"
 REFUSED = (FlightError, PlaneError, HistoryError, StripError, MappingError, CalibrationError, ControlError)
 
@@ -110,7 +110,7 @@ class _Found:
     control: list[dict[str, Any]] = field(default_factory=list)
 
 
-def run_validation(request: ValidationOptions, folder: Path, told: Told) -> Validated:
+def run_validation(request: ValidationOptions, folder: Path, told: Tell) -> Validated:
     """Run a validation and write its results.
 
     Args:
@@ -160,7 +160,7 @@ def _entry(path: Path, named: Sequence[Path]) -> Calibration | None:
     return None
 
 
-def _against_logs(request: ValidationOptions, found: _Found, folder: Path, told: Told) -> None:
+def _against_logs(request: ValidationOptions, found: _Found, folder: Path, told: Tell) -> None:
     kept = read_flight(request.logs, folder, told)
     refuse_installations(kept.logged)
     found.carried += verdicts_of(kept.logged)
@@ -169,21 +169,20 @@ def _against_logs(request: ValidationOptions, found: _Found, folder: Path, told:
         _against_flight(request, found, kept, folder, told)
 
 
-def _against_flight(request: ValidationOptions, found: _Found, kept: KeptFlight, folder: Path, told: Told) -> None:
+def _against_flight(request: ValidationOptions, found: _Found, kept: KeptFlight, folder: Path, told: Tell) -> None:
     _refuse_others(request, found, kept)
     flight = kept.flight
     points, notes = (None, []) if request.control is None else control_of(request.control, flight, ["shift"])
     named = sorted(found.calibrations)
     found.notes += _assumed(kept)
     _along(kept, found)
-    told("planes", 0, 1)
-    planes = find_planes(flight)
+    planes = find_planes(flight, tell=told)
     if not planes.planes:
         raise UserError(
             f"{request.logs.logs[0]}: no two strips see a common plane; a validation needs strips that overlap"
         )
     anew, why_not = _anew(request, found, kept, points or (), folder, told) if request.anew else (None, "")
-    told("tests", 0, 1)
+    told("tests", 0, 0)
     asked = Asked(points, anew, why_not, named)
     validation = validate(flight, planes, found.calibrations, asked, _prior(kept))
     paths = [part.path for logged in kept.logged for part in logged.session.parts]
@@ -267,23 +266,28 @@ def _anew(
     kept: KeptFlight,
     points: Sequence[ControlPoint],
     folder: Path,
-    told: Told,
+    told: Tell,
 ) -> tuple[Mapping[str, Calibration], str]:
     """Return parameters estimated from these logs and control alone, as by `swath calibrate`; or
     none and the reason.
     """
 
     def features(flight: Flight) -> Features:
-        told("parameters anew", 0, 1)
-        return Features.joined([find_planes(flight, PLANES), control_planes(flight, points)])
+        return Features.joined([find_planes(flight, PLANES, tell=told), control_planes(flight, points)])
 
     def found_anew(calibrations: Mapping[str, Calibration]) -> Features:
-        return features(replaced(kept.flight, calibrations, folder, "anew", request.logs.workers))
+        return features(replaced(kept.flight, calibrations, folder, "anew", request.logs.workers, told))
 
     start = found.calibrations
     try:
         adjusted = adjust(
-            kept.flight, features(kept.flight), Model("scanner"), prior_of(kept), start=start, rematch=found_anew
+            kept.flight,
+            features(kept.flight),
+            Model("scanner"),
+            prior_of(kept),
+            start=start,
+            rematch=found_anew,
+            tell=told,
         )
     except (FlightError, NormalError) as error:
         return {}, str(error)

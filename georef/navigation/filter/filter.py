@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -217,9 +218,15 @@ class NavigationFilter:
 
 
 def run_filter(
-    inertial: Inertial, observations: StructArray, setup: Setup, start: Start, *, storage: Storage = IN_MEMORY
+    inertial: Inertial,
+    observations: StructArray,
+    setup: Setup,
+    start: Start,
+    *,
+    storage: Storage = IN_MEMORY,
+    passed: Callable[[int], None] = lambda samples: None,
 ) -> FilterRun:
-    """Filter a whole flight, in pieces, between which the storage may free memory."""
+    """Filter a whole flight, in pieces, between which the storage may free memory; pass on the samples done."""
     heights = bool((observations["kind"] == Kind.HEIGHT).any())
     bridges = primed_bridges(samples_of(inertial.between(0, PIECE)))
     navigation = NavigationFilter(
@@ -229,6 +236,7 @@ def run_filter(
     for first in range(0, len(inertial), PIECE):
         navigation.feed(inertial.between(first, first + PIECE))
         storage.rest()
+        passed(min(first + PIECE, len(inertial)))
     return navigation.finish()
 
 

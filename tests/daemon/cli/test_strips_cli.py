@@ -239,7 +239,7 @@ def test_a_wrong_roll_is_named_and_is_a_problem(made: Cast, tmp_path: Path, caps
 def test_a_flight_and_its_files_give_the_same_differences(made: Cast, tmp_path: Path) -> None:
     """Both ways to the same differences: arrays in t, and LAZ in a projection."""
     of_flight = strips_of_flight("flight", made.flight, StripRules())
-    of_files = strips_of_files([products(tmp_path / "p", made.flight)], StripRules(), lambda what, done, of: None)
+    of_files = strips_of_files([products(tmp_path / "p", made.flight)], StripRules(), lambda *_: None)
     numbers = [one.look.overlap.numbers() for one in (of_flight, of_files)]
     assert numbers[0] is not None
     assert numbers[1] is not None
@@ -290,7 +290,7 @@ def test_the_datum_is_taken_from_the_configuration(made: Cast, tmp_path: Path, s
     assert setup.mapping is not None
     setup.mapping.settle(made.flight.trajectories[0].position_e[:1])
     folder = products(tmp_path / "p", made.flight, setup.mapping)
-    of_files = strips_of_files([folder], StripRules(), lambda what, done, of: None)
+    of_files = strips_of_files([folder], StripRules(), lambda *_: None)
     assert of_files.notes == []
     assert of_files.seen is not None
     swath, gathered = made.flight.swaths[0], of_files.gathered
@@ -306,7 +306,7 @@ def test_strips_with_equal_numbers_of_two_runs_are_separate(made: Cast, tmp_path
     """This includes two aircraft at one time: each strip has the trajectory of its run."""
     first = products(tmp_path / "p", made.flight)
     second = products(tmp_path / "q", made.flight, session="b", up_m=0.07)
-    strips = strips_of_files([first, second], StripRules(), lambda what, done, of: None)
+    strips = strips_of_files([first, second], StripRules(), lambda *_: None)
     assert strips.look.names == ["1", "2", "1/2", "2/2"]
     (row,) = (row for row in strips.look.overlap.rows if (row["first"], row["second"]) == (0, 2))
     assert row["median_m"] == pytest.approx(-0.07, abs=2e-3)
@@ -321,7 +321,7 @@ def test_strips_with_equal_numbers_of_two_runs_are_separate(made: Cast, tmp_path
 @pytest.mark.slow
 def test_strips_of_two_scanners_processed_apart_are_the_same_strips(made: Cast, tmp_path: Path) -> None:
     folders = [products(tmp_path / name, made.flight) for name in ("left", "right")]
-    strips = strips_of_files(folders, StripRules(), lambda what, done, of: None)
+    strips = strips_of_files(folders, StripRules(), lambda *_: None)
     assert (strips.look.names, strips.notes) == (["1", "2"], [])
 
 
@@ -331,7 +331,7 @@ def test_seconds_of_the_week_belong_to_the_trajectory_beside_them(
 ) -> None:
     """The header of each file decides; files that mix both kinds are named."""
     folder = products(tmp_path / "p", made.flight, of_week=of_week)
-    strips = strips_of_files([folder], StripRules(), lambda what, done, of: None)
+    strips = strips_of_files([folder], StripRules(), lambda *_: None)
     begin, end = made.flight.trajectories[0].span
     assert ((strips.gathered.time_ns >= begin) & (strips.gathered.time_ns <= end)).all()
     mixed = (
@@ -344,11 +344,11 @@ def test_seconds_of_the_week_belong_to_the_trajectory_beside_them(
 def test_points_of_another_time_than_their_trajectory_are_reported(made: Cast, tmp_path: Path) -> None:
     folder = products(tmp_path / "p", made.flight, of_week=(1, 2))
     week = made.flight.trajectories[0].span[0] // WEEK_NS
-    strips = strips_of_files([folder], StripRules(), lambda what, done, of: None, week - 1)
+    strips = strips_of_files([folder], StripRules(), lambda *_: None, week - 1)
     assert len(strips.notes) == 1
     assert strips.notes[0].startswith("100 % of the points lie at other times")
     with pytest.raises(UserError, match="--week 24233 is not a GPS week; give whole weeks since 1980"):
-        strips_of_files([folder], StripRules(), lambda what, done, of: None, 24233)
+        strips_of_files([folder], StripRules(), lambda *_: None, 24233)
 
 
 def test_a_sidecar_without_a_datum_is_reported(made: Cast, tmp_path: Path) -> None:
@@ -356,7 +356,7 @@ def test_a_sidecar_without_a_datum_is_reported(made: Cast, tmp_path: Path) -> No
     sidecar = json.loads((folder / "a.json").read_text())
     del sidecar["crs"]["datum_said"]
     (folder / "a.json").write_text(json.dumps(sidecar))
-    (note,) = strips_of_files([folder], StripRules(), lambda what, done, of: None).notes
+    (note,) = strips_of_files([folder], StripRules(), lambda *_: None).notes
     assert "no signatures: the sidecar beside the points does not give their datum" in note
 
 

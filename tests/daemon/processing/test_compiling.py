@@ -13,7 +13,7 @@ import numba
 import pytest
 
 from swath.daemon.cli.progress import COMPILING
-from swath.daemon.processing.compiling import before_compiling, compilations, mark_compiling, tell_of_worker
+from swath.daemon.processing.compiling import before_compiling, compilations, mark_compiling, tell_of_workers
 from tests.daemon.rig import HANGS_S
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -43,26 +43,26 @@ def test_the_function_is_called_once_and_before_compiling_begins() -> None:
     with before_compiling(lambda: calls.append("begins")):
         numba.njit(lambda x: 3 * x)(2)
         numba.njit(lambda x: 4 * x)(2)
-        tell_of_worker()
+        tell_of_workers(0.0)
     assert calls == ["begins"]
     with before_compiling(lambda: calls.append("again")):
         pass
-    tell_of_worker()  # the block has ended
+    tell_of_workers(0.0)  # the block has ended
     assert calls == ["begins"]
 
 
 def test_a_worker_process_marks_that_it_compiles() -> None:
     context = multiprocessing.get_context("spawn")
-    flag = context.Value("b", False)
+    flag = context.Value("d", 0.0)
     worker = context.Process(target=compile_in_worker, args=(flag,))
     worker.start()
     worker.join(HANGS_S)
     assert worker.exitcode == 0
-    assert flag.value
+    assert flag.value > 0.0
     calls: list[str] = []
     with before_compiling(lambda: calls.append("worker")):
-        tell_of_worker()
-        tell_of_worker()
+        tell_of_workers(0.0)
+        tell_of_workers(0.0)
     assert calls == ["worker"]
 
 

@@ -26,6 +26,7 @@ from swath.daemon.processing.calibration.run import EVERY, PLANES
 from swath.georef.arrays import ByteArray, FloatArray
 from swath.georef.geodesy.rotations import quaternion_from_rot
 from swath.georef.navigation.inputs import NavigationError
+from swath.georef.progress import Tell, silent
 from swath.georef.scanner.beams import LineGeometry
 from swath.georef.scanner.calibration import PARAMETERS, read_calibration
 from swath.georef.scanner.uncertainty import Noise
@@ -157,14 +158,15 @@ class PlannedCalibration:
         return f"This flight does not determine {words}."
 
 
-def plan_calibration(plan: Plan, request: PlanOptions) -> PlannedCalibration:
-    """Predict a plan's calibration.
+def plan_calibration(plan: Plan, request: PlanOptions, tell: Tell = silent) -> PlannedCalibration:
+    """Predict a plan's calibration; ``tell`` is called with the progress.
 
     Raises:
         PlanError: the plan cannot be flown; UserError: its scanners cannot be calibrated, or an option cannot be met.
     """
     survey = Survey(plan)
     frame = Tangent.at(survey.site.origin_e)
+    tell("trajectory's errors", 0, 0)
     try:
         navigation = navigated(survey, BEGIN_NS) if request.sigmas is None else None
     except NavigationError as error:
@@ -175,13 +177,16 @@ def plan_calibration(plan: Plan, request: PlanOptions) -> PlannedCalibration:
         Line(strip.name, 0, number + 1, _gps(strip.start_s), _gps(strip.end_s))
         for number, strip in enumerate(survey.strips)
     ]
+    tell("roofs and ground", 0, 0)
     surfaces = [*_roofs(survey, frame), *_ground(survey, frame)]
     control = _control(survey, frame, request.control_sigma_m) if request.control else []
+    tell("flight lines over them", 0, 0)
     try:
         most = (PLANES if navigation is None else EVERY).most_points
         trajectories = [_trajectory(survey, sigmas)]
         flight, features = planned(frame, heads, scans, trajectories, lines, [*surfaces, *control], most)
         prior = gauss_markov(flight) if navigation is None else navigation.prior(flight)
+        tell("sigmas", 0, 0)
         predicted = predict(flight, features, of_parameters(request.model), prior)
     except (FlightError, ParameterError, NormalError) as error:
         raise UserError(one_line(str(error)), ExitCode.USAGE) from error

@@ -16,6 +16,7 @@ from swath.daemon.processing.flights.read import GeorefOptions
 from swath.daemon.processing.flights.trajectory_choice import TrajectoryOptions
 from swath.daemon.processing.setup.setup import Options
 from swath.georef.formats.trajectory.csv import csv_text
+from swath.georef.progress import silent
 from swath.georef.scanner.calibration import INDEX, Calibration, read_calibration
 from swath.georef.trajectory.trajectory import Trajectory
 from tests.calib.village import KNOWN, Made, village
@@ -24,10 +25,6 @@ pytestmark = [pytest.mark.xdist_group("kernels"), pytest.mark.slow]
 
 CELL_M = 8.0
 ROLL_RAD = math.radians(0.02)
-
-
-def quiet(what: str, done: int, total: int) -> None:
-    """Ignore progress."""
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +45,7 @@ def options(made: Made, tmp_path_factory: pytest.TempPathFactory) -> Calibration
 @pytest.fixture(scope="module")
 def done(options: CalibrationOptions, tmp_path_factory: pytest.TempPathFactory) -> Calibrated:
     """Return an outcome without faults before it is written."""
-    return calibrate(options, tmp_path_factory.mktemp("returns"), quiet)
+    return calibrate(options, tmp_path_factory.mktemp("returns"), silent)
 
 
 def wrong(done: Calibrated, sigma_rad: float = 1e-5, **by: float) -> Calibrated:
@@ -107,7 +104,7 @@ def test_all_three_contradictions_are_in_the_verdict_of_a_calibration(
         "validation: crossStripFlight (002): ",
         "8 profiles put boresight φ (pitch) −0.0026° from the adjustment (−3.0 sigmas)",
     ]
-    told = write_products(options, bad, quiet)
+    told = write_products(options, bad, silent)
     assert told.record["verdict"]["level"] in ("care", "unusable")
     reasons = [one["what"] for one in told.record["verdict"]["reasons"]]
     in_file = read_calibration(options.output.read_text(), "left.toml").header["verdict_reasons"]
@@ -116,7 +113,7 @@ def test_all_three_contradictions_are_in_the_verdict_of_a_calibration(
         assert any(reason.startswith(word) for reason in reasons), reasons
         assert any(str(reason).startswith(word) for reason in in_file)
         assert any(word in line for line in told.lines)
-    sound = write_products(options, replace(done, check=Check((), (replace(comparison, told=-2.75 * sigma),))), quiet)
+    sound = write_products(options, replace(done, check=Check((), (replace(comparison, told=-2.75 * sigma),))), silent)
     for word in words:
         assert not any(one["what"].startswith(word) for one in sound.record["verdict"]["reasons"])
 
@@ -133,7 +130,7 @@ def test_a_forced_trajectory_of_another_place_is_noted(made: Made, options: Cali
     elsewhere = replace(options.logs, trajectory=TrajectoryOptions(file, force=True))
     output = tmp_path / "left.toml"
     forced = replace(options, logs=elsewhere, output=output)
-    told = write_products(forced, calibrate(forced, tmp_path, quiet), quiet)
+    told = write_products(forced, calibrate(forced, tmp_path, silent), silent)
     (note,) = (line for line in told.record["notes"] if line.startswith(f"{file}: "))
     assert "lies 7.6 km off the fixes of gnss/rover" in note
     assert f"note: {note}" in told.lines

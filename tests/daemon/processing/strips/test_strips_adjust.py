@@ -260,7 +260,7 @@ def done(made: Made, lifted: Path, tmp_path_factory: pytest.TempPathFactory) -> 
     options = Options(datum="same", calibrations={"left": (text, str(made.flown.folder / "left.true.toml"))})
     logs = GeorefOptions([made.flown.log], folder, TrajectoryOptions(lifted), replace(options, uncertainty=False))
     request = AdjustOptions(logs, folder / "none")
-    return request, correct_strips(request, folder, lambda what, done, total: None)
+    return request, correct_strips(request, folder, lambda *_: None)
 
 
 @pytest.mark.parametrize("there", [True, False], ids=["folder there", "folder not there"])
@@ -275,7 +275,7 @@ def test_a_full_disk_leaves_no_files(
     if there:
         output.mkdir()
     with pytest.raises(UserError, match="No space left on device") as caught:
-        write_adjustment(replace(done[0], output=output), done[1], lambda what, done, total: None)
+        write_adjustment(replace(done[0], output=output), done[1], lambda *_: None)
     assert caught.value.exit_code == ExitCode.IO
     assert "\n" not in caught.value.message
     assert output.exists() == there
@@ -298,7 +298,7 @@ def test_a_trajectory_is_written_back_about_the_plumb_line_of_its_input(
         source=logged.source,
     )
     kept = replace(outcome.kept, logged=[plumbed])
-    write_adjustment(request, replace(outcome, kept=kept), lambda what, done, total: None)
+    write_adjustment(request, replace(outcome, kept=kept), lambda *_: None)
     path = trajectory_of(tmp_path / "out", ".csv")
     read = read_trajectory(path.read_bytes(), path.name)
     for turned, same in ((read, False), (read.with_deflection(*xi_eta_rad), True)):
