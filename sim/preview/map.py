@@ -13,38 +13,26 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon
 from matplotlib.patheffects import withStroke
-from matplotlib.ticker import FuncFormatter
+from matplotlib.ticker import FuncFormatter, MaxNLocator
 from matplotlib.transforms import ScaledTranslation
-from pyproj import Transformer
 
 from swath.georef.arrays import FloatArray
 from swath.sim.flight.envelope import Ground
+from swath.sim.preview.chart import Chart
 from swath.sim.preview.coverage import Strip, Survey, control_points
 from swath.sim.scene.village import STREET_M
 
 INK, MUTED = "#22262b", "#5a6068"
 ROOFS, WATER, TREES, ROAD, MAST, CAR = "#a65f4a", "#8fbfdc", "#7fa65e", "#8d8d89", "#3b3b3b", "#c23b22"
-LINE_COLOURS = (
-    "#1f6fb4",
-    "#d9541e",
-    "#228b57",
-    "#8e4fb0",
-    "#c2358a",
-    "#8c6d1f",
-    "#0f8c9a",
-    "#b5352b",
-    "#5661c9",
-    "#5f7d12",
-)
 LAND = LinearSegmentedColormap.from_list("land", ["#c9d9b5", "#e3e7c8", "#f1e8cf", "#e4d3b3", "#d3ba97"])
 HALO = (withStroke(linewidth=2.6, foreground="white", alpha=0.85),)
 SHADE_CELLS = 420
 KILOMETRES_FROM_M = 30_000.0
 
 
-def colour_of(number: int) -> str:
-    """Return the colour of a flight line."""
-    return LINE_COLOURS[number % len(LINE_COLOURS)]
+def thousands(value: float) -> str:
+    """Return a whole number with separated thousands and a real minus sign."""
+    return f"{value:,.0f}".replace(",", "\u202f").replace("-", "−")
 
 
 def shortened(name: str, most: int) -> str:
@@ -74,6 +62,7 @@ def draw_map(
     track: FloatArray,
     ground_m: Ground,
     frame: tuple[FloatArray, FloatArray, float],
+    chart: Chart,
 ) -> None:
     """Draw the map between two corners.
 
@@ -81,40 +70,47 @@ def draw_map(
         axes: to draw in.
         survey: the flown plan.
         track: (n, 4) time, east, north and height of the aircraft.
-        ground_m: function that gives heights all over the map.
-        frame: (2,) east and north of either corner, then the factor by which north is drawn larger than east.
+        ground_m: function that gives heights all over the map, by east and north in the site frame.
+        frame: (2,) easting and northing of either corner, then the factor by which north is drawn larger than east.
+        chart: coordinates of the map, and the lines' colours.
     """
     low, high, stretch = frame
-    _relief(axes, ground_m, low, high)
-    draw_ground(axes, survey)
-    for number, strip in enumerate(survey.strips):
-        _swath(axes, survey.edges(strip), colour_of(number), 0.16 if len(survey.strips) < 5 else 0.09)
-    axes.plot(track[:, 1], track[:, 2], color=INK, lw=0.8, ls=(0, (5, 2)), alpha=0.75, zorder=5)
-    axes.plot(*track[0, 1:3], marker="o", ms=5, color="white", mec=INK, mew=1.2, zorder=8)
-    axes.plot(*track[-1, 1:3], marker="s", ms=5, color=INK, mec="white", mew=0.8, zorder=8)
-    for number, strip in enumerate(survey.strips):
-        _line(axes, strip, colour_of(number))
-    control = control_points(survey.plan, survey.scene)
+    _relief(axes, ground_m, low, high, chart)
+    draw_ground(axes, survey, chart)
+    for strip, colour in zip(survey.strips, chart.colours, strict=True):
+        _swath(axes, chart.place(survey.edges(strip)), colour, 0.16 if len(survey.strips) < 5 else 0.09)
+    way = chart.place(track[:, 1:3])
+    axes.plot(way[:, 0], way[:, 1], color=INK, lw=0.8, ls=(0, (5, 2)), alpha=0.75, zorder=5)
+    axes.plot(*way[0], marker="o", ms=5, color="white", mec=INK, mew=1.2, zorder=8)
+    axes.plot(*way[-1], marker="s", ms=5, color=INK, mec="white", mew=0.8, zorder=8)
+    for strip, colour in zip(survey.strips, chart.colours, strict=True):
+        _line(axes, strip, colour, chart)
+    control = chart.place(np.asarray(control_points(survey.plan, survey.scene))[:, :2])
     axes.plot(control[:, 0], control[:, 1], ls="", marker="^", ms=5.5, color="#ffd23f", mec=INK, mew=0.7, zorder=7)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-    for axis, where, size_m in ((axes.xaxis, "east", high[0] - low[0]), (axes.yaxis, "north", high[1] - low[1])):
+    for axis, word, size_m in ((axes.xaxis, "Easting", high[0] - low[0]), (axes.yaxis, "Northing", high[1] - low[1])):
         unit, metres = ("km", 1000.0) if size_m > KILOMETRES_FROM_M else ("m", 1.0)
-        axis.set_major_formatter(FuncFormatter(lambda value, _, metres=metres: f"{value / metres:g}".replace("-", "−")))
-        axis.set_label_text(f"{where} of the origin ({unit})", fontsize=8, color=MUTED)
+        axis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
+        axis.set_major_formatter(FuncFormatter(lambda value, _, metres=metres: thousands(value / metres)))
+        axis.set_label_text(f"{word} ({unit})", fontsize=8, color=MUTED)
+    axes.tick_params(axis="y", labelrotation=90)
+    for label in axes.get_yticklabels():
+        label.set(va="center")
     axes.grid(color="white", lw=0.6, alpha=0.55, zorder=1)
     _scale_bar(axes, low, high)
     _north_arrow(axes)
-    _legend(axes, survey)
-    _origin(axes, survey, stretch)
+    _legend(axes, survey, chart.colours[0])
+    _origin(axes, survey, stretch, chart)
 
 
-def _relief(axes: Axes, ground_m: Ground, low: FloatArray, high: FloatArray) -> None:
+def _relief(axes: Axes, ground_m: Ground, low: FloatArray, high: FloatArray, chart: Chart) -> None:
     """Draw heights as soft colours with shadows, and contour lines."""
     size = high - low
     shape = np.maximum((SHADE_CELLS * size / size.max()).astype(int), 40)
     east_m, north_m = (np.linspace(low[axis], high[axis], shape[axis]) for axis in (0, 1))
     east, north = np.meshgrid(east_m, north_m)
-    height_m = ground_m(east.ravel(), north.ravel()).reshape(east.shape)
+    places = chart.back(np.column_stack([east.ravel(), north.ravel()]))
+    height_m = ground_m(np.ascontiguousarray(places[:, 0]), np.ascontiguousarray(places[:, 1])).reshape(east.shape)
     extent = (low[0], high[0], low[1], high[1])
     relief_m = float(np.ptp(height_m))
     if relief_m < 1.0:
@@ -131,47 +127,60 @@ def _relief(axes: Axes, ground_m: Ground, low: FloatArray, high: FloatArray) -> 
     levels = step * np.arange(math.ceil(height_m.min() / step), math.floor(height_m.max() / step) + 1)
     if len(levels):
         lines = axes.contour(east_m, north_m, height_m, levels=levels, colors="#8a7752", linewidths=0.45, alpha=0.7)
-        axes.clabel(lines, fmt="%g", fontsize=6, inline_spacing=2)
+        axes.clabel(lines, fmt="%g m", fontsize=6, inline_spacing=2)
 
 
-def draw_ground(axes: Axes, survey: Survey, *, outlines: bool = False) -> None:
-    """Draw the objects on the ground; ``outlines`` draws only outlines, which hide no colours beneath."""
-    scene = survey.scene
+def draw_ground(axes: Axes, survey: Survey, chart: Chart | None = None, *, outlines: bool = False) -> None:
+    """Draw the objects on the ground.
+
+    Args:
+        axes: to draw in.
+        survey: the flown plan.
+        chart: coordinates of the map; None: those of the site frame.
+        outlines: draw only outlines, which hide no colours beneath.
+    """
+    scene, place = survey.scene, np.asarray if chart is None else chart.place
     for forest in [] if outlines else survey.plan.tables.terrain.forest:
         corners = np.array(forest.center_m) + np.array(forest.size_m) / 2 * [[-1, -1], [1, -1], [1, 1], [-1, 1]]
-        axes.add_patch(Polygon(corners, facecolor=TREES, alpha=0.3, lw=0, zorder=1.9))
+        axes.add_patch(Polygon(place(corners), facecolor=TREES, alpha=0.3, lw=0, zorder=1.9))
     for circles, edge, face in ((scene.waters, "#4d88ad", WATER), (scene.trees, "#4f7a35", TREES)):
         width = 2.0 * circles[:, 2]
         look = {"edgecolors": edge, "linewidths": 0.4, "facecolors": "none"} if outlines else {"facecolors": face}
         if not outlines or circles is scene.waters:
-            axes.add_collection(_circles(axes, circles, width, zorder=2.0, **look), autolim=False)
+            axes.add_collection(_circles(axes, place(circles[:, :2]), width, zorder=2.0, **look), autolim=False)
     for road in sorted(scene.roads, key=lambda road: road.width_m):
-        points = np.array(road.points_m).T
+        points = place(np.array(road.points_m, np.float64)).T
         wide = 0.4 if outlines else 1.1 if road.width_m <= STREET_M else 2.2
         axes.plot(*points, color=ROAD, lw=wide, solid_joinstyle="round", zorder=2.2)
         if wide > 2.0:
             axes.plot(*points, color="#f4f2ec", lw=1.0, solid_joinstyle="round", zorder=2.3)
     edge, face = ("#555555", "none") if outlines else ("#6b3a2c", ROOFS)
     axes.add_collection(
-        PolyCollection(list(scene.buildings), edgecolors=edge, facecolors=face, linewidths=0.25, zorder=2.5),
+        PolyCollection(
+            [place(corners) for corners in scene.buildings],
+            edgecolors=edge,
+            facecolors=face,
+            linewidths=0.25,
+            zorder=2.5,
+        ),
         autolim=False,
     )
-    wires = scene.wires.reshape(-1, 2, 2)
+    wires = place(scene.wires.reshape(-1, 2, 2))
     axes.add_collection(LineCollection(list(wires), colors=MAST, linewidths=0.5 if outlines else 0.9, zorder=2.6))
     if outlines:
         return
     axes.plot(*wires.reshape(-1, 2).T, ls="", marker="P", ms=3.4, color=MAST, mew=0.0, zorder=2.7)
-    for way in scene.cars.reshape(-1, 2, 2):
+    for way in place(scene.cars.reshape(-1, 2, 2)):
         axes.plot(*way.T, color=CAR, lw=0.9, ls=(0, (1, 1.2)), zorder=2.8)
 
 
-def _circles(axes: Axes, circles: FloatArray, width: FloatArray, **look: Any) -> EllipseCollection:
+def _circles(axes: Axes, centres: FloatArray, width: FloatArray, **look: Any) -> EllipseCollection:
     return EllipseCollection(
         width,
         width,
         np.zeros(len(width)),
         units="xy",
-        offsets=circles[:, :2],
+        offsets=centres,
         offset_transform=axes.transData,
         **look,
     )
@@ -182,13 +191,14 @@ def _swath(axes: Axes, outline: FloatArray, colour: str, alpha: float) -> None:
     axes.add_patch(Polygon(outline, facecolor="none", edgecolor=colour, lw=0.7, alpha=0.7, zorder=3.5))
 
 
-def _line(axes: Axes, strip: Strip, colour: str) -> None:
+def _line(axes: Axes, strip: Strip, colour: str, chart: Chart) -> None:
     """Draw a line with an arrow, its name behind its beginning, a little to its right."""
-    aside = np.array([strip.ahead[1], -strip.ahead[0]]) * 1.4 / 72.0
+    start, end = chart.place(np.stack([strip.from_m, strip.end_m]))
+    ahead = (end - start) / max(float(np.linalg.norm(end - start)), 1e-9)
+    aside = np.array([ahead[1], -ahead[0]]) * 1.4 / 72.0
     moved = axes.transData + ScaledTranslation(aside[0], aside[1], page_of(axes).dpi_scale_trans)
-    start, end = strip.from_m, strip.end_m
     axes.plot([start[0], end[0]], [start[1], end[1]], color=colour, lw=2.0, transform=moved, zorder=6)
-    turned = math.degrees(math.atan2(strip.ahead[1], strip.ahead[0]))
+    turned = math.degrees(math.atan2(ahead[1], ahead[0]))
     for part in (0.3, 0.75):
         tip = start + part * (end - start)
         arrow = (3, 0, turned - 90.0)
@@ -198,7 +208,7 @@ def _line(axes: Axes, strip: Strip, colour: str) -> None:
     axes.annotate(
         shortened(strip.name, 14),
         xy=(start[0], start[1]),
-        xytext=(-6.0 * strip.ahead[0], -6.0 * strip.ahead[1]),
+        xytext=(-6.0 * ahead[0], -6.0 * ahead[1]),
         textcoords="offset points",
         rotation=upright,
         rotation_mode="anchor",
@@ -244,12 +254,12 @@ def _north_arrow(axes: Axes) -> None:
     )
 
 
-def _legend(axes: Axes, survey: Survey) -> None:
+def _legend(axes: Axes, survey: Survey, colour: str) -> None:
     """Draw the legend below the map, with entries only for what the map contains."""
     scene, control = survey.scene, survey.plan.tables.control
     entries: list[tuple[Any, str, Any]] = [
-        (True, "flight line", Line2D([], [], color=LINE_COLOURS[0], lw=2)),
-        (True, "swath", Patch(facecolor=LINE_COLOURS[0], alpha=0.3)),
+        (True, "flight line", Line2D([], [], color=colour, lw=2)),
+        (True, "swath", Patch(facecolor=colour, alpha=0.3)),
         (True, "way between", Line2D([], [], color=INK, lw=0.8, ls=(0, (5, 2)))),
         (True, "begin", Line2D([], [], ls="", marker="o", ms=5, color="white", mec=INK, mew=1.2)),
         (True, "end", Line2D([], [], ls="", marker="s", ms=5, color=INK)),
@@ -279,15 +289,13 @@ def _legend(axes: Axes, survey: Survey) -> None:
     )
 
 
-def _origin(axes: Axes, survey: Survey, stretch: float) -> None:
-    """Write the site's place on earth above the map."""
+def _origin(axes: Axes, survey: Survey, stretch: float, chart: Chart) -> None:
+    """Write the CRS and the site's place on earth above the map."""
     lat_deg, lon_deg = survey.plan.tables.flight.origin_deg
-    crs = survey.plan.tables.flight.crs
-    east_m, north_m = Transformer.from_crs("EPSG:4326", crs, always_xy=True).transform(lon_deg, lat_deg)[:2]
     text = (
         f"origin {abs(lat_deg):.5f}° {'N' if lat_deg >= 0 else 'S'}, {abs(lon_deg):.5f}° {'E' if lon_deg >= 0 else 'W'}"
     )
-    text += f"   {crs} {east_m:.1f}, {north_m:.1f}"
+    text += f"   coordinates: {chart.name}"
     if stretch != 1.0:
         larger = f"north drawn {stretch:.2g} × larger than east" if stretch > 1.0 else ""
         text += f"   {larger or f'east drawn {1.0 / stretch:.2g} × larger than north'}"

@@ -17,8 +17,9 @@ from swath.georef.arrays import FloatArray
 from swath.sim.flight.envelope import Ground
 from swath.sim.plan.errors import PlanError
 from swath.sim.plan.plan import Plan
+from swath.sim.preview.chart import Chart
 from swath.sim.preview.coverage import Grid, Survey, grid_of, summary_of
-from swath.sim.preview.map import INK, MUTED, colour_of, draw_ground, draw_map, heading, nice_step, page_of, shortened
+from swath.sim.preview.map import INK, MUTED, draw_ground, draw_map, heading, nice_step, page_of, shortened, thousands
 from swath.sim.scene.terrain import build_ground
 
 FORMATS = (".pdf", ".png", ".svg")
@@ -57,7 +58,8 @@ def draw_plan(plan: Plan, path: Path) -> list[dict[str, Any]]:
     survey = Survey(plan)
     rows = summary_of(survey)
     track = _track(survey)
-    low, high = _extent(survey, track)
+    chart = Chart(survey)
+    low, high = _extent(survey, track, chart)
     wide = (high - low)[0] > WIDE * (high - low)[1]
     grid = grid_of(survey)
     page, panels = (WIDE_PAGE, WIDE_PANELS) if wide else (TALL_PAGE, _tall_panels(len(rows), grid))
@@ -65,12 +67,12 @@ def draw_plan(plan: Plan, path: Path) -> list[dict[str, Any]]:
     axes = {name: _panel(figure, page, box) for name, box in panels.items()}
     _title(figure, page, survey, rows)
     frame = _framed(low, high, panels["map"])
-    ground_m = _wide_ground(survey, *frame[:2])
-    draw_map(axes["map"], survey, track, ground_m, frame)
-    _profile(axes["profile"], survey, track, ground_m)
+    ground_m = _wide_ground(survey, chart, *frame[:2])
+    draw_map(axes["map"], survey, track, ground_m, frame, chart)
+    _profile(axes["profile"], survey, track, ground_m, chart)
     _density(axes["density"], survey, grid)
     _overlap(axes["overlap"], survey, grid)
-    _table(axes["table"], rows)
+    _table(axes["table"], rows, chart.colours)
     figure.savefig(path, dpi=DPI)
     return rows
 
@@ -110,9 +112,9 @@ def _track(survey: Survey) -> FloatArray:
     return np.column_stack([time_s, points[:, :2], survey.site.heights(points)])
 
 
-def _extent(survey: Survey, track: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _extent(survey: Survey, track: FloatArray, chart: Chart) -> tuple[FloatArray, FloatArray]:
     """Return the south-western and the north-eastern corner of the map."""
-    points = np.concatenate([track[:, 1:3], *(survey.edges(strip) for strip in survey.strips)])
+    points = chart.place(np.concatenate([track[:, 1:3], *(survey.edges(strip) for strip in survey.strips)]))
     low, high = points.min(axis=0), points.max(axis=0)
     border = 0.05 * (high - low)
     return low - border, high + border
@@ -128,7 +130,7 @@ def _framed(low: FloatArray, high: FloatArray, box: Box) -> tuple[FloatArray, Fl
     return middle - half, middle + half, float(scale[0] / scale[1])
 
 
-def _wide_ground(survey: Survey, low: FloatArray, high: FloatArray) -> Ground:
+def _wide_ground(survey: Survey, chart: Chart, low: FloatArray, high: FloatArray) -> Ground:
     """Return a function that gives heights all over the map.
 
     A raster is read only where the flight needs it; beyond, heights are those at its edge.
@@ -137,7 +139,9 @@ def _wide_ground(survey: Survey, low: FloatArray, high: FloatArray) -> Ground:
         return survey.scene.ground_m
     cell_m = float(np.clip((high - low).max() / GROUND_CELLS, 0.25, 100.0))
     coarse = survey.plan.changed({"terrain": {"cell_m": cell_m}})
-    return build_ground(coarse, survey.site, np.stack([low, high])).ground_m
+    corners = chart.back(np.array([[east, north] for east in (low[0], high[0]) for north in (low[1], high[1])]))
+    ends = np.stack([corners.min(axis=0) - cell_m, corners.max(axis=0) + cell_m])
+    return build_ground(coarse, survey.site, ends).ground_m
 
 
 def _title(figure: Figure, page: tuple[float, float], survey: Survey, rows: Sequence[dict[str, Any]]) -> None:
@@ -163,7 +167,7 @@ def _scanner_words(table: Any) -> str:
     return f"{table.kind}, {table.prf_hz / 1000:g} kHz, ±{table.half_angle_deg:g}°"
 
 
-def _profile(axes: Axes, survey: Survey, track: FloatArray, ground: Ground) -> None:
+def _profile(axes: Axes, survey: Survey, track: FloatArray, ground: Ground, chart: Chart) -> None:
     """Draw heights over time: the ground below, the aircraft, and the height above ground on each line."""
     unit_s, unit = (60.0, "min") if track[-1, 0] > 300.0 else (1.0, "s")
     time, height_m = track[:, 0] / unit_s, track[:, 3]
@@ -174,7 +178,7 @@ def _profile(axes: Axes, survey: Survey, track: FloatArray, ground: Ground) -> N
     axes.plot(time, ground_m, color="#8a7752", lw=0.9)
     axes.plot(time, height_m, color=INK, lw=1.4)
     axes.set(xlim=(0.0, time[-1]), ylim=(bottom, top))
-    _profile_lines(axes, survey, unit_s, top)
+    _profile_lines(axes, survey, unit_s, top, chart.colours)
     axes.set_xlabel(f"time ({unit})", fontsize=8, color=MUTED)
     axes.set_ylabel("ellipsoidal height (m)", fontsize=8, color=MUTED)
     heading(axes, "Height during the flight, and above ground on the lines", 16.0, weight="bold")
@@ -182,19 +186,19 @@ def _profile(axes: Axes, survey: Survey, track: FloatArray, ground: Ground) -> N
     axes.set_axisbelow(True)
 
 
-def _profile_lines(axes: Axes, survey: Survey, unit_s: float, top: float) -> None:
+def _profile_lines(axes: Axes, survey: Survey, unit_s: float, top: float, colours: Sequence[str]) -> None:
     """Draw each line's time in its colour and its height above ground; its name is above if there is room."""
     crowded = len(survey.strips) > 10
     for number, strip in enumerate(survey.strips):
-        start, end, colour = strip.start_s / unit_s, strip.end_s / unit_s, colour_of(number)
+        start, end, colour = strip.start_s / unit_s, strip.end_s / unit_s, colours[number]
         middle = (start + end) / 2
         axes.axvspan(start, end, color=colour, alpha=0.16, lw=0, zorder=0.5)
         _, above_m = survey.stations(strip)
         look: dict[str, Any] = {"rotation": 90, "fontsize": 6.5} if crowded else {"fontsize": 7.5}
         at_m, text = strip.height_m - 0.5 * float(above_m.mean()), f"{above_m.mean():.0f} m"
-        axes.text(middle, at_m, text, color=colour, ha="center", va="center", **look)
+        axes.text(middle, at_m, text, color=INK, ha="center", va="center", **look)
         if not crowded:
-            axes.text(middle, top, shortened(strip.name, 12), fontsize=6, color=colour, ha="center", va="bottom")
+            axes.text(middle, top, shortened(strip.name, 12), fontsize=6, color=INK, ha="center", va="bottom")
 
 
 def _density(axes: Axes, survey: Survey, grid: Grid) -> None:
@@ -251,7 +255,7 @@ def _bar(axes: Axes, image: Any, labels: Sequence[str]) -> None:
 
 COLUMNS: tuple[tuple[str, float, Callable[[dict[str, Any]], str]], ...] = (  # heading, its place, text of a row
     ("line", 0.03, lambda row: shortened(row["name"], 24)),
-    ("length", 0.32, lambda row: f"{row['length_m']:.0f} m"),
+    ("length", 0.32, lambda row: f"{thousands(row['length_m'])} m"),
     ("time", 0.43, lambda row: f"{row['seconds']:.1f} s"),
     ("above ground\nmin / mean", 0.62, lambda row: f"{row['height_min_m']:.0f} / {row['height_mean_m']:.0f} m"),
     ("swath", 0.74, lambda row: f"{row['swath_m']:.0f} m"),
@@ -260,24 +264,25 @@ COLUMNS: tuple[tuple[str, float, Callable[[dict[str, Any]], str]], ...] = (  # h
 )
 
 
-def _table(axes: Axes, rows: Sequence[dict[str, Any]]) -> None:
+def _table(axes: Axes, rows: Sequence[dict[str, Any]], colours: Sequence[str]) -> None:
     """Draw the summary's rows, each with its line's colour."""
     lines, left_out = rows[:-1][:MOST_ROWS], len(rows) - 1 - MOST_ROWS
+    columns = [column for column in COLUMNS if any(column[2](row) != "–" for row in lines)]
     figure = page_of(axes)
     inches = axes.get_position().height * figure.get_size_inches()[1]
     pitch = min(LARGEST_PITCH_IN, (inches - HEADER_IN) / (len(lines) + (left_out > 0)))
     size = min(8.5, 0.66 * 72.0 * pitch)
     axes.axis("off")
     axes.set(xlim=(0.0, 1.0), ylim=(inches, 0.0))
-    for text, x, _ in COLUMNS:
+    for text, x, _ in columns:
         ha = "left" if x < 0.1 else "right"
         axes.text(x, HEADER_IN - 0.1, text, fontsize=7.5, color=MUTED, ha=ha, va="bottom", linespacing=1.1)
     for number, row in enumerate(lines):
         y = HEADER_IN + (number + 0.5) * pitch
         if number % 2 == 0:
             axes.axhspan(y - pitch / 2, y + pitch / 2, color="#f2f2ec", lw=0)
-        axes.plot([0.008], [y], marker="s", ms=0.6 * size, color=colour_of(number), clip_on=False)
-        for _, x, say in COLUMNS:
+        axes.plot([0.008], [y], marker="s", ms=0.6 * size, color=colours[number], clip_on=False)
+        for _, x, say in columns:
             ha = "left" if x < 0.1 else "right"
             axes.text(x, y, say(row), fontsize=size, color=INK, ha=ha, va="center_baseline")
     if left_out > 0:
