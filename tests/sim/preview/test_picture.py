@@ -19,39 +19,9 @@ from swath.sim.preview.coverage import Strip, Survey, corners, fan_of, grid_of, 
 from swath.sim.preview.picture import _framed, draw_plan
 from swath.sim.scanners.line_heads import LineHead
 from swath.sim.scanners.spinning_heads import Os1Head, Vlp16Head
+from tests.sim.preview.builders import FLAT, flat_plan, line
 
 ACROSS = [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]  # a head whose axis points forward
-FLAT = """
-[flight]
-name = "flat"
-speed_mps = 50.0
-turbulence = "none"
-
-[terrain]
-height_m = 400.0
-
-[control]
-points = 3
-
-[scanner.left]
-prf_hz = 100_000.0
-half_angle_deg = 30.0
-"""
-LINE = """
-[[line]]
-name = "{name}"
-from_m = [{from_m}]
-to_m = [{to_m}]
-height_m = {height_m}
-"""
-
-
-def line(name: str, from_m: str, to_m: str, height_m: float = 800.0) -> str:
-    return LINE.format(name=name, from_m=from_m, to_m=to_m, height_m=height_m)
-
-
-def flat_plan(*lines: str, more: str = "") -> Plan:
-    return parse_plan(FLAT + more + "".join(lines), Path())
 
 
 def strip(plan: Plan, index: int = 0) -> Strip:

@@ -14,7 +14,7 @@ from swath.sim.preview.chart import Chart
 from swath.sim.preview.coverage import Survey
 from swath.sim.preview.picture import draw_plan
 from tests.daemon.processing.pages.builders import overlapping, texts_of
-from tests.sim.preview.test_picture import FLAT, flat_plan, line
+from tests.sim.preview.builders import FLAT, flat_plan, line
 
 
 def parallel(count: int) -> list[str]:
