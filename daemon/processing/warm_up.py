@@ -49,6 +49,7 @@ from swath.georef.arrays import FloatArray, Int64Array, StructArray
 from swath.georef.formats.las import LasSettings, LasWriter
 from swath.georef.geodesy.earth import e_from_geodetic, geodetic_from_e
 from swath.georef.geodesy.gravity import gravity_e
+from swath.georef.mapping.crs_names import plain_code
 from swath.georef.navigation.alignment.align import Aligner
 from swath.georef.navigation.filter.filter import NavigationFilter, run_filter
 from swath.georef.navigation.filter.smoother import forward, smooth
@@ -272,7 +273,7 @@ def _solutions(setup: Setup, gps_ns: int) -> StructArray:
     lat_deg, lon_deg = SOMEWHERE
     crs, area = setup.options.crs or setup.config.output.crs, None
     with contextlib.suppress(pyproj.exceptions.CRSError):
-        area = None if crs is None else pyproj.CRS.from_user_input(crs).area_of_use
+        area = None if crs is None else pyproj.CRS.from_user_input(plain_code(crs)).area_of_use
     if area is not None:
         lat_deg, lon_deg = (area.south + area.north) / 2, (area.west + area.east) / 2
     rows = np.zeros(SECOND_NS // EPOCH_NS, dtype=INS_DTYPE)

@@ -25,6 +25,7 @@ from pyproj.transformer import AreaOfInterest, TransformerGroup
 
 from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.earth import A_M, B_M, e_from_geodetic, geodetic_from_e
+from swath.georef.mapping.crs_names import Place, plain_code, proposals
 
 Area = tuple[float, float, float, float]
 
@@ -32,6 +33,7 @@ ACCURACY_M = 0.05
 ELLIPSOID_M = 0.01  # tolerance of its axes: GRS 80 and WGS 84 differ by a tenth of a millimetre
 WGS84 = "EPSG:4978"
 SAME = "same"
+OUTPUT, DATUM = "output.crs", "datum"  # keys, for messages
 # Common geographic CRS of EPSG's: of plates (within metres of ITRF), and of older surveys.
 CONTINENTS = (4258, 6318, 4617, 7844, 4283, 4167, 6668, 4674, 4148)
 NATIONS = (4230, 4314, 4312, 4275, 4277, 4289, 4313, 4149, 4156, 4284, 4179, 4265, 4124, 4267, 4301, 4202, 4618, 4214)
@@ -49,14 +51,41 @@ class MappingError(ValueError):
     """Raised for a mapping frame, datum or position that is refused: one line with the fault and the remedy."""
 
 
+class UnknownCrsError(MappingError):
+    """Raised for a name of a CRS that PROJ does not know; the message proposes codes.
+
+    Attributes:
+        text: the name.
+        key: the option or key that it was given for.
+    """
+
+    def __init__(self, text: str, key: str, place: Place | None = None) -> None:
+        self.text, self.key = text, key
+        first, *others = proposals(text, place) or ("",)
+        way = "EPSG:CODE, EPSG:CODE+CODE with heights, or WKT"
+        if first:
+            way = ", or ".join([first, *others]) + "; with heights that are not ellipsoidal, EPSG:CODE+CODE"
+        super().__init__(f'{key} = "{text}" is unknown to PROJ; write {way}')
+
+
 @dataclass(frozen=True)
 class Target:
-    """A mapping frame: its horizontal CRS (projected, or geocentric with `vertical` None), and its name."""
+    """A mapping frame: its horizontal CRS (projected, or geocentric with `vertical` None), and its name.
+
+    `key` is the option or the configuration's key that it was given for. The horizontal CRS of control may also be
+    geographic, with three axes.
+    """
 
     text: str
     crs: CRS
     horizontal: CRS
     vertical: CRS | None
+    key: str = OUTPUT
+
+    @property
+    def said(self) -> str:
+        """The key and its value, for messages."""
+        return f'{self.key} = "{self.text}"'
 
     @property
     def datum_name(self) -> str:
@@ -94,31 +123,39 @@ class _Judgement:
     fault: str
 
 
-def read_target(text: str) -> Target:
-    """Return a mapping frame as the user wrote it (any text that PROJ reads).
+def read_target(text: str, key: str = OUTPUT, *, geographic: bool = False) -> Target:
+    """Return a mapping frame as the user wrote it (any text that PROJ reads, or a code that people write otherwise).
+
+    Args:
+        text: the frame.
+        key: the option or key that it was given for, for messages.
+        geographic: accept a geographic CRS, in degrees, too.
 
     Raises:
         MappingError: the frame is not projected (a geocentric one is accepted: ECEF), has axes other than east and
-            north, or counts depths.
+            north, or counts depths; UnknownCrsError: PROJ does not know it.
     """
-    crs = _read(text, "output.crs")
+    text = plain_code(text)
+    crs = _read(text, key)
     parts = crs.sub_crs_list if crs.is_compound else [crs]
     horizontal, vertical = _unbound(parts[0]), parts[1] if crs.is_compound else None
+    said = f'{key} = "{text}"'
+    if horizontal.is_geographic and geographic:
+        if vertical is not None:
+            return Target(text, crs, horizontal, vertical, key)
+        horizontal = horizontal.to_3d()
+        return Target(text, horizontal, horizontal, None, key)
     if horizontal.is_geographic:
         raise MappingError(
-            f'output.crs = "{text}" ({crs.name}) is geographic, in degrees; use a projected CRS, such as "EPSG:326ZZ" '
+            f'{said} ({crs.name}) is geographic, in degrees; use a projected CRS, such as "EPSG:326ZZ" '
             "for UTM zone ZZ north on WGS 84"
         )
     if horizontal.is_vertical:
-        raise MappingError(
-            f'output.crs = "{text}" ({crs.name}) has heights only; write it after a projected CRS, "EPSG:25832+7837"'
-        )
+        raise MappingError(f'{said} ({crs.name}) has heights only; write it after a projected CRS, "EPSG:25832+7837"')
     if not (horizontal.is_projected or (horizontal.is_geocentric and vertical is None)):
-        raise MappingError(
-            f'output.crs = "{text}" ({crs.name}) is neither projected nor geocentric; use a projected CRS'
-        )
-    _refuse_axes(text, crs, horizontal, vertical)
-    return Target(text=text, crs=crs, horizontal=horizontal, vertical=vertical)
+        raise MappingError(f"{said} ({crs.name}) is neither projected nor geocentric; use a projected CRS")
+    _refuse_axes(said, crs, horizontal, vertical)
+    return Target(text=text, crs=crs, horizontal=horizontal, vertical=vertical, key=key)
 
 
 def read_source(datum: str | None, target: Target) -> CRS:
@@ -134,7 +171,7 @@ def read_source(datum: str | None, target: Target) -> CRS:
         source = _geocentric(target.horizontal)
         _refuse_ellipsoid(datum, source)
         return source
-    crs = _unbound(_read(datum, "datum"))
+    crs = _unbound(_read(plain_code(datum), DATUM))
     if not (crs.is_geographic or crs.is_geocentric):
         geodetic = crs.geodetic_crs
         base = "" if geodetic is None else f', "{":".join(geodetic.to_authority() or (geodetic.name,))}"'
@@ -171,7 +208,7 @@ def choose(
         elif whole.missing or not sure or _guesses(whole.operations[0]):
             faults.insert(0, _vertical_fault(whole))
     if faults:
-        raise MappingError(f'output.crs = "{target.text}" ({target.crs.name}): ' + "; and ".join(faults))
+        raise MappingError(f"{target.said} ({target.crs.name}): " + "; and ".join(faults))
     if whole is None or open_still:
         return good[0], not open_still
     return _with_heights(whole.operations[0], good[0], target, used, accuracy_m), True
@@ -309,7 +346,7 @@ def _with_heights(best: Transformer, flat: Operation, target: Target, area: Area
     operation = _operation(best, flat.accuracy_m, flat.realisation, grids or _named_grids(str(best.definition)))
     if _apart_m(operation, flat, area) > max(accuracy_m, flat.stated_accuracy_m or 0.0):
         raise MappingError(
-            f'output.crs = "{target.text}": PROJ\'s operation with heights, "{_short(operation.name)}", is not '
+            f'{target.said}: PROJ\'s operation with heights, "{_short(operation.name)}", is not '
             f'"{_short(flat.name)}" in the plane: use ellipsoidal heights, or another datum'
         )
     return operation
@@ -432,9 +469,11 @@ def _read(text: str, key: str) -> CRS:
     try:
         return CRS.from_user_input(text)
     except CRSError as error:
-        raise MappingError(
-            f'{key} = "{text}" is unknown to PROJ (write EPSG:CODE, EPSG:CODE+CODE with heights, or WKT): {error}'
-        ) from error
+        if key == DATUM:
+            raise MappingError(
+                f'{key} = "{text}" is unknown to PROJ; write EPSG:CODE, a name such as ITRF2014, or WKT'
+            ) from error
+        raise UnknownCrsError(text, key) from error
 
 
 def _unbound(crs: CRS) -> CRS:
@@ -472,12 +511,12 @@ def _geocentric(crs: CRS) -> CRS:
     return CRS.from_json_dict({"type": "GeodeticCRS", **kept, "coordinate_system": system})
 
 
-def _refuse_axes(text: str, crs: CRS, horizontal: CRS, vertical: CRS | None) -> None:
+def _refuse_axes(said: str, crs: CRS, horizontal: CRS, vertical: CRS | None) -> None:
     """Refuse axes that point west, south or down, which PROJ leaves as they are; it swaps northing and easting."""
     if any(axis.direction == "west" for axis in horizontal.axis_info) and horizontal.is_projected:
         raise MappingError(
-            f'output.crs = "{text}" ({crs.name}) counts towards the west and south: points are written as easting, '
+            f"{said} ({crs.name}) counts towards the west and south: points are written as easting, "
             "northing, height, so use the version of the CRS with these axes"
         )
     if vertical is not None and any(axis.direction == "down" for axis in vertical.axis_info):
-        raise MappingError(f'output.crs = "{text}" ({crs.name}) counts depths downwards; use a CRS with heights')
+        raise MappingError(f"{said} ({crs.name}) counts depths downwards; use a CRS with heights")

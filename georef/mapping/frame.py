@@ -24,10 +24,12 @@ from swath.georef.map_fit import degrees_text, misfit_of, outside_deg
 from swath.georef.mapping.cells import APPROXIMATION_M, ROOT_M, MapCells
 from swath.georef.mapping.datums import (
     ACCURACY_M,
+    OUTPUT,
     SAME,
     Area,
     MappingError,
     Operation,
+    Target,
     choose,
     read_source,
     read_target,
@@ -48,7 +50,8 @@ class Mapping:
     `crs` is any text that PROJ reads; `datum` names the realisation of the positions (None: WGS 84, realisation
     unknown; "same": the user states that it is the output's datum); `epoch` is the positions' (decimal years); `area`
     (west, south, east, north, degrees) is where the points lie; `accuracy_m` is the accuracy that the operation must
-    have. Where PROJ knows several operations and no area is given, `settle` or the first mapped point decides.
+    have; `key` is the option that names it, for messages; `geographic` accepts degrees, east before north. Where PROJ
+    knows several operations and no area is given, `settle` or the first mapped point decides.
 
     Raises MappingError, at once or later, for a frame or an operation that is refused.
     """
@@ -61,11 +64,13 @@ class Mapping:
         epoch: float | None = None,
         area: Area | None = None,
         accuracy_m: float = ACCURACY_M,
+        key: str = OUTPUT,
+        geographic: bool = False,
     ) -> None:
         self._said = (crs, datum, epoch, accuracy_m)
         self._area = area
         self._epoch = _checked_epoch(epoch)
-        self._target = read_target(crs)
+        self._target = read_target(crs, key, geographic=geographic)
         self._source = read_source(datum, self._target)
         self._operation: Operation | None = None
         operation, settled = choose(self._source, self._target, datum, area, accuracy_m)
@@ -74,11 +79,15 @@ class Mapping:
             self._take(operation)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {"said": self._said, "area": self._area, "operation": self._operation}
+        key, geographic = self._target.key, bool(self._target.horizontal.is_geographic)
+        said = (*self._said, key, geographic)
+        return {"said": said, "area": self._area, "operation": self._operation}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        crs, datum, epoch, _ = self._said = state["said"]
-        self._area, self._epoch, self._target = state["area"], epoch, read_target(crs)
+        crs, datum, epoch, accuracy_m, key, geographic = state["said"]
+        self._said = (crs, datum, epoch, accuracy_m)
+        self._area, self._epoch = state["area"], epoch
+        self._target = read_target(crs, key, geographic=geographic)
         self._source = read_source(datum, self._target)
         self._operation = None
         if state["operation"] is not None:
@@ -88,6 +97,23 @@ class Mapping:
     def wkt(self) -> str:
         """Well-known text of the whole CRS: version 1 as LAS 1.4 demands (OGC 01-009), or 2 if 1 cannot express it."""
         return _wkt(self._target.crs)
+
+    def beside(self, crs: str, key: str) -> Mapping:
+        """Return a frame of another CRS, which may be geographic, for positions of this one's datum and epoch.
+
+        Raises:
+            MappingError: as the constructor.
+        """
+        _, datum, epoch, accuracy_m = self._said
+        if datum == SAME:
+            authority = self._source.to_authority()
+            datum = ":".join(authority) if authority else self._source.to_json()
+        return Mapping(crs, datum=datum, epoch=epoch, accuracy_m=accuracy_m, key=key, geographic=True)
+
+    @property
+    def target(self) -> Target:
+        """The CRS and its parts."""
+        return self._target
 
     @property
     def datum_crs(self) -> CRS:
@@ -114,9 +140,7 @@ class Mapping:
         if self._geocentric or not len(points_e):
             return ""
         lat, lon, _ = (np.degrees(angle) for angle in geodetic_from_e(points_e))
-        return misfit_of(
-            self._target.horizontal, f'output.crs = "{self._target.text}" ({self._target.crs.name})', lat, lon
-        )
+        return misfit_of(self._target.horizontal, f"{self._target.said} ({self._target.crs.name})", lat, lon)
 
     def settle(self, points_e: ArrayLike) -> None:
         """Choose the operation for positions in e (n, 3) if it is still open; call this before sharing out work.
@@ -184,14 +208,12 @@ class Mapping:
         """Return PROJ's own results (n, 3), which `map_from_e` approximates."""
         points = np.ascontiguousarray(points_e, dtype=np.float64)
         self._settle_by_first(points)
-        return _finite(self._forward(points), points, self._target.text)
+        return _finite(self._forward(points), points, self._target.said)
 
     def e_from_map(self, points_map: FloatArray) -> FloatArray:
         """Return positions in e (n, 3) of easting, northing, height (n, 3), by PROJ. The operation must be settled."""
         if self._operation is None:
-            raise MappingError(
-                f'output.crs = "{self._target.text}": the operation that leads to this CRS is not yet chosen'
-            )
+            raise MappingError(f"{self._target.said}: the operation that leads to this CRS is not yet chosen")
         points = np.ascontiguousarray(points_map, dtype=np.float64)
         found = self._transform(points, TransformDirection.INVERSE)
         wrong = np.flatnonzero(~np.isfinite(found).all(axis=1))
@@ -263,7 +285,7 @@ class Mapping:
     def _refuse_timeless(self, operation: Operation) -> None:
         if operation.moves and self._epoch is None:
             raise MappingError(
-                f'output.crs = "{self._target.text}": "{operation.name.split(" + ")[0]}" changes with time: give the '
+                f'{self._target.said}: "{operation.name.split(" + ")[0]}" changes with time: give the '
                 "epoch of the positions, such as output.epoch = 2026.9"
             )
 
@@ -291,7 +313,7 @@ class Mapping:
         if len(far):
             where = degrees_text(float(lat[far[0]]), float(lon[far[0]]), 1)
             raise MappingError(
-                f'output.crs = "{self._target.text}" ({self._target.crs.name}) is used from {area.west:g}° to '
+                f"{self._target.said} ({self._target.crs.name}) is used from {area.west:g}° to "
                 f"{area.east:g}° E, {area.south:g}° to {area.north:g}° N: points lie more than 1000 km outside, "
                 f"at {where}"
             )
@@ -333,12 +355,12 @@ def _wrapped(lon_deg: float) -> float:
     return (lon_deg + 180.0) % 360.0 - 180.0
 
 
-def _finite(mapped: FloatArray, points_e: FloatArray, text: str) -> FloatArray:
+def _finite(mapped: FloatArray, points_e: FloatArray, said: str) -> FloatArray:
     """Return ``mapped`` if all of it is finite; else refuse it, naming the first place without coordinates."""
     wrong = np.flatnonzero(~np.isfinite(mapped).all(axis=1))
     if len(wrong):
         raise MappingError(
-            f'output.crs = "{text}" has no coordinates for {len(wrong)} points, the first at '
+            f"{said} has no coordinates for {len(wrong)} points, the first at "
             f"{_place(points_e[wrong[0]])}: they lie outside the domain of the projection or of its grids"
         )
     return mapped

@@ -14,6 +14,7 @@ from pyproj import CRS
 
 from swath.daemon.errors import ConfigError, ExitCode, UserError
 from swath.daemon.log.chunk_index import Listening, LogIndex, index_log
+from swath.daemon.log.parsers import stored_config
 from swath.daemon.log.reader import Session, open_logs
 from swath.daemon.processing.carried_verdict import (
     Carried,
@@ -23,6 +24,7 @@ from swath.daemon.processing.carried_verdict import (
     verdict_entry,
 )
 from swath.daemon.processing.files import refuse_no_name
+from swath.daemon.processing.flights.flight_places import flight_places
 from swath.daemon.processing.flights.trajectory_choice import TrajectoryOptions, choose_trajectory
 from swath.daemon.processing.head_clocks import find_stamps, stamp_lines
 from swath.daemon.processing.points.clocks import LogClocks, read_clocks
@@ -30,6 +32,8 @@ from swath.daemon.processing.points.time_checks import refuse_no_time, time_trou
 from swath.daemon.processing.points.workers import refuse_in_import
 from swath.daemon.processing.setup.setup import Options, Setup
 from swath.daemon.text_files import text_of
+from swath.georef.mapping.crs_names import plain_code
+from swath.georef.mapping.datums import UnknownCrsError
 from swath.georef.progress import BYTES
 from swath.georef.strips import Span, StripRules, cut, laser_spans, read_strips, straight_spans
 from swath.georef.trajectory.trajectory import Trajectory, gps_text
@@ -40,7 +44,6 @@ if TYPE_CHECKING:
     from swath.daemon.config.config import Config
     from swath.daemon.processing.navigation.navigate import Navigated
     from swath.daemon.processing.points.jobs import JobResult
-    from swath.daemon.processing.setup.setup import Options
     from swath.georef.progress import Tell
     from swath.georef.timescales import ClockStatus
 
@@ -216,19 +219,36 @@ def read_flights(
 
 
 def _setup(request: GeorefOptions, session: Session) -> Setup:
-    if request.config is None:
-        try:
+    config = request.config
+    try:
+        if config is None:
             setup = Setup.of_log(session.attachments(), request.options)
-        except UserError as error:
-            lines = of_log(session.parts[0].path, error.message.splitlines(), request.options)
-            raise UserError("\n".join(lines), error.exit_code) from error
-    else:
-        setup = Setup.of_config(request.config, request.options)
+        else:
+            setup = Setup.of_config(config, request.options)
+    except UserError as error:
+        if isinstance(error.__cause__, UnknownCrsError):
+            error = _with_likely_crs(error.__cause__, session, config)
+        lines = error.message.splitlines()
+        if config is None:
+            lines = of_log(session.parts[0].path, lines, request.options)
+        raise UserError("\n".join(lines), error.exit_code) from error
     crs = request.options.crs or setup.config.output.crs
     if crs is None:
         raise UserError(f"{session.parts[0].path}: its configuration has no output.crs; give --crs", ExitCode.USAGE)
     refuse_geocentric(crs)
     return setup
+
+
+def _with_likely_crs(error: UnknownCrsError, session: Session, config: Config | None) -> ConfigError:
+    """Return the error of an unknown CRS with proposals for the place of the flight."""
+    attachments = session.attachments()
+    if config is None:
+        config = stored_config(attachments)
+    else:
+        attachments = {name: data for name, _, data in config.attachments()}
+    places = np.empty((0, 2)) if config is None else flight_places(session, config, attachments)
+    place = (float(places[0, 0]), float(places[0, 1])) if len(places) else None
+    return ConfigError(str(UnknownCrsError(error.text, error.key, place)))
 
 
 def _read(session: Session, setup: Setup, tell: Tell, *, positions: bool) -> Flight:
@@ -421,7 +441,7 @@ def refuse_geocentric(crs: str) -> None:
     Raises:
         UserError: the CRS is geocentric.
     """
-    read = CRS.from_user_input(crs)
+    read = CRS.from_user_input(plain_code(crs))
     if read.is_geocentric:
         raise UserError(
             f'output.crs = "{crs}" ({read.name}) is geocentric; point files need a projected CRS, such as '

@@ -225,6 +225,19 @@ def on_log(judged: Judged, command: str, output: Path, trajectory: str) -> list[
 # ---------------------------------------------------------------------- maps that do not suit
 
 
+def test_the_likely_code_for_the_flights_place_is_proposed_for_an_unknown_name(
+    judged: Judged, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    capsys.readouterr()
+    assert run_app(judged.georef(tmp_path / "out", "--crs", "UTM32")) == ExitCode.USAGE
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(
+        'swath: output.crs = "UTM32" is unknown to PROJ; write EPSG:25832 (ETRS89 / UTM zone 32N), or EPSG:32632'
+    )
+    assert run_app(judged.georef(tmp_path / "out", "--crs", "epsg: 4978")) == ExitCode.USAGE
+    assert 'output.crs = "epsg: 4978" (WGS 84) is geocentric' in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("crs", "words"),
     [
