@@ -43,6 +43,7 @@ IMPORTED_LATE = {
         "swath.daemon.processing.calibration.report",
         "swath.daemon.processing.pages",
     },
+    "swath.daemon.processing.control.layers": {"shapefile"},  # for shapefiles only
     "swath.daemon.processing.flights.trajectory_choice": {"swath.georef.trajectory.turn_rates"},  # scipy.signal
     "swath.daemon.processing.pages.pdf": {"weasyprint"},
     "swath.daemon.processing.setup.terrain": {"rasterio"},

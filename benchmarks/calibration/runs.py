@@ -17,7 +17,7 @@ import numpy as np
 from scipy.linalg import cholesky
 
 from swath.calib.adjust import adjust
-from swath.calib.control.points import control_planes, in_t, read_control
+from swath.calib.control.points import control_planes, in_t
 from swath.calib.equations.solve import Settings
 from swath.calib.equations.trajectory_prior import Knots, TrajectoryPrior, apply, from_smoother, knots_of
 from swath.calib.features import Features, Patch, Plane
@@ -27,6 +27,8 @@ from swath.calib.planes.fit import PlaneSettings
 from swath.calib.planes.returns import thinned
 from swath.calib.planes.search import find_planes
 from swath.daemon.processing.calibration.returns import KNOT_S, read_flight, replaced
+from swath.daemon.processing.control.place import place_control
+from swath.daemon.processing.control.text import read_text
 from swath.daemon.processing.flights.read import GeorefOptions as Logs
 from swath.daemon.processing.flights.trajectory_choice import TrajectoryOptions
 from swath.daemon.processing.setup.setup import Options
@@ -104,7 +106,10 @@ def read_reference(folder: Path, work: Path, rows: int, workers: int) -> tuple[R
     true_calibration = read_calibration((folder / f"{head.name}.true.toml").read_text("utf-8"), "truth")
     truth = head.start.changed(**{name: true_calibration.value(name) for name in MODELS[MODEL.model]})
     flight = replaced(kept.flight, {head.name: truth}, work, "truth")
-    surveyed = in_t(read_control((folder / "control.csv").read_text("utf-8"), "control.csv"), flight.frame)
+    mapping = kept.logged[0].setup.mapping
+    assert mapping is not None
+    table = read_text((folder / "control.csv").read_text("utf-8"), Path("control.csv"))
+    surveyed = in_t(place_control(table, None, mapping, np.empty((0, 2))).points, flight.frame)
     planes = find_planes(flight, PlaneSettings(most_points=MOST_POINTS))
     features = fewer(Features.joined([planes, control_planes(flight, surveyed)]), rows)
     compact, features = own_returns(flight, features)

@@ -31,6 +31,7 @@ THINNED_TO = 20_000  # returns of a swath that represent its extent
 SURE_SIGMAS = 5.0
 SWATHS_APART = 0.5  # of the heights' spread; swaths farther apart show a wrong boresight
 GEOIDS = ((3855, "EGM2008"), (5773, "EGM96"))
+GIVE_HEIGHTS = "give heights above the ellipsoid, or the CRS of the control with its vertical part"
 COMPASS = ("north", "north-east", "east", "south-east", "south", "south-west", "west", "north-west")
 
 
@@ -39,7 +40,8 @@ class Doubt:
     """A doubt about control.
 
     Attributes:
-        kind: ``outside``, ``orthometric``, ``height``, ``shift`` of all control; ``point`` of single points.
+        kind: ``outside``, ``orthometric``, ``ellipsoidal``, ``height``, ``shift`` of all control; ``point`` of single
+            points.
         text: one line for the user.
         points: names of the points concerned.
     """
@@ -116,7 +118,7 @@ def _outside(flight: Flight, points: Sequence[ControlPoint], seen: set[int], rul
         return (Doubt("point", text, names),)
     text = (
         f"no control point lies within the flight: the nearest, {nearest}, is {_length(least_m)} from its returns; "
-        "give geodetic latitude and longitude in degrees, in the area of the flight"
+        "give control in the area of the flight, and the CRS of its coordinates"
     )
     return (Doubt("outside", text, names),)
 
@@ -147,12 +149,16 @@ def _heights(
     known = undulation(places_e)
     if known is not None and abs(known[0]) > 1.0 and abs(middle_m + known[0]) < max(1.0, 0.1 * abs(known[0])):
         text = f"{what}, as orthometric heights would lie; the undulation there is {known[0]:.1f} m ({known[1]})"
-        return (Doubt("orthometric", f"{text}; give heights above the ellipsoid", names),)
+        return (Doubt("orthometric", f"{text}; {GIVE_HEIGHTS}", names),)
+    if known is not None and abs(known[0]) > 1.0 and abs(middle_m - known[0]) < max(1.0, 0.1 * abs(known[0])):
+        text = f"{what}, as ellipsoidal heights read as heights above the geoid would lie; the undulation there is "
+        text += f"{known[0]:.1f} m ({known[1]})"
+        return (Doubt("ellipsoidal", f"{text}; give the CRS of the control without its vertical part", names),)
     if ground_m > 30.0 and abs((ground_m + middle_m) / ground_m - FEET) < 0.1:
         return (Doubt("height", f"{what}, as heights in feet would lie; give metres above the ellipsoid", names),)
     if known is None and ORTHOMETRIC_M[0] <= abs(middle_m) <= ORTHOMETRIC_M[1]:
         text = f"{what}, as orthometric heights would lie where the undulation is {-middle_m:.1f} m"
-        return (Doubt("orthometric", f"{text}; give heights above the ellipsoid", names),)
+        return (Doubt("orthometric", f"{text}; {GIVE_HEIGHTS}", names),)
     not_geoid = "" if known is None else f"; this is not the undulation of {known[1]}, which is {known[0]:.1f} m there"
     text = f"{what} (± {spread_m / math.sqrt(len(above_m)):.2f} m), as in another height reference or datum{not_geoid}"
     return (Doubt("height", text, names),)

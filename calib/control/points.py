@@ -1,4 +1,4 @@
-"""Read surveyed ground control points and find the planes of the swaths' returns on which they lie.
+"""Take surveyed ground control points and find the planes of the swaths' returns on which they lie.
 
 A surveyed point is only useful if the ground around it is flat: a plane is fitted to each swath's returns around the
 point, and the point must lie within these returns. Heights are never extrapolated beyond returns.
@@ -20,11 +20,6 @@ from swath.calib.planes.local import LocalPlane, PlaneRules, is_inside, robust_p
 from swath.georef.arrays import BoolArray, FloatArray, Int64Array
 from swath.georef.geodesy.earth import e_from_geodetic
 
-COLUMNS = ("name", "lat_deg", "lon_deg", "h_ellipsoidal_m", "sigma_m")
-HEADER = ",".join(COLUMNS)
-SMALLEST_SIGMA_M = 1e-6
-LIMITS = {"lat_deg": 90.0, "lon_deg": 360.0, "h_ellipsoidal_m": 9000.0, "sigma_m": 10.0}
-MOST_MISTAKES = 10
 SAME_PLACE_M = 0.01
 BLOCK = 1_000_000  # returns that are processed at a time
 CELLS_A_SIDE = 4096  # at most, of the grid that excludes returns far from all points
@@ -36,7 +31,8 @@ class ControlError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Surveyed:
-    """A surveyed point as given in its file: radians, metres above the ellipsoid, one sigma of each coordinate."""
+    """A surveyed point: geodetic in the datum of the flight's positions, radians, metres
+    above the ellipsoid, one sigma of each coordinate."""
 
     name: str
     lat_rad: float
@@ -85,97 +81,14 @@ class Ground:
     above_m: float
 
 
-def read_control(text: str, name: str) -> tuple[Surveyed, ...]:
-    """Read surveyed points (CONVENTIONS, "Trajectory and text files").
-
-    Args:
-        text: of the file, with the header `HEADER`; lines that are empty or begin with # are ignored.
-        name: of the file, for messages.
-
-    Raises:
-        ControlError: one line for each of the first `MOST_MISTAKES` mistakes.
-    """
-    lines = [(number, line.strip()) for number, line in enumerate(text.lstrip("\ufeff").splitlines(), start=1)]
-    lines = [(number, line) for number, line in lines if line and not line.startswith("#")]
-    if not lines:
-        raise ControlError(f"{name}: the file is empty; it needs the header {HEADER} and one line for each point")
-    number, header = lines[0]
-    if tuple(column.strip() for column in header.split(",")) != COLUMNS:
-        raise ControlError(f"{name}: line {number}: the header must be {HEADER}{_other_header(header)}")
-    mistakes: list[str] = []
-    points = [(number, _point(line, number, mistakes)) for number, line in lines[1:]]
-    read = [(number, point) for number, point in points if point is not None]
-    mistakes += _twice(read)
-    if not points:
-        mistakes.append(f"line {number}: no points follow the header; add one line for each point")
-    if mistakes:
-        raise ControlError("\n".join(f"{name}: {mistake}" for mistake in mistakes[:MOST_MISTAKES]))
-    return tuple(point for _, point in read)
-
-
-def _other_header(header: str) -> str:
-    """Return a hint about the likely mistake in a wrong header."""
-    if ";" in header or "\t" in header:
-        return ", with commas between the columns"
-    missing = [column for column in COLUMNS if column not in header]
-    return f"; {', '.join(missing)} missing" if len(missing) < len(COLUMNS) and missing else ""
-
-
-def _point(line: str, number: int, mistakes: list[str]) -> Surveyed | None:
-    fields = [field.strip() for field in line.split(",")]
-    if len(fields) != len(COLUMNS):
-        mistakes.append(f"line {number}: {len(fields)} fields instead of {len(COLUMNS)}: {HEADER}")
-        return None
-    before = len(mistakes)
-    if not fields[0]:
-        mistakes.append(f"line {number}: the point has no name")
-    values = {
-        column: _number(field, column, number, mistakes) for column, field in zip(COLUMNS[1:], fields[1:], strict=True)
-    }
-    if len(mistakes) > before:
-        return None
-    lat, lon, height, sigma = values.values()
-    return Surveyed(fields[0], math.radians(lat), math.radians(lon), height, sigma)
-
-
-def _number(field: str, column: str, line: int, mistakes: list[str]) -> float:
-    try:
-        value = float(field)
-    except ValueError:
-        value = math.nan
-    least, most = (0.0 if column == "sigma_m" else -LIMITS[column]), LIMITS[column]
-    if not least <= value <= most or (column == "sigma_m" and value < SMALLEST_SIGMA_M):
-        unit = column.rpartition("_")[2].replace("deg", "degrees").replace("m", "metres", 1)
-        hint = (
-            "; are these map coordinates in metres?" if column in ("lat_deg", "lon_deg") and abs(value) > 1000.0 else ""
-        )
-        want = f"{unit} above 0, at most {most:g}" if column == "sigma_m" else f"{unit} from {least:g} to {most:g}"
-        mistakes.append(f'line {line}: {column}: got "{field}", want {want}{hint}')
-    return value
-
-
-def _twice(read: Sequence[tuple[int, Surveyed]]) -> list[str]:
-    """Report points that occur twice: the same name, or the same place under two names, would count twice."""
-    mistakes: list[str] = []
-    names: dict[str, int] = {}
-    for line, point in read:
-        if point.name in names:
-            mistakes.append(
-                f"line {line}: {point.name} already stands in line {names[point.name]}; list each point once"
-            )
-        names.setdefault(point.name, line)
-    if len(read) > 1:
-        places = e_from_geodetic(*np.array([[p.lat_rad, p.lon_rad, p.height_m] for _, p in read]).T)
-        distance, nearest = cKDTree(places).query(places, k=2, distance_upper_bound=SAME_PLACE_M)
-        found = {tuple(sorted(pair)) for pair in nearest[np.isfinite(distance).all(axis=1)].tolist()}
-        for one_at, other_at in sorted(found):
-            (line, one), (other_line, other) = read[one_at], read[other_at]
-            if one.name != other.name:
-                mistakes.append(
-                    f"line {other_line}: {other.name} has the position of {one.name} in line {line}; list each "
-                    "point once"
-                )
-    return mistakes
+def same_places(points: Sequence[Surveyed]) -> list[tuple[int, int]]:
+    """Return indexes of points that have the place of an earlier one, each with the earlier one's."""
+    if len(points) < 2:
+        return []
+    places = e_from_geodetic(*np.array([[one.lat_rad, one.lon_rad, one.height_m] for one in points]).T)
+    distance, nearest = cKDTree(places).query(places, k=2, distance_upper_bound=SAME_PLACE_M)
+    found = {tuple(sorted(pair)) for pair in nearest[np.isfinite(distance).all(axis=1)].tolist()}
+    return [(later, earlier) for earlier, later in sorted(found)]
 
 
 def in_t(surveyed: Sequence[Surveyed], frame: Tangent) -> tuple[ControlPoint, ...]:

@@ -13,6 +13,9 @@ import typer
 
 from swath.daemon.cli.options import (
     AcceptVerdict,
+    ControlColumns,
+    ControlCrs,
+    ControlPath,
     ForceCrs,
     ForceTrajectory,
     TrajectoryDatum,
@@ -39,10 +42,9 @@ def command(
     ] = None,
     at: TrajectoryPoint = "body",
     week: TrajectoryWeek = None,
-    control: Annotated[
-        Path | None,
-        typer.Option(metavar="CSV", help="Control points: name, lat_deg, lon_deg, h_ellipsoidal_m, sigma_m"),
-    ] = None,
+    control: ControlPath = None,
+    control_crs: ControlCrs = None,
+    control_columns: ControlColumns = None,
     ties: Annotated[
         Path | None, typer.Option(metavar="CSV", help="Picked tie points: name, strip, x, y, z, sigma_m in output.crs.")
     ] = None,
@@ -96,6 +98,12 @@ def command(
     --accept-verdict (the file is written and holds the verdict).
     """
     require_installed("swath calibrate", *(PRINTED_PAGES if report else ()))
+    from swath.daemon.processing.control.files import read_control_file
+
+    _refuse(output, observe, overwrite=overwrite)
+    if facts is not None and report is None:
+        raise UserError("--facts needs --report DIR, because facts are written to the record", ExitCode.USAGE)
+    surveyed = read_control_file(control, control_crs, control_columns)  # before all that takes seconds to import
     from swath.daemon.cli.georef import calibrations_given
     from swath.daemon.cli.progress import progress_bar
     from swath.daemon.config import load_config
@@ -107,9 +115,6 @@ def command(
     from swath.daemon.processing.flights.trajectory_choice import TrajectoryOptions
     from swath.daemon.processing.setup.setup import Options
 
-    _refuse(output, observe, overwrite=overwrite)
-    if facts is not None and report is None:
-        raise UserError("--facts needs --report DIR, because facts are written to the record", ExitCode.USAGE)
     request = CalibrationOptions(
         logs=GeorefOptions(
             logs=logs,
@@ -131,7 +136,7 @@ def command(
         output=output,
         model=model_of(model, fix, free, prior or []),
         model_file=file_of(model),
-        control=control,
+        control=surveyed,
         ties=ties,
         polygons=polygons,
         observe=tuple(observe.split(",")),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -27,4 +28,28 @@ ForceCrs = Annotated[
 ]
 AcceptVerdict = Annotated[
     bool, typer.Option("--accept-verdict", help='Exit with code 0 even if the verdict is "Not to be used".')
+]
+ControlPath = Annotated[
+    Path | None,
+    typer.Option(
+        "--control",
+        metavar="FILE",
+        help="Control points: text with name, E, N, H or name, lat, lon, h; GeoPackage; shapefile.",
+    ),
+]
+ControlCrs = Annotated[
+    str | None,
+    typer.Option(
+        "--control-crs",
+        metavar="CRS",
+        help="CRS of the control, such as EPSG:25832+7837; default: the file's own, or output.crs.",
+    ),
+]
+ControlColumns = Annotated[
+    str | None,
+    typer.Option(
+        "--control-columns",
+        metavar="NAME,…",
+        help="Columns of a control file without header, such as name,E,N,H,-,sigma.",
+    ),
 ]

@@ -12,11 +12,20 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from swath.daemon.cli.options import AcceptVerdict, ForceTrajectory, TrajectoryDatum, TrajectoryPoint
+from swath.daemon.cli.options import (
+    AcceptVerdict,
+    ControlColumns,
+    ControlCrs,
+    ControlPath,
+    ForceTrajectory,
+    TrajectoryDatum,
+    TrajectoryPoint,
+)
 from swath.daemon.errors import ExitCode, UserError, one_line
 from swath.daemon.processing.requirements import PRINTED_PAGES, require_installed
 
 if TYPE_CHECKING:
+    from swath.daemon.processing.control.files import ControlFile
     from swath.daemon.processing.flights.read import GeorefOptions
 
 SMALLEST_CELL_M, LARGEST_CELL_M = 0.05, 100.0
@@ -73,12 +82,9 @@ def command(
             metavar="DIR", help="Correct the trajectory of each strip with a fixed calibration; write to DIR."
         ),
     ] = None,
-    control: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="CSV", help="Control points for --adjust: name, lat_deg, lon_deg, h_ellipsoidal_m, sigma_m"
-        ),
-    ] = None,
+    control: ControlPath = None,
+    control_crs: ControlCrs = None,
+    control_columns: ControlColumns = None,
     strip_model: Annotated[
         str,
         typer.Option(
@@ -102,6 +108,7 @@ def command(
     require_installed("swath strips", *(PRINTED_PAGES if output else ()))
     from swath.daemon.cli.georef import calibrations_given
     from swath.daemon.config import load_config
+    from swath.daemon.processing.control.files import read_control_file
     from swath.daemon.processing.flights.read import GeorefOptions
     from swath.daemon.processing.flights.trajectory_choice import TrajectoryOptions
     from swath.daemon.processing.setup.setup import Options
@@ -125,10 +132,12 @@ def command(
     )
     if adjust is not None:
         _refuse_besides(("--before", before), ("--output", output), ("--level", level), ("--cell", cell))
-        _adjust(logs, adjust, control, strip_model, overwrite=overwrite, as_json=as_json)
+        surveyed = read_control_file(control, control_crs, control_columns)
+        _adjust(logs, adjust, surveyed, strip_model, overwrite=overwrite, as_json=as_json)
         return
-    if control or overwrite or strip_model != "auto":
-        named = "--control" if control else "--overwrite" if overwrite else "--strip-model"
+    if control or control_crs or control_columns or overwrite or strip_model != "auto":
+        of_control = control or control_crs or control_columns
+        named = "--control" if of_control else "--overwrite" if overwrite else "--strip-model"
         raise UserError(f"{named} needs --adjust DIR, because only an adjustment uses it", ExitCode.USAGE)
     _compare(logs, before or (), (cells, cell), output, level, as_json=as_json, all_pairs=all_pairs)
 
@@ -166,7 +175,7 @@ def _compare(
 
 
 def _adjust(
-    logs: GeorefOptions, folder: Path, control: Path | None, strip_model: str, *, overwrite: bool, as_json: bool
+    logs: GeorefOptions, folder: Path, control: ControlFile | None, strip_model: str, *, overwrite: bool, as_json: bool
 ) -> None:
     from swath.daemon.cli.progress import progress_bar
     from swath.daemon.processing.carried_verdict import refusal

@@ -11,7 +11,16 @@ from typing import Annotated
 
 import typer
 
-from swath.daemon.cli.options import AcceptVerdict, ForceTrajectory, TrajectoryDatum, TrajectoryPoint, TrajectoryWeek
+from swath.daemon.cli.options import (
+    AcceptVerdict,
+    ControlColumns,
+    ControlCrs,
+    ControlPath,
+    ForceTrajectory,
+    TrajectoryDatum,
+    TrajectoryPoint,
+    TrajectoryWeek,
+)
 from swath.daemon.errors import ExitCode, UserError, one_line
 from swath.daemon.processing.requirements import PRINTED_PAGES, require_installed
 from swath.daemon.text_files import text_of
@@ -29,10 +38,9 @@ def command(
         list[Path] | None,
         typer.Option(metavar="FILE", help="Calibration of another scanner in the same logs; repeatable."),
     ] = None,
-    control: Annotated[
-        Path | None,
-        typer.Option(metavar="CSV", help="Control points: name, lat_deg, lon_deg, h_ellipsoidal_m, sigma_m"),
-    ] = None,
+    control: ControlPath = None,
+    control_crs: ControlCrs = None,
+    control_columns: ControlColumns = None,
     anew: Annotated[
         bool, typer.Option("--anew", help="Also estimate the parameters from these logs and compare.")
     ] = False,
@@ -77,12 +85,7 @@ def command(
     at all, could not be made.
     """
     require_installed("swath validate", *PRINTED_PAGES)
-    from swath.daemon.cli.progress import progress_bar
-    from swath.daemon.config import load_config
-    from swath.daemon.processing.flights.read import GeorefOptions
-    from swath.daemon.processing.flights.trajectory_choice import TrajectoryOptions
-    from swath.daemon.processing.setup.setup import Options
-    from swath.daemon.processing.validation.run import ValidationOptions, read_file, run_validation
+    from swath.daemon.processing.control.files import read_control_file
 
     if not logs and not past:
         raise UserError("nothing to validate against; give LOG… or --history", ExitCode.USAGE)
@@ -91,6 +94,14 @@ def command(
             "--record needs LOG… and --output DIR, because the new record holds the results from the logs",
             ExitCode.USAGE,
         )
+    surveyed = read_control_file(control, control_crs, control_columns)  # before all that takes seconds to import
+    from swath.daemon.cli.progress import progress_bar
+    from swath.daemon.config import load_config
+    from swath.daemon.processing.flights.read import GeorefOptions
+    from swath.daemon.processing.flights.trajectory_choice import TrajectoryOptions
+    from swath.daemon.processing.setup.setup import Options
+    from swath.daemon.processing.validation.run import ValidationOptions, read_file, run_validation
+
     files = [calibration, *(also or [])]
     given = {read_file(path).scanner: (text_of(path, "a calibration file"), str(path)) for path in files}
     if len(given) < len(files):
@@ -109,7 +120,7 @@ def command(
             workers=workers or os.cpu_count() or 1,
             accept_verdict=accept_verdict,
         ),
-        control=control,
+        control=surveyed,
         histories=past or (),
         anew=anew,
         output=output,

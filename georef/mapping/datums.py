@@ -320,7 +320,10 @@ def _refusal(flat: _Candidates, judged: list[_Judgement], target: Target, datum:
     same = f", or {_SAME.format(datum=target.datum_name)}" if _has_our_ellipsoid(target.horizontal) else ""
     if datum is None:
         return f"the positions are in WGS 84 of unknown realisation, and {first.fault}: {_NAMED}{same}"
-    fault = f'the positions are in "{datum}", and {first.fault}: name another datum{same}'
+    if target.key != OUTPUT:  # coordinates that are compared with the positions, whose datum is settled
+        fault = f"the flight's positions are in \"{datum}\", and {first.fault}: give coordinates of the flight's datum"
+    else:
+        fault = f'the positions are in "{datum}", and {first.fault}: name another datum{same}'
     if first.operation is None:
         return fault
     return f"{fault}; or accept it with output.datum_accuracy_m = {first.operation.accuracy_m:g}"

@@ -6,9 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from swath.calib.control.points import HEADER, read_control
 from swath.daemon.config import load_config
 from swath.daemon.errors import ConfigError, ExitCode, UserError
+from swath.daemon.processing.control.table import HEADER
+from swath.daemon.processing.control.text import read_text
 from swath.daemon.text_files import text_of
 from swath.sim.plan.plan import load_plan
 from tests.daemon.rig import session_table
@@ -20,8 +21,7 @@ ENCODINGS = ["utf-8", "utf-8-sig", "utf-16", "utf-32"]  # the latter three with 
 def test_control_points_are_read_by_their_byte_order_mark(tmp_path: Path, encoding: str) -> None:
     file = tmp_path / "control.csv"
     file.write_bytes(f"{HEADER}\r\nKürbis,47.5,8.95,510.0,0.01\r\n".encode(encoding))
-    (point,) = read_control(text_of(file), str(file))
-    assert point.name == "Kürbis"
+    assert read_text(text_of(file), file).names == ("Kürbis",)
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from swath.calib.calibration_file import CalibrationFileError, Header, calibration_text
-from swath.calib.control.points import HEADER, ControlError, in_t, read_control
+from swath.calib.control.points import ControlError, in_t
 from swath.calib.flight import Tangent
 from swath.calib.record.record import (
     Record,
@@ -31,11 +31,15 @@ from swath.calib.validation.history import HistoryError, history
 from swath.daemon.processing.calibration.inputs import PolygonError, read_polygons
 from swath.daemon.processing.calibration.model import read_model
 from swath.daemon.processing.calibration.record import facts_of
+from swath.daemon.processing.control.place import place_control
+from swath.daemon.processing.control.table import HEADER
+from swath.daemon.processing.control.text import read_text
 from swath.daemon.processing.flights.read import _given_strips
 from swath.daemon.processing.validation.run import _entry, read_file
 from swath.daemon.simulate.plans import FlightOptions
 from swath.daemon.text_files import text_of
 from swath.georef.geodesy.earth import e_from_geodetic
+from swath.georef.mapping.frame import Mapping
 from swath.georef.scanner.beams import GeometryError, read_fibres
 from swath.georef.scanner.calibration import INDEX, BeamCorrection, Calibration, RangeOffset, nominal
 from swath.georef.strips import CSV_COLUMNS, StripError
@@ -66,14 +70,19 @@ def office_targets() -> Iterator[tuple[str, Callable[[], Target]]]:
 
 def _control() -> Target:
     text = f"# survey\n{HEADER}\nP1,47.5,8.9,450.123,0.01\nP2,47.501,8.902,451.5,0.02\n\nP3,47.502,8.9,449,0.01\n"
-    frame = Tangent.at(e_from_geodetic(*np.array([[0.829], [0.155], [450.0]]))[0])
+    frame, mapping = Tangent.at(e_from_geodetic(*np.array([[0.829], [0.155], [450.0]]))[0]), Mapping("EPSG:32632")
 
     def read(path: Path) -> Iterator[str]:
-        points = in_t(read_control(text_of(path), str(path)), frame)
+        table = read_text(text_of(path), path)
+        points = in_t(place_control(table, None, mapping, np.array([[47.5, 8.9]])).points, frame)
         assert np.isfinite([point.position_t for point in points]).all()
         yield f"{len(points)} points"
 
-    return text_target("control-points", [text.encode()], CSV, read, ControlError, mistakes_a_line=True)
+    maps = (
+        "Punkt;Rechtswert;Hochwert;Höhe;CQ 3D;Code\nP1;492465,1;5261234,5;450,1;0,01;G\nP2;492565,1;5261244,5;451,2;;\n"
+    )
+    seeds = [text.encode(), maps.encode(), b"P1 492465.1 5261234.5 450.1\nP2 492565.1 5261244.5 451.2\n"]
+    return text_target("control-points", seeds, CSV, read, ControlError, mistakes_a_line=True)
 
 
 def _picked() -> Target:

@@ -18,12 +18,13 @@ from typing import Any
 import numpy as np
 
 from swath.calib.control.doubts import doubts
-from swath.calib.control.points import in_t, read_control
+from swath.calib.control.points import in_t
 from swath.calib.features import ControlPoint, Features
 from swath.calib.flight import Flight
 from swath.calib.ties.picked import picked_ties, read_picked
 from swath.daemon.errors import UserError
 from swath.daemon.processing.calibration.returns import KeptFlight
+from swath.daemon.processing.control.files import ControlFile
 from swath.daemon.text_files import text_of
 from swath.georef.arrays import FloatArray
 from swath.georef.mapping.frame import Mapping
@@ -38,24 +39,26 @@ class PolygonError(ValueError):
     """Raised for a file of polygons that cannot be used; its text is one line for the user."""
 
 
-def control_of(path: Path, flight: Flight, suffered: Collection[str]) -> tuple[tuple[ControlPoint, ...], list[str]]:
+def control_of(
+    control: ControlFile, flight: Flight, suffered: Collection[str]
+) -> tuple[tuple[ControlPoint, ...], list[str]]:
     """Return the surveyed points in the flight's frame, and doubts about them, one line each.
 
     Args:
-        path: CSV as of `swath.calib.control.points.read_control`.
+        control: file whose points are placed.
         flight: the flight, with its points placed as well as is known.
         suffered: kinds of doubts about the whole (`swath.calib.control.doubts.Doubt`) that are reported but not
             refused.
 
     Raises:
-        UserError: the file cannot be read, or is doubtful as a whole; ControlError: it is not such a file.
+        UserError: it is doubtful as a whole.
     """
-    points = in_t(read_control(text_of(path), str(path)), flight.frame)
+    points, path = in_t(control.points, flight.frame), control.path
     found = doubts(flight, points)
     refusing = [f"{path}: {one.text}" for one in found if one.refuses and one.kind not in suffered]
     if refusing:
         raise UserError(refusing[0])
-    return points, [f"{path}: {one.text}" for one in found]
+    return points, [*control.notes, *(f"{path}: {one.text}" for one in found)]
 
 
 def control_places(

@@ -183,7 +183,8 @@ def _write(files: Mapping[Path, bytes]) -> None:
 def _inputs(request: CalibrationOptions, done: Calibrated) -> list[tuple[str, str]]:
     """Return name and SHA-256 of every input file, logs first."""
     paths = [part.path for flight in done.kept.logged for part in flight.session.parts]
-    given = (request.logs.trajectory.file, request.control, request.ties, request.polygons, request.model_file)
+    control = None if request.control is None else request.control.path
+    given = (request.logs.trajectory.file, control, request.ties, request.polygons, request.model_file)
     paths += [path for path in given if path is not None]
     return [(path.name, sha256_of(path)) for path in paths]
 

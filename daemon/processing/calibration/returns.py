@@ -21,8 +21,8 @@ from swath.calib.flight import Flight, Head, Swath, Tangent
 from swath.daemon.config.config import Config
 from swath.daemon.config.tables import ScannerConfig
 from swath.daemon.errors import UserError
+from swath.daemon.processing.flights.read import Check, GeorefOptions, note_times, read_flights
 from swath.daemon.processing.flights.read import Flight as LoggedFlight
-from swath.daemon.processing.flights.read import GeorefOptions, note_times, read_flights
 from swath.daemon.processing.points.feed import LogFeed
 from swath.daemon.processing.points.jobs import MARGIN_NS, Job, JobPlan, JobResult, feed_job
 from swath.daemon.processing.points.workers import run_jobs
@@ -106,7 +106,7 @@ def smoothed_prior(kept: KeptFlight) -> TrajectoryPrior | None:
 
 
 def read_flight(
-    request: GeorefOptions, folder: Path, tell: Tell, check: Callable[[list[str]], None] = lambda scanners: None
+    request: GeorefOptions, folder: Path, tell: Tell, check: Check = lambda sessions, setups: None
 ) -> KeptFlight:
     """Read logs into a flight with all returns of its strips.
 

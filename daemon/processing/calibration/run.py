@@ -19,7 +19,7 @@ from pathlib import Path
 
 from swath.calib.adjust import adjust
 from swath.calib.control.doubts import doubts
-from swath.calib.control.points import ControlError, control_planes, in_t, read_control
+from swath.calib.control.points import ControlError, control_planes, in_t
 from swath.calib.equations.normals import NormalError
 from swath.calib.equations.trajectory_prior import TrajectoryPrior, gauss_markov
 from swath.calib.features import ControlPoint, Features
@@ -42,6 +42,7 @@ from swath.calib.ties.markings import find_markings
 from swath.calib.ties.picked import PickedError
 from swath.calib.ties.picked import carried as carried_points
 from swath.daemon.errors import ExitCode, UserError
+from swath.daemon.log.reader import Session
 from swath.daemon.processing.calibration.inputs import PolygonError, rings_of, ties_of
 from swath.daemon.processing.calibration.returns import (
     KeptFlight,
@@ -52,9 +53,10 @@ from swath.daemon.processing.calibration.returns import (
     smoothed_prior,
 )
 from swath.daemon.processing.carried_verdict import told_before
+from swath.daemon.processing.control.files import ControlFile
 from swath.daemon.processing.flights.read import GeorefOptions, trajectory_verdicts_of
+from swath.daemon.processing.setup.setup import Setup
 from swath.daemon.processing.user_errors import as_user_error
-from swath.daemon.text_files import text_of
 from swath.georef.mapping.frame import MappingError
 from swath.georef.progress import Tell
 from swath.georef.scanner.calibration import Calibration
@@ -95,7 +97,7 @@ class CalibrationOptions:
         output: path of the calibration file; for several scanners the folder of their files.
         model: the parameters that are estimated.
         model_file: file of the model; None: the model is given by name.
-        control: CSV of surveyed points.
+        control: file of surveyed points; None: no control.
         ties: CSV of points picked in several strips; used beside the observations found.
         polygons: CSV of polygons that planes fill; used instead of a search for planes.
         observe: kinds of features that are searched for: planes or ties, and markings.
@@ -109,7 +111,7 @@ class CalibrationOptions:
     output: Path
     model: Model = field(default_factory=Model)
     model_file: Path | None = None
-    control: Path | None = None
+    control: ControlFile | None = None
     ties: Path | None = None
     polygons: Path | None = None
     observe: tuple[str, ...] = ("planes",)
@@ -162,7 +164,13 @@ def calibrate(request: CalibrationOptions, folder: Path, tell: Tell) -> Calibrat
 
 def _calibrate(request: CalibrationOptions, folder: Path, tell: Tell) -> Calibrated:
     _refuse_existing(request, [] if request.report is None else [request.report / OUTCOME])
-    kept = read_flight(request.logs, folder, tell, lambda scanners: check_scanners(scanners, request.model))
+
+    def check(sessions: Sequence[Session], setups: Sequence[Setup]) -> None:
+        check_scanners(list(dict.fromkeys(name for setup in setups for name in setup.scanners)), request.model)
+        if request.control is not None:
+            request.control.place(sessions, setups)
+
+    kept = read_flight(request.logs, folder, tell, check)
     _refuse_existing(request, paths_of(request, (head.name for head in kept.flight.heads)).values())
     check_options(kept.flight, request.model)
     with told_before(trajectory_verdicts_of(kept.logged), *REFUSED):
@@ -177,7 +185,7 @@ def _calibrated(request: CalibrationOptions, kept: KeptFlight, folder: Path, tel
     first, away = _aligned(kept.flight, request.model.fix)
     doubted = {name: abs(apart) for name, apart in away.items()}
     flight = replaced(kept.flight, first, folder, "aligned", workers, tell)
-    notes = _doubts(flight, points)
+    notes = (*(request.control.notes if request.control else ()), *_doubts(request, flight, points))
     rings = None if request.polygons is None else rings_of(request.polygons, kept)
     picked = Features() if request.ties is None else ties_of(request.ties, kept)
 
@@ -315,12 +323,12 @@ def refuse_no_planes(log: str, planes: Features) -> None:
     )
 
 
-def refuse_lost_control(control: Path | None, features: Features) -> None:
+def refuse_lost_control(control: ControlFile | None, features: Features) -> None:
     """Refuse with `UserError` control of which no point can be used."""
     if control is None or any(plane.control for plane in features.planes):
         return
     why = ", ".join(f"{count:,} {reason}" for reason, count in features.refused.items() if "control" in reason)
-    raise UserError(f"{control}: no point lies on ground where a strip has a plane ({why or 'no returns'})")
+    raise UserError(f"{control.path}: no point lies on ground where a strip has a plane ({why or 'no returns'})")
 
 
 # ---------------------------------------------------------------------- observations
@@ -329,10 +337,10 @@ def refuse_lost_control(control: Path | None, features: Features) -> None:
 def _control(request: CalibrationOptions, flight: Flight) -> tuple[ControlPoint, ...]:
     if request.control is None:
         return ()
-    return in_t(read_control(text_of(request.control), str(request.control)), flight.frame)
+    return in_t(request.control.points, flight.frame)
 
 
-def _doubts(flight: Flight, points: Sequence[ControlPoint]) -> tuple[str, ...]:
+def _doubts(request: CalibrationOptions, flight: Flight, points: Sequence[ControlPoint]) -> tuple[str, ...]:
     """Return doubts about control; refuse with `UserError` control that cannot be used at all.
 
     An equal offset of all its heights is only a doubt here: the range offset that is to be found causes one too. An
@@ -340,9 +348,10 @@ def _doubts(flight: Flight, points: Sequence[ControlPoint]) -> tuple[str, ...]:
     """
     found = doubts(flight, points)
     whole = [doubt.text for doubt in found if doubt.kind not in ("point", "height")]
+    path = "" if request.control is None else f"{request.control.path}: "
     if whole:
-        raise UserError("\n".join(whole))
-    return tuple(doubt.text for doubt in found)
+        raise UserError("\n".join(f"{path}{text}" for text in whole))
+    return tuple(f"{path}{doubt.text}" for doubt in found)
 
 
 def _features(

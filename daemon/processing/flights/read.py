@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -39,14 +39,14 @@ from swath.georef.strips import Span, StripRules, cut, laser_spans, read_strips,
 from swath.georef.trajectory.trajectory import Trajectory, gps_text
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from swath.daemon.config.config import Config
     from swath.daemon.processing.navigation.navigate import Navigated
     from swath.daemon.processing.points.jobs import JobResult
     from swath.georef.progress import Tell
     from swath.georef.timescales import ClockStatus
 
+
+Check = Callable[[Sequence[Session], Sequence[Setup]], None]
 
 UNSAID = "an unspecified datum"
 
@@ -181,15 +181,13 @@ class Flight:
         return found
 
 
-def read_flights(
-    request: GeorefOptions, tell: Tell, check: Callable[[list[str]], None] = lambda scanners: None
-) -> list[Flight]:
+def read_flights(request: GeorefOptions, tell: Tell, check: Check = lambda sessions, setups: None) -> list[Flight]:
     """Return the flights of the logs, with trajectories and strips; note files that are not logs as holes of the first.
 
     Args:
         request: which logs, and how.
         tell: called with the progress.
-        check: called with the names of all scanners before any long work; its exceptions pass through.
+        check: called with all sessions and their setups before any long work; its exceptions pass through.
 
     Raises:
         UserError: the logs cannot be georeferenced, or not together.
@@ -204,7 +202,7 @@ def read_flights(
     configs = dict(zip(logs, (setup.config for setup in setups), strict=True))
     for session in sessions:
         refuse_no_name(session.session_id, session.parts[0].path)
-    check(list(dict.fromkeys(name for setup in setups for name in setup.scanners)))
+    check(sessions, setups)
     refuse_different_settings(configs, request.options.crs, request.options.datum, request.options.epoch)
     flights: list[Flight] = []
     for session, setup in zip(sessions, setups, strict=True):

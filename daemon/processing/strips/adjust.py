@@ -37,6 +37,7 @@ from swath.daemon.processing.calibration.returns import (
 )
 from swath.daemon.processing.calibration.run import PLANES, refuse_lost_control, refuse_no_planes
 from swath.daemon.processing.carried_verdict import ADJUSTMENT, told_before
+from swath.daemon.processing.control.files import ControlFile
 from swath.daemon.processing.flights.read import Flight as LoggedFlight
 from swath.daemon.processing.flights.read import GeorefOptions, verdicts_of
 from swath.daemon.processing.strip_agreement import FlightStrips, before_and_after
@@ -69,7 +70,7 @@ class AdjustOptions:
     Attributes:
         logs: which logs are read and how; its options about products are ignored.
         output: folder for the corrected trajectories and the record.
-        control: CSV of surveyed points; None: no control.
+        control: file of surveyed points; None: no control.
         model: model for all strips, of `swath.calib.strips.corrections.MODELS`; ``auto``: chosen for each strip by its
             returns.
         overwrite: replace files of an earlier run.
@@ -77,7 +78,7 @@ class AdjustOptions:
 
     logs: GeorefOptions
     output: Path
-    control: Path | None = None
+    control: ControlFile | None = None
     model: str = AUTO
     overwrite: bool = False
 
@@ -164,7 +165,8 @@ def correct_strips(request: AdjustOptions, folder: Path, tell: Tell) -> StripsCo
 
 
 def _corrected(request: AdjustOptions, folder: Path, tell: Tell) -> StripsCorrected:
-    kept = read_flight(request.logs, folder, tell)
+    control = request.control
+    kept = read_flight(request.logs, folder, tell, *([] if control is None else [control.place]))
     with told_before(verdicts_of(kept.logged), *REFUSED):
         return _of_flight(request, kept, folder, tell)
 

@@ -144,7 +144,8 @@ def _record(request: AdjustOptions, done: StripsCorrected, written: list[tuple[P
     adjusted, settings = done.adjusted, request.settings
     heads = done.kept.flight.heads
     inputs = [part.path for flight in done.kept.logged for part in flight.session.parts]
-    inputs += [path for path in (request.logs.trajectory.file, request.control) if path is not None]
+    control = None if request.control is None else request.control.path
+    inputs += [path for path in (request.logs.trajectory.file, control) if path is not None]
     inputs += [Path(file) for _, file in request.logs.options.calibrations.values()]
     return {
         "format": "swath.strip-adjustment",

@@ -41,6 +41,7 @@ from swath.daemon.processing.calibration.inputs import control_of, control_place
 from swath.daemon.processing.calibration.returns import KeptFlight, read_flight, refuse_installations, replaced
 from swath.daemon.processing.calibration.run import PLANES, prior_of
 from swath.daemon.processing.carried_verdict import Carried, first_lines, refusal, told_before, verdict_entry
+from swath.daemon.processing.control.files import ControlFile
 from swath.daemon.processing.files import sha256_of, write_whole
 from swath.daemon.processing.flights.read import GeorefOptions, verdicts_of
 from swath.daemon.processing.pages.head import NOTHING_KNOWN, PageHead, calibrations_words, head_of_flights
@@ -70,7 +71,7 @@ class ValidationOptions:
     Attributes:
         calibrations: files to be validated, one per scanner.
         logs: which logs are read and how; their calibrations are replaced by those above.
-        control: CSV of surveyed points; None: no control.
+        control: file of surveyed points; None: no control.
         histories: calibration files, or folders of them.
         anew: estimate parameters anew from the logs and compare them.
         output: folder for results, the picture and updated records; None: no files.
@@ -79,7 +80,7 @@ class ValidationOptions:
 
     calibrations: Sequence[Path]
     logs: GeorefOptions
-    control: Path | None = None
+    control: ControlFile | None = None
     histories: Sequence[Path] = ()
     anew: bool = False
     output: Path | None = None
@@ -161,7 +162,8 @@ def _entry(path: Path, named: Sequence[Path]) -> Calibration | None:
 
 
 def _against_logs(request: ValidationOptions, found: _Found, folder: Path, told: Tell) -> None:
-    kept = read_flight(request.logs, folder, told)
+    control = request.control
+    kept = read_flight(request.logs, folder, told, *([] if control is None else [control.place]))
     refuse_installations(kept.logged)
     found.carried += verdicts_of(kept.logged)
     found.head = head_of_flights(kept.logged, calibrations_words(found.calibrations))

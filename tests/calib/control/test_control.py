@@ -1,4 +1,4 @@
-"""Control: what its file may say, the planes it lies on, and what speaks against it."""
+"""Control: the planes it lies on, and what speaks against it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 from pyproj import Transformer
 
 from swath.calib.control.doubts import Doubt, doubts
-from swath.calib.control.points import HEADER, ControlError, ControlRules, control_planes, in_t, read_control
+from swath.calib.control.points import ControlRules, Surveyed, control_planes, in_t, same_places
 from swath.calib.features import ControlPoint
 from swath.calib.flight import Flight
 from swath.calib.planes.local import PlaneRules, is_inside, robust_plane
@@ -15,8 +15,6 @@ from swath.georef.arrays import FloatArray
 from tests.calib.surface_flight import FRAME, surface_flight, swath_of
 
 pytestmark = pytest.mark.xdist_group("kernels")
-
-ROW = "GCP1,47.4001,8.9001,512.34,0.02"
 
 
 def unknown(position_e: FloatArray) -> None:
@@ -44,56 +42,20 @@ def flight() -> Flight:
     return surface_flight([rolling, rolling])
 
 
-# ---------------------------------------------------------------------- the file
-
-
-def test_a_file_is_read_with_comments_blanks_and_a_byte_order_mark() -> None:
-    text = f"\ufeff# survey of June\n\n{HEADER}\n{ROW}\n GCP2 , -47.5 , 8.95 , 510.0 , 0.01 \n"
-    first, second = read_control(text, "control.csv")
-    assert (first.name, second.name) == ("GCP1", "GCP2")
-    assert np.degrees([first.lat_rad, first.lon_rad, second.lat_rad]) == pytest.approx([47.4001, 8.9001, -47.5])
-    assert (first.height_m, first.sigma_m, second.height_m) == (512.34, 0.02, 510.0)
-
-
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("", "control.csv: the file is empty; it needs the header"),
-        (f"{HEADER}\n", "no points follow the header"),
-        (HEADER.replace(",", ";") + f"\n{ROW}", "line 1: the header must be .*commas between the columns"),
-        (HEADER.replace("h_ellipsoidal_m", "h_m") + f"\n{ROW}", "line 1: the header must be .*h_ellipsoidal_m missing"),
-        (f"{HEADER}\n{ROW}\nG2,47.4,8.9,500", "line 3: 4 fields instead of 5"),
-        (f"{HEADER}\nG1,47,4,8,9,500,0.01", "line 2: 7 fields instead of 5"),
-        (f"{HEADER}\n,47.4,8.9,500,0.01", "line 2: the point has no name"),
-        (f"{HEADER}\nG1,abc,8.9,500,0.01", 'line 2: lat_deg: got "abc", want degrees from -90 to 90'),
-        (f"{HEADER}\nG1,5250000.0,8.9,500,0.01", "line 2: lat_deg: .*map coordinates in metres"),
-        (f"{HEADER}\nG1,47.4,8.9,nan,0.01", 'line 2: h_ellipsoidal_m: got "nan", want metres from -9000'),
-        (f"{HEADER}\nG1,47.4,8.9,500,0", 'line 2: sigma_m: got "0", want metres above 0, at most 10'),
-        (f"{HEADER}\nG1,47.4,8.9,500,-1", "line 2: sigma_m"),
-        (f"{HEADER}\n{ROW}\n\n{ROW}", "line 4: GCP1 already stands in line 2"),
-        (f"{HEADER}\n{ROW}\n{ROW.replace('GCP1', 'GCP9')}", "line 3: GCP9 has the position of GCP1 in line 2"),
-    ],
-)
-def test_each_mistake_is_one_line_that_names_its_place(text: str, said: str) -> None:
-    with pytest.raises(ControlError, match=said) as caught:
-        read_control(text, "control.csv")
-    assert all(line.startswith("control.csv: ") for line in str(caught.value).splitlines())
-
-
-def test_all_mistakes_are_reported_at_once_in_one_line_each() -> None:
-    text = f"{HEADER}\nG1,abc,8.9,500,0.01\nG2,47.4,8.9,500\n{ROW}"
-    with pytest.raises(ControlError) as caught:
-        read_control(text, "c")
-    assert [line.split(": ")[1] for line in str(caught.value).splitlines()] == ["line 2", "line 3"]
-
-
 def test_points_are_converted_to_the_tangent_frame() -> None:
-    (point,) = in_t(read_control(f"{HEADER}\n{ROW}", "c"), FRAME)
+    (point,) = in_t([Surveyed("GCP1", np.radians(47.4001), np.radians(8.9001), 512.34, 0.02)], FRAME)
     x, y, z = Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True).transform(8.9001, 47.4001, 512.34)
     assert FRAME.e_from_t(point.position_t) == pytest.approx([x, y, z], abs=1e-6)
     assert point.sigma_m == 0.02
     assert point.position_t[0] == pytest.approx(7.548, abs=0.01)  # 0.0001° of longitude: cos(47.4°) · 11.13 m
     assert in_t((), FRAME) == ()
+
+
+def test_two_points_of_one_place_are_found() -> None:
+    places = [(47.4001, 512.34), (47.4101, 512.34), (47.4001, 512.345), (47.4001, 513.0)]
+    points = [Surveyed(str(at), np.radians(lat), 0.15, height, 0.02) for at, (lat, height) in enumerate(places)]
+    assert same_places(points) == [(2, 0)]
+    assert same_places(points[:1]) == []
 
 
 # ---------------------------------------------------------------------- planes
@@ -201,6 +163,14 @@ def test_orthometric_heights_are_recognised_by_the_geoid_undulation() -> None:
     assert (doubt.kind, doubt.refuses) == ("orthometric", True)
     assert "control lies 48.3 m below the laser's ground everywhere, as orthometric heights would" in doubt.text
     assert "the undulation there is 48.1 m (EGM96)" in doubt.text
+
+
+def test_ellipsoidal_heights_read_as_heights_above_the_geoid_are_recognised() -> None:
+    points = surveyed(np.zeros(1), np.array([0.0, 0.0, 48.3]))
+    doubt = only(doubts(flight(), points, undulation=lambda position_e: (48.1, "EGM96")))
+    assert (doubt.kind, doubt.refuses) == ("ellipsoidal", True)
+    assert "48.3 m above the laser's ground everywhere, as ellipsoidal heights read as heights above" in doubt.text
+    assert "without its vertical part" in doubt.text
 
 
 def test_without_a_geoid_the_constant_offset_is_named() -> None:

@@ -408,6 +408,16 @@ def test_error_names_a_wrong_line_of_control(made: Made, tmp_path: Path, capsys:
     assert "line 2" in line
 
 
+def test_control_is_read_before_the_logs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    control, output = tmp_path / "control.csv", tmp_path / "left.toml"
+    control.write_text("foo,bar,baz\nA,1,2\n")
+    given = ["calibrate", str(tmp_path / "no.mcap"), "-o", str(output), "--control", str(control)]
+    line = refused(capsys, output, given)
+    assert (
+        'control.csv: line 1: no column of coordinates among "foo", "bar", "baz"; name the columns name, E, N' in line
+    )
+
+
 def test_strips_without_common_planes_are_refused_with_the_reason() -> None:
     refuse_no_planes("log", Features((Plane("roof 1", np.zeros(3), np.array([0.0, 0.0, 1.0]), ()),)))
     with pytest.raises(UserError, match=r"log: no two strips see a common plane \(7 too rough, 2 curved\)"):

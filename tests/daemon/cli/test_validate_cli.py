@@ -22,6 +22,7 @@ from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.processing.calibration.returns import KeptFlight
 from swath.daemon.processing.carried_verdict import Carried
 from swath.daemon.processing.validation import run as validate_run
+from swath.georef.mapping.frame import Mapping
 from swath.georef.scanner.calibration import INDEX, Calibration, nominal, read_calibration
 from swath.georef.verdicts import Level
 from tests.calib.cast_flight import Cast, cast_flight
@@ -116,7 +117,7 @@ def log(made: Cast, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     path = tmp_path / "flight.mcap"
     path.write_bytes(b"bytes of a log")
 
-    def read(request: Any, folder: Path, tell: Any) -> KeptFlight:
+    def read(request: Any, folder: Path, tell: Any, check: Any = lambda sessions, setups: None) -> KeptFlight:
         text, name = request.options.calibrations.get("left", (None, ""))
         head = made.flight.heads[0]
         start = head.start if text is None else read_calibration(text, name)
@@ -132,6 +133,8 @@ def log(made: Cast, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
             span=made.flight.trajectories[0].span,
             session=SimpleNamespace(session_id="second-flight", parts=[SimpleNamespace(path=path)]),
         )
+        sources = SimpleNamespace(attachments={})
+        check([logged.session], [SimpleNamespace(config=None, sources=sources, mapping=Mapping("EPSG:32632"))])
         return KeptFlight(flight, [logged], [])
 
     monkeypatch.setattr(validate_run, "read_flight", read)

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pyproj import Transformer
 
 from swath.daemon.cli.main import run_app
 from swath.daemon.errors import ExitCode, UserError
@@ -175,14 +176,29 @@ def test_an_unusable_trajectory_is_reported_first_and_stays_unusable(
 def test_a_common_shift_is_found_with_control(made: Made, tmp_path: Path) -> None:
     path = tmp_path / "high.csv"
     path.write_text(csv_text(raised(made, UP_M, (0, 1, 2))))
-    control = ("--control", str(made.flown.folder / "control.csv"), "--strip-model", "constant")
+    on_map = tmp_path / "control.txt"
+    on_map.write_text(utm32_text(made.flown.folder / "control.csv"))
+    control = ("--control", str(on_map), "--control-crs", "EPSG: 25832", "--strip-model", "constant")
     assert run_app(arguments(made, path, tmp_path / "out", *control)) == 0
     record = record_of(tmp_path / "out")
     assert record["control"] > 0
+    assert any("points in EPSG:25832 (ETRS89 / UTM zone 32N), heights above" in note for note in record["notes"])
+    assert any("no point has a sigma: 0.02 m is used" in note for note in record["notes"])
     assert not any("datum is not determined" in note for note in record["notes"])
     for strip in record["strips"]:
         mean = strip["mean"]
         assert abs(mean["down_m"] - UP_M) < 3.0 * mean["sigma_down_m"] < 0.5 * UP_M
+
+
+def utm32_text(control: Path, *, swapped: bool = False) -> str:
+    """Return the points of a control file as an office exports them, with decimal commas."""
+    to_map = Transformer.from_crs("EPSG:4979", "EPSG:32632", always_xy=True)
+    lines = ["Punkt-Nr.;Hochwert;Rechtswert;Höhe;Code" if swapped else "Punkt-Nr.;Rechtswert;Hochwert;Höhe;Code"]
+    for row in control.read_text().splitlines()[1:]:
+        name, lat, lon, height, _ = row.split(",")
+        east, north, up = to_map.transform(float(lon), float(lat), float(height))
+        lines.append(f"{name};{east:.4f};{north:.4f};{up:.4f};GCP".replace(".", ","))
+    return "\n".join(lines) + "\n"
 
 
 # ---------------------------------------------------------------------- what cannot be
@@ -214,6 +230,8 @@ def test_mistakes_are_reported_in_one_line_and_leave_no_files(
     beginnings = [(start, start + 2_500_000_000) for start, _ in times[:2]]  # of opposite lines: their far ends
     far = tmp_path / "far.csv"
     far.write_text("name,lat_deg,lon_deg,h_ellipsoidal_m,sigma_m\na,47.5,9.5,450,0.02\n")
+    swapped = tmp_path / "swapped.txt"
+    swapped.write_text(utm32_text(made.flown.folder / "control.csv", swapped=True))
     (tmp_path / "points").mkdir()
     (tmp_path / "points" / "a.laz").touch()
     full = arguments(made, lifted, output)
@@ -225,7 +243,9 @@ def test_mistakes_are_reported_in_one_line_and_leave_no_files(
         (points, 2, "contains points; give the logs of these points"),
         (nominal, 2, "left: has only the nominal calibration"),
         ([*full, "--control", str(tmp_path / "no.csv")], 3, "no.csv: cannot be read"),
-        ([*full, "--control", str(far)], 1, "no control point lies within the flight"),
+        ([*full, "--control", str(far)], 1, "no control point lies near the flight"),
+        ([*full, "--control", str(swapped)], 1, "easting and northing look swapped: exchange the names of the two"),
+        ([*full, "--control", str(swapped), "--control-crs", "UTM 32"], 2, "write EPSG:25832 (ETRS89 / UTM zone 32N)"),
         ([*full, *spans(tmp_path, times[0])], 1, "1 strip with returns; an adjustment compares strips"),
     ):
         found, line = refused(capsys, given)
