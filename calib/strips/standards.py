@@ -40,7 +40,8 @@ QUALITY_LEVELS = (
     QualityLevel("QL2", 2.0, 0.06, 0.08, 0.16, 0.10),
     QualityLevel("QL3", 0.5, 0.12, 0.16, 0.32, 0.20),
 )
-ASPRS_CLASSES_M = (0.01, 0.025, 0.05, 0.10, 0.15, 0.20, 0.333, 0.667, 1.0, 3.333)  # ASPRS 2014, vertical classes
+# ASPRS 2014, vertical classes; its coarser ones, of 33.3 to 333.3 cm, are for other products than lidar's strips
+ASPRS_CLASSES_M = (0.01, 0.025, 0.05, 0.10, 0.15, 0.20)
 ASPRS_WITHIN, ASPRS_OVERLAP, ASPRS_OVERLAP_MAX = 0.6, 0.8, 1.6  # of a class: its limits within and between strips
 
 
@@ -107,7 +108,7 @@ def _kept(measured: dict[str, float | None], limits: dict[str, float]) -> dict[s
 
 
 def _asprs(measured: dict[str, float | None]) -> Judged:
-    """Return the smallest class that is kept, otherwise the largest class.
+    """Return the smallest class that is kept, otherwise the largest class, which is then not kept.
 
     Its limit within strips applies to the largest difference, which a repeatability (RMS) does not show.
     """

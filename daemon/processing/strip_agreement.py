@@ -122,7 +122,9 @@ class Agreement:
         if above:
             usgs += f"; {above[-1].level} fails its limit of {', '.join(_broken(above[-1]))}"
         asprs = next(one for one in self.judged if one.standard == ASPRS_2014)
-        fits = f"strips meet the {asprs.level} class" if asprs.all_kept else "strips meet no class"
+        fits = (
+            f"strips meet the {asprs.level} class" if asprs.all_kept else f"strips do not meet the {asprs.level} class"
+        )
         return [f"{USGS}: {usgs}", f"{ASPRS_2014}: {fits}", TO_CONFIRM]
 
     def record(self) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-DPI = 140
+DPI = 180
 INK, MUTED, EMPTY = "#1d242b", "#5d6770", "#f3f4f2"
 
 

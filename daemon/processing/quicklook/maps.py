@@ -33,8 +33,8 @@ from swath.daemon.processing.quicklook.run import Look
 from swath.daemon.processing.quicklook.strips import HISTOGRAM_HALF, HISTOGRAM_STEP_M
 from swath.georef.arrays import FloatArray
 
-LARGEST_MAP_IN, SMALLEST_MAP_IN = (10.0, 7.6), (3.0, 1.3)
-NARROW_SIDE_IN, WIDE_SIDE_IN = 1.55, 2.75
+LARGEST_MAP_IN, SMALLEST_MAP_IN = (7.4, 5.8), (3.0, 1.3)  # so small that words can be read on paper too
+NARROW_SIDE_IN, WIDE_SIDE_IN = 1.55, 2.6
 LEFT_IN, TOP_IN, BOTTOM_IN, LOWEST_PAGE_IN = 1.0, 0.8, 0.62, 4.9
 MOST_OUTLINES = 60
 BARS_MM = (1, 2, 4, 5, 10, 20, 40, 80)  # widths of a histogram's bars, which divide the classes' limits
@@ -57,7 +57,7 @@ class MapPage:
         size_m = self.high_m - self.low_m
         map_in = np.maximum(size_m * float((np.array(LARGEST_MAP_IN) / size_m).min()), SMALLEST_MAP_IN)
         self.page_in = np.array([LEFT_IN + map_in[0] + side_in, max(TOP_IN + map_in[1] + BOTTOM_IN, LOWEST_PAGE_IN)])
-        self.page_in[0] = max(self.page_in[0], 8.2)
+        self.page_in[0] = max(self.page_in[0], 7.6)
         self.figure = Figure(figsize=(float(self.page_in[0]), float(self.page_in[1])), facecolor="white")
         bottom = self.page_in[1] - TOP_IN - map_in[1]
         self.axes = self._panel(LEFT_IN, bottom, self.page_in[0] - LEFT_IN - side_in, map_in[1])

@@ -14,7 +14,7 @@ from swath.daemon.processing.pages.words import DPI, INK, MUTED, shortened, thou
 from swath.daemon.processing.quicklook.profile import Profile, steps_of
 from swath.daemon.processing.quicklook.run import Look
 
-PAGE_IN = (12.2, 6.4)
+PAGE_IN = (9.6, 5.4)
 MOST_DRAWN = 150_000
 MOST_IN_LEGEND = 12
 LEAST_HEIGHT_M = 1.0  # minimum height that the upper panel spans
@@ -32,7 +32,7 @@ def draw_profile(look: Look, path: Path) -> None:
         upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2.3, 1.0))
     else:
         upper, lower = figure.subplots(1, 1), None
-    figure.subplots_adjust(left=0.075, right=0.885, top=0.865, bottom=0.09, hspace=0.12)
+    figure.subplots_adjust(left=0.085, right=0.885, top=0.855, bottom=0.1, hspace=0.12)
     _points(upper, look, profile)
     if lower is not None:
         for strip, offset_m in steps.offset_m.items():

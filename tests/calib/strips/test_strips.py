@@ -265,8 +265,8 @@ def test_empty_cells_give_an_empty_report() -> None:
         (0.03, 0.09, "QL1", "10 cm"),
         (0.041, 0.08, "QL1", "10 cm"),
         (0.081, 0.16, "QL3", "15 cm"),
-        (0.2, 0.3, None, "33.3 cm"),
-        (9.0, 9.0, None, "333.3 cm"),
+        (0.2, 0.3, None, "20 cm"),
+        (9.0, 9.0, None, "20 cm"),
     ],
 )
 def test_a_quality_level_is_met_if_rms_and_largest_difference_are_within_limits(
@@ -275,6 +275,7 @@ def test_a_quality_level_is_met_if_rms_and_largest_difference_are_within_limits(
     judged = judge(overlap_rms_m=rms_m, overlap_max_m=max_m)
     assert best_of(judged) == best
     assert (judged[-1].standard, judged[-1].level) == (ASPRS_2014, asprs)
+    assert judged[-1].all_kept is (best is not None)
     assert [one.level for one in judged if one.standard == USGS] == ["QL0", "QL1", "QL2", "QL3"]
 
 
