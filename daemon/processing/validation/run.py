@@ -414,7 +414,7 @@ def _draw(axes: Axes, one: History, row: int, name: str) -> None:
     )
     for trend in one.trends:
         if trend.name == name:
-            text = f"{math.degrees(trend.per_year):+.4f} ± {math.degrees(trend.sigma):.4f}° a year"
+            text = f"{math.degrees(trend.per_year):+.4f} ± {math.degrees(trend.sigma):.4f}° a year".replace("-", "−")
             axes.text(0.98, 0.04, text, transform=axes.transAxes, ha="right", fontsize=8, color=MUTED)
     axes.set_ylabel(f"{key.removesuffix('_deg')} (°)", fontsize=9, color=INK)
     axes.ticklabel_format(axis="y", useOffset=False)
