@@ -35,7 +35,7 @@ from swath.georef.arrays import FloatArray
 
 LARGEST_MAP_IN, SMALLEST_MAP_IN = (7.4, 5.8), (3.0, 1.3)  # so small that words can be read on paper too
 NARROW_SIDE_IN, WIDE_SIDE_IN = 1.55, 2.6
-LEFT_IN, TOP_IN, BOTTOM_IN, LOWEST_PAGE_IN = 1.0, 0.8, 0.62, 4.9
+LEFT_IN, TOP_IN, BOTTOM_IN, LOWEST_PAGE_IN, LOWEST_HISTOGRAM_IN = 1.0, 0.8, 0.62, 4.9, 6.1
 MOST_OUTLINES = 60
 BARS_MM = (1, 2, 4, 5, 10, 20, 40, 80)  # widths of a histogram's bars, which divide the classes' limits
 NAME_SHARES = (0.06, 0.94, 0.15, 0.85, 0.25, 0.75, 0.35, 0.65, 0.5)  # places for a strip's name along it: ends first
@@ -56,7 +56,8 @@ class MapPage:
         self.low_m, self.high_m = low - border, high + border
         size_m = self.high_m - self.low_m
         map_in = np.maximum(size_m * float((np.array(LARGEST_MAP_IN) / size_m).min()), SMALLEST_MAP_IN)
-        self.page_in = np.array([LEFT_IN + map_in[0] + side_in, max(TOP_IN + map_in[1] + BOTTOM_IN, LOWEST_PAGE_IN)])
+        lowest_in = LOWEST_PAGE_IN if side_in == NARROW_SIDE_IN else LOWEST_HISTOGRAM_IN
+        self.page_in = np.array([LEFT_IN + map_in[0] + side_in, max(TOP_IN + map_in[1] + BOTTOM_IN, lowest_in)])
         self.page_in[0] = max(self.page_in[0], 7.6)
         self.figure = Figure(figsize=(float(self.page_in[0]), float(self.page_in[1])), facecolor="white")
         bottom = self.page_in[1] - TOP_IN - map_in[1]
@@ -342,7 +343,7 @@ def _pale_ground(page: MapPage) -> None:
 
 def _dz_histogram(page: MapPage, top: float) -> None:
     """Draw a histogram of the single cells' signed differences, coloured like the map; bars end at class limits."""
-    room = page.page_in[1] - TOP_IN - top - 0.5
+    room = page.page_in[1] - TOP_IN - top - 0.75
     if room < 0.6:
         return
     axes = page.side(top, 2.2, float(min(room, 2.0)))
