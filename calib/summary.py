@@ -14,6 +14,7 @@ from swath.calib.outcome import Adjusted
 from swath.calib.profiles.check import Check
 from swath.georef.arrays import FloatArray
 from swath.georef.mapping.chart import Chart
+from swath.georef.scanner.calibration import Calibration
 
 Pair = tuple[str, str]
 
@@ -122,6 +123,7 @@ class ReportInput:
         title: of the whole; empty: made of installation and scanners.
         measure: what the height differences are, for display; empty: not stated.
         level: the quality level that strips keep, or why there is none; empty: not judged.
+        prealigned: by scanner, angles from which the iterations began; without a scanner: from its start.
         chart: coordinates of the maps; None: those of the UTM zone in which the flight lies.
     """
 
@@ -142,6 +144,7 @@ class ReportInput:
     title: str = ""
     measure: str = ""
     level: str = ""
+    prealigned: Mapping[str, Calibration] = field(default_factory=dict)
     chart: Chart | None = None
 
     @property

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
+from swath.calib.labels import number, with_sigma
 from swath.georef.scanner.calibration import INDEX, PARAMETERS, BeamCorrection, Calibration
 
 LIKE = 1.0 / 3.0  # of a sigma: a difference of this size adds a twentieth to the expected square
@@ -57,10 +58,13 @@ class Difference:
     def words(self) -> str:
         """Text such as ``phi_deg +0.0081 ± 0.0012 (6.8 σ)``."""
         parameter = PARAMETERS[INDEX[self.name]]
-        value, sigma = self.difference / parameter.factor, self.sigma / parameter.factor
-        digits = max(0, 1 - math.floor(math.log10(sigma))) if sigma > 0.0 else 6
-        times = abs(value) / sigma if sigma > 0.0 else math.inf
-        return f"{parameter.key} {value:+.{digits}f} ± {sigma:.{digits}f} ({times:.1f} σ)"
+        text = with_sigma(self.difference / parameter.factor, self.sigma / parameter.factor)
+        return f"{parameter.key} {text} ({number(self.times, '.1f')} σ)"
+
+    @property
+    def times(self) -> float:
+        """The size of the difference in sigmas."""
+        return abs(self.difference) / self.sigma if self.sigma > 0.0 else math.inf
 
     def record(self) -> dict[str, Any]:
         """Return the difference for JSON, in the unit of the key."""
@@ -181,7 +185,7 @@ class History:
         """Return one row per calibration: id, time, method, and the boresight with its sigmas, degrees."""
         rows = []
         for entry, time in zip(self.entries, self.times, strict=True):
-            row: dict[str, Any] = {"id": entry.id, "created": _date(time), "method": entry.method}
+            row: dict[str, Any] = {"id": entry.id, "created": date_words(time), "method": entry.method}
             for name in BORESIGHT:
                 key = PARAMETERS[INDEX[name]].key
                 row[key] = math.degrees(entry.value(name))
@@ -212,6 +216,24 @@ class History:
         }
 
 
+def created_s(one: Calibration) -> float:
+    """Return when a calibration was made, seconds since 1970.
+
+    Raises:
+        HistoryError: the file does not tell it.
+    """
+    created = one.header.get("created")
+    if not isinstance(created, dt.datetime):
+        raise HistoryError(
+            f"calibration {one.id}: calibration.created is not a time; write it like 2026-11-21T10:15:00Z"
+        )
+    if not EARLIEST <= created.year <= LATEST:
+        raise HistoryError(
+            f"calibration {one.id}: calibration.created lies in the year {created.year}; give the time when it was made"
+        )
+    return (created if created.tzinfo else created.replace(tzinfo=dt.UTC)).timestamp()
+
+
 def history(calibrations: Sequence[Calibration]) -> tuple[History, ...]:
     """Return one history per scanner and installation, from calibrations in any order.
 
@@ -223,22 +245,13 @@ def history(calibrations: Sequence[Calibration]) -> tuple[History, ...]:
     groups: dict[tuple[str, str], list[tuple[float, Calibration]]] = {}
     seen: set[str] = set()
     for one in calibrations:
-        installation, created = one.header.get("installation"), one.header.get("created")
+        installation = one.header.get("installation")
         if not installation:
             raise HistoryError(f"calibration {one.id}: has no calibration.installation; a history needs it")
-        if not isinstance(created, dt.datetime):
-            raise HistoryError(
-                f"calibration {one.id}: calibration.created is not a time; write it like 2026-11-21T10:15:00Z"
-            )
-        if not EARLIEST <= created.year <= LATEST:
-            raise HistoryError(
-                f"calibration {one.id}: calibration.created lies in the year {created.year}; give the time when "
-                "it was made"
-            )
+        time = created_s(one)
         if one.id in seen:
             raise HistoryError(f"calibration {one.id}: is given twice; give each calibration once")
         seen.add(one.id)
-        time = (created if created.tzinfo else created.replace(tzinfo=dt.UTC)).timestamp()
         groups.setdefault((one.scanner, str(installation)), []).append((time, one))
     return tuple(_history(key, sorted(group, key=lambda entry: entry[0])) for key, group in sorted(groups.items()))
 
@@ -246,7 +259,7 @@ def history(calibrations: Sequence[Calibration]) -> tuple[History, ...]:
 def _history(key: tuple[str, str], group: list[tuple[float, Calibration]]) -> History:
     times, entries = tuple(time for time, _ in group), tuple(entry for _, entry in group)
     tested = [(time, entry) for time, entry in group if compare(entry, entry, BORESIGHT).freedom]
-    when = {entry.id: _date(time)[:10] for time, entry in group}
+    when = {entry.id: date_words(time)[:10] for time, entry in group}
     steps, notes = [], []
     for (_, one), (_, two) in pairwise(tested):
         step = compare(one, two, BORESIGHT)
@@ -256,7 +269,7 @@ def _history(key: tuple[str, str], group: list[tuple[float, Calibration]]) -> Hi
         else:
             steps.append(step)
     trends = (
-        () if notes else tuple(_trend(name, tested) for name in BORESIGHT if _told(name, tested) >= FEWEST_FOR_TREND)
+        () if notes else tuple(trend_of(name, tested) for name in BORESIGHT if _told(name, tested) >= FEWEST_FOR_TREND)
     )
     sentences = [] if notes and not steps else _sentences(key[0], steps, trends, when)
     return History(*key, entries, times, tuple(steps), trends, (*sentences, *notes))
@@ -266,7 +279,7 @@ def _told(name: str, tested: Sequence[tuple[float, Calibration]]) -> int:
     return len({time for time, entry in tested if entry.sigmas[INDEX[name]] > 0.0})
 
 
-def _trend(name: str, tested: Sequence[tuple[float, Calibration]]) -> Trend:
+def trend_of(name: str, tested: Sequence[tuple[float, Calibration]]) -> Trend:
     """Fit a weighted straight line; its sigma follows from the calibrations' own sigmas."""
     rows = [(t, e.value(name), float(e.sigmas[INDEX[name]])) for t, e in tested if e.sigmas[INDEX[name]] > 0.0]
     time, value, sigma = (np.array(column) for column in zip(*rows, strict=True))
@@ -291,13 +304,13 @@ def _sentences(scanner: str, steps: Sequence[Compared], trends: Sequence[Trend],
     for trend in trends:
         if trend.p < ALPHA:
             key = PARAMETERS[INDEX[trend.name]].key
-            per_year, sigma = math.degrees(trend.per_year), math.degrees(trend.sigma)
-            found.append(f"{scanner}: {key} drifts by {per_year:+.4f} ± {sigma:.4f} a year (p {trend.p:.2g})")
+            text = with_sigma(math.degrees(trend.per_year), math.degrees(trend.sigma))
+            found.append(f"{scanner}: {key} drifts by {text} a year (p {trend.p:.2g})")
     worst = min(step.p for step in steps)
     return found or [f"{scanner}: the boresight has not moved: {len(steps)} steps, the least likely with p {worst:.2g}"]
 
 
-def _date(time_s: float) -> str:
+def date_words(time_s: float) -> str:
     return dt.datetime.fromtimestamp(time_s, dt.UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 

@@ -24,6 +24,7 @@ from swath.calib.equations.observability import RULES_OF_ALL
 from swath.calib.equations.trajectory_prior import ERRORS, Taus, TrajectoryPrior, gauss_markov
 from swath.calib.features import ControlPoint, Features
 from swath.calib.flight import Flight
+from swath.calib.labels import number
 from swath.calib.strips.differences import Numbers
 from swath.calib.strips.effects import EFFECTS
 from swath.calib.validation.distances import Rows, control_rows, estimated_floor_m, plane_rows
@@ -350,15 +351,15 @@ def _classes(flight: Flight, rows: Rows) -> dict[str, BoolArray]:
 def _flown_so(flight: Flight) -> tuple[FloatArray, FloatArray]:
     """Return headings (swaths,), degrees, and heights above their points, metres."""
     headings, heights = np.zeros(len(flight.swaths)), np.ones(len(flight.swaths))
-    for number, swath in enumerate(flight.swaths):
+    for index, swath in enumerate(flight.swaths):
         if not len(swath):
             continue
         trajectory = flight.trajectories[swath.trajectory_index]
         within = trajectory.between(int(swath.time_ns[0]), int(swath.time_ns[-1]))
         way = within.velocity_l().mean(axis=0)
-        headings[number] = math.degrees(math.atan2(way[1], way[0])) % 360.0
+        headings[index] = math.degrees(math.atan2(way[1], way[0])) % 360.0
         ground = float(np.nanmedian(swath.points_t[:: max(len(swath) // 1000, 1), 2]))
-        heights[number] = max(float(np.median(geodetic_from_e(within.position_e)[2])) - ground, 1.0)
+        heights[index] = max(float(np.median(geodetic_from_e(within.position_e)[2])) - ground, 1.0)
     return headings, heights
 
 
@@ -433,8 +434,8 @@ def smallest_errors(rows: Rows) -> tuple[Detectable, ...]:
 
 def _sentence(name: str, what: str, numbers: Numbers, tests: Sequence[Test]) -> str:
     values = (
-        f"mean {100 * numbers.mean_m:+.1f} cm, std {100 * numbers.std_m:.1f}, RMS {100 * numbers.rms_m:.1f}, "
-        f"largest {100 * numbers.max_m:.1f}"
+        f"mean {number(100 * numbers.mean_m, '+.1f')} cm, std {100 * numbers.std_m:.1f}, "
+        f"RMS {100 * numbers.rms_m:.1f}, largest {100 * numbers.max_m:.1f}"
     )
     chi2, mean = tests[:2]
     if len(tests) > 2 and not tests[2].passed:
@@ -444,7 +445,7 @@ def _sentence(name: str, what: str, numbers: Numbers, tests: Sequence[Test]) -> 
     elif not chi2.passed:
         verdict = f"more than expected (χ² {chi2.value:,.0f} of {chi2.freedom:,.0f}, p {chi2.p:.2g})"
     elif not mean.passed:
-        verdict = f"the mean is not zero (z {mean.value:.1f}, p {mean.p:.2g})"
+        verdict = f"the mean is not zero (z {number(mean.value, '.1f')}, p {mean.p:.2g})"
     elif stats.chi2.cdf(chi2.value, chi2.freedom) < ALPHA:
         verdict = (
             f"less than expected (χ² {chi2.value:,.0f} of {chi2.freedom:,.0f}): the trajectory's sigmas are larger "

@@ -106,6 +106,13 @@ class Agreement:
             "tiles with smooth open ground where strips overlap, or set another --cell"
         )
 
+    @property
+    def level_words(self) -> str:
+        """The quality level that strips keep, in words."""
+        if not self.judged:
+            return f"too few cells for a quality level ({self.cells:,} in {self.places} places)"
+        return f"strips meet {self.best or 'no quality level'}"
+
     def broken(self, level: str) -> list[str]:
         """Return in words the limits of a USGS level that are not kept."""
         named = next((one for one in self.judged if one.standard == USGS and one.level == level), None)

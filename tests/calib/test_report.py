@@ -308,6 +308,15 @@ def test_the_same_input_gives_the_same_picture(report: ReportInput) -> None:
     assert first.svg(NARROW) == second.svg(NARROW)
 
 
+def test_the_start_is_the_given_file_and_the_pre_alignment_has_its_own_column(report: ReportInput) -> None:
+    found = report.adjusted.calibrations["left"].changed(kappa_rad=math.radians(0.58))
+    (table,) = parameter_tables(replace(report, prealigned={"left": found}))
+    rows = {row[0]: dict(zip(table.heads, row, strict=True)) for row in table.rows}
+    kappa = rows["boresight κ (heading)"]
+    assert (kappa["start"], kappa["pre-alignment"], kappa["estimate"]) == ("0.0000", "0.5800", "0.6116")
+    assert rows["range offset"]["pre-alignment"] == "–"
+
+
 def test_parameters_are_shown_as_in_the_file(report: ReportInput) -> None:
     (table,) = parameter_tables(report)
     rows = {row[0]: dict(zip(table.heads, row, strict=True)) for row in table.rows}
@@ -315,6 +324,7 @@ def test_parameters_are_shown_as_in_the_file(report: ReportInput) -> None:
     # 0.611° and 0.4 of 2.4e-5 rad
     assert (kappa["unit"], kappa["estimate"], kappa["sigma"], kappa["start"]) == ("°", "0.6116", "0.0014", "0.0000")
     assert kappa["change / sigma"] == f"{(math.radians(0.611) + 0.4 * 2.4e-5) / 2.4e-5:.0f}"
+    assert "pre-alignment" not in table.heads
     assert rows["time offset"]["estimate"] == "76"  # 0.4 · 190 µs
     assert rows["time offset"]["change / sigma"] == "0.4 ·"
     held = [table.rows[i][0] for i in sorted(table.pale)]

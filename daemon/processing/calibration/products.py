@@ -29,8 +29,9 @@ from swath.calib.strips.effects import SeenFrom
 from swath.calib.strips.signatures import signatures
 from swath.calib.summary import Finding, ReportInput
 from swath.calib.validation.methods import Asked, validate
-from swath.calib.verdict import DEG, held_words, judge
+from swath.calib.verdict import judge
 from swath.daemon.errors import ExitCode, UserError, one_line
+from swath.daemon.processing.calibration.console import calibration_lines
 from swath.daemon.processing.calibration.inputs import control_places
 from swath.daemon.processing.calibration.model import in_words, key_of
 from swath.daemon.processing.calibration.record import instruments_of
@@ -108,16 +109,8 @@ def write_products(request: CalibrationOptions, done: Calibrated, tell: Tell) ->
     if printed is not None and printed not in files:
         printed.unlink(missing_ok=True)  # of an earlier run
     written = [str(path) for path in files]
-    reasons = [f"also: {reason.what}" for reason in verdict.reasons[1:]]
-    return Told(
-        record | {"files": written},
-        [
-            *first_lines(record["carried"]),
-            *_lines(done, request.model.ibrc_knots, before, after),
-            *(verdict.sentence, *reasons, *written),
-        ],
-        warnings,
-    )
+    lines = calibration_lines(done, report, request.model.ibrc_knots, (before, after), verdict)
+    return Told(record | {"files": written}, [*first_lines(record["carried"]), *lines, *written], warnings)
 
 
 def trajectory_says(carried: Sequence[Carried]) -> list[Finding]:
@@ -351,7 +344,8 @@ def _report(
         after=after.pairs(),
         differences=difference_map(before, after, MAP_CELLS, in_t=mapping is None),
         measure=after.agreement.measure,
-        level=level_words(after),
+        level=after.agreement.level_words,
+        prealigned=done.prealigned,
         chart=chart_of(mapping, _positions_e(done.flight)),
         check=done.check,
         inputs=inputs,
@@ -364,14 +358,6 @@ def _report(
 def _positions_e(flight: Flight) -> FloatArray:
     """Return some positions of all trajectories."""
     return np.concatenate([one.position_e[:: max(1, len(one.position_e) // 200)] for one in flight.trajectories])
-
-
-def level_words(strips: FlightStrips) -> str:
-    """Return the quality level that strips keep, in words."""
-    agreement = strips.agreement
-    if not agreement.judged:
-        return f"too few cells for a quality level ({agreement.cells:,} in {agreement.places} places)"
-    return f"strips meet {agreement.best or 'no quality level'}"
 
 
 def _wanted(done: Calibrated) -> dict[str, float]:
@@ -428,55 +414,3 @@ def _settings(request: CalibrationOptions, done: Calibrated) -> dict[str, str]:
         "trajectory errors": "; ".join(done.prior.notes) or f"{len(done.prior)} knots",
         "atmosphere": f"ranges {air.ranges}, refraction {air.refraction}",
     }
-
-
-# ---------------------------------------------------------------------- for people
-
-
-def _lines(done: Calibrated, knots: Sequence[float], before: FlightStrips, after: FlightStrips) -> list[str]:
-    adjusted = done.adjusted
-    lines = [f"{'parameter':34}{'start':>14}{'found':>14}{'sigma':>12}"]
-    lines += _parameter_lines(adjusted, knots)
-    for held in adjusted.held:
-        remedy = f"; {held.remedy}" if held.remedy else ""
-        lines.append(f"not estimated: {held.scanner} {key_of(held.name, knots)[0]}: {held.why}{remedy}")
-    lines += [f"held: {words}" for words in held_words(adjusted)]
-    lines += _prealigned_lines(done)
-    planes, ties = len(done.features.planes), len(done.features.ties)
-    seen = [f"{planes} planes", *([f"{ties} tie points"] if ties else [])]
-    control = sum(len(plane.control) for plane in done.features.planes)
-    used = f", {control} of {len(done.control)} control points" if done.control else ""
-    fit = f"redundancy {adjusted.redundancy:,.0f}, variance factor {adjusted.variance_factor:.2f}"
-    lines.append(f"{' and '.join(seen)}{used}, {fit}")
-    rms = [f"{strips.rms_m:.3f} m" if math.isfinite(strips.rms_m) else "nothing" for strips in (before, after)]
-    lines.append(f"strips differ by {rms[0]} (RMSDz) before, {rms[1]} after; {level_words(after)}")
-    lines.append(after.agreement.measure)
-    lines += _profile_lines(done.check)
-    return [*lines, *(f"note: {note}" for note in done.notes)]
-
-
-def _prealigned_lines(done: Calibrated) -> list[str]:
-    """Return lines on where the iterations began if that is not the given start."""
-    starts = done.kept.flight.starts()
-    lines = []
-    for name, found in done.prealigned.items():
-        away = [f"{key_of(angle)[0]} {found.value(angle) * DEG:.3f}" for angle in ANGLES]
-        if any(abs(found.value(angle) - starts[name].value(angle)) > 1e-6 for angle in ANGLES):
-            lines.append(f"pre-aligned: {name}: {', '.join(away)}")
-    return lines
-
-
-def _profile_lines(check: Check) -> list[str]:
-    differences = [f"{one.scanner}.{key_of(one.parameter)[0]} {one.normalised:+.1f}" for one in check.comparisons]
-    return [f"profiles less adjustment, in sigmas: {', '.join(differences)}"] if differences else []
-
-
-def _parameter_lines(adjusted: Adjusted, knots: Sequence[float]) -> list[str]:
-    lines = []
-    for name, start, value, sigma in zip(
-        adjusted.names, adjusted.start.tolist(), adjusted.values.tolist(), adjusted.sigmas.tolist(), strict=True
-    ):
-        scanner, _, bare = name.partition(".")
-        key, factor = key_of(bare, knots)
-        lines.append(f"{scanner + '.' + key:34}{start / factor:14.5f}{value / factor:14.5f}{sigma / factor:12.5f}")
-    return lines

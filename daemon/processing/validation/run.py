@@ -21,6 +21,7 @@ from swath.calib.equations.normals import NormalError
 from swath.calib.equations.trajectory_prior import TrajectoryPrior
 from swath.calib.features import ControlPoint, Features
 from swath.calib.flight import Flight, FlightError
+from swath.calib.labels import number, with_sigma
 from swath.calib.parameters import ParameterOptions as Model
 from swath.calib.planes.fit import PlaneError
 from swath.calib.planes.search import find_planes
@@ -357,7 +358,7 @@ def _table(one: History) -> list[str]:
     lines = [f"{'calibration':<28}{'created':<22}" + "".join(f"{key:>20}" for key in ("omega °", "phi °", "kappa °"))]
     for row in one.table():
         values = [
-            f"{row[key]:.4f} ± {row[f'{key}_sigma']:.4f}" if row[f"{key}_sigma"] else f"{row[key]:.4f}"
+            with_sigma(row[key], row[f"{key}_sigma"], sign=False) if row[f"{key}_sigma"] else number(row[key], ".4f")
             for key in ("omega_deg", "phi_deg", "kappa_deg")
         ]
         lines.append(f"{row['id']:<28}{row['created']:<22}" + "".join(f"{value:>20}" for value in values))
@@ -414,7 +415,7 @@ def _draw(axes: Axes, one: History, row: int, name: str) -> None:
     )
     for trend in one.trends:
         if trend.name == name:
-            text = f"{math.degrees(trend.per_year):+.4f} ± {math.degrees(trend.sigma):.4f}° a year".replace("-", "−")
+            text = f"{with_sigma(math.degrees(trend.per_year), math.degrees(trend.sigma))}° a year"
             axes.text(0.98, 0.04, text, transform=axes.transAxes, ha="right", fontsize=8, color=MUTED)
     axes.set_ylabel(f"{key.removesuffix('_deg')} (°)", fontsize=9, color=INK)
     axes.ticklabel_format(axis="y", useOffset=False)

@@ -21,7 +21,7 @@ from swath.calib.strips.cells import StripRules
 from swath.calib.verdict import overall_rms_m
 from swath.daemon.cli import strips
 from swath.daemon.errors import ExitCode, UserError
-from swath.daemon.processing.calibration.products import level_words, strips_entry
+from swath.daemon.processing.calibration.products import strips_entry
 from swath.daemon.processing.calibration.returns import refuse_installations
 from swath.daemon.processing.quicklook.run import look_at, numbers_of
 from swath.daemon.processing.setup.setup import Options, Setup
@@ -272,7 +272,7 @@ def test_every_command_gives_the_same_figure_and_level_for_one_cloud(
     assert told["best"] is not None
     assert seen["best"] == calibrated["quality"]["best"] == told["best"]
     assert seen["measure"] == calibrated["quality"]["measure"] == told["measure"]
-    assert level_words(after) == f"strips meet {told['best']}"
+    assert after.agreement.level_words == f"strips meet {told['best']}"
 
 
 @pytest.mark.slow

@@ -16,6 +16,7 @@ from swath.calib.equations.observability import RULES_OF_ALL
 from swath.calib.equations.trajectory_prior import gauss_markov
 from swath.calib.features import ControlPoint, Features
 from swath.calib.flight import Flight, FlightError, Head, Tangent
+from swath.calib.labels import decimals_of, unknown
 from swath.calib.outcome import FixedParameter
 from swath.calib.parameters import ParameterError, ParameterOptions
 from swath.calib.plan import Line, Predicted, Scan, Surface, planned, predict
@@ -205,7 +206,7 @@ def _gps(time_s: float) -> int:
 
 def _rows(predicted: Predicted) -> list[dict[str, Any]]:
     """Return one row per parameter, in files' units, in the order of the model."""
-    by_name = {parameter.name: (number, parameter) for number, parameter in enumerate(PARAMETERS)}
+    by_name = {parameter.name: (index, parameter) for index, parameter in enumerate(PARAMETERS)}
     found: list[tuple[str, float, FixedParameter | None]] = [
         (name, sigma, None) for name, sigma in zip(predicted.names, predicted.sigmas.tolist(), strict=True)
     ]
@@ -217,14 +218,15 @@ def _rows(predicted: Predicted) -> list[dict[str, Any]]:
         parameter = by_name[short][1]
         wanted = USEFUL[parameter.key]
         useful = held is None and sigma <= wanted * parameter.factor
-        predicted_words, need = (
-            f"{value:.3g} {parameter.key.rpartition('_')[2]}" for value in (sigma / parameter.factor, wanted)
-        )
+        unit, reached = unknown(name).unit, sigma / parameter.factor
+        gap = "" if unit == "°" else " "
+        predicted_words, need = f"{reached:.{decimals_of(reached)}f}{gap}{unit}", f"{wanted:g}{gap}{unit}"
         poor = f"would be known to {predicted_words}; {need} or better is useful"
         rows.append(
             {
                 "scanner": scanner,
                 "name": parameter.key,
+                "unit": unit,
                 "sigma": sigma / parameter.factor if math.isfinite(sigma) else None,
                 "wanted": wanted,
                 "determined": useful,

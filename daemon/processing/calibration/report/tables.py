@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -19,6 +21,7 @@ from swath.calib.labels import (
     words_of,
 )
 from swath.calib.outcome import FixedParameter, Residuals
+from swath.calib.parameters import ANGLES
 from swath.calib.summary import ReportInput
 from swath.calib.verdict import held_words
 from swath.daemon.processing.calibration.report.pictures import SUSPECT
@@ -28,7 +31,88 @@ from swath.georef.scanner.calibration import INDEX, PARAMETERS
 
 MOST_ROWS = 25
 INSIGNIFICANT = 2.0
+SAME_RAD = 1e-6  # a pre-alignment by less has changed nothing
 OBSERVED = {"range_m": "one range", "ties": "one coordinate of a tie point", "control": "one control point"}
+
+
+@dataclass(frozen=True, slots=True)
+class ParameterRow:
+    """A parameter or an entry of a table, in the unit of reports.
+
+    Attributes:
+        one: its words and unit.
+        start, first: the value given, and the one that the pre-alignment found; None: it was not pre-aligned.
+        value: as found, or as held.
+        sigma: of the value; of a held one: its plausible error, 0 if it has none.
+        prior: sigma before the adjustment.
+        state: ``held``, ``not determined``; empty: it was estimated.
+    """
+
+    one: Unknown
+    start: float
+    first: float | None
+    value: float
+    sigma: float
+    prior: float
+    state: str = ""
+
+    @property
+    def pattern(self) -> str:
+        """Format of its values: to the place of the sigma's second digit."""
+        return f".{decimals_of(self.sigma)}f" if self.sigma > 0.0 else ".6g"
+
+    def text(self, value: float | None) -> str:
+        """Return a value to the place of the sigma's second digit."""
+        return number(value, self.pattern)
+
+    @property
+    def sigma_text(self) -> str:
+        """The sigma with two digits; a dash if there is none."""
+        return number(self.sigma, self.pattern) if self.sigma > 0.0 else "–"
+
+
+def parameter_rows(report: ReportInput, scanner: str) -> list[ParameterRow]:
+    """Return the parameters of a scanner: those that were estimated, then those that were held."""
+    calibration, aligned = report.adjusted.calibrations[scanner], _prealigned(report, scanner)
+    rows = [row for row in _estimated_rows(report, aligned) if row.one.scanner == scanner and row.one.is_parameter]
+    held = {one.name: one for one in report.adjusted.held if one.scanner == scanner}
+    for parameter in PARAMETERS:
+        if parameter.name in held:
+            one = unknown(f"{scanner}.{parameter.name}")
+            value = calibration.value(parameter.name) * one.factor
+            sigma = float(calibration.held_sigmas[INDEX[parameter.name]]) * one.factor
+            state = "not determined" if is_undetermined(held[parameter.name]) else "held"
+            rows.append(ParameterRow(one, value, aligned.get(parameter.name), value, sigma, math.inf, state))
+    return rows
+
+
+def entry_rows(report: ReportInput) -> list[ParameterRow]:
+    """Return the unknowns that are entries of tables: IBRC, beams, range offsets."""
+    return [row for row in _estimated_rows(report, {}) if not row.one.is_parameter]
+
+
+def _prealigned(report: ReportInput, scanner: str) -> dict[str, float]:
+    """Return the angles of a pre-alignment by name, in the unit of reports; empty if it changed none."""
+    found, adjusted = report.prealigned.get(scanner), report.adjusted
+    if found is None:
+        return {}
+    start = dict(zip(adjusted.names, adjusted.start.tolist(), strict=True))
+    held = adjusted.calibrations[scanner]
+    apart = [found.value(name) - start.get(f"{scanner}.{name}", held.value(name)) for name in ANGLES]
+    if max(map(abs, apart)) <= SAME_RAD:
+        return {}
+    return {name: found.value(name) * unknown(f"{scanner}.{name}").factor for name in ANGLES}
+
+
+def _estimated_rows(report: ReportInput, aligned: Mapping[str, float]) -> Iterator[ParameterRow]:
+    adjusted = report.adjusted
+    for i, name in enumerate(adjusted.names):
+        one = unknown(name)
+        start, value, sigma, prior = (
+            one.factor * float(table[i])
+            for table in (adjusted.start, adjusted.values, adjusted.sigmas, adjusted.prior_sigmas)
+        )
+        yield ParameterRow(one, start, aligned.get(one.name), value, sigma, prior)
 
 
 def parameter_tables(report: ReportInput) -> list[Table]:
@@ -38,28 +122,10 @@ def parameter_tables(report: ReportInput) -> list[Table]:
 
 
 def _parameters(report: ReportInput, scanner: str, *, several: bool) -> Table:
-    adjusted = report.adjusted
-    rows: list[list[str]] = []
-    for i, name in enumerate(adjusted.names):
-        one = unknown(name)
-        if one.scanner == scanner and one.is_parameter:
-            values = (
-                float(table[i]) for table in (adjusted.start, adjusted.values, adjusted.sigmas, adjusted.prior_sigmas)
-            )
-            rows.append(_estimated(one, *values))
-    estimated = len(rows)
-    held = {one.name: one for one in adjusted.held if one.scanner == scanner}
-    calibration = adjusted.calibrations[scanner]
-    for parameter in PARAMETERS:
-        if parameter.name in held:
-            one = unknown(f"{scanner}.{parameter.name}")
-            value = number(calibration.value(parameter.name) * one.factor, ".6g")
-            why = "not determined" if is_undetermined(held[parameter.name]) else "held"
-            sigma = float(calibration.held_sigmas[INDEX[parameter.name]]) * one.factor
-            plausible = number(sigma, f".{decimals_of(sigma)}f") if sigma > 0.0 else "–"
-            rows.append([one.words, one.unit, value, plausible, value, why, "–", "–"])
-    heads = ("parameter", "unit", "estimate", "sigma", "start", "change", "change / sigma", "sigma before")
-    honest = adjusted.trajectory is not None
+    shown = parameter_rows(report, scanner)
+    aligned = any(row.first is not None for row in shown)
+    rows = [_cells(row, aligned=aligned) for row in shown]
+    honest = report.adjusted.trajectory is not None
     words = (
         "including the trajectory's errors and the plausible errors of held parameters"
         if honest
@@ -67,45 +133,41 @@ def _parameters(report: ReportInput, scanner: str, *, several: bool) -> Table:
         "of the trajectory's errors"
     )
     under = f"Sigmas are one standard deviation, {words}."
-    for sentence in held_words(adjusted):
+    if aligned:
+        under += " The pre-alignment gives only the values from which the iterations began."
+    for sentence in held_words(report.adjusted):
         under += f" {sentence[0].upper()}{sentence[1:]}."
-    if any(row[6].endswith("·") for row in rows):
+    if any(row[-2].endswith("·") for row in rows):
         under += f" · the change is below {INSIGNIFICANT:g} sigmas: the initial value may have been as good."
     title = f"Parameters of {scanner}" if several else "Parameters"
-    return Table(title, heads, rows, under, pale=frozenset(range(estimated, len(rows))))
+    pale = frozenset(at for at, row in enumerate(shown) if row.state)
+    return Table(title, _heads("parameter", aligned=aligned), rows, under, pale=pale)
 
 
-def _estimated(one: Unknown, start: float, value: float, sigma: float, prior: float) -> list[str]:
-    digits = decimals_of(sigma * one.factor)
-    start, value, sigma, prior = (one.factor * x for x in (start, value, sigma, prior))
-    pattern = f".{digits}f"
-    ratio = abs(value - start) / sigma if sigma > 0.0 else math.inf
+def _heads(first: str, *, aligned: bool) -> tuple[str, ...]:
+    between = ("pre-alignment",) if aligned else ()
+    return (first, "unit", "estimate", "sigma", "start", *between, "change", "change / sigma", "sigma before")
+
+
+def _cells(row: ParameterRow, *, aligned: bool) -> list[str]:
+    cells = [row.one.words, row.one.unit, row.text(row.value), row.sigma_text, row.text(row.start)]
+    cells += [row.text(row.first)] if aligned else []
+    if row.state:
+        return [*cells, row.state, "–", "–"]
+    ratio = abs(row.value - row.start) / row.sigma if row.sigma > 0.0 else math.inf
     significance = thousands(ratio, 0) if ratio >= 100.0 else number(ratio, ".1f")
     significance += " ·" if ratio < INSIGNIFICANT else ""
-    return [
-        one.words,
-        one.unit,
-        *(number(x, pattern) for x in (value, sigma, start)),
-        number(value - start, f"+{pattern}"),
-        significance,
-        number(prior, f".{decimals_of(prior)}f"),
-    ]
+    change = number(row.value - row.start, f"+{row.pattern}")
+    return [*cells, change, significance, number(row.prior, f".{decimals_of(row.prior)}f")]
 
 
 def entries_table(report: ReportInput) -> Table | None:
     """Return a table of unknowns that are entries of tables: IBRC, beams, range offsets; None if there are none."""
-    adjusted = report.adjusted
     rows = []
-    for i, name in enumerate(adjusted.names):
-        one = unknown(name)
-        if not one.is_parameter:
-            values = (
-                float(table[i]) for table in (adjusted.start, adjusted.values, adjusted.sigmas, adjusted.prior_sigmas)
-            )
-            row = _estimated(one, *values)
-            rows.append([f"{one.scanner}: {row[0]}", *row[1:]])
-    heads = ("entry", "unit", "estimate", "sigma", "start", "change", "change / sigma", "sigma before")
-    return Table("Tables of the calibration", heads, rows) if rows else None
+    for row in entry_rows(report):
+        cells = _cells(row, aligned=False)
+        rows.append([f"{row.one.scanner}: {cells[0]}", *cells[1:]])
+    return Table("Tables of the calibration", _heads("entry", aligned=False), rows) if rows else None
 
 
 def held_table(report: ReportInput) -> Table | None:
