@@ -75,6 +75,7 @@ COMMANDS = (
     Listed("plan-calibration", "Predict the accuracy of a planned calibration.", "Calibration"),
     Listed("strips", "Compare strips; judge them by specifications.", "Calibration"),
     Listed("validate", "Test a calibration with independent data.", "Calibration"),
+    Listed("history", "Follow the calibrations of an aircraft over time.", "Calibration"),
     Listed("sim", "Simulate a flight into a log or on wires.", "Simulation"),
     Listed("warm-up", "Compile the computing code before the flight.", "Setup"),
     Listed("doctor", "Check whether this computer can record safely.", "Setup"),

@@ -10,10 +10,12 @@ QUICK_LOOK_MAPS = ("height.tif", "differences.tif", "density.tif", "intensity.ti
 QUICK_LOOK_FEATURES = "view.gpkg"
 STRIPS_PICTURES = ("differences.png", "differences_before.png")
 HISTORY_PICTURE = "history.png"
+HISTORY, HISTORY_TABLE = "history.html", "history.csv"
 # Every name that a command may write for people into its folder, the record for scripts not included.
 OF_COMMAND = {
     "view": (QUICK_LOOK, "index.pdf", *QUICK_LOOK_PICTURES, *QUICK_LOOK_MAPS, QUICK_LOOK_FEATURES),
     "strips": (STRIPS, "strips.pdf", *STRIPS_PICTURES),
     "validate": (VALIDATION, "validation.pdf", HISTORY_PICTURE),
     "calibrate": (REPORT, "report.pdf"),
+    "history": (HISTORY, "history.pdf"),
 }

@@ -142,6 +142,21 @@ def test_strips_agree_after_calibration(products: Path) -> None:
     assert "strips agree to" in told["verdict"]["sentence"]
 
 
+def test_the_history_reads_the_file_or_else_the_record(products: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    told = []
+    for path in (products / "left.toml", products / "report" / "left.record.json"):
+        capsys.readouterr()
+        assert run_app(["history", str(path), "--json"]) == 0
+        told.append(json.loads(capsys.readouterr().out)["scanners"][0]["calibrations"][0])
+    of_file, of_record = told
+    assert of_file["id"] == of_record["id"]
+    for key in ("omega_deg", "phi_deg", "kappa_deg", "range_offset_m"):
+        assert of_record["parameters"][key] == pytest.approx(of_file["parameters"][key], abs=1e-9)
+        assert of_record["sigmas"].get(key) == pytest.approx(of_file["sigmas"].get(key), rel=1e-6)
+    assert run_app(["history", str(products)]) == 0
+    assert capsys.readouterr().out.startswith("left")
+
+
 def test_report_and_record_are_written_beside_the_file(products: Path) -> None:
     page = (products / "report" / "report.html").read_text()
     assert "boresight" in page

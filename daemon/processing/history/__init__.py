@@ -1,0 +1,1 @@
+"""`swath history`: the parameters of all calibrations of an aircraft over time."""

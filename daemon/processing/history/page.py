@@ -1,0 +1,156 @@
+"""Writes the page of a scanner's calibrations over time: what changed, tables, and a picture for each parameter."""
+
+from __future__ import annotations
+
+import datetime as dt
+import io
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from swath.calib.labels import unknown
+from swath.calib.validation.courses import Course, ScannerCourse, Step
+from swath.calib.validation.history import date_words
+from swath.daemon.errors import ExitCode, UserError
+from swath.daemon.processing.files import write_whole
+from swath.daemon.processing.history.run import Collected, csv_text, table_of
+from swath.daemon.processing.pages.blocks import Block, Card, Image, Judged, Notes, Table, Words, data_uri
+from swath.daemon.processing.pages.head import PageHead
+from swath.daemon.processing.pages.names import HISTORY, HISTORY_TABLE, PRINTED
+from swath.daemon.processing.pages.pdf import page_files
+from swath.daemon.processing.pages.render import Page, html_of
+from swath.daemon.processing.pages.words import INK, MUTED
+from swath.georef.scanner.calibration import INDEX, Calibration
+
+DAY_S = 86_400.0
+DPI = 110
+COLOURS = ("#2f6690", "#b3541e", "#4f772d", "#7b4b94", "#9c6b00", "#1f7a8c")  # one a mounting
+HOW = (
+    "Points are values with one sigma, a colour for each mounting. Successive calibrations are compared by the χ² of "
+    "all parameters that both estimated, with their correlations. Within one mounting a parameter is constant if "
+    "chance explains its scatter (p of at least 0.001); otherwise a steady drift and a jump between two calibrations "
+    "are tried."
+)
+
+
+def write_history(found: Collected, folder: Path, warnings: list[str]) -> list[Path]:
+    """Write page, PDF and CSV into a folder; return their paths.
+
+    Args:
+        found: what was collected.
+        folder: where the files go.
+        warnings: gets a line if the PDF cannot be made.
+
+    Raises:
+        UserError: the folder cannot be written to.
+    """
+    page = folder / HISTORY
+    files = page_files(page, history_page(found), warnings) | {folder / HISTORY_TABLE: csv_text(found).encode()}
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        page.with_suffix(PRINTED).unlink(missing_ok=True)  # of an earlier run
+        write_whole(files)
+    except OSError as error:
+        raise UserError(f"{folder}: is not writable ({error.strerror or error})", ExitCode.IO) from error
+    return list(files)
+
+
+def history_page(found: Collected) -> str:
+    """Return the HTML text of the page."""
+    blocks: list[Block] = []
+    for one in found.scanners:
+        blocks += _of_scanner(one, several=len(found.scanners) > 1)
+    if found.notes:
+        blocks.append(Notes(found.notes))
+    entries = [entry for one in found.scanners for entry in one.entries]
+    times = [time for one in found.scanners for time in one.times_s]
+    changed = sum(step.changed for one in found.scanners for step in one.steps)
+    cards: list[Card] = [
+        (str(len(entries)), "calibrations"),
+        (str(len(found.scanners)), "scanners" if len(found.scanners) > 1 else "scanner"),
+        (str(len({mounting for one in found.scanners for mounting in one.mountings})), "mountings"),
+        (str(changed), "significant changes"),
+    ]
+    subtitle = f"{date_words(min(times))[:10]} to {date_words(max(times))[:10]}"
+    heading = ", ".join(one.title for one in found.scanners)
+    page = Page(
+        "History of calibrations", heading, PageHead(), blocks, cards=cards, subtitle=subtitle,
+        appendix=[Words(HOW, "How changes are told")],
+    )  # fmt: skip
+    return html_of(page)
+
+
+def _of_scanner(one: ScannerCourse, *, several: bool) -> Iterator[Block]:
+    prefix = f"{one.title}: " if several else ""
+    steps = [
+        [
+            f"{step.before} to {step.after}",
+            "yes" if step.remounted else "no",
+            _change_cell(step),
+        ]
+        for step in one.steps
+    ]
+    if steps:
+        yield Table(
+            f"{prefix}From one calibration to the next", ("between", "mounted anew", "change"), steps, left=(0, 2)
+        )
+    rows = [[mounting, *_course_cells(course)] for mounting, courses_of in one.courses.items() for course in courses_of]
+    if rows:
+        yield Table(f"{prefix}Within each mounting", ("mounting", "parameter", "course"), rows, left=(0, 1, 2))
+    for name in one.names:
+        words = unknown(f".{name}").words
+        yield Image(f"{words} over time", data_uri(picture(one, name), "image/png"), title=f"{prefix}{words}")
+    yield Table(f"{prefix}All calibrations", *table_of(one), left=(0, 1, 2))
+
+
+def _change_cell(step: Step) -> str | Judged:
+    """Return what changed; after a new mounting a change is expected, and no colour judges it."""
+    words = step.words.partition(": ")[2]
+    return words if step.remounted or step.compared is None else Judged(words, good=not step.changed)
+
+
+def _course_cells(course: Course) -> list[str | Judged]:
+    name, _, words = course.words.partition(": ")
+    return [name, words if course.kind in ("constant", "once") else Judged(words, good=False)]
+
+
+def picture(one: ScannerCourse, name: str) -> bytes:
+    """Return a PNG of a parameter's values with one sigma over time, a colour for each mounting."""
+    figure = Figure(figsize=(9.0, 3.0), facecolor="white", layout="constrained")
+    axes = figure.subplots()
+    named = unknown(f".{name}")
+    mountings = list(dict.fromkeys(one.mountings))
+    for index, mounting in enumerate(mountings):
+        at = [k for k, entry in enumerate(one.entries) if one.mountings[k] == mounting and _sigma(entry, name) > 0.0]
+        if not at:
+            continue
+        values = np.array([one.entries[k].value(name) for k in at]) * named.factor
+        sigmas = np.array([_sigma(one.entries[k], name) for k in at]) * named.factor
+        days = np.array([one.times_s[k] for k in at]) / DAY_S  # Matplotlib's dates: days since 1970
+        axes.errorbar(
+            days, values, sigmas, fmt="o-", color=COLOURS[index % len(COLOURS)], capsize=3, lw=1.0, ms=4.5,
+            label=mounting,
+        )  # fmt: skip
+    _style(axes, f"{named.words.partition(' (')[0]}, {named.unit}", legend=len(mountings) > 1)
+    made = io.BytesIO()
+    figure.savefig(made, dpi=DPI)
+    return made.getvalue()
+
+
+def _style(axes: Axes, label: str, *, legend: bool) -> None:
+    axes.set_ylabel(label, fontsize=9, color=INK)
+    axes.ticklabel_format(axis="y", useOffset=False)
+    axes.tick_params(labelsize=8, colors=MUTED)
+    axes.xaxis_date(dt.UTC)
+    axes.margins(x=0.08)
+    axes.grid(color="#c9cecb", lw=0.4)
+    axes.spines[["top", "right"]].set_visible(False)
+    if legend:
+        axes.legend(fontsize=8, frameon=False, loc="best")
+
+
+def _sigma(entry: Calibration, name: str) -> float:
+    return float(entry.sigmas[INDEX[name]])

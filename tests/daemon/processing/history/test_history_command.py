@@ -1,0 +1,115 @@
+"""``swath history``: calibrations below folders as table, sentences, CSV and page."""
+
+from __future__ import annotations
+
+import csv
+import datetime as dt
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from swath.calib.calibration_file import Header, calibration_text
+from swath.daemon.cli.main import run_app
+from swath.daemon.errors import ExitCode
+from swath.georef.scanner.calibration import INDEX, nominal
+
+SIGMAS = {"omega_rad": np.radians(0.002), "kappa_rad": np.radians(0.004), "range_offset_m": 0.008}
+
+
+def write(folder: Path, month: int, omega_deg: float, mounting: str = "HB-ABC/left/2026-01") -> Path:
+    """Write a calibration that was made in a month of 2026."""
+    sigmas = np.zeros(len(INDEX))
+    for name, sigma in SIGMAS.items():
+        sigmas[INDEX[name]] = sigma
+    one = nominal("left", [0.12, -0.03, 0.28], np.eye(3).tolist())
+    one = one.changed(omega_rad=float(np.radians(omega_deg)), range_offset_m=0.35)
+    one = replace(one, id=f"cal-{month}", method="planes", sigmas=sigmas, correlation=np.eye(len(INDEX)))
+    header = Header(
+        id=one.id,
+        created=dt.datetime(2026, month, 5, 10, tzinfo=dt.UTC),
+        method="planes",
+        scanner_serial="S-17",
+        installation=mounting,
+        logs=(),
+        variance_factor=1.0,
+        redundancy=1000,
+    )
+    path = folder / f"{month:02d}" / "left.toml"
+    path.parent.mkdir(parents=True)
+    path.write_text(calibration_text(one, header))
+    return path
+
+
+@pytest.fixture
+def archive(tmp_path: Path) -> Path:
+    """Return a folder with four calibrations; ω jumps before the third, and the scanner is mounted anew after it."""
+    folder = tmp_path / "archive"
+    for month, omega_deg in ((1, 0.250), (2, 0.251), (3, 0.280)):
+        write(folder, month, omega_deg)
+    write(folder, 6, 0.41, "HB-ABC/left/2026-06")
+    (folder / "swath.toml").write_text("[recording]\n")  # a configuration is TOML too
+    return folder
+
+
+def test_the_console_shows_table_changes_and_courses(archive: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_app(["history", str(archive)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "left, serial S-17: 4 calibrations"
+    assert lines[1].split() == ["date", "calibration", "mounting", "ω", "°", "κ", "°", "Δρ", "m"]
+    assert lines[2].split()[:6] == ["2026-01-05", "cal-1", "HB-ABC/left/2026-01", "0.2500", "±", "0.0020"]
+    changed = "2026-02-05 to 2026-03-05: changed: omega_deg +0.0290 ± 0.0028 (10.3 σ)"
+    assert any(line.startswith(changed) for line in lines)
+    assert any(line.startswith("2026-03-05 to 2026-06-05, mounted anew: changed: omega_deg ") for line in lines)
+    assert "HB-ABC/left/2026-01: boresight ω (roll): jumped by +0.0295 ± 0.0024° between 2026-02-05 and 2026-03-05" in (
+        lines
+    )
+    assert any(line.startswith("HB-ABC/left/2026-01: range offset: constant, 0.3500 ± 0.0046 m") for line in lines)
+
+
+def test_page_pdf_and_csv_are_written(archive: Path, tmp_path: Path) -> None:
+    output = tmp_path / "out"
+    assert run_app(["history", str(archive), "-o", str(output)]) == 0
+    assert sorted(path.name for path in output.iterdir()) == ["history.csv", "history.html", "history.pdf"]
+    page = (output / "history.html").read_text(encoding="utf-8")
+    assert page.count("data:image/png;base64") == 3
+    for words in ("left, serial S-17", "From one calibration to the next", "boresight ω (roll)", "jumped by +0.0295"):
+        assert words in page, words
+    rows = list(csv.DictReader((output / "history.csv").read_text().splitlines()))
+    assert [row["id"] for row in rows] == ["cal-1", "cal-2", "cal-3", "cal-6"]
+    assert float(rows[2]["omega_deg"]) == pytest.approx(0.28)
+    assert (rows[2]["omega_deg_sigma"], rows[2]["phi_deg_sigma"]) == ("0.002", "")
+    assert (output / "history.pdf").read_bytes().startswith(b"%PDF")
+
+
+def test_json_has_values_steps_and_courses(archive: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_app(["history", str(archive), "--json"]) == 0
+    record = json.loads(capsys.readouterr().out)
+    (scanner,) = record["scanners"]
+    assert (scanner["scanner"], scanner["serial"]) == ("left", "S-17")
+    assert [step["changed"] for step in scanner["steps"]] == [False, True, True]
+    assert scanner["calibrations"][0]["sigmas"]["omega_deg"] == pytest.approx(0.002)
+    jump = next(one for one in scanner["courses"] if one["parameter"] == "omega_deg")
+    assert (jump["course"], jump["between"]) == ("jump", ["2026-02-05", "2026-03-05"])
+
+
+def test_copies_count_once_and_contradicting_ones_are_named(archive: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = (archive / "01" / "left.toml").read_text()
+    (archive / "copy.toml").write_text(text)
+    (archive / "edited.toml").write_text(text.replace("omega_deg = 0.25", "omega_deg = 0.26", 1))
+    (archive / "broken.toml").write_text("[calibration]\nid = 3\n")
+    assert run_app(["history", str(archive)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "left, serial S-17: 4 calibrations"
+    edited = f"{archive / 'edited.toml'}: has the id of {archive / '01' / 'left.toml'}, cal-1, but other values"
+    assert any(line.startswith(edited) for line in lines)
+    assert any(str(archive / "broken.toml") in line and line.endswith("it was left out") for line in lines)
+
+
+def test_what_has_no_calibration_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_app(["history", str(tmp_path)]) == ExitCode.PROBLEM
+    assert "no calibration there; give folders with files of swath calibrate" in capsys.readouterr().err
+    assert run_app(["history", str(tmp_path / "none")]) == ExitCode.IO
+    assert capsys.readouterr().err == f"swath: {tmp_path / 'none'}: no such file or folder\n"
