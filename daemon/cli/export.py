@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from swath.daemon.exchange.export import ExportReport
     from swath.daemon.log.reader import Session
 
+LEAST_OF_LOG, MOST_OF_LOG = 0.7, 3.0  # size of exported files by that of the log, whose chunks are compressed
+
 
 def command(
     logs: Annotated[list[Path], typer.Argument(help="Logs, or directories of logs.", metavar="LOG…")],
@@ -31,6 +33,7 @@ def command(
     """
     from swath.daemon.cli.progress import progress_bar
     from swath.daemon.exchange.export import export_session
+    from swath.daemon.free_space import check_space
     from swath.daemon.log.format import LogError
     from swath.daemon.log.reader import open_logs
 
@@ -38,7 +41,10 @@ def command(
     done: list[tuple[Session, ExportReport]] = []
     try:
         with progress_bar() as tell:
-            for session in open_logs(logs, passed_over):
+            sessions = open_logs(logs, passed_over)
+            size = sum(part.path.stat().st_size for session in sessions for part in session.parts)
+            check_space(directory, "exported files", least_bytes=LEAST_OF_LOG * size, most_bytes=MOST_OF_LOG * size)
+            for session in sessions:
                 session.progress = partial(_tell, tell, session.session_id)
                 done.append((session, export_session(session, directory)))
     except LogError as error:

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 ValueT = TypeVar("ValueT")
 
+MOST_OF_CAPTURES = 1.2  # size of a log by that of its captures; what is of other devices is left out, chunks compressed
+
 
 def command(
     config: Annotated[Path, typer.Argument(metavar="CONFIG", help="Configuration that describes the devices.")],
@@ -59,12 +61,15 @@ def command(
     from swath.daemon.config import load_config
     from swath.daemon.exchange.capture_files import ImportOptions, find_captures
     from swath.daemon.exchange.routes import Routes
+    from swath.daemon.free_space import check_space
 
     logging.getLogger("swath").addHandler(logging.NullHandler())  # findings about captures are printed below
     options = ImportOptions(source or (), _by_source(start, _time_ns), _by_source(baud, _baud), keep_copies)
     loaded = load_config(config)
     routes = Routes.of(loaded)
     captures = find_captures(routes, files or (), options)
+    size = sum(capture.path.stat().st_size for capture in captures if capture.path.exists())
+    check_space(output, "logs", least_bytes=0.0, most_bytes=MOST_OF_CAPTURES * size)
     report = _import(loaded, routes, captures, output)
     if as_json:
         found = {"session_id": report.session_id, "log": [str(path) for path in report.paths], "units": report.units}

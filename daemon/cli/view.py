@@ -10,10 +10,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from swath.daemon.errors import ExitCode, UserError, one_line
+from swath.daemon.free_space import check_space
 from swath.daemon.processing.requirements import GIS, PRINTED_PAGES, require_installed
 
 if TYPE_CHECKING:
     from swath.daemon.processing.quicklook.run import Look
+
+PAGE_BYTES = (3e6, 5e7)  # of the page and its pictures: at least, and at most
 
 
 def command(
@@ -82,6 +85,7 @@ def _make(
     first = paths[0]
     folder = output or (first if first.is_dir() else first.parent) / "view"
     title = (first.resolve() if len(paths) == 1 else first.resolve().parent).name
+    check_space(folder, "page and pictures", least_bytes=PAGE_BYTES[0], most_bytes=PAGE_BYTES[1])
     with progress_bar() as tell:
         try:
             look = look_at(paths, cell, ends, tell)

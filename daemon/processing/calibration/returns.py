@@ -6,6 +6,7 @@ beside their points in t.
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -21,12 +22,15 @@ from swath.calib.flight import Flight, Head, Swath, Tangent
 from swath.daemon.config.config import Config
 from swath.daemon.config.tables import ScannerConfig
 from swath.daemon.errors import UserError
+from swath.daemon.log.reader import Session
 from swath.daemon.processing.flights.read import Check, GeorefOptions, note_times, read_flights
 from swath.daemon.processing.flights.read import Flight as LoggedFlight
 from swath.daemon.processing.points.feed import LogFeed
 from swath.daemon.processing.points.jobs import MARGIN_NS, Job, JobPlan, JobResult, feed_job
+from swath.daemon.processing.points.space import check_space_for_returns
 from swath.daemon.processing.points.workers import run_jobs
 from swath.daemon.processing.setup.models import motion_of
+from swath.daemon.processing.setup.setup import Setup
 from swath.georef.arrays import ByteArray, FloatArray, Int64Array, StructArray
 from swath.georef.georeference import Georeferencer
 from swath.georef.points import Fate, Points
@@ -52,6 +56,10 @@ COLUMNS: dict[str, tuple[np.dtype[np.generic], tuple[int, ...]]] = {  # one file
     "encoder_rate": (np.dtype(np.float64), ()),
     "encoder_acceleration": (np.dtype(np.float64), ()),
 }
+
+
+KEPT_BYTES = sum(dtype.itemsize * math.prod(shape) for dtype, shape in COLUMNS.values())  # of a return
+PLACED_BYTES = COLUMNS["points_t"][0].itemsize * 3  # of a return each time that a flight is placed anew
 
 
 @dataclass(frozen=True)
@@ -141,6 +149,17 @@ def read_flight(
     ]
     trajectories = tuple(flight.trajectory for flight in logged if flight.trajectory is not None)
     return KeptFlight(Flight(frame, heads, trajectories, tuple(swaths)), logged, results)
+
+
+def check_space_to_keep(folder: Path, placed: int, sessions: Sequence[Session], setups: Sequence[Setup]) -> None:
+    """Compare the space for the returns of a flight, which is placed anew so many times, with the space there is.
+
+    Raises:
+        UserError: as of `swath.daemon.processing.points.space.check_space_for_returns`.
+    """
+    most = KEPT_BYTES + placed * PLACED_BYTES
+    what = "temporary files of the strips' returns"
+    check_space_for_returns(folder, what, (KEPT_BYTES, most), sessions, setups)
 
 
 def _middle(flight: LoggedFlight) -> FloatArray:

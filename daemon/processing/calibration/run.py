@@ -42,10 +42,12 @@ from swath.calib.ties.markings import find_markings
 from swath.calib.ties.picked import PickedError
 from swath.calib.ties.picked import carried as carried_points
 from swath.daemon.errors import ExitCode, UserError
+from swath.daemon.free_space import check_space
 from swath.daemon.log.reader import Session
 from swath.daemon.processing.calibration.inputs import PolygonError, rings_of, ties_of
 from swath.daemon.processing.calibration.returns import (
     KeptFlight,
+    check_space_to_keep,
     read_flight,
     refuse_installations,
     refuse_without_noise,
@@ -72,6 +74,8 @@ PLANES = PlaneSettings(most_points=25)
 # If the smoother's covariance describes the errors: without control the range offset is found by averaging noise over
 # all ground. Beyond 400 returns a patch the attitude between two knots dominates.
 EVERY = PlaneSettings(most_points=400, most_planes=4000, ground_planes=100)
+PLACED = 5  # times that the returns are placed anew: aligned, matched, entire, calibrated, and for the comparison
+REPORT_BYTES = (5e6, 2e8)  # of a report with its record, whose matrices grow with the observations
 ROWS_MOST = 4_000_000  # in all: some seconds per pass, and 300 MB
 REFUSED = (
     ControlError,
@@ -169,6 +173,9 @@ def _calibrate(request: CalibrationOptions, folder: Path, tell: Tell) -> Calibra
         check_scanners(list(dict.fromkeys(name for setup in setups for name in setup.scanners)), request.model)
         if request.control is not None:
             request.control.place(sessions, setups)
+        check_space_to_keep(folder.parent, PLACED, sessions, setups)
+        if request.report is not None:
+            check_space(request.report, "report and record", least_bytes=REPORT_BYTES[0], most_bytes=REPORT_BYTES[1])
 
     kept = read_flight(request.logs, folder, tell, check)
     _refuse_existing(request, paths_of(request, (head.name for head in kept.flight.heads)).values())

@@ -23,6 +23,7 @@ import numpy as np
 from swath import __version__
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.log.durable import sync_file, try_sync_directory
+from swath.daemon.log.reader import Session
 from swath.daemon.processing.files import put_in_place, sha256_of
 from swath.daemon.processing.flights.read import (
     INTENSITY_FACTOR,
@@ -34,8 +35,10 @@ from swath.daemon.processing.flights.read import (
 )
 from swath.daemon.processing.georeferencing.sidecar import count_undecoded, reasons_text, run_record, write_sidecar
 from swath.daemon.processing.points.jobs import MARGIN_NS, Job, JobError, JobResult, SessionPlan
+from swath.daemon.processing.points.space import LAZ_BYTES, check_space_for_returns
 from swath.daemon.processing.points.workers import run_jobs
 from swath.daemon.processing.quicklook.product_facts import read_sidecar, sessions_in
+from swath.daemon.processing.setup.setup import Setup
 from swath.daemon.processing.trajectory.files import TrajectoryFiles, write_trajectory
 from swath.daemon.processing.undecoded import undecoded_lines
 from swath.daemon.processing.user_errors import as_user_error
@@ -66,8 +69,12 @@ def georeference(request: GeorefOptions, tell: Tell) -> Report:
     Raises:
         UserError: they cannot be made, one line; no file that looks like a product is left then.
     """
+
+    def check(sessions: Sequence[Session], setups: Sequence[Setup]) -> None:
+        check_space_for_returns(request.output, "points", LAZ_BYTES, sessions, setups)
+
     with as_user_error(request.output, StripError, JobError, MappingError):
-        flights = read_flights(request, tell)
+        flights = read_flights(request, tell, check)
         names = [flight.session.session_id for flight in flights]
         with _out_of_sight(request, names) as (partial, into_place):
             return _make(request, flights, names[0], partial, into_place, tell)

@@ -9,6 +9,7 @@ height differences of strips, before and after                 swath.calib.strip
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -26,9 +27,11 @@ from swath.calib.strips.effects import SeenFrom
 from swath.calib.strips.signatures import signatures
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.log.directory import nearest_there
+from swath.daemon.log.reader import Session
 from swath.daemon.processing.calibration.inputs import control_of
 from swath.daemon.processing.calibration.returns import (
     KeptFlight,
+    check_space_to_keep,
     read_flight,
     refuse_installations,
     refuse_without_noise,
@@ -40,6 +43,7 @@ from swath.daemon.processing.carried_verdict import ADJUSTMENT, told_before
 from swath.daemon.processing.control.files import ControlFile
 from swath.daemon.processing.flights.read import Flight as LoggedFlight
 from swath.daemon.processing.flights.read import GeorefOptions, verdicts_of
+from swath.daemon.processing.setup.setup import Setup
 from swath.daemon.processing.strip_agreement import FlightStrips, before_and_after
 from swath.daemon.processing.strips.compare import is_of_logs
 from swath.daemon.processing.trajectory.files import TrajectoryFiles
@@ -50,6 +54,7 @@ from swath.georef.strips import StripError as StripTimesError
 from swath.georef.trajectory.trajectory import TrajectoryError
 
 AUTO = "auto"
+PLACED = 2  # times that the returns are placed anew
 CHOICES = (*MODELS, AUTO)
 REFUSED = (
     ControlError,
@@ -165,8 +170,12 @@ def correct_strips(request: AdjustOptions, folder: Path, tell: Tell) -> StripsCo
 
 
 def _corrected(request: AdjustOptions, folder: Path, tell: Tell) -> StripsCorrected:
-    control = request.control
-    kept = read_flight(request.logs, folder, tell, *([] if control is None else [control.place]))
+    def check(sessions: Sequence[Session], setups: Sequence[Setup]) -> None:
+        if request.control is not None:
+            request.control.place(sessions, setups)
+        check_space_to_keep(folder.parent, PLACED, sessions, setups)
+
+    kept = read_flight(request.logs, folder, tell, check)
     with told_before(verdicts_of(kept.logged), *REFUSED):
         return _of_flight(request, kept, folder, tell)
 

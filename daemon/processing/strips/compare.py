@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,12 @@ from swath.calib.strips.cells import StripRules
 from swath.calib.strips.differences import Numbers, PairReport, StripReport, report_of
 from swath.calib.strips.signatures import MATTERS_M, Signatures, record_of, signatures
 from swath.daemon.errors import ExitCode, UserError
-from swath.daemon.processing.calibration.returns import read_flight, refuse_installations, smoothed_prior
+from swath.daemon.processing.calibration.returns import (
+    check_space_to_keep,
+    read_flight,
+    refuse_installations,
+    smoothed_prior,
+)
 from swath.daemon.processing.carried_verdict import points_verdicts, refusal, told_before, verdict_entry
 from swath.daemon.processing.flights.read import GeorefOptions, verdicts_of
 from swath.daemon.processing.pages.head import head_of_flights, head_of_sidecars
@@ -125,7 +131,9 @@ def _read(paths: Sequence[Path], request: StripsOptions, folder: Path, told: Tel
         strips.carried.extend(points_verdicts(sidecars))
         return replace(strips, head=head_of_sidecars(sidecars, crs_of(source.crs for source in strips.look.sources)))
     folder.mkdir(parents=True, exist_ok=True)
-    kept = read_flight(replace(request.logs, logs=paths), folder, told)
+    kept = read_flight(
+        replace(request.logs, logs=paths), folder, told, partial(check_space_to_keep, folder.parent.parent, 0)
+    )
     refuse_installations(kept.logged)
     mapping = kept.logged[0].setup.mapping
     carried = verdicts_of(kept.logged)

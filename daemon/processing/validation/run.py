@@ -38,8 +38,15 @@ from swath.calib.validation.methods import (
     with_sigmas,
 )
 from swath.daemon.errors import ExitCode, UserError
+from swath.daemon.log.reader import Session
 from swath.daemon.processing.calibration.inputs import control_of, control_places
-from swath.daemon.processing.calibration.returns import KeptFlight, read_flight, refuse_installations, replaced
+from swath.daemon.processing.calibration.returns import (
+    KeptFlight,
+    check_space_to_keep,
+    read_flight,
+    refuse_installations,
+    replaced,
+)
 from swath.daemon.processing.calibration.run import PLANES, prior_of
 from swath.daemon.processing.carried_verdict import Carried, first_lines, refusal, told_before, verdict_entry
 from swath.daemon.processing.control.files import ControlFile
@@ -48,6 +55,7 @@ from swath.daemon.processing.flights.read import GeorefOptions, verdicts_of
 from swath.daemon.processing.pages.head import NOTHING_KNOWN, PageHead, calibrations_words, head_of_flights
 from swath.daemon.processing.pages.names import HISTORY_PICTURE, PRINTED, VALIDATION
 from swath.daemon.processing.pages.pdf import page_files
+from swath.daemon.processing.setup.setup import Setup
 from swath.daemon.processing.user_errors import as_user_error, finite
 from swath.daemon.processing.validation.page import validation_page
 from swath.daemon.processing.validation.record import record_files, records_of
@@ -163,8 +171,12 @@ def _entry(path: Path, named: Sequence[Path]) -> Calibration | None:
 
 
 def _against_logs(request: ValidationOptions, found: _Found, folder: Path, told: Tell) -> None:
-    control = request.control
-    kept = read_flight(request.logs, folder, told, *([] if control is None else [control.place]))
+    def check(sessions: Sequence[Session], setups: Sequence[Setup]) -> None:
+        if request.control is not None:
+            request.control.place(sessions, setups)
+        check_space_to_keep(folder.parent, int(request.anew), sessions, setups)
+
+    kept = read_flight(request.logs, folder, told, check)
     refuse_installations(kept.logged)
     found.carried += verdicts_of(kept.logged)
     found.head = head_of_flights(kept.logged, calibrations_words(found.calibrations))
