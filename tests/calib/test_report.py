@@ -34,6 +34,7 @@ from swath.daemon.processing.calibration.report.tables import entries_table, hel
 from swath.daemon.processing.pages.canvas import NARROW
 from swath.georef.verdicts import Level
 from tests.calib.made_outcome import RISE, Outcome, made_report
+from tests.daemon.processing.pages.builders import faults_of
 from tests.same_bytes import numbers_of
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("kernels")]
@@ -270,6 +271,10 @@ def test_the_page_needs_no_network(page: str) -> None:
         assert ET.fromstring(svg).tag == "{http://www.w3.org/2000/svg}svg"
         assert not re.search(r"href=[\"']https?:", svg)
     assert len(page) < 5_000_000
+
+
+def test_the_page_has_no_empty_heads_or_columns_and_real_minus_signs(page: str) -> None:
+    assert faults_of(page) == []
 
 
 def test_the_page_has_all_its_parts(page: str) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
+from swath.calib.labels import decimals_of, share
 from swath.daemon.processing.pages.blocks import Block, Card, Image, Judged, Notes, Table, Words, data_uri
 from swath.daemon.processing.pages.head import NOTHING_KNOWN, PageHead
 from swath.daemon.processing.pages.render import Page, html_of
@@ -199,11 +200,16 @@ def _length(metres: float | None) -> str:
     """Return the text of a sigma: below a metre in centimetres."""
     if metres is None:
         return "–"
-    return f"{metres:.2f} m" if metres >= 1.0 else f"{100 * metres:.2f} cm"
+    return f"{_sigma_number(metres)} m" if metres >= 1.0 else f"{_sigma_number(100.0 * metres)} cm"
 
 
 def _number(value: float | None, pattern: str = ".3g") -> str:
     return "–" if value is None else format(value, pattern).replace("-", "−")
+
+
+def _sigma_number(value: float | None) -> str:
+    """Return a sigma with two digits."""
+    return "–" if value is None else _number(value, f".{decimals_of(value)}f")
 
 
 def _cards(figures: Figures) -> list[Card]:
@@ -216,7 +222,7 @@ def _cards(figures: Figures) -> list[Card]:
         (f"{_number(rate)} Hz", f"{thousands(figures['epochs'])} epochs"),
         (_length(flat), "sigma, horizontal"),
         (_length(place[2]), "sigma, vertical"),
-        (f"{_number(rms['heading_deg'], '.4f')}°", "sigma of heading"),
+        (f"{_sigma_number(rms['heading_deg'])}°", "sigma of heading"),
         (thousands(positions["used"]), "positions used"),
         (str(positions["outages"]), f"outages, longest {_duration(positions['longest_outage_s'])}"),
     ]
@@ -246,15 +252,15 @@ def _facts(flight: Flight) -> list[Words]:
 
 def _sigmas(figures: Figures) -> Table:
     rows = []
-    for key, words, unit, factor, pattern in (
-        *((f"{axis}_m", f"position {axis}", "cm", 100.0, ".2f") for axis in AXES_L),
-        *((f"velocity_{axis}_mps", f"velocity {axis}", "cm/s", 100.0, ".2f") for axis in AXES_L),
-        *((f"{angle}_deg", angle, "°", 1.0, ".4f") for angle in ANGLES),
+    for key, words, unit, factor in (
+        *((f"{axis}_m", f"position {axis}", "cm", 100.0) for axis in AXES_L),
+        *((f"velocity_{axis}_mps", f"velocity {axis}", "cm/s", 100.0) for axis in AXES_L),
+        *((f"{angle}_deg", angle, "°", 1.0) for angle in ANGLES),
     ):
         columns = [figures[name][key] for name in ("sigma_rms", "sigma_p95", "sigma_largest", "filter_sigma_rms")]
-        shown = [_number(None if value is None else factor * value, pattern) for value in columns]
+        shown = [_sigma_number(None if value is None else factor * value) for value in columns]
         rows.append([f"{words} ({unit})", *shown])
-    heads: tuple[str, ...] = ("", "RMS", "95 %", "largest", "filter, RMS")
+    heads: tuple[str, ...] = ("sigma of", "RMS", "95 % are below", "largest", "filter, RMS")
     if figures["solution"] == "filter":
         heads, rows = heads[:4], [row[:4] for row in rows]
     return Table("Sigmas over the flight", heads, rows)
@@ -282,39 +288,46 @@ def _observations(figures: Figures) -> Table | None:
     return Table("Observations", heads, rows, under) if rows else None
 
 
+SENSORS = {
+    "gyro_bias": ("gyro bias", "°/h", np.degrees(1.0) * 3600.0),
+    "accel_bias": ("accelerometer bias", "mg", 1e3 / 9.80665),
+    "gyro_scale": ("gyro scale", "ppm", 1e6),
+    "accel_scale": ("accelerometer scale", "ppm", 1e6),
+    "gyro_misalignment": ("gyro misalignment", "mrad", 1e3),
+    "accel_misalignment": ("accelerometer misalignment", "mrad", 1e3),
+}
+
+
 def _sensors(figures: Figures) -> Table | None:
     rows = []
-    units = {
-        "gyro_bias": ("gyro bias", "°/h", np.degrees(1.0) * 3600.0),
-        "accel_bias": ("accelerometer bias", "mg", 1e3 / 9.80665),
-        "gyro_scale": ("gyro scale", "ppm", 1e6),
-        "accel_scale": ("accelerometer scale", "ppm", 1e6),
-        "gyro_misalignment": ("gyro misalignment", "mrad", 1e3),
-        "accel_misalignment": ("accelerometer misalignment", "mrad", 1e3),
-    }
     for name, axes in figures["sensors"].items():
-        words, unit, factor = units[name]
+        words, unit, factor = SENSORS[name]
         for axis, row in axes.items():
-            value, sigma = factor * row["estimate"], factor * row["sigma"]
             ratio = _number(row["largest_over_expected"], ".2f")
-            rows.append([f"{words} {axis} ({unit})", _number(value, ".3f"), _number(sigma, ".3f"), ratio])
+            estimated = _estimated_words(factor * row["estimate"], factor * row["sigma"])
+            rows.append([f"{words} {axis} ({unit})", "–", *estimated, ratio])
     arm, offset = figures["lever_arm"], figures["time_offset"]
     if arm is not None:
         for i, axis in enumerate(AXES_B):
-            given = f"given {_number(arm['given_m'][i], '.3f')}"
-            value, sigma = arm["estimate_m"][i], arm["sigma_m"][i]
-            rows.append([f"lever arm {axis} (m)", _number(value, ".3f"), _number(sigma, ".3f"), given])
+            estimated = _estimated_words(arm["estimate_m"][i], arm["sigma_m"][i])
+            rows.append([f"lever arm {axis} (m)", _number(arm["given_m"][i], ".3f"), *estimated, "–"])
     if offset is not None:
-        value, sigma = 1e3 * offset["estimate_s"], 1e3 * offset["sigma_s"]
-        rows.append(["time offset of GNSS (ms)", _number(value, ".2f"), _number(sigma, ".2f"), ""])
-    heads = ("at the end", "estimate", "sigma", "largest / expected")
+        estimated = _estimated_words(1e3 * offset["estimate_s"], 1e3 * offset["sigma_s"])
+        rows.append(["time offset of GNSS (ms)", "–", *estimated, "–"])
+    heads = ("at the end of the flight", "given", "estimate", "sigma", "largest / expected")
     return Table("Sensors", heads, rows) if rows else None
+
+
+def _estimated_words(value: float, sigma: float) -> tuple[str, str]:
+    """Return an estimate and its sigma, which has two digits."""
+    pattern = f".{decimals_of(sigma)}f"
+    return _number(value, pattern), _number(sigma, pattern)
 
 
 def _run(figures: Figures) -> Table:
     bridged, positions, separation = figures["bridged"], figures["positions"], figures["separation"] or {}
     rows = [
-        ["inertial samples made up", f"{thousands(bridged['epochs'])} ({bridged['share']:.3%})"],
+        ["inertial samples made up", f"{thousands(bridged['epochs'])} ({share(bridged['share'])})"],
         ["longest run of them", _duration(bridged["longest_s"])],
         ["time in outages", _duration(positions["outages_s"])],
         *([f"positions, {name.replace('_', ' ')}", thousands(n)] for name, n in positions["fix_types"].items()),
@@ -328,4 +341,4 @@ def _run(figures: Figures) -> Table:
         ["how long headings' errors last, s", _number(figures["lasting_heading_s"], ".1f")],
         *([name.replace("_", " "), thousands(count)] for name, count in figures["counts"].items()),
     ]
-    return Table("The run", ("", ""), rows)
+    return Table("The run", ("", ""), [row for row in rows if row[1] != "–"])

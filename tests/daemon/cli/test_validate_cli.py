@@ -26,6 +26,7 @@ from swath.georef.mapping.frame import Mapping
 from swath.georef.scanner.calibration import INDEX, Calibration, nominal, read_calibration
 from swath.georef.verdicts import Level
 from tests.calib.cast_flight import Cast, cast_flight
+from tests.daemon.processing.pages.builders import faults_of
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
@@ -312,6 +313,7 @@ def test_check_points_are_counted_in_the_record(log: Path, made: Cast, tmp_path:
     assert row in page
     assert '<td>003</td><td class="left">needs the log of a second flight' in page
     assert "second-flight" in page
+    assert faults_of(page) == []
     assert "HB-ABC" in page
     assert page.count(">passed</span>") >= 6  # two methods, and their tests in the appendix
     assert "≤ " in page

@@ -16,6 +16,7 @@ from pyproj import CRS
 
 from swath.daemon.cli.main import run_app
 from tests.daemon.builders import EAST_M, NORTH_M, lattice, plane, write_laz
+from tests.daemon.processing.pages.builders import faults_of
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
@@ -118,6 +119,7 @@ def test_the_head_names_log_aircraft_crs_calibration_and_the_pdf_its_author(prod
 def test_the_page_needs_no_network_and_is_well_formed(products: Path, page: Page) -> None:
     text = (products / "view" / "index.html").read_text(encoding="utf-8")
     assert page.links == []
+    assert faults_of(text) == []
     assert (page.open, page.crossed) == ([], [])
     assert not re.search(r"https?://|@import|url\(|<script", text)
     assert "prefers-color-scheme: dark" in text

@@ -216,9 +216,9 @@ def strips_table(report: ReportInput) -> Table | None:
         early = "–" if before is None else number(100.0 * before.rms_m, ".1f")
         late = [number(100.0 * x, ".1f") for x in (after.rms_m, after.mean_m, after.std_m, after.max_m)]
         rows.append([f"{pair[0]} – {pair[1]}", thousands(after.count), early, *late])
-    heads = ("strips", "compared", "RMSDz before", "RMSDz after", "mean", "std", "largest")
+    heads = ("strips", "compared", "RMSDz before, cm", "RMSDz after, cm", "mean, cm", "std, cm", "largest, cm")
     measure = f" {report.measure}." if report.measure else ""
-    return Table("", heads, rows, f"Centimetres.{measure}{_more(len(pairs))}")
+    return Table("", heads, rows, f"{measure}{_more(len(pairs))}".strip())
 
 
 def _more(count: int) -> str:
@@ -319,7 +319,7 @@ def control_table(report: ReportInput) -> Table | None:
         "The adjustment used every point; the rightmost column shows the parameter that changes most when the point "
         "is left out."
     )
-    heads = ("point", "misclosure cm", "sigma cm", "w", "changes most if left out")
+    heads = ("point", "misclosure, cm", "sigma, cm", "w", "changes most if left out")
     return Table("", heads, rows, under, left=(0, 4))
 
 

@@ -1,7 +1,9 @@
-"""Measures the texts of a drawn figure."""
+"""Measures the texts of a drawn figure; reads pages as a person would, and names what no page may have."""
 
 from __future__ import annotations
 
+import re
+from html.parser import HTMLParser
 from itertools import combinations
 from typing import Any
 
@@ -53,3 +55,53 @@ def overlapping(figure: Figure) -> list[tuple[str, str]]:
         if box.x0 < page.x0 - 0.5 or box.x1 > page.x1 + 0.5 or box.y0 < page.y0 - 0.5 or box.y1 > page.y1 + 0.5
     ]
     return found
+
+
+class Tables(HTMLParser):
+    """The words of a page outside its style, and its tables as rows of cells, the heads first."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.words: list[str] = []
+        self.tables: list[list[list[str]]] = []
+        self.headed: list[bool] = []
+        self._inside = ""
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        if tag == "table":
+            self.tables.append([])
+            self.headed.append(False)
+        elif tag == "tr":
+            self.tables[-1].append([])
+        elif tag in ("td", "th"):
+            self.tables[-1][-1].append("")
+            self.headed[-1] |= tag == "th"
+        if tag in ("style", "td", "th"):
+            self._inside = tag
+
+    def handle_endtag(self, tag: str) -> None:
+        self._inside = "" if tag == self._inside else self._inside
+
+    def handle_data(self, data: str) -> None:
+        if self._inside in ("td", "th"):
+            self.tables[-1][-1][-1] += data
+        if self._inside != "style":
+            self.words.append(data)
+
+
+def faults_of(text: str) -> list[str]:
+    """Return what no page may have: empty heads, columns without content, hyphens as minus signs."""
+    page, faults = Tables(text), []
+    for table, headed in zip(page.tables, page.headed, strict=True):
+        if headed:
+            heads, *rows = table
+            faults += [f"empty head in {heads}" for head in heads if not head.strip()]
+            columns = zip(*rows, strict=True)
+            faults += [
+                f"nothing known: {head}"
+                for number, (head, column) in enumerate(zip(heads, columns, strict=True))
+                if number and {cell.strip() for cell in column} <= {"", "–"}
+            ]
+    words = " ".join(page.words)
+    return faults + [f"hyphen: {found[0]}" for found in re.finditer(r".{0,20}(?<![\w=.,/-])-\d.{0,10}", words)]

@@ -22,6 +22,7 @@ from swath.daemon.processing.pages.head import (
 from swath.daemon.processing.pages.names import OF_COMMAND, PRINTED
 from swath.daemon.processing.pages.pdf import PdfUnavailableError, page_files, pdf_of
 from swath.daemon.processing.pages.render import Page, html_of
+from tests.daemon.processing.pages.builders import faults_of
 
 NINE_NS = 1_465_549_218_000_000_000  # 2026-06-15 09:00:00 UTC and 18 leap seconds
 DAY_NS = 86_400_000_000_000
@@ -110,6 +111,7 @@ def test_a_page_ends_with_its_appendix_and_shows_no_empty_column() -> None:
     text = html_of(page_of())
     assert text.index("HB-ABC") < text.index("row 2") < text.index("<h1>Appendix</h1>") < text.index("x = a + b")
     assert "unknown" not in text
+    assert faults_of(text) == []
     assert "<title>Title &amp; more: test page</title>" in text
     assert '<meta name="author" content="Aero &lt;Survey&gt;">' in text
     assert "Appendix" not in html_of(Page("Test page", "Title", PageHead(), []))

@@ -32,6 +32,7 @@ from swath.georef.navigation.inputs import Fate, Kind, Solution
 from swath.georef.records import FixType
 from swath.georef.timescales.gps_time import SECOND_NS
 from tests.daemon.navigation_flights import reference_truth, sound_flight, with_rows
+from tests.daemon.processing.pages.builders import faults_of
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("kernels")]
 
@@ -90,6 +91,7 @@ def test_the_page_is_complete(flight: Flight) -> None:
     page.feed(text)
     assert len(text.encode()) < 3_000_000
     assert "<b>log" not in text
+    assert faults_of(text) == []
     assert "http" not in text
     assert not {"script", "link", "iframe"} & set(page.tags)
     words = "".join(page.words)
