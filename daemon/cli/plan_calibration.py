@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -10,7 +11,7 @@ import typer
 
 from swath.daemon.cli.sim import PlanArgument
 from swath.daemon.errors import ExitCode, UserError, one_line
-from swath.daemon.processing.requirements import require_installed
+from swath.daemon.processing.requirements import PRINTED_PAGES, require_installed
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -26,7 +27,7 @@ def command(
             "--output",
             "-o",
             metavar="FILE",
-            help="Picture to write: PNG, PDF or SVG; default: PLAN-calibration.png in this folder.",
+            help="NAME.html (page and PDF), or a picture: PNG, PDF, SVG; default: PLAN-calibration.png in this folder.",
         ),
     ] = None,
     model: Annotated[str, typer.Option(help="Parameters to estimate: basic, scanner, full, or FILE.toml.")] = "scanner",
@@ -51,12 +52,12 @@ def command(
     Computes which roofs, ground and control points the flight lines see, and puts them through the equations of
     `swath calibrate`. Exit code 1 when the flight would not determine boresight or range offset.
     """
-    require_installed("swath plan-calibration", "matplotlib")
+    require_installed("swath plan-calibration", *PRINTED_PAGES)
     from rich.console import Console
 
     from swath.daemon.cli.progress import progress_bar
     from swath.daemon.processing.calibration.model import model_of
-    from swath.daemon.processing.calibration.plan.page import draw_planned, require_picture
+    from swath.daemon.processing.calibration.plan.page import require_picture
     from swath.daemon.processing.calibration.plan.run import PlanOptions, plan_calibration
     from swath.daemon.simulate.plans import FlightOptions
 
@@ -64,19 +65,33 @@ def command(
     require_picture(picture)
     asked = PlanOptions(model_of(model), None if sigmas is None else _three(sigmas), not no_control, control_sigma)
     flight = FlightOptions(plan)
+    warnings: list[str] = []
     with progress_bar() as tell, flight.as_user_errors():
         planned = plan_calibration(flight.load(), asked, tell)
         tell("picture", 0, 0)
         try:
-            draw_planned(planned, picture)
+            written = _write(planned, picture, warnings)
         except OSError as error:
             raise UserError(one_line(f"{picture}: {error.strerror or error}"), ExitCode.IO) from error
     if as_json:
         print(json.dumps(_document(planned, picture), indent=2))
     else:
-        _print(Console(), planned, picture)
+        _print(Console(), planned, written)
+    for line in warnings:
+        print(one_line(f"swath: {line}"), file=sys.stderr)
     if planned.lacking:
         raise UserError(one_line(f"{plan}: {planned.sentence}"))
+
+
+def _write(planned: PlannedCalibration, path: Path, warnings: list[str]) -> list[Path]:
+    """Write the page with its PDF, or the picture; return what was written."""
+    from swath.daemon.processing.calibration.plan.document import HTML, write_planned
+    from swath.daemon.processing.calibration.plan.page import draw_planned
+
+    if path.suffix.lower() == HTML:
+        return write_planned(planned, path, warnings)
+    draw_planned(planned, path)
+    return [path]
 
 
 def _three(text: str) -> tuple[float, float, float]:
@@ -102,7 +117,7 @@ def _document(planned: PlannedCalibration, picture: Path) -> dict[str, Any]:
     }
 
 
-def _print(console: Console, planned: PlannedCalibration, picture: Path) -> None:
+def _print(console: Console, planned: PlannedCalibration, written: list[Path]) -> None:
     from rich.table import Table
 
     from swath.calib.labels import decimals_of, number
@@ -121,4 +136,5 @@ def _print(console: Console, planned: PlannedCalibration, picture: Path) -> None
     for note in planned.notes:
         print(one_line(note))
     print(planned.sentence)
-    print(one_line(str(picture)))
+    for path in written:
+        print(one_line(str(path)))

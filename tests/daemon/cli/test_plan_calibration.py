@@ -8,9 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from pypdf import PdfReader
 
 from swath.daemon.cli.plan_calibration import command
 from swath.daemon.errors import ExitCode, UserError
+from tests.daemon.processing.pages.builders import Tables, faults_of
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("kernels")]
 
@@ -244,9 +246,28 @@ def test_an_impossible_plan_is_refused_in_one_line(
     assert ended.value.exit_code == ExitCode.USAGE
 
 
+def test_a_page_shows_verdict_parameters_and_what_to_fly(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="does not determine"):
+        planned(plan_of(tmp_path, OPPOSITE), tmp_path / "plan.html", no_control=True)
+    text = (tmp_path / "plan.html").read_text(encoding="utf-8")
+    assert faults_of(text) == []
+    (parameters, missing) = Tables(text).tables[:2]
+    assert parameters[0] == ["parameter", "unit", "predicted sigma", "largest useful sigma", "determined"]
+    rows = {row[0]: row for row in parameters[1:]}
+    assert rows["boresight ω (roll)"][1:2] + rows["boresight ω (roll)"][3:4] == ["°", "0.005"]
+    undetermined = {row[0] for row in parameters[1:] if row[4] == "no"}
+    assert undetermined == {row[0] for row in missing[1:]}
+    assert undetermined
+    assert "This flight does not determine" in text
+    assert "EPSG:32632" in text
+    read = PdfReader(tmp_path / "plan.pdf")
+    assert read.metadata is not None
+    assert str(read.metadata.title).endswith(": planned calibration")
+
+
 def test_unwritable_pictures_are_reported_in_one_line(tmp_path: Path) -> None:
     plan = plan_of(tmp_path, OPPOSITE)
-    with pytest.raises(UserError, match=r"plan.bmp: want a picture's name that ends in one of .pdf, .png, .svg"):
+    with pytest.raises(UserError, match=r"plan.bmp: want a file's name that ends in one of .html, .pdf, .png, .svg"):
         planned(plan, tmp_path / "plan.bmp")
     with pytest.raises(UserError, match="No such file") as ended:
         planned(plan, tmp_path / "none" / "plan.png")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,6 +15,7 @@ from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import NullFormatter, NullLocator
+from matplotlib.transforms import Bbox
 
 from swath.calib.labels import Unknown, decimals_of, plain, unknown
 from swath.daemon.errors import ExitCode, UserError
@@ -22,7 +24,7 @@ from swath.georef.scanner.calibration import PARAMETERS
 from swath.sim.preview.chart import Chart
 from swath.sim.preview.map import INK, MUTED, draw_map
 
-FORMATS = (".pdf", ".png", ".svg")
+FORMATS = (".html", ".pdf", ".png", ".svg")
 DPI = 150
 PAGE = (17.0, 10.6)  # inches
 MAP, COLOURS = (0.75, 1.05, 8.6, 8.45), (6.75, 1.35, 2.3, 0.12)
@@ -36,9 +38,9 @@ NAMES = {parameter.key: parameter.name for parameter in PARAMETERS}
 
 
 def require_picture(path: Path) -> None:
-    """Refuse with `UserError` a path that does not end as a picture's."""
+    """Refuse with `UserError` a path that does not end as a page's or a picture's."""
     if path.suffix.lower() not in FORMATS:
-        raise UserError(f"{path}: want a picture's name that ends in one of {', '.join(FORMATS)}", ExitCode.USAGE)
+        raise UserError(f"{path}: want a file's name that ends in one of {', '.join(FORMATS)}", ExitCode.USAGE)
 
 
 def draw_planned(planned: PlannedCalibration, path: Path) -> None:
@@ -58,6 +60,17 @@ def draw_planned(planned: PlannedCalibration, path: Path) -> None:
     below = _sigmas(figure, planned.rows)
     _words(figure, planned, below)
     figure.savefig(path, dpi=DPI)
+
+
+def map_png(planned: PlannedCalibration) -> bytes:
+    """Return the map alone as PNG."""
+    figure = Figure(figsize=PAGE, facecolor="white")
+    _map(figure, planned)
+    left, bottom, width, height = MAP
+    box = Bbox([[left - 0.7, bottom - 0.6], [left + width + 0.25, bottom + height + 0.2]])
+    made = io.BytesIO()
+    figure.savefig(made, format="png", dpi=DPI, bbox_inches=box)
+    return made.getvalue()
 
 
 def _panel(figure: Figure, box: tuple[float, float, float, float]) -> Axes:
