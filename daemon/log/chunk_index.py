@@ -104,8 +104,13 @@ class LogIndex:
         return np.array([chunk.start_ns for chunk in chunks]), np.array([chunk.end_ns for chunk in chunks])
 
 
-def index_log(session: Session) -> LogIndex:
+def index_log(session: Session, *, walk: bool = True) -> LogIndex:
     """Locate the chunks of a session.
+
+    Args:
+        session: the session.
+        walk: walk through parts without a sound summary, which takes as long as reading them; False: leave out their
+            chunks.
 
     Raises:
         LogError: a part is no longer a log.
@@ -116,8 +121,10 @@ def index_log(session: Session) -> LogIndex:
         with part.path.open("rb") as file:
             size = part.path.stat().st_size
             found = _from_summary(file, size, number)
-            if found is None:
+            if found is None and walk:
                 found = _from_walk(file, size, number, part.path, index.damage)
+            elif found is None:
+                found = PartChannels({}, {}), []
         index.parts.append(found[0])
         index.chunks += found[1]
     return index

@@ -23,10 +23,11 @@ def flight_places(session: Session, config: Config, attachments: Mapping[str, by
     """Return latitudes and longitudes (n, 2), degrees, of a few places along a session.
 
     They are those of receivers and of an INS, to be compared with places that are kilometres apart; none if neither
-    gives any, or if the log cannot be read, which other code reports.
+    gives any, if all parts were cut off (walking through them takes as long as reading them), or if the log cannot be
+    read, which other code reports.
     """
     try:
-        index = index_log(session)
+        index = index_log(session, walk=False)
         found = [place for run in _runs(index) for place in _places(index, run, Sources(config, attachments))]
     except (LogError, OSError):
         found = []

@@ -40,9 +40,12 @@ def check_space_for_returns(
 
 
 def estimated_returns(session: Session, setup: Setup) -> int:
-    """Return about how many returns a session holds, from a few of its chunks; 0 if these cannot be decoded alone."""
+    """Return about how many returns a session holds, from a few of its chunks; 0 if they cannot be decoded alone.
+
+    Parts that were cut off count as empty: walking through them takes as long as reading them.
+    """
     try:
-        index = index_log(session)
+        index = index_log(session, walk=False)
     except (LogError, OSError):  # reported by the code that reads the log
         return 0
     chunks = index.scanner_chunks()

@@ -88,6 +88,7 @@ class TestIndex:
         assert cut.damage
         assert cut.chunks == whole.chunks
         assert whole.damage == []
+        assert index_log(open_logs([log])[0], walk=False).chunks == []
 
     def test_a_wrong_bit_in_the_summary_does_not_change_the_chunks(self, flown: Flown, tmp_path: Path) -> None:
         whole = index_log(open_logs([flown.log])[0])
