@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -146,6 +147,28 @@ def test_heights_must_be_those_of_the_crs() -> None:
     assert "give --control-crs without its vertical part, or export heights in DHHN2016 height" in line
     both = "Point ID,Easting,Northing,Ortho. Height,Ellip. Height\n" + rows("{name},{e},{n},,{h}")
     assert is_right(placed(both))
+
+
+@pytest.mark.parametrize("plane", ["+proj=utm +zone=32", "+proj=longlat"])
+def test_heights_above_a_geoid_are_raised_by_its_grid(plane: str, tmp_path: Path) -> None:
+    grid = tmp_path / "geoid.gtx"
+    shape, undulation_m = (11, 11), 47.25
+    head = struct.pack(">4d2i", 47.0, 8.4, 0.1, 0.1, *shape)
+    grid.write_bytes(head + np.full(shape, undulation_m, ">f4").tobytes())
+    crs = f"{plane} +datum=WGS84 +geoidgrids={grid} +type=crs"
+    below = np.array([0.0, 0.0, undulation_m])
+    if "utm" in plane:
+        text = "Point ID,Easting,Northing,Ortho. Height\n" + rows("{name},{e},{n},{h}", utm32() - below)
+    else:
+        text = "Point ID,Latitude,Longitude,Elevation\n" + rows("{name},{e},{n},{h}", LAT_LON_H - below)
+    found = placed(text, crs)
+    assert is_right(found, 6e-4 if "utm" in plane else 8.0)  # degrees have four digits in the file
+    assert lat_lon_h(found)[:, 2] == pytest.approx(LAT_LON_H[:, 2], abs=1e-4)
+    assert ", heights in " in found.notes[0]
+    assert "above the ellipsoid" not in found.notes[0]
+    assert "are above the ellipsoid, but" in mistaken(
+        text.replace("Ortho. Height", "Ellip. Height").replace("Elevation", "Ellip. Height"), crs
+    )
 
 
 def test_a_missing_grid_of_a_geoid_is_told_with_its_remedy() -> None:
