@@ -253,8 +253,9 @@ def _lines(look: Look, srs_id: int, notes: list[str]) -> Iterator[tuple[LineStri
     except (TrajectoryError, OSError, ValueError) as error:
         notes.append(f"no lines: {error}")
         return
+    names = {source.path.name for source in look.sources}
     for source in {str(one.path.parent): one for one in look.sources if one.sidecar}.values():
-        for entry in _entries(source.sidecar, "strips"):
+        for entry in (one for one in _entries(source.sidecar, "strips") if Path(str(one.get("file"))).name in names):
             span = (entry.get("first_gps_ns"), entry.get("last_gps_ns"))
             found = next((one for one in trajectories if _covers(one, *span)), None)
             if found is None:

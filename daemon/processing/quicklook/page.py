@@ -84,7 +84,7 @@ def _cards(look: Look) -> list[Card]:
     cards = [
         (thousands(look.surface.points), "points"),
         (_area(look.area_m2), "covered"),
-        (f"{look.density:.3g} per m²", "pulses, all strips together"),
+        (f"{look.density:.3g}", "pulses per m², all strips together"),
         (str(len(look.strips)), "strip" if len(look.strips) == 1 else "strips"),
     ]
     if agreement.numbers:

@@ -113,7 +113,7 @@ def _cards(now: Judgement) -> list[Card]:
     cards.append((agreement.best or ("none" if agreement.judged else "no verdict"), "best quality level met"))
     cards += [(str(len(now.strips.look.names)), "strips"), (str(len(now.pairs())), "pairs that overlap")]
     if math.isfinite(agreement.pulses_m2):
-        cards.append((f"{agreement.pulses_m2:.3g} per m²", "pulses, all strips together"))
+        cards.append((f"{agreement.pulses_m2:.3g}", "pulses per m², all strips together"))
     return cards
 
 

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import io
 import math
-import textwrap
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -19,7 +18,7 @@ from matplotlib.ticker import MaxNLocator
 
 from swath.calib.features import ControlPoint
 from swath.calib.flight import Flight
-from swath.calib.labels import decimals_of, number, unknown
+from swath.calib.labels import decimals_of, number, unknown, with_sigma
 from swath.calib.profiles.check import Check, Comparison
 from swath.calib.profiles.measure import Ground
 from swath.calib.profiles.sections import Corridor, fit_pieces
@@ -77,8 +76,8 @@ def profiles_table(checked: Check) -> Table | None:
         [
             profile.kind,
             f"{profile.names[0]} and {profile.names[1]}",
-            number(profile.separation_m, "+.3f"),
-            number(profile.separation_sigma_m, ".3f"),
+            number(profile.separation_m, f"+.{decimals_of(profile.separation_sigma_m)}f"),
+            number(profile.separation_sigma_m, f".{decimals_of(profile.separation_sigma_m)}f"),
             "–" if profile.kind == "range" else number(profile.baseline_m, ".1f"),
             str(profile.pieces),
         ]
@@ -233,15 +232,14 @@ def _thinned(section: Section, low: float, high: float) -> tuple[Any, Any]:
 
 
 def _words(figure: Figure, profile: Profile) -> None:
-    figure.subplots_adjust(left=0.075, right=0.985, top=0.745, bottom=0.11, wspace=0.06)
+    figure.subplots_adjust(left=0.075, right=0.985, top=0.8, bottom=0.11, wspace=0.06)
     between = f"{profile.names[0]} and {profile.names[1]}"
     figure.text(0.02, 0.945, f"{profile.kind.capitalize()}: {between}", fontsize=13, weight="bold", color=INK)
     unit, factor = ("m", 1.0) if profile.kind == "range" else ("°", float(np.degrees(1.0)))
-    digits = 4 if unit == "m" else 5
+    found = with_sigma(factor * profile.found, factor * profile.sigma)
     measured = (
-        f"separation {profile.separation_m:+.3f} ± {profile.separation_sigma_m:.3f} m, "
-        f"found {factor * profile.found:+.{digits}f} ± {factor * profile.sigma:.{digits}f}{'' if unit == '°' else ' '}"
-        f"{unit}, {profile.pieces} {'targets' if profile.kind == 'range' else 'pieces of ground'}"
+        f"separation {with_sigma(profile.separation_m, profile.separation_sigma_m)} m, "
+        f"found {found}{'' if unit == '°' else ' '}{unit}, "
+        f"{profile.pieces} {'targets' if profile.kind == 'range' else 'pieces of ground'}"
     )
-    lines = [*textwrap.wrap(profile.formula, 130), measured]
-    figure.text(0.02, 0.92, "\n".join(lines), fontsize=8.5, color=MUTED, va="top", linespacing=1.35)
+    figure.text(0.02, 0.9, measured, fontsize=8.5, color=MUTED, va="top")

@@ -227,6 +227,12 @@ def test_one_strip_without_a_crs_gives_maps_without_one_and_a_note(
     assert not (tmp_path / "view" / QUICK_LOOK_FEATURES).exists()
 
 
+def test_lines_are_those_of_the_strips_that_were_looked_at(products: Path, tmp_path: Path) -> None:
+    assert run_app(["view", str(products / "s2.laz"), "--gis", "-o", str(tmp_path / "view")]) == 0
+    _, _, columns = features_of(tmp_path, "lines")
+    assert list(columns["strip"]) == ["2"]
+
+
 def test_coordinates_in_feet_stay_in_feet(tmp_path: Path) -> None:
     foot_m = 1200.0 / 3937.0
     x, y = (axis / foot_m for axis in lattice(EAST_M, NORTH_M, 60.0, 40.0, 0.5))
