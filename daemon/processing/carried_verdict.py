@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -29,6 +30,7 @@ OF_ADJUSTMENT, ADJUSTMENT = "swath.strip-adjustment", "strip-adjustment.json"  #
 SOURCES = {"smoothed": "navigated", "realtime": "navigated", "as-is": "ins"}  # by a trajectory's summary
 MADE_WITH = {"navigated": "a trajectory navigated from IMU and GNSS", "ins": "the device's own INS", "file": "a file"}
 TRAJECTORY_ENDS = ("_trajectory.csv", "_trajectory.sbet")
+REMEDY = re.compile(r"; (?=(?:calibrate|check|correct|fly|give|navigate|run|set|use) )")  # begins in a sentence here
 RANGE_M = 100.0  # range at which the error of a nominal calibration is given
 
 
@@ -52,8 +54,8 @@ class Carried:
     @property
     def reason(self) -> Reason:
         """The sentence as the gravest reason of a verdict, with its remedy apart."""
-        what, _, change = self.sentence.partition("; ")
-        return Reason(self.level, "input", what, change, math.inf)
+        what, *change = REMEDY.split(self.sentence, 1)
+        return Reason(self.level, "input", what, "; ".join(change), math.inf)
 
 
 def verdict_entry(carried: Sequence[Carried], *, accepted: bool) -> dict[str, Any]:

@@ -167,3 +167,13 @@ def test_points_carry_the_verdict_of_their_sidecar() -> None:
     sidecars: list[dict[str, Any]] = [{"format": "swath.georef", "verdict": entry}, {}, {"verdict": 3}]
     assert points_verdicts([*sidecars, *sidecars]) == [Carried(Level.UNUSABLE, "b")]
     assert replace(Carried(Level.CARE, "b"), level=Level.UNUSABLE).line == "not to be used: b"
+
+
+def test_the_reason_of_a_carried_verdict_has_its_remedy_apart() -> None:
+    nominal_one = Carried(Level.UNUSABLE, "calibration c is nominal: points may lie 2 m off; run swath calibrate")
+    assert (nominal_one.reason.what, nominal_one.reason.change) == (
+        "calibration c is nominal: points may lie 2 m off",
+        "run swath calibrate",
+    )
+    figure = "the calibration leaves 7.1 cm in points; 4.5 cm is required"
+    assert (Carried(Level.CARE, figure).reason.what, Carried(Level.CARE, figure).reason.change) == (figure, "")
