@@ -120,15 +120,15 @@ def _document(planned: PlannedCalibration, picture: Path) -> dict[str, Any]:
 def _print(console: Console, planned: PlannedCalibration, written: list[Path]) -> None:
     from rich.table import Table
 
-    from swath.calib.labels import decimals_of, number
+    from swath.daemon.processing.calibration.plan.document import sigma_words
 
     table = Table(box=None, pad_edge=False, header_style="bold")
     for column in ("scanner", "parameter", "unit", "sigma", "wanted", "determined"):
         table.add_column(column, justify="right" if column in ("sigma", "wanted") else "left")
     for row in planned.rows:
-        sigma = "–" if row["sigma"] is None else number(row["sigma"], f".{decimals_of(row['sigma'])}f")
         word = "yes" if row["determined"] else "no"
-        table.add_row(one_line(row["scanner"]), row["name"], row["unit"], sigma, f"{row['wanted']:.3g}", word)
+        words = one_line(row["scanner"]), row["name"], row["unit"], sigma_words(row["sigma"])
+        table.add_row(*words, f"{row['wanted']:.3g}", word)
     console.print(table)
     for row in planned.rows:
         if row["why"]:

@@ -6,12 +6,14 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
+from pyproj import CRS
+
 from swath.calib.labels import Unknown, decimals_of, number, plain, thousands, unknown
 from swath.daemon.processing.calibration.plan.page import NAMES, map_png
 from swath.daemon.processing.calibration.plan.run import PlannedCalibration
 from swath.daemon.processing.files import write_whole
 from swath.daemon.processing.pages.blocks import Block, Card, Cell, Image, Judged, Notes, Table, Words, data_uri
-from swath.daemon.processing.pages.head import PageHead
+from swath.daemon.processing.pages.head import PageHead, crs_words
 from swath.daemon.processing.pages.pdf import page_files
 from swath.daemon.processing.pages.render import Page, html_of
 from swath.georef.verdicts import Level, Verdict
@@ -58,7 +60,8 @@ def planned_page(planned: PlannedCalibration) -> str:
         *([Table("Not determined", heads, missing, left=(0, 1, 2), stacked=True)] if missing else []),
         Image(title, data_uri(map_png(planned), "image/png")),
     ]
-    head = PageHead(crs=tables.flight.crs)
+    crs = tables.flight.crs
+    head = PageHead(crs=crs_words({"name": CRS.from_user_input(crs).name, "crs": crs}))
     page = Page(
         "Planned calibration",
         tables.flight.name,
@@ -92,10 +95,15 @@ def _parameters(planned: PlannedCalibration) -> Table:
     rows: list[list[Cell]] = []
     for row in planned.rows:
         useful = float(row["wanted"])
-        sigma = "undetermined" if row["sigma"] is None else number(row["sigma"], f".{decimals_of(row['sigma'])}f")
+        sigma = "none" if row["sigma"] is None else sigma_words(row["sigma"])
         verdict = Judged("yes", good=True) if row["determined"] else Judged("no", good=False)
         rows.append([_words(planned, row), _unknown(row).unit, sigma, number(useful, ".6g"), verdict])
     return Table("Parameters", ("parameter", "unit", "predicted sigma", "largest useful sigma", "determined"), rows)
+
+
+def sigma_words(sigma: float | None) -> str:
+    """Return a sigma with two digits; a dash if there is none."""
+    return "–" if sigma is None else number(sigma, f".{decimals_of(sigma)}f")
 
 
 def _unknown(row: dict[str, Any]) -> Unknown:

@@ -67,7 +67,7 @@ def map_png(planned: PlannedCalibration) -> bytes:
     figure = Figure(figsize=PAGE, facecolor="white")
     _map(figure, planned)
     left, bottom, width, height = MAP
-    box = Bbox([[left - 0.7, bottom - 0.6], [left + width + 0.25, bottom + height + 0.2]])
+    box = Bbox([[left - 0.7, bottom - 0.95], [left + width + 0.25, bottom + height + 0.2]])
     made = io.BytesIO()
     figure.savefig(made, format="png", dpi=DPI, bbox_inches=box)
     return made.getvalue()
