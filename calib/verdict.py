@@ -119,10 +119,8 @@ def _beyond_wanted(report: ReportInput) -> Iterator[tuple[str, float]]:
     for name, sigma in zip(report.adjusted.names, report.adjusted.sigmas.tolist(), strict=True):
         limit = wanted.get(unknown(name).name)
         if limit is not None:
-            words = (
-                f"{unknown_words(name, several)} is known to {sized(name, sigma)} only; {sized(name, limit)} is "
-                "required"
-            )
+            known = f"{unknown_words(name, several)} is known to {sized(name, sigma)} only"
+            words = f"{known}, where {sized(name, limit)} is required"
             yield words, sigma / limit
 
 
@@ -135,7 +133,8 @@ def _points(report: ReportInput) -> Iterator[tuple[str, float]]:
     for scanner, left_m in need.left_m.items():
         of = f" of {scanner}" if several else ""
         if math.isfinite(left_m):
-            yield f"leaves {length(left_m)} in points{of}; {length(need.point_m)} is required", left_m / need.point_m
+            words = f"leaves {length(left_m)} in points{of}, where {length(need.point_m)} is required"
+            yield words, left_m / need.point_m
 
 
 def _contradicted(report: ReportInput) -> Iterator[tuple[str, float]]:

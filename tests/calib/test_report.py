@@ -143,10 +143,10 @@ def test_the_verdict_follows_the_requirements(report: ReportInput) -> None:
     """An angle and the points against what the user wants of them."""
     need = Need(0.05, {"kappa_rad": math.radians(0.001)}, 0.1, {"left": 0.04})
     (reason,) = judge(replace(sound(report), need=need)).reasons
-    assert reason.what == "boresight κ (heading) is known to 0.0014° only; 0.0010° is required"
+    assert reason.what == "boresight κ (heading) is known to 0.0014° only, where 0.0010° is required"
     assert not judge(replace(sound(report), need=replace(need, wanted={}))).reasons
     (reason,) = judge(replace(sound(report), need=replace(need, wanted={}, point_m=0.03))).reasons
-    assert reason.what == "the calibration leaves 4.0\u00a0cm in points; 3.0\u00a0cm is required"
+    assert reason.what == "the calibration leaves 4.0\u00a0cm in points, where 3.0\u00a0cm is required"
     assert judge(replace(sound(report), need=replace(need, wanted={}, point_m=0.003))).level is Level.UNUSABLE
 
 

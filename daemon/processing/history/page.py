@@ -27,6 +27,7 @@ from swath.georef.scanner.calibration import INDEX, Calibration
 
 DAY_S = 86_400.0
 DPI = 110
+DAYS_BESIDE = 15.0  # least shown on each side of the dates
 COLOURS = ("#2f6690", "#b3541e", "#4f772d", "#7b4b94", "#9c6b00", "#1f7a8c")  # one a mounting
 HOW = (
     "Points are values with one sigma, a colour for each mounting. Successive calibrations are compared by the χ² of "
@@ -146,6 +147,10 @@ def _style(axes: Axes, label: str, *, legend: bool) -> None:
     axes.tick_params(labelsize=8, colors=MUTED)
     axes.xaxis_date(dt.UTC)
     axes.margins(x=0.08)
+    low, high = axes.get_xlim()
+    if high - low < 2.0 * DAYS_BESIDE:  # of one date alone Matplotlib shows years
+        middle = (axes.dataLim.x0 + axes.dataLim.x1) / 2.0
+        axes.set_xlim(middle - DAYS_BESIDE, middle + DAYS_BESIDE)
     axes.grid(color="#c9cecb", lw=0.4)
     axes.spines[["top", "right"]].set_visible(False)
     if legend:

@@ -206,7 +206,7 @@ def _effect(one: Signature) -> list[Cell]:
         return [effect.name, effect.key, "–", "–", "–", "–", f"{LEVEL_WORDS.get(one.level, one.level)}: {why}"]
     pattern = f".{decimals_of(effect.factor * one.sigma)}f"
     value, sigma = (
-        f"{number(effect.factor * size, form)} {effect.unit}".replace(" °", "°")
+        f"{number(effect.factor * size, form)} {effect.unit.partition(' of ')[0]}".replace(" °", "°")
         for size, form in ((one.value, f"+{pattern}"), (one.sigma, pattern))
     )
     verdict: Cell = LEVEL_WORDS.get(one.level, one.level)
