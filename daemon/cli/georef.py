@@ -155,13 +155,8 @@ def _tell(record: dict[str, Any], sidecar: Path, *, as_json: bool) -> None:
 
 
 def _print(record: dict[str, Any], sidecar: Path) -> None:
-    for strip in record["strips"]:
-        seconds = ((strip["last_gps_ns"] or 0) - (strip["first_gps_ns"] or 0)) / 1e9
-        print(f"strip {strip['number']}: {strip['points']:,} points, {seconds:.1f} s, {strip['file'] or 'no file'}")
-    for scanner, counts in record["counts"].items():
-        reasons = ", ".join(f"{count:,} {reason.replace('_', ' ')}" for reason, count in counts["dropped"].items())
-        left_out = f"; left out: {reasons}" if reasons else ""
-        print(f"{one_line(scanner)}: {counts['read']:,} returns, {counts['written']:,} in files{left_out}")
-    for line in record["warnings"]:
-        print(f"warning: {one_line(line)}")
+    from swath.daemon.processing.georeferencing.console import georef_lines
+
+    for line in georef_lines(record):
+        print(one_line(line))
     print(f"{'complete' if record['complete'] else 'partial'}: {one_line(str(sidecar))}")

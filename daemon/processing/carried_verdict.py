@@ -5,16 +5,20 @@ from __future__ import annotations
 import json
 import math
 import re
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.processing.trajectory.figures import figures_of
-from swath.daemon.processing.trajectory.series import Flight, separation_of
+from swath.daemon.processing.trajectory.series import Flight, separation_of, used_positions
 from swath.daemon.processing.trajectory.verdict import judge
+from swath.georef.records import FixType
 from swath.georef.scanner.calibration import INDEX
 from swath.georef.verdicts import Level, Reason
 
@@ -174,6 +178,27 @@ def navigated_verdicts(flight: Navigated) -> Iterator[Carried]:
         verdict = judge(figures_of(seen, separation_of(seen)), leg.findings)
         if verdict.level is not Level.GOOD:
             yield Carried(verdict.level, f"navigated trajectory of {title}: {_reason(verdict.as_dict())}")
+
+
+def navigated_fixed_share(flight: Navigated) -> float | None:
+    """Return the share of the positions that navigation used which had fixed ambiguities; None: it used none."""
+    used = [used_positions(leg.solved.forward)["fix_type"] for leg in flight.legs]
+    types = np.concatenate(used) if used else np.zeros(0)
+    return float(np.mean(types == FixType.RTK_FIXED)) if len(types) else None
+
+
+def file_fixed_share(file: Path, span_ns: tuple[int, int]) -> float | None:
+    """Return the same of a trajectory's file for a span of GPS time, from the summary beside it; None: not known."""
+    counts: Counter[str] = Counter()
+    for beside in _beside(file):
+        record = _read(beside)
+        if record.get("format") != OF_TRAJECTORY:
+            continue
+        for leg in (leg for session in record.get("sessions", []) for leg in session.get("legs", [])):
+            if leg.get("first_gps_ns", 0) <= span_ns[1] and leg.get("last_gps_ns", 1 << 62) >= span_ns[0]:
+                counts.update(((leg.get("figures") or {}).get("positions") or {}).get("fix_types") or {})
+        break
+    return counts[FixType.RTK_FIXED.name.lower()] / counts.total() if counts.total() else None
 
 
 def file_verdicts(file: Path, span_ns: tuple[int, int]) -> tuple[list[Carried], str]:

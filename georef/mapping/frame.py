@@ -122,7 +122,7 @@ class Mapping:
 
     def convergence_rad(self, position_e: FloatArray) -> float:
         """Return the direction of grid north at a position (3,), clockwise from true north, rad; 0 if not projected."""
-        if self._geocentric:
+        if self.is_geocentric:
             return 0.0
         lat, lon, _ = (math.degrees(float(value[0])) for value in geodetic_from_e(position_e[np.newaxis]))
         return math.radians(float(pyproj.Proj(self._target.horizontal).get_factors(lon, lat).meridian_convergence))
@@ -137,7 +137,7 @@ class Mapping:
 
     def misfit(self, points_e: FloatArray) -> str:
         """Return why the frame does not suit positions in e (n, 3), by `misfit_of`; empty if it suits."""
-        if self._geocentric or not len(points_e):
+        if self.is_geocentric or not len(points_e):
             return ""
         lat, lon, _ = (np.degrees(angle) for angle in geodetic_from_e(points_e))
         return misfit_of(self._target.horizontal, f"{self._target.said} ({self._target.crs.name})", lat, lon)
@@ -227,7 +227,7 @@ class Mapping:
         stated: dict[str, Any] = {
             "crs": target.text,
             "name": str(target.crs.name),
-            "axes": [axis.name for axis in self._target.crs.axis_info] if self._geocentric else ["E", "N", "up"],
+            "axes": [axis.name for axis in self._target.crs.axis_info] if self.is_geocentric else ["E", "N", "up"],
             "units": {"metres": self.unit_m.tolist(), "names": self._unit_names()},
             "heights": self._heights(),
             "datum": self._datum_text(datum),
@@ -241,7 +241,8 @@ class Mapping:
         return stated | self._operation_text()
 
     @property
-    def _geocentric(self) -> bool:
+    def is_geocentric(self) -> bool:
+        """True if coordinates are earth-centred, so that there is no map."""
         return bool(self._target.horizontal.is_geocentric)
 
     def _unit_names(self) -> list[str]:
@@ -250,7 +251,7 @@ class Mapping:
         return [*names, "metre"][:3]
 
     def _heights(self) -> str:
-        if self._geocentric:
+        if self.is_geocentric:
             return "none: earth-centred coordinates"
         if self._target.vertical is not None:
             grids = self._operation.grids if self._operation is not None else ()

@@ -19,7 +19,9 @@ from swath.daemon.log.reader import Session, open_logs
 from swath.daemon.processing.carried_verdict import (
     Carried,
     calibration_verdicts,
+    file_fixed_share,
     file_verdicts,
+    navigated_fixed_share,
     navigated_verdicts,
     verdict_entry,
 )
@@ -117,6 +119,7 @@ class Flight:
         span: GPS time of its first and last return; host_span likewise in log time.
         trajectory: trajectory of the body.
         solutions: number of the device's INS solutions by fate.
+        fixed_share: share of the trajectory's GNSS positions that had fixed ambiguities; None: not known.
         navigated: the navigation that the trajectory was smoothed in; None: it comes from elsewhere.
         strips: spans of log time; `first_number` is the number of the first.
         lost: number of units that the recorder lost, by source.
@@ -134,6 +137,7 @@ class Flight:
     host_span: tuple[int, int]
     trajectory: Trajectory | None = None
     solutions: dict[str, int] = field(default_factory=dict)
+    fixed_share: float | None = None
     navigated: Navigated | None = None
     strips: list[Span] = field(default_factory=list)
     first_number: int = 1
@@ -300,8 +304,10 @@ def _judge(request: GeorefOptions, flight: Flight) -> None:
     """Set the verdicts that products of the flight carry."""
     if request.trajectory.file is not None:
         flight.trajectory_verdicts, flight.source = file_verdicts(request.trajectory.file, flight.span)
+        flight.fixed_share = file_fixed_share(request.trajectory.file, flight.span)
     elif flight.navigated is not None:
         flight.trajectory_verdicts, flight.source = list(navigated_verdicts(flight.navigated)), "navigated"
+        flight.fixed_share = navigated_fixed_share(flight.navigated)
     else:
         flight.source = "ins"
     flight.verdicts = [*flight.trajectory_verdicts, *calibration_verdicts(flight.setup, flight.source)]

@@ -10,6 +10,7 @@ from __future__ import annotations
 import glob
 import json
 import shutil
+import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -69,6 +70,7 @@ def georeference(request: GeorefOptions, tell: Tell) -> Report:
     Raises:
         UserError: they cannot be made, one line; no file that looks like a product is left then.
     """
+    began = time.monotonic()
 
     def check(sessions: Sequence[Session], setups: Sequence[Setup]) -> None:
         check_space_for_returns(request.output, "points", LAZ_BYTES, sessions, setups)
@@ -77,7 +79,7 @@ def georeference(request: GeorefOptions, tell: Tell) -> Report:
         flights = read_flights(request, tell, check)
         names = [flight.session.session_id for flight in flights]
         with _out_of_sight(request, names) as (partial, into_place):
-            return _make(request, flights, names[0], partial, into_place, tell)
+            return _make(request, flights, names[0], partial, into_place, tell, began)
 
 
 # ---------------------------------------------------------------------- jobs
@@ -224,6 +226,7 @@ def _make(
     partial: Path,
     into_place: Callable[[list[Path]], None],
     tell: Tell,
+    began: float,
 ) -> Report:
     origin = _origin(flights)
     numbers = _numbers(flights)
@@ -255,6 +258,7 @@ def _make(
     record["verdict"] = verdict_of(request, flights)
     record |= {"logs": logs, "files": [path.name for path in trajectories], "options": request.record()}
     into_place([*done, *trajectories])
+    record["elapsed_s"] = round(time.monotonic() - began, 1)
     sidecar = request.output / f"{name}.json"
     write_sidecar(sidecar, record)
     return Report(record, sidecar)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime as dt
 import json
 import math
 from collections import Counter
@@ -9,9 +10,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from swath import __version__
 from swath.daemon.processing.carried_verdict import trajectory_entry
 from swath.daemon.processing.files import utc_text, write_whole
+from swath.daemon.processing.points.coverage import area_of_all_m2
 from swath.daemon.processing.setup.models import air_of
 from swath.daemon.processing.undecoded import undecoded_lines
 from swath.georef.points import Fate
@@ -25,7 +29,15 @@ if TYPE_CHECKING:
 
 FORMAT = "swath.georef"
 FORMAT_VERSION = 1
-CARRIED = ("verdict", "verdict_reasons", "held", "trajectory", "installation")  # entries of a calibration's header
+CARRIED = (
+    "created",
+    "verdict",
+    "verdict_reasons",
+    "held",
+    "trajectory",
+    "installation",
+)  # entries of a calibration's header
+SIGMAS = ("north_m", "east_m", "down_m", "roll_deg", "pitch_deg", "heading_deg")
 IN_FILES = Fate.GEOREFERENCED.name.lower()
 UNCOVERED = {"outside_trajectory": "are outside the trajectory", "trajectory_gap": "are in gaps of the trajectory"}
 
@@ -34,6 +46,7 @@ def calibration_entry(calibration: Calibration) -> dict[str, Any]:
     """Return the entry of a calibration with all its parameters, in the units of its file."""
     parameters = {parameter.key: calibration.value(parameter.name) / parameter.factor for parameter in PARAMETERS}
     carried = {key: calibration.header[key] for key in CARRIED if key in calibration.header}
+    carried |= {key: value.isoformat() for key, value in carried.items() if isinstance(value, dt.datetime)}
     created = {"created": str(calibration.header["created"])} if "created" in calibration.header else {}
     return {"id": calibration.id, "method": calibration.method, **created, **carried, "parameters": parameters}
 
@@ -102,6 +115,8 @@ def strip_entry(result: JobResult, file: Path | None, dropped: Path | None) -> d
         "last_gps_ns": result.last_gps_ns,
         "bounds": result.bounds,
         "bytes": result.file_bytes,
+        "last_returns": result.last_returns,
+        **_density_entry(result.points, result.last_returns, None if (on := result.covered) is None else on.area_m2),
         "counts": {scanner: counts_entry(fates) for scanner, fates in sorted(result.fates.items())},
         "clipped": {
             "sigma_above_6.5535_m": result.clipped.sigma,
@@ -110,6 +125,37 @@ def strip_entry(result: JobResult, file: Path | None, dropped: Path | None) -> d
         },
     }
     return entry | ({"failed": result.failed} if result.failed else {})
+
+
+def _density_entry(points: int, last: int, area_m2: float | None) -> dict[str, Any]:
+    """Return the area that points cover, and their density there: of all returns and of last ones."""
+    density = {"all": points / area_m2, "last": last / area_m2} if area_m2 and points else None
+    return {"area_m2": area_m2, "density_m2": density}
+
+
+def totals_entry(results: Sequence[JobResult]) -> dict[str, Any]:
+    """Return points, strips, area and density of all strips together; ground that strips share counts once."""
+    strips = [result for result in results if result.strip and result.points]
+    points, last = sum(one.points for one in strips), sum(one.last_returns for one in strips)
+    known = all(one.covered is not None for one in strips)
+    area_m2 = area_of_all_m2(one.covered for one in strips) if known else None
+    return {"points": points, "last_returns": last, "strips": len(strips)} | _density_entry(points, last, area_m2)
+
+
+def quality_entry(flight: Flight) -> dict[str, Any]:
+    """Return the trajectory's root mean square sigmas over the returns, and the share of positions with fixed
+    ambiguities; null: not known.
+    """
+    trajectory = flight.trajectory
+    assert trajectory is not None
+    within = trajectory.between(*flight.span)
+    sigmas = np.concatenate([within.position_sigma_l, np.degrees(within.attitude_sigma_rad)], axis=1)
+    known = np.isfinite(sigmas).all(axis=1)
+    rms = np.sqrt(np.mean(sigmas[known] ** 2, axis=0)).tolist() if known.any() else None
+    return {
+        "sigma_rms": None if rms is None else dict(zip(SIGMAS, rms, strict=True)),
+        "fixed_share": flight.fixed_share,
+    }
 
 
 def run_record(
@@ -136,6 +182,7 @@ def run_record(
         "warnings": warnings,
         "crs": mapping.description(),
         "counts": count_fates(results),
+        "totals": totals_entry(results),
         "strips": strips,
         "flights": [_flight_entry(flight, _of(results, flight, flights)) for flight in flights],
     }
@@ -159,6 +206,7 @@ def _flight_entry(flight: Flight, results: Sequence[JobResult]) -> dict[str, Any
         "returns_gps_ns": list(flight.span),
         "trajectory": trajectory_entry(trajectory, flight.source, flight.trajectory_verdicts)
         | {
+            "quality": quality_entry(flight),
             "epochs": len(trajectory),
             "solutions": flight.solutions,
             "gaps_gps_ns": trajectory.between(*flight.span).gaps().tolist(),

@@ -24,6 +24,7 @@ from swath.daemon.log.chunk_index import SCANNER, ChunkPlace, LogIndex, read_chu
 from swath.daemon.log.format import source_of_topic
 from swath.daemon.log.mcap.chunks import LogBatch
 from swath.daemon.log.reader import PartDamage
+from swath.daemon.processing.points.coverage import Coverage, Covered
 from swath.daemon.processing.points.discarded import DiscardedPoints
 from swath.daemon.processing.points.feed import LogFeed
 from swath.daemon.processing.setup.setup import Setup
@@ -117,6 +118,8 @@ class JobResult:
         undecoded: by scanner, messages that its parser refused, by reason, and those missing from its own sequence.
         first_gps_ns, last_gps_ns: times of the points; None: there are none.
         bounds: smallest and largest coordinates.
+        last_returns: number of points that are the last return of their pulse.
+        covered: ground that the points lie on; None: not known.
         edges: by scanner, for the sampled point seen farthest from nadir: the angle, rad, the height of the scanner
             above the point, m, and the point's ellipsoidal height, m.
         file_bytes: size of the file written.
@@ -139,6 +142,8 @@ class JobResult:
     first_gps_ns: int | None = None
     last_gps_ns: int | None = None
     bounds: list[list[float]] = field(default_factory=list)
+    last_returns: int = 0
+    covered: Covered | None = None
     edges: dict[str, tuple[float, float, float]] = field(default_factory=dict)
     file_bytes: int = 0
     damage: list[PartDamage] = field(default_factory=list)
@@ -206,9 +211,16 @@ def _write(
         factor = plan.intensity_factors.get(name, 1.0)
         sink.write(points, scanner=plan.numbers[name], intensity_factor=factor, withheld=withheld)
 
+    coverage = (
+        None if setup.mapping is None or setup.mapping.is_geocentric else Coverage(float(setup.mapping.unit_m[0]))
+    )
+
     def write(placed: list[tuple[str, Points]]) -> None:
         for name, points in placed:
             put(name, points)
+            result.last_returns += int(np.count_nonzero(points.return_number == points.number_of_returns))
+            if coverage is not None:
+                coverage.add(points.points_map[:, 0], points.points_map[:, 1])
             _note_span(result, points)
             _note_edge(result, name, points, setup, trajectory)
 
@@ -219,6 +231,7 @@ def _write(
     feed_job(plan, job, result, feed, write, tell)
     sink.close()
     result.clipped = sink.clipped
+    result.covered = None if coverage is None else coverage.covered()
     if dropped_file is not None:
         result.withheld, result.listed = dropped_file.withheld, dropped_file.rows
 

@@ -423,6 +423,36 @@ class TestRefusals:
         assert "the recordings overlap in time" in line
 
 
+def test_georef_ends_with_calibration_trajectory_crs_density_and_time(
+    flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    capsys.readouterr()
+    assert run_app(flown.arguments(tmp_path / "points")) == 0
+    lines, told = capsys.readouterr().out.splitlines(), record(tmp_path / "points")
+    calibration, trajectory, crs, density, seconds = lines[-6:-1]
+    (entry,) = told["flights"][0]["calibrations"].values()
+    assert calibration == f"calibration: {entry['id']} of left, made {entry['created'][:10]}, {entry['verdict']}"
+    sizes = r"sigmas [\d.]+\s.m in plan, [\d.]+\s.m in height, .*° roll and pitch, .*° heading"
+    assert re.fullmatch(rf"trajectory: .*; {sizes}; .*", trajectory)
+    assert crs.startswith(f"CRS: {told['crs']['name']}")
+    assert f"heights {told['crs']['heights']}" in crs
+    totals = told["totals"]
+    assert totals["points"] == sum(strip["points"] for strip in told["strips"])
+    assert re.fullmatch(r"density: [\d.]+ per m²( \([\d.]+ last returns\))?, all strips together; .* km²", density)
+    assert f"; {totals['points']:,} points, {totals['strips']} strip" in density
+    assert re.fullmatch(r"time: [\d.]+ s, [\d,]+ returns a second", seconds)
+    for strip in told["strips"]:
+        (low, high), area_m2 = strip["bounds"], strip["area_m2"]
+        assert 0.3 < area_m2 / ((high[0] - low[0]) * (high[1] - low[1])) <= 1.02
+        assert strip["density_m2"]["all"] == pytest.approx(strip["points"] / area_m2)
+        assert strip["last_returns"] <= strip["points"]
+        assert f"{strip['points']:,} points" in lines[strip["number"] - 1]
+    assert max(strip["area_m2"] for strip in told["strips"]) <= totals["area_m2"]
+    assert told["elapsed_s"] > 0.0
+    sigma = told["flights"][0]["trajectory"]["quality"]["sigma_rms"]
+    assert 0.0 < sigma["north_m"] < 1.0
+
+
 def test_georef_with_a_nominal_calibration_prints_a_warning_and_exits_with_1(
     flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
