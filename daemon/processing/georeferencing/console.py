@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator, Mapping
 from typing import Any
 
 from swath.calib.labels import degrees, length, number
 from swath.daemon.processing.pages.head import calibration_words
 
+GEOID = re.compile(r"proj=vgridshift\b(?:(?! step ).)*?\bgrids=([^\s,]+)")  # of a PROJ pipeline
 SOURCES = {
     "navigated": "navigated from IMU and GNSS",
     "ins": "the device's own INS, from the log",
@@ -78,8 +80,8 @@ def trajectory_words(trajectory: Mapping[str, Any]) -> str:
 def crs_line(crs: Mapping[str, Any]) -> str:
     """Return coordinate system, heights with their geoid, and datum."""
     code = f" ({crs['crs']})" if crs["crs"] != crs["name"] and len(crs["crs"]) < 40 else ""
-    geoid = f", geoid {', '.join(crs['grids'])}" if crs.get("grids") and "ellipsoidal" not in crs["heights"] else ""
-    heights = f"heights {crs['heights']}{geoid}"
+    geoids = dict.fromkeys(GEOID.findall(crs.get("pipeline") or ""))
+    heights = f"heights {crs['heights']}" + (f", geoid {', '.join(geoids)}" if geoids else "")
     return f"{crs['name']}{code}; {heights}; from {crs['datum']}"
 
 
