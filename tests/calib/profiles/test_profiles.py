@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 from functools import cache, partial
 from xml.etree import ElementTree
@@ -30,6 +31,7 @@ from swath.calib.profiles.stepwise import (
 from swath.daemon.processing.calibration.report.profiles import draw, most_precise, svg
 from swath.georef.arrays import BoolArray, FloatArray
 from tests.calib.analytic_scene import Line, Scanner, fly, gables, only, retold, truth_of
+from tests.daemon.processing.pages.builders import overlapping
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
@@ -293,6 +295,12 @@ def test_the_picture_is_valid_svg_with_strip_names_and_without_the_formula() -> 
     words = " ".join(one.get_text() for one in figure.findobj(Text) if isinstance(one, Text))
     assert profile.formula.split(" = ")[0] not in words  # which is in the appendix
     assert {"Before", "After", *profile.names} <= set(words.split())
+    assert overlapping(figure) == []
+    assert re.search(r"found [+−]0\.\d+ ± 0\.0*\d\d°, ", words)  # the sigma with two digits
+    assert not re.search(r"(?<!\w)-\d", words)
+    legend = figure.axes[1].get_legend()
+    assert legend is not None
+    assert [handle.get_marker() for handle in legend.get_lines()] == ["o", "^"]
 
 
 def test_the_report_shows_a_range_section_before_and_after() -> None:

@@ -37,7 +37,8 @@ MOST_CELLS = 60  # maximum unknowns in the correlation matrix
 MOST_PAIRS = 30
 MOST_CONTROL = 60
 SUSPECT = 3.29  # exceeded by |w| of one sound observation in a thousand (Baarda 1968)
-SWATH_LIMITS_CM = ((4.0, "QL0"), (8.0, "QL1, QL2"))  # RMSDz of swath overlap, USGS Lidar Base Specification
+# RMSDz of swath overlap, USGS Lidar Base Specification
+SWATH_LIMITS_CM = ((4.0, "QL0"), (8.0, "QL1, QL2"), (16.0, "QL3"))
 
 
 def correlation_picture(report: ReportInput) -> Picture | None:
@@ -159,7 +160,7 @@ def control_picture(report: ReportInput) -> Picture | None:
         names = [point.name for point in points]
         axes.set_xticks(at, names, fontsize=7.5, rotation=90 if steep else 0)
         axes.set_xlim(-0.6, len(points) - 0.4)
-        axes.set_ylabel("cm", fontsize=8.5, color=MUTED)
+        axes.set_ylabel("Surveyed − laser (cm)", fontsize=8.5, color=MUTED)
         axes.margins(y=0.15)
 
     room = 0.07 * max(len(point.name) for point in points)
@@ -247,8 +248,8 @@ def intensity_picture(report: ReportInput) -> Picture | None:
         axes = canvas.panel(0.6, 0.3, canvas.form.width_in - 0.7, 1.7)
         for i, (_, (intensity, correction_m)) in enumerate(known):
             axes.plot(intensity, 1000.0 * correction_m, "-", lw=1.1, color=colour_of(i))
-        axes.set_xlabel("Intensity", fontsize=8.5, color=MUTED)
-        axes.set_ylabel("mm", fontsize=8.5, color=MUTED)
+        axes.set_xlabel("Intensity (no unit)", fontsize=8.5, color=MUTED)
+        axes.set_ylabel("Correction (mm)", fontsize=8.5, color=MUTED)
         canvas.legend([Line2D([], [], color=colour_of(i), label=name) for i, (name, _) in enumerate(known)])
 
     return Picture(

@@ -14,6 +14,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
 from swath.calib.features import ControlPoint
@@ -27,12 +28,12 @@ from swath.calib.summary import Profile as Picture
 from swath.daemon.processing.pages.blocks import Table
 from swath.daemon.processing.pages.canvas import INK, MOST_MARKS, MUTED, RASTER_DPI
 
-PAGE_IN = (9.6, 4.6)
+PAGE_IN = (9.6, 4.2)
 COLOURS = ("#0072b2", "#d55e00")  # first, second; their marks differ too, for readers who cannot see the colours
 MARKS = ("o", "^")
 MOST_POINTS = 1500  # of each section; more would only enlarge the file
 WINDOW_M = 160.0  # length of a profile along track that is shown: the part with the most relief
-_SVG: Any = {"svg.hashsalt": "profile", "svg.fonttype": "path"}
+_SVG: Any = {"svg.hashsalt": "profile", "svg.fonttype": "path", "axes.unicode_minus": True}
 
 MOST_DRAWN = 6
 MOST_RETURNS = 8000
@@ -196,7 +197,22 @@ def draw(profile: Profile) -> Figure:
     panels[0].set_ylabel(
         "Laser less survey (m)" if profile.kind == "range" else "Height (m)", fontsize=8.5, color=MUTED
     )
-    panels[1].legend(loc="upper right", fontsize=8, frameon=False, labelcolor=INK, markerscale=1.5)
+    handles = [
+        Line2D([], [], marker=mark, ls="", ms=5, color=colour, label=name)
+        for name, colour, mark in zip(profile.names, COLOURS, MARKS, strict=True)
+    ]
+    panels[1].legend(
+        handles=handles,
+        loc="lower right",
+        bbox_to_anchor=(1.0, 1.0),
+        ncols=2,
+        fontsize=8,
+        frameon=False,
+        labelcolor=INK,
+        handletextpad=0.3,
+        columnspacing=1.2,
+        borderaxespad=0.2,
+    )
     _words(figure, profile)
     return figure
 
@@ -232,9 +248,7 @@ def _thinned(section: Section, low: float, high: float) -> tuple[Any, Any]:
 
 
 def _words(figure: Figure, profile: Profile) -> None:
-    figure.subplots_adjust(left=0.075, right=0.985, top=0.8, bottom=0.11, wspace=0.06)
-    between = f"{profile.names[0]} and {profile.names[1]}"
-    figure.text(0.02, 0.945, f"{profile.kind.capitalize()}: {between}", fontsize=13, weight="bold", color=INK)
+    figure.subplots_adjust(left=0.075, right=0.985, top=0.83, bottom=0.12, wspace=0.06)
     unit, factor = ("m", 1.0) if profile.kind == "range" else ("°", float(np.degrees(1.0)))
     found = with_sigma(factor * profile.found, factor * profile.sigma)
     measured = (
@@ -242,4 +256,4 @@ def _words(figure: Figure, profile: Profile) -> None:
         f"found {found}{'' if unit == '°' else ' '}{unit}, "
         f"{profile.pieces} {'targets' if profile.kind == 'range' else 'pieces of ground'}"
     )
-    figure.text(0.02, 0.9, measured, fontsize=8.5, color=MUTED, va="top")
+    figure.text(0.02, 0.97, measured, fontsize=8.5, color=MUTED, va="top")

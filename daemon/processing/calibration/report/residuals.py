@@ -62,7 +62,7 @@ def residual_picture(report: ReportInput) -> Picture | None:
     columns = int(np.clip(len(seen.misclosure_m) // EACH, 8, MOST_COLUMNS))
     half_cm = 100.0 * SPREAD * float(np.sqrt(np.mean(seen.misclosure_m**2))) + 1e-6
     names = [swath.name for swath in report.flight.swaths]
-    titles = ("By strip", "By scan angle (°)", "By range (m)", "By intensity")
+    titles = ("By strip", "By scan angle (°)", "By range (m)", "By intensity (no unit)")
 
     def draw(canvas: Canvas) -> None:
         panels = Panels(canvas, titles, PANEL_IN, 0.25)
@@ -130,6 +130,7 @@ def normal_picture(report: ReportInput) -> Picture | None:
         panels = Panels(canvas, titles, NORMAL_IN, 0.3, columns_of(canvas.form))
         for i, (axes, group) in enumerate(zip(panels.axes, groups, strict=True)):
             _bars(axes, group, SERIES[i])
+            axes.set_xlabel("Residual / sigma", fontsize=8.5, color=MUTED)
         canvas.legend([Line2D([], [], color=INK, lw=1.1, label="normal distribution, sigma 1")])
 
     words = "Residuals divided by their sigmas (w of data snooping); those beyond ±5 are drawn at the edge."
