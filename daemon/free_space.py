@@ -9,6 +9,7 @@ from pathlib import Path
 
 from swath.daemon.errors import ExitCode, UserError, one_line
 from swath.daemon.log.directory import nearest_there
+from swath.daemon.written import note_needed
 
 UNITS = ((1e9, "GB"), (1e6, "MB"), (1e3, "kB"))
 
@@ -25,6 +26,7 @@ def check_space(folder: Path, what: str, *, least_bytes: float, most_bytes: floa
     Raises:
         UserError: the disk has less than ``least_bytes``.
     """
+    note_needed(least_bytes if most_bytes is None else most_bytes)  # for the line of a disk that gets full after all
     there, _ = nearest_there(folder.absolute())
     try:
         free_bytes = shutil.disk_usage(there).free

@@ -6,11 +6,14 @@ import contextlib
 import ctypes
 import os
 import resource
+import signal
 import threading
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 NICE = 10
+INTERRUPTS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 KEPT_BYTES = 64 << 20  # freed memory that an arena keeps for reuse
 LARGEST_KEPT_BYTES = 32 << 20  # the largest threshold that glibc accepts
 
@@ -41,6 +44,50 @@ def keep_freed_memory() -> None:
     if mallopt is not None:
         mallopt(trim_threshold, KEPT_BYTES)
         mallopt(mmap_threshold, LARGEST_KEPT_BYTES)
+
+
+@contextlib.contextmanager
+def held_interrupts() -> Iterator[None]:
+    """Hold interrupts back until the end of the block; processes started within hold theirs until they release them.
+
+    For work that must not be half done: files that are given their final names, and worker processes that are starting,
+    which an interrupt would leave behind.
+    """
+    came: list[int] = []
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # the processes inherit it
+    before: dict[signal.Signals, Any] = {}
+    if threading.current_thread() is threading.main_thread():
+        before = {one: handler for one in INTERRUPTS if callable(handler := signal.getsignal(one))}
+    for one in before:  # another thread may take the signal, and Python pass it to this one
+        signal.signal(one, lambda number, _: came.append(number))
+    try:
+        yield
+    finally:
+        for one, handler in before.items():
+            signal.signal(one, handler)
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+    if came:
+        signal.raise_signal(came[0])
+
+
+@contextlib.contextmanager
+def ended_in_order() -> Iterator[None]:
+    """Let SIGTERM and SIGHUP end the block as an interrupt does, so that unfinished files are removed.
+
+    `timeout`, a service manager or a closed terminal send them. Where they are ignored, as under nohup, they stay so.
+    """
+    before: dict[signal.Signals, Any] = {}
+    if threading.current_thread() is threading.main_thread():
+        of_interrupt = signal.getsignal(signal.SIGINT)
+        handler = of_interrupt if callable(of_interrupt) else signal.default_int_handler
+        for one in INTERRUPTS:
+            if signal.getsignal(one) is signal.SIG_DFL:
+                before[one] = signal.signal(one, handler)
+    try:
+        yield
+    finally:
+        for one, handler in before.items():
+            signal.signal(one, handler)
 
 
 def lower_priority() -> None:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from swath.daemon.errors import ExitCode, UserError, one_line
+from swath.daemon.written import Reached, error_words, room_noted
 from swath.georef.progress import BYTES, Tell
 
 if TYPE_CHECKING:
@@ -45,13 +46,14 @@ def command(
             size = sum(part.path.stat().st_size for session in sessions for part in session.parts)
             check_space(directory, "exported files", least_bytes=LEAST_OF_LOG * size, most_bytes=MOST_OF_LOG * size)
             for session in sessions:
-                session.progress = partial(_tell, tell, session.session_id)
-                done.append((session, export_session(session, directory)))
+                reached = Reached(partial(_tell, tell, session.session_id))
+                session.progress = reached
+                with room_noted(directory, reached.share):
+                    done.append((session, export_session(session, directory)))
     except LogError as error:
         raise UserError(one_line(str(error)), ExitCode.IO) from error
     except OSError as error:
-        text = f"{directory}: {error.strerror or error}; incomplete files were removed"
-        raise UserError(one_line(text), ExitCode.IO) from error
+        raise UserError(one_line(error_words(error, directory)), ExitCode.IO) from error
     if as_json:
         print(json.dumps({"sessions": [_plain(*one) for one in done], "passed_over": passed_over}, indent=2))
     else:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import math
@@ -15,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 import typer
 
 from swath.daemon.errors import ExitCode, UserError, one_line
+from swath.daemon.written import NO_ROOM, error_words, make_folder, written_words
 
 if TYPE_CHECKING:
     from swath.daemon.config import Config
@@ -86,11 +88,14 @@ def command(
 def _import(config: Config, routes: Routes, captures: list[Capture], output: Path) -> ImportReport:
     from swath.daemon.cli.progress import progress_bar
     from swath.daemon.exchange.import_ import import_captures
-    from swath.daemon.log.directory import take_directory
+    from swath.daemon.log.directory import LOCK, take_directory
     from swath.drivers.transports.base import TransportError
 
     most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))  # merging keeps all captures open at once
+    new = not output.exists()
+    with contextlib.suppress(OSError):  # `take_directory` says why
+        make_folder(output)
     lock = take_directory(output, "--output")
     try:
         with progress_bar() as tell:
@@ -100,11 +105,14 @@ def _import(config: Config, routes: Routes, captures: list[Capture], output: Pat
     except TransportError as error:
         raise UserError(one_line(str(error)), ExitCode.IO) from error
     except OSError as error:
-        raise UserError(
-            one_line(f"{output}: {error.strerror or error}; the incomplete log was removed"), ExitCode.IO
-        ) from error
+        text = error_words(error, output)
+        if error.errno not in NO_ROOM:
+            text += f"; {written_words()}"
+        raise UserError(one_line(text), ExitCode.IO) from error
     finally:
         os.close(lock)
+        if new and [path.name for path in output.iterdir()] == [LOCK]:
+            (output / LOCK).unlink()
 
 
 def _by_source(texts: Sequence[str] | None, parse: Callable[[str], ValueT]) -> dict[str, ValueT]:

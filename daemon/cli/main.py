@@ -6,29 +6,33 @@ that the line names.
 
 from __future__ import annotations
 
-import errno
 import functools
 import importlib
 import importlib.util
 import keyword
+import math
 import os
+import signal
 import sys
 import tempfile
 import time
 import traceback
 from dataclasses import dataclass
 from pathlib import Path
+from types import FrameType
 from typing import Annotated
 
 import typer
 
 from swath import __version__
+from swath.daemon import written
 from swath.daemon.errors import ExitCode, UserError, one_line
 from swath.daemon.system import keep_freed_memory
 
 INTERRUPTED = 130  # 128 + SIGINT, as in shells
 PIPE_CLOSED = 141  # 128 + SIGPIPE
-NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
+CLEANING_S = 5.0  # after an interrupt, during which another one does not disturb the removal of unfinished files
+WITHOUT_FILES = ("run", "mark", "split", "check", "monitor", "live", "info", "replay", "devices", "doctor", "setup")
 
 HELP = """Record, georeference and calibrate an airborne laser scanner.
 
@@ -121,7 +125,33 @@ def make_app(name: str | None) -> typer.Typer:
 def main() -> None:
     """Run the command line and leave with its exit code."""
     keep_freed_memory()
+    interrupts = _Interrupts()
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # a background job of a shell ignores it
+        signal.signal(signal.SIGINT, interrupts.take)
+        sys.unraisablehook = interrupts.take_again
     sys.exit(run_app(sys.argv[1:]))
+
+
+class _Interrupts:
+    """Turns the first interrupt into an exception; while unfinished files are removed, more have no effect."""
+
+    def __init__(self) -> None:
+        self._since_s = -math.inf
+
+    def take(self, number: int, frame: FrameType | None) -> None:
+        """Raise `KeyboardInterrupt`, unless that was done a moment ago."""
+        now_s = time.monotonic()
+        if now_s - self._since_s >= CLEANING_S:
+            self._since_s = now_s
+            raise KeyboardInterrupt
+
+    def take_again(self, lost: sys.UnraisableHookArgs) -> None:
+        """Repeat an interrupt that was lost where Python can raise nothing, as in a finaliser."""
+        if issubclass(lost.exc_type, KeyboardInterrupt):
+            self._since_s = -math.inf
+            signal.raise_signal(signal.SIGINT)
+        else:
+            sys.__unraisablehook__(lost)
 
 
 def run_app(arguments: list[str]) -> int:
@@ -137,7 +167,7 @@ def run_app(arguments: list[str]) -> int:
         _say(*error.message.splitlines())
         return int(error.exit_code)
     except KeyboardInterrupt:
-        return INTERRUPTED
+        return _end_interrupted(arguments[0])
     except BrokenPipeError:
         _drop_output()
         return PIPE_CLOSED
@@ -147,6 +177,11 @@ def run_app(arguments: list[str]) -> int:
         raise
     except Exception as error:  # the last resort, for errors that a command does not handle
         return _end_unforeseen(error)
+    finally:
+        written.remove_empty_folders()
+        written.begin()
+    if result == INTERRUPTED:  # typer's code for an interrupt, too
+        return _end_interrupted(arguments[0])
     return int(result) if isinstance(result, int) else int(ExitCode.OK)
 
 
@@ -155,6 +190,12 @@ def _drop_output() -> None:
     at its end.
     """
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _end_interrupted(command: str) -> int:
+    """Say in one line what an interrupted command has written."""
+    _say("interrupted" if command in WITHOUT_FILES else f"interrupted; {written.written_words()}")
+    return INTERRUPTED
 
 
 def _end_unforeseen(error: Exception) -> int:
@@ -168,9 +209,12 @@ def _end_unforeseen(error: Exception) -> int:
         _say(f"{message.rstrip('.')}; see `{context.command_path if context else 'swath'} --help`")
         return int(ExitCode.USAGE)
     if isinstance(error, typer.Abort):
-        return INTERRUPTED
-    if isinstance(error, OSError) and error.errno in NO_ROOM:
-        _say(f"{error.filename or 'output'}: {error.strerror}; free some space and run the command again")
+        return _end_interrupted("")
+    if isinstance(error, OSError) and error.errno in written.NO_ROOM:
+        if error.filename is None:
+            _say(f"output: {error.strerror}; free some space and run the command again")
+        else:
+            _say(written.error_words(error, error.filename))
         try:
             sys.stdout.flush()
         except OSError:

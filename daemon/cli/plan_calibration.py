@@ -12,6 +12,7 @@ import typer
 from swath.daemon.cli.sim import PlanArgument
 from swath.daemon.errors import ExitCode, UserError, one_line
 from swath.daemon.processing.requirements import PRINTED_PAGES, require_installed
+from swath.daemon.written import error_words
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -72,7 +73,7 @@ def command(
         try:
             written = _write(planned, picture, warnings)
         except OSError as error:
-            raise UserError(one_line(f"{picture}: {error.strerror or error}"), ExitCode.IO) from error
+            raise UserError(one_line(error_words(error, picture)), ExitCode.IO) from error
     if as_json:
         print(json.dumps(_document(planned, picture), indent=2))
     else:
@@ -87,11 +88,16 @@ def _write(planned: PlannedCalibration, path: Path, warnings: list[str]) -> list
     """Write the page with its PDF, or the picture; return what was written."""
     from swath.daemon.processing.calibration.plan.document import HTML, write_planned
     from swath.daemon.processing.calibration.plan.page import draw_planned
+    from swath.daemon.processing.files import aside_folder
 
-    if path.suffix.lower() == HTML:
-        return write_planned(planned, path, warnings)
-    draw_planned(planned, path)
-    return [path]
+    with aside_folder(path.parent) as folder:
+        aside = folder / path.name
+        if path.suffix.lower() == HTML:
+            made = write_planned(planned, aside, warnings)
+        else:
+            draw_planned(planned, aside)
+            made = [aside]
+    return [path.parent / one.name for one in made]
 
 
 def _three(text: str) -> tuple[float, float, float]:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from swath.daemon.errors import one_line
+from swath.daemon.system import ended_in_order
 from swath.georef.progress import BYTES, Tell
 
 if TYPE_CHECKING:
@@ -124,7 +125,8 @@ class Display:
         """Write the lines that are due, and update the bar."""
         with self._lock:
             now_s, phase = self._clock(), self._phase
-            if now_s - self._began_s >= AFTER_S:
+            late = now_s - self._began_s >= AFTER_S
+            if late:
                 for line in self._waiting:
                     self._say(line)
                 self._waiting.clear()
@@ -133,7 +135,7 @@ class Display:
             if self._show is not None:
                 share = phase.done / phase.total if phase.total and phase.unit else None
                 self._show(phase.what, share, phase.state(now_s))
-            elif now_s - phase.said_s >= EVERY_S:
+            elif late and now_s - phase.said_s >= EVERY_S:
                 phase.said_s = now_s
                 self._say(f"{phase.what}: {phase.state(now_s)}")
 
@@ -154,12 +156,13 @@ def progress_bar(*, compiling: bool = True) -> Iterator[Tell]:
     """Show the progress of the block on stderr; give the function that updates it.
 
     Where loops have to be compiled, a line says so, and another at the end how long that took; with ``compiling`` False
-    the command says so itself.
+    the command says so itself. SIGTERM and SIGHUP end the block as Ctrl-C does.
     """
     from rich.console import Console
 
     console = Console(stderr=True, markup=False, highlight=False, soft_wrap=True)
     with (
+        ended_in_order(),
         _display(console) as display,
         _compiling_noticed(display, console.print) if compiling else nullcontext(),
         _ticking(display),

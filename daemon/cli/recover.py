@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from swath.daemon.errors import ExitCode, UserError, one_line
+from swath.daemon.written import error_words
 
 if TYPE_CHECKING:
     from swath.daemon.log.recover import RecoveryReport
@@ -44,7 +45,7 @@ def command(
             except LogError as error:
                 refused.append(str(error))
             except OSError as error:
-                refused.append(f"{error.filename or path}: {error.strerror or error}")
+                refused.append(error_words(error, path))
             else:
                 reports.append(report)
                 if not as_json:

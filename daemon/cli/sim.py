@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from swath.daemon.errors import ExitCode, UserError, one_line
+from swath.daemon.written import Reached, error_words, make_folder, room_noted
 from swath.georef.progress import Tell
 
 if TYPE_CHECKING:
@@ -97,7 +98,7 @@ def fly(
         raise UserError(f"{'--config' if config else '--set-clock'} needs --wire", ExitCode.USAGE)
     if output is None:
         raise UserError("no output given; use -o LOG or --wire", ExitCode.USAGE)
-    _fly_into_log(console, options, output, with_truth=not no_truth)
+    _fly_into_log(options, output, with_truth=not no_truth)
 
 
 @app.command("plan", short_help="Draw a plan and print what it covers.")
@@ -118,15 +119,17 @@ def plan_(
     from rich.console import Console
 
     from swath.daemon.cli.progress import progress_bar
+    from swath.daemon.processing.files import aside_folder
     from swath.daemon.simulate.plans import FlightOptions, draw
 
     picture = output if output is not None else Path(f"{Path(plan).stem}.png")
     try:
         with progress_bar() as tell:
             tell("drawing", 0, 0)
-            rows = draw(FlightOptions(plan), picture)
+            with aside_folder(picture.parent) as aside:
+                rows = draw(FlightOptions(plan), aside / picture.name)
     except OSError as error:
-        raise UserError(one_line(f"{picture}: {error.strerror or error}"), ExitCode.IO) from error
+        raise UserError(one_line(error_words(error, picture)), ExitCode.IO) from error
     if as_json:
         print(json.dumps({"picture": str(picture), "lines": rows[:-1], "total": rows[-1]}, indent=2))
         return
@@ -160,26 +163,17 @@ def _print_lines(console: Console, rows: list[dict[str, Any]]) -> None:
 # ---------------------------------------------------------------------------------------------- into a log
 
 
-def _fly_into_log(console: Console, options: FlightOptions, output: Path, *, with_truth: bool) -> None:
+def _fly_into_log(options: FlightOptions, output: Path, *, with_truth: bool) -> None:
     from swath.daemon.cli.progress import progress_bar
     from swath.daemon.simulate.folder import FlightFolder
 
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     started_s = time.monotonic()
     try:
         with progress_bar() as tell, FlightFolder(output) as folder:
             report, names = _make_log(tell, options, folder, with_truth=with_truth)
             logs = folder.keep(report.paths)
-    except KeyboardInterrupt:
-        console.print("interrupted: the incomplete files of this flight were removed")
-        raise
     except OSError as error:
-        text = (
-            f"{error.filename or output}: {error.strerror or error}; the incomplete files of this flight were removed"
-        )
-        raise UserError(one_line(text), ExitCode.IO) from error
-    finally:
-        signal.signal(signal.SIGTERM, before)
+        raise UserError(one_line(error_words(error, output)), ExitCode.IO) from error
     _print_flown(report, time.monotonic() - started_s, logs, names)
 
 
@@ -203,13 +197,15 @@ def _make_log(
     flight_seed = plan.tables.flight.seed
     folder.refuse_session(sim_session_info(config.session.name, flight.host_clock, flight_seed).session_id)
     flown = f"flying {config.session.name}"
-    report = fly_into_log(
-        config,
-        folder.work,
-        flight,
-        flight_seed,
-        lambda flown_s, *_: tell(flown, round(flown_s), round(flight.duration_s), SECONDS),
-    )
+    reached = Reached(lambda done, total: tell(flown, done, total, SECONDS))
+    with room_noted(folder.work, reached.share):
+        report = fly_into_log(
+            config,
+            folder.work,
+            flight,
+            flight_seed,
+            lambda flown_s, *_: reached(round(flown_s), round(flight.duration_s)),
+        )
     tell("packing the truth", 0, 0)
     flight.finish_truth()
     return report, names
@@ -267,7 +263,7 @@ def _fly_on_wires(
             close_outputs(outputs)
             close_outputs(others)
     except OSError as error:
-        text = f"{error.filename}: {error.strerror}" if error.filename else str(error)
+        text = error_words(error, error.filename) if error.filename else str(error)
         raise UserError(one_line(text), ExitCode.IO) from error
     finally:
         ahead.close()
@@ -291,7 +287,7 @@ def _make_wires(console: Console, plan: Any, facts: FlightFacts, folder: Path | 
         if (place / name).exists():
             instead = f"use its wires with --config {path}, or " if name == CONFIG_NAME else ""
             raise UserError(one_line(f"{place / name}: already exists; {instead}choose another folder"), ExitCode.IO)
-    place.mkdir(parents=True, exist_ok=True)
+    make_folder(place)
     for name, data in files.items():
         (place / name).write_bytes(data)
     console.print(f"the wires of the flight are in {place}; record it in another terminal:\n\n  swath run {path}\n")

@@ -164,7 +164,7 @@ def _compare(
         if output is not None:
             from swath.daemon.processing.strips.page import write_comparison
 
-            tell("page", 0, 1)
+            tell("page", 0, 0)
             written = write_comparison(done, output, level, warnings)
     lines = [*comparison_lines(done, level, all_pairs=all_pairs), *map(str, written)]
     print(json.dumps(done.record, indent=2) if as_json else "\n".join(map(one_line, lines)))

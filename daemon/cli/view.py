@@ -12,6 +12,7 @@ import typer
 from swath.daemon.errors import ExitCode, UserError, one_line
 from swath.daemon.free_space import check_space
 from swath.daemon.processing.requirements import GIS, PRINTED_PAGES, require_installed
+from swath.daemon.written import error_words
 
 if TYPE_CHECKING:
     from swath.daemon.processing.quicklook.run import Look
@@ -75,6 +76,7 @@ def _make(
     from rich.console import Console
 
     from swath.daemon.cli.progress import progress_bar
+    from swath.daemon.processing.files import aside_folder
     from swath.daemon.processing.quicklook.page import make_page
     from swath.daemon.processing.quicklook.read import QuickLookError
     from swath.daemon.processing.quicklook.run import look_at, numbers_of
@@ -92,13 +94,13 @@ def _make(
         except QuickLookError as error:
             raise UserError(one_line(str(error)), ExitCode.IO) from error
         try:
-            page = make_page(look, folder, title, warnings, tell)
-            if gis:
-                tell("GIS layers", 0, 0)
-            made = _gis(look, folder, paths, warnings) if gis else []
+            with aside_folder(folder) as aside:
+                page = folder / make_page(look, aside, title, warnings, tell).name
+                if gis:
+                    tell("GIS layers", 0, 0)
+                made = [folder / path.name for path in _gis(look, aside, paths, warnings)] if gis else []
         except OSError as error:
-            text = f"{folder}: cannot write there ({error.strerror or error}); choose another folder with --output"
-            raise UserError(one_line(text), ExitCode.IO) from error
+            raise UserError(one_line(error_words(error, folder)), ExitCode.IO) from error
     for line in warnings:
         console.print(one_line(f"swath: {line}"))
     damaged = False

@@ -23,6 +23,8 @@ from swath.daemon.log.format import LogError, safe_attachment_path, source_of_to
 from swath.daemon.log.mcap.chunks import LogBatch
 from swath.daemon.log.parsers import stored_config
 from swath.daemon.log.reader import Session
+from swath.daemon.system import held_interrupts
+from swath.daemon.written import make_folder, note_written
 
 MANIFEST = "swath-export.json"
 CONFIG_FOLDER = "config"
@@ -68,12 +70,14 @@ def export_session(session: Session, directory: Path) -> ExportReport:
     for path in (target, unfinished):
         if os.path.lexists(path):
             raise UserError(f"{path}: already exists; remove it or choose another directory", ExitCode.IO)
-    directory.mkdir(parents=True, exist_ok=True)
+    make_folder(directory)
     unfinished.mkdir()
     try:
         report = _Export(session, unfinished).run()
         sync_tree(unfinished)
-        unfinished.rename(target)
+        with held_interrupts():
+            unfinished.rename(target)
+            note_written(target)
     except BaseException:
         shutil.rmtree(unfinished, ignore_errors=True)
         raise

@@ -21,6 +21,8 @@ from swath.daemon.log.durable import sync_directory, try_sync_directory
 from swath.daemon.log.format import MAGIC
 from swath.daemon.log.parts import read_sign
 from swath.daemon.log.reader import RECOVERED
+from swath.daemon.system import held_interrupts
+from swath.daemon.written import note_rest, note_written
 
 NAME = "SHA256SUMS"
 _LINE = re.compile(r"(\\?)([0-9a-f]{64}) [ *](.+)")
@@ -235,6 +237,7 @@ def _check_there(path: Path, report: OffloadReport, sums: ChecksumList, verify: 
 def _copy_new(path: Path, report: OffloadReport, sums: ChecksumList, progress: Progress) -> None:
     copy, size = report.destination / path.name, path.stat().st_size
     partial = copy.with_name(copy.name + PARTIAL)
+    note_rest(f"{partial} stays, and the same command continues from there")
     had = partial.stat().st_size if partial.exists() else 0
     free = shutil.disk_usage(report.destination).free
     if free < size - had:
@@ -247,9 +250,12 @@ def _copy_new(path: Path, report: OffloadReport, sums: ChecksumList, progress: P
         raise NoRoomError(_no_room(report, path, size, shutil.disk_usage(report.destination).free)) from error
     times = path.stat()
     os.utime(partial, ns=(times.st_atime_ns, times.st_mtime_ns))
-    partial.rename(copy)
-    try_sync_directory(report.destination)
-    sums.add(path.name, digest)
+    with held_interrupts():
+        partial.rename(copy)
+        note_rest("")
+        note_written(copy)
+        try_sync_directory(report.destination)
+        sums.add(path.name, digest)
     report.copied.append(Copied(path.name, size, digest, resumed))
 
 

@@ -38,6 +38,8 @@ from swath.daemon.log.mcap.scan import (
 )
 from swath.daemon.log.mcap.writer import PartWriter, create_exclusively
 from swath.daemon.log.reader import MAX_DAMAGE, RECOVERED, read_part_head
+from swath.daemon.system import held_interrupts
+from swath.daemon.written import note_written
 
 UNFINISHED = ".part"  # suffix of a copy that is not complete yet
 
@@ -149,7 +151,9 @@ def recover(
         head = read_part_head(path)
         writer = PartWriter(temporary, head.info, head.number, fd=os.dup(fd))
         report = _pass(path, writer, lambda done, total: tell(f"repairing {path.name}", done, total, "B"))
-        temporary.rename(target)
+        with held_interrupts():
+            temporary.rename(target)
+            note_written(target)
         sync_directory(folder)
     report.recovered = target
     return report

@@ -9,16 +9,17 @@ from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import IO
 
 from swath.daemon.errors import UserError, one_line
-from swath.daemon.log.durable import try_sync_directory
+from swath.daemon.log.durable import sync_file, try_sync_directory
+from swath.daemon.system import held_interrupts
+from swath.daemon.written import ASIDE, PARTIAL, make_folder, note_needed, note_written
 
 LONGEST_NAME = 200  # bytes of a session's name at most; its products' names are longer
 
 _HASH_BLOCK = 1 << 20
-
-PARTIAL = ".partial"
 
 
 def write_aside(path: Path, write: Callable[[IO[bytes]], None]) -> Path:
@@ -27,7 +28,7 @@ def write_aside(path: Path, write: Callable[[IO[bytes]], None]) -> Path:
     Raises:
         OSError: the file cannot be written; no temporary file is left.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     aside = path.with_name(path.name + PARTIAL)
     try:
         with aside.open("wb") as stream:
@@ -43,12 +44,15 @@ def write_aside(path: Path, write: Callable[[IO[bytes]], None]) -> Path:
 def put_in_place(written: list[tuple[Path, Path]]) -> None:
     """Rename temporary files to their final names, in the order given, and sync the folders to disk.
 
+    An interrupt waits until all are renamed.
+
     Raises:
         OSError: a file cannot be renamed; no temporary file is left.
     """
-    with gone_on_failure(written):
+    with gone_on_failure(written), held_interrupts():
         for aside, path in written:
             aside.replace(path)
+            note_written(path)
     for folder in dict.fromkeys(path.parent for _, path in written):
         try_sync_directory(folder)
 
@@ -60,10 +64,29 @@ def write_whole(files: Mapping[Path, bytes]) -> None:
         OSError: a file cannot be written or renamed; no temporary file is left.
     """
     written: list[tuple[Path, Path]] = []
+    note_needed(sum(map(len, files.values())))
     with gone_on_failure(written):
         for path, data in files.items():
             written.append((write_aside(path, partial(_put, data)), path))
     put_in_place(written)
+
+
+@contextmanager
+def aside_folder(folder: Path) -> Iterator[Path]:
+    """Give a hidden folder for files; when the block ends, all of them get their places in ``folder`` at once.
+
+    If the block fails or is interrupted, nothing of it is left.
+
+    Raises:
+        OSError: the folder cannot be written to.
+    """
+    make_folder(folder)
+    with TemporaryDirectory(prefix=ASIDE, dir=folder) as name:
+        yield Path(name)
+        made = sorted(path for path in Path(name).iterdir() if path.is_file())
+        for path in made:
+            sync_file(path)
+        put_in_place([(path, folder / path.name) for path in made])
 
 
 def _put(data: bytes, stream: IO[bytes]) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.log.format import LogError
+from swath.daemon.written import error_words
 
 
 @contextmanager
@@ -30,7 +31,7 @@ def as_user_error(place: Path, *refused: type[Exception]) -> Iterator[None]:
     except LogError as error:
         raise UserError(str(error), ExitCode.IO) from error
     except OSError as error:
-        raise UserError(f"{error.filename or place}: {error.strerror or error}", ExitCode.IO) from error
+        raise UserError(error_words(error, place), ExitCode.IO) from error
 
 
 def finite(value: Any) -> Any:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import shutil
 from collections.abc import Iterable, Mapping
@@ -12,6 +11,8 @@ from types import TracebackType
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.exchange.log_maker import refuse_session
 from swath.daemon.log.durable import sync_directory
+from swath.daemon.system import held_interrupts
+from swath.daemon.written import FLYING, make_folder, note_written, remove_empty_folders
 
 _AGAIN = "already exists; remove it or choose another place"
 
@@ -33,10 +34,9 @@ class FlightFolder:
     def __init__(self, output: Path) -> None:
         self.log_name = output.name if output.suffix == ".mcap" else ""
         self.place = output.parent if self.log_name else output
-        self.work = self.place / f".{output.name}.flying"
-        self._made = not self.place.exists()
+        self.work = self.place / f".{output.name}{FLYING}"
         try:
-            self.place.mkdir(parents=True, exist_ok=True)
+            make_folder(self.place)
             self.work.mkdir()
         except FileExistsError as error:
             text = f"{error.filename}: another flight runs there, or was killed there; wait for it or remove the folder"
@@ -52,11 +52,9 @@ class FlightFolder:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        """Remove all files that were not kept, and the requested folder if this object created it."""
+        """Remove all files that were not kept, and the requested folder if it was made for them."""
         shutil.rmtree(self.work, ignore_errors=True)
-        if self._made:
-            with contextlib.suppress(OSError):  # fails if there are files in it
-                self.place.rmdir()
+        remove_empty_folders()
 
     def refuse_taken(self, names: Iterable[str]) -> None:
         """Refuse to overwrite existing files; raises UserError."""
@@ -88,7 +86,9 @@ class FlightFolder:
         if self.log_name:
             goes[logs[0]] = self.log_name
         self.refuse_taken(goes.values())
-        for path, name in goes.items():
-            path.rename(self.place / name)
+        with held_interrupts():
+            for path, name in goes.items():
+                path.rename(self.place / name)
+                note_written(self.place / name)
         sync_directory(self.place)
         return [self.place / goes[path] for path in logs]

@@ -6,6 +6,7 @@ For tests of what a command does; that it starts at all, and what it loads, is s
 from __future__ import annotations
 
 import atexit
+import contextlib
 import functools
 import importlib
 import json
@@ -16,10 +17,14 @@ import signal
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
+from unittest.mock import patch
 
 from swath.daemon.cli import progress
 from swath.daemon.cli.main import COMMANDS, main
+from swath.daemon.cli.progress import Display
 from swath.drivers.driver import KINDS, all_drivers
 from tests.daemon.rig import HANGS_S
 
@@ -110,6 +115,9 @@ def serve() -> None:
 def become(arguments: list[str], environment: dict[str, str], says_to: list[str]) -> None:
     """Adopt the arguments, environment and outputs of a separately started process; no line of progress is due."""
     progress.AFTER_S = math.inf
+    at_phase(environment.pop("INTERRUPTED_AT", ""), lambda: os.kill(os.getpid(), signal.SIGINT))
+    folder = environment.pop("FILLED_FOLDER", "")
+    at_phase(environment.pop("FILLED_AT", ""), lambda: fill(Path(folder)))
     sys.argv[1:] = arguments
     os.environ.clear()
     os.environ.update(environment)
@@ -117,6 +125,26 @@ def become(arguments: list[str], environment: dict[str, str], says_to: list[str]
     for number, descriptor in enumerate(opened):
         os.dup2(descriptor, number)
         os.close(descriptor)
+
+
+def at_phase(phase: str, act: Callable[[], None]) -> None:
+    """Act each time that the work tells of a phase that begins so; "": never."""
+    tell = Display.tell
+
+    def acting(display: Display, what: str, *state: Any) -> None:
+        tell(display, what, *state)
+        if what.startswith(phase):
+            act()
+
+    if phase:
+        patch.object(Display, "tell", acting).start()
+
+
+def fill(folder: Path) -> None:
+    """Take all the room on a folder's disk."""
+    with (folder / "others.bin").open("ab", buffering=0) as file, contextlib.suppress(OSError):
+        while True:
+            file.write(bytes(4096))
 
 
 if __name__ == "__main__":

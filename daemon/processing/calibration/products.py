@@ -43,6 +43,7 @@ from swath.daemon.processing.pages.head import NOTHING_KNOWN, PageHead, head_of_
 from swath.daemon.processing.pages.names import PRINTED, REPORT
 from swath.daemon.processing.strip_agreement import FlightStrips, before_and_after, difference_map
 from swath.daemon.processing.user_errors import finite
+from swath.daemon.written import error_words
 from swath.georef.arrays import FloatArray
 from swath.georef.mapping.chart import chart_of
 from swath.georef.progress import Tell
@@ -170,7 +171,7 @@ def _write(files: Mapping[Path, bytes]) -> None:
     try:
         write_whole(files)
     except OSError as error:
-        raise UserError(f"{error.filename}: {error.strerror or error}", ExitCode.IO) from error
+        raise UserError(error_words(error, error.filename or "output"), ExitCode.IO) from error
 
 
 def _inputs(request: CalibrationOptions, done: Calibrated) -> list[tuple[str, str]]:

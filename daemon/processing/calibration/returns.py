@@ -31,6 +31,7 @@ from swath.daemon.processing.points.space import check_space_for_returns
 from swath.daemon.processing.points.workers import run_jobs
 from swath.daemon.processing.setup.models import motion_of
 from swath.daemon.processing.setup.setup import Setup
+from swath.daemon.written import Reached, room_noted
 from swath.georef.arrays import ByteArray, FloatArray, Int64Array, StructArray
 from swath.georef.georeference import Georeferencer
 from swath.georef.points import Fate, Points
@@ -132,14 +133,16 @@ def read_flight(
     plans = [KeepPlan(flight.index, flight.setup, flight.clocks.clocks, frame) for flight in logged]
     jobs = [job for number, flight in enumerate(logged) for job in _jobs(flight, number, folder)]
     total = sum(job.size for job in jobs)
-    results = run_jobs(
-        plans,
-        jobs,
-        workers=request.workers,
-        scheduler=None,
-        progress=lambda done: tell("returns", done, total, BYTES),
-        do=keep_job,
-    )
+    reached = Reached(lambda done, total: tell("returns", done, total, BYTES))
+    with room_noted(folder, reached.share):
+        results = run_jobs(
+            plans,
+            jobs,
+            workers=request.workers,
+            scheduler=None,
+            progress=lambda done: reached(done, total),
+            do=keep_job,
+        )
     note_times(logged, results)
     heads = _heads(logged)
     swaths = [

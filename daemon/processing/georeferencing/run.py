@@ -43,6 +43,8 @@ from swath.daemon.processing.setup.setup import Setup
 from swath.daemon.processing.trajectory.files import TrajectoryFiles, write_trajectory
 from swath.daemon.processing.undecoded import undecoded_lines
 from swath.daemon.processing.user_errors import as_user_error
+from swath.daemon.system import held_interrupts
+from swath.daemon.written import Reached, make_folder, note_written, room_noted
 from swath.drivers.driver import find_driver
 from swath.georef.formats.las import LasSettings
 from swath.georef.mapping.frame import MappingError
@@ -162,7 +164,7 @@ def _out_of_sight(request: GeorefOptions, names: Sequence[str]) -> Iterator[tupl
     """
     output, name = request.output, names[0]
     _refuse_existing(request, names)
-    output.mkdir(parents=True, exist_ok=True)
+    make_folder(output)
     partial = output / f"{name}.partial"
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir()
@@ -170,12 +172,14 @@ def _out_of_sight(request: GeorefOptions, names: Sequence[str]) -> Iterator[tupl
     def into_place(files: list[Path]) -> None:
         for file in files:
             sync_file(file)
-        for one in names:
-            (output / f"{one}.json").unlink(missing_ok=True)
-            for old in _strips(output, one):
-                old.unlink()
-        for file in files:
-            file.replace(output / file.name)
+        with held_interrupts():
+            for one in names:
+                (output / f"{one}.json").unlink(missing_ok=True)
+                for old in _strips(output, one):
+                    old.unlink()
+            for file in files:
+                file.replace(output / file.name)
+                note_written(output / file.name)
         try_sync_directory(output)
 
     try:
@@ -233,8 +237,8 @@ def _make(
     plans = [_plan(request, flight, origin, numbers) for flight in flights]
     jobs = [job for number, flight in enumerate(flights) for job in _jobs(request, flight, number, partial)]
     total = sum(job.size for job in jobs)
-    given_up = Event()
-    with ThreadPoolExecutor(1) as hasher:
+    given_up, reached = Event(), Reached(lambda done, total: tell("points", done, total, BYTES))
+    with ThreadPoolExecutor(1) as hasher, room_noted(partial, reached.share):
         paths = [part.path for flight in flights for part in flight.session.parts]
         hashes = [hasher.submit(sha256_of, path, given_up.is_set) for path in paths]
         try:
@@ -243,7 +247,7 @@ def _make(
                 jobs,
                 workers=request.workers,
                 scheduler=request.scheduler,
-                progress=lambda done: tell("points", done, total, BYTES),
+                progress=lambda done: reached(done, total),
             )
             logs = [{"name": path.name, "sha256": found.result()} for path, found in zip(paths, hashes, strict=True)]
         except BaseException:  # an interrupt too: it must not wait for the hashes of large logs
@@ -257,11 +261,11 @@ def _make(
     record = run_record(flights, results, files)
     record["verdict"] = verdict_of(request, flights)
     record |= {"logs": logs, "files": [path.name for path in trajectories], "options": request.record()}
-    into_place([*done, *trajectories])
     record["elapsed_s"] = round(time.monotonic() - began, 1)
-    sidecar = request.output / f"{name}.json"
+    sidecar = partial / f"{name}.json"
     write_sidecar(sidecar, record)
-    return Report(record, sidecar)
+    into_place([*done, *trajectories, sidecar])
+    return Report(record, request.output / sidecar.name)
 
 
 def _files(job: Job, result: JobResult) -> tuple[Path | None, Path | None]:

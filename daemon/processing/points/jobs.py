@@ -6,6 +6,8 @@ A job's result depends on its input only, so it does not matter which process or
 from __future__ import annotations
 
 import errno
+import os
+import shutil
 import tempfile
 import time
 from collections import Counter
@@ -43,6 +45,7 @@ MARGIN_NS = 5_000_000_000  # of log time read on either side: edges a device lat
 BETWEEN_STRIPS = "between_strips"
 EDGE_SAMPLES = 50  # points of a tick that are looked at
 MAX_EDGE_RAD = 1.31  # 75°; beams of spinning heads go to the horizon
+LEAST_ROOM_BYTES = 1 << 20  # with less room a disk is full for files of points
 Tell = Callable[[int], None]  # called with the bytes of the log that were read
 
 
@@ -186,6 +189,8 @@ def run_job(plan: SessionPlan, job: Job, tell: Tell = lambda size: None) -> JobR
         except (LasError, MappingError) as error:
             raise JobError(f"{job.path.name}: {error}") from error
         except lazrs.LazrsError as error:  # this error does not give the file system's reason
+            if shutil.disk_usage(job.path.parent).free < LEAST_ROOM_BYTES:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(job.path)) from error
             raise OSError(errno.EIO, "cannot be written; is the disk full?", str(job.path)) from error
         finally:
             if not result.points and not result.withheld:

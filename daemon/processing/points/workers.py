@@ -6,16 +6,16 @@ import importlib
 import multiprocessing
 import pickle
 import signal
-import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from typing import Any
 
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.processing.compiling import mark_compiling, tell_of_workers
 from swath.daemon.processing.points.jobs import Job, JobResult, run_job
+from swath.daemon.system import held_interrupts
 from swath.drivers.extras import how_to_install
 
 TELL_EVERY_S = 0.2
@@ -111,28 +111,6 @@ def _begin(plans: bytes, done: Any, begun: Any, compiling: Any) -> None:
     _plans, _done = pickle.loads(plans), done
 
 
-@contextmanager
-def _held_interrupts() -> Iterator[None]:
-    """Hold interrupts back until the end of the block; processes started within hold theirs until they release them.
-
-    A process that is starting reads the plans for seconds: if an interrupt hit it then, it would be left behind.
-    """
-    came: list[int] = []
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # the processes inherit it
-    in_main = threading.current_thread() is threading.main_thread()
-    before = signal.getsignal(signal.SIGINT)
-    if in_main and callable(before):  # another thread may take the signal, and Python pass it to this one
-        signal.signal(signal.SIGINT, lambda number, _: came.append(number))
-    try:
-        yield
-    finally:
-        if in_main and callable(before):
-            signal.signal(signal.SIGINT, before)
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-    if came:
-        raise KeyboardInterrupt
-
-
 def _do(do: Do, job: Job) -> JobResult:
     def tell(size: int) -> None:
         with _done.get_lock():
@@ -151,7 +129,7 @@ def _in_processes(
     results: dict[int, JobResult] = {}
     futures: dict[Future[JobResult], int] = {}
     try:
-        with _held_interrupts():
+        with held_interrupts():
             for number in order:
                 try:
                     futures[pool.submit(_do, do, jobs[number])] = number

@@ -19,12 +19,13 @@ from pyproj.exceptions import CRSError
 from scipy import ndimage
 
 from swath.daemon.errors import one_line
-from swath.daemon.processing.files import PARTIAL, utc_text
+from swath.daemon.processing.files import utc_text
 from swath.daemon.processing.pages.names import QUICK_LOOK_FEATURES, QUICK_LOOK_MAPS
 from swath.daemon.processing.quicklook.grids import HEIGHT, INTENSITY, SIGMA_HEIGHT, Frame
 from swath.daemon.processing.quicklook.product_facts import read_sidecar
 from swath.daemon.processing.quicklook.run import Look
 from swath.daemon.processing.strips.inputs import mapping_of, trajectories_beside
+from swath.daemon.written import PARTIAL
 from swath.georef.arrays import BoolArray, FloatArray
 from swath.georef.mapping.frame import MappingError
 from swath.georef.timescales.gps_time import SECOND_NS, table_leap_seconds, unix_ns_from_gps

@@ -10,7 +10,7 @@ from swath.calib.strips.standards import ASPRS_OVERLAP, QUALITY_LEVELS, TO_CONFI
 from swath.daemon.processing.files import write_whole
 from swath.daemon.processing.pages.blocks import Block, Card, Cell, Image, Judged, Notes, Table, Words, data_uri
 from swath.daemon.processing.pages.head import head_of_sidecars
-from swath.daemon.processing.pages.names import PRINTED, QUICK_LOOK, QUICK_LOOK_FEATURES, QUICK_LOOK_MAPS
+from swath.daemon.processing.pages.names import QUICK_LOOK, QUICK_LOOK_FEATURES, QUICK_LOOK_MAPS
 from swath.daemon.processing.pages.pdf import page_files
 from swath.daemon.processing.pages.render import Page, html_of
 from swath.daemon.processing.pages.words import thousands
@@ -49,19 +49,16 @@ def make_page(look: Look, folder: Path, title: str, warnings: list[str], tell: T
     Raises:
         OSError: the folder cannot be written to.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     shown = []
     for number, (name, alt, draw, wanted) in enumerate(PICTURES):
         tell("pictures", number, len(PICTURES), "pictures")
         path = folder / f"{name}.png"
-        path.unlink(missing_ok=True)  # left by an earlier run
         if wanted(look):
             draw(look, path)
             shown.append(Image(alt, data_uri(path.read_bytes(), "image/png")))
     for name in (*QUICK_LOOK_MAPS, QUICK_LOOK_FEATURES):
         (folder / name).unlink(missing_ok=True)
     page = folder / QUICK_LOOK
-    page.with_suffix(PRINTED).unlink(missing_ok=True)
     write_whole(page_files(page, page_of(look, title, shown), warnings))
     return page
 

@@ -24,6 +24,7 @@ from swath.daemon.processing.strips.adjust import AdjustOptions, StripsCorrected
 from swath.daemon.processing.trajectory.files import write_trajectory
 from swath.daemon.processing.trajectory.summary import write_json
 from swath.daemon.processing.user_errors import finite
+from swath.daemon.written import error_words, remove_empty_folders
 from swath.georef.arrays import FloatArray, Int64Array
 from swath.georef.progress import Tell
 from swath.georef.trajectory.trajectory import Trajectory
@@ -51,7 +52,6 @@ def write_adjustment(request: AdjustOptions, done: StripsCorrected, tell: Tell) 
     tell("trajectories", 0, 0)
     files = [files_of(request, flight) for flight in done.kept.logged]
     written: list[tuple[Path, Path]] = []
-    made = not request.output.exists()
     try:
         with gone_on_failure(written):
             for flight, own, trajectory in zip(done.kept.logged, files, done.adjusted.trajectories, strict=True):
@@ -61,9 +61,8 @@ def write_adjustment(request: AdjustOptions, done: StripsCorrected, tell: Tell) 
             written.append((write_aside(path, partial(write_json, record)), path))
         put_in_place(written)
     except OSError as error:
-        if made and request.output.is_dir() and not any(request.output.iterdir()):
-            request.output.rmdir()
-        raise UserError(f"{error.filename or request.output}: {error.strerror or error}", ExitCode.IO) from error
+        remove_empty_folders()
+        raise UserError(error_words(error, request.output), ExitCode.IO) from error
     paths = [str(path) for _, path in written]
     return Told(record | {"files": paths}, [*first_lines(record["verdict"]), *_lines(done), *paths])
 

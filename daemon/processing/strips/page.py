@@ -11,13 +11,14 @@ from swath.calib.labels import decimals_of, number, thousands
 from swath.calib.strips.signatures import MATTERS_M, SIGNIFICANT, Signature
 from swath.calib.strips.standards import TO_CONFIRM
 from swath.daemon.errors import ExitCode, UserError
-from swath.daemon.processing.files import write_whole
+from swath.daemon.processing.files import aside_folder, write_whole
 from swath.daemon.processing.pages.blocks import Block, Card, Cell, Image, Judged, Notes, Table, Words, data_uri
-from swath.daemon.processing.pages.names import PRINTED, STRIPS, STRIPS_PICTURES
+from swath.daemon.processing.pages.names import STRIPS, STRIPS_PICTURES
 from swath.daemon.processing.pages.pdf import page_files
 from swath.daemon.processing.pages.render import Page, html_of
 from swath.daemon.processing.quicklook.maps import draw_differences
 from swath.daemon.processing.strips.compare import RECORD, WORST_PAIRS, Compared, Judgement
+from swath.daemon.written import error_words
 
 MAP_TITLE = "Height difference of overlapping strips"
 MAP_TITLES = (f"{MAP_TITLE}, now", f"{MAP_TITLE}, before")
@@ -42,21 +43,20 @@ def write_comparison(done: Compared, folder: Path, level: str | None, warnings: 
         UserError: the folder cannot be written to.
     """
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        maps = []
-        for name, title, one in zip(STRIPS_PICTURES, MAP_TITLES, (done.now, done.before), strict=True):
-            if one is not None:
-                draw_differences(one.strips.look, folder / name)
-                maps.append((title if done.before is not None else MAP_TITLE, folder / name))
-        page = folder / STRIPS
-        files = page_files(page, strips_page(done.now, done.before, level, maps), warnings)
-        page.with_suffix(PRINTED).unlink(missing_ok=True)  # of an earlier run
-        shown = [*files, *(path for _, path in maps)]
-        done.record.update({"pictures": [str(path) for _, path in maps], "page": str(page)})
-        files[folder / RECORD] = (json.dumps(done.record, indent=2, allow_nan=False) + "\n").encode()
-        write_whole(files)
+        with aside_folder(folder) as aside:
+            maps = []
+            for name, title, one in zip(STRIPS_PICTURES, MAP_TITLES, (done.now, done.before), strict=True):
+                if one is not None:
+                    draw_differences(one.strips.look, aside / name)
+                    maps.append((title if done.before is not None else MAP_TITLE, aside / name))
+            files = page_files(aside / STRIPS, strips_page(done.now, done.before, level, maps), warnings)
+            shown = [folder / path.name for path in (*files, *(path for _, path in maps))]
+            pictures = [str(folder / path.name) for _, path in maps]
+            done.record.update({"pictures": pictures, "page": str(folder / STRIPS)})
+            files[aside / RECORD] = (json.dumps(done.record, indent=2, allow_nan=False) + "\n").encode()
+            write_whole(files)
     except OSError as error:
-        raise UserError(f"{folder}: is not writable ({error.strerror or error})", ExitCode.IO) from error
+        raise UserError(error_words(error, folder), ExitCode.IO) from error
     return shown
 
 

@@ -60,6 +60,7 @@ from swath.daemon.processing.user_errors import as_user_error, finite
 from swath.daemon.processing.validation.page import validation_page
 from swath.daemon.processing.validation.record import record_files, records_of
 from swath.daemon.text_files import text_of
+from swath.daemon.written import error_words
 from swath.georef.mapping.frame import MappingError
 from swath.georef.progress import Tell
 from swath.georef.scanner.calibration import Calibration, CalibrationError, read_calibration
@@ -392,7 +393,7 @@ def _write(request: ValidationOptions, output: Path, record: dict[str, Any], fou
         page.with_suffix(PRINTED).unlink(missing_ok=True)  # of an earlier run
         write_whole(files)
     except OSError as error:
-        raise UserError(f"{output}: is not writable ({error.strerror or error})", ExitCode.IO) from error
+        raise UserError(error_words(error, output), ExitCode.IO) from error
     return [str(path) for path in files]
 
 

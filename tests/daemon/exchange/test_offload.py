@@ -127,7 +127,7 @@ def test_a_killed_run_is_resumed(logs: Path, disk: Path) -> None:
     assert coreutils_agree(disk) == 1
 
 
-def test_ctrl_c_ends_the_run_quietly_and_leaves_the_partial_copy(logs: Path, disk: Path) -> None:
+def test_ctrl_c_ends_the_run_in_one_line_and_leaves_the_partial_copy(logs: Path, disk: Path) -> None:
     path = big_log(logs)
     partial = disk / (path.name + ".partial")
     command = [sys.executable, "-m", "swath.daemon.cli.main", "offload", "--same-disk", str(logs), str(disk)]
@@ -135,7 +135,10 @@ def test_ctrl_c_ends_the_run_quietly_and_leaves_the_partial_copy(logs: Path, dis
     wait_until(lambda: partial.exists() and partial.stat().st_size > BLOCK_BYTES, "a part of the copy")
     process.send_signal(signal.SIGINT)
     _, stderr = process.communicate(timeout=HANGS_S)
-    assert (process.returncode, stderr) == (130, "")
+    assert (process.returncode, stderr.splitlines()) == (
+        130,
+        [f"swath: interrupted; nothing written; {partial} stays, and the same command continues from there"],
+    )
     assert names(disk) == [partial.name]
 
 

@@ -294,7 +294,7 @@ def test_a_full_disk_leaves_no_files(
     output = tmp_path / "out"
     if there:
         output.mkdir()
-    with pytest.raises(UserError, match="No space left on device") as caught:
+    with pytest.raises(UserError, match=r"no space left on the disk .*; nothing written") as caught:
         write_adjustment(replace(done[0], output=output), done[1], lambda *_: None)
     assert caught.value.exit_code == ExitCode.IO
     assert "\n" not in caught.value.message

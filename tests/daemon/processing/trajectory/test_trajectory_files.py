@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from swath.daemon.errors import UserError
-from swath.daemon.processing.files import PARTIAL, put_in_place
+from swath.daemon.processing.files import put_in_place
 from swath.daemon.processing.trajectory import files as trajectory_files
 from swath.daemon.processing.trajectory.files import TrajectoryFiles, smrmsg_beside, write_trajectory
+from swath.daemon.written import PARTIAL
 from swath.georef.formats.sbet import sbet_bytes
 from swath.georef.formats.trajectory.csv import csv_text
 from swath.georef.formats.trajectory.file import read_trajectory
