@@ -47,7 +47,7 @@ class Format:
     ticks: int
 
 
-WIDE, NARROW = Format(10.4, 1.45, 112, 8), Format(4.1, 1.3, 180, 4)
+WIDE, NARROW = Format(8.6, 1.3, 136, 7), Format(4.1, 1.3, 180, 4)
 
 
 @dataclass(frozen=True, eq=False)

@@ -78,6 +78,7 @@ def map_of(drawn: Drawn, form: Format) -> Figure:
             handles.append(Line2D([], [], color=colour, lw=2.0, label=word))
     _map_marks(drawn, axes, handles)
     coordinates(axes, course.chart.unit, (form.ticks - 1, 6))
+    axes.set_xlabel(f"Easting ({course.chart.unit}), {course.chart.name}", fontsize=8.5, color=MUTED)
     scale_bar(axes, 2.0 * float(half[0]) * course.chart.unit_m, _empty_corner(axes, course.place))
     north_arrow(axes)
     _strip_numbers(drawn, axes)

@@ -82,7 +82,7 @@ def test_the_map_is_in_the_crs_of_the_products(flight: Flight, drawn: Drawn) -> 
         assert len(shown) >= 3
         assert [number(text) for _, text in shown] == [tick for tick, _ in shown]
     assert drawn.course.place[:, 0] == pytest.approx([east_m[0], north_m[0]], abs=0.01)
-    assert (axes.get_xlabel(), axes.get_ylabel()) == ("Easting (m)", "Northing (m)")
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("Easting (m), ETRS89 / UTM zone 32N", "Northing (m)")
 
 
 def test_without_a_crs_the_map_is_in_the_zone_of_the_flight(flight: Flight) -> None:
