@@ -50,6 +50,7 @@ NONE, CONSTANT = "none", "constant"
 MODELS = (NONE, CONSTANT, "linear", "spline")
 MOST_CHOSEN_SINGLY = 30  # strips; with more, all get one model
 MOST_SWEEPS = 5
+MOST_REFERENCES = 4  # strips without control that are tried as the one that the others are related to
 IN_PLAN = (0, 1, 4, 5)  # shifts along and across, and what moves the ground like them: pitch and heading
 
 
@@ -352,26 +353,43 @@ class _Choice:
         """Choose models by the criterion: first one model for all strips, then strip by strip until no choice changes.
 
         Of strips that no control relates to the ground at least one gets no correction, and the others are related to
-        it: at first, of the half that the returns know best, the one that the common solution moves least. The strips
-        follow in the order in which it moves them.
+        it. Of the half that the returns know best, those that the common solution moves least are tried as the first of
+        these, because from a wrong one no single change leads to the strips that agree.
         """
         of_all = quadratic.of(self._basis)
         self._groups = self._linked(of_all)
-        starts = [self._start(of_all, model) for model in self._settings.models]
-        order, self.models = min(starts, key=lambda start: self._criterion(of_all, start[1]))
+        ends: list[tuple[float, list[int], list[str]]] = []
+        for rank in range(MOST_REFERENCES):
+            starts = [self._start(of_all, model, rank) for model in self._settings.models]
+            order, models = min(starts, key=lambda start: self._criterion(of_all, start[1]))
+            if len(self._keys) <= MOST_CHOSEN_SINGLY:
+                models = self._swept(of_all, order, models)
+            ends.append((self._criterion(of_all, models), order, models))
+            if all(group.knows_height for group in self._groups):
+                break  # no strip is a reference
+        _, order, self.models = min(ends, key=lambda end: end[0])
         self._groups = [replace(one, strips=sorted(one.strips, key=order.index)) for one in self._groups]
-        if len(self._keys) > MOST_CHOSEN_SINGLY:
-            return
+
+    def _swept(self, of_all: Quadratic, order: Sequence[int], models: list[str]) -> list[str]:
+        """Return the models of strips when no single change improves the criterion any more."""
+        self.models = list(models)
         for _ in range(MOST_SWEEPS):
             before = list(self.models)
             for number in order:
                 found = self._tried(of_all, number)
                 self.models[number] = min(found, key=lambda model: found[model])
             if self.models == before:
-                return
+                break
+        return self.models
 
-    def _start(self, of_all: Quadratic, model: str) -> tuple[list[int], list[str]]:
-        """Return strips in the order in which one model for all moves them, and the models to begin with."""
+    def _start(self, of_all: Quadratic, model: str, rank: int) -> tuple[list[int], list[str]]:
+        """Return strips in the order in which one model for all moves them, and the models to begin with.
+
+        Args:
+            of_all: χ² of all parameters.
+            model: of all strips but references.
+            rank: number in this order of the reference of each group, among the half that the returns know best.
+        """
         models = [model] * len(self._keys)
         columns = self._taken(models)
         moved = (self._basis[:, columns] @ self._solve(of_all, models).whole).reshape(-1, ERRORS)
@@ -382,7 +400,7 @@ class _Choice:
         for group in self._groups:
             if not group.knows_height:
                 well_seen = [number for number in group.strips if own[number] >= np.median(own[group.strips])]
-                models[min(well_seen, key=order.index)] = NONE
+                models[sorted(well_seen, key=order.index)[: rank + 1][-1]] = NONE
         return order, models
 
     def _linked(self, of_all: Quadratic) -> list[_Group]:
