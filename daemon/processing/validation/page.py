@@ -137,7 +137,7 @@ def _methods(validation: Validation) -> list[Block]:
         "Codes: ISO/TS 19159-2, 6.8. Figure and limit are those of the test that failed, otherwise of "
         f"{TESTS['chi2']}; the appendix has all tests."
     )
-    tables: list[Block] = [Table("Methods", (*heads, "verdict"), rows, under, left=(0, 10))] if rows else []
+    tables: list[Block] = [Table("Methods", (*heads, "verdict"), rows, under)] if rows else []
     if missing:
         tables.append(Table("Methods not applied", ("method", "code", "why"), missing, left=(0, 2)))
     return tables
