@@ -25,6 +25,7 @@ def command(
     directory: Annotated[
         Path, typer.Argument(help="Destination; each session gets its own folder in it.", metavar="DIR")
     ],
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace earlier exports of the logs.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object, for scripts.")] = False,
 ) -> None:
     """Write logs as serial streams (with RTKLIB's time tags), candump logs, pcap files and PPS text.
@@ -49,7 +50,7 @@ def command(
                 reached = Reached(partial(_tell, tell, session.session_id))
                 session.progress = reached
                 with room_noted(directory, reached.share):
-                    done.append((session, export_session(session, directory)))
+                    done.append((session, export_session(session, directory, overwrite=overwrite)))
     except LogError as error:
         raise UserError(one_line(str(error)), ExitCode.IO) from error
     except OSError as error:

@@ -46,6 +46,7 @@ def command(
             "--control-sigma", metavar="M", help="Sigma of the control points, in metres.", min=0.0005, max=1.0
         ),
     ] = 0.01,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files of an earlier run.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object, for scripts.")] = False,
 ) -> None:
     """Predict how well a planned flight determines the calibration: the sigma of each parameter, or why it has none.
@@ -60,10 +61,12 @@ def command(
     from swath.daemon.processing.calibration.model import model_of
     from swath.daemon.processing.calibration.plan.page import require_picture
     from swath.daemon.processing.calibration.plan.run import PlanOptions, plan_calibration
+    from swath.daemon.processing.earlier_runs import refuse_existing
     from swath.daemon.simulate.plans import FlightOptions
 
     picture = output if output is not None else Path(f"{Path(plan).stem}-calibration.png")
     require_picture(picture)
+    refuse_existing([picture], overwrite=overwrite, instead="name")
     asked = PlanOptions(model_of(model), None if sigmas is None else _three(sigmas), not no_control, control_sigma)
     flight = FlightOptions(plan)
     warnings: list[str] = []

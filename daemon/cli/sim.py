@@ -113,16 +113,19 @@ def plan_(
             help="Picture to write: PNG, PDF or SVG; default: PLAN.png in this folder.",
         ),
     ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files of an earlier run.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object, for scripts.")] = False,
 ) -> None:
     """Draw a plan (lines, swaths, buildings, height profile, density, overlap) and print its figures as a table."""
     from rich.console import Console
 
     from swath.daemon.cli.progress import progress_bar
+    from swath.daemon.processing.earlier_runs import refuse_existing
     from swath.daemon.processing.files import aside_folder
     from swath.daemon.simulate.plans import FlightOptions, draw
 
     picture = output if output is not None else Path(f"{Path(plan).stem}.png")
+    refuse_existing([picture], overwrite=overwrite, instead="name")
     try:
         with progress_bar() as tell:
             tell("drawing", 0, 0)

@@ -91,7 +91,7 @@ def command(
             "--strip-model", help="Correction for --adjust: none, constant, linear, spline, or auto (chosen per strip)."
         ),
     ] = "auto",
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files of an earlier adjustment.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files of an earlier run.")] = False,
     workers: Annotated[int | None, typer.Option(help="Number of processes; default: one per processor.", min=1)] = None,
     force_trajectory: ForceTrajectory = False,
     accept_verdict: AcceptVerdict = False,
@@ -135,11 +135,13 @@ def command(
         surveyed = read_control_file(control, control_crs, control_columns)
         _adjust(logs, adjust, surveyed, strip_model, overwrite=overwrite, as_json=as_json)
         return
-    if control or control_crs or control_columns or overwrite or strip_model != "auto":
+    if control or control_crs or control_columns or strip_model != "auto":
         of_control = control or control_crs or control_columns
-        named = "--control" if of_control else "--overwrite" if overwrite else "--strip-model"
+        named = "--control" if of_control else "--strip-model"
         raise UserError(f"{named} needs --adjust DIR, because only an adjustment uses it", ExitCode.USAGE)
-    _compare(logs, before or (), (cells, cell), output, level, as_json=as_json, all_pairs=all_pairs)
+    _compare(
+        logs, before or (), (cells, cell), output, level, overwrite=overwrite, as_json=as_json, all_pairs=all_pairs
+    )
 
 
 def _compare(
@@ -149,13 +151,20 @@ def _compare(
     output: Path | None,
     level: str | None,
     *,
+    overwrite: bool,
     as_json: bool,
     all_pairs: bool,
 ) -> None:
     from swath.daemon.cli.progress import progress_bar
-    from swath.daemon.processing.strips.compare import StripsOptions, compare_strips, rules_of
+    from swath.daemon.processing.earlier_runs import refuse_existing
+    from swath.daemon.processing.pages.names import STRIPS
+    from swath.daemon.processing.strips.compare import RECORD, StripsOptions, compare_strips, rules_of
     from swath.daemon.processing.strips.console import comparison_lines
 
+    if output is not None:
+        refuse_existing((output / RECORD, output / STRIPS), overwrite=overwrite)
+    elif overwrite:
+        raise UserError("--overwrite needs --output or --adjust, because nothing is written otherwise", ExitCode.USAGE)
     request = StripsOptions(logs.logs, logs, before, rules_of(*cells), level)
     warnings: list[str] = []
     written: list[Path] = []

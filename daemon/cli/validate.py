@@ -77,6 +77,7 @@ def command(
     workers: Annotated[int | None, typer.Option(help="Number of processes; default: one per processor.", min=1)] = None,
     force_trajectory: ForceTrajectory = False,
     accept_verdict: AcceptVerdict = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files of an earlier run.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object, for scripts.")] = False,
 ) -> None:
     """Validate a calibration by the six methods of ISO/TS 19159-2, 6.8, each with numbers, a test and a sentence.
@@ -97,10 +98,12 @@ def command(
     surveyed = read_control_file(control, control_crs, control_columns)  # before all that takes seconds to import
     from swath.daemon.cli.progress import progress_bar
     from swath.daemon.config import load_config
+    from swath.daemon.processing.earlier_runs import refuse_existing
     from swath.daemon.processing.flights.read import GeorefOptions
     from swath.daemon.processing.flights.trajectory_choice import TrajectoryOptions
+    from swath.daemon.processing.pages.names import VALIDATION
     from swath.daemon.processing.setup.setup import Options
-    from swath.daemon.processing.validation.run import ValidationOptions, read_file, run_validation
+    from swath.daemon.processing.validation.run import RECORD, ValidationOptions, read_file, run_validation
 
     files = [calibration, *(also or [])]
     given = {read_file(path).scanner: (text_of(path, "a calibration file"), str(path)) for path in files}
@@ -126,6 +129,8 @@ def command(
         output=output,
         record=record,
     )
+    if output is not None:
+        refuse_existing((output / RECORD, output / VALIDATION), overwrite=overwrite)
     with tempfile.TemporaryDirectory(prefix="swath-") as folder, progress_bar() as tell:
         done = run_validation(request, Path(folder), tell)
     print(json.dumps(done.record, indent=2) if as_json else "\n".join(map(one_line, done.lines)))

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from swath import __version__
 from swath.daemon.errors import ExitCode, UserError, one_line
 from swath.daemon.free_space import check_space
 from swath.daemon.processing.requirements import GIS, PRINTED_PAGES, require_installed
@@ -42,6 +43,7 @@ def command(
     gis: Annotated[
         bool, typer.Option("--gis", help="Also write maps as GeoTIFF, and lines, footprints, control as GeoPackage.")
     ] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files of an earlier run.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object, for scripts.")] = False,
 ) -> None:
     """Make a page with maps of height, intensity, density, sigma and strip differences, and a profile.
@@ -52,7 +54,7 @@ def command(
     if cell is not None and not (math.isfinite(cell) and cell > 0.0):
         raise UserError(f"--cell: got {cell:g}, want metres above 0", ExitCode.USAGE)
     ends = _ends(profile)
-    damaged = _make(paths, output, cell, ends, gis=gis, as_json=as_json)
+    damaged = _make(paths, output, cell, ends, gis=gis, overwrite=overwrite, as_json=as_json)
     if damaged:
         raise typer.Exit(int(ExitCode.DAMAGE))
 
@@ -70,13 +72,22 @@ def _ends(text: str | None) -> list[float] | None:
 
 
 def _make(
-    paths: list[Path], output: Path | None, cell: float | None, ends: list[float] | None, *, gis: bool, as_json: bool
+    paths: list[Path],
+    output: Path | None,
+    cell: float | None,
+    ends: list[float] | None,
+    *,
+    gis: bool,
+    overwrite: bool,
+    as_json: bool,
 ) -> bool:
     """Read, draw, write and report; return True if a file could be read only in part."""
     from rich.console import Console
 
     from swath.daemon.cli.progress import progress_bar
+    from swath.daemon.processing.earlier_runs import listed_files, refuse_existing, relative_to
     from swath.daemon.processing.files import aside_folder
+    from swath.daemon.processing.pages.names import QUICK_LOOK, VIEW_RECORD
     from swath.daemon.processing.quicklook.page import make_page
     from swath.daemon.processing.quicklook.read import QuickLookError
     from swath.daemon.processing.quicklook.run import look_at, numbers_of
@@ -87,6 +98,8 @@ def _make(
     first = paths[0]
     folder = output or (first if first.is_dir() else first.parent) / "view"
     title = (first.resolve() if len(paths) == 1 else first.resolve().parent).name
+    record = folder / VIEW_RECORD
+    refuse_existing((record, folder / QUICK_LOOK), overwrite=overwrite)
     check_space(folder, "page and pictures", least_bytes=PAGE_BYTES[0], most_bytes=PAGE_BYTES[1])
     with progress_bar() as tell:
         try:
@@ -94,11 +107,19 @@ def _make(
         except QuickLookError as error:
             raise UserError(one_line(str(error)), ExitCode.IO) from error
         try:
-            with aside_folder(folder) as aside:
+            with aside_folder(folder, listed_files(record)) as aside:
                 page = folder / make_page(look, aside, title, warnings, tell).name
                 if gis:
                     tell("GIS layers", 0, 0)
                 made = [folder / path.name for path in _gis(look, aside, paths, warnings)] if gis else []
+                about = {
+                    "format": "swath.view",
+                    "version": 1,
+                    "software": f"swath {__version__}",
+                    "of": relative_to(folder, (source.path for source in look.sources)),
+                    "files": sorted(path.name for path in aside.iterdir()),
+                }
+                (aside / VIEW_RECORD).write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
         except OSError as error:
             raise UserError(one_line(error_words(error, folder)), ExitCode.IO) from error
     for line in warnings:

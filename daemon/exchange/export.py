@@ -29,6 +29,7 @@ from swath.daemon.written import make_folder, note_written
 MANIFEST = "swath-export.json"
 CONFIG_FOLDER = "config"
 _UNFINISHED = ".part"
+_EARLIER = ".earlier"
 _MOST_NAME_BYTES = 200  # names derived from it are longer, and file systems accept at most 255
 _MOST_PLACE = 500  # characters of a name with its folders, which are created one inside the other
 _NO_PLACE = (errno.ENAMETOOLONG, errno.ENOTDIR, errno.EEXIST, errno.EISDIR)  # a foreign log's name, or a collision
@@ -51,12 +52,13 @@ class ExportReport:
     notes: list[str] = field(default_factory=list)
 
 
-def export_session(session: Session, directory: Path) -> ExportReport:
+def export_session(session: Session, directory: Path, *, overwrite: bool = False) -> ExportReport:
     """Write a session into ``directory/<session_id>``; the folder appears when it is complete.
 
     Args:
         session: as `open_logs` gives it; read once, a chunk at a time.
         directory: created if necessary.
+        overwrite: replace an export of the same session.
 
     Raises:
         LogError: the log's name cannot be the name of a folder.
@@ -67,16 +69,24 @@ def export_session(session: Session, directory: Path) -> ExportReport:
     if target.parent != directory or len(os.fsencode(target.name)) > _MOST_NAME_BYTES:
         raise LogError(f"session {session.session_id[:60]!r}: cannot be a folder name; this session was not exported")
     unfinished = target.with_name(target.name + _UNFINISHED)
-    for path in (target, unfinished):
+    earlier = target.with_name(target.name + _EARLIER)
+    for path in (unfinished, earlier):
         if os.path.lexists(path):
-            raise UserError(f"{path}: already exists; remove it or choose another directory", ExitCode.IO)
+            raise UserError(f"{path}: is left of a killed export; remove it or choose another folder", ExitCode.IO)
+    if os.path.lexists(target) and not overwrite:
+        raise UserError(f"{target}: already exists; choose another folder or use --overwrite", ExitCode.USAGE)
+    if os.path.lexists(target) and not (target / MANIFEST).is_file():
+        raise UserError(f"{target}: is not an export; remove it or choose another folder", ExitCode.USAGE)
     make_folder(directory)
     unfinished.mkdir()
     try:
         report = _Export(session, unfinished).run()
         sync_tree(unfinished)
         with held_interrupts():
+            if target.exists():
+                target.rename(earlier)
             unfinished.rename(target)
+            shutil.rmtree(earlier, ignore_errors=True)
             note_written(target)
     except BaseException:
         shutil.rmtree(unfinished, ignore_errors=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from functools import partial
@@ -41,10 +41,10 @@ def write_aside(path: Path, write: Callable[[IO[bytes]], None]) -> Path:
     return aside
 
 
-def put_in_place(written: list[tuple[Path, Path]]) -> None:
+def put_in_place(written: list[tuple[Path, Path]], gone: Iterable[Path] = ()) -> None:
     """Rename temporary files to their final names, in the order given, and sync the folders to disk.
 
-    An interrupt waits until all are renamed.
+    An interrupt waits until all are renamed, and files of an earlier run that are ``gone`` now are removed.
 
     Raises:
         OSError: a file cannot be renamed; no temporary file is left.
@@ -53,6 +53,8 @@ def put_in_place(written: list[tuple[Path, Path]]) -> None:
         for aside, path in written:
             aside.replace(path)
             note_written(path)
+        for path in set(gone) - {path for _, path in written}:
+            path.unlink(missing_ok=True)
     for folder in dict.fromkeys(path.parent for _, path in written):
         try_sync_directory(folder)
 
@@ -72,10 +74,11 @@ def write_whole(files: Mapping[Path, bytes]) -> None:
 
 
 @contextmanager
-def aside_folder(folder: Path) -> Iterator[Path]:
+def aside_folder(folder: Path, gone: Iterable[Path] = ()) -> Iterator[Path]:
     """Give a hidden folder for files; when the block ends, all of them get their places in ``folder`` at once.
 
-    If the block fails or is interrupted, nothing of it is left.
+    If the block fails or is interrupted, nothing of it is left. Files of an earlier run that are ``gone`` and not made
+    anew are removed.
 
     Raises:
         OSError: the folder cannot be written to.
@@ -86,7 +89,7 @@ def aside_folder(folder: Path) -> Iterator[Path]:
         made = sorted(path for path in Path(name).iterdir() if path.is_file())
         for path in made:
             sync_file(path)
-        put_in_place([(path, folder / path.name) for path in made])
+        put_in_place([(path, folder / path.name) for path in made], gone)
 
 
 def _put(data: bytes, stream: IO[bytes]) -> None:

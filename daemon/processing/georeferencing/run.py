@@ -13,7 +13,7 @@ import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Event
@@ -25,6 +25,7 @@ from swath import __version__
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.log.durable import sync_file, try_sync_directory
 from swath.daemon.log.reader import Session
+from swath.daemon.processing.earlier_runs import listed_files, refuse_existing, stale_pages
 from swath.daemon.processing.files import put_in_place, sha256_of
 from swath.daemon.processing.flights.read import (
     INTENSITY_FACTOR,
@@ -168,6 +169,7 @@ def _out_of_sight(request: GeorefOptions, names: Sequence[str]) -> Iterator[tupl
     partial = output / f"{name}.partial"
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir()
+    stale = _stale(output, names)
 
     def into_place(files: list[Path]) -> None:
         for file in files:
@@ -177,6 +179,11 @@ def _out_of_sight(request: GeorefOptions, names: Sequence[str]) -> Iterator[tupl
                 (output / f"{one}.json").unlink(missing_ok=True)
                 for old in _strips(output, one):
                     old.unlink()
+            for old in stale:
+                old.unlink(missing_ok=True)
+            for folder in {old.parent for old in stale} - {output}:
+                with suppress(OSError):  # there are other files in it
+                    folder.rmdir()
             for file in files:
                 file.replace(output / file.name)
                 note_written(output / file.name)
@@ -186,6 +193,16 @@ def _out_of_sight(request: GeorefOptions, names: Sequence[str]) -> Iterator[tupl
         yield partial, into_place
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+
+
+def _stale(folder: Path, names: Sequence[str]) -> list[Path]:
+    """Return the pages of earlier runs that show the points or the trajectories that are replaced."""
+    pages = stale_pages(folder, [path for name in names for path in _strips(folder, name)])
+    for name in names:
+        summary = TrajectoryFiles.in_folder(folder, name, csv=True).summary  # of `swath trajectory`
+        replaced = (".sbet", ".smrmsg", ".csv")
+        pages += [path for path in (*listed_files(summary), summary) if path.suffix not in replaced and path.exists()]
+    return pages
 
 
 def _strips(folder: Path, name: str) -> list[Path]:
@@ -203,10 +220,7 @@ def _refuse_existing(request: GeorefOptions, names: Sequence[str]) -> None:
             raise UserError(f"{read}: is an input and would be overwritten; choose another folder", ExitCode.USAGE)
         there = [path for path in (request.output / f"{name}.json", *_strips(request.output, name)) if path.exists()]
         if (there or trajectories) and not request.overwrite:
-            first = [*there, *trajectories][0]
-            raise UserError(
-                f"{first}: exists from an earlier run; choose another folder or use --overwrite", ExitCode.USAGE
-            )
+            refuse_existing([*there, *trajectories], overwrite=False)
     _refuse_parts(request.output, names)
 
 
@@ -261,6 +275,11 @@ def _make(
     record = run_record(flights, results, files)
     record["verdict"] = verdict_of(request, flights)
     record |= {"logs": logs, "files": [path.name for path in trajectories], "options": request.record()}
+    if stale := _stale(request.output, [flight.session.session_id for flight in flights]):
+        record["warnings"].append(
+            f"{request.output}: removed pages and pictures of the replaced points or trajectory: "
+            + ", ".join(str(path.relative_to(request.output)) for path in stale)
+        )
     record["elapsed_s"] = round(time.monotonic() - began, 1)
     sidecar = partial / f"{name}.json"
     write_sidecar(sidecar, record)

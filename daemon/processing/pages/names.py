@@ -5,6 +5,7 @@ from __future__ import annotations
 PRINTED = ".pdf"  # the PDF beside a page has its stem
 # `swath trajectory` names its page after the trajectory's own file.
 QUICK_LOOK, STRIPS, VALIDATION, REPORT = "index.html", "strips.html", "validation.html", "report.html"
+VIEW_RECORD = "view.json"  # of `swath view`: its files, and the points that they show
 QUICK_LOOK_PICTURES = ("height.png", "differences.png", "profile.png", "density.png", "intensity.png", "sigma.png")
 QUICK_LOOK_MAPS = ("height.tif", "differences.tif", "density.tif", "intensity.tif", "sigma.tif")
 QUICK_LOOK_FEATURES = "view.gpkg"

@@ -11,6 +11,7 @@ from swath.calib.labels import decimals_of, number, thousands
 from swath.calib.strips.signatures import MATTERS_M, SIGNIFICANT, Signature
 from swath.calib.strips.standards import TO_CONFIRM
 from swath.daemon.errors import ExitCode, UserError
+from swath.daemon.processing.earlier_runs import listed_files, relative_to
 from swath.daemon.processing.files import aside_folder, write_whole
 from swath.daemon.processing.pages.blocks import Block, Card, Cell, Image, Judged, Notes, Table, Words, data_uri
 from swath.daemon.processing.pages.names import STRIPS, STRIPS_PICTURES
@@ -43,7 +44,7 @@ def write_comparison(done: Compared, folder: Path, level: str | None, warnings: 
         UserError: the folder cannot be written to.
     """
     try:
-        with aside_folder(folder) as aside:
+        with aside_folder(folder, listed_files(folder / RECORD)) as aside:
             maps = []
             for name, title, one in zip(STRIPS_PICTURES, MAP_TITLES, (done.now, done.before), strict=True):
                 if one is not None:
@@ -52,7 +53,9 @@ def write_comparison(done: Compared, folder: Path, level: str | None, warnings: 
             files = page_files(aside / STRIPS, strips_page(done.now, done.before, level, maps), warnings)
             shown = [folder / path.name for path in (*files, *(path for _, path in maps))]
             pictures = [str(folder / path.name) for _, path in maps]
-            done.record.update({"pictures": pictures, "page": str(folder / STRIPS)})
+            points = [source.path for one in (done.now, done.before) if one for source in one.strips.look.sources]
+            listed = {"of": relative_to(folder, points), "files": [path.name for path in shown]}
+            done.record.update({"pictures": pictures, "page": str(folder / STRIPS)} | listed)
             files[aside / RECORD] = (json.dumps(done.record, indent=2, allow_nan=False) + "\n").encode()
             write_whole(files)
     except OSError as error:

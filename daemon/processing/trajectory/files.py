@@ -14,6 +14,7 @@ from typing import IO
 import numpy as np
 
 from swath.daemon.errors import ExitCode, UserError
+from swath.daemon.processing.earlier_runs import refuse_existing
 from swath.daemon.processing.files import gone_on_failure, write_aside
 from swath.daemon.processing.pages.names import PRINTED
 from swath.georef.arrays import FloatArray
@@ -78,9 +79,8 @@ class TrajectoryFiles:
 
     def refuse_existing(self, *others: Path | None) -> None:
         """Refuse with `UserError` to replace any of the files, or of ``others``, that exists."""
-        for path in [*self.all(), *(other for other in others if other is not None)]:
-            if path.exists():
-                raise UserError(f"{path}: already exists; choose another name or use --overwrite", ExitCode.USAGE)
+        paths = [*self.all(), *(other for other in others if other is not None)]
+        refuse_existing(paths, overwrite=False, instead="name")
 
 
 def _smrmsg_of(sbet: Path) -> Path:

@@ -14,6 +14,7 @@ import numpy as np
 
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.log.reader import Session, open_logs
+from swath.daemon.processing.earlier_runs import listed_files
 from swath.daemon.processing.files import put_in_place, refuse_no_name, remove, write_aside
 from swath.daemon.processing.navigation.inputs import Mark
 from swath.daemon.processing.navigation.log import session_holes
@@ -90,7 +91,7 @@ def _write(
     except BaseException:
         remove(written)
         raise
-    put_in_place(written)
+    put_in_place(written, listed_files(files.summary))
     return TrajectoryReport(record, files.summary, [path for _, path in written], warnings)
 
 
@@ -119,7 +120,7 @@ def _write_as_is(
     except BaseException:
         remove(written)
         raise
-    put_in_place(written)
+    put_in_place(written, listed_files(files.summary))
     return TrajectoryReport(record, files.summary, [path for _, path in written])
 
 

@@ -388,6 +388,7 @@ def _write(request: ValidationOptions, output: Path, record: dict[str, Any], fou
         files |= record_files(output, found.documents, found.validation, found.logs)
     if picture is not None:
         files[output / HISTORY_PICTURE] = picture
+    record["files"] = [path.name for path in files]
     files[output / RECORD] = (json.dumps(record, indent=2, allow_nan=False) + "\n").encode()
     try:
         page.with_suffix(PRINTED).unlink(missing_ok=True)  # of an earlier run

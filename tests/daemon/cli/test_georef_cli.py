@@ -291,7 +291,7 @@ class TestRefusals:
         before = there.stat().st_mtime_ns
         arguments = flown.arguments(tmp_path)
         assert run_app(arguments) == 2
-        assert f"{there}: exists from an earlier run" in capsys.readouterr().err
+        assert f"{there}: already exists; choose another folder or use --overwrite" in capsys.readouterr().err
         arguments[arguments.index("--trajectory") + 1] = str(there)
         assert run_app([*arguments, "--overwrite"]) == 2
         assert f"{there}: is an input and would be overwritten" in capsys.readouterr().err
@@ -305,7 +305,10 @@ class TestRefusals:
         (made, *_) = products.glob("*_strip*.laz")
         shutil.copy(made, tmp_path)
         assert run_app(flown.arguments(tmp_path)) == 2
-        assert f"{tmp_path / made.name}: exists from an earlier run" in capsys.readouterr().err
+        assert (
+            f"{tmp_path / made.name}: already exists; choose another folder or use --overwrite"
+            in capsys.readouterr().err
+        )
         assert [path.name for path in tmp_path.iterdir()] == [made.name]
 
     def test_a_single_session_is_not_replaced_if_the_sidecar_covers_several(

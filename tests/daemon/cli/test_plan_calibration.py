@@ -84,7 +84,14 @@ def plan_of(
 def planned(plan: str, picture: Path, **options: Any) -> None:
     model = Path(plan).with_name("known.toml")
     model.write_text(KNOWN)
-    asked = {"model": str(model), "sigmas": None, "no_control": False, "control_sigma": 0.01, "as_json": True}
+    asked = {
+        "model": str(model),
+        "sigmas": None,
+        "no_control": False,
+        "control_sigma": 0.01,
+        "as_json": True,
+        "overwrite": True,
+    }
     command(plan, picture, **asked | options)
 
 
@@ -269,6 +276,6 @@ def test_unwritable_pictures_are_reported_in_one_line(tmp_path: Path) -> None:
     plan = plan_of(tmp_path, OPPOSITE)
     with pytest.raises(UserError, match=r"plan.bmp: want a file's name that ends in one of .html, .pdf, .png, .svg"):
         planned(plan, tmp_path / "plan.bmp")
-    with pytest.raises(UserError, match="No such file") as ended:
-        planned(plan, tmp_path / "none" / "plan.png")
+    with pytest.raises(UserError, match=r"plan\.toml: File exists") as ended:
+        planned(plan, Path(plan) / "plan.png")
     assert ended.value.exit_code == ExitCode.IO

@@ -242,7 +242,7 @@ def test_another_record_can_be_named_and_that_of_another_calibration_is_unchange
     assert written == {"validation.json", "validation.html", "validation.pdf"}
     (tmp_path / "report").mkdir()
     record_beside(tmp_path / "report" / "left.record.json", "c1")
-    run(str(file), str(log), "-o", str(tmp_path / "out"), "--record", str(tmp_path / "report"))
+    run(str(file), str(log), "-o", str(tmp_path / "out"), "--record", str(tmp_path / "report"), "--overwrite")
     assert "CA_GeometryValidation.validationMethod" in attributes_of(tmp_path / "out" / "left.record.json")
 
 

@@ -315,15 +315,22 @@ class TestCommand:
         assert result.returncode == 0, result.stderr
         assert content_of(tmp_path / "back") == content_of(one)
 
-    def test_an_existing_export_is_never_overwritten(self, tmp_path: Path) -> None:
+    def test_an_existing_export_is_replaced_only_if_asked(self, tmp_path: Path) -> None:
         log = write_log(tmp_path / "log", write_config(tmp_path), UNITS)
         assert swath("export", str(log), str(tmp_path / "out")).returncode == 0
         before = {path: path.stat().st_mtime_ns for path in (tmp_path / "out").rglob("*")}
         result = swath("export", str(log), str(tmp_path / "out"))
-        assert result.returncode == 3
-        assert result.stderr.startswith(f"swath: {tmp_path / 'out' / log.stem[:-2]}: already exists")
+        assert result.returncode == 2
+        target = tmp_path / "out" / log.stem[:-2]
+        assert result.stderr.startswith(f"swath: {target}: already exists; choose another folder or use --overwrite")
         assert result.stderr.count("\n") == 1
         assert {path: path.stat().st_mtime_ns for path in (tmp_path / "out").rglob("*")} == before
+        (target / "earlier.txt").touch()
+        assert swath("export", str(log), str(tmp_path / "out"), "--overwrite").returncode == 0
+        assert set((tmp_path / "out").rglob("*")) == set(before)
+        (target / "swath-export.json").unlink()  # a folder of the user's own
+        result = swath("export", str(log), str(tmp_path / "out"), "--overwrite")
+        assert (result.returncode, result.stderr.count("is not an export")) == (2, 1)
 
     def test_the_intact_part_of_a_damaged_log_is_exported(self, tmp_path: Path) -> None:
         log = write_log(tmp_path / "log", write_config(tmp_path), UNITS)
