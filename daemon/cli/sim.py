@@ -131,6 +131,8 @@ def plan_(
             tell("drawing", 0, 0)
             with aside_folder(picture.parent) as aside:
                 rows = draw(FlightOptions(plan), aside / picture.name)
+    except UserError as error:  # it names the unfinished picture
+        raise UserError(error.message.replace(str(aside / picture.name), str(picture)), error.exit_code) from error
     except OSError as error:
         raise UserError(one_line(error_words(error, picture)), ExitCode.IO) from error
     if as_json:

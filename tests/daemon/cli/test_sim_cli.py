@@ -286,7 +286,9 @@ def test_a_plan_is_drawn_and_summarised(plan: str, tmp_path: Path, capsys: pytes
     assert told["lines"][0]["length_m"] == pytest.approx(200.0)
     assert told["total"]["pulses"] == pytest.approx(5000 * told["total"]["seconds"], abs=1)
     assert picture.read_bytes().startswith(b"\x89PNG")
-    assert cli.run_app(["sim", "plan", plan, "-o", str(picture)]) == 0
+    assert cli.run_app(["sim", "plan", plan, "-o", str(picture)]) == ExitCode.USAGE
+    assert "choose another name or use --overwrite" in capsys.readouterr().err
+    assert cli.run_app(["sim", "plan", plan, "-o", str(picture), "--overwrite"]) == 0
     text = capsys.readouterr().out
     assert text.splitlines()[1].split()[:3] == ["one", "200", "m"]
     assert text.splitlines()[-1] == str(picture)
