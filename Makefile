@@ -42,10 +42,9 @@ test-peers: $(VENV)/.tests ## run the tests against gpsd and Foxglove's reader, 
 	npm ci --silent --no-audit --no-fund --prefix tests/peers
 	$(PYTEST) -n 0 -v tests/peers
 
-test-vm: $(VENV)/.tests ## run the tests of CAN, PPS, systemd and power cuts in virtual machines, which it installs (root, apt, alone)
+test-vm: $(VENV)/.tests ## run the tests of CAN, PPS, systemd and power cuts in a virtual machine, which it installs (root, apt, alone)
 	@bash tests/vm/setup.sh
-	$(PYTEST) -n 2 --dist loadgroup -v -m "not long and not alone" tests/vm
-	$(call PYTEST,-alone) -n 0 -v -m "alone and not long" tests/vm
+	$(PYTEST) -n 0 -v -m "not long" tests/vm
 
 test-vm-long: $(VENV)/.tests ## run the same with 50 power cuts and three minutes of flight
 	@bash tests/vm/setup.sh

@@ -5,15 +5,11 @@ from __future__ import annotations
 from itertools import pairwise
 from pathlib import Path
 
-import pytest
-
 from swath.georef.timescales.gps_time import SECOND_NS
 from tests.daemon.log_check import read_log
 from tests.vm.crew import aboard, facts
 from tests.vm.machine import MODULES
 from tests.vm.seconds import labelled, wrong_seconds
-
-pytestmark = pytest.mark.alone  # another machine beside this one would take its seconds
 
 
 def test_a_clock_stepped_slewed_and_with_a_leap_second_gives_no_wrong_second(tmp_path: Path) -> None:

@@ -37,8 +37,6 @@ from tests.daemon.rig import HANGS_S, wait_until
 from tests.vm import aircraft, machine
 from tests.vm.installed import with_udev
 
-pytestmark = pytest.mark.alone  # another machine beside this one would take its seconds
-
 PRF_HZ = 2000  # what an emulated machine can follow; 1000 on the other flight of this kind of the ordinary tests
 SECONDS, SECONDS_LONG = 60.0, 180.0
 BITRATE = 460_800

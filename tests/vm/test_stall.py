@@ -5,13 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-import pytest
-
 from tests.daemon.log_check import LogContent, read_log
 from tests.vm.aboard_stall import STALL_S
 from tests.vm.crew import aboard, facts
-
-pytestmark = pytest.mark.alone  # another machine beside this one would take its seconds
 
 
 def numbers(content: LogContent) -> list[int]:
