@@ -11,6 +11,7 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from pyproj import Transformer
 
+from swath.calib.features import ControlPoint
 from swath.calib.need import Need
 from swath.calib.summary import ReportInput
 from swath.daemon.processing.calibration.report.cuts import cut_picture
@@ -82,6 +83,16 @@ def test_no_texts_of_any_picture_overlap(report: ReportInput, form: Format) -> N
     ]
     found = {picture.title: overlapping(drawn(picture, form)) for picture in pictures if picture is not None}
     assert {title: pairs for title, pairs in found.items() if pairs} == {}
+
+
+def test_no_legend_names_a_mark_twice(report: ReportInput) -> None:
+    first, *others = report.features.planes
+    of_control = replace(first, kind="control", control=(ControlPoint("K1", first.centre_t, 0.02),))
+    shown = replace(report, features=replace(report.features, planes=(of_control, *others)))
+    words = [text.get_text() for legend in drawn(map_picture(shown)).legends for text in legend.get_texts()]
+    assert "control" in words
+    named = [word for word in words if word.strip()]
+    assert sorted(named) == sorted(set(named))
 
 
 def test_minus_signs_are_no_hyphens(report: ReportInput) -> None:

@@ -238,7 +238,7 @@ class _Shown:
             for colour, word in zip(PLANE_COLOURS, words, strict=True)
         ]
         look: dict[str, Any] = {"ls": "", "ms": 5.5, "color": MUTED}
-        kinds = sorted({plane.kind for plane in self.features.planes})
+        kinds = sorted({plane.kind for plane in self.features.planes} - {"control"})  # their points have an entry below
         handles += [Line2D([], [], marker=MARKERS.get(kind, "o"), label=kind or "plane", **look) for kind in kinds]
         if self.features.ties:
             handles.append(Line2D([], [], marker="D", ls="", ms=4, color="white", mec=INK, label="tie point"))
