@@ -162,6 +162,8 @@ def run_app(arguments: list[str]) -> int:
     try:
         named = next((listed.name for listed in COMMANDS if listed.name == arguments[0]), None)
         result = make_app(named)(args=arguments, prog_name="swath", standalone_mode=False)
+        if result == INTERRUPTED:  # typer's code for an interrupt, too
+            return _end_interrupted(arguments[0])
         sys.stdout.flush()
     except UserError as error:
         _say(*error.message.splitlines())
@@ -180,8 +182,6 @@ def run_app(arguments: list[str]) -> int:
     finally:
         written.remove_empty_folders()
         written.begin()
-    if result == INTERRUPTED:  # typer's code for an interrupt, too
-        return _end_interrupted(arguments[0])
     return int(result) if isinstance(result, int) else int(ExitCode.OK)
 
 
