@@ -202,7 +202,7 @@ def test_control_residuals_of_both_records_lie_at_the_surveyed_place(
     assert list(columns["sights"]) == [1, 2]
     for shape in shapes:
         np.testing.assert_allclose(numbers_of_wkb(shape, 5)[0], CONTROL, rtol=0.0, atol=2e-3)
-    assert run_app(["view", str(products), "--gis", "--json"]) == 0
+    assert run_app(["view", str(products), "--gis", "--json", "--overwrite"]) == 0
     told = capsys.readouterr()
     assert [Path(one).name for one in json.loads(told.out)["gis"]] == [*QUICK_LOOK_MAPS, QUICK_LOOK_FEATURES]
     assert "validation.json: a control point is left out" in told.err
@@ -222,7 +222,7 @@ def test_one_strip_without_a_crs_gives_maps_without_one_and_a_note(
         assert raster.bounds.left == pytest.approx(EAST_M, abs=1.0)
     layers = pyogrio.list_layers(tmp_path / "view" / QUICK_LOOK_FEATURES)
     assert [name for name, _ in layers] == ["strips"]
-    assert run_app(["view", str(tmp_path)]) == 0  # a later run without --gis leaves no old maps
+    assert run_app(["view", str(tmp_path), "--overwrite"]) == 0  # a later run without --gis leaves no old maps
     assert not list((tmp_path / "view").glob("*.tif"))
     assert not (tmp_path / "view" / QUICK_LOOK_FEATURES).exists()
 

@@ -103,7 +103,7 @@ class TestNames:
     def test_a_folder_holds_files_with_the_name_of_the_session(self, tmp_path: Path) -> None:
         files = TrajectoryFiles.of_output(tmp_path, "flight-1", csv=True)
         names = {path.name for path in files.all()}
-        assert names == {f"flight-1_trajectory{end}" for end in (".sbet", ".smrmsg", ".csv", ".json", ".html")}
+        assert names == {f"flight-1_trajectory{end}" for end in (".sbet", ".smrmsg", ".csv", ".json", ".html", ".pdf")}
 
     def test_sigmas_are_written_where_georeferencing_looks_for_them(self, tmp_path: Path) -> None:
         applanix = TrajectoryFiles.of_output(tmp_path / "sbet_f1.out", "x", csv=False)
