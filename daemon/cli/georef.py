@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import time
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -111,8 +112,10 @@ def command(
         write_dropped=write_dropped,
     )
     with progress_bar() as tell:
+        began_s = time.monotonic()
         report = georeference(request, tell)
-    _tell(report.record, report.sidecar, as_json=as_json)
+        elapsed_s = time.monotonic() - began_s
+    _tell(report.record, report.sidecar, elapsed_s, as_json=as_json)
 
 
 def calibrations_given(given: list[str]) -> dict[str, tuple[str, str]]:
@@ -140,23 +143,23 @@ def _scanner_of(text: str, file: Path) -> str:
         raise UserError(str(error), ExitCode.USAGE) from error
 
 
-def _tell(record: dict[str, Any], sidecar: Path, *, as_json: bool) -> None:
+def _tell(record: dict[str, Any], sidecar: Path, elapsed_s: float, *, as_json: bool) -> None:
     from swath.daemon.processing.carried_verdict import first_lines, refusal
 
     if as_json:
         print(json.dumps(record, indent=2))
     else:
         print(*(f"{one_line(line)}\n" for line in first_lines(record["verdict"])), sep="", end="")
-        _print(record, sidecar)
+        _print(record, sidecar, elapsed_s)
     partial = [] if record["complete"] else ["partial: " + "; ".join(map(one_line, record["holes"][:5]))]
     unusable = refusal(record["verdict"])
     if partial or unusable:
         raise UserError(f"{sidecar}: " + "; ".join([*partial, *([one_line(unusable)] if unusable else [])]))
 
 
-def _print(record: dict[str, Any], sidecar: Path) -> None:
+def _print(record: dict[str, Any], sidecar: Path, elapsed_s: float) -> None:
     from swath.daemon.processing.georeferencing.console import georef_lines
 
-    for line in georef_lines(record):
+    for line in georef_lines(record, elapsed_s):
         print(one_line(line))
     print(f"{'complete' if record['complete'] else 'partial'}: {one_line(str(sidecar))}")

@@ -194,7 +194,8 @@ def _drop_output() -> None:
 
 def _end_interrupted(command: str) -> int:
     """Say in one line what an interrupted command has written."""
-    _say("interrupted" if command in WITHOUT_FILES else f"interrupted; {written.written_words()}")
+    if command != "monitor":  # whose page ends in no other way
+        _say("interrupted" if command in WITHOUT_FILES else f"interrupted; {written.written_words()}")
     return INTERRUPTED
 
 

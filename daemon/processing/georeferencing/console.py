@@ -18,8 +18,13 @@ SOURCES = {
 }
 
 
-def georef_lines(record: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the lines from a run's sidecar: strips, returns, then calibration, trajectory, CRS, density, time."""
+def georef_lines(record: Mapping[str, Any], elapsed_s: float) -> Iterator[str]:
+    """Yield the lines that end a run: strips, returns, then calibration, trajectory, CRS, density, time.
+
+    Args:
+        record: the run's sidecar, which is the same whatever time the run took.
+        elapsed_s: how long it took.
+    """
     yield from map(_strip_line, record["strips"])
     for scanner, counts in record["counts"].items():
         reasons = ", ".join(f"{count:,} {reason.replace('_', ' ')}" for reason, count in counts["dropped"].items())
@@ -37,7 +42,7 @@ def georef_lines(record: Mapping[str, Any]) -> Iterator[str]:
         yield f"trajectory{name}: {trajectory_words(flight['trajectory'])}"
     yield f"CRS: {crs_line(record['crs'])}"
     yield _density_line(record["totals"])
-    yield _time_line(record)
+    yield _time_line(record, elapsed_s)
 
 
 def _strip_line(strip: Mapping[str, Any]) -> str:
@@ -93,6 +98,6 @@ def _density_line(totals: Mapping[str, Any]) -> str:
     return f"{words}, all strips together; {totals['points']:,} points, {count} strip{'s' * (count != 1)}{ground}"
 
 
-def _time_line(record: Mapping[str, Any]) -> str:
-    read, seconds = sum(counts["read"] for counts in record["counts"].values()), record["elapsed_s"]
-    return f"time: {seconds:.1f} s, {read / max(seconds, 1e-9):,.0f} returns a second"
+def _time_line(record: Mapping[str, Any], elapsed_s: float) -> str:
+    read = sum(counts["read"] for counts in record["counts"].values())
+    return f"time: {elapsed_s:.1f} s, {read / max(elapsed_s, 1e-9):,.0f} returns a second"

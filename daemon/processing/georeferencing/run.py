@@ -10,7 +10,6 @@ from __future__ import annotations
 import glob
 import json
 import shutil
-import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
@@ -73,7 +72,6 @@ def georeference(request: GeorefOptions, tell: Tell) -> Report:
     Raises:
         UserError: they cannot be made, one line; no file that looks like a product is left then.
     """
-    began = time.monotonic()
 
     def check(sessions: Sequence[Session], setups: Sequence[Setup]) -> None:
         check_space_for_returns(request.output, "points", LAZ_BYTES, sessions, setups)
@@ -82,7 +80,7 @@ def georeference(request: GeorefOptions, tell: Tell) -> Report:
         flights = read_flights(request, tell, check)
         names = [flight.session.session_id for flight in flights]
         with _out_of_sight(request, names) as (partial, into_place):
-            return _make(request, flights, names[0], partial, into_place, tell, began)
+            return _make(request, flights, names[0], partial, into_place, tell)
 
 
 # ---------------------------------------------------------------------- jobs
@@ -244,7 +242,6 @@ def _make(
     partial: Path,
     into_place: Callable[[list[Path]], None],
     tell: Tell,
-    began: float,
 ) -> Report:
     origin = _origin(flights)
     numbers = _numbers(flights)
@@ -280,7 +277,6 @@ def _make(
             f"{request.output}: removed pages and pictures of the replaced points or trajectory: "
             + ", ".join(str(path.relative_to(request.output)) for path in stale)
         )
-    record["elapsed_s"] = round(time.monotonic() - began, 1)
     sidecar = partial / f"{name}.json"
     write_sidecar(sidecar, record)
     into_place([*done, *trajectories, sidecar])

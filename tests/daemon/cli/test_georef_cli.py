@@ -451,7 +451,7 @@ def test_georef_ends_with_calibration_trajectory_crs_density_and_time(
         assert strip["last_returns"] <= strip["points"]
         assert f"{strip['points']:,} points" in lines[strip["number"] - 1]
     assert max(strip["area_m2"] for strip in told["strips"]) <= totals["area_m2"]
-    assert told["elapsed_s"] > 0.0
+    assert "elapsed_s" not in told  # two runs write the same sidecar
     sigma = told["flights"][0]["trajectory"]["quality"]["sigma_rms"]
     assert 0.0 < sigma["north_m"] < 1.0
 
