@@ -166,7 +166,7 @@ def runs_with_georef(_: Path) -> None:
 def extra_is_there(_: Path) -> None:
     """pip would fetch it; that it brings all that a command wants is what the tests of processing run on."""
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
-    wanted = {"numba", "scipy", "pyproj", "laspy", "matplotlib", "jinja2", "tomlkit", "weasyprint"}
+    wanted = {"numba", "scipy", "pyproj", "laspy", "matplotlib", "jinja2", "tomlkit", "weasyprint", "pyshp"}
     assert {re.split(r"[\[><=]", line)[0] for line in extras["process"]} == wanted
 
 

@@ -18,7 +18,12 @@ from swath.calib.profiles.check import CHECK, check, compare
 from swath.calib.profiles.influence import influence
 from swath.calib.profiles.measure import KINDS, PARAMETER
 from swath.calib.profiles.stepwise import Given, Profile, survey
-from swath.daemon.processing.calibration.report.profiles import comparison_table, pictures, profiles_table
+from swath.daemon.processing.calibration.report.profiles import (
+    comparison_table,
+    formulas_table,
+    pictures,
+    profiles_table,
+)
 from swath.georef.arrays import FloatArray
 from tests.calib.analytic_scene import Line, Scanner, fly, gables
 from tests.calib.roofs import exactly_known
@@ -147,6 +152,9 @@ def test_profile_check_appears_in_the_report(flight: Flight, prior: TrajectoryPr
     assert every is not None
     assert len(compared.rows) == 4
     assert len(every.rows) == len(checked.profiles)
-    assert all("=" in str(row[-1]) for row in every.rows)
+    formulas = formulas_table(checked)
+    assert formulas is not None
+    assert len(formulas.rows) == len(checked.profiles)
+    assert all("=" in str(row[-1]) for row in formulas.rows)
     assert pictures(checked, flight, CONTROL)[0].svg.startswith("<?xml")
     assert compare(flight, (), known(flight), prior) == ()

@@ -196,8 +196,8 @@ def test_calibration_of_a_navigated_flight_matches_the_sigmas_of_the_plan(
     output, control = tmp_path / "left.toml", str(made.flown.folder / "control.csv")
     searches: list[tuple[PlaneSettings, Features]] = []
 
-    def searched(flight: Flight, settings: PlaneSettings, each: Any) -> Features:
-        searches.append((settings, find_planes(flight, settings, each)))
+    def searched(flight: Flight, settings: PlaneSettings, each: Any, tell: Any) -> Features:
+        searches.append((settings, find_planes(flight, settings, each, tell)))
         return searches[-1][1]
 
     monkeypatch.setattr(calibrate_run, "find_planes", searched)
