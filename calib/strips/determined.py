@@ -45,7 +45,7 @@ class Quadratic:
 
 @dataclass(frozen=True, eq=False)
 class Unknowns:
-    """What columns of the basis mean, (u,) each.
+    """Describes the columns of the basis, (u,) each.
 
     Attributes:
         strip: index of the strip.

@@ -45,7 +45,7 @@ UNKNOWN_MOUNTING = "mounting not recorded"
 
 @dataclass(frozen=True, slots=True)
 class Course:
-    """How one parameter went through the calibrations of one mounting.
+    """Describes how one parameter went through the calibrations of one mounting.
 
     Attributes:
         name: of the parameter.

@@ -33,7 +33,7 @@ Row = tuple[int, list[str]]  # line number, fields
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """How lines are divided and numbers are written."""
+    """Describes how lines are divided and numbers are written."""
 
     separator: str
     decimal_comma: bool

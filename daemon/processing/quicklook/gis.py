@@ -43,7 +43,7 @@ NO_CRS = "the files state no coordinate system, so maps and features have none"
 
 @dataclass(frozen=True, slots=True)
 class GisFiles:
-    """What was written: paths, and notes for the user."""
+    """Names the files that were written, with notes for the user."""
 
     paths: list[Path]
     notes: list[str]

@@ -1,4 +1,4 @@
-"""What long work shows: lines where there is no terminal, a bar where there is one, nothing where it is short."""
+"""Long work shows a bar on a terminal and lines elsewhere; short work shows nothing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What of an earlier run is refused, replaced and removed; files of others stay."""
+"""Files of an earlier run are refused, replaced or removed; foreign files stay."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a flight was, found in a few seconds of its log."""
+"""The place of a flight is found in a few seconds of its log."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What every page has: its head, tables without empty columns, an appendix; and its PDF."""
+"""Every page has a head, tables without empty columns, an appendix and a PDF."""
 
 from __future__ import annotations
 
