@@ -492,7 +492,7 @@ class _Choice:
         how = (
             f"models chosen by {name} information criterion" if len(models) > 1 else f"model of all strips: {models[0]}"
         )
-        notes = [f"{how}; the calibration parameters were held"]
+        notes = [f"{how}; the calibration parameters were held, and no sigma here contains theirs"]
         if len(self._keys) > MOST_CHOSEN_SINGLY:
             notes.append(f"{len(self._keys)} strips, more than {MOST_CHOSEN_SINGLY}, so all use the same model")
         notes += [
