@@ -146,7 +146,10 @@ def command(
         limit_m=limit_m,
         overwrite=overwrite,
     )
-    with tempfile.TemporaryDirectory(prefix="swath-", dir=output.resolve().parent) as folder, progress_bar() as tell:
+    with (
+        tempfile.TemporaryDirectory(prefix="swath-", dir=output.resolve().parent) as folder,
+        progress_bar(compiling=True) as tell,
+    ):
         products = write_products(request, calibrate(request, Path(folder), tell), tell)
     print(json.dumps(products.record, indent=2) if as_json else "\n".join(map(one_line, products.lines)))
     for line in products.warnings:

@@ -111,7 +111,7 @@ def command(
         overwrite=overwrite,
         write_dropped=write_dropped,
     )
-    with progress_bar() as tell:
+    with progress_bar(compiling=True) as tell:
         began_s = time.monotonic()
         report = georeference(request, tell)
         elapsed_s = time.monotonic() - began_s

@@ -70,7 +70,7 @@ def command(
     asked = PlanOptions(model_of(model), None if sigmas is None else _three(sigmas), not no_control, control_sigma)
     flight = FlightOptions(plan)
     warnings: list[str] = []
-    with progress_bar() as tell, flight.as_user_errors():
+    with progress_bar(compiling=True) as tell, flight.as_user_errors():
         planned = plan_calibration(flight.load(), asked, tell)
         tell("picture", 0, 0)
         try:

@@ -152,11 +152,14 @@ class Display:
 
 
 @contextmanager
-def progress_bar(*, compiling: bool = True) -> Iterator[Tell]:
+def progress_bar(*, compiling: bool = False) -> Iterator[Tell]:
     """Show the progress of the block on stderr; give the function that updates it.
 
-    Where loops have to be compiled, a line says so, and another at the end how long that took; with ``compiling`` False
-    the command says so itself. SIGTERM and SIGHUP end the block as Ctrl-C does.
+    SIGTERM and SIGHUP end the block as Ctrl-C does.
+
+    Args:
+        compiling: True if loops may have to be compiled within the block: a line then says so, and another at the end
+            how long that took. This loads the compiler, which a command beside a recording has no time for.
     """
     from rich.console import Console
 

@@ -127,7 +127,7 @@ def plan_(
     picture = output if output is not None else Path(f"{Path(plan).stem}.png")
     refuse_existing([picture], overwrite=overwrite, instead="name")
     try:
-        with progress_bar() as tell:
+        with progress_bar(compiling=True) as tell:
             tell("drawing", 0, 0)
             with aside_folder(picture.parent) as aside:
                 rows = draw(FlightOptions(plan), aside / picture.name)
@@ -174,7 +174,7 @@ def _fly_into_log(options: FlightOptions, output: Path, *, with_truth: bool) -> 
 
     started_s = time.monotonic()
     try:
-        with progress_bar() as tell, FlightFolder(output) as folder:
+        with progress_bar(compiling=True) as tell, FlightFolder(output) as folder:
             report, names = _make_log(tell, options, folder, with_truth=with_truth)
             logs = folder.keep(report.paths)
     except OSError as error:
@@ -251,7 +251,7 @@ def _fly_on_wires(
     stop: list[int] = []
     before = {signum: signal.getsignal(signum) for signum in (signal.SIGINT, signal.SIGTERM)}
     try:
-        with progress_bar(compiling=False) as tell:
+        with progress_bar() as tell:
             tell("preparing the flight", 0, 0)
             facts = ahead.facts
         check_steps(facts, set_clock=set_clock)
@@ -321,7 +321,7 @@ def _play(
     from swath.daemon.simulate.on_wires import fly_on_wires
 
     duration_s = ahead.facts.duration_s
-    with progress_bar(compiling=False) as tell:  # the other process has compiled
+    with progress_bar() as tell:  # the other process has compiled
 
         def flown(flown_s: float, report: PlayReport) -> None:
             tell(f"flying {name}", round(flown_s), round(duration_s), SECONDS)

@@ -168,7 +168,7 @@ def _compare(
     request = StripsOptions(logs.logs, logs, before, rules_of(*cells), level)
     warnings: list[str] = []
     written: list[Path] = []
-    with tempfile.TemporaryDirectory(prefix="swath-") as folder, progress_bar() as tell:
+    with tempfile.TemporaryDirectory(prefix="swath-") as folder, progress_bar(compiling=True) as tell:
         done = compare_strips(request, Path(folder), tell)
         if output is not None:
             from swath.daemon.processing.strips.page import write_comparison
@@ -192,7 +192,7 @@ def _adjust(
     from swath.daemon.processing.strips.adjust_products import write_adjustment
 
     request = AdjustOptions(logs, folder, control, strip_model, overwrite)
-    with tempfile.TemporaryDirectory(prefix="swath-") as returns, progress_bar() as tell:
+    with tempfile.TemporaryDirectory(prefix="swath-") as returns, progress_bar(compiling=True) as tell:
         products = write_adjustment(request, correct_strips(request, Path(returns), tell), tell)
     print(json.dumps(products.record, indent=2) if as_json else "\n".join(map(one_line, products.lines)))
     if line := refusal(products.record["verdict"]):

@@ -88,7 +88,7 @@ def command(
         page=not no_page,
         overwrite=overwrite,
     )
-    with progress_bar() as tell:
+    with progress_bar(compiling=True) as tell:
         report = make_trajectory(request, tell)
     if as_json:
         print(json.dumps(report.record, indent=2))

@@ -131,7 +131,7 @@ def command(
     )
     if output is not None:
         refuse_existing((output / RECORD, output / VALIDATION), overwrite=overwrite)
-    with tempfile.TemporaryDirectory(prefix="swath-") as folder, progress_bar() as tell:
+    with tempfile.TemporaryDirectory(prefix="swath-") as folder, progress_bar(compiling=True) as tell:
         done = run_validation(request, Path(folder), tell)
     print(json.dumps(done.record, indent=2) if as_json else "\n".join(map(one_line, done.lines)))
     for line in done.warnings:

@@ -101,7 +101,7 @@ def _make(
     record = folder / VIEW_RECORD
     refuse_existing((record, folder / QUICK_LOOK), overwrite=overwrite)
     check_space(folder, "page and pictures", least_bytes=PAGE_BYTES[0], most_bytes=PAGE_BYTES[1])
-    with progress_bar() as tell:
+    with progress_bar(compiling=True) as tell:
         try:
             look = look_at(paths, cell, ends, tell)
         except QuickLookError as error:

@@ -28,6 +28,6 @@ def command(
     from swath.daemon.processing.warm_up import warm_up
 
     setups = [] if config is None else [Setup.of_config(load_config(config), Options(uncertainty=False))]
-    with progress_bar(compiling=False) as tell:
+    with progress_bar() as tell:
         done = warm_up(setups, calibration=True, tell=tell)
     print(done.text(), flush=True)

@@ -15,7 +15,9 @@ from rich.console import Console
 from swath.daemon.cli import progress
 from swath.daemon.cli.main import run_app
 from swath.daemon.cli.progress import COMPILING, Display, progress_bar
+from swath.daemon.errors import ExitCode
 from swath.georef.progress import BYTES
+from tests.daemon.builders import INFO, run_python, write_part
 from tests.daemon.one_line import fly
 
 pytestmark = pytest.mark.xdist_group("kernels")
@@ -138,7 +140,7 @@ def test_a_bar_on_a_terminal_disappears(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_compiling_is_told_once_with_the_time_it_took(capsys: pytest.CaptureFixture[str]) -> None:
-    with progress_bar():
+    with progress_bar(compiling=True):
         numba.njit(lambda x: 7 * x)(2)
         numba.njit(lambda x: 8 * x)(2)
     lines = capsys.readouterr().err.splitlines()
@@ -146,9 +148,24 @@ def test_compiling_is_told_once_with_the_time_it_took(capsys: pytest.CaptureFixt
     assert len(lines) == 2
     assert lines[1].startswith("compiling took ")
     assert "swath warm-up" in lines[0]
-    with progress_bar():
+    with progress_bar(compiling=True):
         pass
     assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize("command", ["info", "recover", "export", "offload"])
+def test_commands_for_the_aircraft_do_not_load_the_compiler(tmp_path: Path, command: str) -> None:
+    """Loading it takes minutes where the recorder leaves little of the processor, and no loop of them is compiled."""
+    logs, out = tmp_path / "logs", tmp_path / "out"
+    logs.mkdir()
+    out.mkdir()
+    write_part(logs / f"{INFO.session_id}_0.mcap", finish=command != "recover")
+    arguments = [command, str(logs), *([] if command in ("info", "recover") else [str(out)])]
+    if command == "offload":
+        arguments.append("--same-disk")
+    run = run_python(f"code = cli.run_app({arguments!r})\nprint('ended:', code, 'numba' in sys.modules)")
+    expected = ExitCode.DAMAGE if command == "recover" else ExitCode.OK
+    assert run.stdout.splitlines()[-1] == f"ended: {int(expected)} False", run.stdout + run.stderr
 
 
 def test_json_on_stdout_is_not_mixed_with_progress(
