@@ -109,13 +109,12 @@ class StreamParser(Parser):
 
 
 class PacketParser(Parser):
-    """Base of parsers for datagrams and CAN frames, whose units are whole; a subclass implements `parse_units`.
+    """Base of parsers for datagrams and CAN frames, whose units are whole; a subclass implements `parse_units`."""
 
-    Attributes:
-        warnings: facts that the units leave uncertain, one line for the user each.
-    """
-
-    warnings: tuple[str, ...] = ()
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Facts that the units leave uncertain, one line for the user each."""
+        return ()
 
     def feed(self, chunk: Chunk) -> list[Record]:
         """Parse one unit as a batch of one row."""

@@ -170,7 +170,8 @@ class ImuConfig(Section):
         None,
         ge=0,
         le=253,
-        description="nmea2000: address of the device to use; absent: for each PGN, the first device that sends it",
+        description="nmea2000, dbc of J1939: address of the device to use; absent: the first device that sends the "
+        "PGN; dbc: of the messages with one address in the DBC, the first that sends any",
     )
     ids: dict[str, int] | None = Field(
         None, description="sbg-ellipse, xsens-mti: CAN identifiers, by message name, where they differ from the maker's"
@@ -208,6 +209,9 @@ class ImuConfig(Section):
         "absent: for dbc, found from the spacing of the frames",
     )
     signals: SignalsConfig | None = Field(None, description="signals of the DBC file, by quantity")
+    units: dict[Signal, Text] | None = Field(
+        None, description='dbc: units that the DBC does not give, by signal, such as { "ACC.x" = "g" }'
+    )
     noise: NoiseConfig = Field(default_factory=NoiseConfig, description="noise model for the navigation filter")
 
 

@@ -26,6 +26,7 @@ from swath.daemon.devices.identify import Heard, describe_time, not_understood
 from swath.daemon.log.directory import nearest_there
 from swath.daemon.log.host_clock import ClockDiscipline, read_clock_discipline
 from swath.drivers.driver import find_driver
+from swath.drivers.parser import PacketParser
 from swath.drivers.session import Session
 from swath.drivers.transports.base import RawEdge, TransportCounters, UnitBlock
 from swath.drivers.transports.can.bitrate import interface_bitrate
@@ -135,6 +136,8 @@ class Reading:
         if self.report.bytes:
             self.report.time = describe_time(self.entry, self.heard)
             self.report.problems += _answer_problems(self)
+            if isinstance(self.parser, PacketParser):
+                self.report.notes += self.parser.warnings
             self.report.notes += lock_notes(self.entry, self.heard) + far_notes(self.heard, read_clock_discipline())
 
 

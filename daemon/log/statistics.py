@@ -12,9 +12,9 @@ from swath.daemon.log.format import source_of_topic
 from swath.daemon.log.mcap.chunks import LogBatch, json_objects
 from swath.daemon.log.parsers import stored_parsers
 from swath.daemon.log.reader import Session
-from swath.drivers.parser import Parser
+from swath.drivers.parser import PacketParser, Parser
 from swath.georef.arrays import Int64Array
-from swath.georef.records import ChunkBatch
+from swath.georef.records import ChunkBatch, Record
 
 USUAL_SHARE = 0.95  # intervals up to this quantile count as usual: those within bursts and the pauses between them
 GAP_MIN_NS = 1 << 27  # 0.134 s: a scanner whose laser is off still sends ten times a second
@@ -166,9 +166,12 @@ def session_statistics(session: Session, *, decode: bool = True) -> dict[str, An
         first_ns = start if first_ns is None else min(first_ns, start)
         last_ns = max(last_ns, end)
         _take(batch, sources, events, parsers)
-    for numbers in sources.values():
+    for source, numbers in sorted(sources.items()):
         if numbers.parser is not None:
-            numbers.records.update(type(record).__name__ for record in numbers.parser.close())
+            for record in numbers.parser.close():
+                numbers.records[type(record).__name__] += record_count(record)
+            if not source.endswith("/aux"):
+                troubles += parser_lines(source, numbers.parser)
     complete = not session.missing_parts and not session.damage
     return {
         "session_id": session.session_id,
@@ -200,6 +203,18 @@ def session_statistics(session: Session, *, decode: bool = True) -> dict[str, An
     }
 
 
+def record_count(record: Record) -> int:
+    """Return the number of rows of a record, 1 if it has none."""
+    rows = getattr(record, "rows", None)
+    return 1 if rows is None else len(rows)
+
+
+def parser_lines(source: str, parser: Parser) -> list[str]:
+    """Return what a parser has to tell the user of its data, one line each, with the source's name."""
+    doubts = parser.warnings if isinstance(parser, PacketParser) else ()
+    return [*parser.remarks(), *(f"{source}: {doubt}" for doubt in doubts)]
+
+
 def _take(batch: LogBatch, sources: dict[str, SourceNumbers], events: EventNumbers, parsers: dict[str, Parser]) -> None:
     topic = batch.channel.topic
     source = source_of_topic(topic)
@@ -210,8 +225,7 @@ def _take(batch: LogBatch, sources: dict[str, SourceNumbers], events: EventNumbe
         if parser is not None:
             numbers.parser = parser
             for record in parser.feed_batch(ChunkBatch(source, batch.log_time_ns, batch.units)):
-                rows = getattr(record, "rows", None)
-                numbers.records[type(record).__name__] += 1 if rows is None else len(rows)
+                numbers.records[type(record).__name__] += record_count(record)
     elif topic.startswith("/status/"):
         numbers = sources.setdefault(topic.removeprefix("/status/"), SourceNumbers())
         for _, value in json_objects(batch):

@@ -4,10 +4,13 @@ The configuration names the signals (``[imu.NAME.signals]``, docs/configuration.
 units. Frames are decoded in batches; `SampleGrouper` joins the frames of one sample, and `CounterUnwrapper` makes
 counters continuous. Specific force and angular rate are in the device's own axes: the configuration's rotation_b_imu,
 sample and stamp are applied where the samples are used, except that increments (sample = "increment") are divided by
-the nominal interval here.
+the nominal interval here. A sample is dropped and counted if one of its values is outside the DBC's range of the
+signal, or is a code of J1939 for "error" or "not available"; such a temperature is unknown.
 """
 
 from __future__ import annotations
+
+from collections import Counter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,9 +27,10 @@ from swath.drivers.imu.dbc.groups import (
     has_evidence,
     no_frames,
 )
+from swath.drivers.imu.dbc.j1939 import FLAGS, SourceChoice, may_be_j1939, parameter_codes, pgn_mask
 from swath.drivers.imu.dbc.settings import MappedSignal, Part, SignalMap, map_signals
 from swath.drivers.parser import DeviceSettings, PacketParser
-from swath.georef.arrays import BoolArray, Int64Array, StructArray, UInt64Array
+from swath.georef.arrays import BoolArray, FloatArray, Int64Array, StructArray, UInt64Array
 from swath.georef.records import DEVICE_CLOCK_DTYPE, IMU_DTYPE, ByteRows, DeviceClockSamples, ImuSamples, Record
 
 
@@ -83,6 +87,10 @@ class DbcParser(PacketParser):
         packets = self._map.packet_counter
         self._gaps = GapCounter(packets.layout.length) if packets else None
         optional = (latch, self._map.temperature, self._map.status)
+        address = settings.config.get("source_address")
+        self._choice = SourceChoice(None if address is None else int(address))
+        self._doubts: tuple[str, ...] = ()
+        self._outside: Counter[str] = Counter()  # dropped samples by signal that was outside its range
         self._side = {
             signal.layout.name: SideSignal(signal) for signal in optional if signal and signal.part >= self._map.grouped
         }
@@ -119,11 +127,30 @@ class DbcParser(PacketParser):
             self._grouper = self._grouper_of("last", last)
         elif grouped.any():
             names = " and ".join(dict.fromkeys(part.message for part in self._map.parts[: self._map.grouped]))
-            self.warnings = (
+            self._doubts = (
                 f"the frames of {names} are evenly spaced, so it is uncertain which of them form one sample: specific "
                 'force and angular rate may be one sample apart; set group = "last" or "first"',
             )
         self._rule_is_open, self._unread = False, no_frames(self._width)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Facts that the frames leave uncertain, one line for the user each."""
+        parts = {part.message: part for part in self._map.parts}
+        lines = [*self._doubts]
+        for message, part in parts.items():
+            seen = self.counters.messages[message]
+            lines += self._choice.lines(message, part.can_id, seen=seen, chosen=part.any_source)
+        layouts = {
+            signal.layout.name: signal.layout for signal in (*self._map.vectors, self._map.temperature) if signal
+        }
+        for name, count in self._outside.items():
+            layout = layouts[name]
+            lines.append(
+                f"{count} values of {name} are outside the range {layout.minimum:g} to {layout.maximum:g} of the DBC; "
+                "correct the DBC file if its range is wrong"
+            )
+        return tuple(lines)
 
     # -- frames
 
@@ -135,6 +162,7 @@ class DbcParser(PacketParser):
             return no_frames(self._width)
         can_id = table["can_id"]
         self._count_flagged(can_id)
+        self._choose_sources(can_id)
         part = np.full(len(can_id), -1, np.int8)
         for number, kind in enumerate(self._map.parts):
             part[self._frames_of(kind, table, can_id)] = number
@@ -146,7 +174,13 @@ class DbcParser(PacketParser):
 
     def _frames_of(self, kind: Part, table: StructArray, can_id: NDArray[np.uint32]) -> NDArray[np.intp]:
         """Return indices of the complete frames of a kind; short ones are counted."""
-        where = np.flatnonzero(can_id == np.uint32(kind.can_id))
+        where = self._named(kind, can_id)
+        if kind.any_source:
+            where = self._choice.pick(kind.message, kind.can_id & 0xFF, where, can_id & np.uint32(0xFF))
+        elif may_be_j1939(kind.can_id) and not kind.j1939 and not self.counters.messages[kind.message]:
+            alike = (can_id ^ np.uint32(kind.can_id)) & np.uint32(FLAGS | pgn_mask(kind.can_id)) == 0
+            alike[where] = False
+            self._choice.note_others(kind.message, can_id[alike] & np.uint32(0xFF))
         if kind.selector is not None:
             data = _padded(table["data"][where], self._width)
             value = kind.selector.bits(data)
@@ -158,6 +192,21 @@ class DbcParser(PacketParser):
         if len(where):
             self.counters.messages[kind.message] += len(where)
         return where
+
+    @staticmethod
+    def _named(kind: Part, can_id: NDArray[np.uint32]) -> NDArray[np.intp]:
+        """Return indices of the frames with a kind's identifier, whichever device sends them where any may."""
+        return np.flatnonzero((can_id ^ np.uint32(kind.can_id)) & np.uint32(kind.id_mask) == 0)
+
+    def _choose_sources(self, can_id: NDArray[np.uint32]) -> None:
+        """Choose the devices of the J1939 messages that any may send."""
+        named: dict[int, list[NDArray[np.intp]]] = {}
+        for kind in self._map.parts:
+            if kind.any_source:
+                named.setdefault(kind.can_id & 0xFF, []).append(self._named(kind, can_id))
+        if named:
+            joined = {address: np.concatenate(found) for address, found in named.items()}
+            self._choice.settle(joined, can_id & np.uint32(0xFF))
 
     def _count_bad(self, frames: int) -> None:
         self.counters.bad_messages += frames
@@ -206,8 +255,10 @@ class DbcParser(PacketParser):
         if self._latch is not None:
             records.append(DeviceClockSamples(_clock_rows(rows)))
         if not self._clock_only:
-            self._fill_values(rows, data, position)
-            records.append(ImuSamples(rows))
+            dropped = self._fill_values(rows, data, position)
+            kept = rows[~dropped] if dropped.any() else rows
+            if len(kept):
+                records.append(ImuSamples(kept))
         return records
 
     def _fill_times(self, rows: StructArray, data: list[ByteRows], position: NDArray[np.intp]) -> None:
@@ -226,20 +277,40 @@ class DbcParser(PacketParser):
             latched = self._latch.track(*self._bits_of(latch, data, position), counts, restart)
             rows["pps_time_ns"] = np.where(latched >= 0, nanoseconds(latched, self._map.tick_hz), -1)
 
-    def _fill_values(self, rows: StructArray, data: list[ByteRows], position: NDArray[np.intp]) -> None:
-        """Write specific force, angular rate, temperature and status (its low 32 bits)."""
+    def _fill_values(self, rows: StructArray, data: list[ByteRows], position: NDArray[np.intp]) -> BoolArray:
+        """Write specific force, angular rate, temperature and status (its low 32 bits); return the rows to drop."""
+        dropped = np.zeros(len(rows), np.bool_)
         for number, signal in enumerate(self._map.vectors):
-            values = signal.layout.values(signal.layout.bits(data[signal.part]))
+            bits = signal.layout.bits(data[signal.part])
+            values = signal.layout.values(bits)
+            dropped |= self._unusable(signal, bits, values, dropped)
             field = "specific_force_b" if number < 3 else "angular_rate_b"
             np.multiply(values, signal.factor, out=rows[field][:, number % 3])
         rows["temperature_c"] = np.nan
         temperature = self._map.temperature
         if temperature is not None:
             bits, known = self._bits_of(temperature, data, position)
-            rows["temperature_c"][known] = temperature.layout.values(bits[known])
+            values = temperature.layout.values(bits)
+            known &= ~self._unusable(temperature, bits, values, ~known)
+            rows["temperature_c"][known] = values[known]
         if self._map.status is not None:
             bits, known = self._bits_of(self._map.status, data, position)
             rows["status"] = np.where(known, bits & np.uint64(0xFFFF_FFFF), 0)
+        return dropped
+
+    def _unusable(self, signal: MappedSignal, bits: UInt64Array, values: FloatArray, dropped: BoolArray) -> BoolArray:
+        """Return which values of a signal cannot be used; count the rows that are not dropped already."""
+        missing = failed = np.zeros(len(bits), np.bool_)
+        if self._map.parts[signal.part].j1939:
+            missing, failed = parameter_codes(signal.layout, bits)
+        outside = signal.layout.outside(values) & ~missing & ~failed
+        for code, found in (("not_available", missing), ("error_value", failed), ("out_of_range", outside)):
+            count = int(np.count_nonzero(found & ~dropped)) if found.any() else 0
+            if count:
+                self.counters.errors[code] += count
+                if code == "out_of_range":
+                    self._outside[signal.layout.name] += count
+        return missing | failed | outside
 
     def _bits_of(
         self, signal: MappedSignal, data: list[ByteRows], position: NDArray[np.intp]

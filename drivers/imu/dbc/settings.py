@@ -3,25 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from math import radians
 from typing import Any
 
+from swath.drivers.can_frames import CAN_EFF_FLAG
 from swath.drivers.imu.dbc.groups import GroupRule
+from swath.drivers.imu.dbc.j1939 import FLAGS, is_j1939, pgn_mask
 from swath.drivers.imu.dbc.signals import FoundSignal, SignalLayout, find_signal, load_database
 from swath.drivers.parser import DeviceSettings, DriverSettingsError
 
 STANDARD_GRAVITY = 9.80665  # m/s², CGPM 1901
 UNITS = {  # unit in the spelling of `_plain_unit` -> factor to SI
-    "specific_force": {"m/s2": 1.0, "m/s/s": 1.0, "m.s-2": 1.0, "g": STANDARD_GRAVITY},
-    "angular_rate": {"rad/s": 1.0, "rad.s-1": 1.0, "deg/s": radians(1.0)},
+    "specific_force": {"m/s2": 1.0, "m/s/s": 1.0, "m.s-2": 1.0, "g": STANDARD_GRAVITY, "mg": 0.001 * STANDARD_GRAVITY},
+    "angular_rate": {"rad/s": 1.0, "rad.s-1": 1.0, "deg/s": radians(1.0), "deg/h": radians(1.0) / 3600.0},
 }
 INCREMENT_UNITS = {
     "specific_force": {"m/s": 1.0, "m.s-1": 1.0},
     "angular_rate": {"rad": 1.0, "deg": radians(1.0)},
 }
-RIGHT_UNITS = {"specific_force": "m/s2 or g", "angular_rate": "deg/s or rad/s"}
+RIGHT_UNITS = {"specific_force": "m/s2, g or mg", "angular_rate": "deg/s, rad/s or deg/h"}
 RIGHT_INCREMENTS = {"specific_force": "m/s", "angular_rate": "rad or deg"}
 VECTORS = ("specific_force", "angular_rate")
 SCALARS = ("sample_ticks", "pps_ticks", "temperature", "status", "packet_counter")
@@ -38,6 +40,10 @@ class Part:
         message: its name in the DBC.
         selector, selector_values: the multiplexer and its values; None selects every frame of the message.
         needs_bytes: minimum data length that contains its configured signals.
+        id_mask: bits of a frame's ``can_id`` word that must equal those of `can_id`; all of them, except in a J1939
+            message, whose priority is free, and its source address too where `any_source` is true.
+        j1939: whether the message is a J1939 parameter group, whose values have codes for "error" and "not available".
+        any_source: whether one of the devices that send the message is chosen.
     """
 
     can_id: int
@@ -45,6 +51,9 @@ class Part:
     selector: SignalLayout | None
     selector_values: frozenset[int]
     needs_bytes: int
+    id_mask: int = 0xFFFF_FFFF
+    j1939: bool = False
+    any_source: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +126,7 @@ class _PartList:
         """Return the part with room for one more signal; ``narrowed`` limits it to the signal's multiplexer values."""
         chooser = found if narrowed else part
         needs = max(part.needs_bytes, found.layout.needs_bytes, found.selector.needs_bytes if found.selector else 0)
-        return Part(part.can_id, part.message, chooser.selector, chooser.selector_values, needs)
+        return replace(part, selector=chooser.selector, selector_values=chooser.selector_values, needs_bytes=needs)
 
 
 def map_signals(settings: DeviceSettings) -> SignalMap:
@@ -130,7 +139,8 @@ def map_signals(settings: DeviceSettings) -> SignalMap:
     if "dbc" not in settings.files:
         raise DriverSettingsError("dbc: missing; want the DBC file")
     file_name = str(config.get("dbc") or "the DBC file")
-    found = _find_all(config, load_database(settings.files["dbc"]), file_name)
+    database = load_database(settings.files["dbc"])
+    found = _find_all(config, database, file_name)
     if "pps_ticks" in found and "sample_ticks" not in found:
         raise DriverSettingsError("signals.pps_ticks needs signals.sample_ticks, the running value of the same counter")
     parts = _PartList()
@@ -148,7 +158,7 @@ def map_signals(settings: DeviceSettings) -> SignalMap:
     ticks = scalar("sample_ticks")
     rule = _group_rule(config, ticks, grouped)
     return SignalMap(
-        parts=tuple(parts.parts),
+        parts=tuple(_addressed(part, database, config) for part in parts.parts),
         grouped=grouped,
         vectors=tuple(
             MappedSignal(signal.layout, number, factor)
@@ -165,6 +175,26 @@ def map_signals(settings: DeviceSettings) -> SignalMap:
         key_part=ticks.part if ticks else 0,
         rule_is_said=grouped == 1 or bool(config.get("group")),
     )
+
+
+def _addressed(part: Part, database: Any, config: Mapping[str, Any]) -> Part:
+    """Return the part with the bits of the identifier that its frames must have."""
+    address = config.get("source_address")
+    extended = bool(part.can_id & CAN_EFF_FLAG)
+    if not extended:
+        if address is not None:
+            raise DriverSettingsError(
+                f"source_address: message {part.message} has an 11-bit identifier, which contains no address; "
+                "remove the key"
+            )
+        return part
+    message = next(message for message in database.messages if message.name == part.message)
+    if address is None and not is_j1939(database, message):
+        return part
+    mask = pgn_mask(part.can_id)
+    twins = sum(other.is_extended_frame and (other.frame_id ^ part.can_id) & mask == 0 for other in database.messages)
+    any_source = address is not None or twins == 1
+    return replace(part, id_mask=FLAGS | mask | (0 if any_source else 0xFF), j1939=True, any_source=any_source)
 
 
 def _find_all(config: Mapping[str, Any], database: Any, file_name: str) -> dict[str, list[FoundSignal]]:
@@ -204,18 +234,38 @@ def _factors(
     if increment and rate_hz <= 0.0:
         raise DriverSettingsError('rate_hz: needed with sample = "increment", to divide by the interval')
     known, right = (INCREMENT_UNITS, RIGHT_INCREMENTS) if increment else (UNITS, RIGHT_UNITS)
+    given = dict(config.get("units") or {})
     factors: dict[str, list[float]] = {}
     for key in VECTORS:
         factors[key] = []
         for signal in found[key]:
-            factor = known[key].get(_plain_unit(signal.layout.unit))
+            name, unit = signal.layout.name, signal.layout.unit
+            factor = known[key].get(_plain_unit(unit))
+            if name in given:
+                factor = _given_factor(name, str(given.pop(name)), known[key], right[key], (factor, unit, file_name))
             if factor is None:
                 raise DriverSettingsError(
-                    f'signal {signal.layout.name} of {file_name} has unit "{signal.layout.unit}"; '
-                    f"{key} needs {right[key]}"
+                    f'signal {name} of {file_name} has unit "{unit}"; {key} needs {right[key]}, '
+                    f'which units = {{ "{name}" = "…" }} can give'
                 )
             factors[key].append(factor * (rate_hz if increment else 1.0))
+    for name in given:
+        raise DriverSettingsError(f"units: {name} is no signal of specific_force or angular_rate; remove it")
     return factors
+
+
+def _given_factor(
+    name: str, unit: str, known: Mapping[str, float], right: str, stated: tuple[float | None, str, str]
+) -> float:
+    """Return the factor of a unit that the configuration gives; ``stated`` is the DBC's factor, unit and file name."""
+    factor = known.get(_plain_unit(unit))
+    if factor is None:
+        raise DriverSettingsError(f'units: {name} has "{unit}"; want {right}')
+    if stated[0] is not None and stated[0] != factor:
+        raise DriverSettingsError(
+            f'units: {name} has "{unit}", but {stated[2]} says "{stated[1]}"; remove the entry or correct the DBC file'
+        )
+    return factor
 
 
 def _plain_unit(unit: str) -> str:

@@ -10,18 +10,21 @@ from __future__ import annotations
 
 import difflib
 import logging
+import math
+import re
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from swath.drivers.can_frames import frame_id
+from swath.drivers.can_frames import CAN_EFF_FLAG, frame_id
 from swath.drivers.parser import DriverSettingsError
-from swath.georef.arrays import FloatArray, UInt64Array
+from swath.georef.arrays import BoolArray, FloatArray, UInt64Array
 from swath.georef.records import ByteRows
 from swath.georef.text_encoding import decoded
 
 WORD_BITS = 64
+LONG_IDENTIFIER = re.compile(r"Standard frame id 0x([0-9a-fA-F]+) is more than 11 bits in message (\w+)")  # cantools'
 FLOAT_TYPES: dict[int, tuple[type[np.unsignedinteger[Any]], str]] = {
     16: (np.uint16, "<f2"),
     32: (np.uint32, "<f4"),
@@ -42,6 +45,7 @@ class SignalLayout:
         scale, offset: physical = raw · scale + offset.
         unit: unit as written in the DBC.
         needs_bytes: number of data bytes that a frame must have to contain it.
+        minimum, maximum: the DBC's range of physical values; infinite where it gives none.
     """
 
     name: str
@@ -55,6 +59,8 @@ class SignalLayout:
     offset: float
     unit: str
     needs_bytes: int
+    minimum: float = -math.inf
+    maximum: float = math.inf
 
     def bits(self, data: ByteRows) -> UInt64Array:
         """Return the signal's bits of each row of (n, 8 or 64) data, right-aligned and unsigned."""
@@ -91,6 +97,13 @@ class SignalLayout:
         if self.offset != 0.0:
             raw += self.offset
         return raw
+
+    def outside(self, values: FloatArray) -> BoolArray:
+        """Return which physical values (n,) are outside the DBC's range, by more than half a step."""
+        half = max(1e-6 * abs(self.minimum), 1e-6 * abs(self.maximum)) if self.is_float else 0.5 * abs(self.scale)
+        if not np.isfinite(half):  # a range that is open on one side, of a float
+            half = 0.0
+        return (values < self.minimum - half) | (values > self.maximum + half)
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,7 +161,19 @@ def signal_layout(message: Any, signal: Any) -> SignalLayout:
         offset=float(signal.offset),
         unit=signal.unit or "",
         needs_bytes=last_byte + 1,
+        **_range_of(signal),
     )
+
+
+def _range_of(signal: Any) -> dict[str, float]:
+    """Return a cantools signal's range; ``[0|0]`` and a range without width give none."""
+    least, most = signal.minimum, signal.maximum
+    if least is not None and most is not None and least >= most:
+        return {}
+    return {
+        "minimum": -math.inf if least is None else float(least),
+        "maximum": math.inf if most is None else float(most),
+    }
 
 
 def load_database(contents: bytes, key: str = "dbc") -> Any:
@@ -170,6 +195,12 @@ def load_database(contents: bytes, key: str = "dbc") -> Any:
     try:
         return dbc.load_string(text, database_format="dbc", strict=False)
     except (errors.Error, ValueError) as error:
+        if long := LONG_IDENTIFIER.search(str(error)):
+            number, message = int(long[1], 16), long[2]
+            raise DriverSettingsError(
+                f"{key}: the identifier {number} of message {message} has more than 11 bits; "
+                f"a DBC marks 29 bits by adding 2147483648: BO_ {number | CAN_EFF_FLAG} {message}"
+            ) from error
         raise DriverSettingsError(f"{key}: not a DBC file ({' '.join(str(error).split())})") from error
 
 

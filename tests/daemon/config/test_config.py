@@ -79,6 +79,7 @@ class TestWholeFile:
             "gnss.*.setup.port",
             "imu.*.imu_type",
             "imu.*.source_address",
+            "imu.*.units",
             "imu.*.ids",
             "imu.*.extended_ids",
             "imu.*.byte_order",
