@@ -16,7 +16,9 @@ from swath.georef.records import NamesEdge
 if TYPE_CHECKING:
     from swath.drivers.startup import StartupMessage, StartupOptions
 
-TransportKind = Literal["serial", "can", "udp", "gnss", "ntrip"]
+TransportKind = Literal["serial", "can", "udp", "tcp", "gnss", "ntrip"]
+
+STREAM_TRANSPORTS: tuple[TransportKind, ...] = ("serial", "udp", "tcp")  # every wire that carries a byte stream
 
 KINDS: tuple[DeviceKind, ...] = ("gnss", "imu", "scanner", "corrections")
 
@@ -65,7 +67,7 @@ class Driver:
     Attributes:
         protocol: its name in the configuration.
         kind: gnss, imu, scanner or corrections.
-        transports: kinds of transport that can carry it.
+        transports: kinds of transport that can carry it; `STREAM_TRANSPORTS` for the byte stream of a port.
         yields: record types that its parser returns.
         summary: one line for ``swath devices``.
         make_parser: builds the parser of all record types.

@@ -25,7 +25,7 @@ def command(
     pace: Annotated[float, typer.Option(help="Speed factor; PPS edges are written at 1 only.")] = 1.0,
     wait: Annotated[float, typer.Option(help="Seconds to wait until every port and FIFO has a reader.", min=0)] = 10.0,
 ) -> None:
-    """Play back the bytes of a log on ptys, CAN and UDP, and its PPS edges into fixed: FIFOs."""
+    """Play back the bytes of a log on ptys, CAN, UDP and TCP, and its PPS edges into fixed: FIFOs."""
     from rich.console import Console
 
     from swath.daemon.config import load_config

@@ -162,8 +162,8 @@ def _check_forwarding(config: Config, section: str, table: CorrectionsConfig) ->
     if kind != "gnss" or name not in config.gnss:
         known = ", ".join(f"gnss.{one}" for one in config.gnss) or "none"
         yield f'{section}.forward_to: got "{table.forward_to}", want a receiver such as gnss.rover; there are: {known}'
-    elif not config.gnss[name].transport.startswith("serial:"):
-        yield f"{section}.forward_to: {table.forward_to} has no serial port; choose a receiver with a serial: transport"
+    elif config.gnss[name].transport.partition(":")[0] not in ("serial", "tcp"):
+        yield f"{section}.forward_to: {table.forward_to} has no port to write to; want a receiver by serial: or tcp:"
 
 
 def _check_needs(section: str, table: DeviceTable, driver: Driver) -> Iterator[str]:
@@ -323,6 +323,8 @@ def _wire_name(spec: TransportSpec) -> str:
         return f"UDP port {spec.port}"
     if spec.kind == "ntrip":
         return f"the mountpoint {spec.address}"
+    if spec.kind == "tcp":
+        return f"the TCP port {spec.address}"
     path = _device_path(spec)
     return f"the device {path}" if path else f"the CAN bus {spec.address}"
 

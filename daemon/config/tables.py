@@ -74,7 +74,8 @@ class GnssSetupConfig(Section):
     port: Text | None = Field(
         None,
         description="the receiver's name for the port that is wired to this computer: "
-        "ubx: UART1, UART2, USB (absent: UART1); sbf: COM1 to COM4, USB1, USB2 (absent: COM1)",
+        "ubx: UART1, UART2, USB (absent: UART1); sbf: COM1 to COM4, USB1, USB2, "
+        "over TCP IP10 to IP17, IPS1 to IPS5 (absent: COM1)",
     )
     rate_hz: Literal[1, 2, 5, 10, 20] = Field(5, description="rate of positions and velocities")
     raw: bool = Field(True, description="send raw measurements and ephemerides too, for post-processing")
@@ -83,7 +84,7 @@ class GnssSetupConfig(Section):
 class GnssConfig(Section):
     """``[gnss.<name>]``: a GNSS receiver."""
 
-    transport: Text = Field(description="serial:… or udp:…")
+    transport: Text = Field(description="serial:…, udp:… or tcp:…")
     protocol: Text = Field(description="nmea, ubx, novatel, … (`swath devices` lists them)")
     pps: Name | None = Field(None, description="name of the [pps.<name>] wired to this receiver")
     names_edge: Literal["auto", "previous", "next"] = Field(
@@ -159,7 +160,7 @@ class ImuConfig(Section):
     """``[imu.<name>]``: an inertial measurement unit."""
 
     transport: Text = Field(
-        description="can:<interface>:<channel>?…, serial:…, or gnss:<name> (inside that receiver's stream)"
+        description="can:<interface>:<channel>?…, serial:…, udp:…, tcp:…, or gnss:<name> (inside its stream)"
     )
     protocol: Text = Field(description="dbc, or a named profile (`swath devices` lists them)")
     dbc: Text | None = Field(None, description="the DBC file, relative to this file")
@@ -332,9 +333,11 @@ class ScannerConfig(Section):
 class CorrectionsConfig(Section):
     """``[corrections.<name>]``: corrections of a base station, which are logged and can be passed on to a receiver."""
 
-    transport: Text = Field(description="serial:… or ntrip:<host>:<port>/<mountpoint>?…")
+    transport: Text = Field(description="serial:…, udp:…, tcp:… or ntrip:<host>:<port>/<mountpoint>?…")
     protocol: Text = Field("rtcm3", description="rtcm3")
-    forward_to: Text | None = Field(None, description="receiver whose serial port gets the bytes, such as gnss.rover")
+    forward_to: Text | None = Field(
+        None, description="receiver whose serial or TCP port gets the bytes, such as gnss.rover"
+    )
 
 
 class AttitudeConfig(Section):

@@ -153,7 +153,7 @@ def not_understood(
         return f"sends {other}, but {entry.protocol} is configured"
     if messages:
         return None
-    hint = "; check the baud rate" if entry.transport.kind == "serial" else ""
+    hint = {"serial": "; check the baud rate", "tcp": "; check the port number"}.get(entry.transport.kind, "")
     return f"its data are neither {entry.protocol} nor another known {entry.kind} protocol{hint}"
 
 

@@ -220,7 +220,9 @@ def _why_not_sent(spec: TransportSpec) -> str:
 
     A UDP device needs a source address and no group: with a group, a datagram would go to the group, not to the device.
     """
-    if spec.kind == "serial" or (spec.kind == "udp" and "source" in spec.options and "group" not in spec.options):
+    if spec.kind in ("serial", "tcp") or (
+        spec.kind == "udp" and "source" in spec.options and "group" not in spec.options
+    ):
         return ""
     hint = "; add ?source=<its address> and remove group" if spec.kind == "udp" else ""
     return f"{spec.text} cannot send{hint}"

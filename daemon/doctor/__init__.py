@@ -43,7 +43,7 @@ def examine(config: Config | None, *, write: bool = True) -> Iterator[Finding]:
     yield from host.memory(tree)
     yield from host.modules(tree, needed_modules(config, specs))
     yield from _clock(tree)
-    yield from _disk(tree, config, specs, write)
+    yield from _disk(tree, config, write)
     yield from _devices(tree, config, specs)
 
 
@@ -76,11 +76,11 @@ def _clock(tree: Tree) -> Iterator[Finding]:
     yield from clock.movement(*clock.watch())
 
 
-def _disk(tree: Tree, config: Config | None, specs: list[TransportSpec], write: bool) -> Iterator[Finding]:
+def _disk(tree: Tree, config: Config | None, write: bool) -> Iterator[Finding]:
     directory = DEFAULT_DIRECTORY if config is None else Path(config.session.directory)
     reserve = DEFAULT_RESERVE_BYTES if config is None else config.session.reserve_mb * 1e6
     split = DEFAULT_SPLIT_BYTES if config is None else config.session.split_size_mb * 1e6
-    scanners = 1 if config is None else sum(spec.kind == "udp" for spec in specs)
+    scanners = 1 if config is None else len(config.scanner)
     rate = scanners * disk.SCANNER_BYTES_PER_S + disk.OTHER_BYTES_PER_S
     there, permitted = nearest_there(directory)
     if not permitted:
@@ -121,6 +121,8 @@ def _devices(tree: Tree, config: Config | None, specs: list[TransportSpec]) -> I
             yield from devices.can_interface(tree, spec.channel, bitrate, interface_bitrate)
         elif spec.kind == "udp" and "interface" in spec.options:
             yield from devices.network_interface(tree, spec.options["interface"])
+        elif spec.kind == "tcp":
+            yield from devices.network_host(spec.host, spec.port)
     for pps in {} if config is None else config.pps.values():
         if pps.source.startswith("/dev/"):
             yield from _device_file(tree, pps.source, user)

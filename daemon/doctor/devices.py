@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import socket
 import stat
 import time
 from collections.abc import Callable, Iterator
@@ -187,6 +188,21 @@ def can_interface(
         yield Finding(check, Verdict.NOTE, text, f"sudo ip link set {name} txqueuelen 1000")
     if actual is not None and actual == wanted_bitrate:
         yield Finding(check, Verdict.OK, f"{name} runs at {actual} bit/s")
+
+
+def network_host(host: str, port: int) -> Iterator[Finding]:
+    """Check that the name of a TCP server is known and that a route leads to it; nothing is sent to it."""
+    try:
+        family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+        with socket.socket(family, kind) as probe:
+            probe.connect(address)  # of a datagram socket: only asks the kernel for the route
+    except socket.gaierror:
+        yield Finding("network", Verdict.WRONG, f"the host name {host} is unknown", f"getent hosts {host}")
+    except OSError as error:
+        text = f"no route leads to {host}: {error.strerror or error}"
+        yield Finding("network", Verdict.WRONG, text, "ip route; ip -brief address")
+    else:
+        yield Finding("network", Verdict.OK, f"a route leads to {host}")
 
 
 def network_interface(tree: Tree, name: str) -> Iterator[Finding]:

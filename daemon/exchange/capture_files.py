@@ -21,7 +21,7 @@ from swath.drivers.transports.base import TransportError
 _LOOKED_AT_BYTES = 65_536
 _LOOKED_AT_LINES = 10
 _MAX_MANIFEST_BYTES = 1 << 20
-_KIND_OF_PORT = {"udp": "pcap", "can": "candump", "serial": "serial", "pps": "pps"}
+_KIND_OF_PORT = {"udp": "pcap", "can": "candump", "serial": "serial", "tcp": "serial", "pps": "pps"}
 _NO_CAPTURE = {  # first bytes of files that hold device bytes in a format that cannot be imported
     b"SQLite format 3\0": "a ROS 2 bag, or another SQLite file",
     b"#ROSBAG V": "a ROS 1 bag",

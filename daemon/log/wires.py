@@ -12,7 +12,13 @@ SILENT_AFTER_S = 3.0
 MAX_SENDERS = 256  # that get a channel on one UDP port; a port scanner must not fill the log with channels
 BLOCK_BYTES = 512 * 1024  # a larger block is split, so that chunks stay near their 1 MiB
 
-_ENCODINGS = {"serial": "x-swath-serial", "can": "x-swath-can", "udp": "x-swath-udp", "ntrip": "x-swath-serial"}
+_ENCODINGS = {
+    "serial": "x-swath-serial",
+    "tcp": "x-swath-serial",
+    "ntrip": "x-swath-serial",
+    "can": "x-swath-can",
+    "udp": "x-swath-udp",
+}
 
 
 def make_wire(device: DeviceEntry, transport: TransportSpec, suffix: str) -> Wire:

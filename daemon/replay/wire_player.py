@@ -1,4 +1,4 @@
-"""Sends recorded units over wires again at their recorded pace: ptys, UDP, CAN, and PPS edges into a ``fixed:`` FIFO.
+"""Sends recorded units over wires again at their recorded pace: ptys, UDP, TCP, CAN, and PPS edges into FIFOs.
 
 `swath replay` plays logs with it, the demonstration plays captures; a recorder, gpsd or a maker's viewer listens.
 """
@@ -120,6 +120,53 @@ class PtyOutput(Output):
             os.close(port)
 
 
+class TcpOutput(Output):
+    """Listens where a recorder connects to, and sends to the newest connection."""
+
+    def __init__(self, spec: TransportSpec) -> None:
+        try:
+            self._server = socket.create_server((spec.host, spec.port))
+        except OSError as error:
+            reason = error.strerror or str(error)
+            text = f"{spec.text}: cannot listen there: {reason}; give tcp:127.0.0.1:<port> to replay"
+            raise TransportError(text) from error
+        self._server.setblocking(False)
+        self._reader: socket.socket | None = None
+
+    def has_reader(self) -> bool:
+        """Return whether a recorder is connected; accept the newest connection."""
+        while True:
+            try:
+                reader, _ = self._server.accept()
+            except OSError:
+                return self._reader is not None
+            self._leave()
+            reader.settimeout(_PATIENCE_S)
+            self._reader = reader
+
+    def send(self, data: bytes, due_realtime_ns: int) -> bool:
+        """Write all bytes; leave a reader that takes none for one second."""
+        if not self.has_reader():
+            return False
+        assert self._reader is not None
+        try:
+            self._reader.sendall(data)
+        except OSError:
+            self._leave()
+            return False
+        return True
+
+    def _leave(self) -> None:
+        if self._reader is not None:
+            self._reader.close()
+            self._reader = None
+
+    def close(self) -> None:
+        """Close the connection, whose last bytes the kernel still delivers, and stop listening."""
+        self._leave()
+        self._server.close()
+
+
 class UdpOutput(Output):
     """Sends datagrams to the port that a recorder listens on."""
 
@@ -215,6 +262,8 @@ def open_output(spec: TransportSpec) -> Output:
     """
     if spec.kind == "serial":
         return PtyOutput(Path(spec.address))
+    if spec.kind == "tcp":
+        return TcpOutput(spec)
     return UdpOutput(spec) if spec.kind == "udp" else CanOutput(spec)
 
 

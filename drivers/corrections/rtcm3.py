@@ -6,7 +6,7 @@ the log holds their bytes.
 
 from __future__ import annotations
 
-from swath.drivers.driver import Driver
+from swath.drivers.driver import STREAM_TRANSPORTS, Driver
 from swath.drivers.framing.framer import Frame, Framer
 from swath.drivers.framing.kinds import RTCM3
 from swath.drivers.parser import DeviceSettings, StreamParser
@@ -71,7 +71,7 @@ DRIVERS = (
     Driver(
         protocol="rtcm3",
         kind="corrections",
-        transports=("serial", "ntrip"),
+        transports=(*STREAM_TRANSPORTS, "ntrip"),
         yields=(DeviceStatus,),
         summary="RTCM 3 of a base station or caster: framed and counted by number; 1005 and 1006 decoded",
         make_parser=Rtcm3Parser,

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from swath.drivers.driver import Driver
+from swath.drivers.driver import STREAM_TRANSPORTS, Driver
 from swath.drivers.framing.framer import Frame, Framer
 from swath.drivers.framing.kinds import XBUS, XBUS_EXTENDED, XBUS_MTDATA2
 from swath.drivers.imu.counters import CounterUnwrapper, GapCounter, nanoseconds
@@ -334,7 +334,7 @@ DRIVERS = (
     Driver(
         protocol="xsens-xbus",
         kind="imu",
-        transports=("serial",),
+        transports=STREAM_TRANSPORTS,
         yields=(ImuSamples, TimeMessage),
         summary="Xsens MTi over serial: Xbus, MTData2",
         make_parser=XbusParser,

@@ -7,12 +7,10 @@ here.
 from __future__ import annotations
 
 import base64
-import errno
 import math
 import os
 import re
 import socket
-import threading
 import time
 from collections.abc import Callable
 from datetime import UTC, datetime
@@ -21,22 +19,18 @@ import numpy as np
 
 from swath.drivers.framing.checksums import nmea_xor
 from swath.drivers.transports.base import TransportError, UnitBlock
-from swath.drivers.transports.descriptor import DescriptorTransport, Gate, wait_writable
+from swath.drivers.transports.descriptor import DescriptorTransport, Gate
 from swath.drivers.transports.spec import TransportSpec, ntrip_position
+from swath.drivers.transports.tcp_socket import CONNECT_S, connected, keep_alive, send_all, why_not_connected
 
-CONNECT_S = 8.0  # limit for each address of the caster, and again for its answer
-SLICE_S = 0.1
-OPEN_S = 18.0  # limit for name, connection and answer; after 20 s the watchdog considers the opening stuck
 SILENT_S = 60.0  # silence after which the connection counts as dead
 READ_BYTES = 65536
 MOST_HEADER_BYTES = 16384
 MOST_TABLE_BYTES = 1 << 18
 MOST_NAMED = 8  # mountpoints listed when the caster lacks the requested one
 GGA_S = 10.0
-SEND_TIMEOUT_S = 2.0
 _STATUS = re.compile(r"[0-9]{3}")  # RFC 9112, 4
 _CHUNK_LENGTH = re.compile(rb"[0-9A-Fa-f]{1,16}")  # RFC 9112, 7.1; no caster sends more than 64 bits
-_KEEPALIVE = ((socket.TCP_KEEPIDLE, 10), (socket.TCP_KEEPINTVL, 5), (socket.TCP_KEEPCNT, 3))
 _REFUSALS = {
     401: "the caster rejects user or password; check user and password_env",
     403: "the caster does not allow this user to read the mountpoint",
@@ -64,15 +58,7 @@ class NtripTransport(DescriptorTransport):
         self._heard_s = self._told_s = 0.0
 
     def _open_device(self) -> int:
-        attempt, limit_s = _Attempt(self._connect), time.monotonic() + OPEN_S
-        while not attempt.wait(SLICE_S):
-            if self._stopped() and not attempt.wait(0.0):
-                attempt.leave()
-                raise TransportError(f"{self.name}: not connected in time")
-            if time.monotonic() > limit_s:
-                attempt.leave()
-                raise TransportError(f"{self.name}: no connection within {OPEN_S:g} s; check the network")
-        self._sock = attempt.result()
+        self._sock = connected(self.name, self._connect, self._stopped)
         self._heard_s = time.monotonic()
         self._told_s = -math.inf
         return self._sock.fileno()
@@ -93,9 +79,7 @@ class NtripTransport(DescriptorTransport):
 
     def _converse(self, sock: socket.socket, request: bytes) -> None:
         """Send the request, read the answer's head, and keep the data that came with it."""
-        sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-        for option, value in _KEEPALIVE:
-            sock.setsockopt(socket.IPPROTO_TCP, option, value)
+        keep_alive(sock)
         sock.sendall(request)
         head, self._first = self._head(sock, time.monotonic() + CONNECT_S)
         lines = head.decode("latin-1").split("\r\n")
@@ -172,17 +156,7 @@ class NtripTransport(DescriptorTransport):
 
     def _why(self, error: OSError | UnicodeError) -> str:
         host, port = self._spec.ntrip_host, self._spec.ntrip_port
-        if isinstance(error, UnicodeError):
-            return f"{self.name}: {host} is not a valid host name"
-        if isinstance(error, socket.gaierror):
-            return f"{self.name}: the host name {host} is unknown; check the name and the network"
-        if isinstance(error, TimeoutError):
-            return f"{self.name}: no answer from {host} port {port} in {CONNECT_S:g} s"
-        if error.errno == errno.ECONNREFUSED:
-            return f"{self.name}: {host} refuses port {port}; most casters use 2101"
-        if error.errno in (errno.ENETUNREACH, errno.EHOSTUNREACH):
-            return f"{self.name}: {host} is unreachable; check the network"
-        return f"{self.name}: cannot connect: {error.strerror or error}"
+        return why_not_connected(self.name, host, port, error, "most casters use 2101")
 
     def _close_device(self) -> None:
         sock, self._sock = self._sock, None
@@ -227,60 +201,7 @@ class NtripTransport(DescriptorTransport):
 
     def _send(self, data: bytes) -> None:
         assert self._sock is not None
-        deadline_s = time.monotonic() + SEND_TIMEOUT_S
-        rest = memoryview(data)
-        while rest:
-            if not wait_writable(self._sock.fileno(), deadline_s):
-                raise TransportError(f"{self.name}: the caster accepts no data")
-            try:
-                rest = rest[self._sock.send(rest) :]
-            except BlockingIOError:
-                continue
-            except OSError as error:
-                raise TransportError(f"{self.name}: the connection broke: {error.strerror or error}") from error
-
-
-class _Attempt(threading.Thread):
-    """Connects in its own thread, however long the resolver takes; the waiting caller may leave earlier."""
-
-    def __init__(self, connect: Callable[[], socket.socket]) -> None:
-        super().__init__(name="ntrip connect", daemon=True)
-        self._connect = connect
-        self._lock = threading.Lock()
-        self._left = False
-        self._sock: socket.socket | None = None
-        self._error = TransportError("not connected")
-        self.start()
-
-    def run(self) -> None:
-        try:
-            sock = self._connect()
-        except TransportError as error:
-            self._error = error
-            return
-        with self._lock:
-            if self._left:
-                sock.close()
-            else:
-                self._sock = sock
-
-    def wait(self, seconds: float) -> bool:
-        """Wait and return whether the attempt has ended."""
-        self.join(seconds)
-        return not self.is_alive()
-
-    def leave(self) -> None:
-        """Give the attempt up and close its connection, now or later."""
-        with self._lock:
-            self._left = True
-            if self._sock is not None:
-                self._sock.close()
-
-    def result(self) -> socket.socket:
-        """Return the connection, or raise the `TransportError` of the attempt."""
-        if self._sock is None:
-            raise self._error
-        return self._sock
+        send_all(self._sock, self.name, data)
 
 
 def gga_sentence(lat_deg: float, lon_deg: float, height_m: float, now: datetime) -> bytes:

@@ -12,6 +12,7 @@ from swath.drivers.transports.pps.kernel import KernelPps
 from swath.drivers.transports.pps.serial_dcd import SerialDcdPps
 from swath.drivers.transports.serial_port import SerialTransport
 from swath.drivers.transports.spec import PpsSpec, TransportSpec
+from swath.drivers.transports.tcp_socket import TcpTransport
 from swath.drivers.transports.udp_socket import UdpTransport
 
 
@@ -29,6 +30,8 @@ def open_transport(spec: TransportSpec, stopped: Callable[[], bool] = lambda: Fa
         return UdpTransport(spec)
     if spec.kind == "serial":
         return SerialTransport(spec)
+    if spec.kind == "tcp":
+        return TcpTransport(spec, stopped)
     if spec.kind == "can":
         return _open_can(spec)
     if spec.kind == "ntrip":

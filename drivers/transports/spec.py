@@ -2,6 +2,7 @@
 
 serial:<path>?baud=921600&bytesize=8&parity=N&stopbits=1&rtscts=no&xonxoff=no&dsrdtr=no
 udp:<host>:<port>?group=239.1.2.3&source=192.168.1.201&interface=eth1&buffer_mb=32
+tcp:<host>:<port>?silent_s=10
 can:<interface>:<channel>?<keyword>=<value>…
 gnss:<name>
 ntrip:<host>:<port>/<mountpoint>?user=<name>&password_env=<variable>&version=2&position=47.5,8.7,500
@@ -15,8 +16,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 PPS_FORMS = "/dev/pps0, serial-dcd:/dev/ttyS0 or fixed:<path>"
-FORMS = "serial:<path>, udp:<host>:<port>, can:<interface>:<channel>, gnss:<name> or ntrip:<host>:<port>/<mountpoint>"
+FORMS = (
+    "serial:<path>, udp:<host>:<port>, tcp:<host>:<port>, can:<interface>:<channel>, gnss:<name> "
+    "or ntrip:<host>:<port>/<mountpoint>"
+)
 MAX_BUFFER_MB = 1023  # the kernel stores twice the value in an int
+MAX_SILENT_S = 86_400
 MAX_BAUD = 20_000_000  # no UART is faster; the kernel's speed is an int of 32 bits
 
 _TRUE = {"1", "true", "yes", "on"}
@@ -28,7 +33,8 @@ class TransportSpec:
     """One checked transport of the configuration.
 
     Attributes:
-        kind: "serial", "udp", "can", "ntrip" or "gnss" (inside another device's stream: no transport of its own).
+        kind: "serial", "udp", "tcp", "can", "ntrip", or "gnss" (inside another device's stream: no transport of its
+            own).
         address: the text between the kind and the options.
         options: keyword to value, as text.
         text: the whole text, as configured.
@@ -41,12 +47,12 @@ class TransportSpec:
 
     @property
     def host(self) -> str:
-        """Local address of a UDP port."""
-        return self.address.rpartition(":")[0]
+        """Local address of a UDP port; name or address of a TCP server."""
+        return self.address.rpartition(":")[0].strip("[]")
 
     @property
     def port(self) -> int:
-        """Port number of a UDP port."""
+        """Port number of a UDP port or a TCP server."""
         return int(self.address.rpartition(":")[2])
 
     @property
@@ -99,12 +105,23 @@ def parse_transport(text: str) -> TransportSpec:
     refuse_unprintable("transport", text)
     kind, colon, rest = text.partition(":")
     if kind not in _CHECKS or not colon:
-        raise ValueError(f"transport {text!r}: want {FORMS}")
+        raise ValueError(f"transport {text!r}: want {_meant(text) or FORMS}")
     address, question, query = rest.partition("?")
     options = _parse_options(text, query) if question else {}
     spec = TransportSpec(kind, address, options, text)
     _CHECKS[kind](spec)
     return spec
+
+
+def _meant(text: str) -> str:
+    """Return the transport that a text in the form of other programs means; "" if there is none to guess."""
+    place, colon, number = text.partition("?")[0].rpartition(":")
+    if text.startswith("/"):
+        path, baud = (place, number) if colon and number.isdecimal() else (text.partition("?")[0], "921600")
+        return f"serial:{path}?baud={baud}"
+    if place not in ("", *_CHECKS) and not {"/", ":"} & set(place) and _is_port(number):
+        return f"tcp:{place}:{number} or udp:0.0.0.0:{number}"
+    return ""
 
 
 def refuse_unprintable(what: str, text: str) -> None:
@@ -167,6 +184,16 @@ def _buffer_mb(value: str) -> bool:
     return True
 
 
+def _silent_s(value: str) -> bool:
+    if not 1.0 <= float(value) <= MAX_SILENT_S:
+        raise ValueError("out of bounds")
+    return True
+
+
+def _is_port(value: str) -> bool:
+    return value.isascii() and value.isdecimal() and 1 <= int(value) <= 65535
+
+
 def _baud(value: str) -> bool:
     if _positive(value) and int(value) > MAX_BAUD:
         raise ValueError("too fast")
@@ -213,6 +240,9 @@ UDP_OPTIONS: dict[str, _Option] = {
     "interface": (bool, "an interface such as eth1"),
     "buffer_mb": (_buffer_mb, f"whole mebibytes, 1 to {MAX_BUFFER_MB}"),
 }
+TCP_OPTIONS: dict[str, _Option] = {
+    "silent_s": (_silent_s, f"seconds, 1 to {MAX_SILENT_S}, after which a mute connection is made anew"),
+}
 SOCKETCAN_OPTIONS: dict[str, _Option] = {
     "bitrate": (_positive, "bits per second such as 1000000"),
     "data_bitrate": (_positive, "bits per second such as 4000000"),
@@ -255,9 +285,19 @@ def _check_udp(spec: TransportSpec) -> None:
         valid = False
     if not valid:
         raise ValueError(f"transport {spec.text!r}: want udp:<IPv4 address>:<port>, such as udp:0.0.0.0:2368")
-    if not port.isascii() or not port.isdecimal() or not 1 <= int(port) <= 65535:
+    if not _is_port(port):
         raise ValueError(f"transport {spec.text!r}: port {port!r} should be 1 to 65535")
     _check_options(spec, UDP_OPTIONS)
+
+
+def _check_tcp(spec: TransportSpec) -> None:
+    host, colon, port = spec.address.rpartition(":")
+    if not host or not colon or "/" in spec.address or " " in spec.address:
+        raise ValueError(f"transport {spec.text!r}: want tcp:<host>:<port>, such as tcp:192.168.3.1:28784")
+    if not _is_port(port):
+        raise ValueError(f"transport {spec.text!r}: port {port!r} should be 1 to 65535")
+    _check_host(spec, spec.host)
+    _check_options(spec, TCP_OPTIONS)
 
 
 def _check_can(spec: TransportSpec) -> None:
@@ -280,13 +320,16 @@ def _check_gnss(spec: TransportSpec) -> None:
         raise ValueError(f"transport {spec.text!r}: want gnss:<name> of a [gnss.<name>] section, without options")
 
 
-def _can_be_asked_for(host: str) -> bool:
-    """Return whether the resolver accepts a name: it first encodes the name, as Python does here."""
+def _check_host(spec: TransportSpec, host: str) -> None:
+    """Refuse a name that the resolver would not accept: it first encodes the name, as Python does here."""
     try:
-        host.encode("idna")
+        valid = bool(host.encode("idna"))
     except UnicodeError:
-        return False
-    return True
+        valid = False
+    if not valid:
+        raise ValueError(
+            f"transport {spec.text!r}: host {host!r} is not a valid host name: want 1 to 63 letters between its dots"
+        )
 
 
 def _check_ntrip(spec: TransportSpec) -> None:
@@ -296,13 +339,9 @@ def _check_ntrip(spec: TransportSpec) -> None:
         raise ValueError(
             f"transport {spec.text!r}: want ntrip:<host>:<port>/<mountpoint>, such as ntrip:caster.example:2101/ZIMM0"
         )
-    if not port.isascii() or not port.isdecimal() or not 1 <= int(port) <= 65535:
+    if not _is_port(port):
         raise ValueError(f"transport {spec.text!r}: port {port!r} should be 1 to 65535, such as 2101")
-    if not _can_be_asked_for(spec.ntrip_host):
-        raise ValueError(
-            f"transport {spec.text!r}: host {spec.ntrip_host!r} is not a valid host name: "
-            "want 1 to 63 letters between its dots"
-        )
+    _check_host(spec, spec.ntrip_host)
     _check_options(spec, NTRIP_OPTIONS)
     if "password_env" in spec.options and "user" not in spec.options:
         raise ValueError(f"transport {spec.text!r}: password_env needs user=<name> too")
@@ -311,6 +350,7 @@ def _check_ntrip(spec: TransportSpec) -> None:
 _CHECKS: dict[str, Callable[[TransportSpec], None]] = {
     "serial": _check_serial,
     "udp": _check_udp,
+    "tcp": _check_tcp,
     "can": _check_can,
     "gnss": _check_gnss,
     "ntrip": _check_ntrip,

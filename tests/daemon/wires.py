@@ -6,8 +6,8 @@ import os
 import threading
 import tty
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from socket import AF_INET, SOCK_DGRAM, socket
+from contextlib import contextmanager, suppress
+from socket import AF_INET, SOCK_DGRAM, create_server, socket
 
 
 @contextmanager
@@ -61,3 +61,26 @@ def udp_sender(port: int, send: Callable[[int], bytes]) -> Iterator[None]:
 
 def _send(sender: socket, port: int, data: bytes) -> None:
     sender.sendto(data, ("127.0.0.1", port))
+
+
+@contextmanager
+def tcp_server(send: Callable[[int], bytes] | None = None) -> Iterator[int]:
+    """A device that serves a TCP port, which is yielded, and sends something again and again to who is connected."""
+    with create_server(("127.0.0.1", 0)) as server:
+        server.setblocking(False)
+        peers: list[socket] = []
+
+        def write(number: int) -> None:
+            with suppress(BlockingIOError):
+                peers.append(server.accept()[0])
+            data = b"" if send is None else send(number)
+            for peer in peers:
+                with suppress(OSError):
+                    peer.sendall(data)
+
+        try:
+            with repeating(write):
+                yield server.getsockname()[1]
+        finally:
+            for peer in peers:
+                peer.close()

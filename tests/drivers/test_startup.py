@@ -200,7 +200,9 @@ class TestSbf:
         assert messages[-1].last
 
     def test_an_unknown_port_is_refused(self) -> None:
-        with pytest.raises(DriverSettingsError, match=r"setup\.port: got 'UART1', want COM1 to COM4, USB1 or USB2"):
+        with pytest.raises(
+            DriverSettingsError, match=r"setup\.port: got 'UART1', want COM1 to COM4, USB1, USB2, IP10 to IP17"
+        ):
             sbf_startup.startup_messages(settings(port="UART1"), StartupOptions())
 
     @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from swath.drivers.driver import Driver
+from swath.drivers.driver import STREAM_TRANSPORTS, Driver
 from swath.drivers.framing.framer import Frame, Framer
 from swath.drivers.framing.kinds import GNSS_KINDS
 from swath.drivers.gnss.date_floor import ReceiverDates
@@ -264,7 +264,7 @@ DRIVERS = (
     Driver(
         protocol="nmea",
         kind="gnss",
-        transports=("serial",),
+        transports=STREAM_TRANSPORTS,
         yields=(TimeMessage, GnssFix, GnssHeading),
         summary="NMEA 0183 sentences of any receiver (GGA GNS RMC ZDA VTG GST HDT)",
         make_parser=NmeaParser,

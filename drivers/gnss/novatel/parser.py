@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from swath.drivers.driver import Driver
+from swath.drivers.driver import STREAM_TRANSPORTS, Driver
 from swath.drivers.framing.framer import Frame, Framer
 from swath.drivers.framing.kinds import NMEA, NOVATEL, NOVATEL_SHORT, RTCM3
 from swath.drivers.gnss.date_floor import ReceiverDates
@@ -207,7 +207,7 @@ DRIVERS = (
     Driver(
         protocol="novatel",
         kind="gnss",
-        transports=("serial", "udp"),
+        transports=STREAM_TRANSPORTS,
         yields=(TimeMessage, GnssFix, InsSolution, ImuSamples, GnssHeading, EventMark, DeviceStatus),
         summary="NovAtel OEM7 binary logs, long and short headers, with SPAN",
         make_parser=NovatelParser,

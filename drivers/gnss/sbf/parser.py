@@ -20,7 +20,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import TypeAlias
 
-from swath.drivers.driver import Driver
+from swath.drivers.driver import STREAM_TRANSPORTS, Driver
 from swath.drivers.framing.framer import Frame, Framer
 from swath.drivers.framing.kinds import NMEA, RTCM3, SBF
 from swath.drivers.gnss.date_floor import ReceiverDates, leap_seconds_of
@@ -326,7 +326,7 @@ DRIVERS = (
     Driver(
         protocol="sbf",
         kind="gnss",
-        transports=("serial",),
+        transports=STREAM_TRANSPORTS,
         yields=(TimeMessage, GnssFix, GnssHeading, EventMark, InsSolution, ImuSamples),
         summary="Septentrio binary (PVTGeodetic, ReceiverTime, xPPSOffset, ExtEvent, INS), NMEA and RTCM3 beside it",
         make_parser=SbfParser,

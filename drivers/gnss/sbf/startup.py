@@ -12,7 +12,7 @@ import re
 from swath.drivers.parser import DeviceSettings, DriverSettingsError
 from swath.drivers.startup import PhraseListener, StartupMessage, StartupOptions, read_setup
 
-PORT = re.compile(r"(COM[1-4]|USB[12])")
+PORT = re.compile(r"(COM[1-4]|USB[12]|IP1[0-7]|IPS[1-5])")
 PROMPT = rb"(?:[^>$]*\n)?[A-Z]+[0-9]+>"
 REFUSED = re.compile(rb"\$R\? ?([^\r\n]*)\r\n" + PROMPT)
 
@@ -66,7 +66,9 @@ def imu_startup_messages(settings: DeviceSettings, options: StartupOptions) -> t
 def _port(settings: DeviceSettings) -> str:
     port = read_setup(settings).port or "COM1"
     if not PORT.fullmatch(port):
-        raise DriverSettingsError(f"setup.port: got {port!r}, want COM1 to COM4, USB1 or USB2")
+        raise DriverSettingsError(
+            f"setup.port: got {port!r}, want COM1 to COM4, USB1, USB2, IP10 to IP17 or IPS1 to IPS5"
+        )
     return port
 
 

@@ -26,7 +26,7 @@ import math
 from collections.abc import Callable
 from typing import Protocol, TypeVar
 
-from swath.drivers.driver import Driver
+from swath.drivers.driver import STREAM_TRANSPORTS, Driver
 from swath.drivers.framing.framer import Frame, Framer
 from swath.drivers.framing.kinds import GNSS_KINDS
 from swath.drivers.gnss.date_floor import GPS_EPOCH, ReceiverDates, leap_seconds_of
@@ -358,7 +358,7 @@ DRIVERS = (
     Driver(
         protocol="ubx",
         kind="gnss",
-        transports=("serial",),
+        transports=STREAM_TRANSPORTS,
         yields=(TimeMessage, GnssFix, EventMark),
         summary="u-blox binary (NAV-PVT HPPOSLLH COV TIMEGPS TIMELS, TIM-TP TM2), NMEA and RTCM3 beside it",
         make_parser=UbxParser,

@@ -211,8 +211,8 @@ def test_check_reports_the_caster_response(tmp_path: Path) -> None:
     ("table", "said"),
     [
         (
-            {"transport": "udp:0.0.0.0:1"},
-            'corrections.base.transport: got "udp:0.0.0.0:1"; rtcm3 supports: serial, ntrip',
+            {"transport": "can:socketcan:can0"},
+            'corrections.base.transport: got "can:socketcan:can0"; rtcm3 supports: serial, udp, tcp, ntrip',
         ),
         (
             {"transport": "ntrip:a:1/B", "protocol": "nmea"},
@@ -224,7 +224,7 @@ def test_check_reports_the_caster_response(tmp_path: Path) -> None:
         ),
         (
             {"transport": "ntrip:a:1/B", "forward_to": "gnss.net"},
-            "corrections.base.forward_to: gnss.net has no serial port; choose a receiver with a serial: transport",
+            "corrections.base.forward_to: gnss.net has no port to write to; want a receiver by serial: or tcp:",
         ),
         (
             {"transport": "serial:/dev/ttyS9"},

@@ -11,7 +11,7 @@ import time
 import pynmea2
 import pytest
 
-from swath.drivers.transports import ntrip as ntrip_client
+from swath.drivers.transports import tcp_socket
 from swath.drivers.transports.base import Transport, TransportError
 from swath.drivers.transports.ntrip import NtripTransport, gga_sentence
 from swath.drivers.transports.opening import open_transport
@@ -182,7 +182,7 @@ def test_a_silent_caster_does_not_block_the_caller() -> None:
 
 def test_opening_ends_by_its_deadline_however_slow_the_network_is(monkeypatch: pytest.MonkeyPatch) -> None:
     """Name servers that do not answer: given up before the recorder's watchdog would take it for stuck."""
-    monkeypatch.setattr(ntrip_client, "OPEN_S", 0.3)
+    monkeypatch.setattr(tcp_socket, "OPEN_S", 0.3)
     hold = threading.Event()
     made: list[socket.socket] = []
 

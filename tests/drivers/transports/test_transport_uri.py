@@ -14,6 +14,7 @@ from swath.drivers.transports.pps.kernel import KernelPps
 from swath.drivers.transports.pps.serial_dcd import SerialDcdPps
 from swath.drivers.transports.serial_port import SerialTransport
 from swath.drivers.transports.spec import parse_pps, parse_transport
+from swath.drivers.transports.tcp_socket import TcpTransport
 from swath.drivers.transports.udp_socket import UdpTransport
 
 
@@ -28,6 +29,20 @@ def test_udp_address_with_every_option_is_parsed() -> None:
         "buffer_mb": "8",
     }
     assert isinstance(open_transport(spec), UdpTransport)
+
+
+@pytest.mark.parametrize(
+    ("text", "host", "port"),
+    [
+        ("tcp:192.168.3.1:28784?silent_s=30.5", "192.168.3.1", 28784),
+        ("tcp:moxa.local:4001", "moxa.local", 4001),
+        ("tcp:[fe80::1]:5017", "fe80::1", 5017),
+    ],
+)
+def test_tcp_addresses_are_parsed(text: str, host: str, port: int) -> None:
+    spec = parse_transport(text)
+    assert (spec.kind, spec.host, spec.port, spec.text) == ("tcp", host, port, text)
+    assert isinstance(open_transport(spec), TcpTransport)
 
 
 def test_serial_path_and_flags_are_parsed() -> None:
@@ -64,7 +79,16 @@ def test_an_address_inside_a_gnss_stream_cannot_be_opened() -> None:
     ("text", "says"),
     [
         ("", "want serial:<path>"),
-        ("tcp:1.2.3.4:5", "want serial:<path>"),
+        ("tcp:1.2.3.4", "want tcp:<host>:<port>, such as tcp:192.168.3.1:28784"),
+        ("tcp:1.2.3.4:0", "port '0' should be 1 to 65535"),
+        ("tcp:a..b:5000", "host 'a..b' is not a valid host name"),
+        ("tcp:1.2.3.4:5000?silent_s=0", "silent_s=0 should be seconds, 1 to 86400"),
+        ("tcp:1.2.3.4:5000?silent_s=nan", "silent_s=nan should be seconds, 1 to 86400"),
+        ("tcp:1.2.3.4:5000?baud=9600", "unknown option 'baud'; tcp knows: silent_s"),
+        ("/dev/ttyUSB0:460800", "want serial:/dev/ttyUSB0?baud=460800"),
+        ("/dev/serial/by-id/usb-u-blox:00:9600", "want serial:/dev/serial/by-id/usb-u-blox:00?baud=9600"),
+        ("/dev/ttyUSB0", "want serial:/dev/ttyUSB0?baud=921600"),
+        ("192.168.3.1:28784", "want tcp:192.168.3.1:28784 or udp:0.0.0.0:28784"),
         ("udp", "want serial:<path>"),
         ("udp:2368", "want udp:<IPv4 address>:<port>"),
         ("udp:localhost:2368", "want udp:<IPv4 address>:<port>"),
