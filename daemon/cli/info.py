@@ -16,6 +16,8 @@ from swath.georef.progress import BYTES, Tell
 if TYPE_CHECKING:
     from rich.console import Console
 
+MOST_MESSAGES = 24  # names of messages in a source's line
+
 
 def command(
     logs: Annotated[list[Path], typer.Argument(help="Logs, or directories of logs.", metavar="LOG…")],
@@ -100,6 +102,8 @@ def _print_session(console: Console, numbers: dict[str, Any]) -> None:
     for source, values in numbers["sources"].items():
         if "decoded" in values:
             console.print(f"{_plain(source)}: {_plain(_decoded(values['decoded']))}", highlight=False)
+            if messages := _messages(values["decoded"]["messages"]):
+                console.print(f"  messages: {_plain(messages)}", highlight=False)
     _print_trouble(console, numbers)
     unaccounted = _unaccounted(numbers)
     if unaccounted:
@@ -156,6 +160,17 @@ def _time(values: dict[str, Any]) -> str:
     sigma = values["time_sigma_ns"]
     sigma_text = f" ±{sigma / 1e3:.1f}µs" if isinstance(sigma, (int, float)) and sigma < 1e6 else ""
     return _plain(state) + sigma_text
+
+
+def _messages(counts: dict[str, int]) -> str:
+    """Return the most frequent messages by name, and the number of further ones."""
+    frequent = sorted(((count, name) for name, count in counts.items() if count), key=lambda item: (-item[0], item[1]))
+    texts = [f"{count:,} {name}" for count, name in frequent[:MOST_MESSAGES]]
+    if len(frequent) > MOST_MESSAGES:
+        texts.append(
+            f"{sum(count for count, _ in frequent[MOST_MESSAGES:]):,} of {len(frequent) - MOST_MESSAGES} others"
+        )
+    return ", ".join(texts)
 
 
 def _decoded(decoded: dict[str, Any]) -> str:

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections import Counter, deque
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from swath.daemon.log.format import source_of_topic
+from swath.daemon.log.format import LogError, source_of_topic
 from swath.daemon.log.mcap.chunks import LogBatch, json_objects
-from swath.daemon.log.parsers import stored_parsers
+from swath.daemon.log.parsers import stored_config, stored_parsers
 from swath.daemon.log.reader import Session
 from swath.drivers.parser import PacketParser, Parser
 from swath.georef.arrays import Int64Array
@@ -173,6 +174,8 @@ def session_statistics(session: Session, *, decode: bool = True) -> dict[str, An
             if not source.endswith("/aux"):
                 troubles += parser_lines(source, numbers.parser)
     complete = not session.missing_parts and not session.damage
+    if decode:
+        troubles += _silent_antennas(attachments, sources)
     return {
         "session_id": session.session_id,
         "software": session.info.software,
@@ -213,6 +216,23 @@ def parser_lines(source: str, parser: Parser) -> list[str]:
     """Return what a parser has to tell the user of its data, one line each, with the source's name."""
     doubts = parser.warnings if isinstance(parser, PacketParser) else ()
     return [*parser.remarks(), *(f"{source}: {doubt}" for doubt in doubts)]
+
+
+def _silent_antennas(attachments: Mapping[str, bytes], sources: dict[str, SourceNumbers]) -> list[str]:
+    """Return a line for each receiver that sent records, but no heading, though it has a second antenna."""
+    try:
+        config = stored_config(attachments)
+    except LogError:  # its own line says so
+        return []
+    lines = []
+    for name, table in config.gnss.items() if config is not None else ():
+        records = sources.get(f"gnss/{name}", SourceNumbers()).records
+        if table.secondary_lever_arm_m is not None and records and not records["GnssHeading"]:
+            lines.append(
+                f"gnss/{name}: sent no heading that this program reads, although secondary_lever_arm_m names a second "
+                "antenna; let it send the heading messages that the page of its protocol lists"
+            )
+    return lines
 
 
 def _take(batch: LogBatch, sources: dict[str, SourceNumbers], events: EventNumbers, parsers: dict[str, Parser]) -> None:

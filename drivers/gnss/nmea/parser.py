@@ -28,7 +28,7 @@ from swath.drivers.framing.kinds import GNSS_KINDS
 from swath.drivers.gnss.date_floor import ReceiverDates
 from swath.drivers.gnss.epochs import EpochGatherer
 from swath.drivers.gnss.nmea.sentences import MPS_PER_KMPH, MPS_PER_KNOT, FieldError, Sentence, velocity_from_course
-from swath.drivers.parser import DeviceSettings, StreamParser
+from swath.drivers.parser import DeviceSettings, ParserCounters, StreamParser
 from swath.georef.arrays import FloatArray
 from swath.georef.records import (
     Chunk,
@@ -91,18 +91,18 @@ class Part:
     undulation_m: float | None = None
 
 
-class NmeaParser(StreamParser):
-    """Converts sentences to records; UBX and RTCM3 on the same port are framed and counted.
+class NmeaDecoder:
+    """Converts checked sentences to records; parsers of protocols with NMEA in their stream use it too.
 
     Args:
         settings: ``date_floor`` is the oldest accepted date, ``add_weeks`` is added to all dates.
+        counters: the parser's counters; bad sentences and errors are counted there.
         time_only: return the same time messages, and no other records.
     """
 
-    def __init__(self, settings: DeviceSettings, *, time_only: bool = False) -> None:
-        super().__init__()
+    def __init__(self, settings: DeviceSettings, counters: ParserCounters, *, time_only: bool = False) -> None:
+        self.counters = counters
         self._dates = ReceiverDates(settings)
-        self._framer = Framer(GNSS_KINDS, self.counters)
         self._epochs: EpochGatherer[Part] = EpochGatherer(self.counters)
         self._time_only = time_only
         self._has_fix: bool | None = None  # whether the latest GGA, GNS or RMC has a fix
@@ -115,20 +115,8 @@ class NmeaParser(StreamParser):
         if not time_only:
             self._decoders |= {b"VTG": self._vtg, b"GST": self._gst, b"HDT": self._hdt}
 
-    def feed(self, chunk: Chunk) -> list[Record]:
-        """Take one read; return the records that it completed."""
-        return self._decode(self._framer.feed(chunk.data, chunk.host_time_ns))
-
-    def close(self) -> list[Record]:
-        """Return the records of the tail and of the last epoch."""
-        records = self._decode(self._framer.close())
-        return records + self._fixes(self._epochs.end())
-
-    def remarks(self) -> list[str]:
-        """Return remarks on the receiver's dates."""
-        return self._dates.remarks()
-
-    def _decode(self, frames: list[Frame]) -> list[Record]:
+    def decode(self, frames: list[Frame]) -> list[Record]:
+        """Return the records that sentences among the frames completed."""
         records: list[Record] = []
         for kind, host_time_ns, data in frames:
             decoder = self._decoders.get(data[3:6])
@@ -139,6 +127,14 @@ class NmeaParser(StreamParser):
             except FieldError:
                 self.counters.bad_messages += 1
         return records
+
+    def close(self) -> list[Record]:
+        """Return the fix of the last epoch."""
+        return self._fixes(self._epochs.end())
+
+    def remarks(self) -> list[str]:
+        """Return remarks on the receiver's dates."""
+        return self._dates.remarks()
 
     # --- sentences ---
 
@@ -258,6 +254,32 @@ def merge_epoch(parts: dict[str, Part]) -> GnssFix | None:
         message=message,
         undulation_m=solution.undulation_m,
     )
+
+
+class NmeaParser(StreamParser):
+    """Converts sentences to records; UBX and RTCM3 on the same port are framed and counted.
+
+    Args:
+        settings: ``date_floor`` is the oldest accepted date, ``add_weeks`` is added to all dates.
+        time_only: return the same time messages, and no other records.
+    """
+
+    def __init__(self, settings: DeviceSettings, *, time_only: bool = False) -> None:
+        super().__init__()
+        self._framer = Framer(GNSS_KINDS, self.counters)
+        self._decoder = NmeaDecoder(settings, self.counters, time_only=time_only)
+
+    def feed(self, chunk: Chunk) -> list[Record]:
+        """Take one read; return the records that it completed."""
+        return self._decoder.decode(self._framer.feed(chunk.data, chunk.host_time_ns))
+
+    def close(self) -> list[Record]:
+        """Return the records of the tail and of the last epoch."""
+        return self._decoder.decode(self._framer.close()) + self._decoder.close()
+
+    def remarks(self) -> list[str]:
+        """Return remarks on the receiver's dates."""
+        return self._decoder.remarks()
 
 
 DRIVERS = (

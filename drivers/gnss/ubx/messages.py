@@ -180,16 +180,131 @@ class NavCov(NamedTuple):
 
 
 class NavSol(NamedTuple):
-    """Beginning of NAV-SOL (u-blox 4 to M8): the time of older receivers."""
+    """NAV-SOL (u-blox 4 to M8): time and solution of older receivers, in ECEF."""
 
     itow_ms: int
     ftow_ns: int
     week: int
-    fix_type: int
+    fix_type: int  # as of NAV-PVT
     flags: int  # SOL_*
+    x_cm: int
+    y_cm: int
+    z_cm: int
+    position_accuracy_cm: int  # all axes together
+    vx_cmps: int
+    vy_cmps: int
+    vz_cmps: int
+    speed_accuracy_cmps: int
+    pdop_1e2: int
+    satellites: int
 
 
-SOL_WEEK, SOL_TOW = 4, 8
+SOL_FIX_OK, SOL_DIFFERENTIAL, SOL_WEEK, SOL_TOW = 1, 2, 4, 8
+
+
+class NavStatus(NamedTuple):
+    """NAV-STATUS, 3.15.26: whether there is a solution; older receivers send it beside NAV-POSLLH."""
+
+    itow_ms: int
+    fix_type: int
+    flags: int  # bits as of NAV-SOL
+
+
+class NavPosllh(NamedTuple):
+    """NAV-POSLLH, 3.15.11: the position."""
+
+    itow_ms: int
+    lon_1e7_deg: int
+    lat_1e7_deg: int
+    height_mm: int  # above the ellipsoid
+    height_msl_mm: int
+    horizontal_accuracy_mm: int  # both axes together
+    vertical_accuracy_mm: int
+
+
+class NavVelned(NamedTuple):
+    """NAV-VELNED, 3.15.36: the velocity."""
+
+    itow_ms: int
+    vel_n_cmps: int
+    vel_e_cmps: int
+    vel_d_cmps: int
+    speed_cmps: int
+    ground_speed_cmps: int
+    course_1e5_deg: int
+    speed_accuracy_cmps: int
+    course_accuracy_1e5_deg: int
+
+
+class NavAtt(NamedTuple):
+    """NAV-ATT (M8 ADR and UDR 19.20, F9 HPS 1.30): attitude of the vehicle, whose axes are forward, right, down."""
+
+    itow_ms: int
+    version: int
+    roll_1e5_deg: int
+    pitch_1e5_deg: int
+    heading_1e5_deg: int
+    roll_accuracy_1e5_deg: int
+    pitch_accuracy_1e5_deg: int
+    heading_accuracy_1e5_deg: int
+
+
+class NavPvat(NamedTuple):
+    """NAV-PVAT (F9 HPS 1.30, class 01 id 17): position, velocity, attitude and UTC of an epoch."""
+
+    itow_ms: int
+    version: int
+    valid: int  # PVT_VALID_*
+    year: int
+    month: int
+    day: int
+    hour: int
+    minute: int
+    second: int
+    time_accuracy_ns: int
+    nano_ns: int
+    fix_type: int
+    flags: int  # as of NAV-PVT, and PVAT_*
+    flags2: int
+    satellites: int
+    lon_1e7_deg: int
+    lat_1e7_deg: int
+    height_mm: int
+    height_msl_mm: int
+    horizontal_accuracy_mm: int
+    vertical_accuracy_mm: int
+    vel_n_mmps: int
+    vel_e_mmps: int
+    vel_d_mmps: int
+    ground_speed_mmps: int
+    speed_accuracy_mmps: int
+    roll_1e5_deg: int
+    pitch_1e5_deg: int
+    heading_1e5_deg: int
+    course_1e5_deg: int
+    roll_accuracy_1e2_deg: int
+    pitch_accuracy_1e2_deg: int
+    heading_accuracy_1e2_deg: int
+
+
+PVAT_ROLL_VALID, PVAT_PITCH_VALID, PVAT_HEADING_VALID = 8, 16, 32
+PVAT_ATTITUDE_VALID = PVAT_ROLL_VALID | PVAT_PITCH_VALID | PVAT_HEADING_VALID
+
+
+class EsfIns(NamedTuple):
+    """ESF-INS (M8 ADR 19.20, F9 HPS 1.30): rates and accelerations of the vehicle, without gravity and biases."""
+
+    flags: int  # bits 8 to 13: x, y, z rate and x, y, z acceleration are valid
+    itow_ms: int
+    x_rate_1e3_dps: int
+    y_rate_1e3_dps: int
+    z_rate_1e3_dps: int
+    x_acceleration_1e2_mps2: int
+    y_acceleration_1e2_mps2: int
+    z_acceleration_1e2_mps2: int
+
+
+ESF_INS_FIRST_VALID_BIT = 8
 
 
 class NavEoe(NamedTuple):
@@ -251,7 +366,13 @@ NAV_TIMEGPS = Layout(b"\x01\x20", "IihbBI", NavTimegps, 16)
 NAV_TIMEUTC = Layout(b"\x01\x21", "IIiHBBBBBB", NavTimeutc, 20)
 NAV_TIMELS = Layout(b"\x01\x26", "IB3xBbBbiHH3xB", NavTimels, 24)
 NAV_COV = Layout(b"\x01\x36", "IBBB9x12f", NavCov, 64)
-NAV_SOL = Layout(b"\x01\x06", "IihBB", NavSol, 52)
+NAV_SOL = Layout(b"\x01\x06", "IihBBiiiIiiiIHxB", NavSol, 52)
+NAV_STATUS = Layout(b"\x01\x03", "IBB", NavStatus, 16)
+NAV_POSLLH = Layout(b"\x01\x02", "IiiiiII", NavPosllh, 28)
+NAV_VELNED = Layout(b"\x01\x12", "IiiiIIiII", NavVelned, 36)
+NAV_ATT = Layout(b"\x01\x05", "IB3xiiiIII", NavAtt, 32)
+NAV_PVAT = Layout(b"\x01\x17", "IBBHBBBBB3xIiBBBBiiiiIIiiiiIiiiiHHH", NavPvat, 116)
+ESF_INS = Layout(b"\x10\x15", "I4xIiiiiii", EsfIns, 36)
 NAV_EOE = Layout(b"\x01\x61", "I", NavEoe, 4)
 TIM_TP = Layout(b"\x0d\x01", "IIiHBB", TimTp, 16)
 TIM_TM2 = Layout(b"\x0d\x03", "BBHHHIIIII", TimTm2, 28)

@@ -1,4 +1,6 @@
-"""u-blox UBX: NAV-PVT, NAV-HPPOSLLH, NAV-COV, NAV-TIMEGPS, NAV-TIMEUTC, NAV-TIMELS, NAV-SOL, NAV-EOE, TIM-TP, TIM-TM2.
+"""u-blox UBX: NAV-PVT, NAV-PVAT, NAV-HPPOSLLH, NAV-COV, NAV-TIMEGPS, NAV-TIMEUTC, NAV-TIMELS, NAV-EOE, TIM-TP, TIM-TM2;
+NAV-POSLLH, NAV-VELNED, NAV-STATUS and NAV-SOL of older receivers; NAV-ATT, ESF-MEAS, ESF-RAW and ESF-INS of receivers
+with inertial sensors.
 
 RXM-RAWX gives its time where no other message of the stream gives one: in a log of raw measurements for
 post-processing. All other messages, RTCM3 and NMEA on the same port included, are framed, checked and counted.
@@ -17,6 +19,8 @@ differs from its iTOW by anything but a whole number of seconds, up to 60, is no
 
 Fix: the NAV messages of one iTOW make one `GnssFix` (`swath.drivers.gnss.epochs`), complete at NAV-EOE at the latest:
 NAV-PVT, refined by NAV-HPPOSLLH, with the covariances of NAV-COV or else of the accuracies, and NAV-TIMEGPS's week.
+Without NAV-PVT the older messages make it (`swath.drivers.gnss.ubx.fix`). Where a receiver sends no position in UBX,
+the NMEA in its stream gives the fixes. NAV-ATT or NAV-PVAT makes a row of `InsSolution` with the fix of its epoch.
 """
 
 from __future__ import annotations
@@ -24,21 +28,26 @@ from __future__ import annotations
 import datetime as dt
 import math
 from collections.abc import Callable
-from typing import Protocol, TypeVar
+from typing import Any, Protocol, TypeAlias, TypeVar
 
 from swath.drivers.driver import STREAM_TRANSPORTS, Driver
 from swath.drivers.framing.framer import Frame, Framer
 from swath.drivers.framing.kinds import GNSS_KINDS
 from swath.drivers.gnss.date_floor import GPS_EPOCH, ReceiverDates, leap_seconds_of
 from swath.drivers.gnss.epochs import EpochGatherer
+from swath.drivers.gnss.record_rows import Row, join_rows
 from swath.drivers.gnss.ubx import messages as ubx
-from swath.drivers.gnss.ubx.fix import NavMessage, merge_epoch
+from swath.drivers.gnss.ubx.fix import POSITION_MESSAGES, NavMessage, NmeaFixes, ins_row, merge_epoch, pvt_of
+from swath.drivers.gnss.ubx.sensors import MEAS_KEY, RAW_KEY, SensorSamples, vehicle_motion
 from swath.drivers.gnss.ubx.startup import startup_messages
 from swath.drivers.parser import DeviceSettings, StreamParser
 from swath.georef.records import (
     Chunk,
+    DeviceStatus,
     EventMark,
     GnssFix,
+    ImuSamples,
+    InsSolution,
     NamesEdge,
     Record,
     TimeMessage,
@@ -65,79 +74,156 @@ class MessageError(ValueError):
     """A message with a good checksum has impossible content; it is counted as bad."""
 
 
+Items: TypeAlias = list[Record | Row]
+
+_EPOCH = (GnssFix, InsSolution)  # records that an epoch's messages make together
+GIVES: dict[bytes, tuple[type, ...]] = {  # record types to which a message contributes
+    ubx.NAV_PVT.key: (TimeMessage, *_EPOCH),
+    ubx.NAV_PVAT.key: (TimeMessage, *_EPOCH),
+    ubx.NAV_TIMEGPS.key: (TimeMessage, *_EPOCH),
+    ubx.NAV_TIMEUTC.key: (TimeMessage,),
+    ubx.NAV_TIMELS.key: (TimeMessage,),
+    ubx.NAV_SOL.key: (TimeMessage, *_EPOCH),
+    ubx.TIM_TP.key: (TimeMessage,),
+    ubx.RXM_RAWX.key: (TimeMessage,),
+    ubx.NAV_HPPOSLLH.key: _EPOCH,
+    ubx.NAV_POSLLH.key: _EPOCH,
+    ubx.NAV_VELNED.key: _EPOCH,
+    ubx.NAV_STATUS.key: _EPOCH,
+    ubx.NAV_COV.key: _EPOCH,
+    ubx.NAV_EOE.key: _EPOCH,
+    ubx.NAV_ATT.key: (InsSolution,),
+    ubx.TIM_TM2.key: (EventMark,),
+    MEAS_KEY: (ImuSamples,),
+    RAW_KEY: (ImuSamples,),
+    ubx.ESF_INS.key: (DeviceStatus,),
+}
+
+NAV_PARTS: dict[bytes, tuple[str, ubx.Layout[Any]]] = {  # messages that contribute to their epoch only
+    ubx.NAV_HPPOSLLH.key: ("NAV-HPPOSLLH", ubx.NAV_HPPOSLLH),
+    ubx.NAV_POSLLH.key: ("NAV-POSLLH", ubx.NAV_POSLLH),
+    ubx.NAV_VELNED.key: ("NAV-VELNED", ubx.NAV_VELNED),
+    ubx.NAV_STATUS.key: ("NAV-STATUS", ubx.NAV_STATUS),
+    ubx.NAV_ATT.key: ("NAV-ATT", ubx.NAV_ATT),
+}
+
+
 class UbxParser(StreamParser):
     """Converts UBX frames to records.
 
     Args:
-        settings: ``date_floor`` is the oldest accepted date (or week), ``add_weeks`` is added to all of them.
-        time_only: return the same time messages, and no other records.
+        settings: ``date_floor`` is the oldest accepted date (or week), ``add_weeks`` is added to all of them;
+            ``tick_hz`` is the rate of the inertial sensors' time tags.
+        wanted: the record types to return; None: all.
+
+    Raises:
+        DriverSettingsError: a setting is not valid.
     """
 
-    def __init__(self, settings: DeviceSettings, *, time_only: bool = False) -> None:
+    def __init__(self, settings: DeviceSettings, *, wanted: tuple[type, ...] | None = None) -> None:
         super().__init__()
         self._dates = ReceiverDates(settings)
         self._framer = Framer(GNSS_KINDS, self.counters)
         self._epochs: EpochGatherer[tuple[int, NavMessage]] = EpochGatherer(self.counters)
-        self._gathers = not time_only
+        self._wanted = wanted
+        self._gathers = wanted is None or not set(wanted).isdisjoint(_EPOCH)
+        self._nmea = NmeaFixes(settings, self.counters) if wanted is None or GnssFix in wanted else None
+        self._sensors = SensorSamples(settings, self.counters)
         self._leap_seconds: int | None = None  # the last valid count of NAV-TIMELS or NAV-TIMEGPS
         self._vouched: bool | None = None  # whether the latest navigation message with time marks it as valid
-        self._decoders: dict[bytes, Callable[[int, bytes], list[Record]]] = {
+        decoders: dict[bytes, Callable[[int, bytes], Items]] = {
             ubx.NAV_PVT.key: self._nav_pvt,
+            ubx.NAV_PVAT.key: self._nav_pvat,
             ubx.NAV_TIMEGPS.key: self._nav_timegps,
             ubx.NAV_TIMEUTC.key: self._nav_timeutc,
             ubx.NAV_TIMELS.key: self._nav_timels,
             ubx.NAV_SOL.key: self._nav_sol,
             ubx.TIM_TP.key: self._tim_tp,
             ubx.RXM_RAWX.key: self._rxm_rawx,
+            ubx.NAV_HPPOSLLH.key: self._nav_part,
+            ubx.NAV_POSLLH.key: self._nav_part,
+            ubx.NAV_VELNED.key: self._nav_part,
+            ubx.NAV_STATUS.key: self._nav_part,
+            ubx.NAV_ATT.key: self._nav_part,
+            ubx.NAV_COV.key: self._nav_cov,
+            ubx.NAV_EOE.key: self._nav_eoe,
+            ubx.TIM_TM2.key: self._tim_tm2,
+            MEAS_KEY: self._esf_meas,
+            RAW_KEY: self._esf_raw,
+            ubx.ESF_INS.key: self._esf_ins,
         }
-        if not time_only:
-            self._decoders |= {
-                ubx.NAV_HPPOSLLH.key: self._nav_hpposllh,
-                ubx.NAV_COV.key: self._nav_cov,
-                ubx.NAV_EOE.key: self._nav_eoe,
-                ubx.TIM_TM2.key: self._tim_tm2,
-            }
+        self._decoders = {
+            key: decode for key, decode in decoders.items() if wanted is None or not set(wanted).isdisjoint(GIVES[key])
+        }
 
     def feed(self, chunk: Chunk) -> list[Record]:
         """Take one read; return the records that it completed."""
-        return self._decode(self._framer.feed(chunk.data, chunk.host_time_ns))
+        return self._join(self._decode(self._framer.feed(chunk.data, chunk.host_time_ns)))
 
     def close(self) -> list[Record]:
         """Return the records of the tail and of the last epoch."""
-        records = self._decode(self._framer.close())
-        return records + self._fixes(self._epochs.end())
+        items = self._decode(self._framer.close()) + self._merged(self._epochs.end())
+        return self._join(items + (list(self._nmea.close()) if self._nmea is not None else []))
 
     def remarks(self) -> list[str]:
         """Return remarks on the receiver's dates."""
         return self._dates.remarks()
 
-    def _decode(self, frames: list[Frame]) -> list[Record]:
-        records: list[Record] = []
-        for kind, host_time_ns, data in frames:
-            decoder = self._decoders.get(data[2:4])
-            if decoder is None or kind != "ubx":
+    def _join(self, items: Items) -> list[Record]:
+        if self._wanted is not None:
+            items = [item for item in items if (item.record if isinstance(item, Row) else type(item)) in self._wanted]
+        return join_rows(items)
+
+    def _decode(self, frames: list[Frame]) -> Items:
+        items: Items = []
+        for frame in frames:
+            if frame.kind == "nmea" and self._nmea is not None:
+                items += self._nmea.add(frame)
+            decoder = self._decoders.get(frame.data[2:4])
+            if decoder is None or frame.kind != "ubx":
                 continue
             try:
-                records += decoder(host_time_ns, data)
+                items += decoder(frame.host_time_ns, frame.data)
             except MessageError:
                 self.counters.bad_messages += 1
-        return records
+        return items
 
     # --- navigation messages ---
 
-    def _nav_pvt(self, host_time_ns: int, frame: bytes) -> list[Record]:
+    def _nav_pvt(self, host_time_ns: int, frame: bytes) -> Items:
         message = _checked(ubx.NAV_PVT.decode(frame))
         if len(frame) < ubx.PVT_FLAGS3_FRAME_BYTES:
             message = message._replace(flags3=0)
+        items = self._time_of_pvt(host_time_ns, message, "NAV-PVT")
+        return items + self._add(host_time_ns, "NAV-PVT", message._replace(**self._moved_date(host_time_ns, message)))
+
+    def _nav_pvat(self, host_time_ns: int, frame: bytes) -> Items:
+        message = _checked(ubx.NAV_PVAT.decode(frame))
+        items = self._time_of_pvt(host_time_ns, pvt_of(message), "NAV-PVAT")
+        return items + self._add(host_time_ns, "NAV-PVAT", message._replace(**self._moved_date(host_time_ns, message)))
+
+    def _time_of_pvt(self, host_time_ns: int, message: ubx.NavPvt, name: str) -> Items:
         has_date = message.valid & ubx.PVT_VALID_DATE != 0
         has_time = message.valid & ubx.PVT_VALID_TIME != 0
-        records: list[Record] = []
         self._vouched = has_date and has_time and message.valid & ubx.PVT_FULLY_RESOLVED != 0
-        if has_time:
-            records += self._utc_message(host_time_ns, message, has_date, self._vouched, "NAV-PVT")
-        return records + self._add(host_time_ns, "NAV-PVT", message)
+        return self._utc_message(host_time_ns, message, has_date, self._vouched, name) if has_time else []
 
-    def _nav_timeutc(self, host_time_ns: int, frame: bytes) -> list[Record]:
+    def _moved_date(self, host_time_ns: int, message: ubx.NavPvt | ubx.NavPvat) -> dict[str, int]:
+        """Return year, month and day after the move by roll-overs, as far as they are a date."""
+        if not message.valid & ubx.PVT_VALID_DATE:
+            return {}
+        try:
+            date = self._dates.date(dt.date(message.year, message.month, message.day), host_time_ns)
+        except ValueError:
+            return {}
+        return {"year": date.year, "month": date.month, "day": date.day}
+
+    def _nav_part(self, host_time_ns: int, frame: bytes) -> Items:
+        """Take a message that contributes to its epoch only."""
+        name, layout = NAV_PARTS[frame[2:4]]
+        return self._add(host_time_ns, name, _checked(layout.decode(frame)))
+
+    def _nav_timeutc(self, host_time_ns: int, frame: bytes) -> Items:
         message = _checked(ubx.NAV_TIMEUTC.decode(frame))
         vouched = message.valid & ubx.TIMEUTC_ALL == ubx.TIMEUTC_ALL
         has_date = message.valid & ubx.TIMEUTC_UTC != 0
@@ -145,7 +231,7 @@ class UbxParser(StreamParser):
 
     def _utc_message(
         self, host_time_ns: int, message: ubx.NavPvt | ubx.NavTimeutc, has_date: bool, vouched: bool, name: str
-    ) -> list[Record]:
+    ) -> Items:
         """Return the second of the previous edge in UTC, valid if it agrees with the message's own iTOW."""
         tag = self._utc_tag(host_time_ns, message, has_date)
         agrees = tag.date is None or tag.leap_seconds is not None
@@ -182,7 +268,7 @@ class UbxParser(StreamParser):
             date, milliseconds = date + dt.timedelta(days=1), milliseconds - DAY_MS
         return TimeTag(TimeScale.UTC, milliseconds * MS_NS, date=date, leap_seconds=leap)
 
-    def _nav_timegps(self, host_time_ns: int, frame: bytes) -> list[Record]:
+    def _nav_timegps(self, host_time_ns: int, frame: bytes) -> Items:
         message = _checked(ubx.NAV_TIMEGPS.decode(frame))
         message = message._replace(week=self._dates.week(message.week, host_time_ns))
         has_leap = message.valid & ubx.TIMEGPS_LEAP != 0
@@ -194,12 +280,13 @@ class UbxParser(StreamParser):
         records = self._gps_message(host_time_ns, message.itow_ms, message.week, has_week, vouched, "NAV-TIMEGPS", leap)
         return records + self._add(host_time_ns, "NAV-TIMEGPS", message)
 
-    def _nav_sol(self, host_time_ns: int, frame: bytes) -> list[Record]:
+    def _nav_sol(self, host_time_ns: int, frame: bytes) -> Items:
         message = _checked(ubx.NAV_SOL.decode(frame))
         message = message._replace(week=self._dates.week(message.week, host_time_ns))
         has_week = message.flags & ubx.SOL_WEEK != 0
         vouched = has_week and message.flags & ubx.SOL_TOW != 0
-        return self._gps_message(host_time_ns, message.itow_ms, message.week, has_week, vouched, "NAV-SOL")
+        records = self._gps_message(host_time_ns, message.itow_ms, message.week, has_week, vouched, "NAV-SOL")
+        return records + self._add(host_time_ns, "NAV-SOL", message)
 
     def _gps_message(
         self,
@@ -210,14 +297,14 @@ class UbxParser(StreamParser):
         vouched: bool,
         name: str,
         leap_seconds: int | None = None,
-    ) -> list[Record]:
+    ) -> Items:
         """Return the second of the previous edge by week and time of week of one message."""
         self._vouched = vouched
         tag = TimeTag(TimeScale.GPS, itow_ms * MS_NS, week=week if has_week else None, leap_seconds=leap_seconds)
         valid = vouched and self._week_believed(week)
         return [TimeMessage(host_time_ns, tag, NamesEdge.PREVIOUS, valid=valid, message=name)]
 
-    def _nav_timels(self, host_time_ns: int, frame: bytes) -> list[Record]:
+    def _nav_timels(self, host_time_ns: int, frame: bytes) -> Items:
         message = _checked(ubx.NAV_TIMELS.decode(frame))
         if not message.valid & ubx.TIMELS_CURRENT:
             return []
@@ -227,20 +314,17 @@ class UbxParser(StreamParser):
         valid = self._vouched is not False
         return [TimeMessage(host_time_ns, tag, NamesEdge.PREVIOUS, valid=valid, message="NAV-TIMELS")]
 
-    def _nav_hpposllh(self, host_time_ns: int, frame: bytes) -> list[Record]:
-        return self._add(host_time_ns, "NAV-HPPOSLLH", _checked(ubx.NAV_HPPOSLLH.decode(frame)))
-
-    def _nav_cov(self, host_time_ns: int, frame: bytes) -> list[Record]:
+    def _nav_cov(self, host_time_ns: int, frame: bytes) -> Items:
         message = _checked(ubx.NAV_COV.decode(frame))
         if not all(map(math.isfinite, message)):
             raise MessageError("covariance")
         return self._add(host_time_ns, "NAV-COV", message)
 
-    def _nav_eoe(self, host_time_ns: int, frame: bytes) -> list[Record]:
+    def _nav_eoe(self, host_time_ns: int, frame: bytes) -> Items:
         message = _checked(ubx.NAV_EOE.decode(frame))
-        return self._fixes(self._epochs.end()) if message.itow_ms == self._epochs.key else []
+        return self._merged(self._epochs.end()) if message.itow_ms == self._epochs.key else []
 
-    def _rxm_rawx(self, host_time_ns: int, frame: bytes) -> list[Record]:
+    def _rxm_rawx(self, host_time_ns: int, frame: bytes) -> Items:
         """Return the second of raw measurements, in a stream without navigation messages, which arrive earlier."""
         if self._vouched is not None:
             return []
@@ -256,7 +340,7 @@ class UbxParser(StreamParser):
 
     # --- pulse and event messages ---
 
-    def _tim_tp(self, host_time_ns: int, frame: bytes) -> list[Record]:
+    def _tim_tp(self, host_time_ns: int, frame: bytes) -> Items:
         message = _present(ubx.TIM_TP.decode(frame))
         if message.tow_ms >= WEEK_MS:
             raise MessageError("time of week")
@@ -281,7 +365,7 @@ class UbxParser(StreamParser):
             )
         ]
 
-    def _tim_tm2(self, host_time_ns: int, frame: bytes) -> list[Record]:
+    def _tim_tm2(self, host_time_ns: int, frame: bytes) -> Items:
         message = _present(ubx.TIM_TM2.decode(frame))
         base = message.flags >> ubx.TM2_BASE_SHIFT & ubx.TM2_BASE_MASK
         valid = message.flags & ubx.TM2_TIME_VALID != 0 and base != ubx.TM2_BASE_RECEIVER
@@ -289,7 +373,7 @@ class UbxParser(StreamParser):
             (ubx.TM2_NEW_RISING, True, message.week_rising, message.tow_rising_ms, message.tow_rising_sub_ns),
             (ubx.TM2_NEW_FALLING, False, message.week_falling, message.tow_falling_ms, message.tow_falling_sub_ns),
         )
-        records: list[Record] = []
+        records: Items = []
         for flag, rising, week, tow_ms, sub_ns in edges:
             if not message.flags & flag:
                 continue
@@ -332,12 +416,35 @@ class UbxParser(StreamParser):
             return False
         return True
 
-    def _add(self, host_time_ns: int, name: str, message: NavMessage) -> list[Record]:
-        return self._fixes(self._epochs.add(message.itow_ms, name, (host_time_ns, message))) if self._gathers else []
+    def _add(self, host_time_ns: int, name: str, message: NavMessage) -> Items:
+        if name in POSITION_MESSAGES and self._nmea is not None:
+            self._nmea.ubx_position()
+        return self._merged(self._epochs.add(message.itow_ms, name, (host_time_ns, message))) if self._gathers else []
 
-    def _fixes(self, epochs: list[dict[str, tuple[int, NavMessage]]]) -> list[Record]:
-        floor_week = self._dates.floor_week
-        return [fix for parts in epochs if (fix := merge_epoch(parts, floor_week)) is not None]
+    def _merged(self, epochs: list[dict[str, tuple[int, NavMessage]]]) -> Items:
+        """Return the fix and the attitude of each epoch; an attitude without a week is counted."""
+        items: Items = []
+        for parts in epochs:
+            fix = merge_epoch(parts, self._dates.floor_week)
+            if fix is not None:
+                items.append(fix)
+            row = ins_row(parts, fix, self._dates.floor_week)
+            if row is not None and row.values[1] < 0:
+                self.counters.errors["time_unknown"] += 1
+            elif row is not None:
+                items.append(row)
+        return items
+
+    # --- inertial sensors ---
+
+    def _esf_meas(self, host_time_ns: int, frame: bytes) -> Items:
+        return [*_present(self._sensors.measured(host_time_ns, frame))]
+
+    def _esf_raw(self, host_time_ns: int, frame: bytes) -> Items:
+        return [*_present(self._sensors.raw(host_time_ns, frame))]
+
+    def _esf_ins(self, host_time_ns: int, frame: bytes) -> Items:
+        return [vehicle_motion(host_time_ns, _checked(ubx.ESF_INS.decode(frame)))]
 
 
 def _present(message: _AnyT | None) -> _AnyT:
@@ -359,10 +466,10 @@ DRIVERS = (
         protocol="ubx",
         kind="gnss",
         transports=STREAM_TRANSPORTS,
-        yields=(TimeMessage, GnssFix, EventMark),
-        summary="u-blox binary (NAV-PVT HPPOSLLH COV TIMEGPS TIMELS, TIM-TP TM2), NMEA and RTCM3 beside it",
+        yields=(TimeMessage, GnssFix, EventMark, InsSolution, ImuSamples, DeviceStatus),
+        summary="u-blox binary (NAV-PVT, older NAV, TIM-TP TM2, NAV-ATT, ESF), NMEA and RTCM3 beside it",
         make_parser=UbxParser,
-        make_time_parser=lambda settings: UbxParser(settings, time_only=True),
+        make_time_parser=lambda settings: UbxParser(settings, wanted=(TimeMessage,)),
         startup=startup_messages,
     ),
 )

@@ -12,10 +12,13 @@ from pathlib import Path
 import pytest
 
 from swath.drivers.driver import find_driver
+from swath.drivers.gnss.nmea.sentences import encode_gga
+from swath.drivers.gnss.ubx.messages import RXM_RAWX, RxmRawx
 from swath.drivers.parser import DeviceSettings
 from swath.georef.records import ChunkBatch
 from tests.daemon.builders import CAPTURE, INFO, write_part
 from tests.daemon.commands import swath
+from tests.daemon.exchange.builders import write_config, write_log
 from tests.daemon.rig import Recorder, session_table
 
 ROVER = '[gnss.rover]\ntransport = "serial:{path}?baud=921600"\nprotocol = "novatel"\n'
@@ -50,6 +53,19 @@ def test_numbers_of_a_recording_match_a_direct_parse(tmp_path: Path) -> None:
     assert sum(rover["decoded"]["messages"].values()) > 100
     quick = json.loads(swath("info", "--quick", "--json", str(logs)).stdout)["sessions"][0]
     assert "decoded" not in quick["sources"]["gnss/rover"]
+
+
+def test_messages_are_listed_and_a_silent_second_antenna_is_named(tmp_path: Path) -> None:
+    """Raw measurements and NMEA of a u-blox receiver; the NMEA has no heading."""
+    table = '[session]\nname = "n"\ndirectory = "logs"\n[gnss.rover]\ntransport = "serial:/dev/ttyUSB0?baud=115200"\n'
+    arms = "lever_arm_m = [0.0, -0.5, 0.0]\nsecondary_lever_arm_m = [0.0, 0.5, 0.0]\n"
+    config = write_config(tmp_path, f'{table}protocol = "ubx"\n{arms}')
+    rawx = RXM_RAWX.encode(RxmRawx(302_400.0, 2342, 18, 0, 1))
+    frames = [rawx, encode_gga(0, 0.8, 0.1, 500.0, 48.0), encode_gga(10**9, 0.8, 0.1, 500.0, 48.0)]
+    write_log(tmp_path / "logs", config, [("gnss/rover", at, frame, None) for at, frame in enumerate(frames)])
+    said = swath("info", str(tmp_path / "logs")).stdout
+    assert "gnss/rover: 2 GnssFix, 1 TimeMessage\n  messages: 2 GGA, 1 RXM-RAWX\n" in said
+    assert "note: gnss/rover: sent no heading that this program reads, although secondary_lever_arm_m" in said
 
 
 @pytest.mark.parametrize("columns", [80, 120])

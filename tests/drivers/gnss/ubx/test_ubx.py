@@ -83,7 +83,35 @@ FIELDS: dict[str, tuple[ubx.Layout[Any], dict[str, tuple[str, float]]]] = {
     ),
     "NAV-TIMELS": (ubx.NAV_TIMELS, {"current": ("currLs", 1), "time_to_event_s": ("timeToLsEvent", 1)}),
     "NAV-COV": (ubx.NAV_COV, {"pos_nn": ("posCovNN", 1), "pos_ed": ("posCovED", 1), "vel_dd": ("velCovDD", 1)}),
-    "NAV-SOL": (ubx.NAV_SOL, {"week": ("week", 1), "ftow_ns": ("fTOW", 1)}),
+    "NAV-SOL": (
+        ubx.NAV_SOL,
+        {
+            "week": ("week", 1),
+            "ftow_ns": ("fTOW", 1),
+            "fix_type": ("gpsFix", 1),
+            "x_cm": ("ecefX", 1),
+            "z_cm": ("ecefZ", 1),
+            "position_accuracy_cm": ("pAcc", 1),
+            "vz_cmps": ("ecefVZ", 1),
+            "speed_accuracy_cmps": ("sAcc", 1),
+            "pdop_1e2": ("pDOP", 1e2),
+            "satellites": ("numSV", 1),
+        },
+    ),
+    "NAV-STATUS": (ubx.NAV_STATUS, {"fix_type": ("gpsFix", 1)}),
+    "NAV-POSLLH": (
+        ubx.NAV_POSLLH,
+        {
+            "lat_1e7_deg": ("lat", 1e7),
+            "lon_1e7_deg": ("lon", 1e7),
+            "height_mm": ("height", 1),
+            "vertical_accuracy_mm": ("vAcc", 1),
+        },
+    ),
+    "NAV-VELNED": (
+        ubx.NAV_VELNED,
+        {"vel_n_cmps": ("velN", 1), "vel_d_cmps": ("velD", 1), "speed_accuracy_cmps": ("sAcc", 1)},
+    ),
     "TIM-TP": (ubx.TIM_TP, {"tow_ms": ("towMS", 1), "week": ("week", 1), "quantisation_ps": ("qErr", 1)}),
 }
 
