@@ -30,8 +30,9 @@ from swath.drivers.framing.kinds import GNSS_KINDS
 from swath.drivers.imu.canmod_gps import CanmodGpsParser
 from swath.drivers.imu.dbc.parser import DbcParser
 from swath.drivers.parser import DeviceSettings, Parser, ParserCounters
-from swath.drivers.scanner.hesai.heads import QT64, XT32
-from swath.drivers.scanner.hesai.parser import HesaiParser
+from swath.drivers.scanner.hesai.heads import MODE_FIRST_LAST_STRONGEST, HesaiHead
+from swath.drivers.scanner.hesai.models import QT64, QT128, XT16, XT32, XT32M2X
+from swath.drivers.scanner.hesai.parser import HesaiParser, with_checksums
 from swath.drivers.scanner.ouster.layout import LidarLayout
 from swath.drivers.scanner.ouster.parser import OusterParser
 from swath.drivers.scanner.srep.layout import SrepHeader, encode_datagram
@@ -168,17 +169,36 @@ def head_figure(
 
 
 def measure_hesai(repeats: int) -> Iterator[Figure]:
-    """Measure PandarXT-32 and PandarQT in dual return, with real packets and a continuous sequence."""
+    """Measure Hesai heads with real packets in dual return and a continuous sequence, and one with three returns."""
     for name, head, recording in (
         ("PandarXT-32, dual return", XT32, "nebula_xt32.pcap.gz"),
+        ("PandarXT-16, dual return", XT16, "nebula_xt16.pcap.gz"),
+        ("XT32M2X, dual return", XT32M2X, "nebula_xt32m.pcap.gz"),
         ("PandarQT, dual return", QT64, "nebula_qt64.pcap.gz"),
+        ("QT128C2X, dual return, CRC", QT128, "nebula_qt128.pcap.gz"),
     ):
-        packets = [unit.data for unit in read_pcap(FIXTURES / "hesai" / recording)]
-        units = np.frombuffer(b"".join(packets), dtype=np.uint8).reshape(len(packets), -1)
-        units = np.tile(units, (max(1, 3600 // len(units)), 1))
-        units.view(head.packet_dtype())["sequence"][:, 0] = np.arange(1, len(units) + 1)
-        settings = DeviceSettings("scanner/bench")
-        yield head_figure(name, partial(HesaiParser, head=head), settings, units, 10e6, repeats)
+        units = hesai_units(head, recording)
+        yield hesai_figure(name, head, units, repeats)
+        if head is XT32M2X:
+            packets = units.view(head.packet_dtype())[:, 0]
+            packets["mode"] = MODE_FIRST_LAST_STRONGEST
+            packets["blocks"]["azimuth"] = np.repeat(packets["blocks"]["azimuth"][:, ::3], 3, axis=1)
+            yield hesai_figure("XT32M2X, three returns", head, units, repeats)
+
+
+def hesai_units(head: HesaiHead, recording: str) -> ByteRows:
+    """Return a recording's packets, repeated several times with continuous sequence numbers and the CRCs of that."""
+    packets = [unit.data for unit in read_pcap(FIXTURES / "hesai" / recording)]
+    once = np.frombuffer(b"".join(packets), dtype=np.uint8).reshape(len(packets), -1)
+    units, dtype = np.tile(once, (max(1, 3600 // len(once)), 1)), head.packet_dtype()
+    units.view(dtype)["sequence"][:, 0] = np.arange(1, len(units) + 1)
+    sealed = b"".join(with_checksums(unit.tobytes(), dtype) for unit in units)
+    return np.frombuffer(bytearray(sealed), dtype=np.uint8).reshape(units.shape)
+
+
+def hesai_figure(name: str, head: HesaiHead, units: ByteRows, repeats: int) -> Figure:
+    """Measure one Hesai head."""
+    return head_figure(name, partial(HesaiParser, head=head), DeviceSettings("scanner/bench"), units, 10e6, repeats)
 
 
 def velodyne_units(name: str, step_us: float) -> ByteRows:

@@ -39,9 +39,10 @@ from swath.daemon.processing.live.products import Thinning
 from swath.daemon.processing.setup.setup import Options, Setup
 from swath.drivers.driver import find_driver
 from swath.drivers.parser import DeviceSettings, Parser
-from swath.drivers.scanner.hesai.heads import XT32
-from swath.drivers.scanner.hesai.parser import MODE_LAST_STRONGEST, encode_point_packet
-from swath.drivers.scanner.hesai.parser import MODE_STRONGEST as HESAI_STRONGEST
+from swath.drivers.scanner.hesai.heads import MODE_LAST_STRONGEST
+from swath.drivers.scanner.hesai.heads import MODE_STRONGEST as HESAI_STRONGEST
+from swath.drivers.scanner.hesai.models import XT32
+from swath.drivers.scanner.hesai.parser import encode_point_packet
 from swath.drivers.scanner.ouster.parser import OusterParser
 from swath.drivers.scanner.srep.layout import SrepHeader, encode_datagram
 from swath.drivers.scanner.velodyne.parser import MODE_DUAL, MODE_STRONGEST, encode_data_packet

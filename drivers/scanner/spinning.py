@@ -1,4 +1,4 @@
-"""Common parts of packets of spinning heads of all makers: firings of one return mode, single or in pairs."""
+"""Common parts of packets of spinning heads of all makers: firings of one return mode, with one to three returns."""
 
 from __future__ import annotations
 
@@ -13,15 +13,16 @@ from swath.drivers.scanner.rows.slots import (
     BLOCK_SLOTS,
     Chosen,
     Fill,
-    PairRule,
+    FlagRule,
     ReturnSlots,
     common_words,
     in_order,
     returns_table,
 )
-from swath.georef.arrays import ByteArray, FloatArray, Int64Array, StructArray
+from swath.georef.arrays import FloatArray, Int64Array, StructArray
 
-# A return as one 32-bit number: range, reflectivity, and 1 for a pair's second. ``strength`` omits the range.
+# A return as one 32-bit number: range, reflectivity, and its block's number of the firing's. ``strength`` omits the
+# range.
 _CONTENT = np.dtype(
     {
         "names": ["strength", "intensity", "range"],
@@ -37,8 +38,8 @@ class Firings:
     """The firings of consecutive packets of one return mode, in order: rounds of all lasers.
 
     Attributes:
-        returns: (packets, blocks, places), fields ``range`` and ``reflectivity``; in dual return a firing's first and
-            second return are in neighbouring blocks.
+        returns: (packets, blocks, places), fields ``range`` and ``reflectivity``; several returns of a firing are in
+            neighbouring blocks.
         range_unit_m: metres of one unit of range.
         host_time_ns: (packets,) host time of each packet.
         number: (packets,) running number of each packet.
@@ -48,7 +49,8 @@ class Firings:
         azimuth_rad: makes the azimuth of each firing in the same way.
         channel: (lasers,) channels of a round.
         flags: flags of all returns.
-        pair: in dual return, whether one of the two is the strongest and whether one is the last return; else None.
+        echoes: number of blocks that a firing's returns take: 1, 2 or 3.
+        names: where there are several, whether one of them is the strongest and whether one is the last return.
     """
 
     returns: StructArray
@@ -60,11 +62,12 @@ class Firings:
     azimuth_rad: Callable[[Chosen], FloatArray]
     channel: NDArray[np.uint16]
     flags: int
-    pair: tuple[bool, bool] | None
+    echoes: int = 1
+    names: tuple[bool, bool] = (False, False)
 
     def slots(self) -> ReturnSlots:
         """Return the slots of these firings."""
-        content = single_content(self.returns) if self.pair is None else pair_content(self.returns)
+        content = _CONTENT_OF[self.echoes](self.returns)
         packets, lasers = len(self.number), len(self.channel)
         rounds = len(content) // (packets * lasers)
         host_time_ns = np.repeat(self.host_time_ns, rounds)[:, np.newaxis]
@@ -79,15 +82,17 @@ class Firings:
                 "device_time_ns": self.device_time_ns,
                 "encoder_rad": self.azimuth_rad,
             },
-            pair=None if self.pair is None else PairRule(_strength, *self.pair),
+            rule=None if self.echoes == 1 else FlagRule(_strength, *self.names),
         )
 
 
-def returns_of_packets(mode: ByteArray, most: int, firings_of: Callable[[slice], Firings], fill: Fill) -> StructArray:
+def returns_of_packets(
+    mode: NDArray[np.integer], most: int, firings_of: Callable[[slice], Firings], fill: Fill
+) -> StructArray:
     """Decode the returns of all packets in order, in blocks of one return mode.
 
     Args:
-        mode: (n,) return mode of each packet.
+        mode: (n,) return mode of each packet, and what else is one for a block.
         most: maximum number of returns in a packet.
         firings_of: makes the firings of a slice of the packets.
         fill: writes their rows.
@@ -114,18 +119,39 @@ def pair_content(returns: StructArray) -> StructArray:
     Equal ranges are one return, the first block's. The return of greater reflectivity is the stronger, the second
     block's where they are equal, since a head sends the second strongest beside a strongest that is also the other.
     """
-    one, other = _as_numbers(returns[:, 0::2]), _as_numbers(returns[:, 1::2], second=1)
+    one, other = _as_numbers(returns[:, 0::2]), _as_numbers(returns[:, 1::2], block=1)
     other *= one ^ other > 0xFFFF
     return in_order(one, other).view(_CONTENT)
 
 
-def _as_numbers(returns: StructArray, second: int = 0) -> NDArray[np.uint32]:
+def triple_content(returns: StructArray) -> StructArray:
+    """Convert triple returns (packets, blocks, lasers), three in neighbouring blocks, to slots (firings, 3) by rising
+    range.
+
+    Equal ranges are one return, that of the latest block, which is the one that names the strongest.
+    """
+    one, two, three = (_as_numbers(returns[:, at::3], at) for at in range(3))
+    one *= (one ^ two > 0xFFFF) & (one ^ three > 0xFFFF)
+    two *= two ^ three > 0xFFFF
+    slots = np.empty((len(one), 3), dtype=np.uint32)
+    near, far = np.minimum(one, two), np.maximum(one, two)
+    np.minimum(near, three, out=slots[:, 0])
+    middle = np.maximum(near, three)
+    np.minimum(middle, far, out=slots[:, 1])
+    np.maximum(middle, far, out=slots[:, 2])
+    return slots.view(_CONTENT)
+
+
+_CONTENT_OF = {1: single_content, 2: pair_content, 3: triple_content}
+
+
+def _as_numbers(returns: StructArray, block: int = 0) -> NDArray[np.uint32]:
     """Pack each return as `_CONTENT` into one number, flat; sorting numbers takes half as long as writing fields."""
     number = returns["range"].astype(np.uint32).reshape(-1)
     strength = returns["reflectivity"].astype(np.uint16).reshape(-1)
     number <<= 16
     strength <<= 8
-    strength |= second
+    strength |= block
     number |= strength
     return number
 

@@ -350,6 +350,7 @@ def test_frames_of_a_candump_log_match_the_loggers_own_file(name: str, tmp_path:
     [
         ("hesai", "nebula_qt64", 4),
         ("hesai", "nebula_xt32", 4),
+        ("hesai", "nebula_qt128", 2),
         ("velodyne", "nebula_vlp16", 4),
         ("velodyne", "nebula_vlp32", 5),
     ],

@@ -36,7 +36,8 @@ Protocols = tuple[tuple[DeviceKind, str], ...]
 
 def device_file_targets() -> Iterator[tuple[str, Callable[[], Target]]]:
     """Return the targets of device files, each with the drivers that read such a file."""
-    yield "geometry-hesai", partial(_files, "geometry-hesai", (("scanner", "hesai-xt32"), ("scanner", "hesai-qt64")))
+    hesai: Protocols = (("scanner", "hesai-xt32"), ("scanner", "hesai-qt64"), ("scanner", "hesai-qt128"))
+    yield "geometry-hesai", partial(_files, "geometry-hesai", hesai)
     yield "geometry-ouster", partial(_files, "geometry-ouster", (("scanner", "ouster"),))
     heads: Protocols = (("scanner", "velodyne-vlp16"), ("scanner", "velodyne-vlp32c"))
     yield "geometry-velodyne", partial(_files, "geometry-velodyne", heads)

@@ -7,10 +7,14 @@ import struct
 import zlib
 from collections.abc import Callable, Sequence
 
+import numpy as np
+
 from swath.drivers.framing import kinds as frame_kinds
 from swath.drivers.framing.checksums import crc16_ccitt, crc24q, crc32_novatel, nmea_xor, ubx_fletcher
 from swath.drivers.framing.framer import FrameKind, Framer
 from swath.drivers.parser import ParserCounters
+from swath.drivers.scanner.hesai.models import QT128
+from swath.drivers.scanner.hesai.parser import with_checksums
 from tests.fuzz.mutation import LARGEST_CASE_BYTES, bounds, damage
 
 KINDS: dict[str, FrameKind] = {kind.name: kind for kind in vars(frame_kinds).values() if isinstance(kind, FrameKind)}
@@ -193,12 +197,24 @@ def crc64_xz(data: bytes) -> int:
     return crc ^ ((1 << 64) - 1)
 
 
+HESAI_HEADS = (QT128,)
 TAILS: tuple[tuple[int, Callable[[bytes], int]], ...] = ((4, zlib.crc32), (8, crc64_xz))
 
 
+def _hesai_layouts(sample: Sequence[bytes]) -> list[np.dtype[np.void]]:
+    """The layout of a Hesai head with CRCs that these datagrams have."""
+    dtypes = (layout.dtype for head in HESAI_HEADS for layout in head.layouts().values())
+    fit = [dtype for dtype in dtypes if sample and {len(one) for one in sample} == {dtype.itemsize}]
+    return [dtype for dtype in fit if all(with_checksums(one, dtype) == one for one in sample)][:1]
+
+
 def tail_of(datagrams: Sequence[bytes]) -> Callable[[bytes], bytes]:
-    """What makes a changed datagram good again: the checksum that the recorded ones are seen to end in, if any."""
+    """What makes a changed datagram good again: the checksum that the recorded ones are seen to end in, if any, or the
+    two within those of a Hesai head.
+    """
     sample = [datagram for datagram in datagrams[:8] if len(datagram) > 16]
+    for dtype in _hesai_layouts(sample):
+        return lambda datagram: with_checksums(datagram, dtype) if len(datagram) == dtype.itemsize else datagram
     for width, checksum in TAILS:
         if sample and all(checksum(one[:-width]) == int.from_bytes(one[-width:], "little") for one in sample):
             return lambda datagram: datagram[:-width] + checksum(datagram[:-width]).to_bytes(width, "little")

@@ -6,6 +6,7 @@ The harness itself is tested too: sealed frames are good ones, and planted defec
 from __future__ import annotations
 
 import csv
+import datetime as dt
 import random
 import traceback
 from collections.abc import Callable, Iterator
@@ -18,9 +19,11 @@ from swath.drivers.framing import framer as framing
 from swath.drivers.framing.framer import Framer
 from swath.drivers.gnss.ubx.parser import UbxParser
 from swath.drivers.parser import DeviceSettings, ParserCounters
+from swath.drivers.scanner.hesai.models import QT128
+from swath.drivers.scanner.hesai.parser import HesaiParser, encode_point_packet
 from swath.georef.records import Chunk
 from tests.fuzz.engine import Target, check, fuzz
-from tests.fuzz.frames import KINDS, SEALS, FramePool, mutate_stream, split_frames
+from tests.fuzz.frames import KINDS, SEALS, FramePool, mutate_stream, split_frames, tail_of
 from tests.fuzz.mcap_parts import MESSAGE, take_apart
 from tests.fuzz.mutation import damage
 from tests.fuzz.parsers import unpack
@@ -67,6 +70,16 @@ def test_a_sealed_frame_is_valid(kind: str) -> None:
         assert KINDS[kind].measure(frame, 0, True) == len(frame)
         assert KINDS[kind].intact(frame)
         assert split_frames(b"\0" + frame) == [("", b"\0"), (kind, frame)]
+
+
+def test_a_changed_datagram_of_a_hesai_head_is_sealed_again() -> None:
+    """Its two CRCs lie within it, where a seal at the end would not reach."""
+    good = encode_point_packet(dt.datetime(2026, 4, 15, tzinfo=dt.UTC), 0, 5_000, 7, head=QT128)
+    changed = good[:100] + b"\x07" + good[101:1070] + b"\x09" + good[1071:]
+    parsers = [HesaiParser(DeviceSettings("scanner/left"), QT128) for _ in range(2)]
+    for parser, unit in zip(parsers, (changed, tail_of([good])(changed)), strict=True):
+        parser.feed(Chunk("scanner/left", 0, unit))
+    assert [parser.counters.bad_checksums for parser in parsers] == [1, 0]
 
 
 def test_a_log_taken_apart_is_reassembled_unchanged() -> None:

@@ -1,6 +1,6 @@
-"""Hesai spinning heads of protocols 3.1 (PandarQT) and 6.1 (PandarXT-32): point cloud and GPS data packets.
+"""Hesai spinning heads: point cloud and GPS data packets.
 
-Wire format: the models' user manuals, 3.1.2 and Appendix II (`swath.drivers.scanner.hesai.heads`), 3.2
+Wire format: the models' user manuals, 3.1.2 and Appendix II (`swath.drivers.scanner.hesai.models`), 3.2
 (`swath.drivers.scanner.hesai.gps`). Device time is nanoseconds since 1970 of the UTC in the packets, without leap
 seconds; until the head receives a time, it counts from a virtual date. Its microseconds restart at each edge of its
 1 Hz signal, so while the head reports that this signal is locked to the PPS, the beginning of its second is the latched
@@ -12,16 +12,27 @@ Azimuths are extrapolated from the block's firing to the channel's own with the 
 from __future__ import annotations
 
 import datetime as dt
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
+from fastcrc.crc32 import mpeg_2
 from numpy.typing import ArrayLike, NDArray
 
 from swath.drivers.driver import Driver
 from swath.drivers.parser import DeviceSettings, PacketParser, Parser
 from swath.drivers.scanner.beams import BeamTable
 from swath.drivers.scanner.hesai.gps import GPS_BYTES, NS, GpsReader
-from swath.drivers.scanner.hesai.heads import QT64, XT32, HesaiHead, read_angle_file
+from swath.drivers.scanner.hesai.heads import (
+    MODE_STRONGEST,
+    SEQUENCE,
+    SEVERAL_NAMES,
+    SINGLE_FLAGS,
+    HesaiHead,
+    Layout,
+    echoes_of,
+    read_angle_file,
+)
+from swath.drivers.scanner.hesai.models import QT64, QT128, XT16, XT32, XT32M2X
 from swath.drivers.scanner.rows.filler import filler
 from swath.drivers.scanner.rows.slots import Chosen
 from swath.drivers.scanner.sequence import SampleThinner, SequenceTracker
@@ -29,9 +40,7 @@ from swath.drivers.scanner.spinning import Firings, returns_of_packets
 from swath.georef.arrays import BoolArray, ByteArray, FloatArray, Int64Array, StructArray
 from swath.georef.records import (
     DEVICE_CLOCK_DTYPE,
-    RETURN_FLAG_LAST,
     RETURN_FLAG_PPS_LOCKED,
-    RETURN_FLAG_STRONGEST,
     ByteRows,
     DeviceClockSamples,
     DeviceStatus,
@@ -41,17 +50,8 @@ from swath.georef.records import (
 )
 
 SOP = 0xFFEE
-DISTANCE_UNIT_MM = 4
 FULL_CIRCLE = 36_000  # azimuth in 0.01°
 MAX_MICROSECOND = 1_999_999  # the manuals' range ends at 1 000 000; a head may count on until a late edge
-MODE_FIRST, MODE_STRONGEST, MODE_LAST = 0x33, 0x37, 0x38
-MODE_LAST_STRONGEST, MODE_LAST_FIRST, MODE_FIRST_STRONGEST = 0x39, 0x3B, 0x3C
-SINGLE_FLAGS = {MODE_FIRST: 0, MODE_STRONGEST: RETURN_FLAG_STRONGEST, MODE_LAST: RETURN_FLAG_LAST}
-DUAL_NAMES = {  # by mode: includes the strongest, includes the last
-    MODE_LAST_STRONGEST: (True, True),
-    MODE_LAST_FIRST: (False, True),
-    MODE_FIRST_STRONGEST: (True, False),
-}
 _UTC = np.dtype([(name, "u1") for name in ("year", "month", "day", "hour", "minute", "second")])
 _RAD_PER_NS_AT_1_RPM = 2 * np.pi / (60 * NS)
 
@@ -66,31 +66,69 @@ def encode_point_packet(
     head: HesaiHead = XT32,
     sequence: int | None = 1,
     motor_rpm: int = 600,
+    tail: Mapping[str, int] | None = None,
 ) -> bytes:
     """Encode one point cloud packet.
 
     Args:
         time: the packet's own time, UTC.
-        azimuth_0p01deg: (blocks,), in dual return pairs of equal ones.
-        range_raw: (blocks, channels) in 4 mm, 0 = no return.
+        azimuth_0p01deg: (blocks,), equal ones for the blocks of a round.
+        range_raw: (blocks, channels) in the head's first unit, 0 = no return.
         reflectivity: (blocks, channels) or one value for all.
         mode: ``MODE_…``.
         head: the model.
         sequence: UDP sequence number; None where the head sends none.
         motor_rpm: speed of rotation.
+        tail: other fields of the tail, by name.
     """
-    packet = np.zeros(1, dtype=head.packet_dtype(sequence=sequence is not None))
-    packet["sop"], packet["protocol_major"], packet["protocol_minor"] = SOP, head.protocol_major, 1
-    packet["laser_num"], packet["block_num"], packet["distance_unit_mm"] = head.channels, head.blocks, DISTANCE_UNIT_MM
-    packet["return_num"], packet["flags"] = 2 if mode in DUAL_NAMES else 1, sequence is not None
+    flags = head.flags & ~SEQUENCE | (0 if sequence is None else SEQUENCE)
+    packet = np.zeros(1, dtype=head.packet_dtype(flags))
+    utc = bytes((time.year - 1900, time.month, time.day, time.hour, time.minute, time.second))
+    fields: dict[str, object] = {
+        "sop": SOP,
+        "protocol_major": head.protocol_major,
+        "protocol_minor": head.protocol_minor,
+        "laser_num": head.channels,
+        "block_num": head.blocks,
+        "distance_unit_mm": head.units_mm[0],
+        "return_num": echoes_of(mode),
+        "flags": flags,
+        "mode": mode,
+        "motor_rpm": motor_rpm,
+        "utc": np.void(utc),
+        "microsecond": time.microsecond,
+        "factory": 0x42,
+        **(tail or {}),
+    }
+    for name, value in fields.items():
+        packet[name] = value
     packet["blocks"]["azimuth"] = azimuth_0p01deg
     packet["blocks"]["returns"]["range"], packet["blocks"]["returns"]["reflectivity"] = range_raw, reflectivity
-    utc = bytes((time.year - 1900, time.month, time.day, time.hour, time.minute, time.second))
-    packet["mode"], packet["motor_rpm"], packet["utc"] = mode, motor_rpm, np.void(utc)
-    packet["microsecond"], packet["factory"] = time.microsecond, 0x42
     if sequence is not None:
         packet["sequence"] = sequence
-    return packet.tobytes()
+    return with_checksums(packet.tobytes(), packet.dtype)
+
+
+def with_checksums(packet: bytes, dtype: np.dtype[np.void]) -> bytes:
+    """Return a packet with the CRCs, if it has any, that belong to its content."""
+    made = bytearray(packet)
+    for start, at in checked_parts(dtype):
+        made[at : at + 4] = mpeg_2(packet[start:at]).to_bytes(4, "little")
+    return bytes(made)
+
+
+def checked_parts(dtype: np.dtype[np.void]) -> list[tuple[int, int]]:
+    """Return the first byte of each part of a packet that a CRC follows, and the CRC's own.
+
+    CRC-32/MPEG-2 of the blocks, and of the tail from behind the functional safety (as seen in the recording of a
+    QT128C2X; the manuals do not say which CRC it is).
+    """
+    fields = dtype.fields
+    assert fields is not None
+    if "body_crc" not in fields:
+        return []
+    starts = (("blocks", "body_crc"), ("tail_reserved", "tail_crc"))
+    return [(int(fields[start][1]), int(fields[crc][1])) for start, crc in starts]
 
 
 class HesaiParser(PacketParser):
@@ -98,7 +136,8 @@ class HesaiParser(PacketParser):
 
     Counts ``bad_length``, ``bad_header``, ``wrong_product`` (another model answers), ``bad_return_mode``,
     ``bad_azimuth``, ``bad_time``, ``bad_gps``, ``date_before_floor``, and of the UDP sequence ``sequence_gap``,
-    ``out_of_order``, ``duplicate`` and ``restart`` (the head's time went back).
+    ``out_of_order``, ``duplicate`` and ``restart`` (the head's time went back); packets whose CRC is wrong are
+    ``bad_checksums``.
 
     Args:
         settings: ``geometry.file`` is the head's own angle correction file.
@@ -115,8 +154,7 @@ class HesaiParser(PacketParser):
         self.beams: BeamTable = head.beams
         if "geometry" in settings.files:
             self.beams = read_angle_file(settings.files["geometry"], head)
-        whole, short = head.packet_dtype(), head.packet_dtype(sequence=False)
-        self._dtypes = {whole.itemsize: whole} | ({short.itemsize: short} if head.without_sequence else {})
+        self._layouts = head.layouts()
         self._gps = GpsReader(self.counters, settings)
         self._tracker = SequenceTracker(self.counters.errors)
         self._thinner = SampleThinner() if clock_only else None
@@ -129,12 +167,13 @@ class HesaiParser(PacketParser):
         length = units.shape[1]
         if length == GPS_BYTES:
             return self._gps.read(host_time_ns, units)
-        if length not in self._dtypes:
+        if length not in self._layouts:
             self._refuse("bad_length", len(units), length)
             return []
-        packets = units.view(self._dtypes[length])[:, 0]
+        layout = self._layouts[length]
+        packets = units.view(layout.dtype)[:, 0]
         second_ns = NS * _utc_seconds(packets)
-        good = self._check(packets)
+        good = self._check(packets, self._checksums_hold(units, layout), layout)
         self.counters.messages["points"] += int(good.sum())
         self.counters.bytes_framed += int(good.sum()) * length
         if not good.all():
@@ -151,11 +190,21 @@ class HesaiParser(PacketParser):
         """Return remarks on the dates that the head received."""
         return self._gps.dates.remarks()
 
-    def _check(self, packets: StructArray) -> BoolArray:
-        """Return (n,) True for packets of this model that can be decoded; the others are counted by error."""
+    def _checksums_hold(self, units: ByteRows, layout: Layout) -> BoolArray:
+        """Return (n,) False for packets of this head whose CRCs are wrong; they are counted."""
+        holds = np.ones(len(units), dtype=np.bool_)
+        for start, at in checked_parts(layout.dtype):
+            stated = np.ascontiguousarray(units[:, at : at + 4]).view("<u4")[:, 0].tolist()
+            for row in np.flatnonzero(holds).tolist():
+                holds[row] = mpeg_2(units[row, start:at].data) == stated[row]
+        wrong = len(holds) - int(holds.sum())
+        self.counters.bad_checksums += wrong
+        self.counters.bytes_skipped += wrong * units.shape[1]
+        return holds
+
+    def _check(self, packets: StructArray, good: BoolArray, layout: Layout) -> BoolArray:
+        """Return (n,) True for good packets of this model that can be decoded; the others are counted by error."""
         head, utc = self._head, packets["utc"].copy().view(_UTC)
-        good = np.ones(len(packets), dtype=np.bool_)
-        numbered = "sequence" in (packets.dtype.names or ())
         for code, passes in (
             ("bad_header", packets["sop"] == SOP),
             ("wrong_product", packets["protocol_major"] == head.protocol_major),
@@ -163,10 +212,10 @@ class HesaiParser(PacketParser):
                 "bad_header",
                 (packets["laser_num"] == head.channels)
                 & (packets["block_num"] == head.blocks)
-                & (packets["distance_unit_mm"] == DISTANCE_UNIT_MM)
-                & (packets["flags"] & 1 == numbered),
+                & np.isin(packets["distance_unit_mm"], head.units_mm)
+                & layout.fits[packets["flags"]],
             ),
-            ("bad_return_mode", np.isin(packets["mode"], [*SINGLE_FLAGS, *DUAL_NAMES])),
+            ("bad_return_mode", np.isin(packets["mode"], head.modes)),
             ("bad_azimuth", (packets["blocks"]["azimuth"] < FULL_CIRCLE).all(axis=1)),
             (
                 "bad_time",
@@ -206,7 +255,7 @@ class HesaiParser(PacketParser):
         records: list[Record] = [DeviceClockSamples(clock)] if len(clock) else []
         if self._thinner is None:
             rows = returns_of_packets(
-                packets["mode"],
+                packets["mode"].astype(np.uint16) << 8 | packets["distance_unit_mm"],
                 self._head.blocks * self._head.channels,
                 lambda part: self._firings(host_time_ns[part], packets[part], stamp_ns[part], number[part]),
                 self._fill,
@@ -221,14 +270,11 @@ class HesaiParser(PacketParser):
         """Return one `DEVICE_CLOCK_DTYPE` row a packet: device time of its last firing, and the edge that began its
         second.
         """
-        head = self._head
-        last_ns = [
-            int(head.round_start_ns(rounds)[-1] + head.offset_ns.max()) for rounds in (head.blocks, head.blocks // 2)
-        ]
-        dual = np.isin(mode, list(DUAL_NAMES))
+        last_ns = np.zeros(256, dtype=np.int64)
+        last_ns[list(self._head.modes)] = [self._head.last_ns(one) for one in self._head.modes]
         rows = np.empty(len(stamp_ns), dtype=DEVICE_CLOCK_DTYPE)
         rows["host_time_ns"] = host_time_ns
-        rows["device_time_ns"] = stamp_ns + np.where(dual, last_ns[1], last_ns[0])
+        rows["device_time_ns"] = stamp_ns + last_ns[mode]
         rows["pps_time_ns"] = second_ns if self._gps.locked == 1 else -1
         rows["pps_count"] = -1
         rows["locked"] = self._gps.locked
@@ -237,33 +283,37 @@ class HesaiParser(PacketParser):
     def _firings(
         self, host_time_ns: Int64Array, packets: StructArray, stamp_ns: Int64Array, number: Int64Array
     ) -> Firings:
-        """Return the firings of packets of one return mode."""
+        """Return the firings of packets of one return mode and one unit of distance."""
         head, mode = self._head, int(packets["mode"][0])
-        azimuth = packets["blocks"]["azimuth"][:, :: 2 if mode in DUAL_NAMES else 1]
-        round_ns = (stamp_ns[:, np.newaxis] + head.round_start_ns(azimuth.shape[1])).reshape(-1, 1)
+        echoes = echoes_of(mode)
+        azimuth = packets["blocks"]["azimuth"][:, ::echoes]
+        rounds = azimuth.shape[1]
+        round_ns = (stamp_ns[:, np.newaxis] + head.round_start_ns(rounds)).reshape(-1, 1)
+        firing_ns = head.firing_ns(packets, rounds)
         return Firings(
             returns=packets["blocks"]["returns"],
-            range_unit_m=DISTANCE_UNIT_MM * 1e-3,
+            range_unit_m=int(packets["distance_unit_mm"][0]) * 1e-3,
             host_time_ns=host_time_ns,
             number=number,
             most=head.blocks * head.channels,
-            device_time_ns=lambda at: at(round_ns) + at(head.offset_ns[np.newaxis]),
-            azimuth_rad=_azimuths(azimuth, packets["motor_rpm"], head),
+            device_time_ns=lambda at: at(round_ns) + at(firing_ns),
+            azimuth_rad=_azimuths(azimuth, packets["motor_rpm"], firing_ns),
             channel=np.arange(head.channels, dtype=np.uint16),
             flags=SINGLE_FLAGS.get(mode, 0) | (RETURN_FLAG_PPS_LOCKED if self._gps.locked == 1 else 0),
-            pair=DUAL_NAMES.get(mode),
+            echoes=echoes,
+            names=SEVERAL_NAMES.get(mode, (False, False)),
         )
 
 
 def _azimuths(
-    azimuth: NDArray[np.uint16], motor_rpm: NDArray[np.uint16], head: HesaiHead
+    azimuth: NDArray[np.uint16], motor_rpm: NDArray[np.uint16], firing_ns: Int64Array
 ) -> Callable[[Chosen], FloatArray]:
-    """Return a function for the azimuths at each firing, radians, 0 … 2π, from those of rounds (n, rounds) and channel
-    times.
+    """Return a function for the azimuths at each firing, radians, 0 … 2π, from those of rounds (n, rounds) and times of
+    firings.
     """
     start = (azimuth * (2 * np.pi / FULL_CIRCLE)).reshape(-1, 1)
     speed = np.repeat(motor_rpm * _RAD_PER_NS_AT_1_RPM, azimuth.shape[1])[:, np.newaxis]
-    offset_ns = head.offset_ns.astype(np.float64)[np.newaxis]
+    offset_ns = firing_ns.astype(np.float64)
 
     def made_of(at: Chosen) -> FloatArray:
         angle = at(speed) * at(offset_ns)
@@ -302,12 +352,13 @@ def _maker(head: HesaiHead, *, clock_only: bool) -> Callable[[DeviceSettings], P
 
 
 def _driver(protocol: str, head: HesaiHead) -> Driver:
+    most = {2: "two", 3: "three"}[max(map(echoes_of, head.modes))]
     return Driver(
         protocol=protocol,
         kind="scanner",
         transports=("udp",),
         yields=(ScannerReturns, DeviceClockSamples, TimeMessage, DeviceStatus),
-        summary=f"Hesai {head.name}: single and dual return, GPS data packets with time and PPS lock",
+        summary=f"Hesai {head.name}: one to {most} returns, GPS data packets with time and PPS lock",
         make_parser=_maker(head, clock_only=False),
         make_time_parser=_maker(head, clock_only=True),
         needs=("installation",),
@@ -316,4 +367,10 @@ def _driver(protocol: str, head: HesaiHead) -> Driver:
     )
 
 
-DRIVERS = (_driver("hesai-xt32", XT32), _driver("hesai-qt64", QT64))
+DRIVERS = (
+    _driver("hesai-xt32", XT32),
+    _driver("hesai-xt16", XT16),
+    _driver("hesai-xt32m2x", XT32M2X),
+    _driver("hesai-qt64", QT64),
+    _driver("hesai-qt128", QT128),
+)

@@ -35,7 +35,7 @@ from swath.drivers.scanner.ouster.layout import (
     crc_holds,
 )
 from swath.drivers.scanner.rows.filler import filler
-from swath.drivers.scanner.rows.slots import BLOCK_SLOTS, PairRule, ReturnSlots, common_words, in_order, returns_table
+from swath.drivers.scanner.rows.slots import BLOCK_SLOTS, FlagRule, ReturnSlots, common_words, in_order, returns_table
 from swath.drivers.scanner.sequence import SampleThinner, SequenceTracker
 from swath.georef.arrays import BoolArray, Int64Array, StructArray, UInt64Array
 from swath.georef.records import (
@@ -145,7 +145,7 @@ class OusterParser(PacketParser):
         ordered = self.head.return_order == "STRONGEST_TO_WEAKEST"
         self._light = "SIGNAL" if "SIGNAL" in self.layout.profile.fields else "REFLECTIVITY"
         says_strongest = ordered or self._light == "SIGNAL"
-        self._pair = PairRule(_first_is_stronger if ordered else _more_light_is_stronger, says_strongest, True)
+        self._rule = FlagRule(_first_is_stronger if ordered else _more_light_is_stronger, says_strongest, True)
         self._thinner = SampleThinner() if clock_only else None
         self._fill = filler(compiled=settings.compiled and not clock_only)
         self._init_id: int | None = None
@@ -333,7 +333,7 @@ class OusterParser(PacketParser):
                 "device_time_ns": lambda at: at(columns["time_ns"].reshape(-1, 1)),
                 "encoder_rad": lambda at: at(self._encoder_rad[columns["id"].reshape(-1, 1)]),
             },
-            pair=self._pair if dual else None,
+            rule=self._rule if dual else None,
         )
 
     def _content(self, pixels: NDArray[np.uint32]) -> StructArray:

@@ -28,7 +28,7 @@ _NOT_NUMBERS = ~np.uint64(0xFFFF0000)
 
 def fill(slots: ReturnSlots, table: StructArray) -> int:
     """Write the same rows as `ReturnSlots.fill`, bit for bit."""
-    content, pair, width_unit_ns = slots.content[:, slots.others :], slots.pair, slots.pulse_width_unit_ns
+    content, rule, width_unit_ns = slots.content[:, slots.others :], slots.rule, slots.pulse_width_unit_ns
     of_pulse = {
         name: np.broadcast_to(made_of(lambda values: values), slots.shape) for name, made_of in slots.per_pulse.items()
     }
@@ -41,10 +41,10 @@ def fill(slots: ReturnSlots, table: StructArray) -> int:
         intensity,
         intensity if width_unit_ns is None else content["pulse_width"],
         np.float32(0) if width_unit_ns is None else width_unit_ns,
-        intensity if pair is None else pair.strength(content),
-        _NO_FLAG if pair is None else _ONLY,
-        _STRONGEST if pair is not None and pair.names_strongest else _NO_FLAG,
-        _LAST if pair is not None and pair.names_last else _NO_FLAG,
+        intensity if rule is None else rule.strength(content),
+        _NO_FLAG if rule is None else _ONLY,
+        _STRONGEST if rule is not None and rule.names_strongest else _NO_FLAG,
+        _LAST if rule is not None and rule.names_last else _NO_FLAG,
         slots.pulse_id,
         np.broadcast_to(slots.common & _NOT_NUMBERS, slots.shape),
         of_pulse["host_time_ns"],
@@ -81,7 +81,7 @@ def _rows_written(
     for i in range(host_time_ns.shape[0]):
         for j in range(host_time_ns.shape[1]):
             pulse = np.uint64(i * host_time_ns.shape[1] + j)
-            count, number, nearer = np.uint64(0), np.uint64(0), 0
+            count, number, best, of_best = np.uint64(0), np.uint64(0), 0, filled
             for slot in range(ranges.shape[1]):
                 count += np.uint64(ranges[pulse, slot] != 0)
             if count == 0:
@@ -93,16 +93,16 @@ def _rows_written(
                 if ranges[pulse, slot] == 0:
                     continue
                 number += _ONE
+                if number == 1 or strength[pulse, slot] >= strength[pulse, best]:
+                    best, of_best = slot, filled
                 flags = _NO_FLAG
                 if count == 1:
                     flags = of_an_only_one
-                elif number == 1:
-                    nearer = slot
-                elif strength[pulse, nearer] > strength[pulse, slot]:
-                    words[filled - _ONE, _WORDS - 1] |= of_the_strongest
-                    flags = of_the_last
-                else:
+                elif number == count and of_best == filled:
                     flags = of_the_strongest | of_the_last
+                elif number == count:
+                    words[of_best, _WORDS - 1] |= of_the_strongest
+                    flags = of_the_last
                 row = table[filled]
                 row["host_time_ns"] = host_time_ns[i, j]
                 row["device_time_ns"] = device_time_ns[i, j]

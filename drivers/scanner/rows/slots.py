@@ -44,23 +44,28 @@ def _column(words: UInt64Array, name: str) -> NDArray[Any]:
 
 
 @dataclass(frozen=True, slots=True)
-class PairRule:
-    """Rule for the flags of two returns of a pulse, the nearer first; a single return is both strongest and last.
+class FlagRule:
+    """Rule for the flags of a pulse's returns, the nearer first; a single return is both strongest and last.
 
     Attributes:
-        strength: strength of returns (n,), with the fields of `ReturnSlots.content`: the greater of two is the
-            stronger; never equal.
-        names_strongest: one of the two is the strongest return, that of greater strength.
-        names_last: one of the two is the last return, the farther.
+        strength: strength of returns (n,), with the fields of `ReturnSlots.content`: the greatest is the strongest;
+            those of a pulse are never equal.
+        names_strongest: one of several is the strongest return, that of greatest strength.
+        names_last: one of several is the last return, the farthest.
     """
 
     strength: Callable[[StructArray], NDArray[Any]]
     names_strongest: bool
     names_last: bool
 
-    def flags(self, returns: StructArray, number: ByteArray, count: ByteArray) -> ByteArray:
-        """Return (n,) flags of consecutive returns, from their numbers and the counts of their pulses."""
+    def flags(self, returns: StructArray, number: ByteArray, count: ByteArray, slots: int) -> ByteArray:
+        """Return (n,) flags of consecutive returns, from their numbers and the counts of their pulses, which have at
+        most so many slots.
+        """
         strength = np.ascontiguousarray(self.strength(returns))
+        return self._of_pairs(strength, number, count) if slots == 2 else self._of_many(strength, number, count)
+
+    def _of_pairs(self, strength: NDArray[Any], number: ByteArray, count: ByteArray) -> ByteArray:
         # choices are multiplications by 0 or 1: np.where takes ten times as long on conditions that vary often
         second = (number[1:] == 2).view(np.uint8)
         near_strongest = (strength[:-1] > strength[1:]).view(np.uint8) * second
@@ -68,6 +73,15 @@ class PairRule:
         flags: ByteArray = (count == 1) * np.uint8(RETURN_FLAG_STRONGEST | RETURN_FLAG_LAST)
         flags[:-1] += near_strongest * strongest
         flags[1:] += (second - near_strongest) * strongest + second * (last * np.uint8(self.names_last))
+        return flags
+
+    def _of_many(self, strength: NDArray[Any], number: ByteArray, count: ByteArray) -> ByteArray:
+        firsts = np.flatnonzero(number == 1)
+        greatest = np.repeat(np.maximum.reduceat(strength, firsts), count[firsts]) if len(firsts) else strength
+        alone = (count == 1).view(np.uint8)
+        strongest = alone | (strength == greatest).view(np.uint8) * np.uint8(self.names_strongest)
+        last = alone | (number == count).view(np.uint8) * np.uint8(self.names_last)
+        flags: ByteArray = strongest * np.uint8(RETURN_FLAG_STRONGEST) + last * np.uint8(RETURN_FLAG_LAST)
         return flags
 
 
@@ -80,14 +94,14 @@ class ReturnSlots:
 
     Attributes:
         content: (pulses, slots), contiguous, of 4 or 8 bytes, which are gathered at once; fields ``range`` (the
-            device's unit, 0 without a return), ``intensity`` and the fields that `pair` and `pulse_width_unit_ns` need.
+            device's unit, 0 without a return), ``intensity`` and the fields that `rule` and `pulse_width_unit_ns` need.
         range_unit_m: metres of one raw unit.
         common: `common_words` of the pulses, an array of such a shape.
         shape: (m, n).
         pulse_id: (m,) id of the first of n pulses; the others count up from it.
         per_pulse: functions that make the fields of `RETURN_DTYPE` with one value for each pulse from such arrays,
             elementwise; each must first pass its arrays to its argument, which selects the values of the wanted pulses.
-        pair: rule for the flags of returns in two slots, beside the common flags; None: no such flags.
+        rule: rule for the flags of returns in several slots, beside the common flags; None: no such flags.
         pulse_width_unit_ns: nanoseconds of a unit of the field ``pulse_width``; None: unknown.
         others: slots at the front of each pulse with other content.
     """
@@ -98,7 +112,7 @@ class ReturnSlots:
     shape: tuple[int, int]
     pulse_id: Int64Array
     per_pulse: Mapping[str, Callable[[Chosen], NDArray[Any]]]
-    pair: PairRule | None = None
+    rule: FlagRule | None = None
     pulse_width_unit_ns: np.float32 | None = None
     others: int = 0
 
@@ -158,9 +172,9 @@ class ReturnSlots:
         """Write the number of each return, the count of its pulse, and the flags that follow from them."""
         # the two bytes after the channel
         words[-1].view("<u2")[1::4] = number | count.astype(np.uint16) << 8
-        if self.pair is not None:
+        if self.rule is not None:
             flags = _column(words, "flags")
-            flags |= self.pair.flags(returns, number, count)
+            flags |= self.rule.flags(returns, number, count, self.content.shape[1] - self.others)
 
     def _write_returns(self, words: UInt64Array, returns: StructArray) -> None:
         """Write the values of each single return."""

@@ -237,7 +237,8 @@ class VelodyneParser(PacketParser):
             azimuth_rad=_firing_azimuths(azimuth, turn, head),
             channel=head.channel,
             flags=SINGLE_FLAGS.get(mode, 0) | (RETURN_FLAG_PPS_LOCKED if self._position.locked == 1 else 0),
-            pair=(True, True) if dual else None,
+            echoes=2 if dual else 1,
+            names=(True, True),
         )
 
 

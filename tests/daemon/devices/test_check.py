@@ -326,6 +326,9 @@ class TestOtherProtocols:
             ("velodyne/nebula_vlp32.pcap.gz", "velodyne-vlp32c"),
             ("hesai/nebula_xt32.pcap.gz", "hesai-xt32"),
             ("hesai/nebula_qt64.pcap.gz", "hesai-qt64"),
+            ("hesai/nebula_xt16.pcap.gz", "hesai-xt16"),
+            ("hesai/nebula_xt32m.pcap.gz", "hesai-xt32m2x"),
+            ("hesai/nebula_qt128.pcap.gz", "hesai-qt128"),
         ],
     )
     def test_a_head_of_another_model_is_named_despite_an_identical_second_port(

@@ -19,7 +19,7 @@ from swath.daemon.config.tables import ScannerConfig
 from swath.daemon.processing.setup.models import geometry_of
 from swath.drivers.driver import find_driver
 from swath.drivers.parser import DeviceSettings, PacketParser
-from swath.drivers.scanner.hesai.heads import XT32
+from swath.drivers.scanner.hesai.models import XT32
 from swath.drivers.scanner.velodyne.heads import VLP16, VLP32C, SpinningHead
 from swath.georef.arrays import FloatArray, StructArray
 from swath.georef.scanner.beams import OusterGeometry, SpinningGeometry

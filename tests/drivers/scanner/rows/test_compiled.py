@@ -13,10 +13,10 @@ from swath.drivers.driver import Driver, all_drivers
 from swath.drivers.parser import DeviceSettings, DriverSettingsError, PacketParser
 from swath.drivers.scanner.rows.compiled import fill
 from swath.drivers.scanner.rows.filler import filler
-from swath.drivers.scanner.rows.slots import PairRule, ReturnSlots, common_words, in_order, returns_table
+from swath.drivers.scanner.rows.slots import FlagRule, ReturnSlots, common_words, in_order, returns_table
 from swath.drivers.scanner.srep.layout import SrepHeader, encode_datagram
 from swath.drivers.scanner.srep.parser import SrepParser
-from swath.georef.arrays import StructArray
+from swath.georef.arrays import StructArray, UInt64Array
 from swath.georef.records import Record, ScannerReturns
 from tests.drivers.builders import feed
 from tests.fuzz.recordings import packets_of, settings_of
@@ -96,19 +96,20 @@ def random_slots(slots: int, named: tuple[bool, bool] | None, seed: int) -> Retu
             "device_time_ns": lambda at: at(host_time_ns) + at(offset_ns),
             "encoder_rad": lambda at: at(angle),
         },
-        pair=None if named is None else PairRule(strength_of, *named),
+        rule=None if named is None else FlagRule(strength_of, *named),
         pulse_width_unit_ns=np.float32(0.01) if seed % 2 else None,
     )
 
 
-def strength_of(returns: StructArray) -> StructArray:
-    strength: StructArray = returns["intensity"].astype(np.uint32) * 2 + returns["pulse_width"] % 2
+def strength_of(returns: StructArray) -> UInt64Array:
+    """Return different values for the returns of a pulse, as `FlagRule` wants."""
+    strength: UInt64Array = returns["intensity"].astype(np.uint64) << np.uint64(32) | returns["range"]
     return strength
 
 
 @pytest.mark.parametrize(("named", "seed"), list(product(NAMED, [1, 2])))
 def test_compiled_and_plain_code_give_the_same_rows_for_any_pulses(named: tuple[bool, bool] | None, seed: int) -> None:
-    for slots in (2,) if named else (1, 2, 5):
+    for slots in (2, 3) if named else (1, 2, 5):
         made = random_slots(slots, named, seed)
         expected, table = returns_table(made.content.size), returns_table(made.content.size)
         table.view(np.uint8)[:] = 0xA5  # what was there before
