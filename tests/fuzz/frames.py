@@ -12,12 +12,18 @@ import numpy as np
 from swath.drivers.framing import kinds as frame_kinds
 from swath.drivers.framing.checksums import crc16_ccitt, crc24q, crc32_novatel, nmea_xor, ubx_fletcher
 from swath.drivers.framing.framer import FrameKind, Framer
+from swath.drivers.imu.vectornav import wire as vectornav
 from swath.drivers.parser import ParserCounters
 from swath.drivers.scanner.hesai.models import QT128
 from swath.drivers.scanner.hesai.parser import with_checksums
 from tests.fuzz.mutation import LARGEST_CASE_BYTES, bounds, damage
 
-KINDS: dict[str, FrameKind] = {kind.name: kind for kind in vars(frame_kinds).values() if isinstance(kind, FrameKind)}
+KINDS: dict[str, FrameKind] = {
+    kind.name: kind
+    for module in (frame_kinds, vectornav)
+    for kind in vars(module).values()
+    if isinstance(kind, FrameKind)
+}
 KEPT_OF_A_NAME = 6  # frames of one message in a pool
 
 NMEA_FIELDS = (
@@ -75,6 +81,16 @@ def _seal_sbf(frame: bytes) -> bytes:
     return b"$@" + struct.pack("<H", crc16_ccitt(content)) + content
 
 
+def _seal_vectornav(frame: bytes) -> bytes:
+    content = frame[:-2].ljust(vectornav.MAX_BYTES, b"\0")
+    length = vectornav.measure(content, 0, True)
+    if length <= 0:  # no header: the content becomes that of yaw, pitch and roll
+        content = b"\xfa\x01\x08\0" + content
+        length = vectornav.measure(content, 0, True)
+    body = content[1 : length - 2]
+    return b"\xfa" + body + crc16_ccitt(body).to_bytes(2, "big")
+
+
 SEALS: dict[str, Callable[[bytes], bytes]] = {
     "nmea": _seal_nmea,
     "ubx": _seal_ubx,
@@ -83,6 +99,7 @@ SEALS: dict[str, Callable[[bytes], bytes]] = {
     "novatel-short": _seal_novatel_short,
     "xbus": _seal_xbus,
     "sbf": _seal_sbf,
+    "vectornav": _seal_vectornav,
 }
 """Length and checksum of a frame made right, whatever is in it; by the name of its kind."""
 

@@ -22,6 +22,7 @@ from swath.drivers.parser import DeviceSettings, Parser
 from swath.drivers.transports.base import TransportError
 from tests.drivers.recordings import FIXTURES
 from tests.drivers.srep_cases import split_datagrams
+from tests.drivers.vnb import read_messages
 
 PAGES = FIXTURES.parent / "docs/devices"
 MOST_OF_A_FILE_BYTES = 256 * 1024
@@ -80,7 +81,8 @@ def streams_of(driver: Driver) -> list[bytes]:
     others = [FIXTURES / "rtcm3", FIXTURES / "nmea"] if driver.kind == "gnss" else []
     paths = _files_of(driver) + [path for folder in others for path in sorted(folder.iterdir())[:6]]
     found = [path for path in paths if _suffix(path).lower() not in NO_RECORDING and path.suffix != ".pcap"]
-    return [_content(path)[:MOST_OF_A_FILE_BYTES] for path in found]
+    streams = [b"".join(read_messages(path)) if _suffix(path) == ".vnb" else _content(path) for path in found]
+    return [stream[:MOST_OF_A_FILE_BYTES] for stream in streams]
 
 
 def packets_of(driver: Driver, parser: Parser) -> list[list[bytes]]:

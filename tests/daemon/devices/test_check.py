@@ -32,6 +32,7 @@ from swath.georef.records import ChunkBatch, TimeScale, TimeTag
 from tests.daemon.builders import nmea_sentence
 from tests.daemon.rig import HANGS_S, free_udp_port
 from tests.daemon.wires import pty, repeating, udp_sender
+from tests.drivers.vnb import read_messages
 
 ROOT = Path(__file__).parents[3]
 CANMOD = ROOT / "fixtures/canmod-gps/3BA199E2_00000164_00000005_candump.log.gz"
@@ -307,10 +308,11 @@ class TestOtherProtocols:
         ("unit", "frames", "protocol"),
         [
             (2048, gzip.decompress((ROOT / "fixtures/xsens/2_output.bin.gz").read_bytes()), "xsens-xbus"),
+            (512, b"".join(read_messages(ROOT / "fixtures/vectornav/FixedSize_vn310-imu.vnb.gz")), "vectornav"),
             (16, b"".join(encode_can_frame(number, bytes(8)) for number in (0x120, 0x121, 0x122)) * 20, "sbg-ellipse"),
             (16, b"".join(encode_can_frame(number, bytes(8)) for number in (0x005, 0x032, 0x034)) * 20, "xsens-mti"),
         ],
-        ids=["xsens-xbus", "sbg-ellipse", "xsens-mti"],
+        ids=["xsens-xbus", "vectornav", "sbg-ellipse", "xsens-mti"],
     )
     def test_an_imu_of_another_protocol_is_named(self, unit: int, frames: bytes, protocol: str) -> None:
         whole = len(frames) // unit

@@ -1,0 +1,1 @@
+"""VectorNav inertial units: binary output messages, by field."""
