@@ -378,6 +378,7 @@ def test_few_modules_of_the_daemon_import_the_simulator() -> None:
     processing = ["swath.calib.**", "swath.georef.**", *libraries]
     assert light["ignore_imports"] == [
         "swath.drivers.scanner.rows.compiled -> numba",
+        "swath.daemon.cli.check -> swath.georef.mapping.datums",
         "swath.daemon.simulate.plans -> swath.sim.**",
         "swath.daemon.processing.calibration.plan.run -> swath.sim.**",
         "swath.daemon.processing.calibration.plan.page -> swath.sim.**",

@@ -21,21 +21,63 @@ def command(
     seconds: Annotated[float, typer.Option(help="Seconds to listen to the devices.", min=0.1, max=3600.0)] = 5.0,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object, for scripts.")] = False,
 ) -> None:
-    """Validate CONFIG, then listen to every device and report what it sends, its time status and its problems."""
+    """Validate CONFIG, then listen to every device and report what it sends, its time status and its problems.
+
+    Prints where the devices are mounted. Exit code 1 when a device has a problem or a setting is hardly meant.
+    """
     from swath.daemon.config import load_config
+    from swath.daemon.config.findings import configuration_findings
+    from swath.daemon.config.geometry import drawing, geometry_lines, placed_devices
 
     loaded = load_config(config)
-    if offline:
-        _print_valid(loaded, as_json)
-        return
-    reports = _listen(loaded, seconds)
+    findings = [*configuration_findings(loaded), *_crs_findings(loaded)]
+    placed = placed_devices(loaded)
+    reports = [] if offline else _listen(loaded, seconds)
+    wrong = bool(findings) or any(report.problems for report in reports)
     if as_json:
-        found = {"config": str(config), "ok": all(not report.problems for report in reports)}
-        print(json.dumps(found | {"devices": [report.plain() for report in reports]}, indent=2))
+        found = {"config": str(config), "ok": not wrong, "findings": findings, "geometry": geometry_lines(placed)}
+        found |= {"sources": _sources(loaded)} if offline else {"devices": [report.plain() for report in reports]}
+        print(json.dumps(found, indent=2))
     else:
-        _print_reports(reports)
-    if any(report.problems for report in reports):
+        if offline:
+            sources = _sources(loaded)
+            print(f"{loaded.path}: valid; {len(sources)} sources: {', '.join(sources) or 'none'}")
+        else:
+            _print_reports(reports)
+        for line in [*geometry_lines(placed), *drawing(placed)]:
+            print(line)
+        _print_findings(findings)
+    if wrong:
         raise typer.Exit(int(ExitCode.PROBLEM))
+
+
+def _print_findings(findings: list[str]) -> None:
+    from rich.console import Console
+
+    console = Console(soft_wrap=True)
+    for line in findings:
+        console.print(line, style="red", markup=False, highlight=False)
+
+
+def _crs_findings(config: Config) -> list[str]:
+    """Return a line for each CRS that PROJ does not know or Swath refuses; PROJ may be absent on a recorder."""
+    if config.output.crs is None:
+        return []
+    try:
+        from swath.georef.mapping.datums import MappingError, read_source, read_target
+    except ImportError:
+        return []
+    lines = []
+    try:
+        target = read_target(config.output.crs)
+    except MappingError as error:
+        return [str(error)]
+    for name, gnss in config.gnss.items():
+        try:
+            read_source(gnss.datum, target)
+        except MappingError as error:
+            lines.append(f"gnss.{name}: {error}")
+    return lines
 
 
 def _listen(config: Config, seconds: float) -> list[Report]:
@@ -47,12 +89,8 @@ def _listen(config: Config, seconds: float) -> list[Report]:
         return check_everything(config, seconds)
 
 
-def _print_valid(config: Config, as_json: bool) -> None:
-    sources = [f"pps/{name}" for name in config.pps] + [device.source for device in config.devices()]
-    if as_json:
-        print(json.dumps({"config": str(config.path), "ok": True, "sources": sources}, indent=2))
-    else:
-        print(f"{config.path}: valid; {len(sources)} sources: {', '.join(sources) or 'none'}")
+def _sources(config: Config) -> list[str]:
+    return [f"pps/{name}" for name in config.pps] + [device.source for device in config.devices()]
 
 
 def _print_reports(reports: list[Report]) -> None:

@@ -31,7 +31,12 @@ def command(
 ) -> None:
     """Record every byte of the sensors in CONFIG until SIGTERM or Ctrl-C; SIGHUP begins a new part of the log."""
     from swath.daemon.config import load_config
+    from swath.daemon.config.findings import NO_SOURCE
+    from swath.daemon.errors import ExitCode, UserError
     from swath.daemon.recorder.run import record
 
     _log_to_stderr()
-    raise typer.Exit(int(record(load_config(config), seconds)))
+    loaded = load_config(config)
+    if not any(loaded.device_tables()) and not loaded.pps:
+        raise UserError(f"{config}: {NO_SOURCE}", ExitCode.USAGE)
+    raise typer.Exit(int(record(loaded, seconds)))

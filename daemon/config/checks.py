@@ -18,6 +18,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from swath.daemon.config.config import Config, DeviceTable
+from swath.daemon.config.rotations import rotation_problem
 from swath.daemon.config.tables import CorrectionsConfig, GnssConfig, ScannerConfig
 from swath.drivers.driver import Driver, UnknownProtocolError, find_driver
 from swath.drivers.parser import DeviceKind, DriverSettingsError
@@ -40,7 +41,6 @@ NEEDED_PARAMETERS = (
 )
 
 WILDCARD = "0.0.0.0"
-ROTATION_TOLERANCE = 1e-6  # for a matrix typed with 7 digits; 0.2 arc seconds
 MIN_BASELINE_M = 0.1  # a shorter baseline gives no useful heading
 
 
@@ -230,20 +230,6 @@ def _check_rotations(section: str, table: DeviceTable) -> Iterator[str]:
         problem = rotation_problem(rows)
         if problem:
             yield f"{section}.{key}: {problem}"
-
-
-def rotation_problem(rows: list[list[float]]) -> str | None:
-    """Return why three rows are not a proper rotation matrix; None if they are one."""
-    matrix = np.array(rows, dtype=np.float64)
-    lengths = np.linalg.norm(matrix, axis=1)
-    for row in range(3):
-        if abs(lengths[row] - 1.0) > ROTATION_TOLERANCE:
-            return f"not a rotation: row {row + 1} has length {lengths[row]:.6g}, want 1"
-    if np.abs(matrix @ matrix.T - np.eye(3)).max() > ROTATION_TOLERANCE:
-        return "not a rotation: its rows are not perpendicular to each other"
-    if np.linalg.det(matrix) < 0.0:
-        return "not a rotation but a reflection (determinant -1): change the sign of one axis"
-    return None
 
 
 def _check_gimbal(config: Config, name: str, table: ScannerConfig) -> Iterator[str]:

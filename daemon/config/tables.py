@@ -7,9 +7,11 @@ the descriptions.
 from __future__ import annotations
 
 import datetime as dt
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from swath.daemon.config.rotations import with_matrix
 
 NAME_PATTERN = r"^[A-Za-z0-9_-]+$"
 SIGNAL_PATTERN = r"^[A-Za-z_][A-Za-z0-9_]*\.[A-Za-z_][A-Za-z0-9_]*$"
@@ -190,6 +192,9 @@ class ImuConfig(Section):
         default_factory=_identity,
         description="rotation from the IMU's axes to the body, by rows; also applied to the attitude of its INS",
     )
+    rotation_b_imu_deg: Vector | None = Field(
+        None, description="instead of the matrix: its roll, pitch, yaw; see Angles of a mounting"
+    )
     tick_hz: float | None = Field(
         None,
         gt=0.0,
@@ -214,6 +219,11 @@ class ImuConfig(Section):
         None, description='dbc: units that the DBC does not give, by signal, such as { "ACC.x" = "g" }'
     )
     noise: NoiseConfig = Field(default_factory=NoiseConfig, description="noise model for the navigation filter")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _fill_rotation(cls, table: Any) -> Any:
+        return with_matrix(table, "rotation_b_imu", "rotation_b_imu_deg")
 
 
 _KEYS_OF_GEOMETRY = {
@@ -299,6 +309,9 @@ class ScannerConfig(Section):
     installation: Matrix | None = Field(
         None, description="rotation T from scanner to body axes, by rows; required for spinning heads, else identity"
     )
+    installation_deg: Vector | None = Field(
+        None, description="instead of the matrix: its roll, pitch, yaw; see Angles of a mounting"
+    )
     calibration: Text | None = Field(None, description="calibration file, relative to this file")
     lever_arm_m: Vector = Field(
         default_factory=_zero_vector,
@@ -320,6 +333,11 @@ class ScannerConfig(Section):
     )
     geometry: GeometryConfig | None = Field(None, description="how the beam is deflected")
     gimbal: GimbalConfig | None = Field(None, description="stages of a stabilised or pointed mount")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _fill_installation(cls, table: Any) -> Any:
+        return with_matrix(table, "installation", "installation_deg")
 
     @model_validator(mode="after")
     def _ranges(self) -> Self:

@@ -16,8 +16,9 @@ from hypothesis import strategies as st
 from pydantic import BaseModel
 
 from swath.daemon.config import Config, Tables, load_config, parse_config
-from swath.daemon.config.checks import rotation_problem, same_wire
+from swath.daemon.config.checks import same_wire
 from swath.daemon.config.load import MAX_CONFIG_BYTES, _model_in, validate
+from swath.daemon.config.rotations import matrix_of_deg, rotation_problem
 from swath.daemon.errors import ConfigError, ExitCode, UserError
 from swath.daemon.log.parsers import stored_parsers
 from swath.daemon.processing.setup.models import mount_of
@@ -80,6 +81,8 @@ class TestWholeFile:
             "imu.*.imu_type",
             "imu.*.source_address",
             "imu.*.units",
+            "imu.*.rotation_b_imu_deg",
+            "scanner.*.installation_deg",
             "imu.*.ids",
             "imu.*.extended_ids",
             "imu.*.byte_order",
@@ -213,9 +216,57 @@ def test_addresses_of_the_same_wire_are_recognised(one: str, other: str, same: b
 def test_rotations_of_seven_digits_are_accepted_and_less_precise_ones_refused() -> None:
     assert rotation_problem([[0.7071068, -0.7071068, 0], [0.7071068, 0.7071068, 0], [0, 0, 1]]) is None
     assert rotation_problem([[0, 1, 0], [0, 0, 1], [1, 0, 0]]) is None
-    assert "length" in str(rotation_problem([[0.70711, -0.70711, 0], [0.70711, 0.70711, 0], [0, 0, 1]]))
+    assert rotation_problem([[0.7071, -0.7071, 0], [0.7071, 0.7071, 0], [0, 0, 1]]) == (
+        "not a rotation: row 1 has length 0.99999041, want 1; the nearest rotation is "
+        "[[0.7071068, -0.7071068, 0], [0.7071068, 0.7071068, 0], [0, 0, 1]]"
+    )
+    sheared = rotation_problem([[1, 0.001, 0], [0, 1, 0], [0, 0, 1]])
+    assert str(sheared).endswith("the nearest rotation is [[0.9999999, 0.0005, 0], [-0.0005, 0.9999999, 0], [0, 0, 1]]")
+    assert "nearest" not in str(rotation_problem([[1, 0, 0], [0, 2, 0], [0, 0, 1]]))
     assert "reflection" in str(rotation_problem([[0, 1, 0], [1, 0, 0], [0, 0, 1]]))
     assert "length 0" in str(rotation_problem([[0, 0, 0], [0, 1, 0], [0, 0, 1]]))
+
+
+HALF, ROOT_3 = 0.5, 0.75**0.5
+
+
+@pytest.mark.parametrize(
+    ("angles_deg", "rows"),
+    [  # by hand: where the device's x, y and z axes (the columns) point in forward, right, down
+        ([0, 0, 0], [[1, 0, 0], [0, 1, 0], [0, 0, 1]]),
+        ([90, 0, 0], [[1, 0, 0], [0, 0, -1], [0, 1, 0]]),  # right side down: y points down, z left
+        ([0, 90, 0], [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]),  # nose up: x points up, z forward
+        ([0, 0, 90], [[0, -1, 0], [1, 0, 0], [0, 0, 1]]),  # turned to the right: x points right, y backward
+        ([0, 0, 30], [[ROOT_3, -HALF, 0], [HALF, ROOT_3, 0], [0, 0, 1]]),
+        ([0, 0, -450], [[0, 1, 0], [-1, 0, 0], [0, 0, 1]]),
+        ([90, 0, 90], [[0, 0, 1], [1, 0, 0], [0, 1, 0]]),  # roll, then yaw about the body's z: x right, y down
+        ([90, 90, 0], [[0, 1, 0], [0, 0, -1], [-1, 0, 0]]),  # roll, then pitch about the body's y: x up, y forward
+    ],
+)
+def test_angles_of_a_mounting_turn_about_the_axes_of_the_body(
+    angles_deg: list[float], rows: list[list[float]], tmp_path: Path
+) -> None:
+    text = with_session(
+        f'[imu.main]\ntransport = "can:socketcan:can0"\nprotocol = "canmod-gps"\nrotation_b_imu_deg = {angles_deg}\n'
+        '[scanner.left]\ntransport = "udp:0.0.0.0:2368"\nprotocol = "velodyne-vlp16"\n'
+        f"installation_deg = {angles_deg}\n"
+    )
+    config = parse_config(text, tmp_path / "a.toml")
+    for matrix in (config.imu["main"].rotation_b_imu, config.scanner["left"].installation):
+        assert matrix is not None
+        for row, wanted in zip(matrix, rows, strict=True):
+            assert row == pytest.approx(wanted, abs=1e-12)
+    if all(angle % 90 == 0 for angle in angles_deg):
+        assert matrix_of_deg(angles_deg) == rows, "exactly"
+
+
+def test_angles_of_a_mounting_beside_a_matrix_are_refused(tmp_path: Path) -> None:
+    head = '[scanner.left]\ntransport = "udp:0.0.0.0:2368"\nprotocol = "velodyne-vlp16"\n'
+    both = "installation = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\ninstallation_deg = [0, 0, 0]\n"
+    with pytest.raises(ConfigError, match=r"scanner.left: installation and installation_deg are both given; keep one"):
+        parse_config(with_session(head + both), tmp_path / "a.toml")
+    with pytest.raises(ConfigError, match=r'installation_deg\[1\]: got "90", want a number'):
+        parse_config(with_session(head + 'installation_deg = [0, "90", 0]\n'), tmp_path / "a.toml")
 
 
 TOML_VALUES = st.recursive(
