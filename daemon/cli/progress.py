@@ -41,6 +41,7 @@ class _Phase:
     done: int = 0
     total: int = 0
     unit: str = ""
+    compiled_s: float = 0.0  # time that compiling had taken when it began
     compiled: bool = False  # its pace says nothing of the rest
 
     def ended(self, now_s: float) -> str:
@@ -100,6 +101,7 @@ class Display:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._say, self._show, self._clock = say, show, clock
+        self.compile_s: Callable[[], float] = lambda: 0.0  # returns the time that compiling has taken up to now
         self._lock = threading.Lock()
         self._began_s = clock()
         self._phase: _Phase | None = None
@@ -111,15 +113,12 @@ class Display:
             now_s = self._clock()
             if self._phase is None or self._phase.what != what:
                 self._end(now_s)
-                self._phase = _Phase(one_line(what), now_s, now_s)
+                self._phase = _Phase(one_line(what), now_s, now_s, compiled_s=self.compile_s())
             self._phase.done, self._phase.total, self._phase.unit = done, total, unit
 
     def compiling(self) -> None:
-        """Say that loops are compiled during this phase, which takes longer therefore."""
-        with self._lock:
-            if self._phase is not None:
-                self._phase.compiled = True
-            self._say(COMPILING)
+        """Say that loops are compiled, so that it takes longer."""
+        self._say(COMPILING)
 
     def tick(self) -> None:
         """Write the lines that are due, and update the bar."""
@@ -132,6 +131,7 @@ class Display:
                 self._waiting.clear()
             if phase is None:
                 return
+            self._note_compiling(phase)
             if self._show is not None:
                 share = phase.done / phase.total if phase.total and phase.unit else None
                 self._show(phase.what, share, phase.state(now_s))
@@ -147,8 +147,12 @@ class Display:
 
     def _end(self, now_s: float) -> None:
         if self._phase is not None:
+            self._note_compiling(self._phase)
             self._waiting.append(self._phase.ended(now_s))
         self._phase = None
+
+    def _note_compiling(self, phase: _Phase) -> None:
+        phase.compiled |= self.compile_s() > phase.compiled_s
 
 
 @contextmanager
@@ -221,6 +225,7 @@ def _compiling_noticed(display: Display, say: Callable[[str], None]) -> Iterator
         return
 
     with before_compiling(display.compiling) as compiling:
+        display.compile_s = lambda: compiling.seconds
         yield
     if compiling.seconds:
         again = "later runs use the stored code"

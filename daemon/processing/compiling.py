@@ -30,8 +30,10 @@ class Compiling(numba.core.event.Listener):
 
     @property
     def seconds(self) -> float:
-        """Time during which this process compiled, and the longest such time of its workers."""
-        return self._own_s + self._workers_s
+        """Time during which this process has compiled up to now, and the longest such time of its workers."""
+        with self._lock:
+            running_s = time.monotonic() - self._since_s if self._open else 0.0
+            return self._own_s + running_s + self._workers_s
 
     def on_start(self, event: numba.core.event.Event) -> None:
         """Call the function, if it has not been called; note the time."""

@@ -87,12 +87,24 @@ def test_a_long_phase_writes_percentage_and_remaining_time_each_minute(clock: Cl
 def test_no_remaining_time_is_told_while_loops_are_compiled(clock: Clock) -> None:
     said: list[str] = []
     display = Display(said.append, clock=clock)
-    display.tell("points", 0, 100_000_000, BYTES)
-    display.compiling()
+    compiled_s = 0.0
+    display.compile_s = lambda: compiled_s
+    for phase in ("clocks", "points"):  # loops of a later phase are compiled when it comes to them
+        display.tell(phase, 0, 100_000_000, BYTES)
+        compiled_s += 30.0
+        clock.now_s += 61.0
+        display.tell(phase, 1_000_000, 100_000_000, BYTES)
+        display.tick()
+    assert said == [
+        "clocks: 1 %, 61 s so far",
+        "clocks: 61.0 s, 100.0 MB",
+        "points: 1 %, 61 s so far",
+    ]
+    display.tell("pages", 0, 100, "pages")
     clock.now_s += 61.0
-    display.tell("points", 1_000_000, 100_000_000, BYTES)
+    display.tell("pages", 50, 100, "pages")
     display.tick()
-    assert said == [COMPILING, "points: 1 %, 61 s so far"]
+    assert said[-1] == "pages: 50 %, 50 of 100 pages, 61 s so far, about 61 s remaining"
 
 
 def test_a_phase_that_was_not_finished_has_no_line_of_its_end(
