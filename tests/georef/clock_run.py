@@ -16,7 +16,7 @@ SURE = (TimeState.LOCKED, TimeState.HOLDOVER)
 
 @dataclass
 class Outcome:
-    """What a run gave; states by second, errors (ns) and their sigmas where LOCKED or HOLDOVER."""
+    """The result of a run: states by second, and errors (ns) with their sigmas where LOCKED or HOLDOVER."""
 
     clock: PpsClock
     states: list[TimeState] = field(default_factory=list)
@@ -34,7 +34,7 @@ class Outcome:
         return [code for _, code, _ in self.events]
 
     def counts(self, start: int = 0, stop: int | None = None) -> Counter[TimeState]:
-        """How often each state was seen between two seconds."""
+        """Return how often each state was seen between two seconds."""
         return Counter(self.states[start:stop])
 
 
@@ -83,5 +83,5 @@ def _ask(simulation: Simulation, clock: PpsClock, outcome: Outcome, second: int,
 
 
 def rms(values: list[float] | np.ndarray) -> float:
-    """Root mean square."""
+    """Return the root mean square of values."""
     return float(np.sqrt(np.mean(np.square(np.asarray(values, dtype=np.float64)))))

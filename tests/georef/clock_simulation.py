@@ -34,7 +34,7 @@ def gps_second(moment: dt.datetime, leap: int) -> int:
 
 @dataclass
 class Oscillator:
-    """The host's clock: host time of every true second, and between them by linear interpolation."""
+    """The host's clock: host time at every true second, interpolated linearly in between."""
 
     seconds: int
     seed: int = 0
@@ -43,7 +43,7 @@ class Oscillator:
     ramps: bool = False
 
     def host_seconds(self) -> FloatArray:
-        """(seconds + 1,) host ns since the start at true seconds 0, 1, …"""
+        """Return (seconds + 1,) host ns since the start at true seconds 0, 1, …"""
         random = np.random.default_rng(self.seed)
         frequency = self.drift_ppm * 1e3 + np.cumsum(random.normal(0.0, self.wander * NS, self.seconds))
         if self.ramps:
@@ -63,7 +63,10 @@ class Oscillator:
 
 @dataclass
 class Edges:
-    """How the edges are seen. late_s: of the train (inverted polarity: the pulse's other end)."""
+    """How the simulated host sees the PPS edges.
+
+    `late_s` shifts the whole train, as inverted polarity does, which marks the pulse's other end.
+    """
 
     noise_ns: float = 1500.0
     outliers: float = 0.01
@@ -75,9 +78,10 @@ class Edges:
 
 @dataclass
 class Sender:
-    """One kind of message of one source, once a second.
+    """One kind of message of one source, sent once a second.
 
-    error_s: seconds its clock is off at a true second. tag_of: its time tag of a GPS second, None: says nothing.
+    `error_s` gives by how many seconds its clock is off at a true second; `tag_of` gives its time tag of a GPS second,
+    or None if the message has no time tag.
     """
 
     name: str
@@ -95,7 +99,7 @@ class Sender:
 
 @dataclass
 class Simulation:
-    """One run: iterate it for ("edge", host_ns) and ("message", source, TimeMessage), in order of the host's time."""
+    """One run: iterate over it for its edges and messages in order of host time."""
 
     start_gps_s: int
     oscillator: Oscillator
@@ -125,7 +129,7 @@ class Simulation:
         return (self.start_gps_s + whole) * NS + round(part * NS)
 
     def __iter__(self) -> Iterator[tuple[int, str, str, TimeMessage | None]]:
-        """(host ns, "edge" or "message", source, message) in order of host time."""
+        """Yield (host ns, "edge" or "message", source, message) in order of host time."""
         found: list[tuple[int, str, str, TimeMessage | None]] = []
         random = np.random.default_rng(self.seed)
         arrivals = {id(sender): 0 for sender in self.senders}
@@ -183,7 +187,10 @@ class Simulation:
 
 
 def week_tag(modulus: int | None = None, leap: int | None = None) -> Callable[[int], TimeTag]:
-    """Week and time of week; modulus: a week number that has rolled over (1024: as old firmware says it)."""
+    """Return a function that tags GPS seconds with week and time of week.
+
+    With `modulus`, the week number has rolled over; 1024 is what old firmware sends.
+    """
 
     def tag(second: int) -> TimeTag:
         week = second // 604_800
@@ -195,7 +202,10 @@ def week_tag(modulus: int | None = None, leap: int | None = None) -> Callable[[i
 def utc_tag(
     leap: int, leap_event_s: int | None = None, *, said: bool = False, dated: bool = True
 ) -> Callable[[int], TimeTag]:
-    """UTC date and time of day. leap_event_s: GPS second that is 23:59:60; from then on there is one more."""
+    """Return a function that tags GPS seconds with UTC date and time of day.
+
+    `leap_event_s` is the GPS second that is 23:59:60; afterwards the number of leap seconds is larger by one.
+    """
 
     def tag(second: int) -> TimeTag:
         count = leap if leap_event_s is None or second <= leap_event_s else leap + 1

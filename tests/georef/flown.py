@@ -17,7 +17,7 @@ LAT, LON = np.radians(47.5), np.radians(8.9)
 def flown(
     n: int = 600, step_s: float = 0.05, start_ns: int = START_NS, course_deg: float = 70.0, **changes: Any
 ) -> Trajectory:
-    """60 m/s in S-turns, 4° of drift, climbing."""
+    """Return a trajectory of n epochs in S-turns at 60 m/s, climbing, with 4° of drift."""
     t = step_s * np.arange(n, dtype=np.float64)
     columns = path(t, np.radians(course_deg))
     columns["time_ns"] = start_ns + np.rint(t * 1e9).astype(np.int64)
@@ -27,7 +27,7 @@ def flown(
 
 
 def path(t: FloatArray, course_rad: float) -> dict[str, Any]:
-    """Columns by time, m/s along radii of curvature by the textbook."""
+    """Return the trajectory's columns by time, with metres converted to angles by the textbook's radii of curvature."""
     e2 = 0.00669437999014132
     w2 = 1 - e2 * np.sin(LAT) ** 2
     meridian_m, parallel_m = 6378137 * (1 - e2) / w2**1.5 + 900, (6378137 / np.sqrt(w2) + 900) * np.cos(LAT)

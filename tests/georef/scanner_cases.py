@@ -59,7 +59,7 @@ def rows_of(encoder_rad: object, range_m: object, **others: object) -> StructArr
 
 
 def still_trajectory() -> Trajectory:
-    """A body whose axes are those of e, in their origin, for a second."""
+    """Return one second of a body whose origin and axes are those of e."""
     quaternions = np.tile([1.0, 0.0, 0.0, 0.0], (2, 1))
     unsaid = np.full((2, 3), np.nan)
     time_ns = np.array([0, 1_000_000_000])
@@ -75,13 +75,13 @@ def calibration_of(geometry: Geometry, **changes: float) -> Calibration:
 
 
 def mirrored(ray: FloatArray, normal: FloatArray) -> FloatArray:
-    """Rays behind flat mirrors: a half turn about the normal, and back."""
+    """Return rays (n, 3) behind flat mirrors: turned by 180° about the normal, and reversed."""
     behind: FloatArray = -Rotation.from_rotvec(np.pi * normal).apply(ray)
     return behind
 
 
 def bent(ray: FloatArray, normal: FloatArray, ratio: float) -> FloatArray:
-    """Snell's law as a turn in the plane of incidence."""
+    """Return refracted rays (n, 3), with Snell's law as a rotation in the plane of incidence."""
     across = np.cross(normal, ray)
     sine = np.linalg.norm(across, axis=1)
     turn = np.arcsin(ratio * sine) - np.arcsin(sine)
@@ -97,7 +97,10 @@ def scaled(direction: FloatArray, rho: FloatArray) -> FloatArray:
 
 
 def swung_points(calibration: Calibration, rows: StructArray, theta: FloatArray, rho: FloatArray) -> FloatArray:
-    """A flat mirror turned about x, whose normal leans by the facet's tilt; the laser leaves the scan's plane by Δη."""
+    """Return points (n, 3), m, in s, of a flat mirror turned about x, whose normal leans by the facet's tilt.
+
+    The laser leaves the scan plane by Δη.
+    """
     tilts = np.array([calibration.facet_tilt_rad.get(facet, 0.0) for facet in range(256)])[rows["channel"]]
     laser = Rotation.from_euler("z", -calibration.value("scan_plane_tilt_rad")).apply([0.0, -1.0, 0.0])
     at_rest = Rotation.from_euler("x", -np.pi / 4).apply([0.0, 0.0, 1.0])
@@ -107,7 +110,7 @@ def swung_points(calibration: Calibration, rows: StructArray, theta: FloatArray,
 
 
 def monogon_points(calibration: Calibration, rows: StructArray, theta: FloatArray, rho: FloatArray) -> FloatArray:
-    """A mirror turned about the laser's beam, Δη / 2 off its 45°."""
+    """Return points (n, 3), m, in s, of a mirror that turns about the laser's beam and is Δη / 2 off its 45°."""
     slope = np.pi / 4 - 0.5 * calibration.value("scan_plane_tilt_rad")
     at_rest = np.tile([-np.cos(slope), 0.0, np.sin(slope)], (len(rows), 1))
     normal = Rotation.from_euler("x", -theta[:, np.newaxis]).apply(at_rest)
@@ -115,7 +118,7 @@ def monogon_points(calibration: Calibration, rows: StructArray, theta: FloatArra
 
 
 def palmer_points(shaft_rad: float, nutation_rad: float) -> PointsS:
-    """A mirror that nutates about a shaft in the plane x, z."""
+    """Return the function for a mirror that nutates about a shaft in the plane x, z."""
 
     def points(calibration: Calibration, rows: StructArray, theta: FloatArray, rho: FloatArray) -> FloatArray:
         shaft = Rotation.from_euler("y", shaft_rad).apply([-1.0, 0.0, 0.0])
@@ -127,7 +130,7 @@ def palmer_points(shaft_rad: float, nutation_rad: float) -> PointsS:
 
 
 def risley_points(wedge_rad: tuple[float, float], index: float, ratio: float) -> PointsS:
-    """Two prisms, four surfaces."""
+    """Return the function for two prisms, that is four refracting surfaces."""
 
     def points(calibration: Calibration, rows: StructArray, theta: FloatArray, rho: FloatArray) -> FloatArray:
         flat = np.tile([0.0, 0.0, 1.0], (len(rows), 1))
@@ -141,7 +144,7 @@ def risley_points(wedge_rad: tuple[float, float], index: float, ratio: float) ->
 
 
 def fibre_points(across_rad: FloatArray, along_rad: FloatArray) -> PointsS:
-    """Fibres, which the mirror's shaft only selects."""
+    """Return the function for a ring of fibres, where the mirror's shaft only selects the fibre."""
 
     def points(calibration: Calibration, rows: StructArray, theta: FloatArray, rho: FloatArray) -> FloatArray:
         fibre = np.rint(rows["encoder_rad"] / (2 * np.pi) * len(across_rad)).astype(int) % len(across_rad)
@@ -157,7 +160,7 @@ def fibre_points(across_rad: FloatArray, along_rad: FloatArray) -> PointsS:
 
 
 def spinning_points(table: BeamTable) -> PointsS:
-    """The driver's own formula."""
+    """Return the function for a spinning head, by the driver's own formula."""
 
     def points(calibration: Calibration, rows: StructArray, theta: FloatArray, rho: FloatArray) -> FloatArray:
         rows = rows.copy()
@@ -172,7 +175,7 @@ def spinning_points(table: BeamTable) -> PointsS:
 
 
 def ouster_points(geometry: OusterGeometry) -> PointsS:
-    """The maker's formula (FORMULAS 2.2), beam by beam a chain of SciPy's rotations."""
+    """Return the function of the maker's formula (FORMULAS 2.2), a chain of SciPy's rotations for each beam."""
 
     def points(calibration: Calibration, rows: StructArray, theta: FloatArray, rho: FloatArray) -> FloatArray:
         channel = rows["channel"]
@@ -193,13 +196,12 @@ def ouster_points(geometry: OusterGeometry) -> PointsS:
 
 @dataclass(frozen=True)
 class Case:
-    """A scanner, and its points in s by other means.
-
+    """A scanner, and its points in s computed independently.
     Attributes:
-        geometry, points_s: of the scanner.
+        geometry, points_s: the scanner's geometry, and the function that computes its points.
         reading_rad: encoder readings go from −this to this.
-        channels: a return's channel is below.
-        tables: what belongs to its calibration.
+        channels: the number of channels; a return's channel is less.
+        tables: tables that belong to its calibration.
     """
 
     geometry: Geometry
@@ -211,7 +213,7 @@ class Case:
     beam_range_m: FloatArray | None = None
 
     def calibration(self, **changes: float) -> Calibration:
-        """Every error that the scanner has."""
+        """Return a calibration in which every error that the scanner can have is set."""
         return replace(
             calibration_of(self.geometry, **changes),
             facet_tilt_rad=dict(self.facet_tilt_rad),

@@ -28,7 +28,7 @@ def terrain(height_m: FloatArray) -> CoarseTerrain:
 
 
 def aimed(n: int, height_m: FloatArray, sensor_m: float, aside_deg: float) -> tuple[FloatArray, FloatArray]:
-    """Sensors and places on the ground aside of them (n, 3): degrees, metres."""
+    """Return sensors and ground places beside them, (n, 3) each: longitude, latitude in degrees, height in m."""
     rng = np.random.default_rng(2)
     grid = RegularGridInterpolator((np.arange(height_m.shape[0]), np.arange(height_m.shape[1])), height_m)
     row, column = rng.uniform(40, 120, n), rng.uniform(40, 90, n)

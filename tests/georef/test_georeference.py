@@ -29,7 +29,7 @@ COUNT = 500
 
 
 def flight() -> Trajectory:
-    """Two seconds of a flight over the Alps with sigmas; the second half is missing a quarter of a second."""
+    """Return two seconds of a flight over the Alps with sigmas; the second half lacks a quarter of a second."""
     seconds = np.concatenate([np.arange(0, 1.25, 0.01), np.arange(1.5, 2.0, 0.01)])
     same = np.ones_like(seconds)
     return Trajectory.from_geodetic(
@@ -118,13 +118,13 @@ def test_scan_angles_are_positive_to_the_right_however_the_head_is_mounted() -> 
 
 
 def test_scan_angles_include_the_roll_of_the_aircraft() -> None:
-    """Right wing down: beams of the scanner's own nadir go to the left. LAS 1.4: from the vertical of the data."""
+    """With the right wing down, the scanner's own nadir points left. LAS 1.4 measures from the vertical."""
     level = np.degrees(np.arctan2(-np.sin(0.2), np.cos(0.2) * np.cos(0.06)))
     np.testing.assert_allclose(scan_angles(LINE, np.eye(3), 0.2, [0.0]), level, atol=1e-4)
 
 
 def test_scan_angles_of_spinning_heads_follow_the_beam_direction() -> None:
-    """A head whose axis lies along the way: not its azimuth, but where it looks, all the way round."""
+    """The head's axis lies along the flight, so the scan angle is where a beam looks, all the way round."""
     readings = np.radians([0.0, 90.0, 179.0, 181.0, 270.0]).tolist()
     found = scan_angles(SPINNING, SIDEWAYS, 0.0, readings)
     assert found[[0, 1, 4]] == pytest.approx([0.0, 90.0, -90.0], abs=0.3)
@@ -196,7 +196,7 @@ def test_sigmas_are_earth_centred_without_a_map() -> None:
 
 
 class Steady:
-    """An encoder that turns evenly."""
+    """An encoder that turns at a constant rate."""
 
     def __init__(self) -> None:
         self.asked = 0

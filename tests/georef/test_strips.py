@@ -24,7 +24,7 @@ Flown = tuple[Int64Array, FloatArray, FloatArray]
 
 
 def flown(*legs: tuple[float, float, float], rate_hz: float = 50.0, gusts_rad: float = 0.0) -> Flown:
-    """Times, heading 0 … 2π and roll of legs of (seconds, °/s, bank in °), beginning at a heading of 350°."""
+    """Return GPS times (ns), headings 0 … 2π and rolls (rad) of legs of (seconds, °/s, bank in °), starting at 350°."""
     rates = np.concatenate([np.full(round(seconds * rate_hz), rate) for seconds, rate, _ in legs])
     banks = np.concatenate([np.full(round(seconds * rate_hz), bank) for seconds, _, bank in legs])
     time_s = np.arange(len(rates)) / rate_hz

@@ -41,7 +41,7 @@ def test_an_integer_with_more_digits_than_python_accepts_is_refused() -> None:
 
 
 def nested(depth: int) -> str:
-    """A key whose list lies so deep; the document itself is at 0."""
+    """Return a key whose list is nested to a depth; the document itself has depth 0."""
     return f"a = {'[' * depth}{']' * depth}"
 
 

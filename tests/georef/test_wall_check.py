@@ -64,7 +64,10 @@ def test_a_tag_is_compared_with_the_wall_clock(tag: TimeTag, ahead: float) -> No
 
 
 def heard(ahead: list[float], *, kept: bool, whole_log: bool, step_s: int = 0) -> WallComparison:
-    """Messages a second, each so far ahead of the clock that was stepped by so much since the session began."""
+    """Compare the wall clock with one message a second.
+
+    `ahead` says by how many seconds each message leads the clock; `step_s` by how much the clock was stepped.
+    """
     comparison = WallComparison(CLOCK, whole_log=whole_log)
     comparison.set_wall(step_s * SECOND_NS, kept=kept)
     for second, seconds in enumerate(ahead):
@@ -75,7 +78,7 @@ def heard(ahead: list[float], *, kept: bool, whole_log: bool, step_s: int = 0) -
 
 
 def test_the_whole_log_is_judged_by_the_majority_of_messages() -> None:
-    """A receiver that found its date after some seconds is right; live it was wrong at that time."""
+    """A receiver that finds its date after some seconds is right, though it looked wrong while it was recorded."""
     ahead = [7200.0] * 20 + [-0.2] * 200
     assert heard(ahead, kept=True, whole_log=True).lines() == []
     assert heard(ahead[:20], kept=True, whole_log=False).lines() != []

@@ -42,7 +42,7 @@ def test_layer_air_matches_the_formula_sheet() -> None:
 
 @pytest.mark.parametrize(("constant", "k_urad"), [(VISIBLE, 31.9030463), (INFRARED, 31.5370169)])
 def test_flat_layers_match_the_formula_sheet(constant: float, k_urad: float) -> None:
-    """K = n̄ − n_s of the air that the spherical layers are made of (4.2)."""
+    """K is n̄ − n_s of the air that the spherical layers are made of (FORMULAS 4.2)."""
     refractivity_sum = quad(lambda height_m: float(layer_refractivity(height_m, constant)), GROUND_M, SENSOR_M)[0]
     mean = refractivity_sum / (SENSOR_M - GROUND_M)
     assert 1e6 * (mean - float(layer_refractivity(SENSOR_M, constant))) == pytest.approx(k_urad, abs=5e-7)

@@ -33,7 +33,7 @@ GPS_NS = 1_479_297_618 * 10**9  # 2026-11-21T12:00:00Z with 18 leap seconds (FOR
 
 
 def made(n: int, *, sigmas: bool = True) -> Points:
-    """Points over two kilometres, deterministic, with everything that varies varying."""
+    """Return n deterministic points over two kilometres, with different values in every field that can vary."""
     rng = np.random.default_rng(5)
     xyz = np.array([500_000.0, 5_400_000.0, 450.0]) + rng.uniform(-1, 1, (n, 3)) * [900.0, 1200.0, 30.0]
     of = rng.integers(1, 6, n).astype(np.uint8)
@@ -52,7 +52,7 @@ def made(n: int, *, sigmas: bool = True) -> Points:
 
 
 def written(points: Points, settings: LasSettings = SETTINGS, *, cuts: tuple[int, ...] = ()) -> tuple[bytes, Clipped]:
-    """The file of points written in pieces."""
+    """Return the bytes of a LAS file whose points were written in pieces, and the count of clipped values."""
     stream = io.BytesIO()
     writer = LasWriter(stream, settings, 7)
     for first, last in zip((0, *cuts), (*cuts, len(points)), strict=True):
@@ -106,7 +106,7 @@ def test_the_header_describes_the_points() -> None:
 
 
 def test_the_header_layout_matches_the_standard() -> None:
-    """Offsets of the header's fields as LAS 1.4-R15 table 3 has them."""
+    """The offsets of the fields are those of LAS 1.4-R15, table 3."""
     data = written(made(100))[0]
     assert data[:4] == b"LASF"
     assert struct.unpack_from("<H", data, 6) == (0b10001,)
@@ -118,7 +118,7 @@ def test_the_header_layout_matches_the_standard() -> None:
 
 
 def test_adjusted_time_matches_the_formula_sheet() -> None:
-    """FORMULAS 12: 2026-11-21T12:00:00Z is 479297618 in a LAS file."""
+    """By FORMULAS 12, 2026-11-21T12:00:00Z is 479297618 in a LAS file."""
     assert read(written(made(1))[0]).gps_time[0] == 479_297_618.0
 
 
@@ -206,7 +206,7 @@ def test_a_file_without_points_is_valid() -> None:
 
 
 def copc(points: Points) -> bytes:
-    """A COPC file of points."""
+    """Return the bytes of a COPC file of points."""
     stream = io.BytesIO()
     with tempfile.TemporaryFile() as spool, tempfile.TemporaryFile() as ordered:
         writer = CopcWriter(stream, (spool, ordered), SETTINGS, 7)
@@ -218,7 +218,7 @@ def copc(points: Points) -> bytes:
 
 @pytest.fixture(scope="module")
 def tree() -> tuple[Points, bytes]:
-    """Points enough for three levels."""
+    """Return enough points for three levels of a COPC file, and that file."""
     points = made(6 * NODE_POINTS)
     return points, copc(points)
 

@@ -81,7 +81,7 @@ def same(one: Trajectory, other: Trajectory) -> None:
 
 
 def test_pdals_file_has_the_values_of_pdals_tests() -> None:
-    """SbetReaderTest.cpp: 151631.003 s, 0.5680211852972264, −2.04165439230394, 107.71529532965604, …"""
+    """SbetReaderTest.cpp of PDAL has 151631.003 s, 0.5680211852972264, −2.04165439230394, 107.71529532965604, …"""
     trajectory = read_trajectory(struct.pack("<34d", *PDAL[0], *PDAL[1]), "2-points.sbet", week=1700)
     assert trajectory.time_ns[0] == 1700 * 604_800_000_000_000 + 151_631_002_836_071
     lat, lon, height = trajectory.geodetic()
@@ -121,7 +121,7 @@ def test_a_written_trajectory_is_read_back() -> None:
 @pytest.mark.parametrize("wander_deg", [-100.0, -1.3, 0.0, 25.0, 170.0])
 @pytest.mark.parametrize("pospac", [True, False])
 def test_wander_angle_rotates_heading_and_velocities(wander_deg: float, pospac: bool) -> None:
-    """Platform x is α west of north; y is left and z up with POSPac, right and down with others."""
+    """Platform x is α west of north; y is left and z up with POSPac, but right and down with other software."""
     trajectory = flown()
     table = table_of(trajectory)
     wander = np.radians(wander_deg) + 0.001 * np.arange(len(table))
@@ -192,7 +192,7 @@ def test_the_week_is_chosen_to_overlap_the_log() -> None:
 
 @pytest.mark.parametrize("week", [-1, 24_233, 10**6, 10**20])
 def test_an_impossible_week_is_refused(week: int) -> None:
-    """24233 is the third day of week 2423, as names of orbit files have it: beyond 64 bits of nanoseconds."""
+    """24233 is the third day of week 2423 in the names of orbit files; as a week it exceeds 64 bits of nanoseconds."""
     with pytest.raises(TrajectoryError, match=rf"--week {week} is not a GPS week; give whole weeks since 1980"):
         read_trajectory(sbet_bytes(flown()), "s", week=week)
 
@@ -200,7 +200,7 @@ def test_an_impossible_week_is_refused(week: int) -> None:
 @pytest.mark.parametrize("begins_anew", [True, False])
 @pytest.mark.parametrize("log_begins_s", [-20.0, 10.0])
 def test_a_trajectory_across_the_end_of_a_week_is_read(begins_anew: bool, log_begins_s: float) -> None:
-    """Count the week in both ways, with a log on either side of the end of the week."""
+    """Some software counts seconds on across the end of a week and some begins anew; the log may lie on either side."""
     end_ns = (WEEK + 1) * WEEK_S * 10**9
     trajectory = flown(start_ns=end_ns - 15 * 10**9)
     table = table_of(trajectory)
@@ -225,7 +225,7 @@ def test_sigmas_that_begin_after_the_end_of_the_week_are_read() -> None:
 
 
 def test_epochs_with_gaps_across_the_end_of_a_week_are_read() -> None:
-    """Such gaps occur if only the lines of a flight were exported, or with epochs of some seconds."""
+    """Such gaps occur if only the lines of a flight were exported, or if epochs are seconds apart."""
     end_ns = (WEEK + 1) * WEEK_S * 10**9
     trajectory = flown(start_ns=end_ns - 10 * 10**9)
     table = table_of(trajectory)
@@ -303,7 +303,7 @@ def test_swapped_coordinates_are_reported_on_every_course(course_deg: float) -> 
 
 
 def test_slow_crabbing_is_not_reported_as_a_wrong_course() -> None:
-    """Below 20 m/s the course of positions is not held against that of the velocities."""
+    """Below 20 m/s the course of the positions is not compared with that of the velocities."""
     n = 600
     slow = flown(n, velocity_l=np.tile([15.0, 0, 0], (n, 1)))
     assert len(read(table_of(slow))) == n

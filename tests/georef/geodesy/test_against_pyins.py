@@ -28,9 +28,9 @@ ARM = np.array([0.35, -0.12, -1.1])
 
 
 def test_filter_results_match_pyins() -> None:
-    """Half a minute with a turn: positions to a fifth of their sigma, sigmas to 3 %; biases and scales in both.
+    """Over half a minute with a turn, positions agree to a fifth of their sigma and sigmas to 3 %.
 
-    Biases are constant in both: theirs cannot be Gauss–Markov.
+    Both estimate biases and scales. Biases are constant in both, because pyins has no Gauss–Markov biases.
     """
     truth = fly(survey(line_s=25.0), 30.0, 50.0)
     inertial, rows = noised(truth, NOISE, Fixes(sigma_m=(0.015, 0.015, 0.015), first_s=0.32), ARM, 22)

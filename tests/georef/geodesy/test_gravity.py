@@ -18,14 +18,14 @@ PLACES = e_from_geodetic(LAT, LON, HEIGHT)
 
 
 def test_gravity_at_the_equator_and_the_poles_matches_the_published_values() -> None:
-    """NIMA TR8350.2, table 3.4."""
+    """The published values are those of NIMA TR8350.2, table 3.4."""
     there = gravity_e(np.array([[6_378_137.0, 0.0, 0.0], [0.0, 0.0, 6_356_752.314245], [0.0, 0.0, -6_356_752.314245]]))
     published = [[-9.7803253359, 0, 0], [0, 0, -9.8321849378], [0, 0, 9.8321849378]]
     np.testing.assert_allclose(there, published, rtol=0, atol=2e-10)
 
 
 def test_gravity_anywhere_matches_the_simulator() -> None:
-    """The simulator finds the normal by PROJ."""
+    """The simulator computes the normal independently, with PROJ."""
     np.testing.assert_allclose(gravity_e(PLACES), simulated(PLACES), rtol=0, atol=1e-11)
 
 

@@ -24,7 +24,7 @@ def proj(source: str, target: str) -> pyproj.Transformer:
 
 
 def at(lat_deg: float, lon_deg: float, height_m: float = 500.0) -> FloatArray:
-    """One position in e."""
+    """Return one position (1, 3) in e."""
     return np.atleast_2d(e_from_geodetic(np.radians(lat_deg), np.radians(lon_deg), height_m))
 
 
@@ -38,7 +38,10 @@ def refusal(crs: str, **settings: Any) -> str:
 
 
 def test_itrf_to_etrs89_is_not_the_identity() -> None:
-    """EPSG:7912 at 2026.47 → EPSG:25832 at 47.55° N 9° E: −0.729 m E, −0.581 m N of what PROJ calls best for WGS 84."""
+    """EPSG:7912 at 2026.47 → EPSG:25832 at 47.55° N 9° E moves points by −0.729 m east and −0.581 m north.
+
+    This is relative to what PROJ considers best for WGS 84.
+    """
     itrf = np.array(proj("EPSG:7912", "EPSG:7789").transform(9.0, 47.55, 500.0))[None]
     identity = np.array(proj("EPSG:4979", "EPSG:25832").transform(9.0, 47.55, 500.0))
     mapping = Mapping("EPSG:25832", datum="EPSG:7912", epoch=2026.47)
@@ -76,7 +79,7 @@ def test_wgs_84_to_utm_on_wgs_84_is_taken(datum: str | None) -> None:
 
 
 def test_itrf_to_utm_on_wgs_84_names_the_realisation() -> None:
-    """G2139 is ITRF2014 to 1 cm (EPSG), and a member of the ensemble that EPSG:32632 is on."""
+    """G2139 equals ITRF2014 to 1 cm (EPSG) and is a member of the ensemble on which EPSG:32632 is based."""
     mapping = Mapping("EPSG:32632", datum="EPSG:7912")
     mapping.settle(at(47.5, 9.0))
     assert mapping.description()["realisation"] == "WGS 84 (G2139)"
@@ -103,7 +106,7 @@ def test_datum_same_is_accepted_on_the_users_word() -> None:
     ],
 )
 def test_a_datum_on_another_ellipsoid_is_refused(crs: str, datum: str, ellipsoid: str) -> None:
-    """Latitudes on Bessel's read as those on WGS 84's would be 67 m and 700 m of height off in Switzerland."""
+    """Latitudes on Bessel's ellipsoid read as WGS 84's would be off by 67 m in Switzerland, and heights by 700 m."""
     line = refusal(crs, datum=datum, accuracy_m=1000.0)
     assert line.startswith(f'datum = "{datum}": ')
     assert f"is on the ellipsoid {ellipsoid}, but positions are read on that of WGS 84 and GRS 1980" in line
@@ -116,7 +119,7 @@ def test_datum_same_is_not_suggested_if_it_would_be_refused() -> None:
 
 
 def test_an_accuracy_of_a_decimetre_is_accepted_if_the_user_allows_it() -> None:
-    """EPSG gives CHTRS95 → CH1903+ as good to 0.1 m; heights stay on the ellipsoid of the positions, as in PROJ."""
+    """EPSG states 0.1 m for CHTRS95 → CH1903+; heights stay on the ellipsoid of the positions, as in PROJ."""
     line = refusal("EPSG:2056", datum="EPSG:4932")
     assert "accurate to 0.1 m only" in line
     assert line.endswith("output.datum_accuracy_m = 0.1")
@@ -129,7 +132,7 @@ def test_an_accuracy_of_a_decimetre_is_accepted_if_the_user_allows_it() -> None:
 
 
 def test_an_operation_of_a_single_step_is_checked() -> None:
-    """To geocentric frames PROJ's operation is one transformation, without conversions around it."""
+    """To a geocentric frame PROJ's operation is one transformation, without conversions before and after it."""
     assert "accurate to 1 m only" in refusal("EPSG:4936")
     stated = Mapping("EPSG:7789", datum="EPSG:9988", epoch=2020.0).description()
     assert stated["operation"] == "Inverse of ITRF2014 to ITRF2020 (1)"
@@ -187,7 +190,7 @@ def test_an_unusable_datum_is_refused() -> None:
 
 
 def test_the_first_point_chooses_among_several_operations() -> None:
-    """Around the Baltic PROJ's best operation to ETRS89 takes a grid of velocities, in Germany none."""
+    """Around the Baltic PROJ's best operation to ETRS89 needs a grid of velocities; in Germany it needs none."""
     mapping = Mapping("EPSG:25832", datum="EPSG:7912", epoch=2026.0)
     assert mapping.description()["operation"] is None
     with pytest.raises(MappingError, match="not yet chosen"):

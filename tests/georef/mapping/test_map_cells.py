@@ -22,37 +22,37 @@ def quadratic(points: FloatArray) -> FloatArray:
 
 
 def cubic(points: FloatArray) -> FloatArray:
-    """With a third order that leaves 0.6 mm over 1024 m, an eighth of it over 512 m."""
+    """Map points with a third-order term, which causes 0.6 mm over 1024 m and an eighth of it over 512 m."""
     x = (points[:, 0] - HERE[0]) / 1000.0
     mapped: FloatArray = points + np.stack([0 * x, 0.014 * x**3, 0 * x], axis=-1)
     return mapped
 
 
 def creased(points: FloatArray) -> FloatArray:
-    """The slope of the third coordinate changes by 30 µm a metre along an oblique plane."""
+    """Map points so that the slope of the third coordinate changes by 30 µm per metre along an oblique plane."""
     along = (points - HERE) @ np.array([0.6, 0.64, 0.48])
     mapped: FloatArray = points + np.stack([0 * along, 0 * along, 3e-5 * np.maximum(along, 0.0)], axis=-1)
     return mapped
 
 
 def torn(points: FloatArray) -> FloatArray:
-    """The third coordinate jumps by 10 cm."""
+    """Map points so that the third coordinate jumps by 10 cm."""
     mapped: FloatArray = points + np.where(points[:, :1] > HERE[0], 1.0, 0.0) * [0.0, 0.0, 0.1]
     return mapped
 
 
 def cells(exact: map_cells.Exact) -> MapCells:
-    """Cubes that may stand anywhere."""
+    """Make map cells that may stand anywhere."""
     return MapCells(exact, METRES, lambda centres: None)
 
 
 def cloud(n: int, spread_m: float, seed: int = 3) -> FloatArray:
-    """Points around the place where all these maps have their features."""
+    """Return n points around the place where all these maps have their features."""
     return HERE + np.random.default_rng(seed).uniform(-spread_m, spread_m, (n, 3))
 
 
 def test_values_and_derivatives_of_a_quadratic_map_are_exact() -> None:
-    """Closed form of the derivatives; the factor ½ of the squares is in the row."""
+    """The derivatives are known in closed form; the row includes the factor ½ of the squares."""
     rows, error = expand_cells(quadratic, HERE[None], np.array([512.0]), METRES)
     first = np.array([[1, -2, 0], [0, 0, 0], [0, 0, 1]]) / 1e3
     second = np.array([[0, 3, 0, 0, 0, 0], [1, 0, 0, 0, 1, -1], [0, 0, 1, 0.5, 0, 0]]) / 1e6
@@ -63,7 +63,7 @@ def test_values_and_derivatives_of_a_quadratic_map_are_exact() -> None:
 
 
 def test_the_check_finds_the_neglected_third_order_at_the_corners() -> None:
-    """Central differences over ±h make c x³ into c h² x: what is left, c (x³ − h² x), is largest inside the cube."""
+    """Central differences over ±h turn c x³ into c h² x; the rest, c (x³ − h² x), is largest inside the cube."""
     _, error = expand_cells(cubic, HERE[None], np.array([512.0]), METRES)
     c, h, x = 0.014e-9, 512.0, 0.75 * 512.0
     assert error[0] == pytest.approx(abs(c * (x**3 - h * h * x)), rel=1e-4)
@@ -79,7 +79,7 @@ def test_a_cube_without_values_has_infinite_error() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("exact", [quadratic, cubic, creased, torn])
 def test_no_point_is_wrong_by_a_tenth_of_a_millimetre(exact: map_cells.Exact) -> None:
-    """Over several cubes, with points at their corners and near creases."""
+    """The points cover several cubes, including corners of cubes and the neighbourhood of creases."""
     made = cells(exact)
     corners = np.array(np.meshgrid(*[[-1024.0, 0.0, 1024.0 - 1e-6]] * 3)).reshape(3, -1).T
     corners += np.floor(HERE / 1024.0) * 1024.0
@@ -102,7 +102,7 @@ def test_cubes_are_halved_only_where_needed() -> None:
 
 
 def test_a_result_depends_on_its_point_alone() -> None:
-    """Bit for bit: alone, shuffled, in pieces, before and after other points."""
+    """Results are equal bit for bit for a point alone, shuffled, in pieces, and before and after other points."""
     points = cloud(5_000, 1500.0)
     whole = cells(creased).map(points)
     shuffled = np.random.default_rng(1).permutation(len(points))
@@ -113,7 +113,7 @@ def test_a_result_depends_on_its_point_alone() -> None:
 
 
 def test_each_face_belongs_to_one_cube() -> None:
-    """A point less than a rounding below a face is the lower cube's, whoever was asked before."""
+    """A point less than a rounding below a face belongs to the lower cube, whichever point was asked for first."""
     below, above = np.array([-1e-300, 5.0, 5.0]), np.array([0.0, 5.0, 5.0])
     made = cells(cubic)
     nodes = [made._locate(np.array(points)).tolist() for points in ([above, below], [below, above], [below])]
@@ -122,7 +122,7 @@ def test_each_face_belongs_to_one_cube() -> None:
 
 
 def test_memory_is_bounded_and_recomputed_cubes_give_the_same_results(monkeypatch: pytest.MonkeyPatch) -> None:
-    """DiscardedPoints cubes come back the same."""
+    """Cubes that were discarded and computed again give the same results."""
     monkeypatch.setattr(map_cells, "CELLS_KEPT", 50)
     points = HERE + np.arange(3_000)[:, None] * [700.0, 30.0, 10.0]
     made = cells(cubic)
@@ -133,7 +133,7 @@ def test_memory_is_bounded_and_recomputed_cubes_give_the_same_results(monkeypatc
 
 
 def test_a_cube_is_made_once() -> None:
-    """A thousand points of one cube cost its 91 exact values."""
+    """A thousand points of one cube cost only the cube's 91 exact values."""
     asked = []
 
     def counted(points: FloatArray) -> FloatArray:
@@ -147,7 +147,7 @@ def test_a_cube_is_made_once() -> None:
 
 
 def test_points_outside_any_cube_are_computed_by_the_exact_map() -> None:
-    """Not a number, and farther than any cube reaches."""
+    """Such points are NaN, or farther away than any cube reaches."""
     points = np.array([[np.nan, 0.0, 0.0], [2e7, 0.0, 0.0], HERE])
     made = cells(quadratic)
     np.testing.assert_array_equal(made.map(points)[:2], quadratic(points)[:2])
@@ -156,7 +156,7 @@ def test_points_outside_any_cube_are_computed_by_the_exact_map() -> None:
 
 
 def test_sigmas_follow_the_law_of_propagation() -> None:
-    """Against J Σ Jᵀ written with matrices, in units of half a metre."""
+    """The expected values are J Σ Jᵀ written with matrices, in units of half a metre."""
     random = np.random.default_rng(5)
     root = random.normal(size=(50, 3, 3)) * 0.02
     full = root @ root.transpose(0, 2, 1)

@@ -47,19 +47,19 @@ FRAMES: list[tuple[str, str | None, tuple[str, ...], tuple[float, float, float, 
 
 
 def pipeline(*steps: str) -> pyproj.Transformer:
-    """PROJ, told every step."""
+    """Return PROJ's transformer with every step stated."""
     return pyproj.Transformer.from_pipeline("+proj=pipeline " + " ".join(f"+step {step}" for step in steps))
 
 
 def places(n: int, box: tuple[float, float, float, float], seed: int = 2) -> FloatArray:
-    """Positions in e in a box, from below the sea to the highest mountain."""
+    """Return n positions (n, 3) in e inside a box, from below sea level to the height of the highest mountain."""
     random = np.random.default_rng(seed)
     lat, lon = random.uniform(box[1], box[3], n), random.uniform(box[0], box[2], n)
     return e_from_geodetic(np.radians(lat), np.radians(lon), random.uniform(-400.0, 8900.0, n))
 
 
 def at(lat_deg: float, lon_deg: float, height_m: float = 0.0) -> FloatArray:
-    """One position in e."""
+    """Return one position (1, 3) in e."""
     return np.atleast_2d(e_from_geodetic(np.radians(lat_deg), np.radians(lon_deg), height_m))
 
 
@@ -71,7 +71,7 @@ def sigmas_of(frame: Mapping, points_e: FloatArray, covariance_e: FloatArray) ->
 
 
 def test_coordinates_match_the_formula_sheet() -> None:
-    """FORMULAS 1.9: UTM 32 of lat 47.1234567°, lon 8.7°; meridian convergence and scale at the ellipsoid."""
+    """FORMULAS 1.9 has UTM 32 of lat 47.1234567°, lon 8.7°, with meridian convergence and scale at the ellipsoid."""
     utm = Mapping("EPSG:32632")
     coordinates = utm.map_from_e(at(47.1234567, 8.7, 512.3))[0]
     np.testing.assert_allclose(coordinates, [477244.9241968, 5218927.210357, 512.3], atol=2e-5)
@@ -88,7 +88,7 @@ def test_coordinates_match_the_formula_sheet() -> None:
 def test_coordinates_match_proj_within_a_tenth_of_a_millimetre(
     crs: str, datum: str | None, steps: tuple[str, ...], box: tuple[float, float, float, float]
 ) -> None:
-    """1e5 points in some 1500 cubes, easting first whatever the CRS lists first; 0.007 mm is what is found."""
+    """1e5 points in some 1500 cubes differ by at most 0.007 mm; easting is first, whatever the CRS lists first."""
     frame = Mapping(crs, datum=datum, accuracy_m=0.1)
     spread = np.random.default_rng(4).uniform(-300.0, 300.0, (100_000, 3))
     points = np.repeat(places(400, box), 250, axis=0) + spread
@@ -107,7 +107,7 @@ def test_coordinates_are_continuous_across_the_antimeridian_and_the_pole() -> No
 
 
 def test_a_point_maps_the_same_alone_and_among_others() -> None:
-    """Bit for bit, in another process's copy too."""
+    """Results are equal bit for bit, also in a copy pickled as for another process."""
     frame = Mapping("EPSG:25832", datum="EPSG:7912", epoch=2026.47)
     points = places(20_000, (8.0, 47.0, 8.3, 47.2))
     whole = frame.map_from_e(points)
@@ -121,7 +121,7 @@ def test_a_point_maps_the_same_alone_and_among_others() -> None:
 
 
 def test_map_coordinates_are_converted_back_to_earth_centred_ones() -> None:
-    """The remaining error of PROJ's single step of Bowring's method is 1 µm at 8 km."""
+    """PROJ makes a single step of Bowring's method, whose remaining error is 1 µm at a height of 8 km."""
     frame = Mapping("EPSG:32733")
     points = places(1000, (12, -60, 18, -1))
     assert np.abs(frame.e_from_map(frame.exact(points)) - points).max() < 2e-6
@@ -133,7 +133,7 @@ def test_map_coordinates_are_converted_back_to_earth_centred_ones() -> None:
 
 
 def test_sigmas_are_those_of_the_map_coordinates() -> None:
-    """Against sampled differences of PROJ; the scale of UTM (0.9996 on the central meridian) is left in."""
+    """Sampled differences of PROJ are the reference; UTM's scale (0.9996 on the central meridian) is not removed."""
     frame = Mapping("EPSG:32632")
     point = at(47.5, 10.5, 400.0)
     root = np.array([[0.02, 0.0, 0.0], [-0.01, 0.03, 0.0], [0.015, 0.02, 0.05]])
@@ -149,7 +149,7 @@ def test_sigmas_are_those_of_the_map_coordinates() -> None:
 
 
 def test_coordinates_in_feet_match_proj_and_are_declared() -> None:
-    """EPSG:2263 is in US survey feet; heights of a two-dimensional CRS are metres; sigmas are metres."""
+    """EPSG:2263 is in US survey feet; heights of a two-dimensional CRS are in metres, and so are sigmas."""
     frame = Mapping("EPSG:2263", datum="same")
     point = at(40.7, -74.0, 100.0)
     metres = pipeline(
@@ -184,7 +184,7 @@ def test_wkt_for_files_is_given(crs: str, datum: str, begins: str) -> None:
 
 
 def test_a_three_dimensional_frame_may_be_given_as_text() -> None:
-    """Its heights are on its own ellipsoid, its WKT is that of the plane."""
+    """Its heights are on its own ellipsoid; the WKT written is that of the horizontal CRS."""
     frame = Mapping(CRS("EPSG:2056").to_3d().to_wkt(), datum="EPSG:4932", accuracy_m=0.1)
     expected = pipeline(TO_CH1903, BESSEL, LV95).transform(*at(47.1, 8.5, 480.0).T)
     np.testing.assert_allclose(frame.exact(at(47.1, 8.5, 480.0))[0], np.ravel(expected), atol=1e-6)
@@ -207,7 +207,7 @@ def test_places_without_coordinates_are_refused() -> None:
 
 
 def test_the_area_of_positions_is_found_across_the_antimeridian_and_the_pole() -> None:
-    """Across the antimeridian by the shorter way, around the pole all longitudes."""
+    """Across the antimeridian the area takes the shorter way; around the pole it has all longitudes."""
     west, south, east, north = module._area_of(np.vstack([at(65.0, 179.0), at(66.0, -179.0)]))
     assert (round(south, 3), round(north, 3)) == (64.5, 66.5)
     assert 177.0 < west < 179.0
@@ -223,7 +223,7 @@ def undulation(lat_deg: Any, lon_deg: Any) -> FloatArray:
 
 
 def write_gtx(path: Path, south: float, west: float, step: float, shape: tuple[int, int]) -> SingleArray:
-    """A grid in NOAA's GTX format: big-endian, rows from south to north."""
+    """Write a grid in NOAA's GTX format (big-endian, rows from south to north) and return its nodes, m."""
     lat, lon = south + step * np.arange(shape[0])[:, None], west + step * np.arange(shape[1])[None]
     nodes = undulation(lat, lon).astype(np.float32)
     path.write_bytes(struct.pack(">4d2i", south, west, step, step, *shape) + nodes.astype(">f4").tobytes())
@@ -241,7 +241,7 @@ def bilinear(nodes: SingleArray, south: float, west: float, step: float, lat: An
 
 
 def test_heights_above_a_grid_follow_its_bilinear_values(tmp_path: Path) -> None:
-    """A 1′ grid: points of a small area with its creases, and lines along and across them."""
+    """The grid has a spacing of 1′; points fill a small area with its creases, and lines along and across creases."""
     step = 1.0 / 60.0
     nodes = write_gtx(tmp_path / "made.gtx", 46.5, 8.0, step, (61, 61))
     frame = Mapping(f"+proj=utm +zone=32 +datum=WGS84 +geoidgrids={tmp_path}/made.gtx +type=crs")
@@ -263,7 +263,7 @@ def test_heights_above_a_grid_follow_its_bilinear_values(tmp_path: Path) -> None
 
 
 def test_an_installed_grid_gives_orthometric_heights(tmp_path: Path) -> None:
-    """EPSG:32632+5773 with a file in the user's folder under the name that Debian's proj-data gives EGM96."""
+    """EPSG:32632+5773 finds a file in the user's folder under the name that Debian's proj-data gives EGM96."""
     nodes = write_gtx(tmp_path / "egm96_15.gtx", -90.0, -180.0, 0.25, (721, 1440))
     script = (
         "import json, numpy as np\n"

@@ -23,7 +23,7 @@ BASELINE_B = np.array([2.0, 0.0, 0.0])
 
 
 def survey(speed_mps: float = 60.0, line_s: float = 40.0) -> Motion:
-    """Lines there and back with turns between them, wings and nose moving as in air."""
+    """Return a motion along lines there and back with turns, with small movements in roll and pitch as in air."""
 
     def heading(t: FloatArray) -> FloatArray:
         phase = t / line_s
@@ -47,18 +47,17 @@ def survey(speed_mps: float = 60.0, line_s: float = 40.0) -> Motion:
 
 
 def _step(x: FloatArray) -> FloatArray:
-    """0 to 1 on 0 … 1, with four derivatives zero at either end."""
+    """Return 0 to 1 on 0 … 1, a smooth step with four derivatives zero at either end."""
     x = np.clip(x, 0.0, 1.0)
     return x**5 * (126.0 - 420.0 * x + 540.0 * x**2 - 315.0 * x**3 + 70.0 * x**4)
 
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """A flight of n samples.
-
+    """True motion of a flight of n samples.
     Attributes:
         edges: (n + 1,) s; angle_b, velocity_b: (n, 3) exact increments.
-        flight: of `sim`.
+        flight: the simulator's trajectory.
     """
 
     edges: FloatArray
@@ -67,14 +66,14 @@ class Truth:
     flight: Trajectory
 
     def inertial(self) -> Inertial:
-        """Perfect samples."""
+        """Return the samples of a perfect unit."""
         return Inertial(
             ns(self.edges[1:]), np.diff(self.edges), self.angle_b, self.velocity_b, np.zeros(len(self.angle_b), bool)
         )
 
 
 def fly(motion: Motion, seconds: float, rate_hz: float) -> Truth:
-    """The motion as a spline, and its increments."""
+    """Return the motion as a spline, with its exact increments."""
     lat, lon, height = motion.place
     origin_e, rot = e_from_geodetic(lat, lon, height), rot_e_from_l(lat, lon)
     knots = np.arange(-2.0, seconds + 2.0, 0.05)
@@ -89,9 +88,11 @@ def fly(motion: Motion, seconds: float, rate_hz: float) -> Truth:
 
 @dataclass(frozen=True)
 class Fixes:
-    """GNSS of the made flight: sigmas of position, velocity and heading, shares of their variances that last, how long.
+    """Errors of the simulated GNSS: sigmas of position, velocity and heading, and their correlated parts.
 
-    Pitch of the baseline, forward `BASELINE_B`, errs twice as much as heading; 0: there is no second antenna.
+    A share is the part of a variance whose errors last; it has a correlation time. The pitch of the baseline, which is
+    `BASELINE_B`, forward, errs twice as much as the heading. A heading sigma of 0 means that there is no second
+    antenna.
     """
 
     sigma_m: tuple[float, float, float] = (0.01, 0.01, 0.02)
@@ -108,7 +109,7 @@ class Fixes:
 
 
 def markov(rng: np.random.Generator, steps: int, columns: int, step_s: float, tau_s: float) -> FloatArray:
-    """(steps, columns) of Gauss–Markov processes of sigma 1."""
+    """Return (steps, columns) of Gauss–Markov processes of sigma 1."""
     kept = np.exp(-step_s / tau_s)
     drive = rng.standard_normal((steps, columns)) * np.sqrt(1.0 - kept**2)
     drive[0] = rng.standard_normal(columns)
@@ -119,7 +120,10 @@ def markov(rng: np.random.Generator, steps: int, columns: int, step_s: float, ta
 def noised(
     truth: Truth, noise: ImuNoise, fixes: Fixes, lever_arm_b: FloatArray, seed: int
 ) -> tuple[Inertial, StructArray]:
-    """Samples with walks, biases that drift, scale factors and axes that lean; fixes with white and lasting errors."""
+    """Return samples and fixes with errors.
+
+    Samples have random walks, drifting biases, scale factors and misaligned axes; fixes have white and lasting errors.
+    """
     rng = np.random.default_rng(seed)
     span_s, n = float(truth.edges[1]), len(truth.angle_b)
     biases = markov(rng, n, 6, span_s, noise.bias_correlation_s)
@@ -161,7 +165,7 @@ def noised(
 
 
 def _directions(t: FloatArray, line_l: FloatArray, fixes: Fixes, rng: np.random.Generator) -> StructArray:
-    """Headings and pitches of a baseline (n, 3) north, east, down, with their errors."""
+    """Return rows of headings and pitches of a baseline (n, 3), north, east, down, with errors."""
     sigma = fixes.heading_rad * np.array([1.0, 2.0])
     lasting = markov(rng, len(t), 2, 1.0 / fixes.rate_hz, fixes.heading_tau_s)
     error = np.sqrt(fixes.heading_share) * lasting + np.sqrt(1.0 - fixes.heading_share) * rng.standard_normal(
@@ -195,7 +199,7 @@ def drawn_start(
 
 
 def errors(truth: Truth, t: FloatArray, position_e: FloatArray, velocity_e: FloatArray, q: FloatArray) -> FloatArray:
-    """(n, 9) found − true position and velocity north, east, down, roll, pitch, heading."""
+    """Return (n, 9) found − true position (m), velocity (m/s) north, east, down and roll, pitch, heading (rad)."""
     at = truth.flight.motion(t)
     level = rot_e_from_l(*geodetic_from_e(at.position_e)[:2])
     off = np.einsum("nji,nj->ni", level, position_e - at.position_e)
@@ -207,5 +211,5 @@ def errors(truth: Truth, t: FloatArray, position_e: FloatArray, velocity_e: Floa
 
 
 def setup_for(noise: ImuNoise, lever_arm_b: FloatArray) -> Setup:
-    """The matching setup."""
+    """Return a filter setup that knows the unit's noise and one lever arm (3,), m, in b."""
     return Setup(noise, lever_arm_b[None])

@@ -23,11 +23,10 @@ PARTS = {"position": slice(0, 3), "velocity": slice(3, 6), "attitude": slice(6, 
 @dataclass(frozen=True)
 class Honesty:
     """Consistency of one part of the state.
-
     Attributes:
         mean: NEES of three components over 3; 1 where sigmas are right.
-        low, high: of its 99.8 % interval.
-        independent: samples that it counts as, all flights together.
+        low, high: bounds of its 99.8 % interval.
+        independent: number of independent samples that it is worth, over all flights.
     """
 
     mean: float
@@ -42,7 +41,7 @@ class Honesty:
 
 
 def squares(truth: Truth, solution: Solution, from_s: float, step_s: float) -> FloatArray:
-    """(k, 9) squares of normalised errors, every so often."""
+    """Return (k, 9) squares of normalised errors, every `step_s` from `from_s` on."""
     t = (solution.time_ns - BEGIN_NS) / 1e9
     at = np.searchsorted(t, np.arange(max(from_s, t[0]), t[-1], step_s))
     off = errors(truth, t[at], solution.position_e[at], solution.velocity_e[at], solution.q_e_from_b[at])
@@ -52,7 +51,7 @@ def squares(truth: Truth, solution: Solution, from_s: float, step_s: float) -> F
 
 
 def judge(flights: list[FloatArray]) -> dict[str, Honesty]:
-    """Of the squares of many flights of one length."""
+    """Judge each part of the state from the squares of many flights of one length."""
     stacked = np.stack(flights)
     found = {}
     for name, part in PARTS.items():

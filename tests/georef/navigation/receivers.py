@@ -23,11 +23,10 @@ HEADING_SHARE = 0.36  # of the headings', as `swath trajectory` assumes
 
 @dataclass(frozen=True)
 class Receiver:
-    """What it measures and what it says of it.
-
+    """A receiver's true errors, and the sigmas that it states.
     Attributes:
         fixes: true errors.
-        position_m, velocity_mps: sigmas that stand for those which it does not tell; None: it tells them.
+        position_m, velocity_mps: sigmas assumed where the receiver states none; None where it states them.
     """
 
     fixes: Fixes
@@ -62,13 +61,13 @@ DUAL_ANTENNAS = {
 
 @dataclass(frozen=True, eq=False)
 class Compared:
-    """One flight: by its own account of the noise, and by the smoother that is told the true one."""
+    """One flight solved twice: with the noise estimated from it, and by a smoother that knows the true noise."""
 
     solved: Solved
     best: Solution
 
     def squares(self, truth: Truth) -> tuple[FloatArray, FloatArray]:
-        """(9,) mean squares of errors, every tenth of a second: solved, best."""
+        """Return the (9,) mean squares of errors, every tenth of a second, of both solutions: solved, best."""
         found = []
         for one in (self.solved.smoothed, self.best):
             at = slice(None, None, max(round(0.1 / float(truth.edges[1])), 1))

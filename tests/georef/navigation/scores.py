@@ -50,7 +50,7 @@ def without(rows: StructArray, spans_s: FloatArray) -> StructArray:
 
 
 def start_of(folder: str, name: str) -> Start:
-    """The start that its description gives."""
+    """Return the start that the recording's description gives."""
     about = json.loads((NAVIGATION / f"{folder}/{name}.json").read_text())
     lat, lon = np.radians(about["initpos"][:2])
     return Start(
@@ -65,7 +65,7 @@ def start_of(folder: str, name: str) -> Start:
 
 
 def flight_errors(name: str, solution: Solution, span_s: tuple[float, float]) -> tuple[FloatArray, FloatArray]:
-    """Times and (n, 6) found − true north, east, down m, roll, pitch, heading degrees, at the truth's epochs."""
+    """Return times and (n, 6) found − true north, east, down (m), roll, pitch, heading (deg), at the truth's epochs."""
     rows = truth(name)
     rows = rows[(rows[:, 1] >= span_s[0]) & (rows[:, 1] <= span_s[1])]
     poses = solution.trajectory().poses(ns(rows[:, 1]))
@@ -95,13 +95,16 @@ def rms(errors: FloatArray) -> FloatArray:
 
 
 def of_maxima(t: FloatArray, size_m: FloatArray, spans_s: FloatArray) -> float:
-    """RMS of the largest error in each outage."""
+    """Return the RMS of the largest error in each outage, m."""
     largest = [size_m[(t >= begin) & (t <= end)].max() for begin, end in spans_s]
     return float(np.sqrt(np.mean(np.square(largest))))
 
 
 def off_fixes(solution: Solution, fixes: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Times and (n, 3) found − fixed north, east, down of antennas in the body's origin, at the fixes' own times."""
+    """Return times and (n, 3) found − fixed north, east, down (m), for antennas at the body's origin.
+
+    The times are those of the fixes.
+    """
     at_ns = ns(fixes[:, 0])
     inside = (at_ns >= solution.time_ns[0]) & (at_ns <= solution.time_ns[-1])
     lat, lon = np.radians(fixes[inside, 1:3].T)

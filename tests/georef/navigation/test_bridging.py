@@ -26,7 +26,7 @@ SECONDS = 120.0
 
 
 def lossy(inertial: Inertial, gone: BoolArray, rate_hz: float = RATE_HZ) -> Inertial:
-    """The samples without some, put together and bridged as a log's are."""
+    """Return the samples without those that are gone, assembled and bridged as a log's are."""
     rows = np.zeros(len(inertial), IMU_DTYPE)
     rows["specific_force_b"] = inertial.velocity_b / inertial.interval_s[:, None]
     rows["angular_rate_b"] = inertial.angle_b / inertial.interval_s[:, None]
@@ -42,7 +42,7 @@ def lost(count: int, share: float, run: int, seed: int) -> BoolArray:
 
 
 def shaken(axis: int, seed: int) -> Inertial:
-    """White noise, and on one axis a vibration in the second half."""
+    """Return white noise, with a vibration on one axis in the second half."""
     rng, n = np.random.default_rng(seed), round(SECONDS * RATE_HZ)
     t = np.arange(1, n + 1) / RATE_HZ
     angle, push = 1e-4 * rng.standard_normal((n, 3)), 1e-3 * rng.standard_normal((n, 3))
@@ -52,7 +52,7 @@ def shaken(axis: int, seed: int) -> Inertial:
 
 @pytest.mark.parametrize("run", [1, 2, 3, 10])
 def test_variance_of_bridged_samples_matches_that_of_the_lost_samples(run: int) -> None:
-    """For each axis, quiet and shaken, squared errors over predicted ones are 1 within five sigmas."""
+    """For each axis, quiet and vibrating, the ratio of squared errors to predicted ones is 1 within five sigmas."""
     whole = shaken(1, 3)
     gone = lost(len(whole), 0.02 * np.sqrt(run), run, 5)
     bridged = lossy(whole, gone)
@@ -98,7 +98,7 @@ def test_results_do_not_depend_on_how_samples_are_cut() -> None:
 
 @pytest.mark.parametrize("run", [1, 10])
 def test_losing_one_sample_in_a_hundred_does_little_harm(run: int) -> None:
-    """Three flights with a tactical unit, lost singly and ten on end: errors at most 1.3 times those without loss."""
+    """In three flights with a tactical unit, losses of single samples or ten in a row enlarge errors by at most 1.3."""
     truth = fly(survey(), SECONDS, RATE_HZ)
     squares = np.zeros((2, 9))
     for seed in range(3):

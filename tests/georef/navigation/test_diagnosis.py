@@ -28,7 +28,7 @@ FLIGHT = "tactical"
 
 
 def survey() -> Recording:
-    """Transit, S-turns and some of the lines."""
+    """Return a part of the flight: transit, S-turns and some of the lines."""
     return reference(FLIGHT).cut(100_150, 100_950)
 
 
@@ -125,7 +125,7 @@ def bridged(share: float) -> Callable[[Parts], Parts]:
 
 
 def at_body(parts: Parts) -> Parts:
-    """Positions brought to the body's origin, as an INS gives them."""
+    """Return the parts with positions reduced to the body's origin, as an INS gives them."""
     flight = reference(FLIGHT)
     assert flight.truth is not None
     rows = parts[1][parts[1]["kind"] == Kind.POSITION].copy()
@@ -163,7 +163,7 @@ def kilometres_an_hour(part: StructArray) -> None:
 
 
 def other_place(parts: Parts) -> Parts:
-    """Positions and velocities of another flight: this one's, ten minutes on."""
+    """Return the parts with positions and velocities of another flight: the same one, ten minutes later."""
     other = reference(FLIGHT).cut(100_750, 101_550).rows.copy()
     other["time_ns"] -= 600 * 10**9
     return parts[0], other, parts[2]
@@ -301,7 +301,7 @@ class Timed:
 
 
 def velocity_innovations(rows: StructArray, size_mps: float) -> StructArray:
-    """One an observed velocity, each component that large."""
+    """Return one innovation for each observed velocity, with every component of the given size."""
     found = np.zeros(int((rows["kind"] == Kind.VELOCITY).sum()), INNOVATION_DTYPE)
     found["kind"], found["value"] = Kind.VELOCITY, size_mps
     return found
@@ -309,7 +309,7 @@ def velocity_innovations(rows: StructArray, size_mps: float) -> StructArray:
 
 @pytest.mark.parametrize(("size_mps", "told"), [(0.02, False), (2.0, True)])
 def test_a_filter_that_follows_gnss_rules_out_a_time_offset(size_mps: float, told: bool) -> None:
-    """0.3 s would show in the velocities of the turns as more than a metre a second."""
+    """An offset of 0.3 s would show as more than one metre per second in the velocities of the turns."""
     sound = survey()
     parts = moved(0.3)((sound.inertial, sound.rows, sound.setup))
     solved = Solved(Timed(velocity_innovations(parts[1], size_mps), np.zeros(0)))
@@ -334,7 +334,7 @@ def test_contradicting_comparisons_give_no_offset() -> None:
 
 
 def component_late(rows: StructArray, component: str, late_s: float) -> StructArray:
-    """Velocities of which one part alone, ``course`` or ``down``, comes later than the rest, as one filtered alone."""
+    """Return velocities of which one component, ``course`` or ``down``, lags, as if it alone were filtered."""
     rows, at = rows.copy(), np.flatnonzero(rows["kind"] == Kind.VELOCITY)
     t = (rows["time_ns"][at] - rows["time_ns"][at[0]]) / 1e9
     north, east, down = rows["value"][at].T
@@ -361,7 +361,10 @@ def component_late(rows: StructArray, component: str, late_s: float) -> StructAr
 def test_motion_late_in_one_signal_only_is_reported_as_unclear(
     recording: Callable[[], Recording], component: str, late_s: float, compared: str
 ) -> None:
-    """What is compared with that part says so, the speed denies it; late as a whole, all of them say so."""
+    """The comparison with that component shows the lag, and the speed contradicts it.
+
+    If the motion is late as a whole, all comparisons show it.
+    """
     sound = recording()
     rows = component_late(sound.rows, component, late_s)
     found = time_offset(sound.inertial, rows)
@@ -378,7 +381,7 @@ def test_motion_late_in_one_signal_only_is_reported_as_unclear(
 
 @pytest.mark.parametrize("late_s", [2.0, -18.0])
 def test_noise_of_dense_positions_does_not_hide_an_offset(late_s: float) -> None:
-    """Post-processed at 5 Hz to 1.5 cm: noise of 0.9 m/s² between neighbours, more than what the flight has itself."""
+    """Positions to 1.5 cm at 5 Hz imply accelerations with noise of 0.9 m/s², more than the flight's own."""
     sound = reference("tactical").cut(100_150, 100_300)
     rows = sound.only(Kind.POSITION)
     begin_ns, end_ns = int(rows["time_ns"][0]), int(rows["time_ns"][-1])
@@ -393,7 +396,7 @@ def test_noise_of_dense_positions_does_not_hide_an_offset(late_s: float) -> None
 
 
 def test_the_sigma_of_a_time_offset_is_honest() -> None:
-    """Of stretches of 250 s the offsets scatter no more than their sigmas say; the worst is within four."""
+    """Offsets of stretches of 250 s scatter no more than their sigmas say; the worst is within four."""
     whole = reference("mems")
     begin = float(whole.inertial.time_ns[0] - BEGIN_NS) / 1e9
     parts = [whole.cut(begin + at, begin + at + 250.0) for at in (100.0, 350.0)]

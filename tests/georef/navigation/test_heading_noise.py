@@ -30,7 +30,7 @@ pytestmark = pytest.mark.xdist_group("kernels")
 
 @cache
 def flight(seconds: float) -> Truth:
-    """Lines of 90 s: heading shows in the turns between them."""
+    """Return a flight with lines of 90 s; heading is observable in the turns between them."""
     return fly(survey(line_s=150.0), seconds, 50.0)
 
 
@@ -52,7 +52,7 @@ def knowing(receiver: Receiver, grade: str) -> Setup:
 
 
 def found_of(receiver: Receiver, seconds: float, seed: int, *, doubted: bool = False) -> tuple[Setup, NoiseFound]:
-    """What is found of its headings where positions and velocities are known, and the setup that was assumed."""
+    """Return the assumed setup, and the heading noise found where positions and velocities are well known."""
     inertial, rows = noised(flight(seconds), GRADES["tactical"], receiver.fixes, ARM, seed)
     start = drawn_start(flight(seconds), seed)
     assumed = replace(knowing(receiver, "tactical"), gnss_heading_share=HEADING_SHARE, gnss_heading_correlation_s=TAU_S)
@@ -69,7 +69,7 @@ def test_white_headings_are_recognised_as_white() -> None:
 
 
 def test_heading_errors_correlated_over_seconds_are_found() -> None:
-    """Half of the variance for 10 s: white and lasting sigma to a tenth and a fifth, the time to a factor."""
+    """Half of the variance lasts for 10 s; white sigma is found to a tenth, lasting to a fifth, the time roughly."""
     _, found = found_of(DUAL_ANTENNAS["half lasting 10 s"], 240.0, 3)
     scale, share = found.setup.gnss_heading_scale, found.setup.gnss_heading_share
     assert scale * np.sqrt(1.0 - share) == pytest.approx(np.sqrt(0.5), rel=0.1)
@@ -80,7 +80,7 @@ def test_heading_errors_correlated_over_seconds_are_found() -> None:
 
 @pytest.mark.parametrize("doubted", [False, True], ids=["few", "doubted"])
 def test_headings_keep_their_assumed_noise_if_it_cannot_be_estimated(doubted: bool) -> None:
-    """Fewer than sixty, whatever they are; and where positions are too far off to be noise."""
+    """This is so with fewer than sixty headings, and where positions are too far off for it to be noise."""
     seconds = 180.0 if doubted else 11.0
     assumed, found = found_of(DUAL_ANTENNAS["white"], seconds, 3, doubted=doubted)
     assert found.setup is assumed
@@ -88,7 +88,7 @@ def test_headings_keep_their_assumed_noise_if_it_cannot_be_estimated(doubted: bo
 
 
 def test_errors_with_correlated_headings_are_as_large_as_their_sigmas() -> None:
-    """Fly 12 times with the true heading noise: NEES of attitude must lie within 99.8 % of chance."""
+    """12 flights are solved with the true heading noise; the attitude's NEES must be within its 99.8 % interval."""
     receiver = DUAL_ANTENNAS["half lasting 10 s"]
     flights = []
     for seed in range(12):
@@ -103,7 +103,7 @@ def test_errors_with_correlated_headings_are_as_large_as_their_sigmas() -> None:
 
 
 def test_alignment_takes_headings_far_enough_apart_to_be_independent() -> None:
-    """The mean of many has the variance that lasting errors leave it; white headings are all taken."""
+    """The mean of many headings keeps the variance that lasting errors leave it; white headings are all taken."""
     t = np.arange(0.0, 200.0, 0.2)
     rows = observed(Kind.HEADING, t, np.zeros(3), np.full(3, 0.01), FixType.RTK_FIXED)
     setup = Setup(GRADES["mems"], gnss_heading_share=0.5, gnss_heading_correlation_s=10.0)
@@ -123,10 +123,11 @@ def test_alignment_takes_headings_far_enough_apart_to_be_independent() -> None:
     [("tactical", "white"), ("mems", "white"), ("tactical", "half lasting 10 s"), ("mems", "half lasting 60 s")],
 )
 def test_a_flight_with_two_antennas_is_navigated_as_if_its_noise_were_known(grade: str, name: str) -> None:
-    """3 flights of ten minutes, sigmas true, too small by 3, too large by 3: attitudes lie within a quarter sigma of
-    those of the smoother that knows, which adds 3 % to their errors, and sigmas are that smoother's to a tenth.
+    """3 flights of ten minutes have sigmas that are true, too small by 3 and too large by 3.
 
-    Errors of attitude last for a whole flight: whether they are as large as their sigmas, many flights tell.
+    Attitudes lie within a quarter sigma of those of the smoother that knows the noise, which adds 3 % to their errors,
+    and sigmas equal that smoother's to a tenth. Attitude errors last for a whole flight, so only many flights can show
+    whether they are as large as their sigmas.
     """
     apart, variances = [], np.zeros((2, 3))
     for seed, optimism in enumerate((1.0, 3.0, 1.0 / 3.0)):

@@ -23,8 +23,9 @@ ARM = np.array([0.35, -0.12, -1.1])
 @pytest.mark.parametrize("share", [0.0, 0.7], ids=["white", "lasting"])
 @pytest.mark.parametrize("grade", ["tactical", "mems"])
 def test_errors_are_as_large_as_their_sigmas(grade: str, share: float) -> None:
-    """32 flights: NEES of position, velocity and attitude within 99.8 % of what chance allows, filtered and smoothed;
-    innovations likewise.
+    """In 32 flights, NEES of position, velocity and attitude lie within the 99.8 % interval, filtered and smoothed.
+
+    The innovations are as large as predicted too.
     """
     moments: list[float] = []
     squared: dict[str, list[FloatArray]] = {"filtered": [], "smoothed": []}
@@ -44,7 +45,7 @@ def test_errors_are_as_large_as_their_sigmas(grade: str, share: float) -> None:
 
 
 def test_errors_with_a_consumer_imu_are_as_large_as_their_sigmas() -> None:
-    """Biases of 0.4 °/s and of 80 mg, axes that lean by 10 mrad: 8 flights, filtered and smoothed."""
+    """In 8 flights, filtered and smoothed, biases are 0.4 °/s and 80 mg, and axes are misaligned by 10 mrad."""
     squared: dict[str, list[FloatArray]] = {"filtered": [], "smoothed": []}
     for seed in range(8):
         inertial, rows = noised(flight(), GRADES["consumer"], Fixes(), ARM, seed)
@@ -62,7 +63,7 @@ def test_errors_with_a_consumer_imu_are_as_large_as_their_sigmas() -> None:
 
 
 def test_errors_with_correlated_fast_gnss_positions_are_as_large_as_their_sigmas() -> None:
-    """Half of the positions' variance for 10 s, told of it: estimates of such errors have to die away as they do."""
+    """Half of the positions' variance lasts for 10 s, and the filter knows it, so its estimate must decay likewise."""
     fixes = Fixes((0.014, 0.014, 0.02), 0.5, 10.0, 5.0, 0.03)
     setup = replace(setup_for(GRADES["tactical"], ARM), gnss_correlated_share=0.5, gnss_correlation_s=10.0)
     setup = replace(setup, position_floor_m=0.001)

@@ -23,7 +23,7 @@ SENSORS = ("gyro", "accel", "both")
 
 
 def ways() -> list[FloatArray]:
-    """The 24 turns and 24 mirrored turns by right angles."""
+    """Return the 24 rotations and 24 mirrored rotations by right angles, (3, 3) each."""
     found = []
     for order in permutations(range(3)):
         for signs in product((1.0, -1.0), repeat=3):
@@ -35,14 +35,14 @@ def ways() -> list[FloatArray]:
 
 @cache
 def flight() -> tuple[Inertial, StructArray, Setup]:
-    """Lines of 20 s with turns between them, at 50 Hz; fixes of 1 cm and 3 cm/s once a second."""
+    """Return a flight of 20 s lines with turns between them, at 50 Hz, with fixes of 1 cm and 3 cm/s at 1 Hz."""
     noise = GRADES["tactical"]
     inertial, rows = noised(fly(survey(60.0, 20.0), 100.0, 50.0), noise, Fixes(velocity_mps=0.03), ARM_B, seed=3)
     return inertial, sort_observations(rows), setup_for(noise, ARM_B)
 
 
 def mounted(sensor: str, matrix: FloatArray, unit: float = 1.0) -> tuple[Inertial, StructArray, Setup]:
-    """The flight with a triad, or both, taken otherwise."""
+    """Return the flight with the axes of one triad, or of both, exchanged by a matrix; `unit` scales the gyroscopes."""
     inertial, rows, setup = flight()
     gyro = matrix if sensor != "accel" else np.eye(3)
     accel = matrix if sensor != "gyro" else np.eye(3)
@@ -51,7 +51,7 @@ def mounted(sensor: str, matrix: FloatArray, unit: float = 1.0) -> tuple[Inertia
 
 
 def remedy(text: str) -> FloatArray:
-    """The matrix that a finding says: rows of rotation_b_imu, or the signals for body x, y, z."""
+    """Return the matrix (3, 3) that a finding recommends: rows of rotation_b_imu, or the signals for body x, y, z."""
     said = re.search(r"by (\[\[.*\]\])", text)
     if said is not None:
         return np.array([[float(value) for value in row.split(",")] for row in re.findall(r"\[([^\[\]]+)\]", said[1])])
@@ -64,7 +64,7 @@ def remedy(text: str) -> FloatArray:
 
 
 def check(sensor: str, matrix: FloatArray) -> None:
-    """One finding, whose remedy undoes what was done."""
+    """Check that the only finding's remedy undoes the exchange of axes."""
     found = diagnose(*mounted(sensor, matrix))
     if np.array_equal(matrix, np.eye(3)):
         assert found == []
@@ -98,14 +98,14 @@ def test_degrees_given_as_radians_are_found_by_the_gain() -> None:
 
 @pytest.mark.parametrize("unit", [0.6, 1.7, 20.0])
 def test_a_gain_that_fits_no_unit_is_not_reported_as_a_wrong_unit(unit: float) -> None:
-    """A gain that fits no unit is reported as a mismatch, not as a wrong unit."""
+    """Only a gain that equals the ratio of two units is reported as a wrong unit."""
     assert all("unit: " not in finding.text for finding in diagnose(*mounted("gyro", np.eye(3), unit=unit)))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("recording", [car, uav], ids=["car", "uav"])
 def test_real_recordings_with_rotated_axes_give_no_time_offset_and_no_unit(recording: object) -> None:
-    """Use minutes of them, also with rotated axes: only the axes may be reported, never a time or a unit."""
+    """The recordings are cut into two-minute pieces; only the axes may be reported, never a time offset or a unit."""
     assert callable(recording)
     whole = recording()
     begin, end = (float(edge) for edge in (whole.inertial.time_ns[[0, -1]] - 2300 * 604_800 * 10**9) / 1e9)

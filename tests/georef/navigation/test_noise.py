@@ -28,7 +28,7 @@ FIXED, FLOAT = int(FixType.RTK_FIXED), int(FixType.RTK_FLOAT)
 def innovations(
     kind: Kind, fix: int, times: tuple[float, float, float], count: int = 900, seed: int = 4
 ) -> StructArray:
-    """White ones, so many times as large as predicted."""
+    """Return rows of white innovations, `times` as large as predicted on each axis."""
     rows = np.zeros(count, INNOVATION_DTYPE)
     rows["kind"], rows["fate"], rows["fix_type"], rows["dimension"] = kind, Fate.TAKEN, fix, 3
     rows["time_ns"] = np.arange(count)
@@ -56,7 +56,7 @@ def test_sigmas_are_scaled_up_and_down_by_kind_fix_type_and_axis() -> None:
 
 
 def test_innovations_within_chance_scale_nothing() -> None:
-    """Innovations as large as predicted; and fewer than sixty, whatever they are."""
+    """Innovations are as large as predicted, or there are fewer than sixty, too few to judge."""
     setup = Setup(GRADES["tactical"])
     few = innovations(Kind.VELOCITY, FIXED, (3.0, 3.0, 3.0), count=59)
     rows = np.concatenate([innovations(Kind.POSITION, FIXED, (1.0, 1.0, 1.0)), few])
@@ -73,11 +73,11 @@ def test_an_outlier_does_not_affect_the_other_scales() -> None:
 @pytest.mark.parametrize("optimism", [1.0, 3.0, 1.0 / 3.0], ids=["honest", "optimistic", "pessimistic"])
 @pytest.mark.parametrize("name", RECEIVERS)
 def test_a_flight_is_navigated_as_if_its_noise_were_known(name: str, optimism: float) -> None:
-    """Positions and velocities err as with the smoother that is told the true noise, within a tenth; sigmas likewise.
+    """Errors of positions and velocities, and all sigmas, are near those of the smoother that knows the true noise.
 
     Errors of attitude last for a whole flight, so that two flights have few of them: each lies within half a sigma of
-    that smoother's, which adds at most a quarter to the variance. The share that lasts is found to 0.12 where
-    it is looked for often enough, and else assumed.
+    that smoother's, which adds at most a quarter to the variance. The share of lasting errors is found to 0.12 where
+    there are enough fixes to estimate it, and is assumed elsewhere.
     """
     squares, sigmas = np.zeros((2, 9)), np.zeros((2, 3, 3))
     for seed in range(2):
@@ -97,11 +97,11 @@ def test_a_flight_is_navigated_as_if_its_noise_were_known(name: str, optimism: f
 @pytest.mark.slow
 @pytest.mark.parametrize("name", RECEIVERS)
 def test_sigmas_equal_the_errors_whatever_the_receiver_states(name: str) -> None:
-    """18 flights of 240 s, sigmas true, too small by 3, too large by 3 in turn: NEES of position, velocity and attitude
-    within 99.8 % of what chance allows; positions and velocities err, RMS, at most 1.05 times as the best smoother's.
+    """18 flights of 240 s have sigmas that are true, too small by 3 and too large by 3 in turn.
 
-    18 flights are too few to compare attitudes' errors so: attitudes lie within a tenth of a sigma of the best, which
-    adds half a percent to their errors.
+    NEES of position, velocity and attitude lie within the 99.8 % interval; RMS errors of positions and velocities are
+    at most 1.05 times the best smoother's. 18 flights are too few to compare attitude errors like this: attitudes lie
+    within a tenth of a sigma of the best, which adds half a percent to their errors.
     """
     flights, squared, apart = [], np.zeros((2, 9)), []
     for seed in range(18):
@@ -126,9 +126,9 @@ def filtered(share: float, tau_s: float) -> Receiver:
 @pytest.mark.slow
 @pytest.mark.parametrize("grade", ["tactical", "mems"])
 def test_velocity_errors_correlated_over_seconds_are_found(grade: str) -> None:
-    """Half of their variance for 2 s: as with the smoother that knows, within a quarter of a sigma, and sigmas alike.
+    """Half of the velocities' variance lasts for 2 s; the result is within a quarter of a sigma of the best smoother's.
 
-    How long they last and how much of them is not told apart well: neither is asked for here.
+    How long the errors last and how large their share is cannot be separated well, so neither is tested here.
     """
     (one,) = compared(flight(), filtered(0.5, 2.0), grade, 7, (1.0,))
     noise = one.solved.report.noise
@@ -143,7 +143,7 @@ def test_velocity_errors_correlated_over_seconds_are_found(grade: str) -> None:
 
 @pytest.mark.slow
 def test_white_velocities_are_not_reported_as_correlated() -> None:
-    """Not even where those that filter were looked for: the flight is navigated as if nobody had."""
+    """The search for correlated velocity errors must find none and leave the setup unchanged."""
     (one,) = compared(flight(), RECEIVERS["UBX"], "tactical", 7, (1.0,))
     assert one.solved.report.noise is not None
     assert one.solved.report.noise.velocity_evidence == 0.0

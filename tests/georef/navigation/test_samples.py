@@ -34,7 +34,7 @@ def rows_of(force: FloatArray, turn: FloatArray) -> StructArray:
 
 
 def means(edges_s: FloatArray) -> StructArray:
-    """What a perfect unit says of the intervals between edges."""
+    """Return what a perfect unit measures as means over the intervals between edges."""
     turn = np.diff(rate_integral(edges_s), axis=0) / np.diff(edges_s)[:, None]
     return rows_of(np.broadcast_to(FORCE, turn.shape), turn)
 

@@ -48,7 +48,7 @@ def unit(lean: float) -> ImuTable:
 
 @cache
 def flown(lean: float, told: float, seed: int) -> tuple[Solution, Solution]:
-    """Filtered and smoothed, with axes that lean by so much, the filter told of so much."""
+    """Return filtered and smoothed solutions for axes misaligned by `lean`, rad, where the filter assumes `told`."""
     setup = Setup(replace(reference_noise("mems"), misalignment=told), np.array([ARM]))
     attitude_rad = (1e-3, 1e-3, 1e-2)
     start = drawn_start(craft().truth, seed, attitude_rad=attitude_rad, at_s=BEGIN_S)
@@ -58,7 +58,7 @@ def flown(lean: float, told: float, seed: int) -> tuple[Solution, Solution]:
 
 @pytest.mark.parametrize("lean", [0.0, MISALIGNMENT], ids=["true axes", "leaning axes"])
 def test_errors_on_the_lines_match_their_prediction(lean: float) -> None:
-    """Over the seeds: filtered and smoothed RMS within the 99 % interval of the prediction, position and attitude."""
+    """Over the seeds, filtered and smoothed RMS of position and attitude are in the 99 % interval of the prediction."""
     solutions = [flown(lean, lean, seed) for seed in range(SEEDS)]
     for column in zip(*solutions, strict=True):
         found = seeds_of([on_lines(craft(), solution) for solution in column])
@@ -66,7 +66,7 @@ def test_errors_on_the_lines_match_their_prediction(lean: float) -> None:
 
 
 def test_axis_misalignments_are_estimated() -> None:
-    """By the pairs of axes that the simulator drew, within their sigmas; turns show those of the gyroscopes."""
+    """The misalignments drawn by the simulator are found within their sigmas; turns show those of the gyroscopes."""
     off, sigmas = [], []
     for seed in range(SEEDS):
         _, smoothed = flown(MISALIGNMENT, MISALIGNMENT, seed)
@@ -81,6 +81,6 @@ def test_axis_misalignments_are_estimated() -> None:
 
 
 def test_a_filter_without_misalignment_states_is_recognised() -> None:
-    """The interval is narrow enough to refuse what leaves misalignment out."""
+    """The interval is narrow enough to refuse a filter that leaves misalignment out."""
     found = seeds_of([on_lines(craft(), flown(MISALIGNMENT, 0.0, seed)[1]) for seed in range(4)])
     assert (found.measured > found.high)[3:].any(), found

@@ -25,7 +25,7 @@ ARM = np.array([0.35, -0.12, -1.1])
 
 
 def test_a_flight_that_begins_in_the_air_is_as_accurate_at_its_start() -> None:
-    """On a line, the heading wrong by 8° and known to 10°: the first minute is as good as the last."""
+    """It begins on a line with a heading that is wrong by 8° and has a sigma of 10°; the first minute is as good."""
     flown = reference("tactical").cut(100_640.0, 101_550.0)
     assert flown.truth is not None
     rot, velocity, place = (value[0] for value in flown.truth(np.array([100_640.5])))
@@ -44,8 +44,9 @@ def test_a_flight_that_begins_in_the_air_is_as_accurate_at_its_start() -> None:
 
 
 def test_a_further_pass_claims_no_more_knowledge_than_the_first() -> None:
-    """A MEMS unit whose start is known nearly as well as the flight tells it: a pass begun from the smoothed attitude
-    lies within a tenth of a sigma of the first; what was known of the start counts once.
+    """A MEMS unit's start is known nearly as well as the flight determines it, and must not be counted twice.
+
+    A pass that begins from the smoothed attitude lies within a tenth of a sigma of the first.
     """
     truth, noise = fly(survey(), 240.0, 50.0), GRADES["mems"]
     inertial, rows = noised(truth, noise, Fixes(rate_hz=5.0, velocity_mps=0.03), ARM, 2000)
@@ -58,9 +59,10 @@ def test_a_further_pass_claims_no_more_knowledge_than_the_first() -> None:
 
 
 def ticking(inertial: Inertial) -> Inertial:
-    """The car's samples at the times of the unit's own counter, raw: GNSS is 0.125 s early by them.
+    """Return the car's samples at the times of the unit's own counter; on that clock GNSS is 0.125 s early.
 
-    imu.txt has them stretched by 292 ppm, 0.16 s over the drive, which makes of a constant offset one that grows.
+    The times in imu.txt are stretched by 292 ppm, 0.16 s over the drive, which turns a constant offset into one that
+    grows.
     """
     rows = np.loadtxt(FIXTURES / "rtklib/imu_1934.csv.gz", delimiter=",", usecols=6)
     ticks = rows.astype(np.int64)[1 : 1 + len(inertial)]
@@ -70,7 +72,7 @@ def ticking(inertial: Inertial) -> Inertial:
 
 
 def test_the_logging_delay_of_the_car_is_found() -> None:
-    """0.125 s by its makers' configuration, within 10 ms; positions only, for its velocities are means over 0.25 s."""
+    """Its makers configure 0.125 s; only positions are used, because the velocities are means over 0.25 s."""
     drive, start = car(), start_of("gnss_imu_drive", "meta")
     setup = replace(drive.setup, estimate_time_offset_s=0.3)
     solved = solve(ticking(drive.inertial), drive.only(Kind.POSITION), setup, start)
@@ -83,11 +85,11 @@ def test_the_logging_delay_of_the_car_is_found() -> None:
 
 @pytest.mark.slow
 def test_the_trajectory_of_a_late_imu_is_given_at_gnss_times() -> None:
-    """Stamps 8 ms late, half a metre of way, in eight flights: poses at GNSS's times, as sure as they say.
+    """Stamps are 8 ms late, which is half a metre of flight; the poses refer to GNSS time and have honest sigmas.
 
-    The filter is better than a fix, the smoother than half of one. Squares over predicted ones scatter by 0.3 from
-    flight to flight and axis to axis, those of angles, which last, by 1: the mean of 24 is 1 ± 0.2, and 1 ± 0.6, at
-    three sigmas.
+    The filter is better than a fix, the smoother better than half of one. Ratios of squares to predicted ones scatter
+    by 0.3 from flight to flight and axis to axis, and by 1 for angles, which last: the mean of 24 is 1 ± 0.2, and 1 ±
+    0.6 for angles, at three sigmas.
     """
     late_ns, truth, noise = 8_000_000, fly(survey(), 200.0, 50.0), GRADES["tactical"]
     setup, fix_m = replace(setup_for(noise, ARM), estimate_time_offset_s=0.02), np.array(Fixes().sigma_m)
@@ -116,9 +118,10 @@ def test_the_trajectory_of_a_late_imu_is_given_at_gnss_times() -> None:
 def test_the_outages_of_the_car_are_bridged_as_accurately_as_published(
     raw: bool, filtered_m: float, smoothed_m: float
 ) -> None:
-    """Thirteen of 15 s, horizontal, RMS of the largest errors; by the unit's own clock a third better.
+    """The figures are the RMS of the largest horizontal errors in thirteen outages of 15 s.
 
-    The published times stretch, which looks like positions that err twenty times as much as they are said to: no noise.
+    The published times are stretched, which makes positions err twenty times as much as their sigmas say; this is no
+    noise. With the unit's own clock errors are a third smaller.
     """
     drive, start = car(), start_of("gnss_imu_drive", "meta")
     fixes, spans = (np.loadtxt(NAVIGATION / f"gnss_imu_drive/{name}.txt.xz") for name in ("gnss", "outages"))
@@ -138,7 +141,7 @@ FLIGHT_S = 600.0
 
 @pytest.mark.parametrize(("scale", "share"), [(1.0, 0.0), (2.5, 0.0), (1.0, 0.8)])
 def test_noise_different_from_the_stated_sigmas_is_found(scale: float, share: float) -> None:
-    """Fixes as said, worse by 2.5, and with errors that last a minute: what they are is found, and used."""
+    """Fixes are as good as stated, worse by 2.5, or have errors that last a minute; the noise is found and used."""
     truth = fly(survey(), FLIGHT_S, 50.0)
     inertial, rows = noised(truth, GRADES["tactical"], Fixes(share=share, rate_hz=5.0), ARM, 11)
     rows["sigma"] /= scale
@@ -152,8 +155,9 @@ def test_noise_different_from_the_stated_sigmas_is_found(scale: float, share: fl
 
 @pytest.mark.parametrize("fault", ["frozen", "wrong fix"])
 def test_seconds_of_blunders_do_not_hide_the_noise_of_the_flight(fault: str) -> None:
-    """A receiver that repeats itself for 5 s, a wrong fix for 20 s: errors that last are found all the same, and sigmas
-    long before and after are honest: the mean of squares over predicted ones scatters by 0.4.
+    """A receiver repeats itself for 5 s, or has a wrong fix for 20 s; lasting errors are still found.
+
+    Sigmas long before and after are honest; the mean of squares over predicted ones scatters by 0.4.
     """
     truth = fly(survey(), FLIGHT_S, 50.0)
     inertial, rows = noised(truth, GRADES["tactical"], Fixes(share=0.8, rate_hz=5.0), ARM, 11)
@@ -170,7 +174,7 @@ def test_seconds_of_blunders_do_not_hide_the_noise_of_the_flight(fault: str) -> 
 
 @pytest.mark.parametrize("velocity_mps", [0.02, 0.0], ids=["velocities", "positions alone"])
 def test_a_wrong_fix_does_not_move_the_trajectory(velocity_mps: float) -> None:
-    """1.6 m from one epoch to the next, for 20 s: refused to its end, and errors stay within their sigmas."""
+    """A fix that jumps by 1.6 m between epochs is refused for all of its 20 s, and errors stay within their sigmas."""
     truth = fly(survey(), FLIGHT_S, 50.0)
     inertial, rows = noised(truth, GRADES["tactical"], Fixes(rate_hz=5.0, velocity_mps=velocity_mps), ARM, 11)
     bad = (rows["kind"] == Kind.POSITION) & (rows["time_ns"] >= ns(300.0)) & (rows["time_ns"] < ns(320.0))
@@ -187,7 +191,7 @@ def test_a_wrong_fix_does_not_move_the_trajectory(velocity_mps: float) -> None:
 
 
 def test_a_parameter_that_the_flight_cannot_determine_is_reported() -> None:
-    """Estimate a lever arm in straight and level flight, where it is inseparable from the start."""
+    """In straight and level flight a lever arm cannot be separated from the start."""
     truth = fly(survey(line_s=1000.0), 60.0, 50.0)
     inertial, rows = noised(truth, GRADES["tactical"], Fixes(), ARM, 12)
     setup = replace(setup_for(GRADES["tactical"], ARM), estimate_lever_arm=0.05)

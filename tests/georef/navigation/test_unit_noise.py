@@ -25,13 +25,13 @@ def flight() -> Truth:
 
 
 def flown(unit: ImuNoise, told: ImuNoise) -> tuple[Run, Setup]:
-    """A flight of 150 s with a unit, and the setup of somebody who takes it for another."""
+    """Return a flight of 150 s with a unit, and a setup that assumes another unit."""
     inertial, rows = noised(flight(), unit, Fixes(rate_hz=5.0, velocity_mps=0.02), ARM, 7)
     return stretch_of(inertial, rows, drawn_start(flight(), 7)), Setup(told, ARM[None])
 
 
 def test_the_consumer_grade_matches_its_data_sheet() -> None:
-    """InvenSense PS-MPU-6000A 3.4, 6.1 and 6.2: 0.005 °/s/√Hz, 400 µg/√Hz, ±80 mg, and within ±3 % and ±2 %."""
+    """InvenSense PS-MPU-6000A 3.4, 6.1, 6.2 state 0.005 °/s/√Hz, 400 µg/√Hz, ±80 mg, scales of ±3 %, axes of ±2 %."""
     noise = GRADES["consumer"]
     assert noise.velocity_random_walk == pytest.approx(400e-6 * 9.80665, rel=0.03)
     assert 1.0 <= noise.angle_random_walk / np.radians(0.005) < 2.0  # of other units of the kind more

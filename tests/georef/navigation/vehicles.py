@@ -39,7 +39,7 @@ BEGIN_NS = 2300 * 604_800 * 10**9
 
 
 def ns(t: FloatArray | float) -> Int64Array:
-    """GPS time of seconds of the recording's week."""
+    """Return GPS time, ns, of seconds in the recording's week."""
     return BEGIN_NS + np.rint(np.asarray(t) * 1e9).astype(np.int64)
 
 
@@ -52,10 +52,9 @@ def observed(kind: Kind, t: FloatArray, value: FloatArray, sigma: FloatArray, fi
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """What went in, and how the vehicle truly was.
-
+    """A recording: what a filter receives, and the vehicle's true motion.
     Attributes:
-        truth: times (n,) to rot_l_from_b (n, 3, 3), velocity_l (n, 3), position_e (n, 3); None: unknown.
+        truth: maps times (n,) to rot_l_from_b (n, 3, 3), velocity_l (n, 3), position_e (n, 3); None if unknown.
     """
 
     inertial: Inertial
@@ -90,7 +89,7 @@ def flight_arrays(name: str) -> dict[str, NDArray[Any]]:
 
 @cache
 def reference(name: str) -> Recording:
-    """The survey flight with a "tactical" or "mems" unit."""
+    """Return the survey flight with a "tactical" or "mems" unit."""
     data, about = flight_arrays(name), json.loads((NAVIGATION / f"reference_flight/{name}.json").read_text())
     time_ns = ns(data["imu_t"])
     interval_s = np.diff(time_ns, prepend=time_ns[0] - 5_000_000) / 1e9
@@ -118,7 +117,7 @@ def reference(name: str) -> Recording:
 
 @cache
 def car() -> Recording:
-    """A real drive; attitude unknown."""
+    """Return a real drive of a car, whose true attitude is unknown."""
     folder = NAVIGATION / "gnss_imu_drive"
     imu, fixes, speeds = (np.loadtxt(folder / f"{name}.txt.xz") for name in ("imu", "gnss", "gnssvel"))
     about = json.loads((folder / "meta.json").read_text())
@@ -138,7 +137,7 @@ def car() -> Recording:
 
 @cache
 def uav() -> Recording:
-    """A real flight of a small aeroplane with single-frequency GPS; its own filter's attitude serves as truth."""
+    """Return a real flight of a small aeroplane with single-frequency GPS; its own filter gives the true attitude."""
     from scipy.io import loadmat
 
     path = NAVIGATION / "umn_thor75/thor75.mat"
@@ -175,12 +174,11 @@ def _spec(said: dict[str, float]) -> ImuNoise:
 
 @dataclass(frozen=True)
 class Motion:
-    """How a made-up vehicle goes: functions of time (n,) in a plane at a place; angles rad.
-
+    """The motion of a made-up vehicle: functions of time (n,) in a plane at a place; angles in rad.
     Attributes:
         place: latitude, longitude rad, height m.
-        north_east_down_m: times to (n, 3), metres from the place.
-        attitude: times to roll, pitch, heading (n, 3) against the plane's north, east, down.
+        north_east_down_m: maps times to (n, 3), metres from the place.
+        attitude: maps times to roll, pitch, heading (n, 3) relative to the plane's north, east, down.
     """
 
     place: tuple[float, float, float]
@@ -199,7 +197,7 @@ def made(
     sigma: tuple[float, float] = (0.02, 0.02),
     rate_hz: float = 100.0,
 ) -> Recording:
-    """Samples of a unit with such noise, biases and scale factors, and an antenna's fixes once a second."""
+    """Return samples of a unit with the given noise, biases and scale factors, and an antenna's fixes once a second."""
     rng = np.random.default_rng(seed)
     lat, lon, height = motion.place
     origin_e, rot = e_from_geodetic(lat, lon, height), rot_e_from_l(lat, lon)
@@ -255,7 +253,7 @@ def made(
 
 
 def normalised(recording: Recording, start: Start) -> FloatArray:
-    """(9,) true − found attitude, velocity and position of a start, over its sigmas."""
+    """Return (9,) true − found attitude, velocity and position of a start, divided by its sigmas."""
     assert recording.truth is not None
     rot, velocity, place = (value[0] for value in recording.truth(np.array([(start.time_ns - BEGIN_NS) / 1e9])))
     turn = rotation_vector(quaternion_from_rot(rot @ rot_l_from_b(*start.attitude_rad).T))

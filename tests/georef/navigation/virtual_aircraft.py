@@ -48,7 +48,7 @@ REFERENCE = {
 
 
 def reference_noise(name: str) -> ImuNoise:
-    """What a filter is to be told of `REFERENCE`: biases are drawn when the unit is switched on, and stay."""
+    """Return the noise that a filter is to assume for `REFERENCE`; biases are drawn at power-on and stay constant."""
     table = REFERENCE[name]
     return imu_noise(
         float(table.angle_random_walk_deg_per_sqrt_h or 0.0),
@@ -63,11 +63,10 @@ def reference_noise(name: str) -> ImuNoise:
 
 @dataclass(frozen=True, eq=False)
 class Aircraft:
-    """A way flown.
-
+    """A simulated flight.
     Attributes:
         truth: exact increments between the ends of the samples, and the motion at any time.
-        on_line: (n,) whether the sample ends on a flight line.
+        on_line: (n,) True where the sample ends on a flight line.
     """
 
     truth: Truth
@@ -91,7 +90,7 @@ def aircraft(plan_text: str) -> Aircraft:
 
 
 def survey_plan(lines: int, length_m: float, *, static_s: float) -> str:
-    """From a runway over two short lines across each other to lines there and back at 60 m/s."""
+    """Return a plan from a runway over two short crossing lines to lines there and back, flown at 60 m/s."""
     ends = [((1500.0, -2500.0), (1500.0, -2000.0)), ((3000.0, -1500.0), (2500.0, -1500.0))]
     for k in range(lines):
         way = (0.0, 400.0 * k), (length_m, 400.0 * k)
@@ -113,7 +112,7 @@ static_s = {static_s}
 
 
 def sensed(flown: Aircraft, table: ImuTable, seed: int) -> Inertial:
-    """What a unit of the plan's table says, switched on with a seed: means over its intervals, times known."""
+    """Return a unit's samples, with errors drawn from a seed; times are exact."""
     truth = flown.truth
     errors_of = InertialUnit(table, truth.flight, seed, "main", noise=True).errors
     count, rate_hz = len(truth.angle_b), table.rate_hz
@@ -130,7 +129,7 @@ def sensed(flown: Aircraft, table: ImuTable, seed: int) -> Inertial:
 
 
 def white_fixes(flown: Aircraft, seed: int) -> StructArray:
-    """Positions of the antenna once a second, wrong by 1, 1 and 2 cm from epoch to epoch."""
+    """Return positions of the antenna once a second, with white errors of 1, 1 and 2 cm."""
     t = np.arange(1.0, flown.end_s)
     at = flown.truth.flight.motion(t)
     place = at.position_e + at.rot_e_from_b @ np.array(ARM)
@@ -142,7 +141,7 @@ def white_fixes(flown: Aircraft, seed: int) -> StructArray:
 
 
 def receiver_fixes(flown: Aircraft, seed: int, rate_hz: int = 1) -> StructArray:
-    """Positions and velocities of the virtual RTK receiver, with the sigmas that it says."""
+    """Return positions and velocities of the virtual RTK receiver, with the sigmas that it states."""
     table = GnssTable.model_validate({"protocol": "ubx", "rate_hz": rate_hz, "lever_arm_m": list(ARM)})
     epochs = Receiver(table, flown.truth.flight, seed=seed, name="rover", noise=True).epochs(
         rate_hz, int(flown.end_s - 1.0) * rate_hz
@@ -156,7 +155,7 @@ def receiver_fixes(flown: Aircraft, seed: int, rate_hz: int = 1) -> StructArray:
 
 
 def on_lines(flown: Aircraft, solution: Solution, step: int = 20) -> tuple[FloatArray, FloatArray]:
-    """(6,) mean squares on the lines, of errors north, east, down, roll, pitch, heading, and of their sigmas."""
+    """Return (6,) mean squares on the lines of errors north, east, down, roll, pitch, heading, and of their sigmas."""
     first = round((int(solution.time_ns[0]) - int(ns(flown.truth.edges[1]))) / SECOND_NS * RATE_HZ)
     at = np.flatnonzero(flown.on_line[first : first + len(solution)])[::step]
     t = (solution.time_ns[at] - BEGIN_NS) / SECOND_NS
@@ -167,11 +166,10 @@ def on_lines(flown: Aircraft, solution: Solution, step: int = 20) -> tuple[Float
 
 @dataclass(frozen=True, eq=False)
 class Seeds:
-    """Many flights' RMS on the lines, of north, east, down, roll, pitch, heading, (6,) each.
-
+    """RMS on the lines over many flights, of north, east, down, roll, pitch, heading, (6,) each.
     Attributes:
         measured, predicted: of all flights together, m and rad.
-        low, high: the 99 % interval of what is measured if the prediction is right.
+        low, high: the 99 % interval of the measured value if the prediction is right.
     """
 
     measured: FloatArray
@@ -186,10 +184,10 @@ class Seeds:
 
 
 def seeds_of(squares: list[tuple[FloatArray, FloatArray]]) -> Seeds:
-    """Of `on_lines` of many flights.
+    """Summarise the results of `on_lines` of many flights.
 
-    How much the mean of n flights may be off is told by their own scatter: Student's t of n − 1, of the logarithm, for
-    mean squares are positive.
+    The flights' own scatter gives the uncertainty of the mean of n flights: Student's t of n − 1 degrees of freedom, of
+    the logarithm, because mean squares are positive.
     """
     errors2, sigmas2 = (np.stack(column) for column in zip(*squares, strict=True))
     share = errors2 / sigmas2

@@ -34,7 +34,7 @@ NOMINAL = nominal("left", [0.0, 0.0, 0.0], np.eye(3))
 def points_s(
     geometry: Geometry, angle_rad: object, range_m: object = 1.0, calibration: Calibration = NOMINAL, **columns: object
 ) -> FloatArray:
-    """Points in s, of a scanner whose axes are those of e."""
+    """Return points (n, 3), m, in s, of a scanner whose axes are those of e."""
     rows = rows_of(angle_rad, range_m, **columns)
     rays = SensorModel(calibration, geometry).rays(rows, np.full(len(rows), 5), still_trajectory())
     assert not rays.fate.any()
@@ -42,13 +42,13 @@ def points_s(
 
 
 def spinning(**columns: object) -> SpinningGeometry:
-    """One beam; what is not given is zero."""
+    """Return the geometry of a head with one beam; omitted values are zero."""
     names = ("elevation_deg", "azimuth_deg", "range_m", "right_m", "forward_m", "up_m")
     return SpinningGeometry(*(np.atleast_1d(np.asarray(columns.get(name, 0.0), np.float64)) for name in names))
 
 
 def tilted(geometry: Geometry, theta: float, tilt: float) -> float:
-    """u_x a radian of facet tilt."""
+    """Return ∂u_x / ∂tilt, the change of the beam's x component per radian of facet tilt."""
     calibration = replace(NOMINAL, facet_tilt_rad={0: tilt})
     return float(points_s(geometry, theta, calibration=calibration)[0, 0] / tilt)
 
@@ -91,7 +91,7 @@ def test_palmer_scan_follows_its_formula() -> None:
 
 
 def test_palmer_scan_with_another_shaft_angle_follows_its_formula() -> None:
-    """Middle of the scan: the laser's beam turned by π − 2β."""
+    """In the middle of the scan, the laser's beam is turned by π − 2β."""
     points = points_s(NutatingGeometry(1e-12, np.radians(40.0)), 0.0)
     assert points[0] == pytest.approx([-np.cos(np.radians(80.0)), 0.0, np.sin(np.radians(80.0))], abs=1e-11)
 

@@ -21,7 +21,7 @@ BITS_17 = 2 * np.pi / 2**17
 def read(
     motion: Any, prf_hz: float, duration_s: float, quantum_rad: float
 ) -> tuple[StructArray, Int64Array, FloatArray, FloatArray]:
-    """Rows of every pulse, their times, true rates and accelerations."""
+    """Return rows of every pulse, their times (ns), true rates (rad/s) and accelerations (rad/s²)."""
     time_ns = np.rint(np.arange(round(prf_hz * duration_s)) * 1e9 / prf_hz).astype(np.int64)
     swing = motion(1e-9 * time_ns)
     rows = np.zeros(len(time_ns), RETURN_DTYPE)
@@ -34,7 +34,7 @@ def read(
 def run(
     rows: StructArray, time_ns: Int64Array, cuts: Any = (), **keys: bool
 ) -> tuple[StructArray, FloatArray, FloatArray]:
-    """All rows with their rates; nothing is lost and nothing changes its place."""
+    """Return all rows with their rates, and check that no row is lost or moved."""
     motion = EncoderMotion(**keys)
     parts = zip(np.split(rows, cuts), np.split(time_ns, cuts), strict=True)
     given = [*(motion.feed(*part) for part in parts), motion.flush()]

@@ -30,7 +30,7 @@ ROLLING = Mount((Stage(np.array([0.1, -0.05, 0.3]), np.array([0.2, 0.1, 0.3])), 
 
 
 def tumbling() -> Trajectory:
-    """A body that flies and turns fast, near the middle of the earth, where coordinates have all their digits."""
+    """Return a body that flies and turns fast near the earth's centre, where coordinates have all their digits."""
     epochs = np.arange(5)
     position: FloatArray = np.array([0.6, -1.2, 0.3]) * epochs[:, np.newaxis].astype(np.float64)
     position[2:] += 0.3
@@ -41,7 +41,7 @@ def tumbling() -> Trajectory:
 
 
 class Shots:
-    """Twenty pulses in the middle of an interval."""
+    """Twenty pulses in the middle of an interval between epochs."""
 
     def __init__(self, case: Case, mount: Mount) -> None:
         rng = np.random.default_rng(3)
@@ -75,7 +75,7 @@ class Shots:
 
 
 def slope_of(points: list[FloatArray], step: float) -> FloatArray:
-    """Central differences of points at −h, −h/2, h/2, h, with the error of second order taken out by halving."""
+    """Return the slope by central differences of points at −h, −h/2, h/2, h, extrapolated to remove h²."""
     wide, narrow = (points[3] - points[0]) / (2 * step), (points[2] - points[1]) / step
     return (4.0 * narrow - wide) / 3.0
 
@@ -160,7 +160,7 @@ PRINTED_L = {  # north, east, down
 
 
 def published_flight() -> Trajectory:
-    """A millisecond around the published pose, with its velocity and its rates of roll, pitch and heading."""
+    """Return a millisecond around the published pose, with its velocity and its rates of roll, pitch and heading."""
     lat_deg, lon_deg = 47.1234567, 8.7
     middle_e = np.array(TO_ECEF.transform(lon_deg, lat_deg, 1512.3))
     rot_e_l = Rotation.from_euler("ZY", [lon_deg, -lat_deg - 90.0], degrees=True)
@@ -173,7 +173,7 @@ def published_flight() -> Trajectory:
 
 
 def test_columns_match_the_formula_sheet() -> None:
-    """By FORMULAS' header: its Δρ stands inside the scale, its Δθ has the other sign."""
+    """By the header of FORMULAS, its Δρ stands inside the scale, and its Δθ has the opposite sign."""
     errors = dict(zip(("omega_rad", "phi_rad", "kappa_rad"), np.radians([0.05, -0.08, 0.03]), strict=True))
     errors |= {"range_offset_m": (1 + RANGE_SCALE) * OFFSET_M, "range_scale": RANGE_SCALE}
     errors |= {"scan_angle_offset_rad": -ANGLE_OFFSET, "scan_angle_scale": ANGLE_SCALE}
@@ -201,7 +201,7 @@ def test_columns_match_the_formula_sheet() -> None:
 
 
 def test_first_order_effects_on_flat_ground_match_the_formula_sheet() -> None:
-    """FORMULAS 5.3: level flight, H = 1000 m, θ = 20°; forward, right, down."""
+    """FORMULAS 5.3 lists forward, right, down for level flight at H = 1000 m and θ = 20°."""
     theta = np.radians(20.0)
     model = SensorModel(nominal("left", [0, 0, 0], np.eye(3)), LineGeometry())
     rays = model.rays(

@@ -46,7 +46,7 @@ def test_two_stages_are_applied_outermost_first() -> None:
 
 
 def test_chain_of_a_moving_gimbal_uses_the_angles_of_each_pulse() -> None:
-    """Boresight outside, installation inside, the head's own frame innermost; each pulse with its own angles."""
+    """The boresight is outermost, then the installation, then the head's own frame; each pulse has its own angles."""
     rng = np.random.default_rng(4)
     series = AngleSeries(np.array([0, 40, 80]) * MS, np.array([[0.0, 0.1, 3.1], [0.2, -0.1, -3.1], [0.1, 0.0, -3.0]]))
     zero = np.array([0.01, -0.02, 0.03])
@@ -121,7 +121,7 @@ def test_angles_reported_by_a_device_are_those_of_the_stage() -> None:
 
 
 def test_angles_of_two_recordings_cover_the_time_of_both() -> None:
-    """Whatever was recorded first; nothing is known between them."""
+    """The order of the recordings does not matter, and no angles are known between them."""
     early = AngleSeries(np.array([0, 10]) * MS, np.full((2, 3), 0.1), max_gap_ns=20 * MS)
     late = AngleSeries(np.array([100, 110]) * MS, np.full((2, 3), 0.2), max_gap_ns=20 * MS)
     still = Stage(angles_rad=np.array([0.0, 0.0, 0.5]))

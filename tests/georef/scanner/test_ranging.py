@@ -25,7 +25,7 @@ APPARENT_M = 1e-3
 
 
 def longer_m(ticks: int, tick_hz: int, group_index: float, about_m: float) -> float:
-    """What the range of an echo is longer when it belongs to the pulse so many ticks of the counter before."""
+    """Return by how many metres an echo's range grows if it belongs to the pulse `ticks` of the counter earlier."""
     rows = np.zeros(2, RETURN_DTYPE)
     rows["device_time_ns"] = 10**12, 10**12 + ticks * 10**9 // tick_hz
     rows["pulse_id"], rows["mta_zone"] = (7, 8), 255
@@ -93,9 +93,9 @@ def train(
     every_pulse: bool = False,
     half_angle_rad: float = 0.5,
 ) -> tuple[StructArray, StructArray]:
-    """Records of a scanner that tells apparent ranges, and the same returns as they truly are, by emission.
+    """Return records of a scanner that gives apparent ranges, and the same returns as they truly are, by emission.
 
-    ``range_of(pulse, angle)`` gives the list of a pulse's ranges; ``period_ns`` one or (n,) of them.
+    ``range_of(pulse, angle)`` gives the list of a pulse's ranges, m; ``period_ns`` is one period or (n,) of them.
     """
     steps = np.broadcast_to(np.asarray(period_ns, np.int64), (n,))
     times = 10**12 + np.concatenate([[0], np.cumsum(steps[1:])])
@@ -131,7 +131,7 @@ def fed(resolver: ZoneResolver, rows: StructArray, cuts: Any = ()) -> StructArra
 
 
 def assert_true(found: StructArray, true: StructArray) -> None:
-    """Every row is one of the true ones: emission, encoder, zone and number; its intensity names the pulse."""
+    """Assert that each row has the true emission, encoder, zone and number; its intensity identifies the pulse."""
     key = {(int(row["pulse_id"]), int(row["return_number"])): row for row in true}
     wanted = np.array([key[int(row["pulse_id"]), int(row["return_number"])] for row in found], RETURN_DTYPE)
     for name in ("device_time_ns", "pulse_id", "intensity", "mta_zone", "return_number", "number_of_returns"):
@@ -346,7 +346,7 @@ def test_context_rows_are_not_counted() -> None:
 
 @pytest.mark.parametrize("cuts", [(), (1, 399, 400, 401, 700)])
 def test_the_tick_rate_follows_the_header(cuts: tuple[int, ...]) -> None:
-    """70 MHz, then, of another device, 150: its counter begins anew."""
+    """A device of 70 MHz is followed by another of 150 MHz, whose counter starts again."""
     rows, zones_m = np.zeros(800, RETURN_DTYPE), []
     for part, hz in ((slice(0, 400), 70_000_000), (slice(400, 800), 150_000_000)):
         ticks = 10**11 + hz // 500_000 * np.arange(400)

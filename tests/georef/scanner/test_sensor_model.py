@@ -33,7 +33,7 @@ UNIT = nominal("left", [0, 0, 0], np.eye(3))
 
 @dataclass
 class Flights:
-    """Many short flights all over the earth, one second after the other, two epochs each."""
+    """Many short flights all over the earth, one second apart, with two epochs each."""
 
     time_ns: Int64Array
     lat_rad: FloatArray
@@ -66,7 +66,7 @@ class Flights:
         )
 
     def poses(self, time_s: FloatArray, attitude_s: FloatArray) -> tuple[FloatArray, Rotation]:
-        """Positions and attitudes in e, seconds after each flight's first epoch, by pyproj and SciPy."""
+        """Return positions (n, 3), m, and attitudes in e, seconds after each first epoch, by pyproj and SciPy."""
         x, y, z = TO_ECEF.transform(np.degrees(self.lon_rad), np.degrees(self.lat_rad), self.height_m)
         ends = np.stack([x, y, z], axis=1).reshape(-1, 2, 3)
         share = (time_s / (STEP_NS * 1e-9))[:, np.newaxis]
@@ -79,7 +79,7 @@ class Flights:
 
 @dataclass
 class Shots:
-    """One pulse a flight, and the encoder's motion."""
+    """One pulse for each flight, and the encoder's motion."""
 
     rows: StructArray
     time_ns: Int64Array
@@ -113,7 +113,7 @@ class Shots:
 
 
 def expected(case: Case, calibration: Calibration, flights: Flights, shots: Shots) -> FloatArray:
-    """Ground points by CONVENTIONS' page, pyproj and SciPy."""
+    """Return ground points (n, 3), m, in e, computed from the page of conventions by pyproj and SciPy."""
     value, rows = calibration.value, shots.rows
     rho = (1 + value("range_scale")) * rows["range_m"] + value("range_offset_m")
     rho -= np.interp(rows["intensity"], *IBRC)
@@ -155,7 +155,7 @@ def test_the_model_is_exact_everywhere_on_earth_with_every_error(kind: str) -> N
 
 
 def test_axes_reproduce_the_points() -> None:
-    """The arm in b, turned by the attitude that was taken, and put where the body was, is the point."""
+    """A point is the arm in b, rotated by the interpolated attitude and added to the body's position."""
     case, rng = CASES["spinning"], np.random.default_rng(6)
     flights = Flights.all_over_the_earth(rng)
     shots = Shots.of(case, flights, rng)
@@ -186,7 +186,7 @@ GROUND_E = np.array([4297745.87263879, 657512.472772624, 4651743.38727272])
 
 
 def hovering(lat: float = LAT, lon: float = LON, height_m: float = HEIGHT_M) -> Trajectory:
-    """Ten milliseconds in one place."""
+    """Return ten milliseconds of trajectory in one place."""
     same = np.ones(2)
     return Trajectory.from_geodetic(
         np.array([0, 10_000_000]),
@@ -199,14 +199,14 @@ def hovering(lat: float = LAT, lon: float = LON, height_m: float = HEIGHT_M) -> 
 
 
 def published_model(**changes: float) -> SensorModel:
-    """That of FORMULAS 2.1."""
+    """Return the sensor model of FORMULAS 2.1, with changed parameters."""
     names = ("omega_rad", "phi_rad", "kappa_rad")
     calibration = nominal("left", LEVER_ARM_B, TURNED).changed(**dict(zip(names, BORESIGHT_RAD.tolist(), strict=True)))
     return SensorModel(calibration.changed(**changes), LineGeometry())
 
 
 def matrices() -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """x_b^e, R_l^e, R_b^l, R_s^b by pyproj and SciPy."""
+    """Return x_b^e, R_l^e, R_b^l, R_s^b, computed by pyproj and SciPy."""
     body_e = np.array(TO_ECEF.transform(np.degrees(LON), np.degrees(LAT), HEIGHT_M))
     rot_e_l = Rotation.from_euler("ZY", [LON, -LAT - np.pi / 2]).as_matrix()
     rot_l_b = Rotation.from_euler("ZYX", ATTITUDE_RAD[::-1]).as_matrix()
@@ -214,12 +214,12 @@ def matrices() -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
 
 
 def beam() -> FloatArray:
-    """u(θ) of ISO Eq. 1."""
+    """Return u(θ) of ISO Eq. 1."""
     return np.array([0.0, np.sin(THETA), np.cos(THETA)])
 
 
 def form_9() -> FloatArray:
-    """ISO Eq. 9: by the foot point on the ellipsoid."""
+    """Return the point by ISO Eq. 9, which starts from the foot point on the ellipsoid."""
     _, rot_e_l, rot_l_b, rot_b_s = matrices()
     foot_e = np.array(TO_ECEF.transform(np.degrees(LON), np.degrees(LAT), 0.0))
     body_l = np.array([0.0, 0.0, -HEIGHT_M])
@@ -227,20 +227,20 @@ def form_9() -> FloatArray:
 
 
 def form_10() -> FloatArray:
-    """ISO Eq. 10."""
+    """Return the point by ISO Eq. 10."""
     body_e, rot_e_l, rot_l_b, rot_b_s = matrices()
     return np.asarray(body_e + rot_e_l @ rot_l_b @ (LEVER_ARM_B + rot_b_s @ (RANGE_M * beam())))
 
 
 def form_11(lever_sign: float = 1.0) -> FloatArray:
-    """ISO Eq. 11 with the lever arm in s, and with the sign that makes it true."""
+    """Return the point by ISO Eq. 11, with the lever arm in s and the sign that makes the equation true."""
     body_e, rot_e_l, rot_l_b, rot_b_s = matrices()
     lever_s = rot_b_s.T @ LEVER_ARM_B
     return np.asarray(body_e + rot_e_l @ rot_l_b @ rot_b_s @ (lever_sign * lever_s + RANGE_M * beam()))
 
 
 def form_nga() -> FloatArray:
-    """NGA Eq. 3: antenna, IMU, gimbal centre, scanner."""
+    """Return the point by NGA Eq. 3: antenna, IMU, gimbal centre, scanner."""
     body_e, rot_e_l, rot_l_b, _ = matrices()
     antenna_b = np.array([-1.2, 0.05, -1.35])
     platform = Rotation.from_euler("XYZ", BORESIGHT_RAD).as_matrix()
@@ -268,7 +268,7 @@ def test_published_misprints_have_the_expected_size() -> None:
 
 
 def test_the_model_with_a_fixed_gimbal_equals_the_rigid_model() -> None:
-    """A stage that stands still with r_GIM, one that is the installation."""
+    """The gimbal has one fixed stage with r_GIM and one that is the installation."""
     lever_gimbal = boresight(*BORESIGHT_RAD).T @ (0.4 * LEVER_ARM_B)
     mount = Mount((Stage(lever_arm=lever_gimbal), Stage(angles_rad=np.array([0.0, 0.0, np.pi]))))
     calibration = replace(published_model().calibration, installation_matrix=np.eye(3))
@@ -280,7 +280,7 @@ def test_the_model_with_a_fixed_gimbal_equals_the_rigid_model() -> None:
 
 
 def test_small_corrections_have_the_sizes_of_the_formula_sheet() -> None:
-    """FORMULAS 9: encoder latency and IMU latency on the ground, H = 1000 m."""
+    """FORMULAS 9 gives the effect of encoder latency and IMU latency on the ground at H = 1000 m."""
     rows, time_ns = rows_of(0.0, 1000.0), np.array([4_000_000])
     model = SensorModel(UNIT.changed(encoder_latency_s=1e-6), LineGeometry())
     rate = np.radians([4200.0])
@@ -348,7 +348,7 @@ def test_every_return_has_one_fate() -> None:
 
 
 def test_latencies_count_for_the_trajectory_coverage() -> None:
-    """The attitude of a late IMU is needed after the pulse, where the trajectory may have ended."""
+    """A late IMU's attitude is needed at a time after the pulse, when the trajectory may have ended."""
     ns = still_trajectory().time_ns[-1]
     base = UNIT
     rows = rows_of(np.zeros(3), np.full(3, 500.0))

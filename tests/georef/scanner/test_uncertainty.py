@@ -57,7 +57,7 @@ USUAL = [name for name in NAMES if name in ("omega_rad", "phi_rad", "kappa_rad")
 
 @dataclass
 class Geometry:
-    """One return and all that it was made of."""
+    """One return and everything that determines its point."""
 
     calibration: Calibration
     lat_deg: float
@@ -80,7 +80,7 @@ class Geometry:
         return columns
 
     def trajectory(self) -> Trajectory:
-        """Two epochs of steady motion."""
+        """Return two epochs of steady motion."""
         step_s = STEP_NS * 1e-9
         start = np.array(TO_ECEF.transform(self.lon_deg, self.lat_deg, self.height_m))
         step_e = self.rot_e_from_l @ self.velocity_l * step_s
@@ -119,7 +119,7 @@ class Geometry:
 
 
 def random_geometry(rng: np.random.Generator, correlation: FloatArray) -> Geometry:
-    """Anywhere on the globe, any heading, all parameters set."""
+    """Return a geometry anywhere on the globe, with any heading and with every parameter set."""
     signs = rng.uniform(-1, 1, len(NAMES))
     values = {name: float(sign * SIZES[name][0]) for name, sign in zip(NAMES, signs, strict=True)}
     sigmas = np.array([SIZES[name][1] for name in NAMES]) * rng.uniform(0.3, 1.0, len(NAMES))
@@ -142,7 +142,10 @@ def random_geometry(rng: np.random.Generator, correlation: FloatArray) -> Geomet
 
 
 def drawn_points_e(geometry: Geometry, rng: np.random.Generator, draws: int) -> FloatArray:
-    """(draws, 3) less the body's position: the equation of CONVENTIONS with every input drawn from its covariance."""
+    """Return points (draws, 3) minus the body's position, m, in e, with every input drawn from its covariance.
+
+    The equation is that of the page of conventions.
+    """
     calibration = geometry.calibration
     drawn = rng.multivariate_normal(calibration.parameters, calibration.covariance(), draws, method="eigh")
     value = dict(zip(NAMES, drawn.T, strict=True))
@@ -174,7 +177,7 @@ def as_matrix(six: FloatArray) -> FloatArray:
 
 
 def random_correlation(rng: np.random.Generator) -> FloatArray:
-    """Of all parameters, some of it strong."""
+    """Return a correlation matrix of all parameters, with some strong correlations."""
     mixed = np.eye(len(NAMES)) + 0.35 * rng.normal(size=(len(NAMES), len(NAMES)))
     covariance = mixed @ mixed.T
     sigma = np.sqrt(np.diag(covariance))
@@ -227,7 +230,7 @@ def test_covariances_and_axes_requested_together_equal_those_requested_alone(sta
 
 
 def level(calibration: Calibration) -> Geometry:
-    """FORMULAS 10.5: 20° to the right, 1000 m down, heading 75°."""
+    """Return the geometry of FORMULAS 10.5: 20° to the right, 1000 m down, heading 75°."""
     return Geometry(
         calibration,
         47.0,
@@ -291,7 +294,7 @@ def test_a_zero_encoder_latency_with_a_sigma_still_contributes() -> None:
 
 
 def test_a_fixed_parameter_adds_to_sigmas_and_cancels_with_correlated_estimates() -> None:
-    """A range offset held to 5 cm makes points 5 cm uncertain; a lever arm estimated beside it takes that back."""
+    """A range offset held to 5 cm makes points 5 cm uncertain, unless a lever arm estimated with it compensates it."""
     none, arm, offset = np.zeros(len(NAMES)), NAMES.index("lever_arm_z_m"), NAMES.index("range_offset_m")
     held, sigmas, correlation = none.copy(), none.copy(), np.eye(len(NAMES))
     held[offset] = sigmas[arm] = 0.05

@@ -52,7 +52,7 @@ PLAN = ClockPlan(
 
 
 def device_ns(seconds: float | np.ndarray[Any, Any]) -> Any:
-    """The scanner's counter so long after 0."""
+    """Return the scanner's counter (ns) at seconds since the start."""
     return DEVICE_0 + np.rint(np.asarray(seconds) * 1e9 * (1 + DRIFT)).astype(np.int64)
 
 
@@ -86,7 +86,7 @@ class Echo:
 
 @dataclass
 class Rig:
-    """A stream of one scanner, whose world goes on second by second."""
+    """A stream with one scanner, fed second by second."""
 
     settings: StreamSettings = field(default_factory=StreamSettings)
     ins_s: tuple[float, float] = (0.0, 1e9)
@@ -106,7 +106,7 @@ class Rig:
         self.given = 0
 
     def run(self, until_s: float, *, rows: int = 10, since_s: float = 0.0) -> Rig:
-        """Tick by tick: what a tenth of a second brings, then the decision."""
+        """Feed and advance the stream tick by tick, a tenth of a second each."""
         for step in range(round(since_s * 10), round(until_s * 10)):
             self.feed(step / 10, rows)
             tick = HOST_0 + (step + 1) * TICK
@@ -141,7 +141,7 @@ class Rig:
 
 
 def second_of(second: int) -> tuple[PpsEdge, TimeMessage]:
-    """An edge, and the message that names it 80 ms later."""
+    """Return an edge, and the message that names it 80 ms later."""
     host_ns = HOST_0 + second * SECOND_NS
     tag = TimeTag(TimeScale.GPS, (TOW_S + second) * SECOND_NS, week=WEEK)
     message = TimeMessage(host_ns + 80_000_000, tag, NamesEdge.PREVIOUS, bound=True, message="TIME")
@@ -221,7 +221,7 @@ def test_a_scanner_without_latch_runs_free_and_is_refused() -> None:
 
 
 def test_after_a_lost_pulse_points_end_when_the_sigma_has_grown() -> None:
-    """A device that is no more latched wanders by some 30 ns/s per √s: half a microsecond is soon passed."""
+    """A device without a latch wanders by some 30 ns/s per √s, so it soon exceeds half a microsecond."""
     tight = StreamSettings(max_time_sigma_ns=500.0)
     rig = Rig(tight, latch_s=(0.0, 10.0)).run(26.0)
     rig.stream.close()
@@ -233,7 +233,7 @@ def test_after_a_lost_pulse_points_end_when_the_sigma_has_grown() -> None:
 
 
 def test_a_head_on_another_hour_is_refused() -> None:
-    """A locked Velodyne has timestamps past the UTC hour; one that contradicts the host's hour is refused."""
+    """A locked Velodyne counts from the UTC hour; a head that contradicts the host's hour is refused."""
     for lag_s, placed in ((0.0, True), (700.0, False)):
         rig = Rig(name="top")
         past_hour_ns = (GPS_0 - 18 * SECOND_NS - round(lag_s * 1e9)) % (3600 * SECOND_NS)
@@ -315,7 +315,7 @@ def test_discarded_returns_are_passed_on_with_their_fate_and_known_time() -> Non
 
 
 def test_the_order_in_which_a_tick_is_fed_does_not_matter() -> None:
-    """Edges, messages and readings of one tick are taken in one order, whatever came first."""
+    """Edges, messages and readings of one tick are processed in a fixed order, whichever was fed first."""
     digests = []
     for backwards in (False, True):
         rig = Rig()
@@ -371,7 +371,7 @@ class Turning(Echo):
 
 
 def test_encoder_motion_belongs_to_its_row() -> None:
-    """A shaft that turns evenly at 3 rad/s; what is there for its neighbours only tells, and gives no point."""
+    """The shaft turns evenly at 3 rad/s; rows that only give context to their neighbours become no points."""
     rig, echo = Rig(), Turning()
     motion = EncoderMotion(steady=True)
     chain = ScannerChain("left", echo, motion=motion, given=echo.given)
@@ -441,7 +441,7 @@ def test_returns_of_unknown_zone_get_the_time_of_their_emission() -> None:
 
 
 def test_interpolated_times_match_the_device_clock() -> None:
-    """The quick way is within 2 ns of every row asked by itself; across a restart every row is asked."""
+    """Interpolated times are within 2 ns of those computed for each row; across a restart every row is computed."""
     rig = Rig().run(12.0)
     clocks, rows = rig.stream.clocks, return_rows(np.arange(9.0, 12.0, 0.0007))
     good, quick = clocks.place("scanner/left", rows, 1e6)

@@ -18,7 +18,10 @@ OFFSET_NS = HOST_NS - 1000 * SECOND_NS  # host time less MONOTONIC
 
 
 def told(clocks: HostClocks, delay_ns: int, max_error_s: float, *, seconds: int, ticks_s: int) -> None:
-    """Edges, RMC that comes so late, and ten readings a second; taken every so many seconds, 0: at the end."""
+    """Feed edges, RMC messages with a delay and ten clock readings a second.
+
+    The clocks are updated every `ticks_s` seconds; 0 means only at the end.
+    """
     for second in range(seconds):
         edge_ns = HOST_NS + second * SECOND_NS
         for reading_ns in range(edge_ns, edge_ns + SECOND_NS, SECOND_NS // 10):
@@ -36,7 +39,7 @@ def told(clocks: HostClocks, delay_ns: int, max_error_s: float, *, seconds: int,
 @pytest.mark.parametrize("ticks_s", [0, 1, 7])
 @pytest.mark.parametrize("delay_ms", [100, 800, 1200])
 def test_a_synchronised_wall_clock_decides_the_second_of_late_messages(delay_ms: int, ticks_s: int) -> None:
-    """NMEA late by 0.8 s is uncertain, late by 1.2 s looks 0.2 s late; chrony decides, as it does while recording."""
+    """NMEA that is late by 0.8 s is ambiguous, by 1.2 s it looks 0.2 s late; chrony decides, as while recording."""
     plan = ClockPlan(OFFSET_NS, pps={"pps/main": PpsPlan(18)}, gnss={"gnss/rover": GnssPlan("pps/main")})
     clocks = HostClocks(plan, keep_history=True)
     told(clocks, delay_ms * 1_000_000, 0.01, seconds=400, ticks_s=ticks_s)
@@ -54,7 +57,7 @@ def test_an_unsynchronised_wall_clock_decides_no_second() -> None:
 
 
 def test_a_wall_clock_alone_gives_no_time() -> None:
-    """Its drift between readings is in no sigma, and a missing receiver could not be reported."""
+    """No sigma includes the wall clock's drift between readings, and a missing receiver would go unnoticed."""
     plan = ClockPlan(OFFSET_NS, pps={"pps/main": PpsPlan(18)}, gnss={"gnss/rover": GnssPlan(None)})
     clocks = HostClocks(plan, keep_history=True)
     told(clocks, 100_000_000, 0.01, seconds=60, ticks_s=1)

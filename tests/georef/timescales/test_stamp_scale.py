@@ -17,13 +17,13 @@ HOUR = 3600 * NS
 
 
 def truth_ns(seconds: float = 60.0, step_s: float = 0.02) -> Int64Array:
-    """GPS times of pulses."""
+    """Return GPS times of pulses, ns."""
     times: Int64Array = START_S * NS + np.rint(np.arange(10.0, seconds, step_s) * NS).astype(np.int64)
     return times
 
 
 def latencies(count: int, least_ms: float = 0.3, typical_ms: float = 0.8) -> Int64Array:
-    """From a pulse to the arrival of its datagram: a least one and an exponential tail."""
+    """Return latencies (n,), ns, between pulse and arrival of a datagram: a minimum and an exponential tail."""
     drawn = least_ms + np.random.default_rng(4).exponential(typical_ms, count)
     return np.rint(drawn * 1e6).astype(np.int64)
 
@@ -37,7 +37,7 @@ def judged(
     off_ns: int = 0,
     **more: object,
 ) -> Stamps:
-    """The judgement by arrivals; off_ns: of the host's clock."""
+    """Return the judgement by arrivals, where the host's clock is wrong by `off_ns`."""
     near = gps + latencies(len(gps)) + off_ns
     wanted = more.get("wanted", StampScale.AUTO)
     assert isinstance(wanted, StampScale)
@@ -47,7 +47,7 @@ def judged(
 
 
 def absolute(gps: Int64Array, beside_gps_s: int) -> Int64Array:
-    """Stamps since 1970 on a scale so many seconds beside GPS time: TAI +19, UTC −18."""
+    """Return stamps since 1970, ns, on a scale that differs from GPS time: TAI by +19 s, UTC by −18 s."""
     return gps + (UNIX_MINUS_GPS_S + beside_gps_s) * NS
 
 
@@ -72,7 +72,7 @@ def test_a_capture_of_two_seconds_is_enough() -> None:
 
 
 def test_absolute_timestamps_of_unknown_scale_run_free_until_configured() -> None:
-    """A PTP master has right fractions and a date a second off, so arrivals decide once configured."""
+    """A PTP master whose date is a second off has right fractions, so arrivals decide the second once configured."""
     gps = truth_ns()
     stamps = absolute(gps, 20)
     found = judged(stamps, gps)
@@ -97,7 +97,7 @@ def hour_stamps(gps: Int64Array, off_ns: int = 0, drift_ppm: float = 0.0) -> Int
 
 
 def test_timestamps_of_a_locked_head_are_recognised_as_hours_of_utc() -> None:
-    """Across the turn of the hour, too."""
+    """The stamps cross the turn of the hour."""
     gps = truth_ns() + 3570 * NS
     found = judged(hour_stamps(gps), gps, past_hour=True)
     assert (found.scale, found.sigma_ns) == (StampScale.HOUR, 20_000.0)
@@ -106,14 +106,14 @@ def test_timestamps_of_a_locked_head_are_recognised_as_hours_of_utc() -> None:
 
 @pytest.mark.parametrize(("off_s", "drift_ppm"), [(1.0, 0.0), (-1.0, 0.0), (0.3, 0.0), (777.7, 12.0), (0.0, 30.0)])
 def test_timestamps_that_do_not_follow_the_hour_run_free(off_s: float, drift_ppm: float) -> None:
-    """A second off, anywhere in the hour, and once right but without a pulse: 30 ppm are 9 ms in five minutes."""
+    """They are a second off, or elsewhere in the hour, or drift by 30 ppm without a pulse, 9 ms in five minutes."""
     gps = truth_ns(310, 0.1)
     found = judged(hour_stamps(gps, round(off_s * NS), drift_ppm), gps, past_hour=True)
     assert found.scale is StampScale.FREE
 
 
 def test_a_drift_within_the_limit_is_included_in_the_sigma() -> None:
-    """3 ppm over five minutes, 0.9 ms: the stamps are not as good as those of a head known to be locked."""
+    """3 ppm over five minutes are 0.9 ms, so the stamps are less accurate than those of a head known to be locked."""
     gps = truth_ns(310, 0.1)
     stamps = hour_stamps(gps, 0, 3.0)
     found = judged(stamps, gps, past_hour=True)
@@ -123,7 +123,7 @@ def test_a_drift_within_the_limit_is_included_in_the_sigma() -> None:
 
 
 def test_free_counters_are_rarely_taken_for_the_hour() -> None:
-    """600 starts, evenly over the hour: of them 0.1 s in 3600 s stand there by chance."""
+    """Of 600 starts spread evenly over the hour, 0.1 s in 3600 s would fit by chance."""
     gps = truth_ns(20, 0.1)
     off = np.linspace(0, 3600, 600, endpoint=False) + 0.6
     taken = [judged(hour_stamps(gps, round(s * NS)), gps, past_hour=True).scale is StampScale.HOUR for s in off]
@@ -150,7 +150,7 @@ def test_without_enough_data_or_a_time_no_scale_is_found() -> None:
 
 
 def rows_of(stamps: Int64Array, gps: Int64Array, locked: int = -1) -> StructArray:
-    """Clock samples as they arrive."""
+    """Return clock samples as they arrive at the host."""
     rows = np.zeros(len(gps), DEVICE_CLOCK_DTYPE)
     rows["host_time_ns"] = host_ns((gps + latencies(len(gps)) - START_S * NS) / NS)
     rows["device_time_ns"] = stamps
@@ -166,7 +166,7 @@ def errors(clock: DeviceClock, rows: StructArray, gps: Int64Array) -> tuple[Floa
 
 @pytest.mark.parametrize("hour", [False, True])
 def test_a_growing_clock_finds_the_scale_after_some_seconds(hour: bool) -> None:
-    """Before it, the arrivals' 2 ms; from then on the stamps' own; the same however the rows are cut."""
+    """Before that, the sigma is the arrivals' 2 ms, then the stamps' own; batches of rows do not matter."""
     gps = truth_ns(60)
     stamps = hour_stamps(gps) if hour else absolute(gps, 19)
     rows = rows_of(stamps, gps)
@@ -193,7 +193,7 @@ def test_a_head_that_reports_no_lock_is_not_judged() -> None:
 
 
 def test_timestamps_that_jump_away_from_their_arrival_are_refused() -> None:
-    """A PTP master whose date changes in flight: those stamps are counted, and have no time good enough."""
+    """A PTP master's date changes in flight; those stamps are counted and get a sigma too large to be used."""
     gps = truth_ns(60)
     stamps = absolute(gps, 19)
     stamps[len(stamps) // 2 :] += 5 * NS

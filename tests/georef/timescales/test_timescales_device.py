@@ -19,13 +19,13 @@ DEVICE_RATE = 1.0 - 41e-6
 
 
 def device_ns(true_s: FloatArray | float) -> Int64Array:
-    """Device time of true seconds since START_S, in whole 100 ns ticks."""
+    """Return device time, ns, of true seconds since START_S, in whole ticks of 100 ns."""
     ticks = np.rint((POWER_ON_NS + np.asarray(true_s, dtype=np.float64) * DEVICE_RATE * NS) / 100.0)
     return ticks.astype(np.int64) * 100
 
 
 def test_an_edge_stamped_in_the_future_does_not_stop_the_clock() -> None:
-    """One wrong line of a FIFO, an hour ahead: refused, and the edges that come then are taken."""
+    """One wrong entry of a FIFO, an hour ahead, is refused, and the edges that follow are accepted."""
     clock = host_clock(30)
     before = dict(clock.edges_refused)
     clock.add_edge(int(host_ns(3630.4)))
@@ -43,7 +43,7 @@ def rows_of(
     latched: bool = True,
     locked: int = -1,
 ) -> StructArray:
-    """Rows sent at true seconds and received some latency later; the latch is that of the last whole second."""
+    """Return rows sent at true seconds and received with a latency; the latch is that of the last whole second."""
     rows = np.zeros(len(true_s), dtype=DEVICE_CLOCK_DTYPE)
     rows["host_time_ns"] = host_ns(true_s + latency_s)
     rows["device_time_ns"] = device_ns(true_s)
@@ -61,7 +61,7 @@ def errors_ns(clock: DeviceClock, true_s: FloatArray, host: Int64Array | None = 
 
 
 def test_a_latched_device_is_accurate_to_its_ticks() -> None:
-    """100 ns ticks: between and after edges within 0.3 µs, whatever the datagrams' latency (up to 0.25 s)."""
+    """With ticks of 100 ns, times are within 0.3 µs, even if datagrams are up to 0.25 s late."""
     random = np.random.default_rng(1)
     clock = DeviceClock(host_clock(120))
     times = np.arange(20.003, 110.0, 0.02)
@@ -75,7 +75,6 @@ def test_a_latched_device_is_accurate_to_its_ticks() -> None:
 
 
 def test_batches_of_any_size_give_the_same_clock() -> None:
-    """Rows in batches of any size make the same clock."""
     host = host_clock(60)
     times = np.arange(20.003, 50.0, 0.02)
     whole, parts = DeviceClock(host), DeviceClock(host)
@@ -88,7 +87,7 @@ def test_batches_of_any_size_give_the_same_clock() -> None:
 
 
 def test_stalled_datagrams_do_not_shift_the_second() -> None:
-    """First datagrams of a second that come 1.0 s late name the next edge; most others outvote them."""
+    """First datagrams of a second that come 1.0 s late name the next edge, but the others outvote them."""
     times = np.arange(20.003, 60.0, 0.02)
     latency = np.where((times % 1.0 < 0.02) & (np.floor(times) % 8 == 3), 1.0, 0.001)
     clock = DeviceClock(host_clock(120))
@@ -97,7 +96,7 @@ def test_stalled_datagrams_do_not_shift_the_second() -> None:
 
 
 def test_latches_more_than_three_tenths_of_a_second_off_are_not_paired() -> None:
-    """Latched edges the host saw 0.4 s off are not paired: arrivals are used instead, with a sigma that says so."""
+    """Latched edges that the host saw 0.4 s off are not paired; arrivals are used instead, with their larger sigma."""
     times = np.arange(20.003, 60.0, 0.02)
     clock = DeviceClock(host_clock(120))
     clock.add(rows_of(times, 0.4))
@@ -106,7 +105,7 @@ def test_latches_more_than_three_tenths_of_a_second_off_are_not_paired() -> None
 
 
 def test_missing_latches_are_bridged_and_spurious_ones_refused() -> None:
-    """A latch that stays away for 20 s is bridged; one between two seconds is refused and counted."""
+    """A latch that is missing for 20 s is bridged; one between two seconds is refused and counted."""
     times = np.arange(20.003, 90.0, 0.02)
     rows = rows_of(times)
     gone = (times > 40) & (times < 60)
@@ -120,7 +119,7 @@ def test_missing_latches_are_bridged_and_spurious_ones_refused() -> None:
 
 
 def test_a_spurious_first_latch_is_discarded() -> None:
-    """A spurious first latch makes all later ones look wrong: the chain restarts and the time is right."""
+    """After a spurious first latch all later ones look wrong, so the chain restarts and the time becomes right."""
     times = np.arange(20.503, 60.0, 0.02)
     rows = rows_of(times)
     rows["pps_time_ns"][times < 21] = device_ns(20.2)
@@ -149,7 +148,7 @@ def test_a_latch_register_of_zero_before_the_first_pulse_is_not_an_edge(pulses_f
 
 
 def test_a_counter_restart_begins_a_new_segment() -> None:
-    """The counter starts again from little: the host time chooses the segment; both are right."""
+    """The counter starts again near zero; the host time selects the segment, and both segments are right."""
     times = np.arange(20.003, 60.0, 0.02)
     before, after = rows_of(times), rows_of(times + 50.0)
     reset = int(device_ns(70.0)) - 5 * NS
@@ -175,7 +174,7 @@ def fed_whole_and_in_pieces(rows: StructArray, seconds: int) -> Iterator[DeviceC
 
 
 def head_rows(times: FloatArray, free: BoolArray, free_s: FloatArray) -> StructArray:
-    """Of a head whose second is the edge while it is locked; free for so long it is 20 ppm fast."""
+    """Return rows of a head whose second follows the edge while locked, and which runs 20 ppm fast while free."""
     rows = rows_of(times, latched=False)
     rows["device_time_ns"] = np.rint((times + np.where(free, 20e-6 * free_s, 0.0)) * NS)
     rows["locked"] = ~free
@@ -186,7 +185,7 @@ def head_rows(times: FloatArray, free: BoolArray, free_s: FloatArray) -> StructA
 @pytest.mark.parametrize("latched", [False, True])
 @pytest.mark.parametrize(("silent_s", "ahead_s"), [(0.02, 20.123), (0.02, 1.7e9), (60.0, -20.123)])
 def test_a_jump_of_device_time_begins_a_new_segment(silent_s: float, ahead_s: float, latched: bool) -> None:
-    """Set to another scale, or restarted while nothing came and further on by now: what host time contradicts."""
+    """The device was set to another time scale, or restarted during a silence; host time contradicts its counter."""
     times = np.arange(20.003, 60.0, 0.02)
     after = np.arange(times[-1] + silent_s, times[-1] + silent_s + 60.0, 0.02)
     rows, later = rows_of(times, latched=latched), rows_of(after, latched=latched)
@@ -220,7 +219,7 @@ def test_a_late_label_applies_to_earlier_edges() -> None:
 
 
 def test_without_latch_the_least_delayed_arrivals_count() -> None:
-    """Latency 1 ms plus an exponential tail of 5 ms mean: within the stated sigma, and never silently as if latched."""
+    """Latencies are 1 ms plus an exponential tail of mean 5 ms; errors are within a sigma that is never a latch's."""
     random = np.random.default_rng(2)
     clock = DeviceClock(host_clock(400))
     times = np.arange(20.0, 390.0, 0.02)
@@ -235,7 +234,7 @@ def test_without_latch_the_least_delayed_arrivals_count() -> None:
 
 
 def test_hour_timestamps_are_used_only_while_locked() -> None:
-    """Velodyne: µs past the UTC hour, over its turn, while locked; before that from power-on, which is not UTC."""
+    """A locked Velodyne counts µs past the UTC hour; before lock it counts from power-on, which is not UTC."""
     host = host_clock(7300, message_s=0.05)
     times = np.arange(100.0, 7200.0, 0.5)
     locked = times >= 1000.0
@@ -254,7 +253,7 @@ def test_hour_timestamps_are_used_only_while_locked() -> None:
 
 
 def test_a_head_that_loses_its_pulse_is_not_treated_as_latched() -> None:
-    """A head whose second is the edge while locked drifts by 20 ppm for a minute, then is set right again: 1.2 ms."""
+    """Its second is the edge while locked; it drifts by 20 ppm for a minute, 1.2 ms, and is then set right again."""
     times = np.arange(20.003, 160.0, 0.02)
     free = (times >= 60.0) & (times < 120.0)
     rows = head_rows(times, free, times - 60.0)
@@ -267,7 +266,7 @@ def test_a_head_that_loses_its_pulse_is_not_treated_as_latched() -> None:
 
 
 def test_a_missed_pulse_costs_no_returns() -> None:
-    """Unlocked for one second in five, 20 ppm off then: 20 µs, and not the 2 ms of arrivals, no time for returns."""
+    """A head unlocked for one second in five, 20 ppm off, errs by 20 µs; the 2 ms of arrivals would reject returns."""
     times = np.arange(21.003, 160.0, 0.02)
     free = times // 1.0 % 5 == 0
     rows = head_rows(times, free, times % 1.0)
@@ -293,7 +292,7 @@ def test_hour_timestamps_that_contradict_the_clock_are_refused(off_s: float) -> 
 
 
 def test_without_data_or_host_time_the_sigma_is_infinite() -> None:
-    """No rows, or a host without time: sigma is inf, nothing raises."""
+    """There are no rows, or the host has no time; nothing raises."""
     empty = DeviceClock(PpsClock(18))
     assert math.isinf(empty.gps_from_device(np.array([5]))[1][0])
     empty.add(np.zeros(0, dtype=DEVICE_CLOCK_DTYPE))

@@ -37,7 +37,7 @@ gps_times = st.integers(0, 4 * 10**9 * SECOND_NS)
 
 
 def test_gps_time_matches_the_check_of_formulas_12() -> None:
-    """2026-11-21T12:00:00Z with 18 leap seconds: the figures of FORMULAS 12."""
+    """FORMULAS 12 gives these figures for 2026-11-21T12:00:00Z with 18 leap seconds."""
     gps = gps_ns_from_utc(NOON, 12 * HOUR_NS, 18)
     assert gps == CHECK_S * SECOND_NS
     assert week_from_gps(gps) == (2445, 561_618 * SECOND_NS)
@@ -76,7 +76,7 @@ def test_leap_second_is_one_second_long() -> None:
 
 
 def test_leap_second_table_grows_by_one_and_knows_its_end() -> None:
-    """One more at each row; the table knows how far it reaches."""
+    """Each row has one leap second more, and the table says whether a date is beyond its end."""
     counts = [count for _, count in LEAP_SECOND_TABLE]
     assert counts == list(range(19))
     assert table_leap_seconds(dt.date(2016, 12, 31)) == (17, True)
@@ -86,7 +86,7 @@ def test_leap_second_table_grows_by_one_and_knows_its_end() -> None:
 
 @given(gps_times, st.integers(0, 30))
 def test_utc_and_unix_conversions_are_invertible(gps: int, leap: int) -> None:
-    """GPS to UTC (or POSIX) and back is the identity; the date is the calendar's."""
+    """GPS to UTC (or POSIX) and back is the identity; the date is that of Python's calendar."""
     date, of_day = utc_from_gps(gps, leap)
     assert gps_ns_from_utc(date, of_day, leap) == gps
     unix = unix_ns_from_gps(gps, leap)
@@ -96,7 +96,7 @@ def test_utc_and_unix_conversions_are_invertible(gps: int, leap: int) -> None:
 
 @given(st.integers(-3 * WEEK_NS, 3 * WEEK_NS))
 def test_week_differences_are_folded(difference: int) -> None:
-    """Within half a week, and the same modulo a week."""
+    """The result is within half a week and equal modulo a week."""
     folded = week_difference_ns(difference)
     assert -WEEK_NS // 2 <= folded < WEEK_NS // 2
     assert (folded - difference) % WEEK_NS == 0
@@ -104,7 +104,7 @@ def test_week_differences_are_folded(difference: int) -> None:
 
 @given(gps_times, st.integers(-300, 9_000), st.integers(-2, 2))
 def test_complete_time_corrects_the_week(gps: int, age_ms: int, weeks_off: int) -> None:
-    """A wrong or missing week number beside a right time of week gives the right time, given the arrival's."""
+    """A right time of week with a wrong or missing week number gives the right time, with the time of arrival."""
     week, of_week = week_from_gps(gps + 3 * WEEK_NS)
     truth = gps_ns_from_week(week, of_week)
     arrival = truth + age_ms * 1_000_000
@@ -114,7 +114,7 @@ def test_complete_time_corrects_the_week(gps: int, age_ms: int, weeks_off: int) 
 
 @given(gps_times)
 def test_complete_time_finds_the_day(gps: int) -> None:
-    """UTC without a date (GGA), within half a day of the arrival."""
+    """UTC without a date (as in GGA) is completed to within half a day of the arrival."""
     gps += WEEK_NS
     _, of_day = utc_from_gps(gps, 18)
     tag = TimeTag(TimeScale.UTC, of_day)
@@ -123,7 +123,7 @@ def test_complete_time_finds_the_day(gps: int) -> None:
 
 
 def test_complete_time_refuses_impossible_tags() -> None:
-    """Tags far from the arrival, or that say too little, are not placed."""
+    """Tags are not placed if they are far from the arrival or contain too little."""
     arrival = CHECK_S * SECOND_NS
     of_week = 561_618 * SECOND_NS
     assert complete_time(TimeTag(TimeScale.GPS, of_week + 2 * SECOND_NS, 2445), arrival, None) is None
@@ -139,7 +139,7 @@ def test_complete_time_refuses_impossible_tags() -> None:
 
 @given(gps_times, st.integers(-450, 900))
 def test_hour_timestamps_find_their_hour(gps: int, off_ms: int) -> None:
-    """Stamps past the UTC hour, across the hour's turn: placed within ± 30 min, believed up to 1 s old, 0.5 s ahead."""
+    """Stamps past the UTC hour are placed within ± 30 min; they are believed if up to 1 s old or 0.5 s ahead."""
     gps += WEEK_NS
     past = np.array([(gps - 18 * SECOND_NS) % HOUR_NS])
     placed, believed = gps_ns_past_hour(past, np.array([gps + off_ms * 1_000_000]), 18)
@@ -148,7 +148,7 @@ def test_hour_timestamps_find_their_hour(gps: int, off_ms: int) -> None:
 
 
 def test_hour_timestamps_counted_from_power_on_are_refused() -> None:
-    """A head without lock counts from power-on: its stamps are not near any clock's time and are not believed."""
+    """A head without lock counts from power-on, so its stamps are far from any clock's time."""
     near = np.full(3, CHECK_S * SECOND_NS)
     past = np.array([5, 1500, 3599]) * SECOND_NS + SECOND_NS // 2
     _, believed = gps_ns_past_hour(past, near, 18)

@@ -19,13 +19,13 @@ START = 1_479_297_618
 
 
 def slewed(seconds: np.ndarray) -> np.ndarray:
-    """MONOTONIC (ns) at RAW seconds: slewed by −30 ppm, between 100 s and 200 s by +100 ppm (chrony)."""
+    """Return MONOTONIC (ns) at RAW seconds: slewed by −30 ppm, between 100 s and 200 s by +100 ppm (chrony)."""
     slew = -30e-6 * seconds + 130e-6 * np.clip(seconds - 100.0, 0.0, 100.0)
     return np.rint((seconds + slew) * NS).astype(np.int64) + 4 * NS
 
 
 def timeline(*, step_s: float = 0.0, keep_history: bool = True) -> HostTimeline:
-    """300 s of 10 Hz readings; the wall clock stepped half-way."""
+    """Return 300 s of readings at 10 Hz, with the wall clock stepped half-way by `step_s`."""
     line = HostTimeline(CONSTANT, keep_history=keep_history)
     for raw_s in np.arange(0.0, 300.0, 0.1):
         monotonic = int(slewed(np.array(raw_s)))
@@ -35,7 +35,7 @@ def timeline(*, step_s: float = 0.0, keep_history: bool = True) -> HostTimeline:
 
 
 def test_raw_clock_is_interpolated_between_and_extrapolated_after_readings() -> None:
-    """Within 2 µs between readings and 10 µs where the slew changed."""
+    """Errors are within 2 µs between readings and 10 µs where the slew changed."""
     line = timeline()
     raw = np.arange(0.05, 310.0, 0.037)
     host = slewed(raw) + CONSTANT
@@ -49,7 +49,7 @@ def test_raw_clock_is_interpolated_between_and_extrapolated_after_readings() -> 
 
 
 def test_wall_clock_steps_change_nothing() -> None:
-    """Stepped by an hour, both ways: the same map."""
+    """Steps of an hour in either direction give the same map."""
     host = slewed(np.arange(1.0, 299.0)) + CONSTANT
     straight = timeline().raw_from_host(host)
     for step in (3600.0, -3600.0):
@@ -57,7 +57,7 @@ def test_wall_clock_steps_change_nothing() -> None:
 
 
 def test_torn_reading_is_refused() -> None:
-    """Readings torn by preemption (2 ms) are refused; a lasting change is taken after three."""
+    """Readings torn by preemption (2 ms) are refused; a lasting change is accepted after three."""
     line = timeline()
     last = int(slewed(np.array(300.0)))
     line.add(0, last, 300 * NS + 2_000_000)
@@ -73,7 +73,7 @@ def test_torn_reading_is_refused() -> None:
 
 
 def test_without_readings_raw_equals_monotonic() -> None:
-    """No /clock channel: MONOTONIC is the best there is."""
+    """Without a /clock channel MONOTONIC is the best approximation of RAW."""
     line = HostTimeline(CONSTANT)
     host = np.array([CONSTANT + 5, CONSTANT + 10 * NS])
     np.testing.assert_array_equal(line.raw_from_host(host), host - CONSTANT)
@@ -81,7 +81,7 @@ def test_without_readings_raw_equals_monotonic() -> None:
 
 
 def test_real_clocks_of_this_machine_are_mapped_within_a_millisecond() -> None:
-    """Fed by this machine's clocks for 0.3 s: RAW read now is found within 1 ms."""
+    """The timeline reads this machine's clocks for 0.3 s; RAW read afterwards is found within 1 ms."""
     line = HostTimeline(0)
     for _ in range(30):
         line.add(
@@ -115,7 +115,6 @@ def test_the_second_is_never_wrong(
     noise_ns: float,
     drift_ppm: float,
 ) -> None:
-    """Any receiver, wire, oscillator and stamps: LOCKED and HOLDOVER are right; below 0.45 s the clock does lock."""
     senders = [
         Sender("RMC", utc_tag(18), delay_s=delay_s, jitter_s=jitter_s, stalls=stalls),
         Sender("TIME", week_tag(), delay_s=delay_s + 0.05, jitter_s=jitter_s, stalls=stalls),
@@ -131,7 +130,7 @@ def test_the_second_is_never_wrong(
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 40 * NS), st.integers(0, 3), st.integers(-3, 3)), max_size=60))
 def test_arbitrary_input_never_raises_or_gives_a_wrong_claim(items: list[tuple[int, int, int]]) -> None:
-    """Edges and messages in any order, at any time, with any second: nothing raises, nothing is claimed falsely."""
+    """Edges and messages come in any order, at any time, with any second."""
     clock = PpsClock(18)
     for host, kind, off in items:
         if kind == 0:
@@ -148,7 +147,7 @@ def test_arbitrary_input_never_raises_or_gives_a_wrong_claim(items: list[tuple[i
 
 
 def test_time_is_monotone_and_continuous_across_a_relock() -> None:
-    """History over a gap and a jump of the edges by 20 ms: strictly increasing GPS time, the jump spread over 1 s."""
+    """The history has a gap, and a jump of the edges by 20 ms, which is spread over 1 s."""
     edges = Edges(silent=lambda s: 300 <= s < 360, late_s=lambda s: 0.02 if s >= 500 else 0.0)
     simulation = Simulation(START, Oscillator(800, seed=6), edges, [Sender("TIME", week_tag())], seed=6)
     clock = PpsClock(18, keep_history=True)
@@ -161,7 +160,7 @@ def test_time_is_monotone_and_continuous_across_a_relock() -> None:
 
 
 def test_a_small_move_of_the_edges_spoils_no_earlier_second() -> None:
-    """The receiver sets its pulse by 0.5 ms: near enough to what was that a chain could run through both."""
+    """The receiver moves its pulse by 0.5 ms, which is so little that one chain could run through both."""
     clock = PpsClock(18, keep_history=True)
     true = np.arange(200) * NS
     edges = true + 10**13 + np.where(np.arange(200) >= 100, 500_000, 0)

@@ -38,7 +38,7 @@ RECORDINGS = [
 
 
 def messages_of(path: Path, protocol: str) -> list[TimeMessage]:
-    """All time messages of a recording, in order."""
+    """Return all time messages of a recording, in order."""
     data = gzip.decompress(path.read_bytes()) if path.suffix == ".gz" else path.read_bytes()
     parser = find_driver("gnss", protocol).make_parser(DeviceSettings("gnss/rover"))
     records = [
@@ -49,7 +49,7 @@ def messages_of(path: Path, protocol: str) -> list[TimeMessage]:
 
 @pytest.mark.parametrize(("name", "protocol", "kinds"), RECORDINGS, ids=[name for name, _, _ in RECORDINGS])
 def test_all_messages_name_the_same_second(name: str, protocol: str, kinds: set[str]) -> None:
-    """LOCKED on the receiver's own second, no voter contradicts, nothing unplaced."""
+    """The clock locks on the receiver's own second; no voter contradicts it, and every message is placed."""
     clock = PpsClock(18)
     first_ns = second_ns = None
     voters = set()

@@ -37,13 +37,13 @@ LOCKED, HOLDOVER, COARSE, NO_TIME = TimeState.LOCKED, TimeState.HOLDOVER, TimeSt
 
 
 def time_gps(**more: Any) -> Sender:
-    """Week, time of week, from some second on leap seconds."""
+    """Return a sender of week and time of week with leap seconds."""
     return Sender("NAV-TIMEGPS", week_tag(leap=18), **more)
 
 
 @dataclass
 class Case:
-    """A scenario and what must come of it. steady: the state of all but a few seconds after the first 30."""
+    """A scenario and its expected result; `steady` is the state of nearly all seconds after the first 30."""
 
     name: str
     senders: list[Sender]
@@ -70,18 +70,18 @@ class Case:
 
 
 def unix_ns(gps_ns: int) -> int:
-    """CLOCK_REALTIME of a GPS time with 18 leap seconds."""
+    """Return CLOCK_REALTIME, ns, of a GPS time with 18 leap seconds."""
     return gps_ns + (315_964_800 - 18) * NS
 
 
 def stepped_wall(second: int, gps_ns: int) -> tuple[int, bool]:
-    """A wall clock that claims discipline while it is stepped ± 1 h and slewed by 100 ppm."""
+    """Return a wall clock (ns) that claims discipline while it is stepped by ± 1 h and slewed by 100 ppm."""
     hours = 1 if 1000 <= second < 1500 else -1 if 2000 <= second < 2500 else 0
     return unix_ns(gps_ns) + hours * 3600 * NS + second * 100_000, True
 
 
 def cold(second: int) -> bool:
-    """The first minutes of a receiver that knows nothing yet."""
+    """Return False during the first minutes of a receiver, when it knows nothing yet."""
     return second >= 400
 
 
@@ -177,7 +177,7 @@ def expected_events(case: Case) -> tuple[str, ...]:
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 def test_no_second_is_wrong(case: Case) -> None:
-    """No second is wrong, the steady state is as expected, and the log gives the reason."""
+    """The steady state is as expected, and the log gives the reason."""
     _, outcome = case.run()
     assert outcome.wrong_seconds == 0
     late = outcome.counts(720 if case.name.startswith(("cold", "assumed")) else 30)
@@ -189,7 +189,7 @@ def test_no_second_is_wrong(case: Case) -> None:
 
 
 def test_the_simulated_time_is_long_enough() -> None:
-    """The cases above are 1e5 seconds together."""
+    """The cases above simulate 1e5 seconds together."""
     assert len(CASES) * SECONDS >= 100_000
 
 
@@ -202,7 +202,7 @@ def simulate(
 
 
 def test_holdover_follows_when_edges_stop_and_lock_returns_with_them() -> None:
-    """HOLDOVER with a growing sigma; LOCKED at once when they are back; nothing relabelled."""
+    """The sigma grows in HOLDOVER; when edges return the state is LOCKED at once, without a new label."""
     _, outcome = simulate(nmea(), Edges(silent=lambda s: 1000 <= s < 1900))
     assert outcome.wrong_seconds == 0
     assert outcome.counts(1010, 1890) == {HOLDOVER: 880}
@@ -213,7 +213,7 @@ def test_holdover_follows_when_edges_stop_and_lock_returns_with_them() -> None:
 
 
 def test_holdover_ends_in_lost_when_the_sigma_passes_its_limit() -> None:
-    """HOLDOVER ends in LOST where the sigma passes the limit; time is still given, with that sigma."""
+    """Beyond the limit time is still given, with its sigma."""
     clock = PpsClock(18, lost_sigma_ns=20_000.0)
     _, outcome = simulate(nmea(), Edges(silent=lambda s: s >= 1000), clock)
     states = outcome.counts(1000)
@@ -223,7 +223,7 @@ def test_holdover_ends_in_lost_when_the_sigma_passes_its_limit() -> None:
 
 
 def test_a_receiver_restart_with_pulses_off_phase_gives_holdover() -> None:
-    """A restarting receiver pulses at any phase and says its time is invalid: HOLDOVER meanwhile, then on as before."""
+    """A restarting receiver pulses at any phase and marks its time invalid; afterwards the state is as before."""
     edges = Edges(late_s=lambda s: 0.37 if 1000 <= s < 1100 else 0.0)
     _, outcome = simulate(nmea(valid=lambda s: not 1000 <= s < 1110), edges)
     assert outcome.wrong_seconds == 0
@@ -236,7 +236,7 @@ def test_a_receiver_restart_with_pulses_off_phase_gives_holdover() -> None:
 @pytest.mark.parametrize("phase_s", [0.2, 0.45, 0.55, 0.8])
 @pytest.mark.parametrize("found_s", [5, 7, 12, 40])
 def test_pulses_before_a_receiver_has_time_name_no_second(sender: str, phase_s: float, found_s: int) -> None:
-    """At any phase until it has the time, its messages invalid; then on the second: none is named by former pulses."""
+    """Until a receiver has time, its pulses have any phase and its messages are invalid; then both are right."""
     known: dict[str, Any] = {"valid": lambda s: s >= found_s}
     senders = {
         "bound to the edge before": [Sender("TIME", week_tag(), bound=True, delay_s=0.1, **known)],
@@ -253,7 +253,7 @@ def test_pulses_before_a_receiver_has_time_name_no_second(sender: str, phase_s: 
 
 
 def contradicted(free_s: int, seconds: int) -> Outcome:
-    """A receiver that calls its time valid while its pulses are still anywhere, and then moves them by 0.8 s."""
+    """Return a run with a receiver that calls its time valid while its pulses are wrong, then moves them by 0.8 s."""
     edges = Edges(late_s=lambda s: 0.2 if s < free_s else 0.0)
     return simulate([Sender("TIME", week_tag(), bound=True, delay_s=0.1)], edges, seconds=seconds)[1]
 
@@ -280,7 +280,7 @@ def test_labels_from_rejected_edges_are_doubtful_in_post_processing() -> None:
 
 
 def test_edges_at_a_new_phase_are_relocked_and_logged() -> None:
-    """Edges that move by 0.1 s (polarity swapped) and stay: relocked, and the log says by how much."""
+    """The edges move by 0.1 s, as if the polarity were swapped, and stay; the log says by how much."""
     _, outcome = simulate(nmea(0.3), Edges(late_s=lambda s: 0.1 if s >= 1000 else 0.0))
     assert outcome.wrong_seconds == 0
     assert "pps_relocked" in outcome.codes
@@ -289,7 +289,7 @@ def test_edges_at_a_new_phase_are_relocked_and_logged() -> None:
 
 
 def test_a_restarted_receiver_with_a_wrong_valid_time_makes_the_state_coarse() -> None:
-    """Valid but one second off for a while: the label is held, the state COARSE until they agree again."""
+    """A valid time that is one second off does not change the label; the state is COARSE until both agree again."""
     _, outcome = simulate(nmea(error_s=lambda s: -1 if 1000 <= s < 1100 else 0))
     assert outcome.wrong_seconds == 0
     assert outcome.counts(1020, 1099) == {COARSE: 79}
@@ -298,7 +298,7 @@ def test_a_restarted_receiver_with_a_wrong_valid_time_makes_the_state_coarse() -
 
 
 def default_leap_count(seconds_ahead: int, wall: Callable[[int], int] | None) -> Outcome:
-    """NMEA alone, valid from the start, by a leap count that is too small until second 700."""
+    """Return a run with NMEA alone, valid from the start, whose leap count is too small until second 700."""
     senders = nmea(error_s=lambda s: 0 if s >= 700 else seconds_ahead)
     simulation = Simulation(START, Oscillator(1500, seed=5), Edges(), senders, seed=11)
     clock = PpsClock(18)
@@ -313,7 +313,7 @@ def default_leap_count(seconds_ahead: int, wall: Callable[[int], int] | None) ->
 
 @pytest.mark.parametrize("seconds_ahead", [1, 2, 18])
 def test_a_synchronised_wall_clock_reveals_a_default_leap_count(seconds_ahead: int) -> None:
-    """COARSE with the reason until the receiver knows; LOCKED from then on, never on a wrong second."""
+    """The state is COARSE, with the reason, until the receiver knows the count, and never LOCKED on a wrong second."""
     outcome = default_leap_count(seconds_ahead, lambda gps_ns: gps_ns)
     assert outcome.wrong_seconds == 0
     assert outcome.counts(30, 700) == {COARSE: 670}
@@ -323,7 +323,10 @@ def test_a_synchronised_wall_clock_reveals_a_default_leap_count(seconds_ahead: i
 
 
 def test_an_uncontradicted_default_leap_count_is_used_until_a_new_one_outlasts_it() -> None:
-    """What no software can see (docs/time.md); once it changes, COARSE until the new one has lasted longer, aloud."""
+    """No software can detect this alone (docs/time.md).
+
+    When the count changes, the state is COARSE, with events, until the new one has lasted longer than the old one.
+    """
     outcome = default_leap_count(2, None)
     assert outcome.counts(30, 700) == {LOCKED: 670}
     assert outcome.codes == ["second_known", "second_ambiguous", "relabelled", "second_confirmed"]
@@ -343,7 +346,7 @@ def test_a_wall_clock_of_another_hour_changes_nothing() -> None:
 
 
 def test_a_reported_leap_count_relabels_all_seconds_in_one_logged_step() -> None:
-    """Assumed 19, said 18: two events, all seconds since lock move together, history included."""
+    """18 replaces the assumed 19: two events are logged, and all seconds since lock move together, with the history."""
     senders = [Sender("RMC", UTC), time_gps(silent=lambda s: s < 500)]
     clock = PpsClock(19, keep_history=True)
     simulation, outcome = simulate(senders, clock=clock, seconds=1000)
@@ -357,7 +360,7 @@ def test_a_reported_leap_count_relabels_all_seconds_in_one_logged_step() -> None
 
 
 def test_a_bound_message_corrects_a_label_and_is_logged() -> None:
-    """Messages 1.2 s late look 0.2 s late: undetectable alone, and the label moves, logged, when TIM-TP comes."""
+    """Messages 1.2 s late look 0.2 s late, which is undetectable until TIM-TP comes and moves the label."""
     senders = [*nmea(1.2), tim_tp()]
     senders[-1].silent = lambda s: s < 500
     _, outcome = simulate(senders, seconds=1000)
@@ -368,7 +371,7 @@ def test_a_bound_message_corrects_a_label_and_is_logged() -> None:
 
 
 def test_messages_that_become_late_do_not_change_a_held_label() -> None:
-    """Edges carry the label on: a delay that grows from 0.3 s to 0.85 s is a warning, and the seconds stay right."""
+    """Edges carry the label on; a delay that grows from 0.3 s to 0.85 s only causes a warning."""
     early = [Sender("RMC", UTC, delay_s=0.3, silent=lambda s: s >= 500)]
     late = [Sender("RMC", UTC, delay_s=0.85, silent=lambda s: s < 500)]
     _, outcome = simulate([*early, *late], seconds=1000)
@@ -378,7 +381,7 @@ def test_messages_that_become_late_do_not_change_a_held_label() -> None:
 
 
 def test_the_leap_second_table_suffices_where_it_reaches() -> None:
-    """UTC of 2019, nothing configured: the built-in table knows. Configured against it is a guess."""
+    """The built-in table covers UTC of 2019 without configuration; a contradicting configured count is a guess."""
     start = gps_second(dt.datetime(2019, 5, 1, tzinfo=dt.UTC), 18)
 
     def last(assumed: int | None) -> tuple[TimeState, str]:
@@ -393,7 +396,7 @@ def test_the_leap_second_table_suffices_where_it_reaches() -> None:
 
 
 def test_edges_may_arrive_after_their_messages() -> None:
-    """The PPS thread wakes 80 ms late, so messages 15 ms after an edge are told before it: the same seconds, LOCKED."""
+    """The PPS thread wakes 80 ms late, so messages 15 ms after an edge are received before the edge."""
     simulation = Simulation(START, Oscillator(300, seed=5), Edges(), nmea(0.015, 0.001), seed=11)
     told = sorted(simulation, key=lambda event: event[0] + (NS * 80 // 1000 if event[1] == "edge" else 0))
     assert [event[1] for event in told[:4]] != [event[1] for event in list(simulation)[:4]]
@@ -421,7 +424,7 @@ def test_the_named_edge_can_be_configured() -> None:
 
 
 def test_delay_is_subtracted() -> None:
-    """A cable and capture delay of 5 µs, configured: gone."""
+    """A configured delay of cable and capture of 5 µs disappears from the errors."""
     simulation = Simulation(
         START, Oscillator(300, seed=5), Edges(noise_ns=50.0, late_s=lambda s: 5e-6), nmea(), seed=11
     )
@@ -442,7 +445,7 @@ def test_coarse_time_is_accurate_to_half_a_second() -> None:
 
 
 def test_quantisation_of_the_edge_is_subtracted() -> None:
-    """TIM-TP's qErr belongs to the edge it names: with it the edges fit several times better than without."""
+    """qErr of TIM-TP belongs to the edge that it names; corrected edges fit several times better."""
     errors = np.rint(np.random.default_rng(3).uniform(-100.0, 100.0, 602))
 
     def noise(told: bool) -> float:

@@ -19,14 +19,14 @@ UTC = utc_tag(18)
 def flown(
     senders: list[Sender], *, seconds: int = SECONDS, edges: Edges | None = None
 ) -> tuple[Simulation, Outcome, PpsClock]:
-    """A run of a clock that keeps its history."""
+    """Run a clock that keeps its history, and return the simulation, its outcome and the clock."""
     simulation = Simulation(START, Oscillator(seconds, seed=5), edges or Edges(), senders, seed=11)
     clock = PpsClock(18, keep_history=True)
     return simulation, run(simulation, clock), clock
 
 
 def errors_s(simulation: Simulation, clock: PpsClock, from_s: int = 8, to_s: int = SECONDS - 2) -> tuple[Any, Any]:
-    """Errors and sigmas in s of all seconds, asked after the flight."""
+    """Return errors and sigmas, s, of all seconds, computed after the flight."""
     hosts = np.array([simulation.host_ns(second + 0.25) for second in range(from_s, to_s)], np.int64)
     truth = np.array([simulation.true_gps_ns(int(host)) for host in hosts])
     gps_ns, sigma_ns = clock.gps_from_host(hosts)
@@ -51,7 +51,7 @@ def test_wrong_seconds_at_the_start_are_corrected_after_the_flight(error_s: int,
 
 @pytest.mark.parametrize("error_s", [1, -1, 20])
 def test_only_the_tags_of_the_wrong_stretch_are_corrected(error_s: int) -> None:
-    """By the arrival of each tag; messages that were stalled for more than a second are right all the same."""
+    """The arrival of each tag decides; messages that were delayed for more than a second are right all the same."""
     simulation, _, clock = flown(nmea(error_s=lambda s: error_s if s < 60 else 0, stalls=0.05))
     clock.settle()
     hosts = np.array([simulation.host_ns(second + 0.22) for second in range(10, SECONDS - 10)], np.int64)
@@ -83,7 +83,7 @@ def test_a_flight_without_contradictions_is_unchanged_and_gives_no_event() -> No
 
 
 def test_receivers_that_always_contradict_each_other_are_not_outvoted() -> None:
-    """Two kinds of messages of one receiver against one of another decide nothing; a refusal can name both."""
+    """Two kinds of messages of one receiver against one of another decide nothing; the refusal can name both."""
     senders = [*nmea(), Sender("RMC", UTC, source="gnss/base", error_s=lambda s: 1)]
     simulation, _, clock = flown(senders)
     assert clock.settle() == []
@@ -115,7 +115,7 @@ def test_messages_bound_to_their_edges_outvote_any_number_of_others() -> None:
 
 
 def test_seconds_of_restarted_edges_are_settled_with_earlier_ones_of_the_same_phase() -> None:
-    """The edges pause and come back at the same phase: the wrong start is that of the former ones alone."""
+    """The edges pause and return at the same phase; only the earlier ones had a wrong label at the start."""
     edges = Edges(late_s=lambda s: 0.1 if 40 <= s < 60 else 0.0)
     simulation, _, clock = flown(nmea(0.3, error_s=lambda s: 1 if s < 30 else 0), edges=edges)
     clock.settle()
@@ -138,7 +138,7 @@ def test_a_label_moves_in_flight_when_contradiction_outlasts_support() -> None:
 
 
 def test_in_flight_a_label_is_not_moved_by_another_source() -> None:
-    """The one that gave the label has fallen silent: another that names another second is a contradiction."""
+    """The source that gave the label has become silent; another that names another second contradicts it."""
     senders = [
         *nmea(silent=lambda s: s >= 30),
         Sender("TIME", week_tag(), source="gnss/base", error_s=lambda s: 1, silent=lambda s: s < 30),

@@ -28,7 +28,7 @@ KERNEL_NS, USER_NS = 1500.0, 300e3
 
 @functools.cache
 def errors(noise_ns: float, ramps: bool, ahead_s: float = 60.0) -> tuple[np.ndarray, ...]:
-    """Errors and sigmas (ns) locked, then ahead_s later, of three oscillators."""
+    """Return errors and sigmas (ns) of three oscillators while locked, then errors and sigmas `ahead_s` later."""
     columns: list[list[float]] = [[], [], [], []]
     for seed in (21, 22, 23):
         oscillator = Oscillator(SECONDS, seed=seed, ramps=ramps)
@@ -45,7 +45,7 @@ def errors(noise_ns: float, ramps: bool, ahead_s: float = 60.0) -> tuple[np.ndar
 @pytest.mark.parametrize("noise_ns", [KERNEL_NS, USER_NS])
 @pytest.mark.parametrize("ramps", [False, True])
 def test_clock_errors_are_as_large_as_their_sigma(noise_ns: float, ramps: bool) -> None:
-    """Normalised RMS within 0.8 … 1.25, locked and 60 s into holdover."""
+    """The RMS of error over sigma is within 0.8 … 1.25, locked and 60 s into holdover."""
     locked, locked_sigma, ahead, ahead_sigma = errors(noise_ns, ramps)
     figures = rms(locked / locked_sigma), rms(ahead / ahead_sigma)
     assert 0.8 <= figures[0] <= 1.25, figures
@@ -53,20 +53,20 @@ def test_clock_errors_are_as_large_as_their_sigma(noise_ns: float, ramps: bool) 
 
 
 def test_kernel_timestamps_are_accurate_to_a_microsecond() -> None:
-    """Without ramps, 1.5 µs stamps: better than 1 µs rms locked and 5 µs after 60 s of holdover."""
+    """Stamps of 1.5 µs without ramps give less than 1 µs RMS locked and less than 5 µs after 60 s of holdover."""
     locked, _, ahead, _ = errors(KERNEL_NS, False)
     assert rms(locked) < 1_000.0
     assert rms(ahead) < 5_000.0
 
 
 def test_user_space_timestamps_profit_from_a_longer_memory() -> None:
-    """300 µs stamps without ramps: better than a fixed 64 s window can be (60 µs, ACQUISITION 5.3)."""
+    """Stamps of 300 µs without ramps give less than the 60 µs of a fixed window of 64 s (ACQUISITION 5.3)."""
     locked, _, _, _ = errors(USER_NS, False)
     assert rms(locked) < 60_000.0
 
 
 def test_no_locked_error_exceeds_six_sigmas() -> None:
-    """Once settled, no locked error is beyond 6 sigma without ramps: outliers and spurious edges are kept out."""
+    """There are no ramps, so an error beyond 6 sigma would come from an outlier or a spurious edge."""
     for noise_ns in (KERNEL_NS, USER_NS):
         locked, sigma, _, _ = errors(noise_ns, False)
         assert float(np.max(np.abs(locked / sigma))) < 6.0
@@ -82,7 +82,7 @@ def test_timestamp_noise_is_reported() -> None:
 
 
 def test_history_interpolates_gaps_from_both_sides() -> None:
-    """Afterwards the middle of a 5 min gap is known better than live, within what its sigma says; time is monotone."""
+    """Afterwards the middle of a gap of 5 min is known better than live, within its sigma, and time is monotone."""
     simulation = Simulation(
         START, Oscillator(2400, seed=8), Edges(silent=lambda s: 1500 <= s < 1800), [Sender("TIME", week_tag())], seed=8
     )
@@ -115,7 +115,7 @@ def test_history_labels_edges_before_the_first_label() -> None:
 
 
 def test_live_memory_is_bounded() -> None:
-    """Without history two hours leave no more behind than a quarter of an hour or two of knots."""
+    """Two hours without history keep no more knots than a quarter of an hour or two."""
     simulation = Simulation(START, Oscillator(7200, seed=1), Edges(), [Sender("TIME", week_tag())])
     clock = PpsClock(18)
     run(simulation, clock)
@@ -126,6 +126,6 @@ def test_live_memory_is_bounded() -> None:
 
 
 def test_a_chain_with_scattered_edges_reports_its_own_noise() -> None:
-    """Stray edges may form such a chain: 5 ms to either side, while only those within 2 ms fit."""
+    """Stray edges may form a chain that scatters by 5 ms, although only edges within 2 ms fit."""
     chain = [(second, 1_000_000_000 * second + 10_000_000 * (second % 2)) for second in range(10)]
     assert _chain_noise_ns(chain, [host for _, host in chain]) > 5_000_000

@@ -54,7 +54,7 @@ def test_a_written_csv_is_read_back() -> None:
 
 
 def test_a_csv_written_by_hand_is_read() -> None:
-    """Times to the nanosecond, sigmas absent or in another order."""
+    """Times keep their nanoseconds; sigmas may be absent or in another order."""
     rows = [
         "1479297618000000001,47.5,8.9,900,60,0,-1,1.5,-2,359.5",
         "1479297618050000003,47.5,8.9,900.05,60,0,-1,1.5,-2,0.5",
@@ -71,7 +71,7 @@ def test_a_csv_written_by_hand_is_read() -> None:
 
 
 def degrees_as_radians(text: str) -> str:
-    """Roll, pitch and heading columns in the wrong unit."""
+    """Return a trajectory's text with roll, pitch and heading written in radians instead of degrees."""
     lines = text.splitlines()
     rows = [line.split(",") for line in lines[1:]]
     for row in rows:
@@ -96,7 +96,7 @@ def test_a_wrong_csv_is_refused() -> None:
 
 
 def test_a_gap_takes_no_memory() -> None:
-    """A first row of another month: 2.6 million pieces of a second, of which five are flown."""
+    """The first row is of another month, 2.6 million pieces of a second earlier, of which five are flown."""
     lines = csv_text(flown(100)).splitlines()
     alone_ns = START_NS - 30 * 86_400 * 10**9
     lines[1] = f"{alone_ns},{lines[1].partition(',')[2]}"
@@ -143,7 +143,10 @@ def weeks(trajectory: Trajectory) -> list[str]:
 
 
 def export(trajectory: Trajectory, times: list[str], titles: str, units: str, head: str = HEAD) -> str:
-    """Columns after those of time: latitude, longitude (D M S), height, velocities, heading, pitch, roll, sigmas, Q."""
+    """Return a Waypoint export of a trajectory.
+
+    After the columns of time come latitude, longitude (D M S), height, velocities, heading, pitch, roll, sigmas, Q.
+    """
     lat, lon, height = trajectory.geodetic()
     north, east, down = trajectory.velocity_l().T
     roll, pitch, heading = np.degrees(trajectory.attitude())
@@ -202,7 +205,7 @@ UNITS = "(weeks) (sec) (deg) (deg) (m) (deg) (deg) (deg)"  # Q has none
 
 
 def separated(mark: str, comma: bool, dms_cells: bool = False) -> str:
-    """An export of four epochs with a mark between its columns, of which line 3 of the data has an empty Q."""
+    """Return an export of four epochs with a mark between its columns; the third row of data has an empty Q."""
     place = ("-8 30 0.0", "47 24 1.5") if dms_cells else ("-8.5000000000", "47.4004166667")
     units = UNITS.replace("(deg) (deg) (m)", "(+/-D!M!S) (+/-D!M!S) (m)") if dms_cells else UNITS
     lines = [mark.join(NAMED.split()), mark.join(units.split()).replace("!", " ")]
@@ -361,7 +364,7 @@ def test_waypoint_export_in_other_units_is_refused(units: str, others: str, says
 
 
 def test_waypoint_yaw_is_not_taken_for_heading() -> None:
-    """It counts from north to west: 350° of it is a heading of 10°."""
+    """Yaw counts from north to west: a yaw of 350° is a heading of 10°."""
     trajectory = flown(100)
     text = export(trajectory, weeks(trajectory), *WEEKS)
     assert "has no column Heading; export roll, pitch and heading" in refusal(text.replace(" Heading ", "     Yaw "))
@@ -373,7 +376,7 @@ def test_waypoint_yaw_is_not_taken_for_heading() -> None:
 
 
 def move(words: list[str]) -> list[str]:
-    """A line's heading twice, the first as yaw, instead of its first sigma."""
+    """Return a line's cells with the heading twice, first as yaw, in place of the first sigma."""
     return [*words[:12], str(-float(words[12])), *words[12:15], *words[16:]]
 
 
@@ -397,7 +400,7 @@ def positions(text: str, **settings: Any) -> Trajectory:
 
 
 def test_rtklib_positions_of_a_drive_are_read() -> None:
-    """243 258.499 s of week 2374 by the data set's own notes; sigmas and velocities as printed."""
+    """By the data set's notes the first epoch is 243 258.499 s of week 2374; sigmas and velocities are as printed."""
     drive = positions(DRIVE)
     assert drive.time_ns.tolist() == [2374 * 604_800 * 10**9 + ms * 10**6 for ms in (243_258_499, 243_258_749)]
     lat, lon, height = drive.geodetic()
@@ -431,7 +434,7 @@ def test_rtklib_weeks_utc_degrees_minutes_and_separators_are_read() -> None:
 
 
 def test_rtklib_earth_centred_positions_and_their_sigmas_are_read() -> None:
-    """The covariance of north, east, down 1, 2, 3 cm, turned to ECEF by differences of PROJ, comes back."""
+    """A covariance of north, east, down of 1, 2, 3 cm, rotated to ECEF by differences of PROJ, is recovered."""
     place = np.array([-60.0, 47.5, 600.0])
     to_e = np.stack(
         [

@@ -22,7 +22,7 @@ MS = 1_000_000
 
 
 def wild(n: int = 400, seed: int = 3, **changes: Any) -> Trajectory:
-    """Large turns, uneven steps, every heading."""
+    """Return a trajectory with large turns, uneven steps and every heading."""
     rng = np.random.default_rng(seed)
     columns: dict[str, Any] = {
         "time_ns": START_NS + np.cumsum(rng.integers(4 * MS, 60 * MS, n)),
@@ -41,7 +41,7 @@ def wild(n: int = 400, seed: int = 3, **changes: Any) -> Trajectory:
 
 
 def inside(trajectory: Trajectory, n: int = 5000) -> Int64Array:
-    """Times over the whole span, epochs themselves among them."""
+    """Return times (ns) over the whole span, the epochs among them."""
     first_ns, last_ns = trajectory.span
     return np.sort(np.r_[np.random.default_rng(5).integers(first_ns, last_ns, n), trajectory.time_ns])
 
@@ -88,7 +88,7 @@ def test_position_velocity_and_sigmas_are_linear_in_time() -> None:
 
 
 def test_height_follows_a_climb_between_epochs() -> None:
-    """A quarter of the way up is a quarter of the climb: PDAL's filters.georeference weighs the two ends swapped."""
+    """A quarter of the interval is a quarter of the climb; PDAL's filters.georeference swaps the ends' weights."""
     two: dict[str, Any] = {"lat_rad": [0.8, 0.8], "lon_rad": [0.1, 0.1], "height_m": [500.0, 500.02]}
     trajectory = wild(2, time_ns=START_NS + np.array([0, 20 * MS]), **two)
     x, y, z = trajectory.poses([START_NS + 5 * MS]).position_e[0]
@@ -97,7 +97,7 @@ def test_height_follows_a_climb_between_epochs() -> None:
 
 
 def test_turn_rate_matches_a_steady_turn() -> None:
-    """0.3 rad/s of roll at 200 Hz, over ground that stands still."""
+    """The body rolls at 0.3 rad/s, sampled at 200 Hz, over a fixed place."""
     n, rate = 100, 0.3
     times = START_NS + 5 * MS * np.arange(n)
     still: dict[str, Any] = {"lat_rad": np.full(n, 0.8), "lon_rad": np.full(n, 0.1), "height_m": np.full(n, 500.0)}
@@ -109,7 +109,7 @@ def test_turn_rate_matches_a_steady_turn() -> None:
 
 
 def test_inertial_turn_rate_includes_earth_rotation() -> None:
-    """Level and north at the equator and at rest, the earth's rate is all about x; at the pole all about −z."""
+    """Level, heading north and at rest, the earth's rate is all about x at the equator and all about −z at the pole."""
     n = 4
     rest: dict[str, Any] = {key: np.zeros(n) for key in ("roll_rad", "pitch_rad", "heading_rad", "lon_rad")}
     for lat_rad, expected in ((0.0, [7.292115e-5, 0, 0]), (np.pi / 2, [0, 0, -7.292115e-5])):
@@ -118,7 +118,7 @@ def test_inertial_turn_rate_includes_earth_rotation() -> None:
 
 
 def test_turn_rate_in_l_excludes_the_transport_rate() -> None:
-    """Level flight north at 100 m/s: l itself pitches down at v / M."""
+    """In level flight north at 100 m/s, l itself pitches down at v / M."""
     n, step_s = 50, 0.005
     lat = 0.8 + 100 / 6_367_000 * step_s * np.arange(n)
     level: dict[str, Any] = {key: np.zeros(n) for key in ("roll_rad", "pitch_rad", "heading_rad", "lon_rad")}
@@ -168,7 +168,7 @@ def test_neighbouring_quaternions_have_the_same_sign() -> None:
 
 
 def eastwards(times_ns: Int64Array, said: FloatArray | None = None) -> Trajectory:
-    """Along the equator with a speed that grows by 2 m/s²."""
+    """Return a trajectory along the equator whose speed grows by 2 m/s²."""
     seconds = (times_ns - START_NS) / 1e9
     lon = (60.0 * seconds + seconds**2) / 6_378_137.0
     flat: dict[str, Any] = dict.fromkeys(
@@ -301,7 +301,7 @@ def test_body_position_is_derived_from_the_antenna() -> None:
 
 
 def test_body_velocity_differs_from_the_antenna_velocity_in_a_turn() -> None:
-    """Turning right at 0.1 rad/s over one spot: an antenna 2 m ahead moves to the right, east when heading north."""
+    """Turning right at 0.1 rad/s over one spot, heading north, an antenna 2 m ahead moves right, that is east."""
     n = 201
     times = START_NS + 5 * MS * np.arange(n)
     heading = 0.1 * (times - times[100]) / 1e9
@@ -326,7 +326,7 @@ def test_body_velocity_differs_from_the_antenna_velocity_in_a_turn() -> None:
 
 
 def test_deflection_tilts_the_attitude_as_in_the_formula_sheet() -> None:
-    """ξ +8″, η −5″: 1000 m along the plumb line end 38.8 mm south and 24.2 mm east of the normal's foot."""
+    """With ξ +8″, η −5″, 1000 m along the plumb line end 38.8 mm south and 24.2 mm east of the normal's foot."""
     level: dict[str, Any] = {key: np.zeros(3) for key in ("roll_rad", "pitch_rad", "heading_rad")}
     trajectory = wild(3, lat_rad=np.full(3, np.radians(47.1234567)), lon_rad=np.full(3, np.radians(8.7)), **level)
     tilted = trajectory.with_deflection(np.radians(8 / 3600), np.radians(-5 / 3600))

@@ -18,7 +18,7 @@ COLUMNS = ("time_ns", "position_e", "q_e_from_b", "velocity_e", "position_sigma_
 
 
 def solutions(n: int, first: int = 0) -> StructArray:
-    """A climbing turn at 100 Hz, several times round; no sigmas, status of a good NovAtel solution."""
+    """Return n rows of a climbing turn at 100 Hz, without sigmas, with the status of a good NovAtel solution."""
     at = first + np.arange(n)
     rows = np.zeros(n, INS_DTYPE)
     rows["gps_ns"] = START_NS + STEP_NS * at

@@ -37,7 +37,7 @@ class Flight(NamedTuple):
 
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
-    """Three minutes with a turn; the IMU of MEMS grade and shaken, the attitude off by 0.02° from epoch to epoch."""
+    """Return three minutes with a turn, a vibrating MEMS IMU, and an attitude with white errors of 0.01° per axis."""
     truth = rough_flight(Path(tmp_path_factory.mktemp("plan")))
     rng = np.random.default_rng(4)
     edges_s = np.arange(FIRST_S, LAST_S, 1 / RATE_HZ)
@@ -107,7 +107,7 @@ def test_before_leap_seconds_utc_is_not_a_wrong_time(flight: Flight) -> None:
 
 
 def test_the_sigma_of_the_time_shift_is_realistic(flight: Flight) -> None:
-    """The shift found differs from the true one by a few of its sigmas, over parts of the flight."""
+    """Over parts of the flight the shift found differs from the true one by a few of its sigmas."""
     errors = []
     for begin in range(0, 16_000, 2_000):
         felt = Felt(flight.felt.time_ns[begin : begin + 4_000], flight.felt.rate_b[begin : begin + 4_000])
@@ -152,7 +152,7 @@ def test_non_finite_samples_are_ignored(flight: Flight) -> None:
 
 
 def test_a_single_epoch_days_earlier_uses_no_memory_and_hides_no_wrong_time(flight: Flight) -> None:
-    """17 million steps of 50 ms, of which 6000 matter; and it hides no wrong time."""
+    """There are 17 million steps of 50 ms, of which 6000 matter."""
     time_ns = flight.trajectory.time_ns.copy()
     time_ns[0] -= 10 * DAY_S * 10**9
     stray = late(replace(flight.trajectory, time_ns=time_ns), 18.0)

@@ -46,7 +46,7 @@ def parked(heading_deg: float) -> Motion:
 
 
 def winding(place: tuple[float, float, float], speed: float = 40.0, reverse: bool = False) -> Motion:
-    """Along sines, nose where it goes (or backwards), banked."""
+    """Return a motion along sines, banked, with the nose along the course or, with `reverse`, opposite to it."""
 
     def position(t: FloatArray) -> FloatArray:
         return np.column_stack([speed * t, 60.0 * np.sin(0.2 * t), 5.0 * np.cos(0.1 * t)])
@@ -60,7 +60,7 @@ def winding(place: tuple[float, float, float], speed: float = 40.0, reverse: boo
 
 
 def straight(crab_deg: float) -> Motion:
-    """Due north at 50 m/s in still air, the nose off the course."""
+    """Return a motion due north at 50 m/s in still air, with the nose `crab_deg` off the course."""
     angles = np.radians([0.5, 2.0, crab_deg])
     return Motion(
         (0.8, 0.15, 400.0),
@@ -266,7 +266,7 @@ def test_attitude_of_a_real_light_aircraft_matches_its_own_filter() -> None:
 
 
 def feed(recording: Recording, cuts: list[int], order: list[bool]) -> Aligner:
-    """Samples and observations in pieces up to these times, now the one first, now the other."""
+    """Feed samples and observations in pieces up to the times `cuts`; `order` says where samples come first."""
     aligner = Aligner(recording.setup)
     for first, last, samples_first in zip([0, *cuts], [*cuts, 2**62], order, strict=True):
         rows = recording.rows[(recording.rows["time_ns"] >= first) & (recording.rows["time_ns"] < last)]

@@ -35,7 +35,7 @@ def turned_e(since_s: FloatArray) -> Rotation:
 
 
 def samples() -> Inertial:
-    """Exact turns relative to inertial space, which coincides with e at the beginning."""
+    """Return exact turns relative to inertial space, whose axes coincide with e at the beginning."""
     ends = np.arange(1, round(SECONDS * RATE_HZ) + 1) / RATE_HZ
     inertial = [Rotation.from_rotvec(np.multiply.outer(at, EARTH)) * turned_e(at) for at in (ends - 1 / RATE_HZ, ends)]
     angle_b = (inertial[0].inv() * inertial[1]).as_rotvec()

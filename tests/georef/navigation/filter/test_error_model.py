@@ -64,7 +64,7 @@ STEP = np.repeat(STEPS, OF_STATES)  # of each error
 
 
 def state_at(lat: float, lon: float, rng: np.random.Generator) -> FloatArray:
-    """Flying, with every error of a sensor and of the installation."""
+    """Return a state in flight in which every error of a sensor and of the installation is non-zero."""
     x = np.zeros(STATE_SIZE)
     rot = rot_e_from_l(lat, lon)
     x[:3] = e_from_geodetic(lat, lon, 1200.0)
@@ -79,7 +79,7 @@ def state_at(lat: float, lon: float, rng: np.random.Generator) -> FloatArray:
 
 
 def moved(x: FloatArray, increments: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The state after samples of 5 ms, and the sums over them."""
+    """Return the state after samples of 5 ms, and the sums over them."""
     state, sums = x.copy(), np.zeros(LAYOUT.sums_size)
     for angle, push in increments:
         advance_part(state, sums, tuple(angle), tuple(push), 0.005)
@@ -94,9 +94,9 @@ def off_by(x: FloatArray, error: FloatArray) -> FloatArray:
 
 @pytest.mark.parametrize("place", PLACES.values(), ids=PLACES.keys())
 def test_the_transition_matrix_matches_difference_quotients_of_the_strapdown(place: tuple[float, float]) -> None:
-    """Over a step of 0.1 s in a steep turn: to 1e-3 of each block's largest element.
+    """Over a step of 0.1 s in a steep turn, they agree to 1e-3 of each block's largest element.
 
-    Of what is second order in the step to a tenth: the force is taken for even within it.
+    Terms of second order in the step agree to a tenth, because the model takes the force as constant within the step.
     """
     rng = np.random.default_rng(3)
     x = state_at(*place, rng)
@@ -148,13 +148,16 @@ REFERENCE_E = e_from_geodetic(0.82, 0.15, 1200.0)
 @pytest.mark.parametrize("antenna", [0, 1])
 @pytest.mark.parametrize("kind", OBSERVED, ids=lambda kind: kind.name)
 def test_derivatives_of_each_observation_match_difference_quotients(kind: Kind, antenna: int) -> None:
-    """Compare for all errors, including those of installation and receiver."""
+    """All errors are compared, including those of the installation and of the receiver."""
     rng = np.random.default_rng(5)
     x = state_at(*PLACES["mid-latitude"], rng)
     angle, push = np.array([2e-3, -1e-3, 2.5e-3]), np.array([0.005, -0.01, -0.046])
 
     def after(error: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """With a rate that the gyroscopes' errors change; what they do within the time offset is left out."""
+        """Return the state after a step in which an error of the gyroscopes changes the rate.
+
+        Their effect within the time offset is left out.
+        """
         state, sums = off_by(x, error), np.zeros(LAYOUT.sums_size)
         if error[SENSORS].any():
             state[TIME_OFFSET] = 0.0
@@ -177,7 +180,7 @@ TURNING = 1e-4  # velocity by position: north and east turn with it; by attitude
 
 
 def test_covariance_propagation_matches_dense_matrices() -> None:
-    """Φ P Φᵀ, and two steps' Φ as their product."""
+    """The reference is Φ P Φᵀ with dense matrices; Φ of two steps must be the product of the two."""
     rng = np.random.default_rng(1)
     n, core = LAYOUT.size, LAYOUT.core
     drive = Drive(1e-6, 1e-4, rng.random(n), np.where(np.arange(n) >= MOVED, 50.0, np.inf))
@@ -202,7 +205,10 @@ def test_covariance_propagation_matches_dense_matrices() -> None:
 
 
 def test_process_noise_matches_the_covariance_of_sampled_random_walks() -> None:
-    """White rates and forces over 0.5 s of constant specific force: covariance of 20 000 draws, to 3 %."""
+    """The reference is the covariance of 20 000 draws of white rates and forces over 0.5 s of constant specific force.
+
+    They agree to 3 %.
+    """
     rng = np.random.default_rng(8)
     sums = np.zeros(LAYOUT.sums_size)
     force, span_s, steps = np.array([3.0, -1.0, -9.0]), 0.5, 100

@@ -41,7 +41,10 @@ GOOD = Fixes(velocity_mps=0.03)
 
 @pytest.mark.parametrize("name", ["tactical", "mems"])
 def test_the_reference_flight_is_filtered_as_accurately_as_published(name: str) -> None:
-    """Positions only; each figure against the README's filter, to a tenth; the outages' too, to 15 %."""
+    """With positions only, each figure is within a tenth of the filter in the data set's README.
+
+    In the outages it is within 15 %.
+    """
     flown, start = reference(name), start_of("reference_flight", name)
     rows = flown.only(Kind.POSITION)
     run = run_filter(flown.inertial, rows, flown.setup, start)
@@ -56,7 +59,7 @@ def test_the_reference_flight_is_filtered_as_accurately_as_published(name: str) 
 
 
 def test_knowledge_of_a_correlated_error_decays_with_the_error() -> None:
-    """Half a minute without observations: of the positions' error, and of the velocities', what decay leaves."""
+    """In half a minute without observations the estimated errors of positions and velocities decay exponentially."""
     truth, noise = fly(survey(), 60.0, 50.0), GRADES["mems"]
     inertial, rows = noised(truth, noise, Fixes(share=0.5, tau_s=20.0, velocity_mps=0.03), ARM, 3)
     setup = replace(setup_for(noise, ARM), gnss_correlated_share=0.5, gnss_correlation_s=20.0)
@@ -71,7 +74,7 @@ def test_knowledge_of_a_correlated_error_decays_with_the_error() -> None:
 
 
 def test_results_do_not_depend_on_how_the_input_is_cut() -> None:
-    """Sample by sample, with observations held back, or all at once: bit for bit."""
+    """Results are equal bit for bit, fed sample by sample, with observations held back, or all at once."""
     truth = fly(survey(), 40.0, 100.0)
     inertial, rows = noised(truth, GRADES["tactical"], GOOD, ARM, 1)
     setup, start = setup_for(GRADES["tactical"], ARM), drawn_start(truth, 1, at_s=0.5)
@@ -97,7 +100,7 @@ def test_results_do_not_depend_on_how_the_input_is_cut() -> None:
 
 
 def test_the_first_covariance_equals_the_sigmas_of_the_start() -> None:
-    """Nose up, banked, heading west, near a pole: by what each angle, and each step north, east, down, changes."""
+    """Near a pole, with nose up, bank and heading west, each angle and each direction changes the state differently."""
     setup = setup_for(GRADES["tactical"], ARM)
     place, angles = e_from_geodetic(1.4, -2.0, 3000.0), np.array([0.4, 0.7, 4.5])
     sigma = np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3, 0.01, 0.02, 0.03])
@@ -176,7 +179,7 @@ def test_every_observation_has_a_fate() -> None:
 
 
 def test_a_permanent_position_jump_is_accepted_after_half_a_minute() -> None:
-    """A base station set wrong by 20 m: refused for half a minute, as long as a wrong fix may last, then taken."""
+    """A base station set wrong by 20 m is refused for half a minute, which is as long as a wrong fix may last."""
     truth = fly(survey(), 90.0, 100.0)
     inertial, rows = noised(truth, GRADES["tactical"], Fixes(), ARM, 4)
     rows["value"][30:] += [10.0, 10.0, 14.0]
@@ -193,7 +196,7 @@ def test_a_permanent_position_jump_is_accepted_after_half_a_minute() -> None:
 
 
 def test_a_receiver_with_too_small_sigmas_is_not_refused_for_long() -> None:
-    """Sigmas a third of the errors: nothing is refused for long, and the result is what the errors allow."""
+    """The sigmas are a third of the errors; the result must still be as accurate as the errors allow."""
     truth = fly(survey(), 120.0, 100.0)
     inertial, rows = noised(truth, GRADES["tactical"], Fixes(sigma_m=(0.06, 0.06, 0.12)), ARM, 5)
     rows["sigma"] /= 3.0
@@ -206,7 +209,7 @@ def test_a_receiver_with_too_small_sigmas_is_not_refused_for_long() -> None:
 
 
 def test_missing_samples_are_counted_and_bridged_by_the_next() -> None:
-    """Lose 20 ms of samples that are not bridged: they are counted and marked, and no fix is refused."""
+    """20 ms of lost samples are counted and marked, and no fix is refused because of them."""
     truth = fly(survey(), 30.0, 100.0)
     inertial, rows = noised(truth, GRADES["tactical"], Fixes(), ARM, 6)
     kept = np.r_[0:1500, 1502:3000]
@@ -224,7 +227,7 @@ def test_missing_samples_are_counted_and_bridged_by_the_next() -> None:
 
 
 def test_the_covariance_stays_positive_after_hours_of_perfect_fixes() -> None:
-    """Standing still for three hours with a perfect unit and fixes of 0.1 mm: symmetric, and positive."""
+    """The unit stands still for three hours; perfect samples and fixes of 0.1 mm strain the arithmetic most."""
     noise, seconds = ImuNoise(1e-9, 1e-9, 1e-10, 1e-9, 3600.0, 1e-8, 1e-8), 10_800
     lat, lon = np.radians(47.0), np.radians(8.0)
     place, level = e_from_geodetic(lat, lon, 400.0), rot_e_from_l(lat, lon)
@@ -248,7 +251,7 @@ def test_the_covariance_stays_positive_after_hours_of_perfect_fixes() -> None:
 
 
 def test_a_real_flight_with_metre_level_gps_is_processed() -> None:
-    """The UAV: what its GPS jumps by is counted, all else taken, and the filter's attitude is near the on-board one."""
+    """Jumps of the UAV's GPS are refused, all other fixes are taken, and the attitude is near the on-board one."""
     flown = uav()
     assert flown.truth is not None
     begin = 120.0
@@ -271,7 +274,7 @@ def test_a_real_flight_with_metre_level_gps_is_processed() -> None:
 
 
 def test_a_live_filter_keeps_only_the_latest_innovations() -> None:
-    """Only the latest innovations stay, and yet all are counted, as where they are kept."""
+    """A live filter counts all innovations, as one that keeps them all does, but its memory is bounded."""
     truth = fly(survey(), 60.0, 100.0)
     inertial, rows = noised(truth, GRADES["tactical"], Fixes(rate_hz=100.0), ARM, 2)
     setup, start = setup_for(GRADES["tactical"], ARM), drawn_start(truth, 2)

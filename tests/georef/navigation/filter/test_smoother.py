@@ -35,7 +35,7 @@ ARM = np.array([0.35, -0.12, -1.1])
 
 @pytest.mark.parametrize("name", ["tactical", "mems"])
 def test_the_reference_flight_is_smoothed_as_accurately_as_published(name: str) -> None:
-    """Positions only; each figure within a tenth of the README's smoother, in outages too."""
+    """With positions only, each figure is within a tenth of the smoother in the data set's README, in outages too."""
     flown, start = reference(name), start_of("reference_flight", name)
     rows = flown.only(Kind.POSITION)
     solution = smooth(run_filter(flown.inertial, rows, flown.setup, start))
@@ -68,7 +68,7 @@ def dense(packed: FloatArray, n: int) -> FloatArray:
 
 
 def rauch_tung_striebel(run: FilterRun) -> tuple[FloatArray, FloatArray]:
-    """Smoothed errors (m, n) and variances (m, n) by C = P Φᵀ P⁻¹, with inverses, from what the filter kept."""
+    """Return smoothed errors (m, n) and variances (m, n) from the filter's run, by C = P Φᵀ P⁻¹ with inverses."""
     n, [block] = run.layout.size, run.nodes
     m = len(block.time_ns)
     error, p = np.zeros(n), dense(block.covariance[m - 1], n)
@@ -95,7 +95,7 @@ def rauch_tung_striebel(run: FilterRun) -> tuple[FloatArray, FloatArray]:
 
 
 def test_the_adjoint_smoother_equals_rauch_tung_striebel() -> None:
-    """With everything estimated, across an outage of 15 s: errors and sigmas of the formulas with inverses."""
+    """All optional states are estimated across an outage of 15 s; the reference uses the formulas with inverses."""
     run = flown(1, estimate_lever_arm=0.1, estimate_time_offset_s=0.01, gnss_correlated_share=0.4)
     errors_there, variance = rauch_tung_striebel(run)
     nodes = smooth_nodes(run)
@@ -108,7 +108,10 @@ def test_the_adjoint_smoother_equals_rauch_tung_striebel() -> None:
 
 
 def test_a_start_off_its_mean_equals_one_begun_there() -> None:
-    """Begun 50 µrad off what was known before, and told: states to a hundredth of a sigma, sigmas to a thousandth."""
+    """The run begins 50 µrad off the mean that is known, and the smoother is given that mean.
+
+    States agree to a hundredth of a sigma, sigmas to a thousandth.
+    """
     keys: dict[str, Any] = {"estimate_time_offset_s": 0.01, "gnss_correlated_share": 0.4}
     there, off = flown(1, **keys), np.array([5e-5, -3e-5, 4e-5])
     begun = replace(there.start, attitude_rad=there.start.attitude_rad + off)
@@ -126,7 +129,7 @@ def test_a_start_off_its_mean_equals_one_begun_there() -> None:
 
 
 def test_a_sensor_without_errors_is_harmless() -> None:
-    """Scale factors known perfectly: their covariance is singular, which a smoother with inverses could not bear."""
+    """The covariance of perfectly known scale factors is singular, so a smoother with inverses would fail."""
     truth = fly(survey(), 40.0, 50.0)
     noise = replace(GRADES["tactical"], gyro_scale=0.0, accel_scale=0.0)
     inertial, rows = noised(truth, noise, Fixes(), ARM, 2)
@@ -138,7 +141,7 @@ def test_a_sensor_without_errors_is_harmless() -> None:
 
 
 def test_the_path_between_nodes_is_smooth() -> None:
-    """No step at a node, where the filter jumps: what the position moves by in a sample is the velocity there."""
+    """The filter jumps at a node; a smoothed position must move by its velocity in each sample."""
     run = flown(3)
 
     def steps(solution: Solution) -> float:
@@ -150,7 +153,7 @@ def test_the_path_between_nodes_is_smooth() -> None:
 
 
 def test_parts_of_a_run_equal_the_whole() -> None:
-    """A long flight is written piece by piece."""
+    """A long flight is written piece by piece, so a piece must not depend on where it is cut."""
     run = flown(4)
     nodes = smooth_nodes(run)
     whole = solution_of(run, nodes)
@@ -162,7 +165,7 @@ def test_parts_of_a_run_equal_the_whole() -> None:
 
 
 def test_forward_and_smoothed_solutions_differ_as_their_sigmas_predict() -> None:
-    """Separation over its own sigma, √(P forward − P smoothed), over the whole flight: near 1."""
+    """The squared separation over its variance, P forward − P smoothed, is near 1 over the whole flight."""
     ratios = []
     for seed in range(8):
         solution = smooth(flown(seed))

@@ -42,7 +42,7 @@ def samples(edges_s: FloatArray, angle_b: FloatArray, velocity_b: FloatArray) ->
 def at_rest(
     lat_deg: float, lon_deg: float, height_m: float, seconds: float, rate_hz: float
 ) -> tuple[Inertial, FloatArray]:
-    """Perfect samples of a unit at rest, and its state."""
+    """Return perfect samples of a unit at rest, and its state."""
     lat, lon = np.radians([lat_deg]), np.radians([lon_deg])
     position_e = e_from_geodetic(lat, lon, [height_m])
     rot = rot_e_from_l(lat, lon)[0] @ rot_l_from_b(0.05, -0.03, 2.0)
@@ -58,7 +58,7 @@ def at_rest(
     [(90.0, 0.0, 30.0), (-90.0, 0.0, 2800.0), (89.9999999, 120.0, 0.0), (47.0, 180.0, 500.0), (-20.0, 8.0, 6000.0)],
 )
 def test_a_unit_at_rest_stays_in_place(lat_deg: float, lon_deg: float, height_m: float) -> None:
-    """Ten minutes: Bowring's step, 1e-11 of gravity, moves it by micrometres."""
+    """In ten minutes only the error of Bowring's single step, 1e-11 of gravity, moves it, by micrometres."""
     inertial, state = at_rest(lat_deg, lon_deg, height_m, 600.0, 50.0)
     end = navigate(inertial, state)[-1]
     assert np.abs(end[:3] - state[:3]).max() < 1e-5
@@ -67,7 +67,7 @@ def test_a_unit_at_rest_stays_in_place(lat_deg: float, lon_deg: float, height_m:
 
 
 def test_a_circle_around_the_pole_stays_a_circle() -> None:
-    """A minute on a circle of 100 m around the pole: longitude runs through everything, position does not care."""
+    """In a minute on a circle of 100 m around the pole, longitude takes every value; the position must not suffer."""
     path = circling_the_pole(60.0, 100.0, 0.2, 6_356_752.3)
     edges = np.arange(12_001) / 200.0
     exact = true_increments(path, edges)
@@ -79,7 +79,7 @@ def test_a_circle_around_the_pole_stays_a_circle() -> None:
 
 
 def test_a_flight_is_reproduced_from_its_increments() -> None:
-    """Two minutes with turns and a shaking fuselage: what is left is of the two-sample algorithms' order."""
+    """In two minutes with turns and a vibrating fuselage, the rest is as small as the two-sample algorithms' error."""
     truth = fly(survey(), 120.0, 200.0)
     start = drawn_start(truth, 0, position_m=0.0, velocity_mps=0.0, attitude_rad=(0.0, 0.0, 0.0))
     found = navigate(truth.inertial(), start_state(setup_for(PERFECT, np.zeros(3)), start))
@@ -90,10 +90,11 @@ def test_a_flight_is_reproduced_from_its_increments() -> None:
 
 
 def test_coning_is_compensated() -> None:
-    """A cone of 1° at 5 Hz; with φ the cone's turn in a sample, Ω a²/2 (1 − sin φ / φ) is 4e-4 rad in 20 s.
+    """Over a cone of 1° at 5 Hz, an uncompensated strapdown would be off by 4e-4 rad in 20 s.
 
-    The body's z axis goes round a cone, which q(t) = (cos a/2, sin a/2 cos Ωt, sin a/2 sin Ωt, 0) describes
-    (Bortz 1971); its rate is (−Ω sin a sin Ωt, Ω sin a cos Ωt, −2 Ω sin² a/2).
+    This is Ω a²/2 (1 − sin φ / φ), with φ the cone's turn in a sample. The body's z axis goes round a cone, which q(t)
+    = (cos a/2, sin a/2 cos Ωt, sin a/2 sin Ωt, 0) describes (Bortz 1971); its rate is (−Ω sin a sin Ωt, Ω sin a cos Ωt,
+    −2 Ω sin² a/2).
     """
     half, omega, rate_hz, seconds = np.radians(1.0), 2.0 * np.pi * 5.0, 200.0, 20.0
     edges = np.arange(round(seconds * rate_hz) + 1) / rate_hz
@@ -116,8 +117,11 @@ def test_coning_is_compensated() -> None:
 
 @pytest.mark.parametrize("what", ["accelerometer", "tilt", "gyroscope"])
 def test_an_hour_shows_schuler_oscillation(what: str) -> None:
-    """On the equator, northward, tilt θ (nose down) and heading ψ: dx = v, dv = g θ + b, dθ = ε − v / M + Ω ψ,
-    dψ = −Ω (θ + x / M), solved by the matrix exponential; but for Ω it is b / ω² (1 − cos ωt) and its like."""
+    """The reference is the matrix exponential of the linear error equations on the equator, towards north.
+
+    With tilt θ (nose down) and heading ψ: dx = v, dv = g θ + b, dθ = ε − v / M + Ω ψ, dψ = −Ω (θ + x / M). Without Ω
+    the solution is b / ω² (1 − cos ωt) and similar terms.
+    """
     lat, lon = np.zeros(1), np.array([3.0])
     position_e = e_from_geodetic(lat, lon, [0.0])
     level = rot_e_from_l(lat, lon)[0]
@@ -150,7 +154,7 @@ def test_an_hour_shows_schuler_oscillation(what: str) -> None:
 
 @pytest.mark.filterwarnings("ignore:The copy keyword")
 def test_three_minutes_match_pyins() -> None:
-    """The same increments of the reference flight; its gravity is another above the ground, by 3e-6 m/s²."""
+    """Both integrate the increments of the reference flight; above the ground pyins' gravity differs by 3e-6 m/s²."""
     flown = reference("tactical").cut(100_700.0, 100_880.0)
     true = reference("tactical").truth
     assert true is not None
@@ -175,7 +179,7 @@ def test_three_minutes_match_pyins() -> None:
 
 
 def _two_sample(inertial: Inertial) -> tuple[FloatArray, FloatArray]:
-    """Rotation vector and velocity increment in the axes at the interval's begin, as pyins takes them."""
+    """Return rotation vector and velocity increment in the axes at the interval's beginning, as pyins takes them."""
     a, v = inertial.angle_b, inertial.velocity_b
     angle, push = a.copy(), v + 0.5 * np.cross(a, v)
     angle[1:] += np.cross(a[:-1], a[1:]) / 12.0
