@@ -27,7 +27,7 @@ T_FROM_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])  # t
 
 @dataclass(frozen=True)
 class Line:
-    """A straight level line: where it begins, its heading, length, height in t, speed."""
+    """A straight level line: its beginning, heading, length, height in t, and speed."""
 
     x: float
     y: float
@@ -39,7 +39,7 @@ class Line:
 
 @dataclass(frozen=True)
 class Scanner:
-    """Line scanner of the flights here, with a triangle of scan angles."""
+    """Line scanner of these flights, whose scan angle is a triangle wave."""
 
     prf_hz: float = 20_000.0
     scan_hz: float = 40.0
@@ -50,7 +50,10 @@ class Scanner:
 def gables(
     count: int = 10, spacing_m: float = 24.0, size_m: float = 12.0, pitch_deg: float = 40.0, seed: int = 3
 ) -> Surface:
-    """A house in each square of a grid about the origin, not quite in its middle, ridge to the north or to the east."""
+    """Return a surface with a house in each square of a grid about the origin, slightly off its centre.
+
+    Ridges run north or east.
+    """
     rng = np.random.default_rng(seed)
     off = rng.uniform(-0.45, 0.45, (count, count, 2)) * (spacing_m - size_m)
     turned = rng.integers(0, 2, (count, count)).astype(np.bool_)
@@ -83,11 +86,10 @@ def fly(
     lowest_m: float = -3.0,
     highest_m: float = 11.0,
 ) -> Flight:
-    """A flight with nominal calibration over ground z = f(x, y) of t; ``true`` is what the scanner really is.
-
+    """Return a flight with nominal calibration over ground z = f(x, y) in t; ``true`` is what the scanner really is.
     Args:
-        errors: (lines, 6) of the trajectory told: east, north, up m; small turns about north, east, down of the body.
-        sigmas: the told trajectory's, m and rad.
+        errors: (lines, 6) of the trajectory given: east, north, up m; small turns about north, east, down of b, rad.
+        sigmas: the given trajectory's, m and rad.
     """
     frame = Tangent.at(e_from_geodetic(np.radians(47.2), np.radians(9.0), 0.0))
     matrix = np.eye(3) if installation is None else installation
@@ -117,7 +119,7 @@ def retold(
 
 
 def truth_of(flight: Flight, **true: float) -> Calibration:
-    """The calibration a flight was made with."""
+    """Return the calibration that a flight was simulated with."""
     return flight.heads[0].start.changed(**true)
 
 
@@ -184,7 +186,7 @@ def _scan(
 
 
 def _met(from_t: FloatArray, beam_t: FloatArray, ground: Surface, limits_m: tuple[float, float]) -> FloatArray:
-    """Where beams meet the ground: marched down between two heights, then halved."""
+    """Return where beams meet the ground, m along the beam: marched down between two heights, then bisected."""
     low_m, high_m = limits_m
 
     def above(distance: FloatArray) -> FloatArray:

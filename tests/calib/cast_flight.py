@@ -51,13 +51,12 @@ SPEED_MPS, HALF_ANGLE_RAD, SCAN_HZ, POSE_S = 50.0, np.radians(30.0), 50.0, 0.01
 @dataclass(frozen=True, eq=False)
 class Cast:
     """Flight over a scene with its truth.
-
     Attributes:
-        flight: with nominal calibration.
+        flight: the flight, placed with the nominal calibration.
         truth: the true calibration.
-        scene: what was there.
-        surface: by swath (n,) of `swath.sim.shots`, a row a return.
-        true_t: by swath (n, 3), without noise.
+        scene: the scene that was scanned.
+        surface: for each swath (n,) kind of surface as in `swath.sim.shots`, one row per return.
+        true_t: for each swath (n, 3), m, in t, without noise.
         planes: (p, 5) normal_t, its product with points of the plane in t, surface: all roofs, walls and cars' sides.
     """
 
@@ -73,7 +72,7 @@ class Cast:
         return self.flight.placed({"left": self.truth})
 
     def faces(self, swath: int, at: Int64Array, within_m: float = 1e-3) -> BoolArray:
-        """(k, planes) which of the scene's planes true points lie on."""
+        """Return (k, planes) True where a true point lies on a plane of the scene."""
         distance = self.true_t[swath][at] @ self.planes[:, :3].T - self.planes[:, 3]
         on: BoolArray = np.abs(distance) < within_m
         return on
@@ -145,7 +144,7 @@ def _corners(lines: Sequence[Line], half_angle_rad: float) -> FloatArray:
 def _track(
     line: Line, site: Site, index: int, draws: np.random.Generator, speed_mps: float
 ) -> tuple[NDArray[Any], ...]:
-    """Columns of a trajectory along a line, with slow gusts."""
+    """Return the columns of a trajectory along a line, with slow gusts."""
     begin, end = np.array(line[:2]), np.array(line[2:4])
     length = float(np.linalg.norm(end - begin))
     second = np.arange(0.0, length / speed_mps, POSE_S)
@@ -175,7 +174,7 @@ def _shoot(
     prf_hz: float,
     half_angle_rad: float,
 ) -> tuple[StructArray, Int64Array, ByteArray, FloatArray]:
-    """Rows, their times, surfaces, and points (n, 3) in e, of all pulses along a track: a polygon's even sweeps."""
+    """Return rows, times, surfaces, and points (n, 3), m, in e, of all pulses along a track swept by a polygon."""
     time_ns, position_e, q = track[0].astype(np.int64), track[1], track[2]
     span_s = 1e-9 * float(time_ns[-1] - time_ns[0])
     second = np.arange(0.0, span_s - POSE_S, 1.0 / prf_hz)
@@ -205,7 +204,7 @@ def _shoot(
 
 
 def _planes(scene: Scene, site: Site, frame: Tangent) -> FloatArray:
-    """The planes of all solids, in t."""
+    """Return the planes of all solids, in t."""
     table = scene.arrays.rows
     table = table[: 6 * (len(table) // 6)].reshape(-1, 6)
     real = np.isin(table[:, 4], (ROOF, WALL, CAR)) & (np.abs(np.linalg.norm(table[:, :3], axis=1) - 1.0) < 1e-9)

@@ -45,7 +45,7 @@ SIGMAS = (1.05e-5, 1.2e-5, 2.4e-5, 0.0041, 1.8e-5, 4.2e-6, 1.9e-4)
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """Everything that a report is made of."""
+    """Everything from which a report is made."""
 
     flight: Flight
     features: Features
@@ -54,7 +54,7 @@ class Outcome:
 
 
 def surface_m(place: FloatArray) -> FloatArray:
-    """Height of flat ground and gabled roofs at (n, 2) east, north."""
+    """Return the height, m, of flat ground and gabled roofs at (n, 2) east, north."""
     x, y, turn = np.array(ROOFS).T
     column = np.clip(np.rint((place[:, 0] + 150.0) / 60.0), 0, 5).astype(np.int64)
     nearest = column + 6 * np.clip(np.rint((place[:, 1] + 120.0) / 60.0), 0, 4).astype(np.int64)
@@ -67,7 +67,7 @@ def surface_m(place: FloatArray) -> FloatArray:
 
 
 def trajectory() -> Trajectory:
-    """Straight and level lines one after the other, a minute apart; 20 Hz."""
+    """Return straight and level lines one after the other, a minute apart, at 20 Hz."""
     frame = Tangent.at(np.asarray(e_from_geodetic(LAT, LON, HEIGHT_M), np.float64))
     parts: list[list[FloatArray]] = []
     for k, (_, heading, offset_m) in enumerate(LINES):
@@ -100,7 +100,7 @@ def trajectory() -> Trajectory:
 
 
 def made_flight(returns: int = RETURNS, *, true: Calibration | None = None) -> tuple[Flight, Calibration]:
-    """Strips of a line scanner that saw the surface, with noise; placed with the nominal calibration."""
+    """Return strips of a line scanner over the surface, placed with the nominal calibration, and the true one."""
     random = np.random.default_rng(11)
     start = nominal("left", [0.12, -0.03, 0.28], np.eye(3))
     start = replace(start, id="nominal", ranges="corrected", refraction="none", mirror_factor=1.0)
@@ -141,7 +141,7 @@ def _ranges(flight: Flight, swath: Swath, found: Calibration) -> FloatArray:
 
 
 def made_planes(flight: Flight, found: Calibration) -> tuple[Plane, ...]:
-    """Both sides of each roof, and ground between, with the returns that lie on them."""
+    """Return both sides of each roof, and ground between roofs, with the returns that lie on them."""
     points = [flight.place(swath, found) for swath in flight.swaths]
     planes = []
     for i, (x, y, turn) in enumerate(ROOFS):
@@ -301,7 +301,7 @@ def _adjusted(flight: Flight, features: Features, found: Calibration, random: np
 
 
 def _planes_e(flight: Flight, features: Features, random: np.random.Generator) -> FloatArray:
-    """As adjusted: turned by a hundredth of a degree, moved by millimetres."""
+    """Return the adjusted planes: normals turned by a hundredth of a degree, distances changed by millimetres."""
     normals_e = np.array([plane.normal_t for plane in features.planes]) @ flight.frame.rot_t_from_e
     centres_e = flight.frame.e_from_t(np.array([plane.centre_t for plane in features.planes]))
     normals_e += random.normal(0.0, 2e-4, normals_e.shape)

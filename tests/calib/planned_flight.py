@@ -31,7 +31,7 @@ TWO_HEIGHTS = (*ONE_HEIGHT, (0.0, 1500.0, 0.0), (90.0, 1500.0, 0.0))
 def path(
     lines: Sequence[tuple[float, float, float]], sigma_m: float = 0.02, sigma_deg: float = 0.003
 ) -> tuple[Trajectory, list[Line]]:
-    """Lines one after the other, each through the middle, with a wing that rocks a little; nothing between them."""
+    """Return lines flown one after the other through the middle, with slightly rocking wings and nothing in between."""
     columns, found = [], []
     t = np.arange(0.0, LINE_S + 1e-9, 0.02)
     for number, (heading_deg, height_m, offset) in enumerate(lines):
@@ -56,7 +56,7 @@ def path(
 
 
 def surfaces(*, roofs: bool = True, count: int = 7, spread_m: float = 300.0) -> list[Surface]:
-    """count² pieces of 10 m, slopes of 35° in four aspects and every fifth flat; or all flat."""
+    """Return count² pieces of 10 m: slopes of 35° in four aspects with every fifth flat, or all flat."""
     made = []
     places = np.linspace(-spread_m, spread_m, count)
     grid = np.stack(np.meshgrid(np.linspace(-5, 5, 7), np.linspace(-5, 5, 7)), axis=-1).reshape(-1, 2)

@@ -29,7 +29,7 @@ ENU_FROM_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 
 def planes_ned() -> list[tuple[FloatArray, FloatArray]]:
-    """Centres and normals, north, east, down."""
+    """Return the planes' centres and normals, north, east, down."""
     found, grid = [], np.linspace(-250, 250, 5)
     for index, (north, east) in enumerate((n, e) for n in grid for e in grid):
         aspect, slope = index % 4 * np.pi / 2 + 0.3, np.radians(35)
@@ -41,7 +41,10 @@ def planes_ned() -> list[tuple[FloatArray, FloatArray]]:
 def _shot(
     line: tuple[float, float, float], roll: float, pitch: float, target: FloatArray, normal: FloatArray
 ) -> FloatArray | None:
-    """Position (3), roll, pitch, heading, range, angle of a beam that meets a plane at, nearly, a point of it."""
+    """Return position (3), roll, pitch, heading, range, angle of a beam that meets a plane close to a target.
+
+    None means that the target is outside the scan.
+    """
     heading, height, aside = line
     along = np.array([np.cos(heading), np.sin(heading), 0.0])
     across = np.array([-np.sin(heading), np.cos(heading), 0.0])
@@ -65,7 +68,7 @@ def _shot(
 
 @dataclass(frozen=True, eq=False)
 class Printed:
-    """Observations (n, 8) as measured: position, roll, pitch, heading, range, angle; (n,) planes and lines."""
+    """Observations (n, 8) as measured: position, roll, pitch, heading, range, angle; planes and lines (n,)."""
 
     observed: FloatArray
     plane: Int64Array

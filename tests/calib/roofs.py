@@ -36,7 +36,7 @@ def exactly_known(calibration: Calibration) -> Calibration:
 
 @dataclass(frozen=True)
 class Line:
-    """Heading (deg), height above ground (m), how far to the right of the middle (m)."""
+    """A line: heading (deg), height above ground (m), and distance to the right of the middle (m)."""
 
     heading_deg: float
     height_m: float = 800.0
@@ -56,7 +56,7 @@ LINES = (
 
 
 def roofs(slope_deg: float = 35.0) -> list[tuple[FloatArray, FloatArray]]:
-    """25 centres and normals in t: four aspects, and flat ones."""
+    """Return 25 centres and normals in t: roofs of four aspects, and flat ones."""
     planes = []
     for index, (east, north) in enumerate((e, n) for n in np.linspace(-250, 250, 5) for e in np.linspace(-250, 250, 5)):
         slope = np.radians(slope_deg if index % 5 else 0.0)
@@ -69,11 +69,10 @@ def roofs(slope_deg: float = 35.0) -> list[tuple[FloatArray, FloatArray]]:
 @dataclass(frozen=True, eq=False)
 class Made:
     """Flight with its features.
-
     Attributes:
-        flight: with the head's start, points placed with it.
+        flight: points placed with the head's start calibration.
         features: planes, with every return's index.
-        truth: of the scanner.
+        truth: the scanner's true calibration.
     """
 
     flight: Flight
@@ -87,7 +86,7 @@ def frame() -> Tangent:
 
 
 def trajectory(lines: Sequence[Line] = LINES, swing_deg: float = 1.0) -> Trajectory:
-    """100 Hz, lines one after the other with gaps between; rolls and pitches."""
+    """Return lines flown one after the other with gaps between them, at 100 Hz, with rolls and pitches."""
     at, times, positions, quaternions = frame(), [], [], []
     own = np.arange(0.0, LINE_S, 0.01)
     for index, line in enumerate(lines):
@@ -121,7 +120,10 @@ def trajectory(lines: Sequence[Line] = LINES, swing_deg: float = 1.0) -> Traject
 def aimed(
     flown: Trajectory, lines: Sequence[Line], planes: Sequence[tuple[FloatArray, FloatArray]], points: int, seed: int
 ) -> list[tuple[Int64Array, FloatArray, Int64Array]]:
-    """By line: times, encoder readings and planes of returns that come near the planes' centres, by their times."""
+    """Return for each line times (ns), encoder readings (rad) and planes of returns near the planes' centres.
+
+    The returns are in order of time.
+    """
     g, swaths = np.random.default_rng(seed), []
     for index, line in enumerate(lines):
         heading = np.radians(line.heading_deg)
@@ -150,7 +152,7 @@ def ranges(
     plane: Int64Array,
     intensity: FloatArray | None = None,
 ) -> FloatArray:
-    """(n,) as such a scanner measures them to the planes (ISO/TS 19159-2 Eq. 10, 14 solved for ρ)."""
+    """Return (n,) ranges, m, that a scanner measures to the planes (ISO/TS 19159-2 Eq. 10, 14 solved for ρ)."""
     value, at = truth.value, frame()
     times = time_ns + round(value("time_offset_s") * 1e9)
     where = true.poses(times)

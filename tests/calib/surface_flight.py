@@ -18,14 +18,14 @@ FRAME = Tangent.at(np.asarray(e_from_geodetic(LAT_RAD, LON_RAD, 500.0)))
 
 
 def grid(half_m: float, step_m: float) -> tuple[FloatArray, FloatArray]:
-    """East and north of places around the middle."""
+    """Return east and north, m, of places in a grid around the middle."""
     along = np.arange(-half_m, half_m, step_m)
     east, north = np.meshgrid(along, along)
     return east.ravel(), north.ravel()
 
 
 def swath_of(points_t: FloatArray, strip: int = 1, returns: ByteArray | None = None) -> Swath:
-    """Single returns at places."""
+    """Return a swath of single returns at places (n, 3), m, in t."""
     rows = np.zeros(len(points_t), RETURN_DTYPE)
     rows["return_number"] = 1
     rows["number_of_returns"] = 1 if returns is None else returns
@@ -36,7 +36,7 @@ def swath_of(points_t: FloatArray, strip: int = 1, returns: ByteArray | None = N
 def surface_flight(
     heights: Sequence[Height], *, half_m: float = 60.0, step_m: float = 0.5, noise_m: float = 0.01, seed: int = 5
 ) -> Flight:
-    """One swath a function of height over east and north (metres in t)."""
+    """Return a flight with one swath for each function of height over east and north (metres in t)."""
     draws = np.random.default_rng(seed)
     swaths = []
     for strip, height in enumerate(heights, start=1):

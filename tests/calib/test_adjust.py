@@ -93,7 +93,7 @@ def block(
 
 
 def knots(flown: Trajectory, every_s: float = 6.0) -> TrajectoryPrior:
-    """A dense prior that is no model's."""
+    """Return a trajectory prior with a dense covariance, which no model describes."""
     g = np.random.default_rng(8)
     starts = flown.time_ns[np.concatenate([[True], np.diff(flown.time_ns) > 1_000_000_000])]
     times = np.concatenate([start + np.arange(3) * int(every_s * 1e9) for start in starts])
@@ -146,7 +146,7 @@ def test_reduced_equations_give_the_whole_dense_solution(weighted: bool) -> None
 
 
 def test_the_hard_constraint_equals_the_limit_of_a_weighted_one() -> None:
-    """Four unknowns a plane and s1² + s2² + s3² = 1 with σ = 1e-7 (ISO/TS 19159-2 Eq. 18, 20)."""
+    """Four unknowns of a plane are tied by s1² + s2² + s3² = 1 with σ = 1e-7 (ISO/TS 19159-2 Eq. 18, 20)."""
     built = small()
     rows, ties, weight = block(built.flight, built.features, ParameterOptions(priors={"range_offset_m": 0.05}), None)
     ones, none = np.ones(rows.count, np.float32), NO_TIES
@@ -177,7 +177,7 @@ def test_the_hard_constraint_equals_the_limit_of_a_weighted_one() -> None:
 
 
 def tied(built: Made, noise_m: float, seed: int) -> tuple[TiePoint, ...]:
-    """The planes' middles as points: each where a return of every swath near it shows it."""
+    """Return the planes' centres as tie points, each seen where a return of every swath near it places it."""
     g, ties = np.random.default_rng(seed), []
     truth, flight = built.truth, built.flight
     for plane in built.features.planes:
@@ -416,7 +416,7 @@ def unknown_start(built: Made) -> dict[str, Calibration]:
 
 @pytest.mark.parametrize("lines", [CROSSING, LINES[:3]], ids=["two crossing", "three"])
 def test_a_held_scale_enters_the_sigma_of_the_range_offset(lines: tuple[Line, ...]) -> None:
-    """A scan angle scale 250 ppm off moves the range offset by decimetres; taken as exact it would be many sigmas."""
+    """A scan angle scale 250 ppm off moves the range offset by decimetres, many of the sigmas that ignore it."""
     built = made(truth=SCALED, lines=lines, points=100)
     prior, start = gauss_markov(built.flight, Taus(), 4.0), unknown_start(built)
     found = adjust(built.flight, built.features, ParameterOptions(), prior, PLAIN, start)
@@ -445,7 +445,7 @@ def test_parameters_partly_determined_by_two_lines_use_their_start_as_observatio
 
 
 def test_the_effect_of_a_held_parameter_equals_that_of_another_start() -> None:
-    """Against the adjustment itself, started with the parameter one sigma away."""
+    """The reference is the adjustment itself, started with the parameter one sigma away."""
     built = made(lines=LINES[:6])
     prior, start = gauss_markov(built.flight, Taus(), 4.0), unknown_start(built)
     found = adjust(built.flight, built.features, ParameterOptions(), prior, PLAIN, start)
@@ -474,7 +474,7 @@ def test_a_flight_that_contradicts_a_held_parameter_reports_it() -> None:
 
 @pytest.mark.parametrize("name", ["kappa_rad", "scan_angle_scale"])
 def test_a_fixed_parameter_is_reported_as_wrong_if_the_flight_contradicts_it(name: str) -> None:
-    """However plausible its error is; its sigma stays what is plausible."""
+    """It is reported even if its error is plausible; its sigma stays the plausible one."""
     built = made(truth=SCALED)
     prior, start = gauss_markov(built.flight, Taus(), 4.0), {"left": replace(built.truth, method="nominal")}
     options, away = ParameterOptions(fix=frozenset([name])), {"kappa_rad": 3e-3, "scan_angle_scale": 2.5e-4}[name]
@@ -511,7 +511,7 @@ def by_intensity(correction_m: FloatArray, noise: float = 1.0) -> Adjusted:
 
 @pytest.mark.parametrize("share", [1.0, 0.0], ids=["there", "none is invented"])
 def test_a_correction_by_intensity_lies_within_its_sigmas(share: float) -> None:
-    """At the knots and in the middle between them."""
+    """The sigmas are checked at the knots and in the middle between them."""
     found = by_intensity(share * LOGARITHM)
     assert found.converged
     at = [found.names.index(f"left.ibrc.{knot}") for knot in (0, 1, 2, 4, 5)]
@@ -529,7 +529,7 @@ def test_a_correction_by_intensity_lies_within_its_sigmas(share: float) -> None:
 
 
 def test_a_smooth_correction_is_closer_than_any_piecewise_linear_one() -> None:
-    """With hardly any noise: against the best that lines between the same knots could be."""
+    """There is hardly any noise; the comparison is with the best polygon through the same knots."""
     hats = np.stack([np.interp(INTENSITY, KNOTS, one) for one in np.eye(len(KNOTS))], axis=1)
     best = hats @ np.linalg.lstsq(hats, LOGARITHM)[0]
     table = by_intensity(LOGARITHM, noise=1e-3).calibrations["left"].ibrc

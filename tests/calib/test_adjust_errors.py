@@ -21,7 +21,7 @@ RUNS = 100
 
 
 def test_errors_over_many_runs_are_as_large_as_their_sigmas() -> None:
-    """NEES of every parameter, and its intervals, with trajectory errors drawn from their prior."""
+    """Trajectory errors are drawn from their prior; NEES and intervals of every parameter are checked."""
     lines = LINES[:6]
     flown = trajectory(lines)
     base = made(lines=lines, points=4, seed=5)

@@ -37,7 +37,7 @@ TEXT = st.text(st.characters(exclude_categories=["Cs"]), min_size=1, max_size=20
 
 @st.composite
 def calibrations(draw: st.DrawFn) -> Calibration:
-    """Any calibration: some parameters estimated, correlations of a random factor, every table."""
+    """Draw any calibration: some parameters estimated, correlations of a random factor, every table."""
     count = len(PARAMETERS)
     seed = draw(st.integers(0, 2**32 - 1))
     random = np.random.default_rng(seed)
@@ -72,7 +72,7 @@ def calibrations(draw: st.DrawFn) -> Calibration:
 
 
 def close(read: Any, written: Any) -> None:
-    """True if two numbers agree to one unit of their last binary digit."""
+    """Assert that numbers agree to one unit of their last binary digit."""
     np.testing.assert_array_max_ulp(np.asarray(read, np.float64), np.asarray(written, np.float64), maxulp=1)
 
 
@@ -113,7 +113,7 @@ def test_a_written_calibration_is_read_back(calibration: Calibration, identity: 
 
 
 def test_numbers_written_by_users_keep_their_digits() -> None:
-    """0.0009° in radians and back is 0.0008999999999999999 by plain division."""
+    """By plain division 0.0009° in radians and back would become 0.0008999999999999999."""
     rows = {"omega_deg": "0.2513", "phi_deg": "-0.4021", "kappa_deg": "0.611", "range_offset_m": "0.3502"}
     rows |= {"range_scale_ppm": "12.7", "lever_arm_x_m": "0.12", "lever_arm_y_m": "-0.03", "lever_arm_z_m": "0.28"}
     rows |= {"time_offset_us": "33.1", "torsion_us2": "0.0018", "scan_plane_tilt_deg": "0.0009"}
@@ -125,7 +125,7 @@ def test_numbers_written_by_users_keep_their_digits() -> None:
 
 
 def test_the_file_follows_the_conventions_page() -> None:
-    """Keys and their order are those of the page; what was held has no sigma; all sixteen parameters stand there."""
+    """Keys and their order are those of the page; held parameters have no sigma; all sixteen parameters are written."""
     sigmas, correlation = np.zeros(16), np.eye(16)
     sigmas[INDEX["omega_rad"]], sigmas[INDEX["range_scale"]] = math.radians(0.001), 2e-6
     correlation[0, INDEX["range_scale"]] = correlation[INDEX["range_scale"], 0] = 0.25
@@ -159,7 +159,7 @@ def test_the_file_follows_the_conventions_page() -> None:
 
 
 def judged() -> tuple[Calibration, Header]:
-    """Roll estimated beside a scan angle scale that was held, and the verdict on it."""
+    """Return a calibration with roll estimated and a correlated scan angle scale held, and a header with a verdict."""
     sigmas, held, correlation = np.zeros(16), np.zeros(16), np.eye(16)
     roll, scale = INDEX["omega_rad"], INDEX["scan_angle_scale"]
     sigmas[roll], held[scale] = math.radians(0.01), 3e-4
@@ -199,7 +199,7 @@ def test_a_file_that_contradicts_itself_is_refused(said: str, instead: str, mess
 
 
 def test_table_rows_keep_their_matching_keys() -> None:
-    """Each row keeps what it matches on, and nothing else."""
+    """Each row keeps the keys that it matches on, and no others."""
     offsets = (RangeOffset(0.012, return_slot=2), RangeOffset(-0.03, mta_zone=0, prf_hz=400_000.0))
     calibration = Calibration("x", "left", "planes", np.zeros(16), range_offsets=offsets)
     document = tomllib.loads(calibration_text(calibration, HEADER))

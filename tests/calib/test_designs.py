@@ -42,7 +42,7 @@ def with_points(features: Features, each: int, seed: int) -> Features:
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_six_lines_and_thirty_control_points_determine_the_boresight_with_a_mems_imu(seed: int) -> None:
-    """Attitude errors six times those of a tactical unit: no angle is held, and each is within its sigmas."""
+    """Attitude errors are six times those of a tactical unit; no angle is held, and each is within its sigmas."""
     case = Case(seed, "six", "MEMS", "basic", 1.0, 35.0, control=False)
     built, planes = flight_of(case)
     features = with_points(planes, 6, seed)

@@ -14,7 +14,7 @@ from swath.georef.arrays import FloatArray
 
 @st.composite
 def tables(draw: st.DrawFn) -> tuple[FloatArray, FloatArray]:
-    """Knots, and corrections of a few centimetres at them, equal neighbours among them."""
+    """Draw knots, and corrections of a few centimetres at them, with some equal neighbours."""
     count = draw(st.integers(3, 9))
     gaps = draw(st.lists(st.floats(0.5, 40.0), min_size=count, max_size=count))
     corrections = draw(st.lists(st.integers(-80, 80), min_size=count, max_size=count))
@@ -23,7 +23,7 @@ def tables(draw: st.DrawFn) -> tuple[FloatArray, FloatArray]:
 
 @given(tables())
 def test_the_curve_is_the_monotone_cubic(table: tuple[FloatArray, FloatArray]) -> None:
-    """At the nodes exactly, between them to the share of the knots' differences that `STEPS` is chosen for."""
+    """The curve is exact at the nodes; between them its error is the share of the knots' differences set by `STEPS`."""
     knots, correction_m = table
     nodes, found, cubic = nodes_of(knots), curve(knots, correction_m), PchipInterpolator(knots, correction_m)
     assert at_knots(nodes).tolist() == knots.tolist()
@@ -37,7 +37,7 @@ def test_the_curve_is_the_monotone_cubic(table: tuple[FloatArray, FloatArray]) -
 
 @given(tables())
 def test_monotone_knots_give_a_monotone_table(table: tuple[FloatArray, FloatArray]) -> None:
-    """Each piece between two knots is monotone, whatever the others do."""
+    """Each piece between two knots is monotone, whatever the other pieces do."""
     knots, correction_m = table
     for values in (correction_m, np.sort(correction_m), np.sort(correction_m)[::-1]):
         found = curve(knots, values)

@@ -18,7 +18,7 @@ TILT_RAD, HEADING_RAD, POSITION_M = np.radians(0.003), np.radians(0.006), 0.02
 
 
 def known(built: Made) -> Calibration:
-    """The truth, with a range offset of 20 cm that a scan angle scale beside it takes back at the swath's edges."""
+    """Return the truth with a range offset sigma of 20 cm that a held scan angle scale cancels at the edges."""
     sigmas, held, correlation = np.zeros(len(PARAMETERS)), np.zeros(len(PARAMETERS)), np.eye(len(PARAMETERS))
     offset, scale = INDEX["range_offset_m"], INDEX["scan_angle_scale"]
     sigmas[offset], sigmas[INDEX["kappa_rad"]], held[scale] = 0.2, np.radians(0.01), 3e-4
@@ -57,7 +57,7 @@ def test_expected_point_errors_match_the_scatter_of_drawn_calibrations() -> None
 
 @pytest.mark.parametrize("height_m", [60.0, 800.0])
 def test_the_needed_accuracy_of_an_angle_follows_the_height(height_m: float) -> None:
-    """Half of what points of that flight have wrong anyway, over the distance from which they were measured."""
+    """An angle must be known to half of the points' other errors, divided by the distance of measurement."""
     lines = [Line(0.0, height_m), Line(180.0, height_m)]
     built = made(lines=lines)
     need = of(built)

@@ -129,7 +129,7 @@ def test_tables_start_from_the_existing_ones_and_are_returned() -> None:
 
 
 def test_a_curve_is_returned_at_the_same_knots() -> None:
-    """A calibration goes on from what another one wrote."""
+    """A calibration can continue from what an earlier one wrote."""
     asked = extras()
     done = asked.calibrations(asked.start + np.arange(1, len(asked) + 1) * 1e-3)
     made = flight()
@@ -177,7 +177,7 @@ def test_sigmas_and_correlations_are_returned_to_their_head() -> None:
 
 
 def held_sigma(name: str, options: ParameterOptions, start: Calibration | None = None) -> float:
-    """One sigma of a parameter of ``left`` that is not estimated; 0: it counts as exact."""
+    """Return one sigma of a parameter of ``left`` that is not estimated; 0 means that it counts as exact."""
     starts = flight().starts()
     asked = unknowns(flight(), options, starts if start is None else {**starts, "left": start})
     assert f"left.{name}" not in asked.names
@@ -185,7 +185,7 @@ def held_sigma(name: str, options: ParameterOptions, start: Calibration | None =
 
 
 def test_sigma_of_a_held_parameter_comes_from_user_calibration_or_plausibility() -> None:
-    """Precedence: the user, then an earlier calibration, then what is plausible."""
+    """The user's value comes first, then that of an earlier calibration, then the plausible error."""
     scale, fixed = INDEX["scan_angle_scale"], frozenset(["scan_angle_scale"])
     assert held_sigma("scan_angle_scale", ParameterOptions()) == pytest.approx(3e-4)
     assert held_sigma("scan_angle_scale", ParameterOptions("scanner", fix=fixed)) == pytest.approx(3e-4)

@@ -37,7 +37,7 @@ DEG = float(np.radians(1.0))
 
 @pytest.mark.parametrize("looks", ["ahead", "back"])
 def test_returns_lie_on_the_planes(looks: str) -> None:
-    """With a boresight, an offset and scales: within a micrometre of where they were aimed, within the scan."""
+    """With a boresight, an offset and scales, points lie within a micrometre of their targets and within the scan."""
     values = {
         "omega_rad": 0.3 * DEG, "phi_rad": -0.5 * DEG, "kappa_rad": 0.8 * DEG, "range_offset_m": 0.4,
         "range_scale": 3e-5, "scan_angle_scale": 2e-4, "scan_angle_offset_rad": 0.1 * DEG, "time_offset_s": 2e-3,
@@ -67,7 +67,7 @@ def test_returns_lie_on_the_planes(looks: str) -> None:
 
 @pytest.mark.slow
 def test_sigmas_match_flights_with_simulated_errors() -> None:
-    """60 flights: new trajectory errors, noise on range and angle, one step of the adjustment: χ² of four parameters.
+    """60 flights with new errors of trajectory, range and angle give, after one step, the χ² that four parameters have.
 
     A trajectory taken as white would make these four sigmas several times too small.
     """
@@ -94,7 +94,7 @@ def test_sigmas_match_flights_with_simulated_errors() -> None:
 
 
 def test_a_second_height_separates_time_from_pitch_and_control_fixes_the_range() -> None:
-    """What each design adds."""
+    """A second height separates time from pitch and scale from offset; control points determine the range offset."""
     one, two = flown(ONE_HEIGHT), flown(TWO_HEIGHTS)
     model = ParameterOptions("scanner")
     low = predict(one[0], one[1], model, gauss_markov(one[0]))
@@ -145,7 +145,7 @@ def test_a_single_line_has_planes_only_with_control() -> None:
     ],
 )  # fmt: skip
 def test_cells_hold_several_lines(scan: Scan, speed_mps: float, cell_m: float) -> None:
-    """A swath 400 m wide, with the sizes of cells that a search chooses from."""
+    """The swath is 400 m wide; the cell sizes are those that a search chooses from."""
     per_m2 = scan.rate_hz / (speed_mps * 400.0)
     assert search_cell_m(scan, np.full(9, per_m2), speed_mps) == cell_m
 
@@ -157,7 +157,7 @@ def test_larger_cells_lose_more_of_the_rim_of_a_roof() -> None:
 
 
 def test_encoder_rates_are_derivatives_of_the_scan() -> None:
-    """Rates and accelerations against differences of the motion itself."""
+    """Rates and accelerations are compared with differences of the motion itself."""
     t, h = np.linspace(0.001, 0.011, 7), 1e-6
 
     def sine(at: FloatArray) -> FloatArray:

@@ -51,7 +51,7 @@ def sets(features: Features) -> dict[tuple[str, int], set[int]]:
 
 
 def common(one: Features, other: Features) -> FloatArray:
-    """Of each patch of either, the share of the returns of both that both have."""
+    """Return, for each patch of either, the share of the returns of both that both contain."""
     first, second = sets(one), sets(other)
     empty: set[int] = set()
     return np.array(
@@ -76,7 +76,7 @@ def shifted(flight: Flight, swath: int, by_m: float) -> Flight:
 
 
 def test_unmoved_points_keep_their_planes(flight: Flight, settled: Features) -> None:
-    """All but a patch or two at once; after that, bit for bit."""
+    """All but a patch or two are unchanged at once; after that they are equal bit for bit."""
     again = rematch(flight, settled)
     assert len(again.planes) == len(settled.planes)
     assert np.mean(common(settled, again) == 1.0) > 0.98
@@ -95,7 +95,7 @@ def test_matched_planes_equal_the_planes_found(flight: Flight, settled: Features
 
 
 def test_displaced_planes_are_found_again_after_alignment(cast: Cast, flight: Flight) -> None:
-    """After the first adjustment, planes were found with 0.03° of error in all angles, and points move by 0.4 m."""
+    """The planes were found with 0.03° of error in all angles; after the first adjustment points move by 0.4 m."""
     wrong = moved(cast, omega_rad=5e-4, phi_rad=-5e-4, kappa_rad=1e-3)
     first = find_planes(wrong)
     matched = rematch(flight, first)
@@ -110,7 +110,7 @@ def test_displaced_planes_are_found_again_after_alignment(cast: Cast, flight: Fl
 
 
 def test_a_displaced_swath_is_dropped(flight: Flight, settled: Features) -> None:
-    """Half a metre higher than the other two, which hold the planes."""
+    """It is half a metre higher than the other two, which hold the planes."""
     matched = rematch(shifted(flight, 1, 0.5), settled)
     kept = [plane for plane in matched.planes if {patch.swath for patch in plane.patches} == {0, 2}]
     assert len(kept) > 0.9 * sum({0, 2} <= {patch.swath for patch in plane.patches} for plane in settled.planes)
@@ -159,7 +159,7 @@ def test_other_features_are_passed_on(flight: Flight, settled: Features) -> None
 
 
 def test_a_patch_without_a_plane_is_dropped(flight: Flight) -> None:
-    """Returns all over a swath."""
+    """Its returns are spread over a whole swath."""
     at = np.arange(0, len(flight.swaths[0]), 1000)
     nonsense = Plane("x", np.zeros(3), np.array([0.0, 0.0, 1.0]), (Patch(0, at), Patch(1, at)))
     matched = rematch(flight, Features(planes=(nonsense,)))
@@ -169,7 +169,7 @@ def test_a_patch_without_a_plane_is_dropped(flight: Flight) -> None:
 
 @pytest.mark.parametrize("rows", [16, 60, 190, 240, 1000])
 def test_a_limit_on_returns_shortens_the_largest_patches(rows: int) -> None:
-    """Take as many of each as make the limit: no other number that is the same for all patches comes closer."""
+    """The limit is one number for all patches; a number larger by one would exceed the total."""
     sizes = [[5, 100], [40], [7, 90]]
     planes = [
         Plane(str(at), np.zeros(3), np.array([0.0, 0.0, 1.0]), tuple(Patch(i, np.arange(n)) for i, n in enumerate(own)))

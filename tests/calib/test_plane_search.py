@@ -86,14 +86,14 @@ def made_of(cast: Cast, plane: Plane) -> Int64Array:
 
 
 def true_face(cast: Cast, plane: Plane) -> tuple[int, float]:
-    """The plane of the scene most of its returns lie on, and the least share of a swath's returns that do."""
+    """Return the plane of the scene that most returns lie on, and the least share of a swath's returns that do."""
     shares = np.array([cast.faces(patch.swath, patch.at).mean(axis=0) for patch in plane.patches])
     face = int(np.argmax(shares.mean(axis=0)))
     return face, float(shares[:, face].min())
 
 
 def built_roofs(cast: Cast, features: Features) -> list[tuple[Plane, int, float]]:
-    """Roofs that are roofs of the scene, with their faces; steep banks are planes too."""
+    """Return roofs that are roofs of the scene, with their faces; steep banks are planes too."""
     roofs = [plane for plane in of_kind(features, "roof") if made_of(cast, plane)[ROOF] > 0]
     return [(plane, *true_face(cast, plane)) for plane in roofs]
 
@@ -199,7 +199,7 @@ def test_reasons_for_places_without_a_plane_are_reported(found: Features) -> Non
 
 
 def test_ground_planes_are_spread_over_every_pair_of_swaths(flight: Flight, found: Features) -> None:
-    """In the middle and toward both edges of every swath, with each of the others."""
+    """They lie in the middle and toward both edges of every swath, shared with each of the others."""
     for one in range(3):
         for other in range(3):
             shared = [
@@ -327,7 +327,7 @@ def test_a_wrong_polygon_is_reported(flight: Flight, polygons: list[tuple[str, F
 
 
 def test_planes_of_cells_match_those_of_their_points() -> None:
-    """Against NumPy's eigenvectors and covariances, far from the origin and from height 0."""
+    """NumPy's eigenvectors and covariances are the reference, far from the origin and from height 0."""
     draws = np.random.default_rng(3)
     corner, shape = (3000.0, -7000.0, 2.0), (3, 4)
     points = np.array([3000.0, -7000.0, 800.0]) + draws.uniform(0.0, 1.0, (4000, 3)) * [8.0, 6.0, 0.3]
@@ -348,7 +348,10 @@ def test_planes_of_cells_match_those_of_their_points() -> None:
 
 
 def _grown_over(slope_rad: float, sigma_m: float, limit_rad: float) -> NDArray[np.int32]:
-    """(40, 40) number of the plane of each cell of 1.5 m with six returns, on a slope up to the east, of noise."""
+    """Return (40, 40) the number of each cell's plane, on a noisy slope up to the east.
+
+    Cells are 1.5 m wide and hold six returns.
+    """
     draws, corner, shape, count = np.random.default_rng(8), (0.0, 0.0, 1.5), (40, 40), 1600
     points = draws.uniform(0.0, 60.0, (6 * count, 3))
     points[:, 2] = np.tan(slope_rad) * points[:, 0] + sigma_m * draws.standard_normal(6 * count)
@@ -366,7 +369,7 @@ def _grown_over(slope_rad: float, sigma_m: float, limit_rad: float) -> NDArray[n
 
 
 def test_sloping_ground_ends_at_tile_borders() -> None:
-    """A cell of it may look steeper than ground is, and what began there went on over all the ground of a swath."""
+    """A cell of sloping ground may look steeper than ground is; a plane begun there once grew over a whole swath."""
     label = _grown_over(np.radians(7.0), 0.04, np.radians(10.0))
     tile = np.add.outer(4 * (np.arange(40) // 10), np.arange(40) // 10)
     for plane in np.unique(label[label >= 0]):

@@ -100,7 +100,7 @@ HIGH: tuple[Line, ...] = ((-900, 0, 900, 0, 3450), (900, 500, -900, 500, 3450), 
 def test_strips_of_any_height_become_good_enough_for_planes(
     lines: tuple[Line, ...], half_angle_deg: float, prf_hz: float, speed_mps: float, size_m: float, houses: int
 ) -> None:
-    """Two degrees off; then what is left moves no point of the swath's edge by more than a plane may be displaced."""
+    """The boresight is two degrees off; the rest moves the swath's edge by less than a plane may be displaced."""
     half_angle_rad = float(np.radians(half_angle_deg))
     low = cast_flight(
         YARD.format(size=size_m, houses=houses),
@@ -156,7 +156,7 @@ def test_two_heads_are_aligned_together(cast: Cast) -> None:
 
 
 def test_control_determines_the_height(cast: Cast) -> None:
-    """The true ground, 5 m of range off; one line flown twice shows no height, control does."""
+    """The range is off by 5 m; one line flown twice shows no height, but points of the true ground do."""
     flight = replace(cast.flight, swaths=cast.flight.swaths[:2])
     bare = np.isin(cast.surface[0], (1, 4)) & (np.abs(cast.true_t[0][:, 1]) < 40.0)
     control = cast.true_t[0][np.flatnonzero(bare)[:: int(bare.sum()) // 12]]
@@ -193,7 +193,7 @@ def test_missing_points_are_reported(cast: Cast) -> None:
 
 
 def test_a_wrong_installation_is_reported(cast: Cast) -> None:
-    """Ten degrees are no error of a mounting."""
+    """Ten degrees cannot be an error of the mounting."""
     with pytest.raises(
         PrealignError, match=r"left: \w+ moved .*° from its initial value; check the installation matrix"
     ):
@@ -201,7 +201,7 @@ def test_a_wrong_installation_is_reported(cast: Cast) -> None:
 
 
 def test_a_moved_surface_equals_the_surface_of_moved_points() -> None:
-    """Against the same surface made of points that were moved: up, aside and tilted."""
+    """The same surface is made of points that were moved up, aside and tilted."""
     draws = np.random.default_rng(1)
     place = draws.uniform(0.0, 200.0, (60_000, 2))
 
@@ -221,7 +221,7 @@ def test_a_moved_surface_equals_the_surface_of_moved_points() -> None:
 
 
 def test_oscillating_steps_are_halved() -> None:
-    """A fine level with few edges: x → −0.9 x for ever with whole steps; at rest within five with damped ones."""
+    """On a fine level with few edges whole steps give x → −0.9 x for ever; damped ones come to rest within five."""
     away, share, last = np.array([[0.0, 0.0, 1e-3, 0.0]]), 1.0, np.zeros((1, 4))
     for _ in range(5):
         step = -1.95 * share * away

@@ -90,7 +90,7 @@ def test_verdict_names_undetermined_parameters(report: ReportInput) -> None:
 def test_a_correlated_pair_is_a_reason_unless_points_are_accurate_enough(
     report: ReportInput, left_m: float, level: Level
 ) -> None:
-    """Count what a calibration leaves in points, which holds the correlation: where it is little, the sum suffices."""
+    """The error left in points includes the correlation, so if it is small, the correlation does not matter."""
     correlation = np.eye(len(report.adjusted.names))
     correlation[0, 1] = correlation[1, 0] = 0.97
     need = Need(0.05, {}, 0.1, {"left": left_m})
@@ -103,7 +103,7 @@ def test_a_correlated_pair_is_a_reason_unless_points_are_accurate_enough(
 def test_a_held_angle_makes_the_boresight_calibration_incomplete(
     report: ReportInput, sigma_deg: float, level: Level
 ) -> None:
-    """At the user's word too; how well it is known decides how bad that is, and stands among the sigmas."""
+    """This holds for the user's choice too; the held angle's plausible error decides the level and is listed."""
     held = (FixedParameter("left", "kappa_rad", "held by your choice"),)
     considered = (Considered("left", "kappa_rad", 0.0, math.radians(sigma_deg)),)
     verdict = judge(sound(report, held=held, considered=considered))
@@ -140,7 +140,7 @@ def test_a_contradiction_between_flight_and_held_parameter_is_a_reason(report: R
 
 
 def test_the_verdict_follows_the_requirements(report: ReportInput) -> None:
-    """An angle and the points against what the user wants of them."""
+    """An angle and the points are compared with the user's requirements."""
     need = Need(0.05, {"kappa_rad": math.radians(0.001)}, 0.1, {"left": 0.04})
     (reason,) = judge(replace(sound(report), need=need)).reasons
     assert reason.what == "boresight κ (heading) is known to 0.0014° only, where 0.0010° is required"
@@ -163,7 +163,7 @@ def test_the_verdict_follows_the_requirements(report: ReportInput) -> None:
     ],
 )
 def test_contradicting_profiles_are_a_reason(report: ReportInput, sigmas: float, level: Level) -> None:
-    """Vary by how many sigmas of the difference eight pairs are off together, to either side."""
+    """Eight pairs differ together by this many sigmas of the difference, to either side."""
     sigma = 2.0**-16
     one = Comparison("left", "omega_rad", 8, sigmas * sigma, sigma, 0.0, sigma, sigma)
     fine = replace(one, parameter="phi_rad", told=0.25, adjusted=0.25)
@@ -236,7 +236,7 @@ def test_trajectory_corrections_beyond_their_sigmas_are_a_reason(report: ReportI
 
 
 class Seen(HTMLParser):
-    """What a page refers to, and the words it shows."""
+    """Parser that collects the addresses that a page refers to, and the words that it shows."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -306,7 +306,7 @@ def test_the_page_has_all_its_parts(page: str) -> None:
 
 
 def test_the_same_input_gives_the_same_picture(report: ReportInput) -> None:
-    """Shaded columns are an image within the picture: they too."""
+    """This includes the shaded columns, which are an image inside the picture."""
     first, second = residual_picture(report), residual_picture(report)
     assert first is not None
     assert second is not None
@@ -351,7 +351,7 @@ def test_undetermined_parameters_are_shown_with_their_remedy(report: ReportInput
 
 
 def test_residuals_are_shown_by_possible_causes(report: ReportInput) -> None:
-    """Outliers are left out; strip 04 stands 6 mm higher, as it was made."""
+    """Outliers are left out; strip 04 is 6 mm higher, as it was made."""
     seen = seen_of(report)
     kept = sum(int((one.weight > 0).sum()) for one in report.adjusted.residuals if one.group != "control")
     assert len(seen.misclosure_m) == kept
@@ -375,7 +375,7 @@ def test_planes_are_coloured_by_the_means_of_their_strips(report: ReportInput) -
 
 
 def test_sections_show_one_roof_after_calibration(report: ReportInput) -> None:
-    """Before, strips stand metres apart; after, all lie on the roof's slope."""
+    """Before calibration strips are metres apart; afterwards all lie on the roof's slope."""
     cuts = cuts_of(report)
     assert len(cuts) == 3
 
@@ -397,7 +397,7 @@ def bare_of(report: ReportInput, **more: Any) -> ReportInput:
 
 
 def test_a_report_with_little_input_is_complete_and_reproducible(report: ReportInput) -> None:
-    """What is there is shown, the words of others as words; and the same each time."""
+    """Only what exists is shown, the user's words are escaped, and the page is the same each time."""
     bare = bare_of(report, title="<b>A & B</b>", notes=["<script>x</script>"])
     text = html(bare)
     assert text == html(bare)
@@ -410,7 +410,7 @@ def test_a_report_with_little_input_is_complete_and_reproducible(report: ReportI
 
 
 def test_two_scanners_have_separate_tables(report: ReportInput) -> None:
-    """Each has a table, and words say whose a parameter is."""
+    """Each scanner has its table, and sentences name the scanner of a parameter."""
     adjusted = report.adjusted
     right = replace(adjusted.calibrations["left"], scanner="right")
     both: Adjusted = replace(
@@ -435,7 +435,7 @@ def test_two_scanners_have_separate_tables(report: ReportInput) -> None:
 
 
 def test_the_pdf_is_the_same_bytes_each_time(report: ReportInput) -> None:
-    """Its fonts too, which are cut to the characters in use and could hold the time."""
+    """This includes the fonts, which are cut to the characters in use and could contain the time."""
     bare = bare_of(report, notes=["$100 & <b>"])
     file = pdf(bare)
     time.sleep(1.1)
@@ -444,7 +444,7 @@ def test_the_pdf_is_the_same_bytes_each_time(report: ReportInput) -> None:
 
 
 def inflated(file: bytes) -> bytes:
-    """A PDF's compressed streams, most objects among them, one after the other."""
+    """Return a PDF's compressed streams, which contain most objects, one after the other."""
     return b"\n".join(map(zlib.decompress, re.findall(rb"stream\n(.*?)\nendstream", file, re.DOTALL)))
 
 

@@ -142,7 +142,7 @@ def test_a_grid_in_t_is_turned_onto_the_map(report: ReportInput) -> None:
 
 
 def test_the_colour_of_a_plane_is_the_class_of_its_mean(report: ReportInput) -> None:
-    """Required are 1.5 cm: limits at 0.75, 1.5 and 3 cm; strip 3 is 6 mm off, single returns scatter by 2 cm."""
+    """1.5 cm are required, so limits are 0.75, 1.5 and 3 cm; strip 3 is 6 mm off, single returns scatter by 2 cm."""
     axes = maps_of(drawn(map_picture(report)))[0]
     counts = dict.fromkeys(PLANE_COLOURS, 0)
     for line in axes.lines:

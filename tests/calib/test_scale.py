@@ -16,7 +16,7 @@ HIGHEST = Scale(3000.0, 2500.0, 3.0)
 
 
 def test_height_width_and_spacing_match_the_plan() -> None:
-    """60 m above flat ground with a scan of ±15°: 32.2 m across, 4,000 pulses a second at 10 m/s over that width."""
+    """A scan of ±15° at 60 m is 32.2 m wide; 4,000 pulses a second are spread over that width at 10 m/s."""
     half_rad = np.radians(15.0)
     lines = ((-70, 0, 70, 0, 510), (70, 0, -70, 0, 510))
     made = cast_flight("height_m = 450.0", lines, prf_hz=4_000.0, half_angle_rad=half_rad, speed_mps=10.0)
@@ -35,7 +35,7 @@ def test_spacing_matches_the_points_at_any_size(side_m: float) -> None:
 
 
 def test_spacing_of_a_diagonal_swath_is_not_that_of_its_bounding_box() -> None:
-    """A strip of 10 m by 2 km to the north-east."""
+    """The strip is 10 m wide and runs 2 km to the north-east."""
     along, across = np.random.default_rng(4).uniform([0.0, 0.0], [2000.0, 10.0], (40_000, 2)).T
     points = np.stack([along - across, along + across, 0.0 * along], axis=1) / np.sqrt(2.0)
     assert spacing_m(swath_of(points)) == pytest.approx(np.sqrt(2000.0 * 10.0 / 40_000), rel=0.2)  # its box: 70 times

@@ -32,7 +32,7 @@ def clean() -> tuple[Flight, Features]:
 
 
 def spoilt(flight: Flight, strip: int, along: FloatArray, knot_s: float = 1.0) -> Flight:
-    """A strip whose trajectory lacks errors (k, 6) that lie evenly along it."""
+    """Return the flight with errors (k, 6), spread evenly along one strip, missing from its trajectory."""
     knots = knots_of(flight, knot_s)
     at = np.flatnonzero(knots.strip == strip)
     errors = np.zeros((len(knots), 6))
@@ -47,7 +47,7 @@ def adjusted(flight: Flight, features: Features, **settings: Any) -> StripAdjust
 
 
 def off_planes(flight: Flight, features: Features, strip: int) -> float:
-    """Rms distance of a strip's returns from where the planes truly are."""
+    """Return the RMS distance, m, of a strip's returns from the true planes."""
     found = []
     for plane in features.planes:
         for patch in plane.patches:
@@ -78,7 +78,7 @@ def test_a_sound_flight_gets_no_corrections(clean: tuple[Flight, Features]) -> N
 
 
 def test_a_shift_and_a_drift_are_found_in_their_strips(clean: tuple[Flight, Features]) -> None:
-    """A strip 15 cm too high and 10 cm beside, another whose roll drifts: both corrected, no other moved."""
+    """One strip is 15 cm too high and 10 cm aside, another's roll drifts; both are corrected and no other moves."""
     flight, features = clean
     shifted = np.tile([0.05, -0.1, 0.15, 0.0, 0.0, 0.0], (2, 1))
     drifting = np.array([[0.0, 0.0, 0.0, -TURN, 0.0, 0.0], [0.0, 0.0, 0.0, TURN, 0.0, 0.0]])
@@ -112,7 +112,7 @@ def test_a_shift_and_a_drift_are_found_in_their_strips(clean: tuple[Flight, Feat
 
 
 def test_a_bend_needs_a_spline_with_knots(clean: tuple[Flight, Features]) -> None:
-    """A height that swells by 12 cm in the middle of a strip."""
+    """A strip's height rises by 12 cm in its middle."""
     flight, features = clean
     swell = np.zeros((9, 6))
     swell[:, 2] = 0.12 * np.sin(np.linspace(0.0, np.pi, 9)) ** 2
@@ -146,7 +146,7 @@ def test_only_the_displaced_strips_are_corrected(clean: tuple[Flight, Features],
 
 
 def test_a_common_shift_is_found_only_with_control(clean: tuple[Flight, Features]) -> None:
-    """All strips 12 cm too high: nothing without control; with it, within a centimetre."""
+    """All strips are 12 cm too high; nothing is found without control, and it is right within a centimetre with it."""
     flight, features = clean
     low = flight
     for strip in range(1, 7):
@@ -167,7 +167,7 @@ def test_a_common_shift_is_found_only_with_control(clean: tuple[Flight, Features
 def test_poorly_determined_corrections_are_not_applied(
     clean: tuple[Flight, Features], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Level ground, and three returns of a roof: their noise would move the strip in plan, where nothing is wrong."""
+    """With level ground and three returns of a roof, noise would move the strip sideways, where nothing is wrong."""
     flight, features = clean
     seen = [plane for plane in features.planes if 3 in [flight.swaths[patch.swath].strip for patch in plane.patches]]
     roof = next(plane for plane in seen if plane.normal_t[2] < 0.99)
@@ -206,9 +206,9 @@ def turned(components: FloatArray, course_deg: float) -> FloatArray:
 
 
 def test_a_strip_beside_the_others_is_not_corrected_and_moves_none(clean: tuple[Flight, Features]) -> None:
-    """Strip 6 has no plane in common with others; strip 7 overlaps them at its edge only, where it is 30 cm too high.
+    """Strip 6 shares no plane with others; strip 7 overlaps them only at its edge, where it is 30 cm too high.
 
-    What the edge shows is height and roll together. Neither may be guessed, and no other strip may follow it.
+    The edge shows height and roll together. Neither may be guessed, and no other strip may follow it.
     """
     flight, features = flown((*ONE_HEIGHT, (0.0, 800.0, 700.0)))
     features = seen_by_few(flight, features, 6)
@@ -238,7 +238,7 @@ def test_a_strip_beside_the_others_is_not_corrected_and_moves_none(clean: tuple[
 @pytest.mark.slow
 @pytest.mark.parametrize("scale", [1.0, 0.25])
 def test_corrected_heights_are_no_worse_and_sigmas_honest(scale: float) -> None:
-    """Forty flights whose strips 3, 5, 6 and 7 err in all six components, by the prior's sigmas or by a quarter."""
+    """Strips 3, 5, 6 and 7 of forty flights err in all six components, by the prior's sigmas or a quarter of them."""
     flight, features = flown((*ONE_HEIGHT, (0.0, 800.0, 700.0)))
     features, courses = seen_by_few(flight, features, 6), (0.0, 180.0, 0.0, 0.0, 90.0, 270.0, 0.0)
     rng = np.random.default_rng(11)

@@ -92,13 +92,12 @@ TRUE = {"omega_deg": 0.25, "phi_deg": -0.4, "kappa_deg": 0.6, "range_offset_m": 
 @dataclass(frozen=True, eq=False)
 class Made:
     """Flight with its truth.
-
     Attributes:
-        flight: as read, with nominal calibration, on the true trajectory (its sigmas say what the INS's do).
+        flight: as read, with nominal calibration, on the true trajectory with the INS's sigmas.
         truth: the true calibration.
-        trajectory: the true one.
+        trajectory: the true trajectory.
         flown: the log and the files beside it: ``flown.folder / "truth.npz"``, ``control.csv``.
-        plan: its text.
+        plan: the plan's text.
     """
 
     flight: Flight

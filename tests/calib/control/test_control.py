@@ -23,13 +23,13 @@ def unknown(position_e: FloatArray) -> None:
 
 
 def rolling(east: FloatArray, north: FloatArray) -> FloatArray:
-    """Ground with slopes of every aspect, up to 12 %."""
+    """Return heights, m, of ground with slopes of every aspect, up to 12 %."""
     up: FloatArray = 500.0 + 1.2 * np.sin(east / 10.0) + 1.0 * np.cos(north / 9.0)
     return up
 
 
 def surveyed(flight_height: FloatArray, shift: FloatArray, count: int = 12) -> list[ControlPoint]:
-    """Points on the rolling ground, said to be somewhere else by a shift (3,)."""
+    """Return points on the rolling ground whose stated coordinates are displaced by a shift (3,), m."""
     draws = np.random.default_rng(3)
     places = draws.uniform(-50.0, 50.0, (count, 2))
     up = rolling(*places.T) + flight_height
@@ -91,7 +91,7 @@ def test_returns_off_the_ground_are_dropped_and_the_other_indices_are_right() ->
 
 
 def tilted(slope: float, roughness_m: float) -> Flight:
-    """One swath on a slope to the north."""
+    """Return a flight with one swath over a slope to the north."""
     return surface_flight([lambda east, north: slope * north], noise_m=roughness_m, half_m=6.0)
 
 
@@ -208,7 +208,7 @@ def test_another_datum_is_recognised_from_slopes() -> None:
 
 
 def test_disagreeing_swaths_give_no_datum_warning() -> None:
-    """What a boresight that is wrong does: each swath beside its place, and their middle too."""
+    """A wrong boresight displaces each swath, and their mean too, so this is no sign of a wrong datum."""
     points = surveyed(np.zeros(1), np.zeros(3), count=30)
     beside = surface_flight(
         [lambda east, north: rolling(east + 2.5, north + 2.5), lambda east, north: rolling(east - 0.7, north - 0.7)]

@@ -45,7 +45,7 @@ ANGLES = dict.fromkeys(("omega_rad", "phi_rad", "kappa_rad"), ARC)
 
 
 def planes(roofs: bool) -> list[tuple[FloatArray, FloatArray]]:
-    """25 of them, 125 m apart: centre and normal, north, east, down; of roofs every fifth is flat."""
+    """Return 25 planes, 125 m apart: centre and normal, north, east, down; of roofs every fifth is flat."""
     made = []
     for index, (north, east) in enumerate((n, e) for n in np.linspace(-250, 250, 5) for e in np.linspace(-250, 250, 5)):
         azimuth, slope = index % 4 * np.pi / 2 + 0.3, np.radians(35.0 if roofs and index % 5 else 0.0)
@@ -56,7 +56,7 @@ def planes(roofs: bool) -> list[tuple[FloatArray, FloatArray]]:
 
 @cache
 def design(name: str, roofs: bool) -> tuple[FloatArray, FloatArray, Int64Array, FloatArray]:
-    """Rows of all returns that hit: normal · columns (n, 16), variance (n,), plane (n,), place on it (n, 3)."""
+    """Return rows of all returns that hit: normal · columns (n, 16), variance (n,), plane (n,), place on it (n, 3)."""
     rng = np.random.default_rng(3)
     targets, poses, normals, plane_of, places = [], [], [], [], []
     for index, (centre, normal) in enumerate(planes(roofs)):
@@ -78,7 +78,10 @@ def design(name: str, roofs: bool) -> tuple[FloatArray, FloatArray, Int64Array, 
 
 
 def aimed(targets: FloatArray, poses: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Where on its line the body was when its beam met the target, (n,) range and angle: Newton on three equations."""
+    """Return position and rotation of the body when its beam met the target, range and angle, (n, …) each.
+
+    Newton's method solves the three equations.
+    """
     heading, height, offset, roll, pitch = poses.T
     rot = rot_l_from_b(roll, pitch, heading)
     along = np.stack([np.cos(heading), np.sin(heading), 0 * heading], axis=1)
@@ -101,7 +104,7 @@ def aimed(targets: FloatArray, poses: FloatArray) -> tuple[FloatArray, FloatArra
 def rows(
     position: FloatArray, rot: FloatArray, range_m: FloatArray, angle: FloatArray, normals: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Georef's columns of shots in a flat local frame, each between two epochs of its own."""
+    """Return georef's columns of shots in a flat local frame, each between two epochs of its own."""
     count, rot_e_l = len(angle), rot_e_from_l(np.radians(47.0), np.radians(9.0))
     origin = e_from_geodetic(np.radians(47.0), np.radians(9.0), 0.0)
     shot_ns = BEGIN + np.arange(count) * SECOND
@@ -131,7 +134,7 @@ def rows(
 
 
 def reduced(name: str, roofs: bool, names: tuple[str, ...]) -> FloatArray:
-    """The normal matrix of some parameters with all planes eliminated (FORMULAS 6.4)."""
+    """Return the normal matrix of some parameters with all planes eliminated (FORMULAS 6.4)."""
     columns, variance, plane_of, places = design(name, roofs)
     chosen = columns[:, [INDEX[parameter] for parameter in names]] / np.sqrt(variance)[:, None]
     places = places / np.sqrt(variance)[:, None]
@@ -190,7 +193,7 @@ def test_printed_table_of_designs_is_reproduced(
     correlations: dict[tuple[str, str], float],
     held: set[str],
 ) -> None:
-    """Printed sigmas and correlations to their last digit, from georef's Jacobian; and which parameters are held."""
+    """The sigmas and correlations agree to their last printed digit, with georef's Jacobian."""
     names = (*BASIC, *added)
     normal = reduced(lines, roofs, names)
     told = held_by(normal, [f"left.{name}" for name in names])
@@ -214,7 +217,7 @@ def held_of(lines: str, roofs: bool, *added: str) -> dict[str, FixedParameter]:
 
 
 def test_opposite_lines_over_flat_ground_do_not_determine_the_range_offset() -> None:
-    """In plain words, with the control that would. A poor sigma of an angle is no reason to hold it."""
+    """The reason is given in plain words with the control that would help; an angle's poor sigma does not hold it."""
     held = held_of("opposite", False)
     assert set(held) == {"range_offset_m"}
     assert held["range_offset_m"].why.startswith(
@@ -239,7 +242,10 @@ def test_inseparable_parameters_are_reported_with_their_remedy() -> None:
 
 
 def test_the_whole_model_determines_the_boresight() -> None:
-    """All sixteen at once, of two heights: rank defects and all; what looks alike shares what is plausible of it."""
+    """All sixteen parameters are judged at once, over two heights.
+
+    Rank defects are held, and parameters that look alike share the plausible error.
+    """
     names = tuple(parameter.name for parameter in PARAMETERS)
     normal = reduced("two heights", True, names)
     found, weak = decide(normal, [f"a.{name}" for name in names])
@@ -257,13 +263,13 @@ def test_the_whole_model_determines_the_boresight() -> None:
 
 
 def information(covariance: FloatArray, names: list[str]) -> FloatArray:
-    """Normal matrix of a covariance given in plausible sigmas."""
+    """Return the normal matrix of a covariance given in units of plausible sigmas."""
     plausible = np.array([RULES[kind_of(name)].plausible for name in names])
     return np.asarray(np.linalg.inv(covariance * np.outer(plausible, plausible)), dtype=np.float64)
 
 
 def test_a_parameter_with_a_prior_is_not_held() -> None:
-    """Decide on a lever arm that the flight does not determine: with a prior it is estimated, without one held."""
+    """The flight does not determine the lever arm: with a prior it is estimated, without one it is held."""
     names = ["left.phi_rad", "left.lever_arm_x_m"]
     normal = information(np.diag([1e-4, 1e4]), names)
     assert [held.name for held in held_by(normal, names)] == ["lever_arm_x_m"]
@@ -297,7 +303,7 @@ def test_parameters_without_any_information_are_reported() -> None:
 
 
 def test_limits_of_plausibility_are_given_by_the_caller() -> None:
-    """A start that is plausible to half as much: the same matrix is decided otherwise."""
+    """The same matrix is decided differently if the plausible error of the start is halved."""
     names = ["left.omega_rad", "left.phi_rad"]
     normal = information(np.array([[4.0, 0.0], [0.0, 0.1]]), names)
     assert held_by(normal, names) == ()
@@ -306,7 +312,7 @@ def test_limits_of_plausibility_are_given_by_the_caller() -> None:
 
 
 def test_partly_determined_parameters_are_estimated_with_their_start_as_observation() -> None:
-    """Held, the one would leave what is plausible of it in the other."""
+    """Held, one of them would transfer its plausible error to the other."""
     names = ["left.range_offset_m", "left.scan_angle_scale"]
     alike = np.array([[1.0, 0.999], [0.999, 1.0]])
     held, weak = decide(information(25.0 * alike, names), names)
@@ -316,7 +322,7 @@ def test_partly_determined_parameters_are_estimated_with_their_start_as_observat
 
 
 def test_heads_with_a_common_trajectory_keep_their_own_parameters() -> None:
-    """Decide on two offsets known to 1 mm relative to each other and to 1 cm absolutely (correlation 0.995)."""
+    """The two offsets are known to 1 mm relative to each other and to 1 cm absolutely (correlation 0.995)."""
     names = ("left.range_offset_m", "right.range_offset_m")
     normal: FloatArray = np.linalg.inv(1e-4 * np.array([[1.0, 0.995], [0.995, 1.0]])).astype(np.float64)
     assert held_by(normal, names) == ()

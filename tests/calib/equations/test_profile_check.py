@@ -88,7 +88,7 @@ def profile_of(flight: Flight, kind: str) -> Profile:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_each_parameter_moves_a_profile_as_predicted(flight: Flight, prior: TrajectoryPrior, kind: str) -> None:
-    """Foretold, and seen with the parameter or the trajectory really changed."""
+    """The prediction is compared with the effect of really changing the parameter or the trajectory."""
     profile = profile_of(flight, kind)
     told = influence(flight, profile, flight.starts(), prior, NAMES)
     assert told.by_parameter[PARAMETER[kind]] == pytest.approx(1.0, abs=0.02)

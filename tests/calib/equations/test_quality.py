@@ -33,7 +33,7 @@ def test_limits_match_the_printed_values() -> None:
 
 
 def test_huber_weight_matches_the_printed_value() -> None:
-    """Four times six steps with weights of the last solution; a blunder of 0.6 m gets 0.185."""
+    """After four rounds of six steps, with weights of the last solution, a blunder of 0.6 m gets 0.185."""
     flight, features = printed().with_blunder().flight()
     block = Block.of(flight, features, unknowns(flight, ParameterOptions()), None, None)
     done = solved(block, Settings(huber=HUBER, family=0.0, rounds=0, tolerance=1e-3), block.start())
@@ -86,7 +86,7 @@ def test_redundancy_matches_the_dense_solution() -> None:
 
 
 def sharing(rows: Rows, state: State) -> tuple[Int64Array, FloatArray, FloatArray]:
-    """(n,) of the rows: their run, M, and the variance c of what they have in common with it."""
+    """Return (n,) of each row its run, the variance M and the variance c that its run has in common, m²."""
     run_of, variance, common, count = [], [], [], 0
     for batch, looks in rows.looks(state):
         begin = 0
@@ -105,7 +105,7 @@ def sharing(rows: Rows, state: State) -> tuple[Int64Array, FloatArray, FloatArra
 
 
 def test_redundancy_of_correlated_rows_matches_the_dense_solution() -> None:
-    """What residuals are expected to be, (I − H) V (I − H)ᵀ with V of noise and of what a run's rows have in common."""
+    """The expected covariance of residuals is (I − H) V (I − H)ᵀ, with V of noise and of the runs' common errors."""
     built = made(lines=LINES[:4], points=25)
     prior = gauss_markov(built.flight, Taus(), 5.0)
     prior = replace(prior, walk_rad2=np.full(len(prior), (6e-5) ** 2))
@@ -141,7 +141,7 @@ def test_redundancy_of_correlated_rows_matches_the_dense_solution() -> None:
 
 
 def test_variance_factor_of_correlated_rows_is_one() -> None:
-    """A common error is added to each run of returns, as large as the prior states."""
+    """Each run of returns gets a common error as large as the prior states."""
     built, factors, rejected = made(lines=LINES[:4], points=25), [], 0
     prior = gauss_markov(built.flight, Taus(), 5.0)
     prior = replace(prior, walk_rad2=np.full(len(prior), (8e-5) ** 2))
@@ -165,7 +165,7 @@ def test_variance_factor_of_correlated_rows_is_one() -> None:
 
 
 def test_variance_components_show_which_group_is_worse() -> None:
-    """Points at 5 cm that say 1 cm."""
+    """The control points scatter by 5 cm but state 1 cm."""
     built = made()
     prior = gauss_markov(built.flight, Taus(), 4.0)
     features, g = controlled(built), np.random.default_rng(3)
@@ -196,7 +196,7 @@ def test_unusable_returns_are_not_counted() -> None:
 
 
 def test_errors_of_the_minimal_detectable_size_are_found_as_often_as_stated() -> None:
-    """With 0.8 probability at |w| > 3.29: errors of that size in one range each."""
+    """Errors of that size are found with a probability of 0.8 at |w| > 3.29, with one error in each range in turn."""
     built = made(lines=LINES[:4])
     prior = gauss_markov(built.flight, Taus(), 4.0)
     found = adjust(built.flight, built.features, ParameterOptions(), prior, PLAIN)

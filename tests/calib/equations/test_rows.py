@@ -48,7 +48,7 @@ EVERYTHING = ParameterOptions("full", free=frozenset(["scan_angle_offset_rad"]))
 
 
 def line_flight() -> tuple[Flight, tuple[Plane, ...], Calibration]:
-    """Two lines over five planes, with every parameter set."""
+    """Return two lines over five planes, with every parameter set."""
     built = made(lines=LINES[:2], points=3, truth={}, noise=0.0)
     start = built.truth.changed(**VALUES)
     g = np.random.default_rng(1)
@@ -211,9 +211,10 @@ def test_columns_of_the_trajectory_match_differences_of_the_model() -> None:
 
 
 def test_attitude_error_between_knots_is_common_to_a_run() -> None:
-    """Rows of a run count like their mean: of the variance M / n + c, c that of a bridge between the run's knots.
+    """The rows of a run count like their mean, with the variance M / n + c.
 
-    n is as many as the rows that are taken stand for: some are not taken, the others stand for four.
+    c is the variance of a bridge between the run's knots; n is the number of rows that the selected rows stand for:
+    some are left out, and the others stand for four each.
     """
     flight, planes, _ = line_flight()
     flight = replace(flight, swaths=flight.swaths[:1])
@@ -248,7 +249,7 @@ def test_attitude_error_between_knots_is_common_to_a_run() -> None:
 
 
 def looks_of(flight: Flight, planes: tuple[Plane, ...], options: ParameterOptions) -> tuple[FloatArray, FloatArray]:
-    """Columns (n, u) of the parameters and of the plane's turns, and f (n,), of one swath's returns on one plane."""
+    """Return columns (n, u) of the parameters and the plane's turns, and f (n,), of a swath's returns on one plane."""
     seen = Rows(flight, planes, unknowns(flight, options), None)
     ((batch, looks),) = seen.looks(seen.start())
     (run,) = batch.runs
@@ -261,7 +262,7 @@ def looks_of(flight: Flight, planes: tuple[Plane, ...], options: ParameterOption
     [("range_m", RANGES_ONLY, 1.2, 2e-6), ("encoder_rad", Noise(1e-9, 4e-4, 0.0, 0.0), 1e-3, 2e-4)],
 )
 def test_rows_use_the_adjusted_observations(name: str, noise: Noise, errors: float, tolerance: float) -> None:
-    """Adjust ranges, or angles, where only these err: they are the true ones then, and so are all coefficients."""
+    """Where only ranges or only angles err, the adjusted ones are the true ones, and so are all coefficients."""
     normal = np.array([0.5, -0.3, 0.81])
     planes = [(np.array([150.0, 0.0, 400.0]), normal / np.linalg.norm(normal))]
     still = trajectory(LINES[:1])

@@ -90,7 +90,7 @@ def batch(run: FilterRun) -> FloatArray:
 
 
 def test_the_chain_equals_least_squares_in_one_piece() -> None:
-    """All pairs of nodes of a short flight, 27 errors estimated, within 1e-8 of their sigmas."""
+    """All pairs of nodes of a short flight, with 27 errors estimated, agree to 1e-8 of their sigmas."""
     run = navigated(fly(survey(line_s=8.0), 24.0, 50.0), 1)
     [block], whole = run.nodes, batch(run)
     chain = error_chain(run, block.time_ns)
@@ -117,9 +117,10 @@ def test_the_chain_equals_least_squares_in_one_piece() -> None:
 
 
 def test_errors_of_navigated_flights_are_correlated_as_the_chain_states() -> None:
-    """80 flights with other noise: χ² of 24 joint errors at four moments, far apart and close; and their differences.
+    """80 flights differ in their noise: χ² is computed of 24 joint errors at four moments and of their differences.
 
-    A joint covariance without the correlations would give a χ² several times too small or large.
+    The moments are far apart and close. A joint covariance without the correlations would give a χ² several times too
+    small or too large.
     """
     truth = fly(survey(line_s=15.0), 45.0, 50.0)
     joint: list[float] = []
@@ -153,7 +154,7 @@ def off(truth: Truth, time_ns: Int64Array, state: FloatArray) -> FloatArray:
 
 
 def test_the_prior_of_a_smoothed_run_has_its_strips_and_is_positive() -> None:
-    """Knots at the run's nodes, each in its strip; a run that ends before the last strip is refused."""
+    """Knots are at the run's nodes, each in its strip; a run that ends before the last strip is refused."""
     truth = fly(survey(line_s=15.0), 45.0, 50.0)
     run = navigated(truth, 7)
     chain = error_chain(run, smooth_nodes(run).time_ns)
@@ -177,7 +178,7 @@ def test_the_prior_of_a_smoothed_run_has_its_strips_and_is_positive() -> None:
 
 
 def walk_is_that_of_the_nodes_between(prior: TrajectoryPrior, chain: ErrorChain) -> None:
-    """A turn half way less the mean of those at both knots: a quarter of the walk's variance, as a bridge has it."""
+    """Check that a turn half-way, minus the mean at both knots, has a bridge's variance: a quarter of the walk's."""
     seen = []
     for knot in np.flatnonzero((np.diff(prior.strip) == 0) & (np.diff(prior.time_ns) > 0.8 * SECOND)):
         ends = prior.time_ns[knot : knot + 2]
@@ -215,7 +216,7 @@ def level_path(seconds: float, begin: int = BEGIN, heading_deg: float = 30.0, si
 
 
 def made(strips: Sequence[tuple[int, int, float, float]], paths: list[Trajectory], begin: int = BEGIN) -> Flight:
-    """Strips (trajectory, number, begin, end), two returns each."""
+    """Return a flight with strips (trajectory, number, begin, end), s, of two returns each."""
     head = Head("left", nominal("left", [0, 0, 0], np.eye(3)), LineGeometry())
     swaths = tuple(
         Swath(
@@ -233,7 +234,7 @@ def made(strips: Sequence[tuple[int, int, float, float]], paths: list[Trajectory
 
 
 def test_a_covariance_made_negative_by_rounding_has_an_inverse() -> None:
-    """Break correlations of 1 by 4 %, as a heading's that was known to degrees before it was to thousandths."""
+    """Correlations of 1 are changed by 4 %, as for a heading known to degrees before it was known to thousandths."""
     built = made([(0, 1, 5.0, 15.0)], [level_path(50, begin=int(ns(0.0)))], begin=int(ns(0.0)))
     sound = gauss_markov(built, Taus(heading_s=1e5), 1.0)
     joint = sound.covariance.reshape(len(sound), 6, len(sound), 6).copy()
@@ -253,7 +254,7 @@ def test_a_covariance_made_negative_by_rounding_has_an_inverse() -> None:
 
 
 def test_sigmas_become_gauss_markov_processes() -> None:
-    """Entries against the definition, for roll and pitch through the axes they turn about."""
+    """Entries are compared with the definition, for roll and pitch through the axes of rotation."""
     path = level_path(200)
     flight = made([(0, 1, 10, 30), (0, 2, 100, 110)], [path])
     prior = gauss_markov(flight, Taus(60.0, 100.0, 200.0), 5.0)
@@ -292,7 +293,7 @@ def test_trajectories_of_two_sessions_are_independent() -> None:
 
 
 def test_knots_are_widened_and_reported_if_there_would_be_too_many() -> None:
-    """At most so many, evenly over all strips; strips that meet keep their knots apart."""
+    """The knots that are left are spread evenly over all strips; strips that meet keep separate knots."""
     flight = made([(0, 1, 10, 60), (0, 2, 60.4, 90), (0, 3, 120, 180)], [level_path(200)])
     knots = knots_of(flight, 1.0, most=40)
     assert knots.widened
@@ -330,7 +331,7 @@ def test_impossible_trajectory_priors_are_refused() -> None:
 
 
 def test_drawn_errors_have_the_covariance() -> None:
-    """20 000 draws, with a component that is known and two that are one: within sampling error."""
+    """20 000 draws, with one component known exactly and two identical ones, agree within the sampling error."""
     flight = made([(0, 1, 10, 15)], [level_path(60)])
     prior = gauss_markov(flight)
     factor = prior.covariance.copy()
@@ -350,7 +351,7 @@ def test_drawn_errors_have_the_covariance() -> None:
 
 
 def test_applied_errors_move_and_rotate_the_body() -> None:
-    """Linear between knots, held beyond them; of one trajectory only; a turn about down changes the heading."""
+    """Errors are linear between knots and constant beyond them, on one trajectory; turns about down change heading."""
     path = level_path(60)
     time_ns = BEGIN + np.array([10, 20, 40], np.int64) * SECOND
     prior = TrajectoryPrior(np.array([0, 0, 0]), time_ns, np.array([1, 1, 2]), np.eye(18))

@@ -150,7 +150,10 @@ def _between(low: FloatArray, high: FloatArray, points: FloatArray) -> BoolArray
 
 
 def _told_wrong(number: int, line: Line, state: int) -> FloatArray:
-    """(2, 6) one sigma of north, east, down, roll, pitch or heading on one of two lines, as `retold` takes them."""
+    """Return (2, 6) errors of one sigma in one state (north, east, down, roll, pitch, heading) of one of two lines.
+
+    The form is that of `retold`.
+    """
     sin, cos = math.sin(math.radians(line.heading_deg)), math.cos(math.radians(line.heading_deg))
     turned = {
         0: (0.0, 0.02, 0.0, 0.0, 0.0, 0.0),
@@ -272,7 +275,7 @@ def test_corrected_sections_coincide() -> None:
 
 
 def test_points_lie_on_the_ground_with_the_true_calibration() -> None:
-    """The scene itself: with the true calibration the points lie on the ground."""
+    """This checks the simulated scene itself."""
     true = {"omega_rad": 0.004, "phi_rad": -0.006, "kappa_rad": 0.01, "range_offset_m": 0.15}
     flight = fly(
         [THERE],
@@ -304,7 +307,7 @@ def test_the_picture_is_valid_svg_with_strip_names_and_without_the_formula() -> 
 
 
 def test_the_report_shows_a_range_section_before_and_after() -> None:
-    """A laser 1.37 m off: before the ground lies that much too high, after on the survey but for what is left."""
+    """The range is wrong by 1.37 m: the ground is too high by that before, and by the remaining error after."""
     flight = village((THERE,), range_offset_m=1.37)
     start = flight.heads[0].start
     for left_m in (0.0, 0.2):
@@ -322,7 +325,7 @@ def test_the_report_shows_a_range_section_before_and_after() -> None:
 
 
 def test_the_report_shows_the_roll_left_by_the_adjustment() -> None:
-    """Not what the profile's own finding would make of it, which always lies on each other."""
+    """The profile's own finding is not applied, because it would always make the two lines coincide."""
     flight = village((THERE, BACK), omega_rad=0.01)
     adjusted = {"left": flight.heads[0].start.changed(omega_rad=0.006)}
     profiles = survey(flight.placed(adjusted), "roll", calibrations=adjusted).profiles[:1]

@@ -27,7 +27,7 @@ def section(title: str) -> str:
 
 
 def table(title: str, columns: int) -> list[list[str]]:
-    """The rows of a section's table, as cells."""
+    """Return the rows of a section's table, as cells."""
     rows = [line.split("|")[1:-1] for line in section(title).splitlines() if line.startswith("| ")]
     assert all(len(row) == columns for row in rows), [row for row in rows if len(row) != columns]
     return [[cell.strip() for cell in row] for row in rows[1:]]
@@ -38,7 +38,7 @@ CAMERA = table("Conformance, ISO/TS 19159-1, clause 7", 4)
 
 
 def keys(owner: str, cell: str) -> set[str]:
-    """``CLASS.attribute`` of a cell: the first words between its commas, but for those in brackets."""
+    """Return ``CLASS.attribute`` for the words of a cell: each first word between commas, without brackets."""
     words = re.sub(r"\([^)]*\)", "", cell).split(",")
     return {f"{owner.split()[0].rstrip(':')}.{word.split()[0]}" for word in words if word.strip()}
 
@@ -79,7 +79,7 @@ def test_every_other_name_on_the_page_exists() -> None:
 
 
 def test_the_tables_list_every_attribute_of_the_dictionary_once() -> None:
-    """Each attribute has its row; those of validation are in both parts."""
+    """Attributes of validation are in both tables, because both parts of the standard have them."""
     named = [key for row in LASER for key in sorted(keys(row[0], row[1]))]
     also = [key for row in CAMERA for cell in row[1:3] for key in sorted(keys(row[0], cell))]
     for known in (named, also):

@@ -82,7 +82,7 @@ def test_mandatory_attributes_are_present_or_listed_as_missing(outcome: Outcome)
 
 
 def test_uncertain_names_are_flagged(outcome: Outcome) -> None:
-    """Rows 1 to 24 of the dictionary were at hand, and nothing after them."""
+    """Rows 1 to 24 of the dictionary could be checked against the standard, and none after them."""
     doubtful = {row.owner for row in ROWS if not row.confirmed}
     assert doubtful == {"CA_BFrame", "CA_LFrame", "CA_Intensity", "CA_ErrorModel"}
     assert not any(row.obligation for row in ROWS if not row.confirmed)
@@ -173,7 +173,7 @@ def test_large_matrices_are_mentioned_and_attached(outcome: Outcome) -> None:
 
 
 def test_matrices_equal_the_derivatives_of_the_sensor_model(outcome: Outcome) -> None:
-    """A1 and B against differences of the sensor model itself, on the first plane's returns."""
+    """A1 and B equal difference quotients of the sensor model itself, on the first plane's returns."""
     arrays = record_of(given(outcome)).arrays()
     group = outcome.adjusted.residuals[0]
     row = int(np.flatnonzero(group.weight > 0.0)[0])
@@ -213,7 +213,7 @@ def test_matrices_equal_the_derivatives_of_the_sensor_model(outcome: Outcome) ->
 
 
 def test_figures_of_the_flight_match_the_plan(outcome: Outcome) -> None:
-    """Flown at 750 m over ground at 450 m and roofs; level, at the turn of the wave at most 0.6°."""
+    """The flight was at 750 m over ground at 450 m and roofs; it is level, with at most 0.6° at the wave's peak."""
     record = record_of(given(outcome))
     number = {key: value.content for key, value in record.values.items()}
     assert number["CA_PhotoFlight.terrainHeight"] == pytest.approx(450.0, abs=2.0)
@@ -233,7 +233,7 @@ def numbers(outcome: Outcome, **more: Any) -> dict[str, Any]:
 
 
 def test_instruments_match_the_calibration(outcome: Outcome) -> None:
-    """A boresight of ω, φ, κ on an installation that turns nothing, and the trajectory's sigmas."""
+    """The boresight is ω, φ, κ on an installation without rotation; sigmas are the trajectory's."""
     calibration, number = outcome.adjusted.calibrations["left"], numbers(outcome)
     angles = [calibration.value(name) for name in ("omega_rad", "phi_rad", "kappa_rad")]
     turned = Rotation.from_euler("XYZ", angles).as_matrix()
@@ -286,7 +286,7 @@ def test_errors_are_recorded_as_values_with_sigmas(outcome: Outcome) -> None:
 
 
 def test_angles_and_ranges_match_the_returns(outcome: Outcome) -> None:
-    """In the order of the residuals, as corrected: θ and ρ give back where a return lies in the sensor's frame."""
+    """θ and ρ, as corrected and in the order of the residuals, give a return's place in the sensor's frame."""
     arrays, group = record_of(given(outcome)).arrays(), outcome.adjusted.residuals[0]
     rows = np.flatnonzero(group.weight > 0.0)
     assert len(arrays["thetaTarget"]) == len(arrays["rhoTarget"]) == len(rows)
@@ -301,8 +301,9 @@ def test_angles_and_ranges_match_the_returns(outcome: Outcome) -> None:
 
 
 def test_planes_are_recorded_with_their_derivatives(outcome: Outcome) -> None:
-    """A2 · (s1 … s4) of a plane about its centre is the distance from it; G_c is that of unit normals; δ2 leads
-    to those adjusted.
+    """A2 · (s1 … s4) of a plane about its centre is the distance from it.
+
+    G_c is that of unit normals, and δ2 leads to the adjusted planes.
     """
     record = record_of(given(outcome))
     arrays, group = record.arrays(), outcome.adjusted.residuals[0]
@@ -322,7 +323,7 @@ def test_planes_are_recorded_with_their_derivatives(outcome: Outcome) -> None:
 
 @pytest.mark.parametrize(("nodes", "whole"), [(160, True), (240, False)])
 def test_a_correction_by_intensity_is_recorded(outcome: Outcome, nodes: int, whole: bool) -> None:
-    """Where there is one; a long table like other large matrices."""
+    """It is recorded only if it exists, and a long table is attached like other large matrices."""
     assert "CA_Intensity.intensityCorrection" not in numbers(outcome)
     table = np.linspace(0.0, 1000.0, nodes + 1), np.linspace(-0.02, 0.03, nodes + 1)
     calibration = replace(outcome.adjusted.calibrations["left"], ibrc=table)
@@ -336,7 +337,7 @@ def test_a_correction_by_intensity_is_recorded(outcome: Outcome, nodes: int, who
 
 @pytest.mark.parametrize("key", [row.key for row in ROWS])
 def test_facts_given_by_the_user_are_recorded_in_their_class(outcome: Outcome, key: str) -> None:
-    """User facts replace computed and missing values, whatever the attribute."""
+    """A user's fact replaces a computed or missing value of any attribute."""
     words: dict[str, Plain] = {
         "Integer": 7,
         "Length": 0.25,

@@ -31,7 +31,7 @@ RULES = StripRules(most_cells=3000)
 
 @pytest.fixture(scope="module")
 def made() -> Cast:
-    """Four lines over a village at 400 m, no error at all but the noise of single returns."""
+    """Return four lines over a village at 400 m, without errors except the noise of single returns."""
     return cast_flight(prf_hz=20_000.0, true={})
 
 
@@ -168,7 +168,7 @@ def test_several_wrong_parameters_are_separated(made: Cast) -> None:
 
 
 def test_scan_direction_is_found_if_the_encoder_determines_it(made: Cast) -> None:
-    """A mirror to and fro: every other sweep backwards, points of a latency of 8 µs at ±3 rad/s."""
+    """A mirror swings to and fro with every other sweep backwards, and a latency of 8 µs acts at ±3 rad/s."""
     rate = 3.0
     swaths = []
     for number, swath in enumerate(made.flight.swaths):
@@ -184,7 +184,7 @@ def test_scan_direction_is_found_if_the_encoder_determines_it(made: Cast) -> Non
 
 
 def test_errors_of_single_strips_are_not_taken_for_a_calibration_error(made: Cast) -> None:
-    """Strips shifted as their trajectory's 2 cm allow: within three sigmas of nothing."""
+    """Strips are shifted within the 2 cm of their trajectory's sigma, so no error may be significant."""
     shifts = np.random.default_rng(1).normal(0.0, 0.02, (4, 3))
     swaths = [
         replace(swath, points_t=swath.points_t + shift) for swath, shift in zip(made.flight.swaths, shifts, strict=True)
@@ -195,7 +195,7 @@ def test_errors_of_single_strips_are_not_taken_for_a_calibration_error(made: Cas
 
 
 def test_the_sigma_covers_an_error_common_to_all_strips(made: Cast) -> None:
-    """A roll of 0.003°, as the trajectory's sigma has it, is common to all strips: it looks like a boresight."""
+    """A roll of 0.003°, one sigma of the trajectory, is common to all strips and looks like a boresight."""
     flight, roll_rad = made.flight, math.radians(0.003)
     leaning = wrong(made, omega_rad=roll_rad)
     found = signatures(differences(leaning, RULES).checks, SeenFrom.of(leaning))
@@ -208,7 +208,10 @@ def test_the_sigma_covers_an_error_common_to_all_strips(made: Cast) -> None:
 
 
 def test_sigmas_hold_if_errors_follow_their_covariance(made: Cast) -> None:
-    """Eight flights with errors drawn from it; Σ(value / σ)² of m values is within χ²'s 1e-4 bounds on either side."""
+    """Errors of eight flights are drawn from the covariance.
+
+    Σ(value / σ)² of m values is within χ²'s 1e-4 bounds on either side.
+    """
     flight = made.flight
     prior = gauss_markov(flight, Taus(lasting_tilt=0.4, lasting_heading=0.2), 2.0)
     squares = []

@@ -23,7 +23,7 @@ SETTINGS = MarkingSettings()
 
 
 def roads(x: FloatArray, y: FloatArray) -> FloatArray:
-    """Streets each 25 m with dashes in their middle, on grass that is not the same everywhere; none along the axes."""
+    """Return the intensity of streets every 25 m with dashes in their middle, on uneven grass, none along the axes."""
     grass = 0.35 + 0.06 * np.sin(0.9 * x + 0.4 * y) + 0.05 * np.sin(0.3 * x - 1.1 * y)
     a, b = 0.92 * x + 0.39 * y, -0.39 * x + 0.92 * y
     u, v = (a + 3.0) % 25.0 - 12.5, (b - 4.0) % 25.0 - 12.5
@@ -37,7 +37,7 @@ def roads(x: FloatArray, y: FloatArray) -> FloatArray:
 
 
 def _within(away: FloatArray, half: float) -> FloatArray:
-    """1 inside, 0 outside, as a footprint blurs it."""
+    """Return 1 inside and 0 outside, blurred by a footprint."""
     inside: FloatArray = 0.5 * (erf((away + half) / FOOTPRINT_M) - erf((away - half) / FOOTPRINT_M))
     return inside
 
@@ -59,7 +59,10 @@ def flown(**true: float) -> Flight:
 
 
 def misses(flight: Flight, **true: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """(k, 3) differences of two sightings less what the wrong calibration makes, (k, 3, 3) covariances; (k, 3) made."""
+    """Return (k, 3) errors of tie points, m, in t, (k, 3, 3) covariances, and (k, 3) the wrong calibration's effect.
+
+    An error is the difference of two sightings minus that effect.
+    """
     truth = truth_of(flight, **true)
     found = find_markings(flight).ties
     off, covariance, made = [], [], []
@@ -86,7 +89,7 @@ def test_shifts_match_a_wrong_boresight_and_their_sigmas() -> None:
 
 
 def test_heights_lie_on_the_plane_of_each_swath() -> None:
-    """A wrong roll tilts the two swaths against each other: each sighting is on its own."""
+    """A wrong roll tilts the two swaths against each other, so each sighting lies on its own swath."""
     true = {"omega_rad": 0.0013, "phi_rad": -0.0017}
     flight = flown(**true)
     for tie in find_markings(flight).ties:

@@ -27,7 +27,7 @@ NOISE_M = 0.02
 
 
 def face(normal: FloatArray, count: int, rng: np.random.Generator, noise_m: float = NOISE_M) -> FloatArray:
-    """Returns on a face of the roof, off it along the normal."""
+    """Return noisy returns on a face of the roof; the noise is along the normal."""
     fall = np.tan(SLOPE)
     down, side = rng.uniform(0.2, 4.0, count), rng.uniform(-1.0, 1.0, count)
     if normal is EAST:
@@ -39,7 +39,7 @@ def face(normal: FloatArray, count: int, rng: np.random.Generator, noise_m: floa
 
 
 def flight_of(swaths: Sequence[Sequence[FloatArray]], normals: Sequence[FloatArray]) -> tuple[Flight, Features]:
-    """Swaths with the points of each face one after the other, and the planes of the faces."""
+    """Return swaths with the points of each face one after the other, and the planes of the faces."""
     made = []
     patches: list[list[Patch]] = [[] for _ in normals]
     for index, faces in enumerate(swaths):

@@ -27,7 +27,7 @@ def made(
     correlation: float = 0.0,
     installation: str = "HB-ABC/left/2026-03",
 ) -> Calibration:
-    """A calibration of the boresight, made in a month."""
+    """Return a calibration of the boresight, made in a month."""
     values = dict(zip(BORESIGHT, np.radians(angles_deg), strict=True))
     one = nominal("left", np.zeros(3), np.eye(3)).changed(**values)
     whole, matrix = np.zeros(len(INDEX)), np.eye(len(INDEX))
@@ -51,7 +51,7 @@ def test_differences_are_tested_against_the_joint_sigma() -> None:
 
 
 def test_correlation_is_taken_into_account() -> None:
-    """Differences along the direction that is known worse are no surprise, across it they are."""
+    """Differences along the poorly known direction are no surprise; across it they are."""
     along = compare(made(1, correlation=0.9), made(2, (0.253, -0.397, 0.6), correlation=0.9))
     across = compare(made(1, correlation=0.9), made(2, (0.253, -0.403, 0.6), correlation=0.9))
     assert along.chi2 == pytest.approx(9.0 / (1.0 + 0.9), rel=1e-6)
@@ -138,7 +138,7 @@ IBRC = np.array([200.0, 2000.0])
     ],
 )
 def test_a_parameter_held_at_another_value_is_not_a_change(other: dict[str, Any], said: str) -> None:
-    """Neither a step nor a line through all; steps between others are judged."""
+    """It gives neither a step nor a line through all entries; steps between the other entries are judged."""
     values = {name: value for name, value in other.items() if name in INDEX}
     tables = {name: value for name, value in other.items() if name not in INDEX}
     entries = [replace(made(number), refraction="none") for number in (1, 2, 3)]

@@ -62,7 +62,7 @@ def roofs(made: Cast) -> Features:
 
 @pytest.fixture(scope="module")
 def control(made: Cast) -> list[ControlPoint]:
-    """Places on the true ground, surveyed to a centimetre, on no roof and no wall."""
+    """Return places on the true ground, surveyed to a centimetre, away from roofs and walls."""
     draws = np.random.default_rng(2)
     ground = np.flatnonzero(made.surface[0] == np.bincount(made.surface[0]).argmax())
     chosen = draws.choice(ground, 40, replace=False)
@@ -197,7 +197,7 @@ def test_the_tests_reject_at_their_stated_rate() -> None:
 
 @pytest.mark.slow
 def test_planes_seen_by_many_swaths_are_rejected_at_the_stated_rate(made: Cast, roofs: Features) -> None:
-    """Each sight errs once, in all its distances, as returns and 3 mm of a distance say; so does a strip on a plane."""
+    """Each sighting errs once in all its distances, by its returns and a floor of 3 mm; so does a strip on a plane."""
     calibrations, flight = {"left": made.truth}, made.flight.placed({"left": made.truth})
     planes = tuple(plane for plane in roofs.planes if len(plane.patches) == 4)
     prior = gauss_markov(flight, knot_s=1.0)
@@ -226,14 +226,14 @@ def test_planes_seen_by_many_swaths_are_rejected_at_the_stated_rate(made: Cast, 
 
 @pytest.fixture(scope="module")
 def drawn(made: Cast, roofs: Features) -> tuple[Rows, TrajectoryPrior]:
-    """Independent distances of the true calibration, and the trajectory's errors that are expected."""
+    """Return independent distances of the true calibration, and the trajectory's expected errors."""
     prior = gauss_markov(made.flight, Taus(5.0, 5.0, 5.0), 1.0)
     rows = plane_rows(made.at_truth(), roofs, {"left": made.truth}, prior)
     return rows.take(rows.independent(np.ones(len(rows), bool))), prior
 
 
 def values_of(rows: Rows, prior: TrajectoryPrior, draws: np.random.Generator, floor_m: float) -> FloatArray:
-    """Distances as the rows expect them, with so much roughness."""
+    """Return distances as the rows expect them, with the given roughness, m."""
     sights = floor_m * draws.standard_normal(rows.floor.shape[1])
     local = rows.local @ draws.standard_normal(rows.local.shape[1])
     value: FloatArray = rows.by_knot @ draw(prior, draws).ravel() + rows.floor @ sights + local
@@ -241,7 +241,7 @@ def values_of(rows: Rows, prior: TrajectoryPrior, draws: np.random.Generator, fl
 
 
 def test_chi2_equals_the_redundancy_if_planes_and_trajectory_match_their_sigmas(made: Cast, roofs: Features) -> None:
-    """Erroneous trajectories, and all points placed along them: not the rows' own linear model."""
+    """Points are placed along erroneous trajectories, which does not use the rows' own linear model."""
     prior, draws = gauss_markov(made.flight, Taus(5.0, 5.0, 5.0), 1.0), np.random.default_rng(3)
     ratios, redundancy = [], 0.0
     for _ in range(4):
@@ -317,7 +317,7 @@ def test_errors_within_the_sigmas_of_the_calibration_are_undetectable(made: Cast
 
 
 def test_a_test_without_power_is_reported(made: Cast, roofs: Features) -> None:
-    """Sigmas of a trajectory far larger than its errors: χ² far below its redundancy, and nothing small can be seen."""
+    """The trajectory's sigmas are far larger than its errors: χ² is far below its redundancy, and small errors hide."""
     trajectory = replace(
         made.flight.trajectories[0], attitude_sigma_rad=np.full((len(made.flight.trajectories[0]), 3), 0.01)
     )
@@ -354,7 +354,7 @@ def test_failed_remeasurements_and_comparisons_are_reported(made: Cast, roofs: F
 
 
 def test_a_scanner_that_no_test_covers_is_reported(made: Cast, roofs: Features) -> None:
-    """A second head without a return on any plane."""
+    """The second head has no return on any plane."""
     head = replace(made.flight.heads[0], name="right")
     flight = replace(made.flight, heads=(*made.flight.heads, head)).placed({"left": made.truth, "right": made.truth})
     calibrations = {"left": made.truth, "right": made.truth}
