@@ -184,7 +184,17 @@ def _changed_sentence(rng: random.Random, sentence: bytes) -> bytes:
             del fields[rng.randrange(1, len(fields))]
         elif kind == 7:
             fields[0] = fields[0][:3] + rng.choice(
-                (b"GGA", b"RMC", b"ZDA", b"VTG", b"GST", b"HDT", rng.randbytes(2).hex().upper().encode())
+                (
+                    b"GGA",
+                    b"RMC",
+                    b"ZDA",
+                    b"VTG",
+                    b"GST",
+                    b"HDT",
+                    b"THS",
+                    b"HPR",
+                    rng.randbytes(2).hex().upper().encode(),
+                )
             )
     return b",".join(fields)
 

@@ -1,4 +1,7 @@
-"""NMEA 0183: GGA, GNS, RMC, ZDA, VTG, GST and HDT of any talker (v4.11; u-blox and NovAtel manuals agree).
+"""NMEA 0183: GGA, GNS, RMC, ZDA, VTG, GST, HDT, THS and HPR of any talker, PASHR and PTNL,AVR.
+
+The standard's sentences by v4.11; u-blox and NovAtel manuals agree. HPR by Unicore's N4 command reference, PASHR by
+Applanix, PTNL,AVR by Trimble.
 
 Time: RMC and ZDA refer to the previous PPS edge, in UTC. RMC confirms its time by status A; ZDA has no status and is
 accepted while the stream's latest GGA, GNS or RMC has a fix, or if the stream has none of them. A tag off the whole
@@ -11,6 +14,10 @@ GNS, None where the receiver leaves either empty. There is no vertical velocity.
 fix, not an error. GNS has a mode for each constellation; the best of them applies to the fix, as all constellations
 make one position. Where a receiver adds a GNS for each constellation, these have no mode and give satellites only: they
 are ignored.
+
+Heading: HPR and PTNL,AVR have the direction of the baseline between two antennas with its quality, and count with fixed
+ambiguities only. PASHR has the vehicle's heading with its sigma. THS and HDT have neither time nor quality, so they
+count only where none of these comes. The sigma is the one in the sentence, else None.
 """
 
 from __future__ import annotations
@@ -69,6 +76,14 @@ FIX_TYPE_BY_MODE = {
     "N": FixType.NONE,
 }
 MODES_BEST_FIRST = "RFDPAEMS"
+HEADING_ERRORS = {
+    "V": "heading_not_valid",
+    "E": "heading_estimated",
+    "M": "heading_estimated",
+    "S": "heading_estimated",
+}
+QUALITY_FIXED = {"HPR": 4, "PTNL,AVR": 3}  # of the baseline: the values of GGA, and Trimble's own
+BETTER_HEADING_LASTS = 16  # sentences without time and quality that are left out after one that has them
 POSITION_SENTENCES = ("GGA", "GNS", "RMC")  # the first one present gives position and quality
 VOUCHED = frozenset(
     {FixType.SINGLE, FixType.DIFFERENTIAL, FixType.RTK_FLOAT, FixType.RTK_FIXED}  # fixes from satellites, not estimates
@@ -113,17 +128,22 @@ class NmeaDecoder:
             b"ZDA": self._zda,
         }
         if not time_only:
-            self._decoders |= {b"VTG": self._vtg, b"GST": self._gst, b"HDT": self._hdt}
+            self._decoders |= {b"VTG": self._vtg, b"GST": self._gst, b"HDT": self._hdt, b"THS": self._ths}
+            self._decoders |= {b"HPR": self._hpr, b"PASHR": self._pashr, b"PTNLAVR": self._avr}
+        self._better_headings = 0  # sentences without time and quality that are still left out
 
     def decode(self, frames: list[Frame]) -> list[Record]:
         """Return the records that sentences among the frames completed."""
         records: list[Record] = []
         for kind, host_time_ns, data in frames:
-            decoder = self._decoders.get(data[3:6])
-            if decoder is None or kind != "nmea" or data[6:7] != b"," or data[1:2] == b"P":
+            if kind != "nmea":
+                continue
+            name = _sentence_type(data)
+            decoder = self._decoders.get(name)
+            if decoder is None:
                 continue
             try:
-                records += decoder(host_time_ns, Sentence(data[3:6].decode(), data))
+                records += decoder(host_time_ns, Sentence(name.decode(), data))
             except FieldError:
                 self.counters.bad_messages += 1
         return records
@@ -197,9 +217,79 @@ class NmeaDecoder:
 
     def _hdt(self, host_time_ns: int, sentence: Sentence) -> list[Record]:
         heading = sentence.number("heading")
-        if heading is None:
+        if heading is None or self._has_better():
             return []
         return [GnssHeading(host_time_ns, time=None, heading_rad=math.radians(heading), message="HDT")]
+
+    def _ths(self, host_time_ns: int, sentence: Sentence) -> list[Record]:
+        heading, mode = sentence.number("heading"), sentence.text("mode")
+        if self._has_better():
+            return []
+        error = HEADING_ERRORS.get(mode)
+        if error is not None:
+            self.counters.errors[error] += 1
+        if heading is None:
+            return []
+        valid = mode == "A"
+        return [GnssHeading(host_time_ns, None, math.radians(heading), valid=valid, message="THS")]
+
+    def _has_better(self) -> bool:
+        """Return whether headings with time and quality have come lately, and count down."""
+        self._better_headings = max(0, self._better_headings - 1)
+        return self._better_headings > 0
+
+    def _hpr(self, host_time_ns: int, sentence: Sentence) -> list[Record]:
+        return self._baseline(host_time_ns, sentence, "HPR", None)
+
+    def _avr(self, host_time_ns: int, sentence: Sentence) -> list[Record]:
+        return self._baseline(host_time_ns, sentence, "PTNL,AVR", sentence.number("range"))
+
+    def _baseline(self, host_time_ns: int, sentence: Sentence, name: str, range_m: float | None) -> list[Record]:
+        """Return the direction of a baseline; without fixed ambiguities it is counted and not valid."""
+        time_ns, heading, pitch = sentence.time_ns(), sentence.number("heading"), sentence.number("pitch")
+        quality = sentence.number("quality")
+        self._better_headings = BETTER_HEADING_LASTS
+        if quality != QUALITY_FIXED[name]:
+            self.counters.errors["heading_not_fixed" if quality else "heading_not_valid"] += 1
+        if heading is None or time_ns is None:
+            return []
+        return [
+            GnssHeading(
+                host_time_ns,
+                TimeTag(TimeScale.UTC, time_ns),
+                heading_rad=math.radians(heading),
+                pitch_rad=None if pitch is None else math.radians(pitch),
+                baseline_m=range_m or None,
+                valid=quality == QUALITY_FIXED[name],
+                message=name,
+            )
+        ]
+
+    def _pashr(self, host_time_ns: int, sentence: Sentence) -> list[Record]:
+        """Return the vehicle's heading; its pitch is not that of the baseline. A sigma of 0 is not known.
+
+        The sentence of that address with a name in place of the time (``ATT``, ``POS``) is another one of Ashtech's.
+        """
+        if sentence.text("timestamp").isalpha():
+            return []
+        time_ns, heading = sentence.time_ns(), sentence.number("heading")
+        sigma = sentence.number("heading_sigma")
+        self._better_headings = BETTER_HEADING_LASTS
+        valid = bool(sentence.number("gps_quality"))
+        if not valid:
+            self.counters.errors["heading_not_valid"] += 1
+        if heading is None or time_ns is None or sentence.text("true") != "T":
+            return []
+        return [
+            GnssHeading(
+                host_time_ns,
+                TimeTag(TimeScale.UTC, time_ns),
+                heading_rad=math.radians(heading),
+                heading_sigma_rad=math.radians(sigma) if sigma else None,
+                valid=valid,
+                message="PASHR",
+            )
+        ]
 
     # --- time and epochs ---
 
@@ -228,6 +318,13 @@ class NmeaDecoder:
 
     def _fixes(self, epochs: list[dict[str, Part]]) -> list[Record]:
         return [fix for parts in epochs if (fix := merge_epoch(parts)) is not None]
+
+
+def _sentence_type(data: bytes) -> bytes:
+    """Return the type of a sentence: the address without talker, of a maker's own sentence all of it."""
+    if data[1:2] == b"P":
+        return b"PTNLAVR" if data[5:10] == b",AVR," else data[1:6] if data[6:7] == b"," else b""
+    return data[3:6] if data[6:7] == b"," else b""
 
 
 def merge_epoch(parts: dict[str, Part]) -> GnssFix | None:
@@ -288,7 +385,7 @@ DRIVERS = (
         kind="gnss",
         transports=STREAM_TRANSPORTS,
         yields=(TimeMessage, GnssFix, GnssHeading),
-        summary="NMEA 0183 sentences of any receiver (GGA GNS RMC ZDA VTG GST HDT)",
+        summary="NMEA 0183 sentences of any receiver (GGA GNS RMC ZDA VTG GST HDT THS HPR PASHR AVR)",
         make_parser=NmeaParser,
         make_time_parser=lambda settings: NmeaParser(settings, time_only=True),
         names_edge=NamesEdge.PREVIOUS,

@@ -1,7 +1,8 @@
 """NMEA 0183 sentences: fields located by pynmea2's tables, times and numbers checked strictly, and an encoder for each.
 
-pynmea2 locates the fields. Times are read here, since second 60 of a leap second must be accepted and fractions must
-stay exact, and ``datetime.time`` supports neither; numbers and coordinates are read here too.
+pynmea2 locates the fields; tables here do for headings, which it has not for every talker. Times are read here, since
+second 60 of a leap second must be accepted and fractions must stay exact, and ``datetime.time`` supports neither;
+numbers and coordinates are read here too.
 """
 
 from __future__ import annotations
@@ -24,6 +25,22 @@ TIME = re.compile(r"([01]\d|2[0-3])([0-5]\d)([0-5]\d|60)(?:\.(\d*))?")
 NUMBER = re.compile(r"[+-]?(?:\d{1,12}(?:\.\d*)?|\.\d+)")
 DEGREES_MINUTES = re.compile(r"(\d{1,3})([0-5]\d(?:\.\d*)?)")
 DATE_DDMMYY = re.compile(r"\d{6}")
+FIELDS = {  # of sentences that pynmea2 does not have, after the address
+    "THS": ("heading", "mode"),  # IEC 61162-1; mode A, E, M, S, V
+    # Unicore N4 command reference, GPHPR
+    "HPR": ("timestamp", "heading", "pitch", "roll", "quality", "num_sats", "age", "station"),
+    # Applanix POS LV and Trimble BD9xx; OEM7 PASHR
+    "PASHR": (
+        *("timestamp", "heading", "true", "roll", "pitch", "heave"),
+        *("roll_sigma", "pitch_sigma", "heading_sigma", "gps_quality", "imu_status"),
+    ),
+    # Trimble OEM receiver help, NMEA-0183 message PTNL,AVR
+    "PTNLAVR": (
+        *("type", "timestamp", "heading", "_yaw", "pitch", "_tilt", "roll", "_roll", "range", "quality", "pdop"),
+        "num_sats",
+    ),
+}
+PLACES = {kind: {name: place for place, name in enumerate(names)} for kind, names in FIELDS.items()}
 
 
 class FieldError(ValueError):
@@ -34,19 +51,23 @@ class Sentence:
     """Gives access to one sentence's fields by pynmea2's names.
 
     Args:
-        kind: sentence type that pynmea2 knows, such as ``GGA``.
+        kind: sentence type of `FIELDS`, or one that pynmea2 knows, such as ``GGA``.
         frame: the whole sentence, its checksum already verified.
     """
 
     def __init__(self, kind: str, frame: bytes) -> None:
         fields = frame[1 : frame.rindex(b"*")].decode("ascii").split(",")
-        self._message: Any = pynmea2.TalkerSentence.sentence_types[kind](fields[0][:-3], kind, fields[1:])
+        self._places: dict[str, int] | None = PLACES.get(kind)
+        self._data = fields[1:]
+        if self._places is None:
+            message: Any = pynmea2.TalkerSentence.sentence_types[kind](fields[0][:-3], kind, fields[1:])
+            self._places, self._data = message.name_to_idx, message.data
 
     def text(self, name: str) -> str:
         """Return the field's text, empty where the sentence is shorter."""
-        place: int = self._message.name_to_idx[name]
-        data: list[str] = self._message.data
-        return data[place] if place < len(data) else ""
+        assert self._places is not None
+        place = self._places[name]
+        return self._data[place] if place < len(self._data) else ""
 
     def number(self, name: str) -> float | None:
         """Return the field as a number; None where it is empty."""
@@ -222,3 +243,47 @@ def encode_vtg(speed_mps: float, course_rad: float, *, talker: str = "GN") -> by
 def encode_hdt(heading_rad: float, *, talker: str = "GN") -> bytes:
     """Encode an HDT: true heading."""
     return encode_sentence(f"{talker}HDT,{math.degrees(heading_rad) % 360.0:.4f},T")
+
+
+def encode_ths(heading_rad: float | None, *, mode: str = "A", talker: str = "GN") -> bytes:
+    """Encode a THS: true heading and mode (A autonomous, E estimated, M manual, S simulated, V not valid)."""
+    return encode_sentence(f"{talker}THS,{_degrees_text(heading_rad)},{mode}")
+
+
+def encode_hpr(time_ns: int, heading_rad: float, pitch_rad: float, *, quality: int = 4, talker: str = "GN") -> bytes:
+    """Encode Unicore's HPR: heading and pitch of the baseline; quality as of GGA."""
+    pitch = math.degrees(pitch_rad)
+    return encode_sentence(
+        f"{talker}HPR,{_time_text(time_ns)},{_degrees_text(heading_rad)},{pitch:.4f},0.0000,{quality},30,0.00,0999"
+    )
+
+
+def encode_pashr(
+    time_ns: int,
+    roll_rad: float,
+    pitch_rad: float,
+    heading_rad: float,
+    sigmas_rad: tuple[float, float, float],
+    *,
+    gps_quality: int = 2,
+    imu_status: int = 1,
+) -> bytes:
+    """Encode a PASHR: attitude of the vehicle, its sigmas in the same order, and status."""
+    roll, pitch = math.degrees(roll_rad), math.degrees(pitch_rad)
+    sigmas = ",".join(f"{math.degrees(sigma):.3f}" for sigma in sigmas_rad)
+    return encode_sentence(
+        f"PASHR,{_time_text(time_ns)},{_degrees_text(heading_rad)},T,{roll:+.4f},{pitch:+.4f},+0.00,{sigmas},"
+        f"{gps_quality},{imu_status}"
+    )
+
+
+def encode_avr(time_ns: int, yaw_rad: float, tilt_rad: float, range_m: float, *, quality: int = 3) -> bytes:
+    """Encode a PTNL,AVR: yaw and tilt of a moving baseline and its length; quality 3 is a fixed solution."""
+    yaw, tilt = math.degrees(yaw_rad), math.degrees(tilt_rad)
+    return encode_sentence(
+        f"PTNL,AVR,{_time_text(time_ns)},{yaw:+.4f},Yaw,{tilt:+.4f},Tilt,,,{range_m:.3f},{quality},1.6,12"
+    )
+
+
+def _degrees_text(heading_rad: float | None) -> str:
+    return "" if heading_rad is None else f"{math.degrees(heading_rad) % 360.0:.4f}"

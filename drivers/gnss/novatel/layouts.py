@@ -271,6 +271,28 @@ class Heading2(NamedTuple):
     gps_glonass_mask: int
 
 
+class Heading(NamedTuple):
+    """HEADING (971), DUALANTENNAHEADING (2042): as HEADING2, with one station."""
+
+    solution_status: int
+    position_type: int
+    baseline_m: float
+    heading_deg: float
+    pitch_deg: float
+    reserved_1: float
+    heading_sigma_deg: float
+    pitch_sigma_deg: float
+    station: bytes
+    satellites_tracked: int
+    satellites_used: int
+    satellites_observed: int
+    satellites_multi: int
+    solution_source: int
+    extended_status: int
+    galileo_beidou_mask: int
+    gps_glonass_mask: int
+
+
 class InsConfig(NamedTuple):
     """INSCONFIG (1945): its first field, the type of the IMU."""
 
@@ -291,6 +313,7 @@ Body = (
     | CorrImu
     | MarkTime
     | Heading2
+    | Heading
     | InsConfig
 )
 
@@ -312,6 +335,7 @@ _INSATT = struct.Struct("<IddddI")
 _RAWIMU = struct.Struct("<IdIiiiiii")
 _RAWIMUX = struct.Struct("<BBHdIiiiiii")
 _CORRIMUDATA = struct.Struct("<Iddddddd")
+_HEADING = struct.Struct("<IIffffff4sBBBBBBBB")
 _MARKTIME = struct.Struct("<IddddI")
 
 LAYOUTS: dict[int, Layout] = {
@@ -341,6 +365,8 @@ LAYOUTS: dict[int, Layout] = {
     1075: Layout("MARK3TIME", MarkTime, _MARKTIME),
     1076: Layout("MARK4TIME", MarkTime, _MARKTIME),
     1335: Layout("HEADING2", Heading2, struct.Struct("<IIffffff4s4sBBBBBBBB")),
+    971: Layout("HEADING", Heading, _HEADING),
+    2042: Layout("DUALANTENNAHEADING", Heading, _HEADING),
     1945: Layout("INSCONFIG", InsConfig, struct.Struct("<I")),
 }
 IDS = {layout.name: number for number, layout in LAYOUTS.items()}

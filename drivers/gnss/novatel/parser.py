@@ -12,7 +12,7 @@ Records by log:
 - RAWIMU(S), RAWIMUX(S): `ImuSamples` in the axes marked on the IMU. Scaling the counts needs the IMU's type, which
   RAWIMUX and INSCONFIG give, or the setting ``imu_type``; without it they are counted as ``imu_scale_unknown``.
 - CORRIMU…: motion of the vehicle with gravity and earth rotation removed, so `DeviceStatus`, not `ImuSamples`.
-- HEADING2: `GnssHeading`. MARKxTIME: `EventMark`.
+- HEADING2, HEADING, DUALANTENNAHEADING: `GnssHeading`. MARKxTIME: `EventMark`.
 """
 
 from __future__ import annotations
@@ -60,6 +60,7 @@ GIVES: dict[type[nov.Body], tuple[type, ...]] = {  # record types of a body; a b
     nov.CorrImuData: (DeviceStatus,),
     nov.MarkTime: (EventMark,),
     nov.Heading2: (GnssHeading,),
+    nov.Heading: (GnssHeading,),
     nov.InsConfig: (ImuSamples,),
 }
 

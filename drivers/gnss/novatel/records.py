@@ -301,7 +301,7 @@ def event_mark(state: State, header: Header, mark: nov.MarkTime) -> list[Record 
     ]
 
 
-def baseline_heading(state: State, header: Header, heading: nov.Heading2) -> list[Record | Row]:
+def baseline_heading(state: State, header: Header, heading: nov.Heading2 | nov.Heading) -> list[Record | Row]:
     """Return the heading from the master antenna to the rover's."""
     there = heading.position_type != tables.POSITION_NONE
     return [
@@ -364,5 +364,6 @@ DECODERS: dict[type[nov.Body], Callable[[State, Header, Any], list[Record | Row]
     nov.CorrImuData: corrected_imu,
     nov.MarkTime: event_mark,
     nov.Heading2: baseline_heading,
+    nov.Heading: baseline_heading,
     nov.InsConfig: ins_config,
 }

@@ -20,7 +20,7 @@ from swath.drivers.gnss.record_rows import Row
 from swath.drivers.gnss.ubx import messages as ubx
 from swath.drivers.parser import DeviceSettings, ParserCounters
 from swath.georef.arrays import FloatArray
-from swath.georef.records import FixType, GnssFix, InsSolution, Record, TimeScale, TimeTag
+from swath.georef.records import FixType, GnssFix, GnssHeading, InsSolution, Record, TimeScale, TimeTag
 
 NavMessage: TypeAlias = (
     ubx.NavPvt
@@ -340,6 +340,39 @@ def _vouched(parts: Parts, position: _Position) -> bool:
 def _status(parts: Parts) -> ubx.NavPvt | ubx.NavSol | ubx.NavStatus | None:
     """Return the message that has the fix type and flags; their lowest two bits mean the same in all of them."""
     return _pvt(parts) or _of(parts, "NAV-SOL", ubx.NavSol) or _of(parts, "NAV-STATUS", ubx.NavStatus)
+
+
+def baseline_heading(host_time_ns: int, message: ubx.NavRelposned, counters: ParserCounters) -> GnssHeading | None:
+    """Return the direction from this receiver's antenna, whose positions it sends, to the reference's on the same body.
+
+    The message has the vector in the other direction (3.15.22). None if the reference does not move: then it stands
+    somewhere on the ground. Without fixed ambiguities it is not valid, and counted.
+    """
+    if not message.flags & ubx.RELPOS_MOVING:
+        return None
+    needed = ubx.RELPOS_FIX_OK | ubx.RELPOS_VALID | ubx.RELPOS_HEADING_VALID
+    there = message.flags & needed == needed
+    fixed = message.flags >> ubx.RELPOS_CARRIER_SHIFT & ubx.RELPOS_CARRIER_BITS == ubx.RELPOS_FIXED
+    if not (there and fixed):
+        counters.errors["heading_not_fixed" if there else "heading_not_valid"] += 1
+    north_m = message.north_cm / 1e2 + message.north_hp_tenth_mm / 1e4
+    east_m = message.east_cm / 1e2 + message.east_hp_tenth_mm / 1e4
+    down_m = message.down_cm / 1e2 + message.down_hp_tenth_mm / 1e4
+    length_m = math.hypot(north_m, east_m, down_m)
+    if not length_m:
+        return None
+    normalised = message.flags & ubx.RELPOS_NORMALISED
+    return GnssHeading(
+        host_time_ns,
+        TimeTag(TimeScale.GPS, message.itow_ms * MS_NS),
+        heading_rad=math.radians((message.heading_1e5_deg / 1e5 + 180.0) % 360.0),
+        pitch_rad=math.atan2(down_m, math.hypot(north_m, east_m)),
+        baseline_m=None if normalised else message.length_cm / 1e2 + message.length_hp_tenth_mm / 1e4,
+        heading_sigma_rad=math.radians(message.heading_accuracy_1e5_deg / 1e5) or None,
+        pitch_sigma_rad=math.atan(message.down_accuracy_tenth_mm / 1e4 / length_m) or None,
+        valid=there and fixed,
+        message="NAV-RELPOSNED",
+    )
 
 
 # --- NMEA in the stream ---

@@ -249,6 +249,33 @@ class NavAtt(NamedTuple):
     heading_accuracy_1e5_deg: int
 
 
+class NavRelposned(NamedTuple):
+    """NAV-RELPOSNED version 1, 3.15.22: vector from the reference's antenna to this receiver's own."""
+
+    version: int
+    station: int
+    itow_ms: int
+    north_cm: int
+    east_cm: int
+    down_cm: int
+    length_cm: int
+    heading_1e5_deg: int
+    north_hp_tenth_mm: int
+    east_hp_tenth_mm: int
+    down_hp_tenth_mm: int
+    length_hp_tenth_mm: int
+    north_accuracy_tenth_mm: int
+    east_accuracy_tenth_mm: int
+    down_accuracy_tenth_mm: int
+    length_accuracy_tenth_mm: int
+    heading_accuracy_1e5_deg: int
+    flags: int  # RELPOS_*
+
+
+RELPOS_FIX_OK, RELPOS_VALID, RELPOS_MOVING, RELPOS_HEADING_VALID, RELPOS_NORMALISED = 1, 4, 0x20, 0x100, 0x200
+RELPOS_CARRIER_SHIFT, RELPOS_CARRIER_BITS, RELPOS_FIXED = 3, 3, 2
+
+
 class NavPvat(NamedTuple):
     """NAV-PVAT (F9 HPS 1.30, class 01 id 17): position, velocity, attitude and UTC of an epoch."""
 
@@ -371,6 +398,7 @@ NAV_STATUS = Layout(b"\x01\x03", "IBB", NavStatus, 16)
 NAV_POSLLH = Layout(b"\x01\x02", "IiiiiII", NavPosllh, 28)
 NAV_VELNED = Layout(b"\x01\x12", "IiiiIIiII", NavVelned, 36)
 NAV_ATT = Layout(b"\x01\x05", "IB3xiiiIII", NavAtt, 32)
+NAV_RELPOSNED = Layout(b"\x01\x3c", "BxHIiiiii4xbbbbIIIII4xI", NavRelposned, 64)
 NAV_PVAT = Layout(b"\x01\x17", "IBBHBBBBB3xIiBBBBiiiiIIiiiiIiiiiHHH", NavPvat, 116)
 ESF_INS = Layout(b"\x10\x15", "I4xIiiiiii", EsfIns, 36)
 NAV_EOE = Layout(b"\x01\x61", "I", NavEoe, 4)

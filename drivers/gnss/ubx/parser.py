@@ -1,6 +1,6 @@
 """u-blox UBX: NAV-PVT, NAV-PVAT, NAV-HPPOSLLH, NAV-COV, NAV-TIMEGPS, NAV-TIMEUTC, NAV-TIMELS, NAV-EOE, TIM-TP, TIM-TM2;
-NAV-POSLLH, NAV-VELNED, NAV-STATUS and NAV-SOL of older receivers; NAV-ATT, ESF-MEAS, ESF-RAW and ESF-INS of receivers
-with inertial sensors.
+NAV-POSLLH, NAV-VELNED, NAV-STATUS and NAV-SOL of older receivers; NAV-RELPOSNED of two receivers on one
+body; NAV-ATT, ESF-MEAS, ESF-RAW and ESF-INS of receivers with inertial sensors.
 
 RXM-RAWX gives its time where no other message of the stream gives one: in a log of raw measurements for
 post-processing. All other messages, RTCM3 and NMEA on the same port included, are framed, checked and counted.
@@ -37,7 +37,15 @@ from swath.drivers.gnss.date_floor import GPS_EPOCH, ReceiverDates, leap_seconds
 from swath.drivers.gnss.epochs import EpochGatherer
 from swath.drivers.gnss.record_rows import Row, join_rows
 from swath.drivers.gnss.ubx import messages as ubx
-from swath.drivers.gnss.ubx.fix import POSITION_MESSAGES, NavMessage, NmeaFixes, ins_row, merge_epoch, pvt_of
+from swath.drivers.gnss.ubx.fix import (
+    POSITION_MESSAGES,
+    NavMessage,
+    NmeaFixes,
+    baseline_heading,
+    ins_row,
+    merge_epoch,
+    pvt_of,
+)
 from swath.drivers.gnss.ubx.sensors import MEAS_KEY, RAW_KEY, SensorSamples, vehicle_motion
 from swath.drivers.gnss.ubx.startup import startup_messages
 from swath.drivers.parser import DeviceSettings, StreamParser
@@ -46,6 +54,7 @@ from swath.georef.records import (
     DeviceStatus,
     EventMark,
     GnssFix,
+    GnssHeading,
     ImuSamples,
     InsSolution,
     NamesEdge,
@@ -93,6 +102,7 @@ GIVES: dict[bytes, tuple[type, ...]] = {  # record types to which a message cont
     ubx.NAV_COV.key: _EPOCH,
     ubx.NAV_EOE.key: _EPOCH,
     ubx.NAV_ATT.key: (InsSolution,),
+    ubx.NAV_RELPOSNED.key: (GnssHeading,),
     ubx.TIM_TM2.key: (EventMark,),
     MEAS_KEY: (ImuSamples,),
     RAW_KEY: (ImuSamples,),
@@ -145,6 +155,7 @@ class UbxParser(StreamParser):
             ubx.NAV_VELNED.key: self._nav_part,
             ubx.NAV_STATUS.key: self._nav_part,
             ubx.NAV_ATT.key: self._nav_part,
+            ubx.NAV_RELPOSNED.key: self._nav_relposned,
             ubx.NAV_COV.key: self._nav_cov,
             ubx.NAV_EOE.key: self._nav_eoe,
             ubx.TIM_TM2.key: self._tim_tm2,
@@ -314,6 +325,14 @@ class UbxParser(StreamParser):
         valid = self._vouched is not False
         return [TimeMessage(host_time_ns, tag, NamesEdge.PREVIOUS, valid=valid, message="NAV-TIMELS")]
 
+    def _nav_relposned(self, host_time_ns: int, frame: bytes) -> Items:
+        message = _checked(ubx.NAV_RELPOSNED.decode(frame))
+        if message.version != 1:  # version 0, of M8 and early F9, has no heading
+            self.counters.errors["relposned_version"] += 1
+            return []
+        heading = baseline_heading(host_time_ns, message, self.counters)
+        return [] if heading is None else [heading]
+
     def _nav_cov(self, host_time_ns: int, frame: bytes) -> Items:
         message = _checked(ubx.NAV_COV.decode(frame))
         if not all(map(math.isfinite, message)):
@@ -466,7 +485,7 @@ DRIVERS = (
         protocol="ubx",
         kind="gnss",
         transports=STREAM_TRANSPORTS,
-        yields=(TimeMessage, GnssFix, EventMark, InsSolution, ImuSamples, DeviceStatus),
+        yields=(TimeMessage, GnssFix, GnssHeading, EventMark, InsSolution, ImuSamples, DeviceStatus),
         summary="u-blox binary (NAV-PVT, older NAV, TIM-TP TM2, NAV-ATT, ESF), NMEA and RTCM3 beside it",
         make_parser=UbxParser,
         make_time_parser=lambda settings: UbxParser(settings, wanted=(TimeMessage,)),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -47,6 +48,7 @@ INS_PVA = nov.InsPva(WEEK, 345_600.005, 47.5, 9.25, 448.5, 10.0, 20.0, 3.0, 1.0,
 INS_PVAX = nov.InsPvax(3, 56, 47.5, 9.25, 400.0, 48.5, 10.0, 20.0, 3.0, 1.0, 2.0, 90.0, *(0.5,) * 9, 0, 0)
 RAW_IMU = nov.RawImu(WEEK, 345_600.005, 7, 1000, -200, 30, 400, -50, 6)
 HEADING = nov.Heading2(0, 50, 2.0, 359.5, -1.5, 0.0, 0.25, 0.5, b"ROVR", b"MSTR", 20, 20, 20, 20, 0, 0, 0, 0)
+ONE_STATION = nov.Heading(*HEADING[:8], b"MSTR", *HEADING[10:])
 MARK = nov.MarkTime(WEEK, 604_799.9999999, -2e-7, 1e-8, -18.0, 0)
 
 
@@ -118,6 +120,8 @@ def early_logs() -> dict[str, bytes]:
         "BESTPOS": BEST_POS,
         "BESTVEL": BEST_VEL,
         "HEADING2": HEADING,
+        "HEADING": ONE_STATION,
+        "DUALANTENNAHEADING": ONE_STATION,
         "MARK1TIME": MARK._replace(week=week),
         "INSPVA": INS_PVA._replace(week=week),
         "INSPVAS": INS_PVA._replace(week=week),
@@ -261,6 +265,9 @@ def test_headings_and_event_marks_are_decoded() -> None:
     heading = one(encode_log("HEADING2", HEADING, WEEK, MS), GnssHeading)
     assert math.degrees(heading.heading_rad) == pytest.approx(359.5)
     assert (heading.baseline_m, heading.valid) == (2.0, True)
+    for name in ("HEADING", "DUALANTENNAHEADING"):
+        same = one(encode_log(name, ONE_STATION, WEEK, MS), GnssHeading)
+        assert same == replace(heading, message=name)
     mark = one(encode_log("MARK2TIME", MARK, WEEK, MS), EventMark)
     assert (mark.channel, mark.rising) == ("MARK2", None), "MARKCONTROL's polarity is in no log"
     assert mark.time.week == WEEK + 1, "the receiver's clock is behind: GPS time is in the next week"

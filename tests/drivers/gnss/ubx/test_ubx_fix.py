@@ -20,7 +20,7 @@ from swath.drivers.gnss.ubx.fix import FORGET_AFTER_SENTENCES, geodetic_from_ece
 from swath.drivers.gnss.ubx.parser import UbxParser
 from swath.drivers.imu.ubx_esf import make_imu_parser
 from swath.drivers.parser import DeviceSettings, DriverSettingsError
-from swath.georef.records import DeviceStatus, FixType, GnssFix, ImuSamples, InsSolution, Record, TimeScale
+from swath.georef.records import DeviceStatus, FixType, GnssFix, GnssHeading, ImuSamples, InsSolution, Record, TimeScale
 from tests.drivers.builders import of_type, rows_of, times
 from tests.drivers.gnss.builders import fixes
 from tests.drivers.harness import check_bytewise, check_random_reads, feed_pieces
@@ -169,6 +169,53 @@ def test_nav_pvat_written_by_pyubx2_is_read() -> None:
     assert row["velocity_l"].tolist() == [50.0, -10.0, 1.5]
     without = UBXMessage("NAV", "NAV-PVAT", GET, **(values | {"vehHeadingValid": 0})).serialize()
     assert of_type(parse(without)[0], InsSolution) == []
+
+
+# --- two receivers on one body ---
+
+RELPOS_MM = (1200.3, -900.4, 150.2)  # from the reference's antenna to this receiver's: north, east, down
+
+
+def relposned(flags: int, **changes: int) -> bytes:
+    north, east, down = (round(value) for value in RELPOS_MM)
+    length = math.hypot(*RELPOS_MM)
+    message = ubx.NavRelposned(
+        *(1, 0, TOW_MS, north // 10, east // 10, down // 10, int(length // 10)),
+        round(math.degrees(math.atan2(RELPOS_MM[1], RELPOS_MM[0])) % 360.0 * 1e5),
+        *(north % 10 * 10, east % 10 * 10, down % 10 * 10, round(length % 10 * 10), 30, 30, 60, 40, 25_000, flags),
+    )
+    return ubx.NAV_RELPOSNED.encode(message._replace(**changes))
+
+
+def test_relposned_gives_the_direction_to_the_references_antenna() -> None:
+    """The receiver sends its own antenna's positions, so it is the primary; the vector has the other direction."""
+    frame = relposned(0x137)
+    theirs = UBXReader.parse(frame)
+    assert (theirs.relPosN, theirs.relPosE, theirs.relPosD) == pytest.approx((120.0, -90.0, 15.0), abs=0.2)
+    assert (theirs.isMoving, theirs.relPosHeadingValid, theirs.carrSoln, theirs.accHeading) == (1, 1, 2, 0.25)
+    (heading,) = of_type(parse(frame)[0], GnssHeading)
+    to_reference = -np.array(RELPOS_MM)
+    assert heading.heading_rad == pytest.approx(math.atan2(to_reference[1], to_reference[0]) % math.tau, abs=1e-4)
+    assert heading.pitch_rad == pytest.approx(math.asin(-to_reference[2] / np.linalg.norm(to_reference)), abs=1e-3)
+    assert heading.baseline_m == pytest.approx(np.linalg.norm(RELPOS_MM) / 1e3, abs=1e-4)
+    assert math.degrees(heading.heading_sigma_rad or 0.0) == pytest.approx(0.25)
+    assert heading.pitch_sigma_rad == pytest.approx(0.006 / 1.508, rel=1e-3)
+    assert (heading.valid, heading.time and heading.time.time_ns) == (True, TOW_MS * 1_000_000)
+
+
+def test_relposned_counts_with_fixed_ambiguities_and_a_moving_reference_only() -> None:
+    for flags, valid, errors in (
+        (0x12F, False, {"heading_not_fixed": 1}),
+        (0x037, False, {"heading_not_valid": 1}),
+    ):
+        records, parser = parse(relposned(flags))
+        (heading,) = of_type(records, GnssHeading)
+        assert (heading.valid, parser.counters.errors) == (valid, errors)
+    assert parse(relposned(0x117))[0] == []  # a base station on the ground
+    records, parser = parse(relposned(0x137, version=0))
+    assert (records, parser.counters.errors) == ([], {"relposned_version": 1})
+    (normalised,) = of_type(parse(relposned(0x337))[0], GnssHeading)
+    assert normalised.baseline_m is None
 
 
 FORCE, RATE = (0.5, -0.25, -9.75), (0.1, -0.2, 0.3)
