@@ -49,6 +49,7 @@ class Header:
         verdict_reasons: why the verdict is not simply good, one sentence each.
         held: keys of parameters that were requested but not estimated.
         trajectory: ``navigated``, ``ins`` or ``file``, the source of the trajectory; empty: not known.
+        flown: time of the first return used, with its time zone; None: not known.
     """
 
     id: str
@@ -65,6 +66,7 @@ class Header:
     verdict_reasons: tuple[str, ...] = ()
     held: tuple[str, ...] = ()
     trajectory: str = ""
+    flown: dt.datetime | None = None
 
 
 def calibration_text(calibration: Calibration, header: Header) -> str:
@@ -106,7 +108,8 @@ def _header(calibration: Calibration, header: Header) -> dict[str, Any]:
     rows: dict[str, Any] = {
         "id": header.id,
         "scanner": calibration.scanner,
-        "created": _utc(header.created),
+        "created": _utc(header.created, "created"),
+        "flown": None if header.flown is None else _utc(header.flown, "flown"),
         "conventions": CONVENTIONS,
         "scanner_model": header.scanner_model,
         "scanner_serial": header.scanner_serial,
@@ -223,9 +226,9 @@ def _optional(value: float | None) -> float | None:
     return None if value is None else in_unit(float(value), 1.0)
 
 
-def _utc(value: dt.datetime) -> dt.datetime:
+def _utc(value: dt.datetime, key: str) -> dt.datetime:
     if value.utcoffset() is None:
-        raise CalibrationFileError(f"created: {value.isoformat()} has no time zone; give it in UTC")
+        raise CalibrationFileError(f"{key}: {value.isoformat()} has no time zone; give it in UTC")
     return value.astimezone(dt.UTC)
 
 

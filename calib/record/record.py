@@ -35,6 +35,8 @@ NOTE = (
 )
 
 
+IDENTITY = ("scanner", "scanner_model", "scanner_serial", "installation")  # as in the calibration's file
+
 _LONGEST_KEY = 80  # greatest length of a name for the search of similar ones
 
 
@@ -78,12 +80,14 @@ class Record:
         values: by ``CLASS.attribute``, in the order of the dictionary.
         missing: mandatory attributes without a value.
         attachment: name of the file with the matrices; empty: none.
+        identity: what is known of `IDENTITY`.
     """
 
     id: str
     values: Mapping[str, Value]
     missing: tuple[str, ...]
     attachment: str = ""
+    identity: Mapping[str, str] = field(default_factory=dict)
 
     def arrays(self) -> dict[str, np.ndarray[Any, np.dtype[np.float64]]]:
         """Return the matrices by attribute, for `numpy.savez_compressed`."""
@@ -102,7 +106,10 @@ def record_of(given: RecordInput) -> Record:
     found |= {**given.known, **told}
     values = {row.key: found[row.key] for row in ROWS if row.key in found}
     missing = tuple(row.key for row in ROWS if row.obligation == "M" and row.key not in values)
-    return Record(given.header.id, values, missing, given.attachment)
+    header = given.header
+    identity = (given.scanner, header.scanner_model, header.scanner_serial, header.installation)
+    known = {key: word for key, word in zip(IDENTITY, identity, strict=True) if word}
+    return Record(header.id, values, missing, given.attachment, known)
 
 
 def told_value(key: str, value: Plain, note: str = "as told") -> Value:
@@ -157,7 +164,7 @@ def _document(record: Record) -> Document:
             attributes = [_attribute(row, record.values[row.key], record.attachment) for row in rows]
             classes.append(_of_class(owner) | {"attributes": attributes})
     missing = [{"class": BY_KEY[key].owner, "name": BY_KEY[key].name} for key in record.missing]
-    head = {"version": VERSION, "id": record.id, "note": NOTE}
+    head = {"version": VERSION, "id": record.id, **record.identity, "note": NOTE}
     return head | {"classes": classes, "missing": missing}
 
 
@@ -189,7 +196,8 @@ def record_xml(record: Record) -> str:
 def document_xml(document: Document) -> str:
     """Return the XML text of a document that holds a record's JSON."""
     ET.register_namespace("cr", NAMESPACE)
-    head = {"version": str(document["version"]), "id": _clean(document["id"])}
+    head = {"version": str(document["version"])}
+    head |= {key: _clean(document[key]) for key in ("id", *IDENTITY) if key in document}
     root = ET.Element(_tag("calibrationRecord"), head)
     ET.SubElement(root, _tag("note")).text = document["note"]
     for owner in document["classes"]:
@@ -251,6 +259,7 @@ def read_document(text: str, name: str) -> Document:
         document = json.loads(text, parse_constant=_refuse)
         json.dumps(document, ensure_ascii=False).encode()  # raises an error for half a surrogate pair, which is no text
         known = document["version"] == VERSION and is_document(document)
+        known &= all(isinstance(document.get(key, ""), str) for key in IDENTITY)
         named = [(owner["name"], one["name"]) for owner in document["classes"] for one in owner["attributes"]]
         lost = [(one["class"], one["name"]) for one in document["missing"]]
     except (ValueError, KeyError, TypeError, RecursionError):

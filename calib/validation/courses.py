@@ -30,9 +30,10 @@ from swath.calib.validation.history import (
     Compared,
     HistoryError,
     compare,
-    created_s,
+    created_words,
     date_words,
     difference_between,
+    flown_s,
     trend_of,
 )
 from swath.georef.arrays import FloatArray
@@ -102,14 +103,14 @@ class Step:
     Attributes:
         compared: their differences; None: they cannot be compared.
         before, after: their dates.
-        remounted: their mountings differ.
+        remounted: their mountings differ; None: one is not known.
         why_not: why they were not compared; empty: they were.
     """
 
     compared: Compared | None
     before: str
     after: str
-    remounted: bool
+    remounted: bool | None
     why_not: str = ""
 
     @property
@@ -120,7 +121,8 @@ class Step:
     @property
     def words(self) -> str:
         """The step in one line."""
-        when = f"{self.before} to {self.after}" + (", mounted anew" if self.remounted else "")
+        mounted = {True: ", mounted anew", None: ", perhaps mounted anew", False: ""}[self.remounted]
+        when = f"{self.before} to {self.after}{mounted}"
         if self.compared is None:
             return f"{when}: not tested: {self.why_not}"
         step = self.compared
@@ -149,11 +151,11 @@ class Step:
 
 @dataclass(frozen=True, eq=False)
 class ScannerCourse:
-    """All calibrations of one scanner, by time.
+    """All calibrations of one scanner, by the times of their flights.
 
     Attributes:
         scanner, serial: of the calibrations; serial: empty if it is not recorded.
-        entries: calibrations; times_s: seconds since 1970; mountings: of each.
+        entries: calibrations; times_s: of their flights, seconds since 1970; mountings: of each.
         steps: from each calibration with sigmas to the next one.
         courses: by mounting, of every parameter that was estimated there.
     """
@@ -182,7 +184,13 @@ class ScannerCourse:
             "scanner": self.scanner,
             "serial": self.serial or None,
             "calibrations": [
-                {"id": entry.id, "created": date_words(time), "mounting": mounting, "method": entry.method}
+                {
+                    "id": entry.id,
+                    "flown": date_words(time),
+                    "created": created_words(entry),
+                    "mounting": mounting,
+                    "method": entry.method,
+                }
                 | {"parameters": {one.key: entry.value(one.name) / one.factor for one in PARAMETERS}}
                 | {"sigmas": {one.key: sigma for one in PARAMETERS if (sigma := _sigma(entry, one.name) / one.factor)}}
                 for entry, time, mounting in zip(self.entries, self.times_s, self.mountings, strict=True)
@@ -197,38 +205,68 @@ class ScannerCourse:
 def courses(calibrations: Sequence[Calibration]) -> tuple[ScannerCourse, ...]:
     """Return the course of each scanner, told by its serial number where that is recorded, or else by its name.
 
+    A calibration without serial number belongs to the only scanner of its name that has one, unless its mounting
+    contradicts.
+
     Raises:
-        HistoryError: a calibration has no creation time.
+        HistoryError: a calibration has no time.
     """
     groups: dict[tuple[str, str], list[tuple[float, Calibration]]] = {}
-    for one in calibrations:
-        serial = str(one.header.get("scanner_serial") or "")
+    for one in sorted(calibrations, key=lambda entry: not _serial(entry)):  # those with serial number first
+        serial = _serial(one)
         key = (f"{one.header.get('scanner_model') or ''} {serial}", "") if serial else ("", one.scanner)
-        groups.setdefault(key, []).append((created_s(one), one))
+        if not serial:
+            named = [other for other, group in groups.items() if other[0] and _same_scanner(one, group)]
+            key = named[0] if len(named) == 1 else key
+        groups.setdefault(key, []).append((flown_s(one), one))
     found = [_of_scanner(sorted(group, key=lambda entry: entry[0])) for group in groups.values()]
     return tuple(sorted(found, key=lambda one: (one.scanner, one.serial)))
 
 
+def _same_scanner(one: Calibration, group: Sequence[tuple[float, Calibration]]) -> bool:
+    """Return whether a calibration without serial number may be one of a scanner's: name, and mounting if recorded."""
+    names = {entry.scanner for _, entry in group}
+    mountings = {str(entry.header.get("installation") or "") for _, entry in group}
+    mounting = str(one.header.get("installation") or "")
+    return one.scanner in names and (not mounting or mounting in mountings)
+
+
+def _serial(one: Calibration) -> str:
+    return str(one.header.get("scanner_serial") or "")
+
+
 def _of_scanner(group: list[tuple[float, Calibration]]) -> ScannerCourse:
     entries, times_s = tuple(entry for _, entry in group), tuple(time for time, _ in group)
-    mountings = tuple(str(entry.header.get("installation") or UNKNOWN_MOUNTING) for entry in entries)
+    mountings = _mountings(entries)
     estimated = [at for at, entry in enumerate(entries) if (entry.sigmas > 0.0).any()]
     steps, broken = [], set()
     for one, two in pairwise(estimated):
-        step = _step((times_s[one], entries[one]), (times_s[two], entries[two]), mountings[one] != mountings[two])
+        remounted = None if UNKNOWN_MOUNTING in (mountings[one], mountings[two]) else mountings[one] != mountings[two]
+        step = _step((times_s[one], entries[one]), (times_s[two], entries[two]), remounted)
         steps.append(step)
-        if step.why_not and not step.remounted:
+        if step.why_not and mountings[one] == mountings[two]:
             broken.add(mountings[one])
     by_mounting = {
         mounting: tuple(_courses([group[at] for at in estimated if mountings[at] == mounting], mounting in broken))
         for mounting in dict.fromkeys(mountings[at] for at in estimated)
     }
     names = " and ".join(dict.fromkeys(entry.scanner for entry in entries))
-    serial = str(entries[-1].header.get("scanner_serial") or "")
+    serial = next((known for entry in reversed(entries) if (known := _serial(entry))), "")
     return ScannerCourse(names, serial, entries, times_s, mountings, tuple(steps), by_mounting)
 
 
-def _step(one: tuple[float, Calibration], two: tuple[float, Calibration], remounted: bool) -> Step:
+def _mountings(entries: Sequence[Calibration]) -> tuple[str, ...]:
+    """Return the mounting of each; where it is not recorded, that of both neighbours in time if they have the same."""
+    told = [str(entry.header.get("installation") or "") for entry in entries]
+    found = []
+    for at, mounting in enumerate(told):
+        before = next((one for one in reversed(told[:at]) if one), "")
+        after = next((one for one in told[at + 1 :] if one), "")
+        found.append(mounting or (before if before == after and before else UNKNOWN_MOUNTING))
+    return tuple(found)
+
+
+def _step(one: tuple[float, Calibration], two: tuple[float, Calibration], remounted: bool | None) -> Step:
     dates = date_words(one[0])[:10], date_words(two[0])[:10]
     try:
         compared = compare(one[1], two[1])

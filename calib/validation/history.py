@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import datetime as dt
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -37,7 +38,8 @@ NO_BEAM = BeamCorrection()
 
 BORESIGHT = ("omega_rad", "phi_rad", "kappa_rad")
 ALPHA = 0.001
-EARLIEST, LATEST = 1980, 2500  # years in which calibrations can have been made
+EARLIEST, LATEST = 1980, 2500  # years in which calibrations can have been flown and made
+LOG_START = re.compile(r"(?<!\d)(\d{8}T\d{6})Z")  # in the name of a session
 FEWEST_FOR_TREND = 3
 YEAR_S = 365.25 * 86_400.0
 
@@ -162,7 +164,7 @@ class History:
 
     Attributes:
         scanner, installation: of the calibrations.
-        entries: in the order of time; times: (n,) seconds since 1970.
+        entries: in the order of their flights; times: (n,) of the flights, seconds since 1970.
         steps: each against the one before, boresight only; without those that cannot be compared.
         trends: of the boresight; empty: too few calibrations, or some that cannot be compared.
         sentences: the verdict.
@@ -182,10 +184,10 @@ class History:
         return any(step.moved for step in self.steps) or any(trend.p < ALPHA for trend in self.trends)
 
     def table(self) -> list[dict[str, Any]]:
-        """Return one row per calibration: id, time, method, and the boresight with its sigmas, degrees."""
+        """Return one row per calibration: id, flight, method, and the boresight with its sigmas, degrees."""
         rows = []
         for entry, time in zip(self.entries, self.times, strict=True):
-            row: dict[str, Any] = {"id": entry.id, "created": date_words(time), "method": entry.method}
+            row: dict[str, Any] = {"id": entry.id, "flown": date_words(time), "method": entry.method}
             for name in BORESIGHT:
                 key = PARAMETERS[INDEX[name]].key
                 row[key] = math.degrees(entry.value(name))
@@ -216,22 +218,42 @@ class History:
         }
 
 
-def created_s(one: Calibration) -> float:
-    """Return when a calibration was made, seconds since 1970.
+def flown_s(one: Calibration) -> float:
+    """Return when a calibration was flown, seconds since 1970.
+
+    That is `calibration.flown`, or the earliest start in the names of its logs, or else the time when it was made.
 
     Raises:
-        HistoryError: the file does not tell it.
+        HistoryError: the file tells none of them.
     """
-    created = one.header.get("created")
-    if not isinstance(created, dt.datetime):
+    if "flown" in one.header:
+        return _time_s(one, "flown")
+    logs = one.header.get("logs")
+    names = [str(log.get("name")) for log in logs if isinstance(log, Mapping)] if isinstance(logs, list | tuple) else []
+    starts = [start for name in names if (start := _start_s(name)) is not None]
+    return min(starts) if starts else _time_s(one, "created")
+
+
+def _start_s(name: str) -> float | None:
+    """Return the start that the name of a log contains, such as ``north-20260615T090000Z-a6f2_0.mcap``."""
+    found = LOG_START.search(name)
+    try:
+        start = dt.datetime.strptime(found[1], "%Y%m%dT%H%M%S").replace(tzinfo=dt.UTC) if found else None
+    except ValueError:  # digits that are no date
+        return None
+    return start.timestamp() if start and EARLIEST <= start.year <= LATEST else None
+
+
+def _time_s(one: Calibration, key: str) -> float:
+    time = one.header.get(key)
+    if not isinstance(time, dt.datetime):
+        raise HistoryError(f"calibration {one.id}: calibration.{key} is not a time; write it like 2026-11-21T10:15:00Z")
+    if not EARLIEST <= time.year <= LATEST:
+        when = "made" if key == "created" else key
         raise HistoryError(
-            f"calibration {one.id}: calibration.created is not a time; write it like 2026-11-21T10:15:00Z"
+            f"calibration {one.id}: calibration.{key} lies in the year {time.year}; give the time when it was {when}"
         )
-    if not EARLIEST <= created.year <= LATEST:
-        raise HistoryError(
-            f"calibration {one.id}: calibration.created lies in the year {created.year}; give the time when it was made"
-        )
-    return (created if created.tzinfo else created.replace(tzinfo=dt.UTC)).timestamp()
+    return (time if time.tzinfo else time.replace(tzinfo=dt.UTC)).timestamp()
 
 
 def history(calibrations: Sequence[Calibration]) -> tuple[History, ...]:
@@ -240,7 +262,7 @@ def history(calibrations: Sequence[Calibration]) -> tuple[History, ...]:
     Calibrations without any estimate (``method = "nominal"``) have no sigmas and are listed, but not tested.
 
     Raises:
-        HistoryError: a calibration has no creation time or no installation, or occurs twice.
+        HistoryError: a calibration has no time or no installation, or occurs twice.
     """
     groups: dict[tuple[str, str], list[tuple[float, Calibration]]] = {}
     seen: set[str] = set()
@@ -248,7 +270,7 @@ def history(calibrations: Sequence[Calibration]) -> tuple[History, ...]:
         installation = one.header.get("installation")
         if not installation:
             raise HistoryError(f"calibration {one.id}: has no calibration.installation; a history needs it")
-        time = created_s(one)
+        time = flown_s(one)
         if one.id in seen:
             raise HistoryError(f"calibration {one.id}: is given twice; give each calibration once")
         seen.add(one.id)
@@ -308,6 +330,11 @@ def _sentences(scanner: str, steps: Sequence[Compared], trends: Sequence[Trend],
             found.append(f"{scanner}: {key} drifts by {text} a year (p {trend.p:.2g})")
     worst = min(step.p for step in steps)
     return found or [f"{scanner}: the boresight has not moved: {len(steps)} steps, the least likely with p {worst:.2g}"]
+
+
+def created_words(one: Calibration) -> str:
+    """Return when a calibration was made, in UTC; empty if its file does not tell it."""
+    return date_words(_time_s(one, "created")) if isinstance(one.header.get("created"), dt.datetime) else ""
 
 
 def date_words(time_s: float) -> str:

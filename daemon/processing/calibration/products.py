@@ -22,7 +22,7 @@ from swath.calib.outcome import Adjusted
 from swath.calib.parameters import ANGLES
 from swath.calib.profiles.check import Check
 from swath.calib.record.record import RecordInput, record_json, record_of, record_xml
-from swath.calib.record.values import Plain
+from swath.calib.record.values import Plain, utc_text
 from swath.calib.strips.cells import StripRules
 from swath.calib.strips.differences import differences
 from swath.calib.strips.effects import SeenFrom
@@ -194,6 +194,7 @@ def _header(done: Calibrated, name: str, inputs: list[tuple[str, str]]) -> Heade
     return Header(
         id=f"{now:%Y-%m-%dT%H:%M:%SZ}-{digest[:4]}",
         created=now,
+        flown=_flown(done),
         method=method_of(done),
         scanner_model=table.model,
         scanner_serial=table.serial,
@@ -202,6 +203,12 @@ def _header(done: Calibrated, name: str, inputs: list[tuple[str, str]]) -> Heade
         variance_factor=done.adjusted.variance_factor,
         redundancy=done.adjusted.redundancy,
     )
+
+
+def _flown(done: Calibrated) -> dt.datetime | None:
+    """Return the time of the first return used, as `CA_Frames.timeRecording` of the record has it, to the second."""
+    starts = [int(swath.time_ns[0]) for swath in done.flight.swaths if len(swath)]
+    return dt.datetime.fromisoformat(utc_text(min(starts))).replace(microsecond=0) if starts else None
 
 
 def method_of(done: Calibrated) -> str:

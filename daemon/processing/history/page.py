@@ -30,10 +30,10 @@ DPI = 110
 DAYS_BESIDE = 15.0  # least shown on each side of the dates
 COLOURS = ("#2f6690", "#b3541e", "#4f772d", "#7b4b94", "#9c6b00", "#1f7a8c")  # one a mounting
 HOW = (
-    "Points are values with one sigma, a colour for each mounting. Successive calibrations are compared by the χ² of "
-    "all parameters that both estimated, with their correlations. Within one mounting a parameter is constant if "
-    "chance explains its scatter (p of at least 0.001); otherwise a steady drift and a jump between two calibrations "
-    "are tried."
+    "Points are values with one sigma at the dates of the flights, a colour for each mounting. Successive calibrations "
+    "are compared by the χ² of all parameters that both estimated, with their correlations. Within one mounting a "
+    "parameter is constant if chance explains its scatter (p of at least 0.001); otherwise a steady drift and a jump "
+    "between two calibrations are tried."
 )
 
 
@@ -89,7 +89,7 @@ def _of_scanner(one: ScannerCourse, *, several: bool) -> Iterator[Block]:
     steps = [
         [
             f"{step.before} to {step.after}",
-            "yes" if step.remounted else "no",
+            {True: "yes", False: "no", None: "not known"}[step.remounted],
             _change_cell(step),
         ]
         for step in one.steps

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from swath.calib.labels import number, unknown, with_sigma
-from swath.calib.record.record import Document, RecordError, read_document
+from swath.calib.record.record import IDENTITY, Document, RecordError, read_document
 from swath.calib.validation.courses import ScannerCourse, courses
-from swath.calib.validation.history import BORESIGHT, HistoryError, date_words
+from swath.calib.validation.history import BORESIGHT, HistoryError, created_words, date_words
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.text_files import text_of
 from swath.georef.geodesy.rotations import boresight
@@ -70,9 +70,16 @@ def collect(paths: Sequence[Path]) -> Collected:
         where = ", ".join(map(str, paths))
         raise UserError(f"{where}: no calibration there; give folders with files of swath calibrate")
     try:
-        return Collected(courses(list(found.values())), files, tuple(notes))
+        scanners = courses(list(found.values()))
     except HistoryError as error:
         raise UserError(str(error)) from error
+    notes += [
+        f"{files[entry.id]}: tells no serial number, and several scanners may be its {one.scanner}; it stands alone"
+        for one in scanners
+        if not one.serial and any(other.serial and one.scanner in other.scanner.split(" and ") for other in scanners)
+        for entry in one.entries
+    ]
+    return Collected(scanners, files, tuple(notes))
 
 
 def _calibrations(paths: Sequence[Path], notes: list[str]) -> Iterator[tuple[Path, Calibration]]:
@@ -114,11 +121,12 @@ def calibration_of(document: Document, scanner: str) -> Calibration:
 
     Args:
         document: the record.
-        scanner: name of its scanner.
+        scanner: name of its scanner, if the record does not have it.
 
     Raises:
         KeyError, TypeError, ValueError: the record lacks values.
     """
+    scanner = str(document.get("scanner") or scanner)
     by_key = {
         f"{owner['name']}.{entry['name']}": entry for owner in document["classes"] for entry in owner["attributes"]
     }
@@ -131,7 +139,10 @@ def calibration_of(document: Document, scanner: str) -> Calibration:
     sigmas = np.zeros(len(PARAMETERS))
     sigmas[[INDEX[name] for name in names]] = pairs[:, 1]
     created = dt.datetime.fromisoformat(by_key["CA_OpticsSensorGeometry.geometryCalibrationDate"]["value"])
-    return replace(one, id=document["id"], method="record", sigmas=sigmas, header={"created": created})
+    header: dict[str, Any] = {key: document[key] for key in IDENTITY if key in document} | {"created": created}
+    if "CA_Frames.timeRecording" in by_key:
+        header["flown"] = dt.datetime.fromisoformat(by_key["CA_Frames.timeRecording"]["value"])
+    return replace(one, id=document["id"], method="record", sigmas=sigmas, header=header)
 
 
 # ---------------------------------------------------------------------- output
@@ -160,7 +171,7 @@ def _lines(one: ScannerCourse) -> list[str]:
 
 def table_of(one: ScannerCourse) -> tuple[list[str], list[list[str]]]:
     """Return heads and rows of a scanner's table: a calibration a row, with sigmas."""
-    heads = ["date", "calibration", "mounting"]
+    heads = ["flown", "calibration", "mounting"]
     for name in one.names:
         named = unknown(f".{name}")
         heads.append(f"{named.words}, {named.unit}")
@@ -181,12 +192,12 @@ def csv_text(found: Collected) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     keys = [(one, f"{one.key}_sigma") for one in PARAMETERS]
-    head = ["scanner", "scanner_serial", "mounting", "created", "id", "method", "file"]
+    head = ["scanner", "scanner_serial", "mounting", "flown", "created", "id", "method", "file"]
     writer.writerow([*head, *(word for one, sigma in keys for word in (one.key, sigma))])
     for scanner in found.scanners:
         for entry, time, mounting in zip(scanner.entries, scanner.times_s, scanner.mountings, strict=True):
-            row = [entry.scanner, scanner.serial, mounting, date_words(time), entry.id, entry.method]
-            row.append(str(found.files[entry.id]))
+            row = [entry.scanner, scanner.serial, mounting, date_words(time), created_words(entry)]
+            row += [entry.id, entry.method, str(found.files[entry.id])]
             for one, _ in keys:
                 sigma = float(entry.sigmas[INDEX[one.name]]) / one.factor
                 row += [f"{entry.value(one.name) / one.factor:.9g}", f"{sigma:.4g}" if sigma > 0.0 else ""]

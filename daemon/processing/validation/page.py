@@ -211,10 +211,10 @@ def _histories(histories: Iterable[History], picture: bytes | None) -> list[Bloc
     keys = ("omega_deg", "phi_deg", "kappa_deg")
     for one in histories:
         rows = [
-            [row["id"], row["created"], *(_with_sigma(row[key], row[f"{key}_sigma"]) for key in keys)]
+            [row["id"], row["flown"], *(_with_sigma(row[key], row[f"{key}_sigma"]) for key in keys)]
             for row in one.table()
         ]
-        heads = ("calibration", "made", "ω, °", "φ, °", "κ, °")
+        heads = ("calibration", "flown", "ω, °", "φ, °", "κ, °")
         title = f"Calibrations of {one.scanner}" + (f", {one.installation}" if one.installation else "")
         blocks += [Table(title, heads, rows, " ".join(f"{line[0].upper()}{line[1:]}." for line in one.sentences))]
     return [*blocks, *([Image("Boresight over time", data_uri(picture, "image/png"))] if picture else [])]

@@ -368,13 +368,13 @@ def _method(method: Method) -> dict[str, Any]:
 
 
 def _table(one: History) -> list[str]:
-    lines = [f"{'calibration':<28}{'created':<22}" + "".join(f"{key:>20}" for key in ("omega °", "phi °", "kappa °"))]
+    lines = [f"{'calibration':<28}{'flown':<22}" + "".join(f"{key:>20}" for key in ("omega °", "phi °", "kappa °"))]
     for row in one.table():
         values = [
             with_sigma(row[key], row[f"{key}_sigma"], sign=False) if row[f"{key}_sigma"] else number(row[key], ".4f")
             for key in ("omega_deg", "phi_deg", "kappa_deg")
         ]
-        lines.append(f"{row['id']:<28}{row['created']:<22}" + "".join(f"{value:>20}" for value in values))
+        lines.append(f"{row['id']:<28}{row['flown']:<22}" + "".join(f"{value:>20}" for value in values))
     return lines
 
 

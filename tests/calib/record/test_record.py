@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from swath.calib.record.dictionary import BY_KEY, CLASSES, ROWS
 from swath.calib.record.record import (
+    IDENTITY,
     NAMESPACE,
     RecordError,
     RecordInput,
@@ -100,6 +101,7 @@ def from_json(text: str) -> dict[str, Any]:
     """Return the flattened JSON record: text by path."""
     document = json.loads(text)
     found: dict[str, Any] = {"id": document["id"], "version": str(document["version"])}
+    found |= {key: document.get(key) for key in IDENTITY}
     found["missing"] = [f"{one['class']}.{one['name']}" for one in document["missing"]]
     for owner in document["classes"]:
         for attribute in owner["attributes"]:
@@ -121,6 +123,7 @@ def from_xml(text: str) -> dict[str, Any]:
     root = ET.fromstring(text)
     space = {"cr": NAMESPACE}
     found: dict[str, Any] = {"id": root.get("id"), "version": root.get("version")}
+    found |= {key: root.get(key) for key in IDENTITY}
     missing = root.findall("cr:missing/cr:attribute", space)
     found["missing"] = [f"{one.get('class')}.{one.get('name')}" for one in missing]
     for owner in root.findall("cr:class", space):
@@ -146,6 +149,7 @@ def test_json_and_xml_have_the_same_content(outcome: Outcome) -> None:
     record = record_of(given(outcome, told=told, settings={"Swath": "0.1.0"}, attachment="left.npz"))
     assert from_xml(record_xml(record)) == from_json(record_json(record))
     flat = from_json(record_json(record))
+    assert [flat[key] for key in IDENTITY] == ["left", "VQ-780", "S2221234", "HB-ABC/left/2026-03"]
     assert flat["CA_GNSS.numberSatellites"] == ["14"]
     assert flat["SD_Calibration.calibrationAgency"] == ["Geo & <Sons> «Zürich»"]
     assert float(flat["CA_AuxiliaryDevice.leverarm"][2]) == 1.0 / 3.0

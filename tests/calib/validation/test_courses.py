@@ -54,6 +54,36 @@ def test_scatter_within_the_sigmas_is_constant() -> None:
     assert one.steps[0].words.startswith("2026-01-01 to 2026-02-01: no significant change (χ² ")
 
 
+def test_the_flight_dates_a_calibration_not_its_making() -> None:
+    flights = (
+        {"flown": dt.datetime(2026, 4, 9, tzinfo=dt.UTC)},
+        {"logs": [{"name": "north-20260228T235900Z-a6f2_0.mcap"}]},
+    )
+    three = [made(number, 0.25) for number in (1, 2, 3)]
+    late, early = (replace(one, header=one.header | more) for one, more in zip(three, flights, strict=False))
+    (one,) = courses([three[2], late, early])
+    assert [entry.id for entry in one.entries] == ["left-2", "left-3", "left-1"]
+    assert [(step.before, step.after) for step in one.steps] == [
+        ("2026-02-28", "2026-03-01"),
+        ("2026-03-01", "2026-04-09"),
+    ]
+    rows = one.record()["calibrations"]
+    assert (rows[2]["flown"], rows[2]["created"]) == ("2026-04-09T00:00:00Z", "2026-01-01T12:00:00Z")
+
+
+def test_a_calibration_without_serial_number_belongs_to_the_scanner_of_its_name() -> None:
+    """Its mounting is that of its neighbours; where several scanners have its name, nothing is guessed."""
+    bare = made(2, 0.25, mounting="", serial="")
+    (one,) = courses([made(1, 0.25), made(3, 0.25), bare])
+    assert (one.serial, len(one.entries), set(one.mountings)) == ("S-17", 3, {"HB-ABC/left/2026-03"})
+    (moved,) = courses([made(1, 0.25), made(3, 0.25, mounting="HB-ABC/left/2026-09"), bare])
+    assert moved.mountings[1] == "mounting not recorded"
+    assert [step.remounted for step in moved.steps] == [None, None]
+    assert moved.steps[0].words.startswith("2026-01-01 to 2026-02-01, perhaps mounted anew: no significant change")
+    assert len(courses([made(1, 0.25), made(3, 0.25, serial="S-18"), bare])) == 3
+    assert len(courses([made(1, 0.25), made(2, 0.25, mounting="HB-XYZ/left", serial="")])) == 2
+
+
 def test_a_steady_change_is_a_drift() -> None:
     found, _ = course_of([0.250 + 0.004 * month for month in range(6)])
     assert found.kind == "drift"

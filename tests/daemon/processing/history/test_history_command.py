@@ -12,11 +12,18 @@ import numpy as np
 import pytest
 
 from swath.calib.calibration_file import Header, calibration_text
+from swath.calib.record.record import IDENTITY, RecordInput, record_json, record_of
+from swath.calib.validation.history import date_words
 from swath.daemon.cli.main import run_app
 from swath.daemon.errors import ExitCode
+from swath.daemon.processing.history.run import collect
 from swath.georef.scanner.calibration import INDEX, nominal
+from tests.calib.made_outcome import made_outcome
 
 SIGMAS = {"omega_rad": np.radians(0.002), "kappa_rad": np.radians(0.004), "range_offset_m": 0.008}
+
+
+FLOWN = "2025-11-12"  # in tests.calib.made_outcome
 
 
 def write(folder: Path, month: int, omega_deg: float, mounting: str = "HB-ABC/left/2026-01") -> Path:
@@ -58,7 +65,7 @@ def test_the_console_shows_table_changes_and_courses(archive: Path, capsys: pyte
     assert run_app(["history", str(archive)]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == "left, serial S-17: 4 calibrations"
-    assert lines[1].split() == ["date", "calibration", "mounting", "ω", "°", "κ", "°", "Δρ", "m"]
+    assert lines[1].split() == ["flown", "calibration", "mounting", "ω", "°", "κ", "°", "Δρ", "m"]
     assert lines[2].split()[:6] == ["2026-01-05", "cal-1", "HB-ABC/left/2026-01", "0.2500", "±", "0.0020"]
     changed = "2026-02-05 to 2026-03-05: changed: omega_deg +0.0290 ± 0.0028 (10.3 σ)"
     assert any(line.startswith(changed) for line in lines)
@@ -106,6 +113,27 @@ def test_copies_count_once_and_contradicting_ones_are_named(archive: Path, capsy
     edited = f"{archive / 'edited.toml'}: has the id of {archive / '01' / 'left.toml'}, cal-1, but other values"
     assert any(line.startswith(edited) for line in lines)
     assert any(str(archive / "broken.toml") in line and line.endswith("it was left out") for line in lines)
+
+
+def test_a_calibration_only_in_a_record_is_one_of_its_scanner(
+    archive: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Records of today tell the scanner's serial number; in older ones the name is all there is."""
+    made = made_outcome()
+    document = json.loads(
+        record_json(record_of(RecordInput(made.flight, made.features, made.adjusted, "left", made.header)))
+    )
+    (archive / "report").mkdir()
+    record = archive / "report" / "left.record.json"
+    record.write_text(json.dumps(document))
+    collected = collect([archive])
+    assert [(one.serial, len(one.entries)) for one in collected.scanners] == [("S-17", 4), ("S2221234", 1)]
+    assert date_words(collected.scanners[1].times_s[0])[:10] == FLOWN
+    record.write_text(json.dumps({key: value for key, value in document.items() if key not in IDENTITY}))
+    assert run_app(["history", str(archive)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "left, serial S-17: 5 calibrations"
+    assert any(line.startswith(f"{FLOWN}  2026-11-21T10:15:00Z-ab12  mounting not recorded") for line in lines)
 
 
 def test_what_has_no_calibration_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
