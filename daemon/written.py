@@ -24,11 +24,12 @@ _files: list[Path] = []
 _folders: list[Path] = []
 _rests: list[str] = []
 _needed: list[int] = []
+_done: list[str] = []
 
 
 def begin() -> None:
     """Forget everything: another command begins."""
-    for noted in (_files, _folders, _rests, _needed):
+    for noted in (_files, _folders, _rests, _needed, _done):
         noted.clear()
 
 
@@ -40,6 +41,11 @@ def note_written(*paths: Path) -> None:
 def note_rest(words: str) -> None:
     """Note in words something incomplete that stays on purpose; an empty text: it no longer does."""
     _rests[:] = [words] if words else []
+
+
+def note_done(words: str) -> None:
+    """Note in words what a command has done whose work is not a file."""
+    _done[:] = [words]
 
 
 def note_needed(size: float) -> None:
@@ -68,12 +74,12 @@ def remove_empty_folders() -> None:
 
 
 def written_words() -> str:
-    """Return in words which files are complete, and what else stays."""
+    """Return in words which files are complete, or what else was done, and what else stays."""
     names = [str(path) for path in _files if path.exists()]
     if len(names) > NAMED:
         names = [names[-1], f"{len(names) - 1} more files"]
     complete = f"complete: {' and '.join(filter(None, (', '.join(names[:-1]), names[-1])))}" if names else ""
-    return "; ".join(filter(None, (complete or "nothing written", *_rests)))
+    return "; ".join(filter(None, (complete or "".join(_done) or "nothing written", *_rests)))
 
 
 class Reached:

@@ -17,6 +17,7 @@ import typer
 
 from swath.daemon.errors import ExitCode, UserError, one_line
 from swath.daemon.written import NO_ROOM, error_words, make_folder, written_words
+from swath.georef.progress import BYTES
 
 if TYPE_CHECKING:
     from swath.daemon.config import Config
@@ -100,7 +101,7 @@ def _import(config: Config, routes: Routes, captures: list[Capture], output: Pat
     try:
         with progress_bar() as tell:
             return import_captures(
-                config, routes, captures, output, lambda units: tell("reading captures", units, 0, "units")
+                config, routes, captures, output, lambda done, total: tell("reading captures", done, total, BYTES)
             )
     except TransportError as error:
         raise UserError(one_line(str(error)), ExitCode.IO) from error

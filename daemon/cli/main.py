@@ -32,7 +32,7 @@ from swath.daemon.system import keep_freed_memory
 INTERRUPTED = 130  # 128 + SIGINT, as in shells
 PIPE_CLOSED = 141  # 128 + SIGPIPE
 CLEANING_S = 5.0  # after an interrupt, during which another one does not disturb the removal of unfinished files
-WITHOUT_FILES = ("run", "mark", "split", "check", "monitor", "live", "info", "replay", "devices", "doctor", "setup")
+WITHOUT_FILES = ("run", "mark", "split", "check", "monitor", "live", "info", "devices", "doctor", "setup")
 
 HELP = """Record, georeference and calibrate an airborne laser scanner.
 

@@ -10,7 +10,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from swath.daemon.written import note_done
 from swath.georef.progress import BYTES
+
+INTERRUPTED = 130  # 128 + SIGINT
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -31,8 +34,9 @@ def command(
     from swath.daemon.config import load_config
     from swath.daemon.errors import ExitCode, UserError
     from swath.daemon.replay.units import close_outputs, open_outputs
-    from swath.daemon.replay.wire_player import wait_for_readers
+    from swath.daemon.replay.wire_player import PlayReport, wait_for_readers
 
+    note_done("nothing played")
     if not 0 < pace < math.inf:
         raise UserError(f"--pace {pace}: must be a number above 0", exit_code=ExitCode.USAGE)
     config = load_config(wire)
@@ -46,15 +50,26 @@ def command(
     except OSError as error:
         raise UserError(str(error), exit_code=ExitCode.IO) from error
     try:
-        for source in wait_for_readers(outputs, wait, lambda: bool(stop)):
+        waited_for = wait_for_readers(outputs, wait, lambda: bool(stop))
+        for source in [] if stop else waited_for:
             console.print(f"{source}: no reader has opened it; playing without one")
-        for session in sessions:
+        for number, session in enumerate(sessions):
+            report = PlayReport() if stop else _play_session(session, outputs, pace, lambda: bool(stop))
             if stop:
-                break
-            report = _play_session(session, outputs, pace, lambda: bool(stop))
+                note_done(_played_words(report, session, number))
+                raise typer.Exit(INTERRUPTED)
             _tell_report(report, session, outputs, wire, console)
     finally:
         close_outputs(outputs)
+
+
+def _played_words(report: PlayReport, session: Session, whole: int) -> str:
+    """Return what was played up to an interrupt: whole sessions, then the begun one."""
+    count = report.units.total()
+    begun = f"{report.played_s:.1f} s of {session.session_id} ({count:,} unit{'s' if count > 1 else ''})"
+    before = f"{whole} whole session{'s' if whole > 1 else ''}"
+    parts = [*([before] if whole else []), *([begun] if report.units else [])]
+    return f"played {' and '.join(parts)}" if parts else "nothing played"
 
 
 def _open_sessions(logs: list[Path], console: Console) -> list[Session]:

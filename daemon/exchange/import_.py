@@ -5,8 +5,11 @@ Files are merged by time, each read in its own order and never held in memory as
 
 from __future__ import annotations
 
+import contextlib
 import heapq
+import os
 import platform
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -82,7 +85,7 @@ def import_captures(
     routes: Routes,
     captures: list[Capture],
     directory: Path,
-    progress: Callable[[int], None] = lambda _: None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> ImportReport:
     """Make a log from captures.
 
@@ -91,19 +94,20 @@ def import_captures(
         routes: of the same configuration.
         captures: read here, once; each holds the counts of its units afterwards.
         directory: of the log; created if necessary.
-        progress: called occasionally with the number of units so far.
+        progress: called occasionally with the bytes of the files that are read, and those of all.
 
     Raises:
         UserError: the log exists already.
         OSError: it cannot be written; nothing is left of it.
     """
     log: ImportLog | None = None
+    read_so_far = ReadSoFar(captures)
     try:
         for number, unit in enumerate(merge(captures, routes)):
             log = log or ImportLog(config, directory, unit.time_ns)
             log.add(unit)
             if number % 10_000 == 0:
-                progress(number)
+                progress(read_so_far(), read_so_far.total)
         if log is None:
             return ImportReport("", [], {})
         for capture in captures:
@@ -114,6 +118,32 @@ def import_captures(
             log.give_up()
         raise
     return ImportReport(log.info.session_id, log.paths, log.units())
+
+
+class ReadSoFar:
+    """Measures how far files are read, by the positions at which this process has them open.
+
+    Attributes:
+        total: bytes of all files; a compressed file counts as it is on the disk.
+    """
+
+    def __init__(self, captures: Iterable[Capture]) -> None:
+        paths = [capture.path.resolve() for capture in captures]
+        self._sizes = Counter({path: path.stat().st_size for path in set(paths) if path.exists()})
+        self._readers = Counter(path for path in paths if path in self._sizes)
+        self.total = sum(self._sizes[path] * count for path, count in self._readers.items())
+
+    def __call__(self) -> int:
+        """Return the bytes that are read; a file that is no longer open is read to its end."""
+        done, still_open = 0, Counter[Path]()
+        for entry in Path("/proc/self/fd").iterdir():
+            with contextlib.suppress(OSError, ValueError):  # the descriptor of this very loop is closed already
+                path = Path(os.readlink(entry))
+                if path in self._readers:
+                    still_open[path] += 1
+                    done += os.lseek(int(entry.name), 0, os.SEEK_CUR)
+        ended = self._readers - still_open
+        return min(self.total, done + sum(self._sizes[path] * count for path, count in ended.items()))
 
 
 def _note(log: ImportLog, capture: Capture) -> None:

@@ -286,6 +286,7 @@ class PlayReport:
         refused: units that no reader took in time.
         passed_over: units of sources without an output.
         latest_s: the largest delay of a unit.
+        played_s: recorded time from the first to the last unit, without steps.
         jumps: number of time steps of more than an hour, forwards or back, for which the player did not wait.
     """
 
@@ -294,6 +295,7 @@ class PlayReport:
     refused: Counter[str] = field(default_factory=Counter)
     passed_over: Counter[str] = field(default_factory=Counter)
     latest_s: float = 0.0
+    played_s: float = 0.0
     jumps: int = 0
 
 
@@ -325,6 +327,8 @@ def play(
     last_ns = 0
     told_s = 0.0
     for unit in units:
+        if stopped():
+            break
         if unit.source not in outputs:
             report.passed_over[unit.source] += 1
             continue
@@ -341,6 +345,7 @@ def play(
             break
         sent = outputs[unit.source].send(unit.data, realtime_ns + round(due_s * 1e9))
         _count(report, unit, sent)
+        report.played_s = due_s * pace
         now_s = (time.monotonic_ns() - start_ns) * 1e-9
         report.latest_s = max(report.latest_s, now_s - due_s)
         if progress is not None and now_s - told_s > 0.1:

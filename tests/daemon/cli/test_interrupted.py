@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -20,9 +22,10 @@ from swath.daemon.errors import ExitCode
 from swath.daemon.processing.files import write_whole
 from swath.daemon.system import ended_in_order, held_interrupts
 from swath.daemon.written import make_folder, note_written, remove_empty_folders, written_words
+from tests.daemon.builders import SREP
 from tests.daemon.commands import swath
 from tests.daemon.one_line import Flown, fly
-from tests.daemon.rig import HANGS_S, disk_of, wait_until
+from tests.daemon.rig import HANGS_S, disk_of, free_udp_port, session_table, wait_until
 
 pytestmark = pytest.mark.xdist_group("kernels")
 ROOT = Path(__file__).resolve().parents[3]
@@ -83,6 +86,7 @@ def test_georef_over_earlier_products_leaves_them_whole(flown: Flown, products: 
     ("command", "phase"),
     [
         ("strips", "returns"),
+        ("strips --adjust", "returns"),
         ("calibrate", "returns"),
         ("validate", "returns"),
         ("trajectory", "IMU and GNSS"),
@@ -102,6 +106,7 @@ def test_every_command_leaves_nothing(
     given = ["--trajectory", flown.sbet, "--trajectory-datum", "same", "--workers", "1"]
     arguments: dict[str, list[object]] = {
         "strips": [flown.log, "-o", out, *given],
+        "strips --adjust": [out, flown.log, "--calibration", true, *given],
         "calibrate": [flown.log, "-o", place / "left.toml", *given],
         "validate": [true, flown.log, "-o", out, *given],
         "trajectory": [flown.log, "-o", out],
@@ -117,6 +122,38 @@ def test_every_command_leaves_nothing(
         arguments["import"] = [flown.folder / "swath.toml", tmp_path / "exported" / flown.name, "-o", out]
     assert interrupted(phase, *command.split(), *arguments[command], place=place) == (INTERRUPTED, NOTHING)
     assert list(place.iterdir()) == []
+
+
+@pytest.mark.parametrize("phase", ["checking", "repairing"])
+def test_recover_leaves_nothing_but_the_log(flown: Flown, place: Path, phase: str) -> None:
+    log = flown.copy_of_log(place)
+    os.truncate(log, log.stat().st_size // 2)
+    assert interrupted(phase, "recover", log, place=place) == (INTERRUPTED, NOTHING)
+    assert list(place.iterdir()) == [log]
+    assert log.stat().st_size == flown.log.stat().st_size // 2
+
+
+def test_replay_says_what_it_has_played(flown: Flown, tmp_path: Path) -> None:
+    port = free_udp_port()
+    wire = tmp_path / "wire.toml"
+    wire.write_text(session_table(tmp_path) + SREP.format(port=port))
+    command = [sys.executable, "-m", "swath.daemon.cli.main", "replay", "--wait", "0", "--wire", str(wire)]
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as reader,
+        subprocess.Popen([*command, str(flown.log)], cwd=ROOT, stderr=subprocess.PIPE, text=True) as process,
+    ):
+        reader.bind(("127.0.0.1", port))
+        reader.settimeout(HANGS_S)
+        for _ in range(20):
+            reader.recv(65536)
+        process.send_signal(signal.SIGINT)
+        assert process.stderr is not None
+        said = process.stderr.read()
+        assert process.wait(HANGS_S) == INTERRUPTED
+    found = re.fullmatch(rf"swath: interrupted; played (\d+\.\d) s of {flown.name} \(([\d,]+) units\)\n", said)
+    assert found, said
+    assert 0.0 < float(found[1]) < 10.0
+    assert int(found[2].replace(",", "")) >= 20
 
 
 def test_info_ends_in_one_word(flown: Flown, place: Path) -> None:

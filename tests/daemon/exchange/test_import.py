@@ -15,7 +15,9 @@ import pytest
 
 from swath.daemon.errors import UserError
 from swath.daemon.exchange.capture_files import ImportOptions
+from swath.daemon.exchange.captures import Capture
 from swath.daemon.exchange.export import export_session
+from swath.daemon.exchange.import_ import ReadSoFar
 from swath.daemon.exchange.sidecar import read_sidecar, sidecar_of
 from swath.daemon.log.directory import take_directory
 from swath.daemon.log.reader import open_logs
@@ -50,6 +52,24 @@ def write_pcap(
         data += pcap_frames(times, number, HEAD, ("10.0.0.1", port), np.frombuffer(payload, np.uint8)[None]).tobytes()
     path.write_bytes(data)
     return path
+
+
+def test_progress_counts_the_bytes_read_of_files_as_they_are_on_the_disk(tmp_path: Path) -> None:
+    plain, packed = write_pcap(tmp_path / "a.pcap", [bytes(1000)] * 100), tmp_path / "b.pcap.gz"
+    packed.write_bytes(gzip.compress(plain.read_bytes()))
+    captures = [Capture(path, "pcap") for path in (plain, packed, plain)]
+    sizes = [capture.path.stat().st_size for capture in captures]
+    read = ReadSoFar(captures)
+    assert read.total == sum(sizes)
+    with plain.open("rb") as first, packed.open("rb", buffering=0) as second, plain.open("rb", buffering=0) as third:
+        assert read() == 0
+        first.read()
+        second.read(10)
+        assert read() == sizes[0] + 10
+        first.close()
+        third.read(5)
+        assert read() == sizes[0] + 15
+    assert read() == read.total
 
 
 @pytest.fixture(scope="module")
