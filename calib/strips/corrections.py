@@ -1,7 +1,7 @@
 """Adjust strips after the calibration: correct each strip's trajectory, but no parameter of the scanner.
 
-The calibration is held; each strip gets the simplest correction that its returns justify, as a correction of the
-trajectory (ISO/TS 19159-2, 6.3.3, Eq. 12; FORMULAS 7.3):
+The calibration is held, and its errors are part of the sigmas. Each strip gets the simplest correction that its returns
+justify, as a correction of the trajectory (ISO/TS 19159-2, 6.3.3, Eq. 12; FORMULAS 7.3):
 
     none        0
     constant    a
@@ -38,12 +38,13 @@ from swath.calib.features import Features
 from swath.calib.flight import Flight
 from swath.calib.outcome import TrajectoryFit
 from swath.calib.parameters import ParameterOptions, unknowns
+from swath.calib.parameters import Unknowns as Parameters
 from swath.calib.strips.determined import ALONG, DOWN, LEAST_KNOWN, ORDERS, PITCH, Quadratic, Solved, Unknowns
 from swath.georef.arrays import BoolArray, FloatArray, Int64Array, SingleArray
 from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
 from swath.georef.geodesy.rotations import rot_z
 from swath.georef.progress import Tell, silent
-from swath.georef.scanner.calibration import Calibration
+from swath.georef.scanner.calibration import INDEX, PARAMETERS, Calibration
 from swath.georef.trajectory.trajectory import Trajectory
 
 NONE, CONSTANT = "none", "constant"
@@ -92,6 +93,7 @@ class Components:
 
     Attributes:
         mean, sigma: (6,) m, rad; a component that is not determined has mean 0 and its prior sigma.
+        of_calibration: (6,) part of `sigma` that errors of the held calibration have, m, rad; 0: its file tells none.
         redundancy: (6,) share of the prior variance that the returns take away.
         determined: (6,) flags of components that the returns determine; the others are not corrected.
         absorbs: (6, 6) [i, j]: component i contains the error of component j, which is held. The sigma of i is that of
@@ -102,6 +104,7 @@ class Components:
 
     mean: FloatArray
     sigma: FloatArray
+    of_calibration: FloatArray
     redundancy: FloatArray
     determined: BoolArray
     absorbs: BoolArray
@@ -112,7 +115,7 @@ class Components:
         """Return components that all hold the datum."""
         no = np.zeros(ERRORS, np.bool_)
         zero, unknown = np.zeros(ERRORS), np.full(ERRORS, np.nan)
-        return cls(zero, unknown, zero.copy(), no, np.zeros((ERRORS, ERRORS), np.bool_), ~no)
+        return cls(zero, unknown, zero.copy(), zero.copy(), no, np.zeros((ERRORS, ERRORS), np.bool_), ~no)
 
 
 @dataclass(frozen=True, slots=True)
@@ -256,7 +259,9 @@ class _Equations:
         row_weight: SingleArray | None,
     ) -> None:
         planes = tuple(plane for plane in features.planes if plane.points)
-        self._rows = Rows(flight, planes, unknowns(flight, ParameterOptions(), calibrations), free)
+        held = unknowns(flight, _with_sigmas(flight, calibrations), calibrations)
+        self._held = _roots(held)
+        self._rows = Rows(flight, planes, held, free)
         self._ties = Ties(self._rows, features.ties, None)
         self._weight = TrajectoryWeight(self._rows)
         self._weight.normal = np.zeros_like(self._weight.normal)
@@ -277,12 +282,43 @@ class _Equations:
         to_l = self._weight.to_l
         turned = to_l(to_l(normal).T)
         return Quadratic(
-            (turned + turned.T) / 2.0, to_l(normal @ x - right).ravel(), constant, found.observations - len(x)
+            (turned + turned.T) / 2.0,
+            to_l(normal @ x - right).ravel(),
+            constant,
+            found.observations - len(x),
+            to_l(found.normal[p:, :p] @ self._held),
         )
 
     def moved(self, along: FloatArray) -> State:
         """Return the state with corrections (k, 6) in l; planes are as at the start."""
         return replace(self.start(), knots=self._weight.to_e(along.reshape(-1, 1)).reshape(-1, ERRORS))
+
+
+def _with_sigmas(flight: Flight, calibrations: Mapping[str, Calibration]) -> ParameterOptions:
+    """Return options that let the equations contain each parameter whose sigma its calibration tells."""
+    names = [
+        f"{head.name}.{name}"
+        for head in flight.heads
+        for name, at in INDEX.items()
+        if calibrations[head.name].all_sigmas[at] > 0.0 and name not in head.geometry.without
+    ]
+    return ParameterOptions(free=frozenset(names))
+
+
+def _roots(held: Parameters) -> FloatArray:
+    """Return L (p, h) with L Lᵀ the covariance of the held parameters; scanners' errors count as independent."""
+    covariance = np.zeros((len(held), len(held)))
+    for head, base in enumerate(held.base):
+        places, kinds, _ = held.of_head(head)
+        own = kinds < len(PARAMETERS)
+        covariance[np.ix_(places[own], places[own])] = base.covariance()[np.ix_(kinds[own], kinds[own])]
+    sigmas = np.sqrt(np.diag(covariance))
+    known = np.flatnonzero(sigmas > 0.0)
+    scaled = covariance[np.ix_(known, known)] / np.outer(sigmas[known], sigmas[known])
+    values, vectors = np.linalg.eigh(scaled) if len(known) else (np.zeros(0), np.zeros((0, 0)))
+    roots = np.zeros((len(held), len(known)))
+    roots[known] = sigmas[known, np.newaxis] * vectors * np.sqrt(np.maximum(values, 0.0))
+    return roots
 
 
 def _reduced_square(found: Normals) -> float:
@@ -432,7 +468,8 @@ class _Choice:
     def solved(self, quadratic: Quadratic) -> tuple[FloatArray, FloatArray, float]:
         """Return corrections (k, 6) in l, their sigmas, and how many parameters are determined."""
         found, basis = self._solve(quadratic.of(self._basis), self.models), self._basis[:, self._taken(self.models)]
-        sigmas: FloatArray = np.sqrt(np.maximum(np.einsum("ia,ia->i", basis @ found.covariance, basis), 0.0))
+        variance = np.einsum("ia,ia->i", basis @ found.covariance, basis) + np.sum((basis @ found.held) ** 2, axis=1)
+        sigmas: FloatArray = np.sqrt(np.maximum(variance, 0.0))
         return (basis @ found.values).reshape(-1, ERRORS), sigmas.reshape(-1, ERRORS), found.parameters
 
     def prior_sigmas(self) -> FloatArray:
@@ -469,7 +506,10 @@ class _Choice:
             named = own.component[at]
             one = Components.held()
             one.mean[named] = prior[named] * found.values[at]
-            one.sigma[named] = prior[named] * np.sqrt(np.diag(found.covariance)[at])
+            one.of_calibration[named] = prior[named] * np.sqrt(np.sum(found.held[at] ** 2, axis=1))
+            one.sigma[named] = np.hypot(
+                prior[named] * np.sqrt(np.diag(found.covariance)[at]), one.of_calibration[named]
+            )
             one.redundancy[named] = np.maximum(1.0 - found.left[at], 0.0)
             one.determined[named] = found.determined[at]
             for both in ((ALONG, PITCH), (PITCH, ALONG)):
@@ -492,7 +532,9 @@ class _Choice:
         how = (
             f"models chosen by {name} information criterion" if len(models) > 1 else f"model of all strips: {models[0]}"
         )
-        notes = [f"{how}; the calibration parameters were held, and no sigma here contains theirs"]
+        notes = [how]
+        if not any(one.components.of_calibration.any() for one in told):
+            notes.append("the held calibration's file tells no sigmas, and no sigma here contains its errors")
         if len(self._keys) > MOST_CHOSEN_SINGLY:
             notes.append(f"{len(self._keys)} strips, more than {MOST_CHOSEN_SINGLY}, so all use the same model")
         notes += [

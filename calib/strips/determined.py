@@ -1,5 +1,8 @@
 """Decide which corrections of strips the returns determine, and estimate these (decision 0034; FORMULAS 7.4).
 
+The calibration is held. Its errors move the estimates: with the mixed part M of the normal matrix, of unknowns and held
+parameters, by −C M / f for each unit. What its covariance leaves that way is kept apart (FORMULAS 7.4).
+
 The unknowns are scaled to prior sigmas of 1. N is the returns' normal matrix, b its right-hand side, f the variance
 factor of their misclosures. All unknowns are estimated together, each with its prior:
 
@@ -27,12 +30,18 @@ ORDERS = 3  # of a component's parameters: constant, drift, bends
 
 @dataclass(frozen=True, eq=False)
 class Quadratic:
-    """The function χ²(x) = constant − 2 right · x + x · normal x, of corrections x (6k,) in l or parameters."""
+    """The function χ²(x) = constant − 2 right · x + x · normal x, of corrections x (6k,) in l or parameters.
+
+    Attributes:
+        held: (6k, h) by how much one sigma of each independent error of the held calibration lowers `right`; (6k, 0):
+            its file tells no sigmas.
+    """
 
     normal: FloatArray
     right: FloatArray
     constant: float
     observations: int
+    held: FloatArray
 
     def square(self, x: FloatArray) -> float:
         """Return χ² of corrections or parameters."""
@@ -40,7 +49,13 @@ class Quadratic:
 
     def of(self, basis: FloatArray) -> Quadratic:
         """Return χ² as a function of parameters (u,) with x = basis · parameters."""
-        return Quadratic(basis.T @ self.normal @ basis, basis.T @ self.right, self.constant, self.observations)
+        return Quadratic(
+            basis.T @ self.normal @ basis,
+            basis.T @ self.right,
+            self.constant,
+            self.observations,
+            basis.T @ self.held,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +95,9 @@ class Solved:
         merged: (u,) flags of parameters whose error another one of the strip contains, because the returns show only
             their sum.
         left: (u,) share of the prior variance that the returns leave.
-        covariance: (u, u) of the errors of `values`; of a parameter that contains a merged one: of the sum's.
+        covariance: (u, u) of the errors of `values` by the returns; of a parameter that contains a merged one: of the
+            sum's.
+        held: (u, h) by how much one sigma of each independent error of the held calibration moves `values`.
     """
 
     values: FloatArray
@@ -91,6 +108,7 @@ class Solved:
     merged: BoolArray
     left: FloatArray
     covariance: FloatArray
+    held: FloatArray
 
     @property
     def parameters(self) -> float:
@@ -120,9 +138,11 @@ class Solved:
             left[free] = np.diag(covariance)[free]
         whole = np.where(free, covariance @ np.where(free, right, 0.0) / factor, 0.0)
         determined = _determined(left, unknowns) & free
+        held = -covariance @ np.where(free[:, np.newaxis], quadratic.held[columns], 0.0) / factor
+        held[~determined] = 0.0
         covariance[np.ix_(~determined, ~determined)] = np.eye(int((~determined).sum()))
         values = np.where(determined, whole, 0.0)
-        return cls(values, whole, square, freedom, determined, merged, left, covariance)
+        return cls(values, whole, square, freedom, determined, merged, left, covariance, held)
 
 
 def _left(normal: FloatArray, factor: float) -> FloatArray:

@@ -16,6 +16,7 @@ from swath.calib.strips import determined as strip_unknowns
 from swath.calib.strips.corrections import Settings, StripAdjusted, StripError, adjust_strips
 from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.rotations import rot_z
+from swath.georef.scanner.calibration import INDEX
 from tests.calib.planned_flight import ONE_HEIGHT, flown, noised
 
 pytestmark = pytest.mark.xdist_group("kernels")
@@ -276,6 +277,66 @@ def test_corrected_heights_are_no_worse_and_sigmas_honest(scale: float) -> None:
         assert len(square) >= 70
         assert 0.7 < square.mean() < 1.6
         assert square.max() < 4.5**2
+
+
+@pytest.mark.slow
+def test_sigmas_contain_the_errors_of_the_held_calibration(clean: tuple[Flight, Features]) -> None:
+    """Thirty flights whose calibration errs by its own covariance; control makes all corrections absolute."""
+    flight, features = clean
+    planes = tuple(
+        replace(plane, control=(ControlPoint(f"c{index}", plane.centre_t, 0.005),))
+        for index, plane in enumerate(features.planes)
+    )
+    features, (start,) = replace(features, planes=planes), flight.starts().values()
+    at = [INDEX[name] for name in ("omega_rad", "phi_rad", "kappa_rad", "range_offset_m")]
+    sigmas, correlation = np.zeros(len(INDEX)), np.eye(len(INDEX))
+    sigmas[at] = [*np.radians([0.004, 0.006, 0.008]), 0.01]
+    correlation[at[0], at[1]] = correlation[at[1], at[0]] = 0.6
+    told = replace(start, sigmas=sigmas, held_sigmas=np.zeros(len(INDEX)), correlation=correlation)
+    rng, courses = np.random.default_rng(5), (0.0, 180.0, 0.0, 0.0, 90.0, 270.0)
+    with_it: dict[int, list[float]] = {component: [] for component in range(6)}
+    without_it: list[float] = []
+    for run in range(30):
+        true = PRIORS * rng.standard_normal(6) * [0, 1, 1, 1, 0, 1]  # along and pitch: the returns show their sum
+        bad = spoilt(noised(flight, 900 + run), 3, np.tile(turned(true, courses[2]), (2, 1)))
+        error = rng.multivariate_normal(np.zeros(len(INDEX)), told.covariance())
+        held = {start.scanner: replace(told, parameters=told.parameters + error)}
+        for choice in adjust_strips(bad, features, held, replace(Settings(), models=("constant",))).choices:
+            found = choice.components
+            left = (true if choice.strip == 3 else 0.0) - found.mean
+            by_returns = np.sqrt(found.sigma**2 - found.of_calibration**2)
+            for component in np.flatnonzero(found.determined).tolist():
+                with_it[component].append(float(left[component] / found.sigma[component]))
+                without_it.append(float(left[component] / by_returns[component]))
+    assert all(len(with_it[component]) >= 100 for component in (1, 2, 3, 5))
+    for ratios in with_it.values():
+        if len(ratios) >= 100:
+            assert 0.6 < np.mean(np.square(ratios)) < 1.6
+    assert np.mean(np.square(without_it)) > 5.0
+
+
+def test_the_held_calibration_is_part_of_the_sigmas(clean: tuple[Flight, Features]) -> None:
+    """Roll of 0.004° turns into roll; a file without sigmas adds nothing, and a note says so."""
+    flight, features = clean
+    bad = spoilt(flight, 3, np.tile([0.0, 0.0, 0.15, 0.0, 0.0, 0.0], (2, 1)))
+    (start,) = flight.starts().values()
+    sigmas = np.zeros(len(INDEX))
+    sigmas[INDEX["omega_rad"]] = np.radians(0.004)
+    bare = replace(start, sigmas=np.zeros(len(INDEX)), held_sigmas=np.zeros(len(INDEX)))
+    told = replace(bare, sigmas=sigmas, correlation=np.eye(len(INDEX)))
+    settings = replace(Settings(), models=("none", "constant"))
+    without, with_it = (adjust_strips(bad, features, {start.scanner: held}, settings) for held in (bare, told))
+    lacks = "the held calibration's file tells no sigmas, and no sigma here contains its errors"
+    assert lacks in without.notes
+    assert lacks not in with_it.notes
+    one, two = (result.choices[2].components for result in (without, with_it))
+    assert not one.of_calibration.any()
+    np.testing.assert_array_equal(one.mean, two.mean)
+    np.testing.assert_allclose(two.sigma**2, one.sigma**2 + two.of_calibration**2)
+    assert two.of_calibration[1:].any()
+    mine = with_it.fit.strip == 3
+    assert (with_it.fit.position_sigma_l[mine] >= without.fit.position_sigma_l[mine]).all()
+    assert (with_it.fit.attitude_sigma_rad[mine] >= without.fit.attitude_sigma_rad[mine]).all()
 
 
 def test_more_strips_than_the_limit_share_one_model(

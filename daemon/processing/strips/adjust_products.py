@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from swath import __version__
-from swath.calib.labels import number, with_sigma
+from swath.calib.labels import decimals_of, number, with_sigma
 from swath.calib.strips.corrections import NONE, Settings, StripChoice
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.processing.calibration.products import Told, strips_entry
@@ -202,6 +202,7 @@ def _component_entry(done: StripsCorrected, strip: _Strip, at: int) -> dict[str,
         "determined": bool(own.determined[at]),
         "correction": None if reason else unit * float(own.mean[at]),
         "sigma": unit * float(own.sigma[at]),
+        "sigma_of_calibration": unit * float(own.of_calibration[at]),
         "prior_sigma": unit * (settings.position_m if at < len(AXES) else settings.turn_rad),
         "redundancy": float(own.redundancy[at]),
         "contains": [name for other, name in enumerate(COMPONENTS) if own.absorbs[at, other]],
@@ -251,6 +252,14 @@ def _legend(settings: Settings, strips: Sequence[_Strip]) -> list[str]:
         )
     if "0" in shown:
         lines.append("0: the strip agrees with the others without a correction")
+    parts = np.array([strip.choice.components.of_calibration for strip in strips]).max(axis=0)
+    if parts.any():
+        sizes = [
+            f"{name} {number(factor * part, f'.{decimals_of(factor * part)}f')} {'cm' if at < len(AXES) else 'mdeg'}"
+            for at, (name, factor, part) in enumerate(zip(COMPONENTS, FACTORS, parts.tolist(), strict=True))
+            if part > 0.0
+        ]
+        lines.append(f"sigmas contain errors of the held calibration: at most {', '.join(sizes)}")
     for strip in strips:
         own = strip.choice.components
         for at, name in enumerate(COMPONENTS):

@@ -55,12 +55,10 @@ def test_scatter_within_the_sigmas_is_constant() -> None:
 
 
 def test_the_flight_dates_a_calibration_not_its_making() -> None:
-    flights = (
-        {"flown": dt.datetime(2026, 4, 9, tzinfo=dt.UTC)},
-        {"logs": [{"name": "north-20260228T235900Z-a6f2_0.mcap"}]},
-    )
+    flown: dict[str, object] = {"flown": dt.datetime(2026, 4, 9, tzinfo=dt.UTC)}
+    logs: dict[str, object] = {"logs": [{"name": "north-20260228T235900Z-a6f2_0.mcap"}]}
     three = [made(number, 0.25) for number in (1, 2, 3)]
-    late, early = (replace(one, header=dict(one.header) | more) for one, more in zip(three, flights, strict=False))
+    late, early = (replace(one, header={**one.header, **more}) for one, more in zip(three, (flown, logs), strict=False))
     (one,) = courses([three[2], late, early])
     assert [entry.id for entry in one.entries] == ["left-2", "left-3", "left-1"]
     assert [(step.before, step.after) for step in one.steps] == [

@@ -131,8 +131,8 @@ def test_the_calibration_is_unchanged_and_the_table_lists_the_corrections(
     assert (file.read_bytes(), file.stat().st_mtime_ns) == was
     told = capsys.readouterr().out
     assert f"no calibration; held: left {made.truth.id}" in told
-    assert "model of all strips: constant; the calibration parameters were held" in told
-    assert "no sigma here contains theirs" in told
+    assert "note: model of all strips: constant\n" in told
+    assert "file tells no sigmas, and no sigma here contains its errors" in told  # the true calibration's
     row = next(line for line in told.splitlines() if line.startswith(f"{made.flight.swaths[LIFTED].strip:02d} "))
     assert "constant" in row
     assert "not determined" in row  # its place in plan, over hardly anything but level ground
