@@ -12,6 +12,7 @@ import numpy as np
 from swath.drivers.framing import kinds as frame_kinds
 from swath.drivers.framing.checksums import crc16_ccitt, crc24q, crc32_novatel, nmea_xor, ubx_fletcher
 from swath.drivers.framing.framer import FrameKind, Framer
+from swath.drivers.imu.microstrain import wire as microstrain
 from swath.drivers.imu.vectornav import wire as vectornav
 from swath.drivers.parser import ParserCounters
 from swath.drivers.scanner.hesai.models import QT128
@@ -20,7 +21,7 @@ from tests.fuzz.mutation import LARGEST_CASE_BYTES, bounds, damage
 
 KINDS: dict[str, FrameKind] = {
     kind.name: kind
-    for module in (frame_kinds, vectornav)
+    for module in (frame_kinds, microstrain, vectornav)
     for kind in vars(module).values()
     if isinstance(kind, FrameKind)
 }
@@ -91,6 +92,12 @@ def _seal_vectornav(frame: bytes) -> bytes:
     return b"\xfa" + body + crc16_ccitt(body).to_bytes(2, "big")
 
 
+def _seal_mip(frame: bytes) -> bytes:
+    payload = frame[4:-2][:255]
+    body = b"ue" + frame[2:3].ljust(1, b"\x80") + bytes([len(payload)]) + payload
+    return body + bytes(ubx_fletcher(body))
+
+
 SEALS: dict[str, Callable[[bytes], bytes]] = {
     "nmea": _seal_nmea,
     "ubx": _seal_ubx,
@@ -100,6 +107,7 @@ SEALS: dict[str, Callable[[bytes], bytes]] = {
     "xbus": _seal_xbus,
     "sbf": _seal_sbf,
     "vectornav": _seal_vectornav,
+    "mip": _seal_mip,
 }
 """Length and checksum of a frame made right, whatever is in it; by the name of its kind."""
 

@@ -309,10 +309,15 @@ class TestOtherProtocols:
         [
             (2048, gzip.decompress((ROOT / "fixtures/xsens/2_output.bin.gz").read_bytes()), "xsens-xbus"),
             (512, b"".join(read_messages(ROOT / "fixtures/vectornav/FixedSize_vn310-imu.vnb.gz")), "vectornav"),
+            (
+                2048,
+                gzip.decompress((ROOT / "fixtures/microstrain/mip_data.bin.gz").read_bytes())[:65536],
+                "microstrain",
+            ),
             (16, b"".join(encode_can_frame(number, bytes(8)) for number in (0x120, 0x121, 0x122)) * 20, "sbg-ellipse"),
             (16, b"".join(encode_can_frame(number, bytes(8)) for number in (0x005, 0x032, 0x034)) * 20, "xsens-mti"),
         ],
-        ids=["xsens-xbus", "vectornav", "sbg-ellipse", "xsens-mti"],
+        ids=["xsens-xbus", "vectornav", "microstrain", "sbg-ellipse", "xsens-mti"],
     )
     def test_an_imu_of_another_protocol_is_named(self, unit: int, frames: bytes, protocol: str) -> None:
         whole = len(frames) // unit

@@ -1,0 +1,1 @@
+"""MicroStrain (LORD, HBK) inertial units: MIP packets."""
