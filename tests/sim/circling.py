@@ -19,7 +19,7 @@ STEP_S = 0.02
 
 @dataclass(frozen=True)
 class Motion:
-    """What a receiver asks of a trajectory."""
+    """The motion that a receiver needs from a trajectory."""
 
     position_e: FloatArray
     velocity_e: FloatArray
@@ -28,13 +28,16 @@ class Motion:
 
 
 def geodetic(points_e: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Latitude, longitude in radians, ellipsoidal height."""
+    """Return latitude, longitude (rad) and ellipsoidal height (m) of points (n, 3) in e, m."""
     lon, lat, height = TO_GEODETIC.transform(points_e[:, 0], points_e[:, 1], points_e[:, 2])
     return np.radians(lat), np.radians(lon), np.asarray(height)
 
 
 def ned_from_e(lat_rad: FloatArray, lon_rad: FloatArray) -> Rotation:
-    """To the local level: about z by the longitude, then about y so that z points down the ellipsoid's normal."""
+    """Return rotations from e to the local level: about z by the longitude, then about y.
+
+    After the second turn z points down the ellipsoid's normal.
+    """
     turns = np.stack([lon_rad, -lat_rad - np.pi / 2], axis=-1)
     return Rotation.from_euler("ZY", turns).inv()
 
@@ -49,10 +52,9 @@ def derivative(function: object, time_s: FloatArray) -> FloatArray:
 
 class Circling:
     """Circles to the right around the site at 60 m/s.
-
     Args:
-        level: roll and pitch are zero.
-        end_s: of the flight.
+        level: True if roll and pitch are zero.
+        end_s: the flight's end.
     """
 
     def __init__(self, *, level: bool = False, end_s: float = 1000.0) -> None:
@@ -83,7 +85,7 @@ class Circling:
         return ned_from_e(lat_rad, lon_rad).inv() * Rotation.from_euler("ZYX", np.stack([heading, pitch, roll], -1))
 
     def motion(self, time_s: FloatArray) -> Motion:
-        """The rotation's rate by differences over 2 ms, which errs by less than 1e-6 rad/s."""
+        """Return the motion at times, s; the rate of rotation by differences over 2 ms errs by less than 1e-6 rad/s."""
         before, after = self.turned(time_s - 1e-3), self.turned(time_s + 1e-3)
         return Motion(
             position_e=self.position_e(time_s),
@@ -93,7 +95,7 @@ class Circling:
         )
 
     def geodetic(self, time_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Latitude, longitude in radians, ellipsoidal height."""
+        """Return latitude, longitude (rad) and ellipsoidal height (m) at times, s."""
         return geodetic(self.position_e(time_s))
 
     def velocity_l(self, time_s: FloatArray) -> FloatArray:
@@ -105,14 +107,14 @@ class Circling:
         return np.asarray(self.position_e(time_s) + self.turned(time_s).apply(lever_arm_b))
 
     def velocity_of(self, lever_arm_b: list[float], time_s: FloatArray) -> FloatArray:
-        """(n, 3) north, east, down of a point of the body, from its positions alone."""
+        """Return velocities (n, 3), m/s, north, east, down of a point of the body, derived from its positions."""
         lat_rad, lon_rad, _ = geodetic(self.point_e(lever_arm_b, time_s))
         velocity_e = derivative(lambda t: self.point_e(lever_arm_b, t), time_s)
         return np.asarray(ned_from_e(lat_rad, lon_rad).apply(velocity_e))
 
 
 class Standing(Circling):
-    """Stands still, level, heading north: cheap for many epochs."""
+    """A body that stands still, level, heading north, and costs little for many epochs."""
 
     def __init__(self) -> None:
         super().__init__(level=True, end_s=1e9)
@@ -126,7 +128,7 @@ class Standing(Circling):
         return Motion(position_e, still, np.broadcast_to(self._motion.rot_e_from_b, (n, 3, 3)), still)
 
     def attitude(self, time_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return zeros."""
+        """Return roll, pitch and heading, rad, which are zero."""
         return np.zeros(len(time_s)), np.zeros(len(time_s)), np.zeros(len(time_s))
 
     def geodetic(self, time_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -135,5 +137,5 @@ class Standing(Circling):
         return np.full(len(time_s), lat), np.full(len(time_s), lon), np.full(len(time_s), height)
 
     def velocity_l(self, time_s: FloatArray) -> FloatArray:
-        """Return zeros."""
+        """Return the velocity, m/s, which is zero."""
         return np.zeros((len(time_s), 3))

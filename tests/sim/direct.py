@@ -28,7 +28,7 @@ PIECE_S = 8.0  # of trajectory at a time: RotationSpline solves for all its knot
 
 @dataclass(frozen=True)
 class Calibration:
-    """A calibration file, read here by itself."""
+    """A calibration file, read without the program's own reader."""
 
     parameters: dict[str, float]
     installation: FloatArray
@@ -56,7 +56,7 @@ class Calibration:
 
 @dataclass(frozen=True)
 class Track:
-    """Body poses at the IMU's rate: GPS seconds since some whole second, geodetic, attitude."""
+    """Body poses at the IMU's rate: GPS seconds since some whole second, geodetic position, attitude."""
 
     time_s: FloatArray
     lat_rad: FloatArray
@@ -65,7 +65,7 @@ class Track:
     attitude_rad: FloatArray  # (n, 3) roll, pitch, heading
 
     def poses(self, time_s: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Position (n, 3) and rot_e_from_b (n, 3, 3) at times in order."""
+        """Return position (n, 3), m, in e and rot_e_from_b (n, 3, 3) at times (n,), s, in order."""
         position = np.empty((len(time_s), 3))
         rotation = np.empty((len(time_s), 3, 3))
         for start_s in np.arange(np.floor(time_s[0]), time_s[-1] + PIECE_S, PIECE_S):
@@ -85,7 +85,7 @@ class Track:
 
 
 def beam_angle(calibration: Calibration, time_s: FloatArray, encoder_rad: FloatArray) -> FloatArray:
-    """θ of CONVENTIONS; its derivatives from the readings themselves, one a pulse, at a steady rate."""
+    """Return θ of the conventions, rad; its derivatives come from readings at a steady rate, one for each pulse."""
     theta = (1 + calibration.value("scan_angle_scale_ppm")) * (encoder_rad - calibration.value("scan_angle_offset_deg"))
     step_s = float(np.median(np.diff(time_s)))
     first = savgol_filter(encoder_rad, 61, 4, deriv=1, delta=step_s)
@@ -97,7 +97,7 @@ def beam_angle(calibration: Calibration, time_s: FloatArray, encoder_rad: FloatA
 
 
 def line_direction(calibration: Calibration, theta: FloatArray) -> FloatArray:
-    """(n, 3) beam in s with the scan plane's tilt (ISO Eq. 14)."""
+    """Return the beam (n, 3) in s with the scan plane's tilt (ISO Eq. 14)."""
     eta = calibration.value("scan_plane_tilt_deg")
     return np.stack(
         [np.full_like(theta, -np.sin(eta)), np.sin(theta) * np.cos(eta), np.cos(theta) * np.cos(eta)], axis=1
@@ -120,7 +120,7 @@ def ground_points(
     theta: FloatArray,
     bending: Bending | None = None,
 ) -> FloatArray:
-    """(n, 3) ECEF of points in s at their pulses' times (ISO Eq. 10); each θ tilts φ by the pitch slope."""
+    """Return (n, 3), m, in e of points in s at their pulses' times (ISO Eq. 10); each θ tilts φ by the pitch slope."""
     lever_arm_b = np.array([calibration.value(f"lever_arm_{axis}_m") for axis in "xyz"])
     phi = calibration.value("phi_deg") + calibration.value("pitch_slope_ppm") * theta
     omega, kappa = (np.full_like(theta, calibration.value(f"{name}_deg")) for name in ("omega", "kappa"))
@@ -133,7 +133,7 @@ def ground_points(
 
 
 def bent_towards_nadir(origin_e: FloatArray, along_e: FloatArray, bending: Bending) -> FloatArray:
-    """Beams (n, 3) with their lengths, turned about the horizontal by Δd (NGA Eq. 4, 5)."""
+    """Return beams (n, 3) in e, with their lengths, turned about the horizontal by Δd (NGA Eq. 4, 5)."""
     x, y, z = origin_e.T
     lon, lat, height_m = TO_GEODETIC.transform(x, y, z)
     lat, lon = np.radians(lat), np.radians(lon)
@@ -148,7 +148,7 @@ def bent_towards_nadir(origin_e: FloatArray, along_e: FloatArray, bending: Bendi
 
 
 def ardc(sensor_m: FloatArray, ground_m: FloatArray) -> FloatArray:
-    """K of the ARDC model, radians (NGA Eq. 4, 5; FORMULAS 4.1)."""
+    """Return K of the ARDC model, rad (NGA Eq. 4, 5; FORMULAS 4.1)."""
     top, base = sensor_m / 1000, ground_m / 1000
     first = 2410 * top / (top**2 - 6 * top + 250)
     second = 2410 * base / (base**2 - 6 * base + 250) * base / top
@@ -156,7 +156,7 @@ def ardc(sensor_m: FloatArray, ground_m: FloatArray) -> FloatArray:
 
 
 def flat_layers(sensor_m: FloatArray, ground_m: FloatArray) -> FloatArray:
-    """K = n̄ − n_s in the dry atmosphere of NGA Eq. 9 to 11 at 1064 nm (FORMULAS 4.2, 4.3), radians."""
+    """Return K = n̄ − n_s, rad, in the dry atmosphere of NGA Eq. 9 to 11 at 1064 nm (FORMULAS 4.2, 4.3)."""
 
     def excess(height_m: FloatArray) -> FloatArray:
         fahrenheit = 59 - 0.00356 * height_m / 0.3048
@@ -170,7 +170,10 @@ def flat_layers(sensor_m: FloatArray, ground_m: FloatArray) -> FloatArray:
 
 
 def group_index(sensor_m: FloatArray, ground_m: FloatArray) -> FloatArray:
-    """Mean over the path in the dry standard atmosphere at 1064 nm, by the closed form of IAG 1999 (FORMULAS 3.2)."""
+    """Return the mean group index over the path in the dry standard atmosphere at 1064 nm.
+
+    The equation is the closed form of IAG 1999 (FORMULAS 3.2).
+    """
 
     def refractivity(height_m: FloatArray) -> FloatArray:
         kelvin = 288.15 - 0.0065 * height_m

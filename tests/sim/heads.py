@@ -33,7 +33,7 @@ SLOTS = 3
 
 
 def plan_of(kind: str, *, noise: bool = False, **keys: Any) -> Plan:
-    """A plan with the scanner ``left`` of this kind."""
+    """Return a plan with the scanner ``left`` of this kind."""
     scanner = {"kind": kind, "scan_hz": 10.0} | keys
     return parse_plan(TEXT, Path()).changed({"flight": {"noise": noise}, "scanner": {"left": scanner}})
 
@@ -44,7 +44,7 @@ def pulse(plan: Plan) -> PulsePerSecond:
 
 
 class Still:
-    """An aircraft over one place, flying north-east."""
+    """An aircraft that stays over one place but has a velocity to the north-east."""
 
     def geodetic(self, time_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         return np.full(len(time_s), 0.829), np.full(len(time_s), 0.155), np.full(len(time_s), 600.0)
@@ -54,7 +54,7 @@ class Still:
 
 
 class Shots(NamedTuple):
-    """Pulses, what is measured of them, and rows that tell each slot of each from all others."""
+    """Pulses, their measurements, and truth rows whose values differ from slot to slot."""
 
     pulses: Pulses
     measured: Measured
@@ -62,7 +62,10 @@ class Shots(NamedTuple):
 
 
 def measured_of(pulses: Pulses, farthest_m: float = 120.0) -> Shots:
-    """Up to three returns a pulse, a function of its number alone; slots in any order, some empty, some much alike."""
+    """Return up to three returns for each pulse, determined by its number alone.
+
+    The slots are in any order; some are empty, and some are almost alike.
+    """
     count = len(pulses)
     rng = np.random.default_rng(5)
     table = rng.random((4096, 3 * SLOTS))[pulses.number % 4096]
@@ -81,7 +84,7 @@ def measured_of(pulses: Pulses, farthest_m: float = 120.0) -> Shots:
 
 
 def feed(parser: PacketParser, units: Iterable[WireUnit]) -> list[Record]:
-    """Units as a recorder would hand them over, its clock the true one."""
+    """Return the records of a parser fed as by a recorder whose clock is true time."""
     records: list[Record] = []
     for unit in units:
         rows = np.frombuffer(unit.data, np.uint8).reshape(1, -1)
@@ -95,5 +98,5 @@ def rows_of(records: Sequence[Record], kind: type[ScannerReturns | DeviceClockSa
 
 
 def joined(pieces: Sequence[Pulses]) -> dict[str, NDArray[Any]]:
-    """Columns of consecutive batches of pulses."""
+    """Return the columns of consecutive batches of pulses as one."""
     return {name: np.concatenate([getattr(piece, name) for piece in pieces]) for name in Pulses.__slots__}

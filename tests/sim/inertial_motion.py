@@ -63,7 +63,7 @@ class Moving:
 def standing(
     end_s: float, lat_deg: float = 47.5, height_m: float = 0.0, *, attitude_deg: tuple[float, float, float] = (0, 0, 0)
 ) -> Trajectory:
-    """At rest on the earth, at a longitude of 8.5 degrees, with this heading, pitch and roll."""
+    """Return a body at rest on the earth, at a longitude of 8.5°; `attitude_deg` is heading, pitch and roll."""
     lat, lon, height = np.radians([lat_deg]), np.radians([8.5]), np.array([height_m])
     position_e = e_from_geodetic(lat, lon, height)
     body = Rotation.from_matrix(rot_e_from_ned(lat, lon)[0]) * Rotation.from_euler("ZYX", attitude_deg, degrees=True)
@@ -76,7 +76,10 @@ def standing(
 
 
 def circling_the_pole(end_s: float, radius_m: float, turn_radps: float, z_m: float) -> Trajectory:
-    """Eastward around the north pole, wings level: x along the path, y outward, z towards the earth's centre plane."""
+    """Return a flight eastward around the north pole, wings level: x along the path, y outward, z down.
+
+    Down is along the earth's axis, towards the equator's plane.
+    """
 
     def motion(time_s: FloatArray) -> Motion:
         angle, zero = turn_radps * time_s, np.zeros(len(time_s))
@@ -95,7 +98,7 @@ def circling_the_pole(end_s: float, radius_m: float, turn_radps: float, z_m: flo
 
 
 def rough_flight(folder: Path) -> Trajectory:
-    """The plan above, flown over a plain."""
+    """Return the flight of the plan above over a plain."""
     plan: Plan = parse_plan(ROUGH_PLAN, folder)
     site = Site.at(*plan.tables.flight.origin_deg)
     return fly(plan, site, lambda east_m, north_m: np.full(np.shape(east_m), 450.0))

@@ -53,7 +53,7 @@ def cast(
     pulse_m: float = 0.45,
     slots: int = 5,
 ) -> Echoes:
-    """Echoes of pulses numbered from 0, all at one time."""
+    """Return the echoes of pulses numbered from 0, all at one time."""
     number = np.arange(len(origin))
     times = np.full(len(origin), time_s)
     return scene.cast(origin, direction, times, number, divergence_rad, pulse_m, slots)

@@ -37,12 +37,12 @@ def pulse_per_second(jitter_ns: float = 20.0) -> PulsePerSecond:
 
 
 def measured_count(number: Int64Array, slots: int) -> Int64Array:
-    """How many returns a pulse of this number has."""
+    """Return how many returns a pulse of this number has."""
     return number * 48_271 % 2_147_483_647 % (slots + 1)
 
 
 def measured_of(pulses: Pulses, slots: int, near_m: float, far_m: float) -> tuple[Measured, StructArray]:
-    """Up to ``slots`` returns of each pulse, of its number alone; the truth's range is what the device says."""
+    """Return up to ``slots`` returns for each pulse, determined by its number; the truth has the device's range."""
     hashed = (pulses.number[:, np.newaxis] * 2_654_435_761 + np.arange(slots) * 40_503) % 65_536
     spread = np.sort(hashed / 65_536, axis=1)
     there = np.arange(slots) < measured_count(pulses.number, slots)[:, np.newaxis]
@@ -71,7 +71,7 @@ class Spoken:
         return np.concatenate([np.frombuffer(unit.data[:48], HEADER_DTYPE) for unit in self.units])
 
     def parsed(self) -> tuple[StructArray, StructArray]:
-        """Returns and clock samples by this project's parser, which has nothing to complain of."""
+        """Return returns and clock samples read by this project's parser, and check that it counts no error."""
         config = config_table(self.table, "left", TRANSPORT)
         parser = SrepParser(DeviceSettings("scanner/left", config))
         records = [
@@ -96,7 +96,10 @@ def speak(
     idle: Sequence[tuple[float, float]] = (),
     **keys: Any,
 ) -> Spoken:
-    """Fires from the first cut to the last; silent in ``idle`` windows, which are cuts too."""
+    """Return what a scanner sends from the first cut to the last, s.
+
+    It is silent in ``idle`` windows, whose limits must be cuts too.
+    """
     wire = SrepWire(table, "left", pps or pulse_per_second(), HostTable(), 1, noise=noise, **keys)
     spoken, head = Spoken(table, wire), LineHead(table, "left")
     for start, stop in pairwise(cuts):

@@ -90,7 +90,7 @@ def test_group_refractivity_matches_the_formula_sheet(wavelength_um: float, shee
 
 
 def closed_refractivity_ppm(height_m: float, wavelength_um: float) -> float:
-    """IAG 1999's closed form in the closed form of the standard atmosphere: neither is used by the module."""
+    """Return IAG 1999's closed form in the standard atmosphere's closed form, ppm; the module uses neither."""
     temperature_k = 288.15 - 0.0065 * height_m
     pressure_hpa = 1013.25 * (temperature_k / 288.15) ** 5.255876
     group = 287.6155 + 4.88660 / wavelength_um**2 + 0.06800 / wavelength_um**4
@@ -204,7 +204,7 @@ def test_ray_bending_matches_another_integration(height_m: float, nadir_deg: flo
         return [*(state[2:] / index(height)), *(gradient * up)]
 
     class Ground:
-        """The event that ends the ray: it is down at 200 m."""
+        """The event that ends the ray, when it has come down to 200 m."""
 
         terminal = True
 

@@ -25,7 +25,7 @@ def random_rays(
     center_m: tuple[float, float] = (0.0, 0.0),
     floor_m: float = 450.0,
 ) -> tuple[FloatArray, FloatArray]:
-    """Down to every side, most of them slanting."""
+    """Return origins and directions of rays that go down to every side, most of them slanting."""
     random = np.random.default_rng(seed)
     target = np.column_stack([random.uniform(-half_m, half_m, (count, 2)) + center_m, np.full(count, floor_m)])
     aside = random.uniform(-2.0, 2.0, (count, 2)) * lift_m
@@ -37,7 +37,7 @@ def random_rays(
 
 
 def test_a_slope_is_hit_on_its_plane() -> None:
-    """Close to the origin the ellipsoid differs from the site's plane by d²/2R alone: 0.8 mm at 100 m."""
+    """Close to the origin the ellipsoid differs from the site's plane only by d²/2R, 0.8 mm at 100 m."""
     scene = scene_of("height_m = 450\nslope_percent = 20\nslope_towards_deg = 90\ncell_m = 2")
     origin, direction = random_rays(1, 500, half_m=50.0, lift_m=100.0)
     slope = 0.2
@@ -56,7 +56,7 @@ def test_a_slope_is_hit_on_its_plane() -> None:
 
 
 def ray_above(scene: Scene, origin: FloatArray, direction: FloatArray, at: float) -> float:
-    """How far above the ground a ray is at a distance."""
+    """Return a ray's height above the ground, m, at a distance along it."""
     x, y, z = origin + at * direction
     return float(z - scene.site_z(np.array([x]), np.array([y]))[0])
 
@@ -129,14 +129,14 @@ QUADS = [(0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7)]
 
 
 def houses_at(center_m: tuple[float, float]) -> str:
-    """Four buildings around a place."""
+    """Return the text of a plan with four buildings around a place."""
     x, y = center_m
     slope = "height_m = 450\nslope_percent = 4\nslope_towards_deg = 20\n"  # so that a corner is the highest ground
     return slope + BUILDINGS.format(x0=x - 15.0, x1=x + 15.0, y0=y - 15.0, y1=y + 15.0)
 
 
 def up_at(scene: Scene, place: FloatArray) -> FloatArray:
-    """The ellipsoid's normal by latitude and longitude."""
+    """Return the ellipsoid's normal in the site's frame, from latitude and longitude."""
     lat, lon, _ = geodetic_from_e(scene.site.e_from_site(place[np.newaxis]))
     normal_e = np.array([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])[:, 0]
     up: FloatArray = scene.site.rot_site_from_e @ normal_e
@@ -146,7 +146,7 @@ def up_at(scene: Scene, place: FloatArray) -> FloatArray:
 def triangles_of(
     scene: Scene, center: list[float], size: list[float], heading_deg: float, eaves_m: float, ridge: tuple[float, float]
 ) -> FloatArray:
-    """(m, 3, 3) triangles of a building from its corners; ``ridge``: above the eaves, half its length.
+    """Return (m, 3, 3) triangles of a building, from its corners; ``ridge`` is height above eaves and half length.
 
     A ridge lies along the longer side.
     """
@@ -176,7 +176,7 @@ def triangles_of(
 
 
 def nearest_triangle(origin: FloatArray, direction: FloatArray, triangles: FloatArray) -> FloatArray:
-    """(n,) distances by Möller and Trumbore (1997), infinite where there is none."""
+    """Return (n,) distances, m, by Möller and Trumbore (1997), infinite where a ray meets no triangle."""
     edge_1, edge_2 = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
     cross = np.cross(direction[:, np.newaxis], edge_2)
     determinant = np.einsum("nmx,mx->nm", cross, edge_1)
@@ -223,7 +223,10 @@ def test_incidence_on_a_roof_seen_from_above_is_its_pitch() -> None:
 
 
 def test_a_footprint_across_an_edge_gives_two_echoes_that_share_the_light() -> None:
-    """Straight down beside a wall 9 m high: four rim rays of a tenth each, one or two of them on the roof."""
+    """The beam goes down beside a wall 9 m high; each of its four rim rays has a tenth of the light.
+
+    One or two of them meet the roof.
+    """
     scene = scene_of(
         "height_m = 450\n[[terrain.building]]\ncenter_m = [0, 0]\nsize_m = [40, 40]\nroof = 'flat'\neaves_m = 9"
     )
@@ -268,7 +271,7 @@ def test_echoes_of_trees_come_in_order_before_the_ground() -> None:
 
 
 def test_leaves_and_ground_share_the_light() -> None:
-    """Each leaf echo is its share of the light times a reflectance of 0.35 … 0.6; the ground gets what is left."""
+    """Each leaf's echo is its share of the light times a reflectance of 0.35 … 0.6; the ground gets the rest."""
     origin, direction = random_rays(6, 20_000)
     wooded = cast(scene_of(FOREST), origin, direction, slots=30, pulse_m=0.0)
     bare = cast(scene_of("height_m = 450"), origin, direction)
@@ -284,7 +287,7 @@ def test_leaves_and_ground_share_the_light() -> None:
 
 
 def test_transmission_through_a_crown_follows_beer_and_lambert() -> None:
-    """Through the middle of a crown of height h: no interception with probability exp(−rate · h)."""
+    """Through the middle of a crown of height h the probability of no interception is exp(−rate · h)."""
     scene = scene_of(FOREST)
     apart = np.linalg.norm(scene.trees[:, np.newaxis, :2] - scene.trees[:, :2], axis=2)
     np.fill_diagonal(apart, np.inf)
@@ -307,7 +310,7 @@ def test_transmission_through_a_crown_follows_beer_and_lambert() -> None:
 
 
 def test_a_wire_is_hit_on_its_catenary() -> None:
-    """Between masts 20 m high and 200 m apart, sagging 4 m: 16 m above the ground in the middle, 17 m halfway to it."""
+    """Masts 20 m high, 200 m apart, with a sag of 4 m, leave 16 m in the middle and 17 m half-way to it."""
     scene = scene_of(
         "height_m = 450\n[[terrain.wire]]\nfrom_m = [-100, 0]\nto_m = [100, 0]\n"
         "height_m = 20\nsag_m = 4\ndiameter_m = 0.03"
@@ -334,7 +337,7 @@ def test_a_wire_is_hit_on_its_catenary() -> None:
 
 @pytest.mark.parametrize(("time_s", "east_m"), [(0.0, -50.0), (3.0, -20.0), (10.0, 50.0), (13.0, 20.0), (20.0, -50.0)])
 def test_a_car_is_at_its_place_at_each_time(time_s: float, east_m: float) -> None:
-    """100 m at 10 m/s, there and back in 20 s; 4.4 m long, 1.5 m high."""
+    """The car drives 100 m at 10 m/s, there and back in 20 s; it is 4.4 m long and 1.5 m high."""
     scene = scene_of("height_m = 450\n[[terrain.car]]\nfrom_m = [-50, 8]\nto_m = [50, 8]\nspeed_mps = 10")
     east = np.arange(-60.0, 60.0, 0.05) + 0.01
     origin = np.column_stack([east, np.full(len(east), 8.3), np.full(len(east), 900.0)])
@@ -346,7 +349,7 @@ def test_a_car_is_at_its_place_at_each_time(time_s: float, east_m: float) -> Non
 
 
 def test_few_pulses_return_from_water_and_fewer_at_oblique_incidence() -> None:
-    """A tenth near nadir; at angle i exp(−tan² i / 0.0235) of that (slopes of Cox and Munk)."""
+    """A tenth returns near nadir, and exp(−tan² i / 0.0235) of that at angle i (slopes of Cox and Munk)."""
     scene = scene_of(
         "height_m = 450\nslope_percent = 3\n[[terrain.water]]\ncenter_m = [0, 0]\nradius_m = 80\nreturns = 0.1"
     )
@@ -362,7 +365,7 @@ def test_few_pulses_return_from_water_and_fewer_at_oblique_incidence() -> None:
 
 
 def test_water_is_level_at_its_lowest_shore() -> None:
-    """On a slope of 3 % down to the north, 80 m from the middle: 2.4 m below it, at every place the same."""
+    """On a slope of 3 % down to the north, the shore 80 m from the middle is 2.4 m below it."""
     scene = scene_of(
         "height_m = 450\nslope_percent = 3\ncell_m = 2\n[[terrain.water]]\ncenter_m = [0, 0]\n"
         "radius_m = 80\nreturns = 1.0"
@@ -378,7 +381,7 @@ def test_water_is_level_at_its_lowest_shore() -> None:
 
 
 def test_markings_lie_along_the_edges_and_in_dashes_in_the_middle() -> None:
-    """6 m wide: edge lines 0.3 m from either edge, 0.15 m wide; dashes of 4 m every 12 m."""
+    """The road is 6 m wide with lines of 0.15 m, 0.3 m from either edge, and dashes of 4 m every 12 m."""
     scene = scene_of("height_m = 450\n[[terrain.road]]\npoints_m = [[-90, -20], [90, -20]]\nwidth_m = 6")
     north = np.array([-20.0, -20.0, -17.3, -22.7, -18.5, -17.1, -16.9])
     east = np.array([-90.0 + 24.0 + 2.0, -90.0 + 24.0 + 6.0, 1.0, 1.0, 1.0, 1.0, 1.0])

@@ -31,7 +31,7 @@ def plan(*faults: dict[str, Any]) -> Plan:
 
 
 def units(source: str = "scanner/left", count: int = 1000) -> list[WireUnit]:
-    """A unit each hundredth of a second, all different."""
+    """Return a unit for each hundredth of a second, all different."""
     return [WireUnit(number / 100, source, number.to_bytes(4, "little") * 4) for number in range(count)]
 
 
@@ -125,7 +125,7 @@ def test_faults_of_one_source_are_applied_in_their_order() -> None:
 
 
 def bad() -> Iterator[tuple[dict[str, Any], str]]:
-    """Faults that make no sense, and what is said of them."""
+    """Yield contradictory faults, and the error of each."""
     yield (
         {"source": "scanner/right", "kind": "silent", "at_s": 0},
         r'fault\[0\].source: the plan has no "scanner/right"',

@@ -65,7 +65,7 @@ def plan(**changes: Any) -> Plan:
 
 
 def flown(changed: Plan, stop_s: float = 3.2) -> tuple[VirtualFlight, list[WireUnit]]:
-    """A flight and everything it sent."""
+    """Return a flight and everything that it sent."""
     flight = VirtualFlight(changed, stop_s=stop_s)
     return flight, list(flight.units())
 
@@ -113,7 +113,7 @@ def test_an_early_stop_changes_nothing_before_it(flight_and_units: tuple[Virtual
 
 
 def test_receiver_positions_lie_at_its_antenna(tmp_path: Path) -> None:
-    """With everything else exact, the receiver's fix less its lever arm is the body of the truth."""
+    """Everything else is exact, so the receiver's fix minus its lever arm is the true body."""
     changed = plan(flight={"noise": False}, scanner={"left": {"prf_hz": 1000}})
     flight = VirtualFlight(changed, open_truth(changed, tmp_path / "truth.npz"), stop_s=3.2)
     parser = find_driver("gnss", "novatel").make_parser(DeviceSettings("gnss/rover"))

@@ -43,7 +43,7 @@ ANGLE = float(np.radians(ANGLE_DEG))
 
 @dataclass(frozen=True)
 class Shot:
-    """One pulse and everything it depends on; angles in radians."""
+    """One pulse and everything that it depends on; angles in radians."""
 
     boresight: Three
     range_m: float = RANGE_M
@@ -108,7 +108,7 @@ def turned(part: Three, number: int, by: float) -> Three:
 
 
 def later(shot: Shot, by: float, *, moving: bool) -> Shot:
-    """The attitude so much later, and the position too."""
+    """Return the shot with its attitude, and if `moving` its position, at a time later by `by` seconds."""
     roll, pitch, heading = (np.array(shot.attitude) + by * RATES).tolist()
     north, east, down = (by * VELOCITY_L).tolist() if moving else (0.0, 0.0, 0.0)
     return replace(shot, attitude=(roll, pitch, heading), moved_l=(north, east, down))

@@ -54,7 +54,7 @@ def misses(flown: Flown, points_e: FloatArray) -> FloatArray:
 
 
 def line_points(flown: Flown, theta: FloatArray, direction: FloatArray) -> FloatArray:
-    """Ground points of a line scanner."""
+    """Return ground points (n, 3), m, in e of a line scanner."""
     rho = corrected_range(flown.calibration, flown.rows["range_m"], flown.rows["intensity"])
     time_s = flown.time_s + flown.calibration.value("time_offset_us")
     return ground_points(flown.calibration, flown.track(), time_s, rho[:, np.newaxis] * direction, theta)
@@ -89,7 +89,10 @@ def heights(points_e: FloatArray) -> FloatArray:
 
 
 def pulse_angles(flown: Flown) -> FloatArray:
-    """θ of every return, its derivatives from the readings of all pulses; pulses without a return are bridged."""
+    """Return θ, rad, of every return; its derivatives come from the readings of all pulses.
+
+    Pulses without a return are interpolated.
+    """
     _, first, back = np.unique(flown.rows["pulse_id"], return_index=True, return_inverse=True)
     step_s = 1.0 / flown.plan.tables.scanner["left"].prf_hz
     number = np.rint((flown.time_s[first] - flown.time_s[first[0]]) / step_s).astype(int)
@@ -138,7 +141,7 @@ def test_points_of_a_polygon_are_recovered_with_facet_tilts(tmp_path: Path) -> N
 
 
 def mirrored(ray: FloatArray, normal: FloatArray) -> FloatArray:
-    """Rays behind flat mirrors: a half turn about the normal, and back."""
+    """Return rays (n, 3) behind flat mirrors: turned by 180° about the normal, and reversed."""
     behind: FloatArray = -Rotation.from_rotvec(np.pi * normal).apply(ray)
     return behind
 
@@ -156,7 +159,7 @@ def test_points_of_a_monogon_are_recovered_with_every_error(tmp_path: Path) -> N
 
 
 def shaft_angle(flown: Flown, scan_hz: float) -> FloatArray:
-    """γ of a shaft that turns evenly."""
+    """Return γ, rad, of a shaft that turns at a constant rate."""
     offset = flown.calibration.value("scan_angle_offset_deg")
     latency = flown.calibration.value("encoder_latency_us") * 2 * np.pi * scan_hz
     angle: FloatArray = flown.rows["encoder_rad"] - offset + latency
@@ -192,14 +195,14 @@ def test_points_of_a_risley_pair_are_recovered(tmp_path: Path) -> None:
 
 
 def whole_turns(flown: Flown, scan_hz: float) -> FloatArray:
-    """Turns of an even shaft that its reading leaves out."""
+    """Return the whole turns of a steady shaft that its reading leaves out."""
     time_s = flown.time_s + flown.calibration.value("time_offset_us")
     turns: FloatArray = np.rint(scan_hz * time_s - flown.rows["encoder_rad"] / (2 * np.pi))
     return turns
 
 
 def bent(ray: FloatArray, normal: FloatArray, ratio: float) -> FloatArray:
-    """Snell's law as a turn in the plane of incidence."""
+    """Return refracted rays (n, 3), with Snell's law as a rotation in the plane of incidence."""
     across = np.cross(normal, ray)
     sine = np.linalg.norm(across, axis=1)
     turn = np.arcsin(ratio * sine) - np.arcsin(sine)
@@ -227,7 +230,7 @@ def test_points_of_an_os1_are_recovered(tmp_path: Path) -> None:
 
 
 def corrected_rows(flown: Flown, scan_hz: float) -> StructArray:
-    """Rows with what CONVENTIONS adds to range and azimuth."""
+    """Return rows with the corrections of range and azimuth that the conventions define."""
     rows = flown.rows.copy()
     rows["range_m"] = corrected_range(flown.calibration, rows["range_m"], rows["intensity"])
     rows["encoder_rad"] -= flown.calibration.value("scan_angle_offset_deg")
@@ -236,7 +239,7 @@ def corrected_rows(flown: Flown, scan_hz: float) -> StructArray:
 
 
 def check_spinning(flown: Flown, points_s: FloatArray, **quanta: Any) -> None:
-    """Ground points of a spinning head against the truth."""
+    """Assert that ground points of a spinning head are within their bounds of the truth."""
     time_s = flown.time_s + flown.calibration.value("time_offset_us")
     points = ground_points(flown.calibration, flown.track(), time_s, points_s, np.zeros(len(time_s)))
     missed, limits = misses(flown, points), bound(flown, **quanta)

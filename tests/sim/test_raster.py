@@ -24,13 +24,13 @@ SQUARE = 200.0 * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 
 
 def heights_at(easting: FloatArray, northing: FloatArray) -> FloatArray:
-    """A plane: bilinear interpolation gives it back."""
+    """Return heights, m, of a plane, which bilinear interpolation reproduces."""
     height_m: FloatArray = 500.0 + 0.03 * (easting - CENTER[0]) - 0.05 * (northing - CENTER[1])
     return height_m
 
 
 def pixel_centers(transform: Affine, count: int) -> tuple[FloatArray, FloatArray]:
-    """Easting and northing of the pixels of a square raster."""
+    """Return easting and northing, m, of the pixels of a square raster."""
     column, row = np.meshgrid(np.arange(count) + 0.5, np.arange(count) + 0.5)
     a, b, c, d, e, f = transform[:6]
     return a * column + b * row + c, d * column + e * row + f
@@ -87,7 +87,7 @@ def test_heights_match_the_map_at_every_node(tmp_path: Path, rotated: bool) -> N
 
 
 def test_places_far_from_the_origin_are_found_at_their_height(tmp_path: Path) -> None:
-    """At 8 km, 300 m of height move a place on the map by 0.4 m: 40 mm on a slope of a tenth."""
+    """At 8 km a height of 300 m moves a place on the map by 0.4 m, which is 40 mm on a slope of a tenth."""
     east_m = 8000.0
     transform = Affine(10.0, 0.0, CENTER[0] + east_m - 600.0, 0.0, -10.0, CENTER[1] + 600.0)
     easting, _ = pixel_centers(transform, 120)

@@ -16,7 +16,7 @@ from tests.sim.srep_spoken import C_MPS, Spoken, joined, measured_count, scanner
 
 
 def records_of(units: list[WireUnit]) -> list[tuple[int, int, list[int]]]:
-    """(ticks, encoder, ranges in 0.1 mm) of every record, by the page, over all datagrams."""
+    """Return (ticks, encoder, ranges in 0.1 mm) of every record of all datagrams, read as the page defines them."""
     records = []
     for unit in units:
         n, slots, zone = struct.unpack_from("<H", unit.data, 6)[0], unit.data[14], unit.data[15]
@@ -31,7 +31,10 @@ def records_of(units: list[WireUnit]) -> list[tuple[int, int, list[int]]]:
 
 
 def resolved(units: list[WireUnit], tick_hz: int, about_m: tuple[float, float]) -> list[tuple[int, int, float]]:
-    """(ticks and encoder of its emission, whole range) of every return, of a reader who knows where the ground is."""
+    """Return (ticks, encoder, whole range in m) of every return, with the emission's ticks and encoder.
+
+    The reader knows about where the ground is.
+    """
     found = []
     records = records_of(units)
     for place, (ticks, _, ranges) in enumerate(records):

@@ -85,12 +85,12 @@ def times(trajectory: Trajectory, step_s: float = 0.05) -> FloatArray:
 
 
 def geodetic(position_e: FloatArray) -> FloatArray:
-    """(3, n) longitude, latitude in degrees and ellipsoidal height, by PROJ."""
+    """Return (3, n) longitude, latitude (deg) and ellipsoidal height (m), by PROJ."""
     return np.stack(GEODETIC.transform(position_e[:, 0], position_e[:, 1], position_e[:, 2]))
 
 
 def plane(trajectory: Trajectory, time_s: FloatArray) -> FloatArray:
-    """(n, 3) east, north of the tangent plane and ellipsoidal height, by PROJ."""
+    """Return (n, 3) east, north of the tangent plane and ellipsoidal height, m, by PROJ."""
     position_e = trajectory.poses(time_s).position_e
     topocentric = Transformer.from_pipeline("+proj=topocentric +ellps=WGS84 +lat_0=47.5 +lon_0=8.9 +h_0=0")
     places = np.stack(topocentric.transform(position_e[:, 0], position_e[:, 1], position_e[:, 2]), axis=-1)
@@ -99,7 +99,7 @@ def plane(trajectory: Trajectory, time_s: FloatArray) -> FloatArray:
 
 
 def rot_e_from_l(position_e: FloatArray) -> FloatArray:
-    """(n, 3, 3) north, east, down by differences of what PROJ says."""
+    """Return (n, 3, 3) with axes north, east, down in e as columns, from differences of PROJ's coordinates."""
     lon, lat, height = geodetic(position_e)
     axes = []
     for shift in ((0.0, 1e-4, 0.0), (1e-4, 0.0, 0.0), (0.0, 0.0, -10.0)):
@@ -111,14 +111,17 @@ def rot_e_from_l(position_e: FloatArray) -> FloatArray:
 
 
 def gravity_mps2(lat_rad: FloatArray, height_m: FloatArray) -> FloatArray:
-    """International gravity formula 1980, free-air with height: within 2e-5 m/s² of WGS 84's below 2 km."""
+    """Return gravity, m/s², by the international gravity formula 1980 with the free-air gradient.
+
+    It is within 2e-5 m/s² of WGS 84's below 2 km.
+    """
     sine = np.sin(lat_rad) ** 2
     surface = 9.780327 * (1 + 0.0053024 * sine - 0.0000058 * np.sin(2 * lat_rad) ** 2)
     return np.asarray(surface - (3.0877e-6 - 4.3e-9 * sine) * height_m + 7.2e-13 * height_m**2)
 
 
 def specific_force_b(trajectory: Trajectory, time_s: FloatArray) -> FloatArray:
-    """(n, 3) what an accelerometer triad in the body feels."""
+    """Return (n, 3) specific force, m/s², in b that an accelerometer triad in the body measures."""
     motion = trajectory.motion(time_s)
     _, lat, height = geodetic(motion.position_e)
     down_e = rot_e_from_l(motion.position_e)[:, :, 2]
@@ -277,7 +280,7 @@ def test_no_sideways_force_acts_in_flight(wind_mps: list[float]) -> None:
 
 
 def test_bank_follows_from_speed_and_rate_of_turn() -> None:
-    """tan(roll) = v ω / g where a level turn at constant speed is steady."""
+    """In a steady level turn at constant speed tan(roll) = v ω / g."""
     lines = [
         {"name": "a", "from_m": [0.0, 0.0], "to_m": [2000.0, 0.0], "height_m": 900.0},
         {"name": "b", "from_m": [2000.0, -2600.0], "to_m": [0.0, -2600.0], "height_m": 900.0},

@@ -30,7 +30,7 @@ def assert_joins(way: Way, start: Pose, end: Pose) -> None:
 
 
 def sides(way: Way) -> str:
-    """The word, arcs that continue each other taken as one."""
+    """Return the letters of a way's turns, with arcs that continue each other taken as one."""
     letters = ["S" if arc.curvature_per_m == 0 else "R" if arc.curvature_per_m > 0 else "L" for arc in way]
     return "".join(letter for letter, _ in itertools.groupby(letters))
 

@@ -71,7 +71,7 @@ VELOCITY_MPS = {
 
 @dataclass
 class Flight:
-    """A receiver on a circling body, and its bytes."""
+    """A receiver on a circling body, and the bytes that it sends."""
 
     plan: Plan
     wire: GnssWire
@@ -83,11 +83,11 @@ class Flight:
         return self.wire.units(0.0, stop_s)
 
     def records(self, stop_s: float) -> list[Record]:
-        """What the project's parser makes of them; host time is nanoseconds since the plan's start."""
+        """Return what the project's parser reads from the bytes; host time is nanoseconds since the plan's start."""
         return parsed(self.plan, self.units(stop_s))
 
     def time_s(self, record: GnssFix | GnssHeading | TimeMessage) -> float:
-        """The record's own time, seconds since the plan's start by the calendar."""
+        """Return the record's own time, seconds since the plan's start, by the calendar."""
         assert record.time is not None
         gps_ns = whole_gps_ns(record.time, LEAP_S)
         assert gps_ns is not None
@@ -101,7 +101,7 @@ def start_gps_ns(plan: Plan) -> int:
 
 
 def flight(*, level: bool = False, start: str = "", noise: bool = False, end_s: float = 1000.0, **keys: Any) -> Flight:
-    """A plan with one receiver; ``keys`` are those of its table."""
+    """Return a plan with one receiver; ``keys`` are those of its table."""
     changes: dict[str, Any] = {"flight": {"noise": noise}, "gnss": {"rover": {"lever_arm_m": LEVER_ARM} | keys}}
     text = PLAN.replace('name = "gnss"', f'name = "gnss"\nstart = {start}') if start else PLAN
     plan = parse_plan(text, Path()).changed(changes)
@@ -308,7 +308,7 @@ def test_pynmea2_reads_the_nmea_sentences() -> None:
 
 
 def test_novatel_position_follows_the_offsets_of_the_manual() -> None:
-    """BESTPOS: header of 28 bytes, fields H, H+4, H+8, H+16, H+24, H+32, H+40 … (OEM7, table BESTPOS)."""
+    """The BESTPOS header has 28 bytes; fields follow at H, H+4, H+8, H+16, H+24, H+32, H+40 … (OEM7, table BESTPOS)."""
     at = flight(protocol="novatel", undulation_m=47.3, start="2026-11-21T12:00:00Z")
     data = stream(at.units(2.0))
     bodies: dict[int, bytes] = {}
@@ -380,7 +380,7 @@ def test_the_bound_message_gives_the_error_of_its_edge(protocol: str, name: str,
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 def test_week_and_day_change_during_the_flight(protocol: str) -> None:
-    """Saturday night: the GPS week turns at 23:59:42 UTC, the day 18 s later."""
+    """On Saturday night the GPS week changes at 23:59:42 UTC, and the day 18 s later."""
     at = flight(protocol=protocol, rate_hz=2, start="2026-06-13T23:59:40Z", ins=protocol == "novatel")
     records = at.records(24.0)
     fixes = [fix for fix in of(GnssFix, records) if fix.lat_rad is not None]
@@ -465,7 +465,7 @@ def test_units_must_go_on_where_they_ended() -> None:
 
 
 def test_bytes_arrive_in_succession_and_are_read_in_intervals() -> None:
-    """Noiseless: a burst leaves 80 ms after its epoch, each byte takes ten bits, a read takes what is there."""
+    """Without noise a burst leaves 80 ms after its epoch, each byte takes ten bits, and a read takes what is there."""
     baud, latency_s = 19_200, 0.080
     at = flight(protocol="nmea", rate_hz=1, baud=baud, latency_ms=80.0)
     units = at.units(10.0)

@@ -46,7 +46,7 @@ def autocovariance(rows: FloatArray, lag: int) -> FloatArray:
 
 
 def estimate_sigma(model: FloatArray, lag: int, count: int) -> float:
-    """One sigma of an autocovariance estimated from ``count`` rows of a Gaussian process (Bartlett's formula)."""
+    """Return one sigma of an autocovariance estimated from ``count`` rows of a Gaussian process (Bartlett)."""
     far = np.concatenate([model[:0:-1], model])  # lags −L … L
     middle = len(model) - 1
     moved = np.array([model[abs(k + lag)] * model[abs(k - lag)] for k in range(lag - middle, middle - lag + 1)])
@@ -110,7 +110,7 @@ def test_position_errors_have_the_sigma_and_correlation_of_their_grade(grade: st
 
 @pytest.mark.parametrize("smooth", [False, True])
 def test_noise_is_stationary_from_its_first_row_on(smooth: bool) -> None:
-    """Across many components of one draw, where a process that starts from zero has no variance yet."""
+    """One draw has many components; a process that starts from zero would have no variance yet."""
     components, tau_s, step_s = 20_000, 7.0, 0.5
     rows = Noise(3, ("many",), np.full(components, 2.0), tau_s, step_s, smooth=smooth).rows(0, 600)
     for first, lag in ((0, 0), (0, 1), (0, 8), (1, 1), (511, 1), (505, 14)):  # blocks of 512 rows

@@ -30,7 +30,7 @@ SYNC = 260
 
 
 def made(noise: bool = True, **keys: Any) -> InertialUnit:
-    """A tactical unit in a steady turn."""
+    """Return a tactical unit in a steady turn."""
     table = ImuTable(**({"oscillator": OSCILLATOR} | keys))
     return InertialUnit(table, circling_the_pole(SECONDS, 800.0, 0.075, 6357500.0), 4, "main", noise=noise)
 
@@ -46,7 +46,7 @@ def settings(table: ImuTable) -> DeviceSettings:
 
 
 def decoded(units: list[WireUnit], table: ImuTable) -> tuple[StructArray, StructArray]:
-    """Samples and device clock rows, with no frame to complain of."""
+    """Return samples and device clock rows, and check that no frame was faulty."""
     parser = find_driver("imu", "dbc").make_parser(settings(table))
     host_ns = np.array([round(one.time_s * 1e9) for one in units], np.int64) + 10**15
     rows = np.stack([np.frombuffer(one.data, np.uint8) for one in units])
@@ -59,7 +59,10 @@ def decoded(units: list[WireUnit], table: ImuTable) -> tuple[StructArray, Struct
 
 
 def gps_times_s(rows: StructArray) -> FloatArray:
-    """Times of samples by the edges they carry, the first being that of second 0, straight from each to the next."""
+    """Return times of samples, s, interpolated linearly between the edges that they carry.
+
+    The first edge is that of second 0.
+    """
     edges_ns = np.unique(rows["pps_time_ns"])
     assert len(edges_ns) == SECONDS
     assert edges_ns[0] >= 0
@@ -100,7 +103,7 @@ def test_the_parser_reads_the_measurements_of_the_unit(keys: dict[str, Any]) -> 
 
 
 def test_samples_carry_the_latest_transmitted_edge() -> None:
-    """Its frame is out within a millisecond of the edge: from then on every sample carries it."""
+    """The edge's frame is sent within a millisecond of the edge; from then on every sample carries it."""
     unit = made(noise=False)
     units = wired(unit).units(0.0, SECONDS)
     rows, _ = decoded(units, unit.table)

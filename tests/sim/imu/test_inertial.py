@@ -40,7 +40,7 @@ def unit(trajectory: Any, seed: int = 1, *, noisy: bool = True, **keys: Any) -> 
 
 
 def test_gravity_on_the_ellipsoid_matches_the_published_values() -> None:
-    """NIMA TR8350.2, table 3.4: at the equator, at a pole, mean over the ellipsoid."""
+    """NIMA TR8350.2, table 3.4, gives the values at the equator, at a pole, and the mean over the ellipsoid."""
     equator, pole = normal_gravity(np.array([0.0, 1.0]), np.zeros(2))
     np.testing.assert_allclose([equator, pole], [9.7803253359, 9.8321849378], rtol=0, atol=1.5e-10)
     nodes, weights = np.polynomial.legendre.leggauss(60)
@@ -50,7 +50,7 @@ def test_gravity_on_the_ellipsoid_matches_the_published_values() -> None:
 
 
 def test_gravity_and_its_gradient_at_45_degrees_match_grs_80() -> None:
-    """GRS 80 says 9.806199203 (Moritz 2000); WGS 84's GM is smaller, its shape and the centrifugal part the same."""
+    """GRS 80 has 9.806199203 m/s² (Moritz 2000); WGS 84 has a smaller GM, and the same shape and centrifugal part."""
     sine = np.full(2, np.sqrt(0.5))
     ground, above = normal_gravity(sine, np.array([0.0, 1.0]))
     centrifugal = OMEGA**2 * 6388838.3 / 2  # N cos² φ
@@ -60,7 +60,7 @@ def test_gravity_and_its_gradient_at_45_degrees_match_grs_80() -> None:
 
 
 def normal_potential(point: FloatArray) -> float:
-    """W of the level ellipsoid at x, z (Heiskanen and Moritz 1967, Eq. 2-62), centrifugal part included."""
+    """Return W of the level ellipsoid at x, z (Heiskanen and Moritz 1967, Eq. 2-62), centrifugal part included."""
     gm, a, b, omega = 3.986004418e14, 6378137.0, 6356752.3142, OMEGA
     e = np.sqrt(a * a - b * b)
     x, z = point
@@ -69,7 +69,7 @@ def normal_potential(point: FloatArray) -> float:
     sin_beta = z / u
 
     def q(v: float) -> float:
-        """By its series, 2-57: the closed form cancels."""
+        """Compute the function by its series, 2-57, because the closed form loses all digits."""
         n = np.arange(1, 12)
         return float((2 * (-1.0) ** (n + 1) * n / ((2 * n + 1) * (2 * n + 3)) * (e / v) ** (2 * n + 1)).sum())
 
@@ -80,7 +80,10 @@ def normal_potential(point: FloatArray) -> float:
 @pytest.mark.parametrize("lat_deg", [0.0, 30.0, 47.5, 75.0])
 @pytest.mark.parametrize("height_m", [0.0, 500.0, 3000.0])
 def test_gravity_above_the_ellipsoid_is_the_gradient_of_the_potential(lat_deg: float, height_m: float) -> None:
-    """The series has flattening to first order, 2γ/a · 3f² = 1e-10 m/s² a metre, and stops at h², 5e-9 m/s² at 3 km."""
+    """The series is first order in flattening, which errs by 2γ/a · 3f² = 1e-10 m/s² per metre.
+
+    It stops at h², which errs by 5e-9 m/s² at 3 km.
+    """
     lat = np.radians(lat_deg)
     up, step = np.array([np.cos(lat), np.sin(lat)]), 50.0
     place = e_from_geodetic(np.array([lat]), np.zeros(1), np.array([height_m]))[0, [0, 2]]
@@ -122,7 +125,7 @@ def test_pitch_up_gives_forward_force_and_roll_right_gives_leftward_force() -> N
 
 
 def test_a_steady_turn_gives_the_centripetal_force_of_inertial_space() -> None:
-    """Around the pole the turn and the earth's add: ρ (ω + Ω)² towards the axis, less what attraction gives."""
+    """Around the pole the turn and the earth's rotation add to ρ (ω + Ω)² towards the axis, less the attraction."""
     radius_m, turn, z_m = 800.0, 0.075, 6357500.0
     circle = circling_the_pole(4.0, radius_m, turn, z_m)
     _, force, rate = unit(circle, grade="perfect", rate_hz=50).samples(1, 200)
@@ -162,7 +165,7 @@ def test_increments_match_a_fine_quadrature(rate_hz: int, tmp_path: Path) -> Non
 
 
 def test_increments_use_the_axes_and_clock_of_the_unit() -> None:
-    """Mounted with x to the right and y backward; its clock 100 ppm fast: intervals shorter, means smaller by that."""
+    """The unit is mounted with x right and y backward; its clock is 100 ppm fast, so intervals and means shrink."""
     mounted = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
     still = standing(3.0, attitude_deg=(20, 4, 2))
     fast = OscillatorTable(offset_ppm=100.0)
@@ -178,7 +181,7 @@ def test_increments_use_the_axes_and_clock_of_the_unit() -> None:
 
 
 def pooled_allan(values: FloatArray, rate_hz: int, tau_s: float) -> float:
-    """Allan deviation of columns at τ, clusters side by side (IEEE Std 952-1997, C.3), pooled over the columns."""
+    """Return the Allan deviation at τ, with adjacent clusters (IEEE Std 952-1997, C.3), pooled over columns."""
     size = round(tau_s * rate_hz)
     clusters = len(values) // size
     means = values[: clusters * size].reshape(clusters, size, -1).mean(axis=1)
@@ -186,11 +189,11 @@ def pooled_allan(values: FloatArray, rate_hz: int, tau_s: float) -> float:
 
 
 def expected_allan(white: float, drift: float, constants_s: FloatArray, tau_s: float, clusters: int) -> tuple[Any, Any]:
-    """Allan deviation at τ of white noise and Gauss-Markov processes, and one sigma of its estimate from one column.
+    """Return the Allan deviation at τ of white noise and Gauss-Markov processes, and one sigma of its estimate.
 
-    By the covariances c_k of cluster means k apart: differences have d_k = 2 c_k − c_{k+1} − c_{k−1}, the Allan
-    variance is d_0 / 2, and as the differences are Gaussian the variance of the mean of their squares is
-    2/M Σ (1 − |k|/M) d_k².
+    The estimate is from one column. With covariances c_k of cluster means k apart, differences have d_k = 2 c_k −
+    c_{k+1} − c_{k−1}, and the Allan variance is d_0 / 2. As the differences are Gaussian, the variance of the mean of
+    their squares is 2/M Σ (1 − |k|/M) d_k².
     """
     lag = np.arange(clusters + 1)
     n = tau_s / constants_s[:, None]
@@ -208,7 +211,7 @@ def expected_allan(white: float, drift: float, constants_s: FloatArray, tau_s: f
 
 @pytest.mark.parametrize("grade", ["navigation", "tactical", "mems"])
 def test_random_walk_at_one_second_matches_the_grade(grade: Any) -> None:
-    """600 s of six sensors at rest: three sigmas are 6 % at a second, where there is little but white noise."""
+    """600 s of six sensors at rest determine it to 6 % (three sigmas); at a second nearly all noise is white."""
     rate_hz, seconds = 20, 600
     _, force, rate = unit(standing(seconds + 1.0), grade=grade, rate_hz=rate_hz).samples(1, seconds * rate_hz)
     for values, sensor in zip((force, rate), sensor_grades(ImuTable(grade=grade)), strict=True):
@@ -223,7 +226,7 @@ def test_random_walk_at_one_second_matches_the_grade(grade: Any) -> None:
 
 
 def test_drift_level_matches_the_requested_instability() -> None:
-    """A drift of short constants, far above the white noise: its curve by closed forms, its top the instability."""
+    """Short constants make the drift larger than the white noise; the maximum of its curve is the instability."""
     keys = {"gyro_bias_instability_deg_per_h": 30.0, "accel_bias_instability_mg": 0.5, "bias_correlation_h": 80 / 3600}
     table = ImuTable(grade="navigation", rate_hz=10, noise=ImuNoiseTable(**keys))
     seconds, constants_s = 6000, np.array([80.0, 20.0])
@@ -241,7 +244,7 @@ def test_drift_level_matches_the_requested_instability() -> None:
 
 
 def test_default_drift_is_level_over_two_decades() -> None:
-    """Flicker noise: within a tenth of its top from a minute to half an hour."""
+    """Flicker noise is within a tenth of its maximum from a minute to half an hour."""
     constants_s = drift_constants(3600.0)
     drift = 1.0 / drift_level(constants_s)
     curve = [expected_allan(0.0, drift, constants_s, tau_s, 4)[0] for tau_s in np.geomspace(60.0, 1800.0, 30)]
@@ -250,7 +253,7 @@ def test_default_drift_is_level_over_two_decades() -> None:
 
 
 def test_turn_on_errors_have_the_spread_of_the_grade() -> None:
-    """Variances of 900 draws each: one sigma of them is √(2/900), three are 14 %."""
+    """One sigma of a variance of 900 draws is √(2/900), so three are 14 %."""
     table = ImuTable(grade="mems")
     noise, limit = noise_of(table), 3 * np.sqrt(2 / 900)
     drawn = [SensorErrors(table, seed, "main", noise=True) for seed in range(300)]

@@ -75,7 +75,7 @@ def test_integration_off_the_body_origin_is_accurate_to_a_centimetre(flight: Tra
 
 
 def test_small_rate_and_gravity_errors_break_the_centimetre(flight: Trajectory) -> None:
-    """A hundredth of the earth's rate, or a tenth of a milligal, break it: the limit tests what it should."""
+    """A hundredth of the earth's rate, or a tenth of a milligal, exceeds the limit, so the limit is strict enough."""
     seconds = 300.0
     edges = edges_s(seconds)
     increments = true_increments(flight, edges)

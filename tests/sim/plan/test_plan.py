@@ -44,7 +44,7 @@ def text_of(flight: str = "", line: str = "", more: str = "") -> str:
 
 
 def refused(text: str) -> PlanError:
-    """The error of a plan, which is one line."""
+    """Return the error of a plan, and check that it is one line."""
     with pytest.raises(PlanError) as caught:
         parse_plan(text, Path())
     assert "\n" not in str(caught.value)
@@ -63,7 +63,7 @@ class TestLoading:
         assert plan.tables.scanner["left"].nominal.range_offset_m == 0.0
 
     def test_the_start_is_gps_time_with_the_leap_seconds_of_its_day(self) -> None:
-        """GPS week 1903 began on 2016-06-26; five days and 18 s later it was 2016-07-01T00:00:01 by 17 leap seconds."""
+        """GPS week 1903 began on 2016-06-26; five days and 18 s later UTC was 2016-07-01T00:00:01 (17 leap seconds)."""
         plan = parse_plan(text_of(flight="start = 2016-07-01T02:00:01+02:00"), Path())
         assert plan.leap_seconds == 17
         assert plan.start_gps_ns == (1903 * 604_800 + 5 * 86_400 + 18) * 1_000_000_000
@@ -212,7 +212,7 @@ BOUNDS = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
 
 
 def sections(model: type[BaseModel] = Tables, prefix: str = "") -> dict[str, type[BaseModel]]:
-    """Headings of the page and the tables below them."""
+    """Return the headings that the page must have, with the tables that they describe."""
     found: dict[str, type[BaseModel]] = {}
     for key, field in model.model_fields.items():
         inner, outer = model_in(field.annotation), str(field.annotation)
@@ -226,7 +226,7 @@ def sections(model: type[BaseModel] = Tables, prefix: str = "") -> dict[str, typ
 
 
 def model_in(annotation: Any) -> type[BaseModel] | None:
-    """The table in an annotation."""
+    """Return the table in an annotation, or None."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
     inner = (model_in(part) for part in typing.get_args(annotation))
@@ -288,7 +288,7 @@ def default_of(field: FieldInfo) -> str:
 
 
 def tables_of_page() -> dict[str, str]:
-    """Headings and what stands below them; a heading may name several tables."""
+    """Return the page's headings with the text below each; a heading may name several tables."""
     found = {}
     for block in re.split(r"^### ", PAGE, flags=re.MULTILINE)[1:]:
         heading, _, text = block.partition("\n")
@@ -298,7 +298,7 @@ def tables_of_page() -> dict[str, str]:
 
 
 class TestPage:
-    """docs/simulation.md and the tables say the same."""
+    """docs/simulation.md and the tables agree."""
 
     def test_every_table_has_a_heading_and_every_heading_a_table(self) -> None:
         assert set(tables_of_page()) == set(sections())

@@ -37,7 +37,7 @@ def headings_deg(preset: str) -> list[float]:
 class TestEveryPreset:
     @pytest.mark.parametrize("preset", PRESETS)
     def test_every_preset_stays_within_the_range_of_its_scanner(self, preset: str) -> None:
-        """What is below, from the middle of a swath to its edges, is measured."""
+        """The ground below is in range from the middle of a swath to its edges."""
         flown = survey(preset)
         assert flown.plan.tables.flight.name == preset
         check_faults(flown.plan.tables)
@@ -90,7 +90,7 @@ class TestCalibrationPreset:
         assert total["pulses"] == pytest.approx(20e6, rel=0.05)
 
     def test_flight_turns_to_both_sides(self) -> None:
-        """Between neighbouring lines: else what gyroscopes' axes lean by passes for the accelerometers' biases."""
+        """Turns to one side only would let the gyroscopes' misalignment look like accelerometer biases."""
         flown = survey("calibration")
         turned_deg = []
         for before, behind in pairwise(flown.strips):
@@ -135,7 +135,7 @@ class TestCalibrationPreset:
             assert true[key] != 0.0
 
     def test_roofs_face_every_direction(self) -> None:
-        """Ridges of at least 150 houses, some in every sixth of the half circle."""
+        """At least 150 houses have ridges, some of them in every sixth of the half circle."""
         corners = survey("calibration").scene.buildings
         assert len(corners) >= 150
         side = corners[:, 1] - corners[:, 0]
@@ -153,7 +153,7 @@ class TestCalibrationPreset:
 
 class TestOtherPresets:
     def test_corridor_follows_its_wire_both_ways(self) -> None:
-        """Every mast is seen; most from a line out, most from a line back: both leave out where they turn."""
+        """Every mast is seen, most of them from a line out and a line back; either leaves out masts at its turns."""
         flown = survey("corridor")
         east_m, north_m = flown.scene.wires.reshape(-1, 2).T
         ground_m = flown.scene.ground_m(east_m, north_m)

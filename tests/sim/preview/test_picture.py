@@ -30,7 +30,10 @@ def strip(plan: Plan, index: int = 0) -> Strip:
 
 class TestSummary:
     def test_summary_matches_a_calculation_by_hand(self) -> None:
-        """H = 400 m, ±30°: swath 800/√3 m; 1000 m at 50 m/s; lines 230.94 m apart overlap by half."""
+        """With H = 400 m and ±30° a swath is 800/√3 m wide; lines 230.94 m apart overlap by half.
+
+        A line of 1000 m takes 20 s at 50 m/s.
+        """
         apart = 400.0 / math.sqrt(3.0)
         plan = flat_plan(
             line("a", "-500.0, 0.0", "500.0, 0.0"),
@@ -55,13 +58,13 @@ class TestSummary:
         assert total["seconds"] > 60.0
 
     def test_datagrams_dominate_the_size_of_the_log(self) -> None:
-        """SREP/1: 48 + 100 · (8 + 8 · 3) + 4 bytes for 100 pulses."""
+        """A datagram of SREP/1 with 100 pulses has 48 + 100 · (8 + 8 · 3) + 4 bytes."""
         plan = flat_plan(line("a", "-500.0, 0.0", "500.0, 0.0"))
         datagrams = 20_000 * (48 + 100 * 32 + 4)
         assert datagrams < plan_summary(plan)[-1]["log_bytes"] < 1.15 * datagrams
 
     def test_a_slope_reduces_the_height_above_ground(self) -> None:
-        """10 %, falling to the west along the line: ±50 m over 500 m, the mean as at the origin."""
+        """A slope of 10 % that falls west along the line gives ±50 m over 500 m, with the mean of the origin."""
         more = "slope_percent = 10.0\nslope_towards_deg = 270.0\n[control]\npoints = 0\n"
         text = FLAT.replace("[control]\npoints = 3\n", more)
         row = plan_summary(parse_plan(text + line("a", "-500.0, 0.0", "500.0, 0.0"), Path()))[0]
@@ -69,7 +72,7 @@ class TestSummary:
         assert row["height_mean_m"] == pytest.approx(400.0, abs=0.1)
 
     def test_swath_of_a_spinning_head_is_limited_by_its_range(self) -> None:
-        """60 m up, to 100 m: 80 m to either side; acos 0.6 of half a turn of the pulses reach the ground."""
+        """From 60 m, a range of 100 m reaches 80 m to either side; acos 0.6 of half a turn of pulses reach ground."""
         head = f'[scanner.belly]\nkind = "vlp16"\nscan_hz = 10.0\nrange_max_m = 100.0\ninstallation = {ACROSS}\n'
         text = FLAT.partition("[scanner.left]")[0] + head + line("a", "-500.0, 0.0", "500.0, 0.0", 460.0)
         row = plan_summary(parse_plan(text, Path()))[0]
@@ -110,10 +113,10 @@ HEADS: dict[str, Callable[[ScannerTable, str], Vlp16Head | Os1Head | LineHead]] 
 
 
 class TestFans:
-    """Against the pulses that the scanners themselves fire."""
+    """The expected angles are those of the pulses that the scanners themselves emit."""
 
     def angles(self, table: ScannerTable) -> FloatArray:
-        """Across the flight from nadir, of every pulse."""
+        """Return the angle (n,), rad, of every pulse across the flight, from nadir."""
         head = HEADS.get(table.kind, LineHead)(table, "left")
         pulses = head.pulses(0.0, SPAN_S)
         beams = pulses.direction_s @ np.array(table.installation).T
@@ -128,14 +131,14 @@ class TestFans:
 
     @pytest.mark.parametrize("kind", ["sine", "polygon", "monogon", "nutating", "vlp16", "os1"])
     def test_shares_of_pulses_below_each_angle_match(self, kind: str) -> None:
-        """Share of the pulses below each angle; spinning heads' beams lean, so that they differ a little from turns."""
+        """The beams of spinning heads lean, so their shares differ slightly from those of turns."""
         angles, fan = self.angles(KINDS[kind]), fan_of(KINDS[kind])
         at = np.linspace(-0.95, 0.95, 39) * fan.half_angle_rad
         below = np.searchsorted(np.sort(angles), at) / len(angles)
         assert np.abs(below - fan.share(at)).max() < 0.01
 
     def test_a_scanner_mounted_with_roll_looks_sideways(self) -> None:
-        """Mounted rolled by 20° to the left of the aircraft's axis: the beam at 0 goes to the right."""
+        """The scanner is rolled by 20° to the left, so the beam at 0 points right."""
         roll = math.radians(-20.0)
         turned = [[1.0, 0.0, 0.0], [0.0, math.cos(roll), -math.sin(roll)], [0.0, math.sin(roll), math.cos(roll)]]
         table = scanner(kind="polygon", facets=8, half_angle_deg=35.0, installation=turned, prf_hz=1e6)
@@ -147,7 +150,7 @@ class TestFans:
 
 class TestStrips:
     def test_strip_has_its_sides_and_ends(self) -> None:
-        """A line to the north-east: right of it is south-east."""
+        """On a line to the north-east, right is south-east."""
         one = strip(flat_plan(line("a", "100.0, 200.0", "400.0, 600.0")))
         east, north = np.array([220.0, 180.0, 100.0, 400.0]), np.array([360.0, 390.0, 200.0, 600.0])
         along, right = one.beside(east, north)
@@ -173,7 +176,7 @@ class TestStrips:
         assert covered == pytest.approx(2 * 1000.0 * swath - swath**2, rel=0.01)
 
     def test_density_follows_the_mirror(self) -> None:
-        """Uniform angles: rate / (v · 2 θmax) · cos² θ / H; a sine is dense at its edges."""
+        """Uniform angles give rate / (v · 2 θmax) · cos² θ / H; a sine gives more points at its edges."""
         plan = flat_plan(line("a", "0.0, 0.0", "500.0, 0.0"))
         even = plan.changed({"scanner": {"left": {"kind": "oscillating", "motion": "triangle"}}})
         east, north, ground = np.full(2, 250.0), np.array([0.0, 200.0]), np.full(2, 400.0)
@@ -194,7 +197,7 @@ class TestStrips:
 
 
 def png_size(path: Path) -> tuple[int, int]:
-    """Width and height, from the header chunk (PNG specification, 11.2.2)."""
+    """Return width and height from the header chunk (PNG specification, 11.2.2)."""
     data = path.read_bytes()
     assert data[:8] == b"\x89PNG\r\n\x1a\n"
     width, height = struct.unpack(">II", data[16:24])
@@ -234,7 +237,7 @@ class TestDrawing:
         assert (tmp_path / "plan.png").stat().st_size > 200_000
 
     def test_a_long_line_gets_a_wide_page(self, tmp_path: Path) -> None:
-        """17 × 11.4 inches of 72 points."""
+        """The page has 17 × 11.4 inches of 72 points."""
         draw_plan(flat_plan(line("a", "-20000.0, 0.0", "20000.0, 0.0")), tmp_path / "plan.PDF")
         data = (tmp_path / "plan.PDF").read_bytes()
         assert data[:5] == b"%PDF-"

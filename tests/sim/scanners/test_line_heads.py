@@ -33,7 +33,7 @@ OSCILLATOR = {"offset_ppm": 4.0, "drift_ppm_per_h": 20.0, "wander_ppm": 0.5}
 
 
 def scanner(kind: str, **keys: Any) -> ScannerTable:
-    """A table; "triangle" is an oscillating mirror's motion."""
+    """Return a scanner table; "triangle" means the motion of an oscillating mirror."""
     named = {"kind": "oscillating", "motion": "triangle"} if kind == "triangle" else {"kind": kind}
     return ScannerTable.model_validate(named | keys)
 
@@ -191,7 +191,7 @@ def test_only_light_within_the_half_angle_leaves(kind: str, share: float) -> Non
 
 
 def read_angle(table: ScannerTable, pulses: Pulses) -> tuple[FloatArray, FloatArray]:
-    """θ_encoder and facet from readings, by PROTOCOLS' words."""
+    """Return θ_encoder (rad) and facet from readings, as the page of SREP defines them."""
     factor = 2.0 if table.kind == "oscillating" else 1.0
     if table.kind != "polygon":
         return 2 * np.pi * pulses.encoder / table.encoder_counts * factor, np.zeros(len(pulses))
@@ -201,7 +201,10 @@ def read_angle(table: ScannerTable, pulses: Pulses) -> tuple[FloatArray, FloatAr
 
 
 def derivatives(table: ScannerTable, pulses: Pulses) -> tuple[FloatArray | float, FloatArray | float]:
-    """dθ/dt and d²θ/dt²: of an oscillating mirror from where its light went, of others by what turns evenly."""
+    """Return dθ/dt and d²θ/dt², rad/s and rad/s².
+
+    For an oscillating mirror they come from the beam's direction, for others from the steady rotation.
+    """
     if table.kind == "oscillating":
         theta = np.arctan2(pulses.direction_s[:, 1], pulses.direction_s[:, 2])
         rate = np.gradient(theta, pulses.time_s, edge_order=2)
@@ -210,7 +213,7 @@ def derivatives(table: ScannerTable, pulses: Pulses) -> tuple[FloatArray | float
 
 
 def direction_of(table: ScannerTable, theta: FloatArray) -> FloatArray:
-    """The beam in s at CONVENTIONS' angle."""
+    """Return the beam (n, 3) in s at the angle of the conventions, rad."""
     tilt = np.radians(table.true.scan_plane_tilt_deg)
     if table.kind == "nutating":
         psi = np.radians(table.nutation_deg)
@@ -223,7 +226,10 @@ def direction_of(table: ScannerTable, theta: FloatArray) -> FloatArray:
 
 
 def risley_by_angles(table: ScannerTable, first: FloatArray, second: FloatArray) -> FloatArray:
-    """Snell's law in the plane of each surface's normal and the ray: sines of angles, no vector formula."""
+    """Return beams (n, 3) behind both prisms by Snell's law in the plane of normal and ray.
+
+    It uses sines of angles instead of a vector formula.
+    """
     ray = np.tile([0.0, 0.0, 1.0], (len(first), 1))
     for turned, wedge_deg in zip((first, second), table.wedge_deg, strict=True):
         wedge = np.radians(wedge_deg)
@@ -239,7 +245,7 @@ def risley_by_angles(table: ScannerTable, first: FloatArray, second: FloatArray)
 
 
 def miss_rad(table: ScannerTable, pulses: Pulses) -> FloatArray:
-    """Angles between the light and where CONVENTIONS says that it went."""
+    """Return angles (n,), rad, between the beam and the direction that the conventions predict."""
     true = table.true
     reading, facet = read_angle(table, pulses)
     rate, acceleration = derivatives(table, pulses)
@@ -269,7 +275,7 @@ def test_the_readings_reproduce_the_beams_to_less_than_a_count(kind: str, error:
 
 @pytest.mark.parametrize("key", ["scan_angle_offset_deg", "scan_angle_scale_ppm", "encoder_latency_us", "torsion_us2"])
 def test_an_omitted_error_changes_the_beam_by_many_counts(key: str) -> None:
-    """Each of the errors above turns the beam by many counts: the test before could fail."""
+    """The previous test could fail, because each of the errors turns the beam by many counts."""
     table = scanner("oscillating", prf_hz=1_000_000.0, true={key: ERRORS[key]})
     pulses = LineHead(table, "left").pulses(5.0, 5.03)
     blind = scanner("oscillating", prf_hz=1_000_000.0)
@@ -294,7 +300,7 @@ def test_errors_have_their_documented_signs() -> None:
 
 
 def test_each_facet_of_a_polygon_has_its_own_tilt() -> None:
-    """FORMULAS 2.2: u_x = 2 cos i sin ε (times cos ε), i = 45° − θ/2."""
+    """FORMULAS 2.2 has u_x = 2 cos i sin ε (times cos ε), with i = 45° − θ/2."""
     tilts = {0: 0.02, 2: -0.05}
     facet = [{"index": index, "tilt_deg": tilt} for index, tilt in tilts.items()]
     table = scanner("polygon", facets=5, facet=facet, half_angle_deg=40.0)
@@ -309,7 +315,7 @@ def test_each_facet_of_a_polygon_has_its_own_tilt() -> None:
 
 
 def test_the_reading_of_a_risley_pair_counts_whole_turns() -> None:
-    """From the reading alone both prisms are known, over as many turns as it takes the second to be back."""
+    """The reading alone determines both prisms, over the number of turns after which the second repeats."""
     table = scanner("risley", prism_ratio=-0.75, prf_hz=100_000.0, scan_hz=100.0, encoder_counts=100_000)
     pulses = LineHead(table, "left").pulses(0.0, 0.1)
     assert (pulses.encoder.min(), pulses.encoder.max()) == pytest.approx((-200_000, 200_000), abs=200)

@@ -31,7 +31,7 @@ def wire_of(plan: Plan, lost: list[tuple[float, float]] | None = None, *, wired:
 def sent(
     plan: Plan, cuts: list[float], wire: OusterWire | None = None
 ) -> tuple[list[WireUnit], StructArray, list[Shots]]:
-    """Units and truth of the time between the cuts."""
+    """Return units and truth of the time between the cuts, s."""
     wire = wire or wire_of(plan)
     head = Os1Head(plan.tables.scanner["left"], "left")
     shots = [measured_of(head.pulses(start, stop), 500.0) for start, stop in pairwise(cuts)]
@@ -46,7 +46,7 @@ def parser_of(plan: Plan) -> OusterParser:
 
 
 def read_back(plan: Plan, units: list[WireUnit]) -> tuple[StructArray, StructArray]:
-    """Returns and clock samples, of packets of which none is bad."""
+    """Return returns and clock samples, and check that no packet is bad."""
     parser = parser_of(plan)
     records = feed(parser, units)
     assert not parser.counters.errors
@@ -59,7 +59,7 @@ def read_back(plan: Plan, units: list[WireUnit]) -> tuple[StructArray, StructArr
 
 
 def expected_returns(shot: Shots, most: int) -> list[tuple[int, int, int, float]]:
-    """(pulse, range in mm, number, light): the strongest so many, by range, pulse by pulse."""
+    """Return (pulse, range in mm, number, light) of the strongest returns, sorted by range, for each pulse."""
     found = []
     for number, ranges, lights in zip(shot.pulses.number, shot.measured.range_m, shot.measured.intensity, strict=True):
         echoes = [(float(lights[slot]), -slot, round(r / 0.001)) for slot, r in enumerate(ranges) if r]
@@ -163,7 +163,7 @@ def test_timestamps_count_the_seconds_since_power_on() -> None:
 
 
 def ahead_us(plan: Plan, lost: list[tuple[float, float]], times_s: list[float], *, wired: bool = True) -> FloatArray:
-    """Stamps less the true time and half a minute, of the packets that begin soon after each time."""
+    """Return stamp − true time − 30 s, µs, of the packets that begin soon after each time."""
     wire, head = wire_of(plan, lost, wired=wired), Os1Head(plan.tables.scanner["left"], "left")
     found = []
     for at_s in times_s:

@@ -83,7 +83,7 @@ def test_the_conventions_recover_the_true_range(errors: dict[str, Any], ranges: 
 
 
 def test_intensity_corrections_hold_at_the_middle_the_ends_and_beyond() -> None:
-    """A brighter echo than the table's last is corrected as that one, a darker one as the first."""
+    """An echo brighter than the table's last entry is corrected like that entry, a darker one like the first."""
     table = scanner(ibrc={"intensity": [400.0, 2000.0], "correction_m": [0.04, -0.04]})
     range_m = np.full((4, 1), 1000.0)
     measured = measure(table, echoes_of(range_m, np.array([[0.05], [0.1], [0.3], [1.0]])))
@@ -92,7 +92,10 @@ def test_intensity_corrections_hold_at_the_middle_the_ends_and_beyond() -> None:
 
 
 def test_a_correction_that_is_subtracted_belongs_to_a_range_that_is_too_long() -> None:
-    """ρ = … − ibrc(I): what triggers early (bright, too short) has a negative entry, what triggers late a positive."""
+    """In ρ = … − ibrc(I) bright echoes, which trigger early, are too short and have negative entries.
+
+    Dark ones trigger late and have positive entries.
+    """
     table = scanner(ibrc={"intensity": [0.0, 4000.0], "correction_m": [0.10, -0.10]})
     bright, dark = measure(table, echoes_of(np.full((2, 1), 1000.0), np.array([[1.0], [0.01]]))).range_m[:, 0]
     assert bright == pytest.approx(999.9, abs=1e-9)
@@ -112,7 +115,7 @@ def test_each_beam_of_a_spinning_head_has_its_own_correction() -> None:
 
 
 def test_intensity_follows_reflectance_distance_and_air() -> None:
-    """Twice as far: a quarter. Beer and Lambert: half the light after ln 2 of extinction, there and back."""
+    """Twice the distance gives a quarter. By Beer and Lambert, ln 2 of extinction there and back leaves half."""
     range_m = np.array([[1000.0], [2000.0], [500.0], [10.0]])
     measured = measure(scanner(), echoes_of(range_m, np.array([[1.0], [1.0], [0.25], [1.0]])))
     assert measured.intensity[:, 0].tolist() == [4000.0, 1000.0, 4000.0, 65_535.0]
@@ -157,7 +160,7 @@ def test_packed_slots_keep_their_truth() -> None:
 
 
 def test_a_footprint_on_a_slope_lengthens_the_echo() -> None:
-    """1000 m, 0.5 mrad, 45°: 0.5 m deep, 2 · 0.5 m / c = 3.336 ns more."""
+    """At 1000 m, 0.5 mrad and 45° the footprint is 0.5 m deep, which adds 2 · 0.5 m / c = 3.336 ns."""
     table = scanner(pulse_ns=4.0, divergence_mrad=0.5)
     measured = measure(table, echoes_of(np.full((2, 1), 1000.0), 1.0, np.array([[0.0], [45.0]])))
     np.testing.assert_allclose(measured.pulse_width_ns[:, 0], [4.0, 4.0 + 3.3356409520], atol=1e-9)

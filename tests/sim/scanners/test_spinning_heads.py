@@ -37,7 +37,7 @@ def points_at(pulses: Pulses, range_m: FloatArray | float) -> FloatArray:
 
 
 def turned_deg(one: FloatArray, other: FloatArray) -> FloatArray:
-    """By how much the azimuth of directions (n, 3) grows from one to the other, x right at 90°, y at 0."""
+    """Return by how many degrees the azimuth of directions (n, 3) grows from one to the other: x at 90°, y at 0°."""
     difference = np.arctan2(other[:, 0], other[:, 1]) - np.arctan2(one[:, 0], one[:, 1])
     degrees: FloatArray = np.degrees((difference + np.pi) % (2 * np.pi) - np.pi)
     return degrees

@@ -32,7 +32,7 @@ from tests.sim.srep_spoken import (
 
 
 def expected_angle(table: ScannerTable, encoder: Int64Array) -> FloatArray:
-    """θ_encoder by PROTOCOLS' words."""
+    """Return θ_encoder, rad, as the page of SREP defines it."""
     shaft = 2 * np.pi * encoder / table.encoder_counts
     if table.kind == "polygon":
         facet = np.floor(encoder * table.facets / table.encoder_counts)
@@ -195,7 +195,7 @@ def test_a_long_gap_between_pulses_ends_a_datagram_too() -> None:
 
 
 def test_ticks_since_the_first_pulse_fit_their_field() -> None:
-    """1 GHz and 100 pulses a second: 2³² ticks go by in 430 pulses."""
+    """At 1 GHz and 100 pulses a second 2³² ticks pass in 430 pulses."""
     oscillator = {"ticks_at_start": 12}
     table = scanner(tick_hz=1_000_000_000, prf_hz=100.0, pulses_per_datagram=1000, oscillator=oscillator)
     spoken = speak(table, (0.0, 6.0))

@@ -40,7 +40,7 @@ def wire_of(plan: Plan, lost: list[tuple[float, float]] | None = None, *, wired:
 
 
 def sent(plan: Plan, wire: VelodyneWire, cuts: list[float]) -> tuple[list[WireUnit], StructArray, list[Shots]]:
-    """Units and truth of the time between the cuts."""
+    """Return units and truth of the time between the cuts, s."""
     head = Vlp16Head(plan.tables.scanner["left"], "left")
     shots = [measured_of(head.pulses(start, stop)) for start, stop in pairwise(cuts)]
     told = [wire.units(*shot) for shot in shots] + [wire.close()]
@@ -64,7 +64,7 @@ def statuses(records: list[Record]) -> list[tuple[float, object]]:
 
 
 def expected_single(shot: Shots) -> list[tuple[int, int, int, float]]:
-    """(pulse, range in 2 mm, number, light) by the manual's words, pulse by pulse."""
+    """Return (pulse, range in 2 mm, number, light) as the manual defines it, pulse by pulse."""
     found = []
     for number, ranges, lights in zip(shot.pulses.number, shot.measured.range_m, shot.measured.intensity, strict=True):
         echoes = [(light, -slot, round(r / 0.002)) for slot, (r, light) in enumerate(zip(ranges, lights, strict=True))]
@@ -76,7 +76,10 @@ def expected_single(shot: Shots) -> list[tuple[int, int, int, float]]:
 
 
 def expected_pairs(shot: Shots) -> list[tuple[int, int, int, float]]:
-    """The same of dual returns: the last, and the strongest or, where that is the last, the second-strongest."""
+    """Return the same for dual returns: the last, and the strongest.
+
+    If the strongest is the last, the second-strongest takes its place.
+    """
     found = []
     for number, ranges, lights in zip(shot.pulses.number, shot.measured.range_m, shot.measured.intensity, strict=True):
         echoes = [(round(r / 0.002), float(lights[slot]), -slot) for slot, r in enumerate(ranges) if round(r / 0.002)]
@@ -253,7 +256,7 @@ def test_returns_report_the_locked_pulse() -> None:
 
 
 def past_hour_s(plan: Plan, lost: list[tuple[float, float]], times_s: list[float], *, wired: bool = True) -> FloatArray:
-    """Device times less the true ones past the hour, of the packets that begin soon after each time."""
+    """Return device time − true time past the hour, s, of the packets that begin soon after each time."""
     wire = wire_of(plan, lost, wired=wired)
     head = Vlp16Head(plan.tables.scanner["left"], "left")
     ahead = []

@@ -27,7 +27,7 @@ SQUARE = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 
 
 def test_ground_has_the_height_of_the_plan_even_far_from_the_origin() -> None:
-    """At its nodes: 20 km away the ellipsoid lies 31 m below the site's plane."""
+    """At a distance of 20 km the ellipsoid is 31 m below the site's plane; heights are checked at nodes."""
     scene = scene_of(
         "height_m = 730\nslope_percent = 2\nslope_towards_deg = 250\ncell_m = 20", 300.0, (16_000.0, -12_000.0)
     )
@@ -103,7 +103,7 @@ houses = 90
 
 
 def overlap(one: FloatArray, other: FloatArray) -> bool:
-    """Whether two convex polygons overlap: none of their sides separates them (the separating axis theorem)."""
+    """Return True if two convex polygons overlap, because no side separates them (separating axis theorem)."""
     for polygon in (one, other):
         sides = np.roll(polygon, -1, axis=0) - polygon
         for normal in np.stack([-sides[:, 1], sides[:, 0]], axis=1):
@@ -152,7 +152,7 @@ def test_a_village_has_houses_of_many_kinds_within_its_bounds() -> None:
 
 
 def test_roofs_face_every_side() -> None:
-    """What calibration needs: planes that lean to the four sides of the village."""
+    """Calibration needs planes that lean to the four sides of the village."""
     houses, _ = build_village(plan_of(VILLAGE).tables.terrain.village[0], 1, 0)
     planes = build_solids(houses, scene_of(VILLAGE, 300.0).ground, 1).plane
     roofs = planes[(planes[:, 4] == ROOF) & (planes[:, 2] < 0.99)]
