@@ -86,7 +86,7 @@ def _tell(name: str, path: Path, what: str) -> None:
 
 
 def _guided_in_a_child(build: Callable[[], Target], name: str, seconds: float, seed: int) -> bool:
-    """Search by libFuzzer, which ends its process; then let it make a crashing input smaller."""
+    """Search with libFuzzer, which ends its process, and let it reduce a crashing input."""
     crashes, corpus = CRASHES / name, CORPUS / name
     for folder in (crashes, corpus):
         folder.mkdir(parents=True, exist_ok=True)

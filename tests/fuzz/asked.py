@@ -48,7 +48,7 @@ OF_HTTP = (
 
 
 def asked_targets() -> Iterator[tuple[str, Callable[[], Target]]]:
-    """Both sides of the control socket, the caster's side of NTRIP, what receivers say to start-up messages."""
+    """Yield the targets of both sides of the control socket, NTRIP casters and answers to start-up messages."""
     yield "control-request", _requests
     yield "control-answer", _answers
     yield "ntrip", _casters
@@ -117,7 +117,7 @@ def _say(one: Control, ours: socket.socket, theirs: socket.socket, data: bytes) 
 
 
 def _answered(sock: socket.socket, one: Control) -> Iterator[str]:
-    """A line, or nothing to what is no request; notes that can be printed."""
+    """Yield the answer, which is a line, or "ignored" for what is no request; check that events can be printed."""
     said = b""
     with contextlib.suppress(ConnectionResetError):  # of what was sent behind the line
         said = sock.recv(1 << 16)

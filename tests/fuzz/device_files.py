@@ -66,7 +66,7 @@ def _made(driver: Driver, settings: DeviceSettings) -> Iterator[str]:
 
 
 def _of_velodyne() -> list[bytes]:
-    """As ROS has them, and as the maker's viewer has."""
+    """Return calibrations in the form of ROS and in that of the maker's viewer."""
     lasers = "".join(
         f"<item><px> <id_> {laser} </id_> <vertCorrection_> {laser - 8} </vertCorrection_>\n"
         "<rotCorrection_> 0 </rotCorrection_> <distCorrection_> 1.5 </distCorrection_></px></item>\n"

@@ -36,13 +36,12 @@ SETTINGS = settings(
 
 
 class FindingError(AssertionError):
-    """A target broke a rule of time, memory or growth."""
+    """Raised if a target breaks a rule of time, memory or growth."""
 
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """Something that reads bytes of others.
-
+    """A reader of foreign bytes.
     Attributes:
         name: name on the command line, and of the folder of its inputs.
         seeds: inputs to begin with.
@@ -62,7 +61,7 @@ class Target:
 
 @dataclass(slots=True)
 class Report:
-    """A run's figures; ``findings`` by the place where they happened: the input and the error."""
+    """A run's figures; ``findings`` maps the place of each finding to its input and error."""
 
     executions: int = 0
     seen: set[str] = field(default_factory=set)
@@ -143,7 +142,7 @@ def fuzz(target: Target, paths: int, *, number: int | None = None, report: Repor
 
 
 def fuzz_for(target: Target, seconds: float, *, number: int) -> Report:
-    """Fuzz for so many seconds of processor time, which no other work takes from it, then for a life of many inputs."""
+    """Fuzz for some seconds of processor time, not shortened by other work, then feed many inputs to one object."""
     report, started, turns = Report(), time.process_time(), 0
     while not report.findings and time.process_time() - started < seconds:
         fuzz(target, PATHS_OF_A_ROUND, number=number + turns, report=report)

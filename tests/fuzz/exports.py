@@ -40,7 +40,7 @@ Place = tuple[str, tuple[str, ...]]
 
 
 def export_targets() -> Iterator[tuple[str, Callable[[], Target]]]:
-    """A log that is exported, each file of an export that is imported, and the list of an offload."""
+    """Yield the targets of a log's export, of each file of an import, and of an offload's list."""
     yield "export", _exports
     manifest: Place = (MANIFEST, (*NUMBERS, *OF_JSON, *OF_FILES))
     yield "export-manifest", partial(_imports, "export-manifest", manifest)
@@ -55,7 +55,7 @@ def export_targets() -> Iterator[tuple[str, Callable[[], Target]]]:
 
 @lru_cache(maxsize=1)
 def _exported() -> dict[str, bytes]:
-    """The files of a log with every kind of source."""
+    """Return the exported files of a log with every kind of source."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "log.mcap")
         _write(path)
@@ -84,7 +84,10 @@ def _write(path: Path) -> None:
 
 
 def _imports(target: str, place: Place) -> Target:
-    """One of its files changed; a sidecar before it is packed, else gzip's checksum hides it all."""
+    """Return the target that changes one file of an export.
+
+    A sidecar is changed before it is packed, because gzip's checksum would hide the change.
+    """
     name, words = place
     packed = name.endswith(SUFFIX)
     seed = gzip.decompress(_exported()[name]) if packed else _exported()[name]
@@ -108,7 +111,7 @@ def _imports(target: str, place: Place) -> Target:
 
 
 def _imported(folder: Path) -> Iterator[str]:
-    """What `swath import` does before it writes."""
+    """Yield what `swath import` reads before it writes."""
     routes = _routes()
     captures = find_captures(routes, [folder], ImportOptions(start_ns={"": 0}))
     for unit in islice(merge(captures, routes), UNITS):
@@ -149,7 +152,7 @@ def _log() -> bytes:
 
 
 def _export(path: Path, out: Path) -> Iterator[str]:
-    """Export and read the export again, unit for unit."""
+    """Export a log and read the export again, unit by unit."""
     for session in open_logs([path]):
         report = export_session(session, out)
         yield f"{len(report.files)} files, {len(report.notes)} notes"

@@ -48,7 +48,7 @@ WORDS = (
 
 
 def file_targets() -> Iterator[tuple[str, Callable[[], Target]]]:
-    """Readers of captures, each on what begins as its own kind, and the configuration with the files it names."""
+    """Yield the targets of capture readers, each with its own kind of file, and of the configuration with its files."""
     yield "pcap", lambda: _captures("pcap", _pcaps(), read_pcap)
     yield "candump", lambda: _captures("candump", _heads("nmea2000/*.log.gz", "canmod-gps/*.log.gz"), read_candump)
     yield "serial", lambda: _captures("serial", [_serial_case()], _read_serial)
@@ -61,7 +61,7 @@ def _heads(*patterns: str) -> list[bytes]:
 
 
 def _pcaps() -> list[bytes]:
-    """Beginnings of captures; one gzipped, whose end is missing."""
+    """Return the beginnings of captures, one of them gzipped and cut off."""
     found = _heads("*/*.pcap.gz")
     return [*found, gzip.compress(found[0])[:-20]]
 
@@ -89,7 +89,7 @@ _TABLE = b"arrival_unix_s,offset,length\n1600000000.25,0,10\n1600000000.5,10,20\
 
 
 def _serial_case() -> bytes:
-    """The table of arrivals and, behind an empty line, the bytes."""
+    """Return the table of arrivals and, after an empty line, the bytes."""
     return _TABLE + b"\n" + bytes(range(100))
 
 
@@ -114,7 +114,7 @@ def _configuration() -> Target:
 
 
 def _changed_configuration(rng: random.Random, base: bytes) -> bytes:
-    """A value of the configuration, or bytes of it or of a file that it names."""
+    """Change a value of the configuration, or bytes of it or of a file that it names."""
     parts = base.split(_PARTED)
     at = rng.choice((0, 0, 0, rng.randrange(len(parts))))
     lines = parts[at].split(b"\n")

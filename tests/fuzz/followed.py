@@ -41,7 +41,7 @@ OF_PATHS = (
 
 
 def followed_targets() -> Iterator[tuple[str, Callable[[], Target]]]:
-    """A sign with good logs, and a log with a good sign."""
+    """Yield the targets with a changed sign and good logs, and with a changed log and a good sign."""
     yield "recording-sign", _signs
     yield "log-followed", _followed
 
@@ -98,7 +98,7 @@ def _monitored(folder: Path) -> Iterator[str]:
 
 
 def _live(folder: Path) -> Iterator[str]:
-    """What `swath live` is given to georeference."""
+    """Yield the types of what `swath live` receives for georeferencing."""
     for from_start in (False, True):
         follower = LiveFollower(folder, from_start=from_start)
         for item in islice(follower.poll(), BATCHES):
@@ -139,7 +139,7 @@ def _said_otherwise(rng: random.Random, base: bytes) -> bytes:
 
 
 def _indexed(path: Path) -> Iterator[str]:
-    """As jobs read it, each its own piece."""
+    """Yield the chunks of a log as jobs read them, each its own piece."""
     try:
         for session in open_logs([path]):
             index = index_log(session)

@@ -113,7 +113,7 @@ SEALS: dict[str, Callable[[bytes], bytes]] = {
 
 
 def split_frames(data: bytes) -> list[tuple[str, bytes]]:
-    """A stream as frames by kind and what lies between them (kind empty)."""
+    """Split a stream into frames with their kind, and the bytes between them with an empty kind."""
     framer = Framer(tuple(KINDS.values()), ParserCounters())
     pieces: list[tuple[str, bytes]] = []
     position = 0
@@ -127,7 +127,7 @@ def split_frames(data: bytes) -> list[tuple[str, bytes]]:
 
 
 class FramePool:
-    """A few frames of every message in the recordings, whichever are frequent."""
+    """A few frames of every message in the recordings, however frequent it is."""
 
     def __init__(self, recordings: Sequence[bytes]) -> None:
         by_name: dict[tuple[str, str], list[bytes]] = {}
@@ -140,7 +140,7 @@ class FramePool:
         self._by_name = [(kind, frames) for (kind, _), frames in sorted(by_name.items())]
 
     def draw(self, rng: random.Random) -> tuple[str, bytes]:
-        """A frame, of each message as often as of any other."""
+        """Draw a frame, with equal probability for each message."""
         if not self._by_name:
             return "", rng.randbytes(rng.randrange(1, 60))
         kind, frames = rng.choice(self._by_name)
@@ -148,7 +148,7 @@ class FramePool:
 
 
 def mutate_stream(rng: random.Random, base: bytes, pool: FramePool) -> bytes:
-    """Some frames of the base and of the pool, most of them changed and sealed anew, some left broken."""
+    """Return some frames of the base and of the pool, most of them changed and sealed again, some left broken."""
     pieces = split_frames(base[:LARGEST_CASE_BYTES]) or [("", base)]
     first = rng.randrange(len(pieces))
     chosen = pieces[first : first + 1 + int(12 * rng.random() ** 2)]
@@ -237,15 +237,17 @@ TAILS: tuple[tuple[int, Callable[[bytes], int]], ...] = ((4, zlib.crc32), (8, cr
 
 
 def _hesai_layouts(sample: Sequence[bytes]) -> list[np.dtype[np.void]]:
-    """The layout of a Hesai head with CRCs that these datagrams have."""
+    """Return the layouts of Hesai heads with CRCs that these datagrams have."""
     dtypes = (layout.dtype for head in HESAI_HEADS for layout in head.layouts().values())
     fit = [dtype for dtype in dtypes if sample and {len(one) for one in sample} == {dtype.itemsize}]
     return [dtype for dtype in fit if all(with_checksums(one, dtype) == one for one in sample)][:1]
 
 
 def tail_of(datagrams: Sequence[bytes]) -> Callable[[bytes], bytes]:
-    """What makes a changed datagram good again: the checksum that the recorded ones are seen to end in, if any, or the
-    two within those of a Hesai head.
+    """Return a function that makes a changed datagram valid again by its checksum.
+
+    This is the checksum that the recorded datagrams end in, or the two inside those of a Hesai head; without either
+    the function changes nothing.
     """
     sample = [datagram for datagram in datagrams[:8] if len(datagram) > 16]
     for dtype in _hesai_layouts(sample):
@@ -257,7 +259,7 @@ def tail_of(datagrams: Sequence[bytes]) -> Callable[[bytes], bytes]:
 
 
 def changed_datagram(rng: random.Random, datagram: bytes, seal: Callable[[bytes], bytes]) -> bytes:
-    """A datagram with a few fields changed, near its beginning rather than elsewhere, sealed again mostly."""
+    """Change a few fields of a datagram, mostly near its beginning, and usually seal it again."""
     if rng.random() < 0.3:
         head = damage(rng, datagram[:64], resize=False)
         changed = head + datagram[64:]

@@ -126,7 +126,7 @@ def _json_value(turn: int) -> dict[str, Any]:
 
 
 def _of_another_writer(compression: CompressionType) -> bytes:
-    """Channels stand once, with a schema of its own; JSON as it likes it."""
+    """Return a log of another writer, where channels appear once, with a foreign schema and JSON."""
     file = io.BytesIO()
     writer = Writer(file, chunk_size=600, compression=compression)
     writer.start(profile="swath", library="other")
@@ -145,7 +145,7 @@ def _of_another_writer(compression: CompressionType) -> bytes:
 
 
 def mutate_log(rng: random.Random, base: bytes) -> bytes:
-    """Records changed, moved, doubled, left out, with right lengths and checksums; sometimes wrong ones."""
+    """Change, move, double or remove records, usually with right lengths and checksums."""
     if rng.random() < 0.15:
         return damage(rng, base, start=8)
     parts = take_apart(base)
@@ -220,7 +220,7 @@ def _changed_body(rng: random.Random, piece: Piece) -> bytes:
 
 
 def _another_text(rng: random.Random, body: bytes) -> bytes:
-    """One of the strings replaced; found by their length fields."""
+    """Replace one of the strings, which is found by its length field."""
     places = []
     for at in range(len(body) - 4):
         length = int.from_bytes(body[at : at + 4], "little")
@@ -256,7 +256,7 @@ def run(data: bytes) -> Iterator[str]:
 
 
 def _scan(data: bytes, seen: set[str]) -> None:
-    """Records and damage lie side by side, from the magic to the data's end."""
+    """Check that records and damage are adjacent, from the magic to the end of the data."""
     at = 8
     try:
         for found in scan(io.BytesIO(data), len(data)):
@@ -306,7 +306,7 @@ def _recover(path: Path, out: Path, seen: set[str]) -> None:
 
 
 def _same(messages: Any, expected: Counter[str]) -> None:
-    """The official reader finds in a copy what we said we saved."""
+    """Check that the official reader finds in a copy the messages that were reported as saved."""
     counts = Counter(channel.topic for _, channel, _ in messages)
     if counts != expected:
         raise FindingError(f"another reader finds {counts} instead of {expected}")

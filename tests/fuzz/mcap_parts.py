@@ -23,34 +23,34 @@ def text(value: bytes | str) -> bytes:
 
 
 def record(opcode: int, body: bytes) -> bytes:
-    """A record with its head."""
+    """Return a record with its head."""
     return _HEAD.pack(opcode, len(body)) + body
 
 
 def channel(number: int, topic: bytes | str, *, schema: int = 0, encoding: str = "x-swath-serial") -> bytes:
-    """The body of a channel record without metadata."""
+    """Return the body of a channel record without metadata."""
     return struct.pack("<HH", number, schema) + text(topic) + text(encoding) + struct.pack("<I", 0)
 
 
 def schema(number: int, name: str, data: bytes = b"{}") -> bytes:
-    """The body of a schema record."""
+    """Return the body of a schema record."""
     return struct.pack("<H", number) + text(name) + text("jsonschema") + text(data)
 
 
 def message(number: int, time_ns: int, data: bytes, *, sequence: int = 0) -> bytes:
-    """The body of a message record; a negative time as the two's complement that it is read as."""
+    """Return the body of a message record; a negative time is written as its two's complement."""
     time = time_ns & ((1 << 64) - 1)
     return struct.pack("<HIQQ", number, sequence, time, time) + data
 
 
 def metadata(name: str, values: dict[str, str]) -> bytes:
-    """The body of a metadata record."""
+    """Return the body of a metadata record."""
     pairs = b"".join(text(key) + text(value) for key, value in values.items())
     return text(name) + struct.pack("<I", len(pairs)) + pairs
 
 
 def attachment(name: bytes | str, data: bytes, *, claimed: int | None = None) -> bytes:
-    """The body of an attachment record; ``claimed``: the length it says its data have."""
+    """Return the body of an attachment record; ``claimed`` is the length that it states for its data."""
     size = len(data) if claimed is None else claimed
     body = struct.pack("<QQ", 1, 1) + text(name) + text("text/plain") + struct.pack("<Q", size) + data
     return body + struct.pack("<I", zlib.crc32(body))
@@ -58,7 +58,7 @@ def attachment(name: bytes | str, data: bytes, *, claimed: int | None = None) ->
 
 @dataclass(slots=True)
 class Piece:
-    """A record; of a chunk, ``inner`` are its records and ``body`` is the name of its compression."""
+    """A record; for a chunk, ``inner`` has its records and ``body`` the name of its compression."""
 
     opcode: int
     body: bytes
@@ -75,7 +75,7 @@ class Piece:
 
 
 def chunk_body(content: bytes, compression: bytes, claimed: int | None = None) -> bytes:
-    """The body of a chunk of that content."""
+    """Return the body of a chunk with that content."""
     stored = content
     if compression == b"lz4":
         stored = lz4.frame.compress(content)
@@ -88,13 +88,13 @@ def chunk_body(content: bytes, compression: bytes, claimed: int | None = None) -
 
 @dataclass(slots=True)
 class LogParts:
-    """A file: its records, and what lies behind the last whole one."""
+    """A file: its records, and what follows the last whole one."""
 
     pieces: list[Piece] = field(default_factory=list)
     rest: bytes = b""
 
     def encode(self) -> bytes:
-        """With a footer that fits, where there is one."""
+        """Return the file, with a footer that fits if it has one."""
         done = MAGIC
         summary_start = 0
         for piece in self.pieces:

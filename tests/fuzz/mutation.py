@@ -14,7 +14,7 @@ _NANS = (struct.pack("<Q", 0x7FF0_0000_0000_0001), struct.pack("<d", float("nan"
 
 
 def bounds(rng: random.Random) -> bytes:
-    """A number at the bound of some type: whole or float, of 1 to 8 bytes, either byte order; a NaN, quiet or not."""
+    """Draw a number at the limit of some type: whole or float, 1 to 8 bytes, either byte order, or a NaN."""
     kind = rng.randrange(8)
     if kind == 0:
         return rng.choice(_NANS)
@@ -33,7 +33,7 @@ def bounds(rng: random.Random) -> bytes:
 
 
 def damage(rng: random.Random, data: bytes, *, resize: bool = True, start: int = 0) -> bytes:
-    """One to six changes at places from ``start`` on; without ``resize`` the length stays."""
+    """Make one to six changes at places from ``start`` on; without ``resize`` the length stays."""
     changed = bytearray(data)
     for _ in range(1 + int(5 * rng.random() ** 2)):
         if len(changed) <= start:

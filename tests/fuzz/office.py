@@ -51,7 +51,7 @@ CSV, TOML, JSON = (*NUMBERS, *OF_CSV), (*NUMBERS, *OF_TOML), (*NUMBERS, *OF_JSON
 
 
 def office_targets() -> Iterator[tuple[str, Callable[[], Target]]]:
-    """Each with what the command does with the file before it looks at a flight."""
+    """Yield the targets of office files, each with what the command does before it reads a flight."""
     yield "control-points", _control
     yield "picked-points", _picked
     yield "polygons", _polygons
@@ -134,7 +134,7 @@ def _fibres() -> Target:
 
 
 def _made(number: int) -> Calibration:
-    """A calibration with everything in it that a file can hold."""
+    """Return a calibration with everything that a file can hold."""
     one = nominal("left", [0.1, -0.2, 0.3], np.eye(3)).changed(omega_rad=0.001, kappa_rad=-0.002 * number)
     at = [INDEX[name] for name in ("omega_rad", "phi_rad", "kappa_rad")]
     sigmas, correlation = np.zeros(len(INDEX)), np.eye(len(INDEX))
@@ -157,7 +157,7 @@ def _made(number: int) -> Calibration:
 
 
 def _texts() -> list[bytes]:
-    """Of three months; the last without a zone and a method's nominal."""
+    """Return calibrations of three months; the last has no time zone, and its method is nominal."""
     texts = []
     for number in (1, 2, 3):
         created = dt.datetime(2026, number, 1, 12, tzinfo=dt.UTC)

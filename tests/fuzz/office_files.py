@@ -53,7 +53,7 @@ _PARTED = b"\n#### FILE ####\n"
 
 
 def office_file_targets() -> Iterator[tuple[str, Callable[[], Target]]]:
-    """Each with what the command does with the file before it looks at a log."""
+    """Yield the targets of office files, each with what the command does before it reads a log."""
     yield "trajectory", _trajectories
     yield "sbet", _sbets
     yield "antenna-positions", _positions
@@ -65,7 +65,7 @@ def office_file_targets() -> Iterator[tuple[str, Callable[[], Target]]]:
 
 
 def _texts() -> list[bytes]:
-    """A second of flight as CSV, Waypoint text of two layouts, and .pos of two."""
+    """Return a second of flight as CSV, as Waypoint text in two layouts, and as .pos in two."""
     path = flown(12, 0.1)
     lat, lon, height = path.geodetic()
     roll, pitch, heading = (np.degrees(angle) for angle in path.attitude())
@@ -160,7 +160,7 @@ def _sbets() -> Target:
 
 
 def _changed_doubles(rng: random.Random, base: bytes) -> bytes:
-    """Mostly one number of one record, or of a column of all of them."""
+    """Change usually one number of one record, or of one column of all records."""
     parts = base.split(_PARTED)
     at = rng.randrange(len(parts))
     if rng.random() < 0.2 or len(parts[at]) < 136:
@@ -180,7 +180,7 @@ def _changed_doubles(rng: random.Random, base: bytes) -> bytes:
 
 
 def _las(suffix: str) -> bytes:
-    """Two strips of a slope that overlap."""
+    """Return two overlapping strips of a slope as a LAS or LAZ file."""
     header = laspy.LasHeader(version="1.4", point_format=6)
     header.scales, header.offsets = [0.001] * 3, [465_000.0, 5_261_000.0, 450.0]
     header.add_crs(CRS.from_epsg(32632))
@@ -216,7 +216,7 @@ def _points() -> Target:
             return iter(told(lambda: _looked_at(folder)))
 
     def mutate(rng: random.Random, base: bytes) -> bytes:
-        """The header, what lies between it and the points, or anything."""
+        """Change the header, what lies between it and the points, or any bytes."""
         kind = rng.random()
         end = 375 if kind < 0.6 else min(len(base), 1600)
         head = damage(rng, base[:end], resize=False, start=rng.choice((4, 24, 90, 100, 131, 227)))

@@ -32,7 +32,7 @@ Run = Callable[[Parser, bytes, int], list[Record]]
 
 
 def parser_targets() -> Iterator[tuple[str, Callable[[], Target]]]:
-    """A target of every parser that any driver makes: name, and what builds it."""
+    """Yield a target for every parser of every driver: its name, and a function that builds it."""
     for kind in KINDS:
         for driver in all_drivers(kind).values():
             for suffix, make in (("", driver.make_parser), ("-time", driver.make_time_parser)):
@@ -56,7 +56,7 @@ def _builder(driver: Driver, name: str, make: Callable[[DeviceSettings], Parser]
 
 
 def _made(make: Callable[[DeviceSettings], Parser], variants: list[DeviceSettings]) -> Iterator[Parser]:
-    """A parser of each of the settings; a file of another head is refused."""
+    """Yield a parser for each of the settings that the driver accepts; a file of another head is refused."""
     for settings in variants:
         with suppress(DriverSettingsError):
             yield make(settings)
@@ -130,7 +130,7 @@ def pack(units: Units) -> bytes:
 
 
 def unpack(case: bytes) -> Units:
-    """The units of an input; what is cut off at its end is a unit too."""
+    """Return the units of an input; a unit cut off at its end counts too."""
     units: Units = []
     at = 0
     while at + _UNIT.size <= len(case) and len(units) < 400:
@@ -141,7 +141,7 @@ def unpack(case: bytes) -> Units:
 
 
 def _batches(units: Units, largest: Callable[[], int]) -> Iterator[ChunkBatch]:
-    """Neighbours of equal length, at most ``largest()`` together."""
+    """Yield batches of neighbours with equal length, each of at most ``largest()`` units."""
     start = 0
     while start < len(units):
         limit, end, length = max(1, largest()), start + 1, len(units[start][1])
@@ -203,7 +203,7 @@ def _packet_target(driver: Driver, name: str, make: Callable[[int], Parser], fir
 
 
 def _kinds_of_units(units: list[bytes], is_can: bool) -> list[list[bytes]]:
-    """A few units of every identifier (CAN) or length (datagrams), whichever are frequent."""
+    """Return a few units of every identifier (CAN) or length (datagrams), however frequent it is."""
     kinds: dict[bytes | int, list[bytes]] = {}
     for unit in units:
         kept = kinds.setdefault(unit[:4] if is_can else len(unit), [])
@@ -237,7 +237,7 @@ def _change_unit(
 
 
 def _changed_frame(rng: random.Random, unit: bytes, identifiers: list[bytes]) -> bytes:
-    """A CAN frame with other data mostly; sometimes another identifier, length, flag or layout."""
+    """Change usually a CAN frame's data, sometimes its identifier, length, flags or layout."""
     kind = rng.randrange(16)
     if kind == 0:
         return rng.choice(identifiers) + unit[4:]
@@ -272,7 +272,7 @@ def _feed_packets(parser: Parser, data: bytes) -> None:
 
 
 def _endure(parser: Parser, cases: list[bytes], feed: Callable[[Parser, bytes], None]) -> None:
-    """One parser takes all cases; the second half must leave nothing behind in it that the first did not."""
+    """Feed all cases to one parser, and check that the second half does not make it grow."""
     half = len(cases) // 2
     tracemalloc.start()
     try:

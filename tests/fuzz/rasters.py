@@ -61,7 +61,7 @@ def _raster(**kind: Any) -> bytes:
 
 
 def _changed(rng: random.Random, base: bytes) -> bytes:
-    """Mostly an entry of the directory, or what stands right behind it; TIFF 6.0, section 2."""
+    """Change usually an entry of the directory, or what follows it (TIFF 6.0, section 2)."""
     order: Literal["little", "big"] = "little" if base[:2] == b"II" else "big"
     at = int.from_bytes(base[4:8], order)
     count = int.from_bytes(base[at : at + 2], order)
@@ -98,7 +98,7 @@ def _terrain(data: bytes) -> Iterator[str]:
 
 
 def _ground(data: bytes) -> Iterator[str]:
-    """A few hundred metres of it, as a flight begins."""
+    """Yield what is read of a few hundred metres of ground, as at the beginning of a flight."""
     plan, site = _plan()
 
     def read() -> Iterator[str]:

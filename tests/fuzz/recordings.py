@@ -32,7 +32,7 @@ NO_RECORDING = {".md", ".json", ".jsonl", ".csv", ".npz", ".pcd", ".chk", ".asci
 
 
 def folders_of(driver: Driver) -> list[Path]:
-    """The driver's fixtures and its family's, the nearest first."""
+    """Return folders of fixtures of the driver and of its family, the nearest first."""
     names = accumulate(driver.protocol.split("-"), lambda head, part: f"{head}-{part}")
     return [folder for name in reversed(list(names)) if (folder := FIXTURES / name).is_dir()]
 
@@ -50,7 +50,7 @@ def _content(path: Path) -> bytes:
 
 
 def settings_of(driver: Driver) -> list[DeviceSettings]:
-    """Of the page's example, once for each file that could be the one it names."""
+    """Return the settings of the page's example, one for each file that could be the one it names."""
     source = f"{driver.kind}/fuzz"
     file = PAGES / f"{driver.protocol}.md"
     assert file.is_file(), f"{driver.protocol}: write docs/devices/{file.name} first: its example is fuzzed"
@@ -77,7 +77,7 @@ def _candidates(driver: Driver, path: Path) -> list[bytes]:
 
 
 def streams_of(driver: Driver) -> list[bytes]:
-    """What a serial device sent, a file each; of a receiver also what others lay between."""
+    """Return what a serial device sent, one item per file; for a receiver also foreign messages between."""
     others = [FIXTURES / "rtcm3", FIXTURES / "nmea"] if driver.kind == "gnss" else []
     paths = _files_of(driver) + [path for folder in others for path in sorted(folder.iterdir())[:6]]
     found = [path for path in paths if _suffix(path).lower() not in NO_RECORDING and path.suffix != ".pcap"]
@@ -86,7 +86,10 @@ def streams_of(driver: Driver) -> list[bytes]:
 
 
 def packets_of(driver: Driver, parser: Parser) -> list[list[bytes]]:
-    """Datagrams or CAN frames, a list a recording; of a CAN unit without one, frames under its identifiers."""
+    """Return datagrams or CAN frames, a list for each recording.
+
+    A CAN unit without a recording gets frames under its identifiers.
+    """
     read = read_candump if "can" in driver.transports else read_pcap
     found = []
     for path in _files_of(driver):

@@ -18,7 +18,7 @@ from tests.fuzz.rasters import raster_targets
 
 
 def all_targets() -> dict[str, Callable[[], Target]]:
-    """What builds each: parsers of every driver there is, readers of everything else that comes from outside."""
+    """Return a function that builds each target: parsers of every driver, and readers of all other foreign input."""
     return {
         **dict(parser_targets()),
         **dict(log_targets()),

@@ -62,7 +62,7 @@ def test_every_driver_is_a_target() -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_sealed_frame_is_valid(kind: str) -> None:
-    """Whatever the content; a kind of frame without a seal would be fuzzed before its checksum only."""
+    """It is valid whatever its content; a kind without a seal would be fuzzed only up to its checksum."""
     rng = random.Random(kind)
     for _ in range(300):
         content = rng.randbytes(rng.randrange(5, 400))
@@ -83,7 +83,7 @@ def test_a_changed_datagram_of_a_hesai_head_is_sealed_again() -> None:
 
 
 def test_a_log_taken_apart_is_reassembled_unchanged() -> None:
-    """Records, chunks of every compression, footer: byte for byte where nothing was compressed."""
+    """Records, chunks of every compression and footer are equal byte for byte where nothing was compressed."""
     for data in TARGETS["log"]().seeds:
         again = take_apart(data).encode()
         assert [piece.opcode for piece in take_apart(again).pieces] == [
@@ -105,7 +105,7 @@ def _planted(name: str, is_reached: Callable[[bytes], bool]) -> Target:
 
 
 def _has_127_satellites(data: bytes) -> bool:
-    """One value of one field of one message, behind a checksum."""
+    """Return True if a message, behind its checksum, has the value 127 in its number of satellites."""
     parser = UbxParser(DeviceSettings("gnss/fuzz"))
     records = [*parser.feed(Chunk("gnss/fuzz", 0, data)), *parser.close()]
     return any(getattr(record, "satellites", 0) == 0x7F for record in records)
@@ -121,7 +121,7 @@ def _has_tiny_sigma(data: bytes) -> bool:
 
 
 def _has_edge_without_time(data: bytes) -> bool:
-    """A value of a message of JSON within a compressed chunk."""
+    """Return True if a JSON message inside a compressed chunk has an edge without time."""
     pieces = [inner for piece in take_apart(data).pieces for inner in piece.inner or [piece]]
     return any(piece.opcode == MESSAGE and b'"edge_time_ns": null' in piece.body for piece in pieces)
 
@@ -180,7 +180,7 @@ def test_a_finding_is_minimised() -> None:
 
 
 def test_names_from_noise_take_bounded_memory() -> None:
-    """Every sentence has another address, all of them good."""
+    """Every sentence has another address and a good checksum."""
     counters = ParserCounters()
     framer = Framer((KINDS["nmea"],), counters)
     for number in range(5000):

@@ -32,7 +32,7 @@ _VARYING = re.compile(r"\S*[0-9'\"`]\S*")
 
 
 def changed_text(rng: random.Random, base: bytes, words: tuple[str, ...]) -> bytes:
-    """One to three changes, mostly of a word."""
+    """Make one to three changes, mostly of a word."""
     if rng.random() < 0.15:
         return damage(rng, base)
     lines = base.split(b"\n")
@@ -55,12 +55,13 @@ def changed_text(rng: random.Random, base: bytes, words: tuple[str, ...]) -> byt
 
 
 def told(read: Callable[[], Iterable[str]], *refusals: type[Exception], begins: str = "") -> set[str]:
-    """What was seen, or the beginning of a refusal.
-
+    """Return what was seen, or the beginning of a refusal.
     Args:
         read: does what the command does.
         refusals: errors that the command turns into a line.
-        begins: with what each of several lines must begin, where the reader tells of every mistake; empty: one line.
+        begins: how each of several lines must begin if the reader reports every mistake; empty: only one line.
+
+    |
 
     Raises:
         FindingError: a refusal of several lines, or of none.
@@ -85,14 +86,13 @@ def text_target(
     *refusals: type[Exception],
     mistakes_a_line: bool = False,
 ) -> Target:
-    """A reader of a text file.
-
+    """Return the target of a reader of a text file.
     Args:
-        name: of the target and of the file.
+        name: name of the target and of the file.
         seeds, words: see `changed_text`.
-        read: of the file's path.
-        refusals: as of `told`.
-        mistakes_a_line: whether the reader documents a line a mistake, each with the file's name before it.
+        read: reads the file at a path.
+        refusals: as in `told`.
+        mistakes_a_line: True if the reader documents one line for each mistake, with the file's name before it.
     """
 
     def run(data: bytes) -> Iterable[str]:
