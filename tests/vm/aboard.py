@@ -66,7 +66,7 @@ def lend(device: str) -> None:
 
 
 class Recorder:
-    """``swath run`` as it is installed, by its own user; it has said READY."""
+    """``swath run`` as installed, run by its own user, after it has reported READY."""
 
     def __init__(self, config: str) -> None:
         WORK.mkdir(parents=True, exist_ok=True)
@@ -109,13 +109,13 @@ class Recorder:
 
 
 def session(name: str = "vm") -> str:
-    """[session] of a recording in `WORK`."""
+    """Return the table [session] of a recording in `WORK`."""
     return f'[session]\nname = "{name}"\ndirectory = "{WORK}/logs"\nreserve_mb = 1\n'
 
 
 @contextlib.contextmanager
 def recording(config: str, keep_as: str = "logs") -> Iterator[Recorder]:
-    """A recorder at work; log and words are in `SHARED` afterwards."""
+    """Run a recorder, and leave its log and its messages in `SHARED`."""
     recorder = Recorder(config)
     try:
         yield recorder

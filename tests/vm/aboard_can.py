@@ -45,7 +45,7 @@ def imu(name: str, channel: str, rate_hz: int, options: str = "") -> str:
 
 
 class Bus:
-    """The sending end of an interface."""
+    """The sending end of a CAN interface."""
 
     def __init__(self, channel: str, *, fd: bool = False) -> None:
         os.sched_setaffinity(0, {0})  # vcan keeps the order of one processor's frames only
@@ -54,13 +54,13 @@ class Bus:
         self._socket.bind((channel,))
 
     def send(self, identifier: int, data: bytes) -> bytes:
-        """One classic frame; the frame, when the driver has taken it."""
+        """Send one classic frame, and return it when the driver has accepted it."""
         frame = FRAME.pack(identifier, len(data), data)
         self.send_frame(frame)
         return frame
 
     def send_frame(self, frame: bytes) -> None:
-        """A frame of 16 or 72 bytes; waits while a controller's queue is full."""
+        """Send a frame of 16 or 72 bytes, and wait while a controller's queue is full."""
         while not self.try_frame(frame):
             time.sleep(0.001)
 
@@ -87,10 +87,10 @@ def sample_frames(number: int, period_us: int) -> list[bytes]:
 
 
 def send_samples(buses: list[Bus], rate_hz: int, count: int, first: int = 0, to: str = "") -> array[int]:
-    """Samples in real time; times (CLOCK_MONOTONIC, ns) before and after each frame of the first bus, by turns.
+    """Send samples in real time; return times (CLOCK_MONOTONIC, ns) before and after each frame of the first bus.
 
-    A controller at the other end (``to``) holds five frames, whose interrupts an emulated processor serves late now
-    and then: the next sample waits until it has them all.
+    A controller at the other end (``to``) holds five frames, whose interrupts an emulated processor sometimes serves
+    late, so the next sample waits until the controller has them all.
     """
     frames = [sample_frames(number, 1_000_000 // rate_hz) for number in range(first, first + count)]
     times = array("q")
@@ -128,7 +128,7 @@ def make_vcan(mtu: int = 16) -> None:
 
 
 def rate(seconds: str) -> None:
-    """1 kHz, three frames a sample, in real time."""
+    """Record 1 kHz with three frames a sample, in real time."""
     make_vcan()
     with recording(session() + imu("main", "vcan0", 1000)) as recorder:
         listening(recorder)
@@ -139,7 +139,7 @@ def rate(seconds: str) -> None:
 
 
 def overrun(count: str) -> None:
-    """The recorder stands still while frames come faster than its buffer is deep; then it goes on."""
+    """Stop the recorder while more frames come than its buffer holds, then let it continue."""
     make_vcan()
     with recording(session() + imu("main", "vcan0", 1000, "?buffer_mb=1")) as recorder:
         listening(recorder)
@@ -156,7 +156,10 @@ def overrun(count: str) -> None:
 
 
 def trouble() -> None:
-    """FD frames, error frames, bus-off and restart as a controller tells them; the interface goes down and comes up."""
+    """Send FD frames, and error frames, bus-off and restart as a controller reports them.
+
+    Then the interface goes down and comes up.
+    """
     make_vcan(mtu=72)
     with recording(session() + imu("main", "vcan0", 1000)) as recorder:
         listening(recorder)
@@ -192,7 +195,7 @@ def trouble() -> None:
 
 
 def set_state(state: str) -> None:
-    """What the counters of errors of `guest/can_sim.c` mean from now on."""
+    """Set what the error counters of `guest/can_sim.c` mean from now on."""
     numbers = {"ERROR-ACTIVE": 0, "ERROR-WARNING": 1, "ERROR-PASSIVE": 2, "BUS-OFF": 3}
     Path("/sys/module/can_sim/parameters/state").write_text(str(numbers[state]))
     wait_state(state)
@@ -209,7 +212,7 @@ def send_numbers(bus: Bus, identifier: int) -> list[bytes]:
 
 
 def bus_off(module: str) -> None:
-    """A controller goes off the bus and comes back after its restart-ms; without one, when it is told to."""
+    """Take a controller off the bus, so that it returns after its restart-ms; without one, after a command."""
     sh(f"modprobe -a can_dev can_raw; insmod {module}; ip link set can0 up type can bitrate 500000 restart-ms 2000")
     with recording(session() + imu("main", "can0", 1000, "?bitrate=500000")) as recorder:
         listening(recorder)
@@ -240,7 +243,7 @@ def bus_off(module: str) -> None:
 
 
 def controllers(seconds: str) -> None:
-    """Two emulated controllers on one bus, 200 Hz; each sends what the other receives."""
+    """Connect two emulated controllers at 200 Hz on one bus; each sends what the other receives."""
     sh("modprobe -a kvaser_pci can_raw")
     wait_until(lambda: "can1" in os.listdir("/sys/class/net"), "two controllers")
     for number in range(2):

@@ -58,7 +58,7 @@ def drained() -> int:
 
 
 def stall() -> None:
-    """The highest rate without loss; a stall at it with the installed settings, and one with the kernel's default."""
+    """Find the highest rate without loss, then stall at it with the installed settings and the kernel's default."""
     with recording(session("installed") + SCANNER, "installed") as recorder:
         recorder.wait_said("device_opened")
         scanner = Scanner()

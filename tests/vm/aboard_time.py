@@ -39,7 +39,7 @@ def sentence(body: str) -> bytes:
 
 
 def second_told(utc_s: int) -> bytes:
-    """RMC and ZDA of a second of UTC, seconds since 1970."""
+    """Return RMC and ZDA of a second of UTC, seconds since 1970."""
     at = time.gmtime(utc_s)
     clock, date = time.strftime("%H%M%S.00", at), time.strftime("%d%m%y", at)
     rmc = f"GPRMC,{clock},A,4728.9200,N,00854.3000,E,0.0,0.0,{date},,,A"
@@ -47,8 +47,7 @@ def second_told(utc_s: int) -> bytes:
 
 
 class Receiver:
-    """A serial port that tells each second shortly after it has begun.
-
+    """A serial port that reports each second shortly after it has begun.
     Args:
         clock_ns: the receiver's own time, UTC.
     """
@@ -76,7 +75,7 @@ class Receiver:
 
 
 class _Timex(ctypes.Structure):
-    """struct timex of <linux/timex.h>."""
+    """The struct timex of <linux/timex.h>."""
 
     _fields_ = [
         ("modes", ctypes.c_uint),
@@ -93,7 +92,7 @@ def raw_ns() -> int:
 
 
 def adjtimex(modes: int, **fields: int) -> None:
-    """Call adjtimex(2)."""
+    """Call adjtimex(2), and fail if it fails."""
     timex = _Timex(modes=modes, **fields)
     found = ctypes.CDLL(None, use_errno=True).adjtimex(ctypes.byref(timex))
     assert found >= 0, os.strerror(ctypes.get_errno())
@@ -106,7 +105,7 @@ def set_pps(**parameters: int) -> None:
 
 
 def edges(module: str) -> None:
-    """Edges that are missing, stray, late, uneven, wrong for long, gone; the device vanishes and returns."""
+    """Make edges that are missing, stray, late, uneven, wrong for long, or gone; the device vanishes and returns."""
     sh(f"insmod {module}")
     lend("/dev/pps0")
     receiver = Receiver(time.time_ns)
@@ -145,7 +144,10 @@ def edges(module: str) -> None:
 
 
 def ahead_of_outside_ns() -> int:
-    """This machine's wall clock less that of the computer outside, whose file system stamps what is written there."""
+    """Return this machine's wall clock minus that of the computer outside, ns.
+
+    The computer outside stamps the files of its file system that the machine writes.
+    """
     place, found = SHARED / "stamped", []
     for number in range(50):
         before_ns = time.time_ns()
@@ -157,7 +159,7 @@ def ahead_of_outside_ns() -> int:
 
 
 def serial(kind: str, seconds: str) -> None:
-    """The receiver stands outside, at /dev/ttyS1: NMEA, and its pulse on DCD."""
+    """Record from a receiver outside the machine, at /dev/ttyS1: NMEA, and its pulse on DCD."""
     line = None
     if kind == "ldisc":
         sh("modprobe pps_ldisc")
@@ -177,7 +179,7 @@ def serial(kind: str, seconds: str) -> None:
 
 
 def wall_clock(module: str) -> None:
-    """The wall clock is stepped by an hour, back, and slewed; then the kernel inserts a leap second."""
+    """Step the wall clock by an hour and back, slew it, and let the kernel insert a leap second."""
     sh(f"insmod {module} raw=1")
     lend("/dev/pps0")
     # the receiver's UTC is a clock that nobody steps or slews, whose seconds are the pulses'

@@ -57,7 +57,7 @@ SENDING_PORT = "/dev/$(basename /sys/bus/pci/drivers/serial/0000*/tty/ttyS*)"
 
 
 def null_modem(folder: Path) -> list[str]:
-    """qemu's words for ttyS1 and `SENDING_PORT`, joined."""
+    """Return qemu's arguments that connect ttyS1 with `SENDING_PORT`."""
     place = folder / "wire"
     return [
         *("-chardev", f"socket,id=here,path={place},server=on,wait=off", "-chardev", f"socket,id=there,path={place}"),
@@ -66,7 +66,7 @@ def null_modem(folder: Path) -> list[str]:
 
 
 def aboard(folder: Path, *, session: str = "", enabled: tuple[str, ...] = ("swathd.service",)) -> Path:
-    """An overlay: all sensors configured and there, the log on the first disk, the recorder enabled."""
+    """Make an overlay with all sensors configured and present, the log on the first disk, the recorder enabled."""
     plan = parse_plan(_PLAN, Path())
     flight = VirtualFlight(plan, None, 1.0)
     text = config_text(plan, default_wires(plan) | _WIRES, LOGS)
@@ -87,7 +87,7 @@ def aboard(folder: Path, *, session: str = "", enabled: tuple[str, ...] = ("swat
 
 @dataclass(frozen=True)
 class Turn:
-    """What had been sent by a moment of the machine's CLOCK_MONOTONIC."""
+    """How much had been sent by a moment of the machine's CLOCK_MONOTONIC."""
 
     monotonic_ns: int
     udp: int
@@ -96,13 +96,13 @@ class Turn:
 
 
 def sent(folder: Path) -> list[Turn]:
-    """What the sensors wrote down, the last line possibly cut short by the power."""
+    """Return what the sensors noted; the last line may be cut off by the power cut."""
     lines = (folder / "sent").read_text().split("\n")[:-1]
     return [Turn(*(int(word) for word in line.split())) for line in lines]
 
 
 def numbers(paths: list[Path]) -> dict[str, list[int]]:
-    """The numbers of the units in logs, in file order, by kind of sensor."""
+    """Return the numbers of the units in logs, in file order, for each kind of sensor."""
     found: dict[str, list[int]] = defaultdict(list)
     text = b""
     for session in open_logs(paths):
@@ -126,7 +126,7 @@ def missing(numbers: list[int]) -> list[tuple[int, int]]:
 
 
 def event_codes(path: Path) -> list[str]:
-    """The codes of a log's events, in order; the log is whole."""
+    """Return the codes of a log's events, in order, and check that the log is whole."""
     (session,) = open_logs([path])
     found = [
         str(event["code"])

@@ -13,12 +13,11 @@ TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 
 @dataclass(frozen=True)
 class Moment:
-    """Processor time so far, seconds.
-
+    """Processor time so far, in seconds.
     Attributes:
-        monotonic_s: when.
-        busy_s: of all processors, with what a hypervisor gave to others.
-        own_s: of this process and all that descend from it, those that have ended too.
+        monotonic_s: the moment.
+        busy_s: time of all processors, with that which a hypervisor gave to other machines.
+        own_s: time of this process and all its descendants, those that have ended too.
     """
 
     monotonic_s: float
@@ -35,14 +34,17 @@ class Moment:
         return cls(time.monotonic(), busy / TICKS_PER_S, own)
 
     def share_of_others(self) -> float:
-        """Of all processors from this moment to now, 0 … 1."""
+        """Return the share of all processors that others used from this moment to now, 0 … 1."""
         now, processors = Moment.here(), os.cpu_count() or 1
         others_s = (now.busy_s - self.busy_s) - (now.own_s - self.own_s)
         return max(0.0, others_s / (processors * max(now.monotonic_s - self.monotonic_s, 0.01)))
 
 
 def _living_s() -> float:
-    """Of this process and the living ones below it, with those below them that have ended (proc(5), stat)."""
+    """Return the processor time, s, of this process and its living descendants.
+
+    It includes descendants of these that have ended (proc(5), stat).
+    """
     children, ticks = defaultdict(list), {}
     for place in Path("/proc").glob("[0-9]*/stat"):
         try:

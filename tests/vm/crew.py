@@ -21,7 +21,7 @@ PATIENCE = 20  # how many times as long as on an idle machine, where other machi
 
 
 def command(module: str, *arguments: object, before: str = "") -> str:
-    """A program of this package, run by the very Python that runs the test."""
+    """Return a command that runs a program of this package with the Python that runs the test."""
     lines = []
     if Path(sys.prefix).is_relative_to("/tmp"):  # the machine has a /tmp of its own
         place = shlex.quote(sys.prefix)
@@ -89,8 +89,7 @@ def facts(shared: Path, name: str) -> dict[str, Any]:
 
 
 class GnssReceiver:
-    """A receiver on this computer, for a serial line of the machine: NMEA at a pty, PPS as a byte that is DCD.
-
+    """A receiver on this computer for a serial line of the machine: NMEA on a pty, PPS as a byte that sets DCD.
     Attributes:
         port: the pty, for qemu.
         pulses_utc_s: seconds of the pulses so far.

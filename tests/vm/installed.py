@@ -20,9 +20,9 @@ _ACCOUNTS = ("passwd", "group", "shadow", "gshadow")
 
 
 def installed() -> Path:
-    """The layer that `make install DESTDIR=…` makes, with systemd's user of it; made anew when the program has changed.
+    """Return the layer that `make install DESTDIR=…` makes with systemd's user, made again if the program changed.
 
-    ``SWATH_VM_KEEP=1`` in the environment takes the one that is there, whatever has changed.
+    ``SWATH_VM_KEEP=1`` in the environment takes the existing one, whatever has changed.
     """
     CACHE.mkdir(exist_ok=True)
     with (CACHE / "installed.lock").open("w") as lock:
@@ -45,7 +45,7 @@ def image() -> Path:
 
 
 def overlay(folder: Path, config: str, *, enabled: Iterable[str] = ("swathd.service",)) -> Path:
-    """A folder for `machine.start`'s ``overlay``: the configuration, and units as `systemctl enable` leaves them."""
+    """Return a folder for `machine.start`'s ``overlay``: configuration, and units as `systemctl enable` leaves them."""
     (folder / "etc/swath").mkdir(parents=True, exist_ok=True)
     (folder / "etc/swath/swath.toml").write_text(config)
     units = installed() / "usr/lib/systemd/system"
@@ -59,7 +59,7 @@ def overlay(folder: Path, config: str, *, enabled: Iterable[str] = ("swathd.serv
 
 
 def with_udev() -> list[Path]:
-    """The layers of a machine that names its devices."""
+    """Return the layers of a machine that names its devices."""
     return [image(), UDEV]
 
 
@@ -79,7 +79,7 @@ def _install(layer: Path) -> None:
 
 
 def _make_image(layer: Path, path: Path) -> None:
-    """Of what a disk that is only read needs nothing: no journal, no checksums, no blocks kept for root."""
+    """Make an image without what a read-only disk does not need: journal, checksums, blocks reserved for root."""
     path.unlink(missing_ok=True)
     # blocks of what is in it, one more for a part of one, one for entries; 128 MB hold the inodes of 8 GB (1/64)
     held = sum(one.lstat().st_size // 4096 + 2 for one in layer.rglob("*")) * 4096
@@ -93,7 +93,7 @@ def _run(command: list[str], environment: dict[str, str]) -> None:
 
 
 def _state() -> str:
-    """A digest of everything that is installed, the documentation aside."""
+    """Return a digest of everything that is installed, without the documentation."""
     digest = hashlib.sha256()
     for name in _SOURCES:
         root = TREE / name

@@ -53,17 +53,16 @@ _NOT_LOADED = (
 
 @dataclass(frozen=True)
 class Finished:
-    """What the command left: its status (or `TIMED_OUT`, `NO_STATUS`), its words, the kernel's and systemd's."""
+    """The result of a command: its status (or `TIMED_OUT`, `NO_STATUS`), its output, the kernel's and systemd's."""
 
     status: int
     output: str
     console: str
 
     def check(self) -> Finished:
-        """This, where the status is 0.
-
+        """Return this if the status is 0.
         Raises:
-            AssertionError: with the last words, where it is another.
+            AssertionError: the status is another; the message has the last output.
         """
         assert self.status == 0, f"status {self.status}\n{self.output[-8000:]}\n--- console\n{self.console[-3000:]}"
         return self
@@ -71,7 +70,7 @@ class Finished:
 
 @dataclass
 class Machine:
-    """A running machine."""
+    """A running virtual machine."""
 
     qemu: subprocess.Popen[bytes]
     shared: Path
@@ -79,7 +78,7 @@ class Machine:
     _asked: int = 0
 
     def wakes(self) -> bool:
-        """Whether its first program has said a word in time, or it has ended."""
+        """Return True when its first program has printed something or it has ended; False if neither is in time."""
         until_s = time.monotonic() + FIRST_WORD_S
         while self.qemu.poll() is None and "VM-STAGE1" not in self.console:
             if time.monotonic() > until_s:
@@ -154,7 +153,7 @@ class Machine:
         self.qemu.wait()
 
     def wait(self) -> Finished:
-        """The end of the machine, at the latest when its time is up."""
+        """Wait for the machine's end, and end it when its time is up."""
         try:
             self.qemu.wait(max(0.0, self.deadline_s - time.monotonic()))
             status_text = _text(self.shared / "status").strip()
@@ -184,7 +183,7 @@ def run(
     memory_mb: int = 1024,
     timeout_s: float = BOOT_S,
 ) -> Finished:
-    """Boot, run a bash command as root, power off; see `start`."""
+    """Boot, run a bash command as root, and power off; see `start`."""
     with start(
         command,
         shared=shared,
@@ -215,9 +214,8 @@ def start(
 ) -> Machine:
     """Boot and run a bash command as root.
 
-    An emulated machine may stand still while its kernel begins (README, pitfalls): one in which no program has run yet
-    is powered on again, and `stood_still` tells it.
-
+    An emulated machine may hang while its kernel begins (README, pitfalls): one in which no program has run yet is
+    powered on again, and `stood_still` reports it.
     Args:
         command: for bash, in the project's tree.
         shared: folder of the host, ``/vm`` in the machine; holds ``output``, ``console`` and with systemd ``journal``.
@@ -227,8 +225,8 @@ def start(
         qemu: further arguments of qemu; a network, a disk, a serial line.
         kernel: further words of the kernel's command line.
         environment: further variables of qemu's environment.
-        memory_mb: of which three quarters may hold files.
-        timeout_s: after which it is killed.
+        memory_mb: memory, of which three quarters may hold files.
+        timeout_s: seconds after which it is killed.
     """
     needed = [CACHE / "kernel/boot/vmlinux", CACHE / "initramfs.gz"]
     if shutil.which("qemu-system-x86_64") is None or not all(path.exists() for path in needed):
@@ -275,7 +273,7 @@ def start(
 
 
 def _image(number: int, path: Path) -> list[str]:
-    """A disk behind all that a test has: theirs are vda, vdb, …"""
+    """Return qemu's arguments for a disk that comes after those of a test, which are vda, vdb, …"""
     return [
         *("-drive", f"if=none,id=layer{number},format=raw,file={path},readonly=on,cache=unsafe"),
         *("-device", f"virtio-blk-pci,drive=layer{number},serial=layer{number},addr={0x1D - number:#x}"),
@@ -295,20 +293,19 @@ def _power_on(line: list[str], shared: Path, environment: Mapping[str, str], tim
 
 
 def make_disk(path: Path, size_mb: int) -> Path:
-    """An empty ext4 file system in a file, for `disk`."""
+    """Make an empty ext4 file system in a file, for `disk`."""
     path.unlink(missing_ok=True)
     subprocess.run(["mkfs.ext4", "-qF", str(path), f"{size_mb}M"], check=True, capture_output=True, env=with_sbin())
     return path
 
 
 def disk(path: Path) -> list[str]:
-    """qemu's words for a virtio disk; what the machine flushes is in the file when its power is cut, and no more."""
+    """Return qemu's arguments for a virtio disk; at a power cut, the file has exactly what the machine flushed."""
     return ["-drive", f"if=virtio,format=raw,file={path},cache=writeback"]
 
 
 def replay_journal(path: Path) -> None:
-    """What the next mount would do: replay the journal of an ext4 file system, and check it whole.
-
+    """Replay the journal of an ext4 file system as the next mount would, and check it completely.
     Raises:
         AssertionError: it is damaged beyond that.
     """
@@ -327,7 +324,7 @@ def copy_from_disk(path: Path, source: str, folder: Path) -> None:
 
 
 def quoted_python(script: Path, *arguments: str) -> str:
-    """A command that runs a script with this process's Python, for the machine without systemd."""
+    """Return a command that runs a script with this process's Python, for the machine without systemd."""
     return shlex.join([sys.executable, str(script), *arguments])
 
 
@@ -366,7 +363,7 @@ def _prepare(shared: Path, command: str, overlay: Path | None, systemd: bool) ->
 
 
 def _accelerator() -> list[str]:
-    """KVM where the processor has it; a /dev/kvm without it opens, and is slower than none."""
+    """Return qemu's arguments for KVM if the processor has it; a /dev/kvm without it opens, but is slower than TCG."""
     flags = re.search(r"^flags.*\b(vmx|svm)\b", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
     if flags and os.access("/dev/kvm", os.W_OK):
         return ["-accel", "kvm", "-cpu", "host"]
@@ -374,7 +371,7 @@ def _accelerator() -> list[str]:
 
 
 def with_sbin() -> dict[str, str]:
-    """The environment of a program that not everybody's PATH finds."""
+    """Return an environment for programs that are not on everybody's PATH."""
     return {**os.environ, "PATH": f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin"}
 
 

@@ -24,7 +24,7 @@ UNDISCIPLINED = ClockDiscipline(0.0, 0x40, 16.0)
 
 @dataclass(frozen=True)
 class Labelled:
-    """At one moment of the recording: host's clocks, UTC as it was told then, all in ns; the clock's state."""
+    """One moment of the recording: the host's clocks and UTC as known then, all in ns, and the clock's state."""
 
     monotonic_ns: int
     raw_ns: int
@@ -33,7 +33,7 @@ class Labelled:
 
 
 class _Unheard(Events):
-    """Events that nobody hears; the recorder's own are in its log."""
+    """Events that are discarded; the recorder's own are in its log."""
 
     def __init__(self) -> None:
         pass
@@ -43,7 +43,7 @@ class _Unheard(Events):
 
 
 def labelled(logs: Path) -> list[Labelled]:
-    """Ten times a second of a recording of ``pps/main`` and ``gnss/rover``, where a time was known."""
+    """Return ten moments a second of a recording of ``pps/main`` and ``gnss/rover``, where a time was known."""
     (session,) = open_logs([logs])
     offset_ns = session.info.realtime_ns - session.info.monotonic_ns
     keeper = TimeKeeper(_Unheard(), offset_ns)
@@ -78,13 +78,13 @@ def _moment(keeper: TimeKeeper, monotonic_ns: int, raw_ns: int, offset_ns: int) 
 
 
 def wrong_seconds(moments: list[Labelled], truth_ns: Callable[[Labelled], int]) -> list[tuple[Labelled, float]]:
-    """Moments whose second was sure, and another than the true one; by how many seconds."""
+    """Return moments that claim to know their second but are wrong, and the error, s."""
     errors = [(moment, (moment.utc_ns - truth_ns(moment)) * 1e-9) for moment in moments]
     return [(moment, error) for moment, error in errors if moment.state in ("LOCKED", "HOLDOVER") and abs(error) > 0.5]
 
 
 def states_between(logs: Path, begin_ns: int, end_ns: int) -> set[str]:
-    """What the recorder itself said of its clock, between two times of CLOCK_MONOTONIC."""
+    """Return the states that the recorder reported for its clock between two times of CLOCK_MONOTONIC, ns."""
     (session,) = open_logs([logs])
     offset_ns = session.info.realtime_ns - session.info.monotonic_ns
     return {

@@ -39,7 +39,7 @@ def assert_nothing_lost(content: LogContent, source: str) -> None:
 
 
 def decoded(logs: Path, source: str) -> int:
-    """Samples that the log's own parser finds, each of the number that its axes say."""
+    """Return the number of samples that the log's own parser finds, and check the number encoded in each."""
     (session,) = open_logs([logs])
     parsers, troubles = stored_parsers(session.attachments())
     assert troubles == []

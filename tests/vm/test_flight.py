@@ -79,8 +79,7 @@ NETWORK = (
 
 
 class Lines:
-    """This end of the wires: the clock that is asked, CAN frames on their way, the pulses' phase.
-
+    """This end of the wires: the clock that is queried, CAN frames in transit, the pulses' phase.
     Args:
         wires: folder of the flight's ports.
         can_port: UDP port of the flight's CAN bus.
@@ -103,7 +102,7 @@ class Lines:
         self._threads = [threading.Thread(target=self._tell_time)]
 
     def connect(self) -> None:
-        """Once the machine listens; only now does the flight find its pulses read, and begins."""
+        """Connect when the machine listens; only then does the flight find a reader of its pulses, and begin."""
         stream = socket.create_connection(("127.0.0.1", self._stream_port))
         stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._threads += [threading.Thread(target=self._carry, args=(stream,)), threading.Thread(target=self._follow)]
@@ -174,7 +173,7 @@ class Ends:
 
     @classmethod
     def of(cls, wires: Path) -> Ends:
-        """By the configuration beside them."""
+        """Read the ends from the configuration beside them."""
         config = load_config(wires / "swath.toml")
         receiver, imu, scanner = (
             parse_transport(one.transport) for one in (config.gnss["rover"], config.imu["main"], config.scanner["left"])
@@ -261,7 +260,7 @@ def test_a_flight_is_recorded_from_the_wires_and_georeferenced(
 
 
 def assert_complete(logs: Path, again: Path) -> None:
-    """What was recorded is what the same flight writes into a log, to the byte."""
+    """Assert that the recording equals the log that the same flight writes, to the byte."""
     (log,) = logs.glob("*.mcap")
     (same,) = again.glob("*.mcap")
     recorded, flown_ = read_log(log), read_log(same)

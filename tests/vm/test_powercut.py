@@ -39,7 +39,7 @@ WITHOUT_SYNC = "[Service]\nEnvironment=LD_PRELOAD=/usr/local/lib/nosync.so\n"
 
 @dataclass(frozen=True)
 class Synced:
-    """A sync that the kernel has ended: this much of a log was there before it began."""
+    """A sync that the kernel has completed: this much of a log existed before it began."""
 
     began_ns: int
     ended_ns: int
@@ -49,10 +49,9 @@ class Synced:
 
 @dataclass
 class Cut:
-    """What is left of a flight that ended in the dark, its journal replayed.
-
+    """What is left of a flight that ended with a power cut, its journal replayed.
     Attributes:
-        begun_ns: of the last sync that began, whether it ended or not.
+        begun_ns: the beginning of the last sync, whether it ended or not.
     """
 
     logs: Path
@@ -67,7 +66,7 @@ class Cut:
         return logs[0]
 
     def lost_s(self) -> float:
-        """From the first unit that is missing to the cut, as far as the machine lived to write down."""
+        """Return the time, s, from the first missing unit to the cut, as far as the machine could note it."""
         found = aircraft.numbers([self.log()])
         complete = dict.fromkeys(("udp", "serial", "can"), 0)
         for kind in complete:
@@ -79,7 +78,10 @@ class Cut:
         return (self.turns[-1].monotonic_ns - begin_ns) * 1e-9
 
     def bound_s(self) -> float:
-        """The sync period, 250 ms and the sync under way; the machine's own stalls, as its sender saw them."""
+        """Return the largest loss allowed, s: sync period, 250 ms, the sync under way, and the machine's own stalls.
+
+        The sender's notes show the stalls.
+        """
         syncs_ns = [sync.ended_ns - sync.began_ns for sync in self.syncs]
         if self.syncs and self.begun_ns > self.syncs[-1].ended_ns:
             syncs_ns.append(self.turns[-1].monotonic_ns - self.begun_ns)
@@ -90,7 +92,7 @@ class Cut:
 
 
 def fly_and_cut(folder: Path, disk: Path, after_s: float, *, syncs: bool = True) -> Cut:
-    """One flight into a fresh disk, cut some seconds after everything has begun."""
+    """Fly once into a fresh disk, and cut the power some seconds after everything has begun."""
     overlay = aircraft.aboard(folder / "overlay")
     shared = folder / "vm"
     if not syncs:
@@ -129,7 +131,7 @@ def synced(path: Path) -> list[Synced]:
 
 
 def check(cut: Cut) -> dict[str, float]:
-    """Everything that was durable is there and whole; the rest is lost within bounds; the log opens after recover."""
+    """Check that everything durable is there and whole, that the loss is within bounds, and that recovery works."""
     path = cut.log()
     last = cut.syncs[-1]
     assert last.log == path.name
@@ -153,7 +155,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @functools.cache
 def flown(place: Path, number: int) -> Cut:
-    """The flight of this number, cut at a random moment of its own; the disk of the first stays as it is."""
+    """Return the flight of this number, cut at its own random moment; the first flight's disk is kept."""
     disk = place / ("first" if number == 0 else "disk")
     return fly_and_cut(place / str(number), disk, random.Random(number).uniform(1.0, 5.0))
 
@@ -170,14 +172,14 @@ def test_durable_data_survive_a_power_cut(
 
 
 def test_without_sync_more_data_are_lost(place: Path) -> None:
-    """The control: were it the same without, the machine would not lose what a computer loses."""
+    """This is the control: if nothing more were lost, the machine would not lose what a real computer loses."""
     cut = fly_and_cut(place / "control", place / "disk", 6.0, syncs=False)
     logs = list(cut.logs.glob("*.mcap"))
     assert not logs or logs[0].stat().st_size == 0 or cut.lost_s() > FSYNC_S + CHUNK_OPEN_S + 1.0
 
 
 def test_recording_begins_by_itself_and_recovery_follows(place: Path) -> None:
-    """On the disk that the first of these cuts left."""
+    """The disk is the one that the first of these cuts left."""
     disk, folder = place / "first", place / "0"
     old = flown(place, 0).log()
     overlay, qemu = folder / "overlay", [*machine.disk(disk), *aircraft.null_modem(folder)]

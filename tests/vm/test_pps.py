@@ -57,7 +57,7 @@ def at_serial_port(folder: Path, kind: str) -> Iterator[tuple[GnssReceiver, Mach
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, list[int]]]:
-    """Folder and pulses of each kind; both machines run at the same time, because they wait most of it."""
+    """Return folder and pulses of each kind; both machines run at the same time, because they mostly wait."""
     folders = {kind: tmp_path_factory.mktemp(kind) for kind in KINDS}
     with ExitStack() as stack:
         running = {kind: stack.enter_context(at_serial_port(folders[kind], kind)) for kind in KINDS}
@@ -67,10 +67,11 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, 
 
 
 def assert_pulses_are_named(logs: Path, pulses_utc_s: list[int], ahead_ns: int) -> None:
-    """Every pulse while recording is an edge, and the second told is that of the world outside.
+    """Assert that every pulse is a recorded edge, and that its second is that of the world outside.
 
-    The emulated port looks at DCD every 10 ms only: too uneven for LOCKED, so the second counts in COARSE too. The
-    machine's wall clock is told to nobody: the recorder has the second from NMEA. ``ahead_ns``: of the outside's.
+    The emulated port reads DCD every 10 ms only, which is too uneven for LOCKED, so COARSE seconds count too. Nothing
+    uses the machine's wall clock: the recorder has the second from NMEA. ``ahead_ns`` is the machine's clock minus the
+    outside's.
     """
     content = read_log(logs)
     edges = [value for _, value in content.messages["/pps/main"] if value["edge"] == "assert"]

@@ -41,7 +41,7 @@ _OTHERWISE = {
 
 
 def probing_unit(unit: str) -> str:
-    """A unit as it is installed, its sandbox around the probe."""
+    """Return a unit as installed, with its sandbox around the probe."""
     lines = (installed() / f"usr/lib/systemd/system/{unit}").read_text().splitlines()
     gone = ("ExecStartPre", "ExecReload", "BindsTo", "PartOf", "After", "Wants", "NotifyAccess", "RestartPrevent")
     kept = [line for line in lines if not line.startswith(gone)]
@@ -56,7 +56,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def service(place: Path) -> Iterator[Machine]:
-    """The aircraft's computer; the receiver on its serial port is silent for as long as it runs."""
+    """Start the aircraft's computer; the receiver on its serial port stays silent."""
     overlay = aircraft.aboard(place / "overlay", session=SESSION, enabled=SERVICES)
     (overlay / "usr/local/lib/probe.py").write_bytes((machine.GUEST / "probe.py").read_bytes())
     for unit in SERVICES:
@@ -110,7 +110,7 @@ def fetched(service: Machine, place: Path) -> Path:
 
 @pytest.fixture
 def without_live(service: Machine) -> None:
-    """The live service compiles for a quarter of an hour here, beside which a repair takes minutes."""
+    """Stop the live service, which compiles for a quarter of an hour here and slows a repair down to minutes."""
     service.told("systemctl mask --runtime --now swath-live", COMES_BACK_S)
 
 
@@ -152,7 +152,7 @@ def test_devices_have_their_names_and_rights(service: Machine) -> None:
 
 @pytest.mark.usefixtures("without_live")
 def test_a_rule_makes_a_pps_source_of_a_serial_port(service: Machine) -> None:
-    """By the line discipline that the unit holds; the recorder has the same port open."""
+    """The unit holds the line discipline while the recorder has the same port open."""
     service.until("systemctl is-active swath-pps@ttyS1 && ls /dev/pps1")
     service.told("sleep 5")  # what a rule itself starts does not live so long
     assert service.told("stat -Lc '%G %a' /dev/pps1") == "dialout 660"
@@ -205,7 +205,7 @@ def test_a_port_in_use_is_waited_for(service: Machine) -> None:
 @pytest.mark.usefixtures("without_live")
 @pytest.mark.parametrize("thread", ["scanner/left", "writer"])
 def test_a_hanging_thread_costs_only_a_restart(service: Machine, place: Path, thread: str) -> None:
-    """systemd's watchdog ends it; the next one records at once, and repairs the old log beside it."""
+    """systemd's watchdog ends it; the next one records at once, and repairs the old log meanwhile."""
     old, pid = next_part(service), shown(service, "MainPID")  # a long one is repaired for minutes here
     service.told("sleep 3")
     stem, fired = Path(old).stem, "journalctl -b -u swathd | grep -c 'Watchdog timeout'"

@@ -37,7 +37,7 @@ def feed_can(interface: str, port: int) -> None:
 
 
 def send(bus: socket.socket, frame: bytes) -> None:
-    """One frame; waits while the queue is full."""
+    """Send one frame, and wait while the queue is full."""
     while True:
         try:
             bus.send(frame)

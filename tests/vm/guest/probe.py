@@ -54,7 +54,7 @@ def real_time() -> None:
 
 
 def set_uid_file() -> None:
-    """A program of its own that runs as its owner."""
+    """Make a program that would run as its owner."""
     path = Path("/var/lib/swath/probe")
     path.touch()
     try:
@@ -100,7 +100,7 @@ TRIALS: dict[str, Callable[[], object]] = {
 
 
 def main() -> None:
-    """Try everything."""
+    """Try everything, and print what succeeds or fails with which error."""
     found: dict[str, object] = {}
     for name, trial in TRIALS.items():
         try:

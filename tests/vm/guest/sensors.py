@@ -23,7 +23,7 @@ TURN_S = 0.01
 
 
 def udp(place: str) -> tuple[Callable[[int], None], float]:
-    """A datagram begins with its number, eight bytes, little-endian."""
+    """Return a sender of datagrams, each beginning with its number (eight bytes, little-endian), and its rate, Hz."""
     port, rate = place.split(":")
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     address = ("127.0.0.1", int(port))
@@ -31,7 +31,7 @@ def udp(place: str) -> tuple[Callable[[int], None], float]:
 
 
 def serial(device: str) -> tuple[Callable[[int], None], float]:
-    """A line is ``$P,<number>``."""
+    """Return a sender of lines ``$P,<number>`` on a serial port, and its rate, Hz."""
     fd = os.open(device, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
     tty.setraw(fd)
     settings = termios.tcgetattr(fd)
@@ -41,7 +41,7 @@ def serial(device: str) -> tuple[Callable[[int], None], float]:
 
 
 def can(place: str) -> tuple[Callable[[int], None], float]:
-    """A frame is its number, eight bytes, little-endian, under the identifier 0x123."""
+    """Return a sender of frames 0x123, each with its number (eight bytes, little-endian), and its rate, Hz."""
     interface, rate = place.split(":")
     sock = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
     sock.bind((interface,))
@@ -49,7 +49,7 @@ def can(place: str) -> tuple[Callable[[int], None], float]:
 
 
 def void(_: object) -> None:
-    """For what a call hands back and nobody wants."""
+    """Ignore the result of a call."""
 
 
 def main() -> None:

@@ -11,7 +11,7 @@ PTRACE_SEIZE, PTRACE_INTERRUPT, WAIT_ALL = 0x4206, 0x4207, 0x40000000  # <linux/
 
 
 def main() -> None:
-    """ptrace(2): SIGSTOP would stop them all."""
+    """Stop one thread with ptrace(2); SIGSTOP would stop them all."""
     tasks = Path(f"/proc/{sys.argv[1]}/task")
     thread = next(int(task.name) for task in tasks.iterdir() if (task / "comm").read_text().strip() == sys.argv[2])
     libc = ctypes.CDLL(None, use_errno=True)

@@ -21,7 +21,7 @@ _LINE = re.compile(r"(?P<task>\S.*)-\d+\s+\[\d+\].*? (?P<time>\d+\.\d+): sys_fda
 
 
 def begin() -> int:
-    """Of what is traced only threads called writer; returns the pipe."""
+    """Begin to trace the threads called writer only, and return the pipe."""
     if not (TRACING / "trace_pipe").exists():
         os.system(f"mount -t tracefs nodev {TRACING}")
     for event in ("sys_enter_fdatasync", "sys_exit_fdatasync"):
