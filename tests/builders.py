@@ -55,7 +55,7 @@ TO_MAP = Transformer.from_crs("EPSG:4978", "EPSG:32632", always_xy=True)
 
 @dataclass(frozen=True)
 class Recorded:
-    """Hold a recorded flight: the log's folder, the points georeferenced in flight, and the truth of the returns."""
+    """A recorded flight: the log's folder, the points georeferenced in flight, and the truth of the returns."""
 
     logs: Path
     points: StructArray
@@ -176,7 +176,7 @@ TURNED = [[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]]  # cables to the 
 
 @dataclass
 class Flown:
-    """Hold a flight's decoded returns, the times of their pulses by the packets' own clock, and the truth."""
+    """A flight's decoded returns, the times of their pulses by the packets' own clock, and the truth."""
 
     plan: Plan
     rows: StructArray

@@ -33,7 +33,7 @@ def heed_interrupts() -> None:
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    """The few tests that are alone are looked for where the mark stands, not by importing all the others."""
+    """Skip files without the mark when only the few tests marked alone are wanted, to avoid importing all others."""
     if not config.option.markexpr.startswith("alone") or collection_path.suffix != ".py":
         return None
     return True if "pytest.mark.alone" not in collection_path.read_text() else None
@@ -41,10 +41,10 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """One worker for tests that share what is made once: a fixture of their file, or loops that are to be compiled.
+    """Give one worker to tests that share something made once: a fixture of their file, or loops to be compiled.
 
-    `make test` compiles most loops beforehand, those of calib all. What is left is compiled once for georef and once
-    for sim; tests of whole commands find it there, or compile the same beside them.
+    `make test` compiles most loops beforehand, those of calib all. The rest is compiled once for georef and once for
+    sim; tests of whole commands find it there, or compile the same beside them.
     """
     for item in items:
         marker = item.get_closest_marker("xdist_group")

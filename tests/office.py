@@ -27,7 +27,7 @@ IDENTITY = re.compile(r"-[0-9a-f]{4}\b")  # of a session or a calibration
 
 @dataclass(frozen=True)
 class Step:
-    """A command of the page and what the page says that it prints."""
+    """A command of the page, and what the page says that it prints."""
 
     command: str
     printed: list[str]

@@ -76,13 +76,13 @@ def parsed(path: Path) -> ast.Module:
 
 
 def tracked() -> list[Path]:
-    """Files that git knows, as they lie here."""
+    """Return the files that git tracks, as far as they exist here."""
     listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
     return [path for name in listed.split("\0") if name and (path := ROOT / name).is_file()]
 
 
 def contract(name: str) -> dict[str, Any]:
-    """A contract of import-linter by its name."""
+    """Return a contract of import-linter by its name."""
     (found,) = [one for one in project()["tool"]["importlinter"]["contracts"] if one["name"] == name]
     return dict(found)
 
@@ -94,7 +94,7 @@ def test_the_packages_of_swath_are_links_to_the_folders_beside_it() -> None:
 
 
 def test_every_folder_of_modules_is_a_package() -> None:
-    """setuptools installs no other."""
+    """setuptools installs packages only."""
     folders = {path.parent for name in PACKAGES for path in (ROOT / name).rglob("*.py")}
     assert [str(folder) for folder in sorted(folders) if not (folder / "__init__.py").exists()] == []
 
@@ -117,7 +117,7 @@ def test_sim_may_import_only_the_shared_modules_of_georef() -> None:
 
 
 def georef_modules_imported(path: Path) -> set[str]:
-    """What a file imports of georef, as ``swath.georef.<module>``."""
+    """Return what a file imports from georef, as ``swath.georef.<module>``."""
     found: set[str] = set()
     for node in ast.walk(parsed(path)):
         if isinstance(node, ast.Import):
@@ -154,7 +154,7 @@ def test_no_file_contains_a_path_of_a_users_computer() -> None:
 
 
 def modules() -> dict[str, Path]:
-    """All modules of the packages, by name."""
+    """Return all modules of the packages, by name."""
     return {
         f"swath.{path.relative_to(ROOT).with_suffix('')}".replace("/", ".").removesuffix(".__init__"): path
         for name in PACKAGES
@@ -164,7 +164,7 @@ def modules() -> dict[str, Path]:
 
 @functools.cache
 def imports() -> dict[str, set[str]]:
-    """By module, those of the packages that it imports, anywhere in it and for whatever purpose."""
+    """Return for each module those of the packages that it imports, anywhere in it and for whatever purpose."""
     known, found = modules(), {}
     for name, path in known.items():
         taken: set[str] = set()
@@ -179,7 +179,7 @@ def imports() -> dict[str, set[str]]:
 
 
 def test_no_module_imports_itself_through_others() -> None:
-    """Imports for type checkers only count too."""
+    """Imports for type checkers count too."""
     try:
         TopologicalSorter(imports()).prepare()
     except CycleError as error:
@@ -187,7 +187,7 @@ def test_no_module_imports_itself_through_others() -> None:
 
 
 def imported_in_functions(path: Path) -> set[str]:
-    """Modules that functions of a file import."""
+    """Return the modules that functions of a file import."""
     functions = (ast.FunctionDef, ast.AsyncFunctionDef)
     bodies = [node for node in ast.walk(parsed(path)) if isinstance(node, functions)]
     found: set[str] = set()
@@ -218,7 +218,7 @@ def test_files_stay_within_the_line_limit() -> None:
 
 
 def test_folders_stay_within_the_module_limit() -> None:
-    """Commands have a file each."""
+    """Only the folder of commands may have more, because each command has a file."""
     paths = [*modules().values(), *(ROOT / "benchmarks").rglob("*.py")]
     folders = Counter(path.parent for path in paths if path.stem != "__init__")
     crowded = {str(folder.relative_to(ROOT)): count for folder, count in folders.items() if count > MOST_MODULES}
@@ -234,7 +234,7 @@ def test_three_files_with_a_common_prefix_form_a_folder() -> None:
 
 
 def test_a_small_module_used_by_one_other_is_part_of_it() -> None:
-    """Unless the two stand in different packages, whose border lies between them."""
+    """Modules in different packages are exempt, because a border lies between them."""
     users: dict[str, set[str]] = defaultdict(set)
     for name, taken in imports().items():
         for one in taken:
@@ -258,7 +258,7 @@ def test_every_device_has_a_page() -> None:
 
 
 def test_every_counter_of_a_driver_is_documented() -> None:
-    """`swath info` and `swath monitor` show it by its code alone."""
+    """`swath info` and `swath monitor` show it only by its code."""
     sources = [path.read_text() for path in (ROOT / "drivers").rglob("*.py")]
     codes = {code for text in sources for code in re.findall(r'errors\["([a-z0-9_]+)"\]', text)}
     assert len(codes) > 25
@@ -291,7 +291,7 @@ def imported_tests(source: str) -> set[str]:
 
 
 def test_no_test_imports_from_another_test() -> None:
-    """Functions that several tests use are in builders.py, fixtures in conftest.py, of the nearest common folder."""
+    """Functions shared by tests are in builders.py, fixtures in conftest.py, of the nearest common folder."""
     files = [path for path in tracked() if path.is_relative_to(ROOT / "tests") and path.suffix == ".py"]
     assert Path(__file__) in files
     found = {str(path.relative_to(ROOT)): imported_tests(path.read_text()) for path in files}
@@ -301,7 +301,7 @@ def test_no_test_imports_from_another_test() -> None:
 
 
 def event_codes() -> set[str]:
-    """The code of every event posted: third argument, second where it is said once only."""
+    """Return the code of every event posted: the third argument, or the second of `add_once`."""
     place = {"post": 2, "make": 2, "add": 2, "add_once": 1}
     codes = set()
     for path in [*(ROOT / "daemon").rglob("*.py"), *(ROOT / "georef").rglob("*.py")]:
@@ -339,7 +339,10 @@ def test_the_example_of_a_new_device_is_a_driver() -> None:
 
 
 def loaded_by(code: str) -> set[str]:
-    """Names of all modules, without what stands below packages, that a new interpreter has after running this."""
+    """Return names of all modules that a new interpreter has loaded after running this code.
+
+    Modules below packages are counted as their package.
+    """
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-c", f"{code}; import sys; print(*sys.modules)"]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
@@ -370,7 +373,7 @@ def test_importing_the_command_line_loads_no_processing_or_simulator_module() ->
 
 
 def test_few_modules_of_the_daemon_import_the_simulator() -> None:
-    """The contract that keeps the recorder light lets only the folder of processing through besides them."""
+    """The contract that keeps the recorder light lets only these and the folder of processing import it."""
     light = contract("the recorder stays light")
     assert light["source_modules"] == ["swath.daemon", "swath.drivers"]
     assert PROCESSING_ONLY | {"swath.sim"} <= set(light["forbidden_modules"])

@@ -25,7 +25,7 @@ EVERY = [(part, source) for part, sources in SOURCES.items() for source in (*sou
 
 
 class Nowhere(Output):
-    """Output that accepts everything."""
+    """Output that accepts everything and keeps nothing."""
 
     def send(self, data: bytes, due_realtime_ns: int) -> bool:
         return True
@@ -44,7 +44,7 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
 
 
 def sent_as_logged(content: LogContent, report: PlayReport, sources: tuple[str, ...]) -> dict[str, Hashed]:
-    """Outputs that have sent exactly what is in a log."""
+    """Return outputs that have sent exactly what is in a log."""
     outputs: dict[str, Hashed] = {source: Hashed(Nowhere()) for source in sources}
     for source, output in outputs.items():
         for _, data in content.units[source]:

@@ -41,7 +41,7 @@ def make(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 def files_below(folder: Path) -> set[str]:
-    """All files and links, relative; the program's own folder only by its name."""
+    """Return all files and links, relative to the folder; the program's own folder only by its name."""
     found = set()
     for parent, folders, names in os.walk(folder):
         if Path(parent) == folder / "opt":
@@ -53,7 +53,7 @@ def files_below(folder: Path) -> set[str]:
 
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A root with the program installed into it, by any Python that a service could see."""
+    """Install the program into a root, with any Python that a service could see."""
     root = tmp_path_factory.mktemp("root")
     done = make("install", f"DESTDIR={root}", "EXTRAS=", *python_for_services())
     assert done.returncode == 0, done.stderr
@@ -61,7 +61,7 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def python_for_services() -> list[str]:
-    """`PYTHON=` for make install: nothing where the system's Python will do, which is the default."""
+    """Return `PYTHON=` for make install; nothing if the default, the system's Python, will do."""
     system = Path("/usr/bin/python3")
     probe = "import ensurepip, sys, venv; sys.exit(sys.version_info < (3, 11))"
     if system.exists() and subprocess.run([system, "-c", probe], capture_output=True, check=False).returncode == 0:
@@ -100,7 +100,7 @@ def test_bare_install_imports_all_packages_and_no_processing_module(installed: P
 
 
 def wants_an_extra(name: str) -> bool:
-    """Whether a module imports what only an extra brings: compiled loops, the virtual aircraft, processing."""
+    """Return True if a module imports what only an extra brings: compiled loops, virtual aircraft, processing."""
     _, package, module = [*name.split(".", 2), ""][:3]
     if package == "georef":
         return bool(module) and module.split(".")[0] not in ("records", "timescales")
@@ -110,7 +110,7 @@ def wants_an_extra(name: str) -> bool:
 
 
 def test_bare_install_has_every_module_of_the_project(installed: Path) -> None:
-    """All modules are there; all that want no extra import without the extras."""
+    """Modules that need no extra can be imported without the extras."""
     names = [
         f"swath.{path.relative_to(ROOT).with_suffix('')}".replace("/", ".").removesuffix(".__init__")
         for package in PACKAGES
@@ -165,7 +165,7 @@ def test_installed_example_configuration_is_valid(installed: Path) -> None:
 
 
 def test_uninstall_leaves_the_configuration_and_the_logs(installed: Path, tmp_path: Path) -> None:
-    """On a copy of the root without the program's bulk: what uninstall removes does not depend on it."""
+    """The root is a copy without the bulk of the program, which does not matter to what uninstall removes."""
     for name in PLACED:
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         source = installed / name
@@ -184,7 +184,7 @@ def test_uninstall_leaves_the_configuration_and_the_logs(installed: Path, tmp_pa
 
 
 def install_files(root: Path, prefix: str) -> str:
-    """Everything but the program, which takes longest; returns what the installer said."""
+    """Install everything except the program, which takes longest, and return what the installer printed."""
     environment = os.environ | {"DESTDIR": str(root), "PREFIX": prefix}
     command = ["sh", str(ROOT / "systemd/install.sh"), "files"]
     return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=HANGS_S, check=True).stdout
@@ -207,7 +207,7 @@ def test_an_existing_configuration_is_never_overwritten(tmp_path: Path) -> None:
 
 
 def test_a_configuration_on_an_unmounted_disk_is_not_replaced_by_the_example(tmp_path: Path) -> None:
-    """Else the next start would record with the example's devices."""
+    """Otherwise the next start would record with the example's devices."""
     link = tmp_path / "etc/swath/swath.toml"
     link.parent.mkdir(parents=True)
     link.symlink_to(tmp_path / "data/aircraft.toml")
@@ -254,7 +254,7 @@ BEFORE = {"opt/swath/pyvenv.cfg", "opt/swath/bin/swath", "opt/swath/lib/only_bef
 
 @pytest.fixture
 def root_before(tmp_path: Path) -> Path:
-    """A root with an installed program, and what a power cut left of building another."""
+    """Return a root with an installed program, and the remains of another whose building a power cut ended."""
     root = tmp_path / "root"
     for name in BEFORE | {"opt/swath.building/bin/python"}:
         (root / name).parent.mkdir(parents=True, exist_ok=True)

@@ -122,7 +122,7 @@ def test_pages_find_their_templates(tmp_path: Path, options: tuple[str, ...]) ->
 
 
 def test_an_editable_installation_works_over_the_remains_of_an_ordinary_one(tmp_path: Path) -> None:
-    """pip leaves the caches of compiled loops, and with them the folders that they stand in."""
+    """pip leaves the caches of compiled loops, and with them the folders that they are in."""
     place = Place(tmp_path)
     place.install_swath()
     assert place.run("python", "-c", COMPILE) == f"{place.packages / 'swath/__init__.py'}\n"

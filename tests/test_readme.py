@@ -24,12 +24,12 @@ README = (ROOT / "README.md").read_text()
 
 
 def blocks(language: str) -> list[str]:
-    """The fenced blocks of a language."""
+    """Return the fenced blocks of a language."""
     return re.findall(rf"^```{language}\n(.*?)^```$", README, flags=re.MULTILINE | re.DOTALL)
 
 
 def commands() -> list[str]:
-    """Every command line of the README: those after a prompt, and those that stand in the text."""
+    """Return every command line of the README: those after a prompt, and those in the text."""
     prompted = [line[2:] for block in blocks("console") for line in block.splitlines() if line.startswith("$ ")]
     inline = re.findall(
         r"`((?:sudo |make |swath |systemctl |pip )[^`]*)`", re.sub(r"^```.*?^```$", "", README, flags=re.M | re.S)
@@ -38,7 +38,7 @@ def commands() -> list[str]:
 
 
 def run(*command: str | Path) -> subprocess.CompletedProcess[str]:
-    """A command in the project's folder, which must succeed."""
+    """Run a command in the project's folder, and check that it succeeds."""
     words = [str(word) for word in command]
     done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=HANGS_S, check=False)
     assert done.returncode == 0, f"{words}: {done.stderr}"
@@ -46,7 +46,7 @@ def run(*command: str | Path) -> subprocess.CompletedProcess[str]:
 
 
 def swath(*arguments: str | Path) -> str:
-    """`swath` as installed from here."""
+    """Run `swath` as installed from here, and return what it printed."""
     return run(sys.executable, "-m", "swath.daemon.cli.main", *arguments).stdout
 
 
@@ -66,7 +66,7 @@ def run_devices(_: Path) -> None:
 
 
 def aircraft_of_readme(folder: Path) -> Path:
-    """The README's configuration as a file."""
+    """Write the README's configuration to a file, and return its path."""
     (text,) = blocks("toml")
     path = folder / "swath.toml"
     path.write_text(text)
@@ -80,7 +80,7 @@ def run_check_offline(folder: Path) -> None:
 
 
 def run_check(folder: Path) -> None:
-    """The aircraft's devices are not here, nor its clock: each is said to be wrong, and that is exit status 1."""
+    """Run the check without the aircraft's devices and clock: each is reported as wrong, with exit status 1."""
     command = [
         sys.executable,
         "-m",
@@ -97,7 +97,7 @@ def run_check(folder: Path) -> None:
 
 
 def record_a_little(folder: Path) -> Path:
-    """A log of a second, of a recorder without any device."""
+    """Record a log of a second without any device, and return its folder."""
     logs = folder / "logs"
     config = folder / "record.toml"
     config.write_text(f'[session]\nname = "readme"\ndirectory = "{logs}"\nreserve_mb = 1\n')
@@ -114,14 +114,14 @@ def run_recover(folder: Path) -> None:
 
 
 def run_setup(folder: Path) -> None:
-    """Shows only: with --apply it is run against simulators in test_device_setup.py."""
+    """Run setup without --apply; test_device_setup.py runs it with --apply against simulators."""
     said = swath("setup", aircraft_of_readme(folder))
     assert "LOG TIMEB ONTIME 1" in said
     assert "nothing was sent" in said
 
 
 def run_doctor(folder: Path) -> None:
-    """This computer may well be found wanting: exit status 1, with what mends it."""
+    """Run the doctor, which may find faults of this computer: exit status 1, with remedies."""
     command = [sys.executable, "-m", "swath.daemon.cli.main", "doctor", str(aircraft_of_readme(folder))]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=HANGS_S, check=False)
     assert done.returncode in (0, 1), done.stderr
@@ -143,12 +143,12 @@ def run_beside_a_recorder(folder: Path) -> None:
 
 
 def point_to_the_page(_: Path) -> None:
-    """Named in the text only; what they do is proven in test_import.py and test_export.py."""
+    """Check that the commands exist; test_import.py and test_export.py prove what they do."""
     assert {"import", "export"} <= set(getattr(get_command(make_app(None)), "commands", {}))
 
 
 def run_points(folder: Path) -> None:
-    """A flight into a log, points of it, and the page that shows them."""
+    """Fly into a log, and make points of it and the page that shows them."""
     swath("sim", "fly", "small", "--seconds", "24", "-o", folder / "small")
     calibration = folder / "small/left.true.toml"  # its log has the nominal one
     crs = ("--crs", "EPSG:32632")
@@ -159,34 +159,34 @@ def run_points(folder: Path) -> None:
 
 
 def runs_with_georef(_: Path) -> None:
-    """`run_points` flies, and looks at what it made."""
+    """Check that the commands exist; `run_points` runs them."""
     assert {"sim", "view"} <= set(getattr(get_command(make_app(None)), "commands", {}))
 
 
 def extra_is_there(_: Path) -> None:
-    """pip would fetch it; that it brings all that a command wants is what the tests of processing run on."""
+    """Check the extra's list, because pip would download it; the tests of processing prove that it is enough."""
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     wanted = {"numba", "scipy", "pyproj", "laspy", "matplotlib", "jinja2", "tomlkit", "weasyprint", "pyshp"}
     assert {re.split(r"[\[><=]", line)[0] for line in extras["process"]} == wanted
 
 
 def pango_is_installed(_: Path) -> None:
-    """apt would install for this computer; the tests of PDF reports run on the packages that `make test` installs."""
+    """Check that set-up lists the packages; the tests of PDF reports run with those that `make test` installs."""
     assert "libpango-1.0-0 libpangoft2-1.0-0" in (ROOT / "systemd/setup.sh").read_text()
 
 
 def live_unit_is_there(_: Path) -> None:
-    """That the unit is right is proven in test_systemd.py, what it runs in test_live.py."""
+    """Check that the unit exists; test_systemd.py proves that it is right, test_live.py what it runs."""
     assert "WantedBy=swathd.service" in (ROOT / "systemd/swath-live.service").read_text()
 
 
 def unit_is_there(_: Path) -> None:
-    """systemctl would act on a service of this computer; that the unit is right is proven in test_systemd.py."""
+    """Check that the unit exists, because systemctl would act on this computer; test_systemd.py proves it right."""
     assert (ROOT / "systemd/swathd.service").read_text().count("[Install]\nWantedBy=multi-user.target") == 1
 
 
 def group_may_read(_: Path) -> None:
-    """usermod would act on a user of this computer; that users and folders are made so is proven in test_systemd.py."""
+    """Check the folder's mode, because usermod would change this computer; test_systemd.py proves the rest."""
     assert "d /var/lib/swath 0750 swath swath -" in (ROOT / "systemd/tmpfiles/swath.conf").read_text()
 
 
@@ -262,7 +262,7 @@ def test_commands_named_in_the_pages_exist() -> None:
 
 
 def options(command: Any, name: str = "swath") -> Iterator[tuple[str, list[str]]]:
-    """Of a command and those below it: who has it, and how it is written, with the word that turns it off."""
+    """Yield each option of a command and of those below it, with its spellings and the word that turns it off."""
     for below, found in getattr(command, "commands", {}).items():
         yield from options(found, f"{name} {below}")
     for parameter in command.params:

@@ -33,13 +33,13 @@ def run_tool(*command: str | Path) -> subprocess.CompletedProcess[str]:
 
 
 def unit_values(key: str, unit: Path = UNIT) -> list[str]:
-    """All values of a key of the unit, in order."""
+    """Return all values of a key of the unit, in order."""
     return re.findall(rf"^{key}=(.*)$", unit.read_text(), flags=re.MULTILINE)
 
 
 @pytest.fixture
 def unit_with_program(tmp_path: Path) -> Path:
-    """The unit with a program that exists, because the checker looks for it; the live one stands beside it."""
+    """Return the unit with a program that exists, because the checker looks for it; the live unit is beside it."""
     program = tmp_path / "opt/swath/bin/swath"
     program.parent.mkdir(parents=True)
     program.write_text("#!/bin/sh\n")
@@ -68,7 +68,7 @@ def test_exposure_is_at_most_two() -> None:
 
 
 class TestLive:
-    """The live georeferencer's unit, beside the recorder's."""
+    """The live georeferencer's unit is checked beside the recorder's."""
 
     def test_the_unit_passes_verification(self, unit_with_program: Path) -> None:
         found = run_tool("systemd-analyze", "verify", "--man=no", unit_with_program.with_name(LIVE.name))
@@ -106,7 +106,7 @@ class TestLive:
         assert unit_values("RestartPreventExitStatus", LIVE) == ["2"]
 
     def test_the_unit_is_hardened_like_the_recorder_except_where_unneeded(self) -> None:
-        """Every restriction of the recorder's unit is one of this unit too, as strict or stricter."""
+        """Every restriction of the recorder's unit applies to this unit too, as strictly or more strictly."""
         for name in HARDENING:
             assert unit_values(name, LIVE) == unit_values(name) != [], name
         assert unit_values("DeviceAllow", LIVE) == []
@@ -114,7 +114,7 @@ class TestLive:
         assert unit_values("SystemCallFilter", LIVE) == [*unit_values("SystemCallFilter")[:2], "mincore"]
 
     def test_the_unit_may_query_the_page_cache(self) -> None:
-        """mincore(2) stands in no group of systemd's; where it is not permitted, everything looks cold."""
+        """mincore(2) is in no group of systemd's; where it is not permitted, all pages look cold."""
         allowed: set[str] = set()
         waiting = [word for line in unit_values("SystemCallFilter", LIVE) if line[0] != "~" for word in line.split()]
         while waiting:
@@ -170,7 +170,7 @@ class TestPps:
 
 
 def test_no_rule_starts_a_program() -> None:
-    """udev(7): what RUN starts is killed when the event is through, in the background or not."""
+    """By udev(7), what RUN starts is killed when the event has been handled, in the background or not."""
     assert not [line for line in _udev_rules() + _udev_examples() if "RUN" in line]
 
 
@@ -188,13 +188,13 @@ def test_only_a_wrong_configuration_is_not_retried() -> None:
 
 
 def test_the_recovering_child_may_become_idle_and_read_the_clock() -> None:
-    """What the recorder calls beyond the ordinary is let through by name; the last filter line wins."""
+    """Unusual system calls of the recorder are allowed by name; the last filter line wins."""
     last = unit_values("SystemCallFilter")[-1].split()
     assert set(last) >= {"adjtimex", "ioprio_set", "setpriority", "sched_setscheduler"}
 
 
 def test_drivers_of_the_allowed_devices_are_loaded_before_the_devices_are_named() -> None:
-    """systemd.resource-control(5): a class that /proc/devices does not know at the start is left out of the policy."""
+    """By systemd.resource-control(5), a class that /proc/devices lacks at the start is left out of the policy."""
     module_of = {"char-ttyUSB": "usbserial", "char-ttyACM": "cdc_acm", "char-pps": "pps_core"}
     built_in = {"char-ttyS", "char-ttyAMA"}
     allowed = {value.split()[0] for value in unit_values("DeviceAllow")}

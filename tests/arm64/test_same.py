@@ -148,7 +148,7 @@ def test_exported_captures_are_the_same(flight: Path, tmp_path: Path) -> None:
 
 
 def test_a_recovered_log_is_the_same(flight: Path, tmp_path: Path) -> None:
-    """Recover a log without its end and with one wrong byte: chunks are read, checked, written and summed."""
+    """The log has lost its end and has one wrong byte, so chunks are read, checked, written and summed."""
     (log,) = flight.glob("*.mcap")
     damaged = bytearray(log.read_bytes()[: -(2 << 20)])
     damaged[len(damaged) // 2] ^= 0x10
@@ -162,7 +162,7 @@ def test_a_recovered_log_is_the_same(flight: Path, tmp_path: Path) -> None:
 
 
 def test_navigated_trajectories_differ_by_far_less_than_their_sigma(flight: Path, tmp_path: Path) -> None:
-    """Sums of products in an order that BLAS chooses; columns of SBET and smrmsg as Applanix lists them."""
+    """BLAS chooses the order of sums; columns of SBET and smrmsg are those that Applanix lists."""
     both = on_both(tmp_path, "swath.daemon.cli.main", "trajectory", flight, "-o", "{}")
     ((host, sigma), (arm64, _)) = (
         (np.fromfile(next(own.glob("*.sbet"))).reshape(-1, 17), np.fromfile(next(own.glob("*.smrmsg"))).reshape(-1, 10))

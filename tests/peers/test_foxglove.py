@@ -36,7 +36,7 @@ def swath(*arguments: str | Path) -> str:
 
 @pytest.fixture(scope="module")
 def live(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a live run over the beginning of a virtual flight."""
+    """Return the folder of a live run over the beginning of a virtual flight."""
     folder = tmp_path_factory.mktemp("foxglove")
     swath("sim", "fly", "small", "--seconds", "14", "-o", folder / "flight")
     swath("live", "--replay", folder / "flight", "-o", folder / "live", "--json", "--accept-verdict")
@@ -45,7 +45,7 @@ def live(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def read(live: Path) -> dict[str, Any]:
-    """What Foxglove's libraries make of the file."""
+    """Return what Foxglove's libraries read from the file."""
     node = shutil.which("node")
     assert node, "there is no node: apt-get install nodejs npm"
     assert (HERE / "node_modules/@mcap/core").is_dir(), f"no @mcap/core: npm install --prefix {HERE}"
@@ -73,7 +73,7 @@ def test_all_messages_and_points_are_present(live: Path, read: dict[str, Any]) -
 
 
 def test_a_cloud_lies_below_the_aircraft_in_the_local_frame(read: dict[str, Any]) -> None:
-    """All in the frame ``local``; points below the body, position as the pose, in degrees."""
+    """Everything is in the frame ``local``: points are below the body, and the position in degrees is the pose's."""
     topics, metadata = read["topics"], read["metadata"]["swath.live"]
     cloud, pose, fix = (topics[name]["first"] for name in ("/points/left", "/pose", "/position"))
     assert cloud["frame_id"] == pose["frame_id"] == topics["/tf"]["first"]["parent_frame_id"] == "local"

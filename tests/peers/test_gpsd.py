@@ -47,7 +47,10 @@ leap_seconds = 18
 
 @dataclass(frozen=True)
 class Case:
-    """A recording, and what its messages resolve: degrees (a NMEA minute has digits behind the point) and metres."""
+    """A recording, and the resolution of its messages in degrees and metres.
+
+    A NMEA minute has decimals, whose number decides.
+    """
 
     protocol: str
     name: str
@@ -68,7 +71,7 @@ def swath(*arguments: str | Path) -> list[str]:
 
 
 def recorded(folder: Path, case: Case) -> Path:
-    """The recording as a log, at the pace of its line."""
+    """Import the recording as a log, at the pace of its line, and return the configuration."""
     raw = folder / "rover.bytes"
     raw.write_bytes(gzip.decompress((ROOT / "fixtures" / case.protocol / f"{case.name}.log.gz").read_bytes()))
     config = folder / "swath.toml"
@@ -90,7 +93,7 @@ def utc(fix: GnssFix) -> dt.datetime:
 
 
 def our_fixes(folder: Path) -> list[GnssFix]:
-    """Valid fixes of the log, by our decoder."""
+    """Return the valid fixes of the log, read by our decoder."""
     (session,) = open_logs([folder / "log"])
     parsers, troubles = stored_parsers(session.attachments())
     assert not troubles
@@ -105,7 +108,7 @@ def our_fixes(folder: Path) -> list[GnssFix]:
 
 @contextmanager
 def gpsd(device: Path) -> Iterator[socket.socket]:
-    """A gpsd that only listens to a device, and a client of it."""
+    """Start a gpsd that only listens to a device, and a client of it."""
     program = shutil.which("gpsd", path="/usr/sbin:/usr/local/sbin:/usr/bin:/usr/local/bin")
     assert program, "there is no gpsd: apt-get install gpsd"
     with socket.socket() as probe:
@@ -131,7 +134,7 @@ def gpsd(device: Path) -> Iterator[socket.socket]:
 
 
 def played_to_gpsd(folder: Path, config: Path) -> list[dict[str, Any]]:
-    """Every TPV with a time and a position that gpsd tells while a log is played to it."""
+    """Play a log to gpsd, and return every TPV with a time and a position."""
     command = swath("replay", "--wire", config, "--wait", "30", folder / "log")
     player = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
     try:
