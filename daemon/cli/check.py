@@ -33,7 +33,7 @@ def command(
     findings = [*configuration_findings(loaded), *_crs_findings(loaded)]
     placed = placed_devices(loaded)
     reports = [] if offline else _listen(loaded, seconds)
-    wrong = bool(findings) or any(report.problems for report in reports)
+    wrong = bool(findings) or not all(report.ok for report in reports)
     if as_json:
         found = {"config": str(config), "ok": not wrong, "findings": findings, "geometry": geometry_lines(placed)}
         found |= {"sources": _sources(loaded)} if offline else {"devices": [report.plain() for report in reports]}
@@ -105,7 +105,9 @@ def _print_reports(reports: list[Report]) -> None:
     for report in reports:
         records = ", ".join(f"{name} {count}" for name, count in report.records.most_common() if count)
         count = f"{report.bytes:,}" if report.bytes else ""
-        verdict = Text("wrong", style="red") if report.problems else Text("ok", style="green")
+        verdict = Text("ok", style="green") if report.ok else Text("doubtful", style="yellow")
+        if report.problems:
+            verdict = Text("wrong", style="red")
         opens = "yes" if report.opens else "no"
         table.add_row(report.source, report.protocol, opens, count, records, report.time, verdict)
     console = Console()
@@ -113,5 +115,7 @@ def _print_reports(reports: list[Report]) -> None:
     for report in reports:
         for problem in report.problems:
             console.print(f"{report.source}: {problem}", style="red", markup=False, highlight=False, soft_wrap=True)
-        for note in report.notes:
+        for doubt in report.doubts:
+            console.print(f"{report.source}: {doubt}", style="yellow", markup=False, highlight=False, soft_wrap=True)
+        for note in [*report.facts, *report.notes]:
             console.print(f"{report.source}: {note}", style="dim", markup=False, highlight=False, soft_wrap=True)

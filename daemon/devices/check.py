@@ -23,6 +23,7 @@ import numpy as np
 
 from swath.daemon.config import Config, DeviceEntry
 from swath.daemon.devices.identify import Heard, describe_time, not_understood
+from swath.daemon.devices.values import Values
 from swath.daemon.log.directory import nearest_there
 from swath.daemon.log.host_clock import ClockDiscipline, read_clock_discipline
 from swath.drivers.driver import find_driver
@@ -32,7 +33,7 @@ from swath.drivers.transports.base import RawEdge, TransportCounters, UnitBlock
 from swath.drivers.transports.can.bitrate import interface_bitrate
 from swath.drivers.transports.opening import open_pps, open_transport
 from swath.drivers.transports.spec import TransportSpec, parse_pps
-from swath.georef.records import ChunkBatch, TimeMessage
+from swath.georef.records import ChunkBatch, Record, TimeMessage
 from swath.georef.timescales import ahead_s, distance_text
 
 SLICE_S = 0.1
@@ -74,6 +75,8 @@ class Report:
         time: the device's own time, as text.
         problems: faults, one line each.
         notes: remarks that are not faults.
+        facts: what its values say, such as the fix and the specific force.
+        doubts: values that a sound system that stands still does not have, one line each.
     """
 
     source: str
@@ -85,6 +88,13 @@ class Report:
     time: str = ""
     problems: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    facts: list[str] = field(default_factory=list)
+    doubts: list[str] = field(default_factory=list)
+
+    @property
+    def ok(self) -> bool:
+        """True without problems and doubts."""
+        return not (self.problems or self.doubts)
 
     def add(self, batch: ChunkBatch) -> None:
         """Count the units of a batch."""
@@ -103,7 +113,9 @@ class Report:
             "time": self.time,
             "problems": self.problems,
             "notes": self.notes,
-            "ok": not self.problems,
+            "facts": self.facts,
+            "doubts": self.doubts,
+            "ok": self.ok,
         }
 
 
@@ -114,7 +126,9 @@ class Reading:
         self.entry = entry
         self.report = Report(entry.source, entry.protocol)
         self.heard = Heard()
-        self.parser = find_driver(entry.kind, entry.protocol).make_parser(entry.settings)
+        driver = find_driver(entry.kind, entry.protocol)
+        self.values = Values(line_scanner=driver.line_scanner)
+        self.parser = driver.make_parser(entry.settings)
         self.kept: list[ChunkBatch] = []
         self._kept_bytes = 0
         self._lock = threading.Lock()
@@ -122,7 +136,7 @@ class Reading:
     def feed(self, batch: ChunkBatch, *, main: bool) -> None:
         """Take units of the device's own port, or of its second one."""
         with self._lock:
-            self.heard.add(self.parser.feed_batch(batch))
+            self._take(self.parser.feed_batch(batch))
             if main:
                 self.report.add(batch)
                 if self._kept_bytes < KEPT_BYTES:
@@ -131,14 +145,19 @@ class Reading:
 
     def finish(self) -> None:
         """Complete the report after the last byte: the device's time, and its faults."""
-        self.heard.add(self.parser.close())
+        self._take(self.parser.close())
         self.report.records = self.heard.counts
         if self.report.bytes:
             self.report.time = describe_time(self.entry, self.heard)
             self.report.problems += _answer_problems(self)
+            self.report.facts, self.report.doubts = self.values.judge(self.entry.kind, self.entry.settings.config)
             if isinstance(self.parser, PacketParser):
                 self.report.notes += self.parser.warnings
             self.report.notes += lock_notes(self.entry, self.heard) + far_notes(self.heard, read_clock_discipline())
+
+    def _take(self, records: list[Record]) -> None:
+        self.heard.add(records)
+        self.values.add(records)
 
 
 class Wire:
@@ -379,6 +398,15 @@ def _time_problems(entry: DeviceEntry, heard: Heard) -> list[str]:
     rate = heard.imu_clock_rate
     if entry.kind == "imu" and rate is not None and not 1.0 / CLOCK_RATE_FACTOR < rate < CLOCK_RATE_FACTOR:
         return [f"its counter runs {rate:.3g} times as fast as time; check tick_hz"]
-    if entry.pps is not None and heard.sees_pps is False:
+    if entry.pps is None or entry.transport.kind == "gnss" or entry.kind not in ("imu", "scanner"):
+        return []
+    if heard.sees_pps is False:
         return [f"does not see its PPS ({entry.pps})"]
+    untold = (
+        heard.sees_pps is None
+        and heard.valid_time is None
+        and not str(entry.settings.config.get("clock")).startswith("ptp")
+    )
+    if untold and find_driver(entry.kind, entry.protocol).tells_pps:
+        return [f"nothing shows that it sees its PPS ({entry.pps}); check the wiring, or remove pps"]
     return []
