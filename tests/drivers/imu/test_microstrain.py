@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from swath.drivers.driver import find_driver
+from swath.drivers.framing.checksums import ubx_fletcher
 from swath.drivers.imu.microstrain import wire
 from swath.drivers.imu.microstrain.parser import STANDARD_GRAVITY, MicrostrainParser, make_time_parser
 from swath.drivers.imu.microstrain.startup import startup_messages
@@ -262,7 +263,7 @@ def test_what_is_missing_or_wrong_is_counted() -> None:
     short = wire.encode_packet(SENSOR, (0x04, bytes(8)))
     outside = wire.encode_packet(SENSOR, (0x04, bytes(12)))[:-2] + b""
     outside = outside[:3] + bytes([outside[3] + 1]) + outside[4:] + b"\x09"
-    broken = outside + bytes(wire.ubx_fletcher(outside))
+    broken = outside + bytes(ubx_fletcher(outside))
     back = sample(TOW_S, 0), sample(TOW_S - 10, 0)
     _, parser = parse(half, increments, endless, short, broken, *back, fix_packet(epoch=(303_000.0, 1000, 3)))
     assert parser.counters.errors == {
