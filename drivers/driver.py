@@ -80,6 +80,8 @@ class Driver:
         needs: configuration keys that it requires.
         line_scanner: True for a scanner with one beam, whose path the configuration's ``geometry`` declares. The parser
             of any other scanner has ``beams``, a `swath.drivers.scanner.beams.BeamTable` to georeference returns.
+        aimed: True for a scanner whose returns have an elevation beside the encoder's angle (`AIMED_RETURN_DTYPE`), and
+            therefore neither a path nor beams.
         wavelength_nm: a scanner's wavelength by its maker's data sheet; None: 1064, as in most airborne scanners.
         eight_bit_intensity: whether a scanner's intensities range from 0 to 255.
         past_hour: whether a scanner's device time counts from the last full hour of UTC.
@@ -99,6 +101,7 @@ class Driver:
     tells_pps: bool = True
     needs: tuple[str, ...] = ()
     line_scanner: bool = False
+    aimed: bool = False
     wavelength_nm: float | None = None
     eight_bit_intensity: bool = False
     past_hour: bool = False

@@ -28,6 +28,7 @@ from swath.georef.arrays import ByteArray, FloatArray, Int64Array, SingleArray, 
 from swath.georef.compiled import jit_cached
 from swath.georef.mapping.frame import Mapping, MappingError
 from swath.georef.points import Fate, Points, Rays, contiguous
+from swath.georef.return_rows import plain
 from swath.georef.scanner.encoder_motion import TellsMotion
 from swath.georef.scanner.kernels.types import PointColumns
 from swath.georef.scanner.ranging import PulseRates
@@ -66,7 +67,7 @@ class Georeferencer:
         """Return the points of returns, and the fate of each return.
 
         Args:
-            rows: (n,) `RETURN_DTYPE`, preferably in the order of their times.
+            rows: (n,) `RETURN_DTYPE` or `AIMED_RETURN_DTYPE`, preferably in the order of their times.
             time_ns: (n,) GPS time of their emission by the scanner's stamps; negative: unknown.
             trajectory: of the body.
 
@@ -137,7 +138,7 @@ class Georeferencer:
         points.points_map[to] = points_map
         columns = PointColumns(*(getattr(points, name)[to] for name in PointColumns._fields))
         rows = rows if done.all() else rows[done]
-        fill_columns(contiguous(rows), kept.time_ns, kept.off_nadir_rad, kept.range_m, columns)
+        fill_columns(contiguous(plain(rows)), kept.time_ns, kept.off_nadir_rad, kept.range_m, columns)
         if points.sigma_map is not None:
             points.sigma_map[to] = sigma_map
         return len(points_map), failure

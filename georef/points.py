@@ -121,7 +121,7 @@ class Rays:
         arm_b: (n, 3) from the body's origin to the point.
         range_axis_b: (n, 3) ∂point/∂ρ.
         angle_axis_b: (n, 3) ∂point/∂θ, m/rad.
-        tilt_axis_b: (n, 3) ∂point/∂Δη, m/rad.
+        tilt_axis_b: (n, 3) ∂point/∂Δη, m/rad; ∂point/∂elevation where returns have an elevation of their own.
         measured_m: range as measured.
         encoder_rad: encoder reading.
         encoder_rate, encoder_acceleration: rad/s, rad/s²; zero if not given.

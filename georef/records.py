@@ -227,26 +227,28 @@ INS_DTYPE = np.dtype(
     align=True,
 )
 
-RETURN_DTYPE = np.dtype(
-    [
-        ("host_time_ns", "i8"),  # of the datagram
-        ("device_time_ns", "i8"),  # emission of the pulse in the device's own time
-        ("range_m", "f8"),  # as measured, before any correction
-        ("encoder_rad", "f8"),  # scan angle θ_encoder, or azimuth of a spinning head, 0 … 2π
-        ("pulse_id", "u8"),
-        ("intensity", "f4"),
-        ("pulse_width_ns", "f4"),  # 0: unknown
-        ("channel", "u2"),  # beam of a multi-beam head, or facet of a polygon
-        ("return_number", "u1"),  # 1 … number_of_returns
-        ("number_of_returns", "u1"),
-        ("mta_zone", "u1"),  # 255: unknown
-        ("flags", "u1"),  # RETURN_FLAG_*
-    ],
-    align=True,
-)
+_RETURN: list[tuple[str, str]] = [
+    ("host_time_ns", "i8"),  # of the datagram
+    ("device_time_ns", "i8"),  # emission of the pulse in the device's own time
+    ("range_m", "f8"),  # as measured, before any correction
+    ("encoder_rad", "f8"),  # scan angle θ_encoder, or azimuth of a spinning head, 0 … 2π
+    ("pulse_id", "u8"),
+    ("intensity", "f4"),
+    ("pulse_width_ns", "f4"),  # 0: unknown
+    ("channel", "u2"),  # beam of a multi-beam head, or facet of a polygon
+    ("return_number", "u1"),  # 1 … number_of_returns
+    ("number_of_returns", "u1"),
+    ("mta_zone", "u1"),  # 255: unknown
+    ("flags", "u1"),  # RETURN_FLAG_*
+]
+RETURN_DTYPE = np.dtype(_RETURN, align=True)
+# Of heads that give a direction by two angles: the same row, then the angle above the plane in which encoder_rad counts
+# (decision 0037); encoder_rad is −π … π.
+AIMED_RETURN_DTYPE = np.dtype([*_RETURN, ("elevation_rad", "f8")], align=True)
 RETURN_FLAG_STRONGEST = 1  # a spinning head's strongest return
 RETURN_FLAG_LAST = 2
 RETURN_FLAG_PPS_LOCKED = 4
+RETURN_FLAG_DOUBTED = 8  # the device's own filter takes the return for noise, or may do so
 
 DEVICE_CLOCK_DTYPE = np.dtype(
     [
@@ -276,7 +278,7 @@ class InsSolution:
 
 @dataclass(frozen=True, slots=True)
 class ScannerReturns:
-    """Laser returns, one row per return (`RETURN_DTYPE`)."""
+    """Laser returns, one row per return (`RETURN_DTYPE`, or `AIMED_RETURN_DTYPE`: always the same of one device)."""
 
     rows: StructArray
 

@@ -1,4 +1,8 @@
-"""Copy and inspect waiting returns as 64-bit numbers, since NumPy copies a structure with gaps field by field."""
+"""Copy and inspect waiting returns as 64-bit numbers, since NumPy copies a structure with gaps field by field.
+
+Rows are `RETURN_DTYPE`, or `AIMED_RETURN_DTYPE` for heads that give a direction by two angles. Compiled loops are made
+for the first only: `plain` and `elevations` divide the second.
+"""
 
 from __future__ import annotations
 
@@ -9,30 +13,46 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.georef.arrays import BoolArray, Int64Array, StructArray, UInt64Array
-from swath.georef.records import RETURN_DTYPE
+from swath.georef.arrays import BoolArray, FloatArray, Int64Array, StructArray, UInt64Array
+from swath.georef.records import AIMED_RETURN_DTYPE, RETURN_DTYPE
 
 WORDS = RETURN_DTYPE.itemsize // 8
 _OFFSETS = {name: int(place[1]) for name, place in (RETURN_DTYPE.fields or {}).items()}
 
 
 def words(rows: StructArray) -> UInt64Array:
-    """Return rows as numbers (n, `WORDS`), whose copies are ten times as fast as those of a structure with gaps."""
-    return np.ascontiguousarray(rows).view(np.uint64).reshape(-1, WORDS)
+    """Return rows as numbers (n, `WORDS` or more), whose copies are ten times as fast as those of a structure with
+    gaps.
+    """
+    return np.ascontiguousarray(rows).view(np.uint64).reshape(-1, rows.dtype.itemsize // 8)
+
+
+def plain(rows: StructArray) -> StructArray:
+    """Return rows as `RETURN_DTYPE`: themselves, or a copy without their elevations."""
+    if rows.dtype != AIMED_RETURN_DTYPE:
+        return rows
+    return words(rows)[:, :WORDS].copy().view(RETURN_DTYPE).reshape(-1)
+
+
+def elevations(rows: StructArray) -> FloatArray:
+    """Return the elevations (n,) of rows, radians; (0,) if they have none."""
+    if rows.dtype != AIMED_RETURN_DTYPE:
+        return np.zeros(0)
+    return np.ascontiguousarray(rows["elevation_rad"], dtype=np.float64)
 
 
 def any_has(rows: StructArray, name: str, bits: int) -> bool:
     """Return whether any row has all these bits set in a field of its last word."""
     offset = _OFFSETS[name]
     word = bits << 8 * (offset % 8)
-    if not len(rows) or int(np.bitwise_or.reduce(words(rows)[:, -1])) & word != word:
+    if not len(rows) or int(np.bitwise_or.reduce(words(rows)[:, offset // 8])) & word != word:
         return False
     return bool((rows[name] & bits == bits).any())
 
 
 def take(rows: StructArray, mask: BoolArray) -> StructArray:
     """Return the rows of a mask."""
-    return words(rows).take(np.flatnonzero(mask), axis=0).view(RETURN_DTYPE).reshape(-1)
+    return words(rows).take(np.flatnonzero(mask), axis=0).view(rows.dtype).reshape(-1)
 
 
 def concatenate(pieces: list[NDArray[Any]], like: NDArray[Any]) -> NDArray[Any]:
@@ -42,9 +62,9 @@ def concatenate(pieces: list[NDArray[Any]], like: NDArray[Any]) -> NDArray[Any]:
         return like[:0]
     if len(pieces) == 1:
         return pieces[0]
-    if pieces[0].dtype != RETURN_DTYPE:
+    if pieces[0].dtype not in (RETURN_DTYPE, AIMED_RETURN_DTYPE):
         return np.concatenate(pieces)
-    return np.concatenate([words(piece) for piece in pieces]).view(RETURN_DTYPE).reshape(-1)
+    return np.concatenate([words(piece) for piece in pieces]).view(pieces[0].dtype).reshape(-1)
 
 
 def compact(rows: StructArray) -> StructArray:
@@ -53,7 +73,7 @@ def compact(rows: StructArray) -> StructArray:
     Parsers allocate room for every slot, which the copy releases.
     """
     spare = isinstance(rows.base, np.ndarray) and rows.base.nbytes > rows.nbytes + rows.nbytes // 4
-    return words(rows).copy().view(RETURN_DTYPE).reshape(-1) if spare else rows
+    return words(rows).copy().view(rows.dtype).reshape(-1) if spare else rows
 
 
 @dataclass(slots=True)

@@ -14,6 +14,7 @@ from swath.calib.parameters import Unknowns
 from swath.georef.arrays import FloatArray, Int64Array
 from swath.georef.geodesy.rotations import rot_x, rot_y, rot_z
 from swath.georef.points import Rays, contiguous
+from swath.georef.return_rows import plain
 from swath.georef.scanner.beams import OusterGeometry
 from swath.georef.scanner.calibration import Calibration
 from swath.georef.scanner.kernels.types import Track
@@ -51,7 +52,7 @@ def rays_of(flight: Flight, swath: Swath, model: SensorModel, rows: Any, at: Int
 
 
 def beam_table(rows: Any, rays: Rays) -> Beam:
-    columns: dict[str, Any] = {"rows": rows}
+    columns: dict[str, Any] = {"rows": plain(rows)}
     for name in Beam._fields[1:]:
         column = getattr(rays, name)
         columns[name] = column.T if name.endswith("_b") else column
@@ -96,6 +97,7 @@ def head_table(unknowns: Unknowns, flight: Flight, index: int, model: SensorMode
         by_knot,
         float(head.noise.range_m),
         float(head.noise.angle_rad),
+        float(head.noise.angle_rad) if model.aimed else 0.0,
         float(head.noise.time_s),
         float(head.noise.divergence_rad),
     )

@@ -110,14 +110,15 @@ def own_variance(cells: FloatArray, n: int, k: int, beam: Beam, head: Head) -> N
         foot = 0.25 * head.divergence_rad * beam.range_m[k + i]
         ranging = longer * longer * head.range_m * head.range_m + foot * foot * (1.0 - cosine2) / cosine2
         turned = wider * head.angle_rad * cells[BY_ANGLE, i]
+        raised = head.elevation_rad * cells[BY_TILT, i]
         later = head.time_s * cells[SPEED, i]
         cells[RANGING, i] = ranging
-        cells[VARIANCE, i] = along * along * ranging + turned * turned + later * later
+        cells[VARIANCE, i] = along * along * ranging + turned * turned + raised * raised + later * later
 
 
 @jit_inline
 def adjust_observations(cells: FloatArray, n: int, k: int, beam: Beam, head: Head, planes: Planes, at: int) -> None:
-    """Move the columns' quantities to the adjusted observations, l − Σ Bᵀ f / M in range and angle (FORMULAS 6.3).
+    """Move the columns' quantities to the adjusted observations, l − Σ Bᵀ f / M in range and angles (FORMULAS 6.3).
 
     A point lies off its plane mainly because of an error of its range, and this error is in its coefficients, too: with
     the coefficients as measured, Σ aᵀ p f has the expectation Σ (∂a/∂ρ) / (∂f/∂ρ), which for the range scale is the
@@ -129,7 +130,7 @@ def adjust_observations(cells: FloatArray, n: int, k: int, beam: Beam, head: Hea
     """
     first, second = vector_at(planes.first_e, at), vector_at(planes.second_e, at)
     longer, wider = 1.0 + head.value[SCALE], (1.0 + head.value[ENCODER_SCALE])
-    q, u, a = beam.q_e_from_b, beam.range_axis_b, beam.angle_axis_b
+    q, u, a, t = beam.q_e_from_b, beam.range_axis_b, beam.angle_axis_b, beam.tilt_axis_b
     for i in range(n):
         j = k + i
         limit = _FARTHEST * math.sqrt(cells[VARIANCE, i])
@@ -138,17 +139,18 @@ def adjust_observations(cells: FloatArray, n: int, k: int, beam: Beam, head: Hea
         cells[LONGER, i] = by_range / longer
         cells[AHEAD, i] = share * wider * head.angle_rad * head.angle_rad * cells[BY_ANGLE, i]
         by_angle = wider * cells[AHEAD, i]
+        by_tilt = share * head.elevation_rad * head.elevation_rad * cells[BY_TILT, i]
         moved_b = (
-            by_range * u[0, j] + by_angle * a[0, j],
-            by_range * u[1, j] + by_angle * a[1, j],
-            by_range * u[2, j] + by_angle * a[2, j],
+            by_range * u[0, j] + by_angle * a[0, j] + by_tilt * t[0, j],
+            by_range * u[1, j] + by_angle * a[1, j] + by_tilt * t[1, j],
+            by_range * u[2, j] + by_angle * a[2, j] + by_tilt * t[2, j],
         )
         turned_b = cross(moved_b, (cells[NORMAL, i], cells[NORMAL + 1, i], cells[NORMAL + 2, i]))
         rot_e_from_b = rot_of(q[0, j], q[1, j], q[2, j], q[3, j])
         moved, turned = times(rot_e_from_b, moved_b), times(rot_e_from_b, turned_b)
         range_m, along, across = beam.range_m[j], cells[ALONG, i], cells[BY_ANGLE, i]
         swing2 = a[0, j] * a[0, j] + a[1, j] * a[1, j] + a[2, j] * a[2, j]
-        cells[ALONG, i] -= by_angle * across / range_m
+        cells[ALONG, i] -= (by_angle * across + by_tilt * cells[BY_TILT, i]) / range_m
         cells[BY_ANGLE, i] += (by_angle * swing2 * along - by_range * across) / range_m
         cells[BY_TILT, i] -= by_range * cells[BY_TILT, i] / range_m
         for axis in range(3):

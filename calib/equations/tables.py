@@ -40,7 +40,8 @@ class Head(NamedTuple):
         spin_b: (1, 3) a spinning head's axis.
         before_m: part of the range before the beam's start; nan: the start turns with the beam.
         nodes: (d,) intensities of its range correction; by_knot: (k, d) derivatives of that by its knots.
-        range_m, angle_rad, time_s, divergence_rad: sigmas of a return, and its beam.
+        range_m, angle_rad, elevation_rad, time_s, divergence_rad: sigmas of a return, and its beam; the elevation's
+            is 0 where returns have none.
     """
 
     at: Int64Array
@@ -54,6 +55,7 @@ class Head(NamedTuple):
     by_knot: FloatArray
     range_m: float
     angle_rad: float
+    elevation_rad: float
     time_s: float
     divergence_rad: float
 

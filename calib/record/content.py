@@ -301,6 +301,7 @@ def matrices_of(flight: Flight, features: Features, adjusted: Adjusted, scanner:
     - designMatrix1 (n, 16): nᵀ ∂x/∂parameter in the order of `swath.georef.scanner.calibration.PARAMETERS`, SI.
     - designMatrix2 (n, 4): ((x − c)ᵀ, 1), c the plane's centre, in e.
     - designMatrixObservations (n, 8): nᵀ ∂x/∂observable in the order of `swath.georef.scanner.jacobian.OBSERVATIONS`.
+      With (n, 9) the last is the elevation of a head that gives two angles; so it is with the residuals.
     - residuals (n, 8): v = Σ Bᵀ e / M (FORMULAS 6.3) of range and scan angle; those of the trajectory are zero here,
       because its errors are unknowns of their own.
     - designMatrixUnitLength (planes, 4): (2 s1, 2 s2, 2 s3, 0).
@@ -316,7 +317,9 @@ def matrices_of(flight: Flight, features: Features, adjusted: Adjusted, scanner:
     observed = observed_of(flight, adjusted, scanner)
     if observed is None:
         return found
-    columns = {name: np.full((len(observed.at), width), np.nan) for name, width in COLUMNS.items()}
+    (head,) = (head for head in flight.heads if head.name == scanner)
+    more = dict.fromkeys(("designMatrixObservations", "residuals"), int(head.model(head.start).aimed))
+    columns = {name: np.full((len(observed.at), width + more.get(name, 0)), np.nan) for name, width in COLUMNS.items()}
     for swath in np.unique(observed.swath).tolist():
         rows = np.flatnonzero(observed.swath == swath)
         for first in range(0, len(rows), BLOCK):
@@ -339,7 +342,7 @@ def _block(
     centres_e = flight.frame.e_from_t(np.array([plane.centre_t for plane in planes]))
     by_observation = np.einsum("nkc,nc->nk", observation_columns_e(rays, model, trajectory), normals_e)
     residual_m, variance = observed.misclosure_m[block], observed.sigma_m[block] ** 2
-    sigma2 = np.array([0.0] * 6 + [head.noise.range_m**2, head.noise.angle_rad**2])
+    sigma2 = np.array([0.0] * 6 + [head.noise.range_m**2] + [head.noise.angle_rad**2] * (1 + model.aimed))
     rot_e_b = rot_from_quaternion(_there(rays.q_e_from_b))
     lat, lon, height = geodetic_from_e(rays.points_e - np.einsum("nij,nj->ni", rot_e_b, _there(rays.arm_b)))
     attitude = attitude_of(np.swapaxes(rot_e_from_l(lat, lon), 1, 2) @ rot_e_b)

@@ -12,7 +12,7 @@ from swath.calib.flight import Flight, Head, Swath, Tangent
 from swath.georef.arrays import FloatArray, Int64Array
 from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
 from swath.georef.geodesy.rotations import rot_from_quaternion
-from swath.georef.scanner.beams import SpinningGeometry
+from swath.georef.scanner.beams import AimedGeometry, SpinningGeometry
 from swath.georef.scanner.calibration import INDEX, PARAMETERS
 from swath.georef.trajectory.trajectory import Poses, Trajectory
 
@@ -116,7 +116,7 @@ class SeenFrom:
 
 def _rot_b_from_s(head: Head, swath: Swath) -> FloatArray:
     """Return the rotation (3, 3) of a swath's scanner, in the middle of the swath if the mount moves."""
-    if isinstance(head.geometry, SpinningGeometry) or not len(swath):
+    if isinstance(head.geometry, SpinningGeometry | AimedGeometry) or not len(swath):
         return np.eye(3)  # a spinning head has its own axis, and no scan angle for such a column
     turned: FloatArray = head.mount.poses(swath.time_ns[len(swath) // 2 :][:1])[0][0]
     return turned @ head.start.installation_matrix

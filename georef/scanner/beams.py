@@ -17,6 +17,7 @@ import numpy as np
 from swath.georef.arrays import FloatArray
 from swath.georef.scanner.calibration import Calibration, is_rotation
 from swath.georef.scanner.kernels.beam import (
+    AIMED,
     BY_CHANNEL,
     COLUMNS,
     FIBRE_BY_CHANNEL,
@@ -257,6 +258,23 @@ class OusterGeometry:
         table[:, RANGE] = range_m
         rotation, shift = self.sensor_from_lidar[:3, :3], self.sensor_from_lidar[:3, 3]
         return Deflection(SPINNING, table, BY_CHANNEL, np.array(rotation), np.array(shift))
+
+
+@dataclass(frozen=True)
+class AimedGeometry:
+    """Head that gives each return's direction by two angles, or by x, y and z: a rosette, or many beams.
+
+    In the maker's frame with x forward, y left and z up the encoder's angle counts from x towards y, the elevation from
+    the plane of both towards z: u = (cos ε cos α, cos ε sin α, sin ε). Ranges count from the frame's origin. It has no
+    table of beams; the head has applied its own.
+    """
+
+    without: ClassVar[tuple[str, ...]] = (*_NO_SWING, "scan_angle_offset_rad", "encoder_latency_s")
+
+    def deflection(self, calibration: Calibration) -> Deflection:
+        """Return the table as in `Geometry`: a spinning head whose azimuth falls, from y, as the encoder turns."""
+        _refuse(calibration, self.without)
+        return Deflection(AIMED, _table(1, 0.0, 1.0, np.pi / 2, 0.0, 0.0, 0.0, -1.0), ONE, np.eye(3), np.zeros(3))
 
 
 def line_scanner(

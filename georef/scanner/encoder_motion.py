@@ -14,7 +14,7 @@ import numpy as np
 
 from swath.georef.arrays import FloatArray, Int64Array, StructArray
 from swath.georef.records import RETURN_DTYPE
-from swath.georef.return_rows import concatenate, words
+from swath.georef.return_rows import concatenate, plain, words
 from swath.georef.scanner.kernels.motion import PLACE, REACH, TRAIN, cut, rates
 
 Moving = tuple[StructArray, Int64Array, FloatArray, FloatArray]
@@ -25,6 +25,18 @@ class TellsMotion(Protocol):
 
     def motion(self, rows: StructArray, time_ns: Int64Array) -> tuple[FloatArray, FloatArray]:
         """Return rate and acceleration (n,) of the readings, rad/s, rad/s²."""
+
+
+class NoMotion:
+    """Stands for a head that gives a direction by two angles: it has no encoder whose motion could be a parameter."""
+
+    def feed(self, rows: StructArray, time_ns: Int64Array) -> Moving:
+        """Return the rows with rates and accelerations of 0."""
+        return rows, time_ns, np.zeros(len(rows)), np.zeros(len(rows))
+
+    def flush(self) -> Moving:
+        """Return no rows."""
+        return np.zeros(0, RETURN_DTYPE), np.zeros(0, np.int64), np.zeros(0), np.zeros(0)
 
 
 class EncoderMotion:
@@ -75,7 +87,7 @@ class EncoderMotion:
             return self._rows, self._time_ns, np.zeros(0), np.zeros(0)
         pulses, pulse_ns, angle = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n)
         pieces = np.empty((n, 3), np.int64)
-        count, parts = cut(self._rows, self._time_ns, self._facets, pulses, pulse_ns, angle, pieces)
+        count, parts = cut(plain(self._rows), self._time_ns, self._facets, pulses, pulse_ns, angle, pieces)
         pulses, pulse_ns, angle, pieces = pulses[:count], pulse_ns[:count], angle[:count], pieces[:parts]
         starts = np.append(pulses[pieces[:, 0]], n)  # first row of each piece
         first = int(np.searchsorted(starts, self._given, side="right")) - 1
@@ -102,6 +114,6 @@ class EncoderMotion:
         next_piece = pieces[done]
         needed = (pieces[:, TRAIN] == next_piece[TRAIN]) & (next_piece[PLACE] - pieces[:, PLACE] <= REACH)
         keep = int(starts[int(np.argmax(needed))])
-        self._rows = words(self._rows[keep:]).copy().view(RETURN_DTYPE).reshape(-1)
+        self._rows = words(self._rows[keep:]).copy().view(self._rows.dtype).reshape(-1)
         self._time_ns = self._time_ns[keep:].copy()
         self._given = int(starts[done]) - keep

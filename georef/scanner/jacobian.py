@@ -17,6 +17,7 @@ from swath.georef.scanner.sensor_model import SensorModel
 from swath.georef.trajectory.trajectory import Trajectory
 
 OBSERVATIONS = ("x_e", "y_e", "z_e", "roll_rad", "pitch_rad", "heading_rad", "range_m", "encoder_rad")
+ELEVATION = len(OBSERVATIONS)  # the column after these, of returns with an elevation of their own
 _SECOND_NS = 1e9
 
 
@@ -61,28 +62,30 @@ def parameter_columns_e(rays: Rays, model: SensorModel, trajectory: Trajectory) 
 
 
 def observation_columns_e(rays: Rays, model: SensorModel, trajectory: Trajectory) -> FloatArray:
-    """Return ∂point/∂observation in e, the eight of ISO/TS 19159-2 Eq. 13 completed.
+    """Return ∂point/∂observation in e: the eight of ISO/TS 19159-2 Eq. 13, and the elevation of a return that has one.
 
     Args:
         rays, model, trajectory: as of `parameter_columns_e`.
 
     Returns:
         (n, 8, 3) in the order of `OBSERVATIONS`: position of the body in e; roll, pitch, heading; range as measured;
-        encoder reading.
+        encoder reading; (n, 9, 3) with the elevation last where returns have one.
     """
     value = model.calibration.value
-    arm, by_range, by_angle, _ = _axes(rays)
+    arm, by_range, by_angle, by_tilt = _axes(rays)
     rot_b_from_e = _rot_b_from_e(rays)
     body_e = _body_e(rays, trajectory)
     rot_e_l = _rot_e_from_l(body_e)
     roll, pitch, _ = attitude_of(np.swapaxes(rot_e_l, 1, 2) @ np.swapaxes(rot_b_from_e, 1, 2))
-    columns = np.zeros((len(rays.fate), len(OBSERVATIONS), 3))
+    columns = np.zeros((len(rays.fate), len(OBSERVATIONS) + model.aimed, 3))
     turned_back = np.swapaxes(rot_x(roll), 1, 2)  # axes in b: roll x, pitch Rx(−r) y, heading Rx(−r) Ry(−p) z
     columns[:, 3] = np.cross([1.0, 0.0, 0.0], arm)
     columns[:, 4] = np.cross(turned_back[:, :, 1], arm)
     columns[:, 5] = np.cross((turned_back @ rot_y(-pitch))[:, :, 2], arm)
     columns[:, 6] = (1.0 + value("range_scale")) * by_range
     columns[:, 7] = (1.0 + value("scan_angle_scale")) * by_angle
+    if model.aimed:
+        columns[:, ELEVATION] = by_tilt
     columns = columns @ rot_b_from_e
     columns[:, :3] = np.eye(3)
     return columns

@@ -17,9 +17,10 @@ from swath.georef.air.atmosphere import Air
 from swath.georef.arrays import FloatArray, Int64Array, StructArray
 from swath.georef.geodesy.rotations import rot_x, rot_y, rot_z
 from swath.georef.points import Fate, Rays, contiguous
+from swath.georef.return_rows import elevations, plain
 from swath.georef.scanner.beams import Geometry
 from swath.georef.scanner.calibration import INDEX, Calibration
-from swath.georef.scanner.kernels.beam import FIBRE_BY_CHANNEL, FIBRE_BY_ENCODER, FIXED_ANGLE, SPINNING
+from swath.georef.scanner.kernels.beam import AIMED, FIBRE_BY_CHANNEL, FIBRE_BY_ENCODER, FIXED_ANGLE, SPINNING
 from swath.georef.scanner.kernels.rays import cast
 from swath.georef.scanner.kernels.types import Axes, Model, Mounted, Out, Ranging, Scanning, Track
 from swath.georef.scanner.mount import Mount
@@ -65,6 +66,11 @@ class SensorModel:
         self._deltas: dict[float | None, FloatArray] = {}
 
     @property
+    def aimed(self) -> bool:
+        """True if each return has an elevation of its own, besides the encoder's angle."""
+        return self._deflection.kind == AIMED
+
+    @property
     def needs_encoder_motion(self) -> bool:
         """True if encoder latency or torsion, or their sigmas, require the encoder's rate and acceleration."""
         asking = [INDEX["encoder_latency_s"], INDEX["torsion_s2"]]
@@ -86,7 +92,8 @@ class SensorModel:
         """Return the rays of returns, with their points.
 
         Args:
-            rows: (n,) `RETURN_DTYPE`, preferably in the order of their times.
+            rows: (n,) `RETURN_DTYPE`, or `AIMED_RETURN_DTYPE` where the geometry needs elevations; preferably in the
+                order of their times.
             time_ns: (n,) GPS time of their emission by the scanner's stamps; negative: unknown.
             trajectory: of the body, with attitude.
             encoder_rate, encoder_acceleration: (n,) of the readings, rad/s, rad/s².
@@ -99,20 +106,24 @@ class SensorModel:
             Rays; their ``origin_e`` is the point on the beam from which (1 + range_scale) · measured range counts.
 
         Raises:
-            ValueError: the calibration needs the encoder's motion.
+            ValueError: the calibration needs the encoder's motion, or the geometry elevations that rows do not have.
             TrajectoryError: the trajectory has no attitude.
         """
         if self.needs_encoder_motion and (encoder_rate is None or encoder_acceleration is None):
             text = "encoder latency and torsion need the encoder's motion"
             raise ValueError(f"calibration of {self.calibration.scanner}: {text}")
         trajectory.require_attitude()
-        rows, time_ns = contiguous(rows), contiguous(time_ns)
+        elevation = elevations(rows) if self.aimed else np.zeros(0)
+        if self.aimed and len(elevation) != len(rows):
+            raise ValueError(f"scanner {self.calibration.scanner}: its returns need an elevation, AIMED_RETURN_DTYPE")
+        rows, time_ns = contiguous(plain(rows)), contiguous(time_ns)
         out, axes = _out(len(rows)), _axes(len(rows)) if with_axes else None
         doubt = None if uncertainty is None else uncertainty.doubt(trajectory, len(rows), incidence_rad)
         if len(trajectory) < 2:
             out.fate[:] = Fate.OUTSIDE_TRAJECTORY
         elif len(rows):
-            model = self._model(time_ns, trajectory, encoder_rate, encoder_acceleration, prf_hz)
+            scanning = self._scanning(encoder_rate, encoder_acceleration, elevation)
+            model = self._model(time_ns, trajectory, scanning, prf_hz)
             cast(rows, time_ns, model, out, axes, doubt)
         covariance_e = None if doubt is None else doubt.covariance_e
         if axes is None:
@@ -141,15 +152,14 @@ class SensorModel:
         self,
         time_ns: Int64Array,
         trajectory: Trajectory,
-        rate: FloatArray | None,
-        acceleration: FloatArray | None,
+        scanning: Scanning,
         prf_hz: float | None,
     ) -> Model:
         """Return the model as the kernels take it."""
         offset_ns = self.calibration.value("time_offset_s") * _SECOND_NS
         return Model(
             self._ranging(prf_hz),
-            self._scanning(rate, acceleration),
+            scanning,
             self._rigid or self._mounted(time_ns + round(offset_ns)),
             self._track(trajectory, offset_ns),
         )
@@ -174,7 +184,7 @@ class SensorModel:
             per_unit,
         )
 
-    def _scanning(self, rate: FloatArray | None, acceleration: FloatArray | None) -> Scanning:
+    def _scanning(self, rate: FloatArray | None, acceleration: FloatArray | None, elevation: FloatArray) -> Scanning:
         value, deflection = self.calibration.value, self._deflection
         if rate is None or acceleration is None or not self.needs_encoder_motion:
             rate = acceleration = np.zeros(0)
@@ -188,6 +198,7 @@ class SensorModel:
             torsion_s2=value("torsion_s2"),
             rate=contiguous(rate),
             acceleration=contiguous(acceleration),
+            elevation=elevation,
         )
 
     def _mounted(self, time_ns: Int64Array) -> Mounted:

@@ -59,7 +59,8 @@ class Noise:
 
     Attributes:
         range_m: of the range.
-        angle_rad: of the scan angle (of a spinning head's azimuth).
+        angle_rad: of the scan angle (of a spinning head's azimuth); of each of two angles, azimuth and elevation, where
+            a head gives both.
         time_s: of the pulse's time.
         divergence_rad: full divergence of the beam; used if the surface is known.
     """
@@ -77,8 +78,13 @@ class Noise:
 class Uncertainty:
     """Covariances of the points of one scanner, by `swath.georef.scanner.sensor_model.SensorModel.rays`."""
 
-    def __init__(self, calibration: Calibration, noise: Noise) -> None:
+    def __init__(self, calibration: Calibration, noise: Noise, *, aimed: bool = False) -> None:
         """Take the parameters' covariance apart into independent errors.
+
+        Args:
+            calibration: of the scanner.
+            noise: of its returns.
+            aimed: whether returns have an elevation of their own.
 
         Raises:
             UncertaintyError: the calibration's correlations are not a covariance.
@@ -106,6 +112,7 @@ class Uncertainty:
             calibration.value("scan_angle_offset_rad"),
             noise.range_m,
             noise.angle_rad,
+            noise.angle_rad if aimed else 0.0,
             noise.time_s,
             noise.divergence_rad,
         )

@@ -66,7 +66,8 @@ def test_every_scanner_declares_its_beam_geometry(driver: Driver) -> None:
             parsers.append(driver.make_parser(found))
     assert parsers
     for parser in parsers:
-        assert driver.line_scanner != (hasattr(parser, "beams") or hasattr(parser, "head"))
+        told = (driver.line_scanner, driver.aimed, hasattr(parser, "beams") or hasattr(parser, "head"))
+        assert sum(told) == 1, told
 
 
 def test_the_example_driver_of_the_documentation_works() -> None:

@@ -11,8 +11,9 @@ from scipy.spatial.transform import Rotation
 from swath.drivers.scanner.beams import BeamTable, beam_table
 from swath.drivers.scanner.beams import beam_points as velodyne_points
 from swath.georef.arrays import FloatArray, StructArray
-from swath.georef.records import RETURN_DTYPE
+from swath.georef.records import AIMED_RETURN_DTYPE, RETURN_DTYPE
 from swath.georef.scanner.beams import (
+    AimedGeometry,
     FibreGeometry,
     Geometry,
     LineGeometry,
@@ -50,7 +51,7 @@ def rows_of(encoder_rad: object, range_m: object, **others: object) -> StructArr
     encoder, measured = np.broadcast_arrays(
         np.asarray(encoder_rad, dtype=np.float64), np.asarray(range_m, dtype=np.float64)
     )
-    rows = np.zeros(encoder.size, RETURN_DTYPE)
+    rows = np.zeros(encoder.size, AIMED_RETURN_DTYPE if "elevation_rad" in others else RETURN_DTYPE)
     rows["encoder_rad"], rows["range_m"] = encoder.ravel(), measured.ravel()
     rows["return_number"] = rows["number_of_returns"] = 1
     for name, column in others.items():
@@ -194,14 +195,23 @@ def ouster_points(geometry: OusterGeometry) -> PointsS:
     return points
 
 
+def aimed_points(calibration: Calibration, rows: StructArray, theta: FloatArray, rho: FloatArray) -> FloatArray:
+    """Return points of a beam along x that is raised towards z about −y, then turned about z."""
+    angles = np.stack([theta, -rows["elevation_rad"]], axis=1)
+    ahead = np.tile([1.0, 0.0, 0.0], (len(rows), 1))
+    return scaled(Rotation.from_euler("ZY", angles).apply(ahead), rho)
+
+
 @dataclass(frozen=True)
 class Case:
     """A scanner, and its points in s computed independently.
+
     Attributes:
         geometry, points_s: the scanner's geometry, and the function that computes its points.
         reading_rad: encoder readings go from −this to this.
         channels: the number of channels; a return's channel is less.
         tables: tables that belong to its calibration.
+        raised_rad: elevations go from −this to this; 0: returns have none.
     """
 
     geometry: Geometry
@@ -211,6 +221,11 @@ class Case:
     facet_tilt_rad: tuple[tuple[int, float], ...] = ()
     beams: tuple[tuple[int, BeamCorrection], ...] = ()
     beam_range_m: FloatArray | None = None
+    raised_rad: float = 0.0
+
+    def elevations(self, rng: np.random.Generator, count: int) -> dict[str, FloatArray]:
+        """Return the column of elevations (n,) for `rows_of`, if returns have one."""
+        return {"elevation_rad": rng.uniform(-1.0, 1.0, count) * self.raised_rad} if self.raised_rad else {}
 
     def calibration(self, **changes: float) -> Calibration:
         """Return a calibration in which every error that the scanner can have is set."""
@@ -251,5 +266,6 @@ CASES = {
         beams=_WRONG_BEAMS,
         beam_range_m=_HDL.range_m,
     ),
+    "aimed": Case(AimedGeometry(), aimed_points, reading_rad=7.0, raised_rad=1.5),
     "ouster": Case(_OUSTER, ouster_points(_OUSTER), reading_rad=7.0, channels=64, beams=_WRONG_BEAMS),
 }

@@ -32,11 +32,12 @@ from swath.daemon.processing.points.workers import run_jobs
 from swath.daemon.processing.setup.models import motion_of
 from swath.daemon.processing.setup.setup import Setup
 from swath.daemon.written import Reached, room_noted
+from swath.drivers.driver import find_driver
 from swath.georef.arrays import ByteArray, FloatArray, Int64Array, StructArray
 from swath.georef.georeference import Georeferencer
 from swath.georef.points import Fate, Points
 from swath.georef.progress import BYTES, Tell, silent
-from swath.georef.records import RETURN_DTYPE
+from swath.georef.records import AIMED_RETURN_DTYPE, RETURN_DTYPE
 from swath.georef.scanner.calibration import Calibration
 from swath.georef.scanner.uncertainty import Noise
 from swath.georef.stream.stream import GivenMotion
@@ -121,7 +122,7 @@ def read_flight(
 
     Args:
         request: options as of `swath georef`; those about products are ignored.
-        folder: folder for the files, which take 104 bytes per return.
+        folder: folder for the files, which take 104 bytes per return, 112 of a head that gives two angles.
         tell: called with the progress.
         check: called as by `read_flights`.
 
@@ -160,9 +161,12 @@ def check_space_to_keep(folder: Path, placed: int, sessions: Sequence[Session], 
     Raises:
         UserError: as of `swath.daemon.processing.points.space.check_space_for_returns`.
     """
-    most = KEPT_BYTES + placed * PLACED_BYTES
+    tables = [setup.config.scanner[name] for setup in setups for name in setup.scanners]
+    aimed = any(find_driver("scanner", table.protocol).aimed for table in tables)
+    least = KEPT_BYTES + (AIMED_RETURN_DTYPE.itemsize - RETURN_DTYPE.itemsize if aimed else 0)
+    most = least + placed * PLACED_BYTES
     what = "temporary files of the strips' returns"
-    check_space_for_returns(folder, what, (KEPT_BYTES, most), sessions, setups)
+    check_space_for_returns(folder, what, (least, most), sessions, setups)
 
 
 def _middle(flight: LoggedFlight) -> FloatArray:
@@ -227,9 +231,10 @@ def _swaths(job: Job, result: JobResult, heads: Sequence[Head], flight: LoggedFl
     for number, head in enumerate(heads):
         if head.name not in result.fates:
             continue
+        aimed = {"rows": (AIMED_RETURN_DTYPE, ())} if head.model(head.start).aimed else {}
         columns: dict[str, Any] = {
             name: _mapped(_file(job.path, job.segment.strip, head.name, name), dtype, shape)
-            for name, (dtype, shape) in COLUMNS.items()
+            for name, (dtype, shape) in (COLUMNS | aimed).items()
         }
         if not len(columns["rows"]):
             continue

@@ -22,14 +22,21 @@ from swath.georef.georeference import Georeferencer
 from swath.georef.mapping.frame import Mapping
 from swath.georef.points import Fate
 from swath.georef.records import InsSolution
-from swath.georef.scanner.beams import Geometry, OusterGeometry, SpinningGeometry, line_scanner, read_fibres
+from swath.georef.scanner.beams import (
+    AimedGeometry,
+    Geometry,
+    OusterGeometry,
+    SpinningGeometry,
+    line_scanner,
+    read_fibres,
+)
 from swath.georef.scanner.calibration import Calibration
-from swath.georef.scanner.encoder_motion import EncoderMotion
+from swath.georef.scanner.encoder_motion import EncoderMotion, NoMotion
 from swath.georef.scanner.mount import AngleSeries, Mount, Stage
 from swath.georef.scanner.ranging import PulseRates, ZoneResolver
 from swath.georef.scanner.sensor_model import SensorModel
 from swath.georef.scanner.uncertainty import Noise, Uncertainty
-from swath.georef.stream.stream import GivenMotion, ScannerChain
+from swath.georef.stream.stream import GivenMotion, Motion, ScannerChain
 from swath.georef.text_encoding import decoded
 from swath.georef.trajectory.trajectory import Trajectory
 
@@ -81,7 +88,7 @@ def make_georeferencer(
         air_of(config, table),
     )
     noise = Noise(table.range_sigma_m, np.radians(table.angle_sigma_deg), divergence_rad=1e-3 * table.divergence_mrad)
-    sigmas = Uncertainty(calibration, noise) if uncertainty else None
+    sigmas = Uncertainty(calibration, noise, aimed=model.aimed) if uncertainty else None
     return Georeferencer(model, mapping, sigmas, GivenMotion() if model.needs_encoder_motion else None)
 
 
@@ -98,10 +105,13 @@ def geometry_of(table: ScannerConfig, parser: Parser, fibres: bytes | None = Non
         return SpinningGeometry(
             beams.elevation_deg, beams.azimuth_deg, beams.range_m, beams.right_m, beams.forward_m, beams.up_m
         )
-    if not find_driver("scanner", table.protocol).line_scanner:
+    driver = find_driver("scanner", table.protocol)
+    if driver.aimed:
+        return AimedGeometry()
+    if not driver.line_scanner:
         raise ValueError(
-            f"protocol {table.protocol}: its parser has no beam table and it is not a line scanner; use a protocol "
-            "with either"
+            f"protocol {table.protocol}: its parser has no beam table, its returns have no elevation, and it is not a "
+            "line scanner; use a protocol with one of these"
         )
     geometry = table.geometry
     if geometry is None:
@@ -203,13 +213,15 @@ def connect(chain: ScannerChain, parser: Parser) -> None:
         chain.georeferencer.rates = rates
 
 
-def make_motion(table: ScannerConfig, model: SensorModel) -> EncoderMotion | None:
+def make_motion(table: ScannerConfig, model: SensorModel) -> Motion | None:
     """Return the estimator of the encoder's motion; None if the calibration does not need it."""
     return motion_of(table) if model.needs_encoder_motion else None
 
 
-def motion_of(table: ScannerConfig) -> EncoderMotion:
+def motion_of(table: ScannerConfig) -> Motion:
     """Return the estimator of a scanner's encoder motion."""
+    if find_driver("scanner", table.protocol).aimed:
+        return NoMotion()
     kind = table.geometry.type if table.geometry is not None else None
     swings = table.protocol == "srep" and kind in (None, "oscillating")
     return EncoderMotion(steady=not swings, facets=kind == "polygon")

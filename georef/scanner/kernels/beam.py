@@ -8,6 +8,7 @@ metres added to the range; columns 0 to 6 are
     RISLEY     horizontal and vertical part of the ray before the last surface; sin, cos of the second wedge; refractive
                index; turns of the second prism per turn of the first
     SPINNING   sin, cos of elevation; azimuth; right, forward, up of the beam's start; sense of turning (1, −1)
+    AIMED      the same, but each return has its own elevation
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import math
 from swath.georef.compiled import jit_inline
 from swath.georef.scanner.kernels.types import Eight, Three, Two
 
-LINE, NUTATING, RISLEY, SPINNING = 0, 1, 2, 3
+LINE, NUTATING, RISLEY, SPINNING, AIMED = 0, 1, 2, 3, 4
 ONE, BY_CHANNEL, FIBRE_BY_CHANNEL, FIBRE_BY_ENCODER = 0, 1, 2, 3  # how a return chooses its row
 COLUMNS = 8
 FIXED_ANGLE, RANGE = 4, 7
@@ -118,3 +119,9 @@ def spinning_beam(row: Eight, sin: float, cos: float) -> tuple[Three, Three]:
 def spinning_turn(row: Eight, start: Three, direction: Three, range_m: float) -> Three:
     """Return ∂point/∂θ of `spinning_beam`, m/rad."""
     return row[6] * (start[1] + range_m * direction[1]), -row[6] * (start[0] + range_m * direction[0]), 0.0
+
+
+@jit_inline
+def raised(row: Eight, sin: float, cos: float, range_m: float) -> Three:
+    """Return ∂point/∂elevation of `spinning_beam`, m/rad; sine and cosine are of the azimuth."""
+    return -range_m * row[0] * sin, -range_m * row[0] * cos, range_m * row[1]

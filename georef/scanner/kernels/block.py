@@ -27,6 +27,7 @@ from swath.georef.geodesy.vectors import (
     turned_by,
 )
 from swath.georef.scanner.kernels.beam import (
+    AIMED,
     LINE,
     NUTATING,
     SPINNING,
@@ -35,6 +36,7 @@ from swath.georef.scanner.kernels.beam import (
     mirror_angle,
     nutating_beam,
     nutating_turn,
+    raised,
     risley_beam,
     risley_turn,
     spinning_angle,
@@ -50,7 +52,7 @@ BLOCK = 64
 THETA, RHO, COUNTED, MORE, SHARE, TURN_SHARE, A, B, ANGLE = (whole(row) for row in range(9))
 SIN, COS, SIN_2, COS_2, SLOPE_SIN, SLOPE_COS = (whole(row) for row in range(9, 15))
 # Three rows each: direction and start of the beam in the head, and then in the axes that the boresight's ω and φ turn;
-# ∂direction/∂θ and ∂direction/∂Δη (the first two of them also hold origin and point in e)
+# ∂point/∂θ and ∂point/∂Δη or ∂point/∂elevation (the first two of them also hold origin and point in e)
 HEAD, HEAD_START, ALONG, START, ACROSS, TILT = (whole(row) for row in range(15, 33, 3))
 BEAM = whole(33)  # the row of the geometry's table, eight rows
 # For covariances: rot_e_from_b, three rows of three; effect of a later attitude and of a later pulse, per second; the
@@ -109,12 +111,23 @@ def sines(block: FloatArray, n: int, sin: int, cos: int) -> None:
 
 
 @jit_inline
+def lift(block: FloatArray, elevation: Any) -> None:
+    """Set the beams' elevations to those of the returns."""
+    n = len(elevation)
+    for i in range(n):
+        block[ANGLE, i] = elevation[i]
+    sines(block, n, SIN, COS)
+    for i in range(n):
+        block[BEAM, i], block[BEAM + 1, i] = block[SIN, i], block[COS, i]
+
+
+@jit_inline
 def aim(block: FloatArray, n: int, kind: int) -> None:
     """Compute the beam in the head from θ."""
     if kind == LINE:
         for i in range(n):
             block[ANGLE, i] = mirror_angle(block[THETA, i])
-    elif kind == SPINNING:
+    elif kind in (SPINNING, AIMED):
         for i in range(n):
             block[ANGLE, i] = spinning_angle(beam_at(block, i), block[THETA, i])
     else:
@@ -124,7 +137,7 @@ def aim(block: FloatArray, n: int, kind: int) -> None:
     if kind == LINE:
         for i in range(n):
             put(block, HEAD, i, line_beam(beam_at(block, i), block[SIN, i], block[COS, i]))
-    elif kind == SPINNING:
+    elif kind in (SPINNING, AIMED):
         for i in range(n):
             start, direction = spinning_beam(beam_at(block, i), block[SIN, i], block[COS, i])
             put(block, HEAD_START, i, start)
@@ -143,7 +156,10 @@ def aim(block: FloatArray, n: int, kind: int) -> None:
 
 @jit_inline
 def swing(block: FloatArray, n: int, kind: int) -> None:
-    """Compute ∂point/∂θ and ∂point/∂Δη in the head, m/rad; only line scanners have Δη."""
+    """Compute ∂point/∂θ and ∂point/∂Δη in the head, m/rad.
+
+    Only line scanners have Δη; where returns have their own elevation, ∂point/∂elevation takes its place.
+    """
     if kind == LINE:
         for i in range(n):
             rho = block[RHO, i]
@@ -154,7 +170,9 @@ def swing(block: FloatArray, n: int, kind: int) -> None:
     for i in range(n):
         rho = block[RHO, i]
         put(block, TILT, i, (0.0, 0.0, 0.0))
-        if kind == SPINNING:
+        if kind == AIMED:
+            put(block, TILT, i, raised(beam_at(block, i), block[SIN, i], block[COS, i], rho))
+        if kind in (SPINNING, AIMED):
             start, direction = three(block, HEAD_START, i), three(block, HEAD, i)
             put(block, ACROSS, i, spinning_turn(beam_at(block, i), start, direction, rho))
         else:

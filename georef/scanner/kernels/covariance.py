@@ -78,7 +78,8 @@ class Known(NamedTuple):
         gram: (8, 8) the covariance of these, which then stands for all errors; shifts are those of the body's origin.
         lever_arm_b: (3,).
         angle_offset_rad: of the parameters.
-        range_sigma_m, angle_sigma_rad, time_sigma_s: of one return.
+        range_sigma_m, angle_sigma_rad, elevation_sigma_rad, time_sigma_s: of one return; the third is 0 where returns
+            have no elevation.
         divergence_rad: of the beam, full.
     """
 
@@ -89,6 +90,7 @@ class Known(NamedTuple):
     angle_offset_rad: float
     range_sigma_m: float
     angle_sigma_rad: float
+    elevation_sigma_rad: float
     time_sigma_s: float
     divergence_rad: float
 
@@ -272,6 +274,10 @@ def begin(block: FloatArray, n: int, interval: Interval, more: Six, known: Known
         arm = three(block, START, i)
         c = of_turn(sum_of(turn, block[SHARE, i], by_share), arm)
         keep(block, i, with_outer(c, angle_variance, three(block, ACROSS, i)))
+    if known.elevation_sigma_rad > 0.0:
+        elevation_variance = known.elevation_sigma_rad * known.elevation_sigma_rad
+        for i in range(n):
+            keep(block, i, with_outer(six(block, i), elevation_variance, three(block, TILT, i)))
     for i in range(n):
         turning, rows = cross(rate, three(block, START, i)), axes_at(block, i)
         moved = plus(plus(plus(turning, velocity[0], rows[0]), velocity[1], rows[1]), velocity[2], rows[2])

@@ -52,6 +52,7 @@ from swath.georef.scanner.kernels.block import (
     factors,
     give,
     lean,
+    lift,
     new_block,
     put,
     three,
@@ -147,7 +148,9 @@ def channel_of(select: int, channels: int, channel: int, encoder_rad: float) -> 
 
 
 @jit_inline
-def judge(part: Any, times_ns: Int64Array, fate: Any, known: Any, scanning: Scanning, covered: int) -> None:
+def judge(
+    part: Any, times_ns: Int64Array, fate: Any, known: Any, scanning: Scanning, elevation: Any, covered: int
+) -> None:
     """Set fates before ranges are checked; ``covered`` is the trajectory's fate, ``known`` (1,) or (n,) the mount's."""
     select, channels, moves = scanning.select, len(scanning.table), len(known) > 1
     for i in range(len(part)):
@@ -158,6 +161,9 @@ def judge(part: Any, times_ns: Int64Array, fate: Any, known: Any, scanning: Scan
         if channel < 0 or not (math.isfinite(row.range_m) and math.isfinite(row.encoder_rad)):
             verdict = NOT_FINITE
         fate[i] = NO_TIME if times_ns[i] < 0 else verdict
+    for i in range(len(elevation)):
+        if fate[i] != NO_TIME and not math.isfinite(elevation[i]):
+            fate[i] = NOT_FINITE
 
 
 @jit_inline
@@ -243,12 +249,14 @@ def shares(block: FloatArray, row: int, stamps: Any, begin: int, offset_ns: floa
 
 
 @jit_inline
-def beams(block: FloatArray, k: int, part: Any, model: Model, rate: Any, acceleration: Any) -> None:
+def beams(block: FloatArray, k: int, part: Any, model: Model, rate: Any, acceleration: Any, elevation: Any) -> None:
     """Compute ranges, scan angles, and the beams in the axes of ω and φ; ``part`` are the rows from k on."""
     ranging, scanning, mounted, _ = model
     n, kind = len(part), scanning.kind
     if scanning.select != ONE:
         take_table(block, part, scanning)
+    if len(elevation):
+        lift(block, elevation)
     take(block, part, ranging, scanning, rate, acceleration)
     aim(block, n, kind)
     lean(block, n, mounted.slope)
@@ -283,7 +291,8 @@ def cast(
     The trajectory has at least two epochs, n > 0.
     """
     ranging, scanning, mounted, track = model
-    rate, acceleration, moves = scanning.rate, scanning.acceleration, len(mounted.inner) > 1
+    rate, acceleration, elevation = scanning.rate, scanning.acceleration, scanning.elevation
+    moves = len(mounted.inner) > 1
     offset_ns, turn_offset_ns = track.offset_ns, track.offset_ns + track.latency_ns
     whole_ns, turn_ns = round(offset_ns), round(turn_offset_ns)
     begin, end, per_ns, fate, at, place, way = way_at(track, time_ns[0] + whole_ns, FIRST)
@@ -312,7 +321,8 @@ def cast(
         here = slice(k, k + n)
         part, stamps, fates = rows[here], time_ns[here], out.fate[here]
         covered = max(fate, turn_fate)
-        judge(part, stamps, fates, mounted.known[here] if moves else mounted.known, scanning, covered)
+        known = mounted.known[here] if moves else mounted.known
+        judge(part, stamps, fates, known, scanning, elevation[here], covered)
         given_ns = out.time_ns[here]
         for i in range(n):
             given_ns[i] = stamps[i] + whole_ns
@@ -322,13 +332,14 @@ def cast(
 
         shares(block, SHARE, stamps, begin, offset_ns, per_ns)
         shares(block, TURN_SHARE, stamps, begun, turn_offset_ns, per_turn_ns)
-        beams(block, k, part, model, rate[here], acceleration[here])
+        beams(block, k, part, model, rate[here], acceleration[here], elevation[here])
         gate(block, fates, ranging.minimum_m, ranging.maximum_m)
         factors(block, n, phi2)
         to_e(block, n, (place, way), (turn, phi), arms, mounted.shifted)
         hand_out(block, n, here, level, out)
         if doubt is not None:
-            turn_axes(block, n, k, scanning.kind, mounted, with_axes or not doubt.known.along_only)
+            tilts = with_axes or not doubt.known.along_only or len(elevation) > 0
+            turn_axes(block, n, k, scanning.kind, mounted, tilts)
             if at != doubted:
                 interval, doubted = interval_at(doubt.flown, at), at
             if not doubt.known.along_only:

@@ -49,6 +49,7 @@ class Scanning(NamedTuple):
         select: how a row chooses its channel of the table.
         scale, offset_rad, latency_s, torsion_s2: of the parameters.
         rate, acceleration: (n,) of the readings; (0,): not used.
+        elevation: (n,) of the returns; (0,): the table has those of the beams.
     """
 
     kind: int
@@ -60,6 +61,7 @@ class Scanning(NamedTuple):
     torsion_s2: float
     rate: FloatArray
     acceleration: FloatArray
+    elevation: FloatArray
 
 
 class Mounted(NamedTuple):

@@ -51,6 +51,7 @@ class Shots:
             rng.uniform(300.0, 3000.0, 20),
             channel=rng.integers(0, case.channels, 20),
             intensity=rng.uniform(0.0, 2000.0, 20),
+            **case.elevations(rng, 20),
         )
         self.time_ns = rng.integers(25_000_000, 31_000_000, 20)
         self.motion = rng.uniform(-50.0, 50.0, 20), rng.uniform(-1e4, 1e4, 20)
@@ -103,12 +104,15 @@ def test_parameter_derivatives_match_central_differences(kind: str, mount: Mount
         assert size > 0.0, name
 
 
-def test_observation_derivatives_match_central_differences() -> None:
-    case = CASES["polygon"]
-    rows, time_ns = rows_of([-0.6, 0.1, 0.9], [900.0, 1500.0, 800.0], channel=[0, 1, 3]), np.full(3, 5_000_000)
+@pytest.mark.parametrize("kind", ["polygon", "aimed"])
+def test_observation_derivatives_match_central_differences(kind: str) -> None:
+    case, time_ns = CASES[kind], np.full(3, 5_000_000)
+    raised = {"elevation_rad": np.array([-1.2, 0.3, 0.9])} if case.raised_rad else {}
+    rows = rows_of([-0.6, 0.1, 0.9], [900.0, 1500.0, 800.0], channel=[0, 1, 3], **raised)
     place = {"lat_rad": 0.82, "lon_rad": 0.15, "height_m": 1500.0}
     attitude = {"roll_rad": 0.05, "pitch_rad": -0.03, "heading_rad": 1.3}
     calibration = case.calibration(encoder_latency_s=0.0, torsion_s2=0.0)
+    names = [*OBSERVATIONS, *raised]
     model = SensorModel(calibration, case.geometry)
 
     def rays(change: dict[str, float], *, with_axes: bool = False) -> tuple[Rays, Trajectory]:
@@ -120,13 +124,14 @@ def test_observation_derivatives_match_central_differences() -> None:
         move = np.array([change.get(f"{axis}_e", 0.0) for axis in "xyz"])
         trajectory = replace(trajectory, position_e=trajectory.position_e + move)
         read = rows.copy()
-        for name in ("range_m", "encoder_rad"):
+        for name in ("range_m", "encoder_rad", *raised):
             read[name] += change.get(name, 0.0)
         return model.rays(read, time_ns, trajectory, with_axes=with_axes), trajectory
 
     seen, trajectory = rays({}, with_axes=True)
     columns = observation_columns_e(seen, model, trajectory)
-    for index, name in enumerate(OBSERVATIONS):
+    assert columns.shape == (3, len(names), 3)
+    for index, name in enumerate(names):
         step = 10.0 if name.endswith(("_e", "_m")) else 1e-2
         moved = [rays({name: f * step})[0].points_e for f in (-1, -0.5, 0.5, 1)]
         slope = slope_of(moved, step)

@@ -96,6 +96,7 @@ class Shots:
             intensity=rng.uniform(-10.0, 2500.0, count),
             return_number=rng.integers(1, 4, count),
             mta_zone=rng.integers(0, 4, count),
+            **case.elevations(rng, count),
         )
         time_ns = flights.time_ns[::2] + rng.integers(4_000_000, 14_000_000, count)
         return cls(rows, time_ns, rng.uniform(-80.0, 80.0, count), rng.uniform(-2e4, 2e4, count))
