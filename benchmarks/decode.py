@@ -33,13 +33,24 @@ from swath.drivers.parser import DeviceSettings, Parser, ParserCounters
 from swath.drivers.scanner.hesai.heads import MODE_FIRST_LAST_STRONGEST, HesaiHead
 from swath.drivers.scanner.hesai.models import QT64, QT128, XT16, XT32, XT32M2X
 from swath.drivers.scanner.hesai.parser import HesaiParser, with_checksums
+from swath.drivers.scanner.livox.layout import AVIA, POINTS_1, PTP, encode_packet_1
+from swath.drivers.scanner.livox.parser import LivoxParser
 from swath.drivers.scanner.ouster.layout import LidarLayout
 from swath.drivers.scanner.ouster.parser import OusterParser
 from swath.drivers.scanner.srep.layout import SrepHeader, encode_datagram
 from swath.drivers.scanner.srep.parser import SrepParser
 from swath.drivers.scanner.velodyne.heads import VLP16, VLP32C, VLS128
 from swath.drivers.scanner.velodyne.parser import DATA_BYTES, MODE_DUAL, PACKET_DTYPE, VelodyneParser
-from swath.georef.records import IMU_DTYPE, RETURN_DTYPE, ByteRows, ChunkBatch, ImuSamples, Record, ScannerReturns
+from swath.georef.records import (
+    AIMED_RETURN_DTYPE,
+    IMU_DTYPE,
+    RETURN_DTYPE,
+    ByteRows,
+    ChunkBatch,
+    ImuSamples,
+    Record,
+    ScannerReturns,
+)
 
 FIXTURES = Path(__file__).parents[1] / "fixtures"
 BATCH_BYTES = 1 << 20  # of one chunk of the log
@@ -155,10 +166,11 @@ def head_figure(
     units: ByteRows,
     target: float,
     repeats: int,
+    row: np.dtype[np.void] = RETURN_DTYPE,
 ) -> Figure:
     """Measure the decoding of a spinning head's packets, beside a copy of packets and rows."""
     rows = decode_all(lambda: make(settings), batches_of(units))
-    copy, taken = copy_rows(RETURN_DTYPE, rows), np.empty(units.shape, np.uint8)
+    copy, taken = copy_rows(row, rows), np.empty(units.shape, np.uint8)
 
     def least() -> None:
         np.copyto(taken, units)
@@ -166,6 +178,27 @@ def head_figure(
 
     compiled, plain = both_rates(make, settings, units, rows, repeats)
     return Figure(name, "returns", compiled, target, rate(least, rows, repeats), "copy of packets and rows", plain)
+
+
+def livox_units(data_type: int, packets: int = 2000) -> ByteRows:
+    """Make packets of an Avia, 240 000 pulses a second, of which every eleventh has no return."""
+    kind, random = POINTS_1[data_type], np.random.default_rng(2)
+    table = np.zeros((packets, kind.pulses), dtype=kind.dtype)
+    returns = table["echoes"] if kind.echoes > 1 else table
+    for axis in "xyz":
+        returns[axis] = random.integers(-60_000, 60_000, returns.shape)
+        returns[axis][:, ::11] = 0
+    step_ns = kind.pulses * 1_000_000_000 // 240_000
+    units = [encode_packet_1(data_type, PTP, 5_000_000_000 + at * step_ns, row) for at, row in enumerate(table)]
+    return np.frombuffer(b"".join(units), dtype=np.uint8).reshape(packets, -1)
+
+
+def measure_livox(repeats: int) -> Iterator[Figure]:
+    """Measure Cartesian points of SDK 1, single and dual return; there are no compiled loops."""
+    for name, data_type in (("Livox Avia, x y z", 2), ("Livox Avia, dual return", 4)):
+        settings = DeviceSettings("scanner/bench")
+        make = partial(LivoxParser, head=AVIA)
+        yield head_figure(name, make, settings, livox_units(data_type), 8e6, repeats, AIMED_RETURN_DTYPE)
 
 
 def measure_hesai(repeats: int) -> Iterator[Figure]:
@@ -400,7 +433,15 @@ def main() -> None:
     keep_freed_memory()  # as every command of swath does
     figures = []
     print(f"{'decoding, one core':<30} {'no numba':>9} {'rate':>9} {'asked':>8} {'limit':>9} {'share':>6}  item, limit")
-    for measure in (measure_srep, measure_velodyne, measure_hesai, measure_ouster, measure_can, measure_framing):
+    for measure in (
+        measure_srep,
+        measure_velodyne,
+        measure_hesai,
+        measure_livox,
+        measure_ouster,
+        measure_can,
+        measure_framing,
+    ):
         for figure in measure(arguments.repeats):
             figures.append(figure)
             asked = f"{figure.target / 1e6:.0f} M/s" if figure.target else "-"

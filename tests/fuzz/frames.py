@@ -244,10 +244,9 @@ def _hesai_layouts(sample: Sequence[bytes]) -> list[np.dtype[np.void]]:
 
 
 def tail_of(datagrams: Sequence[bytes]) -> Callable[[bytes], bytes]:
-    """Return a function that makes a changed datagram valid again by its checksum.
-
-    This is the checksum that the recorded datagrams end in, or the two inside those of a Hesai head; without either
-    the function changes nothing.
+    """Return what seals a changed datagram again: the checksum that the recorded ones are seen to hold, if any: at their
+    end, the two within those of a Hesai head, or in the header of a Livox head.
+    """
     """
     sample = [datagram for datagram in datagrams[:8] if len(datagram) > 16]
     for dtype in _hesai_layouts(sample):
@@ -255,7 +254,21 @@ def tail_of(datagrams: Sequence[bytes]) -> Callable[[bytes], bytes]:
     for width, checksum in TAILS:
         if sample and all(checksum(one[:-width]) == int.from_bytes(one[-width:], "little") for one in sample):
             return lambda datagram: datagram[:-width] + checksum(datagram[:-width]).to_bytes(width, "little")
+    if sample and any(_holds_in_header(one) for one in sample):
+        return lambda datagram: _seal_header(datagram) if len(datagram) > HEADER_CRC_AT + 4 else datagram
     return lambda datagram: datagram
+
+
+HEADER_CRC_AT = 24  # of a Livox packet of SDK 2: CRC-32 of all that follows it
+
+
+def _holds_in_header(datagram: bytes) -> bool:
+    return _seal_header(datagram) == datagram and any(datagram[HEADER_CRC_AT : HEADER_CRC_AT + 4])
+
+
+def _seal_header(datagram: bytes) -> bytes:
+    rest = datagram[HEADER_CRC_AT + 4 :]
+    return datagram[:HEADER_CRC_AT] + zlib.crc32(rest).to_bytes(4, "little") + rest
 
 
 def changed_datagram(rng: random.Random, datagram: bytes, seal: Callable[[bytes], bytes]) -> bytes:

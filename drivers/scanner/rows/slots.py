@@ -136,7 +136,7 @@ class ReturnSlots:
             self._write_pulses(words, pulse)
             returns = content.take(index)
             if slots > 1:
-                self._write_numbers(words, returns, *_numbers(pulse, slots))
+                self._write_numbers(words, returns, *numbers_of(pulse, slots))
         self._write_returns(words, returns)
         table[: len(index)].view(np.uint64).reshape(-1, _WORDS)[:] = words.T
         return len(index)
@@ -187,7 +187,7 @@ class ReturnSlots:
             np.multiply(returns["pulse_width"], self.pulse_width_unit_ns, out=width)
 
 
-def _numbers(pulse: NDArray[np.intp], slots: int) -> tuple[ByteArray, ByteArray]:
+def numbers_of(pulse: NDArray[np.intp], slots: int) -> tuple[ByteArray, ByteArray]:
     """Return return_number and number_of_returns of returns in the order of their pulses; ``slots`` is the maximum of a
     pulse.
     """
