@@ -10,17 +10,26 @@ from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Literal
 
-from swath.drivers.parser import DeviceKind, DeviceSettings, Parser
-from swath.georef.records import NamesEdge
+from swath.drivers.parser import ChosenRecords, DeviceKind, DeviceSettings, Parser
+from swath.georef.records import EventMark, GnssFix, GnssHeading, NamesEdge, TimeMessage
 
 if TYPE_CHECKING:
     from swath.drivers.startup import StartupMessage, StartupOptions
 
-TransportKind = Literal["serial", "can", "udp", "tcp", "gnss", "ntrip"]
+TransportKind = Literal["serial", "can", "udp", "tcp", "gnss", "imu", "ntrip"]
 
 STREAM_TRANSPORTS: tuple[TransportKind, ...] = ("serial", "udp", "tcp")  # every wire that carries a byte stream
 
 KINDS: tuple[DeviceKind, ...] = ("gnss", "imu", "scanner", "corrections")
+FOLDERS: dict[DeviceKind, tuple[str, ...]] = {  # where drivers of a kind are declared: a receiver may hold an IMU and
+    "gnss": ("gnss", "imu"),  # an IMU a receiver, and one protocol file then declares both
+    "imu": ("imu", "gnss"),
+    "scanner": ("scanner",),
+    "corrections": ("corrections",),
+}
+
+
+RECEIVER_RECORDS = (TimeMessage, GnssFix, GnssHeading, EventMark)
 
 
 class UnknownProtocolError(LookupError):
@@ -32,18 +41,28 @@ def all_drivers(kind: DeviceKind) -> dict[str, Driver]:
     """Return all drivers of a kind by protocol name, from the ``DRIVERS`` of each module or of each package's
     ``parser`` module.
     """
-    package = importlib.import_module(f"swath.drivers.{kind}")
     found: dict[str, Driver] = {}
+    for driver in (driver for folder in FOLDERS[kind] for driver in _declared_in(folder)):
+        if driver.kind != kind:
+            continue
+        if driver.protocol in found:
+            raise RuntimeError(f"two drivers declare {kind} protocol {driver.protocol!r}")
+        found[driver.protocol] = driver
+    return dict(sorted(found.items()))
+
+
+@cache
+def _declared_in(folder: str) -> tuple[Driver, ...]:
+    """Return the drivers of all kinds that the protocol files of a folder declare."""
+    package = importlib.import_module(f"swath.drivers.{folder}")
+    found: list[Driver] = []
     for info in sorted(pkgutil.iter_modules(package.__path__), key=lambda info: info.name):
         name = f"{info.name}.parser" if info.ispkg else info.name
-        if info.ispkg and importlib.util.find_spec(f"swath.drivers.{kind}.{name}") is None:
+        if info.ispkg and importlib.util.find_spec(f"swath.drivers.{folder}.{name}") is None:
             continue
-        module = importlib.import_module(f"swath.drivers.{kind}.{name}")
-        for driver in getattr(module, "DRIVERS", ()):
-            if driver.protocol in found:
-                raise RuntimeError(f"two drivers declare {kind} protocol {driver.protocol!r}")
-            found[driver.protocol] = driver
-    return found
+        module = importlib.import_module(f"swath.drivers.{folder}.{name}")
+        found += getattr(module, "DRIVERS", ())
+    return tuple(found)
 
 
 def find_driver(kind: DeviceKind, protocol: str) -> Driver:
@@ -67,7 +86,8 @@ class Driver:
     Attributes:
         protocol: its name in the configuration.
         kind: gnss, imu, scanner or corrections.
-        transports: kinds of transport that can carry it; `STREAM_TRANSPORTS` for the byte stream of a port.
+        transports: kinds of transport that can carry it; `STREAM_TRANSPORTS` for the byte stream of a port; ``gnss`` or
+            ``imu`` for a device inside the stream of a receiver or of an inertial unit of the same protocol.
         yields: record types that its parser returns.
         summary: one line for ``swath devices``.
         make_parser: builds the parser of all record types.
@@ -106,3 +126,30 @@ class Driver:
     eight_bit_intensity: bool = False
     past_hour: bool = False
     startup: Callable[[DeviceSettings, StartupOptions], tuple[StartupMessage, ...]] | None = None
+
+
+def receiver_inside(unit: Driver, make_parser: Callable[[DeviceSettings], Parser] | None = None) -> Driver:
+    """Return the driver of the GNSS receiver inside an inertial unit (``transport = "imu:NAME"``).
+
+    Its parser reads the unit's stream once more, for the receiver's records only. Its settings have the unit's keys and
+    files where the receiver's own table has none.
+
+    Args:
+        unit: the driver of the inertial unit.
+        make_parser: builds the parser of the receiver's records, where one costs less than the unit's own; None: the
+            unit's parser, whose other records are left out.
+    """
+
+    def chosen(settings: DeviceSettings) -> Parser:
+        return ChosenRecords(unit.make_parser(settings), RECEIVER_RECORDS)
+
+    return Driver(
+        protocol=unit.protocol,
+        kind="gnss",
+        transports=("imu",),
+        yields=tuple(kind for kind in unit.yields if kind in RECEIVER_RECORDS),
+        summary=f"the receiver inside it: {unit.summary}",
+        make_parser=make_parser or chosen,
+        make_time_parser=unit.make_time_parser,
+        names_edge=unit.names_edge,
+    )

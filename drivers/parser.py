@@ -135,6 +135,42 @@ class PacketParser(Parser):
         """
 
 
+class ChosenRecords(Parser):
+    """Returns the records of another parser that are of the wanted types; counters and remarks are that parser's.
+
+    Attributes:
+        parser: the other parser.
+    """
+
+    def __init__(self, parser: Parser, wanted: tuple[type, ...]) -> None:
+        super().__init__()
+        self.parser, self._wanted = parser, wanted
+        self.counters = parser.counters
+
+    def _chosen(self, records: list[Record]) -> list[Record]:
+        return [record for record in records if isinstance(record, self._wanted)]
+
+    def feed(self, chunk: Chunk) -> list[Record]:
+        """Take one unit; return its wanted records."""
+        return self._chosen(self.parser.feed(chunk))
+
+    def feed_batch(self, batch: ChunkBatch) -> list[Record]:
+        """Take consecutive units; return their wanted records."""
+        return self._chosen(self.parser.feed_batch(batch))
+
+    def feed_batches(self, batches: Sequence[ChunkBatch]) -> list[Record]:
+        """Take consecutive batches; return their wanted records."""
+        return self._chosen(self.parser.feed_batches(batches))
+
+    def close(self) -> list[Record]:
+        """Return the wanted records still held back."""
+        return self._chosen(self.parser.close())
+
+    def remarks(self) -> list[str]:
+        """Return the parser's lines for the user."""
+        return self.parser.remarks()
+
+
 @dataclass(frozen=True, slots=True)
 class DeviceSettings:
     """Holds everything that a parser may know of its configuration.

@@ -192,14 +192,15 @@ def _check_transport(config: Config, section: str, table: DeviceTable, driver: D
     except ValueError as error:
         yield f"{section}.{error}"
     else:
-        if spec.kind == "gnss" and spec.address not in config.gnss:
-            known = ", ".join(config.gnss) or "none"
-            yield f'{section}.transport: got "{table.transport}", want the name of a [gnss.<name>]; there are: {known}'
+        carriers = config.gnss if spec.kind == "gnss" else config.imu
+        got = f'{section}.transport: got "{table.transport}"'
+        if spec.carrier is not None and spec.address not in carriers:
+            known = ", ".join(carriers) or "none"
+            yield f"{got}, want the name of a [{spec.kind}.<name>]; there are: {known}"
         elif spec.kind not in driver.transports:
-            yield f'{section}.transport: got "{table.transport}"; {driver.protocol} supports: {allowed}'
-        elif spec.kind == "gnss" and config.gnss[spec.address].protocol != table.protocol:
-            wanted = f'"{config.gnss[spec.address].protocol}" like [gnss.{spec.address}], whose stream carries it'
-            yield f'{section}.protocol: got "{table.protocol}", want {wanted}'
+            yield f"{got}; {driver.protocol} supports: {allowed}"
+        elif spec.carrier is not None:
+            yield from _check_carrier(section, table, spec, carriers[spec.address])
     if isinstance(table, ScannerConfig) and table.auxiliary:
         try:
             auxiliary = parse_transport(table.auxiliary)
@@ -208,6 +209,16 @@ def _check_transport(config: Config, section: str, table: DeviceTable, driver: D
         else:
             if auxiliary.kind != "udp":
                 yield f'{section}.auxiliary: got "{table.auxiliary}", want udp:<address>:<port>'
+
+
+def _check_carrier(section: str, table: DeviceTable, spec: TransportSpec, carrier: DeviceTable) -> Iterator[str]:
+    """Check the device whose stream holds another one's bytes: it has a wire of its own, and speaks the protocol."""
+    name = f"{spec.kind}.{spec.address}"
+    if carrier.transport.partition(":")[0] in ("gnss", "imu"):
+        yield f'{section}.transport: got "{table.transport}", but [{name}] has no wire of its own; name one that has'
+    elif carrier.protocol != table.protocol:
+        wanted = f'"{carrier.protocol}" like [{name}], whose stream carries it'
+        yield f'{section}.protocol: got "{table.protocol}", want {wanted}'
 
 
 def check_antennas(section: str, table: GnssConfig) -> Iterator[str]:
@@ -270,7 +281,7 @@ def _wires(config: Config) -> Iterator[tuple[str, TransportSpec]]:
                 spec = parse_transport(text)
             except ValueError:
                 continue  # already a finding
-            if spec.kind != "gnss":
+            if spec.carrier is None:
                 yield f"{kind}.{name}.{key}", spec
 
 

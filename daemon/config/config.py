@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -36,7 +36,7 @@ class DeviceEntry:
 
     Attributes:
         kind, name: of its section; ``source`` is ``kind/name``.
-        transport: source of its bytes; kind ``gnss`` if they are part of another stream.
+        transport: source of its bytes; with a ``carrier`` if they are part of another stream.
         auxiliary: the same head's second port.
         protocol: the driver's name.
         pps: name of its PPS source.
@@ -153,9 +153,46 @@ class Config:
         Raises:
             OSError: a file cannot be read.
         """
-        files = self.files_of(table)
-        contents: dict[str, bytes] = {key: files[key].read_bytes() for key in PARSER_FILES if key in files}
-        return DeviceSettings(f"{kind}/{name}", plain_table(table), contents)
+
+        def contents(_: str, of: DeviceTable) -> dict[str, bytes]:
+            files = self.files_of(of)
+            return {key: files[key].read_bytes() for key in PARSER_FILES if key in files}
+
+        return self.settings_with(kind, name, table, contents)
+
+    def settings_with(
+        self,
+        kind: DeviceKind,
+        name: str,
+        table: DeviceTable,
+        contents: Callable[[str, DeviceTable], dict[str, bytes]],
+        *,
+        compiled: bool = False,
+    ) -> DeviceSettings:
+        """Return the settings for the parser of a device.
+
+        A device inside the stream of another one has that one's keys and files too, where its own table has none.
+
+        Args:
+            kind, name, table: of the device.
+            contents: returns the contents of the parser's files that a device's name and table name, by key.
+            compiled: as in `DeviceSettings`.
+        """
+        values, files = plain_table(table), contents(name, table)
+        carrier = self.carrier_of(table)
+        if carrier is not None:
+            outer_name, outer = carrier
+            values = {**plain_table(outer), **values}
+            files = {**contents(outer_name, outer), **files}
+        return DeviceSettings(f"{kind}/{name}", values, files, compiled)
+
+    def carrier_of(self, table: DeviceTable) -> tuple[str, DeviceTable] | None:
+        """Return name and table of the device whose stream holds this one's bytes; None: it has its own wire, or that
+        device does not exist.
+        """
+        kind, _, name = table.transport.partition(":")
+        tables: Mapping[str, DeviceTable] = self.gnss if kind == "gnss" else self.imu if kind == "imu" else {}
+        return (name, tables[name]) if name in tables else None
 
     def devices(self) -> Iterator[DeviceEntry]:
         """Yield every device: GNSS, IMU, scanners, corrections, in the order of the file."""

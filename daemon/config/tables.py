@@ -86,7 +86,7 @@ class GnssSetupConfig(Section):
 class GnssConfig(Section):
     """``[gnss.<name>]``: a GNSS receiver."""
 
-    transport: Text = Field(description="serial:…, udp:… or tcp:…")
+    transport: Text = Field(description="serial:…, udp:…, tcp:…, or imu:<name> (inside its stream)")
     protocol: Text = Field(description="nmea, ubx, novatel, … (`swath devices` lists them)")
     pps: Name | None = Field(None, description="name of the [pps.<name>] wired to this receiver")
     names_edge: Literal["auto", "previous", "next"] = Field(

@@ -219,16 +219,12 @@ def check_everything(config: Config, seconds: float) -> list[Report]:
 def _wires(reading: Reading, readings: dict[str, Reading]) -> Iterable[Wire]:
     """Yield the wires of a device; devices inside its stream read along, and have no wires of their own."""
     entry = reading.entry
-    if entry.transport.kind == "gnss":
+    if entry.transport.carrier is not None:
         return
-    inside = [other for other in readings.values() if _is_inside(other.entry, entry)]
+    inside = [other for other in readings.values() if other.entry.transport.carrier == entry.source]
     yield Wire(reading.report, entry.transport, [reading, *inside], main=True)
     if entry.auxiliary is not None:
         yield Wire(Report(f"{entry.source}/aux", entry.protocol), entry.auxiliary, [reading], main=False)
-
-
-def _is_inside(inner: DeviceEntry, outer: DeviceEntry) -> bool:
-    return inner.transport.kind == "gnss" and f"gnss/{inner.transport.address}" == outer.source
 
 
 def _run(jobs: list[Callable[[], None]], span: Span) -> None:

@@ -16,7 +16,6 @@ from typing import Any
 from swath.daemon.config import Config, DeviceEntry
 from swath.daemon.errors import ExitCode, UserError, one_line
 from swath.drivers.driver import find_driver
-from swath.drivers.parser import DeviceSettings
 from swath.drivers.startup import Answer, StartupMessage, StartupOptions
 from swath.drivers.transports.base import TransportError
 from swath.drivers.transports.opening import open_transport
@@ -60,7 +59,7 @@ class DeviceSetup:
 
     Attributes:
         source: ``kind/name``.
-        transport: as configured; ``gnss:<name>`` if its bytes are part of that receiver's stream.
+        transport: as configured; ``gnss:<name>`` or ``imu:<name>`` if its bytes are part of that device's stream.
         steps: its messages; empty if it needs none.
         problem: why nothing can be sent to it, or what went wrong; one line.
     """
@@ -175,7 +174,7 @@ def plan_setup(
     wires: dict[str, WireSetup] = {}
     for entry in entries.values():
         if not only or entry.source in only:
-            carrier = entries[f"gnss/{entry.transport.address}"] if entry.transport.kind == "gnss" else entry
+            carrier = entries[entry.transport.carrier or entry.source]
             wire = wires.setdefault(carrier.source, WireSetup(carrier.transport))
             _add_device(wire, entry, carrier, StartupOptions(save, present_baud and _configured_baud(carrier)))
     if present_baud is not None:
@@ -206,12 +205,8 @@ def _add_device(wire: WireSetup, entry: DeviceEntry, carrier: DeviceEntry, optio
     startup = find_driver(entry.kind, entry.protocol).startup
     if startup is None:
         return
-    settings = entry.settings
-    if entry is not carrier:  # the receiver owns the port
-        setup = carrier.settings.config.get("setup")
-        settings = DeviceSettings(settings.source, {**settings.config, "setup": setup}, settings.files)
     known = {step.message.data for step in wire.steps()}
-    device.steps = [Step(message) for message in startup(settings, options) if message.data not in known]
+    device.steps = [Step(message) for message in startup(entry.settings, options) if message.data not in known]
     device.problem = _why_not_sent(wire.spec)
 
 

@@ -50,7 +50,7 @@ def examine(config: Config | None, *, write: bool = True) -> Iterator[Finding]:
 def _specs(config: Config | None) -> list[TransportSpec]:
     entries = [] if config is None else list(config.devices())
     wires = [spec for entry in entries for spec in (entry.transport, entry.auxiliary) if spec is not None]
-    return [spec for spec in wires if spec.kind != "gnss"]
+    return [spec for spec in wires if spec.carrier is None]
 
 
 def _asked_bytes(specs: list[TransportSpec]) -> int:

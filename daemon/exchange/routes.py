@@ -47,7 +47,7 @@ def _ports(config: Config) -> Iterator[Port]:
         yield Port(f"pps/{name}", "pps", None, channel, pps.edge)
     for device in config.devices():
         for spec, suffix in ((device.transport, ""), (device.auxiliary, "/aux")):
-            if spec is not None and spec.kind != "gnss":
+            if spec is not None and spec.carrier is None:
                 yield _port(make_wire(device, spec, suffix), spec)
 
 

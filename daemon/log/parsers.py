@@ -8,11 +8,11 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from swath.daemon.config.config import Config, attachment_name, plain_table
+from swath.daemon.config.config import Config, DeviceTable, attachment_name
 from swath.daemon.config.tables import Tables
 from swath.daemon.log.format import LogError
 from swath.drivers.driver import UnknownProtocolError, find_driver
-from swath.drivers.parser import DeviceSettings, DriverSettingsError, Parser
+from swath.drivers.parser import DriverSettingsError, Parser
 from swath.georef.toml_tables import TomlError, toml_tables
 
 
@@ -45,10 +45,13 @@ def stored_drivers(attachments: Mapping[str, bytes]) -> tuple[dict[str, Callable
         return {}, ["the log holds no configuration: units are counted, not decoded"]
     makers: dict[str, Callable[[], Parser]] = {}
     troubles: list[str] = []
-    for kind, name, table in config.device_tables():
+
+    def contents(name: str, table: DeviceTable) -> dict[str, bytes]:
         files = {key: attachments.get(attachment_name(key, name, path)) for key, path in config.files_of(table).items()}
-        contents: dict[str, bytes] = {key: data for key, data in files.items() if data is not None}
-        settings = DeviceSettings(f"{kind}/{name}", plain_table(table), contents)
+        return {key: data for key, data in files.items() if data is not None}
+
+    for kind, name, table in config.device_tables():
+        settings = config.settings_with(kind, name, table, contents)
         try:
             makers[settings.source] = partial(find_driver(kind, table.protocol).make_parser, settings)
         except UnknownProtocolError as error:

@@ -84,9 +84,9 @@ class Monitor:
         if config is not None:
             self._reserve_bytes = int(config.session.reserve_mb * 1e6)
             for kind, name, table in config.device_tables():
-                if table.transport.startswith("gnss:"):
-                    stream = f"gnss/{table.transport.removeprefix('gnss:')}"
-                    self._inside.setdefault(stream, []).append(f"{kind}/{name}")
+                carrier, _, carrier_name = table.transport.partition(":")
+                if carrier in ("gnss", "imu"):
+                    self._inside.setdefault(f"{carrier}/{carrier_name}", []).append(f"{kind}/{name}")
 
     def _take(self, batch: LogBatch) -> None:
         topic = batch.channel.topic

@@ -66,9 +66,14 @@ def assemble(config: Config, queue_bytes: int = QUEUE_BYTES) -> Assembly:
     )
     timekeeper = make_timekeeper(config, events, clock.offset_ns)
     watches: dict[str, CorrectionsWatch] = {}
+    devices = list(config.devices())
+    # the time of a receiver inside an inertial unit shows in the unit's status, which is that of the wire
+    receivers = {device.transport.carrier: device.source for device in devices if device.kind == "gnss"}
 
     def added_status(source: str) -> dict[str, object]:
-        return watches[source].status() if source in watches else timekeeper.status(source, clock.now_ns())
+        if source in watches:
+            return watches[source].status()
+        return timekeeper.status(receivers.get(source, source), clock.now_ns())
 
     recorder = Recorder(parts, settings, queue, channels, events, clock, added_status)
     assembly = Assembly(
@@ -83,8 +88,9 @@ def assemble(config: Config, queue_bytes: int = QUEUE_BYTES) -> Assembly:
         corrections=watches,
     )
     _add_pps(assembly)
-    for device in config.devices():
-        _add_device(assembly, device)
+    for device in devices:
+        inside = [other.source for other in devices if other.transport.carrier == device.source]
+        _add_device(assembly, device, inside)
     for receiver in assembly.receivers:
         recorder.add_source(receiver.source)
     return assembly
@@ -97,7 +103,7 @@ def make_timekeeper(config: Config, events: Events, host_minus_monotonic_ns: int
     for name, pps in config.pps.items():
         keeper.add_pps(f"pps/{name}", leap_seconds.get(name), pps.delay_ns)
     for device in config.devices():
-        if device.kind == "gnss" and device.transport.kind != "gnss":
+        if device.kind == "gnss":
             _add_gnss_time(keeper, device, config.gnss[device.name])
     return keeper
 
@@ -120,14 +126,16 @@ def _add_pps(assembly: Assembly) -> None:
         assembly.receivers.append(receiver)
 
 
-def _add_device(assembly: Assembly, device: DeviceEntry) -> None:
-    if device.transport is None or device.transport.kind == "gnss":
+def _add_device(assembly: Assembly, device: DeviceEntry, inside: list[str]) -> None:
+    """Add the receiver threads of a device's wires; ``inside`` are the sources whose bytes are in its stream."""
+    if device.transport.carrier is not None:
         return  # part of another stream, which is logged
     first_units = FirstUnits(device)
     assembly.first_units.append(first_units)
     units_seen: list[UnitsSeen] = [first_units.add]
-    if device.kind == "gnss":
-        units_seen.append(assembly.timekeeper.units_seen(device.source))
+    for source in (device.source, *inside):
+        if source.startswith("gnss/"):
+            units_seen.append(assembly.timekeeper.units_seen(source))
     if device.kind == "corrections":
         units_seen.append(_watch_corrections(assembly, device).units_seen)
     main = make_wire(device, device.transport, "")

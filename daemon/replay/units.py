@@ -41,7 +41,7 @@ def output_makers(config: Config, *, with_pps: bool) -> dict[str, Callable[[], O
     makers: dict[str, Callable[[], Output]] = {}
     for device in config.devices():
         for spec, suffix in ((device.transport, ""), (device.auxiliary, "/aux")):
-            if spec is not None and spec.kind not in ("gnss", "ntrip"):  # a caster only sends
+            if spec is not None and spec.carrier is None and spec.kind != "ntrip":  # a caster only sends
                 makers[device.source + suffix] = partial(open_output, spec)
     for name, pps in config.pps.items():
         if with_pps and pps.source.startswith(FIXED_SCHEME):

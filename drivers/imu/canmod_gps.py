@@ -3,11 +3,13 @@
 A preset of `swath.drivers.imu.dbc.parser` with the maker's own DBC (canmod-gps.dbc beside this file, which contains its
 MIT licence). The device has no counter and no PPS output: its samples are timed by their arrival, and its time message,
 a second old and some 0.5 s late, refers to the edge before it for a host that receives PPS from another source.
+Its altitude is the height above the WGS 84 ellipsoid (CANmod.gps manual, Configuration, GNSS, Output, Altitude).
 """
 
 from __future__ import annotations
 
 import datetime as dt
+from dataclasses import replace
 from math import radians
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from swath.drivers.can_frames import decode_can_frames
-from swath.drivers.driver import Driver
+from swath.drivers.driver import Driver, receiver_inside
 from swath.drivers.imu.dbc.parser import DbcParser
 from swath.drivers.imu.dbc.signals import SignalLayout, find_signal, load_database
 from swath.drivers.parser import DeviceSettings
@@ -115,6 +117,7 @@ class CanmodGpsParser(DbcParser):
         self._time_only = time_only
         self._time: TimeTag | None = None
         self._status: dict[str, float] = {}
+        self._waiting: GnssFix | None = None  # a position whose altitude follows in the next message
 
     def parse_units(self, host_time_ns: Int64Array, units: ByteRows) -> list[Record]:
         """Decode CAN frames, (n, 16) or (n, 72)."""
@@ -150,8 +153,23 @@ class CanmodGpsParser(DbcParser):
             found += [(int(row), name, {key: columns[key][n] for key in columns}) for n, row in enumerate(whole)]
         records: list[Record] = []
         for row, name, values in sorted(found, key=lambda item: item[0]):
+            records += self._placed(values if name == "gnss_altitude" else {})
             records += self._gnss_record(int(host_time_ns[row]), name, values)
         return records
+
+    def _placed(self, altitude: dict[str, float]) -> list[Record]:
+        """Return the fix that waits for its height, which the message after it gives if that is ``gnss_altitude``."""
+        fix, self._waiting = self._waiting, None
+        if fix is None:
+            return []
+        if not altitude.get("AltitudeValid") or fix.position_cov_l is None:
+            return [fix]
+        variances = [*np.diag(fix.position_cov_l)[:2], altitude["AltitudeAccuracy"] ** 2]
+        return [replace(fix, height_m=altitude["Altitude"], position_cov_l=np.diag(variances))]
+
+    def close(self) -> list[Record]:
+        """Return the samples and the fix that are still held back."""
+        return [*super().close(), *self._placed({})]
 
     def _gnss_record(self, host_time_ns: int, name: str, values: dict[str, float]) -> list[Record]:
         """Return the records of one GNSS message."""
@@ -168,15 +186,12 @@ class CanmodGpsParser(DbcParser):
         if self._time_only:
             return []
         if name == "gnss_pos":
-            return [self._fix(host_time_ns, values)] if self._time is not None else []
+            self._waiting = self._fix(host_time_ns, values) if self._time is not None else None
+            return []
         return [DeviceStatus(host_time_ns, _status_values(name, values), message=name)]
 
     def _fix(self, host_time_ns: int, values: dict[str, float]) -> GnssFix:
-        """Return the position at the epoch of the last time message.
-
-        The maker does not define the reference surface of its altitude, so the fix has no ellipsoidal height; the
-        altitude is in the device's status.
-        """
+        """Return the position at the epoch of the last time message, without its height."""
         assert self._time is not None
         accuracy = values["PositionAccuracy"]
         fix_type = FIX_TYPES.get(int(self._status.get("FixType", 0)), FixType.NONE)
@@ -227,15 +242,14 @@ def make_time_parser(settings: DeviceSettings) -> CanmodGpsParser:
     return CanmodGpsParser(settings, time_only=True)
 
 
-DRIVERS = (
-    Driver(
-        protocol="canmod-gps",
-        kind="imu",
-        transports=("can",),
-        yields=(ImuSamples, TimeMessage, GnssFix, DeviceStatus),
-        summary="CSS Electronics CANmod.gps: IMU at 100 Hz, GNSS at 1 Hz",
-        make_parser=CanmodGpsParser,
-        make_time_parser=make_time_parser,
-        names_edge=NamesEdge.PREVIOUS,
-    ),
+UNIT = Driver(
+    protocol="canmod-gps",
+    kind="imu",
+    transports=("can",),
+    yields=(ImuSamples, TimeMessage, GnssFix, DeviceStatus),
+    summary="CSS Electronics CANmod.gps: IMU at 100 Hz, GNSS at 1 Hz",
+    make_parser=CanmodGpsParser,
+    make_time_parser=make_time_parser,
+    names_edge=NamesEdge.PREVIOUS,
 )
+DRIVERS = (UNIT, receiver_inside(UNIT))

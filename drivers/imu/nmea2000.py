@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swath.drivers.can_frames import CAN_EFF_FLAG, CAN_ERR_FLAG, CAN_RTR_FLAG, decode_can_frames
-from swath.drivers.driver import Driver
+from swath.drivers.driver import Driver, receiver_inside
 from swath.drivers.parser import DeviceSettings, DriverSettingsError, PacketParser
 from swath.georef.arrays import Int64Array, StructArray
 from swath.georef.records import (
@@ -366,18 +366,17 @@ def make_time_parser(settings: DeviceSettings) -> Nmea2000Parser:
     return Nmea2000Parser(settings, time_only=True)
 
 
-DRIVERS = (
-    Driver(
-        protocol="nmea2000",
-        kind="imu",
-        transports=("can",),
-        yields=(GnssHeading, GnssFix, TimeMessage, DeviceStatus),
-        summary="NMEA 2000 bus: heading, attitude, rate of turn, heave, position, time",
-        make_parser=Nmea2000Parser,
-        make_time_parser=make_time_parser,
-        names_edge=NamesEdge.PREVIOUS,
-    ),
+BUS = Driver(
+    protocol="nmea2000",
+    kind="imu",
+    transports=("can",),
+    yields=(GnssHeading, GnssFix, TimeMessage, DeviceStatus),
+    summary="NMEA 2000 bus: heading, attitude, rate of turn, heave, position, time",
+    make_parser=Nmea2000Parser,
+    make_time_parser=make_time_parser,
+    names_edge=NamesEdge.PREVIOUS,
 )
+DRIVERS = (BUS, receiver_inside(BUS))
 
 
 @dataclass(slots=True)

@@ -5,6 +5,7 @@ udp:<host>:<port>?group=239.1.2.3&source=192.168.1.201&interface=eth1&buffer_mb=
 tcp:<host>:<port>?silent_s=10
 can:<interface>:<channel>?<keyword>=<value>…
 gnss:<name>
+imu:<name>
 ntrip:<host>:<port>/<mountpoint>?user=<name>&password_env=<variable>&version=2&position=47.5,8.7,500
 """
 
@@ -17,7 +18,7 @@ from dataclasses import dataclass, field
 
 PPS_FORMS = "/dev/pps0, serial-dcd:/dev/ttyS0 or fixed:<path>"
 FORMS = (
-    "serial:<path>, udp:<host>:<port>, tcp:<host>:<port>, can:<interface>:<channel>, gnss:<name> "
+    "serial:<path>, udp:<host>:<port>, tcp:<host>:<port>, can:<interface>:<channel>, gnss:<name>, imu:<name> "
     "or ntrip:<host>:<port>/<mountpoint>"
 )
 MAX_BUFFER_MB = 1023  # the kernel stores twice the value in an int
@@ -33,8 +34,8 @@ class TransportSpec:
     """One checked transport of the configuration.
 
     Attributes:
-        kind: "serial", "udp", "tcp", "can", "ntrip", or "gnss" (inside another device's stream: no transport of its
-            own).
+        kind: "serial", "udp", "tcp", "can", "ntrip", or "gnss" or "imu" (inside that device's stream: no transport of
+            its own).
         address: the text between the kind and the options.
         options: keyword to value, as text.
         text: the whole text, as configured.
@@ -79,6 +80,11 @@ class TransportSpec:
     def mountpoint(self) -> str:
         """Mountpoint of a caster."""
         return self.address.partition("/")[2]
+
+    @property
+    def carrier(self) -> str | None:
+        """Source whose stream holds the device's bytes, as ``gnss/rover``; None: the transport is a wire of its own."""
+        return f"{self.kind}/{self.address}" if self.kind in ("gnss", "imu") else None
 
     @property
     def device(self) -> str:
@@ -315,9 +321,10 @@ def _check_can(spec: TransportSpec) -> None:
         raise ValueError(f"transport {spec.text!r}: {taken[0]} is not an option; want can:<interface>:<channel>?…")
 
 
-def _check_gnss(spec: TransportSpec) -> None:
+def _check_carrier(spec: TransportSpec) -> None:
     if not spec.address or spec.options:
-        raise ValueError(f"transport {spec.text!r}: want gnss:<name> of a [gnss.<name>] section, without options")
+        want = f"{spec.kind}:<name> of a [{spec.kind}.<name>] section, without options"
+        raise ValueError(f"transport {spec.text!r}: want {want}")
 
 
 def _check_host(spec: TransportSpec, host: str) -> None:
@@ -352,7 +359,8 @@ _CHECKS: dict[str, Callable[[TransportSpec], None]] = {
     "udp": _check_udp,
     "tcp": _check_tcp,
     "can": _check_can,
-    "gnss": _check_gnss,
+    "gnss": _check_carrier,
+    "imu": _check_carrier,
     "ntrip": _check_ntrip,
 }
 

@@ -14,13 +14,13 @@ from copy import deepcopy
 import numpy as np
 
 from swath.drivers.driver import KINDS, Driver, all_drivers
-from swath.drivers.parser import DeviceSettings, DriverSettingsError, Parser, StreamParser
+from swath.drivers.parser import ChosenRecords, DeviceSettings, DriverSettingsError, Parser, StreamParser
 from swath.georef.records import Chunk, ChunkBatch, Record
 from tests.drivers.harness import Outcome, assert_bytes_accounted, outcome, random_pieces
 from tests.fuzz.engine import FindingError, Target
 from tests.fuzz.frames import FramePool, changed_datagram, mutate_stream, tail_of
 from tests.fuzz.mutation import LARGEST_CASE_BYTES, bounds, damage
-from tests.fuzz.recordings import packets_of, settings_of, streams_of
+from tests.fuzz.recordings import is_on_can, packets_of, settings_of, streams_of
 
 SOURCE = "fuzz/fuzz"
 HOST_NS = 1_800_000_000_000_000_000
@@ -47,10 +47,11 @@ def _builder(driver: Driver, name: str, make: Callable[[DeviceSettings], Parser]
     def build() -> Target:
         parsers = list(_made(make, settings_of(driver)))
         assert parsers, f"{driver.protocol}: the example on its page, with files of its fixtures, makes no parser"
-        stream = isinstance(parsers[0], StreamParser)
+        first = parsers[0].parser if isinstance(parsers[0], ChosenRecords) else parsers[0]
+        stream = isinstance(first, StreamParser)
         target = _stream_target if stream else _packet_target
         # a copy, since reading a DBC takes longer than an input
-        return target(driver, name, lambda number: deepcopy(parsers[number % len(parsers)]), parsers[0])
+        return target(driver, name, lambda number: deepcopy(parsers[number % len(parsers)]), first)
 
     return build
 
@@ -157,13 +158,13 @@ def _packet_target(driver: Driver, name: str, make: Callable[[int], Parser], fir
     recordings = packets_of(driver, first)
     step_ns = 100_000
     times = [[(HOST_NS + step_ns * at, data) for at, data in enumerate(units)] for units in recordings]
-    window = 24 if "can" in driver.transports else max(3, min(8, 24_000 // len(recordings[0][0])))
+    window = 24 if is_on_can(driver) else max(3, min(8, 24_000 // len(recordings[0][0])))
     rng = random.Random(name)
     seeds = []
     for units in times:
         for start in (0, rng.randrange(len(units)), max(0, len(units) - window)):
             seeds.append(pack(units[start : start + window]))
-    is_can = "can" in driver.transports
+    is_can = is_on_can(driver)
     pool = _kinds_of_units([unit for units in recordings for unit in units], is_can)
     seals = {len(kind[0]): tail_of(kind) for kind in pool}
     identifiers = sorted({unit[:4] for kind in pool for unit in kind}) if is_can else []

@@ -12,11 +12,11 @@ import tomllib
 from itertools import accumulate
 from pathlib import Path
 
-from swath.daemon.config.config import Config, plain_table
+from swath.daemon.config.config import Config
 from swath.daemon.config.tables import Tables
 from swath.drivers.can_frames import encode_can_frame
 from swath.drivers.captures.opening import read_candump, read_pcap
-from swath.drivers.driver import Driver
+from swath.drivers.driver import Driver, all_drivers
 from swath.drivers.imu.dbc.parser import DbcParser
 from swath.drivers.parser import DeviceSettings, Parser
 from swath.drivers.transports.base import TransportError
@@ -57,13 +57,14 @@ def settings_of(driver: Driver) -> list[DeviceSettings]:
     page = file.read_text()
     for block in re.findall(r"^```toml\n(.*?)^```", page, re.M | re.S):
         config = Config(Tables.model_validate({"session": {"name": "fuzz"}, **tomllib.loads(block)}), Path("x"), block)
-        for kind, _, table in config.device_tables():
+        for kind, name, table in config.device_tables():
             if kind == driver.kind and table.protocol == driver.protocol:
                 named = {key: path for key, path in config.files_of(table).items() if key != "calibration"}
-                variants = [DeviceSettings(source, plain_table(table))]
+                values = config.settings_with(kind, name, table, lambda *_: {}).config
+                variants = [DeviceSettings(source, values)]
                 for key, path in named.items():
                     contents = _candidates(driver, path)
-                    variants += [DeviceSettings(source, plain_table(table), {key: content}) for content in contents]
+                    variants += [DeviceSettings(source, values, {key: content}) for content in contents]
                     variants = variants if not driver.needs else variants[1:]
                 return variants
     return [DeviceSettings(source)]
@@ -85,12 +86,19 @@ def streams_of(driver: Driver) -> list[bytes]:
     return [stream[:MOST_OF_A_FILE_BYTES] for stream in streams]
 
 
+def is_on_can(driver: Driver) -> bool:
+    """Return whether the device, or the unit that holds it, is on a CAN bus."""
+    if "imu" in driver.transports and driver.kind == "gnss":
+        driver = all_drivers("imu")[driver.protocol]
+    return "can" in driver.transports
+
+
 def packets_of(driver: Driver, parser: Parser) -> list[list[bytes]]:
     """Return datagrams or CAN frames, a list for each recording.
 
     A CAN unit without a recording gets frames under its identifiers.
     """
-    read = read_candump if "can" in driver.transports else read_pcap
+    read = read_candump if is_on_can(driver) else read_pcap
     found = []
     for path in _files_of(driver):
         if _suffix(path).lower() in NO_RECORDING:

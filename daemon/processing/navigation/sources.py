@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from swath.daemon.config.checks import check_antennas
-from swath.daemon.config.config import PARSER_FILES, Config, attachment_name, plain_table
+from swath.daemon.config.config import PARSER_FILES, Config, attachment_name
 from swath.daemon.config.tables import GnssConfig, ImuConfig, MtaConfig, NoiseConfig, OutputConfig
 from swath.daemon.errors import ConfigError, ExitCode, UserError
 from swath.daemon.log.format import LogError, SessionInfo
@@ -17,7 +17,7 @@ from swath.daemon.log.parsers import stored_config
 from swath.daemon.processing.setup.models import gimbal_sources
 from swath.daemon.processing.setup.sources import Sources
 from swath.drivers.driver import UnknownProtocolError, find_driver
-from swath.drivers.parser import DeviceSettings, DriverSettingsError, Parser
+from swath.drivers.parser import DriverSettingsError, Parser
 from swath.georef.arrays import FloatArray, StructArray
 from swath.georef.navigation.inputs import ARM_UNSAID_M, GRADES, ImuNoise, Setup, imu_noise
 from swath.georef.stream.clocks import ClockPlan, DevicePlan
@@ -103,8 +103,9 @@ class NavigationSources:
 
     @property
     def imu_is_in_receiver(self) -> bool:
-        """True if the IMU is inside the receiver, which makes an INS of it."""
-        return self.imu.transport == f"gnss:{self.gnss_name}"
+        """True if the IMU is inside the receiver, or the receiver in the IMU, which makes an INS of both."""
+        inside = self.gnss is not None and self.gnss.transport == f"imu:{self.imu_name}"
+        return inside or self.imu.transport == f"gnss:{self.gnss_name}"
 
     @property
     def noise_by_grade(self) -> dict[str, float]:
@@ -139,7 +140,7 @@ class NavigationSources:
                 continue
             source = f"{kind}/{name}"
             try:
-                settings = DeviceSettings(source, plain_table(table), self._files(name, table), compiled=True)
+                settings = self.config.settings_with(kind, name, table, self._files, compiled=True)
                 made[source] = find_driver(kind, table.protocol).make_parser(settings)
             except UnknownProtocolError as error:
                 raise ConfigError(f"{kind}.{name}.protocol: {error}") from error

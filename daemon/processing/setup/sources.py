@@ -9,13 +9,13 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from swath.daemon.config.config import PARSER_FILES, Config, DeviceTable, attachment_name, plain_table
+from swath.daemon.config.config import PARSER_FILES, Config, DeviceTable, attachment_name
 from swath.daemon.config.tables import GnssConfig, ImuConfig
 from swath.daemon.errors import ConfigError
 from swath.daemon.log.format import SessionInfo
 from swath.daemon.processing.setup.models import gimbal_sources
 from swath.drivers.driver import Driver, UnknownProtocolError, find_driver
-from swath.drivers.parser import DeviceKind, DeviceSettings, DriverSettingsError, Parser
+from swath.drivers.parser import DeviceKind, DriverSettingsError, Parser
 from swath.georef.arrays import FloatArray, StructArray
 from swath.georef.geodesy.rotations import attitude_of, rot_l_from_b
 from swath.georef.records import InsSolution, NamesEdge
@@ -85,12 +85,12 @@ class Sources:
         return None if pps is None else pps.edge
 
     def inside(self, source: str) -> list[str]:
-        """Return sources whose messages are in a wire's bytes: its own, and an IMU or INS inside a
-        receiver's stream.
+        """Return sources whose messages are in a wire's bytes: its own, an IMU or INS inside a receiver's stream, a
+        receiver inside an IMU's.
         """
-        kind, _, name = source.partition("/")
-        within = [f"imu/{imu}" for imu, table in self.config.imu.items() if table.transport == f"gnss:{name}"]
-        return [source, *(within if kind == "gnss" else [])]
+        transport = source.replace("/", ":", 1)
+        tables = self.config.device_tables()
+        return [source, *(f"{kind}/{name}" for kind, name, table in tables if table.transport == transport)]
 
     def parsers(self, kinds: tuple[DeviceKind, ...], *, whole: bool = False) -> dict[str, Parser]:
         """Return new parsers of these kinds of sources, by source.
@@ -111,7 +111,7 @@ class Sources:
             if kind == "gnss" and not wanted and driver.make_time_parser is not None:
                 make = driver.make_time_parser
             try:
-                made[source] = make(DeviceSettings(source, plain_table(table), self.files(name, table), compiled=True))
+                made[source] = make(self.config.settings_with(kind, name, table, self.files, compiled=True))
             except DriverSettingsError as error:
                 raise ConfigError(f"{kind}.{name}: {error}") from error
         return made
@@ -128,7 +128,7 @@ class Sources:
             make = self._driver("scanner", name, table).make_time_parser
             try:
                 if make is not None:
-                    made[source] = make(DeviceSettings(source, plain_table(table), self.files(name, table)))
+                    made[source] = make(self.config.settings_with("scanner", name, table, self.files))
             except DriverSettingsError as error:
                 raise ConfigError(f"scanner.{name}: {error}") from error
         return made

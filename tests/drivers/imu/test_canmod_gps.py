@@ -113,15 +113,29 @@ def test_gnss_records_match_cantools(expected: Expected, tmp_path: Path) -> None
         assert time.time.time_ns % 1_000_000_000 == 0, "its second votes"
     fixes = [record for record in records if isinstance(record, GnssFix)]
     positions = [signals for message, signals in theirs if message == "gnss_pos"]
+    altitudes = [signals for message, signals in theirs if message == "gnss_altitude"]
     assert len(fixes) == len(positions)
-    for fix, position in zip(fixes, positions, strict=True):
+    for fix, position, altitude in zip(fixes, positions, altitudes, strict=True):
         assert fix.lat_rad == pytest.approx(np.radians(position["Latitude"]), abs=1e-15)
         assert fix.lon_rad == pytest.approx(np.radians(position["Longitude"]), abs=1e-15)
-        assert fix.height_m is None
+        assert fix.height_m == altitude["Altitude"]
+        assert fix.position_cov_l is not None
+        assert fix.position_cov_l[2, 2] == altitude["AltitudeAccuracy"] ** 2
+        assert 2.0 * fix.position_cov_l[0, 0] == pytest.approx(position["PositionAccuracy"] ** 2)
         assert fix.fix_type is FixType.SINGLE
-    altitudes = [signals["Altitude"] for message, signals in theirs if message == "gnss_altitude"]
     status = [r.values["altitude_m"] for r in records if isinstance(r, DeviceStatus) and r.message == "gnss_altitude"]
-    assert status == altitudes
+    assert status == [altitude["Altitude"] for altitude in altitudes]
+
+
+def test_a_position_without_a_valid_altitude_after_it_has_no_height(tmp_path: Path) -> None:
+    units = [unit for unit in candump_units(RECORDINGS[0].name, tmp_path) if unit[:4] != b"\x04\0\0\0"]
+    fixes = [record for record in parse(units, CanmodGpsParser(SETTINGS)) if isinstance(record, GnssFix)]
+    assert len(fixes) == RECORDINGS[0].gnss
+    assert all(fix.valid and fix.height_m is None for fix in fixes)
+    parser = CanmodGpsParser(SETTINGS)
+    last = max(n for n, unit in enumerate(units) if unit[:4] == b"\x03\0\0\0")
+    found = sum(isinstance(record, GnssFix) for record in parse(units[: last + 1], parser))
+    assert (found, len(parser.close())) == (RECORDINGS[0].gnss - 1, 1)
 
 
 @pytest.mark.parametrize("expected", RECORDINGS, ids=lambda expected: expected.name)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from swath.drivers.driver import find_driver
+from swath.drivers.driver import STREAM_TRANSPORTS, find_driver
 from swath.drivers.framing.framer import Framer
 from swath.drivers.framing.kinds import XBUS, XBUS_MAX_DATA_BYTES
 from swath.drivers.imu import xsens_xbus as xbus
@@ -420,5 +420,5 @@ def test_increments_need_the_rate() -> None:
 
 def test_the_driver_is_registered() -> None:
     driver = find_driver("imu", "xsens-xbus")
-    assert driver.transports == ("serial",)
+    assert driver.transports == STREAM_TRANSPORTS
     assert driver.make_time_parser is make_time_parser
