@@ -193,7 +193,7 @@ def _casters() -> Target:
         with (
             theirs,
             patch.object(socket, "create_connection", lambda *_: ours),
-            patch.object(ntrip_client, "_KEEPALIVE", ()),
+            patch.object(ntrip_client, "keep_alive", lambda _: None),
         ):
             theirs.sendall(data)
             theirs.shutdown(socket.SHUT_WR)

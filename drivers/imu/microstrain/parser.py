@@ -20,7 +20,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from swath.drivers.driver import STREAM_TRANSPORTS, Driver
+from swath.drivers.driver import STREAM_TRANSPORTS, Driver, receiver_inside
 from swath.drivers.framing.framer import Frame, Framer
 from swath.drivers.framing.kinds import NMEA
 from swath.drivers.gnss.date_floor import read_date_floor, week_of
@@ -340,16 +340,15 @@ def make_time_parser(settings: DeviceSettings) -> MicrostrainParser:
     return MicrostrainParser(settings, wanted=(TimeMessage,))
 
 
-DRIVERS = (
-    Driver(
-        protocol="microstrain",
-        kind="imu",
-        transports=STREAM_TRANSPORTS,
-        yields=(ImuSamples, InsSolution, TimeMessage, GnssFix, EventMark, DeviceStatus),
-        summary="MicroStrain (LORD, HBK) by MIP: sensor, filter, receiver and system data",
-        make_parser=MicrostrainParser,
-        make_time_parser=make_time_parser,
-        names_edge=NamesEdge.PREVIOUS,
-        startup=startup_messages,
-    ),
+UNIT = Driver(
+    protocol="microstrain",
+    kind="imu",
+    transports=STREAM_TRANSPORTS,
+    yields=(ImuSamples, InsSolution, TimeMessage, GnssFix, EventMark, DeviceStatus),
+    summary="MicroStrain (LORD, HBK) by MIP: sensor, filter, receiver and system data",
+    make_parser=MicrostrainParser,
+    make_time_parser=make_time_parser,
+    names_edge=NamesEdge.PREVIOUS,
+    startup=startup_messages,
 )
+DRIVERS = (UNIT, receiver_inside(UNIT))

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from swath.drivers.driver import STREAM_TRANSPORTS, Driver
+from swath.drivers.driver import STREAM_TRANSPORTS, Driver, receiver_inside
 from swath.drivers.framing.framer import Frame, Framer
 from swath.drivers.framing.kinds import NMEA
 from swath.drivers.gnss.date_floor import read_date_floor, week_of
@@ -385,16 +385,15 @@ def make_time_parser(settings: DeviceSettings) -> VectornavParser:
     return VectornavParser(settings, wanted=(TimeMessage,))
 
 
-DRIVERS = (
-    Driver(
-        protocol="vectornav",
-        kind="imu",
-        transports=STREAM_TRANSPORTS,
-        yields=(ImuSamples, InsSolution, TimeMessage, GnssFix, DeviceStatus),
-        summary="VectorNav VN-100 to VN-x10: binary output, any groups and fields; IMU, INS, GNSS, time",
-        make_parser=VectornavParser,
-        make_time_parser=make_time_parser,
-        names_edge=NamesEdge.PREVIOUS,
-        startup=startup_messages,
-    ),
+UNIT = Driver(
+    protocol="vectornav",
+    kind="imu",
+    transports=STREAM_TRANSPORTS,
+    yields=(ImuSamples, InsSolution, TimeMessage, GnssFix, DeviceStatus),
+    summary="VectorNav VN-100 to VN-x10: binary output, any groups and fields; IMU, INS, GNSS, time",
+    make_parser=VectornavParser,
+    make_time_parser=make_time_parser,
+    names_edge=NamesEdge.PREVIOUS,
+    startup=startup_messages,
 )
+DRIVERS = (UNIT, receiver_inside(UNIT))
