@@ -244,9 +244,9 @@ def _hesai_layouts(sample: Sequence[bytes]) -> list[np.dtype[np.void]]:
 
 
 def tail_of(datagrams: Sequence[bytes]) -> Callable[[bytes], bytes]:
-    """Return what seals a changed datagram again: the checksum that the recorded ones are seen to hold, if any: at their
-    end, the two within those of a Hesai head, or in the header of a Livox head.
-    """
+    """Return what seals a changed datagram again: the checksum that the recorded datagrams hold, if any.
+
+    It is at their end, within them (the two of a Hesai head), or in the header (a Livox head).
     """
     sample = [datagram for datagram in datagrams[:8] if len(datagram) > 16]
     for dtype in _hesai_layouts(sample):
