@@ -24,19 +24,20 @@ NOUN_MAY_BEGIN = {"property", "cached_property", "setter"}
 FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 VERBS = set(
     """
-    abandon accept accumulate add adjust adopt advance allocate append apply ask assert begin bind boot bridge build
-    calibrate call carry change check choose classify clear climb close collect combine compare compile complete
-    compress compute concatenate connect convert copy correct count create cut decide decode decompress derive
-    describe detect determine distribute divide do double draw drop encode end enlarge estimate evaluate examine
-    expand export fail feed fill filter find finish fit flatten flush fly follow forget format forward free fuzz
-    georeference give go group grow handle have hold ignore import improve initialise insert install interpolate
-    invert iterate join judge keep label lay learn leave let limit link list listen load locate lock log look lower
-    make map mark measure merge move multiply name navigate normalise note number open overwrite pack parse pass
-    place plan play post predict prepare print process propagate provide put queue raise rank read receive recognise
-    record redirect reduce refit refuse register release remove rename repair repeat replace replay report request
-    restore return rotate run sample save say scale scan search select send set shift show skip smooth solve sort
-    split spread start steer step stop store style sum summarise switch sync take tell terminate test thin transform
-    truncate try turn unpack update use validate view wait wake warm watch whiten widen wire work wrap write yield
+    abandon accept accumulate act add adjust adopt advance allocate append apply ask assert begin bind boot bridge
+    build calibrate call carry change check choose classify clear climb close collect combine compare compile
+    complete compress compute concatenate connect convert copy correct count create cut decide decode decompress
+    derive describe detect determine discard distribute divide do double draw drop encode end enlarge estimate
+    evaluate examine expand export fail feed fill filter find finish fit flatten flush fly follow forget fork format
+    forward free fuzz georeference give go group grow handle have hold ignore import improve initialise insert
+    install interpolate invert iterate join judge keep label lay learn leave let limit link list listen load locate
+    lock log look lower make map mark measure merge mount move multiply name navigate normalise note number open
+    overwrite pack parse pass place plan play post predict prepare print process propagate provide put queue raise
+    rank read receive recognise record redirect reduce refit refuse register release remove rename repair repeat
+    replace replay reply report request restore return rotate run sample save say scale scan search select send
+    serve set shift show skip smooth solve sort split spread start steer step stop store style sum summarise switch
+    sync take tell terminate test thin transform truncate try turn unpack unplug update use validate view wait wake
+    warm watch whiten widen wire work wrap write yield
 """.split()
 )
 

@@ -113,7 +113,7 @@ def scanner(port: int, options: str = "") -> str:
 
 
 class Numbers:
-    """Send numbered datagrams to one port, from one processor, so that their order is kept."""
+    """A sender of numbered datagrams to one port, from one processor, so that their order is kept."""
 
     def __init__(self, port: int) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -151,7 +151,7 @@ source = "fixed:{fifo}"
 
 
 class Pty:
-    """Open a serial port whose other end the test holds; the link is the device's name under udev."""
+    """A serial port whose other end the test holds; the link is the device's name under udev."""
 
     def __init__(self, link: Path) -> None:
         self.master, self.slave = os.openpty()

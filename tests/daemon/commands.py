@@ -61,7 +61,7 @@ def _starter() -> Starter:
 
 
 class Starter:
-    """The process that forks, and the line to it."""
+    """The process that forks, and the pipe to it."""
 
     def __init__(self) -> None:
         self._process = subprocess.Popen(
@@ -128,7 +128,7 @@ def become(arguments: list[str], environment: dict[str, str], says_to: list[str]
 
 
 def at_phase(phase: str, act: Callable[[], None]) -> None:
-    """Act each time that the work tells of a phase that begins so; "": never."""
+    """Act each time that the work reports a phase that begins with `phase`; never if it is empty."""
     tell = Display.tell
 
     def acting(display: Display, what: str, *state: Any) -> None:

@@ -19,7 +19,7 @@ ENTRY_POINT = "[can.interface]\nfaulty = tests.daemon.faulty_can:FaultyBus\n"
 
 
 class FaultyBus(can.BusABC):
-    """The bus that python-can opens."""
+    """A bus that python-can opens by its plugin interface."""
 
     def __init__(self, channel: str, **keywords: Any) -> None:
         if Path(channel + ".off").exists():

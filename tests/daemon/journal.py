@@ -10,7 +10,7 @@ from swath.daemon.log.events import Severity
 
 
 class Said(NamedTuple):
-    """Line of an event."""
+    """An event as one line of the journal."""
 
     severity: Severity
     source: str
@@ -19,7 +19,7 @@ class Said(NamedTuple):
 
 
 def journal_of(caplog: pytest.LogCaptureFixture) -> list[Said]:
-    """The events since the test began, in order; of severity info where the test has set that level."""
+    """Return the events since the test began, in order; those of severity info only if the test set that level."""
     found = []
     for record in caplog.records:
         if (record.name, record.msg) == ("swath", "%s %s: %s") and isinstance(record.args, tuple):

@@ -15,7 +15,7 @@ from swath.daemon.log.reader import open_logs
 
 @dataclass
 class LogContent:
-    """Raw units by source, JSON messages by topic, in file order."""
+    """Raw units by source and JSON messages by topic, in file order."""
 
     units: dict[str, list[tuple[int, bytes]]] = field(default_factory=lambda: defaultdict(list))
     messages: dict[str, list[tuple[int, dict[str, Any]]]] = field(default_factory=lambda: defaultdict(list))
@@ -31,7 +31,10 @@ class LogContent:
 
 
 def read_log(*paths: Path) -> LogContent:
-    """Everything in logs or a directory of them, with our reader; every status is checked against what precedes it."""
+    """Read everything in logs or a directory of them with our reader.
+
+    Every status is checked against the units that precede it.
+    """
     content = LogContent()
     seen: Counter[str] = Counter()
     for session in open_logs(list(paths)):
@@ -62,7 +65,7 @@ def check_status(topic: str, value: dict[str, Any], seen: Counter[str]) -> None:
 
 
 def official_counts(path: Path) -> Counter[str]:
-    """Messages by topic, with the official reader checking CRCs, seeking by the index."""
+    """Count messages by topic, with the official reader, which checks CRCs and seeks by the index."""
     counts: Counter[str] = Counter()
     with path.open("rb") as file:
         for _, channel, _ in make_reader(file, validate_crcs=True).iter_messages():

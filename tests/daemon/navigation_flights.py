@@ -26,13 +26,13 @@ SMOOTHER_SIGMA = np.array([0.003, 0.003, 0.005]), np.array([0.004, 0.004, 0.005]
 
 
 def reference_truth() -> Array:
-    """Rows of the survey flight's truth."""
+    """Return rows of the survey flight's truth."""
     truth: Array = flight_arrays("tactical")["truth"]
     return truth
 
 
 def solution(sigmas: Any, errors: tuple[Array, ...], truth: Array, innovations: Array) -> Solution:
-    """The truth with errors (n, 3) of position (n, e, d), velocity and attitude."""
+    """Return the truth with errors (n, 3) of position (north, east, down; m), velocity (m/s) and attitude (rad)."""
     t, lat_deg, lon_deg, height_m = truth[:, 1:5].T
     time_ns = WEEK * WEEK_S * SECOND_NS + np.rint(t * 1e3).astype(np.int64) * 1_000_000
     lat, lon = np.radians(lat_deg), np.radians(lon_deg)
@@ -74,7 +74,7 @@ def solution(sigmas: Any, errors: tuple[Array, ...], truth: Array, innovations: 
 
 
 def innovations_of(truth: Array, random: np.random.Generator) -> Array:
-    """A position and a velocity each second, honest and white."""
+    """Return a position and a velocity innovation each second, white and as large as predicted."""
     seconds = np.arange(np.ceil(truth[0, 1]), truth[-1, 1])
     rows = np.zeros(2 * len(seconds), INNOVATION_DTYPE)
     base_ns = WEEK * WEEK_S * SECOND_NS

@@ -49,7 +49,7 @@ range_offset_m = 0.35
 
 @dataclass(frozen=True)
 class Flown:
-    """A flight's folder and what is in it."""
+    """A flight's folder and its contents."""
 
     folder: Path
 
@@ -74,7 +74,7 @@ class Flown:
         return self.folder / "truth.sbet"
 
     def trajectory(self) -> Trajectory:
-        """The true trajectory with sigmas, as a table."""
+        """Return the true trajectory with sigmas, as a table."""
         truth = self.truth
         n = len(truth["trajectory.gps_ns"])
         return Trajectory.from_geodetic(
@@ -91,7 +91,7 @@ class Flown:
         )
 
     def arguments(self, output: Path, *more: str, log: Path | None = None) -> list[str]:
-        """`swath georef` with the truth."""
+        """Return the arguments of `swath georef` with the truth."""
         given = ["georef", str(log or self.log), "-o", str(output), "--crs", "EPSG:32632", "--trajectory-datum", "same"]
         given += ["--trajectory", str(self.sbet), "--calibration", str(self.folder / "left.true.toml")]
         return [*given, *([] if "--workers" in more or "--scheduler" in more else ["--workers", "1"]), *more]

@@ -17,13 +17,12 @@ Reply = Callable[[bytes], bytes]
 
 
 class Receiver:
-    """A serial device: takes commands as long as the line runs at its rate, answers them, and talks all the time.
-
+    """A serial device that accepts commands at its own rate, answers them, and sends data all the time.
     Args:
         split: cuts one whole command off the front of what came; (command, rest), or None.
-        reply: what a command is answered.
-        chatter: what it says between its answers.
-        speed: the rate it speaks at (termios constant); None: any. ``reply`` may change it.
+        reply: returns the answer to a command.
+        chatter: what it sends between its answers.
+        speed: its rate (termios constant); None: any. ``reply`` may change it.
     """
 
     def __init__(
@@ -97,7 +96,10 @@ def split_ubx(data: bytes) -> tuple[bytes, bytes] | None:
 
 
 def ubx_acknowledges(refuses: str = "", silent: str = "") -> Reply:
-    """UBX-ACK-ACK by pyubx2 to each UBX-CFG-VALSET; -NAK, or nothing, to one that sets a key with this in its name."""
+    """Return a reply that acknowledges each UBX-CFG-VALSET with UBX-ACK-ACK, encoded by pyubx2.
+
+    A command that sets a key with `refuses` in its name gets -NAK, with `silent` nothing.
+    """
 
     def reply(command: bytes) -> bytes:
         keys = " ".join(vars(UBXReader.parse(command, msgmode=SET)))

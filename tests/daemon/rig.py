@@ -154,10 +154,10 @@ class Recorder:
 
     @contextlib.contextmanager
     def stopped_thread(self, name: str) -> Iterator[None]:
-        """One thread stands still, as before a disk that does not answer; the others go on.
+        """Stop one thread, as before a disk that does not answer, while the others go on.
 
-        Where it was stopped it may hold the interpreter's lock, and everything would stand still: then it is let go
-        and stopped again elsewhere.
+        Where it was stopped it may hold the interpreter's lock, which would stop everything: then it is released and
+        stopped again elsewhere.
         """
         libc = ctypes.CDLL(None, use_errno=True)
         attach, detach, wait_all = 16, 17, 0x40000000
@@ -178,7 +178,7 @@ class Recorder:
             libc.ptrace(detach, thread, None, None)
 
     def _others_go_on(self) -> bool:
-        """True if the main thread still reports its status each second."""
+        """Return True if the main thread still reports its status each second."""
         before = self.notify.count("STATUS")
         deadline = time.monotonic() + 2.5
         while time.monotonic() < deadline:
@@ -201,7 +201,7 @@ def session_table(directory: Path, **keys: object) -> str:
 
 @contextlib.contextmanager
 def disk_of(folder: Path, size_mb: int) -> Iterator[Path]:
-    """A file system of its own and of that size, at a folder that is made."""
+    """Mount a separate file system of that size at a new folder."""
     if os.geteuid() != 0:
         pytest.fail("this test mounts a tmpfs: run it as root")
     folder.mkdir()

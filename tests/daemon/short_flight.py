@@ -103,7 +103,7 @@ def two_lines(
 
 @contextmanager
 def marking() -> Iterator[None]:
-    """While this lasts virtual NovAtel receivers stamp an event some time after each whole second."""
+    """Let virtual NovAtel receivers stamp an event some time after each whole second."""
     plain = NovatelMessages.epoch
 
     def epoch(self: NovatelMessages, epochs: Any, row: int) -> list[bytes]:

@@ -29,7 +29,7 @@ TICKS = 10_000_000  # of the scanner's counter, a second
 
 @dataclass(frozen=True)
 class Unit:
-    """Unit of a source."""
+    """A unit of a source."""
 
     time_s: float
     source: str
@@ -54,10 +54,9 @@ class Clock:
 
 class Standin:
     """A flight of so many seconds.
-
     Args:
-        pulled: (source, from, to) when nothing comes.
-        silent: the same, and the wire stays plugged in.
+        pulled: (source, from, to) when nothing comes and the wire is unplugged.
+        silent: the same, but the wire stays plugged in.
     """
 
     sources = SOURCES
@@ -92,7 +91,7 @@ class Standin:
             yield Unit(second + 1e-6, "pps/main", b"")
 
     def _receiver(self) -> Iterator[Unit]:
-        """TIME, which names the edge before, cut into two reads."""
+        """Yield TIME messages, which name the previous edge, cut into two reads."""
         for second in range(int(self.duration_s)):
             body = Time(0, 0.0, 1e-9, -18.0, 2026, 6, 15, 9, second // 60, 1000 * (second % 60), 1)
             frame = encode_log("TIME", body, WEEK, 1000 * (MONDAY_S + second))
@@ -109,7 +108,7 @@ class Standin:
             yield Unit(0.01 * (place // each + 1) + 1e-4 * (place % each), "imu/main", frame.tobytes())
 
     def _datagrams(self) -> Iterator[Unit]:
-        """Twenty pulses a hundredth of a second, two returns each."""
+        """Yield a datagram of twenty pulses each hundredth of a second, with two returns each."""
         for number in range(round(100 * self.duration_s)):
             first = TICKS // 100 * number
             second = first // TICKS
@@ -155,7 +154,7 @@ def vanish() -> tuple[Standin, dict[str, bytes]]:
 
 
 def aircraft_config(folder: Path, changes: dict[str, str] | None = None) -> Config:
-    """The configuration of the fixtures, with its files, in a folder."""
+    """Write the fixtures' configuration with its files to a folder, and load it."""
     folder.mkdir(parents=True, exist_ok=True)
     for name in ("imu.dbc", "left.toml"):
         (folder / name).write_bytes((AIRCRAFT.parent / name).read_bytes())

@@ -36,7 +36,7 @@ def test_configurations_and_plans_are_read_by_their_byte_order_mark(tmp_path: Pa
 
 @pytest.mark.parametrize("content", [b"\x89\xff", b"\xff\xfea\x00b", b"caf\xe9"])
 def test_a_file_that_is_not_text_is_refused_in_one_line(tmp_path: Path, content: bytes) -> None:
-    """Two bytes of nothing, UTF-16 that ends within a letter, and Latin-1."""
+    """The files are two meaningless bytes, UTF-16 that ends within a letter, and Latin-1."""
     file = tmp_path / "control.csv"
     file.write_bytes(content)
     with pytest.raises(UserError) as refused:

@@ -32,7 +32,7 @@ def repeating(job: Callable[[int], None], period_s: float = 0.05) -> Iterator[No
 
 @contextmanager
 def pty(send: Callable[[int], bytes] | None = None) -> Iterator[str]:
-    """A serial device that sends something again and again; its path."""
+    """Open a serial device that sends repeatedly, and yield its path."""
     main, secondary = os.openpty()
     tty.setraw(secondary)
     os.set_blocking(main, False)
@@ -54,7 +54,7 @@ def pty(send: Callable[[int], bytes] | None = None) -> Iterator[str]:
 
 @contextmanager
 def udp_sender(port: int, send: Callable[[int], bytes]) -> Iterator[None]:
-    """Datagrams to a port of this computer."""
+    """Send datagrams repeatedly to a port of this computer."""
     with socket(AF_INET, SOCK_DGRAM) as sender, repeating(lambda n: _send(sender, port, send(n)), 0.01):
         yield
 
@@ -65,7 +65,7 @@ def _send(sender: socket, port: int, data: bytes) -> None:
 
 @contextmanager
 def tcp_server(send: Callable[[int], bytes] | None = None) -> Iterator[int]:
-    """A device that serves a TCP port, which is yielded, and sends something again and again to who is connected."""
+    """Serve a TCP port as a device does, send repeatedly to every client, and yield the port."""
     with create_server(("127.0.0.1", 0)) as server:
         server.setblocking(False)
         peers: list[socket] = []

@@ -52,7 +52,7 @@ def arguments(made: Made, output: Path, *more: str) -> list[str]:
 
 
 def loops() -> set[str]:
-    """Of calib, those that this process has compiled or read from the cache, with the types they are for."""
+    """Return calib's loops that this process has compiled or read from the cache, with their types."""
     modules = [module for name, module in sys.modules.items() if name.startswith("swath.calib.")]
     known = [one for module in modules for one in vars(module).values() if isinstance(one, Dispatcher)]
     return {f"{one.py_func.__qualname__} {types}" for one in known for types in one.overloads}
@@ -220,7 +220,7 @@ def test_calibration_of_a_navigated_flight_matches_the_sigmas_of_the_plan(
 
 
 def test_control_outside_the_points_is_refused(made: Made, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Two points, too few to be doubted as a whole."""
+    """Two points are too few for the software to doubt their coordinates as a whole."""
     lines = (made.flown.folder / "control.csv").read_text().splitlines()
     points = [line.split(",") for line in lines[1:]]
     control = tmp_path / "control.csv"
@@ -232,7 +232,7 @@ def test_control_outside_the_points_is_refused(made: Made, tmp_path: Path, capsy
 
 
 def picked(made: Made, path: Path) -> Path:
-    """Forty places on roofs and ground, as the strips' points show them with the calibration to start from."""
+    """Write forty places on roofs and ground, as the strips' points show them with the start calibration."""
     flight, truth = made.flight, made.at_truth()
     mapping = Mapping("EPSG:25832", datum="same")
     mapping.settle(flight.frame.origin_e[np.newaxis])
@@ -264,7 +264,7 @@ def test_points_picked_before_the_calibration_fit_after_it(
 
 
 def first_strips(made: Made, count: int, folder: Path) -> tuple[str, str]:
-    """The option for the first of the strips only."""
+    """Return the option that selects the first strips only."""
     strips = folder / "strips.csv"
     spans = [f"{int(swath.time_ns[0])},{int(swath.time_ns[-1])}" for swath in made.flight.swaths[:count]]
     strips.write_text("\n".join(["start_gps_ns,end_gps_ns", *spans]) + "\n")
@@ -274,7 +274,7 @@ def first_strips(made: Made, count: int, folder: Path) -> tuple[str, str]:
 def test_an_unusable_trajectory_makes_the_calibration_unusable(
     made: Made, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Say it first, and in the file, from which whatever is made with the calibration has it."""
+    """The verdict is printed first and written to the file, which passes it on to everything made with it."""
     file, output = tmp_path / "flight.csv", tmp_path / "left.toml"
     file.write_bytes((made.flown.folder / "true_trajectory.csv").read_bytes())
     judge_unusable(file, "the lever arm has another sign")
@@ -359,7 +359,7 @@ def test_a_model_file_can_request_the_correction_by_intensity(
 def test_undetermined_tables_of_a_model_are_held_and_reported(
     by_intensity: Made, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """No return is so bright, almost none is a second one, and all are in one zone."""
+    """No return is as bright as the last knot, almost none is a second one, and all are in one zone."""
     tables = "[ibrc]\nknots = [500, 1000, 2500, 60000]\n[range_offset]\nreturn_slots = [2]\nmta_zones = [0]\n"
     told, found = asked(by_intensity, tmp_path, capsys, f'model = "basic"\n{tables}')
     held = {one["name"]: one for one in told["held"] if one["why"] != "held by your choice"}

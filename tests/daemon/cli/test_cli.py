@@ -180,7 +180,7 @@ class TestErrors:
 
 
 def _has_open(pid: int, path: Path) -> bool:
-    """True if a process has opened the file."""
+    """Return True if a process has opened the file."""
     folder = Path(f"/proc/{pid}/fd")
     links = [os.path.realpath(link) for link in folder.iterdir()] if folder.exists() else []
     return os.path.realpath(path) in links

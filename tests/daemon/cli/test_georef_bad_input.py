@@ -46,7 +46,7 @@ for_s = 60.0
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
-    """Twelve seconds of one line; for one of them every datagram is damaged."""
+    """Fly twelve seconds of one line, in one of which every datagram is damaged."""
     folder = tmp_path_factory.mktemp("bad")
     plan = folder / "line.toml"
     plan.write_text(PLAN.replace("[-1000.0, -80.0]", "[-300.0, -80.0]").replace("[1000.0, -80.0]", "[300.0, -80.0]"))
@@ -116,7 +116,7 @@ def test_files_of_a_directory_that_are_not_logs_are_skipped(
 
 
 def refused_alone(flown: Flown) -> dict[str, int]:
-    """What a parser refuses that is given all of the log's datagrams at once."""
+    """Return what a parser refuses if it is given all of the log's datagrams at once."""
     (session,) = open_logs([flown.log])
     parser = Setup.of_log(session.attachments(), Options(datum="same")).sources.parsers(("scanner",))["scanner/left"]
     for batch in session.batches(lambda topic: topic.startswith("/scanner/left")):

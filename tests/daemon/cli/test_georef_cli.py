@@ -109,7 +109,7 @@ class TestProducts:
         assert np.abs(one.xyz - other.xyz).max() <= 0.001 + 1e-9
 
     def test_an_attitude_about_the_plumb_line_is_converted_to_the_ellipsoid(self, flown: Flown, tmp_path: Path) -> None:
-        """Compare with the matrix of FORMULAS 1.8 (headings are geodetic) applied to the true body."""
+        """The reference is the matrix of FORMULAS 1.8 (headings are geodetic), applied to the true body."""
         xi, eta = np.radians(np.array([100.0, -70.0]) / 3600)
         config = tmp_path / "plumb.toml"
         text = (flown.folder / "swath.toml").read_text()
@@ -169,7 +169,7 @@ class TestProducts:
 
 class TestStrips:
     def times(self, flown: Flown, path: Path, *spans_s: tuple[float, float]) -> Path:
-        """A file of strips, in seconds since the first return."""
+        """Write a file of strips from spans in seconds since the first return."""
         first = int(flown.truth["left.gps_ns"][0])
         lines = [f"{first + round(start * S)},{first + round(end * S)}" for start, end in spans_s]
         path.write_text("\n".join(["start_gps_ns,end_gps_ns", *lines]))

@@ -43,7 +43,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
 
 
 def made_of(flown: Flown, output: Path, *more: str) -> dict[str, Any]:
-    """The sidecar of a run over two strips, which is partial."""
+    """Return the sidecar of a run over two strips, which is partial."""
     config, strips = str(flown.folder / "swath.toml"), str(flown.folder / "halves.csv")
     arguments = flown.arguments(output, "--config", config, "--strips", strips, *more)
     arguments[arguments.index("--trajectory") + 1] = str(flown.folder / "short.csv")

@@ -22,7 +22,7 @@ STAGE = '[scanner.left.gimbal]\nstages = [{{ source = "{source}", lever_arm_m = 
 
 
 def fly(folder: Path, *, ins: bool) -> Flown:
-    """Twelve seconds of one line; the configuration that lies beside the log says a gimbal."""
+    """Fly twelve seconds of one line, and write a gimbal into the configuration beside the log."""
     plan = folder / "line.toml"
     text = PLAN.replace("[-1000.0, -80.0]", "[-300.0, -80.0]").replace("[1000.0, -80.0]", "[300.0, -80.0]")
     plan.write_text(text + ("\n[gnss.rover]\nins = true\n" if ins else ""))
@@ -36,7 +36,7 @@ def fly(folder: Path, *, ins: bool) -> Flown:
 
 
 def through_the_gimbal(flown: Flown) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
-    """(n, 3) in e: where the beams would have gone, turned by the aircraft's own roll, pitch and heading once more."""
+    """Return (n, 3), m, in e: where the beams would meet if the gimbal turned them by the aircraft's attitude again."""
     truth = flown.truth
     at_s = (truth["trajectory.gps_ns"] - truth["left.gps_ns"][0]) / 1e9
     of_s = (truth["left.gps_ns"] - truth["left.gps_ns"][0]) / 1e9

@@ -40,7 +40,7 @@ def plan(seed: int, half_m: float, norths_m: tuple[float, float]) -> str:
 
 
 def true_of_another_flight(folder: Path) -> Trajectory:
-    """At the same time over the same land, along longer lines and with a wider turn to the other side."""
+    """Return a trajectory at the same time over the same land, with longer lines and a wider turn to the other side."""
     folder.mkdir()
     other = parse_plan(plan(6, 800.0, (100.0, -300.0)), folder)
     VirtualFlight(other, open_truth(other, folder / "truth.npz")).finish_truth()
@@ -133,7 +133,7 @@ def test_unusable_points_are_accepted_with_the_users_override(
 
 @pytest.fixture(scope="module")
 def points(judged: Judged, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Strips that agree, made with a trajectory that somebody called unusable."""
+    """Make strips that agree, with a trajectory that was declared unusable."""
     output = tmp_path_factory.mktemp("points")
     assert run_app(judged.georef(output, trajectory="judged")) == ExitCode.PROBLEM
     assert sidecar(output)["verdict"]["level"] == "not to be used"
@@ -203,7 +203,7 @@ def test_every_command_refuses_a_trajectory_of_another_place(
 def test_a_forced_trajectory_of_another_place_gives_a_warning(
     judged: Judged, command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """All strips are moved alike there, so only this warning reveals it."""
+    """All strips are displaced alike there, so only this warning reveals the error."""
     capsys.readouterr()
     assert run_app([*on_log(judged, command, tmp_path / "out", "away"), "--force-trajectory"]) == 0
     told = [line for line in capsys.readouterr().out.splitlines() if ELSEWHERE in line]

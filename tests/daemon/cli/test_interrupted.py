@@ -162,7 +162,7 @@ def test_info_ends_in_one_word(flown: Flown, place: Path) -> None:
 
 @pytest.mark.slow
 def test_worker_processes_and_compiling_end_at_a_real_ctrl_c(flown: Flown, tmp_path: Path) -> None:
-    """The terminal sends the signal to the whole group; on a new installation all of them compile."""
+    """The terminal sends the signal to the whole process group; on a new installation all of them compile."""
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
     arguments = [*flown.arguments(tmp_path / "out"), "--workers", "2", "--strips", "whole"]
     command = [sys.executable, "-m", "swath.daemon.cli.main", *arguments]
@@ -250,7 +250,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 def test_a_disk_that_gets_full_is_told_in_one_line_and_nothing_is_left(
     command: str, phase: str, flown: Flown, products: Path, small_disk: Path
 ) -> None:
-    """Others fill the disk while the command works; it has compared room and need before."""
+    """Other programs fill the disk during the work, after the command has compared free and needed space."""
     out, plan = small_disk / "out", flown.folder.parent / "line.toml"
     given = ["--trajectory", flown.sbet, "--trajectory-datum", "same", "--workers", "1"]
     arguments: dict[str, list[object]] = {

@@ -35,7 +35,7 @@ SHORT = (
 
 
 def flown_by(folder: Path, beside_utc_s: float) -> Flown:
-    """A flight of 8 s whose head stamps nanoseconds since 1970 on a scale so many seconds beside UTC."""
+    """Return a flight of 8 s whose head counts nanoseconds since 1970, `beside_utc_s` ahead of UTC."""
 
     def ticks(clock: HeadClock, time_s: FloatArray) -> Int64Array:
         return UNIX_NS + np.floor((np.asarray(time_s) + beside_utc_s) * 1e9).astype(np.int64)

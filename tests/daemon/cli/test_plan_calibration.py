@@ -100,7 +100,7 @@ def sigmas_of(told: Any) -> dict[str, float]:
 
 
 def test_lines_over_a_village_determine_the_boresight(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Sigmas of an honest size, a picture of one page."""
+    """The sigmas have realistic sizes, and the picture has one page."""
     plan, picture = plan_of(tmp_path, more=VILLAGE), tmp_path / "plan.png"
     planned(plan, picture)
     told = json.loads(capsys.readouterr().out)
@@ -119,7 +119,7 @@ def test_lines_over_a_village_determine_the_boresight(tmp_path: Path, capsys: py
 
 
 def test_sigmas_follow_the_expected_trajectory_accuracy(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """With half the trajectory's sigmas, hardly more than half."""
+    """Half the trajectory's sigmas give hardly more than half the calibration's."""
     plan, picture = plan_of(tmp_path, more=VILLAGE), tmp_path / "plan.png"
     found = []
     for sigmas in ("0.02,0.004,0.01", "0.01,0.002,0.005"):
@@ -143,7 +143,7 @@ def test_sigmas_follow_the_expected_trajectory_accuracy(tmp_path: Path, capsys: 
 def test_sigmas_follow_the_noise_of_the_imu(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], noise: str, worse: dict[str, float]
 ) -> None:
-    """Not by its grade alone: single figures of the plan count, too."""
+    """Single figures of the plan count, not only the IMU's grade."""
     picture, found = tmp_path / "plan.png", []
     for more in ("", f"[imu.main.noise]\n{noise}\n"):
         with contextlib.suppress(UserError):
@@ -191,10 +191,10 @@ def test_without_a_receiver_the_trajectory_follows_the_grade(
 def test_opposite_lines_over_flat_ground_determine_roll_alone(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Pitch, heading and range are declared not determinable, each with what to fly. Control gives the range.
+    """Pitch, heading and range are declared undeterminable, each with what to fly; control determines the range.
 
-    With few returns: a body that pitches in gusts tells its scanner's pitch by heights, to 0.005° with so good a unit
-    and all that 100 kHz give.
+    There are few returns: a body that pitches in gusts shows its scanner's pitch by heights, to 0.005° with so good a
+    unit and all returns of 100 kHz.
     """
     plan, picture = plan_of(tmp_path, OPPOSITE, grade="navigation", prf_hz=10_000.0), tmp_path / "plan.pdf"
     with pytest.raises(UserError, match=r"does not determine pitch \(φ\), heading \(κ\) and range offset\.") as ended:
@@ -217,7 +217,7 @@ def test_two_lines_do_not_separate_roll_from_the_levelling_of_a_poor_imu(tmp_pat
 
 
 def test_a_poor_imu_is_reported_before_the_flight(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The same lines with a MEMS unit: its attitude is too poor for these sigmas."""
+    """A MEMS unit's attitude on the same lines is too poor for these sigmas."""
     with pytest.raises(UserError, match="does not determine"):
         planned(plan_of(tmp_path, more=VILLAGE, grade="mems"), tmp_path / "plan.svg")
     told = json.loads(capsys.readouterr().out)

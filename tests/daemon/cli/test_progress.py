@@ -25,7 +25,7 @@ AFTER_S = 5.0
 
 
 class Clock:
-    """A clock that stands still until it is told to go on."""
+    """A clock that stands still until the test advances it."""
 
     def __init__(self) -> None:
         self.now_s = 100.0
@@ -167,7 +167,7 @@ def test_compiling_is_told_once_with_the_time_it_took(capsys: pytest.CaptureFixt
 
 @pytest.mark.parametrize("command", ["info", "recover", "export", "offload"])
 def test_commands_for_the_aircraft_do_not_load_the_compiler(tmp_path: Path, command: str) -> None:
-    """Loading it takes minutes where the recorder leaves little of the processor, and no loop of them is compiled."""
+    """Loading takes minutes where the recorder leaves little of the processor, and these commands compile no loop."""
     logs, out = tmp_path / "logs", tmp_path / "out"
     logs.mkdir()
     out.mkdir()

@@ -116,7 +116,7 @@ LARGE = f"{INFO.session_id}_2.mcap"
 
 @pytest.fixture
 def recovering(logs: Path) -> Iterator[subprocess.Popen[str]]:
-    """A process that stands still in the middle of a recovery."""
+    """Start a process and stop it in the middle of a recovery."""
     write_part(logs / LARGE, part=2, blocks=1200, finish=False)
     command = [sys.executable, "-m", "swath.daemon.cli.main", "recover", str(logs / LARGE)]
     process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
@@ -154,7 +154,7 @@ def test_remains_of_a_killed_recovery_are_replaced(logs: Path, recovering: subpr
 
 
 def test_of_many_simultaneous_recoveries_only_one_runs(logs: Path) -> None:
-    """A claim is of an open file, so threads stand for processes; a copy that was left behind is in everybody's way."""
+    """A claim belongs to an open file, so threads can stand for processes; a left-behind copy is in everybody's way."""
     copy = logs / CUT.replace(".mcap", ".recovered.mcap")
     for _ in range(20):
         copy.with_name(copy.name + ".part").write_bytes(b"left behind")
@@ -191,7 +191,7 @@ def test_the_copy_has_the_owner_and_permissions_of_the_log(logs: Path, mode: int
 
 
 class Said(Events):
-    """Events that were reported."""
+    """Events that keep the codes reported."""
 
     def __init__(self) -> None:
         self.codes: list[str] = []

@@ -295,7 +295,7 @@ def test_a_plan_is_drawn_and_summarised(plan: str, tmp_path: Path, capsys: pytes
 
 
 class Noted(Output):
-    """Output that accepts everything and records what arrived when, and that it was closed."""
+    """Output that accepts everything and notes what arrived when, and that it was closed."""
 
     def __init__(self, notes: list[tuple[str, bytes, int]], name: str) -> None:
         self._notes, self._name = notes, name
@@ -323,8 +323,6 @@ def ahead() -> Iterator[Callable[..., Ahead]]:
 
 
 class TestFlightInAnotherProcess:
-    """Flight computed by another process."""
-
     def test_the_same_units_arrive_in_the_same_order(self, ahead: Callable[..., Ahead]) -> None:
         one = ahead(make_standin, 5.0, ((1.0, 60.0),), (("gnss/rover", 2.0, 3.0),))
         facts = FlightFacts(5.0, SOURCES, ((1.0, 60.0),), (("gnss/rover", 2.0, 3.0),), {"README.md": b"none"})

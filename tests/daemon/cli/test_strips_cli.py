@@ -72,7 +72,7 @@ def products(
     up_m: float = 0.0,
     of_week: Sequence[int] = (),
 ) -> Path:
-    """A flight's points as a folder of `swath georef`: LAZ a strip, trajectory, sidecar.
+    """Write a flight's points as a folder of `swath georef`: LAZ for each strip, trajectory, sidecar.
 
     Strips ``of_week`` have the seconds of the GPS week, as other programs write them.
     """
@@ -154,7 +154,7 @@ def test_the_page_begins_with_the_verdict_and_shows_strips_pairs_and_the_map(tmp
 def test_the_console_has_verdict_strips_and_the_ten_worst_pairs(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Six strips over one slope, each 1 cm above the one before: 15 pairs."""
+    """Six strips over one slope, each 1 cm above the previous one, have 15 pairs."""
     folder = tmp_path / "six"
     folder.mkdir()
     x, y = lattice(EAST_M, NORTH_M, 120.0, 50.0, 0.5)
@@ -238,7 +238,7 @@ def test_a_wrong_roll_is_named_and_is_a_problem(made: Cast, tmp_path: Path, caps
 
 @pytest.mark.slow
 def test_a_flight_and_its_files_give_the_same_differences(made: Cast, tmp_path: Path) -> None:
-    """Both ways to the same differences: arrays in t, and LAZ in a projection."""
+    """One way uses arrays in t, the other LAZ in a projection."""
     of_flight = strips_of_flight("flight", made.flight, StripRules())
     of_files = strips_of_files([products(tmp_path / "p", made.flight)], StripRules(), lambda *_: None)
     numbers = [one.look.overlap.numbers() for one in (of_flight, of_files)]
@@ -253,7 +253,7 @@ def test_a_flight_and_its_files_give_the_same_differences(made: Cast, tmp_path: 
 def test_every_command_gives_the_same_figure_and_level_for_one_cloud(
     made: Cast, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """`calibrate`, the map of its report, `strips` and `view`; coordinates of files are rounded to 0.1 mm."""
+    """These are `calibrate`, the map of its report, `strips` and `view`; coordinates of files are rounded to 0.1 mm."""
     mapping = Mapping("EPSG:25832", datum="same")
     mapping.settle(made.flight.trajectories[0].position_e[:1])
     folder = products(tmp_path / "p", made.flight, mapping)
@@ -391,7 +391,7 @@ def test_incomparable_files_are_refused_in_one_line(what: str, tmp_path: Path) -
 
 
 def logged(name: str, installation: str) -> Any:
-    """A flight as logged, as far as its installation goes."""
+    """Return a stand-in for a logged flight that only has an installation."""
     profile = SimpleNamespace(installation=installation)
     return SimpleNamespace(log=Path(name), setup=SimpleNamespace(config=SimpleNamespace(profile=profile)))
 

@@ -280,7 +280,7 @@ def test_a_given_attitude_is_in_degrees() -> None:
 
 
 def test_post_processed_positions_improve_the_trajectory(flown: Flown, made: Path, tmp_path: Path) -> None:
-    """They replace the receiver's; errors shrink, the sigmas with them, and all are counted."""
+    """They replace the receiver's; errors and sigmas shrink, and all of them are counted."""
     truth = flown.truth()
     file = tmp_path / "ppk.pos"
     file.write_text(post_processed(truth, truth.span))

@@ -35,7 +35,7 @@ PLAN = two_lines("raw", gnss="rate_hz = 2")
 
 @contextmanager
 def raw_measurements() -> Iterator[None]:
-    """While this lasts virtual receivers put out raw measurements alone, and chrony keeps the host's wall clock."""
+    """Let virtual receivers send raw measurements only, and chrony discipline the host's wall clock."""
     encode = JsonChannel.encode
 
     def epoch(self: NovatelMessages, epochs: Any, row: int) -> list[bytes]:
@@ -63,7 +63,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
 
 
 def without_receiver(flown: Flown) -> Path:
-    """The configuration without its receiver."""
+    """Write the configuration without its receiver, and return its path."""
     text = (flown.folder / "swath.toml").read_text()
     first = text.index("[gnss.rover]")
     after = text.index("\n[", first)
@@ -73,7 +73,7 @@ def without_receiver(flown: Flown) -> Path:
 
 
 def trajectory(folder: Path, flown: Flown, *arguments: str) -> tuple[dict[str, Any], Trajectory]:
-    """Summary and SBET of a run."""
+    """Return summary and SBET of a run."""
     given = ["--gnss", str(flown.folder / "ppk.pos"), "--no-page", *arguments]
     assert run_app(["trajectory", str(flown.log), "-o", str(folder / "a.sbet"), *given]) == 0
     told: dict[str, Any] = json.loads((folder / "a.json").read_text())
@@ -130,7 +130,7 @@ def test_a_lever_arm_without_a_position_file_is_refused(
 
 
 def test_stretches_without_time_are_reported_with_begin_and_end() -> None:
-    """1000 samples at 100 Hz: the first 100, 60 in the middle and the last 2 s are not placed; 30 are too few."""
+    """Of 1000 samples at 100 Hz, the first 100, 60 in the middle and the last 2 s have no time; 30 are too few."""
     host_ns = np.arange(1000) * S // 100 + 5 * S
     placed = np.ones(1000, np.bool_)
     placed[:100] = placed[400:460] = placed[600:630] = placed[800:] = False

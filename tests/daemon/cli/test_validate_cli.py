@@ -44,7 +44,7 @@ def run(*arguments: str) -> None:
 def file_of(
     path: Path, calibration: Calibration, month: int = 1, *, sigma_deg: float = 0.001, place: str = PLACE
 ) -> Path:
-    """A calibration file of the boresight."""
+    """Write a calibration file of the boresight."""
     sigmas = np.zeros(len(INDEX))
     sigmas[[INDEX["omega_rad"], INDEX["phi_rad"], INDEX["kappa_rad"]]] = np.radians(sigma_deg)
     header = Header(path.stem, dt.datetime(2026, month, 1, tzinfo=dt.UTC), method="planes", installation=place)
@@ -114,7 +114,7 @@ def made() -> Cast:
 
 @pytest.fixture
 def log(made: Cast, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """A log that reads as the made flight, placed with the calibrations that are validated."""
+    """Return a log that is read as the made flight, placed with the calibrations that are validated."""
     path = tmp_path / "flight.mcap"
     path.write_bytes(b"bytes of a log")
 
@@ -194,7 +194,7 @@ def test_the_log_used_for_the_calibration_is_not_independent(
 
 
 def record_beside(path: Path, calibration_id: str) -> Path:
-    """A record as `swath calibrate` leaves it: of a validation it knows nothing."""
+    """Write a record as `swath calibrate` writes it: without any result of a validation."""
     methods = ("CA_GeometryValidation.validationMethod", "CA_GeometryValidation.validationTime")
     values = {"CA_CalibrationValidation.calibrationType": Value("inFlight")}
     path.write_text(record_json(Record(calibration_id, values, (*methods, "CA_GNSS.numberSatellites"))))
@@ -298,7 +298,7 @@ def test_control_heights_above_the_geoid_are_refused(log: Path, made: Cast, tmp_
 
 
 def test_check_points_are_counted_in_the_record(log: Path, made: Cast, tmp_path: Path) -> None:
-    """Those that the laser met."""
+    """Only points that the laser reached are counted."""
     control, file = tmp_path / "control.csv", file_of(tmp_path / "c1.toml", boresight(0.0))
     given = control_of(made, control)
     record_beside(tmp_path / "left.record.json", "c1")

@@ -24,7 +24,7 @@ PICTURES = ("height", "differences", "profile", "density", "intensity", "sigma")
 
 
 class Page(HTMLParser):
-    """What a browser would see: rows of tables, sources of pictures, tags that were left open."""
+    """What a browser would see: rows of tables, sources of pictures, tags left open."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -61,7 +61,7 @@ class Page(HTMLParser):
 
 @pytest.fixture(scope="module")
 def products(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two strips, the second 7 cm higher, with sigmas and a sidecar that lists them."""
+    """Write two strips, the second 7 cm higher, with sigmas and a sidecar that lists them."""
     folder = tmp_path_factory.mktemp("products")
     for number, (south_m, lift_m) in enumerate([(0.0, 0.0), (30.0, 0.07)], start=1):
         x, y = lattice(EAST_M, NORTH_M + south_m, 120.0, 50.0, 0.5)

@@ -44,7 +44,7 @@ def expected_lines(path: Path) -> list[str]:
 
 
 def _shortened(lines: list[str], expected: list[str]) -> list[str]:
-    """The lines, cut where an expected one ends in …: what follows is another library's wording."""
+    """Return lines cut where an expected one ends in …, because the rest is another library's wording."""
     begins = [line.removesuffix("…") for line in expected if line.endswith("…")]
     return [next((f"{begin}…" for begin in begins if line.startswith(begin)), line) for line in lines]
 
@@ -117,7 +117,7 @@ class TestWholeFile:
             parse_config(with_session('fsync_s = "2"'), tmp_path / "a.toml")
 
     def test_loading_a_configuration_imports_no_heavy_module(self) -> None:
-        """No DBC configured: no cantools; and never what georeferencing needs."""
+        """No DBC is configured, so cantools is not needed either; georeferencing is never needed."""
         code = (
             "import sys; from pathlib import Path; from swath.daemon.config import parse_config; "
             'parse_config(\'[session]\\nname="x"\\n[scanner.left]\\ntransport="udp:0.0.0.0:2368"\\n'
@@ -352,7 +352,7 @@ class TestDevices:
         assert next(config.devices()).settings.files == {"geometry": b"{}"}
 
     def test_a_parser_can_be_made_from_the_attachments_of_a_log(self, tmp_path: Path) -> None:
-        """An Ouster head's metadata goes into every log."""
+        """An Ouster head's metadata is attached to every log."""
         metadata = (ROOT / "fixtures/ouster/crc_test.json").read_bytes()
         (tmp_path / "os0.json").write_bytes(metadata)
         text = with_session(
@@ -371,7 +371,7 @@ class TestDevices:
 
 
 class TestPage:
-    """docs/configuration.md and the models say the same."""
+    """docs/configuration.md and the models agree."""
 
     PAGE = (ROOT / "docs/configuration.md").read_text()
 
@@ -392,7 +392,7 @@ class TestPage:
 
 
 def _findings(table: dict[str, Any]) -> list[str]:
-    """What is wrong with a table; where nothing is, its devices must be usable."""
+    """Return what is wrong with a table; if nothing is, check that its devices are usable."""
     try:
         config = validate(table, AIRCRAFT, "")
     except ConfigError as error:
@@ -403,7 +403,7 @@ def _findings(table: dict[str, Any]) -> list[str]:
 
 
 def _sections(model: type[BaseModel], prefix: str) -> dict[str, type[BaseModel]]:
-    """Section names as the page writes them, and their models."""
+    """Return section names as the page writes them, and their models."""
     found: dict[str, type[BaseModel]] = {}
     for key, field in model.model_fields.items():
         inner = _model_in(field.annotation)
@@ -438,7 +438,7 @@ def _page_row(page: str, section: str, key: str) -> str:
 
 
 def _absent_keys(model: type[BaseModel], table: dict[str, object], prefix: str) -> list[str]:
-    """Keys of the models that a file does not use."""
+    """Return keys of the models that a file does not use."""
     absent: list[str] = []
     for key, field in model.model_fields.items():
         if key not in table:

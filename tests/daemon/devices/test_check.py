@@ -63,7 +63,7 @@ def srep_datagram(sequence: int, pps_count: int = 3) -> bytes:
 
 @contextmanager
 def pps_fifo(path: Path, spacing_ns: int = 1_000_000_000) -> Iterator[str]:
-    """A FIFO with edges, faster than real ones so that a test need not wait; their stamps say the spacing."""
+    """Make a FIFO whose edges come faster than real ones, to save time, but have stamps at the real spacing."""
     os.mkfifo(path)
     fd = os.open(path, os.O_RDWR | os.O_NONBLOCK)
     start_ns = time.time_ns() // 1_000_000_000 * 1_000_000_000
@@ -109,7 +109,7 @@ class TestWorkingDevices:
         assert reports["scanner/left"].time == "PPS seen"
 
     def test_both_ports_of_a_real_head_are_one_device(self, tmp_path: Path) -> None:
-        """A VLP-16 locked to its PPS, which only the position packets say, on a port of their own."""
+        """The VLP-16 is locked to its PPS, which only the position packets report, on their own port."""
         data, position = free_udp_port(), free_udp_port()
         recorded = list(read_pcap(ROOT / "fixtures/velodyne/mrpt_vlp16_gps.pcap.gz"))
         streams = [[unit.data for unit in recorded if len(unit.data) == length] for length in (1206, 512)]
@@ -155,7 +155,7 @@ class TestWorkingDevices:
         assert note == said
 
     def test_a_head_whose_lock_cannot_be_known_is_reported(self, tmp_path: Path) -> None:
-        """The same head with its data port alone: auxiliary is named; a configured clock is named instead."""
+        """The head's data port is alone: the report recommends `auxiliary`, or names the clock if one is configured."""
         data = free_udp_port()
         recorded = list(read_pcap(ROOT / "fixtures/velodyne/mrpt_vlp16_gps.pcap.gz"))
         packets = [unit.data for unit in recorded if len(unit.data) == 1206]
@@ -171,7 +171,7 @@ class TestWorkingDevices:
         assert 'clock = "utc-hour"' in configured
 
     def test_a_head_is_read_by_the_metadata_beside_the_configuration(self, tmp_path: Path) -> None:
-        """An OS0 and its own IMU, on two ports."""
+        """The head is an OS0 with its own IMU, on two ports."""
         lidar, imu = free_udp_port(), free_udp_port()
         capture = ROOT / "fixtures/ouster/crc_test.pcap.gz"
         metadata = (ROOT / "fixtures/ouster/crc_test.json").read_text()
@@ -193,7 +193,7 @@ class TestWorkingDevices:
         assert reports["scanner/roof"].records["ImuSamples"] == reports["scanner/roof/aux"].units > 0
 
     def test_an_imu_inside_a_gnss_stream_is_checked_on_the_same_wire(self, tmp_path: Path) -> None:
-        """A NovAtel SPAN recording: one wire, two devices."""
+        """A NovAtel SPAN recording carries two devices on one wire."""
         data = (ROOT / "fixtures/novatel/ins1.gps").read_bytes()
         imu = '[imu.main]\ntransport = "gnss:rover"\nprotocol = "novatel"\n'
         with pty(lambda number: data[number * 2000 % len(data) :][:2000]) as path:
@@ -290,7 +290,7 @@ class TestOtherProtocols:
         assert report.problems == [f"sends {answers_as}, but {configured} is configured"]
 
     def test_a_real_recording_of_another_scanner_is_named(self, tmp_path: Path) -> None:
-        """A VLP-16, where a line scanner is configured."""
+        """A VLP-16 sends where a line scanner is configured."""
         port = free_udp_port()
         recorded = [unit.data for unit in read_pcap(ROOT / "fixtures/velodyne/nebula_vlp16.pcap.gz")]
         with udp_sender(port, lambda number: recorded[number % len(recorded)]):
@@ -341,7 +341,7 @@ class TestOtherProtocols:
     def test_a_head_of_another_model_is_named_despite_an_identical_second_port(
         self, recording: str, answers_as: str, tmp_path: Path
     ) -> None:
-        """Velodyne's position packets are the same for all models: here they come while the data is another's."""
+        """Velodyne's position packets are the same for all models, but the data packets are another model's."""
         data, position = free_udp_port(), free_udp_port()
         recorded = [unit.data for unit in read_pcap(ROOT / "fixtures" / recording)]
         text = (
@@ -371,7 +371,7 @@ class TestOtherProtocols:
 
 
 class TestCan:
-    """A real CANmod.gps recording on a bus of its own."""
+    """A real CANmod.gps recording is sent on its own bus."""
 
     @pytest.fixture
     def port(self) -> Iterator[int]:
@@ -400,7 +400,7 @@ class TestCan:
 
     @pytest.mark.parametrize(("tick_hz", "rate"), [(1_000_000, None), (10_000, 100.0), (100_000_000, 0.01)])
     def test_a_counter_in_the_wrong_unit_is_reported(self, tick_hz: int, rate: float | None, tmp_path: Path) -> None:
-        """An MTi whose SampleTime is in microseconds; the maker's documents say two units."""
+        """The MTi's SampleTime is in microseconds, but its documents state two different units."""
         port = free_udp_port()
         with can.Bus(interface="udp_multicast", channel=GROUP, port=port, ignore_config=True) as bus:
 
@@ -441,7 +441,7 @@ class TestTime:
         assert report.time == "not valid"
 
     def test_a_receiver_in_local_time_is_reported_and_not_refused(self, tmp_path: Path) -> None:
-        """The receiver is two hours east of UTC, beside a clock that is set and not synchronised."""
+        """The receiver is two hours east of UTC; the computer's clock is set but not synchronised."""
 
         def local(_: int) -> bytes:
             now = dt.datetime.now(dt.UTC) + dt.timedelta(hours=2)
@@ -493,7 +493,7 @@ class TestComputer:
         assert bitrate_problems(spec, None) == []
 
     def test_a_receive_buffer_that_is_not_granted_is_reported(self, tmp_path: Path) -> None:
-        """In a process without the right to force it, as the service is."""
+        """The process may not force the buffer's size, like the service."""
         config = tmp_path / "swath.toml"
         port = free_udp_port()
         text = srep(port).replace("buffer_mb=1", "buffer_mb=1023")

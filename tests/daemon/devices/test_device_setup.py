@@ -61,7 +61,7 @@ def outcomes(device: DeviceSetup) -> list[Outcome]:
 
 
 def outcome_of(device: DeviceSetup, part: str) -> tuple[str, str]:
-    """Outcome of the one message with a text in it, and the device's answer."""
+    """Return the outcome of the only message that contains a text, and the device's answer."""
     (step,) = [step for step in device.steps if any(part in line for line in step.message.lines)]
     return step.outcome, step.answer
 

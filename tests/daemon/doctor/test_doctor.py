@@ -248,7 +248,7 @@ def test_permissions_are_judged_as_by_the_kernel(tree: Tree, mode: int, uid: int
 
 
 def _kernel_lets(path: Path, user: devices.User) -> bool:
-    """True if a process of that user can open the file."""
+    """Return True if a process of that user can open the file."""
     folder = os.open(path.parent, os.O_PATH)
     words = [sys.executable, "-c", OPEN_AS, str(folder), path.name, str(user.uid), *map(str, sorted(user.gids))]
     try:
@@ -353,7 +353,7 @@ def test_kernel_modules_needed_by_a_configuration_are_listed(tmp_path: Path) -> 
 
 
 def test_this_computer_is_judged_by_its_own_files(tmp_path: Path) -> None:
-    """The command itself, on the real files: each wrong finding can be mended, its verdict is the files' own."""
+    """The command reads the real files: each wrong finding has a remedy, and the verdict is that of the files."""
     config = tmp_path / "swath.toml"
     config.write_text(
         session_table(tmp_path / "logs")

@@ -38,7 +38,7 @@ def tree(tmp_path: Path) -> Tree:
     ],
 )
 def test_a_directive_overridden_later_has_no_effect(tree: Tree, files: dict[str, str]) -> None:
-    """chrony.conf(5): of a directive that stands there twice the last is effective."""
+    """By chrony.conf(5), the last of two equal directives is effective."""
     for path, text in files.items():
         write(tree, path, text)
     assert list(chrony_steps(tree)) == []

@@ -54,7 +54,7 @@ def write_config(folder: Path, text: str = CONFIG) -> Config:
 
 
 def write_log(folder: Path, config: Config, units: list[Unit], session: str = "made-20261121T101500Z-ab12") -> Path:
-    """A log with a message a unit, in this very order, as a recorder with this configuration describes them."""
+    """Write a log with one message for each unit, in this order, with the channels of a recorder's configuration."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{session}_0.mcap"
     first_ns = units[0][1] if units else 0
@@ -81,7 +81,7 @@ def write_log(folder: Path, config: Config, units: list[Unit], session: str = "m
 
 
 def content_of(*paths: Path) -> Content:
-    """By topic, in file order: log time, bytes and the channel's metadata of every raw unit and edge."""
+    """Return for each topic, in file order, log time, bytes and channel metadata of every raw unit and edge."""
     content: Content = defaultdict(list)
     for session in open_logs(list(paths)):
         for batch in session.batches(lambda topic: topic.endswith("/raw") or topic.startswith("/pps/")):
@@ -94,7 +94,7 @@ def content_of(*paths: Path) -> Content:
 def run_import(
     config: Config, files: list[Path], output: Path, told: ImportOptions | None = None
 ) -> tuple[ImportReport, list[Capture]]:
-    """An import within this process, and what was found in each file."""
+    """Import within this process, and return the report and what was found in each file."""
     routes = Routes.of(config)
     captures = find_captures(routes, files, told or ImportOptions())
     return import_captures(config, routes, captures, output), captures

@@ -80,7 +80,7 @@ class TestFiles:
         ]
 
     def test_datagrams_of_two_ports_are_merged_by_time_and_keep_their_own_order(self, tmp_path: Path) -> None:
-        """A log has them block by block. The stamps of a port that step back stay where they are."""
+        """A log has them block by block; the stamps of a port that step back stay where they are."""
         main, aux, second = "scanner/top", "scanner/top/aux", 10**9
         stamps = [(main, n * 10) for n in range(40)] + [(aux, n * 45 + 5) for n in range(8)]
         stamps += [(main, 400 + n * 10) for n in range(40)] + [(aux, 5 * second), (main, 5 * second + 1)]
@@ -114,7 +114,7 @@ class TestFiles:
         assert first.timestamp == pytest.approx(START_NS // 1000 / 1e6, abs=1e-6)
 
     def test_serial_bytes_are_one_stream_with_a_tag_for_each_read(self, exported: ExportReport) -> None:
-        """The tag's layout is written down in drivers/transports/rtklib_tag.py from RTKLIB's source."""
+        """The tag's layout is documented in drivers/transports/rtklib_tag.py from RTKLIB's source."""
         assert (exported.folder / "gnss-rover.gps").read_bytes() == b"\xaa\x44\x12rest"
         tags = (exported.folder / "gnss-rover.gps.tag").read_bytes()
         assert tags.startswith(b"TIMETAG RTKLIB")
@@ -195,7 +195,7 @@ def there_and_back(folder: Path, config: Config, units: list[Unit]) -> None:
 @settings(max_examples=50, deadline=None)
 @given(st.lists(ANY_UNIT, min_size=1, max_size=25))
 def test_any_log_is_restored_exactly(units: list[Unit]) -> None:
-    """Log timestamps that step back or exceed 2106, empty reads, frames without a candump line and unnamed senders."""
+    """These include timestamps that step back or exceed 2106, empty reads, non-candump frames and unnamed senders."""
     with tempfile.TemporaryDirectory() as folder:
         there_and_back(Path(folder), write_config(Path(folder)), units)
 
@@ -237,7 +237,7 @@ def parts_of(message: can.Message) -> tuple[int, bytes, bool, bool, bool]:
 
 @pytest.mark.slow
 def test_units_on_the_wire_are_exported_and_restored(tmp_path: Path) -> None:
-    """A real recorder: sentences on a pty, datagrams, frames, edges; its log exported, imported, and all compared."""
+    """A real recorder records sentences on a pty, datagrams, frames and edges; its log is exported and imported."""
     port, link, fifo = free_udp_port(), tmp_path / "rover", tmp_path / "pps"
     os.mkfifo(fifo)
     pty = Pty(link)
@@ -377,7 +377,7 @@ class TestCommand:
 @pytest.mark.long
 @pytest.mark.slow
 def test_memory_does_not_grow_with_the_log(tmp_path: Path) -> None:
-    """Files are read and written in a stream: four times the datagrams need no more memory."""
+    """Files are read and written as streams, so four times the datagrams need no more memory."""
     config = write_config(tmp_path)
     payloads = np.random.default_rng(1).integers(0, 256, (500, 1206), dtype=np.uint8)
     peaks: dict[str, list[int]] = {"import": [], "export": []}

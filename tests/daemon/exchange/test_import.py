@@ -45,7 +45,7 @@ HEAD = ("192.168.1.201", 2368)
 def write_pcap(
     path: Path, payloads: list[bytes], port: int = 2368, first_ns: int = START_NS, step_ns: int = 10**6
 ) -> Path:
-    """Datagrams of a head to a port, a step apart."""
+    """Write datagrams of a head to a port, one step apart."""
     data = FILE_HEADER
     for number, payload in enumerate(payloads):
         times = np.array([first_ns + number * step_ns], np.int64)
@@ -74,7 +74,7 @@ def test_progress_counts_the_bytes_read_of_files_as_they_are_on_the_disk(tmp_pat
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """One log of a scanner's, a bus's and a receiver's captures of different years."""
+    """Import captures of a scanner, a bus and a receiver, of different years, into one log."""
     folder = tmp_path_factory.mktemp("real")
     write_config(folder)
     result = swath(
@@ -149,8 +149,6 @@ class TestRealCaptures:
 
 
 class TestDeviceAssignment:
-    """Assignment of units to devices."""
-
     def test_units_are_assigned_by_port_sender_interface_or_name(self, tmp_path: Path) -> None:
         text = CONFIG.replace("udp:0.0.0.0:2368", "udp:0.0.0.0:2368?source=192.168.1.201")
         config = write_config(tmp_path, text)
@@ -202,7 +200,7 @@ class TestDeviceAssignment:
         assert "source_address" not in dict(units[-1][2])
 
     def test_two_heads_of_a_real_capture_are_distinguished_by_their_senders(self, tmp_path: Path) -> None:
-        """Both send to port 7502, in fragments; exported and imported again they are the same."""
+        """Both send to port 7502, in fragments; after export and import they are the same."""
         capture = FIXTURES / "captures" / "same_ports.pcap.gz"
         text = CONFIG.replace("udp:0.0.0.0:2368", "udp:0.0.0.0:7502")
         config = write_config(tmp_path, text)
@@ -280,7 +278,7 @@ class TestTimestamps:
 
 
 class TestSerialTimes:
-    """A serial stream says its times by a table, by RTKLIB's tags, or the user does."""
+    """The times of a serial stream come from a table, from RTKLIB's tags, or from the user."""
 
     def test_times_are_taken_from_rtklib_tags(self, tmp_path: Path) -> None:
         data = gzip.decompress(UBX.read_bytes())
@@ -299,7 +297,7 @@ class TestSerialTimes:
         ]
 
     def test_a_capture_of_rtklib_is_imported(self, tmp_path: Path) -> None:
-        """Nine minutes of an IMU on a serial line; CR, which upstream lost, is put back before each LF."""
+        """It has nine minutes of an IMU on a serial line; CR, which upstream lost, is restored before each LF."""
         data = gzip.decompress((RTKLIB / "imu_1934.csv.gz").read_bytes()).replace(b"\n", b"\r\n")
         (tmp_path / "imu_1934.csv").write_bytes(data)
         (tmp_path / "imu_1934.csv.tag").write_bytes(gzip.decompress((RTKLIB / "imu_1934.csv.tag.gz").read_bytes()))
@@ -357,10 +355,10 @@ class TestSerialTimes:
 
 
 class TestRefusals:
-    """Refusals of wrong input in one line with the documented exit code."""
+    """Wrong input is refused in one line, with the documented exit code."""
 
     def run(self, folder: Path, *arguments: str, text: str = CONFIG) -> tuple[int, str, dict[str, Any]]:
-        """Exit code, stderr and the JSON object of an import into ``logs``."""
+        """Return exit code, stderr and the JSON object of an import into ``logs``."""
         write_config(folder, text)
         result = swath("import", str(folder / "swath.toml"), *arguments, "-o", str(folder / "logs"), "--json")
         assert "Traceback" not in result.stderr
@@ -528,7 +526,7 @@ class TestRefusals:
 
 @pytest.mark.parametrize("row", ["0,5,3,2,010203", "0,5,3,?,", "0,5,3,0,", "1,5,2,0,010203"])
 def test_an_impossible_row_of_a_sidecar_is_reported(tmp_path: Path, row: str) -> None:
-    """The row marks an entry as neither native nor not, or has bytes that contradict its length."""
+    """The row's mark of native entries has an invalid value, or its bytes contradict its length."""
     with gzip.open(sidecar_of(tmp_path / "a.log"), "wt") as stream:
         stream.write(f"unit,time_ns,length,native,data\n{row}\n")
     with pytest.raises(CaptureDamageError, match="line 2: want unit,time_ns,length,native,data"):
@@ -538,7 +536,7 @@ def test_an_impossible_row_of_a_sidecar_is_reported(tmp_path: Path, row: str) ->
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["pcap", "candump", "rtklib", "table", "bytes", "sidecar"])
 def test_truncated_and_damaged_captures_never_break_an_import(tmp_path: Path, kind: str) -> None:
-    """Whatever is wrong, it is counted or refused in a line, and the log that is made is whole."""
+    """Any fault is counted or refused in one line, and the resulting log is whole."""
     config = write_config(tmp_path)
     rng = np.random.default_rng(5)
     folder = tmp_path / "captures"

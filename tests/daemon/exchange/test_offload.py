@@ -51,7 +51,7 @@ def state(folder: Path) -> dict[str, tuple[int, str]]:
 
 
 def coreutils_agree(folder: Path) -> int:
-    """How many files sha256sum(1) finds as the list says; strict about the list's form."""
+    """Return how many files sha256sum(1) finds correct; it is strict about the list's form."""
     command = ["sha256sum", "--check", "--strict", "SHA256SUMS"]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -69,7 +69,7 @@ def run_all(logs: Path, disk: Path, **options: Any) -> OffloadReport:
 
 
 def big_log(logs: Path) -> Path:
-    """A log too large to be copied in an instant: its content does not matter here."""
+    """Write a log that takes time to copy; its content does not matter."""
     path = logs / "big_0.mcap"
     block = os.urandom(BLOCK_BYTES)
     with path.open("wb") as file:
@@ -247,7 +247,7 @@ def test_a_log_left_open_by_a_crash_is_copied_and_reported(logs: Path, disk: Pat
 
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A file system of its own, of 8 MB."""
+    """Return a separate file system of 8 MB."""
     with disk_of(tmp_path / "small", 8) as folder:
         yield folder
 

@@ -42,7 +42,7 @@ print(json.dumps({
 
 @pytest.fixture
 def closed() -> Iterator[Path]:
-    """A folder that nobody but root may enter, with a log directory in it, where others can get at it."""
+    """Return a folder that only root may enter, with a log directory, in a place that others can reach."""
     with tempfile.TemporaryDirectory(dir="/tmp") as folder:
         Path(folder).chmod(0o755)
         closed = Path(folder) / "closed"

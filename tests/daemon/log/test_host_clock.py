@@ -25,7 +25,7 @@ HOUR = 3600 * SECOND
 
 
 def pair(seconds: float, step_ns: int = 0) -> ClockPair:
-    """The clocks so many seconds after the start, the wall clock stepped by ``step_ns``."""
+    """Return the clocks some seconds after the start, with the wall clock stepped by ``step_ns``."""
     elapsed = round(seconds * SECOND)
     return ClockPair(REALTIME_0 + elapsed + step_ns, MONOTONIC_0 + elapsed, 100)
 
@@ -86,7 +86,7 @@ def test_a_wide_bracket_is_not_taken_for_a_step(converter: StampConverter) -> No
 
 
 def test_a_timestamp_of_a_clock_stepped_on_and_back_uses_the_read_time(converter: StampConverter) -> None:
-    """Between two readings: no step is seen, and no unit comes an hour after it was read."""
+    """Both steps lie between two readings: no step is seen, but no unit is dated an hour after it was read."""
     stamps = np.array([host(0.9), host(0.95) + HOUR], dtype=np.int64)
     assert converter.convert_at(stamps, 2, pair(1.0)).tolist() == [host(0.9), host(1.0)]
     assert converter.ambiguous == 1

@@ -151,7 +151,7 @@ def test_a_recovered_file_is_accepted_by_the_doctor_and_supersedes_the_original(
 
 
 def test_a_tail_of_zeros_is_ignored(tmp_path: Path, whole: tuple[Path, Content]) -> None:
-    """What ext4 leaves after a power cut: the length is there, the bytes are not."""
+    """After a power cut ext4 leaves files whose length is right but whose bytes are zero."""
     data = whole[0].read_bytes()
     path = tmp_path / "zeros.mcap"
     path.write_bytes(data[:800_000] + bytes(len(data) - 800_000))

@@ -66,7 +66,7 @@ def scanned(data: bytes) -> tuple[int, list[Damage]]:
 
 
 def test_every_truncation_of_the_end_is_reported_and_repaired(tmp_path: Path, data: bytes) -> None:
-    """Nothing of the data is lost, but no other reader opens such a file by its index."""
+    """No data are lost, but no other reader opens such a file by its index."""
     end = records_of(data)[-1]
     assert end.opcode == DATA_END
     cuts = range(end.offset, len(data), 97)
@@ -103,7 +103,7 @@ def test_padding_after_the_end_is_reported(data: bytes) -> None:
 
 
 def test_a_wrong_record_head_between_chunks_hides_no_chunk(data: bytes) -> None:
-    """Flip every bit of every record head between chunks: all chunks are read, and unreadable bytes are reported."""
+    """Every bit of every record head between chunks is flipped; all chunks are read, unreadable bytes reported."""
     chunks, _ = scanned(data)
     outside = [one for one in records_of(data) if one.opcode not in (CHUNK, DATA_END)]
     for record in outside:
@@ -176,7 +176,7 @@ def test_overwritten_bytes_cost_only_the_chunks_they_touch(data: bytes, seed: in
 
 
 def test_false_chunk_heads_are_searched_quickly(data: bytes) -> None:
-    """Search garbage full of heads of 16 MB chunks: each is rejected by its head, and none is read."""
+    """The garbage is full of heads of 16 MB chunks: each is rejected by its head, and none is read."""
     false_head = struct.pack("<BQ", CHUNK, 16 << 20)
     chunk = next(one for one in records_of(data) if one.opcode == CHUNK)
 
@@ -246,7 +246,7 @@ def test_lost_messages_are_counted_exactly_if_the_end_is_intact(tmp_path: Path, 
 
 
 def test_a_log_being_recorded_is_read_without_complaint_and_not_recovered(tmp_path: Path) -> None:
-    """A copy of what is there so far would stand for the log when it is finished."""
+    """A copy of the content so far would be mistaken for the log when it is finished."""
     path = tmp_path / f"{INFO.session_id}_0.mcap"
     writer = PartWriter(path, INFO, 0)
     writer.add_channel(1, SCANNER_CHANNEL)
@@ -298,7 +298,7 @@ def test_a_part_left_empty_by_a_crash_does_not_affect_the_others(tmp_path: Path)
 
 
 def test_text_of_a_foreign_log_is_validated_and_escaped(tmp_path: Path) -> None:
-    """Try invalid JSON, invalid numbers, console markup and control characters."""
+    """The text has invalid JSON, invalid numbers, console markup and control characters."""
     path = tmp_path / "stranger.mcap"
     writer = PartWriter(path, INFO, 0)
     writer.add_channel(1, EVENTS_CHANNEL)
@@ -321,7 +321,7 @@ def test_text_of_a_foreign_log_is_validated_and_escaped(tmp_path: Path) -> None:
 
 
 def test_messages_whose_channel_was_lost_are_reported(tmp_path: Path) -> None:
-    """In a log of another writer the channel's record stands once, in the first chunk that uses it."""
+    """Another writer may write the channel's record only once, in the first chunk that uses it."""
     path = tmp_path / "other.mcap"
     with path.open("wb") as file:
         writer = Writer(file, chunk_size=2000, compression=CompressionType.NONE)
@@ -410,7 +410,7 @@ print(count, saved, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
 
 
 def test_a_log_of_any_length_is_read_and_recovered_in_little_memory(tmp_path: Path) -> None:
-    """A second is held to merge by time, here 24 MB, and a chunk or two."""
+    """Merging by time holds one second, here 24 MB, and a chunk or two."""
     path = tmp_path / "long.mcap"
     writer = PartWriter(path, INFO, 0)
     writer.add_channel(1, SCANNER_CHANNEL)

@@ -55,14 +55,14 @@ json.dump(told, sys.stdout)
 
 
 def log_of(*records: bytes, session: dict[str, str] | None = None) -> bytes:
-    """A file of our profile that begins as it should, with these records; it has no end."""
+    """Return a file of our profile with a correct beginning, these records and no end."""
     head = mcap.record(mcap.HEADER, mcap.text("swath") + mcap.text("stranger"))
     info = INFO.to_metadata(0) | (session or {})
     return mcap.MAGIC + head + mcap.record(mcap.METADATA, mcap.metadata("swath.session", info)) + b"".join(records)
 
 
 def chunk(*inner: bytes, compression: bytes = b"", claimed: int | None = None) -> bytes:
-    """A chunk of records, its CRC right."""
+    """Return a chunk of records with a correct CRC."""
     return mcap.record(mcap.CHUNK, mcap.chunk_body(b"".join(inner), compression, claimed))
 
 
@@ -95,7 +95,7 @@ def attachments_elsewhere() -> bytes:
 
 
 def lengths_and_counts() -> bytes:
-    """Lengths of strings, maps, data and records that nothing holds."""
+    """Return a log with lengths of strings, maps, data and records that exceed every limit."""
     huge = struct.pack("<I", 0xFFFF_FFFF)
     inner = [
         mcap.record(mcap.CHANNEL, struct.pack("<HH", 2, 0) + huge),
@@ -114,14 +114,14 @@ def lengths_and_counts() -> bytes:
 
 
 def lz4_bomb() -> bytes:
-    """A gigabyte in four megabytes, in chunks that say they hold less, as much as is read, and more."""
+    """Return a gigabyte in four megabytes, in chunks that state less, as much as is read, and more."""
     compressor = lz4.frame.LZ4FrameCompressor(block_size=lz4.frame.BLOCKSIZE_MAX4MB)
     stored = compressor.begin() + b"".join(compressor.compress(bytes(4 << 20)) for _ in range(256)) + compressor.flush()
     return log_of(*(claiming(b"lz4", stored, size) for size in (100, 30 << 20, 1 << 63)), GOOD)
 
 
 def zstd_bomb() -> bytes:
-    """The same by zstd; and a window of two gigabytes."""
+    """Return the same with zstd, and a window of two gigabytes."""
     compressor = zstandard.ZstdCompressor(level=1).compressobj()
     stored = b"".join(compressor.compress(bytes(4 << 20)) for _ in range(256)) + compressor.flush()
     wide = zstandard.ZstdCompressionParameters(window_log=31, enable_ldm=False)
@@ -137,7 +137,7 @@ def claiming(name: bytes, stored: bytes, size: int) -> bytes:
 
 
 def small_messages_that_unfold() -> bytes:
-    """A small file: tiny messages of two channels in turns, all of one time; zeros; events and one huge JSON."""
+    """Return a small log that unfolds: tiny alternating messages of one time, zeros, events and one huge JSON."""
     pair = message(1, START_NS, b"") + message(2, START_NS, b"")
     event = json.dumps({"severity": "x", "code": "mark"}).encode()
     events = b"".join(message(3, START_NS, event + b" " * at) for at in range(2)) * 2_000
@@ -151,7 +151,7 @@ def small_messages_that_unfold() -> bytes:
 
 
 def times_beyond_reason() -> bytes:
-    """Before 1970, in 1970, at the end of what 63 and 64 bits hold, in 2200, and edges that are none."""
+    """Return a log with times before 1970, in 1970, at the limits of 63 and 64 bits, in 2200, and invalid edges."""
     times = (0, 1, START_NS, YEAR_2200_NS, (1 << 63) - 1, -(1 << 63), -1, START_NS + 10**9)
     edges = (b"{}", b"[]", b"no", b'{"edge_time_ns":1e400}', b'{"edge_time_ns":-5}', b'{"edge_time_ns":%d}' % (1 << 70))
     return log_of(
@@ -162,7 +162,7 @@ def times_beyond_reason() -> bytes:
 
 
 def schemas_not_ours() -> bytes:
-    """One that is a stranger's, one that no record describes, two of one number."""
+    """Return a log with a foreign schema, one that no record describes, and two with the same number."""
     return log_of(
         chunk(
             mcap.record(mcap.SCHEMA, mcap.schema(1, "stranger.Thing", b'{"title":"Thing"}')),
@@ -206,7 +206,7 @@ def session_that_leads_elsewhere() -> bytes:
 
 
 def damage_without_end() -> bytes:
-    """Thousands of places, no two neighbours of which can be told as one."""
+    """Return a log with thousands of damaged places that cannot be reported as one."""
     bad = claiming(b"", b"abcd", 4)
     return log_of(*([bad, GOOD] * 2_500))
 
@@ -291,7 +291,7 @@ def write(tmp_path: Path, data: bytes) -> Path:
 
 
 def test_a_foreign_schema_is_recovered_with_its_messages(tmp_path: Path) -> None:
-    """The official reader finds the stranger's schema, by its name and text, with the copy's messages."""
+    """The official reader finds the foreign schema, by name and text, with the copy's messages."""
     report = recover(write(tmp_path, schemas_not_ours()))
     assert report.messages == {"/stranger/things": 1, "/gnss/rover/raw": 1, "/x/y": 1}
     assert report.recovered is not None
@@ -306,7 +306,7 @@ def test_a_foreign_schema_is_recovered_with_its_messages(tmp_path: Path) -> None
 
 
 def test_impossible_times_are_counted_and_the_other_messages_kept(tmp_path: Path) -> None:
-    """Two messages of each order of times have the sign bit; what is left is copied with the stamps it has."""
+    """Two messages of each order of times have the sign bit; the others are copied with their stamps."""
     path = write(tmp_path, times_beyond_reason())
     report = recover(path)
     said = [(damage.what, damage.messages) for damage in report.damage if damage.messages]
@@ -320,7 +320,7 @@ def test_impossible_times_are_counted_and_the_other_messages_kept(tmp_path: Path
 
 
 def test_a_channel_that_changes_its_topic_is_refused(tmp_path: Path) -> None:
-    """Its later messages are not put under the topic of the earlier ones, nor the other way round."""
+    """Its later messages do not appear under the earlier topic, nor the earlier ones under the later topic."""
     report = examine(write(tmp_path, channels_of_one_number()))
     assert report.messages == {"/gnss/rover/raw": 2}
     again = "channel 1 is described as '/imu/main/raw', before as '/gnss/rover/raw'"

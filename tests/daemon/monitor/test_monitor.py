@@ -63,7 +63,7 @@ def srep(sequence: int) -> bytes:
 
 @contextmanager
 def srep_sender(port: int, hz: float, left_out: Callable[[int], bool] = lambda sequence: False) -> Iterator[None]:
-    """Datagrams with a sequence number, some left out."""
+    """Send datagrams with a sequence number, leaving some out."""
     stop = threading.Event()
 
     def send() -> None:
@@ -91,7 +91,7 @@ def once(where: Path) -> tuple[int, dict[str, Any]]:
 
 
 def once_when(where: Path, fits: Callable[[dict[str, Any]], bool], what: str) -> tuple[int, dict[str, Any]]:
-    """The first time that the monitor says something: on a busy machine it comes later."""
+    """Return the monitor's first output that fits, which comes later on a busy machine."""
     said: list[tuple[int, dict[str, Any]]] = []
 
     def is_said() -> bool:
@@ -169,7 +169,7 @@ def test_sequence_gaps_and_damaged_messages_degrade_the_verdict(tmp_path: Path, 
 
 @pytest.mark.slow
 def test_a_device_inside_a_stream_is_decoded_from_it(tmp_path: Path, logs: Path) -> None:
-    """It has no units and no status of its own; what it is fed is its stream's."""
+    """It has no units and no status of its own; its parser receives the stream's bytes."""
     data = gzip.decompress(CAPTURE.read_bytes())[:200_000]
     config = session_table(logs) + ROVER.replace("nmea", "novatel")
     config += '[imu.main]\ntransport = "gnss:rover"\nprotocol = "novatel"\n'
@@ -230,7 +230,7 @@ def test_without_a_recording_monitor_exits_with_2_and_gives_the_reason(tmp_path:
 
 @pytest.mark.slow
 def test_a_recorder_stopped_at_the_reserve_is_not_recording(tmp_path: Path) -> None:
-    """A note waits for room, a new part is refused."""
+    """A note waits until there is space, and a new part is refused."""
     logs = tmp_path / "disk/logs"
     with (
         disk_of(tmp_path / "disk", 24) as disk,
@@ -299,7 +299,7 @@ def test_the_log_of_another_computer_is_judged_by_its_growth(
 
 @pytest.mark.slow
 def test_after_a_power_cut_and_restart_the_old_log_is_not_recording(tmp_path: Path, logs: Path) -> None:
-    """The sign of what is recorded outlives the recorder; the recorder of another boot has no lock to be seen."""
+    """The sign of the current recording outlives the recorder; a recorder of another boot has no visible lock."""
     with Recorder(tmp_path, session_table(logs)) as recorder:
         recorder.wait_said("session_started")
         time.sleep(1.5)
@@ -338,7 +338,7 @@ def units_of(follower: LogFollower) -> list[int]:
 
 @pytest.mark.slow
 def test_monitor_follows_parts_a_kill_and_a_restart(tmp_path: Path, logs: Path) -> None:
-    """What is followed is what is in the files, each unit once, in order."""
+    """The follower reads exactly what is in the files, each unit once, in order."""
     numbers = Numbers(free_udp_port())
     config = session_table(logs) + scanner(numbers.port)
     follower = LogFollower(logs, tail_s=60.0)
@@ -382,7 +382,7 @@ def test_monitor_follows_parts_a_kill_and_a_restart(tmp_path: Path, logs: Path) 
 
 
 def test_a_chunk_is_read_once_it_is_complete(tmp_path: Path) -> None:
-    """A log that grows by odd pieces gives what it gives when it is read at once."""
+    """A log that grows in odd pieces gives the same as when it is read at once."""
     whole, growing = tmp_path / f"{INFO.session_id}_0.mcap", tmp_path / "growing.mcap"
     write_part(whole)
     data = whole.read_bytes()
@@ -419,7 +419,7 @@ def test_a_damaged_chunk_is_counted_and_the_next_one_read(tmp_path: Path) -> Non
 
 
 def test_a_damaged_chunk_of_the_growing_log_degrades_the_verdict(tmp_path: Path) -> None:
-    """What the disk made of the log since is lost as well; the next session begins without."""
+    """Data that the disk lost since are missing as well; the next session begins without the fault."""
     path = tmp_path / f"{INFO.session_id}_0.mcap"
     write_part(path, finish=False)
     data = bytearray(path.read_bytes())
@@ -480,7 +480,7 @@ def test_an_expensive_parser_gets_only_a_share_of_the_time(tmp_path: Path) -> No
 @pytest.mark.long
 @pytest.mark.slow
 def test_memory_is_bounded_and_processor_load_is_low(tmp_path: Path, logs: Path) -> None:
-    """Over some 100 MB its memory stands still; it costs less than the recorder it looks at would notice."""
+    """Memory stays constant over some 100 MB, and the processor time is too small to disturb the recorder."""
     port = free_udp_port()
     with Recorder(tmp_path, session_table(logs, split_size_mb=16) + scanner(port)) as recorder:
         recorder.wait_said("device_opened")

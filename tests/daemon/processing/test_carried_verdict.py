@@ -58,7 +58,7 @@ def said_of(one: Calibration, source: str = "navigated", installation: str = "HB
 
 
 def test_a_nominal_calibration_is_unusable_and_states_the_possible_point_error() -> None:
-    """One degree about two axes: 100 m · √2 · π/180 = 2.47 m."""
+    """One degree about each of two axes gives 100 m · √2 · π/180 = 2.47 m."""
     for one in (nominal("left", [0.0, 0.0, 0.0], np.eye(3)), calibration(method="nominal")):
         (said,) = said_of(one)
         assert said.level is Level.UNUSABLE

@@ -26,7 +26,7 @@ Angles = tuple[Any, Any, Any]
 
 
 def plan(gnss: str) -> str:
-    """Two lines in the Alps, whose receiver has an antenna aside."""
+    """Return a plan with two lines in the Alps, whose receiver has an antenna aside."""
     return two_lines(
         "given",
         flight="origin_deg = [47.48, 11.4]\nlead_s = 3.0",
@@ -41,7 +41,7 @@ def plan(gnss: str) -> str:
 
 @dataclass
 class Log:
-    """A log, what it says, and the truth."""
+    """A log, what is read from it, and the truth."""
 
     flown: Flown
     setup: Setup
@@ -73,13 +73,13 @@ def read(flown: Flown) -> Log:
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Log:
-    """An RTK receiver; two lines and the turn between them."""
+    """Return the log of an RTK receiver with two lines and the turn between them."""
     return read(fly_short(tmp_path_factory.mktemp("rtk"), plan('grade = "rtk"')))
 
 
 @pytest.fixture(scope="module")
 def single(tmp_path_factory: pytest.TempPathFactory) -> Log:
-    """A receiver alone that says no sigmas, by NMEA."""
+    """Return the log of a single receiver that sends NMEA without sigmas."""
     return read(fly_short(tmp_path_factory.mktemp("spp"), plan('grade = "spp"\nprotocol = "nmea"')))
 
 
@@ -112,7 +112,7 @@ def test_errors_of_metres_in_single_fixes_do_not_refuse_a_trajectory(single: Log
 
 
 def up_by(one: Log, own_m: float, *, metres: float | None = None, sigmas: float | None = None) -> Trajectory:
-    """The truth lifted until it lies so far off the fixes, or so many sigmas; it says one sigma of its own."""
+    """Return the truth raised until it is so many metres, or sigmas, off the fixes; its own sigma is `own_m`."""
     sure = replace(one.truth, position_sigma_l=np.full((len(one.truth), 3), own_m))
 
     def lifted(up_m: float) -> Trajectory:
@@ -150,7 +150,7 @@ def up_by(one: Log, own_m: float, *, metres: float | None = None, sigmas: float 
 def test_warnings_and_refusals_begin_at_their_limits(
     log: Log, own_m: float, limit: dict[str, float], warned: bool, refused: bool
 ) -> None:
-    """Refused from 3 m or 20 sigmas on, warned of from 5 sigmas on, and not a word below."""
+    """From 3 m or 20 sigmas on it is refused, from 5 sigmas on there is a warning, and below nothing."""
     found = log.judged(up_by(log, own_m, **limit))
     assert (len(found.warnings), len(found.refused)) == (int(warned), int(refused))
     for line in [*found.warnings, *found.refused]:
@@ -161,7 +161,7 @@ def test_warnings_and_refusals_begin_at_their_limits(
 def test_a_trajectory_metres_from_poor_fixes_gives_a_warning_about_both(
     single: Log, metres: float, warned: bool
 ) -> None:
-    """Not called the time's or a datum's fault, which such fixes cannot exclude and nothing speaks for."""
+    """The time or the datum is not blamed, because such fixes cannot exclude it and nothing indicates it."""
     found = single.judged(up_by(single, 0.1, metres=metres))
     assert found.refused == []
     assert len(found.warnings) == int(warned)
@@ -206,7 +206,7 @@ def test_heights_in_feet_are_recognised(log: Log) -> None:
 
 @pytest.mark.parametrize(("code", "words"), [("EPSG:4230", "ED50"), ("EPSG:4312", "MGI")])
 def test_another_datum_is_recognised(log: Log, code: str, words: str) -> None:
-    """Tens of metres to hundreds: an old national datum. PROJ's transformation makes the case, at another place."""
+    """An old national datum differs by tens to hundreds of metres; PROJ makes the case, at another place."""
     there = Transformer.from_crs("EPSG:4979", code, always_xy=True)
 
     def moved(lat: Any, lon: Any, height: Any) -> Any:
@@ -219,7 +219,7 @@ def test_another_datum_is_recognised(log: Log, code: str, words: str) -> None:
 
 
 def test_a_continental_frame_is_distinguished_from_a_global_one(log: Log) -> None:
-    """ETRS89 lies 0.8 m from ITRF there: more than 20 sigmas of an RTK fix and of the trajectory."""
+    """ETRS89 is 0.8 m from ITRF there, which exceeds 20 sigmas of an RTK fix and of the trajectory."""
     there = Transformer.from_crs("EPSG:7789", "EPSG:4936", always_xy=True)
     epoch = np.full(len(log.truth), 2026.5)
     x, y, z = log.truth.position_e.T
@@ -246,7 +246,7 @@ def test_a_reference_point_other_than_stated_is_recognised(log: Log) -> None:
 
 
 def test_an_antenna_without_a_lever_arm_gives_only_a_warning(log: Log) -> None:
-    """1.2 m apart, at 20 sigmas and more, because lever_arm_m is not in the configuration: a warning that names it."""
+    """It is 1.2 m away, over 20 sigmas, because lever_arm_m is not configured; the warning names the key."""
     table = log.setup.config.gnss["rover"]
     unsaid = GnssConfig(transport=table.transport, protocol=table.protocol, pps=table.pps)
     config = log.setup.config
@@ -294,7 +294,7 @@ def test_one_straight_line_of_20_seconds_suffices_to_recognise_other_angles(log:
 
 
 def test_headings_from_grid_north_are_recognised(log: Log) -> None:
-    """Convergence of UTM zone 32 there: (11.4° − 9°) sin 47.48° = 1.77°."""
+    """The convergence of UTM zone 32 is (11.4° − 9°) sin 47.48° = 1.77° there."""
     grid_rad = np.radians(2.4 * np.sin(np.radians(47.48)))
     line = log.refused(turned(log.truth, lambda roll, pitch, heading: (roll, pitch, heading - grid_rad)))
     assert "counts from grid north, which lies +1.7" in line
@@ -303,7 +303,7 @@ def test_headings_from_grid_north_are_recognised(log: Log) -> None:
 
 
 def test_a_trajectory_of_another_flight_is_refused_by_its_turns(log: Log) -> None:
-    """It lies where it should: the same way with another motion about it."""
+    """It follows the same path but with another motion about it."""
     random = np.random.default_rng(5)
     count = len(log.truth)
     since_s = (log.truth.time_ns - log.truth.time_ns[0]) / 1e9
@@ -318,7 +318,7 @@ def test_a_trajectory_of_another_flight_is_refused_by_its_turns(log: Log) -> Non
 
 @pytest.fixture(scope="module")
 def rough(tmp_path_factory: pytest.TempPathFactory) -> list[Log]:
-    """One plan flown twice in light turbulence, by an inertial unit of the least grade."""
+    """Return one plan flown twice in light turbulence, with an inertial unit of the lowest grade."""
     flights = []
     for seed in (1, 2):
         flight = f'origin_deg = [47.48, 11.4]\nlead_s = 3.0\nturbulence = "light"\nseed = {seed}'
@@ -328,7 +328,7 @@ def rough(tmp_path_factory: pytest.TempPathFactory) -> list[Log]:
 
 
 def test_another_flight_over_the_same_lines_is_refused_by_its_gusts(rough: list[Log]) -> None:
-    """The flights turn alike (correlation 0.9) and lie a decimetre apart, which the fixes cannot separate."""
+    """The flights turn alike (correlation 0.9) and are a decimetre apart, which the fixes cannot separate."""
     for one, other in (rough, rough[::-1]):
         assert one.judged(one.truth).refused == []
         line = one.refused(other.truth)
@@ -348,14 +348,14 @@ def test_rounded_attitudes_at_20_hz_are_accepted(rough: list[Log], every: int, d
 
 
 def test_noise_is_not_taken_for_gusts(log: Log) -> None:
-    """Calm air: angles noisy by 0.02° say nothing of gusts, and the flight is this one."""
+    """In calm air angles with noise of 0.02° contain no gusts, and the flight is this one."""
     noise = np.radians(0.02) * np.random.default_rng(7).standard_normal((3, len(log.truth)))
     given = turned(log.truth, lambda *angles: tuple(np.stack(angles) + noise))
     assert not any("gusts" in line for line in log.judged(given).refused)
 
 
 def test_the_truth_matches_the_ellipsoidal_height_of_the_fixes(log: Log) -> None:
-    """The fixes that all is held against are the receiver's, brought to the ellipsoid by its undulation."""
+    """The fixes used for comparison are the receiver's, reduced to the ellipsoid by its undulation."""
     fixes = [fix for fix in log.clocks.fixes["gnss/rover"] if fix.height_m is not None]
     height = float(np.median(geodetic_from_e(log.truth.position_e)[2]))
     assert np.median([fix.height_m for fix in fixes]) == pytest.approx(height + 1.2, abs=0.3)

@@ -54,7 +54,7 @@ def rmc(second: int, status: str = "A", off: dt.timedelta = dt.timedelta()) -> b
 
 
 def receiver() -> Units:
-    """Edges at the second and RMC 0.2 s later."""
+    """Return edges at each second and RMC 0.2 s later."""
     units: Units = []
     for second in range(SECONDS):
         edge_ns = START_UNIX_NS + second * NS
@@ -65,13 +65,13 @@ def receiver() -> Units:
 
 
 def past_hour_us(unix_us: int, *, goes_on: bool) -> int:
-    """Time past the UTC hour; goes_on: past the one that the log began in."""
+    """Return the time past the UTC hour, µs; with `goes_on`, past the hour in which the log began."""
     hour_us = 3_600_000_000
     return unix_us - START_UNIX_NS // 1000 // hour_us * hour_us if goes_on else unix_us % hour_us
 
 
 def velodyne(off_us: int = 0, *, goes_on: bool = False) -> Units:
-    """A data packet every 50 ms, stamped past the hour of UTC; off_us: somewhere else."""
+    """Return a data packet every 50 ms, stamped past the hour of UTC plus `off_us`."""
     units: Units = []
     for number in range(SECONDS * 20):
         unix_us = START_UNIX_NS // 1000 + number * 50_000
@@ -84,9 +84,9 @@ def velodyne(off_us: int = 0, *, goes_on: bool = False) -> Units:
 def positions(
     *, goes_on: bool = False, pps: int = PPS_LOCKED, status: str | None = "A", off: dt.timedelta = dt.timedelta()
 ) -> Units:
-    """Two position packets a second with the sentence of the second, of a fix or void; None: no sentence.
+    """Return two position packets a second with the second's sentence: valid, void, or none if `status` is None.
 
-    off: that the sentences' time is wrong by.
+    `off` is the error of the sentences' time.
     """
     units: Units = []
     for half in range(1, 2 * SECONDS):
@@ -99,7 +99,7 @@ def positions(
 
 
 def hesai(scale_s: int) -> Units:
-    """A packet every 50 ms by PTP, its date and time on a scale so many seconds beside UTC."""
+    """Return a packet every 50 ms by PTP, its date and time on a scale `scale_s` ahead of UTC."""
     units: Units = []
     for number in range(SECONDS * 20):
         at = START + dt.timedelta(milliseconds=50 * number)
@@ -127,7 +127,7 @@ def found(folder: Path, text: str, units: Iterable[tuple[str, int, bytes]]) -> t
 
 
 def errors_ns(clocks: FrozenClocks, stamps_ns: list[int], locked: int | list[int]) -> tuple[list[int], float]:
-    """Errors of stamps every 50 ms over the log, placed as a job places them, and the greatest sigma."""
+    """Return errors (ns) of stamps every 50 ms over the log, placed as in a job, and the largest sigma (ns)."""
     times = START_UNIX_NS + np.arange(SECONDS * 20, dtype=np.int64) * NS // 20
     rows = np.zeros(len(times), DEVICE_CLOCK_DTYPE)
     rows["host_time_ns"], rows["device_time_ns"] = times + LATENCY_NS + CLOCK_WRONG_NS, stamps_ns
@@ -167,7 +167,7 @@ def test_an_unlocked_head_runs_free(tmp_path: Path, off_us: int) -> None:
 
 
 def test_position_packets_are_the_clock_in_a_log_without_a_receiver(tmp_path: Path) -> None:
-    """The recording computer is 0.3 s wrong: the head's own seconds count, not the computer's."""
+    """The recording computer is wrong by 0.3 s: the head's own seconds count, not the computer's."""
     setup, clocks = found(tmp_path, WITH_AUX, [*velodyne(), *positions()])
     plan = clocks.host.plan.devices["scanner/top"]
     assert plan.clock == "scanner/top"
@@ -194,7 +194,7 @@ def test_timestamps_before_the_first_position_packet_are_judged_by_later_ones(tm
 
 @pytest.mark.parametrize("off_us", [300_000, -40_000])
 def test_timestamps_before_a_jump_to_lock_are_refused(tmp_path: Path, off_us: int) -> None:
-    """A counter before the pulse set it, 0.3 s or, by chance, 40 ms beside the hour."""
+    """Before the pulse sets it, the counter is 0.3 s or, by chance, 40 ms off the hour."""
     first_said_ns = min(at_ns for _, at_ns, _ in positions())
     early = [unit for unit in velodyne(off_us) if unit[1] < first_said_ns]
     units = [*early, *(unit for unit in velodyne() if unit[1] > first_said_ns), *positions(), *receiver()]
@@ -206,7 +206,7 @@ def test_timestamps_before_a_jump_to_lock_are_refused(tmp_path: Path, off_us: in
 
 
 def test_a_rollover_of_the_heads_receiver_is_corrected(tmp_path: Path) -> None:
-    """Sentences 1024 weeks old: 2006 has another count of leap seconds, so that points lay 4 s off within the week."""
+    """Sentences are 1024 weeks old; 2006 had another count of leap seconds, which put points 4 s off in the week."""
     _, clocks = found(tmp_path, WITH_AUX, [*velodyne(), *positions(off=-ROLLOVER)])
     error, _ = errors_ns(clocks, HOURS, 1)
     assert max(map(abs, error)) < 1_000
@@ -278,7 +278,7 @@ def test_a_head_without_fix_or_pulse_is_refused_with_that_reason(
 
 
 def test_an_unlocked_head_without_a_reason_is_not_reported_as_without_pulse(tmp_path: Path) -> None:
-    """Hesai's packets have a flag, and no reason."""
+    """Hesai's packets have a flag but no reason."""
     text = RECEIVER + XT32 + 'auxiliary = "udp:0.0.0.0:10110"\npps = "main"\n'
     seconds = [(START_UNIX_NS + k * NS + LATENCY_NS, START + dt.timedelta(seconds=k)) for k in range(SECONDS)]
     aux = [("scanner/top/aux", at_ns, encode_gps_packet(time, locked=False)) for at_ns, time in seconds]
@@ -288,7 +288,7 @@ def test_an_unlocked_head_without_a_reason_is_not_reported_as_without_pulse(tmp_
 
 @pytest.mark.parametrize("status", ["A", "V"])
 def test_a_head_without_pulse_beside_a_receiver_is_reported_as_such(tmp_path: Path, status: str) -> None:
-    """What the head's own sentences say does not matter then."""
+    """The contents of the head's own sentences do not matter then."""
     units = [*receiver(), *velodyne(12_345_678), *positions(pps=PPS_ABSENT, status=status)]
     _, clocks = found(tmp_path, RECEIVER + WITH_AUX + 'pps = "main"\n', units)
     state = clocks.host.status("pps/main", START_UNIX_NS + 20 * NS)
@@ -315,7 +315,7 @@ def test_a_head_without_status_and_receiver_is_refused_with_the_remedy(tmp_path:
 def test_ptp_timestamps_keep_their_fraction_on_either_scale(
     tmp_path: Path, beside_utc_s: int, scale: StampScale, configured: bool
 ) -> None:
-    """Found by a receiver's time; configured they are complete without one."""
+    """A receiver's time finds the scale; with a configured scale the stamps are complete without a receiver."""
     stamps = [START_UNIX_NS + number * NS // 20 + beside_utc_s * NS for number in range(SECONDS * 20)]
     text = f'{XT32}clock = "{scale.value}"\n' if configured else RECEIVER + XT32
     units = hesai(beside_utc_s) if configured else [*receiver(), *hesai(beside_utc_s)]

@@ -19,7 +19,7 @@ ADJUSTED_S = FLIGHT_NS / 1e9 - 1e9
 
 
 def tile(folder: Path, name: str, first_s: float, *, adjusted: bool, west_m: float = 0.0) -> PointTimes:
-    """Points of 20 s from a time on, as a header says, and what is read of them."""
+    """Write points of 20 s from a time on, with a header's kind of time, and return what is read of them."""
     x, y = lattice(500_000.0 + west_m, 5_200_000.0, 20.0, 20.0, 1.0)
     times = first_s + np.linspace(0.0, 20.0, len(x))
     return point_times_of(write_laz(folder / name, x, y, 0.0 * x + 400.0, gps_time=times, adjusted=adjusted))
@@ -37,7 +37,7 @@ def test_the_header_determines_the_kind_of_time(tmp_path: Path) -> None:
 
 
 def as_las_15(path: Path, offset: int) -> PointTimes:
-    """The header of a LAS 1.4 file made one of 1.5, with the flag of offset times.
+    """Change a LAS 1.4 file to 1.5, with the flag of offset times, and return what is read of it.
 
     LAS 1.5 R00, 2.4: greatest and least time (two doubles) and the offset in millions of seconds (u16) come after the
     375 bytes of 1.4; 393 in all.
@@ -55,7 +55,7 @@ def as_las_15(path: Path, offset: int) -> PointTimes:
 
 @pytest.mark.parametrize("offset", [1000, 1250, 1500])
 def test_times_of_las_15_use_the_offset_of_the_header(tmp_path: Path, offset: int) -> None:
-    """1500 is the LAS working group's recommendation for 2023 to 2031: times of now are below 0."""
+    """The LAS working group recommends 1500 for 2023 to 2031, so times of today are negative."""
     first_s = FLIGHT_NS / 1e9 - offset * 1e6
     tile(tmp_path, "a.las", first_s, adjusted=True)
     one = as_las_15(tmp_path / "a.las", offset)
@@ -106,7 +106,7 @@ def test_times_that_contradict_their_header_are_reported(tmp_path: Path) -> None
 def test_times_in_the_future_are_reported_with_their_probable_kind(
     tmp_path: Path, first_s: float, told: str, adjusted: bool
 ) -> None:
-    """2017-03-30 07:18:38 UTC as GPS seconds and as Unix seconds, under either bit (LAStools' list, 2017-08-27)."""
+    """The moment is 2017-03-30 07:18:38 UTC in GPS and in Unix seconds, under either bit (LAStools' list)."""
     one = tile(tmp_path, "future.laz", first_s, adjusted=adjusted)
     assert one.kind is TimeKind.ADJUSTED
     assert told in one.doubt

@@ -34,9 +34,9 @@ ORDERS: dict[str, Callable[[Cloud, np.random.Generator], Array]] = {
 
 
 def flown(pulses_m2: float, seed: int = 3) -> Cloud:
-    """Two strips of 160 m × 100 m that overlap by 80 m: meadow in the west, wood of three returns a pulse in the east.
+    """Return two strips of 160 m × 100 m that overlap by 80 m, with alternating points.
 
-    The second is higher by 3 cm; points of both come in turn.
+    The west is a meadow, the east a wood with three returns per pulse. The second strip is 3 cm higher.
     """
     rng = np.random.default_rng(seed)
     parts = []
@@ -71,7 +71,7 @@ def tiles(folder: Path, cloud: Cloud, order: Array, side_m: float = 70.0) -> Pat
 
 
 def places_of(look: Look) -> set[tuple[float, float]]:
-    """Middles of the compared cells, on the map."""
+    """Return the centres of the compared cells, on the map."""
     assert look.overlap.best is not None
     return set(map(tuple, look.cells.frame.centres(look.overlap.best.row, look.overlap.best.column).tolist()))
 
@@ -92,7 +92,7 @@ def run(command: Any, *arguments: str) -> None:
 
 @pytest.mark.slow
 def test_tiles_in_any_order_give_the_same_cells_and_differences(tmp_path: Path) -> None:
-    """Density of all returns and strips is 18 a square metre; of one strip's single ones on the meadow it is 5."""
+    """All returns of both strips have 18 per square metre; one strip's single returns on the meadow have 5."""
     cloud, rng = flown(5.0), np.random.default_rng(1)
     looks = {name: look_at([tiles(tmp_path / name, cloud, order(cloud, rng))]) for name, order in ORDERS.items()}
     looks["one file"] = look_at([tiles(tmp_path / "whole", cloud, ORDERS["shuffled"](cloud, rng), 1000.0)])
@@ -111,7 +111,7 @@ def test_tiles_in_any_order_give_the_same_cells_and_differences(tmp_path: Path) 
 def test_cells_contain_enough_returns_at_any_density_and_thinning(
     tmp_path: Path, pulses_m2: float, cell_m: float
 ) -> None:
-    """A plane through n returns is as good as 2 cm / √n: of all cells the mean is known to 0.3 mm."""
+    """A plane through n returns is accurate to 2 cm / √n, so the mean over all cells is known to 0.3 mm."""
     cloud = flown(pulses_m2)
     order = ORDERS["shuffled"](cloud, np.random.default_rng(2))
     thin = order[np.arange(len(order)) % 7 != 0]  # returns are left out, not pulses
@@ -143,7 +143,7 @@ def test_a_cell_size_given_by_the_user_is_used(tmp_path: Path, capsys: pytest.Ca
 
 
 def test_few_cells_give_no_verdict_but_advice(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A meadow of 14 m × 80 m: hundreds of square metres, dozens of cells."""
+    """A meadow of 14 m × 80 m has hundreds of square metres but only dozens of cells."""
     cloud = flown(5.0)
     near = cloud["x"] < EAST_M + 14.0
     small = tiles(tmp_path / "small", cloud, np.flatnonzero(near & (cloud["y"] < NORTH_M + 50.0)))
@@ -175,7 +175,7 @@ def test_cells_of_one_patch_are_one_place() -> None:
 
 @pytest.mark.parametrize("noise_m", [0.02, 0.08])
 def test_repeatability_equals_the_noise_beyond_the_compared_cells(noise_m: float) -> None:
-    """Of 3600 planes through 16 returns the quartile of variances is known to 1 %, its root to half of that."""
+    """From 3600 planes through 16 returns the quartile of variances is known to 1 %, its root to half of that."""
     count = np.full(3600, 16.0)
     variance = noise_m**2 * np.random.default_rng(4).chisquare(13, 3600) / 13.0
     variance[::3] *= 9.0  # what grows on a third of them

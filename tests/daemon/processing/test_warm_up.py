@@ -77,7 +77,7 @@ def run_python(text: str, *arguments: object, **environment: str) -> subprocess.
 
 @pytest.mark.slow
 def test_after_a_warm_up_a_flight_compiles_nothing(tmp_path: Path) -> None:
-    """The first pulse costs what the thousandth does: neither compiling nor reading what was compiled before."""
+    """The first pulse takes as long as the thousandth: nothing is compiled, and no cache is read."""
     done = run_python(FLY, tmp_path)
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout.splitlines()[-1])

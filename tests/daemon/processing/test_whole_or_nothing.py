@@ -39,7 +39,7 @@ def synced(monkeypatch: pytest.MonkeyPatch) -> Synced:
 
 
 def missing(synced: Synced, folder: Path) -> list[str]:
-    """Files and folders that were not brought to the disk."""
+    """Return files and folders that were not synchronised to the disk."""
     there = [folder, *folder.rglob("*")]
     return [str(path.relative_to(folder.parent)) for path in there if path.stat().st_ino not in synced]
 

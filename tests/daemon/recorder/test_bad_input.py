@@ -75,7 +75,7 @@ def test_a_note_given_as_a_directory_is_refused_in_one_line(command: str) -> Non
 
 @pytest.mark.slow
 def test_a_configuration_of_another_aircraft_is_reported_device_by_device(tmp_path: Path) -> None:
-    """Each device that speaks something else is named, the one that is right is not, and every byte is recorded."""
+    """Each device with another protocol is named, the right one is not, and every byte is recorded."""
     ubx = recording("ubx", "ublox-zed-f9p-hp.log")
     srep = scan_lines()
     velodyne = [unit.data for unit in read_pcap(ROOT / "fixtures/velodyne/nebula_vlp16.pcap.gz")]

@@ -30,7 +30,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
 
 @pytest.fixture(scope="module")
 def lossy(flown: Flown, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int]:
-    """A log as if frames had been lost before the recorder, and how many samples are whole in it."""
+    """Return a log in which frames were lost before the recorder, and the number of its complete samples."""
     folder = tmp_path_factory.mktemp("lossy")
     assert run_app(["export", str(flown.log), str(folder / "files")]) == 0
     (files,) = (folder / "files").iterdir()
@@ -51,7 +51,7 @@ def lossy(flown: Flown, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path,
 
 
 def whole(lines: list[str]) -> Iterator[bool]:
-    """Whether each sample of a candump has its frames, each of them once."""
+    """Yield for each sample of a candump whether each of its frames is there exactly once."""
     frames = [line.split()[2].partition("#")[0] for line in lines]
     ends = [-1, *(at for at, frame in enumerate(frames) if frame == "100")]
     for begin, end in pairwise(ends):
@@ -75,7 +75,7 @@ def test_samples_with_a_missing_frame_are_counted_and_dropped(
 def test_remaining_samples_are_navigated_and_missing_ones_reported(
     flown: Flown, lossy: tuple[Path, int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Single samples are bridged; three seconds are a hole, and the rest lies within its sigmas."""
+    """Single samples are bridged; three seconds are a gap, and the rest is within its sigmas."""
     output = tmp_path / "t.csv"
     assert run_app(["trajectory", str(lossy[0]), "-o", str(output), "--no-page"]) == 1
     told = capsys.readouterr()

@@ -58,7 +58,7 @@ def no_unit(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def open_folder() -> Iterator[Path]:
-    """A folder that every user may look into, unlike the tests' own."""
+    """Return a folder that every user may enter, unlike the tests' own."""
     folder = Path(tempfile.mkdtemp(prefix="swath-"))
     folder.chmod(0o755)
     yield folder
@@ -174,7 +174,7 @@ def test_only_the_owner_of_the_recorder_can_connect(tmp_path: Path, open_folder:
 
 @pytest.mark.parametrize("words", [("mark", "x"), ("split",), ("monitor", "--once"), ("offload",)])
 def test_status_without_permission_is_refused(tmp_path: Path, open_folder: Path, words: tuple[str, ...]) -> None:
-    """Not that nothing is recorded there."""
+    """The user must not read that nothing is being recorded there."""
     logs = open_folder / "logs"
     logs.mkdir(mode=0o750)
     arguments = [*words, str(logs), *([str(open_folder)] if words[0] == "offload" else [])]
@@ -295,7 +295,7 @@ def test_endless_part_requests_are_refused(running: Path) -> None:
 
 
 class Nuisance:
-    """Everything that should not be done to a control socket, by many at once, until told to stop."""
+    """Everything that should not be done to a control socket, done by many at once until stopped."""
 
     def __init__(self, place: Path) -> None:
         self._place = place

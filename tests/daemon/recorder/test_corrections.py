@@ -62,7 +62,7 @@ def reader(descriptor: int) -> Iterator[bytearray]:
 
 @pytest.mark.slow
 def test_data_of_a_caster_are_logged_and_reach_the_receiver(tmp_path: Path) -> None:
-    """The caster hangs up in the middle; the second connection gives the rest."""
+    """The caster hangs up in the middle; the second connection sends the rest."""
     logs, half = tmp_path / "logs", len(DATA) // 2
     all_sent, ready = threading.Event(), threading.Event()
 

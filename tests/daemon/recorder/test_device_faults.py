@@ -86,7 +86,7 @@ def faulty(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[FaultyCa
 def test_bus_off_and_error_frames_are_reported_and_the_bus_is_reopened(
     tmp_path: Path, logs: Path, faulty: FaultyCan
 ) -> None:
-    """Error frames of 3 classes, bus-off with restart, then an adapter that fails and cannot be opened for a while."""
+    """Three classes of error frames and bus-off with restart come before an adapter that fails for a while."""
     config = f'[imu.main]\ntransport = "can:faulty:{faulty.path}"\nprotocol = "canmod-gps"\n'
     with Recorder(tmp_path / "rig", session_table(logs) + config) as recorder:
         recorder.wait_said("imu/main device_opened")
@@ -213,7 +213,7 @@ def recording(tmp_path: Path, logs: Path, wires: list[Wire]) -> Iterator[Recorde
 
 @pytest.mark.slow
 def test_two_devices_of_each_kind_are_recorded_and_a_changed_receiver_is_reported(tmp_path: Path, logs: Path) -> None:
-    """Each source has exactly its own units; only the receiver that gives no time any more is reported."""
+    """Each source has exactly its own units; only the receiver that no longer gives time is reported."""
     scanners = [udp_wire("scanner/left"), udp_wire("scanner/right")]
     rover, base = serial_wire("gnss/rover"), serial_wire("gnss/base")
     imus = [can_wire("imu/main"), can_wire("imu/spare")]
@@ -261,7 +261,7 @@ def test_two_devices_of_each_kind_are_recorded_and_a_changed_receiver_is_reporte
 
 
 def heard_at(data: bytes, sent_baud: int, heard_baud: int) -> bytes:
-    """What a UART set to one rate makes of bytes sent at another, 8N1: a bit is what the line holds at its middle."""
+    """Return what a UART at one rate reads from bytes sent at another, 8N1, sampling each bit in its middle."""
     bits = [1] * 20  # the line at rest
     for byte in data:
         bits += [0, *(byte >> place & 1 for place in range(8)), 1]
@@ -332,7 +332,7 @@ def imu_sample(number: int, ticks: int) -> list[bytes]:
 
 
 def segments(logs: Path, source: str) -> int:
-    """Segments that the time model makes of a device's clock in the log."""
+    """Return the number of segments that the time model makes of a device's clock in the log."""
     clock = DeviceClock(PpsClock(18))
     (session,) = open_logs([logs])
     parsers, troubles = stored_parsers(session.attachments())
@@ -407,7 +407,7 @@ def memory_mb(recorder: Recorder) -> float:
 @pytest.mark.slow
 @pytest.mark.alone
 def test_garbage_at_full_rate_does_not_affect_other_sources(tmp_path: Path, logs: Path) -> None:
-    """Send beginnings of messages that never end, and 20 000 invalid datagrams a second."""
+    """The garbage is beginnings of messages that never end, and 20 000 invalid datagrams a second."""
     good, noisy = udp_wire("scanner/left"), udp_wire("scanner/right")
     rover, babbling = serial_wire("gnss/rover", "ubx"), serial_wire("gnss/base", "ubx")
     generator = random.Random(1)

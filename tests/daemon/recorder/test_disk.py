@@ -21,7 +21,7 @@ SIZE_MB = 24
 
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A file system of its own, of 24 MB."""
+    """Return a separate file system of 24 MB."""
     with disk_of(tmp_path / "disk", SIZE_MB) as folder:
         yield folder
 
@@ -32,7 +32,7 @@ def config_of(logs: Path, port: int, reserve_mb: float) -> str:
 
 
 class Flood:
-    """Numbered datagrams of 1206 bytes, so many every 5 ms."""
+    """A sender of numbered datagrams of 1206 bytes, `burst` of them every 5 ms."""
 
     def __init__(self, port: int, burst: int) -> None:
         self.burst = burst
@@ -65,7 +65,7 @@ class Flood:
 def test_recording_stops_when_the_disk_is_full_and_resumes_with_space(
     small_disk: Path, reserve_mb: int, said: str
 ) -> None:
-    """Looked at once a second, the reserve stops 5 MB/s in time; 20 MB/s run past 1 MB into the disk's own error."""
+    """The reserve, checked once a second, stops 5 MB/s in time; 20 MB/s exceed 1 MB and meet the disk's own error."""
     port = free_udp_port()
     filler = small_disk / "filler"
     filler.write_bytes(bytes(10 << 20))
@@ -105,7 +105,7 @@ def test_recording_stops_when_the_disk_is_full_and_resumes_with_space(
 
 @pytest.fixture
 def failing_disk(tmp_path: Path) -> Iterator[tuple[Path, Path]]:
-    """An ext4 of its own, and the file by which one tells it that it is broken: it then goes read-only at once."""
+    """Return a separate ext4, and the file that declares it broken, after which it is read-only at once."""
     if os.geteuid() != 0:
         pytest.fail("this test mounts a file system: run it as root")
     image, folder = tmp_path / "image", tmp_path / "disk"
@@ -137,7 +137,7 @@ def keep_parts(logs: Path, kept: Path) -> None:
 def test_a_read_only_file_system_is_reported_at_once_and_replaced_by_another(
     failing_disk: tuple[Path, Path], tmp_path: Path
 ) -> None:
-    """The kernel's own remedy for a broken disk; remounting it by hand is refused while the log is open (EBUSY)."""
+    """The kernel does this to a broken disk; remounting by hand is refused while the log is open (EBUSY)."""
     folder, trigger = failing_disk
     port = free_udp_port()
     logs, kept = folder / "logs", tmp_path / "kept"

@@ -74,7 +74,7 @@ def test_an_invalid_recording_sign_is_ignored(changes: dict[str, Any], tmp_path:
 
 
 def test_previous_parts_are_the_existing_files_only(tmp_path: Path) -> None:
-    """However high a number the sign names, each file is looked at once."""
+    """However high a number the sign names, each file is examined once."""
     (tmp_path / RECORDING_SIGN).write_text(json.dumps(SIGN | {"part": 999_999}))
     sign = read_sign(tmp_path)
     assert sign is not None

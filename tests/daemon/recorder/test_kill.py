@@ -72,7 +72,7 @@ class Bystander:
 
 
 class ForkServer:
-    """Process that forks recorders on demand."""
+    """A process that forks recorders on demand."""
 
     def __init__(self) -> None:
         command = [sys.executable, "-m", "tests.daemon.fork_server"]
@@ -117,7 +117,7 @@ class Sent:
 
 
 def send_until(stop: threading.Event, port: int, master: int, fifo: int, sent: Sent) -> None:
-    """A datagram a millisecond, a line every 10 ms, an edge every 100 ms, all numbered."""
+    """Send a datagram each millisecond, a line every 10 ms and an edge every 100 ms, all numbered."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         number = 0
         while not stop.is_set():
@@ -166,12 +166,12 @@ def record_and_kill(server: ForkServer, bystander: Bystander, folder: Path, afte
 
 
 def opened_devices(logs: Path) -> int:
-    """Devices that the log, which is not compressed, says are open."""
+    """Return the number of devices that the uncompressed log reports as open."""
     return sum(path.read_bytes().count(b'"code":"device_opened"') for path in logs.glob("*.mcap"))
 
 
 def check_what_is_left(logs: Path, sent: Sent, safe: float) -> None:
-    """The unrepaired file has every unit sent until `safe` (monotonic s); the recovered one the same."""
+    """Check that the file has every unit sent until `safe` (monotonic s), and the recovered file the same units."""
     (path,) = logs.glob("*.mcap")
     found = numbers_in(path)
     for stream, times in sent.times.items():
@@ -188,7 +188,7 @@ def check_what_is_left(logs: Path, sent: Sent, safe: float) -> None:
 
 
 def numbers_in(path: Path) -> dict[str, list[int]]:
-    """The numbers of each stream's units in a log."""
+    """Return the numbers of each stream's units in a log."""
     found: dict[str, list[int]] = {"scanner": [], "pps": []}
     text = b""
     for session in open_logs([path]):

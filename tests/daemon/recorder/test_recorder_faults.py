@@ -98,7 +98,7 @@ def test_kernel_drops_are_counted_exactly(tmp_path: Path, logs: Path, numbers: N
 
 
 def test_a_stall_within_the_buffer_loses_no_data(tmp_path: Path, logs: Path, numbers: Numbers) -> None:
-    """Half of what the granted buffer holds: the kernel charges 2304 bytes for a datagram of 1206."""
+    """The stall lasts for half of the granted buffer; the kernel charges 2304 bytes for a datagram of 1206."""
     config = session_table(logs) + scanner(numbers.port)
     with Recorder(tmp_path, config) as recorder:
         recorder.wait_said("device_opened")
@@ -358,7 +358,7 @@ def test_a_failing_writer_ends_the_process(tmp_path: Path, logs: Path, numbers: 
 def test_a_failing_receiver_ends_the_service_or_leaves_the_others_recording(
     tmp_path: Path, logs: Path, numbers: Numbers, watchdog_s: float | None
 ) -> None:
-    """Under a service manager a new process begins at once; by hand the others are recorded on."""
+    """Under a service manager a new process begins at once; without one the others are still recorded."""
     config = session_table(logs) + scanner(numbers.port)
     with Recorder(tmp_path, config, watchdog_s=watchdog_s, module=(SPECIAL, "broken-receiver")) as recorder:
         recorder.wait_said("device_opened")
@@ -383,7 +383,7 @@ def test_a_failing_receiver_ends_the_service_or_leaves_the_others_recording(
 
 @pytest.mark.slow
 def test_loss_counters_are_exact_under_simultaneous_faults(tmp_path: Path, logs: Path, numbers: Numbers) -> None:
-    """Parts, stalls and a flood together: every status of every part keeps the equation (checked while reading)."""
+    """Parts, stalls and a flood come together; every status of every part fulfils the equation when it is read."""
     config = session_table(logs) + scanner(numbers.port, "?buffer_mb=1")
     with Recorder(tmp_path, config, module=(SPECIAL, "small-queue")) as recorder:
         recorder.wait_said("device_opened")

@@ -110,7 +110,10 @@ CHANGED_S, BACK_S = 15, 30
 
 
 def play_changing(assembly: Assembly, *, edges: bool, messages: bool) -> dict[str, list[str]]:
-    """The recording, of which other sentences without time take the place of all messages for 15 s; states a second."""
+    """Play the recording with other sentences, without time, instead of all messages for 15 s.
+
+    Return each source's states, one per second.
+    """
     keeper, start_ns = assembly.timekeeper, assembly.clock.now_ns()
     units_seen, edge_seen = keeper.units_seen("gnss/rover"), keeper.edge_seen("pps/main")
     changed = (TimedUnit(at * SECOND_NS // 5, "gnss/rover", GSV) for at in range(CHANGED_S * 5, BACK_S * 5))

@@ -74,7 +74,7 @@ def test_the_queue_is_bounded_for_data_and_not_for_events_and_counters() -> None
 
 @dataclass
 class Bench:
-    """Recorder without threads whose turns the test runs by hand."""
+    """A recorder without threads whose turns the test runs by hand."""
 
     logs: Path
     queue: BlockQueue
@@ -223,21 +223,21 @@ def test_an_abandoned_part_does_not_delete_a_file_that_replaced_it(tmp_path: Pat
 
 
 class ScriptedPps(PpsSource):
-    """Edges with the sequence numbers given, all at once."""
+    """A source of edges with the given sequence numbers, all at once."""
 
     def __init__(self, sequences: list[int]) -> None:
         self._sequences = sequences
 
     def open(self) -> None:
-        """Do nothing."""
+        """Do nothing, because there is no device to open."""
 
     def receive(self, timeout_s: float) -> list[RawEdge]:
-        """All edges, once."""
+        """Return all edges, once."""
         sequences, self._sequences = self._sequences, []
         return [RawEdge(time.time_ns(), sequence, "assert") for sequence in sequences]
 
     def close(self) -> None:
-        """Do nothing."""
+        """Do nothing, because there is no device to close."""
 
 
 @pytest.mark.parametrize(("overwrites", "lost"), [(True, 4), (False, 0)])

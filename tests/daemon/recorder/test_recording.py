@@ -120,7 +120,7 @@ def test_a_blocked_writer_does_not_notify_the_watchdog(tmp_path: Path, logs: Pat
 
 @pytest.mark.slow
 def test_an_unread_journal_blocks_nothing(tmp_path: Path, logs: Path) -> None:
-    """stderr is a full pipe from the start, so that not one line of the recorder's is taken."""
+    """stderr is a full pipe from the start, so that no line of the recorder is accepted."""
     unread, full = os.pipe()
     os.set_blocking(full, False)
     with contextlib.suppress(BlockingIOError):

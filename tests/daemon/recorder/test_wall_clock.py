@@ -19,7 +19,7 @@ HOUR_NS = 3600 * 1_000_000_000
 
 @contextlib.contextmanager
 def restored_clock() -> Iterator[int]:
-    """Whatever happens inside, the wall clock goes on afterwards as if nothing had."""
+    """Restore the wall clock afterwards, as if nothing had changed it, and yield its offset (ns)."""
     offset_ns = read_clock_pair().offset_ns
     try:
         yield offset_ns

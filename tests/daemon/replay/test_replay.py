@@ -33,7 +33,7 @@ BUS = '[imu.main]\ntransport = "can:udp_multicast:239.74.163.2?port={port}"\npro
 
 
 def record_first(folder: Path) -> LogContent:
-    """A log of two parts: datagrams, sentences and edges of some seconds."""
+    """Record a log of two parts with datagrams, sentences and edges of some seconds."""
     port, link, fifo = free_udp_port(), folder / "rover", folder / "pps"
     folder.mkdir()
     os.mkfifo(fifo)
@@ -146,7 +146,7 @@ def test_a_second_recorder_gets_the_same_bytes_edges_and_seconds(
 
 
 def arrival_after_edge(content: LogContent) -> list[float]:
-    """Seconds from each edge to the first sentence behind it."""
+    """Return the seconds from each edge to the first sentence after it."""
     arrivals = [time_ns for time_ns, _ in content.units["gnss/rover"]]
     edges = [value["edge_time_ns"] for _, value in content.messages["/pps/main"]]
     return [min(arrival - edge for arrival in arrivals if arrival > edge) * 1e-9 for edge in edges]
@@ -184,7 +184,7 @@ def test_an_unread_port_does_not_delay_the_others(tmp_path: Path) -> None:
 
 
 def test_a_device_link_is_kept_and_one_left_by_a_killed_replay_is_replaced(tmp_path: Path) -> None:
-    """Played with the aircraft's own configuration, udev's name of the receiver must not be lost."""
+    """A replay with the aircraft's own configuration must not replace udev's name of the receiver."""
     link = tmp_path / "rover"
     link.symlink_to("/dev/null")
     with pytest.raises(TransportError, match="is not a link to a pseudo-terminal"):
@@ -215,7 +215,7 @@ class Dues(Output):
 
 
 def test_time_begins_with_the_first_unit_however_long_reading_takes() -> None:
-    """Else the first units of every source are late, and the ones after them are not."""
+    """Otherwise only the first units of every source would be late."""
     output, read_ns = Dues(), []
 
     def units() -> Iterator[TimedUnit]:

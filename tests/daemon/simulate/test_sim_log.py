@@ -44,7 +44,7 @@ def states(content: LogContent, source: str) -> list[str]:
 
 
 def told(content: LogContent, source: str) -> list[tuple[str, str, str]]:
-    """Severity, code and text of the events of a source."""
+    """Return severity, code and text of the events of a source."""
     events = [event for _, event in content.messages["/events"]]
     return [(one["severity"], one["code"], one["text"]) for one in events if one["source"] == source]
 
@@ -101,7 +101,7 @@ class TestUnits:
 
 
 class TestRecorder:
-    """What a recorder says beside the units."""
+    """The log has what a recorder writes beside the units."""
 
     def test_session_names_no_computer(self, made: tuple[SimReport, Path]) -> None:
         report, logs = made
@@ -180,7 +180,7 @@ class TestRecorder:
 
 
 class TestFaults:
-    """What befalls the wires and the wall clock is told as a recorder tells it."""
+    """Faults of the wires and of the wall clock are reported as a recorder reports them."""
 
     def test_a_step_of_the_wall_clock_does_not_change_log_times(self, tmp_path: Path) -> None:
         content = fly(tmp_path, Standin(9.0, wall_steps=((4.05, 3600.0),)))

@@ -49,7 +49,7 @@ def done(options: CalibrationOptions, tmp_path_factory: pytest.TempPathFactory) 
 
 
 def wrong(done: Calibrated, sigma_rad: float = 1e-5, **by: float) -> Calibrated:
-    """With a calibration that is wrong by so much, knows nothing of it and says such sigmas of its angles."""
+    """Return the result with a calibration that is wrong by `by` but states small sigmas for its angles."""
     calibrations: dict[str, Calibration] = {}
     for name, found in done.adjusted.calibrations.items():
         sigmas = found.sigmas.copy()
@@ -75,13 +75,13 @@ def test_strips_contradict_a_wrong_roll(done: Calibrated) -> None:
 
 
 def test_an_effect_within_the_joint_sigma_is_not_a_contradiction(done: Calibrated) -> None:
-    """Three sigmas of both together."""
+    """The limit is three sigmas of both together."""
     assert strips_say(wrong(done, ROLL_RAD / 2.0, omega_rad=ROLL_RAD), CELL_M) == []
     assert strips_say(wrong(done, ROLL_RAD / 4.0, omega_rad=ROLL_RAD), CELL_M) != []
 
 
 def test_a_validation_contradicts_a_wrong_roll(done: Calibrated) -> None:
-    """Both of its methods that compare strips: all that such a flight has."""
+    """Such a flight has two methods that compare strips, and both of them report it."""
     said = validation_says(wrong(done, omega_rad=ROLL_RAD))
     assert [one.what.split(": ")[1] for one in said] == ["crossStripFlight (002)", "other (006)"]
     for one in said:
@@ -94,7 +94,7 @@ def test_a_validation_contradicts_a_wrong_roll(done: Calibrated) -> None:
 def test_all_three_contradictions_are_in_the_verdict_of_a_calibration(
     done: Calibrated, options: CalibrationOptions
 ) -> None:
-    """Eight pairs of one sign, three sigmas off together: on the terminal, in the record and in the file."""
+    """Eight pairs of one sign are three sigmas off together; terminal, record and file have the reasons."""
     sigma = 2.0**-16
     comparison = Comparison("left", "phi_rad", 8, -3.0 * sigma, sigma, 0.0, sigma, sigma)
     bad = wrong(done, omega_rad=ROLL_RAD)
@@ -119,7 +119,7 @@ def test_all_three_contradictions_are_in_the_verdict_of_a_calibration(
 
 
 def test_a_forced_trajectory_of_another_place_is_noted(made: Made, options: CalibrationOptions, tmp_path: Path) -> None:
-    """All strips are moved alike, so only this note reveals it."""
+    """All strips are displaced alike, so only this note reveals it."""
     true, file = made.trajectory, tmp_path / "away.csv"
     lat, lon, height = true.geodetic()
     away = Trajectory.from_geodetic(

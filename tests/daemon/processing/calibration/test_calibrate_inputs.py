@@ -23,7 +23,7 @@ GOOD = 'WKT,name\n"POLYGON ((10 0, 20 0, 20 8, 10 8, 10 0))",roof 1\n"Polygon Z 
 
 
 def kept() -> Any:
-    """A flight over houses whose points are given in UTM."""
+    """Return a flight over houses whose points are given in UTM."""
     lines = (Line(-60, 0, 90, 120, 300), Line(60, 10, 270, 120, 300))
     flight = fly(lines, gables(), scanner=Scanner(prf_hz=3_000.0))
     mapping = Mapping("EPSG:32632", datum="same")

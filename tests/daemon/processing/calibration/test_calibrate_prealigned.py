@@ -37,7 +37,7 @@ def through_a_file(calibration: Calibration) -> Calibration:
 
 @pytest.fixture(scope="module")
 def cast() -> Cast:
-    """One line there and another back, over houses on level ground."""
+    """Return a line flown there and back, over houses on level ground."""
     return cast_flight(VILLAGE.replace("relief_m = 8.0", "relief_m = 0.0"), LINES, prf_hz=12_000.0)
 
 

@@ -51,7 +51,7 @@ def wanted(text: str) -> dict[str, float]:
 
 
 def test_requirements_of_the_configuration_determine_the_verdict() -> None:
-    """From TOML in the units of people, through what points need, to the words and the level."""
+    """The path leads from TOML in users' units, through the needs of points, to the words and the level."""
     table = "[calibration.wanted]\npoint_m = {point_m}\nkappa_deg = {kappa_deg}\nrange_scale_ppm = 7.5\n"
     outcome = made_outcome()
     adjusted, report = outcome.adjusted, made_report(outcome)

@@ -79,7 +79,7 @@ def test_parameters_of_an_unknown_scanner_are_refused_before_the_log_is_read(
 
 
 def test_returns_without_time_are_noted(made: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Take the time of half of each strip's returns: calibrate, validate and strips say so of their logs."""
+    """Half of each strip's returns lose their time; calibrate, validate and strips name the logs concerned."""
 
     def without_time(*args: Any, **keys: Any) -> list[JobResult]:
         results = run_jobs(*args, **keys)

@@ -161,7 +161,7 @@ def test_the_reason_for_returns_without_time_is_given(refused: dict[str, int], s
 
 
 def turning(time_ns: np.ndarray[Any, np.dtype[np.int64]], seed: int = 1) -> Trajectory:
-    """A flight that rolls slowly and at random, always in one place."""
+    """Return a flight that rolls slowly and at random, always in one place."""
     n = len(time_ns)
     since_s = (time_ns - time_ns[0])[:, np.newaxis] / 1e9
     phase = np.random.default_rng(seed).uniform(0.0, 2 * np.pi, 40)
@@ -244,7 +244,7 @@ def test_a_height_unit_other_than_the_horizontal_unit_gives_a_warning(crs: str, 
 def level_flight(
     heading_rad: float, roll_rad: float, course_rad: float = 1.0, speed_mps: float = 50.0, seconds: int = 60
 ) -> Trajectory:
-    """A minute, straight on; in one place, which does not matter here."""
+    """Return a straight flight at constant speed; its place is constant, which does not matter here."""
     time_ns = 1_465_549_218_000_000_000 + np.arange(0, seconds * S, S // 10)
     n = len(time_ns)
     level, lat, lon, height = (np.full(n, value) for value in (0.0, 0.8, 0.15, 800.0))

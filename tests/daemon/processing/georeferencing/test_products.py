@@ -13,5 +13,5 @@ def session(*scanners: str) -> Any:
 
 
 def test_a_scanner_keeps_its_number_in_sessions_that_lack_another() -> None:
-    """Strips of a run are one product: channel 0 of one must not be channel 1 of the next."""
+    """Strips of a run are one product, so channel 0 of one must not be channel 1 of the next."""
     assert _numbers([session("right"), session("left", "right")]) == {"left": 0, "right": 1}

@@ -61,7 +61,7 @@ LAT_DEG, LON_DEG, HEIGHT_M = 47.5, 8.9, 800.0
 
 
 class Utm:
-    """Map points by PROJ alone: to UTM zone 32N unless another CRS is given."""
+    """A mapping by PROJ alone, to UTM zone 32N unless another CRS is given."""
 
     def __init__(self, crs: str = "EPSG:32632", unit_m: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> None:
         self._transformer = Transformer.from_crs("EPSG:4978", crs, always_xy=True)
@@ -130,7 +130,7 @@ TYPE_DOUBLE, TYPE_STRING, TYPE_MESSAGE, TYPE_FIXED32 = 1, 9, 11, 7
 
 
 class Schema:
-    """Decode messages by a FileDescriptorSet: message types by full name, their fields by number."""
+    """A decoder of messages by a FileDescriptorSet: message types by full name, their fields by number."""
 
     def __init__(self, data: bytes) -> None:
         self.types: dict[str, dict[int, tuple[str, int, str, bool]]] = {}

@@ -116,7 +116,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
 
 @pytest.fixture(scope="module")
 def replayed(flown: Flown, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Told]:
-    """The folder of a replay, with all points in ``points.npy``, and what was told at its end."""
+    """Return the folder of a replay, with all points in ``points.npy``, and its final status."""
     folder = tmp_path_factory.mktemp("replayed")
     found = replay(flown.session(), flown.setup(), folder, LiveConfig(), folder / "points.npy")
     return folder, found
@@ -174,7 +174,7 @@ class TestPoints:
     def test_points_after_skipped_chunks_are_unchanged(
         self, flown: Flown, replayed: tuple[Path, Told], tmp_path: Path
     ) -> None:
-        """Chunks of scanners of 1.5 s are left out, as by somebody who is behind."""
+        """1.5 s of scanner chunks are skipped, as when live processing falls behind."""
         begin_ns = flown.session().info.realtime_ns + 3_000_000_000
 
         def with_a_hole() -> Iterator[LogBatch]:
@@ -232,7 +232,7 @@ class TestStatus:
         assert sentence(found | {"points_file": "p.npy ends"}).endswith("; free space is down; p.npy ends")
 
     def test_status_is_green_only_if_all_is_well(self, replayed: tuple[Path, Told]) -> None:
-        """At a glance: points of every scanner, on time, every clock locked, nothing damaged or passed over."""
+        """It needs points of every scanner on time, every clock locked, nothing damaged and nothing skipped."""
         found = copy.deepcopy(replayed[1])
         found |= {"trouble": "", "live_skipped_s": 0.0, "damaged_chunks": 0, "state": "following", "without_time": []}
         found["points_per_s"] = dict.fromkeys(found["points"], 8000)
@@ -257,7 +257,7 @@ class TestStatus:
         assert "2 chunks of the log DAMAGED" in sentence(found | {"damaged_chunks": 2})
 
     def test_latency_uses_the_current_clock_of_the_scanner(self) -> None:
-        """The clock is asked once a second and answers differently each time here."""
+        """The clock is queried once a second and answers differently each time here."""
         asked: list[int] = []
 
         def gps_from_host(clock: str, host_ns: Int64Array) -> tuple[Int64Array, FloatArray]:
@@ -280,7 +280,7 @@ class TestStatus:
         assert len(asked) == 3
 
     def test_returns_without_time_are_reported_with_the_reason_while_they_come(self) -> None:
-        """Those since the last time: at its beginning nothing has time, which passes."""
+        """Only returns since the last report count; at the beginning nothing has time, which is temporary."""
         counts: dict[Fate, int] = {}
         refused: dict[str, int] = {}
         locked = ClockStatus(TimeState.LOCKED, 100.0)
@@ -312,7 +312,7 @@ class TestStatus:
         assert said[3][0].startswith("scanner/left: 300 of 300 returns have no time: its stamps contradict the host's")
 
     def test_a_navigated_trajectory_is_not_called_a_device_solution(self) -> None:
-        """The receiver's protocol has INS solutions, and this receiver sends none."""
+        """The receiver's protocol has INS solutions, but this receiver sends none."""
         host = SimpleNamespace(by_source={})
         stream: Any = SimpleNamespace(
             scanners=[], clocks=SimpleNamespace(host=host), path=SimpleNamespace(covered_until_ns=7)
@@ -330,7 +330,7 @@ class TestStatus:
     def test_a_calibration_made_with_another_trajectory_source_is_reported(
         self, flown: Flown, tmp_path: Path, made_with: str, other: bool
     ) -> None:
-        """The receiver's own INS is what points come from here."""
+        """Points are made with the receiver's own INS here."""
         setup = flown.setup()
         assert setup.sources.ins_source is not None
         for name, one in setup.calibrations.items():
@@ -386,7 +386,7 @@ class TestCommand:
     def test_an_unwritable_compilation_cache_is_reported(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
     ) -> None:
-        """A service's journal has what stands on standard error."""
+        """A service's journal contains standard error."""
 
         class Nothing:
             def __init__(self, *_: object, **__: object) -> None:

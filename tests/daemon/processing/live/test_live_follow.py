@@ -25,7 +25,7 @@ Unit = tuple[str, int]
 
 
 class Recording:
-    """A recorder's files, written by hand: units that are their own number, every 250 ms one a class."""
+    """A recorder's files written by hand: units contain their own number, one of each class every 250 ms."""
 
     def __init__(self, folder: Path, info: SessionInfo = INFO) -> None:
         self.folder, self.info = folder, info
@@ -53,7 +53,7 @@ class Recording:
             self.steps += 1
 
     def split(self, *, last: float = 0.0) -> None:
-        """The next part is there before this one is finished; ``last``: seconds that still go into this one."""
+        """Begin the next part before this one is finished; ``last`` gives the seconds that still go into this one."""
         before, self.number = self.writer, self.number + 1
         following = self._open()
         self.go_on(last)
@@ -78,7 +78,7 @@ Follow = Callable[..., LiveFollower]
 
 @pytest.fixture
 def follow(tmp_path: Path) -> Iterator[Follow]:
-    """Makes followers of the recording."""
+    """Return a function that makes followers of the recording."""
     made: list[LiveFollower] = []
 
     def make(*, from_start: bool = False) -> LiveFollower:
@@ -116,7 +116,7 @@ class TestFollowing:
         assert (follower.skipped_ns, follower.damaged) == (0, 0)
 
     def test_a_part_being_finished_is_read_to_its_end(self, recording: Recording, follow: Follow) -> None:
-        """The next one is there already, and the last chunks of this one are not."""
+        """The next part exists already, but the last chunks of this one are not written."""
         follower = follow()
         recording.go_on(1.0)
         seen = units_of(follower.poll())

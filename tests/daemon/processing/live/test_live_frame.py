@@ -36,7 +36,7 @@ class TestFrame:
         np.testing.assert_allclose(nose, [np.sqrt(0.5), np.sqrt(0.5), 0], atol=1e-9)
 
     def test_a_frame_in_feet_is_converted_to_metres(self, tmp_path: Path) -> None:
-        """The same points in UTM metres and in UTM feet: the same cells, clouds and poses."""
+        """The same points in UTM metres and in UTM feet give the same cells, clouds and poses."""
         trajectory = flight()
         told: list[tuple[Any, ...]] = []
         for maps in (Utm(), Utm(FEET, (FOOT_M, FOOT_M, 1.0))):
@@ -81,7 +81,7 @@ class TestFrame:
             np.testing.assert_allclose(one, other, atol=1e-8)
 
     def test_attitudes_match_scipy(self) -> None:
-        """Where a map stretches east and north by two and more, the rotation is the one nearest to its steps."""
+        """If a map stretches east and north by two and more, the rotation is the one nearest to its steps."""
         rng = np.random.default_rng(9)
         position_e = flight().position_e[0]
         half_turns = [Rotation.from_rotvec(np.pi * axis) for axis in np.eye(3)]

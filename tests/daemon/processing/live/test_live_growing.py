@@ -24,7 +24,7 @@ SECONDS = 6.5
 
 
 def test_points_made_during_recording_equal_those_of_the_replay(tmp_path: Path) -> None:
-    """The bytes are equal over part changes; nothing is skipped, and the delay is reported."""
+    """The bytes are equal across part changes; nothing is skipped, and the delay is reported."""
     warm_up([])  # else the command compiles before it follows anything, and says so
     logs, points, said, plan = (tmp_path / name for name in ("logs", "points.npy", "said", "plan.toml"))
     logs.mkdir()

@@ -50,7 +50,7 @@ SETTLED_S = 8.0  # of the points: before, the filter has hardly begun
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
-    """A flight on wires, recorded and followed; three processes."""
+    """Record a flight on wires and follow it live, in three processes."""
     warm_up([])  # else the command compiles at the lowest priority before it follows anything
     folder = tmp_path_factory.mktemp("end_to_end")
     logs, points, said, plan = (folder / name for name in ("logs", "points.npy", "said", "plan.toml"))
@@ -77,7 +77,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
 
 
 def test_points_in_flight_match_the_truth_within_their_sigmas(recorded: Recorded) -> None:
-    """Those that ``swath live`` wrote are those of the replay, which has the sigmas too."""
+    """The points of ``swath live`` equal those of the replay, which has the sigmas too."""
     session = recorded.session()
     setup = Setup.of_log(session.attachments(), Options())
     feed = LogFeed(setup, setup.live_stream(session.info))
@@ -98,7 +98,7 @@ def test_points_in_flight_match_the_truth_within_their_sigmas(recorded: Recorded
 def test_smoothed_points_of_the_same_log_match_the_truth_within_their_sigmas(
     recorded: Recorded, tmp_path: Path
 ) -> None:
-    """``swath georef`` without a trajectory."""
+    """``swath georef`` navigates if no trajectory is given."""
     arguments = ["georef", str(recorded.logs), "-o", str(tmp_path), "--strips", "whole"]
     assert run_app(arguments) in (0, 1)  # partial: returns before the first or after the last sample have no pose
     las = laspy.read(next(tmp_path.glob("*.laz")))

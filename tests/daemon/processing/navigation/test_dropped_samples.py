@@ -22,7 +22,7 @@ Spoil = Callable[[StructArray, Int64Array, slice], None]
 
 
 def holes(spoil: Spoil, count: int) -> list[Stretch]:
-    """What is missing of 20 s at 100 Hz of which so many samples, from the fourth second on, are spoilt."""
+    """Return the stretches missing from 20 s at 100 Hz, of which `count` samples from 4 s on are spoilt."""
     rows = np.zeros(2000, IMU_DTYPE)
     rows["specific_force_b"] = [0.0, 0.0, -9.81]
     stamps_ns = BEGIN_NS + np.arange(2000) * (S // 100)
@@ -42,7 +42,7 @@ def far_back(rows: StructArray, stamps_ns: Int64Array, at: slice) -> None:
 
 
 def again(rows: StructArray, stamps_ns: Int64Array, at: slice) -> None:
-    """A clock that is set back by as much as it takes: from there on the same times come twice."""
+    """Set a clock back by the spoilt time, so that the same times occur twice."""
     stamps_ns[at.start :] -= (at.stop - at.start) * (S // 100)
 
 
@@ -51,7 +51,7 @@ def stuck(rows: StructArray, stamps_ns: Int64Array, at: slice) -> None:
 
 
 def lone(rows: StructArray, stamps_ns: Int64Array, at: slice) -> None:
-    """Stamps that no other comes near to, each farther away than the one before."""
+    """Give each sample a stamp far from all others, each farther away than the one before."""
     stamps_ns[at] += np.arange(1, at.stop - at.start + 1) * 600 * S
 
 
@@ -66,7 +66,7 @@ def lone(rows: StructArray, stamps_ns: Int64Array, at: slice) -> None:
     ],
 )
 def test_a_long_run_of_dropped_samples_is_reported_as_one_gap(spoil: Spoil, begin_s: float, why: str) -> None:
-    """Told once, with the reason, as long as the samples last: 0.7 s."""
+    """It is reported once, with the reason, and lasts as long as the samples: 0.7 s."""
     (hole,) = holes(spoil, 70)
     assert hole.why == why
     assert (hole.begin_ns - BEGIN_NS) / S == pytest.approx(begin_s, abs=0.001)

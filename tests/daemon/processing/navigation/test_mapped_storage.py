@@ -29,7 +29,7 @@ def resident_kb() -> int:
 
 
 def test_a_flight_in_files_equals_the_flight_in_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Filtered and smoothed in pieces, with files for all arrays, however small: every byte."""
+    """Results that are filtered and smoothed in pieces, with files for all arrays, are equal in every byte."""
     truth = fly(survey(), 60.0, 50.0)
     inertial, rows = noised(truth, GRADES["tactical"], Fixes(), ARM, 3)
 

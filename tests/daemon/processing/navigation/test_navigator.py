@@ -64,7 +64,7 @@ Told = tuple[StructArray, list[tuple[str, Points]], LogFeed]
 
 
 def told(setup: Setup, flown: Flown, batches: Iterable[LogBatch]) -> Told:
-    """Poses that the navigator gave, and the points."""
+    """Return the poses that the navigator gave, the points and the feed."""
     feed = LogFeed(setup, setup.live_stream(flown.session().info))
     navigator = feed.navigator
     assert navigator is not None
@@ -87,7 +87,7 @@ def followed(setup: Setup, flown: Flown) -> Told:
 
 
 def one_by_one(batches: Iterable[LogBatch]) -> Iterator[LogBatch]:
-    """One message at a time until some seconds beyond the start that is found, then batches cut in two."""
+    """Yield single messages until some seconds after the start that is found, then batches cut in two."""
     begun_ns = 0
     for batch in batches:
         count = len(batch.log_time_ns)
@@ -137,7 +137,7 @@ def test_poses_do_not_depend_on_how_messages_arrive(followed: Told, setup: Setup
 
 
 def test_an_epoch_whose_messages_come_in_two_ticks_is_used_once(setup: Setup, flown: Flown) -> None:
-    """BESTPOS before a tick and BESTGNSSPOS behind it are one position: their errors are the same."""
+    """BESTPOS before a tick and BESTGNSSPOS after it are one position with the same errors."""
     navigator = LogFeed(setup, setup.live_stream(flown.session().info)).navigator
     assert navigator is not None
     rows = np.zeros(3, OBSERVATION_DTYPE)

@@ -146,7 +146,7 @@ class TestInputsOfALog:
         assert np.abs(off).max() < radians(0.6)  # roll and pitch of some degrees turn the baseline's horizontal part
 
     def test_increments_match_the_motion_of_the_flight(self, flown: Flown, inputs: NavigationInputs) -> None:
-        """Axes of b, though the IMU's own are others; each at the time of its interval."""
+        """The axes are those of b, though the IMU has others; each increment has the time of its interval."""
         truth, (leg,) = flown.truth(), inputs.legs
         sample = leg.inertial
         inside = (sample.time_ns < truth.time_ns[-1] - S) & (sample.time_ns > truth.time_ns[0] + S)
@@ -390,7 +390,7 @@ class TestHeadings:
 def test_correlated_errors_average_as_slowly_as_white_ones_with_their_factor(
     step_s: float, share: float, tau_s: float
 ) -> None:
-    """Compare the variance of a mean of many with that from the covariance of the errors themselves."""
+    """The variance of a mean of many is compared with that from the covariance of the errors themselves."""
     n = 4000
     apart = step_s * np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
     covariance = share**2 * np.exp(-apart / tau_s) + (1 - share**2) * np.eye(n)
@@ -398,7 +398,7 @@ def test_correlated_errors_average_as_slowly_as_white_ones_with_their_factor(
 
 
 def test_each_heading_is_taken_once() -> None:
-    """However quickly they follow each other: the filter knows that their errors last."""
+    """Headings may follow each other quickly, because the filter knows that their errors last."""
     headings = [GnssHeading(at, TimeTag(TimeScale.GPS, 0), 0.01 * at, heading_sigma_rad=2e-3) for at in range(60)]
     found = heading_observations([*headings, headings[7]], [at * 200_000_000 for at in [*range(60), 7]], 1.0)
     assert found.rows["time_ns"].tolist() == [at * 200_000_000 for at in range(60)]
@@ -424,7 +424,7 @@ def test_attitudes_of_an_ins_are_few_and_only_of_valid_solutions() -> None:
 
 
 def test_arrivals_in_bunches_are_spread_evenly() -> None:
-    """Reads of 16 ms, and a pause of two seconds in which samples were lost."""
+    """Reads take 16 ms, and samples are lost in a pause of two seconds."""
     true_ns = np.arange(2000) * 5_000_100
     true_ns = np.delete(true_ns, slice(1000, 1400))
     host_ns = (true_ns // 16_000_000 + 1) * 16_000_000
@@ -530,7 +530,7 @@ def test_positions_without_quality_are_as_accurate_as_their_sigmas(tmp_path: Pat
 
 
 def gga_fixes(separations_m: list[float]) -> list[GnssFix]:
-    """Fixes of a receiver in the Alps, a GGA each second that tells such a geoid."""
+    """Return fixes of a receiver in the Alps, from a GGA each second with the given geoid separation, m."""
     sentences = [
         encode_gga((36_000 + second) * S, 0.82, 0.16, 850.0, separation_m, quality=4, satellites=14)
         for second, separation_m in enumerate(separations_m)
@@ -580,7 +580,7 @@ def test_a_log_whose_receiver_lacks_a_geoid_has_the_finding(tmp_path: Path) -> N
 
 
 def flown_rows(later_s: float = 0.0, north_m: float = 0.0) -> StructArray:
-    """Positions twice a second of a turning flight at 50 m/s, stamped so much later, or so far away."""
+    """Return positions twice a second of a turning flight at 50 m/s, late by `later_s` or displaced by `north_m`."""
     second = np.arange(0.0, 120.0, 0.5)
     rows = np.zeros(len(second), OBSERVATION_DTYPE)
     rows["kind"], rows["time_ns"] = Kind.POSITION, np.rint(1e9 * (1e9 + second + later_s)).astype(np.int64)

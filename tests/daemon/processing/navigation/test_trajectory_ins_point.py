@@ -20,7 +20,7 @@ ARM = np.array([0.3, -0.2, -1.1])
 
 
 def turning(n: int = 600) -> Trajectory:
-    """A level turn, 10 Hz."""
+    """Return a level turn at 10 Hz."""
     since = np.arange(n) / 10
     heading = 0.05 * since
     north, east = 1000 * np.sin(heading), -1000 * np.cos(heading)

@@ -58,7 +58,7 @@ def overlapping(figure: Figure) -> list[tuple[str, str]]:
 
 
 class Tables(HTMLParser):
-    """The words of a page outside its style, and its tables as rows of cells, the heads first."""
+    """Parser that collects a page's words outside its style, and its tables as rows of cells, heads first."""
 
     def __init__(self, text: str) -> None:
         super().__init__()

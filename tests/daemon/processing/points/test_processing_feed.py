@@ -263,7 +263,7 @@ def office(setup: Setup, known: LogClocks, batches: Iterable[tuple[LogBatch, boo
 
 
 def by_time(placed: Placed, name: str) -> dict[tuple[int, int, int], bytes]:
-    """Coordinates of each point by its time, channel and number."""
+    """Return the coordinates of each point by its time, channel and number."""
     found: dict[tuple[int, int, int], bytes] = {}
     for scanner, points in placed:
         if scanner == name:
@@ -273,7 +273,7 @@ def by_time(placed: Placed, name: str) -> dict[tuple[int, int, int], bytes]:
 
 
 def test_pieces_of_a_log_together_give_the_whole(setup: Setup, flown: Flown, known: LogClocks) -> None:
-    """With complete clocks, which pickle, each return stands in the piece where its message does, and alike."""
+    """The clocks are complete and can be pickled; each return is in the piece that has its message."""
     session = flown.session()
     known = pickle.loads(pickle.dumps(known))
     setup = pickle.loads(pickle.dumps(setup))
@@ -306,7 +306,7 @@ def test_invalid_readings_and_edges_are_dropped(setup: Setup, flown: Flown) -> N
 def test_scanner_units_of_any_length_are_decoded_in_batches(
     setup: Setup, flown: Flown, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Until they are enough, come by another wire, or a tick comes."""
+    """A batch ends when it is large enough, when another wire's units come, or at a tick."""
     session = flown.session()
     feed = LogFeed(setup, setup.live_stream(session.info))
     left = next(batch for batch in session.batches() if batch.channel.topic == "/scanner/left/raw")
@@ -375,7 +375,7 @@ def test_a_batch_is_split_at_every_tick(setup: Setup, flown: Flown, monkeypatch:
 def test_a_terrain_model_predicts_the_measured_range(
     setup: Setup, flown: Flown, known: LogClocks, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Flat ground, heights of which a grid around the site knows; so the range expected is the range."""
+    """A coarse grid around the site knows the heights of the flat ground, so the prediction equals the range."""
     terrain = CoarseTerrain(np.full((2, 2), 450.0), (0.14, 0.81), (0.03, 0.04))
     georeferencer = setup.georeferencer("left")
     predict = TerrainRanges(georeferencer.model, terrain)

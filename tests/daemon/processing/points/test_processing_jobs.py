@@ -45,7 +45,7 @@ def halves(flown: Flown, path: Path) -> str:
 
 @pytest.fixture(scope="module")
 def alone(flown: Flown, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, str]]:
-    """Strips' file, and what one process makes."""
+    """Return the file of strips, and the digests of what one process makes."""
     output = tmp_path_factory.mktemp("alone")
     strips = Path(halves(flown, output.parent / "halves.csv"))
     assert run_app(flown.arguments(output, "--strips", str(strips))) == 0

@@ -44,7 +44,7 @@ AIR = {"ranges": "vacuum", "refraction": "spherical"}
 
 @dataclass(frozen=True)
 class Case:
-    """A kind of scanner: what the plan says of it, and the quanta of its packets."""
+    """A kind of scanner: its table in the plan, and the quanta of its packets."""
 
     scanner: dict[str, Any]
     low: bool = False

@@ -106,7 +106,7 @@ class Velodyne:
         return [unit for unit in payloads(f"velodyne/{self.capture}.pcap.gz") if len(unit) == 1206]
 
     def decoder_cloud(self) -> StructArray:
-        """velodyne-decoder's first scan in the order of firing, then range."""
+        """Return velodyne-decoder's first scan in the order of firing, then range."""
         with np.load(FIXTURES / "velodyne" / f"{self.capture}.velodyne_decoder.npz") as archive:
             cloud: StructArray = archive["points"]
         return cloud[np.lexsort([np.linalg.norm(xyz(cloud), axis=1), cloud["ring"], cloud["column"]])]
@@ -143,7 +143,10 @@ def test_velodyne_points_match_velodyne_decoder(recording: Velodyne) -> None:
 
 
 def test_vlp16_points_match_nebula() -> None:
-    """Its own regression cloud: 3 cm, as it has no vertical corrections (11 mm) and turns azimuths on otherwise."""
+    """The reference is nebula's regression cloud, to 3 cm.
+
+    nebula has no vertical corrections (11 mm) and interpolates azimuths differently.
+    """
     fields = [("x", "f4"), ("y", "f4"), ("z", "f4"), ("intensity", "u1"), ("return_type", "u1"), ("channel", "u2")]
     kind = np.dtype([*fields, ("azimuth", "f4"), ("elevation", "f4"), ("distance", "f4"), ("time_stamp", "u4")])
     cloud = read_pcd(FIXTURES / "velodyne" / "nebula_vlp16_golden_1673400472138016708.pcd.gz", kind)
@@ -164,9 +167,10 @@ def nearest_m(points: FloatArray, others: FloatArray) -> FloatArray:
 
 
 def test_vlp32c_points_match_nebula() -> None:
-    """Laser by elevation and raw distance of each point are ours, and so is its azimuth as nebula turns it on.
+    """Laser by elevation, raw distance and azimuth of each point agree with nebula's, with its interpolation.
 
-    It lets every laser fire 2.304 µs after the one before (the manual: every pair), and some blocks it does not turn.
+    nebula lets every laser fire 2.304 µs after the previous one (the manual: every pair), and does not interpolate the
+    azimuth in some blocks.
     """
     recording = Velodyne("velodyne-vlp32c", VLP32C, "nebula_vlp32")
     parser = recording.parser("calib_VLP32.yaml")  # as nebula has it: without vertical corrections
@@ -184,7 +188,10 @@ def test_vlp32c_points_match_nebula() -> None:
 
 
 def by_laser(points: FloatArray) -> FloatArray:
-    """(n, 3) laser and raw distance so far apart that only points of both alike are near, and azimuth in degrees."""
+    """Return (n, 3) for a search of neighbours: laser, raw distance, and azimuth in degrees.
+
+    Laser and distance are scaled so that points with different ones are far apart.
+    """
     range_m = np.linalg.norm(points, axis=1)
     elevation = np.degrees(np.arcsin(points[:, 2] / range_m))
     laser = np.abs(elevation[:, np.newaxis] - VLP32C.beams.elevation_deg).argmin(axis=1)
@@ -196,7 +203,7 @@ def by_laser(points: FloatArray) -> FloatArray:
 
 
 def test_xt32_points_match_nebula() -> None:
-    """Every point of its cloud within 0.1 mm, once its leaving out the turn up to the firing is done here too."""
+    """Every point of nebula's cloud is within 0.1 mm if the rotation until the firing is omitted here too, as there."""
     angles = (FIXTURES / "hesai" / "calib_PandarXT32.csv").read_bytes()
     parser = find_driver("scanner", "hesai-xt32").make_parser(DeviceSettings("scanner/left", {}, {"geometry": angles}))
     assert isinstance(parser, PacketParser)

@@ -84,7 +84,7 @@ def test_rough_and_steep_ground_is_not_compared(tmp_path: Path) -> None:
 
 
 def test_only_single_returns_are_compared_and_first_returns_counted(tmp_path: Path) -> None:
-    """Second returns lie a metre below and would spoil both."""
+    """Second returns are a metre below and would spoil both."""
     paths = []
     for number in (1, 2):
         x, y = lattice(EAST_M, NORTH_M, 60.0, 60.0, 0.5)
@@ -139,7 +139,7 @@ def test_means_of_cells_match_those_of_their_points(tmp_path: Path) -> None:
 def test_quality_levels_follow_density_and_rmsdz(
     tmp_path: Path, dz_m: float, best: str | None, asprs_m: float | None
 ) -> None:
-    """5 pulses a square metre are no QL1, whatever dZ is."""
+    """5 pulses per square metre are too few for QL1, whatever dZ is."""
     quality = two_strips(tmp_path, dz_m).agreement.record()
     assert quality["best"] == best
     assert quality["asprs_class_m"] == asprs_m
@@ -148,7 +148,7 @@ def test_quality_levels_follow_density_and_rmsdz(
 
 
 def test_feet_are_converted_to_metres(tmp_path: Path) -> None:
-    """EPSG:2994 counts in feet; a lattice of a foot has 1 / 0.3048² points a square metre."""
+    """EPSG:2994 is in feet; a lattice of a foot has 1 / 0.3048² points per square metre."""
     x, y = lattice(600_000.0, 800_000.0, 300.0, 300.0, 1.0)
     paths = [
         write_laz(tmp_path / f"{n}.laz", x, y, 1000.0 + 0.05 * x + 0.1 * n, n, crs=CRS.from_epsg(2994), scale=0.001)
@@ -260,7 +260,7 @@ def test_a_requested_profile_lies_at_its_requested_place(tmp_path: Path) -> None
 def test_enlarged_cells_give_the_results_of_larger_cells(
     shifted: Look, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """With room for few tiles the cells grow; the moments are the ones of larger cells from the beginning."""
+    """With memory for few tiles the cells grow; the moments equal those of larger cells from the beginning."""
     monkeypatch.setattr("swath.daemon.processing.quicklook.strips.MOST_TILES", 30)
     look = two_strips(tmp_path, 0.07)
     assert look.cells.frame.cell_m >= 2 * shifted.cells.frame.cell_m
@@ -272,7 +272,7 @@ def test_enlarged_cells_give_the_results_of_larger_cells(
 
 
 def test_moments_move_with_their_cells() -> None:
-    """A quarter of a tile of cells twice as large, against moments summed there directly."""
+    """A quarter of a tile of cells twice as large is compared with moments summed there directly."""
     random = np.random.default_rng(5)
     x, y, z = random.uniform(0.0, TILE, (3, 4000))
     fine, coarse = np.zeros((TILE, TILE, MOMENTS)), np.zeros((TILE // 2, TILE // 2, MOMENTS))
@@ -292,7 +292,7 @@ def test_tiles_are_stored_only_where_there_are_points() -> None:
 
 
 def test_an_overflowing_number_of_cells_is_too_many() -> None:
-    """`--cell 1e-9`: their product is no 64 bit integer."""
+    """With `--cell 1e-9` the product of rows and columns exceeds a 64-bit integer."""
     frame = frame_of(np.array([0.0, 0.0]), np.array([1e4, 1e4]), 1e-9)
     assert 1_000_000 < frame.rows * frame.columns <= 2_000_000
 

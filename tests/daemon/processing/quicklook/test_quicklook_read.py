@@ -44,7 +44,7 @@ def as_copc(laz: Path, path: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Look, Path]:
-    """Two strips as LAZ looked at, and their folder as COPC, in chunks of several sizes."""
+    """Return two strips read as LAZ, and their folder as COPC, in chunks of several sizes."""
     laz, copc = tmp_path_factory.mktemp("laz"), tmp_path_factory.mktemp("copc")
     look = two_strips(laz, 0.07)
     with pytest.MonkeyPatch.context() as patch:
@@ -79,7 +79,7 @@ def test_a_copc_file_looks_like_the_laz_file_of_its_points(both: tuple[Look, Pat
 def test_a_profile_through_copc_contains_the_points_of_laz(
     both: tuple[Look, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """At the far end, where only some of the blocks are wanted."""
+    """The profile is at the far end, where only some of the blocks are needed."""
     monkeypatch.setattr("swath.daemon.processing.quicklook.read.BLOCK_POINTS", 5_000)
     ends = (EAST_M + 290.0, NORTH_M + 5.0, EAST_M + 290.0, NORTH_M + 155.0)
     heights = []
@@ -95,13 +95,13 @@ def test_a_profile_through_copc_contains_the_points_of_laz(
 def test_density_does_not_depend_on_the_point_order(
     both: tuple[Look, Path], monkeypatch: pytest.MonkeyPatch, size: int
 ) -> None:
-    """COPC's is that of a tree: a piece of it is less dense than the whole."""
+    """COPC orders points by a tree, so that a piece of the file is less dense than the whole."""
     monkeypatch.setattr("swath.daemon.processing.quicklook.read.SAMPLE_POINTS", size)
     assert density_near(open_source(both[1] / "s1.copc.laz"), Units()) == pytest.approx(4.0, rel=0.3)
 
 
 def feet(folder: Path, name: str, crs: CRS, height: float, sidecar: dict[str, Any] | None = None) -> Look:
-    """Two strips in US survey feet, the second a unit of height above; sigmas of 3 cm."""
+    """Return two strips in US survey feet, the second one unit higher, with sigmas of 3 cm."""
     inside = folder / name
     inside.mkdir()
     for number in (1, 2):
@@ -142,7 +142,7 @@ def test_a_sidecar_without_a_unit_changes_nothing(tmp_path: Path, units: Any) ->
 
 
 def test_differences_of_metres_are_shown_in_metres(tmp_path: Path) -> None:
-    """An aircraft that was never calibrated: nothing is cut off at a metre."""
+    """An aircraft that was never calibrated may differ by more than a metre, and nothing is clipped."""
     for number in (1, 2):
         x, y = lattice(EAST_M, NORTH_M, 60.0, 60.0, 0.5)
         write_laz(tmp_path / f"{number}.laz", x, y, plane(x, y) + 2.5 * number, number)
@@ -152,7 +152,7 @@ def test_differences_of_metres_are_shown_in_metres(tmp_path: Path) -> None:
 
 
 def test_lengths_on_a_distorted_map_are_ground_lengths(tmp_path: Path) -> None:
-    """At 47.5° N web Mercator has 1.48 m for one on the ground, and so 2.19 times fewer pulses a square metre."""
+    """At 47.5° N a ground metre is 1.48 m in web Mercator, so it has 2.19 times fewer pulses per square metre."""
     x, y = lattice(990_000.0, 6_024_000.0, 300.0, 100.0, 0.5)  # four a square metre of the map
     write_laz(tmp_path / "s.laz", x, y, 0.0 * x + 400.0, crs=CRS.from_epsg(3857))
     look = look_at([tmp_path])
@@ -165,7 +165,7 @@ def test_lengths_on_a_distorted_map_are_ground_lengths(tmp_path: Path) -> None:
 
 
 def test_points_outside_the_area_of_use_of_their_crs_are_reported(tmp_path: Path) -> None:
-    """Points of 9° E in zone 33, which begins at 12° E."""
+    """The points are at 9° E in zone 33, which begins at 12° E."""
     x, y = lattice(47_000.0, 5_275_000.0, 50.0, 50.0, 0.5)
     write_laz(tmp_path / "s.laz", x, y, 0.0 * x + 400.0, crs=CRS.from_epsg(32633))
     (note,) = look_at([tmp_path]).notes

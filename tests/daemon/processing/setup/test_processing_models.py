@@ -48,7 +48,7 @@ STAGES = {
 
 
 def test_a_scanner_without_declared_beams_is_not_taken_for_a_line_scanner() -> None:
-    """Use srep's parser, which has no table of beams, under the name of a head that has one."""
+    """srep's parser, which has no table of beams, is given under the name of a head that has one."""
     table = ScannerConfig.model_validate({"transport": "udp:0.0.0.0:2368", "protocol": "velodyne-vlp16"})
     with pytest.raises(
         ValueError, match="protocol velodyne-vlp16: its parser has no beam table and it is not a line scanner"
@@ -87,7 +87,7 @@ FIXED = "angles_deg = [0, 0, 0]"
 
 
 def logged(folder: Path, source: str) -> Config:
-    """An aircraft whose gimbal is read by a source; its receiver, a NovAtel, is an INS too."""
+    """Return an aircraft whose gimbal is read by a source; its receiver, a NovAtel, is an INS too."""
     return aircraft_config(folder, {FIXED: f'source = "{source}", angles_deg = [0, 0, 0]'})
 
 

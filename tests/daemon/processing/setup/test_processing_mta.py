@@ -62,26 +62,26 @@ ABOVE_M, GROUND_M, HILL_M, HILL_LENGTH_M = 1200.0, 500.0, 330.0, 2600.0
 
 
 def frame() -> tuple[FloatArray, Rotation]:
-    """Origin in e of a level frame, north, east and down, and its rotation to e."""
+    """Return the origin in e, m, of a level frame (north, east, down), and its rotation to e."""
     to_e = Transformer.from_crs(4979, 4978, always_xy=True)
     return np.array(to_e.transform(LON_DEG, LAT_DEG, 0.0)), Rotation.from_euler("ZY", [LON_DEG, -LAT_DEG - 90], True)
 
 
 def flown(seconds: FloatArray) -> tuple[FloatArray, Rotation]:
-    """Positions (n, 3) in the level frame and attitudes: straight on, and rolling slowly."""
+    """Return positions (n, 3), m, in the level frame and attitudes of a straight flight that rolls slowly."""
     position = np.stack([62.0 * seconds, 3.0 * seconds, -ABOVE_M - GROUND_M - 0.5 * seconds], axis=1)
     level = Rotation.from_euler("ZYX", [0.05, 0.02, -0.03])
     return position, level * Rotation.from_rotvec(seconds[:, np.newaxis] * np.array([0.12, 0.03, -0.02]))
 
 
 def ground_down(north: FloatArray, east: FloatArray) -> FloatArray:
-    """Down coordinate of the hills."""
+    """Return the down coordinate of the hills, m."""
     down: FloatArray = -GROUND_M + HILL_M * np.sin(2 * np.pi * east / HILL_LENGTH_M + north / 300.0)
     return down
 
 
 def to_the_ground(from_l: FloatArray, along_l: FloatArray) -> FloatArray:
-    """(n,) ranges, by bisection."""
+    """Return ranges (n,), m, to the ground by bisection."""
     near, far = np.full(len(from_l), 300.0), np.full(len(from_l), 3000.0)
     for _ in range(60):
         middle = 0.5 * (near + far)
@@ -93,7 +93,7 @@ def to_the_ground(from_l: FloatArray, along_l: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Flight:
-    """Emissions (n,), their echoes (k,) with the pulse and the record they stand in, and what went on the wire."""
+    """Emissions (n,), their echoes (k,) with pulse and record, and the datagrams sent."""
 
     ticks: Int64Array
     pulse: Int64Array
@@ -172,7 +172,7 @@ def trajectory() -> Trajectory:
 
 
 def coarse_terrain() -> CoarseTerrain:
-    """The hills at nodes 110 m apart, 25 m too high."""
+    """Return the hills at nodes 110 m apart, 25 m too high."""
     lat_step, lon_step = np.radians(1e-3), np.radians(1.4e-3)
     rows, columns = np.meshgrid(np.arange(-12, 13), np.arange(-12, 13), indexing="ij")
     origin_e, rot_e_from_l = frame()
@@ -187,10 +187,10 @@ def coarse_terrain() -> CoarseTerrain:
 
 
 class SteadyClocks:
-    """Stand-in: the scanner's counter runs as GPS does."""
+    """Stand-in for clocks: the scanner's counter runs as GPS does."""
 
     def update(self) -> None:
-        """Do nothing."""
+        """Do nothing, because these clocks need no update."""
 
     def place(self, source: str, rows: StructArray, worst_ns: float) -> tuple[BoolArray, Int64Array]:
         del source, worst_ns
@@ -205,7 +205,7 @@ class Made:
 
 
 def made_of(*, terrain: bool, at_once: int = 37, emissions: bool = True, offsets: tuple[Any, ...] = ()) -> Made:
-    """Datagrams that were not lost, so many at once, a tick after each."""
+    """Georeference the datagrams that were not lost, `at_once` at a time, with a tick after each."""
     keys = {"transport": "udp:0.0.0.0:2368", "protocol": "srep", "mirror_factor": 2.0, "range_max_m": 2200.0}
     table = ScannerConfig.model_validate(keys)
     calibration = replace(nominal("left", ARM_B, np.eye(3)), range_offsets=offsets)
@@ -232,7 +232,7 @@ def made_of(*, terrain: bool, at_once: int = 37, emissions: bool = True, offsets
 
 
 def echoes_of(points: Points) -> NDArray[np.intp]:
-    """Which echo each point is: its intensity says the pulse, its range the tree or the ground."""
+    """Return which echo each point is: its intensity gives the pulse, its range separates tree and ground."""
     true = flight()
     order = np.lexsort([true.range_m, true.pulse])
     pulse, range_m = true.pulse[order], true.range_m[order]
@@ -285,7 +285,7 @@ def test_results_do_not_depend_on_how_the_log_is_cut() -> None:
 
 
 def test_without_pulses_that_gave_no_return_most_points_are_lost() -> None:
-    """What the rows of pulses without a return are for."""
+    """This shows what the rows of pulses without a return are needed for."""
     alone = made_of(terrain=True, emissions=False)
     assert alone.fates[Fate.MTA_GAP] > 0.3 * flight().came.sum()
 

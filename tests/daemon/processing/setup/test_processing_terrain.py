@@ -23,12 +23,12 @@ LAT, LON = np.radians(47.5), np.radians(8.9)
 
 
 def plane_m(east_m: Any, north_m: Any) -> Any:
-    """Heights so far east and north of the middle."""
+    """Return heights, m, at distances east and north of the middle."""
     return 480.0 + 0.05 * north_m + 0.03 * east_m
 
 
 def write(path: Path, **others: Any) -> None:
-    """A plane that falls to south and west, `plane_m`, pixels of 30 m, 3 km wide, 480 m high in the middle."""
+    """Write a raster of the plane `plane_m`: 30 m pixels, 3 km wide, 480 m high in the middle."""
     transform = Affine(30.0, 0.0, EAST_M - 1500.0, 0.0, -30.0, NORTH_M + 1500.0)
     from_west_m = 30.0 * (np.arange(100) + 0.5)
     values = plane_m(from_west_m[np.newaxis] - 1500.0, 1500.0 - from_west_m[:, np.newaxis])

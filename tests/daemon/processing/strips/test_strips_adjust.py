@@ -41,7 +41,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
 
 
 def raised(made: Made, up_m: float, swaths: tuple[int, ...]) -> Trajectory:
-    """The true trajectory, too high along some strips."""
+    """Return the true trajectory, raised along some strips by `up_m`."""
     trajectory, margin_ns = made.trajectory, 2_000_000_000
     lat, lon, _ = trajectory.geodetic()
     up_e = -rot_e_from_l(lat, lon)[:, :, 2]
@@ -158,7 +158,7 @@ def test_the_corrected_trajectory_is_readable_and_needs_no_correction(
 def test_an_unusable_trajectory_is_reported_first_and_stays_unusable(
     made: Made, lifted: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Exit code 1, the files written, and the same word on what is made with them."""
+    """The exit code is 1; the files are written, and products made with them carry the verdict."""
     file = tmp_path / "flight.csv"
     file.write_bytes(lifted.read_bytes())
     judge_unusable(file, "the lever arm has another sign")
@@ -206,14 +206,14 @@ def utm32_text(control: Path, *, swapped: bool = False) -> str:
 
 
 def spans(folder: Path, *times: tuple[int, int]) -> tuple[str, str]:
-    """The option for strips at these times."""
+    """Return the option for strips at these times (GPS ns)."""
     path = folder / "strips.csv"
     path.write_text("\n".join(["start_gps_ns,end_gps_ns", *(f"{start},{end}" for start, end in times)]) + "\n")
     return "--strips", str(path)
 
 
 def refused(capsys: pytest.CaptureFixture[str], given: list[str]) -> tuple[int, str]:
-    """Exit code and the one line of a command that made nothing."""
+    """Return exit code and the only line of a command that made nothing."""
     capsys.readouterr()
     code = run_app(given)
     line = capsys.readouterr().err
@@ -306,7 +306,7 @@ def test_a_full_disk_leaves_no_files(
 def test_a_trajectory_is_written_back_about_the_plumb_line_of_its_input(
     made: Made, done: tuple[AdjustOptions, StripsCorrected], tmp_path: Path
 ) -> None:
-    """Otherwise the deflection of the vertical would be taken off twice."""
+    """Otherwise the deflection of the vertical would be removed twice."""
     xi_eta_rad = tuple(np.radians([12.0 / 3600.0, -7.0 / 3600.0]))
     request, outcome = replace(done[0], output=tmp_path / "out"), done[1]
     (logged,) = outcome.kept.logged

@@ -109,7 +109,7 @@ def test_the_page_is_complete(flight: Flight) -> None:
 
 
 def test_a_minimal_solution_gives_a_page(flight: Flight) -> None:
-    """Three epochs, no observation, no node, not smoothed."""
+    """It has three epochs, no observation, no node, and no smoothing."""
     first: dict[str, Any] = {}
     for name in Solution.__dataclass_fields__:
         value = getattr(flight.forward, name)
@@ -151,7 +151,7 @@ def test_blocks_cover_every_sample_once(flight: Flight) -> None:
 
 
 def test_drawn_errors_match_the_truth_of_the_flight() -> None:
-    """Errors of the stand-in are 5 mm, 5 mm/s, 0.004°; bands hold the truth but for six sigmas of these."""
+    """The stand-in's errors are 5 mm, 5 mm/s, 0.004°; bands contain the truth within six sigmas of these."""
     flight = sound_flight(every=1)  # 20 Hz: epochs are close enough to share verticals
     truth = reference_truth()
     course = course_of(flight)
@@ -208,7 +208,7 @@ def test_outages_bridges_and_fix_types_are_found(flight: Flight) -> None:
 
 
 def test_separation_is_filter_minus_smoother_in_l(flight: Flight) -> None:
-    """A step put into the filter comes out north, east, down; and the sigma is that of the difference."""
+    """A step put into the filter appears in north, east, down, with the sigma of the difference."""
     assert flight.smoothed is not None
     separation = separation_of(replace(flight, forward=flight.smoothed))
     assert separation is not None
@@ -229,7 +229,7 @@ def test_separation_is_filter_minus_smoother_in_l(flight: Flight) -> None:
 
 
 def pixels_near(png: bytes, colour: str) -> int:
-    """How many pixels have a colour, but for a little."""
+    """Return how many pixels nearly have a colour."""
     image = np.asarray(Image.open(io.BytesIO(png)).convert("RGB")).astype(int)
     wanted = np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)])
     return int((np.abs(image - wanted).max(axis=2) < 24).sum())

@@ -24,7 +24,7 @@ EVENT = EventMark(0, TimeTag(TimeScale.GPS, 0), "MARK2", count=7, sigma_s=1e-3)
 
 @pytest.fixture(scope="module")
 def trajectory() -> Trajectory:
-    """Level flight to the north at 60 m/s along a meridian, 10 Hz, a hole from 4 s to 6 s."""
+    """Return level flight north at 60 m/s along a meridian, at 10 Hz, with a gap from 4 s to 6 s."""
     seconds = np.concatenate([np.arange(0, 4.05, 0.1), np.arange(6, 10.05, 0.1)])
     n = len(seconds)
     return Trajectory.from_geodetic(

@@ -25,7 +25,7 @@ WEEK_NS = 604_800 * S
 
 @pytest.fixture
 def trajectory() -> Trajectory:
-    """A climbing turn over the week's end."""
+    """Return a climbing turn across the end of the week."""
     n = 50
     time_ns = 2423 * WEEK_NS - 2 * S + np.arange(n) * S // 10
     since = (time_ns - time_ns[0]) / S
