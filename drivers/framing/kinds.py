@@ -186,6 +186,48 @@ def novatel_name(frame: bytes) -> str:
     return f"NOVATEL-{NOVATEL_MESSAGE_ID.unpack_from(frame)[0]}"
 
 
+# --- NovAtel and Unicore ASCII: #NAME,header;fields*CRC-32, short header %NAME,… (OEM7 commands and logs, ASCII) ------
+
+# A RANGEA of 150 signals has 15 kB; longer logs are not decoded here, and their bytes are skipped.
+NOVATEL_ASCII_MAX_BYTES = 16 * 1024
+NOVATEL_ASCII_BODY = re.compile(rb"[#%][A-Z][A-Z0-9_]*,[ -)+-~]*")  # printable, not * (the checksum)
+NOVATEL_ASCII_BEGIN = re.compile(rb"[#%](?:\Z|[A-Z][A-Z0-9_]{0,31}(?:,|\Z))")
+NOVATEL_ASCII_CHECKSUM = re.compile(rb"\*[0-9A-Fa-f]{8}")
+NOVATEL_ASCII_TAIL_BYTES = 9  # star and checksum
+
+
+def measure_novatel_ascii(buffer: bytes, start: int, final: bool) -> int:
+    """Measure a log with its line end, or up to its checksum where the line end is missing."""
+    if not NOVATEL_ASCII_BEGIN.match(buffer, start):
+        return FALSE_SYNC
+    body = NOVATEL_ASCII_BODY.match(buffer, start, start + NOVATEL_ASCII_MAX_BYTES)
+    star = body.end() if body else len(buffer)
+    end = star + NOVATEL_ASCII_TAIL_BYTES
+    if end - start > NOVATEL_ASCII_MAX_BYTES - 2:
+        return OVER_BOUND
+    if end > len(buffer):
+        plausible = star == len(buffer) or buffer[star] == 0x2A
+        return UNDECIDED if plausible else FALSE_SYNC
+    if not NOVATEL_ASCII_CHECKSUM.match(buffer, star):
+        return FALSE_SYNC
+    ending = buffer[end : end + 2]
+    if ending in (b"", b"\r") and not final:
+        return UNDECIDED
+    return end - start + (2 if ending == b"\r\n" else 1 if ending[:1] == b"\n" else 0)
+
+
+def intact_novatel_ascii(frame: bytes) -> bool:
+    """Return whether the eight hexadecimal digits are the CRC-32 of the bytes between the first one and the star."""
+    star = frame.rindex(b"*")
+    return crc32_novatel(frame[1:star]) == int(frame[star + 1 : star + NOVATEL_ASCII_TAIL_BYTES], 16)
+
+
+def novatel_ascii_name(frame: bytes) -> str:
+    """Return the name of the log without its format letter, and without the number of a secondary antenna."""
+    name = frame[1 : frame.index(b",")].partition(b"_")[0].decode()
+    return name[:-1] if name.endswith("A") else name
+
+
 # --- Xbus: FA FF, message identifier, length, data, checksum (Xsens MT Low-Level Communication Protocol) --------------
 
 XBUS_MAX_DATA_BYTES = 2048  # data of a message with an extended length
@@ -281,6 +323,15 @@ NOVATEL_SHORT = FrameKind(
     measure_novatel_short,
     lambda frame: crc32_novatel(frame) == 0,
     novatel_name,
+)
+
+NOVATEL_ASCII = FrameKind(
+    "novatel-ascii",
+    (b"#%", bytes(range(0x41, 0x5B))),
+    NOVATEL_ASCII_MAX_BYTES,
+    measure_novatel_ascii,
+    intact_novatel_ascii,
+    novatel_ascii_name,
 )
 
 XBUS = FrameKind(

@@ -67,6 +67,15 @@ def _seal_novatel_short(frame: bytes) -> bytes:
     return bytes(content) + struct.pack("<I", crc32_novatel(content))
 
 
+def _seal_novatel_ascii(frame: bytes) -> bytes:
+    sync = frame[:1] if frame[:1] in (b"#", b"%") else b"#"
+    text = frame[1:].rpartition(b"*")[0] or frame[1:]
+    content = bytes(byte for byte in text if 0x20 <= byte < 0x7F and byte != 0x2A)[:16_000]
+    if not frame_kinds.NOVATEL_ASCII_BEGIN.match(sync + content + b"!"):
+        content = b"BESTPOSA," + content
+    return sync + content + b"*%08x\r\n" % crc32_novatel(content)
+
+
 def _seal_xbus(frame: bytes) -> bytes:
     identifier = frame[2:3] if frame[2:3] in [bytes([one]) for one in frame_kinds.XBUS_IDENTIFIERS] else b"\x36"
     payload = frame[6 if frame[3:4] == b"\xff" else 4 : -1][:2048]
@@ -104,6 +113,7 @@ SEALS: dict[str, Callable[[bytes], bytes]] = {
     "rtcm3": _seal_rtcm3,
     "novatel": _seal_novatel,
     "novatel-short": _seal_novatel_short,
+    "novatel-ascii": _seal_novatel_ascii,
     "xbus": _seal_xbus,
     "sbf": _seal_sbf,
     "vectornav": _seal_vectornav,
@@ -168,7 +178,7 @@ def _changed(rng: random.Random, kind: str, frame: bytes) -> bytes:
     seal = SEALS.get(kind)
     if seal is None:
         return damage(rng, frame)
-    if kind == "nmea":
+    if kind in ("nmea", "novatel-ascii"):
         return seal(_changed_sentence(rng, frame))
     # what a frame is (identifier, time) stands in its head, so that part is spared mostly
     start = 2 if rng.random() < 0.15 else min(6, len(frame) - 1)

@@ -1,7 +1,8 @@
-"""NovAtel OEM7 (and OEM4 to OEM6) binary logs, long and short headers, with or without SPAN.
+"""NovAtel OEM7 (and OEM4 to OEM6) binary and ASCII logs, long and short headers, with or without SPAN.
 
 `swath.drivers.framing.framer` does framing and checksum; layouts and tables are in `swath.drivers.gnss.novatel`.
-Prompts (``[COM1]``), ASCII logs, NMEA and RTCM3 between the logs are framed or skipped, and counted.
+Prompts (``[COM1]``), abbreviated ASCII logs (``<BESTPOS``), NMEA and RTCM3 between the logs are framed or skipped, and
+counted. A log is decoded alike in ASCII and in binary, so a stream with both forms of one log gives its records twice.
 
 Records by log:
 
@@ -21,8 +22,9 @@ from dataclasses import replace
 
 from swath.drivers.driver import STREAM_TRANSPORTS, Driver
 from swath.drivers.framing.framer import Frame, Framer
-from swath.drivers.framing.kinds import NMEA, NOVATEL, NOVATEL_SHORT, RTCM3
+from swath.drivers.framing.kinds import NMEA, NOVATEL, NOVATEL_ASCII, NOVATEL_SHORT, RTCM3
 from swath.drivers.gnss.date_floor import ReceiverDates
+from swath.drivers.gnss.novatel import ascii as text
 from swath.drivers.gnss.novatel import layouts as nov
 from swath.drivers.gnss.novatel import tables
 from swath.drivers.gnss.novatel.records import DECODERS, Header, State
@@ -79,6 +81,7 @@ def message_name(frame: bytes) -> str:
 FRAME_KINDS = (
     replace(NOVATEL, message_name=message_name),
     replace(NOVATEL_SHORT, message_name=message_name),
+    NOVATEL_ASCII,
     NMEA,
     RTCM3,
 )
@@ -122,10 +125,12 @@ class NovatelParser(StreamParser):
         return join_rows(item for log in logs for item in self._decode(log))
 
     def _decode(self, frame: Frame) -> list[Record | Row]:
-        """Decode one frame; a body that is too short is counted."""
+        """Decode one frame; a body that is too short or cannot be read is counted."""
+        if frame.kind == NOVATEL_ASCII.name:
+            return self._decode_ascii(frame)
         number = int.from_bytes(frame.data[4:6], "little")
         if number in RAW_RANGES:
-            return self._second_of_raw(frame, RAW_RANGES[number])
+            return self._second_of_raw(_split(frame, RAW_RANGES[number], self._state.dates)[0])
         layout = nov.LAYOUTS.get(number)
         if layout is None or layout.body not in self._bodies:
             return []
@@ -136,8 +141,32 @@ class NovatelParser(StreamParser):
             self.counters.bad_messages += 1
             self.counters.errors["bad_length"] += 1
             return []
-        message = layout.body._make(layout.wire.unpack_from(body))
-        items = [*self._named_second(header), *DECODERS[layout.body](self._state, header, message)]
+        return self._records(header, layout.body._make(layout.wire.unpack_from(body)))
+
+    def _decode_ascii(self, frame: Frame) -> list[Record | Row]:
+        name = NOVATEL_ASCII.message_name(frame.data)
+        layout = nov.LAYOUTS.get(nov.IDS.get(name, -1))
+        is_raw = name in RAW_RANGES.values()
+        if not is_raw and (layout is None or layout.body not in self._bodies):
+            return []
+        try:
+            head, texts = text.split_log(frame.data)
+            fields = text.read_header(frame.data, head)
+            week = self._state.dates.week(fields.week, frame.host_time_ns)
+            floor_week = self._state.floor_week
+            header = Header(
+                name, frame.host_time_ns, week, fields.milliseconds, fields.time_status, fields.source, floor_week
+            )
+            if is_raw or layout is None:
+                return self._second_of_raw(header)
+            return self._records(header, text.read_body(layout.body, layout.wire, texts))
+        except text.FieldError:
+            self.counters.bad_messages += 1
+            self.counters.errors["bad_field"] += 1
+            return []
+
+    def _records(self, header: Header, message: nov.Body) -> list[Record | Row]:
+        items = [*self._named_second(header), *DECODERS[type(message)](self._state, header, message)]
         if self._wanted is None:
             return items
         return [item for item in items if (item.record if isinstance(item, Row) else type(item)) in self._wanted]
@@ -152,9 +181,8 @@ class NovatelParser(StreamParser):
         self._last_named, self._has_solutions = epoch, True
         return [TimeMessage(header.host_time_ns, header.tag(), NamesEdge.PREVIOUS, message=header.name)]
 
-    def _second_of_raw(self, frame: Frame, name: str) -> list[Record | Row]:
+    def _second_of_raw(self, header: Header | None) -> list[Record | Row]:
         """Return the whole second of raw measurements, in a log for post-processing that contains no solution."""
-        header, _ = _split(frame, name, self._state.dates)
         wanted = self._wanted is None or TimeMessage in self._wanted
         if header is None or self._has_solutions or not wanted:
             return []
@@ -164,7 +192,7 @@ class NovatelParser(StreamParser):
         if header.time_status is None:
             return []
         self._last_named = epoch
-        return [TimeMessage(header.host_time_ns, header.tag(), NamesEdge.PREVIOUS, message=name)]
+        return [TimeMessage(header.host_time_ns, header.tag(), NamesEdge.PREVIOUS, message=header.name)]
 
 
 def _split(frame: Frame, name: str, dates: ReceiverDates) -> tuple[Header | None, bytes]:
@@ -210,7 +238,7 @@ DRIVERS = (
         kind="gnss",
         transports=STREAM_TRANSPORTS,
         yields=(TimeMessage, GnssFix, InsSolution, ImuSamples, GnssHeading, EventMark, DeviceStatus),
-        summary="NovAtel OEM7 binary logs, long and short headers, with SPAN",
+        summary="NovAtel OEM7 binary and ASCII logs, long and short headers, with SPAN",
         make_parser=NovatelParser,
         make_time_parser=make_time_parser,
         names_edge=NamesEdge.PREVIOUS,

@@ -40,7 +40,6 @@ NO_MESSAGES = (
     "short_ascii_sync_error.ASC",
     "abbreviated_ascii_sync_error.ASC",
     "nmea_sync_error.txt",
-    "BESTPOS.GPS",  # ASCII logs only
 )
 POSITION_TYPES = {  # as edie writes them -> the number in the binary log
     "NONE": 0,
