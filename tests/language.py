@@ -24,8 +24,8 @@ NOUN_MAY_BEGIN = {"property", "cached_property", "setter"}
 FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 VERBS = set(
     """
-    abandon accept accumulate act add adjust adopt advance allocate append apply ask assert begin bind boot bridge
-    build calibrate call carry change check choose classify clear climb close collect combine compare compile
+    abandon accept accumulate act add adjust adopt advance allocate answer append apply ask assert begin bind boot
+    bridge build calibrate call carry change check choose classify clear climb close collect combine compare compile
     complete compress compute concatenate connect convert copy correct count create cut decide decode decompress
     derive describe detect determine discard distribute divide do double draw drop encode end enlarge estimate
     evaluate examine expand export fail feed fill filter find finish fit flatten flush fly follow forget fork format

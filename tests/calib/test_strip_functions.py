@@ -281,7 +281,7 @@ def test_corrected_heights_are_no_worse_and_sigmas_honest(scale: float) -> None:
 
 @pytest.mark.slow
 def test_sigmas_contain_the_errors_of_the_held_calibration(clean: tuple[Flight, Features]) -> None:
-    """Thirty flights whose calibration errs by its own covariance; control makes all corrections absolute."""
+    """The calibration of thirty flights errs by its own covariance; control makes all corrections absolute."""
     flight, features = clean
     planes = tuple(
         replace(plane, control=(ControlPoint(f"c{index}", plane.centre_t, 0.005),))
@@ -316,7 +316,7 @@ def test_sigmas_contain_the_errors_of_the_held_calibration(clean: tuple[Flight, 
 
 
 def test_the_held_calibration_is_part_of_the_sigmas(clean: tuple[Flight, Features]) -> None:
-    """Roll of 0.004° turns into roll; a file without sigmas adds nothing, and a note says so."""
+    """A roll of 0.004° becomes roll; a file without sigmas adds nothing, and a note reports it."""
     flight, features = clean
     bad = spoilt(flight, 3, np.tile([0.0, 0.0, 0.15, 0.0, 0.0, 0.0], (2, 1)))
     (start,) = flight.starts().values()

@@ -13,12 +13,11 @@ Script = Callable[[socket.socket, int], None]
 
 @dataclass
 class Caster:
-    """One server on the loopback.
-
+    """An NTRIP server on the loopback.
     Attributes:
         port: where it listens.
         requests: heads of the requests, in order.
-        said: what clients said after their request.
+        said: what clients sent after their request.
     """
 
     port: int
@@ -28,7 +27,7 @@ class Caster:
 
 
 def read_head(sock: socket.socket) -> bytes:
-    """A request up to its empty line."""
+    """Read a request up to its empty line."""
     data = b""
     while not data.endswith(b"\r\n\r\n"):
         more = sock.recv(1)
@@ -40,7 +39,7 @@ def read_head(sock: socket.socket) -> bytes:
 
 @contextlib.contextmanager
 def caster(script: Script) -> Iterator[Caster]:
-    """``script(socket, number)`` answers the connection of that number, after its request was read."""
+    """Serve a caster in which ``script(socket, number)`` answers each connection after its request was read."""
     server = socket.create_server(("127.0.0.1", 0))
     found = Caster(server.getsockname()[1])
 

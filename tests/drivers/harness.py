@@ -54,7 +54,7 @@ class Outcome(NamedTuple):
 
 
 class Message(NamedTuple):
-    """Where a message lies in a recording and what the parser counts it as."""
+    """Where a message lies in a recording and the name under which the parser counts it."""
 
     start: int
     end: int
@@ -68,7 +68,10 @@ PLAIN = frozenset({int, str, bytes, bool, type(None)})
 
 
 def canonical(value: Any) -> Any:
-    """A value that compares by content: arrays by dtype, shape and bytes, NaN equal to NaN, dataclasses by fields."""
+    """Return a value that compares by content.
+
+    Arrays compare by dtype, shape and bytes, dataclasses by fields, and NaN equals NaN.
+    """
     kind: Any = type(value)
     if kind in PLAIN:
         return value
@@ -87,12 +90,12 @@ def canonical(value: Any) -> Any:
 
 @cache
 def fields_of(kind: type) -> tuple[str, ...]:
-    """Names of a dataclass's fields; none of another type."""
+    """Return the names of a dataclass's fields, none for another type."""
     return tuple(field.name for field in dataclasses.fields(kind)) if dataclasses.is_dataclass(kind) else ()
 
 
 def packed_rows(rows: StructArray) -> list[bytes]:
-    """(n,) array, structured or plain, as one byte string a row without padding."""
+    """Return an array (n,), structured or plain, as one byte string per row, without padding."""
     if rows.dtype.names is None:
         return [row.tobytes() for row in rows]
     packed = np.empty(rows.shape, dtype=[(name, rows.dtype[name]) for name in rows.dtype.names])
@@ -102,7 +105,7 @@ def packed_rows(rows: StructArray) -> list[bytes]:
 
 
 def outcome(records: Iterable[Record], parser: Parser) -> Outcome:
-    """Canonical records and counters."""
+    """Return records and counters in canonical form."""
     events: list[Any] = []
     rows: dict[str, list[bytes]] = {}
     for record in records:
@@ -128,13 +131,13 @@ def feed_pieces(parser: Parser, pieces: Iterable[bytes], *, close: bool = True) 
 
 
 def run_stream(make: Factory, pieces: Iterable[bytes]) -> Outcome:
-    """A fresh parser's outcome on the pieces, closed."""
+    """Return a new parser's outcome for the pieces, closed."""
     parser = make()
     return outcome(feed_pieces(parser, pieces), parser)
 
 
 def assert_bytes_accounted(parser: Parser, fed: int) -> None:
-    """Every byte fed to a closed stream parser was in a good frame or was skipped."""
+    """Assert that each byte fed to a closed stream parser was in a good frame or was skipped."""
     counters = parser.counters
     assert counters.bytes == fed
     assert counters.bytes_framed + counters.bytes_skipped == fed, counters
@@ -142,7 +145,7 @@ def assert_bytes_accounted(parser: Parser, fed: int) -> None:
 
 
 def random_pieces(data: bytes, seed: int, largest: int = 4096) -> list[bytes]:
-    """The data cut into reads of 1 to ``largest`` bytes, small ones as frequent as large ones."""
+    """Return the data cut into reads of 1 to ``largest`` bytes, small ones as frequent as large ones."""
     rng = random.Random(seed)
     pieces, position = [], 0
     while position < len(data):
@@ -153,14 +156,14 @@ def random_pieces(data: bytes, seed: int, largest: int = 4096) -> list[bytes]:
 
 
 def check_random_reads(make: Factory, data: bytes, seeds: Sequence[int] = (1, 2, 3)) -> None:
-    """Whole and in random read sizes: same records, same counters."""
+    """Check that random read sizes give the same records and counters as the whole."""
     whole = run_stream(make, [data])
     for seed in seeds:
         assert run_stream(make, random_pieces(data, seed)) == whole, f"differs when cut with seed {seed}"
 
 
 def check_bytewise(make: Factory, data: bytes) -> None:
-    """Byte by byte over the first 64 KiB."""
+    """Check that single bytes give the same as the whole, over the first 64 KiB."""
     head = data[:BYTEWISE_BYTES]
     assert run_stream(make, (head[i : i + 1] for i in range(len(head)))) == run_stream(make, [head])
 
@@ -239,7 +242,7 @@ def check_random_cuts(make: Factory, data: bytes, count: int = RANDOM_CUTS, seed
 
 
 def check_stream(make: Factory, data: bytes) -> Outcome:
-    """All ways of cutting; returns the outcome of the whole, for the test's own expectations."""
+    """Check all ways of cutting, and return the outcome of the whole for the test's own expectations."""
     assert data, "an empty recording proves nothing"
     parser = make()
     whole = outcome(feed_pieces(parser, [data]), parser)
@@ -256,9 +259,9 @@ def check_stream(make: Factory, data: bytes) -> Outcome:
 
 
 def find_messages(make: Factory, data: bytes) -> list[Message]:
-    """Where the messages lie: fed byte by byte, a message ends where the parser counts it.
+    """Return where the messages are: fed byte by byte, a message ends where the parser counts it.
 
-    Messages that came out together (released behind a false sync) are left out: their places are not known so.
+    Messages that appeared together (released behind a false sync) are left out, because their places are unknown.
     """
     parser = make()
     found: list[Message] = []
@@ -275,7 +278,7 @@ def find_messages(make: Factory, data: bytes) -> list[Message]:
 
 
 class Damage(NamedTuple):
-    """At ``position`` one byte is changed (``flip`` ≠ 0) and ``garbage`` goes in before it."""
+    """Damage at ``position``: one byte is changed (``flip`` ≠ 0), and ``garbage`` is inserted before it."""
 
     position: int
     flip: int
@@ -283,7 +286,10 @@ class Damage(NamedTuple):
 
 
 def damage_strategy(size: int, starts: Sequence[bytes] = ()) -> st.SearchStrategy[list[Damage]]:
-    """Up to eight places of damage; the garbage likes the bytes that frames begin with, ``starts`` among them."""
+    """Return a strategy of up to eight damaged places, whose garbage often has bytes that begin frames.
+
+    ``starts`` adds such beginnings.
+    """
     syncs = st.sampled_from(
         [
             b"$",
@@ -306,7 +312,7 @@ def damage_strategy(size: int, starts: Sequence[bytes] = ()) -> st.SearchStrateg
 
 
 def damaged(data: bytes, damages: Sequence[Damage]) -> bytes:
-    """The data with all damages done."""
+    """Return the data with all damages done."""
     pieces, position = [], 0
     for damage in sorted(damages):
         pieces += [data[position : damage.position], damage.garbage, bytes([data[damage.position] ^ damage.flip])]
@@ -315,7 +321,7 @@ def damaged(data: bytes, damages: Sequence[Damage]) -> bytes:
 
 
 def untouched(messages: Sequence[Message], damages: Sequence[Damage]) -> Counter[str]:
-    """Names of the messages no damage lies in (garbage right before a message is outside of it)."""
+    """Count names of messages without damage; garbage right before a message is outside of it."""
     names: Counter[str] = Counter()
     for message in messages:
         if not any(
@@ -330,7 +336,10 @@ def untouched(messages: Sequence[Message], damages: Sequence[Damage]) -> Counter
 def check_damage(
     make: Factory, data: bytes, *, examples: int = 60, window: int = 6 * 1024, starts: Sequence[bytes] = ()
 ) -> None:
-    """Bytes flipped and garbage between: never raises, accounts for every byte, finds what was not touched."""
+    """Check a parser on flipped bytes and garbage between frames.
+
+    It never raises, accounts for every byte, and finds each undamaged message.
+    """
     head = data[:window]
     messages = find_messages(make, head)
     assert messages, "no message in this recording"
@@ -350,7 +359,7 @@ def check_damage(
 
 
 def check_garbage(make: Factory, *, examples: int = 60, starts: Sequence[bytes] = ()) -> None:
-    """Random bytes, with frame beginnings among them: never raises, accounts for every byte."""
+    """Check that a parser never raises and accounts for every byte of random ones, among them frame beginnings."""
     common = [b"$GPGGA,", b"\xb5b\x01\x07\x5c\x00", b"\xd3\x00\x13", b"\xaaD\x12\x1c", b"\xaaD\x13", b"*00\r\n"]
     common.append(b"$@\x00\x00\xa7\x0f\x60\x00")
     pieces = st.lists(st.one_of(st.binary(max_size=200), st.sampled_from([*common, *starts])), max_size=20)
@@ -369,7 +378,7 @@ def check_garbage(make: Factory, *, examples: int = 60, starts: Sequence[bytes] 
 
 
 def packet_batches(units: Sequence[bytes], largest: Callable[[], int]) -> list[ChunkBatch]:
-    """Consecutive units of equal length as batches of at most ``largest()`` rows; host time 1 ms a unit."""
+    """Return consecutive units of equal length as batches of at most ``largest()`` rows; host time is 1 ms per unit."""
     batches: list[ChunkBatch] = []
     position = 0
     while position < len(units):
@@ -384,7 +393,7 @@ def packet_batches(units: Sequence[bytes], largest: Callable[[], int]) -> list[C
 
 
 def run_packets(make: Factory, units: Sequence[bytes], largest: Callable[[], int]) -> Outcome:
-    """A fresh parser's outcome on the units in such batches, closed."""
+    """Return a new parser's outcome for the units in such batches, closed."""
     parser = make()
     records: list[Record] = []
     for batch in packet_batches(units, largest):
@@ -403,12 +412,12 @@ def run_together(make: Factory, units: Sequence[bytes], some: Callable[[], int])
 
 
 def few_or_many(rng: random.Random) -> int:
-    """A size of 1 to 99, small ones as likely as large."""
+    """Return a size of 1 to 99, small ones as likely as large."""
     return int(100 ** rng.random())
 
 
 def check_packets(make: Factory, units: Sequence[bytes], seeds: Sequence[int] = (1, 2, 3)) -> Outcome:
-    """Largest batches, one by one through `feed`, random batch sizes, several at once: same records, same counters."""
+    """Check that the largest batches, `feed` one by one, random batches and several at once give the same."""
     assert units, "an empty recording proves nothing"
     whole = run_packets(make, units, lambda: len(units))
     assert whole.counters["bytes"] == sum(map(len, units))
@@ -428,7 +437,7 @@ def check_packets(make: Factory, units: Sequence[bytes], seeds: Sequence[int] = 
 
 
 def check_packet_damage(make: Factory, units: Sequence[bytes], *, examples: int = 60) -> None:
-    """Units cut short, made longer, flipped: never raises, whatever the batches, and every byte fed is counted."""
+    """Check that units cut short, extended or flipped never raise, in any batches, and every byte is counted."""
     few, fresh = list(units[:40]), Snapshot(make()).again  # to make one may take reading a DBC file
 
     @settings(max_examples=examples, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))

@@ -50,7 +50,7 @@ SIGNALS: dict[str, Any] = {
 
 
 def settings(dbc: str = IMU_DBC, signals: dict[str, Any] | None = None, **config: Any) -> DeviceSettings:
-    """Settings of an IMU on CAN; keywords override the configuration's keys."""
+    """Return settings of an IMU on CAN; keywords override the configuration's keys."""
     table = {
         "dbc": "imu.dbc",
         "tick_hz": 1_000_000,
@@ -66,12 +66,12 @@ def without(*keys: str) -> dict[str, Any]:
 
 
 def acc_frame(x: int, y: int = 0, z: int = 0) -> bytes:
-    """ACC with raw counts."""
+    """Return the frame ACC with raw counts."""
     return encode_can_frame(ACC, struct.pack("<3h", x, y, z))
 
 
 def gyr_frame(x: int, y: int = 0, z: int = 0) -> bytes:
-    """GYR with raw counts."""
+    """Return the frame GYR with raw counts."""
     return encode_can_frame(GYR, struct.pack(">3h", x, y, z))
 
 
@@ -86,12 +86,12 @@ def sync_frame(ticks: int) -> bytes:
 
 
 def temp_frame(tenths: int) -> bytes:
-    """TEMP."""
+    """Return the frame TEMP, in tenths of a degree."""
     return encode_can_frame(TEMP, struct.pack("<h", tenths))
 
 
 def units(frames: list[bytes]) -> ByteRows:
-    """Frames of one length as rows."""
+    """Return frames of one length as rows."""
     return np.frombuffer(b"".join(frames), np.uint8).reshape(len(frames), -1)
 
 
@@ -102,7 +102,7 @@ def feed(parser: Parser, frames: list[bytes], host_time_ns: Int64Array | None = 
 
 
 def imu_rows(records: list[Record]) -> StructArray:
-    """All `ImuSamples` rows of a list of records, zeros between their fields, so that bytes can be compared."""
+    """Return all `ImuSamples` rows of records, with zeros between their fields, so that bytes can be compared."""
     rows = [record.rows for record in records if isinstance(record, ImuSamples)]
     assert rows, "no samples"
     together = np.zeros(sum(map(len, rows)), IMU_DTYPE)
@@ -110,7 +110,7 @@ def imu_rows(records: list[Record]) -> StructArray:
 
 
 def clock_rows(records: list[Record]) -> StructArray:
-    """All `DeviceClockSamples` rows of a list of records."""
+    """Return all `DeviceClockSamples` rows of records."""
     rows = [record.rows for record in records if isinstance(record, DeviceClockSamples)]
     assert rows, "no clock samples"
     return np.concatenate(rows)

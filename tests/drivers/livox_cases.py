@@ -65,7 +65,7 @@ def wall(kind: PointType, at_s: FloatArray, *, behind_m: float = 3.5) -> StructA
 
 
 def packets_1(pulses_hz: int, kinds: tuple[int, ...], packets: int = 4) -> list[bytes]:
-    """Packets of SDK 1: every type of points, under every type of time, with a sample of the IMU after every fourth."""
+    """Return packets of SDK 1 with every type of points and time, and an IMU sample after every fourth."""
     units: list[bytes] = []
     passed = 0
     for number, (data_type, time_type) in enumerate((d, t) for t in (NO_SYNC, PTP, PPS_GPS_1, PPS_1) for d in kinds):
@@ -90,7 +90,7 @@ def time_1(time_type: int, since_ns: int) -> int | bytes:
 
 
 def packets_2(step_ns: int, kinds: tuple[int, ...] = (1, 2, 3), packets: int = 4) -> list[bytes]:
-    """Packets of SDK 2: every type of points, under every type of time; a Mid-360's points have no CRC."""
+    """Return packets of SDK 2 with every type of points and time; a Mid-360's points have no CRC."""
     units: list[bytes] = []
     for number, (data_type, time_type) in enumerate((d, t) for t in (NO_SYNC, PTP, GPS_2) for d in kinds):
         kind = POINTS_2[data_type]

@@ -14,7 +14,7 @@ WEEK_NS = 604_800 * SECOND_NS
 
 
 def recording(name: str) -> bytes:
-    """A recording's bytes, whether it is stored gzipped or not."""
+    """Return a recording's bytes, whether it is stored gzipped or not."""
     plain, packed = FIXTURES / name, FIXTURES / f"{name}.gz"
     return plain.read_bytes() if plain.exists() else gzip.decompress(packed.read_bytes())
 
@@ -22,11 +22,10 @@ def recording(name: str) -> bytes:
 @dataclass(frozen=True)
 class AsciiLog:
     """One ASCII log.
-
     Attributes:
         name: without the format letter: ``BESTPOS``.
         status: GPS reference time status; empty in a short header.
-        week, seconds: of the header.
+        week, seconds: GPS week and seconds of the header.
         fields: everything after the semicolon, as text.
     """
 

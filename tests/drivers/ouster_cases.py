@@ -23,7 +23,7 @@ SERIAL = 122_247_000_785
 
 
 def metadata_of(capture: str) -> bytes:
-    """The metadata that belongs to a capture."""
+    """Return the metadata that belongs to a capture."""
     name = FIXTURES / EXPECTED[f"{capture}.pcap"]["metadata"]
     return name.read_bytes() if name.exists() else gzip.decompress(name.with_name(f"{name.name}.gz").read_bytes())
 
@@ -83,7 +83,7 @@ def metadata(
 
 
 def frames_of(layout: LidarLayout, packets: int, first: int = 0, seed: int = 1) -> list[bytes]:
-    """So many packets of consecutive frames, with random ranges and light in every field the profile has."""
+    """Return packets of consecutive frames, with random ranges and light in every field of the profile."""
     random = np.random.default_rng(seed)
     head = layout.head
     per_frame = head.columns_per_frame // head.columns_per_packet

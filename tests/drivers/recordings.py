@@ -21,7 +21,7 @@ def expected(family: str) -> dict[str, dict[str, Any]]:
 
 @cache
 def recording(family: str, name: str) -> bytes:
-    """The receiver's bytes: unpacked, without the comment header of gpsd's logs."""
+    """Return the receiver's bytes, unpacked and without the comment header of gpsd's logs."""
     data = gzip.decompress((FIXTURES / family / f"{name}.gz").read_bytes())
     entry = expected(family)[name]
     assert len(data) == entry["bytes"], f"{name} is not the file of expected.json"
@@ -29,20 +29,20 @@ def recording(family: str, name: str) -> bytes:
 
 
 def gpsd_reports(family: str, name: str) -> list[dict[str, Any]]:
-    """gpsd's TPV reports of a log that have a position."""
+    """Return gpsd's TPV reports of a log that have a position."""
     return [report for report in gpsd_output(family, name, "TPV") if "lat" in report and "time" in report]
 
 
 def gpsd_output(family: str, name: str, kind: str) -> list[dict[str, Any]]:
-    """gpsd's reports of one class from a log, in order."""
+    """Return gpsd's reports of one class from a log, in order."""
     return [json.loads(line) for line in gpsd_lines(family, name) if line.startswith(b'{"class":"%s"' % kind.encode())]
 
 
 def gpsd_lines(family: str, name: str) -> list[bytes]:
-    """gpsd's output from a log: its reports, and the receiver's sentences or such made from its messages."""
+    """Return gpsd's output from a log: its reports, and the receiver's sentences or ones made from its messages."""
     return gzip.decompress((FIXTURES / family / f"{name}.chk.gz").read_bytes()).splitlines()
 
 
 def every_recording() -> list[tuple[str, str]]:
-    """All (family, file) pairs."""
+    """Return all (family, file) pairs."""
     return [(family, name) for family in FAMILIES for name in sorted(expected(family))]

@@ -23,7 +23,7 @@ Fields = list[tuple[str, str | None, str]]  # type, length of an array (empty: v
 
 
 def read_bag(data: bytes) -> Iterator[tuple[str, Message]]:
-    """Topic and fields of each message, in order."""
+    """Yield topic and fields of each message, in order."""
     assert data.startswith(MAGIC)
     connections: dict[bytes, tuple[str, dict[str, Fields]]] = {}
     for header, chunk in _records(data[len(MAGIC) :]):
@@ -64,7 +64,7 @@ def _header(data: bytes) -> dict[str, bytes]:
 
 
 def _definitions(text: str) -> dict[str, Fields]:
-    """Fields of each type by its name without package; those of the message itself under an empty name."""
+    """Return the fields of each type by its name without package; the message's own have an empty name."""
     types: dict[str, Fields] = {}
     for section in re.split(r"^=+\s*$", text, flags=re.MULTILINE):
         head, _, rest = section.strip().partition("\n")

@@ -18,30 +18,30 @@ Points = NDArray[np.float64]
 
 
 def payloads(path: str) -> list[bytes]:
-    """Datagrams of a capture in ``fixtures/``."""
+    """Return datagrams of a capture in ``fixtures/``."""
     return [unit.data for unit in read_pcap(FIXTURES / path)]
 
 
 def ros_points(rows: StructArray, beams: BeamTable) -> Points:
-    """The maker's frame turned as ROS decoders publish it: x forward, y left."""
+    """Return points (n, 3), m, in the frame of ROS decoders: x forward, y left."""
     x, y, z = beam_points(rows, beams).T
     return np.stack([y, -x, z], axis=1)
 
 
 def xyz(points: StructArray) -> Points:
-    """(n, 3) of records with the fields x, y, z."""
+    """Return (n, 3) of records with the fields x, y, z."""
     return np.stack([points["x"], points["y"], points["z"]], axis=1).astype(np.float64)
 
 
 def read_pcd(path: Path, dtype: np.dtype[np.void]) -> StructArray:
-    """Points of a gzipped binary PCD file."""
+    """Return the points of a gzipped binary PCD file."""
     data = gzip.decompress(path.read_bytes())
     start = data.index(b"DATA binary\n") + len(b"DATA binary\n")
     return np.frombuffer(data[start:], dtype=dtype)
 
 
 def are_near(points: Points, others: Points, cell_m: float) -> BoolArray:
-    """(n,) whether a point has one of the others within 1.5 cells an axis; True where one is within half a cell."""
+    """Return (n,) True where another point is within half a cell on each axis; never True beyond 1.5 cells."""
 
     def keys(cells: Points) -> Int64Array:
         x, y, z = (cells.astype(np.int64) + (1 << 20)).T

@@ -41,7 +41,7 @@ class Return:
 
 
 def reference_decode(datagram: bytes, mirror_factor: float, facets: int = 0) -> list[Return]:
-    """All returns of one good datagram; asserts that it is one."""
+    """Return all returns of one good datagram, and assert that it is good."""
     magic, version, flags, n, _seq, _id, r, zone = struct.unpack_from("<IBBHIHBB", datagram, 0)
     _pps_count, hz, _pps_ticks, first, counts, _prf = struct.unpack_from("<IIQQII", datagram, 16)
     assert (magic, version, len(datagram)) == (0x50455253, 1, 48 + n * (8 + 8 * r) + 4)
@@ -71,9 +71,10 @@ def reference_decode(datagram: bytes, mirror_factor: float, facets: int = 0) -> 
 
 
 def scan_lines(datagrams: int = 24, pulses: int = 64) -> list[bytes]:
-    """An oscillating mirror over rolling ground: 200 kHz, two returns now and then, PPS latched each second.
+    """Return datagrams of an oscillating mirror over rolling ground at 200 kHz, with PPS latched each second.
 
-    The stream holds an unlocked start, a heartbeat, returns lost to the sky, a zone change and a sequence wrap.
+    Some pulses have two returns. The stream has an unlocked start, a heartbeat, returns lost to the sky, a zone change
+    and a sequence wrap.
     """
     random = np.random.default_rng(20_261_121)
     stream = []
@@ -106,7 +107,7 @@ def scan_lines(datagrams: int = 24, pulses: int = 64) -> list[bytes]:
 
 
 def split_datagrams(data: bytes) -> list[bytes]:
-    """Datagrams laid end to end, cut by their own headers."""
+    """Return datagrams laid end to end, cut by their own headers."""
     found = []
     while data:
         n, r = struct.unpack_from("<H", data, 6)[0], data[14]

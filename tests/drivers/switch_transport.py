@@ -10,14 +10,13 @@ from swath.drivers.transports.base import Transport, TransportError, UnitBlock
 
 
 class SwitchTransport(Transport):
-    """Gives one unit a call: its number, four bytes.
-
+    """A transport that gives one unit per call: its number in four bytes.
     Attributes:
-        refuse_open: opening fails.
+        refuse_open: True if opening fails.
         drop_every: each n-th unit is dropped by the kernel, and counted; 0: none.
-        raise_after: the device goes after so many units; None: never.
-        stall_s: every receive takes this long, whatever was asked.
-        silent: nothing comes.
+        raise_after: the device disappears after so many units; None: never.
+        stall_s: seconds that every receive takes, whatever was asked.
+        silent: True if nothing comes.
     """
 
     def __init__(self) -> None:

@@ -59,20 +59,20 @@ WITHOUT_COPY = {
 
 @cache
 def files() -> dict[str, dict[str, str]]:
-    """By name in the collection: bytes and SHA-256 of the unpacked content, and the copy in fixtures/."""
+    """Return for each name in the collection bytes and SHA-256 of the unpacked content, and the copy in fixtures/."""
     with (FIXTURES / "FILES.csv").open(newline="") as file:
         return {row["file"]: row for row in csv.DictReader(file)}
 
 
 @cache
 def entries() -> dict[str, Entry]:
-    """By name in the collection: what others found in each recording."""
+    """Return for each name in the collection what other decoders found in the recording."""
     table = json.loads(gzip.decompress((FIXTURES / "EXPECTED.json.gz").read_bytes()))
     return {entry["file"].removeprefix("share/"): entry for entry in table["files"]}
 
 
 def content(path: Path) -> bytes:
-    """A copy as it was upstream."""
+    """Return the content of a copy as it was upstream."""
     data = path.read_bytes()
     return gzip.decompress(data) if path.suffix == ".gz" else data
 
@@ -87,7 +87,7 @@ def run(kind: DeviceKind, protocol: str, data: bytes) -> tuple[Parser, list[Reco
 
 
 def check_mixed_stream(copy: Path, entry: Entry) -> None:
-    """NMEA, UBX and RTCM 3: by the driver of the family, counted as by pyubx2, pynmeagps and pyrtcm."""
+    """Check NMEA, UBX and RTCM 3 with the family's driver against the counts of pyubx2, pynmeagps and pyrtcm."""
     family, name = copy.parent.name, copy.name.removesuffix(".gz")
     assert (family, name) in every_recording()
     excerpt = {key: value for key, value in expected(family)[name].items() if key != "origin"}
@@ -116,7 +116,7 @@ def check_sbf(copy: Path, entry: Entry) -> None:
 
 
 def check_novatel(copy: Path, entry: Entry) -> None:
-    """By number, as the bytes have it; the decoder's names are in the driver's test."""
+    """Check logs by number, as in the bytes; the decoder's names are in the driver's test."""
     parser, _ = run("gnss", "novatel", content(copy))
     framed = Framer(FRAME_KINDS, ParserCounters())
     frames = [*framed.feed(content(copy), 0), *framed.close()]
@@ -190,7 +190,10 @@ def check_nmea2000(copy: Path, entry: Entry) -> None:
 
 
 def datagrams(copy: Path, entry: Entry) -> list[bytes]:
-    """All of a capture, or the payloads that lie end to end; as many of each port and length as others found."""
+    """Return all datagrams of a capture, or the payloads laid end to end.
+
+    There are as many of each port and length as other decoders found.
+    """
     if copy.name.removesuffix(".gz").endswith(".bin"):
         data = content(copy)
         units = [data[at : at + 1206] for at in range(0, len(data), 1206)]
@@ -263,7 +266,7 @@ def check_ouster(copy: Path, entry: Entry) -> None:
 
 
 def check_fragments(copy: Path, entry: Entry) -> None:
-    """Others count the first fragment of a large datagram; here its fragments are put together."""
+    """Check fragments, which are joined here; other decoders count the first fragment of a large datagram."""
     lengths = sorted(len(unit.data) for unit in read_pcap(copy, port=7502))
     assert lengths == [48, 48, 12_608, 16_640]
     assert entry["packets"] == {"udp dport 7502 len 48": 2, "udp dport 7502 len 1472": 2}
@@ -338,7 +341,7 @@ print(json.dumps(frames))
 
 @pytest.mark.parametrize("name", ["2F6913DB_00000004_00000001", "3BA199E2_00000164_00000005"])
 def test_frames_of_a_candump_log_match_the_loggers_own_file(name: str, tmp_path: Path) -> None:
-    """The logger's MF4, as python-can reads it by asammdf, in a process that has it; both write microseconds."""
+    """The reference is the logger's MF4, read by asammdf in another process; both have microseconds."""
     own = tmp_path / "own.MF4"
     own.write_bytes(content(FIXTURES / "canmod-gps" / f"{name}.MF4.gz"))
     command = [sys.executable, "-c", MF4_FRAMES, str(own)]

@@ -13,7 +13,7 @@ from tests.drivers.switch_transport import SwitchTransport
 
 
 class Bench:
-    """A session on transports with switches, its clock moved by its own pauses."""
+    """A session on transports with switches, whose clock advances by its own pauses."""
 
     def __init__(self) -> None:
         self.now_s = 100.0
@@ -41,7 +41,7 @@ class Bench:
         self.now_s += time_s
 
     def attempt_times(self, attempts: int) -> list[float]:
-        """When the next ``attempts`` openings were tried."""
+        """Return when the next ``attempts`` openings were tried, s."""
         times: list[float] = []
         while len(times) < attempts:
             made = len(self.made)
@@ -82,7 +82,7 @@ def test_the_retry_delay_of_an_absent_device_doubles_up_to_its_limit(bench: Benc
 
 
 def test_an_unforeseen_error_on_opening_is_retried() -> None:
-    """An error of the system while opening ends no thread: the next try may succeed."""
+    """An error of the system while opening ends no thread, because the next try may succeed."""
 
     class Odd(SwitchTransport):
         def open(self) -> None:

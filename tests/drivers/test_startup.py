@@ -126,7 +126,7 @@ class TestUbx:
         assert heard(AckListener(), damaged + OTHER_ACK, 5) is None
 
     def test_a_response_after_a_false_sync_is_found_at_the_timeout(self) -> None:
-        """A false sync holds back what follows until the time is over."""
+        """A false sync holds back the bytes after it until the time is over."""
         listener = AckListener()
         assert listener.hear(b"\xb5b\x01\x07\x00\x10" + ACK) is None
         assert listener.close() == Answer(True)

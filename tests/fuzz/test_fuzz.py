@@ -73,7 +73,7 @@ def test_a_sealed_frame_is_valid(kind: str) -> None:
 
 
 def test_a_changed_datagram_of_a_hesai_head_is_sealed_again() -> None:
-    """Its two CRCs lie within it, where a seal at the end would not reach."""
+    """Its two CRCs are inside it, where a seal at the end would not reach."""
     good = encode_point_packet(dt.datetime(2026, 4, 15, tzinfo=dt.UTC), 0, 5_000, 7, head=QT128)
     changed = good[:100] + b"\x07" + good[101:1070] + b"\x09" + good[1071:]
     parsers = [HesaiParser(DeviceSettings("scanner/left"), QT128) for _ in range(2)]

@@ -70,7 +70,7 @@ def test_the_flight_dates_a_calibration_not_its_making() -> None:
 
 
 def test_a_calibration_without_serial_number_belongs_to_the_scanner_of_its_name() -> None:
-    """Its mounting is that of its neighbours; where several scanners have its name, nothing is guessed."""
+    """Its mounting is that of its neighbours; if several scanners have its name, nothing is guessed."""
     bare = made(2, 0.25, mounting="", serial="")
     (one,) = courses([made(1, 0.25), made(3, 0.25), bare])
     assert (one.serial, len(one.entries), set(one.mountings)) == ("S-17", 3, {"HB-ABC/left/2026-03"})

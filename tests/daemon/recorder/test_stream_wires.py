@@ -77,7 +77,7 @@ def sending_end(wire: str, folder: Path, name: str) -> Iterator[tuple[str, Calla
 
 
 def test_every_stream_is_recorded_and_read_over_every_wire(tmp_path: Path) -> None:
-    """All drivers and wires in one recorder: the log has each byte, and its records are those of the recording."""
+    """All drivers and wires are in one recorder: the log has each byte, and its records are those of the recording."""
     assert {driver.protocol for driver in STREAMS} >= {"nmea", "ubx", "sbf", "novatel", "xsens-xbus", "rtcm3"}
     sent = {f"{driver.kind}/{driver.protocol}": recording_of(driver) for driver in STREAMS}
     logs = tmp_path / "logs"

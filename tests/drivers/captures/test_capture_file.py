@@ -58,7 +58,7 @@ def test_payloads_and_times_match_dpkt() -> None:
 
 
 def test_reassembled_fragments_of_a_real_capture_match_dpkt() -> None:
-    """Two heads on one port, datagrams in up to a dozen pieces; the oracle joins dpkt's fragments by their offsets."""
+    """Two heads on one port send datagrams in up to a dozen pieces; the oracle joins dpkt's fragments by offset."""
     pieces: dict[tuple[bytes, int], dict[int, bytes]] = {}
     with gzip.open(FIXTURES / "captures" / "same_ports.pcap.gz") as stream:
         for _, frame in dpkt.pcap.Reader(stream):
@@ -79,7 +79,7 @@ def udp_packet(payload: bytes, to_port: int = 2368) -> bytes:
 
 
 def fragments(packet: bytes, size: int) -> list[bytes]:
-    """An IPv4 packet in pieces of ``size`` bytes, as RFC 791 cuts it."""
+    """Return an IPv4 packet in pieces of ``size`` bytes, cut as in RFC 791."""
     header, data = packet[:20], packet[20:]
     pieces = []
     for at in range(0, len(data), size):
@@ -122,7 +122,7 @@ def test_each_link_layer_and_byte_order_is_read(tmp_path: Path, link: int, head:
 
 
 def test_frame_check_sequence_bits_are_not_part_of_the_link_type(tmp_path: Path) -> None:
-    """draft-ietf-opsawg-pcap: the link type is in the low 16 bits, FCS length 2 and its flag above."""
+    """By draft-ietf-opsawg-pcap the link type is in the low 16 bits; the FCS length (here 2) and its flag are above."""
     [unit] = read_pcap(write_pcap(tmp_path / "fcs.pcap", [ETHERNET + udp_packet(b"scan") + bytes(4)], 0x2400_0001))
     assert unit.data == b"scan"
 
@@ -140,7 +140,7 @@ def test_ipv6_datagrams_are_read(tmp_path: Path) -> None:
 
 
 def ipv6_with_options(following: int, rest: bytes, cut: int = 0) -> bytes:
-    """A packet with hop-by-hop, routing and destination options (RFC 8200, 4.3, 4.4, 4.6) before what follows."""
+    """Return a packet with hop-by-hop, routing and destination options (RFC 8200, 4.3, 4.4, 4.6) before the rest."""
     options = bytes([43, 0, 1, 4, 0, 0, 0, 0]) + bytes([60, 2]) + bytes(22) + bytes([following, 1]) + bytes(14)
     head = struct.pack(">IHBB", 6 << 28, len(options + rest), 0, 64) + bytes(15) + b"\1" + bytes(15) + b"\2"
     return (head + options + rest)[: cut or None]
@@ -176,7 +176,7 @@ def test_fragments_are_put_together_in_any_order(tmp_path: Path) -> None:
 
 
 def ipv6_fragments(segment: bytes, size: int) -> list[bytes]:
-    """An IPv6 datagram in pieces with fragment headers, RFC 8200, 4.5."""
+    """Return an IPv6 datagram in pieces with fragment headers (RFC 8200, 4.5)."""
     addresses = bytes(15) + b"\1" + bytes(15) + b"\2"
     pieces = []
     for at in range(0, len(segment), size):
@@ -196,7 +196,7 @@ def test_ipv6_fragments_are_reassembled(tmp_path: Path) -> None:
 
 
 def test_a_frame_captured_on_two_interfaces_counts_once_if_it_has_an_identification(tmp_path: Path) -> None:
-    """Repeat the same identification and bytes; without an identification copies cannot be recognised."""
+    """A copy has the same identification and bytes; without an identification copies cannot be recognised."""
     big = fragments(udp_packet(bytes(3000)), 1480)
     anonymous = udp_packet(b"none")[:4] + b"\0\0" + udp_packet(b"none")[6:]
     frames = [ETHERNET + packet for packet in (udp_packet(b"a"), udp_packet(b"a"), anonymous, anonymous, *big, *big)]
@@ -261,14 +261,14 @@ def test_pcapng_is_read_and_a_truncated_file_is_refused(tmp_path: Path) -> None:
 
 
 def pcapng_block(kind: int, body: bytes, order: str = "<") -> bytes:
-    """A block of pcapng, padded."""
+    """Return a block of pcapng, padded."""
     body += bytes(-len(body) % 4)
     length = struct.pack(f"{order}I", 12 + len(body))
     return struct.pack(f"{order}I", kind) + length + body + length
 
 
 def pcapng_section(order: str, resolution: bytes, offset_s: int, counts: list[int]) -> bytes:
-    """A section with one interface and a packet a count of its clock."""
+    """Return a section with one interface and a packet for each count of its clock."""
     options = struct.pack(f"{order}HHB3x", 9, 1, resolution[0]) + struct.pack(f"{order}HHqHH", 14, 8, offset_s, 0, 0)
     data = pcapng_block(0x0A0D0D0A, struct.pack(f"{order}IHHq", 0x1A2B3C4D, 1, 0, -1), order)
     data += pcapng_block(1, struct.pack(f"{order}HHI", 1, 0, 0) + options, order)
@@ -448,7 +448,7 @@ def test_bad_lines_are_counted_and_the_rest_is_read(tmp_path: Path) -> None:
 
 
 def test_real_candump_frames_are_written_back_byte_for_byte(tmp_path: Path) -> None:
-    """The lines of a recording by candump's makers' own rules, byte for byte."""
+    """The lines of the recording follow the rules of candump's makers."""
     lines = gzip.decompress(CANDUMP.read_bytes()).decode().splitlines()
     ours = [candump_line(unit.time_ns, unit.channel, unit.data) for unit in read_candump(CANDUMP)]
     assert [str(line).strip() for line in ours] == lines

@@ -28,7 +28,7 @@ UTM = "BESTUTMBIN.GPS"
 
 
 def ros_messages(name: str, topic: str) -> list[Message]:
-    """What the driver made of a recording on one of its own topics."""
+    """Return what the driver published from a recording on one of its own topics."""
     return [message for found, message in read_bag(recording(f"{name}.bag")) if found == f"/novatel/oem7/{topic}"]
 
 
@@ -122,7 +122,7 @@ def test_times_match_the_ros_driver() -> None:
 
 
 def test_a_log_with_altered_bytes_is_refused() -> None:
-    """A text filter put CR before each LF, in the binary log too: that one is refused until it is undone."""
+    """A text filter put CR before each LF, in the binary log too, which is refused until that is undone."""
     data, parser = recording(UTM), make_novatel()
     assert parse_novatel(data, parser) == []
     in_ascii = +parser.counters.messages
@@ -135,7 +135,7 @@ def test_a_log_with_altered_bytes_is_refused() -> None:
 
 @pytest.mark.parametrize("form", ["BINARY", "FLATTENED_BINARY"])
 def test_binary_output_of_the_converter_is_framed(form: str) -> None:
-    """The same two logs as in its JSON, also with arrays filled up to their greatest length."""
+    """The same two logs are in its JSON; arrays are also filled up to their greatest length."""
     data, parser = recording(f"{UTM}.{form}"), make_novatel()
     parse_novatel(data, parser)
     assert parser.counters.messages == {"BESTUTM": 1, "VERSION": 1}
@@ -168,7 +168,7 @@ def test_text_output_of_the_converter_contains_no_log(form: str) -> None:
 
 
 def test_checksum_matches_the_ascii_examples_of_the_manual() -> None:
-    """OEM7 manual, "32-bit CRC": the same over the characters between # and * as over a binary log."""
+    """By the OEM7 manual, "32-bit CRC", the characters between # and * have the same CRC as a binary log."""
     lines = recording(f"{UTM}.edie.ascii").splitlines()
     assert lines == recording(f"{UTM}.ASCII").splitlines()
     assert all(line in recording(UTM) for line in lines)
@@ -181,7 +181,7 @@ def test_checksum_matches_the_ascii_examples_of_the_manual() -> None:
 
 
 def test_stream_joins_tcp_payloads_in_sequence_order() -> None:
-    """Bytes to the host in the order of their sequence numbers, each chunk at the time of its packet."""
+    """Bytes to the host are in the order of their sequence numbers, and each chunk has the time of its packet."""
     chunks: list[tuple[str, int, int]] = []
     stream = b""
     first: int | None = None

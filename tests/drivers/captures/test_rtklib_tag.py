@@ -29,7 +29,7 @@ LAYOUTS = {"4 and 4": ("I", "I"), "4 and 8": ("I", "Q"), "8 and 8": ("q", "Q"), 
 def tag_file(
     seconds: str = "I", size: str = "I", writes: list[tuple[int, int]] = WRITES, fraction: float = 0.25
 ) -> bytes:
-    """A tag file with fields of these struct codes."""
+    """Return a tag file whose fields have these struct codes."""
     body = struct.pack(f"<{seconds}d", OPENED_GPS_S, fraction)
     return HEAD + body + b"".join(struct.pack(f"<I{size}", *write) for write in writes)
 
@@ -94,7 +94,7 @@ def test_bytes_carry_the_time_at_which_they_were_written(tmp_path: Path) -> None
 
 
 def test_receiver_tags_follow_the_epochs_of_its_solution_within_milliseconds() -> None:
-    """The epochs of RTKLIB's own solution are in GPS time; each byte was written within milliseconds of them."""
+    """RTKLIB's own solution has epochs in GPS time; each byte was written within milliseconds of them."""
     text = gzip.decompress((FIXTURES / "gnss_1934_sf.pos.gz").read_bytes()).decode()
     epochs = [line[:23].replace("/", "-").replace(" ", "T") for line in text.splitlines()[1:]]
     epoch_ms = np.array(epochs, "datetime64[ms]").astype(np.int64) - 18_000  # GPS − UTC
@@ -108,7 +108,7 @@ def test_receiver_tags_follow_the_epochs_of_its_solution_within_milliseconds() -
 
 
 def test_imu_tags_follow_the_clock_of_the_imu(tmp_path: Path) -> None:
-    """Its lines carry its milliseconds; the time at which each was written stays within 30 ms of them for 9 minutes."""
+    """Each line has the IMU's milliseconds; its time of writing stays within 30 ms of them for 9 minutes."""
     data = gzip.decompress((FIXTURES / "imu_1934.csv.gz").read_bytes()).replace(b"\n", b"\r\n")
     (tmp_path / "imu.csv").write_bytes(data)
     units = list(read_tagged(tmp_path / "imu.csv", FIXTURES / "imu_1934.csv.tag.gz"))

@@ -75,7 +75,7 @@ def count_frames() -> FramingParser:
 
 
 def frames_of(*pieces: bytes) -> FramingParser:
-    """A parser that has taken the pieces, piece i at host time i, and is closed."""
+    """Return a parser that was given the pieces, piece i at host time i, and closed."""
     parser = FramingParser()
     for index, piece in enumerate(pieces):
         parser.feed(Chunk("gnss/test", index, piece))
@@ -122,7 +122,7 @@ def test_fletcher_of_long_data_equals_the_checksum_of_its_joined_parts(length: i
 
 
 def test_crc32_novatel_follows_the_bitwise_rule_of_the_manual() -> None:
-    """OEM7 manual, "32-bit CRC": register 0, polynomial 0xEDB88320, low bit first, no inversion."""
+    """The OEM7 manual, "32-bit CRC", has register 0, polynomial 0xEDB88320, low bit first, no inversion."""
     data = random.Random(3).randbytes(500)
     register = 0
     for byte in data:
@@ -172,7 +172,7 @@ WITH_SENTENCES = sorted(name for name, entry in expected("nmea").items() if entr
 
 @pytest.mark.parametrize("name", WITH_SENTENCES)
 def test_nmea_sentences_match_gpsd(name: str) -> None:
-    """gpsd repeats each sentence it framed, so its output is a list of them."""
+    """gpsd repeats each sentence that it framed, so its output lists them."""
     ours = [frame.data.strip().replace(b"|", b"") for frame in frames_of(recording("nmea", name)).frames]
     theirs = [line.strip() for line in gpsd_lines("nmea", name) if line[:1] in (b"$", b"!")]
     if name not in GPSD_ALONE:
@@ -394,7 +394,7 @@ def test_garbage_never_raises() -> None:
 
 
 def test_sbf_mixed_with_nmea_and_rtcm3_does_not_depend_on_how_it_is_cut() -> None:
-    """Block, sentence, block, RTCM3 and the replies of the command line between them, all on one port."""
+    """Blocks, sentences, RTCM3 and replies of the command line alternate on one port."""
     mixed = recording("sbf", "pygpsdata_mixed.log")
     blocks = recording("sbf", "pygpsdata_x5_status.log")
     reply = b"$R: setDataInOut, COM1, , SBF\r\n  DataInOut, COM1, CMD, SBF\r\nCOM1>"

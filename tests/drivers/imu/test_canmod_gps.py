@@ -27,7 +27,7 @@ SETTINGS = DeviceSettings("imu/main", {"protocol": "canmod-gps"})
 
 @dataclass(frozen=True)
 class Expected:
-    """What an existing decoder (python-can + cantools) found."""
+    """The result of an existing decoder (python-can with cantools)."""
 
     name: str
     frames: int
@@ -58,7 +58,7 @@ RECORDINGS = (
 
 
 def candump_units(name: str, tmp_path: Path) -> list[bytes]:
-    """All frames of both channels of a recording, as the log holds them."""
+    """Return all frames of both channels of a recording, in the log's form."""
     path = tmp_path / f"{name}.log"
     path.write_bytes(gzip.decompress((FIXTURES / f"{name}_candump.log.gz").read_bytes()))
     with can.CanutilsLogReader(path) as reader:

@@ -65,7 +65,7 @@ def rows_of(records: list[Record], kind: Any) -> Any:
 
 
 def test_samples_are_those_of_the_makers_library() -> None:
-    """Counts and sums of fixtures/microstrain/SOURCE.md."""
+    """Counts and sums are those of fixtures/microstrain/SOURCE.md."""
     data = recording()
     records, parser = parse(data)
     assert parser.counters.messages == {"base": 1, "sensor": 7157, "filter": 714, "system": 512}

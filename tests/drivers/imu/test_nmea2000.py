@@ -45,7 +45,7 @@ def decoded(name: str) -> list[dict[str, Any]]:
 
 
 def parser_of(source_address: int | None = None) -> Nmea2000Parser:
-    """A parser that listens to one device, or to the first of each PGN."""
+    """Return a parser that listens to one device, or to the first of each PGN."""
     return Nmea2000Parser(DeviceSettings("imu/main", {"source_address": source_address}))
 
 
@@ -61,7 +61,7 @@ def frame(pgn: int, data: bytes, source: int = 1, priority: int = 2) -> bytes:
 
 
 def fast_frames(message: bytes, sequence: int, source: int = 1) -> list[bytes]:
-    """A message of 129029 cut by hand."""
+    """Return a message of 129029 cut into frames by hand."""
     pieces = [bytes([len(message)]) + message[:6]]
     pieces += [message[start : start + 7] for start in range(6, len(message), 7)]
     return [
@@ -71,7 +71,7 @@ def fast_frames(message: bytes, sequence: int, source: int = 1) -> list[bytes]:
 
 
 def position(lat_deg: float, *, method: int = 1, days: int = 19326, time: int = 432_890_000) -> bytes:
-    """The 43 bytes of 129029 without stations."""
+    """Return the 43 bytes of 129029 without stations."""
     lat, lon, altitude = round(lat_deg * 1e16), round(8.5 * 1e16), 43_000_000
     counts = struct.pack("<BHIqqq", 5, days, time, lat, lon, altitude)
     return counts + struct.pack("<BBBhhiB", method << 4, 0xFC, 9, 90, 0x7FFF, 4690, 0)

@@ -28,14 +28,14 @@ def parser_of(**config: Any) -> DbcParser:
 
 
 def frame(name: str, values: dict[str, float], identifier: int | None = None, *, extended: bool = False) -> bytes:
-    """A message of the maker's DBC as cantools encodes it."""
+    """Return a message of the maker's DBC, encoded by cantools."""
     message = MAKERS.get_message_by_name(f"SBG_ECAN_MSG_{name}")
     number = message.frame_id if identifier is None else identifier
     return encode_can_frame(number, message.encode(values, strict=False), extended=extended)
 
 
 def cycles(count: int, first_us: int = 0) -> tuple[list[bytes], np.ndarray[Any, np.dtype[np.float64]]]:
-    """Frames of so many IMU cycles, and (n, 8) their counter in µs, six rates, temperature, before encoding."""
+    """Return frames of IMU cycles, and (n, 8) values before encoding: counter (µs), six rates, temperature."""
     rng = np.random.default_rng(11)
     values = np.empty((count, 8))
     values[:, 0] = first_us + STEP_US * np.arange(count)
@@ -133,7 +133,7 @@ def test_identifiers_can_be_configured(extended: bool) -> None:
 
 
 def test_the_deprecated_messages_decode_like_the_current_ones() -> None:
-    """canProtocol.md: IMU_DELTA_VEL and IMU_DELTA_ANGLE are the same as IMU_ACCEL and IMU_GYRO."""
+    """By canProtocol.md IMU_DELTA_VEL and IMU_DELTA_ANGLE are the same as IMU_ACCEL and IMU_GYRO."""
     parser = parser_of(ids={"IMU_ACCEL": 0x123, "IMU_GYRO": 0x124})
     frames = [
         frame("IMU_INFO", {"TIME_STAMP": 0, "STATUS": 0, "TEMPERATURE": 0.0}),
@@ -147,7 +147,7 @@ def test_the_deprecated_messages_decode_like_the_current_ones() -> None:
 
 @pytest.mark.parametrize("event", "ABCDE")
 def test_a_pps_on_sync_in_latches_the_counter(event: str) -> None:
-    """6 bytes by the document, 8 by the DBC: the time stamp is in both."""
+    """The frame has 6 bytes in the document and 8 in the DBC, and both have the time stamp."""
     frames, _ = cycles(4)
     stamp = {"TIME_STAMP": 7500.0, "STATUS": 0.0}
     long = frame(f"EVENT_INFO_{event}", stamp)

@@ -67,7 +67,7 @@ def messages(name: str) -> list[bytes]:
 
 
 def columns(name: str) -> tuple[list[str], list[list[str]]]:
-    """Titles and whole rows; the last row of one file breaks off."""
+    """Return titles and whole rows; the last row of one file breaks off."""
     head, *rows = csv.reader(gzip.decompress((FOLDER / f"{name}.csv.gz").read_bytes()).decode().splitlines())
     return head, [row for row in rows if len(row) == len(head)]
 
@@ -162,7 +162,7 @@ def test_increments_are_divided_by_their_own_interval() -> None:
 
 
 def test_specific_force_at_rest_points_up_in_the_axes_of_the_body() -> None:
-    """The attitude turns it to north, east, down as −9.8 m/s²: axes and angles are those of the conventions."""
+    """The attitude turns it to north, east, down as −9.8 m/s², so axes and angles are those of the conventions."""
     for message in messages(IMU_FILE):
         values = wire.read_values(message)
         roll, pitch, yaw = attitude(values) or (0.0,) * 3
@@ -249,7 +249,7 @@ def message(*fields: tuple[int, int, tuple[Any, ...]]) -> bytes:
 
 
 def test_the_example_of_the_manual() -> None:
-    """UM005, 5.2.4: yaw, pitch and roll in the common group."""
+    """UM005, 5.2.4, has yaw, pitch and roll in the common group."""
     frame = bytes.fromhex("FA01080093502E42833EF13F48B504BB9288")
     values = wire.read_values(frame)
     assert wire.VECTORNAV.intact(frame)

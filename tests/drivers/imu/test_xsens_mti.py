@@ -25,7 +25,7 @@ def parser_of(**config: Any) -> DbcParser:
 
 
 def group(number: int, mark: str = ">", ticks: int | None = None) -> list[bytes]:
-    """The frames of one sample: SampleTime first, then counter, status, rate of turn, acceleration."""
+    """Return the frames of one sample: SampleTime first, then counter, status, rate of turn, acceleration."""
     return [
         encode_can_frame(0x005, struct.pack(f"{mark}I", (100 * number if ticks is None else ticks) & 0xFFFF_FFFF)),
         encode_can_frame(0x006, struct.pack(f"{mark}H", number & 0xFFFF)),
@@ -107,7 +107,7 @@ def test_identifiers_can_be_configured() -> None:
 
 
 def test_the_layout_is_a_dbc_with_frames_of_the_documented_lengths() -> None:
-    """Lengths of MT1604P section 6: SampleTime 4, GroupCounter 2, StatusWord 4, vectors 6, Temperature 2."""
+    """MT1604P, section 6: SampleTime 4, GroupCounter 2, StatusWord 4, vectors 6, Temperature 2 bytes."""
     for order in MARKS:
         database: Any = cantools.database.load_string(dbc_text(order), database_format="dbc")
         lengths = {message.frame_id: message.length for message in database.messages}

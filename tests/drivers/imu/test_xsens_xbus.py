@@ -48,7 +48,7 @@ def recording(name: str) -> bytes:
 
 @cache
 def decoded(name: str) -> list[Block]:
-    """xsens-go's decoding: a block a message, item names without format to the lines below them."""
+    """Return xsens-go's decoding: one block per message, with the lines below each item's name."""
     text = gzip.decompress((FIXTURES / f"xsens/{name}.golden.gz").read_bytes()).decode()
     blocks = []
     for part in text.strip().split("\n\n"):
@@ -63,7 +63,7 @@ def decoded(name: str) -> list[Block]:
 
 
 def vector(block: Block, item: str) -> list[float]:
-    """Numbers of an item, ``X:…`` or ``Q0:…``."""
+    """Return the numbers of an item, ``X:…`` or ``Q0:…``."""
     return [float(line.partition(":")[2]) for line in block[item]]
 
 
@@ -126,7 +126,7 @@ FORMAT_NAMES = {"Float32": xbus.FLOAT32, "FP1220": xbus.FP1220}
 
 @pytest.mark.parametrize("number", "12")
 def test_identifiers_match_the_output_configuration_of_the_device(number: str) -> None:
-    """Identifier and rate of each item that the device was told to send, beside the other library's names for them."""
+    """The identifiers and rates that the device was configured to send are compared with the library's names."""
     data = (FIXTURES / f"xsens/{number}_outputconfig.bin").read_bytes()
     text = (FIXTURES / f"xsens/{number}_outputconfig.golden").read_text()
     said = re.findall(r"^(\w+)(?:\((.*)\))?:\n  (?:(Max)|(\d+) Hz)", text, re.MULTILINE)
@@ -147,7 +147,7 @@ def test_identifiers_match_the_output_configuration_of_the_device(number: str) -
 
 @pytest.mark.parametrize("name", NAMES)
 def test_every_decoded_item_matches_the_reference_library(name: str) -> None:
-    """Delta V, delta Q, the counter and UTC too, from the items themselves."""
+    """Delta V, delta Q, the counter and UTC are compared too, from the items themselves."""
     data, position = recording(name), 0
     for block in decoded(name):
         length = XBUS.measure(data, position, True)
@@ -175,7 +175,7 @@ def test_increments_are_divided_by_the_interval(name: str) -> None:
 
 
 def test_rate_of_turn_equals_its_increment_divided_by_the_interval() -> None:
-    """In float32; 12.20 resolves 2e-4 rad/s of an increment."""
+    """They agree in float32; 12.20 resolves 2e-4 rad/s of an increment."""
     rates = imu_rows(parse(recording("1_output"))[0])
     increments = imu_rows(parse(recording("1_output"), sample="increment", rate_hz=100)[0])
     np.testing.assert_allclose(increments["angular_rate_b"], rates["angular_rate_b"], rtol=1e-5, atol=1e-8)

@@ -181,7 +181,7 @@ def test_a_silent_caster_does_not_block_the_caller() -> None:
 
 
 def test_opening_ends_by_its_deadline_however_slow_the_network_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Name servers that do not answer: given up before the recorder's watchdog would take it for stuck."""
+    """Name servers do not answer; opening gives up before the recorder's watchdog would call it stuck."""
     monkeypatch.setattr(tcp_socket, "OPEN_S", 0.3)
     hold = threading.Event()
     made: list[socket.socket] = []

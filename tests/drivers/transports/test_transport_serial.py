@@ -23,7 +23,7 @@ from swath.drivers.transports.spec import TransportSpec, parse_transport
 
 
 class Device:
-    """The far end of a pty, and the path a port is opened by."""
+    """The far end of a pty, and the path by which a port is opened."""
 
     def __init__(self) -> None:
         self.master, slave = os.openpty()
@@ -122,7 +122,7 @@ def test_unplugging_while_waiting_raises_a_transport_error(device: Device) -> No
 
 
 def test_a_replugged_device_is_reopened_under_its_stable_name(device: Device, tmp_path: Path) -> None:
-    """The name is a link, as udev makes it; the session opens what it points to now."""
+    """The name is a link, as udev makes it; the session opens its current target."""
     link = tmp_path / "gnss"
     link.symlink_to(device.path)
     spec = parse_transport(f"serial:{link}?baud=115200")
@@ -206,7 +206,7 @@ def test_a_baud_rate_unknown_to_the_kernel_raises_a_transport_error(device: Devi
 
 
 def test_error_for_a_port_without_permission_names_the_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
-    """root may open anything, so the refusal itself is stood in for; the wording is what is tested."""
+    """root may open anything, so the refusal is simulated; the wording is what is tested."""
 
     def refuse(*_: object, **__: object) -> None:
         raise PermissionError(errno.EACCES, "Permission denied")
@@ -241,7 +241,7 @@ def test_reopening_leaks_no_descriptor(device: Device) -> None:
 
 
 def test_line_settings_reach_the_driver(device: Device) -> None:
-    """All but the character size and parity bit, which a pty keeps at eight and none."""
+    """All settings but character size and parity bit are checked; a pty keeps these at eight and none."""
     serial = port(device.path, "?baud=57600&bytesize=7&parity=O&stopbits=2&rtscts=yes&xonxoff=yes")
     serial.open()
     iflag, _, cflag, _, ispeed, ospeed, _ = termios.tcgetattr(serial._fd)

@@ -112,7 +112,7 @@ def test_blocks_are_not_changed_by_later_reads(sender: socket.socket) -> None:
 
 
 def test_writing_into_the_spare_bytes_before_units_changes_no_unit(sender: socket.socket) -> None:
-    """Over several of the reader's memories, with lengths that change now and then."""
+    """Units span several of the reader's memories, with lengths that change now and then."""
     rng = random.Random(2)
     sent, length = [], 1206
     for _ in range(4000):
@@ -419,7 +419,7 @@ def test_send_without_a_known_peer_is_refused() -> None:
 
 
 def test_the_reader_handles_many_senders(sender: socket.socket) -> None:
-    """A device that takes a new port for every datagram keeps its order, and its ports are right."""
+    """A device that uses a new port for every datagram keeps its order, and its ports are right."""
     udp = transport()
     udp.open()
     expected = []

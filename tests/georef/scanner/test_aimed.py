@@ -24,13 +24,16 @@ MIDDLE_NS = 500_000_000
 
 
 def model(installation: object = None) -> SensorModel:
-    """A head in the body's origin."""
+    """Return the model of a head in the body's origin."""
     turned = np.eye(3) if installation is None else np.array(installation, dtype=np.float64)
     return SensorModel(nominal("front", [0, 0, 0], turned), AimedGeometry())
 
 
 def test_points_lie_where_azimuth_and_elevation_put_them() -> None:
-    """100 m by hand: cos 20° = 0.9396926, sin 20° = 0.3420201, cos 30° = 0.8660254; 90° to the left is +y, not −y."""
+    """The points of 100 m are computed by hand; 90° to the left is +y, not −y.
+
+    cos 20° = 0.9396926, sin 20° = 0.3420201, cos 30° = 0.8660254.
+    """
     rows = rows_of(
         np.radians([0.0, 90.0, 0.0, 30.0, 330.0]), 100.0, elevation_rad=np.radians([0.0, 0.0, 90.0, 20.0, -20.0])
     )
@@ -59,7 +62,7 @@ def covariance_of(points: FloatArray) -> FloatArray:
 
 
 def test_sigmas_hold_both_angles() -> None:
-    """Draws of range, azimuth and elevation through the formula itself; the sample scatters by 1 % of a variance."""
+    """Range, azimuth and elevation are drawn through the formula itself; the sample variance scatters by 1 %."""
     azimuth, elevation, range_m, draws = 0.7, -0.9, 80.0, 40_000
     noise, rng = Noise(range_m=0.02, angle_rad=1e-3, time_s=0.0, divergence_rad=0.0), np.random.default_rng(4)
     rho = range_m + noise.range_m * rng.standard_normal(draws)

@@ -118,7 +118,7 @@ def test_copies_count_once_and_contradicting_ones_are_named(archive: Path, capsy
 def test_a_calibration_only_in_a_record_is_one_of_its_scanner(
     archive: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Records of today tell the scanner's serial number; in older ones the name is all there is."""
+    """Recent records have the scanner's serial number; older ones have only its name."""
     made = made_outcome()
     document = json.loads(
         record_json(record_of(RecordInput(made.flight, made.features, made.adjusted, "left", made.header)))

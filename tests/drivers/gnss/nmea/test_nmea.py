@@ -86,7 +86,7 @@ def test_fixes_match_gpsd(name: str) -> None:
 
 
 def test_only_the_broken_recordings_have_bad_messages() -> None:
-    """april6_2019 says the date 2208-1, tcp-torture and nmeafoo2 have fields overwritten."""
+    """april6_2019 has the invalid date 2208-1; tcp-torture and nmeafoo2 have overwritten fields."""
     bad = {}
     for name in expected("nmea"):
         parser = make()
@@ -97,7 +97,7 @@ def test_only_the_broken_recordings_have_bad_messages() -> None:
 
 
 def test_a_date_one_rollover_behind_is_invalid_and_counted() -> None:
-    """april6_2019.log: after the roll-over of 2019-04-06 this receiver says 1999."""
+    """april6_2019.log comes from a receiver that sends 1999 after the roll-over of 2019-04-06."""
     parser = make()
     records = feed_pieces(parser, [recording("nmea", "april6_2019.log")])
     assert [message.valid for message in times(records)] == [False]
@@ -106,7 +106,7 @@ def test_a_date_one_rollover_behind_is_invalid_and_counted() -> None:
 
 
 def test_a_date_one_rollover_behind_is_corrected_by_the_host_date() -> None:
-    """The same on a computer whose clock is right: the date is the one that gpsd has for the sentence."""
+    """The computer's clock is right here, and the date is the one that gpsd has for the sentence."""
     (report,) = [report for report in gpsd_reports("nmea", "april6_2019.log") if "time" in report]
     at = dt.datetime.fromisoformat(str(report["time"]))
     parser = make()
@@ -283,7 +283,7 @@ def test_a_height_without_geoid_separation_is_ignored() -> None:
 
 
 def test_gns_position_matches_gga() -> None:
-    """A receiver's own (fixtures/nmea/pygpsdata-nmea4.log): 56.0 m above a geoid that is 48.5 m above the ellipsoid."""
+    """fixtures/nmea/pygpsdata-nmea4.log has this sentence: 56.0 m above a geoid 48.5 m above the ellipsoid."""
     records, parser = parse(b"$GNGNS,103607.00,5327.03942,N,00214.42462,W,AANN,06,5.88,56.0,48.5,,,V*34\r\n")
     (fix,) = fixes(records)
     assert math.degrees(fix.lat_rad or 0.0) == pytest.approx(53.450657, abs=1e-9)
@@ -381,7 +381,7 @@ def test_a_fix_is_given_with_the_last_sentence_of_its_epoch_once_the_order_is_kn
 
 
 def test_sigmas_sent_every_third_epoch_are_not_lost() -> None:
-    """Every third epoch has a GST at its end: the others wait for the next epoch rather than lose it."""
+    """Every third epoch has a GST at its end; the others wait for the next epoch rather than lose it."""
     records, parser = parse(
         *(sentence for second in range(12) for sentence in epoch(second, "GRS" if second % 3 == 0 else "GR"))
     )

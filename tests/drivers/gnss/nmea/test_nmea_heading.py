@@ -28,7 +28,7 @@ def parse(*sentences: bytes) -> tuple[list[GnssHeading], NmeaParser]:
 
 
 def test_a_um982_with_ths_and_hpr_gives_a_heading_each_second() -> None:
-    """A stream of GGA, RMC, THS and HPR at 1 Hz: HPR counts, as it has time and quality; the first THS came before."""
+    """At 1 Hz come GGA, RMC, THS and HPR; HPR counts, because it has time and quality, but the first THS is earlier."""
     stream = (FIXTURES / "nmea/um982_heading.nmea").read_bytes()
     headings, parser = parse(stream)
     counts = parser.counters.messages
@@ -88,7 +88,7 @@ def test_pashr_gives_the_vehicles_heading_with_its_sigma_and_no_pitch() -> None:
 
 
 def test_avr_matches_pynmea2() -> None:
-    """The first sentence is the example of Trimble's OEM receiver help."""
+    """The first sentence is the example in Trimble's OEM receiver help."""
     example = nmea.encode_sentence("PTNL,AVR,181059.6,+149.4688,Yaw,+0.0134,Tilt,,,60.191,3,2.5,6")
     for sentence, yaw, tilt, length in (
         (example, 149.4688, 0.0134, 60.191),

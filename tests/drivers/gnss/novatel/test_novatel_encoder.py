@@ -113,7 +113,7 @@ def test_a_position_without_valid_time_names_no_second(status: int) -> None:
 
 
 def early_logs() -> dict[str, bytes]:
-    """What is dated, from a receiver that is one roll-over of ten bits behind."""
+    """Return the dated logs of a receiver that is one roll-over of ten bits behind."""
     week = WEEK - 1024
     bodies: dict[str, nov.Body] = {
         "TIME": TIME,
@@ -255,7 +255,7 @@ def test_an_imu_error_is_counted() -> None:
 
 
 def test_encrypted_counts_give_no_samples() -> None:
-    """RAWIMUX, IMU info bit 1: "the IMU data is encrypted and should not be used"."""
+    """By the manual RAWIMUX, IMU info bit 1, means "the IMU data is encrypted and should not be used"."""
     records, parser = parse(encode_log("RAWIMUSX", nov.RawImux(2, 8, *RAW_IMU), WEEK, MS))
     assert records == []
     assert parser.counters.errors == {"imu_encrypted": 1}

@@ -37,7 +37,7 @@ def parse(*pieces: bytes) -> tuple[list[Record], SbfParser]:
 
 
 def blocks_of(name: str, block: str = "") -> Iterator[tuple[bytes, Any]]:
-    """Frames of a recording and what pysbf2 makes of them, of one block if said."""
+    """Yield the frames of a recording, of one block if given, with what pysbf2 reads from each."""
     reader = SBFReader(io.BytesIO(recording("sbf", name)), protfilter=SBF_PROTOCOL, quitonerror=ERR_RAISE)
     for raw, message in reader:
         if message is not None and (not block or message.identity == block):
@@ -69,7 +69,7 @@ def test_messages_of_every_recording_match_pysbf2(name: str) -> None:
 
 
 def test_nmea_from_a_septentrio_receiver_is_framed() -> None:
-    """PolaRx2 of gpsd's suite."""
+    """The recording is a PolaRx2 of gpsd's suite."""
     records, parser = parse(recording("nmea", "polarx2.log"))
     assert records == []
     assert parser.counters.messages.total() == expected("nmea")["polarx2.log"]["frame_scan_own"]["nmea_ok"] == 75
@@ -260,7 +260,7 @@ def test_fixes_match_pysbf2() -> None:
 
 
 def test_accuracies_replace_a_missing_covariance() -> None:
-    """The same epoch with and without PosCovGeodetic: centimetres are all that PVTGeodetic carries."""
+    """The same epoch comes with and without PosCovGeodetic; PVTGeodetic alone resolves centimetres only."""
     data = recording("sbf", "pygpsdata_x5_pvtgeod.log")
     [alone], [whole] = (of_type(parse(piece)[0], GnssFix) for piece in (data[:96], data))
     assert alone.position_cov_l is not None

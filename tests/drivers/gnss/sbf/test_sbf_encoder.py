@@ -60,7 +60,7 @@ TRIPLES = {
 
 
 def sensor(kind: int, *values: float, source: int = 32) -> sbf.SensorSet:
-    """A measurement of three numbers, or a temperature in 0.01 °C."""
+    """Return a measurement of three numbers, or a temperature in 0.01 °C."""
     data = struct.pack("<h22x", int(values[0])) if kind == sbf.SENSOR_INFO else struct.pack("<3d", *values)
     return sbf.SensorSet(source, 10, kind, kind + 1, data)
 
@@ -125,7 +125,7 @@ def test_pysbf2_reads_encoded_blocks() -> None:
 
 
 def stream() -> bytes:
-    """Three seconds of an INS receiver at 5 Hz, with all that is decoded, sentences and replies between."""
+    """Return three seconds of an INS receiver at 5 Hz, with every decoded block, and sentences and replies between."""
     pieces = []
     for step in range(15):
         tow = TOW_MS + 200 * step
@@ -315,7 +315,7 @@ def test_pulses_are_labelled_and_their_offsets_subtracted(told: bool, least_ns: 
 
 
 def test_an_event_is_in_gnss_time() -> None:
-    """TOW/1000 + Offset − RxClkBias, page 426 of the reference guide."""
+    """By page 426 of the reference guide its time is TOW/1000 + Offset − RxClkBias."""
     mark = one(sbf.EXT_EVENT.encode(EVENT, TOW_MS + 3, WEEK), EventMark)
     assert (mark.time.week, mark.channel, mark.rising, mark.valid) == (WEEK, "EventA", True, True)
     assert mark.time.time_ns == pytest.approx((TOW_MS + 3) * 10**6 + 250_000 + 250_000, abs=1)

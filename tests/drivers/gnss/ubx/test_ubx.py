@@ -135,14 +135,14 @@ def test_fields_match_pyubx2(identity: str) -> None:
 
 
 def tow_ms(utc: str) -> int:
-    """GPS time of week of gpsd's UTC text; 18 leap seconds since 2017."""
+    """Return the GPS time of week, ms, of gpsd's UTC text; there are 18 leap seconds since 2017."""
     since = dt.datetime.fromisoformat(utc) + dt.timedelta(seconds=18) - GPS_EPOCH
     return round(since.total_seconds() * 1000) % WEEK_MS
 
 
 @pytest.mark.parametrize("name", ["ublox-zed-f9p-hp.log", "ublox-zed-f9p-sfrbx.log", "ublox-zed-f9t-rtcm3.log"])
 def test_fixes_match_gpsd(name: str) -> None:
-    """gpsd's reports are of NAV-PVT alone: a refined position differs by less than its last digit and its height's."""
+    """gpsd reports NAV-PVT alone, so a refined position differs by less than the last digit of each coordinate."""
     reports = {tow_ms(report["time"]): report for report in gpsd_reports("ubx", name)}
     found = fixes(feed_pieces(make(), [recording("ubx", name)]))
     compared = 0
@@ -163,7 +163,7 @@ def test_fixes_match_gpsd(name: str) -> None:
 
 
 def test_week_and_time_of_week_match_gpsd() -> None:
-    """NAV-TIMEGPS of an M8 in time mode beside the UTC that gpsd made of it."""
+    """An M8 in time mode sends NAV-TIMEGPS, from which gpsd made UTC."""
     reports = {report["time"] for report in gpsd_reports("ubx", "ublox-8-time.log")}
     messages = [
         message
@@ -188,7 +188,7 @@ def test_no_recording_has_a_bad_message() -> None:
 
 
 def test_tim_tp_pulses_of_an_old_receiver_are_decoded() -> None:
-    """ublox-lea-4t.log: TIM-TP in UTC, with its quantisation; NAV-SOL two seconds of the same week."""
+    """ublox-lea-4t.log has TIM-TP in UTC with its quantisation, and NAV-SOL two seconds of the same week."""
     messages = times(feed_pieces(make(), [recording("ubx", "ublox-lea-4t.log")]))
     pulses = [message for message in messages if message.message == "TIM-TP"]
     assert [pulse.quantisation_ns for pulse in pulses][:1] == [16.813]
@@ -209,7 +209,7 @@ def test_tim_tp_pulses_of_an_old_receiver_are_decoded() -> None:
     ],
 )
 def test_records_do_not_depend_on_how_the_stream_is_cut(name: str, message: str) -> None:
-    """UBX and RTCM3 mixed; epochs of many messages; long raw measurements between."""
+    """The streams mix UBX and RTCM3, have epochs of many messages, and long raw measurements between."""
     outcome = check_stream(make, recording("ubx", name))
     assert outcome.counters["messages"][message] == expected("ubx")[name]["messages"][f"UBX:{message}"]
 
@@ -251,7 +251,7 @@ MIDNIGHT_MS = 6 * 86_400_000  # Saturday 2026-11-21 of week 2445
 
 
 def pvt(at_ms: int, **changes: int) -> bytes:
-    """A NAV-PVT of 2026-11-21, UTC = iTOW − 18 s, fixed at 47.1234567° N 8.7654321° W, 500 m."""
+    """Return a NAV-PVT of 2026-11-21, UTC = iTOW − 18 s, fixed at 47.1234567° N 8.7654321° W, 500 m."""
     utc_ms = (at_ms - 18_000) % 86_400_000
     hour, rest = divmod(utc_ms, 3_600_000)
     minute, rest = divmod(rest, 60_000)
@@ -326,7 +326,7 @@ def test_accuracies_replace_missing_covariances() -> None:
 
 
 def test_an_itow_is_never_joined_with_the_week_of_another_epoch() -> None:
-    """The solution of the new week's first epoch beside the old week's number, and at last its own."""
+    """The new week's first solution comes beside the old week's number, which must not date it."""
     last, first = WEEK_MS - 1000, 0
     records, _ = parse(
         pvt(last), timegps(last, WEEK), pvt(first), timegps(last, WEEK), pvt(1000), timegps(1000, WEEK + 1)
@@ -393,7 +393,7 @@ def test_the_second_follows_itow_whatever_leap_count_utc_uses() -> None:
 @pytest.mark.parametrize("leap", [13, 16, 17, 38, -2])
 @pytest.mark.parametrize("name", ["NAV-PVT", "NAV-TIMEUTC"])
 def test_utc_with_a_stale_leap_count_gives_the_second_of_its_own_itow(name: str, leap: int) -> None:
-    """A receiver whose firmware counts `leap` leap seconds where there are 18, fully resolved all the same."""
+    """The receiver's firmware counts `leap` leap seconds instead of 18, yet reports fully resolved UTC."""
     utc = dt.datetime(2026, 11, 21, 12, tzinfo=dt.UTC) - dt.timedelta(seconds=leap)
     calendar = (utc.year, utc.month, utc.day, utc.hour, utc.minute, utc.second)
     frame = (
@@ -445,7 +445,7 @@ def test_weeks_one_rollover_behind_are_corrected_on_request_or_by_the_host_date(
 
 
 def test_second_60_is_read_as_a_leap_second() -> None:
-    """2016-12-31, a Saturday: 23:59:60 is 17 s behind GPS, whose new week began 17 s ago."""
+    """On 2016-12-31, a Saturday, 23:59:60 is 17 s behind GPS, whose new week began 17 s earlier."""
     frame = pvt(NOON_MS, itow_ms=17_000, year=2016, month=12, day=31, hour=23, minute=59, second=60)
     records, parser = parse(ubx.encode_nav_timels(ubx.NavTimels(0, 0, 2, 17, 2, 1, 17, 1930, 1, 3)), frame)
     message = times(records)[-1]

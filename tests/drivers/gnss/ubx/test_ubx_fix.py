@@ -101,7 +101,7 @@ def test_ecef_conversion_matches_proj(lat: float, lon: float, height: float) -> 
 
 
 def test_nav_sol_alone_gives_position_and_velocity_of_ecef() -> None:
-    """The velocity by PROJ's topocentric frame: one second along it."""
+    """The expected velocity is one second along PROJ's topocentric frame."""
     lat, lon, height = 47.0, 8.5, 555.0
     ecef = pyproj.Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
     start = np.array(ecef.transform(lon, lat, height))
@@ -120,7 +120,7 @@ def test_nav_sol_alone_gives_position_and_velocity_of_ecef() -> None:
 
 @pytest.mark.parametrize("name", ["ublox-aek-4t.log", "ublox-lea-4t.log"])
 def test_nav_sol_of_old_receivers_matches_gpsd(name: str) -> None:
-    """The first fix: gpsd repeats its first position in these logs."""
+    """Only the first fix is compared, because gpsd repeats its first position in these logs."""
     report = gpsd_reports("ubx", name)[0]
     fix = fixes(feed_pieces(UbxParser(SETTINGS), [recording("ubx", name)]))[0]
     assert (fix.message, fix.valid) == ("NAV-SOL", True)
@@ -222,7 +222,7 @@ FORCE, RATE = (0.5, -0.25, -9.75), (0.1, -0.2, 0.3)
 
 
 def test_esf_raw_gives_a_sample_for_each_time_tag() -> None:
-    """Laid out by hand after the manual's table of ESF measurement data; and by the encoder."""
+    """The frame is laid out by hand from the manual's table of ESF measurement data, and by the encoder."""
     words = [
         (14, round(math.degrees(0.1) * 4096)),
         (13, round(math.degrees(-0.2) * 4096)),

@@ -56,7 +56,7 @@ def make(rule: str = "last", *drop: str, **config: Any) -> DbcParser:
 
 
 def reference_samples(kinds: str, rule: str) -> tuple[list[dict[str, int]], int, int]:
-    """Samples by the rules as CONFIG states them, one frame at a time; also incomplete and duplicate counts."""
+    """Return samples by the documented rules, one frame at a time, and the incomplete and duplicate counts."""
     parts = set(KINDS[rule][0])
     good: list[dict[str, int]] = []
     group: list[tuple[str, int]] = []
@@ -115,12 +115,12 @@ def test_samples_follow_the_stated_rule_whatever_the_batches(rule: str) -> None:
 
 
 def _numbered(kind: str, number: int) -> bytes:
-    """A frame whose value is its number, so that a sample tells which frames made it."""
+    """Return a frame whose value is its number, so that a sample shows which frames made it."""
     return {"A": acc_frame(number), "G": gyr_frame(number), "T": sample_frame(number * 1000)}[kind]
 
 
 def _stream(samples: int, *, with_latch: bool = True) -> list[bytes]:
-    """A regular stream at 100 Hz with a latch a second, a lost frame, a doubled one and foreign traffic."""
+    """Return a regular stream at 100 Hz with a latch a second, a lost frame, a doubled one and foreign traffic."""
     frames: list[bytes] = []
     for number in range(samples):
         ticks = 4_294_000_000 + number * 10_000  # wraps in the stream
@@ -185,7 +185,7 @@ def _sample(ticks: int) -> list[bytes]:
 
 
 def _run(parser: Parser, ticks: list[int], host_s: list[float]) -> StructArray:
-    """One sample for each counter value, arriving at the times given."""
+    """Return the rows of one sample for each counter value, arriving at the times given, s."""
     frames = [frame for value in ticks for frame in _sample(value)]
     return imu_rows(feed(parser, frames, np.repeat(np.array(host_s) * 1e9, 3).astype(np.int64)))
 
@@ -218,7 +218,7 @@ def test_a_late_reader_is_not_taken_for_a_restart() -> None:
 
 
 def test_a_fast_counter_that_may_have_wrapped_unseen_begins_anew() -> None:
-    """One stamp that is late by 40 ms, of a counter that wraps in 65: no whole wrap is made of it."""
+    """One stamp is late by 40 ms, and the counter wraps in 65 ms; no whole wrap is derived from it."""
     unwrapper = CounterUnwrapper(16, 1e6)
     ticks = np.arange(40, dtype=np.uint64) * 5000
     host_ns = np.arange(40) * 5_000_000
@@ -459,7 +459,7 @@ def test_frames_are_unchanged_by_the_log_layout() -> None:
 
 
 def test_a_manufacturers_dbc_with_the_counter_first_is_decoded() -> None:
-    """SBG Ellipse: IMU_INFO with the time stamp opens a sample, ACCEL and GYRO follow (sbgECom, canProtocol.md)."""
+    """SBG Ellipse's IMU_INFO with the time stamp opens a sample; ACCEL and GYRO follow (sbgECom, canProtocol.md)."""
     prefix = "SBG_ECAN_MSG_IMU_"
     signals = {
         "specific_force": [f"{prefix}ACCEL.ACCEL_{axis}" for axis in "XYZ"],
@@ -491,7 +491,10 @@ def test_a_manufacturers_dbc_with_the_counter_first_is_decoded() -> None:
 
 
 def _burst(order: str, pauses_ms: float, samples: int = 80) -> tuple[list[bytes], Int64Array]:
-    """Frames of numbered samples in an order, 0.2 ms apart and a pause after each sample; the first lacks its begin."""
+    """Return frames of numbered samples in an order, 0.2 ms apart with a pause after each sample, and their times.
+
+    The first sample lacks its first frame.
+    """
     frames, times, at = [], [], 0.0
     for number in range(samples):
         for kind in order[1:] if number == 0 else order:
@@ -508,7 +511,7 @@ def _burst(order: str, pauses_ms: float, samples: int = 80) -> tuple[list[bytes]
 def test_an_unspecified_group_is_derived_from_the_pauses_between_samples(
     order: str, drop: tuple[str, ...], batch: int
 ) -> None:
-    """Whichever frame comes last: force and rate are of one sample, though the log begins within one."""
+    """Force and rate belong to one sample, whichever frame is last, though the log begins within a sample."""
     order = order.replace("T", "") if drop else order
     parser = DbcParser(settings(signals=without(*drop) if drop else None, group=None))
     frames, times = _burst(order, 4.4)

@@ -47,7 +47,7 @@ FLOAT_SIGNALS = {
 
 
 def units() -> dict[str, tuple[SignalMap, str, DeviceSettings]]:
-    """Signal maps, the DBC's text as cantools reads it, settings; by a name for the test."""
+    """Return signal maps, the DBC's text as cantools reads it, and settings, by a name for the test."""
     empty = DeviceSettings("imu/main")
     ticked = DeviceSettings("imu/main", {"tick_hz": 10_000})
     little = DeviceSettings("imu/main", {"tick_hz": 10_000, "byte_order": "little"})
@@ -78,7 +78,7 @@ def columns() -> dict[str, Any]:
 
 
 def decoded(text: str, frames: np.ndarray[Any, np.dtype[np.uint8]]) -> dict[str, list[float]]:
-    """cantools' values by ``MESSAGE.signal``, in order; signals behind a frame's end are left out."""
+    """Return cantools' values by ``MESSAGE.signal``, in order, without signals beyond a frame's end."""
     database: Any = cantools.database.load_string(text, database_format="dbc", strict=False)
     values: dict[str, list[float]] = {}
     for frame in frames.reshape(-1).view(CAN_FRAME_DTYPE):

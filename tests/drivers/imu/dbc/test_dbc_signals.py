@@ -35,7 +35,7 @@ class DbcSignal:
     message_bytes: int
 
     def text(self) -> str:
-        """A DBC with this one signal."""
+        """Return a DBC with this one signal."""
         start = self.first_bit // 8 * 8 + 7 - self.first_bit % 8 if self.big_endian else self.first_bit
         order, sign = int(not self.big_endian), "-" if self.signed else "+"
         kind = {32: 1, 64: 2}.get(self.length) if self.is_float else None
@@ -48,7 +48,7 @@ class DbcSignal:
 
 @st.composite
 def dbc_signals(draw: st.DrawFn) -> DbcSignal:
-    """Any signal that fits a classic or an FD frame."""
+    """Draw any signal that fits a classic or an FD frame."""
     message_bytes = draw(st.sampled_from([8, 64]))
     is_float = draw(st.booleans())
     length = draw(st.sampled_from([32, 64])) if is_float else draw(st.integers(1, 64))
@@ -65,7 +65,7 @@ def dbc_signals(draw: st.DrawFn) -> DbcSignal:
 
 
 def assert_like_cantools(message: Any, signal: Any, data: np.ndarray[Any, np.dtype[np.uint8]]) -> int:
-    """Every row's value equals cantools'; the number of rows compared."""
+    """Assert that every row's value equals cantools', and return the number of rows compared."""
     layout = signal_layout(message, signal)
     values = layout.values(layout.bits(data))
     compared = 0

@@ -23,7 +23,7 @@ NOON_NS = 1_795_262_400_250_000_000  # `date -u -d '2026-11-21 12:00:00' +%s`
 
 @dataclass(frozen=True)
 class Model:
-    """A recording of a model and what is known of it."""
+    """A recording of a model, and the known facts about it."""
 
     protocol: str
     head: HesaiHead

@@ -52,7 +52,7 @@ from tests.drivers.scanner.hesai.builders import MODELS, NOON, NOON_NS, decode, 
 
 
 def test_firing_times_follow_the_xt32_manual() -> None:
-    """Appendix II, PandarXT: block N at t0 + 5.632 − 50 (8 − N) µs, channel n at 0.368 + 1.512 (n − 1) µs."""
+    """By appendix II, PandarXT, block N is at t0 + 5.632 − 50 (8 − N) µs, channel n at 0.368 + 1.512 (n − 1) µs."""
     times = decode(packet())["device_time_ns"].reshape(8, 32) - NOON_NS
     for block, channel, want_us in ((8, 1, 6.0), (8, 32, 52.872), (1, 1, -344.0), (7, 2, -42.488)):
         assert times[block - 1, channel - 1] == round(1000 * want_us)
@@ -62,7 +62,7 @@ def test_firing_times_follow_the_xt32_manual() -> None:
 
 
 def test_firing_times_follow_the_qt64_driver() -> None:
-    """HesaiLidar_General_ROS: 25.71 µs + 166.67 µs a round + 10 µs + the channel's own."""
+    """HesaiLidar_General_ROS has 25.71 µs + 166.67 µs per round + 10 µs + the channel's own time."""
     times = decode(packet(QT64), QT64)["device_time_ns"].reshape(4, 64) - NOON_NS
     for block, channel, want_us in ((1, 1, 38.02), (4, 1, 538.02), (2, 64, 338.827), (3, 17, 405.653)):
         assert times[block - 1, channel - 1] == pytest.approx(1000 * want_us, abs=1)
@@ -95,7 +95,7 @@ def test_firing_times_follow_the_xt16_tables(mode: int, block: int, channel: int
     ],
 )
 def test_firing_times_follow_the_xt32m2x_tables(mode: int, block: int, channel: int, want_us: float) -> None:
-    """udp6_1_parser.cc: 50 µs before the last round, of one, two or three blocks."""
+    """By udp6_1_parser.cc a round of one, two or three blocks fires 50 µs before the next one."""
     times = decode(packet(XT32M2X, mode), XT32M2X)["device_time_ns"].reshape(-1, 32) - NOON_NS
     assert times[(block - 1) // echoes_of(mode), channel - 1] == round(1000 * want_us)
 
@@ -114,7 +114,7 @@ def test_firing_times_follow_the_xt32m2x_tables(mode: int, block: int, channel: 
 def test_firing_times_follow_the_loops_of_the_qt128(
     mode: int, flag: int, block: int, channel: int, want_us: float
 ) -> None:
-    """udp3_2_parser.cc; the azimuth is advanced by the loop's time too, at 600 rpm by 3.6e-3° a µs."""
+    """In udp3_2_parser.cc the azimuth advances by the loop's time too, at 600 rpm by 3.6e-3° per µs."""
     rows = decode(packet(QT128, mode, mode_flag=flag), QT128)
     at = (block - 1) // echoes_of(mode), channel - 1
     assert rows["device_time_ns"].reshape(-1, 128)[at] - NOON_NS == round(1000 * want_us)
@@ -124,7 +124,7 @@ def test_firing_times_follow_the_loops_of_the_qt128(
 
 
 def test_azimuth_is_advanced_to_each_firing() -> None:
-    """10 rev/s are 3.6° in a millisecond; across 0° too."""
+    """10 rev/s are 3.6° in a millisecond, also across 0°."""
     azimuth = (35_990 + 18 * np.arange(8)) % 36_000
     unit = encode_point_packet(NOON, azimuth, np.full((8, 32), 100), 1, motor_rpm=600)
     rows = decode(unit)
@@ -160,7 +160,7 @@ def test_single_return_modes_are_flagged(mode: int, flags: int) -> None:
 def test_dual_return_modes_follow_the_manual(
     mode: int, pair: tuple[tuple[int, int], tuple[int, int]], want: list[tuple[int, int]]
 ) -> None:
-    """PandarXT-16 User Manual 3.1.2, table of return modes; the last two of udp_protocol_v3_2.h."""
+    """The table is that of the PandarXT-16 User Manual 3.1.2; the last two modes are of udp_protocol_v3_2.h."""
     head = QT128 if mode in (MODE_FIRST_SECOND, MODE_STRONGEST_SECOND) else XT32
     ranges, light = np.zeros((head.blocks, head.channels), dtype=int), np.zeros((head.blocks, head.channels), dtype=int)
     ranges[:2, 5], light[:2, 5] = [one[0] for one in pair], [one[1] for one in pair]
@@ -188,7 +188,7 @@ def test_dual_return_modes_follow_the_manual(
 def test_three_returns_are_ordered_and_named(
     triple: tuple[tuple[int, int], ...], want: list[tuple[int, int]], compiled: bool
 ) -> None:
-    """Blocks 4 to 6 of an XT32M2X, whose distances are in the header's unit: here 5 mm, the encoder's first is 4 mm."""
+    """Blocks 4 to 6 of an XT32M2X are used; distances are in the header's unit: 5 mm here, 4 mm in the encoder."""
     ranges, light = np.zeros((6, 32), dtype=int), np.zeros((6, 32), dtype=int)
     ranges[3:6, 5], light[3:6, 5] = [one[0] for one in triple], [one[1] for one in triple]
     unit = bytearray(packet(XT32M2X, MODE_FIRST_LAST_STRONGEST, ranges=ranges, light=light))
@@ -266,7 +266,7 @@ def utc_at(head: HesaiHead) -> int:
 
 
 def test_a_date_in_seconds_since_1970_is_decoded() -> None:
-    """HesaiLidar_SDK_2.0: a year of 0 is followed by seconds since 1970, the highest byte first."""
+    """In HesaiLidar_SDK_2.0 a year of 0 is followed by seconds since 1970, highest byte first."""
     unit = bytearray(packet())
     at = utc_at(XT32)
     unit[at : at + 6] = b"\0\0" + (1_795_262_400).to_bytes(4, "big")
@@ -275,7 +275,7 @@ def test_a_date_in_seconds_since_1970_is_decoded() -> None:
 
 @pytest.mark.parametrize(("head", "year"), [(QT64, 26), (QT64, 126), (XT32, 126), (XT32, 226)])
 def test_a_year_of_either_century_is_decoded(head: HesaiHead, year: int) -> None:
-    """HesaiLidar_SDK_2.0, udp_protocol_v3_1.h and v6_1.h, GetMicroLidarTimeU64: 2026 in all of these."""
+    """These are 2026 by HesaiLidar_SDK_2.0, udp_protocol_v3_1.h and v6_1.h, GetMicroLidarTimeU64."""
     unit = bytearray(packet(head))
     unit[utc_at(head)] = year
     np.testing.assert_array_equal(decode(bytes(unit), head), decode(packet(head), head))
@@ -331,7 +331,7 @@ def test_packets_of_a_qt128_with_a_wrong_checksum_are_counted(at: int) -> None:
 
 
 def test_lengths_of_a_qt128_follow_the_flags_of_its_header() -> None:
-    """udp_protocol_v3_2.h: 256 bytes of confidence, 17 of safety, 4 of sequence, 32 of signature; 818 without them."""
+    """udp_protocol_v3_2.h has 256 bytes of confidence, 17 of safety, 4 of sequence, 32 of signature, 818 without."""
     layouts = QT128.layouts()
     assert len(layouts) == 16
     assert min(layouts) == 12 + 2 * (2 + 3 * 128) + 4 + 26 + 4
@@ -358,7 +358,10 @@ def run(*units: bytes) -> tuple[HesaiParser, list[Record]]:
 
 
 def test_the_example_gps_packet_of_the_manual_is_decoded() -> None:
-    """PandarXT-16 and PandarXT User Manual 3.2.3: 30 32 34 30 37 30 and 38 35 37 30 34 30 are 2020-04-07 04:07:58."""
+    """In the PandarXT-16 and PandarXT User Manual 3.2.3 this is 2020-04-07 04:07:58.
+
+    The bytes are 30 32 34 30 37 30 and 38 35 37 30 34 30.
+    """
     unit = encode_gps_packet(dt.datetime(2020, 4, 7, 4, 7, 58, 120, tzinfo=dt.UTC))
     assert unit[:14] == bytes.fromhex("ffee 303234303730 383537303430")
     assert unit[18:102].rstrip(b"\0") == b""
@@ -393,7 +396,7 @@ def test_a_locked_head_latches_the_whole_second() -> None:
 
 
 def test_a_locked_head_is_timed_by_its_latches_and_an_unlocked_one_by_arrival() -> None:
-    """Through `DeviceClock`: to its microseconds while locked, whatever the delay; by arrival while it is not."""
+    """`DeviceClock` is right to the head's microseconds while locked, whatever the delay, else it uses arrivals."""
     parser = find_driver("scanner", "hesai-xt32").make_time_parser
     assert parser is not None
     random, host = np.random.default_rng(3), host_clock(70)
@@ -441,7 +444,7 @@ def test_time_is_valid_only_if_the_head_is_locked_and_has_a_position(
 
 
 def test_a_date_one_rollover_behind_is_corrected_in_the_time_message() -> None:
-    """2006-11-06 is 1024 weeks before 2026-06-22. Device times stay as the head counts them."""
+    """2006-11-06 is 1024 weeks before 2026-06-22; device times stay as the head counts them."""
     parser = HesaiParser(DeviceSettings("scanner/left"), XT32)
     host_ns = int(dt.datetime(2026, 6, 22, 12, tzinfo=dt.UTC).timestamp()) * 10**9
     records = [

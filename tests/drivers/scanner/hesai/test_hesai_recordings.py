@@ -48,7 +48,7 @@ def turns_rad(model: Model, rows: StructArray, raw: StructArray) -> FloatArray:
 
 @EVERY_MODEL
 def test_points_agree_with_the_golden_cloud_of_nebula(model: Model) -> None:
-    """nebula leaves out the turn between the reading of the azimuth and the firing; without it every point is there."""
+    """nebula omits the rotation between reading the azimuth and firing; without it every point is found."""
     parser = model.parser()
     rows = returns_of(feed(parser, payloads(model.capture)))
     assert parser.counters.errors == model.errors

@@ -55,7 +55,7 @@ def parser_of(name: str, *, clock_only: bool = False) -> PacketParser:
 
 
 def avia_by_hand() -> bytes:
-    """96 tagged points, of which four are set; header and points byte by byte from livox_def.h."""
+    """Return 96 tagged points, of which four are set, with header and points byte by byte from livox_def.h."""
     when = struct.pack("<4BI", 21, 6, 8, 8, 1_661_272_021)
     header = struct.pack("<4BIBB", 5, 1, 1, 0, 33_280, 3, 2) + when
     points = {
@@ -103,7 +103,7 @@ def test_a_packet_of_sdk_1_is_decoded_as_computed_by_hand() -> None:
 
 
 def test_a_packet_of_sdk_2_is_decoded_as_computed_by_hand() -> None:
-    """Two points 4.75 µs apart; type 2 counts centimetres. The CRC is that of time and points."""
+    """Two points are 4.75 µs apart; type 2 counts centimetres; the CRC is that of time and points."""
     content = struct.pack("<Q", 1_700_000_000_250_000_000)
     content += struct.pack("<3h2B", 300, 0, 400, 9, 0) + struct.pack("<3h2B", 0, -1200, 500, 8, 0x24)
     head = struct.pack("<B4HBBB12x", 0, 36 + 16, 475, 2, 17_473, 0, 2, 2)
@@ -121,7 +121,7 @@ def test_a_packet_of_sdk_2_is_decoded_as_computed_by_hand() -> None:
 
 
 def test_spherical_points_are_zenith_angle_and_azimuth() -> None:
-    """Zenith 60° is 30° up, azimuth 270° is to the right; 180.01° of zenith is none."""
+    """Zenith 60° is 30° up and azimuth 270° is right; a zenith of 180.01° is invalid."""
     points = np.zeros(4, dtype=POINTS_1[3].dtype)
     points["range"] = [10_000, 20_000, 0, 30_000]
     points["zenith"], points["azimuth"] = [6000, 18_000, 9000, 18_001], [27_000, 36_000, 100, 100]
@@ -171,7 +171,7 @@ def test_the_imu_is_in_si_units_and_has_the_time_of_its_packet() -> None:
 
 @pytest.mark.parametrize(("name", "time_type", "locked"), [("mid40", 0, -1), ("mid40", 1, -1), ("hap", 1, -1)])
 def test_without_a_pulse_no_edge_is_claimed(name: str, time_type: int, locked: int) -> None:
-    """Types 0 and 1: the origin is found from the arrival, as for every head that does not tell its lock."""
+    """With types 0 and 1 the arrival gives the origin, as for every head that does not report its lock."""
     time_ns = 1_764_000_000 * S + 5
     encode = encode_packet_1 if name == "mid40" else encode_packet_2
     data_type = 0 if name == "mid40" else 1
@@ -184,7 +184,7 @@ def test_without_a_pulse_no_edge_is_claimed(name: str, time_type: int, locked: i
 
 
 def test_times_since_the_pulse_go_on_by_the_hosts_seconds() -> None:
-    """The stamp starts again at each pulse; a packet late by 0.3 s, and 12 s without packets, do not cost a second."""
+    """The stamp restarts at each pulse; a packet late by 0.3 s and 12 s without packets do not cost a second."""
     point = np.ones(1, dtype=POINTS_1[0].dtype)
     sent = [0.25, 0.75, 0.25, 0.90, 0.10, 0.35]
     host_s = [10.251, 10.751, 11.252, 12.2, 24.101, 24.351]

@@ -78,7 +78,7 @@ def test_every_field_of_every_frame_matches_the_digest_of_the_manufacturers_deco
 
 @pytest.mark.parametrize("capture", LIDAR)
 def test_returns_rebuild_the_images_of_the_manufacturers_decoder(capture: str) -> None:
-    """Ranges and intensities put back to their places, and nothing beside them."""
+    """Ranges and intensities fill the manufacturer's images exactly, with no other pixel set."""
     parser = recorded(capture)
     rows = returns_of(feed(parser, payloads(capture)))
     assert not parser.counters.errors
@@ -232,7 +232,7 @@ def test_non_finite_imu_samples_are_dropped(word: int) -> None:
 
 
 def test_points_match_the_formula_sheet() -> None:
-    """FORMULAS 2.2: 50 m at tick 22528, azimuth 3.2°, altitude −9°, n 15.806 mm, before the sensor's own frame."""
+    """FORMULAS 2.2 has 50 m at tick 22528, azimuth 3.2°, altitude −9°, n 15.806 mm, before the sensor's own frame."""
     head = read_head(metadata())
     head.azimuth_rad[2], head.altitude_rad[2] = np.radians([3.2, -9.0])
     row = np.zeros(1, dtype=RETURN_DTYPE)
@@ -460,7 +460,7 @@ def test_imu_packets_of_another_head_are_counted() -> None:
 
 
 def test_encoder_counts_of_another_mode_are_refused() -> None:
-    """LEGACY packets say the encoder: metadata of another number of columns is found out by it."""
+    """LEGACY packets contain the encoder, which reveals metadata with another number of columns."""
     units = frames_of(parser_of(metadata("LEGACY", columns=512)).layout, 10)
     parser = parser_of(metadata("LEGACY", columns=1024))
     feed(parser, units)

@@ -46,7 +46,7 @@ def column_values(layout: LidarLayout, columns: StructArray) -> Iterator[tuple[s
 
 @pytest.mark.parametrize("capture", DIGESTED)
 def test_packet_fields_match_the_manufacturers_digests(capture: str) -> None:
-    """Its digest of each field through all packets, each packet beam by beam."""
+    """The manufacturer's digest covers each field through all packets, each packet beam by beam."""
     digests = json.loads((FIXTURES / f"{capture}_digest.json").read_text())["packet_hash"]
     layout, packets = lidar_packets(capture)
     dtypes = {"TIMESTAMP": "u8", "MEASUREMENT_ID": "u2", "STATUS": "i4", "ENCODER_COUNT": "u4"}
@@ -61,7 +61,7 @@ def test_packet_fields_match_the_manufacturers_digests(capture: str) -> None:
 
 @pytest.mark.parametrize("capture", DIGESTED)
 def test_frame_fields_match_the_manufacturers_digests(capture: str) -> None:
-    """Compare the image of each field, its pixels staggered as sent, and the values of each column."""
+    """The image of each field is compared, its pixels staggered as sent, and the values of each column."""
     [digests] = json.loads((FIXTURES / f"{capture}_digest.json").read_text())["scans"]
     layout, packets = lidar_packets(capture)
     assert set(layout.frame_id(packets).tolist()) == {int(digests["FRAME_ID"])}
@@ -89,7 +89,7 @@ def test_a_single_packet_gives_its_part_of_the_frame() -> None:
 
 
 def test_the_manufacturers_poses_align_successive_frames() -> None:
-    """Its poses (rows of 3 × 4, in the sensor's frame) bring the second and the third frame nearer to the first."""
+    """The manufacturer's poses (rows of 3 × 4, in the sensor's frame) bring the later frames nearer to the first."""
     parser = recorded(THREE)
     rows = returns_of(feed(parser, payloads(THREE)))
     points = beam_points(rows, parser.head)
@@ -115,7 +115,7 @@ def test_the_manufacturers_poses_align_successive_frames() -> None:
 @pytest.mark.parametrize("capture", ["VLI-16-one-packet.pcap.gz", "empty_pcap.pcap"])
 @pytest.mark.parametrize("protocol", ["ouster", "velodyne-vlp16"])
 def test_a_foreign_datagram_is_counted_and_gives_no_returns(capture: str, protocol: str) -> None:
-    """One of 1212 bytes to Velodyne's port, of a head that is like a VLP-16, and a capture of nothing."""
+    """One capture has 1212 bytes to Velodyne's port, of a head similar to a VLP-16; the other is empty."""
     units = [unit.data for unit in read_pcap(FIXTURES.parent / "captures" / capture)]
     assert [len(unit) for unit in units] == ([1212] if capture.startswith("VLI") else [])
     parser = find_driver("scanner", protocol).make_parser(

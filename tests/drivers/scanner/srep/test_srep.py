@@ -74,7 +74,7 @@ def assert_as_reference(rows: StructArray, datagrams: list[bytes], mirror_factor
 
 
 def test_test_vector_is_decoded_as_the_protocol_page_states() -> None:
-    """The sentence before the vector calls the id 42 and pps_count 3; the bytes, by the page's table, the reverse."""
+    """The sentence before the vector has id 42 and pps_count 3; the bytes, by the page's table, have the reverse."""
     records = feed_all(make_parser(), [TEST_VECTOR])
     rows = returns_of(records)
     np.testing.assert_allclose(rows["range_m"], [912.3456, 925.0, 913.0001], atol=1e-9)
@@ -149,7 +149,7 @@ def test_a_recording_passes_the_common_driver_checks() -> None:
 
 
 def test_strided_rows_of_a_log_chunk_are_read() -> None:
-    """Rows lie in the log with a message header before each: a view, not a copy."""
+    """Rows in the log have a message header before each, so they are a view, not a copy."""
     datagrams = [d for d in scan_lines() if len(d) == datagram_bytes(64, 2)]
     table = np.zeros((len(datagrams), 31 + len(datagrams[0])), dtype=np.uint8)
     table[:, 31:] = np.frombuffer(b"".join(datagrams), dtype=np.uint8).reshape(len(datagrams), -1)
@@ -226,7 +226,7 @@ def test_truncated_datagrams_are_counted() -> None:
 
 
 def with_bytes(at: int, new: bytes) -> bytes:
-    """The test vector with bytes replaced and its CRC made right again."""
+    """Return the test vector with bytes replaced and its CRC corrected."""
     data = TEST_VECTOR[:at] + new + TEST_VECTOR[at + len(new) : -4]
     return data + struct.pack("<I", zlib.crc32(data))
 
@@ -274,7 +274,7 @@ def test_gaps_late_and_repeated_datagrams_are_distinguished() -> None:
 
 @pytest.mark.parametrize("cut", [1, 3, 100])
 def test_repeated_and_reordered_datagrams_give_each_pulse_once_in_time_order(cut: int) -> None:
-    """Neighbours swapped throughout, every fifth datagram again five places later; 70 ms apart."""
+    """Neighbours are swapped throughout, every fifth datagram comes again five places later; they are 70 ms apart."""
     order = [number ^ 1 for number in range(200)]
     for at in range(195, -1, -5):
         order.insert(at + 5, order[at])
@@ -304,7 +304,7 @@ def test_restart_begins_a_segment_without_a_gap(cut: int) -> None:
 @pytest.mark.parametrize("before", [1, 2, 40, 64, 66])
 @pytest.mark.parametrize("off_s", [1.5, 10.0])
 def test_an_early_scanner_restart_is_not_taken_for_repeated_datagrams(before: int, off_s: float) -> None:
-    """Its second beginning has the numbers and the times of its first; only when they come is another."""
+    """The second beginning has the numbers and times of the first; only the arrival differs."""
     datagrams = [*(line(at, 1000 * at + 10) for at in range(before)), *(line(at, 1000 * at) for at in range(100))]
     host_s = [*(at * 1e-4 for at in range(before)), *(off_s + at * 1e-4 for at in range(100))]
     units = np.frombuffer(b"".join(datagrams), dtype=np.uint8).reshape(len(datagrams), -1)
@@ -315,7 +315,7 @@ def test_an_early_scanner_restart_is_not_taken_for_repeated_datagrams(before: in
 
 
 def test_datagrams_of_equal_length_and_different_layout_share_a_batch() -> None:
-    """N = 2, R = 2 and N = 3, R = 1 are both 100 bytes; tick rates differ too."""
+    """N = 2, R = 2 and N = 3, R = 1 both have 100 bytes; tick rates differ too."""
     other = encode_datagram(
         SrepHeader(8, tick_hz=3, first_ticks=1000, pps_count=3), [0, 1, 2], [1, 2, 3], [[5], [0], [7]]
     )
@@ -342,7 +342,7 @@ def test_counters_of_64_bits_are_exact(tick_hz: int, first_ticks: int) -> None:
 
 
 def test_polygon_facets_are_derived_from_the_shaft_angle() -> None:
-    """Four facets of 90° shaft: beam angle 0 in a facet's middle, ±90° at its edges, facet by facet, both ways."""
+    """Four facets take 90° of shaft each: beam angle 0 in the middle, ±90° at the edges, in both directions."""
     counts = 3600
     shaft_deg = np.array([45.0, 0.0, 89.9, 90.0, 135.0, 315.0, 359.9, 360.0, 405.0, -0.1, -45.0, -90.0])
     encoder = np.rint(shaft_deg * 10).astype(np.int32)

@@ -28,7 +28,7 @@ STEP_NS = 7_000_000  # between datagrams, of host time
 
 
 class Reader:
-    """Parser with everything that it gave."""
+    """A parser with everything that it returned."""
 
     def __init__(self, *, compiled: bool = False, emissions: bool = False, clock_only: bool = False) -> None:
         settings = DeviceSettings(SOURCE, {"mirror_factor": 2.0, "geometry": POLYGON}, compiled=compiled)
@@ -44,7 +44,7 @@ class Reader:
         return self
 
     def together(self, datagrams: list[bytes], cuts: random.Random, longest: int) -> Reader:
-        """At most ``longest`` at once, in batches of equal length of which some are cut, as the log hands them over."""
+        """Feed at most ``longest`` datagrams at once, in batches of equal length, some of them cut, as from the log."""
         held: list[ChunkBatch] = []
         left = cuts.randint(1, longest)
         at = 0
@@ -152,7 +152,7 @@ def test_any_mix_gives_the_rows_of_its_single_datagrams(seed: int, longest: int)
 
 
 def test_the_mix_contains_every_kind_of_error() -> None:
-    """Else the test above would show little."""
+    """Otherwise the previous test would prove little."""
     counters = Reader().one_by_one(mixed(0) + mixed(1)).parser.counters
     assert {"bad_length", "bad_magic", "bad_version", "bad_header"} < set(counters.errors)
     assert {"sequence_gap", "out_of_order", "duplicate", "restart"} < set(counters.errors)
@@ -189,7 +189,7 @@ def test_pieces_of_a_mix_have_at_most_the_working_number_of_slots(monkeypatch: p
 
 
 def test_a_mix_of_one_layout_is_one_piece() -> None:
-    """However many lengths there are, and with datagrams of no pulse, nor encoder, between."""
+    """This holds for any number of lengths, and with datagrams without pulses or encoder between."""
     ranges = [np.full((pulses, 2), 5) for pulses in (3, 0, 1, 2, 0, 7)]
     units = [
         encode_datagram(SrepHeader(at, encoder_counts=100 if len(r) else 0), range(len(r)), 0, r)

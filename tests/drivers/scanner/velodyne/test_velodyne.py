@@ -200,7 +200,7 @@ def test_lost_packets_are_counted_by_their_timestamps() -> None:
 
 @pytest.mark.parametrize("cut", [1, 7, 1000])
 def test_late_and_repeated_packets_are_not_jumps(cut: int) -> None:
-    """Neighbours swapped in one place, a packet four places late in another, copies three places later."""
+    """Neighbours are swapped once, a packet comes four places late, and copies come three places later."""
     units = recording()[:200]
     units[20], units[21] = units[21], units[20]
     units.insert(64, units.pop(60))
@@ -236,7 +236,7 @@ def decode(unit: bytes) -> StructArray:
 
 
 def test_firing_times_follow_figure_9_9_of_the_manual() -> None:
-    """Single return: block b, sequence s, laser k fires at 110.592 b + 55.296 s + 2.304 k µs."""
+    """In single return, block b, sequence s, laser k fires at 110.592 b + 55.296 s + 2.304 k µs."""
     times = decode(packet(stamp_us=2_000))["device_time_ns"].reshape(12, 2, 16) - 2_000_000
     for block, sequence, laser, want_us in [
         (0, 0, 0, 0.0),
@@ -255,7 +255,7 @@ def test_a_dual_return_block_advances_half_as_far() -> None:
 
 
 def test_azimuth_is_advanced_to_each_firing() -> None:
-    """Section 9.5, across 0° and with the last block turned on as fast as the one before."""
+    """Section 9.5 gives the rule; the azimuths cross 0°, and the last block turns as fast as the previous one."""
     azimuth = [(35_900 + 20 * block) % 36_000 for block in range(12)]
     rows = decode(packet(azimuth=azimuth))
     want = 359.0 + 0.2 * rows["device_time_ns"] / 110_592
@@ -265,7 +265,7 @@ def test_azimuth_is_advanced_to_each_firing() -> None:
 
 
 def test_an_azimuth_of_360_degrees_is_north() -> None:
-    """PointCloudLibrary/pcl #20: "the rotation angle returned from the HDL might be 36000 (instead of 0)"."""
+    """See PointCloudLibrary/pcl #20: "the rotation angle returned from the HDL might be 36000 (instead of 0)"."""
     azimuth = [(35_900 + 20 * block) % 36_000 for block in range(12)]
     full, zero = decode(packet(azimuth=[each or 36_000 for each in azimuth])), decode(packet(azimuth=azimuth))
     assert len(full) == 12 * 32
@@ -297,7 +297,7 @@ def test_the_hour_wrap_is_not_a_gap_and_a_clock_step_is_a_jump() -> None:
 
 
 def test_beam_points_match_the_formula_sheet() -> None:
-    """FORMULAS 2.2: 50 m at azimuth 123° and elevation −9° without the vertical correction of its laser (8.1 mm)."""
+    """FORMULAS 2.2 has 50 m at azimuth 123° and elevation −9°, without its laser's vertical correction (8.1 mm)."""
     rows = decode(packet())[:1].copy()
     rows["channel"], rows["encoder_rad"], rows["range_m"] = 6, np.radians(123.0), 50.0
     assert VLP16.beams.elevation_deg[6] == -9.0
@@ -403,7 +403,7 @@ def positions(*said: tuple[int, int, str]) -> tuple[VelodyneParser, list[Record]
 
 
 def test_a_repeated_sentence_does_not_name_the_second_again() -> None:
-    """The packet after an edge still repeats the sentence before it: only a new sentence speaks."""
+    """The packet after an edge still repeats the previous sentence; only a new sentence counts."""
     parser, records = positions(
         (1_000_200_000, 2, rmc("081639.00")),  # stale: the clock stands in second 40
         (1_000_300_000, 2, rmc("081640.00")),
@@ -433,7 +433,7 @@ def test_a_receiver_with_status_void_gives_an_invalid_time() -> None:
 
 
 def test_a_date_one_rollover_behind_is_corrected_and_an_older_one_is_invalid() -> None:
-    """What pucks said on 2019-04-07, when the 10-bit week had begun anew: 1999-08-22, 1024 weeks before."""
+    """On 2019-04-07, when the 10-bit week restarted, pucks sent 1999-08-22, which is 1024 weeks earlier."""
     parser, host_ns = make_parser(), int(dt.datetime(2019, 4, 7, tzinfo=dt.UTC).timestamp()) * 10**9
     said = [(1_000_200_000, rmc("081640.00", date="220899")), (1_001_200_000, rmc("081641.00", date="210898"))]
     units = [encode_position_packet(stamp_us, 2, sentence) for stamp_us, sentence in said]
@@ -461,7 +461,7 @@ def test_damaged_sentences_are_counted_once() -> None:
 
 
 def test_a_counter_beyond_the_hour_is_taken_modulo_the_hour() -> None:
-    """As the data packets' are: lock and sentence count, and the sentence is that of the second the clock stands in."""
+    """Lock and sentence count, and the sentence is that of the second in which the clock stands, as in data packets."""
     parser, records = positions((3_600_000_000 + 500_200_000, 2, rmc("080820.00")))
     assert not parser.counters.errors
     (message,) = [r for r in records if isinstance(r, TimeMessage)]

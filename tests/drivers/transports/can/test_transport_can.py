@@ -37,7 +37,7 @@ def free_port() -> int:
 
 
 def collect(transport: Transport, count: int) -> list[UnitBlock]:
-    """Blocks until ``count`` units came or 5 s were silent."""
+    """Return blocks until ``count`` units came or 5 s were silent."""
     blocks: list[UnitBlock] = []
     while sum(len(block.units) for block in blocks) < count:
         more = transport.receive(5.0)
@@ -205,7 +205,7 @@ def test_received_and_lost_counts_equal_the_frames_sent(bus: can.BusABC, port: i
 
 
 class SlcanAdapter:
-    """The far end of an slcan line: a pty that speaks as the adapter does."""
+    """The far end of an slcan line: a pty that answers as the adapter does."""
 
     def __init__(self) -> None:
         self.master, slave = os.openpty()
@@ -393,7 +393,7 @@ def test_socketcan_counts_error_frames_and_bus_off() -> None:
 
 
 def test_frame_slots_of_the_reader_keep_classic_and_fd_apart() -> None:
-    """SocketCAN's reading is UDP's with slots of 72 bytes and no sender; a datagram pair stands in for the bus."""
+    """SocketCAN is read like UDP with slots of 72 bytes and no sender; a datagram pair stands in for the bus."""
     near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
     ask_stamps(near)
     reader = MessageReader(72, 256, peers=False)
@@ -417,7 +417,7 @@ def attribute(kind: int, value: bytes) -> bytes:
 
 
 def link_message(info: bytes) -> bytes:
-    """An RTM_NEWLINK as the kernel sends it: header, ifinfomsg, name, link info."""
+    """Return an RTM_NEWLINK as the kernel sends it: header, ifinfomsg, name, link info."""
     body = struct.pack("=BxHiII", 0, 280, 4, 0, 0) + attribute(3, b"can0\0") + attribute(18, info)
     return struct.pack("=IHHII", 16 + len(body), 16, 0, 1, 0) + body
 
@@ -478,7 +478,7 @@ def test_a_closed_gateway_is_detected_and_reopened() -> None:
 
 
 def test_a_gateway_with_a_single_client_is_retried_until_it_is_free() -> None:
-    """It may take a while to notice that a client has gone, and turns the next one away meanwhile."""
+    """The gateway may take a while to notice that a client has gone, and refuses the next one meanwhile."""
     with socket.create_server(("127.0.0.1", 0)) as gateway:
 
         def serve() -> None:

@@ -39,7 +39,7 @@ def edge(number: int, polarity: str = "assert") -> RawEdge:
 
 
 def collect(source: PpsSource, count: int) -> list[RawEdge]:
-    """Edges until ``count`` came or 5 s were silent."""
+    """Return edges until ``count`` came or 5 s were silent."""
     edges: list[RawEdge] = []
     while len(edges) < count:
         more = source.receive(5.0)
@@ -214,7 +214,7 @@ def test_error_on_opening_gives_the_reason(source: PpsSource, says: str) -> None
 
 
 def test_error_for_an_unreadable_device_names_the_udev_rule(monkeypatch: pytest.MonkeyPatch) -> None:
-    """root may open anything, so the refusal itself is stood in for; the wording is what is tested."""
+    """root may open anything, so the refusal is simulated; the wording is what is tested."""
 
     def refuse(*_: object) -> int:
         raise PermissionError(13, "Permission denied")
@@ -240,7 +240,7 @@ def test_a_kernel_source_that_vanishes_or_is_replaced_raises_a_transport_error(
     device = tmp_path / "pps0"
 
     def silent(fd: int, request: int, argument: bytes) -> bytes:
-        """An ioctl of a source that has had one edge and no more; it goes on so when the source is unregistered."""
+        """Answer an ioctl as a source that has had one edge and no more, and remains so when it is unregistered."""
         if request == PPS_FETCH and FETCH_DATA.unpack(argument)[9:11] != (0, 0):
             raise TimeoutError
         values = {
@@ -265,7 +265,7 @@ def test_a_kernel_source_that_vanishes_or_is_replaced_raises_a_transport_error(
 
 
 def test_ioctl_numbers_and_layouts_match_the_kernel_header() -> None:
-    """<linux/pps.h> on a 64-bit machine, as printed by a C program that includes it."""
+    """The numbers were printed by a C program with <linux/pps.h> on a 64-bit machine."""
     assert struct.calcsize("@P") == 8
     assert (PPS_GETPARAMS, PPS_SETPARAMS, PPS_GETCAP, PPS_FETCH) == (0x800870A1, 0x400870A2, 0x800870A3, 0xC00870A4)
     assert PARAMETERS.size == 40
@@ -273,7 +273,7 @@ def test_ioctl_numbers_and_layouts_match_the_kernel_header() -> None:
 
 
 def test_both_edges_are_read_from_the_kernel_structure() -> None:
-    """A struct pps_fdata laid out by hand, offset by offset."""
+    """The struct pps_fdata is laid out by hand, offset by offset."""
     answer = bytearray(64)
     struct.pack_into("<II", answer, 0, 17, 16)
     struct.pack_into("<qi", answer, 8, 1_763_704_800, 123_456_789)
