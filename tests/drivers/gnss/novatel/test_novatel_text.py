@@ -38,7 +38,10 @@ def parse(data: bytes) -> tuple[list[Record], NovatelParser]:
 
 
 def edie(name: str) -> bytes:
-    """The ASCII logs that NovAtel's own decoder wrote from a binary recording; it marks secondary antennas by _2."""
+    """Return the ASCII logs that NovAtel's own decoder wrote from a binary recording.
+
+    The decoder marks secondary antennas by _2.
+    """
     return gzip.decompress((FIXTURES / f"{name}.edie.ascii.gz").read_bytes())
 
 

@@ -363,7 +363,7 @@ def test_calibration_files_of_the_fixtures_are_read() -> None:
 
 
 def full_table(unit: str) -> bytes:
-    """One VLP-16 whose lasers are all that of FORMULAS 2.2's check, as YAML (rad, m) or as db.xml (°, cm)."""
+    """Return a VLP-16's table, each laser that of FORMULAS 2.2's check, as YAML (rad, m) or db.xml (°, cm)."""
     if unit == "yaml":
         laser = (
             "- {{laser_id: {}, rot_correction: 0.020943951023931952, vert_correction: -0.15707963267948966, "
