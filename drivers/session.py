@@ -190,6 +190,6 @@ def _sum(past: TransportCounters, present: TransportCounters) -> TransportCounte
     """Add up the counts; take the buffer sizes from ``present``."""
     total = TransportCounters()
     for item in fields(TransportCounters):
-        now: int = getattr(present, item.name)
+        now = getattr(present, item.name)  # a number, or a Counter, which adds up too
         setattr(total, item.name, now if item.name in _LATEST else now + getattr(past, item.name))
     return total

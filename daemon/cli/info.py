@@ -134,7 +134,8 @@ def _print_trouble(console: Console, numbers: dict[str, Any]) -> None:
     for source, values in numbers["sources"].items():
         if values["trouble"]:
             counts = ", ".join(f"{count:,} {key.replace('_', ' ')}" for key, count in values["trouble"].items())
-            console.print(f"[red]{_plain(source)}: {_plain(counts)}[/]", highlight=False)
+            senders = f"; refused senders: {values['refused_senders']}" if values["refused_senders"] else ""
+            console.print(f"[red]{_plain(source)}: {_plain(counts + senders)}[/]", highlight=False)
 
 
 def _row(source: str, values: dict[str, Any]) -> tuple[str, ...]:

@@ -267,7 +267,8 @@ def _check_wires(config: Config) -> Iterator[str]:
     for index, (key, spec) in enumerate(wires):
         for other_key, other in wires[:index]:
             if same_wire(spec, other):
-                yield f"{other_key} and {key}: both use {_wire_name(spec)}; give each its own"
+                hint = ", or tell their senders apart by ?source=<address>" if spec.kind == "udp" else ""
+                yield f"{other_key} and {key}: both use {_wire_name(spec)}; give each its own{hint}"
                 break
 
 
@@ -289,17 +290,26 @@ def same_wire(one: TransportSpec, other: TransportSpec) -> bool:
     """Return whether two transports would open the same port or device.
 
     UDP ports are the same if the port numbers are equal and the addresses (or groups) are equal or either is the
-    wildcard; devices, including a serial CAN adapter's, if their real paths are equal; a CAN bus if interface and
-    channel are equal.
+    wildcard, unless ``source`` tells their senders apart; devices, including a serial CAN adapter's, if their real
+    paths are equal; a CAN bus if interface and channel are equal.
     """
     if one.kind == "udp" and other.kind == "udp":
         addresses = {_udp_address(one), _udp_address(other)}
-        return one.port == other.port and (len(addresses) == 1 or WILDCARD in addresses)
+        overlap = one.port == other.port and (len(addresses) == 1 or WILDCARD in addresses)
+        return overlap and not _told_apart(one, other)
     path, other_path = _device_path(one), _device_path(other)
     if path is not None or other_path is not None:
         return path == other_path
     port, other_port = one.options.get("port"), other.options.get("port")  # set for a CAN bus over UDP
     return one.kind == other.kind and (one.address, port) == (other.address, other_port)
+
+
+def _told_apart(one: TransportSpec, other: TransportSpec) -> bool:
+    """Return whether two transports of a UDP port take different senders, from one socket or from those of a group."""
+    sources = {one.options.get("source"), other.options.get("source")}
+    groups = {one.options.get("group"), other.options.get("group")}
+    one_socket = (one.host, one.options.get("interface")) == (other.host, other.options.get("interface"))
+    return None not in sources and len(sources) == 2 and len(groups) == 1 and (None not in groups or one_socket)
 
 
 def _udp_address(spec: TransportSpec) -> str:

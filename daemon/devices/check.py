@@ -192,7 +192,7 @@ class Wire:
             if counters.refused:
                 what = "unreadable messages or lines; check the speed of the adapter"
                 if self._spec.kind == "udp":
-                    what = "datagrams from senders other than the configured source"
+                    what = f"datagrams from senders other than the configured source: {counters.refused_text()}"
                 report.notes.append(f"{counters.refused} {what}")
 
 

@@ -24,7 +24,7 @@ class SourceCount:
     last_unit_ns: int | None = None
     receive_buffer_bytes: int = 0
     state: str = "opening"
-    trouble: Mapping[str, int] = field(default_factory=dict)  # error counts of the wire itself, where not zero
+    trouble: Mapping[str, int | str] = field(default_factory=dict)  # error counts of the wire itself, where not zero
 
 
 @dataclass(frozen=True, slots=True)

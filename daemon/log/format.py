@@ -153,6 +153,7 @@ SCHEMAS: dict[str, bytes] = {
             "bus_off": "int",
             "line_errors": "int",
             "refused": "int",
+            "refused_senders": "str",
         },
     ),
     "swath.Event": _object(

@@ -21,6 +21,7 @@ USUAL_SHARE = 0.95  # intervals up to this quantile count as usual: those within
 GAP_MIN_NS = 1 << 27  # 0.134 s: a scanner whose laser is off still sends ten times a second
 MAX_MARKS = 10_000  # more than an operator sets in a flight; a foreign log may hold any number
 MAX_WORDS = 32
+MAX_SENDERS_TEXT = 100  # three addresses with their counts
 _ACCOUNT = ("units", "written", "lost_kernel", "lost_queue", "lost_write")
 _TROUBLE = ("bus_off", "error_frames", "line_errors", "refused")
 
@@ -111,6 +112,7 @@ class SourceNumbers:
             "gaps": self.intervals.gaps(),
             "lost": {key: _count(status, key) for key in _ACCOUNT[2:]},
             "trouble": {key: count for key in _TROUBLE if (count := _count(status, key))},
+            "refused_senders": str(status.get("refused_senders", ""))[:MAX_SENDERS_TEXT],
             "account_errors": self.account_errors + (self.miscounted if complete else 0),
             "state": status.get("state"),
             "has_status": self.status is not None,

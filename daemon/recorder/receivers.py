@@ -76,22 +76,25 @@ class WireTrouble:
         self._reported: dict[str, int] = {}
         self._reported_s: dict[str, float] = {}
 
-    def look(self, counters: TransportCounters) -> dict[str, int]:
-        """Report counters that have grown, and return all that are not zero."""
-        counts: dict[str, int] = {}
+    def look(self, counters: TransportCounters) -> dict[str, int | str]:
+        """Report counters that have grown; return all that are not zero, and the most frequent senders refused."""
+        found: dict[str, int | str] = {}
+        senders = counters.refused_text()
         for kind in _KINDS:
             count: int = getattr(counters, kind.counter)
             if count:
-                counts[kind.counter] = count
-                self._tell(kind, count)
-        return counts
+                found[kind.counter] = count
+                self._tell(kind, count, f"; most of {senders}" if senders and kind.counter == "refused" else "")
+        if senders:
+            found["refused_senders"] = senders
+        return found
 
-    def _tell(self, kind: _Kind, count: int) -> None:
+    def _tell(self, kind: _Kind, count: int, more: str) -> None:
         now_s = self._monotonic_s()
         grown = count - self._reported.get(kind.counter, 0)
         if grown > 0 and now_s - self._reported_s.get(kind.counter, -REPORT_AGAIN_S) >= REPORT_AGAIN_S:
             self._reported[kind.counter], self._reported_s[kind.counter] = count, now_s
-            self._events.post(kind.severity, self._source, kind.code, f"{grown} {kind.text}")
+            self._events.post(kind.severity, self._source, kind.code, f"{grown} {kind.text}{more}")
 
 
 WAIT_S = 0.2  # a receive thread returns from its wait at least this often
@@ -114,7 +117,7 @@ class _Account:
     receive_buffer_bytes: int = 0
     state: str = "opening"
     ambiguous: int = 0
-    trouble: dict[str, int] = field(default_factory=dict)
+    trouble: dict[str, int | str] = field(default_factory=dict)
 
     def snapshot(self) -> SourceCount:
         return SourceCount(

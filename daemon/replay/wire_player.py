@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import array
+import contextlib
 import fcntl
 import os
 import select
@@ -175,6 +176,9 @@ class UdpOutput(Output):
         host = group or ("127.0.0.1" if spec.host in ("0.0.0.0", "") else spec.host)
         self._address = (host, spec.port)
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        if source := spec.options.get("source"):
+            with contextlib.suppress(OSError):  # the one sender that is accepted may be this computer
+                self._socket.bind((source, 0))
         if group:
             self._socket.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_LOOP, 1)
 

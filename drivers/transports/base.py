@@ -10,11 +10,14 @@ from __future__ import annotations
 import errno
 import termios
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from collections import Counter
+from dataclasses import dataclass, field
 
 from swath.georef.arrays import Int64Array
 from swath.georef.records import ByteRows
 
+MOST_SENDERS = 256  # that are counted by name; a port scanner must not fill the memory
+SENDERS_SHOWN = 3
 HEAD_ROOM_BYTES = 31  # size of a message's header in the log: opcode, length, channel, sequence, two times (MCAP)
 
 
@@ -61,6 +64,7 @@ class TransportCounters:
         error_frames, bus_off: error frames of the CAN controller, and those that report bus-off.
         receive_buffer_asked_bytes: requested size; if it exceeds the granted one, the system's limit is lower.
         refused: arrivals that are not units: datagrams of other senders, unreadable lines or messages.
+        refused_senders: of the refused datagrams, by address.
         line_errors: framing, parity and overrun errors of a serial line; bytes, not units, are missing or wrong.
     """
 
@@ -71,6 +75,17 @@ class TransportCounters:
     receive_buffer_asked_bytes: int = 0
     refused: int = 0
     line_errors: int = 0
+    refused_senders: Counter[str] = field(default_factory=Counter)
+
+    def refuse(self, sender: str, units: int) -> None:
+        """Count units of another sender; beyond `MOST_SENDERS` of them, without its name."""
+        self.refused += units
+        known = sender in self.refused_senders or len(self.refused_senders) < MOST_SENDERS
+        self.refused_senders[sender if known else "others"] += units
+
+    def refused_text(self) -> str:
+        """Return the most frequent of the senders that were refused, as ``192.168.1.7 (12), …``; "" without any."""
+        return ", ".join(f"{sender} ({count})" for sender, count in self.refused_senders.most_common(SENDERS_SHOWN))
 
 
 class Transport(ABC):

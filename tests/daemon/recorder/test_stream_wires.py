@@ -23,10 +23,11 @@ from swath.drivers.transports.opening import open_transport
 from swath.drivers.transports.spec import TransportSpec, parse_transport
 from swath.georef.records import Chunk
 from tests.daemon.builders import Pty, nmea_zda
+from tests.daemon.commands import swath
 from tests.daemon.log_check import read_log
 from tests.daemon.receivers import novatel_replies
-from tests.daemon.rig import Recorder, free_udp_port, session_table, wait_until
-from tests.daemon.wires import pty, tcp_server, udp_sender
+from tests.daemon.rig import Recorder, free_udp_port, one_processor, session_table, wait_until
+from tests.daemon.wires import pty, repeating, tcp_server, udp_sender
 from tests.fuzz.recordings import settings_of, streams_of
 
 STREAMS = [
@@ -71,7 +72,7 @@ def sending_end(wire: str, folder: Path, name: str) -> Iterator[tuple[str, Calla
                     peers.append(server.accept()[0])
                 peers[0].sendall(data)
 
-            yield f"tcp:127.0.0.1:{server.getsockname()[1]}", send
+            yield f"tcp:127.0.0.1:{server.getsockname()[1]}?silent_s=600", send
             for peer in peers:
                 peer.close()
 
@@ -185,3 +186,45 @@ def test_replay_serves_the_tcp_port_that_a_recorder_connects_to() -> None:
     reader.close()
     with pytest.raises(TransportError, match=r"give tcp:127\.0\.0\.1:<port> to replay"):
         TcpOutput(TransportSpec("tcp", "192.0.2.1:5000", {}, "tcp:192.0.2.1:5000"))
+
+
+def test_two_heads_on_one_port_are_two_sources_and_strangers_are_named(tmp_path: Path) -> None:
+    port, logs = free_udp_port(), tmp_path / "logs"
+    config = session_table(logs)
+    for head, name in ((2, "left"), (3, "right")):
+        transport = f"udp:0.0.0.0:{port}?source=127.0.0.{head}"
+        config += f'[scanner.{name}]\ntransport = "{transport}"\nprotocol = "srep"\nmirror_factor = 1.0\n'
+    sent = {"scanner/left": 2, "scanner/right": 3, "a": 4, "b": 5, "c": 6, "d": 7}
+
+    def send(number: int) -> None:
+        for name, last in sent.items():
+            sender = senders[name]
+            if name.startswith("scanner") or number % last == 0:  # the stranger at 127.0.0.7 comes least
+                sender.sendto(b"%s %d" % (name.encode(), number), ("127.0.0.1", port))
+
+    with ExitStack() as stack:
+        senders = {}
+        for name, last in sent.items():
+            senders[name] = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+            senders[name].bind((f"127.0.0.{last}", 0))
+        with Recorder(tmp_path / "rig", config) as recorder:
+            recorder.wait_said("device_opened", times=2)
+            with one_processor():
+                for number in range(420):
+                    send(number)
+            recorder.wait_said("units_refused")
+            assert recorder.stop() == 0, recorder.stderr()
+        with repeating(send):
+            found = check_everything(parse_config(config, tmp_path / "swath.toml"), 1.0)
+    content = read_log(logs)
+    for name in ("scanner/left", "scanner/right"):
+        assert [data for _, data in content.units[name]] == [b"%s %d" % (name.encode(), n) for n in range(420)]
+    last = [content.messages[f"/status/{name}"][-1][1] for name in ("scanner/left", "scanner/right")]
+    (refusing,) = [status for status in last if "refused" in status]
+    assert refusing["refused"] == 105 + 84 + 70 + 60
+    assert refusing["refused_senders"] == "127.0.0.4 (105), 127.0.0.5 (84), 127.0.0.6 (70)"
+    assert "; most of 127.0.0." in content.events("units_refused")[0]["text"]
+    assert "refused senders: 127.0.0.4 (105), 127.0.0.5 (84), 127.0.0.6 (70)" in swath("info", str(logs)).stdout
+    (note,) = [note for report in found for note in report.notes if "senders other than" in note]
+    assert "127.0.0.4 (" in note
+    assert all(report.units > 5 for report in found[:2])

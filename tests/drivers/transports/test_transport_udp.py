@@ -9,6 +9,7 @@ import struct
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -250,6 +251,87 @@ def test_only_datagrams_of_the_multicast_group_are_received(sender: socket.socke
     udp.close()
 
 
+@contextmanager
+def sender_at(address: str) -> Iterator[socket.socket]:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.bind((address, 0))
+        yield sock
+
+
+def test_two_senders_to_one_port_are_two_transports_on_one_socket() -> None:
+    """Two heads and a stranger, interleaved: each unit is at its head, the stranger is counted once and named."""
+    port = free_port()
+    left, right = (transport(f"?source=127.0.0.{head}", port=port) for head in (2, 3))
+    left.open()
+    right.open()
+    with sender_at("127.0.0.2") as one, sender_at("127.0.0.3") as two, sender_at("127.0.0.4") as stranger:
+        found: dict[str, list[bytes]] = {"left": [], "right": []}
+
+        def read(name: str, udp: UdpTransport) -> None:
+            while len(found[name]) < 500 and (blocks := udp.receive(5.0)):
+                assert {block.peer[0] for block in blocks if block.peer} == {udp._source}
+                assert all(block.kernel_realtime_ns is not None for block in blocks)
+                found[name] += payloads(blocks)
+
+        threads = [threading.Thread(target=read, args=item) for item in (("left", left), ("right", right))]
+        for thread in threads:
+            thread.start()
+        for number in range(500):
+            one.sendto(b"left %d" % number, ("127.0.0.1", port))
+            two.sendto(b"right %d" % number, ("127.0.0.1", port))
+            if number % 10 == 0:
+                stranger.sendto(b"x", ("127.0.0.1", port))
+        for thread in threads:
+            thread.join()
+        assert found["left"] == [b"left %d" % number for number in range(500)]
+        assert found["right"] == [b"right %d" % number for number in range(500)]
+        counters = left.poll_counters(), right.poll_counters()
+        assert sum(one.refused for one in counters) == 50
+        assert [one.refused_text() for one in counters] == ["127.0.0.4 (50)", ""]
+        left.close()
+        two.sendto(b"still here", ("127.0.0.1", port))
+        assert payloads(collect(right, 1)) == [b"still here"]
+        left.open()
+        one.sendto(b"again", ("127.0.0.1", port))
+        assert payloads(collect(left, 1)) == [b"again"]
+        left.close()
+        right.close()
+    alone = transport(port=port)  # nobody holds the port any more
+    alone.open()
+    alone.close()
+
+
+def test_drops_of_a_shared_port_are_counted_once() -> None:
+    port = free_port()
+    left, right = (transport(f"?source=127.0.0.{head}&buffer_mb=1", port=port) for head in (2, 3))
+    left.open()
+    right.open()
+    with sender_at("127.0.0.2") as one, sender_at("127.0.0.3") as two:
+        for _ in range(3000):
+            one.sendto(bytes(1206), ("127.0.0.1", port))
+            two.sendto(bytes(1206), ("127.0.0.1", port))
+        units = 0
+        while blocks := left.receive(0.2) + right.receive(0.0):
+            units += sum(len(block.units) for block in blocks)
+        lost = [udp.poll_counters().lost_kernel for udp in (left, right)]
+        assert (units + sum(lost), lost[1]) == (6000, 0)
+        assert lost[0] > 0
+        left.close()
+        assert right.poll_counters().lost_kernel == 0  # those of the port before stay with the one that counted them
+        right.close()
+
+
+def test_one_sender_has_one_transport() -> None:
+    port = free_port()
+    first, second = (transport("?source=127.0.0.2", port=port) for _ in range(2))
+    first.open()
+    with pytest.raises(TransportError, match=f"port {port} is in use by this program itself"):
+        second.open()
+    first.close()
+    second.open()
+    second.close()
+
+
 @pytest.mark.parametrize("index", [99, None])
 def test_a_replaced_interface_raises_a_transport_error(monkeypatch: pytest.MonkeyPatch, index: int | None) -> None:
     """An adapter that fell off its bus and came back would leave the socket silent without an error."""
@@ -264,7 +346,8 @@ def test_a_replaced_interface_raises_a_transport_error(monkeypatch: pytest.Monke
         return index
 
     monkeypatch.setattr(socket, "if_nametoindex", now)
-    udp._looked_s = 0.0
+    assert udp._port is not None
+    udp._port._looked_s = 0.0
     with pytest.raises(TransportError, match="network interface lo has gone or was replaced"):
         udp.receive(0.05)
     udp.close()
@@ -273,7 +356,8 @@ def test_a_replaced_interface_raises_a_transport_error(monkeypatch: pytest.Monke
 def test_a_multicast_group_is_still_received_after_a_silence() -> None:
     udp = transport(f"?group={GROUP}")
     udp.open()
-    udp._looked_s = 0.0
+    assert udp._port is not None
+    udp._port._looked_s = 0.0
     assert udp.receive(0.05) == []
     with multicast_sender("127.0.0.1") as scanner:
         scanner.sendto(b"group", (GROUP, port_of(udp)))
