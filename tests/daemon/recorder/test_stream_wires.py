@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import array
+import fcntl
 import socket
+import termios
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -56,7 +59,13 @@ def sending_end(wire: str, folder: Path, name: str) -> Iterator[tuple[str, Calla
     """Provide the device's end of a wire: the transport that reaches it, and the function that sends on it."""
     if wire == "serial":
         line = Pty(folder / name)
-        yield f"serial:{folder / name}", line.write
+
+        def write(data: bytes) -> None:
+            """Write a piece once the one before was read: a line has no end that a reader could wait for."""
+            wait_until(lambda: not _unread(line.slave), "the line is read", 60.0)
+            line.write(data)
+
+        yield f"serial:{folder / name}", write
         line.unplug()
     elif wire == "udp":
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
@@ -75,6 +84,12 @@ def sending_end(wire: str, folder: Path, name: str) -> Iterator[tuple[str, Calla
             yield f"tcp:127.0.0.1:{server.getsockname()[1]}?silent_s=600", send
             for peer in peers:
                 peer.close()
+
+
+def _unread(terminal: int) -> int:
+    waiting = array.array("i", [0])
+    fcntl.ioctl(terminal, termios.FIONREAD, waiting)
+    return waiting[0]
 
 
 def test_every_stream_is_recorded_and_read_over_every_wire(tmp_path: Path) -> None:
@@ -219,8 +234,8 @@ def test_two_heads_on_one_port_are_two_sources_and_strangers_are_named(tmp_path:
     content = read_log(logs)
     for name in ("scanner/left", "scanner/right"):
         assert [data for _, data in content.units[name]] == [b"%s %d" % (name.encode(), n) for n in range(420)]
-    last = [content.messages[f"/status/{name}"][-1][1] for name in ("scanner/left", "scanner/right")]
-    (refusing,) = [status for status in last if "refused" in status]
+    statuses = [content.messages[f"/status/{name}"][-1][1] for name in ("scanner/left", "scanner/right")]
+    (refusing,) = [status for status in statuses if "refused" in status]
     assert refusing["refused"] == 105 + 84 + 70 + 60
     assert refusing["refused_senders"] == "127.0.0.4 (105), 127.0.0.5 (84), 127.0.0.6 (70)"
     assert "; most of 127.0.0." in content.events("units_refused")[0]["text"]
