@@ -185,7 +185,7 @@ class ImuConfig(Section):
     )
     pps_event: Literal["A", "B", "C", "D", "E"] | None = Field(
         None,
-        description="sbg-ellipse: the Sync In input that PPS is wired to; its event message holds the latched counter",
+        description="sbg-ellipse, sbg-ecom: the Sync In that PPS is wired to; its event holds the latched counter",
     )
     rate_hz: float = Field(200.0, gt=0.0, le=100_000.0, description="nominal sample rate")
     rotation_b_imu: Matrix = Field(

@@ -13,6 +13,7 @@ from swath.drivers.framing import kinds as frame_kinds
 from swath.drivers.framing.checksums import crc16_ccitt, crc24q, crc32_novatel, nmea_xor, ubx_fletcher
 from swath.drivers.framing.framer import FrameKind, Framer
 from swath.drivers.imu.microstrain import wire as microstrain
+from swath.drivers.imu.sbg_ecom import wire as sbg_ecom
 from swath.drivers.imu.vectornav import wire as vectornav
 from swath.drivers.parser import ParserCounters
 from swath.drivers.scanner.hesai.models import QT128
@@ -21,7 +22,7 @@ from tests.fuzz.mutation import LARGEST_CASE_BYTES, bounds, damage
 
 KINDS: dict[str, FrameKind] = {
     kind.name: kind
-    for module in (frame_kinds, microstrain, vectornav)
+    for module in (frame_kinds, microstrain, sbg_ecom, vectornav)
     for kind in vars(module).values()
     if isinstance(kind, FrameKind)
 }
@@ -107,6 +108,11 @@ def _seal_mip(frame: bytes) -> bytes:
     return body + bytes(ubx_fletcher(body))
 
 
+def _seal_sbg_ecom(frame: bytes) -> bytes:
+    kind = frame[3] if frame[3:4] and frame[3] in sbg_ecom.CLASSES else 0
+    return sbg_ecom.encode_frame(frame[2] if frame[2:3] else 44, frame[6:-3][: sbg_ecom.MAX_DATA_BYTES], kind)
+
+
 SEALS: dict[str, Callable[[bytes], bytes]] = {
     "nmea": _seal_nmea,
     "ubx": _seal_ubx,
@@ -118,6 +124,7 @@ SEALS: dict[str, Callable[[bytes], bytes]] = {
     "sbf": _seal_sbf,
     "vectornav": _seal_vectornav,
     "mip": _seal_mip,
+    "sbg-ecom": _seal_sbg_ecom,
 }
 """Length and checksum of a frame made right, whatever is in it; by the name of its kind."""
 

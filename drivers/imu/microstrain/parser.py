@@ -16,17 +16,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from math import isfinite, nan, radians
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from swath.drivers.driver import STREAM_TRANSPORTS, Driver, receiver_inside
 from swath.drivers.framing.framer import Frame, Framer
 from swath.drivers.framing.kinds import NMEA
-from swath.drivers.gnss.date_floor import read_date_floor, week_of
 from swath.drivers.gnss.record_rows import Row, join_rows
 from swath.drivers.imu.microstrain.startup import startup_messages
 from swath.drivers.imu.microstrain.wire import FILTER, MIP, RECEIVERS, SENSOR, read_values
+from swath.drivers.imu.unit_time import WEEK_NS, Moment, UnitTime
 from swath.drivers.parser import DeviceSettings, StreamParser
 from swath.georef.records import (
     Chunk,
@@ -40,17 +40,12 @@ from swath.georef.records import (
     NamesEdge,
     Record,
     TimeMessage,
-    TimeScale,
-    TimeTag,
 )
 from swath.georef.timescales.gps_time import SECOND_NS
 
 Items: TypeAlias = list[Record | Row]
 Values: TypeAlias = dict[str, tuple[Any, ...]]
 
-WEEK_NS = 604_800 * SECOND_NS
-GREATEST_WEEK = 8191
-LATEST_IN_SECOND_NS = SECOND_NS // 2  # a packet later in its second may arrive in the next one
 STANDARD_GRAVITY = 9.80665
 # name of a time: its flags of a valid time of week and week
 TIMES = {"gps_time": 0x03, "sensor_time": 0x18, "filter_time": 0x01, "epoch": 0x03}
@@ -65,24 +60,10 @@ ANTENNAS = {"gnss": "primary", "gnss1": "primary", "gnss2": "secondary"}
 STATUS_SHIFT = 16  # status of a solution: the filter's state in the low bits, its flags above
 
 
-class Moment(NamedTuple):
-    """GPS time of a packet and whether it is valid."""
-
-    week: int
-    tow_ns: int
-    valid: bool
-
-    @property
-    def tag(self) -> TimeTag:
-        """The time as a tag."""
-        return TimeTag(TimeScale.GPS, self.tow_ns, week=self.week)
-
-
 @dataclass(slots=True)
 class _Latest:
     """The latest values of which only changes become records."""
 
-    second: tuple[int, int] | None = None
     fixes: dict[int, tuple[Any, ...]] = field(default_factory=dict)
     status: dict[int, tuple[Any, ...]] = field(default_factory=dict)
     reference_ns: int = -1
@@ -104,7 +85,7 @@ class MicrostrainParser(StreamParser):
         self._increments = settings.config.get("sample") == "increment"
         self._interval_s = 1.0 / float(settings.config.get("rate_hz") or nan)
         self._by_counter = settings.config.get("pps") is not None
-        self._floor_week = week_of(read_date_floor(settings))
+        self._time = UnitTime(settings, self.counters, "GpsTime")
         self._latest = _Latest()
 
     def feed(self, chunk: Chunk) -> list[Record]:
@@ -143,7 +124,7 @@ class MicrostrainParser(StreamParser):
         (trigger,) = values.get("event_source", (0,))
         if trigger:  # sent for an event, not in the rhythm of the samples
             return self._event(host_time_ns, moment, trigger)
-        items = self._time_message(host_time_ns, moment)
+        items: Items = [*self._time.name_second(host_time_ns, moment, self._latest.leap_seconds)]
         if descriptor_set == SENSOR:
             items += self._sample(host_time_ns, values, moment)
         elif descriptor_set == FILTER:
@@ -165,24 +146,9 @@ class MicrostrainParser(StreamParser):
         if name is None:
             return None
         tow_s, week, flags = values[name]
-        if not 0.0 <= tow_s < 604_800.0 or not 0 < week <= GREATEST_WEEK:
+        if not 0.0 <= tow_s < 604_800.0:
             return None
-        if week < self._floor_week:
-            self.counters.errors["date_before_floor"] += 1
-            return None
-        return Moment(week, round(tow_s * 1e9) % WEEK_NS, flags & TIMES[name] == TIMES[name])
-
-    def _time_message(self, host_time_ns: int, moment: Moment | None) -> Items:
-        """Return the second of the first packet in it; its edge is the one before the arrival."""
-        if moment is None or moment.tow_ns % SECOND_NS >= LATEST_IN_SECOND_NS:
-            return []
-        second = moment.week, moment.tow_ns // SECOND_NS
-        if second == self._latest.second:
-            return []
-        self._latest.second = second
-        leap = self._latest.leap_seconds
-        tag = TimeTag(TimeScale.GPS, second[1] * SECOND_NS, week=moment.week, leap_seconds=leap)
-        return [TimeMessage(host_time_ns, tag, NamesEdge.PREVIOUS, valid=moment.valid, message="GpsTime")]
+        return self._time.moment(week, round(tow_s * 1e9) % WEEK_NS, valid=flags & TIMES[name] == TIMES[name])
 
     def _event(self, host_time_ns: int, moment: Moment | None, trigger: int) -> Items:
         if moment is None:
@@ -254,7 +220,7 @@ class MicrostrainParser(StreamParser):
         state, _, flags = values.get("status", (0, 0, 0))
         row = (
             host_time_ns,
-            moment.week * WEEK_NS + moment.tow_ns,
+            moment.gps_ns,
             *(radians(position[0]), radians(position[1]), position[2]),
             _valid(values, "velocity") or unknown,
             *angles,

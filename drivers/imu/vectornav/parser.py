@@ -15,17 +15,18 @@ program INSTINCT of the University of Stuttgart decoded in them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from math import asin, atan2, isfinite, nan, radians
-from typing import Any, NamedTuple, TypeAlias
+from dataclasses import dataclass, field, replace
+from math import isfinite, nan, radians
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from swath.drivers.driver import STREAM_TRANSPORTS, Driver, receiver_inside
 from swath.drivers.framing.framer import Frame, Framer
 from swath.drivers.framing.kinds import NMEA
-from swath.drivers.gnss.date_floor import read_date_floor, week_of
 from swath.drivers.gnss.record_rows import Row, join_rows
+from swath.drivers.imu.attitude import angles_of
+from swath.drivers.imu.unit_time import WEEK_NS, Moment, UnitTime
 from swath.drivers.imu.vectornav.startup import startup_messages
 from swath.drivers.imu.vectornav.wire import RECEIVERS, VECTORNAV, read_values
 from swath.drivers.parser import DeviceSettings, StreamParser
@@ -40,17 +41,12 @@ from swath.georef.records import (
     NamesEdge,
     Record,
     TimeMessage,
-    TimeScale,
     TimeTag,
 )
-from swath.georef.timescales.gps_time import SECOND_NS
 
 Items: TypeAlias = list[Record | Row]
 Values: TypeAlias = dict[str, tuple[Any, ...]]
 
-WEEK_NS = 604_800 * SECOND_NS
-GREATEST_WEEK = 8191
-LATEST_IN_SECOND_NS = SECOND_NS // 2  # a message later in its second may arrive in the next one
 TIME_KNOWN = 0x03  # time status, receiver's time info: time of week and date; the next bit: UTC
 UTC_KNOWN = 0x04
 INS_MODE = 0x03
@@ -73,19 +69,10 @@ ANTENNAS = {"gnss1": "primary", "gnss2": "secondary", "gnss3": "gnss3"}
 MEASURED = (("uncomp_accel", "uncomp_gyro"), ("accel", "angular_rate"))
 
 
-class Moment(NamedTuple):
-    """GPS time of a message and whether the device vouches for it."""
-
-    week: int
-    tow_ns: int
-    vouched: bool
-
-
 @dataclass(slots=True)
 class _Epochs:
     """The latest values of which only changes become records."""
 
-    second: tuple[int, int] | None = None
     fixes: dict[str, tuple[Any, ...]] = field(default_factory=dict)
     status: tuple[Any, ...] = ()
     startup_ns: int = 0
@@ -107,7 +94,7 @@ class VectornavParser(StreamParser):
         self._wanted = wanted
         self._increments = settings.config.get("sample") == "increment"
         self._by_counter = settings.config.get("pps") is not None
-        self._floor_week = week_of(read_date_floor(settings))
+        self._time = UnitTime(settings, self.counters, "TimeGps")
         self._latest = _Epochs()
         self._compensated = False
 
@@ -146,7 +133,7 @@ class VectornavParser(StreamParser):
 
     def _decode(self, host_time_ns: int, values: Values) -> Items:
         moment = self._moment(values)
-        items = self._time_message(host_time_ns, moment)
+        items: Items = [*self._time.name_second(host_time_ns, moment, self._latest.leap_seconds)]
         if self._wanted == (TimeMessage,):
             return items
         for receiver in RECEIVERS.values():
@@ -173,26 +160,10 @@ class VectornavParser(StreamParser):
             week, tow_ns = divmod(values["time_gps"][0], WEEK_NS)
         else:
             return None
-        if tow_ns >= WEEK_NS or not 0 < week <= GREATEST_WEEK:
-            return None
-        if week < self._floor_week:
-            self.counters.errors["date_before_floor"] += 1
-            return None
         status, leap_seconds = values.get("gnss1.time_info", (0, 0))
         if status & UTC_KNOWN:
             self._latest.leap_seconds = leap_seconds
-        return Moment(week, tow_ns, _vouched(values))
-
-    def _time_message(self, host_time_ns: int, moment: Moment | None) -> Items:
-        """Return the second of the first message in it; its edge is the one before the arrival."""
-        if moment is None or moment.tow_ns % SECOND_NS >= LATEST_IN_SECOND_NS:
-            return []
-        second = moment.week, moment.tow_ns // SECOND_NS
-        if second == self._latest.second:
-            return []
-        self._latest.second = second
-        tag = TimeTag(TimeScale.GPS, second[1] * SECOND_NS, week=moment.week, leap_seconds=self._latest.leap_seconds)
-        return [TimeMessage(host_time_ns, tag, NamesEdge.PREVIOUS, valid=moment.vouched, message="TimeGps")]
+        return self._time.moment(week, tow_ns, valid=_vouched(values))
 
     # --- samples ---
 
@@ -205,7 +176,7 @@ class VectornavParser(StreamParser):
             return self._count_bad("bad_value")
         startup_ns = values.get("time_startup", (-1,))[0]
         device_ns, pps_ns, week = -1, -1, -1
-        if moment is not None and moment.vouched and not self._by_counter:
+        if moment is not None and moment.valid and not self._by_counter:
             device_ns, week = moment.tow_ns, moment.week
         elif 0 <= startup_ns < 1 << 63:
             device_ns, pps_ns = startup_ns, latched_ns(startup_ns, values)
@@ -261,10 +232,11 @@ class VectornavParser(StreamParser):
 
     def _fix_time(self, receiver: str, values: Values) -> TimeTag | None:
         tow_ns, week = values.get(f"{receiver}.tow"), values.get(f"{receiver}.week")
-        if tow_ns is None or week is None or tow_ns[0] >= WEEK_NS or not self._floor_week <= week[0] <= GREATEST_WEEK:
+        moment = None if tow_ns is None or week is None else self._time.moment(week[0], tow_ns[0], valid=True)
+        if moment is None:
             return None
         status, leap = values.get(f"{receiver}.time_info", (0, 0))
-        return TimeTag(TimeScale.GPS, tow_ns[0], week=week[0], leap_seconds=leap if status & UTC_KNOWN else None)
+        return replace(moment.tag, leap_seconds=leap if status & UTC_KNOWN else None)
 
     def _solution(self, host_time_ns: int, values: Values, moment: Moment | None) -> Items:
         angles = attitude(values)
@@ -274,7 +246,7 @@ class VectornavParser(StreamParser):
         if "ins_status" in values and status & INS_MODE == NOT_TRACKING:
             self.counters.errors["ins_no_solution"] += 1
             return []
-        if moment is None or not moment.vouched:
+        if moment is None or not moment.valid:
             self.counters.errors["time_unknown"] += 1
             return []
         latitude, longitude, height = values["pos_lla"]
@@ -284,7 +256,7 @@ class VectornavParser(StreamParser):
         yaw_sigma, pitch_sigma, roll_sigma = map(radians, values.get("ypr_sigma", (nan,) * 3))
         row = (
             host_time_ns,
-            moment.week * WEEK_NS + moment.tow_ns,
+            moment.gps_ns,
             *(radians(latitude), radians(longitude), height),
             velocity,
             *angles,
@@ -342,9 +314,7 @@ def attitude(values: Values) -> tuple[float, float, float] | None:
     if "quaternion" not in values:
         return None
     x, y, z, w = values["quaternion"]
-    roll = atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
-    pitch = asin(min(1.0, max(-1.0, 2.0 * (w * y - z * x))))
-    return roll, pitch, atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    return angles_of(w, x, y, z)
 
 
 def gnss_fix(host_time_ns: int, receiver: str, tag: TimeTag, values: Values) -> GnssFix:

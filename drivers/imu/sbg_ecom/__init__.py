@@ -1,0 +1,1 @@
+"""SBG Systems inertial units: sbgECom logs."""
