@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,10 +57,10 @@ _PLACES = np.arange(PLACES)
 
 # VLP-16 User Manual 63-9243 rev. D: distances in 2 mm (9.3.1.3); vertical angles and vertical corrections by laser id
 # (table 9-1); 16 lasers 2.304 µs apart, then 18.43 µs of recharge, a sequence each 55.296 µs, two sequences in a data
-# block (9.4, figure 9-9); product id 0x22 (table 9-2).
+# block (9.4, figure 9-9); product ids 0x22, and 0x23 of the Puck LITE, which differs in weight only (table 9-2).
 VLP16 = SpinningHead(
     name="VLP-16",
-    product_ids=(0x22,),
+    product_ids=(0x22, 0x23),
     range_unit_m=0.002,
     channel=(_PLACES % 16).astype(np.uint16),
     offset_ns=(_PLACES // 16) * 55_296 + (_PLACES % 16) * 2_304,
@@ -69,6 +69,19 @@ VLP16 = SpinningHead(
         [-15, 1, -13, 3, -11, 5, -9, 7, -7, 9, -5, 11, -3, 13, -1, 15],
         up_m=1e-3
         * np.array([11.2, -0.7, 9.7, -2.2, 8.1, -3.7, 6.6, -5.1, 5.1, -6.6, 3.7, -8.1, 2.2, -9.7, 0.7, -11.2]),
+    ),
+)
+
+# Puck Hi-Res: as the VLP-16, but with lasers 4/3° apart. Vertical angles and vertical corrections of table 9-1; the
+# corrections also stand in the maker's envelope drawing 86-0129 rev. A (velodyne-decoder 3.1.0, calib_db.cpp). They are
+# up to 0.5 mm more than 41.91 mm · tan of the angle, by which those of the VLP-16 are explained. Product id 0x24.
+VLP16_HIRES = replace(
+    VLP16,
+    name="Puck Hi-Res (VLP-16 Hi-Res)",
+    product_ids=(0x24,),
+    beams=beam_table(
+        [-10, 0.667, -8.667, 2, -7.333, 3.333, -6, 4.667, -4.667, 6, -3.333, 7.333, -2, 8.667, -0.667, 10],
+        up_m=1e-3 * np.array([7.4, -0.9, 6.5, -1.8, 5.5, -2.7, 4.6, -3.7, 3.7, -4.6, 2.7, -5.5, 1.8, -6.5, 0.9, -7.4]),
     ),
 )
 

@@ -26,7 +26,16 @@ from swath.drivers.scanner.rows.slots import Chosen
 from swath.drivers.scanner.sequence import SampleThinner
 from swath.drivers.scanner.spinning import Firings, returns_of_packets
 from swath.drivers.scanner.velodyne.calibration import read_calibration
-from swath.drivers.scanner.velodyne.heads import BLOCKS, HDL32E, PLACES, VLP16, VLP32C, VLS128, SpinningHead
+from swath.drivers.scanner.velodyne.heads import (
+    BLOCKS,
+    HDL32E,
+    PLACES,
+    VLP16,
+    VLP16_HIRES,
+    VLP32C,
+    VLS128,
+    SpinningHead,
+)
 from swath.drivers.scanner.velodyne.position import HOUR_US, POSITION_BYTES, PositionReader
 from swath.georef.arrays import BoolArray, ByteArray, FloatArray, Int64Array, StructArray
 from swath.georef.records import (
@@ -321,6 +330,7 @@ def _driver(protocol: str, head: SpinningHead) -> Driver:
 DRIVERS = (
     _driver("velodyne-hdl32e", HDL32E),
     _driver("velodyne-vlp16", VLP16),
+    _driver("velodyne-vlp16-hires", VLP16_HIRES),
     _driver("velodyne-vlp32c", VLP32C),
     _driver("velodyne-vls128", VLS128),
 )

@@ -13,7 +13,16 @@ from swath.drivers.driver import find_driver
 from swath.drivers.parser import DeviceSettings, DriverSettingsError
 from swath.drivers.scanner.beams import beam_points
 from swath.drivers.scanner.velodyne.calibration import read_calibration
-from swath.drivers.scanner.velodyne.heads import BLOCKS, HDL32E, PLACES, VLP16, VLP32C, VLS128, SpinningHead
+from swath.drivers.scanner.velodyne.heads import (
+    BLOCKS,
+    HDL32E,
+    PLACES,
+    VLP16,
+    VLP16_HIRES,
+    VLP32C,
+    VLS128,
+    SpinningHead,
+)
 from swath.drivers.scanner.velodyne.parser import (
     MODE_DUAL,
     MODE_LAST,
@@ -39,7 +48,13 @@ from tests.drivers.spinning import payloads, read_pcd, ros_points, xyz
 
 VLP32C_CAPTURE = "velodyne/nebula_vlp32.pcap.gz"
 XYZ = np.dtype([("x", "f4"), ("y", "f4"), ("z", "f4")])
-HEADS = {"velodyne-hdl32e": HDL32E, "velodyne-vlp16": VLP16, "velodyne-vlp32c": VLP32C, "velodyne-vls128": VLS128}
+HEADS = {
+    "velodyne-hdl32e": HDL32E,
+    "velodyne-vlp16": VLP16,
+    "velodyne-vlp16-hires": VLP16_HIRES,
+    "velodyne-vlp32c": VLP32C,
+    "velodyne-vls128": VLS128,
+}
 EVERY_HEAD = pytest.mark.parametrize("head", HEADS.values(), ids=HEADS.keys())
 
 
@@ -280,6 +295,27 @@ def test_returns_of_every_head_do_not_depend_on_how_batches_are_cut() -> None:
         units.insert(40, encode_position_packet(3_599_999_000, 2, ""))
         check_packets(lambda head=head: make_parser(head), units)  # type: ignore[misc]
         check_packet_damage(lambda head=head: make_parser(head), units[25:45], examples=15)  # type: ignore[misc]
+
+
+def test_a_puck_hi_res_has_its_own_angles() -> None:
+    """Lasers 0 and 7 at 10 m: −10° and 7.4 mm up, 4.667° and 3.7 mm down, by table 9-1; a VLP-16 refuses them."""
+    units = payloads("velodyne/made_vlp16_hires.pcap.gz")
+    parsers = {
+        protocol: find_driver("scanner", protocol).make_parser(DeviceSettings("scanner/left")) for protocol in HEADS
+    }
+    rows = {
+        protocol: sum(len(record.rows) for record in feed(parser, units) if isinstance(record, ScannerReturns))
+        for protocol, parser in parsers.items()
+    }
+    assert rows == {**dict.fromkeys(HEADS, 0), "velodyne-vlp16-hires": 300 * 384}
+    assert parsers["velodyne-vlp16-hires"].counters.errors == {}
+    assert parsers["velodyne-vlp16"].counters.errors == {"wrong_product": 300}
+    first = decode(units[0], VLP16_HIRES)[:16]
+    points = beam_points(first, VLP16_HIRES.beams)
+    for laser, elevation_deg, up_m in ((0, -10.0, 0.0074), (7, 4.667, -0.0037), (15, 10.0, -0.0074)):
+        assert points[laser, 2] == pytest.approx(10 * np.sin(np.radians(elevation_deg)) + up_m, abs=1e-9)
+        assert np.hypot(*points[laser, :2]) == pytest.approx(10 * np.cos(np.radians(elevation_deg)), abs=1e-9)
+    np.testing.assert_allclose(np.diff(np.sort(VLP16_HIRES.beams.elevation_deg)), 4 / 3, atol=1e-3)
 
 
 @EVERY_HEAD
